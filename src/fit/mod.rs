@@ -1,0 +1,1 @@
+//! Training: losses, schedules, pruning, pose refinement.

@@ -1,0 +1,1 @@
+//! ONNX inference: sessions, model registry, one file per model family.

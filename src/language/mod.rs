@@ -1,0 +1,29 @@
+//! Masks, region features, alignment, codebook.
+use crate::scene::Plane;
+
+/// The label map of one level of one view.
+#[derive(Clone, Debug, Default)]
+pub struct LevelMasks {
+    /// [H, W] mask index, −1 = hole.
+    pub labels: Plane<i32>,
+    /// [M] quality weight of each mask (predicted IoU · stability; 1 when unknown).
+    pub quality: Vec<f32>,
+    /// [M, D] unit feature per mask, row-major; empty until region features ran.
+    pub features: Vec<f32>,
+}
+
+/// The masks of one view, index as in [`crate::scene::LEVEL_NAMES`].
+#[derive(Clone, Debug, Default)]
+pub struct ViewMasks {
+    /// Three levels.
+    pub levels: Vec<LevelMasks>,
+}
+
+/// A dense match field from view i to view j at the working resolution of view i.
+#[derive(Clone, Debug, Default)]
+pub struct DenseWarp {
+    /// [H, W] pixel position in view j.
+    pub target: Plane<[f32; 2]>,
+    /// [H, W] probability in [0, 1]; 0 where there is no match.
+    pub certainty: Plane<f32>,
+}

@@ -1,0 +1,1 @@
+//! One file per GPU pass, each with its CPU twin.

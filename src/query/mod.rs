@@ -1,0 +1,1 @@
+//! Text queries and evaluation.

@@ -1,0 +1,1 @@
+//! Progress, run.json, report.html.

@@ -1,0 +1,58 @@
+//! Images and per-pixel maps.
+
+/// A row-major map of one value per pixel, `data[y * width + x]`.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct Plane<T> {
+    /// Pixels.
+    pub width: usize,
+    /// Pixels.
+    pub height: usize,
+    /// [H, W] values.
+    pub data: Vec<T>,
+}
+
+impl<T: Clone> Plane<T> {
+    /// A map filled with one value.
+    pub fn filled(width: usize, height: usize, value: T) -> Self {
+        Plane { width, height, data: vec![value; width * height] }
+    }
+}
+
+impl<T: Copy> Plane<T> {
+    /// Value at column x, row y.
+    pub fn at(&self, x: usize, y: usize) -> T {
+        self.data[y * self.width + x]
+    }
+}
+
+/// An RGB image: `[H, W, 3]` in [0, 1].
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct RgbImage {
+    /// Pixels.
+    pub width: usize,
+    /// Pixels.
+    pub height: usize,
+    /// [H, W] colours.
+    pub data: Vec<[f32; 3]>,
+}
+
+impl RgbImage {
+    /// Colour at column x, row y.
+    pub fn at(&self, x: usize, y: usize) -> [f32; 3] {
+        self.data[y * self.width + x]
+    }
+    /// Rec. 601 luma per pixel.
+    pub fn luma(&self) -> Plane<f32> {
+        let data = self.data.iter().map(|c| 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2]).collect();
+        Plane { width: self.width, height: self.height, data }
+    }
+}
+
+/// Depth (camera z, world units, 0 = unknown) and confidence of one view, at the photo's working resolution.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct DepthMap {
+    /// [H, W] camera z; 0 = unknown.
+    pub depth: Plane<f32>,
+    /// [H, W] confidence ≥ 0; 0 where depth is unknown.
+    pub confidence: Plane<f32>,
+}

@@ -1,0 +1,55 @@
+//! What the scene knows about words: per-level features on the splats and the codebook that gives them meaning.
+use super::Plane;
+
+/// Level names, finest first: subpart, part, whole (internal level index 0, 1, 2).
+pub const LEVEL_NAMES: [&str; 3] = ["s", "m", "l"];
+
+/// The bijection of one level: K distinct unit vectors of the text/image space and their unit codes (ALGORITHMS 6).
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct Codebook {
+    /// Width D of the embedding space (512 for CLIP B/16).
+    pub embedding_dim: usize,
+    /// Width d of the codes that splats carry.
+    pub code_dim: usize,
+    /// [K, D] unit rows.
+    pub embeddings: Vec<f32>,
+    /// [K, d] unit rows.
+    pub codes: Vec<f32>,
+    /// [K] pixel area behind each code.
+    pub weights: Vec<f32>,
+    /// (view, mask id) pairs behind each code.
+    pub members: Vec<Vec<(u32, u32)>>,
+    /// Smallest distance between two codes.
+    pub min_chord: f32,
+}
+
+impl Codebook {
+    /// Number of codes K.
+    pub fn len(&self) -> usize {
+        self.embeddings.len().checked_div(self.embedding_dim).unwrap_or(0)
+    }
+    /// True without codes.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// One level of the language field.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct LevelField {
+    /// The bijection.
+    pub codebook: Codebook,
+    /// [N, d] raw splat features (the renderer's semantic channels), splat order of the scene.
+    pub features: Vec<f32>,
+    /// Per training view: code index per pixel, −1 = none. Training targets; empty in a loaded scene.
+    pub targets: Vec<Plane<i32>>,
+}
+
+/// All levels (index as in [`LEVEL_NAMES`]); a level without masks has an empty codebook.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct LanguageField {
+    /// Three levels.
+    pub levels: Vec<LevelField>,
+    /// Identifies the embedding space, for example `words/efficientnet-lite+minilm` or `dir:oracle`.
+    pub space: String,
+}

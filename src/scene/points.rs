@@ -1,0 +1,27 @@
+//! Coloured points, as geometry initialisers produce them.
+
+/// Structure of arrays; all vectors have the same length N.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct PointCloud {
+    /// [N, 3] world units, OpenCV axes.
+    pub positions: Vec<[f32; 3]>,
+    /// [N, 3] RGB in [0, 1].
+    pub colours: Vec<[f32; 3]>,
+    /// [N] confidence > 0.
+    pub confidence: Vec<f32>,
+    /// [N] index of the view each point came from.
+    pub view: Vec<u8>,
+    /// [N] footprint of one pixel at the point's depth, `z / f`, world units.
+    pub radius: Vec<f32>,
+}
+
+impl PointCloud {
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.positions.len()
+    }
+    /// True without points.
+    pub fn is_empty(&self) -> bool {
+        self.positions.is_empty()
+    }
+}

@@ -1,0 +1,38 @@
+//! The Gaussians of a scene, as raw (pre-activation) parameters.
+
+/// Number of spherical-harmonics coefficients per channel at a degree 0–3.
+pub const fn sh_coefficients(degree: u32) -> usize {
+    ((degree + 1) * (degree + 1)) as usize
+}
+
+/// Structure of arrays of N Gaussians (Kerbl et al. 2023), raw parameters as 3DGS files store them.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct Splats {
+    /// [N, 3] world units, OpenCV axes.
+    pub means: Vec<[f32; 3]>,
+    /// [N, 3] natural log of the standard deviation along each local axis.
+    pub log_scales: Vec<[f32; 3]>,
+    /// [N, 4] (w, x, y, z), not necessarily normalised.
+    pub quats: Vec<[f32; 4]>,
+    /// [N] opacity before the sigmoid.
+    pub opacity_logits: Vec<f32>,
+    /// Spherical-harmonics degree, 0–3.
+    pub sh_degree: u32,
+    /// [N, (degree+1)², 3] coefficients, DC first, RGB interleaved.
+    pub sh: Vec<f32>,
+}
+
+impl Splats {
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.means.len()
+    }
+    /// True without Gaussians.
+    pub fn is_empty(&self) -> bool {
+        self.means.is_empty()
+    }
+    /// Coefficients per channel.
+    pub fn sh_len(&self) -> usize {
+        sh_coefficients(self.sh_degree)
+    }
+}
