@@ -1,5 +1,6 @@
 //! Photos to cameras, depth and points.
 use crate::scene::{Camera, DepthMap, PointCloud};
+use glam::{DVec2, DVec3};
 
 /// What every geometry initialiser returns (ALGORITHMS 2.6). World frame: camera 0 of the run, OpenCV axes.
 #[derive(Clone, Debug, Default)]
@@ -14,4 +15,26 @@ pub struct Geometry {
     pub focal_log_sigma: Option<f64>,
     /// Name of the initialiser and of what it used, for run.json.
     pub method: String,
+}
+
+/// A triangulated point and where the photos show it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SparsePoint {
+    /// World units.
+    pub position: DVec3,
+    /// RGB in [0, 1].
+    pub colour: [f32; 3],
+    /// (view, pixel position) of every observation; at least two, at most one per view.
+    pub views: Vec<(usize, DVec2)>,
+}
+
+/// Cameras and the sparse points that fix them. World frame: camera 0; unit: the median depth of the points is 1.
+#[derive(Clone, Debug, Default)]
+pub struct SparseModel {
+    /// One per photo, at the photo's working resolution.
+    pub cameras: Vec<Camera>,
+    /// Triangulated points.
+    pub points: Vec<SparsePoint>,
+    /// One standard deviation of ln f, if the focal length was estimated.
+    pub focal_log_sigma: Option<f64>,
 }
