@@ -1,1 +1,2 @@
 //! File formats and the scene directory.
+pub mod npy;
