@@ -1,4 +1,11 @@
 //! ONNX inference: sessions, model registry, one file per model family.
+mod registry;
+mod runtime;
+pub mod xfeat;
+
+pub use registry::{ModelStatus, Registry, Role, home};
+pub use runtime::{Input, Session, Tensor, runtime};
+
 use crate::Result;
 use crate::scene::{Plane, RgbImage};
 

@@ -1,0 +1,255 @@
+//! The default model pack: which files it holds, where they are, and whether they are what they should be.
+//!
+//! The table is `tools/models/pack.json`, the same one that the set-up script builds from, so the two cannot disagree.
+use std::collections::HashMap;
+use std::fmt::Write as _;
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, OnceLock};
+use std::time::SystemTime;
+
+use serde::Deserialize;
+use sha2::{Digest, Sha256};
+
+use crate::{Error, Result};
+
+const PACK: &str = include_str!("../../tools/models/pack.json");
+/// What to do about anything that is missing or broken.
+const FIX: &str = "run tools/setup (or tools/models/build) to get it";
+
+/// What a model file is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Role {
+    /// Keypoints and descriptors.
+    Keypoints,
+    /// Edge probability.
+    Edges,
+    /// Image classifier.
+    Classifier,
+    /// Names of the classifier's classes.
+    Classes,
+    /// Sentence encoder.
+    Text,
+    /// Its tokenizer.
+    Tokenizer,
+}
+
+/// One file of the pack as found on this machine.
+#[derive(Clone, Debug)]
+pub struct ModelStatus {
+    /// What it is for.
+    pub role: Role,
+    /// The model's name.
+    pub name: String,
+    /// Where it is, or should be.
+    pub file: PathBuf,
+    /// Present with the right content.
+    pub installed: bool,
+    /// Size it should have.
+    pub bytes: u64,
+    /// Content it should have.
+    pub sha256: String,
+    /// Content it has; `None` when the file is absent or unreadable.
+    pub actual_sha256: Option<String>,
+    /// SPDX expression.
+    pub licence: String,
+    /// Where it comes from.
+    pub source: String,
+    /// What is wrong and what to do; `None` when installed.
+    pub fix: Option<String>,
+}
+
+#[derive(Deserialize)]
+struct Package {
+    version: String,
+    licence: String,
+}
+
+#[derive(Deserialize)]
+struct PackFile {
+    role: Role,
+    name: String,
+    package: String,
+    file: String,
+    bytes: u64,
+    sha256: String,
+}
+
+#[derive(Deserialize)]
+struct Pack {
+    packages: HashMap<String, Package>,
+    files: Vec<PackFile>,
+}
+
+/// The folder that set-up fills: `SPLATVK_HOME`, else `splatvk` in the user's data folder.
+pub fn home() -> PathBuf {
+    let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    let data = || set("XDG_DATA_HOME").unwrap_or_else(|| set("HOME").unwrap_or_default().join(".local/share"));
+    set("SPLATVK_HOME").unwrap_or_else(|| data().join("splatvk"))
+}
+
+/// Finds model files and vouches for them.
+pub struct Registry {
+    folder: PathBuf,
+    pack: Pack,
+}
+
+impl Registry {
+    /// `models_dir`, else `SPLATVK_MODELS`, else `models` under [`home`]. Opening does not look at the files.
+    pub fn open(models_dir: Option<&Path>) -> Result<Self> {
+        let pack = serde_json::from_str(PACK).map_err(|e| Error::work(format!("built-in model table: {e}")))?;
+        let folder = match models_dir {
+            Some(folder) if !folder.is_dir() => {
+                return Err(Error::input(format!("{}: no such model folder; {FIX}", folder.display())));
+            }
+            Some(folder) => folder.to_path_buf(),
+            None => match std::env::var_os("SPLATVK_MODELS").filter(|v| !v.is_empty()) {
+                Some(folder) => PathBuf::from(folder),
+                None => home().join("models"),
+            },
+        };
+        Ok(Registry { folder, pack })
+    }
+
+    /// The folder that is searched.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Every file of the pack, read and hashed.
+    pub fn status(&self) -> Vec<ModelStatus> {
+        self.pack.files.iter().map(|f| self.inspect(f)).collect()
+    }
+
+    /// The file for `role`, present and with the right content; otherwise an error that names the file, the sha256 it
+    /// should have and how to get it. Content is hashed once per process and file version.
+    pub fn path(&self, role: Role) -> Result<PathBuf> {
+        let found = self.pack.files.iter().find(|f| f.role == role).map(|f| self.inspect(f));
+        match found {
+            Some(ModelStatus { fix: Some(fix), .. }) => Err(Error::missing(fix)),
+            Some(status) => Ok(status.file),
+            None => Err(Error::work(format!("no model for {role:?} in the model table"))),
+        }
+    }
+
+    fn inspect(&self, entry: &PackFile) -> ModelStatus {
+        let file = self.folder.join(&entry.file);
+        let (actual, problem) = match content_hash(&file) {
+            Ok(hash) if hash == entry.sha256 => (Some(hash), None),
+            Ok(hash) => {
+                let size = std::fs::metadata(&file).map_or(0, |m| m.len());
+                let what = if size < entry.bytes { "truncated" } else { "corrupt or of another version" };
+                let problem = format!("is {what} ({size} bytes of {}, sha256 {hash})", entry.bytes);
+                (Some(hash), Some(problem))
+            }
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => (None, Some("is missing".to_string())),
+            Err(e) => (None, Some(format!("cannot be read ({e})"))),
+        };
+        let package = self.pack.packages.get(&entry.package);
+        let fix = problem.map(|p| {
+            format!("model {}: {} {p}; it should have sha256 {}: {FIX}", entry.name, file.display(), entry.sha256)
+        });
+        ModelStatus {
+            role: entry.role,
+            name: entry.name.clone(),
+            installed: fix.is_none(),
+            file,
+            bytes: entry.bytes,
+            sha256: entry.sha256.clone(),
+            actual_sha256: actual,
+            licence: package.map(|p| p.licence.clone()).unwrap_or_default(),
+            source: package.map(|p| format!("PyPI {} {}", entry.package, p.version)).unwrap_or_default(),
+            fix,
+        }
+    }
+}
+
+/// sha256 of a file in lower-case hex; remembered per path, size and modification time.
+fn content_hash(path: &Path) -> std::io::Result<String> {
+    type Known = HashMap<PathBuf, (u64, SystemTime, String)>;
+    static KNOWN: OnceLock<Mutex<Known>> = OnceLock::new();
+    let known = KNOWN.get_or_init(Mutex::default);
+    let meta = std::fs::metadata(path)?;
+    let stamp = (meta.len(), meta.modified()?);
+    if let Ok(known) = known.lock()
+        && let Some((size, time, hash)) = known.get(path)
+        && (*size, *time) == stamp
+    {
+        return Ok(hash.clone());
+    }
+    let mut file = std::fs::File::open(path)?;
+    let (mut digest, mut block) = (Sha256::new(), vec![0u8; 1 << 18]);
+    loop {
+        match file.read(&mut block)? {
+            0 => break,
+            n => digest.update(&block[..n]),
+        }
+    }
+    let hash = digest.finalize().iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}");
+        text
+    });
+    if let Ok(mut known) = known.lock() {
+        known.insert(path.to_path_buf(), (stamp.0, stamp.1, hash.clone()));
+    }
+    Ok(hash)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A folder with the pack's small files, so that corrupting one is cheap.
+    fn copied_pack() -> tempfile::TempDir {
+        let from = Registry::open(None).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        for role in [Role::Classes, Role::Keypoints] {
+            let path = from.path(role).unwrap();
+            std::fs::copy(&path, dir.path().join(path.file_name().unwrap())).unwrap();
+        }
+        dir
+    }
+
+    #[test]
+    fn every_file_of_the_installed_pack_is_sound() {
+        for status in Registry::open(None).unwrap().status() {
+            assert!(status.installed, "{:?}", status.fix);
+            assert_eq!(std::fs::metadata(&status.file).unwrap().len(), status.bytes);
+            assert!(!status.licence.is_empty() && status.source.starts_with("PyPI "));
+        }
+    }
+
+    #[test]
+    fn missing_truncated_and_corrupt_files_are_named_with_hash_and_remedy() {
+        let dir = copied_pack();
+        let registry = Registry::open(Some(dir.path())).unwrap();
+        assert!(registry.path(Role::Classes).is_ok());
+        let missing = registry.path(Role::Edges).unwrap_err();
+        let wanted = registry.status().into_iter().find(|s| s.role == Role::Edges).unwrap();
+        for part in ["hed.onnx is missing", &wanted.sha256, "tools/setup"] {
+            assert!(missing.to_string().contains(part), "{missing}");
+        }
+        assert_eq!(missing.exit_code(), 2);
+
+        let file = registry.path(Role::Keypoints).unwrap();
+        let mut bytes = std::fs::read(&file).unwrap();
+        std::fs::write(&file, &bytes[..bytes.len() / 2]).unwrap();
+        let truncated = registry.path(Role::Keypoints).unwrap_err().to_string();
+        assert!(truncated.contains("xfeat.onnx is truncated"), "{truncated}");
+
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        std::fs::write(&file, &bytes).unwrap();
+        let corrupt = registry.path(Role::Keypoints).unwrap_err().to_string();
+        assert!(corrupt.contains("is corrupt"), "{corrupt}");
+        assert!(!corrupt.contains('\n'));
+    }
+
+    #[test]
+    fn an_absent_model_folder_is_bad_input() {
+        let error = Registry::open(Some(Path::new("/no/such/folder"))).err().unwrap();
+        assert_eq!(error.exit_code(), 2);
+        assert!(error.to_string().contains("/no/such/folder"));
+    }
+}

@@ -1,0 +1,121 @@
+//! ONNX Runtime, loaded at run time from a shared library, and sessions with plain tensors in and out.
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+use ort::environment::Environment;
+use ort::logging::LogLevel;
+use ort::session::{SessionInputValue, builder::GraphOptimizationLevel};
+use ort::value::Tensor as OrtTensor;
+
+use super::registry::home;
+use crate::{Error, Result};
+
+#[cfg(target_os = "macos")]
+const LIBRARY: &str = "libonnxruntime.dylib";
+#[cfg(windows)]
+const LIBRARY: &str = "onnxruntime.dll";
+#[cfg(not(any(target_os = "macos", windows)))]
+const LIBRARY: &str = "libonnxruntime.so";
+
+/// The library's path and the environment made with it, or what went wrong.
+static LOADED: OnceLock<Result<(PathBuf, Environment), String>> = OnceLock::new();
+
+/// The library in use, loaded on the first call: `ORT_DYLIB_PATH`, else `lib` under [`home`], else the system's.
+pub fn runtime() -> Result<PathBuf> {
+    // ort panics when used without a library, so every session goes through this check first.
+    Ok(loaded()?.0.clone())
+}
+
+fn loaded() -> Result<&'static (PathBuf, Environment)> {
+    LOADED.get_or_init(load).as_ref().map_err(|e| Error::missing(e.as_str()))
+}
+
+fn load() -> Result<(PathBuf, Environment), String> {
+    let fix = "run tools/setup (or tools/models/build) to get it, or set ORT_DYLIB_PATH";
+    if let Some(path) = std::env::var_os("ORT_DYLIB_PATH").filter(|v| !v.is_empty()).map(PathBuf::from) {
+        let failed = |e| format!("ONNX Runtime: ORT_DYLIB_PATH={} cannot be loaded ({e}); {fix}", path.display());
+        return try_load(&path).map(|e| (path.clone(), e)).map_err(failed);
+    }
+    let own = home().join("lib").join(LIBRARY);
+    if own.exists() {
+        let failed = |e| format!("ONNX Runtime: {} cannot be loaded ({e}); {fix}", own.display());
+        return try_load(&own).map(|e| (own.clone(), e)).map_err(failed);
+    }
+    let system = PathBuf::from(LIBRARY);
+    let failed = |_| format!("ONNX Runtime: neither {} nor a system {LIBRARY} is there; {fix}", own.display());
+    try_load(&system).map(|e| (system.clone(), e)).map_err(failed)
+}
+
+fn try_load(path: &Path) -> Result<Environment, String> {
+    let one_line = |e: String| e.split_whitespace().collect::<Vec<_>>().join(" ");
+    let builder = ort::environment::init_from(path).map_err(|e| one_line(e.to_string()))?;
+    let environment = builder.with_name("splatvk").with_telemetry(false).build().map_err(|e| line(&e))?;
+    environment.set_log_level(LogLevel::Error);
+    Ok(environment)
+}
+
+/// A dense tensor of 32-bit floats.
+#[derive(Clone, Debug, Default)]
+pub struct Tensor {
+    /// Axes, outermost first.
+    pub shape: Vec<usize>,
+    /// Row-major values.
+    pub data: Vec<f32>,
+}
+
+/// What a session is fed.
+pub enum Input {
+    /// Row-major floats.
+    F32(Vec<usize>, Vec<f32>),
+    /// Row-major integers.
+    I64(Vec<usize>, Vec<i64>),
+}
+
+/// One loaded network. Dropping it frees its memory.
+pub struct Session {
+    inner: ort::session::Session,
+    file: PathBuf,
+}
+
+impl Session {
+    /// Loads a graph; it computes on as many threads as the machine has cores.
+    pub fn load(file: &Path) -> Result<Self> {
+        let environment = &loaded()?.1;
+        let threads = std::thread::available_parallelism().map_or(1, usize::from);
+        let inner = build(environment, file, threads).map_err(|e| Error::missing(format!("{}: {}", file.display(), line(&e))))?;
+        Ok(Session { inner, file: file.to_path_buf() })
+    }
+
+    /// Runs the graph once and returns the named outputs.
+    pub fn run(&mut self, inputs: Vec<(&'static str, Input)>, outputs: &[&str]) -> Result<Vec<Tensor>> {
+        let file = self.file.display().to_string();
+        let failed = |e: ort::Error| Error::work(format!("{file}: {}", line(&e)));
+        let mut fed: Vec<(&'static str, SessionInputValue<'_>)> = Vec::with_capacity(inputs.len());
+        for (name, input) in inputs {
+            fed.push((name, match input {
+                Input::F32(shape, data) => OrtTensor::from_array((shape, data)).map_err(failed)?.into(),
+                Input::I64(shape, data) => OrtTensor::from_array((shape, data)).map_err(failed)?.into(),
+            }));
+        }
+        let produced = self.inner.run(fed).map_err(failed)?;
+        let mut tensors = Vec::with_capacity(outputs.len());
+        for name in outputs {
+            let value =
+                produced.get(*name).ok_or_else(|| Error::work(format!("{file}: the graph has no output {name}")))?;
+            let (shape, data) = value.try_extract_tensor::<f32>().map_err(failed)?;
+            tensors.push(Tensor { shape: shape.iter().map(|n| *n as usize).collect(), data: data.to_vec() });
+        }
+        Ok(tensors)
+    }
+}
+
+fn build(environment: &Environment, file: &Path, threads: usize) -> ort::Result<ort::session::Session> {
+    Ok(ort::session::Session::builder(environment)?
+        .with_optimization_level(GraphOptimizationLevel::Level3)?
+        .with_intra_threads(threads)?
+        .commit_from_file(file)?)
+}
+
+fn line(error: &ort::Error) -> String {
+    error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
+}
