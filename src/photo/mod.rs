@@ -1,15 +1,25 @@
-//! Photos: decoding, EXIF, resizing, affine bookkeeping.
-use crate::scene::RgbImage;
-use std::path::PathBuf;
+//! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (ALGORITHMS 0.4, 1.1, 1.2).
+mod affine;
+mod choose;
+mod decode;
+mod exif_tags;
+mod resize;
 
-/// Axis-aligned affine map of pixel positions, `u' = s·u + o` per axis (ALGORITHMS 0.4).
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Affine {
-    /// Scale along x and y.
-    pub scale: [f64; 2],
-    /// Offset along x and y, pixels of the target.
-    pub offset: [f64; 2],
-}
+pub use affine::Affine;
+pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
+
+use crate::progress::Progress;
+use crate::scene::RgbImage;
+use crate::{Error, Result};
+use sha2::{Digest, Sha256};
+use std::path::{Path, PathBuf};
+
+/// Greatest height of the working image, pixels (ALGORITHMS 1.2).
+pub const WORKING_HEIGHT: usize = 1080;
+
+/// Smallest side of a usable photo, pixels: feature networks work at 1/8 resolution, below 8 × 8 cells nothing is left
+/// to match.
+pub const SMALLEST_SIDE: usize = 64;
 
 /// One decoded photo at working resolution, upright.
 #[derive(Clone, Debug)]
@@ -28,4 +38,104 @@ pub struct Photo {
     pub exif_focal: Option<f64>,
     /// Camera make and model from EXIF: photos that share it may share one focal length.
     pub camera_model: Option<String>,
+}
+
+/// Reads one photo: EXIF orientation applied, alpha composited on black, height at most [`WORKING_HEIGHT`].
+pub fn load(path: &Path) -> Result<Photo> {
+    let bytes = std::fs::read(path).map_err(|e| {
+        Error::input(format!("{}: {e}; check the name and that you may read it", path.display()))
+    })?;
+    let decoded = decode::decode(bytes, path)?;
+    let (w, h) = decoded.size;
+    if w.min(h) < SMALLEST_SIDE {
+        return Err(Error::input(format!(
+            "{}: {w} × {h} pixels are too few; each side needs at least {SMALLEST_SIDE}",
+            path.display()
+        )));
+    }
+    let (working_w, working_h) = working_size(w, h);
+    let image = resize::area_average((w, h), (working_w, working_h), |x, y| decoded.at(x, y));
+    let to_working = Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32));
+    Ok(Photo {
+        path: path.to_path_buf(),
+        stem: path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
+        image,
+        original_size: (w as u32, h as u32),
+        to_working,
+        // The two scales differ by the rounding of the size only; the height is the exact one.
+        exif_focal: decoded.lens.focal.map(|f| f * to_working.scale[1]),
+        camera_model: decoded.lens.camera_model,
+    })
+}
+
+/// Working (width, height) of an upright size: the height is capped, sizes truncated (ALGORITHMS 1.2).
+fn working_size(w: usize, h: usize) -> (usize, usize) {
+    if h <= WORKING_HEIGHT {
+        return (w, h);
+    }
+    ((w * WORKING_HEIGHT / h).max(1), WORKING_HEIGHT)
+}
+
+/// Finds, chooses and reads the photos of a run; refuses sets that cannot give geometry (the same photo twice) or that
+/// would mix up files (the same name twice).
+pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progress) -> Result<Vec<Photo>> {
+    let found = find(inputs)?;
+    if let Some(first) = found.ignored.first() {
+        let more = found.ignored.len() - 1;
+        let others = if more > 0 { format!(" and {more} more") } else { String::new() };
+        progress.warn(&format!("not a JPEG or PNG photo, ignored: {}{others}", first.display()));
+    }
+    let paths = choose(&found.photos, views)?;
+    if views.is_none() && paths.len() < found.photos.len() {
+        progress.warn(&format!(
+            "using {} of {} photos, spread over their names; --views changes how many",
+            paths.len(),
+            found.photos.len()
+        ));
+    }
+    progress.begin("photos", paths.len() as u64);
+    let mut photos = Vec::with_capacity(paths.len());
+    for (i, path) in paths.iter().enumerate() {
+        progress.check()?;
+        photos.push(load(path)?);
+        progress.step(i as u64 + 1, "");
+    }
+    progress.end();
+    refuse_twins(&photos)?;
+    Ok(photos)
+}
+
+fn refuse_twins(photos: &[Photo]) -> Result<()> {
+    let digests: Vec<_> =
+        photos.iter().map(|p| Sha256::digest(bytemuck::cast_slice(&p.image.data))).collect();
+    for j in 1..photos.len() {
+        for i in 0..j {
+            let (a, b) = (photos[i].path.display(), photos[j].path.display());
+            if digests[i] == digests[j] && photos[i].image.width == photos[j].image.width {
+                return Err(Error::input(format!(
+                    "{a} and {b}: the same photo twice; each photo must be taken from another place"
+                )));
+            }
+            if photos[i].stem == photos[j].stem {
+                return Err(Error::input(format!(
+                    "{a} and {b}: two photos with the name \"{}\"; rename one",
+                    photos[i].stem
+                )));
+            }
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_height_is_capped_and_sizes_truncated() {
+        assert_eq!(working_size(640, 480), (640, 480));
+        assert_eq!(working_size(1920, 1080), (1920, 1080));
+        assert_eq!(working_size(4032, 3024), (1440, 1080));
+        assert_eq!(working_size(3024, 4033), (809, 1080));
+    }
 }

@@ -1,0 +1,151 @@
+//! What EXIF says about the lens.
+use exif::{Exif, In, Reader, Tag, Value};
+
+/// Diagonal of the 36 × 24 mm frame that "35 mm equivalent" refers to (CIPA DCG-001: equal diagonal angle of view).
+const FULL_FRAME_DIAGONAL_MM: f64 = 43.266615305567875;
+
+/// Shortest and longest believable focal length over the long side of the image: a 140° fisheye and a 1,000 mm
+/// telephoto lens on full frame. Tags outside are typing errors or placeholders.
+const BELIEVABLE: std::ops::Range<f64> = 0.18..28.0;
+
+/// Lens facts of one file.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Lens {
+    /// Focal length in pixels of the upright original, from the tags that tell it.
+    pub focal: Option<f64>,
+    /// "Make Model".
+    pub camera_model: Option<String>,
+}
+
+/// Reads the lens facts out of a raw EXIF block; a damaged block yields what could be read. `size` is the size of the
+/// image in pixels, in either orientation.
+pub(super) fn lens(raw: Vec<u8>, size: (u32, u32)) -> Lens {
+    let read = Reader::new().continue_on_error(true).read_raw(raw);
+    match read.or_else(|e| e.distill_partial_result(|_| ())) {
+        Ok(exif) => Lens { focal: focal(&exif, size), camera_model: camera_model(&exif) },
+        Err(_) => Lens::default(),
+    }
+}
+
+fn number(exif: &Exif, tag: Tag) -> Option<f64> {
+    let value = match &exif.get_field(tag, In::PRIMARY)?.value {
+        Value::Rational(v) => v.first()?.to_f64(),
+        Value::SRational(v) => v.first()?.to_f64(),
+        other => other.get_uint(0)? as f64,
+    };
+    (value.is_finite() && value > 0.0).then_some(value)
+}
+
+/// The focal plane tags are exact where they are right, the 35 mm tag is a whole number of millimetres (2 % at 26 mm)
+/// but hard to get wrong: the former count only when the latter agrees or is absent.
+fn focal(exif: &Exif, (w, h): (u32, u32)) -> Option<f64> {
+    let (w, h) = (w as f64, h as f64);
+    let believable = |f: &f64| BELIEVABLE.contains(&(f / w.max(h)));
+    let equivalent = number(exif, Tag::FocalLengthIn35mmFilm)
+        .map(|mm| mm / FULL_FRAME_DIAGONAL_MM * w.hypot(h))
+        .filter(believable);
+    let plane = focal_plane(exif, w.max(h)).filter(believable);
+    match (plane, equivalent) {
+        // 12 %: rounding of a short 35 mm figure plus the width-based equivalents that some makers write.
+        (Some(p), Some(e)) if (p / e).ln().abs() < 0.12 => Some(p),
+        (_, Some(e)) => Some(e),
+        (p, None) => p,
+    }
+}
+
+/// Focal length in pixels from FocalLength and the sensor's pixels per unit length.
+fn focal_plane(exif: &Exif, long_side: f64) -> Option<f64> {
+    let mm = number(exif, Tag::FocalLength)?;
+    let resolution = number(exif, Tag::FocalPlaneXResolution)?;
+    let unit_mm = match number(exif, Tag::FocalPlaneResolutionUnit).unwrap_or(2.0) as u32 {
+        2 => 25.4,
+        3 => 10.0,
+        4 => 1.0,
+        5 => 0.001,
+        _ => return None,
+    };
+    // The resolution counts pixels of the image as the camera wrote it; PixelXDimension tells when it was scaled since.
+    let written = [Tag::PixelXDimension, Tag::PixelYDimension].map(|t| number(exif, t).unwrap_or(0.0));
+    let written = written[0].max(written[1]);
+    let scale = if written > 0.0 { long_side / written } else { 1.0 };
+    Some(mm * resolution / unit_mm * scale)
+}
+
+fn camera_model(exif: &Exif) -> Option<String> {
+    let text = |tag| match &exif.get_field(tag, In::PRIMARY)?.value {
+        Value::Ascii(v) => {
+            let s = String::from_utf8_lossy(v.first()?).trim_matches(['\0', ' ']).to_string();
+            (!s.is_empty()).then_some(s)
+        }
+        _ => None,
+    };
+    match (text(Tag::Make), text(Tag::Model)) {
+        (Some(make), Some(model)) if model.starts_with(&make) => Some(model),
+        (Some(make), Some(model)) => Some(format!("{make} {model}")),
+        (make, model) => model.or(make),
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use exif::experimental::Writer;
+    use exif::{Field, Rational};
+
+    /// An EXIF block (TIFF bytes) with the given fields.
+    pub fn block(fields: &[(Tag, Value)]) -> Vec<u8> {
+        let fields: Vec<Field> = fields
+            .iter()
+            .map(|(tag, value)| Field { tag: *tag, ifd_num: In::PRIMARY, value: value.clone() })
+            .collect();
+        let mut writer = Writer::new();
+        fields.iter().for_each(|f| writer.push_field(f));
+        let mut bytes = std::io::Cursor::new(Vec::new());
+        writer.write(&mut bytes, true).unwrap();
+        bytes.into_inner()
+    }
+
+    fn rational(num: u32, denom: u32) -> Value {
+        Value::Rational(vec![Rational { num, denom }])
+    }
+
+    #[test]
+    fn equivalent_focal_uses_the_diagonal() {
+        let raw = block(&[
+            (Tag::FocalLengthIn35mmFilm, Value::Short(vec![26])),
+            (Tag::Make, Value::Ascii(vec![b"Acme".to_vec()])),
+            (Tag::Model, Value::Ascii(vec![b"Phone 3".to_vec()])),
+        ]);
+        let lens = lens(raw, (4000, 3000));
+        assert!((lens.focal.unwrap() - 26.0 / 43.2666 * 5000.0).abs() < 0.1);
+        assert_eq!(lens.camera_model.as_deref(), Some("Acme Phone 3"));
+    }
+
+    #[test]
+    fn focal_plane_tags_count_when_they_agree() {
+        // 50 mm on a 36 mm wide sensor of 6000 pixels: 8333 px; the file was halved since.
+        let mut fields = vec![
+            (Tag::FocalLength, rational(50, 1)),
+            (Tag::FocalPlaneXResolution, rational(6000 * 254, 36 * 10)),
+            (Tag::FocalPlaneResolutionUnit, Value::Short(vec![2])),
+            (Tag::PixelXDimension, Value::Long(vec![6000])),
+            (Tag::PixelYDimension, Value::Long(vec![4000])),
+        ];
+        let size = (3000, 2000);
+        let alone = lens(block(&fields), size).focal.unwrap();
+        assert!((alone - 50.0 / 36.0 * 3000.0).abs() < 0.1, "{alone}");
+        fields.push((Tag::FocalLengthIn35mmFilm, Value::Short(vec![85])));
+        let contradicted = lens(block(&fields), size).focal.unwrap();
+        assert!((contradicted - 85.0 / 43.2666 * 3000f64.hypot(2000.0)).abs() < 0.1);
+    }
+
+    #[test]
+    fn nonsense_is_ignored() {
+        assert_eq!(lens(b"Exif?".to_vec(), (100, 100)), Lens::default());
+        assert_eq!(
+            lens(block(&[(Tag::FocalLengthIn35mmFilm, Value::Short(vec![0]))]), (100, 100)).focal,
+            None
+        );
+        assert_eq!(lens(block(&[(Tag::FocalLength, rational(1, 0))]), (100, 100)).focal, None);
+    }
+}

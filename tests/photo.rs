@@ -1,0 +1,103 @@
+//! Photo loading from real files: kinds of JPEG and PNG, EXIF, and sets that must be refused.
+use splatvk::photo::{self, Photo};
+use splatvk::progress::Silent;
+use std::path::{Path, PathBuf};
+
+fn data(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
+}
+
+/// Asserts 8-bit colours at four positions. The expected values come from Pillow 13 reading the same files.
+fn assert_colours(photo: &Photo, expected: [[u8; 3]; 4], tolerance: f32) {
+    for ((x, y), e) in [(5, 5), (90, 10), (40, 50), (90, 60)].into_iter().zip(expected) {
+        let c = photo.image.at(x, y).map(|v| v * 255.0);
+        let off = (0..3).map(|k| (c[k] - e[k] as f32).abs()).fold(0.0, f32::max);
+        assert!(off <= tolerance, "{} at ({x}, {y}): {c:?}, expected {e:?}", photo.stem);
+    }
+}
+
+#[test]
+fn kinds_of_files_agree_with_another_reader() {
+    // JPEG decoders may differ by rounding of the inverse DCT and of the chroma interpolation: 3 of 255.
+    let cmyk = photo::load(&data("photos/cmyk.jpg")).unwrap();
+    assert_colours(&cmyk, [[237, 231, 211], [17, 174, 173], [124, 49, 177], [15, 15, 153]], 3.0);
+    let progressive = photo::load(&data("photos/progressive.jpg")).unwrap();
+    assert_colours(&progressive, [[14, 18, 247], [233, 39, 154], [105, 195, 167], [233, 233, 101]], 3.0);
+    let palette = photo::load(&data("photos/palette.png")).unwrap();
+    assert_colours(&palette, [[13, 11, 247], [231, 41, 156], [104, 197, 165], [231, 230, 107]], 0.01);
+}
+
+#[test]
+fn a_tall_photo_is_scaled_with_its_focal_and_orientation() {
+    use exif::{Field, In, Tag, Value, experimental::Writer};
+    use image::ImageEncoder;
+    let folder = tempfile::tempdir().unwrap();
+    let fields = [
+        (Tag::Orientation, Value::Short(vec![6])),
+        (Tag::FocalLengthIn35mmFilm, Value::Short(vec![28])),
+        (Tag::Model, Value::Ascii(vec![b"Phone".to_vec()])),
+    ]
+    .map(|(tag, value)| Field { tag, ifd_num: In::PRIMARY, value });
+    let mut writer = Writer::new();
+    fields.iter().for_each(|f| writer.push_field(f));
+    let mut raw = std::io::Cursor::new(Vec::new());
+    writer.write(&mut raw, false).unwrap();
+    // Stored 2000 × 1200 lying on its side, left half red: upright 1200 × 2000 with the upper half red.
+    let stored = image::RgbImage::from_fn(2000, 1200, |x, _| {
+        image::Rgb(if x < 1000 { [220, 0, 0] } else { [0, 0, 220] })
+    });
+    let path = folder.path().join("tall.jpg");
+    let mut encoder =
+        image::codecs::jpeg::JpegEncoder::new_with_quality(std::fs::File::create(&path).unwrap(), 90);
+    encoder.set_exif_metadata(raw.into_inner()).unwrap();
+    encoder.encode_image(&stored).unwrap();
+
+    let photo = photo::load(&path).unwrap();
+    assert_eq!(photo.original_size, (1200, 2000));
+    assert_eq!((photo.image.width, photo.image.height), (648, 1080));
+    assert!(photo.image.at(324, 20)[0] > 0.8 && photo.image.at(324, 1060)[2] > 0.8, "upright");
+    let expected = 28.0 / 43.2666 * 1200f64.hypot(2000.0) * 0.54;
+    assert!((photo.exif_focal.unwrap() - expected).abs() < 0.1);
+    assert_eq!(photo.camera_model.as_deref(), Some("Phone"));
+    assert_eq!(photo.to_working.apply([1200.0, 2000.0]), [648.0, 1080.0]);
+}
+
+#[test]
+fn a_folder_is_read_in_order() {
+    let photos = photo::load_all(&[data("breakfast/images")], Some(4), &Silent).unwrap();
+    let stems: Vec<_> = photos.iter().map(|p| p.stem.as_str()).collect();
+    assert_eq!(stems, ["train_00", "train_01", "train_02", "train_03"], "held-out views must not be here");
+    assert!(photos.iter().all(|p| (p.image.width, p.image.height) == (640, 480) && p.exif_focal.is_none()));
+}
+
+#[test]
+fn unusable_sets_are_refused_in_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path();
+    let refuse = |inputs: &[PathBuf], views: Option<usize>, words: &[&str]| {
+        let e = photo::load_all(inputs, views, &Silent).unwrap_err();
+        let message = e.to_string();
+        assert_eq!((e.exit_code(), message.lines().count()), (2, 1), "{message}");
+        assert!(words.iter().all(|w| message.contains(w)), "{message}");
+    };
+    refuse(&[dir.to_path_buf()], None, &["no photos"]);
+    refuse(&[dir.join("nothing")], None, &["nothing", "No such file"]);
+    std::fs::write(dir.join("clip.mp4"), b"\0\0\0\x18ftypmp42").unwrap();
+    refuse(&[dir.to_path_buf()], None, &["clip.mp4", "video"]);
+    refuse(&[dir.join("clip.mp4")], None, &["clip.mp4"]);
+    let source = |i: u32| data(&format!("breakfast/images/train_{i:02}.jpg"));
+    std::fs::copy(source(0), dir.join("a.jpg")).unwrap();
+    refuse(&[dir.to_path_buf()], None, &["a.jpg", "only one photo"]);
+    std::fs::copy(source(0), dir.join("b.jpg")).unwrap();
+    refuse(&[dir.to_path_buf()], None, &["a.jpg", "b.jpg", "the same photo twice"]);
+    refuse(&[dir.to_path_buf()], Some(3), &["--views 3", "only 2"]);
+    refuse(&[dir.to_path_buf()], Some(1), &["--views 1"]);
+    std::fs::create_dir(dir.join("c")).unwrap();
+    std::fs::copy(source(1), dir.join("c/a.jpg")).unwrap();
+    refuse(&[dir.join("a.jpg"), dir.join("c/a.jpg")], None, &["two photos with the name \"a\""]);
+    image::RgbImage::new(20, 300).save(dir.join("b.png")).unwrap();
+    refuse(&[dir.join("a.jpg"), dir.join("b.png")], None, &["b.png", "20 × 300"]);
+    let whole = std::fs::read(source(2)).unwrap();
+    std::fs::write(dir.join("b.jpg"), &whole[..whole.len() / 2]).unwrap();
+    refuse(&[dir.join("a.jpg"), dir.join("b.jpg")], None, &["b.jpg", "cut off"]);
+}
