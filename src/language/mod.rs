@@ -1,5 +1,15 @@
 //! Masks, region features, alignment, codebook.
+//!
+//! [`dir`] or [`graph`] give masks, a [`crate::infer::RegionEncoder`] or `dir` their features, [`matcher`] the dense
+//! matches between views; [`build()`] aligns everything and turns it into codebooks and training targets.
 use crate::scene::Plane;
+
+pub mod align;
+mod build;
+pub mod codebook;
+pub mod dir;
+
+pub use build::{BuildOptions, Language, build};
 
 /// The label map of one level of one view.
 #[derive(Clone, Debug, Default)]

@@ -1,1 +1,186 @@
 //! Text queries and evaluation.
+//!
+//! A query is a unit vector and the canonical vectors of the same space. Its relevancy is computed once per code and
+//! gathered through the decoded code maps of a frame (ALGORITHMS 9). Level and location are chosen on the smoothed
+//! map; the mask of the `field` protocol is chosen on codes, so smoothing never moves its edges.
+pub mod filter;
+mod heatmap;
+
+pub use heatmap::heat_map;
+
+use crate::scene::{Codebook, LanguageField, Plane};
+use crate::{Error, Result};
+use rayon::prelude::*;
+
+/// The phrases that every query is compared against (LERF).
+pub const CANONICAL_PHRASES: [&str; 4] = ["object", "things", "stuff", "texture"];
+
+/// Cosines are multiplied by this before the softmax (LERF); without it no relevancy leaves 0.45 to 0.55.
+const LOGIT_SCALE: f64 = 10.0;
+
+/// A text query in the field's embedding space.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TextQuery {
+    /// What was asked.
+    pub text: String,
+    /// [D] unit vector.
+    pub embedding: Vec<f32>,
+    /// [C, D] unit rows of the canonical phrases.
+    pub canonicals: Vec<f32>,
+}
+
+/// How an answer is cut out of the relevancy map.
+#[derive(Clone, Debug, PartialEq)]
+pub struct QueryOptions {
+    /// Mask rule.
+    pub mask: MaskRule,
+    /// A query whose best relevancy stays below this is "not found". 0.5 means: no closer than the nearest canonical
+    /// phrase (ALGORITHMS 9.3).
+    pub abs_threshold: f32,
+}
+
+/// How the mask follows from relevancy.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum MaskRule {
+    /// Protocol `field`: the codes whose relevancy is at least this share of the way from 0.5 (as close as a canonical
+    /// phrase) to the best code of the level; their pixels are the mask, without smoothing.
+    Codes(f32),
+    /// Protocol `lerf` (9.3): threshold on the min–max-normalised smoothed map, then a 7×7 majority filter.
+    Lerf(f32),
+}
+
+impl Default for QueryOptions {
+    fn default() -> Self {
+        QueryOptions { mask: MaskRule::Codes(CODE_SHARE), abs_threshold: 0.5 }
+    }
+}
+
+/// With 0.8, a code joins the best one when it is nearly as relevant: the pieces of an object that was cut into several
+/// masks with alike features do, a different object whose phrase shares some meaning does not.
+pub const CODE_SHARE: f32 = 0.8;
+
+/// The answer to one query in one frame.
+#[derive(Clone, Debug, Default)]
+pub struct QueryResult {
+    /// Chosen level, index as in [`crate::scene::LEVEL_NAMES`].
+    pub level: usize,
+    /// [H, W] blended relevancy of the chosen level (9.2), 0 where nothing is.
+    pub relevancy: Plane<f32>,
+    /// [H, W] the mask.
+    pub mask: Plane<bool>,
+    /// Column and row of the most relevant pixel.
+    pub location: (usize, usize),
+    /// Best unsmoothed relevancy of the frame at the chosen level.
+    pub score: f32,
+    /// Whether the score reaches [`QueryOptions::abs_threshold`].
+    pub found: bool,
+}
+
+/// Relevancy of every code, [K]: `min_i σ(10 (φ·q − φ·n_i))` (ALGORITHMS 9.1).
+pub fn code_relevancy(codebook: &Codebook, query: &TextQuery) -> Result<Vec<f32>> {
+    let d = codebook.embedding_dim;
+    if codebook.is_empty() {
+        return Ok(Vec::new());
+    }
+    if query.embedding.len() != d || query.canonicals.is_empty() || query.canonicals.len() % d != 0 {
+        return Err(Error::input(format!(
+            "the query '{}' has {} values, the scene's embeddings {d}: they come from different models",
+            query.text,
+            query.embedding.len()
+        )));
+    }
+    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| *x as f64 * *y as f64).sum::<f64>();
+    let one = |phi: &[f32]| {
+        let q = dot(phi, &query.embedding);
+        let hardest = query.canonicals.chunks_exact(d).map(|n| dot(phi, n)).fold(f64::NEG_INFINITY, f64::max);
+        (1.0 / (1.0 + (-LOGIT_SCALE * (q - hardest)).exp())) as f32
+    };
+    Ok(codebook.embeddings.chunks_exact(d).map(one).collect())
+}
+
+/// Relevancy per pixel of a decoded map; void pixels (−1) get 0.
+pub fn relevancy_map(codes: &Plane<i32>, relevancy: &[f32]) -> Plane<f32> {
+    let value = |&k: &i32| usize::try_from(k).ok().and_then(|k| relevancy.get(k)).copied().unwrap_or(0.0);
+    Plane { width: codes.width, height: codes.height, data: codes.data.par_iter().map(value).collect() }
+}
+
+/// Answers a query in one frame. `codes` holds the frame's decoded map per level; levels without codes are skipped.
+pub fn answer(
+    codes: &[Plane<i32>],
+    field: &LanguageField,
+    query: &TextQuery,
+    options: &QueryOptions,
+) -> Result<QueryResult> {
+    let mut best: Option<Candidate> = None;
+    for (level, (map, part)) in codes.iter().zip(&field.levels).enumerate() {
+        let relevancy = code_relevancy(&part.codebook, query)?;
+        if relevancy.is_empty() {
+            continue;
+        }
+        let raw = relevancy_map(map, &relevancy);
+        let boxed = filter::box30(&raw);
+        let blended = filter::blend(&raw, &boxed);
+        let peak = blended.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        // ties go to the finer level
+        if best.as_ref().is_none_or(|b| peak > b.peak) {
+            best = Some(Candidate { level, peak, codes: relevancy, raw, boxed, blended });
+        }
+    }
+    let best = best.ok_or_else(|| Error::work("the scene has no language level to query"))?;
+    let score = best.raw.data.iter().copied().fold(0.0, f32::max);
+    let mask = match options.mask {
+        MaskRule::Codes(share) => code_mask(&codes[best.level], &best.codes, share),
+        MaskRule::Lerf(threshold) => filter::lerf_mask(&best.blended, threshold),
+    };
+    Ok(QueryResult {
+        level: best.level,
+        location: locate(&best, &mask),
+        relevancy: best.blended,
+        mask,
+        score,
+        found: score >= options.abs_threshold,
+    })
+}
+
+struct Candidate {
+    level: usize,
+    peak: f32,
+    codes: Vec<f32>,
+    raw: Plane<f32>,
+    boxed: Plane<f32>,
+    blended: Plane<f32>,
+}
+
+/// The pixel with the highest box-filtered relevancy (9.4), inside the mask where it has any pixel.
+fn locate(best: &Candidate, mask: &Plane<bool>) -> (usize, usize) {
+    let any = mask.data.iter().any(|&m| m);
+    let mut top: Option<(f32, usize)> = None;
+    for (p, &v) in best.boxed.data.iter().enumerate() {
+        if (!any || mask.data[p]) && top.is_none_or(|(t, _)| v > t) {
+            top = Some((v, p));
+        }
+    }
+    let p = top.map_or(0, |(_, p)| p);
+    (p % mask.width.max(1), p / mask.width.max(1))
+}
+
+/// Pixels of the codes that answer the query ([`MaskRule::Codes`]). Only codes that this frame shows compete, so that a
+/// code seen elsewhere does not suppress the best one here.
+fn code_mask(map: &Plane<i32>, relevancy: &[f32], share: f32) -> Plane<bool> {
+    let mut shown = vec![false; relevancy.len()];
+    for &k in map.data.iter().filter(|&&k| k >= 0) {
+        if let Some(s) = shown.get_mut(k as usize) {
+            *s = true;
+        }
+    }
+    let visible = relevancy.iter().zip(&shown).filter(|(_, s)| **s).map(|(r, _)| *r);
+    let top = visible.fold(0.0f32, f32::max);
+    // above 0.5 a code is closer to the phrase than to every canonical; the bar lies a share of the way from there
+    let bar = if top > 0.5 { 0.5 + share * (top - 0.5) } else { top };
+    let chosen: Vec<bool> = relevancy.iter().map(|&r| r > 0.0 && r >= bar).collect();
+    let data = map.data.iter().map(|&k| k >= 0 && chosen.get(k as usize).copied().unwrap_or(false)).collect();
+    Plane { width: map.width, height: map.height, data }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,197 @@
+//! Three-step semantic alignment (ALGORITHMS 5): which masks of different views are the same thing.
+//!
+//! Step 1 scores mask pairs by dense matches, step 2 fuses masks that one view splits and another keeps whole,
+//! step 3 re-scores by reprojection through depth and poses. Accepted pairs are undirected edges; connected
+//! components, built under constraints, become the things of the scene. Everything is integer counting or f64 sums
+//! in a fixed order, so the result depends neither on the thread count nor on the order of the views.
+mod components;
+mod links;
+mod score;
+
+#[cfg(test)]
+mod tests;
+
+pub use components::Component;
+pub use links::{PairLinks, links_from_depth, links_from_warps};
+
+use super::ViewMasks;
+use crate::{Error, Result};
+use serde::Serialize;
+
+/// How the share of a target mask is measured (ALGORITHMS 5.2, row 5).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum AreaScore {
+    /// Share of the target's own pixels whose reverse match lands in the source: independent of image scale.
+    Coverage,
+    /// Matched source pixels over target pixels, at most 1: the paper's ratio.
+    Paper,
+}
+
+/// Thresholds of the alignment; the defaults are those of ALGORITHMS 0.6 and section 5.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct AlignOptions {
+    /// Acceptance threshold of step 1.
+    pub tau1: f64,
+    /// Acceptance threshold of step 3.
+    pub tau2: f64,
+    /// Weight of the feature cosine; the area share has 1 − λ.
+    pub lambda: f64,
+    /// Area share.
+    pub area: AreaScore,
+    /// Matched pixels needed, as a share of the image ([`AlignOptions::min_matches`]).
+    pub min_match_share: f64,
+    /// Smallest cosine between two masks that may become one thing.
+    pub veto: f64,
+    /// Share of a mask's matches that must fall into the fusion target.
+    pub containment: f64,
+    /// Masks above this share of the image are background and never a fusion target.
+    pub background_share: f64,
+    /// Run step 1 (dense matches).
+    pub matching: bool,
+    /// Run step 2 (fusion; levels m and l only).
+    pub fusion: bool,
+    /// Run step 3 (reprojection).
+    pub reprojection: bool,
+}
+
+impl Default for AlignOptions {
+    fn default() -> Self {
+        AlignOptions {
+            tau1: 0.5,
+            tau2: 0.5,
+            lambda: 0.3,
+            area: AreaScore::Coverage,
+            min_match_share: 2.05e-4,
+            veto: 0.5,
+            containment: 0.6,
+            background_share: 0.6,
+            matching: true,
+            fusion: true,
+            reprojection: true,
+        }
+    }
+}
+
+impl AlignOptions {
+    /// Matched pixels that make a pair of masks worth scoring: 150 at 0.73 megapixels, at least 32.
+    pub fn min_matches(&self, pixels: usize) -> u32 {
+        ((self.min_match_share * pixels as f64).round() as u32).max(32)
+    }
+}
+
+/// An accepted pair of masks.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Edge {
+    /// 1 dense matching, 2 dense matching after fusion, 3 reprojection.
+    pub step: u8,
+    /// Source view and mask.
+    pub from: (u32, u32),
+    /// Target view and mask.
+    pub to: (u32, u32),
+    /// Area share of the target.
+    pub area: f64,
+    /// Cosine of the features, at least 0.
+    pub lang: f64,
+    /// λ·lang + (1 − λ)·area.
+    pub score: f64,
+}
+
+/// What alignment did on one level, for run.json.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct LevelReport {
+    /// Accepted edges, best first.
+    pub edges: Vec<Edge>,
+    /// Fused masks: (view, kept mask, absorbed mask).
+    pub fused: Vec<(u32, u32, u32)>,
+    /// Masks before alignment.
+    pub masks: usize,
+    /// Things after alignment.
+    pub components: usize,
+    /// Mean cosine over the accepted edges.
+    pub mean_cosine: f64,
+}
+
+/// The outcome: masks with fused labels, and per level the things they form.
+#[derive(Clone, Debug, Default)]
+pub struct Alignment {
+    /// The input masks; fused masks carry the smallest id of their set (absorbed ids have no pixel left).
+    pub views: Vec<ViewMasks>,
+    /// Per level.
+    pub components: Vec<Vec<Component>>,
+    /// Per level.
+    pub report: Vec<LevelReport>,
+}
+
+/// Aligns the masks of all views. `matched` holds the dense matches of step 1, `projected` the reprojections of step
+/// 3, each at most once per unordered pair of views; both may be empty.
+pub fn align(
+    views: &[ViewMasks],
+    matched: &[PairLinks],
+    projected: &[PairLinks],
+    options: &AlignOptions,
+) -> Result<Alignment> {
+    check(views)?;
+    let mut out = Alignment { views: views.to_vec(), ..Alignment::default() };
+    for level in 0..views.iter().map(|v| v.levels.len()).max().unwrap_or(0) {
+        let mut state = score::LevelState::new(&out.views, level);
+        let masks = state.areas.iter().flatten().filter(|&&a| a > 0).count();
+        let matched = if options.matching { matched } else { &[] };
+        let projected = if options.reprojection { projected } else { &[] };
+        let mut table = score::match_proposals(&state, matched, options, 1);
+        let mut fused = Vec::new();
+        // the finest level is never fused: its masks are subparts, and fusing them would make it another level
+        if options.fusion && level > 0 {
+            fused = score::fuse(&mut state, matched, options);
+            if !fused.is_empty() {
+                table = score::match_proposals(&state, matched, options, 2);
+                score::mark_unfused(&mut table, &fused);
+            }
+        }
+        score::add_reprojections(&mut table, &state, projected, options);
+        let edges = score::undirected(table);
+        let components = components::build(&state, &edges, options.veto);
+        let cosines: f64 = edges.iter().map(|e| e.lang).sum();
+        out.report.push(LevelReport {
+            masks,
+            components: components.len(),
+            mean_cosine: if edges.is_empty() { 0.0 } else { cosines / edges.len() as f64 },
+            edges,
+            fused,
+        });
+        out.components.push(components);
+        state.store(&mut out.views, level);
+    }
+    Ok(out)
+}
+
+fn check(views: &[ViewMasks]) -> Result<()> {
+    let levels = views.first().map_or(0, |v| v.levels.len());
+    let mut dim = 0;
+    for (t, view) in views.iter().enumerate() {
+        if view.levels.len() != levels {
+            return Err(Error::work(format!(
+                "view {t} has {} mask levels, view 0 has {levels}",
+                view.levels.len()
+            )));
+        }
+        for level in &view.levels {
+            let count = level.quality.len();
+            if count == 0 {
+                continue;
+            }
+            let d = level.features.len() / count;
+            if d == 0 || level.features.len() != count * d || (dim != 0 && d != dim) {
+                return Err(Error::work(format!(
+                    "view {t}: {} feature values for {count} masks of a {dim}-dimensional space",
+                    level.features.len()
+                )));
+            }
+            dim = d;
+            if level.labels.data.iter().any(|&l| l >= count as i32) {
+                return Err(Error::work(format!("view {t}: a label exceeds the {count} masks")));
+            }
+        }
+    }
+    Ok(())
+}

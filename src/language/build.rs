@@ -1,0 +1,130 @@
+//! Masks with features → aligned things → codebooks and training targets.
+use super::ViewMasks;
+use super::align::{self, AlignOptions, Alignment, PairLinks, links_from_depth};
+use super::codebook::{self, CodeEntry};
+use crate::progress::Progress;
+use crate::scene::{Camera, DepthMap, LanguageField, LevelField, Plane};
+use crate::{Error, Result};
+
+/// How the language field is built.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BuildOptions {
+    /// Alignment thresholds.
+    pub align: AlignOptions,
+    /// d, the length of the codes that splats carry.
+    pub feature_dim: usize,
+    /// Identifies the embedding space, for [`LanguageField::space`].
+    pub space: String,
+    /// Seed of the code layout.
+    pub seed: u64,
+}
+
+impl Default for BuildOptions {
+    fn default() -> Self {
+        // 16: codes of up to 200 things stay ghost-free at borders, where 3 gives 95 % ghosts (ALGORITHMS 6.2)
+        BuildOptions { align: AlignOptions::default(), feature_dim: 16, space: String::new(), seed: 0 }
+    }
+}
+
+/// What [`build`] produces.
+#[derive(Clone, Debug, Default)]
+pub struct Language {
+    /// Codebooks and training targets; splat features are empty until training fills them.
+    pub field: LanguageField,
+    /// Aligned masks, components and accepted edges.
+    pub alignment: Alignment,
+}
+
+/// Aligns the masks of all views and encodes the things they form.
+///
+/// `masks`, `cameras` and `depths` have one entry per view, all at the view's working resolution; `matched` holds
+/// the dense matches of step 1 ([`super::matcher`]), once per unordered pair.
+pub fn build(
+    masks: &[ViewMasks],
+    cameras: &[Camera],
+    depths: &[DepthMap],
+    matched: &[PairLinks],
+    options: &BuildOptions,
+    progress: &dyn Progress,
+) -> Result<Language> {
+    check_sizes(masks, cameras, depths)?;
+    let views = masks.len();
+    let pairs: Vec<(usize, usize)> = (0..views).flat_map(|i| (i + 1..views).map(move |j| (i, j))).collect();
+    progress.begin("align", pairs.len() as u64 + 2);
+    let mut projected = Vec::with_capacity(pairs.len());
+    for (k, &(i, j)) in pairs.iter().enumerate() {
+        progress.check()?;
+        projected.push(links_from_depth(i, j, (&cameras[i], &cameras[j]), (&depths[i], &depths[j])));
+        progress.step(k as u64 + 1, "");
+    }
+    let alignment = align::align(masks, matched, &projected, &options.align)?;
+    progress.step(pairs.len() as u64 + 1, "");
+    progress.check()?;
+    let field = encode(&alignment, options, progress)?;
+    progress.end();
+    Ok(Language { field, alignment })
+}
+
+fn check_sizes(masks: &[ViewMasks], cameras: &[Camera], depths: &[DepthMap]) -> Result<()> {
+    if masks.len() != cameras.len() || masks.len() != depths.len() {
+        return Err(Error::work(format!(
+            "language: {} mask sets for {} cameras and {} depth maps",
+            masks.len(),
+            cameras.len(),
+            depths.len()
+        )));
+    }
+    for (t, ((view, camera), depth)) in masks.iter().zip(cameras).zip(depths).enumerate() {
+        let size = (camera.width as usize, camera.height as usize);
+        let depth_size = (depth.depth.width, depth.depth.height);
+        for level in &view.levels {
+            if (level.labels.width, level.labels.height) != size || depth_size != size {
+                return Err(Error::work(format!(
+                    "language: view {t} is {}x{}, its masks {}x{}, its depth {}x{}",
+                    size.0, size.1, level.labels.width, level.labels.height, depth_size.0, depth_size.1
+                )));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// One codebook per level from the components, and the code index of every pixel.
+fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress) -> Result<LanguageField> {
+    let mut field = LanguageField { levels: Vec::new(), space: options.space.clone() };
+    for (level, components) in alignment.components.iter().enumerate() {
+        let entries: Vec<CodeEntry> = components
+            .iter()
+            .map(|c| {
+                let masks = &alignment.views[c.medoid.0 as usize].levels[level];
+                let dim = masks.features.len() / masks.quality.len().max(1);
+                let at = c.medoid.1 as usize * dim;
+                CodeEntry {
+                    embedding: masks.features[at..at + dim].to_vec(),
+                    weight: c.weight,
+                    members: c.members.clone(),
+                }
+            })
+            .collect();
+        let built = codebook::build(&entries, options.feature_dim, options.seed)?;
+        if built.codebook.is_empty() {
+            progress
+                .warn(&format!("no masks at level {}: it is not trained", crate::scene::LEVEL_NAMES[level]));
+        }
+        let mut code_of: Vec<Vec<i32>> =
+            alignment.views.iter().map(|v| vec![-1; v.levels[level].quality.len()]).collect();
+        for (component, &code) in components.iter().zip(&built.code_of) {
+            for &(view, mask) in &component.members {
+                code_of[view as usize][mask as usize] = code as i32;
+            }
+        }
+        let targets = alignment.views.iter().zip(&code_of).map(|(view, codes)| {
+            let labels = &view.levels[level].labels;
+            let data = labels.data.iter().map(|&l| if l < 0 { -1 } else { codes[l as usize] }).collect();
+            Plane { width: labels.width, height: labels.height, data }
+        });
+        let targets = targets.collect();
+        field.levels.push(LevelField { codebook: built.codebook, features: Vec::new(), targets });
+    }
+    Ok(field)
+}

@@ -1,0 +1,173 @@
+//! The bijection between embeddings and the short codes that splats carry (ALGORITHMS 6).
+mod pca;
+mod spread;
+
+use crate::scene::{Codebook, Plane};
+use crate::{Error, Result};
+use rayon::prelude::*;
+
+/// Embeddings with a larger cosine cannot be told apart by any text query and share a code (ALGORITHMS 6.3, step 1).
+const SAME_EMBEDDING: f64 = 0.9995;
+
+/// Smallest distance between two codes that the construction accepts (ALGORITHMS 6.3, step 5).
+const MIN_CHORD: f32 = 0.02;
+
+/// Pixels less opaque than this show nothing of the scene (ALGORITHMS 6.3, step 6).
+pub const VOID_ALPHA: f32 = 0.5;
+
+/// One distinct embedding and what stands behind it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CodeEntry {
+    /// [D] unit vector.
+    pub embedding: Vec<f32>,
+    /// Pixels.
+    pub weight: f64,
+    /// (view, mask) pairs.
+    pub members: Vec<(u32, u32)>,
+}
+
+/// A codebook and, for every input entry, the code it received.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Built {
+    /// The bijection.
+    pub codebook: Codebook,
+    /// [entries] code index.
+    pub code_of: Vec<u32>,
+}
+
+/// Builds the codebook of one level: merges indistinguishable embeddings, gives each of the K that remain a unit code
+/// of length `dim`, and proves that decoding inverts encoding, also under noise.
+pub fn build(entries: &[CodeEntry], dim: usize, seed: u64) -> Result<Built> {
+    if dim == 0 {
+        return Err(Error::input("the feature dimension must be at least 1"));
+    }
+    let (kept, code_of) = deduplicate(entries);
+    if kept.is_empty() {
+        return Ok(Built::default());
+    }
+    let embedding_dim = kept[0].embedding.len();
+    let embeddings: Vec<f32> = kept.iter().flat_map(|e| e.embedding.iter().copied()).collect();
+    let weights: Vec<f64> = kept.iter().map(|e| e.weight.max(1.0)).collect();
+    let codes = if kept.len() <= dim {
+        one_hot(kept.len(), dim)
+    } else {
+        let start = pca::project(&embeddings, &weights, embedding_dim, dim)?;
+        spread::spread(start, &embeddings, embedding_dim, dim, seed)
+    };
+    let codebook = Codebook {
+        embedding_dim,
+        code_dim: dim,
+        min_chord: min_chord(&codes, dim),
+        embeddings,
+        codes,
+        weights: weights.iter().map(|&w| w as f32).collect(),
+        members: kept.into_iter().map(|e| e.members).collect(),
+    };
+    assert_bijection(&codebook, seed)?;
+    Ok(Built { codebook, code_of })
+}
+
+/// Keeps the heaviest of indistinguishable entries; the order of first appearance stays.
+fn deduplicate(entries: &[CodeEntry]) -> (Vec<CodeEntry>, Vec<u32>) {
+    let mut kept: Vec<CodeEntry> = Vec::new();
+    let mut heaviest: Vec<f64> = Vec::new();
+    let mut code_of = Vec::with_capacity(entries.len());
+    for e in entries {
+        let same = kept.iter().position(|k| cosine(&k.embedding, &e.embedding) > SAME_EMBEDDING);
+        match same {
+            Some(k) => {
+                kept[k].weight += e.weight;
+                kept[k].members.extend_from_slice(&e.members);
+                if e.weight > heaviest[k] {
+                    heaviest[k] = e.weight;
+                    kept[k].embedding.clone_from(&e.embedding);
+                }
+                code_of.push(k as u32);
+            }
+            None => {
+                code_of.push(kept.len() as u32);
+                heaviest.push(e.weight);
+                kept.push(e.clone());
+            }
+        }
+    }
+    (kept, code_of)
+}
+
+fn cosine(a: &[f32], b: &[f32]) -> f64 {
+    a.iter().zip(b).map(|(x, y)| *x as f64 * *y as f64).sum()
+}
+
+/// `c_k = e_k`: with no more codes than dimensions a mix of two codes is never nearest to a third.
+fn one_hot(count: usize, dim: usize) -> Vec<f32> {
+    (0..count * dim).map(|i| if i / dim == i % dim { 1.0 } else { 0.0 }).collect()
+}
+
+/// Smallest distance between two codes; 2 (the diameter) for fewer than two codes.
+pub fn min_chord(codes: &[f32], dim: usize) -> f32 {
+    let rows: Vec<&[f32]> = codes.chunks_exact(dim).collect();
+    let nearest = |k: usize| {
+        let others = rows[k + 1..].iter();
+        others
+            .map(|o| rows[k].iter().zip(*o).map(|(a, b)| (a - b) * (a - b)).sum::<f32>())
+            .fold(4.0, f32::min)
+    };
+    (0..rows.len()).into_par_iter().map(nearest).reduce(|| 4.0, f32::min).sqrt()
+}
+
+/// `argmax_k F·c_k` over all codes of the level; ties take the lowest k; `None` without codes.
+pub fn decode_one(codebook: &Codebook, feature: &[f32]) -> Option<usize> {
+    let mut best: Option<(f32, usize)> = None;
+    for (k, code) in codebook.codes.chunks_exact(codebook.code_dim.max(1)).enumerate() {
+        let dot: f32 = feature.iter().zip(code).map(|(a, b)| a * b).sum();
+        if best.is_none_or(|(d, _)| dot > d) {
+            best = Some((dot, k));
+        }
+    }
+    best.map(|(_, k)| k)
+}
+
+/// Code index per pixel of rendered features `[H·W, d]`; −1 where alpha < [`VOID_ALPHA`]. Twin of the GPU pass.
+pub fn decode_map(codebook: &Codebook, features: &[f32], alpha: &Plane<f32>) -> Result<Plane<i32>> {
+    let (dim, pixels) = (codebook.code_dim, alpha.data.len());
+    if features.len() != pixels * dim {
+        return Err(Error::work(format!(
+            "decode: {} feature values for {pixels} pixels of {dim} channels",
+            features.len()
+        )));
+    }
+    let code = |p: usize| {
+        if alpha.data[p] < VOID_ALPHA {
+            return -1;
+        }
+        decode_one(codebook, &features[p * dim..(p + 1) * dim]).map_or(-1, |k| k as i32)
+    };
+    let data = (0..pixels).into_par_iter().map(code).collect();
+    Ok(Plane { width: alpha.width, height: alpha.height, data })
+}
+
+/// The bijection guarantee: codes are distinct, decode(encode(k)) = k, also with uniform noise of amplitude 0.45 δ_min
+/// along a random direction.
+fn assert_bijection(codebook: &Codebook, seed: u64) -> Result<()> {
+    let chord = codebook.min_chord;
+    if chord < MIN_CHORD {
+        return Err(Error::work(format!(
+            "codebook: two of {} codes are only {chord:.4} apart in {} dimensions; raise --feature-dim",
+            codebook.len(),
+            codebook.code_dim
+        )));
+    }
+    let mut random = spread::Random::new(seed ^ 0x5eed);
+    for (k, code) in codebook.codes.chunks_exact(codebook.code_dim).enumerate() {
+        let direction = random.unit(codebook.code_dim);
+        let amplitude = 0.45 * chord * random.uniform() as f32;
+        let noisy: Vec<f32> = code.iter().zip(&direction).map(|(c, n)| c + amplitude * *n as f32).collect();
+        if decode_one(codebook, code) != Some(k) || decode_one(codebook, &noisy) != Some(k) {
+            return Err(Error::work(format!("codebook: code {k} does not decode to itself")));
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests;

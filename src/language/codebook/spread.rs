@@ -1,0 +1,154 @@
+//! Spreads codes over the sphere so that they stay apart (ALGORITHMS 6.3, step 4).
+use rayon::prelude::*;
+
+/// Gradient steps; the minimum distance no longer grows after about 200 on 50 to 600 codes.
+const STEPS: usize = 300;
+
+/// How many nearest embeddings pull at each code, and how strongly against a mean repulsion of 1: enough to keep
+/// neighbours in meaning near each other, too little to bring codes together.
+const NEIGHBOURS: usize = 3;
+const ATTRACTION: f64 = 0.02;
+
+/// SplitMix64: small, seedable, identical everywhere.
+pub(super) struct Random(u64);
+
+impl Random {
+    pub fn new(seed: u64) -> Self {
+        Random(seed)
+    }
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+    /// Uniform in [0, 1).
+    pub fn uniform(&mut self) -> f64 {
+        (self.next() >> 11) as f64 / (1u64 << 53) as f64
+    }
+    /// Standard normal (Box–Muller).
+    pub fn normal(&mut self) -> f64 {
+        let (a, b) = (1.0 - self.uniform(), self.uniform());
+        (-2.0 * a.ln()).sqrt() * (std::f64::consts::TAU * b).cos()
+    }
+    /// A uniformly random direction.
+    pub fn unit(&mut self, dim: usize) -> Vec<f64> {
+        let mut v: Vec<f64> = (0..dim).map(|_| self.normal()).collect();
+        normalise(&mut v);
+        v
+    }
+}
+
+fn normalise(v: &mut [f64]) {
+    let norm = v.iter().map(|x| x * x).sum::<f64>().sqrt();
+    if norm > 1e-12 {
+        v.iter_mut().for_each(|x| *x /= norm);
+    } else if let Some(first) = v.first_mut() {
+        *first = 1.0;
+    }
+}
+
+/// Minimises `Σ 1/‖y_k − y_l‖^p` plus a weak pull between neighbours in meaning, by projected gradient steps with a
+/// shrinking step length; returns the layout with the largest minimum distance seen, [K, dim] unit rows.
+pub(super) fn spread(
+    start: Vec<f64>,
+    embeddings: &[f32],
+    embedding_dim: usize,
+    dim: usize,
+    seed: u64,
+) -> Vec<f32> {
+    let mut random = Random::new(seed);
+    let mut y = start;
+    for row in y.chunks_exact_mut(dim) {
+        normalise(row);
+        // equal projections (two embeddings alike in the kept directions) need a nudge to repel each other
+        row.iter_mut().for_each(|v| *v += 1e-3 * random.normal());
+        normalise(row);
+    }
+    if dim == 1 {
+        return y.iter().map(|&v| v as f32).collect();
+    }
+    let count = y.len() / dim;
+    let neighbours = nearest(embeddings, embedding_dim, count);
+    let power = if dim < 6 { dim as i32 } else { 4 };
+    // typical spacing of K points on the sphere: the natural step length
+    let spacing = 2.0 / (count as f64).powf(1.0 / (dim - 1) as f64);
+    let (mut best, mut best_chord) = (y.clone(), chord(&y, dim));
+    for step in 0..STEPS {
+        let length = 0.2 * spacing * (1.0 - step as f64 / STEPS as f64) + 1e-4 * spacing;
+        let previous = y.clone();
+        y.par_chunks_exact_mut(dim).enumerate().for_each(|(k, row)| {
+            let mut force = repulsion(&previous, k, dim, power);
+            normalise_force(&mut force);
+            for &l in &neighbours[k] {
+                for c in 0..dim {
+                    force[c] += ATTRACTION * (previous[l * dim + c] - row[c]);
+                }
+            }
+            // only the tangential part moves the point along the sphere
+            let radial: f64 = force.iter().zip(row.iter()).map(|(f, v)| f * v).sum();
+            for c in 0..dim {
+                row[c] += length * (force[c] - radial * row[c]);
+            }
+            normalise(row);
+        });
+        let now = chord(&y, dim);
+        if now > best_chord {
+            (best, best_chord) = (y.clone(), now);
+        }
+    }
+    best.iter().map(|&v| v as f32).collect()
+}
+
+/// `Σ_l (y_k − y_l)/‖y_k − y_l‖^(p+2)`, the descent direction of the energy.
+fn repulsion(y: &[f64], k: usize, dim: usize, power: i32) -> Vec<f64> {
+    let mut force = vec![0.0; dim];
+    let me = &y[k * dim..(k + 1) * dim];
+    for (l, other) in y.chunks_exact(dim).enumerate() {
+        if l == k {
+            continue;
+        }
+        let square: f64 = me.iter().zip(other).map(|(a, b)| (a - b) * (a - b)).sum();
+        // 1e-12 keeps coincident points finite; they were nudged apart before
+        let scale = square.max(1e-12).powi(-(power + 2) / 2);
+        for c in 0..dim {
+            force[c] += scale * (me[c] - other[c]);
+        }
+    }
+    force
+}
+
+/// Unit length: with p = 4 forces span many decades, and a fixed step length converges where a scaled one explodes.
+fn normalise_force(force: &mut [f64]) {
+    let norm = force.iter().map(|x| x * x).sum::<f64>().sqrt();
+    if norm > 0.0 {
+        force.iter_mut().for_each(|x| *x /= norm);
+    }
+}
+
+fn chord(y: &[f64], dim: usize) -> f64 {
+    let rows: Vec<&[f64]> = y.chunks_exact(dim).collect();
+    let nearest = |k: usize| {
+        let others = rows[k + 1..].iter();
+        others
+            .map(|o| rows[k].iter().zip(*o).map(|(a, b)| (a - b) * (a - b)).sum::<f64>())
+            .fold(4.0, f64::min)
+    };
+    (0..rows.len()).into_par_iter().map(nearest).reduce(|| 4.0, f64::min).sqrt()
+}
+
+/// The most similar embeddings of each embedding.
+fn nearest(embeddings: &[f32], dim: usize, count: usize) -> Vec<Vec<usize>> {
+    let rows: Vec<&[f32]> = embeddings.chunks_exact(dim).collect();
+    (0..count)
+        .into_par_iter()
+        .map(|k| {
+            let mut order: Vec<(f64, usize)> =
+                (0..count).filter(|&l| l != k).map(|l| (super::cosine(rows[k], rows[l]), l)).collect();
+            order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+            order.truncate(NEIGHBOURS);
+            order.into_iter().map(|(_, l)| l).collect()
+        })
+        .collect()
+}

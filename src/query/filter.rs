@@ -1,0 +1,129 @@
+//! Smoothing and the LERF mask (ALGORITHMS 9.2, 9.3).
+use crate::scene::Plane;
+
+/// Side of the smoothing box, pixels (LERF, LangSplat).
+const BOX: usize = 30;
+
+/// Side of the majority filter of the LERF protocol, pixels.
+const MAJORITY: usize = 7;
+
+/// 30×30 box mean with the window `x−15 … x+14`, border reflected without repeating the edge pixel (OpenCV
+/// `filter2D`, `REFLECT_101`).
+pub fn box30(map: &Plane<f32>) -> Plane<f32> {
+    box_filter(map, BOX, BOX / 2, reflect_101)
+}
+
+/// `½ (box + raw)`.
+pub fn blend(raw: &Plane<f32>, boxed: &Plane<f32>) -> Plane<f32> {
+    let data = raw.data.iter().zip(&boxed.data).map(|(a, b)| 0.5 * (a + b)).collect();
+    Plane { width: raw.width, height: raw.height, data }
+}
+
+/// Protocol `lerf`: `clip(2·o − 1, 0, 1) > threshold` with o the min–max-normalised map, then a 7×7 majority.
+pub fn lerf_mask(blended: &Plane<f32>, threshold: f32) -> Plane<bool> {
+    let low = blended.data.iter().copied().fold(f32::INFINITY, f32::min);
+    let high = blended.data.iter().map(|v| v - low).fold(0.0, f32::max) + 1e-9;
+    let mask = blended.data.iter().map(|v| {
+        let o = ((v - low) / high * 2.0 - 1.0).clamp(0.0, 1.0);
+        if o > threshold { 1.0 } else { 0.0 }
+    });
+    let mask = Plane { width: blended.width, height: blended.height, data: mask.collect() };
+    let votes = box_filter(&mask, MAJORITY, MAJORITY / 2, replicate);
+    let data = votes.data.iter().map(|&v| v >= 0.5).collect();
+    Plane { width: mask.width, height: mask.height, data }
+}
+
+/// Index inside 0..n for an index that may lie outside; reflection without the edge.
+fn reflect_101(i: isize, n: usize) -> usize {
+    if n == 1 {
+        return 0;
+    }
+    let period = 2 * (n as isize - 1);
+    let m = i.rem_euclid(period);
+    (if m < n as isize { m } else { period - m }) as usize
+}
+
+fn replicate(i: isize, n: usize) -> usize {
+    i.clamp(0, n as isize - 1) as usize
+}
+
+/// Separable mean over `size` pixels starting `anchor` before each pixel; running sums in f64.
+fn box_filter(map: &Plane<f32>, size: usize, anchor: usize, border: fn(isize, usize) -> usize) -> Plane<f32> {
+    let (w, h) = (map.width, map.height);
+    let mut rows = vec![0.0f64; w * h];
+    let mut prefix = vec![0.0f64; w.max(h) + size + 1];
+    for y in 0..h {
+        for k in 0..w + size {
+            let x = border(k as isize - anchor as isize, w);
+            prefix[k + 1] = prefix[k] + map.at(x, y) as f64;
+        }
+        for x in 0..w {
+            rows[y * w + x] = prefix[x + size] - prefix[x];
+        }
+    }
+    let mut out = Plane::filled(w, h, 0.0f32);
+    for x in 0..w {
+        for k in 0..h + size {
+            let y = border(k as isize - anchor as isize, h);
+            prefix[k + 1] = prefix[k] + rows[y * w + x];
+        }
+        for y in 0..h {
+            out.data[y * w + x] = ((prefix[y + size] - prefix[y]) / (size * size) as f64) as f32;
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn noise(w: usize, h: usize) -> Plane<f32> {
+        let data = (0..w * h).map(|i| ((i * 7919 + 13) % 1009) as f32 / 1009.0).collect();
+        Plane { width: w, height: h, data }
+    }
+
+    #[test]
+    fn box_matches_the_defining_sum_everywhere() {
+        // narrower than the box too: reflection then folds more than once
+        for (w, h) in [(41, 33), (8, 50), (1, 1)] {
+            let map = noise(w, h);
+            let got = box30(&map);
+            for y in 0..h {
+                for x in 0..w {
+                    let mut sum = 0.0f64;
+                    for j in 0..30isize {
+                        for i in 0..30isize {
+                            let fold = |v: isize, n: usize| {
+                                let (mut v, n) = (v, n as isize);
+                                while n > 1 && (v < 0 || v >= n) {
+                                    v = if v < 0 { -v } else { 2 * (n - 1) - v };
+                                }
+                                if n == 1 { 0 } else { v as usize }
+                            };
+                            sum += map.at(fold(x as isize + i - 15, w), fold(y as isize + j - 15, h)) as f64;
+                        }
+                    }
+                    // both sides end in f32
+                    assert!((got.at(x, y) as f64 - sum / 900.0).abs() < 1e-6);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn lerf_mask_shrinks_as_the_threshold_grows_and_drops_specks() {
+        let mut map = noise(64, 48);
+        map.data.iter_mut().for_each(|v| *v *= 0.2);
+        for y in 10..30 {
+            for x in 20..40 {
+                map.data[y * 64 + x] = 0.9 + 0.005 * x as f32;
+            }
+        }
+        map.data[40 * 64 + 60] = 1.1;
+        let count = |t: f32| lerf_mask(&map, t).data.iter().filter(|&&m| m).count();
+        assert!(count(0.4) >= count(0.6) && count(0.6) >= count(0.9) && count(0.6) > 300);
+        assert!(!lerf_mask(&map, 0.6).at(60, 40), "a single pixel has no majority");
+        assert!(!lerf_mask(&Plane::filled(5, 5, 0.3), 0.6).data.iter().any(|&m| m));
+    }
+}
