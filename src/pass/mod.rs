@@ -1,1 +1,12 @@
 //! One file per GPU pass, each with its CPU twin.
+pub mod close;
+pub mod project;
+pub mod project_backward;
+pub mod raster_backward;
+pub mod raster_forward;
+pub mod seeded;
+pub mod sh;
+pub mod twin;
+#[cfg(test)]
+mod twin_tests;
+pub mod view;

@@ -1,0 +1,130 @@
+//! Projection of splats to the screen (EWA, Zwicker et al. 2002; Kerbl et al. 2023, ALGORITHMS 7.4).
+//!
+//! Per splat, with R_q of the unit quaternion, s = exp(log scale):
+//! `t = R μ + τ`, `M = R_q diag(s)`, `B = J R M` (2×3), `Σ' = B Bᵀ + 0.3 I`, `(A, B, C) = Σ'⁻¹`,
+//! `u = fx t_x/t_z + cx − ½`, colour = max(0, Σ_k B_k(dir) sh_k + ½), opacity = σ(logit).
+//! J is evaluated at t_x/t_z clamped to the image border plus 30 %, so that splats far outside do not explode.
+use super::sh;
+use super::twin::{FeatureMode, Params};
+use super::view::View;
+use glam::{DMat3, DVec3, DVec4};
+
+/// Added to the diagonal of the screen covariance: a splat never gets thinner than about a pixel (INRIA's value).
+pub const DILATION: f64 = 0.3;
+
+/// A splat on the screen, f64 twin.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Projected {
+    /// Centre in index coordinates (centre of the first pixel = 0), pixels.
+    pub centre: [f64; 2],
+    /// (A, B, C): the inverse screen covariance, 1/pixels².
+    pub conic: [f64; 3],
+    /// Camera z, world units.
+    pub depth: f64,
+    /// o in (0, 1).
+    pub opacity: f64,
+    /// RGB ≥ 0.
+    pub colour: DVec3,
+}
+
+/// What forward and backward both need of the geometry of one splat.
+#[derive(Clone, Debug)]
+pub(super) struct Geometry {
+    pub t: DVec3,
+    /// Unit quaternion (w, x, y, z) and the length of the raw one.
+    pub quat: DVec4,
+    pub quat_length: f64,
+    pub rotation: DMat3,
+    pub scale: DVec3,
+    /// Clamped t_x/t_z and t_y/t_z, times t_z.
+    pub clamped: [f64; 2],
+    /// Whether each was inside the limits.
+    pub inside: [bool; 2],
+    /// Rows of J and of T = J R.
+    pub jacobian: [DVec3; 2],
+    pub to_screen: [DVec3; 2],
+    /// Rows of B = T M.
+    pub b: [DVec3; 2],
+    pub conic: [f64; 3],
+}
+
+/// R_q of a unit quaternion (w, x, y, z).
+pub fn rotation_of(q: DVec4) -> DMat3 {
+    let (r, x, y, z) = (q.x, q.y, q.z, q.w);
+    // glam wants columns; each line below is one column.
+    DMat3::from_cols(
+        DVec3::new(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + r * z), 2.0 * (x * z - r * y)),
+        DVec3::new(2.0 * (x * y - r * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + r * x)),
+        DVec3::new(2.0 * (x * z + r * y), 2.0 * (y * z - r * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+}
+
+/// `None` when the splat is not in front of the near plane.
+pub(super) fn geometry(params: &Params, i: usize, view: &View) -> Option<Geometry> {
+    let t = view.rotation * params.means[i] + view.translation;
+    if t.z <= view.near {
+        return None;
+    }
+    let quat_length = params.quats[i].length();
+    let quat = params.quats[i] / quat_length;
+    let rotation = rotation_of(quat);
+    let scale = params.log_scales[i].exp();
+    let (negative, positive) = view.jacobian_limits();
+    let slope = [t.x / t.z, t.y / t.z];
+    let clamped = [0, 1].map(|a| slope[a].clamp(-negative[a], positive[a]) * t.z);
+    let inside = [0, 1].map(|a| slope[a] >= -negative[a] && slope[a] <= positive[a]);
+    let [fx, fy] = view.focal;
+    let jacobian = [
+        DVec3::new(fx / t.z, 0.0, -fx * clamped[0] / (t.z * t.z)),
+        DVec3::new(0.0, fy / t.z, -fy * clamped[1] / (t.z * t.z)),
+    ];
+    let to_screen = jacobian.map(|row| view.rotation.transpose() * row);
+    let b = to_screen.map(|row| (rotation.transpose() * row) * scale);
+    let (xx, xy, yy) = (b[0].dot(b[0]) + DILATION, b[0].dot(b[1]), b[1].dot(b[1]) + DILATION);
+    // det(BBᵀ + cI) by Lagrange's identity: no cancellation for needles, where xx·yy − xy² loses every digit.
+    let det = b[0].cross(b[1]).length_squared()
+        + DILATION * (b[0].dot(b[0]) + b[1].dot(b[1]))
+        + DILATION * DILATION;
+    let conic = [yy / det, -xy / det, xx / det];
+    Some(Geometry { t, quat, quat_length, rotation, scale, clamped, inside, jacobian, to_screen, b, conic })
+}
+
+/// Projects splat `i`; `None` when it is behind the near plane or its opacity is below `alpha_min`, where it can
+/// change no pixel.
+pub fn twin(params: &Params, i: usize, view: &View, alpha_min: f64) -> Option<Projected> {
+    let g = geometry(params, i, view)?;
+    let opacity = 1.0 / (1.0 + (-params.opacity_logits[i]).exp());
+    if opacity < alpha_min {
+        return None;
+    }
+    let colour = (raw_colour(params, i, view) + 0.5).max(DVec3::ZERO);
+    let [fx, fy] = view.focal;
+    Some(Projected {
+        centre: [fx * g.t.x / g.t.z + view.centre[0] - 0.5, fy * g.t.y / g.t.z + view.centre[1] - 0.5],
+        conic: g.conic,
+        depth: g.t.z,
+        opacity,
+        colour,
+    })
+}
+
+/// Σ_k B_k(dir) sh_k, before the offset of ½ and the clamp.
+pub(super) fn raw_colour(params: &Params, i: usize, view: &View) -> DVec3 {
+    let direction = (params.means[i] - view.position()).normalize();
+    let basis = sh::basis(direction, params.sh_degree);
+    params.sh_of(i).iter().zip(basis).map(|(&c, b)| c * b).sum()
+}
+
+/// Raw features [N, d] → rendered ones (ALGORITHMS 8.4).
+pub fn features_twin(features: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
+    match mode {
+        FeatureMode::Linear => features.to_vec(),
+        FeatureMode::Gauge(epsilon) => features
+            .chunks(dim.max(1))
+            .flat_map(|f| {
+                let length = f.iter().map(|x| x * x).sum::<f64>().sqrt();
+                f.iter().map(move |x| x / (length + f64::from(epsilon)))
+            })
+            .collect(),
+    }
+}

@@ -1,0 +1,139 @@
+//! Alpha blending of depth-sorted splats (ALGORITHMS 7.4).
+//!
+//! Per pixel, front to back, with d = centre − pixel: `p = −½(A dx² + C dy²) − B dx dy`, `α = min(0.99, o eᵖ)`; a
+//! splat with α < 1/255 is skipped; the pixel stops before the splat that would bring T below 1e-4; every channel
+//! adds `c α T`, then `T ← T(1 − α)`. Channels: RGB (plus T_f · background), Σ w z (expected depth, not yet
+//! divided by alpha), d features (no background). Median depth is the z at which T falls below ½.
+use super::project::Projected;
+use super::view::View;
+
+/// RGB and depth come before the d features in every stack of planes.
+pub const BASE_CHANNELS: usize = 4;
+
+/// The discontinuities of the blending rule. Tests that take finite differences switch them off.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Cutoffs {
+    /// A contribution below this is skipped.
+    pub alpha_min: f64,
+    /// α is clamped here, so that T never reaches 0.
+    pub alpha_max: f64,
+    /// A pixel stops before T would fall below this.
+    pub transmittance_min: f64,
+}
+
+impl Cutoffs {
+    /// The values every 3DGS renderer uses, and the shaders here.
+    pub const STANDARD: Cutoffs =
+        Cutoffs { alpha_min: 1.0 / 255.0, alpha_max: 0.99, transmittance_min: 1e-4 };
+    /// Without the two jumps (the α clamp is continuous and stays).
+    pub const SMOOTH: Cutoffs = Cutoffs { alpha_min: 0.0, alpha_max: 0.99, transmittance_min: 0.0 };
+}
+
+/// What the raster twins read.
+pub struct TwinScene<'a> {
+    /// [N].
+    pub projected: &'a [Option<Projected>],
+    /// [N, d] as rendered.
+    pub features: &'a [f64],
+    /// d.
+    pub feature_dim: usize,
+    /// Nearest first.
+    pub order: &'a [u32],
+    /// Size and background.
+    pub view: &'a View,
+}
+
+/// Output planes.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Image {
+    /// [4 + d, H, W]: RGB on the background, Σ w z, features.
+    pub planes: Vec<f64>,
+    /// [H, W] T_f; alpha is 1 − T_f.
+    pub transmittance: Vec<f64>,
+    /// [H, W] camera z where T falls below ½; 0 where it does not.
+    pub median_depth: Vec<f64>,
+}
+
+/// One contribution to a pixel.
+pub(super) struct Contribution {
+    pub splat: usize,
+    /// α after the clamp.
+    pub alpha: f64,
+    /// True where α was clamped: no gradient to the geometry.
+    pub clamped: bool,
+    /// T before the splat.
+    pub transmittance: f64,
+    /// centre − pixel.
+    pub d: [f64; 2],
+}
+
+/// Contributions to pixel (x, y), front to back, and the final T.
+pub(super) fn walk(scene: &TwinScene, cutoffs: &Cutoffs, x: u32, y: u32) -> (Vec<Contribution>, f64) {
+    let mut list = Vec::new();
+    let mut transmittance = 1.0;
+    for &i in scene.order {
+        let Some(p) = &scene.projected[i as usize] else { continue };
+        let d = [p.centre[0] - f64::from(x), p.centre[1] - f64::from(y)];
+        let [a, b, c] = p.conic;
+        let power = -0.5 * (a * d[0] * d[0] + c * d[1] * d[1]) - b * d[0] * d[1];
+        let raw = p.opacity * power.exp();
+        let alpha = raw.min(cutoffs.alpha_max);
+        if alpha < cutoffs.alpha_min {
+            continue;
+        }
+        let next = transmittance * (1.0 - alpha);
+        if next < cutoffs.transmittance_min {
+            break;
+        }
+        list.push(Contribution {
+            splat: i as usize,
+            alpha,
+            clamped: raw > cutoffs.alpha_max,
+            transmittance,
+            d,
+        });
+        transmittance = next;
+    }
+    (list, transmittance)
+}
+
+/// Channel values (RGB, z, features) of one splat.
+pub(super) fn channels_of(scene: &TwinScene, splat: usize) -> Vec<f64> {
+    let Some(p) = &scene.projected[splat] else { return Vec::new() };
+    let mut values = vec![p.colour.x, p.colour.y, p.colour.z, p.depth];
+    values.extend_from_slice(&scene.features[splat * scene.feature_dim..(splat + 1) * scene.feature_dim]);
+    values
+}
+
+/// Renders by walking all splats at every pixel.
+pub fn twin(scene: &TwinScene, cutoffs: &Cutoffs) -> Image {
+    let [width, height] = scene.view.size;
+    let pixels = width as usize * height as usize;
+    let channels = BASE_CHANNELS + scene.feature_dim;
+    let values: Vec<_> = (0..scene.projected.len()).map(|i| channels_of(scene, i)).collect();
+    let mut image = Image {
+        planes: vec![0.0; channels * pixels],
+        transmittance: vec![1.0; pixels],
+        median_depth: vec![0.0; pixels],
+    };
+    for y in 0..height {
+        for x in 0..width {
+            let pixel = (y * width + x) as usize;
+            let (list, last) = walk(scene, cutoffs, x, y);
+            for c in &list {
+                let weight = c.alpha * c.transmittance;
+                for (k, value) in values[c.splat].iter().enumerate() {
+                    image.planes[k * pixels + pixel] += weight * value;
+                }
+                if c.transmittance >= 0.5 && c.transmittance * (1.0 - c.alpha) < 0.5 {
+                    image.median_depth[pixel] = values[c.splat][3];
+                }
+            }
+            for k in 0..3 {
+                image.planes[k * pixels + pixel] += last * scene.view.background[k];
+            }
+            image.transmittance[pixel] = last;
+        }
+    }
+    image
+}
