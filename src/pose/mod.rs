@@ -1,4 +1,13 @@
 //! Photos to cameras, depth and points.
+pub mod align;
+mod bundle;
+mod matching;
+mod minimal;
+mod numeric;
+mod resect;
+mod sift;
+mod two_view;
+
 use crate::scene::{Camera, DepthMap, PointCloud};
 use glam::{DVec2, DVec3};
 
