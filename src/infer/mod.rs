@@ -1,4 +1,7 @@
 //! ONNX inference: sessions, model registry, one file per model family.
+#[cfg(test)]
+mod breakfast;
+pub mod hed;
 mod registry;
 mod runtime;
 pub mod xfeat;

@@ -85,7 +85,8 @@ struct Pack {
 /// The folder that set-up fills: `SPLATVK_HOME`, else `splatvk` in the user's data folder.
 pub fn home() -> PathBuf {
     let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
-    let data = || set("XDG_DATA_HOME").unwrap_or_else(|| set("HOME").unwrap_or_default().join(".local/share"));
+    let data =
+        || set("XDG_DATA_HOME").unwrap_or_else(|| set("HOME").unwrap_or_default().join(".local/share"));
     set("SPLATVK_HOME").unwrap_or_else(|| data().join("splatvk"))
 }
 
@@ -98,7 +99,8 @@ pub struct Registry {
 impl Registry {
     /// `models_dir`, else `SPLATVK_MODELS`, else `models` under [`home`]. Opening does not look at the files.
     pub fn open(models_dir: Option<&Path>) -> Result<Self> {
-        let pack = serde_json::from_str(PACK).map_err(|e| Error::work(format!("built-in model table: {e}")))?;
+        let pack =
+            serde_json::from_str(PACK).map_err(|e| Error::work(format!("built-in model table: {e}")))?;
         let folder = match models_dir {
             Some(folder) if !folder.is_dir() => {
                 return Err(Error::input(format!("{}: no such model folder; {FIX}", folder.display())));
@@ -148,7 +150,12 @@ impl Registry {
         };
         let package = self.pack.packages.get(&entry.package);
         let fix = problem.map(|p| {
-            format!("model {}: {} {p}; it should have sha256 {}: {FIX}", entry.name, file.display(), entry.sha256)
+            format!(
+                "model {}: {} {p}; it should have sha256 {}: {FIX}",
+                entry.name,
+                file.display(),
+                entry.sha256
+            )
         });
         ModelStatus {
             role: entry.role,

@@ -33,7 +33,8 @@ fn loaded() -> Result<&'static (PathBuf, Environment)> {
 fn load() -> Result<(PathBuf, Environment), String> {
     let fix = "run tools/setup (or tools/models/build) to get it, or set ORT_DYLIB_PATH";
     if let Some(path) = std::env::var_os("ORT_DYLIB_PATH").filter(|v| !v.is_empty()).map(PathBuf::from) {
-        let failed = |e| format!("ONNX Runtime: ORT_DYLIB_PATH={} cannot be loaded ({e}); {fix}", path.display());
+        let failed =
+            |e| format!("ONNX Runtime: ORT_DYLIB_PATH={} cannot be loaded ({e}); {fix}", path.display());
         return try_load(&path).map(|e| (path.clone(), e)).map_err(failed);
     }
     let own = home().join("lib").join(LIBRARY);
@@ -42,7 +43,8 @@ fn load() -> Result<(PathBuf, Environment), String> {
         return try_load(&own).map(|e| (own.clone(), e)).map_err(failed);
     }
     let system = PathBuf::from(LIBRARY);
-    let failed = |_| format!("ONNX Runtime: neither {} nor a system {LIBRARY} is there; {fix}", own.display());
+    let failed =
+        |_| format!("ONNX Runtime: neither {} nor a system {LIBRARY} is there; {fix}", own.display());
     try_load(&system).map(|e| (system.clone(), e)).map_err(failed)
 }
 
@@ -82,7 +84,8 @@ impl Session {
     pub fn load(file: &Path) -> Result<Self> {
         let environment = &loaded()?.1;
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        let inner = build(environment, file, threads).map_err(|e| Error::missing(format!("{}: {}", file.display(), line(&e))))?;
+        let inner = build(environment, file, threads)
+            .map_err(|e| Error::missing(format!("{}: {}", file.display(), line(&e))))?;
         Ok(Session { inner, file: file.to_path_buf() })
     }
 
@@ -92,16 +95,20 @@ impl Session {
         let failed = |e: ort::Error| Error::work(format!("{file}: {}", line(&e)));
         let mut fed: Vec<(&'static str, SessionInputValue<'_>)> = Vec::with_capacity(inputs.len());
         for (name, input) in inputs {
-            fed.push((name, match input {
-                Input::F32(shape, data) => OrtTensor::from_array((shape, data)).map_err(failed)?.into(),
-                Input::I64(shape, data) => OrtTensor::from_array((shape, data)).map_err(failed)?.into(),
-            }));
+            fed.push((
+                name,
+                match input {
+                    Input::F32(shape, data) => OrtTensor::from_array((shape, data)).map_err(failed)?.into(),
+                    Input::I64(shape, data) => OrtTensor::from_array((shape, data)).map_err(failed)?.into(),
+                },
+            ));
         }
         let produced = self.inner.run(fed).map_err(failed)?;
         let mut tensors = Vec::with_capacity(outputs.len());
         for name in outputs {
-            let value =
-                produced.get(*name).ok_or_else(|| Error::work(format!("{file}: the graph has no output {name}")))?;
+            let value = produced
+                .get(*name)
+                .ok_or_else(|| Error::work(format!("{file}: the graph has no output {name}")))?;
             let (shape, data) = value.try_extract_tensor::<f32>().map_err(failed)?;
             tensors.push(Tensor { shape: shape.iter().map(|n| *n as usize).collect(), data: data.to_vec() });
         }
@@ -110,10 +117,10 @@ impl Session {
 }
 
 fn build(environment: &Environment, file: &Path, threads: usize) -> ort::Result<ort::session::Session> {
-    Ok(ort::session::Session::builder(environment)?
+    ort::session::Session::builder(environment)?
         .with_optimization_level(GraphOptimizationLevel::Level3)?
         .with_intra_threads(threads)?
-        .commit_from_file(file)?)
+        .commit_from_file(file)
 }
 
 fn line(error: &ort::Error) -> String {
