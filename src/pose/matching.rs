@@ -14,6 +14,16 @@ pub struct Features {
     pub descriptors: Vec<f32>,
 }
 
+impl From<crate::infer::xfeat::Features> for Features {
+    fn from(f: crate::infer::xfeat::Features) -> Features {
+        Features {
+            points: f.keypoints.iter().map(|k| DVec2::new(k[0] as f64, k[1] as f64)).collect(),
+            dim: crate::infer::xfeat::DIM,
+            descriptors: f.descriptors,
+        }
+    }
+}
+
 /// A putative match, better ones have a higher quality.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Match {

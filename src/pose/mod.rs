@@ -1,11 +1,14 @@
 //! Photos to cameras, depth and points.
 pub mod align;
 mod bundle;
-mod matching;
+pub mod matching;
 mod minimal;
 mod numeric;
 mod resect;
+pub mod sfm;
 mod sift;
+#[cfg(test)]
+mod testing;
 mod two_view;
 
 use crate::scene::{Camera, DepthMap, PointCloud};

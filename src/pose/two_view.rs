@@ -247,7 +247,8 @@ mod tests {
         let turn = Pose::exp(DVec3::ZERO, DVec3::new(0.05, 0.45, -0.03));
         // Not an orbit about one centre: equal distances with crossing axes leave the focal length free (Sturm 2001).
         let c = DVec3::new(0.0, 0.0, 4.0);
-        let pose = Pose { rotation: turn.rotation, translation: DVec3::new(0.3, 0.4, 2.5) - turn.rotation * c };
+        let pose =
+            Pose { rotation: turn.rotation, translation: DVec3::new(0.3, 0.4, 2.5) - turn.rotation * c };
         let (x, y) = views(&pose, 660.0, 400, false);
         let found = estimate(&x, &y, 3.0 / 576.0, 0.35).unwrap();
         let error = rotation_angle(&(found.pose.rotation * pose.rotation.transpose())).to_degrees();

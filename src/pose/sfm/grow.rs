@@ -1,0 +1,141 @@
+//! From verified pairs to a reconstruction: the pair with most matches at good parallax first, the other views by
+//! resection, an adjustment after each.
+use super::model::{Model, Sighting, Track};
+use super::tracks::Sightings;
+use crate::pose::resect::resect;
+use crate::pose::two_view::TwoView;
+use crate::scene::Pose;
+use glam::{DVec2, DVec3};
+
+/// A verified pair of views.
+pub(super) struct Pair {
+    pub(super) first: usize,
+    pub(super) second: usize,
+    pub(super) geometry: TwoView,
+}
+
+/// Why a reconstruction could not grow to all views.
+pub(super) struct Stuck {
+    /// Views without a camera.
+    pub(super) left: Vec<usize>,
+}
+
+/// Fewest agreeing points for placing a view: six fix pose and focal length, twice that guards against chance.
+const MIN_RESECTION: usize = 12;
+
+/// Usefulness of a pair as the seed: matches, discounted below 10° of parallax.
+pub(super) fn seed_score(pair: &Pair) -> f64 {
+    pair.geometry.inliers.len() as f64 * (pair.geometry.parallax / 10.0).min(1.0)
+}
+
+/// Grows a model over all views. `empty` holds centres, groups, focals and priors; `threshold` in pixels.
+pub(super) fn grow(
+    empty: &Model,
+    tracks: &[Sightings],
+    pairs: &[Pair],
+    seed: &Pair,
+    threshold: f64,
+) -> Result<Model, Stuck> {
+    let mut model = empty.clone();
+    model.tracks = tracks
+        .iter()
+        .map(|t| Track {
+            position: None,
+            sightings: t.iter().map(|&(view, pixel)| Sighting { view, pixel, sigma: 1.0 }).collect(),
+        })
+        .collect();
+    model.poses[seed.first] = Some(Pose::IDENTITY);
+    model.poses[seed.second] = Some(seed.geometry.pose);
+    model.triangulate_all(2.0 * threshold);
+    settle(&mut model, threshold);
+    let views = model.poses.len();
+    loop {
+        let left: Vec<usize> = (0..views).filter(|v| model.poses[*v].is_none()).collect();
+        if left.is_empty() {
+            break;
+        }
+        let best = left
+            .iter()
+            .map(|&v| (resection(&model, v, threshold), v))
+            .max_by_key(|(r, v)| (r.as_ref().map_or(0, |r| r.1), std::cmp::Reverse(*v)));
+        match best {
+            Some((Some((pose, count)), v)) if count >= MIN_RESECTION => model.poses[v] = Some(pose),
+            _ => match by_pair(&model, pairs, &left, threshold) {
+                Some((v, pose)) => model.poses[v] = Some(pose),
+                None => return Err(Stuck { left }),
+            },
+        }
+        model.triangulate_all(2.0 * threshold);
+        settle(&mut model, threshold);
+    }
+    Ok(model)
+}
+
+/// Adjusts, triangulates again with the better cameras, adjusts.
+fn settle(model: &mut Model, threshold: f64) {
+    for gate in [4.0, 2.0] {
+        // An adjustment that fails leaves the model as it is; too few points show up as a stuck view.
+        let _ = model.adjust(gate * threshold, 1.5, 25);
+        model.triangulate_all(gate * threshold);
+    }
+}
+
+/// Pose of a view from its sightings of triangulated points, and how many agree.
+fn resection(model: &Model, view: usize, threshold: f64) -> Option<(Pose, usize)> {
+    let (mut world, mut pixels) = (Vec::<DVec3>::new(), Vec::<DVec2>::new());
+    for t in &model.tracks {
+        let Some(x) = t.position else { continue };
+        if let Some(s) = t.sightings.iter().find(|s| s.view == view) {
+            world.push(x);
+            pixels.push(s.pixel - model.centres[view]);
+        }
+    }
+    let r = resect(&world, &pixels, model.focal(view), 2.0 * threshold, 500)?;
+    Some((r.pose, r.inliers.len()))
+}
+
+/// Fallback for a view with few tracks into the model: the relative pose of its best pair with a placed view, scaled by
+/// the depths of the points both see.
+fn by_pair(model: &Model, pairs: &[Pair], left: &[usize], threshold: f64) -> Option<(usize, Pose)> {
+    let mut best: Option<(usize, usize, Pose)> = None;
+    for pair in pairs {
+        let (placed, new, relative) = if left.contains(&pair.second) && !left.contains(&pair.first) {
+            (pair.first, pair.second, pair.geometry.pose)
+        } else if left.contains(&pair.first) && !left.contains(&pair.second) {
+            (pair.second, pair.first, pair.geometry.pose.inverse())
+        } else {
+            continue;
+        };
+        let base = model.poses[placed]?;
+        // Candidate scales: each common point proposes one, and the one most others agree with wins.
+        let common: Vec<(DVec3, DVec2)> = model
+            .tracks
+            .iter()
+            .filter_map(|t| Some((t.position?, t.sightings.iter().find(|s| s.view == new)?.pixel)))
+            .collect();
+        let unit = relative.translation.normalize();
+        for (x, pixel) in &common {
+            let p = relative.rotation * base.transform(*x);
+            let r = model.ray(new, *pixel);
+            // p + s·unit ∥ r, least squares over s.
+            let (a, b) = (unit.cross(r), -p.cross(r));
+            let scale = a.dot(b) / a.length_squared().max(1e-12);
+            if scale <= 0.0 {
+                continue;
+            }
+            let pose = Pose { rotation: relative.rotation, translation: unit * scale }.compose(&base);
+            let mut trial = model.clone();
+            trial.poses[new] = Some(pose);
+            let support = common
+                .iter()
+                .filter(|(x, p)| {
+                    trial.project(new, *x).is_some_and(|(q, _)| (q - *p).length() < 2.0 * threshold)
+                })
+                .count();
+            if support >= 5 && best.as_ref().is_none_or(|b| support > b.0) {
+                best = Some((support, new, pose));
+            }
+        }
+    }
+    best.map(|(_, v, p)| (v, p))
+}

@@ -1,0 +1,322 @@
+//! Structure from motion: the built-in initialiser that needs no large model.
+mod grow;
+mod model;
+mod tracks;
+
+use super::matching::{self, Features, Match};
+use super::two_view::{self, TwoView};
+use super::{SparseModel, SparsePoint, sift};
+use crate::photo::Photo;
+use crate::progress::Progress;
+use crate::scene::{Camera, Plane, RgbImage};
+use crate::{Error, Result};
+use glam::DVec2;
+use grow::{Pair, grow};
+use model::Model;
+use rayon::prelude::*;
+use tracks::Link;
+
+/// ln f of a photo without EXIF: 0.9 × the long side covers phones (0.8) to normal lenses (1.2) within one σ.
+const FOCAL_GUESS: f64 = 0.9;
+const FOCAL_SIGMA: f64 = 0.35;
+/// EXIF focal lengths are rounded and sensors are cropped.
+const EXIF_SIGMA: f64 = 0.05;
+/// Agreement threshold as a fraction of the long side: 3 px at 640, three times the noise of learned keypoints.
+const THRESHOLD: f64 = 3.0 / 640.0;
+/// Fewest verified matches of a usable pair: five are fitted by anything, 20 agree by chance in few cases.
+const MIN_INLIERS: usize = 20;
+
+/// What two photos have in common.
+enum Relation {
+    Usable(TwoView, Vec<Link>),
+    /// Too few matches agree on any geometry.
+    Apart,
+    /// The camera only turned, or did not move.
+    NoParallax,
+    /// The same picture twice.
+    Same,
+}
+
+/// Cameras and sparse points from photos and their learned features (one per photo; may be empty, then only the
+/// built-in corner detector is used).
+pub fn reconstruct(photos: &[Photo], features: &[Features], progress: &dyn Progress) -> Result<SparseModel> {
+    if photos.len() < 2 {
+        return Err(Error::input("cameras need at least two photos; give two or more"));
+    }
+    progress.check()?;
+    let own: Vec<Features> = photos
+        .par_iter()
+        .map(|p| sift::detect(&p.image.luma(), &matching::valid_area(&p.image, 4), MAX_CORNERS))
+        .collect();
+    let mut families = vec![own];
+    if features.len() == photos.len() {
+        let masked = photos.iter().zip(features).map(|(p, f)| within(f, &matching::valid_area(&p.image, 4)));
+        families.push(masked.collect());
+    }
+    let empty = empty_model(photos);
+    let relations = relate_all(photos, &families, &empty, progress)?;
+    explain(photos, &relations)?;
+    let model = assemble(photos, &families, empty, relations, progress)?;
+    finish(photos, model)
+}
+
+/// Strongest corners kept per photo: matching stays below a second for four photos.
+const MAX_CORNERS: usize = 4000;
+
+/// Features on valid pixels.
+fn within(f: &Features, valid: &Plane<bool>) -> Features {
+    let mut out = Features { dim: f.dim, ..Default::default() };
+    for (k, p) in f.points.iter().enumerate() {
+        let (x, y) = (p.x.max(0.0) as usize, p.y.max(0.0) as usize);
+        if x < valid.width && y < valid.height && valid.at(x, y) {
+            out.points.push(*p);
+            out.descriptors.extend_from_slice(&f.descriptors[k * f.dim..(k + 1) * f.dim]);
+        }
+    }
+    out
+}
+
+/// Focal groups and priors: photos of one size and camera model share a focal length; photos without EXIF share by size.
+fn empty_model(photos: &[Photo]) -> Model {
+    type Key<'a> = (u32, u32, Option<&'a str>);
+    let mut keys: Vec<Key> = Vec::new();
+    let (mut group, mut samples) = (Vec::new(), Vec::<Vec<f64>>::new());
+    for p in photos {
+        let (w, h) = p.original_size;
+        let key = (w.max(h), w.min(h), p.camera_model.as_deref());
+        let g = keys.iter().position(|k| *k == key).unwrap_or_else(|| {
+            keys.push(key);
+            samples.push(Vec::new());
+            keys.len() - 1
+        });
+        group.push(g);
+        samples[g].extend(p.exif_focal);
+    }
+    let long = |g: usize| {
+        let k = group.iter().position(|x| *x == g).unwrap_or(0);
+        photos[k].image.width.max(photos[k].image.height) as f64
+    };
+    let priors: Vec<(f64, f64)> = samples
+        .iter_mut()
+        .enumerate()
+        .map(|(g, s)| match super::numeric::median(s) {
+            Some(f) => (f.ln(), EXIF_SIGMA),
+            None => ((FOCAL_GUESS * long(g)).ln(), FOCAL_SIGMA),
+        })
+        .collect();
+    Model {
+        poses: vec![None; photos.len()],
+        centres: photos
+            .iter()
+            .map(|p| DVec2::new(p.image.width as f64, p.image.height as f64) * 0.5)
+            .collect(),
+        group,
+        focals: priors.iter().map(|p| p.0.exp()).collect(),
+        priors,
+        tracks: Vec::new(),
+    }
+}
+
+/// All pairs (i < j), in order.
+fn pairs_of(n: usize) -> Vec<(usize, usize)> {
+    (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).collect()
+}
+
+fn relate_all(
+    photos: &[Photo],
+    families: &[Vec<Features>],
+    empty: &Model,
+    progress: &dyn Progress,
+) -> Result<Vec<(usize, usize, Relation)>> {
+    let out = pairs_of(photos.len())
+        .into_par_iter()
+        .map(|(i, j)| {
+            let relation = match progress.cancelled() {
+                true => Relation::Apart,
+                false => relate(photos, families, empty, i, j),
+            };
+            (i, j, relation)
+        })
+        .collect();
+    progress.check()?;
+    Ok(out)
+}
+
+fn relate(photos: &[Photo], families: &[Vec<Features>], empty: &Model, i: usize, j: usize) -> Relation {
+    if same_picture(&photos[i].image, &photos[j].image) {
+        return Relation::Same;
+    }
+    let mut all: Vec<(DVec2, DVec2, Link)> = Vec::new();
+    let (mut start_i, mut start_j) = (0, 0);
+    for (k, family) in families.iter().enumerate() {
+        let (a, b) = (&family[i], &family[j]);
+        // Learned descriptors are compared more leniently: their second-best is close by design of the training.
+        let ratio = if k == 0 { 0.85 } else { 0.97 };
+        all.extend(matching::mutual_matches(a, b, ratio).into_iter().map(|m: Match| {
+            let quality = m.quality / (1.0 - ratio as f64).max(0.1) * 0.15;
+            let link = Link { first: (i, start_i + m.first), second: (j, start_j + m.second), quality };
+            (a.points[m.first], b.points[m.second], link)
+        }));
+        start_i += a.points.len();
+        start_j += b.points.len();
+    }
+    all.sort_by(|a, b| b.2.quality.total_cmp(&a.2.quality).then(a.2.first.cmp(&b.2.first)));
+    let centred = |view: usize, p: DVec2| (p - empty.centres[view]) / empty.focal(view);
+    let x: Vec<DVec2> = all.iter().map(|m| centred(i, m.0)).collect();
+    let y: Vec<DVec2> = all.iter().map(|m| centred(j, m.1)).collect();
+    let long = photos[i].image.width.max(photos[i].image.height) as f64;
+    let threshold = THRESHOLD * long / empty.focal(i);
+    let sigma = empty.priors[empty.group[i]].1.max(empty.priors[empty.group[j]].1);
+    let Some(found) = two_view::estimate(&x, &y, threshold, sigma) else { return Relation::Apart };
+    if found.inliers.len() < MIN_INLIERS {
+        return Relation::Apart;
+    }
+    // Without translation nothing but noise remains after the rotation: 0.6 of the threshold is about two σ.
+    if found.rotation_residual < 0.6 * threshold {
+        return Relation::NoParallax;
+    }
+    let links = found.inliers.iter().map(|k| all[*k].2).collect();
+    Relation::Usable(found, links)
+}
+
+/// True when two photos differ by less than re-compression does.
+fn same_picture(a: &RgbImage, b: &RgbImage) -> bool {
+    if (a.width, a.height) != (b.width, b.height) {
+        return false;
+    }
+    let sum: f64 = a
+        .data
+        .iter()
+        .zip(&b.data)
+        .map(|(p, q)| (0..3).map(|k| (p[k] - q[k]).abs() as f64).sum::<f64>())
+        .sum();
+    sum / (3.0 * a.data.len().max(1) as f64) < 0.004
+}
+
+/// A clear error unless the usable pairs connect all photos.
+fn explain(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Result<()> {
+    let n = photos.len();
+    let name = |i: &usize, j: &usize| format!("{}–{}", photos[*i].stem, photos[*j].stem);
+    let list = |test: fn(&Relation) -> bool| {
+        relations.iter().filter(|r| test(&r.2)).map(|r| name(&r.0, &r.1)).collect::<Vec<_>>().join(", ")
+    };
+    let same = list(|r| matches!(r, Relation::Same));
+    if !same.is_empty() {
+        return Err(Error::input(format!("identical photos: {same}; give photos from different positions")));
+    }
+    let mut reached = vec![false; n];
+    reached[0] = true;
+    for _ in 0..n {
+        for (i, j, r) in relations {
+            if matches!(r, Relation::Usable(..)) && (reached[*i] || reached[*j]) {
+                (reached[*i], reached[*j]) = (true, true);
+            }
+        }
+    }
+    if reached.iter().all(|r| *r) {
+        return Ok(());
+    }
+    let turned = list(|r| matches!(r, Relation::NoParallax));
+    if !turned.is_empty() {
+        return Err(Error::input(format!(
+            "no parallax between {turned}: the camera only turned; take the photos from different positions"
+        )));
+    }
+    let apart = list(|r| matches!(r, Relation::Apart));
+    Err(Error::input(format!(
+        "photos do not overlap enough: {apart}; take photos that share at least half of what they show"
+    )))
+}
+
+fn assemble(
+    photos: &[Photo],
+    families: &[Vec<Features>],
+    mut empty: Model,
+    relations: Vec<(usize, usize, Relation)>,
+    progress: &dyn Progress,
+) -> Result<Model> {
+    let points: Vec<Vec<DVec2>> = (0..photos.len())
+        .map(|v| families.iter().flat_map(|f| f[v].points.iter().copied()).collect())
+        .collect();
+    let (mut pairs, mut links) = (Vec::new(), Vec::new());
+    for (first, second, relation) in relations {
+        if let Relation::Usable(geometry, l) = relation {
+            links.extend(l);
+            pairs.push(Pair { first, second, geometry });
+        }
+    }
+    let tracks = tracks::join(&mut links, &points);
+    // The pair estimates vote on the focal stretch, weighted by matches and parallax.
+    for g in 0..empty.focals.len() {
+        let (mut sum, mut weight) = (0.0, 1e-9);
+        for p in pairs.iter().filter(|p| empty.group[p.first] == g || empty.group[p.second] == g) {
+            let w = grow::seed_score(p);
+            sum += w * p.geometry.stretch.ln();
+            weight += w;
+        }
+        empty.focals[g] *= (sum / weight).exp();
+    }
+    let long = photos[0].image.width.max(photos[0].image.height) as f64;
+    let threshold = THRESHOLD * long;
+    pairs.sort_by(|a, b| grow::seed_score(b).total_cmp(&grow::seed_score(a)));
+    let mut stuck: Option<Vec<usize>> = None;
+    for seed in pairs.iter().take(3) {
+        progress.check()?;
+        match grow(&empty, &tracks, &pairs, seed, threshold) {
+            Ok(model) => return Ok(model),
+            Err(s) => stuck = Some(s.left),
+        }
+    }
+    let names: Vec<&str> = stuck.unwrap_or_default().iter().map(|v| photos[*v].stem.as_str()).collect();
+    Err(Error::input(format!(
+        "no camera position found for {}; these photos share too little with the others: replace them or add photos in between",
+        names.join(", ")
+    )))
+}
+
+fn finish(photos: &[Photo], mut model: Model) -> Result<SparseModel> {
+    let long = photos[0].image.width.max(photos[0].image.height) as f64;
+    model.triangulate_all(THRESHOLD * long);
+    model.prune(THRESHOLD * long);
+    let outcome = model.adjust(f64::INFINITY, 1.5, 60)?;
+    model.normalise();
+    let cameras = cameras_of(photos, &model)?;
+    let points = model
+        .tracks
+        .iter()
+        .filter_map(|t| {
+            let views: Vec<(usize, DVec2)> = t.sightings.iter().map(|s| (s.view, s.pixel)).collect();
+            let (v, p) = *views.first()?;
+            Some(SparsePoint { position: t.position?, colour: colour_at(&photos[v].image, p), views })
+        })
+        .collect();
+    Ok(SparseModel { cameras, points, focal_log_sigma: outcome.focal_log_sigma.first().copied() })
+}
+
+fn colour_at(image: &RgbImage, p: DVec2) -> [f32; 3] {
+    image.at((p.x.max(0.0) as usize).min(image.width - 1), (p.y.max(0.0) as usize).min(image.height - 1))
+}
+
+fn cameras_of(photos: &[Photo], model: &Model) -> Result<Vec<Camera>> {
+    photos
+        .iter()
+        .enumerate()
+        .map(|(v, p)| {
+            let pose = model.poses[v]
+                .ok_or_else(|| Error::work(format!("no camera position found for {}", p.stem)))?;
+            Ok(Camera {
+                name: p.path.file_name().map_or_else(|| p.stem.clone(), |n| n.to_string_lossy().into()),
+                width: p.image.width as u32,
+                height: p.image.height as u32,
+                fx: model.focal(v),
+                fy: model.focal(v),
+                cx: model.centres[v].x,
+                cy: model.centres[v].y,
+                pose,
+            })
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,237 @@
+//! The growing reconstruction: cameras, points and their sightings.
+use crate::Result;
+use crate::pose::bundle::{Observation, Outcome, Problem};
+use crate::scene::Pose;
+use glam::{DMat3, DVec2, DVec3};
+
+/// One sighting of a point.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Sighting {
+    pub(super) view: usize,
+    pub(super) pixel: DVec2,
+    /// One standard deviation, pixels.
+    pub(super) sigma: f64,
+}
+
+/// A point; without a position it is not (yet) triangulated.
+#[derive(Clone, Debug)]
+pub(super) struct Track {
+    pub(super) position: Option<DVec3>,
+    pub(super) sightings: Vec<Sighting>,
+}
+
+/// Cameras by view (`None` = not registered) and tracks.
+#[derive(Clone, Debug)]
+pub(super) struct Model {
+    pub(super) poses: Vec<Option<Pose>>,
+    /// Principal points, pixels.
+    pub(super) centres: Vec<DVec2>,
+    /// Focal group of each view.
+    pub(super) group: Vec<usize>,
+    /// Focal lengths per group, pixels.
+    pub(super) focals: Vec<f64>,
+    /// (ln f, σ) per group.
+    pub(super) priors: Vec<(f64, f64)>,
+    pub(super) tracks: Vec<Track>,
+}
+
+/// Least angle between two rays of a usable point: below it the depth is mostly noise.
+pub(super) const MIN_ANGLE_DEGREES: f64 = 1.0;
+
+impl Model {
+    pub(super) fn focal(&self, view: usize) -> f64 {
+        self.focals[self.group[view]]
+    }
+
+    /// Camera-frame ray, z = 1.
+    pub(super) fn ray(&self, view: usize, pixel: DVec2) -> DVec3 {
+        ((pixel - self.centres[view]) / self.focal(view)).extend(1.0)
+    }
+
+    /// Pixel and depth of a world point in a registered view.
+    pub(super) fn project(&self, view: usize, world: DVec3) -> Option<(DVec2, f64)> {
+        let t = self.poses[view]?.transform(world);
+        (t.z > 1e-9).then(|| (DVec2::new(t.x, t.y) * (self.focal(view) / t.z) + self.centres[view], t.z))
+    }
+
+    /// Reprojection distance in pixels; infinite when it cannot be seen.
+    pub(super) fn error(&self, s: &Sighting, world: DVec3) -> f64 {
+        self.project(s.view, world).map_or(f64::INFINITY, |(p, _)| (p - s.pixel).length())
+    }
+
+    /// Position from the registered sightings: least squares on ray distances, then Gauss–Newton on pixels. `None` when
+    /// the rays do not meet within `threshold` pixels in front of every camera, or are nearly parallel.
+    pub(super) fn triangulate(&self, sightings: &[Sighting], threshold: f64) -> Option<DVec3> {
+        let seen: Vec<(&Sighting, Pose)> =
+            sightings.iter().filter_map(|s| Some((s, self.poses[s.view]?))).collect();
+        if seen.len() < 2 {
+            return None;
+        }
+        let (mut a, mut b) = (DMat3::ZERO, DVec3::ZERO);
+        for (s, pose) in &seen {
+            let d = (pose.rotation.transpose() * self.ray(s.view, s.pixel)).normalize();
+            let p = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+            a += p;
+            b += p * pose.centre();
+        }
+        if a.determinant().abs() < 1e-12 {
+            return None;
+        }
+        let mut x = a.inverse() * b;
+        for _ in 0..5 {
+            let (mut h, mut g) = (DMat3::ZERO, DVec3::ZERO);
+            for (s, pose) in &seen {
+                let t = pose.transform(x);
+                if t.z <= 1e-9 {
+                    return None;
+                }
+                let f = self.focal(s.view) / t.z;
+                let r = DVec2::new(t.x, t.y) * f + self.centres[s.view] - s.pixel;
+                let rows = [DVec3::new(f, 0.0, -f * t.x / t.z), DVec3::new(0.0, f, -f * t.y / t.z)];
+                for (row, r) in rows.iter().zip([r.x, r.y]) {
+                    let j = pose.rotation.transpose() * *row / s.sigma;
+                    h += DMat3::from_cols(j * j.x, j * j.y, j * j.z);
+                    g += j * (r / s.sigma);
+                }
+            }
+            if h.determinant().abs() < 1e-300 {
+                return None;
+            }
+            x -= h.inverse() * g;
+        }
+        let good = x.is_finite()
+            && seen.iter().all(|(s, _)| self.error(s, x) < threshold)
+            && self.angle(x, sightings) >= MIN_ANGLE_DEGREES;
+        good.then_some(x)
+    }
+
+    /// Largest angle between two rays of a point, degrees.
+    pub(super) fn angle(&self, x: DVec3, sightings: &[Sighting]) -> f64 {
+        let rays: Vec<DVec3> =
+            sightings.iter().filter_map(|s| Some((x - self.poses[s.view]?.centre()).normalize())).collect();
+        let mut best: f64 = 0.0;
+        for i in 0..rays.len() {
+            for j in 0..i {
+                best = best.max(rays[i].angle_between(rays[j]));
+            }
+        }
+        best.to_degrees()
+    }
+
+    /// Triangulates every track anew; outlying sightings are dropped when the rest agrees. Tracks that do not triangulate
+    /// keep their sightings and have no position.
+    pub(super) fn triangulate_all(&mut self, threshold: f64) {
+        let positions: Vec<Option<DVec3>> = self
+            .tracks
+            .iter()
+            .map(|t| {
+                if let Some(x) = self.triangulate(&t.sightings, threshold) {
+                    return Some(x);
+                }
+                // Any two sightings that agree with most others.
+                let s = &t.sightings;
+                let mut best: Option<(usize, DVec3)> = None;
+                for i in 0..s.len() {
+                    for j in 0..i {
+                        let Some(x) = self.triangulate(&[s[j], s[i]], threshold) else { continue };
+                        let support = s.iter().filter(|o| self.error(o, x) < threshold).count();
+                        if best.is_none_or(|b| support > b.0) {
+                            best = Some((support, x));
+                        }
+                    }
+                }
+                best.map(|b| b.1)
+            })
+            .collect();
+        for (t, p) in self.tracks.iter_mut().zip(positions) {
+            t.position = p;
+        }
+    }
+
+    /// Adjusts cameras and points over the sightings within `gate` pixels; `c` is the Cauchy scale in standard
+    /// deviations. The first registered view stays where it is.
+    pub(super) fn adjust(&mut self, gate: f64, c: f64, steps: usize) -> Result<Outcome> {
+        let views: Vec<usize> = (0..self.poses.len()).filter(|v| self.poses[*v].is_some()).collect();
+        let mut local = vec![usize::MAX; self.poses.len()];
+        let mut problem =
+            Problem { focals: self.focals.clone(), priors: self.priors.clone(), ..Default::default() };
+        for (k, &v) in views.iter().enumerate() {
+            local[v] = k;
+            problem.poses.extend(self.poses[v]);
+            problem.centres.push(self.centres[v]);
+            problem.group.push(self.group[v]);
+        }
+        let mut used = Vec::new();
+        for (k, t) in self.tracks.iter().enumerate() {
+            let Some(x) = t.position else { continue };
+            let near: Vec<&Sighting> = t.sightings.iter().filter(|s| self.error(s, x) < gate).collect();
+            if near.len() < 2 {
+                continue;
+            }
+            let point = problem.points.len();
+            problem.points.push(x);
+            used.push(k);
+            problem.observations.extend(near.iter().map(|s| Observation {
+                camera: local[s.view],
+                point,
+                pixel: s.pixel,
+                sigma: s.sigma,
+            }));
+        }
+        let outcome = problem.solve(c, steps)?;
+        for (k, &v) in views.iter().enumerate() {
+            self.poses[v] = Some(problem.poses[k]);
+        }
+        self.focals = problem.focals;
+        for (k, x) in used.into_iter().zip(problem.points) {
+            self.tracks[k].position = Some(x);
+        }
+        Ok(outcome)
+    }
+
+    /// Drops sightings farther than `gate` from their point, then points with fewer than two left or too little parallax.
+    pub(super) fn prune(&mut self, gate: f64) {
+        let mut tracks = std::mem::take(&mut self.tracks);
+        tracks.retain_mut(|t| {
+            let Some(x) = t.position else { return false };
+            t.sightings.retain(|s| self.error(s, x) < gate);
+            t.sightings.len() >= 2 && self.angle(x, &t.sightings) >= MIN_ANGLE_DEGREES
+        });
+        self.tracks = tracks;
+    }
+
+    /// Median distance between points and their sightings, pixels.
+    pub(super) fn median_error(&self) -> f64 {
+        let mut errors: Vec<f64> = self
+            .tracks
+            .iter()
+            .filter_map(|t| t.position.map(|x| (t, x)))
+            .flat_map(|(t, x)| t.sightings.iter().map(move |s| self.error(s, x)))
+            .filter(|e| e.is_finite())
+            .collect();
+        crate::pose::numeric::median(&mut errors).unwrap_or(f64::INFINITY)
+    }
+
+    /// Moves the world so that view 0 is the identity and the median depth of the points over their sightings is 1.
+    pub(super) fn normalise(&mut self) {
+        let Some(first) = self.poses[0] else { return };
+        let model = &*self;
+        let mut depths: Vec<f64> = model
+            .tracks
+            .iter()
+            .filter_map(|t| t.position.map(|x| (t, x)))
+            .flat_map(|(t, x)| t.sightings.iter().filter_map(move |s| model.project(s.view, x)))
+            .map(|(_, z)| z)
+            .collect();
+        let Some(scale) = crate::pose::numeric::median(&mut depths) else { return };
+        let back = first.inverse();
+        for pose in self.poses.iter_mut().flatten() {
+            *pose = pose.compose(&back).orthonormalised();
+            pose.translation /= scale;
+        }
+        self.poses[0] = Some(Pose::IDENTITY);
+        for x in self.tracks.iter_mut().filter_map(|t| t.position.as_mut()) {
+            *x = first.transform(*x) / scale;
+        }
+    }
+}

@@ -1,0 +1,58 @@
+//! Ground truth for tests: photos, cameras and depth of the breakfast set (and any set in its layout).
+use crate::photo::{self, Photo};
+use crate::scene::{Camera, Pose};
+use glam::{DMat3, DVec3};
+use std::path::{Path, PathBuf};
+
+pub(crate) struct Truth {
+    pub(crate) photos: Vec<Photo>,
+    pub(crate) cameras: Vec<Camera>,
+    pub(crate) mean_depth: f64,
+    pub(crate) folder: PathBuf,
+}
+
+/// The breakfast set in the repository, or another set of the same layout named by SPLATVK_TEST_SET.
+pub(crate) fn folder() -> PathBuf {
+    std::env::var_os("SPLATVK_TEST_SET")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast"), PathBuf::from)
+}
+
+/// Photos, cameras and mean depth of the train split.
+pub(crate) fn train(folder: &Path) -> Truth {
+    let text = std::fs::read_to_string(folder.join("ground_truth.json")).unwrap();
+    let json: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let mut truth =
+        Truth { photos: Vec::new(), cameras: Vec::new(), mean_depth: 0.0, folder: folder.to_path_buf() };
+    let mut depths = Vec::new();
+    for frame in json["frames"].as_array().unwrap().iter().filter(|f| f["split"] == "train") {
+        let file = frame["file"].as_str().unwrap();
+        let photo = photo::load(&folder.join(file)).unwrap();
+        let m = |r: usize, c: usize| frame["world_to_camera"][r][c].as_f64().unwrap();
+        let column = |c: usize| DVec3::new(m(0, c), m(1, c), m(2, c));
+        let k = |name: &str| frame[name].as_f64().unwrap();
+        truth.cameras.push(Camera {
+            name: file.to_string(),
+            width: photo.image.width as u32,
+            height: photo.image.height as u32,
+            fx: k("fx"),
+            fy: k("fy"),
+            cx: k("cx"),
+            cy: k("cy"),
+            pose: Pose {
+                rotation: DMat3::from_cols(column(0), column(1), column(2)),
+                translation: column(3),
+            },
+        });
+        let depth = depth(folder, &photo.stem);
+        let known: Vec<f64> = depth.iter().filter(|z| **z > 0.0).map(|z| *z as f64).collect();
+        depths.push(known.iter().sum::<f64>() / known.len() as f64);
+        truth.photos.push(photo);
+    }
+    truth.mean_depth = depths.iter().sum::<f64>() / depths.len() as f64;
+    truth
+}
+
+/// Camera z per pixel, row-major, 0 = unknown.
+pub(crate) fn depth(folder: &Path, stem: &str) -> Vec<f32> {
+    crate::format::npy::read_npz(folder.join(format!("depth/{stem}.npz"))).unwrap()["depth"].to_f32()
+}
