@@ -1,0 +1,236 @@
+//! Writes the Rust side of the shaders.
+use crate::compile::{Family, Module};
+use crate::reflect::{Access, Binding, Member, Scalar};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+/// The whole of `OUT_DIR/shaders.rs`.
+pub fn shaders(families: &[Family]) -> Result<String, String> {
+    let mut out = String::new();
+    for family in families {
+        let module = one(family).map_err(|e| format!("{}: error: {e}", family.path.display()))?;
+        out.push_str(&module);
+    }
+    let names: Vec<String> = families.iter().map(|f| format!("&{}::FAMILY", f.name)).collect();
+    let _ = writeln!(
+        out,
+        "/// Every shader file.\npub static FAMILIES: &[&crate::gpu::Family] = &[{}];",
+        names.join(", ")
+    );
+    Ok(out)
+}
+
+fn one(family: &Family) -> Result<String, String> {
+    let bindings = union(family)?;
+    let push = &family.modules[0].reflection.push;
+    if family.modules.iter().any(|m| &m.reflection.push != push) {
+        return Err("all variants must have the same push constants".into());
+    }
+    let mut out = String::new();
+    let w = &mut out;
+    let _ = writeln!(w, "/// `{}`.\npub mod {} {{", family.path.display(), family.name);
+    let _ = writeln!(
+        w,
+        "    #[allow(unused_imports)]\n    use crate::gpu::{{Access, Binding, Buffer, Call, Capability, Family, Module}};"
+    );
+    let workgroup = family.modules[0].reflection.workgroup;
+    if family.modules.iter().all(|m| m.reflection.workgroup == workgroup) {
+        let _ = writeln!(w, "    /// `local_size`.\n    pub const WORKGROUP: [u32; 3] = {workgroup:?};");
+    }
+    bindings_struct(w, &bindings);
+    if !push.is_empty() {
+        push_struct(w, push, family.modules[0].reflection.push_bytes);
+    }
+    variant_struct(w, family);
+    call_function(w, family, &bindings, !push.is_empty());
+    family_static(w, family);
+    let _ = writeln!(w, "}}");
+    Ok(out)
+}
+
+/// The bindings of all variants together: a variant may leave some out, but a number has one name and a name one number.
+fn union(family: &Family) -> Result<Vec<Binding>, String> {
+    let mut all: BTreeMap<u32, Binding> = BTreeMap::new();
+    for binding in family.modules.iter().flat_map(|m| &m.reflection.bindings) {
+        let entry = all.entry(binding.number).or_insert_with(|| binding.clone());
+        if entry.block != binding.block {
+            return Err(format!(
+                "binding {} is both `{}` and `{}`",
+                binding.number, entry.block, binding.block
+            ));
+        }
+        entry.access.read |= binding.access.read;
+        entry.access.write |= binding.access.write;
+    }
+    let all: Vec<Binding> = all.into_values().collect();
+    for (i, b) in all.iter().enumerate() {
+        if all[..i].iter().any(|a| snake(&a.block) == snake(&b.block)) {
+            return Err(format!("two bindings are called `{}`", b.block));
+        }
+    }
+    Ok(all)
+}
+
+fn bindings_struct(w: &mut String, bindings: &[Binding]) {
+    let _ = writeln!(w, "    /// The buffers.\n    #[derive(Clone, Copy)]\n    pub struct Bindings<'a> {{");
+    for b in bindings {
+        let _ = writeln!(w, "        /// Binding {}, {}.", b.number, words(b.access));
+        let _ = writeln!(w, "        pub {}: &'a Buffer,", snake(&b.block));
+    }
+    let _ = writeln!(w, "    }}");
+}
+
+fn words(access: Access) -> &'static str {
+    match (access.read, access.write) {
+        (true, true) => "read and written",
+        (true, false) => "read",
+        (false, true) => "written",
+        (false, false) => "not used",
+    }
+}
+
+fn push_struct(w: &mut String, push: &[Member], bytes: u32) {
+    let _ = writeln!(w, "    /// The push constants; [`Push::bytes`] puts each at its reflected offset.");
+    let _ = writeln!(w, "    #[derive(Clone, Copy, Debug, Default, PartialEq)]\n    pub struct Push {{");
+    for m in push {
+        let _ = writeln!(w, "        /// Byte {}.\n        pub {}: {},", m.offset, m.name, rust_type(m));
+    }
+    let _ = writeln!(w, "    }}\n    impl Push {{");
+    let _ = writeln!(
+        w,
+        "        /// The block as the shader reads it.\n        pub fn bytes(&self) -> [u8; {bytes}] {{"
+    );
+    let _ = writeln!(w, "            let mut out = [0u8; {bytes}];");
+    for m in push {
+        writer(w, m);
+    }
+    let _ = writeln!(w, "            out\n        }}\n    }}");
+}
+
+fn rust_type(m: &Member) -> String {
+    let mut t = match m.scalar {
+        Scalar::F32 => "f32",
+        Scalar::I32 => "i32",
+        Scalar::U32 => "u32",
+    }
+    .to_owned();
+    if m.rows > 1 {
+        t = format!("[{t}; {}]", m.rows);
+    }
+    for (n, _) in m.columns.iter().chain(&m.array) {
+        t = format!("[{t}; {n}]");
+    }
+    t
+}
+
+/// One `copy_from_slice` per scalar: at most 32 lines, since push constants have 128 bytes.
+fn writer(w: &mut String, m: &Member) {
+    let (elements, element_stride) = m.array.unwrap_or((1, 0));
+    let (columns, column_stride) = m.columns.unwrap_or((1, 0));
+    for e in 0..elements {
+        for c in 0..columns {
+            for r in 0..m.rows {
+                let at = m.offset + e * element_stride + c * column_stride + 4 * r;
+                let mut path = format!("self.{}", m.name);
+                for (used, index) in [(m.array.is_some(), e), (m.columns.is_some(), c), (m.rows > 1, r)] {
+                    if used {
+                        let _ = write!(path, "[{index}]");
+                    }
+                }
+                let end = at + 4;
+                let _ = writeln!(w, "            out[{at}..{end}].copy_from_slice(&{path}.to_le_bytes());");
+            }
+        }
+    }
+}
+
+fn variant_struct(w: &mut String, family: &Family) {
+    if family.axes.is_empty() {
+        return;
+    }
+    let _ = writeln!(w, "    /// The macros that choose a variant.");
+    let _ = writeln!(w, "    #[derive(Clone, Copy, Debug, PartialEq, Eq)]\n    pub struct Variant {{");
+    for axis in &family.axes {
+        let _ = writeln!(w, "        /// `{axis}`.\n        pub {}: u32,", axis.to_lowercase());
+    }
+    let _ = writeln!(w, "    }}");
+}
+
+fn call_function(w: &mut String, family: &Family, bindings: &[Binding], push: bool) {
+    let variant_parameter = if family.axes.is_empty() { "" } else { "variant: Variant, " };
+    let push_parameter = if push { ", push: &Push" } else { "" };
+    let axes: Vec<String> = family.axes.iter().map(|a| format!("variant.{}", a.to_lowercase())).collect();
+    let buffers: Vec<String> =
+        bindings.iter().map(|b| format!("({}, bindings.{}.clone())", b.number, snake(&b.block))).collect();
+    let push_bytes = if push { "push.bytes().to_vec()" } else { "Vec::new()" };
+    let _ = writeln!(w, "    /// One call of the shader, for `Recorder::dispatch`.");
+    let _ = writeln!(w, "    pub fn call({variant_parameter}bindings: &Bindings{push_parameter}) -> Call {{");
+    let _ = writeln!(
+        w,
+        "        Call::new(&FAMILY, vec![{}], vec![{}], {push_bytes})\n    }}",
+        axes.join(", "),
+        buffers.join(", ")
+    );
+}
+
+fn family_static(w: &mut String, family: &Family) {
+    let _ = writeln!(w, "    /// All compiled variants.");
+    let _ = writeln!(
+        w,
+        "    pub static FAMILY: Family = Family {{ name: {:?}, axes: &{:?}, modules: &[",
+        family.name, family.axes
+    );
+    for m in &family.modules {
+        let _ = writeln!(w, "        Module {{");
+        let _ = writeln!(w, "            name: {:?},", module_name(family, m));
+        let _ = writeln!(w, "            variant: &{:?},", m.variant);
+        let _ = writeln!(
+            w,
+            "            subgroup_size: {:?}, float_atomics: {:?},",
+            m.subgroup_size, m.float_atomics
+        );
+        let _ = writeln!(w, "            workgroup: {:?},", m.reflection.workgroup);
+        let _ = writeln!(w, "            push_bytes: {},", m.reflection.push_bytes);
+        let capabilities: Vec<String> =
+            m.reflection.capabilities.iter().map(|c| format!("Capability::{c}")).collect();
+        let _ = writeln!(w, "            capabilities: &[{}],", capabilities.join(", "));
+        let bindings: Vec<String> = m
+            .reflection
+            .bindings
+            .iter()
+            .map(|b| {
+                let Access { read, write } = b.access;
+                let name = snake(&b.block);
+                format!("Binding {{ number: {}, name: {name:?}, access: Access {{ read: {read}, write: {write} }} }}", b.number)
+            })
+            .collect();
+        let _ = writeln!(w, "            bindings: &[{}],", bindings.join(", "));
+        let _ = writeln!(w, "            spirv: include_bytes!({:?}),", m.spirv.display().to_string());
+        let _ = writeln!(w, "        }},");
+    }
+    let _ = writeln!(w, "    ] }};");
+}
+
+fn module_name(family: &Family, m: &Module) -> String {
+    let mut parts: Vec<String> =
+        family.axes.iter().zip(&m.variant).map(|(a, v)| format!("{a}={v}")).collect();
+    parts.extend(m.subgroup_size.map(|s| format!("SUBGROUP_SIZE={s}")));
+    parts.extend(m.float_atomics.map(|f| format!("FLOAT_ATOMICS={}", u32::from(f))));
+    if parts.is_empty() { family.name.clone() } else { format!("{}[{}]", family.name, parts.join(",")) }
+}
+
+/// `TileRanges` → `tile_ranges`, `SHGrad` → `sh_grad`.
+fn snake(name: &str) -> String {
+    let chars: Vec<char> = name.chars().collect();
+    let mut out = String::new();
+    for (i, &c) in chars.iter().enumerate() {
+        let after_small = i > 0 && (chars[i - 1].is_lowercase() || chars[i - 1].is_ascii_digit());
+        let ends_acronym =
+            i > 0 && chars[i - 1].is_uppercase() && chars.get(i + 1).is_some_and(|n| n.is_lowercase());
+        if c.is_uppercase() && (after_small || ends_acronym) {
+            out.push('_');
+        }
+        out.extend(c.to_lowercase());
+    }
+    out
+}

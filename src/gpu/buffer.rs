@@ -1,0 +1,302 @@
+//! Storage buffers.
+use super::device::{Device, lock, vk_error};
+use crate::{Error, Result};
+use ash::vk;
+use bytemuck::Pod;
+use gpu_allocator::MemoryLocation;
+use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
+use std::ops::Range;
+use std::sync::{Arc, Mutex};
+
+/// A storage buffer in device memory. Clones share it; it lives as long as any clone, or any program that uses it.
+///
+/// Reading and writing from the host is synchronous. Do not write from one thread what a program run by another uses.
+#[derive(Clone)]
+pub struct Buffer(Arc<Inner>);
+
+struct Inner {
+    device: Device,
+    name: String,
+    raw: vk::Buffer,
+    bytes: u64,
+    /// `None` only while dropping.
+    allocation: Mutex<Option<Allocation>>,
+}
+
+impl Device {
+    /// A zero-filled buffer of `len` elements of `T`.
+    pub fn buffer<T: Pod>(&self, name: &str, len: usize) -> Result<Buffer> {
+        let buffer = Buffer::create(self, name, byte_len::<T>(len), self.info().mapped)?;
+        buffer.clear()?;
+        Ok(buffer)
+    }
+
+    /// A buffer with these elements.
+    pub fn buffer_from<T: Pod>(&self, name: &str, data: &[T]) -> Result<Buffer> {
+        let buffer = Buffer::create(self, name, byte_len::<T>(data.len()), self.info().mapped)?;
+        buffer.write(data)?;
+        Ok(buffer)
+    }
+}
+
+fn byte_len<T>(len: usize) -> u64 {
+    (len as u64).saturating_mul(size_of::<T>() as u64)
+}
+
+impl Buffer {
+    fn create(device: &Device, name: &str, bytes: u64, mapped: bool) -> Result<Buffer> {
+        let limit = device.info().max_storage_range;
+        let mib = |b: u64| b as f64 / f64::from(1 << 20);
+        if bytes > limit {
+            return Err(Error::gpu(format!(
+                "buffer `{name}` needs {:.1} MiB but {} binds at most {:.0} MiB: use fewer splats, smaller photos or another device",
+                mib(bytes),
+                device.info().name,
+                mib(limit)
+            )));
+        }
+        let fail = |e: String| Error::gpu(format!("buffer `{name}` of {:.1} MiB: {e}", mib(bytes)));
+        // Vulkan knows no empty buffers, and fills work on multiples of four bytes.
+        let size = bytes.max(16).next_multiple_of(4);
+        let usage = vk::BufferUsageFlags::STORAGE_BUFFER
+            | vk::BufferUsageFlags::TRANSFER_SRC
+            | vk::BufferUsageFlags::TRANSFER_DST
+            | vk::BufferUsageFlags::INDIRECT_BUFFER;
+        let vulkan = &device.0.device;
+        let info = vk::BufferCreateInfo::default().size(size).usage(usage);
+        // SAFETY: plain object creation on a live device.
+        let raw = unsafe { vulkan.create_buffer(&info, None) }.map_err(|e| fail(e.to_string()))?;
+        let bound = bind(device, name, raw, mapped);
+        match bound {
+            Ok(allocation) => Ok(Buffer(Arc::new(Inner {
+                device: device.clone(),
+                name: name.to_owned(),
+                raw,
+                bytes,
+                allocation: Mutex::new(Some(allocation)),
+            }))),
+            Err(e) => {
+                // SAFETY: the buffer was never used.
+                unsafe { vulkan.destroy_buffer(raw, None) };
+                Err(fail(e))
+            }
+        }
+    }
+
+    /// The name it was made with.
+    pub fn name(&self) -> &str {
+        &self.0.name
+    }
+
+    /// Size in bytes.
+    pub fn bytes(&self) -> u64 {
+        self.0.bytes
+    }
+
+    /// Length in elements of `T`, rounded down.
+    pub fn len<T: Pod>(&self) -> usize {
+        (self.0.bytes / size_of::<T>().max(1) as u64) as usize
+    }
+
+    pub(super) fn raw(&self) -> vk::Buffer {
+        self.0.raw
+    }
+
+    /// Bytes that a fill covers and a binding spans.
+    pub(super) fn raw_bytes(&self) -> u64 {
+        self.0.bytes.max(16).next_multiple_of(4)
+    }
+
+    /// Identity: equal for clones of one buffer.
+    pub(super) fn id(&self) -> u64 {
+        Arc::as_ptr(&self.0) as u64
+    }
+
+    pub(super) fn belongs_to(&self, device: &Device) -> bool {
+        Arc::ptr_eq(&self.0.device.0, &device.0)
+    }
+
+    /// All elements. The size must be a multiple of `T`'s.
+    pub fn read<T: Pod>(&self) -> Result<Vec<T>> {
+        if !self.0.bytes.is_multiple_of(size_of::<T>().max(1) as u64) {
+            return Err(Error::gpu(format!(
+                "buffer `{}` of {} bytes is no whole number of {}-byte elements",
+                self.0.name,
+                self.0.bytes,
+                size_of::<T>()
+            )));
+        }
+        self.read_range(0..self.len::<T>())
+    }
+
+    /// Elements of a range.
+    pub fn read_range<T: Pod>(&self, range: Range<usize>) -> Result<Vec<T>> {
+        let bytes = self.byte_range::<T>(range)?;
+        let (start, end) = (bytes.start as usize, bytes.end as usize);
+        if start == end {
+            return Ok(Vec::new());
+        }
+        if let Some(memory) = lock(&self.0.allocation).as_ref().and_then(Allocation::mapped_slice) {
+            return Ok(bytemuck::pod_collect_to_vec(&memory[start..end]));
+        }
+        let staging = Buffer::create(&self.0.device, "staging", bytes.end - bytes.start, true)?;
+        let region = [vk::BufferCopy::default().src_offset(bytes.start).size(bytes.end - bytes.start)];
+        self.0.device.one_time("read back", |commands| {
+            // SAFETY: ranges were checked, both buffers outlive the submit.
+            unsafe { self.0.device.0.device.cmd_copy_buffer(commands, self.raw(), staging.raw(), &region) }
+        })?;
+        let memory = lock(&staging.0.allocation);
+        let mapped = memory.as_ref().and_then(Allocation::mapped_slice).ok_or_else(not_mapped)?;
+        Ok(bytemuck::pod_collect_to_vec(&mapped[..end - start]))
+    }
+
+    /// Replaces the first elements.
+    pub fn write<T: Pod>(&self, data: &[T]) -> Result<()> {
+        self.write_at(0, data)
+    }
+
+    /// Replaces the elements from `first` on.
+    pub fn write_at<T: Pod>(&self, first: usize, data: &[T]) -> Result<()> {
+        let range = self.byte_range::<T>(first..first.saturating_add(data.len()))?;
+        let bytes: &[u8] = bytemuck::cast_slice(data);
+        if bytes.is_empty() {
+            return Ok(());
+        }
+        if let Some(memory) = lock(&self.0.allocation).as_mut().and_then(Allocation::mapped_slice_mut) {
+            memory[range.start as usize..range.end as usize].copy_from_slice(bytes);
+            return Ok(());
+        }
+        let staging = Buffer::create(&self.0.device, "staging", bytes.len() as u64, true)?;
+        staging.write(bytes)?;
+        let region = [vk::BufferCopy::default().dst_offset(range.start).size(bytes.len() as u64)];
+        self.0.device.one_time("upload", |commands| {
+            // SAFETY: ranges were checked, both buffers outlive the submit.
+            unsafe { self.0.device.0.device.cmd_copy_buffer(commands, staging.raw(), self.raw(), &region) }
+        })
+    }
+
+    fn clear(&self) -> Result<()> {
+        if let Some(memory) = lock(&self.0.allocation).as_mut().and_then(Allocation::mapped_slice_mut) {
+            memory.fill(0);
+            return Ok(());
+        }
+        self.0.device.one_time("clear", |commands| {
+            // SAFETY: the whole buffer is filled, it outlives the submit.
+            unsafe { self.0.device.0.device.cmd_fill_buffer(commands, self.raw(), 0, vk::WHOLE_SIZE, 0) }
+        })
+    }
+
+    fn byte_range<T>(&self, range: Range<usize>) -> Result<Range<u64>> {
+        let bytes = byte_len::<T>(range.start)..byte_len::<T>(range.end);
+        if bytes.start > bytes.end || bytes.end > self.0.bytes {
+            return Err(Error::gpu(format!(
+                "elements {range:?} of {} bytes lie outside buffer `{}` of {} bytes",
+                size_of::<T>(),
+                self.0.name,
+                self.0.bytes
+            )));
+        }
+        Ok(bytes)
+    }
+}
+
+fn not_mapped() -> Error {
+    Error::gpu("staging memory is not mapped")
+}
+
+fn bind(
+    device: &Device,
+    name: &str,
+    raw: vk::Buffer,
+    mapped: bool,
+) -> std::result::Result<Allocation, String> {
+    let vulkan = &device.0.device;
+    // SAFETY: the buffer is alive and unbound.
+    let requirements = unsafe { vulkan.get_buffer_memory_requirements(raw) };
+    let mut guard = lock(&device.0.allocator);
+    let allocator = guard.as_mut().ok_or("the device is closing")?;
+    // GpuToCpu is cached host memory: read-backs and CPU devices need it, uploads do not suffer.
+    let location = if mapped { MemoryLocation::GpuToCpu } else { MemoryLocation::GpuOnly };
+    let allocation = allocator
+        .allocate(&AllocationCreateDesc {
+            name,
+            requirements,
+            location,
+            linear: true,
+            allocation_scheme: AllocationScheme::GpuAllocatorManaged,
+        })
+        .map_err(|e| e.to_string())?;
+    // SAFETY: memory and offset come from the allocator for these requirements.
+    match unsafe { vulkan.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) } {
+        Ok(()) => Ok(allocation),
+        Err(e) => {
+            let _ = allocator.free(allocation);
+            Err(e.to_string())
+        }
+    }
+}
+
+impl Device {
+    /// Records, submits and waits: for uploads and read-backs on devices without mapped buffers.
+    fn one_time(&self, what: &str, record: impl FnOnce(vk::CommandBuffer)) -> Result<()> {
+        let device = &self.0.device;
+        let pool_info = vk::CommandPoolCreateInfo::default().queue_family_index(self.0.queue_family);
+        // SAFETY: objects are created, used and destroyed on one live device; the submit waits before they go.
+        unsafe {
+            let pool = device.create_command_pool(&pool_info, None).map_err(vk_error(what))?;
+            let work = || -> Result<()> {
+                let allocate =
+                    vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
+                let buffers = device.allocate_command_buffers(&allocate).map_err(vk_error(what))?;
+                let commands = buffers.first().copied().unwrap_or_default();
+                device
+                    .begin_command_buffer(commands, &vk::CommandBufferBeginInfo::default())
+                    .map_err(vk_error(what))?;
+                self.cmd_edge_barrier(commands);
+                record(commands);
+                self.cmd_edge_barrier(commands);
+                device.end_command_buffer(commands).map_err(vk_error(what))?;
+                let fence =
+                    device.create_fence(&vk::FenceCreateInfo::default(), None).map_err(vk_error(what))?;
+                let done = self.submit(commands, fence, what);
+                device.destroy_fence(fence, None);
+                done
+            };
+            let done = work();
+            device.destroy_command_pool(pool, None);
+            done
+        }
+    }
+
+    /// Orders a command buffer after everything before it and makes its results visible to the host and to what comes
+    /// next: put at both ends of every command buffer, so that derivation inside may start from a clean state.
+    pub(super) fn cmd_edge_barrier(&self, commands: vk::CommandBuffer) {
+        let work = vk::PipelineStageFlags2::COMPUTE_SHADER
+            | vk::PipelineStageFlags2::ALL_TRANSFER
+            | vk::PipelineStageFlags2::DRAW_INDIRECT;
+        let barrier = [vk::MemoryBarrier2::default()
+            .src_stage_mask(work)
+            .src_access_mask(vk::AccessFlags2::MEMORY_WRITE)
+            .dst_stage_mask(work | vk::PipelineStageFlags2::HOST)
+            .dst_access_mask(vk::AccessFlags2::MEMORY_READ | vk::AccessFlags2::MEMORY_WRITE)];
+        self.cmd_barrier(commands, &vk::DependencyInfo::default().memory_barriers(&barrier));
+    }
+}
+
+impl std::fmt::Debug for Buffer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Buffer({}, {} bytes)", self.0.name, self.0.bytes)
+    }
+}
+
+impl Drop for Inner {
+    fn drop(&mut self) {
+        // SAFETY: every submit waits and programs hold their buffers, so nothing uses it any more.
+        unsafe { self.device.0.device.destroy_buffer(self.raw, None) };
+        if let (Some(allocation), Some(allocator)) =
+            (lock(&self.allocation).take(), lock(&self.device.0.allocator).as_mut())
+        {
+            let _ = allocator.free(allocation);
+        }
+    }
+}

@@ -1,0 +1,214 @@
+//! Commands as plain data.
+use super::device::Device;
+use super::hazard::{Stage, Touch};
+use super::module::{Call, Module};
+use super::program::Program;
+use super::{Buffer, hazard};
+use crate::{Error, Result};
+
+/// What a command does.
+pub(super) enum Op {
+    Fill { buffer: Buffer, value: u32 },
+    Copy { from: Buffer, to: Buffer, from_byte: u64, to_byte: u64, bytes: u64 },
+    Dispatch { module: &'static Module, call: Call, groups: Groups },
+}
+
+/// How many workgroups run.
+pub(super) enum Groups {
+    Direct([u32; 3]),
+    Indirect { args: Buffer, byte: u64 },
+}
+
+pub(super) struct Command {
+    pub label: String,
+    pub op: Op,
+}
+
+impl Command {
+    /// Declared accesses; for a dispatch they come from the compiled module.
+    pub fn touches(&self) -> Vec<Touch> {
+        let touch = |b: &Buffer, stage, read, write| Touch { buffer: b.id(), stage, read, write };
+        match &self.op {
+            Op::Fill { buffer, .. } => vec![touch(buffer, Stage::Transfer, false, true)],
+            Op::Copy { from, to, .. } => {
+                vec![touch(from, Stage::Transfer, true, false), touch(to, Stage::Transfer, false, true)]
+            }
+            Op::Dispatch { module, call, groups } => {
+                let mut touches = Vec::with_capacity(call.buffers.len() + 1);
+                if let Groups::Indirect { args, .. } = groups {
+                    touches.push(touch(args, Stage::Indirect, true, false));
+                }
+                for binding in module.bindings.iter().filter(|b| b.access.read || b.access.write) {
+                    if let Some((_, buffer)) = call.buffers.iter().find(|(n, _)| *n == binding.number) {
+                        touches.push(touch(
+                            buffer,
+                            Stage::Compute,
+                            binding.access.read,
+                            binding.access.write,
+                        ));
+                    }
+                }
+                touches
+            }
+        }
+    }
+
+    /// One of its buffers by identity.
+    pub fn buffer(&self, id: u64) -> Option<&Buffer> {
+        let (first, second, bound): (Option<&Buffer>, Option<&Buffer>, &[(u32, Buffer)]) = match &self.op {
+            Op::Fill { buffer, .. } => (Some(buffer), None, &[]),
+            Op::Copy { from, to, .. } => (Some(from), Some(to), &[]),
+            Op::Dispatch { call, groups: Groups::Indirect { args, .. }, .. } => {
+                (Some(args), None, &call.buffers)
+            }
+            Op::Dispatch { call, .. } => (None, None, &call.buffers),
+        };
+        first.into_iter().chain(second).chain(bound.iter().map(|(_, b)| b)).find(|b| b.id() == id)
+    }
+}
+
+/// Collects commands; barriers are derived from what the shaders do with their buffers when it is compiled or run.
+/// Recording never fails: the first mistake is kept and returned by [`Recorder::compile`] and [`Recorder::run`].
+pub struct Recorder {
+    device: Device,
+    label: String,
+    commands: Vec<Command>,
+    error: Option<Error>,
+}
+
+impl Recorder {
+    /// An empty recording; the label appears in errors.
+    pub fn new(device: &Device, label: &str) -> Recorder {
+        Recorder { device: device.clone(), label: label.to_owned(), commands: Vec::new(), error: None }
+    }
+
+    /// Sets every 32-bit word of the buffer.
+    pub fn fill(&mut self, buffer: &Buffer, value: u32) {
+        self.own(&[buffer]);
+        let op = Op::Fill { buffer: buffer.clone(), value };
+        self.commands.push(Command { label: format!("fill {}", buffer.name()), op });
+    }
+
+    /// Copies a whole buffer onto the start of one that is at least as long.
+    pub fn copy(&mut self, from: &Buffer, to: &Buffer) {
+        self.copy_bytes(from, 0, to, 0, from.bytes());
+    }
+
+    /// Copies `bytes` bytes from one offset to another; offsets are in bytes.
+    pub fn copy_bytes(&mut self, from: &Buffer, from_byte: u64, to: &Buffer, to_byte: u64, bytes: u64) {
+        self.own(&[from, to]);
+        let label = format!("copy {} to {}", from.name(), to.name());
+        if from_byte.saturating_add(bytes) > from.bytes() || to_byte.saturating_add(bytes) > to.bytes() {
+            self.fail(format!("{label}: {bytes} bytes from {from_byte} to {to_byte} reach beyond the end"));
+        } else if bytes > 0 {
+            let op = Op::Copy { from: from.clone(), to: to.clone(), from_byte, to_byte, bytes };
+            self.commands.push(Command { label, op });
+        }
+    }
+
+    /// Runs `groups` workgroups; nothing when one of the counts is 0.
+    pub fn dispatch(&mut self, call: Call, groups: [u32; 3]) {
+        if let Some(module) = self.resolve(&call) {
+            self.push_dispatch(module, call, groups);
+        }
+    }
+
+    /// Runs enough workgroups for this many threads per axis; shaders guard the overhang.
+    pub fn dispatch_threads(&mut self, call: Call, threads: [u32; 3]) {
+        if let Some(module) = self.resolve(&call) {
+            let size = module.workgroup;
+            let groups = [0, 1, 2].map(|i| threads[i].div_ceil(size[i].max(1)));
+            self.push_dispatch(module, call, groups);
+        }
+    }
+
+    /// Takes the three `u32` group counts from `args` at a byte offset, when the device gets there.
+    pub fn dispatch_indirect(&mut self, call: Call, args: &Buffer, byte: u64) {
+        self.own(&[args]);
+        if !byte.is_multiple_of(4) || byte.saturating_add(12) > args.bytes() {
+            self.fail(format!("indirect arguments at byte {byte} of `{}` are misplaced", args.name()));
+        }
+        if let Some(module) = self.resolve(&call) {
+            let groups = Groups::Indirect { args: args.clone(), byte };
+            self.commands
+                .push(Command { label: module.name.to_owned(), op: Op::Dispatch { module, call, groups } });
+        }
+    }
+
+    /// Number of commands so far.
+    pub fn len(&self) -> usize {
+        self.commands.len()
+    }
+
+    /// Whether nothing was recorded.
+    pub fn is_empty(&self) -> bool {
+        self.commands.is_empty()
+    }
+
+    /// Submits once and waits.
+    pub fn run(self) -> Result<()> {
+        self.compile()?.run()
+    }
+
+    /// Submits once and waits; milliseconds per command, in order. The first run of a shader includes the driver's own
+    /// compilation, so warm up before timing.
+    pub fn run_timed(self) -> Result<Vec<(String, f64)>> {
+        self.compile()?.run_timed()
+    }
+
+    /// Derives and checks the barriers and encodes the commands for repeated runs.
+    pub fn compile(self) -> Result<Program> {
+        match self.error {
+            Some(e) => Err(e),
+            None => Program::new(self.device, self.label, self.commands),
+        }
+    }
+
+    fn push_dispatch(&mut self, module: &'static Module, call: Call, groups: [u32; 3]) {
+        let most = self.device.info().max_groups;
+        if (0..3).any(|i| groups[i] > most[i]) {
+            self.fail(format!("{}: {groups:?} workgroups, the device allows {most:?}", module.name));
+        } else if groups.iter().all(|&g| g > 0) {
+            let groups = Groups::Direct(groups);
+            self.commands
+                .push(Command { label: module.name.to_owned(), op: Op::Dispatch { module, call, groups } });
+        }
+    }
+
+    fn resolve(&mut self, call: &Call) -> Option<&'static Module> {
+        let buffers: Vec<&Buffer> = call.buffers.iter().map(|(_, b)| b).collect();
+        self.own(&buffers);
+        match self.device.resolve(call) {
+            Ok(module) => Some(module),
+            Err(e) => {
+                self.error.get_or_insert(e);
+                None
+            }
+        }
+    }
+
+    fn own(&mut self, buffers: &[&Buffer]) {
+        if let Some(stranger) = buffers.iter().find(|b| !b.belongs_to(&self.device)) {
+            self.fail(format!("buffer `{}` belongs to another device", stranger.name()));
+        }
+    }
+
+    fn fail(&mut self, what: String) {
+        let message = format!("{}: {what}", self.label);
+        self.error.get_or_insert_with(|| Error::gpu(message));
+    }
+}
+
+/// Refuses a command that touches one buffer twice with a write: the shader would see itself.
+pub(super) fn check_aliases(label: &str, commands: &[Command], touches: &[Vec<Touch>]) -> Result<()> {
+    for (command, touches) in commands.iter().zip(touches) {
+        if let Some(id) = hazard::aliased(touches) {
+            return Err(Error::gpu(format!(
+                "{label}: {} has buffer `{}` twice and writes to it",
+                command.label,
+                command.buffer(id).map_or("?", |b| b.name())
+            )));
+        }
+    }
+    Ok(())
+}

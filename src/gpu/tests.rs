@@ -1,0 +1,178 @@
+//! The engine on a real device, with validation on.
+use super::*;
+
+fn relevancy(device: &Device, codes: &[i32], scores: &[f32]) -> crate::Result<Vec<f32>> {
+    let codes_buffer = device.buffer_from("codes", codes)?;
+    let scores_buffer = device.buffer_from("scores", scores)?;
+    let relevancy = device.buffer::<f32>("relevancy", codes.len())?;
+    let mut rec = Recorder::new(device, "relevancy");
+    rec.dispatch_threads(
+        shaders::relevancy_map::call(
+            &shaders::relevancy_map::Bindings {
+                codes: &codes_buffer,
+                scores: &scores_buffer,
+                relevancy: &relevancy,
+            },
+            &shaders::relevancy_map::Push { pixels: codes.len() as u32 },
+        ),
+        [codes.len() as u32, 1, 1],
+    );
+    rec.run()?;
+    relevancy.read()
+}
+
+/// Sums `values` into `bins.max() + 1` bins, twice in a row so that a read-modify-write chain needs its barrier.
+fn sums_twice(device: &Device, values: &[f32], bins: &[u32]) -> crate::Result<Vec<f32>> {
+    use shaders::scatter_sum::{Bindings, Push, call};
+    let values_buffer = device.buffer_from("values", values)?;
+    let bins_buffer = device.buffer_from("bins", bins)?;
+    let sums = device.buffer::<f32>("sums", 1 + *bins.iter().max().unwrap_or(&0) as usize)?;
+    let mut rec = Recorder::new(device, "sums");
+    rec.fill(&sums, 0);
+    let n = values.len() as u32;
+    for _ in 0..2 {
+        let bindings = Bindings { values: &values_buffer, bins: &bins_buffer, sums: &sums };
+        rec.dispatch_threads(call(&bindings, &Push { count: n }), [n, 1, 1]);
+    }
+    let program = rec.compile()?;
+    assert_eq!(program.counts(), (3, 2));
+    // Replays start from the fill again.
+    program.run()?;
+    program.run()?;
+    sums.read()
+}
+
+fn check_sums(device: &Device) {
+    // Multiples of 1/4 add exactly in any order.
+    let values: Vec<f32> = (0..1000).map(|i| (i % 9) as f32 * 0.25 - 1.0).collect();
+    let bins: Vec<u32> = (0..1000).map(|i| (i * 7 % 13) as u32).collect();
+    let mut expected = vec![0f32; 13];
+    for (v, &b) in values.iter().zip(&bins) {
+        expected[b as usize] += 2.0 * v;
+    }
+    assert_eq!(sums_twice(device, &values, &bins).unwrap(), expected);
+}
+
+#[test]
+fn a_pass_computes_what_its_twin_says() {
+    let device = test_device();
+    let out = relevancy(&device, &[0, 1, -1, 1], &[0.25, 0.75]).unwrap();
+    assert_eq!(out, [0.25, 0.75, 0.0, 0.75]);
+}
+
+#[test]
+fn float_atomics_and_their_fallback_agree() {
+    let device = test_device();
+    check_sums(&device);
+    let fallback = TestDevice::with(&Options { no_float_atomics: true, ..Options::from_env(None) }).unwrap();
+    assert!(!fallback.info().float_atomics);
+    check_sums(&fallback);
+}
+
+#[test]
+fn staged_buffers_behave_like_mapped_ones() {
+    let device = TestDevice::with(&Options { staging: true, ..Options::from_env(None) }).unwrap();
+    assert!(!device.info().mapped);
+    check_sums(&device);
+    let buffer = device.buffer::<u32>("numbers", 5).unwrap();
+    assert_eq!(buffer.read::<u32>().unwrap(), [0; 5]);
+    buffer.write_at(3, &[7u32, 8]).unwrap();
+    buffer.write(&[1u32]).unwrap();
+    assert_eq!(buffer.read::<u32>().unwrap(), [1, 0, 0, 7, 8]);
+    assert_eq!(buffer.read_range::<u16>(6..7).unwrap(), [7]);
+}
+
+#[test]
+fn buffers_check_their_bounds_and_sizes() {
+    let device = test_device();
+    let buffer = device.buffer_from("five", &[1u8, 2, 3, 4, 5]).unwrap();
+    assert_eq!(buffer.read::<u8>().unwrap(), [1, 2, 3, 4, 5]);
+    assert!(buffer.read::<u32>().unwrap_err().to_string().contains("`five`"));
+    assert!(buffer.write_at(4, &[1u8, 2]).is_err());
+    assert!(buffer.read_range::<u8>(4..6).is_err());
+    assert_eq!(device.buffer::<f32>("empty", 0).unwrap().read::<f32>().unwrap(), []);
+    let too_long = device.info().max_storage_range as usize + 1;
+    let message = device.buffer::<u8>("huge", too_long).unwrap_err().to_string();
+    assert!(message.contains("huge") && message.contains("MiB"), "{message}");
+}
+
+#[test]
+fn copies_and_timestamps() {
+    let device = test_device();
+    let a = device.buffer_from("a", &[1u32, 2, 3, 4]).unwrap();
+    let b = device.buffer::<u32>("b", 6).unwrap();
+    let mut rec = Recorder::new(&device, "copies");
+    rec.copy(&a, &b);
+    rec.copy_bytes(&b, 4, &a, 0, 8);
+    let times = rec.run_timed().unwrap();
+    assert_eq!(a.read::<u32>().unwrap(), [2, 3, 3, 4]);
+    assert_eq!(b.read::<u32>().unwrap(), [1, 2, 3, 4, 0, 0]);
+    assert_eq!(times.len(), 2);
+    assert_eq!(times[0].0, "copy a to b");
+    assert!(times.iter().all(|(_, ms)| (0.0..10_000.0).contains(ms)), "{times:?}");
+}
+
+#[test]
+fn indirect_dispatch_reads_its_size_on_the_device() {
+    let device = test_device();
+    let codes = device.buffer_from("codes", &[0i32; 1000]).unwrap();
+    let scores = device.buffer_from("scores", &[1f32]).unwrap();
+    let out = device.buffer::<f32>("out", 1000).unwrap();
+    let source = device.buffer_from("source", &[9u32, 2, 1, 1]).unwrap();
+    let args = device.buffer::<u32>("args", 4).unwrap();
+    let mut rec = Recorder::new(&device, "indirect");
+    rec.copy(&source, &args);
+    let call = shaders::relevancy_map::call(
+        &shaders::relevancy_map::Bindings { codes: &codes, scores: &scores, relevancy: &out },
+        &shaders::relevancy_map::Push { pixels: 1000 },
+    );
+    rec.dispatch_indirect(call, &args, 4);
+    rec.run().unwrap();
+    let reached = 2 * shaders::relevancy_map::WORKGROUP[0] as usize;
+    let out = out.read::<f32>().unwrap();
+    assert!(out[..reached].iter().all(|&v| v == 1.0));
+    assert!(out[reached..].iter().all(|&v| v == 0.0));
+}
+
+#[test]
+fn mistakes_are_reported_not_run() {
+    let device = test_device();
+    let a = device.buffer_from("a", &[0i32; 4]).unwrap();
+    let run = |f: &dyn Fn(&mut Recorder)| {
+        let mut rec = Recorder::new(&device, "mistake");
+        f(&mut rec);
+        rec.run().unwrap_err().to_string()
+    };
+    let call = || {
+        shaders::relevancy_map::call(
+            &shaders::relevancy_map::Bindings { codes: &a, scores: &a, relevancy: &a },
+            &shaders::relevancy_map::Push { pixels: 4 },
+        )
+    };
+    assert!(run(&|r| r.dispatch(call(), [1; 3])).contains("`a` twice"));
+    assert!(run(&|r| r.copy(&a, &a)).contains("`a` twice"));
+    assert!(run(&|r| r.dispatch(call(), [u32::MAX, 1, 1])).contains("workgroups"));
+    assert!(run(&|r| r.dispatch_indirect(call(), &a, 8)).contains("misplaced"));
+    let small = device.buffer::<u32>("small", 1).unwrap();
+    assert!(run(&|r| r.copy(&a, &small)).contains("beyond the end"));
+    let other = TestDevice::with(&Options::from_env(None)).unwrap();
+    let foreign = other.buffer::<u32>("foreign", 4).unwrap();
+    assert!(run(&|r| r.fill(&foreign, 0)).contains("another device"));
+    let unknown = Device::open(Some("no such device")).unwrap_err();
+    assert_eq!(unknown.exit_code(), 2);
+}
+
+#[test]
+fn validation_messages_are_caught() {
+    // A device of its own, since the mistake below is deliberate. Dropped as a plain Device, it asserts nothing.
+    let device = Device::with(&Options { validation: true, ..Options::from_env(None) }).unwrap();
+    assert!(device.validation_messages().is_empty());
+    let info = ash::vk::BufferCreateInfo::default().size(0).usage(ash::vk::BufferUsageFlags::STORAGE_BUFFER);
+    // SAFETY: a size of zero is what the layer must object to; nothing is done with the buffer.
+    unsafe {
+        if let Ok(raw) = device.0.device.create_buffer(&info, None) {
+            device.0.device.destroy_buffer(raw, None);
+        }
+    }
+    assert!(device.validation_messages().iter().any(|m| m.contains("VUID-VkBufferCreateInfo-size-00912")));
+}

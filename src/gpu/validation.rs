@@ -1,0 +1,109 @@
+//! The Khronos validation layer with synchronization validation, its messages collected so that tests can fail on them.
+use super::device::{Device, Options};
+use crate::{Error, Result};
+use ash::vk;
+use std::ffi::{CStr, c_void};
+use std::ops::Deref;
+use std::sync::{Mutex, MutexGuard, OnceLock};
+
+pub(super) const LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
+
+/// Where the layer's messages end up.
+#[derive(Default)]
+pub(super) struct Messages(Mutex<Vec<String>>);
+
+impl Messages {
+    fn lock(&self) -> MutexGuard<'_, Vec<String>> {
+        self.0.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
+    }
+}
+
+/// The message store in a box, so that the address the driver keeps stays valid when the owner moves.
+#[derive(Default)]
+pub(super) struct Sink(Box<Messages>);
+
+impl Sink {
+    /// For instance creation and for the messenger itself. No message is filtered.
+    pub fn messenger_info(&self) -> vk::DebugUtilsMessengerCreateInfoEXT<'static> {
+        let store: *const Messages = &*self.0;
+        vk::DebugUtilsMessengerCreateInfoEXT::default()
+            .message_severity(
+                vk::DebugUtilsMessageSeverityFlagsEXT::ERROR | vk::DebugUtilsMessageSeverityFlagsEXT::WARNING,
+            )
+            // GENERAL is the loader talking about the machine's drivers and layers, not about our calls.
+            .message_type(
+                vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION
+                    | vk::DebugUtilsMessageTypeFlagsEXT::PERFORMANCE,
+            )
+            .pfn_user_callback(Some(collect))
+            .user_data(store as *mut c_void)
+    }
+
+    pub fn messages(&self) -> Vec<String> {
+        self.0.lock().clone()
+    }
+}
+
+unsafe extern "system" fn collect(
+    _: vk::DebugUtilsMessageSeverityFlagsEXT,
+    _: vk::DebugUtilsMessageTypeFlagsEXT,
+    data: *const vk::DebugUtilsMessengerCallbackDataEXT<'_>,
+    user: *mut c_void,
+) -> vk::Bool32 {
+    if !data.is_null() && !user.is_null() {
+        // SAFETY: Vulkan passes valid callback data, and `user` is the boxed store, which outlives the instance.
+        let (text, store) = unsafe { ((*data).message_as_c_str(), &*(user as *const Messages)) };
+        store.lock().push(text.map(|t| t.to_string_lossy().into_owned()).unwrap_or_default());
+    }
+    vk::FALSE
+}
+
+/// An error with the package name when the layer is not installed.
+pub(super) fn require_layer(entry: &ash::Entry) -> Result<()> {
+    // SAFETY: a plain query.
+    let layers = unsafe { entry.enumerate_instance_layer_properties() }.unwrap_or_default();
+    if layers.iter().any(|l| l.layer_name_as_c_str() == Ok(LAYER)) {
+        return Ok(());
+    }
+    Err(Error::missing(
+        "the Vulkan validation layer is not installed; on Debian or Ubuntu: apt install vulkan-validationlayers",
+    ))
+}
+
+/// The device that all tests of a process share, with validation on. Dropping the handle fails the test if the layer has
+/// said anything so far.
+pub struct TestDevice(Device);
+
+/// See [`TestDevice`]. `SPLATVK_DEVICE` picks another device than the first.
+#[allow(clippy::panic)] // for tests only: a missing device or layer must fail them, not skip them
+pub fn test_device() -> TestDevice {
+    static SHARED: OnceLock<Result<Device>> = OnceLock::new();
+    let opened =
+        SHARED.get_or_init(|| Device::with(&Options { validation: true, ..Options::from_env(None) }));
+    match opened {
+        Ok(device) => TestDevice(device.clone()),
+        Err(e) => panic!("tests need a Vulkan device with validation: {e}"),
+    }
+}
+
+impl TestDevice {
+    /// A device of its own for tests that need other options than the shared one.
+    pub fn with(options: &Options) -> Result<TestDevice> {
+        Device::with(&Options { validation: true, ..options.clone() }).map(TestDevice)
+    }
+}
+
+impl Deref for TestDevice {
+    type Target = Device;
+    fn deref(&self) -> &Device {
+        &self.0
+    }
+}
+
+impl Drop for TestDevice {
+    fn drop(&mut self) {
+        if !std::thread::panicking() {
+            self.0.assert_no_validation_messages();
+        }
+    }
+}
