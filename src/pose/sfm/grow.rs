@@ -1,6 +1,6 @@
 //! From verified pairs to a reconstruction: the pair with most matches at good parallax first, the other views by
 //! resection, an adjustment after each.
-use super::model::{Model, Sighting, Track};
+use super::model::{Model, Track};
 use super::tracks::Sightings;
 use crate::pose::resect::resect;
 use crate::pose::two_view::TwoView;
@@ -37,13 +37,7 @@ pub(super) fn grow(
     threshold: f64,
 ) -> Result<Model, Stuck> {
     let mut model = empty.clone();
-    model.tracks = tracks
-        .iter()
-        .map(|t| Track {
-            position: None,
-            sightings: t.iter().map(|&(view, pixel)| Sighting { view, pixel, sigma: 1.0 }).collect(),
-        })
-        .collect();
+    model.tracks = tracks.iter().map(|t| Track { position: None, sightings: t.clone() }).collect();
     model.poses[seed.first] = Some(Pose::IDENTITY);
     model.poses[seed.second] = Some(seed.geometry.pose);
     model.triangulate_all(2.0 * threshold);

@@ -12,7 +12,7 @@ use crate::scene::{Camera, Plane, RgbImage};
 use crate::{Error, Result};
 use glam::DVec2;
 use grow::{Pair, grow};
-use model::Model;
+use model::{Model, Sighting};
 use rayon::prelude::*;
 use tracks::Link;
 
@@ -235,9 +235,12 @@ fn assemble(
     relations: Vec<(usize, usize, Relation)>,
     progress: &dyn Progress,
 ) -> Result<Model> {
-    let points: Vec<Vec<DVec2>> = (0..photos.len())
-        .map(|v| families.iter().flat_map(|f| f[v].points.iter().copied()).collect())
-        .collect();
+    let keypoints = |view: usize| {
+        let all =
+            families.iter().enumerate().flat_map(move |(k, f)| f[view].points.iter().map(move |p| (k, *p)));
+        all.map(|(family, pixel)| Sighting { view, pixel, sigma: 1.0, family }).collect()
+    };
+    let points: Vec<Vec<Sighting>> = (0..photos.len()).map(keypoints).collect();
     let (mut pairs, mut links) = (Vec::new(), Vec::new());
     for (first, second, relation) in relations {
         if let Relation::Usable(geometry, l) = relation {
@@ -278,7 +281,12 @@ fn finish(photos: &[Photo], mut model: Model) -> Result<SparseModel> {
     let long = photos[0].image.width.max(photos[0].image.height) as f64;
     model.triangulate_all(THRESHOLD * long);
     model.prune(THRESHOLD * long);
-    let outcome = model.adjust(f64::INFINITY, 1.5, 60)?;
+    let mut outcome = model.adjust(f64::INFINITY, 1.5, 60)?;
+    for _ in 0..2 {
+        // Weights and geometry depend on each other; two rounds settle them to a percent.
+        model.weigh();
+        outcome = model.adjust(f64::INFINITY, 2.0, 60)?;
+    }
     model.normalise();
     let cameras = cameras_of(photos, &model)?;
     let points = model

@@ -5,12 +5,14 @@ use crate::scene::Pose;
 use glam::{DMat3, DVec2, DVec3};
 
 /// One sighting of a point.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Sighting {
     pub(super) view: usize,
     pub(super) pixel: DVec2,
     /// One standard deviation, pixels.
     pub(super) sigma: f64,
+    /// Which detector measured it: each has its own noise.
+    pub(super) family: usize,
 }
 
 /// A point; without a position it is not (yet) triangulated.
@@ -200,16 +202,27 @@ impl Model {
         self.tracks = tracks;
     }
 
-    /// Median distance between points and their sightings, pixels.
-    pub(super) fn median_error(&self) -> f64 {
-        let mut errors: Vec<f64> = self
-            .tracks
-            .iter()
-            .filter_map(|t| t.position.map(|x| (t, x)))
-            .flat_map(|(t, x)| t.sightings.iter().map(move |s| self.error(s, x)))
-            .filter(|e| e.is_finite())
-            .collect();
-        crate::pose::numeric::median(&mut errors).unwrap_or(f64::INFINITY)
+    /// Sets σ of every sighting from the residuals of its detector family.
+    pub(super) fn weigh(&mut self) {
+        let families = self.tracks.iter().flat_map(|t| &t.sightings).map(|s| s.family + 1).max().unwrap_or(0);
+        for family in 0..families {
+            let mut squares = Vec::new();
+            for t in &self.tracks {
+                let Some(x) = t.position else { continue };
+                // n sightings leave 2n − 3 free residual components.
+                let n = t.sightings.len() as f64;
+                let share = 2.0 * n / (2.0 * n - 3.0);
+                let of_family = t.sightings.iter().filter(|s| s.family == family);
+                squares.extend(of_family.map(|s| self.error(s, x).powi(2) * share).filter(|e| e.is_finite()));
+            }
+            // The median of the squared length of a 2-D normal deviate is 2 ln 2 σ².
+            let Some(middle) = crate::pose::numeric::median(&mut squares) else { continue };
+            // Below 0.05 px the lens, not the detector, limits; a smaller σ would only freeze the solution.
+            let sigma = (middle / (2.0 * std::f64::consts::LN_2)).sqrt().max(0.05);
+            for s in self.tracks.iter_mut().flat_map(|t| &mut t.sightings).filter(|s| s.family == family) {
+                s.sigma = sigma;
+            }
+        }
     }
 
     /// Moves the world so that view 0 is the identity and the median depth of the points over their sightings is 1.

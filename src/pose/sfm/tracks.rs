@@ -1,5 +1,5 @@
 //! Matches of all pairs, joined into tracks.
-use glam::DVec2;
+use super::model::Sighting;
 
 /// A verified match between two keypoints; keypoints are numbered per view.
 #[derive(Clone, Copy, Debug)]
@@ -9,12 +9,12 @@ pub(super) struct Link {
     pub(super) quality: f64,
 }
 
-/// A scene point as the photos show it: (view, pixel), at most once per view, at least twice.
-pub(super) type Sightings = Vec<(usize, DVec2)>;
+/// A scene point as the photos show it: at most once per view, at least twice.
+pub(super) type Sightings = Vec<Sighting>;
 
 /// Joins links into tracks, best links first; a link that would put two keypoints of one view into a track is left out.
-/// `points[view][keypoint]` are the pixel positions.
-pub(super) fn join(links: &mut [Link], points: &[Vec<DVec2>]) -> Vec<Sightings> {
+/// `points[view][keypoint]` are all keypoints.
+pub(super) fn join(links: &mut [Link], points: &[Vec<Sighting>]) -> Vec<Sightings> {
     links.sort_by(|a, b| {
         b.quality.total_cmp(&a.quality).then(a.first.cmp(&b.first)).then(a.second.cmp(&b.second))
     });
@@ -45,7 +45,7 @@ pub(super) fn join(links: &mut [Link], points: &[Vec<DVec2>]) -> Vec<Sightings> 
         .filter(|m| m.len() >= 2)
         .map(|mut m| {
             m.sort_unstable();
-            m.into_iter().map(|(v, k)| (v, points[v][k])).collect()
+            m.into_iter().map(|(v, k)| points[v][k]).collect()
         })
         .collect()
 }
@@ -64,8 +64,13 @@ mod tests {
 
     #[test]
     fn chains_join_and_conflicts_lose_to_better_links() {
-        let points: Vec<Vec<DVec2>> =
-            (0..3).map(|v| (0..2).map(|k| DVec2::new(v as f64, k as f64)).collect()).collect();
+        let keypoint = |view: usize, k: usize| Sighting {
+            view,
+            pixel: glam::DVec2::new(view as f64, k as f64),
+            sigma: 1.0,
+            family: 0,
+        };
+        let points: Vec<Vec<Sighting>> = (0..3).map(|v| (0..2).map(|k| keypoint(v, k)).collect()).collect();
         let link = |a, b, quality| Link { first: a, second: b, quality };
         let mut links = [
             link((1, 0), (2, 0), 0.5),
@@ -74,6 +79,6 @@ mod tests {
             link((0, 0), (1, 0), 0.9),
         ];
         let tracks = join(&mut links, &points);
-        assert_eq!(tracks, [vec![(0, points[0][0]), (1, points[1][0]), (2, points[2][0])]]);
+        assert_eq!(tracks, [vec![points[0][0], points[1][0], points[2][0]]]);
     }
 }
