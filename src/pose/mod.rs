@@ -1,6 +1,7 @@
 //! Photos to cameras, depth and points.
 pub mod align;
 mod bundle;
+mod initialise;
 pub mod matching;
 mod minimal;
 mod numeric;
@@ -10,6 +11,9 @@ mod sift;
 #[cfg(test)]
 mod testing;
 mod two_view;
+
+pub use initialise::{InitChoice, learned_features, sparse};
+pub use matching::Features;
 
 use crate::scene::{Camera, DepthMap, PointCloud};
 use glam::{DVec2, DVec3};
@@ -40,7 +44,8 @@ pub struct SparsePoint {
     pub views: Vec<(usize, DVec2)>,
 }
 
-/// Cameras and the sparse points that fix them. World frame: camera 0; unit: the median depth of the points is 1.
+/// Cameras and the sparse points that fix them. World frame: camera 0; unit: the median depth of the points is
+/// 1 where it is free, that of the given cameras otherwise.
 #[derive(Clone, Debug, Default)]
 pub struct SparseModel {
     /// One per photo, at the photo's working resolution.

@@ -20,7 +20,7 @@ pub(crate) struct TwoView {
 }
 
 /// Squared Sampson error of `yᵀ F x`.
-fn sampson(f: &DMat3, x: DVec2, y: DVec2) -> f64 {
+pub(crate) fn sampson(f: &DMat3, x: DVec2, y: DVec2) -> f64 {
     signed_sampson(f, x, y).powi(2)
 }
 
@@ -31,6 +31,12 @@ fn signed_sampson(f: &DMat3, x: DVec2, y: DVec2) -> f64 {
     let ft = f.transpose() * y;
     let e = y.dot(fx);
     e / (fx.x * fx.x + fx.y * fx.y + ft.x * ft.x + ft.y * ft.y).max(1e-300).sqrt()
+}
+
+/// F between centred pixels of two cameras with known focal lengths; `pose` maps the first camera to the second.
+pub(crate) fn fundamental(pose: &Pose, f1: f64, f2: f64) -> DMat3 {
+    let inverse = |f: f64| DMat3::from_diagonal(DVec3::new(1.0 / f, 1.0 / f, 1.0));
+    inverse(f2) * essential(pose) * inverse(f1)
 }
 
 /// F in prior-focal units from E in true units.

@@ -1,5 +1,6 @@
 //! Structure from motion: the built-in initialiser that needs no large model.
 mod grow;
+mod known;
 mod model;
 mod tracks;
 
@@ -12,6 +13,7 @@ use crate::scene::{Camera, Plane, RgbImage};
 use crate::{Error, Result};
 use glam::DVec2;
 use grow::{Pair, grow};
+pub use known::with_cameras;
 use model::{Model, Sighting};
 use rayon::prelude::*;
 use tracks::Link;
@@ -43,16 +45,7 @@ pub fn reconstruct(photos: &[Photo], features: &[Features], progress: &dyn Progr
     if photos.len() < 2 {
         return Err(Error::input("cameras need at least two photos; give two or more"));
     }
-    progress.check()?;
-    let own: Vec<Features> = photos
-        .par_iter()
-        .map(|p| sift::detect(&p.image.luma(), &matching::valid_area(&p.image, 4), MAX_CORNERS))
-        .collect();
-    let mut families = vec![own];
-    if features.len() == photos.len() {
-        let masked = photos.iter().zip(features).map(|(p, f)| within(f, &matching::valid_area(&p.image, 4)));
-        families.push(masked.collect());
-    }
+    let families = corner_families(photos, features, progress)?;
     let empty = empty_model(photos);
     let relations = relate_all(photos, &families, &empty, progress)?;
     explain(photos, &relations)?;
@@ -62,6 +55,28 @@ pub fn reconstruct(photos: &[Photo], features: &[Features], progress: &dyn Progr
 
 /// Strongest corners kept per photo: matching stays below a second for four photos.
 const MAX_CORNERS: usize = 4000;
+
+/// Pixels next to the image edge that hold no features: their neighbourhood is cut off.
+const MARGIN: usize = 4;
+
+/// Features per detector family (built-in corners first, then the learned ones if given) and photo.
+fn corner_families(
+    photos: &[Photo],
+    features: &[Features],
+    progress: &dyn Progress,
+) -> Result<Vec<Vec<Features>>> {
+    progress.check()?;
+    let own: Vec<Features> = photos
+        .par_iter()
+        .map(|p| sift::detect(&p.image.luma(), &matching::valid_area(&p.image, MARGIN), MAX_CORNERS))
+        .collect();
+    progress.check()?;
+    let mut families = vec![own];
+    if features.len() == photos.len() {
+        families.push(known::masked(photos, features));
+    }
+    Ok(families)
+}
 
 /// Features on valid pixels.
 fn within(f: &Features, valid: &Plane<bool>) -> Features {
@@ -142,10 +157,8 @@ fn relate_all(
     Ok(out)
 }
 
-fn relate(photos: &[Photo], families: &[Vec<Features>], empty: &Model, i: usize, j: usize) -> Relation {
-    if same_picture(&photos[i].image, &photos[j].image) {
-        return Relation::Same;
-    }
+/// Matches by descriptor between two views, all families, best first: (pixel, pixel, link).
+fn putative(families: &[Vec<Features>], i: usize, j: usize) -> Vec<(DVec2, DVec2, Link)> {
     let mut all: Vec<(DVec2, DVec2, Link)> = Vec::new();
     let (mut start_i, mut start_j) = (0, 0);
     for (k, family) in families.iter().enumerate() {
@@ -161,6 +174,14 @@ fn relate(photos: &[Photo], families: &[Vec<Features>], empty: &Model, i: usize,
         start_j += b.points.len();
     }
     all.sort_by(|a, b| b.2.quality.total_cmp(&a.2.quality).then(a.2.first.cmp(&b.2.first)));
+    all
+}
+
+fn relate(photos: &[Photo], families: &[Vec<Features>], empty: &Model, i: usize, j: usize) -> Relation {
+    if same_picture(&photos[i].image, &photos[j].image) {
+        return Relation::Same;
+    }
+    let all = putative(families, i, j);
     let centred = |view: usize, p: DVec2| (p - empty.centres[view]) / empty.focal(view);
     let x: Vec<DVec2> = all.iter().map(|m| centred(i, m.0)).collect();
     let y: Vec<DVec2> = all.iter().map(|m| centred(j, m.1)).collect();
@@ -228,6 +249,12 @@ fn explain(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Result<(
     )))
 }
 
+/// All keypoints of a view, numbered as the links number them.
+fn keypoints(families: &[Vec<Features>], view: usize) -> Vec<Sighting> {
+    let all = families.iter().enumerate().flat_map(|(k, f)| f[view].points.iter().map(move |p| (k, *p)));
+    all.map(|(family, pixel)| Sighting { view, pixel, sigma: 1.0, family }).collect()
+}
+
 fn assemble(
     photos: &[Photo],
     families: &[Vec<Features>],
@@ -235,12 +262,7 @@ fn assemble(
     relations: Vec<(usize, usize, Relation)>,
     progress: &dyn Progress,
 ) -> Result<Model> {
-    let keypoints = |view: usize| {
-        let all =
-            families.iter().enumerate().flat_map(move |(k, f)| f[view].points.iter().map(move |p| (k, *p)));
-        all.map(|(family, pixel)| Sighting { view, pixel, sigma: 1.0, family }).collect()
-    };
-    let points: Vec<Vec<Sighting>> = (0..photos.len()).map(keypoints).collect();
+    let points: Vec<Vec<Sighting>> = (0..photos.len()).map(|v| keypoints(families, v)).collect();
     let (mut pairs, mut links) = (Vec::new(), Vec::new());
     for (first, second, relation) in relations {
         if let Relation::Usable(geometry, l) = relation {

@@ -41,3 +41,85 @@ fn corners_alone_place_the_breakfast_cameras() {
 fn learned_features_place_the_breakfast_cameras() {
     check("corners + XFeat", learned, 0.2, 0.003, 0.01);
 }
+
+#[test]
+fn known_cameras_give_points_on_the_true_surface() {
+    let truth = testing::train(&testing::folder());
+    let model = with_cameras(&truth.photos, &truth.cameras, &[], &Silent).unwrap();
+    let mut errors = Vec::new();
+    for p in &model.points {
+        for (v, pixel) in &p.views {
+            let width = truth.photos[*v].image.width;
+            let z = testing::depth(&truth.folder, &truth.photos[*v].stem)
+                [pixel.y as usize * width + pixel.x as usize] as f64;
+            errors.push((model.cameras[*v].project(p.position).1 / z - 1.0).abs());
+        }
+        if errors.len() > 400 {
+            break;
+        }
+    }
+    assert!(super::super::numeric::median(&mut errors).unwrap() < 0.005);
+    // Cameras of other photos must be refused: mirror the rig.
+    let mut wrong = truth.cameras.clone();
+    wrong.reverse();
+    let error = with_cameras(&truth.photos, &wrong, &[], &Silent).unwrap_err().to_string();
+    println!("{error}");
+    assert!(error.contains("do not fit"));
+}
+
+/// A photo of the same camera turned by `angle` about the vertical: the homography K R K⁻¹.
+fn turned(photo: &Photo, focal: f64, angle: f64) -> Photo {
+    let (w, h) = (photo.image.width, photo.image.height);
+    let (s, c) = angle.sin_cos();
+    let mut out = photo.clone();
+    out.stem = format!("{}-turned", photo.stem);
+    for y in 0..h {
+        for x in 0..w {
+            let (u, v) =
+                ((x as f64 + 0.5 - w as f64 / 2.0) / focal, (y as f64 + 0.5 - h as f64 / 2.0) / focal);
+            let (rx, rz) = (c * u + s, -s * u + c);
+            let (px, py) = (rx / rz * focal + w as f64 / 2.0, v / rz * focal + h as f64 / 2.0);
+            out.image.data[y * w + x] = bilinear(&photo.image, px - 0.5, py - 0.5);
+        }
+    }
+    out
+}
+
+fn bilinear(image: &RgbImage, x: f64, y: f64) -> [f32; 3] {
+    let (x, y) = (x.clamp(0.0, image.width as f64 - 1.001), y.clamp(0.0, image.height as f64 - 1.001));
+    let (i, j, fx, fy) = (x as usize, y as usize, x.fract() as f32, y.fract() as f32);
+    std::array::from_fn(|k| {
+        let top = image.at(i, j)[k] * (1.0 - fx) + image.at(i + 1, j)[k] * fx;
+        let low = image.at(i, j + 1)[k] * (1.0 - fx) + image.at(i + 1, j + 1)[k] * fx;
+        top * (1.0 - fy) + low * fy
+    })
+}
+
+/// The error for photos that cannot be reconstructed: one line, exit code 2, naming the photos.
+fn refusal(photos: &[Photo]) -> String {
+    let error = reconstruct(photos, &[], &Silent).unwrap_err();
+    let text = error.to_string();
+    assert!(error.exit_code() == 2 && !text.contains('\n') && text.contains(&photos[1].stem), "{text}");
+    text
+}
+
+#[test]
+fn photos_without_geometry_are_refused_by_name() {
+    let truth = testing::train(&testing::folder());
+    let a = &truth.photos[0];
+    let twice = [a.clone(), Photo { stem: "copy".into(), ..a.clone() }];
+    assert!(refusal(&twice).contains("identical photos: train_00–copy"));
+    let turn = [a.clone(), turned(a, truth.cameras[0].fx, 0.15)];
+    assert!(refusal(&turn).contains("no parallax"));
+    let mut sky = a.clone();
+    sky.stem = "sky".into();
+    sky.image.data.iter_mut().enumerate().for_each(|(i, c)| *c = [0.4, 0.6, 0.5 + 1e-6 * i as f32]);
+    assert!(refusal(&[a.clone(), sky]).contains("do not overlap"));
+    // Mirroring keeps the texture but no camera motion explains it.
+    let mut mirrored = truth.photos[1].clone();
+    mirrored.stem = "mirrored".into();
+    for row in mirrored.image.data.chunks_mut(mirrored.image.width) {
+        row.reverse();
+    }
+    assert!(refusal(&[a.clone(), mirrored]).contains("do not overlap"));
+}

@@ -1,0 +1,89 @@
+//! Choosing and running a geometry initialiser.
+use super::{Features, SparseModel, sfm};
+use crate::infer::Registry;
+use crate::infer::xfeat::XFeat;
+use crate::photo::Photo;
+use crate::progress::Progress;
+use crate::scene::Camera;
+use crate::{Error, Result};
+
+/// Where cameras and points come from.
+#[derive(Clone, Debug, Default)]
+pub enum InitChoice {
+    /// The best that is available: `Sfm`.
+    #[default]
+    Auto,
+    /// Structure from motion over the photos; needs no large model.
+    Sfm,
+    /// Known cameras, joined to the photos by file name without extension; any resolution of the same aspect.
+    Cameras(Vec<Camera>),
+}
+
+/// Keypoints kept per photo from the learned detector.
+const MAX_LEARNED: usize = 4096;
+
+/// Learned features of all photos.
+pub fn learned_features(
+    photos: &[Photo],
+    registry: &Registry,
+    progress: &dyn Progress,
+) -> Result<Vec<Features>> {
+    let mut xfeat = XFeat::load(registry)?;
+    photos
+        .iter()
+        .map(|p| {
+            progress.check()?;
+            Ok(Features::from(xfeat.detect(&p.image, MAX_LEARNED)?))
+        })
+        .collect()
+}
+
+/// Cameras and sparse points by structure from motion (`cameras` = None) or for known cameras. Without a registry only
+/// the built-in corner detector is used.
+pub fn sparse(
+    photos: &[Photo],
+    cameras: Option<&[Camera]>,
+    registry: Option<&Registry>,
+    progress: &dyn Progress,
+) -> Result<SparseModel> {
+    let features = match registry {
+        Some(r) => learned_features(photos, r, progress)?,
+        None => Vec::new(),
+    };
+    match cameras {
+        Some(c) => sfm::with_cameras(photos, &assigned(photos, c)?, &features, progress),
+        None => sfm::reconstruct(photos, &features, progress),
+    }
+}
+
+/// One camera per photo, at working resolution, by file name without extension.
+fn assigned(photos: &[Photo], cameras: &[Camera]) -> Result<Vec<Camera>> {
+    let stem = |name: &str| {
+        std::path::Path::new(name).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default()
+    };
+    photos
+        .iter()
+        .map(|p| {
+            let camera = cameras.iter().find(|c| stem(&c.name) == p.stem).ok_or_else(|| {
+                Error::input(format!(
+                    "the camera file has no camera named {}; it names {}",
+                    p.stem,
+                    cameras.iter().map(|c| stem(&c.name)).collect::<Vec<_>>().join(", ")
+                ))
+            })?;
+            let size = (p.image.width as u32, p.image.height as u32);
+            if (camera.width, camera.height) == p.original_size {
+                return Ok(p.to_working.camera(camera, size));
+            }
+            let (a, b) = (camera.width as f64 * size.1 as f64, camera.height as f64 * size.0 as f64);
+            // One pixel of rounding on the short side of a small image.
+            if (a / b - 1.0).abs() > 0.01 {
+                return Err(Error::input(format!(
+                    "camera {} is for {}×{} pixels, the photo is {}×{}: the aspects differ",
+                    camera.name, camera.width, camera.height, p.original_size.0, p.original_size.1
+                )));
+            }
+            Ok(camera.resized(size.0, size.1))
+        })
+        .collect()
+}

@@ -1,0 +1,113 @@
+//! Sparse points for cameras that are known already.
+use super::model::{MIN_ANGLE_DEGREES, Model, Sighting};
+use super::{Features, THRESHOLD, colour_at, corner_families, matching, pairs_of, tracks};
+use crate::photo::Photo;
+use crate::pose::two_view::{fundamental, sampson};
+use crate::pose::{SparseModel, SparsePoint};
+use crate::progress::Progress;
+use crate::scene::Camera;
+use crate::{Error, Result};
+use glam::DVec2;
+use rayon::prelude::*;
+use tracks::Link;
+
+/// Fewest points that tell the depth range of a scene.
+const MIN_POINTS: usize = 20;
+/// Least share of the matches by appearance that must obey the given cameras: chance gives about 2 % (a band of 2 × 3 px
+/// in 480), true cameras 20 % and more.
+const MIN_AGREEMENT: f64 = 0.1;
+
+/// Points for given cameras (one per photo, at working resolution). The cameras keep their intrinsics, relative poses and
+/// unit of length; the world frame becomes that of camera 0.
+pub fn with_cameras(
+    photos: &[Photo],
+    cameras: &[Camera],
+    features: &[Features],
+    progress: &dyn Progress,
+) -> Result<SparseModel> {
+    if photos.len() < 2 || photos.len() != cameras.len() {
+        return Err(Error::input("known cameras need one camera per photo and at least two photos"));
+    }
+    let families = corner_families(photos, features, progress)?;
+    // Every view becomes a camera with one focal length and its principal point at the origin.
+    let focal = |c: &Camera| 0.5 * (c.fx + c.fy);
+    let flat = |c: &Camera, p: DVec2| DVec2::new((p.x - c.cx) / c.fx, (p.y - c.cy) / c.fy) * focal(c);
+    let long = photos[0].image.width.max(photos[0].image.height) as f64;
+    let threshold = THRESHOLD * long;
+    let back = cameras[0].pose.inverse();
+    let mut model = Model {
+        poses: cameras.iter().map(|c| Some(c.pose.compose(&back))).collect(),
+        centres: vec![DVec2::ZERO; cameras.len()],
+        group: (0..cameras.len()).collect(),
+        focals: cameras.iter().map(focal).collect(),
+        priors: vec![(0.0, 0.0); cameras.len()],
+        tracks: Vec::new(),
+    };
+    let per_pair: Vec<(usize, Vec<Link>)> = pairs_of(photos.len())
+        .into_par_iter()
+        .map(|(i, j)| {
+            let relative = cameras[j].pose.compose(&cameras[i].pose.inverse());
+            let f = fundamental(&relative, focal(&cameras[i]), focal(&cameras[j]));
+            let put = super::putative(&families, i, j);
+            let close = move |m: &(DVec2, DVec2, Link)| {
+                sampson(&f, flat(&cameras[i], m.0), flat(&cameras[j], m.1)) < threshold * threshold
+            };
+            (put.len(), put.into_iter().filter(close).map(|m| m.2).collect())
+        })
+        .collect();
+    let tried: usize = per_pair.iter().map(|p| p.0).sum();
+    let mut links: Vec<Link> = per_pair.into_iter().flat_map(|p| p.1).collect();
+    let agreement = links.len() as f64 / tried.max(1) as f64;
+    let keypoints: Vec<Vec<Sighting>> = (0..photos.len())
+        .map(|v| {
+            let mut all = super::keypoints(&families, v);
+            all.iter_mut().for_each(|s| s.pixel = flat(&cameras[v], s.pixel));
+            all
+        })
+        .collect();
+    model.tracks = tracks::join(&mut links, &keypoints)
+        .into_iter()
+        .map(|sightings| super::model::Track { position: None, sightings })
+        .collect();
+    model.triangulate_all(threshold);
+    model.prune(threshold);
+    if model.tracks.len() < MIN_POINTS || agreement < MIN_AGREEMENT {
+        return Err(Error::input(format!(
+            "the given cameras and the photos do not fit: only {:.0} % of the matches between the photos and {} points \
+             (rays at least {MIN_ANGLE_DEGREES}° apart) agree with them; check that the cameras belong to these photos",
+            100.0 * agreement,
+            model.tracks.len()
+        )));
+    }
+    let placed: Vec<Camera> = cameras
+        .iter()
+        .zip(&model.poses)
+        .map(|(c, p)| Camera { pose: p.unwrap_or(c.pose), ..c.clone() })
+        .collect();
+    let points = model
+        .tracks
+        .iter()
+        .filter_map(|t| {
+            let views: Vec<(usize, DVec2)> = t
+                .sightings
+                .iter()
+                .map(|s| {
+                    let (c, p) = (&cameras[s.view], s.pixel / focal(&cameras[s.view]));
+                    (s.view, DVec2::new(p.x * c.fx + c.cx, p.y * c.fy + c.cy))
+                })
+                .collect();
+            let (v, p) = *views.first()?;
+            Some(SparsePoint { position: t.position?, colour: colour_at(&photos[v].image, p), views })
+        })
+        .collect();
+    Ok(SparseModel { cameras: placed, points, focal_log_sigma: None })
+}
+
+/// Masked features of all detectors, per family and photo.
+pub(super) fn masked(photos: &[Photo], features: &[Features]) -> Vec<Features> {
+    photos
+        .iter()
+        .zip(features)
+        .map(|(p, f)| super::within(f, &matching::valid_area(&p.image, super::MARGIN)))
+        .collect()
+}
