@@ -10,3 +10,8 @@ pub mod twin;
 #[cfg(test)]
 mod twin_tests;
 pub mod view;
+pub mod adam;
+pub mod compact;
+pub mod metrics;
+pub mod ssim_l1;
+pub mod sum;

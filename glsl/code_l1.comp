@@ -1,0 +1,37 @@
+#version 460
+// The language loss of one view: L1 between rendered features and the target code where there is a label (ALGORITHMS 8.1).
+// Labels index rows of `codes`, all levels one after the other; -1 has no influence, not even on the gradient's bits.
+// mode 0: upstream = weight[level] * sign(F - code);  mode 1 (lifting): upstream = code, so that the backward pass
+// returns the blending-weighted sum of codes of every splat.
+layout(local_size_x = 64) in;
+layout(std430, binding = 0) readonly buffer Labels { int labels[]; };  // [levels, H*W]
+layout(std430, binding = 1) readonly buffer Codes { float codes[]; };  // [K, width]
+layout(std430, binding = 2) readonly buffer Weights { float weights[]; };  // [levels]
+layout(std430, binding = 3) readonly buffer Planes { float planes[]; };  // [4 + levels*width, H*W]: RGB, depth, features
+layout(std430, binding = 4) writeonly buffer Upstream { float upstream[]; };  // [4 + levels*width + 1, H*W]
+layout(std430, binding = 5) writeonly buffer Loss { float loss[]; };  // [H*W] weighted sum over levels
+layout(push_constant) uniform Push { uint pixels; uint levels; uint width; uint mode; };
+
+void main() {
+    uint pixel = gl_GlobalInvocationID.x;
+    if (pixel >= pixels) return;
+    float total = 0.0;
+    for (uint level = 0u; level < levels; level++) {
+        int label = labels[level * pixels + pixel];
+        float weight = weights[level];
+        float sum = 0.0;
+        for (uint k = 0u; k < width; k++) {
+            uint at = (4u + level * width + k) * pixels + pixel;
+            float slope = 0.0;
+            if (label >= 0) {
+                float code = codes[uint(label) * width + k];
+                float difference = planes[at] - code;
+                sum += abs(difference);
+                slope = mode == 0u ? weight * sign(difference) : code;
+            }
+            upstream[at] = slope;
+        }
+        total += weight * sum;
+    }
+    loss[pixel] = total;
+}

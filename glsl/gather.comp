@@ -1,0 +1,16 @@
+#version 460
+// Rows of a [N, stride] array by index: to[i] = from[index[i]]; index 0xffffffff makes a row of zeros.
+// Serves pruning, compaction and densification for parameters and for optimiser state alike.
+layout(local_size_x = 256) in;
+layout(std430, binding = 0) readonly buffer Index { uint index[]; };
+layout(std430, binding = 1) readonly buffer From { uint from[]; };
+layout(std430, binding = 2) writeonly buffer To { uint to[]; };
+layout(push_constant) uniform Push { uint rows; uint stride; };
+
+void main() {
+    uint i = (gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x) * 256u + gl_LocalInvocationID.x;
+    if (i >= rows * stride) return;
+    uint row = i / stride;
+    uint source = index[row];
+    to[i] = source == 0xffffffffu ? 0u : from[source * stride + (i - row * stride)];
+}

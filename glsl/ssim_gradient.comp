@@ -1,0 +1,50 @@
+#version 460
+// SSIM, pass 3 of 3: vertical blur of the derivatives, then the gradient of
+//   l1_weight * mean|x-y| + dssim_weight * (1 - mean SSIM)
+// by x; the weights arrive divided by the number of values. Also the sum of |x-y| per strip.
+#extension GL_EXT_control_flow_attributes : require
+#define STRIP 16
+layout(local_size_x = 64) in;
+layout(std430, binding = 0) readonly buffer Rendered { float rendered[]; };  // [C, H, W]
+layout(std430, binding = 1) readonly buffer Target { float target_image[]; };  // [C, H, W]
+layout(std430, binding = 2) readonly buffer Slopes { vec2 slopes[]; };  // [C, H, W]
+layout(std430, binding = 3) readonly buffer Cross { float cross_slopes[]; };  // [C, H, W]
+layout(std430, binding = 4) writeonly buffer Gradient { float gradient[]; };  // [C, H, W]: the first planes of the upstream stack
+layout(std430, binding = 5) writeonly buffer Sums { float sums[]; };  // [C, strips, W] sum of |x-y| over each strip
+layout(push_constant) uniform Push { int width; int height; float l1_weight; float dssim_weight; };
+#include "shared/ssim.glsl"
+
+void main() {
+    int x = int(gl_GlobalInvocationID.x);
+    int y0 = int(gl_WorkGroupID.y) * STRIP;
+    int channel = int(gl_WorkGroupID.z);
+    int base = channel * width * height;
+    if (x >= width) return;
+    float a[STRIP], b[STRIP], c[STRIP];
+    [[unroll]] for (int k = 0; k < STRIP; k++) { a[k] = 0.0; b[k] = 0.0; c[k] = 0.0; }
+    [[unroll]] for (int i = 0; i < STRIP + 2 * HALF; i++) {
+        int y = y0 + i - HALF;
+        bool inside = y >= 0 && y < height;
+        int q = base + clamp(y, 0, height - 1) * width + x;
+        vec2 slope = inside ? slopes[q] : vec2(0.0);
+        float cross_slope = inside ? cross_slopes[q] : 0.0;
+        [[unroll]] for (int k = 0; k < STRIP; k++) {
+            if (i - k >= 0 && i - k < 2 * HALF + 1) {
+                float w = WINDOW[i - k];
+                a[k] = fma(w, slope.x, a[k]);
+                b[k] = fma(w, slope.y, b[k]);
+                c[k] = fma(w, cross_slope, c[k]);
+            }
+        }
+    }
+    float sum = 0.0;
+    [[unroll]] for (int k = 0; k < STRIP; k++) {
+        if (y0 + k < height) {
+            int q = base + (y0 + k) * width + x;
+            float u = rendered[q], v = target_image[q];
+            gradient[q] = l1_weight * sign(u - v) - dssim_weight * (a[k] + 2.0 * u * b[k] + v * c[k]);
+            sum += abs(u - v);
+        }
+    }
+    sums[(channel * int(gl_NumWorkGroups.y) + int(gl_WorkGroupID.y)) * width + x] = sum;
+}

@@ -1,0 +1,251 @@
+//! Splats from points: size from the pixel footprint and the nearest neighbours, colour from the photos (ALGORITHMS 7.1).
+use super::options::InitOptions;
+use super::schedule::Random;
+use crate::scene::{PointCloud, Splats};
+use crate::{Error, Result};
+use glam::Vec3;
+use rayon::prelude::*;
+use std::collections::HashMap;
+
+/// SH basis constant of degree 0: `rgb = 0.5 + C0·dc`.
+pub const SH_C0: f32 = 0.282_094_8;
+
+/// Makes one isotropic splat per (kept) point, SH degree 0.
+pub fn splats_from_points(points: &PointCloud, options: &InitOptions, seed: u64) -> Result<Splats> {
+    let finite: Vec<usize> = (0..points.len())
+        .filter(|&i| points.positions[i].iter().chain(&points.colours[i]).all(|v| v.is_finite()))
+        .collect();
+    if finite.len() < 4 {
+        return Err(Error::work(format!(
+            "training needs at least 4 points and got {}; the photos may not overlap enough",
+            finite.len()
+        )));
+    }
+    let keep = thin(points, finite, options.max_points.max(4), seed);
+    let positions: Vec<Vec3> = keep.iter().map(|&i| Vec3::from(points.positions[i])).collect();
+    let spacing = neighbour_distances(&positions);
+    let logit = (options.opacity / (1.0 - options.opacity)).ln();
+    // Thinning spreads the same surface over fewer splats: each must cover proportionally more of it.
+    let grow = (points.len() as f32 / keep.len() as f32).sqrt();
+    let mut splats = Splats { sh_degree: 0, ..Splats::default() };
+    for (n, &i) in keep.iter().enumerate() {
+        let footprint = match points.radius.get(i) {
+            Some(&r) if r > 0.0 && r.is_finite() => r * options.footprint * grow,
+            _ => f32::INFINITY,
+        };
+        // 1e-7 is the squared-distance floor of the reference implementation for coincident points.
+        let scale = footprint.min(spacing[n] * options.neighbours).max(1e-7f32.sqrt());
+        splats.means.push(points.positions[i]);
+        splats.log_scales.push([scale.ln(); 3]);
+        splats.quats.push([1.0, 0.0, 0.0, 0.0]);
+        splats.opacity_logits.push(logit);
+        splats.sh.extend(points.colours[i].map(|c| (c - 0.5) / SH_C0));
+    }
+    Ok(splats)
+}
+
+/// Reduces `candidates` to at most `max` points: the most confident point of every voxel, in voxels just large enough,
+/// then random ones up to the cap. Thin and far regions stay covered.
+fn thin(points: &PointCloud, mut candidates: Vec<usize>, max: usize, seed: u64) -> Vec<usize> {
+    if candidates.len() <= max {
+        return candidates;
+    }
+    Random::new(seed).shuffle(&mut candidates);
+    // The voxel edge is in pixel footprints: on a surface with one point per footprint, a voxel of edge √ratio holds
+    // `ratio` points. Overlapping views hold more, so start there and grow until the voxels fit under the cap.
+    let mut edge = (candidates.len() as f32 / max as f32).sqrt() * 0.7;
+    let mut best = occupied(points, &candidates, edge);
+    while best.len() > max {
+        edge *= 1.2;
+        best = occupied(points, &candidates, edge);
+    }
+    let mut chosen = vec![false; points.len()];
+    best.values().for_each(|&i| chosen[i] = true);
+    let (mut keep, rest): (Vec<usize>, Vec<usize>) = candidates.into_iter().partition(|&i| chosen[i]);
+    keep.extend(rest);
+    keep.truncate(max);
+    keep.sort_unstable();
+    keep
+}
+
+/// The most confident candidate of every occupied voxel of `edge` pixel footprints.
+fn occupied(points: &PointCloud, candidates: &[usize], edge: f32) -> HashMap<[i64; 4], usize> {
+    let confidence = |j: usize| points.confidence.get(j).copied().unwrap_or(0.0);
+    let mut best: HashMap<[i64; 4], usize> = HashMap::new();
+    for &i in candidates {
+        let radius = points.radius.get(i).copied().filter(|r| *r > 0.0 && r.is_finite()).unwrap_or(1e-3);
+        // Octaves of the footprint, so near and far surfaces are both thinned in image space.
+        let octave = radius.log2().round();
+        let cell = octave.exp2() * edge;
+        let p = points.positions[i].map(|v| (v / cell).floor() as i64);
+        let entry = best.entry([octave as i64, p[0], p[1], p[2]]).or_insert(i);
+        if confidence(i) > confidence(*entry) {
+            *entry = i;
+        }
+    }
+    best
+}
+
+/// Root of the mean squared distance to the three nearest other points, per point.
+pub fn neighbour_distances(positions: &[Vec3]) -> Vec<f32> {
+    let tree = KdTree::new(positions);
+    (0..positions.len())
+        .into_par_iter()
+        .map(|i| {
+            let squares = tree.nearest(positions[i], i);
+            let found: Vec<f32> = squares.into_iter().filter(|d| d.is_finite()).collect();
+            (found.iter().sum::<f32>() / found.len().max(1) as f32).sqrt()
+        })
+        .collect()
+}
+
+/// A balanced k-d tree over point indices: the median of each range splits it along its widest axis.
+struct KdTree<'a> {
+    positions: &'a [Vec3],
+    order: Vec<u32>,
+    axes: Vec<u8>,
+}
+
+impl<'a> KdTree<'a> {
+    fn new(positions: &'a [Vec3]) -> Self {
+        let mut order: Vec<u32> = (0..positions.len() as u32).collect();
+        let mut axes = vec![0; positions.len()];
+        Self::build(positions, &mut order, &mut axes);
+        KdTree { positions, order, axes }
+    }
+
+    fn build(positions: &[Vec3], order: &mut [u32], axes: &mut [u8]) {
+        if order.len() < 2 {
+            return;
+        }
+        let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+        for &i in order.iter() {
+            low = low.min(positions[i as usize]);
+            high = high.max(positions[i as usize]);
+        }
+        let axis = (high - low).max_position();
+        let middle = order.len() / 2;
+        order.select_nth_unstable_by(middle, |&a, &b| {
+            positions[a as usize][axis].total_cmp(&positions[b as usize][axis])
+        });
+        axes[middle] = axis as u8;
+        let (left, right) = order.split_at_mut(middle);
+        let (left_axes, right_axes) = axes.split_at_mut(middle);
+        // Below a few thousand points a task costs more than it saves.
+        if left.len() > 4096 {
+            rayon::join(
+                || Self::build(positions, left, left_axes),
+                || Self::build(positions, &mut right[1..], &mut right_axes[1..]),
+            );
+        } else {
+            Self::build(positions, left, left_axes);
+            Self::build(positions, &mut right[1..], &mut right_axes[1..]);
+        }
+    }
+
+    /// Squared distances to the three nearest points other than `skip`, infinite when there are fewer.
+    fn nearest(&self, query: Vec3, skip: usize) -> [f32; 3] {
+        let mut best = [f32::INFINITY; 3];
+        self.search(query, skip as u32, 0, self.order.len(), &mut best);
+        best
+    }
+
+    fn search(&self, query: Vec3, skip: u32, from: usize, to: usize, best: &mut [f32; 3]) {
+        if from >= to {
+            return;
+        }
+        let middle = from + (to - from) / 2;
+        let index = self.order[middle];
+        let point = self.positions[index as usize];
+        if index != skip {
+            let mut d = point.distance_squared(query);
+            for slot in best.iter_mut() {
+                if d < *slot {
+                    std::mem::swap(&mut d, slot);
+                }
+            }
+        }
+        if to - from == 1 {
+            return;
+        }
+        let axis = self.axes[middle] as usize;
+        let offset = query[axis] - point[axis];
+        let (near, far) =
+            if offset < 0.0 { ((from, middle), (middle + 1, to)) } else { ((middle + 1, to), (from, middle)) };
+        self.search(query, skip, near.0, near.1, best);
+        if offset * offset < best[2] {
+            self.search(query, skip, far.0, far.1, best);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cloud(n: usize, seed: u64) -> PointCloud {
+        let mut random = Random::new(seed);
+        let mut points = PointCloud::default();
+        for _ in 0..n {
+            points.positions.push([0; 3].map(|_| random.uniform() as f32));
+            points.colours.push([0; 3].map(|_| random.uniform() as f32));
+            points.confidence.push(random.uniform() as f32);
+            points.view.push(0);
+            points.radius.push(0.01);
+        }
+        points
+    }
+
+    #[test]
+    fn neighbours_match_brute_force() {
+        let points = cloud(700, 3);
+        let positions: Vec<Vec3> = points.positions.iter().map(|p| Vec3::from(*p)).collect();
+        for (i, got) in neighbour_distances(&positions).into_iter().enumerate() {
+            let mut all: Vec<f32> = (0..positions.len())
+                .filter(|&j| j != i)
+                .map(|j| positions[i].distance_squared(positions[j]))
+                .collect();
+            all.sort_by(f32::total_cmp);
+            let expected = (all[..3].iter().sum::<f32>() / 3.0).sqrt();
+            assert!((got - expected).abs() < 1e-6, "{i}: {got} {expected}");
+        }
+    }
+
+    #[test]
+    fn splats_keep_colour_and_respect_both_size_limits() {
+        let points = cloud(200, 5);
+        let options = InitOptions { max_points: 1000, opacity: 0.3, footprint: 0.5, neighbours: 1.0 };
+        let splats = splats_from_points(&points, &options, 0).unwrap();
+        let positions: Vec<Vec3> = points.positions.iter().map(|p| Vec3::from(*p)).collect();
+        let spacing = neighbour_distances(&positions);
+        for i in 0..splats.len() {
+            let scale = splats.log_scales[i][0].exp();
+            assert!((scale - spacing[i].min(0.005)).abs() < 1e-6);
+            let o = 1.0 / (1.0 + (-splats.opacity_logits[i]).exp());
+            assert!((o - 0.3).abs() < 1e-6);
+            for c in 0..3 {
+                assert!((0.5 + SH_C0 * splats.sh[3 * i + c] - points.colours[i][c]).abs() < 1e-6);
+            }
+        }
+    }
+
+    #[test]
+    fn thinning_keeps_the_cap_and_sparse_regions() {
+        let mut points = cloud(4000, 9);
+        points.positions[77] = [50.0, 50.0, 50.0];
+        let options = InitOptions { max_points: 500, opacity: 0.5, footprint: 0.7, neighbours: 1.0 };
+        let splats = splats_from_points(&points, &options, 1).unwrap();
+        assert_eq!(splats.len(), 500);
+        assert!(splats.means.contains(&[50.0, 50.0, 50.0]), "the only point of its region survives");
+        assert_eq!(splats, splats_from_points(&points, &options, 1).unwrap(), "seeded");
+    }
+
+    #[test]
+    fn too_few_or_broken_points_are_an_error() {
+        let mut points = cloud(5, 1);
+        points.positions[0][1] = f32::NAN;
+        points.colours[1][0] = f32::INFINITY;
+        let options = InitOptions { max_points: 10, opacity: 0.5, footprint: 0.7, neighbours: 1.0 };
+        assert!(splats_from_points(&points, &options, 0).is_err());
+    }
+}

@@ -1,0 +1,222 @@
+//! What the training stages can be told, and the presets.
+use super::densify::DensifyOptions;
+use super::pose::PoseOptions;
+use super::schedule::Exponential;
+
+/// How much time a fit may take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Preset {
+    /// A few hundred steps: minutes on a CPU device.
+    Draft,
+    /// The recommended length on a GPU.
+    Default,
+    /// The constants of the reference implementation behind the paper (ALGORITHMS 7.2, column [AUTH]).
+    Paper,
+}
+
+/// How splats start (ALGORITHMS 7.1).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct InitOptions {
+    /// At most this many splats; more points are thinned to an even density by voxels.
+    pub max_points: usize,
+    /// Opacity of a new splat, in (0, 1).
+    pub opacity: f32,
+    /// Standard deviation of a new splat in units of its pixel footprint (`PointCloud::radius`).
+    pub footprint: f32,
+    /// Upper bound of the standard deviation in units of the mean distance to the three nearest points.
+    pub neighbours: f32,
+}
+
+/// Learning rates per parameter class.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rates {
+    /// Means, times the scene extent.
+    pub means: Exponential,
+    /// Log-scales.
+    pub log_scales: f64,
+    /// Quaternions.
+    pub quats: f64,
+    /// Opacity logits.
+    pub opacity: f64,
+    /// SH, DC coefficients.
+    pub sh_dc: f64,
+    /// SH, the other coefficients.
+    pub sh_rest: f64,
+}
+
+/// Options of [`super::train_rgb`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct RgbOptions {
+    /// Optimisation steps; one view each.
+    pub iterations: usize,
+    /// Seeds the view order, thinning and densification.
+    pub seed: u64,
+    /// Start of the splats.
+    pub init: InitOptions,
+    /// Learning rates.
+    pub rates: Rates,
+    /// Weight of mean |render − photo|.
+    pub l1_weight: f64,
+    /// Weight of 1 − SSIM.
+    pub dssim_weight: f64,
+    /// Weight of the relative depth difference to the stereo depth where that is confident; 0 = off.
+    pub depth_weight: f64,
+    /// Stereo depth counts only where its confidence is at least this.
+    pub min_confidence: f32,
+    /// Weight of `mean max(0, s_max/s_min − 8)`, against needles; 0 = off.
+    pub ratio_weight: f64,
+    /// Drop splats with a lower opacity …
+    pub prune_opacity: f32,
+    /// … every so many steps (0 = never) …
+    pub prune_every: usize,
+    /// … from this step on.
+    pub prune_from: usize,
+    /// Clone and split, if at all.
+    pub densify: Option<DensifyOptions>,
+    /// Camera refinement, if at all. Camera 0 never moves.
+    pub poses: Option<PoseOptions>,
+    /// SH degree of the result, 0–3.
+    pub sh_degree: u32,
+    /// A point of the loss curve every so many steps.
+    pub report_every: usize,
+}
+
+impl RgbOptions {
+    /// The options of a preset.
+    pub fn preset(preset: Preset) -> Self {
+        match preset {
+            Preset::Paper => Self::paper(),
+            // Fewer steps take proportionally longer ones: with Adam the distance a parameter can travel is about
+            // rate × steps. Rates stay below the point where the loss oscillates (means: a tenth of a pixel a step).
+            Preset::Draft => Self::scaled(300, 2.0),
+            Preset::Default => Self::scaled(1000, 1.0),
+        }
+    }
+
+    fn scaled(iterations: usize, speed: f64) -> Self {
+        let paper = Self::paper();
+        RgbOptions {
+            iterations,
+            // Stereo points are dense and already have the right colour, so splats start nearly opaque: from 0.1 the
+            // first hundred steps would only build up opacity.
+            init: InitOptions { max_points: 200_000, opacity: 0.6, footprint: 0.7, neighbours: 1.0 },
+            rates: Rates {
+                means: Exponential { start: 1.6e-4 * speed, end: 1.6e-5 * speed, steps: iterations },
+                log_scales: 5e-3 * speed,
+                quats: 1e-3 * speed,
+                opacity: 0.025 * speed,
+                sh_dc: 2.5e-3 * speed,
+                sh_rest: 2.5e-3 / 20.0 * speed,
+            },
+            depth_weight: 0.02,
+            min_confidence: 0.5,
+            ratio_weight: 1e-3,
+            poses: Some(PoseOptions {
+                start: (iterations / 10).min(100),
+                rate: Exponential { start: 1e-4, end: 1e-6, steps: iterations },
+            }),
+            ..paper
+        }
+    }
+
+    fn paper() -> Self {
+        RgbOptions {
+            iterations: 1000,
+            seed: 0,
+            init: InitOptions { max_points: 1_000_000, opacity: 0.1, footprint: f32::INFINITY, neighbours: 1.0 },
+            rates: Rates {
+                means: Exponential { start: 1.6e-4, end: 1.6e-6, steps: 30_000 },
+                log_scales: 5e-3,
+                quats: 1e-3,
+                opacity: 0.05,
+                sh_dc: 2.5e-3,
+                sh_rest: 2.5e-3 / 20.0,
+            },
+            l1_weight: 0.8,
+            dssim_weight: 0.2,
+            depth_weight: 0.0,
+            min_confidence: 0.5,
+            ratio_weight: 0.0,
+            prune_opacity: 0.005,
+            prune_every: 100,
+            prune_from: 200,
+            densify: None,
+            poses: Some(PoseOptions {
+                start: 0,
+                rate: Exponential { start: 1e-4, end: 1e-6, steps: 1000 },
+            }),
+            sh_degree: 0,
+            report_every: 10,
+        }
+    }
+}
+
+/// How raw splat features become what is rendered (ALGORITHMS 8.4).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum FeatureGauge {
+    /// `f̂ = f/(‖f‖+ε)` per level, as the paper.
+    Normalised {
+        /// ε; only the ratio of ε and learning rate matters when features start at zero.
+        epsilon: f32,
+    },
+    /// Features are rendered as they are.
+    Linear,
+}
+
+/// Options of [`super::train_language`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct LanguageOptions {
+    /// Optimisation steps; one view each.
+    pub iterations: usize,
+    /// Seeds the view order.
+    pub seed: u64,
+    /// λ2 of `L = λ2·L_img + (1−λ2)·L_sem`.
+    pub image_weight: f64,
+    /// Learning rates of everything but the features (reduced, ALGORITHMS 8.2).
+    pub rates: Rates,
+    /// Learning rate of the features.
+    pub feature_rate: f64,
+    /// Parameterisation.
+    pub gauge: FeatureGauge,
+    /// Start from the weighted mean of the codes each splat sees instead of from zero.
+    pub lift: bool,
+    /// Train every level on its own copy of the splats, as the paper; otherwise all levels share one geometry.
+    pub per_level: bool,
+    /// Keep geometry, opacity and colour fixed: only the features move.
+    pub detach_geometry: bool,
+    /// Measure the decode accuracy every so many steps (0 = never) and stop when it gains less than 0.1 % in two
+    /// measurements.
+    pub check_every: usize,
+}
+
+impl LanguageOptions {
+    /// The options of a preset.
+    pub fn preset(preset: Preset) -> Self {
+        let iterations = match preset {
+            Preset::Draft => 60,
+            Preset::Default => 400,
+            Preset::Paper => 1000,
+        };
+        let paper = preset == Preset::Paper;
+        LanguageOptions {
+            iterations,
+            seed: 0,
+            image_weight: 0.3,
+            rates: Rates {
+                means: Exponential { start: 3e-5, end: 3e-7, steps: 30_000 },
+                log_scales: 1e-3,
+                quats: 2e-4,
+                opacity: 0.01,
+                sh_dc: 1e-4,
+                sh_rest: 1e-4 / 20.0,
+            },
+            // From zero: the paper's dynamics (7e-9 at ε = 1e-9) scaled to numbers f32 holds. After lifting: 2.5e-3.
+            feature_rate: if paper { 7e-3 } else { 2.5e-3 },
+            gauge: FeatureGauge::Normalised { epsilon: 1e-3 },
+            lift: !paper,
+            per_level: paper,
+            detach_geometry: false,
+            check_every: 100,
+        }
+    }
+}

@@ -1,0 +1,197 @@
+//! Adam on the GPU (Kingma & Ba 2015), with a learning rate per parameter class that the host sets before each step.
+use crate::Result;
+use crate::gpu::{Buffer, Device, Recorder, shaders};
+
+/// β1, β2 of every 3D Gaussian splatting implementation.
+pub const BETA: [f64; 2] = [0.9, 0.999];
+/// ε: tiny, since gradients are (Kerbl et al. 2023 use 1e-15).
+pub const EPSILON: f64 = 1e-15;
+/// Threads per workgroup in `glsl/adam.comp` and `glsl/gather.comp`.
+const GROUP: usize = 256;
+
+/// Workgroup counts for `threads` in a shader that numbers its groups row by row: at most 32768 a row, since one
+/// dimension may end at 65535.
+pub(crate) fn rows_of_groups(threads: usize) -> [u32; 3] {
+    let groups = threads.div_ceil(GROUP).max(1);
+    let row = groups.min(32768);
+    [row as u32, groups.div_ceil(row) as u32, 1]
+}
+
+/// The moving averages of one parameter buffer: `[count]` pairs (m, v).
+#[derive(Clone)]
+pub struct Moments {
+    /// (m, v) per parameter.
+    pub buffer: Buffer,
+}
+
+impl Moments {
+    /// Fresh (zero) state for `count` parameters.
+    pub fn new(device: &Device, count: usize) -> Result<Self> {
+        Ok(Moments { buffer: device.buffer::<[f32; 2]>("adam moments", count.max(1))? })
+    }
+}
+
+/// One parameter class: `head` of every `stride` values use the head rate, the rest the tail rate.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Class {
+    /// Row of the [`Schedule`].
+    pub slot: u32,
+    /// Number of values.
+    pub count: usize,
+    /// Period of the two rates.
+    pub stride: u32,
+    /// How many of each period use the head rate.
+    pub head: u32,
+}
+
+/// The rates of the current step in GPU memory, one row per class, and the count of bad gradients.
+pub struct Schedule {
+    rates: Buffer,
+    faults: Buffer,
+    rows: Vec<[f32; 4]>,
+}
+
+impl Schedule {
+    /// Room for `classes` rows.
+    pub fn new(device: &Device, classes: usize) -> Result<Self> {
+        Ok(Schedule {
+            rates: device.buffer::<[f32; 4]>("adam rates", classes)?,
+            faults: device.buffer::<u32>("adam faults", 1)?,
+            rows: vec![[0.0; 4]; classes],
+        })
+    }
+
+    /// Writes the rates (head, tail) of every class for the 1-based `step` of the moments.
+    pub fn set(&mut self, step: usize, rates: &[[f64; 2]]) -> Result<()> {
+        for (row, rate) in self.rows.iter_mut().zip(rates) {
+            *row = row_of(step, *rate);
+        }
+        self.rates.write(&self.rows)
+    }
+
+    /// How many non-finite gradients the steps so far have met (and skipped).
+    pub fn faults(&self) -> Result<u32> {
+        Ok(self.faults.read::<u32>()?.first().copied().unwrap_or(0))
+    }
+
+    /// Records one step of one class.
+    pub fn record(
+        &self,
+        rec: &mut Recorder,
+        class: Class,
+        parameters: &Buffer,
+        gradients: &Buffer,
+        moments: &Moments,
+    ) {
+        let call = shaders::adam::call(
+            &shaders::adam::Bindings {
+                parameters,
+                gradients,
+                moments: &moments.buffer,
+                faults: &self.faults,
+                rates: &self.rates,
+            },
+            &shaders::adam::Push {
+                count: class.count as u32,
+                stride: class.stride,
+                head: class.head,
+                slot: class.slot,
+            },
+        );
+        rec.dispatch(call, rows_of_groups(class.count));
+    }
+}
+
+/// (head, tail, second-moment correction) for a 1-based step.
+fn row_of(step: usize, rate: [f64; 2]) -> [f32; 4] {
+    let t = step.max(1) as f64;
+    let first = 1.0 / (1.0 - BETA[0].powf(t));
+    let second = 1.0 / (1.0 - BETA[1].powf(t)).sqrt();
+    [(rate[0] * first) as f32, (rate[1] * first) as f32, second as f32, 0.0]
+}
+
+/// The CPU twin of one step for one class with one rate; `moments` are (m, v).
+pub fn adam(parameters: &mut [f64], gradients: &[f64], moments: &mut [[f64; 2]], rate: f64, step: usize) {
+    let t = step.max(1) as f64;
+    for ((p, &g), mv) in parameters.iter_mut().zip(gradients).zip(moments) {
+        if !g.is_finite() {
+            continue;
+        }
+        mv[0] = BETA[0] * mv[0] + (1.0 - BETA[0]) * g;
+        mv[1] = BETA[1] * mv[1] + (1.0 - BETA[1]) * g * g;
+        let (m, v) = (mv[0] / (1.0 - BETA[0].powf(t)), mv[1] / (1.0 - BETA[1].powf(t)));
+        *p -= rate * m / (v.sqrt() + EPSILON);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::schedule::Random;
+
+    #[test]
+    fn gpu_equals_the_twin_over_many_steps_and_rates() {
+        let device = crate::gpu::test_device();
+        let mut random = Random::new(4);
+        // 9 values per row: 3 at the head rate, 6 at the tail rate; not a multiple of the workgroup.
+        let (rows, stride, head, rates) = (101usize, 9usize, 3usize, [2e-3, 1e-4]);
+        let count = rows * stride;
+        let start: Vec<f32> = (0..count).map(|_| random.normal() as f32).collect();
+        let parameters = device.buffer_from("p", &start).unwrap();
+        let gradients = device.buffer::<f32>("g", count).unwrap();
+        let moments = Moments::new(&device, count).unwrap();
+        let mut schedule = Schedule::new(&device, 2).unwrap();
+        let mut twin: Vec<f64> = start.iter().map(|&v| f64::from(v)).collect();
+        let mut state = vec![[0.0; 2]; count];
+        for step in 1..=20 {
+            let g: Vec<f32> = (0..count).map(|i| (random.normal() * 10f64.powi(i as i32 % 7 - 6)) as f32).collect();
+            gradients.write(&g).unwrap();
+            schedule.set(step, &[[0.0; 2], rates]).unwrap();
+            let mut rec = Recorder::new(&device, "adam");
+            let class = Class { slot: 1, count, stride: stride as u32, head: head as u32 };
+            schedule.record(&mut rec, class, &parameters, &gradients, &moments);
+            rec.run().unwrap();
+            for i in 0..count {
+                let rate = rates[usize::from(i % stride >= head)];
+                let range = i..i + 1;
+                adam(&mut twin[range.clone()], &[f64::from(g[i])], &mut state[range], rate, step);
+            }
+        }
+        for (i, (p, t)) in parameters.read::<f32>().unwrap().into_iter().zip(&twin).enumerate() {
+            // 20 steps of 2e-3, each rounded in f32.
+            assert!((f64::from(p) - t).abs() < 2e-6, "{i}: {p} {t}");
+        }
+        assert_eq!(schedule.faults().unwrap(), 0);
+    }
+
+    #[test]
+    fn non_finite_gradients_are_counted_and_change_nothing() {
+        let device = crate::gpu::test_device();
+        let parameters = device.buffer_from("p", &[1.0f32, 2.0, 3.0]).unwrap();
+        let gradients = device.buffer_from("g", &[f32::NAN, f32::NEG_INFINITY, 1.0]).unwrap();
+        let moments = Moments::new(&device, 3).unwrap();
+        let mut schedule = Schedule::new(&device, 1).unwrap();
+        schedule.set(1, &[[0.5, 0.5]]).unwrap();
+        let mut rec = Recorder::new(&device, "adam");
+        schedule.record(
+            &mut rec,
+            Class { slot: 0, count: 3, stride: 1, head: 1 },
+            &parameters,
+            &gradients,
+            &moments,
+        );
+        rec.run().unwrap();
+        let p = parameters.read::<f32>().unwrap();
+        assert_eq!((p[0], p[1]), (1.0, 2.0));
+        assert!((p[2] - 2.5).abs() < 1e-6, "the first Adam step has the length of the rate");
+        assert_eq!(schedule.faults().unwrap(), 2);
+    }
+
+    #[test]
+    fn groups_cover_all_threads_within_device_limits() {
+        for threads in [1, 256, 257, 8_388_608, 8_388_609, 50_000_000] {
+            let [x, y, _] = rows_of_groups(threads);
+            assert!(x as usize * y as usize * GROUP >= threads && x <= 32768 && y <= 65535);
+        }
+    }
+}

@@ -1,0 +1,77 @@
+//! Pruning and compaction: which splats stay, and moving their rows (parameters and optimiser state alike) together.
+use super::adam::rows_of_groups;
+use crate::Result;
+use crate::gpu::{Buffer, Device, Recorder, shaders};
+
+/// Index of a row that has no source: it becomes zeros (the optimiser state of new splats).
+pub const NEW: u32 = u32::MAX;
+
+/// Indices of the splats whose opacity is finite and at least `min_opacity`, in order.
+pub fn kept(opacity_logits: &[f32], min_opacity: f32) -> Vec<u32> {
+    let limit = (min_opacity / (1.0 - min_opacity)).ln();
+    (0..opacity_logits.len() as u32)
+        .filter(|&i| {
+            let logit = opacity_logits[i as usize];
+            logit.is_finite() && logit >= limit
+        })
+        .collect()
+}
+
+/// A buffer with the rows `index` of `from`, each `stride` 32-bit words; [`NEW`] rows are zero.
+pub fn gather(
+    device: &Device,
+    name: &'static str,
+    from: &Buffer,
+    index: &Buffer,
+    rows: usize,
+    stride: usize,
+) -> Result<Buffer> {
+    let to = device.buffer::<u32>(name, (rows * stride).max(1))?;
+    let mut rec = Recorder::new(device, "gather");
+    let call = shaders::gather::call(
+        &shaders::gather::Bindings { index, from, to: &to },
+        &shaders::gather::Push { rows: rows as u32, stride: stride as u32 },
+    );
+    rec.dispatch(call, rows_of_groups(rows * stride));
+    rec.run()?;
+    Ok(to)
+}
+
+/// The CPU twin of [`gather`].
+pub fn gather_rows<T: Copy + Default>(from: &[T], index: &[u32], stride: usize) -> Vec<T> {
+    index
+        .iter()
+        .flat_map(|&i| {
+            (0..stride).map(move |k| if i == NEW { T::default() } else { from[i as usize * stride + k] })
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::schedule::Random;
+
+    #[test]
+    fn gpu_equals_the_twin() {
+        let device = crate::gpu::test_device();
+        let mut random = Random::new(11);
+        let logits: Vec<f32> = (0..1003).map(|_| random.normal() as f32 * 4.0).collect();
+        let mut index = kept(&logits, 0.1);
+        assert!(index.len() > 100 && index.len() < 900);
+        index.extend([NEW, 5, 5, NEW]);
+        let index_buffer = device.buffer_from("index", &index).unwrap();
+        for stride in [1, 3, 8] {
+            let rows: Vec<f32> = (0..1003 * stride).map(|_| random.normal() as f32).collect();
+            let from = device.buffer_from("rows", &rows).unwrap();
+            let to = gather(&device, "compacted", &from, &index_buffer, index.len(), stride).unwrap();
+            assert_eq!(to.read::<f32>().unwrap(), gather_rows(&rows, &index, stride));
+        }
+    }
+
+    #[test]
+    fn pruning_keeps_order_and_drops_what_is_faint_or_broken() {
+        let logit = |o: f32| (o / (1.0 - o)).ln();
+        assert_eq!(kept(&[logit(0.9), logit(0.004), f32::NAN, logit(0.006), f32::INFINITY], 0.005), [0, 3]);
+    }
+}

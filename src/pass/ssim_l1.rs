@@ -1,0 +1,286 @@
+//! The image loss `w₁·mean|x−y| + w₂·(1 − mean SSIM(x,y))` and its gradient with respect to the rendered image x.
+//!
+//! SSIM as 3D Gaussian splatting uses it (Wang et al. 2004; Kerbl et al. 2023): 11×11 Gaussian window, σ = 1.5,
+//! normalised, zero padding, per channel, C1 = 1e-4, C2 = 9e-4, mean over all pixels and channels.
+//! With ∗ the (symmetric) window and S = A1·A2/(B1·B2), the derivative is three more blurs:
+//! `∂/∂x = ∗(∂S/∂μx) + 2x·∗(∂S/∂E[x²]) + y·∗(∂S/∂E[xy])`.
+use super::sum;
+use crate::Result;
+use crate::gpu::{Buffer, Device, Recorder, shaders};
+
+/// Taps of the SSIM window.
+pub const WINDOW: usize = 11;
+/// Half of the window: how far a pixel's influence reaches.
+pub const HALF: usize = WINDOW / 2;
+const SIGMA: f64 = 1.5;
+const C1: f64 = 1e-4; // (0.01)², Wang et al. 2004
+const C2: f64 = 9e-4; // (0.03)²
+
+/// The two parts of the image loss before weighting.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ImageLoss {
+    /// Mean absolute difference.
+    pub l1: f64,
+    /// Mean structural similarity, at most 1.
+    pub ssim: f64,
+}
+
+impl ImageLoss {
+    /// `l1_weight·L1 + dssim_weight·(1 − SSIM)`.
+    pub fn total(&self, l1_weight: f64, dssim_weight: f64) -> f64 {
+        l1_weight * self.l1 + dssim_weight * (1.0 - self.ssim)
+    }
+}
+
+/// The normalised 1D Gaussian taps.
+fn taps() -> [f64; WINDOW] {
+    let mut w = [0.0; WINDOW];
+    for (k, v) in w.iter_mut().enumerate() {
+        let d = k as f64 - HALF as f64;
+        *v = (-d * d / (2.0 * SIGMA * SIGMA)).exp();
+    }
+    let sum: f64 = w.iter().sum();
+    w.map(|v| v / sum)
+}
+
+/// Separable zero-padded blur of one [H, W] plane.
+fn blur(plane: &[f64], width: usize, height: usize) -> Vec<f64> {
+    let w = taps();
+    let mut rows = vec![0.0; plane.len()];
+    for y in 0..height {
+        for x in 0..width {
+            let (lo, hi) = (x.saturating_sub(HALF), (x + HALF).min(width - 1));
+            rows[y * width + x] = (lo..=hi).map(|i| w[i + HALF - x] * plane[y * width + i]).sum();
+        }
+    }
+    let mut out = vec![0.0; plane.len()];
+    for y in 0..height {
+        let (lo, hi) = (y.saturating_sub(HALF), (y + HALF).min(height - 1));
+        for x in 0..width {
+            out[y * width + x] = (lo..=hi).map(|i| w[i + HALF - y] * rows[i * width + x]).sum();
+        }
+    }
+    out
+}
+
+/// The CPU twin, in f64: loss parts and gradient of [`ImageLoss::total`] for planar `[C, H, W]` images.
+pub fn ssim_l1(
+    rendered: &[f64],
+    target: &[f64],
+    width: usize,
+    height: usize,
+    l1_weight: f64,
+    dssim_weight: f64,
+) -> (ImageLoss, Vec<f64>) {
+    let count = rendered.len() as f64;
+    let mut loss = ImageLoss::default();
+    let mut gradient = Vec::with_capacity(rendered.len());
+    for (x, y) in rendered.chunks(width * height).zip(target.chunks(width * height)) {
+        let (ssim, d) = ssim_plane(x, y, width, height);
+        loss.ssim += ssim / count;
+        for i in 0..x.len() {
+            let difference = x[i] - y[i];
+            loss.l1 += difference.abs() / count;
+            // f64::signum(0) is 1; the subgradient there must be 0 or identical images would move.
+            let sign = if difference == 0.0 { 0.0 } else { difference.signum() };
+            gradient.push((l1_weight * sign - dssim_weight * d[i]) / count);
+        }
+    }
+    (loss, gradient)
+}
+
+/// Sum of SSIM over one plane and its derivative with respect to x.
+fn ssim_plane(x: &[f64], y: &[f64], width: usize, height: usize) -> (f64, Vec<f64>) {
+    let product = |f: &dyn Fn(usize) -> f64| blur(&(0..x.len()).map(f).collect::<Vec<_>>(), width, height);
+    let (mx, my) = (blur(x, width, height), blur(y, width, height));
+    let squares = product(&|i| x[i] * x[i] + y[i] * y[i]);
+    let cross = product(&|i| x[i] * y[i]);
+    let (mut d_mean, mut d_square, mut d_cross) =
+        (vec![0.0; x.len()], vec![0.0; x.len()], vec![0.0; x.len()]);
+    let mut sum = 0.0;
+    for i in 0..x.len() {
+        let a1 = 2.0 * mx[i] * my[i] + C1;
+        let a2 = 2.0 * (cross[i] - mx[i] * my[i]) + C2;
+        let b1 = mx[i] * mx[i] + my[i] * my[i] + C1;
+        let b2 = squares[i] - mx[i] * mx[i] - my[i] * my[i] + C2;
+        let s = a1 * a2 / (b1 * b2);
+        sum += s;
+        d_mean[i] = 2.0 * my[i] * (a2 - a1) / (b1 * b2) - 2.0 * mx[i] * s / b1 + 2.0 * mx[i] * s / b2;
+        d_square[i] = -s / b2;
+        d_cross[i] = 2.0 * a1 / (b1 * b2);
+    }
+    let (p, q, r) =
+        (blur(&d_mean, width, height), blur(&d_square, width, height), blur(&d_cross, width, height));
+    (sum, (0..x.len()).map(|i| p[i] + 2.0 * x[i] * q[i] + y[i] * r[i]).collect())
+}
+
+/// Outputs per thread in the shaders (`STRIP`).
+const STRIP: usize = 16;
+/// Colour channels.
+const CHANNELS: usize = 3;
+
+/// The GPU pass for one image size: scratch memory, reused for every view of that size.
+pub struct SsimL1 {
+    width: usize,
+    height: usize,
+    means: Buffer,
+    moments: Buffer,
+    slopes: Buffer,
+    cross: Buffer,
+    ssim_sums: Buffer,
+    l1_sums: Buffer,
+    partials: Buffer,
+}
+
+impl SsimL1 {
+    /// Allocates for `width × height` RGB images.
+    pub fn new(device: &Device, width: usize, height: usize) -> Result<Self> {
+        let values = CHANNELS * width * height;
+        let pairs = |name| device.buffer::<[f32; 2]>(name, values);
+        Ok(SsimL1 {
+            width,
+            height,
+            means: pairs("ssim means")?,
+            moments: pairs("ssim moments")?,
+            slopes: pairs("ssim slopes")?,
+            cross: device.buffer::<f32>("ssim cross slopes", values)?,
+            ssim_sums: device.buffer::<f32>("ssim sums", CHANNELS * height * width.div_ceil(STRIP))?,
+            l1_sums: device.buffer::<f32>("l1 sums", CHANNELS * width * height.div_ceil(STRIP))?,
+            partials: device.buffer::<f32>("loss partials", sum::PARTIALS)?,
+        })
+    }
+
+    /// Records the pass. `rendered` and `gradient` are planar `[≥3, H, W]` stacks whose first three planes count,
+    /// `target` `[3, H, W]`. Afterwards `loss[slot]` is Σ|x−y| and `loss[slot+1]` ΣSSIM: see [`SsimL1::loss`].
+    pub fn record(
+        &self,
+        rec: &mut Recorder,
+        rendered: &Buffer,
+        target: &Buffer,
+        gradient: &Buffer,
+        weights: [f64; 2],
+        loss: (&Buffer, u32),
+    ) {
+        let (width, height) = (self.width as i32, self.height as i32);
+        let count = (CHANNELS * self.width * self.height) as f64;
+        let strips = |n: usize| n.div_ceil(STRIP) as u32;
+        let columns = [(self.width as u32).div_ceil(64), strips(self.height), CHANNELS as u32];
+        let call = shaders::ssim_columns::call(
+            &shaders::ssim_columns::Bindings {
+                rendered,
+                target,
+                means: &self.means,
+                moments: &self.moments,
+            },
+            &shaders::ssim_columns::Push { width, height },
+        );
+        rec.dispatch(call, columns);
+        let call = shaders::ssim_rows::call(
+            &shaders::ssim_rows::Bindings {
+                means: &self.means,
+                moments: &self.moments,
+                slopes: &self.slopes,
+                cross: &self.cross,
+                sums: &self.ssim_sums,
+            },
+            &shaders::ssim_rows::Push { width, height, strips: strips(self.width) as i32 },
+        );
+        rec.dispatch_threads(call, [strips(self.width), self.height as u32, CHANNELS as u32]);
+        let call = shaders::ssim_gradient::call(
+            &shaders::ssim_gradient::Bindings {
+                rendered,
+                target,
+                slopes: &self.slopes,
+                cross: &self.cross,
+                gradient,
+                sums: &self.l1_sums,
+            },
+            &shaders::ssim_gradient::Push {
+                width,
+                height,
+                l1_weight: (weights[0] / count) as f32,
+                dssim_weight: (weights[1] / count) as f32,
+            },
+        );
+        rec.dispatch(call, columns);
+        sum::record(rec, &self.l1_sums, &self.partials, loss.0, loss.1);
+        sum::record(rec, &self.ssim_sums, &self.partials, loss.0, loss.1 + 1);
+    }
+
+    /// The loss parts from the two sums that [`SsimL1::record`] leaves.
+    pub fn loss(&self, sums: [f32; 2]) -> ImageLoss {
+        let count = (CHANNELS * self.width * self.height) as f64;
+        ImageLoss { l1: f64::from(sums[0]) / count, ssim: f64::from(sums[1]) / count }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A reproducible pseudo-random number in [0, 1).
+    fn noise(i: usize) -> f64 {
+        let mut z = (i as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        ((z ^ (z >> 27)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    #[test]
+    fn identical_images_have_ssim_one_and_no_gradient() {
+        let x: Vec<f64> = (0..3 * 20 * 17).map(noise).collect();
+        let (loss, gradient) = ssim_l1(&x, &x, 20, 17, 0.8, 0.2);
+        assert!((loss.ssim - 1.0).abs() < 1e-12 && loss.l1 == 0.0);
+        assert!(gradient.iter().all(|g| g.abs() < 1e-14));
+    }
+
+    #[test]
+    fn gradient_matches_central_differences() {
+        let (w, h) = (23, 19);
+        let mut x: Vec<f64> = (0..3 * w * h).map(noise).collect();
+        let y: Vec<f64> = (0..3 * w * h).map(|i| 0.7 * noise(i) + 0.3 * noise(i + 7777)).collect();
+        let (_, gradient) = ssim_l1(&x, &y, w, h, 0.8, 0.2);
+        let step = 1e-6;
+        let mut worst: f64 = 0.0;
+        let scale = gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
+        for i in (0..x.len()).step_by(53) {
+            let keep = x[i];
+            let mut at = |v: f64| {
+                x[i] = v;
+                ssim_l1(&x, &y, w, h, 0.8, 0.2).0.total(0.8, 0.2)
+            };
+            let difference = (at(keep + step) - at(keep - step)) / (2.0 * step);
+            x[i] = keep;
+            worst = worst.max((difference - gradient[i]).abs() / scale);
+        }
+        assert!(worst < 1e-6, "relative error {worst:.1e}");
+    }
+
+    #[test]
+    fn gpu_equals_the_twin_on_odd_sizes() {
+        let device = crate::gpu::test_device();
+        // Neither side is a multiple of a strip or workgroup; the second is smaller than one strip and window.
+        for (w, h) in [(75, 53), (13, 7), (130, 33)] {
+            let x: Vec<f32> = (0..3 * w * h).map(|i| noise(i) as f32).collect();
+            let y: Vec<f32> = (0..3 * w * h).map(|i| (0.7 * noise(i) + 0.3 * noise(i + 7777)) as f32).collect();
+            let wide = |v: &[f32]| v.iter().map(|&a| f64::from(a)).collect::<Vec<_>>();
+            let (expected, gradient) = ssim_l1(&wide(&x), &wide(&y), w, h, 0.8, 0.2);
+            let pass = SsimL1::new(&device, w, h).unwrap();
+            let rendered = device.buffer_from("x", &x).unwrap();
+            let target = device.buffer_from("y", &y).unwrap();
+            let out = device.buffer::<f32>("gradient", 3 * w * h).unwrap();
+            let sums = device.buffer::<f32>("loss", 4).unwrap();
+            let mut rec = Recorder::new(&device, "ssim");
+            pass.record(&mut rec, &rendered, &target, &out, [0.8, 0.2], (&sums, 1));
+            rec.run().unwrap();
+            let sums = sums.read::<f32>().unwrap();
+            let loss = pass.loss([sums[1], sums[2]]);
+            // f32 sums of about 10⁴ values of order one: 1e-5.
+            assert!((loss.l1 - expected.l1).abs() < 1e-5 && (loss.ssim - expected.ssim).abs() < 1e-5);
+            let scale = gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
+            for (g, e) in out.read::<f32>().unwrap().into_iter().zip(gradient) {
+                // E[x²]−E[x]² cancels about three digits in f32, amplified by 1/C2 in flat regions.
+                assert!((f64::from(g) - e).abs() < 1e-3 * scale, "{w}x{h}: {g} {e}");
+            }
+        }
+    }
+}
