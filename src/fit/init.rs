@@ -170,8 +170,11 @@ impl<'a> KdTree<'a> {
         }
         let axis = self.axes[middle] as usize;
         let offset = query[axis] - point[axis];
-        let (near, far) =
-            if offset < 0.0 { ((from, middle), (middle + 1, to)) } else { ((middle + 1, to), (from, middle)) };
+        let (near, far) = if offset < 0.0 {
+            ((from, middle), (middle + 1, to))
+        } else {
+            ((middle + 1, to), (from, middle))
+        };
         self.search(query, skip, near.0, near.1, best);
         if offset * offset < best[2] {
             self.search(query, skip, far.0, far.1, best);

@@ -123,7 +123,12 @@ impl RgbOptions {
         RgbOptions {
             iterations: 1000,
             seed: 0,
-            init: InitOptions { max_points: 1_000_000, opacity: 0.1, footprint: f32::INFINITY, neighbours: 1.0 },
+            init: InitOptions {
+                max_points: 1_000_000,
+                opacity: 0.1,
+                footprint: f32::INFINITY,
+                neighbours: 1.0,
+            },
             rates: Rates {
                 means: Exponential { start: 1.6e-4, end: 1.6e-6, steps: 30_000 },
                 log_scales: 5e-3,
@@ -141,10 +146,7 @@ impl RgbOptions {
             prune_every: 100,
             prune_from: 200,
             densify: None,
-            poses: Some(PoseOptions {
-                start: 0,
-                rate: Exponential { start: 1e-4, end: 1e-6, steps: 1000 },
-            }),
+            poses: Some(PoseOptions { start: 0, rate: Exponential { start: 1e-4, end: 1e-6, steps: 1000 } }),
             sh_degree: 0,
             report_every: 10,
         }

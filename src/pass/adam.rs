@@ -144,7 +144,8 @@ mod tests {
         let mut twin: Vec<f64> = start.iter().map(|&v| f64::from(v)).collect();
         let mut state = vec![[0.0; 2]; count];
         for step in 1..=20 {
-            let g: Vec<f32> = (0..count).map(|i| (random.normal() * 10f64.powi(i as i32 % 7 - 6)) as f32).collect();
+            let g: Vec<f32> =
+                (0..count).map(|i| (random.normal() * 10f64.powi(i as i32 % 7 - 6)) as f32).collect();
             gradients.write(&g).unwrap();
             schedule.set(step, &[[0.0; 2], rates]).unwrap();
             let mut rec = Recorder::new(&device, "adam");

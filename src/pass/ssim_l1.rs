@@ -166,12 +166,7 @@ impl SsimL1 {
         let strips = |n: usize| n.div_ceil(STRIP) as u32;
         let columns = [(self.width as u32).div_ceil(64), strips(self.height), CHANNELS as u32];
         let call = shaders::ssim_columns::call(
-            &shaders::ssim_columns::Bindings {
-                rendered,
-                target,
-                means: &self.means,
-                moments: &self.moments,
-            },
+            &shaders::ssim_columns::Bindings { rendered, target, means: &self.means, moments: &self.moments },
             &shaders::ssim_columns::Push { width, height },
         );
         rec.dispatch(call, columns);
@@ -261,7 +256,8 @@ mod tests {
         // Neither side is a multiple of a strip or workgroup; the second is smaller than one strip and window.
         for (w, h) in [(75, 53), (13, 7), (130, 33)] {
             let x: Vec<f32> = (0..3 * w * h).map(|i| noise(i) as f32).collect();
-            let y: Vec<f32> = (0..3 * w * h).map(|i| (0.7 * noise(i) + 0.3 * noise(i + 7777)) as f32).collect();
+            let y: Vec<f32> =
+                (0..3 * w * h).map(|i| (0.7 * noise(i) + 0.3 * noise(i + 7777)) as f32).collect();
             let wide = |v: &[f32]| v.iter().map(|&a| f64::from(a)).collect::<Vec<_>>();
             let (expected, gradient) = ssim_l1(&wide(&x), &wide(&y), w, h, 0.8, 0.2);
             let pass = SsimL1::new(&device, w, h).unwrap();
