@@ -11,7 +11,7 @@ pub enum Error {
     #[error("{0}")]
     Input(String),
     /// A file could not be read or written.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {source}{}", path.display(), advice(source))]
     Io {
         /// The file or folder.
         path: PathBuf,
@@ -54,12 +54,26 @@ impl Error {
         let path = path.as_ref().to_path_buf();
         move |source| Error::Io { path, source }
     }
-    /// 2 for bad usage, bad input or a missing part; 1 for a failure while working; 130 when stopped by the user.
+    /// 2 for bad usage, bad input, a missing part or a place that cannot be written (also a full disk); 1 for a failure
+    /// while working; 130 when stopped by the user.
     pub fn exit_code(&self) -> u8 {
         match self {
             Error::Input(_) | Error::Missing(_) => 2,
+            Error::Io { source, .. } if !advice(source).is_empty() => 2,
             Error::Io { .. } | Error::Gpu(_) | Error::Work(_) => 1,
             Error::Cancelled => 130,
         }
+    }
+}
+
+/// What the user can do about an I/O error; empty where only its cause can tell.
+fn advice(e: &std::io::Error) -> &'static str {
+    use std::io::ErrorKind as K;
+    match e.kind() {
+        K::StorageFull | K::QuotaExceeded => "; free some space there, or choose a folder on another disk",
+        K::FileTooLarge => "; the file size limit (ulimit -f) is too small for this file",
+        K::PermissionDenied | K::ReadOnlyFilesystem => "; choose a folder that you may write to",
+        K::NotFound => "; check the name",
+        _ => "",
     }
 }

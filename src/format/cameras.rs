@@ -1,0 +1,135 @@
+//! Camera files: one reader for every kind, the project's own `cameras.json`.
+use super::{colmap, transforms};
+use crate::scene::{Camera, Pose};
+use crate::{Error, Result};
+use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// Reads cameras from nerfstudio `transforms.json`, `cameras.json`, or a COLMAP model folder (text or binary).
+pub fn read(path: &Path) -> Result<Vec<Camera>> {
+    let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
+    if path.is_dir() {
+        // A scene directory and common COLMAP layouts keep the model further down.
+        let nested = ["", "sparse/0", "sparse", "cameras/colmap", "colmap"].map(|n| path.join(n));
+        let model = nested.iter().find(|p| colmap::is_model(p));
+        return match model {
+            Some(folder) => colmap::read(folder),
+            None if path.join("transforms.json").is_file() => read(&path.join("transforms.json")),
+            None => Err(bad(
+                "no cameras here; give transforms.json, cameras.json or a COLMAP model folder".into()
+            )),
+        };
+    }
+    let text = std::fs::read_to_string(path).map_err(|e| bad(format!("{e}; check the camera file")))?;
+    let value: serde_json::Value =
+        serde_json::from_str(&text).map_err(|e| bad(format!("not a JSON camera file: {e}")))?;
+    let cameras = match &value {
+        serde_json::Value::Array(_) => {
+            let entries: Vec<Entry> =
+                serde_json::from_value(value).map_err(|e| bad(format!("not a cameras.json file: {e}")))?;
+            entries.into_iter().map(Entry::camera).collect::<Result<Vec<_>, _>>()
+        }
+        serde_json::Value::Object(o) if o.contains_key("frames") => {
+            transforms::parse(value, path.parent().unwrap_or(Path::new(".")))
+        }
+        _ => Err("neither transforms.json (an object with \"frames\") nor cameras.json (a list)".to_string()),
+    };
+    let cameras = cameras.map_err(bad)?;
+    if cameras.is_empty() {
+        return Err(bad("the file has no cameras".into()));
+    }
+    Ok(cameras)
+}
+
+/// One camera of `cameras.json`: the layout 3DGS tools write, plus the principal point.
+#[derive(Debug, Serialize, Deserialize)]
+struct Entry {
+    #[serde(default)]
+    id: u32,
+    img_name: String,
+    width: u32,
+    height: u32,
+    /// Camera centre, world.
+    position: [f64; 3],
+    /// Rows of R, camera → world.
+    rotation: [[f64; 3]; 3],
+    fx: f64,
+    fy: f64,
+    #[serde(default)]
+    cx: Option<f64>,
+    #[serde(default)]
+    cy: Option<f64>,
+}
+
+impl Entry {
+    fn camera(self) -> Result<Camera, String> {
+        // The rows of camera → world are the columns of world → camera.
+        let rotation = DMat3::from_cols_array_2d(&self.rotation);
+        let pose = Pose { rotation, translation: -(rotation * DVec3::from_array(self.position)) };
+        checked(Camera {
+            name: self.img_name,
+            width: self.width,
+            height: self.height,
+            fx: self.fx,
+            fy: self.fy,
+            cx: self.cx.unwrap_or(self.width as f64 / 2.0),
+            cy: self.cy.unwrap_or(self.height as f64 / 2.0),
+            pose,
+        })
+    }
+}
+
+/// Refuses what no pinhole camera can be.
+pub(super) fn checked(c: Camera) -> Result<Camera, String> {
+    let finite =
+        [c.fx, c.fy, c.cx, c.cy].iter().chain(&c.pose.rotation.to_cols_array()).all(|v| v.is_finite())
+            && c.pose.translation.is_finite();
+    let r = c.pose.rotation;
+    let off =
+        (r * r.transpose() - DMat3::IDENTITY).to_cols_array().iter().fold(0.0f64, |m, v| m.max(v.abs()));
+    if !finite || c.fx <= 0.0 || c.fy <= 0.0 || c.width == 0 || c.height == 0 {
+        return Err(format!(
+            "camera {:?}: sizes and focal lengths must be positive, all numbers finite",
+            c.name
+        ));
+    }
+    // Files with 6 printed digits reach 1e-5; a scaled or sheared matrix is far above.
+    if off > 1e-3 || r.determinant() < 0.0 {
+        return Err(format!("camera {:?}: its matrix is not a rotation (off by {off:.1e})", c.name));
+    }
+    let pose = if off > 1e-12 { c.pose.orthonormalised() } else { c.pose };
+    Ok(Camera { pose, ..c })
+}
+
+/// Writes `cameras.json`.
+pub fn write_json(path: &Path, cameras: &[Camera]) -> Result<()> {
+    let entry = |(id, c): (usize, &Camera)| Entry {
+        id: id as u32,
+        img_name: c.name.clone(),
+        width: c.width,
+        height: c.height,
+        position: c.pose.centre().to_array(),
+        rotation: c.pose.rotation.to_cols_array_2d(),
+        fx: c.fx,
+        fy: c.fy,
+        cx: Some(c.cx),
+        cy: Some(c.cy),
+    };
+    let entries: Vec<Entry> = cameras.iter().enumerate().map(entry).collect();
+    super::write_json(path, &entries)
+}
+
+/// File name of a camera without folder and extension: what joins it to photos, masks and renders.
+pub fn stem(name: &str) -> String {
+    // Only known image extensions are cut: labels such as "view.2" are names of their own.
+    let base = name.rsplit(['/', '\\']).next().unwrap_or(name);
+    match base.rsplit_once('.') {
+        Some((stem, ext))
+            if !stem.is_empty() && ext.len() <= 4 && ext.chars().any(|c| c.is_ascii_alphabetic()) =>
+        {
+            stem.to_string()
+        }
+        _ => base.to_string(),
+    }
+}

@@ -1,0 +1,146 @@
+//! Images and maps on disk: PNG, OpenEXR, npy.
+use super::npy::{self, NpyArray};
+use super::to_byte;
+use crate::scene::{Plane, RgbImage};
+use crate::{Error, Result};
+use exr::prelude as ex;
+use std::io::BufWriter;
+use std::path::Path;
+
+fn file(path: &Path) -> Result<BufWriter<std::fs::File>> {
+    Ok(BufWriter::new(std::fs::File::create(path).map_err(Error::io(path))?))
+}
+
+fn picture_error(path: &Path) -> impl FnOnce(image::ImageError) -> Error {
+    move |e| match e {
+        image::ImageError::IoError(source) => Error::Io { path: path.to_path_buf(), source },
+        other => Error::work(format!("{}: {other}", path.display())),
+    }
+}
+
+fn write_bytes(
+    path: &Path,
+    size: (usize, usize),
+    bytes: &[u8],
+    colour: image::ExtendedColorType,
+) -> Result<()> {
+    use image::ImageEncoder;
+    use std::io::Write;
+    let mut out = file(path)?;
+    let encoder = image::codecs::png::PngEncoder::new(&mut out);
+    encoder.write_image(bytes, size.0 as u32, size.1 as u32, colour).map_err(picture_error(path))?;
+    out.flush().map_err(Error::io(path))
+}
+
+/// 8-bit RGB PNG.
+pub fn write_png(path: &Path, image: &RgbImage) -> Result<()> {
+    let bytes: Vec<u8> = image.data.iter().flat_map(|c| c.map(to_byte)).collect();
+    write_bytes(path, (image.width, image.height), &bytes, image::ExtendedColorType::Rgb8)
+}
+
+/// 8-bit grey PNG of values in [0, 1].
+pub fn write_grey_png(path: &Path, plane: &Plane<f32>) -> Result<()> {
+    let bytes: Vec<u8> = plane.data.iter().map(|v| to_byte(*v)).collect();
+    write_bytes(path, (plane.width, plane.height), &bytes, image::ExtendedColorType::L8)
+}
+
+/// 8-bit grey PNG, 0 or 255.
+pub fn write_mask_png(path: &Path, plane: &Plane<bool>) -> Result<()> {
+    let bytes: Vec<u8> = plane.data.iter().map(|v| if *v { 255 } else { 0 }).collect();
+    write_bytes(path, (plane.width, plane.height), &bytes, image::ExtendedColorType::L8)
+}
+
+/// JPEG or PNG bytes for embedding in a page.
+pub fn jpeg_bytes(image: &RgbImage, quality: u8) -> Result<Vec<u8>> {
+    let bytes: Vec<u8> = image.data.iter().flat_map(|c| c.map(to_byte)).collect();
+    let mut out = Vec::new();
+    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut out, quality)
+        .encode(&bytes, image.width as u32, image.height as u32, image::ExtendedColorType::Rgb8)
+        .map_err(|e| Error::work(format!("cannot encode a JPEG: {e}")))?;
+    Ok(out)
+}
+
+/// The planes of one rendered view that go into one EXR file; all of one size.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Planes<'a> {
+    /// R, G, B.
+    pub rgb: Option<&'a RgbImage>,
+    /// A.
+    pub alpha: Option<&'a Plane<f32>>,
+    /// Z, scene units.
+    pub depth: Option<&'a Plane<f32>>,
+    /// feat.00 …: (d, [H, W, d] values).
+    pub features: Option<(usize, &'a [f32])>,
+}
+
+/// Writes a scan-line, ZIP-compressed, 32-bit float OpenEXR file.
+pub fn write_exr(path: &Path, size: (usize, usize), planes: Planes) -> Result<()> {
+    use exr::prelude::WritableImage;
+    let mut channels: Vec<(String, Vec<f32>)> = Vec::new();
+    if let Some(rgb) = planes.rgb {
+        for (k, name) in ["R", "G", "B"].into_iter().enumerate() {
+            channels.push((name.into(), rgb.data.iter().map(|c| c[k]).collect()));
+        }
+    }
+    channels.extend(planes.alpha.map(|p| ("A".to_string(), p.data.clone())));
+    channels.extend(planes.depth.map(|p| ("Z".to_string(), p.data.clone())));
+    if let Some((d, values)) = planes.features {
+        for k in 0..d {
+            channels.push((format!("feat.{k:02}"), values.iter().skip(k).step_by(d).copied().collect()));
+        }
+    }
+    let list =
+        channels.into_iter().map(|(name, v)| ex::AnyChannel::new(name.as_str(), ex::FlatSamples::F32(v)));
+    let encoding = ex::Encoding { compression: ex::Compression::ZIP16, ..ex::Encoding::FAST_LOSSLESS };
+    let channels = ex::AnyChannels::sort(list.collect());
+    let layer = ex::Layer::new(size, ex::LayerAttributes::default(), encoding, channels);
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    ex::Image::from_layer(layer)
+        .write()
+        .to_buffered(&mut bytes)
+        .map_err(|e| Error::work(format!("{}: cannot encode the EXR file: {e}", path.display())))?;
+    std::fs::write(path, bytes.into_inner()).map_err(Error::io(path))
+}
+
+/// Writes `[H, W]` or `[H, W, d]` values as `<f4` npy.
+pub fn write_npy(path: &Path, size: (usize, usize), d: Option<usize>, values: &[f32]) -> Result<()> {
+    let mut shape = vec![size.1, size.0];
+    shape.extend(d);
+    npy::write(path, &NpyArray::f32(&shape, values.to_vec()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exr_keeps_every_float() {
+        use exr::prelude::*;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.exr");
+        let (w, h, d) = (5, 3, 2);
+        let rgb =
+            RgbImage { width: w, height: h, data: (0..15).map(|i| [i as f32 * 0.1, -1.5, 2.0e5]).collect() };
+        let depth = Plane { width: w, height: h, data: (0..15).map(|i| i as f32 * 1e-3).collect() };
+        let features: Vec<f32> = (0..30).map(|i| i as f32).collect();
+        let planes =
+            Planes { rgb: Some(&rgb), alpha: None, depth: Some(&depth), features: Some((d, &features)) };
+        write_exr(&path, (w, h), planes).unwrap();
+        let image = read()
+            .no_deep_data()
+            .largest_resolution_level()
+            .all_channels()
+            .first_valid_layer()
+            .all_attributes()
+            .from_file(&path)
+            .unwrap();
+        let names: Vec<String> =
+            image.layer_data.channel_data.list.iter().map(|c| c.name.to_string()).collect();
+        assert_eq!(names, ["B", "G", "R", "Z", "feat.00", "feat.01"], "alphabetical, as the format demands");
+        let values =
+            |k: usize| image.layer_data.channel_data.list[k].sample_data.values_as_f32().collect::<Vec<_>>();
+        assert_eq!(values(2), rgb.data.iter().map(|c| c[0]).collect::<Vec<_>>());
+        assert_eq!(values(3), depth.data);
+        assert_eq!(values(5), features.iter().skip(1).step_by(2).copied().collect::<Vec<_>>());
+    }
+}

@@ -1,0 +1,274 @@
+//! The scene directory: what a run writes and every other command reads.
+use super::npy::{self, NpyArray};
+use super::workspace::MANIFEST;
+use super::{cameras, colmap, create_folder, picture, ply, transforms};
+use crate::photo::Photo;
+use crate::scene::{Camera, Codebook, LEVEL_NAMES, LanguageField, LevelField, PointCloud, Splats};
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Version of the layout; readers refuse newer ones.
+pub const VERSION: u32 = 1;
+
+/// Name in the manifest.
+const FORMAT: &str = "splatvk-scene";
+
+/// Text embeddings that came with precomputed features, kept so that the scene answers queries on its own.
+pub const TEXT_EMBEDDINGS: &str = "language/text_embeddings.npz";
+
+/// A loaded scene.
+#[derive(Clone, Debug, Default)]
+pub struct Scene {
+    /// Where it was read from.
+    pub path: PathBuf,
+    /// The Gaussians.
+    pub splats: Splats,
+    /// Training cameras at working resolution; empty for a bare PLY.
+    pub cameras: Vec<Camera>,
+    /// What it knows about words.
+    pub language: Option<LanguageField>,
+}
+
+/// `scene.json`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Manifest {
+    format: String,
+    version: u32,
+    generator: String,
+    splats: usize,
+    sh_degree: u32,
+    cameras: usize,
+    #[serde(default)]
+    language: Option<LanguageManifest>,
+}
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct LanguageManifest {
+    space: String,
+    levels: Vec<LevelManifest>,
+}
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct LevelManifest {
+    name: String,
+    codes: usize,
+    embedding_dim: usize,
+    code_dim: usize,
+}
+
+/// What [`write`] puts into a scene directory.
+#[derive(Clone, Copy)]
+pub struct Contents<'a> {
+    /// The Gaussians.
+    pub splats: &'a Splats,
+    /// One per photo, at working resolution.
+    pub cameras: &'a [Camera],
+    /// Kept beside the cameras (undistorted, working resolution), for other tools; may be empty.
+    pub photos: &'a [Photo],
+    /// Points for the COLMAP model.
+    pub points: Option<&'a PointCloud>,
+    /// Language field with trained features.
+    pub language: Option<&'a LanguageField>,
+    /// `text_embeddings.npz` of precomputed features, copied into the scene.
+    pub text_embeddings: Option<&'a Path>,
+}
+
+/// Writes splats, cameras and language into `folder`, which exists (see [`super::Workspace`]). The manifest comes last:
+/// a folder without it is not a scene.
+pub fn write(folder: &Path, c: &Contents) -> Result<()> {
+    ply::write_splats(&folder.join("point_cloud.ply"), c.splats, ply::PlyOptions::default())?;
+    let camera_folder = folder.join("cameras");
+    create_folder(&camera_folder)?;
+    let mut named = c.cameras.to_vec();
+    if !c.photos.is_empty() {
+        create_folder(&camera_folder.join("images"))?;
+        for (camera, photo) in named.iter_mut().zip(c.photos) {
+            camera.name = format!("{}.png", photo.stem);
+            picture::write_png(&camera_folder.join("images").join(&camera.name), &photo.image)?;
+        }
+    }
+    colmap::write(&camera_folder.join("colmap"), &named, c.points)?;
+    if !c.photos.is_empty() {
+        named.iter_mut().for_each(|camera| camera.name = format!("images/{}", camera.name));
+    }
+    transforms::write(&camera_folder.join("transforms.json"), &named, Some("../point_cloud.ply"))?;
+    let language = c.language.map(|l| write_language(folder, l, c.splats.len())).transpose()?;
+    if let (Some(_), Some(table)) = (&language, c.text_embeddings) {
+        let to = folder.join(TEXT_EMBEDDINGS);
+        std::fs::copy(table, &to).map_err(Error::io(&to))?;
+    }
+    let manifest = Manifest {
+        format: FORMAT.into(),
+        version: VERSION,
+        generator: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
+        splats: c.splats.len(),
+        sh_degree: c.splats.sh_degree,
+        cameras: c.cameras.len(),
+        language,
+    };
+    super::write_json(&folder.join(MANIFEST), &manifest)
+}
+
+fn write_language(folder: &Path, field: &LanguageField, splats: usize) -> Result<LanguageManifest> {
+    let folder = folder.join("language");
+    create_folder(&folder)?;
+    let mut levels = Vec::new();
+    let mut features: Vec<(&str, NpyArray)> = Vec::new();
+    for (name, level) in LEVEL_NAMES.into_iter().zip(&field.levels).filter(|(_, l)| !l.codebook.is_empty()) {
+        let book = &level.codebook;
+        if level.features.len() != splats * book.code_dim {
+            return Err(Error::work(format!("level {name} has features for another number of splats")));
+        }
+        write_codebook(&folder.join(format!("codebook_{name}.npz")), book, &field.space)?;
+        features.push((name, NpyArray::f32(&[splats, book.code_dim], level.features.clone())));
+        levels.push(LevelManifest {
+            name: name.into(),
+            codes: book.len(),
+            embedding_dim: book.embedding_dim,
+            code_dim: book.code_dim,
+        });
+    }
+    let arrays: Vec<(&str, &NpyArray)> = features.iter().map(|(n, a)| (*n, a)).collect();
+    npy::write_npz(folder.join("features.npz"), &arrays)?;
+    Ok(LanguageManifest { space: field.space.clone(), levels })
+}
+
+/// One level's bijection (ALGORITHMS 10.2).
+fn write_codebook(path: &Path, book: &Codebook, space: &str) -> Result<()> {
+    let k = book.len();
+    let mut offsets = vec![0i32];
+    let mut members = Vec::new();
+    for list in &book.members {
+        members.extend(list.iter().flat_map(|(view, mask)| [*view as i32, *mask as i32]));
+        offsets.push(members.len() as i32 / 2);
+    }
+    let count = members.len() / 2;
+    npy::write_npz(
+        path,
+        &[
+            ("clip", &NpyArray::f32(&[k, book.embedding_dim], book.embeddings.clone())),
+            ("code", &NpyArray::f32(&[k, book.code_dim], book.codes.clone())),
+            ("weight", &NpyArray::f32(&[book.weights.len()], book.weights.clone())),
+            ("members", &NpyArray::i32(&[count, 2], members)),
+            ("offsets", &NpyArray::i32(&[offsets.len()], offsets)),
+            ("delta_min", &NpyArray::f32(&[], vec![book.min_chord])),
+            ("model", &NpyArray::text(space)),
+            ("version", &NpyArray::i32(&[], vec![VERSION as i32])),
+        ],
+    )
+}
+
+/// Loads a scene directory, or a bare Gaussian `.ply`.
+pub fn load(path: &Path) -> Result<Scene> {
+    if path.is_file() {
+        return Ok(Scene { path: path.into(), splats: ply::read_splats(path)?, ..Scene::default() });
+    }
+    let manifest = read_manifest(path)?;
+    let splats = ply::read_splats(&path.join("point_cloud.ply"))?;
+    let cameras = cameras::read(&path.join("cameras/transforms.json"))?;
+    let damaged =
+        |what: String| Error::input(format!("{}: {what}; the scene is damaged, run again", path.display()));
+    if splats.len() != manifest.splats || cameras.len() != manifest.cameras {
+        return Err(damaged(format!(
+            "{MANIFEST} counts {} splats, the PLY has {}",
+            manifest.splats,
+            splats.len()
+        )));
+    }
+    let splats = cut_degree(splats, manifest.sh_degree);
+    let language = manifest.language.map(|m| read_language(path, &m, splats.len())).transpose()?;
+    Ok(Scene { path: path.into(), splats, cameras, language })
+}
+
+fn read_manifest(path: &Path) -> Result<Manifest> {
+    let file = path.join(MANIFEST);
+    let text = std::fs::read_to_string(&file).map_err(|e| {
+        Error::input(format!(
+            "{}: not a scene directory ({MANIFEST}: {e}); give one that splatvk run wrote",
+            path.display()
+        ))
+    })?;
+    let manifest: Manifest = serde_json::from_str(&text)
+        .map_err(|e| Error::input(format!("{}: {e}; the scene is damaged, run again", file.display())))?;
+    if manifest.format != FORMAT || manifest.version > VERSION {
+        return Err(Error::input(format!(
+            "{}: format {} version {}; this program reads {FORMAT} up to version {VERSION}, update it",
+            file.display(),
+            manifest.format,
+            manifest.version
+        )));
+    }
+    Ok(manifest)
+}
+
+/// The PLY is padded to degree 3 for other viewers; the scene's own degree renders the same in less time.
+fn cut_degree(splats: Splats, degree: u32) -> Splats {
+    let (have, keep) = (splats.sh_len(), crate::scene::sh_coefficients(degree.min(splats.sh_degree)));
+    let sh = splats.sh.chunks_exact(have * 3).flat_map(|c| c[..keep * 3].iter().copied()).collect();
+    Splats { sh, sh_degree: degree.min(splats.sh_degree), ..splats }
+}
+
+fn read_language(path: &Path, manifest: &LanguageManifest, splats: usize) -> Result<LanguageField> {
+    let folder = path.join("language");
+    let file = folder.join("features.npz");
+    let mut features = npy::read_npz(&file)?;
+    let mut field = LanguageField {
+        levels: vec![LevelField::default(); LEVEL_NAMES.len()],
+        space: manifest.space.clone(),
+    };
+    for m in &manifest.levels {
+        let at = LEVEL_NAMES.iter().position(|n| *n == m.name);
+        let (Some(at), Some(array)) = (at, features.remove(&m.name)) else {
+            return Err(Error::input(format!(
+                "{}: no level {:?}; the scene is damaged",
+                file.display(),
+                m.name
+            )));
+        };
+        let codebook = read_codebook(&folder.join(format!("codebook_{}.npz", m.name)))?;
+        if array.shape != [splats, m.code_dim] || codebook.code_dim != m.code_dim || codebook.len() != m.codes
+        {
+            return Err(Error::input(format!(
+                "{}: level {} has the wrong shape; the scene is damaged",
+                file.display(),
+                m.name
+            )));
+        }
+        field.levels[at] = LevelField { codebook, features: array.to_f32(), targets: Vec::new() };
+    }
+    Ok(field)
+}
+
+fn read_codebook(path: &Path) -> Result<Codebook> {
+    let arrays: BTreeMap<String, NpyArray> = npy::read_npz(path)?;
+    let get = |name: &str| {
+        arrays.get(name).ok_or_else(|| {
+            Error::input(format!("{}: no array {name:?}; the scene is damaged", path.display()))
+        })
+    };
+    let (clip, code) = (get("clip")?, get("code")?);
+    let (&[k, embedding_dim], &[k2, code_dim]) = (&clip.shape[..], &code.shape[..]) else {
+        return Err(Error::input(format!("{}: arrays have no two dimensions", path.display())));
+    };
+    let (members, offsets) = (get("members")?.to_i32(), get("offsets")?.to_i32());
+    let bounds = |w: &[i32]| members.get(w[0].max(0) as usize * 2..w[1].max(0) as usize * 2);
+    let members: Option<Vec<Vec<(u32, u32)>>> = offsets
+        .windows(2)
+        .map(|w| Some(bounds(w)?.chunks_exact(2).map(|p| (p[0] as u32, p[1] as u32)).collect()))
+        .collect();
+    let members = members.filter(|m| k == k2 && m.len() == k);
+    let members = members.ok_or_else(|| {
+        Error::input(format!("{}: arrays do not fit together; the scene is damaged", path.display()))
+    })?;
+    Ok(Codebook {
+        embedding_dim,
+        code_dim,
+        embeddings: clip.to_f32(),
+        codes: code.to_f32(),
+        weights: get("weight")?.to_f32(),
+        members,
+        min_chord: get("delta_min")?.to_f32().first().copied().unwrap_or(0.0),
+    })
+}

@@ -1,0 +1,145 @@
+//! nerfstudio `transforms.json`: camera → world in OpenGL axes (x right, y up, z backward).
+use crate::Result;
+use crate::scene::{Camera, Pose};
+use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::path::Path;
+
+/// Intrinsics, at the top of the file or per frame; a frame's own win.
+#[derive(Debug, Default, Clone, Deserialize)]
+#[serde(default)]
+struct Intrinsics {
+    fl_x: Option<f64>,
+    fl_y: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    // Some writers store sizes as floats.
+    w: Option<f64>,
+    h: Option<f64>,
+    camera_angle_x: Option<f64>,
+    camera_model: Option<String>,
+    k1: f64,
+    k2: f64,
+    k3: f64,
+    k4: f64,
+    p1: f64,
+    p2: f64,
+}
+
+#[derive(Debug, Deserialize)]
+struct Frame {
+    #[serde(default)]
+    file_path: String,
+    transform_matrix: Vec<Vec<f64>>,
+    #[serde(flatten)]
+    own: Intrinsics,
+}
+
+#[derive(Debug, Deserialize)]
+struct File {
+    #[serde(flatten)]
+    shared: Intrinsics,
+    frames: Vec<Frame>,
+}
+
+/// Cameras of a parsed file; `folder` is where its image paths start, for files that do not state the image size.
+pub(super) fn parse(value: Value, folder: &Path) -> Result<Vec<Camera>, String> {
+    let file: File = serde_json::from_value(value).map_err(|e| format!("not a transforms.json file: {e}"))?;
+    file.frames.iter().enumerate().map(|(i, f)| camera(&file.shared, f, i, folder)).collect()
+}
+
+fn camera(shared: &Intrinsics, frame: &Frame, index: usize, folder: &Path) -> Result<Camera, String> {
+    let name = if frame.file_path.is_empty() { format!("{index:05}") } else { frame.file_path.clone() };
+    let own = &frame.own;
+    let model = own.camera_model.as_ref().or(shared.camera_model.as_ref());
+    if let Some(m) = model.filter(|m| m.contains("FISHEYE") || m.contains("EQUIRECT")) {
+        return Err(format!("frame {name:?}: camera model {m} is not a pinhole; undistort the photos first"));
+    }
+    for (k, v) in [("k1", own.k1, shared.k1), ("k2", own.k2, shared.k2), ("k3", own.k3, shared.k3)]
+        .into_iter()
+        .chain([("k4", own.k4, shared.k4), ("p1", own.p1, shared.p1), ("p2", own.p2, shared.p2)])
+        .map(|(k, a, b)| (k, if a != 0.0 { a } else { b }))
+    {
+        if v != 0.0 {
+            return Err(format!(
+                "frame {name:?}: lens distortion {k} = {v} is not supported; undistort the photos first"
+            ));
+        }
+    }
+    let pick = |get: fn(&Intrinsics) -> Option<f64>| get(own).or_else(|| get(shared));
+    let stated = pick(|i| i.w).zip(pick(|i| i.h));
+    let (w, h) = stated.or_else(|| size_of_image(folder, &name)).ok_or_else(|| {
+        format!("frame {name:?}: no image size; add \"w\" and \"h\" to the file or keep the images beside it")
+    })?;
+    let fx = pick(|i| i.fl_x).or_else(|| pick(|i| i.camera_angle_x).map(|a| 0.5 * w / (0.5 * a).tan()));
+    let fx = fx.ok_or_else(|| format!("frame {name:?}: no focal length (fl_x or camera_angle_x)"))?;
+    super::cameras::checked(Camera {
+        width: w as u32,
+        height: h as u32,
+        fx,
+        fy: pick(|i| i.fl_y).unwrap_or(fx),
+        cx: pick(|i| i.cx).unwrap_or(w / 2.0),
+        cy: pick(|i| i.cy).unwrap_or(h / 2.0),
+        pose: pose(&frame.transform_matrix)
+            .ok_or_else(|| format!("frame {name:?}: transform_matrix must be 4 × 4"))?,
+        name,
+    })
+}
+
+fn size_of_image(folder: &Path, name: &str) -> Option<(f64, f64)> {
+    let candidates =
+        [folder.join(name), folder.join(format!("{name}.png")), folder.join(format!("{name}.jpg"))];
+    candidates.iter().find_map(|p| image::image_dimensions(p).ok()).map(|(w, h)| (w as f64, h as f64))
+}
+
+/// `T_cw` of a camera → world matrix in OpenGL axes: `T_wc = T_gl · diag(1, −1, −1, 1)`.
+fn pose(rows: &[Vec<f64>]) -> Option<Pose> {
+    if rows.len() < 3 || rows.iter().any(|r| r.len() != 4) {
+        return None;
+    }
+    let column = |k: usize| DVec3::new(rows[0][k], rows[1][k], rows[2][k]);
+    let to_world = DMat3::from_cols(column(0), -column(1), -column(2));
+    Some(Pose { rotation: to_world, translation: column(3) }.inverse())
+}
+
+#[derive(Serialize)]
+struct OutFrame<'a> {
+    file_path: &'a str,
+    fl_x: f64,
+    fl_y: f64,
+    cx: f64,
+    cy: f64,
+    w: u32,
+    h: u32,
+    transform_matrix: [[f64; 4]; 4],
+}
+
+/// Writes `transforms.json`; every frame carries its own intrinsics. `ply_file_path`, relative to the file, names points
+/// or splats for tools that start from them.
+pub fn write(path: &Path, cameras: &[Camera], ply_file_path: Option<&str>) -> Result<()> {
+    let frames: Vec<OutFrame> = cameras
+        .iter()
+        .map(|c| {
+            let to_world = c.pose.inverse();
+            let (r, t) = (to_world.rotation, to_world.translation);
+            let row = |k: usize| [r.x_axis[k], -r.y_axis[k], -r.z_axis[k], t[k]];
+            OutFrame {
+                file_path: &c.name,
+                fl_x: c.fx,
+                fl_y: c.fy,
+                cx: c.cx,
+                cy: c.cy,
+                w: c.width,
+                h: c.height,
+                transform_matrix: [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+            }
+        })
+        .collect();
+    let mut file =
+        serde_json::json!({ "camera_model": "PINHOLE", "orientation_override": "none", "frames": frames });
+    if let Some(ply) = ply_file_path {
+        file["ply_file_path"] = ply.into();
+    }
+    super::write_json(path, &file)
+}

@@ -1,0 +1,359 @@
+//! File formats: what is written reads back, foreign files are understood, damaged ones are refused in one line.
+use glam::{DQuat, DVec3};
+use splatvk::format::{cameras, colmap, ply, scene_dir, splat, transforms};
+use splatvk::photo;
+use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, PointCloud, Pose, Splats};
+use std::path::{Path, PathBuf};
+
+fn data(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
+}
+
+/// Numbers in (−1, 1) from a hash: every value differs, so swapped columns cannot go unnoticed.
+fn noise(i: usize) -> f32 {
+    let h = (i as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    ((h >> 40) as f32 / (1u64 << 23) as f32) - 1.0
+}
+
+fn splats(n: usize, sh_degree: u32) -> Splats {
+    let mut next = 0;
+    let mut value = || {
+        next += 1;
+        noise(next)
+    };
+    let mut s = Splats { sh_degree, ..Splats::default() };
+    for _ in 0..n {
+        s.means.push([value(), value(), value()]);
+        s.log_scales.push([value(), value(), value()]);
+        s.quats.push([value(), value(), value(), value()]);
+        s.opacity_logits.push(value());
+        s.sh.extend((0..s.sh_len() * 3).map(|_| value()));
+    }
+    s
+}
+
+fn some_cameras() -> Vec<Camera> {
+    (0..3)
+        .map(|i| Camera {
+            name: format!("photo {i}.jpg"),
+            width: 640 + i,
+            height: 480,
+            fx: 611.123456789012 + i as f64,
+            fy: 612.0 / 7.0,
+            cx: 320.1,
+            cy: 239.7 - i as f64,
+            pose: Pose {
+                rotation: glam::DMat3::from_quat(
+                    DQuat::from_xyzw(0.1, 0.2 * i as f64, -0.4, 0.8 - 0.9 * i as f64).normalize(),
+                ),
+                translation: DVec3::new(0.1, -2.0 / 3.0, 1e3 * i as f64),
+            },
+        })
+        .collect()
+}
+
+/// Camera centres and rotations must survive text files (ALGORITHMS 10.3: 1e-9); centres relative to their size.
+fn assert_same_cameras(a: &[Camera], b: &[Camera]) {
+    assert_eq!(a.len(), b.len());
+    for (a, b) in a.iter().zip(b) {
+        assert_eq!((a.width, a.height), (b.width, b.height));
+        assert_eq!(cameras::stem(&a.name), cameras::stem(&b.name));
+        for (x, y) in [(a.fx, b.fx), (a.fy, b.fy), (a.cx, b.cx), (a.cy, b.cy)] {
+            assert_eq!(x, y);
+        }
+        let scale = 1.0 + a.pose.centre().length();
+        assert!((a.pose.centre() - b.pose.centre()).length() < 1e-9 * scale);
+        assert!(a.pose.rotation.abs_diff_eq(b.pose.rotation, 1e-12));
+    }
+}
+
+#[test]
+fn gaussian_ply_round_trip() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.ply");
+    for degree in 0..=3 {
+        let s = splats(7, degree);
+        ply::write_splats(&path, &s, ply::PlyOptions { degree, language: None }).unwrap();
+        assert_eq!(ply::read_splats(&path).unwrap(), s);
+        // Padded to degree 3, as most viewers expect: the added coefficients are zero.
+        ply::write_splats(&path, &s, ply::PlyOptions::default()).unwrap();
+        let padded = ply::read_splats(&path).unwrap();
+        assert_eq!((padded.sh_degree, &padded.means, &padded.quats), (3, &s.means, &s.quats));
+        for i in 0..7 {
+            let (row, own) =
+                (&padded.sh[i * 48..(i + 1) * 48], &s.sh[i * s.sh_len() * 3..(i + 1) * s.sh_len() * 3]);
+            assert_eq!(&row[..own.len()], own);
+            assert!(row[own.len()..].iter().all(|v| *v == 0.0));
+        }
+    }
+    ply::write_splats(&path, &splats(0, 0), ply::PlyOptions::default()).unwrap();
+    assert!(ply::read_splats(&path).unwrap().is_empty());
+}
+
+#[test]
+fn ply_has_the_fields_in_the_order_of_the_format() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.ply");
+    let s = splats(2, 1);
+    ply::write_splats(&path, &s, ply::PlyOptions { degree: 1, language: Some(&field(2)) }).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let header = String::from_utf8(bytes[..end].to_vec()).unwrap();
+    let names: Vec<&str> =
+        header.lines().filter(|l| l.starts_with("property")).map(|l| l.rsplit(' ').next().unwrap()).collect();
+    let expected = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 f_rest_1 f_rest_2 f_rest_3 f_rest_4 f_rest_5 f_rest_6 \
+                    f_rest_7 f_rest_8 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 lang_s_0 lang_s_1 lang_l_0 \
+                    lang_l_1 code_s code_l";
+    assert_eq!(names.join(" "), expected);
+    let row = |i: usize| {
+        let start = end + i * names.len() * 4;
+        bytes[start..start + names.len() * 4]
+            .chunks(4)
+            .map(|b| f32::from_le_bytes(b.try_into().unwrap()))
+            .collect::<Vec<_>>()
+    };
+    // Channel-major rest: R of coefficients 1–3, then G, then B; in memory they are interleaved.
+    let sh = &s.sh[12..24];
+    assert_eq!(row(1)[9..18], [sh[3], sh[6], sh[9], sh[4], sh[7], sh[10], sh[5], sh[8], sh[11]]);
+    assert_eq!(row(1)[18], s.opacity_logits[1]);
+    assert_eq!(row(1)[22..26], s.quats[1]);
+    assert_eq!(row(0)[26..28], [0.6, 0.8], "features are written as unit vectors");
+    assert_eq!((row(0)[30].to_bits(), row(1)[30].to_bits()), (1, 0), "nearest code");
+    assert_eq!(row(1)[31].to_bits() as i32, -1, "a splat without feature has no code");
+}
+
+/// Levels s and l of two splats, m empty.
+fn field(n: usize) -> LanguageField {
+    let book = Codebook {
+        embedding_dim: 3,
+        code_dim: 2,
+        embeddings: vec![1.0, 0.0, 0.0, 0.0, 0.6, 0.8],
+        codes: vec![1.0, 0.0, 0.0, 1.0],
+        weights: vec![12.0, 3.5],
+        members: vec![vec![(0, 4), (2, 1)], vec![]],
+        min_chord: 2f32.sqrt(),
+    };
+    let mut features = vec![0.0; n * 2];
+    features[..4].copy_from_slice(&[3.0, 4.0, 2.0, 0.5]);
+    let s = LevelField { codebook: book.clone(), features: features.clone(), targets: vec![] };
+    features[2..4].fill(0.0);
+    let l = LevelField { codebook: book, features, targets: vec![] };
+    LanguageField { levels: vec![s, LevelField::default(), l], space: "test/space".into() }
+}
+
+#[test]
+fn files_of_other_programs() {
+    // Written by trimesh, kept in the brush repository: 100 coloured points, no Gaussians.
+    let points = ply::read_points(&data("formats/brush_init.ply")).unwrap();
+    assert!(points.len() == 100 && points.positions.iter().flatten().all(|v| v.is_finite() && v.abs() < 10.0));
+    let e = ply::read_splats(&data("formats/brush_init.ply")).unwrap_err().to_string();
+    assert!(e.contains("not a Gaussian splat file"), "{e}");
+    // An ASCII cloud with columns in another order, of other types, and an element before the vertices.
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("points.ply");
+    let text = "ply\nformat ascii 1.0\ncomment x\nelement camera 1\nproperty float f\nelement vertex 2\nproperty uchar red\n\
+                property uchar green\nproperty uchar blue\nproperty double x\nproperty float y\nproperty float z\nelement face 0\n\
+                property list uchar int vertex_indices\nend_header\n9\n255 0 51 1.5 2 3\n0 0 0 -1 -2 -3\n";
+    std::fs::write(&path, text).unwrap();
+    let p = ply::read_points(&path).unwrap();
+    assert_eq!(
+        (p.positions.as_slice(), p.colours[0]),
+        (&[[1.5, 2.0, 3.0], [-1.0, -2.0, -3.0]][..], [1.0, 0.0, 0.2])
+    );
+}
+
+#[test]
+fn damaged_ply_files_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.ply");
+    ply::write_splats(&path, &splats(3, 0), ply::PlyOptions::default()).unwrap();
+    let whole = std::fs::read(&path).unwrap();
+    for cut in (0..whole.len()).step_by(37) {
+        std::fs::write(&path, &whole[..cut]).unwrap();
+        let e = ply::read_splats(&path).unwrap_err();
+        assert_eq!((e.exit_code(), e.to_string().lines().count()), (2, 1), "cut at {cut}: {e}");
+    }
+    let liar = String::from_utf8_lossy(&whole).replace("vertex 3", "vertex 99999999999999");
+    std::fs::write(&path, liar.as_bytes()).unwrap();
+    assert_eq!(
+        ply::read_splats(&path).unwrap_err().exit_code(),
+        2,
+        "no memory is taken on the word of a header"
+    );
+    std::fs::write(&path, "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
+        .unwrap();
+    assert!(ply::read_splats(&path).unwrap_err().to_string().contains("no column y"));
+}
+
+#[test]
+fn splat_file_layout() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.splat");
+    let mut s = splats(2, 1);
+    (s.opacity_logits[0], s.opacity_logits[1]) = (-5.0, 0.0);
+    s.quats[1] = [2.0, 0.0, -2.0, 0.0];
+    splat::write_splats(&path, &s).unwrap();
+    let b = std::fs::read(&path).unwrap();
+    assert_eq!(b.len(), 64);
+    let f = |k: usize| f32::from_le_bytes(b[4 * k..4 * k + 4].try_into().unwrap());
+    assert_eq!([f(0), f(1), f(2)], s.means[1], "the more visible splat comes first");
+    assert_eq!(f(4), s.log_scales[1][1].exp());
+    assert_eq!((b[24], b[27]), (((0.5 + 0.2820948 * s.sh[12]) * 255.0).round() as u8, 128));
+    assert_eq!(b[28..32], [219, 128, 37, 128]);
+}
+
+#[test]
+fn cameras_round_trip() {
+    let folder = tempfile::tempdir().unwrap();
+    let cams = some_cameras();
+    let (t, j, c) = (
+        folder.path().join("transforms.json"),
+        folder.path().join("cameras.json"),
+        folder.path().join("model"),
+    );
+    transforms::write(&t, &cams, None).unwrap();
+    assert_same_cameras(&cameras::read(&t).unwrap(), &cams);
+    cameras::write_json(&j, &cams).unwrap();
+    assert_same_cameras(&cameras::read(&j).unwrap(), &cams);
+    let points = PointCloud {
+        positions: vec![[0.1, 0.2, 0.3], [-4.0, 5.0, 6.5]],
+        colours: vec![[1.0, 0.0, 0.2], [0.4, 0.6, 0.8]],
+        ..PointCloud::default()
+    };
+    colmap::write(&c, &cams, Some(&points)).unwrap();
+    assert_same_cameras(&cameras::read(&c).unwrap(), &cams);
+    let back = colmap::read_points(&c).unwrap();
+    assert_eq!((back.positions, back.colours), (points.positions, points.colours));
+}
+
+#[test]
+fn transforms_are_camera_to_world_in_opengl_axes() {
+    // A camera at (1, 2, 3) that looks along world +x with world −z up: OpenCV right = +y... worked out by hand.
+    let text = r#"{"fl_x": 500, "w": 640, "h": 480, "frames": [{"file_path": "a.png", "transform_matrix":
+        [[0, 0, -1, 1], [1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]]}]}"#;
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("transforms.json");
+    std::fs::write(&path, text).unwrap();
+    let c = &cameras::read(&path).unwrap()[0];
+    assert_eq!((c.fy, c.cx, c.cy), (500.0, 320.0, 240.0));
+    // OpenGL: right = world +y, up = world −z, forward = −z axis = world +x.
+    let (pixel, depth) = c.project(DVec3::new(1.0 + 4.0, 2.0, 3.0));
+    assert!(
+        (depth - 4.0).abs() < 1e-12 && (pixel - glam::DVec2::new(320.0, 240.0)).length() < 1e-9,
+        "straight ahead"
+    );
+    let (pixel, _) = c.project(DVec3::new(5.0, 3.0, 3.0));
+    assert!((pixel.x - (320.0 + 125.0)).abs() < 1e-9, "right of the camera is world +y: {pixel}");
+    let (pixel, _) = c.project(DVec3::new(5.0, 2.0, 2.0));
+    assert!((pixel.y - (240.0 - 125.0)).abs() < 1e-9, "above the camera is world −z: {pixel}");
+}
+
+#[test]
+fn colmap_binary_model() {
+    let folder = tempfile::tempdir().unwrap();
+    let cams = some_cameras();
+    let (mut c, mut im) = (3u64.to_le_bytes().to_vec(), 3u64.to_le_bytes().to_vec());
+    for (i, cam) in cams.iter().enumerate() {
+        c.extend((i as u32 + 7).to_le_bytes());
+        c.extend(1u32.to_le_bytes());
+        c.extend((cam.width as u64).to_le_bytes());
+        c.extend((cam.height as u64).to_le_bytes());
+        [cam.fx, cam.fy, cam.cx, cam.cy].iter().for_each(|v| c.extend(v.to_le_bytes()));
+        im.extend((i as u32 + 1).to_le_bytes());
+        let q = DQuat::from_mat3(&cam.pose.rotation);
+        let t = cam.pose.translation;
+        [q.w, q.x, q.y, q.z, t.x, t.y, t.z].iter().for_each(|v| im.extend(v.to_le_bytes()));
+        im.extend((i as u32 + 7).to_le_bytes());
+        im.extend(cam.name.as_bytes());
+        im.push(0);
+        im.extend(2u64.to_le_bytes());
+        im.extend([1u8; 48]);
+    }
+    std::fs::write(folder.path().join("cameras.bin"), &c).unwrap();
+    std::fs::write(folder.path().join("images.bin"), &im).unwrap();
+    assert_same_cameras(&cameras::read(folder.path()).unwrap(), &cams);
+    std::fs::write(folder.path().join("images.bin"), &im[..im.len() - 1]).unwrap();
+    assert!(
+        cameras::read(folder.path()).unwrap_err().to_string().contains("images.bin: the file ends early")
+    );
+}
+
+#[test]
+fn what_no_pinhole_can_be_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("t.json");
+    let identity = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]";
+    let frame = |extra: &str, m: &str| {
+        format!(
+            r#"{{"w": 64, "h": 48, {extra} "frames": [{{"file_path": "a.png", "transform_matrix": {m}}}]}}"#
+        )
+    };
+    let cases = [
+        ("{", "not a JSON camera file"),
+        ("{}", "neither transforms.json"),
+        (r#"{"frames": []}"#, "no cameras"),
+        (&frame("", identity), "no focal length"),
+        (&frame(r#""fl_x": 50, "k1": 0.1,"#, identity), "k1 = 0.1"),
+        (&frame(r#""fl_x": -50,"#, identity), "must be positive"),
+        (&frame(r#""fl_x": 50,"#, "[[1,0,0,0]]"), "4 × 4"),
+        (&frame(r#""fl_x": 50,"#, "[[2,0,0,0],[0,1,0,0],[0,0,1,0]]"), "not a rotation"),
+    ];
+    for (text, words) in cases {
+        std::fs::write(&path, text).unwrap();
+        let e = cameras::read(&path).unwrap_err();
+        assert!(
+            e.exit_code() == 2 && e.to_string().contains(words) && e.to_string().contains("t.json"),
+            "{e}"
+        );
+        assert_eq!(e.to_string().lines().count(), 1);
+    }
+    assert_eq!(cameras::read(&folder.path().join("none.json")).unwrap_err().exit_code(), 2);
+    assert_eq!(cameras::read(folder.path()).unwrap_err().exit_code(), 2);
+}
+
+#[test]
+fn scene_directory_round_trip() {
+    let folder = tempfile::tempdir().unwrap();
+    let photos = photo::load_all(&[data("breakfast/images")], Some(3), &splatvk::progress::Silent).unwrap();
+    let (s, cams, language) = (splats(5, 2), some_cameras(), field(5));
+    let contents = scene_dir::Contents {
+        splats: &s,
+        cameras: &cams,
+        photos: &photos,
+        points: None,
+        language: Some(&language),
+        text_embeddings: None,
+    };
+    scene_dir::write(folder.path(), &contents).unwrap();
+    let scene = scene_dir::load(folder.path()).unwrap();
+    assert_eq!(scene.splats, s, "with its own SH degree, though the PLY is padded to 3");
+    assert_eq!(scene.language.as_ref(), Some(&language));
+    let stems: Vec<_> = scene.cameras.iter().map(|c| cameras::stem(&c.name)).collect();
+    assert_eq!(stems, photos.iter().map(|p| p.stem.clone()).collect::<Vec<_>>());
+    assert!((scene.cameras[2].pose.centre() - cams[2].pose.centre()).length() < 1e-6);
+    assert_eq!(colmap::read(&folder.path().join("cameras/colmap")).unwrap().len(), 3);
+    let kept = photo::load(&folder.path().join("cameras/images/train_00.png")).unwrap();
+    assert_eq!(kept.image, photos[0].image, "8-bit photos survive unchanged");
+
+    let bare = scene_dir::load(&folder.path().join("point_cloud.ply")).unwrap();
+    assert!(bare.language.is_none() && bare.cameras.is_empty() && bare.splats.len() == 5);
+    let manifest = folder.path().join("scene.json");
+    let text = std::fs::read_to_string(&manifest).unwrap();
+    std::fs::write(&manifest, text.replace("\"version\": 1", "\"version\": 99")).unwrap();
+    assert!(scene_dir::load(folder.path()).unwrap_err().to_string().contains("update it"));
+    std::fs::remove_file(&manifest).unwrap();
+    assert!(scene_dir::load(folder.path()).unwrap_err().to_string().contains("not a scene directory"));
+}
+
+#[test]
+fn stems_join_cameras_to_photos() {
+    for (name, stem) in [
+        ("images/a b.jpg", "a b"),
+        ("a.tar.png", "a.tar"),
+        ("view.2", "view.2"),
+        ("x", "x"),
+        (".png", ".png"),
+    ] {
+        assert_eq!(cameras::stem(name), stem);
+    }
+}
