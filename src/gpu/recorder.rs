@@ -193,7 +193,8 @@ impl Recorder {
         }
     }
 
-    fn fail(&mut self, what: String) {
+    /// Keeps a mistake for [`Recorder::compile`] to return, unless there is an earlier one.
+    pub fn fail(&mut self, what: impl std::fmt::Display) {
         let message = format!("{}: {what}", self.label);
         self.error.get_or_insert_with(|| Error::gpu(message));
     }

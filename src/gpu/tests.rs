@@ -176,3 +176,52 @@ fn validation_messages_are_caught() {
     }
     assert!(device.validation_messages().iter().any(|m| m.contains("VUID-VkBufferCreateInfo-size-00912")));
 }
+
+/// `cargo test --lib sort_speed -- --ignored --nocapture`: milliseconds per command, best of five.
+#[test]
+#[ignore = "a measurement"]
+fn sort_speed() {
+    use crate::pass::sort::Sort;
+    let device = Device::open(None).unwrap();
+    for n in [100_000usize, 500_000] {
+        let pairs: Vec<[u32; 2]> = (0..n as u32).map(|i| [i.wrapping_mul(2654435761), i]).collect();
+        let buffer = device.buffer_from("pairs", &pairs).unwrap();
+        let count = device.buffer_from("count", &[n as u32]).unwrap();
+        let sort = Sort::new(&device, n).unwrap();
+        let mut rec = Recorder::new(&device, "sort");
+        sort.record(&mut rec, &buffer, &count, 32);
+        let program = rec.compile().unwrap();
+        let mut best = f64::MAX;
+        for _ in 0..6 {
+            buffer.write(&pairs).unwrap();
+            let start = std::time::Instant::now();
+            program.run().unwrap();
+            best = best.min(start.elapsed().as_secs_f64() * 1e3);
+        }
+        println!("{n} pairs, 32 bits: {best:.2} ms; {:?}", program.run_timed().unwrap());
+    }
+    // An empty program and a chain of tiny dependent dispatches: what a submit and a dispatch cost.
+    let start = std::time::Instant::now();
+    let empty = Recorder::new(&device, "empty").compile().unwrap();
+    let compiled = start.elapsed();
+    let start = std::time::Instant::now();
+    (0..100).for_each(|_| empty.run().unwrap());
+    println!("empty: compile {compiled:?}, run {:?}", start.elapsed() / 100);
+    let codes = device.buffer_from("codes", &[0i32; 8]).unwrap();
+    let a = device.buffer::<f32>("a", 8).unwrap();
+    let b = device.buffer::<f32>("b", 8).unwrap();
+    let mut rec = Recorder::new(&device, "chain");
+    for i in 0..1000 {
+        let (scores, relevancy) = if i % 2 == 0 { (&a, &b) } else { (&b, &a) };
+        let bindings = shaders::relevancy_map::Bindings { codes: &codes, scores, relevancy };
+        let push = shaders::relevancy_map::Push { pixels: 8 };
+        rec.dispatch_threads(shaders::relevancy_map::call(&bindings, &push), [8, 1, 1]);
+    }
+    let start = std::time::Instant::now();
+    let chain = rec.compile().unwrap();
+    let compiled = start.elapsed();
+    chain.run().unwrap();
+    let start = std::time::Instant::now();
+    chain.run().unwrap();
+    println!("1000 dependent dispatches: compile {compiled:?}, run {:?}", start.elapsed());
+}

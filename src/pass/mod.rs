@@ -4,8 +4,10 @@ pub mod project;
 pub mod project_backward;
 pub mod raster_backward;
 pub mod raster_forward;
+pub mod scan;
 pub mod seeded;
 pub mod sh;
+pub mod sort;
 pub mod twin;
 #[cfg(test)]
 mod twin_tests;

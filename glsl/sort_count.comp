@@ -1,0 +1,24 @@
+#version 450
+// Radix sort, step 1 of 3: every lane counts the digits of its own contiguous chunk. Contiguous chunks, one per lane, with
+// private counters need neither atomics nor barriers, are stable by construction and do not depend on the subgroup size.
+layout(local_size_x = 8) in; // 8 lanes x 256 counters fill 8 KiB of shared memory; lavapipe's subgroup is 8 wide
+
+layout(std430, binding = 0) readonly buffer Pairs { uvec2 pairs[]; };            // [N] (key, value)
+layout(std430, binding = 1) readonly buffer Count { uint count; };               // N
+layout(std430, binding = 2) writeonly buffer Histogram { uint histogram[]; };    // [lanes, 256]
+layout(push_constant) uniform Push { uint shift; uint mask; uint lanes; };
+
+shared uint counters[256 * 8];
+
+void main() {
+    uint column = gl_LocalInvocationID.x;
+    uint lane = gl_GlobalInvocationID.x;
+    for (uint digit = 0u; digit < 256u; digit++) counters[digit * 8u + column] = 0u;
+    uint chunk = (count + lanes - 1u) / lanes;
+    uint end = min((lane + 1u) * chunk, count);
+    for (uint i = lane * chunk; i < end; i++) {
+        uint slot = (((pairs[i].x & mask) >> shift) & 255u) * 8u + column;
+        counters[slot] += 1u;
+    }
+    for (uint digit = 0u; digit < 256u; digit++) histogram[lane * 256u + digit] = counters[digit * 8u + column];
+}

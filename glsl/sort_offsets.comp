@@ -1,0 +1,34 @@
+#version 450
+// Radix sort, step 2 of 3: counts become the place of each lane's first element per digit, in place: digits in order, and
+// within a digit lanes in order. One thread per digit walks the lanes; one workgroup, so that digit totals meet in
+// shared memory.
+layout(local_size_x = 256) in;
+
+layout(std430, binding = 0) buffer Histogram { uint histogram[]; }; // [lanes, 256]
+layout(push_constant) uniform Push { uint lanes; };
+
+shared uint totals[2][256];
+
+void main() {
+    uint digit = gl_LocalInvocationID.x;
+    uint total = 0u;
+    for (uint lane = 0u; lane < lanes; lane++) total += histogram[lane * 256u + digit];
+    // Inclusive scan over the digits, double-buffered: one barrier per doubling.
+    uint side = 0u;
+    totals[0][digit] = total;
+    barrier();
+    for (uint reach = 1u; reach < 256u; reach <<= 1u) {
+        uint sum = totals[side][digit];
+        if (digit >= reach) sum += totals[side][digit - reach];
+        totals[1u - side][digit] = sum;
+        side = 1u - side;
+        barrier();
+    }
+    uint place = totals[side][digit] - total;
+    for (uint lane = 0u; lane < lanes; lane++) {
+        uint slot = lane * 256u + digit;
+        uint here = histogram[slot];
+        histogram[slot] = place;
+        place += here;
+    }
+}

@@ -1,0 +1,94 @@
+//! Exclusive prefix sum of `u32`, wrapping on overflow.
+use crate::Result;
+use crate::gpu::{Buffer, Device, Recorder, shaders};
+
+/// Scratch space; the length of the input is only known to the device.
+pub struct Scan {
+    sums: Buffer,
+    lanes: u32,
+}
+
+impl Scan {
+    /// Allocates one word per lane.
+    pub fn new(device: &Device) -> Result<Scan> {
+        // Each lane walks a contiguous chunk twice. Step 2 is one workgroup of 256 threads, so 256 lanes keep it short on
+        // the CPU, while a GPU needs thousands of threads to be busy.
+        let lanes = if device.info().is_cpu { 256 } else { 16384 };
+        Ok(Scan { sums: device.buffer::<u32>("scan sums", lanes as usize)?, lanes })
+    }
+
+    /// `starts[i] = values[0] + .. + values[i - 1]` for the first `count[0]` elements, and `total[0]` the sum of them all.
+    /// `values` and `starts` are different buffers. Twin: [`exclusive_scan`].
+    pub fn record(
+        &self,
+        rec: &mut Recorder,
+        values: &Buffer,
+        count: &Buffer,
+        starts: &Buffer,
+        total: &Buffer,
+    ) {
+        let (lanes, sums) = (self.lanes, &self.sums);
+        rec.dispatch_threads(
+            shaders::scan_sums::call(
+                &shaders::scan_sums::Bindings { values, count, sums },
+                &shaders::scan_sums::Push { lanes },
+            ),
+            [lanes, 1, 1],
+        );
+        rec.dispatch(
+            shaders::scan_lanes::call(
+                &shaders::scan_lanes::Bindings { sums, total },
+                &shaders::scan_lanes::Push { lanes },
+            ),
+            [1, 1, 1],
+        );
+        rec.dispatch_threads(
+            shaders::scan_apply::call(
+                &shaders::scan_apply::Bindings { values, count, sums, starts },
+                &shaders::scan_apply::Push { lanes },
+            ),
+            [lanes, 1, 1],
+        );
+    }
+}
+
+/// Twin of [`Scan::record`]: the starts and the total.
+pub fn exclusive_scan(values: &[u32]) -> (Vec<u32>, u32) {
+    let mut sum = 0u32;
+    let starts = values
+        .iter()
+        .map(|&v| {
+            let start = sum;
+            sum = sum.wrapping_add(v);
+            start
+        })
+        .collect();
+    (starts, sum)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::test_device;
+
+    #[test]
+    fn equals_its_twin_at_awkward_sizes() {
+        let device = test_device();
+        let scan = Scan::new(&device).unwrap();
+        for n in [0usize, 1, 2, 255, 256, 257, 1000, 70_001] {
+            let values: Vec<u32> = (0..n).map(|i| (i as u32).wrapping_mul(2654435761) >> 20).collect();
+            // One more element than counted: it must stay untouched.
+            let buffer = device.buffer_from("values", &[values.as_slice(), &[7]].concat()).unwrap();
+            let count = device.buffer_from("count", &[n as u32]).unwrap();
+            let starts = device.buffer_from("starts", &vec![99u32; n + 1]).unwrap();
+            let total = device.buffer::<u32>("total", 1).unwrap();
+            let mut rec = Recorder::new(&device, "scan");
+            scan.record(&mut rec, &buffer, &count, &starts, &total);
+            rec.run().unwrap();
+            let (mut expected, sum) = exclusive_scan(&values);
+            expected.push(99);
+            assert_eq!(starts.read::<u32>().unwrap(), expected, "{n} values");
+            assert_eq!(total.read::<u32>().unwrap(), [sum], "{n} values");
+        }
+    }
+}
