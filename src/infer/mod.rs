@@ -1,9 +1,13 @@
 //! ONNX inference: sessions, model registry, one file per model family.
 #[cfg(test)]
 mod breakfast;
+mod classify;
+mod colour;
 pub mod hed;
 mod registry;
 mod runtime;
+pub mod text;
+pub mod words;
 pub mod xfeat;
 
 pub use registry::{ModelStatus, Registry, Role, home};

@@ -1,0 +1,175 @@
+//! What an image region shows: EfficientNet-Lite0 (Tan 2020) on the region cut out of its surroundings.
+use rayon::prelude::*;
+
+use super::registry::{Registry, Role};
+use super::runtime::{Input, Session};
+use crate::scene::{Plane, RgbImage};
+use crate::{Error, Result};
+
+/// ImageNet classes.
+pub const CLASSES: usize = 1000;
+/// Side of the network's input, pixels.
+const SIDE: usize = 224;
+/// What surrounds a region: the value that the network's own normalisation maps to zero.
+const GREY: f32 = 127.0 / 255.0;
+/// Crops per forward pass.
+const BATCH: usize = 8;
+
+/// The loaded network.
+pub struct Classifier {
+    session: Session,
+}
+
+/// The bounding box of a region, in pixels, ends excluded.
+#[derive(Clone, Copy)]
+struct Extent {
+    x0: usize,
+    y0: usize,
+    x1: usize,
+    y1: usize,
+}
+
+impl Classifier {
+    /// Loads the network of the model pack.
+    pub fn load(registry: &Registry) -> Result<Self> {
+        Ok(Classifier { session: Session::load(&registry.path(Role::Classifier)?)? })
+    }
+
+    /// [count, 1000] class probabilities of the regions `0..count` of `labels`; a zero row for a region without pixels.
+    ///
+    /// A region is judged from one crop: the square around its bounding box with everything else grey. On breakfast
+    /// (perfect masks and 830 graph segments) wider crops, blurred, white, black or dimmed surroundings, their
+    /// averages, and the larger Lite1 and Lite2 named fewer regions right.
+    pub fn regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
+        if (labels.width, labels.height) != (image.width, image.height) {
+            return Err(Error::input(format!(
+                "label map is {}×{} but its image is {}×{}",
+                labels.width, labels.height, image.width, image.height
+            )));
+        }
+        let present: Vec<(usize, Extent)> =
+            extents(labels, count).into_iter().enumerate().filter_map(|(i, e)| Some((i, e?))).collect();
+        let mut all = vec![0f32; count * CLASSES];
+        for batch in present.chunks(BATCH) {
+            let crops: Vec<f32> =
+                batch.par_iter().flat_map_iter(|(i, e)| crop(image, labels, *i as i32, *e)).collect();
+            let input = Input::F32(vec![batch.len(), 3, SIDE, SIDE], crops);
+            let output = self.session.run(vec![("image", input)], &["logits"])?;
+            let logits = output.first().map(|t| &t.data[..]).unwrap_or_default();
+            for ((i, _), row) in batch.iter().zip(logits.chunks_exact(CLASSES)) {
+                all[i * CLASSES..(i + 1) * CLASSES].copy_from_slice(&softmax(row));
+            }
+        }
+        Ok(all)
+    }
+}
+
+fn softmax(logits: &[f32]) -> Vec<f32> {
+    let most = logits.iter().copied().fold(f32::MIN, f32::max);
+    let powers: Vec<f32> = logits.iter().map(|l| (l - most).exp()).collect();
+    let total: f32 = powers.iter().sum();
+    powers.into_iter().map(|p| p / total).collect()
+}
+
+fn extents(labels: &Plane<i32>, count: usize) -> Vec<Option<Extent>> {
+    let mut found: Vec<Option<Extent>> = vec![None; count];
+    for y in 0..labels.height {
+        for x in 0..labels.width {
+            let label = labels.at(x, y);
+            if label >= 0 && (label as usize) < count {
+                let e = found[label as usize].get_or_insert(Extent { x0: x, y0: y, x1: x + 1, y1: y + 1 });
+                *e = Extent { x0: e.x0.min(x), y0: e.y0, x1: e.x1.max(x + 1), y1: y + 1 };
+            }
+        }
+    }
+    found
+}
+
+/// The region in the middle of a grey square, resized to the network's input, [3, 224, 224] in [0, 1].
+fn crop(image: &RgbImage, labels: &Plane<i32>, label: i32, e: Extent) -> Vec<f32> {
+    let side = (e.x1 - e.x0).max(e.y1 - e.y0);
+    let left = (e.x0 + e.x1) as f32 / 2.0 - side as f32 / 2.0;
+    let top = (e.y0 + e.y1) as f32 / 2.0 - side as f32 / 2.0;
+    let columns = taps(left, side, e.x0, e.x1);
+    let rows = taps(top, side, e.y0, e.y1);
+    // Separable: first along x for every source row of the box, then along y.
+    let mut squeezed = vec![[0f32; 3]; (e.y1 - e.y0) * SIDE];
+    for y in e.y0..e.y1 {
+        for (x, (start, weights)) in columns.iter().enumerate() {
+            let out = &mut squeezed[(y - e.y0) * SIDE + x];
+            for (k, w) in weights.iter().enumerate() {
+                if labels.at(start + k, y) == label {
+                    let c = image.at(start + k, y);
+                    // Relative to grey, so that whatever is left out counts as grey.
+                    (0..3).for_each(|i| out[i] += w * (c[i] - GREY));
+                }
+            }
+        }
+    }
+    let mut planes = vec![GREY; 3 * SIDE * SIDE];
+    for (y, (start, weights)) in rows.iter().enumerate() {
+        for x in 0..SIDE {
+            for (k, w) in weights.iter().enumerate() {
+                let c = squeezed[(start + k - e.y0) * SIDE + x];
+                (0..3).for_each(|i| planes[(i * SIDE + y) * SIDE + x] += w * c[i]);
+            }
+        }
+    }
+    planes
+}
+
+/// For each output pixel of one axis: the first source pixel and the weights from there on. A triangle as wide as the
+/// reduction (at least one source pixel to each side), cut to the source range `from..to`.
+fn taps(start: f32, side: usize, from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
+    let scale = side as f32 / SIDE as f32;
+    let reach = scale.max(1.0);
+    let one = |i: usize| {
+        let centre = start + (i as f32 + 0.5) * scale;
+        let first = ((centre - reach - 0.5).ceil().max(0.0) as usize).clamp(from, to);
+        let last = ((centre + reach - 0.5).floor().max(-1.0) + 1.0) as usize;
+        let weight = |j: usize| (1.0 - ((j as f32 + 0.5) - centre).abs() / reach).max(0.0) / reach;
+        (first, (first..last.clamp(first, to)).map(weight).collect())
+    };
+    (0..SIDE).map(one).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_crop_centres_the_region_on_grey() {
+        let (width, height) = (40, 30);
+        let mut image = RgbImage { width, height, data: vec![[1.0, 0.0, 0.0]; width * height] };
+        let mut labels = Plane::filled(width, height, -1);
+        for y in 10..14 {
+            for x in 5..25 {
+                labels.data[y * width + x] = 2;
+                image.data[y * width + x] = [0.2, 0.4, 0.6];
+            }
+        }
+        let e = extents(&labels, 3)[2].unwrap();
+        assert_eq!((e.x0, e.y0, e.x1, e.y1), (5, 10, 25, 14));
+        assert!(extents(&labels, 3)[0].is_none() && extents(&labels, 2).iter().all(Option::is_none));
+        let planes = crop(&image, &labels, 2, e);
+        let at = |c: usize, x: usize, y: usize| planes[(c * SIDE + y) * SIDE + x];
+        for (c, want) in [0.2, 0.4, 0.6].into_iter().enumerate() {
+            assert!((at(c, 112, 112) - want).abs() < 1e-4, "{}", at(c, 112, 112));
+            assert!((at(c, 112, 30) - GREY).abs() < 1e-6 && (at(c, 112, 200) - GREY).abs() < 1e-6);
+        }
+        // The region fills a fifth of the square: its share of the green plane's departure from grey is that fifth.
+        let sum: f32 = (0..SIDE * SIDE).map(|i| planes[SIDE * SIDE + i] - GREY).sum();
+        let want = (0.4 - GREY) * (SIDE * SIDE) as f32 / 5.0;
+        assert!((sum / want - 1.0).abs() < 0.02, "{sum} {want}");
+    }
+
+    #[test]
+    fn weights_of_a_reduction_sum_to_one_inside() {
+        for (side, from, to) in [(1000, 0, 1000), (224, 0, 224), (60, 0, 60)] {
+            let all = taps(0.0, side, from, to);
+            for (_, weights) in &all[20..200] {
+                assert!((weights.iter().sum::<f32>() - 1.0).abs() < 0.02, "{side}: {weights:?}");
+            }
+        }
+    }
+}

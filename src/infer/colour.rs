@@ -1,0 +1,112 @@
+//! The eleven basic colour terms of English (Berlin & Kay 1969): which of them a patch shows, which of them a text says.
+use std::sync::OnceLock;
+
+/// Terms that languages with eleven colour words share.
+pub const COUNT: usize = 11;
+
+/// Term, other spellings and words taken for it, and an sRGB colour near the middle of what people call by it.
+const TERMS: [(&[&str], [u8; 3]); COUNT] = [
+    (&["black"], [0, 0, 0]),
+    (&["white"], [255, 255, 255]),
+    (&["grey", "gray"], [128, 128, 128]),
+    (&["red"], [200, 20, 20]),
+    (&["orange"], [255, 140, 0]),
+    (&["yellow"], [250, 220, 30]),
+    (&["green"], [30, 140, 40]),
+    (&["blue"], [30, 70, 190]),
+    (&["purple", "violet"], [120, 40, 140]),
+    (&["pink"], [250, 160, 180]),
+    (&["brown"], [110, 65, 30]),
+];
+
+/// Lab distance over which one term fades into the next: neighbouring middles lie 40 to 80 apart.
+const SPREAD: f32 = 20.0;
+
+/// CIE L*a*b* (D65) of an sRGB colour in [0, 1].
+pub fn lab(rgb: [f32; 3]) -> [f32; 3] {
+    let linear = rgb.map(|v| if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) });
+    let dot = |m: [f32; 3]| m[0] * linear[0] + m[1] * linear[1] + m[2] * linear[2];
+    let x = dot([0.412_456_4, 0.357_576_1, 0.180_437_5]) / 0.950_47;
+    let y = dot([0.212_672_9, 0.715_152_2, 0.072_175]);
+    let z = dot([0.019_333_9, 0.119_192, 0.950_304_1]) / 1.088_83;
+    let f = |t: f32| if t > 0.008_856 { t.cbrt() } else { 7.787 * t + 16.0 / 116.0 };
+    [116.0 * f(y) - 16.0, 500.0 * (f(x) - f(y)), 200.0 * (f(y) - f(z))]
+}
+
+/// How likely each term is said of a colour; sums to 1.
+pub fn terms_of(rgb: [f32; 3]) -> [f32; COUNT] {
+    static MIDDLES: OnceLock<[[f32; 3]; COUNT]> = OnceLock::new();
+    let middles = MIDDLES.get_or_init(|| TERMS.map(|(_, rgb)| lab(rgb.map(|v| f32::from(v) / 255.0))));
+    let here = lab(rgb);
+    let distance = |m: &[f32; 3]| m.iter().zip(here).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+    let exponents = middles.each_ref().map(|m| -distance(m) / (2.0 * SPREAD * SPREAD));
+    let most = exponents.iter().copied().fold(f32::MIN, f32::max);
+    let weights = exponents.map(|e| (e - most).exp());
+    let total: f32 = weights.iter().sum();
+    weights.map(|w| w / total)
+}
+
+/// The terms in a text, evenly weighted; `None` if it says no colour.
+pub fn terms_in(text: &str) -> Option<[f32; COUNT]> {
+    let text = text.to_lowercase();
+    let words: Vec<&str> = text.split(|c: char| !c.is_alphanumeric()).collect();
+    let said = TERMS.each_ref().map(|(names, _)| names.iter().any(|n| words.contains(n)));
+    let count = said.iter().filter(|s| **s).count() as f32;
+    (count > 0.0).then(|| said.map(|s| if s { 1.0 / count } else { 0.0 }))
+}
+
+/// Distribution over terms → direction: square roots (so that a dot product is a Bhattacharyya coefficient) less what
+/// all terms share, unit length. An even distribution says nothing and gives zero.
+pub fn direction(distribution: &[f32; COUNT]) -> [f32; COUNT] {
+    let roots = distribution.map(f32::sqrt);
+    let mean = roots.iter().sum::<f32>() / COUNT as f32;
+    let mut centred = roots.map(|r| r - mean);
+    let norm = centred.iter().map(|c| c * c).sum::<f32>().sqrt();
+    // Below this the distribution is even to within rounding.
+    if norm < 1e-4 {
+        return [0.0; COUNT];
+    }
+    centred.iter_mut().for_each(|c| *c /= norm);
+    centred
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lab_agrees_with_published_values() {
+        // Lindbloom's calculator, D65, sRGB.
+        for (rgb, want) in [
+            ([1.0, 1.0, 1.0], [100.0, 0.0, 0.0]),
+            ([1.0, 0.0, 0.0], [53.24, 80.09, 67.2]),
+            ([0.0, 0.0, 1.0], [32.3, 79.19, -107.86]),
+        ] {
+            for (got, want) in lab(rgb).into_iter().zip(want) {
+                assert!((got - want).abs() < 0.05, "{rgb:?}: {:?}", lab(rgb));
+            }
+        }
+    }
+
+    #[test]
+    fn colours_get_their_names_and_texts_give_theirs() {
+        let name = |rgb: [u8; 3]| {
+            let terms = terms_of(rgb.map(|v| f32::from(v) / 255.0));
+            let best = (0..COUNT).max_by(|a, b| terms[*a].total_cmp(&terms[*b])).unwrap();
+            TERMS[best].0[0]
+        };
+        for (rgb, want) in [
+            ([250, 235, 60], "yellow"),
+            ([160, 20, 30], "red"),
+            ([60, 90, 200], "blue"),
+            ([90, 60, 35], "brown"),
+            ([20, 20, 22], "black"),
+            ([150, 150, 145], "grey"),
+        ] {
+            assert_eq!(name(rgb), want, "{rgb:?}");
+        }
+        assert!(terms_in("a reddish thing").is_none());
+        assert_eq!(terms_in("Gray-green stone").unwrap().iter().filter(|t| **t == 0.5).count(), 2);
+        assert_eq!(direction(&[1.0 / COUNT as f32; COUNT]), [0.0; COUNT]);
+    }
+}
