@@ -1,6 +1,6 @@
 //! ONNX inference: sessions, model registry, one file per model family.
 #[cfg(test)]
-mod breakfast;
+pub(crate) mod breakfast;
 mod classify;
 mod colour;
 pub mod hed;

@@ -8,6 +8,7 @@ pub mod align;
 mod build;
 pub mod codebook;
 pub mod dir;
+pub mod graph;
 
 pub use build::{BuildOptions, Language, build};
 
