@@ -145,7 +145,9 @@ fn field(n: usize) -> LanguageField {
 fn files_of_other_programs() {
     // Written by trimesh, kept in the brush repository: 100 coloured points, no Gaussians.
     let points = ply::read_points(&data("formats/brush_init.ply")).unwrap();
-    assert!(points.len() == 100 && points.positions.iter().flatten().all(|v| v.is_finite() && v.abs() < 10.0));
+    assert!(
+        points.len() == 100 && points.positions.iter().flatten().all(|v| v.is_finite() && v.abs() < 10.0)
+    );
     let e = ply::read_splats(&data("formats/brush_init.ply")).unwrap_err().to_string();
     assert!(e.contains("not a Gaussian splat file"), "{e}");
     // An ASCII cloud with columns in another order, of other types, and an element before the vertices.

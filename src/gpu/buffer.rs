@@ -98,6 +98,11 @@ impl Buffer {
         (self.0.bytes / size_of::<T>().max(1) as u64) as usize
     }
 
+    /// Whether it was made with no elements.
+    pub fn is_empty(&self) -> bool {
+        self.0.bytes == 0
+    }
+
     pub(super) fn raw(&self) -> vk::Buffer {
         self.0.raw
     }

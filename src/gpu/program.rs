@@ -41,6 +41,16 @@ impl Program {
                 h.kind
             )));
         }
+        Self::assemble(device, label, commands, steps)
+    }
+
+    /// Encodes a final list; [`Program::new`] has checked it.
+    pub(super) fn assemble(
+        device: Device,
+        label: String,
+        commands: Vec<Command>,
+        steps: Vec<Step>,
+    ) -> Result<Program> {
         let raw = Raw {
             pool: vk::CommandPool::null(),
             descriptors: vk::DescriptorPool::null(),

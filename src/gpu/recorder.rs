@@ -164,6 +164,13 @@ impl Recorder {
         }
     }
 
+    /// For the test that the validation layer sees missing barriers: all commands, no barriers, no checks.
+    #[cfg(test)]
+    pub(super) fn compile_without_barriers(self) -> Result<Program> {
+        let steps = (0..self.commands.len()).map(hazard::Step::Command).collect();
+        Program::assemble(self.device, self.label, self.commands, steps)
+    }
+
     fn push_dispatch(&mut self, module: &'static Module, call: Call, groups: [u32; 3]) {
         let most = self.device.info().max_groups;
         if (0..3).any(|i| groups[i] > most[i]) {

@@ -177,6 +177,21 @@ fn validation_messages_are_caught() {
     assert!(device.validation_messages().iter().any(|m| m.contains("VUID-VkBufferCreateInfo-size-00912")));
 }
 
+#[test]
+fn synchronization_validation_is_on() {
+    let device = Device::with(&Options { validation: true, ..Options::from_env(None) }).unwrap();
+    let a = device.buffer::<u32>("a", 4).unwrap();
+    let b = device.buffer::<u32>("b", 4).unwrap();
+    let mut rec = Recorder::new(&device, "deliberate hazard");
+    rec.fill(&a, 1);
+    rec.copy(&a, &b);
+    // Encoding is enough for the layer; it is not run.
+    let program = rec.compile_without_barriers().unwrap();
+    assert_eq!(program.counts(), (2, 0));
+    let messages = device.validation_messages();
+    assert!(messages.iter().any(|m| m.contains("SYNC-HAZARD-READ-AFTER-WRITE")), "{messages:?}");
+}
+
 /// `cargo test --lib sort_speed -- --ignored --nocapture`: milliseconds per command, best of five.
 #[test]
 #[ignore = "a measurement"]

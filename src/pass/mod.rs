@@ -1,5 +1,8 @@
 //! One file per GPU pass, each with its CPU twin.
+pub mod adam;
 pub mod close;
+pub mod compact;
+pub mod metrics;
 pub mod project;
 pub mod project_backward;
 pub mod raster_backward;
@@ -8,12 +11,9 @@ pub mod scan;
 pub mod seeded;
 pub mod sh;
 pub mod sort;
+pub mod ssim_l1;
+pub mod sum;
 pub mod twin;
 #[cfg(test)]
 mod twin_tests;
 pub mod view;
-pub mod adam;
-pub mod compact;
-pub mod metrics;
-pub mod ssim_l1;
-pub mod sum;
