@@ -1,1 +1,167 @@
-//! Progress, run.json, report.html.
+//! What a run tells about itself: `run.json`, `report.html`, `previews/`, the closing table on the terminal.
+pub mod chart;
+pub mod colour;
+mod html;
+mod summary;
+
+pub use html::write_html;
+pub use summary::{duration, table};
+
+use crate::format::{create_folder, picture};
+use crate::scene::{Plane, RgbImage};
+use crate::{Error, Result};
+use serde::Serialize;
+use std::path::Path;
+
+/// A model file that a run used.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ModelUsed {
+    /// Model name.
+    pub name: String,
+    /// Of the file.
+    pub sha256: String,
+    /// SPDX expression.
+    pub licence: String,
+}
+
+/// Time and memory of one stage.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct StageUsed {
+    /// Stage name.
+    pub name: String,
+    /// Wall seconds.
+    pub seconds: f64,
+    /// Peak resident memory of the process up to the end of the stage, bytes; 0 where the system does not tell.
+    pub peak_memory: u64,
+}
+
+/// The content of `run.json`.
+#[derive(Clone, Debug, Serialize)]
+pub struct RunRecord {
+    /// "splatvk 0.1.0".
+    pub program: String,
+    /// Options after defaults were resolved.
+    pub config: serde_json::Value,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Name of the Vulkan device.
+    pub device: String,
+    /// The device computes on the CPU.
+    pub device_is_cpu: bool,
+    /// Model files that were used.
+    pub models: Vec<ModelUsed>,
+    /// Stages in order.
+    pub stages: Vec<StageUsed>,
+    /// Wall seconds of the run.
+    pub seconds: f64,
+    /// Splats, PSNR, match counts, codes per level: free-form.
+    pub statistics: serde_json::Value,
+    /// What the user was warned about.
+    pub warnings: Vec<String>,
+}
+
+impl RunRecord {
+    /// Writes `run.json` into a scene folder.
+    pub fn write(&self, folder: &Path) -> Result<()> {
+        crate::format::write_json(&folder.join("run.json"), self)
+    }
+}
+
+/// One training view in the report; maps have the size of the photo or are left out.
+#[derive(Clone, Copy, Debug)]
+pub struct ViewShown<'a> {
+    /// Name under the pictures, also the stem of preview files.
+    pub name: &'a str,
+    /// Working-resolution photo.
+    pub photo: &'a RgbImage,
+    /// Render from the final scene.
+    pub render: Option<&'a RgbImage>,
+    /// Expected depth of the render.
+    pub depth: Option<&'a Plane<f32>>,
+    /// Decoded codes per level (name, map), −1 = none.
+    pub levels: &'a [(&'a str, Plane<i32>)],
+    /// PSNR of the render, dB.
+    pub psnr: Option<f64>,
+}
+
+/// The answer to one text in one view.
+#[derive(Clone, Copy, Debug)]
+pub struct AnswerShown<'a> {
+    /// Index into the views.
+    pub view: usize,
+    /// [H, W] relevancy, size of the photo.
+    pub relevancy: &'a Plane<f32>,
+    /// [H, W] mask.
+    pub mask: Option<&'a Plane<bool>>,
+    /// Best relevancy.
+    pub score: f32,
+    /// Reached the threshold.
+    pub found: bool,
+    /// Name of the level that answered.
+    pub level: &'a str,
+}
+
+/// A query and its answers.
+#[derive(Clone, Debug)]
+pub struct QueryShown<'a> {
+    /// What was asked.
+    pub text: &'a str,
+    /// One per view.
+    pub answers: Vec<AnswerShown<'a>>,
+}
+
+/// Everything that `report.html` and `previews/` show.
+#[derive(Clone, Debug)]
+pub struct Report<'a> {
+    /// Headline, usually the name of the photo folder.
+    pub title: &'a str,
+    /// Training views.
+    pub views: Vec<ViewShown<'a>>,
+    /// Queries of the run.
+    pub queries: Vec<QueryShown<'a>>,
+    /// (optimisation step, PSNR in dB).
+    pub psnr_curve: Vec<(f64, f64)>,
+    /// Embedding space of the language field; `words/…` gets a plain statement of what it knows.
+    pub space: Option<&'a str>,
+    /// Figures for the head of the page: (label, value).
+    pub figures: Vec<(String, String)>,
+    /// Run record.
+    pub run: &'a RunRecord,
+}
+
+/// Writes `previews/`: render, depth and levels per view, a heat map per query and view.
+pub fn write_previews(folder: &Path, report: &Report) -> Result<()> {
+    let folder = folder.join("previews");
+    create_folder(&folder)?;
+    let save = |name: String, image: &RgbImage| {
+        let path = folder.join(name);
+        std::fs::write(&path, picture::jpeg_bytes(image, 90)?).map_err(Error::io(&path))
+    };
+    for v in &report.views {
+        if let Some(render) = v.render {
+            save(format!("{}_render.jpg", v.name), render)?;
+        }
+        if let Some(depth) = v.depth {
+            save(format!("{}_depth.jpg", v.name), &colour::depth_image(depth))?;
+        }
+        for (level, codes) in v.levels {
+            save(format!("{}_level_{level}.jpg", v.name), &colour::label_image(codes))?;
+        }
+    }
+    for q in &report.queries {
+        for a in &q.answers {
+            if let Some(v) = report.views.get(a.view) {
+                let heat = colour::heat_image(v.photo, a.relevancy, a.mask);
+                save(format!("query_{}_{}.jpg", file_name(q.text), v.name), &heat)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// A text as part of a file name: letters and digits stay, everything else becomes `_`.
+pub fn file_name(text: &str) -> String {
+    let safe: String =
+        text.trim().chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).take(60).collect();
+    if safe.is_empty() { "_".into() } else { safe }
+}

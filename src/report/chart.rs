@@ -1,0 +1,82 @@
+//! A line chart as inline SVG.
+use std::fmt::Write;
+
+const WIDTH: f64 = 640.0;
+const HEIGHT: f64 = 220.0;
+const LEFT: f64 = 44.0;
+const BOTTOM: f64 = 30.0;
+
+/// A step of 1, 2 or 5 times a power of ten that cuts `span` into at most `most` parts.
+fn nice_step(span: f64, most: f64) -> f64 {
+    let raw = (span / most).max(1e-9);
+    let power = 10f64.powf(raw.log10().floor());
+    let factor = [1.0, 2.0, 5.0, 10.0].into_iter().find(|f| f * power >= raw * 0.999).unwrap_or(10.0);
+    factor * power
+}
+
+/// A curve of (x, y) with axis labels; empty without at least two finite points.
+pub fn line_chart(points: &[(f64, f64)], x_label: &str, y_label: &str) -> String {
+    let points: Vec<_> = points.iter().filter(|p| p.0.is_finite() && p.1.is_finite()).collect();
+    if points.len() < 2 {
+        return String::new();
+    }
+    let range = |get: fn(&(f64, f64)) -> f64| {
+        points.iter().fold((f64::MAX, f64::MIN), |(a, b), p| (a.min(get(p)), b.max(get(p))))
+    };
+    let ((x0, x1), (low, high)) = (range(|p| p.0), range(|p| p.1));
+    let step = nice_step((high - low).max(1e-6), 5.0);
+    let (y0, y1) = ((low / step).floor() * step, (high / step).ceil() * step + 1e-9);
+    let px = |x: f64| LEFT + (x - x0) / (x1 - x0).max(1e-9) * (WIDTH - LEFT - 12.0);
+    let py = |y: f64| HEIGHT - BOTTOM - (y - y0) / (y1 - y0) * (HEIGHT - BOTTOM - 12.0);
+    let mut svg = format!(
+        "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{y_label} over {x_label}\">"
+    );
+    // Writing to a String cannot fail.
+    for k in 0..=((y1 - y0) / step).round() as usize {
+        let y = y0 + k as f64 * step;
+        let decimals = if step < 1.0 { 1 } else { 0 };
+        let _ = write!(svg, "<path class=\"grid\" d=\"M{LEFT} {:.1}H{WIDTH}\"/>", py(y));
+        let _ = write!(
+            svg,
+            "<text x=\"{}\" y=\"{:.1}\" text-anchor=\"end\">{y:.decimals$}</text>",
+            LEFT - 6.0,
+            py(y) + 4.0
+        );
+    }
+    let x_step = nice_step(x1 - x0, 6.0);
+    for k in (x0 / x_step).ceil() as i64..=(x1 / x_step).floor() as i64 {
+        let x = k as f64 * x_step;
+        let _ =
+            write!(svg, "<text x=\"{:.1}\" y=\"{}\" text-anchor=\"middle\">{x}</text>", px(x), HEIGHT - 12.0);
+    }
+    let path: Vec<String> = points.iter().map(|p| format!("{:.1} {:.1}", px(p.0), py(p.1))).collect();
+    let _ = write!(svg, "<path class=\"line\" d=\"M{}\"/>", path.join("L"));
+    let _ = write!(
+        svg,
+        "<text x=\"{LEFT}\" y=\"10\">{y_label}</text><text x=\"{WIDTH}\" y=\"{}\" text-anchor=\"end\">{x_label}</text></svg>",
+        HEIGHT - 1.0
+    );
+    svg
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_curve_stays_inside_and_ends_where_it_should() {
+        let svg = line_chart(&[(0.0, 12.5), (100.0, 20.0), (f64::NAN, 1.0), (300.0, 31.5)], "step", "dB");
+        let d = svg.split("class=\"line\" d=\"M").nth(1).unwrap().split('"').next().unwrap();
+        let xy: Vec<Vec<f64>> =
+            d.split('L').map(|p| p.split(' ').map(|v| v.parse().unwrap()).collect()).collect();
+        assert_eq!((xy.len(), xy[0][0], xy[2][0]), (3, LEFT, WIDTH - 12.0));
+        assert!(xy.iter().all(|p| p[1] >= 0.0 && p[1] <= HEIGHT - BOTTOM) && xy[0][1] > xy[2][1]);
+        assert_eq!(line_chart(&[(1.0, 2.0)], "a", "b"), "");
+        assert!(line_chart(&[(0.0, 5.0), (1.0, 5.0)], "a", "b").contains("class=\"line\""), "a flat curve");
+    }
+
+    #[test]
+    fn steps_are_one_two_or_five() {
+        assert_eq!([nice_step(10.0, 5.0), nice_step(19.0, 5.0), nice_step(1000.0, 6.0)], [2.0, 5.0, 200.0]);
+    }
+}

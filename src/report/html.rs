@@ -1,0 +1,244 @@
+//! `report.html`: one self-contained file, readable on a phone.
+use super::{QueryShown, Report, ViewShown, chart, colour, duration};
+use crate::format::picture;
+use crate::scene::RgbImage;
+use crate::{Error, Result};
+use base64::Engine;
+use std::fmt::Write;
+use std::path::Path;
+
+/// Widest embedded picture, pixels: sharp on a phone, and a report of four views stays near 2 MB.
+const PICTURE_WIDTH: usize = 640;
+
+const STYLE: &str = include_str!("report.css");
+
+/// Writes `report.html` into a scene folder.
+pub fn write_html(folder: &Path, report: &Report) -> Result<()> {
+    let path = folder.join("report.html");
+    std::fs::write(&path, page(report)?).map_err(Error::io(&path))
+}
+
+fn escape(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+fn figure(image: &RgbImage, caption: &str) -> Result<String> {
+    let width = image.width.min(PICTURE_WIDTH);
+    let height = (image.height * width / image.width.max(1)).max(1);
+    let small = if width < image.width { &image.resized_by_area(width, height) } else { image };
+    let bytes = base64::engine::general_purpose::STANDARD.encode(picture::jpeg_bytes(small, 84)?);
+    let caption = escape(caption);
+    Ok(format!(
+        "<figure><img src=\"data:image/jpeg;base64,{bytes}\" width=\"{width}\" height=\"{height}\" alt=\"{caption}\" \
+         loading=\"lazy\"><figcaption>{caption}</figcaption></figure>"
+    ))
+}
+
+fn page(report: &Report) -> Result<String> {
+    let title = escape(report.title);
+    let mut body = format!("<header><h1>{title}</h1><p>{}</p></header>", escape(&report.run.program));
+    body.push_str("<section class=\"figures\">");
+    for (label, value) in &report.figures {
+        // Writing to a String cannot fail.
+        let _ = write!(body, "<div><b>{}</b><span>{}</span></div>", escape(value), escape(label));
+    }
+    body.push_str("</section>");
+    if !report.run.warnings.is_empty() {
+        let items: String = report.run.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
+        let _ = write!(body, "<section class=\"note\"><h2>Warnings</h2><ul>{items}</ul></section>");
+    }
+    body.push_str(&queries(report)?);
+    body.push_str("<section><h2>Views</h2>");
+    for view in &report.views {
+        body.push_str(&view_row(view)?);
+    }
+    body.push_str("</section>");
+    let curve = chart::line_chart(&report.psnr_curve, "step", "PSNR, dB");
+    if !curve.is_empty() {
+        let _ = write!(body, "<section><h2>Training</h2>{curve}</section>");
+    }
+    body.push_str(&run_tables(report));
+    Ok(format!(
+        "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><meta name=\"viewport\" \
+         content=\"width=device-width, initial-scale=1\"><title>{title} · splatvk</title><style>{STYLE}</style>\
+         <main>{body}</main></html>\n"
+    ))
+}
+
+fn view_row(v: &ViewShown) -> Result<String> {
+    let mut row = format!("<h3>{}</h3><div class=\"row\">{}", escape(v.name), figure(v.photo, "photo")?);
+    if let Some(render) = v.render {
+        let caption = v.psnr.map_or("render".to_string(), |p| format!("render, {p:.1} dB"));
+        row.push_str(&figure(render, &caption)?);
+    }
+    if let Some(depth) = v.depth {
+        row.push_str(&figure(&colour::depth_image(depth), "depth (near is warm)")?);
+    }
+    for (level, codes) in v.levels {
+        let long = match *level {
+            "s" => "subparts",
+            "m" => "parts",
+            "l" => "whole things",
+            other => other,
+        };
+        row.push_str(&figure(&colour::label_image(codes), long)?);
+    }
+    row.push_str("</div>");
+    Ok(row)
+}
+
+fn queries(report: &Report) -> Result<String> {
+    let mut out = String::new();
+    if report.space.is_some_and(|s| s.starts_with("words")) {
+        out.push_str(
+            "<section class=\"note\"><p>Words come from the built-in model: an image classifier that knows about a thousand \
+             everyday things, joined to texts through a small sentence model. It is a light stand-in; CLIP is the full \
+             model. A thing outside its thousand classes may be confused with its nearest relative.</p></section>",
+        );
+    }
+    if report.queries.is_empty() {
+        return Ok(out);
+    }
+    out.push_str("<section><h2>Queries</h2>");
+    for q in &report.queries {
+        out.push_str(&query_row(report, q)?);
+    }
+    out.push_str("</section>");
+    Ok(out)
+}
+
+fn query_row(report: &Report, q: &QueryShown) -> Result<String> {
+    let hits = q.answers.iter().filter(|a| a.found).count();
+    let class = if hits > 0 { "yes" } else { "no" };
+    let mut row = format!(
+        "<h3>“{}” <span class=\"{class}\">found in {hits} of {} views</span></h3><div class=\"row\">",
+        escape(q.text),
+        q.answers.len()
+    );
+    for a in &q.answers {
+        let Some(view) = report.views.get(a.view) else { continue };
+        let verdict = if a.found { "" } else { ", not found" };
+        let caption = format!("{}: {:.2} at level {}{verdict}", view.name, a.score, a.level);
+        row.push_str(&figure(&colour::heat_image(view.photo, a.relevancy, a.mask), &caption)?);
+    }
+    row.push_str("</div>");
+    Ok(row)
+}
+
+fn run_tables(report: &Report) -> String {
+    let run = report.run;
+    let mut out =
+        String::from("<section><h2>Time and memory</h2><table><tr><th>stage<th>time<th>peak memory</tr>");
+    let longest = run.stages.iter().map(|s| s.seconds).fold(1e-9, f64::max);
+    for s in &run.stages {
+        let memory =
+            if s.peak_memory > 0 { format!("{:.2} GB", s.peak_memory as f64 / 1e9) } else { "–".into() };
+        let share = s.seconds / longest * 100.0;
+        // Writing to a String cannot fail.
+        let _ = write!(
+            out,
+            "<tr><td>{}<td>{}<i style=\"width:{share:.1}%\"></i><td>{memory}</tr>",
+            escape(&s.name),
+            duration(s.seconds)
+        );
+    }
+    let kind = if run.device_is_cpu { " (computes on the CPU)" } else { "" };
+    let _ = write!(
+        out,
+        "<tr><td>total<td>{}<td></tr></table><p>Vulkan device: {}{kind}. Seed {}.</p>",
+        duration(run.seconds),
+        escape(&run.device),
+        run.seed
+    );
+    if !run.models.is_empty() {
+        out.push_str("<h2>Models</h2><table><tr><th>model<th>licence<th>sha256</tr>");
+        for m in &run.models {
+            let _ = write!(
+                out,
+                "<tr><td>{}<td>{}<td><code>{}</code></tr>",
+                escape(&m.name),
+                escape(&m.licence),
+                escape(&m.sha256)
+            );
+        }
+        out.push_str("</table>");
+    }
+    let settings = serde_json::to_string_pretty(&run.config).unwrap_or_default();
+    let statistics = serde_json::to_string_pretty(&run.statistics).unwrap_or_default();
+    let _ = write!(out, "<details><summary>Settings</summary><pre>{}</pre></details>", escape(&settings));
+    let _ = write!(
+        out,
+        "<details><summary>Statistics</summary><pre>{}</pre></details></section>",
+        escape(&statistics)
+    );
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{AnswerShown, RunRecord, StageUsed};
+    use super::*;
+    use crate::scene::Plane;
+
+    #[test]
+    fn the_page_is_whole_and_needs_nothing_else() {
+        let photo = RgbImage { width: 8, height: 6, data: vec![[0.5, 0.2, 0.1]; 48] };
+        let (depth, relevancy) = (Plane::filled(8, 6, 2.0f32), Plane::filled(8, 6, 0.9f32));
+        let levels = [("l", Plane::filled(8, 6, 1i32))];
+        let run = RunRecord {
+            program: "splatvk".into(),
+            config: serde_json::json!({"views": 4}),
+            seed: 7,
+            device: "<device>".into(),
+            device_is_cpu: true,
+            models: vec![],
+            stages: vec![StageUsed { name: "train".into(), seconds: 3.0, peak_memory: 1 << 30 }],
+            seconds: 3.5,
+            statistics: serde_json::json!({"psnr": 31.5}),
+            warnings: vec!["a < b".into()],
+        };
+        let view = ViewShown {
+            name: "a",
+            photo: &photo,
+            render: Some(&photo),
+            depth: Some(&depth),
+            levels: &levels,
+            psnr: Some(31.25),
+        };
+        let answer =
+            AnswerShown { view: 0, relevancy: &relevancy, mask: None, score: 0.9, found: true, level: "l" };
+        let report = Report {
+            title: "a <b> & \"c\"",
+            views: vec![view],
+            queries: vec![QueryShown { text: "<script>", answers: vec![answer] }],
+            psnr_curve: vec![(0.0, 10.0), (100.0, 30.0)],
+            space: Some("words/x"),
+            figures: vec![("splats".into(), "123".into())],
+            run: &run,
+        };
+        let folder = tempfile::tempdir().unwrap();
+        write_html(folder.path(), &report).unwrap();
+        super::super::write_previews(folder.path(), &report).unwrap();
+        run.write(folder.path()).unwrap();
+        let html = std::fs::read_to_string(folder.path().join("report.html")).unwrap();
+        // Photo, render, depth, one level, one heat map; nothing is fetched; user text is escaped.
+        assert_eq!(html.matches("data:image/jpeg;base64,").count(), 5);
+        assert!(!html.contains("http") && !html.contains("<script>") && html.contains("&lt;script&gt;"));
+        for text in [
+            "31.2 dB",
+            "about a thousand everyday things",
+            "CLIP is the full",
+            "a &lt; b",
+            "1.07 GB",
+            "found in 1 of 1",
+        ] {
+            assert!(html.contains(text), "{text}");
+        }
+        for name in ["a_render.jpg", "a_depth.jpg", "a_level_l.jpg", "query__script__a.jpg"] {
+            assert!(image::open(folder.path().join("previews").join(name)).is_ok(), "{name}");
+        }
+        let json: serde_json::Value =
+            serde_json::from_str(&std::fs::read_to_string(folder.path().join("run.json")).unwrap()).unwrap();
+        assert_eq!(json["stages"][0]["name"], "train");
+    }
+}
