@@ -65,7 +65,7 @@ fn nearest(a: &Features, b: &Features) -> Vec<(usize, f32, f32)> {
 /// Mutual nearest neighbours whose distance is below `ratio` of the distance to the second-best elsewhere, best first.
 /// Descriptor lengths must be multiples of 8 and equal; otherwise there are no matches.
 pub(crate) fn mutual_matches(a: &Features, b: &Features, ratio: f32) -> Vec<Match> {
-    if a.dim != b.dim || a.dim % 8 != 0 || a.points.is_empty() || b.points.is_empty() {
+    if a.dim != b.dim || !a.dim.is_multiple_of(8) || a.points.is_empty() || b.points.is_empty() {
         return Vec::new();
     }
     let (forward, backward) = (nearest(a, b), nearest(b, a));

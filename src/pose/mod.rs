@@ -5,6 +5,7 @@ mod initialise;
 pub mod matching;
 mod minimal;
 mod numeric;
+pub mod pointmap;
 mod resect;
 pub mod sfm;
 mod sift;

@@ -155,7 +155,7 @@ impl Octave {
             let moved = |at: usize, by: f64| (at as i64 + by.round().clamp(-1.0, 1.0) as i64) as usize;
             (x, y, l) = (moved(x, o.x), moved(y, o.y), moved(l, o.z));
             let (w, h) = (self.differences[0].width, self.differences[0].height);
-            if l < 1 || l > LEVELS || x < 5 || y < 5 || x + 5 >= w || y + 5 >= h {
+            if !(1..=LEVELS).contains(&l) || x < 5 || y < 5 || x + 5 >= w || y + 5 >= h {
                 return None;
             }
         }

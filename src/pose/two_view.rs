@@ -173,10 +173,9 @@ pub(crate) fn estimate(x: &[DVec2], y: &[DVec2], threshold: f64, prior_sigma: f6
     let mut best: Option<(f64, Pose, f64)> = None;
     for (k, m) in stretches.iter().enumerate() {
         let iterations = if k == 0 { 1500 } else { 300 };
-        if let Some(found) = data.ransac(*m, iterations, prior_sigma, 0x5eed_0001 + k as u64) {
-            if best.as_ref().is_none_or(|b| found.0 < b.0) {
-                best = Some(found);
-            }
+        let found = data.ransac(*m, iterations, prior_sigma, 0x5eed_0001 + k as u64);
+        if let Some(found) = found.filter(|f| best.as_ref().is_none_or(|b| f.0 < b.0)) {
+            best = Some(found);
         }
     }
     let (_, mut pose, mut m) = best?;

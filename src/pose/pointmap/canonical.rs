@@ -1,0 +1,190 @@
+//! Steps B and C: one depth map per view from all pairs that contain it, and the focal lengths.
+use super::{ModelView, PairPointmaps, Pointmap, centre, point};
+use crate::pose::numeric::median;
+use glam::{DVec2, DVec3};
+
+/// What all pairs together say about one view, in the scale of its reference pair.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Canonical {
+    /// [H, W] points in the view's own camera frame.
+    pub(super) points: Vec<DVec3>,
+    /// [H, W] `Σw²/Σw` of w = confidence − 1.
+    pub(super) confidence: Vec<f64>,
+    /// [H, W] weighted standard deviation of ln z between the pairs: the depth's uncertainty.
+    pub(super) spread: Vec<f64>,
+}
+
+/// The pointmaps of a view in its own frame.
+fn own_maps(pairs: &[PairPointmaps], view: usize) -> Vec<&Pointmap> {
+    pairs
+        .iter()
+        .filter_map(|p| match view {
+            v if v == p.first => Some(&p.x11),
+            v if v == p.second => Some(&p.x22),
+            _ => None,
+        })
+        .collect()
+}
+
+fn mean_confidence(m: &Pointmap) -> f64 {
+    m.confidence.iter().map(|c| *c as f64).sum::<f64>() / m.confidence.len().max(1) as f64
+}
+
+/// Factor that brings `map` to the scale of the canonical points: median z ratio over pixels where both are confident.
+pub(super) fn scale_to(reference: &Pointmap, map: &Pointmap) -> Option<f64> {
+    let middle = |m: &Pointmap| median(&mut m.confidence.iter().map(|c| *c as f64).collect::<Vec<_>>());
+    let (a, b) = (middle(reference)?, middle(map)?);
+    let mut ratios: Vec<f64> = (0..map.points.len())
+        .filter(|&k| reference.confidence[k] as f64 >= a && map.confidence[k] as f64 >= b)
+        .filter(|&k| reference.points[k][2] > 0.0 && map.points[k][2] > 0.0)
+        .map(|k| reference.points[k][2] as f64 / map.points[k][2] as f64)
+        .collect();
+    median(&mut ratios)
+}
+
+pub(super) fn all(views: &[ModelView], pairs: &[PairPointmaps]) -> Vec<Canonical> {
+    (0..views.len()).map(|v| of_view(views[v].width * views[v].height, &own_maps(pairs, v))).collect()
+}
+
+fn of_view(size: usize, maps: &[&Pointmap]) -> Canonical {
+    let mut best: Option<(f64, &Pointmap)> = None;
+    for m in maps {
+        let mean = mean_confidence(m);
+        if best.is_none_or(|b| mean > b.0) {
+            best = Some((mean, m));
+        }
+    }
+    let Some((_, reference)) = best else { return Canonical::default() };
+    let scales: Vec<Option<f64>> = maps.iter().map(|m| scale_to(reference, m)).collect();
+    let mut out = Canonical::default();
+    for k in 0..size {
+        let (mut sum, mut weight, mut squares) = (DVec3::ZERO, 0.0, 0.0);
+        let (mut log, mut log2) = (0.0, 0.0);
+        for (m, s) in maps.iter().zip(&scales) {
+            let (Some(s), p) = (*s, point(m.points[k])) else { continue };
+            if !(p.is_finite() && p.z > 0.0) {
+                continue;
+            }
+            // A hair above zero, so that a pixel of least confidence everywhere still has a depth.
+            let w = (m.confidence[k] as f64 - 1.0).max(0.0) + 1e-3;
+            let l = (p.z * s).ln();
+            sum += p * (s * w);
+            log += l * w;
+            log2 += l * l * w;
+            weight += w;
+            squares += w * w;
+        }
+        if weight > 0.0 {
+            out.points.push(sum / weight);
+            out.confidence.push(squares / weight);
+            out.spread.push((log2 / weight - (log / weight).powi(2)).max(0.0).sqrt());
+        } else {
+            out.points.push(DVec3::ZERO);
+            out.confidence.push(0.0);
+            out.spread.push(1.0);
+        }
+    }
+    out
+}
+
+/// Focal lengths and which of them each view uses.
+#[derive(Clone, Debug)]
+pub(super) struct Focals {
+    pub(super) group: Vec<usize>,
+    /// Model pixels.
+    pub(super) values: Vec<f64>,
+    /// (ln f, σ) for the adjustment.
+    pub(super) priors: Vec<(f64, f64)>,
+}
+
+impl Focals {
+    pub(super) fn of(&self, view: usize) -> f64 {
+        self.values[self.group[view]]
+    }
+}
+
+/// Weighted Weiszfeld estimate: minimises `Σ w |p − f·(x/z, y/z)|` over f.
+pub(super) fn weiszfeld(view: &ModelView, c: &Canonical) -> Option<(f64, f64)> {
+    let middle = centre(view);
+    // Every third pixel in both axes: the estimate averages over tens of thousands all the same.
+    let samples: Vec<(DVec2, DVec2, f64)> = (0..c.points.len())
+        .filter(|k| (k % view.width).is_multiple_of(3) && (k / view.width).is_multiple_of(3))
+        .filter(|&k| c.points[k].z > 0.0)
+        .map(|k| {
+            let p = DVec2::new((k % view.width) as f64 + 0.5, (k / view.width) as f64 + 0.5) - middle;
+            let x = c.points[k];
+            (p, DVec2::new(x.x, x.y) / x.z, c.confidence[k])
+        })
+        .collect();
+    let solve = |weight: &dyn Fn(&(DVec2, DVec2, f64)) -> f64| {
+        let (mut a, mut b) = (0.0, 0.0);
+        for s in &samples {
+            let w = weight(s);
+            a += w * s.0.dot(s.1);
+            b += w * s.1.length_squared();
+        }
+        a / b
+    };
+    let mut f = solve(&|s| s.2);
+    for _ in 0..20 {
+        f = solve(&|s| s.2 / (s.0 - s.1 * f).length().max(1e-8));
+    }
+    let total: f64 = samples.iter().map(|s| s.2).sum();
+    (f.is_finite() && f > 0.0).then_some((f, total))
+}
+
+/// Views of different groups whose estimates agree this well share a focal length all the same when there is no EXIF.
+const AGREEMENT: f64 = 0.15;
+
+pub(super) fn focals(views: &[ModelView], canonical: &[Canonical]) -> Focals {
+    let estimates: Vec<(f64, f64)> = views
+        .iter()
+        .zip(canonical)
+        // 1.2 × the width (45°) where a view has no points at all; the prior then decides.
+        .map(|(v, c)| weiszfeld(v, c).unwrap_or((1.2 * v.width as f64, 1e-9)))
+        .collect();
+    let no_exif = views.iter().all(|v| v.exif_focal.is_none());
+    let same_size = views.iter().all(|v| (v.width, v.height) == (views[0].width, views[0].height));
+    let (low, high) = estimates.iter().fold((f64::MAX, 0f64), |m, e| (m.0.min(e.0), m.1.max(e.0)));
+    let share_all = no_exif && same_size && high / low < 1.0 + AGREEMENT;
+    let mut names: Vec<usize> = Vec::new();
+    let mut group = Vec::new();
+    for v in views {
+        let key = if share_all { 0 } else { v.camera_group };
+        let g = names.iter().position(|n| *n == key).unwrap_or_else(|| {
+            names.push(key);
+            names.len() - 1
+        });
+        group.push(g);
+    }
+    let (mut values, mut priors) = (Vec::new(), Vec::new());
+    for g in 0..names.len() {
+        let members: Vec<usize> = (0..views.len()).filter(|v| group[*v] == g).collect();
+        let mut exif: Vec<f64> = members.iter().filter_map(|v| views[*v].exif_focal).collect();
+        match median(&mut exif) {
+            Some(f) => {
+                values.push(f);
+                priors.push((f.ln(), 0.05));
+            }
+            None => {
+                let f = weighted_median(members.iter().map(|v| estimates[*v]).collect());
+                values.push(f);
+                priors.push((f.ln(), 0.10));
+            }
+        }
+    }
+    Focals { group, values, priors }
+}
+
+fn weighted_median(mut values: Vec<(f64, f64)>) -> f64 {
+    values.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let half = 0.5 * values.iter().map(|v| v.1).sum::<f64>();
+    let mut sum = 0.0;
+    for v in &values {
+        sum += v.1;
+        if sum >= half {
+            return v.0;
+        }
+    }
+    values.last().map_or(1.0, |v| v.0)
+}
