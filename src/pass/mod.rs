@@ -1,5 +1,6 @@
 //! One file per GPU pass, each with its CPU twin.
 pub mod adam;
+pub mod bin;
 pub mod close;
 pub mod compact;
 pub mod metrics;
@@ -7,6 +8,8 @@ pub mod project;
 pub mod project_backward;
 pub mod raster_backward;
 pub mod raster_forward;
+pub mod rasterizer;
+pub mod renderer;
 pub mod scan;
 pub mod seeded;
 pub mod sh;
@@ -14,6 +17,12 @@ pub mod sort;
 pub mod ssim_l1;
 pub mod sum;
 pub mod twin;
+pub mod view;
+
+pub use rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
+pub use renderer::{Frame, Renderer};
+pub use twin::FeatureMode;
+pub use view::View;
+
 #[cfg(test)]
 mod twin_tests;
-pub mod view;

@@ -4,13 +4,55 @@
 //! `t = R μ + τ`, `M = R_q diag(s)`, `B = J R M` (2×3), `Σ' = B Bᵀ + 0.3 I`, `(A, B, C) = Σ'⁻¹`,
 //! `u = fx t_x/t_z + cx − ½`, colour = max(0, Σ_k B_k(dir) sh_k + ½), opacity = σ(logit).
 //! J is evaluated at t_x/t_z clamped to the image border plus 30 %, so that splats far outside do not explode.
+use super::rasterizer::{FrameBuffers, SplatBuffers};
 use super::sh;
 use super::twin::{FeatureMode, Params};
 use super::view::View;
+use crate::gpu::{Buffer, Recorder, shaders};
 use glam::{DMat3, DVec3, DVec4};
 
 /// Added to the diagonal of the screen covariance: a splat never gets thinner than about a pixel (INRIA's value).
 pub const DILATION: f64 = 0.3;
+
+/// Records the projection of all splats, with the first (sh_degree + 1)² coefficients, to `frame.projected`
+/// and `frame.depth_pairs`.
+pub fn record(
+    rec: &mut Recorder,
+    splats: &SplatBuffers,
+    camera: &Buffer,
+    frame: &FrameBuffers,
+    sh_degree: u32,
+) {
+    let count = splats.count as u32;
+    let call = shaders::project::call(
+        shaders::project::Variant { sh_degree },
+        &shaders::project::Bindings {
+            camera,
+            means: &splats.means,
+            log_scales: &splats.log_scales,
+            quats: &splats.quats,
+            opacity_logits: &splats.opacity_logits,
+            sh: &splats.sh,
+            projected: &frame.projected,
+            depth_pairs: &frame.depth_pairs,
+        },
+        &shaders::project::Push { count, sh_stride: splats.sh_len() as u32 },
+    );
+    rec.dispatch_threads(call, [count, 1, 1]);
+}
+
+/// Records the change from stored to rendered features, `frame.codes`. Nothing without features.
+pub fn record_features(rec: &mut Recorder, splats: &SplatBuffers, frame: &FrameBuffers, mode: FeatureMode) {
+    if splats.feature_dim == 0 {
+        return;
+    }
+    let (count, dim) = (splats.count as u32, splats.feature_dim as u32);
+    let call = shaders::features_forward::call(
+        &shaders::features_forward::Bindings { features: &splats.features, codes: &frame.codes },
+        &shaders::features_forward::Push { count, dim, stride: frame.code_stride(), epsilon: mode.epsilon() },
+    );
+    rec.dispatch_threads(call, [count, 1, 1]);
+}
 
 /// A splat on the screen, f64 twin.
 #[derive(Clone, Debug, PartialEq)]

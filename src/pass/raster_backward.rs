@@ -8,10 +8,50 @@
 //! With σ = ∂α · α (0 where α was clamped), the shader only sums six moments: Σσ, Σσdx, Σσdy, Σσdx², Σσdxdy, Σσdy².
 //! Every geometry gradient follows per splat: ∂o = m₀/o, ∂(u, v) = −(A m₁ + B m₂, C m₂ + B m₁),
 //! ∂(A, B, C) = (−½ m₃, −m₄, −½ m₅).
-use super::raster_forward::{BASE_CHANNELS, Cutoffs, TwinScene, channels_of, walk};
+use super::raster_forward::{BASE_CHANNELS, Cutoffs, TwinScene, blocks, channels_of, walk};
+use super::rasterizer::FrameBuffers;
+use crate::gpu::{Recorder, shaders};
 
 /// Floats of one splat in the gradient buffer: six moments, RGB, z.
 pub const MOMENTS: usize = 6;
+
+/// Records the way from `frame.planes_grad` to `frame.projected_grad` and `frame.codes_grad`, which it clears first.
+/// `features_move_geometry` = false keeps the features' part of the loss away from everything but the features.
+pub fn record(rec: &mut Recorder, frame: &FrameBuffers, features_move_geometry: bool) {
+    rec.fill(&frame.projected_grad, 0);
+    if frame.feature_dim > 0 {
+        rec.fill(&frame.codes_grad, 0);
+    }
+    let tiles = frame.tiles();
+    for block in blocks(frame.feature_dim as u32) {
+        let call = shaders::raster_backward::call(
+            shaders::raster_backward::Variant { channels: block.channels },
+            &shaders::raster_backward::Bindings {
+                projected: &frame.projected,
+                tile_ranges: &frame.tile_ranges,
+                tile_splats: &frame.tile_splats,
+                codes: &frame.codes,
+                codes_grad: &frame.codes_grad,
+                planes: &frame.planes,
+                planes_grad: &frame.planes_grad,
+                transmittance: &frame.transmittance,
+                projected_grad: &frame.projected_grad,
+            },
+            &shaders::raster_backward::Push {
+                width: frame.width,
+                height: frame.height,
+                tiles_x: tiles[0],
+                code_vectors: frame.code_stride() / 4,
+                first_vector: block.first_vector,
+                first_plane: block.first_plane,
+                features: block.features,
+                alpha_plane: (BASE_CHANNELS + frame.feature_dim) as u32,
+                coupling: if features_move_geometry { 1.0 } else { 0.0 },
+            },
+        );
+        rec.dispatch(call, [tiles[0], tiles[1], 1]);
+    }
+}
 
 /// What flows back to one splat, in the layout of the GPU gradient buffer.
 #[derive(Clone, Debug, Default, PartialEq)]

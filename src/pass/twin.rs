@@ -17,6 +17,16 @@ pub enum FeatureMode {
     Linear,
 }
 
+impl FeatureMode {
+    /// As the shaders take it: ε, negative for [`FeatureMode::Linear`].
+    pub fn epsilon(self) -> f32 {
+        match self {
+            FeatureMode::Gauge(epsilon) => epsilon,
+            FeatureMode::Linear => -1.0,
+        }
+    }
+}
+
 /// Raw (pre-activation) parameters of N splats in f64, layout as in [`Splats`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Params {

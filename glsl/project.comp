@@ -1,0 +1,51 @@
+#version 450
+// variants: SH_DEGREE=0,1,2,3
+// Projects splats to the screen and writes their depth sort keys. Equations and twin: pass::project.
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+layout(local_size_x = 64) in;
+
+layout(std430, binding = 0) readonly buffer Camera { vec4 camera[]; };                   // [6]
+layout(std430, binding = 1) readonly buffer Means { float means[]; };                    // [N, 3]
+layout(std430, binding = 2) readonly buffer LogScales { float log_scales[]; };           // [N, 3]
+layout(std430, binding = 3) readonly buffer Quats { vec4 quats[]; };                     // [N]
+layout(std430, binding = 4) readonly buffer OpacityLogits { float opacity_logits[]; };   // [N]
+layout(std430, binding = 5) readonly buffer Sh { float sh[]; };                          // [N, sh_stride, 3]
+// [N, 3]: (u, v, A', B'), (C', log2 o, r, g), (b, z, 0, 0) with log2(o e^p) = A' dx² + B' dx dy + C' dy² + log2 o
+layout(std430, binding = 6) writeonly buffer Projected { vec4 projected[]; };
+layout(std430, binding = 7) writeonly buffer DepthPairs { uvec2 depth_pairs[]; };        // [N] (sort key, splat)
+layout(push_constant) uniform Push { uint count; uint sh_stride; };
+
+#include "shared/camera.glsl"
+#include "shared/sh.glsl"
+#include "shared/splat.glsl"
+
+const float LOG2_E = 1.4426950408889634;
+const float LOG2_ALPHA_MIN = -7.994353436858858; // log2(1/255)
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i >= count) return;
+    vec3 mean = vec3(means[3 * i], means[3 * i + 1], means[3 * i + 2]);
+    Geometry g = geometry_of(mean, vec3(log_scales[3 * i], log_scales[3 * i + 1], log_scales[3 * i + 2]), quats[i]);
+    // exp(80) is still finite, so an extreme logit gives a tiny opacity and not a NaN.
+    float log2_opacity = -log2(1.0 + exp(min(-opacity_logits[i], 80.0)));
+
+    float basis[SH_COUNT];
+    sh_basis(normalize(mean - camera_position()), basis);
+    vec3 colour = vec3(0.5);
+    [[unroll]] for (int k = 0; k < SH_COUNT; k++) {
+        uint at = 3 * (i * sh_stride + k);
+        colour += basis[k] * vec3(sh[at], sh[at + 1], sh[at + 2]);
+    }
+    colour = max(colour, vec3(0.0));
+
+    bool visible = g.visible && log2_opacity >= LOG2_ALPHA_MIN;
+    vec2 centre = camera_focal() * g.t.xy / g.t.z + camera_centre() - 0.5;
+    vec3 power = vec3(-0.5 * LOG2_E, -LOG2_E, -0.5 * LOG2_E) * g.conic;
+    // A splat that is not visible must fail every comparison downstream: far below any opacity.
+    projected[3 * i] = vec4(centre, power.xy);
+    projected[3 * i + 1] = vec4(power.z, visible ? log2_opacity : -1e4, colour.rg);
+    projected[3 * i + 2] = vec4(colour.b, g.t.z, 0.0, 0.0);
+    depth_pairs[i] = uvec2(visible ? floatBitsToUint(g.t.z) : 0xffffffffu, i); // positive floats sort like integers
+}

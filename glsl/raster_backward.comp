@@ -1,0 +1,159 @@
+#version 450
+// variants: CHANNELS=4,7,12,16,20
+// subgroups: 4,8,16,32,64
+// Gradients by the screen-space splats: T is recomputed front to back, six moments of σ and the channel sums are
+// reduced over the tile by butterflies so that lane i keeps splat i, then one atomic per value. Blocks of channels
+// add up, since the gradient by alpha is linear in the channels. Equations and twin: pass::raster_backward.
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_vote : require
+#extension GL_KHR_shader_subgroup_shuffle : require
+#include "shared/atomic_float.glsl"
+layout(local_size_x = SUBGROUP_SIZE) in;
+
+layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };      // [N, 3], see project.comp
+layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; };   // [tiles + 1]
+layout(std430, binding = 2) readonly buffer TileSplats { uint tile_splats[]; };   // [capacity]
+#if CHANNELS != 4
+layout(std430, binding = 3) readonly buffer Codes { vec4 codes[]; };              // [N, code_vectors]
+layout(std430, binding = 4) buffer CodesGrad { ATOMIC_FLOAT codes_grad[]; };      // [N, 4 * code_vectors], added to
+#endif
+layout(std430, binding = 5) readonly buffer Planes { float planes[]; };           // [4 + d, H, W]
+layout(std430, binding = 6) readonly buffer PlanesGrad { float planes_grad[]; };  // [4 + d + 1, H, W], alpha last
+#if CHANNELS != 16
+layout(std430, binding = 7) readonly buffer Transmittance { float transmittances[]; }; // [H, W]
+#endif
+layout(std430, binding = 8) buffer ProjectedGrad { ATOMIC_FLOAT projected_grad[]; };   // [N, 10], added to
+// As in raster_forward.comp; coupling 0 keeps the features' part of the loss from moving the geometry, 1 lets it.
+layout(push_constant) uniform Push {
+    uint width; uint height; uint tiles_x; uint code_vectors; uint first_vector; uint first_plane; uint features;
+    uint alpha_plane; float coupling;
+};
+
+#include "shared/raster.glsl"
+#define VALUES (6 + CHANNELS)
+
+float T[PIXELS], behind[PIXELS], upstream[CHANNELS * PIXELS];
+float part[VALUES];
+
+void evaluate(uint i, vec2 origin) {
+    float dx0 = subgroupShuffle(own_u, i) - origin.x, dy0 = subgroupShuffle(own_v, i) - origin.y;
+    float a = subgroupShuffle(own_a, i), b = subgroupShuffle(own_b, i), c = subgroupShuffle(own_c, i);
+    float log2_opacity = subgroupShuffle(own_log2_opacity, i);
+    // ratio = α / (1 − α), 0 where no gradient may reach the geometry
+    float weight[PIXELS], ratio[PIXELS], own[PIXELS];
+    [[unroll]] for (int n = 0; n < COLUMNS; n++) {
+        float dx = dx0 - float(n * LANES_X);
+        float ax = fma(a * dx, dx, log2_opacity), bx = b * dx;
+        [[unroll]] for (int m = 0; m < ROWS; m++) {
+            const int k = n * ROWS + m;
+            float dy = dy0 - float(m * LANES_Y);
+            float raw = exp2(fma(fma(c, dy, bx), dy, ax));
+            // The comparison of raster_forward.comp, on the power: it must decide alike.
+            float alpha = fma(fma(c, dy, bx), dy, ax) >= LOG2_ALPHA_MIN ? min(ALPHA_MAX, raw) : 0.0;
+            float w = alpha * T[k], next = T[k] - w;
+            bool stop = next < TRANSMITTANCE_MIN;
+            weight[k] = stop ? 0.0 : w;
+            ratio[k] = stop || raw > ALPHA_MAX ? 0.0 : alpha / (1.0 - alpha);
+            T[k] = stop ? -abs(T[k]) : next;
+            own[k] = 0.0;
+        }
+    }
+    [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {
+        float value = subgroupShuffle(own_value[channel], i);
+        float felt = channel < CHANNELS - FEATURES ? value : value * coupling;
+        float sum = 0.0;
+        [[unroll]] for (int k = 0; k < PIXELS; k++) {
+            own[k] = fma(felt, upstream[channel * PIXELS + k], own[k]);
+            sum = fma(weight[k], upstream[channel * PIXELS + k], sum);
+        }
+        part[6 + channel] = sum;
+    }
+    [[unroll]] for (int k = 0; k < 6; k++) part[k] = 0.0;
+    [[unroll]] for (int n = 0; n < COLUMNS; n++) {
+        float dx = dx0 - float(n * LANES_X);
+        float m0 = 0.0, m1 = 0.0, m2 = 0.0;
+        [[unroll]] for (int m = 0; m < ROWS; m++) {
+            const int k = n * ROWS + m;
+            float dy = dy0 - float(m * LANES_Y);
+            behind[k] = fma(-weight[k], own[k], behind[k]);
+            float sigma = ratio[k] * (T[k] * own[k] - behind[k]);
+            float sigma_y = sigma * dy;
+            m0 += sigma;
+            m1 += sigma_y;
+            m2 = fma(sigma_y, dy, m2);
+        }
+        part[0] += m0;
+        part[1] = fma(m0, dx, part[1]);
+        part[2] += m1;
+        part[3] = fma(m0 * dx, dx, part[3]);
+        part[4] = fma(m1, dx, part[4]);
+        part[5] += m2;
+    }
+}
+
+void main() {
+    uint lane = gl_SubgroupInvocationID;
+    uint tile = gl_WorkGroupID.y * tiles_x + gl_WorkGroupID.x;
+    uvec2 corner = gl_WorkGroupID.xy * 8 + uvec2(lane % LANES_X, lane / LANES_X);
+    vec2 origin = vec2(corner);
+    uint first = tile_ranges[tile], last = tile_ranges[tile + 1], pixels = width * height;
+
+    [[unroll]] for (int k = 0; k < PIXELS; k++) {
+        uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
+        bool inside = x < width && y < height;
+        uint pixel = inside ? y * width + x : 0;
+        T[k] = inside ? 1.0 : -1.0;
+        behind[k] = 0.0;
+        [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {
+            bool used = inside && (channel < CHANNELS - FEATURES || channel - (CHANNELS - FEATURES) < features);
+            uint at = (first_plane + channel) * pixels + pixel;
+            float g = used ? planes_grad[used ? at : 0] : 0.0;
+            upstream[channel * PIXELS + k] = g;
+            float felt = channel < CHANNELS - FEATURES ? g : g * coupling;
+            behind[k] = fma(felt, planes[used ? at : 0], behind[k]);
+        }
+#if BASE
+        if (inside) behind[k] -= planes_grad[alpha_plane * pixels + pixel] * transmittances[pixel];
+#endif
+    }
+
+    for (uint j = first; j < last; j += SUBGROUP_SIZE) {
+        uint splat = tile_splats[min(j + lane, last - 1)];
+        load_splat(splat, j + lane < last);
+        uint batch = min(uint(SUBGROUP_SIZE), last - j);
+        float kept[VALUES];
+        [[unroll]] for (int n = 0; n < VALUES; n++) kept[n] = 0.0;
+        for (uint i = 0; i < batch; i++) {
+            evaluate(i, origin);
+            [[unroll]] for (int n = 0; n < VALUES; n++) {
+                float sum = part[n];
+                sum += subgroupShuffleXor(sum, 1);
+                sum += subgroupShuffleXor(sum, 2);
+#if SUBGROUP_SIZE >= 8
+                sum += subgroupShuffleXor(sum, 4);
+#endif
+#if SUBGROUP_SIZE >= 16
+                sum += subgroupShuffleXor(sum, 8);
+#endif
+#if SUBGROUP_SIZE >= 32
+                sum += subgroupShuffleXor(sum, 16);
+#endif
+#if SUBGROUP_SIZE >= 64
+                sum += subgroupShuffleXor(sum, 32);
+#endif
+                kept[n] = lane == i ? sum : kept[n];
+            }
+        }
+        if (j + lane < last) {
+            [[unroll]] for (int n = 0; n < VALUES - FEATURES; n++) ATOMIC_ADD(projected_grad[10 * splat + n], kept[n]);
+#if FEATURES > 0
+            [[unroll]] for (int n = 0; n < FEATURES; n++)
+                if (n < features)
+                    ATOMIC_ADD(codes_grad[4 * (splat * code_vectors + first_vector) + n], kept[VALUES - FEATURES + n]);
+#endif
+        }
+        if (all_stopped(T)) break;
+    }
+}

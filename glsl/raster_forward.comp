@@ -1,0 +1,105 @@
+#version 450
+// variants: CHANNELS=4,7,12,16,20
+// subgroups: 4,8,16,32,64
+// Blends the splats of a tile front to back. Twin: pass::raster_forward.
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_vote : require
+#extension GL_KHR_shader_subgroup_shuffle : require
+layout(local_size_x = SUBGROUP_SIZE) in;
+
+layout(std430, binding = 0) readonly buffer Camera { vec4 camera[]; };
+layout(std430, binding = 1) readonly buffer Projected { vec4 projected[]; };      // [N, 3], see project.comp
+layout(std430, binding = 2) readonly buffer TileRanges { uint tile_ranges[]; };   // [tiles + 1]
+layout(std430, binding = 3) readonly buffer TileSplats { uint tile_splats[]; };   // [capacity]
+#if CHANNELS != 4
+layout(std430, binding = 4) readonly buffer Codes { vec4 codes[]; };              // [N, code_vectors]
+#endif
+layout(std430, binding = 5) writeonly buffer Planes { float planes[]; };          // [4 + d, H, W]
+#if CHANNELS != 16
+layout(std430, binding = 6) writeonly buffer Transmittance { float transmittances[]; }; // [H, W]
+layout(std430, binding = 7) writeonly buffer MedianDepth { float median_depths[]; };    // [H, W]
+#endif
+// Features of this block start at vector first_vector of a splat's code and fill `features` planes from
+// first_plane + (4 if the block has RGB and depth).
+layout(push_constant) uniform Push {
+    uint width; uint height; uint tiles_x; uint code_vectors; uint first_vector; uint first_plane; uint features;
+};
+
+#include "shared/camera.glsl"
+#include "shared/raster.glsl"
+
+void main() {
+    uint lane = gl_SubgroupInvocationID;
+    uint tile = gl_WorkGroupID.y * tiles_x + gl_WorkGroupID.x;
+    uvec2 corner = gl_WorkGroupID.xy * 8 + uvec2(lane % LANES_X, lane / LANES_X);
+    vec2 origin = vec2(corner);
+    uint first = tile_ranges[tile], last = tile_ranges[tile + 1];
+
+    // Negative T marks a pixel that has stopped; pixels beyond the border never start.
+    float T[PIXELS], sum[CHANNELS * PIXELS], median[PIXELS];
+    [[unroll]] for (int k = 0; k < PIXELS; k++) {
+        uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
+        T[k] = x < width && y < height ? 1.0 : -1.0;
+        median[k] = 0.0;
+    }
+    [[unroll]] for (int k = 0; k < CHANNELS * PIXELS; k++) sum[k] = 0.0;
+
+    for (uint j = first; j < last; j += SUBGROUP_SIZE) {
+        load_splat(tile_splats[min(j + lane, last - 1)], j + lane < last);
+        uint batch = min(uint(SUBGROUP_SIZE), last - j);
+        for (uint i = 0; i < batch; i++) {
+            float dx0 = subgroupShuffle(own_u, i) - origin.x, dy0 = subgroupShuffle(own_v, i) - origin.y;
+            float a = subgroupShuffle(own_a, i), b = subgroupShuffle(own_b, i), c = subgroupShuffle(own_c, i);
+            float log2_opacity = subgroupShuffle(own_log2_opacity, i);
+#if BASE
+            float depth = subgroupShuffle(own_value[3], i);
+#endif
+            float weight[PIXELS];
+            [[unroll]] for (int n = 0; n < COLUMNS; n++) {
+                float dx = dx0 - float(n * LANES_X);
+                float ax = fma(a * dx, dx, log2_opacity), bx = b * dx;
+                [[unroll]] for (int m = 0; m < ROWS; m++) {
+                    const int k = n * ROWS + m;
+                    float dy = dy0 - float(m * LANES_Y);
+                    float power = fma(fma(c, dy, bx), dy, ax);
+                    float alpha = power >= LOG2_ALPHA_MIN ? min(ALPHA_MAX, exp2(power)) : 0.0;
+                    float w = alpha * T[k], next = T[k] - w;
+                    bool stop = next < TRANSMITTANCE_MIN;
+                    weight[k] = stop ? 0.0 : w;
+#if BASE
+                    median[k] = T[k] >= 0.5 && next < 0.5 ? depth : median[k];
+#endif
+                    T[k] = stop ? -abs(T[k]) : next;
+                }
+            }
+            [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {
+                float value = subgroupShuffle(own_value[channel], i);
+                [[unroll]] for (int k = 0; k < PIXELS; k++)
+                    sum[channel * PIXELS + k] = fma(weight[k], value, sum[channel * PIXELS + k]);
+            }
+        }
+        if (all_stopped(T)) break;
+    }
+
+    uint pixels = width * height;
+    [[unroll]] for (int k = 0; k < PIXELS; k++) {
+        uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
+        if (x < width && y < height) {
+            uint pixel = y * width + x;
+#if BASE
+            vec3 background = camera_background() * abs(T[k]);
+            planes[pixel] = sum[k] + background.r;
+            planes[pixels + pixel] = sum[PIXELS + k] + background.g;
+            planes[2 * pixels + pixel] = sum[2 * PIXELS + k] + background.b;
+            planes[3 * pixels + pixel] = sum[3 * PIXELS + k];
+            transmittances[pixel] = abs(T[k]);
+            median_depths[pixel] = median[k];
+#endif
+            [[unroll]] for (int channel = CHANNELS - FEATURES; channel < CHANNELS; channel++)
+                if (channel - (CHANNELS - FEATURES) < features)
+                    planes[(first_plane + channel) * pixels + pixel] = sum[channel * PIXELS + k];
+        }
+    }
+}

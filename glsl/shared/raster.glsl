@@ -1,0 +1,59 @@
+// One subgroup owns one 8x8 tile, its pixels live in registers. The lanes load SUBGROUP_SIZE splats together and
+// then loop over them with subgroupShuffle: no shared memory and no barrier. Equations: pass::raster_forward.
+//
+// CHANNELS names a block of channels: 4 = RGB and depth, 7 / 12 / 20 = those and 3 / 8 / 16 features, 16 = sixteen
+// further features only. A block with room for more features than there are reads zeros for the rest.
+#define BASE (CHANNELS != 16)
+#if BASE
+#define FEATURES (CHANNELS - 4)
+#else
+#define FEATURES CHANNELS
+#endif
+#define FEATURE_VECTORS ((FEATURES + 3) / 4)
+
+// Which pixels of the tile a lane owns: column lane % LANES_X (+ LANES_X per column step), row lane / LANES_X
+// (+ LANES_Y per row step).
+#define LANES_X (SUBGROUP_SIZE < 8 ? SUBGROUP_SIZE : 8)
+#define LANES_Y (SUBGROUP_SIZE / LANES_X)
+#define COLUMNS (8 / LANES_X)
+#define ROWS (8 / LANES_Y)
+#define PIXELS (COLUMNS * ROWS)
+
+const float LOG2_ALPHA_MIN = -7.994353436858858; // log2(1/255)
+const float ALPHA_MAX = 0.99;
+const float TRANSMITTANCE_MIN = 1e-4;
+
+// One splat per lane.
+float own_u, own_v, own_a, own_b, own_c, own_log2_opacity;
+float own_value[CHANNELS];
+
+void load_splat(uint splat, bool valid) {
+    vec4 p = projected[3 * splat], q = projected[3 * splat + 1];
+    own_u = p.x;
+    own_v = p.y;
+    own_a = p.z;
+    own_b = p.w;
+    own_c = q.x;
+    own_log2_opacity = valid ? q.y : -1e4;
+#if BASE
+    vec4 r = projected[3 * splat + 2];
+    own_value[0] = q.z;
+    own_value[1] = q.w;
+    own_value[2] = r.x;
+    own_value[3] = r.y;
+#endif
+#if FEATURES > 0
+    [[unroll]] for (int k = 0; k < FEATURE_VECTORS; k++) {
+        uint at = uint(k) + first_vector;
+        vec4 f = at < code_vectors ? codes[splat * code_vectors + at] : vec4(0.0);
+        [[unroll]] for (int n = 0; n < 4; n++)
+            if (4 * k + n < FEATURES) own_value[CHANNELS - FEATURES + 4 * k + n] = f[n];
+    }
+#endif
+}
+
+bool all_stopped(float transmittance[PIXELS]) {
+    float most = transmittance[0];
+    [[unroll]] for (int k = 1; k < PIXELS; k++) most = max(most, transmittance[k]);
+    return subgroupAll(most < 0.0);
+}

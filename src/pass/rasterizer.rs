@@ -1,0 +1,363 @@
+//! The training-facing render: parameters and gradients in GPU buffers, forward and backward as recorded commands.
+//!
+//! ```no_run
+//! # fn main() -> splatvk::Result<()> {
+//! # use splatvk::{gpu::{Device, Recorder}, pass::rasterizer::*, pass::view::View, scene::{Camera, Splats}};
+//! # let (splats, camera): (Splats, Camera) = todo!();
+//! let device = Device::open(None)?;
+//! let params = SplatBuffers::upload(&device, &splats, &[], 0)?;
+//! let grads = params.zeros_like(&device)?;
+//! let mut raster = Rasterizer::new(&device, params.count, params.feature_dim, camera.width, camera.height)?;
+//! let options = RasterOptions::default();
+//!
+//! raster.set_view(&View::new(&camera, 0.02))?;
+//! raster.forward(&params, &options)?;               // runs; grows its lists and repeats if they were too short
+//! let mut rec = Recorder::new(&device, "step");
+//! // … a loss pass reads raster.frame().planes and writes raster.frame().planes_grad …
+//! raster.record_backward(&mut rec, &params, &options, &grads);
+//! // … an optimiser pass reads grads and writes params …
+//! rec.run()?;
+//! let twist = raster.frame().camera_grad.read::<f32>()?; // ρ (3), θ (3), fx, fy, cx, cy
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! A whole step may also be one [`crate::gpu::Program`]: [`Rasterizer::record_forward`], loss,
+//! [`Rasterizer::record_backward`], optimiser. It can be run again for other views after [`Rasterizer::set_view`].
+//! Then check [`Rasterizer::overflow`] after each run: if the lists did not fit, that step saw an image without any
+//! splats; call [`Rasterizer::grow`], record again and repeat the step (an optimiser pass can read
+//! `frame().status[1]` on the GPU and do nothing when it is not 0).
+//!
+//! Recordings hold the buffers they were made with: record again after `grow`, after changing the number of splats,
+//! the SH degree or the options.
+use super::sort::Sort;
+use super::twin::FeatureMode;
+use super::view::{VIEW_FLOATS, View};
+use super::{bin, project, project_backward, raster_backward, raster_forward};
+use crate::gpu::{Buffer, Device, Recorder};
+use crate::scene::{Splats, sh_coefficients};
+use crate::{Error, Result};
+
+/// Raw parameters of N splats, or gradients by them, on the GPU.
+#[derive(Clone)]
+pub struct SplatBuffers {
+    /// N. Buffers may be longer (after pruning); only the first N splats are used.
+    pub count: usize,
+    /// Degree of the stored coefficients, 0–3.
+    pub sh_degree: u32,
+    /// d.
+    pub feature_dim: usize,
+    /// [N, 3] f32, world units.
+    pub means: Buffer,
+    /// [N, 3] f32, natural logs.
+    pub log_scales: Buffer,
+    /// [N, 4] f32 (w, x, y, z), not necessarily normalised.
+    pub quats: Buffer,
+    /// [N] f32.
+    pub opacity_logits: Buffer,
+    /// [N, (sh_degree+1)², 3] f32, DC first, RGB interleaved.
+    pub sh: Buffer,
+    /// [N, d] f32 raw features (a single unused float when d = 0).
+    pub features: Buffer,
+}
+
+impl SplatBuffers {
+    /// Copies splats and their features [N, d] to the GPU (`features` empty and d = 0 for none).
+    pub fn upload(
+        device: &Device,
+        splats: &Splats,
+        features: &[f32],
+        feature_dim: usize,
+    ) -> Result<SplatBuffers> {
+        let n = splats.len();
+        let lengths = [splats.log_scales.len(), splats.quats.len(), splats.opacity_logits.len()];
+        if lengths.iter().any(|&l| l != n) || splats.sh.len() != n * 3 * splats.sh_len() {
+            return Err(Error::work(format!("splats with {n} means have other arrays of different lengths")));
+        }
+        if features.len() != n * feature_dim {
+            let given = features.len();
+            return Err(Error::work(format!("{given} feature values do not make {n} × {feature_dim}")));
+        }
+        let out = SplatBuffers::zeros(device, "splats", n, splats.sh_degree, feature_dim)?;
+        if n > 0 {
+            out.means.write(&splats.means)?;
+            out.log_scales.write(&splats.log_scales)?;
+            out.quats.write(&splats.quats)?;
+            out.opacity_logits.write(&splats.opacity_logits)?;
+            out.sh.write(&splats.sh)?;
+        }
+        if !features.is_empty() {
+            out.features.write(features)?;
+        }
+        Ok(out)
+    }
+
+    /// Zero-filled buffers for `count` splats; `label` begins their names.
+    pub fn zeros(
+        device: &Device,
+        label: &str,
+        count: usize,
+        sh_degree: u32,
+        feature_dim: usize,
+    ) -> Result<SplatBuffers> {
+        let make =
+            |name: &str, floats: usize| device.buffer::<f32>(&format!("{label} {name}"), floats.max(4));
+        Ok(SplatBuffers {
+            count,
+            sh_degree,
+            feature_dim,
+            means: make("means", 3 * count)?,
+            log_scales: make("log_scales", 3 * count)?,
+            quats: make("quats", 4 * count)?,
+            opacity_logits: make("opacity_logits", count)?,
+            sh: make("sh", 3 * count * sh_coefficients(sh_degree))?,
+            features: make("features", count * feature_dim)?,
+        })
+    }
+
+    /// Zero-filled buffers of the same shape, for gradients or optimiser moments.
+    pub fn zeros_like(&self, device: &Device) -> Result<SplatBuffers> {
+        SplatBuffers::zeros(device, "gradient", self.count, self.sh_degree, self.feature_dim)
+    }
+
+    /// SH coefficients per channel.
+    pub fn sh_len(&self) -> usize {
+        sh_coefficients(self.sh_degree)
+    }
+
+    /// Back to the host: splats and features [N, d].
+    pub fn download(&self) -> Result<(Splats, Vec<f32>)> {
+        let n = self.count;
+        let floats = |b: &Buffer, len: usize| b.read_range::<f32>(0..len);
+        let splats = Splats {
+            means: triples(&floats(&self.means, 3 * n)?),
+            log_scales: triples(&floats(&self.log_scales, 3 * n)?),
+            quats: floats(&self.quats, 4 * n)?.chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect(),
+            opacity_logits: floats(&self.opacity_logits, n)?,
+            sh_degree: self.sh_degree,
+            sh: floats(&self.sh, 3 * n * self.sh_len())?,
+        };
+        Ok((splats, floats(&self.features, n * self.feature_dim)?))
+    }
+}
+
+fn triples(values: &[f32]) -> Vec<[f32; 3]> {
+    values.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect()
+}
+
+/// How to render.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RasterOptions {
+    /// Degree used, at most the stored one.
+    pub sh_degree: u32,
+    /// From stored to rendered features.
+    pub feature_mode: FeatureMode,
+    /// Whether the loss on the features reaches means, scales, rotations and opacities (`--sem-detach-geometry` = false).
+    pub features_move_geometry: bool,
+}
+
+impl Default for RasterOptions {
+    /// Degree 0; ε = 1e-3 as ALGORITHMS 8.4.
+    fn default() -> Self {
+        RasterOptions { sh_degree: 0, feature_mode: FeatureMode::Gauge(1e-3), features_move_geometry: true }
+    }
+}
+
+/// Buffers of one frame; pixel planes are planar [C, H, W], f32.
+pub struct FrameBuffers {
+    /// Pixels.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// d.
+    pub feature_dim: usize,
+    /// [4 + d, H, W]: RGB on the background, Σ w z, features. Written by the forward pass.
+    pub planes: Buffer,
+    /// [H, W] final transmittance T_f; alpha = 1 − T_f.
+    pub transmittance: Buffer,
+    /// [H, W] camera z where T falls below ½, 0 where it does not.
+    pub median_depth: Buffer,
+    /// [4 + d + 1, H, W]: the loss's gradient by `planes` and, last, by alpha. Zero at first; a loss overwrites the planes
+    /// it uses. Read by the backward pass.
+    pub planes_grad: Buffer,
+    /// [10]: gradient by the left pose twist (ρ, θ) and by fx, fy, cx, cy. Written by the backward pass.
+    pub camera_grad: Buffer,
+    /// [2] u32: tile-list entries of this frame; the number needed if a frame did not fit since the last `grow`, else 0.
+    pub status: Buffer,
+    pub(super) projected: Buffer,
+    pub(super) projected_grad: Buffer,
+    pub(super) codes: Buffer,
+    pub(super) codes_grad: Buffer,
+    pub(super) depth_pairs: Buffer,
+    pub(super) counters: Buffer,
+    pub(super) tile_ranges: Buffer,
+    pub(super) tile_splats: Buffer,
+    pub(super) chunks: u32,
+    pub(super) capacity: usize,
+}
+
+impl FrameBuffers {
+    /// Tiles along x and y.
+    pub(super) fn tiles(&self) -> [u32; 2] {
+        [self.width.div_ceil(bin::TILE), self.height.div_ceil(bin::TILE)]
+    }
+    /// Floats per splat in `codes`: d, rounded up to whole vectors.
+    pub(super) fn code_stride(&self) -> u32 {
+        (self.feature_dim as u32).next_multiple_of(4)
+    }
+}
+
+/// Renders up to N splats with d features at a fixed image size, and back.
+pub struct Rasterizer {
+    device: Device,
+    capacity: usize,
+    camera: Buffer,
+    frame: FrameBuffers,
+    sort: Sort,
+    /// [1] u32: N, where the sort reads it.
+    count: Buffer,
+}
+
+impl Rasterizer {
+    /// Room for `capacity` splats with `feature_dim` features (0, or as the splats have), images of width × height.
+    pub fn new(
+        device: &Device,
+        capacity: usize,
+        feature_dim: usize,
+        width: u32,
+        height: u32,
+    ) -> Result<Rasterizer> {
+        if width == 0 || height == 0 {
+            return Err(Error::work("an image of zero size cannot be rendered"));
+        }
+        let tiles = width.div_ceil(bin::TILE) as usize * height.div_ceil(bin::TILE) as usize;
+        let pixels = width as usize * height as usize;
+        let planes = raster_forward::BASE_CHANNELS + feature_dim;
+        let splats = capacity.max(1);
+        let stride = feature_dim.next_multiple_of(4);
+        let chunks = chunks_for(device, tiles);
+        // About five entries per splat on the seeded scene; `forward` grows the list if that is too few.
+        let entries = 8 * splats + 4 * tiles;
+        let frame = FrameBuffers {
+            width,
+            height,
+            feature_dim,
+            planes: device.buffer::<f32>("planes", planes * pixels)?,
+            transmittance: device.buffer::<f32>("transmittance", pixels)?,
+            median_depth: device.buffer::<f32>("median_depth", pixels)?,
+            planes_grad: device.buffer::<f32>("planes_grad", (planes + 1) * pixels)?,
+            camera_grad: device.buffer::<f32>("camera_grad", 10)?,
+            status: device.buffer::<u32>("status", 2)?,
+            projected: device.buffer::<f32>("projected", 12 * splats)?,
+            projected_grad: device.buffer::<f32>("projected_grad", 10 * splats)?,
+            codes: device.buffer::<f32>("codes", (stride * splats).max(4))?,
+            codes_grad: device.buffer::<f32>("codes_grad", (stride * splats).max(4))?,
+            depth_pairs: device.buffer::<[u32; 2]>("depth_pairs", splats)?,
+            counters: device.buffer::<u32>("counters", tiles * chunks as usize)?,
+            tile_ranges: device.buffer::<u32>("tile_ranges", tiles + 1)?,
+            tile_splats: device.buffer::<u32>("tile_splats", entries)?,
+            chunks,
+            capacity: entries,
+        };
+        let camera = device.buffer::<f32>("camera", VIEW_FLOATS)?;
+        let sort = Sort::new(device, splats)?;
+        let count = device.buffer::<u32>("splat count", 1)?;
+        Ok(Rasterizer { device: device.clone(), capacity, camera, frame, sort, count })
+    }
+
+    /// The output and gradient planes.
+    pub fn frame(&self) -> &FrameBuffers {
+        &self.frame
+    }
+
+    /// [6] rows of four floats, layout of [`View::to_gpu`]: what later runs of any recording render.
+    pub fn camera(&self) -> &Buffer {
+        &self.camera
+    }
+
+    /// Chooses the view that later runs render.
+    pub fn set_view(&self, view: &View) -> Result<()> {
+        if view.size != [self.frame.width, self.frame.height] {
+            return Err(Error::work(format!(
+                "a view of {} × {} does not fit a rasterizer of {} × {}",
+                view.size[0], view.size[1], self.frame.width, self.frame.height
+            )));
+        }
+        self.camera.write(&view.to_gpu())
+    }
+
+    /// Records projection, depth sort, binning and blending.
+    pub fn record_forward(&self, rec: &mut Recorder, params: &SplatBuffers, options: &RasterOptions) {
+        let sh_degree = options.sh_degree.min(params.sh_degree);
+        project::record(rec, params, &self.camera, &self.frame, sh_degree);
+        project::record_features(rec, params, &self.frame, options.feature_mode);
+        // Keys are the bits of camera z. The sort is stable, so equal depths keep the order of the splats.
+        rec.fill(&self.count, params.count as u32);
+        self.sort.record(rec, &self.frame.depth_pairs, &self.count, 32);
+        bin::record(rec, &self.frame, params.count);
+        raster_forward::record(rec, &self.camera, &self.frame);
+    }
+
+    /// Records the way back from `frame().planes_grad` to `gradients` (overwritten; zero for unseen splats) and
+    /// `frame().camera_grad`. Needs the results of a forward pass with the same parameters, view and options.
+    pub fn record_backward(
+        &self,
+        rec: &mut Recorder,
+        params: &SplatBuffers,
+        options: &RasterOptions,
+        gradients: &SplatBuffers,
+    ) {
+        let sh_degree = options.sh_degree.min(params.sh_degree);
+        raster_backward::record(rec, &self.frame, options.features_move_geometry);
+        let camera_grad = &self.frame.camera_grad;
+        project_backward::record(rec, params, &self.camera, &self.frame, sh_degree, gradients, camera_grad);
+        project_backward::record_features(rec, params, &self.frame, options.feature_mode, gradients);
+    }
+
+    /// Runs the forward pass now; grows the tile lists and repeats when they were too short.
+    pub fn forward(&mut self, params: &SplatBuffers, options: &RasterOptions) -> Result<()> {
+        self.check(params)?;
+        loop {
+            let mut rec = Recorder::new(&self.device, "forward");
+            self.record_forward(&mut rec, params, options);
+            rec.run()?;
+            match self.overflow()? {
+                Some(needed) => self.grow(needed)?,
+                None => return Ok(()),
+            }
+        }
+    }
+
+    /// Entries that a frame needed since the last [`Rasterizer::grow`], if they did not fit; `None` when all was well.
+    pub fn overflow(&self) -> Result<Option<usize>> {
+        let needed = self.frame.status.read::<u32>()?[1] as usize;
+        Ok((needed > 0).then_some(needed))
+    }
+
+    /// Makes room for tile lists of `needed` entries and a quarter more. Earlier recordings must not be run again.
+    pub fn grow(&mut self, needed: usize) -> Result<()> {
+        let capacity = needed + needed / 4;
+        self.frame.tile_splats = self.device.buffer::<u32>("tile_splats", capacity)?;
+        self.frame.capacity = capacity;
+        self.frame.status.write(&[0u32, 0])
+    }
+
+    fn check(&self, params: &SplatBuffers) -> Result<()> {
+        if params.count > self.capacity || params.feature_dim != self.frame.feature_dim {
+            return Err(Error::work(format!(
+                "{} splats with {} features do not fit a rasterizer for {} with {}",
+                params.count, params.feature_dim, self.capacity, self.frame.feature_dim
+            )));
+        }
+        Ok(())
+    }
+}
+
+/// Lanes that bin in parallel. Each has a counter per tile, so their number is bounded by memory; a CPU is busy with
+/// few (more only add counters to clear and scan), a GPU wants many.
+fn chunks_for(device: &Device, tiles: usize) -> u32 {
+    let wanted = if device.info().is_cpu { 64 } else { 1024 };
+    // 16 M counters, 64 MiB: half of the smallest buffer limit Vulkan drivers have in practice.
+    let bound = ((1 << 24) / tiles.max(1)).max(8) as u32;
+    wanted.min(bound) / 8 * 8
+}

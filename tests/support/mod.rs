@@ -1,0 +1,131 @@
+//! Shared by the integration tests.
+#![allow(dead_code)] // each test binary uses its own part
+use splatvk::gpu::{Device, Recorder};
+use splatvk::pass::close::{Distance, Tolerance, compare};
+use splatvk::pass::raster_forward::Cutoffs;
+use splatvk::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
+use splatvk::pass::seeded;
+use splatvk::pass::twin::{self, Forward, Gradients, Params};
+use splatvk::pass::view::View;
+use splatvk::scene::{Camera, Splats};
+
+/// A scene with everything a render needs.
+pub struct Scene {
+    pub splats: Splats,
+    pub features: Vec<f32>,
+    pub dim: usize,
+    pub view: View,
+    pub options: RasterOptions,
+}
+
+/// What the GPU rendered.
+pub struct Rendered {
+    pub planes: Vec<f32>,
+    pub transmittance: Vec<f32>,
+    pub median_depth: Vec<f32>,
+}
+
+/// Gradients as the GPU computed them.
+pub struct GpuGradients {
+    pub splats: Splats,
+    pub features: Vec<f32>,
+    pub camera: Vec<f32>,
+}
+
+impl Scene {
+    pub fn new(splats: Splats, camera: &Camera, dim: usize, seed: u64) -> Scene {
+        let features = seeded::features(splats.len(), dim, seed);
+        let options = RasterOptions { sh_degree: splats.sh_degree, ..RasterOptions::default() };
+        let view = View::new(camera, 0.05).with_background([0.2, 0.4, 0.1]);
+        Scene { splats, features, dim, view, options }
+    }
+
+    /// N random splats over a 75 × 53 image (partial tiles on both borders).
+    pub fn small(n: usize, sh_degree: u32, dim: usize, seed: u64) -> Scene {
+        let (splats, camera) = seeded::small(n, 75, 53, sh_degree, seed);
+        Scene::new(splats, &camera, dim, seed)
+    }
+
+    pub fn pixels(&self) -> usize {
+        (self.view.size[0] * self.view.size[1]) as usize
+    }
+
+    pub fn params(&self) -> Params {
+        Params::new(&self.splats, &self.features, self.dim)
+    }
+
+    pub fn twin(&self) -> Forward {
+        twin::forward(&self.params(), &self.view, self.options.feature_mode, &Cutoffs::STANDARD)
+    }
+
+    pub fn upload(&self, device: &Device) -> (SplatBuffers, Rasterizer) {
+        let params = SplatBuffers::upload(device, &self.splats, &self.features, self.dim).unwrap();
+        let [width, height] = self.view.size;
+        let raster = Rasterizer::new(device, self.splats.len(), self.dim, width, height).unwrap();
+        raster.set_view(&self.view).unwrap();
+        (params, raster)
+    }
+
+    pub fn render(&self, device: &Device) -> Rendered {
+        let (params, mut raster) = self.upload(device);
+        raster.forward(&params, &self.options).unwrap();
+        rendered(&raster)
+    }
+
+    /// Random upstream gradients for all planes, alpha last.
+    pub fn upstream(&self, seed: u64) -> Vec<f32> {
+        let mut random = seeded::Random::new(seed ^ 0xB0);
+        (0..(5 + self.dim) * self.pixels()).map(|_| random.normal(1.0) as f32).collect()
+    }
+
+    pub fn gradients(&self, device: &Device, upstream: &[f32]) -> GpuGradients {
+        let (params, mut raster) = self.upload(device);
+        raster.forward(&params, &self.options).unwrap();
+        raster.frame().planes_grad.write(upstream).unwrap();
+        let gradients = params.zeros_like(device).unwrap();
+        let mut rec = Recorder::new(device, "backward");
+        raster.record_backward(&mut rec, &params, &self.options, &gradients);
+        rec.run().unwrap();
+        let (splats, features) = gradients.download().unwrap();
+        GpuGradients { splats, features, camera: raster.frame().camera_grad.read().unwrap() }
+    }
+
+    pub fn twin_gradients(&self, forward: &Forward, upstream: &[f32]) -> Gradients {
+        let upstream: Vec<f64> = upstream.iter().map(|&g| g.into()).collect();
+        let mode = self.options.feature_mode;
+        twin::backward(&self.params(), &self.view, mode, &Cutoffs::STANDARD, forward, &upstream)
+    }
+}
+
+pub fn rendered(raster: &Rasterizer) -> Rendered {
+    Rendered {
+        planes: raster.frame().planes.read().unwrap(),
+        transmittance: raster.frame().transmittance.read().unwrap(),
+        median_depth: raster.frame().median_depth.read().unwrap(),
+    }
+}
+
+/// Image bound of ALGORITHMS 7.8. A contribution at the α threshold of 1/255 may be counted by one side and not by
+/// the other, which is worth up to 1/255 of a channel value; at most 2 pixels in 10 000 may show that.
+pub const IMAGE: Tolerance =
+    Tolerance { relative_l2: 1e-4, absolute: 1e-4, relative: 1e-5, outliers: 2e-4, outlier_factor: 200.0 };
+
+#[track_caller]
+pub fn assert_close(name: &str, actual: &[f32], reference: &[f64], tolerance: &Tolerance) -> Distance {
+    match compare(actual, reference, tolerance) {
+        Ok(distance) => {
+            println!("{name}: {distance}");
+            distance
+        }
+        Err(e) => panic!("{name}: {e}"),
+    }
+}
+
+#[track_caller]
+pub fn assert_images(actual: &Rendered, reference: &Forward) {
+    assert_close("planes", &actual.planes, &reference.image.planes, &IMAGE);
+    assert_close("transmittance", &actual.transmittance, &reference.image.transmittance, &IMAGE);
+    // The median is a jump where T is just ½: a few pixels may take the neighbouring splat's depth.
+    let median = Tolerance { outliers: 1e-3, outlier_factor: f64::INFINITY, relative_l2: 1e-3, ..IMAGE };
+    assert_close("median depth", &actual.median_depth, &reference.image.median_depth, &median);
+}
