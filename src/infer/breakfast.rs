@@ -33,9 +33,14 @@ pub fn phrases() -> Vec<(i32, String)> {
 }
 
 pub fn train_views() -> Vec<View> {
+    views("train")
+}
+
+/// The views of a split: "train" or "test".
+pub fn views(split: &str) -> Vec<View> {
     let truth = ground_truth();
     let frames = truth["frames"].as_array().unwrap();
-    frames.iter().filter(|f| f["split"] == "train").map(view).collect()
+    frames.iter().filter(|f| f["split"] == split).map(view).collect()
 }
 
 fn view(frame: &serde_json::Value) -> View {

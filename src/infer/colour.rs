@@ -46,6 +46,18 @@ pub fn terms_of(rgb: [f32; 3]) -> [f32; COUNT] {
     weights.map(|w| w / total)
 }
 
+/// [`terms_of`] the middle of the colour's cell in a cube of 32³ cells: at most 4/255 off, and quick enough for every
+/// pixel.
+pub fn terms_near(rgb: [f32; 3]) -> &'static [f32; COUNT] {
+    const CELLS: usize = 32;
+    static TABLE: OnceLock<Vec<[f32; COUNT]>> = OnceLock::new();
+    let middle = |i: usize| (i as f32 + 0.5) / CELLS as f32;
+    let cell = |i: usize| terms_of([i / CELLS / CELLS, i / CELLS % CELLS, i % CELLS].map(middle));
+    let table = TABLE.get_or_init(|| (0..CELLS.pow(3)).map(cell).collect());
+    let [r, g, b] = rgb.map(|v| ((v * CELLS as f32).max(0.0) as usize).min(CELLS - 1));
+    &table[(r * CELLS + g) * CELLS + b]
+}
+
 /// The terms in a text, evenly weighted; `None` if it says no colour.
 pub fn terms_in(text: &str) -> Option<[f32; COUNT]> {
     let text = text.to_lowercase();
@@ -104,6 +116,10 @@ mod tests {
             ([150, 150, 145], "grey"),
         ] {
             assert_eq!(name(rgb), want, "{rgb:?}");
+        }
+        for rgb in [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.2, 0.5, 0.9]] {
+            let (exact, near) = (terms_of(rgb), terms_near(rgb));
+            assert!(exact.iter().zip(near).all(|(a, b)| (a - b).abs() < 0.1), "{exact:?} {near:?}");
         }
         assert!(terms_in("a reddish thing").is_none());
         assert_eq!(terms_in("Gray-green stone").unwrap().iter().filter(|t| **t == 0.5).count(), 2);

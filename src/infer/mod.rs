@@ -11,7 +11,7 @@ pub mod words;
 pub mod xfeat;
 
 pub use registry::{ModelStatus, Registry, Role, home};
-pub use runtime::{Input, Session, Tensor, runtime};
+pub use runtime::{Input, Session, Tensor, runtime, runtime_build};
 
 use crate::Result;
 use crate::scene::{Plane, RgbImage};

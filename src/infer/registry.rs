@@ -124,6 +124,12 @@ impl Registry {
         self.pack.files.iter().map(|f| self.inspect(f)).collect()
     }
 
+    /// The files for some roles, read and hashed.
+    pub fn status_of(&self, roles: &[Role]) -> Vec<ModelStatus> {
+        let wanted = self.pack.files.iter().filter(|f| roles.contains(&f.role));
+        wanted.map(|f| self.inspect(f)).collect()
+    }
+
     /// The file for `role`, present and with the right content; otherwise an error that names the file, the sha256 it
     /// should have and how to get it. Content is hashed once per process and file version.
     pub fn path(&self, role: Role) -> Result<PathBuf> {
@@ -193,14 +199,23 @@ fn content_hash(path: &Path) -> std::io::Result<String> {
             n => digest.update(&block[..n]),
         }
     }
-    let hash = digest.finalize().iter().fold(String::new(), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}");
-        text
-    });
+    let hash = hex(&digest.finalize());
     if let Ok(mut known) = known.lock() {
         known.insert(path.to_path_buf(), (stamp.0, stamp.1, hash.clone()));
     }
     Ok(hash)
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}");
+        text
+    })
+}
+
+/// sha256 of some bytes in lower-case hex.
+pub(super) fn sha256(bytes: &[u8]) -> String {
+    hex(&Sha256::digest(bytes))
 }
 
 #[cfg(test)]

@@ -26,6 +26,12 @@ pub fn runtime() -> Result<PathBuf> {
     Ok(loaded()?.0.clone())
 }
 
+/// What the library in use says about its own build (version, commit, flags).
+pub fn runtime_build() -> Result<&'static str> {
+    loaded()?;
+    Ok(ort::info())
+}
+
 fn loaded() -> Result<&'static (PathBuf, Environment)> {
     LOADED.get_or_init(load).as_ref().map_err(|e| Error::missing(e.as_str()))
 }

@@ -18,7 +18,7 @@
 //!
 //! It knows about a thousand everyday things and eleven colours. CLIP is the full model.
 use super::classify::{CLASSES, Classifier};
-use super::registry::{Registry, Role};
+use super::registry::{Registry, Role, home, sha256};
 use super::text::{self, TextEncoder, normalise};
 use super::{RegionEncoder, colour};
 use crate::scene::{Plane, RgbImage};
@@ -137,11 +137,41 @@ fn region_colours(image: &RgbImage, labels: &Plane<i32>, count: usize) -> Vec<Op
     for (label, rgb) in labels.data.iter().zip(&image.data) {
         if *label >= 0 && (*label as usize) < count {
             let (sum, n) = &mut sums[*label as usize];
-            sum.iter_mut().zip(colour::terms_of(*rgb)).for_each(|(s, t)| *s += t);
+            sum.iter_mut().zip(colour::terms_near(*rgb)).for_each(|(s, t)| *s += t);
             *n += 1;
         }
     }
     sums.into_iter().map(|(sum, n)| (n > 0).then(|| sum.map(|s| s / n as f32))).collect()
+}
+
+/// `compute`, or what it gave the last time with these model files: naming a thousand classes takes seconds, which a
+/// single query should not pay. The file is a cache: anything odd about it, and it is computed and written again.
+fn remembered(
+    registry: &Registry,
+    length: usize,
+    compute: impl FnOnce() -> Result<Vec<f32>>,
+) -> Result<Vec<f32>> {
+    let folder = home().join("cache");
+    let inputs = [Role::Text, Role::Tokenizer, Role::Classes];
+    let used = registry.status_of(&inputs).into_iter().map(|s| s.sha256).collect::<String>();
+    let file = folder.join(format!("class-names-{}.f32", &sha256(used.as_bytes())[..16]));
+    if let Ok(bytes) = std::fs::read(&file)
+        && bytes.len() == 64 + 4 * length
+        && bytes[..64] == *sha256(&bytes[64..]).as_bytes()
+    {
+        return Ok(bytemuck::pod_collect_to_vec(&bytes[64..]));
+    }
+    let values = compute()?;
+    let body: &[u8] = bytemuck::cast_slice(&values);
+    let partial = file.with_extension(format!("partial-{}", std::process::id()));
+    // Not being able to keep it costs time only.
+    let kept = std::fs::create_dir_all(&folder)
+        .and_then(|()| std::fs::write(&partial, [sha256(body).as_bytes(), body].concat()))
+        .and_then(|()| std::fs::rename(&partial, &file));
+    if kept.is_err() {
+        let _ = std::fs::remove_file(&partial);
+    }
+    Ok(values)
 }
 
 impl Vocabulary {
@@ -159,7 +189,9 @@ impl Vocabulary {
             )));
         }
         let mut encoder = TextEncoder::load(registry)?;
-        let mut names = encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>())?;
+        let mut names = remembered(registry, CLASSES * text::DIM, || {
+            encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>())
+        })?;
         let mut mean = vec![0f32; text::DIM];
         for name in names.chunks_exact(text::DIM) {
             mean.iter_mut().zip(name).for_each(|(m, n)| *m += n / CLASSES as f32);
@@ -189,7 +221,7 @@ impl Vocabulary {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::infer::breakfast::{View, phrases, train_views};
+    use crate::infer::breakfast::{View, phrases, views};
 
     fn dot(a: &[f32], b: &[f32]) -> f32 {
         a.iter().zip(b).map(|(p, q)| p * q).sum()
@@ -217,34 +249,59 @@ mod tests {
         Some((better + 1, right))
     }
 
+    /// How many phrase–view pairs put the right region first, and of how many. Phrases in `sure` must.
+    fn first_of(words: &mut RegionWords, split: &str, sure: &[&str]) -> (usize, usize) {
+        let canonical = words.embed_texts(&["object", "things", "stuff", "texture"]).unwrap();
+        let views = views(split);
+        let regions: Vec<_> =
+            views.iter().map(|v| words.embed_regions(&v.image, &v.masks, 12).unwrap()).collect();
+        let (mut first, mut all) = (0, 0);
+        for (object, phrase) in phrases() {
+            let query = words.embed_texts(&[&phrase]).unwrap();
+            let pairs = views.iter().zip(&regions);
+            let found: Vec<_> = pairs.filter_map(|(v, r)| rank(v, r, object, &query, &canonical)).collect();
+            println!("{split} {phrase:14} {found:.2?}");
+            first += found.iter().filter(|(rank, _)| *rank == 1).count();
+            all += found.len();
+            if sure.contains(&phrase.as_str()) {
+                // Measured: 0.78 (plate) to 1.00. Without any evidence the score is 0.5.
+                assert!(found.iter().all(|(rank, score)| *rank == 1 && *score > 0.7), "{phrase}: {found:?}");
+            }
+        }
+        (first, all)
+    }
+
     #[test]
     fn phrases_find_their_regions_on_breakfast() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
-        let canonical = words.embed_texts(&["object", "things", "stuff", "texture"]).unwrap();
-        let views = train_views();
-        let regions: Vec<_> =
-            views.iter().map(|v| words.embed_regions(&v.image, &v.masks, 12).unwrap()).collect();
-        let mut first = 0;
-        for (object, phrase) in phrases() {
-            let query = words.embed_texts(&[&phrase]).unwrap();
-            let found: Vec<_> =
-                views.iter().zip(&regions).map(|(v, r)| rank(v, r, object, &query, &canonical)).collect();
-            println!("{phrase:14} {found:.2?}");
-            first += found.iter().flatten().filter(|(rank, _)| *rank == 1).count();
-            if ["lemon", "blue mug", "plate", "red soda can", "loaf of bread"].contains(&phrase.as_str()) {
-                for (rank, score) in found.iter().flatten() {
-                    assert!(*rank == 1 && *score > 0.8, "{phrase}: {found:?}");
-                }
-            }
+        let sure = ["lemon", "blue mug", "plate", "red soda can", "loaf of bread", "green book"];
+        // Measured 39 of 41 on the views that the shares were chosen on, 73 of 81 on views that they were not.
+        let (first, all) = first_of(&mut words, "train", &sure);
+        assert!(first >= 37 && all == 41, "{first} of {all}");
+        let (first, all) = first_of(&mut words, "test", &sure);
+        assert!(first >= 69 && all == 81, "{first} of {all}");
+    }
+
+    #[test]
+    fn views_of_one_thing_agree() {
+        let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
+        let views = views("train");
+        let mut of = |v: &View| words.embed_regions(&v.image, &v.masks, 12).unwrap();
+        let (a, b) = (of(&views[1]), of(&views[2]));
+        let row = |all: &[f32], i: usize| all[i * DIM..(i + 1) * DIM].to_vec();
+        // The eight objects. Measured: the same one 0.8 to 0.98, another 0.38 in the middle and 0.76 at most.
+        for i in 4..12 {
+            let same = dot(&row(&a, i), &row(&b, i));
+            let other =
+                (4..12).filter(|j| *j != i).map(|j| dot(&row(&a, i), &row(&b, j))).fold(0.0, f32::max);
+            assert!(same > 0.7 && same > other, "object {i}: {same} with itself, {other} with another");
         }
-        println!("first: {first}");
-        assert!(first >= 36, "{first}");
     }
 
     #[test]
     fn embeddings_are_unit_vectors_and_empty_regions_zero() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
-        let view = &train_views()[0];
+        let view = &views("train")[0];
         let regions = words.embed_regions(&view.image, &view.masks, 14).unwrap();
         assert_eq!(regions.len(), 14 * DIM);
         for (i, row) in regions.chunks_exact(DIM).enumerate() {
