@@ -4,6 +4,8 @@ pub mod bin;
 pub mod close;
 pub mod compact;
 pub mod metrics;
+pub mod plane_sweep;
+pub mod plane_sweep_cpu;
 pub mod project;
 pub mod project_backward;
 pub mod raster_backward;

@@ -9,6 +9,7 @@ pub mod pointmap;
 mod resect;
 pub mod sfm;
 mod sift;
+pub mod stereo;
 #[cfg(test)]
 mod testing;
 mod two_view;

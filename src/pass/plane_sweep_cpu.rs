@@ -1,0 +1,380 @@
+//! CPU twin of the `plane_sweep` and `plane_sweep_refine` shaders: slanted-plane multi-view matching.
+//!
+//! A hypothesis is the plane `π·X = 1` in the reference camera's frame, so that the inverse depth along a pixel's ray is
+//! `1/z = π·ray` and the warp into a source view is the homography `K_s (R + t πᵀ)`. Matching cost: 1 − bilaterally
+//! weighted ZNCC (Schönberger et al. 2016, eq. 7–8), mixed over the best source views; propagation on a red-black
+//! checkerboard with adaptive candidate areas (Xu and Tao 2019, ACMM, section 3.1).
+use super::plane_sweep::{MAX_SOURCES, Matcher, Reference, Source};
+use crate::Result;
+use glam::{Vec2, Vec3, Vec4};
+use rayon::prelude::*;
+
+/// Taps along one side of the matching window.
+pub const TAPS: usize = 5;
+/// Pixels between two taps: 5 taps at every second pixel cover a 9 × 9 window at 31 % of its cost.
+pub const TAP_STEP: i32 = 2;
+/// Cost of a source view that sees nothing of the plane; also where costs saturate, so that one occluded view cannot
+/// outvote the others. Unrelated patches have ZNCC about 0.
+pub const COST_LIMIT: f32 = 1.0;
+/// Added to both variances: (1.5 grey levels)², the noise of an 8-bit JPEG. Flat patches get cost ≈ 1 instead of noise.
+pub const VARIANCE_FLOOR: f32 = 3.5e-5;
+/// Luma difference at which a tap's weight falls to 1/e: less and texture is lost, more and edges grow fat.
+pub const SIGMA_COLOUR: f32 = 0.03;
+/// Pixel distance of the spatial Gaussian, as in ACMM.
+pub const SIGMA_SPACE: f32 = 3.5;
+/// Shares of the best, second, ... source view in the aggregated cost: the second view confirms, but a pixel seen
+/// by one other view only still prefers the right plane.
+pub const VIEW_SHARES: [f32; MAX_SOURCES] = [0.6, 0.3, 0.1, 0.0];
+/// Reprojection error (pixels) at which the geometric term saturates, as in ACMM.
+pub const GEOMETRIC_LIMIT: f32 = 3.0;
+
+/// PCG-like integer hash (Jarzynski and Olano 2020): deterministic, the same in GLSL.
+pub fn hash(mut v: u32) -> u32 {
+    v = v.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+    let word = ((v >> ((v >> 28) + 4)) ^ v).wrapping_mul(277_803_737);
+    (word >> 22) ^ word
+}
+
+/// A stream of hashed numbers.
+pub struct Random(pub u32);
+
+impl Random {
+    /// Uniform in [0, 1).
+    pub fn uniform(&mut self) -> f32 {
+        self.0 = hash(self.0);
+        (self.0 >> 8) as f32 / 16_777_216.0
+    }
+    /// Uniform in the cube [−1, 1)³.
+    pub fn cube(&mut self) -> Vec3 {
+        let x = self.uniform();
+        let y = self.uniform();
+        let z = self.uniform();
+        Vec3::new(x, y, z) * 2.0 - Vec3::ONE
+    }
+}
+
+/// The matching window of one reference pixel: offsets are implicit, weights sum to 1.
+pub struct Window {
+    /// Weight per tap.
+    pub weights: [f32; TAPS * TAPS],
+    /// Weight × (luma − weighted mean).
+    pub centred: [f32; TAPS * TAPS],
+    /// Weighted variance.
+    pub variance: f32,
+}
+
+/// Everything a pass reads.
+pub struct Inputs<'a> {
+    /// Luma of all views, one after the other.
+    pub luma: &'a [f32],
+    /// Source table.
+    pub sources: &'a [Source],
+    /// The reference and the search.
+    pub reference: Reference,
+}
+
+fn offset(tap: usize) -> i32 {
+    (tap as i32 - (TAPS as i32 - 1) / 2) * TAP_STEP
+}
+
+impl Inputs<'_> {
+    /// Camera-frame ray (z = 1) through the centre of a pixel.
+    pub fn ray(&self, x: i32, y: i32) -> Vec3 {
+        let [fx, fy, cx, cy] = self.reference.intrinsics;
+        Vec3::new((x as f32 + 0.5 - cx) / fx, (y as f32 + 0.5 - cy) / fy, 1.0)
+    }
+
+    /// Weights and moments of the window around a pixel; taps beyond the border repeat it.
+    pub fn window(&self, x: i32, y: i32) -> Window {
+        let r = &self.reference;
+        let image = &self.luma[r.first as usize..];
+        let at = |x: i32, y: i32| {
+            let (x, y) = (x.clamp(0, r.width as i32 - 1), y.clamp(0, r.height as i32 - 1));
+            image[(y as u32 * r.width + x as u32) as usize]
+        };
+        let centre = at(x, y);
+        let mut weights = [0.0; TAPS * TAPS];
+        let mut values = [0.0; TAPS * TAPS];
+        let (mut sum, mut mean, mut square) = (0.0, 0.0, 0.0);
+        for j in 0..TAPS {
+            for i in 0..TAPS {
+                let (dx, dy) = (offset(i), offset(j));
+                // Relative to the centre: keeps the variance exact in f32.
+                let value = at(x + dx, y + dy) - centre;
+                let space = (dx * dx + dy * dy) as f32 / (2.0 * SIGMA_SPACE * SIGMA_SPACE);
+                let weight = (-value.abs() / SIGMA_COLOUR - space).exp();
+                weights[j * TAPS + i] = weight;
+                values[j * TAPS + i] = value;
+                sum += weight;
+                mean += weight * value;
+                square += weight * value * value;
+            }
+        }
+        mean /= sum;
+        let mut centred = [0.0; TAPS * TAPS];
+        for k in 0..TAPS * TAPS {
+            weights[k] /= sum;
+            centred[k] = weights[k] * (values[k] - mean);
+        }
+        Window { weights, centred, variance: (square / sum - mean * mean).max(0.0) }
+    }
+
+    /// Bilinear luma of a source view at continuous pixel coordinates, clamped to the border.
+    fn sample(&self, source: &Source, u: f32, v: f32) -> f32 {
+        let [width, height, first, _] = source.size;
+        let x = (u - 0.5).clamp(0.0, width as f32 - 1.001);
+        let y = (v - 0.5).clamp(0.0, height as f32 - 1.001);
+        let (ix, iy) = (x as usize, y as usize);
+        let (fx, fy) = (x - ix as f32, y - iy as f32);
+        let k = first as usize + iy * width as usize + ix;
+        let w = width as usize;
+        let top = self.luma[k] + fx * (self.luma[k + 1] - self.luma[k]);
+        let bottom = self.luma[k + w] + fx * (self.luma[k + w + 1] - self.luma[k + w]);
+        top + fy * (bottom - top)
+    }
+
+    /// 1 − ZNCC of the window warped by `plane` into one source view, at most [`COST_LIMIT`].
+    pub fn source_cost(&self, source: &Source, window: &Window, ray: Vec3, plane: Vec3) -> f32 {
+        let rows = source.forward.map(Vec4::from);
+        let [fx, fy, ..] = self.reference.intrinsics;
+        let apply = |v: Vec4| Vec3::new(rows[0].dot(v), rows[1].dot(v), rows[2].dot(v));
+        let centre = apply(ray.extend(plane.dot(ray)));
+        let (u, v) = (centre.x / centre.z, centre.y / centre.z);
+        let inside = u >= 0.0 && v >= 0.0 && u < source.size[0] as f32 && v < source.size[1] as f32;
+        // The source must look at the same side of the plane.
+        let front = plane.dot(Vec4::from(source.centre).truncate()) < 1.0;
+        if !(centre.z > 0.0 && inside && front) {
+            return COST_LIMIT;
+        }
+        let along_x = apply(Vec4::new(1.0, 0.0, 0.0, plane.x)) / fx;
+        let along_y = apply(Vec4::new(0.0, 1.0, 0.0, plane.y)) / fy;
+        let base = self.sample(source, u, v);
+        let (mut mean, mut square, mut covariance) = (0.0f32, 0.0f32, 0.0f32);
+        for j in 0..TAPS {
+            for i in 0..TAPS {
+                let q = centre + along_x * offset(i) as f32 + along_y * offset(j) as f32;
+                let inverse = 1.0 / q.z.max(1e-6);
+                let value = self.sample(source, q.x * inverse, q.y * inverse) - base;
+                let k = j * TAPS + i;
+                mean += window.weights[k] * value;
+                square += window.weights[k] * value * value;
+                covariance += window.centred[k] * value;
+            }
+        }
+        let variance = (square - mean * mean).max(0.0);
+        let scale = ((window.variance + VARIANCE_FLOOR) * (variance + VARIANCE_FLOOR)).sqrt();
+        (1.0 - covariance / scale).min(COST_LIMIT)
+    }
+
+    /// Forward–backward reprojection error of the plane through a source view's present planes, pixels, at most
+    /// [`GEOMETRIC_LIMIT`].
+    fn geometric_error(
+        &self,
+        planes: &[Vec4],
+        source: &Source,
+        x: i32,
+        y: i32,
+        ray: Vec3,
+        plane: Vec3,
+    ) -> f32 {
+        let apply = |rows: &[[f32; 4]; 3], v: Vec4| {
+            Vec3::new(Vec4::from(rows[0]).dot(v), Vec4::from(rows[1]).dot(v), Vec4::from(rows[2]).dot(v))
+        };
+        let q = apply(&source.forward, ray.extend(plane.dot(ray)));
+        let (u, v) = (q.x / q.z, q.y / q.z);
+        let [width, height, first, _] = source.size;
+        if !(q.z > 0.0 && u >= 0.0 && v >= 0.0 && u < width as f32 && v < height as f32) {
+            return GEOMETRIC_LIMIT;
+        }
+        let other = planes[first as usize + v as usize * width as usize + u as usize].truncate();
+        let [fx, fy, cx, cy] = source.intrinsics;
+        let ray_s = Vec3::new((u - cx) / fx, (v - cy) / fy, 1.0);
+        let p = apply(&source.back, ray_s.extend(other.dot(ray_s)));
+        if p.z <= 0.0 {
+            return GEOMETRIC_LIMIT;
+        }
+        let error = Vec2::new(p.x / p.z - x as f32 - 0.5, p.y / p.z - y as f32 - 0.5);
+        error.length().min(GEOMETRIC_LIMIT)
+    }
+
+    /// Aggregated cost of a plane at a pixel: the sorted source costs mixed by [`VIEW_SHARES`].
+    pub fn cost(&self, planes: &[Vec4], window: &Window, x: i32, y: i32, ray: Vec3, plane: Vec3) -> f32 {
+        let r = &self.reference;
+        let mut best = [COST_LIMIT + r.geometric * GEOMETRIC_LIMIT; MAX_SOURCES];
+        for source in &self.sources[r.first_source as usize..(r.first_source + r.sources) as usize] {
+            let mut cost = self.source_cost(source, window, ray, plane);
+            if r.geometric > 0.0 {
+                cost += r.geometric * self.geometric_error(planes, source, x, y, ray, plane);
+            }
+            // Insertion into the sorted list; the last entry falls out.
+            for slot in &mut best {
+                if cost < *slot {
+                    std::mem::swap(slot, &mut cost);
+                }
+            }
+        }
+        (0..MAX_SOURCES).map(|k| VIEW_SHARES[k] * best[k]).sum()
+    }
+
+    /// A plane through `1/z = inverse_depth` at the pixel with a given normal, or None if it is seen too obliquely or
+    /// lies outside the searched range.
+    pub fn plane(&self, ray: Vec3, normal: Vec3, inverse_depth: f32) -> Option<Vec3> {
+        let slope = normal.dot(ray);
+        let [near, far] = [self.reference.range[1], self.reference.range[0]];
+        // cos 84°: a window foreshortened tenfold matches nothing.
+        let visible = slope < -0.1 * normal.length() * ray.length();
+        (visible && inverse_depth >= far && inverse_depth <= near).then(|| normal * (inverse_depth / slope))
+    }
+
+    /// Random number stream of a pixel.
+    pub fn random(&self, x: i32, y: i32) -> Random {
+        let r = &self.reference;
+        Random(hash(r.seed ^ hash(r.first + y as u32 * r.width + x as u32)))
+    }
+
+    /// The initial sweep at one pixel: `planes` inverse depths over the range, jittered, each with a random normal
+    /// (cosine-weighted about the viewing ray). Returns the best plane and its cost.
+    pub fn sweep(&self, x: i32, y: i32) -> Vec4 {
+        let r = &self.reference;
+        let ray = self.ray(x, y);
+        let window = self.window(x, y);
+        let mut random = self.random(x, y);
+        let view = ray.normalize();
+        let mut best = (-view * (r.range[0] / -view.dot(ray))).extend(f32::MAX);
+        for k in 0..r.planes {
+            let share = (k as f32 + random.uniform()) / r.planes as f32;
+            let inverse_depth = r.range[0] + share * (r.range[1] - r.range[0]);
+            let normal = random.cube() * 0.9 - view;
+            let Some(plane) = self.plane(ray, normal, inverse_depth) else { continue };
+            let cost = self.cost(&[], &window, x, y, ray, plane);
+            if cost < best.w {
+                best = plane.extend(cost);
+            }
+        }
+        best
+    }
+
+    /// One propagation and refinement step at one pixel. `planes` holds (π, cost) of all views.
+    pub fn refine(&self, planes: &[Vec4], x: i32, y: i32) -> Vec4 {
+        let r = &self.reference;
+        let own = &planes[r.first as usize..];
+        let ray = self.ray(x, y);
+        let window = self.window(x, y);
+        let mut random = self.random(x, y);
+        let current = own[(y as u32 * r.width + x as u32) as usize];
+        // Re-evaluated: after a change of resolution or of the other views its stored cost is stale.
+        let cost = self.cost(planes, &window, x, y, ray, current.truncate());
+        let mut best = current.truncate().extend(cost);
+        for area in 0..8 {
+            let Some(candidate) = self.area_best(own, x, y, area) else { continue };
+            let inverse_depth = candidate.dot(ray);
+            if inverse_depth < r.range[0] || inverse_depth > r.range[1] || candidate == best.truncate() {
+                continue;
+            }
+            let cost = self.cost(planes, &window, x, y, ray, candidate);
+            if cost < best.w {
+                best = candidate.extend(cost);
+            }
+        }
+        for trial in 0..4 {
+            let plane = best.truncate();
+            let inverse_depth = plane.dot(ray);
+            let normal = -plane.normalize();
+            // Log-uniform step lengths replace an annealing schedule: 10 % down to 0.02 % of the depth.
+            let depth_step = 0.1 * (-9.0 * random.uniform()).exp2();
+            let normal_step = 0.7 * (-5.0 * random.uniform()).exp2();
+            let moved = inverse_depth * (1.0 + depth_step * (2.0 * random.uniform() - 1.0));
+            let turned = normal + random.cube() * normal_step;
+            let (normal, inverse_depth) = match trial {
+                0 => (normal, moved),
+                1 => (turned, inverse_depth),
+                2 => (turned, moved),
+                _ => {
+                    let share = random.uniform();
+                    let wild = r.range[0] + share * (r.range[1] - r.range[0]);
+                    (random.cube() * 0.9 - ray.normalize(), wild)
+                }
+            };
+            let Some(candidate) = self.plane(ray, normal, inverse_depth) else { continue };
+            let cost = self.cost(planes, &window, x, y, ray, candidate);
+            if cost < best.w {
+                best = candidate.extend(cost);
+            }
+        }
+        best
+    }
+
+    /// The plane with the lowest cost in one of eight areas around a pixel (0–3: a near wedge per direction, 4–7: a
+    /// far strip per direction), all of the other checkerboard colour; None outside the image.
+    pub fn area_best(&self, own: &[Vec4], x: i32, y: i32, area: usize) -> Option<Vec3> {
+        let r = &self.reference;
+        let (dx, dy) = [(1, 0), (-1, 0), (0, 1), (0, -1)][area % 4];
+        let mut best: Option<Vec4> = None;
+        let mut consider = |x: i32, y: i32| {
+            if x >= 0 && y >= 0 && x < r.width as i32 && y < r.height as i32 {
+                let candidate = own[(y as u32 * r.width + x as u32) as usize];
+                if best.is_none_or(|b| candidate.w < b.w) {
+                    best = Some(candidate);
+                }
+            }
+        };
+        if area < 4 {
+            consider(x + dx, y + dy);
+            for side in [-1, 1] {
+                consider(x + 2 * dx + side * dy, y + 2 * dy + side * dx);
+                consider(x + 3 * dx + 2 * side * dy, y + 3 * dy + 2 * side * dx);
+            }
+        } else {
+            for step in 0..8 {
+                consider(x + (5 + 2 * step) * dx, y + (5 + 2 * step) * dy);
+            }
+        }
+        best.map(|b| b.truncate())
+    }
+}
+
+/// The twin of the whole GPU matcher: same calls, plain loops.
+pub struct CpuMatcher {
+    luma: Vec<f32>,
+    sources: Vec<Source>,
+    planes: Vec<Vec4>,
+}
+
+impl CpuMatcher {
+    /// `luma` and `planes` (π, cost) hold all views one after the other.
+    pub fn new(luma: Vec<f32>, sources: Vec<Source>, planes: Vec<Vec4>) -> Self {
+        CpuMatcher { luma, sources, planes }
+    }
+}
+
+impl Matcher for CpuMatcher {
+    fn sweep(&mut self, reference: &Reference) -> Result<()> {
+        let (width, first) = (reference.width as usize, reference.first as usize);
+        let inputs = Inputs { luma: &self.luma, sources: &self.sources, reference: *reference };
+        let pixels = width * reference.height as usize;
+        self.planes[first..first + pixels]
+            .par_iter_mut()
+            .enumerate()
+            .for_each(|(k, plane)| *plane = inputs.sweep((k % width) as i32, (k / width) as i32));
+        Ok(())
+    }
+    fn refine(&mut self, reference: &Reference) -> Result<()> {
+        let (width, first) = (reference.width as usize, reference.first as usize);
+        let inputs = Inputs { luma: &self.luma, sources: &self.sources, reference: *reference };
+        let of_colour = |k: &usize| (k % width + k / width) % 2 == reference.parity as usize;
+        let pixels = width * reference.height as usize;
+        let active: Vec<usize> = (0..pixels).filter(of_colour).collect();
+        let planes = &self.planes;
+        let updated: Vec<Vec4> = active
+            .par_iter()
+            .map(|&k| inputs.refine(planes, (k % width) as i32, (k / width) as i32))
+            .collect();
+        for (k, plane) in active.into_iter().zip(updated) {
+            self.planes[first + k] = plane;
+        }
+        Ok(())
+    }
+    fn planes(&self) -> Result<Vec<Vec4>> {
+        Ok(self.planes.clone())
+    }
+}

@@ -1,0 +1,289 @@
+//! Which matched pixels to believe: agreement with the other views, and smooth local planes for those.
+use super::Level;
+use crate::scene::Plane;
+use glam::{DMat3, DVec2, DVec3, Vec3, Vec4};
+use rayon::prelude::*;
+
+/// Matched planes of all views with how far each pixel can be trusted, at one resolution.
+#[derive(Clone, Debug)]
+pub struct Surface {
+    /// `π` per pixel (`1/z = π·ray`), all views one after the other.
+    pub planes: Vec<Vec3>,
+    /// Confidence per pixel; 0 = not to be believed.
+    pub confidence: Vec<f32>,
+}
+
+/// Depths that differ by less agree: several times the matching noise, far below the size of objects.
+pub const DEPTH_TOLERANCE: f32 = 0.01;
+/// Forward–backward reprojection error that still agrees, pixels: leaves room for 0.1° of pose error (1.1 px at f = 650).
+const REPROJECTION_TOLERANCE: f32 = 1.5;
+/// A point this much nearer than what another view sees there would hide it: it cannot exist.
+pub const FREE_SPACE_TOLERANCE: f32 = 0.03;
+/// Aggregated cost above which even an agreeing pixel is not believed: half way between a perfect match in one view
+/// (0.4 + geometric limits) and none (1.0 and more).
+const COST_TOLERANCE: f32 = 0.75;
+/// Connected areas of believed pixels smaller than this share of the image are chance.
+const SPECKLE_SHARE: f32 = 1.5e-4;
+/// Confidence by number of agreeing views.
+const CONFIDENCE: [f32; 3] = [0.0, 0.6, 0.9];
+
+/// What another view says about a point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Verdict {
+    /// Outside its image, or it knows nothing there.
+    Unseen,
+    /// It sees a surface at the same place.
+    Agrees,
+    /// It sees something nearer.
+    Hidden,
+    /// It sees farther: the point would be in the way.
+    InTheWay,
+}
+
+/// Maps between the cameras of a level, in f32.
+pub struct Links {
+    /// `to[a * views + b]`: rotation and translation of frame a → frame b.
+    to: Vec<(glam::Mat3, Vec3)>,
+    views: usize,
+}
+
+impl Links {
+    /// Precomputes all pairs.
+    pub fn new(level: &Level) -> Links {
+        let views = level.cameras.len();
+        let mut to = Vec::with_capacity(views * views);
+        for a in &level.cameras {
+            for b in &level.cameras {
+                let relative = b.pose.compose(&a.pose.inverse());
+                let r: DMat3 = relative.rotation;
+                to.push((r.as_mat3(), relative.translation.as_vec3()));
+            }
+        }
+        Links { to, views }
+    }
+
+    /// Depth and pixel of a point of frame `a` in view `b`, if it falls into the image.
+    pub fn project(&self, level: &Level, a: usize, b: usize, point: Vec3) -> Option<(f32, f32, f32)> {
+        let (r, t) = self.to[a * self.views + b];
+        let p = r * point + t;
+        let [fx, fy, cx, cy] = level.references[b].intrinsics;
+        let (u, v) = (fx * p.x / p.z + cx, fy * p.y / p.z + cy);
+        let inside = p.z > 0.0
+            && u >= 0.0
+            && v >= 0.0
+            && u < level.references[b].width as f32
+            && v < level.references[b].height as f32;
+        inside.then_some((u, v, p.z))
+    }
+
+    /// What view `b` says about a point of frame `a` seen at pixel position (x, y).
+    pub fn verdict(
+        &self,
+        level: &Level,
+        surface: &Surface,
+        a: usize,
+        b: usize,
+        pixel: [f32; 2],
+        point: Vec3,
+    ) -> Verdict {
+        let Some((u, v, z)) = self.project(level, a, b, point) else { return Verdict::Unseen };
+        let r = &level.references[b];
+        let index = r.first as usize + v as usize * r.width as usize + u as usize;
+        if surface.confidence[index] <= 0.0 {
+            return Verdict::Unseen;
+        }
+        let [fx, fy, cx, cy] = r.intrinsics;
+        let ray = Vec3::new((u - cx) / fx, (v - cy) / fy, 1.0);
+        let seen = 1.0 / surface.planes[index].dot(ray).max(1e-9);
+        if z < seen * (1.0 - FREE_SPACE_TOLERANCE) {
+            return Verdict::InTheWay;
+        }
+        if z > seen * (1.0 + FREE_SPACE_TOLERANCE) {
+            return Verdict::Hidden;
+        }
+        let agrees = (z - seen).abs() < DEPTH_TOLERANCE * seen
+            && self.project(level, b, a, ray * seen).is_some_and(|(x, y, _)| {
+                let (dx, dy) = (x - pixel[0], y - pixel[1]);
+                dx * dx + dy * dy < REPROJECTION_TOLERANCE * REPROJECTION_TOLERANCE
+            });
+        if agrees { Verdict::Agrees } else { Verdict::Unseen }
+    }
+}
+
+/// Camera-frame ray through a pixel's centre.
+pub fn ray(level: &Level, view: usize, x: usize, y: usize) -> Vec3 {
+    let [fx, fy, cx, cy] = level.references[view].intrinsics;
+    Vec3::new((x as f32 + 0.5 - cx) / fx, (y as f32 + 0.5 - cy) / fy, 1.0)
+}
+
+/// Calls `f(view, x, y, index)` for all pixels of all views in parallel and collects the results in buffer order.
+pub fn map_pixels<T: Send>(level: &Level, f: impl Fn(usize, usize, usize, usize) -> T + Sync) -> Vec<T> {
+    let mut out = Vec::with_capacity(level.pixels());
+    for (view, r) in level.references.iter().enumerate() {
+        let (width, first) = (r.width as usize, r.first as usize);
+        let values: Vec<T> = (0..width * r.height as usize)
+            .into_par_iter()
+            .map(|k| f(view, k % width, k / width, first + k))
+            .collect();
+        out.extend(values);
+    }
+    out
+}
+
+/// Keeps what at least one other view confirms and none that confirmed itself contradicts more often.
+pub fn believed(level: &Level, links: &Links, matched: &[Vec4], void: &[bool]) -> Surface {
+    let mut surface = Surface {
+        planes: matched.iter().map(|p| p.truncate()).collect(),
+        confidence: matched
+            .iter()
+            .zip(void)
+            .map(|(p, v)| if *v || p.w > COST_TOLERANCE { 0.0 } else { 1.0 })
+            .collect(),
+    };
+    let views = level.cameras.len();
+    // Twice: the second time only confirmed pixels confirm or contradict.
+    for _ in 0..2 {
+        surface.confidence = map_pixels(level, |view, x, y, k| {
+            if surface.confidence[k] <= 0.0 {
+                return 0.0;
+            }
+            let ray = ray(level, view, x, y);
+            let inverse = surface.planes[k].dot(ray);
+            if inverse <= 0.0 {
+                return 0.0;
+            }
+            let (mut agree, mut against) = (0usize, 0usize);
+            for other in (0..views).filter(|&o| o != view) {
+                let pixel = [x as f32 + 0.5, y as f32 + 0.5];
+                match links.verdict(level, &surface, view, other, pixel, ray / inverse) {
+                    Verdict::Agrees => agree += 1,
+                    Verdict::InTheWay => against += 1,
+                    _ => {}
+                }
+            }
+            if against >= agree { 0.0 } else { CONFIDENCE[agree.min(2)] }
+        });
+    }
+    remove_speckles(level, &mut surface);
+    surface
+}
+
+/// Depth map of a view from its planes; 0 where not believed.
+pub fn depth(level: &Level, view: usize, surface: &Surface) -> Plane<f32> {
+    let r = &level.references[view];
+    let (width, height) = (r.width as usize, r.height as usize);
+    let mut out = Plane::filled(width, height, 0.0);
+    for y in 0..height {
+        for x in 0..width {
+            let k = r.first as usize + y * width + x;
+            let inverse = surface.planes[k].dot(ray(level, view, x, y));
+            if surface.confidence[k] > 0.0 && inverse > 0.0 {
+                out.data[y * width + x] = 1.0 / inverse;
+            }
+        }
+    }
+    out
+}
+
+/// Distrusts small areas that are connected by depth.
+fn remove_speckles(level: &Level, surface: &mut Surface) {
+    for view in 0..level.cameras.len() {
+        let depth = depth(level, view, surface);
+        let smallest = (SPECKLE_SHARE * depth.data.len() as f32) as usize;
+        let mut done = vec![false; depth.data.len()];
+        let mut area = Vec::new();
+        for start in 0..depth.data.len() {
+            if done[start] || depth.data[start] <= 0.0 {
+                continue;
+            }
+            area.clear();
+            area.push(start);
+            done[start] = true;
+            let mut next = 0;
+            while next < area.len() {
+                let k = area[next];
+                next += 1;
+                for n in neighbours(k, depth.width, depth.height) {
+                    let (a, b) = (depth.data[k], depth.data[n]);
+                    if !done[n] && b > 0.0 && (a - b).abs() < FREE_SPACE_TOLERANCE * a {
+                        done[n] = true;
+                        area.push(n);
+                    }
+                }
+            }
+            if area.len() < smallest {
+                for &k in &area {
+                    surface.confidence[level.references[view].first as usize + k] = 0.0;
+                }
+            }
+        }
+    }
+}
+
+/// The up to four direct neighbours of a pixel index.
+pub fn neighbours(k: usize, width: usize, height: usize) -> impl Iterator<Item = usize> {
+    let (x, y) = (k % width, k / width);
+    [
+        (x > 0).then(|| k - 1),
+        (x + 1 < width).then_some(k + 1),
+        (y > 0).then(|| k - width),
+        (y + 1 < height).then_some(k + width),
+    ]
+    .into_iter()
+    .flatten()
+}
+
+/// Least-squares plane of the believed pixels around each believed pixel that lie on its plane, in inverse depth
+/// (affine over the image). `radius` in pixels.
+pub fn smoothed(level: &Level, surface: &Surface, radius: i32) -> Surface {
+    let planes = map_pixels(level, |view, x, y, k| {
+        if surface.confidence[k] <= 0.0 {
+            return surface.planes[k];
+        }
+        let r = &level.references[view];
+        let plane = surface.planes[k];
+        let inverse = plane.dot(ray(level, view, x, y));
+        // Normal equations of 1/z = a + b dx + c dy, relative to the centre's own value.
+        let (mut m, mut rhs) = ([0.0f64; 6], [0.0f64; 3]);
+        for dy in -radius..=radius {
+            for dx in -radius..=radius {
+                let (px, py) = (x as i32 + dx, y as i32 + dy);
+                if px < 0 || py < 0 || px >= r.width as i32 || py >= r.height as i32 {
+                    continue;
+                }
+                let n = r.first as usize + py as usize * r.width as usize + px as usize;
+                if surface.confidence[n] <= 0.0 {
+                    continue;
+                }
+                let there = ray(level, view, px as usize, py as usize);
+                let value = surface.planes[n].dot(there);
+                if (value - plane.dot(there)).abs() > DEPTH_TOLERANCE * inverse {
+                    continue;
+                }
+                let (u, v, w) = (dx as f64, dy as f64, (value - inverse) as f64);
+                for (slot, product) in m.iter_mut().zip([1.0, u, v, u * u, u * v, v * v]) {
+                    *slot += product;
+                }
+                for (slot, product) in rhs.iter_mut().zip([w, u * w, v * w]) {
+                    *slot += product;
+                }
+            }
+        }
+        let matrix = DMat3::from_cols(
+            DVec3::new(m[0], m[1], m[2]),
+            DVec3::new(m[1], m[3], m[4]),
+            DVec3::new(m[2], m[4], m[5]),
+        );
+        // Fewer than a dozen pixels, or all in a row: the matched plane is better than the fit.
+        if m[0] < 12.0 || matrix.determinant() < 1e-3 * m[0] * m[3] * m[5] {
+            return plane;
+        }
+        let fit = matrix.inverse() * DVec3::from(rhs);
+        let [fx, fy, cx, cy] = r.intrinsics;
+        let centre = DVec2::new((x as f32 + 0.5 - cx) as f64, (y as f32 + 0.5 - cy) as f64);
+        // 1/z(u, v) = w₀ + b (u − u₀) + c (v − v₀) as π·ray.
+        let constant = inverse as f64 + fit.x - fit.y * centre.x - fit.z * centre.y;
+        DVec3::new(fit.y * fx as f64, fit.z * fy as f64, constant).as_vec3()
+    });
+    Surface { planes, confidence: surface.confidence.clone() }
+}
