@@ -1,8 +1,16 @@
 //! Training: losses, schedules, pruning, pose refinement.
 pub mod densify;
 pub mod init;
+mod language;
+mod lift;
+mod model;
 pub mod options;
 pub mod pose;
+mod rgb;
+pub mod scale;
 pub mod schedule;
+mod views;
 
+pub use language::{LanguagePoint, TrainedLanguage, train_language};
 pub use options::{FeatureGauge, InitOptions, LanguageOptions, Preset, Rates, RgbOptions};
+pub use rgb::{CurvePoint, FitStats, Trained, fit_rgb, train_rgb};

@@ -218,7 +218,7 @@ impl LanguageOptions {
             lift: !paper,
             per_level: paper,
             detach_geometry: false,
-            check_every: 100,
+            check_every: (iterations / 4).min(100),
         }
     }
 }

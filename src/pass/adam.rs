@@ -74,7 +74,7 @@ impl Schedule {
         Ok(self.faults.read::<u32>()?.first().copied().unwrap_or(0))
     }
 
-    /// Records one step of one class.
+    /// Records one step of one class; `guard[1] ≠ 0` on the GPU makes it void (see the rasteriser's status).
     pub fn record(
         &self,
         rec: &mut Recorder,
@@ -82,6 +82,7 @@ impl Schedule {
         parameters: &Buffer,
         gradients: &Buffer,
         moments: &Moments,
+        guard: &Buffer,
     ) {
         let call = shaders::adam::call(
             &shaders::adam::Bindings {
@@ -90,6 +91,7 @@ impl Schedule {
                 moments: &moments.buffer,
                 faults: &self.faults,
                 rates: &self.rates,
+                guard,
             },
             &shaders::adam::Push {
                 count: class.count as u32,
@@ -140,6 +142,7 @@ mod tests {
         let parameters = device.buffer_from("p", &start).unwrap();
         let gradients = device.buffer::<f32>("g", count).unwrap();
         let moments = Moments::new(&device, count).unwrap();
+        let guard = device.buffer::<u32>("guard", 2).unwrap();
         let mut schedule = Schedule::new(&device, 2).unwrap();
         let mut twin: Vec<f64> = start.iter().map(|&v| f64::from(v)).collect();
         let mut state = vec![[0.0; 2]; count];
@@ -150,7 +153,7 @@ mod tests {
             schedule.set(step, &[[0.0; 2], rates]).unwrap();
             let mut rec = Recorder::new(&device, "adam");
             let class = Class { slot: 1, count, stride: stride as u32, head: head as u32 };
-            schedule.record(&mut rec, class, &parameters, &gradients, &moments);
+            schedule.record(&mut rec, class, &parameters, &gradients, &moments, &guard);
             rec.run().unwrap();
             for i in 0..count {
                 let rate = rates[usize::from(i % stride >= head)];
@@ -171,17 +174,19 @@ mod tests {
         let parameters = device.buffer_from("p", &[1.0f32, 2.0, 3.0]).unwrap();
         let gradients = device.buffer_from("g", &[f32::NAN, f32::NEG_INFINITY, 1.0]).unwrap();
         let moments = Moments::new(&device, 3).unwrap();
+        let guard = device.buffer_from("guard", &[0u32, 1]).unwrap();
         let mut schedule = Schedule::new(&device, 1).unwrap();
         schedule.set(1, &[[0.5, 0.5]]).unwrap();
-        let mut rec = Recorder::new(&device, "adam");
-        schedule.record(
-            &mut rec,
-            Class { slot: 0, count: 3, stride: 1, head: 1 },
-            &parameters,
-            &gradients,
-            &moments,
-        );
-        rec.run().unwrap();
+        let class = Class { slot: 0, count: 3, stride: 1, head: 1 };
+        let step = || {
+            let mut rec = Recorder::new(&device, "adam");
+            schedule.record(&mut rec, class, &parameters, &gradients, &moments, &guard);
+            rec.run().unwrap();
+        };
+        step();
+        assert_eq!(parameters.read::<f32>().unwrap(), [1.0, 2.0, 3.0], "a guarded step is void");
+        guard.write(&[0u32, 0]).unwrap();
+        step();
         let p = parameters.read::<f32>().unwrap();
         assert_eq!((p[0], p[1]), (1.0, 2.0));
         assert!((p[2] - 2.5).abs() < 1e-6, "the first Adam step has the length of the rate");

@@ -3,6 +3,7 @@ pub mod adam;
 pub mod bin;
 pub mod close;
 pub mod compact;
+pub mod densify;
 pub mod metrics;
 pub mod plane_sweep;
 pub mod plane_sweep_cpu;

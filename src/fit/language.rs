@@ -1,0 +1,374 @@
+//! The language stage: features on the splats that render to each pixel's code (ALGORITHMS 8),
+//! `L = λ2·L_img + (1−λ2)·L_sem`, starting from lifted features.
+use super::lift::{CodeTargets, lift};
+use super::model::Model;
+use super::options::{FeatureGauge, LanguageOptions};
+use super::scale::SceneScale;
+use super::schedule::ViewOrder;
+use super::views::Views;
+use crate::gpu::{Buffer, Device, Program, Recorder, shaders};
+use crate::pass::rasterizer::RasterOptions;
+use crate::pass::sum;
+use crate::pass::twin::FeatureMode;
+use crate::progress::Progress;
+use crate::scene::{Camera, LEVEL_NAMES, LanguageField, LevelField, RgbImage, Splats};
+use crate::{Error, Result};
+use rayon::prelude::*;
+use std::time::Instant;
+
+/// L_img in this stage weighs L1 and D-SSIM as in the first (the paper).
+const IMAGE_WEIGHTS: [f64; 2] = [0.8, 0.2];
+/// Slots of the loss sums: Σ|x−y|, ΣSSIM, language loss.
+const LANGUAGE_SUM: u32 = 2;
+/// Two measurements that gain less than this share of the pixels end the training (ALGORITHMS 8.5).
+const MIN_GAIN: f64 = 1e-3;
+
+/// One measurement during the language stage.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LanguagePoint {
+    /// 1-based step; 0 = after lifting.
+    pub step: usize,
+    /// Mean L_sem since the last point.
+    pub loss: f64,
+    /// Share of labelled training pixels that decode to their label, per trained level.
+    pub accuracy: Vec<f64>,
+}
+
+/// The result of the language stage.
+#[derive(Clone, Debug)]
+pub struct TrainedLanguage {
+    /// Splats of the shared model (or the given ones, with `per_level`).
+    pub splats: Splats,
+    /// With `per_level`: the splats of each level's own model, index as in [`LEVEL_NAMES`], empty where not trained.
+    pub level_splats: Vec<Splats>,
+    /// The field given, with features [N, d] as they are rendered (linear blending).
+    pub field: LanguageField,
+    /// Measurements; with `per_level` those of all levels one after the other.
+    pub curve: Vec<LanguagePoint>,
+    /// Wall-clock time, seconds.
+    pub seconds: f64,
+}
+
+/// Trains the features of all levels that have codes and targets.
+pub fn train_language(
+    device: &Device,
+    images: &[RgbImage],
+    cameras: &[Camera],
+    splats: &Splats,
+    field: LanguageField,
+    options: &LanguageOptions,
+    progress: &dyn Progress,
+) -> Result<TrainedLanguage> {
+    let clock = Instant::now();
+    let active: Vec<usize> = (0..field.levels.len())
+        .filter(|&l| !field.levels[l].codebook.is_empty() && !field.levels[l].targets.is_empty())
+        .collect();
+    if active.is_empty() {
+        return Err(Error::work("the language stage has no labelled pixels on any level: check the masks"));
+    }
+    let groups: Vec<Vec<usize>> =
+        if options.per_level { active.iter().map(|&l| vec![l]).collect() } else { vec![active] };
+    progress.begin("language", (options.iterations * groups.len()) as u64);
+    let mut out = TrainedLanguage {
+        splats: splats.clone(),
+        level_splats: vec![Splats::default(); if options.per_level { field.levels.len() } else { 0 }],
+        field,
+        curve: Vec::new(),
+        seconds: 0.0,
+    };
+    for (g, group) in groups.iter().enumerate() {
+        let levels: Vec<&LevelField> = group.iter().map(|&l| &out.field.levels[l]).collect();
+        let mut run = Run::new(device, images, cameras, splats, &levels, options)?;
+        run.train(progress, (g * options.iterations) as u64)?;
+        let (trained, features) = run.finish()?;
+        out.curve.append(&mut run.curve);
+        for (&level, features) in group.iter().zip(features) {
+            out.field.levels[level].features = features;
+            if options.per_level {
+                out.level_splats[level] = trained.clone();
+            }
+        }
+        if !options.per_level {
+            out.splats = trained;
+        }
+    }
+    progress.end();
+    out.seconds = clock.elapsed().as_secs_f64();
+    Ok(out)
+}
+
+/// The training of one model: all levels together, or one.
+struct Run<'a> {
+    device: Device,
+    options: &'a LanguageOptions,
+    raster: RasterOptions,
+    levels: Vec<&'a LevelField>,
+    names: String,
+    width: usize,
+    extent: f64,
+    model: Model,
+    /// [N, levels·d] what Adam moves; the rendered features themselves when linear.
+    raw: Buffer,
+    views: Views,
+    cameras: &'a [Camera],
+    targets: CodeTargets,
+    losses: Vec<Buffer>,
+    partials: Buffer,
+    programs: Vec<Option<Program>>,
+    order: ViewOrder,
+    recent: Vec<f64>,
+    curve: Vec<LanguagePoint>,
+}
+
+impl<'a> Run<'a> {
+    fn new(
+        device: &Device,
+        images: &[RgbImage],
+        cameras: &'a [Camera],
+        splats: &Splats,
+        levels: &[&'a LevelField],
+        options: &'a LanguageOptions,
+    ) -> Result<Self> {
+        let width = levels[0].codebook.code_dim;
+        let channels = width * levels.len();
+        let scale = SceneScale::measure(cameras, &splats.means);
+        let model = Model::new(device, splats, channels)?;
+        let mut views = Views::new(device, images, cameras, None, splats.len(), channels, scale.near())?;
+        let targets = CodeTargets::new(device, levels, images, 1.0 - options.image_weight)?;
+        let raster = RasterOptions {
+            sh_degree: splats.sh_degree,
+            feature_mode: FeatureMode::Linear,
+            features_move_geometry: !options.detach_geometry,
+        };
+        let mut start = vec![0.0; splats.len() * channels];
+        if options.lift {
+            start = lift(device, &mut views, cameras, &model, &raster, &targets, options.gauge)?;
+        }
+        let raw = match options.gauge {
+            FeatureGauge::Linear => {
+                model.values.features.write(&start)?;
+                model.values.features.clone()
+            }
+            FeatureGauge::Normalised { .. } => device.buffer_from("raw features", &start)?,
+        };
+        let losses = views
+            .stages
+            .iter()
+            .map(|s| {
+                let frame = s.raster.frame();
+                device.buffer::<f32>("language loss", frame.width as usize * frame.height as usize)
+            })
+            .collect::<Result<_>>()?;
+        Ok(Run {
+            device: device.clone(),
+            options,
+            raster,
+            levels: levels.to_vec(),
+            names: level_names(levels.len()),
+            width,
+            extent: scale.extent,
+            model,
+            raw,
+            views,
+            cameras,
+            targets,
+            losses,
+            partials: device.buffer::<f32>("loss partials", sum::PARTIALS)?,
+            programs: cameras.iter().map(|_| None).collect(),
+            order: ViewOrder::new(cameras.len(), options.seed),
+            recent: Vec::new(),
+            curve: Vec::new(),
+        })
+    }
+
+    fn train(&mut self, progress: &dyn Progress, done: u64) -> Result<()> {
+        if self.options.check_every > 0 {
+            self.measure(0)?;
+        }
+        for iteration in 0..self.options.iterations {
+            progress.check()?;
+            self.step(iteration)?;
+            let step = iteration + 1;
+            if self.options.check_every > 0 && step % self.options.check_every == 0 {
+                self.model.check(step)?;
+                self.measure(step)?;
+                if self.settled() {
+                    break;
+                }
+            }
+            let note = self.curve.last().map_or(String::new(), |p| {
+                let shares: Vec<String> = p.accuracy.iter().map(|a| format!("{:.1} %", 100.0 * a)).collect();
+                format!("{} decoded {}", self.names, shares.join(" "))
+            });
+            progress.step(done + step as u64, &note);
+        }
+        self.model.check(self.options.iterations)
+    }
+
+    /// True when the last two measurements together gained less than [`MIN_GAIN`].
+    fn settled(&self) -> bool {
+        let mean = |p: &LanguagePoint| p.accuracy.iter().sum::<f64>() / p.accuracy.len().max(1) as f64;
+        match self.curve.as_slice() {
+            [.., a, b, c] => mean(c).max(mean(b)) - mean(a) < MIN_GAIN,
+            _ => false,
+        }
+    }
+
+    fn step(&mut self, iteration: usize) -> Result<()> {
+        let view = self.order.draw();
+        let at = self.views.list[view].stage;
+        self.model.set_rates(&self.options.rates, self.options.feature_rate, self.extent, iteration)?;
+        self.views.set_camera(view, &self.cameras[view])?;
+        loop {
+            let program = match self.programs[view].take() {
+                Some(program) => program,
+                None => self.record(view)?,
+            };
+            program.run()?;
+            self.programs[view] = Some(program);
+            match self.views.stages[at].raster.overflow()? {
+                None => break,
+                Some(needed) => {
+                    self.views.stages[at].raster.grow(needed)?;
+                    self.programs.iter_mut().for_each(|p| *p = None);
+                }
+            }
+        }
+        let sums = self.views.stages[at].sums.read::<f32>()?;
+        self.recent.push(f64::from(sums[LANGUAGE_SUM as usize]));
+        Ok(())
+    }
+
+    fn record(&self, view: usize) -> Result<Program> {
+        let (item, stage) = (&self.views.list[view], self.views.stage(view));
+        let frame = stage.raster.frame();
+        let mut rec = Recorder::new(&self.device, "language step");
+        self.record_gauge(&mut rec);
+        stage.raster.record_forward(&mut rec, &self.model.values, &self.raster);
+        if !self.options.detach_geometry {
+            let weights = IMAGE_WEIGHTS.map(|w| w * self.options.image_weight);
+            stage.loss.record(
+                &mut rec,
+                &frame.planes,
+                &item.target,
+                &frame.planes_grad,
+                weights,
+                (&stage.sums, 0),
+            );
+        }
+        let loss = &self.losses[item.stage];
+        self.targets.record(&mut rec, view, frame, loss, false);
+        sum::record(&mut rec, loss, &self.partials, &stage.sums, LANGUAGE_SUM);
+        stage.raster.record_backward(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
+        if let FeatureGauge::Normalised { epsilon } = self.options.gauge {
+            let blocks = self.blocks();
+            let call = shaders::feature_gauge_backward::call(
+                &shaders::feature_gauge_backward::Bindings {
+                    raw: &self.raw,
+                    gradients: &self.model.gradients.features,
+                },
+                &shaders::feature_gauge_backward::Push { blocks, width: self.width as u32, epsilon },
+            );
+            rec.dispatch(call, gauge_groups(blocks));
+        }
+        self.model.record_feature_step(&mut rec, &self.raw, &frame.status);
+        if !self.options.detach_geometry {
+            self.model.record_step(&mut rec, &frame.status);
+        }
+        rec.compile()
+    }
+
+    fn blocks(&self) -> u32 {
+        (self.model.count() * self.levels.len()) as u32
+    }
+
+    /// Rendered features from raw ones.
+    fn record_gauge(&self, rec: &mut Recorder) {
+        if let FeatureGauge::Normalised { epsilon } = self.options.gauge {
+            let blocks = self.blocks();
+            let call = shaders::feature_gauge::call(
+                &shaders::feature_gauge::Bindings { raw: &self.raw, features: &self.model.values.features },
+                &shaders::feature_gauge::Push { blocks, width: self.width as u32, epsilon },
+            );
+            rec.dispatch(call, gauge_groups(blocks));
+        }
+    }
+
+    fn update_rendered(&self) -> Result<()> {
+        if self.options.gauge == FeatureGauge::Linear {
+            return Ok(());
+        }
+        let mut rec = Recorder::new(&self.device, "feature gauge");
+        self.record_gauge(&mut rec);
+        rec.run()
+    }
+
+    /// Renders all training views and counts the labelled pixels that decode to their label.
+    fn measure(&mut self, step: usize) -> Result<()> {
+        self.update_rendered()?;
+        let mut counts = vec![[0usize; 2]; self.levels.len()];
+        for view in 0..self.cameras.len() {
+            self.views.set_camera(view, &self.cameras[view])?;
+            let at = self.views.list[view].stage;
+            let stage = &mut self.views.stages[at];
+            stage.raster.forward(&self.model.values, &self.raster)?;
+            let frame = stage.raster.frame();
+            let pixels = frame.width as usize * frame.height as usize;
+            let planes = frame.planes.read::<f32>()?;
+            for (l, level) in self.levels.iter().enumerate() {
+                let Some(labels) = level.targets.get(view) else { continue };
+                let first = (4 + l * self.width) * pixels;
+                let block = &planes[first..first + self.width * pixels];
+                let [right, valid] = decoded_right(level, &labels.data, block);
+                counts[l][0] += right;
+                counts[l][1] += valid;
+            }
+        }
+        let accuracy = counts.iter().map(|c| c[0] as f64 / c[1].max(1) as f64).collect();
+        let loss = self.recent.iter().sum::<f64>() / self.recent.len().max(1) as f64;
+        self.recent.clear();
+        self.curve.push(LanguagePoint { step, loss, accuracy });
+        Ok(())
+    }
+
+    /// Splats and, per level, features [N, d] as rendered.
+    fn finish(&mut self) -> Result<(Splats, Vec<Vec<f32>>)> {
+        self.update_rendered()?;
+        let splats = self.model.splats()?;
+        let (levels, d) = (self.levels.len(), self.width);
+        let all = self.model.values.features.read_range::<f32>(0..splats.len() * levels * d)?;
+        if !all.iter().all(|v| v.is_finite()) {
+            return Err(Error::work("the language stage produced features that are not finite"));
+        }
+        let level =
+            |l: usize| all.chunks_exact(levels * d).flat_map(move |f| &f[l * d..(l + 1) * d]).copied();
+        Ok((splats, (0..levels).map(|l| level(l).collect()).collect()))
+    }
+}
+
+fn level_names(levels: usize) -> String {
+    if levels == LEVEL_NAMES.len() { LEVEL_NAMES.join("/") } else { String::new() }
+}
+
+/// Workgroups of 64 in rows of at most 32768.
+fn gauge_groups(blocks: u32) -> [u32; 3] {
+    let groups = blocks.div_ceil(64).max(1);
+    let row = groups.min(32768);
+    [row, groups.div_ceil(row), 1]
+}
+
+/// (pixels that decode to their label, labelled pixels) of planar features [d, H·W].
+fn decoded_right(level: &LevelField, labels: &[i32], features: &[f32]) -> [usize; 2] {
+    let pixels = labels.len();
+    let d = level.codebook.code_dim;
+    labels
+        .par_iter()
+        .enumerate()
+        .filter(|(_, label)| **label >= 0)
+        .map(|(p, &label)| {
+            let feature: Vec<f32> = (0..d).map(|k| features[k * pixels + p]).collect();
+            let decoded = crate::fit::lift::decode(&level.codebook, &feature);
+            [usize::from(decoded == label as usize), 1]
+        })
+        .reduce(|| [0, 0], |a, b| [a[0] + b[0], a[1] + b[1]])
+}

@@ -1,0 +1,161 @@
+//! Code targets in GPU memory, and lifting: features that start as the blending-weighted mean of the codes each splat
+//! is seen with (ALGORITHMS 8.4).
+use super::model::Model;
+use super::options::FeatureGauge;
+use super::views::Views;
+use crate::gpu::{Buffer, Device, Recorder, shaders};
+use crate::pass::rasterizer::{FrameBuffers, RasterOptions};
+use crate::scene::{Camera, Codebook, LevelField, RgbImage};
+use crate::{Error, Result};
+
+/// Splats that labelled pixels saw with less weight than this (in pixels) start without a feature: their direction
+/// would be noise (ALGORITHMS 8.4).
+const MIN_WEIGHT: f32 = 0.05;
+/// Length of a lifted raw feature in the normalised gauge: far above ε, so steps turn it without collapsing it.
+const LIFTED_LENGTH: f32 = 0.5;
+
+/// Labels, codes and loss weights of all views and levels.
+pub(super) struct CodeTargets {
+    levels: u32,
+    width: u32,
+    /// [ΣK, d], all levels.
+    codes: Buffer,
+    /// Per view: [levels, H·W] rows of `codes`, −1 = none.
+    labels: Vec<Buffer>,
+    /// Per view: [levels] weight of one labelled value.
+    weights: Vec<Buffer>,
+}
+
+impl CodeTargets {
+    /// Checks and uploads the targets. `weight` is that of L_sem, the mean over levels of the mean absolute difference
+    /// over labelled pixels and channels.
+    pub(super) fn new(
+        device: &Device,
+        levels: &[&LevelField],
+        images: &[RgbImage],
+        weight: f64,
+    ) -> Result<Self> {
+        let width = levels[0].codebook.code_dim;
+        if levels.iter().any(|l| l.codebook.code_dim != width) {
+            return Err(Error::work("all levels must have codes of one length to share a model"));
+        }
+        let codes: Vec<f32> = levels.iter().flat_map(|l| l.codebook.codes.iter().copied()).collect();
+        let (mut labels, mut weights) = (Vec::new(), Vec::new());
+        for (view, image) in images.iter().enumerate() {
+            let (mut rows, mut scale, mut first) = (Vec::new(), Vec::new(), 0);
+            for level in levels {
+                let start = rows.len();
+                rows.extend(rows_of(level, view, image.data.len(), first)?);
+                let valid = rows[start..].iter().filter(|r| **r >= 0).count().max(1);
+                scale.push((weight / (levels.len() * valid * width) as f64) as f32);
+                first += level.codebook.len() as i32;
+            }
+            labels.push(device.buffer_from("code labels", &rows)?);
+            weights.push(device.buffer_from("code weights", &scale)?);
+        }
+        Ok(CodeTargets {
+            levels: levels.len() as u32,
+            width: width as u32,
+            codes: device.buffer_from("codes", &codes)?,
+            labels,
+            weights,
+        })
+    }
+
+    /// Records the language loss of a view: the feature planes of the upstream stack, and per pixel the loss; with
+    /// `lifting` the upstream is the code itself.
+    pub(super) fn record(
+        &self,
+        rec: &mut Recorder,
+        view: usize,
+        frame: &FrameBuffers,
+        loss: &Buffer,
+        lifting: bool,
+    ) {
+        let pixels = frame.width * frame.height;
+        let call = shaders::code_l1::call(
+            &shaders::code_l1::Bindings {
+                labels: &self.labels[view],
+                codes: &self.codes,
+                weights: &self.weights[view],
+                planes: &frame.planes,
+                upstream: &frame.planes_grad,
+                loss,
+            },
+            &shaders::code_l1::Push {
+                pixels,
+                levels: self.levels,
+                width: self.width,
+                mode: u32::from(lifting),
+            },
+        );
+        rec.dispatch_threads(call, [pixels, 1, 1]);
+    }
+}
+
+/// The labels of one level and view as rows of the common code table, whose first row for this level is `first`.
+fn rows_of(level: &LevelField, view: usize, pixels: usize, first: i32) -> Result<Vec<i32>> {
+    let Some(map) = level.targets.get(view) else {
+        return Ok(vec![-1; pixels]);
+    };
+    let codes = level.codebook.len() as i32;
+    if map.data.len() != pixels || map.data.iter().any(|&l| l >= codes) {
+        return Err(Error::work(format!(
+            "the code targets of view {view} do not fit its photo ({} values for {pixels} pixels) or codebook",
+            map.data.len()
+        )));
+    }
+    Ok(map.data.iter().map(|&l| if l < 0 { -1 } else { l + first }).collect())
+}
+
+/// Raw start features [N, levels·d].
+///
+/// The gradient of `Σ_px F(px)·c(px)` by a splat's feature is `Σ_px w(px) c(px)`, so one backward pass per view with the
+/// codes as upstream gives the weighted sums. Its length per level is at most the total weight (equal if all codes agree)
+/// and stands in for it in the threshold.
+pub(super) fn lift(
+    device: &Device,
+    views: &mut Views,
+    cameras: &[Camera],
+    model: &Model,
+    raster: &RasterOptions,
+    targets: &CodeTargets,
+    gauge: FeatureGauge,
+) -> Result<Vec<f32>> {
+    let d = targets.width as usize;
+    let total = model.count() * d * targets.levels as usize;
+    let mut sums = vec![0.0f32; total];
+    for (view, camera) in cameras.iter().enumerate() {
+        views.set_camera(view, camera)?;
+        let at = views.list[view].stage;
+        let stage = &mut views.stages[at];
+        stage.raster.forward(&model.values, raster)?;
+        let frame = stage.raster.frame();
+        let scratch = device.buffer::<f32>("language loss", (frame.width * frame.height) as usize)?;
+        let mut rec = Recorder::new(device, "lift");
+        targets.record(&mut rec, view, frame, &scratch, true);
+        stage.raster.record_backward(&mut rec, &model.values, raster, &model.gradients);
+        rec.run()?;
+        let seen = model.gradients.features.read_range::<f32>(0..total)?;
+        sums.iter_mut().zip(seen).for_each(|(s, v)| *s += v);
+    }
+    let length = if gauge == FeatureGauge::Linear { 1.0 } else { LIFTED_LENGTH };
+    for feature in sums.chunks_exact_mut(d) {
+        let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
+        let scale = if norm > MIN_WEIGHT { length / norm } else { 0.0 };
+        feature.iter_mut().for_each(|v| *v *= scale);
+    }
+    Ok(sums)
+}
+
+/// `argmax_k F·c_k`, the lowest k on ties (ALGORITHMS 6.3, step 6).
+pub(super) fn decode(codebook: &Codebook, feature: &[f32]) -> usize {
+    let mut best = (f32::NEG_INFINITY, 0);
+    for (k, code) in codebook.codes.chunks_exact(codebook.code_dim).enumerate() {
+        let dot: f32 = code.iter().zip(feature).map(|(a, b)| a * b).sum();
+        if dot > best.0 {
+            best = (dot, k);
+        }
+    }
+    best.1
+}

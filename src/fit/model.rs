@@ -1,0 +1,198 @@
+//! Splat parameters in GPU memory with their gradients and optimiser state, moved together when splats come and go.
+use super::options::Rates;
+use crate::gpu::{Buffer, Device, Recorder};
+use crate::pass::adam::{Class, Moments, Schedule};
+use crate::pass::compact;
+use crate::pass::rasterizer::SplatBuffers;
+use crate::scene::Splats;
+use crate::{Error, Result};
+
+/// The parameter classes, in the order of the schedule's rows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    Means,
+    LogScales,
+    Quats,
+    Opacity,
+    Sh,
+}
+
+/// Everything but the features.
+pub(super) const GEOMETRY_AND_COLOUR: [Kind; 5] =
+    [Kind::Means, Kind::LogScales, Kind::Quats, Kind::Opacity, Kind::Sh];
+
+/// Row of the schedule that the features use.
+const FEATURE_ROW: usize = 5;
+
+/// All parameters of the splats, with room for nothing more: recordings are made again when splats come or go.
+pub(super) struct Model {
+    device: Device,
+    /// What the rasteriser reads.
+    pub(super) values: SplatBuffers,
+    /// What its backward pass writes.
+    pub(super) gradients: SplatBuffers,
+    moments: [Moments; 5],
+    feature_moments: Moments,
+    schedule: Schedule,
+    /// Steps that the moments have seen.
+    step: usize,
+}
+
+impl Model {
+    /// Uploads splats and reserves rendered features [N, feature_dim].
+    pub(super) fn new(device: &Device, splats: &Splats, feature_dim: usize) -> Result<Self> {
+        let zeros = vec![0.0; splats.len() * feature_dim];
+        let values = SplatBuffers::upload(device, splats, &zeros, feature_dim)?;
+        let gradients = values.zeros_like(device)?;
+        let n = values.count;
+        let moments = |kind| Moments::new(device, n * width(&values, kind));
+        Ok(Model {
+            moments: [
+                moments(Kind::Means)?,
+                moments(Kind::LogScales)?,
+                moments(Kind::Quats)?,
+                moments(Kind::Opacity)?,
+                moments(Kind::Sh)?,
+            ],
+            feature_moments: Moments::new(device, n * feature_dim)?,
+            schedule: Schedule::new(device, FEATURE_ROW + 1)?,
+            device: device.clone(),
+            values,
+            gradients,
+            step: 0,
+        })
+    }
+
+    /// Number of splats.
+    pub(super) fn count(&self) -> usize {
+        self.values.count
+    }
+
+    /// Sets the rates of the next step; `extent` scales the means' rate.
+    pub(super) fn set_rates(
+        &mut self,
+        rates: &Rates,
+        feature_rate: f64,
+        extent: f64,
+        iteration: usize,
+    ) -> Result<()> {
+        self.step += 1;
+        let rows = [
+            [rates.means.at(iteration) * extent; 2],
+            [rates.log_scales; 2],
+            [rates.quats; 2],
+            [rates.opacity; 2],
+            [rates.sh_dc, rates.sh_rest],
+            [feature_rate; 2],
+        ];
+        self.schedule.set(self.step, &rows)
+    }
+
+    /// Records the Adam step of geometry, opacity and colour; void where the frame's `guard` says so.
+    pub(super) fn record_step(&self, rec: &mut Recorder, guard: &Buffer) {
+        for kind in GEOMETRY_AND_COLOUR {
+            let w = width(&self.values, kind);
+            let class = Class {
+                slot: kind as u32,
+                count: self.count() * w,
+                stride: w as u32,
+                head: if kind == Kind::Sh { 3 } else { w as u32 },
+            };
+            let (values, gradients) = (buffer(&self.values, kind), buffer(&self.gradients, kind));
+            self.schedule.record(rec, class, values, gradients, &self.moments[kind as usize], guard);
+        }
+    }
+
+    /// Records the Adam step of the raw features, whose gradient stands in the feature gradients.
+    pub(super) fn record_feature_step(&self, rec: &mut Recorder, raw: &Buffer, guard: &Buffer) {
+        let count = self.count() * self.values.feature_dim;
+        let class = Class { slot: FEATURE_ROW as u32, count, stride: 1, head: 1 };
+        self.schedule.record(rec, class, raw, &self.gradients.features, &self.feature_moments, guard);
+    }
+
+    /// Fails if any step so far has met a gradient that is not finite.
+    pub(super) fn check(&self, iteration: usize) -> Result<()> {
+        match self.schedule.faults()? {
+            0 => Ok(()),
+            n => Err(Error::work(format!(
+                "training broke down before step {iteration}: {n} gradients are not finite; the cameras or points \
+                 may be degenerate"
+            ))),
+        }
+    }
+
+    /// Keeps the given rows, optimiser state included; [`compact::NEW`] makes a row of zeros. Features start anew.
+    pub(super) fn keep(&mut self, rows: &[u32]) -> Result<()> {
+        let (device, n) = (&self.device, rows.len());
+        let index = device.buffer_from("kept rows", rows)?;
+        let (degree, dim) = (self.values.sh_degree, self.values.feature_dim);
+        let mut values = SplatBuffers::zeros(device, "splats", n, degree, dim)?;
+        for kind in GEOMETRY_AND_COLOUR {
+            let w = width(&self.values, kind);
+            *buffer_mut(&mut values, kind) =
+                compact::gather(device, "kept splats", buffer(&self.values, kind), &index, n, w)?;
+            let moments = &mut self.moments[kind as usize];
+            moments.buffer = compact::gather(device, "adam moments", &moments.buffer, &index, n, 2 * w)?;
+        }
+        self.feature_moments = Moments::new(device, n * dim)?;
+        self.gradients = values.zeros_like(device)?;
+        self.values = values;
+        Ok(())
+    }
+
+    /// Replaces the splats; rows take the optimiser state of the old row `source[i]`, if any.
+    pub(super) fn replace(&mut self, splats: &Splats, source: &[u32]) -> Result<()> {
+        self.keep(source)?;
+        self.values.means.write(&splats.means)?;
+        self.values.log_scales.write(&splats.log_scales)?;
+        self.values.quats.write(&splats.quats)?;
+        self.values.opacity_logits.write(&splats.opacity_logits)?;
+        self.values.sh.write(&splats.sh)
+    }
+
+    /// Reads the splats back; an error if any value is not finite.
+    pub(super) fn splats(&self) -> Result<Splats> {
+        let (splats, _) = self.values.download()?;
+        let finite = |v: &[f32]| v.iter().all(|x| x.is_finite());
+        let all = finite(splats.means.as_flattened())
+            && finite(splats.log_scales.as_flattened())
+            && finite(splats.quats.as_flattened())
+            && finite(&splats.opacity_logits)
+            && finite(&splats.sh);
+        if all {
+            Ok(splats)
+        } else {
+            Err(Error::work("training produced splats that are not finite; nothing was kept"))
+        }
+    }
+}
+
+/// Values per splat of a class.
+fn width(splats: &SplatBuffers, kind: Kind) -> usize {
+    match kind {
+        Kind::Means | Kind::LogScales => 3,
+        Kind::Quats => 4,
+        Kind::Opacity => 1,
+        Kind::Sh => 3 * splats.sh_len(),
+    }
+}
+
+fn buffer(splats: &SplatBuffers, kind: Kind) -> &Buffer {
+    match kind {
+        Kind::Means => &splats.means,
+        Kind::LogScales => &splats.log_scales,
+        Kind::Quats => &splats.quats,
+        Kind::Opacity => &splats.opacity_logits,
+        Kind::Sh => &splats.sh,
+    }
+}
+
+fn buffer_mut(splats: &mut SplatBuffers, kind: Kind) -> &mut Buffer {
+    match kind {
+        Kind::Means => &mut splats.means,
+        Kind::LogScales => &mut splats.log_scales,
+        Kind::Quats => &mut splats.quats,
+        Kind::Opacity => &mut splats.opacity_logits,
+        Kind::Sh => &mut splats.sh,
+    }
+}

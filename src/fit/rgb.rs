@@ -1,0 +1,378 @@
+//! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (ALGORITHMS 7).
+use super::densify::densify;
+use super::init::splats_from_points;
+use super::model::Model;
+use super::options::RgbOptions;
+use super::pose::PoseAdam;
+use super::scale::SceneScale;
+use super::schedule::{Random, ViewOrder};
+use super::views::Views;
+use crate::gpu::{Device, Program, Recorder, shaders};
+use crate::pass::densify::GradientStats;
+use crate::pass::metrics::psnr;
+use crate::pass::rasterizer::RasterOptions;
+use crate::pass::twin::FeatureMode;
+use crate::pass::{compact, ssim_l1::ImageLoss};
+use crate::progress::Progress;
+use crate::scene::{Camera, DepthMap, PointCloud, RgbImage, Splats};
+use crate::{Error, Result};
+use std::time::Instant;
+
+/// Scale ratios above this are penalised (ALGORITHMS 7.7).
+const RATIO_LIMIT: f32 = 8.0;
+
+/// One point of the training curve.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CurvePoint {
+    /// 1-based step.
+    pub step: usize,
+    /// Mean loss over the steps since the last point.
+    pub loss: f64,
+    /// Mean SSIM over the same steps.
+    pub ssim: f64,
+    /// Number of splats.
+    pub splats: usize,
+}
+
+/// What happened during a fit.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct FitStats {
+    /// The loss over time.
+    pub curve: Vec<CurvePoint>,
+    /// PSNR per training view with the returned cameras, dB.
+    pub psnr: Vec<f64>,
+    /// Splats at the start and at the end.
+    pub splats: [usize; 2],
+    /// Whether the refined cameras were kept.
+    pub poses_refined: bool,
+    /// Wall-clock time, seconds.
+    pub seconds: f64,
+}
+
+impl FitStats {
+    /// Mean PSNR over the training views, dB.
+    pub fn mean_psnr(&self) -> f64 {
+        self.psnr.iter().sum::<f64>() / self.psnr.len().max(1) as f64
+    }
+}
+
+/// The result of the RGB stage.
+#[derive(Clone, Debug)]
+pub struct Trained {
+    /// Fitted splats.
+    pub splats: Splats,
+    /// Refined cameras; camera 0 as given.
+    pub cameras: Vec<Camera>,
+    /// How it went.
+    pub stats: FitStats,
+}
+
+/// Fits splats to photos. `depths`, if given, regularises where a view's depth is confident. Deterministic for a seed
+/// up to the order of float atomics on the device.
+pub fn train_rgb(
+    device: &Device,
+    images: &[RgbImage],
+    cameras: &[Camera],
+    points: &PointCloud,
+    depths: Option<&[DepthMap]>,
+    options: &RgbOptions,
+    progress: &dyn Progress,
+) -> Result<Trained> {
+    let mut start = splats_from_points(points, &options.init, options.seed)?;
+    super::init::raise_sh_degree(&mut start, options.sh_degree);
+    let scale = SceneScale::of(cameras, points);
+    fit_rgb(device, images, cameras, start, scale, depths, options, progress)
+}
+
+/// [`train_rgb`] from given splats instead of points.
+pub fn fit_rgb(
+    device: &Device,
+    images: &[RgbImage],
+    cameras: &[Camera],
+    start: Splats,
+    scale: SceneScale,
+    depths: Option<&[DepthMap]>,
+    options: &RgbOptions,
+    progress: &dyn Progress,
+) -> Result<Trained> {
+    let clock = Instant::now();
+    progress.begin("splats", options.iterations as u64);
+    let mut run = Run::new(device, images, cameras, &start, scale, depths, options)?;
+    for iteration in 0..options.iterations {
+        progress.check()?;
+        run.step(iteration)?;
+        if let Some(point) = run.report(iteration)? {
+            let note = format!("loss {:.4}, {} splats", point.loss, point.splats);
+            progress.step(iteration as u64 + 1, &note);
+        }
+        run.prune(iteration)?;
+        run.densify(iteration)?;
+    }
+    progress.step(options.iterations as u64, "");
+    run.model.check(options.iterations)?;
+    let (splats, cameras, psnr, poses_refined) = run.finish(images, cameras)?;
+    progress.end();
+    let stats = FitStats {
+        curve: run.curve,
+        psnr,
+        splats: [start.len(), splats.len()],
+        poses_refined,
+        seconds: clock.elapsed().as_secs_f64(),
+    };
+    Ok(Trained { splats, cameras, stats })
+}
+
+/// The state of one fit.
+struct Run<'a> {
+    device: Device,
+    options: &'a RgbOptions,
+    scale: SceneScale,
+    raster: RasterOptions,
+    model: Model,
+    views: Views,
+    cameras: Vec<Camera>,
+    poses: Vec<PoseAdam>,
+    order: ViewOrder,
+    random: Random,
+    stats: Option<GradientStats>,
+    /// One recorded step per view; empty after anything they bind has changed.
+    programs: Vec<Option<Program>>,
+    recent: Vec<ImageLoss>,
+    curve: Vec<CurvePoint>,
+}
+
+impl<'a> Run<'a> {
+    fn new(
+        device: &Device,
+        images: &[RgbImage],
+        cameras: &[Camera],
+        start: &Splats,
+        scale: SceneScale,
+        depths: Option<&[DepthMap]>,
+        options: &'a RgbOptions,
+    ) -> Result<Self> {
+        let depths = depths.filter(|_| options.depth_weight > 0.0).map(|d| (d, options.min_confidence));
+        let stats = match options.densify {
+            Some(_) => Some(GradientStats::new(device, start.len())?),
+            None => None,
+        };
+        Ok(Run {
+            device: device.clone(),
+            options,
+            scale,
+            raster: RasterOptions {
+                sh_degree: 0,
+                feature_mode: FeatureMode::Linear,
+                features_move_geometry: true,
+            },
+            model: Model::new(device, start, 0)?,
+            views: Views::new(device, images, cameras, depths, start.len(), 0, scale.near())?,
+            cameras: cameras.to_vec(),
+            poses: vec![PoseAdam::default(); cameras.len()],
+            order: ViewOrder::new(cameras.len(), options.seed),
+            random: Random::new(options.seed ^ 0x5eed),
+            stats,
+            programs: cameras.iter().map(|_| None).collect(),
+            recent: Vec::new(),
+            curve: Vec::new(),
+        })
+    }
+
+    /// One step on the next view; repeated with longer tile lists if they overflowed.
+    fn step(&mut self, iteration: usize) -> Result<()> {
+        // One more SH band per 1000 steps (Kerbl et al. 2023), so that the low bands settle first.
+        let degree = self.options.sh_degree.min((iteration / 1000) as u32);
+        if degree != self.raster.sh_degree {
+            self.raster.sh_degree = degree;
+            self.forget_recordings();
+        }
+        let view = self.order.draw();
+        self.model.set_rates(&self.options.rates, 0.0, self.scale.extent, iteration)?;
+        self.views.set_camera(view, &self.cameras[view])?;
+        loop {
+            let program = match self.programs[view].take() {
+                Some(program) => program,
+                None => self.record(view)?,
+            };
+            program.run()?;
+            self.programs[view] = Some(program);
+            let at = self.views.list[view].stage;
+            match self.views.stages[at].raster.overflow()? {
+                None => break,
+                Some(needed) => {
+                    self.views.stages[at].raster.grow(needed)?;
+                    self.forget_recordings();
+                }
+            }
+        }
+        let stage = self.views.stage(view);
+        let sums = stage.sums.read::<f32>()?;
+        self.recent.push(stage.loss.loss([sums[0], sums[1]]));
+        self.move_camera(view, iteration)
+    }
+
+    fn forget_recordings(&mut self) {
+        self.programs.iter_mut().for_each(|p| *p = None);
+    }
+
+    /// Forward, losses, backward and Adam of one view.
+    fn record(&self, view: usize) -> Result<Program> {
+        let (item, stage) = (&self.views.list[view], self.views.stage(view));
+        let frame = stage.raster.frame();
+        let mut rec = Recorder::new(&self.device, "rgb step");
+        stage.raster.record_forward(&mut rec, &self.model.values, &self.raster);
+        let weights = [self.options.l1_weight, self.options.dssim_weight];
+        stage.loss.record(
+            &mut rec,
+            &frame.planes,
+            &item.target,
+            &frame.planes_grad,
+            weights,
+            (&stage.sums, 0),
+        );
+        let pixels = frame.width * frame.height;
+        match &item.depth {
+            Some((reference, count)) => {
+                let call = shaders::depth_l1::call(
+                    &shaders::depth_l1::Bindings {
+                        reference,
+                        planes: &frame.planes,
+                        transmittance: &frame.transmittance,
+                        upstream: &frame.planes_grad,
+                    },
+                    &shaders::depth_l1::Push {
+                        pixels,
+                        alpha_plane: 4,
+                        weight: (self.options.depth_weight / *count as f64) as f32,
+                    },
+                );
+                rec.dispatch_threads(call, [pixels, 1, 1]);
+            }
+            // Another view of this size may have left its depth gradients there.
+            None => {
+                let clear = shaders::clear_depth_gradient::call(
+                    &shaders::clear_depth_gradient::Bindings { upstream: &frame.planes_grad },
+                    &shaders::clear_depth_gradient::Push { pixels, alpha_plane: 4 },
+                );
+                rec.dispatch_threads(clear, [pixels, 1, 1]);
+            }
+        }
+        stage.raster.record_backward(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
+        if let Some(stats) = &self.stats {
+            stats.record(&mut rec, frame, self.model.count());
+        }
+        if self.options.ratio_weight > 0.0 {
+            let count = self.model.count() as u32;
+            let call = shaders::ratio_penalty::call(
+                &shaders::ratio_penalty::Bindings {
+                    log_scales: &self.model.values.log_scales,
+                    gradients: &self.model.gradients.log_scales,
+                },
+                &shaders::ratio_penalty::Push {
+                    count,
+                    weight: (self.options.ratio_weight / f64::from(count)) as f32,
+                    limit: RATIO_LIMIT,
+                },
+            );
+            rec.dispatch_threads(call, [count, 1, 1]);
+        }
+        self.model.record_step(&mut rec, &frame.status);
+        rec.compile()
+    }
+
+    /// Pose refinement; camera 0 fixes the world frame.
+    fn move_camera(&mut self, view: usize, iteration: usize) -> Result<()> {
+        let Some(poses) = self.options.poses.filter(|p| view > 0 && iteration >= p.start) else {
+            return Ok(());
+        };
+        let g = self.views.stage(view).raster.frame().camera_grad.read::<f32>()?;
+        let twist = [g[0], g[1], g[2], g[3], g[4], g[5]].map(f64::from);
+        let rate = poses.rate.at(iteration);
+        let pose = &mut self.cameras[view].pose;
+        *pose = self.poses[view].update(pose, twist, rate, self.scale.median_depth);
+        Ok(())
+    }
+
+    /// A point of the loss curve now and then, and with it the check for broken numbers.
+    fn report(&mut self, iteration: usize) -> Result<Option<CurvePoint>> {
+        let step = iteration + 1;
+        if !step.is_multiple_of(self.options.report_every.max(1)) && step != self.options.iterations {
+            return Ok(None);
+        }
+        self.model.check(step)?;
+        let n = self.recent.len().max(1) as f64;
+        let total = |l: &ImageLoss| l.total(self.options.l1_weight, self.options.dssim_weight);
+        let point = CurvePoint {
+            step,
+            loss: self.recent.iter().map(total).sum::<f64>() / n,
+            ssim: self.recent.iter().map(|l| l.ssim).sum::<f64>() / n,
+            splats: self.model.count(),
+        };
+        self.recent.clear();
+        self.curve.push(point);
+        Ok(Some(point))
+    }
+
+    fn prune(&mut self, iteration: usize) -> Result<()> {
+        let (step, every) = (iteration + 1, self.options.prune_every);
+        if every == 0 || step < self.options.prune_from || !step.is_multiple_of(every) {
+            return Ok(());
+        }
+        let logits = self.model.values.opacity_logits.read_range::<f32>(0..self.model.count())?;
+        let rows = compact::kept(&logits, self.options.prune_opacity);
+        if rows.is_empty() {
+            return Err(Error::work(format!(
+                "every splat faded away by step {step}: cameras and photos do not fit together"
+            )));
+        }
+        if rows.len() < self.model.count() {
+            self.model.keep(&rows)?;
+            if let Some(stats) = &mut self.stats {
+                stats.keep(&self.device, &rows)?;
+            }
+            self.forget_recordings();
+        }
+        Ok(())
+    }
+
+    fn densify(&mut self, iteration: usize) -> Result<()> {
+        let step = iteration + 1;
+        let (Some(options), Some(stats)) = (self.options.densify, &self.stats) else { return Ok(()) };
+        if step < options.from || step > options.until || !step.is_multiple_of(options.every.max(1)) {
+            return Ok(());
+        }
+        let splats = self.model.splats()?;
+        let mean = stats.mean()?;
+        let (splats, source) = densify(&splats, &mean, self.scale.extent as f32, &options, &mut self.random);
+        self.model.replace(&splats, &source)?;
+        self.stats = Some(GradientStats::new(&self.device, splats.len())?);
+        self.views.resize(splats.len(), 0)?;
+        self.forget_recordings();
+        Ok(())
+    }
+
+    /// Reads everything back and keeps the refined cameras only if they explain the photos better.
+    fn finish(
+        &mut self,
+        images: &[RgbImage],
+        initial: &[Camera],
+    ) -> Result<(Splats, Vec<Camera>, Vec<f64>, bool)> {
+        let splats = self.model.splats()?;
+        let mut score = |cameras: &[Camera]| -> Result<Vec<f64>> {
+            (0..images.len())
+                .map(|i| Ok(psnr(&self.views.render(i, &cameras[i], &self.model, &self.raster)?, &images[i])))
+                .collect()
+        };
+        let refined = score(&self.cameras)?;
+        if self.options.poses.is_none() {
+            return Ok((splats, initial.to_vec(), refined, false));
+        }
+        let before = score(initial)?;
+        let sum = |v: &[f64]| v.iter().sum::<f64>();
+        if sum(&refined) > sum(&before) {
+            Ok((splats, self.cameras.clone(), refined, true))
+        } else {
+            Ok((splats, initial.to_vec(), before, false))
+        }
+    }
+}
