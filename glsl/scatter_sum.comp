@@ -1,6 +1,6 @@
 #version 450
 // Sums values into bins with float atomics. It is small on purpose: the tests drive the two sides of
-// shared/atomic_float.glsl through it. Twin: pass::scatter_sum.
+// shared/atomic_float.glsl through it (src/gpu/tests.rs).
 #extension GL_GOOGLE_include_directive : require
 #include "shared/atomic_float.glsl"
 layout(local_size_x = 128) in;

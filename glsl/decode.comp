@@ -1,0 +1,71 @@
+#version 450
+// Code per pixel: k* = argmax_k F.c_k, ties to the lowest k, -1 where alpha < 0.5, with the margin to the second best.
+// Twin: pass::decode::decode_pixels.
+// variants: DIM=4,8,16,32
+#extension GL_EXT_control_flow_attributes : require
+// Every thread takes four pixels, so that each code is loaded once for four: on lavapipe a load costs as much as seven FMAs.
+#define PIXELS 4u
+#define QUADS (DIM / 4)
+layout(local_size_x = 64) in;
+
+layout(std430, binding = 0) readonly buffer Features { float features[]; };  // planar [planes, P]
+layout(std430, binding = 1) readonly buffer Alpha { float alpha[]; };        // [P]
+layout(std430, binding = 2) readonly buffer Codes { vec4 codes[]; };         // [K, DIM / 4], zero padded
+layout(std430, binding = 3) writeonly buffer Decoded { int decoded[]; };     // [P]
+layout(std430, binding = 4) writeonly buffer Margin { float margin[]; };     // [P]
+// The features are planes first_plane .. first_plane + dim.
+layout(push_constant) uniform Push { uint pixels; uint count; uint dim; uint first_plane; };
+
+void main() {
+    uint first = gl_WorkGroupID.x * (64u * PIXELS) + gl_LocalInvocationID.x;
+    vec4 feature[PIXELS * QUADS];
+    [[unroll]] for (uint j = 0u; j < PIXELS; j++) {
+        uint pixel = min(first + j * 64u, pixels - 1u);
+        [[unroll]] for (uint q = 0u; q < QUADS; q++) {
+            vec4 f;
+            // Channels beyond dim repeat the last one; their code components are zero.
+            [[unroll]] for (uint c = 0u; c < 4u; c++)
+                f[c] = features[(first_plane + min(q * 4u + c, dim - 1u)) * pixels + pixel];
+            feature[j * QUADS + q] = f;
+        }
+    }
+    const float LOWEST = -3.4e38;
+    float best[PIXELS];
+    float second[PIXELS];
+    int chosen[PIXELS];
+    [[unroll]] for (uint j = 0u; j < PIXELS; j++) {
+        best[j] = LOWEST;
+        second[j] = LOWEST;
+        chosen[j] = -1;
+    }
+    for (uint k = 0u; k < count; k++) {
+        vec4 code[QUADS];
+        [[unroll]] for (uint q = 0u; q < QUADS; q++) code[q] = codes[k * QUADS + q];
+        [[unroll]] for (uint j = 0u; j < PIXELS; j++) {
+            vec4 sums = vec4(0.0);
+            [[unroll]] for (uint q = 0u; q < QUADS; q++) sums += code[q] * feature[j * QUADS + q];
+            float score = sums.x + sums.y + sums.z + sums.w;
+            bool better = score > best[j];
+            second[j] = max(second[j], better ? best[j] : score);
+            best[j] = better ? score : best[j];
+            chosen[j] = better ? int(k) : chosen[j];
+        }
+    }
+    [[unroll]] for (uint j = 0u; j < PIXELS; j++) {
+        uint pixel = first + j * 64u;
+        float norm2 = 0.0;
+        [[unroll]] for (uint q = 0u; q < QUADS; q++)
+            [[unroll]] for (uint c = 0u; c < 4u; c++) {
+                float f = feature[j * QUADS + q][c];
+                norm2 += q * 4u + c < dim ? f * f : 0.0;
+            }
+        float norm = sqrt(norm2);
+        // A lone code competes with the least a product can be.
+        float rival = count > 1u ? second[j] : -norm;
+        if (pixel < pixels) {
+            bool shown = alpha[pixel] >= 0.5; // less opaque pixels show nothing of the scene
+            decoded[pixel] = shown ? chosen[j] : -1;
+            margin[pixel] = shown && norm > 0.0 && count > 0u ? (best[j] - rival) / norm : 0.0;
+        }
+    }
+}

@@ -1,0 +1,170 @@
+//! Rendered features to code indices: `k*(p) = argmax_k F(p)·c_k`, brute force over the codes of a level.
+use crate::gpu::{Buffer, Device, Recorder, shaders};
+use crate::{Error, Result};
+
+/// Pixels less opaque than this show nothing of the scene; the shader holds the same value.
+const VOID_ALPHA: f32 = 0.5;
+
+/// Code widths that glsl/decode.comp is compiled for; others are padded with zeros to the next.
+const WIDTHS: [usize; 4] = [4, 8, 16, 32];
+
+/// Pixels per workgroup of glsl/decode.comp: 64 threads with four each.
+const PIXELS_PER_GROUP: u32 = 256;
+
+/// The codes of one level on the device.
+pub struct Codes {
+    buffer: Buffer,
+    count: u32,
+    dim: u32,
+    width: u32,
+}
+
+impl Codes {
+    /// `codes` is `[K, dim]`, row-major, unit rows; `dim` at most 32.
+    pub fn upload(device: &Device, codes: &[f32], dim: usize) -> Result<Codes> {
+        let Some(&width) = WIDTHS.iter().find(|&&w| w >= dim).filter(|_| dim > 0) else {
+            return Err(Error::work(format!("codes have {dim} components, the decoder takes 1 to 32")));
+        };
+        let mut padded = Vec::with_capacity(codes.len() / dim * width);
+        for code in codes.chunks_exact(dim) {
+            padded.extend_from_slice(code);
+            padded.resize(padded.len() + width - dim, 0.0);
+        }
+        let buffer = device.buffer_from("codes", &padded)?;
+        Ok(Codes { buffer, count: (codes.len() / dim) as u32, dim: dim as u32, width: width as u32 })
+    }
+
+    /// Decodes `pixels` pixels. `features` is planar `[planes, pixels]`, the level's channels are the planes
+    /// `first_plane..first_plane + dim`; `alpha` is `[pixels]`. Writes `decoded`, `[pixels]` of `i32` with −1 where alpha
+    /// < 0.5 (or without codes), and `margin`, `[pixels]` of `(F·c_1 − F·c_2) / ‖F‖`. Twin: [`decode_pixels`].
+    pub fn record(
+        &self,
+        rec: &mut Recorder,
+        features: &Buffer,
+        first_plane: u32,
+        alpha: &Buffer,
+        pixels: u32,
+        decoded: &Buffer,
+        margin: &Buffer,
+    ) {
+        let planes = u64::from(first_plane + self.dim);
+        if features.bytes() < planes * u64::from(pixels) * 4 {
+            rec.fail(format!("decode: `{}` has fewer than {planes} planes", features.name()));
+        }
+        rec.dispatch(
+            shaders::decode::call(
+                shaders::decode::Variant { dim: self.width },
+                &shaders::decode::Bindings { features, alpha, codes: &self.buffer, decoded, margin },
+                &shaders::decode::Push { pixels, count: self.count, dim: self.dim, first_plane },
+            ),
+            [pixels.div_ceil(PIXELS_PER_GROUP), 1, 1],
+        );
+    }
+}
+
+/// Twin of [`Codes::record`], in f64: code and margin per pixel of planar `features` `[dim, P]` and `alpha` `[P]`.
+pub fn decode_pixels(codes: &[f32], dim: usize, features: &[f32], alpha: &[f32]) -> (Vec<i32>, Vec<f64>) {
+    let pixels = alpha.len();
+    let decode = |p: usize| {
+        let feature: Vec<f64> = (0..dim).map(|c| f64::from(features[c * pixels + p])).collect();
+        let norm = feature.iter().map(|f| f * f).sum::<f64>().sqrt();
+        let (mut chosen, mut best, mut second) = (-1, f64::NEG_INFINITY, -norm);
+        for (k, code) in codes.chunks_exact(dim).enumerate() {
+            let score = code.iter().zip(&feature).map(|(c, f)| f64::from(*c) * f).sum::<f64>();
+            if score > best {
+                second = if k == 0 { -norm } else { best };
+                (chosen, best) = (k as i32, score);
+            } else if k == 1 || score > second {
+                second = score;
+            }
+        }
+        if alpha[p] < VOID_ALPHA || chosen < 0 {
+            (if alpha[p] < VOID_ALPHA { -1 } else { chosen }, 0.0)
+        } else {
+            (chosen, if norm > 0.0 { (best - second) / norm } else { 0.0 })
+        }
+    };
+    (0..pixels).map(decode).unzip()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::test_device;
+
+    fn noise(n: usize, mut seed: u64) -> Vec<f32> {
+        (0..n)
+            .map(|_| {
+                // Knuth's MMIX constants.
+                seed = seed.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+                (seed >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+            })
+            .collect()
+    }
+
+    fn unit_rows(mut rows: Vec<f32>, dim: usize) -> Vec<f32> {
+        for row in rows.chunks_exact_mut(dim) {
+            let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();
+            row.iter_mut().for_each(|x| *x /= norm);
+        }
+        rows
+    }
+
+    /// Decodes on the device with two planes of rubbish before the features.
+    fn on_device(codes: &[f32], dim: usize, features: &[f32], alpha: &[f32]) -> (Vec<i32>, Vec<f32>) {
+        let device = test_device();
+        let planes = [noise(2 * alpha.len(), 99).as_slice(), features].concat();
+        let features = device.buffer_from("features", &planes).unwrap();
+        let alpha_buffer = device.buffer_from("alpha", alpha).unwrap();
+        let decoded = device.buffer::<i32>("decoded", alpha.len()).unwrap();
+        let margin = device.buffer::<f32>("margin", alpha.len()).unwrap();
+        let codes = Codes::upload(&device, codes, dim).unwrap();
+        let mut rec = Recorder::new(&device, "decode");
+        codes.record(&mut rec, &features, 2, &alpha_buffer, alpha.len() as u32, &decoded, &margin);
+        rec.run().unwrap();
+        (decoded.read().unwrap(), margin.read().unwrap())
+    }
+
+    #[test]
+    fn equals_its_twin() {
+        for (dim, count, pixels) in
+            [(3, 50, 700), (4, 2, 256), (5, 1, 1), (8, 20, 257), (16, 100, 300), (20, 7, 64)]
+        {
+            let codes = unit_rows(noise(count * dim, dim as u64), dim);
+            let features = noise(dim * pixels, 7);
+            let alpha: Vec<f32> = noise(pixels, 8).iter().map(|a| 0.5 + 0.5 * a).collect();
+            let (twin_code, twin_margin) = decode_pixels(&codes, dim, &features, &alpha);
+            let (code, margin) = on_device(&codes, dim, &features, &alpha);
+            for p in 0..pixels {
+                // Sums of at most 32 products of numbers below 1 in f32: 32 × 6e-8 × ‖F‖, over ‖F‖, twice.
+                let tolerance = 8e-6;
+                assert!((f64::from(margin[p]) - twin_margin[p]).abs() < tolerance, "{dim} {p}");
+                assert!(code[p] == twin_code[p] || twin_margin[p] < tolerance, "{dim} {p}");
+            }
+            assert!(pixels < 64 || code.contains(&-1), "some pixel is transparent");
+        }
+    }
+
+    #[test]
+    fn ties_take_the_lowest_code_and_no_code_is_void() {
+        let codes = [0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0];
+        let (code, margin) = on_device(&codes, 2, &[2.0, 0.0, 0.0, 2.0], &[1.0, 1.0]);
+        assert_eq!(code, [1, 0]);
+        assert_eq!(margin, [0.0, 0.0]);
+        let (code, margin) = on_device(&[], 2, &[2.0, 0.0, 0.0, 2.0], &[1.0, 1.0]);
+        assert_eq!((code, margin), (vec![-1, -1], vec![0.0, 0.0]));
+        let (twin, _) = decode_pixels(&[], 2, &[2.0, 0.0, 0.0, 2.0], &[1.0, 1.0]);
+        assert_eq!(twin, [-1, -1]);
+    }
+
+    #[test]
+    fn refuses_wide_codes_and_missing_planes() {
+        let device = test_device();
+        assert!(Codes::upload(&device, &[0.0; 66], 33).is_err());
+        let codes = Codes::upload(&device, &[1.0, 0.0], 2).unwrap();
+        let one = device.buffer::<f32>("one", 4).unwrap();
+        let mut rec = Recorder::new(&device, "decode");
+        codes.record(&mut rec, &one, 0, &one, 4, &one, &one);
+        assert!(rec.run().unwrap_err().to_string().contains("planes"));
+    }
+}
