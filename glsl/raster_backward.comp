@@ -33,6 +33,7 @@ layout(push_constant) uniform Push {
 
 #include "shared/raster.glsl"
 #define VALUES (6 + CHANNELS)
+#define HALF (SUBGROUP_SIZE / 2)
 
 float T[PIXELS], behind[PIXELS], upstream[CHANNELS * PIXELS];
 float part[VALUES];
@@ -123,35 +124,49 @@ void main() {
         uint splat = tile_splats[min(j + lane, last - 1)];
         load_splat(splat, j + lane < last);
         uint batch = min(uint(SUBGROUP_SIZE), last - j);
-        float kept[VALUES];
-        [[unroll]] for (int n = 0; n < VALUES; n++) kept[n] = 0.0;
+        // Both halves of the subgroup keep their own half sum of splat i; one exchange after the loop completes
+        // them. That saves a shuffle per value and splat.
+        float low[VALUES], high[VALUES];
+        [[unroll]] for (int n = 0; n < VALUES; n++) low[n] = high[n] = 0.0;
         for (uint i = 0; i < batch; i++) {
             evaluate(i, origin);
+            bool mine = (lane & (HALF - 1)) == (i & (HALF - 1));
+            bool keep_low = mine && i < HALF, keep_high = mine && i >= HALF;
             [[unroll]] for (int n = 0; n < VALUES; n++) {
                 float sum = part[n];
                 sum += subgroupShuffleXor(sum, 1);
+#if HALF > 2
                 sum += subgroupShuffleXor(sum, 2);
-#if SUBGROUP_SIZE >= 8
+#endif
+#if HALF > 4
                 sum += subgroupShuffleXor(sum, 4);
 #endif
-#if SUBGROUP_SIZE >= 16
+#if HALF > 8
                 sum += subgroupShuffleXor(sum, 8);
 #endif
-#if SUBGROUP_SIZE >= 32
+#if HALF > 16
                 sum += subgroupShuffleXor(sum, 16);
 #endif
-#if SUBGROUP_SIZE >= 64
-                sum += subgroupShuffleXor(sum, 32);
-#endif
-                kept[n] = lane == i ? sum : kept[n];
+                low[n] = keep_low ? sum : low[n];
+                high[n] = keep_high ? sum : high[n];
             }
         }
+        bool in_low = lane < HALF;
+        [[unroll]] for (int n = 0; n < VALUES; n++) {
+            float own = in_low ? low[n] : high[n];
+            high[n] = subgroupShuffleXor(in_low ? high[n] : low[n], HALF);
+            low[n] = own;
+        }
         if (j + lane < last) {
-            [[unroll]] for (int n = 0; n < VALUES - FEATURES; n++) ATOMIC_ADD(projected_grad[10 * splat + n], kept[n]);
+            // The additions stand inside the branch because naga 30 loses an atomic's operand that another block made.
+            [[unroll]] for (int n = 0; n < VALUES - FEATURES; n++)
+                ATOMIC_ADD(projected_grad[10 * splat + n], low[n] + high[n]);
 #if FEATURES > 0
-            [[unroll]] for (int n = 0; n < FEATURES; n++)
-                if (n < features)
-                    ATOMIC_ADD(codes_grad[4 * (splat * code_vectors + first_vector) + n], kept[VALUES - FEATURES + n]);
+            [[unroll]] for (int n = 0; n < FEATURES; n++) {
+                float sum = low[VALUES - FEATURES + n] + high[VALUES - FEATURES + n];
+                if (n >= features) sum = 0.0;
+                ATOMIC_ADD(codes_grad[4 * (splat * code_vectors + first_vector) + min(n, features - 1)], sum);
+            }
 #endif
         }
         if (all_stopped(T)) break;
