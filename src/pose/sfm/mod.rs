@@ -2,8 +2,11 @@
 mod grow;
 mod known;
 mod model;
+mod patch;
+mod refine;
 mod tracks;
 
+use super::bundle::Outcome;
 use super::matching::{self, Features, Match};
 use super::two_view::{self, TwoView};
 use super::{SparseModel, SparsePoint, sift};
@@ -15,6 +18,7 @@ use glam::DVec2;
 use grow::{Pair, grow};
 pub use known::with_cameras;
 use model::{Model, Sighting};
+use patch::Shades;
 use rayon::prelude::*;
 use tracks::Link;
 
@@ -50,7 +54,7 @@ pub fn reconstruct(photos: &[Photo], features: &[Features], progress: &dyn Progr
     let relations = relate_all(photos, &families, &empty, progress)?;
     explain(photos, &relations)?;
     let model = assemble(photos, &families, empty, relations, progress)?;
-    finish(photos, model)
+    finish(photos, model, progress)
 }
 
 /// Strongest corners kept per photo: matching stays below a second for four photos.
@@ -299,16 +303,24 @@ fn assemble(
     )))
 }
 
-fn finish(photos: &[Photo], mut model: Model) -> Result<SparseModel> {
+/// Settles the model: outliers out, weights from the residuals, every sighting refined to sub-pixel and further points
+/// added where the geometry predicts them.
+fn finish(photos: &[Photo], mut model: Model, progress: &dyn Progress) -> Result<SparseModel> {
     let long = photos[0].image.width.max(photos[0].image.height) as f64;
-    model.triangulate_all(THRESHOLD * long);
-    model.prune(THRESHOLD * long);
-    let mut outcome = model.adjust(f64::INFINITY, 1.5, 60)?;
-    for _ in 0..2 {
-        // Weights and geometry depend on each other; two rounds settle them to a percent.
-        model.weigh();
-        outcome = model.adjust(f64::INFINITY, 2.0, 60)?;
-    }
+    let threshold = THRESHOLD * long;
+    model.triangulate_all(threshold);
+    model.prune(threshold);
+    model.adjust(f64::INFINITY, 1.5, 60)?;
+    settle(&mut model)?;
+    let shades: Vec<Shades> = photos.par_iter().map(|p| Shades::new(&p.image)).collect();
+    let valid: Vec<Plane<bool>> = photos.iter().map(|p| matching::valid_area(&p.image, MARGIN)).collect();
+    refine::refine(&mut model, &shades);
+    settle(&mut model)?;
+    progress.check()?;
+    model.prune(0.5 * threshold);
+    refine::extend(&mut model, &shades, &valid);
+    model.prune(0.5 * threshold);
+    let outcome = settle(&mut model)?;
     model.normalise();
     let cameras = cameras_of(photos, &model)?;
     let points = model
@@ -321,6 +333,14 @@ fn finish(photos: &[Photo], mut model: Model) -> Result<SparseModel> {
         })
         .collect();
     Ok(SparseModel { cameras, points, focal_log_sigma: outcome.focal_log_sigma.first().copied() })
+}
+
+/// Adjusts with weights from the residuals. Weights and geometry depend on each other; two rounds settle them to a percent.
+fn settle(model: &mut Model) -> Result<Outcome> {
+    model.weigh();
+    model.adjust(f64::INFINITY, 2.0, 60)?;
+    model.weigh();
+    model.adjust(f64::INFINITY, 2.0, 60)
 }
 
 fn colour_at(image: &RgbImage, p: DVec2) -> [f32; 3] {

@@ -34,12 +34,13 @@ fn check(name: &str, features: impl Fn(&[Photo]) -> Vec<Features>, rotation: f64
 
 #[test]
 fn corners_alone_place_the_breakfast_cameras() {
-    check("corners", |_| Vec::new(), 0.2, 0.003, 0.01);
+    // A tenth of what is asked of the whole (0.2°, 0.3 %, 1 %): ten times what it measures, so a slip shows.
+    check("corners", |_| Vec::new(), 0.03, 0.0005, 0.002);
 }
 
 #[test]
 fn learned_features_place_the_breakfast_cameras() {
-    check("corners + XFeat", learned, 0.2, 0.003, 0.01);
+    check("corners + XFeat", learned, 0.03, 0.0005, 0.002);
 }
 
 #[test]
