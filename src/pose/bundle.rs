@@ -37,8 +37,6 @@ pub(crate) struct Problem {
 /// What an adjustment found.
 #[derive(Clone, Debug)]
 pub(crate) struct Outcome {
-    /// Robust cost including priors.
-    pub(crate) cost: f64,
     /// σ of ln f per focal group.
     pub(crate) focal_log_sigma: Vec<f64>,
 }
@@ -245,7 +243,7 @@ impl Problem {
                 break;
             }
         }
-        Ok(Outcome { cost, focal_log_sigma: self.focal_sigma(c) })
+        Ok(Outcome { focal_log_sigma: self.focal_sigma(c) })
     }
 
     /// σ of ln f per group from the inverse of the reduced system, scaled by the observed residual variance.

@@ -1,5 +1,8 @@
 //! Choosing and running a geometry initialiser.
-use super::{Features, SparseModel, sfm};
+use super::pointmap::{self, ModelView, PairPointmaps};
+use super::stereo::{self, StereoOptions};
+use super::{Features, Geometry, SparseModel, sfm};
+use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
 use crate::photo::Photo;
@@ -17,6 +20,50 @@ pub enum InitChoice {
     Sfm,
     /// Known cameras, joined to the photos by file name without extension; any resolution of the same aspect.
     Cameras(Vec<Camera>),
+    /// Pairwise pointmaps of a network such as MASt3R, DUSt3R or VGGT, one view per photo.
+    Pointmaps(Vec<ModelView>, Vec<PairPointmaps>),
+}
+
+/// Above this σ of ln f the depth of the scene is guessed more than measured: say so.
+const UNSURE_FOCAL: f64 = 0.05;
+
+/// Photos to cameras, depth maps and points (ALGORITHMS 2.6).
+pub fn initialise(
+    device: &Device,
+    photos: &[Photo],
+    choice: &InitChoice,
+    registry: &Registry,
+    progress: &dyn Progress,
+) -> Result<Geometry> {
+    let cameras = match choice {
+        InitChoice::Auto | InitChoice::Sfm => None,
+        InitChoice::Cameras(cameras) => Some(cameras.as_slice()),
+        InitChoice::Pointmaps(views, pairs) => return pointmap::reconstruct(views, pairs, progress),
+    };
+    let model = sparse(photos, cameras, Some(registry), progress)?;
+    if let Some(sigma) = model.focal_log_sigma.filter(|s| *s > UNSURE_FOCAL) {
+        progress.warn(&format!(
+            "the photos leave the focal length open by ±{:.0} %: depth may be stretched; photos from more different \
+             directions, or with EXIF focal length, would settle it",
+            100.0 * sigma
+        ));
+    }
+    progress.check()?;
+    let images: Vec<_> = photos.iter().map(|p| p.image.clone()).collect();
+    let positions: Vec<_> = model.points.iter().map(|p| p.position).collect();
+    let options = StereoOptions::default();
+    let (depths, points) = stereo::dense(device, &images, &model.cameras, &positions, &options, progress)?;
+    Ok(Geometry {
+        cameras: model.cameras,
+        depths,
+        points,
+        focal_log_sigma: model.focal_log_sigma,
+        method: if cameras.is_some() {
+            "cameras + stereo".into()
+        } else {
+            "sfm (corners + XFeat) + stereo".into()
+        },
+    })
 }
 
 /// Keypoints kept per photo from the learned detector.
@@ -29,13 +76,15 @@ pub fn learned_features(
     progress: &dyn Progress,
 ) -> Result<Vec<Features>> {
     let mut xfeat = XFeat::load(registry)?;
-    photos
-        .iter()
-        .map(|p| {
-            progress.check()?;
-            Ok(Features::from(xfeat.detect(&p.image, MAX_LEARNED)?))
-        })
-        .collect()
+    progress.begin("features", photos.len() as u64);
+    let mut out = Vec::with_capacity(photos.len());
+    for (k, p) in photos.iter().enumerate() {
+        progress.check()?;
+        out.push(Features::from(xfeat.detect(&p.image, MAX_LEARNED)?));
+        progress.step(k as u64 + 1, &p.stem);
+    }
+    progress.end();
+    Ok(out)
 }
 
 /// Cameras and sparse points by structure from motion (`cameras` = None) or for known cameras. Without a registry only

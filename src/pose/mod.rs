@@ -14,7 +14,7 @@ pub mod stereo;
 mod testing;
 mod two_view;
 
-pub use initialise::{InitChoice, learned_features, sparse};
+pub use initialise::{InitChoice, initialise, learned_features, sparse};
 pub use matching::Features;
 
 use crate::scene::{Camera, DepthMap, PointCloud};

@@ -49,13 +49,24 @@ pub fn reconstruct(photos: &[Photo], features: &[Features], progress: &dyn Progr
     if photos.len() < 2 {
         return Err(Error::input("cameras need at least two photos; give two or more"));
     }
+    progress.begin("cameras", STEPS);
+    progress.step(0, "corners");
     let families = corner_families(photos, features, progress)?;
+    progress.step(1, "matches");
     let empty = empty_model(photos);
     let relations = relate_all(photos, &families, &empty, progress)?;
     explain(photos, &relations)?;
+    progress.step(2, "poses");
     let model = assemble(photos, &families, empty, relations, progress)?;
-    finish(photos, model, progress)
+    progress.step(3, "refining");
+    let model = finish(photos, model, progress)?;
+    progress.step(STEPS, &format!("{} points", model.points.len()));
+    progress.end();
+    Ok(model)
 }
+
+/// Steps of the progress bar: corners, matches, poses, refinement, extension.
+const STEPS: u64 = 5;
 
 /// Strongest corners kept per photo: matching stays below a second for four photos.
 const MAX_CORNERS: usize = 4000;
@@ -317,6 +328,7 @@ fn finish(photos: &[Photo], mut model: Model, progress: &dyn Progress) -> Result
     refine::refine(&mut model, &shades);
     settle(&mut model)?;
     progress.check()?;
+    progress.step(4, "more points");
     model.prune(0.5 * threshold);
     refine::extend(&mut model, &shades, &valid);
     model.prune(0.5 * threshold);
