@@ -1,6 +1,7 @@
 //! Depth where matching fails (weak texture, seen by one view only, rims of objects): the planes of believed pixels
 //! are carried on along paths of similar colour, never into space that another view sees through.
 use super::Level;
+use super::colours::ColourModel;
 use super::planes::WorldPlane;
 use super::surface::{FREE_SPACE_TOLERANCE, Links, Surface, Verdict, neighbours, ray};
 use glam::Vec3;
@@ -12,9 +13,15 @@ use std::collections::BinaryHeap;
 /// 5 grey levels weighs as much as 4 pixels.
 const STEP: f32 = 0.005;
 /// A locally fitted plane is carried on this much more reluctantly than one of the scene's large planes.
-const LOCAL_RELUCTANCE: f32 = 1.5;
+const LOCAL_RELUCTANCE: f32 = 2.0;
+/// Factor on the path cost over colours that never occur on the large plane, less [`OWN`].
+const FOREIGN: f32 = 3.0;
+/// Factor on the path cost over colours that occur only on the large plane: texture of the plane is no edge.
+const OWN: f32 = 0.1;
 /// Path cost of a pixel where the carried plane would block another view.
 const BLOCKING: f32 = 0.3;
+/// RGB distance (Euclidean) up to which two views show the same point: gloss and exposure change this much.
+const COLOUR_TOLERANCE: f32 = 0.2;
 /// Factor on a pixel's path cost where another view confirms the carried plane.
 const CONFIRMED: f32 = 0.3;
 /// Highest confidence of a filled pixel, below every matched one.
@@ -99,7 +106,7 @@ impl<'a> ViewFill<'a> {
         };
         let believed: Vec<u32> =
             (0..pixels as u32).filter(|&k| self.surface.confidence[self.first + k as usize] > 0.0).collect();
-        let (carried, cost) = self.spread(&believed, None);
+        let (carried, cost) = self.spread(&believed, None, None);
         consider(&carried, &cost, LOCAL_RELUCTANCE, &|source| self.surface.planes[self.first + source]);
         for plane in large {
             let Some(plane) = plane.in_camera(&self.level.cameras[self.view]) else { continue };
@@ -109,7 +116,8 @@ impl<'a> ViewFill<'a> {
             if on.len() * 1000 < pixels {
                 continue;
             }
-            let (carried, cost) = self.spread(&on, Some(plane));
+            let colours = ColourModel::new(&self.level.guide[self.view], &on, &believed);
+            let (carried, cost) = self.spread(&on, Some(plane), Some(&colours));
             consider(&carried, &cost, 1.0, &|_| plane);
         }
         for k in 0..pixels {
@@ -134,7 +142,12 @@ impl<'a> ViewFill<'a> {
 
     /// Dijkstra from the given pixels over the pixels without belief: per pixel where its plane comes from
     /// (`u32::MAX` = unreached) and the path cost. With `plane`, that plane is carried; else each source's own.
-    fn spread(&self, sources: &[u32], plane: Option<Vec3>) -> (Vec<u32>, Vec<f32>) {
+    fn spread(
+        &self,
+        sources: &[u32],
+        plane: Option<Vec3>,
+        colours: Option<&ColourModel>,
+    ) -> (Vec<u32>, Vec<f32>) {
         let pixels = self.width * self.height;
         let mut cost = vec![f32::INFINITY; pixels];
         let mut carried = vec![u32::MAX; pixels];
@@ -169,7 +182,9 @@ impl<'a> ViewFill<'a> {
                     continue;
                 }
                 let evidence = self.evidence(n, candidate);
-                let total = here + (STEP + difference) * evidence.0 + evidence.1;
+                // Up to threefold the path cost for colours of other surfaces, next to nothing for the plane's own.
+                let foreign = colours.map_or(1.0, |c| FOREIGN * (1.0 - c.share(b)).powi(2) + OWN);
+                let total = here + (STEP + difference) * evidence.0 * foreign + evidence.1;
                 if total < cost[n] {
                     cost[n] = total;
                     carried[n] = carried[k];
@@ -190,10 +205,24 @@ impl<'a> ViewFill<'a> {
             let pixel = [x as f32 + 0.5, y as f32 + 0.5];
             match self.links.verdict(self.level, self.surface, self.view, other, pixel, point) {
                 Verdict::InTheWay => evidence.1 = BLOCKING,
-                Verdict::Agrees => evidence.0 = CONFIRMED,
+                Verdict::Agrees => {
+                    if self.same_colour(x, y, other, point) {
+                        evidence.0 = CONFIRMED;
+                    } else {
+                        evidence.1 = BLOCKING;
+                    }
+                }
                 _ => {}
             }
         }
         evidence
+    }
+
+    /// Whether the other view shows the point in a similar colour.
+    fn same_colour(&self, x: usize, y: usize, other: usize, point: Vec3) -> bool {
+        let Some((u, v, _)) = self.links.project(self.level, self.view, other, point) else { return true };
+        let here = self.level.guide[self.view].at(x, y);
+        let there = self.level.guide[other].at(u as usize, v as usize);
+        (0..3).map(|c| (here[c] - there[c]).powi(2)).sum::<f32>().sqrt() < COLOUR_TOLERANCE
     }
 }

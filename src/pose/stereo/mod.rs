@@ -1,5 +1,6 @@
 //! Dense depth for views with known cameras: multi-view slanted plane sweep, propagation, consistency checks,
 //! filling, and fusion into points.
+mod colours;
 mod fill;
 mod fuse;
 mod planes;
