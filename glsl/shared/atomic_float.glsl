@@ -7,7 +7,13 @@
 #if FLOAT_ATOMICS
 #extension GL_EXT_shader_atomic_float : require
 #define ATOMIC_FLOAT float
-#define ATOMIC_ADD(memory, value) atomicAdd(memory, value)
+// naga 30 reads an atomic's value only if it was computed in the same block; `precise` keeps the addition of zero there
+// through the optimiser.
+float atomic_addend(float value) {
+    precise float here = value + 0.0;
+    return here;
+}
+#define ATOMIC_ADD(memory, value) atomicAdd(memory, atomic_addend(value))
 #define ATOMIC_VALUE(memory) (memory)
 #else
 #define ATOMIC_FLOAT uint
