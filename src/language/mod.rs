@@ -9,8 +9,9 @@ mod build;
 pub mod codebook;
 pub mod dir;
 pub mod graph;
+pub mod matcher;
 
-pub use build::{BuildOptions, Language, build};
+pub use build::{BuildOptions, Language, attach_features, build};
 
 /// The label map of one level of one view.
 #[derive(Clone, Debug, Default)]

@@ -3,6 +3,7 @@
 //! A query is a unit vector and the canonical vectors of the same space. Its relevancy is computed once per code and
 //! gathered through the decoded code maps of a frame (ALGORITHMS 9). Level and location are chosen on the smoothed
 //! map; the mask of the `field` protocol is chosen on codes, so smoothing never moves its edges.
+pub mod eval;
 pub mod filter;
 mod heatmap;
 

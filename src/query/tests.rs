@@ -92,3 +92,71 @@ fn an_all_void_frame_has_an_empty_mask() {
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap();
     assert!(!r.found && r.mask.data.iter().all(|m| !m));
 }
+
+/// Distinct unit vectors per object that share a strong common direction, as image features of one photo set do.
+fn oracle_vectors(count: usize, dim: usize) -> Vec<Vec<f32>> {
+    let mut state = 11u64;
+    let mut normal = || {
+        let mut sum = 0.0f32;
+        for _ in 0..6 {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            sum += (state >> 40) as f32 / (1u64 << 24) as f32 - 0.5;
+        }
+        sum
+    };
+    let common = unit(&(0..dim).map(|_| normal()).collect::<Vec<_>>());
+    let mut own = || unit(&(0..dim).map(|_| normal()).collect::<Vec<_>>());
+    (0..count)
+        .map(|_| unit(&own().iter().zip(&common).map(|(a, c)| a + 0.8 * c).collect::<Vec<_>>()))
+        .collect()
+}
+
+#[test]
+fn perfect_masks_and_distinct_features_answer_every_phrase() {
+    use crate::infer::breakfast::{phrases, train_views};
+    use crate::language::{BuildOptions, LevelMasks, ViewMasks, build};
+    use crate::scene::DepthMap;
+    let (views, phrases) = (train_views(), phrases());
+    let vectors = oracle_vectors(16, 64);
+    let masks: Vec<ViewMasks> = views
+        .iter()
+        .map(|v| {
+            let labels = Plane { data: v.masks.data.iter().map(|&k| k.max(0)).collect(), ..v.masks };
+            let features = vectors[..12].concat();
+            let level = LevelMasks { labels, quality: vec![1.0; 12], features };
+            ViewMasks { levels: vec![level.clone(), level.clone(), level] }
+        })
+        .collect();
+    let depths: Vec<DepthMap> = views
+        .iter()
+        .map(|v| DepthMap {
+            depth: v.depth.clone(),
+            confidence: Plane { data: v.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect(), ..v.depth },
+        })
+        .collect();
+    let cameras: Vec<_> = views.iter().map(|v| v.camera.clone()).collect();
+    let built =
+        build(&masks, &cameras, &depths, &[], &BuildOptions::default(), &crate::progress::Silent).unwrap();
+    let mut codes_per_level = Vec::new();
+    for level in &built.field.levels {
+        codes_per_level.push(level.codebook.len());
+    }
+    // eleven things, whichever views show them
+    assert_eq!(codes_per_level, [11, 11, 11]);
+    for (object, text) in &phrases {
+        let embedding = vectors[*object as usize].clone();
+        let query = TextQuery { text: text.clone(), embedding, canonicals: vectors[12..].concat() };
+        for (t, view) in views.iter().enumerate() {
+            let maps: Vec<Plane<i32>> = built.field.levels.iter().map(|l| l.targets[t].clone()).collect();
+            let r = answer(&maps, &built.field, &query, &QueryOptions::default()).unwrap();
+            if view.masks.data.contains(object) {
+                assert!(
+                    view.masks.data.iter().zip(&r.mask.data).all(|(k, &m)| m == (k == object)),
+                    "{text} {t}"
+                );
+                assert_eq!(view.masks.at(r.location.0, r.location.1), *object);
+                assert!(r.found);
+            }
+        }
+    }
+}

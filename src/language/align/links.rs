@@ -27,7 +27,7 @@ pub struct Links {
 
 impl Links {
     /// Pixel of the other view that source pixel `p` corresponds to.
-    pub(super) fn target(&self, p: usize) -> Option<usize> {
+    pub(in crate::language) fn target(&self, p: usize) -> Option<usize> {
         match self.target.get(p) {
             Some(&q) if q != NONE => Some(q as usize),
             _ => None,

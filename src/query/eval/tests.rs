@@ -1,0 +1,108 @@
+use super::*;
+use glam::{DMat3, DVec3};
+
+fn breakfast() -> GroundTruth {
+    GroundTruth::read(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast"))).unwrap()
+}
+
+/// The true train cameras seen from another world: `truth = s R scene + t`.
+fn moved() -> (GroundTruth, Vec<Camera>, Similarity) {
+    let truth = breakfast();
+    let turn = Pose::exp(DVec3::ZERO, DVec3::new(0.4, -0.2, 0.9)).rotation;
+    let similarity = Similarity { scale: 0.37, rotation: turn, translation: DVec3::new(1.0, -2.0, 0.5) };
+    let train = truth.frames.iter().filter(|f| f.split == Split::Train);
+    let cameras = train
+        .map(|f| Camera { name: format!("in/{}.JPG", f.stem), ..to_scene(&f.camera, &similarity) })
+        .collect();
+    (truth, cameras, similarity)
+}
+
+#[test]
+fn a_perfect_scene_scores_perfectly_and_its_files_say_so() {
+    let (truth, scene, similarity) = moved();
+    let dir = tempfile::tempdir().unwrap();
+    let mut eval = Evaluation::new(truth.clone(), &scene, Some(dir.path())).unwrap();
+    assert_eq!(eval.phrases().len(), 8);
+    for (frame, camera) in
+        eval.cameras().into_iter().filter(|(f, _)| f.stem.ends_with("3") || f.stem == "test_05")
+    {
+        // the scene camera sees a true point at the same pixel, in scene units
+        let point = DVec3::new(0.1, 0.2, 0.05);
+        let x = similarity.rotation.transpose() * (point - similarity.translation) / similarity.scale;
+        let ((a, za), (b, zb)) = (camera.project(x), frame.camera.project(point));
+        // the file's rotations are orthonormal to f32 rounding only
+        assert!((a - b).length() < 1e-3 && (za * similarity.scale - zb).abs() < 1e-5);
+        let mut depth = truth.depth(&frame).unwrap().unwrap();
+        depth.data.iter_mut().for_each(|z| *z /= similarity.scale as f32);
+        let rgb = truth.image(&frame).unwrap();
+        let alpha = Plane::filled(640, 480, 1.0);
+        let objects = truth.objects(&frame).unwrap().unwrap();
+        let answers: Vec<(u32, QueryResult)> = eval
+            .phrases()
+            .into_iter()
+            .map(|(label, _)| {
+                let mask: Vec<bool> = objects.data.iter().map(|&o| o == label).collect();
+                let p = mask.iter().position(|&m| m).unwrap_or(0);
+                let mask = Plane { width: 640, height: 480, data: mask };
+                (
+                    label,
+                    QueryResult { mask, location: (p % 640, p / 640), found: true, ..QueryResult::default() },
+                )
+            })
+            .collect();
+        eval.add_frame(&frame, &Rendered { rgb, alpha, depth }, &answers).unwrap();
+    }
+    let report = eval.finish();
+    assert_eq!(report.poses.len(), 4);
+    for p in &report.poses {
+        assert!(p.rotation_degrees < 1e-3 && p.centre_fraction < 1e-5 && p.focal_relative < 1e-12);
+    }
+    let (train, test) = (&report.summary["train"], &report.summary["test"]);
+    assert_eq!((train.miou, test.miou, test.localisation), (Some(1.0), Some(1.0), Some(1.0)));
+    assert!(train.psnr.unwrap() > 60.0 && train.ssim.unwrap() > 0.999);
+    // f16 depth, divided and multiplied again in f32
+    assert!(train.depth_median_relative.unwrap() < 1e-5);
+    let mask = image::open(dir.path().join("masks/7/test_05.png")).unwrap().to_luma8();
+    let frame = truth.frames.iter().find(|f| f.stem == "test_05").unwrap();
+    let objects = truth.objects(frame).unwrap().unwrap();
+    assert!(mask.pixels().zip(&objects.data).all(|(m, &o)| (m.0[0] > 127) == (o == 7)));
+    assert!(dir.path().join("renders/train_03.png").exists());
+}
+
+#[test]
+fn iou_counts_pixels_and_resamples_masks() {
+    let objects = Plane { width: 4, height: 2, data: vec![1, 1, 0, 0, 1, 1, 0, 2] };
+    let mask = |data: Vec<bool>, width| Plane { width, height: data.len() / width, data };
+    let m = mask(vec![true, false, false, false, true, true, true, false], 4);
+    assert_eq!(iou(&m, &objects, 1).unwrap(), 3.0 / 5.0);
+    assert_eq!(iou(&mask(vec![true, false], 2), &objects, 1).unwrap(), 1.0);
+    assert_eq!(iou(&mask(vec![false; 8], 4), &objects, 9).unwrap(), 0.0);
+    assert!(iou(&mask(vec![], 1), &objects, 1).is_err());
+}
+
+#[test]
+fn depth_error_is_a_median_over_solid_pixels() {
+    let plane = |data: Vec<f32>| Plane { width: data.len(), height: 1, data };
+    let rendered = Rendered {
+        rgb: RgbImage::default(),
+        alpha: plane(vec![1.0, 1.0, 1.0, 0.2, 1.0]),
+        depth: plane(vec![1.0, 2.2, 4.0, 9.0, 0.0]),
+    };
+    let truth = plane(vec![2.0, 4.0, 4.0, 1.0, 1.0]);
+    let error = depth_error(&rendered, &truth, 2.0).unwrap();
+    assert!((error - 0.1).abs() < 1e-6, "{error}");
+    assert_eq!(depth_error(&rendered, &plane(vec![0.0; 5]), 1.0), None);
+}
+
+#[test]
+fn another_scenes_truth_is_refused() {
+    let (truth, mut scene, _) = moved();
+    scene.iter_mut().for_each(|c| c.name = format!("x{}", c.name.len()));
+    let text = Evaluation::new(truth, &scene, None).err().unwrap().to_string();
+    assert!(text.contains("0 of its train frames"), "{text}");
+    let text = GroundTruth::read(Path::new("/nonexistent")).unwrap_err().to_string();
+    assert!(text.contains("ground_truth.json"), "{text}");
+    let same = Similarity { scale: 1.0, rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
+    let camera = breakfast().frames[0].camera.clone();
+    assert_eq!(to_scene(&camera, &same), camera);
+}

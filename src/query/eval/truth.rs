@@ -1,0 +1,155 @@
+//! Ground-truth folders: `ground_truth.json`, photos, `masks/<stem>.png`, `depth/<stem>.npz`.
+use crate::format::npy;
+use crate::scene::{Camera, Plane, Pose, RgbImage};
+use crate::{Error, Result};
+use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Which frames the pipeline may have seen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Split {
+    /// Photos the scene was made from.
+    Train,
+    /// Held out.
+    Test,
+}
+
+impl Split {
+    /// As the ground truth spells it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Split::Train => "train",
+            Split::Test => "test",
+        }
+    }
+}
+
+/// One known view.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// Photo, relative to the folder.
+    pub file: String,
+    /// File name without extension.
+    pub stem: String,
+    /// Train or test.
+    pub split: Split,
+    /// Intrinsics and pose in the true world.
+    pub camera: Camera,
+}
+
+/// A ground-truth folder.
+#[derive(Clone, Debug)]
+pub struct GroundTruth {
+    /// Where it lies.
+    pub folder: PathBuf,
+    /// Object index → phrase; empty when the set has no labels.
+    pub labels: BTreeMap<u32, String>,
+    /// All views.
+    pub frames: Vec<Frame>,
+}
+
+#[derive(Deserialize)]
+struct File {
+    width: u32,
+    height: u32,
+    #[serde(default)]
+    labels: BTreeMap<u32, String>,
+    frames: Vec<FileFrame>,
+}
+
+#[derive(Deserialize)]
+struct FileFrame {
+    file: String,
+    split: Split,
+    fx: f64,
+    fy: f64,
+    cx: f64,
+    cy: f64,
+    world_to_camera: [[f64; 4]; 4],
+}
+
+impl GroundTruth {
+    /// Reads `ground_truth.json` of a folder.
+    pub fn read(folder: &Path) -> Result<Self> {
+        let path = folder.join("ground_truth.json");
+        let text = std::fs::read_to_string(&path).map_err(|e| {
+            Error::input(format!("{}: {e}; --ground-truth wants a folder with that file", path.display()))
+        })?;
+        let file: File = serde_json::from_str(&text)
+            .map_err(|e| Error::input(format!("{}: not a ground truth file: {e}", path.display())))?;
+        let (width, height) = (file.width, file.height);
+        let frame = |f: FileFrame| {
+            let m = f.world_to_camera;
+            let column = |c: usize| DVec3::new(m[0][c], m[1][c], m[2][c]);
+            let rotation = DMat3::from_cols(column(0), column(1), column(2));
+            let stem = Path::new(&f.file).file_stem().map(|s| s.to_string_lossy().into_owned());
+            let stem = stem.unwrap_or_default();
+            let pose = Pose { rotation, translation: column(3) };
+            let camera =
+                Camera { name: f.file.clone(), width, height, fx: f.fx, fy: f.fy, cx: f.cx, cy: f.cy, pose };
+            Frame { file: f.file, stem, split: f.split, camera }
+        };
+        let frames = file.frames.into_iter().map(frame).collect();
+        Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, frames })
+    }
+
+    /// The photo of a frame.
+    pub fn image(&self, frame: &Frame) -> Result<RgbImage> {
+        let path = self.folder.join(&frame.file);
+        let image = open(&path)?.to_rgb8();
+        let data = image.pixels().map(|p| p.0.map(|v| v as f32 / 255.0)).collect();
+        Ok(RgbImage { width: image.width() as usize, height: image.height() as usize, data })
+    }
+
+    /// Object index per pixel, if the set has masks.
+    pub fn objects(&self, frame: &Frame) -> Result<Option<Plane<u32>>> {
+        let path = self.folder.join("masks").join(format!("{}.png", frame.stem));
+        if self.labels.is_empty() || !path.exists() {
+            return Ok(None);
+        }
+        let image = open(&path)?.to_luma8();
+        let data = image.pixels().map(|p| p.0[0] as u32).collect();
+        Ok(Some(Plane { width: image.width() as usize, height: image.height() as usize, data }))
+    }
+
+    /// Camera z per pixel, 0 = unknown, if the set has depth.
+    pub fn depth(&self, frame: &Frame) -> Result<Option<Plane<f32>>> {
+        let path = self.folder.join("depth").join(format!("{}.npz", frame.stem));
+        if !path.exists() {
+            return Ok(None);
+        }
+        let arrays = npy::read_npz(&path)?;
+        match arrays.get("depth") {
+            Some(a) if a.shape.len() == 2 => {
+                Ok(Some(Plane { width: a.shape[1], height: a.shape[0], data: a.to_f32() }))
+            }
+            _ => Err(Error::input(format!("{}: no HxW array named depth", path.display()))),
+        }
+    }
+
+    /// Mean over frames of their mean known depth; the largest camera distance from their mean where no depth exists.
+    pub fn mean_depth(&self, frames: &[&Frame]) -> Result<f64> {
+        let mut means = Vec::new();
+        for frame in frames {
+            let Some(depth) = self.depth(frame)? else { continue };
+            let known: Vec<f64> = depth.data.iter().filter(|&&z| z > 0.0).map(|&z| z as f64).collect();
+            if !known.is_empty() {
+                means.push(known.iter().sum::<f64>() / known.len() as f64);
+            }
+        }
+        if !means.is_empty() {
+            return Ok(means.iter().sum::<f64>() / means.len() as f64);
+        }
+        let centres: Vec<DVec3> = frames.iter().map(|f| f.camera.pose.centre()).collect();
+        let mean = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
+        Ok(centres.iter().map(|c| (*c - mean).length()).fold(0.0, f64::max).max(f64::MIN_POSITIVE))
+    }
+}
+
+fn open(path: &Path) -> Result<image::DynamicImage> {
+    image::open(path)
+        .map_err(|e| Error::input(format!("{}: cannot be read as an image: {e}", path.display())))
+}
