@@ -342,6 +342,13 @@ impl Rasterizer {
         self.frame.status.write(&[0u32, 0])
     }
 
+    /// The tile lists of the last forward pass, row by row of tiles, nearest splat first. For tests and statistics.
+    pub fn tile_lists(&self) -> Result<Vec<Vec<u32>>> {
+        let ranges = self.frame.tile_ranges.read::<u32>()?;
+        let splats = self.frame.tile_splats.read::<u32>()?;
+        Ok(ranges.windows(2).map(|r| splats[r[0] as usize..r[1] as usize].to_vec()).collect())
+    }
+
     fn check(&self, params: &SplatBuffers) -> Result<()> {
         if params.count > self.capacity || params.feature_dim != self.frame.feature_dim {
             return Err(Error::work(format!(
