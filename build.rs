@@ -28,6 +28,7 @@ fn build() -> Result<(), String> {
     let out_dir = PathBuf::from(std::env::var("OUT_DIR").map_err(|e| format!("OUT_DIR: {e}"))?);
     let glsl = Path::new("glsl");
     let sources = source::collect(glsl)?;
+    compile::Compiler::warm(&out_dir, &sources);
     let compiler = compile::Compiler::new(&out_dir)?;
     let mut families = Vec::new();
     let mut errors = Vec::new();

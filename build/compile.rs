@@ -4,6 +4,7 @@ use crate::reflect::{self, Reflection};
 use crate::source::Source;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Raise when the options below change, so that cached modules are not reused.
 const CACHE_VERSION: u32 = 1;
@@ -40,35 +41,34 @@ impl Compiler {
         Ok(Self { shaderc, cache })
     }
 
-    /// Compiles every variant of a file.
+    /// Compiles every variant of a file, or takes it from the cache.
     pub fn family(&self, source: &Source) -> Result<Family, String> {
-        let subgroups: Vec<Option<u32>> = match source.subgroups.as_slice() {
-            [] => vec![None],
-            sizes => sizes.iter().copied().map(Some).collect(),
-        };
-        let atomics: &[Option<bool>] =
-            if source.float_atomics { &[Some(true), Some(false)] } else { &[None] };
         let mut modules = Vec::new();
-        for variant in product(&source.axes) {
-            for &subgroup_size in &subgroups {
-                for &float_atomics in atomics {
-                    let mut macros: Vec<(String, u32)> =
-                        source.axes.iter().zip(&variant).map(|((n, _), &v)| (n.clone(), v)).collect();
-                    macros.extend(subgroup_size.map(|s| ("SUBGROUP_SIZE".to_owned(), s)));
-                    macros.extend(float_atomics.map(|f| ("FLOAT_ATOMICS".to_owned(), u32::from(f))));
-                    let (spirv, reflection) = self.module(source, &macros)?;
-                    modules.push(Module {
-                        variant: variant.clone(),
-                        subgroup_size,
-                        float_atomics,
-                        spirv,
-                        reflection,
-                    });
-                }
-            }
+        for job in jobs(source) {
+            let (spirv, reflection) = self.module(source, &job.macros)?;
+            let Job { variant, subgroup_size, float_atomics, .. } = job;
+            modules.push(Module { variant, subgroup_size, float_atomics, spirv, reflection });
         }
         let axes = source.axes.iter().map(|(n, _)| n.clone()).collect();
         Ok(Family { name: source.name.clone(), path: source.path.clone(), axes, modules })
+    }
+
+    /// Fills the cache on all cores. Errors are left to [`Compiler::family`], which meets them again in a fixed order.
+    pub fn warm(out_dir: &Path, sources: &[Source]) {
+        let all: Vec<(&Source, Job)> =
+            sources.iter().flat_map(|s| jobs(s).into_iter().map(move |j| (s, j))).collect();
+        let next = AtomicUsize::new(0);
+        let workers = std::thread::available_parallelism().map_or(1, |n| n.get());
+        std::thread::scope(|scope| {
+            for _ in 0..workers {
+                scope.spawn(|| {
+                    let Ok(compiler) = Compiler::new(out_dir) else { return };
+                    while let Some((source, job)) = all.get(next.fetch_add(1, Ordering::Relaxed)) {
+                        let _ = compiler.module(source, &job.macros);
+                    }
+                });
+            }
+        });
     }
 
     /// One module: the path of its optimised SPIR-V and the reflection of the unoptimised one.
@@ -119,13 +119,47 @@ impl Compiler {
                 [] => e.to_string(),
                 _ => format!("{e}\n{file}: error: ... in the variant {macros:?}"),
             })?;
-        std::fs::write(target, artifact.as_binary_u8()).map_err(|e| format!("{}: {e}", target.display()))
+        // Written beside and renamed, so that an interrupted build leaves no half module in the cache.
+        let part = target.with_extension("part");
+        std::fs::write(&part, artifact.as_binary_u8())
+            .and_then(|()| std::fs::rename(&part, target))
+            .map_err(|e| format!("{}: {e}", target.display()))
     }
 }
 
 fn read_words(path: &Path) -> Result<Vec<u32>, String> {
     let bytes = std::fs::read(path).map_err(|e| format!("{}: {e}", path.display()))?;
     Ok(bytes.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
+}
+
+/// One module to be made.
+struct Job {
+    variant: Vec<u32>,
+    subgroup_size: Option<u32>,
+    float_atomics: Option<bool>,
+    macros: Vec<(String, u32)>,
+}
+
+/// Every combination of variant, subgroup size and atomics.
+fn jobs(source: &Source) -> Vec<Job> {
+    let subgroups: Vec<Option<u32>> = match source.subgroups.as_slice() {
+        [] => vec![None],
+        sizes => sizes.iter().copied().map(Some).collect(),
+    };
+    let atomics: &[Option<bool>] = if source.float_atomics { &[Some(true), Some(false)] } else { &[None] };
+    let mut jobs = Vec::new();
+    for variant in product(&source.axes) {
+        for &subgroup_size in &subgroups {
+            for &float_atomics in atomics {
+                let mut macros: Vec<(String, u32)> =
+                    source.axes.iter().zip(&variant).map(|((n, _), &v)| (n.clone(), v)).collect();
+                macros.extend(subgroup_size.map(|s| ("SUBGROUP_SIZE".to_owned(), s)));
+                macros.extend(float_atomics.map(|f| ("FLOAT_ATOMICS".to_owned(), u32::from(f))));
+                jobs.push(Job { variant: variant.clone(), subgroup_size, float_atomics, macros });
+            }
+        }
+    }
+    jobs
 }
 
 /// Cartesian product of the axes' values; one empty variant when there is no axis.
