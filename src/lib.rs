@@ -16,6 +16,7 @@ pub mod pose;
 pub mod progress;
 pub mod query;
 pub mod report;
+pub mod run;
 pub mod scene;
 
 #[doc(hidden)]

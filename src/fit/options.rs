@@ -4,7 +4,7 @@ use super::pose::PoseOptions;
 use super::schedule::Exponential;
 
 /// How much time a fit may take.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 pub enum Preset {
     /// A few hundred steps: minutes on a CPU device.
     Draft,
@@ -91,6 +91,19 @@ impl RgbOptions {
             Preset::Draft => Self::scaled(300, 2.0),
             Preset::Default => Self::scaled(1000, 1.0),
         }
+    }
+
+    /// The same options for another number of steps; schedules end with the run.
+    pub fn with_iterations(mut self, iterations: usize) -> Self {
+        self.iterations = iterations;
+        if self.rates.means.steps < 30_000 {
+            self.rates.means.steps = iterations;
+        }
+        if let Some(poses) = &mut self.poses {
+            poses.start = poses.start.min(iterations / 10);
+            poses.rate.steps = iterations;
+        }
+        self
     }
 
     fn scaled(iterations: usize, speed: f64) -> Self {

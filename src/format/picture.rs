@@ -71,6 +71,8 @@ pub struct Planes<'a> {
     pub depth: Option<&'a Plane<f32>>,
     /// feat.00 …: (d, [H, W, d] values).
     pub features: Option<(usize, &'a [f32])>,
+    /// code.s, code.m, code.l: one map per level, −1 = none.
+    pub codes: &'a [Plane<i32>],
 }
 
 /// Writes a scan-line, ZIP-compressed, 32-bit float OpenEXR file.
@@ -123,8 +125,12 @@ mod tests {
             RgbImage { width: w, height: h, data: (0..15).map(|i| [i as f32 * 0.1, -1.5, 2.0e5]).collect() };
         let depth = Plane { width: w, height: h, data: (0..15).map(|i| i as f32 * 1e-3).collect() };
         let features: Vec<f32> = (0..30).map(|i| i as f32).collect();
-        let planes =
-            Planes { rgb: Some(&rgb), alpha: None, depth: Some(&depth), features: Some((d, &features)) };
+        let planes = Planes {
+            rgb: Some(&rgb),
+            depth: Some(&depth),
+            features: Some((d, &features)),
+            ..Planes::default()
+        };
         write_exr(&path, (w, h), planes).unwrap();
         let image = read()
             .no_deep_data()

@@ -176,8 +176,9 @@ fn run_tables(report: &Report) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{AnswerShown, RunRecord, StageUsed};
+    use super::super::{AnswerShown, RunRecord};
     use super::*;
+    use crate::progress::StageRecord;
     use crate::scene::Plane;
 
     #[test]
@@ -192,7 +193,7 @@ mod tests {
             device: "<device>".into(),
             device_is_cpu: true,
             models: vec![],
-            stages: vec![StageUsed { name: "train".into(), seconds: 3.0, peak_memory: 1 << 30 }],
+            stages: vec![StageRecord { name: "train".into(), seconds: 3.0, peak_memory: 1 << 30 }],
             seconds: 3.5,
             statistics: serde_json::json!({"psnr": 31.5}),
             warnings: vec!["a < b".into()],

@@ -7,6 +7,8 @@ mod summary;
 pub use html::write_html;
 pub use summary::{duration, table};
 
+pub use crate::progress::StageRecord;
+
 use crate::format::{create_folder, picture};
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
@@ -22,17 +24,6 @@ pub struct ModelUsed {
     pub sha256: String,
     /// SPDX expression.
     pub licence: String,
-}
-
-/// Time and memory of one stage.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct StageUsed {
-    /// Stage name.
-    pub name: String,
-    /// Wall seconds.
-    pub seconds: f64,
-    /// Peak resident memory of the process up to the end of the stage, bytes; 0 where the system does not tell.
-    pub peak_memory: u64,
 }
 
 /// The content of `run.json`.
@@ -51,7 +42,7 @@ pub struct RunRecord {
     /// Model files that were used.
     pub models: Vec<ModelUsed>,
     /// Stages in order.
-    pub stages: Vec<StageUsed>,
+    pub stages: Vec<StageRecord>,
     /// Wall seconds of the run.
     pub seconds: f64,
     /// Splats, PSNR, match counts, codes per level: free-form.

@@ -1,5 +1,5 @@
 //! The closing table of a run on the terminal.
-use super::StageUsed;
+use super::StageRecord;
 use std::fmt::Write;
 
 /// "4.2 s", "3 min 05 s", "1 h 02 min".
@@ -14,7 +14,7 @@ pub fn duration(seconds: f64) -> String {
 }
 
 /// Seconds per stage with a bar, then (label, value) figures.
-pub fn table(stages: &[StageUsed], figures: &[(String, String)]) -> String {
+pub fn table(stages: &[StageRecord], figures: &[(String, String)]) -> String {
     let mut out = String::new();
     let total: f64 = stages.iter().map(|s| s.seconds).sum();
     let longest = stages.iter().map(|s| s.seconds).fold(1e-9, f64::max);
@@ -56,7 +56,7 @@ mod tests {
 
     #[test]
     fn the_table_adds_up() {
-        let stage = |name: &str, seconds| StageUsed { name: name.into(), seconds, peak_memory: 0 };
+        let stage = |name: &str, seconds| StageRecord { name: name.into(), seconds, peak_memory: 0 };
         let t = table(&[stage("photos", 1.0), stage("train", 120.0)], &[("splats".into(), "12,345".into())]);
         assert!(t.contains("2 min 01 s") && t.contains("12,345") && t.lines().count() == 4, "{t}");
     }

@@ -1,0 +1,311 @@
+//! What the user typed. [`super::plan`] says what it means.
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use std::path::PathBuf;
+
+/// Photos in, a 3D scene that answers text queries out.
+#[derive(Debug, Parser)]
+#[command(name = "splatvk", version, about, max_term_width = 100, arg_required_else_help = true)]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// One variant per command; each has its own file in `cli/`.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Photos → scene directory: cameras, splats, language, report
+    Run(RunArgs),
+    /// Posed photos → scene without language
+    Train(TrainArgs),
+    /// Scene + cameras → images
+    Render(RenderArgs),
+    /// Scene + texts → heat maps, masks, locations
+    Query(QueryArgs),
+    /// Scene against ground truth → figures
+    Eval(EvalArgs),
+    /// Scene → another program's format
+    Export(ExportArgs),
+    /// The installed models
+    Models(ModelsArgs),
+    /// What this machine has and what is missing
+    Doctor(DoctorArgs),
+}
+
+/// How much time a run may take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum PresetArg {
+    /// Minutes on a 2-core CPU
+    Draft,
+    /// Best quality for the time on a GPU
+    Default,
+    /// The paper's schedule and constants
+    Paper,
+}
+
+/// Options that every command working on a device takes.
+#[derive(Clone, Debug, Default, Args)]
+pub struct DeviceArgs {
+    /// Vulkan device: part of its name, or its number in `splatvk doctor`
+    #[arg(long, value_name = "NAME|INDEX")]
+    pub device: Option<String>,
+    /// Folder of the models
+    #[arg(long, value_name = "DIR")]
+    pub models: Option<PathBuf>,
+    /// Print one JSON object on standard output
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `splatvk run`
+#[derive(Debug, Args)]
+pub struct RunArgs {
+    /// Photos, or folders of photos (JPEG, PNG)
+    #[arg(required = true, value_name = "INPUT")]
+    pub inputs: Vec<PathBuf>,
+    /// How many photos to use, spread over the sorted names
+    #[arg(long, value_name = "N")]
+    pub views: Option<usize>,
+    /// Scene directory to write [default: out/<name of the input>]
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Replace a scene that is already there
+    #[arg(long)]
+    pub force: bool,
+    /// Time against quality [default: draft on a CPU device, default on a GPU]
+    #[arg(long, value_enum)]
+    pub preset: Option<PresetArg>,
+    /// Cameras and points: auto, sfm, or cameras:FILE (transforms.json, COLMAP folder, cameras.json)
+    #[arg(long, default_value = "auto", value_name = "SOURCE")]
+    pub init: String,
+    /// Dense matches for the alignment of masks: auto, xfeat
+    #[arg(long, default_value = "auto", value_name = "NAME")]
+    pub matcher: String,
+    /// Masks on three levels: auto, graph, or dir:DIR (<stem>_s.npy)
+    #[arg(long, default_value = "auto", value_name = "SOURCE")]
+    pub masks: String,
+    /// Region features: auto, words, or dir:DIR (<stem>_f.npy, text_embeddings.npz)
+    #[arg(long, default_value = "auto", value_name = "SOURCE")]
+    pub features: String,
+    /// Ask the finished scene; may be repeated
+    #[arg(long = "query", value_name = "TEXT")]
+    pub queries: Vec<String>,
+    /// Seed of everything random
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Optimisation steps of the colour stage, instead of the preset's
+    #[arg(long, value_name = "N")]
+    pub iterations: Option<usize>,
+    /// Optimisation steps of the language stage, instead of the preset's
+    #[arg(long, value_name = "N")]
+    pub language_iterations: Option<usize>,
+    /// Length of the codes that splats carry: 3, 8 or 16
+    #[arg(long, default_value_t = 16, value_name = "D")]
+    pub feature_dim: usize,
+    /// One model per level as in the paper, instead of one geometry for all three
+    #[arg(long)]
+    pub per_level: bool,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// `splatvk train`
+#[derive(Debug, Args)]
+pub struct TrainArgs {
+    /// Folder of the photos
+    #[arg(long, value_name = "DIR")]
+    pub images: PathBuf,
+    /// Cameras: transforms.json, a COLMAP model folder, or cameras.json
+    #[arg(long, value_name = "FILE")]
+    pub cameras: PathBuf,
+    /// Start from the points of this .ply instead of stereo
+    #[arg(long, value_name = "FILE")]
+    pub points: Option<PathBuf>,
+    /// Scene directory to write
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Replace a scene that is already there
+    #[arg(long)]
+    pub force: bool,
+    /// Time against quality [default: draft on a CPU device, default on a GPU]
+    #[arg(long, value_enum)]
+    pub preset: Option<PresetArg>,
+    /// Optimisation steps, instead of the preset's
+    #[arg(long, value_name = "N")]
+    pub iterations: Option<usize>,
+    /// Seed of everything random
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// What `render` can write.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Channel {
+    /// Colour
+    Rgb,
+    /// Accumulated opacity
+    Alpha,
+    /// Expected depth, world units
+    Depth,
+    /// Semantic features of every level
+    Features,
+    /// Index of the decoded code per level, −1 = none
+    Codes,
+}
+
+/// How `render` writes it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ImageFormat {
+    /// 8-bit preview
+    Png,
+    /// Float, multi-channel
+    Exr,
+    /// NumPy array
+    Npy,
+}
+
+/// `splatvk render`
+#[derive(Debug, Args)]
+pub struct RenderArgs {
+    /// Scene directory, or a Gaussian .ply
+    pub scene: PathBuf,
+    /// Cameras: transforms.json, a COLMAP model folder, or cameras.json
+    #[arg(long, value_name = "FILE")]
+    pub cameras: PathBuf,
+    /// Folder for the images
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// What to write
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "rgb")]
+    pub channels: Vec<Channel>,
+    /// How to write it
+    #[arg(long = "format", value_enum, value_delimiter = ',', default_value = "png")]
+    pub formats: Vec<ImageFormat>,
+    /// Device
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// `splatvk query`
+#[derive(Debug, Args)]
+pub struct QueryArgs {
+    /// Scene directory
+    pub scene: PathBuf,
+    /// What to look for
+    #[arg(required = true, value_name = "TEXT")]
+    pub texts: Vec<String>,
+    /// Views to answer in [default: the scene's own]
+    #[arg(long, value_name = "FILE")]
+    pub cameras: Option<PathBuf>,
+    /// Folder for heat maps and masks
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// How `eval` turns relevancy into masks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ProtocolArg {
+    /// Masks from codes; the default
+    Field,
+    /// Threshold on the smoothed, normalised map, as LERF evaluations do
+    Lerf,
+}
+
+/// `splatvk eval`
+#[derive(Debug, Args)]
+pub struct EvalArgs {
+    /// Scene directory
+    pub scene: PathBuf,
+    /// Folder with ground_truth.json
+    #[arg(long, value_name = "DIR")]
+    pub ground_truth: PathBuf,
+    /// Write every rendered view and predicted mask here
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// How masks are cut
+    #[arg(long, value_enum, default_value = "field")]
+    pub protocol: ProtocolArg,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// What `export` writes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ExportFormat {
+    /// INRIA .ply
+    Ply,
+    /// .splat
+    Splat,
+    /// COLMAP text model
+    Colmap,
+    /// nerfstudio transforms.json
+    Transforms,
+}
+
+/// `splatvk export`
+#[derive(Debug, Args)]
+pub struct ExportArgs {
+    /// Scene directory, or a Gaussian .ply
+    pub scene: PathBuf,
+    /// What to write
+    #[arg(long, value_enum)]
+    pub format: ExportFormat,
+    /// File (ply, splat, transforms) or folder (colmap)
+    #[arg(long, value_name = "PATH")]
+    pub out: PathBuf,
+    /// ply: spherical-harmonics degree of the file, padded with zeros; most viewers ask for 3
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(0..=3), value_name = "0-3")]
+    pub ply_degree: u32,
+    /// ply: add the language features and codes as extra columns
+    #[arg(long)]
+    pub with_features: bool,
+    /// Print one JSON object on standard output
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `splatvk models`
+#[derive(Debug, Args)]
+pub struct ModelsArgs {
+    /// What to do
+    #[command(subcommand)]
+    pub action: ModelsAction,
+}
+
+/// What `splatvk models` does.
+#[derive(Debug, Subcommand)]
+pub enum ModelsAction {
+    /// Every known model: role, licence, size, source, installed or not
+    List(DeviceArgs),
+    /// Verify the files of the installed models
+    Check(DeviceArgs),
+    /// Where models are looked for
+    Path(DeviceArgs),
+}
+
+/// `splatvk doctor`
+#[derive(Debug, Args)]
+pub struct DoctorArgs {
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_definitions_are_consistent() {
+        Cli::command().debug_assert();
+    }
+}

@@ -1,0 +1,69 @@
+//! `splatvk doctor`: what this machine has, and what to do about what it lacks.
+use super::args::DoctorArgs;
+use super::{models, print, print_json};
+use crate::gpu::report::{Line, Status, vulkan};
+use crate::infer::{self, Registry};
+use crate::{Error, Result};
+use serde_json::json;
+use std::fmt::Write;
+
+pub fn doctor(args: &DoctorArgs) -> Result<()> {
+    let mut lines = vulkan(args.device.device.as_deref());
+    lines.push(match infer::runtime() {
+        Ok(path) => line("ONNX Runtime", Status::Ok, path.display().to_string(), None),
+        Err(error) => line("ONNX Runtime", Status::Missing, "not usable".to_owned(), Some(error.to_string())),
+    });
+    let status = Registry::open(args.device.models.as_deref())?.status();
+    for m in &status {
+        let found = format!(
+            "{} · {:.1} MB · {} · sha256 {}",
+            m.file.display(),
+            m.bytes as f64 / 1e6,
+            m.licence,
+            m.sha256
+        );
+        let state = if m.installed { Status::Ok } else { Status::Missing };
+        lines.push(line(&format!("model {}", m.name), state, found, m.fix.clone()));
+    }
+    let missing = lines.iter().filter(|l| l.status == Status::Missing).count();
+    if args.device.json {
+        let lines: Vec<_> = lines
+            .iter()
+            .map(|l| json!({ "topic": l.topic, "status": word(l.status), "found": l.found, "advice": l.advice }))
+            .collect();
+        let models: Vec<_> = status.iter().map(models::to_json).collect();
+        print_json(&json!({ "ready": missing == 0, "lines": lines, "models": models }))?;
+    } else {
+        print(&table(&lines))?;
+    }
+    match missing {
+        0 => Ok(()),
+        n => Err(Error::missing(format!(
+            "{n} required parts are missing; follow the advice above, tools/setup does it all"
+        ))),
+    }
+}
+
+fn line(topic: &str, status: Status, found: String, advice: Option<String>) -> Line {
+    Line { topic: topic.to_owned(), status, found, advice }
+}
+
+fn word(status: Status) -> &'static str {
+    match status {
+        Status::Ok => "ok",
+        Status::Note => "note",
+        Status::Missing => "MISSING",
+    }
+}
+
+fn table(lines: &[Line]) -> String {
+    let mut text = String::new();
+    for l in lines {
+        // Writing to a String cannot fail.
+        let _ = writeln!(text, "{:<8} {:<28} {}", word(l.status), l.topic, l.found);
+        if let Some(advice) = &l.advice {
+            let _ = writeln!(text, "{:<8} {:<28} → {advice}", "", "");
+        }
+    }
+    text
+}

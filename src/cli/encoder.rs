@@ -1,0 +1,24 @@
+//! The text model that speaks a scene's language.
+use crate::format::scene_dir::{Scene, TEXT_EMBEDDINGS};
+use crate::infer::{RegionEncoder, Registry};
+use crate::run::{FeatureSource, sources};
+use crate::{Error, Result};
+
+/// The table of text embeddings that the scene carries, or the built-in model when the scene was made with it.
+pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncoder>> {
+    let table = scene.path.join(TEXT_EMBEDDINGS);
+    if table.is_file() {
+        return sources::table(&table);
+    }
+    let space = scene.language.as_ref().map_or("", |l| l.space.as_str());
+    let encoder = sources::encoder(&FeatureSource::Words, &registry)?;
+    if encoder.space() != space {
+        return Err(Error::input(format!(
+            "{}: its features are of the space \"{space}\", the installed text model speaks \"{}\"; put {TEXT_EMBEDDINGS} \
+             (phrase → vector) into the scene, or make it again",
+            scene.path.display(),
+            encoder.space()
+        )));
+    }
+    Ok(encoder)
+}

@@ -1,0 +1,151 @@
+//! What the arguments mean: defaults resolved, names understood, contradictions refused. No work happens here.
+use super::args::{DeviceArgs, PresetArg, RunArgs};
+use crate::run::{FeatureSource, InitSource, MaskSource, RunPlan};
+use crate::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// Networks that users may bring. The registry cannot run them yet; saying so beats "unknown name".
+const LARGE_MODELS: [&str; 7] = ["mast3r", "dust3r", "vggt", "sam", "clip", "lseg", "roma"];
+
+/// `splatvk run`
+pub fn run(args: &RunArgs) -> Result<RunPlan> {
+    if ![3, 8, 16].contains(&args.feature_dim) {
+        return Err(Error::input(format!("--feature-dim {}: choose 3, 8 or 16", args.feature_dim)));
+    }
+    for (flag, value) in
+        [("--iterations", args.iterations), ("--language-iterations", args.language_iterations)]
+    {
+        if value == Some(0) {
+            return Err(Error::input(format!("{flag} 0: give at least 1, or leave it out")));
+        }
+    }
+    match args.matcher.as_str() {
+        "auto" | "xfeat" => {}
+        other => return Err(unknown("--matcher", other, "auto, xfeat")),
+    }
+    if let Some(blank) = args.queries.iter().find(|q| q.trim().is_empty()) {
+        return Err(Error::input(format!("--query \"{blank}\": give a few words")));
+    }
+    Ok(RunPlan {
+        inputs: args.inputs.clone(),
+        views: args.views,
+        out: args.out.clone().unwrap_or_else(|| default_out(&args.inputs)),
+        force: args.force,
+        preset: args.preset.map(preset),
+        init: init(&args.init)?,
+        masks: masks(&args.masks)?,
+        features: features(&args.features)?,
+        queries: args.queries.clone(),
+        seed: args.seed,
+        iterations: args.iterations,
+        language_iterations: args.language_iterations,
+        feature_dim: args.feature_dim,
+        per_level: args.per_level,
+        device: args.device.device.clone(),
+        models: models(&args.device),
+    })
+}
+
+/// The folder of `--models`.
+pub fn models(args: &DeviceArgs) -> Option<PathBuf> {
+    args.models.clone()
+}
+
+/// The library's preset.
+pub fn preset(preset: PresetArg) -> crate::fit::Preset {
+    match preset {
+        PresetArg::Draft => crate::fit::Preset::Draft,
+        PresetArg::Default => crate::fit::Preset::Default,
+        PresetArg::Paper => crate::fit::Preset::Paper,
+    }
+}
+
+/// `out/<name>` beside where the command runs; a folder called `images` takes its parent's name.
+fn default_out(inputs: &[PathBuf]) -> PathBuf {
+    let first = inputs.first().map(PathBuf::as_path).unwrap_or(Path::new("scene"));
+    let folder = if first.is_file() { first.parent().unwrap_or(first) } else { first };
+    let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_path_buf());
+    let generic = |p: &Path| p.file_name().is_some_and(|n| n == "images" || n == "photos" || n == "input");
+    let named = if generic(&folder) { folder.parent().unwrap_or(&folder) } else { &folder };
+    Path::new("out").join(named.file_name().unwrap_or("scene".as_ref()))
+}
+
+fn init(text: &str) -> Result<InitSource> {
+    match text.split_once(':') {
+        Some(("cameras", file)) if !file.is_empty() => Ok(InitSource::Cameras(existing("--init", file)?)),
+        None if text == "auto" || text == "sfm" => Ok(InitSource::Sfm),
+        _ => Err(unknown("--init", text, "auto, sfm, cameras:FILE")),
+    }
+}
+
+fn masks(text: &str) -> Result<MaskSource> {
+    match text.split_once(':') {
+        Some(("dir", dir)) if !dir.is_empty() => Ok(MaskSource::Dir(existing("--masks", dir)?)),
+        None if text == "auto" || text == "graph" => Ok(MaskSource::Graph),
+        _ => Err(unknown("--masks", text, "auto, graph, dir:DIR")),
+    }
+}
+
+fn features(text: &str) -> Result<FeatureSource> {
+    match text.split_once(':') {
+        Some(("dir", dir)) if !dir.is_empty() => Ok(FeatureSource::Dir(existing("--features", dir)?)),
+        None if text == "auto" || text == "words" => Ok(FeatureSource::Words),
+        _ => Err(unknown("--features", text, "auto, words, dir:DIR")),
+    }
+}
+
+fn existing(flag: &str, path: &str) -> Result<PathBuf> {
+    let path = PathBuf::from(path);
+    if path.exists() {
+        return Ok(path);
+    }
+    Err(Error::input(format!("{flag}: {} does not exist; check the path", path.display())))
+}
+
+fn unknown(flag: &str, value: &str, choices: &str) -> Error {
+    if LARGE_MODELS.contains(&value) {
+        return Error::missing(format!(
+            "{flag} {value}: this release has no loader for that model yet; use one of: {choices}"
+        ));
+    }
+    Error::input(format!("{flag} {value}: unknown; use one of: {choices}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::args::{Cli, Command};
+    use clap::Parser;
+
+    fn plan(extra: &[&str]) -> Result<RunPlan> {
+        let line = ["splatvk", "run", "tests/data/breakfast/images"].iter().chain(extra);
+        match Cli::try_parse_from(line).unwrap().command {
+            Command::Run(args) => run(&args),
+            _ => unreachable!(),
+        }
+    }
+
+    #[test]
+    fn defaults_are_the_built_in_models() {
+        let plan = plan(&[]).unwrap();
+        assert_eq!(plan.out, Path::new("out/breakfast"));
+        assert_eq!((plan.init, plan.masks), (InitSource::Sfm, MaskSource::Graph));
+        assert_eq!((plan.features, plan.feature_dim), (FeatureSource::Words, 16));
+    }
+
+    #[test]
+    fn what_cannot_be_meant_is_refused_with_the_choices() {
+        for (extra, says) in [
+            (["--init", "colmap"], "auto, sfm, cameras:FILE"),
+            (["--init", "mast3r"], "no loader"),
+            (["--masks", "dir:nowhere"], "does not exist"),
+            (["--features", "clip"], "no loader"),
+            (["--matcher", "sift"], "auto, xfeat"),
+            (["--feature-dim", "5"], "3, 8 or 16"),
+            (["--query", " "], "a few words"),
+        ] {
+            let error = plan(&extra).unwrap_err();
+            assert!(error.exit_code() == 2 && error.to_string().contains(says), "{extra:?}: {error}");
+        }
+    }
+}

@@ -1,0 +1,168 @@
+//! `splatvk render`
+use super::args::{Channel, ImageFormat, RenderArgs};
+use super::outputs::Outputs;
+use super::progress::Terminal;
+use super::{listing, views};
+use crate::format::npy::{self, NpyArray};
+use crate::format::picture::{self, Planes};
+use crate::format::{cameras, scene_dir};
+use crate::gpu::Device;
+use crate::progress::Progress;
+use crate::report::colour;
+use crate::run::view::{DecodedFrame, Viewer};
+use crate::scene::{LEVEL_NAMES, LanguageField, Plane, RgbImage};
+use crate::{Error, Result};
+
+pub fn render(args: &RenderArgs) -> Result<()> {
+    let scene = scene_dir::load(&args.scene)?;
+    let cameras = cameras::read(&args.cameras)?;
+    let stems = views::stems(&cameras)?;
+    let wants_language = args.channels.iter().any(|c| matches!(c, Channel::Features | Channel::Codes));
+    if wants_language && scene.language.is_none() {
+        return Err(Error::input(format!(
+            "{}: the scene has no language, so no features and codes; leave them out of --channels",
+            args.scene.display()
+        )));
+    }
+    let nothing = LanguageField::default();
+    let field = if wants_language { scene.language.as_ref().unwrap_or(&nothing) } else { &nothing };
+    let mut out = Outputs::open(&args.out)?;
+    let device = Device::open(args.device.device.as_deref())?;
+    let mut viewer = Viewer::new(&device, &scene.splats, field)?;
+    let progress = Terminal::new();
+    progress.begin("render", cameras.len() as u64);
+    for (i, (camera, stem)) in cameras.iter().zip(&stems).enumerate() {
+        progress.check()?;
+        let view = viewer.view(camera)?;
+        for format in &args.formats {
+            match format {
+                ImageFormat::Png => png(&mut out, stem, &args.channels, &view, field)?,
+                ImageFormat::Exr => exr(&mut out, stem, &args.channels, &view)?,
+                ImageFormat::Npy => arrays(&mut out, stem, &args.channels, &view, field)?,
+            }
+        }
+        progress.step(i as u64 + 1, "");
+    }
+    progress.end();
+    listing(&out.keep(), args.device.json)
+}
+
+/// Levels of the field that have codes: (name, first feature channel, number of channels, index).
+fn levels(field: &LanguageField) -> Vec<(&'static str, usize, usize, usize)> {
+    let mut first = 0;
+    let mut out = Vec::new();
+    for (at, (name, level)) in LEVEL_NAMES.into_iter().zip(&field.levels).enumerate() {
+        if !level.codebook.is_empty() {
+            out.push((name, first, level.codebook.code_dim, at));
+            first += level.codebook.code_dim;
+        }
+    }
+    out
+}
+
+fn part(view: &DecodedFrame, first: usize, d: usize) -> Vec<f32> {
+    let pixels = view.frame.features.chunks_exact(view.frame.feature_dim.max(1));
+    pixels.flat_map(|f| f[first..first + d].iter().copied()).collect()
+}
+
+/// Previews: exact values are in the EXR and npy files.
+fn png(
+    out: &mut Outputs,
+    stem: &str,
+    channels: &[Channel],
+    view: &DecodedFrame,
+    field: &LanguageField,
+) -> Result<()> {
+    let frame = &view.frame;
+    for channel in channels {
+        match channel {
+            Channel::Rgb => picture::write_png(&out.file(&format!("{stem}.png"))?, &frame.rgb)?,
+            Channel::Alpha => {
+                picture::write_grey_png(&out.file(&format!("{stem}_alpha.png"))?, &frame.alpha)?
+            }
+            Channel::Depth => {
+                picture::write_png(
+                    &out.file(&format!("{stem}_depth.png"))?,
+                    &colour::depth_image(&frame.depth),
+                )?;
+            }
+            Channel::Features => {
+                for (name, first, d, _) in levels(field) {
+                    let image = false_colour(&part(view, first, d), d, &frame.alpha);
+                    picture::write_png(&out.file(&format!("{stem}_features_{name}.png"))?, &image)?;
+                }
+            }
+            Channel::Codes => {
+                for (name, _, _, at) in levels(field) {
+                    let image = colour::label_image(&view.codes[at]);
+                    picture::write_png(&out.file(&format!("{stem}_codes_{name}.png"))?, &image)?;
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The first three components of the unit features as a colour.
+fn false_colour(features: &[f32], d: usize, like: &Plane<f32>) -> RgbImage {
+    let colour = |f: &[f32]| {
+        let norm = f.iter().map(|v| v * v).sum::<f32>().sqrt();
+        [0, 1, 2].map(|k| if norm > 0.0 && k < d { 0.5 + 0.5 * f[k] / norm } else { 0.0 })
+    };
+    RgbImage {
+        width: like.width,
+        height: like.height,
+        data: features.chunks_exact(d.max(1)).map(colour).collect(),
+    }
+}
+
+fn exr(out: &mut Outputs, stem: &str, channels: &[Channel], view: &DecodedFrame) -> Result<()> {
+    let frame = &view.frame;
+    let has = |c: Channel| channels.contains(&c);
+    let planes = Planes {
+        rgb: has(Channel::Rgb).then_some(&frame.rgb),
+        alpha: has(Channel::Alpha).then_some(&frame.alpha),
+        depth: has(Channel::Depth).then_some(&frame.depth),
+        features: has(Channel::Features).then_some((frame.feature_dim, frame.features.as_slice())),
+        codes: if has(Channel::Codes) { &view.codes } else { &[] },
+    };
+    picture::write_exr(&out.file(&format!("{stem}.exr"))?, (frame.rgb.width, frame.rgb.height), planes)
+}
+
+fn arrays(
+    out: &mut Outputs,
+    stem: &str,
+    channels: &[Channel],
+    view: &DecodedFrame,
+    field: &LanguageField,
+) -> Result<()> {
+    let frame = &view.frame;
+    let size = (frame.rgb.width, frame.rgb.height);
+    for channel in channels {
+        match channel {
+            Channel::Rgb => {
+                let values: Vec<f32> = frame.rgb.data.iter().flatten().copied().collect();
+                picture::write_npy(&out.file(&format!("{stem}_rgb.npy"))?, size, Some(3), &values)?;
+            }
+            Channel::Alpha => {
+                picture::write_npy(&out.file(&format!("{stem}_alpha.npy"))?, size, None, &frame.alpha.data)?
+            }
+            Channel::Depth => {
+                picture::write_npy(&out.file(&format!("{stem}_depth.npy"))?, size, None, &frame.depth.data)?
+            }
+            Channel::Features => {
+                for (name, first, d, _) in levels(field) {
+                    let path = out.file(&format!("{stem}_features_{name}.npy"))?;
+                    picture::write_npy(&path, size, Some(d), &part(view, first, d))?;
+                }
+            }
+            Channel::Codes => {
+                for (name, _, _, at) in levels(field) {
+                    let codes = NpyArray::i32(&[size.1, size.0], view.codes[at].data.clone());
+                    npy::write(out.file(&format!("{stem}_codes_{name}.npy"))?, &codes)?;
+                }
+            }
+        }
+    }
+    Ok(())
+}

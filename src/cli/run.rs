@@ -1,0 +1,15 @@
+//! `splatvk run`
+use super::args::RunArgs;
+use super::progress::Terminal;
+use super::{plan, print, print_json};
+use crate::{Error, Result};
+
+pub fn run(args: &RunArgs) -> Result<()> {
+    let plan = plan::run(args)?;
+    let outcome = crate::run::run(&plan, &Terminal::new())?;
+    if args.device.json {
+        let record = serde_json::to_value(crate::run::run_record(&outcome));
+        return print_json(&record.map_err(|e| Error::work(format!("run record: {e}")))?);
+    }
+    print(&crate::run::closing_table(&outcome))
+}

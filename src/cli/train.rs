@@ -1,0 +1,28 @@
+//! `splatvk train`
+use super::args::TrainArgs;
+use super::plan;
+use super::progress::Terminal;
+use super::{print, print_json};
+use crate::Result;
+use crate::run::train::{TrainPlan, train as run};
+use serde_json::json;
+
+pub fn train(args: &TrainArgs) -> Result<()> {
+    let plan = TrainPlan {
+        images: args.images.clone(),
+        cameras: args.cameras.clone(),
+        points: args.points.clone(),
+        out: args.out.clone(),
+        force: args.force,
+        preset: args.preset.map(plan::preset),
+        iterations: args.iterations,
+        seed: args.seed,
+        device: args.device.device.clone(),
+        models: plan::models(&args.device),
+    };
+    let trained = run(&plan, &Terminal::new())?;
+    if args.device.json {
+        return print_json(&json!({ "out": plan.out, "run": trained.record }));
+    }
+    print(&trained.table)
+}

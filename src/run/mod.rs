@@ -1,0 +1,265 @@
+//! The whole pipeline on one page: photos → cameras, depth and points → splats → language → scene directory.
+mod record;
+pub mod sources;
+pub mod train;
+pub mod view;
+
+pub use record::{closing_table, run_record};
+
+use crate::Result;
+use crate::fit::{self, LanguageOptions, Preset, RgbOptions};
+use crate::format::scene_dir::{self, Contents};
+use crate::format::{Workspace, cameras};
+use crate::gpu::Device;
+use crate::infer::Registry;
+use crate::language::{self, BuildOptions};
+use crate::photo::{self, Photo};
+use crate::pose::{self, Geometry, InitChoice};
+use crate::progress::{Progress, Recorded, StageRecord};
+use crate::query::{QueryOptions, QueryResult};
+use crate::scene::{Camera, LanguageField, RgbImage, Splats};
+use std::path::PathBuf;
+use view::DecodedFrame;
+
+/// Where cameras and points come from.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub enum InitSource {
+    /// Structure from motion over the photos and stereo.
+    Sfm,
+    /// Known cameras from a file; stereo.
+    Cameras(PathBuf),
+}
+
+/// Where masks come from.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub enum MaskSource {
+    /// The built-in graph segmentation.
+    Graph,
+    /// Label maps `<stem>_s.npy` in a folder.
+    Dir(PathBuf),
+}
+
+/// Where region features and text embeddings come from.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub enum FeatureSource {
+    /// The built-in classifier and sentence encoder.
+    Words,
+    /// `<stem>_f.npy` and `text_embeddings.npz` in a folder.
+    Dir(PathBuf),
+}
+
+/// What to do, with every default that does not depend on the machine resolved.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct RunPlan {
+    /// Photos or folders of photos.
+    pub inputs: Vec<PathBuf>,
+    /// How many to use; `None` = as many as there are, at most [`photo::DEFAULT_VIEWS`].
+    pub views: Option<usize>,
+    /// Scene directory.
+    pub out: PathBuf,
+    /// Replace an existing scene.
+    pub force: bool,
+    /// `None` = draft on a CPU device, default elsewhere.
+    pub preset: Option<Preset>,
+    /// Cameras and points.
+    pub init: InitSource,
+    /// Masks.
+    pub masks: MaskSource,
+    /// Features.
+    pub features: FeatureSource,
+    /// Texts to answer once the scene is there.
+    pub queries: Vec<String>,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Steps of the colour stage instead of the preset's.
+    pub iterations: Option<usize>,
+    /// Steps of the language stage instead of the preset's.
+    pub language_iterations: Option<usize>,
+    /// Length of the codes.
+    pub feature_dim: usize,
+    /// One model per level.
+    pub per_level: bool,
+    /// Vulkan device.
+    pub device: Option<String>,
+    /// Folder of the models.
+    pub models: Option<PathBuf>,
+}
+
+/// The answers to one text, one per photo.
+#[derive(Clone, Debug)]
+pub struct Answers {
+    /// What was asked.
+    pub text: String,
+    /// Per photo.
+    pub views: Vec<QueryResult>,
+}
+
+impl Answers {
+    /// Photos in which the text was found.
+    pub fn found(&self) -> usize {
+        self.views.iter().filter(|v| v.found).count()
+    }
+}
+
+/// Everything a finished run knows; [`crate::report`] turns it into run.json, report.html and the summary.
+pub struct Outcome {
+    /// What was asked for.
+    pub plan: RunPlan,
+    /// The preset that was used.
+    pub preset: Preset,
+    /// The device that was used.
+    pub device: crate::gpu::DeviceInfo,
+    /// Photos at working resolution.
+    pub photos: Vec<Photo>,
+    /// Geometry before training.
+    pub geometry: Geometry,
+    /// Refined cameras.
+    pub cameras: Vec<Camera>,
+    /// The scene.
+    pub splats: Splats,
+    /// Figures of the colour stage.
+    pub rgb: fit::FitStats,
+    /// The scene's language.
+    pub field: LanguageField,
+    /// Masks, edges and components behind it.
+    pub alignment: language::align::Alignment,
+    /// Decode accuracy over the language stage.
+    pub language_curve: Vec<fit::LanguagePoint>,
+    /// The trained scene seen from every photo's camera.
+    pub frames: Vec<DecodedFrame>,
+    /// One per query of the plan.
+    pub answers: Vec<Answers>,
+    /// Models that were used.
+    pub models: Vec<crate::infer::ModelStatus>,
+    /// Seconds and memory per stage, up to the writing of the scene.
+    pub stages: Vec<StageRecord>,
+    /// What the user was warned of.
+    pub warnings: Vec<String>,
+}
+
+/// Runs the plan and writes the scene directory, whole or not at all.
+pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
+    let progress = &Recorded::new(progress);
+    let workspace = Workspace::create(&plan.out, plan.force)?;
+    let photos = photo::load_all(&plan.inputs, plan.views, progress)?;
+    let device = Device::open(plan.device.as_deref())?;
+    let registry = Registry::open(plan.models.as_deref())?;
+    // Whatever can be refused is read before the long work, not after it.
+    let init = match &plan.init {
+        InitSource::Sfm => InitChoice::Sfm,
+        InitSource::Cameras(file) => InitChoice::Cameras(cameras::read(file)?),
+    };
+    let given = sources::given_masks(&plan.masks, &plan.features, &photos)?;
+    let mut encoder = sources::encoder(&plan.features, &registry)?;
+    let queries = sources::queries(&plan.queries, encoder.as_mut())?;
+
+    let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
+    let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
+    let geometry = pose::initialise(&device, &photos, &init, &registry, progress)?;
+    let trained = fit::train_rgb(
+        &device,
+        &images,
+        &geometry.cameras,
+        &geometry.points,
+        Some(&geometry.depths),
+        &rgb_options(plan, preset),
+        progress,
+    )?;
+
+    let masks = match given {
+        Some(masks) => masks,
+        None => sources::graph_masks(&images, &geometry, &registry, progress)?,
+    };
+    let masks = sources::with_features(masks, &images, encoder.as_mut(), progress)?;
+    let matches = sources::matches(&images, &geometry, &registry, progress)?;
+    let options = BuildOptions {
+        feature_dim: plan.feature_dim,
+        space: encoder.space().to_owned(),
+        seed: plan.seed,
+        ..BuildOptions::default()
+    };
+    let built = language::build(&masks, &geometry.cameras, &geometry.depths, &matches, &options, progress)?;
+    let spoken = fit::train_language(
+        &device,
+        &images,
+        &trained.cameras,
+        &trained.splats,
+        built.field,
+        &language_options(plan, preset),
+        progress,
+    )?;
+
+    progress.begin("query", 1);
+    let frames = view::decode_all(&device, &spoken.splats, &spoken.field, &trained.cameras)?;
+    let mut answers = Vec::with_capacity(queries.len());
+    for query in &queries {
+        let one =
+            |f: &DecodedFrame| crate::query::answer(&f.codes, &spoken.field, query, &QueryOptions::default());
+        answers.push(Answers {
+            text: query.text.clone(),
+            views: frames.iter().map(one).collect::<Result<_>>()?,
+        });
+    }
+    progress.end();
+    let outcome = Outcome {
+        plan: plan.clone(),
+        preset,
+        device: device.info().clone(),
+        photos,
+        geometry,
+        cameras: trained.cameras,
+        splats: spoken.splats,
+        rgb: trained.stats,
+        field: spoken.field,
+        alignment: built.alignment,
+        language_curve: spoken.curve,
+        frames,
+        answers,
+        models: registry.status(),
+        stages: progress.stages(),
+        warnings: progress.warnings(),
+    };
+    write(workspace, &outcome, progress)?;
+    Ok(outcome)
+}
+
+fn rgb_options(plan: &RunPlan, preset: Preset) -> RgbOptions {
+    let mut options = RgbOptions::preset(preset);
+    options.seed = plan.seed;
+    if let Some(n) = plan.iterations {
+        options = options.with_iterations(n);
+    }
+    options
+}
+
+fn language_options(plan: &RunPlan, preset: Preset) -> LanguageOptions {
+    let mut options = LanguageOptions::preset(preset);
+    options.seed = plan.seed;
+    options.per_level |= plan.per_level;
+    options.iterations = plan.language_iterations.unwrap_or(options.iterations);
+    options
+}
+
+fn write(workspace: Workspace, outcome: &Outcome, progress: &dyn Progress) -> Result<()> {
+    progress.begin("write", 2);
+    progress.check()?;
+    let table = match &outcome.plan.features {
+        FeatureSource::Dir(dir) => Some(dir.join(sources::TEXT_TABLE)),
+        FeatureSource::Words => None,
+    };
+    let contents = Contents {
+        splats: &outcome.splats,
+        cameras: &outcome.cameras,
+        photos: &outcome.photos,
+        points: Some(&outcome.geometry.points),
+        language: Some(&outcome.field),
+        text_embeddings: table.as_deref(),
+    };
+    scene_dir::write(workspace.path(), &contents)?;
+    progress.step(1, "");
+    record::write(workspace.path(), outcome)?;
+    progress.check()?;
+    workspace.commit()?;
+    progress.end();
+    Ok(())
+}

@@ -1,0 +1,145 @@
+//! What a finished run says about itself: `run.json`, the report and the closing table, made from [`Outcome`].
+use super::{Answers, Outcome};
+use crate::Result;
+use crate::report::{self, AnswerShown, ModelUsed, QueryShown, Report, RunRecord, ViewShown};
+use crate::scene::LEVEL_NAMES;
+use serde_json::json;
+use std::path::Path;
+
+/// `run.json`.
+pub fn run_record(o: &Outcome) -> RunRecord {
+    let used = |m: &&crate::infer::ModelStatus| m.installed;
+    RunRecord {
+        program: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
+        config: json!({ "plan": o.plan, "preset": o.preset }),
+        seed: o.plan.seed,
+        device: o.device.name.clone(),
+        device_is_cpu: o.device.is_cpu,
+        models: o
+            .models
+            .iter()
+            .filter(used)
+            .map(|m| ModelUsed { name: m.name.clone(), sha256: m.sha256.clone(), licence: m.licence.clone() })
+            .collect(),
+        seconds: o.stages.iter().map(|s| s.seconds).sum(),
+        stages: o.stages.clone(),
+        statistics: statistics(o),
+        warnings: o.warnings.clone(),
+    }
+}
+
+fn statistics(o: &Outcome) -> serde_json::Value {
+    let levels: Vec<_> = LEVEL_NAMES
+        .iter()
+        .zip(&o.field.levels)
+        .enumerate()
+        .map(|(at, (name, level))| {
+            json!({
+                "level": name, "codes": level.codebook.len(), "min_chord": level.codebook.min_chord,
+                "decode_accuracy": o.language_curve.last().and_then(|p| p.accuracy.get(at)),
+            })
+        })
+        .collect();
+    json!({
+        "photos": o.photos.iter().map(|p| p.path.display().to_string()).collect::<Vec<_>>(),
+        "geometry": {
+            "method": o.geometry.method, "points": o.geometry.points.len(),
+            "focal_px": o.cameras.iter().map(|c| c.fx).collect::<Vec<_>>(),
+            "focal_log_sigma": o.geometry.focal_log_sigma,
+        },
+        "splats": { "start": o.rgb.splats[0], "end": o.splats.len() },
+        "psnr_train": o.rgb.psnr, "poses_refined": o.rgb.poses_refined,
+        "loss": o.rgb.curve.iter().map(|p| json!([p.step, p.loss])).collect::<Vec<_>>(),
+        "levels": levels,
+        "alignment": o.alignment.report,
+        "queries": o.answers.iter().map(answer_json).collect::<Vec<_>>(),
+    })
+}
+
+fn answer_json(a: &Answers) -> serde_json::Value {
+    let views: Vec<_> = a
+        .views
+        .iter()
+        .map(|v| {
+            json!({
+                "found": v.found, "score": v.score, "level": LEVEL_NAMES[v.level],
+                "location": [v.location.0, v.location.1],
+            })
+        })
+        .collect();
+    json!({ "text": a.text, "found": a.found(), "views": views })
+}
+
+/// Figures for the head of the report and the closing table: (label, value).
+fn figures(o: &Outcome) -> Vec<(String, String)> {
+    let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
+    let mut list = vec![
+        ("device".to_owned(), format!("{}{cpu}", o.device.name)),
+        ("splats".to_owned(), o.splats.len().to_string()),
+        ("train PSNR".to_owned(), format!("{:.2} dB", o.rgb.mean_psnr())),
+    ];
+    if let (Some(sigma), Some(camera)) = (o.geometry.focal_log_sigma, o.cameras.first()) {
+        list.push(("focal length".to_owned(), format!("{:.1} px ± {:.1} %", camera.fx, 100.0 * sigma)));
+    }
+    let codes = |k: usize| o.field.levels.get(k).map_or(0, |l| l.codebook.len());
+    list.push(("things s/m/l".to_owned(), format!("{} / {} / {}", codes(0), codes(1), codes(2))));
+    for a in &o.answers {
+        list.push((format!("“{}”", a.text), format!("found in {} of {} photos", a.found(), a.views.len())));
+    }
+    list
+}
+
+/// The table that ends `splatvk run`.
+pub fn closing_table(o: &Outcome) -> String {
+    format!("{}  {:<12}  {}\n", report::table(&o.stages, &figures(o)), "scene", o.plan.out.display())
+}
+
+/// Writes `run.json`, `report.html` and `previews/`.
+pub(super) fn write(folder: &Path, o: &Outcome) -> Result<()> {
+    let record = run_record(o);
+    record.write(folder)?;
+    let levels: Vec<Vec<_>> =
+        o.frames.iter().map(|f| LEVEL_NAMES.into_iter().zip(f.codes.iter().cloned()).collect()).collect();
+    let views = o
+        .photos
+        .iter()
+        .enumerate()
+        .map(|(i, p)| ViewShown {
+            name: &p.stem,
+            photo: &p.image,
+            render: Some(&o.frames[i].frame.rgb),
+            depth: Some(&o.frames[i].frame.depth),
+            levels: &levels[i],
+            psnr: o.rgb.psnr.get(i).copied(),
+        })
+        .collect();
+    let title = o.plan.out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let report = Report {
+        title: &title,
+        views,
+        queries: o.answers.iter().map(shown).collect(),
+        psnr_curve: Vec::new(),
+        space: Some(&o.field.space),
+        figures: figures(o),
+        run: &record,
+    };
+    report::write_html(folder, &report)?;
+    report::write_previews(folder, &report)
+}
+
+fn shown(a: &Answers) -> QueryShown<'_> {
+    let answers = a
+        .views
+        .iter()
+        .enumerate()
+        .map(|(view, v)| AnswerShown {
+            view,
+            relevancy: &v.relevancy,
+            mask: Some(&v.mask),
+            score: v.score,
+            found: v.found,
+            level: LEVEL_NAMES[v.level],
+        })
+        .collect();
+    QueryShown { text: &a.text, answers }
+}

@@ -1,0 +1,168 @@
+//! Masks, features and text embeddings from wherever the plan says they come from.
+use super::{FeatureSource, MaskSource};
+use crate::infer::hed::Hed;
+use crate::infer::words::RegionWords;
+use crate::infer::xfeat::XFeat;
+use crate::infer::{RegionEncoder, Registry};
+use crate::language::align::{PairLinks, links_from_warps};
+use crate::language::dir::{self, TextEmbeddings};
+use crate::language::{ViewMasks, graph, matcher};
+use crate::photo::Photo;
+use crate::pose::Geometry;
+use crate::progress::Progress;
+use crate::query::{CANONICAL_PHRASES, TextQuery};
+use crate::scene::{Plane, RgbImage};
+use crate::{Error, Result};
+use std::path::Path;
+
+/// File of the text embeddings in a `dir:` folder.
+pub const TEXT_TABLE: &str = "text_embeddings.npz";
+
+/// Masks from a folder, with their features if those come from a folder too; `None` for built-in masks.
+pub fn given_masks(
+    masks: &MaskSource,
+    features: &FeatureSource,
+    photos: &[Photo],
+) -> Result<Option<Vec<ViewMasks>>> {
+    let (masks, features) = match (masks, features) {
+        (MaskSource::Dir(m), FeatureSource::Dir(f)) => (m, Some(f)),
+        (MaskSource::Dir(m), FeatureSource::Words) => (m, None),
+        (MaskSource::Graph, FeatureSource::Words) => return Ok(None),
+        (MaskSource::Graph, FeatureSource::Dir(f)) => {
+            return Err(Error::input(format!(
+                "--features dir:{0}: precomputed features belong to precomputed masks; add --masks dir:{0}",
+                f.display()
+            )));
+        }
+    };
+    if features.is_some_and(|f| f != masks) {
+        return Err(Error::input("--masks and --features: give the same dir: folder for both"));
+    }
+    photos.iter().map(|p| dir::read_view(masks, p, features.is_some())).collect::<Result<_>>().map(Some)
+}
+
+/// Text embeddings of a `dir:` folder behind the encoder boundary; region features were read with the masks.
+struct Table {
+    texts: TextEmbeddings,
+    space: String,
+}
+
+impl RegionEncoder for Table {
+    fn space(&self) -> &str {
+        &self.space
+    }
+    fn dim(&self) -> usize {
+        self.texts.dim
+    }
+    fn embed_regions(&mut self, _: &RgbImage, _: &Plane<i32>, _: usize) -> Result<Vec<f32>> {
+        Err(Error::work("precomputed features cannot describe new regions; give --masks dir: with them"))
+    }
+    fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
+        self.texts.embed(texts)
+    }
+}
+
+/// Space name of precomputed features.
+pub const DIR_SPACE: &str = "dir";
+
+/// The encoder behind `--features`.
+pub fn encoder(source: &FeatureSource, registry: &Registry) -> Result<Box<dyn RegionEncoder>> {
+    match source {
+        FeatureSource::Words => Ok(Box::new(RegionWords::load(Registry::open(Some(registry.folder()))?)?)),
+        FeatureSource::Dir(dir) => table(&dir.join(TEXT_TABLE)),
+    }
+}
+
+/// The encoder of a table of text embeddings.
+pub fn table(path: &Path) -> Result<Box<dyn RegionEncoder>> {
+    Ok(Box::new(Table { texts: TextEmbeddings::read(path)?, space: DIR_SPACE.to_owned() }))
+}
+
+/// Embeds texts for [`crate::query::answer`].
+pub fn queries(texts: &[String], encoder: &mut dyn RegionEncoder) -> Result<Vec<TextQuery>> {
+    if texts.is_empty() {
+        return Ok(Vec::new());
+    }
+    let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
+    let list: Vec<&str> = texts.iter().map(String::as_str).collect();
+    let rows = encoder.embed_texts(&list)?;
+    let query = |(text, row): (&String, &[f32])| TextQuery {
+        text: text.clone(),
+        embedding: row.to_vec(),
+        canonicals: canonicals.clone(),
+    };
+    Ok(texts.iter().zip(rows.chunks_exact(encoder.dim())).map(query).collect())
+}
+
+/// The built-in masks, helped by learned edges and stereo depth.
+pub fn graph_masks(
+    images: &[RgbImage],
+    geometry: &Geometry,
+    registry: &Registry,
+    progress: &dyn Progress,
+) -> Result<Vec<ViewMasks>> {
+    progress.begin("masks", images.len() as u64);
+    let mut hed = Hed::load(registry)?;
+    let mut masks = Vec::with_capacity(images.len());
+    for (i, image) in images.iter().enumerate() {
+        progress.check()?;
+        let edges = hed.edges(image)?;
+        let depth = Some((&geometry.cameras[i], &geometry.depths[i]));
+        masks.push(graph::segment(image, Some(&edges), depth, &graph::GraphOptions::default())?);
+        progress.step(i as u64 + 1, "");
+    }
+    progress.end();
+    Ok(masks)
+}
+
+/// Fills in the features that no folder gave.
+pub fn with_features(
+    mut masks: Vec<ViewMasks>,
+    images: &[RgbImage],
+    encoder: &mut dyn RegionEncoder,
+    progress: &dyn Progress,
+) -> Result<Vec<ViewMasks>> {
+    progress.begin("features", masks.iter().map(|m| m.levels.len() as u64).sum());
+    let mut done = 0;
+    for (view, image) in masks.iter_mut().zip(images) {
+        for level in &mut view.levels {
+            progress.check()?;
+            if level.features.is_empty() && !level.quality.is_empty() {
+                level.features = encoder.embed_regions(image, &level.labels, level.quality.len())?;
+            }
+            done += 1;
+            progress.step(done, "");
+        }
+    }
+    progress.end();
+    Ok(masks)
+}
+
+/// Dense matches of every unordered pair of views, for step 1 of the alignment.
+pub fn matches(
+    images: &[RgbImage],
+    geometry: &Geometry,
+    registry: &Registry,
+    progress: &dyn Progress,
+) -> Result<Vec<PairLinks>> {
+    let views = images.len();
+    let pairs: Vec<(usize, usize)> = (0..views).flat_map(|i| (i + 1..views).map(move |j| (i, j))).collect();
+    progress.begin("match", (views + pairs.len()) as u64);
+    let mut xfeat = XFeat::load(registry)?;
+    let mut dense = Vec::with_capacity(views);
+    for image in images {
+        progress.check()?;
+        dense.push(xfeat.dense(image)?);
+        progress.step(dense.len() as u64, "");
+    }
+    let mut links = Vec::with_capacity(pairs.len());
+    for (i, j) in pairs {
+        progress.check()?;
+        let cameras = (&geometry.cameras[i], &geometry.cameras[j]);
+        let (forward, backward) = matcher::xfeat(&dense[i], &dense[j], cameras);
+        links.push(links_from_warps(i, j, &forward, &backward));
+        progress.step((views + links.len()) as u64, "");
+    }
+    progress.end();
+    Ok(links)
+}

@@ -1,0 +1,220 @@
+//! Posed photos → scene without language: `splatvk train`.
+use crate::fit::{self, Preset, RgbOptions};
+use crate::format::scene_dir::{self, Contents};
+use crate::format::{Workspace, cameras, colmap, ply};
+use crate::gpu::Device;
+use crate::infer::Registry;
+use crate::photo::{self, Photo};
+use crate::pose::{self, Geometry, InitChoice};
+use crate::progress::{Progress, Recorded};
+use crate::report::{self, Report, RunRecord, ViewShown};
+use crate::run::view::Viewer;
+use crate::scene::{Camera, LanguageField, PointCloud, RgbImage};
+use crate::{Error, Result};
+use serde_json::json;
+use std::path::{Path, PathBuf};
+
+/// What to do.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct TrainPlan {
+    /// Folder of photos.
+    pub images: PathBuf,
+    /// Camera file or COLMAP model folder.
+    pub cameras: PathBuf,
+    /// Points to start from (`.ply` or a COLMAP model folder) instead of stereo.
+    pub points: Option<PathBuf>,
+    /// Scene directory.
+    pub out: PathBuf,
+    /// Replace an existing scene.
+    pub force: bool,
+    /// `None` = draft on a CPU device, default elsewhere.
+    pub preset: Option<Preset>,
+    /// Steps instead of the preset's.
+    pub iterations: Option<usize>,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Vulkan device.
+    pub device: Option<String>,
+    /// Folder of the models.
+    pub models: Option<PathBuf>,
+}
+
+/// What a finished training tells.
+pub struct TrainOutcome {
+    /// Content of run.json.
+    pub record: RunRecord,
+    /// Closing table for a terminal.
+    pub table: String,
+}
+
+/// Photos that have a camera, in name order; photos without one are named in a warning.
+fn matched(plan: &TrainPlan, known: &[Camera], progress: &dyn Progress) -> Result<Vec<Photo>> {
+    let found = photo::find(std::slice::from_ref(&plan.images))?;
+    let has = |p: &&PathBuf| {
+        let stem = p.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+        known.iter().any(|c| cameras::stem(&c.name) == stem)
+    };
+    let paths: Vec<PathBuf> = found.photos.iter().filter(has).cloned().collect();
+    if paths.len() < 2 {
+        return Err(Error::input(format!(
+            "{}: {} of {} photos have a camera in {}, at least 2 are needed; names must match without extension",
+            plan.images.display(),
+            paths.len(),
+            found.photos.len(),
+            plan.cameras.display()
+        )));
+    }
+    if paths.len() < found.photos.len() {
+        progress
+            .warn(&format!("{} photos have no camera and are left out", found.photos.len() - paths.len()));
+    }
+    photo::load_all(&paths, Some(paths.len()), progress)
+}
+
+fn points(path: &Path) -> Result<PointCloud> {
+    if path.is_dir() { colmap::read_points(path) } else { ply::read_points(path) }
+}
+
+/// Gives points from a file the footprint that initialisation wants: `z / f` in the camera that sees them nearest.
+fn with_footprints(mut cloud: PointCloud, list: &[Camera]) -> Result<PointCloud> {
+    let mut keep = PointCloud::default();
+    for i in 0..cloud.len() {
+        let p = glam::Vec3::from_array(cloud.positions[i]).as_dvec3();
+        let seen = list.iter().enumerate().filter_map(|(v, c)| {
+            let (pixel, z) = c.project(p);
+            let inside =
+                pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < c.width as f64 && pixel.y < c.height as f64;
+            (z > 0.0 && inside).then_some((v, (z / c.fx) as f32))
+        });
+        if let Some((view, radius)) = seen.min_by(|a, b| a.1.total_cmp(&b.1)) {
+            keep.positions.push(cloud.positions[i]);
+            keep.colours.push(cloud.colours[i]);
+            keep.confidence.push(cloud.confidence[i]);
+            keep.view.push(view as u8);
+            keep.radius.push(radius);
+        }
+    }
+    std::mem::swap(&mut cloud, &mut keep);
+    if cloud.is_empty() {
+        return Err(Error::input(
+            "--points: no point is seen by any camera; are both in the same coordinates?",
+        ));
+    }
+    Ok(cloud)
+}
+
+/// Runs the plan and writes the scene directory, whole or not at all.
+pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> {
+    let progress = &Recorded::new(progress);
+    let workspace = Workspace::create(&plan.out, plan.force)?;
+    let known = cameras::read(&plan.cameras)?;
+    let given = plan.points.as_deref().map(points).transpose()?;
+    let photos = matched(plan, &known, progress)?;
+    let device = Device::open(plan.device.as_deref())?;
+    let registry = Registry::open(plan.models.as_deref())?;
+    let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
+    let geometry = match given {
+        Some(cloud) => from_points(&photos, &known, cloud)?,
+        None => pose::initialise(&device, &photos, &InitChoice::Cameras(known), &registry, progress)?,
+    };
+    let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
+    let mut options = RgbOptions::preset(preset);
+    options.seed = plan.seed;
+    if let Some(n) = plan.iterations {
+        options = options.with_iterations(n);
+    }
+    let depths = (!geometry.depths.is_empty()).then_some(geometry.depths.as_slice());
+    let trained =
+        fit::train_rgb(&device, &images, &geometry.cameras, &geometry.points, depths, &options, progress)?;
+
+    progress.begin("write", 1);
+    let nothing = LanguageField::default();
+    let mut viewer = Viewer::new(&device, &trained.splats, &nothing)?;
+    let frames = trained.cameras.iter().map(|c| viewer.view(c)).collect::<Result<Vec<_>>>()?;
+    let contents = Contents {
+        splats: &trained.splats,
+        cameras: &trained.cameras,
+        photos: &photos,
+        points: Some(&geometry.points),
+        language: None,
+        text_embeddings: None,
+    };
+    scene_dir::write(workspace.path(), &contents)?;
+    progress.end();
+    let stages = progress.stages();
+    let record = RunRecord {
+        program: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
+        config: json!({ "plan": plan, "preset": preset }),
+        seed: plan.seed,
+        device: device.info().name.clone(),
+        device_is_cpu: device.info().is_cpu,
+        models: Vec::new(),
+        seconds: stages.iter().map(|s| s.seconds).sum(),
+        stages,
+        statistics: json!({
+            "geometry": { "method": geometry.method, "points": geometry.points.len() },
+            "splats": { "start": trained.stats.splats[0], "end": trained.splats.len() },
+            "psnr_train": trained.stats.psnr, "poses_refined": trained.stats.poses_refined,
+        }),
+        warnings: progress.warnings(),
+    };
+    let figures = vec![
+        ("device".to_owned(), device.info().name.clone()),
+        ("splats".to_owned(), trained.splats.len().to_string()),
+        ("train PSNR".to_owned(), format!("{:.2} dB", trained.stats.mean_psnr())),
+    ];
+    let views = photos.iter().zip(&frames).zip(&trained.stats.psnr);
+    let views = views.map(|((p, f), psnr)| ViewShown {
+        name: &p.stem,
+        photo: &p.image,
+        render: Some(&f.frame.rgb),
+        depth: Some(&f.frame.depth),
+        levels: &[],
+        psnr: Some(*psnr),
+    });
+    let title = plan.out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let shown = Report {
+        title: &title,
+        views: views.collect(),
+        queries: Vec::new(),
+        psnr_curve: Vec::new(),
+        space: None,
+        figures: figures.clone(),
+        run: &record,
+    };
+    record.write(workspace.path())?;
+    report::write_html(workspace.path(), &shown)?;
+    report::write_previews(workspace.path(), &shown)?;
+    progress.check()?;
+    workspace.commit()?;
+    let table = format!("{}scene is in {}\n", report::table(&record.stages, &figures), plan.out.display());
+    Ok(TrainOutcome { record, table })
+}
+
+fn from_points(photos: &[Photo], known: &[Camera], cloud: PointCloud) -> Result<Geometry> {
+    let cameras = photos.iter().map(|p| camera_of(p, known)).collect::<Result<Vec<_>>>()?;
+    let points = with_footprints(cloud, &cameras)?;
+    Ok(Geometry {
+        points,
+        cameras,
+        depths: Vec::new(),
+        focal_log_sigma: None,
+        method: "cameras+points".into(),
+    })
+}
+
+/// The photo's camera at its working resolution; sizes may differ, the aspect may not.
+fn camera_of(photo: &Photo, known: &[Camera]) -> Result<Camera> {
+    let bad = |what: &str| Error::input(format!("{}: {what}", photo.path.display()));
+    let camera = known.iter().find(|c| cameras::stem(&c.name) == photo.stem);
+    let camera = camera.ok_or_else(|| bad("no camera with this name"))?;
+    let (w, h) = (photo.image.width as f64, photo.image.height as f64);
+    // 1 %: sizes are whole numbers, and working sizes are truncated.
+    if (camera.width as f64 / camera.height as f64 / (w / h) - 1.0).abs() > 0.01 {
+        return Err(bad(&format!(
+            "its camera is for {} × {} pixels, another aspect",
+            camera.width, camera.height
+        )));
+    }
+    Ok(camera.resized(photo.image.width as u32, photo.image.height as u32))
+}

@@ -1,0 +1,308 @@
+//! The program as a user runs it: what it refuses, how it says so, and that it leaves nothing half-written.
+mod fixture;
+
+use fixture::{data, scene, small_views};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+fn splatvk() -> Command {
+    let mut c = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+    // Paths of the developer's shell must not decide the outcome.
+    c.env_remove("SPLATVK_MODELS").stdin(Stdio::null());
+    c
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+/// Runs a command that must fail with `code` and exactly one error line, which contains all the words.
+fn refuses(command: &mut Command, code: i32, words: &[&str]) -> Output {
+    let output = command.output().unwrap();
+    let stderr = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{command:?}\n{stderr}");
+    let errors: Vec<&str> = stderr.lines().filter(|l| l.starts_with("splatvk: ")).collect();
+    assert!(
+        errors.len() == 1 && stderr.lines().last() == Some(errors[0]),
+        "one error line, the last one:\n{stderr}"
+    );
+    for w in words {
+        assert!(errors[0].contains(w), "{w:?} is not in: {}", errors[0]);
+    }
+    assert!(!stderr.contains("panicked"), "{stderr}");
+    output
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(folder).unwrap();
+    let mut names: Vec<String> =
+        entries.map(|e| e.unwrap().file_name().to_string_lossy().into_owned()).collect();
+    names.sort();
+    names
+}
+
+/// `splatvk run INPUT... --out FOLDER/scene` must be refused, and FOLDER must stay empty.
+fn run_refuses(inputs: &[&Path], options: &[&str], words: &[&str]) {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = splatvk();
+    command.arg("run").args(inputs).args(options).arg("--out").arg(folder.path().join("scene"));
+    refuses(&mut command, 2, words);
+    assert!(names(folder.path()).is_empty(), "left behind: {:?}", names(folder.path()));
+}
+
+#[test]
+fn photos_that_cannot_be_used() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path();
+    run_refuses(&[dir], &[], &["no photos"]);
+    run_refuses(&[&dir.join("missing")], &[], &["missing"]);
+    std::fs::write(dir.join("clip.mp4"), b"\0\0\0\x18ftypmp42........").unwrap();
+    run_refuses(&[dir], &[], &["clip.mp4", "video"]);
+    run_refuses(&[&dir.join("clip.mp4")], &[], &["clip.mp4", "video"]);
+    let photo = |i: usize| data(&format!("breakfast/images/train_{i:02}.jpg"));
+    std::fs::copy(photo(0), dir.join("a.jpg")).unwrap();
+    run_refuses(&[dir], &[], &["a.jpg", "only one photo"]);
+    std::fs::copy(photo(0), dir.join("b.jpg")).unwrap();
+    run_refuses(&[dir], &[], &["a.jpg", "b.jpg", "the same photo twice"]);
+    let whole = std::fs::read(photo(1)).unwrap();
+    std::fs::write(dir.join("b.jpg"), &whole[..whole.len() * 2 / 3]).unwrap();
+    run_refuses(&[dir], &[], &["b.jpg", "cut off"]);
+    std::fs::write(dir.join("b.jpg"), b"this is text").unwrap();
+    run_refuses(&[dir], &[], &["b.jpg", "not an image"]);
+    std::fs::write(dir.join("b.jpg"), b"").unwrap();
+    run_refuses(&[dir], &[], &["b.jpg", "empty"]);
+}
+
+#[test]
+fn views_must_fit_the_photos() {
+    let photos = data("breakfast/images");
+    run_refuses(&[&photos], &["--views", "5"], &["--views 5", "only 4"]);
+    run_refuses(&[&photos], &["--views", "1"], &["--views 1", "at least 2"]);
+    run_refuses(&[&photos], &["--views", "0"], &["--views 0"]);
+}
+
+#[test]
+fn bad_usage_is_exit_code_two() {
+    for args in [&["run"][..], &["frobnicate"], &["run", "x", "--views", "many"], &["render", "x"], &[]] {
+        let output = splatvk().args(args).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{args:?}");
+        assert!(output.stdout.is_empty() && !output.stderr.is_empty(), "{args:?}");
+    }
+    let help = splatvk().arg("--help").output().unwrap();
+    assert!(help.status.success() && text(&help.stdout).contains("doctor"));
+}
+
+#[test]
+fn output_that_cannot_be_written_is_found_before_the_work() {
+    let folder = tempfile::tempdir().unwrap();
+    let photos = data("breakfast/images");
+    let run = |out: PathBuf, words: &[&str]| {
+        let start = Instant::now();
+        refuses(splatvk().arg("run").arg(&photos).arg("--out").arg(out), 2, words);
+        assert!(start.elapsed() < Duration::from_secs(5), "the work must not start");
+    };
+    let file = folder.path().join("file");
+    std::fs::write(&file, "x").unwrap();
+    run(file.clone(), &["file is in the way"]);
+    run(file.join("scene"), &["cannot write"]);
+    run(PathBuf::from("/proc/splatvk-scene"), &["cannot write"]);
+    let precious = folder.path().join("precious");
+    std::fs::create_dir(&precious).unwrap();
+    std::fs::write(precious.join("letter.txt"), "x").unwrap();
+    run(precious.clone(), &["not empty"]);
+    run(scene().to_path_buf(), &["already holds a scene", "--force"]);
+    let mut force = splatvk();
+    force.arg("run").arg(&photos).arg("--force").arg("--out").arg(&precious);
+    refuses(&mut force, 2, &["not a scene"]);
+    assert_eq!(names(folder.path()), ["file", "precious"]);
+    assert!(scene().join("scene.json").exists());
+}
+
+#[test]
+fn missing_and_corrupt_models_are_named_with_their_checksum() {
+    let folder = tempfile::tempdir().unwrap();
+    let models = folder.path().join("models");
+    std::fs::create_dir(&models).unwrap();
+    let photos = data("breakfast/images");
+    run_refuses(&[&photos], &["--models", models.to_str().unwrap()], &["sha256", "tools/"]);
+    let listed = splatvk().args(["models", "list", "--json", "--models"]).arg(&models).output().unwrap();
+    assert!(listed.status.success());
+    let list: serde_json::Value = serde_json::from_slice(&listed.stdout).unwrap();
+    let list = list["models"].as_array().unwrap();
+    assert!(
+        list.len() >= 5
+            && list.iter().all(|m| m["installed"] == false && m["sha256"].as_str().unwrap().len() == 64)
+    );
+    for m in list {
+        std::fs::write(m["file"].as_str().unwrap(), b"damaged").unwrap();
+    }
+    run_refuses(&[&photos], &["--models", models.to_str().unwrap()], &["sha256", "tools/"]);
+    let mut check = splatvk();
+    check.args(["models", "check", "--models"]).arg(&models);
+    refuses(&mut check, 2, &["sha256"]);
+    run_refuses(&[&photos], &["--models", folder.path().join("none").to_str().unwrap()], &["none"]);
+}
+
+#[test]
+fn no_vulkan_device_is_said_before_the_work() {
+    let folder = tempfile::tempdir().unwrap();
+    let hidden = |c: &mut Command| {
+        c.env("VK_DRIVER_FILES", "/nonexistent.json").env("VK_ICD_FILENAMES", "/nonexistent.json");
+    };
+    let mut run = splatvk();
+    hidden(&mut run);
+    run.arg("run").arg(data("breakfast/images")).arg("--out").arg(folder.path().join("scene"));
+    refuses(&mut run, 2, &["Vulkan", "mesa-vulkan-drivers"]);
+    assert!(names(folder.path()).is_empty());
+    let mut doctor = splatvk();
+    hidden(&mut doctor);
+    let output = refuses(doctor.arg("doctor"), 2, &["missing"]);
+    assert!(text(&output.stdout).contains("MISSING"), "{}", text(&output.stdout));
+    run_refuses(&[&data("breakfast/images")], &["--device", "no such device"], &["no such device"]);
+}
+
+#[test]
+fn ctrl_c_stops_cleanly() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut child = splatvk()
+        .arg("run")
+        .arg(data("breakfast/images"))
+        .arg("--out")
+        .arg(folder.path().join("scene"))
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let start = Instant::now();
+    while names(folder.path()).is_empty() {
+        assert!(start.elapsed() < Duration::from_secs(60), "the run never started");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    // Half a second into the work: reading photos is over, finding features is not.
+    std::thread::sleep(Duration::from_millis(500));
+    let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(killed.success());
+    let sent = Instant::now();
+    let status = child.wait().unwrap();
+    let mut stderr = String::new();
+    std::io::Read::read_to_string(&mut child.stderr.take().unwrap(), &mut stderr).unwrap();
+    assert_eq!(status.code(), Some(130), "{stderr}");
+    assert!(stderr.lines().last().unwrap().contains("nothing was written"), "{stderr}");
+    assert!(names(folder.path()).is_empty(), "left behind: {:?}", names(folder.path()));
+    // The longest step between two checks, on a busy machine.
+    assert!(sent.elapsed() < Duration::from_secs(60), "took {:?} to stop", sent.elapsed());
+}
+
+/// Runs through a shell that limits the size of every written file, as a full disk does; the limit is in 512-byte blocks.
+fn limited(blocks: u32, args: &[&std::ffi::OsStr]) -> Command {
+    let mut c = Command::new("sh");
+    // Without the trap the kernel ends the process instead of failing the write.
+    c.arg("-c").arg(format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$0\" \"$@\""));
+    c.arg(env!("CARGO_BIN_EXE_splatvk")).args(args);
+    c
+}
+
+#[test]
+fn a_full_disk_leaves_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("deep/a.ply");
+    let args = [
+        "export".as_ref(),
+        scene().as_os_str(),
+        "--format".as_ref(),
+        "ply".as_ref(),
+        "--out".as_ref(),
+        out.as_os_str(),
+    ];
+    refuses(&mut limited(8, &args), 2, &["a.ply", "limit"]);
+    assert!(names(&folder.path().join("deep")).is_empty());
+    let (images, cameras, points) = small_views();
+    let out = folder.path().join("scene");
+    let args = [
+        "train".as_ref(),
+        "--images".as_ref(),
+        images.as_os_str(),
+        "--cameras".as_ref(),
+        cameras.as_os_str(),
+        "--points".as_ref(),
+        points.as_os_str(),
+        "--iterations".as_ref(),
+        "2".as_ref(),
+        "--out".as_ref(),
+        out.as_os_str(),
+    ];
+    refuses(&mut limited(8, &args), 2, &["limit"]);
+    assert_eq!(names(folder.path()), ["deep"]);
+}
+
+#[test]
+fn the_scene_of_a_run_is_whole_and_can_be_replaced() {
+    let scene = scene();
+    let expected = ["cameras", "point_cloud.ply", "previews", "report.html", "run.json", "scene.json"];
+    assert_eq!(names(scene), expected);
+    let run: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(scene.join("run.json")).unwrap()).unwrap();
+    assert!(run["stages"].as_array().unwrap().len() >= 2 && run["seed"] == 0 && run["device"].is_string());
+    assert!(names(scene.parent().unwrap()).iter().all(|n| !n.contains("partial") && !n.contains("old")));
+}
+
+#[test]
+fn scenes_render_export_and_answer_only_what_they_know() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("renders");
+    let cameras = scene().join("cameras/transforms.json");
+    let mut render = splatvk();
+    render.arg("render").arg(scene()).arg("--cameras").arg(&cameras).arg("--out").arg(&out);
+    render.args(["--channels", "rgb,alpha,depth", "--format", "png,exr,npy", "--json"]);
+    let output = render.output().unwrap();
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let listed: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let files = listed["files"].as_array().unwrap();
+    // Three PNG, one EXR and three npy per view.
+    assert_eq!((files.len(), names(&out).len()), (2 * 7, 2 * 7));
+    let depth = splatvk::format::npy::read(out.join("train_00_depth.npy")).unwrap();
+    assert_eq!(depth.shape, [120, 160]);
+    assert!(depth.to_f32().iter().any(|z| *z > 0.3), "the table is about 0.7 m away");
+    let picture = image::open(out.join("train_00.png")).unwrap().to_rgb8();
+    assert!(picture.dimensions() == (160, 120) && picture.pixels().any(|p| p.0[0] > 60));
+
+    let mut features = splatvk();
+    features
+        .arg("render")
+        .arg(scene())
+        .arg("--cameras")
+        .arg(&cameras)
+        .arg("--out")
+        .arg(folder.path().join("none"));
+    refuses(features.args(["--channels", "features"]), 2, &["no language"]);
+    let mut query = splatvk();
+    query.arg("query").arg(scene()).arg("lemon").arg("--out").arg(folder.path().join("none"));
+    refuses(&mut query, 2, &["no language"]);
+    for (format, name) in
+        [("ply", "a.ply"), ("splat", "a.splat"), ("colmap", "model"), ("transforms", "t.json")]
+    {
+        let mut export = splatvk();
+        export.arg("export").arg(scene()).args(["--format", format, "--out"]).arg(folder.path().join(name));
+        assert!(export.status().unwrap().success(), "{format}");
+        assert!(folder.path().join(name).exists());
+    }
+    assert_eq!(names(folder.path()), ["a.ply", "a.splat", "model", "renders", "t.json"]);
+    let mut nothing = splatvk();
+    nothing
+        .arg("render")
+        .arg(folder.path().join("model"))
+        .arg("--cameras")
+        .arg(&cameras)
+        .arg("--out")
+        .arg(&out);
+    refuses(&mut nothing, 2, &["not a scene directory"]);
+}
+
+#[test]
+fn a_closed_pipe_is_no_failure() {
+    let mut child =
+        splatvk().args(["models", "list"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert!(output.stderr.is_empty(), "{}", text(&output.stderr));
+}
