@@ -136,6 +136,7 @@ fn breakfast_with_exact_geometry() {
     options.iterations = knob("ITERATIONS", options.iterations as f64) as usize;
     options.depth_weight = knob("DEPTH", options.depth_weight);
     options.ratio_weight = knob("RATIO", options.ratio_weight);
+    options.margin = knob("MARGIN", options.margin);
     options.init.opacity = knob("OPACITY", options.init.opacity.into()) as f32;
     options.init.footprint = knob("FOOTPRINT", options.init.footprint.into()) as f32;
     options.init.neighbours = knob("NEIGHBOURS", options.init.neighbours.into()) as f32;

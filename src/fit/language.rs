@@ -6,10 +6,10 @@ use super::options::{FeatureGauge, LanguageOptions};
 use super::scale::SceneScale;
 use super::schedule::ViewOrder;
 use super::views::Views;
-use crate::gpu::{Buffer, Device, Program, Recorder, shaders};
+use crate::gpu::{Buffer, Device, Program, Recorder};
 use crate::pass::rasterizer::RasterOptions;
-use crate::pass::sum;
 use crate::pass::twin::FeatureMode;
+use crate::pass::{codes, codes::Mode, gauge, sum};
 use crate::progress::Progress;
 use crate::scene::{Camera, LEVEL_NAMES, LanguageField, LevelField, RgbImage, Splats};
 use crate::{Error, Result};
@@ -257,19 +257,12 @@ impl<'a> Run<'a> {
             );
         }
         let loss = &self.losses[item.stage];
-        self.targets.record(&mut rec, view, frame, loss, false);
+        codes::record(&mut rec, &self.targets.of(view), frame, loss, Mode::Loss);
         sum::record(&mut rec, loss, &self.partials, &stage.sums, LANGUAGE_SUM);
         stage.raster.record_backward(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
         if let FeatureGauge::Normalised { epsilon } = self.options.gauge {
-            let blocks = self.blocks();
-            let call = shaders::feature_gauge_backward::call(
-                &shaders::feature_gauge_backward::Bindings {
-                    raw: &self.raw,
-                    gradients: &self.model.gradients.features,
-                },
-                &shaders::feature_gauge_backward::Push { blocks, width: self.width as u32, epsilon },
-            );
-            rec.dispatch(call, gauge_groups(blocks));
+            let gradients = &self.model.gradients.features;
+            gauge::record_backward(&mut rec, &self.raw, gradients, self.blocks(), self.width, epsilon);
         }
         self.model.record_feature_step(&mut rec, &self.raw, &frame.status);
         if !self.options.detach_geometry {
@@ -278,19 +271,16 @@ impl<'a> Run<'a> {
         rec.compile()
     }
 
-    fn blocks(&self) -> u32 {
-        (self.model.count() * self.levels.len()) as u32
+    /// One block of d channels per splat and level.
+    fn blocks(&self) -> usize {
+        self.model.count() * self.levels.len()
     }
 
     /// Rendered features from raw ones.
     fn record_gauge(&self, rec: &mut Recorder) {
         if let FeatureGauge::Normalised { epsilon } = self.options.gauge {
-            let blocks = self.blocks();
-            let call = shaders::feature_gauge::call(
-                &shaders::feature_gauge::Bindings { raw: &self.raw, features: &self.model.values.features },
-                &shaders::feature_gauge::Push { blocks, width: self.width as u32, epsilon },
-            );
-            rec.dispatch(call, gauge_groups(blocks));
+            let features = &self.model.values.features;
+            gauge::record(rec, &self.raw, features, self.blocks(), self.width, epsilon);
         }
     }
 
@@ -348,13 +338,6 @@ impl<'a> Run<'a> {
 
 fn level_names(levels: usize) -> String {
     if levels == LEVEL_NAMES.len() { LEVEL_NAMES.join("/") } else { String::new() }
-}
-
-/// Workgroups of 64 in rows of at most 32768.
-fn gauge_groups(blocks: u32) -> [u32; 3] {
-    let groups = blocks.div_ceil(64).max(1);
-    let row = groups.min(32768);
-    [row, groups.div_ceil(row), 1]
 }
 
 /// (pixels that decode to their label, labelled pixels) of planar features [d, H·W].

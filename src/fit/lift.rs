@@ -3,8 +3,9 @@
 use super::model::Model;
 use super::options::FeatureGauge;
 use super::views::Views;
-use crate::gpu::{Buffer, Device, Recorder, shaders};
-use crate::pass::rasterizer::{FrameBuffers, RasterOptions};
+use crate::gpu::{Buffer, Device, Recorder};
+use crate::pass::codes::{self, Mode, Targets};
+use crate::pass::rasterizer::RasterOptions;
 use crate::scene::{Camera, Codebook, LevelField, RgbImage};
 use crate::{Error, Result};
 
@@ -62,34 +63,15 @@ impl CodeTargets {
         })
     }
 
-    /// Records the language loss of a view: the feature planes of the upstream stack, and per pixel the loss; with
-    /// `lifting` the upstream is the code itself.
-    pub(super) fn record(
-        &self,
-        rec: &mut Recorder,
-        view: usize,
-        frame: &FrameBuffers,
-        loss: &Buffer,
-        lifting: bool,
-    ) {
-        let pixels = frame.width * frame.height;
-        let call = shaders::code_l1::call(
-            &shaders::code_l1::Bindings {
-                labels: &self.labels[view],
-                codes: &self.codes,
-                weights: &self.weights[view],
-                planes: &frame.planes,
-                upstream: &frame.planes_grad,
-                loss,
-            },
-            &shaders::code_l1::Push {
-                pixels,
-                levels: self.levels,
-                width: self.width,
-                mode: u32::from(lifting),
-            },
-        );
-        rec.dispatch_threads(call, [pixels, 1, 1]);
+    /// What the language loss of one view reads.
+    pub(super) fn of(&self, view: usize) -> Targets<'_> {
+        Targets {
+            labels: &self.labels[view],
+            codes: &self.codes,
+            weights: &self.weights[view],
+            levels: self.levels,
+            width: self.width,
+        }
     }
 }
 
@@ -133,7 +115,7 @@ pub(super) fn lift(
         let frame = stage.raster.frame();
         let scratch = device.buffer::<f32>("language loss", (frame.width * frame.height) as usize)?;
         let mut rec = Recorder::new(device, "lift");
-        targets.record(&mut rec, view, frame, &scratch, true);
+        codes::record(&mut rec, &targets.of(view), frame, &scratch, Mode::Lift);
         stage.raster.record_backward(&mut rec, &model.values, raster, &model.gradients);
         rec.run()?;
         let seen = model.gradients.features.read_range::<f32>(0..total)?;

@@ -3,6 +3,7 @@ pub mod densify;
 pub mod init;
 mod language;
 mod lift;
+mod margin;
 mod model;
 pub mod options;
 pub mod pose;

@@ -1,23 +1,27 @@
 //! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (ALGORITHMS 7).
 use super::densify::densify;
 use super::init::splats_from_points;
+use super::margin::margin_splats;
 use super::model::Model;
 use super::options::RgbOptions;
 use super::pose::PoseAdam;
 use super::scale::SceneScale;
 use super::schedule::{Random, ViewOrder};
 use super::views::Views;
-use crate::gpu::{Device, Program, Recorder, shaders};
+use crate::gpu::{Device, Program, Recorder};
 use crate::pass::densify::GradientStats;
 use crate::pass::metrics::psnr;
 use crate::pass::rasterizer::RasterOptions;
 use crate::pass::twin::FeatureMode;
-use crate::pass::{compact, ssim_l1::ImageLoss};
+use crate::pass::{compact, regularise, ssim_l1::ImageLoss};
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, PointCloud, RgbImage, Splats};
 use crate::{Error, Result};
 use std::time::Instant;
 
+/// Photos of 8 bits cannot show more than their rounding noise, 10·log10(12·255²) = 58.9 dB: a render that happens to
+/// match exactly must not outweigh all other views.
+const MOST_PSNR: f64 = 60.0;
 /// Scale ratios above this are penalised (ALGORITHMS 7.7).
 const RATIO_LIMIT: f32 = 8.0;
 
@@ -79,6 +83,10 @@ pub fn train_rgb(
     progress: &dyn Progress,
 ) -> Result<Trained> {
     let mut start = splats_from_points(points, &options.init, options.seed)?;
+    if let Some(depths) = depths.filter(|_| options.margin > 0.0) {
+        let (reach, confidence) = (options.margin, options.min_confidence);
+        start.append(margin_splats(images, cameras, depths, reach, confidence, options.seed));
+    }
     super::init::raise_sh_degree(&mut start, options.sh_degree);
     let scale = SceneScale::of(cameras, points);
     fit_rgb(device, images, cameras, start, scale, depths, options, progress)
@@ -230,51 +238,21 @@ impl<'a> Run<'a> {
             weights,
             (&stage.sums, 0),
         );
-        let pixels = frame.width * frame.height;
-        match &item.depth {
-            Some((reference, count)) => {
-                let call = shaders::depth_l1::call(
-                    &shaders::depth_l1::Bindings {
-                        reference,
-                        planes: &frame.planes,
-                        transmittance: &frame.transmittance,
-                        upstream: &frame.planes_grad,
-                    },
-                    &shaders::depth_l1::Push {
-                        pixels,
-                        alpha_plane: 4,
-                        weight: (self.options.depth_weight / *count as f64) as f32,
-                    },
-                );
-                rec.dispatch_threads(call, [pixels, 1, 1]);
-            }
-            // Another view of this size may have left its depth gradients there.
-            None => {
-                let clear = shaders::clear_depth_gradient::call(
-                    &shaders::clear_depth_gradient::Bindings { upstream: &frame.planes_grad },
-                    &shaders::clear_depth_gradient::Push { pixels, alpha_plane: 4 },
-                );
-                rec.dispatch_threads(clear, [pixels, 1, 1]);
-            }
-        }
+        // Without depth of its own, a view clears what another of its size may have left.
+        let (reference, pixels) = match &item.depth {
+            Some((reference, count)) => (Some(reference), *count as f64),
+            None => (None, 1.0),
+        };
+        regularise::record_depth(&mut rec, frame, reference, self.options.depth_weight / pixels);
         stage.raster.record_backward(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
         if let Some(stats) = &self.stats {
             stats.record(&mut rec, frame, self.model.count());
         }
         if self.options.ratio_weight > 0.0 {
-            let count = self.model.count() as u32;
-            let call = shaders::ratio_penalty::call(
-                &shaders::ratio_penalty::Bindings {
-                    log_scales: &self.model.values.log_scales,
-                    gradients: &self.model.gradients.log_scales,
-                },
-                &shaders::ratio_penalty::Push {
-                    count,
-                    weight: (self.options.ratio_weight / f64::from(count)) as f32,
-                    limit: RATIO_LIMIT,
-                },
-            );
-            rec.dispatch_threads(call, [count, 1, 1]);
+            let count = self.model.count();
+            let (values, gradients) = (&self.model.values.log_scales, &self.model.gradients.log_scales);
+            let weight = self.options.ratio_weight / count as f64;
+            regularise::record_ratio(&mut rec, values, gradients, count, weight, RATIO_LIMIT);
         }
         self.model.record_step(&mut rec, &frame.status);
         rec.compile()

@@ -31,6 +31,15 @@ impl Splats {
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
     }
+    /// Adds the rows of `other`, which must have the same SH degree.
+    pub fn append(&mut self, mut other: Splats) {
+        debug_assert_eq!(self.sh_degree, other.sh_degree);
+        self.means.append(&mut other.means);
+        self.log_scales.append(&mut other.log_scales);
+        self.quats.append(&mut other.quats);
+        self.opacity_logits.append(&mut other.opacity_logits);
+        self.sh.append(&mut other.sh);
+    }
     /// Coefficients per channel.
     pub fn sh_len(&self) -> usize {
         sh_coefficients(self.sh_degree)

@@ -1,0 +1,146 @@
+//! Regularisers of the RGB stage (ALGORITHMS 7.7): depth near the stereo depth, and no needles.
+use super::rasterizer::FrameBuffers;
+use crate::gpu::{Buffer, Recorder, shaders};
+
+/// Records `weight · Σ |D − A·d|/d` over pixels with reference depth d > 0, as gradients by D = Σwz and A; without a
+/// reference both gradients become zero. Weight: divide by the number of pixels for a mean.
+pub fn record_depth(rec: &mut Recorder, frame: &FrameBuffers, reference: Option<&Buffer>, weight: f64) {
+    let pixels = frame.width * frame.height;
+    let alpha_plane = 4 + frame.feature_dim as u32;
+    let call = match reference {
+        Some(reference) => shaders::depth_l1::call(
+            &shaders::depth_l1::Bindings {
+                reference,
+                planes: &frame.planes,
+                transmittance: &frame.transmittance,
+                upstream: &frame.planes_grad,
+            },
+            &shaders::depth_l1::Push { pixels, alpha_plane, weight: weight as f32 },
+        ),
+        None => shaders::clear_depth_gradient::call(
+            &shaders::clear_depth_gradient::Bindings { upstream: &frame.planes_grad },
+            &shaders::clear_depth_gradient::Push { pixels, alpha_plane },
+        ),
+    };
+    rec.dispatch_threads(call, [pixels, 1, 1]);
+}
+
+/// The CPU twin: (loss, gradients by D and by A).
+pub fn depth_l1(depth: &[f64], alpha: &[f64], reference: &[f64], weight: f64) -> (f64, Vec<[f64; 2]>) {
+    let mut loss = 0.0;
+    let gradient = (0..depth.len()).map(|i| {
+        let d = reference[i];
+        if d <= 0.0 {
+            return [0.0; 2];
+        }
+        let difference = depth[i] - alpha[i] * d;
+        loss += weight * difference.abs() / d;
+        [weight * difference.signum() / d, -weight * difference.signum()]
+    });
+    let gradient = gradient.collect();
+    (loss, gradient)
+}
+
+/// Records `gradients += ∂/∂log_scales (weight · Σ max(0, s_max/s_min − limit))`, both [N, 3].
+pub fn record_ratio(
+    rec: &mut Recorder,
+    log_scales: &Buffer,
+    gradients: &Buffer,
+    count: usize,
+    weight: f64,
+    limit: f32,
+) {
+    let call = shaders::ratio_penalty::call(
+        &shaders::ratio_penalty::Bindings { log_scales, gradients },
+        &shaders::ratio_penalty::Push { count: count as u32, weight: weight as f32, limit },
+    );
+    rec.dispatch_threads(call, [count as u32, 1, 1]);
+}
+
+/// The CPU twin: (loss, gradient by the log-scales of one splat). Below e^10 it is exact.
+pub fn ratio_penalty(log_scales: [f64; 3], weight: f64, limit: f64) -> (f64, [f64; 3]) {
+    let (mut high, mut low) = (0, 0);
+    for k in 1..3 {
+        high = if log_scales[k] > log_scales[high] { k } else { high };
+        low = if log_scales[k] < log_scales[low] { k } else { low };
+    }
+    let ratio = (log_scales[high] - log_scales[low]).exp();
+    let mut gradient = [0.0; 3];
+    if ratio > limit {
+        gradient[high] = weight * ratio;
+        gradient[low] = -weight * ratio;
+    }
+    (weight * (ratio - limit).max(0.0), gradient)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::schedule::Random;
+
+    #[test]
+    fn ratio_gradient_matches_differences_and_the_gpu() {
+        let device = crate::gpu::test_device();
+        let mut random = Random::new(2);
+        let rows: Vec<[f32; 3]> = (0..97).map(|_| [0; 3].map(|_| random.normal() as f32 * 2.0)).collect();
+        let log_scales = device.buffer_from("log scales", &rows).unwrap();
+        let gradients = device.buffer_from("gradients", &vec![[1.0f32; 3]; 97]).unwrap();
+        let mut rec = Recorder::new(&device, "ratio");
+        record_ratio(&mut rec, &log_scales, &gradients, 97, 0.5, 8.0);
+        rec.run().unwrap();
+        let mut active = 0;
+        for (row, got) in rows.iter().zip(gradients.read::<[f32; 3]>().unwrap()) {
+            let row = row.map(f64::from);
+            let (_, gradient) = ratio_penalty(row, 0.5, 8.0);
+            active += usize::from(gradient != [0.0; 3]);
+            for k in 0..3 {
+                let at = |s: f64| {
+                    let mut r = row;
+                    r[k] += s;
+                    ratio_penalty(r, 0.5, 8.0).0
+                };
+                let difference = (at(1e-6) - at(-1e-6)) / 2e-6;
+                assert!((difference - gradient[k]).abs() < 1e-5 * (1.0 + gradient[k].abs()));
+                assert!((f64::from(got[k]) - 1.0 - gradient[k]).abs() < 1e-5 * (1.0 + gradient[k].abs()));
+            }
+        }
+        assert!(active > 20, "the sample must contain needles");
+    }
+
+    #[test]
+    fn depth_gradient_matches_differences_and_the_gpu() {
+        let device = crate::gpu::test_device();
+        let mut random = Random::new(6);
+        let (width, height) = (13u32, 9u32);
+        let pixels = (width * height) as usize;
+        let raster = crate::pass::Rasterizer::new(&device, 1, 0, width, height).unwrap();
+        let frame = raster.frame();
+        let mut numbers = |low: f64| (0..pixels).map(|_| low + random.uniform()).collect::<Vec<f64>>();
+        let (depth, alpha, mut reference) = (numbers(0.0), numbers(0.0), numbers(0.5));
+        reference[7] = 0.0;
+        let narrow = |v: &[f64]| v.iter().map(|&a| a as f32).collect::<Vec<f32>>();
+        let see_through: Vec<f64> = alpha.iter().map(|a| 1.0 - a).collect();
+        frame.planes.write_at(3 * pixels, &narrow(&depth)).unwrap();
+        frame.transmittance.write(&narrow(&see_through)).unwrap();
+        let buffer = device.buffer_from("reference", &narrow(&reference)).unwrap();
+        let mut rec = Recorder::new(&device, "depth");
+        record_depth(&mut rec, frame, Some(&buffer), 0.25);
+        rec.run().unwrap();
+        let upstream = frame.planes_grad.read::<f32>().unwrap();
+        let (_, gradient) = depth_l1(&depth, &alpha, &reference, 0.25);
+        for i in 0..pixels {
+            let loss = |d: f64, a: f64| depth_l1(&[d], &[a], &[reference[i]], 0.25).0;
+            let by_depth = (loss(depth[i] + 1e-7, alpha[i]) - loss(depth[i] - 1e-7, alpha[i])) / 2e-7;
+            let by_alpha = (loss(depth[i], alpha[i] + 1e-7) - loss(depth[i], alpha[i] - 1e-7)) / 2e-7;
+            for (k, difference) in [by_depth, by_alpha].into_iter().enumerate() {
+                assert!((difference - gradient[i][k]).abs() < 1e-6);
+                let got = f64::from(upstream[(3 + k) * pixels + i]);
+                assert!((got - gradient[i][k]).abs() < 1e-6, "pixel {i}");
+            }
+        }
+        let mut rec = Recorder::new(&device, "clear");
+        record_depth(&mut rec, frame, None, 0.0);
+        rec.run().unwrap();
+        assert!(frame.planes_grad.read::<f32>().unwrap().iter().all(|&g| g == 0.0));
+    }
+}
