@@ -315,7 +315,8 @@ mod tests {
             let normal = DQuat::from_xyzw(x, y, z, w) * DVec3::Z;
             off += usize::from(normal.dot(n).abs() < 0.99);
         }
-        assert!(off <= splats.len() / 100, "{off} of {} leave the plane or its colour", splats.len());
+        // The object may continue itself at its own 10 of the 560 border pixels, 1.8 %.
+        assert!(off <= splats.len() / 50, "{off} of {} leave the plane or its colour", splats.len());
     }
 
     #[test]
