@@ -38,8 +38,9 @@ impl Classifier {
     /// [count, 1000] class probabilities of the regions `0..count` of `labels`; a zero row for a region without pixels.
     ///
     /// A region is judged from one crop: the square around its bounding box with everything else grey. On breakfast
-    /// (perfect masks and 830 graph segments) wider crops, blurred, white, black or dimmed surroundings, their
-    /// averages, and the larger Lite1 and Lite2 named fewer regions right.
+    /// (40 perfect masks, 840 Felzenszwalb segments, 416 masks of the graph segmentation) nothing else named more
+    /// regions right: wider crops, blurred, white, black or dimmed surroundings, the mirrored crop, filled holes or a
+    /// grown mask, averages of these, and the larger Lite1 and Lite2.
     pub fn regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
         if (labels.width, labels.height) != (image.width, image.height) {
             return Err(Error::input(format!(
