@@ -338,7 +338,10 @@ impl<'a> Run<'a> {
         let splats = self.model.splats()?;
         let mut score = |cameras: &[Camera]| -> Result<Vec<f64>> {
             (0..images.len())
-                .map(|i| Ok(psnr(&self.views.render(i, &cameras[i], &self.model, &self.raster)?, &images[i])))
+                .map(|i| {
+                    let rendered = self.views.render(i, &cameras[i], &self.model, &self.raster)?;
+                    Ok(psnr(&rendered, &images[i]).min(MOST_PSNR))
+                })
                 .collect()
         };
         let refined = score(&self.cameras)?;
