@@ -72,11 +72,12 @@ fn a_perturbed_camera_is_recovered() {
     assert!(angle(&start[2].pose, &truth[2].pose) > 0.49);
 
     let mut options = RgbOptions::preset(Preset::Draft);
-    options.iterations = 300;
+    // 300 updates of the camera: turning and shifting look alike, so the last tenths of a degree come slowly.
+    options.iterations = 900;
     let still = Exponential::constant(0.0);
     options.rates =
         fit::Rates { means: still, log_scales: 0.0, quats: 0.0, opacity: 0.0, sh_dc: 0.0, sh_rest: 0.0 };
-    let rate = Exponential { start: 1e-3, end: 1e-5, steps: 300 };
+    let rate = Exponential { start: 1e-3, end: 3e-5, steps: 900 };
     options.poses = Some(fit::pose::PoseOptions { start: 0, rate });
     let scale = fit::scale::SceneScale::measure(&truth, &splats.means);
     let trained =
