@@ -189,8 +189,8 @@ fn ctrl_c_stops_cleanly() {
     assert_eq!(status.code(), Some(130), "{stderr}");
     assert!(stderr.lines().last().unwrap().contains("nothing was written"), "{stderr}");
     assert!(names(folder.path()).is_empty(), "left behind: {:?}", names(folder.path()));
-    // The longest step between two checks, on a busy machine.
-    assert!(sent.elapsed() < Duration::from_secs(60), "took {:?} to stop", sent.elapsed());
+    // The longest step between two checks is embedding the class names on the very first run: 20 s on two idle cores.
+    assert!(sent.elapsed() < Duration::from_secs(150), "took {:?} to stop", sent.elapsed());
 }
 
 /// Runs through a shell that limits the size of every written file, as a full disk does; the limit is in 512-byte blocks.
@@ -283,7 +283,7 @@ fn scenes_render_export_and_answer_only_what_they_know() {
     {
         let mut export = splatvk();
         export.arg("export").arg(scene()).args(["--format", format, "--out"]).arg(folder.path().join(name));
-        assert!(export.status().unwrap().success(), "{format}");
+        assert!(export.output().unwrap().status.success(), "{format}");
         assert!(folder.path().join(name).exists());
     }
     assert_eq!(names(folder.path()), ["a.ply", "a.splat", "model", "renders", "t.json"]);

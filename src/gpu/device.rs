@@ -115,7 +115,8 @@ impl Device {
         let entry = select::load()?;
         let sink = options.validation.then(Sink::default);
         let instance = select::instance(&entry, sink.as_ref())?;
-        match Self::build(entry, &instance, sink, options) {
+        // A clone keeps the loader in memory: `build` drops its entry on failure, and the instance must be destroyed after.
+        match Self::build(entry.clone(), &instance, sink, options) {
             Ok(device) => Ok(device),
             Err(e) => {
                 // SAFETY: nothing made from the instance is alive after the failure.
