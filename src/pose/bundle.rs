@@ -26,7 +26,9 @@ pub(crate) struct Problem {
     pub(crate) centres: Vec<DVec2>,
     /// Which focal length each camera uses.
     pub(crate) group: Vec<usize>,
-    /// Focal lengths, pixels.
+    /// Pixels of each camera per unit of its focal length: photos of one camera may be scaled differently.
+    pub(crate) zoom: Vec<f64>,
+    /// Focal lengths.
     pub(crate) focals: Vec<f64>,
     /// (ln f, σ of ln f) before seeing the images; σ = 0 holds the focal length fixed.
     pub(crate) priors: Vec<(f64, f64)>,
@@ -59,7 +61,7 @@ impl Problem {
     /// Projection in camera frame and its pixel.
     fn project(&self, o: &Observation) -> (DVec3, DVec2) {
         let t = self.poses[o.camera].transform(self.points[o.point]);
-        let f = self.focals[self.group[o.camera]];
+        let f = self.focals[self.group[o.camera]] * self.zoom[o.camera];
         (t, DVec2::new(f * t.x / t.z, f * t.y / t.z) + self.centres[o.camera])
     }
 
@@ -114,7 +116,7 @@ impl Problem {
             }
             let r = (p - o.pixel) / o.sigma;
             let w = cauchy_weight(r.length_squared(), c);
-            let f = self.focals[self.group[o.camera]];
+            let f = self.focals[self.group[o.camera]] * self.zoom[o.camera];
             let s = f / (t.z * o.sigma);
             // Rows of ∂(u, v)/∂t, each a 3-vector.
             let rows = [DVec3::new(s, 0.0, -s * t.x / t.z), DVec3::new(0.0, s, -s * t.y / t.z)];
@@ -296,6 +298,7 @@ mod tests {
         let mut p = Problem {
             centres: vec![DVec2::new(320.0, 240.0); 4],
             group: vec![0; 4],
+            zoom: vec![1.0; 4],
             focals: vec![600.0],
             priors: vec![(576f64.ln(), 0.35)],
             ..Default::default()

@@ -106,32 +106,43 @@ fn within(f: &Features, valid: &Plane<bool>) -> Features {
     out
 }
 
-/// Focal groups and priors: photos of one size and camera model share a focal length; photos without EXIF share by size.
+/// EXIF focal lengths of one camera that differ more come from different zoom settings.
+const SAME_ZOOM: f64 = 0.03;
+
+/// Focal groups and priors: photos of one size, camera model and zoom share a focal length; photos without EXIF share by
+/// size. Portrait and landscape of one camera share too, although their working sizes differ.
 fn empty_model(photos: &[Photo]) -> Model {
-    type Key<'a> = (u32, u32, Option<&'a str>);
-    let mut keys: Vec<Key> = Vec::new();
-    let (mut group, mut samples) = (Vec::new(), Vec::<Vec<f64>>::new());
-    for p in photos {
-        let (w, h) = p.original_size;
-        let key = (w.max(h), w.min(h), p.camera_model.as_deref());
-        let g = keys.iter().position(|k| *k == key).unwrap_or_else(|| {
-            keys.push(key);
-            samples.push(Vec::new());
-            keys.len() - 1
+    let zoom: Vec<f64> =
+        photos.iter().map(|p| 0.5 * (p.to_working.scale[0] + p.to_working.scale[1])).collect();
+    // Focal length in original pixels.
+    let exif = |v: usize| photos[v].exif_focal.map(|f| f / zoom[v]);
+    let long = |v: usize| photos[v].original_size.0.max(photos[v].original_size.1);
+    let alike = |a: usize, b: usize| {
+        let (p, q) = (&photos[a], &photos[b]);
+        let size =
+            |p: &Photo| (p.original_size.0.max(p.original_size.1), p.original_size.0.min(p.original_size.1));
+        let zoomed = match (exif(a), exif(b)) {
+            (Some(f), Some(g)) => (f / g - 1.0).abs() > SAME_ZOOM,
+            (None, None) => false,
+            _ => true,
+        };
+        size(p) == size(q) && p.camera_model == q.camera_model && !zoomed
+    };
+    // The first photo of each group stands for it.
+    let mut firsts: Vec<usize> = Vec::new();
+    let mut group = Vec::new();
+    for v in 0..photos.len() {
+        let g = firsts.iter().position(|f| alike(*f, v)).unwrap_or_else(|| {
+            firsts.push(v);
+            firsts.len() - 1
         });
         group.push(g);
-        samples[g].extend(p.exif_focal);
     }
-    let long = |g: usize| {
-        let k = group.iter().position(|x| *x == g).unwrap_or(0);
-        photos[k].image.width.max(photos[k].image.height) as f64
-    };
-    let priors: Vec<(f64, f64)> = samples
-        .iter_mut()
-        .enumerate()
-        .map(|(g, s)| match super::numeric::median(s) {
+    let priors: Vec<(f64, f64)> = firsts
+        .iter()
+        .map(|&v| match exif(v) {
             Some(f) => (f.ln(), EXIF_SIGMA),
-            None => ((FOCAL_GUESS * long(g)).ln(), FOCAL_SIGMA),
+            None => ((FOCAL_GUESS * long(v) as f64).ln(), FOCAL_SIGMA),
         })
         .collect();
     Model {
@@ -141,6 +152,7 @@ fn empty_model(photos: &[Photo]) -> Model {
             .map(|p| DVec2::new(p.image.width as f64, p.image.height as f64) * 0.5)
             .collect(),
         group,
+        zoom,
         focals: priors.iter().map(|p| p.0.exp()).collect(),
         priors,
         tracks: Vec::new(),

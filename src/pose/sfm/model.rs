@@ -30,7 +30,9 @@ pub(super) struct Model {
     pub(super) centres: Vec<DVec2>,
     /// Focal group of each view.
     pub(super) group: Vec<usize>,
-    /// Focal lengths per group, pixels.
+    /// Working pixels per pixel of the group's focal length.
+    pub(super) zoom: Vec<f64>,
+    /// Focal lengths per group, original pixels.
     pub(super) focals: Vec<f64>,
     /// (ln f, σ) per group.
     pub(super) priors: Vec<(f64, f64)>,
@@ -42,7 +44,7 @@ pub(super) const MIN_ANGLE_DEGREES: f64 = 1.0;
 
 impl Model {
     pub(super) fn focal(&self, view: usize) -> f64 {
-        self.focals[self.group[view]]
+        self.focals[self.group[view]] * self.zoom[view]
     }
 
     /// Camera-frame ray, z = 1.
@@ -162,6 +164,7 @@ impl Model {
             problem.poses.extend(self.poses[v]);
             problem.centres.push(self.centres[v]);
             problem.group.push(self.group[v]);
+            problem.zoom.push(self.zoom[v]);
         }
         let mut used = Vec::new();
         for (k, t) in self.tracks.iter().enumerate() {

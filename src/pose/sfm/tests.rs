@@ -124,3 +124,28 @@ fn photos_without_geometry_are_refused_by_name() {
     }
     assert!(refusal(&[a.clone(), mirrored]).contains("do not overlap"));
 }
+
+#[test]
+fn two_photos_of_different_size_and_known_focal_are_enough() {
+    let mut truth = testing::train(&testing::folder());
+    truth.photos.truncate(2);
+    truth.cameras.truncate(2);
+    // The second photo comes from a file of 1.6 times its size, as another working resolution of the same camera.
+    let half = &mut truth.photos[1];
+    half.original_size = (1024, 768);
+    half.to_working = crate::photo::Affine::resize(half.original_size, (640, 480));
+    for (p, c) in truth.photos.iter_mut().zip(&truth.cameras) {
+        p.exif_focal = Some(c.fx * 1.02);
+    }
+    let model = reconstruct(&truth.photos, &[], &Silent).unwrap();
+    // Two views fix no scale, so compare the relative rotation and the direction of the baseline.
+    let relative = |c: &[Camera]| c[1].pose.compose(&c[0].pose.inverse());
+    let (found, want) = (relative(&model.cameras), relative(&truth.cameras));
+    let turn =
+        crate::pose::numeric::rotation_angle(&(found.rotation * want.rotation.transpose())).to_degrees();
+    let aim = found.translation.angle_between(want.translation).to_degrees();
+    println!("two views: {turn:.3}° {aim:.3}°, σ ln f {:?}", model.focal_log_sigma);
+    // An orbit of two views hardly sees the focal length: 2 % of it turn the views by up to half a degree.
+    assert!(turn < 0.8 && aim < 0.8, "{turn} {aim}");
+    assert!(model.focal_log_sigma.unwrap() > 0.002);
+}
