@@ -3,6 +3,7 @@
 //!
 //! The files hold raw parameters (degree 3, opacity logits) and the image; the camera is Brush's test
 //! convention: at (0.123, 0.456, −8) without rotation, 90° across the width, square pixels, black background.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // helpers of tests
 mod support;
 use glam::{DMat3, DVec3};
 use safetensors::SafeTensors;

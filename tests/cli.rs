@@ -1,4 +1,5 @@
 //! The program as a user runs it: what it refuses, how it says so, and that it leaves nothing half-written.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
 mod fixture;
 
 use fixture::{data, scene, small_views};

@@ -1,4 +1,5 @@
 //! File formats: what is written reads back, foreign files are understood, damaged ones are refused in one line.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
 use glam::{DQuat, DVec3};
 use splatvk::format::{cameras, colmap, ply, scene_dir, splat, transforms};
 use splatvk::photo;

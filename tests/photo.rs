@@ -1,4 +1,5 @@
 //! Photo loading from real files: kinds of JPEG and PNG, EXIF, and sets that must be refused.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
 use splatvk::photo::{self, Photo};
 use splatvk::progress::Silent;
 use std::path::{Path, PathBuf};

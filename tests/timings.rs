@@ -1,5 +1,6 @@
 //! Milliseconds per pass on the seeded benchmark scene; the figures in docs/performance.md come from here:
 //! `cargo test --test timings -- --ignored --nocapture`.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // helpers of tests
 mod support;
 use splatvk::gpu::{Device, Recorder};
 use splatvk::pass::seeded;

@@ -252,7 +252,7 @@ fn parse_shape(header: &str) -> Option<Vec<usize>> {
 
 fn parse_values(descr: &str, count: usize, bytes: &[u8], origin: &str) -> Result<NpyData> {
     let take = |size: usize| -> Result<&[u8]> {
-        let need = count.checked_mul(size).unwrap_or(usize::MAX);
+        let need = count.saturating_mul(size);
         bytes.get(..need).ok_or_else(|| {
             Error::input(format!(
                 "{origin}: truncated, {need} bytes of values expected, {} found",

@@ -92,7 +92,7 @@ fn check(mut s: Scene, mode: FeatureMode, samples: usize) {
     assert_class("pose", &pairs);
     let mut pairs = Vec::new();
     for k in 0..4 {
-        let mut side = |sign: f64| {
+        let side = |sign: f64| {
             let mut view = s.view.clone();
             let target = if k < 2 { &mut view.focal[k] } else { &mut view.centre[k - 2] };
             *target += sign * step;

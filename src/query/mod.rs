@@ -5,9 +5,6 @@
 //! map; the mask of the `field` protocol is chosen on codes, so smoothing never moves its edges.
 pub mod eval;
 pub mod filter;
-mod heatmap;
-
-pub use heatmap::heat_map;
 
 use crate::scene::{Codebook, LanguageField, Plane};
 use crate::{Error, Result};
@@ -83,7 +80,8 @@ pub fn code_relevancy(codebook: &Codebook, query: &TextQuery) -> Result<Vec<f32>
     if codebook.is_empty() {
         return Ok(Vec::new());
     }
-    if query.embedding.len() != d || query.canonicals.is_empty() || query.canonicals.len() % d != 0 {
+    if query.embedding.len() != d || query.canonicals.is_empty() || !query.canonicals.len().is_multiple_of(d)
+    {
         return Err(Error::input(format!(
             "the query '{}' has {} values, the scene's embeddings {d}: they come from different models",
             query.text,

@@ -1,5 +1,5 @@
 //! Shared by the integration tests.
-#![allow(dead_code)] // each test binary uses its own part
+#![allow(dead_code, clippy::unwrap_used, clippy::expect_used, clippy::panic)] // each test binary uses its own part
 use splatvk::gpu::{Device, Recorder};
 use splatvk::pass::close::{Distance, Tolerance, compare};
 use splatvk::pass::raster_forward::Cutoffs;
