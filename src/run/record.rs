@@ -79,7 +79,7 @@ fn figures(o: &Outcome) -> Vec<(String, String)> {
         ("train PSNR".to_owned(), format!("{:.2} dB", o.rgb.mean_psnr())),
     ];
     if let (Some(sigma), Some(camera)) = (o.geometry.focal_log_sigma, o.cameras.first()) {
-        list.push(("focal length".to_owned(), format!("{:.1} px ± {:.1} %", camera.fx, 100.0 * sigma)));
+        list.push(("focal length".to_owned(), format!("{:.1} px ± {:.2} %", camera.fx, 100.0 * sigma)));
     }
     let codes = |k: usize| o.field.levels.get(k).map_or(0, |l| l.codebook.len());
     list.push(("things s/m/l".to_owned(), format!("{} / {} / {}", codes(0), codes(1), codes(2))));
