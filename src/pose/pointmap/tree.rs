@@ -59,8 +59,11 @@ fn l1(weight: f64, r: f64) -> f64 {
     weight / r.max(1e-4)
 }
 
-/// Solves weighted linear equations `Σ_k A_k x_k = b` given as rows over the free unknowns.
-fn least_squares(n: usize, rows: &[(Vec<(usize, f64)>, f64, f64)]) -> Option<DVector<f64>> {
+/// One weighted linear equation: (unknowns with factors, right-hand side, weight).
+type Equation = (Vec<(usize, f64)>, f64, f64);
+
+/// Solves weighted linear equations in the least-squares sense.
+fn least_squares(n: usize, rows: &[Equation]) -> Option<DVector<f64>> {
     let (mut h, mut g) = (DMatrix::<f64>::zeros(n, n), DVector::<f64>::zeros(n));
     for (row, b, w) in rows {
         for &(i, a) in row {
