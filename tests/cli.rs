@@ -76,6 +76,18 @@ fn photos_that_cannot_be_used() {
 }
 
 #[test]
+fn photos_without_overlap_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::copy(data("breakfast/images/train_00.jpg"), folder.path().join("table.jpg")).unwrap();
+    // A few blocks of random colour: corners, none of them on the table, and few enough to be refused fast.
+    let blob = |x: u32, y: u32, k: u32| ((x / 64 * 7919 + y / 48 * 104_729 + k * 31) % 251) as u8;
+    let noise =
+        image::RgbImage::from_fn(640, 480, |x, y| image::Rgb([blob(x, y, 0), blob(x, y, 1), blob(x, y, 5)]));
+    noise.save(folder.path().join("noise.png")).unwrap();
+    run_refuses(&[folder.path()], &[], &["overlap", "noise", "table"]);
+}
+
+#[test]
 fn views_must_fit_the_photos() {
     let photos = data("breakfast/images");
     run_refuses(&[&photos], &["--views", "5"], &["--views 5", "only 4"]);
