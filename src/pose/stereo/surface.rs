@@ -23,7 +23,7 @@ pub const FREE_SPACE_TOLERANCE: f32 = 0.03;
 /// (0.4 + geometric limits) and none (1.0 and more).
 const COST_TOLERANCE: f32 = 0.75;
 /// Connected areas of believed pixels smaller than this share of the image are chance.
-const SPECKLE_SHARE: f32 = 1.5e-4;
+const SPECKLE_SHARE: f32 = 6e-4;
 /// Confidence by number of agreeing views.
 const CONFIDENCE: [f32; 3] = [0.0, 0.6, 0.9];
 
