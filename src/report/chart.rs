@@ -34,7 +34,7 @@ pub fn line_chart(points: &[(f64, f64)], x_label: &str, y_label: &str) -> String
     // Writing to a String cannot fail.
     for k in 0..=((y1 - y0) / step).round() as usize {
         let y = y0 + k as f64 * step;
-        let decimals = if step < 1.0 { 1 } else { 0 };
+        let decimals = (-step.log10().floor()).clamp(0.0, 3.0) as usize;
         let _ = write!(svg, "<path class=\"grid\" d=\"M{LEFT} {:.1}H{WIDTH}\"/>", py(y));
         let _ = write!(
             svg,

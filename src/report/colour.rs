@@ -74,7 +74,7 @@ pub fn heat_image(picture: &RgbImage, relevancy: &Plane<f32>, mask: Option<&Plan
             // Relevancy 0.5 means "as close as a canonical phrase": below it the picture stays as it is.
             let heat = ((relevancy.at(x, y) - 0.5) * 2.0).clamp(0.0, 1.0);
             let (base, hot) = (0.25 + 0.5 * luma.at(x, y), turbo(0.45 + 0.5 * heat));
-            let share = 0.75 * heat.sqrt();
+            let share = 0.85 * heat;
             let colour = hot.map(|h| base * (1.0 - share) + h * share);
             data.push(if edge(x, y) { [1.0; 3] } else { colour });
         }

@@ -38,7 +38,8 @@ fn page(report: &Report) -> Result<String> {
     let title = escape(report.title);
     let mut body = format!("<header><h1>{title}</h1><p>{}</p></header>", escape(&report.run.program));
     body.push_str("<section class=\"figures\">");
-    for (label, value) in &report.figures {
+    // The device stands with the times below and the answers have their own section: cards are for short figures.
+    for (label, value) in report.figures.iter().filter(|(l, _)| l != "device" && !l.starts_with('“')) {
         // Writing to a String cannot fail.
         let _ = write!(body, "<div><b>{}</b><span>{}</span></div>", escape(value), escape(label));
     }
@@ -53,7 +54,7 @@ fn page(report: &Report) -> Result<String> {
         body.push_str(&view_row(view)?);
     }
     body.push_str("</section>");
-    let curve = chart::line_chart(&report.psnr_curve, "step", "PSNR, dB");
+    let curve = chart::line_chart(&report.ssim_curve, "step", "SSIM of render and photo");
     if !curve.is_empty() {
         let _ = write!(body, "<section><h2>Training</h2>{curve}</section>");
     }
@@ -66,7 +67,8 @@ fn page(report: &Report) -> Result<String> {
 }
 
 fn view_row(v: &ViewShown) -> Result<String> {
-    let mut row = format!("<h3>{}</h3><div class=\"row\">{}", escape(v.name), figure(v.photo, "photo")?);
+    let mut row =
+        format!("<h3>{}</h3><div class=\"row views\">{}", escape(v.name), figure(v.photo, "photo")?);
     if let Some(render) = v.render {
         let caption = v.psnr.map_or("render".to_string(), |p| format!("render, {p:.1} dB"));
         row.push_str(&figure(render, &caption)?);
@@ -212,7 +214,7 @@ mod tests {
             title: "a <b> & \"c\"",
             views: vec![view],
             queries: vec![QueryShown { text: "<script>", answers: vec![answer] }],
-            psnr_curve: vec![(0.0, 10.0), (100.0, 30.0)],
+            ssim_curve: vec![(1.0, 0.31), (100.0, 0.93)],
             space: Some("words/x"),
             figures: vec![("splats".into(), "123".into())],
             run: &run,

@@ -110,8 +110,8 @@ pub struct Report<'a> {
     pub views: Vec<ViewShown<'a>>,
     /// Queries of the run.
     pub queries: Vec<QueryShown<'a>>,
-    /// (optimisation step, PSNR in dB).
-    pub psnr_curve: Vec<(f64, f64)>,
+    /// (optimisation step, SSIM of render and photo).
+    pub ssim_curve: Vec<(f64, f64)>,
     /// Embedding space of the language field; `words/…` gets a plain statement of what it knows.
     pub space: Option<&'a str>,
     /// Figures for the head of the page: (label, value).

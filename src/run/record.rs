@@ -118,7 +118,7 @@ pub(super) fn write(folder: &Path, o: &Outcome) -> Result<()> {
         title: &title,
         views,
         queries: o.answers.iter().map(shown).collect(),
-        psnr_curve: Vec::new(),
+        ssim_curve: o.rgb.curve.iter().map(|p| (p.step as f64, p.ssim)).collect(),
         space: Some(&o.field.space),
         figures: figures(o),
         run: &record,

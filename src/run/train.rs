@@ -177,7 +177,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         title: &title,
         views: views.collect(),
         queries: Vec::new(),
-        psnr_curve: Vec::new(),
+        ssim_curve: trained.stats.curve.iter().map(|p| (p.step as f64, p.ssim)).collect(),
         space: None,
         figures: figures.clone(),
         run: &record,
