@@ -35,6 +35,10 @@ pub struct QueryOptions {
     /// A query whose best relevancy stays below this is "not found". 0.5 means: no closer than the nearest canonical
     /// phrase (ALGORITHMS 9.3).
     pub abs_threshold: f32,
+    /// For [`MaskRule::Codes`]: the coarsest level answers whose peak is at least this share of the best level's. A part
+    /// of a thing often matches a phrase a little better than the thing; the phrase still means the thing. 1 takes the
+    /// best level, as the published protocols do.
+    pub whole_share: f32,
 }
 
 /// How the mask follows from relevancy.
@@ -49,13 +53,16 @@ pub enum MaskRule {
 
 impl Default for QueryOptions {
     fn default() -> Self {
-        QueryOptions { mask: MaskRule::Codes(CODE_SHARE), abs_threshold: 0.5 }
+        QueryOptions { mask: MaskRule::Codes(CODE_SHARE), abs_threshold: 0.5, whole_share: WHOLE_SHARE }
     }
 }
 
 /// With 0.8, a code joins the best one when it is nearly as relevant: the pieces of an object that was cut into several
 /// masks with alike features do, a different object whose phrase shares some meaning does not.
 pub const CODE_SHARE: f32 = 0.8;
+
+/// Default of [`QueryOptions::whole_share`].
+pub const WHOLE_SHARE: f32 = 0.9;
 
 /// The answer to one query in one frame.
 #[derive(Clone, Debug, Default)]
@@ -110,7 +117,7 @@ pub fn answer(
     query: &TextQuery,
     options: &QueryOptions,
 ) -> Result<QueryResult> {
-    let mut best: Option<Candidate> = None;
+    let mut candidates: Vec<Candidate> = Vec::new();
     for (level, (map, part)) in codes.iter().zip(&field.levels).enumerate() {
         let relevancy = code_relevancy(&part.codebook, query)?;
         if relevancy.is_empty() {
@@ -119,12 +126,19 @@ pub fn answer(
         let raw = relevancy_map(map, &relevancy);
         let boxed = filter::box30(&raw);
         let blended = filter::blend(&raw, &boxed);
-        let peak = blended.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-        // ties go to the finer level
-        if best.as_ref().is_none_or(|b| peak > b.peak) {
-            best = Some(Candidate { level, peak, codes: relevancy, raw, boxed, blended });
-        }
+        candidates.push(Candidate { level, codes: relevancy, raw, boxed, blended });
     }
+    let peaks: Vec<f32> = candidates.iter().map(|c| level_peak(c, options.mask)).collect();
+    let top = peaks.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let chosen = match options.mask {
+        // coarsest that is nearly as good; peaks are positive unless nothing is above the canonical phrases
+        MaskRule::Codes(_) if top > 0.0 => {
+            peaks.iter().rposition(|&p| p >= options.whole_share.min(1.0) * top)
+        }
+        // ties go to the finer level
+        _ => peaks.iter().position(|&p| p >= top),
+    };
+    let best = chosen.map(|k| candidates.swap_remove(k));
     let best = best.ok_or_else(|| Error::work("the scene has no language level to query"))?;
     let score = best.raw.data.iter().copied().fold(0.0, f32::max);
     let mask = match options.mask {
@@ -141,9 +155,23 @@ pub fn answer(
     })
 }
 
+/// By what levels compete. The published protocols take the peak of the blended map (9.3). For masks of codes it is the
+/// peak of the blended *excess* over a canonical phrase, `max(0, 2·rel − 1)`: smoothing then counts against specks,
+/// which the usual 0.5 of their surroundings would hide.
+fn level_peak(c: &Candidate, rule: MaskRule) -> f32 {
+    let max = |p: &Plane<f32>| p.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    if !matches!(rule, MaskRule::Codes(_)) {
+        return max(&c.blended);
+    }
+    let data = c.raw.data.iter().map(|v| (2.0 * v - 1.0).max(0.0)).collect();
+    let excess = Plane { data, ..c.raw };
+    let peak = max(&filter::blend(&excess, &filter::box30(&excess)));
+    // below every canonical phrase: rank by relevancy, under all positive peaks
+    if peak > 0.0 { peak } else { max(&c.blended) - 1.0 }
+}
+
 struct Candidate {
     level: usize,
-    peak: f32,
     codes: Vec<f32>,
     raw: Plane<f32>,
     boxed: Plane<f32>,
@@ -183,3 +211,6 @@ fn code_mask(map: &Plane<i32>, relevancy: &[f32], share: f32) -> Plane<bool> {
 
 #[cfg(test)]
 mod tests;
+
+#[cfg(test)]
+mod defaults_tests;

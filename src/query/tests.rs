@@ -65,7 +65,10 @@ fn relevancy_is_the_worst_pairwise_softmax() {
 fn the_mask_follows_code_borders_exactly() {
     let maps = vec![Plane::filled(60, 40, -1), frame(), frame()];
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap();
-    assert_eq!(r.level, 1, "ties go to the finer level, empty levels are skipped");
+    assert_eq!(r.level, 2, "the whole answers when it is as good as its part");
+    let lerf = QueryOptions { mask: MaskRule::Lerf(0.6), ..QueryOptions::default() };
+    let r1 = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &lerf).unwrap();
+    assert_eq!(r1.level, 1, "protocol lerf: ties go to the finer level, empty levels are skipped");
     for (p, &k) in maps[1].data.iter().enumerate() {
         assert_eq!(r.mask.data[p], k == 0 || k == 2, "pixel {p}");
     }
@@ -75,6 +78,27 @@ fn the_mask_follows_code_borders_exactly() {
     let strict = QueryOptions { mask: MaskRule::Codes(1.0), ..QueryOptions::default() };
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &strict).unwrap();
     assert!(maps[1].data.iter().zip(&r.mask.data).all(|(&k, &m)| m == (k == 0)));
+}
+
+#[test]
+fn a_speck_does_not_outvote_the_whole() {
+    let mut part = frame();
+    // level 1 shows the better code 0 on a few pixels only, level 2 its near-copy over the whole square
+    part.data.iter_mut().filter(|k| **k == 0 || **k == 2).for_each(|k| *k = 1);
+    for p in [12 * 60 + 25, 12 * 60 + 26, 13 * 60 + 25] {
+        part.data[p] = 0;
+    }
+    let mut whole = frame();
+    whole.data.iter_mut().filter(|k| **k == 0).for_each(|k| *k = 2);
+    let maps = vec![Plane::filled(60, 40, -1), part, whole];
+    let ask = |share: f32| {
+        let options = QueryOptions { whole_share: share, ..QueryOptions::default() };
+        answer(&maps, &field(), &query(&[1.0, 0.0, -0.02, 0.1]), &options).unwrap().level
+    };
+    assert_eq!((ask(1.0), ask(0.9)), (2, 2));
+    // LERF's rule looks at the peak alone
+    let lerf = QueryOptions { mask: MaskRule::Lerf(0.6), ..QueryOptions::default() };
+    assert!(answer(&maps, &field(), &query(&[1.0, 0.0, -0.02, 0.1]), &lerf).is_ok());
 }
 
 #[test]

@@ -1,0 +1,108 @@
+//! The built-in language defaults end to end in 2D: graph masks, `words` features, XFeat matches, alignment, codebook
+//! and queries on the training targets (what a perfectly trained field would show).
+use super::*;
+use crate::infer::breakfast::{View, phrases, train_views};
+use crate::infer::words::RegionWords;
+use crate::infer::{RegionEncoder, Registry, hed::Hed, xfeat::XFeat};
+use crate::language::align::{AlignOptions, PairLinks, links_from_warps};
+use crate::language::graph::{GraphOptions, segment};
+use crate::language::{BuildOptions, ViewMasks, attach_features, build, matcher};
+use crate::scene::DepthMap;
+
+struct Inputs {
+    views: Vec<View>,
+    masks: Vec<ViewMasks>,
+    depths: Vec<DepthMap>,
+    matched: Vec<PairLinks>,
+    queries: Vec<(i32, TextQuery)>,
+}
+
+fn inputs() -> Inputs {
+    let views = train_views();
+    let open = || Registry::open(None).unwrap();
+    let (mut hed, mut net) = (Hed::load(&open()).unwrap(), XFeat::load(&open()).unwrap());
+    let mut words = RegionWords::load(open()).unwrap();
+    let (mut masks, mut depths, mut dense) = (Vec::new(), Vec::new(), Vec::new());
+    for v in &views {
+        let known = v.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect();
+        let depth = DepthMap { depth: v.depth.clone(), confidence: Plane { data: known, ..v.depth } };
+        let edges = hed.edges(&v.image).unwrap();
+        let mut m =
+            segment(&v.image, Some(&edges), Some((&v.camera, &depth)), &GraphOptions::default()).unwrap();
+        attach_features(&mut words, &v.image, &mut m).unwrap();
+        dense.push(net.dense(&v.image).unwrap());
+        masks.push(m);
+        depths.push(depth);
+    }
+    let mut matched = Vec::new();
+    for i in 0..views.len() {
+        for j in i + 1..views.len() {
+            let (there, back) = matcher::xfeat(&dense[i], &dense[j], (&views[i].camera, &views[j].camera));
+            matched.push(links_from_warps(i, j, &there, &back));
+        }
+    }
+    let canonicals = words.embed_texts(&CANONICAL_PHRASES).unwrap();
+    let ask = |(k, text): (i32, String)| {
+        let embedding = words.embed_texts(&[&text]).unwrap();
+        (k, TextQuery { text, embedding, canonicals: canonicals.clone() })
+    };
+    let queries = phrases().into_iter().filter(|(k, _)| *k > 3).map(ask).collect();
+    Inputs { views, masks, depths, matched, queries }
+}
+
+/// (IoU, localised) per phrase and view.
+fn score(x: &Inputs, align: AlignOptions, options: &QueryOptions) -> Vec<(String, Vec<(f32, bool)>)> {
+    let cameras: Vec<_> = x.views.iter().map(|v| v.camera.clone()).collect();
+    let options_built = BuildOptions { align, ..BuildOptions::default() };
+    let built =
+        build(&x.masks, &cameras, &x.depths, &x.matched, &options_built, &crate::progress::Silent).unwrap();
+    let mut out = Vec::new();
+    for (k, query) in &x.queries {
+        let mut row = Vec::new();
+        for (t, view) in x.views.iter().enumerate() {
+            let maps: Vec<Plane<i32>> = built.field.levels.iter().map(|l| l.targets[t].clone()).collect();
+            let r = answer(&maps, &built.field, query, options).unwrap();
+            let pairs = view.masks.data.iter().map(|o| o == k).zip(&r.mask.data);
+            let (both, either) =
+                pairs.fold((0, 0), |(b, e), (o, &m)| (b + u32::from(o && m), e + u32::from(o || m)));
+            row.push((both as f32 / either.max(1) as f32, view.masks.at(r.location.0, r.location.1) == *k));
+        }
+        out.push((query.text.clone(), row));
+    }
+    out
+}
+
+#[test]
+fn lemon_mug_and_plate_are_found() {
+    let x = inputs();
+    if std::env::var_os("QUERY_TABLE").is_some() {
+        for veto in [0.0, 0.3, 0.5] {
+            for whole_share in [0.6, 0.7, 0.8, 0.9, 1.0] {
+                for share in [0.5, 0.8] {
+                    let align = AlignOptions { veto, ..AlignOptions::default() };
+                    let mask = MaskRule::Codes(share);
+                    let options = QueryOptions { mask, whole_share, ..QueryOptions::default() };
+                    let rows = score(&x, align, &options);
+                    let all: Vec<(f32, bool)> = rows.iter().flat_map(|r| r.1.clone()).collect();
+                    let iou = all.iter().map(|a| a.0).sum::<f32>() / all.len() as f32;
+                    let hits = all.iter().filter(|a| a.1).count();
+                    let each: Vec<f32> = rows
+                        .iter()
+                        .map(|r| r.1.iter().map(|a| a.0).sum::<f32>() / r.1.len() as f32)
+                        .collect();
+                    println!(
+                        "Q veto {veto} whole {whole_share} share {share}: mIoU {iou:.3} hits {hits}/32 {each:.2?}"
+                    );
+                }
+            }
+        }
+    }
+    let rows = score(&x, AlignOptions::default(), &QueryOptions::default());
+    for (text, row) in &rows {
+        println!("R {text}: {row:.2?}");
+    }
+    for name in ["lemon", "blue mug", "plate"] {
+        let row = &rows.iter().find(|r| r.0 == name).unwrap().1;
+        assert!(row.iter().filter(|r| r.1).count() >= 3, "{name}: {row:?}");
+    }
+}
