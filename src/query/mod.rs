@@ -138,6 +138,7 @@ pub fn answer(
         // ties go to the finer level
         _ => peaks.iter().position(|&p| p >= top),
     };
+    let evidence = evidence(&candidates, chosen, options.mask);
     let best = chosen.map(|k| candidates.swap_remove(k));
     let best = best.ok_or_else(|| Error::work("the scene has no language level to query"))?;
     let score = best.raw.data.iter().copied().fold(0.0, f32::max);
@@ -147,7 +148,7 @@ pub fn answer(
     };
     Ok(QueryResult {
         level: best.level,
-        location: locate(&best, &mask),
+        location: locate(&evidence, &mask),
         relevancy: best.blended,
         mask,
         score,
@@ -178,11 +179,22 @@ struct Candidate {
     blended: Plane<f32>,
 }
 
-/// The pixel with the highest box-filtered relevancy (9.4), inside the mask where it has any pixel.
-fn locate(best: &Candidate, mask: &Plane<bool>) -> (usize, usize) {
+/// What the location is read from. The published protocols use the box-filtered map of the chosen level (9.4). With
+/// masks of codes the other levels have a say: the whole "plate" may hold a lemon, which finer levels tell apart.
+fn evidence(candidates: &[Candidate], chosen: Option<usize>, rule: MaskRule) -> Vec<f32> {
+    let Some(best) = chosen.and_then(|k| candidates.get(k)) else { return Vec::new() };
+    if !matches!(rule, MaskRule::Codes(_)) {
+        return best.boxed.data.clone();
+    }
+    let sum = |p: usize| candidates.iter().map(|c| c.boxed.data[p]).sum();
+    (0..best.boxed.data.len()).map(sum).collect()
+}
+
+/// The pixel with the highest evidence, inside the mask where it has any pixel.
+fn locate(evidence: &[f32], mask: &Plane<bool>) -> (usize, usize) {
     let any = mask.data.iter().any(|&m| m);
     let mut top: Option<(f32, usize)> = None;
-    for (p, &v) in best.boxed.data.iter().enumerate() {
+    for (p, &v) in evidence.iter().enumerate() {
         if (!any || mask.data[p]) && top.is_none_or(|(t, _)| v > t) {
             top = Some((v, p));
         }

@@ -184,3 +184,17 @@ fn perfect_masks_and_distinct_features_answer_every_phrase() {
         }
     }
 }
+
+#[test]
+fn the_location_avoids_what_a_finer_level_tells_apart() {
+    // The whole (level 2) spans the square; on level 1 only its right part matches, as a plate around a lemon does.
+    let whole = Plane { data: frame().data.iter().map(|&k| if k == 2 { 0 } else { k }).collect(), ..frame() };
+    let mut fine = whole.clone();
+    for (p, k) in fine.data.iter_mut().enumerate().filter(|(_, k)| **k == 0) {
+        *k = if p % 60 >= 34 { 0 } else { 1 };
+    }
+    let maps = [Plane::filled(60, 40, -1), fine.clone(), whole];
+    let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap();
+    assert_eq!(r.level, 2);
+    assert_eq!(fine.at(r.location.0, r.location.1), 0, "{:?}", r.location);
+}
