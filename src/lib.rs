@@ -3,6 +3,8 @@
 //! photo → infer → pose → scene → fit → language → query → format / report; each may use what stands left of it
 //! and the foundations `gpu`, `pass`, `scene`, `error`.
 #![warn(missing_docs)]
+// [N, 3] in the docs states a shape; rustdoc takes it for a link.
+#![allow(rustdoc::broken_intra_doc_links)]
 
 pub mod error;
 pub mod fit;

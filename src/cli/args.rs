@@ -1,4 +1,4 @@
-//! What the user typed. [`super::plan`] says what it means.
+//! What the user typed. `super::plan` says what it means.
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -66,7 +66,7 @@ pub struct RunArgs {
     /// How many photos to use, spread over the sorted names
     #[arg(long, value_name = "N")]
     pub views: Option<usize>,
-    /// Scene directory to write [default: out/<name of the input>]
+    /// Scene directory to write [default: out/NAME, after the input]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Replace a scene that is already there
@@ -81,10 +81,10 @@ pub struct RunArgs {
     /// Dense matches for the alignment of masks: auto, xfeat
     #[arg(long, default_value = "auto", value_name = "NAME")]
     pub matcher: String,
-    /// Masks on three levels: auto, graph, or dir:DIR (<stem>_s.npy)
+    /// Masks on three levels: auto, graph, or dir:DIR (STEM_s.npy)
     #[arg(long, default_value = "auto", value_name = "SOURCE")]
     pub masks: String,
-    /// Region features: auto, words, or dir:DIR (<stem>_f.npy, text_embeddings.npz)
+    /// Region features: auto, words, or dir:DIR (STEM_f.npy, text_embeddings.npz)
     #[arg(long, default_value = "auto", value_name = "SOURCE")]
     pub features: String,
     /// Ask the finished scene; may be repeated

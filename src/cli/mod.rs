@@ -1,4 +1,4 @@
-//! Command line: [`args`] = what the user typed, [`plan`] = what it means, one file per command.
+//! Command line: [`args`] = what the user typed, `plan` = what it means, one file per command.
 pub mod args;
 mod doctor;
 mod encoder;

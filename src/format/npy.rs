@@ -78,7 +78,7 @@ impl NpyData {
 }
 
 impl NpyArray {
-    /// An f32 array. The caller keeps `shape` consistent with `data`; [`write`] checks it.
+    /// An f32 array. The caller keeps `shape` consistent with `data`; [`write()`] checks it.
     pub fn f32(shape: &[usize], data: Vec<f32>) -> Self {
         NpyArray { shape: shape.to_vec(), data: NpyData::F32(data) }
     }

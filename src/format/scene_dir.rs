@@ -58,7 +58,7 @@ struct LevelManifest {
     code_dim: usize,
 }
 
-/// What [`write`] puts into a scene directory.
+/// What [`write()`] puts into a scene directory.
 #[derive(Clone, Copy)]
 pub struct Contents<'a> {
     /// The Gaussians.
