@@ -47,12 +47,22 @@ impl<'a> Viewer<'a> {
             } else {
                 let pixels = frame.features.chunks_exact(frame.feature_dim);
                 let part: Vec<f32> = pixels.flat_map(|f| f[first..first + d].iter().copied()).collect();
-                decode_map(&level.codebook, &part, &frame.alpha)?
+                decode_map(&level.codebook, &part, &spoken_for(&part, d, &frame.alpha))?
             });
             first += d;
         }
         Ok(DecodedFrame { frame, codes })
     }
+}
+
+/// Alpha where splats with features are what the pixel shows, 0 elsewhere: surfaces continued beyond the photos carry
+/// none, and a blend of nothing has no code. Splat features are unit vectors, so |F| is the alpha they contribute, less
+/// what differing codes cancel (√½ where two meet); a quarter separates that from stray contributions.
+fn spoken_for(features: &[f32], dim: usize, alpha: &Plane<f32>) -> Plane<f32> {
+    let norm = |f: &[f32]| f.iter().map(|v| v * v).sum::<f32>().sqrt();
+    let pixels = alpha.data.iter().zip(features.chunks_exact(dim));
+    let data = pixels.map(|(&a, f)| if norm(f) < 0.25 * a { 0.0 } else { a }).collect();
+    Plane { data, ..*alpha }
 }
 
 /// The scene from every camera.
@@ -64,4 +74,17 @@ pub fn decode_all(
 ) -> Result<Vec<DecodedFrame>> {
     let mut viewer = Viewer::new(device, splats, field)?;
     cameras.iter().map(|c| viewer.view(c)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pixel_without_features_has_no_alpha_for_words() {
+        let alpha = Plane { width: 4, height: 1, data: vec![0.9, 0.9, 0.9, 0.0] };
+        let mixed = 0.9 * 0.5;
+        let features = [0.9, 0.0, mixed, mixed, 0.0, 0.1, 0.0, 0.0];
+        assert_eq!(spoken_for(&features, 2, &alpha).data, [0.9, 0.9, 0.0, 0.0]);
+    }
 }
