@@ -265,5 +265,10 @@ fn without_weight_the_language_loss_changes_nothing() {
         let options = LanguageOptions { image_weight: 1.0, iterations, check_every: 0, ..language_options() };
         fit::train_language(&device, &images, &cameras, &splats, field.clone(), &options, &Silent).unwrap()
     };
-    assert_eq!(run(0).field.levels[0].features, run(9).field.levels[0].features);
+    // Two runs lift with atomic sums in another order, hence the last digits; an Adam step would move a
+    // feature by about its rate, more than 1e-3.
+    let (lifted, trained) = (run(0), run(9));
+    let pairs = lifted.field.levels[0].features.iter().zip(&trained.field.levels[0].features);
+    let moved = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(moved < 1e-5, "{moved}");
 }
