@@ -6,6 +6,7 @@
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]
 
+pub mod bench;
 pub mod error;
 pub mod fit;
 pub mod format;

@@ -1,5 +1,6 @@
 //! Command line: [`args`] = what the user typed, `plan` = what it means, one file per command.
 pub mod args;
+mod bench;
 mod doctor;
 mod encoder;
 mod eval;
@@ -47,6 +48,7 @@ fn execute(command: Command) -> Result<()> {
         Command::Eval(args) => eval::eval(&args),
         Command::Export(args) => export::export(&args),
         Command::Models(args) => models::models(&args),
+        Command::Bench(args) => bench::bench(&args),
         Command::Doctor(args) => doctor::doctor(&args),
     }
 }

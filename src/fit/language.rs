@@ -98,18 +98,18 @@ pub fn train_language(
 }
 
 /// The training of one model: all levels together, or one.
-struct Run<'a> {
+pub(crate) struct Run<'a> {
     device: Device,
     options: &'a LanguageOptions,
-    raster: RasterOptions,
+    pub(super) raster: RasterOptions,
     levels: Vec<&'a LevelField>,
     names: String,
     width: usize,
     extent: f64,
-    model: Model,
+    pub(super) model: Model,
     /// [N, levels·d] what Adam moves; the rendered features themselves when linear.
-    raw: Buffer,
-    views: Views,
+    pub(super) raw: Buffer,
+    pub(super) views: Views,
     cameras: &'a [Camera],
     targets: CodeTargets,
     losses: Vec<Buffer>,
@@ -121,7 +121,7 @@ struct Run<'a> {
 }
 
 impl<'a> Run<'a> {
-    fn new(
+    pub(crate) fn new(
         device: &Device,
         images: &[RgbImage],
         cameras: &'a [Camera],
@@ -214,7 +214,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    fn step(&mut self, iteration: usize) -> Result<()> {
+    pub(super) fn step(&mut self, iteration: usize) -> Result<()> {
         let view = self.order.draw();
         let at = self.views.list[view].stage;
         self.model.set_rates(&self.options.rates, self.options.feature_rate, self.extent, iteration)?;
@@ -239,7 +239,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    fn record(&self, view: usize) -> Result<Program> {
+    pub(super) fn record(&self, view: usize) -> Result<Program> {
         let (item, stage) = (&self.views.list[view], self.views.stage(view));
         let frame = stage.raster.frame();
         let mut rec = Recorder::new(&self.device, "language step");

@@ -10,8 +10,12 @@ pub mod pose;
 mod rgb;
 pub mod scale;
 pub mod schedule;
+mod steps;
 mod views;
 
+pub(crate) use language::Run as LanguageRun;
 pub use language::{LanguagePoint, TrainedLanguage, train_language};
 pub use options::{FeatureGauge, InitOptions, LanguageOptions, Preset, Rates, RgbOptions};
+pub(crate) use rgb::Run as RgbRun;
 pub use rgb::{CurvePoint, FitStats, Trained, fit_rgb, train_rgb};
+pub(crate) use steps::Steps;

@@ -131,13 +131,13 @@ pub fn fit_rgb(
 }
 
 /// The state of one fit.
-struct Run<'a> {
+pub(crate) struct Run<'a> {
     device: Device,
     options: &'a RgbOptions,
     scale: SceneScale,
-    raster: RasterOptions,
-    model: Model,
-    views: Views,
+    pub(super) raster: RasterOptions,
+    pub(super) model: Model,
+    pub(super) views: Views,
     cameras: Vec<Camera>,
     poses: Vec<PoseAdam>,
     order: ViewOrder,
@@ -150,7 +150,7 @@ struct Run<'a> {
 }
 
 impl<'a> Run<'a> {
-    fn new(
+    pub(crate) fn new(
         device: &Device,
         images: &[RgbImage],
         cameras: &[Camera],
@@ -187,7 +187,7 @@ impl<'a> Run<'a> {
     }
 
     /// One step on the next view; repeated with longer tile lists if they overflowed.
-    fn step(&mut self, iteration: usize) -> Result<()> {
+    pub(super) fn step(&mut self, iteration: usize) -> Result<()> {
         // One more SH band per 1000 steps (Kerbl et al. 2023), so that the low bands settle first.
         let degree = self.options.sh_degree.min((iteration / 1000) as u32);
         if degree != self.raster.sh_degree {
@@ -224,7 +224,7 @@ impl<'a> Run<'a> {
     }
 
     /// Forward, losses, backward and Adam of one view.
-    fn record(&self, view: usize) -> Result<Program> {
+    pub(super) fn record(&self, view: usize) -> Result<Program> {
         let (item, stage) = (&self.views.list[view], self.views.stage(view));
         let frame = stage.raster.frame();
         let mut rec = Recorder::new(&self.device, "rgb step");

@@ -81,7 +81,7 @@ impl Entry {
 }
 
 /// Refuses what no pinhole camera can be.
-pub(super) fn checked(c: Camera) -> Result<Camera, String> {
+pub(crate) fn checked(c: Camera) -> Result<Camera, String> {
     let finite =
         [c.fx, c.fy, c.cx, c.cy].iter().chain(&c.pose.rotation.to_cols_array()).all(|v| v.is_finite())
             && c.pose.translation.is_finite();

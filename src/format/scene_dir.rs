@@ -203,8 +203,9 @@ fn read_manifest(path: &Path) -> Result<Manifest> {
     Ok(manifest)
 }
 
-/// The PLY is padded to degree 3 for other viewers; the scene's own degree renders the same in less time.
-fn cut_degree(splats: Splats, degree: u32) -> Splats {
+/// Drops the coefficients above a degree. The PLY is padded to degree 3 for other viewers; the scene's own degree renders
+/// the same in less time.
+pub fn cut_degree(splats: Splats, degree: u32) -> Splats {
     let (have, keep) = (splats.sh_len(), crate::scene::sh_coefficients(degree.min(splats.sh_degree)));
     let sh = splats.sh.chunks_exact(have * 3).flat_map(|c| c[..keep * 3].iter().copied()).collect();
     Splats { sh, sh_degree: degree.min(splats.sh_degree), ..splats }

@@ -68,13 +68,16 @@ impl Buffer {
         let raw = unsafe { vulkan.create_buffer(&info, None) }.map_err(|e| fail(e.to_string()))?;
         let bound = bind(device, name, raw, mapped);
         match bound {
-            Ok(allocation) => Ok(Buffer(Arc::new(Inner {
-                device: device.clone(),
-                name: name.to_owned(),
-                raw,
-                bytes,
-                allocation: Mutex::new(Some(allocation)),
-            }))),
+            Ok(allocation) => {
+                device.0.memory.add(allocation.size());
+                Ok(Buffer(Arc::new(Inner {
+                    device: device.clone(),
+                    name: name.to_owned(),
+                    raw,
+                    bytes,
+                    allocation: Mutex::new(Some(allocation)),
+                })))
+            }
             Err(e) => {
                 // SAFETY: the buffer was never used.
                 unsafe { vulkan.destroy_buffer(raw, None) };
@@ -301,6 +304,7 @@ impl Drop for Inner {
         if let (Some(allocation), Some(allocator)) =
             (lock(&self.allocation).take(), lock(&self.device.0.allocator).as_mut())
         {
+            self.device.0.memory.remove(allocation.size());
             let _ = allocator.free(allocation);
         }
     }

@@ -7,6 +7,7 @@ use crate::{Error, Result};
 use ash::vk;
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 use std::collections::{BTreeSet, HashMap};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 
 /// How a device is opened.
@@ -71,6 +72,36 @@ pub struct DeviceInfo {
     pub timestamp_period: f64,
 }
 
+/// Memory of the buffers of a device, staging included.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Memory {
+    /// Bytes now.
+    pub current: u64,
+    /// Most bytes at any time since the device was opened or [`Device::reset_peak_memory`].
+    pub peak: u64,
+    /// Buffers made so far.
+    pub allocations: u64,
+}
+
+/// [`Memory`] as it is counted.
+#[derive(Default)]
+pub(super) struct MemoryCount {
+    current: AtomicU64,
+    peak: AtomicU64,
+    allocations: AtomicU64,
+}
+
+impl MemoryCount {
+    pub fn add(&self, bytes: u64) {
+        let now = self.current.fetch_add(bytes, Ordering::Relaxed) + bytes;
+        self.peak.fetch_max(now, Ordering::Relaxed);
+        self.allocations.fetch_add(1, Ordering::Relaxed);
+    }
+    pub fn remove(&self, bytes: u64) {
+        self.current.fetch_sub(bytes, Ordering::Relaxed);
+    }
+}
+
 /// A Vulkan device; clones share it.
 #[derive(Clone)]
 pub struct Device(pub(super) Arc<Inner>);
@@ -82,6 +113,7 @@ pub(super) struct Inner {
     pub queue: Mutex<vk::Queue>,
     /// `None` only while dropping: it must go before the device.
     pub allocator: Mutex<Option<Allocator>>,
+    pub memory: MemoryCount,
     pub pipelines: Mutex<HashMap<&'static str, Arc<Pipeline>>>,
     pub pipeline_cache: vk::PipelineCache,
     /// Set where synchronization2 comes from the extension instead of Vulkan 1.3.
@@ -177,6 +209,7 @@ impl Device {
             queue_family,
             queue: Mutex::new(queue),
             allocator: Mutex::new(Some(allocator)),
+            memory: MemoryCount::default(),
             pipelines: Mutex::new(HashMap::new()),
             pipeline_cache,
             sync2,
@@ -190,6 +223,22 @@ impl Device {
     /// What the device is and can do.
     pub fn info(&self) -> &DeviceInfo {
         &self.0.info
+    }
+
+    /// Memory of all buffers made on this device.
+    pub fn memory(&self) -> Memory {
+        let count = &self.0.memory;
+        Memory {
+            current: count.current.load(Ordering::Relaxed),
+            peak: count.peak.load(Ordering::Relaxed),
+            allocations: count.allocations.load(Ordering::Relaxed),
+        }
+    }
+
+    /// Starts measuring [`Memory::peak`] anew.
+    pub fn reset_peak_memory(&self) {
+        let now = self.0.memory.current.load(Ordering::Relaxed);
+        self.0.memory.peak.store(now, Ordering::Relaxed);
     }
 
     /// What the validation layer has said so far; always empty without validation.

@@ -71,7 +71,7 @@ mod select;
 mod validation;
 
 pub use buffer::Buffer;
-pub use device::{Device, DeviceInfo, Options};
+pub use device::{Device, DeviceInfo, Memory, Options};
 pub use module::{Access, Binding, Call, Capability, Family, Module};
 pub use program::Program;
 pub use recorder::Recorder;

@@ -21,6 +21,8 @@ pub(super) enum Groups {
 
 pub(super) struct Command {
     pub label: String,
+    /// The pass it belongs to, see [`Recorder::pass`].
+    pub pass: &'static str,
     pub op: Op,
 }
 
@@ -72,6 +74,7 @@ impl Command {
 pub struct Recorder {
     device: Device,
     label: String,
+    pass: &'static str,
     commands: Vec<Command>,
     error: Option<Error>,
 }
@@ -79,14 +82,25 @@ pub struct Recorder {
 impl Recorder {
     /// An empty recording; the label appears in errors.
     pub fn new(device: &Device, label: &str) -> Recorder {
-        Recorder { device: device.clone(), label: label.to_owned(), commands: Vec::new(), error: None }
+        Recorder {
+            device: device.clone(),
+            label: label.to_owned(),
+            pass: "other",
+            commands: Vec::new(),
+            error: None,
+        }
+    }
+
+    /// Names the pass that the commands from here on belong to: the rows of [`Program::run_passes`].
+    pub fn pass(&mut self, name: &'static str) {
+        self.pass = name;
     }
 
     /// Sets every 32-bit word of the buffer.
     pub fn fill(&mut self, buffer: &Buffer, value: u32) {
         self.own(&[buffer]);
         let op = Op::Fill { buffer: buffer.clone(), value };
-        self.commands.push(Command { label: format!("fill {}", buffer.name()), op });
+        self.push(format!("fill {}", buffer.name()), op);
     }
 
     /// Copies a whole buffer onto the start of one that is at least as long.
@@ -102,7 +116,7 @@ impl Recorder {
             self.fail(format!("{label}: {bytes} bytes from {from_byte} to {to_byte} reach beyond the end"));
         } else if bytes > 0 {
             let op = Op::Copy { from: from.clone(), to: to.clone(), from_byte, to_byte, bytes };
-            self.commands.push(Command { label, op });
+            self.push(label, op);
         }
     }
 
@@ -130,8 +144,7 @@ impl Recorder {
         }
         if let Some(module) = self.resolve(&call) {
             let groups = Groups::Indirect { args: args.clone(), byte };
-            self.commands
-                .push(Command { label: module.name.to_owned(), op: Op::Dispatch { module, call, groups } });
+            self.push(module.name.to_owned(), Op::Dispatch { module, call, groups });
         }
     }
 
@@ -171,14 +184,17 @@ impl Recorder {
         Program::assemble(self.device, self.label, self.commands, steps)
     }
 
+    fn push(&mut self, label: String, op: Op) {
+        self.commands.push(Command { label, pass: self.pass, op });
+    }
+
     fn push_dispatch(&mut self, module: &'static Module, call: Call, groups: [u32; 3]) {
         let most = self.device.info().max_groups;
         if (0..3).any(|i| groups[i] > most[i]) {
             self.fail(format!("{}: {groups:?} workgroups, the device allows {most:?}", module.name));
         } else if groups.iter().all(|&g| g > 0) {
             let groups = Groups::Direct(groups);
-            self.commands
-                .push(Command { label: module.name.to_owned(), op: Op::Dispatch { module, call, groups } });
+            self.push(module.name.to_owned(), Op::Dispatch { module, call, groups });
         }
     }
 

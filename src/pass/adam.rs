@@ -84,6 +84,7 @@ impl Schedule {
         moments: &Moments,
         guard: &Buffer,
     ) {
+        rec.pass("Adam");
         let call = shaders::adam::call(
             &shaders::adam::Bindings {
                 parameters,

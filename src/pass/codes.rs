@@ -28,6 +28,7 @@ pub enum Mode {
 
 /// Records the loss of a frame: writes the feature planes of `frame.planes_grad` and, per pixel, `loss` [H·W].
 pub fn record(rec: &mut Recorder, targets: &Targets, frame: &FrameBuffers, loss: &Buffer, mode: Mode) {
+    rec.pass("feature loss");
     let pixels = frame.width * frame.height;
     record_planes(rec, targets, &frame.planes, &frame.planes_grad, loss, pixels, mode);
 }

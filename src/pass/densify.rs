@@ -19,6 +19,7 @@ impl GradientStats {
 
     /// Adds the frame whose backward pass was recorded before.
     pub fn record(&self, rec: &mut Recorder, frame: &FrameBuffers, count: usize) {
+        rec.pass("densification statistics");
         let call = shaders::gradient_stats::call(
             &shaders::gradient_stats::Bindings {
                 projected: &frame.projected,

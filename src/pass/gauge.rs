@@ -18,6 +18,7 @@ pub fn record(
     width: usize,
     epsilon: f32,
 ) {
+    rec.pass("feature gauge");
     let call = shaders::feature_gauge::call(
         &shaders::feature_gauge::Bindings { raw, features },
         &shaders::feature_gauge::Push { blocks: blocks as u32, width: width as u32, epsilon },
@@ -34,6 +35,7 @@ pub fn record_backward(
     width: usize,
     epsilon: f32,
 ) {
+    rec.pass("feature gauge");
     let call = shaders::feature_gauge_backward::call(
         &shaders::feature_gauge_backward::Bindings { raw, gradients },
         &shaders::feature_gauge_backward::Push { blocks: blocks as u32, width: width as u32, epsilon },

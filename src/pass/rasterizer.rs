@@ -289,12 +289,16 @@ impl Rasterizer {
     /// Records projection, depth sort, binning and blending.
     pub fn record_forward(&self, rec: &mut Recorder, params: &SplatBuffers, options: &RasterOptions) {
         let sh_degree = options.sh_degree.min(params.sh_degree);
+        rec.pass("projection");
         project::record(rec, params, &self.camera, &self.frame, sh_degree);
         project::record_features(rec, params, &self.frame, options.feature_mode);
+        rec.pass("depth sort");
         // Keys are the bits of camera z. The sort is stable, so equal depths keep the order of the splats.
         rec.fill(&self.count, params.count as u32);
         self.sort.record(rec, &self.frame.depth_pairs, &self.count, 32);
+        rec.pass("binning");
         bin::record(rec, &self.frame, params.count);
+        rec.pass("raster forward");
         raster_forward::record(rec, &self.camera, &self.frame);
     }
 
@@ -308,7 +312,9 @@ impl Rasterizer {
         gradients: &SplatBuffers,
     ) {
         let sh_degree = options.sh_degree.min(params.sh_degree);
+        rec.pass("raster backward");
         raster_backward::record(rec, &self.frame, options.features_move_geometry);
+        rec.pass("projection backward");
         let camera_grad = &self.frame.camera_grad;
         project_backward::record(rec, params, &self.camera, &self.frame, sh_degree, gradients, camera_grad);
         project_backward::record_features(rec, params, &self.frame, options.feature_mode, gradients);

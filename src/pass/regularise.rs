@@ -5,6 +5,7 @@ use crate::gpu::{Buffer, Recorder, shaders};
 /// Records `weight · Σ |D − A·d|/d` over pixels with reference depth d > 0, as gradients by D = Σwz and A; without a
 /// reference both gradients become zero. Weight: divide by the number of pixels for a mean.
 pub fn record_depth(rec: &mut Recorder, frame: &FrameBuffers, reference: Option<&Buffer>, weight: f64) {
+    rec.pass("regularisers");
     let pixels = frame.width * frame.height;
     let alpha_plane = 4 + frame.feature_dim as u32;
     let call = match reference {
@@ -50,6 +51,7 @@ pub fn record_ratio(
     weight: f64,
     limit: f32,
 ) {
+    rec.pass("regularisers");
     let call = shaders::ratio_penalty::call(
         &shaders::ratio_penalty::Bindings { log_scales, gradients },
         &shaders::ratio_penalty::Push { count: count as u32, weight: weight as f32, limit },

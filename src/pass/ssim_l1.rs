@@ -161,6 +161,7 @@ impl SsimL1 {
         weights: [f64; 2],
         loss: (&Buffer, u32),
     ) {
+        rec.pass("SSIM + L1");
         let (width, height) = (self.width as i32, self.height as i32);
         let count = (CHANNELS * self.width * self.height) as f64;
         let strips = |n: usize| n.div_ceil(STRIP) as u32;

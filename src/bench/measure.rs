@@ -1,0 +1,122 @@
+//! Repeating a measurement and what its times say.
+use crate::Result;
+use serde::{Deserialize, Serialize};
+use std::time::Instant;
+
+/// How long one measurement runs.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Budget {
+    /// Repeats for this long, but at least [`LEAST`] times.
+    pub seconds: f64,
+    /// Exactly this often instead.
+    pub repeats: Option<usize>,
+}
+
+/// Fewer runs have no quartiles.
+pub const LEAST: usize = 5;
+/// Runs that are not counted: the driver compiles shaders at the first, caches and clocks settle at the second.
+const WARM_UP: usize = 2;
+
+impl Default for Budget {
+    fn default() -> Self {
+        Budget { seconds: 2.0, repeats: None }
+    }
+}
+
+impl Budget {
+    /// Calls `run` to warm up and then until the budget is used; what each counted call returned.
+    pub fn repeat<T>(&self, mut run: impl FnMut() -> Result<T>) -> Result<Vec<T>> {
+        for _ in 0..WARM_UP {
+            run()?;
+        }
+        let start = Instant::now();
+        let mut results = Vec::new();
+        loop {
+            let done = match self.repeats {
+                Some(n) => results.len() >= n.max(1),
+                None => results.len() >= LEAST && start.elapsed().as_secs_f64() >= self.seconds,
+            };
+            if done {
+                return Ok(results);
+            }
+            results.push(run()?);
+        }
+    }
+
+    /// Wall-clock milliseconds of each call.
+    pub fn wall(&self, mut run: impl FnMut() -> Result<()>) -> Result<Spread> {
+        let times = self.repeat(|| {
+            let start = Instant::now();
+            run()?;
+            Ok(start.elapsed().as_secs_f64() * 1e3)
+        })?;
+        Ok(Spread::of(&times))
+    }
+}
+
+/// The distribution of repeated times, milliseconds.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Spread {
+    /// Half of the runs took at most this.
+    pub median: f64,
+    /// A quarter took at most this …
+    pub lower_quartile: f64,
+    /// … and a quarter at least this.
+    pub upper_quartile: f64,
+    /// The fastest run.
+    pub best: f64,
+    /// How many runs.
+    pub runs: usize,
+}
+
+impl Spread {
+    /// Of the given times; all zero when there are none.
+    pub fn of(times: &[f64]) -> Spread {
+        let mut sorted = times.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        // Linear interpolation between the order statistics.
+        let at = |share: f64| {
+            let x = share * sorted.len().saturating_sub(1) as f64;
+            let (low, high) = (x.floor() as usize, x.ceil() as usize);
+            match (sorted.get(low), sorted.get(high)) {
+                (Some(a), Some(b)) => a + (b - a) * (x - low as f64),
+                _ => 0.0,
+            }
+        };
+        Spread {
+            median: at(0.5),
+            lower_quartile: at(0.25),
+            upper_quartile: at(0.75),
+            best: at(0.0),
+            runs: times.len(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quartiles_of_known_times() {
+        let s = Spread::of(&[5.0, 1.0, 2.0, 4.0, 3.0]);
+        assert_eq!((s.best, s.lower_quartile, s.median, s.upper_quartile, s.runs), (1.0, 2.0, 3.0, 4.0, 5));
+        let s = Spread::of(&[1.0, 2.0]);
+        assert_eq!((s.lower_quartile, s.median), (1.25, 1.5));
+        assert_eq!(Spread::of(&[]), Spread::default());
+    }
+
+    #[test]
+    fn warm_up_is_not_counted_and_repeats_are_exact() {
+        let mut calls = 0;
+        let budget = Budget { seconds: 0.0, repeats: Some(3) };
+        let seen = budget
+            .repeat(|| {
+                calls += 1;
+                Ok(calls)
+            })
+            .unwrap();
+        assert_eq!(seen, [3, 4, 5]);
+        assert_eq!(Budget { seconds: 0.0, repeats: None }.repeat(|| Ok(())).unwrap().len(), LEAST);
+    }
+}

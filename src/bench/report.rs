@@ -1,0 +1,225 @@
+//! What a benchmark found, as a table and as JSON.
+use super::measure::Spread;
+use crate::gpu::Device;
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+use std::fmt::Write;
+use std::path::Path;
+
+/// Name and version of the JSON layout; readers refuse others.
+const FORMAT: &str = "splatvk-bench 1";
+
+/// Everything one run of `splatvk bench` measured.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Report {
+    /// `splatvk-bench 1`.
+    pub format: String,
+    /// Version of this program.
+    pub program: String,
+    /// Where it ran.
+    pub device: DeviceRecord,
+    /// In the order they were measured.
+    pub sections: Vec<Section>,
+}
+
+/// The device of a report.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct DeviceRecord {
+    /// As the driver reports it.
+    pub name: String,
+    /// Driver and version.
+    pub driver: String,
+    /// Vulkan version.
+    pub vulkan: String,
+    /// A software device.
+    pub is_cpu: bool,
+    /// Threads.
+    pub subgroup_size: u32,
+    /// Of the host.
+    pub cores: usize,
+}
+
+/// Measurements that belong together.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Section {
+    /// What was measured; equal names are compared between reports.
+    pub name: String,
+    /// On what.
+    pub workload: String,
+    /// Times.
+    pub rows: Vec<Row>,
+    /// Counts and derived figures.
+    pub figures: Vec<Figure>,
+}
+
+/// One timed thing.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Row {
+    /// Pass or part of a step.
+    pub name: String,
+    /// How it was timed.
+    pub clock: Clock,
+    /// Milliseconds.
+    pub ms: Spread,
+    /// Bytes that have to move, estimated.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bytes: Option<f64>,
+    /// Floating-point operations that have to be done, estimated.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flops: Option<f64>,
+    /// Least milliseconds by the measured roofline.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub floor_ms: Option<f64>,
+}
+
+/// What a time is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Clock {
+    /// Difference of two timestamps on the device.
+    #[default]
+    Device,
+    /// Of the host, submission and waiting included.
+    Wall,
+}
+
+/// One number.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Figure {
+    /// What it counts.
+    pub name: String,
+    /// Its value.
+    pub value: f64,
+    /// Empty for a ratio.
+    pub unit: String,
+}
+
+impl Report {
+    /// An empty report of a device.
+    pub fn new(device: &Device) -> Report {
+        let info = device.info();
+        let (major, minor, patch) = info.api_version;
+        Report {
+            format: FORMAT.to_owned(),
+            program: env!("CARGO_PKG_VERSION").to_owned(),
+            device: DeviceRecord {
+                name: info.name.clone(),
+                driver: info.driver.clone(),
+                vulkan: format!("{major}.{minor}.{patch}"),
+                is_cpu: info.is_cpu,
+                subgroup_size: info.subgroup_size,
+                cores: std::thread::available_parallelism().map_or(1, usize::from),
+            },
+            sections: Vec::new(),
+        }
+    }
+
+    /// Reads a report from its JSON file.
+    pub fn read(path: &Path) -> Result<Report> {
+        let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
+        let text = std::fs::read_to_string(path)
+            .map_err(|e| bad(format!("{e}; give a file of splatvk bench --json")))?;
+        let report: Report = serde_json::from_str(&text)
+            .map_err(|e| bad(format!("not a report of splatvk bench --json: {e}")))?;
+        if report.format != FORMAT {
+            return Err(bad(format!("layout {:?}; this program reads {FORMAT:?}", report.format)));
+        }
+        Ok(report)
+    }
+
+    /// The section of a name.
+    pub fn section(&self, name: &str) -> Option<&Section> {
+        self.sections.iter().find(|s| s.name == name)
+    }
+
+    /// Adds the figures that need two sections: steps with features by the step without.
+    pub fn relate(&mut self) {
+        let step = |s: &Section| s.row(super::training::STEP).map(|r| r.ms.median);
+        let Some(base) = self.section(super::training::COLOUR).and_then(step) else { return };
+        for section in &mut self.sections {
+            if section.name.starts_with(super::training::COLOUR) && section.name != super::training::COLOUR {
+                if let Some(ms) = step(section) {
+                    section.figure("step / step on colour alone", ms / base, "");
+                }
+            }
+        }
+    }
+
+    /// The plain table.
+    pub fn table(&self) -> String {
+        let d = &self.device;
+        let mut text = format!(
+            "{} · {} · Vulkan {} · subgroups of {} · {} host cores · splatvk {}\n",
+            d.name, d.driver, d.vulkan, d.subgroup_size, d.cores, self.program
+        );
+        for section in &self.sections {
+            section.print(&mut text);
+        }
+        text
+    }
+}
+
+impl Section {
+    /// An empty section.
+    pub fn new(name: impl Into<String>, workload: impl Into<String>) -> Section {
+        Section { name: name.into(), workload: workload.into(), ..Section::default() }
+    }
+
+    /// The row of a name.
+    pub fn row(&self, name: &str) -> Option<&Row> {
+        self.rows.iter().find(|r| r.name == name)
+    }
+
+    /// The value of a figure.
+    pub fn value(&self, name: &str) -> Option<f64> {
+        self.figures.iter().find(|f| f.name == name).map(|f| f.value)
+    }
+
+    /// Adds a time.
+    pub fn time(&mut self, name: impl Into<String>, clock: Clock, ms: Spread) {
+        self.rows.push(Row { name: name.into(), clock, ms, ..Row::default() });
+    }
+
+    /// Adds a figure.
+    pub fn figure(&mut self, name: impl Into<String>, value: f64, unit: &str) {
+        self.figures.push(Figure { name: name.into(), value, unit: unit.to_owned() });
+    }
+
+    fn print(&self, text: &mut String) {
+        // Writing to a String cannot fail.
+        let _ = writeln!(text, "\n{}: {}", self.name, self.workload);
+        if !self.rows.is_empty() {
+            let head = ["median ms", "quartiles", "best", "runs", "clock"];
+            let _ = writeln!(
+                text,
+                "  {:<34} {:>10} {:>19} {:>10} {:>5}  {:<6} {:>10}",
+                "", head[0], head[1], head[2], head[3], head[4], "floor ms"
+            );
+        }
+        for row in &self.rows {
+            let ms = &row.ms;
+            let clock = if row.clock == Clock::Device { "device" } else { "wall" };
+            let quartiles = format!("{:.3}–{:.3}", ms.lower_quartile, ms.upper_quartile);
+            let floor = row.floor_ms.map_or(String::new(), |f| format!("{f:.3}"));
+            let _ = writeln!(
+                text,
+                "  {:<34} {:>10.3} {quartiles:>19} {:>10.3} {:>5}  {clock:<6} {floor:>10}",
+                row.name, ms.median, ms.best, ms.runs
+            );
+        }
+        for figure in &self.figures {
+            let _ = writeln!(text, "  {:<34} {:>10} {}", figure.name, plain(figure.value), figure.unit);
+        }
+    }
+}
+
+/// Whole numbers as they are, others with the digits that mean something.
+fn plain(value: f64) -> String {
+    if value.fract() == 0.0 && value.abs() < 1e15 {
+        format!("{value:.0}")
+    } else if value.abs() >= 100.0 {
+        format!("{value:.1}")
+    } else {
+        format!("{value:.3}")
+    }
+}

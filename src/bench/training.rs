@@ -1,0 +1,160 @@
+//! The training step: each pass by timestamps on the device, the whole by wall clock.
+use super::measure::{Budget, Spread};
+use super::report::{Clock, Section};
+use super::workload::Workload;
+use crate::Result;
+use crate::fit::options::Rates;
+use crate::fit::scale::SceneScale;
+use crate::fit::schedule::Exponential;
+use crate::fit::{LanguageOptions, LanguageRun, Preset, RgbOptions, RgbRun, Steps};
+use crate::gpu::{Device, Recorder};
+use crate::pass::seeded;
+use crate::scene::{Codebook, LevelField, Plane, RgbImage};
+
+/// Name of the section of steps on colour; others begin with it.
+pub const COLOUR: &str = "training step";
+/// Row of the whole step.
+pub const STEP: &str = "training step";
+/// Codes per level of the synthetic feature targets; a scene of four photos has about as many.
+const CODES: usize = 32;
+/// Far behind the schedule's end: all SH bands are in use (one more every 1000 steps).
+const ITERATION: usize = 1_000_000;
+
+/// No parameter moves, all arithmetic is done.
+fn still() -> Rates {
+    Rates {
+        means: Exponential::constant(0.0),
+        log_scales: 0.0,
+        quats: 0.0,
+        opacity: 0.0,
+        sh_dc: 0.0,
+        sh_rest: 0.0,
+    }
+}
+
+/// Forward, L1 + SSIM, regularisers, backward, Adam: the step of the colour stage.
+pub fn colour(device: &Device, workload: &Workload, budget: &Budget) -> Result<Section> {
+    device.reset_peak_memory();
+    let target = [workload.target(device)?];
+    let cameras = [workload.camera.clone()];
+    let options = RgbOptions {
+        rates: still(),
+        sh_degree: workload.splats.sh_degree,
+        poses: None,
+        ..RgbOptions::preset(Preset::Default)
+    };
+    let scale = SceneScale::measure(&cameras, &workload.splats.means);
+    let mut run = RgbRun::new(device, &target, &cameras, &workload.splats, scale, None, &options)?;
+    let mut section = Section::new(COLOUR, workload.describe(0));
+    measure(device, &mut run, budget, &mut section)?;
+    Ok(section)
+}
+
+/// The step of the language stage with `features` channels: the same image loss, and L1 to the codes of labelled pixels.
+pub fn with_features(
+    device: &Device,
+    workload: &Workload,
+    features: usize,
+    budget: &Budget,
+) -> Result<Section> {
+    device.reset_peak_memory();
+    let target = [workload.target(device)?];
+    let cameras = [workload.camera.clone()];
+    let levels = features.div_ceil(16);
+    let fields: Vec<LevelField> =
+        (0..levels).map(|l| level(&target[0], features / levels, l as u64)).collect();
+    let fields: Vec<&LevelField> = fields.iter().collect();
+    let options = LanguageOptions {
+        rates: still(),
+        feature_rate: 0.0,
+        lift: false,
+        check_every: 0,
+        ..LanguageOptions::preset(Preset::Default)
+    };
+    let mut run = LanguageRun::new(device, &target, &cameras, &workload.splats, &fields, &options)?;
+    run.set_features(&seeded::features(workload.splats.len(), features, 0))?;
+    let mut section = Section::new(format!("{COLOUR}, {features} features"), workload.describe(features));
+    measure(device, &mut run, budget, &mut section)?;
+    Ok(section)
+}
+
+/// Codes and a label per pixel, in blocks as masks have them.
+fn level(image: &RgbImage, width: usize, seed: u64) -> LevelField {
+    let mut codes = seeded::features(CODES, width, seed);
+    for code in codes.chunks_exact_mut(width) {
+        let norm = code.iter().map(|v| v * v).sum::<f32>().sqrt();
+        code.iter_mut().for_each(|v| *v /= norm);
+    }
+    let block = |i: usize| ((i % image.width / 32 + 7 * (i / image.width / 32)) % CODES) as i32;
+    let data = (0..image.data.len()).map(block).collect();
+    LevelField {
+        codebook: Codebook {
+            embedding_dim: 1,
+            code_dim: width,
+            embeddings: vec![1.0; CODES],
+            codes,
+            ..Codebook::default()
+        },
+        features: Vec::new(),
+        targets: vec![Plane { width: image.width, height: image.height, data }],
+    }
+}
+
+fn measure(device: &Device, run: &mut dyn Steps, budget: &Budget, section: &mut Section) -> Result<()> {
+    // Also grows the tile lists to what the scene needs, before anything is recorded.
+    run.step(ITERATION)?;
+    passes(run, budget, section)?;
+    let before = device.memory().allocations;
+    let mut steps = 0usize;
+    let step = budget.wall(|| {
+        steps += 1;
+        run.step(ITERATION)
+    })?;
+    let allocations = (device.memory().allocations - before) as f64 / steps as f64;
+    parts(device, run, budget, section)?;
+    section.time(STEP, Clock::Wall, step);
+    counts(device, run, section)?;
+    section.figure("allocations per step", allocations, "");
+    Ok(())
+}
+
+/// The device work of a step, pass by pass.
+fn passes(run: &dyn Steps, budget: &Budget, section: &mut Section) -> Result<()> {
+    let program = run.record()?;
+    let runs = budget.repeat(|| program.run_passes())?;
+    let names: Vec<&str> = runs.first().map(|r| r.iter().map(|p| p.0).collect()).unwrap_or_default();
+    for (at, name) in names.iter().enumerate() {
+        let times: Vec<f64> = runs.iter().map(|r| r[at].1).collect();
+        section.time(*name, Clock::Device, Spread::of(&times));
+    }
+    let sums: Vec<f64> = runs.iter().map(|r| r.iter().map(|p| p.1).sum()).collect();
+    section.time("sum of the passes", Clock::Device, Spread::of(&sums));
+    Ok(())
+}
+
+/// Forward, and forward with backward, as programs of their own.
+fn parts(device: &Device, run: &dyn Steps, budget: &Budget, section: &mut Section) -> Result<()> {
+    let p = run.parts();
+    for (name, backward) in [("forward", false), ("forward + backward", true)] {
+        let mut rec = Recorder::new(device, name);
+        p.raster.record_forward(&mut rec, p.params, p.options);
+        if backward {
+            p.raster.record_backward(&mut rec, p.params, p.options, p.gradients);
+        }
+        let program = rec.compile()?;
+        section.time(name, Clock::Wall, budget.wall(|| program.run())?);
+    }
+    Ok(())
+}
+
+/// How much work a step is.
+fn counts(device: &Device, run: &dyn Steps, section: &mut Section) -> Result<()> {
+    let p = run.parts();
+    let intersections = f64::from(p.raster.frame().status.read::<u32>()?[0]);
+    let seconds = section.row(STEP).map_or(f64::NAN, |r| r.ms.median / 1e3);
+    section.figure("intersections", intersections, "tile–splat pairs");
+    section.figure("splats per second", p.params.count as f64 / seconds / 1e6, "M/s");
+    section.figure("intersections per second", intersections / seconds / 1e6, "M/s");
+    section.figure("peak device memory", device.memory().peak as f64 / f64::from(1 << 20), "MiB");
+    Ok(())
+}
