@@ -136,11 +136,10 @@ impl Report {
     pub fn relate(&mut self) {
         let step = |s: &Section| s.row(super::training::STEP).map(|r| r.ms.median);
         let Some(base) = self.section(super::training::COLOUR).and_then(step) else { return };
-        for section in &mut self.sections {
-            if section.name.starts_with(super::training::COLOUR) && section.name != super::training::COLOUR {
-                if let Some(ms) = step(section) {
-                    section.figure("step / step on colour alone", ms / base, "");
-                }
+        let prefix = format!("{}, ", super::training::COLOUR);
+        for section in self.sections.iter_mut().filter(|s| s.name.starts_with(&prefix)) {
+            if let Some(ms) = step(section) {
+                section.figure("step / step on colour alone", ms / base, "");
             }
         }
     }
