@@ -14,8 +14,10 @@ pub struct Budget {
 
 /// Fewer runs have no quartiles.
 pub const LEAST: usize = 5;
-/// Runs that are not counted: the driver compiles shaders at the first, caches and clocks settle at the second.
+/// Runs that are not counted: the driver compiles shaders at the first, caches and clocks settle at the second …
 const WARM_UP: usize = 2;
+/// … and, when a time is given, for this share of it.
+const WARM_UP_SHARE: f64 = 0.1;
 
 impl Default for Budget {
     fn default() -> Self {
@@ -26,8 +28,13 @@ impl Default for Budget {
 impl Budget {
     /// Calls `run` to warm up and then until the budget is used; what each counted call returned.
     pub fn repeat<T>(&self, mut run: impl FnMut() -> Result<T>) -> Result<Vec<T>> {
-        for _ in 0..WARM_UP {
+        let start = Instant::now();
+        let mut warm = 0;
+        while warm < WARM_UP
+            || (self.repeats.is_none() && start.elapsed().as_secs_f64() < WARM_UP_SHARE * self.seconds)
+        {
             run()?;
+            warm += 1;
         }
         let start = Instant::now();
         let mut results = Vec::new();
@@ -45,13 +52,31 @@ impl Budget {
 
     /// Wall-clock milliseconds of each call.
     pub fn wall(&self, mut run: impl FnMut() -> Result<()>) -> Result<Spread> {
-        let times = self.repeat(|| {
-            let start = Instant::now();
+        let runs = self.repeat(|| {
+            let (processor, start) = (processor_ms(), Instant::now());
             run()?;
-            Ok(start.elapsed().as_secs_f64() * 1e3)
+            let wall = start.elapsed().as_secs_f64() * 1e3;
+            Ok((wall, (processor_ms() - processor) / cores()))
         })?;
-        Ok(Spread::of(&times))
+        let times: Vec<f64> = runs.iter().map(|r| r.0).collect();
+        let processor = Spread::of(&runs.iter().map(|r| r.1).collect::<Vec<_>>()).median;
+        Ok(Spread { processor, ..Spread::of(&times) })
     }
+}
+
+/// Processor milliseconds of all threads of this process so far, as Linux counts them; 0 elsewhere.
+pub(super) fn processor_ms() -> f64 {
+    let Ok(threads) = std::fs::read_dir("/proc/self/task") else { return 0.0 };
+    let nanoseconds = |thread: std::io::Result<std::fs::DirEntry>| {
+        let text = std::fs::read_to_string(thread.ok()?.path().join("schedstat")).ok()?;
+        text.split_whitespace().next()?.parse::<f64>().ok()
+    };
+    threads.filter_map(nanoseconds).sum::<f64>() / 1e6
+}
+
+/// Of the host, as far as this process may use them.
+pub(super) fn cores() -> f64 {
+    std::thread::available_parallelism().map_or(1, usize::from) as f64
 }
 
 /// The distribution of repeated times, milliseconds.
@@ -67,6 +92,10 @@ pub struct Spread {
     pub best: f64,
     /// How many runs.
     pub runs: usize,
+    /// Median of the processor time of this process, all threads, divided by the cores: on a CPU device about what a run
+    /// would take if nothing else ran. 0 where it was not taken.
+    #[serde(default)]
+    pub processor: f64,
 }
 
 impl Spread {
@@ -89,6 +118,7 @@ impl Spread {
             upper_quartile: at(0.75),
             best: at(0.0),
             runs: times.len(),
+            processor: 0.0,
         }
     }
 }

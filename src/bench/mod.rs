@@ -4,47 +4,86 @@
 //! The steps are those of [`crate::fit`], recorded by the code that trains; learning rates are zero, so that every
 //! repetition does the same work on the same scene. The photo to fit is the scene's own render, a little paler.
 pub mod compare;
+mod growth;
+mod latency;
 pub mod measure;
+mod model;
 pub mod report;
+mod roofline;
+mod sorting;
 mod training;
 pub mod workload;
 
 pub use measure::{Budget, Spread};
 pub use report::{Report, Row, Section};
+pub use roofline::Roofline;
 pub use workload::Workload;
 
 use crate::gpu::Device;
+use crate::infer::RegionEncoder;
+use crate::scene::{Camera, LanguageField, Splats};
 use crate::{Error, Result};
 
-/// What to measure beside the training step on colour alone.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Options {
-    /// How long each measurement runs.
-    pub budget: Budget,
-    /// Feature channels of the second step: 0 = none, at most 16, or a multiple of 16 up to 48.
-    pub features: usize,
+/// A series of measurements on one device, the roofline first.
+pub struct Bench<'a> {
+    device: &'a Device,
+    budget: Budget,
+    roofline: Roofline,
+    /// What was found so far.
+    pub report: Report,
 }
 
-impl Default for Options {
-    fn default() -> Self {
-        Options { budget: Budget::default(), features: 16 }
-    }
-}
-
-/// Measures the training step of a workload.
-pub fn training(device: &Device, workload: &Workload, options: &Options) -> Result<Report> {
-    check_features(options.features)?;
-    let mut report = Report::new(device);
-    report.sections.push(training::colour(device, workload, &options.budget)?);
-    if options.features > 0 {
-        let section = training::with_features(device, workload, options.features, &options.budget)?;
+impl<'a> Bench<'a> {
+    /// Measures the device's limits.
+    pub fn new(device: &'a Device, budget: Budget) -> Result<Bench<'a>> {
+        let (roofline, section) = roofline::measure(device, &budget)?;
+        let mut report = Report::new(device);
         report.sections.push(section);
+        Ok(Bench { device, budget, roofline, report })
     }
-    report.relate();
-    Ok(report)
+
+    /// The training step on colour, and then with `features` more channels (0 = leave that out).
+    pub fn training(&mut self, workload: &Workload, features: usize) -> Result<()> {
+        check_features(features)?;
+        let limits = (&self.budget, &self.roofline);
+        self.report.sections.push(training::colour(self.device, workload, limits)?);
+        if features > 0 {
+            let section = training::with_features(self.device, workload, features, limits)?;
+            self.report.sections.push(section);
+        }
+        self.report.relate();
+        Ok(())
+    }
+
+    /// The training step on seeded scenes of growing size that are otherwise like `like`.
+    pub fn growth(&mut self, sizes: &[usize], like: &Workload) -> Result<()> {
+        let limits = (&self.budget, &self.roofline);
+        self.report.sections.push(growth::measure(self.device, sizes, like, limits)?);
+        Ok(())
+    }
+
+    /// The radix sort of random keys with values.
+    pub fn sort(&mut self, keys: usize) -> Result<()> {
+        let limits = (&self.budget, &self.roofline);
+        self.report.sections.push(sorting::measure(self.device, keys, limits)?);
+        Ok(())
+    }
+
+    /// A text query in all views of a scene.
+    pub fn query(
+        &mut self,
+        scene: (&Splats, &LanguageField, &[Camera]),
+        encoder: &mut dyn RegionEncoder,
+        text: &str,
+    ) -> Result<()> {
+        let section = latency::measure(self.device, scene, encoder, text, &self.budget)?;
+        self.report.sections.push(section);
+        Ok(())
+    }
 }
 
-pub(crate) fn check_features(features: usize) -> Result<()> {
+/// The channels that steps with features exist for.
+pub fn check_features(features: usize) -> Result<()> {
     if features <= 16 || (features.is_multiple_of(16) && features <= 48) {
         return Ok(());
     }

@@ -1,6 +1,8 @@
 //! What a benchmark found, as a table and as JSON.
-use super::measure::Spread;
-use crate::gpu::Device;
+use super::measure::{Budget, Spread, cores, processor_ms};
+use super::model::Work;
+use super::roofline::Roofline;
+use crate::gpu::{Device, Program, Recorder};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
@@ -8,6 +10,11 @@ use std::path::Path;
 
 /// Name and version of the JSON layout; readers refuse others.
 const FORMAT: &str = "splatvk-bench 1";
+
+/// Row that adds up the passes above it.
+pub const SUM: &str = "sum of the passes";
+/// Passes that a render consists of.
+const FORWARD: [&str; 4] = ["projection", "depth sort", "binning", "raster forward"];
 
 /// Everything one run of `splatvk bench` measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -83,6 +90,13 @@ pub enum Clock {
     Wall,
 }
 
+impl Row {
+    /// Bytes, operations and the least milliseconds for them.
+    fn set_floor(&mut self, [bytes, flops, ms]: [f64; 3]) {
+        (self.bytes, self.flops, self.floor_ms) = (Some(bytes), Some(flops), Some(ms));
+    }
+}
+
 /// One number.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Figure {
@@ -108,7 +122,7 @@ impl Report {
                 vulkan: format!("{major}.{minor}.{patch}"),
                 is_cpu: info.is_cpu,
                 subgroup_size: info.subgroup_size,
-                cores: std::thread::available_parallelism().map_or(1, usize::from),
+                cores: cores() as usize,
             },
             sections: Vec::new(),
         }
@@ -179,35 +193,104 @@ impl Section {
         self.rows.push(Row { name: name.into(), clock, ms, ..Row::default() });
     }
 
-    /// Adds a figure.
+    /// Adds a figure, if it is a number: a ratio by nothing is left out.
     pub fn figure(&mut self, name: impl Into<String>, value: f64, unit: &str) {
-        self.figures.push(Figure { name: name.into(), value, unit: unit.to_owned() });
+        if value.is_finite() {
+            self.figures.push(Figure { name: name.into(), value, unit: unit.to_owned() });
+        }
+    }
+
+    /// Runs what `record` records again and again and adds a row per pass; the milliseconds of each run.
+    pub(super) fn passes(
+        &mut self,
+        device: &Device,
+        record: &dyn Fn() -> Recorder,
+        budget: &Budget,
+    ) -> Result<Vec<Vec<(&'static str, f64)>>> {
+        let program = record().compile()?;
+        let runs = budget.repeat(|| program.run_passes())?;
+        let first = self.rows.len();
+        for (at, (name, _)) in runs.first().into_iter().flatten().enumerate() {
+            let times: Vec<f64> = runs.iter().map(|r| r[at].1).collect();
+            self.time(*name, Clock::Device, Spread::of(&times));
+        }
+        // Where the host is the device, the processor time of a pass tells what it takes when nothing else runs.
+        if device.info().is_cpu {
+            let programs = record().compile_passes()?;
+            let runs = budget.repeat(|| {
+                let pass = |(name, program): &(&'static str, Program)| {
+                    let before = processor_ms();
+                    program.run()?;
+                    Ok((*name, processor_ms() - before))
+                };
+                programs.iter().map(pass).collect::<Result<Vec<_>>>()
+            })?;
+            for row in &mut self.rows[first..] {
+                let of_row = |run: &Vec<(&str, f64)>| {
+                    run.iter().filter(|p| p.0 == row.name).map(|p| p.1).sum::<f64>() / cores()
+                };
+                row.ms.processor = Spread::of(&runs.iter().map(of_row).collect::<Vec<_>>()).median;
+            }
+        }
+        Ok(runs)
+    }
+
+    /// Fills in bytes, operations and floors of the passes, and of the rows that are made of them.
+    pub(super) fn bound(&mut self, work: &Work, roofline: &Roofline) {
+        let mut sums = [[0.0; 3]; 3];
+        for row in self.rows.iter_mut().filter(|r| r.clock == Clock::Device) {
+            let Some((bytes, flops)) = work.of(&row.name) else { continue };
+            let floor = roofline.floor_ms(bytes, flops);
+            row.set_floor([bytes, flops, floor]);
+            let backward = row.name.ends_with("backward");
+            let forward = FORWARD.contains(&row.name.as_str());
+            for (sum, counts) in sums.iter_mut().zip([forward, forward || backward, true]) {
+                if counts {
+                    sum.iter_mut().zip([bytes, flops, floor]).for_each(|(s, v)| *s += v);
+                }
+            }
+        }
+        let composed = ["forward", "forward + backward", super::training::STEP];
+        for row in &mut self.rows {
+            match composed.iter().position(|c| *c == row.name) {
+                Some(at) => row.set_floor(sums[at]),
+                None if row.name == SUM => row.set_floor(sums[2]),
+                None => {}
+            }
+        }
     }
 
     fn print(&self, text: &mut String) {
         // Writing to a String cannot fail.
         let _ = writeln!(text, "\n{}: {}", self.name, self.workload);
         if !self.rows.is_empty() {
-            let head = ["median ms", "quartiles", "best", "runs", "clock"];
             let _ = writeln!(
                 text,
-                "  {:<34} {:>10} {:>19} {:>10} {:>5}  {:<6} {:>10}",
-                "", head[0], head[1], head[2], head[3], head[4], "floor ms"
+                "  {:<28} {:>10} {:>19} {:>9} {:>5}  {:<6} {:>9} {:>9} {:>8} {:>8}",
+                "", "median ms", "quartiles", "best", "runs", "clock", "cpu ms", "floor ms", "MB", "MFLOP"
             );
         }
         for row in &self.rows {
             let ms = &row.ms;
             let clock = if row.clock == Clock::Device { "device" } else { "wall" };
             let quartiles = format!("{:.3}–{:.3}", ms.lower_quartile, ms.upper_quartile);
+            let cpu = if ms.processor > 0.0 { format!("{:.1}", ms.processor) } else { String::new() };
             let floor = row.floor_ms.map_or(String::new(), |f| format!("{f:.3}"));
-            let _ = writeln!(
-                text,
-                "  {:<34} {:>10.3} {quartiles:>19} {:>10.3} {:>5}  {clock:<6} {floor:>10}",
-                row.name, ms.median, ms.best, ms.runs
+            let mega = |v: Option<f64>| v.map_or(String::new(), |v| format!("{:.1}", v / 1e6));
+            let line = format!(
+                "  {:<28} {:>10.3} {quartiles:>19} {:>9.3} {:>5}  {clock:<6} {cpu:>9} {floor:>9} {:>8} {:>8}",
+                row.name,
+                ms.median,
+                ms.best,
+                ms.runs,
+                mega(row.bytes),
+                mega(row.flops)
             );
+            let _ = writeln!(text, "{}", line.trim_end());
         }
         for figure in &self.figures {
-            let _ = writeln!(text, "  {:<34} {:>10} {}", figure.name, plain(figure.value), figure.unit);
+            let line = format!("  {:<40} {:>12} {}", figure.name, plain(figure.value), figure.unit);
+            let _ = writeln!(text, "{}", line.trim_end());
         }
     }
 }

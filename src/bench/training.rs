@@ -1,6 +1,8 @@
 //! The training step: each pass by timestamps on the device, the whole by wall clock.
 use super::measure::{Budget, Spread};
-use super::report::{Clock, Section};
+use super::model::Work;
+use super::report::{Clock, SUM, Section};
+use super::roofline::Roofline;
 use super::workload::Workload;
 use crate::Result;
 use crate::fit::options::Rates;
@@ -8,7 +10,7 @@ use crate::fit::scale::SceneScale;
 use crate::fit::schedule::Exponential;
 use crate::fit::{LanguageOptions, LanguageRun, Preset, RgbOptions, RgbRun, Steps};
 use crate::gpu::{Device, Recorder};
-use crate::pass::seeded;
+use crate::pass::{pairs, seeded};
 use crate::scene::{Codebook, LevelField, Plane, RgbImage};
 
 /// Name of the section of steps on colour; others begin with it.
@@ -33,7 +35,7 @@ fn still() -> Rates {
 }
 
 /// Forward, L1 + SSIM, regularisers, backward, Adam: the step of the colour stage.
-pub fn colour(device: &Device, workload: &Workload, budget: &Budget) -> Result<Section> {
+pub fn colour(device: &Device, workload: &Workload, limits: (&Budget, &Roofline)) -> Result<Section> {
     device.reset_peak_memory();
     let target = [workload.target(device)?];
     let cameras = [workload.camera.clone()];
@@ -46,7 +48,7 @@ pub fn colour(device: &Device, workload: &Workload, budget: &Budget) -> Result<S
     let scale = SceneScale::measure(&cameras, &workload.splats.means);
     let mut run = RgbRun::new(device, &target, &cameras, &workload.splats, scale, None, &options)?;
     let mut section = Section::new(COLOUR, workload.describe(0));
-    measure(device, &mut run, budget, &mut section)?;
+    measure(device, &mut run, limits, &mut section)?;
     Ok(section)
 }
 
@@ -55,7 +57,7 @@ pub fn with_features(
     device: &Device,
     workload: &Workload,
     features: usize,
-    budget: &Budget,
+    limits: (&Budget, &Roofline),
 ) -> Result<Section> {
     device.reset_peak_memory();
     let target = [workload.target(device)?];
@@ -74,7 +76,7 @@ pub fn with_features(
     let mut run = LanguageRun::new(device, &target, &cameras, &workload.splats, &fields, &options)?;
     run.set_features(&seeded::features(workload.splats.len(), features, 0))?;
     let mut section = Section::new(format!("{COLOUR}, {features} features"), workload.describe(features));
-    measure(device, &mut run, budget, &mut section)?;
+    measure(device, &mut run, limits, &mut section)?;
     Ok(section)
 }
 
@@ -100,10 +102,19 @@ fn level(image: &RgbImage, width: usize, seed: u64) -> LevelField {
     }
 }
 
-fn measure(device: &Device, run: &mut dyn Steps, budget: &Budget, section: &mut Section) -> Result<()> {
+fn measure(
+    device: &Device,
+    run: &mut dyn Steps,
+    limits: (&Budget, &Roofline),
+    section: &mut Section,
+) -> Result<()> {
+    let (budget, roofline) = limits;
     // Also grows the tile lists to what the scene needs, before anything is recorded.
     run.step(ITERATION)?;
-    passes(run, budget, section)?;
+    let runs = section.passes(device, &|| run.record(), budget)?;
+    let sums: Vec<f64> = runs.iter().map(|r| r.iter().map(|p| p.1).sum()).collect();
+    let processor = section.rows.iter().map(|r| r.ms.processor).sum();
+    section.time(SUM, Clock::Device, Spread { processor, ..Spread::of(&sums) });
     let before = device.memory().allocations;
     let mut steps = 0usize;
     let step = budget.wall(|| {
@@ -113,22 +124,8 @@ fn measure(device: &Device, run: &mut dyn Steps, budget: &Budget, section: &mut 
     let allocations = (device.memory().allocations - before) as f64 / steps as f64;
     parts(device, run, budget, section)?;
     section.time(STEP, Clock::Wall, step);
-    counts(device, run, section)?;
+    counts(device, run, roofline, section)?;
     section.figure("allocations per step", allocations, "");
-    Ok(())
-}
-
-/// The device work of a step, pass by pass.
-fn passes(run: &dyn Steps, budget: &Budget, section: &mut Section) -> Result<()> {
-    let program = run.record()?;
-    let runs = budget.repeat(|| program.run_passes())?;
-    let names: Vec<&str> = runs.first().map(|r| r.iter().map(|p| p.0).collect()).unwrap_or_default();
-    for (at, name) in names.iter().enumerate() {
-        let times: Vec<f64> = runs.iter().map(|r| r[at].1).collect();
-        section.time(*name, Clock::Device, Spread::of(&times));
-    }
-    let sums: Vec<f64> = runs.iter().map(|r| r.iter().map(|p| p.1).sum()).collect();
-    section.time("sum of the passes", Clock::Device, Spread::of(&sums));
     Ok(())
 }
 
@@ -147,13 +144,29 @@ fn parts(device: &Device, run: &dyn Steps, budget: &Budget, section: &mut Sectio
     Ok(())
 }
 
-/// How much work a step is.
-fn counts(device: &Device, run: &dyn Steps, section: &mut Section) -> Result<()> {
+/// How much work a step is, and the least time for it.
+fn counts(device: &Device, run: &dyn Steps, roofline: &Roofline, section: &mut Section) -> Result<()> {
     let p = run.parts();
-    let intersections = f64::from(p.raster.frame().status.read::<u32>()?[0]);
+    let frame = p.raster.frame();
+    let intersections = f64::from(frame.status.read::<u32>()?[0]);
+    let [evaluated, blended] = pairs::count(device, p.raster)?;
     let seconds = section.row(STEP).map_or(f64::NAN, |r| r.ms.median / 1e3);
+    let pixels = f64::from(frame.width) * f64::from(frame.height);
+    let work = Work {
+        splats: p.params.count as f64,
+        sh: p.params.sh_len() as f64,
+        features: p.params.feature_dim as f64,
+        pixels,
+        intersections,
+        blended,
+    };
+    section.bound(&work, roofline);
     section.figure("intersections", intersections, "tile–splat pairs");
-    section.figure("splats per second", p.params.count as f64 / seconds / 1e6, "M/s");
+    section.figure("pairs evaluated", evaluated, "pixel–splat pairs");
+    section.figure("pairs blended", blended, "pixel–splat pairs");
+    section.figure("evaluated / blended", evaluated / blended, "");
+    section.figure("blended per pixel", blended / pixels, "");
+    section.figure("splats per second", work.splats / seconds / 1e6, "M/s");
     section.figure("intersections per second", intersections / seconds / 1e6, "M/s");
     section.figure("peak device memory", device.memory().peak as f64 / f64::from(1 << 20), "MiB");
     Ok(())

@@ -293,9 +293,25 @@ pub enum ModelsAction {
     Path(DeviceArgs),
 }
 
+/// What `bench` measures beside the roofline.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum BenchPart {
+    /// Every pass of a training step and the whole, on colour and with features
+    Training,
+    /// The radix sort of --keys keys
+    Sort,
+    /// A text query in all views of --scene
+    Query,
+    /// The limits of the device
+    Roofline,
+}
+
 /// `splatvk bench`
 #[derive(Debug, Args)]
 pub struct BenchArgs {
+    /// What to measure
+    #[arg(value_enum, default_value = "training", value_name = "WHAT")]
+    pub parts: Vec<BenchPart>,
     /// Gaussian .ply with its camera beside it, or a scene directory [default: a seeded scene]
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
@@ -320,6 +336,18 @@ pub struct BenchArgs {
     /// Feature channels of the second step: 0 = leave it out, 1 to 16, 32, 48
     #[arg(long, default_value_t = 16, value_name = "D")]
     pub features: usize,
+    /// Then the training step of seeded scenes with so many splats each
+    #[arg(long, value_delimiter = ',', value_name = "N,N,...")]
+    pub sweep: Vec<usize>,
+    /// sort: how many keys
+    #[arg(long, default_value_t = 10_000_000, value_name = "N")]
+    pub keys: usize,
+    /// query: what to look for
+    #[arg(long, default_value = "a cup", value_name = "TEXT")]
+    pub query: String,
+    /// query: folder of the models
+    #[arg(long, value_name = "DIR")]
+    pub models: Option<PathBuf>,
     /// Repeat each measurement for this long
     #[arg(long, default_value_t = 2.0, value_name = "S")]
     pub seconds: f64,

@@ -1,9 +1,10 @@
 //! `splatvk bench`
-use super::args::BenchArgs;
-use super::print;
-use crate::bench::{self, Budget, Options, Report, Workload, compare};
-use crate::format::write_json;
+use super::args::{BenchArgs, BenchPart};
+use super::{encoder, print};
+use crate::bench::{self, Bench, Budget, Report, Workload, compare};
+use crate::format::{scene_dir, write_json};
 use crate::gpu::Device;
+use crate::infer::{RegionEncoder, Registry};
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -11,31 +12,59 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     if let Some([a, b]) = args.compare.as_deref() {
         return print(&compare::table(&Report::read(a)?, &Report::read(b)?));
     }
-    let options = options(args)?;
-    let workload = workload(args)?;
+    let budget = check(args)?;
     if let Some(folder) = &args.write_scene {
-        let files = workload.write(folder)?;
+        let files = workload(args)?.write(folder)?;
         return print(&files.map(|f| format!("{}\n", f.display())).concat());
     }
+    let has = |part| args.parts.contains(&part);
+    // Everything that can be wrong with the input comes before the first measurement.
+    let workload =
+        if has(BenchPart::Training) || !args.sweep.is_empty() { Some(workload(args)?) } else { None };
+    let mut asked = if has(BenchPart::Query) { Some(asked(args)?) } else { None };
     writable(args.json.as_deref())?;
     let device = Device::open(args.device.as_deref())?;
-    let report = bench::training(&device, &workload, &options)?;
-    if let Some(file) = &args.json {
-        write_json(file, &report)?;
+    let mut bench = Bench::new(&device, budget)?;
+    if let Some(workload) = &workload {
+        if has(BenchPart::Training) {
+            bench.training(workload, args.features)?;
+        }
+        if !args.sweep.is_empty() {
+            bench.growth(&args.sweep, workload)?;
+        }
     }
-    print(&report.table())
+    if has(BenchPart::Sort) {
+        bench.sort(args.keys)?;
+    }
+    if let Some((scene, encoder)) = &mut asked {
+        let field = scene.language.as_ref().ok_or_else(|| Error::work("the scene lost its language"))?;
+        bench.query((&scene.splats, field, &scene.cameras), encoder.as_mut(), &args.query)?;
+    }
+    if let Some(file) = &args.json {
+        write_json(file, &bench.report)?;
+    }
+    print(&bench.report.table())
 }
 
-fn options(args: &BenchArgs) -> Result<Options> {
+/// What clap cannot check; the budget of each measurement.
+fn check(args: &BenchArgs) -> Result<Budget> {
     if !(args.seconds > 0.0 && args.seconds.is_finite()) {
         return Err(Error::input(format!("--seconds {}: give a positive number", args.seconds)));
     }
     if args.repeats == Some(0) {
         return Err(Error::input("--repeats 0: give at least 1"));
     }
+    if args.keys == 0 || u32::try_from(args.keys).is_err() {
+        return Err(Error::input(format!("--keys {}: give 1 to {}", args.keys, u32::MAX)));
+    }
+    if args.sweep.contains(&0) {
+        return Err(Error::input("--sweep 0: a scene needs at least one splat"));
+    }
+    if args.query.trim().is_empty() {
+        return Err(Error::input("--query: give a few words"));
+    }
     bench::check_features(args.features)?;
-    let budget = Budget { seconds: args.seconds, repeats: args.repeats };
-    Ok(Options { budget, features: args.features })
+    Ok(Budget { seconds: args.seconds, repeats: args.repeats })
 }
 
 fn workload(args: &BenchArgs) -> Result<Workload> {
@@ -45,6 +74,20 @@ fn workload(args: &BenchArgs) -> Result<Workload> {
             Workload::seeded(args.splats, args.width, args.height, args.sh_degree.unwrap_or(0), args.seed)
         }
     }
+}
+
+/// The scene to ask and the model that speaks its language.
+fn asked(args: &BenchArgs) -> Result<(scene_dir::Scene, Box<dyn RegionEncoder>)> {
+    let Some(path) = &args.scene else {
+        return Err(Error::input("bench query: give a scene with language with --scene DIR"));
+    };
+    let scene = scene_dir::load(path)?;
+    if scene.language.is_none() {
+        let path = path.display();
+        return Err(Error::input(format!("{path}: the scene has no language; make one with splatvk run")));
+    }
+    let encoder = encoder::of_scene(&scene, Registry::open(args.models.as_deref())?)?;
+    Ok((scene, encoder))
 }
 
 /// Finds out before the measurements take their time whether the result can be kept.

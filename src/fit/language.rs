@@ -222,7 +222,7 @@ impl<'a> Run<'a> {
         loop {
             let program = match self.programs[view].take() {
                 Some(program) => program,
-                None => self.record(view)?,
+                None => self.record(view).compile()?,
             };
             program.run()?;
             self.programs[view] = Some(program);
@@ -239,7 +239,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    pub(super) fn record(&self, view: usize) -> Result<Program> {
+    pub(super) fn record(&self, view: usize) -> Recorder {
         let (item, stage) = (&self.views.list[view], self.views.stage(view));
         let frame = stage.raster.frame();
         let mut rec = Recorder::new(&self.device, "language step");
@@ -268,7 +268,7 @@ impl<'a> Run<'a> {
         if !self.options.detach_geometry {
             self.model.record_step(&mut rec, &frame.status);
         }
-        rec.compile()
+        rec
     }
 
     /// One block of d channels per splat and level.

@@ -200,7 +200,7 @@ impl<'a> Run<'a> {
         loop {
             let program = match self.programs[view].take() {
                 Some(program) => program,
-                None => self.record(view)?,
+                None => self.record(view).compile()?,
             };
             program.run()?;
             self.programs[view] = Some(program);
@@ -224,7 +224,7 @@ impl<'a> Run<'a> {
     }
 
     /// Forward, losses, backward and Adam of one view.
-    pub(super) fn record(&self, view: usize) -> Result<Program> {
+    pub(super) fn record(&self, view: usize) -> Recorder {
         let (item, stage) = (&self.views.list[view], self.views.stage(view));
         let frame = stage.raster.frame();
         let mut rec = Recorder::new(&self.device, "rgb step");
@@ -255,7 +255,7 @@ impl<'a> Run<'a> {
             regularise::record_ratio(&mut rec, values, gradients, count, weight, RATIO_LIMIT);
         }
         self.model.record_step(&mut rec, &frame.status);
-        rec.compile()
+        rec
     }
 
     /// Pose refinement; camera 0 fixes the world frame.

@@ -1,7 +1,7 @@
 //! Single training steps, for benchmarks: the very steps that the training loops run and record.
 use super::{LanguageRun, RgbRun};
 use crate::Result;
-use crate::gpu::Program;
+use crate::gpu::Recorder;
 use crate::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
 
 /// A training stage that takes one step at a time.
@@ -9,7 +9,7 @@ pub(crate) trait Steps {
     /// One whole step on the next view, as training does it: schedule, device work, loss read back.
     fn step(&mut self, iteration: usize) -> Result<()>;
     /// The device work of a step on view 0.
-    fn record(&self) -> Result<Program>;
+    fn record(&self) -> Recorder;
     /// What a step of view 0 renders with.
     fn parts(&self) -> Parts<'_>;
 }
@@ -26,7 +26,7 @@ impl Steps for RgbRun<'_> {
     fn step(&mut self, iteration: usize) -> Result<()> {
         RgbRun::step(self, iteration)
     }
-    fn record(&self) -> Result<Program> {
+    fn record(&self) -> Recorder {
         RgbRun::record(self, 0)
     }
     fn parts(&self) -> Parts<'_> {
@@ -43,7 +43,7 @@ impl Steps for LanguageRun<'_> {
     fn step(&mut self, iteration: usize) -> Result<()> {
         LanguageRun::step(self, iteration)
     }
-    fn record(&self) -> Result<Program> {
+    fn record(&self) -> Recorder {
         LanguageRun::record(self, 0)
     }
     fn parts(&self) -> Parts<'_> {

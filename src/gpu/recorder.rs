@@ -177,6 +177,23 @@ impl Recorder {
         }
     }
 
+    /// One program per pass, to be run in order: slower than the whole, but the host can look at its clocks in between.
+    pub fn compile_passes(self) -> Result<Vec<(&'static str, Program)>> {
+        if let Some(e) = self.error {
+            return Err(e);
+        }
+        let mut passes: Vec<(&'static str, Vec<Command>)> = Vec::new();
+        for command in self.commands {
+            match passes.last_mut().filter(|p| p.0 == command.pass) {
+                Some(pass) => pass.1.push(command),
+                None => passes.push((command.pass, vec![command])),
+            }
+        }
+        let program =
+            |(name, commands)| Ok((name, Program::new(self.device.clone(), self.label.clone(), commands)?));
+        passes.into_iter().map(program).collect()
+    }
+
     /// For the test that the validation layer sees missing barriers: all commands, no barriers, no checks.
     #[cfg(test)]
     pub(super) fn compile_without_barriers(self) -> Result<Program> {

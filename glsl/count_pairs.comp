@@ -1,0 +1,53 @@
+#version 450
+// subgroups: 4,8,16,32,64
+// Walks the tile lists exactly as raster_forward.comp does and counts what it evaluates and what it blends: for benchmarks.
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_vote : require
+#extension GL_KHR_shader_subgroup_shuffle : require
+layout(local_size_x = SUBGROUP_SIZE) in;
+
+layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };    // [N, 3], see project.comp
+layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; }; // [tiles + 1]
+layout(std430, binding = 2) readonly buffer TileSplats { uint tile_splats[]; }; // [capacity]
+layout(std430, binding = 3) writeonly buffer Counts { uvec2 counts[]; };        // [tiles, 64] (evaluated, blended), zero at first
+layout(push_constant) uniform Push { uint width; uint height; uint tiles_x; };
+
+#define CHANNELS 4
+#include "shared/raster.glsl"
+
+void main() {
+    uint lane = gl_SubgroupInvocationID;
+    uint tile = gl_WorkGroupID.y * tiles_x + gl_WorkGroupID.x;
+    uvec2 corner = gl_WorkGroupID.xy * 8 + uvec2(lane % LANES_X, lane / LANES_X);
+    vec2 origin = vec2(corner);
+    uint first = tile_ranges[tile], last = tile_ranges[tile + 1];
+    uint evaluated = 0, blended = 0;
+    float T[PIXELS];
+    [[unroll]] for (int k = 0; k < PIXELS; k++) {
+        uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
+        T[k] = x < width && y < height ? 1.0 : -1.0;
+    }
+    for (uint j = first; j < last; j += SUBGROUP_SIZE) {
+        load_splat(tile_splats[min(j + lane, last - 1)], j + lane < last);
+        uint batch = min(uint(SUBGROUP_SIZE), last - j);
+        evaluated += batch * PIXELS;
+        for (uint i = 0; i < batch; i++) {
+            float dx0 = subgroupShuffle(own_u, i) - origin.x, dy0 = subgroupShuffle(own_v, i) - origin.y;
+            float a = subgroupShuffle(own_a, i), b = subgroupShuffle(own_b, i), c = subgroupShuffle(own_c, i);
+            float log2_opacity = subgroupShuffle(own_log2_opacity, i);
+            [[unroll]] for (int k = 0; k < PIXELS; k++) {
+                float dx = dx0 - float((k / ROWS) * LANES_X), dy = dy0 - float((k % ROWS) * LANES_Y);
+                float power = fma(fma(c, dy, b * dx), dy, fma(a * dx, dx, log2_opacity));
+                float alpha = power >= LOG2_ALPHA_MIN ? min(ALPHA_MAX, exp2(power)) : 0.0;
+                float next = T[k] - alpha * T[k];
+                bool stop = next < TRANSMITTANCE_MIN;
+                blended += alpha > 0.0 && T[k] > 0.0 && !stop ? 1 : 0;
+                T[k] = stop ? -abs(T[k]) : next;
+            }
+        }
+        if (all_stopped(T)) break;
+    }
+    counts[tile * 64 + lane] = uvec2(evaluated, blended);
+}

@@ -1,0 +1,91 @@
+//! How much work each pass has to do: bytes that must move at least once and arithmetic on pairs that are blended.
+//! What an implementation does beyond that (pairs evaluated in vain, lists read twice) is what the roofline shows up.
+//!
+//! Floats per splat: 11 of geometry and opacity, 3 per SH coefficient, d features; a projected splat has 12 floats.
+//! Operations are counted from the formulas of the passes, a fused multiply-add as two, an exponential as one.
+
+/// Sizes of a step.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Work {
+    /// N.
+    pub splats: f64,
+    /// SH coefficients per channel.
+    pub sh: f64,
+    /// d.
+    pub features: f64,
+    /// W·H.
+    pub pixels: f64,
+    /// Tile-list entries.
+    pub intersections: f64,
+    /// Pixel–splat pairs that change a pixel.
+    pub blended: f64,
+}
+
+/// Geometry and opacity of a splat, bytes.
+const GEOMETRY: f64 = 44.0;
+/// A projected splat, bytes.
+const PROJECTED: f64 = 48.0;
+/// (key, value), bytes.
+const PAIR: f64 = 8.0;
+/// 32-bit keys, eight bits at a time.
+const SORT_PASSES: f64 = 4.0;
+/// Power of the Gaussian (8), its exponential, clamp, weight and the transmittance after it.
+const WEIGH: f64 = 14.0;
+/// Gradient of alpha from what lies behind (6), of the power and its six moments (24).
+const WEIGH_BACK: f64 = 30.0;
+
+impl Work {
+    /// (bytes, operations) of a pass by its name in a recording; `None` for passes without a model.
+    pub fn of(&self, pass: &str) -> Option<(f64, f64)> {
+        let Work { splats: n, sh, features: d, pixels, intersections, blended } = *self;
+        let (colour, channels) = (12.0 * sh, 4.0 + d);
+        let listed = intersections * (4.0 + PROJECTED + 4.0 * d);
+        Some(match pass {
+            "projection" => (n * (GEOMETRY + colour + 8.0 * d + PROJECTED + PAIR), n * (200.0 + 6.0 * sh)),
+            "depth sort" => (n * 2.0 * PAIR * SORT_PASSES, 0.0),
+            "binning" => (n * (PAIR + 24.0) + 4.0 * intersections, 30.0 * intersections),
+            "raster forward" => {
+                (listed + 4.0 * pixels * (channels + 2.0), blended * (WEIGH + 2.0 * channels))
+            }
+            // Seven separable blurs of 11 taps per value and 40 operations for SSIM and its derivatives.
+            "SSIM + L1" => (3.0 * pixels * 12.0, 3.0 * pixels * (7.0 * 44.0 + 40.0)),
+            "feature loss" => (pixels * (8.0 * d + 8.0), 3.0 * pixels * d),
+            "feature gauge" => (20.0 * n * d, 8.0 * n * d),
+            "regularisers" => (8.0 * pixels + 36.0 * n, 10.0 * n),
+            // Gradients of a projected splat are added once per list entry: read and written.
+            "raster backward" => (
+                listed + 8.0 * intersections * (6.0 + channels) + 8.0 * pixels * (channels + 1.0),
+                blended * (WEIGH + WEIGH_BACK + 4.0 * channels),
+            ),
+            "projection backward" => {
+                (n * (2.0 * (GEOMETRY + colour) + PROJECTED + 8.0 * d), n * (600.0 + 12.0 * sh))
+            }
+            "Adam" => {
+                let parameters = n * (11.0 + 3.0 * sh + d);
+                // Parameter and two moments read and written, gradient read.
+                (28.0 * parameters, 12.0 * parameters)
+            }
+            _ => return None,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn work_grows_with_what_it_depends_on() {
+        let small =
+            Work { splats: 1e5, sh: 1.0, pixels: 3e5, intersections: 5e5, blended: 1e7, features: 0.0 };
+        let more = Work { features: 16.0, ..small };
+        for pass in ["projection", "raster forward", "raster backward", "Adam"] {
+            let (a, b) = (small.of(pass).unwrap(), more.of(pass).unwrap());
+            assert!(b.0 > a.0, "{pass}: features have bytes");
+        }
+        // 12 bytes per pixel and channel and 348 operations per value.
+        assert_eq!(small.of("SSIM + L1"), Some((36.0 * 3e5, 3.0 * 3e5 * 348.0)));
+        assert_eq!(small.of("depth sort"), Some((64.0 * 1e5, 0.0)));
+        assert_eq!(small.of("unknown"), None);
+    }
+}

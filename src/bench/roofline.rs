@@ -1,0 +1,114 @@
+//! The device's own limits, by small shaders, in the same run as what is compared with them.
+use super::measure::Budget;
+use super::report::Section;
+use crate::Result;
+use crate::gpu::{Device, Recorder, shaders};
+use crate::pass::adam::rows_of_groups;
+
+/// vec4 per thread in `glsl/bench_copy.comp`.
+const COPY_STEPS: usize = 8;
+/// Fused multiply-adds per thread in `glsl/bench_fma.comp`.
+const FMA_PER_THREAD: usize = 16 * 256;
+
+/// What the device can do at most.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Roofline {
+    /// Bytes read plus bytes written by a copy, per second.
+    pub bytes_per_second: f64,
+    /// Floating-point operations, two per fused multiply-add, per second.
+    pub flops_per_second: f64,
+}
+
+impl Roofline {
+    /// Least milliseconds for this much work.
+    pub fn floor_ms(&self, bytes: f64, flops: f64) -> f64 {
+        (bytes / self.bytes_per_second).max(flops / self.flops_per_second) * 1e3
+    }
+}
+
+/// Measures both limits. The best run counts: a limit is what the device can do, not what it usually does.
+pub fn measure(device: &Device, budget: &Budget) -> Result<(Roofline, Section)> {
+    let mut section = Section::new("roofline", "copies and fused multiply-adds");
+    let bytes_per_second = copy(device, budget, &mut section)?;
+    let flops_per_second = arithmetic(device, budget, &mut section)?;
+    section.figure("copy bandwidth", bytes_per_second / 1e9, "GB/s (read + written)");
+    section.figure("fused multiply-add rate", flops_per_second / 1e9, "GFLOP/s");
+    Ok((Roofline { bytes_per_second, flops_per_second }, section))
+}
+
+/// By a shader and by the driver's copy command: the faster one is the limit.
+fn copy(device: &Device, budget: &Budget, section: &mut Section) -> Result<f64> {
+    // Several times the last-level cache: 128 MiB in all on a CPU, 512 on a GPU.
+    let mib = if device.info().is_cpu { 64 } else { 256 };
+    let limit = device.info().max_storage_range as usize;
+    let vectors = (mib << 16).min(limit / 16).next_multiple_of(256 * COPY_STEPS);
+    let from = device.buffer::<[f32; 4]>("copy source", vectors)?;
+    let to = device.buffer::<[f32; 4]>("copy target", vectors)?;
+    let record = || {
+        let mut rec = Recorder::new(device, "copy bandwidth");
+        rec.pass("copy by shader");
+        let bindings = shaders::bench_copy::Bindings { source: &from, target: &to };
+        rec.dispatch(shaders::bench_copy::call(&bindings), rows_of_groups(vectors / COPY_STEPS));
+        rec.pass("copy by command");
+        rec.copy(&from, &to);
+        rec
+    };
+    let runs = section.passes(device, &record, budget)?;
+    Ok(32.0 * vectors as f64 / (best(&runs) / 1e3))
+}
+
+/// The fastest pass of all runs, milliseconds.
+fn best(runs: &[Vec<(&str, f64)>]) -> f64 {
+    runs.iter().flatten().map(|p| p.1).fold(f64::INFINITY, f64::min)
+}
+
+fn arithmetic(device: &Device, budget: &Budget, section: &mut Section) -> Result<f64> {
+    // About 14 ms on lavapipe and 1 ms on a large GPU: long against launching it.
+    let threads: usize = if device.info().is_cpu { 1 << 17 } else { 1 << 22 };
+    let values = device.buffer::<f32>("fma values", threads)?;
+    let record = || {
+        let mut rec = Recorder::new(device, "arithmetic");
+        rec.pass("fused multiply-adds");
+        let call = shaders::bench_fma::call(&shaders::bench_fma::Bindings { values: &values });
+        rec.dispatch_threads(call, [threads as u32, 1, 1]);
+        rec
+    };
+    let runs = section.passes(device, &record, budget)?;
+    Ok(2.0 * (threads * FMA_PER_THREAD) as f64 / (best(&runs) / 1e3))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn limits_are_positive_and_bound_the_time() {
+        let device = crate::gpu::test_device();
+        let budget = Budget { seconds: 0.0, repeats: Some(2) };
+        let (roofline, section) = measure(&device, &budget).unwrap();
+        assert!(roofline.bytes_per_second > 1e6 && roofline.bytes_per_second.is_finite(), "{roofline:?}");
+        assert!(roofline.flops_per_second > 1e6 && roofline.flops_per_second.is_finite(), "{roofline:?}");
+        assert_eq!(section.rows.len(), 3);
+        let r = Roofline { bytes_per_second: 1e9, flops_per_second: 1e10 };
+        assert_eq!(r.floor_ms(1e6, 0.0), 1.0);
+        assert_eq!(r.floor_ms(1e6, 5e7), 5.0);
+    }
+
+    #[test]
+    fn the_shaders_do_what_is_counted() {
+        let device = crate::gpu::test_device();
+        let n = 3 * 256 * COPY_STEPS;
+        let from = device.buffer_from("from", &(0..4 * n).map(|i| i as f32).collect::<Vec<_>>()).unwrap();
+        let to = device.buffer::<f32>("to", 4 * n).unwrap();
+        let values = device.buffer_from("values", &[4.0f32; 64]).unwrap();
+        let mut rec = Recorder::new(&device, "limits");
+        let bindings = shaders::bench_copy::Bindings { source: &from, target: &to };
+        rec.dispatch(shaders::bench_copy::call(&bindings), rows_of_groups(n / COPY_STEPS));
+        let bindings = shaders::bench_fma::Bindings { values: &values };
+        rec.dispatch(shaders::bench_fma::call(&bindings), [1, 1, 1]);
+        rec.run().unwrap();
+        assert_eq!(to.read::<f32>().unwrap(), from.read::<f32>().unwrap());
+        // x ← x/2 + 1/4 converges to 1/2 in each of the 16 chains.
+        assert!(values.read::<f32>().unwrap().iter().all(|v| (v - 8.0).abs() < 1e-5));
+    }
+}

@@ -1,0 +1,174 @@
+//! `splatvk bench` on small scenes: its figures fit together, its files are read back, and it refuses what it cannot use.
+#![allow(clippy::unwrap_used)] // a panic is how a test fails
+use splatvk::bench::report::{Clock, SUM};
+use splatvk::bench::{Bench, Budget, Report, Section, Spread, Workload, compare};
+use splatvk::gpu::{Options, TestDevice, test_device};
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+const ONCE: Budget = Budget { seconds: 1.0, repeats: Some(3) };
+
+fn is_ordered(s: &Spread) -> bool {
+    0.0 < s.best && s.best <= s.lower_quartile && s.lower_quartile <= s.median && s.median <= s.upper_quartile
+}
+
+/// The rows of a section of training steps fit together.
+fn check_step(section: &Section, expected: &[&str]) {
+    let sum = section.row(SUM).unwrap();
+    let at = section.rows.iter().position(|r| r.name == SUM).unwrap();
+    let passes = &section.rows[..at];
+    let names: Vec<&str> = passes.iter().map(|r| r.name.as_str()).collect();
+    assert_eq!(names, expected);
+    assert!(section.rows.iter().all(|r| is_ordered(&r.ms) && r.ms.runs == 3), "{section:?}");
+    let best: f64 = passes.iter().map(|r| r.ms.best).sum();
+    // The best sum is one run's; each pass can only have been faster in another.
+    assert!(sum.ms.best >= best - 1e-9, "{} < {best}", sum.ms.best);
+    let bytes: f64 = passes.iter().filter_map(|r| r.bytes).sum();
+    let step = section.row("training step").unwrap();
+    assert_eq!((step.clock, step.bytes), (Clock::Wall, Some(bytes)));
+    assert!(passes.iter().all(|r| r.floor_ms.is_some_and(|f| f > 0.0)), "{passes:?}");
+    let floor = |name: &str| section.row(name).unwrap().floor_ms.unwrap();
+    assert!(floor("forward") < floor("forward + backward") && floor("forward + backward") < floor(SUM));
+    let figure = |name: &str| section.value(name).unwrap();
+    assert!(figure("evaluated / blended") >= 1.0);
+    assert!(figure("pairs evaluated") <= 64.0 * figure("intersections"));
+    assert!(figure("peak device memory") > 0.0);
+    let (rate, ms) = (figure("splats per second"), step.ms.median);
+    assert!((rate * ms * 1e3 / 400.0 - 1.0).abs() < 1e-9, "400 splats in {ms} ms are not {rate} M/s");
+}
+
+#[test]
+fn a_training_step_adds_up() {
+    // A device of its own: it counts the buffers of everything that runs on it.
+    let device = TestDevice::with(&Options::from_env(None)).unwrap();
+    let mut bench = Bench::new(&device, ONCE).unwrap();
+    let workload = Workload::seeded(400, 75, 53, 1, 0).unwrap();
+    bench.training(&workload, 5).unwrap();
+    let forward = ["projection", "depth sort", "binning", "raster forward", "SSIM + L1"];
+    let colour = bench.report.section("training step").unwrap();
+    let back = ["regularisers", "raster backward", "projection backward", "Adam"];
+    check_step(colour, &[forward.as_slice(), &back].concat());
+    let features = bench.report.section("training step, 5 features").unwrap();
+    let back = ["feature loss", "raster backward", "projection backward", "Adam"];
+    check_step(features, &[&["feature gauge"], forward.as_slice(), &back].concat());
+    let steps = [colour, features].map(|s| s.row("training step").unwrap().ms.median);
+    let ratio = features.value("step / step on colour alone").unwrap();
+    assert!((ratio - steps[1] / steps[0]).abs() < 1e-12);
+    if device.info().mapped {
+        assert_eq!(colour.value("allocations per step"), Some(0.0));
+    }
+    let text = bench.report.table();
+    for word in ["copy bandwidth", "fused multiply-add rate", "raster backward", "evaluated / blended"] {
+        assert!(text.contains(word), "{word} is not in\n{text}");
+    }
+}
+
+#[test]
+fn sort_and_growth() {
+    let device = test_device();
+    let mut bench = Bench::new(&device, ONCE).unwrap();
+    bench.sort(3000).unwrap();
+    let sort = bench.report.section("radix sort").unwrap();
+    let row = sort.row("radix sort").unwrap();
+    assert!(is_ordered(&row.ms) && row.bytes == Some(3000.0 * 64.0));
+    let share = sort.value("share of the copy bandwidth").unwrap();
+    assert!((share - 100.0 * row.floor_ms.unwrap() / row.ms.median).abs() < 1e-9);
+    bench.growth(&[100, 400], &Workload::seeded(1, 64, 48, 0, 0).unwrap()).unwrap();
+    let growth = bench.report.section("growth").unwrap();
+    let pairs = |n: usize| growth.value(&format!("intersections, {n} splats")).unwrap();
+    assert!(growth.rows.len() == 2 && pairs(400) > pairs(100));
+}
+
+#[test]
+fn reports_are_read_back_and_compared() {
+    let device = test_device();
+    let folder = tempfile::tempdir().unwrap();
+    let mut a = Report::new(&device);
+    let mut section = Section::new("training step", "a scene");
+    section.time("projection", Clock::Device, Spread::of(&[1.0, 2.0, 4.0]));
+    section.figure("intersections", 100.0, "pairs");
+    section.figure("nothing was measured", f64::NAN, "");
+    a.sections.push(section);
+    let write = |name: &str, report: &Report| {
+        let file = folder.path().join(name);
+        std::fs::write(&file, serde_json::to_string(report).unwrap()).unwrap();
+        file
+    };
+    let file = write("a.json", &a);
+    assert_eq!(Report::read(&file).unwrap(), a);
+    let mut b = a.clone();
+    b.sections[0].rows[0].ms.median = 3.0;
+    let other = write("b.json", &b);
+    let text = compare::table(&a, &b);
+    let line = text.lines().find(|l| l.contains("projection")).unwrap();
+    let words: Vec<&str> = line.split_whitespace().collect();
+    assert_eq!(words, ["projection", "2.000", "3.000", "1.500"]);
+    assert!(!text.contains("another workload") && !text.contains("nothing"));
+    let output = splatvk(&["bench", "--compare", file.to_str().unwrap(), other.to_str().unwrap()]);
+    assert_eq!(String::from_utf8(output.stdout).unwrap(), text);
+    std::fs::write(&other, "{}").unwrap();
+    refuses(&["bench", "--compare", file.to_str().unwrap(), other.to_str().unwrap()], "b.json");
+}
+
+fn splatvk(args: &[&str]) -> std::process::Output {
+    Command::new(env!("CARGO_BIN_EXE_splatvk"))
+        .args(args)
+        .env_remove("SPLATVK_MODELS")
+        .stdin(Stdio::null())
+        .output()
+        .unwrap()
+}
+
+/// Exit code 2 and one line that contains the word.
+fn refuses(args: &[&str], word: &str) {
+    let output = splatvk(args);
+    let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{args:?}: {errors}");
+    assert!(errors.lines().count() == 1 && errors.contains(word), "{args:?}: {errors}");
+}
+
+#[test]
+fn what_cannot_be_measured_is_refused_at_once() {
+    refuses(&["bench", "--features", "17"], "--features 17");
+    refuses(&["bench", "--seconds", "0"], "--seconds 0");
+    refuses(&["bench", "--repeats", "0"], "--repeats 0");
+    refuses(&["bench", "--splats", "0"], "at least one splat");
+    refuses(&["bench", "--sweep", "10,0"], "--sweep 0");
+    refuses(&["bench", "sort", "--keys", "0"], "--keys 0");
+    refuses(&["bench", "query"], "--scene");
+    refuses(&["bench", "--scene", "no/such/scene"], "no/such/scene");
+    refuses(&["bench", "--scene", "x", "--splats", "5"], "--splats");
+    refuses(&["bench", "--compare", "missing.json", "missing.json"], "missing.json");
+    refuses(&["bench", "--json", "no/such/folder/x.json"], "--json");
+}
+
+#[test]
+fn a_written_scene_is_the_scene_that_was_measured() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("scene");
+    let size = ["--splats", "300", "--width", "64", "--height", "48", "--sh-degree", "1"];
+    let dir = out.to_str().unwrap();
+    let output = splatvk(&[&["bench", "--write-scene", dir], size.as_slice()].concat());
+    assert!(output.status.success());
+    let scene = out.join("scene.ply");
+    let ours = Workload::seeded(300, 64, 48, 1, 0).unwrap();
+    let read = Workload::load(&scene, None, Some(1)).unwrap();
+    assert_eq!(read.splats, ours.splats);
+    assert_eq!((read.camera.width, read.camera.fx), (ours.camera.width, ours.camera.fx));
+    let json = folder.path().join("out.json");
+    let file = scene.to_str().unwrap();
+    let measured = splatvk(&[
+        "bench",
+        "--scene",
+        file,
+        "--features",
+        "0",
+        "--repeats",
+        "2",
+        "--json",
+        json.to_str().unwrap(),
+    ]);
+    assert!(measured.status.success(), "{}", String::from_utf8_lossy(&measured.stderr));
+    let report = Report::read(Path::new(&json)).unwrap();
+    assert!(report.section("training step").unwrap().workload.contains("300 splats, 64 × 48"));
+}
