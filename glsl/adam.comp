@@ -6,10 +6,13 @@
 // The first `head` of every `stride` parameters use the head rate, the others the tail rate (SH: DC and the rest).
 // The guard is the rasteriser's status: a frame whose tile lists overflowed has no gradients, and the step is repeated.
 // A parameter whose gradient is not finite is left alone and counted in `faults`: the host stops with a clear error.
+// Four parameters per thread: on a CPU device an access costs the same whatever its width, on a GPU it is coalesced
+// either way. Buffers are padded to whole vectors.
+#extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 256) in;
-layout(std430, binding = 0) buffer Parameters { float parameters[]; };
-layout(std430, binding = 1) readonly buffer Gradients { float gradients[]; };
-layout(std430, binding = 2) buffer Moments { vec2 moments[]; };  // (m, v) per parameter: one 64-bit access
+layout(std430, binding = 0) buffer Parameters { vec4 parameters[]; };
+layout(std430, binding = 1) readonly buffer Gradients { vec4 gradients[]; };
+layout(std430, binding = 2) buffer Moments { vec4 moments[]; };  // (m, v) per parameter, two parameters a vector
 layout(std430, binding = 3) buffer Faults { uint faults[]; };
 layout(std430, binding = 4) readonly buffer Rates { vec4 rates[]; };
 layout(std430, binding = 5) readonly buffer Guard { uint guard[]; };  // [2]; the step is void where guard[1] is not 0
@@ -19,17 +22,27 @@ const float BETA1 = 0.9, BETA2 = 0.999, EPS = 1e-15;
 void main() {
     // Two-dimensional, since one dimension ends at 65535 workgroups on some devices.
     uint i = (gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x) * 256u + gl_LocalInvocationID.x;
-    if (i >= count || guard[1] != 0u) return;
-    float g = gradients[i];
-    if ((floatBitsToUint(g) & 0x7f800000u) == 0x7f800000u) {  // isnan/isinf may be optimised away by drivers
-        atomicAdd(faults[0], 1u);
-        return;
-    }
-    vec2 mv = moments[i];
-    float m = BETA1 * mv.x + (1.0 - BETA1) * g;
-    float v = BETA2 * mv.y + (1.0 - BETA2) * g * g;
-    moments[i] = vec2(m, v);
+    if (4u * i >= count || guard[1] != 0u) return;
+    vec4 gradient = gradients[i], parameter = parameters[i];
+    vec4 pair[2] = vec4[2](moments[2u * i], moments[2u * i + 1u]);
     vec4 step_rates = rates[slot];
-    float rate = i % stride < head ? step_rates.x : step_rates.y;
-    parameters[i] -= rate * m / (sqrt(v) * step_rates.z + EPS);
+    uint column = 4u * i % stride, bad = 0u;
+    [[unroll]] for (uint k = 0u; k < 4u; k++) {
+        float g = gradient[k];
+        // isnan and isinf may be optimised away by drivers
+        bool finite = (floatBitsToUint(g) & 0x7f800000u) != 0x7f800000u;
+        vec2 mv = vec2(pair[k / 2u][2u * (k % 2u)], pair[k / 2u][2u * (k % 2u) + 1u]);
+        vec2 next = vec2(BETA1 * mv.x + (1.0 - BETA1) * g, BETA2 * mv.y + (1.0 - BETA2) * g * g);
+        float rate = column < head ? step_rates.x : step_rates.y;
+        float change = rate * next.x / (sqrt(next.y) * step_rates.z + EPS);
+        parameter[k] = finite ? parameter[k] - change : parameter[k];
+        pair[k / 2u][2u * (k % 2u)] = finite ? next.x : mv.x;
+        pair[k / 2u][2u * (k % 2u) + 1u] = finite ? next.y : mv.y;
+        bad += finite || 4u * i + k >= count ? 0u : 1u;
+        column = column + 1u == stride ? 0u : column + 1u;
+    }
+    parameters[i] = parameter;
+    moments[2u * i] = pair[0];
+    moments[2u * i + 1u] = pair[1];
+    if (bad > 0u) atomicAdd(faults[0], bad);
 }

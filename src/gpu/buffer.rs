@@ -43,6 +43,11 @@ fn byte_len<T>(len: usize) -> u64 {
     (len as u64).saturating_mul(size_of::<T>() as u64)
 }
 
+/// Vulkan knows no empty buffers, and shaders read whole vectors of four words up to the end.
+fn padded(bytes: u64) -> u64 {
+    bytes.max(16).next_multiple_of(16)
+}
+
 impl Buffer {
     fn create(device: &Device, name: &str, bytes: u64, mapped: bool) -> Result<Buffer> {
         let limit = device.info().max_storage_range;
@@ -56,8 +61,7 @@ impl Buffer {
             )));
         }
         let fail = |e: String| Error::gpu(format!("buffer `{name}` of {:.1} MiB: {e}", mib(bytes)));
-        // Vulkan knows no empty buffers, and fills work on multiples of four bytes.
-        let size = bytes.max(16).next_multiple_of(4);
+        let size = padded(bytes);
         let usage = vk::BufferUsageFlags::STORAGE_BUFFER
             | vk::BufferUsageFlags::TRANSFER_SRC
             | vk::BufferUsageFlags::TRANSFER_DST
@@ -112,7 +116,7 @@ impl Buffer {
 
     /// Bytes that a fill covers and a binding spans.
     pub(super) fn raw_bytes(&self) -> u64 {
-        self.0.bytes.max(16).next_multiple_of(4)
+        padded(self.0.bytes)
     }
 
     /// Identity: equal for clones of one buffer.

@@ -101,7 +101,7 @@ impl Schedule {
                 slot: class.slot,
             },
         );
-        rec.dispatch(call, rows_of_groups(class.count));
+        rec.dispatch(call, rows_of_groups(class.count.div_ceil(4)));
     }
 }
 
