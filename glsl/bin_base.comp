@@ -1,18 +1,18 @@
 #version 450
-// Counters to the position where each chunk writes its first entry of a tile. Twin: pass::bin.
+// Counters to the place where each lane of bin_emit.comp writes its first entry of a tile. Twin: pass::bin.
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer TileRanges { uint tile_ranges[]; }; // [tiles + 1]
-layout(std430, binding = 1) buffer Counters { uint counters[]; };               // [tiles, chunks]
-layout(push_constant) uniform Push { uint tiles; uint chunks; };
+layout(std430, binding = 1) buffer Counters { uint counters[]; };               // [tiles, lanes]
+layout(push_constant) uniform Push { uint tiles; uint lanes; };
 
 void main() {
     uint tile = gl_GlobalInvocationID.x;
     if (tile >= tiles) return;
     uint position = tile_ranges[tile];
-    for (uint k = 0; k < chunks; k++) {
-        uint size = counters[tile * chunks + k];
-        counters[tile * chunks + k] = position;
+    for (uint k = 0; k < lanes; k++) {
+        uint size = counters[tile * lanes + k];
+        counters[tile * lanes + k] = position;
         position += size;
     }
 }

@@ -11,7 +11,7 @@ layout(std430, binding = 2) readonly buffer LogScales { float log_scales[]; };  
 layout(std430, binding = 3) readonly buffer Quats { vec4 quats[]; };                     // [N]
 layout(std430, binding = 4) readonly buffer OpacityLogits { float opacity_logits[]; };   // [N]
 layout(std430, binding = 5) readonly buffer Sh { float sh[]; };                          // [N, sh_stride, 3]
-// [N, 3]: (u, v, A', B'), (C', log2 o, r, g), (b, z, 0, 0) with log2(o e^p) = A' dx² + B' dx dy + C' dy² + log2 o
+// [N, 3]: (u, v, A', B'), (C', log2 o, A'C' − B'²/4, 0), (r, g, b, z), log2(o e^p) = A' dx² + B' dx dy + C' dy² + log2 o
 layout(std430, binding = 6) writeonly buffer Projected { vec4 projected[]; };
 layout(std430, binding = 7) writeonly buffer DepthPairs { uvec2 depth_pairs[]; };        // [N] (sort key, splat)
 layout(push_constant) uniform Push { uint count; uint sh_stride; };
@@ -45,7 +45,7 @@ void main() {
     vec3 power = vec3(-0.5 * LOG2_E, -LOG2_E, -0.5 * LOG2_E) * g.conic;
     // A splat that is not visible must fail every comparison downstream: far below any opacity.
     projected[3 * i] = vec4(centre, power.xy);
-    projected[3 * i + 1] = vec4(power.z, visible ? log2_opacity : -1e4, colour.rg);
-    projected[3 * i + 2] = vec4(colour.b, g.t.z, 0.0, 0.0);
+    projected[3 * i + 1] = vec4(power.z, visible ? log2_opacity : -1e4, 0.25 * LOG2_E * LOG2_E * g.conic_det, 0.0);
+    projected[3 * i + 2] = vec4(colour, g.t.z);
     depth_pairs[i] = uvec2(visible ? floatBitsToUint(g.t.z) : 0xffffffffu, i); // positive floats sort like integers
 }

@@ -14,7 +14,7 @@ layout(local_size_x = SUBGROUP_SIZE) in;
 
 layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };      // [N, 3], see project.comp
 layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; };   // [tiles + 1]
-layout(std430, binding = 2) readonly buffer TileSplats { uint tile_splats[]; };   // [capacity]
+layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; };  // [capacity] (splat, entry)
 #if CHANNELS != 4
 layout(std430, binding = 3) readonly buffer Codes { vec4 codes[]; };              // [N, code_vectors]
 layout(std430, binding = 4) buffer CodesGrad { ATOMIC_FLOAT codes_grad[]; };      // [N, 4 * code_vectors], added to
@@ -121,7 +121,7 @@ void main() {
     }
 
     for (uint j = first; j < last; j += SUBGROUP_SIZE) {
-        uint splat = tile_splats[min(j + lane, last - 1)];
+        uint splat = tile_splats[min(j + lane, last - 1)].x;
         load_splat(splat, j + lane < last);
         uint batch = min(uint(SUBGROUP_SIZE), last - j);
         // Both halves of the subgroup keep their own half sum of splat i; one exchange after the loop completes

@@ -12,7 +12,7 @@ layout(local_size_x = SUBGROUP_SIZE) in;
 layout(std430, binding = 0) readonly buffer Camera { vec4 camera[]; };
 layout(std430, binding = 1) readonly buffer Projected { vec4 projected[]; };      // [N, 3], see project.comp
 layout(std430, binding = 2) readonly buffer TileRanges { uint tile_ranges[]; };   // [tiles + 1]
-layout(std430, binding = 3) readonly buffer TileSplats { uint tile_splats[]; };   // [capacity]
+layout(std430, binding = 3) readonly buffer TileSplats { uvec2 tile_splats[]; };  // [capacity] (splat, entry)
 #if CHANNELS != 4
 layout(std430, binding = 4) readonly buffer Codes { vec4 codes[]; };              // [N, code_vectors]
 #endif
@@ -47,7 +47,7 @@ void main() {
     [[unroll]] for (int k = 0; k < CHANNELS * PIXELS; k++) sum[k] = 0.0;
 
     for (uint j = first; j < last; j += SUBGROUP_SIZE) {
-        load_splat(tile_splats[min(j + lane, last - 1)], j + lane < last);
+        load_splat(tile_splats[min(j + lane, last - 1)].x, j + lane < last);
         uint batch = min(uint(SUBGROUP_SIZE), last - j);
         for (uint i = 0; i < batch; i++) {
             float dx0 = subgroupShuffle(own_u, i) - origin.x, dy0 = subgroupShuffle(own_v, i) - origin.y;

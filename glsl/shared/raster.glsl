@@ -37,10 +37,7 @@ void load_splat(uint splat, bool valid) {
     own_log2_opacity = valid ? q.y : -1e4;
 #if BASE
     vec4 r = projected[3 * splat + 2];
-    own_value[0] = q.z;
-    own_value[1] = q.w;
-    own_value[2] = r.x;
-    own_value[3] = r.y;
+    [[unroll]] for (int k = 0; k < 4; k++) own_value[k] = r[k];
 #endif
 #if FEATURES > 0
     [[unroll]] for (int k = 0; k < FEATURE_VECTORS; k++) {

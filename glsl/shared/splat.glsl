@@ -15,6 +15,7 @@ struct Geometry {
     vec3 t0, t1;        // J R
     vec3 b0, b1;        // J R M
     vec3 conic;         // (A, B, C)
+    float conic_det;    // AC − B²
 };
 
 mat3 rotation_of(vec4 q) {
@@ -50,6 +51,7 @@ Geometry geometry_of(vec3 mean, vec3 log_scale, vec4 raw_quat) {
     vec3 area = cross(g.b0, g.b1);
     float xx = dot(g.b0, g.b0), yy = dot(g.b1, g.b1), xy = dot(g.b0, g.b1);
     float inv_det = 1.0 / (dot(area, area) + DILATION * (xx + yy) + DILATION * DILATION);
+    g.conic_det = inv_det;
     g.conic = vec3(yy + DILATION, -xy, xx + DILATION) * inv_det;
     return g;
 }

@@ -1,60 +1,198 @@
 //! Tile lists: for every 8×8 tile the splats that can change it, nearest first.
 //!
-//! Lanes own contiguous chunks of the depth order and a counter per tile. Counting, an exclusive scan over
-//! (tile, chunk) and a second, identical walk that writes give lists that are depth sorted without sorting any
-//! (tile, depth) pair: 12–18 ms for 500k pairs on lavapipe, where a pair sort takes hundreds.
+//! Splats in depth order are asked how many tiles they touch, a scan of these counts gives every (splat, tile) entry its
+//! place, and lanes with equal shares of the entries write them. What remains is a stable grouping by tile: on a CPU
+//! device by counting, with a counter per tile and lane, on a GPU by a radix sort of the tile's few bits. No
+//! (tile, depth) pair is ever sorted.
 //!
-//! A splat is listed where `max over the tile's pixel centres of o e^p ≥ 1/255`; the maximum over the rectangle is
-//! found exactly (the point of the nearest edges closest to the centre in the metric of the ellipse).
+//! A splat is listed where `max over the tile's pixel centres of o e^p ≥ 1/255`: `glsl/shared/tiles.glsl`.
 use super::project::Projected;
 use super::rasterizer::FrameBuffers;
-use crate::gpu::{Recorder, shaders};
+use super::scan::Scan;
+use super::sort::Sort;
+use crate::Result;
+use crate::gpu::{Buffer, Device, Recorder, shaders};
 
 /// Tile edge, pixels. 8 evaluates 2.9 times the pairs it blends, 16 six times (measured on the seeded scene).
 pub const TILE: u32 = 8;
 
-/// Records the five steps; the lists land in `frame.tile_ranges` and `frame.tile_splats`, the number of entries
-/// needed in `frame.status`.
-pub fn record(rec: &mut Recorder, frame: &FrameBuffers, count: usize) {
-    let [tiles_x, tiles_y] = frame.tiles();
-    let tiles = tiles_x * tiles_y;
-    let (count, chunks, capacity) = (count as u32, frame.chunks, frame.capacity as u32);
-    let walk = |emit| {
-        shaders::bin_walk::call(
-            shaders::bin_walk::Variant { emit },
-            &shaders::bin_walk::Bindings {
-                projected: &frame.projected,
-                depth_pairs: &frame.depth_pairs,
-                counters: &frame.counters,
-                tile_splats: &frame.tile_splats,
+/// How entries in splat order become lists per tile.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Grouping {
+    /// A counter per (tile, lane): little work, but for few lanes only.
+    Counting,
+    /// A radix sort by tile: any number of lanes.
+    Sorting,
+}
+
+impl Grouping {
+    /// What suits the device.
+    pub fn of(device: &Device) -> Grouping {
+        if device.info().is_cpu { Grouping::Counting } else { Grouping::Sorting }
+    }
+}
+
+/// The tile lists of one frame and what it takes to make them.
+pub(super) struct TileLists {
+    /// [tiles + 1]
+    pub ranges: Buffer,
+    /// [capacity] (splat, entry), grouped by tile, nearest first.
+    pub splats: Buffer,
+    /// [N] entries of each splat, in depth order, and where they begin.
+    pub counts: Buffer,
+    pub starts: Buffer,
+    /// [1] entries of this frame, 0 when they did not fit.
+    pub entry_count: Buffer,
+    /// Entries there is room for.
+    pub capacity: usize,
+    entries: Buffer,
+    scan: Scan,
+    group: Group,
+}
+
+enum Group {
+    Counting { counters: Buffer, lanes: u32 },
+    Sorting { entry_splats: Buffer, sort: Sort },
+}
+
+/// Lanes that write entries before a sort, and that read them behind it: enough to fill any GPU.
+const SORTING_LANES: u32 = 1 << 16;
+
+impl TileLists {
+    /// Room for `capacity` entries of up to `splats` splats on `tiles` tiles.
+    pub fn new(
+        device: &Device,
+        grouping: Grouping,
+        splats: usize,
+        tiles: usize,
+        capacity: usize,
+    ) -> Result<TileLists> {
+        let group = match grouping {
+            Grouping::Counting => {
+                let lanes = counting_lanes(tiles);
+                let counters = device.buffer::<u32>("tile counters", tiles * lanes as usize)?;
+                Group::Counting { counters, lanes }
+            }
+            Grouping::Sorting => Group::Sorting {
+                entry_splats: device.buffer::<u32>("entry splats", capacity)?,
+                sort: Sort::new(device, capacity)?,
             },
-            &shaders::bin_walk::Push { count, tiles_x, tiles_y, chunks, capacity },
-        )
+        };
+        Ok(TileLists {
+            ranges: device.buffer::<u32>("tile_ranges", tiles + 1)?,
+            splats: device.buffer::<[u32; 2]>("tile_splats", capacity)?,
+            counts: device.buffer::<u32>("tile_counts", splats)?,
+            starts: device.buffer::<u32>("tile_starts", splats)?,
+            entry_count: device.buffer::<u32>("entry_count", 1)?,
+            capacity,
+            entries: device.buffer::<[u32; 2]>("entries", capacity)?,
+            scan: Scan::new(device)?,
+            group,
+        })
+    }
+}
+
+/// Few lanes keep a CPU device busy, and more only add counters to clear and scan; their number is also bounded by
+/// memory: 16 M counters are 64 MiB, half of the smallest buffer limit Vulkan drivers have in practice.
+fn counting_lanes(tiles: usize) -> u32 {
+    let bound = ((1 << 24) / tiles.max(1)).max(8) as u32;
+    64.min(bound) / 8 * 8
+}
+
+/// Records counting, writing and grouping of the entries of `count` depth-sorted splats (`splat_count` holds the same
+/// number on the device); the lists land in `frame.lists`, the number of entries needed in `frame.status`.
+pub(super) fn record(rec: &mut Recorder, frame: &FrameBuffers, count: usize, splat_count: &Buffer) {
+    let ([tiles_x, tiles_y], count, lists) = (frame.tiles(), count as u32, &frame.lists);
+    let call = shaders::bin_count::call(
+        &shaders::bin_count::Bindings {
+            projected: &frame.projected,
+            depth_pairs: &frame.depth_pairs,
+            tile_counts: &lists.counts,
+        },
+        &shaders::bin_count::Push { count, tiles_x, tiles_y },
+    );
+    rec.dispatch_threads(call, [count, 1, 1]);
+    lists.scan.record(rec, &lists.counts, splat_count, &lists.starts, &frame.status);
+    let (grouping, lanes) = match &lists.group {
+        Group::Counting { counters, lanes } => {
+            rec.fill(counters, 0);
+            (0, *lanes)
+        }
+        Group::Sorting { .. } => (1, SORTING_LANES),
     };
-    rec.fill(&frame.counters, 0);
-    rec.dispatch_threads(walk(0), [chunks, 1, 1]);
-    rec.dispatch_threads(
-        shaders::bin_sum::call(
-            &shaders::bin_sum::Bindings { counters: &frame.counters, tile_ranges: &frame.tile_ranges },
-            &shaders::bin_sum::Push { tiles, chunks },
-        ),
-        [tiles, 1, 1],
+    // The buffers of the other grouping are ignored by the shader; any will do.
+    let (counters, entry_splats) = match &lists.group {
+        Group::Counting { counters, .. } => (counters, counters),
+        Group::Sorting { entry_splats, .. } => (entry_splats, entry_splats),
+    };
+    let call = shaders::bin_emit::call(
+        shaders::bin_emit::Variant { grouping },
+        &shaders::bin_emit::Bindings {
+            projected: &frame.projected,
+            depth_pairs: &frame.depth_pairs,
+            starts: &lists.starts,
+            status: &frame.status,
+            entry_count: &lists.entry_count,
+            entries: &lists.entries,
+            counters,
+            entry_splats,
+        },
+        &shaders::bin_emit::Push { count, tiles_x, tiles_y, lanes, capacity: lists.capacity as u32 },
     );
-    rec.dispatch(
-        shaders::bin_scan::call(
-            &shaders::bin_scan::Bindings { tile_ranges: &frame.tile_ranges, status: &frame.status },
-            &shaders::bin_scan::Push { tiles, capacity },
-        ),
-        [1, 1, 1],
+    rec.dispatch_threads(call, [lanes, 1, 1]);
+    match &lists.group {
+        Group::Counting { counters, lanes } => {
+            group_by_counting(rec, lists, tiles_x * tiles_y, counters, *lanes)
+        }
+        Group::Sorting { entry_splats, sort } => {
+            group_by_sorting(rec, lists, tiles_x * tiles_y, entry_splats, sort)
+        }
+    }
+}
+
+fn group_by_counting(rec: &mut Recorder, lists: &TileLists, tiles: u32, counters: &Buffer, lanes: u32) {
+    let tile_ranges = &lists.ranges;
+    let call = shaders::bin_sum::call(
+        &shaders::bin_sum::Bindings { counters, tile_ranges },
+        &shaders::bin_sum::Push { tiles, lanes },
     );
-    rec.dispatch_threads(
-        shaders::bin_base::call(
-            &shaders::bin_base::Bindings { tile_ranges: &frame.tile_ranges, counters: &frame.counters },
-            &shaders::bin_base::Push { tiles, chunks },
-        ),
-        [tiles, 1, 1],
+    rec.dispatch_threads(call, [tiles, 1, 1]);
+    let call = shaders::bin_scan::call(
+        &shaders::bin_scan::Bindings { tile_ranges },
+        &shaders::bin_scan::Push { tiles },
     );
-    rec.dispatch_threads(walk(1), [chunks, 1, 1]);
+    rec.dispatch(call, [1, 1, 1]);
+    let call = shaders::bin_base::call(
+        &shaders::bin_base::Bindings { tile_ranges, counters },
+        &shaders::bin_base::Push { tiles, lanes },
+    );
+    rec.dispatch_threads(call, [tiles, 1, 1]);
+    let call = shaders::bin_scatter::call(
+        &shaders::bin_scatter::Bindings {
+            entry_count: &lists.entry_count,
+            entries: &lists.entries,
+            counters,
+            tile_splats: &lists.splats,
+        },
+        &shaders::bin_scatter::Push { lanes },
+    );
+    rec.dispatch_threads(call, [lanes, 1, 1]);
+}
+
+fn group_by_sorting(rec: &mut Recorder, lists: &TileLists, tiles: u32, entry_splats: &Buffer, sort: &Sort) {
+    let bits = u32::BITS - tiles.leading_zeros();
+    sort.record(rec, &lists.entries, &lists.entry_count, bits);
+    let call = shaders::bin_ranges::call(
+        &shaders::bin_ranges::Bindings {
+            entry_count: &lists.entry_count,
+            entries: &lists.entries,
+            entry_splats,
+            tile_ranges: &lists.ranges,
+            tile_splats: &lists.splats,
+        },
+        &shaders::bin_ranges::Push { tiles, lanes: SORTING_LANES },
+    );
+    rec.dispatch_threads(call, [SORTING_LANES, 1, 1]);
 }
 
 /// The lists, by asking every pixel of every tile: `[tiles]`, each nearest first as `order` is.

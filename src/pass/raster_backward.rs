@@ -28,8 +28,8 @@ pub fn record(rec: &mut Recorder, frame: &FrameBuffers, features_move_geometry: 
             shaders::raster_backward::Variant { channels: block.channels },
             &shaders::raster_backward::Bindings {
                 projected: &frame.projected,
-                tile_ranges: &frame.tile_ranges,
-                tile_splats: &frame.tile_splats,
+                tile_ranges: &frame.lists.ranges,
+                tile_splats: &frame.lists.splats,
                 codes: &frame.codes,
                 codes_grad: &frame.codes_grad,
                 planes: &frame.planes,

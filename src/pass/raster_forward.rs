@@ -61,8 +61,8 @@ pub fn record(rec: &mut Recorder, camera: &Buffer, frame: &FrameBuffers) {
             &shaders::raster_forward::Bindings {
                 camera,
                 projected: &frame.projected,
-                tile_ranges: &frame.tile_ranges,
-                tile_splats: &frame.tile_splats,
+                tile_ranges: &frame.lists.ranges,
+                tile_splats: &frame.lists.splats,
                 codes: &frame.codes,
                 planes: &frame.planes,
                 transmittance: &frame.transmittance,

@@ -30,6 +30,7 @@
 //!
 //! Recordings hold the buffers they were made with: record again after `grow`, after changing the number of splats,
 //! the SH degree or the options.
+use super::bin::{Grouping, TileLists};
 use super::sort::Sort;
 use super::twin::FeatureMode;
 use super::view::{VIEW_FLOATS, View};
@@ -189,11 +190,7 @@ pub struct FrameBuffers {
     pub(super) codes: Buffer,
     pub(super) codes_grad: Buffer,
     pub(super) depth_pairs: Buffer,
-    pub(super) counters: Buffer,
-    pub(super) tile_ranges: Buffer,
-    pub(super) tile_splats: Buffer,
-    pub(super) chunks: u32,
-    pub(super) capacity: usize,
+    pub(super) lists: TileLists,
 }
 
 impl FrameBuffers {
@@ -213,6 +210,7 @@ pub struct Rasterizer {
     capacity: usize,
     camera: Buffer,
     frame: FrameBuffers,
+    grouping: Grouping,
     sort: Sort,
     /// [1] u32: N, where the sort reads it.
     count: Buffer,
@@ -227,6 +225,18 @@ impl Rasterizer {
         width: u32,
         height: u32,
     ) -> Result<Rasterizer> {
+        Rasterizer::with_grouping(device, capacity, feature_dim, width, height, Grouping::of(device))
+    }
+
+    /// [`Rasterizer::new`] with a way of making the tile lists that may not be the device's best: for tests, benchmarks.
+    pub fn with_grouping(
+        device: &Device,
+        capacity: usize,
+        feature_dim: usize,
+        width: u32,
+        height: u32,
+        grouping: Grouping,
+    ) -> Result<Rasterizer> {
         if width == 0 || height == 0 {
             return Err(Error::work("an image of zero size cannot be rendered"));
         }
@@ -235,7 +245,6 @@ impl Rasterizer {
         let planes = raster_forward::BASE_CHANNELS + feature_dim;
         let splats = capacity.max(1);
         let stride = feature_dim.next_multiple_of(4);
-        let chunks = chunks_for(device, tiles);
         // About five entries per splat on the seeded scene; `forward` grows the list if that is too few.
         let entries = 8 * splats + 4 * tiles;
         let frame = FrameBuffers {
@@ -253,16 +262,12 @@ impl Rasterizer {
             codes: device.buffer::<f32>("codes", (stride * splats).max(4))?,
             codes_grad: device.buffer::<f32>("codes_grad", (stride * splats).max(4))?,
             depth_pairs: device.buffer::<[u32; 2]>("depth_pairs", splats)?,
-            counters: device.buffer::<u32>("counters", tiles * chunks as usize)?,
-            tile_ranges: device.buffer::<u32>("tile_ranges", tiles + 1)?,
-            tile_splats: device.buffer::<u32>("tile_splats", entries)?,
-            chunks,
-            capacity: entries,
+            lists: TileLists::new(device, grouping, splats, tiles, entries)?,
         };
         let camera = device.buffer::<f32>("camera", VIEW_FLOATS)?;
         let sort = Sort::new(device, splats)?;
         let count = device.buffer::<u32>("splat count", 1)?;
-        Ok(Rasterizer { device: device.clone(), capacity, camera, frame, sort, count })
+        Ok(Rasterizer { device: device.clone(), capacity, camera, frame, grouping, sort, count })
     }
 
     /// The output and gradient planes.
@@ -297,7 +302,7 @@ impl Rasterizer {
         rec.fill(&self.count, params.count as u32);
         self.sort.record(rec, &self.frame.depth_pairs, &self.count, 32);
         rec.pass("binning");
-        bin::record(rec, &self.frame, params.count);
+        bin::record(rec, &self.frame, params.count, &self.count);
         rec.pass("raster forward");
         raster_forward::record(rec, &self.camera, &self.frame);
     }
@@ -343,16 +348,18 @@ impl Rasterizer {
     /// Makes room for tile lists of `needed` entries and a quarter more. Earlier recordings must not be run again.
     pub fn grow(&mut self, needed: usize) -> Result<()> {
         let capacity = needed + needed / 4;
-        self.frame.tile_splats = self.device.buffer::<u32>("tile_splats", capacity)?;
-        self.frame.capacity = capacity;
+        let tiles = self.frame.tiles();
+        let (splats, tiles) = (self.capacity.max(1), tiles[0] as usize * tiles[1] as usize);
+        self.frame.lists = TileLists::new(&self.device, self.grouping, splats, tiles, capacity)?;
         self.frame.status.write(&[0u32, 0])
     }
 
     /// The tile lists of the last forward pass, row by row of tiles, nearest splat first. For tests and statistics.
     pub fn tile_lists(&self) -> Result<Vec<Vec<u32>>> {
-        let ranges = self.frame.tile_ranges.read::<u32>()?;
-        let splats = self.frame.tile_splats.read::<u32>()?;
-        Ok(ranges.windows(2).map(|r| splats[r[0] as usize..r[1] as usize].to_vec()).collect())
+        let ranges = self.frame.lists.ranges.read::<u32>()?;
+        let splats = self.frame.lists.splats.read::<[u32; 2]>()?;
+        let list = |r: &[u32]| splats[r[0] as usize..r[1] as usize].iter().map(|s| s[0]).collect();
+        Ok(ranges.windows(2).map(list).collect())
     }
 
     fn check(&self, params: &SplatBuffers) -> Result<()> {
@@ -364,13 +371,4 @@ impl Rasterizer {
         }
         Ok(())
     }
-}
-
-/// Lanes that bin in parallel. Each has a counter per tile, so their number is bounded by memory; a CPU is busy with
-/// few (more only add counters to clear and scan), a GPU wants many.
-fn chunks_for(device: &Device, tiles: usize) -> u32 {
-    let wanted = if device.info().is_cpu { 64 } else { 1024 };
-    // 16 M counters, 64 MiB: half of the smallest buffer limit Vulkan drivers have in practice.
-    let bound = ((1 << 24) / tiles.max(1)).max(8) as u32;
-    wanted.min(bound) / 8 * 8
 }

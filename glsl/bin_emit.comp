@@ -1,0 +1,87 @@
+#version 450
+// variants: GROUPING=0,1
+// Writes the entries: for every splat in depth order its tiles, row by row. A lane makes the same number of entries as
+// every other, so a splat that covers the screen is shared by many. If the entries do not fit, there are none, and the
+// status says how much room is needed: an image without splats, never one with a few of them missing. Twin: pass::bin.
+//
+// GROUPING 0 (counting, see bin_scatter.comp): entries are (tile, splat), and the lane counts them per tile.
+// GROUPING 1 (sorting, see bin_ranges.comp): entries are (tile, own index), and `entry_splats` keeps the splat.
+#extension GL_GOOGLE_include_directive : require
+#if GROUPING == 0
+layout(local_size_x = 8) in;
+#else
+layout(local_size_x = 64) in;
+#endif
+
+layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };         // [N, 3]
+layout(std430, binding = 1) readonly buffer DepthPairs { uvec2 depth_pairs[]; };     // [N] (key, splat), sorted
+layout(std430, binding = 2) readonly buffer Starts { uint starts[]; };               // [N] first entry, in depth order
+layout(std430, binding = 3) buffer Status { uint status[]; };                        // [2] see FrameBuffers
+layout(std430, binding = 4) writeonly buffer EntryCount { uint entry_count; };       // entries, 0 if they do not fit
+layout(std430, binding = 5) writeonly buffer Entries { uvec2 entries[]; };           // [capacity]
+#if GROUPING == 0
+layout(std430, binding = 6) buffer Counters { uint counters[]; };                    // [tiles, lanes]
+#else
+layout(std430, binding = 7) writeonly buffer EntrySplats { uint entry_splats[]; };   // [capacity]
+#endif
+layout(push_constant) uniform Push { uint count; uint tiles_x; uint tiles_y; uint lanes; uint capacity; };
+
+#include "shared/tiles.glsl"
+
+// Last rank whose entries begin at or before `entry`: the one that contains it.
+uint rank_of(uint entry) {
+    uint low = 0, high = count;
+    while (high - low > 1) {
+        uint middle = (low + high) / 2;
+        if (starts[middle] <= entry) low = middle; else high = middle;
+    }
+    return low;
+}
+
+void main() {
+    uint lane = gl_GlobalInvocationID.x, total = status[0];
+    if (lane >= lanes) return;
+    bool fits = total <= capacity;
+    if (lane == 0) {
+        entry_count = fits ? total : 0;
+        if (!fits) status[1] = max(status[1], total);
+    }
+    uint share = (total + lanes - 1) / lanes;
+    uint begin = lane * share, end = min(begin + share, total);
+    if (!fits || begin >= end) return;
+
+    uint rank = rank_of(begin), entry = starts[rank], splat = depth_pairs[rank].y;
+    Ellipse e = ellipse_of(splat, tiles_y);
+    int row = e.first_row - 1, x = 0, last = -1;
+    // One flat loop over (splat, row, tile): lanes with small splats do not wait for lanes with large ones.
+    while (entry < end && rank < count) {
+        x++;
+        if (x > last) {
+            row++;
+            if (row > e.last_row) {
+                rank++;
+                splat = depth_pairs[rank].y;
+                e = ellipse_of(splat, tiles_y);
+                row = e.first_row;
+            }
+            ivec2 interval = interval_of(e, row, tiles_x);
+            x = interval.x;
+            last = row <= e.last_row ? interval.y : -1;
+            // What lies before this lane's share belongs to others.
+            int skip = clamp(int(begin) - int(entry), 0, max(last - x + 1, 0));
+            x += skip;
+            entry += uint(skip);
+        }
+        if (x <= last) {
+            uint tile = uint(row) * tiles_x + uint(x);
+#if GROUPING == 0
+            entries[entry] = uvec2(tile, splat);
+            counters[tile * lanes + lane]++;
+#else
+            entries[entry] = uvec2(tile, entry);
+            entry_splats[entry] = splat;
+#endif
+            entry++;
+        }
+    }
+}

@@ -1,0 +1,23 @@
+#version 450
+// Grouping by counting, last step: every lane of bin_emit.comp moves its entries, in order, to where its share of each
+// tile's list begins. Twin: pass::bin.
+layout(local_size_x = 8) in;
+
+layout(std430, binding = 0) readonly buffer EntryCount { uint entry_count; };
+layout(std430, binding = 1) readonly buffer Entries { uvec2 entries[]; };            // [capacity] (tile, splat)
+layout(std430, binding = 2) buffer Counters { uint counters[]; };                    // [tiles, lanes]: places
+layout(std430, binding = 3) writeonly buffer TileSplats { uvec2 tile_splats[]; };    // [capacity] (splat, entry)
+layout(push_constant) uniform Push { uint lanes; };
+
+void main() {
+    uint lane = gl_GlobalInvocationID.x;
+    if (lane >= lanes) return;
+    uint share = (entry_count + lanes - 1) / lanes;
+    uint end = min(lane * share + share, entry_count);
+    for (uint i = lane * share; i < end; i++) {
+        uvec2 entry = entries[i];
+        uint at = entry.x * lanes + lane, place = counters[at];
+        counters[at] = place + 1;
+        tile_splats[place] = uvec2(entry.y, i);
+    }
+}

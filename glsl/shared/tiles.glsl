@@ -1,0 +1,44 @@
+// Which tiles a splat can change, row by row of tiles: those with a pixel centre inside the rectangle of the tile where
+// log2(o e^p) reaches log2(1/255). The band of a row cuts a convex piece out of the ellipse, so the tiles of a row are an
+// interval, whose ends follow from two chords. `precise`: counting and writing must take exactly the same decisions.
+// Needs `projected`.
+const int TILE = 8;
+const float LOG2_ALPHA_MIN = -7.994353436858858; // log2(1/255)
+// The raster pass evaluates the same power in another order; 1e-3 covers the difference of up to 1e4 in size.
+const float MARGIN = 1e-3;
+
+struct Ellipse { // A' dx² + B' dx dy + C' dy² + k = 0, all coefficients but k negative or mixed
+    float u, v;          // centre
+    float inv_a, det, k; // 1 / A', A'C' − B'²/4, A' k
+    float slope;         // dx per dy of the middles of horizontal chords
+    float right_dy;      // where the ellipse reaches furthest right; left: the negative
+    int first_row, last_row;
+};
+
+Ellipse ellipse_of(uint splat, uint rows) {
+    vec4 p = projected[3 * splat], q = projected[3 * splat + 1];
+    precise float inv_a = 1.0 / p.z, det = q.z;
+    precise float k = max(q.y - LOG2_ALPHA_MIN + MARGIN, 0.0) * p.z;
+    precise float half_height = sqrt(max(-k / det, 0.0)), half_width = sqrt(max(-k * inv_a * q.x / det, 0.0));
+    precise float slope = -0.5 * p.w * inv_a, right_dy = -0.5 * p.w / q.x * half_width;
+    Ellipse e = Ellipse(p.x, p.y, inv_a, det, k, slope, right_dy, 0, 0);
+    // Clamping as floats first: a far splat must not overflow the conversion to int.
+    float last = float(rows) - 1.0;
+    e.first_row = int(clamp(ceil((e.v - half_height - float(TILE - 1)) / float(TILE)), 0.0, last + 1.0));
+    e.last_row = int(clamp(floor((e.v + half_height) / float(TILE)), -1.0, last));
+    if (q.y < LOG2_ALPHA_MIN) e.last_row = -1;
+    return e;
+}
+
+// First and last tile of a row; none when first > last.
+ivec2 interval_of(Ellipse e, int row, uint columns) {
+    precise float low = float(row * TILE) - e.v, high = low + float(TILE - 1);
+    precise float right = clamp(e.right_dy, low, high), left = clamp(-e.right_dy, low, high);
+    precise float chord_right = sqrt(max(-e.k - e.det * right * right, 0.0));
+    precise float chord_left = sqrt(max(-e.k - e.det * left * left, 0.0));
+    precise float x1 = e.u + e.slope * right - e.inv_a * chord_right;
+    precise float x0 = e.u + e.slope * left + e.inv_a * chord_left;
+    float last = float(columns) - 1.0;
+    return ivec2(int(clamp(ceil((x0 - float(TILE - 1)) / float(TILE)), 0.0, last + 1.0)),
+                 int(clamp(floor(x1 / float(TILE)), -1.0, last)));
+}
