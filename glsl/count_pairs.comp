@@ -10,7 +10,7 @@ layout(local_size_x = SUBGROUP_SIZE) in;
 
 layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };    // [N, 3], see project.comp
 layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; }; // [tiles + 1]
-layout(std430, binding = 2) readonly buffer TileSplats { uint tile_splats[]; }; // [capacity]
+layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; }; // [capacity] (splat, entry)
 layout(std430, binding = 3) writeonly buffer Counts { uvec2 counts[]; };        // [tiles, 64] (evaluated, blended), zero at first
 layout(push_constant) uniform Push { uint width; uint height; uint tiles_x; };
 
@@ -30,7 +30,7 @@ void main() {
         T[k] = x < width && y < height ? 1.0 : -1.0;
     }
     for (uint j = first; j < last; j += SUBGROUP_SIZE) {
-        load_splat(tile_splats[min(j + lane, last - 1)], j + lane < last);
+        load_splat(tile_splats[min(j + lane, last - 1)].x, j + lane < last);
         uint batch = min(uint(SUBGROUP_SIZE), last - j);
         evaluated += batch * PIXELS;
         for (uint i = 0; i < batch; i++) {

@@ -5,7 +5,6 @@
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_arithmetic : require
-#include "shared/atomic_float.glsl"
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer Camera { vec4 camera[]; };                  // [6]
@@ -14,14 +13,16 @@ layout(std430, binding = 2) readonly buffer LogScales { float log_scales[]; };  
 layout(std430, binding = 3) readonly buffer Quats { vec4 quats[]; };                    // [N]
 layout(std430, binding = 4) readonly buffer OpacityLogits { float opacity_logits[]; };  // [N]
 layout(std430, binding = 5) readonly buffer Sh { float sh[]; };                         // [N, sh_stride, 3]
-layout(std430, binding = 6) readonly buffer ProjectedGrad { float projected_grad[]; };  // [N, 10]
+layout(std430, binding = 6) readonly buffer ProjectedGrad { vec4 projected_grad[]; };   // [N, 3]
 layout(std430, binding = 7) writeonly buffer MeansGrad { float means_grad[]; };         // shapes as above
 layout(std430, binding = 8) writeonly buffer LogScalesGrad { float log_scales_grad[]; };
 layout(std430, binding = 9) writeonly buffer QuatsGrad { vec4 quats_grad[]; };
 layout(std430, binding = 10) writeonly buffer OpacityLogitsGrad { float opacity_logits_grad[]; };
 layout(std430, binding = 11) writeonly buffer ShGrad { float sh_grad[]; };
-layout(std430, binding = 12) buffer CameraGrad { ATOMIC_FLOAT camera_grad[]; };         // [10], added to
-layout(push_constant) uniform Push { uint count; uint sh_stride; uint threads; };
+layout(std430, binding = 12) writeonly buffer CameraParts { float camera_parts[]; };    // [10, PARTS]
+layout(push_constant) uniform Push { uint count; uint sh_stride; };
+
+const uint THREADS = 4096, PARTS = THREADS / 64 * 16; // as pass::project_backward
 
 #include "shared/camera.glsl"
 #include "shared/sh.glsl"
@@ -95,12 +96,12 @@ vec3 colour_backward(uint i, vec3 mean, vec3 by_colour) {
 void main() {
     vec3 by_rho = vec3(0.0), by_theta = vec3(0.0);
     vec4 by_intrinsics = vec4(0.0);
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += threads) {
+    for (uint i = gl_GlobalInvocationID.x; i < count; i += THREADS) {
         vec3 mean = vec3(means[3 * i], means[3 * i + 1], means[3 * i + 2]);
         vec3 log_scale = vec3(log_scales[3 * i], log_scales[3 * i + 1], log_scales[3 * i + 2]);
         Geometry g = geometry_of(mean, log_scale, quats[i]);
         float up[10]; // a splat that no pixel saw has zeros here, and gets zero gradients below
-        [[unroll]] for (int k = 0; k < 10; k++) up[k] = projected_grad[10 * i + k];
+        [[unroll]] for (int k = 0; k < 10; k++) up[k] = projected_grad[3 * i + k / 4][k % 4];
 
         float opacity = 1.0 / (1.0 + exp(min(-opacity_logits[i], 80.0)));
         opacity_logits_grad[i] = up[0] * (1.0 - opacity);
@@ -137,8 +138,9 @@ void main() {
     }
     float sums[10] = float[10](by_rho.x, by_rho.y, by_rho.z, by_theta.x, by_theta.y, by_theta.z,
                                by_intrinsics.x, by_intrinsics.y, by_intrinsics.z, by_intrinsics.w);
+    uint part = gl_WorkGroupID.x * 16 + gl_SubgroupID; // at most 16 subgroups of 4
     [[unroll]] for (int k = 0; k < 10; k++) {
         float sum = subgroupAdd(sums[k]);
-        if (gl_SubgroupInvocationID == 0) ATOMIC_ADD(camera_grad[k], sum);
+        if (gl_SubgroupInvocationID == 0) camera_parts[k * PARTS + part] = sum;
     }
 }

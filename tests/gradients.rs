@@ -1,7 +1,9 @@
 //! Gradients of the whole render on the GPU against the f64 twin, which is itself checked by central differences.
 mod support;
 use splatvk::gpu::{Options, TestDevice, test_device};
+use splatvk::pass::Ways;
 use splatvk::pass::close::Tolerance;
+use splatvk::pass::raster_backward::Summation;
 use support::{GpuGradients, Scene, assert_close};
 
 /// Relative 1e-3 by class in the L2 sense (ALGORITHMS 7.8; measured 4e-7 to 4e-6). Single elements are sums of many
@@ -41,15 +43,20 @@ fn assert_gradients(scene: &Scene, actual: &GpuGradients, seed: u64) {
     assert_class("intrinsics", &actual.camera[6..], &reference.intrinsics);
 }
 
+/// Added up by atomics and entry by entry; the latter gives the same bits every time.
 #[test]
 fn random_scenes_match_the_twin() {
     let device = test_device();
+    let by = |summation| Ways { summation, ..Ways::of(&device) };
+    let (atomics, entries) = (by(Summation::Atomics), by(Summation::Entries));
     for (n, sh_degree, dim) in [(1, 3, 3), (10, 3, 0), (100, 2, 8), (500, 1, 16), (100, 0, 48)] {
         let scene = Scene::small(n, sh_degree, dim, 60 + n as u64);
         println!("{n} splats, degree {sh_degree}, {dim} features");
         let upstream = scene.upstream(7);
-        let gradients = scene.gradients(&device, &upstream);
+        assert_gradients(&scene, &scene.gradients_by(&device, atomics, &upstream), 7);
+        let gradients = scene.gradients_by(&device, entries, &upstream);
         assert_gradients(&scene, &gradients, 7);
+        assert_eq!(gradients, scene.gradients_by(&device, entries, &upstream));
     }
 }
 
@@ -127,7 +134,8 @@ fn without_float_atomics_the_gradients_are_the_same() {
     assert!(!device.info().float_atomics);
     let scene = Scene::small(100, 1, 3, 14);
     let upstream = scene.upstream(14);
-    assert_gradients(&scene, &scene.gradients(&device, &upstream), 14);
+    let ways = Ways { summation: Summation::Atomics, ..Ways::of(&device) };
+    assert_gradients(&scene, &scene.gradients_by(&device, ways, &upstream), 14);
 }
 
 /// Scene and camera moved together change nothing: Σ ∂μ = Rᵀ ∂ρ, here over a whole GPU scene.

@@ -4,7 +4,7 @@ use glam::DVec3;
 use splatvk::gpu::{Recorder, test_device};
 use splatvk::pass::raster_forward::BASE_CHANNELS;
 use splatvk::pass::seeded::{self, Random};
-use splatvk::pass::{FeatureMode, RasterOptions, Rasterizer, Renderer, SplatBuffers, View, bin};
+use splatvk::pass::{FeatureMode, RasterOptions, Rasterizer, Renderer, SplatBuffers, View, Ways, bin};
 use splatvk::scene::{Pose, Splats};
 use support::{IMAGE, Scene, assert_close, assert_images, rendered};
 
@@ -159,9 +159,10 @@ fn tile_lists_contain_the_twins() {
     let forward = scene.twin();
     let expected = bin::twin(&forward.projected, &forward.order, scene.view.size);
     let lists = |grouping| {
+        let ways = Ways { grouping, ..Ways::of(&device) };
         let params = SplatBuffers::upload(&device, &scene.splats, &[], 0).unwrap();
         let [width, height] = scene.view.size;
-        let mut raster = Rasterizer::with_grouping(&device, 500, 0, width, height, grouping).unwrap();
+        let mut raster = Rasterizer::with(&device, 500, 0, width, height, ways).unwrap();
         raster.set_view(&scene.view).unwrap();
         raster.forward(&params, &scene.options).unwrap();
         raster.tile_lists().unwrap()

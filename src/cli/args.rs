@@ -95,6 +95,9 @@ pub struct RunArgs {
     /// Seed of everything random
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
+    /// Same bits on every run on one machine: training adds up gradients in a fixed order, about a tenth slower
+    #[arg(long)]
+    pub deterministic: bool,
     /// Optimisation steps of the colour stage, instead of the preset's
     #[arg(long, value_name = "N")]
     pub iterations: Option<usize>,
@@ -139,6 +142,9 @@ pub struct TrainArgs {
     /// Seed of everything random
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
+    /// Same bits on every run on one machine: training adds up gradients in a fixed order, about a tenth slower
+    #[arg(long)]
+    pub deterministic: bool,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,

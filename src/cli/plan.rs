@@ -42,6 +42,7 @@ pub fn run(args: &RunArgs) -> Result<RunPlan> {
         feature_dim: args.feature_dim,
         per_level: args.per_level,
         device: args.device.device.clone(),
+        deterministic: args.deterministic,
         models: models(&args.device),
     })
 }

@@ -18,6 +18,7 @@ pub fn train(args: &TrainArgs) -> Result<()> {
         iterations: args.iterations,
         seed: args.seed,
         device: args.device.device.clone(),
+        deterministic: args.deterministic,
         models: plan::models(&args.device),
     };
     let trained = run(&plan, &Terminal::new())?;

@@ -19,6 +19,8 @@ pub struct Options {
     pub validation: bool,
     /// Keep buffers out of host-visible memory, as on a GPU, even on a CPU device (to test the staging path).
     pub staging: bool,
+    /// Only passes that give the same bits on every run of this device, even where others are faster.
+    pub deterministic: bool,
     /// Use the compare-and-swap loop although the device has float atomics (to test it).
     pub no_float_atomics: bool,
 }
@@ -54,6 +56,8 @@ pub struct DeviceInfo {
     pub subgroup_sizes: (u32, u32),
     /// Subgroup sizes can be pinned per pipeline.
     pub subgroup_control: bool,
+    /// Asked to give the same bits on every run ([`Options::deterministic`]).
+    pub deterministic: bool,
     /// `atomicAdd` on float in storage buffers is native.
     pub float_atomics: bool,
     /// Capabilities that shaders may use here.

@@ -170,6 +170,7 @@ fn describe(
         },
         subgroup_control: pins,
         float_atomics,
+        deterministic: options.deterministic,
         capabilities: capabilities(offer, &v11, float_atomics),
         max_storage_range: u64::from(limits.max_storage_buffer_range),
         max_groups: limits.max_compute_work_group_count,

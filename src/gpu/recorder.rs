@@ -148,6 +148,11 @@ impl Recorder {
         }
     }
 
+    /// The device that will run it.
+    pub fn device(&self) -> &Device {
+        &self.device
+    }
+
     /// Number of commands so far.
     pub fn len(&self) -> usize {
         self.commands.len()

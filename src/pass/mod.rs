@@ -28,7 +28,7 @@ pub mod sum;
 pub mod twin;
 pub mod view;
 
-pub use rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
+pub use rasterizer::{RasterOptions, Rasterizer, SplatBuffers, Ways};
 pub use renderer::{Frame, Renderer};
 pub use twin::FeatureMode;
 pub use view::View;

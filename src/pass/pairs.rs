@@ -11,8 +11,8 @@ pub fn count(device: &Device, raster: &Rasterizer) -> Result<[f64; 2]> {
     let call = shaders::count_pairs::call(
         &shaders::count_pairs::Bindings {
             projected: &frame.projected,
-            tile_ranges: &frame.tile_ranges,
-            tile_splats: &frame.tile_splats,
+            tile_ranges: &frame.lists.ranges,
+            tile_splats: &frame.lists.splats,
             counts: &counts,
         },
         &shaders::count_pairs::Push { width: frame.width, height: frame.height, tiles_x: tiles[0] },

@@ -13,12 +13,13 @@ use super::view::View;
 use crate::gpu::{Buffer, Recorder, shaders};
 use glam::{DMat3, DVec3, DVec4};
 
-/// Threads of the GPU pass. Each walks every THREADS-th splat and adds its share of the camera gradient once, since
-/// contended float atomics are slow (134 ns on lavapipe, where this makes about 1 ms of them).
+/// Threads of the GPU pass: each walks every THREADS-th splat, so that few parts of the camera gradient are left to sum.
 const THREADS: u32 = 4096;
+/// Parts of the camera gradient: room for 16 subgroups in each workgroup of 64, and zero where there are fewer.
+pub(super) const CAMERA_PARTS: usize = THREADS as usize / 64 * 16;
 
 /// Records the gradients by all raw parameters (overwritten in `gradients`, zero where a splat was not seen) and by
-/// the camera (`camera_grad` [10]: ρ, θ, fx, fy, cx, cy; cleared here first).
+/// the camera (`camera_grad` [10]: ρ, θ, fx, fy, cx, cy).
 pub fn record(
     rec: &mut Recorder,
     splats: &SplatBuffers,
@@ -28,7 +29,6 @@ pub fn record(
     gradients: &SplatBuffers,
     camera_grad: &Buffer,
 ) {
-    rec.fill(camera_grad, 0);
     let count = splats.count as u32;
     let call = shaders::project_backward::call(
         shaders::project_backward::Variant { sh_degree },
@@ -45,11 +45,16 @@ pub fn record(
             quats_grad: &gradients.quats,
             opacity_logits_grad: &gradients.opacity_logits,
             sh_grad: &gradients.sh,
-            camera_grad,
+            camera_parts: &frame.camera_parts,
         },
-        &shaders::project_backward::Push { count, sh_stride: splats.sh_len() as u32, threads: THREADS },
+        &shaders::project_backward::Push { count, sh_stride: splats.sh_len() as u32 },
     );
     rec.dispatch_threads(call, [THREADS, 1, 1]);
+    let call = shaders::camera_sum::call(
+        &shaders::camera_sum::Bindings { camera_parts: &frame.camera_parts, camera_grad },
+        &shaders::camera_sum::Push { parts: CAMERA_PARTS as u32 },
+    );
+    rec.dispatch(call, [1, 1, 1]);
 }
 
 /// Records the gradient by the stored features. Nothing without features.

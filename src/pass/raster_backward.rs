@@ -8,49 +8,187 @@
 //! With σ = ∂α · α (0 where α was clamped), the shader only sums six moments: Σσ, Σσdx, Σσdy, Σσdx², Σσdxdy, Σσdy².
 //! Every geometry gradient follows per splat: ∂o = m₀/o, ∂(u, v) = −(A m₁ + B m₂, C m₂ + B m₁),
 //! ∂(A, B, C) = (−½ m₃, −m₄, −½ m₅).
-use super::raster_forward::{BASE_CHANNELS, Cutoffs, TwinScene, blocks, channels_of, walk};
+use super::adam::rows_of_groups;
+use super::raster_forward::{BASE_CHANNELS, Block, Cutoffs, TwinScene, blocks, channels_of, walk};
 use super::rasterizer::FrameBuffers;
-use crate::gpu::{Recorder, shaders};
+use crate::Result;
+use crate::gpu::{Buffer, Device, Recorder, shaders};
 
-/// Floats of one splat in the gradient buffer: six moments, RGB, z.
+/// Moments of one splat in the gradient buffer; RGB and z follow.
 pub const MOMENTS: usize = 6;
+/// Floats per splat in the gradient buffer: moments, RGB and z in whole vectors.
+pub(super) const GRADIENT_FLOATS: usize = 12;
 
-/// Records the way from `frame.planes_grad` to `frame.projected_grad` and `frame.codes_grad`, which it clears first.
-/// `features_move_geometry` = false keeps the features' part of the loss away from everything but the features.
-pub fn record(rec: &mut Recorder, frame: &FrameBuffers, features_move_geometry: bool) {
-    rec.fill(&frame.projected_grad, 0);
-    if frame.feature_dim > 0 {
-        rec.fill(&frame.codes_grad, 0);
+/// How the gradients that one splat gets from several tiles are added up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Summation {
+    /// Float atomics: no memory, but the order of the additions, and so the last digits, differ from run to run.
+    Atomics,
+    /// Every tile stores what it adds, and a second pass sums per splat: the same bits on every run, for 48 bytes per
+    /// entry and about a tenth more time per step (lavapipe, 100,000 splats).
+    Entries,
+}
+
+/// Gradients per entry of the tile lists; made when first needed, since rendering alone does not.
+#[derive(Default)]
+pub(super) struct GradientEntries(std::sync::Mutex<Option<EntryBuffers>>);
+
+#[derive(Clone)]
+struct EntryBuffers {
+    capacity: usize,
+    /// [capacity, 12] as `projected_grad`, and [capacity, code stride].
+    splats: Buffer,
+    codes: Buffer,
+}
+
+impl Summation {
+    /// The faster way, unless the device was opened to be deterministic.
+    pub fn of(device: &Device) -> Summation {
+        if device.info().deterministic { Summation::Entries } else { Summation::Atomics }
     }
+}
+
+impl GradientEntries {
+    fn buffers(&self, device: &Device, frame: &FrameBuffers) -> Result<EntryBuffers> {
+        let mut made = self.0.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let capacity = frame.lists.capacity;
+        if let Some(buffers) = made.as_ref().filter(|b| b.capacity == capacity) {
+            return Ok(buffers.clone());
+        }
+        let floats = |name, each: usize| device.buffer::<f32>(name, (capacity * each).max(4));
+        let buffers = EntryBuffers {
+            capacity,
+            splats: floats("gradient entries", GRADIENT_FLOATS)?,
+            codes: floats("code gradient entries", frame.code_stride() as usize)?,
+        };
+        *made = Some(buffers.clone());
+        Ok(buffers)
+    }
+}
+
+/// Records the way from `frame.planes_grad` to `frame.projected_grad` and `frame.codes_grad` (overwritten) of `count`
+/// splats. `features_move_geometry` = false keeps the features' part of the loss away from everything but the features.
+pub(super) fn record(rec: &mut Recorder, frame: &FrameBuffers, count: usize, features_move_geometry: bool) {
+    let coupling = if features_move_geometry { 1.0 } else { 0.0 };
+    match frame.summation {
+        Summation::Atomics => {
+            rec.fill(&frame.projected_grad, 0);
+            if frame.feature_dim > 0 {
+                rec.fill(&frame.codes_grad, 0);
+            }
+            for block in blocks(frame.feature_dim as u32) {
+                record_atomic(rec, frame, block, coupling);
+            }
+        }
+        Summation::Entries => match frame.gradient_entries.buffers(rec.device(), frame) {
+            Ok(entries) => {
+                for block in blocks(frame.feature_dim as u32) {
+                    record_entries(rec, frame, &entries, block, coupling);
+                }
+                record_sum(
+                    rec,
+                    frame,
+                    count,
+                    &entries.splats,
+                    &frame.projected_grad,
+                    GRADIENT_FLOATS as u32 / 4,
+                );
+                if frame.feature_dim > 0 {
+                    record_sum(rec, frame, count, &entries.codes, &frame.codes_grad, frame.code_stride() / 4);
+                }
+            }
+            Err(e) => rec.fail(e),
+        },
+    }
+}
+
+fn record_atomic(rec: &mut Recorder, frame: &FrameBuffers, block: Block, coupling: f32) {
     let tiles = frame.tiles();
-    for block in blocks(frame.feature_dim as u32) {
-        let call = shaders::raster_backward::call(
-            shaders::raster_backward::Variant { channels: block.channels },
-            &shaders::raster_backward::Bindings {
-                projected: &frame.projected,
-                tile_ranges: &frame.lists.ranges,
-                tile_splats: &frame.lists.splats,
-                codes: &frame.codes,
-                codes_grad: &frame.codes_grad,
-                planes: &frame.planes,
-                planes_grad: &frame.planes_grad,
-                transmittance: &frame.transmittance,
-                projected_grad: &frame.projected_grad,
-            },
-            &shaders::raster_backward::Push {
-                width: frame.width,
-                height: frame.height,
-                tiles_x: tiles[0],
-                code_vectors: frame.code_stride() / 4,
-                first_vector: block.first_vector,
-                first_plane: block.first_plane,
-                features: block.features,
-                alpha_plane: (BASE_CHANNELS + frame.feature_dim) as u32,
-                coupling: if features_move_geometry { 1.0 } else { 0.0 },
-            },
-        );
-        rec.dispatch(call, [tiles[0], tiles[1], 1]);
-    }
+    let call = shaders::raster_backward::call(
+        shaders::raster_backward::Variant { channels: block.channels },
+        &shaders::raster_backward::Bindings {
+            projected: &frame.projected,
+            tile_ranges: &frame.lists.ranges,
+            tile_splats: &frame.lists.splats,
+            codes: &frame.codes,
+            codes_grad: &frame.codes_grad,
+            planes: &frame.planes,
+            planes_grad: &frame.planes_grad,
+            transmittance: &frame.transmittance,
+            projected_grad: &frame.projected_grad,
+        },
+        &shaders::raster_backward::Push {
+            width: frame.width,
+            height: frame.height,
+            tiles_x: tiles[0],
+            code_vectors: frame.code_stride() / 4,
+            first_vector: block.first_vector,
+            first_plane: block.first_plane,
+            features: block.features,
+            alpha_plane: (BASE_CHANNELS + frame.feature_dim) as u32,
+            coupling,
+        },
+    );
+    rec.dispatch(call, [tiles[0], tiles[1], 1]);
+}
+
+fn record_entries(
+    rec: &mut Recorder,
+    frame: &FrameBuffers,
+    entries: &EntryBuffers,
+    block: Block,
+    coupling: f32,
+) {
+    let tiles = frame.tiles();
+    let call = shaders::raster_backward_entries::call(
+        shaders::raster_backward_entries::Variant { channels: block.channels },
+        &shaders::raster_backward_entries::Bindings {
+            projected: &frame.projected,
+            tile_ranges: &frame.lists.ranges,
+            tile_splats: &frame.lists.splats,
+            codes: &frame.codes,
+            code_entries: &entries.codes,
+            planes: &frame.planes,
+            planes_grad: &frame.planes_grad,
+            transmittance: &frame.transmittance,
+            splat_entries: &entries.splats,
+        },
+        &shaders::raster_backward_entries::Push {
+            width: frame.width,
+            height: frame.height,
+            tiles_x: tiles[0],
+            code_vectors: frame.code_stride() / 4,
+            first_vector: block.first_vector,
+            first_plane: block.first_plane,
+            features: block.features,
+            alpha_plane: (BASE_CHANNELS + frame.feature_dim) as u32,
+            coupling,
+        },
+    );
+    rec.dispatch(call, [tiles[0], tiles[1], 1]);
+}
+
+/// `to` [N, vectors] = the sums of `from` [entries, vectors] per splat, in vectors of four.
+fn record_sum(
+    rec: &mut Recorder,
+    frame: &FrameBuffers,
+    count: usize,
+    from: &Buffer,
+    to: &Buffer,
+    vectors: u32,
+) {
+    let call = shaders::gradient_sum::call(
+        &shaders::gradient_sum::Bindings {
+            depth_pairs: &frame.depth_pairs,
+            tile_counts: &frame.lists.counts,
+            starts: &frame.lists.starts,
+            entry_count: &frame.lists.entry_count,
+            entries: from,
+            sums: to,
+        },
+        &shaders::gradient_sum::Push { count: count as u32, vectors },
+    );
+    rec.dispatch(call, rows_of_groups(count * vectors as usize));
 }
 
 /// What flows back to one splat, in the layout of the GPU gradient buffer.

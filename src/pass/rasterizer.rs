@@ -31,6 +31,7 @@
 //! Recordings hold the buffers they were made with: record again after `grow`, after changing the number of splats,
 //! the SH degree or the options.
 use super::bin::{Grouping, TileLists};
+use super::raster_backward::{GradientEntries, Summation};
 use super::sort::Sort;
 use super::twin::FeatureMode;
 use super::view::{VIEW_FLOATS, View};
@@ -187,6 +188,9 @@ pub struct FrameBuffers {
     pub status: Buffer,
     pub(super) projected: Buffer,
     pub(super) projected_grad: Buffer,
+    pub(super) camera_parts: Buffer,
+    pub(super) summation: Summation,
+    pub(super) gradient_entries: GradientEntries,
     pub(super) codes: Buffer,
     pub(super) codes_grad: Buffer,
     pub(super) depth_pairs: Buffer,
@@ -201,6 +205,22 @@ impl FrameBuffers {
     /// Floats per splat in `codes`: d, rounded up to whole vectors.
     pub(super) fn code_stride(&self) -> u32 {
         (self.feature_dim as u32).next_multiple_of(4)
+    }
+}
+
+/// Choices among passes that lead to the same result.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Ways {
+    /// How tile lists are made.
+    pub grouping: Grouping,
+    /// How gradients of several tiles are added up.
+    pub summation: Summation,
+}
+
+impl Ways {
+    /// What suits the device.
+    pub fn of(device: &Device) -> Ways {
+        Ways { grouping: Grouping::of(device), summation: Summation::of(device) }
     }
 }
 
@@ -225,17 +245,17 @@ impl Rasterizer {
         width: u32,
         height: u32,
     ) -> Result<Rasterizer> {
-        Rasterizer::with_grouping(device, capacity, feature_dim, width, height, Grouping::of(device))
+        Rasterizer::with(device, capacity, feature_dim, width, height, Ways::of(device))
     }
 
-    /// [`Rasterizer::new`] with a way of making the tile lists that may not be the device's best: for tests, benchmarks.
-    pub fn with_grouping(
+    /// [`Rasterizer::new`] with ways that may not be the device's best: for tests and benchmarks.
+    pub fn with(
         device: &Device,
         capacity: usize,
         feature_dim: usize,
         width: u32,
         height: u32,
-        grouping: Grouping,
+        ways: Ways,
     ) -> Result<Rasterizer> {
         if width == 0 || height == 0 {
             return Err(Error::work("an image of zero size cannot be rendered"));
@@ -258,16 +278,28 @@ impl Rasterizer {
             camera_grad: device.buffer::<f32>("camera_grad", 10)?,
             status: device.buffer::<u32>("status", 2)?,
             projected: device.buffer::<f32>("projected", 12 * splats)?,
-            projected_grad: device.buffer::<f32>("projected_grad", 10 * splats)?,
+            projected_grad: device
+                .buffer::<f32>("projected_grad", raster_backward::GRADIENT_FLOATS * splats)?,
+            camera_parts: device.buffer::<f32>("camera_parts", 10 * project_backward::CAMERA_PARTS)?,
+            summation: ways.summation,
+            gradient_entries: GradientEntries::default(),
             codes: device.buffer::<f32>("codes", (stride * splats).max(4))?,
             codes_grad: device.buffer::<f32>("codes_grad", (stride * splats).max(4))?,
             depth_pairs: device.buffer::<[u32; 2]>("depth_pairs", splats)?,
-            lists: TileLists::new(device, grouping, splats, tiles, entries)?,
+            lists: TileLists::new(device, ways.grouping, splats, tiles, entries)?,
         };
         let camera = device.buffer::<f32>("camera", VIEW_FLOATS)?;
         let sort = Sort::new(device, splats)?;
         let count = device.buffer::<u32>("splat count", 1)?;
-        Ok(Rasterizer { device: device.clone(), capacity, camera, frame, grouping, sort, count })
+        Ok(Rasterizer {
+            device: device.clone(),
+            capacity,
+            camera,
+            frame,
+            grouping: ways.grouping,
+            sort,
+            count,
+        })
     }
 
     /// The output and gradient planes.
@@ -318,7 +350,7 @@ impl Rasterizer {
     ) {
         let sh_degree = options.sh_degree.min(params.sh_degree);
         rec.pass("raster backward");
-        raster_backward::record(rec, &self.frame, options.features_move_geometry);
+        raster_backward::record(rec, &self.frame, params.count, options.features_move_geometry);
         rec.pass("projection backward");
         let camera_grad = &self.frame.camera_grad;
         project_backward::record(rec, params, &self.camera, &self.frame, sh_degree, gradients, camera_grad);

@@ -10,7 +10,7 @@ use crate::Result;
 use crate::fit::{self, LanguageOptions, Preset, RgbOptions};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras};
-use crate::gpu::Device;
+use crate::gpu::{self, Device};
 use crate::infer::Registry;
 use crate::language::{self, BuildOptions};
 use crate::photo::{self, Photo};
@@ -81,6 +81,8 @@ pub struct RunPlan {
     pub per_level: bool,
     /// Vulkan device.
     pub device: Option<String>,
+    /// The same bits on every run: see [`crate::gpu::Options`].
+    pub deterministic: bool,
     /// Folder of the models.
     pub models: Option<PathBuf>,
 }
@@ -142,7 +144,10 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     let progress = &Recorded::new(progress);
     let workspace = Workspace::create(&plan.out, plan.force)?;
     let photos = photo::load_all(&plan.inputs, plan.views, progress)?;
-    let device = Device::open(plan.device.as_deref())?;
+    let device = Device::with(&gpu::Options {
+        deterministic: plan.deterministic,
+        ..gpu::Options::from_env(plan.device.as_deref())
+    })?;
     let registry = Registry::open(plan.models.as_deref())?;
     // Whatever can be refused is read before the long work, not after it.
     let init = match &plan.init {

@@ -2,7 +2,7 @@
 use crate::fit::{self, Preset, RgbOptions};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras, colmap, ply};
-use crate::gpu::Device;
+use crate::gpu::{self, Device};
 use crate::infer::Registry;
 use crate::photo::{self, Photo};
 use crate::pose::{self, Geometry, InitChoice};
@@ -35,6 +35,8 @@ pub struct TrainPlan {
     pub seed: u64,
     /// Vulkan device.
     pub device: Option<String>,
+    /// The same bits on every run: see [`crate::gpu::Options`].
+    pub deterministic: bool,
     /// Folder of the models.
     pub models: Option<PathBuf>,
 }
@@ -110,7 +112,10 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let known = cameras::read(&plan.cameras)?;
     let given = plan.points.as_deref().map(points).transpose()?;
     let photos = matched(plan, &known, progress)?;
-    let device = Device::open(plan.device.as_deref())?;
+    let device = Device::with(&gpu::Options {
+        deterministic: plan.deterministic,
+        ..gpu::Options::from_env(plan.device.as_deref())
+    })?;
     let registry = Registry::open(plan.models.as_deref())?;
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
     let geometry = match given {

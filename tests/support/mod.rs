@@ -3,7 +3,7 @@
 use splatvk::gpu::{Device, Recorder};
 use splatvk::pass::close::{Distance, Tolerance, compare};
 use splatvk::pass::raster_forward::Cutoffs;
-use splatvk::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
+use splatvk::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers, Ways};
 use splatvk::pass::seeded;
 use splatvk::pass::twin::{self, Forward, Gradients, Params};
 use splatvk::pass::view::View;
@@ -26,6 +26,7 @@ pub struct Rendered {
 }
 
 /// Gradients as the GPU computed them.
+#[derive(PartialEq, Debug)]
 pub struct GpuGradients {
     pub splats: Splats,
     pub features: Vec<f32>,
@@ -59,9 +60,13 @@ impl Scene {
     }
 
     pub fn upload(&self, device: &Device) -> (SplatBuffers, Rasterizer) {
+        self.upload_for(device, Ways::of(device))
+    }
+
+    fn upload_for(&self, device: &Device, ways: Ways) -> (SplatBuffers, Rasterizer) {
         let params = SplatBuffers::upload(device, &self.splats, &self.features, self.dim).unwrap();
         let [width, height] = self.view.size;
-        let raster = Rasterizer::new(device, self.splats.len(), self.dim, width, height).unwrap();
+        let raster = Rasterizer::with(device, self.splats.len(), self.dim, width, height, ways).unwrap();
         raster.set_view(&self.view).unwrap();
         (params, raster)
     }
@@ -79,7 +84,11 @@ impl Scene {
     }
 
     pub fn gradients(&self, device: &Device, upstream: &[f32]) -> GpuGradients {
-        let (params, mut raster) = self.upload(device);
+        self.gradients_by(device, Ways::of(device), upstream)
+    }
+
+    pub fn gradients_by(&self, device: &Device, ways: Ways, upstream: &[f32]) -> GpuGradients {
+        let (params, mut raster) = self.upload_for(device, ways);
         raster.forward(&params, &self.options).unwrap();
         raster.frame().planes_grad.write(upstream).unwrap();
         let gradients = params.zeros_like(device).unwrap();

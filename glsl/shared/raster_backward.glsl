@@ -1,0 +1,203 @@
+// Gradients by the screen-space splats: T is recomputed front to back, six moments of σ and the channel sums are
+// reduced over the tile by butterflies so that lane i keeps splat i. Blocks of channels add up, since the gradient by
+// alpha is linear in the channels. Equations and twin: pass::raster_backward.
+//
+// BY_ENTRY 0: one atomic addition per value, tile and splat. 1: stored per entry for gradient_sum.comp, same bits every run.
+layout(local_size_x = SUBGROUP_SIZE) in;
+
+layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };      // [N, 3], see project.comp
+layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; };   // [tiles + 1]
+layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; };  // [capacity] (splat, entry)
+#if CHANNELS != 4
+layout(std430, binding = 3) readonly buffer Codes { vec4 codes[]; };              // [N, code_vectors]
+#if BY_ENTRY
+layout(std430, binding = 4) writeonly buffer CodeEntries { vec4 code_entries[]; }; // [entries, code_vectors]
+#else
+layout(std430, binding = 4) buffer CodesGrad { ATOMIC_FLOAT codes_grad[]; };      // [N, 4 * code_vectors], added to
+#endif
+#endif
+layout(std430, binding = 5) readonly buffer Planes { float planes[]; };           // [4 + d, H, W]
+layout(std430, binding = 6) readonly buffer PlanesGrad { float planes_grad[]; };  // [4 + d + 1, H, W], alpha last
+#if CHANNELS != 16
+layout(std430, binding = 7) readonly buffer Transmittance { float transmittances[]; }; // [H, W]
+#endif
+#if BY_ENTRY
+layout(std430, binding = 8) buffer SplatEntries { vec4 splat_entries[]; };            // [entries, 3] as projected_grad
+#else
+layout(std430, binding = 8) buffer ProjectedGrad { ATOMIC_FLOAT projected_grad[]; };  // [N, 12], added to
+#endif
+// As in raster_forward.comp; coupling 0 keeps the features' part of the loss from moving the geometry, 1 lets it.
+layout(push_constant) uniform Push {
+    uint width; uint height; uint tiles_x; uint code_vectors; uint first_vector; uint first_plane; uint features;
+    uint alpha_plane; float coupling;
+};
+
+#include "shared/raster.glsl"
+#define VALUES (6 + CHANNELS)
+#define HALF (SUBGROUP_SIZE / 2)
+
+float T[PIXELS], behind[PIXELS], upstream[CHANNELS * PIXELS];
+float part[VALUES];
+
+void evaluate(uint i, vec2 origin) {
+    float dx0 = subgroupShuffle(own_u, i) - origin.x, dy0 = subgroupShuffle(own_v, i) - origin.y;
+    float a = subgroupShuffle(own_a, i), b = subgroupShuffle(own_b, i), c = subgroupShuffle(own_c, i);
+    float log2_opacity = subgroupShuffle(own_log2_opacity, i);
+    // ratio = α / (1 − α), 0 where no gradient may reach the geometry
+    float weight[PIXELS], ratio[PIXELS], own[PIXELS];
+    [[unroll]] for (int n = 0; n < COLUMNS; n++) {
+        float dx = dx0 - float(n * LANES_X);
+        float ax = fma(a * dx, dx, log2_opacity), bx = b * dx;
+        [[unroll]] for (int m = 0; m < ROWS; m++) {
+            const int k = n * ROWS + m;
+            float dy = dy0 - float(m * LANES_Y);
+            float raw = exp2(fma(fma(c, dy, bx), dy, ax));
+            // The comparison of raster_forward.comp, on the power: it must decide alike.
+            float alpha = fma(fma(c, dy, bx), dy, ax) >= LOG2_ALPHA_MIN ? min(ALPHA_MAX, raw) : 0.0;
+            float w = alpha * T[k], next = T[k] - w;
+            bool stop = next < TRANSMITTANCE_MIN;
+            weight[k] = stop ? 0.0 : w;
+            ratio[k] = stop || raw > ALPHA_MAX ? 0.0 : alpha / (1.0 - alpha);
+            T[k] = stop ? -abs(T[k]) : next;
+            own[k] = 0.0;
+        }
+    }
+    [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {
+        float value = subgroupShuffle(own_value[channel], i);
+        float felt = channel < CHANNELS - FEATURES ? value : value * coupling;
+        float sum = 0.0;
+        [[unroll]] for (int k = 0; k < PIXELS; k++) {
+            own[k] = fma(felt, upstream[channel * PIXELS + k], own[k]);
+            sum = fma(weight[k], upstream[channel * PIXELS + k], sum);
+        }
+        part[6 + channel] = sum;
+    }
+    [[unroll]] for (int k = 0; k < 6; k++) part[k] = 0.0;
+    [[unroll]] for (int n = 0; n < COLUMNS; n++) {
+        float dx = dx0 - float(n * LANES_X);
+        float m0 = 0.0, m1 = 0.0, m2 = 0.0;
+        [[unroll]] for (int m = 0; m < ROWS; m++) {
+            const int k = n * ROWS + m;
+            float dy = dy0 - float(m * LANES_Y);
+            behind[k] = fma(-weight[k], own[k], behind[k]);
+            float sigma = ratio[k] * (T[k] * own[k] - behind[k]);
+            float sigma_y = sigma * dy;
+            m0 += sigma;
+            m1 += sigma_y;
+            m2 = fma(sigma_y, dy, m2);
+        }
+        part[0] += m0;
+        part[1] = fma(m0, dx, part[1]);
+        part[2] += m1;
+        part[3] = fma(m0 * dx, dx, part[3]);
+        part[4] = fma(m1, dx, part[4]);
+        part[5] += m2;
+    }
+}
+
+// Where the sums of one (splat, entry) go.
+void store_gradients(uvec2 item, float sums[VALUES]) {
+#if BY_ENTRY
+#if BASE
+    splat_entries[3 * item.y] = vec4(sums[0], sums[1], sums[2], sums[3]);
+    splat_entries[3 * item.y + 1] = vec4(sums[4], sums[5], sums[6], sums[7]);
+    splat_entries[3 * item.y + 2] = vec4(sums[8], sums[9], 0.0, 0.0);
+#else
+    splat_entries[3 * item.y] += vec4(sums[0], sums[1], sums[2], sums[3]);
+    splat_entries[3 * item.y + 1] += vec4(sums[4], sums[5], 0.0, 0.0);
+#endif
+#if FEATURES > 0
+    [[unroll]] for (int k = 0; k < FEATURE_VECTORS; k++) {
+        vec4 f = vec4(0.0);
+        [[unroll]] for (int n = 0; n < 4; n++)
+            if (4 * k + n < FEATURES) f[n] = sums[VALUES - FEATURES + 4 * k + n];
+        if (uint(k) + first_vector < code_vectors) code_entries[item.y * code_vectors + first_vector + k] = f;
+    }
+#endif
+#else
+    [[unroll]] for (int n = 0; n < VALUES - FEATURES; n++) ATOMIC_ADD(projected_grad[12 * item.x + n], sums[n]);
+#if FEATURES > 0
+    [[unroll]] for (int n = 0; n < FEATURES; n++) {
+        float sum = n < features ? sums[VALUES - FEATURES + n] : 0.0;
+        ATOMIC_ADD(codes_grad[4 * (item.x * code_vectors + first_vector) + min(n, features - 1)], sum);
+    }
+#endif
+#endif
+}
+
+void main() {
+    uint lane = gl_SubgroupInvocationID;
+    uint tile = gl_WorkGroupID.y * tiles_x + gl_WorkGroupID.x;
+    uvec2 corner = gl_WorkGroupID.xy * 8 + uvec2(lane % LANES_X, lane / LANES_X);
+    vec2 origin = vec2(corner);
+    uint first = tile_ranges[tile], last = tile_ranges[tile + 1], pixels = width * height;
+
+    [[unroll]] for (int k = 0; k < PIXELS; k++) {
+        uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
+        bool inside = x < width && y < height;
+        uint pixel = inside ? y * width + x : 0;
+        T[k] = inside ? 1.0 : -1.0;
+        behind[k] = 0.0;
+        [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {
+            bool used = inside && (channel < CHANNELS - FEATURES || channel - (CHANNELS - FEATURES) < features);
+            uint at = (first_plane + channel) * pixels + pixel;
+            float g = used ? planes_grad[used ? at : 0] : 0.0;
+            upstream[channel * PIXELS + k] = g;
+            float felt = channel < CHANNELS - FEATURES ? g : g * coupling;
+            behind[k] = fma(felt, planes[used ? at : 0], behind[k]);
+        }
+#if BASE
+        if (inside) behind[k] -= planes_grad[alpha_plane * pixels + pixel] * transmittances[pixel];
+#endif
+    }
+
+    uint j = first;
+    while (j < last) {
+        uvec2 item = tile_splats[min(j + lane, last - 1)];
+        load_splat(item.x, j + lane < last);
+        uint batch = min(uint(SUBGROUP_SIZE), last - j);
+        // Both halves of the subgroup keep their own half sum of splat i; one exchange after the loop completes
+        // them. That saves a shuffle per value and splat.
+        float low[VALUES], high[VALUES];
+        [[unroll]] for (int n = 0; n < VALUES; n++) low[n] = high[n] = 0.0;
+        for (uint i = 0; i < batch; i++) {
+            evaluate(i, origin);
+            bool mine = (lane & (HALF - 1)) == (i & (HALF - 1));
+            bool keep_low = mine && i < HALF, keep_high = mine && i >= HALF;
+            [[unroll]] for (int n = 0; n < VALUES; n++) {
+                float sum = part[n];
+                sum += subgroupShuffleXor(sum, 1);
+#if HALF > 2
+                sum += subgroupShuffleXor(sum, 2);
+#endif
+#if HALF > 4
+                sum += subgroupShuffleXor(sum, 4);
+#endif
+#if HALF > 8
+                sum += subgroupShuffleXor(sum, 8);
+#endif
+#if HALF > 16
+                sum += subgroupShuffleXor(sum, 16);
+#endif
+                low[n] = keep_low ? sum : low[n];
+                high[n] = keep_high ? sum : high[n];
+            }
+        }
+        bool in_low = lane < HALF;
+        [[unroll]] for (int n = 0; n < VALUES; n++) {
+            float own = in_low ? low[n] : high[n];
+            high[n] = subgroupShuffleXor(in_low ? high[n] : low[n], HALF);
+            low[n] = own;
+        }
+        [[unroll]] for (int n = 0; n < VALUES; n++) low[n] += high[n];
+        if (j + lane < last) store_gradients(item, low);
+        j += SUBGROUP_SIZE;
+        if (all_stopped(T)) break;
+    }
+#if BY_ENTRY
+    // Behind the last splat that any pixel sees.
+    float zeros[VALUES];
+    [[unroll]] for (int n = 0; n < VALUES; n++) zeros[n] = 0.0;
+    for (j += lane; j < last; j += SUBGROUP_SIZE) store_gradients(tile_splats[j], zeros);
+#endif
+}
