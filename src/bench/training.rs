@@ -10,6 +10,7 @@ use crate::fit::scale::SceneScale;
 use crate::fit::schedule::Exponential;
 use crate::fit::{LanguageOptions, LanguageRun, Preset, RgbOptions, RgbRun, Steps};
 use crate::gpu::{Device, Recorder};
+use crate::pass::renderer::Renderer;
 use crate::pass::{pairs, seeded};
 use crate::scene::{Codebook, LevelField, Plane, RgbImage};
 
@@ -49,6 +50,9 @@ pub fn colour(device: &Device, workload: &Workload, limits: (&Budget, &Roofline)
     let mut run = RgbRun::new(device, &target, &cameras, &workload.splats, scale, None, &options)?;
     let mut section = Section::new(COLOUR, workload.describe(0));
     measure(device, &mut run, limits, &mut section)?;
+    let mut renderer = Renderer::new(device, &workload.splats, &[], 0)?;
+    let render = limits.0.wall(|| renderer.render(&workload.camera).map(drop))?;
+    section.time("render to the host", Clock::Wall, render);
     Ok(section)
 }
 

@@ -1,5 +1,5 @@
 //! What is measured: splats and a camera.
-use crate::format::{cameras, create_folder, ply, scene_dir, write_json};
+use crate::format::{cameras, create_folder, picture, ply, scene_dir, write_json};
 use crate::gpu::Device;
 use crate::pass::{renderer::Renderer, seeded};
 use crate::scene::{Camera, Pose, RgbImage, Splats};
@@ -61,17 +61,23 @@ impl Workload {
         )
     }
 
+    /// The scene from its camera, on black.
+    pub fn render(&self, device: &Device) -> Result<RgbImage> {
+        Ok(Renderer::new(device, &self.splats, &[], 0)?.render(&self.camera)?.rgb)
+    }
+
     /// The photo to fit: the scene's own render, paler, so that there is a gradient everywhere but nothing unlike it.
     pub fn target(&self, device: &Device) -> Result<RgbImage> {
-        let mut image = Renderer::new(device, &self.splats, &[], 0)?.render(&self.camera)?.rgb;
+        let mut image = self.render(device)?;
         image.data.iter_mut().flatten().for_each(|v| *v = pale(*v));
         Ok(image)
     }
 
-    /// Writes `scene.ply` (INRIA fields) and `scene.json` (pinhole camera, world → camera rows) for other programs.
-    pub fn write(&self, folder: &Path) -> Result<[PathBuf; 2]> {
+    /// For other programs: `scene.ply` (INRIA fields), `scene.json` (pinhole camera, world → camera rows) and
+    /// `render.npy` ([H, W, 3] f32, on black), what they should see.
+    pub fn write(&self, device: &Device, folder: &Path) -> Result<[PathBuf; 3]> {
         create_folder(folder).map_err(|e| Error::input(format!("{e}; choose another --write-scene")))?;
-        let files = ["scene.ply", "scene.json"].map(|name| folder.join(name));
+        let files = ["scene.ply", "scene.json", "render.npy"].map(|name| folder.join(name));
         ply::write_splats(&files[0], &self.splats, ply::PlyOptions::default())?;
         let (c, r) = (&self.camera, &self.camera.pose.rotation);
         let row = |i: usize| [r.row(i).x, r.row(i).y, r.row(i).z, c.pose.translation[i]];
@@ -82,6 +88,8 @@ impl Workload {
             "convention": "OpenCV, world to camera",
         });
         write_json(&files[1], &camera)?;
+        let image = self.render(device)?;
+        picture::write_npy(&files[2], (image.width, image.height), Some(3), image.data.as_flattened())?;
         Ok(files)
     }
 }
@@ -161,7 +169,11 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut w = Workload::seeded(50, 64, 48, 1, 3).unwrap();
         w.camera.pose = Pose::exp(DVec3::new(0.1, 0.2, -0.3), DVec3::new(0.3, -0.2, 0.1));
-        let [scene, camera] = w.write(folder.path()).unwrap();
+        let device = crate::gpu::test_device();
+        let [scene, camera, render] = w.write(&device, folder.path()).unwrap();
+        let seen = crate::format::npy::read(&render).unwrap();
+        assert_eq!(seen.shape, [48, 64, 3]);
+        assert_eq!(seen.to_f32(), w.render(&device).unwrap().data.as_flattened());
         let beside = Workload::load(&scene, None, Some(1)).unwrap();
         let given = Workload::load(&scene, Some(&camera), Some(1)).unwrap();
         assert_eq!(beside, given);

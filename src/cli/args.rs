@@ -366,7 +366,7 @@ pub struct BenchArgs {
     /// Measure nothing: print the ratios B / A of two files of --json
     #[arg(long, num_args = 2, value_names = ["A", "B"], conflicts_with_all = ["scene", "json", "write_scene"])]
     pub compare: Option<Vec<PathBuf>>,
-    /// Measure nothing: write scene.ply and scene.json of the workload for other programs
+    /// Measure nothing: write scene.ply, scene.json and render.npy of the workload for other programs
     #[arg(long, value_name = "DIR", conflicts_with = "json")]
     pub write_scene: Option<PathBuf>,
     /// Vulkan device: part of its name, or its number in `splatvk doctor`

@@ -14,7 +14,8 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     }
     let budget = check(args)?;
     if let Some(folder) = &args.write_scene {
-        let files = workload(args)?.write(folder)?;
+        let workload = workload(args)?;
+        let files = workload.write(&Device::open(args.device.as_deref())?, folder)?;
         return print(&files.map(|f| format!("{}\n", f.display())).concat());
     }
     let has = |part| args.parts.contains(&part);
