@@ -1,5 +1,6 @@
 //! How long work tells its caller where it is, and learns that it should stop.
 use crate::{Error, Result};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
@@ -21,6 +22,11 @@ pub trait Progress: Send + Sync {
     fn check(&self) -> Result<()> {
         if self.cancelled() { Err(Error::Cancelled) } else { Ok(()) }
     }
+    /// Where work that goes on beside this one reports: its stages and this one's do not end each other. Hosts that
+    /// show one stage at a time keep this default and see nothing of the other.
+    fn beside(&self) -> Box<dyn Progress + '_> {
+        Box::new(Silent)
+    }
 }
 
 /// Ignores everything.
@@ -36,77 +42,131 @@ impl Progress for Silent {
 /// What one stage took.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct StageRecord {
-    /// Stage name; a stage that ran several times is one record.
+    /// Stage name.
     pub name: String,
+    /// When it began, wall seconds since the run did. Stages overlap where they can.
+    pub start: f64,
     /// Wall seconds.
     pub seconds: f64,
     /// Peak resident memory of the process up to the end of the stage, bytes; 0 where the system does not tell.
     pub peak_memory: u64,
 }
 
-#[derive(Default)]
-struct Log {
-    current: Option<(&'static str, Instant)>,
-    stages: Vec<StageRecord>,
-    warnings: Vec<String>,
-}
-
-/// Passes everything on and keeps what run.json reports: seconds and memory per stage, and the warnings.
+/// Passes everything on and keeps what run.json reports: times and memory per stage, and the warnings.
 pub struct Recorded<'a> {
     inner: &'a dyn Progress,
-    log: Mutex<Log>,
+    began: Instant,
+    stopped: AtomicBool,
+    stages: Mutex<Vec<StageRecord>>,
+    warnings: Mutex<Vec<String>>,
+    lane: Current,
+}
+
+/// The stage that one lane of work is in.
+#[derive(Default)]
+struct Current(Mutex<Option<(&'static str, Instant)>>);
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // A panic while holding the lock leaves plain data behind, which stays usable.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl<'a> Recorded<'a> {
-    /// Records on the way to `inner`.
+    /// Records on the way to `inner`; the run begins now.
     pub fn new(inner: &'a dyn Progress) -> Self {
-        Recorded { inner, log: Mutex::default() }
+        Recorded {
+            inner,
+            began: Instant::now(),
+            stopped: AtomicBool::new(false),
+            stages: Mutex::default(),
+            warnings: Mutex::default(),
+            lane: Current::default(),
+        }
     }
-    /// Finished stages, in the order in which they first ended.
+    /// Finished stages, in the order in which they began.
     pub fn stages(&self) -> Vec<StageRecord> {
-        self.lock().stages.clone()
+        let mut stages = lock(&self.stages).clone();
+        stages.sort_by(|a, b| a.start.total_cmp(&b.start));
+        stages
+    }
+    /// Wall seconds since the run began.
+    pub fn seconds(&self) -> f64 {
+        self.began.elapsed().as_secs_f64()
     }
     /// Warnings so far.
     pub fn warnings(&self) -> Vec<String> {
-        self.lock().warnings.clone()
+        lock(&self.warnings).clone()
     }
-    fn lock(&self) -> MutexGuard<'_, Log> {
-        // A panic while holding the lock leaves plain data behind, which stays usable.
-        self.log.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Makes all work that reports here stop, because a part of it has failed.
+    pub fn stop(&self) {
+        self.stopped.store(true, Ordering::SeqCst);
     }
-    fn close(&self) {
-        let mut log = self.lock();
-        let Some((name, start)) = log.current.take() else { return };
-        let (seconds, peak_memory) = (start.elapsed().as_secs_f64(), peak_memory());
-        match log.stages.iter_mut().find(|s| s.name == name) {
-            Some(stage) => {
-                stage.seconds += seconds;
-                stage.peak_memory = peak_memory;
-            }
-            None => log.stages.push(StageRecord { name: name.to_owned(), seconds, peak_memory }),
-        }
+    fn open(&self, lane: &Current, stage: &'static str) {
+        self.close(lane);
+        *lock(&lane.0) = Some((stage, Instant::now()));
+    }
+    fn close(&self, lane: &Current) {
+        let Some((name, start)) = lock(&lane.0).take() else { return };
+        lock(&self.stages).push(StageRecord {
+            name: name.to_owned(),
+            start: start.duration_since(self.began).as_secs_f64(),
+            seconds: start.elapsed().as_secs_f64(),
+            peak_memory: peak_memory(),
+        });
     }
 }
 
 impl Progress for Recorded<'_> {
     fn begin(&self, stage: &'static str, steps: u64) {
-        self.close();
-        self.lock().current = Some((stage, Instant::now()));
+        self.open(&self.lane, stage);
         self.inner.begin(stage, steps);
     }
     fn step(&self, done: u64, note: &str) {
         self.inner.step(done, note);
     }
     fn end(&self) {
-        self.close();
+        self.close(&self.lane);
         self.inner.end();
     }
     fn warn(&self, message: &str) {
-        self.lock().warnings.push(message.to_owned());
+        lock(&self.warnings).push(message.to_owned());
         self.inner.warn(message);
     }
     fn cancelled(&self) -> bool {
-        self.inner.cancelled()
+        self.stopped.load(Ordering::SeqCst) || self.inner.cancelled()
+    }
+    fn beside(&self) -> Box<dyn Progress + '_> {
+        Box::new(Beside { owner: self, inner: self.inner.beside(), lane: Current::default() })
+    }
+}
+
+/// A further lane of a [`Recorded`].
+struct Beside<'a> {
+    owner: &'a Recorded<'a>,
+    inner: Box<dyn Progress + 'a>,
+    lane: Current,
+}
+
+impl Progress for Beside<'_> {
+    fn begin(&self, stage: &'static str, steps: u64) {
+        self.owner.open(&self.lane, stage);
+        self.inner.begin(stage, steps);
+    }
+    fn step(&self, done: u64, note: &str) {
+        self.inner.step(done, note);
+    }
+    fn end(&self) {
+        self.owner.close(&self.lane);
+        self.inner.end();
+    }
+    fn warn(&self, message: &str) {
+        self.owner.warn(message);
+    }
+    fn cancelled(&self) -> bool {
+        self.owner.cancelled()
+    }
+    fn beside(&self) -> Box<dyn Progress + '_> {
+        self.owner.beside()
     }
 }
 
@@ -123,23 +183,45 @@ mod tests {
     use super::*;
 
     #[test]
-    fn stages_add_up_and_warnings_are_kept() {
+    fn stages_are_recorded_in_order_and_warnings_are_kept() {
         let recorded = Recorded::new(&Silent);
-        for _ in 0..2 {
-            recorded.begin("train", 10);
-            recorded.step(5, "PSNR 20.0");
-            recorded.end();
-        }
+        recorded.begin("train", 10);
+        recorded.step(5, "PSNR 20.0");
+        recorded.end();
         recorded.begin("align", 1);
         recorded.warn("few matches");
         recorded.begin("write", 1);
         recorded.end();
-        let names: Vec<_> = recorded.stages().into_iter().map(|s| s.name).collect();
+        let stages = recorded.stages();
+        let names: Vec<_> = stages.iter().map(|s| s.name.as_str()).collect();
         assert_eq!(names, ["train", "align", "write"]);
         assert_eq!(recorded.warnings(), ["few matches"]);
-        assert!(recorded.stages().iter().all(|s| s.seconds >= 0.0));
-        if cfg!(target_os = "linux") {
-            assert!(recorded.stages()[0].peak_memory > 1 << 20);
+        for pair in stages.windows(2) {
+            assert!(pair[0].start + pair[0].seconds <= pair[1].start, "one after the other");
         }
+        if cfg!(target_os = "linux") {
+            assert!(stages[0].peak_memory > 1 << 20);
+        }
+    }
+
+    #[test]
+    fn work_beside_overlaps_and_a_failure_of_one_stops_both() {
+        let recorded = Recorded::new(&Silent);
+        let beside = recorded.beside();
+        recorded.begin("splats", 1);
+        beside.begin("masks", 1);
+        recorded.end();
+        recorded.begin("language", 1);
+        beside.warn("no masks");
+        beside.end();
+        recorded.end();
+        let stages = recorded.stages();
+        let names: Vec<_> = stages.iter().map(|s| s.name.as_str()).collect();
+        assert_eq!(names, ["splats", "masks", "language"]);
+        assert!(stages[1].start + stages[1].seconds >= stages[2].start, "masks end after language begins");
+        assert_eq!(recorded.warnings(), ["no masks"]);
+        assert!(beside.check().is_ok());
+        recorded.stop();
+        assert!(beside.check().is_err() && recorded.check().is_err());
     }
 }

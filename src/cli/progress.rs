@@ -1,6 +1,6 @@
 //! Progress on standard error: a bar per stage with the time left on a terminal, one line per stage elsewhere.
 use crate::progress::Progress;
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use std::io::IsTerminal;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -27,18 +27,27 @@ type Stage = (&'static str, Instant, ProgressBar);
 
 /// The command line's [`Progress`].
 pub struct Terminal {
-    bars: bool,
+    /// All bars, below each other; `None` where standard error is no terminal.
+    bars: Option<MultiProgress>,
     current: Mutex<Option<Stage>>,
 }
 
 impl Terminal {
     /// Bars when standard error is a terminal, lines otherwise.
     pub fn new() -> Self {
-        Terminal { bars: std::io::stderr().is_terminal(), current: Mutex::default() }
+        let bars = std::io::stderr().is_terminal().then(MultiProgress::new);
+        Terminal { bars, current: Mutex::default() }
     }
     fn lock(&self) -> std::sync::MutexGuard<'_, Option<Stage>> {
         // A panic while holding the lock leaves plain data behind, which stays usable.
         self.current.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
+    }
+    /// Prints a line above the bars.
+    fn print(&self, line: &str) {
+        match &self.bars {
+            Some(bars) => bars.suspend(|| eprintln!("{line}")),
+            None => eprintln!("{line}"),
+        }
     }
 }
 
@@ -51,7 +60,10 @@ impl Default for Terminal {
 impl Progress for Terminal {
     fn begin(&self, stage: &'static str, steps: u64) {
         self.end();
-        let bar = if self.bars { ProgressBar::new(steps) } else { ProgressBar::hidden() };
+        let bar = match &self.bars {
+            Some(bars) => bars.add(ProgressBar::new(steps)),
+            None => ProgressBar::hidden(),
+        };
         if let Ok(style) =
             ProgressStyle::with_template("{msg:>12} {wide_bar} {pos}/{len} {prefix} {eta} left")
         {
@@ -71,15 +83,15 @@ impl Progress for Terminal {
         let Some((name, start, bar)) = self.lock().take() else { return };
         let note = bar.prefix();
         bar.finish_and_clear();
-        eprintln!("{name:>12}  {:6.1} s  {note}", start.elapsed().as_secs_f64());
+        self.print(&format!("{name:>12}  {:6.1} s  {note}", start.elapsed().as_secs_f64()));
     }
     fn warn(&self, message: &str) {
-        match self.lock().as_ref() {
-            Some((_, _, bar)) => bar.suspend(|| eprintln!("warning: {message}")),
-            None => eprintln!("warning: {message}"),
-        }
+        self.print(&format!("warning: {message}"));
     }
     fn cancelled(&self) -> bool {
         STOPPED.load(Ordering::SeqCst)
+    }
+    fn beside(&self) -> Box<dyn Progress + '_> {
+        Box::new(Terminal { bars: self.bars.clone(), current: Mutex::default() })
     }
 }

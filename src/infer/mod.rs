@@ -18,7 +18,7 @@ use crate::scene::{Plane, RgbImage};
 
 /// Puts image regions and texts into one space of unit vectors, so that a cosine says how well a phrase names a
 /// region. Implemented by `words` (the built-in default) and by user-supplied CLIP-like pairs of towers.
-pub trait RegionEncoder {
+pub trait RegionEncoder: Send {
     /// Name of the space; features and texts may be compared only when this agrees.
     fn space(&self) -> &str;
     /// D, the length of every embedding.

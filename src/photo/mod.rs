@@ -11,8 +11,10 @@ pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
 use crate::progress::Progress;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
+use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Greatest height of the working image, pixels (ALGORITHMS 1.2).
 pub const WORKING_HEIGHT: usize = 1080;
@@ -94,12 +96,16 @@ pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progres
         ));
     }
     progress.begin("photos", paths.len() as u64);
-    let mut photos = Vec::with_capacity(paths.len());
-    for (i, path) in paths.iter().enumerate() {
+    let done = AtomicU64::new(0);
+    let one = |path: &PathBuf| {
         progress.check()?;
-        photos.push(load(path)?);
-        progress.step(i as u64 + 1, "");
-    }
+        let photo = load(path)?;
+        progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
+        Ok(photo)
+    };
+    // Collected before errors are looked at: the first in the order of the photos is reported, whichever came first.
+    let all: Vec<Result<Photo>> = paths.par_iter().map(one).collect();
+    let photos = all.into_iter().collect::<Result<Vec<_>>>()?;
     progress.end();
     refuse_twins(&photos)?;
     Ok(photos)

@@ -129,17 +129,18 @@ fn query_row(report: &Report, q: &QueryShown) -> Result<String> {
 
 fn run_tables(report: &Report) -> String {
     let run = report.run;
-    let mut out =
-        String::from("<section><h2>Time and memory</h2><table><tr><th>stage<th>time<th>peak memory</tr>");
-    let longest = run.stages.iter().map(|s| s.seconds).fold(1e-9, f64::max);
+    let mut out = String::from(
+        "<section><h2>Time and memory</h2><table class=\"time\"><tr><th>stage<th>time; bars show when<th>peak memory</tr>",
+    );
+    let percent = |seconds: f64| seconds / run.seconds.max(1e-9) * 100.0;
     for s in &run.stages {
         let memory =
             if s.peak_memory > 0 { format!("{:.2} GB", s.peak_memory as f64 / 1e9) } else { "–".into() };
-        let share = s.seconds / longest * 100.0;
+        let (from, share) = (percent(s.start), percent(s.seconds));
         // Writing to a String cannot fail.
         let _ = write!(
             out,
-            "<tr><td>{}<td>{}<i style=\"width:{share:.1}%\"></i><td>{memory}</tr>",
+            "<tr><td>{}<td>{}<i style=\"margin-left:{from:.1}%;width:{share:.1}%\"></i><td>{memory}</tr>",
             escape(&s.name),
             duration(s.seconds)
         );
@@ -195,7 +196,12 @@ mod tests {
             device: "<device>".into(),
             device_is_cpu: true,
             models: vec![],
-            stages: vec![StageRecord { name: "train".into(), seconds: 3.0, peak_memory: 1 << 30 }],
+            stages: vec![StageRecord {
+                name: "train".into(),
+                start: 0.5,
+                seconds: 3.0,
+                peak_memory: 1 << 30,
+            }],
             seconds: 3.5,
             statistics: serde_json::json!({"psnr": 31.5}),
             warnings: vec!["a < b".into()],

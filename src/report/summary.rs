@@ -13,17 +13,21 @@ pub fn duration(seconds: f64) -> String {
     }
 }
 
-/// Seconds per stage with a bar, then (label, value) figures.
-pub fn table(stages: &[StageRecord], figures: &[(String, String)]) -> String {
+/// Width of the time line, characters.
+const LINE: f64 = 30.0;
+
+/// Seconds per stage with a bar on a common time line, then (label, value) figures.
+pub fn table(stages: &[StageRecord], total: f64, figures: &[(String, String)]) -> String {
     let mut out = String::new();
-    let total: f64 = stages.iter().map(|s| s.seconds).sum();
-    let longest = stages.iter().map(|s| s.seconds).fold(1e-9, f64::max);
+    let column = |seconds: f64| (seconds / total.max(1e-9) * LINE).round() as usize;
     let wide =
         stages.iter().map(|s| s.name.chars().count()).chain(figures.iter().map(|f| f.0.chars().count()));
     let wide = wide.max().unwrap_or(0).max("total".len());
     // Writing to a String cannot fail.
     for s in stages {
-        let bar = "█".repeat((s.seconds / longest * 24.0).round() as usize);
+        let (from, to) = (column(s.start), column(s.start + s.seconds));
+        let bar = " ".repeat(from) + &"█".repeat(to - from);
+        let bar = bar.trim_end();
         let _ = writeln!(out, "  {:<wide$}  {:>12}  {bar}", s.name, duration(s.seconds));
     }
     if !stages.is_empty() {
@@ -56,8 +60,18 @@ mod tests {
 
     #[test]
     fn the_table_adds_up() {
-        let stage = |name: &str, seconds| StageRecord { name: name.into(), seconds, peak_memory: 0 };
-        let t = table(&[stage("photos", 1.0), stage("train", 120.0)], &[("splats".into(), "12,345".into())]);
-        assert!(t.contains("2 min 01 s") && t.contains("12,345") && t.lines().count() == 4, "{t}");
+        let stage =
+            |name: &str, start, seconds| StageRecord { name: name.into(), start, seconds, peak_memory: 0 };
+        let stages = [stage("photos", 0.0, 60.0), stage("train", 60.0, 60.0), stage("masks", 30.0, 30.0)];
+        let t = table(&stages, 121.0, &[("splats".into(), "12,345".into())]);
+        assert!(t.contains("2 min 01 s") && t.contains("12,345") && t.lines().count() == 5, "{t}");
+        let bar = |line: usize| {
+            let line: Vec<char> = t.lines().nth(line).unwrap_or("").chars().collect();
+            let first = line.iter().position(|c| *c == '█').unwrap();
+            (first, line.iter().filter(|c| **c == '█').count())
+        };
+        // Photos fill the first half, training the second, masks the second quarter.
+        assert_eq!((bar(0).1, bar(1).1, bar(2).1), (15, 15, 8));
+        assert_eq!((bar(1).0 - bar(0).0, bar(2).0 - bar(0).0), (15, 7));
     }
 }

@@ -1,4 +1,5 @@
 //! The whole pipeline on one page: photos → cameras, depth and points → splats → language → scene directory.
+mod describe;
 mod record;
 pub mod sources;
 pub mod train;
@@ -6,19 +7,21 @@ pub mod view;
 
 pub use record::{closing_table, run_record};
 
-use crate::Result;
 use crate::fit::{self, LanguageOptions, Preset, RgbOptions};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras};
 use crate::gpu::{self, Device};
 use crate::infer::Registry;
-use crate::language::{self, BuildOptions};
+use crate::language;
 use crate::photo::{self, Photo};
 use crate::pose::{self, Geometry, InitChoice};
 use crate::progress::{Progress, Recorded, StageRecord};
 use crate::query::{QueryOptions, QueryResult};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
+use crate::{Error, Result};
+use describe::{Described, Describer, both};
 use std::path::PathBuf;
+use std::sync::{OnceLock, mpsc};
 use view::DecodedFrame;
 
 /// Where cameras and points come from.
@@ -133,8 +136,10 @@ pub struct Outcome {
     pub answers: Vec<Answers>,
     /// Models that were used.
     pub models: Vec<crate::infer::ModelStatus>,
-    /// Seconds and memory per stage, up to the writing of the scene.
+    /// Times and memory per stage, up to the writing of the scene.
     pub stages: Vec<StageRecord>,
+    /// Wall seconds up to there; less than the stages together, since some overlap.
+    pub seconds: f64,
     /// What the user was warned of.
     pub warnings: Vec<String>,
 }
@@ -155,35 +160,25 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
         InitSource::Cameras(file) => InitChoice::Cameras(cameras::read(file)?),
     };
     let given = sources::given_masks(&plan.masks, &plan.features, &photos)?;
-    let mut encoder = sources::encoder(&plan.features, &registry)?;
-    let queries = sources::queries(&plan.queries, encoder.as_mut())?;
+    let encoder = sources::encoder(&plan.features, &registry)?;
 
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
     let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
-    let geometry = pose::initialise(&device, &photos, &init, &registry, progress)?;
-    let trained = fit::train_rgb(
-        &device,
-        &images,
-        &geometry.cameras,
-        &geometry.points,
-        Some(&geometry.depths),
-        &rgb_options(plan, preset),
-        progress,
-    )?;
-
-    let masks = match given {
-        Some(masks) => masks,
-        None => sources::graph_masks(&images, &geometry, &registry, progress)?,
+    let describer = Describer { plan, images: &images, registry: &registry, given, encoder };
+    let reconstruct = || pose::initialise(&device, &photos, &init, &registry, progress);
+    let train = |geometry: &Geometry| {
+        fit::train_rgb(
+            &device,
+            &images,
+            &geometry.cameras,
+            &geometry.points,
+            Some(&geometry.depths),
+            &rgb_options(plan, preset),
+            progress,
+        )
     };
-    let masks = sources::with_features(masks, &images, encoder.as_mut(), progress)?;
-    let matches = sources::matches(&images, &geometry, &registry, progress)?;
-    let options = BuildOptions {
-        feature_dim: plan.feature_dim,
-        space: encoder.space().to_owned(),
-        seed: plan.seed,
-        ..BuildOptions::default()
-    };
-    let built = language::build(&masks, &geometry.cameras, &geometry.depths, &matches, &options, progress)?;
+    let (geometry, trained, described) = side_by_side(reconstruct, train, describer, progress)?;
+    let Described { queries, language: built } = described;
     let spoken = fit::train_language(
         &device,
         &images,
@@ -222,10 +217,46 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
         answers,
         models: registry.status(),
         stages: progress.stages(),
+        seconds: progress.seconds(),
         warnings: progress.warnings(),
     };
     write(workspace, &outcome, progress)?;
     Ok(outcome)
+}
+
+/// Geometry and splats on this thread; masks, features and alignment beside them on another. The first error stops both.
+fn side_by_side(
+    reconstruct: impl FnOnce() -> Result<Geometry>,
+    train: impl FnOnce(&Geometry) -> Result<fit::Trained>,
+    describer: Describer,
+    progress: &Recorded,
+) -> Result<(Geometry, fit::Trained, Described)> {
+    let geometry = OnceLock::new();
+    let (ready, wait) = mpsc::channel();
+    let ended = || Error::Cancelled;
+    let (trained, described) = std::thread::scope(|scope| {
+        let beside = progress.beside();
+        let geometry = &geometry;
+        let other = scope.spawn(move || {
+            let known = || wait.recv().ok().and_then(|()| geometry.get()).ok_or_else(ended);
+            describer.run(known, beside.as_ref()).inspect_err(|_| progress.stop())
+        });
+        let front = reconstruct().and_then(|found| {
+            let found = geometry.get_or_init(|| found);
+            // The receiver is gone only when the other lane has failed, which the training then notices.
+            let _ = ready.send(());
+            train(found)
+        });
+        drop(ready);
+        if front.is_err() {
+            progress.stop();
+        }
+        // A panic over there goes on here, as if there had been one thread.
+        let described = other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        both(front, described)
+    })?;
+    let geometry = geometry.into_inner().ok_or_else(ended)?;
+    Ok((geometry, trained, described))
 }
 
 fn rgb_options(plan: &RunPlan, preset: Preset) -> RgbOptions {

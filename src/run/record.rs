@@ -21,7 +21,7 @@ pub fn run_record(o: &Outcome) -> RunRecord {
             .filter(used)
             .map(|m| ModelUsed { name: m.name.clone(), sha256: m.sha256.clone(), licence: m.licence.clone() })
             .collect(),
-        seconds: o.stages.iter().map(|s| s.seconds).sum(),
+        seconds: o.seconds,
         stages: o.stages.clone(),
         statistics: statistics(o),
         warnings: o.warnings.clone(),
@@ -91,7 +91,12 @@ fn figures(o: &Outcome) -> Vec<(String, String)> {
 
 /// The table that ends `splatvk run`.
 pub fn closing_table(o: &Outcome) -> String {
-    format!("{}  {:<12}  {}\n", report::table(&o.stages, &figures(o)), "scene", o.plan.out.display())
+    format!(
+        "{}  {:<12}  {}\n",
+        report::table(&o.stages, o.seconds, &figures(o)),
+        "scene",
+        o.plan.out.display()
+    )
 }
 
 /// Writes `run.json`, `report.html` and `previews/`.

@@ -2,7 +2,7 @@
 use super::{FeatureSource, MaskSource};
 use crate::infer::hed::Hed;
 use crate::infer::words::RegionWords;
-use crate::infer::xfeat::XFeat;
+use crate::infer::xfeat::{DenseFeatures, XFeat};
 use crate::infer::{RegionEncoder, Registry};
 use crate::language::align::{PairLinks, links_from_warps};
 use crate::language::dir::{self, TextEmbeddings};
@@ -13,7 +13,9 @@ use crate::progress::Progress;
 use crate::query::{CANONICAL_PHRASES, TextQuery};
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
+use rayon::prelude::*;
 use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// File of the text embeddings in a `dir:` folder.
 pub const TEXT_TABLE: &str = "text_embeddings.npz";
@@ -94,23 +96,38 @@ pub fn queries(texts: &[String], encoder: &mut dyn RegionEncoder) -> Result<Vec<
     Ok(texts.iter().zip(rows.chunks_exact(encoder.dim())).map(query).collect())
 }
 
+/// Learned contours of every photo, for [`graph_masks`].
+pub fn edges(images: &[RgbImage], registry: &Registry, progress: &dyn Progress) -> Result<Vec<Plane<f32>>> {
+    progress.begin("edges", images.len() as u64);
+    let mut hed = Hed::load(registry)?;
+    let mut edges = Vec::with_capacity(images.len());
+    for image in images {
+        progress.check()?;
+        edges.push(hed.edges(image)?);
+        progress.step(edges.len() as u64, "");
+    }
+    progress.end();
+    Ok(edges)
+}
+
 /// The built-in masks, helped by learned edges and stereo depth.
 pub fn graph_masks(
     images: &[RgbImage],
+    edges: &[Plane<f32>],
     geometry: &Geometry,
-    registry: &Registry,
     progress: &dyn Progress,
 ) -> Result<Vec<ViewMasks>> {
     progress.begin("masks", images.len() as u64);
-    let mut hed = Hed::load(registry)?;
-    let mut masks = Vec::with_capacity(images.len());
-    for (i, image) in images.iter().enumerate() {
+    let done = AtomicU64::new(0);
+    let options = graph::GraphOptions::default();
+    let one = |i: usize| {
         progress.check()?;
-        let edges = hed.edges(image)?;
         let depth = Some((&geometry.cameras[i], &geometry.depths[i]));
-        masks.push(graph::segment(image, Some(&edges), depth, &graph::GraphOptions::default())?);
-        progress.step(i as u64 + 1, "");
-    }
+        let masks = graph::segment(&images[i], edges.get(i), depth, &options)?;
+        progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
+        Ok(masks)
+    };
+    let masks = (0..images.len()).into_par_iter().map(one).collect::<Result<_>>()?;
     progress.end();
     Ok(masks)
 }
@@ -122,7 +139,7 @@ pub fn with_features(
     encoder: &mut dyn RegionEncoder,
     progress: &dyn Progress,
 ) -> Result<Vec<ViewMasks>> {
-    progress.begin("features", masks.iter().map(|m| m.levels.len() as u64).sum());
+    progress.begin("regions", masks.iter().map(|m| m.levels.len() as u64).sum());
     let mut done = 0;
     for (view, image) in masks.iter_mut().zip(images) {
         for level in &mut view.levels {
@@ -138,30 +155,40 @@ pub fn with_features(
     Ok(masks)
 }
 
-/// Dense matches of every unordered pair of views, for step 1 of the alignment.
-pub fn matches(
+/// Dense features of every photo, for [`matches`].
+pub fn dense(
     images: &[RgbImage],
-    geometry: &Geometry,
     registry: &Registry,
     progress: &dyn Progress,
-) -> Result<Vec<PairLinks>> {
-    let views = images.len();
-    let pairs: Vec<(usize, usize)> = (0..views).flat_map(|i| (i + 1..views).map(move |j| (i, j))).collect();
-    progress.begin("match", (views + pairs.len()) as u64);
+) -> Result<Vec<DenseFeatures>> {
+    progress.begin("descriptors", images.len() as u64);
     let mut xfeat = XFeat::load(registry)?;
-    let mut dense = Vec::with_capacity(views);
+    let mut dense = Vec::with_capacity(images.len());
     for image in images {
         progress.check()?;
         dense.push(xfeat.dense(image)?);
         progress.step(dense.len() as u64, "");
     }
+    progress.end();
+    Ok(dense)
+}
+
+/// Dense matches of every unordered pair of views, for step 1 of the alignment.
+pub fn matches(
+    dense: &[DenseFeatures],
+    geometry: &Geometry,
+    progress: &dyn Progress,
+) -> Result<Vec<PairLinks>> {
+    let views = dense.len();
+    let pairs: Vec<(usize, usize)> = (0..views).flat_map(|i| (i + 1..views).map(move |j| (i, j))).collect();
+    progress.begin("match", pairs.len() as u64);
     let mut links = Vec::with_capacity(pairs.len());
     for (i, j) in pairs {
         progress.check()?;
         let cameras = (&geometry.cameras[i], &geometry.cameras[j]);
         let (forward, backward) = matcher::xfeat(&dense[i], &dense[j], cameras);
         links.push(links_from_warps(i, j, &forward, &backward));
-        progress.step((views + links.len()) as u64, "");
+        progress.step(links.len() as u64, "");
     }
     progress.end();
     Ok(links)

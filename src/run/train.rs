@@ -154,7 +154,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         device: device.info().name.clone(),
         device_is_cpu: device.info().is_cpu,
         models: Vec::new(),
-        seconds: stages.iter().map(|s| s.seconds).sum(),
+        seconds: progress.seconds(),
         stages,
         statistics: json!({
             "geometry": { "method": geometry.method, "points": geometry.points.len() },
@@ -192,7 +192,11 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     report::write_previews(workspace.path(), &shown)?;
     progress.check()?;
     workspace.commit()?;
-    let table = format!("{}scene is in {}\n", report::table(&record.stages, &figures), plan.out.display());
+    let table = format!(
+        "{}scene is in {}\n",
+        report::table(&record.stages, record.seconds, &figures),
+        plan.out.display()
+    );
     Ok(TrainOutcome { record, table })
 }
 

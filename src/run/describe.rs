@@ -1,0 +1,84 @@
+//! The part of a run that needs no GPU: what the photos show, in masks, features and words. It runs beside geometry and
+//! training, which leave the processor mostly idle where the device is a GPU.
+use super::{RunPlan, sources};
+use crate::infer::{RegionEncoder, Registry};
+use crate::language::{self, BuildOptions, Language, ViewMasks};
+use crate::pose::Geometry;
+use crate::progress::Progress;
+use crate::query::TextQuery;
+use crate::scene::RgbImage;
+use crate::{Error, Result};
+
+/// What it needs.
+pub(super) struct Describer<'a> {
+    pub plan: &'a RunPlan,
+    pub images: &'a [RgbImage],
+    pub registry: &'a Registry,
+    /// Masks from a folder; built-in ones otherwise.
+    pub given: Option<Vec<ViewMasks>>,
+    pub encoder: Box<dyn RegionEncoder>,
+}
+
+/// What it finds.
+pub(super) struct Described {
+    /// The plan's queries.
+    pub queries: Vec<TextQuery>,
+    /// Codebooks, targets and the alignment behind them.
+    pub language: Language,
+}
+
+impl Describer<'_> {
+    /// Does what the photos alone allow, then takes the geometry from `geometry`, which may wait for it.
+    pub fn run<'g>(
+        mut self,
+        geometry: impl FnOnce() -> Result<&'g Geometry>,
+        progress: &dyn Progress,
+    ) -> Result<Described> {
+        // First what can be refused: a phrase that a table of embeddings does not hold.
+        let queries = sources::queries(&self.plan.queries, self.encoder.as_mut())?;
+        let edges = match &self.given {
+            Some(_) => Vec::new(),
+            None => sources::edges(self.images, self.registry, progress)?,
+        };
+        let dense = sources::dense(self.images, self.registry, progress)?;
+        let geometry = geometry()?;
+        let masks = match self.given.take() {
+            Some(masks) => masks,
+            None => sources::graph_masks(self.images, &edges, geometry, progress)?,
+        };
+        let masks = sources::with_features(masks, self.images, self.encoder.as_mut(), progress)?;
+        let matches = sources::matches(&dense, geometry, progress)?;
+        let options = BuildOptions {
+            feature_dim: self.plan.feature_dim,
+            space: self.encoder.space().to_owned(),
+            seed: self.plan.seed,
+            ..BuildOptions::default()
+        };
+        let (cameras, depths) = (&geometry.cameras, &geometry.depths);
+        let language = language::build(&masks, cameras, depths, &matches, &options, progress)?;
+        Ok(Described { queries, language })
+    }
+}
+
+/// The results of two lanes; of two errors the one that is not the mere consequence of the other.
+pub(super) fn both<A, B>(front: Result<A>, beside: Result<B>) -> Result<(A, B)> {
+    match (front, beside) {
+        (Ok(a), Ok(b)) => Ok((a, b)),
+        (Err(Error::Cancelled), Err(e)) | (Err(e), _) | (_, Err(e)) => Err(e),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_cause_is_reported_and_not_the_stop_it_caused() {
+        let cause = || Error::input("bad mask");
+        let text = |r: Result<((), ())>| r.unwrap_err().to_string();
+        assert_eq!(text(both(Err(Error::Cancelled), Err(cause()))), "bad mask");
+        assert_eq!(text(both(Err(cause()), Err(Error::Cancelled))), "bad mask");
+        assert_eq!(text(both(Ok(()), Err(cause()))), "bad mask");
+        assert!(matches!(both::<(), ()>(Err(Error::Cancelled), Ok(())), Err(Error::Cancelled)));
+    }
+}
