@@ -1,5 +1,6 @@
 #version 450
-// Code per pixel: k* = argmax_k F.c_k, ties to the lowest k, -1 where alpha < 0.5, with the margin to the second best.
+// Code per pixel: k* = argmax_k F.c_k, ties to the lowest k, with the margin to the second best. -1 where alpha < 0.5,
+// and where |F| < alpha / 4: splats without features are what the pixel shows (see pass::decode).
 // Twin: pass::decode::decode_pixels.
 // variants: DIM=4,8,16,32
 #extension GL_EXT_control_flow_attributes : require
@@ -9,7 +10,7 @@
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer Features { float features[]; };  // planar [planes, P]
-layout(std430, binding = 1) readonly buffer Alpha { float alpha[]; };        // [P]
+layout(std430, binding = 1) readonly buffer Transmittance { float transmittance[]; }; // [P]
 layout(std430, binding = 2) readonly buffer Codes { vec4 codes[]; };         // [K, DIM / 4], zero padded
 layout(std430, binding = 3) writeonly buffer Decoded { int decoded[]; };     // [P]
 layout(std430, binding = 4) writeonly buffer Margin { float margin[]; };     // [P]
@@ -63,7 +64,9 @@ void main() {
         // A lone code competes with the least a product can be.
         float rival = count > 1u ? second[j] : -norm;
         if (pixel < pixels) {
-            bool shown = alpha[pixel] >= 0.5; // less opaque pixels show nothing of the scene
+            float alpha = 1.0 - transmittance[pixel];
+            // Less opaque pixels show nothing of the scene; those with shorter features nothing that has words.
+            bool shown = alpha >= 0.5 && norm >= 0.25 * alpha;
             decoded[pixel] = shown ? chosen[j] : -1;
             margin[pixel] = shown && norm > 0.0 && count > 0u ? (best[j] - rival) / norm : 0.0;
         }

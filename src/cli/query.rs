@@ -10,21 +10,27 @@ use crate::infer::Registry;
 use crate::progress::Progress;
 use crate::query::{QueryOptions, QueryResult};
 use crate::report::{colour, file_name};
-use crate::run::sources;
-use crate::run::view::Viewer;
-use crate::scene::LEVEL_NAMES;
+use crate::run::ask::QueryScene;
+use crate::scene::{LEVEL_NAMES, RgbImage};
 use crate::{Error, Result};
 use serde_json::{Value, json};
 use std::fmt::Write;
+use std::time::Instant;
+
+/// Cameras whose frames are kept at a time.
+const AT_ONCE: usize = 16;
 
 pub fn query(args: &QueryArgs) -> Result<()> {
-    let scene = scene_dir::load(&args.scene)?;
-    let field = scene.language.as_ref().ok_or_else(|| {
+    let mut scene = scene_dir::load(&args.scene)?;
+    let mute = || {
         Error::input(format!(
             "{}: the scene has no language; make one with splatvk run",
             args.scene.display()
         ))
-    })?;
+    };
+    if scene.language.is_none() {
+        return Err(mute());
+    }
     let cameras = match &args.cameras {
         Some(file) => cameras::read(file)?,
         None => scene.cameras.clone(),
@@ -43,35 +49,45 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         }
     }
     let registry = Registry::open(args.device.models.as_deref())?;
-    let mut encoder = encoder::of_scene(&scene, registry)?;
-    let queries = sources::queries(&args.texts, encoder.as_mut())?;
+    let encoder = encoder::of_scene(&scene, registry)?;
     let mut out = Outputs::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
-    let mut viewer = Viewer::new(&device, &scene.splats, field)?;
+    let field = scene.language.take().ok_or_else(mute)?;
+    let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
     let progress = Terminal::new();
     progress.begin("query", cameras.len() as u64);
-    let mut answers: Vec<Vec<Value>> = vec![Vec::new(); queries.len()];
-    for (i, (camera, stem)) in cameras.iter().zip(&stems).enumerate() {
+    let mut views: Vec<Vec<Value>> = vec![Vec::new(); args.texts.len()];
+    let mut latency = vec![0.0; args.texts.len()];
+    for (part, (cameras, stems)) in cameras.chunks(AT_ONCE).zip(stems.chunks(AT_ONCE)).enumerate() {
         progress.check()?;
-        let view = viewer.view(camera)?;
-        for (q, query) in queries.iter().enumerate() {
-            let answer = crate::query::answer(&view.codes, field, query, &QueryOptions::default())?;
-            let name = |kind: &str| format!("{}/{stem}_{kind}", folders[q]);
-            let heat = colour::heat_image(&view.frame.rgb, &answer.relevancy, Some(&answer.mask));
-            picture::write_png(&out.file(&name("heat.png"))?, &heat)?;
-            picture::write_mask_png(&out.file(&name("mask.png"))?, &answer.mask)?;
-            let size = (answer.relevancy.width, answer.relevancy.height);
-            picture::write_npy(&out.file(&name("relevancy.npy"))?, size, None, &answer.relevancy.data)?;
-            answers[q].push(to_json(stem, &folders[q], &answer));
+        ready.look(cameras)?;
+        for (q, text) in args.texts.iter().enumerate() {
+            let clock = Instant::now();
+            let answers = ready.ask(text, &QueryOptions::default())?;
+            latency[q] += 1e3 * clock.elapsed().as_secs_f64();
+            for ((frame, stem), answer) in ready.frames().iter().zip(stems).zip(&answers.views) {
+                write(&mut out, stem, &folders[q], &frame.frame.rgb, answer)?;
+                views[q].push(to_json(stem, &folders[q], answer));
+            }
         }
-        progress.step(i as u64 + 1, "");
+        progress.step((part * AT_ONCE + cameras.len()) as u64, "");
     }
     progress.end();
-    let queries = args.texts.iter().zip(&answers).map(|(t, a)| json!({ "text": t, "views": a }));
+    let queries = args.texts.iter().zip(&views).zip(&latency);
+    let queries = queries.map(|((t, v), ms)| json!({ "text": t, "milliseconds": ms, "views": v }));
     let report = json!({ "scene": args.scene, "out": args.out, "queries": queries.collect::<Vec<_>>() });
     write_json(&out.file("answers.json")?, &report)?;
     out.keep();
-    if args.device.json { print_json(&report) } else { print(&table(&args.texts, &answers, args)) }
+    if args.device.json { print_json(&report) } else { print(&table(&args.texts, &views, &latency, args)) }
+}
+
+fn write(out: &mut Outputs, stem: &str, folder: &str, picture: &RgbImage, a: &QueryResult) -> Result<()> {
+    let name = |kind: &str| format!("{folder}/{stem}_{kind}");
+    let heat = colour::heat_image(picture, &a.relevancy, Some(&a.mask));
+    picture::write_png(&out.file(&name("heat.png"))?, &heat)?;
+    picture::write_mask_png(&out.file(&name("mask.png"))?, &a.mask)?;
+    let size = (a.relevancy.width, a.relevancy.height);
+    picture::write_npy(&out.file(&name("relevancy.npy"))?, size, None, &a.relevancy.data)
 }
 
 fn to_json(stem: &str, folder: &str, a: &QueryResult) -> Value {
@@ -85,12 +101,13 @@ fn to_json(stem: &str, folder: &str, a: &QueryResult) -> Value {
     })
 }
 
-fn table(texts: &[String], answers: &[Vec<Value>], args: &QueryArgs) -> String {
+fn table(texts: &[String], answers: &[Vec<Value>], latency: &[f64], args: &QueryArgs) -> String {
     let mut text = String::new();
     // Writing to a String cannot fail.
-    for (query, views) in texts.iter().zip(answers) {
+    for ((query, views), ms) in texts.iter().zip(answers).zip(latency) {
         let found = views.iter().filter(|v| v["found"] == true).count();
-        let _ = writeln!(text, "“{query}”: found in {found} of {} views", views.len());
+        let _ =
+            writeln!(text, "“{query}”: found in {found} of {} views, answered in {ms:.0} ms", views.len());
         for v in views {
             let verdict = if v["found"] == true { "" } else { "  not found" };
             let _ = writeln!(

@@ -33,7 +33,11 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     progress.begin("render", cameras.len() as u64);
     for (i, (camera, stem)) in cameras.iter().zip(&stems).enumerate() {
         progress.check()?;
-        let view = viewer.view(camera)?;
+        let view = if args.channels.contains(&Channel::Features) {
+            viewer.view_with_features(camera)?
+        } else {
+            viewer.view(camera)?
+        };
         for format in &args.formats {
             match format {
                 ImageFormat::Png => png(&mut out, stem, &args.channels, &view, field)?,

@@ -5,6 +5,12 @@ use crate::{Error, Result};
 /// Pixels less opaque than this show nothing of the scene; the shader holds the same value.
 const VOID_ALPHA: f32 = 0.5;
 
+/// Pixels whose feature is shorter than this share of their alpha have no code; the shader holds the same value. Surfaces
+/// continued beyond the photos carry no features, and a blend of nothing has no code. Splat features are unit vectors, so
+/// ‖F‖ is the alpha they contribute, less what differing codes cancel (√½ where two meet); a quarter separates that from
+/// stray contributions.
+const SPOKEN_SHARE: f64 = 0.25;
+
 /// Code widths that glsl/decode.comp is compiled for; others are padded with zeros to the next.
 const WIDTHS: [usize; 4] = [4, 8, 16, 32];
 
@@ -35,14 +41,15 @@ impl Codes {
     }
 
     /// Decodes `pixels` pixels. `features` is planar `[planes, pixels]`, the level's channels are the planes
-    /// `first_plane..first_plane + dim`; `alpha` is `[pixels]`. Writes `decoded`, `[pixels]` of `i32` with −1 where alpha
-    /// < 0.5 (or without codes), and `margin`, `[pixels]` of `(F·c_1 − F·c_2) / ‖F‖`. Twin: [`decode_pixels`].
+    /// `first_plane..first_plane + dim`; `transmittance` is `[pixels]`, 1 − alpha. Writes `decoded`, `[pixels]` of `i32`
+    /// with −1 where alpha < 0.5, where ‖F‖ < alpha / 4 and without codes, and `margin`, `[pixels]` of
+    /// `(F·c_1 − F·c_2) / ‖F‖`. Twin: [`decode_pixels`].
     pub fn record(
         &self,
         rec: &mut Recorder,
         features: &Buffer,
         first_plane: u32,
-        alpha: &Buffer,
+        transmittance: &Buffer,
         pixels: u32,
         decoded: &Buffer,
         margin: &Buffer,
@@ -54,7 +61,7 @@ impl Codes {
         rec.dispatch(
             shaders::decode::call(
                 shaders::decode::Variant { dim: self.width },
-                &shaders::decode::Bindings { features, alpha, codes: &self.buffer, decoded, margin },
+                &shaders::decode::Bindings { features, transmittance, codes: &self.buffer, decoded, margin },
                 &shaders::decode::Push { pixels, count: self.count, dim: self.dim, first_plane },
             ),
             [pixels.div_ceil(PIXELS_PER_GROUP), 1, 1],
@@ -78,8 +85,9 @@ pub fn decode_pixels(codes: &[f32], dim: usize, features: &[f32], alpha: &[f32])
                 second = score;
             }
         }
-        if alpha[p] < VOID_ALPHA || chosen < 0 {
-            (if alpha[p] < VOID_ALPHA { -1 } else { chosen }, 0.0)
+        let shown = alpha[p] >= VOID_ALPHA && norm >= SPOKEN_SHARE * f64::from(alpha[p]);
+        if !shown || chosen < 0 {
+            (if shown { chosen } else { -1 }, 0.0)
         } else {
             (chosen, if norm > 0.0 { (best - second) / norm } else { 0.0 })
         }
@@ -115,12 +123,13 @@ mod tests {
         let device = test_device();
         let planes = [noise(2 * alpha.len(), 99).as_slice(), features].concat();
         let features = device.buffer_from("features", &planes).unwrap();
-        let alpha_buffer = device.buffer_from("alpha", alpha).unwrap();
+        let transmittance: Vec<f32> = alpha.iter().map(|a| 1.0 - a).collect();
+        let transmittance = device.buffer_from("transmittance", &transmittance).unwrap();
         let decoded = device.buffer::<i32>("decoded", alpha.len()).unwrap();
         let margin = device.buffer::<f32>("margin", alpha.len()).unwrap();
         let codes = Codes::upload(&device, codes, dim).unwrap();
         let mut rec = Recorder::new(&device, "decode");
-        codes.record(&mut rec, &features, 2, &alpha_buffer, alpha.len() as u32, &decoded, &margin);
+        codes.record(&mut rec, &features, 2, &transmittance, alpha.len() as u32, &decoded, &margin);
         rec.run().unwrap();
         (decoded.read().unwrap(), margin.read().unwrap())
     }
@@ -155,6 +164,17 @@ mod tests {
         assert_eq!((code, margin), (vec![-1, -1], vec![0.0, 0.0]));
         let (twin, _) = decode_pixels(&[], 2, &[2.0, 0.0, 0.0, 2.0], &[1.0, 1.0]);
         assert_eq!(twin, [-1, -1]);
+    }
+
+    #[test]
+    fn a_pixel_whose_splats_have_no_feature_has_no_code() {
+        let codes = [1.0, 0.0, 0.0, 1.0];
+        // One code; an even mix of both; almost nothing; nothing.
+        let (first, second) = ([0.9, 0.45, 0.0, 0.0], [0.0, 0.45, 0.1, 0.0]);
+        let features = [first, second].concat();
+        let (code, _) = on_device(&codes, 2, &features, &[0.9; 4]);
+        assert_eq!(code, [0, 0, -1, -1]);
+        assert_eq!(decode_pixels(&codes, 2, &features, &[0.9; 4]).0, code);
     }
 
     #[test]

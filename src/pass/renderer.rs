@@ -75,8 +75,13 @@ impl Renderer {
         self
     }
 
-    /// Renders one view.
+    /// Renders one view and copies it to the host.
     pub fn render(&mut self, camera: &Camera) -> Result<Frame> {
+        read_frame(self.draw(camera)?, true)
+    }
+
+    /// Renders one view, which stays on the device.
+    pub fn draw(&mut self, camera: &Camera) -> Result<&Rasterizer> {
         if self.near <= 0.0 {
             self.near = 0.01 * self.median_depth(camera)?;
         }
@@ -93,7 +98,7 @@ impl Renderer {
         };
         rasterizer.set_view(&View::new(camera, self.near).with_background(self.background))?;
         rasterizer.forward(&self.splats, &self.options)?;
-        read_frame(rasterizer)
+        Ok(rasterizer)
     }
 
     /// Median camera z of the splats in front of the camera; 1 when there are none.
@@ -115,12 +120,13 @@ impl Renderer {
     }
 }
 
-/// Copies the planes of the last forward pass to the host.
-pub fn read_frame(rasterizer: &Rasterizer) -> Result<Frame> {
+/// Copies the planes of the last forward pass to the host; without `features` the frame has none.
+pub fn read_frame(rasterizer: &Rasterizer, features: bool) -> Result<Frame> {
     let frame = rasterizer.frame();
-    let (width, height, dim) = (frame.width as usize, frame.height as usize, frame.feature_dim);
+    let (width, height) = (frame.width as usize, frame.height as usize);
+    let dim = if features { frame.feature_dim } else { 0 };
     let pixels = width * height;
-    let planes = frame.planes.read::<f32>()?;
+    let planes = frame.planes.read_range::<f32>(0..(BASE_CHANNELS + dim) * pixels)?;
     let transmittance = frame.transmittance.read::<f32>()?;
     let plane = |data| Plane { width, height, data };
     let rgb = (0..pixels).map(|p| [planes[p], planes[pixels + p], planes[2 * pixels + p]]).collect();

@@ -1,5 +1,6 @@
 //! Smoothing and the LERF mask (ALGORITHMS 9.2, 9.3).
 use crate::scene::Plane;
+use rayon::prelude::*;
 
 /// Side of the smoothing box, pixels (LERF, LangSplat).
 const BOX: usize = 30;
@@ -47,30 +48,44 @@ fn replicate(i: isize, n: usize) -> usize {
     i.clamp(0, n as isize - 1) as usize
 }
 
+/// Rows that one task of the vertical pass takes: enough that filling the first window is a small part of it.
+const BAND: usize = 96;
+
 /// Separable mean over `size` pixels starting `anchor` before each pixel; running sums in f64.
 fn box_filter(map: &Plane<f32>, size: usize, anchor: usize, border: fn(isize, usize) -> usize) -> Plane<f32> {
     let (w, h) = (map.width, map.height);
-    let mut rows = vec![0.0f64; w * h];
-    let mut prefix = vec![0.0f64; w.max(h) + size + 1];
-    for y in 0..h {
-        for k in 0..w + size {
-            let x = border(k as isize - anchor as isize, w);
-            prefix[k + 1] = prefix[k] + map.at(x, y) as f64;
-        }
-        for x in 0..w {
-            rows[y * w + x] = prefix[x + size] - prefix[x];
-        }
-    }
     let mut out = Plane::filled(w, h, 0.0f32);
-    for x in 0..w {
-        for k in 0..h + size {
-            let y = border(k as isize - anchor as isize, h);
-            prefix[k + 1] = prefix[k] + rows[y * w + x];
-        }
-        for y in 0..h {
-            out.data[y * w + x] = ((prefix[y + size] - prefix[y]) / (size * size) as f64) as f32;
-        }
+    if w == 0 || h == 0 {
+        return out;
     }
+    let columns: Vec<usize> = (0..w + size).map(|k| border(k as isize - anchor as isize, w)).collect();
+    let mut rows = vec![0.0f32; w * h];
+    rows.par_chunks_exact_mut(w).zip(map.data.par_chunks_exact(w)).for_each(|(sums, row)| {
+        let mut sum: f64 = columns[..size].iter().map(|&x| f64::from(row[x])).sum();
+        for (x, out) in sums.iter_mut().enumerate() {
+            *out = sum as f32;
+            sum += f64::from(row[columns[x + size]]) - f64::from(row[columns[x]]);
+        }
+    });
+    let row = |y: usize| {
+        let from = border(y as isize - anchor as isize, h) * w;
+        &rows[from..from + w]
+    };
+    let scale = 1.0 / (size * size) as f64;
+    out.data.par_chunks_mut(w * BAND).enumerate().for_each(|(band, out)| {
+        let mut sums = vec![0.0f64; w];
+        let first = band * BAND;
+        for y in first..first + size {
+            sums.iter_mut().zip(row(y)).for_each(|(s, v)| *s += f64::from(*v));
+        }
+        for (k, out) in out.chunks_exact_mut(w).enumerate() {
+            let (gone, new) = (row(first + k), row(first + k + size));
+            for ((o, s), (g, n)) in out.iter_mut().zip(&mut sums).zip(gone.iter().zip(new)) {
+                *o = (*s * scale) as f32;
+                *s += f64::from(*n) - f64::from(*g);
+            }
+        }
+    });
     out
 }
 

@@ -91,14 +91,44 @@ fn a_speck_does_not_outvote_the_whole() {
     let mut whole = frame();
     whole.data.iter_mut().filter(|k| **k == 0).for_each(|k| *k = 2);
     let maps = vec![Plane::filled(60, 40, -1), part, whole];
-    let ask = |share: f32| {
-        let options = QueryOptions { whole_share: share, ..QueryOptions::default() };
+    let ask = |slack: Slack| {
+        let options = QueryOptions { slack, ..QueryOptions::default() };
         answer(&maps, &field(), &query(&[1.0, 0.0, -0.02, 0.1]), &options).unwrap().level
     };
-    assert_eq!((ask(1.0), ask(0.9)), (2, 2));
+    assert_eq!((ask(Slack { margin: 0.0, share: 0.0 }), ask(SLACK)), (2, 2));
     // LERF's rule looks at the peak alone
     let lerf = QueryOptions { mask: MaskRule::Lerf(0.6), ..QueryOptions::default() };
     assert!(answer(&maps, &field(), &query(&[1.0, 0.0, -0.02, 0.1]), &lerf).is_ok());
+}
+
+#[test]
+fn a_clearly_better_part_answers_and_a_marginally_better_one_does_not() {
+    // Level 1 and level 2 show one thing; the part's code is nearer to the phrase by the tilt.
+    let ask = |tilt: f32| {
+        let entry = |first: f32| unit(&[first, 1.0, 0.0, 0.0]);
+        let level = |embedding: Vec<f32>| LevelField {
+            codebook: Codebook { embedding_dim: 4, embeddings: embedding, ..Codebook::default() },
+            ..LevelField::default()
+        };
+        let levels = vec![LevelField::default(), level(entry(1.0 + tilt)), level(entry(1.0))];
+        let field = LanguageField { levels, ..LanguageField::default() };
+        let maps = vec![Plane::filled(60, 40, -1), Plane::filled(60, 40, 0), Plane::filled(60, 40, 0)];
+        answer(&maps, &field, &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap().level
+    };
+    // Margins: cosine 0.707 of the whole; 0.74 (within 0.02 and a tenth) and 0.89 of the part.
+    assert_eq!((ask(0.1), ask(1.0)), (2, 1));
+}
+
+#[test]
+fn frames_are_answered_alike_one_by_one_and_together() {
+    let (one, two) = (vec![frame(), frame(), frame()], vec![Plane::filled(60, 40, -1), frame(), frame()]);
+    let q = query(&[1.0, 0.0, 0.0, 0.0]);
+    let together = answer_all(&[&one, &two], &field(), &q, &QueryOptions::default()).unwrap();
+    for (codes, all) in [&one, &two].into_iter().zip(&together) {
+        let alone = answer(codes, &field(), &q, &QueryOptions::default()).unwrap();
+        assert_eq!((alone.level, alone.location, &alone.mask), (all.level, all.location, &all.mask));
+        assert_eq!(alone.relevancy, all.relevancy);
+    }
 }
 
 #[test]

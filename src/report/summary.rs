@@ -26,7 +26,7 @@ pub fn table(stages: &[StageRecord], total: f64, figures: &[(String, String)]) -
     // Writing to a String cannot fail.
     for s in stages {
         let (from, to) = (column(s.start), column(s.start + s.seconds));
-        let bar = " ".repeat(from) + &"█".repeat(to - from);
+        let bar = " ".repeat(from) + &"█".repeat((to - from).max(1));
         let bar = bar.trim_end();
         let _ = writeln!(out, "  {:<wide$}  {:>12}  {bar}", s.name, duration(s.seconds));
     }

@@ -1,4 +1,5 @@
 //! The whole pipeline on one page: photos → cameras, depth and points → splats → language → scene directory.
+pub mod ask;
 mod describe;
 mod record;
 pub mod sources;
@@ -191,15 +192,8 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
 
     progress.begin("query", 1);
     let frames = view::decode_all(&device, &spoken.splats, &spoken.field, &trained.cameras)?;
-    let mut answers = Vec::with_capacity(queries.len());
-    for query in &queries {
-        let one =
-            |f: &DecodedFrame| crate::query::answer(&f.codes, &spoken.field, query, &QueryOptions::default());
-        answers.push(Answers {
-            text: query.text.clone(),
-            views: frames.iter().map(one).collect::<Result<_>>()?,
-        });
-    }
+    let answer = |query| ask::answers(&frames, &spoken.field, query, &QueryOptions::default());
+    let answers = queries.iter().map(answer).collect::<Result<Vec<_>>>()?;
     progress.end();
     let outcome = Outcome {
         plan: plan.clone(),

@@ -1,0 +1,82 @@
+//! A loaded scene that is kept ready for questions: what viewers, `splatvk query` and benchmarks call.
+use super::Answers;
+use super::view::{DecodedFrame, Viewer};
+use crate::gpu::Device;
+use crate::infer::RegionEncoder;
+use crate::query::{self, CANONICAL_PHRASES, QueryOptions, TextQuery};
+use crate::scene::{Camera, LanguageField, Plane, Splats};
+use crate::{Error, Result};
+
+/// The scene on the device, its code maps from the cameras looked from, and the text encoder. A question costs the
+/// embedding of its text and a gather and five box filters per camera; nothing is rendered for it.
+///
+/// ```no_run
+/// # fn main() -> splatvk::Result<()> {
+/// # use splatvk::{format::scene_dir, gpu::Device, infer::{Registry, words::RegionWords}, run::ask::QueryScene};
+/// let scene = scene_dir::load("out/breakfast".as_ref())?;
+/// let field = scene.language.ok_or_else(|| splatvk::Error::input("no language"))?;
+/// let encoder = Box::new(RegionWords::load(Registry::open(None)?)?);
+/// let mut ready = QueryScene::open(&Device::open(None)?, &scene.splats, field, encoder)?;
+/// ready.look(&scene.cameras)?;
+/// let answers = ready.ask("lemon", &Default::default())?;
+/// println!("found in {} of {} views", answers.found(), answers.views.len());
+/// # Ok(())
+/// # }
+/// ```
+pub struct QueryScene {
+    viewer: Viewer,
+    field: LanguageField,
+    encoder: Box<dyn RegionEncoder>,
+    /// [C, D] unit rows of the canonical phrases.
+    canonicals: Vec<f32>,
+    frames: Vec<DecodedFrame>,
+}
+
+impl QueryScene {
+    /// Uploads the scene and loads the text encoder, which must be of the field's space.
+    pub fn open(
+        device: &Device,
+        splats: &Splats,
+        field: LanguageField,
+        mut encoder: Box<dyn RegionEncoder>,
+    ) -> Result<Self> {
+        if field.levels.iter().all(|l| l.codebook.is_empty()) {
+            return Err(Error::input("the scene has no language; make one with splatvk run"));
+        }
+        let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
+        let viewer = Viewer::new(device, splats, &field)?;
+        Ok(QueryScene { viewer, field, encoder, canonicals, frames: Vec::new() })
+    }
+
+    /// Renders and decodes the cameras that questions are answered for from now on.
+    pub fn look(&mut self, cameras: &[Camera]) -> Result<&[DecodedFrame]> {
+        self.frames.clear();
+        for camera in cameras {
+            self.frames.push(self.viewer.view(camera)?);
+        }
+        Ok(&self.frames)
+    }
+
+    /// The frames of the last [`QueryScene::look`].
+    pub fn frames(&self) -> &[DecodedFrame] {
+        &self.frames
+    }
+
+    /// Answers a text in every frame.
+    pub fn ask(&mut self, text: &str, options: &QueryOptions) -> Result<Answers> {
+        let embedding = self.encoder.embed_texts(&[text])?;
+        let query = TextQuery { text: text.to_owned(), embedding, canonicals: self.canonicals.clone() };
+        answers(&self.frames, &self.field, &query, options)
+    }
+}
+
+/// The answers to one query in all frames.
+pub fn answers(
+    frames: &[DecodedFrame],
+    field: &LanguageField,
+    query: &TextQuery,
+    options: &QueryOptions,
+) -> Result<Answers> {
+    let codes: Vec<&[Plane<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
+    Ok(Answers { text: query.text.clone(), views: query::answer_all(&codes, field, query, options)? })
+}
