@@ -10,6 +10,8 @@ pub trait Progress: Send + Sync {
     fn begin(&self, stage: &'static str, steps: u64);
     /// `done` of the current stage's steps are finished; `note` is a short live figure ("PSNR 28.1").
     fn step(&self, done: u64, note: &str);
+    /// Measurements of the current stage at a step, by name: loss, PSNR in dB, counts.
+    fn figures(&self, _step: u64, _figures: &[(&str, f64)]) {}
     /// The current stage is over.
     fn end(&self);
     /// Something the user should know, one line.
@@ -124,6 +126,9 @@ impl Progress for Recorded<'_> {
     fn step(&self, done: u64, note: &str) {
         self.inner.step(done, note);
     }
+    fn figures(&self, step: u64, figures: &[(&str, f64)]) {
+        self.inner.figures(step, figures);
+    }
     fn end(&self) {
         self.close(&self.lane);
         self.inner.end();
@@ -154,6 +159,9 @@ impl Progress for Beside<'_> {
     }
     fn step(&self, done: u64, note: &str) {
         self.inner.step(done, note);
+    }
+    fn figures(&self, step: u64, figures: &[(&str, f64)]) {
+        self.inner.figures(step, figures);
     }
     fn end(&self) {
         self.owner.close(&self.lane);

@@ -1,8 +1,8 @@
 //! The program as a user runs it: what it refuses, how it says so, and that it leaves nothing half-written.
-#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
-use fixture::{data, scene, small_views};
+use fixture::{data, scene, small_views, train_log};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -318,4 +318,43 @@ fn a_closed_pipe_is_no_failure() {
     drop(child.stdout.take());
     let output = child.wait_with_output().unwrap();
     assert!(output.stderr.is_empty(), "{}", text(&output.stderr));
+}
+
+/// Every line of standard error as JSON.
+fn events(stderr: &str) -> Vec<serde_json::Value> {
+    stderr.lines().map(|l| serde_json::from_str(l).unwrap_or_else(|e| panic!("{e}: {l}"))).collect()
+}
+
+#[test]
+fn logs_for_machines_are_one_json_object_per_line() {
+    let record = scene().join("run.json");
+    let events_of_training = events(&std::fs::read_to_string(train_log()).unwrap());
+    let of = |event: &str, stage: &str| -> Vec<&serde_json::Value> {
+        events_of_training.iter().filter(|e| e["event"] == event && e["stage"] == stage).collect()
+    };
+    assert_eq!((of("begin", "splats").len(), of("end", "splats").len()), (1, 1));
+    assert_eq!(of("begin", "splats")[0]["steps"], 20);
+    let figures = of("figures", "splats");
+    assert_eq!(figures.last().unwrap()["step"], 20);
+    for f in &figures {
+        let number = |name: &str| f[name].as_f64().unwrap();
+        assert!(number("psnr") > 5.0 && number("loss") > 0.0 && number("splats") > 100.0, "{f}");
+    }
+    // The report's curves are the same figures.
+    let record: serde_json::Value = serde_json::from_slice(&std::fs::read(record).unwrap()).unwrap();
+    let curves = record["statistics"]["curves"].as_array().unwrap();
+    let psnr = curves.iter().find(|c| c["unit"] == "dB").unwrap()["points"].as_array().unwrap();
+    assert_eq!(psnr.len(), figures.len());
+    assert_eq!(psnr.last().unwrap()[1], figures.last().unwrap()["psnr"]);
+    assert!(
+        std::fs::read_to_string(scene().join("report.html")).unwrap().contains("PSNR of render and photo")
+    );
+
+    let output =
+        splatvk().args(["--log", "json", "render", "nowhere", "--cameras", "x", "--out", "y"]).output();
+    let output = output.unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    let last = events(&text(&output.stderr)).pop().unwrap();
+    assert_eq!((&last["event"], &last["exit_code"]), (&"error".into(), &2.into()));
+    assert!(last["message"].as_str().unwrap().contains("nowhere"));
 }

@@ -9,6 +9,18 @@ pub struct Cli {
     /// What to do.
     #[command(subcommand)]
     pub command: Command,
+    /// Progress and messages on standard error: for people, or one JSON object per line
+    #[arg(long, global = true, value_enum, default_value = "text", value_name = "FORMAT")]
+    pub log: LogFormat,
+}
+
+/// What goes to standard error.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum LogFormat {
+    /// Bars on a terminal, a line per stage elsewhere
+    Text,
+    /// One JSON object per line: begin, step, figures, end, warning, error
+    Json,
 }
 
 /// One variant per command; each has its own file in `cli/`.

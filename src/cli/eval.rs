@@ -1,12 +1,11 @@
 //! `splatvk eval`
 use super::args::{EvalArgs, ProtocolArg};
 use super::encoder;
-use super::progress::Terminal;
+use super::progress;
 use super::{print, print_json};
 use crate::format::{create_folder, scene_dir, write_json};
 use crate::gpu::Device;
 use crate::infer::Registry;
-use crate::progress::Progress;
 use crate::query::eval::{Evaluation, GroundTruth, Rendered, Report};
 use crate::query::{MaskRule, QueryOptions, QueryResult, TextQuery};
 use crate::run::sources;
@@ -38,7 +37,7 @@ pub fn eval(args: &EvalArgs) -> Result<()> {
     let nothing = LanguageField::default();
     let field = scene.language.as_ref().unwrap_or(&nothing);
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
-    let progress = Terminal::new();
+    let progress = progress::here();
     let frames = evaluation.cameras();
     progress.begin("eval", frames.len() as u64);
     for (i, (frame, camera)) in frames.iter().enumerate() {

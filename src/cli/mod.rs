@@ -29,11 +29,12 @@ pub fn main() -> ExitCode {
         Ok(cli) => cli,
         Err(error) => return usage(&error),
     };
+    progress::set_format(cli.log);
     progress::stop_on_signal();
     match execute(cli.command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("splatvk: {}", one_line(&error.to_string()));
+            progress::failed(&one_line(&error.to_string()), error.exit_code());
             ExitCode::from(error.exit_code())
         }
     }

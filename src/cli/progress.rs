@@ -1,13 +1,107 @@
-//! Progress on standard error: a bar per stage with the time left on a terminal, one line per stage elsewhere.
+//! Progress on standard error: a bar per stage with the time left on a terminal, one line per stage elsewhere, or one
+//! JSON object per line for machines.
+use super::args::LogFormat;
 use crate::progress::Progress;
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
-use std::io::IsTerminal;
-use std::sync::Mutex;
+use serde_json::{Value, json};
+use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 /// Set by the first Ctrl-C of the process; work notices it between steps.
 static STOPPED: AtomicBool = AtomicBool::new(false);
+
+/// What this process writes to standard error, and when it began to.
+static JSON: AtomicBool = AtomicBool::new(false);
+static BEGAN: LazyLock<Instant> = LazyLock::new(Instant::now);
+
+/// Chooses the format of everything that goes to standard error from now on.
+pub fn set_format(format: LogFormat) {
+    LazyLock::force(&BEGAN);
+    JSON.store(format == LogFormat::Json, Ordering::SeqCst);
+}
+
+fn as_json() -> bool {
+    JSON.load(Ordering::SeqCst)
+}
+
+/// Where the commands of this process report to.
+pub fn here() -> Box<dyn Progress> {
+    if as_json() { Box::new(JsonLines::default()) } else { Box::new(Terminal::new()) }
+}
+
+/// True once the user wants the process to stop.
+pub fn stopped() -> bool {
+    STOPPED.load(Ordering::SeqCst)
+}
+
+/// The error that ends the process.
+pub fn failed(message: &str, exit_code: u8) {
+    match as_json() {
+        true => write_event("error", json!({ "message": message, "exit_code": exit_code })),
+        false => eprintln!("splatvk: {message}"),
+    }
+}
+
+fn warned(message: &str) {
+    match as_json() {
+        true => write_event("warning", json!({ "message": message })),
+        false => eprintln!("warning: {message}"),
+    }
+}
+
+/// Writes `{"event", "time", …}` as one line; `time` is in seconds since the process began.
+fn write_event(event: &str, mut fields: Value) {
+    fields["event"] = event.into();
+    fields["time"] = ((BEGAN.elapsed().as_secs_f64() * 1e3).round() / 1e3).into();
+    // Nobody is left to tell when standard error is closed.
+    let _ = writeln!(std::io::stderr().lock(), "{fields}");
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // A panic while holding the lock leaves plain data behind, which stays usable.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// One JSON object per line.
+#[derive(Default)]
+struct JsonLines {
+    current: Mutex<Option<(&'static str, u64, Instant)>>,
+}
+
+impl Progress for JsonLines {
+    fn begin(&self, stage: &'static str, steps: u64) {
+        self.end();
+        write_event("begin", json!({ "stage": stage, "steps": steps }));
+        *lock(&self.current) = Some((stage, steps, Instant::now()));
+    }
+    fn step(&self, done: u64, note: &str) {
+        if let Some((stage, steps, _)) = *lock(&self.current) {
+            write_event("step", json!({ "stage": stage, "done": done, "steps": steps, "note": note }));
+        }
+    }
+    fn figures(&self, step: u64, figures: &[(&str, f64)]) {
+        let stage = lock(&self.current).map(|(stage, _, _)| stage);
+        let mut fields = json!({ "stage": stage, "step": step });
+        figures.iter().for_each(|(name, value)| fields[*name] = (*value).into());
+        write_event("figures", fields);
+    }
+    fn end(&self) {
+        if let Some((stage, _, start)) = lock(&self.current).take() {
+            write_event("end", json!({ "stage": stage, "seconds": start.elapsed().as_secs_f64() }));
+        }
+    }
+    fn warn(&self, message: &str) {
+        warned(message);
+    }
+    fn cancelled(&self) -> bool {
+        stopped()
+    }
+    fn beside(&self) -> Box<dyn Progress + '_> {
+        Box::new(JsonLines::default())
+    }
+}
 
 /// Makes Ctrl-C (and a termination signal) ask for a clean stop; a second one ends the process at once.
 pub fn stop_on_signal() {
@@ -16,17 +110,19 @@ pub fn stop_on_signal() {
             crate::format::remove_unfinished();
             std::process::exit(130);
         }
-        eprintln!("stopping; press Ctrl-C again to end at once");
+        if !as_json() {
+            eprintln!("stopping; press Ctrl-C again to end at once");
+        }
     });
     if let Err(error) = outcome {
-        eprintln!("warning: Ctrl-C cannot be caught: {error}");
+        warned(&format!("Ctrl-C cannot be caught: {error}"));
     }
 }
 
 type Stage = (&'static str, Instant, ProgressBar);
 
-/// The command line's [`Progress`].
-pub struct Terminal {
+/// The command line's [`Progress`] for people.
+struct Terminal {
     /// All bars, below each other; `None` where standard error is no terminal.
     bars: Option<MultiProgress>,
     current: Mutex<Option<Stage>>,
@@ -34,13 +130,9 @@ pub struct Terminal {
 
 impl Terminal {
     /// Bars when standard error is a terminal, lines otherwise.
-    pub fn new() -> Self {
+    fn new() -> Self {
         let bars = std::io::stderr().is_terminal().then(MultiProgress::new);
         Terminal { bars, current: Mutex::default() }
-    }
-    fn lock(&self) -> std::sync::MutexGuard<'_, Option<Stage>> {
-        // A panic while holding the lock leaves plain data behind, which stays usable.
-        self.current.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
     }
     /// Prints a line above the bars.
     fn print(&self, line: &str) {
@@ -48,12 +140,6 @@ impl Terminal {
             Some(bars) => bars.suspend(|| eprintln!("{line}")),
             None => eprintln!("{line}"),
         }
-    }
-}
-
-impl Default for Terminal {
-    fn default() -> Self {
-        Self::new()
     }
 }
 
@@ -71,16 +157,16 @@ impl Progress for Terminal {
         }
         bar.set_message(stage);
         bar.tick();
-        *self.lock() = Some((stage, Instant::now(), bar));
+        *lock(&self.current) = Some((stage, Instant::now(), bar));
     }
     fn step(&self, done: u64, note: &str) {
-        if let Some((_, _, bar)) = self.lock().as_ref() {
+        if let Some((_, _, bar)) = lock(&self.current).as_ref() {
             bar.set_position(done);
             bar.set_prefix(note.to_owned());
         }
     }
     fn end(&self) {
-        let Some((name, start, bar)) = self.lock().take() else { return };
+        let Some((name, start, bar)) = lock(&self.current).take() else { return };
         let note = bar.prefix();
         bar.finish_and_clear();
         self.print(&format!("{name:>12}  {:6.1} s  {note}", start.elapsed().as_secs_f64()));
@@ -89,7 +175,7 @@ impl Progress for Terminal {
         self.print(&format!("warning: {message}"));
     }
     fn cancelled(&self) -> bool {
-        STOPPED.load(Ordering::SeqCst)
+        stopped()
     }
     fn beside(&self) -> Box<dyn Progress + '_> {
         Box::new(Terminal { bars: self.bars.clone(), current: Mutex::default() })

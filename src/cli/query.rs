@@ -2,12 +2,11 @@
 use super::args::QueryArgs;
 use super::encoder;
 use super::outputs::Outputs;
-use super::progress::Terminal;
+use super::progress;
 use super::{print, print_json, views};
 use crate::format::{cameras, picture, scene_dir, write_json};
 use crate::gpu::Device;
 use crate::infer::Registry;
-use crate::progress::Progress;
 use crate::query::{QueryOptions, QueryResult};
 use crate::report::{colour, file_name};
 use crate::run::ask::QueryScene;
@@ -54,7 +53,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let device = Device::open(args.device.device.as_deref())?;
     let field = scene.language.take().ok_or_else(mute)?;
     let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
-    let progress = Terminal::new();
+    let progress = progress::here();
     progress.begin("query", cameras.len() as u64);
     let mut views: Vec<Vec<Value>> = vec![Vec::new(); args.texts.len()];
     let mut latency = vec![0.0; args.texts.len()];

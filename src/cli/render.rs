@@ -1,13 +1,12 @@
 //! `splatvk render`
 use super::args::{Channel, ImageFormat, RenderArgs};
 use super::outputs::Outputs;
-use super::progress::Terminal;
+use super::progress;
 use super::{listing, views};
 use crate::format::npy::{self, NpyArray};
 use crate::format::picture::{self, Planes};
 use crate::format::{cameras, scene_dir};
 use crate::gpu::Device;
-use crate::progress::Progress;
 use crate::report::colour;
 use crate::run::view::{DecodedFrame, Viewer};
 use crate::scene::{LEVEL_NAMES, LanguageField, Plane, RgbImage};
@@ -29,7 +28,7 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     let mut out = Outputs::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
-    let progress = Terminal::new();
+    let progress = progress::here();
     progress.begin("render", cameras.len() as u64);
     for (i, (camera, stem)) in cameras.iter().zip(&stems).enumerate() {
         progress.check()?;

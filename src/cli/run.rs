@@ -1,12 +1,12 @@
 //! `splatvk run`
 use super::args::RunArgs;
-use super::progress::Terminal;
+use super::progress;
 use super::{plan, print, print_json};
 use crate::{Error, Result};
 
 pub fn run(args: &RunArgs) -> Result<()> {
     let plan = plan::run(args)?;
-    let outcome = crate::run::run(&plan, &Terminal::new())?;
+    let outcome = crate::run::run(&plan, progress::here().as_ref())?;
     if args.device.json {
         let record = serde_json::to_value(crate::run::run_record(&outcome));
         return print_json(&record.map_err(|e| Error::work(format!("run record: {e}")))?);

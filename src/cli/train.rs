@@ -1,7 +1,7 @@
 //! `splatvk train`
 use super::args::TrainArgs;
 use super::plan;
-use super::progress::Terminal;
+use super::progress;
 use super::{print, print_json};
 use crate::Result;
 use crate::run::train::{TrainPlan, train as run};
@@ -21,7 +21,7 @@ pub fn train(args: &TrainArgs) -> Result<()> {
         deterministic: args.deterministic,
         models: plan::models(&args.device),
     };
-    let trained = run(&plan, &Terminal::new())?;
+    let trained = run(&plan, progress::here().as_ref())?;
     if args.device.json {
         return print_json(&json!({ "out": plan.out, "run": trained.record }));
     }

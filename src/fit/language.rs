@@ -34,6 +34,13 @@ pub struct LanguagePoint {
     pub accuracy: Vec<f64>,
 }
 
+impl LanguagePoint {
+    /// Mean accuracy of the trained levels.
+    pub fn mean_accuracy(&self) -> f64 {
+        self.accuracy.iter().sum::<f64>() / self.accuracy.len().max(1) as f64
+    }
+}
+
 /// The result of the language stage.
 #[derive(Clone, Debug)]
 pub struct TrainedLanguage {
@@ -184,6 +191,7 @@ impl<'a> Run<'a> {
     fn train(&mut self, progress: &dyn Progress, done: u64) -> Result<()> {
         if self.options.check_every > 0 {
             self.measure(0)?;
+            self.tell(progress, done);
         }
         for iteration in 0..self.options.iterations {
             progress.check()?;
@@ -192,6 +200,7 @@ impl<'a> Run<'a> {
             if self.options.check_every > 0 && step % self.options.check_every == 0 {
                 self.model.check(step)?;
                 self.measure(step)?;
+                self.tell(progress, done);
                 if self.settled() {
                     break;
                 }
@@ -205,11 +214,18 @@ impl<'a> Run<'a> {
         self.model.check(self.options.iterations)
     }
 
+    /// Passes the last measurement on.
+    fn tell(&self, progress: &dyn Progress, done: u64) {
+        if let Some(point) = self.curve.last() {
+            let figures = [("loss", point.loss), ("accuracy", point.mean_accuracy())];
+            progress.figures(done + point.step as u64, &figures);
+        }
+    }
+
     /// True when the last two measurements together gained less than [`MIN_GAIN`].
     fn settled(&self) -> bool {
-        let mean = |p: &LanguagePoint| p.accuracy.iter().sum::<f64>() / p.accuracy.len().max(1) as f64;
         match self.curve.as_slice() {
-            [.., a, b, c] => mean(c).max(mean(b)) - mean(a) < MIN_GAIN,
+            [.., a, b, c] => c.mean_accuracy().max(b.mean_accuracy()) - a.mean_accuracy() < MIN_GAIN,
             _ => false,
         }
     }

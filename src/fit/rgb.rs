@@ -34,6 +34,9 @@ pub struct CurvePoint {
     pub loss: f64,
     /// Mean SSIM over the same steps.
     pub ssim: f64,
+    /// Mean over the views of the PSNR when each was last looked at, dB. One view is looked at per point, which costs a
+    /// copy of its render; until every view had its turn the mean is over those that had.
+    pub psnr: f64,
     /// Number of splats.
     pub splats: usize,
 }
@@ -110,8 +113,12 @@ pub fn fit_rgb(
         progress.check()?;
         run.step(iteration)?;
         if let Some(point) = run.report(iteration)? {
-            let note = format!("loss {:.4}, {} splats", point.loss, point.splats);
+            let note = format!("loss {:.4}, PSNR {:.1}, {} splats", point.loss, point.psnr, point.splats);
             progress.step(iteration as u64 + 1, &note);
+            let splats = point.splats as f64;
+            let figures =
+                [("loss", point.loss), ("ssim", point.ssim), ("psnr", point.psnr), ("splats", splats)];
+            progress.figures(point.step as u64, &figures);
         }
         run.prune(iteration)?;
         run.densify(iteration)?;
@@ -146,13 +153,18 @@ pub(crate) struct Run<'a> {
     /// One recorded step per view; empty after anything they bind has changed.
     programs: Vec<Option<Program>>,
     recent: Vec<ImageLoss>,
+    images: &'a [RgbImage],
+    /// The view of the last step.
+    last: usize,
+    /// Per view its last PSNR, dB.
+    psnr: Vec<Option<f64>>,
     curve: Vec<CurvePoint>,
 }
 
 impl<'a> Run<'a> {
     pub(crate) fn new(
         device: &Device,
-        images: &[RgbImage],
+        images: &'a [RgbImage],
         cameras: &[Camera],
         start: &Splats,
         scale: SceneScale,
@@ -182,6 +194,9 @@ impl<'a> Run<'a> {
             stats,
             programs: cameras.iter().map(|_| None).collect(),
             recent: Vec::new(),
+            images,
+            last: 0,
+            psnr: vec![None; cameras.len()],
             curve: Vec::new(),
         })
     }
@@ -195,6 +210,7 @@ impl<'a> Run<'a> {
             self.forget_recordings();
         }
         let view = self.order.draw();
+        self.last = view;
         self.model.set_rates(&self.options.rates, 0.0, self.scale.extent, iteration)?;
         self.views.set_camera(view, &self.cameras[view])?;
         loop {
@@ -278,12 +294,16 @@ impl<'a> Run<'a> {
             return Ok(None);
         }
         self.model.check(step)?;
+        let shown = self.views.shown(self.last)?;
+        self.psnr[self.last] = Some(psnr(&shown, &self.images[self.last]).min(MOST_PSNR));
+        let known: Vec<f64> = self.psnr.iter().flatten().copied().collect();
         let n = self.recent.len().max(1) as f64;
         let total = |l: &ImageLoss| l.total(self.options.l1_weight, self.options.dssim_weight);
         let point = CurvePoint {
             step,
             loss: self.recent.iter().map(total).sum::<f64>() / n,
             ssim: self.recent.iter().map(|l| l.ssim).sum::<f64>() / n,
+            psnr: known.iter().sum::<f64>() / known.len().max(1) as f64,
             splats: self.model.count(),
         };
         self.recent.clear();

@@ -106,7 +106,12 @@ impl Views {
         let at = self.list[view].stage;
         let stage = &mut self.stages[at];
         stage.raster.forward(&model.values, options)?;
-        let frame = stage.raster.frame();
+        self.shown(view)
+    }
+
+    /// What the view's rasteriser last rendered: colours clipped to [0, 1].
+    pub(super) fn shown(&self, view: usize) -> Result<RgbImage> {
+        let frame = self.stage(view).raster.frame();
         let (width, height) = (frame.width as usize, frame.height as usize);
         let pixels = width * height;
         let planes = frame.planes.read_range::<f32>(0..3 * pixels)?;

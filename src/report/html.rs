@@ -1,5 +1,5 @@
 //! `report.html`: one self-contained file, readable on a phone.
-use super::{QueryShown, Report, ViewShown, chart, colour, duration};
+use super::{Curve, QueryShown, Report, ViewShown, chart, colour, duration};
 use crate::format::picture;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
@@ -54,9 +54,9 @@ fn page(report: &Report) -> Result<String> {
         body.push_str(&view_row(view)?);
     }
     body.push_str("</section>");
-    let curve = chart::line_chart(&report.ssim_curve, "step", "SSIM of render and photo");
-    if !curve.is_empty() {
-        let _ = write!(body, "<section><h2>Training</h2>{curve}</section>");
+    let charts: String = report.curves.iter().map(curve).collect();
+    if !charts.is_empty() {
+        let _ = write!(body, "<section><h2>Training</h2><div class=\"row curves\">{charts}</div></section>");
     }
     body.push_str(&run_tables(report));
     Ok(format!(
@@ -64,6 +64,15 @@ fn page(report: &Report) -> Result<String> {
          content=\"width=device-width, initial-scale=1\"><title>{title} · splatvk</title><style>{STYLE}</style>\
          <main>{body}</main></html>\n"
     ))
+}
+
+/// A chart with its last value in the caption; empty for a curve without two points.
+fn curve(curve: &Curve) -> String {
+    let svg = chart::line_chart(&curve.points, "step", curve.name);
+    let (Some((_, last)), false) = (curve.points.last(), svg.is_empty()) else { return String::new() };
+    let decimals = if last.abs() >= 1000.0 { 0 } else { 2 + usize::from(last.abs() < 1.0) };
+    let unit = if curve.unit.is_empty() { String::new() } else { format!(" {}", curve.unit) };
+    format!("<figure>{svg}<figcaption>at the end {last:.decimals$}{unit}</figcaption></figure>")
 }
 
 fn view_row(v: &ViewShown) -> Result<String> {
@@ -220,7 +229,10 @@ mod tests {
             title: "a <b> & \"c\"",
             views: vec![view],
             queries: vec![QueryShown { text: "<script>", answers: vec![answer] }],
-            ssim_curve: vec![(1.0, 0.31), (100.0, 0.93)],
+            curves: vec![
+                Curve { name: "PSNR", unit: "dB", points: vec![(1.0, 21.0), (100.0, 32.456)] },
+                Curve { name: "nothing", unit: "", points: vec![(1.0, 1.0)] },
+            ],
             space: Some("words/x"),
             figures: vec![("splats".into(), "123".into())],
             run: &run,
@@ -240,9 +252,11 @@ mod tests {
             "a &lt; b",
             "1.07 GB",
             "found in 1 of 1",
+            "at the end 32.46 dB",
         ] {
             assert!(html.contains(text), "{text}");
         }
+        assert_eq!(html.matches("<svg").count(), 1, "a single point is no curve");
         for name in ["a_render.jpg", "a_depth.jpg", "a_level_l.jpg", "query__script__a.jpg"] {
             assert!(image::open(folder.path().join("previews").join(name)).is_ok(), "{name}");
         }

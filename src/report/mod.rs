@@ -101,6 +101,17 @@ pub struct QueryShown<'a> {
     pub answers: Vec<AnswerShown<'a>>,
 }
 
+/// A figure over the optimisation steps of a stage.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Curve {
+    /// What is measured.
+    pub name: &'static str,
+    /// dB, %, or nothing.
+    pub unit: &'static str,
+    /// (step, value).
+    pub points: Vec<(f64, f64)>,
+}
+
 /// Everything that `report.html` and `previews/` show.
 #[derive(Clone, Debug)]
 pub struct Report<'a> {
@@ -110,8 +121,8 @@ pub struct Report<'a> {
     pub views: Vec<ViewShown<'a>>,
     /// Queries of the run.
     pub queries: Vec<QueryShown<'a>>,
-    /// (optimisation step, SSIM of render and photo).
-    pub ssim_curve: Vec<(f64, f64)>,
+    /// How training went.
+    pub curves: Vec<Curve>,
     /// Embedding space of the language field; `words/…` gets a plain statement of what it knows.
     pub space: Option<&'a str>,
     /// Figures for the head of the page: (label, value).

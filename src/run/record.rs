@@ -1,7 +1,8 @@
 //! What a finished run says about itself: `run.json`, the report and the closing table, made from [`Outcome`].
 use super::{Answers, Outcome};
 use crate::Result;
-use crate::report::{self, AnswerShown, ModelUsed, QueryShown, Report, RunRecord, ViewShown};
+use crate::fit::{CurvePoint, FitStats, LanguagePoint};
+use crate::report::{self, AnswerShown, Curve, ModelUsed, QueryShown, Report, RunRecord, ViewShown};
 use crate::scene::LEVEL_NAMES;
 use serde_json::json;
 use std::path::Path;
@@ -29,6 +30,7 @@ pub fn run_record(o: &Outcome) -> RunRecord {
 }
 
 fn statistics(o: &Outcome) -> serde_json::Value {
+    let curves = curves(&o.rgb, &o.language_curve);
     let levels: Vec<_> = LEVEL_NAMES
         .iter()
         .zip(&o.field.levels)
@@ -50,10 +52,33 @@ fn statistics(o: &Outcome) -> serde_json::Value {
         "splats": { "start": o.rgb.splats[0], "end": o.splats.len() },
         "psnr_train": o.rgb.psnr, "poses_refined": o.rgb.poses_refined,
         "loss": o.rgb.curve.iter().map(|p| json!([p.step, p.loss])).collect::<Vec<_>>(),
+        "curves": curves,
         "levels": levels,
         "alignment": o.alignment.report,
         "queries": o.answers.iter().map(answer_json).collect::<Vec<_>>(),
     })
+}
+
+/// Figures over the steps of the colour stage and, where there was one, of the language stage.
+pub(super) fn curves(rgb: &FitStats, language: &[LanguagePoint]) -> Vec<Curve> {
+    let colour = |name, unit, get: fn(&CurvePoint) -> f64| Curve {
+        name,
+        unit,
+        points: rgb.curve.iter().map(|p| (p.step as f64, get(p))).collect(),
+    };
+    let words = |name, unit, skip, get: fn(&LanguagePoint) -> f64| {
+        let points = language.iter().skip(skip).map(|p| (p.step as f64, get(p)));
+        Curve { name, unit, points: points.collect() }
+    };
+    vec![
+        colour("loss", "", |p| p.loss),
+        colour("PSNR of render and photo", "dB", |p| p.psnr),
+        colour("SSIM of render and photo", "", |p| p.ssim),
+        colour("splats", "", |p| p.splats as f64),
+        // The first measurement comes before any step, and so before any loss.
+        words("language loss", "", 1, |p| p.loss),
+        words("pixels that decode to their label", "%", 0, |p| 100.0 * p.mean_accuracy()),
+    ]
 }
 
 fn answer_json(a: &Answers) -> serde_json::Value {
@@ -123,7 +148,7 @@ pub(super) fn write(folder: &Path, o: &Outcome) -> Result<()> {
         title: &title,
         views,
         queries: o.answers.iter().map(shown).collect(),
-        ssim_curve: o.rgb.curve.iter().map(|p| (p.step as f64, p.ssim)).collect(),
+        curves: curves(&o.rgb, &o.language_curve),
         space: Some(&o.field.space),
         figures: figures(o),
         run: &record,

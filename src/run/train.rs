@@ -147,6 +147,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     scene_dir::write(workspace.path(), &contents)?;
     progress.end();
     let stages = progress.stages();
+    let curves = super::record::curves(&trained.stats, &[]);
     let record = RunRecord {
         program: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
         config: json!({ "plan": plan, "preset": preset }),
@@ -160,6 +161,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
             "geometry": { "method": geometry.method, "points": geometry.points.len() },
             "splats": { "start": trained.stats.splats[0], "end": trained.splats.len() },
             "psnr_train": trained.stats.psnr, "poses_refined": trained.stats.poses_refined,
+            "curves": curves,
         }),
         warnings: progress.warnings(),
     };
@@ -182,7 +184,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         title: &title,
         views: views.collect(),
         queries: Vec::new(),
-        ssim_curve: trained.stats.curve.iter().map(|p| (p.step as f64, p.ssim)).collect(),
+        curves: curves.clone(),
         space: None,
         figures: figures.clone(),
         run: &record,
