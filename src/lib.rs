@@ -6,6 +6,7 @@
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]
 
+pub mod ablate;
 pub mod bench;
 pub mod error;
 pub mod fit;
@@ -21,6 +22,7 @@ pub mod query;
 pub mod report;
 pub mod run;
 pub mod scene;
+pub mod synth;
 
 #[doc(hidden)]
 pub mod cli;

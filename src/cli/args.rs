@@ -36,6 +36,10 @@ pub enum Command {
     Query(QueryArgs),
     /// Scene against ground truth → figures
     Eval(EvalArgs),
+    /// Data with ground truth → the tables of the paper's experiments
+    Ablate(AblateArgs),
+    /// Synthetic scene with ground truth, as hard as asked
+    Generate(GenerateArgs),
     /// Scene → another program's format
     Export(ExportArgs),
     /// The installed models
@@ -55,6 +59,19 @@ pub enum PresetArg {
     Default,
     /// The paper's schedule and constants
     Paper,
+}
+
+/// Methods to compare; each changes only what its authors do differently to language.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum MethodArg {
+    /// Alignment across views, a code per thing, photos in the loss
+    Sparselgs,
+    /// No alignment, a scene autoencoder to 3 numbers, features only
+    Langsplat,
+    /// No alignment, 128 quantised features read by an index head, smoothed in space
+    Legaussians,
+    /// No alignment, features lifted onto the stereo points in one pass, nothing optimised
+    Lsm,
 }
 
 /// Options that every command working on a device takes.
@@ -116,9 +133,12 @@ pub struct RunArgs {
     /// Optimisation steps of the language stage, instead of the preset's
     #[arg(long, value_name = "N")]
     pub language_iterations: Option<usize>,
-    /// Length of the codes that splats carry: 3, 8 or 16
-    #[arg(long, default_value_t = 16, value_name = "D")]
-    pub feature_dim: usize,
+    /// Length of the codes that splats carry: 3, 8 or 16 [default: 16; langsplat 3, legaussians 8]
+    #[arg(long, value_name = "D")]
+    pub feature_dim: Option<usize>,
+    /// How language gets onto the splats: this program's way, or a baseline on the same geometry to compare with
+    #[arg(long, value_enum, default_value = "sparselgs")]
+    pub method: MethodArg,
     /// One model per level as in the paper, instead of one geometry for all three
     #[arg(long)]
     pub per_level: bool,
@@ -229,13 +249,18 @@ pub struct QueryArgs {
     pub device: DeviceArgs,
 }
 
-/// How `eval` turns relevancy into masks.
+/// Which labels `eval` reads, how it cuts masks and what it counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ProtocolArg {
-    /// Masks from codes; the default
+    /// ground_truth.json: poses, images, depth, masks from codes; the default
     Field,
-    /// Threshold on the smoothed, normalised map, as LERF evaluations do
+    /// LERF-OVS: a folder of frame_*.json, or ground_truth.json
     Lerf,
+    /// 3D-OVS: a folder with segmentations/classes.txt, or ground_truth.json
+    #[value(name = "3dovs")]
+    Ovs,
+    /// ScanNet: a scene with label-filt/ and pose/; eight labels
+    Scannet,
 }
 
 /// `splatvk eval`
@@ -243,18 +268,142 @@ pub enum ProtocolArg {
 pub struct EvalArgs {
     /// Scene directory
     pub scene: PathBuf,
-    /// Folder with ground_truth.json
+    /// Folder of the labels, in the layout of the protocol
     #[arg(long, value_name = "DIR")]
     pub ground_truth: PathBuf,
+    /// Cameras of the data set, to score labelled frames that the scene was not made from: transforms.json, a COLMAP model
+    /// folder, or cameras.json
+    #[arg(long, value_name = "FILE")]
+    pub cameras: Option<PathBuf>,
     /// Write every rendered view and predicted mask here
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// How masks are cut
+    /// What is read and how it is scored
     #[arg(long, value_enum, default_value = "field")]
     pub protocol: ProtocolArg,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
+}
+
+/// Which tables `ablate` runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum TableArg {
+    /// Every table, shared stages once
+    All,
+    /// None, step 1, steps 1 and 2, step 3, all three
+    Alignment,
+    /// Bijection, autoencoder, no reduction
+    Bijection,
+    /// This program's way and the baselines
+    Methods,
+    /// Codes of 3, 8 and 16 numbers
+    Dimension,
+    /// Language training with and without the image loss
+    ImageLoss,
+    /// Masks and features: built-in, with injected errors, exact
+    Features,
+    /// At most 50k, 500k, or all splats at the start
+    Points,
+    /// 2, 4 and 6 photos
+    Views,
+    /// Cameras and points from photos alone, or from the true cameras
+    Initializer,
+}
+
+/// `splatvk ablate`
+#[derive(Debug, Args)]
+pub struct AblateArgs {
+    /// Which table
+    #[arg(value_enum, value_name = "TABLE")]
+    pub table: TableArg,
+    /// Folder with ground_truth.json, photos and masks
+    #[arg(long, value_name = "DIR")]
+    pub data: PathBuf,
+    /// Folder for ablate.json and one text and one chart per table [default: out/ablate-NAME, after the data]
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Masks and features for every row: built-in, flawed (true masks, errors injected), exact, or dir:DIR [default: those
+    /// that each table is about]
+    #[arg(long, value_name = "SOURCE")]
+    pub regions: Option<String>,
+    /// Photos of the default row [default: all train frames, at most 4]
+    #[arg(long, value_name = "N")]
+    pub views: Option<usize>,
+    /// Seed of training and of injected errors
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Optimisation steps of the colour stage, instead of draft's
+    #[arg(long, value_name = "N")]
+    pub iterations: Option<usize>,
+    /// Optimisation steps of the language stage, instead of draft's
+    #[arg(long, value_name = "N")]
+    pub language_iterations: Option<usize>,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// `splatvk generate`
+#[derive(Debug, Args)]
+pub struct GenerateArgs {
+    /// Folder to write: photos, held-out views, depth, masks, cameras, regions
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Make no scene: only regions_exact/ and regions_flawed/ for this data set with masks
+    #[arg(long, value_name = "DIR")]
+    pub from: Option<PathBuf>,
+    /// Everything random
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Photos
+    #[arg(long, default_value_t = 4, value_name = "N")]
+    pub views: usize,
+    /// Held-out views
+    #[arg(long, default_value_t = 6, value_name = "N")]
+    pub held_out: usize,
+    /// Picture size, pixels
+    #[arg(long, default_value = "640x480", value_name = "WxH")]
+    pub size: String,
+    /// Objects on the table, 1 to 12
+    #[arg(long, default_value_t = 8, value_name = "N")]
+    pub objects: usize,
+    /// Angle between neighbouring photos, degrees
+    #[arg(long, default_value_t = 20.0, value_name = "DEG")]
+    pub baseline: f64,
+    /// Contrast of surfaces: 1 = plenty to match, 0 = bare
+    #[arg(long, default_value_t = 1.0, value_name = "0-1")]
+    pub texture: f64,
+    /// Thin poles
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub thin: usize,
+    /// Objects close together and behind each other
+    #[arg(long, default_value_t = 0.3, value_name = "0-1")]
+    pub occlusion: f64,
+    /// Objects that look like another one
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub similar: usize,
+    /// Error of the starting cameras in cameras_noisy.json, degrees
+    #[arg(long, default_value_t = 0.5, value_name = "DEG")]
+    pub pose_noise: f64,
+    /// Noise of the photos, share of full white
+    #[arg(long, default_value_t = 0.005, value_name = "SHARE")]
+    pub photo_noise: f64,
+    /// regions_flawed/: rate of masks cut in two
+    #[arg(long, default_value_t = 0.2, value_name = "RATE")]
+    pub split: f64,
+    /// regions_flawed/: rate of objects swallowed by a neighbour's mask
+    #[arg(long, default_value_t = 0.05, value_name = "RATE")]
+    pub merge: f64,
+    /// regions_flawed/: rate of features of another object
+    #[arg(long, default_value_t = 0.2, value_name = "RATE")]
+    pub wrong: f64,
+    /// regions_flawed/: random part of every feature
+    #[arg(long, default_value_t = 0.35, value_name = "LENGTH")]
+    pub noise: f64,
+    /// Print one JSON object on standard output
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// What `export` writes.

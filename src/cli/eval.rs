@@ -3,74 +3,110 @@ use super::args::{EvalArgs, ProtocolArg};
 use super::encoder;
 use super::progress;
 use super::{print, print_json};
-use crate::format::{create_folder, scene_dir, write_json};
+use crate::format::scene_dir::Scene;
+use crate::format::{cameras, create_folder, picture, scene_dir, write_json};
 use crate::gpu::Device;
 use crate::infer::Registry;
-use crate::query::eval::{Evaluation, GroundTruth, Rendered, Report};
-use crate::query::{MaskRule, QueryOptions, QueryResult, TextQuery};
+use crate::query::TextQuery;
+use crate::query::eval::{Evaluation, GroundTruth, Report};
+use crate::query::protocol::{self, CodeScores, Kind, Masks, Seen};
+use crate::report::file_name;
+use crate::run::score::score_field;
 use crate::run::sources;
 use crate::run::view::Viewer;
 use crate::scene::LanguageField;
 use crate::{Error, Result};
-
-/// Share of the re-normalised relevancy from which a pixel belongs to the answer (LERF evaluations, ALGORITHMS 0.6).
-const LERF_THRESHOLD: f32 = 0.6;
+use serde::Serialize;
+use std::path::Path;
 
 pub fn eval(args: &EvalArgs) -> Result<()> {
     let scene = scene_dir::load(&args.scene)?;
-    let truth = GroundTruth::read(&args.ground_truth)?;
     if let Some(out) = &args.out {
         create_folder(out).map_err(|e| Error::input(format!("{e}; choose another --out")))?;
     }
-    let mut evaluation = Evaluation::new(truth, &scene.cameras, args.out.as_deref())?;
-    let phrases = evaluation.phrases();
-    let queries = match &scene.language {
-        Some(_) if !phrases.is_empty() => {
-            let registry = Registry::open(args.device.models.as_deref())?;
-            let mut encoder = encoder::of_scene(&scene, registry)?;
-            let texts: Vec<String> = phrases.iter().map(|p| p.1.clone()).collect();
-            sources::queries(&texts, encoder.as_mut())?
-        }
-        _ => Vec::new(),
-    };
+    match args.protocol {
+        ProtocolArg::Field if args.cameras.is_some() => Err(Error::input(
+            "--cameras: with --protocol field the cameras stand in ground_truth.json; leave it out",
+        )),
+        ProtocolArg::Field => report(&field(&scene, args)?, args),
+        ProtocolArg::Lerf => report(&published(Kind::Lerf, &scene, args)?, args),
+        ProtocolArg::Ovs => report(&published(Kind::Ovs, &scene, args)?, args),
+        ProtocolArg::Scannet => report(&published(Kind::ScanNet, &scene, args)?, args),
+    }
+}
+
+/// The texts in the scene's space; none where it has no language.
+fn ask(scene: &Scene, texts: &[String], args: &EvalArgs) -> Result<Vec<TextQuery>> {
+    if scene.language.is_none() || texts.is_empty() {
+        return Ok(Vec::new());
+    }
+    let registry = Registry::open(args.device.models.as_deref())?;
+    let mut encoder = encoder::of_scene(scene, registry)?;
+    sources::queries(texts, encoder.as_mut())
+}
+
+fn field(scene: &Scene, args: &EvalArgs) -> Result<Report> {
+    let truth = GroundTruth::read(&args.ground_truth)?;
+    let evaluation = Evaluation::new(truth, &scene.cameras, args.out.as_deref())?;
+    let phrases: Vec<String> = evaluation.phrases().into_iter().map(|p| p.1).collect();
+    let queries = ask(scene, &phrases, args)?;
     let device = Device::open(args.device.device.as_deref())?;
     let nothing = LanguageField::default();
     let field = scene.language.as_ref().unwrap_or(&nothing);
+    score_field(
+        &device,
+        &scene.splats,
+        field,
+        &queries,
+        evaluation,
+        progress::here().as_ref(),
+        &mut |_, _| Ok(()),
+    )
+}
+
+fn published(kind: Kind, scene: &Scene, args: &EvalArgs) -> Result<protocol::Report> {
+    let Some(field) = &scene.language else {
+        return Err(Error::input(format!(
+            "{}: the scene has no language; make one with splatvk run",
+            args.scene.display()
+        )));
+    };
+    let known = args.cameras.as_deref().map(cameras::read).transpose()?.unwrap_or_default();
+    let mut protocol = protocol::open(kind, &args.ground_truth, &scene.cameras, &known)?;
+    let queries = ask(scene, &protocol.prompts(), args)?;
+    let scores = CodeScores::new(field, &queries)?;
+    let device = Device::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
     let progress = progress::here();
-    let frames = evaluation.cameras();
-    progress.begin("eval", frames.len() as u64);
-    for (i, (frame, camera)) in frames.iter().enumerate() {
+    let views = protocol.views().to_vec();
+    progress.begin("eval", views.len() as u64);
+    for (i, view) in views.iter().enumerate() {
         progress.check()?;
-        let view = viewer.view(camera)?;
-        let answers = phrases
-            .iter()
-            .zip(&queries)
-            .map(|((label, _), q)| Ok((*label, answer(&view.codes, field, q, args.protocol)?)))
-            .collect::<Result<Vec<(u32, QueryResult)>>>()?;
-        let rendered = Rendered { rgb: view.frame.rgb, alpha: view.frame.alpha, depth: view.frame.depth };
-        evaluation.add_frame(frame, &rendered, &answers)?;
+        let decoded = viewer.view(&view.camera)?;
+        let masks = protocol.add(i, &Seen { codes: &decoded.codes, scores: &scores })?;
+        if let Some(out) = &args.out {
+            write(out, &view.stem, &decoded.frame.rgb, masks)?;
+        }
         progress.step(i as u64 + 1, "");
     }
     progress.end();
-    report(&evaluation.finish(), args)
+    Ok(protocol.finish())
 }
 
-fn answer(
-    codes: &[crate::scene::Plane<i32>],
-    field: &LanguageField,
-    query: &TextQuery,
-    protocol: ProtocolArg,
-) -> Result<QueryResult> {
-    let mask = match protocol {
-        ProtocolArg::Field => QueryOptions::default().mask,
-        ProtocolArg::Lerf => MaskRule::Lerf(LERF_THRESHOLD),
-    };
-    crate::query::answer(codes, field, query, &QueryOptions { mask, ..QueryOptions::default() })
+fn write(out: &Path, stem: &str, rgb: &crate::scene::RgbImage, masks: Masks) -> Result<()> {
+    let name = format!("{stem}.png");
+    create_folder(&out.join("renders"))?;
+    picture::write_png(&out.join("renders").join(&name), rgb)?;
+    for (phrase, mask) in masks {
+        let folder = out.join("masks").join(file_name(&phrase));
+        create_folder(&folder)?;
+        picture::write_mask_png(&folder.join(&name), &mask)?;
+    }
+    Ok(())
 }
 
 /// The report is JSON in any case; `--json` keeps it on one line.
-fn report(report: &Report, args: &EvalArgs) -> Result<()> {
+fn report(report: &impl Serialize, args: &EvalArgs) -> Result<()> {
     let value = serde_json::to_value(report).map_err(|e| Error::work(format!("eval report: {e}")))?;
     if let Some(out) = &args.out {
         write_json(&out.join("eval.json"), &value)?;

@@ -1,10 +1,12 @@
 //! Command line: [`args`] = what the user typed, `plan` = what it means, one file per command.
+mod ablate;
 pub mod args;
 mod bench;
 mod doctor;
 mod encoder;
 mod eval;
 mod export;
+mod generate;
 mod models;
 mod outputs;
 mod plan;
@@ -47,6 +49,8 @@ fn execute(command: Command) -> Result<()> {
         Command::Render(args) => render::render(&args),
         Command::Query(args) => query::query(&args),
         Command::Eval(args) => eval::eval(&args),
+        Command::Ablate(args) => ablate::ablate(&args),
+        Command::Generate(args) => generate::generate(&args),
         Command::Export(args) => export::export(&args),
         Command::Models(args) => models::models(&args),
         Command::Bench(args) => bench::bench(&args),

@@ -1,6 +1,7 @@
 //! What the arguments mean: defaults resolved, names understood, contradictions refused. No work happens here.
-use super::args::{DeviceArgs, PresetArg, RunArgs};
-use crate::run::{FeatureSource, InitSource, MaskSource, RunPlan};
+use super::args::{DeviceArgs, MethodArg, PresetArg, RunArgs};
+use crate::language::Reducer;
+use crate::run::{FeatureSource, InitSource, MaskSource, Method, RunPlan};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
@@ -9,8 +10,16 @@ const LARGE_MODELS: [&str; 7] = ["mast3r", "dust3r", "vggt", "sam", "clip", "lse
 
 /// `splatvk run`
 pub fn run(args: &RunArgs) -> Result<RunPlan> {
-    if ![3, 8, 16].contains(&args.feature_dim) {
-        return Err(Error::input(format!("--feature-dim {}: choose 3, 8 or 16", args.feature_dim)));
+    let method = method(args.method);
+    let recipe = method.recipe();
+    let feature_dim = args.feature_dim.unwrap_or(recipe.feature_dim);
+    if ![3, 8, 16].contains(&feature_dim) {
+        return Err(Error::input(format!("--feature-dim {feature_dim}: choose 3, 8 or 16")));
+    }
+    if recipe.reducer == Reducer::Autoencoder && feature_dim != 3 {
+        return Err(Error::input(format!(
+            "--feature-dim {feature_dim}: the autoencoder of --method langsplat has 3 dimensions; leave it out"
+        )));
     }
     for (flag, value) in
         [("--iterations", args.iterations), ("--language-iterations", args.language_iterations)]
@@ -39,7 +48,8 @@ pub fn run(args: &RunArgs) -> Result<RunPlan> {
         seed: args.seed,
         iterations: args.iterations,
         language_iterations: args.language_iterations,
-        feature_dim: args.feature_dim,
+        method,
+        feature_dim,
         per_level: args.per_level,
         device: args.device.device.clone(),
         deterministic: args.deterministic,
@@ -50,6 +60,15 @@ pub fn run(args: &RunArgs) -> Result<RunPlan> {
 /// The folder of `--models`.
 pub fn models(args: &DeviceArgs) -> Option<PathBuf> {
     args.models.clone()
+}
+
+fn method(method: MethodArg) -> Method {
+    match method {
+        MethodArg::Sparselgs => Method::SparseLgs,
+        MethodArg::Langsplat => Method::LangSplat,
+        MethodArg::Legaussians => Method::LeGaussians,
+        MethodArg::Lsm => Method::Lsm,
+    }
 }
 
 /// The library's preset.
@@ -95,7 +114,7 @@ fn features(text: &str) -> Result<FeatureSource> {
     }
 }
 
-fn existing(flag: &str, path: &str) -> Result<PathBuf> {
+pub(super) fn existing(flag: &str, path: &str) -> Result<PathBuf> {
     let path = PathBuf::from(path);
     if path.exists() {
         return Ok(path);
@@ -132,6 +151,14 @@ mod tests {
         assert_eq!(plan.out, Path::new("out/breakfast"));
         assert_eq!((plan.init, plan.masks), (InitSource::Sfm, MaskSource::Graph));
         assert_eq!((plan.features, plan.feature_dim), (FeatureSource::Words, 16));
+        assert_eq!(plan.method, Method::SparseLgs);
+    }
+
+    #[test]
+    fn each_method_has_its_own_code_length() {
+        for (name, dim) in [("sparselgs", 16), ("langsplat", 3), ("legaussians", 8), ("lsm", 16)] {
+            assert_eq!(plan(&["--method", name]).unwrap().feature_dim, dim, "{name}");
+        }
     }
 
     #[test]
@@ -144,6 +171,7 @@ mod tests {
             (["--matcher", "sift"], "auto, xfeat"),
             (["--feature-dim", "5"], "3, 8 or 16"),
             (["--query", " "], "a few words"),
+            (["--method=langsplat", "--feature-dim=16"], "has 3 dimensions"),
         ] {
             let error = plan(&extra).unwrap_err();
             assert!(error.exit_code() == 2 && error.to_string().contains(says), "{extra:?}: {error}");

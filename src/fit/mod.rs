@@ -1,5 +1,6 @@
 //! Training: losses, schedules, pruning, pose refinement.
 pub mod densify;
+pub mod index_head;
 pub mod init;
 mod language;
 mod lift;

@@ -44,6 +44,11 @@ pub fn write_grey_png(path: &Path, plane: &Plane<f32>) -> Result<()> {
     write_bytes(path, (plane.width, plane.height), &bytes, image::ExtendedColorType::L8)
 }
 
+/// 8-bit grey PNG of given bytes.
+pub fn write_grey_bytes(path: &Path, size: (usize, usize), bytes: &[u8]) -> Result<()> {
+    write_bytes(path, size, bytes, image::ExtendedColorType::L8)
+}
+
 /// 8-bit grey PNG, 0 or 255.
 pub fn write_mask_png(path: &Path, plane: &Plane<bool>) -> Result<()> {
     let bytes: Vec<u8> = plane.data.iter().map(|v| if *v { 255 } else { 0 }).collect();

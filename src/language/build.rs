@@ -1,16 +1,30 @@
 //! Masks with features → aligned things → codebooks and training targets.
 use super::ViewMasks;
 use super::align::{self, AlignOptions, Alignment, PairLinks, links_from_depth};
-use super::codebook::{self, CodeEntry};
+use super::codebook::{self, Built, CodeEntry, autoencoder, quantise};
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, LanguageField, LevelField, Plane};
 use crate::{Error, Result};
+
+/// How embeddings become the short codes that splats carry.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Reducer {
+    /// One code per distinct embedding, bound to it (ALGORITHMS 6).
+    Bijection,
+    /// A scene autoencoder to three dimensions and back, as LangSplat; `feature_dim` is then 3.
+    Autoencoder,
+    /// At most 128 mean features, as LEGaussians; codes are a start for an index head.
+    Quantised,
+}
 
 /// How the language field is built.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BuildOptions {
     /// Alignment thresholds.
     pub align: AlignOptions,
+    /// From embeddings to codes.
+    pub reducer: Reducer,
     /// d, the length of the codes that splats carry.
     pub feature_dim: usize,
     /// Identifies the embedding space, for [`LanguageField::space`].
@@ -22,7 +36,13 @@ pub struct BuildOptions {
 impl Default for BuildOptions {
     fn default() -> Self {
         // 16: codes of up to 200 things stay ghost-free at borders, where 3 gives 95 % ghosts (ALGORITHMS 6.2)
-        BuildOptions { align: AlignOptions::default(), feature_dim: 16, space: String::new(), seed: 0 }
+        BuildOptions {
+            align: AlignOptions::default(),
+            reducer: Reducer::Bijection,
+            feature_dim: 16,
+            space: String::new(),
+            seed: 0,
+        }
     }
 }
 
@@ -92,21 +112,20 @@ fn check_sizes(masks: &[ViewMasks], cameras: &[Camera], depths: &[DepthMap]) -> 
 /// One codebook per level from the components, and the code index of every pixel.
 fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress) -> Result<LanguageField> {
     let mut field = LanguageField { levels: Vec::new(), space: options.space.clone() };
-    for (level, components) in alignment.components.iter().enumerate() {
-        let entries: Vec<CodeEntry> = components
-            .iter()
-            .map(|c| {
-                let masks = &alignment.views[c.medoid.0 as usize].levels[level];
-                let dim = masks.features.len() / masks.quality.len().max(1);
-                let at = c.medoid.1 as usize * dim;
-                CodeEntry {
-                    embedding: masks.features[at..at + dim].to_vec(),
-                    weight: c.weight,
-                    members: c.members.clone(),
-                }
-            })
-            .collect();
-        let built = codebook::build(&entries, options.feature_dim, options.seed)?;
+    let entries: Vec<Vec<CodeEntry>> =
+        (0..alignment.components.len()).map(|l| entries(alignment, l)).collect();
+    let built = match options.reducer {
+        Reducer::Bijection => {
+            let one = |e: &Vec<CodeEntry>| codebook::build(e, options.feature_dim, options.seed);
+            entries.iter().map(one).collect::<Result<Vec<Built>>>()?
+        }
+        Reducer::Quantised => {
+            let one = |e: &Vec<CodeEntry>| quantise::build(e, options.feature_dim, options.seed);
+            entries.iter().map(one).collect()
+        }
+        Reducer::Autoencoder => autoencoder::build(&entries, options.seed)?.0,
+    };
+    for (level, (components, built)) in alignment.components.iter().zip(built).enumerate() {
         if built.codebook.is_empty() {
             progress
                 .warn(&format!("no masks at level {}: it is not trained", crate::scene::LEVEL_NAMES[level]));
@@ -127,6 +146,21 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
         field.levels.push(LevelField { codebook: built.codebook, features: Vec::new(), targets });
     }
     Ok(field)
+}
+
+/// What the components of a level mean.
+fn entries(alignment: &Alignment, level: usize) -> Vec<CodeEntry> {
+    let entry = |c: &align::Component| {
+        let masks = &alignment.views[c.medoid.0 as usize].levels[level];
+        let dim = masks.features.len() / masks.quality.len().max(1);
+        let at = c.medoid.1 as usize * dim;
+        CodeEntry {
+            embedding: masks.features[at..at + dim].to_vec(),
+            weight: c.weight,
+            members: c.members.clone(),
+        }
+    };
+    alignment.components[level].iter().map(entry).collect()
 }
 
 /// Fills the features of a view's masks from an encoder; masks it cannot describe become holes.

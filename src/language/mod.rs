@@ -11,7 +11,7 @@ pub mod dir;
 pub mod graph;
 pub mod matcher;
 
-pub use build::{BuildOptions, Language, attach_features, build};
+pub use build::{BuildOptions, Language, Reducer, attach_features, build};
 
 /// The label map of one level of one view.
 #[derive(Clone, Debug, Default)]

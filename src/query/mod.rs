@@ -5,6 +5,7 @@
 //! map; the mask of the `field` protocol is chosen on codes, so smoothing never moves its edges.
 pub mod eval;
 pub mod filter;
+pub mod protocol;
 
 use crate::scene::{Codebook, LanguageField, Plane};
 use crate::{Error, Result};
@@ -129,7 +130,7 @@ pub fn answer(
     query: &TextQuery,
     options: &QueryOptions,
 ) -> Result<QueryResult> {
-    answer_frame(codes, &field_relevancy(field, query)?, options)
+    answer_with(codes, &field_relevancy(field, query)?, options)
 }
 
 /// [`answer`] in several frames.
@@ -140,11 +141,11 @@ pub fn answer_all(
     options: &QueryOptions,
 ) -> Result<Vec<QueryResult>> {
     let relevancy = field_relevancy(field, query)?;
-    frames.par_iter().map(|codes| answer_frame(codes, &relevancy, options)).collect()
+    frames.par_iter().map(|codes| answer_with(codes, &relevancy, options)).collect()
 }
 
 /// [`code_relevancy`] of every level.
-fn field_relevancy(field: &LanguageField, query: &TextQuery) -> Result<Vec<Vec<f32>>> {
+pub fn field_relevancy(field: &LanguageField, query: &TextQuery) -> Result<Vec<Vec<f32>>> {
     field.levels.iter().map(|level| code_relevancy(&level.codebook, query)).collect()
 }
 
@@ -156,7 +157,12 @@ struct Candidate {
     peak: f32,
 }
 
-fn answer_frame(codes: &[Plane<i32>], relevancy: &[Vec<f32>], options: &QueryOptions) -> Result<QueryResult> {
+/// [`answer`] with the relevancy of every code per level ([`field_relevancy`]).
+pub fn answer_with(
+    codes: &[Plane<i32>],
+    relevancy: &[Vec<f32>],
+    options: &QueryOptions,
+) -> Result<QueryResult> {
     let levels = codes.iter().zip(relevancy).enumerate().filter(|(_, (_, r))| !r.is_empty());
     let mut candidates: Vec<Candidate> = levels
         .map(|(level, (map, relevancy))| {

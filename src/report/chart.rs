@@ -1,4 +1,4 @@
-//! A line chart as inline SVG.
+//! Charts as inline SVG.
 use std::fmt::Write;
 
 const WIDTH: f64 = 400.0;
@@ -59,6 +59,79 @@ pub fn line_chart(points: &[(f64, f64)], x_label: &str, y_label: &str) -> String
     svg
 }
 
+/// One bar of [`bar_chart`].
+#[derive(Clone, Debug)]
+pub struct Bar {
+    /// Bars of one group stand together under its name.
+    pub group: String,
+    /// Left of the bar.
+    pub label: String,
+    /// In [0, 1].
+    pub value: f64,
+    /// A tick to compare with.
+    pub reference: Option<f64>,
+}
+
+/// Horizontal bars of values in [0, 1], a file of its own; empty without bars.
+pub fn bar_chart(bars: &[Bar], title: &str) -> String {
+    const ROW: f64 = 22.0;
+    const BAR_LEFT: f64 = 210.0;
+    if bars.is_empty() {
+        return String::new();
+    }
+    let px = |v: f64| BAR_LEFT + v.clamp(0.0, 1.0) * (WIDTH - BAR_LEFT - 56.0);
+    let mut body = String::new();
+    let mut y = 30.0;
+    let mut group = "";
+    for bar in bars {
+        if bar.group != group {
+            group = &bar.group;
+            // Writing to a String cannot fail.
+            let _ = write!(
+                body,
+                "<text x=\"8\" y=\"{:.1}\" font-weight=\"bold\">{}</text>",
+                y + 15.0,
+                escaped(group)
+            );
+            y += ROW;
+        }
+        let text = y + 15.0;
+        let _ = write!(
+            body,
+            "<text x=\"{}\" y=\"{text:.1}\" text-anchor=\"end\">{}</text><rect x=\"{BAR_LEFT}\" y=\"{:.1}\" \
+             width=\"{:.1}\" height=\"{:.1}\" fill=\"#3b7dd8\"/><text x=\"{:.1}\" y=\"{text:.1}\">{:.3}</text>",
+            BAR_LEFT - 8.0,
+            escaped(&bar.label),
+            y + 3.0,
+            px(bar.value) - BAR_LEFT,
+            ROW - 6.0,
+            px(bar.value) + 6.0,
+            bar.value
+        );
+        if let Some(r) = bar.reference {
+            let _ = write!(
+                body,
+                "<path d=\"M{:.1} {:.1}v{:.1}\" stroke=\"#c0392b\" stroke-width=\"3\"/>",
+                px(r),
+                y + 1.0,
+                ROW - 2.0
+            );
+        }
+        y += ROW;
+    }
+    format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {:.0}\" font-family=\"sans-serif\" \
+         font-size=\"13\"><rect width=\"100%\" height=\"100%\" fill=\"white\"/><text x=\"8\" y=\"18\" \
+         font-size=\"14\">{}</text>{body}</svg>\n",
+        y + 8.0,
+        escaped(title)
+    )
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -78,5 +151,22 @@ mod tests {
     #[test]
     fn steps_are_one_two_or_five() {
         assert_eq!([nice_step(10.0, 5.0), nice_step(19.0, 5.0), nice_step(1000.0, 6.0)], [2.0, 5.0, 200.0]);
+    }
+
+    #[test]
+    fn bars_are_as_long_as_their_values_and_text_is_escaped() {
+        let bar =
+            |label: &str, value, reference| Bar { group: "g".into(), label: label.into(), value, reference };
+        let svg = bar_chart(&[bar("a<b", 0.5, None), bar("c", 1.0, Some(0.25))], "t");
+        let widths: Vec<f64> = svg
+            .split("width=\"")
+            .filter(|s| s.contains("fill=\"#3b7dd8\""))
+            .filter_map(|s| s.split('"').next()?.parse().ok())
+            .collect();
+        assert_eq!(widths.len(), 2);
+        assert!(
+            (widths[1] / widths[0] - 2.0).abs() < 0.01 && svg.contains("a&lt;b") && svg.contains("stroke")
+        );
+        assert_eq!(bar_chart(&[], "t"), "");
     }
 }

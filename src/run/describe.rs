@@ -2,7 +2,7 @@
 //! training, which leave the processor mostly idle where the device is a GPU.
 use super::{RunPlan, sources};
 use crate::infer::{RegionEncoder, Registry};
-use crate::language::{self, BuildOptions, Language, ViewMasks};
+use crate::language::{self, Language, ViewMasks};
 use crate::pose::Geometry;
 use crate::progress::Progress;
 use crate::query::TextQuery;
@@ -48,12 +48,7 @@ impl Describer<'_> {
         };
         let masks = sources::with_features(masks, self.images, self.encoder.as_mut(), progress)?;
         let matches = sources::matches(&dense, geometry, progress)?;
-        let options = BuildOptions {
-            feature_dim: self.plan.feature_dim,
-            space: self.encoder.space().to_owned(),
-            seed: self.plan.seed,
-            ..BuildOptions::default()
-        };
+        let options = self.plan.recipe().build(self.encoder.space(), self.plan.seed);
         let (cameras, depths) = (&geometry.cameras, &geometry.depths);
         let language = language::build(&masks, cameras, depths, &matches, &options, progress)?;
         Ok(Described { queries, language })

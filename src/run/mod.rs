@@ -1,11 +1,14 @@
 //! The whole pipeline on one page: photos → cameras, depth and points → splats → language → scene directory.
 pub mod ask;
 mod describe;
+mod method;
 mod record;
+pub mod score;
 pub mod sources;
 pub mod train;
 pub mod view;
 
+pub use method::{Method, Recipe};
 pub use record::{closing_table, run_record};
 
 use crate::fit::{self, LanguageOptions, Preset, RgbOptions};
@@ -79,6 +82,8 @@ pub struct RunPlan {
     pub iterations: Option<usize>,
     /// Steps of the language stage instead of the preset's.
     pub language_iterations: Option<usize>,
+    /// The method compared, [`Method::SparseLgs`] unless a baseline is wanted.
+    pub method: Method,
     /// Length of the codes.
     pub feature_dim: usize,
     /// One model per level.
@@ -180,13 +185,13 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     };
     let (geometry, trained, described) = side_by_side(reconstruct, train, describer, progress)?;
     let Described { queries, language: built } = described;
-    let spoken = fit::train_language(
+    let spoken = plan.recipe().speak(
         &device,
         &images,
         &trained.cameras,
         &trained.splats,
         built.field,
-        &language_options(plan, preset),
+        language_options(plan, preset),
         progress,
     )?;
 
@@ -253,13 +258,20 @@ fn side_by_side(
     Ok((geometry, trained, described))
 }
 
+impl RunPlan {
+    /// What the method does, with the plan's code length.
+    pub fn recipe(&self) -> Recipe {
+        Recipe { feature_dim: self.feature_dim, ..self.method.recipe() }
+    }
+}
+
 fn rgb_options(plan: &RunPlan, preset: Preset) -> RgbOptions {
     let mut options = RgbOptions::preset(preset);
     options.seed = plan.seed;
     if let Some(n) = plan.iterations {
         options = options.with_iterations(n);
     }
-    options
+    plan.recipe().rgb(options)
 }
 
 fn language_options(plan: &RunPlan, preset: Preset) -> LanguageOptions {

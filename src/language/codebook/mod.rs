@@ -1,5 +1,8 @@
 //! The bijection between embeddings and the short codes that splats carry (ALGORITHMS 6).
+pub(super) mod autoencoder;
+mod network;
 mod pca;
+pub(super) mod quantise;
 mod spread;
 
 use crate::scene::{Codebook, Plane};

@@ -27,6 +27,17 @@ pub const BACKGROUND_LABELS: [&str; 6] =
 /// Views that show fewer pixels of an object do not count for it.
 pub const MIN_OBJECT_PIXELS: usize = 100;
 
+/// What the figures of the report are.
+const DEFINITIONS: [&str; 5] = [
+    "poses: after the similarity that maps the scene's cameras of the train frames onto the true ones",
+    "images: PSNR and SSIM of the 8-bit render; depth: median of |z - z_true| / z_true where both are known",
+    "mask: the codes of the chosen level that are nearly as relevant as the best one in the frame, without smoothing; objects \
+     of at least 100 pixels, surfaces behind them left out",
+    "miou: plain mean of IoU over all (object, frame) pairs; localisation: share of pairs whose most relevant pixel lies on \
+     the object",
+    "train: photos that the scene was made from; test: held-out frames",
+];
+
 /// Pixels less opaque than this have no depth to compare.
 const SOLID: f32 = 0.5;
 
@@ -112,6 +123,8 @@ pub struct Summary {
 /// Everything `splatvk eval` reports.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Report {
+    /// What each figure is, one line each.
+    pub definitions: Vec<String>,
     /// Per train view.
     pub poses: Vec<PoseScore>,
     /// Per rendered frame.
@@ -225,6 +238,7 @@ impl Evaluation {
 
     /// The report with its means.
     pub fn finish(mut self) -> Report {
+        self.report.definitions = DEFINITIONS.map(String::from).to_vec();
         for split in [Split::Train, Split::Test] {
             let summary = summarise(&self.report, split);
             self.report.summary.insert(split.name().to_string(), summary);

@@ -1,0 +1,111 @@
+//! `splatvk ablate`
+use super::args::{AblateArgs, TableArg};
+use super::plan::existing;
+use super::progress::Terminal;
+use super::{print, print_json};
+use crate::ablate::{self, Finished, Lab, Plan, Source, Table};
+use crate::format::{create_folder, write_json};
+use crate::gpu::Device;
+use crate::infer::Registry;
+use crate::query::eval::GroundTruth;
+use crate::synth::regions::Flaws;
+use crate::{Error, Result};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+pub fn ablate(args: &AblateArgs) -> Result<()> {
+    let plan = plan(args)?;
+    let truth = GroundTruth::read(&args.data)?;
+    if truth.labels.is_empty() {
+        return Err(Error::input(format!(
+            "{}: no labels to ask for in ground_truth.json",
+            args.data.display()
+        )));
+    }
+    let out = args.out.clone().unwrap_or_else(|| default_out(&args.data));
+    create_folder(&out).map_err(|e| Error::input(format!("{e}; choose another --out")))?;
+    let registry = Registry::open(args.device.models.as_deref())?;
+    let device = Device::open(args.device.device.as_deref())?;
+    let (clock, name) = (Instant::now(), device.info().name.clone());
+    let progress = Terminal::new();
+    let mut lab = Lab::open(device, registry, truth, plan.seed, &progress);
+    let mut tables: Vec<Value> = Vec::new();
+    let mut report = Value::Null;
+    for &table in &plan.tables {
+        let finished = ablate::run(&mut lab, &plan, table)?;
+        tables.push(finished.json());
+        report = json!({
+            "program": format!("splatvk {}", env!("CARGO_PKG_VERSION")), "data": args.data, "device": name, "plan": plan,
+            "seconds": clock.elapsed().as_secs_f64(), "tables": tables,
+        });
+        // Kept after every table: a long run that is stopped leaves what it has.
+        write(&out, &finished, &report)?;
+        if !args.device.json {
+            print(&format!("{}\n", finished.text()))?;
+        }
+    }
+    if args.device.json {
+        return print_json(&report);
+    }
+    print(&format!("tables and charts are in {} ({:.0} s)\n", out.display(), clock.elapsed().as_secs_f64()))
+}
+
+fn write(out: &Path, finished: &Finished, report: &Value) -> Result<()> {
+    let file = |extension: &str| out.join(format!("{}.{extension}", finished.table.name()));
+    std::fs::write(file("txt"), finished.text()).map_err(Error::io(file("txt")))?;
+    std::fs::write(file("svg"), finished.svg()).map_err(Error::io(file("svg")))?;
+    write_json(&out.join("ablate.json"), report)
+}
+
+fn default_out(data: &Path) -> PathBuf {
+    let folder = data.canonicalize().unwrap_or_else(|_| data.to_path_buf());
+    let name = folder.file_name().map_or_else(|| "data".into(), |n| n.to_string_lossy().into_owned());
+    Path::new("out").join(format!("ablate-{name}"))
+}
+
+fn plan(args: &AblateArgs) -> Result<Plan> {
+    let default = Plan::default();
+    for (flag, value) in
+        [("--iterations", args.iterations), ("--language-iterations", args.language_iterations)]
+    {
+        if value == Some(0) {
+            return Err(Error::input(format!("{flag} 0: give at least 1, or leave it out")));
+        }
+    }
+    Ok(Plan {
+        tables: tables(args.table),
+        source: args.regions.as_deref().map(|s| source(s, args.seed)).transpose()?,
+        views: args.views,
+        seed: args.seed,
+        iterations: args.iterations.unwrap_or(default.iterations),
+        language_iterations: args.language_iterations.unwrap_or(default.language_iterations),
+    })
+}
+
+fn tables(table: TableArg) -> Vec<Table> {
+    match table {
+        TableArg::All => Table::ALL.to_vec(),
+        TableArg::Alignment => vec![Table::Alignment],
+        TableArg::Bijection => vec![Table::Bijection],
+        TableArg::Dimension => vec![Table::Dimension],
+        TableArg::ImageLoss => vec![Table::ImageLoss],
+        TableArg::Features => vec![Table::Features],
+        TableArg::Points => vec![Table::Points],
+        TableArg::Views => vec![Table::Views],
+        TableArg::Initializer => vec![Table::Initializer],
+        TableArg::Methods => vec![Table::Methods],
+    }
+}
+
+fn source(text: &str, seed: u64) -> Result<Source> {
+    match text.split_once(':') {
+        Some(("dir", dir)) if !dir.is_empty() => Ok(Source::Dir(existing("--regions", dir)?)),
+        None if text == "built-in" => Ok(Source::BuiltIn),
+        None if text == "flawed" => Ok(Source::Flawed(Flaws::usual(seed))),
+        None if text == "exact" => Ok(Source::Exact),
+        _ => Err(Error::input(format!(
+            "--regions {text}: unknown; use one of: built-in, flawed, exact, dir:DIR"
+        ))),
+    }
+}

@@ -1,0 +1,53 @@
+//! `splatvk generate`
+use super::args::GenerateArgs;
+use super::progress::Terminal;
+use super::{print, print_json};
+use crate::format::Workspace;
+use crate::synth::regions::Flaws;
+use crate::synth::{self, Knobs};
+use crate::{Error, Result};
+
+pub fn generate(args: &GenerateArgs) -> Result<()> {
+    let flaws = flaws(args)?;
+    let workspace = Workspace::create(&args.out, false)?;
+    match &args.from {
+        Some(data) => synth::write_regions(data, workspace.path(), &flaws)?,
+        None => synth::generate(workspace.path(), &knobs(args)?, &flaws, &Terminal::new())?,
+    }
+    let folder = workspace.commit()?;
+    if args.json {
+        return print_json(&serde_json::json!({ "folder": folder }));
+    }
+    print(&format!("data is in {}\n", folder.display()))
+}
+
+fn flaws(args: &GenerateArgs) -> Result<Flaws> {
+    for (flag, rate) in [("--split", args.split), ("--merge", args.merge), ("--wrong", args.wrong)] {
+        if !(0.0..=1.0).contains(&rate) {
+            return Err(Error::input(format!("{flag} {rate}: a rate lies between 0 and 1")));
+        }
+    }
+    if !(args.noise >= 0.0 && args.noise.is_finite()) {
+        return Err(Error::input(format!("--noise {}: give 0 or more", args.noise)));
+    }
+    Ok(Flaws { seed: args.seed, split: args.split, merge: args.merge, wrong: args.wrong, noise: args.noise })
+}
+
+fn knobs(args: &GenerateArgs) -> Result<Knobs> {
+    let size = args.size.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+    let size = size.ok_or_else(|| Error::input(format!("--size {}: write it as 640x480", args.size)))?;
+    Ok(Knobs {
+        seed: args.seed,
+        views: args.views,
+        held_out: args.held_out,
+        size,
+        objects: args.objects,
+        baseline: args.baseline,
+        texture: args.texture,
+        thin: args.thin,
+        occlusion: args.occlusion,
+        similar: args.similar,
+        pose_noise: args.pose_noise,
+        photo_noise: args.photo_noise,
+    })
+}

@@ -1,0 +1,44 @@
+//! Polygons to masks, as the label tools of LERF-OVS are read: vertices truncated to whole pixels, even-odd inside,
+//! outline included (what OpenCV's `fillPoly` draws).
+use crate::scene::Plane;
+
+/// Sets the pixels of a closed polygon. Vertices may lie outside.
+pub fn fill(mask: &mut Plane<bool>, polygon: &[[f64; 2]]) {
+    let points: Vec<[i64; 2]> = polygon.iter().map(|p| p.map(|v| v.trunc() as i64)).collect();
+    let edges = || (0..points.len()).map(|i| (points[i], points[(i + 1) % points.len()]));
+    for (a, b) in edges() {
+        outline(mask, a, b);
+    }
+    for y in 0..mask.height as i64 {
+        // Half-open in y, so that a vertex on the row counts once.
+        let mut crossings: Vec<f64> = edges()
+            .filter(|(a, b)| a[1].min(b[1]) <= y && y < a[1].max(b[1]))
+            .map(|(a, b)| {
+                let t = (y - a[1]) as f64 / (b[1] - a[1]) as f64;
+                a[0] as f64 + t * (b[0] - a[0]) as f64
+            })
+            .collect();
+        crossings.sort_by(f64::total_cmp);
+        for pair in crossings.chunks_exact(2) {
+            for x in pair[0].ceil() as i64..=pair[1].floor() as i64 {
+                set(mask, x, y);
+            }
+        }
+    }
+}
+
+fn set(mask: &mut Plane<bool>, x: i64, y: i64) {
+    if x >= 0 && y >= 0 && x < mask.width as i64 && y < mask.height as i64 {
+        mask.data[y as usize * mask.width + x as usize] = true;
+    }
+}
+
+/// Every pixel of an 8-connected line (Bresenham): one per step along the longer axis, rounded along the other.
+fn outline(mask: &mut Plane<bool>, a: [i64; 2], b: [i64; 2]) {
+    let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
+    let steps = dx.abs().max(dy.abs());
+    for k in 0..=steps {
+        let at = |from: i64, d: i64| from + (2 * k * d + steps).div_euclid((2 * steps).max(1));
+        set(mask, at(a[0], dx), at(a[1], dy));
+    }
+}

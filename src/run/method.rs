@@ -1,0 +1,188 @@
+//! The compared methods as configurations of one engine: each shares photos, cameras, stereo points and every pass with the
+//! default, and changes only what its authors do differently to language.
+use super::view::Viewer;
+use crate::Result;
+use crate::fit::scale::SceneScale;
+use crate::fit::{self, LanguageOptions, RgbOptions, TrainedLanguage, index_head};
+use crate::gpu::Device;
+use crate::language::align::AlignOptions;
+use crate::language::{BuildOptions, Reducer};
+use crate::progress::Progress;
+use crate::scene::{Camera, LanguageField, RgbImage, Splats};
+use serde::Serialize;
+
+/// A method of the paper's comparison. All start from dense points of the photos, as the paper's "-s" rows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Method {
+    /// Alignment in three steps, bijection, image loss.
+    #[default]
+    SparseLgs,
+    /// A scene autoencoder to 3 dimensions, features only, no alignment (Qin et al. 2024).
+    LangSplat,
+    /// A quantised feature codebook with an index head and smoothing in space, no alignment (Shi et al. 2024).
+    LeGaussians,
+    /// Features lifted in one pass onto the points as stereo gives them; nothing is optimised for the scene, and nothing
+    /// aligned (in the manner of LSM, Fan et al. 2024; its network is not part of this program).
+    Lsm,
+}
+
+/// What a method decides.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Recipe {
+    /// Alignment steps 1, 2, 3.
+    pub steps: [bool; 3],
+    /// From embeddings to codes.
+    pub reducer: Reducer,
+    /// Length of the codes.
+    pub feature_dim: usize,
+    /// Weight of the photos' loss in the language stage.
+    pub image_weight: f64,
+    /// Only features move in the language stage.
+    pub features_only: bool,
+    /// Optimise the scene at all.
+    pub optimise: bool,
+    /// Smooth features in space and train a head that reads the codebook index from them.
+    pub index_head: bool,
+}
+
+impl Method {
+    /// What the method does, with codes of the length its authors use.
+    pub fn recipe(self) -> Recipe {
+        let ours = Recipe {
+            steps: [true; 3],
+            reducer: Reducer::Bijection,
+            feature_dim: FEATURE_DIM,
+            image_weight: IMAGE_WEIGHT,
+            features_only: false,
+            optimise: true,
+            index_head: false,
+        };
+        let theirs = Recipe { steps: [false; 3], image_weight: 0.0, features_only: true, ..ours };
+        match self {
+            Method::SparseLgs => ours,
+            Method::LangSplat => Recipe { reducer: Reducer::Autoencoder, feature_dim: 3, ..theirs },
+            Method::LeGaussians => {
+                Recipe { reducer: Reducer::Quantised, feature_dim: 8, index_head: true, ..theirs }
+            }
+            Method::Lsm => Recipe { optimise: false, ..theirs },
+        }
+    }
+}
+
+/// Codes of up to 200 things stay apart at borders; with 3 numbers they do not (ALGORITHMS 6.2).
+const FEATURE_DIM: usize = 16;
+
+/// λ2 of the paper.
+const IMAGE_WEIGHT: f64 = 0.3;
+
+impl Recipe {
+    /// For [`crate::language::build`].
+    pub fn build(&self, space: &str, seed: u64) -> BuildOptions {
+        let [matching, fusion, reprojection] = self.steps;
+        BuildOptions {
+            align: AlignOptions { matching, fusion, reprojection, ..AlignOptions::default() },
+            reducer: self.reducer,
+            feature_dim: self.feature_dim,
+            space: space.to_owned(),
+            seed,
+        }
+    }
+
+    /// The colour stage of this recipe.
+    pub fn rgb(&self, options: RgbOptions) -> RgbOptions {
+        if self.optimise { options } else { options.with_iterations(0) }
+    }
+
+    /// The language stage of this recipe, from codes and targets to features.
+    pub fn speak(
+        &self,
+        device: &Device,
+        images: &[RgbImage],
+        cameras: &[Camera],
+        splats: &Splats,
+        field: LanguageField,
+        options: LanguageOptions,
+        progress: &dyn Progress,
+    ) -> Result<TrainedLanguage> {
+        let (options, seed) = (self.language(options.clone()), options.seed);
+        let mut spoken = fit::train_language(device, images, cameras, splats, field, &options, progress)?;
+        if self.index_head {
+            read_by_index(device, cameras, &mut spoken, seed)?;
+        }
+        Ok(spoken)
+    }
+
+    /// The options of the language stage.
+    fn language(&self, mut options: LanguageOptions) -> LanguageOptions {
+        options.image_weight = self.image_weight;
+        options.detach_geometry |= self.features_only;
+        if !self.optimise {
+            // Lifting is the one pass.
+            (options.iterations, options.lift) = (0, true);
+        }
+        options
+    }
+}
+
+/// Labelled pixels per view that an index head is trained on: some thousand in all pin its few hundred numbers.
+const HEAD_SAMPLES: usize = 4000;
+
+/// Smooths the features in space and trains the index head of every level on what the photos' views then show.
+fn read_by_index(device: &Device, cameras: &[Camera], spoken: &mut TrainedLanguage, seed: u64) -> Result<()> {
+    let extent = SceneScale::measure(cameras, &spoken.splats.means).extent;
+    for level in &mut spoken.field.levels {
+        let d = level.features.len() / spoken.splats.len().max(1);
+        index_head::smooth(&spoken.splats, &mut level.features, d, extent);
+    }
+    let mut viewer = Viewer::new(device, &spoken.splats, &spoken.field)?;
+    let dims: Vec<usize> =
+        spoken.field.levels.iter().map(|l| l.features.len() / spoken.splats.len().max(1)).collect();
+    let total: usize = dims.iter().sum();
+    let mut samples: Vec<(Vec<f32>, Vec<u32>)> = vec![Default::default(); dims.len()];
+    for (view, camera) in cameras.iter().enumerate() {
+        let frame = viewer.view_with_features(camera)?.frame;
+        let mut first = 0;
+        for ((level, &d), (features, labels)) in spoken.field.levels.iter().zip(&dims).zip(&mut samples) {
+            let Some(targets) = level.targets.get(view) else { continue };
+            let step = targets.data.len().div_ceil(HEAD_SAMPLES).max(1);
+            for (p, &label) in targets.data.iter().enumerate().step_by(step) {
+                if let Ok(label) = u32::try_from(label) {
+                    let at = p * total + first;
+                    features.extend_from_slice(&frame.features[at..at + d]);
+                    labels.push(label);
+                }
+            }
+            first += d;
+        }
+    }
+    for (level, (features, labels)) in spoken.field.levels.iter_mut().zip(samples) {
+        index_head::train_head(&mut level.codebook, &features, &labels, seed);
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::Preset;
+
+    #[test]
+    fn the_default_changes_nothing_and_each_baseline_what_it_should() {
+        let preset = LanguageOptions::preset(Preset::Draft);
+        let ours = Method::default().recipe();
+        assert_eq!(ours.language(preset.clone()), preset);
+        assert_eq!(ours.rgb(RgbOptions::preset(Preset::Draft)), RgbOptions::preset(Preset::Draft));
+        let build = ours.build("x", 3);
+        assert_eq!(build, BuildOptions { space: "x".into(), seed: 3, ..BuildOptions::default() });
+        for method in [Method::LangSplat, Method::LeGaussians, Method::Lsm] {
+            let recipe = method.recipe();
+            let align = recipe.build("x", 0).align;
+            assert!(!align.matching && !align.fusion && !align.reprojection, "{method:?}");
+            let language = recipe.language(preset.clone());
+            assert!(language.detach_geometry && language.image_weight == 0.0);
+            assert_eq!(language.iterations == 0, method == Method::Lsm);
+        }
+        assert_eq!(Method::Lsm.recipe().rgb(RgbOptions::preset(Preset::Draft)).iterations, 0);
+    }
+}

@@ -1,0 +1,116 @@
+//! Synthetic scenes on disk, in the layout of a ground-truth folder.
+use super::regions::{self, Flaws};
+use super::render::{self, Seen};
+use super::scene::{Knobs, world};
+use crate::format::npy::{self, NpyArray, NpyData};
+use crate::format::{cameras, create_folder, picture, write_json};
+use crate::progress::Progress;
+use crate::query::eval::{Frame, GroundTruth, Split};
+use crate::scene::Camera;
+use crate::{Error, Result};
+use half::f16;
+use serde_json::json;
+use std::path::Path;
+
+/// JPEG quality of the photos: no visible artefacts.
+const QUALITY: u8 = 95;
+
+/// Makes a scene and writes it: photos, held-out views, depth, masks, cameras, and regions without and with flaws.
+pub fn generate(folder: &Path, knobs: &Knobs, flaws: &Flaws, progress: &dyn Progress) -> Result<()> {
+    let world = world(knobs)?;
+    for name in ["images", "held_out", "depth", "masks"] {
+        create_folder(&folder.join(name))?;
+    }
+    let all =
+        world.train.iter().map(|c| (c, Split::Train)).chain(world.test.iter().map(|c| (c, Split::Test)));
+    let all: Vec<(&Camera, Split)> = all.collect();
+    progress.begin("render", all.len() as u64);
+    let mut frames = Vec::new();
+    for (i, (camera, split)) in all.into_iter().enumerate() {
+        progress.check()?;
+        let seen = render::render(&world, camera, knobs.photo_noise, knobs.seed.wrapping_add(i as u64));
+        let file = write_view(folder, camera, split, &seen)?;
+        frames.push(frame_json(camera, split, &file));
+        progress.step(i as u64 + 1, "");
+    }
+    progress.end();
+    let labels: serde_json::Map<String, serde_json::Value> =
+        world.things.iter().map(|t| (t.label.to_string(), json!(t.phrase))).collect();
+    let truth = json!({
+        "width": knobs.size.0, "height": knobs.size.1, "labels": labels,
+        "convention": "OpenCV world-to-camera, metres, pinhole", "frames": frames, "knobs": knobs,
+    });
+    write_json(&folder.join("ground_truth.json"), &truth)?;
+    cameras::write_json(&folder.join("cameras_noisy.json"), &world.noisy)?;
+    write_regions(folder, folder, flaws)
+}
+
+/// Writes `regions_exact/` and `regions_flawed/` for the photos of a ground-truth folder that has masks.
+pub fn write_regions(data: &Path, out: &Path, flaws: &Flaws) -> Result<()> {
+    let truth = GroundTruth::read(data)?;
+    let photos: Vec<&Frame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
+    let phrases: Vec<String> = truth.labels.values().cloned().collect();
+    for (name, flaws) in [("regions_exact", &Flaws::NONE), ("regions_flawed", flaws)] {
+        regions::write(&out.join(name), &photos, &regions::regions(&truth, &photos, flaws)?, &phrases)?;
+    }
+    Ok(())
+}
+
+fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &Seen) -> Result<String> {
+    let place = if split == Split::Train { "images" } else { "held_out" };
+    let (name, file) = (&camera.name, format!("{place}/{}.jpg", camera.name));
+    let path = folder.join(&file);
+    std::fs::write(&path, picture::jpeg_bytes(&seen.image, QUALITY)?).map_err(Error::io(&path))?;
+    let shape = vec![seen.depth.height, seen.depth.width];
+    let depth = NpyData::F16(seen.depth.data.iter().map(|z| f16::from_f32(*z)).collect());
+    let path = folder.join("depth").join(format!("{name}.npz"));
+    npy::write_npz(path, &[("depth", &NpyArray { shape, data: depth })])?;
+    let path = folder.join("masks").join(format!("{name}.png"));
+    let bytes: Vec<u8> = seen.objects.data.iter().map(|&o| o as u8).collect();
+    let size = (seen.objects.width, seen.objects.height);
+    picture::write_grey_bytes(&path, size, &bytes)?;
+    Ok(file)
+}
+
+fn frame_json(c: &Camera, split: Split, file: &str) -> serde_json::Value {
+    let (r, t) = (c.pose.rotation, c.pose.translation);
+    let row = |k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], t[k]];
+    json!({
+        "split": split, "file": file, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
+        "world_to_camera": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::progress::Silent;
+
+    #[test]
+    fn a_generated_folder_reads_back_as_ground_truth() {
+        let dir = tempfile::tempdir().unwrap();
+        let knobs = Knobs { seed: 1000, size: (160, 120), views: 3, held_out: 2, ..Knobs::default() };
+        generate(dir.path(), &knobs, &Flaws::usual(1000), &Silent).unwrap();
+        let truth = GroundTruth::read(dir.path()).unwrap();
+        let made = world(&knobs).unwrap();
+        assert_eq!((truth.frames.len(), truth.labels.len()), (5, made.things.len()));
+        for (frame, camera) in truth.frames.iter().zip(made.train.iter().chain(&made.test)) {
+            assert_eq!(frame.stem, camera.name);
+            assert!((frame.camera.pose.centre() - camera.pose.centre()).length() < 1e-12);
+            let seen = render::render(&made, camera, 0.0, 0);
+            assert_eq!(truth.objects(frame).unwrap().unwrap(), seen.objects);
+            let depth = truth.depth(frame).unwrap().unwrap();
+            // float16 has 11 bits
+            assert!(depth.data.iter().zip(&seen.depth.data).all(|(a, b)| (a - b).abs() <= b * 5e-4));
+            let photo = truth.image(frame).unwrap();
+            assert!(crate::pass::metrics::psnr(&photo, &seen.image) > 30.0);
+        }
+        let noisy = cameras::read(&dir.path().join("cameras_noisy.json")).unwrap();
+        assert_eq!(noisy.len(), 3);
+        for name in ["regions_exact", "regions_flawed"] {
+            let photo = crate::photo::load(&dir.path().join("images/train_01.jpg")).unwrap();
+            let view = crate::language::dir::read_view(&dir.path().join(name), &photo, true).unwrap();
+            assert!(view.levels.iter().all(|l| !l.quality.is_empty()));
+        }
+    }
+}

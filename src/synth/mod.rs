@@ -1,0 +1,11 @@
+//! Data with a known answer: scenes with exact cameras, depth, masks and phrases, and regions with injected errors.
+mod folder;
+pub mod regions;
+mod render;
+mod scene;
+mod shapes;
+
+pub use folder::{generate, write_regions};
+pub use render::{Seen, render};
+pub use scene::{Knobs, Thing, World, world};
+pub use shapes::{Hit, Paint, Shape};

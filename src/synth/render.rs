@@ -1,0 +1,171 @@
+//! Ray casting: photo, depth and mask of a synthetic scene.
+use super::scene::{Thing, World};
+use super::shapes::Hit;
+use crate::fit::schedule::Random;
+use crate::scene::{Camera, Plane, RgbImage};
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+
+/// Towards the light.
+const LIGHT: DVec3 = DVec3::new(-0.4, -0.5, 0.77);
+/// Brightness of a surface that the light does not reach.
+const AMBIENT: f64 = 0.5;
+/// Rays per pixel side: edges of the photo are as soft as a lens makes them.
+const SAMPLES: usize = 2;
+
+/// One view of a scene; depth and mask are those of the pixel centres.
+#[derive(Clone, Debug)]
+pub struct Seen {
+    /// The photo.
+    pub image: RgbImage,
+    /// Camera z, metres.
+    pub depth: Plane<f32>,
+    /// Label per pixel.
+    pub objects: Plane<u32>,
+}
+
+fn first(world: &World, from: DVec3, ray: DVec3) -> Option<(&Thing, Hit)> {
+    let hits = world.things.iter().filter_map(|t| t.shape.hit(from, ray).map(|h| (t, h)));
+    hits.min_by(|a, b| a.1.t.total_cmp(&b.1.t))
+}
+
+/// Renders a view; `noise` is the standard deviation of the photo's noise.
+pub fn render(world: &World, camera: &Camera, noise: f64, seed: u64) -> Seen {
+    let (w, h) = (camera.width as usize, camera.height as usize);
+    let to_world = camera.pose.inverse();
+    let centre = to_world.translation;
+    // The ray has camera z 1: its parameter is the depth.
+    let cast = |u: f64, v: f64| first(world, centre, to_world.rotation * camera.ray(DVec2::new(u, v)));
+    let pixels: Vec<([f32; 3], f32, u32)> = (0..w * h)
+        .into_par_iter()
+        .map(|p| {
+            let (x, y) = ((p % w) as f64, (p / w) as f64);
+            let (depth, label) = cast(x + 0.5, y + 0.5).map_or((0.0, 0), |(t, h)| (h.t as f32, t.label));
+            let mut sum = [0.0; 3];
+            for k in 0..SAMPLES * SAMPLES {
+                let at = |i: usize| (i as f64 + 0.5) / SAMPLES as f64;
+                if let Some((thing, hit)) = cast(x + at(k % SAMPLES), y + at(k / SAMPLES)) {
+                    let light = AMBIENT + (1.0 - AMBIENT) * hit.normal.dot(LIGHT).max(0.0);
+                    let colour = thing.paint.at(hit.place);
+                    (0..3).for_each(|c| sum[c] += light * colour[c]);
+                }
+            }
+            let mut random = Random::new(seed ^ (p as u64).wrapping_mul(0x2545_f491_4f6c_dd1d));
+            let shown = sum.map(|v| v / (SAMPLES * SAMPLES) as f64 + noise * random.normal());
+            (shown.map(|v| v.clamp(0.0, 1.0) as f32), depth, label)
+        })
+        .collect();
+    let (width, height) = (w, h);
+    Seen {
+        image: RgbImage { width, height, data: pixels.iter().map(|p| p.0).collect() },
+        depth: Plane { width, height, data: pixels.iter().map(|p| p.1).collect() },
+        objects: Plane { width, height, data: pixels.iter().map(|p| p.2).collect() },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::scene::{Knobs, world};
+    use super::*;
+
+    fn small(seed: u64) -> (World, Vec<Seen>) {
+        let knobs = Knobs { seed, size: (160, 120), thin: 1, similar: 1, held_out: 2, ..Knobs::default() };
+        let world = world(&knobs).unwrap();
+        let seen = world.train.iter().map(|c| render(&world, c, 0.0, 0)).collect();
+        (world, seen)
+    }
+
+    #[test]
+    fn views_agree_on_depth_and_label_where_they_see_the_same_place() {
+        for seed in 1000..1003 {
+            let (world, seen) = small(seed);
+            let (mut same, mut agree, mut label) = (0, 0, 0);
+            for p in 0..160 * 120 {
+                let pixel = DVec2::new((p % 160) as f64 + 0.5, (p / 160) as f64 + 0.5);
+                let x = world.train[0].unproject(pixel, f64::from(seen[0].depth.data[p]));
+                let (q, z) = world.train[1].project(x);
+                if z <= 0.0 || q.x < 0.0 || q.y < 0.0 || q.x >= 160.0 || q.y >= 120.0 {
+                    continue;
+                }
+                // an exact ray at the exact position tells whether the other camera sees that place
+                let to_world = world.train[1].pose.inverse();
+                let ray = to_world.rotation * world.train[1].ray(q);
+                let (thing, hit) = first(&world, to_world.translation, ray).unwrap();
+                if hit.t < z - 1e-4 {
+                    continue;
+                }
+                same += 1;
+                agree += usize::from((hit.t - z).abs() < 1e-6);
+                label += usize::from(thing.label == seen[0].objects.data[p]);
+            }
+            // depth is stored as f32, and two things meet where an object stands on the table
+            assert!(same > 9000 && agree as f64 > 0.995 * same as f64, "{same} {agree}");
+            assert!(label as f64 > 0.995 * same as f64, "{same} {label}");
+        }
+    }
+
+    #[test]
+    fn every_thing_has_its_own_phrase_and_shows_somewhere() {
+        for seed in 1000..1006 {
+            let (world, seen) = small(seed);
+            let mut phrases: Vec<&str> = world.things.iter().map(|t| t.phrase.as_str()).collect();
+            phrases.sort_unstable();
+            let count = phrases.len();
+            phrases.dedup();
+            assert_eq!((phrases.len(), count), (12, 12), "{phrases:?}");
+            for thing in &world.things {
+                let shown = seen.iter().any(|s| s.objects.data.contains(&thing.label));
+                assert!(shown, "{} is nowhere", thing.phrase);
+            }
+        }
+    }
+
+    #[test]
+    fn knobs_do_what_they_say() {
+        let base = Knobs { seed: 1000, size: (160, 120), ..Knobs::default() };
+        let of = |knobs: &Knobs| {
+            let world = world(knobs).unwrap();
+            let seen = render(&world, &world.train[0], knobs.photo_noise, 1);
+            (world, seen)
+        };
+        // bare surfaces: neighbouring pixels of the table are alike
+        let rough = |s: &Seen| {
+            let l = s.image.luma();
+            let pairs =
+                (0..l.data.len() - 1).filter(|&p| s.objects.data[p] == 1 && s.objects.data[p + 1] == 1);
+            pairs.map(|p| (l.data[p] - l.data[p + 1]).abs() as f64).sum::<f64>()
+        };
+        let quiet = Knobs { photo_noise: 0.0, ..base.clone() };
+        let bare = Knobs { texture: 0.0, ..quiet.clone() };
+        assert!(rough(&of(&quiet).1) > 20.0 * rough(&of(&bare).1));
+        // wide baselines
+        let angle = |k: &Knobs| {
+            let w = world(k).unwrap();
+            let axis = |c: &Camera| c.pose.rotation.transpose() * DVec3::Z;
+            axis(&w.train[0]).angle_between(axis(&w.train[1])).to_degrees()
+        };
+        assert!(angle(&Knobs { baseline: 40.0, ..base.clone() }) > angle(&base) + 10.0);
+        // poses err by what was asked
+        let error = |k: &Knobs| {
+            let w = world(k).unwrap();
+            let off = |(a, b): (&Camera, &Camera)| {
+                let r = a.pose.rotation * b.pose.rotation.transpose();
+                ((r.x_axis.x + r.y_axis.y + r.z_axis.z - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees()
+            };
+            w.train.iter().zip(&w.noisy).map(off).sum::<f64>() / w.train.len() as f64
+        };
+        // acos near 1 keeps half of the digits
+        assert!(error(&Knobs { pose_noise: 0.0, ..base.clone() }) < 1e-5);
+        // the mean length of three normal numbers is 1.6 σ; four cameras scatter by a quarter of that
+        let two = error(&Knobs { pose_noise: 2.0, ..base.clone() });
+        assert!((1.5..5.5).contains(&two), "{two}");
+        for bad in [
+            Knobs { views: 1, ..base.clone() },
+            Knobs { objects: 13, ..base.clone() },
+            Knobs { similar: 5, ..base.clone() },
+            Knobs { texture: 2.0, ..base.clone() },
+        ] {
+            assert_eq!(world(&bad).unwrap_err().exit_code(), 2);
+        }
+    }
+}

@@ -1,0 +1,250 @@
+//! Small scenes with everything known: a table with objects before a wall, and the knobs that make them hard.
+use super::shapes::{Paint, Shape};
+use crate::fit::schedule::Random;
+use crate::scene::{Camera, Pose};
+use crate::{Error, Result};
+use glam::{DMat3, DVec2, DVec3};
+use serde::Serialize;
+
+/// What to make and what should be hard about it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Knobs {
+    /// Everything random.
+    pub seed: u64,
+    /// Photos, at least 2.
+    pub views: usize,
+    /// Held-out views.
+    pub held_out: usize,
+    /// Width and height, pixels.
+    pub size: (u32, u32),
+    /// Objects on the table, 1 to 12.
+    pub objects: usize,
+    /// Angle between neighbouring photos, degrees: 20 is easy, 40 and more is wide.
+    pub baseline: f64,
+    /// Contrast of patterns, 1 = plenty to match, 0 = bare surfaces.
+    pub texture: f64,
+    /// Thin poles that stand about.
+    pub thin: usize,
+    /// 0 = objects far apart, 1 = close together and behind each other.
+    pub occlusion: f64,
+    /// Objects that have a look-alike in another place, by one word of their phrase.
+    pub similar: usize,
+    /// Standard deviation of the error of the written starting cameras, degrees; positions err alike.
+    pub pose_noise: f64,
+    /// Standard deviation of the photos' noise, in units of full white.
+    pub photo_noise: f64,
+}
+
+impl Default for Knobs {
+    fn default() -> Self {
+        Knobs {
+            seed: 0,
+            views: 4,
+            held_out: 6,
+            size: (640, 480),
+            objects: 8,
+            baseline: 20.0,
+            texture: 1.0,
+            thin: 0,
+            occlusion: 0.3,
+            similar: 0,
+            pose_noise: 0.5,
+            photo_noise: 0.005,
+        }
+    }
+}
+
+/// A thing with a name.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Thing {
+    /// Index in the masks.
+    pub label: u32,
+    /// What it is called.
+    pub phrase: String,
+    /// Its solid.
+    pub shape: Shape,
+    /// Its surface.
+    pub paint: Paint,
+}
+
+/// A finished scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct World {
+    /// Background first.
+    pub things: Vec<Thing>,
+    /// True cameras of the photos.
+    pub train: Vec<Camera>,
+    /// True cameras of the held-out views.
+    pub test: Vec<Camera>,
+    /// The photos' cameras with errors, to start from.
+    pub noisy: Vec<Camera>,
+}
+
+/// Colour word, colour.
+const COLOURS: [(&str, [f64; 3]); 6] = [
+    ("red", [0.75, 0.12, 0.1]),
+    ("blue", [0.12, 0.25, 0.7]),
+    ("green", [0.15, 0.5, 0.2]),
+    ("yellow", [0.85, 0.75, 0.15]),
+    ("purple", [0.45, 0.2, 0.5]),
+    ("white", [0.85, 0.85, 0.85]),
+];
+const NOUNS: [&str; 6] = ["ball", "box", "can", "book", "brick", "drum"];
+
+impl Knobs {
+    fn check(&self) -> Result<()> {
+        let bad = |what: &str| Err(Error::input(format!("generate: {what}")));
+        match self {
+            k if k.views < 2 => bad("--views: at least 2"),
+            k if !(1..=12).contains(&k.objects) => bad("--objects: 1 to 12"),
+            k if k.similar > k.objects / 2 => bad("--similar: at most half of --objects"),
+            k if k.size.0.min(k.size.1) < 64 || k.size.0.max(k.size.1) > 4096 => {
+                bad("--size: 64 to 4096 pixels a side")
+            }
+            k if !(1.0..=80.0).contains(&k.baseline) => bad("--baseline: 1 to 80 degrees"),
+            k if !(0.0..=1.0).contains(&k.occlusion) || !(0.0..=1.0).contains(&k.texture) => {
+                bad("--occlusion and --texture: 0 to 1")
+            }
+            k if k.pose_noise < 0.0 || !(0.0..=0.5).contains(&k.photo_noise) => {
+                bad("--pose-noise: 0 or more; --photo-noise: 0 to 0.5")
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Builds the scene of a set of knobs.
+pub fn world(knobs: &Knobs) -> Result<World> {
+    knobs.check()?;
+    let mut random = Random::new(knobs.seed ^ 0x5ce7e);
+    let mut things = background(knobs, &mut random);
+    objects(knobs, &mut random, &mut things)?;
+    let middle = (knobs.views - 1) as f64 / 2.0;
+    let train = (0..knobs.views).map(|i| {
+        let azimuth = (i as f64 - middle) * knobs.baseline + 4.0 * (random.uniform() - 0.5);
+        camera(&format!("train_{i:02}"), azimuth, 32.0 + 8.0 * (random.uniform() - 0.5), knobs.size)
+    });
+    let train: Vec<Camera> = train.collect();
+    let test = (0..knobs.held_out).map(|i| {
+        let azimuth = (random.uniform() - 0.5) * (2.0 * middle * knobs.baseline + 6.0);
+        let name = format!("test_{:02}", knobs.views + i);
+        camera(&name, azimuth, 25.0 + 18.0 * random.uniform(), knobs.size)
+    });
+    let test: Vec<Camera> = test.collect();
+    let sigma = knobs.pose_noise.to_radians();
+    let noisy = train.iter().map(|c| {
+        let mut draw = || DVec3::new(random.normal(), random.normal(), random.normal()) * sigma;
+        // The scene is about a metre away: an angle moves the picture as much as that length does.
+        let error = Pose::exp(draw(), draw());
+        Camera { pose: error.compose(&c.pose), ..c.clone() }
+    });
+    let noisy = noisy.collect();
+    Ok(World { things, train, test, noisy })
+}
+
+fn paint(colour: [f64; 3], contrast: f64, grain: f64, random: &mut Random) -> Paint {
+    Paint { colour, contrast, grain, seed: random.bits() }
+}
+
+fn background(knobs: &Knobs, random: &mut Random) -> Vec<Thing> {
+    let mut thing = |label, phrase: &str, shape, colour, grain| Thing {
+        label,
+        phrase: phrase.into(),
+        shape,
+        paint: paint(colour, 0.8 * knobs.texture, grain, random),
+    };
+    let top = Shape::Block(DVec3::new(0.0, 0.0, -0.02), DVec3::new(0.62, 0.55, 0.02), 0.0);
+    vec![
+        thing(1, "wooden table", top, [0.5, 0.35, 0.2], 0.05),
+        thing(2, "plaster wall", Shape::Plane(DVec3::Y, 1.0), [0.6, 0.58, 0.52], 0.12),
+        thing(3, "grey carpet", Shape::Plane(DVec3::Z, -0.6), [0.42, 0.42, 0.44], 0.12),
+    ]
+}
+
+/// Names and solids, placed without overlap; look-alikes and poles last.
+fn objects(knobs: &Knobs, random: &mut Random, things: &mut Vec<Thing>) -> Result<()> {
+    let mut names: Vec<(usize, usize)> =
+        (0..COLOURS.len()).flat_map(|c| (0..NOUNS.len()).map(move |n| (c, n))).collect();
+    random.shuffle(&mut names);
+    let kinds = knobs.objects - knobs.similar;
+    let reach = 0.42 - 0.16 * knobs.occlusion;
+    let mut taken: Vec<(DVec2, f64)> = Vec::new();
+    for (label, k) in (4..).zip(0..knobs.objects + knobs.thin) {
+        let like = k.checked_sub(kinds).filter(|_| k < knobs.objects);
+        let (phrase, colour, noun) = if k >= knobs.objects {
+            (format!("thin pole{}", number(k - knobs.objects)), [0.1, 0.1, 0.12], "pole")
+        } else {
+            let (c, n) = names[like.unwrap_or(k)];
+            let n = NOUNS[n];
+            let word = if like.is_some() { "dark " } else { "" };
+            let dim = if like.is_some() { 0.55 } else { 1.0 };
+            (format!("{word}{} {n}", COLOURS[c].0), COLOURS[c].1.map(|v| v * dim), n)
+        };
+        let (footprint, make) = solid(noun, random);
+        let gap = 0.05 * (1.0 - knobs.occlusion) + 0.01;
+        let at = (0..2000).find_map(|_| {
+            let p = DVec2::new(random.uniform() - 0.5, random.uniform() - 0.5)
+                * 2.0
+                * DVec2::new(reach, 0.85 * reach);
+            taken.iter().all(|(q, r)| p.distance(*q) > footprint + r + gap).then_some(p)
+        });
+        let Some(at) = at else {
+            return Err(Error::input(
+                "generate: no room for so many objects; lower --objects or --occlusion",
+            ));
+        };
+        taken.push((at, footprint));
+        let contrast = if noun == "pole" { 0.2 } else { 0.7 } * knobs.texture;
+        things.push(Thing { label, phrase, shape: make(at), paint: paint(colour, contrast, 0.03, random) });
+    }
+    Ok(())
+}
+
+fn number(k: usize) -> String {
+    if k == 0 { String::new() } else { format!(" {}", k + 1) }
+}
+
+/// Radius on the table, and the solid once its place is known.
+fn solid(noun: &str, random: &mut Random) -> (f64, Box<dyn Fn(DVec2) -> Shape>) {
+    let size = 0.85 + 0.3 * random.uniform();
+    let turn = random.uniform() * std::f64::consts::PI;
+    let block = |x: f64, y: f64, z: f64| -> (f64, Box<dyn Fn(DVec2) -> Shape>) {
+        let half = DVec3::new(x, y, z) * size;
+        (half.truncate().length(), Box::new(move |p| Shape::Block(p.extend(half.z), half, turn)))
+    };
+    match noun {
+        "ball" => {
+            let r = 0.055 * size;
+            (r, Box::new(move |p| Shape::Ball(p.extend(r), r)))
+        }
+        "box" => block(0.055, 0.045, 0.08),
+        "book" => block(0.08, 0.06, 0.015),
+        "brick" => block(0.07, 0.035, 0.03),
+        "can" => (0.035 * size, Box::new(move |p| Shape::Can(p.extend(0.0), 0.035 * size, 0.12 * size))),
+        "drum" => (0.065 * size, Box::new(move |p| Shape::Can(p.extend(0.0), 0.065 * size, 0.06 * size))),
+        // a pole of 8 mm is 4 pixels wide at the usual size
+        _ => (0.02, Box::new(|p| Shape::Can(p.extend(0.0), 0.004, 0.24))),
+    }
+}
+
+/// A camera on a sphere around the table's middle, looking at it.
+fn camera(name: &str, azimuth: f64, elevation: f64, (width, height): (u32, u32)) -> Camera {
+    let (a, e) = (azimuth.to_radians(), elevation.to_radians());
+    let target = DVec3::new(0.0, 0.0, 0.04);
+    let centre = target + 0.95 * DVec3::new(a.sin() * e.cos(), -a.cos() * e.cos(), e.sin());
+    let z = (target - centre).normalize();
+    let x = z.cross(DVec3::Z).normalize();
+    let y = z.cross(x);
+    let rotation = DMat3::from_cols(x, y, z).transpose();
+    let f = 1.025 * f64::from(width);
+    Camera {
+        name: name.into(),
+        width,
+        height,
+        fx: f,
+        fy: f,
+        cx: f64::from(width) / 2.0,
+        cy: f64::from(height) / 2.0,
+        pose: Pose { rotation, translation: -(rotation * centre) },
+    }
+}
