@@ -26,6 +26,8 @@ pub struct Plan {
     pub source: Option<Source>,
     /// Photos of the default row; none = all train frames, at most [`crate::photo::DEFAULT_VIEWS`].
     pub views: Option<usize>,
+    /// Take the true cameras in every row, for photos that alone would give none.
+    pub true_cameras: bool,
     /// Seed of training and of injected errors.
     pub seed: u64,
     /// Steps of the colour stage.
@@ -40,6 +42,7 @@ impl Default for Plan {
             tables: Table::ALL.to_vec(),
             source: None,
             views: None,
+            true_cameras: false,
             seed: 0,
             iterations: RgbOptions::preset(Preset::Draft).iterations,
             language_iterations: LanguageOptions::preset(Preset::Draft).iterations,
@@ -73,7 +76,7 @@ pub fn run(lab: &mut Lab, plan: &Plan, table: Table) -> Result<Finished> {
     }
     let base = Setup {
         views: plan.views.unwrap_or(train.min(crate::photo::DEFAULT_VIEWS)),
-        init: Init::Sfm,
+        init: if plan.true_cameras { Init::TrueCameras } else { Init::Sfm },
         max_points: None,
         source: Source::BuiltIn,
         recipe: Method::SparseLgs.recipe(),

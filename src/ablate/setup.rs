@@ -219,7 +219,7 @@ pub fn rows(table: Table, base: &Setup, sources: &[Source], most_views: usize) -
                 }
             }
             Table::Initializer => {
-                out.push(row("sfm", base.clone(), &[]));
+                out.push(row("sfm", Setup { init: Init::Sfm, ..base.clone() }, &[]));
                 out.push(row("true cameras", Setup { init: Init::TrueCameras, ..base.clone() }, &[]));
             }
         }

@@ -77,6 +77,7 @@ fn plan(args: &AblateArgs) -> Result<Plan> {
         tables: tables(args.table),
         source: args.regions.as_deref().map(|s| source(s, args.seed)).transpose()?,
         views: args.views,
+        true_cameras: args.true_cameras,
         seed: args.seed,
         iterations: args.iterations.unwrap_or(default.iterations),
         language_iterations: args.language_iterations.unwrap_or(default.language_iterations),

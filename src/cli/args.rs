@@ -330,6 +330,9 @@ pub struct AblateArgs {
     /// Photos of the default row [default: all train frames, at most 4]
     #[arg(long, value_name = "N")]
     pub views: Option<usize>,
+    /// Take the true cameras in every row, for photos that alone would give none
+    #[arg(long)]
+    pub true_cameras: bool,
     /// Seed of training and of injected errors
     #[arg(long, default_value_t = 0)]
     pub seed: u64,

@@ -1,0 +1,106 @@
+//! Generated data and the tables on it, as a user runs them.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
+use std::path::Path;
+use std::process::{Command, Output};
+
+fn splatvk(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_splatvk")).args(args).output().unwrap()
+}
+
+fn run(args: &[&str]) -> serde_json::Value {
+    let output = splatvk(args);
+    assert!(output.status.success(), "{args:?}\n{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+fn path(p: &Path) -> &str {
+    p.to_str().unwrap()
+}
+
+/// One small scene through generate, ablate, run with its `dir:` regions, and eval under two protocols.
+#[test]
+fn a_generated_scene_is_ablated_reconstructed_and_scored() {
+    let folder = tempfile::tempdir().unwrap();
+    let (data, out) = (folder.path().join("data"), folder.path().join("tables"));
+    let small = [
+        "--size",
+        "160x120",
+        "--views",
+        "3",
+        "--held-out",
+        "2",
+        "--objects",
+        "4",
+        "--seed",
+        "1000",
+        "--json",
+    ];
+    run(&[&["generate", "--out", path(&data)], &small[..]].concat());
+    let short = ["--iterations", "10", "--language-iterations", "2", "--true-cameras", "--json"];
+    let report = run(&[
+        &["ablate", "bijection", "--data", path(&data), "--out", path(&out), "--regions", "exact"],
+        &short[..],
+    ]
+    .concat());
+    let rows = report["tables"][0]["rows"].as_array().unwrap();
+    assert_eq!(rows.len(), 4);
+    let figure = |row: usize, name: &str| rows[row]["figures"][name].as_f64();
+    // the bijection keeps every meaning, whatever the dimension; one photo in four objects' size is coarse, though
+    assert!(
+        figure(0, "SIM").unwrap() > figure(2, "SIM").unwrap() && figure(0, "mIoU").unwrap() > 0.3,
+        "{rows:?}"
+    );
+    assert!(figure(3, "mIoU").is_none() && figure(3, "MB").unwrap() > 10.0 * figure(0, "MB").unwrap());
+    for file in ["bijection.txt", "bijection.svg", "ablate.json"] {
+        assert!(out.join(file).metadata().unwrap().len() > 100, "{file}");
+    }
+    let (scene, regions) =
+        (folder.path().join("scene"), format!("dir:{}", path(&data.join("regions_exact"))));
+    let init = format!("cameras:{}", path(&data.join("cameras_noisy.json")));
+    let images = data.join("images");
+    let plan = ["--iterations", "10", "--language-iterations", "2", "--method", "langsplat", "--json"];
+    let source = ["--masks", &regions, "--features", &regions, "--init", &init, "--views", "3"];
+    let record = run(&[&["run", path(&images), "--out", path(&scene)], &source[..], &plan[..]].concat());
+    assert_eq!(record["config"]["plan"]["method"], "langsplat");
+    assert_eq!(record["config"]["plan"]["feature_dim"], 3);
+    for (protocol, figure) in [("lerf", "localisation"), ("3dovs", "miou_argmax")] {
+        let kept = folder.path().join(protocol);
+        let report = run(&[
+            "eval",
+            path(&scene),
+            "--ground-truth",
+            path(&data),
+            "--protocol",
+            protocol,
+            "--out",
+            path(&kept),
+            "--json",
+        ]);
+        let value = report["summary"]["test"][figure].as_f64().unwrap();
+        assert!((0.0..=1.0).contains(&value) && report["definitions"].as_array().unwrap().len() >= 4);
+        assert!(kept.join("masks").is_dir() && kept.join("eval.json").is_file());
+    }
+}
+
+#[test]
+fn what_cannot_be_done_is_one_line_and_exit_code_two() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let o = path(&out);
+    let breakfast = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast");
+    for (args, says) in [
+        (vec!["generate", "--out", o, "--size", "wide"], "640x480"),
+        (vec!["generate", "--out", o, "--objects", "40"], "--objects"),
+        (vec!["generate", "--out", o, "--wrong", "2"], "--wrong"),
+        (vec!["generate", "--out", o, "--from", o], "ground_truth.json"),
+        (vec!["ablate", "all", "--data", o, "--out", o], "ground_truth.json"),
+        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--regions", "clip"], "--regions clip"),
+        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--iterations", "0"], "--iterations 0"),
+    ] {
+        let output = splatvk(&args);
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{args:?}\n{text}");
+        assert!(text.lines().count() == 1 && text.contains(says), "{args:?}\n{text}");
+        assert!(!out.exists(), "{args:?} left something behind");
+    }
+}
