@@ -80,6 +80,15 @@ fn a_generated_scene_is_ablated_reconstructed_and_scored() {
         assert!((0.0..=1.0).contains(&value) && report["definitions"].as_array().unwrap().len() >= 4);
         assert!(kept.join("masks").is_dir() && kept.join("eval.json").is_file());
     }
+    let truth: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(data.join("ground_truth.json")).unwrap()).unwrap();
+    let (phrase, answers) = (truth["labels"]["4"].as_str().unwrap(), folder.path().join("answers"));
+    let report = run(&["query", path(&scene), phrase, "--splats", "--out", path(&answers), "--json"]);
+    let chosen = &report["queries"][0]["splats"];
+    let part = splatvk::format::ply::read_splats(&answers.join(chosen["file"].as_str().unwrap())).unwrap();
+    let all = splatvk::format::ply::read_splats(&scene.join("point_cloud.ply")).unwrap();
+    assert_eq!(part.len() as u64, chosen["count"].as_u64().unwrap());
+    assert!(!part.is_empty() && part.len() < all.len() / 2, "{} of {}", part.len(), all.len());
 }
 
 #[test]

@@ -244,6 +244,9 @@ pub struct QueryArgs {
     /// Folder for heat maps and masks
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// Also write the splats that each text means, as TEXT/splats.ply
+    #[arg(long)]
+    pub splats: bool,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,

@@ -4,6 +4,7 @@ use super::encoder;
 use super::outputs::Outputs;
 use super::progress;
 use super::{print, print_json, views};
+use crate::format::ply::{self, PlyOptions};
 use crate::format::{cameras, picture, scene_dir, write_json};
 use crate::gpu::Device;
 use crate::infer::Registry;
@@ -72,9 +73,24 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         progress.step((part * AT_ONCE + cameras.len()) as u64, "");
     }
     progress.end();
-    let queries = args.texts.iter().zip(&views).zip(&latency);
-    let queries = queries.map(|((t, v), ms)| json!({ "text": t, "milliseconds": ms, "views": v }));
-    let report = json!({ "scene": args.scene, "out": args.out, "queries": queries.collect::<Vec<_>>() });
+    let mut queries = Vec::new();
+    for (q, text) in args.texts.iter().enumerate() {
+        let mut entry = json!({ "text": text, "milliseconds": latency[q], "views": views[q] });
+        if args.splats {
+            let chosen = ready.select(text, &QueryOptions::default())?;
+            let name = format!("{}/splats.ply", folders[q]);
+            ply::write_splats(
+                &out.file(&name)?,
+                &scene.splats.picked(&chosen.splats),
+                PlyOptions::default(),
+            )?;
+            entry["splats"] = json!({
+                "count": chosen.splats.len(), "level": LEVEL_NAMES[chosen.level], "found": chosen.found, "file": name,
+            });
+        }
+        queries.push(entry);
+    }
+    let report = json!({ "scene": args.scene, "out": args.out, "queries": queries });
     write_json(&out.file("answers.json")?, &report)?;
     out.keep();
     if args.device.json { print_json(&report) } else { print(&table(&args.texts, &views, &latency, args)) }

@@ -6,6 +6,7 @@
 pub mod eval;
 pub mod filter;
 pub mod protocol;
+pub mod select;
 
 use crate::scene::{Codebook, LanguageField, Plane};
 use crate::{Error, Result};
@@ -220,15 +221,27 @@ fn margin(relevancy: f32) -> f32 {
 
 /// Index of the candidate that answers.
 fn choose_level(candidates: &[Candidate], options: &QueryOptions) -> Option<usize> {
-    let top = candidates.iter().map(|c| c.peak).fold(f32::NEG_INFINITY, f32::max);
+    let peaks: Vec<f32> = candidates.iter().map(|c| c.peak).collect();
     match options.mask {
-        MaskRule::Codes(_) if top > 0.0 => {
-            let bar = ((1.0 - options.slack.share) * top - options.slack.margin).max(0.0);
-            candidates.iter().rposition(|c| c.peak > 0.0 && c.peak >= bar)
-        }
-        // ties go to the finer level
-        _ => candidates.iter().position(|c| c.peak >= top),
+        MaskRule::Codes(_) => coarsest_good(&peaks, options.slack),
+        MaskRule::Lerf(_) => first_best(&peaks),
     }
+}
+
+/// The first of the highest: ties go to the finer level.
+fn first_best(peaks: &[f32]) -> Option<usize> {
+    let top = peaks.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    peaks.iter().position(|&p| p >= top)
+}
+
+/// The last level whose margin the best one's does not clearly exceed; the best one where no phrase is near.
+fn coarsest_good(peaks: &[f32], slack: Slack) -> Option<usize> {
+    let top = peaks.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    if top > 0.0 {
+        let bar = ((1.0 - slack.share) * top - slack.margin).max(0.0);
+        return peaks.iter().rposition(|&p| p > 0.0 && p >= bar);
+    }
+    first_best(peaks)
 }
 
 /// Relevancy summed over the levels.
@@ -254,6 +267,12 @@ fn locate(evidence: &[f32], mask: &Plane<bool>) -> (usize, usize) {
     (p % mask.width.max(1), p / mask.width.max(1))
 }
 
+/// Relevancy from which a code joins the best one. Above 0.5 a code is closer to the phrase than to every canonical; the
+/// bar lies a share of the way from there.
+fn code_bar(top: f32, share: f32) -> f32 {
+    if top > 0.5 { 0.5 + share * (top - 0.5) } else { top }
+}
+
 /// Pixels of the codes that answer the query ([`MaskRule::Codes`]). Only codes that this frame shows compete, so that a
 /// code seen elsewhere does not suppress the best one here.
 fn code_mask(map: &Plane<i32>, relevancy: &[f32], share: f32) -> Plane<bool> {
@@ -265,8 +284,7 @@ fn code_mask(map: &Plane<i32>, relevancy: &[f32], share: f32) -> Plane<bool> {
     }
     let visible = relevancy.iter().zip(&shown).filter(|(_, s)| **s).map(|(r, _)| *r);
     let top = visible.fold(0.0f32, f32::max);
-    // above 0.5 a code is closer to the phrase than to every canonical; the bar lies a share of the way from there
-    let bar = if top > 0.5 { 0.5 + share * (top - 0.5) } else { top };
+    let bar = code_bar(top, share);
     let chosen: Vec<bool> = relevancy.iter().map(|&r| r > 0.0 && r >= bar).collect();
     let data = map.data.iter().map(|&k| k >= 0 && chosen.get(k as usize).copied().unwrap_or(false)).collect();
     Plane { width: map.width, height: map.height, data }

@@ -3,6 +3,7 @@ use super::Answers;
 use super::view::{DecodedFrame, Viewer};
 use crate::gpu::Device;
 use crate::infer::RegionEncoder;
+use crate::query::select::{Selection, select};
 use crate::query::{self, CANONICAL_PHRASES, QueryOptions, TextQuery};
 use crate::scene::{Camera, LanguageField, Plane, Splats};
 use crate::{Error, Result};
@@ -60,6 +61,13 @@ impl QueryScene {
     /// The frames of the last [`QueryScene::look`].
     pub fn frames(&self) -> &[DecodedFrame] {
         &self.frames
+    }
+
+    /// The splats that a text means, whatever the views.
+    pub fn select(&mut self, text: &str, options: &QueryOptions) -> Result<Selection> {
+        let embedding = self.encoder.embed_texts(&[text])?;
+        let query = TextQuery { text: text.to_owned(), embedding, canonicals: self.canonicals.clone() };
+        select(&self.field, &query, options)
     }
 
     /// Answers a text in every frame.

@@ -40,6 +40,18 @@ impl Splats {
         self.opacity_logits.append(&mut other.opacity_logits);
         self.sh.append(&mut other.sh);
     }
+    /// The given rows, in their order.
+    pub fn picked(&self, rows: &[usize]) -> Splats {
+        let width = 3 * self.sh_len();
+        Splats {
+            means: rows.iter().map(|&i| self.means[i]).collect(),
+            log_scales: rows.iter().map(|&i| self.log_scales[i]).collect(),
+            quats: rows.iter().map(|&i| self.quats[i]).collect(),
+            opacity_logits: rows.iter().map(|&i| self.opacity_logits[i]).collect(),
+            sh_degree: self.sh_degree,
+            sh: rows.iter().flat_map(|&i| &self.sh[i * width..(i + 1) * width]).copied().collect(),
+        }
+    }
     /// Coefficients per channel.
     pub fn sh_len(&self) -> usize {
         sh_coefficients(self.sh_degree)
