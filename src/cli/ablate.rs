@@ -1,7 +1,7 @@
 //! `splatvk ablate`
 use super::args::{AblateArgs, TableArg};
 use super::plan::existing;
-use super::progress::Terminal;
+use super::progress;
 use super::{print, print_json};
 use crate::ablate::{self, Finished, Lab, Plan, Source, Table};
 use crate::format::{create_folder, write_json};
@@ -28,8 +28,8 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
     let registry = Registry::open(args.device.models.as_deref())?;
     let device = Device::open(args.device.device.as_deref())?;
     let (clock, name) = (Instant::now(), device.info().name.clone());
-    let progress = Terminal::new();
-    let mut lab = Lab::open(device, registry, truth, plan.seed, &progress);
+    let progress = progress::here();
+    let mut lab = Lab::open(device, registry, truth, plan.seed, progress.as_ref());
     let mut tables: Vec<Value> = Vec::new();
     let mut report = Value::Null;
     for &table in &plan.tables {

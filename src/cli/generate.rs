@@ -1,6 +1,6 @@
 //! `splatvk generate`
 use super::args::GenerateArgs;
-use super::progress::Terminal;
+use super::progress;
 use super::{print, print_json};
 use crate::format::Workspace;
 use crate::synth::regions::Flaws;
@@ -12,7 +12,7 @@ pub fn generate(args: &GenerateArgs) -> Result<()> {
     let workspace = Workspace::create(&args.out, false)?;
     match &args.from {
         Some(data) => synth::write_regions(data, workspace.path(), &flaws)?,
-        None => synth::generate(workspace.path(), &knobs(args)?, &flaws, &Terminal::new())?,
+        None => synth::generate(workspace.path(), &knobs(args)?, &flaws, progress::here().as_ref())?,
     }
     let folder = workspace.commit()?;
     if args.json {
