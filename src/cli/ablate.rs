@@ -74,7 +74,7 @@ fn plan(args: &AblateArgs) -> Result<Plan> {
         }
     }
     Ok(Plan {
-        tables: tables(args.table),
+        tables: args.tables.iter().flat_map(|&t| tables(t)).collect(),
         source: args.regions.as_deref().map(|s| source(s, args.seed)).transpose()?,
         views: args.views,
         true_cameras: args.true_cameras,

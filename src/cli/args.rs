@@ -317,9 +317,9 @@ pub enum TableArg {
 /// `splatvk ablate`
 #[derive(Debug, Args)]
 pub struct AblateArgs {
-    /// Which table
-    #[arg(value_enum, value_name = "TABLE")]
-    pub table: TableArg,
+    /// Which tables
+    #[arg(value_enum, required = true, value_name = "TABLE")]
+    pub tables: Vec<TableArg>,
     /// Folder with ground_truth.json, photos and masks
     #[arg(long, value_name = "DIR")]
     pub data: PathBuf,
