@@ -117,6 +117,10 @@ impl Recipe {
     fn language(&self, mut options: LanguageOptions) -> LanguageOptions {
         options.image_weight = self.image_weight;
         options.detach_geometry |= self.features_only;
+        if self.reducer == Reducer::Autoencoder {
+            // Decoding every training pixel against 2048 directions takes the processor longer than the training.
+            options.check_every = 0;
+        }
         if !self.optimise {
             // Lifting is the one pass.
             (options.iterations, options.lift) = (0, true);
