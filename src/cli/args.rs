@@ -390,7 +390,7 @@ pub struct GenerateArgs {
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub similar: usize,
     /// Error of the starting cameras in cameras_noisy.json, degrees
-    #[arg(long, default_value_t = 0.5, value_name = "DEG")]
+    #[arg(long, default_value_t = 0.1, value_name = "DEG")]
     pub pose_noise: f64,
     /// Noise of the photos, share of full white
     #[arg(long, default_value_t = 0.005, value_name = "SHARE")]

@@ -48,7 +48,7 @@ impl Default for Knobs {
             thin: 0,
             occlusion: 0.3,
             similar: 0,
-            pose_noise: 0.5,
+            pose_noise: 0.1,
             photo_noise: 0.005,
         }
     }
