@@ -1,33 +1,80 @@
-//! Stable least-significant-digit radix sort of (key, value) pairs of `u32`.
+//! Stable least-significant-digit radix sort of (key, value) pairs of `u32`, eight bits at a time, in two shapes.
 //!
-//! Every lane owns one contiguous chunk: count digits, turn the counts into places, move; eight bits at a time. Measured
-//! on lavapipe (Mesa 22.3.6, two cores): 100k pairs by 32 bits in about 3 ms, where a classic 256-thread 4-bit sort takes
-//! 180. Nothing depends on the subgroup size, so it is correct on any device; a GPU would want more lanes per
-//! workgroup than shared memory for private counters allows.
+//! [`Shape::Chunks`] gives every lane one contiguous chunk: count digits, turn the counts into places, move. Measured on
+//! lavapipe (Mesa 22.3.6, two cores): 100k pairs by 32 bits in about 3 ms, where a classic 256-thread 4-bit sort takes 180.
+//! [`Shape::Sweep`] is for GPUs, after Adinets & Merrill, "Onesweep" (2022): digits of all passes are counted at
+//! once, then each pass reads and writes every pair once, neighbours beside neighbours; tiles learn where their digits
+//! begin from the tiles before them while those run. Both are correct on any device and any subgroup size.
+use super::adam::rows_of_groups;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
+
+/// How the work is divided.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Shape {
+    /// A chunk of the pairs per lane: CPU devices.
+    Chunks,
+    /// Tiles in one sweep per digit: GPUs.
+    Sweep,
+}
+
+impl Shape {
+    /// The faster one for a kind of device.
+    pub fn of(device: &Device) -> Shape {
+        if device.info().is_cpu { Shape::Chunks } else { Shape::Sweep }
+    }
+}
 
 /// Scratch space for sorting up to `capacity` pairs.
 pub struct Sort {
     scratch: Buffer,
-    histogram: Buffer,
-    lanes: u32,
+    work: Work,
 }
 
-/// Bits per counting pass: 256 counters for each of 8 lanes are 8 KiB of shared memory.
+enum Work {
+    /// [lanes, 256] digit counts.
+    Chunks { histogram: Buffer, lanes: u32 },
+    /// [4, 256] digit counts of the passes, and what the tiles of a pass tell each other.
+    Sweep { digits: Buffer, tiles: Buffer },
+}
+
+/// Bits per pass: 256 counters for each of 8 lanes are 8 KiB of shared memory.
 const DIGIT_BITS: u32 = 8;
+/// Pairs per tile in `glsl/sort_sweep.comp`.
+const TILE: usize = 2048;
+/// Pairs per thread in `glsl/sort_digits.comp`.
+const EACH: usize = 32;
+
+/// What one call sorts by.
+#[derive(Clone, Copy)]
+struct Key {
+    mask: u32,
+    passes: u32,
+}
 
 impl Sort {
-    /// Allocates 8 bytes per pair and the counters.
+    /// Allocates 8 bytes per pair and the counters, in the shape that suits the device.
     pub fn new(device: &Device, capacity: usize) -> Result<Sort> {
-        // 256 measured best on lavapipe for 100k to 1M pairs; a GPU needs thousands of threads to be busy, while one
-        // thread per digit walks all lanes in step 2.
-        let lanes = if device.info().is_cpu { 256 } else { 2048 };
-        Ok(Sort {
-            scratch: device.buffer::<[u32; 2]>("sort scratch", capacity)?,
-            histogram: device.buffer::<[u32; 256]>("sort histogram", lanes as usize)?,
-            lanes,
-        })
+        Self::with(device, capacity, Shape::of(device))
+    }
+
+    /// [`Sort::new`] in a given shape.
+    pub fn with(device: &Device, capacity: usize, shape: Shape) -> Result<Sort> {
+        let work = match shape {
+            Shape::Chunks => {
+                // 256 measured best on lavapipe for 100k to 1M pairs.
+                let lanes = 256;
+                Work::Chunks {
+                    histogram: device.buffer::<[u32; 256]>("sort histogram", lanes)?,
+                    lanes: lanes as u32,
+                }
+            }
+            Shape::Sweep => Work::Sweep {
+                digits: device.buffer::<[u32; 256]>("sort digits", 4)?,
+                tiles: device.buffer::<u32>("sort tiles", 1 + 256 * capacity.div_ceil(TILE))?,
+            },
+        };
+        Ok(Sort { scratch: device.buffer::<[u32; 2]>("sort scratch", capacity)?, work })
     }
 
     /// Sorts the first `count[0]` elements of `pairs` (`[N]` of (key, value)) by the lowest `bits` bits of the key,
@@ -39,38 +86,93 @@ impl Sort {
         }
         let bits = bits.min(32);
         let mask = if bits == 32 { u32::MAX } else { (1 << bits) - 1 };
-        let passes = bits.div_ceil(DIGIT_BITS);
-        let groups = [self.lanes / shaders::sort_count::WORKGROUP[0], 1, 1];
+        let key = Key { mask, passes: bits.div_ceil(DIGIT_BITS) };
+        if let Work::Sweep { digits, .. } = &self.work {
+            record_digits(rec, pairs, count, digits, key);
+        }
         let (mut from, mut to) = (pairs, &self.scratch);
-        for pass in 0..passes {
-            let (shift, lanes, histogram) = (pass * DIGIT_BITS, self.lanes, &self.histogram);
-            rec.dispatch(
-                shaders::sort_count::call(
-                    &shaders::sort_count::Bindings { pairs: from, count, histogram },
-                    &shaders::sort_count::Push { shift, mask, lanes },
-                ),
-                groups,
-            );
-            rec.dispatch(
-                shaders::sort_offsets::call(
-                    &shaders::sort_offsets::Bindings { histogram },
-                    &shaders::sort_offsets::Push { lanes },
-                ),
-                [1, 1, 1],
-            );
-            rec.dispatch(
-                shaders::sort_scatter::call(
-                    &shaders::sort_scatter::Bindings { pairs: from, count, histogram, sorted: to },
-                    &shaders::sort_scatter::Push { shift, mask, lanes },
-                ),
-                groups,
-            );
+        for pass in 0..key.passes {
+            match &self.work {
+                Work::Chunks { histogram, lanes } => {
+                    record_chunks(rec, (from, to), count, (histogram, *lanes), (key, pass));
+                }
+                Work::Sweep { digits, tiles } => {
+                    record_sweep(rec, (from, to), count, (digits, tiles), (key, pass));
+                }
+            }
             (from, to) = (to, from);
         }
-        if passes % 2 == 1 {
+        if key.passes % 2 == 1 {
             rec.copy_bytes(&self.scratch, 0, pairs, 0, pairs.bytes());
         }
     }
+}
+
+fn record_chunks(
+    rec: &mut Recorder,
+    (from, to): (&Buffer, &Buffer),
+    count: &Buffer,
+    (histogram, lanes): (&Buffer, u32),
+    (key, pass): (Key, u32),
+) {
+    let (shift, mask) = (pass * DIGIT_BITS, key.mask);
+    let groups = [lanes / shaders::sort_count::WORKGROUP[0], 1, 1];
+    rec.dispatch(
+        shaders::sort_count::call(
+            &shaders::sort_count::Bindings { pairs: from, count, histogram },
+            &shaders::sort_count::Push { shift, mask, lanes },
+        ),
+        groups,
+    );
+    rec.dispatch(
+        shaders::sort_offsets::call(
+            &shaders::sort_offsets::Bindings { histogram },
+            &shaders::sort_offsets::Push { lanes },
+        ),
+        [1, 1, 1],
+    );
+    rec.dispatch(
+        shaders::sort_scatter::call(
+            &shaders::sort_scatter::Bindings { pairs: from, count, histogram, sorted: to },
+            &shaders::sort_scatter::Push { shift, mask, lanes },
+        ),
+        groups,
+    );
+}
+
+/// Where the elements with each digit begin, for all passes.
+fn record_digits(rec: &mut Recorder, pairs: &Buffer, count: &Buffer, digits: &Buffer, key: Key) {
+    rec.fill(digits, 0);
+    let call = shaders::sort_digits::call(
+        &shaders::sort_digits::Bindings { pairs, count, digits },
+        &shaders::sort_digits::Push { mask: key.mask, passes: key.passes },
+    );
+    rec.dispatch(call, rows_of_groups(capacity(pairs).div_ceil(EACH)));
+    let call = shaders::sort_bases::call(&shaders::sort_bases::Bindings { digits });
+    rec.dispatch(call, [key.passes.max(1), 1, 1]);
+}
+
+fn record_sweep(
+    rec: &mut Recorder,
+    (from, to): (&Buffer, &Buffer),
+    count: &Buffer,
+    (digits, tiles): (&Buffer, &Buffer),
+    (key, pass): (Key, u32),
+) {
+    rec.fill(tiles, 0);
+    let call = shaders::sort_sweep::call(
+        &shaders::sort_sweep::Bindings { pairs: from, count, digits, tiles, sorted: to },
+        &shaders::sort_sweep::Push { pass, mask: key.mask },
+    );
+    // Groups beyond the last tile find nothing to do; dimensions end at 65535.
+    let groups = capacity(from).div_ceil(TILE).max(1);
+    let row = groups.min(32768);
+    rec.dispatch(call, [row as u32, groups.div_ceil(row) as u32, 1]);
+}
+
+/// Pairs in a buffer.
+fn capacity(pairs: &Buffer) -> usize {
+    pairs.bytes() as usize / std::mem::size_of::<[u32; 2]>()
 }
 
 /// Twin of [`Sort::record`].
@@ -95,12 +197,20 @@ mod tests {
             .collect()
     }
 
+    /// In both shapes, which must agree.
     fn sorted_on_device(pairs: &[[u32; 2]], n: usize, bits: u32) -> Vec<[u32; 2]> {
         let device = test_device();
+        let [chunks, sweep] =
+            [Shape::Chunks, Shape::Sweep].map(|shape| sorted_in(&device, pairs, n, bits, shape));
+        assert!(chunks[..n] == sweep[..n], "{n} pairs, {bits} bits: the shapes disagree");
+        chunks
+    }
+
+    fn sorted_in(device: &Device, pairs: &[[u32; 2]], n: usize, bits: u32, shape: Shape) -> Vec<[u32; 2]> {
         let buffer = device.buffer_from("pairs", pairs).unwrap();
         let count = device.buffer_from("count", &[n as u32]).unwrap();
-        let sort = Sort::new(&device, pairs.len()).unwrap();
-        let mut rec = Recorder::new(&device, "sort");
+        let sort = Sort::with(device, pairs.len(), shape).unwrap();
+        let mut rec = Recorder::new(device, "sort");
         sort.record(&mut rec, &buffer, &count, bits);
         rec.run().unwrap();
         buffer.read().unwrap()
@@ -108,7 +218,7 @@ mod tests {
 
     #[test]
     fn equals_its_twin_at_awkward_sizes() {
-        for n in [0, 1, 2, 7, 8, 255, 256, 257, 5000] {
+        for n in [0, 1, 2, 7, 8, 255, 256, 257, 2048, 2049, 50_000] {
             for (bits, range) in [(32, 1u64 << 32), (16, 1 << 16), (10, 1 << 10), (24, 7), (5, 1 << 32)] {
                 let pairs = random_pairs(n, range, n as u64 + u64::from(bits));
                 let mut expected = pairs.clone();
