@@ -43,6 +43,7 @@ void main() {
     }
     vec3 ray = ray_through(p);
     load_window(p);
+    load_neighbours(p);
     start_random(p);
     uint here = push.first + uint(p.y) * push.width + uint(p.x);
     vec4 best = vec4(planes[here].xyz, 3.4e38);
@@ -77,7 +78,7 @@ void main() {
             valid = make_plane(ray, normal, inverse_depth, candidate);
         }
         if (valid) {
-            float cost = plane_cost(p, ray, candidate);
+            float cost = plane_cost(p, ray, candidate) + roughness(p, candidate);
             if (cost < best.w) {
                 best = vec4(candidate, cost);
             }

@@ -6,11 +6,13 @@
 const int TAPS = 5;
 const int TAP_STEP = 2;
 const float COST_LIMIT = 1.0;
-const float VARIANCE_FLOOR = 3.5e-5;
 const float SIGMA_COLOUR = 0.03;
 const float SIGMA_SPACE = 3.5;
 const vec4 VIEW_SHARES = vec4(0.6, 0.3, 0.1, 0.0);
 const float GEOMETRIC_LIMIT = 3.0;
+const float VARIANCE_FLOOR = 3.5e-5;
+const float SMOOTH_LIMIT = 0.03;
+const int NEIGHBOURS = 8;
 
 struct Source {
     vec4 forward[3];
@@ -32,6 +34,7 @@ layout(push_constant) uniform Push {
     uint sources;
     uint parity;
     uint planes;
+    float smoothness;
 } push;
 
 // Per pixel the luma of the 2 x 2 pixels from it to the right and below, 16 bits each: one load per bilinear sample.
@@ -162,6 +165,40 @@ float source_cost(uint index, ivec2 p, vec3 ray, vec3 plane) {
         cost += push.geometric * error;
     }
     return cost;
+}
+
+// Depth and weight of the neighbours that a plane should continue into.
+float neighbour_inverse[NEIGHBOURS];
+float neighbour_weight[NEIGHBOURS];
+
+ivec2 neighbour_offset(int n) {
+    int step = n < 4 ? 1 : 3;
+    return (n & 2) == 0 ? ivec2((1 - 2 * (n & 1)) * step, 0) : ivec2(0, (1 - 2 * (n & 1)) * step);
+}
+
+void load_neighbours(ivec2 p) {
+    float centre = luma_at(p);
+    [[unroll]] for (int n = 0; n < NEIGHBOURS; n++) {
+        ivec2 q = p + neighbour_offset(n);
+        bool inside = all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(push.width, push.height)));
+        neighbour_weight[n] = 0.0;
+        neighbour_inverse[n] = 1.0;
+        if (inside) {
+            neighbour_weight[n] = exp(-abs(luma_at(q) - centre) / SIGMA_COLOUR) * push.smoothness / float(NEIGHBOURS);
+            neighbour_inverse[n] = dot(planes[push.first + uint(q.y) * push.width + uint(q.x)].xyz, ray_through(q));
+        }
+    }
+}
+
+// How badly a plane continues into the neighbours' surfaces.
+float roughness(ivec2 p, vec3 plane) {
+    float sum = 0.0;
+    [[unroll]] for (int n = 0; n < NEIGHBOURS; n++) {
+        float there = dot(plane, ray_through(p + neighbour_offset(n)));
+        float off = abs(there - neighbour_inverse[n]) / (SMOOTH_LIMIT * max(neighbour_inverse[n], 1e-9));
+        sum += neighbour_weight[n] * min(off, 1.0);
+    }
+    return sum;
 }
 
 // Sorted source costs mixed by VIEW_SHARES.

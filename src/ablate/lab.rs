@@ -7,6 +7,7 @@ use crate::infer::{RegionEncoder, Registry};
 use crate::language::align::PairLinks;
 use crate::language::{self, ViewMasks};
 use crate::photo::{self, Photo};
+use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, InitChoice};
 use crate::progress::Progress;
 use crate::query::TextQuery;
@@ -152,7 +153,14 @@ impl<'a> Lab<'a> {
                 InitChoice::Cameras(frames.iter().map(named).collect())
             }
         };
-        let geometry = pose::initialise(&self.device, &photos, &choice, &self.registry, self.progress)?;
+        let geometry = pose::initialise(
+            &self.device,
+            &photos,
+            &choice,
+            &self.registry,
+            &StereoOptions::preset(Preset::Draft),
+            self.progress,
+        )?;
         let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
         let dense = sources::dense(&images, &self.registry, self.progress)?;
         let matches = sources::matches(&dense, &geometry, self.progress)?;

@@ -1,4 +1,5 @@
 //! Training: losses, schedules, pruning, pose refinement.
+mod coarse;
 pub mod densify;
 pub mod index_head;
 pub mod init;

@@ -58,6 +58,8 @@ pub struct RgbOptions {
     pub margin: f64,
     /// Learning rates.
     pub rates: Rates,
+    /// Share of the steps, from the first on, that see the photos at half their size.
+    pub coarse: f64,
     /// Weight of mean |render − photo|.
     pub l1_weight: f64,
     /// Weight of 1 − SSIM.
@@ -91,7 +93,7 @@ impl RgbOptions {
             Preset::Paper => Self::paper(),
             // Fewer steps take proportionally longer ones: with Adam the distance a parameter can travel is about
             // rate × steps. Rates stay below the point where the loss oscillates (means: a tenth of a pixel a step).
-            Preset::Draft => Self::scaled(300, 2.0),
+            Preset::Draft => Self::draft(),
             Preset::Default => Self::scaled(1000, 1.0),
         }
     }
@@ -107,6 +109,14 @@ impl RgbOptions {
             poses.rate.steps = iterations;
         }
         self
+    }
+
+    /// Most steps at half the photos' size and fewer splats: on breakfast two fifths less time than without and 0.4 dB more
+    /// on held-out views, 1.2 dB less on the photos themselves.
+    fn draft() -> Self {
+        let mut options = RgbOptions { coarse: 0.6, ..Self::scaled(300, 2.0) };
+        options.init.max_points = 130_000;
+        options
     }
 
     fn scaled(iterations: usize, speed: f64) -> Self {
@@ -156,6 +166,7 @@ impl RgbOptions {
                 sh_dc: 2.5e-3,
                 sh_rest: 2.5e-3 / 20.0,
             },
+            coarse: 0.0,
             l1_weight: 0.8,
             dssim_weight: 0.2,
             depth_weight: 0.0,
@@ -214,7 +225,8 @@ impl LanguageOptions {
     /// The options of a preset.
     pub fn preset(preset: Preset) -> Self {
         let iterations = match preset {
-            Preset::Draft => 60,
+            // Twice as many decode 0.4 % more of the pixels and find the same objects.
+            Preset::Draft => 30,
             Preset::Default => 400,
             Preset::Paper => 1000,
         };
@@ -237,7 +249,8 @@ impl LanguageOptions {
             lift: !paper,
             per_level: paper,
             detach_geometry: false,
-            check_every: (iterations / 4).min(100),
+            // A measurement costs as much as three steps.
+            check_every: if preset == Preset::Draft { iterations } else { (iterations / 4).min(100) },
         }
     }
 }

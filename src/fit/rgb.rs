@@ -1,4 +1,5 @@
 //! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (ALGORITHMS 7).
+use super::coarse::Halved;
 use super::densify::densify;
 use super::init::splats_from_points;
 use super::margin::margin_splats;
@@ -108,9 +109,18 @@ pub fn fit_rgb(
 ) -> Result<Trained> {
     let clock = Instant::now();
     progress.begin("splats", options.iterations as u64);
-    let mut run = Run::new(device, images, cameras, &start, scale, depths, options)?;
+    let coarse = (options.coarse * options.iterations as f64) as usize;
+    let half = (coarse > 0).then(|| Halved::of(images, cameras, depths));
+    let first = match &half {
+        Some(half) => (half.images.as_slice(), half.cameras.as_slice(), half.depths.as_deref()),
+        None => (images, cameras, depths),
+    };
+    let mut run = Run::new(device, first.0, first.1, &start, scale, first.2, options)?;
     for iteration in 0..options.iterations {
         progress.check()?;
+        if coarse > 0 && iteration == coarse {
+            run.look_at(images, cameras, depths)?;
+        }
         run.step(iteration)?;
         if let Some(point) = run.report(iteration)? {
             let note = format!("loss {:.4}, PSNR {:.1}, {} splats", point.loss, point.psnr, point.splats);
@@ -135,6 +145,11 @@ pub fn fit_rgb(
         seconds: clock.elapsed().as_secs_f64(),
     };
     Ok(Trained { splats, cameras, stats })
+}
+
+/// Depth and the confidence it needs, if it counts at all.
+fn used<'d>(depths: Option<&'d [DepthMap]>, options: &RgbOptions) -> Option<(&'d [DepthMap], f32)> {
+    depths.filter(|_| options.depth_weight > 0.0).map(|d| (d, options.min_confidence))
 }
 
 /// The state of one fit.
@@ -171,7 +186,6 @@ impl<'a> Run<'a> {
         depths: Option<&[DepthMap]>,
         options: &'a RgbOptions,
     ) -> Result<Self> {
-        let depths = depths.filter(|_| options.depth_weight > 0.0).map(|d| (d, options.min_confidence));
         let stats = match options.densify {
             Some(_) => Some(GradientStats::new(device, start.len())?),
             None => None,
@@ -186,7 +200,7 @@ impl<'a> Run<'a> {
                 features_move_geometry: true,
             },
             model: Model::new(device, start, 0)?,
-            views: Views::new(device, images, cameras, depths, start.len(), 0, scale.near())?,
+            views: Views::new(device, images, cameras, used(depths, options), start.len(), 0, scale.near())?,
             cameras: cameras.to_vec(),
             poses: vec![PoseAdam::default(); cameras.len()],
             order: ViewOrder::new(cameras.len(), options.seed),
@@ -199,6 +213,23 @@ impl<'a> Run<'a> {
             psnr: vec![None; cameras.len()],
             curve: Vec::new(),
         })
+    }
+
+    /// Goes on with the same photos at another size; the poses found so far stay.
+    fn look_at(
+        &mut self,
+        images: &'a [RgbImage],
+        cameras: &[Camera],
+        depths: Option<&[DepthMap]>,
+    ) -> Result<()> {
+        let (depths, near) = (used(depths, self.options), self.scale.near());
+        self.views = Views::new(&self.device, images, cameras, depths, self.model.count(), 0, near)?;
+        self.images = images;
+        for (own, camera) in self.cameras.iter_mut().zip(cameras) {
+            *own = Camera { pose: own.pose, ..camera.clone() };
+        }
+        self.forget_recordings();
+        Ok(())
     }
 
     /// One step on the next view; repeated with longer tile lists if they overflowed.

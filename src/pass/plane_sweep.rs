@@ -48,6 +48,8 @@ pub struct Reference {
     pub parity: u32,
     /// Hypotheses of the initial sweep.
     pub planes: u32,
+    /// Weight of the disagreement with the neighbours' surfaces.
+    pub smoothness: f32,
 }
 
 /// What the matching schedule needs of the device and of its twin.
@@ -121,6 +123,7 @@ macro_rules! push {
             sources: $r.sources,
             parity: $r.parity,
             planes: $r.planes,
+            smoothness: $r.smoothness,
         }
     };
 }

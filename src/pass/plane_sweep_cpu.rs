@@ -25,6 +25,11 @@ pub const SIGMA_SPACE: f32 = 3.5;
 /// Shares of the best, second, ... source view in the aggregated cost: the second view confirms, but a pixel seen
 /// by one other view only still prefers the right plane.
 pub const VIEW_SHARES: [f32; MAX_SOURCES] = [0.6, 0.3, 0.1, 0.0];
+/// Neighbours whose depth a plane should continue into: the four at one pixel and the four at three, all of the other
+/// checkerboard colour, so that they stand still during a step.
+pub const NEIGHBOURS: usize = 8;
+/// Relative difference of inverse depth at which the disagreement with a neighbour saturates: steps cost no more.
+pub const SMOOTH_LIMIT: f32 = 0.03;
 /// Reprojection error (pixels) at which the geometric term saturates, as in ACMM.
 pub const GEOMETRIC_LIMIT: f32 = 3.0;
 
@@ -254,16 +259,47 @@ impl Inputs<'_> {
         best
     }
 
+    /// Inverse depth and weight of the neighbours of a pixel: (offset, inverse depth, weight).
+    fn neighbours(&self, own: &[Vec4], x: i32, y: i32) -> [([i32; 2], f32, f32); NEIGHBOURS] {
+        let r = &self.reference;
+        let luma = |x: i32, y: i32| self.luma[(r.first + y as u32 * r.width + x as u32) as usize];
+        std::array::from_fn(|n| {
+            let step = if n < 4 { 1 } else { 3 };
+            let along = (1 - 2 * (n as i32 & 1)) * step;
+            let [dx, dy] = if n & 2 == 0 { [along, 0] } else { [0, along] };
+            let (px, py) = (x + dx, y + dy);
+            if px < 0 || py < 0 || px >= r.width as i32 || py >= r.height as i32 {
+                return ([dx, dy], 1.0, 0.0);
+            }
+            let difference = (luma(px, py) - luma(x, y)).abs();
+            let weight = (-difference / SIGMA_COLOUR).exp() * r.smoothness / NEIGHBOURS as f32;
+            let plane = own[(py as u32 * r.width + px as u32) as usize].truncate();
+            ([dx, dy], plane.dot(self.ray(px, py)), weight)
+        })
+    }
+
+    /// How badly a plane continues into the neighbours' surfaces.
+    fn roughness(&self, near: &[([i32; 2], f32, f32); NEIGHBOURS], x: i32, y: i32, plane: Vec3) -> f32 {
+        let one = |&([dx, dy], inverse, weight): &([i32; 2], f32, f32)| {
+            let there = plane.dot(self.ray(x + dx, y + dy));
+            weight * ((there - inverse).abs() / (SMOOTH_LIMIT * inverse.max(1e-9))).min(1.0)
+        };
+        near.iter().map(one).sum()
+    }
+
     /// One propagation and refinement step at one pixel. `planes` holds (π, cost) of all views.
     pub fn refine(&self, planes: &[Vec4], x: i32, y: i32) -> Vec4 {
         let r = &self.reference;
         let own = &planes[r.first as usize..];
         let ray = self.ray(x, y);
         let window = self.window(x, y);
+        let near = self.neighbours(own, x, y);
+        let total =
+            |plane: Vec3| self.cost(planes, &window, x, y, ray, plane) + self.roughness(&near, x, y, plane);
         let mut random = self.random(x, y);
         let current = own[(y as u32 * r.width + x as u32) as usize];
         // Re-evaluated: after a change of resolution or of the other views its stored cost is stale.
-        let cost = self.cost(planes, &window, x, y, ray, current.truncate());
+        let cost = total(current.truncate());
         let mut best = current.truncate().extend(cost);
         for area in 0..8 {
             let Some(candidate) = self.area_best(own, x, y, area) else { continue };
@@ -271,7 +307,7 @@ impl Inputs<'_> {
             if inverse_depth < r.range[0] || inverse_depth > r.range[1] || candidate == best.truncate() {
                 continue;
             }
-            let cost = self.cost(planes, &window, x, y, ray, candidate);
+            let cost = total(candidate);
             if cost < best.w {
                 best = candidate.extend(cost);
             }
@@ -296,7 +332,7 @@ impl Inputs<'_> {
                 }
             };
             let Some(candidate) = self.plane(ray, normal, inverse_depth) else { continue };
-            let cost = self.cost(planes, &window, x, y, ray, candidate);
+            let cost = total(candidate);
             if cost < best.w {
                 best = candidate.extend(cost);
             }

@@ -3,10 +3,12 @@ mod affine;
 mod choose;
 mod decode;
 mod exif_tags;
+mod frame;
 mod resize;
 
 pub use affine::Affine;
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
+pub use frame::Frame;
 
 use crate::progress::Progress;
 use crate::scene::RgbImage;
@@ -30,8 +32,10 @@ pub struct Photo {
     pub path: PathBuf,
     /// File name without extension: the key that joins masks, cameras and renders.
     pub stem: String,
-    /// Upright pixels at working resolution.
+    /// Upright pixels at working resolution; on a plain frame, the nearest pixels of the picture.
     pub image: RgbImage,
+    /// The white or black frame that was around the picture, working pixels.
+    pub frame: Frame,
     /// Upright size of the file, pixels.
     pub original_size: (u32, u32),
     /// Original (upright) pixels → working pixels.
@@ -56,12 +60,15 @@ pub fn load(path: &Path) -> Result<Photo> {
         )));
     }
     let (working_w, working_h) = working_size(w, h);
-    let image = resize::area_average((w, h), (working_w, working_h), |x, y| decoded.at(x, y));
+    let mut image = resize::area_average((w, h), (working_w, working_h), |x, y| decoded.at(x, y));
+    let frame = Frame::of(&image);
+    frame.continue_picture(&mut image);
     let to_working = Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32));
     Ok(Photo {
         path: path.to_path_buf(),
         stem: path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
         image,
+        frame,
         original_size: (w as u32, h as u32),
         to_working,
         // The two scales differ by the rounding of the size only; the height is the exact one.
@@ -107,6 +114,10 @@ pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progres
     let all: Vec<Result<Photo>> = paths.par_iter().map(one).collect();
     let photos = all.into_iter().collect::<Result<Vec<_>>>()?;
     progress.end();
+    let framed: Vec<&str> = photos.iter().filter(|p| !p.frame.is_none()).map(|p| p.stem.as_str()).collect();
+    if !framed.is_empty() {
+        progress.warn(&format!("plain frame around the picture left out: {}", framed.join(", ")));
+    }
     refuse_twins(&photos)?;
     Ok(photos)
 }

@@ -33,6 +33,7 @@ pub fn initialise(
     photos: &[Photo],
     choice: &InitChoice,
     registry: &Registry,
+    stereo: &StereoOptions,
     progress: &dyn Progress,
 ) -> Result<Geometry> {
     let cameras = match choice {
@@ -51,8 +52,7 @@ pub fn initialise(
     progress.check()?;
     let images: Vec<_> = photos.iter().map(|p| p.image.clone()).collect();
     let positions: Vec<_> = model.points.iter().map(|p| p.position).collect();
-    let options = StereoOptions::default();
-    let (depths, points) = stereo::dense(device, &images, &model.cameras, &positions, &options, progress)?;
+    let (depths, points) = stereo::dense(device, &images, &model.cameras, &positions, stereo, progress)?;
     Ok(Geometry {
         cameras: model.cameras,
         depths,

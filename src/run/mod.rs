@@ -18,6 +18,7 @@ use crate::gpu::{self, Device};
 use crate::infer::Registry;
 use crate::language;
 use crate::photo::{self, Photo};
+use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, InitChoice};
 use crate::progress::{Progress, Recorded, StageRecord};
 use crate::query::{QueryOptions, QueryResult};
@@ -171,7 +172,8 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
     let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
     let describer = Describer { plan, images: &images, registry: &registry, given, encoder };
-    let reconstruct = || pose::initialise(&device, &photos, &init, &registry, progress);
+    let reconstruct =
+        || pose::initialise(&device, &photos, &init, &registry, &StereoOptions::preset(preset), progress);
     let train = |geometry: &Geometry| {
         fit::train_rgb(
             &device,

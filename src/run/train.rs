@@ -5,6 +5,7 @@ use crate::format::{Workspace, cameras, colmap, ply};
 use crate::gpu::{self, Device};
 use crate::infer::Registry;
 use crate::photo::{self, Photo};
+use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, InitChoice};
 use crate::progress::{Progress, Recorded};
 use crate::report::{self, Report, RunRecord, ViewShown};
@@ -120,7 +121,10 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
     let geometry = match given {
         Some(cloud) => from_points(&photos, &known, cloud)?,
-        None => pose::initialise(&device, &photos, &InitChoice::Cameras(known), &registry, progress)?,
+        None => {
+            let (init, stereo) = (InitChoice::Cameras(known), StereoOptions::preset(preset));
+            pose::initialise(&device, &photos, &init, &registry, &stereo, progress)?
+        }
     };
     let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
     let mut options = RgbOptions::preset(preset);

@@ -109,6 +109,6 @@ pub(super) fn masked(photos: &[Photo], features: &[Features]) -> Vec<Features> {
     photos
         .iter()
         .zip(features)
-        .map(|(p, f)| super::within(f, &matching::valid_area(&p.image, super::MARGIN)))
+        .map(|(p, f)| super::within(f, &matching::valid_area(&p.image, p.frame, super::MARGIN)))
         .collect()
 }

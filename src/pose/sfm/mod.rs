@@ -83,7 +83,7 @@ fn corner_families(
     progress.check()?;
     let own: Vec<Features> = photos
         .par_iter()
-        .map(|p| sift::detect(&p.image.luma(), &matching::valid_area(&p.image, MARGIN), MAX_CORNERS))
+        .map(|p| sift::detect(&p.image.luma(), &matching::valid_area(&p.image, p.frame, MARGIN), MAX_CORNERS))
         .collect();
     progress.check()?;
     let mut families = vec![own];
@@ -336,7 +336,8 @@ fn finish(photos: &[Photo], mut model: Model, progress: &dyn Progress) -> Result
     model.adjust(f64::INFINITY, 1.5, 60)?;
     settle(&mut model)?;
     let shades: Vec<Shades> = photos.par_iter().map(|p| Shades::new(&p.image)).collect();
-    let valid: Vec<Plane<bool>> = photos.iter().map(|p| matching::valid_area(&p.image, MARGIN)).collect();
+    let valid: Vec<Plane<bool>> =
+        photos.iter().map(|p| matching::valid_area(&p.image, p.frame, MARGIN)).collect();
     refine::refine(&mut model, &shades);
     settle(&mut model)?;
     progress.check()?;

@@ -3,7 +3,7 @@
 use super::Level;
 use super::colours::ColourModel;
 use super::planes::WorldPlane;
-use super::surface::{FREE_SPACE_TOLERANCE, Links, Surface, Verdict, neighbours, ray};
+use super::surface::{Links, Surface, Verdict, free_space, neighbours, ray};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::cmp::Reverse;
@@ -40,7 +40,7 @@ pub fn open_rims(level: &Level, surface: &Surface, radius: usize) -> Surface {
             for x in 0..width {
                 let z = depth.at(x, y);
                 let step = neighbours(y * width + x, width, height).any(|n| {
-                    z > 0.0 && depth.data[n] > 0.0 && (depth.data[n] - z).abs() > FREE_SPACE_TOLERANCE * z
+                    z > 0.0 && depth.data[n] > 0.0 && (depth.data[n] - z).abs() > free_space(level, view) * z
                 });
                 if !step {
                     continue;
@@ -137,7 +137,7 @@ impl<'a> ViewFill<'a> {
     fn lies_on(&self, k: usize, plane: Vec3) -> bool {
         let ray = self.ray(k);
         let here = self.surface.planes[self.first + k].dot(ray);
-        (plane.dot(ray) - here).abs() < 0.5 * super::surface::DEPTH_TOLERANCE * here
+        (plane.dot(ray) - here).abs() < 0.5 * self.level.tolerance[self.view] * here
     }
 
     /// Dijkstra from the given pixels over the pixels without belief: per pixel where its plane comes from

@@ -1,6 +1,6 @@
 //! Depth maps of all views to one set of points (ALGORITHMS 2.6).
 use super::Level;
-use super::surface::{DEPTH_TOLERANCE, Links, Surface, neighbours, ray};
+use super::surface::{Links, Surface, neighbours, ray};
 use crate::scene::PointCloud;
 use glam::Vec3;
 
@@ -52,7 +52,7 @@ fn fuse_view(
             for py in y.saturating_sub(1)..(y + 2).min(height) {
                 for px in x.saturating_sub(1)..(x + 2).min(width) {
                     let here = depth.at(px, py);
-                    if (here - z).abs() < DEPTH_TOLERANCE * here {
+                    if (here - z).abs() < level.tolerance[view] * here {
                         covered[py * width + px] = true;
                     }
                 }

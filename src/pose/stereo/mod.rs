@@ -13,6 +13,7 @@ mod void;
 pub use views::{Level, pyramid};
 
 use crate::Result;
+use crate::fit::Preset;
 use crate::gpu::Device;
 use crate::pass::plane_sweep::{GpuMatcher, MAX_SOURCES, Matcher, Reference};
 use crate::progress::Progress;
@@ -32,6 +33,8 @@ pub struct StereoOptions {
     pub rounds: Vec<u32>,
     /// Weight of the geometric term per pixel of forward–backward reprojection error.
     pub geometric: f32,
+    /// Weight of the disagreement with the neighbours' depth: carries planes over weak texture.
+    pub smoothness: f32,
     /// Seed of the hashed random numbers.
     pub seed: u32,
 }
@@ -45,7 +48,22 @@ impl Default for StereoOptions {
             rounds: vec![4, 4, 3],
             // 0.1 per pixel, saturating at 3 px: the same strength as ACMM's.
             geometric: 0.1,
+            // A fully different neighbourhood costs as much as 0.1 of correlation, less than real texture tells. On dark
+            // photos of a room (dining) 0.05 leaves 21 % and 0.4 20 % of the pixels wrong by a tenth, 0.1 leaves 18 %.
+            smoothness: 0.1,
             seed: 1,
+        }
+    }
+}
+
+impl StereoOptions {
+    /// The options of a preset. A draft looks at the finest resolution once: three rounds there take three times as long
+    /// and gain 0.1 dB on breakfast, while depth at half the photos' size loses 1.4 dB.
+    pub fn preset(preset: Preset) -> StereoOptions {
+        let full = StereoOptions::default();
+        match preset {
+            Preset::Draft => StereoOptions { rounds: vec![4, 4, 1], ..full },
+            Preset::Default | Preset::Paper => full,
         }
     }
 }
@@ -110,7 +128,8 @@ pub fn run_schedule<M: Matcher>(
                 for parity in 0..2 {
                     progress.check()?;
                     seed = seed.wrapping_add(1);
-                    matcher.refine(&Reference { parity, geometric, seed, ..*reference })?;
+                    let smoothness = options.smoothness;
+                    matcher.refine(&Reference { parity, geometric, smoothness, seed, ..*reference })?;
                 }
             }
             done += level.pixels() as u64 / 1000;

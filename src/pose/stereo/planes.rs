@@ -23,8 +23,8 @@ impl WorldPlane {
     }
 }
 
-/// Distance from the plane, relative to the point's depth, of a point that lies on it.
-const TOLERANCE: f64 = 0.004;
+/// Distance from the plane of a point that lies on it, relative to the depth tolerance of its view.
+const TOLERANCE: f64 = 0.4;
 /// Largest angle between the local and the plane's normal, as a cosine (25°).
 const NORMAL_TOLERANCE: f64 = 0.906;
 /// Planes with a smaller share of all points are not large.
@@ -41,6 +41,8 @@ struct Sample {
     position: DVec3,
     normal: DVec3,
     depth: f64,
+    /// Of its depth, world units.
+    tolerance: f64,
 }
 
 /// Planes by decreasing number of points. `surface` must be smoothed, so that its normals are good.
@@ -75,7 +77,7 @@ pub fn large_planes(level: &Level, surface: &Surface, seed: u32) -> Vec<WorldPla
 }
 
 fn lies_on(plane: &WorldPlane, s: &Sample) -> bool {
-    (plane.normal.dot(s.position) - plane.offset).abs() < TOLERANCE * s.depth
+    (plane.normal.dot(s.position) - plane.offset).abs() < TOLERANCE * s.tolerance
         && plane.normal.dot(s.normal).abs() > NORMAL_TOLERANCE
 }
 
@@ -102,6 +104,7 @@ fn gather(level: &Level, surface: &Surface) -> Vec<Sample> {
                 position: to_world.transform((ray * depth).as_dvec3()),
                 normal: (to_world.rotation * plane.as_dvec3()).normalize(),
                 depth: depth as f64,
+                tolerance: (level.tolerance[view] * depth) as f64,
             });
         }
     }

@@ -1,5 +1,6 @@
 //! Which matched pixels to believe: agreement with the other views, and smooth local planes for those.
 use super::Level;
+use super::views::{DEPTH_TOLERANCE, REPROJECTION_TOLERANCE};
 use crate::scene::Plane;
 use glam::{DMat3, DVec2, DVec3, Vec3, Vec4};
 use rayon::prelude::*;
@@ -13,12 +14,19 @@ pub struct Surface {
     pub confidence: Vec<f32>,
 }
 
-/// Depths that differ by less agree: several times the matching noise, far below the size of objects.
-pub const DEPTH_TOLERANCE: f32 = 0.01;
-/// Forward–backward reprojection error that still agrees, pixels: leaves room for 0.1° of pose error (1.1 px at f = 650).
-const REPROJECTION_TOLERANCE: f32 = 1.5;
+/// Where parallax is small, [`REPROJECTION_TOLERANCE`] corresponds to a larger depth difference; views that could not
+/// tell depths this far apart confirm nothing …
+const UNINFORMATIVE: f32 = 0.06;
+/// … unless the view has nothing better: this many times its typical tolerance.
+const NOTHING_BETTER: f32 = 1.5;
 /// A point this much nearer than what another view sees there would hide it: it cannot exist.
 pub const FREE_SPACE_TOLERANCE: f32 = 0.03;
+
+/// [`FREE_SPACE_TOLERANCE`], wider where depth is known less well.
+pub fn free_space(level: &Level, view: usize) -> f32 {
+    FREE_SPACE_TOLERANCE.max(2.0 * level.tolerance[view])
+}
+
 /// Aggregated cost above which even an agreeing pixel is not believed: half way between a perfect match in one view
 /// (0.4 + geometric limits) and none (1.0 and more).
 const COST_TOLERANCE: f32 = 0.75;
@@ -26,6 +34,14 @@ const COST_TOLERANCE: f32 = 0.75;
 const SPECKLE_SHARE: f32 = 6e-4;
 /// Confidence by number of agreeing views.
 const CONFIDENCE: [f32; 3] = [0.0, 0.6, 0.9];
+/// Confidence of a pixel that nobody confirms but its surroundings: it shapes the surface, it is no measurement.
+const PLAUSIBLE: f32 = 0.45;
+/// Aggregated cost above which not even such a pixel is kept: next to no correlation in any view.
+const PLAUSIBLE_COST: f32 = 0.95;
+/// Share of the surroundings that must lie on a plausible pixel's plane; chance matches scatter.
+const SUPPORT: f32 = 0.6;
+/// The surroundings: 9 × 9 pixels, every second.
+const SUPPORT_TAPS: i32 = 4;
 
 /// What another view says about a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -76,6 +92,19 @@ impl Links {
         inside.then_some((u, v, p.z))
     }
 
+    /// Relative depth difference that a point of frame `a` must show before view `b` contradicts it: what moves its
+    /// image by [`REPROJECTION_TOLERANCE`], at least [`DEPTH_TOLERANCE`].
+    fn tolerance(&self, level: &Level, a: usize, b: usize, point: Vec3) -> f32 {
+        let (r, t) = self.to[a * self.views + b];
+        let along = r * point;
+        let p = along + t;
+        let [fx, fy, ..] = level.references[b].intrinsics;
+        // d(u, v) / d ln z along the ray of `a`.
+        let du = fx * (along.x * p.z - p.x * along.z) / (p.z * p.z);
+        let dv = fy * (along.y * p.z - p.y * along.z) / (p.z * p.z);
+        (REPROJECTION_TOLERANCE / du.hypot(dv).max(1e-6)).max(DEPTH_TOLERANCE)
+    }
+
     /// What view `b` says about a point of frame `a` seen at pixel position (x, y).
     pub fn verdict(
         &self,
@@ -95,13 +124,16 @@ impl Links {
         let [fx, fy, cx, cy] = r.intrinsics;
         let ray = Vec3::new((u - cx) / fx, (v - cy) / fy, 1.0);
         let seen = 1.0 / surface.planes[index].dot(ray).max(1e-9);
-        if z < seen * (1.0 - FREE_SPACE_TOLERANCE) {
+        let tolerance = self.tolerance(level, a, b, point);
+        let free = FREE_SPACE_TOLERANCE.max(2.0 * tolerance);
+        if z < seen * (1.0 - free) {
             return Verdict::InTheWay;
         }
-        if z > seen * (1.0 + FREE_SPACE_TOLERANCE) {
+        if z > seen * (1.0 + free) {
             return Verdict::Hidden;
         }
-        let agrees = (z - seen).abs() < DEPTH_TOLERANCE * seen
+        let agrees = tolerance < UNINFORMATIVE.max(NOTHING_BETTER * level.tolerance[a])
+            && (z - seen).abs() < tolerance * seen
             && self.project(level, b, a, ray * seen).is_some_and(|(x, y, _)| {
                 let (dx, dy) = (x - pixel[0], y - pixel[1]);
                 dx * dx + dy * dy < REPROJECTION_TOLERANCE * REPROJECTION_TOLERANCE
@@ -141,8 +173,8 @@ pub fn believed(level: &Level, links: &Links, matched: &[Vec4], void: &[bool]) -
             .collect(),
     };
     let views = level.cameras.len();
-    // Twice: the second time only confirmed pixels confirm or contradict.
-    for _ in 0..2 {
+    // The second time only confirmed pixels confirm, and they contradict.
+    for round in 0..2 {
         surface.confidence = map_pixels(level, |view, x, y, k| {
             if surface.confidence[k] <= 0.0 {
                 return 0.0;
@@ -161,11 +193,62 @@ pub fn believed(level: &Level, links: &Links, matched: &[Vec4], void: &[bool]) -
                     _ => {}
                 }
             }
-            if against >= agree { 0.0 } else { CONFIDENCE[agree.min(2)] }
+            if agree == 0 || (round > 0 && against >= agree) { 0.0 } else { CONFIDENCE[agree.min(2)] }
         });
     }
+    let mut surface = with_plausible(level, links, &surface, matched, void);
     remove_speckles(level, &mut surface);
     surface
+}
+
+/// Adds what no view confirms in views with little parallax, where confirmation is hard to get: pixels that match
+/// somewhere, lie on one surface with their surroundings and block no confirmed pixel. Where parallax is ample, a missing
+/// confirmation means occlusion or error, and nothing is added.
+fn with_plausible(
+    level: &Level,
+    links: &Links,
+    confirmed: &Surface,
+    matched: &[Vec4],
+    void: &[bool],
+) -> Surface {
+    let confidence = map_pixels(level, |view, x, y, k| {
+        let plane = matched[k].truncate();
+        let ample = level.tolerance[view] <= DEPTH_TOLERANCE;
+        if confirmed.confidence[k] > 0.0 || ample || void[k] || matched[k].w > PLAUSIBLE_COST {
+            return confirmed.confidence[k];
+        }
+        let ray = ray(level, view, x, y);
+        let inverse = plane.dot(ray);
+        if inverse <= 0.0 || support(level, matched, view, x, y, plane) < SUPPORT {
+            return 0.0;
+        }
+        let pixel = [x as f32 + 0.5, y as f32 + 0.5];
+        let against = (0..level.cameras.len())
+            .filter(|&o| o != view)
+            .any(|o| links.verdict(level, confirmed, view, o, pixel, ray / inverse) == Verdict::InTheWay);
+        if against { 0.0 } else { PLAUSIBLE }
+    });
+    Surface { planes: confirmed.planes.clone(), confidence }
+}
+
+/// Share of the pixels around (x, y) that lie on a plane.
+fn support(level: &Level, matched: &[Vec4], view: usize, x: usize, y: usize, plane: Vec3) -> f32 {
+    let r = &level.references[view];
+    let (mut total, mut near) = (0u32, 0u32);
+    for dy in -SUPPORT_TAPS..=SUPPORT_TAPS {
+        for dx in -SUPPORT_TAPS..=SUPPORT_TAPS {
+            let (px, py) = (x as i32 + 2 * dx, y as i32 + 2 * dy);
+            if px < 0 || py < 0 || px >= r.width as i32 || py >= r.height as i32 {
+                continue;
+            }
+            let there = ray(level, view, px as usize, py as usize);
+            let index = r.first as usize + py as usize * r.width as usize + px as usize;
+            let other = matched[index].truncate().dot(there);
+            total += 1;
+            near += u32::from((plane.dot(there) - other).abs() < level.tolerance[view] * other);
+        }
+    }
+    near as f32 / total as f32
 }
 
 /// Depth map of a view from its planes; 0 where not believed.
@@ -205,7 +288,7 @@ fn remove_speckles(level: &Level, surface: &mut Surface) {
                 next += 1;
                 for n in neighbours(k, depth.width, depth.height) {
                     let (a, b) = (depth.data[k], depth.data[n]);
-                    if !done[n] && b > 0.0 && (a - b).abs() < FREE_SPACE_TOLERANCE * a {
+                    if !done[n] && b > 0.0 && (a - b).abs() < free_space(level, view) * a {
                         done[n] = true;
                         area.push(n);
                     }
@@ -257,7 +340,7 @@ pub fn smoothed(level: &Level, surface: &Surface, radius: i32) -> Surface {
                 }
                 let there = ray(level, view, px as usize, py as usize);
                 let value = surface.planes[n].dot(there);
-                if (value - plane.dot(there)).abs() > DEPTH_TOLERANCE * inverse {
+                if (value - plane.dot(there)).abs() > level.tolerance[view] * inverse {
                     continue;
                 }
                 let (u, v, w) = (dx as f64, dy as f64, (value - inverse) as f64);

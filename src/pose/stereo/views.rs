@@ -18,6 +18,35 @@ pub struct Level {
     pub sources: Vec<Source>,
     /// One per view; parity, seed and search parameters are set per pass.
     pub references: Vec<Reference>,
+    /// Relative depth difference below which two depths of a view agree, one per view.
+    pub tolerance: Vec<f32>,
+}
+
+/// Depths that differ by less agree: several times the matching noise, far below the size of objects.
+pub const DEPTH_TOLERANCE: f32 = 0.01;
+/// Where parallax is small, this many pixels of matching noise are a larger depth difference …
+pub const REPROJECTION_TOLERANCE: f32 = 1.5;
+/// … up to here: coarser depth tells surfaces no longer apart.
+const COARSEST_TOLERANCE: f32 = 0.1;
+
+/// Pixels by which the image in `other` moves per relative change of the depth that `camera` sees a point at.
+fn parallax(camera: &Camera, other: &Camera, point: DVec3) -> f64 {
+    let along = other.pose.rotation * (point - camera.pose.centre());
+    let p = other.pose.transform(point);
+    let du = other.fx * (along.x * p.z - p.x * along.z) / (p.z * p.z);
+    let dv = other.fy * (along.y * p.z - p.y * along.z) / (p.z * p.z);
+    du.hypot(dv)
+}
+
+/// [`Level::tolerance`] of a view: what half of the points can be told apart by in the source that tells best.
+fn tolerance(view: usize, cameras: &[Camera], chosen: &[usize], sparse: &[DVec3]) -> f32 {
+    let best = |p: &DVec3| {
+        let sources = chosen.iter().filter(|&&s| seen(&cameras[s], *p));
+        sources.map(|&s| parallax(&cameras[view], &cameras[s], *p)).reduce(f64::max)
+    };
+    let mut all: Vec<f64> = sparse.iter().filter(|p| seen(&cameras[view], **p)).filter_map(best).collect();
+    let typical = crate::pose::numeric::median(&mut all).unwrap_or(f64::INFINITY);
+    (REPROJECTION_TOLERANCE / typical as f32).clamp(DEPTH_TOLERANCE, COARSEST_TOLERANCE)
 }
 
 /// Smallest side of the coarsest resolution, pixels: below, the matching window covers whole objects.
@@ -42,18 +71,19 @@ pub fn pyramid(
     let chosen: Vec<Vec<usize>> = (0..cameras.len())
         .map(|view| choose_sources(view, cameras, sparse, options.sources.clamp(1, MAX_SOURCES)))
         .collect();
+    let tolerance: Vec<f32> = (0..cameras.len()).map(|v| tolerance(v, cameras, &chosen[v], sparse)).collect();
     let mut guide = images.to_vec();
     // A storage buffer holds at least 128 MiB everywhere: 16 bytes per pixel for the planes of all views.
     while guide.iter().map(|g| g.data.len()).sum::<usize>() * 16 > 1 << 27 {
         guide = guide.iter().map(halved).collect();
     }
-    let mut levels = vec![level(&guide, cameras, &chosen, &ranges)];
+    let mut levels = vec![level(&guide, cameras, &chosen, &ranges, &tolerance)];
     while levels.len() < options.rounds.len().max(1) {
         if guide.iter().any(|l| l.width.min(l.height) / 2 < SMALLEST_SIDE) {
             break;
         }
         guide = guide.iter().map(halved).collect();
-        levels.push(level(&guide, cameras, &chosen, &ranges));
+        levels.push(level(&guide, cameras, &chosen, &ranges, &tolerance));
     }
     levels.reverse();
     Ok(levels)
@@ -84,17 +114,16 @@ fn inverse_depth_range(camera: &Camera, sparse: &[DVec3]) -> Result<[f64; 2]> {
     Ok([1.0 / (2.0 * at(0.99)), 1.0 / (0.6 * at(0.01))])
 }
 
+/// Whether a point falls into a camera's image.
+fn seen(camera: &Camera, p: DVec3) -> bool {
+    let (pixel, z) = camera.project(p);
+    let (w, h) = (camera.width as f64, camera.height as f64);
+    z > 0.0 && pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < w && pixel.y < h
+}
+
 /// The best source views of a view: many shared points, seen under 5–60° (optimum 20°, as in COLMAP's and MVSNet's
 /// view selection; narrower has no parallax, wider no common appearance).
 fn choose_sources(view: usize, cameras: &[Camera], sparse: &[DVec3], count: usize) -> Vec<usize> {
-    let seen = |camera: &Camera, p: DVec3| {
-        let (pixel, z) = camera.project(p);
-        z > 0.0
-            && pixel.x >= 0.0
-            && pixel.y >= 0.0
-            && pixel.x < camera.width as f64
-            && pixel.y < camera.height as f64
-    };
     let here = cameras[view].pose.centre();
     let mut scores: Vec<(f64, usize)> = (0..cameras.len())
         .filter(|&other| other != view)
@@ -126,7 +155,13 @@ fn halved(image: &RgbImage) -> RgbImage {
     RgbImage { width, height, data }
 }
 
-fn level(guide: &[RgbImage], cameras: &[Camera], chosen: &[Vec<usize>], ranges: &[[f64; 2]]) -> Level {
+fn level(
+    guide: &[RgbImage],
+    cameras: &[Camera],
+    chosen: &[Vec<usize>],
+    ranges: &[[f64; 2]],
+    tolerance: &[f32],
+) -> Level {
     // `halved` keeps the pixel grid's origin and drops odd borders: the scale is a power of two, not a size ratio.
     let cameras: Vec<Camera> = guide
         .iter()
@@ -166,7 +201,7 @@ fn level(guide: &[RgbImage], cameras: &[Camera], chosen: &[Vec<usize>], ranges: 
     // The shaders read 16 bits per value; rounding here keeps the CPU twin equal.
     let rounded = |l: f32| (l.clamp(0.0, 1.0) * 65535.0).round() / 65535.0;
     let luma = guide.iter().flat_map(|g| g.luma().data).map(rounded).collect();
-    Level { cameras, guide: guide.to_vec(), luma, sources, references }
+    Level { cameras, guide: guide.to_vec(), luma, sources, references, tolerance: tolerance.to_vec() }
 }
 
 fn source(reference: &Camera, other: &Camera, first: u32) -> Source {

@@ -72,7 +72,7 @@ pub struct ImageScore {
     pub frame: String,
     /// `train` or `test`.
     pub split: Split,
-    /// dB, of the 8-bit picture that is written.
+    /// dB, of the 8-bit picture that is written, within a photo's plain frame if it has one.
     pub psnr: f64,
     /// Structural similarity, 11×11 Gaussian window.
     pub ssim: f64,
@@ -196,11 +196,14 @@ impl Evaluation {
             )));
         }
         let depth = self.truth.depth(frame)?;
+        // A white or black frame around a photo is no part of the scene.
+        let border = crate::photo::Frame::of(&target);
+        let (inner, photo) = (border.crop(&shown), border.crop(&target));
         self.report.images.push(ImageScore {
             frame: frame.stem.clone(),
             split: frame.split,
-            psnr: metrics::psnr(&shown, &target),
-            ssim: metrics::ssim(&shown, &target),
+            psnr: metrics::psnr(&inner, &photo),
+            ssim: metrics::ssim(&inner, &photo),
             depth_median_relative: depth.and_then(|d| depth_error(rendered, &d, self.similarity.scale)),
         });
         if let Some(out) = &self.out {

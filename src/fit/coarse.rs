@@ -1,0 +1,33 @@
+//! Training first at half the photos' size: there a step costs less than half, and what it fits is what matters early on.
+use crate::scene::{Camera, DepthMap, Plane, RgbImage};
+
+/// What training looks at, halved.
+pub(super) struct Halved {
+    pub(super) images: Vec<RgbImage>,
+    pub(super) cameras: Vec<Camera>,
+    pub(super) depths: Option<Vec<DepthMap>>,
+}
+
+impl Halved {
+    pub(super) fn of(images: &[RgbImage], cameras: &[Camera], depths: Option<&[DepthMap]>) -> Halved {
+        let image = |i: &RgbImage| i.resized_by_area(half(i.width), half(i.height));
+        let camera = |c: &Camera| c.resized(half(c.width as usize) as u32, half(c.height as usize) as u32);
+        let depth = |d: &DepthMap| DepthMap { depth: sampled(&d.depth), confidence: sampled(&d.confidence) };
+        Halved {
+            images: images.iter().map(image).collect(),
+            cameras: cameras.iter().map(camera).collect(),
+            depths: depths.map(|all| all.iter().map(depth).collect()),
+        }
+    }
+}
+
+fn half(size: usize) -> usize {
+    size.div_ceil(2)
+}
+
+/// Every second value: between a near and a far surface there is no depth to average.
+fn sampled(plane: &Plane<f32>) -> Plane<f32> {
+    let (width, height) = (half(plane.width), half(plane.height));
+    let at = |i: usize| plane.at(i % width * plane.width / width, i / width * plane.height / height);
+    Plane { width, height, data: (0..width * height).map(at).collect() }
+}

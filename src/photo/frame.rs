@@ -1,0 +1,140 @@
+//! Plain frames around photos: scans, rectified and letterboxed pictures. They stand still while the scene moves, so they
+//! are neither matched nor learned: their pixels continue the picture instead.
+use crate::scene::RgbImage;
+
+/// Lines that belong to the frame on each side, pixels.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Frame {
+    /// Columns on the left.
+    pub left: usize,
+    /// Rows at the top.
+    pub top: usize,
+    /// Columns on the right.
+    pub right: usize,
+    /// Rows at the bottom.
+    pub bottom: usize,
+}
+
+/// Frames are thin: plain white or black that reaches deeper is scene (sky, a studio background).
+const DEEPEST_SHARE: f64 = 0.08;
+/// Share of plain pixels in an outermost line of a frame …
+const PLAIN: f64 = 0.9;
+/// … and below which a line belongs to the picture
+/// (bright windows may touch the frame, uneven edges leave steps in it).
+const PICTURE: f64 = 0.3;
+/// Resampling and JPEG mix the frame into this many lines of the picture.
+const MIXED: usize = 1;
+
+impl Frame {
+    /// The white or black frame of a picture. Opposite sides have one or neither: a bright sky has none below.
+    pub fn of(image: &RgbImage) -> Frame {
+        // Compression leaves a few grey levels of ringing on saturated pixels.
+        let white = |c: [f32; 3]| c.iter().all(|v| *v > 0.95);
+        let black = |c: [f32; 3]| c.iter().all(|v| *v < 0.02);
+        let (a, b) = (Frame::plain(image, white), Frame::plain(image, black));
+        if a == Frame::default() { b } else { a }
+    }
+
+    fn plain(image: &RgbImage, plain: impl Fn([f32; 3]) -> bool) -> Frame {
+        let (w, h) = (image.width, image.height);
+        let deepest = ((w.min(h) as f64 * DEEPEST_SHARE) as usize).min(w.min(h) / 4);
+        // The ends of a line belong to the frame's other sides.
+        let share = |across: usize, at: &dyn Fn(usize) -> [f32; 3]| {
+            let inner = deepest..across - deepest;
+            inner.clone().filter(|&i| plain(at(i))).count() as f64 / inner.len().max(1) as f64
+        };
+        let depth = |across: usize, at: &dyn Fn(usize, usize) -> [f32; 3]| {
+            if share(across, &|i| at(0, i)) < PLAIN {
+                return 0;
+            }
+            let first = (1..=deepest).find(|&d| share(across, &|i| at(d, i)) < PICTURE);
+            first.map_or(0, |d| d + MIXED)
+        };
+        let frame = Frame {
+            left: depth(h, &|d, i| image.at(d, i)),
+            right: depth(h, &|d, i| image.at(w - 1 - d, i)),
+            top: depth(w, &|d, i| image.at(i, d)),
+            bottom: depth(w, &|d, i| image.at(i, h - 1 - d)),
+        };
+        let pair = |a: usize, b: usize| if a > 0 && b > 0 { (a, b) } else { (0, 0) };
+        let ((left, right), (top, bottom)) = (pair(frame.left, frame.right), pair(frame.top, frame.bottom));
+        Frame { left, top, right, bottom }
+    }
+
+    /// Whether there is any.
+    pub fn is_none(&self) -> bool {
+        *self == Frame::default()
+    }
+
+    /// True on the frame of a picture of this size.
+    pub fn covers(&self, x: usize, y: usize, width: usize, height: usize) -> bool {
+        x < self.left || y < self.top || x + self.right >= width || y + self.bottom >= height
+    }
+
+    /// Replaces the frame by the nearest pixels of the picture.
+    pub fn continue_picture(&self, image: &mut RgbImage) {
+        if self.is_none() {
+            return;
+        }
+        let (w, h) = (image.width, image.height);
+        for y in 0..h {
+            for x in 0..w {
+                if self.covers(x, y, w, h) {
+                    let nearest = image
+                        .at(x.clamp(self.left, w - 1 - self.right), y.clamp(self.top, h - 1 - self.bottom));
+                    image.data[y * w + x] = nearest;
+                }
+            }
+        }
+    }
+
+    /// The picture without its frame.
+    pub fn crop(&self, image: &RgbImage) -> RgbImage {
+        let rows = self.top..image.height - self.bottom;
+        let row = |y: usize| &image.data[y * image.width + self.left..(y + 1) * image.width - self.right];
+        let data: Vec<[f32; 3]> = rows.clone().flat_map(|y| row(y).iter().copied()).collect();
+        RgbImage { width: image.width - self.left - self.right, height: rows.len(), data }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picture(f: impl Fn(usize, usize) -> [f32; 3]) -> RgbImage {
+        let data = (0..120 * 100).map(|k| f(k % 120, k / 120)).collect();
+        RgbImage { width: 120, height: 100, data }
+    }
+
+    fn scene(x: usize, y: usize) -> [f32; 3] {
+        [x as f32 / 240.0 + 0.2, y as f32 / 200.0 + 0.2, 0.5]
+    }
+
+    #[test]
+    fn an_uneven_white_frame_is_replaced_by_its_neighbours() {
+        let frame = |x: usize, y: usize| x < 4 + y / 60 || y < 3 || x >= 115 || y >= 98;
+        let mut image = picture(|x, y| if frame(x, y) { [1.0; 3] } else { scene(x, y) });
+        let found = Frame::of(&image);
+        assert_eq!(found, Frame { left: 6, top: 4, right: 6, bottom: 3 });
+        let inside = found.crop(&image);
+        assert_eq!((inside.width, inside.height), (108, 93));
+        assert_eq!(inside.at(0, 0), scene(6, 4));
+        found.continue_picture(&mut image);
+        assert_eq!(image.at(0, 50), scene(6, 50));
+        assert_eq!(image.at(119, 99), scene(113, 96));
+        assert_eq!(image.at(60, 60), scene(60, 60));
+        assert!(image.data.iter().all(|c| c[2] == 0.5));
+    }
+
+    #[test]
+    fn letterbox_bars_are_frames_and_bright_scenes_are_not() {
+        let bars = picture(|x, y| if !(7..93).contains(&y) { [0.0; 3] } else { scene(x, y) });
+        assert_eq!(Frame::of(&bars), Frame { top: 8, bottom: 8, ..Frame::default() });
+        let sky = picture(|x, y| if y < 6 { [1.0; 3] } else { scene(x, y) });
+        assert!(Frame::of(&sky).is_none());
+        let studio = picture(|x, y| if (40..80).contains(&x) && y > 30 { scene(x, y) } else { [1.0; 3] });
+        assert!(Frame::of(&studio).is_none());
+        assert!(Frame::of(&picture(scene)).is_none());
+        assert!(Frame::of(&picture(|_, _| [1.0; 3])).is_none());
+    }
+}
