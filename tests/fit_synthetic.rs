@@ -74,6 +74,8 @@ fn a_perturbed_camera_is_recovered() {
     let mut options = RgbOptions::preset(Preset::Draft);
     // 300 updates of the camera: turning and shifting look alike, so the last tenths of a degree come slowly.
     options.iterations = 900;
+    // These splats stand still; at half the size they would need to look different.
+    options.coarse = 0.0;
     let still = Exponential::constant(0.0);
     options.rates =
         fit::Rates { means: still, log_scales: 0.0, quats: 0.0, opacity: 0.0, sh_dc: 0.0, sh_rest: 0.0 };
