@@ -1,6 +1,6 @@
 //! `splatvk ablate`: the tables of the paper's experiments on a data set with ground truth.
 //!
-//! A table ([`setup`]) is a list of setups that differ in one thing. The [`lab`] runs them and shares every stage that two
+//! A table is a list of setups ([`Setup`]) that differ in one thing. The [`Lab`] runs them and shares every stage that two
 //! setups have in common: cameras, points and splats are made once for most tables. Figures are those of protocol `field`
 //! on held-out frames.
 mod lab;
