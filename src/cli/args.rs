@@ -34,6 +34,8 @@ pub enum Command {
     Render(RenderArgs),
     /// Scene + texts → heat maps, masks, locations
     Query(QueryArgs),
+    /// Look at a scene in the browser, and ask it
+    View(ViewArgs),
     /// Scene against ground truth → figures
     Eval(EvalArgs),
     /// Data with ground truth → the tables of the paper's experiments
@@ -247,6 +249,19 @@ pub struct QueryArgs {
     /// Also write the splats that each text means, as TEXT/splats.ply
     #[arg(long)]
     pub splats: bool,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// `splatvk view`
+#[derive(Debug, Args)]
+pub struct ViewArgs {
+    /// Scene directory, or a Gaussian .ply
+    pub scene: PathBuf,
+    /// Port on 127.0.0.1; 0 takes a free one
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub port: u16,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,

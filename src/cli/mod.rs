@@ -15,6 +15,7 @@ mod query;
 mod render;
 mod run;
 mod train;
+mod view;
 mod views;
 
 use crate::{Error, Result};
@@ -48,6 +49,7 @@ fn execute(command: Command) -> Result<()> {
         Command::Train(args) => train::train(&args),
         Command::Render(args) => render::render(&args),
         Command::Query(args) => query::query(&args),
+        Command::View(args) => view::view(&args),
         Command::Eval(args) => eval::eval(&args),
         Command::Ablate(args) => ablate::ablate(&args),
         Command::Generate(args) => generate::generate(&args),

@@ -67,6 +67,16 @@ pub fn terms_in(text: &str) -> Option<[f32; COUNT]> {
     (count > 0.0).then(|| said.map(|s| if s { 1.0 / count } else { 0.0 }))
 }
 
+/// The term that a direction of [`direction`]'s space is nearest to, and the cosine to it.
+pub fn nearest_term(towards: &[f32]) -> (&'static str, f32) {
+    let cosine = |i: usize| {
+        let one = std::array::from_fn(|k| if k == i { 1.0 } else { 0.0 });
+        direction(&one).iter().zip(towards).map(|(a, b)| a * b).sum::<f32>()
+    };
+    let best = (0..COUNT).map(|i| (i, cosine(i))).max_by(|a, b| a.1.total_cmp(&b.1));
+    best.map_or(("", 0.0), |(i, cosine)| (TERMS[i].0[0], cosine))
+}
+
 /// Distribution over terms → direction: square roots (so that a dot product is a Bhattacharyya coefficient) less what
 /// all terms share, unit length. An even distribution says nothing and gives zero.
 pub fn direction(distribution: &[f32; COUNT]) -> [f32; COUNT] {

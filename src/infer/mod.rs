@@ -16,6 +16,20 @@ pub use runtime::{Input, Session, Tensor, runtime, runtime_build};
 use crate::Result;
 use crate::scene::{Plane, RgbImage};
 
+/// The `best` of the rows [P, D] for each of the regions [count, D], by cosine.
+pub(crate) fn nearest(regions: &[f32], rows: &[f32], dim: usize, best: usize) -> Vec<Vec<(usize, f32)>> {
+    use rayon::prelude::*;
+    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f32>();
+    let of = |region: &[f32]| {
+        let mut list: Vec<(usize, f32)> =
+            rows.chunks_exact(dim).map(|row| dot(row, region)).enumerate().collect();
+        list.sort_by(|a, b| b.1.total_cmp(&a.1));
+        list.truncate(best);
+        list
+    };
+    regions.par_chunks_exact(dim).map(of).collect()
+}
+
 /// Puts image regions and texts into one space of unit vectors, so that a cosine says how well a phrase names a
 /// region. Implemented by `words` (the built-in default) and by user-supplied CLIP-like pairs of towers.
 pub trait RegionEncoder: Send {
@@ -28,4 +42,9 @@ pub trait RegionEncoder: Send {
     fn embed_regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>>;
     /// [texts.len(), D] row-major unit vectors.
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>>;
+    /// Per region embedding ([count, D] rows) the `best` phrases that the encoder itself knows, with their cosine, best
+    /// first. None from an encoder that has no list of phrases.
+    fn names(&mut self, regions: &[f32], _best: usize) -> Result<Vec<Vec<(String, f32)>>> {
+        Ok(vec![Vec::new(); regions.len() / self.dim().max(1)])
+    }
 }

@@ -20,9 +20,10 @@
 use super::classify::{CLASSES, Classifier};
 use super::registry::{Registry, Role, home, sha256};
 use super::text::{self, TextEncoder, normalise};
-use super::{RegionEncoder, colour};
+use super::{RegionEncoder, colour, nearest};
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
+use rayon::prelude::*;
 
 const MEANING_AT: usize = 0;
 const CLASSES_AT: usize = text::DIM;
@@ -54,6 +55,8 @@ struct Vocabulary {
     mean: Vec<f32>,
     /// [1000, 384] unit embeddings of the class names, less the mean.
     names: Vec<f32>,
+    /// [1000] the names.
+    list: Vec<String>,
 }
 
 impl RegionWords {
@@ -114,9 +117,7 @@ impl RegionEncoder for RegionWords {
         let mut all = vec![0f32; texts.len() * DIM];
         for (row, text) in all.chunks_exact_mut(DIM).zip(texts) {
             let (meaning, classes) = vocabulary.place(text)?;
-            let known: f32 = classes.iter().sum();
-            fill(row, MEANING_AT, SHARES[0] * known, meaning);
-            fill(row, CLASSES_AT, SHARES[1], classes.iter().map(|w| w.sqrt()));
+            fill_text(row, &meaning, &classes);
             if let Some(said) = colour::terms_in(text) {
                 fill(row, COLOUR_AT, SHARES[2], colour::direction(&said));
             }
@@ -124,6 +125,31 @@ impl RegionEncoder for RegionWords {
         }
         Ok(all)
     }
+
+    /// Class names, with the region's colour before them where that says more: "yellow lemon".
+    fn names(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
+        let vocabulary = self.vocabulary()?;
+        let found = nearest(regions, &vocabulary.rows(), DIM, best);
+        let with_colour = |(list, region): (Vec<(usize, f32)>, &[f32])| {
+            let (term, cosine) = colour::nearest_term(&region[COLOUR_AT..REST_AT]);
+            let gain = SHARES[2].sqrt() * cosine;
+            let name = |(i, cosine): (usize, f32)| match vocabulary.list[i].as_str() {
+                name if gain > 0.0 && colour::terms_in(name).is_none() => {
+                    (format!("{term} {name}"), cosine + gain)
+                }
+                name => (name.to_owned(), cosine),
+            };
+            list.into_iter().map(name).collect()
+        };
+        Ok(found.into_iter().zip(regions.chunks_exact(DIM)).map(with_colour).collect())
+    }
+}
+
+/// Writes a text's blocks of meaning and classes.
+fn fill_text(row: &mut [f32], meaning: &[f32], classes: &[f32]) {
+    let known: f32 = classes.iter().sum();
+    fill(row, MEANING_AT, SHARES[0] * known, meaning.iter().copied());
+    fill(row, CLASSES_AT, SHARES[1], classes.iter().map(|w| w.sqrt()));
 }
 
 /// Writes a unit block with `share` of the squared length.
@@ -200,7 +226,7 @@ impl Vocabulary {
             name.iter_mut().zip(&mean).for_each(|(n, m)| *n -= m);
             normalise(name);
         }
-        Ok(Vocabulary { encoder, mean, names })
+        Ok(Vocabulary { encoder, mean, names, list })
     }
 
     /// A text's centred unit embedding [384] and its weight on each class [1000], which sum to less than 1.
@@ -208,13 +234,28 @@ impl Vocabulary {
         let mut meaning = self.encoder.embed(text)?;
         meaning.iter_mut().zip(&self.mean).for_each(|(v, m)| *v -= m);
         normalise(&mut meaning);
-        let cosine = |name: &[f32]| name.iter().zip(&meaning).map(|(a, b)| a * b).sum::<f32>();
+        let weights = self.weights(&meaning);
+        Ok((meaning, weights))
+    }
+
+    /// The weight [1000] on each class of a centred unit embedding.
+    fn weights(&self, meaning: &[f32]) -> Vec<f32> {
+        let cosine = |name: &[f32]| name.iter().zip(meaning).map(|(a, b)| a * b).sum::<f32>();
         let scores: Vec<f32> = self.names.chunks_exact(text::DIM).map(cosine).collect();
         let most = scores.iter().copied().fold(THRESHOLD, f32::max);
         let power = |score: f32| ((score - most) / SOFTNESS).exp();
         let total = scores.iter().map(|s| power(*s)).sum::<f32>() + power(THRESHOLD);
-        let weights = scores.iter().map(|s| power(*s) / total).collect();
-        Ok((meaning, weights))
+        scores.iter().map(|s| power(*s) / total).collect()
+    }
+
+    /// The class names as texts, without colour: [1000, DIM], all but the last coordinate, which no region has.
+    fn rows(&self) -> Vec<f32> {
+        let mut rows = vec![0f32; CLASSES * DIM];
+        rows.par_chunks_exact_mut(DIM).zip(self.names.par_chunks_exact(text::DIM)).for_each(|(row, name)| {
+            let classes = self.weights(name);
+            fill_text(row, name, &classes);
+        });
+        rows
     }
 }
 
@@ -280,6 +321,22 @@ mod tests {
         assert!(first >= 37 && all == 41, "{first} of {all}");
         let (first, all) = first_of(&mut words, "test", &sure);
         assert!(first >= 69 && all == 81, "{first} of {all}");
+    }
+
+    #[test]
+    fn regions_get_names() {
+        let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
+        let view = &views("train")[1];
+        let regions = words.embed_regions(&view.image, &view.masks, 12).unwrap();
+        let names = words.names(&regions, 5).unwrap();
+        assert!(names.len() == 12 && names.iter().all(|list| list.len() == 5));
+        let object = phrases().into_iter().find(|(_, p)| p == "lemon").map_or(0, |(o, _)| o as usize);
+        // To the classifier it is as much a spaghetti squash.
+        let found = names[object].iter().find(|(name, _)| name == "yellow lemon");
+        // The same text asked for has the same cosine, up to what the batched network rounds away.
+        let asked = words.embed_texts(&["yellow lemon"]).unwrap();
+        let cosine = dot(&asked, &regions[object * DIM..(object + 1) * DIM]);
+        assert!(found.is_some_and(|(_, c)| (c - cosine).abs() < 0.05), "{cosine}: {:?}", names[object]);
     }
 
     #[test]

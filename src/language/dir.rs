@@ -200,6 +200,10 @@ impl TextEmbeddings {
     pub fn get(&self, phrase: &str) -> Option<&[f32]> {
         self.entries.get(&key(phrase)).map(Vec::as_slice)
     }
+    /// Every phrase and its unit vector.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &[f32])> {
+        self.entries.iter().map(|(phrase, vector)| (phrase.as_str(), vector.as_slice()))
+    }
     /// [texts.len(), D] unit rows; an unknown phrase is an error that lists what is known.
     pub fn embed(&self, texts: &[&str]) -> Result<Vec<f32>> {
         let mut out = Vec::with_capacity(texts.len() * self.dim);

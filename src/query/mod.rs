@@ -5,8 +5,11 @@
 //! map; the mask of the `field` protocol is chosen on codes, so smoothing never moves its edges.
 pub mod eval;
 pub mod filter;
+mod highlight;
 pub mod protocol;
 pub mod select;
+
+pub use highlight::{Highlight, highlight};
 
 use crate::scene::{Codebook, LanguageField, Plane};
 use crate::{Error, Result};
@@ -109,13 +112,19 @@ pub fn code_relevancy(codebook: &Codebook, query: &TextQuery) -> Result<Vec<f32>
             query.embedding.len()
         )));
     }
-    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| *x as f64 * *y as f64).sum::<f64>();
-    let one = |phi: &[f32]| {
-        let q = dot(phi, &query.embedding);
-        let hardest = query.canonicals.chunks_exact(d).map(|n| dot(phi, n)).fold(f64::NEG_INFINITY, f64::max);
-        (1.0 / (1.0 + (-LOGIT_SCALE * (q - hardest)).exp())) as f32
-    };
+    let one = |phi: &[f32]| relevancy(phi, dot(phi, &query.embedding), &query.canonicals);
     Ok(codebook.embeddings.chunks_exact(d).map(one).collect())
+}
+
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    a.iter().zip(b).map(|(x, y)| *x as f64 * *y as f64).sum()
+}
+
+/// Relevancy of a text whose cosine to the region embedding `phi` is known, against canonical rows [C, D].
+pub(crate) fn relevancy(phi: &[f32], cosine: f64, canonicals: &[f32]) -> f32 {
+    let hardest =
+        canonicals.chunks_exact(phi.len().max(1)).map(|n| dot(phi, n)).fold(f64::NEG_INFINITY, f64::max);
+    (1.0 / (1.0 + (-LOGIT_SCALE * (cosine - hardest)).exp())) as f32
 }
 
 /// Relevancy per pixel of a decoded map; void pixels (−1) get 0.

@@ -24,7 +24,7 @@ pub struct Selection {
 }
 
 /// Code of every splat, `argmax_k f·c_k`; none for splats without a feature.
-fn codes(level: &LevelField) -> Vec<Option<usize>> {
+pub fn splat_codes(level: &LevelField) -> Vec<Option<usize>> {
     let d = level.codebook.code_dim.max(1);
     let one = |f: &[f32]| {
         let length = f.iter().map(|v| v * v).sum::<f32>().sqrt();
@@ -39,7 +39,7 @@ pub fn select(field: &LanguageField, query: &TextQuery, options: &QueryOptions) 
     let relevancy = field_relevancy(field, query)?;
     let mut found: Vec<(usize, f32, Vec<Option<usize>>)> = Vec::new();
     for (l, (level, values)) in field.levels.iter().zip(&relevancy).enumerate() {
-        let of = codes(level);
+        let of = splat_codes(level);
         let mut carried = vec![0usize; values.len()];
         of.iter().flatten().for_each(|&k| carried[k] += 1);
         let solid = values.iter().zip(&carried).filter(|(_, n)| **n >= LEAST_SPLATS).map(|(v, _)| *v);

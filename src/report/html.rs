@@ -1,5 +1,5 @@
 //! `report.html`: one self-contained file, readable on a phone.
-use super::{Curve, QueryShown, Report, ViewShown, chart, colour, duration};
+use super::{Curve, QueryShown, Report, ViewShown, chart, colour, duration, viewer};
 use crate::format::picture;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
@@ -18,7 +18,7 @@ pub fn write_html(folder: &Path, report: &Report) -> Result<()> {
     std::fs::write(&path, page(report)?).map_err(Error::io(&path))
 }
 
-fn escape(text: &str) -> String {
+pub(super) fn escape(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
@@ -44,6 +44,10 @@ fn page(report: &Report) -> Result<String> {
         let _ = write!(body, "<div><b>{}</b><span>{}</span></div>", escape(value), escape(label));
     }
     body.push_str("</section>");
+    if let Some(scene) = &report.scene {
+        let (section, note) = scene.embedded()?;
+        let _ = write!(body, "{section}<p class=\"small\">{}</p>", escape(&note));
+    }
     if !report.run.warnings.is_empty() {
         let items: String = report.run.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
         let _ = write!(body, "<section class=\"note\"><h2>Warnings</h2><ul>{items}</ul></section>");
@@ -61,8 +65,9 @@ fn page(report: &Report) -> Result<String> {
     body.push_str(&run_tables(report));
     Ok(format!(
         "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><meta name=\"viewport\" \
-         content=\"width=device-width, initial-scale=1\"><title>{title} · splatvk</title><style>{STYLE}</style>\
-         <main>{body}</main></html>\n"
+         content=\"width=device-width, initial-scale=1\"><title>{title} · splatvk</title><style>{STYLE}{}</style>\
+         <main>{body}</main></html>\n",
+        viewer::STYLE
     ))
 }
 
@@ -234,6 +239,7 @@ mod tests {
                 Curve { name: "nothing", unit: "", points: vec![(1.0, 1.0)] },
             ],
             space: Some("words/x"),
+            scene: None,
             figures: vec![("splats".into(), "123".into())],
             run: &run,
         };

@@ -3,6 +3,7 @@ pub mod chart;
 pub mod colour;
 mod html;
 mod summary;
+pub mod viewer;
 
 pub use html::write_html;
 pub use summary::{duration, table};
@@ -125,6 +126,8 @@ pub struct Report<'a> {
     pub curves: Vec<Curve>,
     /// Embedding space of the language field; `words/…` gets a plain statement of what it knows.
     pub space: Option<&'a str>,
+    /// The scene for the interactive view.
+    pub scene: Option<viewer::Scene3d<'a>>,
     /// Figures for the head of the page: (label, value).
     pub figures: Vec<(String, String)>,
     /// Run record.

@@ -5,6 +5,7 @@ use crate::gpu::Device;
 use crate::infer::RegionEncoder;
 use crate::query::select::{Selection, select};
 use crate::query::{self, CANONICAL_PHRASES, QueryOptions, TextQuery};
+use crate::report::viewer::Names;
 use crate::scene::{Camera, LanguageField, Plane, Splats};
 use crate::{Error, Result};
 
@@ -58,6 +59,16 @@ impl QueryScene {
         Ok(&self.frames)
     }
 
+    /// The phrases of the text model that name each code best: see [`RegionEncoder::names`].
+    pub fn names(&mut self) -> Result<Names> {
+        names(self.encoder.as_mut(), &self.field, NAMES)
+    }
+
+    /// The scene's language.
+    pub fn field(&self) -> &LanguageField {
+        &self.field
+    }
+
     /// The frames of the last [`QueryScene::look`].
     pub fn frames(&self) -> &[DecodedFrame] {
         &self.frames
@@ -78,6 +89,28 @@ impl QueryScene {
     }
 }
 
+/// Phrases of the text model that a viewer shows for a code.
+pub const NAMES: usize = 5;
+
+/// Per level and code the `best` phrases with their relevancy, best first; without phrases where the text model has no
+/// list of its own.
+pub fn names(encoder: &mut dyn RegionEncoder, field: &LanguageField, best: usize) -> Result<Names> {
+    let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
+    let mut levels = Vec::with_capacity(field.levels.len());
+    for level in &field.levels {
+        let book = &level.codebook;
+        let rows = book.embeddings.chunks_exact(book.embedding_dim.max(1));
+        let named = encoder.names(&book.embeddings, best)?;
+        let rate = |(row, list): (&[f32], Vec<(String, f32)>)| {
+            list.into_iter()
+                .map(|(name, cosine)| (name, query::relevancy(row, cosine.into(), &canonicals)))
+                .collect()
+        };
+        levels.push(rows.zip(named).map(rate).collect());
+    }
+    Ok(levels)
+}
+
 /// The answers to one query in all frames.
 pub fn answers(
     frames: &[DecodedFrame],
@@ -86,5 +119,7 @@ pub fn answers(
     options: &QueryOptions,
 ) -> Result<Answers> {
     let codes: Vec<&[Plane<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
-    Ok(Answers { text: query.text.clone(), views: query::answer_all(&codes, field, query, options)? })
+    let views = query::answer_all(&codes, field, query, options)?;
+    let highlight = query::highlight(&codes, field, query, &views)?;
+    Ok(Answers { text: query.text.clone(), views, highlight })
 }

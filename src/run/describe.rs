@@ -6,6 +6,7 @@ use crate::language::{self, Language, ViewMasks};
 use crate::pose::Geometry;
 use crate::progress::Progress;
 use crate::query::TextQuery;
+use crate::report::viewer::Names;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
 
@@ -25,6 +26,8 @@ pub(super) struct Described {
     pub queries: Vec<TextQuery>,
     /// Codebooks, targets and the alignment behind them.
     pub language: Language,
+    /// The text model's own phrases per level and code.
+    pub names: Names,
 }
 
 impl Describer<'_> {
@@ -51,7 +54,9 @@ impl Describer<'_> {
         let options = self.plan.recipe().build(self.encoder.space(), self.plan.seed);
         let (cameras, depths) = (&geometry.cameras, &geometry.depths);
         let language = language::build(&masks, cameras, depths, &matches, &options, progress)?;
-        Ok(Described { queries, language })
+        // As many as the page shows beside a selected thing.
+        let names = super::ask::names(self.encoder.as_mut(), &language.field, super::ask::NAMES)?;
+        Ok(Described { queries, language, names })
     }
 }
 

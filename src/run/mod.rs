@@ -21,7 +21,8 @@ use crate::photo::{self, Photo};
 use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, InitChoice};
 use crate::progress::{Progress, Recorded, StageRecord};
-use crate::query::{QueryOptions, QueryResult};
+use crate::query::{Highlight, QueryOptions, QueryResult};
+use crate::report::viewer::{Names, ShownAnswer};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
 use crate::{Error, Result};
 use describe::{Described, Describer, both};
@@ -104,9 +105,21 @@ pub struct Answers {
     pub text: String,
     /// Per photo.
     pub views: Vec<QueryResult>,
+    /// For the scene as a whole.
+    pub highlight: Highlight,
 }
 
 impl Answers {
+    /// For the interactive view.
+    pub fn shown(&self) -> ShownAnswer<'_> {
+        ShownAnswer {
+            text: &self.text,
+            found: self.found(),
+            views: self.views.len(),
+            highlight: &self.highlight,
+        }
+    }
+
     /// Photos in which the text was found.
     pub fn found(&self) -> usize {
         self.views.iter().filter(|v| v.found).count()
@@ -141,6 +154,8 @@ pub struct Outcome {
     pub frames: Vec<DecodedFrame>,
     /// One per query of the plan.
     pub answers: Vec<Answers>,
+    /// The text model's own phrases per level and code.
+    pub names: Names,
     /// Models that were used.
     pub models: Vec<crate::infer::ModelStatus>,
     /// Times and memory per stage, up to the writing of the scene.
@@ -186,7 +201,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
         )
     };
     let (geometry, trained, described) = side_by_side(reconstruct, train, describer, progress)?;
-    let Described { queries, language: built } = described;
+    let Described { queries, language: built, names } = described;
     let spoken = plan.recipe().speak(
         &device,
         &images,
@@ -216,6 +231,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
         language_curve: spoken.curve,
         frames,
         answers,
+        names,
         models: registry.status(),
         stages: progress.stages(),
         seconds: progress.seconds(),

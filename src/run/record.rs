@@ -2,6 +2,7 @@
 use super::{Answers, Outcome};
 use crate::Result;
 use crate::fit::{CurvePoint, FitStats, LanguagePoint};
+use crate::report::viewer::Scene3d;
 use crate::report::{self, AnswerShown, Curve, ModelUsed, QueryShown, Report, RunRecord, ViewShown};
 use crate::scene::LEVEL_NAMES;
 use serde_json::json;
@@ -150,11 +151,24 @@ pub(super) fn write(folder: &Path, o: &Outcome) -> Result<()> {
         queries: o.answers.iter().map(shown).collect(),
         curves: curves(&o.rgb, &o.language_curve),
         space: Some(&o.field.space),
+        scene: Some(scene(&title, o)),
         figures: figures(o),
         run: &record,
     };
     report::write_html(folder, &report)?;
     report::write_previews(folder, &report)
+}
+
+fn scene<'a>(title: &'a str, o: &'a Outcome) -> Scene3d<'a> {
+    Scene3d {
+        title,
+        splats: &o.splats,
+        cameras: &o.cameras,
+        photos: o.photos.iter().map(|p| &p.image).collect(),
+        language: Some(&o.field),
+        names: &o.names,
+        answers: o.answers.iter().map(Answers::shown).collect(),
+    }
 }
 
 fn shown(a: &Answers) -> QueryShown<'_> {

@@ -3,7 +3,7 @@ use super::{FeatureSource, MaskSource};
 use crate::infer::hed::Hed;
 use crate::infer::words::RegionWords;
 use crate::infer::xfeat::{DenseFeatures, XFeat};
-use crate::infer::{RegionEncoder, Registry};
+use crate::infer::{RegionEncoder, Registry, nearest};
 use crate::language::align::{PairLinks, links_from_warps};
 use crate::language::dir::{self, TextEmbeddings};
 use crate::language::{ViewMasks, graph, matcher};
@@ -61,6 +61,13 @@ impl RegionEncoder for Table {
     }
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
         self.texts.embed(texts)
+    }
+    fn names(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
+        let named: Vec<_> = self.texts.iter().filter(|(p, _)| !CANONICAL_PHRASES.contains(p)).collect();
+        let rows: Vec<f32> = named.iter().flat_map(|(_, v)| v.iter().copied()).collect();
+        let found = nearest(regions, &rows, self.texts.dim, best);
+        let text = |(i, cosine): (usize, f32)| (named[i].0.to_owned(), cosine);
+        Ok(found.into_iter().map(|list| list.into_iter().map(text).collect()).collect())
     }
 }
 

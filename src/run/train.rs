@@ -190,6 +190,15 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         queries: Vec::new(),
         curves: curves.clone(),
         space: None,
+        scene: Some(report::viewer::Scene3d {
+            title: &title,
+            splats: &trained.splats,
+            cameras: &trained.cameras,
+            photos: images.iter().collect(),
+            language: None,
+            names: &Vec::new(),
+            answers: Vec::new(),
+        }),
         figures: figures.clone(),
         run: &record,
     };

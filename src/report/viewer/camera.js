@@ -1,0 +1,156 @@
+// Cameras and the small linear algebra behind them. Conventions are splatvk's: OpenCV axes (+x right, +y down, +z
+// forward), pixel (0, 0) covers [0, 1) x [0, 1), quaternions (w, x, y, z), rotations world -> camera, row-major.
+
+export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
+export const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+export const scale = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+export const unit = (a) => scale(a, 1 / (Math.hypot(...a) || 1));
+const mix = (a, b, t) => a.map((v, i) => v + (b[i] - v) * t);
+
+/// R v of a row-major 3 x 3 matrix.
+export const rotate = (r, v) => [0, 3, 6].map((k) => r[k] * v[0] + r[k + 1] * v[1] + r[k + 2] * v[2]);
+/// Transposed R times v: camera axes to world axes.
+export const unrotate = (r, v) => [0, 1, 2].map((k) => r[k] * v[0] + r[k + 3] * v[1] + r[k + 6] * v[2]);
+const multiply = (a, b) => [0, 3, 6].flatMap((i) => [0, 1, 2].map((j) => a[i] * b[j] + a[i + 1] * b[j + 3] + a[i + 2] * b[j + 6]));
+const transpose = (r) => [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
+
+/// Rotation by an angle about a unit axis (Rodrigues).
+function about([x, y, z], angle) {
+  const c = Math.cos(angle), s = Math.sin(angle), d = 1 - c;
+  return [c + x * x * d, x * y * d - z * s, x * z * d + y * s,
+    y * x * d + z * s, c + y * y * d, y * z * d - x * s,
+    z * x * d - y * s, z * y * d + x * s, c + z * z * d];
+}
+
+function toQuaternion(r) {
+  const [xx, yy, zz] = [r[0], r[4], r[8]];
+  const q = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz];
+  const k = q.indexOf(Math.max(...q));
+  const s = Math.sqrt(q[k]);
+  const [a, b, c] = [r[7] - r[5], r[2] - r[6], r[3] - r[1]];
+  const [d, e, f] = [r[1] + r[3], r[2] + r[6], r[5] + r[7]];
+  const rows = [[q[0], a, b, c], [a, q[1], d, e], [b, d, q[2], f], [c, e, f, q[3]]];
+  return rows[k].map((v) => v / (2 * s));
+}
+
+function fromQuaternion([w, x, y, z]) {
+  return [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)];
+}
+
+const normalised = (q) => q.map((v) => v / Math.hypot(...q));
+
+function slerp(a, b, t) {
+  let c = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
+  const to = c < 0 ? b.map((v) => -v) : b;
+  c = Math.min(Math.abs(c), 1);
+  const angle = Math.acos(c);
+  // Below a hundredth of a radian the chord is the arc to 1e-5.
+  const [p, q] = angle < 0.01 ? [1 - t, t] : [Math.sin((1 - t) * angle) / Math.sin(angle), Math.sin(t * angle) / Math.sin(angle)];
+  return normalised(a.map((v, i) => p * v + q * to[i]));
+}
+
+/// A camera that may move. `focal` is in units of the image height; `shift` is the principal point's distance from the
+/// image centre in the same unit; `distance` is how far the point is that it turns about.
+export class Camera {
+  constructor({ rotation, position, focal, shift = [0, 0], ratio = 4 / 3, aspect = 1, distance = 1 }) {
+    Object.assign(this, { rotation, position, focal, shift, ratio, aspect, distance });
+  }
+
+  /// The camera of a photo.
+  static of(view, distance) {
+    return new Camera({
+      rotation: view.rotation,
+      position: scale(unrotate(view.rotation, view.translation), -1),
+      focal: view.fy / view.height,
+      aspect: view.fx / view.fy,
+      shift: [(view.cx - view.width / 2) / view.height, (view.cy - view.height / 2) / view.height],
+      ratio: view.width / view.height,
+      distance,
+    });
+  }
+
+  copy() {
+    return new Camera(this);
+  }
+
+  get translation() {
+    return scale(rotate(this.rotation, this.position), -1);
+  }
+
+  /// The point that it turns about.
+  get pivot() {
+    return add(this.position, scale(this.rotation.slice(6), this.distance));
+  }
+
+  /// fx, fy, cx, cy for an image of this size, which shows at least all that the photo shows.
+  intrinsics(width, height) {
+    const unitLength = Math.min(height, width / this.ratio);
+    const fy = this.focal * unitLength;
+    return [fy * this.aspect, fy, width / 2 + this.shift[0] * unitLength, height / 2 + this.shift[1] * unitLength];
+  }
+
+  /// Turns about the pivot: `yaw` about the world's up, `pitch` about its own horizontal axis, radians.
+  orbit(yaw, pitch, up) {
+    const pivot = this.pivot;
+    const forward = this.rotation.slice(6), right = this.rotation.slice(0, 3);
+    // Looking straight up or down, left and right would swap: stay 5 degrees off.
+    const height = Math.asin(Math.max(-1, Math.min(1, dot(forward, up))));
+    const most = Math.PI / 2 - 0.09;
+    const tilt = Math.max(-most - height, Math.min(most - height, pitch));
+    const turn = multiply(about(up, yaw), about(right, tilt));
+    // By way of a unit quaternion, so that many small turns stay a rotation.
+    this.rotation = fromQuaternion(normalised(toQuaternion(multiply(this.rotation, transpose(turn)))));
+    this.position = sub(pivot, scale(this.rotation.slice(6), this.distance));
+  }
+
+  /// Moves along its own axes, world units.
+  move(x, y, z) {
+    this.position = add(this.position, unrotate(this.rotation, [x, y, z]));
+  }
+
+  /// Goes nearer to the pivot (factor below 1) or away.
+  dolly(factor) {
+    const pivot = this.pivot;
+    this.distance *= factor;
+    this.position = sub(pivot, scale(this.rotation.slice(6), this.distance));
+  }
+
+  /// Makes a point the one to turn about, without turning.
+  aim(point) {
+    this.distance = Math.max(dot(sub(point, this.position), this.rotation.slice(6)), 1e-6);
+  }
+
+  /// The pixel position and depth of a world point.
+  project(point, width, height) {
+    const t = rotate(this.rotation, sub(point, this.position));
+    const [fx, fy, cx, cy] = this.intrinsics(width, height);
+    return [fx * t[0] / t[2] + cx, fy * t[1] / t[2] + cy, t[2]];
+  }
+
+  /// The world point of a pixel position at a depth.
+  unproject(x, y, depth, width, height) {
+    const [fx, fy, cx, cy] = this.intrinsics(width, height);
+    return add(this.position, unrotate(this.rotation, [(x - cx) / fx * depth, (y - cy) / fy * depth, depth]));
+  }
+
+  /// The way from one camera to the other at t in [0, 1].
+  static between(a, b, t) {
+    const k = mix([a.focal, a.ratio, a.aspect, a.distance], [b.focal, b.ratio, b.aspect, b.distance], t);
+    return new Camera({
+      rotation: fromQuaternion(slerp(toQuaternion(a.rotation), toQuaternion(b.rotation), t)),
+      position: mix(a.position, b.position, t),
+      shift: mix(a.shift, b.shift, t),
+      focal: k[0], ratio: k[1], aspect: k[2], distance: k[3],
+    });
+  }
+}
+
+/// The scene's up: opposite to where the photos' columns point on average.
+export function upOf(views) {
+  const sum = views.reduce((s, v) => sub(s, v.rotation.slice(3, 6)), [0, 0, 0]);
+  return Math.hypot(...sum) > 1e-3 ? unit(sum) : [0, -1, 0];
+}

@@ -1,0 +1,217 @@
+//! The interactive 3D view: one page section that needs no build step and no request to anywhere else. `report.html`
+//! embeds it with the splats inside; `splatvk view` serves it and answers its questions.
+//!
+//! The page is plain modules under an import map of `data:` addresses, so that the same text works from a file and from
+//! a server, with nothing beside it.
+mod pack;
+
+pub use pack::{Packed, pack};
+
+use super::colour;
+use crate::Result;
+use crate::format::picture;
+use crate::query::Highlight;
+use crate::scene::{Camera, LEVEL_NAMES, LanguageField, RgbImage, Splats};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use serde_json::{Value, json};
+
+/// Where the page asks for the packed splats of [`pack`].
+pub const SCENE_PATH: &str = "scene.bin";
+
+/// Splats embedded in a report: about 7 MB of page.
+const REPORT_SPLATS: usize = 300_000;
+
+/// Height of the photos' thumbnails, pixels: twice what the page shows, for dense screens.
+const THUMBNAIL: usize = 104;
+
+/// Name under which the page imports a module, and its text.
+const MODULES: [(&str, &str); 6] = [
+    ("splatvk/camera", include_str!("camera.js")),
+    ("splatvk/pick", include_str!("pick.js")),
+    ("splatvk/render", include_str!("render.js")),
+    ("splatvk/sort", include_str!("sort.js")),
+    ("splatvk/splats", include_str!("splats.js")),
+    ("splatvk/viewer", include_str!("viewer.js")),
+];
+
+const MARKUP: &str = include_str!("viewer.html");
+
+/// Style of the section.
+pub const STYLE: &str = include_str!("viewer.css");
+
+/// One answered query as the page shows it.
+#[derive(Clone, Copy, Debug)]
+pub struct ShownAnswer<'a> {
+    /// What was asked.
+    pub text: &'a str,
+    /// Views in which it was found.
+    pub found: usize,
+    /// Views that were asked.
+    pub views: usize,
+    /// What lights up.
+    pub highlight: &'a Highlight,
+}
+
+impl ShownAnswer<'_> {
+    /// What the page reads.
+    pub fn json(&self) -> Value {
+        let h = self.highlight;
+        json!({
+            "text": self.text, "found": self.found, "views": self.views,
+            "level": h.level, "codes": h.codes, "relevancy": h.relevancy,
+        })
+    }
+}
+
+/// Phrases with their relevancy, best first, per level and code.
+pub type Names = Vec<Vec<Vec<(String, f32)>>>;
+
+/// What the view shows.
+#[derive(Clone, Debug)]
+pub struct Scene3d<'a> {
+    /// Name of the scene.
+    pub title: &'a str,
+    /// The Gaussians.
+    pub splats: &'a Splats,
+    /// The photos' cameras.
+    pub cameras: &'a [Camera],
+    /// The photos, for thumbnails; as many as cameras, or none.
+    pub photos: Vec<&'a RgbImage>,
+    /// What the scene knows about words.
+    pub language: Option<&'a LanguageField>,
+    /// The text model's own phrases for every code; may be empty.
+    pub names: &'a Names,
+    /// Queries that were run.
+    pub answers: Vec<ShownAnswer<'a>>,
+}
+
+impl Scene3d<'_> {
+    /// The section for a static page, splats included, and what to tell about it.
+    pub fn embedded(&self) -> Result<(String, String)> {
+        let packed = pack(self.splats, self.language, REPORT_SPLATS)?;
+        let data = STANDARD.encode(&packed.bytes);
+        let note = format!(
+            "{} of {} splats, {:.1} MB in this page. splatvk view SCENE shows all of them and answers any question.",
+            packed.shown,
+            packed.total,
+            data.len() as f64 / 1e6
+        );
+        let manifest =
+            self.manifest("This page answers the queries of its run; splatvk view SCENE answers any.")?;
+        let splats = format!("<script type=\"text/plain\" id=\"v-splats\">{data}</script>");
+        Ok((section(&manifest, &splats), note))
+    }
+
+    /// The whole page of a server that answers `POST query` and sends [`SCENE_PATH`]; `mute` says why it cannot answer.
+    pub fn served(&self, mute: Option<&str>) -> Result<String> {
+        let mut manifest = self.manifest(mute.unwrap_or_default())?;
+        manifest["live"] = mute.is_none().into();
+        manifest["scene"] = SCENE_PATH.into();
+        let title = super::html::escape(self.title);
+        Ok(format!(
+            "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><meta name=\"viewport\" \
+             content=\"width=device-width, initial-scale=1, viewport-fit=cover\"><title>{title} · splatvk</title>\
+             <link rel=\"icon\" href=\"data:,\"><style>* {{ box-sizing: border-box }} body {{ margin: 0; background: #000 }}\
+             {STYLE}</style><body>{}</html>\n",
+            section(&manifest, "").replacen("class=\"viewer\"", "class=\"viewer full\"", 1)
+        ))
+    }
+
+    fn manifest(&self, ask_note: &str) -> Result<Value> {
+        let views = self.cameras.iter().enumerate().map(|(i, c)| view(c, self.photos.get(i).copied()));
+        let words = self.language.is_some_and(|l| l.space.starts_with("words"));
+        Ok(json!({
+            "title": self.title, "live": false, "ask_note": ask_note,
+            "names_note": if words { "" } else { "This text model brings no phrases of its own: ask, and they appear here." },
+            "views": views.collect::<Result<Vec<_>>>()?,
+            "levels": (0..LEVEL_NAMES.len()).map(|at| self.level(at)).collect::<Vec<_>>(),
+            "answers": self.answers.iter().map(ShownAnswer::json).collect::<Vec<_>>(),
+        }))
+    }
+
+    fn level(&self, at: usize) -> Value {
+        let codes = self.language.and_then(|l| l.levels.get(at)).map_or(0, |l| l.codebook.len());
+        let colours: Vec<[f32; 3]> = (0..codes).map(|k| colour::label(k as i32)).collect();
+        let (title, one) = [("Subparts", "Subpart"), ("Parts", "Part"), ("Things", "Thing")][at];
+        let phrases = self.names.get(at).filter(|n| n.len() == codes).cloned().unwrap_or_default();
+        json!({ "name": LEVEL_NAMES[at], "title": title, "one": one, "colours": colours, "phrases": phrases })
+    }
+}
+
+fn view(camera: &Camera, photo: Option<&RgbImage>) -> Result<Value> {
+    let thumbnail = match photo {
+        Some(photo) if photo.height > 0 => {
+            let height = THUMBNAIL.min(photo.height);
+            let small = photo.resized_by_area((photo.width * height / photo.height).max(1), height);
+            Some(format!("data:image/jpeg;base64,{}", STANDARD.encode(picture::jpeg_bytes(&small, 80)?)))
+        }
+        _ => None,
+    };
+    // glam is column-major; the page wants rows.
+    let rotation = camera.pose.rotation.transpose().to_cols_array();
+    Ok(json!({
+        "name": crate::format::cameras::stem(&camera.name), "width": camera.width, "height": camera.height,
+        "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+        "rotation": rotation, "translation": camera.pose.translation.to_array(), "thumbnail": thumbnail,
+    }))
+}
+
+/// Markup, data and modules. In JSON inside a page, `<` could end the script.
+fn section(manifest: &Value, data: &str) -> String {
+    let address = |text: &str| format!("data:text/javascript;base64,{}", STANDARD.encode(text));
+    let imports: serde_json::Map<String, Value> =
+        MODULES.iter().map(|(name, text)| ((*name).to_owned(), address(text).into())).collect();
+    let manifest = manifest.to_string().replace('<', "\\u003c");
+    format!(
+        "{MARKUP}<script type=\"application/json\" id=\"v-manifest\">{manifest}</script>{data}\
+         <script type=\"importmap\">{}</script><script type=\"module\">import \"splatvk/viewer\";</script>",
+        json!({ "imports": imports })
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pass::seeded;
+
+    #[test]
+    fn the_section_is_whole_and_its_data_cannot_break_out() {
+        let (splats, camera) = seeded::small(40, 64, 48, 1, 3);
+        let photo = RgbImage { width: 64, height: 48, data: vec![[0.3; 3]; 64 * 48] };
+        let highlight =
+            Highlight { level: 2, codes: vec![1], relevancy: vec![vec![], vec![], vec![0.1, 0.9]] };
+        let answer = ShownAnswer { text: "</script><b>", found: 1, views: 1, highlight: &highlight };
+        let scene = Scene3d {
+            title: "a<b",
+            splats: &splats,
+            cameras: std::slice::from_ref(&camera),
+            photos: vec![&photo],
+            language: None,
+            names: &Vec::new(),
+            answers: vec![answer],
+        };
+        let (html, note) = scene.embedded().unwrap();
+        assert!(note.contains(&format!("of {} splats", splats.len())), "{note}");
+        assert_eq!(html.matches("</script>").count(), 4, "manifest, splats, import map, start");
+        let manifest = html.split("id=\"v-manifest\">").nth(1).unwrap().split("</script>").next().unwrap();
+        let manifest: Value = serde_json::from_str(manifest).unwrap();
+        assert_eq!(manifest["answers"][0]["text"], "</script><b>");
+        assert_eq!(manifest["live"], false);
+        // Row 2 of the rotation is where the camera looks.
+        let forward = camera.pose.rotation.row(2);
+        assert_eq!(manifest["views"][0]["rotation"][8], forward.z);
+        assert_eq!(manifest["views"][0]["rotation"][6], forward.x);
+        let page = scene.served(Some("no model")).unwrap();
+        assert!(page.contains("viewer full") && page.contains("a&lt;b") && !page.contains("v-splats\""));
+        assert!(page.contains("\"ask_note\":\"no model\"") && page.contains("\"live\":false"));
+        assert!(scene.served(None).unwrap().contains("\"live\":true"));
+        // Every module that is imported is there.
+        for (_, text) in MODULES {
+            for line in text.lines().filter(|l| l.starts_with("import ")) {
+                let name = line.split('"').nth(1).unwrap();
+                assert!(MODULES.iter().any(|(n, _)| *n == name), "{line}");
+            }
+        }
+    }
+}

@@ -1,0 +1,338 @@
+//! Splats in the few bytes that the page needs: quantised, in spatial order, deflated.
+//!
+//! Little endian, after gzip; N splats, B = ⌈N / 256⌉ blocks, L language levels, R = (degree + 1)² − 1:
+//!
+//! | what | type | meaning |
+//! |---|---|---|
+//! | head | `SVKVIEW1`, u32 × 4 | N, SH degree, L, 0 |
+//! | SH scale | f32 × 3 | largest absolute coefficient of degrees 1, 2, 3 |
+//! | ranges | f32 × 10 per block | lowest and highest x, y, z; log scale; colour |
+//! | x, y, z | u16 × N each | position in the block's range |
+//! | log scales | u8 × N, three times | in the block's range |
+//! | rotation | u32 × N | the three smallest of the unit quaternion as 10 bits each, and which one is the largest |
+//! | opacity | u8 × N | 0 to 1 |
+//! | red, green, blue | u8 × N each | 0.5 + SH₀ · DC in the block's range |
+//! | SH rest | i8 × N, 3 R times | coefficient by coefficient, RGB; 127 = the scale of its degree |
+//! | codes | u16 × N, L times | code + 1 per level, finest first; 0 = none |
+//!
+//! Planes of one quantity deflate better than records. A position is exact to 1/65535 of a block, which is a few
+//! neighbouring splats wide.
+use crate::query::select;
+use crate::scene::{LanguageField, LevelField, Splats};
+use crate::{Error, Result};
+use std::io::Write;
+
+/// First bytes of the format.
+const MAGIC: &[u8; 8] = b"SVKVIEW1";
+/// Splats that share a range.
+const BLOCK: usize = 256;
+/// Constant of the lowest spherical harmonic, ½ √(1/π).
+const SH0: f32 = 0.282_094_8;
+/// A fainter splat is never drawn (ALGORITHMS 7.4).
+const LEAST_ALPHA: f32 = 1.0 / 255.0;
+
+/// A packed scene.
+pub struct Packed {
+    /// The gzip stream.
+    pub bytes: Vec<u8>,
+    /// Splats in it.
+    pub shown: usize,
+    /// Splats of the scene.
+    pub total: usize,
+}
+
+/// Packs at most `most` splats, those that cover the most.
+pub fn pack(splats: &Splats, language: Option<&LanguageField>, most: usize) -> Result<Packed> {
+    let order = in_space(splats, chosen(splats, most));
+    let levels: Vec<&LevelField> = language.map_or(Vec::new(), |f| f.levels.iter().collect());
+    let raw = write(splats, &levels, &order);
+    // 6: a tenth larger than 9 and four times as fast.
+    let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::new(6));
+    gzip.write_all(&raw)
+        .and_then(|()| gzip.try_finish())
+        .map_err(|e| Error::work(format!("viewer scene: {e}")))?;
+    let bytes = gzip.finish().map_err(|e| Error::work(format!("viewer scene: {e}")))?;
+    Ok(Packed { bytes, shown: order.len(), total: splats.len() })
+}
+
+fn alpha(splats: &Splats, i: usize) -> f32 {
+    1.0 / (1.0 + (-splats.opacity_logits[i]).exp())
+}
+
+/// Splats that can be seen; when there are more than `most`, those with the largest opacity times area.
+fn chosen(splats: &Splats, most: usize) -> Vec<usize> {
+    let finite = |i: &usize| splats.means[*i].iter().chain(&splats.log_scales[*i]).all(|v| v.is_finite());
+    let seen = |i: &usize| alpha(splats, *i) >= LEAST_ALPHA && finite(i);
+    let mut list: Vec<usize> = (0..splats.len()).filter(seen).collect();
+    if list.len() > most {
+        let cover = |i: usize| {
+            let mut s = splats.log_scales[i];
+            s.sort_by(f32::total_cmp);
+            alpha(splats, i).ln() + s[1] + s[2]
+        };
+        list.sort_by(|&a, &b| cover(b).total_cmp(&cover(a)));
+        list.truncate(most);
+    }
+    list
+}
+
+/// In Morton order, so that blocks are small.
+fn in_space(splats: &Splats, mut list: Vec<usize>) -> Vec<usize> {
+    let (low, high) = bounds(list.iter().map(|&i| splats.means[i]));
+    let key = |i: usize| {
+        (0..3).fold(0u64, |key, a| {
+            let cell = (splats.means[i][a] - low[a]) / (high[a] - low[a]).max(f32::MIN_POSITIVE);
+            // 21 bits an axis fill 63.
+            key | spread((cell.clamp(0.0, 1.0) * 2_097_151.0) as u64) << a
+        })
+    };
+    list.sort_by_cached_key(|&i| key(i));
+    list
+}
+
+/// Two zero bits before every one of 21 bits.
+fn spread(v: u64) -> u64 {
+    (0..21).fold(0, |out, bit| out | (v >> bit & 1) << (3 * bit))
+}
+
+fn bounds<const K: usize>(rows: impl Iterator<Item = [f32; K]>) -> ([f32; K], [f32; K]) {
+    rows.fold(([f32::MAX; K], [f32::MIN; K]), |(low, high), row| {
+        (std::array::from_fn(|k| low[k].min(row[k])), std::array::from_fn(|k| high[k].max(row[k])))
+    })
+}
+
+fn write(splats: &Splats, levels: &[&LevelField], order: &[usize]) -> Vec<u8> {
+    let rest = splats.sh_len() - 1;
+    let colour = |i: usize| [0, 1, 2].map(|c| 0.5 + SH0 * splats.sh[3 * (rest + 1) * i + c]);
+    let all = |i: usize| {
+        let ([x, y, z], [a, b, c], [r, g, u]) = (splats.means[i], splats.log_scales[i], colour(i));
+        [x, y, z, a, b, c, r, g, u]
+    };
+    let ranges: Vec<[[f32; 2]; 5]> = order
+        .chunks(BLOCK)
+        .map(|block| {
+            let (low, high) = bounds(block.iter().map(|&i| all(i)));
+            let join = |from: usize| {
+                let low = low[from..from + 3].iter().copied().fold(f32::MAX, f32::min);
+                [low, high[from..from + 3].iter().copied().fold(f32::MIN, f32::max)]
+            };
+            [[low[0], high[0]], [low[1], high[1]], [low[2], high[2]], join(3), join(6)]
+        })
+        .collect();
+    let share = |at: usize, k: usize, v: f32| {
+        let [low, high] = ranges[at / BLOCK][k];
+        ((v - low) / (high - low).max(f32::MIN_POSITIVE)).clamp(0.0, 1.0)
+    };
+    let scales = sh_scales(splats, order, rest);
+    let mut out = MAGIC.to_vec();
+    for v in [order.len() as u32, splats.sh_degree, levels.len() as u32, 0] {
+        out.extend(v.to_le_bytes());
+    }
+    scales.iter().chain(ranges.iter().flatten().flatten()).for_each(|v| out.extend(v.to_le_bytes()));
+    let items = || order.iter().copied().enumerate();
+    for k in 0..3 {
+        items().for_each(|(at, i)| {
+            out.extend(((share(at, k, splats.means[i][k]) * 65535.0).round() as u16).to_le_bytes());
+        });
+    }
+    let byte = |v: f32| (v * 255.0).round() as u8;
+    for k in 0..3 {
+        out.extend(items().map(|(at, i)| byte(share(at, 3, splats.log_scales[i][k]))));
+    }
+    items().for_each(|(_, i)| out.extend(rotation(splats.quats[i]).to_le_bytes()));
+    out.extend(items().map(|(_, i)| byte(alpha(splats, i))));
+    for k in 0..3 {
+        out.extend(items().map(|(at, i)| byte(share(at, 4, colour(i)[k]))));
+    }
+    for k in 0..rest {
+        let scale = scales[degree_of(k) - 1];
+        for c in 0..3 {
+            out.extend(items().map(|(_, i)| {
+                let v = splats.sh[3 * ((rest + 1) * i + 1 + k) + c];
+                (v / scale.max(f32::MIN_POSITIVE) * 127.0).round() as i8 as u8
+            }));
+        }
+    }
+    for level in levels {
+        codes(level, order).iter().for_each(|code| out.extend(code.to_le_bytes()));
+    }
+    out
+}
+
+/// Degree of the k-th coefficient after the lowest.
+fn degree_of(k: usize) -> usize {
+    match k {
+        0..3 => 1,
+        3..8 => 2,
+        _ => 3,
+    }
+}
+
+fn sh_scales(splats: &Splats, order: &[usize], rest: usize) -> [f32; 3] {
+    let mut scales = [0f32; 3];
+    for &i in order {
+        for k in 0..rest {
+            let at = 3 * ((rest + 1) * i + 1 + k);
+            let scale = &mut scales[degree_of(k) - 1];
+            *scale = splats.sh[at..at + 3].iter().fold(*scale, |m, v| m.max(v.abs()));
+        }
+    }
+    scales
+}
+
+/// Smallest three: the largest component follows from the unit length; its sign is made positive (q and −q are one
+/// rotation). The others lie within ±√½.
+fn rotation(q: [f32; 4]) -> u32 {
+    let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+    let largest = (0..4).max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs())).unwrap_or(0);
+    let sign = if q[largest] < 0.0 { -1.0 } else { 1.0 };
+    let mut packed = (largest as u32) << 30;
+    for (slot, k) in (0..4).filter(|&k| k != largest).enumerate() {
+        let v = (sign * q[k] / norm * std::f32::consts::SQRT_2).clamp(-1.0, 1.0);
+        packed |= (((v + 1.0) * 511.5).round() as u32) << (10 * slot);
+    }
+    packed
+}
+
+/// Code + 1 of every splat, 0 where its feature is about none.
+fn codes(level: &LevelField, order: &[usize]) -> Vec<u16> {
+    let of = select::splat_codes(level);
+    let code = |i: &usize| of.get(*i).copied().flatten().and_then(|k| u16::try_from(k + 1).ok());
+    order.iter().map(|i| code(i).unwrap_or(0)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pass::seeded;
+    use crate::scene::Codebook;
+    use std::io::Read;
+
+    fn unpacked(packed: &Packed) -> Vec<u8> {
+        let mut raw = Vec::new();
+        flate2::read::GzDecoder::new(&packed.bytes[..]).read_to_end(&mut raw).unwrap();
+        raw
+    }
+
+    /// The page's decoder, value by value.
+    struct Reader<'a>(&'a [u8]);
+
+    impl Reader<'_> {
+        fn take<const K: usize>(&mut self) -> [u8; K] {
+            let (head, tail) = self.0.split_at(K);
+            self.0 = tail;
+            head.try_into().unwrap()
+        }
+        fn f32(&mut self) -> f32 {
+            f32::from_le_bytes(self.take())
+        }
+        fn u16(&mut self) -> u16 {
+            u16::from_le_bytes(self.take())
+        }
+        fn u8(&mut self) -> u8 {
+            self.take::<1>()[0]
+        }
+    }
+
+    #[test]
+    fn every_quantity_survives_within_its_step() {
+        let (splats, _) = seeded::small(700, 40, 30, 2, 5);
+        let features: Vec<f32> =
+            (0..700).flat_map(|i| [[1.0, 0.0], [0.0, 1.0], [0.0, 0.05]][i % 3]).collect();
+        let codebook = Codebook {
+            embedding_dim: 1,
+            code_dim: 2,
+            embeddings: vec![1.0; 2],
+            codes: vec![1.0, 0.0, 0.0, 1.0],
+            ..Codebook::default()
+        };
+        let level = LevelField { codebook, features, targets: Vec::new() };
+        let field = LanguageField { levels: vec![level, LevelField::default()], space: String::new() };
+        let order = in_space(&splats, chosen(&splats, usize::MAX));
+        let packed = pack(&splats, Some(&field), usize::MAX).unwrap();
+        let n = order.len();
+        assert_eq!((packed.shown, packed.total), (n, 700));
+        let raw = unpacked(&packed);
+        let mut r = Reader(&raw);
+        assert_eq!(&r.take::<8>(), MAGIC);
+        let head: [u32; 4] = std::array::from_fn(|_| u32::from_le_bytes(r.take()));
+        assert_eq!(head, [n as u32, 2, 2, 0]);
+        let sh_scales: [f32; 3] = std::array::from_fn(|_| r.f32());
+        let ranges: Vec<[f32; 10]> =
+            (0..n.div_ceil(BLOCK)).map(|_| std::array::from_fn(|_| r.f32())).collect();
+        let near = |got: f32, want: f32, step: f32| {
+            // Half a step, and the rounding of f32.
+            assert!((got - want).abs() <= 0.501 * step + 1e-6 * want.abs(), "{got} {want} {step}");
+        };
+        let at = |i: usize, k: usize, share: f32| {
+            let range = &ranges[i / BLOCK][2 * k..];
+            range[0] + share * (range[1] - range[0])
+        };
+        let step = |i: usize, k: usize, levels: f32| {
+            (ranges[i / BLOCK][2 * k + 1] - ranges[i / BLOCK][2 * k]) / levels
+        };
+        for k in 0..3 {
+            for (i, &s) in order.iter().enumerate() {
+                near(at(i, k, r.u16() as f32 / 65535.0), splats.means[s][k], step(i, k, 65535.0));
+            }
+        }
+        for k in 0..3 {
+            for (i, &s) in order.iter().enumerate() {
+                near(at(i, 3, r.u8() as f32 / 255.0), splats.log_scales[s][k], step(i, 3, 255.0));
+            }
+        }
+        for &s in &order {
+            let bits = u32::from_le_bytes(r.take());
+            let largest = (bits >> 30) as usize;
+            let mut q = [0f32; 4];
+            for (slot, k) in (0..4).filter(|&k| k != largest).enumerate() {
+                q[k] = ((bits >> (10 * slot) & 1023) as f32 / 511.5 - 1.0) * std::f32::consts::FRAC_1_SQRT_2;
+            }
+            q[largest] = (1.0 - q.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
+            let want = splats.quats[s];
+            let norm = want.iter().map(|v| v * v).sum::<f32>().sqrt();
+            let cosine = q.iter().zip(want).map(|(a, b)| a * b).sum::<f32>().abs() / norm;
+            // Three errors of half a step of √2/1023, and what they do to the largest.
+            assert!(cosine > 1.0 - 3e-6, "{q:?} {want:?}");
+        }
+        for &s in &order {
+            near(r.u8() as f32 / 255.0, alpha(&splats, s), 1.0 / 255.0);
+        }
+        for k in 0..3 {
+            for (i, &s) in order.iter().enumerate() {
+                near(at(i, 4, r.u8() as f32 / 255.0), 0.5 + SH0 * splats.sh[27 * s + k], step(i, 4, 255.0));
+            }
+        }
+        for k in 0..8 {
+            let scale = sh_scales[degree_of(k) - 1];
+            for c in 0..3 {
+                for &s in &order {
+                    near(
+                        r.u8() as i8 as f32 / 127.0 * scale,
+                        splats.sh[27 * s + 3 * (k + 1) + c],
+                        scale / 127.0,
+                    );
+                }
+            }
+        }
+        for &s in &order {
+            assert_eq!(r.u16(), [1, 2, 0][s % 3], "code + 1, or none for a feature of length 0.05");
+        }
+        assert!(order.iter().all(|_| r.u16() == 0), "a level without codes");
+        assert!(r.0.is_empty());
+    }
+
+    #[test]
+    fn of_too_many_those_stay_that_cover_most() {
+        let (mut splats, _) = seeded::small(50, 40, 30, 0, 1);
+        splats.opacity_logits.fill(2.0);
+        splats.opacity_logits[7] = -9.0;
+        for (i, s) in splats.log_scales.iter_mut().enumerate() {
+            *s = [-9.0, i as f32 * 0.1, i as f32 * 0.1];
+        }
+        assert_eq!(chosen(&splats, 100).len(), 49, "one is too faint to be drawn");
+        let mut most = chosen(&splats, 3);
+        most.sort_unstable();
+        assert_eq!(most, [47, 48, 49]);
+    }
+}

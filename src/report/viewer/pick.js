@@ -1,0 +1,64 @@
+// What is under a pixel: the splats that make its colour, blended on the CPU exactly as on the screen, for one pixel.
+import { rotate } from "splatvk/camera";
+
+const DILATION = 0.3, ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.99, VOID_ALPHA = 0.5;
+
+/// {depth, codes: [L] code or -1} at a pixel position, or null where less than half the light is used up.
+export function pick(splats, camera, x, y, width, height, near) {
+  const [fx, fy, cx, cy] = camera.intrinsics(width, height);
+  const r = camera.rotation, t = camera.translation;
+  const { positions, logScales, quats, opacity } = splats;
+  const hits = [];
+  // As in projection: the Jacobian is taken at most 15 % of the image beyond its border.
+  const limits = [[-(cx + 0.15 * width) / fx, (1.15 * width - cx) / fx], [-(cy + 0.15 * height) / fy, (1.15 * height - cy) / fy]];
+  const limit = (slope, [low, high]) => Math.min(Math.max(slope, low), high);
+  for (let i = 0; i < splats.count; i++) {
+    const p = [positions[3 * i], positions[3 * i + 1], positions[3 * i + 2]];
+    const z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2];
+    if (!(z > near)) continue;
+    const u = (r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + t[0]) / z, v = (r[3] * p[0] + r[4] * p[1] + r[5] * p[2] + t[1]) / z;
+    const dx = fx * u + cx - x, dy = fy * v + cy - y;
+    const lu = limit(u, limits[0]), lv = limit(v, limits[1]);
+    // Beyond 3.4 standard deviations even an opaque splat is below 1/255; slanted ones project up to (1 + u² + v²) larger.
+    const s = Math.exp(Math.max(logScales[3 * i], logScales[3 * i + 1], logScales[3 * i + 2]));
+    const reach = 3.4 * Math.sqrt((Math.max(fx, fy) * s / z) ** 2 * (1 + lu * lu + lv * lv) + DILATION);
+    if (dx * dx + dy * dy > reach * reach) continue;
+    const alpha = alphaAt(i, dx, dy, lu, lv, z, fx, fy, r, logScales, quats, opacity);
+    if (alpha >= ALPHA_MIN) hits.push([z, alpha, i]);
+  }
+  hits.sort((a, b) => a[0] - b[0]);
+  const votes = splats.codes.map(() => new Map());
+  let light = 1, depth = 0;
+  for (const [z, alpha, i] of hits) {
+    const weight = light * alpha;
+    depth += weight * z;
+    splats.codes.forEach((codes, l) => votes[l].set(codes[i], (votes[l].get(codes[i]) || 0) + weight));
+    light -= weight;
+    if (light < 1e-4) break;
+  }
+  if (1 - light < VOID_ALPHA) return null;
+  const best = (votes) => [...votes].reduce((a, b) => (b[1] > a[1] ? b : a), [0, 0])[0] - 1;
+  return { depth: depth / (1 - light), codes: votes.map(best) };
+}
+
+function alphaAt(i, dx, dy, u, v, z, fx, fy, r, logScales, quats, opacity) {
+  const [w, a, b, c] = quats.subarray(4 * i, 4 * i + 4);
+  // Columns of the splat's axes in the world, scaled.
+  const axes = [
+    [1 - 2 * (b * b + c * c), 2 * (a * b + w * c), 2 * (a * c - w * b)],
+    [2 * (a * b - w * c), 1 - 2 * (a * a + c * c), 2 * (b * c + w * a)],
+    [2 * (a * c + w * b), 2 * (b * c - w * a), 1 - 2 * (a * a + b * b)],
+  ];
+  let xx = DILATION, xy = 0, yy = DILATION;
+  for (let k = 0; k < 3; k++) {
+    const s = Math.exp(logScales[3 * i + k]);
+    const q = rotate(r, axes[k]);
+    const jx = s * fx / z * (q[0] - u * q[2]), jy = s * fy / z * (q[1] - v * q[2]);
+    xx += jx * jx;
+    xy += jx * jy;
+    yy += jy * jy;
+  }
+  const det = xx * yy - xy * xy;
+  const power = -0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / det;
+  return Math.min(ALPHA_MAX, opacity[i] * Math.exp(power));
+}

@@ -1,0 +1,338 @@
+// Draws splats with WebGL 2. The same projection and blending as splatvk's own renderer (glsl/shared/splat.glsl,
+// glsl/raster_forward.comp), far to near into a half-float image; a second pass turns that image into colours.
+import { half } from "splatvk/splats";
+
+export const MODES = { colour: 0, depth: 1, level: 2, relevancy: 3 };
+
+const VERTEX = `#version 300 es
+precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
+uniform usampler2D data;     // two texels per splat: position, (r, g); (b, opacity), (log scales), quaternion
+uniform usampler2D codes;    // code + 1 per level
+uniform sampler2D sh;        // (degree + 1)² − 1 texels per splat, -1..1 of shScale
+uniform sampler2D table;     // per level two rows: (label colour, selected), (relevancy, answers)
+uniform vec3 shScale;
+uniform int shCount, mode, level, selecting;
+uniform mat3 rotation;       // world to camera
+uniform vec3 translation, position;
+uniform vec4 intrinsics;     // fx, fy, cx, cy in pixels
+uniform vec2 size;
+uniform float near;
+layout(location = 0) in uint splat;
+flat out vec4 payload;       // what is blended, and the opacity
+out vec2 offset;             // in standard deviations
+
+const float DILATION = 0.3, ALPHA_MIN = 1.0 / 255.0;
+
+ivec2 texel(int width, int i) { return ivec2(i % width, i / width); }
+
+vec3 coefficient(int k) {
+  int i = int(splat) * shCount + k;
+  return texelFetch(sh, texel(textureSize(sh, 0).x, i), 0).rgb;
+}
+
+vec3 harmonics(vec3 d) {
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+  vec3 sum = 0.4886025119029199 * shScale.x * (-y * coefficient(0) + z * coefficient(1) - x * coefficient(2));
+  if (shCount >= 8)
+    sum += shScale.y * (1.0925484305920792 * (x * y * coefficient(3) - y * z * coefficient(4) - x * z * coefficient(6))
+      + 0.31539156525252005 * (2.0 * zz - xx - yy) * coefficient(5) + 0.5462742152960396 * (xx - yy) * coefficient(7));
+  if (shCount >= 15)
+    sum += shScale.z * (-0.5900435899266435 * (y * (3.0 * xx - yy) * coefficient(8) + x * (xx - 3.0 * yy) * coefficient(14))
+      + 2.890611442640554 * x * y * z * coefficient(9)
+      - 0.4570457994644658 * (4.0 * zz - xx - yy) * (y * coefficient(10) + x * coefficient(12))
+      + 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(11)
+      + 1.445305721320277 * z * (xx - yy) * coefficient(13));
+  return sum;
+}
+
+void main() {
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0); // nowhere
+  int width = textureSize(data, 0).x;
+  uvec4 a = texelFetch(data, texel(width, 2 * int(splat)), 0), b = texelFetch(data, texel(width, 2 * int(splat) + 1), 0);
+  vec3 mean = uintBitsToFloat(a.xyz);
+  vec3 t = rotation * mean + translation;
+  vec2 rg = unpackHalf2x16(a.w), bo = unpackHalf2x16(b.x), s01 = unpackHalf2x16(b.y);
+  float opacity = bo.y;
+  if (t.z <= near || opacity < ALPHA_MIN) return;
+  vec3 scale = exp(vec3(s01, unpackHalf2x16(b.z).x));
+  // Smallest three, as in the file.
+  vec3 small = (vec3(uvec3(b.w, b.w >> 10, b.w >> 20) & 1023u) / 511.5 - 1.0) * 0.7071067811865476;
+  float big = sqrt(max(0.0, 1.0 - dot(small, small)));
+  uint largest = b.w >> 30;
+  vec4 q = largest == 0u ? vec4(big, small) : largest == 1u ? vec4(small.x, big, small.yz)
+    : largest == 2u ? vec4(small.xy, big, small.z) : vec4(small, big);
+  float r = q.x, x = q.y, y = q.z, z = q.w;
+  mat3 axes = mat3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + r * z), 2.0 * (x * z - r * y),
+                   2.0 * (x * y - r * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + r * x),
+                   2.0 * (x * z + r * y), 2.0 * (y * z - r * x), 1.0 - 2.0 * (x * x + y * y));
+  vec2 focal = intrinsics.xy, centre = intrinsics.zw, margin = 0.15 * size;
+  vec2 slope = t.xy / t.z;
+  vec2 limited = clamp(slope, -(centre + margin) / focal, (size - centre + margin) / focal);
+  mat3 m = rotation * axes * mat3(scale.x, 0.0, 0.0, 0.0, scale.y, 0.0, 0.0, 0.0, scale.z);
+  vec3 row2 = vec3(m[0].z, m[1].z, m[2].z);
+  vec3 b0 = focal.x / t.z * (vec3(m[0].x, m[1].x, m[2].x) - limited.x * row2);
+  vec3 b1 = focal.y / t.z * (vec3(m[0].y, m[1].y, m[2].y) - limited.y * row2);
+  float xx = dot(b0, b0) + DILATION, yy = dot(b1, b1) + DILATION, xy = dot(b0, b1);
+  float middle = 0.5 * (xx + yy), spread = length(vec2(0.5 * (xx - yy), xy));
+  float major = middle + spread, minor = max(middle - spread, 1e-6);
+  vec2 along = abs(xy) > 1e-6 * major ? normalize(vec2(xy, major - xx)) : xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
+  // The quad ends where alpha falls below 1/255.
+  float reach = sqrt(2.0 * log(opacity / ALPHA_MIN));
+  offset = reach * vec2((gl_VertexID & 1) * 2 - 1, (gl_VertexID & 2) - 1);
+  vec2 pixel = focal * slope + centre + offset.x * sqrt(major) * along + offset.y * sqrt(minor) * vec2(-along.y, along.x);
+  gl_Position = vec4(pixel.x / size.x * 2.0 - 1.0, 1.0 - pixel.y / size.y * 2.0, 0.0, 1.0);
+
+  vec3 colour = vec3(rg, bo.x);
+  if (shCount > 0) colour += harmonics(normalize(mean - position));
+  colour = max(colour, vec3(0.0));
+  float luma = dot(colour, vec3(0.299, 0.587, 0.114));
+  uvec3 code = texelFetch(codes, texel(textureSize(codes, 0).x, int(splat)), 0).xyz;
+  int k = int(code[level]);
+  vec4 label = texelFetch(table, ivec2(k, 2 * level), 0), answer = texelFetch(table, ivec2(k, 2 * level + 1), 0);
+  payload.a = opacity;
+  if (mode == ${MODES.depth}) payload.rgb = vec3(t.z, 0.0, 0.0);
+  else if (mode == ${MODES.relevancy}) payload.rgb = vec3(luma, answer.xy);
+  else {
+    payload.rgb = mode == ${MODES.level} ? label.rgb : colour;
+    if (selecting == 1 && label.a < 0.5) payload.rgb = 0.3 * mix(vec3(dot(payload.rgb, vec3(0.299, 0.587, 0.114))), payload.rgb, 0.25);
+  }
+}`;
+
+const FRAGMENT = `#version 300 es
+precision highp float;
+flat in vec4 payload;
+in vec2 offset;
+out vec4 blended;
+void main() {
+  float alpha = min(0.99, payload.a * exp(-0.5 * dot(offset, offset)));
+  if (alpha < 1.0 / 255.0) discard;
+  blended = vec4(payload.rgb * alpha, alpha);
+}`;
+
+const TRIANGLE = `#version 300 es
+void main() { gl_Position = vec4(vec2((gl_VertexID & 1) * 4 - 1, (gl_VertexID & 2) * 2 - 1), 0.0, 1.0); }`;
+
+// The colours of the report: src/report/colour.rs.
+const RESOLVE = `#version 300 es
+precision highp float;
+uniform sampler2D image;
+uniform int mode;
+uniform vec2 range; // near and far depth
+out vec4 shown;
+
+vec3 turbo(float v) {
+  float x = clamp(v, 0.0, 1.0);
+  vec4 p = vec4(1.0, x, x * x, x * x * x);
+  vec2 q = p.zw * x * x;
+  return clamp(vec3(
+    dot(p, vec4(0.13572138, 4.6153926, -42.66032, 132.13108)) + dot(q.xy, vec2(-152.94240, 59.28638)),
+    dot(p, vec4(0.09140261, 2.19418839, 4.84296658, -14.18503333)) + dot(q.xy, vec2(4.27729857, 2.82956604)),
+    dot(p, vec4(0.10667330, 12.64194608, -60.58204836, 110.36276771)) + dot(q.xy, vec2(-89.90310912, 27.34824973))), 0.0, 1.0);
+}
+
+bool answers(ivec2 p) {
+  vec4 v = texelFetch(image, clamp(p, ivec2(0), textureSize(image, 0) - 1), 0);
+  return v.b > 0.5 * v.a && v.a > 0.5;
+}
+
+void main() {
+  ivec2 p = ivec2(gl_FragCoord.xy);
+  vec4 v = texelFetch(image, p, 0);
+  shown = vec4(v.rgb, 1.0);
+  if (mode == ${MODES.depth}) {
+    float z = v.r / max(v.a, 1e-6);
+    shown.rgb = v.a < 0.5 ? vec3(0.0) : turbo(0.05 + 0.9 * (1.0 / z - 1.0 / range.y) / max(1.0 / range.x - 1.0 / range.y, 1e-9));
+  } else if (mode == ${MODES.relevancy}) {
+    float alpha = max(v.a, 1e-6), heat = clamp((v.g / alpha - 0.5) * 2.0, 0.0, 1.0);
+    vec3 base = vec3(0.25 + 0.5 * v.r / alpha);
+    shown.rgb = v.a * mix(base, turbo(0.45 + 0.5 * heat), 0.85 * heat);
+    bool around = answers(p + ivec2(1, 0)) && answers(p - ivec2(1, 0)) && answers(p + ivec2(0, 1)) && answers(p - ivec2(0, 1));
+    if (answers(p) && !around) shown.rgb = vec3(1.0);
+  }
+}`;
+
+function program(gl, vertex, fragment) {
+  const made = gl.createProgram();
+  for (const [type, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(type);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
+      throw new Error(gl.getShaderInfoLog(shader) || "a shader does not compile");
+    }
+    gl.attachShader(made, shader);
+  }
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
+  const at = {};
+  for (let i = 0; i < gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS); i++) {
+    const { name } = gl.getActiveUniform(made, i);
+    at[name] = gl.getUniformLocation(made, name);
+  }
+  return { made, at };
+}
+
+export class Renderer {
+  constructor(canvas, splats, levels) {
+    const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false, powerPreference: "high-performance" });
+    if (!gl) throw new Error("this browser offers no WebGL 2");
+    this.gl = gl;
+    // Without half floats the image is blended in bytes: banded, but right.
+    this.format = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float")
+      ? [gl.RGBA16F, gl.HALF_FLOAT] : [gl.RGBA8, gl.UNSIGNED_BYTE];
+    this.splat = program(gl, VERTEX, FRAGMENT);
+    this.resolve = program(gl, TRIANGLE, RESOLVE);
+    this.upload(splats);
+    this.levels = levels;
+    this.columns = 1 + Math.max(0, ...levels.map((l) => l.colours.length));
+    this.table = new Float32Array(4 * this.columns * 6);
+    levels.forEach((level, l) => [[0.13, 0.13, 0.13], ...level.colours].forEach((c, k) => this.table.set(c, 4 * (2 * l * this.columns + k))));
+    this.textures.table = this.texture();
+    this.sendTable();
+    this.order = gl.createBuffer();
+    this.count = 0;
+    this.range = [1, 2];
+    this.array = gl.createVertexArray();
+    gl.bindVertexArray(this.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(0, 1);
+    gl.bindVertexArray(null);
+    this.target = gl.createFramebuffer();
+    this.image = this.texture();
+    this.size = [0, 0];
+  }
+
+  texture() {
+    const { gl } = this, made = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, made);
+    for (const which of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, which, gl.NEAREST);
+    return made;
+  }
+
+  /// A texture of `count` texels in rows of a common width.
+  filled(count, make, internal, format, type) {
+    const { gl } = this, most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    const width = Math.min(most, 4096), height = Math.max(1, Math.ceil(count / width));
+    if (height > most) throw new Error("the scene is larger than this device's textures");
+    const made = this.texture();
+    gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, format, type, make(width * height));
+    return made;
+  }
+
+  upload(splats) {
+    const { gl } = this, n = splats.count;
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    const data = this.filled(2 * n, (texels) => {
+      const out = new Uint32Array(4 * texels), floats = new Float32Array(out.buffer);
+      const two = (a, b) => half(a) | half(b) << 16;
+      for (let i = 0; i < n; i++) {
+        const [p, c, s] = [splats.positions, splats.colours, splats.logScales].map((v) => v.subarray(3 * i, 3 * i + 3));
+        floats.set(p, 8 * i);
+        out[8 * i + 3] = two(c[0], c[1]);
+        out[8 * i + 4] = two(c[2], splats.opacity[i]);
+        out[8 * i + 5] = two(s[0], s[1]);
+        out[8 * i + 6] = two(s[2], 0);
+        out[8 * i + 7] = splats.packedQuats[i];
+      }
+      return out;
+    }, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT);
+    const codes = this.filled(n, (texels) => {
+      const out = new Uint16Array(4 * texels);
+      splats.codes.forEach((level, l) => level.forEach((code, i) => { out[4 * i + l] = code; }));
+      return out;
+    }, gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT);
+    this.shScale = splats.shScale;
+    this.shCount = splats.sh ? (splats.degree + 1) ** 2 - 1 : 0;
+    const sh = this.filled(n * this.shCount, (texels) => {
+      const out = new Int8Array(4 * texels);
+      for (let i = 0; i < n * this.shCount; i++) out.set(splats.sh.subarray(3 * i, 3 * i + 3), 4 * i);
+      return out;
+    }, gl.RGBA8_SNORM, gl.RGBA, gl.BYTE);
+    this.textures = { data, codes, sh };
+  }
+
+  sendTable() {
+    const { gl } = this;
+    gl.bindTexture(gl.TEXTURE_2D, this.textures.table);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, this.columns, 6, 0, gl.RGBA, gl.FLOAT, this.table);
+  }
+
+  /// Marks codes of a level as selected; nothing with level < 0.
+  select(level, codes) {
+    this.levels.forEach((l, at) => {
+      for (let k = 0; k <= l.colours.length; k++) this.table[4 * (2 * at * this.columns + k) + 3] = at === level && codes.includes(k - 1) ? 1 : 0;
+    });
+    this.sendTable();
+  }
+
+  /// Sets the relevancy per level and code, and which codes of `level` answer.
+  answer(relevancy, level, codes) {
+    relevancy.forEach((list, at) => list.forEach((v, k) => {
+      this.table.set([v, at === level && codes.includes(k) ? 1 : 0], 4 * ((2 * at + 1) * this.columns + k + 1));
+    }));
+    this.sendTable();
+  }
+
+  setOrder({ sorted, near, far }) {
+    const { gl } = this;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    gl.bufferData(gl.ARRAY_BUFFER, sorted, gl.DYNAMIC_DRAW);
+    this.count = sorted.length;
+    this.range = [near, far];
+  }
+
+  resize(width, height) {
+    const { gl } = this;
+    if (this.size[0] === width && this.size[1] === height) return;
+    this.size = [width, height];
+    gl.bindTexture(gl.TEXTURE_2D, this.image);
+    gl.texImage2D(gl.TEXTURE_2D, 0, this.format[0], width, height, 0, gl.RGBA, this.format[1], null);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.image, 0);
+  }
+
+  /// Draws the camera's image at the canvas's size.
+  draw(camera, { mode, level, selecting, near }) {
+    const { gl } = this, [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+    this.resize(width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    const { made, at } = this.splat;
+    gl.useProgram(made);
+    ["data", "codes", "sh", "table"].forEach((name, slot) => {
+      gl.activeTexture(gl.TEXTURE0 + slot);
+      gl.bindTexture(gl.TEXTURE_2D, this.textures[name]);
+      gl.uniform1i(at[name], slot);
+    });
+    gl.uniform3fv(at.shScale, this.shScale);
+    gl.uniform1i(at.shCount, this.shCount);
+    gl.uniform1i(at.mode, MODES[mode]);
+    gl.uniform1i(at.level, level);
+    gl.uniform1i(at.selecting, selecting ? 1 : 0);
+    gl.uniformMatrix3fv(at.rotation, true, camera.rotation);
+    gl.uniform3fv(at.translation, camera.translation);
+    gl.uniform3fv(at.position, camera.position);
+    gl.uniform4fv(at.intrinsics, camera.intrinsics(width, height));
+    gl.uniform2f(at.size, width, height);
+    gl.uniform1f(at.near, near);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindVertexArray(this.array);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    gl.bindVertexArray(null);
+    gl.disable(gl.BLEND);
+
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.useProgram(this.resolve.made);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.image);
+    gl.uniform1i(this.resolve.at.image, 0);
+    gl.uniform1i(this.resolve.at.mode, MODES[mode]);
+    gl.uniform2fv(this.resolve.at.range, this.range);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+}

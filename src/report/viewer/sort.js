@@ -1,0 +1,51 @@
+// Worker: which splats a camera sees, far to near. Gets the positions once, then one request per camera:
+// {row: [r, t] of camera z, rows of x and y, limits} -> indices. Radix sort on the bits of z: exact, and linear in
+// the number of splats.
+let positions = null, keys, pairs, order, counts;
+
+self.onmessage = ({ data }) => {
+  if (data.positions) {
+    positions = data.positions;
+    const n = positions.length / 3;
+    keys = [new Uint32Array(n), new Uint32Array(n)];
+    order = [new Uint32Array(n), new Uint32Array(n)];
+    counts = new Uint32Array(65536);
+    return;
+  }
+  const { id, rotation: r, translation: t, near, slope } = data;
+  const z = new Float32Array(1), bits = new Uint32Array(z.buffer);
+  let m = 0;
+  for (let i = 0, p = 0; p < positions.length; i++, p += 3) {
+    const x = positions[p], y = positions[p + 1], w = positions[p + 2];
+    z[0] = r[6] * x + r[7] * y + r[8] * w + t[2];
+    if (!(z[0] > near)) continue;
+    // Splats whose centre is far outside the image reach into it only where their projection is meaningless.
+    const u = r[0] * x + r[1] * y + r[2] * w + t[0], v = r[3] * x + r[4] * y + r[5] * w + t[1];
+    if (Math.abs(u) > slope[0] * z[0] || Math.abs(v) > slope[1] * z[0]) continue;
+    // Positive floats order like their bits; the complement puts the far ones first.
+    keys[0][m] = ~bits[0];
+    order[0][m++] = i;
+  }
+  for (const shift of [0, 16]) {
+    const [from, to] = shift ? [1, 0] : [0, 1];
+    counts.fill(0);
+    for (let i = 0; i < m; i++) counts[(keys[from][i] >>> shift) & 65535]++;
+    for (let k = 0, sum = 0; k < 65536; k++) {
+      const count = counts[k];
+      counts[k] = sum;
+      sum += count;
+    }
+    for (let i = 0; i < m; i++) {
+      const at = counts[(keys[from][i] >>> shift) & 65535]++;
+      keys[to][at] = keys[from][i];
+      order[to][at] = order[from][i];
+    }
+  }
+  const sorted = order[0].slice(0, m);
+  const depth = (share) => {
+    if (!m) return 1;
+    bits[0] = ~keys[0][Math.round((m - 1) * (1 - share))];
+    return z[0];
+  };
+  self.postMessage({ id, sorted, near: depth(0.01), far: depth(0.99) }, [sorted.buffer]);
+};

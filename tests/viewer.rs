@@ -1,0 +1,534 @@
+//! The interactive view in a real browser: it draws what the engine draws, selects what is clicked, lights up what is
+//! asked for, and asks nobody but its own server.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
+mod browser;
+mod fixture;
+
+use browser::Page;
+use fixture::{camera, data, truth};
+use serde_json::{Value, json};
+use splatvk::format::npy::{self, NpyArray};
+use splatvk::format::scene_dir::{self, Contents};
+use splatvk::gpu::Device;
+use splatvk::pass::metrics::psnr;
+use splatvk::pass::seeded::Random;
+use splatvk::photo::{self, Photo};
+use splatvk::query::QueryOptions;
+use splatvk::report::viewer::Scene3d;
+use splatvk::run::ask::QueryScene;
+use splatvk::run::sources;
+use splatvk::run::view::Viewer;
+use splatvk::scene::{Codebook, LanguageField, LevelField, Plane, RgbImage, Splats};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+
+/// Objects of breakfast.
+const LABELS: usize = 11;
+/// Width of the language's embeddings: one coordinate per object and one for the canonical phrases.
+const WIDTH: usize = LABELS + 1;
+
+fn photo_of(frame: &Value) -> Photo {
+    photo::load(&data("breakfast").join(frame["file"].as_str().unwrap())).unwrap()
+}
+
+fn masks_of(stem: &str) -> Plane<i32> {
+    let mask = image::open(data(&format!("breakfast/masks/{stem}.png"))).unwrap().to_luma8();
+    let (width, height) = (mask.width() as usize, mask.height() as usize);
+    Plane { width, height, data: mask.into_raw().into_iter().map(i32::from).collect() }
+}
+
+/// Breakfast as splats, straight from the true depth, photos and masks of two views: every fourth pixel is one splat of
+/// random shape whose colour changes a little with the direction, and whose code says which object it is.
+fn breakfast(folder: &Path) -> PathBuf {
+    let mut random = Random::new(7);
+    let (mut splats, mut labels) = (Splats { sh_degree: 3, ..Splats::default() }, Vec::new());
+    let (mut cameras, mut photos) = (Vec::new(), Vec::new());
+    for frame in truth()["frames"].as_array().unwrap().iter().step_by(2).take(2) {
+        let photo = photo_of(frame);
+        let camera = camera(frame, &photo.stem);
+        let depth =
+            npy::read_npz(data(&format!("breakfast/depth/{}.npz", photo.stem))).unwrap()["depth"].to_f32();
+        let mask = masks_of(&photo.stem);
+        for (x, y) in (2..480).step_by(4).flat_map(|y| (2..640).step_by(4).map(move |x| (x, y))) {
+            let z = f64::from(depth[y * 640 + x]);
+            if z <= 0.0 {
+                continue;
+            }
+            let at = camera.unproject(glam::DVec2::new(x as f64 + 0.5, y as f64 + 0.5), z);
+            splats.means.push(at.as_vec3().to_array());
+            let size = (2.4 * z / camera.fx).ln() as f32;
+            splats.log_scales.push([0, 1, 2].map(|_| size + 0.5 * random.normal(1.0) as f32));
+            splats.quats.push([0; 4].map(|_| random.normal(1.0) as f32));
+            splats.opacity_logits.push(1.0 + random.normal(1.0) as f32);
+            // DC of Kerbl et al. 2023, 0.5 + SH0 · dc = colour; the rest small.
+            splats.sh.extend(photo.image.at(x, y).map(|c| (c - 0.5) / 0.282_094_8));
+            splats.sh.extend((0..45).map(|_| 0.04 * random.normal(1.0) as f32));
+            labels.push(mask.at(x, y));
+        }
+        cameras.push(camera);
+        photos.push(photo);
+    }
+    let unit = |k: usize| (0..16).map(move |i| if i == k { 1.0f32 } else { 0.0 });
+    // The finer level counts the objects backwards, so that mixed-up levels show.
+    let level = |code: &dyn Fn(usize) -> usize| {
+        let object = |k: usize| (0..LABELS).find(|&o| code(o) == k).unwrap();
+        let codebook = Codebook {
+            embedding_dim: WIDTH,
+            code_dim: 16,
+            embeddings: (0..LABELS).flat_map(|k| unit(object(k)).take(WIDTH)).collect(),
+            codes: (0..LABELS).flat_map(unit).collect(),
+            weights: vec![1.0; LABELS],
+            members: vec![vec![]; LABELS],
+            min_chord: 1.4,
+        };
+        let feature = |l: &i32| if *l > 0 { unit(code(*l as usize - 1)) } else { unit(16) };
+        LevelField { codebook, features: labels.iter().flat_map(feature).collect(), targets: Vec::new() }
+    };
+    let levels = vec![level(&|o| LABELS - 1 - o), LevelField::default(), level(&|o| o)];
+    let field = LanguageField { levels, space: "dir".into() };
+    let table = folder.join("texts.npz");
+    let texts: Vec<(String, NpyArray)> = (0..LABELS)
+        .map(|o| (truth()["labels"][(o + 1).to_string()].as_str().unwrap().to_owned(), o))
+        .chain(splatvk::query::CANONICAL_PHRASES.map(|p| (p.to_owned(), LABELS)))
+        .map(|(text, k)| (text, NpyArray::f32(&[WIDTH], unit(k).take(WIDTH).collect())))
+        .collect();
+    let texts: Vec<(&str, &NpyArray)> = texts.iter().map(|(t, a)| (t.as_str(), a)).collect();
+    npy::write_npz(&table, &texts).unwrap();
+    let scene = folder.join("breakfast");
+    std::fs::create_dir(&scene).unwrap();
+    let contents = Contents {
+        splats: &splats,
+        cameras: &cameras,
+        photos: &photos,
+        points: None,
+        language: Some(&field),
+        text_embeddings: Some(&table),
+    };
+    scene_dir::write(&scene, &contents).unwrap();
+    scene
+}
+
+/// `splatvk view` and where it is.
+struct Server {
+    child: Child,
+    address: String,
+}
+
+impl Server {
+    fn start(scene: &Path) -> Server {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_splatvk"))
+            .arg("view")
+            .arg(scene)
+            .arg("--json")
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let told: Value = serde_json::from_str(&line).unwrap();
+        Server { child, address: told["address"].as_str().unwrap().to_owned() }
+    }
+
+    /// Status and body of a request with a header.
+    fn request(&self, method: &str, path: &str, header: &str, body: &str) -> (u16, String) {
+        let host = self.address.trim_start_matches("http://").trim_end_matches('/');
+        let host_line = if header.starts_with("Host") { String::new() } else { format!("Host: {host}\r\n") };
+        let mut stream = TcpStream::connect(host).unwrap();
+        let length = body.len();
+        write!(stream, "{method} {path} HTTP/1.1\r\n{host_line}{header}Content-Length: {length}\r\nConnection: close\r\n\r\n{body}")
+            .unwrap();
+        let mut reply = Vec::new();
+        stream.read_to_end(&mut reply).unwrap();
+        let reply = String::from_utf8_lossy(&reply);
+        let (head, body) = reply.split_once("\r\n\r\n").unwrap();
+        (head.split(' ').nth(1).unwrap().parse().unwrap(), body.to_owned())
+    }
+
+    /// Ctrl-C; the exit code.
+    fn stop(mut self) -> Option<i32> {
+        Command::new("kill").args(["-INT", &self.child.id().to_string()]).status().unwrap();
+        self.child.wait().unwrap().code()
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn to_float(picture: &image::RgbImage) -> RgbImage {
+    let data = picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect();
+    RgbImage { width: picture.width() as usize, height: picture.height() as usize, data }
+}
+
+/// A place inside the object's mask that is farthest from its edge, in pixels of the photo.
+fn inside(mask: &Plane<i32>, object: i32) -> (f64, f64) {
+    let clear = |x: usize, y: usize, r: usize| {
+        x >= r
+            && y >= r
+            && x + r < mask.width
+            && y + r < mask.height
+            && (y - r..=y + r).all(|j| (x - r..=x + r).all(|i| mask.at(i, j) == object))
+    };
+    let mut best = (0, 0, 0);
+    for y in 0..mask.height {
+        for x in 0..mask.width {
+            while clear(x, y, best.2 + 1) {
+                best = (x, y, best.2 + 1);
+            }
+        }
+    }
+    (best.0 as f64 + 0.5, best.1 as f64 + 0.5)
+}
+
+/// Pixels that a relevancy picture colours: what does not answer is grey.
+fn coloured(picture: &image::RgbImage) -> Vec<bool> {
+    // Warm and light colours of the heat differ by more than half the range between channels.
+    picture.pixels().map(|p| p.0.iter().max().unwrap() - p.0.iter().min().unwrap() > 100).collect()
+}
+
+fn iou(a: &[bool], b: &[bool]) -> f64 {
+    let both = a.iter().zip(b).filter(|(a, b)| **a && **b).count();
+    both as f64 / a.iter().zip(b).filter(|(a, b)| **a || **b).count() as f64
+}
+
+fn is(mask: &Plane<i32>, object: i32) -> Vec<bool> {
+    mask.data.iter().map(|l| *l == object).collect()
+}
+
+#[test]
+fn the_served_view_draws_selects_and_answers() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = breakfast(folder.path());
+    let server = Server::start(&scene);
+    only_its_own_page_is_answered(&server);
+    let Some(chromium) = browser::installed() else { return };
+    let mut page = Page::open(&chromium, 960, 720, false);
+    page.go(&server.address);
+    draws_what_the_engine_draws(&mut page, &scene);
+    a_click_selects_the_object(&mut page);
+    a_query_lights_it_up(&mut page);
+    the_keyboard_does_it_all(&mut page);
+    assert_eq!(page.complaints, Vec::<String>::new());
+    let foreign: Vec<_> = page
+        .requests
+        .iter()
+        .filter(|r| !r.starts_with(&server.address) && !r.starts_with("data:") && !r.starts_with("blob:"))
+        .collect();
+    assert!(foreign.is_empty(), "{foreign:?}");
+    keep(&mut page, "desktop.png");
+    drop(page);
+    let mut phone = Page::open(&chromium, 390, 844, true);
+    phone.go(&server.address);
+    fits_a_phone(&mut phone);
+    assert_eq!(server.stop(), Some(0), "Ctrl-C is how it ends");
+}
+
+/// Keeps a screenshot to look at where `SPLATVK_KEEP` names a folder.
+fn keep(page: &mut Page, name: &str) {
+    if let Ok(folder) = std::env::var("SPLATVK_KEEP") {
+        std::fs::write(Path::new(&folder).join(name), page.screenshot()).unwrap();
+    }
+}
+
+fn only_its_own_page_is_answered(server: &Server) {
+    let ask = |header: &str, text: &str| {
+        server.request("POST", "/query", header, &json!({ "text": text }).to_string())
+    };
+    assert_eq!(server.request("GET", "/", "Host: evil.example\r\n", "").0, 403);
+    assert_eq!(ask("Origin: http://evil.example\r\n", "lemon").0, 403);
+    assert_eq!(server.request("GET", "/../Cargo.toml", "", "").0, 404);
+    assert_eq!(server.request("POST", "/query", "", "lemon").0, 400);
+    let (status, body) = ask("", "unicorn");
+    assert!(status == 422 && body.contains("no text embedding for 'unicorn'"), "{status} {body}");
+    let (status, body) = ask("", "lemon");
+    assert_eq!(status, 200);
+    let answer: Value = serde_json::from_str(body.trim()).unwrap();
+    assert_eq!((&answer["level"], &answer["codes"], &answer["found"]), (&json!(2), &json!([6]), &json!(2)));
+}
+
+fn draws_what_the_engine_draws(page: &mut Page, scene: &Path) {
+    let loaded = scene_dir::load(scene).unwrap();
+    let device = Device::open(None).unwrap();
+    let mut viewer = Viewer::new(&device, &loaded.splats, &LanguageField::default()).unwrap();
+    for (i, camera) in loaded.cameras.iter().enumerate() {
+        let engine = viewer.view(camera).unwrap().frame;
+        let likeness = psnr(&to_float(&page.picture(i)), &engine.rgb);
+        println!("view {i}: {likeness:.1} dB against splatvk render");
+        // What bytes and half floats cost; 25 dB would show a wrong blend.
+        assert!(likeness > 38.0, "view {i}: {likeness} dB");
+    }
+    page.run("splatvk.show('depth')");
+    let depth = to_float(&page.picture(0));
+    let engine = splatvk::report::colour::depth_image(&viewer.view(&loaded.cameras[0]).unwrap().frame.depth);
+    // The page takes the range of depth from the splats, the engine from the pixels: the same picture, not the same shades.
+    assert!(psnr(&depth, &engine) > 15.0, "{}", psnr(&depth, &engine));
+    page.run("splatvk.show('colour')");
+}
+
+/// Where a pixel of photo 0 is on a page whose canvas fills the window.
+fn on_page(page: &mut Page, (x, y): (f64, f64)) -> (f64, f64) {
+    let size = page.run("[innerWidth, innerHeight]");
+    let (width, height) = (size[0].as_f64().unwrap(), size[1].as_f64().unwrap());
+    let scale = (width / 640.0).min(height / 480.0);
+    (width / 2.0 + (x - 320.0) * scale, height / 2.0 + (y - 240.0) * scale)
+}
+
+fn a_click_selects_the_object(page: &mut Page) {
+    page.run("splatvk.goTo(0)");
+    let mask = masks_of("train_00");
+    let mut clicked = 0;
+    for object in 1..=LABELS as i32 {
+        // A carpet behind the table shows as a few slivers.
+        if is(&mask, object).iter().filter(|m| **m).count() < 2000 {
+            continue;
+        }
+        let (x, y) = on_page(page, inside(&mask, object));
+        if page.run(&format!("document.elementFromPoint({x}, {y}).tagName")) != "CANVAS" {
+            continue;
+        }
+        page.click(x, y);
+        let selected = page.run("splatvk.state.selected");
+        assert_eq!(selected, json!({ "level": 2, "codes": [object - 1] }), "at {x}, {y}");
+        let name = truth()["labels"][object.to_string()].clone();
+        assert_eq!(page.run("document.querySelector('.v-card h3').textContent"), name);
+        clicked += 1;
+        if object == 9 {
+            keep(page, "selected.png");
+        }
+    }
+    assert!(clicked >= 6, "only {clicked} objects are free of controls");
+    // On the finer level, which counts backwards.
+    page.run("document.querySelector('.v-levels button').click()");
+    let selected = page.run("splatvk.state.selected");
+    assert_eq!(selected["level"], 0);
+    assert!(selected["codes"][0].as_u64().unwrap() < LABELS as u64);
+    page.press("Escape");
+    assert_eq!(page.run("splatvk.state.selected"), Value::Null);
+}
+
+fn a_query_lights_it_up(page: &mut Page) {
+    page.press("/");
+    page.write("blue mug");
+    page.press("Enter");
+    let answered = "new Promise((done) => { const look = () => splatvk.state.query ? done(splatvk.state.query.codes) : setTimeout(look, 20); look(); })";
+    assert_eq!(page.run(answered), json!([8]));
+    assert_eq!(page.run("splatvk.state.mode"), "relevancy");
+    for (view, stem) in ["train_00", "train_02"].iter().enumerate() {
+        let overlap = iou(&coloured(&page.picture(view)), &is(&masks_of(stem), 9));
+        println!("blue mug in {stem}: IoU {overlap:.2}");
+        assert!(overlap > 0.7, "{stem}: {overlap}");
+    }
+    keep(page, "query.png");
+    // What the scene has no words for is said, and nothing else changes.
+    page.run("splatvk.ask('unicorn')");
+    assert!(
+        page.run("document.querySelector('.v-status').textContent").as_str().unwrap().contains("unicorn")
+    );
+    assert_eq!(page.run("splatvk.state.query.text"), "blue mug");
+    // The browser logs every refused request by itself.
+    page.complaints.retain(|c| !c.contains("422"));
+    page.run("document.querySelector('.viewer').focus()");
+}
+
+fn the_keyboard_does_it_all(page: &mut Page) {
+    page.press("Escape");
+    assert_eq!(page.run("splatvk.state.mode"), "colour");
+    for mode in ["depth", "level", "level", "colour"] {
+        page.press("m");
+        assert_eq!(page.run("splatvk.state.mode"), mode);
+    }
+    page.press("m");
+    page.press("m");
+    page.run("splatvk.settled()");
+    keep(page, "levels.png");
+    page.run("splatvk.show('colour')");
+    let eye = |page: &mut Page| page.run("splatvk.camera().position");
+    page.run("splatvk.goTo(0)");
+    let first = eye(page);
+    page.press("ArrowLeft");
+    assert_ne!(eye(page), first);
+    page.press("1");
+    page.run("splatvk.settled()");
+    let back = eye(page);
+    for k in 0..3 {
+        assert!((back[k].as_f64().unwrap() - first[k].as_f64().unwrap()).abs() < 1e-9);
+    }
+    page.press("2");
+    page.run("splatvk.settled()");
+    assert_ne!(eye(page), first);
+    page.press(" ");
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    page.press(" ");
+    assert_ne!(eye(page), first, "it flies");
+    page.press("?");
+    assert_eq!(page.run("document.querySelector('.v-help').hidden"), false);
+    page.press("Escape");
+    assert_eq!(page.run("document.querySelector('.v-help').hidden"), true);
+}
+
+fn fits_a_phone(page: &mut Page) {
+    page.run("splatvk.ask('lemon')");
+    let outside = page.run(
+        "[...document.querySelectorAll('.v-ask, .v-card, .v-tools button, .v-modes, .v-photos')].filter((e) => { \
+         const r = e.getBoundingClientRect(); return r.left < 0 || r.top < 0 || r.right > innerWidth || r.bottom > innerHeight; \
+         }).map((e) => e.className)",
+    );
+    assert_eq!(outside, json!([]), "reaches out of the screen");
+    let small = page.run(
+        "[...document.querySelectorAll('.v-tools button, .v-photos button, .v-modes button')].filter((e) => \
+         e.getBoundingClientRect().height < 38).length",
+    );
+    assert_eq!(small, 0, "too small for a finger");
+    keep(page, "phone.png");
+    page.press("Escape");
+    page.run("splatvk.goTo(0)");
+    let (x, y) = on_page(page, inside(&masks_of("train_00"), 4));
+    let point = json!([{ "x": x, "y": y }]);
+    page.call("Input.dispatchTouchEvent", json!({ "type": "touchStart", "touchPoints": point }));
+    page.call("Input.dispatchTouchEvent", json!({ "type": "touchEnd", "touchPoints": [] }));
+    page.run("splatvk.settled()");
+    assert_eq!(page.run("splatvk.state.selected.codes"), json!([3]), "a tap on the box of cereal");
+    assert_eq!(page.complaints, Vec::<String>::new());
+}
+
+#[test]
+fn a_static_page_answers_what_was_asked() {
+    let Some(chromium) = browser::installed() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene_dir::load(&breakfast(folder.path())).unwrap();
+    let encoder = sources::table(&folder.path().join("texts.npz")).unwrap();
+    let device = Device::open(None).unwrap();
+    let field = scene.language.clone().unwrap();
+    let mut ready = QueryScene::open(&device, &scene.splats, field, encoder).unwrap();
+    ready.look(&scene.cameras).unwrap();
+    let answers = ["lemon", "loaf of bread"].map(|t| ready.ask(t, &QueryOptions::default()).unwrap());
+    let names = ready.names().unwrap();
+    let view = Scene3d {
+        title: "static",
+        splats: &scene.splats,
+        cameras: &scene.cameras,
+        photos: Vec::new(),
+        language: scene.language.as_ref(),
+        names: &names,
+        answers: answers.iter().map(|a| a.shown()).collect(),
+    };
+    let (section, note) = view.embedded().unwrap();
+    println!("{note}");
+    let file = folder.path().join("page.html");
+    let style = splatvk::report::viewer::STYLE;
+    std::fs::write(
+        &file,
+        format!("<!doctype html><title>x</title><style>{style}</style><main>{section}</main>"),
+    )
+    .unwrap();
+    let mut page = Page::open(&chromium, 800, 600, false);
+    page.go(&format!("file://{}", file.display()));
+    page.run("splatvk.ask('loaf of bread')");
+    let overlap = iou(&coloured(&page.picture(0)), &is(&masks_of("train_00"), 8));
+    println!("loaf of bread: IoU {overlap:.2}");
+    assert!(overlap > 0.7, "{overlap}");
+    page.run("splatvk.ask('plate')");
+    assert!(
+        page.run("document.querySelector('.v-status').textContent")
+            .as_str()
+            .unwrap()
+            .contains("splatvk view")
+    );
+    assert_eq!(page.complaints, Vec::<String>::new());
+    assert!(
+        page.requests
+            .iter()
+            .all(|r| r.starts_with("file:") || r.starts_with("data:") || r.starts_with("blob:")),
+        "{:?}",
+        page.requests
+    );
+}
+
+#[test]
+fn the_report_of_a_training_shows_its_scene() {
+    let Some(chromium) = browser::installed() else { return };
+    let scene = fixture::scene();
+    let mut page = Page::open(&chromium, 800, 600, false);
+    page.go(&format!("file://{}", scene.join("report.html").display()));
+    let render = image::open(scene.join("previews/train_00_render.jpg")).unwrap().to_rgb8();
+    let likeness = psnr(&to_float(&page.picture(0)), &to_float(&render));
+    println!("report: {likeness:.1} dB against its own preview");
+    // JPEG itself costs down to about 35 dB.
+    assert!(likeness > 30.0, "{likeness} dB");
+    assert_eq!(page.complaints, Vec::<String>::new());
+    assert_eq!(
+        page.requests.iter().filter(|r| !r.starts_with("file:") && !r.starts_with("data:")).count(),
+        0
+    );
+    keep(&mut page, "report.png");
+}
+
+#[test]
+fn a_port_that_is_taken_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = taken.local_addr().unwrap().port().to_string();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+    let output = command.arg("view").arg(breakfast(folder.path())).args(["--port", &port]).output().unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("--port"));
+}
+
+/// The pictures of the README, from a real run: `SPLATVK_SCENE=out/breakfast cargo test --test viewer -- --ignored`.
+#[test]
+#[ignore = "needs a scene of splatvk run on breakfast in SPLATVK_SCENE"]
+fn pictures_of_a_real_scene() {
+    let scene = PathBuf::from(std::env::var("SPLATVK_SCENE").unwrap());
+    let chromium = browser::installed().unwrap();
+    let server = Server::start(&scene);
+    let mut page = Page::open(&chromium, 1120, 760, false);
+    page.go(&server.address);
+    let loaded = scene_dir::load(&scene).unwrap();
+    let device = Device::open(None).unwrap();
+    let mut viewer = Viewer::new(&device, &loaded.splats, &LanguageField::default()).unwrap();
+    let engine = viewer.view(&loaded.cameras[0]).unwrap().frame.rgb;
+    let likeness = psnr(&to_float(&page.picture(0)), &engine);
+    println!("{likeness:.1} dB against splatvk render, {} splats", loaded.splats.len());
+    assert!(likeness > 25.0);
+    let masks = masks_of("train_00");
+    page.run("splatvk.goTo(0)");
+    for (object, word) in [(7, "lemon"), (9, "mug"), (4, "cereal"), (8, "loaf")] {
+        let (x, y) = on_page(&mut page, inside(&masks, object));
+        page.click(x, y);
+        let names = page.run(
+            "[...document.querySelectorAll('.v-names li')].map((l) => l.firstChild.textContent).join(', ')",
+        );
+        println!("a click on {word}: {} = {names}", page.run("splatvk.state.selected"));
+    }
+    let (x, y) = on_page(&mut page, inside(&masks, 9));
+    page.click(x, y);
+    let shots = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/images");
+    let shoot = |page: &mut Page, name: &str, width: u32| {
+        let shot = image::load_from_memory(&page.screenshot()).unwrap().to_rgb8();
+        let height = shot.height() * width / shot.width();
+        let small = image::imageops::resize(&shot, width, height, image::imageops::FilterType::Lanczos3);
+        let file = std::fs::File::create(shots.join(name)).unwrap();
+        image::codecs::jpeg::JpegEncoder::new_with_quality(file, 85).encode_image(&small).unwrap();
+    };
+    shoot(&mut page, "view-select.jpg", 840);
+    for (text, object) in [("lemon", 7), ("blue mug", 9), ("box of cereal", 4), ("loaf of bread", 8)] {
+        page.run(&format!("splatvk.ask('{text}')"));
+        let overlap = iou(&coloured(&page.picture(0)), &is(&masks, object));
+        println!("{text}: IoU {overlap:.2} in photo 0");
+        page.run("splatvk.settled()");
+    }
+    page.run("splatvk.ask('blue mug')");
+    shoot(&mut page, "view-query.jpg", 840);
+    drop(page);
+    let mut phone = Page::open(&chromium, 390, 844, true);
+    phone.go(&server.address);
+    phone.run("splatvk.ask('lemon')");
+    shoot(&mut phone, "view-phone.jpg", 390);
+    phone.run("splatvk.show('level', 2)");
+    keep(&mut phone, "phone-level.png");
+}
