@@ -16,6 +16,10 @@ use std::path::{Path, PathBuf};
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rerun-if-changed=build");
+    // The major half of capi::SVK_ABI_VERSION: programs linked with another one do not load this library.
+    if std::env::var("CARGO_CFG_TARGET_OS").is_ok_and(|os| os == "linux") {
+        println!("cargo::rustc-cdylib-link-arg=-Wl,-soname,libsplatvk.so.1");
+    }
     if let Err(message) = build() {
         // One `cargo::error` line per line of the message: GLSL errors arrive as `glsl/name.comp:12: error: ...`.
         for line in message.lines().filter(|l| !l.trim().is_empty()) {

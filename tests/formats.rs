@@ -1,7 +1,7 @@
 //! File formats: what is written reads back, foreign files are understood, damaged ones are refused in one line.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
 use glam::{DQuat, DVec3};
-use splatvk::format::{cameras, colmap, ply, scene_dir, splat, transforms};
+use splatvk::format::{cameras, colmap, gaussians, ply, scene_dir, side_file, splat, spz, transforms};
 use splatvk::photo;
 use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, PointCloud, Pose, Splats};
 use std::path::{Path, PathBuf};
@@ -205,6 +205,136 @@ fn splat_file_layout() {
     assert_eq!(b[28..32], [219, 128, 37, 128]);
 }
 
+/// Largest differences of two scenes: positions, log scales, rotations (1 − |q·q'|), opacities, SH.
+fn differences(a: &Splats, b: &Splats) -> [f32; 5] {
+    let worst = |x: &[f32], y: &[f32]| {
+        assert_eq!(x.len(), y.len());
+        x.iter().zip(y).fold(0f32, |m, (x, y)| m.max((x - y).abs()))
+    };
+    let unit = |q: &[f32; 4]| q.map(|v| v / q.iter().map(|v| v * v).sum::<f32>().sqrt());
+    let turn = a.quats.iter().zip(&b.quats).fold(0f32, |m, (p, q)| {
+        m.max(1.0 - unit(p).iter().zip(unit(q)).map(|(x, y)| x * y).sum::<f32>().abs())
+    });
+    let opacity = |s: &Splats| s.opacity_logits.iter().map(|v| 1.0 / (1.0 + (-v).exp())).collect::<Vec<_>>();
+    [
+        worst(a.means.as_flattened(), b.means.as_flattened()),
+        worst(a.log_scales.as_flattened(), b.log_scales.as_flattened()),
+        turn,
+        worst(&opacity(a), &opacity(b)),
+        worst(&a.sh, &b.sh),
+    ]
+}
+
+/// Half a step of each format (positions and scales of the packed PLY: of 10 bits over the range −1 to 1 of the noise).
+#[test]
+fn packed_formats_round_trip_within_their_precision() {
+    let folder = tempfile::tempdir().unwrap();
+    for degree in 0..=3 {
+        let s = splats(700, degree);
+        let language = field(700);
+        for (name, bounds) in [
+            ("a.spz", [1e-6, 0.0313, 1e-5, 0.002, 0.0132]),
+            ("a.compressed.ply", [1e-3, 1e-3, 1e-5, 0.002, 0.0158]),
+        ] {
+            let path = folder.path().join(name);
+            gaussians::write(&path, &s, Some(&language)).unwrap();
+            let (back, spoken) = gaussians::read(&path).unwrap();
+            // The two noisy features are those of splats 0 and 1, wherever they went.
+            let features = &spoken.unwrap().levels[0].features;
+            let spoken: Vec<usize> =
+                (0..700).filter(|i| features[2 * i..2 * i + 2].iter().any(|v| *v != 0.0)).collect();
+            assert_eq!(spoken.len(), 2);
+            let first = spoken.iter().find(|i| features[2 * **i] == 3.0).unwrap();
+            let near = |i: usize, j: usize| {
+                back.means[i].iter().zip(s.means[j]).all(|(a, b)| (a - b).abs() < bounds[0])
+            };
+            assert!(near(*first, 0), "{name}: language went with its splat");
+            // The compressed PLY sorts: find every splat again.
+            let rows: Vec<usize> = (0..700).map(|j| (0..700).find(|i| near(*i, j)).unwrap()).collect();
+            let pick = |v: &[f32], w: usize| {
+                rows.iter().flat_map(|r| v[r * w..(r + 1) * w].to_vec()).collect::<Vec<_>>()
+            };
+            let back = Splats {
+                means: rows.iter().map(|r| back.means[*r]).collect(),
+                log_scales: rows.iter().map(|r| back.log_scales[*r]).collect(),
+                quats: rows.iter().map(|r| back.quats[*r]).collect(),
+                opacity_logits: pick(&back.opacity_logits, 1),
+                sh: pick(&back.sh, 3 * back.sh_len()),
+                sh_degree: back.sh_degree,
+            };
+            for (k, (got, bound)) in differences(&back, &s).iter().zip(bounds).enumerate() {
+                assert!(got <= &bound, "{name} degree {degree}, quantity {k}: {got} > {bound}");
+            }
+        }
+    }
+}
+
+#[test]
+fn splat_files_written_by_splat_transform() {
+    // Four Gaussians at the corners of a square in x and z, written by splat-transform (MIT, see the licence there).
+    let corners = [[-1.0, 0.0, -1.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]];
+    let plain = gaussians::read(&data("formats/minimal.splat")).unwrap().0;
+    assert_eq!(plain.means, corners);
+    assert!(plain.log_scales.as_flattened().iter().all(|s| (s - 0.1f32.ln()).abs() < 1e-6));
+    for version in ["raw", "v2", "v3", "v4"] {
+        let s = spz::read_splats(&data(&format!("formats/minimal-{version}.spz"))).unwrap();
+        assert_eq!((s.len(), s.sh_degree), (4, 0), "{version}");
+        // spz has its y and z axes the other way round.
+        let back: Vec<[f32; 3]> = s.means.iter().map(|m| [m[0], -m[1], -m[2]]).collect();
+        assert_eq!(back, corners, "{version}");
+        for i in 0..4 {
+            assert!((1.0 / (1.0 + (-s.opacity_logits[i]).exp()) - 0.9).abs() < 0.004, "{version}");
+            for k in 0..3 {
+                // Colours in steps of 1/38 of an SH coefficient; scales in sixteenths.
+                assert!((s.sh[3 * i + k] - plain.sh[3 * i + k]).abs() < 0.03, "{version}: colour {i} {k}");
+                assert!((s.log_scales[i][k] - 0.1f32.ln()).abs() < 0.032, "{version}");
+            }
+            assert!(s.quats[i][0] > 0.9999, "{version}: no rotation");
+        }
+    }
+}
+
+#[test]
+fn damaged_packed_files_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let s = splats(300, 1);
+    for name in ["a.spz", "a.compressed.ply", "a.splat"] {
+        let path = folder.path().join(name);
+        gaussians::write(&path, &s, None).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        for cut in (0..whole.len()).step_by(97).skip(1) {
+            // A .splat file cut between two rows is a whole file of fewer Gaussians.
+            if name == "a.splat" && cut % 32 == 0 {
+                continue;
+            }
+            std::fs::write(&path, &whole[..cut]).unwrap();
+            let e = gaussians::read(&path).unwrap_err();
+            assert_eq!((e.exit_code(), e.to_string().lines().count()), (2, 1), "{name} cut at {cut}: {e}");
+        }
+    }
+    for version in ["v2", "v3", "v4", "raw"] {
+        let whole = std::fs::read(data(&format!("formats/minimal-{version}.spz"))).unwrap();
+        let path = folder.path().join("b.spz");
+        for cut in 0..whole.len() - 8 {
+            std::fs::write(&path, &whole[..cut]).unwrap();
+            assert_eq!(gaussians::read(&path).unwrap_err().exit_code(), 2, "{version} cut at {cut}");
+        }
+    }
+    assert_eq!(gaussians::read(Path::new("scene.xyz")).unwrap_err().exit_code(), 2);
+}
+
+#[test]
+fn language_of_another_file_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.spz");
+    gaussians::write(&path, &splats(5, 0), Some(&field(5))).unwrap();
+    gaussians::write(&folder.path().join("b.spz"), &splats(6, 0), None).unwrap();
+    std::fs::rename(side_file::path(&path), folder.path().join("b.spz.language.npz")).unwrap();
+    let e = gaussians::read(&folder.path().join("b.spz")).unwrap_err();
+    assert!(e.exit_code() == 2 && e.to_string().contains("another file"), "{e}");
+    assert!(gaussians::read(&path).unwrap().1.is_none());
+}
+
 #[test]
 fn cameras_round_trip() {
     let folder = tempfile::tempdir().unwrap();
@@ -226,6 +356,11 @@ fn cameras_round_trip() {
     colmap::write(&c, &cams, Some(&points)).unwrap();
     assert_same_cameras(&cameras::read(&c).unwrap(), &cams);
     let back = colmap::read_points(&c).unwrap();
+    assert_eq!((back.positions, back.colours), (points.positions.clone(), points.colours.clone()));
+    let binary = folder.path().join("binary");
+    colmap::write_binary(&binary, &cams, Some(&points)).unwrap();
+    assert_same_cameras(&cameras::read(&binary).unwrap(), &cams);
+    let back = colmap::read_points(&binary).unwrap();
     assert_eq!((back.positions, back.colours), (points.positions, points.colours));
 }
 

@@ -50,6 +50,10 @@ pub enum Command {
     Bench(BenchArgs),
     /// What this machine has and what is missing
     Doctor(DoctorArgs),
+    /// Completions of a shell on standard output: bash, elvish, fish, powershell, zsh
+    Completions(CompletionsArgs),
+    /// Man pages into a folder
+    Manuals(ManualsArgs),
 }
 
 /// How much time a run may take.
@@ -213,7 +217,7 @@ pub enum ImageFormat {
 /// `splatvk render`
 #[derive(Debug, Args)]
 pub struct RenderArgs {
-    /// Scene directory, or a Gaussian .ply
+    /// Scene directory, or a file of Gaussians (.ply, .splat, .spz)
     pub scene: PathBuf,
     /// Cameras: transforms.json, a COLMAP model folder, or cameras.json
     #[arg(long, value_name = "FILE")]
@@ -432,10 +436,16 @@ pub struct GenerateArgs {
 pub enum ExportFormat {
     /// INRIA .ply
     Ply,
+    /// Compressed .ply, as SuperSplat writes it
+    CompressedPly,
     /// .splat
     Splat,
+    /// .spz version 4
+    Spz,
     /// COLMAP text model
     Colmap,
+    /// COLMAP binary model
+    ColmapBin,
     /// nerfstudio transforms.json
     Transforms,
 }
@@ -443,12 +453,12 @@ pub enum ExportFormat {
 /// `splatvk export`
 #[derive(Debug, Args)]
 pub struct ExportArgs {
-    /// Scene directory, or a Gaussian .ply
+    /// Scene directory, or a file of Gaussians: .ply (compressed, too), .splat, .spz
     pub scene: PathBuf,
-    /// What to write
+    /// What to write; language goes beside splat, spz and compressed-ply, into OUT.language.npz
     #[arg(long, value_enum)]
     pub format: ExportFormat,
-    /// File (ply, splat, transforms) or folder (colmap)
+    /// File, or folder (colmap, colmap-bin)
     #[arg(long, value_name = "PATH")]
     pub out: PathBuf,
     /// ply: spherical-harmonics degree of the file, padded with zeros; most viewers ask for 3
@@ -562,6 +572,21 @@ pub struct DoctorArgs {
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
+}
+
+/// `splatvk completions`
+#[derive(Debug, Args)]
+pub struct CompletionsArgs {
+    /// Which shell
+    #[arg(value_enum)]
+    pub shell: clap_complete::Shell,
+}
+
+/// `splatvk manuals`
+#[derive(Debug, Args)]
+pub struct ManualsArgs {
+    /// Folder for splatvk.1, splatvk-run.1, ...
+    pub out: PathBuf,
 }
 
 #[cfg(test)]

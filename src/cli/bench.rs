@@ -1,10 +1,11 @@
 //! `splatvk bench`
 use super::args::{BenchArgs, BenchPart};
-use super::{encoder, print};
+use super::print;
 use crate::bench::{self, Bench, Budget, Report, Workload, compare};
 use crate::format::{scene_dir, write_json};
 use crate::gpu::Device;
 use crate::infer::{RegionEncoder, Registry};
+use crate::run::encoder;
 use crate::{Error, Result};
 use std::path::Path;
 

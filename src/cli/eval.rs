@@ -1,6 +1,5 @@
 //! `splatvk eval`
 use super::args::{EvalArgs, ProtocolArg};
-use super::encoder;
 use super::progress;
 use super::{print, print_json};
 use crate::format::scene_dir::Scene;
@@ -11,6 +10,7 @@ use crate::query::TextQuery;
 use crate::query::eval::{Evaluation, GroundTruth, Report};
 use crate::query::protocol::{self, CodeScores, Kind, Masks, Seen};
 use crate::report::file_name;
+use crate::run::encoder;
 use crate::run::score::score_field;
 use crate::run::sources;
 use crate::run::view::Viewer;

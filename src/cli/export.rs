@@ -1,8 +1,10 @@
 //! `splatvk export`
 use super::args::{ExportArgs, ExportFormat};
 use super::listing;
-use crate::format::{colmap, create_folder, ply, scene_dir, splat, transforms};
-use crate::scene::Camera;
+use crate::format::{
+    colmap, create_folder, gaussians, ply, ply_packed, scene_dir, splat, spz, transforms, whole,
+};
+use crate::scene::{Camera, Splats};
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -23,39 +25,42 @@ pub fn export(args: &ExportArgs) -> Result<()> {
             let options = ply::PlyOptions { degree: args.ply_degree, language };
             whole(&args.out, |path| ply::write_splats(path, &scene.splats, options))?;
         }
-        ExportFormat::Splat => whole(&args.out, |path| splat::write_splats(path, &scene.splats))?,
+        ExportFormat::Splat => packed(args, &scene, splat::write_splats)?,
+        ExportFormat::CompressedPly => packed(args, &scene, ply_packed::write_splats)?,
+        // spz keeps the scene's order
+        ExportFormat::Spz => {
+            packed(args, &scene, |path, s| spz::write_splats(path, s).map(|()| Vec::new()))?;
+        }
         ExportFormat::Transforms => {
             let cameras = cameras(&scene, args)?;
             whole(&args.out, |path| transforms::write(path, cameras, None))?;
         }
-        ExportFormat::Colmap => {
+        ExportFormat::Colmap | ExportFormat::ColmapBin => {
             let cameras = cameras(&scene, args)?;
             let points = colmap::read_points(&args.scene.join("cameras/colmap")).ok();
-            colmap::write(&args.out, cameras, points.as_ref())?;
+            let write =
+                if args.format == ExportFormat::Colmap { colmap::write } else { colmap::write_binary };
+            write(&args.out, cameras, points.as_ref())?;
         }
     }
     listing(std::slice::from_ref(&args.out), args.json)
 }
 
+/// A format that only keeps what viewers draw, with the language in a file beside it.
+fn packed(
+    args: &ExportArgs,
+    scene: &scene_dir::Scene,
+    write: impl FnOnce(&Path, &Splats) -> Result<Vec<u32>>,
+) -> Result<()> {
+    gaussians::write_as(&args.out, &scene.splats, scene.language.as_ref(), write)
+}
+
 fn cameras<'a>(scene: &'a scene_dir::Scene, args: &ExportArgs) -> Result<&'a [Camera]> {
     if scene.cameras.is_empty() {
         return Err(Error::input(format!(
-            "{}: a bare .ply has no cameras; give a scene directory",
+            "{}: a file of Gaussians has no cameras; give a scene directory",
             args.scene.display()
         )));
     }
     Ok(&scene.cameras)
-}
-
-/// Writes beside the target and renames: a file that was there stays until the new one is whole.
-fn whole(out: &Path, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
-    let mut name = out.file_name().unwrap_or_default().to_os_string();
-    name.push(format!(".partial-{}", std::process::id()));
-    let partial = out.with_file_name(name);
-    let outcome = write(&partial).and_then(|()| std::fs::rename(&partial, out).map_err(Error::io(out)));
-    if outcome.is_err() {
-        // The error is what matters; the partial file may not even exist.
-        let _ = std::fs::remove_file(&partial);
-    }
-    outcome
 }

@@ -3,7 +3,6 @@ mod ablate;
 pub mod args;
 mod bench;
 mod doctor;
-mod encoder;
 mod eval;
 mod export;
 mod generate;
@@ -14,6 +13,7 @@ mod progress;
 mod query;
 mod render;
 mod run;
+mod shell;
 mod train;
 mod view;
 mod views;
@@ -57,6 +57,8 @@ fn execute(command: Command) -> Result<()> {
         Command::Models(args) => models::models(&args),
         Command::Bench(args) => bench::bench(&args),
         Command::Doctor(args) => doctor::doctor(&args),
+        Command::Completions(args) => shell::completions(&args),
+        Command::Manuals(args) => shell::manuals(&args),
     }
 }
 

@@ -1,6 +1,5 @@
 //! `splatvk query`
 use super::args::QueryArgs;
-use super::encoder;
 use super::outputs::Outputs;
 use super::progress;
 use super::{print, print_json, views};
@@ -11,6 +10,7 @@ use crate::infer::Registry;
 use crate::query::{QueryOptions, QueryResult};
 use crate::report::{colour, file_name};
 use crate::run::ask::QueryScene;
+use crate::run::encoder;
 use crate::scene::{LEVEL_NAMES, RgbImage};
 use crate::{Error, Result};
 use serde_json::{Value, json};

@@ -1,4 +1,4 @@
-//! COLMAP models: text (read, write) and binary (read). World → camera, OpenCV axes, first pixel centre at 0.5.
+//! COLMAP models, text and binary. World → camera, OpenCV axes, first pixel centre at 0.5.
 use crate::scene::{Camera, PointCloud, Pose};
 use crate::{Error, Result};
 use glam::{DMat3, DQuat, DVec3};
@@ -286,6 +286,41 @@ pub fn write(folder: &Path, cameras: &[Camera], points: Option<&PointCloud>) -> 
     for (name, text) in [("cameras.txt", intrinsics), ("images.txt", images), ("points3D.txt", cloud)] {
         let path = folder.join(name);
         std::fs::write(&path, text).map_err(Error::io(&path))?;
+    }
+    Ok(())
+}
+
+/// Writes a binary model with PINHOLE cameras, and all points: only text needs many bytes for them.
+pub fn write_binary(folder: &Path, cameras: &[Camera], points: Option<&PointCloud>) -> Result<()> {
+    std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
+    let count = |n: usize| (n as u64).to_le_bytes();
+    let mut intrinsics = count(cameras.len()).to_vec();
+    let mut images = intrinsics.clone();
+    for (id, c) in (1u32..).zip(cameras) {
+        let q = DQuat::from_mat3(&c.pose.rotation).normalize();
+        let t = c.pose.translation;
+        intrinsics.extend([id, 1].iter().flat_map(|v| v.to_le_bytes()));
+        intrinsics.extend([c.width, c.height].iter().flat_map(|v| u64::from(*v).to_le_bytes()));
+        intrinsics.extend([c.fx, c.fy, c.cx, c.cy].iter().flat_map(|v| v.to_le_bytes()));
+        images.extend(id.to_le_bytes());
+        images.extend([q.w, q.x, q.y, q.z, t.x, t.y, t.z].iter().flat_map(|v| v.to_le_bytes()));
+        images.extend(id.to_le_bytes());
+        images.extend(c.name.bytes().filter(|b| *b != 0).chain([0]));
+        images.extend(count(0));
+    }
+    let mut cloud = count(points.map_or(0, PointCloud::len)).to_vec();
+    for (id, (position, colour)) in points.iter().flat_map(|p| p.positions.iter().zip(&p.colours)).enumerate()
+    {
+        cloud.extend(count(id + 1));
+        cloud.extend(position.iter().flat_map(|v| f64::from(*v).to_le_bytes()));
+        cloud.extend(colour.map(super::to_byte));
+        // No reprojection error and no track: the points are those of stereo.
+        cloud.extend(0f64.to_le_bytes());
+        cloud.extend(count(0));
+    }
+    for (name, bytes) in [("cameras.bin", intrinsics), ("images.bin", images), ("points3D.bin", cloud)] {
+        let path = folder.join(name);
+        std::fs::write(&path, bytes).map_err(Error::io(&path))?;
     }
     Ok(())
 }

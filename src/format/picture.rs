@@ -1,9 +1,10 @@
 //! Images and maps on disk: PNG, OpenEXR, npy.
 use super::npy::{self, NpyArray};
 use super::to_byte;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{LEVEL_NAMES, Plane, RgbImage};
 use crate::{Error, Result};
 use exr::prelude as ex;
+use std::collections::BTreeMap;
 use std::io::BufWriter;
 use std::path::Path;
 
@@ -96,6 +97,10 @@ pub fn write_exr(path: &Path, size: (usize, usize), planes: Planes) -> Result<()
             channels.push((format!("feat.{k:02}"), values.iter().skip(k).step_by(d).copied().collect()));
         }
     }
+    for (name, codes) in LEVEL_NAMES.iter().zip(planes.codes) {
+        // f32 holds every index up to 16 million.
+        channels.push((format!("code.{name}"), codes.data.iter().map(|k| *k as f32).collect()));
+    }
     let list =
         channels.into_iter().map(|(name, v)| ex::AnyChannel::new(name.as_str(), ex::FlatSamples::F32(v)));
     let encoding = ex::Encoding { compression: ex::Compression::ZIP16, ..ex::Encoding::FAST_LOSSLESS };
@@ -107,6 +112,22 @@ pub fn write_exr(path: &Path, size: (usize, usize), planes: Planes) -> Result<()
         .to_buffered(&mut bytes)
         .map_err(|e| Error::work(format!("{}: cannot encode the EXR file: {e}", path.display())))?;
     std::fs::write(path, bytes.into_inner()).map_err(Error::io(path))
+}
+
+/// Reads every channel of the first layer of an OpenEXR file, by name; half floats and integers become floats.
+pub fn read_exr(path: &Path) -> Result<BTreeMap<String, Plane<f32>>> {
+    use ex::ReadChannels;
+    use ex::ReadLayers;
+    let reader = ex::read().no_deep_data().largest_resolution_level().all_channels().first_valid_layer();
+    let image = reader
+        .all_attributes()
+        .from_file(path)
+        .map_err(|e| Error::input(format!("{}: not a readable EXR file: {e}", path.display())))?;
+    let (width, height) = (image.layer_data.size.x(), image.layer_data.size.y());
+    let plane = |c: ex::AnyChannel<ex::FlatSamples>| {
+        (c.name.to_string(), Plane { width, height, data: c.sample_data.values_as_f32().collect() })
+    };
+    Ok(image.layer_data.channel_data.list.into_iter().map(plane).collect())
 }
 
 /// Writes `[H, W]` or `[H, W, d]` values as `<f4` npy.
@@ -122,7 +143,6 @@ mod tests {
 
     #[test]
     fn exr_keeps_every_float() {
-        use exr::prelude::*;
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.exr");
         let (w, h, d) = (5, 3, 2);
@@ -130,28 +150,23 @@ mod tests {
             RgbImage { width: w, height: h, data: (0..15).map(|i| [i as f32 * 0.1, -1.5, 2.0e5]).collect() };
         let depth = Plane { width: w, height: h, data: (0..15).map(|i| i as f32 * 1e-3).collect() };
         let features: Vec<f32> = (0..30).map(|i| i as f32).collect();
+        let codes = Plane { width: w, height: h, data: (-1..14).collect::<Vec<i32>>() };
         let planes = Planes {
             rgb: Some(&rgb),
             depth: Some(&depth),
             features: Some((d, &features)),
+            codes: std::slice::from_ref(&codes),
             ..Planes::default()
         };
         write_exr(&path, (w, h), planes).unwrap();
-        let image = read()
-            .no_deep_data()
-            .largest_resolution_level()
-            .all_channels()
-            .first_valid_layer()
-            .all_attributes()
-            .from_file(&path)
-            .unwrap();
-        let names: Vec<String> =
-            image.layer_data.channel_data.list.iter().map(|c| c.name.to_string()).collect();
-        assert_eq!(names, ["B", "G", "R", "Z", "feat.00", "feat.01"], "alphabetical, as the format demands");
-        let values =
-            |k: usize| image.layer_data.channel_data.list[k].sample_data.values_as_f32().collect::<Vec<_>>();
-        assert_eq!(values(2), rgb.data.iter().map(|c| c[0]).collect::<Vec<_>>());
-        assert_eq!(values(3), depth.data);
-        assert_eq!(values(5), features.iter().skip(1).step_by(2).copied().collect::<Vec<_>>());
+        let image = read_exr(&path).unwrap();
+        let names: Vec<&str> = image.keys().map(String::as_str).collect();
+        assert_eq!(names, ["B", "G", "R", "Z", "code.s", "feat.00", "feat.01"]);
+        assert_eq!(image["R"].data, rgb.data.iter().map(|c| c[0]).collect::<Vec<_>>());
+        assert_eq!(image["Z"], depth);
+        assert_eq!(image["code.s"].data, codes.data.iter().map(|k| *k as f32).collect::<Vec<_>>());
+        assert_eq!(image["feat.01"].data, features.iter().skip(1).step_by(2).copied().collect::<Vec<_>>());
+        std::fs::write(&path, b"no image").unwrap();
+        assert_eq!(read_exr(&path).unwrap_err().exit_code(), 2);
     }
 }

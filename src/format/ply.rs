@@ -1,4 +1,5 @@
 //! PLY files: a table reader for one element, and the Gaussian layout that 3DGS viewers expect (ALGORITHMS 10.1).
+use super::ply_packed;
 use crate::scene::{LanguageField, LevelField, PointCloud, Splats, sh_coefficients};
 use crate::{Error, Result};
 use std::fmt::Write as _;
@@ -6,7 +7,7 @@ use std::path::Path;
 
 /// A column of a PLY element.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Kind {
+pub(super) enum Kind {
     I8,
     U8,
     I16,
@@ -100,7 +101,8 @@ struct Header {
     body: usize,
 }
 
-fn header(bytes: &[u8]) -> Result<Header, String> {
+/// What the header says about the element `wanted`.
+fn header(bytes: &[u8], wanted: &str) -> Result<Header, String> {
     if !bytes.starts_with(b"ply") {
         return Err("not a PLY file (it does not start with \"ply\")".into());
     }
@@ -110,7 +112,7 @@ fn header(bytes: &[u8]) -> Result<Header, String> {
         end + bytes[end..].iter().position(|&b| b == b'\n').ok_or("the file ends with its header")? + 1;
     let text = String::from_utf8_lossy(&bytes[..end]);
     let mut h = Header { ascii: false, little: true, skip: 0, rows: 0, columns: Vec::new(), body };
-    // (name, rows, columns) of the elements before and up to `vertex`.
+    // (name, rows, columns) of the elements before and up to the wanted one.
     let mut element = (String::new(), 0usize, Vec::new());
     let mut found = false;
     for line in text.lines().chain(["element end 0"]) {
@@ -125,7 +127,7 @@ fn header(bytes: &[u8]) -> Result<Header, String> {
             ["element", name, count] => {
                 let done = std::mem::replace(&mut element, (name.to_string(), 0, Vec::new()));
                 element.1 = count.parse().map_err(|_| format!("bad element count {count:?}"))?;
-                if done.0 == "vertex" {
+                if done.0 == wanted {
                     (h.rows, h.columns, found) = (done.1, done.2, true);
                 } else if !found {
                     let width: usize = done.2.iter().map(|c: &(String, Kind)| c.1.size()).sum();
@@ -142,11 +144,64 @@ fn header(bytes: &[u8]) -> Result<Header, String> {
             _ => {}
         }
     }
-    if found { Ok(h) } else { Err("there is no vertex element".into()) }
+    if found { Ok(h) } else { Err(format!("there is no {wanted} element")) }
+}
+
+/// The rows of one element of a binary file, with every digit of their values.
+pub(super) struct Rows<'a> {
+    columns: Vec<(String, Kind)>,
+    offsets: Vec<usize>,
+    width: usize,
+    little: bool,
+    bytes: &'a [u8],
+}
+
+impl Rows<'_> {
+    pub fn len(&self) -> usize {
+        self.bytes.len() / self.width.max(1)
+    }
+    pub fn find(&self, name: &str) -> Option<usize> {
+        self.columns.iter().position(|c| c.0 == name)
+    }
+    /// Column numbers of all the names.
+    pub fn all<const N: usize>(&self, names: [&str; N]) -> Result<[usize; N], String> {
+        let mut out = [0; N];
+        for (o, name) in out.iter_mut().zip(names) {
+            *o = self.find(name).ok_or_else(|| format!("no column {name}"))?;
+        }
+        Ok(out)
+    }
+    /// Columns `prefix0, prefix1, …` as long as they go on.
+    pub fn series(&self, prefix: &str) -> Vec<usize> {
+        (0..).map_while(|k| self.find(&format!("{prefix}{k}"))).collect()
+    }
+    pub fn value(&self, row: usize, column: usize) -> f64 {
+        let at = row * self.width + self.offsets[column];
+        let kind = self.columns[column].1;
+        kind.value(&self.bytes[at..at + kind.size()], self.little)
+    }
+}
+
+/// One element of a binary file.
+pub(super) fn rows<'a>(bytes: &'a [u8], element: &str) -> Result<Rows<'a>, String> {
+    let h = header(bytes, element)?;
+    if h.ascii {
+        return Err("an ASCII file cannot hold packed columns".into());
+    }
+    let mut width = 0;
+    let mut offsets = Vec::with_capacity(h.columns.len());
+    for (_, kind) in &h.columns {
+        offsets.push(width);
+        width += kind.size();
+    }
+    let end = h.rows.checked_mul(width).and_then(|n| n.checked_add(h.skip)).unwrap_or(usize::MAX);
+    let body = bytes.get(h.body..).unwrap_or_default();
+    let rows = body.get(h.skip..end).ok_or("the file ends early; copy it again")?;
+    Ok(Rows { columns: h.columns, offsets, width, little: h.little, bytes: rows })
 }
 
 fn table(bytes: &[u8]) -> Result<Table, String> {
-    let h = header(bytes)?;
+    let h = header(bytes, "vertex")?;
     let (width, wide) = (h.columns.iter().map(|c| c.1.size()).sum::<usize>(), h.columns.len());
     let body = bytes.get(h.body..).unwrap_or_default();
     let mut values = Vec::new();
@@ -187,20 +242,21 @@ fn open(path: &Path) -> Result<Table> {
     table(&bytes).map_err(|e| Error::input(format!("{}: {e}", path.display())))
 }
 
-/// Reads Gaussians in the INRIA layout, of any SH degree 0–3; unknown columns are skipped. ASCII or binary.
+/// Reads Gaussians in the INRIA layout, of any SH degree 0–3; unknown columns are skipped. ASCII or binary. Compressed
+/// files as SuperSplat writes them are understood, too.
 pub fn read_splats(path: &Path) -> Result<Splats> {
-    let t = open(path)?;
-    gaussians(&t).map_err(|what| Error::input(format!("{}: {what}", path.display())))
+    let bytes = std::fs::read(path).map_err(Error::io(path))?;
+    let parse = || {
+        if ply_packed::is_packed(&header(&bytes, "vertex")?.columns) {
+            return ply_packed::parse(&bytes);
+        }
+        gaussians(&table(&bytes)?)
+    };
+    parse().map_err(|what| Error::input(format!("{}: {what}", path.display())))
 }
 
 fn gaussians(t: &Table) -> Result<Splats, String> {
-    let need = |missing: String| {
-        if t.column("packed_position").is_some() {
-            "this is a compressed PLY; save it as a standard Gaussian PLY first".to_string()
-        } else {
-            format!("no column {missing}: this is not a Gaussian splat file")
-        }
-    };
+    let need = |missing: String| format!("no column {missing}: this is not a Gaussian splat file");
     let position = t.all(["x", "y", "z"]).map_err(need)?;
     let scale = t.all(["scale_0", "scale_1", "scale_2"]).map_err(need)?;
     let rotation = t.all(["rot_0", "rot_1", "rot_2", "rot_3"]).map_err(need)?;

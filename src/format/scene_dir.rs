@@ -1,7 +1,7 @@
 //! The scene directory: what a run writes and every other command reads.
 use super::npy::{self, NpyArray};
 use super::workspace::MANIFEST;
-use super::{cameras, colmap, create_folder, picture, ply, transforms};
+use super::{cameras, colmap, create_folder, gaussians, picture, ply, transforms};
 use crate::photo::Photo;
 use crate::scene::{Camera, Codebook, LEVEL_NAMES, LanguageField, LevelField, PointCloud, Splats};
 use crate::{Error, Result};
@@ -160,10 +160,11 @@ fn write_codebook(path: &Path, book: &Codebook, space: &str) -> Result<()> {
     )
 }
 
-/// Loads a scene directory, or a bare Gaussian `.ply`.
+/// Loads a scene directory, or a file of Gaussians ([`gaussians::read`]), which has no cameras.
 pub fn load(path: &Path) -> Result<Scene> {
     if path.is_file() {
-        return Ok(Scene { path: path.into(), splats: ply::read_splats(path)?, ..Scene::default() });
+        let (splats, language) = gaussians::read(path)?;
+        return Ok(Scene { path: path.into(), splats, language, ..Scene::default() });
     }
     let manifest = read_manifest(path)?;
     let splats = ply::read_splats(&path.join("point_cloud.ply"))?;

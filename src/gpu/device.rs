@@ -1,4 +1,5 @@
 //! The logical device and everything that lives as long as it.
+use super::adopt::QueueLock;
 use super::module::{Call, Capability, Module};
 use super::pipeline::Pipeline;
 use super::select;
@@ -106,6 +107,20 @@ impl MemoryCount {
     }
 }
 
+/// A logical device, made by us or by the host, ready for [`Device::assemble`].
+pub(super) struct Setup {
+    pub instance: ash::Instance,
+    pub device: ash::Device,
+    pub info: DeviceInfo,
+    pub queue: vk::Queue,
+    pub queue_family: u32,
+    /// synchronization2 comes from the extension instead of Vulkan 1.3.
+    pub sync2_extension: bool,
+    pub timeline: bool,
+    pub queue_lock: Option<QueueLock>,
+    pub owned: bool,
+}
+
 /// A Vulkan device; clones share it.
 #[derive(Clone)]
 pub struct Device(pub(super) Arc<Inner>);
@@ -115,6 +130,12 @@ pub(super) struct Inner {
     pub device: ash::Device,
     pub queue_family: u32,
     pub queue: Mutex<vk::Queue>,
+    /// Keeps the host off a queue that it shares with us.
+    pub queue_lock: Option<QueueLock>,
+    /// Timeline semaphores may be used.
+    pub timeline: bool,
+    /// Device and instance are ours to destroy.
+    pub owned: bool,
     /// `None` only while dropping: it must go before the device.
     pub allocator: Mutex<Option<Allocator>>,
     pub memory: MemoryCount,
@@ -175,8 +196,31 @@ impl Device {
         let (device, info) = super::features::create(instance, &candidate, queue_family, options)?;
         // SAFETY: the queue was requested in `create`.
         let queue = unsafe { device.get_device_queue(queue_family, 0) };
-        let sync2 = (candidate.properties.api_version < vk::API_VERSION_1_3)
-            .then(|| ash::khr::synchronization2::Device::new(instance, &device));
+        let setup = Setup {
+            instance: instance.clone(),
+            device,
+            info,
+            queue,
+            queue_family,
+            sync2_extension: candidate.properties.api_version < vk::API_VERSION_1_3,
+            timeline: false,
+            queue_lock: None,
+            owned: true,
+        };
+        Self::assemble(entry, physical, sink, setup)
+    }
+
+    /// Adds what splatvk keeps beside a logical device. On failure the device is destroyed if it is ours; the instance
+    /// stays with the caller.
+    pub(super) fn assemble(
+        entry: ash::Entry,
+        physical: vk::PhysicalDevice,
+        sink: Option<Sink>,
+        setup: Setup,
+    ) -> Result<Device> {
+        let Setup { instance, device, info, queue, queue_family, timeline, queue_lock, owned, .. } = setup;
+        let sync2 =
+            setup.sync2_extension.then(|| ash::khr::synchronization2::Device::new(&instance, &device));
         let finish = || -> Result<(vk::PipelineCache, Allocator)> {
             // SAFETY: the device is alive.
             let cache =
@@ -189,20 +233,25 @@ impl Device {
                 debug_settings: gpu_allocator::AllocatorDebugSettings::default(),
                 buffer_device_address: false,
                 allocation_sizes: gpu_allocator::AllocationSizes::default(),
+            });
+            allocator.map(|a| (cache, a)).map_err(|e| {
+                // SAFETY: the cache was never used.
+                unsafe { device.destroy_pipeline_cache(cache, None) };
+                Error::gpu(format!("memory allocator: {e}"))
             })
-            .map_err(|e| Error::gpu(format!("memory allocator: {e}")))?;
-            Ok((cache, allocator))
         };
         let (pipeline_cache, allocator) = match finish() {
             Ok(parts) => parts,
             Err(e) => {
-                // SAFETY: the device has no other user.
-                unsafe { device.destroy_device(None) };
+                if owned {
+                    // SAFETY: the device has no other user.
+                    unsafe { device.destroy_device(None) };
+                }
                 return Err(e);
             }
         };
         let messenger = sink.as_ref().and_then(|sink| {
-            let debug = ash::ext::debug_utils::Instance::new(&entry, instance);
+            let debug = ash::ext::debug_utils::Instance::new(&entry, &instance);
             // SAFETY: the sink outlives the messenger (see Drop).
             let raw = unsafe { debug.create_debug_utils_messenger(&sink.messenger_info(), None) }.ok()?;
             Some((debug, raw))
@@ -212,13 +261,16 @@ impl Device {
             device,
             queue_family,
             queue: Mutex::new(queue),
+            queue_lock,
+            timeline,
+            owned,
             allocator: Mutex::new(Some(allocator)),
             memory: MemoryCount::default(),
             pipelines: Mutex::new(HashMap::new()),
             pipeline_cache,
             sync2,
             messenger,
-            instance: instance.clone(),
+            instance,
             sink,
             _entry: entry,
         })))
@@ -297,16 +349,29 @@ impl Device {
         }
     }
 
+    /// Submits; the fence is unsignalled and ours.
+    pub(super) fn queue_submit(
+        &self,
+        infos: &[vk::SubmitInfo<'_>],
+        fence: vk::Fence,
+    ) -> std::result::Result<(), vk::Result> {
+        let queue = lock(&self.0.queue);
+        let mut outcome = Ok(());
+        // SAFETY: our threads are kept apart by the lock, the host's by `queue_lock` or its promise (see HostDevice).
+        let mut submit = || outcome = unsafe { self.0.device.queue_submit(*queue, infos, fence) };
+        match &self.0.queue_lock {
+            Some(host) => host(&mut submit),
+            None => submit(),
+        }
+        outcome
+    }
+
     /// Submits and waits until the device is done.
     pub(super) fn submit(&self, commands: vk::CommandBuffer, fence: vk::Fence, what: &str) -> Result<()> {
         let device = &self.0.device;
         let commands = [commands];
         let submit = vk::SubmitInfo::default().command_buffers(&commands);
-        {
-            let queue = lock(&self.0.queue);
-            // SAFETY: the queue is externally synchronised by the lock; the fence is unsignalled and ours.
-            unsafe { device.queue_submit(*queue, &[submit], fence) }.map_err(vk_error(what))?;
-        }
+        self.queue_submit(&[submit], fence).map_err(vk_error(what))?;
         // SAFETY: the fence was submitted above.
         unsafe { device.wait_for_fences(&[fence], true, u64::MAX) }.map_err(vk_error(what))?;
         // SAFETY: the fence is signalled and not in use.
@@ -324,12 +389,19 @@ impl Drop for Inner {
     fn drop(&mut self) {
         // SAFETY: buffers and programs hold the device, so only the parts below are left, and nothing runs: every submit waits.
         unsafe {
-            let _ = self.device.device_wait_idle();
+            if self.owned {
+                // Every submit was waited for; this is for what a driver may do on its own. On the host's device it would
+                // take all of the host's queues.
+                let _ = self.device.device_wait_idle();
+            }
             for (_, pipeline) in lock(&self.pipelines).drain() {
                 pipeline.destroy(&self.device);
             }
             self.device.destroy_pipeline_cache(self.pipeline_cache, None);
             drop(lock(&self.allocator).take());
+            if !self.owned {
+                return;
+            }
             self.device.destroy_device(None);
             if let Some((debug, messenger)) = self.messenger.take() {
                 debug.destroy_debug_utils_messenger(messenger, None);

@@ -1,4 +1,5 @@
 //! Device features: which there are, which get enabled, what they mean for shaders.
+use super::adopt::EnabledFeatures;
 use super::device::{DeviceInfo, Options, vk_error};
 use super::module::Capability;
 use super::select::{self, Candidate};
@@ -116,6 +117,29 @@ pub(super) fn create(
         .map_err(vk_error(format!("opening {}", candidate.name)))?;
     let described = describe(instance, candidate, &offer, queue_family, options, atomics_on);
     Ok((device, described))
+}
+
+/// The description of a device that the host made: what it enabled is what there is.
+pub(super) fn adopted(
+    instance: &ash::Instance,
+    candidate: &Candidate,
+    enabled: &EnabledFeatures,
+    queue_family: u32,
+    options: &Options,
+) -> DeviceInfo {
+    let offer = Offer {
+        base: enabled.base,
+        storage8: enabled.storage8,
+        float16: enabled.float16,
+        int8: enabled.int8,
+        storage16: enabled.storage16,
+        synchronization2: enabled.synchronization2,
+        atomic_float_add: enabled.atomic_float_add,
+        subgroup_control: enabled.subgroup_control,
+        full_subgroups: enabled.full_subgroups,
+    };
+    let atomics = offer.atomic_float_add && !options.no_float_atomics;
+    describe(instance, candidate, &offer, queue_family, options, atomics)
 }
 
 /// The public description; also what `doctor` prints for devices it does not open.

@@ -58,8 +58,10 @@
 //! A Vulkan loader and a driver for Vulkan 1.2 with `VK_KHR_synchronization2`; on Debian and Ubuntu `libvulkan1` and
 //! `mesa-vulkan-drivers` (which includes the CPU device lavapipe). The tests also need `vulkan-validationlayers`.
 //! At build time: libshaderc (see `.cargo/config.toml`), nothing of Vulkan.
+mod adopt;
 mod buffer;
 mod device;
+pub mod external;
 mod features;
 mod hazard;
 mod module;
@@ -70,6 +72,9 @@ pub mod report;
 mod select;
 mod validation;
 
+pub use adopt::{EnabledFeatures, HostDevice, QueueLock};
+/// The Vulkan bindings whose handles [`HostDevice`] and [`external`] take.
+pub use ash::vk;
 pub use buffer::Buffer;
 pub use device::{Device, DeviceInfo, Memory, Options};
 pub use module::{Access, Binding, Call, Capability, Family, Module};

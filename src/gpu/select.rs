@@ -71,7 +71,7 @@ pub(super) fn candidates(instance: &ash::Instance) -> Result<Vec<Candidate>> {
     Ok(all)
 }
 
-fn candidate(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Candidate {
+pub(super) fn candidate(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Candidate {
     // SAFETY: `physical` belongs to `instance`.
     let properties = unsafe { instance.get_physical_device_properties(physical) };
     let name = properties.device_name_as_c_str().unwrap_or_default().to_string_lossy().into_owned();

@@ -8,6 +8,7 @@ pub mod decode;
 pub mod densify;
 pub mod gauge;
 pub mod metrics;
+pub mod pack;
 pub mod pairs;
 pub mod plane_sweep;
 pub mod plane_sweep_cpu;

@@ -51,29 +51,58 @@ pub fn load(path: &Path) -> Result<Photo> {
     let bytes = std::fs::read(path).map_err(|e| {
         Error::input(format!("{}: {e}; check the name and that you may read it", path.display()))
     })?;
-    let decoded = decode::decode(bytes, path)?;
-    let (w, h) = decoded.size;
+    from_bytes(path, bytes)
+}
+
+/// [`load`] of a JPEG or PNG file that is in memory already; `name` stands for its path.
+pub fn from_bytes(name: &Path, bytes: Vec<u8>) -> Result<Photo> {
+    let decoded = decode::decode(bytes, name)?;
+    let photo = working(name, decoded.size, |x, y| decoded.at(x, y))?;
+    // The two scales differ by the rounding of the size only; the height is the exact one.
+    let exif_focal = decoded.lens.focal.map(|f| f * photo.to_working.scale[1]);
+    Ok(Photo { exif_focal, camera_model: decoded.lens.camera_model, ..photo })
+}
+
+/// A photo from upright sRGB pixels in [0, 1]; `focal` is in their pixels, where it is known.
+pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>) -> Result<Photo> {
+    if image.data.len() != image.width * image.height {
+        return Err(Error::input(format!(
+            "{}: {} pixels do not make {} × {}",
+            name.display(),
+            image.data.len(),
+            image.width,
+            image.height
+        )));
+    }
+    let photo = working(name, (image.width, image.height), |x, y| image.at(x, y))?;
+    Ok(Photo { exif_focal: focal.map(|f| f * photo.to_working.scale[1]), ..photo })
+}
+
+/// Upright pixels at working resolution, nothing known about the lens.
+fn working(
+    name: &Path,
+    (w, h): (usize, usize),
+    at: impl Fn(usize, usize) -> [f32; 3] + Sync,
+) -> Result<Photo> {
     if w.min(h) < SMALLEST_SIDE {
         return Err(Error::input(format!(
             "{}: {w} × {h} pixels are too few; each side needs at least {SMALLEST_SIDE}",
-            path.display()
+            name.display()
         )));
     }
     let (working_w, working_h) = working_size(w, h);
-    let mut image = resize::area_average((w, h), (working_w, working_h), |x, y| decoded.at(x, y));
+    let mut image = resize::area_average((w, h), (working_w, working_h), at);
     let frame = Frame::of(&image);
     frame.continue_picture(&mut image);
-    let to_working = Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32));
     Ok(Photo {
-        path: path.to_path_buf(),
-        stem: path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
+        path: name.to_path_buf(),
+        stem: name.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
         image,
         frame,
         original_size: (w as u32, h as u32),
-        to_working,
-        // The two scales differ by the rounding of the size only; the height is the exact one.
-        exif_focal: decoded.lens.focal.map(|f| f * to_working.scale[1]),
-        camera_model: decoded.lens.camera_model,
+        to_working: Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32)),
+        exif_focal: None,
+        camera_model: None,
     })
 }
 
@@ -118,11 +147,16 @@ pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progres
     if !framed.is_empty() {
         progress.warn(&format!("plain frame around the picture left out: {}", framed.join(", ")));
     }
-    refuse_twins(&photos)?;
+    check_set(&photos)?;
     Ok(photos)
 }
 
-fn refuse_twins(photos: &[Photo]) -> Result<()> {
+/// Refuses sets that cannot give geometry (one photo, or the same photo twice) or that would mix up files (the same name
+/// twice). [`load_all`] has done it; for photos from memory.
+pub fn check_set(photos: &[Photo]) -> Result<()> {
+    if !(2..=MOST_VIEWS).contains(&photos.len()) {
+        return Err(Error::input(format!("{} photos; give 2 to {MOST_VIEWS}", photos.len())));
+    }
     let digests: Vec<_> =
         photos.iter().map(|p| Sha256::digest(bytemuck::cast_slice(&p.image.data))).collect();
     for j in 1..photos.len() {

@@ -71,7 +71,7 @@ impl Method {
 }
 
 /// Codes of up to 200 things stay apart at borders; with 3 numbers they do not (ALGORITHMS 6.2).
-const FEATURE_DIM: usize = 16;
+pub const FEATURE_DIM: usize = 16;
 
 /// λ2 of the paper.
 const IMAGE_WEIGHT: f64 = 0.3;

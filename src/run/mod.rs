@@ -1,6 +1,8 @@
 //! The whole pipeline on one page: photos → cameras, depth and points → splats → language → scene directory.
 pub mod ask;
 mod describe;
+pub mod encoder;
+pub mod live;
 mod method;
 mod record;
 pub mod score;
@@ -8,7 +10,7 @@ pub mod sources;
 pub mod train;
 pub mod view;
 
-pub use method::{Method, Recipe};
+pub use method::{FEATURE_DIM, Method, Recipe};
 pub use record::{closing_table, run_record};
 
 use crate::fit::{self, LanguageOptions, Preset, RgbOptions};
@@ -26,7 +28,7 @@ use crate::report::viewer::{Names, ShownAnswer};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
 use crate::{Error, Result};
 use describe::{Described, Describer, both};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{OnceLock, mpsc};
 use view::DecodedFrame;
 
@@ -37,6 +39,8 @@ pub enum InitSource {
     Sfm,
     /// Known cameras from a file; stereo.
     Cameras(PathBuf),
+    /// Known cameras, joined to the photos by name; stereo.
+    Given(Vec<Camera>),
 }
 
 /// Where masks come from.
@@ -96,6 +100,32 @@ pub struct RunPlan {
     pub deterministic: bool,
     /// Folder of the models.
     pub models: Option<PathBuf>,
+}
+
+impl Default for RunPlan {
+    /// Built-in models, everything else as the device suggests; no inputs, and nowhere to write.
+    fn default() -> Self {
+        RunPlan {
+            inputs: Vec::new(),
+            views: None,
+            out: PathBuf::new(),
+            force: false,
+            preset: None,
+            init: InitSource::Sfm,
+            masks: MaskSource::Graph,
+            features: FeatureSource::Words,
+            queries: Vec::new(),
+            seed: 0,
+            iterations: None,
+            language_iterations: None,
+            method: Method::default(),
+            feature_dim: FEATURE_DIM,
+            per_level: false,
+            device: None,
+            deterministic: false,
+            models: None,
+        }
+    }
 }
 
 /// The answers to one text, one per photo.
@@ -175,11 +205,37 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
         deterministic: plan.deterministic,
         ..gpu::Options::from_env(plan.device.as_deref())
     })?;
+    let outcome = work(plan, &device, photos, progress)?;
+    write(workspace, &outcome, progress)?;
+    Ok(outcome)
+}
+
+/// The run without its files, for programs that hold photos and device themselves. Of the plan, everything about inputs,
+/// output and device goes unread.
+pub fn reconstruct(
+    plan: &RunPlan,
+    device: &Device,
+    photos: Vec<Photo>,
+    progress: &dyn Progress,
+) -> Result<Outcome> {
+    photo::check_set(&photos)?;
+    work(plan, device, photos, &Recorded::new(progress))
+}
+
+/// Writes what [`reconstruct`] made as a scene directory, whole or not at all; `force` replaces a scene.
+pub fn save(outcome: &mut Outcome, out: &Path, force: bool, progress: &dyn Progress) -> Result<()> {
+    let workspace = Workspace::create(out, force)?;
+    outcome.plan.out = out.to_path_buf();
+    write(workspace, outcome, progress)
+}
+
+fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded) -> Result<Outcome> {
     let registry = Registry::open(plan.models.as_deref())?;
     // Whatever can be refused is read before the long work, not after it.
     let init = match &plan.init {
         InitSource::Sfm => InitChoice::Sfm,
         InitSource::Cameras(file) => InitChoice::Cameras(cameras::read(file)?),
+        InitSource::Given(cameras) => InitChoice::Cameras(cameras.clone()),
     };
     let given = sources::given_masks(&plan.masks, &plan.features, &photos)?;
     let encoder = sources::encoder(&plan.features, &registry)?;
@@ -188,10 +244,10 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
     let describer = Describer { plan, images: &images, registry: &registry, given, encoder };
     let reconstruct =
-        || pose::initialise(&device, &photos, &init, &registry, &StereoOptions::preset(preset), progress);
+        || pose::initialise(device, &photos, &init, &registry, &StereoOptions::preset(preset), progress);
     let train = |geometry: &Geometry| {
         fit::train_rgb(
-            &device,
+            device,
             &images,
             &geometry.cameras,
             &geometry.points,
@@ -203,7 +259,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     let (geometry, trained, described) = side_by_side(reconstruct, train, describer, progress)?;
     let Described { queries, language: built, names } = described;
     let spoken = plan.recipe().speak(
-        &device,
+        device,
         &images,
         &trained.cameras,
         &trained.splats,
@@ -213,11 +269,11 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     )?;
 
     progress.begin("query", 1);
-    let frames = view::decode_all(&device, &spoken.splats, &spoken.field, &trained.cameras)?;
+    let frames = view::decode_all(device, &spoken.splats, &spoken.field, &trained.cameras)?;
     let answer = |query| ask::answers(&frames, &spoken.field, query, &QueryOptions::default());
     let answers = queries.iter().map(answer).collect::<Result<Vec<_>>>()?;
     progress.end();
-    let outcome = Outcome {
+    Ok(Outcome {
         plan: plan.clone(),
         preset,
         device: device.info().clone(),
@@ -236,9 +292,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
         stages: progress.stages(),
         seconds: progress.seconds(),
         warnings: progress.warnings(),
-    };
-    write(workspace, &outcome, progress)?;
-    Ok(outcome)
+    })
 }
 
 /// Geometry and splats on this thread; masks, features and alignment beside them on another. The first error stops both.

@@ -3,6 +3,7 @@ use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder};
 use crate::pass::decode::Codes;
 use crate::pass::raster_forward::BASE_CHANNELS;
+use crate::pass::rasterizer::FrameBuffers;
 use crate::pass::renderer::{Frame, Renderer, read_frame};
 use crate::scene::{Camera, LanguageField, Plane, Splats};
 
@@ -59,36 +60,54 @@ impl Viewer {
         self.seen(camera, true)
     }
 
+    /// Renders one camera. The frame stays on the device, and valid until the next call.
+    pub fn draw(&mut self, camera: &Camera) -> Result<&FrameBuffers> {
+        Ok(self.renderer.draw(camera)?.frame())
+    }
+
+    /// Only the codes of one camera, as [`DecodedFrame::codes`].
+    pub fn codes(&mut self, camera: &Camera) -> Result<Vec<Plane<i32>>> {
+        let rasterizer = self.renderer.draw(camera)?;
+        decode(&self.device, &self.levels, &mut self.output, rasterizer.frame())
+    }
+
     fn seen(&mut self, camera: &Camera, features: bool) -> Result<DecodedFrame> {
         let rasterizer = self.renderer.draw(camera)?;
-        let frame = rasterizer.frame();
-        let (width, height) = (frame.width as usize, frame.height as usize);
-        let pixels = width * height;
-        let (decoded, margin) = match self.output.take().filter(|o| o.0.bytes() == 4 * pixels as u64) {
-            Some(fits) => fits,
-            None => {
-                (self.device.buffer::<i32>("decoded", pixels)?, self.device.buffer::<f32>("margin", pixels)?)
+        let codes = decode(&self.device, &self.levels, &mut self.output, rasterizer.frame())?;
+        Ok(DecodedFrame { frame: read_frame(rasterizer, features)?, codes })
+    }
+}
+
+/// Decodes every level of a rendered frame; `output` keeps the buffers for the next frame of the same size.
+fn decode(
+    device: &Device,
+    levels: &[Option<(usize, Codes)>],
+    output: &mut Option<(Buffer, Buffer)>,
+    frame: &FrameBuffers,
+) -> Result<Vec<Plane<i32>>> {
+    let (width, height) = (frame.width as usize, frame.height as usize);
+    let pixels = width * height;
+    let (decoded, margin) = match output.take().filter(|o| o.0.bytes() == 4 * pixels as u64) {
+        Some(fits) => fits,
+        None => (device.buffer::<i32>("decoded", pixels)?, device.buffer::<f32>("margin", pixels)?),
+    };
+    let mut codes = Vec::with_capacity(levels.len());
+    for level in levels {
+        let data = match level {
+            None => vec![-1; pixels],
+            Some((first, table)) => {
+                let mut rec = Recorder::new(device, "decode");
+                let plane = (BASE_CHANNELS + first) as u32;
+                let (planes, transmittance) = (&frame.planes, &frame.transmittance);
+                table.record(&mut rec, planes, plane, transmittance, pixels as u32, &decoded, &margin);
+                rec.run()?;
+                decoded.read::<i32>()?
             }
         };
-        let mut codes = Vec::with_capacity(self.levels.len());
-        for level in &self.levels {
-            let data = match level {
-                None => vec![-1; pixels],
-                Some((first, table)) => {
-                    let mut rec = Recorder::new(&self.device, "decode");
-                    let plane = (BASE_CHANNELS + first) as u32;
-                    let (planes, transmittance) = (&frame.planes, &frame.transmittance);
-                    table.record(&mut rec, planes, plane, transmittance, pixels as u32, &decoded, &margin);
-                    rec.run()?;
-                    decoded.read::<i32>()?
-                }
-            };
-            codes.push(Plane { width, height, data });
-        }
-        let frame = read_frame(rasterizer, features)?;
-        self.output = Some((decoded, margin));
-        Ok(DecodedFrame { frame, codes })
+        codes.push(Plane { width, height, data });
     }
+    *output = Some((decoded, margin));
+    Ok(codes)
 }
 
 /// The scene from every camera.

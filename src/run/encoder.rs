@@ -1,7 +1,7 @@
 //! The text model that speaks a scene's language.
+use super::{FeatureSource, sources};
 use crate::format::scene_dir::{Scene, TEXT_EMBEDDINGS};
 use crate::infer::{RegionEncoder, Registry};
-use crate::run::{FeatureSource, sources};
 use crate::{Error, Result};
 
 /// The table of text embeddings that the scene carries, or the built-in model when the scene was made with it.

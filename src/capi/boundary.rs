@@ -1,0 +1,302 @@
+//! Between C and Rust: panics, errors, pointers, texts and structures of other versions.
+use super::types::*;
+use crate::{Error, Result};
+use std::any::Any;
+use std::cell::RefCell;
+use std::ffi::{CStr, c_char};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
+use std::sync::{Mutex, PoisonError};
+
+/// What goes wrong in a call.
+pub enum Fault {
+    /// The library's own error.
+    Error(Error),
+    /// The calling program's mistake.
+    Argument(String),
+}
+
+impl From<Error> for Fault {
+    fn from(e: Error) -> Self {
+        Fault::Error(e)
+    }
+}
+
+/// A mistake of the calling program.
+pub fn argument<T>(what: impl Into<String>) -> Result<T, Fault> {
+    Err(Fault::Argument(what.into()))
+}
+
+/// Text of the last failure.
+#[derive(Default)]
+pub struct LastError(Mutex<String>);
+
+impl LastError {
+    fn set(&self, text: String) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = text;
+    }
+    /// Copies the text out as C wants it: see [`copy_text`].
+    pub unsafe fn copy(&self, out: *mut c_char, bytes: usize) -> usize {
+        // SAFETY: passed on.
+        unsafe { copy_text(&self.0.lock().unwrap_or_else(PoisonError::into_inner), out, bytes) }
+    }
+}
+
+thread_local! {
+    /// Failures of calls that have no handle to keep them.
+    static CREATION: RefCell<String> = const { RefCell::new(String::new()) };
+}
+
+/// Runs the body of a function with a handle: nothing unwinds into C, and a failure leaves its text with the handle.
+pub fn guard(store: &LastError, body: impl FnOnce() -> Result<(), Fault>) -> SvkStatus {
+    caught(|text| store.set(text), body)
+}
+
+/// [`guard`] for functions without a handle; the thread keeps the text.
+pub fn guard_creation(body: impl FnOnce() -> Result<(), Fault>) -> SvkStatus {
+    caught(|text| CREATION.with(|c| *c.borrow_mut() = text), body)
+}
+
+/// Copies the text of [`guard_creation`].
+pub unsafe fn copy_creation_error(out: *mut c_char, bytes: usize) -> usize {
+    // SAFETY: passed on.
+    CREATION.with(|c| unsafe { copy_text(&c.borrow(), out, bytes) })
+}
+
+/// [`guard`] for functions that return a number; 0 after a panic.
+pub fn guard_number<T: Default>(body: impl FnOnce() -> T) -> T {
+    catch_unwind(AssertUnwindSafe(body)).unwrap_or_default()
+}
+
+fn caught(store: impl FnOnce(String), body: impl FnOnce() -> Result<(), Fault>) -> SvkStatus {
+    let (status, text) = match catch_unwind(AssertUnwindSafe(body)) {
+        Ok(Ok(())) => return SvkStatus::Ok,
+        Ok(Err(Fault::Error(e))) => (status(&e), e.to_string()),
+        Ok(Err(Fault::Argument(text))) => (SvkStatus::Argument, text),
+        Err(panic) => (SvkStatus::Internal, format!("internal error: {}", panic_text(panic.as_ref()))),
+    };
+    store(text);
+    status
+}
+
+fn panic_text(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")
+}
+
+fn status(e: &Error) -> SvkStatus {
+    match e {
+        Error::Input(_) => SvkStatus::Input,
+        Error::Io { .. } => SvkStatus::Io,
+        Error::Missing(_) => SvkStatus::Missing,
+        Error::Gpu(_) => SvkStatus::Gpu,
+        Error::Work(_) => SvkStatus::Work,
+        Error::Cancelled => SvkStatus::Cancelled,
+    }
+}
+
+/// Structures whose first field is their size, and for which all zero is a valid value.
+///
+/// # Safety
+/// `repr(C)`, the first field is `size: usize`, and zero bytes are a value.
+pub unsafe trait Versioned: Copy {
+    /// For messages.
+    const NAME: &'static str;
+    /// Size of the first version: what every caller has at least. Once a structure grows, this becomes the number of bytes
+    /// that it had in version 1 of the interface.
+    const FIRST: usize;
+}
+
+macro_rules! versioned {
+    ($($name:ident),*) => {$(
+        // SAFETY: integers, floats, raw pointers and optional functions behind a leading size, all `repr(C)`.
+        unsafe impl Versioned for $name {
+            const NAME: &'static str = stringify!($name);
+            const FIRST: usize = size_of::<$name>();
+        }
+    )*};
+}
+
+versioned!(
+    SvkContextOptions,
+    SvkVulkanDevice,
+    SvkCamera,
+    SvkPhoto,
+    SvkTrainOptions,
+    SvkSceneInfo,
+    SvkOutput,
+    SvkSync,
+    SvkAnswer
+);
+
+fn stated_size<T: Versioned>(pointer: *const T) -> Result<usize, Fault> {
+    // SAFETY: every versioned structure starts with its size.
+    let size = unsafe { pointer.cast::<usize>().read() };
+    // Far beyond anything a later version may add: an uninitialised field.
+    if size < T::FIRST || size > T::FIRST + 4096 {
+        return argument(format!("{}.size is {size}; set it to sizeof({})", T::NAME, T::NAME));
+    }
+    Ok(size)
+}
+
+/// Reads a structure that may be of an older or newer version. Fields that only we know are zero; fields that only the
+/// caller knows must be zero.
+pub unsafe fn read<T: Versioned>(pointer: *const T) -> Result<T, Fault> {
+    if pointer.is_null() {
+        return argument(format!("the pointer to {} is null", T::NAME));
+    }
+    let size = stated_size(pointer)?;
+    let mut value = std::mem::MaybeUninit::<T>::zeroed();
+    let known = size.min(size_of::<T>());
+    // SAFETY: the caller's structure has `size` bytes; zero bytes are a value of T.
+    unsafe {
+        std::ptr::copy_nonoverlapping(pointer.cast::<u8>(), value.as_mut_ptr().cast::<u8>(), known);
+        let rest = std::slice::from_raw_parts(pointer.cast::<u8>().add(known), size - known);
+        if rest.iter().any(|b| *b != 0) {
+            return argument(format!("{} uses fields that this version of splatvk does not know", T::NAME));
+        }
+        Ok(value.assume_init())
+    }
+}
+
+/// [`read`] that takes null for all zero.
+pub unsafe fn read_or_default<T: Versioned>(pointer: *const T) -> Result<T, Fault> {
+    if pointer.is_null() {
+        // SAFETY: zero bytes are a value of T.
+        return Ok(unsafe { std::mem::zeroed() });
+    }
+    // SAFETY: passed on.
+    unsafe { read(pointer) }
+}
+
+/// [`read`] of an array; the elements are as far apart as the first one says it is large.
+pub unsafe fn read_array<T: Versioned>(pointer: *const T, count: usize) -> Result<Vec<T>, Fault> {
+    if count == 0 {
+        return Ok(Vec::new());
+    }
+    if pointer.is_null() {
+        return argument(format!("the pointer to {} is null", T::NAME));
+    }
+    let stride = stated_size(pointer)?;
+    // SAFETY: the caller gives `count` structures of this size.
+    (0..count).map(|i| unsafe { read(pointer.cast::<u8>().add(i * stride).cast::<T>()) }).collect()
+}
+
+/// Fills a structure of the caller, as far as its version goes; its size stays.
+pub unsafe fn write<T: Versioned>(pointer: *mut T, value: &T) -> Result<(), Fault> {
+    if pointer.is_null() {
+        return argument(format!("the pointer to {} is null", T::NAME));
+    }
+    let known = stated_size(pointer)?.min(size_of::<T>());
+    let head = size_of::<usize>();
+    // SAFETY: the caller's structure has at least `known` bytes, the first of which hold its size.
+    unsafe {
+        let from = std::ptr::from_ref(value).cast::<u8>().add(head);
+        std::ptr::copy_nonoverlapping(from, pointer.cast::<u8>().add(head), known - head);
+    }
+    Ok(())
+}
+
+/// A text of the caller; `None` for null.
+pub unsafe fn text(pointer: *const c_char, what: &str) -> Result<Option<String>, Fault> {
+    if pointer.is_null() {
+        return Ok(None);
+    }
+    // SAFETY: a null-terminated text, per the header.
+    match unsafe { CStr::from_ptr(pointer) }.to_str() {
+        Ok(text) => Ok(Some(text.to_owned())),
+        Err(_) => argument(format!("{what} is not UTF-8")),
+    }
+}
+
+/// A path of the caller; `None` for null.
+pub unsafe fn path(pointer: *const c_char, what: &str) -> Result<Option<PathBuf>, Fault> {
+    // SAFETY: passed on.
+    Ok(unsafe { text(pointer, what) }?.map(PathBuf::from))
+}
+
+/// Copies a text with its end mark into `bytes` bytes at `out`, cut where it does not fit; returns the bytes that it needs.
+pub unsafe fn copy_text(text: &str, out: *mut c_char, bytes: usize) -> usize {
+    if !out.is_null() && bytes > 0 {
+        let mut fits = text.len().min(bytes - 1);
+        while !text.is_char_boundary(fits) {
+            fits -= 1;
+        }
+        // SAFETY: the caller's memory has `bytes` bytes.
+        unsafe {
+            std::ptr::copy_nonoverlapping(text.as_ptr(), out.cast::<u8>(), fits);
+            out.add(fits).write(0);
+        }
+    }
+    text.len() + 1
+}
+
+/// A handle that the caller gives.
+pub unsafe fn handle<'a, T>(pointer: *const T, name: &str) -> Result<&'a T, Fault> {
+    // SAFETY: null or a live handle, per the header.
+    match unsafe { pointer.as_ref() } {
+        Some(handle) => Ok(handle),
+        None => argument(format!("the {name} is null")),
+    }
+}
+
+/// Where a new handle goes; null until there is one.
+pub unsafe fn slot<'a, T>(pointer: *mut *mut T) -> Result<&'a mut *mut T, Fault> {
+    // SAFETY: null or a writable pointer, per the header.
+    match unsafe { pointer.as_mut() } {
+        Some(slot) => {
+            *slot = std::ptr::null_mut();
+            Ok(slot)
+        }
+        None => argument("the pointer to the new handle is null"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn panics_and_errors_become_codes_with_a_text() {
+        let store = LastError::default();
+        let text = || store.0.lock().unwrap().clone();
+        assert_eq!(guard(&store, || Ok(())), SvkStatus::Ok);
+        assert_eq!(guard(&store, || Err(Error::input("bad photo").into())), SvkStatus::Input);
+        assert_eq!(text(), "bad photo");
+        assert_eq!(guard(&store, || panic!("broken {}", 7)), SvkStatus::Internal);
+        assert_eq!(text(), "internal error: broken 7");
+        assert_eq!(guard(&store, || Err(Error::Cancelled.into())), SvkStatus::Cancelled);
+    }
+
+    #[test]
+    fn structures_of_other_versions() {
+        #[repr(C)]
+        struct Newer {
+            known: SvkSync,
+            added: u64,
+        }
+        // SAFETY: zero is a value.
+        let mut newer: Newer = unsafe { std::mem::zeroed() };
+        newer.known.size = size_of::<Newer>();
+        newer.known.wait_value = 7;
+        // SAFETY: the structure is as large as it says.
+        let back = unsafe { read(&raw const newer.known) };
+        assert_eq!(back.ok().unwrap().wait_value, 7);
+        newer.added = 1;
+        // SAFETY: as above.
+        assert!(unsafe { read(&raw const newer.known) }.is_err(), "an unknown field is in use");
+        newer.known.size = 3;
+        // SAFETY: as above.
+        assert!(unsafe { read(&raw const newer.known) }.is_err(), "no version is that small");
+    }
+
+    #[test]
+    fn texts_are_cut_between_characters_and_always_end() {
+        let mut room = [1 as c_char; 6];
+        // SAFETY: six bytes.
+        let needed = unsafe { copy_text("aé€b", room.as_mut_ptr(), 6) };
+        // SAFETY: ended by copy_text.
+        let text = unsafe { CStr::from_ptr(room.as_ptr()) }.to_str().unwrap();
+        assert_eq!((needed, text), (8, "aé"));
+    }
+}

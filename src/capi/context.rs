@@ -1,0 +1,179 @@
+//! Versions and contexts.
+use super::boundary::{self, Fault, LastError, argument, guard_creation, guard_number};
+use super::types::*;
+use crate::gpu::vk::{self, Handle};
+use crate::gpu::{Device, EnabledFeatures, HostDevice, Options, QueueLock};
+use std::ffi::{CStr, c_char, c_void};
+use std::path::PathBuf;
+
+/// Version of this interface: major × 65536 + minor. A program runs with any library of the same major version and the
+/// same or a higher minor one.
+pub const SVK_ABI_VERSION: u32 = 0x1_0000;
+
+/// A Vulkan device and where the models are.
+pub struct SvkContext {
+    pub(super) device: Device,
+    pub(super) models: Option<PathBuf>,
+    pub(super) error: LastError,
+}
+
+/// The SVK_ABI_VERSION of the library. Thread-safe.
+#[unsafe(no_mangle)]
+pub extern "C" fn svk_abi_version() -> u32 {
+    SVK_ABI_VERSION
+}
+
+/// The library's version, such as "0.1.0". Static memory. Thread-safe.
+#[unsafe(no_mangle)]
+pub extern "C" fn svk_version() -> *const c_char {
+    const TEXT: &CStr = match CStr::from_bytes_with_nul(concat!(env!("CARGO_PKG_VERSION"), "\0").as_bytes()) {
+        Ok(text) => text,
+        Err(_) => c"",
+    };
+    TEXT.as_ptr()
+}
+
+/// Makes a context on a Vulkan device of its own. `options` may be NULL. On failure `*context` is NULL and the text is
+/// kept for the calling thread: svk_context_error(NULL, ...). Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_context_create(
+    options: *const SvkContextOptions,
+    context: *mut *mut SvkContext,
+) -> SvkStatus {
+    guard_creation(|| {
+        // SAFETY: per the header.
+        unsafe {
+            let slot = boundary::slot(context)?;
+            let options = boundary::read_or_default(options)?;
+            let device = boundary::text(options.device, "SvkContextOptions.device")?;
+            let mut chosen = Options::from_env(device.as_deref());
+            chosen.validation |= options.validation != 0;
+            chosen.deterministic = options.deterministic != 0;
+            *slot = boxed(Device::with(&chosen)?, &options)?;
+        }
+        Ok(())
+    })
+}
+
+/// Makes a context on the host's own Vulkan device. `options` may be NULL. Otherwise like svk_context_create.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_context_adopt(
+    device: *const SvkVulkanDevice,
+    options: *const SvkContextOptions,
+    context: *mut *mut SvkContext,
+) -> SvkStatus {
+    guard_creation(|| {
+        // SAFETY: per the header.
+        unsafe {
+            let slot = boundary::slot(context)?;
+            let given = boundary::read(device)?;
+            let options = boundary::read_or_default(options)?;
+            let chosen = Options { deterministic: options.deterministic != 0, ..Options::default() };
+            *slot = boxed(Device::adopt(host_device(&given)?, &chosen)?, &options)?;
+        }
+        Ok(())
+    })
+}
+
+unsafe fn boxed(device: Device, options: &SvkContextOptions) -> Result<*mut SvkContext, Fault> {
+    // SAFETY: passed on.
+    let models = unsafe { boundary::path(options.models, "SvkContextOptions.models") }?;
+    Ok(Box::into_raw(Box::new(SvkContext { device, models, error: LastError::default() })))
+}
+
+unsafe fn host_device(given: &SvkVulkanDevice) -> Result<HostDevice, Fault> {
+    let mut extensions = Vec::new();
+    if given.extension_count > 0 {
+        if given.extensions.is_null() {
+            return argument("SvkVulkanDevice.extensions is null but extension_count is not 0");
+        }
+        // SAFETY: as many texts as the structure says.
+        let names = unsafe { std::slice::from_raw_parts(given.extensions, given.extension_count as usize) };
+        // SAFETY: null-terminated texts.
+        extensions.extend(names.iter().map(|n| unsafe { CStr::from_ptr(*n) }.to_owned()));
+    }
+    // SAFETY: a pointer to vkGetInstanceProcAddr behind another type, as the header asks for; "C" and "system" are one
+    // calling convention wherever Vulkan is used on 64 bits.
+    let get = given
+        .get_instance_proc_addr
+        .map(|f| unsafe { std::mem::transmute::<unsafe extern "C" fn(), vk::PFN_vkGetInstanceProcAddr>(f) });
+    Ok(HostDevice {
+        get_instance_proc_addr: get,
+        instance: vk::Instance::from_raw(given.instance as u64),
+        physical_device: vk::PhysicalDevice::from_raw(given.physical_device as u64),
+        device: vk::Device::from_raw(given.device as u64),
+        queue: vk::Queue::from_raw(given.queue as u64),
+        queue_family: given.queue_family,
+        extensions,
+        // SAFETY: null or the chain that the device was made with.
+        features: unsafe { EnabledFeatures::read(given.features) },
+        queue_lock: queue_lock(given)?,
+    })
+}
+
+/// The host's `user` pointer, which its functions accept from any thread.
+struct User(*mut c_void);
+
+// SAFETY: only ever handed back to the host, whose functions are called from any thread by contract.
+unsafe impl Send for User {}
+// SAFETY: as above.
+unsafe impl Sync for User {}
+
+fn queue_lock(given: &SvkVulkanDevice) -> Result<Option<QueueLock>, Fault> {
+    let (lock, unlock) = match (given.lock_queue, given.unlock_queue) {
+        (None, None) => return Ok(None),
+        (Some(lock), Some(unlock)) => (lock, unlock),
+        _ => return argument("SvkVulkanDevice: set both lock_queue and unlock_queue, or none"),
+    };
+    let user = User(given.user);
+    Ok(Some(Box::new(move |work: &mut dyn FnMut()| {
+        let user = &user;
+        // SAFETY: the host's functions with the host's pointer; `work` does not panic (it submits to a queue).
+        unsafe {
+            lock(user.0);
+            work();
+            unlock(user.0);
+        }
+    })))
+}
+
+/// Ends a context; scenes made from it stay usable. NULL is allowed. No other call with this context may be running.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_context_destroy(context: *mut SvkContext) {
+    if !context.is_null() {
+        // SAFETY: made by Box::into_raw, and not used any more.
+        guard_number(|| drop(unsafe { Box::from_raw(context) }));
+    }
+}
+
+/// Copies the name of the Vulkan device into `text` (`bytes` long, always ended) and returns the bytes that it needs.
+/// Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_context_device_name(
+    context: *const SvkContext,
+    text: *mut c_char,
+    bytes: usize,
+) -> usize {
+    // SAFETY: per the header.
+    guard_number(|| match unsafe { context.as_ref() } {
+        Some(context) => unsafe { boundary::copy_text(&context.device.info().name, text, bytes) },
+        None => 0,
+    })
+}
+
+/// Copies the text of the last failed call with this context (in any thread) into `text` (`bytes` long, always ended) and
+/// returns the bytes that it needs. NULL = the last failed creation of a context in this thread. Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_context_error(
+    context: *const SvkContext,
+    text: *mut c_char,
+    bytes: usize,
+) -> usize {
+    // SAFETY: per the header.
+    guard_number(|| unsafe {
+        match context.as_ref() {
+            Some(context) => context.error.copy(text, bytes),
+            None => boundary::copy_creation_error(text, bytes),
+        }
+    })
+}

@@ -1,0 +1,75 @@
+//! The host's progress callback behind [`Progress`].
+use super::types::*;
+use crate::progress::Progress;
+use std::ffi::{CString, c_void};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+pub struct Callback {
+    call: SvkProgressFunction,
+    user: *mut c_void,
+    cancelled: AtomicBool,
+    /// Held during a call, so that there is never a second one.
+    stage: Mutex<Stage>,
+}
+
+#[derive(Default)]
+struct Stage {
+    name: CString,
+    total: u64,
+}
+
+// SAFETY: `user` is only handed back to the host's function, which may be called from any thread, one at a time.
+unsafe impl Send for Callback {}
+// SAFETY: as above; the mutex keeps calls apart.
+unsafe impl Sync for Callback {}
+
+/// Texts of ours have no zero bytes; should one get in, it is left out.
+fn c_text(text: &str) -> CString {
+    CString::new(text.replace('\0', "")).unwrap_or_default()
+}
+
+impl Callback {
+    pub fn new(call: SvkProgressFunction, user: *mut c_void) -> Callback {
+        Callback { call, user, cancelled: AtomicBool::new(false), stage: Mutex::default() }
+    }
+
+    fn tell(&self, kind: SvkProgressKind, done: u64, note: &str, begin: Option<(&str, u64)>) {
+        let Some(call) = self.call else { return };
+        let mut stage = self.stage.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((name, total)) = begin {
+            *stage = Stage { name: c_text(name), total };
+        }
+        let note = c_text(note);
+        let progress = SvkProgress {
+            size: size_of::<SvkProgress>(),
+            kind: kind as u32,
+            stage: stage.name.as_ptr(),
+            done,
+            total: stage.total,
+            note: note.as_ptr(),
+        };
+        // SAFETY: the host's function with the host's pointer; the texts live until it returns.
+        if unsafe { call(self.user, &raw const progress) } != 0 {
+            self.cancelled.store(true, Ordering::SeqCst);
+        }
+    }
+}
+
+impl Progress for Callback {
+    fn begin(&self, stage: &'static str, steps: u64) {
+        self.tell(SvkProgressKind::Begin, 0, "", Some((stage, steps)));
+    }
+    fn step(&self, done: u64, note: &str) {
+        self.tell(SvkProgressKind::Step, done, note, None);
+    }
+    fn end(&self) {
+        self.tell(SvkProgressKind::End, 0, "", None);
+    }
+    fn warn(&self, message: &str) {
+        self.tell(SvkProgressKind::Warning, 0, message, None);
+    }
+    fn cancelled(&self) -> bool {
+        self.cancelled.load(Ordering::SeqCst)
+    }
+}

@@ -1,0 +1,209 @@
+//! Rendering into memory, buffers and images of the host.
+use super::boundary::{self, Fault, argument, guard};
+use super::scene::{SvkScene, camera_in, lock};
+use super::types::*;
+use crate::gpu::Buffer;
+use crate::gpu::external::{Sync, Target};
+use crate::gpu::vk::{self, Handle};
+use crate::pass::pack::{self, Encoding, Source};
+use crate::run::live::LiveScene;
+use crate::scene::Camera;
+
+/// Renders the scene from a camera into all `outputs` at once. `sync` may be NULL: then targets are written at once, and
+/// the call returns when they are. With a signal semaphore the call returns earlier; memory of the host is always written
+/// before it returns. Calls with one scene follow each other, and so do their writes. Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_render(
+    scene: *mut SvkScene,
+    camera: *const SvkCamera,
+    outputs: *const SvkOutput,
+    output_count: usize,
+    sync: *const SvkSync,
+) -> SvkStatus {
+    // SAFETY: per the header.
+    let Ok(scene) = (unsafe { boundary::handle(scene, "scene") }) else { return SvkStatus::Argument };
+    guard(&scene.error, || {
+        // SAFETY: per the header.
+        unsafe {
+            let camera = camera_in(camera)?;
+            let outputs = boundary::read_array(outputs, output_count)?;
+            let sync = boundary::read_or_default(sync)?;
+            render(scene, &camera, &outputs, &sync)
+        }
+    })
+}
+
+/// Waits until everything that svk_scene_render was asked to write is written. Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_wait(scene: *mut SvkScene) -> SvkStatus {
+    // SAFETY: per the header.
+    let Ok(scene) = (unsafe { boundary::handle(scene, "scene") }) else { return SvkStatus::Argument };
+    guard(&scene.error, || {
+        let under_way = std::mem::take(&mut *lock(&scene.deliveries));
+        under_way.iter().try_for_each(|d| d.wait()).map_err(Fault::from)
+    })
+}
+
+/// An output that was checked.
+struct Wanted {
+    what: What,
+    encoding: Encoding,
+    place: Place,
+}
+
+enum What {
+    Frame(Source),
+    Relevancy(String),
+}
+
+enum Place {
+    Host(*mut u8),
+    Device(Target),
+}
+
+unsafe fn render(
+    scene: &SvkScene,
+    camera: &Camera,
+    outputs: &[SvkOutput],
+    sync: &SvkSync,
+) -> Result<(), Fault> {
+    let mut live = lock(&scene.live);
+    // SAFETY: per the header.
+    let check = |(i, o): (usize, &SvkOutput)| unsafe { wanted(&live, camera, o, i) };
+    let wanted = outputs.iter().enumerate().map(check).collect::<Result<Vec<_>, _>>()?;
+    let packed = pack_all(&mut live, camera, &wanted)?;
+    let mut copies = Vec::new();
+    for (buffer, wanted) in packed.into_iter().zip(&wanted) {
+        match wanted.place {
+            Place::Host(memory) => {
+                let bytes = buffer.read::<u8>()?;
+                // SAFETY: `wanted` has checked that the host's memory is that long.
+                unsafe { std::ptr::copy_nonoverlapping(bytes.as_ptr(), memory, bytes.len()) };
+            }
+            Place::Device(target) => copies.push((buffer, target)),
+        }
+    }
+    let point =
+        |semaphore: u64, value: u64| (semaphore != 0).then(|| (vk::Semaphore::from_raw(semaphore), value));
+    let sync = Sync {
+        wait: point(sync.wait_semaphore, sync.wait_value),
+        signal: point(sync.signal_semaphore, sync.signal_value),
+    };
+    if copies.is_empty() && sync.wait.is_none() && sync.signal.is_none() {
+        return Ok(());
+    }
+    // SAFETY: the host vouches for its targets and semaphores.
+    let delivery = unsafe { live.device().deliver(copies, sync) }?;
+    let mut under_way = lock(&scene.deliveries);
+    under_way.retain(|d| !d.finished());
+    under_way.push(delivery);
+    Ok(())
+}
+
+/// One buffer per output, of exactly its bytes.
+fn pack_all(live: &mut LiveScene, camera: &Camera, wanted: &[Wanted]) -> Result<Vec<Buffer>, Fault> {
+    let device = live.device().clone();
+    // Answers first: they render on their own where the camera is new, and the frame below must be the last one.
+    let mut packed: Vec<Option<Buffer>> = Vec::with_capacity(wanted.len());
+    for w in wanted {
+        packed.push(match &w.what {
+            What::Frame(_) => None,
+            What::Relevancy(text) => {
+                let map = live.ask(text, camera)?.relevancy.data;
+                Some(match w.encoding {
+                    Encoding::F32x4 => {
+                        let texels: Vec<[f32; 4]> = map.iter().map(|v| [*v, 0.0, 0.0, 0.0]).collect();
+                        device.buffer_from("relevancy", &texels)?
+                    }
+                    _ => device.buffer_from("relevancy", &map)?,
+                })
+            }
+        });
+    }
+    if packed.iter().any(Option::is_none) {
+        let frame = live.draw(camera)?;
+        for (slot, w) in packed.iter_mut().zip(wanted) {
+            if let What::Frame(source) = w.what {
+                *slot = Some(pack::pack(&device, frame, source, w.encoding)?);
+            }
+        }
+    }
+    Ok(packed.into_iter().flatten().collect())
+}
+
+unsafe fn wanted(live: &LiveScene, camera: &Camera, o: &SvkOutput, i: usize) -> Result<Wanted, Fault> {
+    let encoding = match o.encoding {
+        0 => Encoding::F32,
+        1 => Encoding::F32x4,
+        2 => Encoding::F16x4,
+        3 => Encoding::Unorm8x4,
+        other => return argument(format!("output {i}: there is no encoding {other}")),
+    };
+    let what = match o.channel {
+        0 => What::Frame(Source::Colour),
+        1 => What::Frame(Source::Alpha),
+        2 => What::Frame(Source::Depth),
+        3 => match live.features(o.level as usize) {
+            (_, 0) => return argument(format!("output {i}: the scene has no features at level {}", o.level)),
+            (first, count) => What::Frame(Source::Features(first, count)),
+        },
+        // SAFETY: per the header.
+        4 => match unsafe { boundary::text(o.text, "SvkOutput.text") }? {
+            Some(text) if matches!(encoding, Encoding::F32 | Encoding::F32x4) => What::Relevancy(text),
+            Some(_) => return argument(format!("output {i}: relevancy is written in 32-bit floats only")),
+            None => return argument(format!("output {i}: relevancy needs a text")),
+        },
+        other => return argument(format!("output {i}: there is no channel {other}")),
+    };
+    let channels = match &what {
+        What::Frame(source) => source.channels(),
+        What::Relevancy(_) => 1,
+    };
+    let bytes = encoding.bytes(channels, camera.width as usize * camera.height as usize);
+    let place = match (o.host.is_null(), o.buffer, o.image) {
+        (false, 0, 0) => Place::Host(o.host.cast::<u8>()),
+        (true, buffer, 0) if buffer != 0 => {
+            if !o.offset.is_multiple_of(4) {
+                return argument(format!("output {i}: the offset {} is no multiple of 4", o.offset));
+            }
+            Place::Device(Target::Buffer { raw: vk::Buffer::from_raw(buffer), offset: o.offset })
+        }
+        (true, 0, image) if image != 0 => Place::Device(image_target(o, i, camera, encoding, channels)?),
+        _ => return argument(format!("output {i}: set exactly one of host, buffer and image")),
+    };
+    if o.image == 0 && o.bytes < bytes {
+        return argument(format!("output {i}: {bytes} bytes are needed, {} are there", o.bytes));
+    }
+    Ok(Wanted { what, encoding, place })
+}
+
+fn image_target(
+    o: &SvkOutput,
+    i: usize,
+    camera: &Camera,
+    encoding: Encoding,
+    channels: usize,
+) -> Result<Target, Fault> {
+    if encoding == Encoding::F32 && channels != 1 && channels != 4 {
+        return argument(format!(
+            "output {i}: no image format has {channels} values; take SVK_ENCODING_F32_X4"
+        ));
+    }
+    let layers = encoding.layers(channels) as u32;
+    if o.layers != layers {
+        return argument(format!(
+            "output {i}: {layers} array layers are written, the image has {}",
+            o.layers
+        ));
+    }
+    if o.new_layout == vk::ImageLayout::UNDEFINED.as_raw() as u32 {
+        return argument(format!("output {i}: new_layout must not be VK_IMAGE_LAYOUT_UNDEFINED"));
+    }
+    Ok(Target::Image {
+        raw: vk::Image::from_raw(o.image),
+        size: [camera.width, camera.height],
+        layers,
+        before: vk::ImageLayout::from_raw(o.old_layout as i32),
+        after: vk::ImageLayout::from_raw(o.new_layout as i32),
+    })
+}

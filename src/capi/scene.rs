@@ -1,0 +1,249 @@
+//! Scenes: loading, reading, asking, saving.
+use super::boundary::{self, Fault, LastError, argument, guard, guard_number};
+use super::context::SvkContext;
+use super::types::*;
+use crate::Error;
+use crate::gpu::external::Delivery;
+use crate::run::live::LiveScene;
+use crate::scene::{Camera, Pose};
+use glam::{DMat3, DVec3};
+use std::ffi::c_char;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// A trained or loaded scene.
+pub struct SvkScene {
+    pub(super) live: Mutex<LiveScene>,
+    /// Copies to targets of the host that may still be under way.
+    pub(super) deliveries: Mutex<Vec<Delivery>>,
+    pub(super) error: LastError,
+}
+
+/// Locks, ignoring poison: a panic was reported by its own call, and every call sets up what it needs.
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl SvkScene {
+    pub(super) fn boxed(live: LiveScene) -> *mut SvkScene {
+        let scene =
+            SvkScene { live: Mutex::new(live), deliveries: Mutex::default(), error: LastError::default() };
+        Box::into_raw(Box::new(scene))
+    }
+}
+
+/// Runs a function of a scene.
+unsafe fn with(scene: *const SvkScene, body: impl FnOnce(&SvkScene) -> Result<(), Fault>) -> SvkStatus {
+    // SAFETY: per the header.
+    match unsafe { scene.as_ref() } {
+        Some(scene) => guard(&scene.error, || body(scene)),
+        None => SvkStatus::Argument,
+    }
+}
+
+pub(super) unsafe fn camera_in(pointer: *const SvkCamera) -> Result<Camera, Fault> {
+    // SAFETY: per the header.
+    let c = unsafe { boundary::read(pointer) }?;
+    let [x, y, z] = c.world_to_camera;
+    let rows = DMat3::from_cols(
+        DVec3::new(x[0], x[1], x[2]),
+        DVec3::new(y[0], y[1], y[2]),
+        DVec3::new(z[0], z[1], z[2]),
+    );
+    let pose = Pose { rotation: rows.transpose(), translation: DVec3::new(x[3], y[3], z[3]) };
+    let camera = Camera {
+        name: "camera".into(),
+        width: c.width,
+        height: c.height,
+        fx: c.fx,
+        fy: c.fy,
+        cx: c.cx,
+        cy: c.cy,
+        pose,
+    };
+    crate::format::cameras::checked(camera).map_err(|e| Fault::Error(Error::input(e)))
+}
+
+/// Loads a scene directory, or a file of Gaussians (which has no language). On failure `*scene` is NULL and the text is the
+/// context's. Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_load(
+    context: *mut SvkContext,
+    path: *const c_char,
+    scene: *mut *mut SvkScene,
+) -> SvkStatus {
+    // SAFETY: per the header.
+    let Ok(context) = (unsafe { boundary::handle(context, "context") }) else { return SvkStatus::Argument };
+    guard(&context.error, || {
+        // SAFETY: per the header.
+        let (slot, path) = unsafe { (boundary::slot(scene)?, boundary::path(path, "path")?) };
+        let Some(path) = path else { return argument("the path is null") };
+        *slot = SvkScene::boxed(LiveScene::load(&context.device, &path, context.models.as_deref())?);
+        Ok(())
+    })
+}
+
+/// Ends a scene, after waiting for what it still writes to buffers and images of the host. NULL is allowed. No other call
+/// with this scene may be running.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_destroy(scene: *mut SvkScene) {
+    if !scene.is_null() {
+        // SAFETY: made by Box::into_raw, and not used any more.
+        guard_number(|| drop(unsafe { Box::from_raw(scene) }));
+    }
+}
+
+/// Copies the text of the last failed call with this scene (in any thread) into `text` (`bytes` long, always ended) and
+/// returns the bytes that it needs. Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_error(scene: *const SvkScene, text: *mut c_char, bytes: usize) -> usize {
+    // SAFETY: per the header.
+    guard_number(|| unsafe { scene.as_ref().map_or(0, |s| s.error.copy(text, bytes)) })
+}
+
+/// What the scene holds. Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_info(scene: *const SvkScene, info: *mut SvkSceneInfo) -> SvkStatus {
+    // SAFETY: per the header.
+    unsafe {
+        with(scene, |scene| {
+            let live = lock(&scene.live);
+            let levels = live.language().map_or(&[][..], |l| &l.levels);
+            let level = |k: usize| levels.get(k).map_or(0, |l| l.codebook.len() as u32);
+            let value = SvkSceneInfo {
+                size: 0,
+                splats: live.splats().len() as u64,
+                sh_degree: live.splats().sh_degree,
+                cameras: live.cameras().len() as u32,
+                codes: [0, 1, 2].map(level),
+                feature_dim: [0, 1, 2].map(|k| live.features(k).1 as u32),
+            };
+            boundary::write(info, &value)
+        })
+    }
+}
+
+/// Camera `index` of the scene, and the name of its photo in `name` (`name_bytes` long; may be NULL). Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_camera(
+    scene: *const SvkScene,
+    index: u32,
+    camera: *mut SvkCamera,
+    name: *mut c_char,
+    name_bytes: usize,
+) -> SvkStatus {
+    // SAFETY: per the header.
+    unsafe {
+        with(scene, |scene| {
+            let live = lock(&scene.live);
+            let Some(c) = live.cameras().get(index as usize) else {
+                return argument(format!("there is no camera {index}, only {}", live.cameras().len()));
+            };
+            let (r, t) = (c.pose.rotation, c.pose.translation);
+            let row = |k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], t[k]];
+            let value = SvkCamera {
+                size: 0,
+                width: c.width,
+                height: c.height,
+                fx: c.fx,
+                fy: c.fy,
+                cx: c.cx,
+                cy: c.cy,
+                world_to_camera: [row(0), row(1), row(2)],
+            };
+            boundary::copy_text(&c.name, name, name_bytes);
+            boundary::write(camera, &value)
+        })
+    }
+}
+
+/// Copies an array of the scene (SvkArray) into `values`, which must hold exactly `count` floats. Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_read(
+    scene: *const SvkScene,
+    array: u32,
+    values: *mut f32,
+    count: usize,
+) -> SvkStatus {
+    // SAFETY: per the header.
+    unsafe {
+        with(scene, |scene| {
+            let live = lock(&scene.live);
+            let s = live.splats();
+            let all: &[f32] = match array {
+                0 => s.means.as_flattened(),
+                1 => s.log_scales.as_flattened(),
+                2 => s.quats.as_flattened(),
+                3 => &s.opacity_logits,
+                4 => &s.sh,
+                other => return argument(format!("there is no array {other}")),
+            };
+            if values.is_null() || all.len() != count {
+                return argument(format!(
+                    "array {array} has {} floats; give room for exactly these",
+                    all.len()
+                ));
+            }
+            std::ptr::copy_nonoverlapping(all.as_ptr(), values, count);
+            Ok(())
+        })
+    }
+}
+
+/// Looks for a text in the view of a camera. `answer` is filled; `mask`, unless NULL, gets width × height bytes, 255 where
+/// the view shows what was asked for and 0 elsewhere, and `mask_bytes` is exactly that many. "Not found" is an answer, not
+/// a failure. Thread-safe; calls with one scene follow each other.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_query(
+    scene: *mut SvkScene,
+    text: *const c_char,
+    camera: *const SvkCamera,
+    answer: *mut SvkAnswer,
+    mask: *mut u8,
+    mask_bytes: usize,
+) -> SvkStatus {
+    // SAFETY: per the header.
+    unsafe {
+        with(scene, |scene| {
+            let Some(text) = boundary::text(text, "text")? else { return argument("the text is null") };
+            let camera = camera_in(camera)?;
+            let pixels = camera.width as usize * camera.height as usize;
+            if !mask.is_null() && mask_bytes != pixels {
+                return argument(format!("the mask has {mask_bytes} bytes, the view {pixels} pixels"));
+            }
+            let found = lock(&scene.live).ask(&text, &camera)?;
+            let value = SvkAnswer {
+                size: 0,
+                found: u32::from(found.found),
+                level: found.level as u32,
+                score: f64::from(found.score),
+                x: found.location.0 as f64 + 0.5,
+                y: found.location.1 as f64 + 0.5,
+                mask_pixels: found.mask.data.iter().filter(|m| **m).count() as u64,
+            };
+            boundary::write(answer, &value)?;
+            if !mask.is_null() {
+                let out = std::slice::from_raw_parts_mut(mask, pixels);
+                out.iter_mut().zip(&found.mask.data).for_each(|(o, m)| *o = if *m { 255 } else { 0 });
+            }
+            Ok(())
+        })
+    }
+}
+
+/// Writes the scene: a file of Gaussians where the name ends like one (.ply, .compressed.ply, .splat, .spz; language goes
+/// beside it, into NAME.language.npz), a scene directory otherwise. It
+/// appears whole or not at all; `replace` = 1 allows to replace a scene or file that is there. Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_save(
+    scene: *mut SvkScene,
+    path: *const c_char,
+    replace: u32,
+) -> SvkStatus {
+    // SAFETY: per the header.
+    unsafe {
+        with(scene, |scene| {
+            let Some(path) = boundary::path(path, "path")? else { return argument("the path is null") };
+            Ok(lock(&scene.live).save(&path, replace != 0)?)
+        })
+    }
+}

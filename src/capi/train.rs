@@ -1,0 +1,154 @@
+//! Photos to a scene.
+use super::boundary::{self, Fault, argument, guard};
+use super::context::SvkContext;
+use super::progress::Callback;
+use super::scene::{SvkScene, camera_in};
+use super::types::*;
+use crate::fit::Preset;
+use crate::photo::{self, Photo};
+use crate::progress::Progress;
+use crate::run::live::LiveScene;
+use crate::run::{self, FEATURE_DIM, FeatureSource, InitSource, MaskSource, RunPlan};
+use crate::scene::{Camera, RgbImage};
+use std::path::{Path, PathBuf};
+
+/// Trains a scene from 2 to 16 photos. `options` may be NULL. On failure, and when the callback stops it, `*scene` is NULL
+/// and the text is the context's. Thread-safe; several trainings may run on one context, sharing its device.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_train(
+    context: *mut SvkContext,
+    photos: *const SvkPhoto,
+    photo_count: usize,
+    options: *const SvkTrainOptions,
+    scene: *mut *mut SvkScene,
+) -> SvkStatus {
+    // SAFETY: per the header.
+    let Ok(context) = (unsafe { boundary::handle(context, "context") }) else { return SvkStatus::Argument };
+    guard(&context.error, || {
+        // SAFETY: per the header.
+        unsafe {
+            let slot = boundary::slot(scene)?;
+            let options = boundary::read_or_default(options)?;
+            let given = boundary::read_array(photos, photo_count)?;
+            // What is wrong with the options is said before the photos are read.
+            let mut plan = RunPlan { models: context.models.clone(), ..plan(&options)? };
+            let progress = Callback::new(options.progress, options.user);
+            let (photos, cameras) = gather(&given, options.views as usize, &progress)?;
+            plan.inputs = photos.iter().map(|p| p.path.clone()).collect();
+            if !cameras.is_empty() {
+                if plan.init != InitSource::Sfm {
+                    return argument("cameras are given with the photos and as a file; give one of them");
+                }
+                plan.init = InitSource::Given(cameras);
+            }
+            let outcome = run::reconstruct(&plan, &context.device, photos, &progress)?;
+            let live = LiveScene::trained(&context.device, outcome, context.models.as_deref())?;
+            *slot = SvkScene::boxed(live);
+        }
+        Ok(())
+    })
+}
+
+/// The photos, and their cameras where they were given.
+unsafe fn gather(
+    given: &[SvkPhoto],
+    views: usize,
+    progress: &dyn Progress,
+) -> Result<(Vec<Photo>, Vec<Camera>), Fault> {
+    // SAFETY: per the header.
+    let paths = given.iter().map(|p| unsafe { boundary::path(p.path, "SvkPhoto.path") });
+    let paths = paths.collect::<Result<Vec<Option<PathBuf>>, _>>()?;
+    let in_memory = given.iter().any(|p| !p.encoded.is_null() || !p.pixels.is_null());
+    let photos = if !in_memory && paths.iter().all(Option::is_some) {
+        let paths: Vec<PathBuf> = paths.into_iter().flatten().collect();
+        let all = if views > 0 || paths.iter().any(|p| p.is_dir()) { None } else { Some(paths.len()) };
+        photo::load_all(&paths, if views > 0 { Some(views) } else { all }, progress)?
+    } else {
+        let one =
+            |(i, (photo, path)): (usize, (&SvkPhoto, Option<PathBuf>))| unsafe { single(photo, path, i) };
+        given.iter().zip(paths).enumerate().map(one).collect::<Result<Vec<_>, Fault>>()?
+    };
+    let mut cameras = Vec::new();
+    for (photo, given) in photos.iter().zip(given).filter(|(_, g)| !g.camera.is_null()) {
+        // SAFETY: per the header.
+        cameras.push(Camera { name: photo.stem.clone(), ..unsafe { camera_in(given.camera) }? });
+    }
+    if !cameras.is_empty() && (cameras.len() != photos.len() || photos.len() != given.len()) {
+        return argument("SvkPhoto.camera: give a camera with every photo, or with none");
+    }
+    Ok((photos, cameras))
+}
+
+unsafe fn single(given: &SvkPhoto, path: Option<PathBuf>, index: usize) -> Result<Photo, Fault> {
+    let sources =
+        [path.is_some(), !given.encoded.is_null(), !given.pixels.is_null()].iter().filter(|s| **s).count();
+    if sources != 1 {
+        return argument(format!("photo {index}: set exactly one of path, encoded and pixels"));
+    }
+    // SAFETY: per the header.
+    let name = unsafe { boundary::text(given.name, "SvkPhoto.name") }?;
+    let name = PathBuf::from(name.unwrap_or_else(|| format!("photo_{index:02}")));
+    if let Some(path) = path {
+        return Ok(photo::load(&path)?);
+    }
+    if !given.encoded.is_null() {
+        // SAFETY: the caller's file of that length.
+        let bytes = unsafe { std::slice::from_raw_parts(given.encoded, given.encoded_bytes) };
+        return Ok(photo::from_bytes(&name, bytes.to_vec())?);
+    }
+    // SAFETY: per the header.
+    let image = unsafe { pixels(given, &name) }?;
+    let focal = (given.focal > 0.0).then_some(given.focal);
+    Ok(photo::from_pixels(&name, &image, focal)?)
+}
+
+unsafe fn pixels(given: &SvkPhoto, name: &Path) -> Result<RgbImage, Fault> {
+    let (width, height, bytes) = (given.width as usize, given.height as usize, given.pixel_bytes as usize);
+    let row = if given.row_bytes == 0 { width * bytes } else { given.row_bytes };
+    if !(3..=4).contains(&bytes) || width == 0 || height == 0 || row < width * bytes {
+        return argument(format!(
+            "{}: {width} × {height} pixels of {bytes} bytes in rows of {row} bytes make no image",
+            name.display()
+        ));
+    }
+    // SAFETY: the last row need not reach to the next one.
+    let all = unsafe { std::slice::from_raw_parts(given.pixels, row * (height - 1) + width * bytes) };
+    let level = |v: u8| f32::from(v) / 255.0;
+    let pixel = |p: &[u8]| [level(p[0]), level(p[1]), level(p[2])];
+    let data = all.chunks(row).flat_map(|r| r[..width * bytes].chunks_exact(bytes).map(pixel)).collect();
+    Ok(RgbImage { width, height, data })
+}
+
+unsafe fn plan(o: &SvkTrainOptions) -> Result<RunPlan, Fault> {
+    let preset = match o.preset {
+        0 => None,
+        1 => Some(Preset::Draft),
+        2 => Some(Preset::Default),
+        3 => Some(Preset::Paper),
+        other => return argument(format!("SvkTrainOptions.preset is {other}")),
+    };
+    if ![0, 3, 8, 16].contains(&o.feature_dim) {
+        return argument(format!("SvkTrainOptions.feature_dim is {}; 3, 8 or 16", o.feature_dim));
+    }
+    // SAFETY: per the header.
+    let (file, masks, features) = unsafe {
+        (
+            boundary::path(o.cameras, "SvkTrainOptions.cameras")?,
+            boundary::path(o.masks, "SvkTrainOptions.masks")?,
+            boundary::path(o.features, "SvkTrainOptions.features")?,
+        )
+    };
+    let count = |n: u64| usize::try_from(n).ok().filter(|n| *n > 0);
+    Ok(RunPlan {
+        preset,
+        init: file.map_or(InitSource::Sfm, InitSource::Cameras),
+        masks: masks.map_or(MaskSource::Graph, MaskSource::Dir),
+        features: features.map_or(FeatureSource::Words, FeatureSource::Dir),
+        seed: o.seed,
+        iterations: count(o.iterations),
+        language_iterations: count(o.language_iterations),
+        feature_dim: if o.feature_dim == 0 { FEATURE_DIM } else { o.feature_dim as usize },
+        per_level: o.per_level != 0,
+        ..RunPlan::default()
+    })
+}

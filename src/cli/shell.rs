@@ -1,0 +1,19 @@
+//! `splatvk completions`, `splatvk manuals`: what tools/install puts beside the program.
+use super::args::{Cli, CompletionsArgs, ManualsArgs};
+use super::outputs::Outputs;
+use super::print;
+use crate::{Error, Result};
+use clap::CommandFactory;
+
+pub fn completions(args: &CompletionsArgs) -> Result<()> {
+    let mut script = Vec::new();
+    clap_complete::generate(args.shell, &mut Cli::command(), "splatvk", &mut script);
+    print(&String::from_utf8_lossy(&script))
+}
+
+pub fn manuals(args: &ManualsArgs) -> Result<()> {
+    let outputs = Outputs::open(&args.out)?;
+    clap_mangen::generate_to(Cli::command(), &args.out).map_err(Error::io(&args.out))?;
+    outputs.keep();
+    Ok(())
+}

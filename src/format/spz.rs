@@ -1,0 +1,272 @@
+//! `.spz`, Niantic's compressed splats: versions 2 and 3 (one gzip stream, or bare) and 4 (one Zstandard stream per
+//! attribute) are read, 4 is written. About a tenth of the size of a PLY.
+//!
+//! The format's axes are right, up, back; files are turned by 180° about x on the way in and out. Positions are 24-bit
+//! fixed point with as many fractional bits as their extent leaves room for (the format's own tools take 12).
+use crate::scene::{Splats, sh_coefficients};
+use crate::{Error, Result};
+use std::io::Read;
+use std::path::Path;
+
+const MAGIC: u32 = 0x5053_474e; // "NGSP"
+/// Bytes of the header of versions 1 to 3, which is also the beginning of version 4's.
+const HEADER: usize = 16;
+/// Bytes of version 4's header.
+const HEADER_4: usize = 32;
+/// Widest position that 24 signed bits hold.
+const FIXED_MAX: f32 = 8_388_607.0;
+/// Slope of the base colour: byte = (f_dc · 0.15 + 0.5) · 255.
+const COLOUR_SCALE: f32 = 0.15;
+/// Most Gaussians that are read, so that a damaged count does not take all memory: ten times the largest scenes shared.
+const MOST: usize = 100_000_000;
+
+/// Signs of the SH coefficients when y and z turn round: the parity of each basis function in (y, z) together.
+const SH_SIGNS: [f32; 16] =
+    [1.0, -1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
+
+/// How a file stores what: the fields of its header.
+struct Head {
+    version: u32,
+    count: usize,
+    degree: u32,
+    fraction_bits: u32,
+}
+
+impl Head {
+    fn parse(b: &[u8]) -> Result<Head, String> {
+        let Some(b) = b.get(..HEADER) else { return Err("the file ends early; copy it again".into()) };
+        let word = |at: usize| u32::from_le_bytes([b[at], b[at + 1], b[at + 2], b[at + 3]]);
+        if word(0) != MAGIC {
+            return Err("not an .spz file (wrong magic bytes)".into());
+        }
+        let head = Head {
+            version: word(4),
+            count: word(8) as usize,
+            degree: u32::from(b[12]),
+            fraction_bits: u32::from(b[13]),
+        };
+        if !(2..=4).contains(&head.version) {
+            return Err(format!("spz version {} is not supported (2 to 4 are)", head.version));
+        }
+        if head.degree > 3 || head.fraction_bits > 24 || head.count > MOST {
+            return Err(format!(
+                "{} Gaussians of SH degree {} with {} fractional bits: not a readable .spz file",
+                head.count, head.degree, head.fraction_bits
+            ));
+        }
+        Ok(head)
+    }
+
+    /// Bytes of positions, alphas, colours, scales, rotations, SH.
+    fn sections(&self) -> [usize; 6] {
+        let rotation = if self.version >= 3 { 4 } else { 3 };
+        let rest = 3 * (sh_coefficients(self.degree) - 1);
+        [9, 1, 3, 3, rotation, rest].map(|n| n * self.count)
+    }
+}
+
+/// Reads a file.
+pub fn read_splats(path: &Path) -> Result<Splats> {
+    let bytes = std::fs::read(path).map_err(Error::io(path))?;
+    parse(&bytes).map_err(|e| Error::input(format!("{}: {e}", path.display())))
+}
+
+fn parse(bytes: &[u8]) -> Result<Splats, String> {
+    if bytes.starts_with(&[0x1f, 0x8b]) {
+        let mut plain = Vec::new();
+        let mut gzip = flate2::read::GzDecoder::new(bytes);
+        // The header first: it tells how much may follow.
+        gzip.by_ref().take(HEADER as u64).read_to_end(&mut plain).map_err(broken)?;
+        let size: usize = Head::parse(&plain)?.sections().iter().sum();
+        gzip.take(size as u64).read_to_end(&mut plain).map_err(broken)?;
+        return unpack(&plain);
+    }
+    if Head::parse(bytes)?.version >= 4 { unpack_4(bytes) } else { unpack(bytes) }
+}
+
+fn broken(e: impl std::fmt::Display) -> String {
+    format!("damaged compression ({e}); copy the file again")
+}
+
+/// Versions 2 and 3 after decompression.
+fn unpack(bytes: &[u8]) -> Result<Splats, String> {
+    let head = Head::parse(bytes)?;
+    if head.version >= 4 {
+        return Err("version 4 inside of gzip is not valid".into());
+    }
+    let mut rest = &bytes[HEADER..];
+    let mut parts = [&[][..]; 6];
+    for (part, size) in parts.iter_mut().zip(head.sections()) {
+        *part = rest.get(..size).ok_or("the file ends early; copy it again")?;
+        rest = &rest[size..];
+    }
+    Ok(splats(&head, parts))
+}
+
+fn unpack_4(bytes: &[u8]) -> Result<Splats, String> {
+    let head = Head::parse(bytes)?;
+    let early = || "the file ends early; copy it again".to_string();
+    let word = |at: usize| -> Result<u64, String> {
+        let b = bytes.get(at..at + 8).ok_or_else(early)?;
+        Ok(u64::from_le_bytes([b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]]))
+    };
+    let streams = usize::from(*bytes.get(15).ok_or_else(early)?);
+    let table = (word(16)? & 0xffff_ffff) as usize;
+    // Empty attributes have no stream.
+    let sizes = head.sections();
+    let wanted = sizes.iter().filter(|s| **s > 0).count();
+    if streams != wanted {
+        return Err(format!("{streams} streams where {wanted} are needed; copy the file again"));
+    }
+    let mut parts: [Vec<u8>; 6] = Default::default();
+    let mut at = table + 16 * streams;
+    let mut stream = 0;
+    for (part, size) in parts.iter_mut().zip(sizes).filter(|(_, size)| *size > 0) {
+        let length = usize::try_from(word(table + 16 * stream)?).map_err(|_| early())?;
+        let end = at.checked_add(length).ok_or_else(early)?;
+        let packed = bytes.get(at..end).ok_or_else(early)?;
+        let mut decoder = ruzstd::decoding::StreamingDecoder::new(packed).map_err(broken)?;
+        decoder.by_ref().take(size as u64).read_to_end(part).map_err(broken)?;
+        if part.len() != size {
+            return Err(early());
+        }
+        (at, stream) = (end, stream + 1);
+    }
+    Ok(splats(&head, [0, 1, 2, 3, 4, 5].map(|k| parts[k].as_slice())))
+}
+
+fn splats(head: &Head, [positions, alphas, colours, scales, rotations, sh]: [&[u8]; 6]) -> Splats {
+    let unit = 1.0 / (1u32 << head.fraction_bits) as f32;
+    // The upper bytes of an i32, shifted down with the sign.
+    let fixed = |b: &[u8]| (i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) as f32 * unit;
+    let mean = |b: &[u8]| [fixed(&b[..3]), -fixed(&b[3..6]), -fixed(&b[6..9])];
+    let rest = sh_coefficients(head.degree) - 1;
+    let mut all = Vec::with_capacity(head.count * 3 * (rest + 1));
+    for (i, c) in colours.chunks_exact(3).enumerate() {
+        all.extend(c.iter().map(|v| (f32::from(*v) / 255.0 - 0.5) / COLOUR_SCALE));
+        let own = &sh[i * 3 * rest..(i + 1) * 3 * rest];
+        all.extend(
+            own.iter().enumerate().map(|(k, v)| SH_SIGNS[1 + k / 3] * (f32::from(*v) - 128.0) / 128.0),
+        );
+    }
+    let rotation = if head.version >= 3 { smallest_three } else { first_three };
+    let width = if head.version >= 3 { 4 } else { 3 };
+    Splats {
+        means: positions.chunks_exact(9).map(mean).collect(),
+        log_scales: scales
+            .chunks_exact(3)
+            .map(|b| [0, 1, 2].map(|k| f32::from(b[k]) / 16.0 - 10.0))
+            .collect(),
+        quats: rotations.chunks_exact(width).map(|b| turned(rotation(b))).collect(),
+        opacity_logits: alphas.iter().map(|a| super::logit(f32::from(*a) / 255.0)).collect(),
+        sh_degree: head.degree,
+        sh: all,
+    }
+}
+
+/// The rotation (w, x, y, z) seen in axes with y and z turned round.
+fn turned([w, x, y, z]: [f32; 4]) -> [f32; 4] {
+    [w, x, -y, -z]
+}
+
+/// Version 2: x, y, z in bytes; w is what is missing to length one, and positive.
+fn first_three(b: &[u8]) -> [f32; 4] {
+    let [x, y, z] = [0, 1, 2].map(|k| f32::from(b[k]) / 127.5 - 1.0);
+    [(1.0 - x * x - y * y - z * z).max(0.0).sqrt(), x, y, z]
+}
+
+/// Largest magnitude of a component that is not the largest one.
+const SMALLER_MAX: f32 = std::f32::consts::FRAC_1_SQRT_2;
+/// Nine bits of magnitude.
+const MAGNITUDE: u32 = 511;
+
+/// Version 3: index of the largest of (x, y, z, w) in the top two bits, then the other three from the last to the first,
+/// each a sign and nine bits of magnitude.
+fn smallest_three(b: &[u8]) -> [f32; 4] {
+    let mut bits = u32::from_le_bytes([b[0], b[1], b[2], b[3]]);
+    let largest = (bits >> 30) as usize;
+    let mut q = [0.0f32; 4];
+    let mut squares = 0.0;
+    for k in (0..4).rev().filter(|k| *k != largest) {
+        let value = SMALLER_MAX * (bits & MAGNITUDE) as f32 / MAGNITUDE as f32;
+        q[k] = if bits >> 9 & 1 == 1 { -value } else { value };
+        squares += value * value;
+        bits >>= 10;
+    }
+    q[largest] = (1.0 - squares).max(0.0).sqrt();
+    [q[3], q[0], q[1], q[2]]
+}
+
+fn pack_rotation([w, x, y, z]: [f32; 4]) -> [u8; 4] {
+    let q = [x, y, z, w];
+    let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+    let largest = (0..4).max_by(|a, b| q[*a].abs().total_cmp(&q[*b].abs())).unwrap_or(3);
+    // q and −q are one rotation: the largest component is stored positive, and so not at all.
+    let sign = q[largest].signum() / norm;
+    let mut bits = largest as u32;
+    for k in (0..4).filter(|k| *k != largest) {
+        let value = q[k] * sign;
+        let magnitude = (value.abs() / SMALLER_MAX * MAGNITUDE as f32).round().min(MAGNITUDE as f32) as u32;
+        bits = bits << 10 | u32::from(value < 0.0) << 9 | magnitude;
+    }
+    bits.to_le_bytes()
+}
+
+/// Writes version 4, in the order of the scene.
+pub fn write_splats(path: &Path, s: &Splats) -> Result<()> {
+    let bad = |what: String| Error::work(format!("{}: {what}", path.display()));
+    let bits = fraction_bits(s).ok_or_else(|| {
+        bad("the scene reaches farther than the format's 24 bits; write a .ply instead".to_owned())
+    })?;
+    let head = Head { version: 4, count: s.len(), degree: s.sh_degree, fraction_bits: bits };
+    let sections: Vec<Vec<u8>> = pack(s, bits).into_iter().filter(|p| !p.is_empty()).collect();
+    let count = u32::try_from(head.count).map_err(|_| bad("too many Gaussians for the format".to_owned()))?;
+    let mut out = Vec::new();
+    for word in [MAGIC, head.version, count] {
+        out.extend(word.to_le_bytes());
+    }
+    // SH degree, fractional bits, no flags, number of streams.
+    out.extend([head.degree as u8, bits as u8, 0, sections.len() as u8]);
+    out.extend((HEADER_4 as u32).to_le_bytes());
+    out.resize(HEADER_4, 0);
+    let level = ruzstd::encoding::CompressionLevel::Fastest;
+    let packed: Vec<Vec<u8>> =
+        sections.iter().map(|p| ruzstd::encoding::compress_to_vec(p.as_slice(), level)).collect();
+    for (packed, plain) in packed.iter().zip(&sections) {
+        out.extend((packed.len() as u64).to_le_bytes());
+        out.extend((plain.len() as u64).to_le_bytes());
+    }
+    packed.iter().for_each(|p| out.extend_from_slice(p));
+    std::fs::write(path, out).map_err(Error::io(path))
+}
+
+/// The most fractional bits, up to 24, with which all positions fit.
+fn fraction_bits(s: &Splats) -> Option<u32> {
+    let widest = s.means.as_flattened().iter().fold(0.0f32, |m, v| m.max(v.abs()));
+    (0..=24).rev().find(|b| widest * (1u32 << b) as f32 <= FIXED_MAX)
+}
+
+fn byte(v: f32) -> u8 {
+    v.round().clamp(0.0, 255.0) as u8
+}
+
+fn pack(s: &Splats, bits: u32) -> [Vec<u8>; 6] {
+    let mut parts: [Vec<u8>; 6] = Default::default();
+    let scale = (1u32 << bits) as f32;
+    let width = 3 * s.sh_len();
+    for i in 0..s.len() {
+        let [x, y, z] = s.means[i];
+        for v in [x, -y, -z] {
+            let fixed = (v * scale).round().clamp(-FIXED_MAX, FIXED_MAX) as i32;
+            parts[0].extend_from_slice(&fixed.to_le_bytes()[..3]);
+        }
+        parts[1].push(byte(255.0 * super::sigmoid(s.opacity_logits[i])));
+        let sh = &s.sh[i * width..(i + 1) * width];
+        parts[2].extend(sh[..3].iter().map(|v| byte((v * COLOUR_SCALE + 0.5) * 255.0)));
+        parts[3].extend(s.log_scales[i].map(|v| byte((v + 10.0) * 16.0)));
+        parts[4].extend(pack_rotation(turned(s.quats[i])));
+        let rest = sh[3..].iter().enumerate();
+        parts[5].extend(rest.map(|(k, v)| byte(SH_SIGNS[1 + k / 3] * v * 128.0 + 128.0)));
+    }
+    parts
+}

@@ -1,0 +1,208 @@
+//! Working on a Vulkan device that the host program made and keeps.
+use super::device::{Device, Setup};
+use super::select::{self, Candidate};
+use super::{Options, features};
+use crate::{Error, Result};
+use ash::vk;
+use std::ffi::{CStr, CString};
+
+/// Runs a closure while nothing else uses the host's queue.
+pub type QueueLock = Box<dyn Fn(&mut dyn FnMut()) + Send + Sync>;
+
+/// The host's Vulkan objects. They must outlive the [`Device`] made from them and everything made on it.
+pub struct HostDevice {
+    /// Where the host has its Vulkan functions from; `None` loads the system's loader.
+    pub get_instance_proc_addr: Option<vk::PFN_vkGetInstanceProcAddr>,
+    /// Made for Vulkan 1.2 or newer.
+    pub instance: vk::Instance,
+    /// One that `splatvk doctor` calls usable.
+    pub physical_device: vk::PhysicalDevice,
+    /// Made with `synchronization2`.
+    pub device: vk::Device,
+    /// A queue with compute of `queue_family`.
+    pub queue: vk::Queue,
+    /// Family of the queue.
+    pub queue_family: u32,
+    /// Device extensions that the host enabled.
+    pub extensions: Vec<CString>,
+    /// Features that the host enabled: see [`EnabledFeatures`].
+    pub features: EnabledFeatures,
+    /// Without one, the host does not use the queue while a call into splatvk runs.
+    pub queue_lock: Option<QueueLock>,
+}
+
+/// Features that the host's device was made with. Only `synchronization2` is indispensable; each other one that is there
+/// allows faster shaders, and `timeline_semaphore` is needed for [`super::external::Sync`].
+#[derive(Clone, Copy, Debug, Default)]
+pub struct EnabledFeatures {
+    /// Vulkan 1.0 features.
+    pub base: vk::PhysicalDeviceFeatures,
+    /// `storageBuffer16BitAccess`
+    pub storage16: bool,
+    /// `storageBuffer8BitAccess`
+    pub storage8: bool,
+    /// `shaderFloat16`
+    pub float16: bool,
+    /// `shaderInt8`
+    pub int8: bool,
+    /// `synchronization2`
+    pub synchronization2: bool,
+    /// `shaderBufferFloat32Atomics` and `shaderBufferFloat32AtomicAdd`
+    pub atomic_float_add: bool,
+    /// `subgroupSizeControl`
+    pub subgroup_control: bool,
+    /// `computeFullSubgroups`
+    pub full_subgroups: bool,
+    /// `timelineSemaphore`
+    pub timeline_semaphore: bool,
+}
+
+impl EnabledFeatures {
+    /// Reads a chain that starts with `VkPhysicalDeviceFeatures2`, as it was given to `vkCreateDevice`. Structures that
+    /// splatvk does not know are skipped.
+    ///
+    /// # Safety
+    /// `chain` is null or a valid chain of Vulkan structures.
+    pub unsafe fn read(chain: *const std::ffi::c_void) -> EnabledFeatures {
+        let on = |v: vk::Bool32| v == vk::TRUE;
+        let mut f = EnabledFeatures::default();
+        let mut next = chain.cast::<vk::BaseInStructure<'_>>();
+        while !next.is_null() {
+            // SAFETY: a valid chain, per the contract; each structure has the type that its `s_type` says.
+            unsafe {
+                match (*next).s_type {
+                    vk::StructureType::PHYSICAL_DEVICE_FEATURES_2 => {
+                        f.base = (*next.cast::<vk::PhysicalDeviceFeatures2<'_>>()).features;
+                    }
+                    vk::StructureType::PHYSICAL_DEVICE_VULKAN_1_1_FEATURES => {
+                        let v = &*next.cast::<vk::PhysicalDeviceVulkan11Features<'_>>();
+                        f.storage16 |= on(v.storage_buffer16_bit_access);
+                    }
+                    vk::StructureType::PHYSICAL_DEVICE_VULKAN_1_2_FEATURES => {
+                        let v = &*next.cast::<vk::PhysicalDeviceVulkan12Features<'_>>();
+                        f.storage8 |= on(v.storage_buffer8_bit_access);
+                        f.float16 |= on(v.shader_float16);
+                        f.int8 |= on(v.shader_int8);
+                        f.timeline_semaphore |= on(v.timeline_semaphore);
+                    }
+                    vk::StructureType::PHYSICAL_DEVICE_VULKAN_1_3_FEATURES => {
+                        let v = &*next.cast::<vk::PhysicalDeviceVulkan13Features<'_>>();
+                        f.synchronization2 |= on(v.synchronization2);
+                        f.subgroup_control |= on(v.subgroup_size_control);
+                        f.full_subgroups |= on(v.compute_full_subgroups);
+                    }
+                    vk::StructureType::PHYSICAL_DEVICE_16BIT_STORAGE_FEATURES => {
+                        let v = &*next.cast::<vk::PhysicalDevice16BitStorageFeatures<'_>>();
+                        f.storage16 |= on(v.storage_buffer16_bit_access);
+                    }
+                    vk::StructureType::PHYSICAL_DEVICE_8BIT_STORAGE_FEATURES => {
+                        let v = &*next.cast::<vk::PhysicalDevice8BitStorageFeatures<'_>>();
+                        f.storage8 |= on(v.storage_buffer8_bit_access);
+                    }
+                    vk::StructureType::PHYSICAL_DEVICE_SHADER_FLOAT16_INT8_FEATURES => {
+                        let v = &*next.cast::<vk::PhysicalDeviceShaderFloat16Int8Features<'_>>();
+                        f.float16 |= on(v.shader_float16);
+                        f.int8 |= on(v.shader_int8);
+                    }
+                    vk::StructureType::PHYSICAL_DEVICE_SYNCHRONIZATION_2_FEATURES => {
+                        let v = &*next.cast::<vk::PhysicalDeviceSynchronization2Features<'_>>();
+                        f.synchronization2 |= on(v.synchronization2);
+                    }
+                    vk::StructureType::PHYSICAL_DEVICE_SUBGROUP_SIZE_CONTROL_FEATURES => {
+                        let v = &*next.cast::<vk::PhysicalDeviceSubgroupSizeControlFeatures<'_>>();
+                        f.subgroup_control |= on(v.subgroup_size_control);
+                        f.full_subgroups |= on(v.compute_full_subgroups);
+                    }
+                    vk::StructureType::PHYSICAL_DEVICE_TIMELINE_SEMAPHORE_FEATURES => {
+                        let v = &*next.cast::<vk::PhysicalDeviceTimelineSemaphoreFeatures<'_>>();
+                        f.timeline_semaphore |= on(v.timeline_semaphore);
+                    }
+                    vk::StructureType::PHYSICAL_DEVICE_SHADER_ATOMIC_FLOAT_FEATURES_EXT => {
+                        let v = &*next.cast::<vk::PhysicalDeviceShaderAtomicFloatFeaturesEXT<'_>>();
+                        f.atomic_float_add |=
+                            on(v.shader_buffer_float32_atomics) && on(v.shader_buffer_float32_atomic_add);
+                    }
+                    _ => {}
+                }
+                next = (*next).p_next;
+            }
+        }
+        f
+    }
+}
+
+impl Device {
+    /// Works on the host's device; it is not destroyed with the [`Device`]. Of `options` only `staging`, `deterministic`
+    /// and `no_float_atomics` count.
+    ///
+    /// # Safety
+    /// The handles are valid, belong together, were made as `host` says, and outlive everything made from the result.
+    /// The queue is used as [`HostDevice::queue_lock`] says.
+    pub unsafe fn adopt(host: HostDevice, options: &Options) -> Result<Device> {
+        let refuse = |what: &str| Err(Error::input(format!("the host's Vulkan device: {what}")));
+        let null = host.instance == vk::Instance::null()
+            || host.physical_device == vk::PhysicalDevice::null()
+            || host.device == vk::Device::null()
+            || host.queue == vk::Queue::null();
+        if null {
+            return refuse("a handle is null; give instance, physical device, device and queue");
+        }
+        let entry = match host.get_instance_proc_addr {
+            // SAFETY: the host's function is what it says, per the contract.
+            Some(get) => unsafe { ash::Entry::from_static_fn(ash::StaticFn { get_instance_proc_addr: get }) },
+            None => select::load()?,
+        };
+        // A missing function becomes a stub that aborts when called, so ask for the newest ones that are used.
+        let instance_has =
+            |name: &CStr| unsafe { entry.get_instance_proc_addr(host.instance, name.as_ptr()) };
+        if instance_has(c"vkGetPhysicalDeviceProperties2").is_none() {
+            return refuse("its instance is older than Vulkan 1.1; make it with apiVersion 1.2");
+        }
+        // SAFETY: a live instance and device, per the contract.
+        let (instance, device) = unsafe {
+            let instance = ash::Instance::load(entry.static_fn(), host.instance);
+            let device = ash::Device::load(instance.fp_v1_0(), host.device);
+            (instance, device)
+        };
+        let candidate = select::candidate(&instance, host.physical_device);
+        if let Some(reason) = &candidate.unusable {
+            return refuse(reason);
+        }
+        // SAFETY: a live device, per the contract.
+        let device_has = |name: &CStr| unsafe { instance.get_device_proc_addr(host.device, name.as_ptr()) };
+        let extension = host.extensions.iter().any(|e| e.as_c_str() == ash::khr::synchronization2::NAME);
+        let core = device_has(c"vkCmdPipelineBarrier2").is_some();
+        let khr = extension && device_has(c"vkCmdPipelineBarrier2KHR").is_some();
+        if !host.features.synchronization2 || !(core || khr) {
+            return refuse("synchronization2 is off; make the device with that feature");
+        }
+        check_queue(&instance, &candidate, host.queue_family)?;
+        let info = features::adopted(&instance, &candidate, &host.features, host.queue_family, options);
+        let setup = Setup {
+            instance,
+            device,
+            info,
+            queue: host.queue,
+            queue_family: host.queue_family,
+            sync2_extension: !core,
+            timeline: host.features.timeline_semaphore,
+            queue_lock: host.queue_lock,
+            owned: false,
+        };
+        Device::assemble(entry, candidate.physical, None, setup)
+    }
+}
+
+fn check_queue(instance: &ash::Instance, candidate: &Candidate, family: u32) -> Result<()> {
+    // SAFETY: the physical device belongs to the instance.
+    let families = unsafe { instance.get_physical_device_queue_family_properties(candidate.physical) };
+    let compute =
+        families.get(family as usize).is_some_and(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE));
+    if compute {
+        return Ok(());
+    }
+    Err(Error::input(format!(
+        "the host's Vulkan device: queue family {family} of {} has no compute",
+        candidate.name
+    )))
+}

@@ -1,0 +1,184 @@
+//! Planes of a rendered frame to texels as host programs want them.
+use super::raster_forward::BASE_CHANNELS;
+use super::rasterizer::FrameBuffers;
+use crate::gpu::{Buffer, Device, Recorder, shaders};
+use crate::{Error, Result};
+
+/// What to take from a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Source {
+    /// R, G, B on the background (not clamped where the encoding holds more than [0, 1]), and alpha.
+    Colour,
+    /// Accumulated opacity.
+    Alpha,
+    /// Expected camera z, world units; 0 where alpha < ½.
+    Depth,
+    /// Blended features: (first, count) of the frame's feature channels.
+    Features(usize, usize),
+}
+
+/// How texels are stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Encoding {
+    /// 32-bit floats, all channels of a pixel side by side: `[H, W, C]`.
+    F32,
+    /// 32-bit floats in groups of four, the last one filled up with zeros: `[⌈C/4⌉, H, W, 4]`, layers of an RGBA image.
+    F32x4,
+    /// 16-bit floats in such groups.
+    F16x4,
+    /// 8-bit unorm in such groups.
+    Unorm8x4,
+}
+
+impl Source {
+    fn index(self) -> u32 {
+        match self {
+            Source::Colour => 0,
+            Source::Alpha => 1,
+            Source::Depth => 2,
+            Source::Features(..) => 3,
+        }
+    }
+    /// Values per pixel.
+    pub fn channels(self) -> usize {
+        match self {
+            Source::Colour => 4,
+            Source::Alpha | Source::Depth => 1,
+            Source::Features(_, count) => count,
+        }
+    }
+    fn first(self) -> usize {
+        match self {
+            Source::Features(first, _) => BASE_CHANNELS + first,
+            _ => 0,
+        }
+    }
+}
+
+impl Encoding {
+    /// (channels in a texel, bytes of a texel) for `channels` values per pixel.
+    fn texel(self, channels: usize) -> (usize, usize) {
+        match self {
+            Encoding::F32 => (channels, 4 * channels),
+            Encoding::F32x4 => (4, 16),
+            Encoding::F16x4 => (4, 8),
+            Encoding::Unorm8x4 => (4, 4),
+        }
+    }
+    /// Image layers for `channels` values per pixel.
+    pub fn layers(self, channels: usize) -> usize {
+        channels.div_ceil(self.texel(channels).0.max(1))
+    }
+    /// Bytes for `channels` values in each of `pixels` pixels.
+    pub fn bytes(self, channels: usize, pixels: usize) -> usize {
+        self.layers(channels) * pixels * self.texel(channels).1
+    }
+    fn index(self) -> u32 {
+        match self {
+            Encoding::F32 | Encoding::F32x4 => 0,
+            Encoding::F16x4 => 1,
+            Encoding::Unorm8x4 => 2,
+        }
+    }
+}
+
+/// Packs a part of a rendered frame into a new buffer of exactly [`Encoding::bytes`]. Twin: [`texels_of`].
+pub fn pack(device: &Device, frame: &FrameBuffers, source: Source, encoding: Encoding) -> Result<Buffer> {
+    let pixels = frame.width as usize * frame.height as usize;
+    if let Source::Features(first, count) = source
+        && (count == 0 || first + count > frame.feature_dim)
+    {
+        return Err(Error::work(format!("the frame has no features {first} to {}", first + count)));
+    }
+    let channels = source.channels();
+    let texels = device.buffer::<u32>("texels", encoding.bytes(channels, pixels) / 4)?;
+    let mut rec = Recorder::new(device, "pack");
+    rec.dispatch_threads(
+        shaders::pack::call(
+            &shaders::pack::Bindings {
+                planes: &frame.planes,
+                transmittance: &frame.transmittance,
+                texels: &texels,
+            },
+            &shaders::pack::Push {
+                pixels: pixels as u32,
+                source: source.index(),
+                first: source.first() as u32,
+                channels: channels as u32,
+                group: encoding.texel(channels).0 as u32,
+                encoding: encoding.index(),
+            },
+        ),
+        [pixels as u32, 1, 1],
+    );
+    rec.run()?;
+    Ok(texels)
+}
+
+/// Twin of [`pack`]: bytes of the texels from `planes` [C, P] and `transmittance` [P].
+pub fn texels_of(planes: &[f32], transmittance: &[f32], source: Source, encoding: Encoding) -> Vec<u8> {
+    let pixels = transmittance.len();
+    let channels = source.channels();
+    let value = |p: usize, k: usize| match source {
+        _ if k >= channels => 0.0,
+        Source::Alpha => 1.0 - transmittance[p],
+        Source::Colour if k == 3 => 1.0 - transmittance[p],
+        Source::Depth => {
+            let alpha = 1.0 - transmittance[p];
+            if alpha >= super::renderer::DEPTH_ALPHA_MIN { planes[3 * pixels + p] / alpha } else { 0.0 }
+        }
+        Source::Colour | Source::Features(..) => planes[(source.first() + k) * pixels + p],
+    };
+    let (group, _) = encoding.texel(channels);
+    let mut out = Vec::with_capacity(encoding.bytes(channels, pixels));
+    for layer in 0..encoding.layers(channels) {
+        for p in 0..pixels {
+            for v in (0..group).map(|j| value(p, layer * group + j)) {
+                match encoding {
+                    Encoding::F32 | Encoding::F32x4 => out.extend(v.to_le_bytes()),
+                    Encoding::F16x4 => out.extend(half::f16::from_f32(v).to_le_bytes()),
+                    Encoding::Unorm8x4 => out.push((v.clamp(0.0, 1.0) * 255.0).round() as u8),
+                }
+            }
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::test_device;
+    use crate::pass::Rasterizer;
+
+    #[test]
+    fn every_source_in_every_encoding_equals_its_twin() {
+        let device = test_device();
+        let (width, height, dim) = (19u32, 7u32, 6usize);
+        let pixels = (width * height) as usize;
+        let raster = Rasterizer::new(&device, 1, dim, width, height).unwrap();
+        // Multiples of 1/64 are exact in half precision and keep the unorm values off the halves of rounding.
+        let noise = |i: usize| ((i * 7919 + 13) % 97) as f32 / 64.0;
+        let planes: Vec<f32> = (0..(BASE_CHANNELS + dim) * pixels).map(noise).collect();
+        let transmittance: Vec<f32> = (0..pixels).map(|i| (i % 9) as f32 / 8.0).collect();
+        raster.frame().planes.write(&planes).unwrap();
+        raster.frame().transmittance.write(&transmittance).unwrap();
+        for source in [Source::Colour, Source::Alpha, Source::Depth, Source::Features(1, 5)] {
+            for encoding in [Encoding::F32, Encoding::F32x4, Encoding::F16x4, Encoding::Unorm8x4] {
+                let got = pack(&device, raster.frame(), source, encoding).unwrap().read::<u8>().unwrap();
+                let expected = texels_of(&planes, &transmittance, source, encoding);
+                assert_eq!(got.len(), encoding.bytes(source.channels(), pixels), "{source:?} {encoding:?}");
+                if encoding == Encoding::F16x4 && source == Source::Depth {
+                    // z / alpha is not exact in half precision; rounding directions may differ by one step.
+                    for (a, b) in got.chunks(2).zip(expected.chunks(2)) {
+                        let step = |v: &[u8]| i32::from(u16::from_le_bytes([v[0], v[1]]));
+                        assert!((step(a) - step(b)).abs() <= 1);
+                    }
+                } else {
+                    assert_eq!(got, expected, "{source:?} {encoding:?}");
+                }
+            }
+        }
+        assert!(pack(&device, raster.frame(), Source::Features(2, 5), Encoding::F32).is_err());
+    }
+}

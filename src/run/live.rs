@@ -1,0 +1,197 @@
+//! A scene that a program holds in memory: drawn, asked and saved on demand. What the C interface is made of.
+use super::view::Viewer;
+use super::{Outcome, encoder, save, sources};
+use crate::format::scene_dir::{self, Contents, Scene};
+use crate::format::{Workspace, colmap, gaussians};
+use crate::gpu::Device;
+use crate::infer::{RegionEncoder, Registry};
+use crate::pass::rasterizer::FrameBuffers;
+use crate::photo;
+use crate::progress::Silent;
+use crate::query::{self, CANONICAL_PHRASES, QueryOptions, QueryResult, TextQuery};
+use crate::scene::{Camera, LanguageField, Plane, Splats};
+use crate::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// A trained or loaded scene on a device.
+///
+/// ```no_run
+/// # fn main() -> splatvk::Result<()> {
+/// use splatvk::{gpu::Device, photo, progress::Silent, run::{self, RunPlan, live::LiveScene}};
+/// let device = Device::open(None)?;
+/// let photos = photo::load_all(&["my-photos".into()], Some(4), &Silent)?;
+/// let outcome = run::reconstruct(&RunPlan::default(), &device, photos, &Silent)?;
+/// let mut scene = LiveScene::trained(&device, outcome, None)?;
+/// let camera = scene.cameras()[0].clone();
+/// let answer = scene.ask("blue mug", &camera)?;
+/// println!("found: {}, at {:?}", answer.found, answer.location);
+/// scene.save("out/kitchen".as_ref(), false)?;
+/// # Ok(())
+/// # }
+/// ```
+pub struct LiveScene {
+    device: Device,
+    source: Source,
+    models: Option<PathBuf>,
+    viewer: Viewer,
+    /// The text encoder and the [C, D] unit rows of the canonical phrases; loaded with the first question.
+    speaker: Option<(Box<dyn RegionEncoder>, Vec<f32>)>,
+    /// Decoded codes of the camera asked last.
+    seen: Option<(Camera, Vec<Plane<i32>>)>,
+}
+
+enum Source {
+    Trained(Box<Outcome>),
+    Loaded(Box<Scene>),
+}
+
+impl LiveScene {
+    /// Loads a scene directory, or a file of Gaussians that has no language. `models` is the folder of the models,
+    /// where the text encoder is taken from; `None` = the default one.
+    pub fn load(device: &Device, path: &Path, models: Option<&Path>) -> Result<LiveScene> {
+        LiveScene::new(device, Source::Loaded(Box::new(scene_dir::load(path)?)), models)
+    }
+
+    /// Takes over what a run made.
+    pub fn trained(device: &Device, outcome: Outcome, models: Option<&Path>) -> Result<LiveScene> {
+        LiveScene::new(device, Source::Trained(Box::new(outcome)), models)
+    }
+
+    fn new(device: &Device, source: Source, models: Option<&Path>) -> Result<LiveScene> {
+        let (splats, field) = match &source {
+            Source::Trained(o) => (&o.splats, Some(&o.field)),
+            Source::Loaded(s) => (&s.splats, s.language.as_ref()),
+        };
+        let viewer = Viewer::new(device, splats, field.unwrap_or(&LanguageField::default()))?;
+        let models = models.map(Path::to_path_buf);
+        Ok(LiveScene { device: device.clone(), source, models, viewer, speaker: None, seen: None })
+    }
+
+    /// The device that it is drawn on.
+    pub fn device(&self) -> &Device {
+        &self.device
+    }
+    /// The Gaussians.
+    pub fn splats(&self) -> &Splats {
+        match &self.source {
+            Source::Trained(o) => &o.splats,
+            Source::Loaded(s) => &s.splats,
+        }
+    }
+    /// One per photo; none for a bare file.
+    pub fn cameras(&self) -> &[Camera] {
+        match &self.source {
+            Source::Trained(o) => &o.cameras,
+            Source::Loaded(s) => &s.cameras,
+        }
+    }
+    /// What the scene knows about words.
+    pub fn language(&self) -> Option<&LanguageField> {
+        match &self.source {
+            Source::Trained(o) => Some(&o.field),
+            Source::Loaded(s) => s.language.as_ref(),
+        }
+    }
+    /// What the run was warned of; none for a loaded scene.
+    pub fn warnings(&self) -> &[String] {
+        match &self.source {
+            Source::Trained(o) => &o.warnings,
+            Source::Loaded(_) => &[],
+        }
+    }
+    /// Feature channels of a level in what [`LiveScene::draw`] renders: (first, count); the count is 0 without codes.
+    pub fn features(&self, level: usize) -> (usize, usize) {
+        let n = self.splats().len().max(1);
+        let levels = self.language().map_or(&[][..], |l| &l.levels);
+        let widths: Vec<usize> = levels.iter().map(|l| l.features.len() / n).collect();
+        (widths.iter().take(level).sum(), widths.get(level).copied().unwrap_or(0))
+    }
+
+    /// Renders one camera. The frame stays on the device, and valid until the next call.
+    pub fn draw(&mut self, camera: &Camera) -> Result<&FrameBuffers> {
+        check(camera)?;
+        self.viewer.draw(camera)
+    }
+
+    /// Answers a text in the view of a camera.
+    pub fn ask(&mut self, text: &str, camera: &Camera) -> Result<QueryResult> {
+        check(camera)?;
+        if text.trim().is_empty() {
+            return Err(Error::input("an empty query; give a few words"));
+        }
+        if self.language().is_none_or(|f| f.levels.iter().all(|l| l.codebook.is_empty())) {
+            return Err(Error::input(
+                "the scene has no language; only scenes made from photos by a run have it",
+            ));
+        }
+        let (mut encoder, canonicals) = match self.speaker.take() {
+            Some(ready) => ready,
+            None => self.speaker()?,
+        };
+        let embedding = encoder.embed_texts(&[text]);
+        let query = embedding.map(|embedding| TextQuery {
+            text: text.to_owned(),
+            embedding,
+            canonicals: canonicals.clone(),
+        });
+        self.speaker = Some((encoder, canonicals));
+        let query = query?;
+        if self.seen.as_ref().is_none_or(|(c, _)| c != camera) {
+            let codes = self.viewer.codes(camera)?;
+            self.seen = Some((camera.clone(), codes));
+        }
+        let codes = self.seen.as_ref().map_or(&[][..], |(_, codes)| codes);
+        let field = self.language().ok_or_else(|| Error::work("the scene lost its language"))?;
+        query::answer(codes, field, &query, &QueryOptions::default())
+    }
+
+    fn speaker(&self) -> Result<(Box<dyn RegionEncoder>, Vec<f32>)> {
+        let registry = Registry::open(self.models.as_deref())?;
+        let mut encoder = match &self.source {
+            Source::Trained(o) => sources::encoder(&o.plan.features, &registry)?,
+            Source::Loaded(s) => encoder::of_scene(s, registry)?,
+        };
+        let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
+        Ok((encoder, canonicals))
+    }
+
+    /// Writes a file of the kind that its name asks for ([`gaussians::write`]), or else a scene directory, whole or not at
+    /// all; `replace` allows to replace a scene or file that is there.
+    pub fn save(&mut self, path: &Path, replace: bool) -> Result<()> {
+        if gaussians::is_named(path) {
+            if path.exists() && !replace {
+                return Err(Error::input(format!("{}: is already there", path.display())));
+            }
+            return gaussians::write(path, self.splats(), self.language());
+        }
+        match &mut self.source {
+            Source::Trained(outcome) => save(outcome, path, replace, &Silent),
+            Source::Loaded(scene) => save_loaded(scene, path, replace),
+        }
+    }
+}
+
+fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
+    let workspace = Workspace::create(path, replace)?;
+    let folder = scene.path.join("cameras");
+    // A scene without its photos is still whole.
+    let photos = scene.cameras.iter().map(|c| photo::load(&folder.join(&c.name)));
+    let photos = photos.collect::<Result<Vec<_>>>().unwrap_or_default();
+    let points = colmap::read_points(&folder.join("colmap")).ok();
+    let table = scene.path.join(scene_dir::TEXT_EMBEDDINGS);
+    let contents = Contents {
+        splats: &scene.splats,
+        cameras: &scene.cameras,
+        photos: &photos,
+        points: points.as_ref(),
+        language: scene.language.as_ref(),
+        text_embeddings: table.is_file().then_some(table.as_path()),
+    };
+    scene_dir::write(workspace.path(), &contents)?;
+    workspace.commit().map(drop)
+}
+
+/// Cameras come from outside: refuses what cannot be rendered.
+fn check(camera: &Camera) -> Result<()> {
+    crate::format::cameras::checked(camera.clone()).map(drop).map_err(Error::input)
+}

@@ -1,0 +1,278 @@
+"""What tools/formats/check runs: every format through a reader or writer that is not ours."""
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import gsply
+import numpy as np
+import OpenEXR
+import plyfile
+import pycolmap
+from gsply.spz import read_spz, write_spz
+
+SPLATVK, SCENE = Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve()
+WORK = Path(tempfile.mkdtemp(prefix="splatvk-formats-"))
+C0 = 0.28209479177387814
+# Parity of the SH basis in (y, z): what a turn by 180° about x changes, degrees 1 to 3.
+TURN = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
+
+
+def run(*args):
+    subprocess.run([SPLATVK, *map(str, args)], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def close(what, got, expected, bound):
+    worst = float(np.max(np.abs(np.asarray(got, np.float64) - np.asarray(expected, np.float64)) - bound))
+    assert worst <= 0, f"{what}: beyond the format's precision by {worst:.2e}"
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-np.asarray(x, np.float64)))
+
+
+def unit(q):
+    q = np.asarray(q, np.float64)
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def same_rotations(what, got, expected, bound):
+    dots = np.abs(np.sum(unit(got) * unit(expected), axis=1))
+    assert dots.min() >= 1 - bound, f"{what}: rotations differ, |q·q'| = {dots.min():.6f}"
+
+
+def random_splats(n, degree, seed):
+    rng = np.random.default_rng(seed)
+    k = (degree + 1) ** 2 - 1
+    return {
+        "means": rng.normal(0, 3, (n, 3)).astype("f4"),
+        "scales": rng.uniform(-6, 0, (n, 3)).astype("f4"),
+        "quats": unit(rng.normal(size=(n, 4))).astype("f4"),
+        "opacities": rng.uniform(-4, 4, n).astype("f4"),
+        "sh0": rng.uniform(-1.5, 1.5, (n, 3)).astype("f4"),
+        "shN": rng.uniform(-0.9, 0.9, (n, k, 3)).astype("f4"),
+    }
+
+
+def write_ply(path, s):
+    """The INRIA layout, by plyfile."""
+    n, k = s["shN"].shape[:2]
+    rest = s["shN"].transpose(0, 2, 1).reshape(n, 3 * k)
+    columns = [("xyz"[i], s["means"][:, i]) for i in range(3)] + [(f"f_dc_{i}", s["sh0"][:, i]) for i in range(3)]
+    columns += [(f"f_rest_{i}", rest[:, i]) for i in range(3 * k)] + [("opacity", s["opacities"])]
+    columns += [(f"scale_{i}", s["scales"][:, i]) for i in range(3)] + [(f"rot_{i}", s["quats"][:, i]) for i in range(4)]
+    table = np.empty(n, dtype=[(name, "f4") for name, _ in columns])
+    for name, values in columns:
+        table[name] = values
+    plyfile.PlyData([plyfile.PlyElement.describe(table, "vertex")]).write(str(path))
+
+
+def read_ply(path):
+    v = plyfile.PlyData.read(str(path))["vertex"]
+    stack = lambda names: np.stack([v[name] for name in names], axis=1)
+    k = sum(p.name.startswith("f_rest_") for p in v.properties) // 3
+    n = len(v["x"])
+    rest = stack([f"f_rest_{i}" for i in range(3 * k)]).reshape(n, 3, k).transpose(0, 2, 1) if k else np.zeros((n, 0, 3))
+    return {
+        "means": stack("xyz"), "scales": stack([f"scale_{i}" for i in range(3)]),
+        "quats": stack([f"rot_{i}" for i in range(4)]), "opacities": np.asarray(v["opacity"]),
+        "sh0": stack([f"f_dc_{i}" for i in range(3)]), "shN": rest,
+    }
+
+
+def of_gsply(d):
+    k = 0 if d.shN is None else np.asarray(d.shN).shape[1]
+    return {
+        "means": d.means, "scales": d.scales, "quats": d.quats, "opacities": np.asarray(d.opacities).reshape(-1),
+        "sh0": d.sh0, "shN": np.asarray(d.shN) if k else np.zeros((len(d.means), 0, 3)),
+    }
+
+
+def turned(s):
+    """The same splats with y and z turned round."""
+    k = s["shN"].shape[1]
+    flip = np.array([1, -1, -1])
+    return {**s, "means": s["means"] * flip, "quats": s["quats"] * np.array([1, 1, -1, -1]),
+            "shN": s["shN"] * TURN[None, :k, None]}
+
+
+def compare(what, got, expected, means, scales, rotation, opacity, sh0, sh):
+    close(f"{what} positions", got["means"], expected["means"], means)
+    close(f"{what} scales", got["scales"], expected["scales"], scales)
+    same_rotations(what, got["quats"], expected["quats"], rotation)
+    close(f"{what} opacity", sigmoid(got["opacities"]), sigmoid(expected["opacities"]), opacity)
+    close(f"{what} colours", C0 * np.asarray(got["sh0"]), C0 * np.asarray(expected["sh0"]), C0 * sh0)
+    assert got["shN"].shape == expected["shN"].shape, f"{what}: SH {got['shN'].shape}"
+    if sh is not None and expected["shN"].size:
+        close(f"{what} SH", got["shN"], expected["shN"], sh)
+    print(f"ok  {what}")
+
+
+# Half a step of each format, and a little for f32 on the way; spz: 24-bit positions, scales in sixteenths, colours in
+# 1/38.25, nine bits of a rotation component.
+SPZ = dict(means=2e-5, scales=0.0313, rotation=1e-5, opacity=0.00197, sh0=0.0131, sh=0.0040)
+
+
+def packed_bounds(s):
+    """Half a step of the coarsest axis, were all of the scene one chunk."""
+    span = lambda a: float(np.ptp(a, axis=0).max())
+    return dict(means=span(s["means"]) / 2046, scales=span(s["scales"]) / 2046 + 1e-5, rotation=1e-5, opacity=0.00197,
+                sh0=span(s["sh0"]) / 510 + 1e-5, sh=0.0157)
+
+
+def by_position(got, expected):
+    """Rows of `got` that belong to the rows of `expected`, for formats that sort; every row is used once."""
+    d = ((got["means"][None] - expected["means"][:, None]) ** 2).sum(-1)
+    rows = d.argmin(1)
+    assert len(set(rows)) == len(rows), "two splats of the file are one of the scene's"
+    return rows, {k: np.asarray(v)[rows] for k, v in got.items()}
+
+
+def splats():
+    for degree in range(4):
+        s = random_splats(900, degree, degree)
+        source = WORK / f"in{degree}.ply"
+        write_ply(source, s)
+        exact = dict(means=0, scales=0, rotation=1e-6, opacity=1e-7, sh0=0, sh=0)
+        out = WORK / "out.ply"
+        run("export", source, "--format", "ply", "--ply-degree", degree, "--out", out)
+        compare(f"ply degree {degree}: plyfile", read_ply(out), s, **exact)
+        compare(f"ply degree {degree}: gsply", of_gsply(gsply.plyread(str(out))), s, **exact)
+
+        out = WORK / "out.compressed.ply"
+        run("export", source, "--format", "compressed-ply", "--out", out)
+        _, got = by_position(of_gsply(gsply.plyread(str(out))), s)
+        compare(f"compressed ply degree {degree}: gsply", got, s, **packed_bounds(s))
+
+        out = WORK / "out.spz"
+        run("export", source, "--format", "spz", "--out", out)
+        compare(f"spz 4 degree {degree}: gsply", turned(of_gsply(read_spz(str(out)))), s, **SPZ)
+        others(s, degree)
+    s = random_splats(900, 0, 7)
+    write_ply(WORK / "in.ply", s)
+    run("export", WORK / "in.ply", "--format", "splat", "--out", WORK / "out.splat")
+    row = np.dtype([("means", "f4", 3), ("scales", "f4", 3), ("colour", "u1", 4), ("quats", "u1", 4)])
+    f = np.fromfile(WORK / "out.splat", row)
+    got = {
+        "means": f["means"], "scales": np.log(f["scales"]), "quats": (f["quats"].astype("f8") - 128) / 128,
+        "opacities": np.log((f["colour"][:, 3] + 1e-9) / (255 - f["colour"][:, 3] + 1e-9)),
+        "sh0": (f["colour"][:, :3] / 255 - 0.5) / C0, "shN": np.zeros((len(f), 0, 3)),
+    }
+    visible = np.abs(C0 * s["sh0"]).max(1) < 0.5  # the format clamps colours to [0, 1]
+    _, got = by_position(got, s)
+    pick = lambda t: {k: np.asarray(v)[visible] for k, v in t.items()}
+    compare("splat: numpy record array", pick(got), pick(s), 0, 1e-5, 1e-4, 0.00197, 0.0071, None)
+
+
+def others(s, degree):
+    """Files that other programs wrote, read by splatvk."""
+    back = WORK / "back.ply"
+
+    def through(name, **bounds):
+        run("export", WORK / name, "--format", "ply", "--ply-degree", degree, "--out", back)
+        got = read_ply(back)
+        if "compressed" in name:
+            _, got = by_position(got, s)
+        compare(f"reading {name} degree {degree}", got, s, **bounds)
+
+    n, k = s["shN"].shape[:2]
+    data = gsply.GSData.from_arrays(**{key: s[key] for key in ("means", "scales", "quats", "opacities", "sh0")},
+                                    shN=s["shN"] if k else None)
+    gsply.plywrite(str(WORK / "gsply.compressed.ply"), data, compressed=True)
+    through("gsply.compressed.ply", **{**packed_bounds(s), "sh": 0.033})
+    t = turned(s)
+    data = gsply.GSData.from_arrays(**{key: t[key].astype("f4") for key in ("means", "scales", "quats", "opacities", "sh0")},
+                                    shN=t["shN"].astype("f4") if k else None)
+    for version in (3, 4):
+        write_spz(str(WORK / f"gsply-v{version}.spz"), data, version=version, fractional_bits=14)
+        through(f"gsply-v{version}.spz", **{**SPZ, "means": 4e-5})
+
+
+def matrices():
+    """World to camera of the scene, by stem, from its transforms.json."""
+    out = {}
+    for f in json.loads((SCENE / "cameras/transforms.json").read_text())["frames"]:
+        m = np.linalg.inv(np.array(f["transform_matrix"]) @ np.diag([1, -1, -1, 1.0]))
+        out[Path(f["file_path"]).stem] = (m, np.array([f["fl_x"], f["fl_y"], f["cx"], f["cy"]]))
+    return out
+
+
+def cameras():
+    expected = matrices()
+    for kind in ("colmap", "colmap-bin"):
+        run("export", SCENE, "--format", kind, "--out", WORK / kind)
+        model = pycolmap.Reconstruction(str(WORK / kind))
+        assert model.num_images() == len(expected) and model.num_points3D() > 100
+        for image in model.images.values():
+            m, intrinsics = expected[Path(image.name).stem]
+            close(f"{kind} pose", image.cam_from_world().matrix(), m[:3], 1e-9)
+            close(f"{kind} intrinsics", image.camera.params, intrinsics, 1e-9)
+        print(f"ok  {kind}: pycolmap")
+    run("export", SCENE, "--format", "transforms", "--out", WORK / "transforms.json")
+    # What pycolmap writes is read by splatvk: the same pictures come out.
+    model = pycolmap.Reconstruction(str(WORK / "colmap-bin"))
+    for kind in ("text", "binary"):
+        folder = WORK / f"pycolmap-{kind}"
+        folder.mkdir()
+        getattr(model, f"write_{kind}")(str(folder))
+        run("render", SCENE, "--cameras", folder, "--out", WORK / kind, "--format", "npy")
+    run("render", SCENE, "--cameras", WORK / "transforms.json", "--out", WORK / "own", "--format", "npy")
+    for stem in expected:
+        own = np.load(WORK / "own" / f"{stem}_rgb.npy")
+        for kind in ("text", "binary"):
+            # Poses that differ in the last digit of a double move a pixel by less than this.
+            close(f"rendered with pycolmap's {kind}", np.load(WORK / kind / f"{stem}_rgb.npy"), own, 1e-3)
+    print("ok  models written by pycolmap")
+
+
+def images():
+    channels = "rgb,alpha,depth,features,codes"
+    run("render", SCENE, "--cameras", SCENE / "cameras/transforms.json", "--out", WORK / "maps", "--channels", channels,
+        "--format", "exr,npy")
+    for stem in matrices():
+        with OpenEXR.File(str(WORK / "maps" / f"{stem}.exr"), separate_channels=True) as file:
+            got = {name: c.pixels for name, c in file.channels().items()}
+        load = lambda part: np.load(WORK / "maps" / f"{stem}_{part}.npy")
+        for k, name in enumerate("RGB"):
+            close(f"EXR {name}", got[name], load("rgb")[..., k], 0)
+        close("EXR A", got["A"], load("alpha"), 0)
+        close("EXR Z", got["Z"], load("depth"), 0)
+        first = 0
+        for level in "sml":
+            if not (WORK / "maps" / f"{stem}_features_{level}.npy").exists():
+                continue
+            features = load(f"features_{level}")
+            for k in range(features.shape[2]):
+                close("EXR features", got[f"feat.{first + k:02d}"], features[..., k], 0)
+            first += features.shape[2]
+            close("EXR codes", got[f"code.{level}"], load(f"codes_{level}"), 0)
+    print("ok  EXR: OpenEXR against npy: numpy")
+
+
+def language():
+    """Features travel with their splats through a format that sorts them."""
+    out = WORK / "scene.compressed.ply"
+    run("export", SCENE, "--format", "compressed-ply", "--out", out)
+    side = np.load(str(out) + ".language.npz")
+    features = np.load(SCENE / "language/features.npz")
+    whole, packed = read_ply(SCENE / "point_cloud.ply"), of_gsply(gsply.plyread(str(out)))
+    span = np.ptp(whole["means"], axis=0).max() / 2046
+    for level in features.files:
+        # A file row belongs to the splat with its features; that splat must also be where the row says.
+        rows = {f.tobytes(): i for i, f in enumerate(features[level])}
+        index = np.array([rows.get(f.tobytes(), -1) for f in side[f"features_{level}"]])
+        assert (index >= 0).all(), f"level {level}: features that are not the scene's"
+        distinct = np.unique(index).size
+        if distinct == len(index):
+            close(f"language level {level}", packed["means"], whole["means"][index], span)
+            print(f"ok  language beside compressed ply, level {level}: {distinct} splats")
+    # And through splatvk again: the file with its side file answers.
+    run("query", out, "lemon", "--cameras", SCENE / "cameras/transforms.json", "--out", WORK / "answers")
+    print("ok  language beside compressed ply answers a query")
+
+
+splats()
+cameras()
+images()
+language()

@@ -1,0 +1,165 @@
+// What the interface must refuse, and how it says so; linked with the static library.
+//   checks SCENE PHOTO PHOTO...
+#include "host.hpp"
+
+#include <atomic>
+#include <cmath>
+#include <cstring>
+#include <thread>
+
+static int failures = 0;
+#define EXPECT(condition)                                                                                              \
+    do {                                                                                                               \
+        if (!(condition)) {                                                                                            \
+            std::fprintf(stderr, "checks.cpp:%d: not so: %s\n", __LINE__, #condition);                                 \
+            failures++;                                                                                                \
+        }                                                                                                              \
+    } while (0)
+
+static bool says(const std::string &text, const char *word) { return text.find(word) != std::string::npos; }
+
+static int32_t stop(void *calls, const SvkProgress *) { return ++*static_cast<std::atomic<int> *>(calls) >= 3; }
+
+static void contexts() {
+    SvkContext *context = reinterpret_cast<SvkContext *>(1);
+    auto options = make<SvkContextOptions>();
+    options.device = "no such device";
+    EXPECT(svk_context_create(&options, &context) == SVK_STATUS_INPUT && !context);
+    EXPECT(says(last_error(svk_context_error, static_cast<SvkContext *>(nullptr)), "no such device"));
+    EXPECT(svk_context_create(nullptr, nullptr) == SVK_STATUS_ARGUMENT);
+    options.size = 1;
+    EXPECT(svk_context_create(&options, &context) == SVK_STATUS_ARGUMENT);
+    EXPECT(says(last_error(svk_context_error, static_cast<SvkContext *>(nullptr)), "sizeof"));
+    auto device = make<SvkVulkanDevice>();
+    EXPECT(svk_context_adopt(&device, nullptr, &context) == SVK_STATUS_INPUT && !context);
+    svk_context_destroy(nullptr);
+    svk_scene_destroy(nullptr);
+}
+
+static void training(SvkContext *context, int count, char **paths) {
+    std::vector<SvkPhoto> photos;
+    for (int i = 0; i < count; i++) {
+        photos.push_back(make<SvkPhoto>());
+        photos.back().path = paths[i];
+    }
+    // Stopped by the callback: nothing is left, and the context goes on working.
+    std::atomic<int> calls{0};
+    auto options = make<SvkTrainOptions>();
+    options.progress = stop;
+    options.user = &calls;
+    SvkScene *scene = nullptr;
+    EXPECT(svk_train(context, photos.data(), photos.size(), &options, &scene) == SVK_STATUS_CANCELLED && !scene);
+    EXPECT(calls >= 3);
+    EXPECT(svk_train(context, photos.data(), 1, nullptr, &scene) == SVK_STATUS_INPUT);
+    EXPECT(svk_train(context, nullptr, 2, nullptr, &scene) == SVK_STATUS_ARGUMENT);
+    EXPECT(svk_train(nullptr, photos.data(), 2, nullptr, &scene) == SVK_STATUS_ARGUMENT);
+    options.preset = 77;
+    EXPECT(svk_train(context, photos.data(), photos.size(), &options, &scene) == SVK_STATUS_ARGUMENT);
+    EXPECT(says(last_error(svk_context_error, context), "preset"));
+    photos[0].encoded = reinterpret_cast<const uint8_t *>("both");
+    EXPECT(svk_train(context, photos.data(), photos.size(), nullptr, &scene) == SVK_STATUS_ARGUMENT);
+    photos[0].path = nullptr;
+    photos[0].encoded_bytes = 4;
+    EXPECT(svk_train(context, photos.data(), photos.size(), nullptr, &scene) == SVK_STATUS_INPUT);
+    EXPECT(says(last_error(svk_context_error, context), "photo_00"));
+}
+
+static std::vector<float> render(SvkScene *scene, const SvkCamera &camera, uint32_t channel, size_t values,
+                                 const char *text = nullptr) {
+    std::vector<float> out(size_t(camera.width) * camera.height * values);
+    auto output = make<SvkOutput>();
+    output.channel = channel;
+    output.encoding = SVK_ENCODING_F32;
+    output.text = text;
+    output.host = out.data();
+    output.bytes = 4 * out.size();
+    check(svk_scene_render(scene, &camera, &output, 1, nullptr), scene);
+    output.bytes--;
+    EXPECT(svk_scene_render(scene, &camera, &output, 1, nullptr) == SVK_STATUS_ARGUMENT);
+    return out;
+}
+
+static void reading(SvkContext *context, const char *path) {
+    SvkScene *loaded = nullptr;
+    EXPECT(svk_scene_load(context, "no/such/scene", &loaded) == SVK_STATUS_INPUT && !loaded);
+    check(svk_scene_load(context, path, &loaded), context);
+    Scene scene(loaded);
+    auto info = make<SvkSceneInfo>();
+    check(svk_scene_info(loaded, &info), loaded);
+    EXPECT(info.splats > 1000 && info.cameras >= 2 && info.codes[0] + info.codes[1] + info.codes[2] > 0);
+    std::vector<float> means(3 * info.splats);
+    check(svk_scene_read(loaded, SVK_ARRAY_MEANS, means.data(), means.size()), loaded);
+    EXPECT(svk_scene_read(loaded, SVK_ARRAY_MEANS, means.data(), means.size() - 1) == SVK_STATUS_ARGUMENT);
+    SvkCamera camera = scene_camera(loaded, 0);
+    auto none = make<SvkCamera>();
+    EXPECT(svk_scene_camera(loaded, 99, &none, nullptr, 0) == SVK_STATUS_ARGUMENT);
+    char name[8];
+    check(svk_scene_camera(loaded, 0, &none, name, sizeof name), loaded);
+    EXPECT(std::strlen(name) == 7 && none.fx == camera.fx);
+
+    const auto alpha = render(loaded, camera, SVK_CHANNEL_ALPHA, 1), depth = render(loaded, camera, SVK_CHANNEL_DEPTH, 1);
+    const auto colour = render(loaded, camera, SVK_CHANNEL_COLOUR, 4);
+    bool same = true, positive = true;
+    for (size_t i = 0; i < alpha.size(); i++) {
+        same &= colour[4 * i + 3] == alpha[i];
+        positive &= (depth[i] > 0) == (alpha[i] >= 0.5f);
+    }
+    EXPECT(same && positive);
+    for (uint32_t level = 0; level < 3; level++) {
+        if (!info.codes[level]) continue;
+        std::vector<float> features(alpha.size() * info.feature_dim[level]);
+        auto output = make<SvkOutput>();
+        output.channel = SVK_CHANNEL_FEATURES;
+        output.level = level;
+        output.host = features.data();
+        output.bytes = 4 * features.size();
+        check(svk_scene_render(loaded, &camera, &output, 1, nullptr), loaded);
+        float most = 0;
+        for (float f : features) most = std::fmax(most, std::fabs(f));
+        EXPECT(most > 0.1f && most < 1.01f);
+    }
+    // Two threads on one scene: calls follow each other, and both answers are the same.
+    SvkAnswer answers[2] = {make<SvkAnswer>(), make<SvkAnswer>()};
+    SvkStatus statuses[2];
+    auto ask = [&](int i) { statuses[i] = svk_scene_query(loaded, "lemon", &camera, &answers[i], nullptr, 0); };
+    std::thread other(ask, 1);
+    ask(0);
+    other.join();
+    EXPECT(statuses[0] == SVK_STATUS_OK && statuses[1] == SVK_STATUS_OK && answers[0].score == answers[1].score);
+    const auto relevancy = render(loaded, camera, SVK_CHANNEL_RELEVANCY, 1, "lemon");
+    float best = 0;
+    for (float r : relevancy) best = std::fmax(best, r);
+    EXPECT(best > 0 && best <= answers[0].score + 1e-6);
+    EXPECT(svk_scene_query(loaded, " ", &camera, &answers[0], nullptr, 0) == SVK_STATUS_INPUT);
+
+    camera.world_to_camera[0][0] = NAN;
+    EXPECT(svk_scene_query(loaded, "lemon", &camera, &answers[0], nullptr, 0) == SVK_STATUS_INPUT);
+    camera = scene_camera(loaded, 0);
+    auto buffer = make<SvkOutput>();
+    buffer.buffer = 1;
+    buffer.bytes = ~size_t(0);
+    EXPECT(svk_scene_render(loaded, &camera, &buffer, 1, nullptr) == SVK_STATUS_INPUT);
+    EXPECT(says(last_error(svk_scene_error, loaded), "own Vulkan device"));
+    EXPECT(svk_scene_save(loaded, path, 0) == SVK_STATUS_INPUT);
+}
+
+int main(int argc, char **argv) {
+    if (argc < 4) {
+        std::fprintf(stderr, "usage: checks SCENE PHOTO PHOTO...\n");
+        return 2;
+    }
+    try {
+        EXPECT(svk_abi_version() == SVK_ABI_VERSION);
+        contexts();
+        SvkContext *made = nullptr;
+        check(svk_context_create(nullptr, &made), made);
+        Context context(made);
+        training(made, argc - 2, argv + 2);
+        reading(made, argv[1]);
+    } catch (const std::exception &e) {
+        std::fprintf(stderr, "checks: %s\n", e.what());
+        return 1;
+    }
+    std::printf("%s\n", failures ? "failed" : "the interface refuses what it must");
+    return failures ? 1 : 0;
+}
