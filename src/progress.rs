@@ -179,11 +179,17 @@ impl Progress for Beside<'_> {
 }
 
 /// Peak resident memory of this process, bytes (`VmHWM` of Linux); 0 elsewhere.
-fn peak_memory() -> u64 {
+pub(crate) fn peak_memory() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
     let kilobytes = line.and_then(|l| l.split_whitespace().next()?.parse::<u64>().ok());
     kilobytes.unwrap_or(0) * 1024
+}
+
+/// Starts [`peak_memory`] afresh from what is resident now, where the system can.
+pub(crate) fn reset_peak_memory() {
+    // "5" resets the high-water mark (proc(5)); elsewhere the peak stays that of the whole process.
+    let _ = std::fs::write("/proc/self/clear_refs", "5");
 }
 
 #[cfg(test)]

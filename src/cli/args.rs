@@ -112,16 +112,23 @@ pub struct RunArgs {
     /// Time against quality [default: draft on a CPU device, default on a GPU]
     #[arg(long, value_enum)]
     pub preset: Option<PresetArg>,
-    /// Cameras and points: auto, sfm, or cameras:FILE (transforms.json, COLMAP folder, cameras.json)
+    /// Cameras and points: auto, sfm, cameras:FILE (transforms.json, COLMAP folder, cameras.json), or an installed network:
+    /// mast3r, dust3r, vggt, da3
     #[arg(long, default_value = "auto", value_name = "SOURCE")]
     pub init: String,
-    /// Dense matches for the alignment of masks: auto, xfeat
+    /// Dense matches for the alignment of masks: auto, xfeat, or an installed network: roma
     #[arg(long, default_value = "auto", value_name = "NAME")]
     pub matcher: String,
-    /// Masks on three levels: auto, graph, or dir:DIR (STEM_s.npy)
+    /// Masks on three levels: auto, graph, dir:DIR (STEM_s.npy), or an installed network: sam, sam2
     #[arg(long, default_value = "auto", value_name = "SOURCE")]
     pub masks: String,
-    /// Region features: auto, words, or dir:DIR (STEM_f.npy, text_embeddings.npz)
+    /// Points along each side of a photo at which a mask network is asked
+    #[arg(long, default_value_t = 32, value_name = "N")]
+    pub mask_points: usize,
+    /// Do not ask the mask network about four overlapping crops as well: five times faster, misses small things
+    #[arg(long)]
+    pub no_mask_crops: bool,
+    /// Region features: auto, words, dir:DIR (STEM_f.npy, text_embeddings.npz), or an installed network: clip, lseg
     #[arg(long, default_value = "auto", value_name = "SOURCE")]
     pub features: String,
     /// Ask the finished scene; may be repeated
@@ -485,7 +492,7 @@ pub struct ModelsArgs {
 pub enum ModelsAction {
     /// Every known model: role, licence, size, source, installed or not
     List(DeviceArgs),
-    /// Verify the files of the installed models
+    /// Verify the built-in files; run every installed network on a built-in input and hold it to its contract
     Check(DeviceArgs),
     /// Where models are looked for
     Path(DeviceArgs),
@@ -500,6 +507,8 @@ pub enum BenchPart {
     Sort,
     /// A text query in all views of --scene
     Query,
+    /// Every step of every installed network: seconds and peak memory
+    Models,
     /// The limits of the device
     Roofline,
 }
@@ -543,7 +552,7 @@ pub struct BenchArgs {
     /// query: what to look for
     #[arg(long, default_value = "a cup", value_name = "TEXT")]
     pub query: String,
-    /// query: folder of the models
+    /// query, models: folder of the models
     #[arg(long, value_name = "DIR")]
     pub models: Option<PathBuf>,
     /// Repeat each measurement for this long

@@ -1,9 +1,12 @@
 //! `splatvk bench`
 use super::args::{BenchArgs, BenchPart};
+use super::models::checked;
 use super::print;
 use crate::bench::{self, Bench, Budget, Report, Workload, compare};
 use crate::format::{scene_dir, write_json};
 use crate::gpu::Device;
+use crate::infer::check::check as check_model;
+use crate::infer::installed::inventory;
 use crate::infer::{RegionEncoder, Registry};
 use crate::run::encoder;
 use crate::{Error, Result};
@@ -20,6 +23,12 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         return print(&files.map(|f| format!("{}\n", f.display())).concat());
     }
     let has = |part| args.parts.contains(&part);
+    if has(BenchPart::Models) {
+        models(&Registry::open(args.models.as_deref())?)?;
+        if args.parts == [BenchPart::Models] {
+            return Ok(());
+        }
+    }
     // Everything that can be wrong with the input comes before the first measurement.
     let workload =
         if has(BenchPart::Training) || !args.sweep.is_empty() { Some(workload(args)?) } else { None };
@@ -76,6 +85,18 @@ fn workload(args: &BenchArgs) -> Result<Workload> {
             Workload::seeded(args.splats, args.width, args.height, args.sh_degree.unwrap_or(0), args.seed)
         }
     }
+}
+
+/// Seconds and peak memory per step of every installed network.
+fn models(registry: &Registry) -> Result<()> {
+    let found = inventory(registry);
+    if found.models.is_empty() {
+        return Err(Error::input("bench models: no network is installed; see splatvk models list"));
+    }
+    for model in &found.models {
+        print(&checked(model, Some(&check_model(model)?)))?;
+    }
+    Ok(())
 }
 
 /// The scene to ask and the model that speaks its language.

@@ -1,6 +1,8 @@
 //! `splatvk models list|check|path`
 use super::args::{ModelsAction, ModelsArgs};
 use super::{print, print_json};
+use crate::infer::check::{Measured, check};
+use crate::infer::installed::{Installed, Inventory, Known, inventory, known};
 use crate::infer::{ModelStatus, Registry};
 use crate::{Error, Result};
 use serde_json::json;
@@ -8,56 +10,187 @@ use std::fmt::Write;
 
 pub fn models(args: &ModelsArgs) -> Result<()> {
     match &args.action {
-        ModelsAction::List(device) => list(&Registry::open(device.models.as_deref())?.status(), device.json),
+        ModelsAction::List(device) => {
+            let registry = Registry::open(device.models.as_deref())?;
+            list(&registry, &inventory(&registry), device.json)
+        }
         ModelsAction::Check(device) => {
             let registry = Registry::open(device.models.as_deref())?;
-            let status = registry.status();
-            list(&status, device.json)?;
-            match status.iter().filter_map(|m| m.fix.as_deref()).next() {
-                Some(fix) => Err(Error::missing(fix)),
-                None => Ok(()),
-            }
+            check_all(&registry, device.json)
         }
         ModelsAction::Path(device) => {
             let registry = Registry::open(device.models.as_deref())?;
-            let folder = registry.folder().display();
+            let paths: Vec<String> = registry.folders().iter().map(|f| f.display().to_string()).collect();
             if device.json {
-                print_json(&json!({ "path": folder.to_string() }))
+                print_json(&json!({ "path": paths.first(), "paths": paths }))
             } else {
-                print(&format!("{folder}\n"))
+                print(&format!("{}\n", paths.join("\n")))
             }
         }
     }
 }
 
-fn list(status: &[ModelStatus], as_json: bool) -> Result<()> {
+fn list(registry: &Registry, found: &Inventory, as_json: bool) -> Result<()> {
+    let status = registry.status();
     if as_json {
-        return print_json(&json!({ "models": status.iter().map(to_json).collect::<Vec<_>>() }));
+        return print_json(&json!({
+            "models": status.iter().map(to_json).collect::<Vec<_>>(),
+            "known": known().iter().map(|k| known_json(k, registry, found)).collect::<Vec<_>>(),
+            "networks": found.models.iter().map(installed_json).collect::<Vec<_>>(),
+            "broken": found.broken.iter().map(|(file, why)| json!({ "file": file, "fix": why })).collect::<Vec<_>>(),
+        }));
     }
-    let mut text = String::new();
-    for m in status {
-        let role = format!("{:?}", m.role).to_lowercase();
-        let state = if m.installed { "installed" } else { "MISSING" };
-        let size = m.bytes as f64 / 1e6;
-        // Writing to a String cannot fail.
-        let _ = writeln!(
-            text,
-            "{role:<10} {:<28} {state:<9} {size:6.1} MB  {:<12} {}",
-            m.name, m.licence, m.source
-        );
-        let _ = writeln!(text, "{:10} sha256 {}", "", m.sha256);
-        if let Some(fix) = &m.fix {
-            let _ = writeln!(text, "{:10} → {fix}", "");
-        }
+    let mut text = String::from("Built-in pack: what splatvk uses unless told otherwise\n");
+    status.iter().for_each(|m| built_in(&mut text, m));
+    let packs = [
+        ("paper", "Paper pack: the networks of the paper; bring their weights yourself"),
+        ("open", "Open pack: every licence permits commercial use; bring their weights yourself"),
+        ("", "Others that splatvk can use"),
+    ];
+    for (pack, title) in packs {
+        let _ = writeln!(text, "\n{title}");
+        let of_pack =
+            |k: &&Known| if pack.is_empty() { k.packs.is_empty() } else { k.packs.iter().any(|p| p == pack) };
+        known().iter().filter(of_pack).for_each(|k| entry(&mut text, k, registry, found));
+    }
+    let strangers: Vec<&Installed> = found.models.iter().filter(|m| m.known().is_none()).collect();
+    if !strangers.is_empty() {
+        text.push_str("\nInstalled, not in the catalogue\n");
+        strangers.iter().for_each(|m| installed(&mut text, m));
+    }
+    if !found.broken.is_empty() {
+        text.push_str("\nNot usable\n");
+        found.broken.iter().for_each(|(_, why)| {
+            let _ = writeln!(text, "  → {why}");
+        });
     }
     print(&text)
 }
 
-/// The JSON of one model, as `models list --json`, `doctor --json` and `run.json` print it.
+fn built_in(text: &mut String, m: &ModelStatus) {
+    let role = format!("{:?}", m.role).to_lowercase();
+    let state = if m.installed { "installed" } else { "MISSING" };
+    let size = m.bytes as f64 / 1e6;
+    // Writing to a String cannot fail.
+    let _ =
+        writeln!(text, "{role:<10} {:<40} {state:<9} {size:7.1} MB  {:<28} {}", m.name, m.licence, m.source);
+    let _ = writeln!(text, "{:10} sha256 {}", "", m.sha256);
+    if let Some(fix) = &m.fix {
+        let _ = writeln!(text, "{:10} → {fix}", "");
+    }
+}
+
+fn entry(text: &mut String, k: &Known, registry: &Registry, found: &Inventory) {
+    let model = of_entry(k, found);
+    let state = if model.is_some() { "installed" } else { "-" };
+    let (role, size) = (k.role.name(), f64::from(k.megabytes));
+    let _ =
+        writeln!(text, "{role:<10} {:<40} {state:<9} {size:7.1} MB  {:<28} {}", k.name, k.licence, k.source);
+    match model {
+        Some(m) => installed(text, m),
+        None => {
+            let _ = writeln!(text, "{:10} looked for in {}; written by {}", "", place(k, registry), k.export);
+        }
+    }
+}
+
+fn installed(text: &mut String, m: &Installed) {
+    let duties: Vec<&str> = m.duties.iter().map(|d| d.name()).collect();
+    let untrained = if m.untrained() { ", UNTRAINED weights" } else { "" };
+    let _ =
+        writeln!(text, "{:10} {} in {}: {}{untrained}", "", m.name, m.folder.display(), duties.join(", "));
+    for graph in m.graphs.values() {
+        let (millions, size) = (graph.parameters as f64 / 1e6, graph.bytes() as f64 / 1e6);
+        let part = graph.binding.part.name();
+        let _ = writeln!(
+            text,
+            "{:10}   {part:<15} {millions:7.1} M weights {size:8.1} MB  {}",
+            "",
+            graph.path.display()
+        );
+    }
+}
+
+fn of_entry<'f>(k: &Known, found: &'f Inventory) -> Option<&'f Installed> {
+    found.models.iter().find(|m| m.known().is_some_and(|known| known.id == k.id))
+}
+
+fn place(k: &Known, registry: &Registry) -> String {
+    registry.folders().first().map_or(k.id.clone(), |f| f.join(&k.id).display().to_string())
+}
+
+fn check_all(registry: &Registry, as_json: bool) -> Result<()> {
+    let found = inventory(registry);
+    let status = registry.status();
+    let mut problems: Vec<String> = status.iter().filter_map(|m| m.fix.clone()).collect();
+    problems.extend(found.broken.iter().map(|(_, why)| why.clone()));
+    let mut results = Vec::new();
+    if !as_json {
+        let mut text = String::new();
+        status.iter().for_each(|m| built_in(&mut text, m));
+        print(&text)?;
+    }
+    for model in &found.models {
+        let result = check(model);
+        if let Err(e) = &result {
+            problems.push(e.to_string());
+        }
+        if !as_json {
+            print(&checked(model, result.as_deref().ok()))?;
+        }
+        results.push(json!({
+            "name": model.name, "untrained": model.untrained(), "steps": result.as_ref().ok(),
+            "fix": result.as_ref().err().map(|e| e.to_string()),
+        }));
+    }
+    if as_json {
+        let models: Vec<_> = status.iter().map(to_json).collect();
+        print_json(&json!({ "models": models, "networks": results, "problems": problems }))?;
+    }
+    match problems.into_iter().next() {
+        Some(first) => Err(Error::missing(first)),
+        None => Ok(()),
+    }
+}
+
+/// Seconds, memory and error of a model's steps.
+pub fn checked(model: &Installed, steps: Option<&[Measured]>) -> String {
+    let state = if steps.is_some() { "sound" } else { "NOT USABLE" };
+    let untrained = if model.untrained() { " (untrained weights)" } else { "" };
+    let mut text = format!("{}{untrained}: {state}\n", model.name);
+    for s in steps.unwrap_or_default() {
+        let error = s.error.map(|e| format!("  relative error {e:.1e}")).unwrap_or_default();
+        let memory = s.peak_memory as f64 / 1e9;
+        let _ = writeln!(text, "  {:<44} {:8.2} s {memory:6.2} GB{error}", s.step, s.seconds);
+    }
+    text
+}
+
+/// The JSON of one built-in model, as `models list --json`, `doctor --json` and `run.json` print it.
 pub fn to_json(m: &ModelStatus) -> serde_json::Value {
     json!({
         "role": format!("{:?}", m.role).to_lowercase(), "name": m.name, "file": m.file, "installed": m.installed,
         "bytes": m.bytes, "sha256": m.sha256, "actual_sha256": m.actual_sha256, "licence": m.licence,
-        "source": m.source, "fix": m.fix,
+        "source": m.source, "fix": m.fix, "pack": "built-in",
+    })
+}
+
+fn known_json(k: &Known, registry: &Registry, found: &Inventory) -> serde_json::Value {
+    json!({
+        "role": k.role, "id": k.id, "name": k.name, "family": k.family, "packs": k.packs, "licence": k.licence,
+        "megabytes": k.megabytes, "source": k.source, "export": k.export, "looked_for": place(k, registry),
+        "installed": of_entry(k, found).is_some(),
+    })
+}
+
+fn installed_json(m: &Installed) -> serde_json::Value {
+    let graph = |g: &crate::infer::graph::GraphFile| {
+        json!({
+            "part": g.binding.part, "file": g.path, "parameters": g.parameters, "bytes": g.bytes(), "opset": g.opset,
+        })
+    };
+    json!({
+        "name": m.name, "family": m.family, "duties": m.duties, "folder": m.folder, "untrained": m.untrained(),
+        "graphs": m.graphs.values().map(graph).collect::<Vec<_>>(),
     })
 }

@@ -1,12 +1,11 @@
 //! What the arguments mean: defaults resolved, names understood, contradictions refused. No work happens here.
 use super::args::{DeviceArgs, MethodArg, PresetArg, RunArgs};
+use crate::infer::installed::{Duty, known};
 use crate::language::Reducer;
-use crate::run::{FeatureSource, InitSource, MaskSource, Method, RunPlan};
+use crate::language::sam::SamOptions;
+use crate::run::{FeatureSource, InitSource, MaskSource, MatchSource, Method, RunPlan};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
-
-/// Networks that users may bring. The registry cannot run them yet; saying so beats "unknown name".
-const LARGE_MODELS: [&str; 7] = ["mast3r", "dust3r", "vggt", "sam", "clip", "lseg", "roma"];
 
 /// `splatvk run`
 pub fn run(args: &RunArgs) -> Result<RunPlan> {
@@ -28,9 +27,8 @@ pub fn run(args: &RunArgs) -> Result<RunPlan> {
             return Err(Error::input(format!("{flag} 0: give at least 1, or leave it out")));
         }
     }
-    match args.matcher.as_str() {
-        "auto" | "xfeat" => {}
-        other => return Err(unknown("--matcher", other, "auto, xfeat")),
+    if args.mask_points == 0 || args.mask_points > 128 {
+        return Err(Error::input(format!("--mask-points {}: give 1 to 128", args.mask_points)));
     }
     if let Some(blank) = args.queries.iter().find(|q| q.trim().is_empty()) {
         return Err(Error::input(format!("--query \"{blank}\": give a few words")));
@@ -42,7 +40,9 @@ pub fn run(args: &RunArgs) -> Result<RunPlan> {
         force: args.force,
         preset: args.preset.map(preset),
         init: init(&args.init)?,
+        matcher: matcher(&args.matcher)?,
         masks: masks(&args.masks)?,
+        sam: SamOptions { points: args.mask_points, crops: !args.no_mask_crops, ..SamOptions::default() },
         features: features(&args.features)?,
         queries: args.queries.clone(),
         seed: args.seed,
@@ -94,7 +94,8 @@ fn init(text: &str) -> Result<InitSource> {
     match text.split_once(':') {
         Some(("cameras", file)) if !file.is_empty() => Ok(InitSource::Cameras(existing("--init", file)?)),
         None if text == "auto" || text == "sfm" => Ok(InitSource::Sfm),
-        _ => Err(unknown("--init", text, "auto, sfm, cameras:FILE")),
+        None => network("--init", text, Duty::Geometry, "auto, sfm, cameras:FILE").map(InitSource::Network),
+        _ => Err(unknown("--init", text, Duty::Geometry, "auto, sfm, cameras:FILE")),
     }
 }
 
@@ -102,7 +103,8 @@ fn masks(text: &str) -> Result<MaskSource> {
     match text.split_once(':') {
         Some(("dir", dir)) if !dir.is_empty() => Ok(MaskSource::Dir(existing("--masks", dir)?)),
         None if text == "auto" || text == "graph" => Ok(MaskSource::Graph),
-        _ => Err(unknown("--masks", text, "auto, graph, dir:DIR")),
+        None => network("--masks", text, Duty::Masks, "auto, graph, dir:DIR").map(MaskSource::Network),
+        _ => Err(unknown("--masks", text, Duty::Masks, "auto, graph, dir:DIR")),
     }
 }
 
@@ -110,7 +112,10 @@ fn features(text: &str) -> Result<FeatureSource> {
     match text.split_once(':') {
         Some(("dir", dir)) if !dir.is_empty() => Ok(FeatureSource::Dir(existing("--features", dir)?)),
         None if text == "auto" || text == "words" => Ok(FeatureSource::Words),
-        _ => Err(unknown("--features", text, "auto, words, dir:DIR")),
+        None => {
+            network("--features", text, Duty::Features, "auto, words, dir:DIR").map(FeatureSource::Network)
+        }
+        _ => Err(unknown("--features", text, Duty::Features, "auto, words, dir:DIR")),
     }
 }
 
@@ -122,13 +127,27 @@ pub(super) fn existing(flag: &str, path: &str) -> Result<PathBuf> {
     Err(Error::input(format!("{flag}: {} does not exist; check the path", path.display())))
 }
 
-fn unknown(flag: &str, value: &str, choices: &str) -> Error {
-    if LARGE_MODELS.contains(&value) {
-        return Error::missing(format!(
-            "{flag} {value}: this release has no loader for that model yet; use one of: {choices}"
-        ));
+fn matcher(text: &str) -> Result<MatchSource> {
+    match text {
+        "auto" | "xfeat" => Ok(MatchSource::Xfeat),
+        _ => network("--matcher", text, Duty::Matcher, "auto, xfeat").map(MatchSource::Network),
     }
-    Error::input(format!("{flag} {value}: unknown; use one of: {choices}"))
+}
+
+/// The name of a family of networks, or of one, that does what the flag asks for; whether it is installed is seen later.
+fn network(flag: &str, name: &str, duty: Duty, built_in: &str) -> Result<String> {
+    let meant = known().iter().any(|k| k.role == duty && (k.family == name || k.id == name));
+    if meant { Ok(name.to_owned()) } else { Err(unknown(flag, name, duty, built_in)) }
+}
+
+fn unknown(flag: &str, value: &str, duty: Duty, built_in: &str) -> Error {
+    let mut choices: Vec<&str> = built_in.split(", ").collect();
+    for model in known().iter().filter(|k| k.role == duty) {
+        if !choices.contains(&model.family.as_str()) {
+            choices.push(&model.family);
+        }
+    }
+    Error::input(format!("{flag} {value}: unknown; use one of: {}", choices.join(", ")))
 }
 
 #[cfg(test)]
@@ -152,6 +171,7 @@ mod tests {
         assert_eq!((plan.init, plan.masks), (InitSource::Sfm, MaskSource::Graph));
         assert_eq!((plan.features, plan.feature_dim), (FeatureSource::Words, 16));
         assert_eq!(plan.method, Method::SparseLgs);
+        assert_eq!((plan.matcher, plan.sam), (MatchSource::Xfeat, SamOptions::default()));
     }
 
     #[test]
@@ -162,13 +182,25 @@ mod tests {
     }
 
     #[test]
+    fn families_and_names_of_networks_are_understood() {
+        let plan =
+            plan(&["--init", "dust3r", "--matcher", "roma", "--masks", "sam_vit_h", "--features", "clip"])
+                .unwrap();
+        assert_eq!(plan.init, InitSource::Network("dust3r".into()));
+        assert_eq!(plan.matcher, MatchSource::Network("roma".into()));
+        assert_eq!(plan.masks, MaskSource::Network("sam_vit_h".into()));
+        assert_eq!(plan.features, FeatureSource::Network("clip".into()));
+    }
+
+    #[test]
     fn what_cannot_be_meant_is_refused_with_the_choices() {
         for (extra, says) in [
-            (["--init", "colmap"], "auto, sfm, cameras:FILE"),
-            (["--init", "mast3r"], "no loader"),
+            (["--init", "colmap"], "auto, sfm, cameras:FILE, mast3r, dust3r"),
+            (["--masks", "clip"], "auto, graph, dir:DIR, sam"),
+            (["--mask-points", "0"], "1 to 128"),
             (["--masks", "dir:nowhere"], "does not exist"),
-            (["--features", "clip"], "no loader"),
-            (["--matcher", "sift"], "auto, xfeat"),
+            (["--features", "sam"], "auto, words, dir:DIR, clip"),
+            (["--matcher", "sift"], "auto, xfeat, roma"),
             (["--feature-dim", "5"], "3, 8 or 16"),
             (["--query", " "], "a few words"),
             (["--method=langsplat", "--feature-dim=16"], "has 3 dimensions"),

@@ -1,6 +1,6 @@
 //! `splatvk view`: the interactive view of a scene, served to the browser of this machine.
 use super::args::ViewArgs;
-use super::{encoder, print, print_json, progress};
+use super::{print, print_json, progress};
 use crate::format::scene_dir::{self, Scene};
 use crate::gpu::Device;
 use crate::infer::Registry;
@@ -8,6 +8,7 @@ use crate::photo;
 use crate::query::QueryOptions;
 use crate::report::viewer::{self, Names, SCENE_PATH, Scene3d};
 use crate::run::ask::QueryScene;
+use crate::run::encoder;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
 use serde_json::{Value, json};

@@ -22,7 +22,7 @@ pub struct Classifier {
 
 /// The bounding box of a region, in pixels, ends excluded.
 #[derive(Clone, Copy)]
-struct Extent {
+pub(super) struct Extent {
     x0: usize,
     y0: usize,
     x1: usize,
@@ -52,8 +52,10 @@ impl Classifier {
             extents(labels, count).into_iter().enumerate().filter_map(|(i, e)| Some((i, e?))).collect();
         let mut all = vec![0f32; count * CLASSES];
         for batch in present.chunks(BATCH) {
-            let crops: Vec<f32> =
-                batch.par_iter().flat_map_iter(|(i, e)| crop(image, labels, *i as i32, *e)).collect();
+            let crops: Vec<f32> = batch
+                .par_iter()
+                .flat_map_iter(|(i, e)| crop(image, labels, *i as i32, *e, SIDE, GREY))
+                .collect();
             let input = Input::F32(vec![batch.len(), 3, SIDE, SIDE], crops);
             let output = self.session.run(vec![("image", input)], &["logits"])?;
             let logits = output.first().map(|t| &t.data[..]).unwrap_or_default();
@@ -72,7 +74,8 @@ fn softmax(logits: &[f32]) -> Vec<f32> {
     powers.into_iter().map(|p| p / total).collect()
 }
 
-fn extents(labels: &Plane<i32>, count: usize) -> Vec<Option<Extent>> {
+/// The boxes of the regions `0..count`; `None` for one without pixels.
+pub(super) fn extents(labels: &Plane<i32>, count: usize) -> Vec<Option<Extent>> {
     let mut found: Vec<Option<Extent>> = vec![None; count];
     for y in 0..labels.height {
         for x in 0..labels.width {
@@ -86,33 +89,40 @@ fn extents(labels: &Plane<i32>, count: usize) -> Vec<Option<Extent>> {
     found
 }
 
-/// The region in the middle of a grey square, resized to the network's input, [3, 224, 224] in [0, 1].
-fn crop(image: &RgbImage, labels: &Plane<i32>, label: i32, e: Extent) -> Vec<f32> {
+/// The region in the middle of a square of one value, resized to the network's input, [3, to, to] in [0, 1].
+pub(super) fn crop(
+    image: &RgbImage,
+    labels: &Plane<i32>,
+    label: i32,
+    e: Extent,
+    to: usize,
+    around: f32,
+) -> Vec<f32> {
     let side = (e.x1 - e.x0).max(e.y1 - e.y0);
     let left = (e.x0 + e.x1) as f32 / 2.0 - side as f32 / 2.0;
     let top = (e.y0 + e.y1) as f32 / 2.0 - side as f32 / 2.0;
-    let columns = taps(left, side, e.x0, e.x1);
-    let rows = taps(top, side, e.y0, e.y1);
+    let columns = taps(left, side, to, e.x0, e.x1);
+    let rows = taps(top, side, to, e.y0, e.y1);
     // Separable: first along x for every source row of the box, then along y.
-    let mut squeezed = vec![[0f32; 3]; (e.y1 - e.y0) * SIDE];
+    let mut squeezed = vec![[0f32; 3]; (e.y1 - e.y0) * to];
     for y in e.y0..e.y1 {
         for (x, (start, weights)) in columns.iter().enumerate() {
-            let out = &mut squeezed[(y - e.y0) * SIDE + x];
+            let out = &mut squeezed[(y - e.y0) * to + x];
             for (k, w) in weights.iter().enumerate() {
                 if labels.at(start + k, y) == label {
                     let c = image.at(start + k, y);
-                    // Relative to grey, so that whatever is left out counts as grey.
-                    (0..3).for_each(|i| out[i] += w * (c[i] - GREY));
+                    // Relative to the surroundings, so that whatever is left out counts as such.
+                    (0..3).for_each(|i| out[i] += w * (c[i] - around));
                 }
             }
         }
     }
-    let mut planes = vec![GREY; 3 * SIDE * SIDE];
+    let mut planes = vec![around; 3 * to * to];
     for (y, (start, weights)) in rows.iter().enumerate() {
-        for x in 0..SIDE {
+        for x in 0..to {
             for (k, w) in weights.iter().enumerate() {
-                let c = squeezed[(start + k - e.y0) * SIDE + x];
-                (0..3).for_each(|i| planes[(i * SIDE + y) * SIDE + x] += w * c[i]);
+                let c = squeezed[(start + k - e.y0) * to + x];
+                (0..3).for_each(|i| planes[(i * to + y) * to + x] += w * c[i]);
             }
         }
     }
@@ -121,8 +131,8 @@ fn crop(image: &RgbImage, labels: &Plane<i32>, label: i32, e: Extent) -> Vec<f32
 
 /// For each output pixel of one axis: the first source pixel and the weights from there on. A triangle as wide as the
 /// reduction (at least one source pixel to each side), cut to the source range `from..to`.
-fn taps(start: f32, side: usize, from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
-    let scale = side as f32 / SIDE as f32;
+fn taps(start: f32, side: usize, pixels: usize, from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
+    let scale = side as f32 / pixels as f32;
     let reach = scale.max(1.0);
     let one = |i: usize| {
         let centre = start + (i as f32 + 0.5) * scale;
@@ -131,7 +141,7 @@ fn taps(start: f32, side: usize, from: usize, to: usize) -> Vec<(usize, Vec<f32>
         let weight = |j: usize| (1.0 - ((j as f32 + 0.5) - centre).abs() / reach).max(0.0) / reach;
         (first, (first..last.clamp(first, to)).map(weight).collect())
     };
-    (0..SIDE).map(one).collect()
+    (0..pixels).map(one).collect()
 }
 
 #[cfg(test)]
@@ -152,7 +162,7 @@ mod tests {
         let e = extents(&labels, 3)[2].unwrap();
         assert_eq!((e.x0, e.y0, e.x1, e.y1), (5, 10, 25, 14));
         assert!(extents(&labels, 3)[0].is_none() && extents(&labels, 2).iter().all(Option::is_none));
-        let planes = crop(&image, &labels, 2, e);
+        let planes = crop(&image, &labels, 2, e, SIDE, GREY);
         let at = |c: usize, x: usize, y: usize| planes[(c * SIDE + y) * SIDE + x];
         for (c, want) in [0.2, 0.4, 0.6].into_iter().enumerate() {
             assert!((at(c, 112, 112) - want).abs() < 1e-4, "{}", at(c, 112, 112));
@@ -167,7 +177,7 @@ mod tests {
     #[test]
     fn weights_of_a_reduction_sum_to_one_inside() {
         for (side, from, to) in [(1000, 0, 1000), (224, 0, 224), (60, 0, 60)] {
-            let all = taps(0.0, side, from, to);
+            let all = taps(0.0, side, SIDE, from, to);
             for (_, weights) in &all[20..200] {
                 assert!((weights.iter().sum::<f32>() - 1.0).abs() < 0.02, "{side}: {weights:?}");
             }

@@ -1,17 +1,39 @@
 //! ONNX inference: sessions, model registry, one file per model family.
+//!
+//! Networks that users bring are recognised by what goes in and comes out: [`onnx`] reads a file's header, [`contract`] says
+//! what splatvk asks of each part of a model, [`adapter`] maps a file's names to it, [`graph`] runs it by role.
+pub mod adapter;
 #[cfg(test)]
 pub(crate) mod breakfast;
+pub mod cache;
+pub mod check;
 mod classify;
+pub mod clip;
 mod colour;
+pub mod contract;
+pub mod graph;
 pub mod hed;
+pub mod installed;
+mod multiview;
+pub mod onnx;
+pub mod pairs;
+pub mod prepare;
 mod registry;
 mod runtime;
+pub mod sam;
+#[cfg(test)]
+pub(crate) mod testing;
+#[cfg(test)]
+mod tests;
 pub mod text;
+pub mod warp;
 pub mod words;
 pub mod xfeat;
 
 pub use registry::{ModelStatus, Registry, Role, home};
 pub use runtime::{Input, Session, Tensor, runtime, runtime_build};
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::Result;
 use crate::scene::{Plane, RgbImage};
@@ -28,6 +50,13 @@ pub(crate) fn nearest(regions: &[f32], rows: &[f32], dim: usize, best: usize) ->
         list
     };
     regions.par_chunks_exact(dim).map(of).collect()
+}
+
+/// Held while a large network is loaded: stages that run beside each other take turns, so that a run needs the memory of one
+/// network and every network has all cores.
+pub(crate) fn alone() -> MutexGuard<'static, ()> {
+    static TURN: Mutex<()> = Mutex::new(());
+    TURN.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Puts image regions and texts into one space of unit vectors, so that a cosine says how well a phrase names a

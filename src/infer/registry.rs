@@ -60,13 +60,13 @@ pub struct ModelStatus {
     pub fix: Option<String>,
 }
 
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 struct Package {
     version: String,
     licence: String,
 }
 
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 struct PackFile {
     role: Role,
     name: String,
@@ -76,7 +76,7 @@ struct PackFile {
     sha256: String,
 }
 
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 struct Pack {
     packages: HashMap<String, Package>,
     files: Vec<PackFile>,
@@ -91,32 +91,52 @@ pub fn home() -> PathBuf {
 }
 
 /// Finds model files and vouches for them.
+#[derive(Clone)]
 pub struct Registry {
-    folder: PathBuf,
+    folders: Vec<PathBuf>,
     pack: Pack,
 }
 
 impl Registry {
-    /// `models_dir`, else `SPLATVK_MODELS`, else `models` under [`home`]. Opening does not look at the files.
+    /// The folders of `models_dir`, else of `SPLATVK_MODELS` (both may be lists, written like `PATH`), else `models` under
+    /// [`home`]. Opening does not look at the files.
     pub fn open(models_dir: Option<&Path>) -> Result<Self> {
         let pack =
             serde_json::from_str(PACK).map_err(|e| Error::work(format!("built-in model table: {e}")))?;
-        let folder = match models_dir {
-            Some(folder) if !folder.is_dir() => {
-                return Err(Error::input(format!("{}: no such model folder; {FIX}", folder.display())));
+        let list = |text: &std::ffi::OsStr| -> Vec<PathBuf> {
+            std::env::split_paths(text).filter(|p| !p.as_os_str().is_empty()).collect()
+        };
+        let folders = match models_dir {
+            Some(folders) => {
+                let folders = list(folders.as_os_str());
+                if let Some(absent) = folders.iter().find(|f| !f.is_dir()) {
+                    return Err(Error::input(format!("{}: no such model folder; {FIX}", absent.display())));
+                }
+                folders
             }
-            Some(folder) => folder.to_path_buf(),
             None => match std::env::var_os("SPLATVK_MODELS").filter(|v| !v.is_empty()) {
-                Some(folder) => PathBuf::from(folder),
-                None => home().join("models"),
+                Some(folders) => list(&folders),
+                None => vec![home().join("models")],
             },
         };
-        Ok(Registry { folder, pack })
+        Ok(Registry { folders, pack })
     }
 
-    /// The folder that is searched.
-    pub fn folder(&self) -> &Path {
-        &self.folder
+    /// Looks in these folders.
+    #[cfg(test)]
+    pub(crate) fn of(folders: &[&Path]) -> Registry {
+        let pack = serde_json::from_str(PACK).unwrap();
+        Registry { folders: folders.iter().map(|f| f.to_path_buf()).collect(), pack }
+    }
+
+    /// The folders that are searched, first to last.
+    pub fn folders(&self) -> &[PathBuf] {
+        &self.folders
+    }
+
+    /// Whether a file is one of the built-in pack's.
+    pub(super) fn owns(&self, file: &Path) -> bool {
+        self.pack.files.iter().any(|f| file.file_name().is_some_and(|n| n == f.file.as_str()))
     }
 
     /// Every file of the pack, read and hashed.
@@ -142,7 +162,9 @@ impl Registry {
     }
 
     fn inspect(&self, entry: &PackFile) -> ModelStatus {
-        let file = self.folder.join(&entry.file);
+        let places: Vec<PathBuf> = self.folders.iter().map(|f| f.join(&entry.file)).collect();
+        let there = places.iter().find(|p| p.exists()).or(places.first());
+        let file = there.cloned().unwrap_or_else(|| PathBuf::from(&entry.file));
         let (actual, problem) = match content_hash(&file) {
             Ok(hash) if hash == entry.sha256 => (Some(hash), None),
             Ok(hash) => {
@@ -179,7 +201,7 @@ impl Registry {
 }
 
 /// sha256 of a file in lower-case hex; remembered per path, size and modification time.
-fn content_hash(path: &Path) -> std::io::Result<String> {
+pub(super) fn content_hash(path: &Path) -> std::io::Result<String> {
     type Known = HashMap<PathBuf, (u64, SystemTime, String)>;
     static KNOWN: OnceLock<Mutex<Known>> = OnceLock::new();
     let known = KNOWN.get_or_init(Mutex::default);

@@ -5,8 +5,9 @@ use std::sync::OnceLock;
 use ort::environment::Environment;
 use ort::logging::LogLevel;
 use ort::session::{SessionInputValue, builder::GraphOptimizationLevel};
-use ort::value::Tensor as OrtTensor;
+use ort::value::{Tensor as OrtTensor, TensorElementType};
 
+use super::contract::reorder;
 use super::registry::home;
 use crate::{Error, Result};
 
@@ -71,12 +72,64 @@ pub struct Tensor {
     pub data: Vec<f32>,
 }
 
-/// What a session is fed.
+/// What a session is fed. Floats and integers are converted to the element type that the graph asks for.
+#[derive(Clone)]
 pub enum Input {
     /// Row-major floats.
     F32(Vec<usize>, Vec<f32>),
     /// Row-major integers.
     I64(Vec<usize>, Vec<i64>),
+}
+
+impl Input {
+    /// Axes, outermost first.
+    pub fn shape(&self) -> &[usize] {
+        match self {
+            Input::F32(shape, _) | Input::I64(shape, _) => shape,
+        }
+    }
+
+    /// The same values in another layout ([`super::contract`]); `None` when the shape does not fit.
+    pub(super) fn relaid(self, from: &str, to: &str) -> Option<Input> {
+        Some(match self {
+            Input::F32(shape, data) => {
+                let (shape, data) = reorder(shape, data, from, to)?;
+                Input::F32(shape, data)
+            }
+            Input::I64(shape, data) => {
+                let (shape, data) = reorder(shape, data, from, to)?;
+                Input::I64(shape, data)
+            }
+        })
+    }
+
+    fn value(self, wanted: Option<TensorElementType>) -> ort::Result<SessionInputValue<'static>> {
+        use TensorElementType as T;
+        let floats = |shape: Vec<usize>, data: Vec<f32>| -> ort::Result<SessionInputValue<'static>> {
+            Ok(match wanted {
+                Some(T::Float16) => {
+                    let half: Vec<half::f16> = data.into_iter().map(half::f16::from_f32).collect();
+                    OrtTensor::from_array((shape, half))?.into()
+                }
+                Some(T::Float64) => {
+                    let wide: Vec<f64> = data.into_iter().map(f64::from).collect();
+                    OrtTensor::from_array((shape, wide))?.into()
+                }
+                _ => OrtTensor::from_array((shape, data))?.into(),
+            })
+        };
+        match (self, wanted) {
+            (Input::F32(shape, data), _) => floats(shape, data),
+            (Input::I64(shape, data), Some(T::Int32)) => {
+                let narrow: Vec<i32> = data.into_iter().map(|v| v as i32).collect();
+                Ok(OrtTensor::from_array((shape, narrow))?.into())
+            }
+            (Input::I64(shape, data), Some(T::Float16 | T::Float32 | T::Float64)) => {
+                floats(shape, data.into_iter().map(|v| v as f32).collect())
+            }
+            (Input::I64(shape, data), _) => Ok(OrtTensor::from_array((shape, data))?.into()),
+        }
+    }
 }
 
 /// One loaded network. Dropping it frees its memory.
@@ -90,24 +143,22 @@ impl Session {
     pub fn load(file: &Path) -> Result<Self> {
         let environment = &loaded()?.1;
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        let inner = build(environment, file, threads)
-            .map_err(|e| Error::missing(format!("{}: {}", file.display(), line(&e))))?;
+        let inner = build(environment, file, threads).map_err(|e| {
+            Error::missing(format!("{}: ONNX Runtime cannot load it: {}", file.display(), line(&e)))
+        })?;
         Ok(Session { inner, file: file.to_path_buf() })
     }
 
-    /// Runs the graph once and returns the named outputs.
-    pub fn run(&mut self, inputs: Vec<(&'static str, Input)>, outputs: &[&str]) -> Result<Vec<Tensor>> {
+    /// Runs the graph once and returns the named outputs as 32-bit floats.
+    pub fn run(&mut self, inputs: Vec<(impl Into<String>, Input)>, outputs: &[&str]) -> Result<Vec<Tensor>> {
         let file = self.file.display().to_string();
         let failed = |e: ort::Error| Error::work(format!("{file}: {}", line(&e)));
-        let mut fed: Vec<(&'static str, SessionInputValue<'_>)> = Vec::with_capacity(inputs.len());
+        let mut fed: Vec<(String, SessionInputValue<'_>)> = Vec::with_capacity(inputs.len());
         for (name, input) in inputs {
-            fed.push((
-                name,
-                match input {
-                    Input::F32(shape, data) => OrtTensor::from_array((shape, data)).map_err(failed)?.into(),
-                    Input::I64(shape, data) => OrtTensor::from_array((shape, data)).map_err(failed)?.into(),
-                },
-            ));
+            let name = name.into();
+            let port = self.inner.inputs().iter().find(|i| i.name() == name);
+            let wanted = port.and_then(|i| i.dtype().tensor_type());
+            fed.push((name, input.value(wanted).map_err(failed)?));
         }
         let produced = self.inner.run(fed).map_err(failed)?;
         let mut tensors = Vec::with_capacity(outputs.len());
@@ -115,11 +166,33 @@ impl Session {
             let value = produced
                 .get(*name)
                 .ok_or_else(|| Error::work(format!("{file}: the graph has no output {name}")))?;
-            let (shape, data) = value.try_extract_tensor::<f32>().map_err(failed)?;
-            tensors.push(Tensor { shape: shape.iter().map(|n| *n as usize).collect(), data: data.to_vec() });
+            tensors.push(floats(value).map_err(failed)?);
         }
         Ok(tensors)
     }
+}
+
+fn floats(value: &ort::value::DynValue) -> ort::Result<Tensor> {
+    use TensorElementType as T;
+    let lengths = |shape: &ort::value::Shape| shape.iter().map(|n| *n as usize).collect();
+    Ok(match value.dtype().tensor_type() {
+        Some(T::Float16) => {
+            let (shape, data) = value.try_extract_tensor::<half::f16>()?;
+            Tensor { shape: lengths(shape), data: data.iter().map(|v| v.to_f32()).collect() }
+        }
+        Some(T::Float64) => {
+            let (shape, data) = value.try_extract_tensor::<f64>()?;
+            Tensor { shape: lengths(shape), data: data.iter().map(|v| *v as f32).collect() }
+        }
+        Some(T::Int64) => {
+            let (shape, data) = value.try_extract_tensor::<i64>()?;
+            Tensor { shape: lengths(shape), data: data.iter().map(|v| *v as f32).collect() }
+        }
+        _ => {
+            let (shape, data) = value.try_extract_tensor::<f32>()?;
+            Tensor { shape: lengths(shape), data: data.to_vec() }
+        }
+    })
 }
 
 fn build(environment: &Environment, file: &Path, threads: usize) -> ort::Result<ort::session::Session> {

@@ -17,8 +17,9 @@
 //! the canonical phrases of the relevancy score should be.
 //!
 //! It knows about a thousand everyday things and eleven colours. CLIP is the full model.
+use super::cache::{Key, remember};
 use super::classify::{CLASSES, Classifier};
-use super::registry::{Registry, Role, home, sha256};
+use super::registry::{Registry, Role};
 use super::text::{self, TextEncoder, normalise};
 use super::{RegionEncoder, colour, nearest};
 use crate::scene::{Plane, RgbImage};
@@ -170,36 +171,6 @@ fn region_colours(image: &RgbImage, labels: &Plane<i32>, count: usize) -> Vec<Op
     sums.into_iter().map(|(sum, n)| (n > 0).then(|| sum.map(|s| s / n as f32))).collect()
 }
 
-/// `compute`, or what it gave the last time with these model files: naming a thousand classes takes seconds, which a
-/// single query should not pay. The file is a cache: anything odd about it, and it is computed and written again.
-fn remembered(
-    registry: &Registry,
-    length: usize,
-    compute: impl FnOnce() -> Result<Vec<f32>>,
-) -> Result<Vec<f32>> {
-    let folder = home().join("cache");
-    let inputs = [Role::Text, Role::Tokenizer, Role::Classes];
-    let used = registry.status_of(&inputs).into_iter().map(|s| s.sha256).collect::<String>();
-    let file = folder.join(format!("class-names-{}.f32", &sha256(used.as_bytes())[..16]));
-    if let Ok(bytes) = std::fs::read(&file)
-        && bytes.len() == 64 + 4 * length
-        && bytes[..64] == *sha256(&bytes[64..]).as_bytes()
-    {
-        return Ok(bytemuck::pod_collect_to_vec(&bytes[64..]));
-    }
-    let values = compute()?;
-    let body: &[u8] = bytemuck::cast_slice(&values);
-    let partial = file.with_extension(format!("partial-{}", std::process::id()));
-    // Not being able to keep it costs time only.
-    let kept = std::fs::create_dir_all(&folder)
-        .and_then(|()| std::fs::write(&partial, [sha256(body).as_bytes(), body].concat()))
-        .and_then(|()| std::fs::rename(&partial, &file));
-    if kept.is_err() {
-        let _ = std::fs::remove_file(&partial);
-    }
-    Ok(values)
-}
-
 impl Vocabulary {
     fn load(registry: &Registry) -> Result<Self> {
         let file = registry.path(Role::Classes)?;
@@ -215,9 +186,11 @@ impl Vocabulary {
             )));
         }
         let mut encoder = TextEncoder::load(registry)?;
-        let mut names = remembered(registry, CLASSES * text::DIM, || {
-            encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>())
-        })?;
+        // Naming a thousand classes takes seconds, which a single query should not pay.
+        let used = registry.status_of(&[Role::Text, Role::Tokenizer, Role::Classes]);
+        let key = used.iter().fold(Key::new("class-names"), |key, file| key.text(&file.sha256));
+        let mut names =
+            remember(key, || encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>()))?;
         let mut mean = vec![0f32; text::DIM];
         for name in names.chunks_exact(text::DIM) {
             mean.iter_mut().zip(name).for_each(|(m, n)| *m += n / CLASSES as f32);

@@ -10,6 +10,7 @@ pub mod codebook;
 pub mod dir;
 pub mod graph;
 pub mod matcher;
+pub mod sam;
 
 pub use build::{BuildOptions, Language, Reducer, attach_features, build};
 

@@ -9,6 +9,7 @@ mod resize;
 pub use affine::Affine;
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
 pub use frame::Frame;
+pub use resize::Kernel;
 
 use crate::progress::Progress;
 use crate::scene::RgbImage;

@@ -1,8 +1,9 @@
 //! The part of a run that needs no GPU: what the photos show, in masks, features and words. It runs beside geometry and
 //! training, which leave the processor mostly idle where the device is a GPU.
-use super::{RunPlan, sources};
+use super::{Networks, RunPlan, sources};
 use crate::infer::{RegionEncoder, Registry};
-use crate::language::{self, Language, ViewMasks};
+use crate::language::{self, Language, ViewMasks, sam};
+use crate::photo::Photo;
 use crate::pose::Geometry;
 use crate::progress::Progress;
 use crate::query::TextQuery;
@@ -13,6 +14,8 @@ use crate::{Error, Result};
 /// What it needs.
 pub(super) struct Describer<'a> {
     pub plan: &'a RunPlan,
+    pub photos: &'a [Photo],
+    pub networks: &'a Networks,
     pub images: &'a [RgbImage],
     pub registry: &'a Registry,
     /// Masks from a folder; built-in ones otherwise.
@@ -39,18 +42,38 @@ impl Describer<'_> {
     ) -> Result<Described> {
         // First what can be refused: a phrase that a table of embeddings does not hold.
         let queries = sources::queries(&self.plan.queries, self.encoder.as_mut())?;
+        // What needs no geometry comes before it: learned edges or a network's masks, descriptors or a network's warps.
+        if let (None, Some(model)) = (&self.given, &self.networks.masks) {
+            let masks = sam::masks(model, self.images, &self.plan.sam, progress)?;
+            let some = masks.iter().flat_map(|m| &m.levels).any(|l| !l.quality.is_empty());
+            // Untrained weights rarely give a stable mask; the stages after this one need some to work on.
+            if some || !model.untrained() {
+                self.given = Some(masks);
+            } else {
+                progress.warn(&format!(
+                    "{}: no mask passes in untrained weights; built-in masks instead",
+                    model.name
+                ));
+            }
+        }
         let edges = match &self.given {
             Some(_) => Vec::new(),
             None => sources::edges(self.images, self.registry, progress)?,
         };
-        let dense = sources::dense(self.images, self.registry, progress)?;
+        let (warped, dense) = match &self.networks.matcher {
+            Some(model) => (Some(sources::network_matches(model, self.photos, progress)?), Vec::new()),
+            None => (None, sources::dense(self.images, self.registry, progress)?),
+        };
         let geometry = geometry()?;
         let masks = match self.given.take() {
             Some(masks) => masks,
             None => sources::graph_masks(self.images, &edges, geometry, progress)?,
         };
         let masks = sources::with_features(masks, self.images, self.encoder.as_mut(), progress)?;
-        let matches = sources::matches(&dense, geometry, progress)?;
+        let matches = match warped {
+            Some(links) => links,
+            None => sources::matches(&dense, geometry, progress)?,
+        };
         let options = self.plan.recipe().build(self.encoder.space(), self.plan.seed);
         let (cameras, depths) = (&geometry.cameras, &geometry.depths);
         let language = language::build(&masks, cameras, depths, &matches, &options, progress)?;

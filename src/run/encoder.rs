@@ -11,7 +11,12 @@ pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncod
         return sources::table(&table);
     }
     let space = scene.language.as_ref().map_or("", |l| l.space.as_str());
-    let encoder = sources::encoder(&FeatureSource::Words, &registry)?;
+    // "clip:0123456789abcdef" was made with a network of the family clip.
+    let source = match space.split_once(':') {
+        Some((family, _)) => FeatureSource::Network(family.to_owned()),
+        None => FeatureSource::Words,
+    };
+    let encoder = sources::encoder(&source, &registry)?;
     if encoder.space() != space {
         return Err(Error::input(format!(
             "{}: its features are of the space \"{space}\", the installed text model speaks \"{}\"; put {TEXT_EMBEDDINGS} \

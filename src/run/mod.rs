@@ -17,13 +17,16 @@ use crate::fit::{self, LanguageOptions, Preset, RgbOptions};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras};
 use crate::gpu::{self, Device};
-use crate::infer::Registry;
+use crate::infer::installed::{Duty, Installed};
+use crate::infer::{Registry, pairs};
 use crate::language;
+use crate::language::sam::SamOptions;
 use crate::photo::{self, Photo};
 use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, InitChoice};
 use crate::progress::{Progress, Recorded, StageRecord};
 use crate::query::{Highlight, QueryOptions, QueryResult};
+use crate::report::ModelUsed;
 use crate::report::viewer::{Names, ShownAnswer};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
 use crate::{Error, Result};
@@ -41,6 +44,17 @@ pub enum InitSource {
     Cameras(PathBuf),
     /// Known cameras, joined to the photos by name; stereo.
     Given(Vec<Camera>),
+    /// Pointmaps of an installed network (DUSt3R, MASt3R, VGGT and others).
+    Network(String),
+}
+
+/// Where dense matches between photos come from.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub enum MatchSource {
+    /// XFeat descriptors along epipolar lines.
+    Xfeat,
+    /// An installed dense matcher (RoMa).
+    Network(String),
 }
 
 /// Where masks come from.
@@ -50,6 +64,8 @@ pub enum MaskSource {
     Graph,
     /// Label maps `<stem>_s.npy` in a folder.
     Dir(PathBuf),
+    /// An installed network that answers points (SAM and others).
+    Network(String),
 }
 
 /// Where region features and text embeddings come from.
@@ -59,6 +75,8 @@ pub enum FeatureSource {
     Words,
     /// `<stem>_f.npy` and `text_embeddings.npz` in a folder.
     Dir(PathBuf),
+    /// An installed pair of image and text towers (CLIP).
+    Network(String),
 }
 
 /// What to do, with every default that does not depend on the machine resolved.
@@ -76,8 +94,12 @@ pub struct RunPlan {
     pub preset: Option<Preset>,
     /// Cameras and points.
     pub init: InitSource,
+    /// Dense matches.
+    pub matcher: MatchSource,
     /// Masks.
     pub masks: MaskSource,
+    /// How a mask network is asked.
+    pub sam: SamOptions,
     /// Features.
     pub features: FeatureSource,
     /// Texts to answer once the scene is there.
@@ -112,7 +134,9 @@ impl Default for RunPlan {
             force: false,
             preset: None,
             init: InitSource::Sfm,
+            matcher: MatchSource::Xfeat,
             masks: MaskSource::Graph,
+            sam: SamOptions::default(),
             features: FeatureSource::Words,
             queries: Vec::new(),
             seed: 0,
@@ -186,8 +210,10 @@ pub struct Outcome {
     pub answers: Vec<Answers>,
     /// The text model's own phrases per level and code.
     pub names: Names,
-    /// Models that were used.
+    /// Built-in models.
     pub models: Vec<crate::infer::ModelStatus>,
+    /// Files of the networks that were used.
+    pub networks: Vec<ModelUsed>,
     /// Times and memory per stage, up to the writing of the scene.
     pub stages: Vec<StageRecord>,
     /// Wall seconds up to there; less than the stages together, since some overlap.
@@ -232,8 +258,10 @@ pub fn save(outcome: &mut Outcome, out: &Path, force: bool, progress: &dyn Progr
 fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded) -> Result<Outcome> {
     let registry = Registry::open(plan.models.as_deref())?;
     // Whatever can be refused is read before the long work, not after it.
+    let networks = Networks::of(plan, &registry)?;
+    networks.warn_untrained(progress);
     let init = match &plan.init {
-        InitSource::Sfm => InitChoice::Sfm,
+        InitSource::Sfm | InitSource::Network(_) => InitChoice::Sfm,
         InitSource::Cameras(file) => InitChoice::Cameras(cameras::read(file)?),
         InitSource::Given(cameras) => InitChoice::Cameras(cameras.clone()),
     };
@@ -242,9 +270,22 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
 
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
     let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
-    let describer = Describer { plan, images: &images, registry: &registry, given, encoder };
-    let reconstruct =
-        || pose::initialise(device, &photos, &init, &registry, &StereoOptions::preset(preset), progress);
+    let describer = Describer {
+        plan,
+        photos: &photos,
+        images: &images,
+        registry: &registry,
+        networks: &networks,
+        given,
+        encoder,
+    };
+    let stereo = StereoOptions::preset(preset);
+    let initialise =
+        |init: &InitChoice| pose::initialise(device, &photos, init, &registry, &stereo, progress);
+    let reconstruct = || match &networks.geometry {
+        Some(model) => geometry_of(model, &photos, initialise, progress),
+        None => initialise(&init),
+    };
     let train = |geometry: &Geometry| {
         fit::train_rgb(
             device,
@@ -289,10 +330,101 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
         answers,
         names,
         models: registry.status(),
+        networks: networks.used()?,
         stages: progress.stages(),
         seconds: progress.seconds(),
         warnings: progress.warnings(),
     })
+}
+
+/// The networks that a plan asks for.
+pub(crate) struct Networks {
+    pub(crate) geometry: Option<Installed>,
+    pub(crate) matcher: Option<Installed>,
+    pub(crate) masks: Option<Installed>,
+    features: Option<Installed>,
+}
+
+impl Networks {
+    /// Finds them all before any work; the error says what is missing.
+    fn of(plan: &RunPlan, registry: &Registry) -> Result<Networks> {
+        let find = |duty, name: Option<&String>| name.map(|n| registry.installed(duty, n)).transpose();
+        let geometry = match &plan.init {
+            InitSource::Network(name) => Some(name),
+            InitSource::Sfm | InitSource::Cameras(_) | InitSource::Given(_) => None,
+        };
+        let matcher = match &plan.matcher {
+            MatchSource::Network(name) => Some(name),
+            MatchSource::Xfeat => None,
+        };
+        let masks = match &plan.masks {
+            MaskSource::Network(name) => Some(name),
+            MaskSource::Graph | MaskSource::Dir(_) => None,
+        };
+        let features = match &plan.features {
+            FeatureSource::Network(name) => Some(name),
+            FeatureSource::Words | FeatureSource::Dir(_) => None,
+        };
+        Ok(Networks {
+            geometry: find(Duty::Geometry, geometry)?,
+            matcher: find(Duty::Matcher, matcher)?,
+            masks: find(Duty::Masks, masks)?,
+            features: find(Duty::Features, features)?,
+        })
+    }
+
+    fn all(&self) -> impl Iterator<Item = &Installed> {
+        [&self.geometry, &self.matcher, &self.masks, &self.features].into_iter().flatten()
+    }
+
+    /// What run.json says about them.
+    fn used(&self) -> Result<Vec<ModelUsed>> {
+        let mut used = Vec::new();
+        for model in self.all() {
+            let licence = model.known().map_or("unknown", |k| k.licence.as_str());
+            for (file, sha256) in model.files()? {
+                let file = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
+                let name =
+                    format!("{} {file}{}", model.name, if model.untrained() { " (untrained)" } else { "" });
+                used.push(ModelUsed { name, sha256, licence: licence.to_owned() });
+            }
+        }
+        Ok(used)
+    }
+
+    fn warn_untrained(&self, progress: &dyn Progress) {
+        let names: Vec<&str> = self.all().filter(|m| m.untrained()).map(|m| m.name.as_str()).collect();
+        if !names.is_empty() {
+            progress.warn(&format!(
+                "{}: untrained weights; what they say means nothing, only time and memory do",
+                names.join(", ")
+            ));
+        }
+    }
+}
+
+/// Cameras and depth from a network's pointmaps. Untrained weights give no geometry: then the photos themselves must.
+fn geometry_of(
+    model: &Installed,
+    photos: &[Photo],
+    initialise: impl Fn(&InitChoice) -> Result<Geometry>,
+    progress: &dyn Progress,
+) -> Result<Geometry> {
+    let (views, maps) = pairs::pointmaps(model, photos, progress)?;
+    let init = InitChoice::Pointmaps(views, maps);
+    match initialise(&init) {
+        Err(Error::Cancelled) => Err(Error::Cancelled),
+        Err(error) if model.untrained() => {
+            drop(init);
+            progress.warn(&format!(
+                "{}: no geometry in untrained pointmaps ({error}); cameras from sfm",
+                model.name
+            ));
+            initialise(&InitChoice::Sfm)
+        }
+        Ok(geometry) => Ok(Geometry { method: format!("{} pointmaps", model.name), ..geometry }),
+        Err(error) => Err(error),
+    }
 }
 
 /// Geometry and splats on this thread; masks, features and alignment beside them on another. The first error stops both.
@@ -359,7 +491,7 @@ fn write(workspace: Workspace, outcome: &Outcome, progress: &dyn Progress) -> Re
     progress.check()?;
     let table = match &outcome.plan.features {
         FeatureSource::Dir(dir) => Some(dir.join(sources::TEXT_TABLE)),
-        FeatureSource::Words => None,
+        FeatureSource::Words | FeatureSource::Network(_) => None,
     };
     let contents = Contents {
         splats: &outcome.splats,

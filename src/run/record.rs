@@ -22,6 +22,7 @@ pub fn run_record(o: &Outcome) -> RunRecord {
             .iter()
             .filter(used)
             .map(|m| ModelUsed { name: m.name.clone(), sha256: m.sha256.clone(), licence: m.licence.clone() })
+            .chain(o.networks.iter().cloned())
             .collect(),
         seconds: o.seconds,
         stages: o.stages.clone(),

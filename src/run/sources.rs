@@ -1,9 +1,11 @@
 //! Masks, features and text embeddings from wherever the plan says they come from.
 use super::{FeatureSource, MaskSource};
+use crate::infer::clip::Clip;
 use crate::infer::hed::Hed;
+use crate::infer::installed::{Duty, Installed};
 use crate::infer::words::RegionWords;
 use crate::infer::xfeat::{DenseFeatures, XFeat};
-use crate::infer::{RegionEncoder, Registry, nearest};
+use crate::infer::{RegionEncoder, Registry, nearest, warp};
 use crate::language::align::{PairLinks, links_from_warps};
 use crate::language::dir::{self, TextEmbeddings};
 use crate::language::{ViewMasks, graph, matcher};
@@ -28,9 +30,11 @@ pub fn given_masks(
 ) -> Result<Option<Vec<ViewMasks>>> {
     let (masks, features) = match (masks, features) {
         (MaskSource::Dir(m), FeatureSource::Dir(f)) => (m, Some(f)),
-        (MaskSource::Dir(m), FeatureSource::Words) => (m, None),
-        (MaskSource::Graph, FeatureSource::Words) => return Ok(None),
-        (MaskSource::Graph, FeatureSource::Dir(f)) => {
+        (MaskSource::Dir(m), FeatureSource::Words | FeatureSource::Network(_)) => (m, None),
+        (MaskSource::Graph | MaskSource::Network(_), FeatureSource::Words | FeatureSource::Network(_)) => {
+            return Ok(None);
+        }
+        (MaskSource::Graph | MaskSource::Network(_), FeatureSource::Dir(f)) => {
             return Err(Error::input(format!(
                 "--features dir:{0}: precomputed features belong to precomputed masks; add --masks dir:{0}",
                 f.display()
@@ -77,8 +81,9 @@ pub const DIR_SPACE: &str = "dir";
 /// The encoder behind `--features`.
 pub fn encoder(source: &FeatureSource, registry: &Registry) -> Result<Box<dyn RegionEncoder>> {
     match source {
-        FeatureSource::Words => Ok(Box::new(RegionWords::load(Registry::open(Some(registry.folder()))?)?)),
+        FeatureSource::Words => Ok(Box::new(RegionWords::load(registry.clone())?)),
         FeatureSource::Dir(dir) => table(&dir.join(TEXT_TABLE)),
+        FeatureSource::Network(name) => Ok(Box::new(Clip::load(registry.installed(Duty::Features, name)?)?)),
     }
 }
 
@@ -160,6 +165,18 @@ pub fn with_features(
     }
     progress.end();
     Ok(masks)
+}
+
+/// Links of every unordered pair from a dense matching network.
+pub fn network_matches(
+    model: &Installed,
+    photos: &[Photo],
+    progress: &dyn Progress,
+) -> Result<Vec<PairLinks>> {
+    let mut warps = warp::warps(model, photos, progress)?.into_iter();
+    let views = photos.len();
+    let pairs = (0..views).flat_map(|i| (i + 1..views).map(move |j| (i, j)));
+    Ok(pairs.zip(&mut warps).map(|((i, j), (there, back))| links_from_warps(i, j, &there, &back)).collect())
 }
 
 /// Dense features of every photo, for [`matches`].

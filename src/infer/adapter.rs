@@ -1,0 +1,403 @@
+//! Adapters: how one file's tensor names, layouts and value ranges map to the roles of a [`Contract`]. Adapters are data, TOML
+//! files: the built-in ones cover the public exports, a user's own lies beside the model (`adapter.toml` in its folder, or
+//! `NAME.toml` beside `NAME.onnx`) and needs to say only what differs from the built-in one of the same family.
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::Deserialize;
+
+use super::contract::{Contract, Part, Slot, unify};
+use super::onnx::{Dim, Header, Kind, Port, listed};
+use super::runtime::Tensor;
+use crate::{Error, Result};
+
+const BUILT_IN: [(&str, &str); 11] = [
+    ("clip", include_str!("adapters/clip.toml")),
+    ("lseg", include_str!("adapters/lseg.toml")),
+    ("sam", include_str!("adapters/sam.toml")),
+    ("sam-transformers", include_str!("adapters/sam-transformers.toml")),
+    ("sam2", include_str!("adapters/sam2.toml")),
+    ("dust3r", include_str!("adapters/dust3r.toml")),
+    ("mast3r", include_str!("adapters/mast3r.toml")),
+    ("vggt", include_str!("adapters/vggt.toml")),
+    ("depth-anything-3", include_str!("adapters/depth-anything-3.toml")),
+    ("roma", include_str!("adapters/roma.toml")),
+    ("roma2", include_str!("adapters/roma2.toml")),
+];
+
+/// How a photo becomes the network's input.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ImageSpec {
+    /// Subtracted from values in [0, 1].
+    pub mean: [f32; 3],
+    /// What remains is divided by this.
+    pub std: [f32; 3],
+    /// Length of the longer side, pixels, where the graph leaves it open.
+    pub size: usize,
+    /// Both sides are multiples of this.
+    #[serde(default = "one")]
+    pub multiple: usize,
+    /// How the photo is brought to that size.
+    #[serde(default)]
+    pub fit: Fit,
+    /// How it is resampled.
+    #[serde(default)]
+    pub filter: Filter,
+}
+
+fn one() -> usize {
+    1
+}
+
+/// How a photo of another aspect is brought to the input size.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Fit {
+    /// Longer side to the size, the rest follows; nothing is cut or added.
+    #[default]
+    Resize,
+    /// As `Resize`, then black below and to the right (after normalisation).
+    Pad,
+    /// Both sides to the size.
+    Squash,
+    /// As `Resize`, then cut symmetrically to the multiple or the fixed size.
+    Crop,
+}
+
+/// How a photo is resampled; all widen when they shrink, as Pillow's do.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Filter {
+    /// Triangle.
+    Bilinear,
+    /// Cubic with a = −0.5.
+    #[default]
+    Bicubic,
+    /// Three lobes to shrink, cubic to enlarge (DUSt3R).
+    Lanczos,
+}
+
+/// What the program must still apply to an output.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Activation {
+    /// 1 / (1 + e^−x): logits → probability.
+    Sigmoid,
+    /// x · (e^|x| − 1) / |x| of each point.
+    Expm1Norm,
+    /// 1 + e^x.
+    OnePlusExp,
+    /// e^x.
+    Exp,
+    /// Camera-to-world matrices are inverted.
+    Invert,
+}
+
+impl Activation {
+    /// Applies it to an output in the contract's layout.
+    pub fn apply(self, tensor: &mut Tensor) {
+        let data = &mut tensor.data;
+        match self {
+            Activation::Sigmoid => data.iter_mut().for_each(|v| *v = 1.0 / (1.0 + (-*v).exp())),
+            Activation::Exp => data.iter_mut().for_each(|v| *v = v.exp()),
+            Activation::OnePlusExp => data.iter_mut().for_each(|v| *v = 1.0 + v.exp()),
+            Activation::Expm1Norm => {
+                for p in data.chunks_exact_mut(3) {
+                    let d = p.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-8);
+                    p.iter_mut().for_each(|v| *v *= d.exp_m1() / d);
+                }
+            }
+            Activation::Invert => {
+                let rows = tensor.shape.iter().rev().nth(1).copied().unwrap_or(3);
+                for m in data.chunks_exact_mut(4 * rows) {
+                    let old: Vec<f32> = m.to_vec();
+                    for r in 0..3 {
+                        (0..3).for_each(|c| m[4 * r + c] = old[4 * c + r]);
+                        m[4 * r + 3] = -(0..3).map(|k| old[4 * k + r] * old[4 * k + 3]).sum::<f32>();
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// A file's own name for a role, or several that occur.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(untagged)]
+enum Names {
+    One(String),
+    Any(Vec<String>),
+}
+
+impl Names {
+    fn list(&self) -> &[String] {
+        match self {
+            Names::One(name) => std::slice::from_ref(name),
+            Names::Any(names) => names,
+        }
+    }
+}
+
+/// What an adapter says about one graph.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct GraphSpec {
+    part: Part,
+    #[serde(default)]
+    names: BTreeMap<String, Names>,
+    #[serde(default)]
+    layouts: BTreeMap<String, String>,
+    image: Option<ImageSpec>,
+    #[serde(default)]
+    apply: BTreeMap<String, Activation>,
+    /// Roles without which it is another model, although the contract could do without.
+    #[serde(default)]
+    needs: Vec<String>,
+    /// A mask decoder that adds the padding point to a prompt itself.
+    #[serde(default)]
+    pads: bool,
+    #[serde(skip)]
+    family: String,
+}
+
+/// An adapter file.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Adapter {
+    /// The kind of model; built-in adapters of the same family fill in what this one leaves out.
+    #[serde(default)]
+    pub family: String,
+    /// Identifies the weights: graphs with different values do not belong together.
+    pub checkpoint: Option<String>,
+    /// The weights were never trained: results mean nothing, and nothing is expected of them.
+    #[serde(default)]
+    pub untrained: bool,
+    #[serde(default)]
+    graph: Vec<GraphSpec>,
+}
+
+impl Adapter {
+    /// The adapter of a model file: `NAME.toml` beside it, else `adapter.toml` in its folder, else none of its own.
+    pub fn beside(model: &Path) -> Result<Adapter> {
+        for path in [model.with_extension("toml"), model.with_file_name("adapter.toml")] {
+            if path.is_file() {
+                let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
+                return Adapter::parse(&text).map_err(|e| Error::input(format!("{}: {e}", path.display())));
+            }
+        }
+        Ok(Adapter::default())
+    }
+
+    fn parse(text: &str) -> Result<Adapter, String> {
+        let one_line = |e: toml::de::Error| e.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
+        let mut adapter: Adapter = toml::from_str(text).map_err(one_line)?;
+        for graph in &mut adapter.graph {
+            graph.family.clone_from(&adapter.family);
+            let contract = graph.part.contract();
+            for role in graph.names.keys().chain(graph.layouts.keys()) {
+                contract.slot(role).ok_or_else(|| unknown_role(contract, role))?;
+            }
+        }
+        Ok(adapter)
+    }
+
+    /// Every description that may fit a graph of this adapter: its own, completed from the built-in ones, then those.
+    fn specs(&self) -> Result<Vec<GraphSpec>> {
+        let mut built_in = Vec::new();
+        for (name, text) in BUILT_IN {
+            let adapter =
+                Adapter::parse(text).map_err(|e| Error::work(format!("built-in adapter {name}: {e}")))?;
+            built_in.extend(adapter.graph);
+        }
+        if !self.family.is_empty() && built_in.iter().any(|g| g.family == self.family) {
+            built_in.retain(|g| g.family == self.family);
+        }
+        let mut specs = Vec::new();
+        for own in &self.graph {
+            let mut alike =
+                built_in.iter().filter(|g| g.part == own.part && g.family == self.family).peekable();
+            if alike.peek().is_none() {
+                specs.push(own.clone());
+            }
+            specs.extend(alike.map(|base| own.over(base)));
+        }
+        specs.extend(built_in.into_iter().map(|g| GraphSpec {
+            family: if self.family.is_empty() { g.family } else { self.family.clone() },
+            ..g
+        }));
+        Ok(specs)
+    }
+
+    /// Which part the graph is, and which of its tensors has which role.
+    pub fn fit(&self, model: &Path, header: &Header) -> Result<Binding> {
+        let mut best: Option<Binding> = None;
+        let mut nearest: Option<(usize, String)> = None;
+        for spec in self.specs()? {
+            match spec.fit(header) {
+                Ok(binding) => {
+                    if best.as_ref().is_none_or(|b| binding.ports.len() > b.ports.len()) {
+                        best = Some(binding);
+                    }
+                }
+                Err(misfit) => {
+                    // Of equally many complaints the contract with more in common is nearer.
+                    let distance = 100 * misfit.complaints.len() + 99 - misfit.bound.min(99);
+                    if nearest.as_ref().is_none_or(|(d, _)| distance < *d) {
+                        let complaints = misfit.complaints.join("; ");
+                        let text = format!("{} ({}): {complaints}", spec.part.name(), spec.family);
+                        nearest = Some((distance, text));
+                    }
+                }
+            }
+        }
+        best.ok_or_else(|| {
+            Error::input(format!(
+                "{}: fits no known model: inputs {}; outputs {}; nearest is {}; if a name differs, say so in {} (docs/models.md)",
+                model.display(),
+                listed(&header.inputs),
+                listed(&header.outputs),
+                nearest.map(|n| n.1).unwrap_or_default(),
+                model.with_extension("toml").display(),
+            ))
+        })
+    }
+}
+
+fn unknown_role(contract: &Contract, role: &str) -> String {
+    let roles: Vec<&str> = contract.inputs.iter().chain(contract.outputs).map(|s| s.role).collect();
+    format!("{} has no role \"{role}\"; it has {}", contract.name, roles.join(", "))
+}
+
+/// The tensor behind a role.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Bound {
+    /// Its name in the graph.
+    pub name: String,
+    /// Its layout, as far as the file tells.
+    pub layout: Option<&'static str>,
+    /// Its axes.
+    pub dims: Option<Vec<Dim>>,
+}
+
+/// A graph whose tensors all have roles.
+#[derive(Clone, Debug)]
+pub struct Binding {
+    /// What it does.
+    pub part: Part,
+    /// The kind of model.
+    pub family: String,
+    /// Role → tensor.
+    pub ports: BTreeMap<&'static str, Bound>,
+    /// How photos become input.
+    pub image: Option<ImageSpec>,
+    /// Role → what must still be applied.
+    pub apply: BTreeMap<String, Activation>,
+    /// A mask decoder that adds the padding point to a prompt itself.
+    pub pads: bool,
+}
+
+impl Binding {
+    /// What must still be applied to a role's output. "points" stands for points1 and points2.
+    pub fn activation(&self, role: &str) -> Option<Activation> {
+        let stem = role.trim_end_matches(|c: char| c.is_ascii_digit());
+        self.apply.get(role).or_else(|| self.apply.get(stem)).copied()
+    }
+}
+
+struct Misfit {
+    bound: usize,
+    complaints: Vec<String>,
+}
+
+impl GraphSpec {
+    /// This description, completed from another one.
+    fn over(&self, base: &GraphSpec) -> GraphSpec {
+        let mut spec = base.clone();
+        spec.family.clone_from(&self.family);
+        spec.names.extend(self.names.clone());
+        spec.layouts.extend(self.layouts.clone());
+        spec.apply.extend(self.apply.clone());
+        spec.image = self.image.clone().or(spec.image);
+        spec
+    }
+
+    fn fit(&self, header: &Header) -> Result<Binding, Misfit> {
+        let contract = self.part.contract();
+        let (mut ports, mut complaints) = (BTreeMap::new(), Vec::new());
+        let mut known = Vec::new();
+        let sides =
+            [("input", contract.inputs, &header.inputs), ("output", contract.outputs, &header.outputs)];
+        for (side, slots, given) in sides {
+            for slot in slots {
+                match self.bind(side, slot, given, &mut known) {
+                    Ok(Some(bound)) => {
+                        ports.insert(slot.role, bound);
+                    }
+                    Ok(None) => {}
+                    Err(complaint) => complaints.push(complaint),
+                }
+            }
+        }
+        for input in &header.inputs {
+            if !ports.values().any(|b: &Bound| b.name == input.name)
+                && !complaints.iter().any(|c| c.contains(&input.name))
+            {
+                complaints.push(format!("nothing to feed to input {input}"));
+            }
+        }
+        if !complaints.is_empty() {
+            return Err(Misfit { bound: ports.len(), complaints });
+        }
+        let (image, apply, family) = (self.image.clone(), self.apply.clone(), self.family.clone());
+        Ok(Binding { part: self.part, family, ports, image, apply, pads: self.pads })
+    }
+
+    fn bind<'s>(
+        &self,
+        side: &str,
+        slot: &'static Slot,
+        given: &[Port],
+        known: &mut Vec<(&'s str, usize)>,
+    ) -> Result<Option<Bound>, String>
+    where
+        'static: 's,
+    {
+        let names = self.names.get(slot.role).map(Names::list).unwrap_or_default();
+        let Some(port) = names.iter().find_map(|n| given.iter().find(|p| p.name == *n)) else {
+            if slot.optional && !self.needs.iter().any(|n| n == slot.role) {
+                return Ok(None);
+            }
+            return Err(format!("no {side} for {} [{}]", slot.role, slot.shape));
+        };
+        let kind_fits = match port.kind {
+            Kind::Float => true,
+            Kind::Integer => slot.integer,
+            Kind::Other => false,
+        };
+        if !kind_fits {
+            return Err(format!("{side} {port} for {} has an element type that it cannot have", slot.role));
+        }
+        let Some(dims) = &port.dims else {
+            return Ok(Some(Bound { name: port.name.clone(), layout: None, dims: None }));
+        };
+        let lengths: Vec<Option<usize>> = dims
+            .iter()
+            .map(|d| match d {
+                Dim::Fixed(n) => Some(*n),
+                Dim::Free => None,
+            })
+            .collect();
+        let wanted = self.layouts.get(slot.role);
+        let layout = std::iter::once(&slot.shape)
+            .chain(slot.layouts)
+            .filter(|l| wanted.is_none_or(|w| w == **l))
+            .find(|l| unify(l, &lengths, known));
+        match layout {
+            Some(layout) => {
+                Ok(Some(Bound { name: port.name.clone(), layout: Some(*layout), dims: Some(dims.clone()) }))
+            }
+            None => Err(format!("{side} {port} cannot be {} [{}]", slot.role, slot.shape)),
+        }
+    }
+}

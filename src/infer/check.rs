@@ -1,0 +1,197 @@
+//! Runs an installed network on a built-in input and holds it to its contract; measures time and memory on the way.
+use std::path::Path;
+use std::time::Instant;
+
+use super::cache;
+use super::clip::Clip;
+use super::graph::GraphFile;
+use super::installed::{Duty, Installed};
+use super::runtime::Input;
+use super::sam::{BATCH, MASKS, Sam};
+use super::{RegionEncoder, pairs, warp};
+use crate::format::npy::{self, NpyData};
+use crate::photo::{Affine, Frame, Photo};
+use crate::progress::{Silent, peak_memory, reset_peak_memory};
+use crate::scene::{Plane, RgbImage};
+use crate::{Error, Result};
+
+/// Largest difference to the reference, relative to its largest value: what float32 sums in another order may cost.
+const TOLERANCE: f32 = 1e-3;
+
+/// What one step took.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct Measured {
+    /// What was done.
+    pub step: String,
+    /// Wall seconds.
+    pub seconds: f64,
+    /// Peak resident memory of the process during the step, bytes; 0 where the system does not tell.
+    pub peak_memory: u64,
+    /// Largest difference to PyTorch's answer, relative to its largest value.
+    pub error: Option<f32>,
+}
+
+fn measured<T>(step: String, steps: &mut Vec<Measured>, work: impl FnOnce() -> Result<T>) -> Result<T> {
+    reset_peak_memory();
+    let began = Instant::now();
+    let done = work()?;
+    let seconds = began.elapsed().as_secs_f64();
+    steps.push(Measured { step, seconds, peak_memory: peak_memory(), error: None });
+    Ok(done)
+}
+
+/// Repeats the reference of every graph that has one, then the model's duty on two built-in pictures. An error names the
+/// file and what it did wrong.
+pub fn check(model: &Installed) -> Result<Vec<Measured>> {
+    let _uncached = cache::off();
+    let mut steps = Vec::new();
+    for graph in model.graphs.values() {
+        let reference = graph.path.with_extension("reference.npz");
+        if reference.is_file() {
+            let step = format!("{}, as the export ran it", graph.binding.part.name());
+            let error = measured(step, &mut steps, || repeat(graph, &reference))?;
+            if let Some(last) = steps.last_mut() {
+                last.error = Some(error);
+            }
+        }
+    }
+    let photos = pictures();
+    for duty in &model.duties {
+        match duty {
+            Duty::Geometry => {
+                // Networks that see all photos at once may ask for a certain number.
+                let count = model.graphs.values().find_map(|g| g.fixed("images", "N")).unwrap_or(2);
+                let some: Vec<Photo> = photos.iter().cycle().take(count).cloned().collect();
+                measured(format!("geometry of {count} photos"), &mut steps, || {
+                    pairs::pointmaps(model, &some, &Silent)
+                })?;
+            }
+            Duty::Matcher => {
+                let step = "matches of a pair, both ways".to_string();
+                measured(step, &mut steps, || warp::warps(model, &photos, &Silent))?;
+            }
+            Duty::Masks => masks(model, &photos[0].image, &mut steps)?,
+            Duty::Features => features(model, &photos[0].image, &mut steps)?,
+            // Runs with the features.
+            Duty::Text => {}
+        }
+    }
+    Ok(steps)
+}
+
+/// The largest relative difference between the graph's outputs and the reference beside it.
+fn repeat(file: &GraphFile, reference: &Path) -> Result<f32> {
+    let arrays = npy::read_npz(reference)?;
+    let mut graph = file.load()?;
+    let mut inputs = Vec::new();
+    for (role, bound) in &file.binding.ports {
+        let Some(array) = arrays.get(&format!("in.{}", bound.name)) else { continue };
+        let shape = array.shape.clone();
+        let whole = !matches!(array.data, NpyData::F16(_) | NpyData::F32(_) | NpyData::F64(_));
+        inputs.push((
+            *role,
+            match whole {
+                true => Input::I64(shape, array.to_i32().into_iter().map(i64::from).collect()),
+                false => Input::F32(shape, array.to_f32()),
+            },
+        ));
+    }
+    let mut outputs = graph.run(inputs)?;
+    let mut worst = 0f32;
+    for (role, bound) in &file.binding.ports {
+        let Some(wanted) = arrays.get(&format!("out.{}", bound.name)) else { continue };
+        // Layouts that differ from the contract's are for the toy graphs of the tests; exports use the contract's own, up to
+        // the channel axis of warps.
+        let given = outputs.take(role)?;
+        let raw = super::contract::relayout(
+            given,
+            file.binding.part.contract().slot(role).map_or("", |s| s.shape),
+            bound.layout.unwrap_or_default(),
+        );
+        let wanted = activated(file, role, wanted.to_f32());
+        let given = raw.map(|t| t.data).unwrap_or_default();
+        if given.len() != wanted.len() {
+            return Err(Error::work(format!(
+                "{}: output {} has another size than its reference",
+                file.path.display(),
+                bound.name
+            )));
+        }
+        let largest = wanted.iter().fold(f32::MIN_POSITIVE, |m, v| m.max(v.abs()));
+        let apart = wanted.iter().zip(&given).fold(0f32, |m, (a, b)| m.max((a - b).abs()));
+        worst = worst.max(apart / largest);
+    }
+    if worst > TOLERANCE {
+        return Err(Error::missing(format!(
+            "{}: differs from its reference by {worst:.1e} of the largest value (at most {TOLERANCE:.0e}); export it again",
+            file.path.display()
+        )));
+    }
+    Ok(worst)
+}
+
+/// The reference after what the program applies to the graph's output.
+fn activated(file: &GraphFile, role: &str, data: Vec<f32>) -> Vec<f32> {
+    let mut tensor = super::Tensor { shape: vec![data.len()], data };
+    if let Some(activation) = file.binding.activation(role) {
+        activation.apply(&mut tensor);
+    }
+    tensor.data
+}
+
+fn masks(model: &Installed, image: &RgbImage, steps: &mut Vec<Measured>) -> Result<()> {
+    let mut net = measured("encoder and decoder loaded".to_string(), steps, || Sam::load(model))?;
+    let encoded = measured("photo encoded".to_string(), steps, || net.encode(image))?;
+    let (w, h) = (image.width as f64, image.height as f64);
+    let points: Vec<[f64; 2]> = (0..BATCH).map(|k| [(k as f64 + 0.5) * w / BATCH as f64, h / 2.0]).collect();
+    let found = measured(format!("{BATCH} prompts decoded"), steps, || net.decode(&encoded, &points))?;
+    if found.scores.len() != MASKS * BATCH || found.logits.len() != MASKS * BATCH * found.width * found.height
+    {
+        return Err(Error::work(format!("model {}: wrong number of masks", model.name)));
+    }
+    Ok(())
+}
+
+fn features(model: &Installed, image: &RgbImage, steps: &mut Vec<Measured>) -> Result<()> {
+    let step = "towers loaded and introduced".to_string();
+    let mut net = measured(step, steps, || Clip::load(model.clone()))?;
+    let half = |p: usize| i32::from(p % image.width >= image.width / 2);
+    let data = (0..image.width * image.height).map(half).collect();
+    let labels = Plane { width: image.width, height: image.height, data };
+    let rows = measured("2 regions".to_string(), steps, || net.embed_regions(image, &labels, 2))?;
+    let unit = |row: &[f32]| (row.iter().map(|v| v * v).sum::<f32>() - 1.0).abs() < 1e-3;
+    if !rows.chunks_exact(net.dim()).all(unit) {
+        return Err(Error::work(format!("model {}: a region without direction", model.name)));
+    }
+    measured("1 text".to_string(), steps, || net.embed_texts(&["a blue mug"])).map(drop)
+}
+
+/// Two views of a textured wall and a nearer box, a step apart.
+fn pictures() -> Vec<Photo> {
+    let (width, height) = (640usize, 480usize);
+    let one = |k: usize| {
+        // Smooth pseudo-random texture; the wall moves by 20 pixels, the box before it by 60.
+        let colour = |x: f64, y: f64, seed: f64| {
+            let wave = |a: f64, b: f64| 0.5 + 0.5 * ((x * a + seed).sin() * (y * b - seed).cos());
+            [wave(0.11, 0.07) as f32, wave(0.05, 0.13) as f32, wave(0.23, 0.19) as f32]
+        };
+        let pixel = |p: usize| {
+            let (x, y) = ((p % width) as f64, (p / width) as f64);
+            let near = x + 60.0 * k as f64;
+            let inside = (260.0..420.0).contains(&near) && (160.0..330.0).contains(&y);
+            if inside { colour(near, y, 3.0) } else { colour(x + 20.0 * k as f64, y, 1.0) }
+        };
+        let image = RgbImage { width, height, data: (0..width * height).map(pixel).collect() };
+        Photo {
+            path: format!("built-in {k}").into(),
+            stem: format!("built-in {k}"),
+            original_size: (width as u32, height as u32),
+            to_working: Affine::IDENTITY,
+            frame: Frame::default(),
+            exif_focal: None,
+            camera_model: None,
+            image,
+        }
+    };
+    (0..2).map(one).collect()
+}

@@ -1,0 +1,288 @@
+//! The networks that users brought: every `.onnx` file in the model folders, recognised and put together into models.
+//!
+//! A folder is a model (`sam_vit_b/encoder.onnx`, `sam_vit_b/decoder.onnx`); files that lie directly in a model folder
+//! belong together when their names do (`sam_vit_b_encoder.onnx`, `sam_vit_b_decoder.onnx`).
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+use serde::{Deserialize, Serialize};
+
+use super::cache::fingerprint;
+use super::contract::Part;
+use super::graph::GraphFile;
+use super::registry::Registry;
+use crate::{Error, Result};
+
+/// What a model does in a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Deserialize, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Duty {
+    /// Cameras, depth and points.
+    Geometry,
+    /// Dense matches between photos.
+    Matcher,
+    /// Masks on three levels.
+    Masks,
+    /// Features of image regions.
+    Features,
+    /// Embeddings of texts.
+    Text,
+}
+
+impl Duty {
+    /// The name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Duty::Geometry => "geometry",
+            Duty::Matcher => "matcher",
+            Duty::Masks => "masks",
+            Duty::Features => "features",
+            Duty::Text => "text",
+        }
+    }
+}
+
+/// A network that splatvk knows and does not ship.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Known {
+    /// Folder or beginning of the file names under which it is looked for.
+    pub id: String,
+    /// What people call it.
+    pub name: String,
+    /// What it does.
+    pub role: Duty,
+    /// What `--init`, `--matcher`, `--masks` or `--features` call it.
+    pub family: String,
+    /// "paper", "open".
+    pub packs: Vec<String>,
+    /// Of code and weights.
+    pub licence: String,
+    /// Size of its float32 files.
+    pub megabytes: u32,
+    /// Where it is from.
+    pub source: String,
+    /// What writes its ONNX files.
+    pub export: String,
+}
+
+/// The known networks, in order of preference within a family.
+pub fn known() -> &'static [Known] {
+    #[derive(Default, Deserialize)]
+    struct Catalogue {
+        model: Vec<Known>,
+    }
+    static KNOWN: OnceLock<Vec<Known>> = OnceLock::new();
+    KNOWN.get_or_init(|| {
+        // A test reads the same text; a mistake in it cannot reach users.
+        toml::from_str::<Catalogue>(include_str!("catalogue.toml")).unwrap_or_default().model
+    })
+}
+
+/// A network that is there, whole.
+#[derive(Clone, Debug)]
+pub struct Installed {
+    /// Name of its folder, or what its file names share.
+    pub name: String,
+    /// What `--init` and the others call it.
+    pub family: String,
+    /// What it does.
+    pub duties: Vec<Duty>,
+    /// Its graphs, one per part.
+    pub graphs: BTreeMap<Part, GraphFile>,
+    /// Where it lies.
+    pub folder: PathBuf,
+}
+
+impl Installed {
+    /// The graph of a part.
+    pub fn graph(&self, part: Part) -> Result<&GraphFile> {
+        self.graphs.get(&part).ok_or_else(|| {
+            Error::missing(format!("{}: model {} has no {}", self.folder.display(), self.name, part.name()))
+        })
+    }
+
+    /// Whether none of it was trained.
+    pub fn untrained(&self) -> bool {
+        self.graphs.values().any(|g| g.untrained)
+    }
+
+    /// (file, sha256) of everything that it consists of.
+    pub fn files(&self) -> Result<Vec<(PathBuf, String)>> {
+        let files = self.graphs.values().flat_map(|g| std::iter::once(&g.path).chain(&g.external));
+        let hash = |file: &PathBuf| Ok((file.clone(), fingerprint(file).map_err(Error::io(file))?));
+        files.map(hash).collect()
+    }
+
+    /// The catalogue entry with its name.
+    pub fn known(&self) -> Option<&'static Known> {
+        // "sam_vit_b" is longer, so more specific, than "sam".
+        known().iter().filter(|k| self.name.starts_with(&k.id)).max_by_key(|k| k.id.len())
+    }
+}
+
+/// What the model folders hold beside the built-in pack.
+#[derive(Debug, Default)]
+pub struct Inventory {
+    /// Whole models.
+    pub models: Vec<Installed>,
+    /// Files that cannot be used: one line each, saying why and what to do.
+    pub broken: Vec<(PathBuf, String)>,
+}
+
+/// Sets of parts that make a model, and what it then does.
+const WHOLE: [(&[Part], &[Duty]); 7] = [
+    (&[Part::Pair], &[Duty::Geometry]),
+    (&[Part::PairEncoder, Part::PairDecoder], &[Duty::Geometry]),
+    (&[Part::MultiView], &[Duty::Geometry]),
+    (&[Part::Warp], &[Duty::Matcher]),
+    (&[Part::MaskEncoder, Part::MaskDecoder], &[Duty::Masks]),
+    (&[Part::ImageTower, Part::TextTower], &[Duty::Features, Duty::Text]),
+    (&[Part::DenseFeatures, Part::TextTower], &[Duty::Features, Duty::Text]),
+];
+
+/// Looks at every `.onnx` file in the folders of `registry` and one folder below.
+pub fn inventory(registry: &Registry) -> Inventory {
+    let mut found = Inventory::default();
+    for folder in registry.folders() {
+        let mut groups: BTreeMap<(PathBuf, String), Vec<PathBuf>> = BTreeMap::new();
+        for file in onnx_files(folder).into_iter().filter(|f| !registry.owns(f)) {
+            groups.entry((folder.clone(), shared_name(&file))).or_default().push(file);
+        }
+        for sub in folders(folder) {
+            let name = sub.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let mut files = onnx_files(&sub);
+            // Hugging Face keeps the graphs of a model in a folder of this name.
+            files.extend(onnx_files(&sub.join("onnx")));
+            if !files.is_empty() {
+                groups.entry((sub, name)).or_default().extend(files);
+            }
+        }
+        for ((folder, name), files) in groups {
+            group(folder, name, &files, &mut found);
+        }
+    }
+    found
+}
+
+fn group(folder: PathBuf, name: String, files: &[PathBuf], found: &mut Inventory) {
+    let mut graphs: BTreeMap<Part, GraphFile> = BTreeMap::new();
+    for file in files {
+        match GraphFile::recognise(file) {
+            // The first of several variants (quantised, half precision): the plain name sorts first.
+            Ok(graph) => {
+                graphs.entry(graph.binding.part).or_insert(graph);
+            }
+            Err(e) => found.broken.push((file.clone(), e.to_string())),
+        }
+    }
+    if graphs.is_empty() {
+        return;
+    }
+    let has = |parts: &&(&[Part], &[Duty])| parts.0.iter().all(|p| graphs.contains_key(p));
+    let Some((parts, duties)) = WHOLE.iter().find(has) else {
+        let have: Vec<&str> = graphs.keys().map(|p| p.name()).collect();
+        let lacks = WHOLE.iter().filter(|w| w.0.iter().any(|p| graphs.contains_key(p)));
+        let lacks: Vec<&str> =
+            lacks.flat_map(|w| w.0).filter(|p| !graphs.contains_key(p)).map(|p| p.name()).collect();
+        let text = format!(
+            "{}: {name} has only its {}; put its {} into the same folder",
+            folder.display(),
+            have.join(", "),
+            lacks.join(" or ")
+        );
+        found.broken.push((folder, text));
+        return;
+    };
+    let stray = |a: &&GraphFile, b: &&GraphFile| {
+        a.checkpoint != b.checkpoint && a.checkpoint.is_some() && b.checkpoint.is_some()
+    };
+    let used: Vec<&GraphFile> = parts.iter().filter_map(|p| graphs.get(p)).collect();
+    if let Some(pair) = used.windows(2).find(|w| stray(&w[0], &w[1])) {
+        let text = format!(
+            "{} and {}: weights of different checkpoints ({} and {}); export both from one",
+            pair[0].path.display(),
+            pair[1].path.display(),
+            pair[0].checkpoint.as_deref().unwrap_or_default(),
+            pair[1].checkpoint.as_deref().unwrap_or_default()
+        );
+        found.broken.push((folder, text));
+        return;
+    }
+    // Encoders look alike in several families; what comes last tells them apart.
+    let family = used.last().map(|g| g.binding.family.clone()).unwrap_or_default();
+    let mut model = Installed { name, family, duties: duties.to_vec(), graphs, folder };
+    if let Some(known) = model.known().filter(|k| model.duties.contains(&k.role)) {
+        model.family.clone_from(&known.family);
+    }
+    found.models.push(model);
+}
+
+impl Registry {
+    /// The model that `--init`, `--masks` and so on call `name` (a family or a model's own name): of several the one that
+    /// the catalogue names first. The error says what to do.
+    pub fn installed(&self, duty: Duty, name: &str) -> Result<Installed> {
+        let inventory = inventory(self);
+        let rank =
+            |m: &Installed| known().iter().position(|k| m.name.starts_with(&k.id)).unwrap_or(usize::MAX);
+        let mut fitting: Vec<Installed> = inventory
+            .models
+            .into_iter()
+            .filter(|m| m.duties.contains(&duty) && (m.family == name || m.name == name))
+            .collect();
+        fitting.sort_by_key(rank);
+        if let Some(model) = fitting.into_iter().next() {
+            return Ok(model);
+        }
+        let about = |path: &Path| {
+            let text = path.to_string_lossy();
+            known().iter().any(|k| k.family == name && text.contains(&k.id)) || text.contains(name)
+        };
+        if let Some((_, why)) = inventory.broken.iter().find(|(path, _)| about(path)) {
+            return Err(Error::missing(why.clone()));
+        }
+        let place = self.folders().first().map(|f| f.display().to_string()).unwrap_or_default();
+        let how = known().iter().find(|k| k.family == name && k.role == duty);
+        let how = how.map_or(String::new(), |k| format!(" (from {}, exported with {})", k.source, k.export));
+        Err(Error::missing(format!(
+            "no model \"{name}\" for {} in {place}; put its ONNX files{how} into {place}/{name}/, or see splatvk models list",
+            duty.name()
+        )))
+    }
+}
+
+fn onnx_files(folder: &Path) -> Vec<PathBuf> {
+    entries(folder)
+        .into_iter()
+        .filter(|p| p.extension().is_some_and(|e| e == "onnx") && p.is_file())
+        .collect()
+}
+
+fn folders(folder: &Path) -> Vec<PathBuf> {
+    entries(folder).into_iter().filter(|p| p.is_dir()).collect()
+}
+
+fn entries(folder: &Path) -> Vec<PathBuf> {
+    let list = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path());
+    let hidden = |p: &PathBuf| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
+    let mut list: Vec<PathBuf> = list.filter(|p| !hidden(p)).collect();
+    list.sort();
+    list
+}
+
+/// A file's name without the words that name a part.
+fn shared_name(file: &Path) -> String {
+    const PARTS: [&str; 14] = [
+        "encoder", "decoder", "enc", "dec", "vision", "visual", "image", "text", "textual", "model", "fp16",
+        "fp32", "tower", "batched",
+    ];
+    let stem = file.file_stem().unwrap_or_default().to_string_lossy().to_lowercase();
+    let mut name = String::new();
+    for piece in stem.split_inclusive(['_', '-', '.']) {
+        if !PARTS.contains(&piece.trim_end_matches(['_', '-', '.'])) {
+            name.push_str(piece);
+        }
+    }
+    name.trim_end_matches(['_', '-', '.']).to_string()
+}

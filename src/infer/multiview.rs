@@ -1,0 +1,148 @@
+//! Geometry networks that see all photos in one call (VGGT, Depth Anything 3, MapAnything): depth and cameras, from which the
+//! pointmaps of every pair follow.
+use glam::{DMat3, DQuat, DVec2, DVec3};
+
+use super::cache::{Key, remember};
+use super::graph::{GraphFile, Outputs};
+use super::prepare::Prepared;
+use super::runtime::Input;
+use crate::photo::Photo;
+use crate::pose::pointmap::{ModelView, PairPointmaps, Pointmap};
+use crate::progress::Progress;
+use crate::scene::{Camera, Pose};
+use crate::{Error, Result};
+
+pub(super) fn pointmaps(
+    graph: &GraphFile,
+    photos: &[Photo],
+    progress: &dyn Progress,
+) -> Result<(Vec<ModelView>, Vec<PairPointmaps>)> {
+    let count = photos.len();
+    if let Some(n) = graph.fixed("images", "N").filter(|n| *n != count) {
+        return Err(Error::input(format!(
+            "{}: was exported for {n} photos, here are {count}; use --views {n} or export it with a free number",
+            graph.path.display()
+        )));
+    }
+    progress.begin("pointmaps", 1);
+    let prepared = same_size(graph, photos)?;
+    let views = super::pairs::views(photos, &prepared, progress);
+    let (width, height) = prepared.first().map_or((0, 0), |p| (p.width, p.height));
+    let mut key = Key::new("views").model(graph)?.values(&[width as u64, height as u64]);
+    for p in &prepared {
+        key = key.values(&p.data);
+    }
+    let pixels = width * height;
+    let values = remember(key, || {
+        let data = prepared.iter().flat_map(|p| p.data.iter().copied()).collect();
+        let mut outputs =
+            graph.load()?.run(vec![("images", Input::F32(vec![1, count, 3, height, width], data))])?;
+        let mut all = cameras(&mut outputs, graph, count, (width, height))?;
+        all.extend(outputs.take("depth")?.data);
+        all.extend(outputs.take("confidence")?.data);
+        Ok(all)
+    })?;
+    let (cameras, maps) = values.split_at_checked(16 * count).unwrap_or_default();
+    let cameras: Vec<Camera> = cameras.chunks_exact(16).map(|c| camera(c, width, height)).collect();
+    let (depth, confidence) = maps.split_at_checked(pixels * count).unwrap_or_default();
+    if confidence.len() != pixels * count || cameras.len() != count {
+        return Err(Error::work(format!(
+            "{}: its depth does not have the size of its input",
+            graph.path.display()
+        )));
+    }
+    let worlds: Vec<Vec<DVec3>> = cameras
+        .iter()
+        .zip(depth.chunks_exact(pixels))
+        .map(|(camera, depth)| {
+            let at = |(p, z): (usize, &f32)| {
+                let pixel = DVec2::new((p % width) as f64 + 0.5, (p / width) as f64 + 0.5);
+                camera.unproject(pixel, f64::from(*z))
+            };
+            depth.iter().enumerate().map(at).collect()
+        })
+        .collect();
+    let map = |seen: usize, by: usize| Pointmap {
+        points: worlds[seen].iter().map(|x| cameras[by].pose.transform(*x).as_vec3().to_array()).collect(),
+        // The alignment counts from 1 = "no idea".
+        confidence: confidence[seen * pixels..(seen + 1) * pixels].iter().map(|c| c.max(1.0)).collect(),
+    };
+    let pairs = (0..count).flat_map(|i| (i + 1..count).map(move |j| (i, j))).map(|(i, j)| PairPointmaps {
+        first: i,
+        second: j,
+        x11: map(i, i),
+        x21: map(j, i),
+        x22: map(j, j),
+        x12: map(i, j),
+        descriptors: None,
+    });
+    let pairs = pairs.collect();
+    progress.end();
+    Ok((views, pairs))
+}
+
+/// All photos at the first one's input size, since they share a tensor.
+fn same_size(graph: &GraphFile, photos: &[Photo]) -> Result<Vec<Prepared>> {
+    let mut prepared = super::pairs::inputs(graph, "images", photos)?;
+    let Some((width, height)) = prepared.first().map(|p| (p.width, p.height)) else { return Ok(prepared) };
+    for (ready, photo) in prepared.iter_mut().zip(photos) {
+        if (ready.width, ready.height) != (width, height) {
+            return Err(Error::input(format!(
+                "{}: photos of different shapes ({} is {}×{} for the network, the first {width}×{height}); this network \
+                 takes photos of one aspect",
+                graph.path.display(),
+                photo.stem,
+                ready.width,
+                ready.height
+            )));
+        }
+    }
+    Ok(prepared)
+}
+
+/// Per photo 16 values: rotation world → camera (row by row), translation, fx, fy, cx, cy.
+fn cameras(outputs: &mut Outputs, graph: &GraphFile, count: usize, size: (usize, usize)) -> Result<Vec<f32>> {
+    let (w, h) = (size.0 as f32, size.1 as f32);
+    let mut all = Vec::with_capacity(16 * count);
+    if let Some(code) = outputs.maybe("pose_code") {
+        for c in code.data.chunks_exact(9) {
+            let q = DQuat::from_xyzw(c[3].into(), c[4].into(), c[5].into(), c[6].into()).normalize();
+            let rows = DMat3::from_quat(q).transpose();
+            all.extend(rows.to_cols_array().map(|v| v as f32));
+            all.extend_from_slice(&c[..3]);
+            all.extend([0.5 * w / (0.5 * c[8]).tan(), 0.5 * h / (0.5 * c[7]).tan(), 0.5 * w, 0.5 * h]);
+        }
+    } else {
+        let (pose, lens) = (outputs.take("extrinsics")?, outputs.take("intrinsics")?);
+        let stride = pose.data.len() / count.max(1);
+        for (p, k) in pose.data.chunks_exact(stride.max(12)).zip(lens.data.chunks_exact(9)) {
+            all.extend((0..3).flat_map(|r| p[4 * r..4 * r + 3].to_vec()));
+            all.extend([p[3], p[7], p[11]]);
+            all.extend([k[0], k[4], k[2], k[5]]);
+        }
+    }
+    if all.len() != 16 * count || all.iter().any(|v| !v.is_finite()) {
+        return Err(Error::work(format!("{}: its cameras are not usable", graph.path.display())));
+    }
+    Ok(all)
+}
+
+fn camera(c: &[f32], width: usize, height: usize) -> Camera {
+    let v = |k: usize| f64::from(c[k]);
+    let rows = DMat3::from_cols(
+        DVec3::new(v(0), v(1), v(2)),
+        DVec3::new(v(3), v(4), v(5)),
+        DVec3::new(v(6), v(7), v(8)),
+    );
+    let pose = Pose { rotation: rows.transpose(), translation: DVec3::new(v(9), v(10), v(11)) };
+    Camera {
+        name: String::new(),
+        width: width as u32,
+        height: height as u32,
+        fx: v(12),
+        fy: v(13),
+        cx: v(14),
+        cy: v(15),
+        pose,
+    }
+}

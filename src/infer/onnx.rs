@@ -1,0 +1,309 @@
+//! What an ONNX file says about itself, read without its weights: inputs, outputs, operator set, and which files hold the
+//! rest. A file of several gigabytes is looked at in milliseconds, and a truncated one is found out before it is loaded.
+//!
+//! Field numbers are those of the published onnx.proto3.
+use std::collections::HashSet;
+use std::fmt;
+use std::fs::File;
+use std::io::{BufReader, Read, Seek};
+use std::path::{Path, PathBuf};
+
+use crate::{Error, Result};
+
+/// Element type of a tensor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// 16-, 32- or 64-bit floats.
+    Float,
+    /// 32- or 64-bit integers.
+    Integer,
+    /// Anything else (bool, string, 8-bit, bfloat16, not a tensor).
+    Other,
+}
+
+/// One axis of a tensor.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Dim {
+    /// So long.
+    Fixed(usize),
+    /// Decided when the graph runs.
+    Free,
+}
+
+/// An input or output of a graph.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Port {
+    /// Its name.
+    pub name: String,
+    /// Its element type.
+    pub kind: Kind,
+    /// Its axes, outermost first; `None` when the file does not tell.
+    pub dims: Option<Vec<Dim>>,
+}
+
+impl fmt::Display for Port {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let axis = |d: &Dim| match d {
+            Dim::Fixed(n) => n.to_string(),
+            Dim::Free => "?".to_string(),
+        };
+        let dims = match &self.dims {
+            Some(dims) => dims.iter().map(axis).collect::<Vec<_>>().join("×"),
+            None => "…".to_string(),
+        };
+        write!(f, "{} [{dims}]", self.name)
+    }
+}
+
+/// The parts of an ONNX file that are not weights.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Header {
+    /// Version of the standard operators.
+    pub opset: i64,
+    /// What must be fed.
+    pub inputs: Vec<Port>,
+    /// What comes out.
+    pub outputs: Vec<Port>,
+    /// Files with weights, beside this one.
+    pub external: Vec<PathBuf>,
+    /// Number of weights.
+    pub parameters: u64,
+}
+
+/// A field of a protobuf message.
+enum Field {
+    Number(u64),
+    /// Length of the bytes that follow.
+    Bytes(u64),
+    Skipped,
+}
+
+struct Reader {
+    file: BufReader<File>,
+    at: u64,
+    size: u64,
+}
+
+impl Reader {
+    fn byte(&mut self) -> Option<u8> {
+        let mut one = [0];
+        self.file.read_exact(&mut one).ok()?;
+        self.at += 1;
+        Some(one[0])
+    }
+
+    fn number(&mut self) -> Option<u64> {
+        let mut value = 0u64;
+        for shift in (0..64).step_by(7) {
+            let byte = self.byte()?;
+            value |= u64::from(byte & 0x7f) << shift;
+            if byte < 0x80 {
+                return Some(value);
+            }
+        }
+        None
+    }
+
+    fn skip(&mut self, n: u64) -> Option<()> {
+        self.at = self.at.checked_add(n).filter(|end| *end <= self.size)?;
+        self.file.seek_relative(i64::try_from(n).ok()?).ok()
+    }
+
+    /// The next field's number and, for bytes, the reader left at their start.
+    fn field(&mut self) -> Option<(u64, Field)> {
+        let key = self.number()?;
+        let field = match key & 7 {
+            0 => Field::Number(self.number()?),
+            1 => self.skip(8).map(|()| Field::Skipped)?,
+            2 => {
+                let n = self.number()?;
+                // Longer than the file: cut off, or not a protobuf at all.
+                (self.at.checked_add(n)? <= self.size).then_some(Field::Bytes(n))?
+            }
+            5 => self.skip(4).map(|()| Field::Skipped)?,
+            _ => return None,
+        };
+        Some((key >> 3, field))
+    }
+
+    /// Calls `each` for every field of the next `length` bytes; what `each` does not read is skipped.
+    fn message(
+        &mut self,
+        length: u64,
+        each: &mut dyn FnMut(&mut Reader, u64, Field) -> Option<()>,
+    ) -> Option<()> {
+        let end = self.at + length;
+        while self.at < end {
+            let (number, field) = self.field()?;
+            let next = match field {
+                Field::Bytes(n) => self.at + n,
+                _ => self.at,
+            };
+            if next > end {
+                return None;
+            }
+            each(self, number, field)?;
+            self.skip(next.checked_sub(self.at)?)?;
+        }
+        (self.at == end).then_some(())
+    }
+
+    fn text(&mut self, n: u64) -> Option<String> {
+        // Names and keys; nothing that is read here is longer.
+        let mut bytes = vec![0; usize::try_from(n).ok().filter(|n| *n < 1 << 16)?];
+        self.file.read_exact(&mut bytes).ok()?;
+        self.at += n;
+        String::from_utf8(bytes).ok()
+    }
+
+    fn port(&mut self, length: u64) -> Option<Port> {
+        let mut port = Port { name: String::new(), kind: Kind::Other, dims: None };
+        self.message(length, &mut |r, number, field| {
+            match (number, field) {
+                (1, Field::Bytes(n)) => port.name = r.text(n)?,
+                (2, Field::Bytes(n)) => r.message(n, &mut |r, number, field| match (number, field) {
+                    (1, Field::Bytes(n)) => r.tensor_type(n, &mut port),
+                    _ => Some(()),
+                })?,
+                _ => {}
+            }
+            Some(())
+        })?;
+        Some(port)
+    }
+
+    fn tensor_type(&mut self, length: u64, port: &mut Port) -> Option<()> {
+        self.message(length, &mut |r, number, field| {
+            match (number, field) {
+                (1, Field::Number(n)) => {
+                    port.kind = match n {
+                        1 | 10 | 11 => Kind::Float,
+                        6 | 7 => Kind::Integer,
+                        _ => Kind::Other,
+                    }
+                }
+                (2, Field::Bytes(n)) => port.dims = Some(r.shape(n)?),
+                _ => {}
+            }
+            Some(())
+        })
+    }
+
+    fn shape(&mut self, length: u64) -> Option<Vec<Dim>> {
+        let mut dims = Vec::new();
+        self.message(length, &mut |r, number, field| {
+            if let (1, Field::Bytes(n)) = (number, field) {
+                let mut dim = Dim::Free;
+                r.message(n, &mut |_, number, field| {
+                    if let (1, Field::Number(n)) = (number, field) {
+                        dim = Dim::Fixed(usize::try_from(n).ok()?);
+                    }
+                    Some(())
+                })?;
+                dims.push(dim);
+            }
+            Some(())
+        })?;
+        Some(dims)
+    }
+
+    /// A weight: its name, its number of values, and the file that holds it, if not this one.
+    fn weight(&mut self, length: u64) -> Option<(String, u64, Option<String>)> {
+        let (mut name, mut values, mut place) = (String::new(), 1u64, None);
+        self.message(length, &mut |r, number, field| {
+            match (number, field) {
+                (1, Field::Number(n)) => values = values.saturating_mul(n),
+                (1, Field::Bytes(n)) => {
+                    let end = r.at + n;
+                    while r.at < end {
+                        values = values.saturating_mul(r.number()?);
+                    }
+                }
+                (8, Field::Bytes(n)) => name = r.text(n)?,
+                (13, Field::Bytes(n)) => {
+                    let (mut key, mut value) = (String::new(), String::new());
+                    r.message(n, &mut |r, number, field| {
+                        match (number, field) {
+                            (1, Field::Bytes(n)) => key = r.text(n)?,
+                            (2, Field::Bytes(n)) => value = r.text(n)?,
+                            _ => {}
+                        }
+                        Some(())
+                    })?;
+                    if key == "location" {
+                        place = Some(value);
+                    }
+                }
+                _ => {}
+            }
+            Some(())
+        })?;
+        Some((name, values, place))
+    }
+}
+
+/// Reads the header of an ONNX file; the error names the file and says what is wrong with it.
+pub fn read(path: &Path) -> Result<Header> {
+    let file = File::open(path).map_err(Error::io(path))?;
+    let size = file.metadata().map_err(Error::io(path))?.len();
+    let mut reader = Reader { file: BufReader::new(file), at: 0, size };
+    let header = whole(&mut reader, path).filter(|h| !h.inputs.is_empty() && !h.outputs.is_empty());
+    header.ok_or_else(|| {
+        let at = reader.file.stream_position().unwrap_or_default();
+        Error::missing(format!(
+            "{}: not a complete ONNX file (unreadable at byte {at} of {size}): truncated or of another format; copy or \
+             export it again",
+            path.display()
+        ))
+    })
+}
+
+fn whole(reader: &mut Reader, path: &Path) -> Option<Header> {
+    let mut header = Header::default();
+    let mut weights = HashSet::new();
+    let mut places = HashSet::new();
+    reader.message(reader.size, &mut |r, number, field| {
+        match (number, field) {
+            (7, Field::Bytes(n)) => r.message(n, &mut |r, number, field| {
+                match (number, field) {
+                    (5, Field::Bytes(n)) => {
+                        let (name, values, place) = r.weight(n)?;
+                        header.parameters += values;
+                        places.extend(place);
+                        weights.insert(name);
+                    }
+                    (11, Field::Bytes(n)) => header.inputs.push(r.port(n)?),
+                    (12, Field::Bytes(n)) => header.outputs.push(r.port(n)?),
+                    _ => {}
+                }
+                Some(())
+            })?,
+            (8, Field::Bytes(n)) => {
+                let (mut domain, mut version) = (String::new(), 0);
+                r.message(n, &mut |r, number, field| {
+                    match (number, field) {
+                        (1, Field::Bytes(n)) => domain = r.text(n)?,
+                        (2, Field::Number(n)) => version = n as i64,
+                        _ => {}
+                    }
+                    Some(())
+                })?;
+                if domain.is_empty() || domain == "ai.onnx" {
+                    header.opset = version;
+                }
+            }
+            _ => {}
+        }
+        Some(())
+    })?;
+    // Old files list their weights among the inputs.
+    header.inputs.retain(|i| !weights.contains(&i.name));
+    header.external = places.into_iter().map(|p| path.with_file_name(p)).collect();
+    header.external.sort();
+    Some(header)
+}
+
+/// "a [1×3×?×?], b [?×77]"
+pub fn listed(ports: &[Port]) -> String {
+    ports.iter().map(Port::to_string).collect::<Vec<_>>().join(", ")
+}

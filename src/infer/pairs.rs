@@ -1,0 +1,265 @@
+//! Geometry networks: DUSt3R and MASt3R see two photos at a time, VGGT and its like all of them. Both give pointmaps of pairs
+//! ([`PairPointmaps`]), which [`crate::pose::pointmap`] brings to one scene.
+use super::alone;
+use super::cache::{Key, remember};
+use super::contract::Part;
+use super::graph::{Graph, GraphFile, Outputs};
+use super::installed::Installed;
+use super::prepare::{Prepared, prepare};
+use super::runtime::{Input, Tensor};
+use crate::photo::Photo;
+use crate::pose::pointmap::{Descriptors, ModelView, PairPointmaps, Pointmap};
+use crate::progress::Progress;
+use crate::{Error, Result};
+
+/// What a network says about all pairs of photos, for [`crate::pose::InitChoice::Pointmaps`].
+pub fn pointmaps(
+    model: &Installed,
+    photos: &[Photo],
+    progress: &dyn Progress,
+) -> Result<(Vec<ModelView>, Vec<PairPointmaps>)> {
+    let _alone = alone();
+    if let Ok(graph) = model.graph(Part::MultiView) {
+        return super::multiview::pointmaps(graph, photos, progress);
+    }
+    let prepared = match model.graph(Part::Pair) {
+        Ok(graph) => inputs(graph, "image1", photos)?,
+        Err(_) => inputs(model.graph(Part::PairEncoder)?, "image", photos)?,
+    };
+    let views = views(photos, &prepared, progress);
+    let count = photos.len();
+    let mut network = Network::new(model, &prepared);
+    let ordered = (count * count.saturating_sub(1)) as u64;
+    progress.begin("pointmaps", ordered);
+    let (mut pairs, mut done) = (Vec::new(), 0);
+    for i in 0..count {
+        for j in i + 1..count {
+            let mut decode = |a: usize, b: usize| {
+                progress.check()?;
+                let decoded = network.decode(a, b)?;
+                done += 1;
+                progress.step(done, "");
+                Ok::<_, Error>(decoded)
+            };
+            let (one, two) = (decode(i, j)?, decode(j, i)?);
+            let ([d11, d21], [d22, d12]) = (one.descriptors, two.descriptors);
+            let descriptors = match (d11, d21, d12, d22) {
+                (Some(a), Some(b), Some(c), Some(d)) => Some([a, b, c, d]),
+                _ => None,
+            };
+            let ([x11, x21], [x22, x12]) = (one.maps, two.maps);
+            pairs.push(PairPointmaps { first: i, second: j, x11, x21, x22, x12, descriptors });
+        }
+    }
+    progress.end();
+    if !model.untrained() {
+        plausible(model, &pairs)?;
+    }
+    Ok((views, pairs))
+}
+
+/// Every photo as the graph sees it.
+pub(super) fn inputs(graph: &GraphFile, role: &str, photos: &[Photo]) -> Result<Vec<Prepared>> {
+    let spec =
+        graph.binding.image.as_ref().ok_or_else(|| {
+            Error::work(format!("{}: its adapter has no image range", graph.path.display()))
+        })?;
+    Ok(photos.iter().map(|p| prepare(&p.image, graph, spec, role)).collect())
+}
+
+/// The views of [`crate::pose::pointmap`]; warns of what a crop cost.
+pub(super) fn views(photos: &[Photo], prepared: &[Prepared], progress: &dyn Progress) -> Vec<ModelView> {
+    let mut groups: Vec<(Option<&str>, (u32, u32))> = Vec::new();
+    let mut lost = 0.0f64;
+    let mut views = Vec::with_capacity(photos.len());
+    for (photo, ready) in photos.iter().zip(prepared) {
+        let group = (photo.camera_model.as_deref(), photo.original_size);
+        let camera_group = groups.iter().position(|g| *g == group).unwrap_or_else(|| {
+            groups.push(group);
+            groups.len() - 1
+        });
+        let scale = ready.from_photo.scale;
+        let kept = (ready.width as f64 / scale[0] / photo.image.width as f64)
+            * (ready.height as f64 / scale[1] / photo.image.height as f64);
+        lost = lost.max(1.0 - kept);
+        views.push(ModelView {
+            name: photo.stem.clone(),
+            image: photo.image.clone(),
+            width: ready.width,
+            height: ready.height,
+            from_working: ready.from_photo,
+            exif_focal: photo.exif_focal.map(|f| f * scale[1]),
+            camera_group,
+        });
+    }
+    // A few rows go with the rounding to whole patches.
+    if lost > 0.1 {
+        progress.warn(&format!(
+            "the geometry network's input cuts {:.0} % off a photo; an export for another aspect would use all of it",
+            100.0 * lost
+        ));
+    }
+    views
+}
+
+/// One decoding: first and second view, both in the first camera.
+struct Decoded {
+    maps: [Pointmap; 2],
+    descriptors: [Option<Descriptors>; 2],
+}
+
+/// A pair network of one or two graphs; loaded when the first answer is not in the cache.
+struct Network<'a> {
+    model: &'a Installed,
+    prepared: &'a [Prepared],
+    graph: Option<Graph>,
+    tokens: Vec<Option<Tensor>>,
+}
+
+impl<'a> Network<'a> {
+    fn new(model: &'a Installed, prepared: &'a [Prepared]) -> Self {
+        Network { model, prepared, graph: None, tokens: vec![None; prepared.len()] }
+    }
+
+    fn decode(&mut self, i: usize, j: usize) -> Result<Decoded> {
+        let (a, b) = (&self.prepared[i], &self.prepared[j]);
+        let mut key = Key::new("pair").values(&[a.width, a.height, b.width, b.height].map(|n| n as u64));
+        for graph in self.model.graphs.values() {
+            key = key.model(graph)?;
+        }
+        let key = key.values(&a.data).values(&b.data);
+        let values = remember(key, || pack(self.forward(i, j)?))?;
+        unpack(&values, [a, b]).ok_or_else(|| {
+            let size = format!("{}×{} and {}×{}", a.width, a.height, b.width, b.height);
+            Error::work(format!(
+                "model {}: its pointmaps do not have the size of its input ({size})",
+                self.model.name
+            ))
+        })
+    }
+
+    fn forward(&mut self, i: usize, j: usize) -> Result<Outputs> {
+        if let Ok(file) = self.model.graph(Part::Pair) {
+            let graph = loaded(&mut self.graph, file)?;
+            let shape = |p: &Prepared| Input::I64(vec![1, 2], vec![p.height as i64, p.width as i64]);
+            let (a, b) = (&self.prepared[i], &self.prepared[j]);
+            return graph.run(vec![
+                ("image1", a.input()),
+                ("image2", b.input()),
+                ("shape1", shape(a)),
+                ("shape2", shape(b)),
+            ]);
+        }
+        self.encode_all()?;
+        let file = self.model.graph(Part::PairDecoder)?;
+        let graph = loaded(&mut self.graph, file)?;
+        let mut fed = Vec::new();
+        for (k, tokens, position) in [(i, "tokens1", "position1"), (j, "tokens2", "position2")] {
+            let Some(t) = &self.tokens[k] else {
+                return Err(Error::work(format!("photo {k} was not encoded")));
+            };
+            fed.push((tokens, Input::F32(t.shape.clone(), t.data.clone())));
+            fed.push((position, positions(&self.prepared[k])));
+        }
+        graph.run(fed)
+    }
+
+    /// Every photo once, with the encoder alone in memory.
+    fn encode_all(&mut self) -> Result<()> {
+        if self.tokens.iter().all(Option::is_some) {
+            return Ok(());
+        }
+        let mut encoder = self.model.graph(Part::PairEncoder)?.load()?;
+        for (slot, ready) in self.tokens.iter_mut().zip(self.prepared) {
+            let shape = Input::I64(vec![1, 2], vec![ready.height as i64, ready.width as i64]);
+            *slot = Some(encoder.run(vec![("image", ready.input()), ("shape", shape)])?.take("tokens")?);
+        }
+        Ok(())
+    }
+}
+
+fn loaded<'g>(slot: &'g mut Option<Graph>, file: &GraphFile) -> Result<&'g mut Graph> {
+    let graph = match slot.take() {
+        Some(graph) => graph,
+        None => file.load()?,
+    };
+    Ok(slot.insert(graph))
+}
+
+/// (row, column) of every patch, for graphs that ask for it.
+fn positions(ready: &Prepared) -> Input {
+    // Patches of 16: what every network of this kind uses.
+    let (columns, rows) = (ready.width / 16, ready.height / 16);
+    let at = (0..rows as i64).flat_map(|y| (0..columns as i64).flat_map(move |x| [y, x])).collect();
+    Input::I64(vec![1, rows * columns, 2], at)
+}
+
+/// Outputs → one row of values: length of a descriptor, then per view points, confidence, descriptors, their confidence.
+fn pack(mut outputs: Outputs) -> Result<Vec<f32>> {
+    let views = [("points1", "conf1", "desc1", "desc_conf1"), ("points2", "conf2", "desc2", "desc_conf2")];
+    let mut all = vec![0.0];
+    for (points, conf, desc, desc_conf) in views {
+        let conf = outputs.take(conf)?.data;
+        all.extend(outputs.take(points)?.data);
+        if let Some(d) = outputs.maybe(desc) {
+            all[0] = d.shape.last().copied().unwrap_or_default() as f32;
+            // Without a confidence of its own a descriptor is as sure as its point.
+            let sure = outputs.maybe(desc_conf).map_or_else(|| conf.clone(), |t| t.data);
+            all.extend(&conf);
+            all.extend(d.data);
+            all.extend(sure);
+        } else {
+            all.extend(&conf);
+        }
+    }
+    Ok(all)
+}
+
+fn unpack(values: &[f32], size: [&Prepared; 2]) -> Option<Decoded> {
+    let (dim, mut rest) = (*values.first()? as usize, values.get(1..)?);
+    let mut take = |n: usize| {
+        let (head, tail) = rest.split_at_checked(n)?;
+        rest = tail;
+        Some(head.to_vec())
+    };
+    let mut view = |p: &Prepared| {
+        let pixels = p.width * p.height;
+        let points = bytemuck::pod_collect_to_vec(&take(3 * pixels)?);
+        let map = Pointmap { points, confidence: take(pixels)? };
+        if dim == 0 {
+            return Some((map, None));
+        }
+        let mut data = take(dim * pixels)?;
+        data.chunks_exact_mut(dim).for_each(super::text::normalise);
+        Some((map, Some(Descriptors { dim, data, confidence: take(pixels)? })))
+    };
+    let ((a, da), (b, db)) = (view(size[0])?, view(size[1])?);
+    rest.is_empty().then_some(Decoded { maps: [a, b], descriptors: [da, db] })
+}
+
+/// Refuses output that a trained network cannot give: most often an activation that the export left out.
+fn plausible(model: &Installed, pairs: &[PairPointmaps]) -> Result<()> {
+    let wrong = |what: &str| {
+        Error::missing(format!(
+            "{}: model {}: {what}; either two outputs are swapped or the export left an activation to the program: say \
+             apply.points = \"expm1-norm\" and apply.conf = \"one-plus-exp\" in its adapter (docs/models.md)",
+            model.folder.display(),
+            model.name
+        ))
+    };
+    for pair in pairs {
+        for map in [&pair.x11, &pair.x21, &pair.x22, &pair.x12] {
+            // 1 + e^x rounds to 1 at least.
+            if map.confidence.iter().any(|c| *c < 0.999) {
+                return Err(wrong("a confidence is below 1"));
+            }
+        }
+        for map in [&pair.x11, &pair.x22] {
+            let ahead = map.points.iter().filter(|p| p[2] > 0.0).count();
+            if 2 * ahead < map.points.len() {
+                return Err(wrong("most points lie behind the camera that sees them"));
+            }
+        }
+    }
+    Ok(())
+}

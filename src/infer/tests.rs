@@ -1,0 +1,446 @@
+//! Networks that users bring, as tiny graphs with the same interfaces: what fits is used, what does not is named.
+use std::path::Path;
+
+use super::clip::Clip;
+use super::contract::Part;
+use super::graph::GraphFile;
+use super::installed::{Duty, inventory, known};
+use super::testing::{Attribute, FLOAT, INT64, Onnx};
+use super::{Input, RegionEncoder, Registry, cache, pairs, warp};
+use crate::photo::{Affine, Frame, Photo};
+use crate::pose::pointmap;
+use crate::progress::Silent;
+use crate::scene::{Plane, RgbImage};
+
+/// Mean colour of the image, as embedding.
+fn image_tower() -> Onnx {
+    Onnx::new().input("pixel_values", FLOAT, "batch 3 16 16").output("image_embeds", "batch 3").node(
+        "ReduceMean",
+        "pixel_values",
+        "image_embeds",
+        &[("axes", Attribute::Ints(&[2, 3])), ("keepdims", Attribute::Int(0))],
+    )
+}
+
+const WORDS: [&str; 12] =
+    ["[UNK]", "red", "green", "blue", "dog", "city", "page", "text", "person", "bicycle", "plate", "food"];
+
+/// Sum of the words' rows: red, green and blue point along their channel, the rest (and padding) nowhere in particular.
+fn text_tower(order: [usize; 3]) -> Onnx {
+    let mut table = vec![0.01f32; 3 * WORDS.len()];
+    for (k, channel) in order.into_iter().enumerate() {
+        table[3 * (k + 1) + channel] = 100.0;
+    }
+    Onnx::new()
+        .input("input_ids", INT64, "1 8")
+        .output("text_embeds", "1 3")
+        .weight("table", &[WORDS.len() as u64, 3], &table)
+        .integers("axis", &[1])
+        .node("Gather", "table input_ids", "rows", &[])
+        .node("ReduceSum", "rows axis", "text_embeds", &[("keepdims", Attribute::Int(0))])
+}
+
+fn tokenizer() -> String {
+    let vocabulary: Vec<String> = WORDS.iter().enumerate().map(|(i, w)| format!("\"{w}\": {i}")).collect();
+    format!(
+        r#"{{"version": "1.0", "truncation": null, "padding": null, "added_tokens": [], "normalizer": {{"type": "Lowercase"}},
+            "pre_tokenizer": {{"type": "Whitespace"}}, "post_processor": null, "decoder": null,
+            "model": {{"type": "WordLevel", "vocab": {{{}}}, "unk_token": "[UNK]"}}}}"#,
+        vocabulary.join(", ")
+    )
+}
+
+fn clip_in(folder: &Path, order: [usize; 3]) {
+    image_tower().write(&folder.join("clip_toy/vision_model.onnx"));
+    text_tower(order).write(&folder.join("clip_toy/text_model.onnx"));
+    std::fs::write(folder.join("clip_toy/tokenizer.json"), tokenizer()).unwrap();
+}
+
+/// The error of recognising, or of loading and running, one graph.
+fn refused(graph: &Onnx, extra: &[(&str, &str)]) -> String {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("graph.onnx");
+    graph.write(&path);
+    for (name, text) in extra {
+        std::fs::write(dir.path().join(name), text).unwrap();
+    }
+    let run = || {
+        let mut graph = GraphFile::recognise(&path)?.load()?;
+        graph.run(vec![("image", Input::F32(vec![1, 3, 16, 16], vec![0.5; 768]))])
+    };
+    let error = run().expect_err("must be refused").to_string();
+    assert!(!error.contains('\n') && error.contains("graph.onnx"), "one line that names the file: {error}");
+    error
+}
+
+#[test]
+fn towers_are_recognised_by_their_tensors_and_proven_to_belong_together() {
+    let _uncached = cache::off();
+    let dir = tempfile::tempdir().unwrap();
+    clip_in(dir.path(), [0, 1, 2]);
+    let registry = Registry::of(&[dir.path()]);
+    let model = registry.installed(Duty::Features, "clip").unwrap();
+    assert_eq!((model.name.as_str(), model.family.as_str()), ("clip_toy", "clip"));
+    let mut clip = Clip::load(model).unwrap();
+    assert_eq!((clip.dim(), clip.tokens("Red dog").unwrap()), (3, vec![1, 4]));
+    assert_eq!(clip.tokens(&"red ".repeat(50)).unwrap().len(), 8, "cut to the context");
+
+    // The left half is green, the right half blue; a label without pixels gets no direction.
+    let (mut image, mut labels) =
+        (RgbImage { width: 32, height: 20, data: Vec::new() }, Plane::filled(32, 20, 0));
+    for p in 0..32 * 20 {
+        let right = p % 32 >= 16;
+        image.data.push(if right { [0.0, 0.1, 1.0] } else { [0.0, 1.0, 0.1] });
+        labels.data[p] = i32::from(right);
+    }
+    let regions = clip.embed_regions(&image, &labels, 3).unwrap();
+    let texts = clip.embed_texts(&["green", "blue"]).unwrap();
+    let dot = |r: usize, t: usize| (0..3).map(|k| regions[3 * r + k] * texts[3 * t + k]).sum::<f32>();
+    assert!(dot(0, 0) > dot(0, 1) && dot(1, 1) > dot(1, 0), "{regions:?} {texts:?}");
+    assert_eq!(regions[6..], [0.0; 3]);
+
+    clip_in(dir.path(), [1, 2, 0]);
+    let strangers = Clip::load(registry.installed(Duty::Features, "clip").unwrap()).err().unwrap();
+    assert!(strangers.to_string().contains("do not belong together"), "{strangers}");
+    assert_eq!(strangers.exit_code(), 2);
+}
+
+#[test]
+fn towers_of_other_widths_or_checkpoints_are_refused() {
+    let _uncached = cache::off();
+    let dir = tempfile::tempdir().unwrap();
+    clip_in(dir.path(), [0, 1, 2]);
+    let registry = Registry::of(&[dir.path()]);
+    let folder = dir.path().join("clip_toy");
+    std::fs::write(folder.join("vision_model.toml"), "family = \"clip\"\ncheckpoint = \"a\"").unwrap();
+    std::fs::write(folder.join("text_model.toml"), "family = \"clip\"\ncheckpoint = \"b\"").unwrap();
+    let apart = registry.installed(Duty::Features, "clip").unwrap_err().to_string();
+    assert!(apart.contains("different checkpoints (a and b)"), "{apart}");
+    std::fs::remove_file(folder.join("text_model.toml")).unwrap();
+    Onnx::new()
+        .input("input_ids", INT64, "1 8")
+        .output("text_embeds", "1 8")
+        .node("Cast", "input_ids", "text_embeds", &[("to", Attribute::Int(1))])
+        .write(&folder.join("text_model.onnx"));
+    let wide = Clip::load(registry.installed(Duty::Features, "clip").unwrap()).err().unwrap().to_string();
+    assert!(wide.contains("embeddings of 3 and 8 values"), "{wide}");
+    std::fs::remove_file(folder.join("text_model.onnx")).unwrap();
+    let half = registry.installed(Duty::Features, "clip").unwrap_err().to_string();
+    assert!(half.contains("only its image-tower") && half.contains("text-tower"), "{half}");
+}
+
+#[test]
+fn a_graph_that_fits_nothing_is_described_with_the_nearest_contract() {
+    let graph = Onnx::new().input("pixel_values", FLOAT, "batch 3 16 16").output("strange", "batch 3").node(
+        "ReduceMean",
+        "pixel_values",
+        "strange",
+        &[("axes", Attribute::Ints(&[2, 3])), ("keepdims", Attribute::Int(0))],
+    );
+    let error = refused(&graph, &[]);
+    for part in
+        ["pixel_values [?×3×16×16]", "strange [?×3]", "nearest is image-tower (clip)", "embedding", ".toml"]
+    {
+        assert!(error.contains(part), "{part}: {error}");
+    }
+    // Said in an adapter, the same file is used.
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("graph.onnx");
+    graph.write(&path);
+    let adapter = "family = \"clip\"\n[[graph]]\npart = \"image-tower\"\nnames.embedding = \"strange\"";
+    std::fs::write(path.with_extension("toml"), adapter).unwrap();
+    let mut graph = GraphFile::recognise(&path).unwrap().load().unwrap();
+    let mut out = graph.run(vec![("image", Input::F32(vec![1, 3, 16, 16], vec![0.5; 768]))]).unwrap();
+    assert_eq!(out.take("embedding").unwrap().data, [0.5; 3]);
+    let misspelt = adapter.replace("names.embedding", "names.embeding");
+    std::fs::write(path.with_extension("toml"), misspelt).unwrap();
+    let error = GraphFile::recognise(&path).unwrap_err().to_string();
+    assert!(
+        error.contains("graph.toml") && error.contains("embeding") && error.contains("image, embedding"),
+        "{error}"
+    );
+}
+
+#[test]
+fn bad_files_are_named_with_the_mend() {
+    let mut future = image_tower();
+    future.opset = 99;
+    let error = refused(&future, &[]);
+    assert!(error.contains("opset_version=17") && error.contains("99"), "{error}");
+
+    let ranked = Onnx::new()
+        .input("pixel_values", FLOAT, "batch 3 16 16")
+        .output("image_embeds", "batch 3 1 1")
+        .node("ReduceMean", "pixel_values", "image_embeds", &[("axes", Attribute::Ints(&[2, 3]))]);
+    let error = refused(&ranked, &[]);
+    assert!(error.contains("image_embeds [?×3×1×1] cannot be embedding [B D]"), "{error}");
+
+    let silent = Onnx::new().input("pixel_values", FLOAT, "batch 3 16 16").output("image_embeds", "…").node(
+        "ReduceMean",
+        "pixel_values",
+        "image_embeds",
+        &[("axes", Attribute::Ints(&[2, 3]))],
+    );
+    let error = refused(&silent, &[]);
+    assert!(error.contains("[1, 3, 1, 1]") && error.contains("swapped"), "seen when it runs: {error}");
+
+    let nan = Onnx::new()
+        .input("pixel_values", FLOAT, "batch 3 16 16")
+        .output("image_embeds", "batch 3")
+        .weight("zero", &[1], &[0.0])
+        .node(
+            "ReduceMean",
+            "pixel_values",
+            "mean",
+            &[("axes", Attribute::Ints(&[2, 3])), ("keepdims", Attribute::Int(0))],
+        )
+        .node("Mul", "mean zero", "nothing", &[])
+        .node("Div", "nothing zero", "image_embeds", &[]);
+    let error = refused(&nan, &[]);
+    assert!(error.contains("image_embeds holds NaN"), "{error}");
+
+    let split = image_tower().external("far", &[4], "weights.bin");
+    let error = refused(&split, &[]);
+    assert!(error.contains("weights.bin, which is missing"), "{error}");
+
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("cut.onnx");
+    let whole = text_tower([0, 1, 2]).encode();
+    for length in [whole.len() / 2, whole.len() - 1, 0] {
+        std::fs::write(&path, &whole[..length]).unwrap();
+        let error = GraphFile::recognise(&path).unwrap_err().to_string();
+        assert!(error.contains("cut.onnx: not a complete ONNX file"), "{error}");
+    }
+    std::fs::write(&path, "<html>404 Not Found</html>").unwrap();
+    assert!(GraphFile::recognise(&path).unwrap_err().to_string().contains("of another format"));
+    assert!(inventory(&Registry::of(&[dir.path()])).broken[0].1.contains("cut.onnx"));
+}
+
+#[test]
+fn swapped_outputs_of_a_mask_decoder_are_seen() {
+    let decoder = |masks: &str, scores: &str| {
+        Onnx::new()
+            .input("image_embeddings", FLOAT, "1 256 64 64")
+            .input("point_coords", FLOAT, "p 2 2")
+            .input("point_labels", FLOAT, "p 2")
+            .output("low_res_masks", masks)
+            .output("iou_predictions", scores)
+            .encode()
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("decoder.onnx");
+    std::fs::write(&path, decoder("p 4 256 256", "p 4")).unwrap();
+    assert_eq!(GraphFile::recognise(&path).unwrap().binding.part, Part::MaskDecoder);
+    std::fs::write(&path, decoder("p 4", "p 4 256 256")).unwrap();
+    let error = GraphFile::recognise(&path).unwrap_err().to_string();
+    assert!(error.contains("low_res_masks [?×4] cannot be masks [P M x y]"), "{error}");
+}
+
+#[test]
+fn the_catalogue_is_sound_and_a_missing_model_is_explained() {
+    assert!(known().len() >= 12);
+    for model in known() {
+        assert!(model.source.starts_with("https://") && !model.licence.is_empty(), "{}", model.id);
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join(&model.export);
+        assert!(model.export.starts_with("https://") || script.is_file(), "{}: {}", model.id, model.export);
+        // The open pack is for commercial use.
+        assert!(!(model.packs.contains(&"open".into()) && model.licence.contains("NC")), "{}", model.id);
+    }
+    for pack in ["paper", "open"] {
+        for role in [Duty::Geometry, Duty::Matcher, Duty::Masks, Duty::Features] {
+            assert!(
+                known().iter().any(|k| k.role == role && k.packs.contains(&pack.into())),
+                "{pack} {role:?}"
+            );
+        }
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let error = Registry::of(&[dir.path()]).installed(Duty::Geometry, "dust3r").unwrap_err();
+    let text = error.to_string();
+    assert!(text.contains("tools/export/export_dust3r.py") && text.contains("naver/dust3r"), "{text}");
+    assert_eq!(error.exit_code(), 2);
+}
+
+#[test]
+fn files_side_by_side_belong_together_by_name_and_the_catalogue_decides_which_is_first() {
+    let dir = tempfile::tempdir().unwrap();
+    for name in ["sam_vit_b", "sam_vit_h"] {
+        Onnx::new()
+            .input("image", FLOAT, "1 3 1024 1024")
+            .output("image_embeddings", "1 256 64 64")
+            .write(&dir.path().join(format!("{name}_encoder.onnx")));
+        Onnx::new()
+            .input("image_embeddings", FLOAT, "1 256 64 64")
+            .input("point_coords", FLOAT, "1 n 2")
+            .input("point_labels", FLOAT, "1 n")
+            .input("mask_input", FLOAT, "1 1 256 256")
+            .input("has_mask_input", FLOAT, "1")
+            .input("orig_im_size", FLOAT, "2")
+            .output("masks", "…")
+            .output("iou_predictions", "1 4")
+            .output("low_res_masks", "1 4 256 256")
+            .write(&dir.path().join(format!("{name}_decoder.onnx")));
+    }
+    let registry = Registry::of(&[dir.path()]);
+    assert_eq!(registry.installed(Duty::Masks, "sam").unwrap().name, "sam_vit_h");
+    assert_eq!(registry.installed(Duty::Masks, "sam_vit_b").unwrap().name, "sam_vit_b");
+    let model = registry.installed(Duty::Masks, "sam").unwrap();
+    assert_eq!(model.graph(Part::MaskDecoder).unwrap().fixed("points", "P"), Some(1));
+}
+
+fn photo(stem: &str, image: RgbImage) -> Photo {
+    Photo {
+        path: format!("{stem}.png").into(),
+        stem: stem.into(),
+        original_size: (image.width as u32, image.height as u32),
+        to_working: Affine::IDENTITY,
+        frame: Frame::default(),
+        exif_focal: None,
+        camera_model: None,
+        image,
+    }
+}
+
+/// The breakfast views with a multi-view graph that returns their true depth and cameras, in VGGT's form.
+#[test]
+fn a_multi_view_network_that_says_the_truth_gives_the_true_cameras() {
+    let _uncached = cache::off();
+    let views = super::breakfast::train_views();
+    let (w, h) = (112usize, 84);
+    let (mut depth, mut poses) = (Vec::new(), Vec::new());
+    for v in &views {
+        let first = &views[0].camera.pose;
+        let relative = v.camera.pose.compose(&first.inverse());
+        let q = glam::DQuat::from_mat3(&relative.rotation);
+        let field = |pixels: f64, focal: f64| 2.0 * (0.5 * pixels / focal).atan();
+        poses.extend(relative.translation.to_array());
+        poses.extend([q.x, q.y, q.z, q.w, field(480.0, v.camera.fy), field(640.0, v.camera.fx)]);
+        for p in 0..w * h {
+            let (x, y) = ((p % w) as f64 + 0.5, (p / w) as f64 + 0.5);
+            depth.push(v.depth.at((x * 640.0 / w as f64) as usize, (y * 480.0 / h as f64) as usize));
+        }
+    }
+    let n = views.len();
+    let poses: Vec<f32> = poses.iter().map(|v| *v as f32).collect();
+    let dir = tempfile::tempdir().unwrap();
+    let shape = format!("1 {n} 3 {h} {w}");
+    let known: Vec<f32> = depth.iter().map(|z| if *z > 0.0 { 5.0 } else { 1.0 }).collect();
+    Onnx::new()
+        .input("images", FLOAT, &shape)
+        .output("depth", &format!("1 {n} {h} {w} 1"))
+        .output("depth_conf", &format!("1 {n} {h} {w}"))
+        .output("pose_enc", &format!("1 {n} 9"))
+        .weight("d", &[1, n as u64, h as u64, w as u64, 1], &depth)
+        .weight("c", &[1, n as u64, h as u64, w as u64], &known)
+        .weight("p", &[1, n as u64, 9], &poses)
+        .node("Identity", "d", "depth", &[])
+        .node("Identity", "c", "depth_conf", &[])
+        .node("Identity", "p", "pose_enc", &[])
+        .write(&dir.path().join("vggt/model.onnx"));
+    let registry = Registry::of(&[dir.path()]);
+    let model = registry.installed(Duty::Geometry, "vggt").unwrap();
+    let photos: Vec<Photo> =
+        views.iter().enumerate().map(|(k, v)| photo(&format!("view{k}"), v.image.clone())).collect();
+    let (seen, maps) = pairs::pointmaps(&model, &photos, &Silent).unwrap();
+    let geometry = pointmap::reconstruct(&seen, &maps, &Silent).unwrap();
+    for (k, (camera, v)) in geometry.cameras.iter().zip(&views).enumerate() {
+        let truth = v.camera.pose.compose(&views[0].camera.pose.inverse());
+        let turned = (camera.pose.rotation * truth.rotation.transpose()).transpose();
+        let angle =
+            ((turned.x_axis.x + turned.y_axis.y + turned.z_axis.z - 1.0) / 2.0).clamp(-1.0, 1.0).acos();
+        // Depth is taken at one of 33 pixels and the nearest at that: measured below 0.1° and 0.3 %.
+        assert!(angle.to_degrees() < 0.3, "view {k}: {}°", angle.to_degrees());
+        assert!((camera.fx / v.camera.fx - 1.0).abs() < 0.01, "view {k}: {} {}", camera.fx, v.camera.fx);
+    }
+    let few = pairs::pointmaps(&model, &photos[..2], &Silent).unwrap_err().to_string();
+    assert!(few.contains(&format!("exported for {n} photos, here are 2")), "{few}");
+}
+
+/// One graph for both views, channels first, raw activations: the adapter says what is left to do.
+#[test]
+fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_the_adapter() {
+    let _uncached = cache::off();
+    let (w, h) = (32u64, 16);
+    let pixels = (w * h) as usize;
+    // ln 3 along z: e^d − 1 = 2. A mark of the first image's brightness in x tells the two orders apart.
+    let raw: Vec<f32> = (0..3 * pixels).map(|k| if k / pixels == 2 { 3f32.ln() } else { 0.0 }).collect();
+    let mut graph = Onnx::new().input("img1", FLOAT, "1 3 16 32").input("img2", FLOAT, "1 3 16 32");
+    for k in ["1", "2"] {
+        graph = graph
+            .output(&format!("pts3d_{k}"), "1 3 16 32")
+            .output(&format!("conf_{k}"), "1 16 32")
+            .weight(&format!("p{k}"), &[1, 3, h, w], &raw)
+            .weight(&format!("c{k}"), &[1, h, w], &vec![3f32.ln(); pixels])
+            .node("Identity", &format!("c{k}"), &format!("conf_{k}"), &[]);
+    }
+    let graph = graph
+        .weight("tiny", &[1], &[1e-3])
+        .node("Mul", "img1 tiny", "mark", &[])
+        .node("Add", "p1 mark", "pts3d_1", &[])
+        .node("Identity", "p2", "pts3d_2", &[]);
+    let dir = tempfile::tempdir().unwrap();
+    graph.write(&dir.path().join("dust3r/model.onnx"));
+    let registry = Registry::of(&[dir.path()]);
+    let grey = |v: f32| RgbImage { width: 64, height: 32, data: vec![[v; 3]; 64 * 32] };
+    let photos = [photo("dark", grey(0.5)), photo("light", grey(1.0))];
+    let model = registry.installed(Duty::Geometry, "dust3r").unwrap();
+    // ln 3 = 1.1 is no confidence of 4, but it is at least 1: nothing to see here yet.
+    let (views, maps) = pairs::pointmaps(&model, &photos, &Silent).unwrap();
+    assert_eq!((views[0].width, views[0].height, maps.len()), (32, 16, 1));
+    assert!((maps[0].x11.points[0][2] - 3f32.ln()).abs() < 1e-6);
+
+    let adapter = "family = \"dust3r\"\n[[graph]]\npart = \"pair\"\napply.points = \"expm1-norm\"\napply.conf = \"one-plus-exp\"";
+    std::fs::write(dir.path().join("dust3r/adapter.toml"), adapter).unwrap();
+    let model = registry.installed(Duty::Geometry, "dust3r").unwrap();
+    let (_, maps) = pairs::pointmaps(&model, &photos, &Silent).unwrap();
+    let pair = &maps[0];
+    assert!((pair.x21.points[7][2] - 2.0).abs() < 1e-5 && (pair.x12.points[7][2] - 2.0).abs() < 1e-5);
+    assert!((pair.x11.confidence[0] - 4.0).abs() < 1e-5);
+    // (1 − 0.5) / 0.5 = 1 for the light photo, 0 for the dark one.
+    assert!(pair.x11.points[0][0].abs() < 1e-6 && pair.x22.points[0][0] > 1e-3, "{:?}", pair.x22.points[0]);
+}
+
+/// A matcher that moves everything a quarter of the width to the right, sure as a logit of 2.
+#[test]
+fn a_warp_is_brought_to_the_photos_pixels() {
+    let _uncached = cache::off();
+    let mut flow = Vec::new();
+    for y in 0..8 {
+        for x in 0..8 {
+            flow.extend([(2.0 * (x as f32 + 0.5) / 8.0 - 1.0) + 0.5, 2.0 * (y as f32 + 0.5) / 8.0 - 1.0]);
+        }
+    }
+    let graph = |certainty: &str| {
+        Onnx::new()
+            .input("im_A", FLOAT, "1 3 56 56")
+            .input("im_B", FLOAT, "1 3 56 56")
+            .output("warp_AB", "1 8 8 2")
+            .output(certainty, "1 1 8 8")
+            .weight("f", &[1, 8, 8, 2], &flow)
+            .weight("c", &[1, 1, 8, 8], &[2.0; 64])
+            .node("Identity", "f", "warp_AB", &[])
+            .node("Identity", "c", certainty, &[])
+    };
+    let dir = tempfile::tempdir().unwrap();
+    graph("certainty").write(&dir.path().join("roma/warp.onnx"));
+    let registry = Registry::of(&[dir.path()]);
+    let model = registry.installed(Duty::Matcher, "roma").unwrap();
+    let grey = |w: usize, h: usize| RgbImage { width: w, height: h, data: vec![[0.5; 3]; w * h] };
+    let photos = [photo("a", grey(80, 40)), photo("b", grey(160, 100))];
+    let found = warp::warps(&model, &photos, &Silent).unwrap();
+    let there = &found[0].0;
+    let p = 10 * 80 + 30;
+    let [u, v] = there.target.data[p];
+    // (30.5 / 80 + 1/4) · 160 and (10.5 / 40) · 100.
+    assert!((u - 101.0).abs() < 1e-3 && (v - 26.25).abs() < 1e-3, "{u} {v}");
+    assert!((there.certainty.data[p] - 1.0 / (1.0 + (-2f32).exp())).abs() < 1e-6);
+    assert_eq!(there.certainty.data[10 * 80 + 78], 0.0, "what leaves the photo has no match");
+    // Without the adapter's sigmoid a logit is no probability.
+    let raw = "family = \"other\"\n[[graph]]\npart = \"warp\"\nnames = { image1 = \"im_A\", image2 = \"im_B\", warp12 = \
+               \"warp_AB\", certainty12 = \"certainty\" }\nimage = { mean = [0.0, 0.0, 0.0], std = [1.0, 1.0, 1.0], size = 56, \
+               fit = \"squash\" }";
+    std::fs::write(dir.path().join("roma/adapter.toml"), raw).unwrap();
+    let error =
+        warp::warps(&registry.installed(Duty::Matcher, "roma").unwrap(), &photos, &Silent).unwrap_err();
+    assert!(error.to_string().contains("apply.certainty"), "{error}");
+}

@@ -1,0 +1,146 @@
+//! Dense matching networks (RoMa v1 and v2): for every pixel of one photo its position in another, with a certainty.
+use rayon::prelude::*;
+
+use super::alone;
+use super::cache::{Key, remember};
+use super::contract::Part;
+use super::graph::Graph;
+use super::installed::Installed;
+use super::prepare::Prepared;
+use super::runtime::Tensor;
+use crate::language::DenseWarp;
+use crate::photo::Photo;
+use crate::progress::Progress;
+use crate::scene::Plane;
+use crate::{Error, Result};
+
+/// Both directions for every unordered pair (i, j), i < j, in order.
+pub fn warps(
+    model: &Installed,
+    photos: &[Photo],
+    progress: &dyn Progress,
+) -> Result<Vec<(DenseWarp, DenseWarp)>> {
+    let _alone = alone();
+    let file = model.graph(Part::Warp)?;
+    let prepared = super::pairs::inputs(file, "image1", photos)?;
+    let both = file.has("warp21") && file.has("certainty21");
+    let mut graph: Option<Graph> = None;
+    let mut forward = |i: usize, j: usize| -> Result<Vec<Field>> {
+        let (a, b) = (&prepared[i], &prepared[j]);
+        let values = remember(Key::new("warp").model(file)?.values(&a.data).values(&b.data), || {
+            let net = match graph.take() {
+                Some(net) => net,
+                None => file.load()?,
+            };
+            let net = graph.insert(net);
+            let mut outputs = net.run(vec![("image1", a.input()), ("image2", b.input())])?;
+            let mut all = Vec::new();
+            let ends = [("warp12", "certainty12"), ("warp21", "certainty21")];
+            for (warp, certainty) in ends.into_iter().take(if both { 2 } else { 1 }) {
+                let (warp, sure) = (outputs.take(warp)?, outputs.take(certainty)?);
+                all.extend(field_values(warp, sure, file)?);
+            }
+            Ok(all)
+        })?;
+        Ok(fields(&values))
+    };
+    let count = photos.len();
+    progress.begin("match", (count * count.saturating_sub(1) / 2) as u64);
+    let mut all = Vec::new();
+    for i in 0..count {
+        for j in i + 1..count {
+            progress.check()?;
+            let mut found = forward(i, j)?;
+            if !both {
+                found.extend(forward(j, i)?);
+            }
+            let [there, back] = &found[..] else {
+                return Err(Error::work(format!("{}: gave no warp", file.path.display())));
+            };
+            let (a, b) = ((&photos[i], &prepared[i]), (&photos[j], &prepared[j]));
+            all.push((there.at_working_size(a, b), back.at_working_size(b, a)));
+            progress.step(all.len() as u64, "");
+        }
+    }
+    progress.end();
+    Ok(all)
+}
+
+/// A warp at the network's resolution: (x, y) in [−1, 1] of the second input, certainty.
+struct Field {
+    width: usize,
+    height: usize,
+    data: Vec<[f32; 3]>,
+}
+
+/// [width, height, (x, y, certainty)…]
+fn field_values(warp: Tensor, certainty: Tensor, file: &super::graph::GraphFile) -> Result<Vec<f32>> {
+    let [_, height, width, _] = warp.shape[..] else { return Ok(Vec::new()) };
+    if certainty.data.len() != width * height {
+        return Err(Error::work(format!("{}: warp and certainty differ in size", file.path.display())));
+    }
+    if let Some(odd) = certainty.data.iter().find(|c| !(-1e-3..=1.001).contains(*c)) {
+        return Err(Error::missing(format!(
+            "{}: a certainty of {odd} is no probability; if the graph gives logits say apply.certainty = \"sigmoid\" in its \
+             adapter (docs/models.md)",
+            file.path.display()
+        )));
+    }
+    let mut all = vec![width as f32, height as f32];
+    for (xy, c) in warp.data.chunks_exact(2).zip(&certainty.data) {
+        let inside = xy.iter().all(|v| v.abs() <= 1.0);
+        all.extend([xy[0], xy[1], if inside { *c } else { 0.0 }]);
+    }
+    Ok(all)
+}
+
+fn fields(mut values: &[f32]) -> Vec<Field> {
+    let mut all = Vec::new();
+    while let [w, h, rest @ ..] = values {
+        let (width, height) = (*w as usize, *h as usize);
+        let Some((body, next)) = rest.split_at_checked(3 * width * height) else { break };
+        all.push(Field { width, height, data: bytemuck::pod_collect_to_vec(body) });
+        values = next;
+    }
+    all
+}
+
+impl Field {
+    /// Bilinear, with pixel centres at half-integers; positions beyond the border repeat it.
+    fn sample(&self, x: f64, y: f64) -> [f32; 3] {
+        let axis = |v: f64, n: usize| {
+            let v = (v - 0.5).clamp(0.0, (n - 1) as f64);
+            (v as usize, (v as usize + 1).min(n - 1), v.fract() as f32)
+        };
+        let ((x0, x1, fx), (y0, y1, fy)) = (axis(x, self.width), axis(y, self.height));
+        let at = |x: usize, y: usize| self.data[y * self.width + x];
+        let mix = |a: [f32; 3], b: [f32; 3], t: f32| [0, 1, 2].map(|k| a[k] + t * (b[k] - a[k]));
+        mix(mix(at(x0, y0), at(x1, y0), fx), mix(at(x0, y1), at(x1, y1), fx), fy)
+    }
+
+    /// At every pixel of the first photo: where it is in the second.
+    fn at_working_size(&self, from: (&Photo, &Prepared), to: (&Photo, &Prepared)) -> DenseWarp {
+        let (width, height) = (from.0.image.width, from.0.image.height);
+        let back = to.1.from_photo.inverse();
+        let mut target = Plane::filled(width, height, [-1.0f32; 2]);
+        let mut certainty = Plane::filled(width, height, 0.0f32);
+        let rows = target.data.par_chunks_mut(width).zip(certainty.data.par_chunks_mut(width)).enumerate();
+        rows.for_each(|(y, (target, certainty))| {
+            for x in 0..width {
+                let [u, v] = from.1.from_photo.apply([x as f64 + 0.5, y as f64 + 0.5]);
+                let cell = [
+                    u * self.width as f64 / from.1.width as f64,
+                    v * self.height as f64 / from.1.height as f64,
+                ];
+                let [a, b, sure] = self.sample(cell[0], cell[1]);
+                let seen = [
+                    (f64::from(a) + 1.0) / 2.0 * to.1.width as f64,
+                    (f64::from(b) + 1.0) / 2.0 * to.1.height as f64,
+                ];
+                target[x] = back.apply(seen).map(|v| v as f32);
+                certainty[x] = sure.clamp(0.0, 1.0);
+            }
+        });
+        DenseWarp { target, certainty }
+    }
+}
