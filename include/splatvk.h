@@ -802,7 +802,8 @@ SvkStatus svk_scene_query(SvkScene *scene,
                           size_t mask_bytes);
 
 /*
- Writes the scene: a file of Gaussians where the name ends like one (.ply, .splat), a scene directory otherwise. It
+ Writes the scene: a file of Gaussians where the name ends like one (.ply, .compressed.ply, .splat, .spz; language goes
+ beside it, into NAME.language.npz), a scene directory otherwise. It
  appears whole or not at all; `replace` = 1 allows to replace a scene or file that is there. Thread-safe.
  */
 SvkStatus svk_scene_save(SvkScene *scene, const char *path, uint32_t replace);

@@ -182,6 +182,11 @@ impl Rows<'_> {
     }
 }
 
+/// Whether the file has such an element.
+pub(super) fn has(bytes: &[u8], element: &str) -> bool {
+    header(bytes, element).is_ok()
+}
+
 /// One element of a binary file.
 pub(super) fn rows<'a>(bytes: &'a [u8], element: &str) -> Result<Rows<'a>, String> {
     let h = header(bytes, element)?;

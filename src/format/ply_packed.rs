@@ -54,7 +54,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Splats, String> {
     if chunks.len() != vertices.len().div_ceil(CHUNK) {
         return Err(format!("{} chunks for {} Gaussians", chunks.len(), vertices.len()));
     }
-    let sh = ply::rows(bytes, "sh").ok();
+    let sh = if ply::has(bytes, "sh") { Some(ply::rows(bytes, "sh")?) } else { None };
     let columns = sh.as_ref().map(|s| s.series("f_rest_")).unwrap_or_default();
     if sh.as_ref().is_some_and(|s| s.len() != vertices.len()) {
         return Err("the sh element has another number of rows".into());

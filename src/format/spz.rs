@@ -78,7 +78,9 @@ fn parse(bytes: &[u8]) -> Result<Splats, String> {
         // The header first: it tells how much may follow.
         gzip.by_ref().take(HEADER as u64).read_to_end(&mut plain).map_err(broken)?;
         let size: usize = Head::parse(&plain)?.sections().iter().sum();
-        gzip.take(size as u64).read_to_end(&mut plain).map_err(broken)?;
+        gzip.by_ref().take(size as u64).read_to_end(&mut plain).map_err(broken)?;
+        // The end of the stream checks the sum of what came before it.
+        gzip.read(&mut [0]).map_err(broken)?;
         return unpack(&plain);
     }
     if Head::parse(bytes)?.version >= 4 { unpack_4(bytes) } else { unpack(bytes) }
