@@ -259,14 +259,16 @@ def language():
     whole, packed = read_ply(SCENE / "point_cloud.ply"), of_gsply(gsply.plyread(str(out)))
     span = np.ptp(whole["means"], axis=0).max() / 2046
     for level in features.files:
-        # A file row belongs to the splat with its features; that splat must also be where the row says.
-        rows = {f.tobytes(): i for i, f in enumerate(features[level])}
-        index = np.array([rows.get(f.tobytes(), -1) for f in side[f"features_{level}"]])
-        assert (index >= 0).all(), f"level {level}: features that are not the scene's"
-        distinct = np.unique(index).size
-        if distinct == len(index):
-            close(f"language level {level}", packed["means"], whole["means"][index], span)
-            print(f"ok  language beside compressed ply, level {level}: {distinct} splats")
+        # A feature that only one splat has tells where that splat went; its position must have gone there, too.
+        unique, first, count = np.unique(features[level], axis=0, return_index=True, return_counts=True)
+        where = {f.tobytes(): i for f, i, n in zip(unique, first, count) if n == 1}
+        known = {f.tobytes() for f in unique}
+        rows = [f.tobytes() for f in side[f"features_{level}"]]
+        assert len(rows) == len(features[level]) and known.issuperset(rows), f"level {level}: not the scene's features"
+        pairs = np.array([(r, where[f]) for r, f in enumerate(rows) if f in where])
+        assert len(pairs) == len(where) > 100, f"level {level}: {len(pairs)} of {len(where)} splats found again"
+        close(f"language level {level}", packed["means"][pairs[:, 0]], whole["means"][pairs[:, 1]], span)
+        print(f"ok  language beside compressed ply, level {level}: {len(pairs)} splats found again")
     # And through splatvk again: the file with its side file answers.
     run("query", out, "lemon", "--cameras", SCENE / "cameras/transforms.json", "--out", WORK / "answers")
     print("ok  language beside compressed ply answers a query")
