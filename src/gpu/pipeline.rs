@@ -76,14 +76,7 @@ impl Device {
     fn create(&self, module: &Module, made: &mut Pipeline) -> Result<()> {
         let device = &self.0.device;
         let error = || vk_error(format!("shader {}", module.name));
-        let over = std::env::var("SPLATVK_SPIRV_DIR").ok().and_then(|d| {
-            std::fs::read_dir(&d)
-                .ok()?
-                .flatten()
-                .find(|e| e.file_name().to_string_lossy() == format!("{}.spv", module.name))
-        });
-        let bytes = over.and_then(|e| std::fs::read(e.path()).ok());
-        let code = ash::util::read_spv(&mut std::io::Cursor::new(bytes.as_deref().unwrap_or(module.spirv)))
+        let code = ash::util::read_spv(&mut std::io::Cursor::new(module.spirv))
             .map_err(|e| Error::gpu(format!("shader {}: {e}", module.name)))?;
         let bindings: Vec<_> = module
             .bindings
