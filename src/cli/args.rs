@@ -2,6 +2,12 @@
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
+mod bench;
+mod experiments;
+
+pub use bench::{BenchArgs, BenchPart};
+pub use experiments::{AblateArgs, GenerateArgs, TableArg};
+
 /// Photos in, a 3D scene that answers text queries out.
 #[derive(Debug, Parser)]
 #[command(name = "splatvk", version, about, max_term_width = 100, arg_required_else_help = true)]
@@ -315,129 +321,6 @@ pub struct EvalArgs {
     pub device: DeviceArgs,
 }
 
-/// Which tables `ablate` runs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum TableArg {
-    /// Every table, shared stages once
-    All,
-    /// None, step 1, steps 1 and 2, step 3, all three
-    Alignment,
-    /// Bijection, autoencoder, no reduction
-    Bijection,
-    /// This program's way and the baselines
-    Methods,
-    /// Codes of 3, 8 and 16 numbers
-    Dimension,
-    /// Language training with and without the image loss
-    ImageLoss,
-    /// Masks and features: built-in, with injected errors, exact
-    Features,
-    /// At most 50k, 500k, or all splats at the start
-    Points,
-    /// 2, 4 and 6 photos
-    Views,
-    /// Cameras and points from photos alone, or from the true cameras
-    Initializer,
-}
-
-/// `splatvk ablate`
-#[derive(Debug, Args)]
-pub struct AblateArgs {
-    /// Which tables
-    #[arg(value_enum, required = true, value_name = "TABLE")]
-    pub tables: Vec<TableArg>,
-    /// Folder with ground_truth.json, photos and masks
-    #[arg(long, value_name = "DIR")]
-    pub data: PathBuf,
-    /// Folder for ablate.json and one text and one chart per table [default: out/ablate-NAME, after the data]
-    #[arg(long, value_name = "DIR")]
-    pub out: Option<PathBuf>,
-    /// Masks and features for every row: built-in, flawed (true masks, errors injected), exact, or dir:DIR [default: those
-    /// that each table is about]
-    #[arg(long, value_name = "SOURCE")]
-    pub regions: Option<String>,
-    /// Photos of the default row [default: all train frames, at most 4]
-    #[arg(long, value_name = "N")]
-    pub views: Option<usize>,
-    /// Take the true cameras in every row, for photos that alone would give none
-    #[arg(long)]
-    pub true_cameras: bool,
-    /// Seed of training and of injected errors
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
-    /// Optimisation steps of the colour stage, instead of draft's
-    #[arg(long, value_name = "N")]
-    pub iterations: Option<usize>,
-    /// Optimisation steps of the language stage, instead of draft's
-    #[arg(long, value_name = "N")]
-    pub language_iterations: Option<usize>,
-    /// Device and models
-    #[command(flatten)]
-    pub device: DeviceArgs,
-}
-
-/// `splatvk generate`
-#[derive(Debug, Args)]
-pub struct GenerateArgs {
-    /// Folder to write: photos, held-out views, depth, masks, cameras, regions
-    #[arg(long, value_name = "DIR")]
-    pub out: PathBuf,
-    /// Make no scene: only regions_exact/ and regions_flawed/ for this data set with masks
-    #[arg(long, value_name = "DIR")]
-    pub from: Option<PathBuf>,
-    /// Everything random
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
-    /// Photos
-    #[arg(long, default_value_t = 4, value_name = "N")]
-    pub views: usize,
-    /// Held-out views
-    #[arg(long, default_value_t = 6, value_name = "N")]
-    pub held_out: usize,
-    /// Picture size, pixels
-    #[arg(long, default_value = "640x480", value_name = "WxH")]
-    pub size: String,
-    /// Objects on the table, 1 to 12
-    #[arg(long, default_value_t = 8, value_name = "N")]
-    pub objects: usize,
-    /// Angle between neighbouring photos, degrees
-    #[arg(long, default_value_t = 20.0, value_name = "DEG")]
-    pub baseline: f64,
-    /// Contrast of surfaces: 1 = plenty to match, 0 = bare
-    #[arg(long, default_value_t = 1.0, value_name = "0-1")]
-    pub texture: f64,
-    /// Thin poles
-    #[arg(long, default_value_t = 0, value_name = "N")]
-    pub thin: usize,
-    /// Objects close together and behind each other
-    #[arg(long, default_value_t = 0.3, value_name = "0-1")]
-    pub occlusion: f64,
-    /// Objects that look like another one
-    #[arg(long, default_value_t = 0, value_name = "N")]
-    pub similar: usize,
-    /// Error of the starting cameras in cameras_noisy.json, degrees
-    #[arg(long, default_value_t = 0.1, value_name = "DEG")]
-    pub pose_noise: f64,
-    /// Noise of the photos, share of full white
-    #[arg(long, default_value_t = 0.005, value_name = "SHARE")]
-    pub photo_noise: f64,
-    /// regions_flawed/: rate of masks cut in two
-    #[arg(long, default_value_t = 0.2, value_name = "RATE")]
-    pub split: f64,
-    /// regions_flawed/: rate of objects swallowed by a neighbour's mask
-    #[arg(long, default_value_t = 0.05, value_name = "RATE")]
-    pub merge: f64,
-    /// regions_flawed/: rate of features of another object
-    #[arg(long, default_value_t = 0.2, value_name = "RATE")]
-    pub wrong: f64,
-    /// regions_flawed/: random part of every feature
-    #[arg(long, default_value_t = 0.35, value_name = "LENGTH")]
-    pub noise: f64,
-    /// Print one JSON object on standard output
-    #[arg(long)]
-    pub json: bool,
-}
-
 /// What `export` writes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ExportFormat {
@@ -496,83 +379,6 @@ pub enum ModelsAction {
     Check(DeviceArgs),
     /// Where models are looked for
     Path(DeviceArgs),
-}
-
-/// What `bench` measures beside the roofline.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum BenchPart {
-    /// Every pass of a training step and the whole, on colour and with features
-    Training,
-    /// The radix sort of --keys keys
-    Sort,
-    /// A text query in all views of --scene
-    Query,
-    /// Every step of every installed network: seconds and peak memory
-    Models,
-    /// The limits of the device
-    Roofline,
-}
-
-/// `splatvk bench`
-#[derive(Debug, Args)]
-pub struct BenchArgs {
-    /// What to measure
-    #[arg(value_enum, default_value = "training", value_name = "WHAT")]
-    pub parts: Vec<BenchPart>,
-    /// Gaussian .ply with its camera beside it, or a scene directory [default: a seeded scene]
-    #[arg(long, value_name = "PATH")]
-    pub scene: Option<PathBuf>,
-    /// Camera of the scene: pinhole .json as --write-scene writes it, transforms.json or cameras.json
-    #[arg(long, value_name = "FILE", requires = "scene")]
-    pub camera: Option<PathBuf>,
-    /// Splats of the seeded scene
-    #[arg(long, default_value_t = 100_000, value_name = "N", conflicts_with = "scene")]
-    pub splats: usize,
-    /// Image width of the seeded scene, pixels
-    #[arg(long, default_value_t = 640, value_name = "PIXELS", conflicts_with = "scene")]
-    pub width: u32,
-    /// Image height of the seeded scene, pixels
-    #[arg(long, default_value_t = 480, value_name = "PIXELS", conflicts_with = "scene")]
-    pub height: u32,
-    /// Seed of the seeded scene
-    #[arg(long, default_value_t = 0, value_name = "N", conflicts_with = "scene")]
-    pub seed: u64,
-    /// Spherical-harmonics degree [default: 0, or the scene's own]
-    #[arg(long, value_parser = clap::value_parser!(u32).range(0..=3), value_name = "0-3")]
-    pub sh_degree: Option<u32>,
-    /// Feature channels of the second step: 0 = leave it out, 1 to 16, 32, 48
-    #[arg(long, default_value_t = 16, value_name = "D")]
-    pub features: usize,
-    /// Then the training step of seeded scenes with so many splats each
-    #[arg(long, value_delimiter = ',', value_name = "N,N,...")]
-    pub sweep: Vec<usize>,
-    /// sort: how many keys
-    #[arg(long, default_value_t = 10_000_000, value_name = "N")]
-    pub keys: usize,
-    /// query: what to look for
-    #[arg(long, default_value = "a cup", value_name = "TEXT")]
-    pub query: String,
-    /// query, models: folder of the models
-    #[arg(long, value_name = "DIR")]
-    pub models: Option<PathBuf>,
-    /// Repeat each measurement for this long
-    #[arg(long, default_value_t = 2.0, value_name = "S")]
-    pub seconds: f64,
-    /// Repeat each measurement so often instead
-    #[arg(long, value_name = "N", conflicts_with = "seconds")]
-    pub repeats: Option<usize>,
-    /// Also write the figures to this file
-    #[arg(long, value_name = "FILE")]
-    pub json: Option<PathBuf>,
-    /// Measure nothing: print the ratios B / A of two files of --json
-    #[arg(long, num_args = 2, value_names = ["A", "B"], conflicts_with_all = ["scene", "json", "write_scene"])]
-    pub compare: Option<Vec<PathBuf>>,
-    /// Measure nothing: write scene.ply, scene.json and render.npy of the workload for other programs
-    #[arg(long, value_name = "DIR", conflicts_with = "json")]
-    pub write_scene: Option<PathBuf>,
-    /// Vulkan device: part of its name, or its number in `splatvk doctor`
-    #[arg(long, value_name = "NAME|INDEX")]
-    pub device: Option<String>,
 }
 
 /// `splatvk doctor`

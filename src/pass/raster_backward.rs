@@ -9,7 +9,7 @@
 //! Every geometry gradient follows per splat: ∂o = m₀/o, ∂(u, v) = −(A m₁ + B m₂, C m₂ + B m₁),
 //! ∂(A, B, C) = (−½ m₃, −m₄, −½ m₅).
 use super::adam::rows_of_groups;
-use super::raster_forward::{BASE_CHANNELS, Block, Cutoffs, TwinScene, blocks, channels_of, walk};
+use super::raster_forward::{BASE_CHANNELS, Block, Cutoffs, TwinScene, blocks, channels_of, push, walk};
 use super::rasterizer::FrameBuffers;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
@@ -117,17 +117,7 @@ fn record_atomic(rec: &mut Recorder, frame: &FrameBuffers, block: Block, couplin
             transmittance: &frame.transmittance,
             projected_grad: &frame.projected_grad,
         },
-        &shaders::raster_backward::Push {
-            width: frame.width,
-            height: frame.height,
-            tiles_x: tiles[0],
-            code_vectors: frame.code_stride() / 4,
-            first_vector: block.first_vector,
-            first_plane: block.first_plane,
-            features: block.features,
-            alpha_plane: (BASE_CHANNELS + frame.feature_dim) as u32,
-            coupling,
-        },
+        &push!(raster_backward, frame, block, alpha_plane: alpha_plane(frame), coupling: coupling),
     );
     rec.dispatch(call, [tiles[0], tiles[1], 1]);
 }
@@ -153,19 +143,14 @@ fn record_entries(
             transmittance: &frame.transmittance,
             splat_entries: &entries.splats,
         },
-        &shaders::raster_backward_entries::Push {
-            width: frame.width,
-            height: frame.height,
-            tiles_x: tiles[0],
-            code_vectors: frame.code_stride() / 4,
-            first_vector: block.first_vector,
-            first_plane: block.first_plane,
-            features: block.features,
-            alpha_plane: (BASE_CHANNELS + frame.feature_dim) as u32,
-            coupling,
-        },
+        &push!(raster_backward_entries, frame, block, alpha_plane: alpha_plane(frame), coupling: coupling),
     );
     rec.dispatch(call, [tiles[0], tiles[1], 1]);
+}
+
+/// Where the alpha plane lies in the stack.
+fn alpha_plane(frame: &FrameBuffers) -> u32 {
+    (BASE_CHANNELS + frame.feature_dim) as u32
 }
 
 /// `to` [N, vectors] = the sums of `from` [entries, vectors] per splat, in vectors of four.

@@ -52,6 +52,23 @@ pub(super) fn blocks(dim: u32) -> Vec<Block> {
     blocks
 }
 
+/// The push constants of a raster shader; what only some of them have goes behind.
+macro_rules! push {
+    ($shader:ident, $frame:expr, $block:expr $(, $field:ident: $value:expr)*) => {
+        shaders::$shader::Push {
+            width: $frame.width,
+            height: $frame.height,
+            tiles_x: $frame.tiles()[0],
+            code_vectors: $frame.code_stride() / 4,
+            first_vector: $block.first_vector,
+            first_plane: $block.first_plane,
+            features: $block.features,
+            $($field: $value,)*
+        }
+    };
+}
+pub(super) use push;
+
 /// Records the blending of the binned splats into `frame.planes`, `frame.transmittance`, `frame.median_depth`.
 pub fn record(rec: &mut Recorder, camera: &Buffer, frame: &FrameBuffers) {
     let tiles = frame.tiles();
@@ -68,15 +85,7 @@ pub fn record(rec: &mut Recorder, camera: &Buffer, frame: &FrameBuffers) {
                 transmittance: &frame.transmittance,
                 median_depth: &frame.median_depth,
             },
-            &shaders::raster_forward::Push {
-                width: frame.width,
-                height: frame.height,
-                tiles_x: tiles[0],
-                code_vectors: frame.code_stride() / 4,
-                first_vector: block.first_vector,
-                first_plane: block.first_plane,
-                features: block.features,
-            },
+            &push!(raster_forward, frame, block),
         );
         rec.dispatch(call, [tiles[0], tiles[1], 1]);
     }

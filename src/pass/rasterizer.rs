@@ -1,16 +1,15 @@
 //! The training-facing render: parameters and gradients in GPU buffers, forward and backward as recorded commands.
 //!
 //! ```no_run
-//! # fn main() -> splatvk::Result<()> {
 //! # use splatvk::{gpu::{Device, Recorder}, pass::rasterizer::*, pass::view::View, scene::{Camera, Splats}};
-//! # let (splats, camera): (Splats, Camera) = todo!();
+//! # fn step(splats: &Splats, camera: &Camera) -> splatvk::Result<()> {
 //! let device = Device::open(None)?;
-//! let params = SplatBuffers::upload(&device, &splats, &[], 0)?;
+//! let params = SplatBuffers::upload(&device, splats, &[], 0)?;
 //! let grads = params.zeros_like(&device)?;
 //! let mut raster = Rasterizer::new(&device, params.count, params.feature_dim, camera.width, camera.height)?;
 //! let options = RasterOptions::default();
 //!
-//! raster.set_view(&View::new(&camera, 0.02))?;
+//! raster.set_view(&View::new(camera, 0.02))?;
 //! raster.forward(&params, &options)?;               // runs; grows its lists and repeats if they were too short
 //! let mut rec = Recorder::new(&device, "step");
 //! // … a loss pass reads raster.frame().planes and writes raster.frame().planes_grad …

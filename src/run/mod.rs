@@ -4,6 +4,7 @@ mod describe;
 pub mod encoder;
 pub mod live;
 mod method;
+mod networks;
 mod record;
 pub mod score;
 pub mod sources;
@@ -17,8 +18,7 @@ use crate::fit::{self, LanguageOptions, Preset, RgbOptions};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras};
 use crate::gpu::{self, Device};
-use crate::infer::installed::{Duty, Installed};
-use crate::infer::{Registry, pairs};
+use crate::infer::Registry;
 use crate::language;
 use crate::language::sam::SamOptions;
 use crate::photo::{self, Photo};
@@ -31,6 +31,7 @@ use crate::report::viewer::{Names, ShownAnswer};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
 use crate::{Error, Result};
 use describe::{Described, Describer, both};
+use networks::Networks;
 use std::path::{Path, PathBuf};
 use std::sync::{OnceLock, mpsc};
 use view::DecodedFrame;
@@ -283,7 +284,7 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
     let initialise =
         |init: &InitChoice| pose::initialise(device, &photos, init, &registry, &stereo, progress);
     let reconstruct = || match &networks.geometry {
-        Some(model) => geometry_of(model, &photos, initialise, progress),
+        Some(model) => networks::geometry_of(model, &photos, initialise, progress),
         None => initialise(&init),
     };
     let train = |geometry: &Geometry| {
@@ -335,96 +336,6 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
         seconds: progress.seconds(),
         warnings: progress.warnings(),
     })
-}
-
-/// The networks that a plan asks for.
-pub(crate) struct Networks {
-    pub(crate) geometry: Option<Installed>,
-    pub(crate) matcher: Option<Installed>,
-    pub(crate) masks: Option<Installed>,
-    features: Option<Installed>,
-}
-
-impl Networks {
-    /// Finds them all before any work; the error says what is missing.
-    fn of(plan: &RunPlan, registry: &Registry) -> Result<Networks> {
-        let find = |duty, name: Option<&String>| name.map(|n| registry.installed(duty, n)).transpose();
-        let geometry = match &plan.init {
-            InitSource::Network(name) => Some(name),
-            InitSource::Sfm | InitSource::Cameras(_) | InitSource::Given(_) => None,
-        };
-        let matcher = match &plan.matcher {
-            MatchSource::Network(name) => Some(name),
-            MatchSource::Xfeat => None,
-        };
-        let masks = match &plan.masks {
-            MaskSource::Network(name) => Some(name),
-            MaskSource::Graph | MaskSource::Dir(_) => None,
-        };
-        let features = match &plan.features {
-            FeatureSource::Network(name) => Some(name),
-            FeatureSource::Words | FeatureSource::Dir(_) => None,
-        };
-        Ok(Networks {
-            geometry: find(Duty::Geometry, geometry)?,
-            matcher: find(Duty::Matcher, matcher)?,
-            masks: find(Duty::Masks, masks)?,
-            features: find(Duty::Features, features)?,
-        })
-    }
-
-    fn all(&self) -> impl Iterator<Item = &Installed> {
-        [&self.geometry, &self.matcher, &self.masks, &self.features].into_iter().flatten()
-    }
-
-    /// What run.json says about them.
-    fn used(&self) -> Result<Vec<ModelUsed>> {
-        let mut used = Vec::new();
-        for model in self.all() {
-            let licence = model.known().map_or("unknown", |k| k.licence.as_str());
-            for (file, sha256) in model.files()? {
-                let file = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
-                let name =
-                    format!("{} {file}{}", model.name, if model.untrained() { " (untrained)" } else { "" });
-                used.push(ModelUsed { name, sha256, licence: licence.to_owned() });
-            }
-        }
-        Ok(used)
-    }
-
-    fn warn_untrained(&self, progress: &dyn Progress) {
-        let names: Vec<&str> = self.all().filter(|m| m.untrained()).map(|m| m.name.as_str()).collect();
-        if !names.is_empty() {
-            progress.warn(&format!(
-                "{}: untrained weights; what they say means nothing, only time and memory do",
-                names.join(", ")
-            ));
-        }
-    }
-}
-
-/// Cameras and depth from a network's pointmaps. Untrained weights give no geometry: then the photos themselves must.
-fn geometry_of(
-    model: &Installed,
-    photos: &[Photo],
-    initialise: impl Fn(&InitChoice) -> Result<Geometry>,
-    progress: &dyn Progress,
-) -> Result<Geometry> {
-    let (views, maps) = pairs::pointmaps(model, photos, progress)?;
-    let init = InitChoice::Pointmaps(views, maps);
-    match initialise(&init) {
-        Err(Error::Cancelled) => Err(Error::Cancelled),
-        Err(error) if model.untrained() => {
-            drop(init);
-            progress.warn(&format!(
-                "{}: no geometry in untrained pointmaps ({error}); cameras from sfm",
-                model.name
-            ));
-            initialise(&InitChoice::Sfm)
-        }
-        Ok(geometry) => Ok(Geometry { method: format!("{} pointmaps", model.name), ..geometry }),
-        Err(error) => Err(error),
-    }
 }
 
 /// Geometry and splats on this thread; masks, features and alignment beside them on another. The first error stops both.

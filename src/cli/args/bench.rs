@@ -1,0 +1,80 @@
+//! `splatvk bench`: what to measure, and on what.
+use clap::{Args, ValueEnum};
+use std::path::PathBuf;
+
+/// What `bench` measures beside the roofline.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum BenchPart {
+    /// Every pass of a training step and the whole, on colour and with features
+    Training,
+    /// The radix sort of --keys keys
+    Sort,
+    /// A text query in all views of --scene
+    Query,
+    /// Every step of every installed network: seconds and peak memory
+    Models,
+    /// The limits of the device
+    Roofline,
+}
+
+/// `splatvk bench`
+#[derive(Debug, Args)]
+pub struct BenchArgs {
+    /// What to measure
+    #[arg(value_enum, default_value = "training", value_name = "WHAT")]
+    pub parts: Vec<BenchPart>,
+    /// Gaussian .ply with its camera beside it, or a scene directory [default: a seeded scene]
+    #[arg(long, value_name = "PATH")]
+    pub scene: Option<PathBuf>,
+    /// Camera of the scene: pinhole .json as --write-scene writes it, transforms.json or cameras.json
+    #[arg(long, value_name = "FILE", requires = "scene")]
+    pub camera: Option<PathBuf>,
+    /// Splats of the seeded scene
+    #[arg(long, default_value_t = 100_000, value_name = "N", conflicts_with = "scene")]
+    pub splats: usize,
+    /// Image width of the seeded scene, pixels
+    #[arg(long, default_value_t = 640, value_name = "PIXELS", conflicts_with = "scene")]
+    pub width: u32,
+    /// Image height of the seeded scene, pixels
+    #[arg(long, default_value_t = 480, value_name = "PIXELS", conflicts_with = "scene")]
+    pub height: u32,
+    /// Seed of the seeded scene
+    #[arg(long, default_value_t = 0, value_name = "N", conflicts_with = "scene")]
+    pub seed: u64,
+    /// Spherical-harmonics degree [default: 0, or the scene's own]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(0..=3), value_name = "0-3")]
+    pub sh_degree: Option<u32>,
+    /// Feature channels of the second step: 0 = leave it out, 1 to 16, 32, 48
+    #[arg(long, default_value_t = 16, value_name = "D")]
+    pub features: usize,
+    /// Then the training step of seeded scenes with so many splats each
+    #[arg(long, value_delimiter = ',', value_name = "N,N,...")]
+    pub sweep: Vec<usize>,
+    /// sort: how many keys
+    #[arg(long, default_value_t = 10_000_000, value_name = "N")]
+    pub keys: usize,
+    /// query: what to look for
+    #[arg(long, default_value = "a cup", value_name = "TEXT")]
+    pub query: String,
+    /// query, models: folder of the models
+    #[arg(long, value_name = "DIR")]
+    pub models: Option<PathBuf>,
+    /// Repeat each measurement for this long
+    #[arg(long, default_value_t = 2.0, value_name = "S")]
+    pub seconds: f64,
+    /// Repeat each measurement so often instead
+    #[arg(long, value_name = "N", conflicts_with = "seconds")]
+    pub repeats: Option<usize>,
+    /// Also write the figures to this file
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Measure nothing: print the ratios B / A of two files of --json
+    #[arg(long, num_args = 2, value_names = ["A", "B"], conflicts_with_all = ["scene", "json", "write_scene"])]
+    pub compare: Option<Vec<PathBuf>>,
+    /// Measure nothing: write scene.ply, scene.json and render.npy of the workload for other programs
+    #[arg(long, value_name = "DIR", conflicts_with = "json")]
+    pub write_scene: Option<PathBuf>,
+    /// Vulkan device: part of its name, or its number in `splatvk doctor`
+    #[arg(long, value_name = "NAME|INDEX")]
+    pub device: Option<String>,
+}

@@ -1,0 +1,127 @@
+//! `splatvk ablate` and `splatvk generate`: tables, and data with a known answer.
+use super::DeviceArgs;
+use clap::{Args, ValueEnum};
+use std::path::PathBuf;
+
+/// Which tables `ablate` runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum TableArg {
+    /// Every table, shared stages once
+    All,
+    /// None, step 1, steps 1 and 2, step 3, all three
+    Alignment,
+    /// Bijection, autoencoder, no reduction
+    Bijection,
+    /// This program's way and the baselines
+    Methods,
+    /// Codes of 3, 8 and 16 numbers
+    Dimension,
+    /// Language training with and without the image loss
+    ImageLoss,
+    /// Masks and features: built-in, with injected errors, exact
+    Features,
+    /// At most 50k, 500k, or all splats at the start
+    Points,
+    /// 2, 4 and 6 photos
+    Views,
+    /// Cameras and points from photos alone, or from the true cameras
+    Initializer,
+}
+
+/// `splatvk ablate`
+#[derive(Debug, Args)]
+pub struct AblateArgs {
+    /// Which tables
+    #[arg(value_enum, required = true, value_name = "TABLE")]
+    pub tables: Vec<TableArg>,
+    /// Folder with ground_truth.json, photos and masks
+    #[arg(long, value_name = "DIR")]
+    pub data: PathBuf,
+    /// Folder for ablate.json and one text and one chart per table [default: out/ablate-NAME, after the data]
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Masks and features for every row: built-in, flawed (true masks, errors injected), exact, or dir:DIR [default: those
+    /// that each table is about]
+    #[arg(long, value_name = "SOURCE")]
+    pub regions: Option<String>,
+    /// Photos of the default row [default: all train frames, at most 4]
+    #[arg(long, value_name = "N")]
+    pub views: Option<usize>,
+    /// Take the true cameras in every row, for photos that alone would give none
+    #[arg(long)]
+    pub true_cameras: bool,
+    /// Seed of training and of injected errors
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Optimisation steps of the colour stage, instead of draft's
+    #[arg(long, value_name = "N")]
+    pub iterations: Option<usize>,
+    /// Optimisation steps of the language stage, instead of draft's
+    #[arg(long, value_name = "N")]
+    pub language_iterations: Option<usize>,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// `splatvk generate`
+#[derive(Debug, Args)]
+pub struct GenerateArgs {
+    /// Folder to write: photos, held-out views, depth, masks, cameras, regions
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Make no scene: only regions_exact/ and regions_flawed/ for this data set with masks
+    #[arg(long, value_name = "DIR")]
+    pub from: Option<PathBuf>,
+    /// Everything random
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Photos
+    #[arg(long, default_value_t = 4, value_name = "N")]
+    pub views: usize,
+    /// Held-out views
+    #[arg(long, default_value_t = 6, value_name = "N")]
+    pub held_out: usize,
+    /// Picture size, pixels
+    #[arg(long, default_value = "640x480", value_name = "WxH")]
+    pub size: String,
+    /// Objects on the table, 1 to 12
+    #[arg(long, default_value_t = 8, value_name = "N")]
+    pub objects: usize,
+    /// Angle between neighbouring photos, degrees
+    #[arg(long, default_value_t = 20.0, value_name = "DEG")]
+    pub baseline: f64,
+    /// Contrast of surfaces: 1 = plenty to match, 0 = bare
+    #[arg(long, default_value_t = 1.0, value_name = "0-1")]
+    pub texture: f64,
+    /// Thin poles
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub thin: usize,
+    /// Objects close together and behind each other
+    #[arg(long, default_value_t = 0.3, value_name = "0-1")]
+    pub occlusion: f64,
+    /// Objects that look like another one
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub similar: usize,
+    /// Error of the starting cameras in cameras_noisy.json, degrees
+    #[arg(long, default_value_t = 0.1, value_name = "DEG")]
+    pub pose_noise: f64,
+    /// Noise of the photos, share of full white
+    #[arg(long, default_value_t = 0.005, value_name = "SHARE")]
+    pub photo_noise: f64,
+    /// regions_flawed/: rate of masks cut in two
+    #[arg(long, default_value_t = 0.2, value_name = "RATE")]
+    pub split: f64,
+    /// regions_flawed/: rate of objects swallowed by a neighbour's mask
+    #[arg(long, default_value_t = 0.05, value_name = "RATE")]
+    pub merge: f64,
+    /// regions_flawed/: rate of features of another object
+    #[arg(long, default_value_t = 0.2, value_name = "RATE")]
+    pub wrong: f64,
+    /// regions_flawed/: random part of every feature
+    #[arg(long, default_value_t = 0.35, value_name = "LENGTH")]
+    pub noise: f64,
+    /// Print one JSON object on standard output
+    #[arg(long)]
+    pub json: bool,
+}
