@@ -258,8 +258,7 @@ function select(level, picked) {
   if (state.mode !== "level") state.mode = "colour";
   renderer.select(level, [code]);
   show(state.mode, level);
-  const count = splats.codes[level].reduce((n, c) => n + (c === code + 1), 0);
-  const names = namesOf(level, code), size = `${count.toLocaleString("en")} splats`;
+  const names = namesOf(level, code), size = `${sizeOf(level, code).toLocaleString("en")} splats`;
   if (names.length) card(names[0][0], `${levels[level].one} · ${size}`, picked, level, names);
   else card(levels[level].one, `${size}. ${manifest.names_note}`, picked, level, names);
 }
@@ -367,14 +366,22 @@ function button(text, act, attributes = {}) {
   return made;
 }
 
+const sizeOf = (level, code) => splats.codes[level].reduce((n, c) => n + (c === code + 1), 0);
+
+/// The level that a click means: the largest thing that the place belongs to. What takes up a quarter of the scene is
+/// a table or a wall that swallowed its things, so a finer level goes first if there it is smaller.
+function levelOf(codes) {
+  const thing = codes.findLastIndex((code, level) => code >= 0 && sizeOf(level, code) < splats.count / 4);
+  return thing >= 0 ? thing : codes.findLastIndex((code) => code >= 0);
+}
+
 /// Selects what is at a position of the canvas, CSS pixels.
 function clickAt(x, y, centre = false) {
   const ratio = canvas.width / canvas.clientWidth;
   const hit = pick(splats, camera, x * ratio, y * ratio, canvas.width, canvas.height, near);
   if (!hit) return clear();
   if (centre) return turn(() => camera.aim(camera.unproject(x * ratio, y * ratio, hit.depth, canvas.width, canvas.height)));
-  // On the level that is shown, else the largest thing that the place belongs to.
-  const level = state.mode === "level" && hit.codes[state.level] >= 0 ? state.level : hit.codes.findLastIndex((k) => k >= 0);
+  const level = state.mode === "level" && hit.codes[state.level] >= 0 ? state.level : levelOf(hit.codes);
   if (level < 0) return say("Nothing that the scene has words for.");
   setQuery(null);
   select(level, hit);
