@@ -43,14 +43,14 @@ fn a_generated_scene_is_ablated() {
     ]
     .concat());
     let rows = report["tables"][0]["rows"].as_array().unwrap();
-    assert_eq!(rows.len(), 4);
+    assert_eq!(rows.len(), 5);
     let figure = |row: usize, name: &str| rows[row]["figures"][name].as_f64();
     // the bijection keeps every meaning, whatever the dimension; one photo in four objects' size is coarse, though
     assert!(
         figure(0, "SIM").unwrap() > figure(2, "SIM").unwrap() && figure(0, "mIoU").unwrap() > 0.3,
         "{rows:?}"
     );
-    assert!(figure(3, "mIoU").is_none() && figure(3, "MB").unwrap() > 10.0 * figure(0, "MB").unwrap());
+    assert!(figure(4, "mIoU").is_none() && figure(4, "MB").unwrap() > 10.0 * figure(0, "MB").unwrap());
     for file in ["bijection.txt", "bijection.svg", "ablate.json"] {
         assert!(out.join(file).metadata().unwrap().len() > 100, "{file}");
     }

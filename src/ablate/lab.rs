@@ -1,9 +1,10 @@
 //! Runs setups, each stage once: setups that agree up to a stage share what that stage made.
-use super::setup::{Init, Setup, Source};
+use super::setup::{Init, Means, Setup, Source};
 use crate::fit::{self, LanguageOptions, Preset, RgbOptions, Trained};
 use crate::format::cameras::stem;
 use crate::gpu::Device;
-use crate::infer::{RegionEncoder, Registry};
+use crate::infer::installed::{Duty, inventory, known};
+use crate::infer::{RegionEncoder, Registry, pairs};
 use crate::language::align::PairLinks;
 use crate::language::{self, ViewMasks};
 use crate::photo::{self, Photo};
@@ -138,16 +139,43 @@ impl<'a> Lab<'a> {
         Ok(frames)
     }
 
+    /// What there is to compare.
+    pub fn means(&self) -> Means {
+        let of = |split| self.truth.frames.iter().filter(|f| f.split == split).count();
+        let there = inventory(&self.registry);
+        let families = |duty| {
+            let mut all: Vec<(String, bool)> = Vec::new();
+            for model in known().iter().filter(|k| k.role == duty) {
+                let installed = there
+                    .models
+                    .iter()
+                    .any(|m| m.duties.contains(&duty) && m.family == model.family && !m.untrained());
+                if all.iter().all(|(name, _)| *name != model.family) {
+                    all.push((model.family.clone(), installed));
+                }
+            }
+            all
+        };
+        // Half of the held-out frames must stay held out.
+        let views = of(Split::Train) + of(Split::Test) / 2;
+        Means { views, geometry: families(Duty::Geometry), features: families(Duty::Features) }
+    }
+
     fn scene(&mut self, setup: &Setup) -> Result<Rc<Scene>> {
-        let name = key(&(setup.views, setup.init))?;
+        let name = key(&(setup.views, &setup.init))?;
         if let Some(found) = self.scenes.get(&name) {
             return Ok(found.clone());
         }
         let frames = self.frames(setup.views)?;
         let paths: Vec<PathBuf> = frames.iter().map(|f| self.truth.folder.join(&f.file)).collect();
         let photos = photo::load_all(&paths, Some(paths.len()), self.progress)?;
-        let choice = match setup.init {
+        let choice = match &setup.init {
             Init::Sfm => InitChoice::Sfm,
+            Init::Network(name) => {
+                let model = self.registry.installed(Duty::Geometry, name)?;
+                let (views, maps) = pairs::pointmaps(&model, &photos, self.progress)?;
+                InitChoice::Pointmaps(views, maps)
+            }
             Init::TrueCameras => {
                 let named = |f: &Frame| Camera { name: f.stem.clone(), ..f.camera.clone() };
                 InitChoice::Cameras(frames.iter().map(named).collect())
@@ -171,7 +199,7 @@ impl<'a> Lab<'a> {
 
     fn trained(&mut self, setup: &Setup) -> Result<Rc<Trained>> {
         let optimise = setup.recipe.optimise;
-        let name = key(&(setup.views, setup.init, setup.max_points, setup.iterations, optimise))?;
+        let name = key(&(setup.views, &setup.init, setup.max_points, setup.iterations, optimise))?;
         if let Some(found) = self.trained.get(&name) {
             return Ok(found.clone());
         }
@@ -196,7 +224,7 @@ impl<'a> Lab<'a> {
     }
 
     fn described(&mut self, setup: &Setup) -> Result<Rc<Described>> {
-        let name = key(&(setup.views, setup.init, &setup.source))?;
+        let name = key(&(setup.views, &setup.init, &setup.source))?;
         if let Some(found) = self.described.get(&name) {
             return Ok(found.clone());
         }
@@ -204,7 +232,8 @@ impl<'a> Lab<'a> {
         let described = match &setup.source {
             Source::Flawed(flaws) => self.synthetic(&scene, flaws)?,
             Source::Exact => self.synthetic(&scene, &Flaws::NONE)?,
-            Source::BuiltIn => self.built_in(&scene)?,
+            Source::BuiltIn => self.built_in(&scene, &FeatureSource::Words)?,
+            Source::Network(name) => self.built_in(&scene, &FeatureSource::Network(name.clone()))?,
             Source::Dir(dir) => {
                 let (masks, features) = (MaskSource::Dir(dir.clone()), FeatureSource::Dir(dir.clone()));
                 let masks = sources::given_masks(&masks, &features, &scene.photos)?.unwrap_or_default();
@@ -246,10 +275,10 @@ impl<'a> Lab<'a> {
         Ok(Described { masks: made.masks, queries, meaning: made.meaning, space: "synthetic".into() })
     }
 
-    fn built_in(&self, scene: &Scene) -> Result<Described> {
+    fn built_in(&self, scene: &Scene, features: &FeatureSource) -> Result<Described> {
         let edges = sources::edges(&scene.images, &self.registry, self.progress)?;
         let masks = sources::graph_masks(&scene.images, &edges, &scene.geometry, self.progress)?;
-        let mut encoder = sources::encoder(&FeatureSource::Words, &self.registry)?;
+        let mut encoder = sources::encoder(features, &self.registry)?;
         let masks = sources::with_features(masks, &scene.images, encoder.as_mut(), self.progress)?;
         let queries = self.queries(encoder.as_mut())?;
         let meaning = self.meaning_by(scene, encoder.as_mut())?;

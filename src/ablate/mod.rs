@@ -84,8 +84,7 @@ pub fn run(lab: &mut Lab, plan: &Plan, table: Table) -> Result<Finished> {
         language_iterations: plan.language_iterations,
     };
     let sources = plan.source.clone().map_or_else(|| sources(table, plan.seed), |s| vec![s]);
-    // Half of the held-out frames must stay held out.
-    let rows = rows(table, &base, &sources, train + test / 2);
+    let rows = rows(table, &base, &sources, &lab.means());
     let mut finished = Finished { table, seen: Vec::new(), rows: Vec::new() };
     for row in rows {
         let done = match &row.setup {

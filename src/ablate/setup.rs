@@ -1,6 +1,6 @@
 //! What the tables compare: a table is a list of setups that differ in one thing.
 use crate::language::Reducer;
-use crate::run::{Method, Recipe};
+use crate::run::{AUTOENCODER, Method, Recipe};
 use crate::synth::regions::Flaws;
 use serde::Serialize;
 use std::path::PathBuf;
@@ -60,13 +60,15 @@ impl Table {
 }
 
 /// Where cameras and points come from.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Init {
     /// Structure from motion and stereo.
     Sfm,
     /// The true cameras of the data set and stereo.
     TrueCameras,
+    /// An installed network's pointmaps.
+    Network(String),
 }
 
 /// Where masks and features come from.
@@ -81,6 +83,8 @@ pub enum Source {
     Exact,
     /// A `dir:` folder.
     Dir(PathBuf),
+    /// Built-in masks, features of an installed network.
+    Network(String),
 }
 
 impl Source {
@@ -91,6 +95,7 @@ impl Source {
             Source::Flawed(f) => format!("flawed, seed {}", f.seed),
             Source::Exact => "exact".into(),
             Source::Dir(dir) => format!("dir:{}", dir.display()),
+            Source::Network(name) => name.clone(),
         }
     }
 }
@@ -129,9 +134,29 @@ pub struct Row {
     pub paper: Vec<(&'static str, f64)>,
 }
 
+/// What a machine and a data set have for the tables to compare.
+#[derive(Clone, Debug, Default)]
+pub struct Means {
+    /// Frames that may be photos.
+    pub views: usize,
+    /// Known families of geometry networks, and whether one is installed.
+    pub geometry: Vec<(String, bool)>,
+    /// The same for features.
+    pub features: Vec<(String, bool)>,
+}
+
 /// The rows of a table. `base` is the default setup; `sources` those to compare under (one group each).
-pub fn rows(table: Table, base: &Setup, sources: &[Source], most_views: usize) -> Vec<Row> {
+pub fn rows(table: Table, base: &Setup, sources: &[Source], means: &Means) -> Vec<Row> {
+    let most_views = means.views;
     let mut out = Vec::new();
+    // A network has a row of its own, which says so where there is none.
+    let optional = |group: String, name: &str, there: bool, setup: Setup| Row {
+        label: name.to_owned(),
+        group,
+        setup: there.then_some(setup),
+        note: if there { String::new() } else { "not installed (splatvk models list)".to_owned() },
+        paper: Vec::new(),
+    };
     for source in sources {
         let base = Setup { source: source.clone(), ..base.clone() };
         let row = |label: &str, setup: Setup, paper: &[(&'static str, f64)]| Row {
@@ -169,8 +194,11 @@ pub fn rows(table: Table, base: &Setup, sources: &[Source], most_views: usize) -
                 out.push(row("bijection", base.clone(), &[("mIoU", 0.538), ("mAcc", 0.786)]));
                 let setup = with(Recipe { feature_dim: 3, ..base.recipe });
                 out.push(row("bijection, 3 dimensions", setup, &[]));
-                let setup = with(Recipe { reducer: Reducer::Autoencoder, feature_dim: 3, ..base.recipe });
-                out.push(row("autoencoder, 3 dimensions", setup, &[("mIoU", 0.463), ("mAcc", 0.640)]));
+                let published = Reducer::Autoencoder { least_steps: 0 };
+                let setup = with(Recipe { reducer: published, feature_dim: 3, ..base.recipe });
+                out.push(row("autoencoder, 100 epochs", setup, &[("mIoU", 0.463), ("mAcc", 0.640)]));
+                let setup = with(Recipe { reducer: AUTOENCODER, feature_dim: 3, ..base.recipe });
+                out.push(row("autoencoder, 2000 steps", setup, &[]));
                 out.push(Row {
                     setup: None,
                     note: "not trained: memory only".into(),
@@ -221,7 +249,17 @@ pub fn rows(table: Table, base: &Setup, sources: &[Source], most_views: usize) -
             Table::Initializer => {
                 out.push(row("sfm", Setup { init: Init::Sfm, ..base.clone() }, &[]));
                 out.push(row("true cameras", Setup { init: Init::TrueCameras, ..base.clone() }, &[]));
+                for (name, there) in &means.geometry {
+                    let setup = Setup { init: Init::Network(name.clone()), ..base.clone() };
+                    out.push(optional(source.name(), name, *there, setup));
+                }
             }
+        }
+    }
+    if table == Table::Features {
+        for (name, there) in &means.features {
+            let setup = Setup { source: Source::Network(name.clone()), ..base.clone() };
+            out.push(optional(name.clone(), name, *there, setup));
         }
     }
     out

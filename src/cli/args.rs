@@ -118,14 +118,14 @@ pub struct RunArgs {
     /// Time against quality [default: draft on a CPU device, default on a GPU]
     #[arg(long, value_enum)]
     pub preset: Option<PresetArg>,
-    /// Cameras and points: auto, sfm, cameras:FILE (transforms.json, COLMAP folder, cameras.json), or an installed network:
+    /// Cameras and points: auto (the best network installed, else sfm), sfm, cameras:FILE (transforms.json, COLMAP folder, cameras.json), or an installed network:
     /// mast3r, dust3r, vggt, da3
     #[arg(long, default_value = "auto", value_name = "SOURCE")]
     pub init: String,
-    /// Dense matches for the alignment of masks: auto, xfeat, or an installed network: roma
+    /// Dense matches for the alignment of masks: auto (as above, else xfeat), xfeat, or an installed network: roma, mast3r
     #[arg(long, default_value = "auto", value_name = "NAME")]
     pub matcher: String,
-    /// Masks on three levels: auto, graph, dir:DIR (STEM_s.npy), or an installed network: sam, sam2
+    /// Masks on three levels: auto (as above, else graph), graph, dir:DIR (STEM_s.npy), or an installed network: sam, sam2
     #[arg(long, default_value = "auto", value_name = "SOURCE")]
     pub masks: String,
     /// Points along each side of a photo at which a mask network is asked
@@ -134,7 +134,7 @@ pub struct RunArgs {
     /// Do not ask the mask network about four overlapping crops as well: five times faster, misses small things
     #[arg(long)]
     pub no_mask_crops: bool,
-    /// Region features: auto, words, dir:DIR (STEM_f.npy, text_embeddings.npz), or an installed network: clip, lseg
+    /// Region features: auto (as above, else words), words, dir:DIR (STEM_f.npy, text_embeddings.npz), or an installed network: clip, lseg
     #[arg(long, default_value = "auto", value_name = "SOURCE")]
     pub features: String,
     /// Ask the finished scene; may be repeated
@@ -332,6 +332,10 @@ pub enum ExportFormat {
     Splat,
     /// .spz version 4
     Spz,
+    /// glTF with KHR_gaussian_splatting, binary
+    Glb,
+    /// the same as text
+    Gltf,
     /// COLMAP text model
     Colmap,
     /// COLMAP binary model

@@ -2,7 +2,7 @@
 use super::args::{ExportArgs, ExportFormat};
 use super::listing;
 use crate::format::{
-    colmap, create_folder, gaussians, ply, ply_packed, scene_dir, splat, spz, transforms, whole,
+    colmap, create_folder, gaussians, gltf, ply, ply_packed, scene_dir, splat, spz, transforms, whole,
 };
 use crate::scene::{Camera, Splats};
 use crate::{Error, Result};
@@ -27,10 +27,10 @@ pub fn export(args: &ExportArgs) -> Result<()> {
         }
         ExportFormat::Splat => packed(args, &scene, splat::write_splats)?,
         ExportFormat::CompressedPly => packed(args, &scene, ply_packed::write_splats)?,
-        // spz keeps the scene's order
-        ExportFormat::Spz => {
-            packed(args, &scene, |path, s| spz::write_splats(path, s).map(|()| Vec::new()))?;
-        }
+        // These keep the scene's order.
+        ExportFormat::Spz => packed(args, &scene, in_order(spz::write_splats))?,
+        ExportFormat::Glb => packed(args, &scene, in_order(gltf::write_glb))?,
+        ExportFormat::Gltf => packed(args, &scene, in_order(gltf::write_gltf))?,
         ExportFormat::Transforms => {
             let cameras = cameras(&scene, args)?;
             whole(&args.out, |path| transforms::write(path, cameras, None))?;
@@ -44,6 +44,10 @@ pub fn export(args: &ExportArgs) -> Result<()> {
         }
     }
     listing(std::slice::from_ref(&args.out), args.json)
+}
+
+fn in_order(write: fn(&Path, &Splats) -> Result<()>) -> impl FnOnce(&Path, &Splats) -> Result<Vec<u32>> {
+    move |path, splats| write(path, splats).map(|()| Vec::new())
 }
 
 /// A format that only keeps what viewers draw, with the language in a file beside it.

@@ -1,21 +1,21 @@
 //! What the arguments mean: defaults resolved, names understood, contradictions refused. No work happens here.
 use super::args::{DeviceArgs, MethodArg, PresetArg, RunArgs};
-use crate::infer::installed::{Duty, known};
+use crate::infer::installed::{Duty, Inventory, known};
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;
 use crate::run::{FeatureSource, InitSource, MaskSource, MatchSource, Method, RunPlan};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// `splatvk run`
-pub fn run(args: &RunArgs) -> Result<RunPlan> {
+/// `splatvk run`; `auto` is the best of `installed`, or what is built in.
+pub fn run(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
     let method = method(args.method);
     let recipe = method.recipe();
     let feature_dim = args.feature_dim.unwrap_or(recipe.feature_dim);
     if ![3, 8, 16].contains(&feature_dim) {
         return Err(Error::input(format!("--feature-dim {feature_dim}: choose 3, 8 or 16")));
     }
-    if recipe.reducer == Reducer::Autoencoder && feature_dim != 3 {
+    if matches!(recipe.reducer, Reducer::Autoencoder { .. }) && feature_dim != 3 {
         return Err(Error::input(format!(
             "--feature-dim {feature_dim}: the autoencoder of --method langsplat has 3 dimensions; leave it out"
         )));
@@ -39,11 +39,11 @@ pub fn run(args: &RunArgs) -> Result<RunPlan> {
         out: args.out.clone().unwrap_or_else(|| default_out(&args.inputs)),
         force: args.force,
         preset: args.preset.map(preset),
-        init: init(&args.init)?,
-        matcher: matcher(&args.matcher)?,
-        masks: masks(&args.masks)?,
+        init: init(&args.init, installed)?,
+        matcher: matcher(&args.matcher, installed)?,
+        masks: masks(&args.masks, installed)?,
         sam: SamOptions { points: args.mask_points, crops: !args.no_mask_crops, ..SamOptions::default() },
-        features: features(&args.features)?,
+        features: features(&args.features, installed)?,
         queries: args.queries.clone(),
         seed: args.seed,
         iterations: args.iterations,
@@ -90,28 +90,37 @@ fn default_out(inputs: &[PathBuf]) -> PathBuf {
     Path::new("out").join(named.file_name().unwrap_or("scene".as_ref()))
 }
 
-fn init(text: &str) -> Result<InitSource> {
+fn init(text: &str, installed: &Inventory) -> Result<InitSource> {
     match text.split_once(':') {
         Some(("cameras", file)) if !file.is_empty() => Ok(InitSource::Cameras(existing("--init", file)?)),
-        None if text == "auto" || text == "sfm" => Ok(InitSource::Sfm),
+        None if text == "auto" => {
+            Ok(best(installed, Duty::Geometry).map_or(InitSource::Sfm, InitSource::Network))
+        }
+        None if text == "sfm" => Ok(InitSource::Sfm),
         None => network("--init", text, Duty::Geometry, "auto, sfm, cameras:FILE").map(InitSource::Network),
         _ => Err(unknown("--init", text, Duty::Geometry, "auto, sfm, cameras:FILE")),
     }
 }
 
-fn masks(text: &str) -> Result<MaskSource> {
+fn masks(text: &str, installed: &Inventory) -> Result<MaskSource> {
     match text.split_once(':') {
         Some(("dir", dir)) if !dir.is_empty() => Ok(MaskSource::Dir(existing("--masks", dir)?)),
-        None if text == "auto" || text == "graph" => Ok(MaskSource::Graph),
+        None if text == "auto" => {
+            Ok(best(installed, Duty::Masks).map_or(MaskSource::Graph, MaskSource::Network))
+        }
+        None if text == "graph" => Ok(MaskSource::Graph),
         None => network("--masks", text, Duty::Masks, "auto, graph, dir:DIR").map(MaskSource::Network),
         _ => Err(unknown("--masks", text, Duty::Masks, "auto, graph, dir:DIR")),
     }
 }
 
-fn features(text: &str) -> Result<FeatureSource> {
+fn features(text: &str, installed: &Inventory) -> Result<FeatureSource> {
     match text.split_once(':') {
         Some(("dir", dir)) if !dir.is_empty() => Ok(FeatureSource::Dir(existing("--features", dir)?)),
-        None if text == "auto" || text == "words" => Ok(FeatureSource::Words),
+        None if text == "auto" => {
+            Ok(best(installed, Duty::Features).map_or(FeatureSource::Words, FeatureSource::Network))
+        }
+        None if text == "words" => Ok(FeatureSource::Words),
         None => {
             network("--features", text, Duty::Features, "auto, words, dir:DIR").map(FeatureSource::Network)
         }
@@ -127,22 +136,27 @@ pub(super) fn existing(flag: &str, path: &str) -> Result<PathBuf> {
     Err(Error::input(format!("{flag}: {} does not exist; check the path", path.display())))
 }
 
-fn matcher(text: &str) -> Result<MatchSource> {
+fn matcher(text: &str, installed: &Inventory) -> Result<MatchSource> {
     match text {
-        "auto" | "xfeat" => Ok(MatchSource::Xfeat),
+        "auto" => Ok(best(installed, Duty::Matcher).map_or(MatchSource::Xfeat, MatchSource::Network)),
+        "xfeat" => Ok(MatchSource::Xfeat),
         _ => network("--matcher", text, Duty::Matcher, "auto, xfeat").map(MatchSource::Network),
     }
 }
 
+fn best(installed: &Inventory, duty: Duty) -> Option<String> {
+    installed.best(duty).map(|model| model.name.clone())
+}
+
 /// The name of a family of networks, or of one, that does what the flag asks for; whether it is installed is seen later.
 fn network(flag: &str, name: &str, duty: Duty, built_in: &str) -> Result<String> {
-    let meant = known().iter().any(|k| k.role == duty && (k.family == name || k.id == name));
+    let meant = known().iter().any(|k| k.does(duty) && (k.family == name || k.id == name));
     if meant { Ok(name.to_owned()) } else { Err(unknown(flag, name, duty, built_in)) }
 }
 
 fn unknown(flag: &str, value: &str, duty: Duty, built_in: &str) -> Error {
     let mut choices: Vec<&str> = built_in.split(", ").collect();
-    for model in known().iter().filter(|k| k.role == duty) {
+    for model in known().iter().filter(|k| k.does(duty)) {
         if !choices.contains(&model.family.as_str()) {
             choices.push(&model.family);
         }
@@ -154,12 +168,17 @@ fn unknown(flag: &str, value: &str, duty: Duty, built_in: &str) -> Error {
 mod tests {
     use super::*;
     use crate::cli::args::{Cli, Command};
+    use crate::infer::installed::Installed;
     use clap::Parser;
 
     fn plan(extra: &[&str]) -> Result<RunPlan> {
+        plan_with(extra, &Inventory::default())
+    }
+
+    fn plan_with(extra: &[&str], installed: &Inventory) -> Result<RunPlan> {
         let line = ["splatvk", "run", "tests/data/breakfast/images"].iter().chain(extra);
         match Cli::try_parse_from(line).unwrap().command {
-            Command::Run(args) => run(&args),
+            Command::Run(args) => run(&args, installed),
             _ => unreachable!(),
         }
     }
@@ -172,6 +191,36 @@ mod tests {
         assert_eq!((plan.features, plan.feature_dim), (FeatureSource::Words, 16));
         assert_eq!(plan.method, Method::SparseLgs);
         assert_eq!((plan.matcher, plan.sam), (MatchSource::Xfeat, SamOptions::default()));
+    }
+
+    #[test]
+    fn auto_takes_the_most_preferred_network_there_is() {
+        let model = |name: &str, duty| Installed {
+            name: name.to_owned(),
+            family: String::new(),
+            duties: vec![duty],
+            graphs: Default::default(),
+            folder: PathBuf::new(),
+        };
+        let models = [
+            ("sam_vit_b", Duty::Masks),
+            ("sam_vit_h", Duty::Masks),
+            ("mine", Duty::Features),
+            ("da3", Duty::Geometry),
+            ("mast3r_512", Duty::Geometry),
+        ];
+        let installed = Inventory { models: models.map(|(n, d)| model(n, d)).into(), broken: Vec::new() };
+        let plan = plan_with(&[], &installed).unwrap();
+        assert_eq!(plan.masks, MaskSource::Network("sam_vit_h".into()));
+        assert_eq!(plan.features, FeatureSource::Network("mine".into()));
+        assert_eq!(plan.init, InitSource::Network("mast3r_512".into()));
+        assert_eq!(plan.matcher, MatchSource::Xfeat);
+        let plan =
+            plan_with(&["--masks", "graph", "--init", "sfm", "--features", "words"], &installed).unwrap();
+        assert_eq!(
+            (plan.init, plan.masks, plan.features),
+            (InitSource::Sfm, MaskSource::Graph, FeatureSource::Words)
+        );
     }
 
     #[test]
@@ -200,7 +249,7 @@ mod tests {
             (["--mask-points", "0"], "1 to 128"),
             (["--masks", "dir:nowhere"], "does not exist"),
             (["--features", "sam"], "auto, words, dir:DIR, clip"),
-            (["--matcher", "sift"], "auto, xfeat, roma"),
+            (["--matcher", "sift"], "auto, xfeat, mast3r, roma"),
             (["--feature-dim", "5"], "3, 8 or 16"),
             (["--query", " "], "a few words"),
             (["--method=langsplat", "--feature-dim=16"], "has 3 dimensions"),

@@ -94,7 +94,7 @@ impl RgbOptions {
             // Fewer steps take proportionally longer ones: with Adam the distance a parameter can travel is about
             // rate × steps. Rates stay below the point where the loss oscillates (means: a tenth of a pixel a step).
             Preset::Draft => Self::draft(),
-            Preset::Default => Self::scaled(1000, 1.0),
+            Preset::Default => RgbOptions { coarse: 0.6, ..Self::scaled(1000, 1.0) },
         }
     }
 
@@ -250,7 +250,7 @@ impl LanguageOptions {
             per_level: paper,
             detach_geometry: false,
             // A measurement costs as much as three steps.
-            check_every: if preset == Preset::Draft { iterations } else { (iterations / 4).min(100) },
+            check_every: if preset == Preset::Draft { iterations } else { (iterations / 4).min(50) },
         }
     }
 }

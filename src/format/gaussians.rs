@@ -1,5 +1,5 @@
 //! Files of Gaussians: one reader and one writer for every kind, chosen by the end of the file's name.
-use super::{ply, ply_packed, side_file, splat, spz, whole};
+use super::{gltf, ply, ply_packed, side_file, splat, spz, whole};
 use crate::scene::{LanguageField, Splats};
 use crate::{Error, Result};
 use std::path::Path;
@@ -14,7 +14,7 @@ struct Kind {
 }
 
 /// All kinds; an ending comes before those that it ends with.
-static KINDS: [Kind; 4] = [
+static KINDS: [Kind; 6] = [
     Kind { ending: ".compressed.ply", read: ply::read_splats, write: ply_packed::write_splats },
     Kind {
         ending: ".ply",
@@ -26,6 +26,16 @@ static KINDS: [Kind; 4] = [
         ending: ".spz",
         read: spz::read_splats,
         write: |path, s| spz::write_splats(path, s).map(|()| Vec::new()),
+    },
+    Kind {
+        ending: ".glb",
+        read: gltf::read_splats,
+        write: |path, s| gltf::write_glb(path, s).map(|()| Vec::new()),
+    },
+    Kind {
+        ending: ".gltf",
+        read: gltf::read_splats,
+        write: |path, s| gltf::write_gltf(path, s).map(|()| Vec::new()),
     },
 ];
 

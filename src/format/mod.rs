@@ -2,6 +2,8 @@
 pub mod cameras;
 pub mod colmap;
 pub mod gaussians;
+pub mod gltf;
+mod moved;
 pub mod npy;
 pub mod picture;
 pub mod ply;

@@ -53,6 +53,9 @@ pub struct Known {
     pub name: String,
     /// What it does.
     pub role: Duty,
+    /// What it can do besides.
+    #[serde(default)]
+    pub also: Vec<Duty>,
     /// What `--init`, `--matcher`, `--masks` or `--features` call it.
     pub family: String,
     /// "paper", "open".
@@ -65,6 +68,13 @@ pub struct Known {
     pub source: String,
     /// What writes its ONNX files.
     pub export: String,
+}
+
+impl Known {
+    /// Whether it does this, mainly or besides.
+    pub fn does(&self, duty: Duty) -> bool {
+        self.role == duty || self.also.contains(&duty)
+    }
 }
 
 /// The known networks, in order of preference within a family.
@@ -115,6 +125,11 @@ impl Installed {
         files.map(hash).collect()
     }
 
+    /// Place in the catalogue's order of preference; networks that it does not know come last.
+    fn rank(&self) -> usize {
+        known().iter().position(|k| self.name.starts_with(&k.id)).unwrap_or(usize::MAX)
+    }
+
     /// The catalogue entry with its name.
     pub fn known(&self) -> Option<&'static Known> {
         // "sam_vit_b" is longer, so more specific, than "sam".
@@ -129,6 +144,15 @@ pub struct Inventory {
     pub models: Vec<Installed>,
     /// Files that cannot be used: one line each, saying why and what to do.
     pub broken: Vec<(PathBuf, String)>,
+}
+
+impl Inventory {
+    /// The most preferred network for a duty that has trained weights.
+    pub fn best(&self, duty: Duty) -> Option<&Installed> {
+        let fitting = self.models.iter().filter(|m| m.duties.contains(&duty) && !m.untrained());
+        // What a network is made for comes before what it can do besides.
+        fitting.min_by_key(|m| (m.duties.first() != Some(&duty), m.rank()))
+    }
 }
 
 /// Sets of parts that make a model, and what it then does.
@@ -212,7 +236,11 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], found: &mut Inventory
     }
     // Encoders look alike in several families; what comes last tells them apart.
     let family = used.last().map(|g| g.binding.family.clone()).unwrap_or_default();
-    let mut model = Installed { name, family, duties: duties.to_vec(), graphs, folder };
+    let mut duties = duties.to_vec();
+    if used.iter().any(|g| g.has("desc1")) {
+        duties.push(Duty::Matcher);
+    }
+    let mut model = Installed { name, family, duties, graphs, folder };
     if let Some(known) = model.known().filter(|k| model.duties.contains(&k.role)) {
         model.family.clone_from(&known.family);
     }
@@ -224,14 +252,12 @@ impl Registry {
     /// the catalogue names first. The error says what to do.
     pub fn installed(&self, duty: Duty, name: &str) -> Result<Installed> {
         let inventory = inventory(self);
-        let rank =
-            |m: &Installed| known().iter().position(|k| m.name.starts_with(&k.id)).unwrap_or(usize::MAX);
         let mut fitting: Vec<Installed> = inventory
             .models
             .into_iter()
             .filter(|m| m.duties.contains(&duty) && (m.family == name || m.name == name))
             .collect();
-        fitting.sort_by_key(rank);
+        fitting.sort_by_key(Installed::rank);
         if let Some(model) = fitting.into_iter().next() {
             return Ok(model);
         }
@@ -243,7 +269,7 @@ impl Registry {
             return Err(Error::missing(why.clone()));
         }
         let place = self.folders().first().map(|f| f.display().to_string()).unwrap_or_default();
-        let how = known().iter().find(|k| k.family == name && k.role == duty);
+        let how = known().iter().find(|k| k.family == name && k.does(duty));
         let how = how.map_or(String::new(), |k| format!(" (from {}, exported with {})", k.source, k.export));
         Err(Error::missing(format!(
             "no model \"{name}\" for {} in {place}; put its ONNX files{how} into {place}/{name}/, or see splatvk models list",

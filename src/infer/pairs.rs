@@ -18,15 +18,25 @@ pub fn pointmaps(
     photos: &[Photo],
     progress: &dyn Progress,
 ) -> Result<(Vec<ModelView>, Vec<PairPointmaps>)> {
-    let _alone = alone();
     if let Ok(graph) = model.graph(Part::MultiView) {
+        let _alone = alone();
         return super::multiview::pointmaps(graph, photos, progress);
     }
+    let (prepared, pairs) = decoded(model, photos, progress)?;
+    Ok((views(photos, &prepared, progress), pairs))
+}
+
+/// The photos as a pair network sees them, and what it says about all pairs.
+pub(super) fn decoded(
+    model: &Installed,
+    photos: &[Photo],
+    progress: &dyn Progress,
+) -> Result<(Vec<Prepared>, Vec<PairPointmaps>)> {
+    let _alone = alone();
     let prepared = match model.graph(Part::Pair) {
         Ok(graph) => inputs(graph, "image1", photos)?,
         Err(_) => inputs(model.graph(Part::PairEncoder)?, "image", photos)?,
     };
-    let views = views(photos, &prepared, progress);
     let count = photos.len();
     let mut network = Network::new(model, &prepared);
     let ordered = (count * count.saturating_sub(1)) as u64;
@@ -55,7 +65,8 @@ pub fn pointmaps(
     if !model.untrained() {
         plausible(model, &pairs)?;
     }
-    Ok((views, pairs))
+    drop(network);
+    Ok((prepared, pairs))
 }
 
 /// Every photo as the graph sees it.

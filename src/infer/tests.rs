@@ -400,6 +400,51 @@ fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_t
     assert!(pair.x11.points[0][0].abs() < 1e-6 && pair.x22.points[0][0] > 1e-3, "{:?}", pair.x22.points[0]);
 }
 
+/// MASt3R as a matcher: pixels of one colour have one descriptor, and every colour occurs once in each photo.
+#[test]
+fn descriptors_of_a_pair_network_match_photos() {
+    let _uncached = cache::off();
+    let (w, h) = (32u64, 16);
+    let pixels = (w * h) as usize;
+    let mut graph = Onnx::new().input("img1", FLOAT, "1 3 16 32").input("img2", FLOAT, "1 3 16 32");
+    for k in ["1", "2"] {
+        graph = graph
+            .output(&format!("pts3d_{k}"), "1 16 32 3")
+            .output(&format!("conf_{k}"), "1 16 32")
+            .output(&format!("desc_{k}"), "1 3 16 32")
+            .weight(&format!("p{k}"), &[1, h, w, 3], &vec![1.0; 3 * pixels])
+            .weight(&format!("c{k}"), &[1, h, w], &vec![2.0; pixels])
+            .node("Identity", &format!("p{k}"), &format!("pts3d_{k}"), &[])
+            .node("Identity", &format!("c{k}"), &format!("conf_{k}"), &[])
+            .node("Identity", &format!("img{k}"), &format!("desc_{k}"), &[]);
+    }
+    let dir = tempfile::tempdir().unwrap();
+    graph.write(&dir.path().join("mast3r/model.onnx"));
+    let registry = Registry::of(&[dir.path()]);
+    let model = registry.installed(Duty::Matcher, "mast3r").unwrap();
+    assert_eq!(model.duties, [Duty::Geometry, Duty::Matcher]);
+    // A direction on a cone per pixel: no two pixels share one, neighbours are near each other. The second photo is the first
+    // moved by eight pixels.
+    let colours = |shift: usize| {
+        let colour = |x: usize, y: usize| {
+            let (sin, cos) = (0.1 * x as f32).sin_cos();
+            let r = 0.2 + 0.01 * y as f32;
+            [0.5 + r * cos, 0.5 + r * sin, 0.95]
+        };
+        let data = (0..pixels).map(|p| colour(p % 32 + shift, p / 32)).collect();
+        RgbImage { width: 32, height: 16, data }
+    };
+    let found = warp::warps(&model, &[photo("a", colours(0)), photo("b", colours(8))], &Silent).unwrap();
+    let (there, back) = &found[0];
+    for (x, y) in [(12, 6), (20, 10), (27, 5)] {
+        let [u, v] = there.target.data[y * 32 + x];
+        let (wanted, row) = (x as f32 + 0.5 - 8.0, y as f32 + 0.5);
+        assert!((u - wanted).abs() < 0.6 && (v - row).abs() < 0.6, "{x} {y}: {u} {v}");
+    }
+    let [u, _] = back.target.data[8 * 32 + 10];
+    assert!((u - 18.5).abs() < 0.6, "{u}");
+}
+
 /// A matcher that moves everything a quarter of the width to the right, sure as a logit of 2.
 #[test]
 fn a_warp_is_brought_to_the_photos_pixels() {

@@ -1,4 +1,5 @@
-//! Dense matching networks (RoMa v1 and v2): for every pixel of one photo its position in another, with a certainty.
+//! Dense matches from networks: for every pixel of one photo its position in another, with a certainty. RoMa v1 and v2 say so
+//! themselves; MASt3R gives descriptors, whose nearest neighbours do.
 use rayon::prelude::*;
 
 use super::alone;
@@ -10,6 +11,7 @@ use super::prepare::Prepared;
 use super::runtime::Tensor;
 use crate::language::DenseWarp;
 use crate::photo::Photo;
+use crate::pose::pointmap::{Descriptors, best_descriptors};
 use crate::progress::Progress;
 use crate::scene::Plane;
 use crate::{Error, Result};
@@ -20,8 +22,8 @@ pub fn warps(
     photos: &[Photo],
     progress: &dyn Progress,
 ) -> Result<Vec<(DenseWarp, DenseWarp)>> {
+    let Ok(file) = model.graph(Part::Warp) else { return by_descriptors(model, photos, progress) };
     let _alone = alone();
-    let file = model.graph(Part::Warp)?;
     let prepared = super::pairs::inputs(file, "image1", photos)?;
     let both = file.has("warp21") && file.has("certainty21");
     let mut graph: Option<Graph> = None;
@@ -66,6 +68,38 @@ pub fn warps(
     Ok(all)
 }
 
+/// Nearest neighbours of a pair network's descriptors, on a grid of [`STEP`] of its pixels.
+fn by_descriptors(
+    model: &Installed,
+    photos: &[Photo],
+    progress: &dyn Progress,
+) -> Result<Vec<(DenseWarp, DenseWarp)>> {
+    let (prepared, pairs) = super::pairs::decoded(model, photos, progress)?;
+    progress.begin("match", pairs.len() as u64);
+    let mut all = Vec::new();
+    for pair in &pairs {
+        progress.check()?;
+        let Some([first, second, _, _]) = &pair.descriptors else {
+            return Err(Error::missing(format!(
+                "{}: model {} gives no descriptors, so it cannot match; choose another --matcher",
+                model.folder.display(),
+                model.name
+            )));
+        };
+        let (i, j) = (pair.first, pair.second);
+        let there = Field::nearest((first, &prepared[i]), (second, &prepared[j]));
+        let back = Field::nearest((second, &prepared[j]), (first, &prepared[i]));
+        let (a, b) = ((&photos[i], &prepared[i]), (&photos[j], &prepared[j]));
+        all.push((there.at_working_size(a, b), back.at_working_size(b, a)));
+        progress.step(all.len() as u64, "");
+    }
+    progress.end();
+    Ok(all)
+}
+
+/// Pitch of the pixels whose nearest neighbours are sought: a search for each would take minutes a pair on a CPU.
+const STEP: usize = 4;
+
 /// A warp at the network's resolution: (x, y) in [−1, 1] of the second input, certainty.
 struct Field {
     width: usize,
@@ -106,6 +140,19 @@ fn fields(mut values: &[f32]) -> Vec<Field> {
 }
 
 impl Field {
+    /// Where the nearest descriptors lie. What returns elsewhere is no match; that is for the caller to see.
+    fn nearest(from: (&Descriptors, &Prepared), to: (&Descriptors, &Prepared)) -> Field {
+        let (width, height) = (from.1.width / STEP, from.1.height / STEP);
+        let seed =
+            |cell: usize| (cell / width * STEP + STEP / 2) * from.1.width + cell % width * STEP + STEP / 2;
+        let seeds: Vec<usize> = (0..width * height).map(seed).collect();
+        // The middle of a cell lies half a pixel before that of its seed, and so does what it sees.
+        let share = |at: usize, of: usize| 2.0 * at as f32 / of as f32 - 1.0;
+        let end = |q: usize| [share(q % to.1.width, to.1.width), share(q / to.1.width, to.1.height), 1.0];
+        let found = best_descriptors(from.0, &seeds, to.0);
+        Field { width, height, data: found.into_iter().map(end).collect() }
+    }
+
     /// Bilinear, with pixel centres at half-integers; positions beyond the border repeat it.
     fn sample(&self, x: f64, y: f64) -> [f32; 3] {
         let axis = |v: f64, n: usize| {

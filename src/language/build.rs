@@ -13,7 +13,10 @@ pub enum Reducer {
     /// One code per distinct embedding, bound to it (ALGORITHMS 6).
     Bijection,
     /// A scene autoencoder to three dimensions and back, as LangSplat; `feature_dim` is then 3.
-    Autoencoder,
+    Autoencoder {
+        /// Train for at least so many steps; the published 100 epochs are few of them for the features of a few photos.
+        least_steps: usize,
+    },
     /// At most 128 mean features, as LEGaussians; codes are a start for an index head.
     Quantised,
 }
@@ -123,7 +126,7 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
             let one = |e: &Vec<CodeEntry>| quantise::build(e, options.feature_dim, options.seed);
             entries.iter().map(one).collect()
         }
-        Reducer::Autoencoder => autoencoder::build(&entries, options.seed)?.0,
+        Reducer::Autoencoder { least_steps } => autoencoder::build(&entries, least_steps, options.seed)?.0,
     };
     for (level, (components, built)) in alignment.components.iter().zip(built).enumerate() {
         if built.codebook.is_empty() {

@@ -61,7 +61,7 @@ impl Method {
         let theirs = Recipe { steps: [false; 3], image_weight: 0.0, features_only: true, ..ours };
         match self {
             Method::SparseLgs => ours,
-            Method::LangSplat => Recipe { reducer: Reducer::Autoencoder, feature_dim: 3, ..theirs },
+            Method::LangSplat => Recipe { reducer: AUTOENCODER, feature_dim: 3, ..theirs },
             Method::LeGaussians => {
                 Recipe { reducer: Reducer::Quantised, feature_dim: 8, index_head: true, ..theirs }
             }
@@ -72,6 +72,9 @@ impl Method {
 
 /// Codes of up to 200 things stay apart at borders; with 3 numbers they do not (ALGORITHMS 6.2).
 pub const FEATURE_DIM: usize = 16;
+
+/// LangSplat trains on the masks of hundreds of photos; 100 epochs of those of a few photos would leave it half trained.
+pub const AUTOENCODER: Reducer = Reducer::Autoencoder { least_steps: 2000 };
 
 /// λ2 of the paper.
 const IMAGE_WEIGHT: f64 = 0.3;
@@ -117,7 +120,7 @@ impl Recipe {
     fn language(&self, mut options: LanguageOptions) -> LanguageOptions {
         options.image_weight = self.image_weight;
         options.detach_geometry |= self.features_only;
-        if self.reducer == Reducer::Autoencoder {
+        if matches!(self.reducer, Reducer::Autoencoder { .. }) {
             // Decoding every training pixel against 2048 directions takes the processor longer than the training.
             options.check_every = 0;
         }

@@ -11,7 +11,7 @@ pub mod sources;
 pub mod train;
 pub mod view;
 
-pub use method::{FEATURE_DIM, Method, Recipe};
+pub use method::{AUTOENCODER, FEATURE_DIM, Method, Recipe};
 pub use record::{closing_table, run_record};
 
 use crate::fit::{self, LanguageOptions, Preset, RgbOptions};

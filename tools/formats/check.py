@@ -10,6 +10,7 @@ import numpy as np
 import OpenEXR
 import plyfile
 import pycolmap
+import pygltflib
 from gsply.spz import read_spz, write_spz
 
 SPLATVK, SCENE = Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve()
@@ -97,6 +98,74 @@ def turned(s):
             "shN": s["shN"] * TURN[None, :k, None]}
 
 
+def read_gltf(path):
+    """Accessors by pygltflib, in the scene's axes; KHR_gaussian_splatting holds scales and opacities themselves."""
+    file = pygltflib.GLTF2().load(str(path))
+    (primitive,) = file.meshes[0].primitives
+    extension = primitive.extensions["KHR_gaussian_splatting"]
+    assert primitive.mode == 0 and file.extensionsUsed == ["KHR_gaussian_splatting"]
+    assert (extension["kernel"], extension["colorSpace"]) == ("ellipse", "srgb_rec709_display")
+    types = {5123: "<u2", 5126: "<f4"}
+
+    def values(name):
+        accessor = file.accessors[vars(primitive.attributes)[name]]
+        view = file.bufferViews[accessor.bufferView]
+        data = file.get_data_from_buffer_uri(file.buffers[0].uri) if file.buffers[0].uri else file.binary_blob()
+        n = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor.type]
+        return np.frombuffer(data, types[accessor.componentType], accessor.count * n, view.byteOffset).reshape(-1, n)
+
+    own = lambda name: values("KHR_gaussian_splatting:" + name)
+    a = own("OPACITY").astype("f8").reshape(-1)
+    means = values("POSITION")
+    position = file.accessors[primitive.attributes.POSITION]
+    assert position.min == means.min(0).tolist() and position.max == means.max(0).tolist()
+    degree = max(d for d in range(4) if f"KHR_gaussian_splatting:SH_DEGREE_{d}_COEF_0" in vars(primitive.attributes))
+    rest = [own(f"SH_DEGREE_{d}_COEF_{n}") for d in range(1, degree + 1) for n in range(2 * d + 1)]
+    # The colour for programs without the extension is linear light.
+    c = np.clip(0.5 + C0 * own("SH_DEGREE_0_COEF_0").astype("f8"), 0, 1)
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    close("glTF COLOR_0", values("COLOR_0") / 65535, np.column_stack([linear, a]), 1e-5)
+    return turned({
+        "means": means, "scales": np.log(own("SCALE")), "quats": own("ROTATION")[:, [3, 0, 1, 2]],
+        "opacities": np.log(a / (1 - a)), "sh0": own("SH_DEGREE_0_COEF_0"),
+        "shN": np.stack(rest, axis=1) if rest else np.zeros((len(means), 0, 3)),
+    })
+
+
+def write_gltf(path, s):
+    """The same layout, interleaved and half of it quantised, below a node that turns and doubles it; by pygltflib."""
+    t = turned(s)
+    turn = np.sqrt(0.5)  # a quarter turn about z: the file's x is the scene's -y
+    n, k = t["shN"].shape[:2]
+    back = {"means": np.stack([t["means"][:, 1], -t["means"][:, 0], t["means"][:, 2]], 1) / 2}
+    product = np.array([[turn, 0, 0, turn], [0, turn, turn, 0], [0, -turn, turn, 0], [-turn, 0, 0, turn]])
+    quats = t["quats"] @ product.T
+    row = np.dtype([("POSITION", "<f4", 3), ("SCALE", "<f4", 3), ("ROTATION", "<i2", 4), ("OPACITY", "<u2"), ("pad", "<u2"),
+                    ("SH", "<f4", 3)])
+    data = np.zeros(n, row)
+    data["POSITION"], data["SCALE"], data["SH"] = back["means"], np.exp(t["scales"]) / 2, t["sh0"]
+    data["ROTATION"] = np.round(quats[:, [1, 2, 3, 0]] * 32767)
+    data["OPACITY"] = np.round(sigmoid(t["opacities"]) * 65535)
+    names = {"POSITION": ("VEC3", 5126, False), "SCALE": ("VEC3", 5126, False), "ROTATION": ("VEC4", 5122, True),
+             "OPACITY": ("SCALAR", 5123, True), "SH": ("VEC3", 5126, False)}
+    attributes, accessors = {}, []
+    for name, (kind, component, normalized) in names.items():
+        full = {"POSITION": name, "SH": "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"}.get(name, "KHR_gaussian_splatting:" + name)
+        attributes[full] = len(accessors)
+        accessors.append(pygltflib.Accessor(bufferView=0, byteOffset=row.fields[name][1], componentType=component,
+                                            normalized=normalized, count=n, type=kind))
+    extension = {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
+    file = pygltflib.GLTF2(
+        scene=0, scenes=[pygltflib.Scene(nodes=[0])],
+        nodes=[pygltflib.Node(children=[1], rotation=[0, 0, turn, turn]), pygltflib.Node(mesh=0, scale=[2, 2, 2])],
+        meshes=[pygltflib.Mesh(primitives=[pygltflib.Primitive(
+            mode=0, attributes=pygltflib.Attributes(**attributes), extensions=extension)])],
+        accessors=accessors, bufferViews=[pygltflib.BufferView(buffer=0, byteLength=data.nbytes, byteStride=row.itemsize)],
+        buffers=[pygltflib.Buffer(byteLength=data.nbytes)], extensionsUsed=["KHR_gaussian_splatting"])
+    file.set_binary_blob(data.tobytes())
+    file.save(str(path))
+
+
 def compare(what, got, expected, means, scales, rotation, opacity, sh0, sh):
     close(f"{what} positions", got["means"], expected["means"], means)
     close(f"{what} scales", got["scales"], expected["scales"], scales)
@@ -148,6 +217,12 @@ def splats():
         out = WORK / "out.spz"
         run("export", source, "--format", "spz", "--out", out)
         compare(f"spz 4 degree {degree}: gsply", turned(of_gsply(read_spz(str(out)))), s, **SPZ)
+
+        for kind in ("glb", "gltf"):
+            out = WORK / f"out.{kind}"
+            run("export", source, "--format", kind, "--out", out)
+            compare(f"{kind} degree {degree}: pygltflib", read_gltf(out), s, means=0, scales=1e-6, rotation=1e-6,
+                    opacity=1e-7, sh0=0, sh=1e-6)
         others(s, degree)
     s = random_splats(900, 0, 7)
     write_ply(WORK / "in.ply", s)
@@ -181,6 +256,9 @@ def others(s, degree):
                                     shN=s["shN"] if k else None)
     gsply.plywrite(str(WORK / "gsply.compressed.ply"), data, compressed=True)
     through("gsply.compressed.ply", **{**packed_bounds(s), "sh": 0.033})
+    if degree == 0:
+        write_gltf(WORK / "pygltflib.glb", s)
+        through("pygltflib.glb", means=1e-5, scales=1e-5, rotation=1e-6, opacity=1e-5, sh0=0, sh=0)
     t = turned(s)
     data = gsply.GSData.from_arrays(**{key: t[key].astype("f4") for key in ("means", "scales", "quats", "opacities", "sh0")},
                                     shN=t["shN"].astype("f4") if k else None)

@@ -143,6 +143,62 @@ static void reading(SvkContext *context, const char *path) {
     EXPECT(svk_scene_save(loaded, path, 0) == SVK_STATUS_INPUT);
 }
 
+// Pixels in memory with known cameras: what the scene shows at its own cameras makes a scene again, in the same axes.
+static void pixels(SvkContext *context, const char *path) {
+    SvkScene *loaded = nullptr;
+    check(svk_scene_load(context, path, &loaded), context);
+    Scene scene(loaded);
+    SvkCamera cameras[2] = {scene_camera(loaded, 0), scene_camera(loaded, 1)};
+    std::vector<SvkPhoto> photos;
+    std::vector<std::vector<unsigned char>> images;
+    // The second has three bytes a pixel and rows with a gap.
+    const size_t bytes[2] = {4, 3}, gap[2] = {0, 5};
+    for (int i = 0; i < 2; i++) {
+        const SvkCamera &camera = cameras[i];
+        std::vector<unsigned char> rgba(size_t(4) * camera.width * camera.height);
+        auto output = make<SvkOutput>();
+        output.encoding = SVK_ENCODING_UNORM8_X4;
+        output.host = rgba.data();
+        output.bytes = rgba.size();
+        check(svk_scene_render(loaded, &camera, &output, 1, nullptr), loaded);
+        const size_t row = bytes[i] * camera.width + gap[i];
+        images.emplace_back(row * camera.height);
+        for (size_t y = 0; y < camera.height; y++)
+            for (size_t x = 0; x < camera.width; x++)
+                std::memcpy(&images[i][y * row + bytes[i] * x], &rgba[4 * (y * camera.width + x)], bytes[i]);
+        auto photo = make<SvkPhoto>();
+        photo.pixels = images[i].data();
+        photo.pixel_bytes = static_cast<uint32_t>(bytes[i]);
+        photo.width = camera.width;
+        photo.height = camera.height;
+        photo.row_bytes = gap[i] ? row : 0;
+        photo.camera = &cameras[i];
+        photos.push_back(photo);
+    }
+    auto options = make<SvkTrainOptions>();
+    options.preset = SVK_PRESET_DRAFT;
+    options.iterations = 4;
+    options.language_iterations = 1;
+    SvkScene *trained = nullptr;
+    check(svk_train(context, photos.data(), 2, &options, &trained), context);
+    Scene again(trained);
+    const SvkCamera first = scene_camera(trained, 0);
+    double worst = std::fabs(first.fx - cameras[0].fx) / cameras[0].fx;
+    for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 4; c++)
+            worst = std::fmax(worst, std::fabs(first.world_to_camera[r][c] - cameras[0].world_to_camera[r][c]));
+    EXPECT(worst < 1e-6);
+    // The scene is where the cameras say: the new one shows nearly what the old one did.
+    const auto was = render(loaded, cameras[0], SVK_CHANNEL_COLOUR, 4), is = render(trained, cameras[0], SVK_CHANNEL_COLOUR, 4);
+    double sum = 0;
+    for (size_t i = 0; i < was.size(); i++) sum += std::fabs(was[i] - is[i]);
+    std::printf("from its own renderings: mean difference %.4f\n", sum / static_cast<double>(was.size()));
+    EXPECT(sum / static_cast<double>(was.size()) < 0.05);
+    // A camera for one photo only cannot be meant.
+    photos[1].camera = nullptr;
+    EXPECT(svk_train(context, photos.data(), 2, &options, &trained) == SVK_STATUS_ARGUMENT);
+}
+
 int main(int argc, char **argv) {
     if (argc < 4) {
         std::fprintf(stderr, "usage: checks SCENE PHOTO PHOTO...\n");
@@ -156,6 +212,7 @@ int main(int argc, char **argv) {
         Context context(made);
         training(made, argc - 2, argv + 2);
         reading(made, argv[1]);
+        pixels(made, argv[1]);
     } catch (const std::exception &e) {
         std::fprintf(stderr, "checks: %s\n", e.what());
         return 1;

@@ -14,12 +14,10 @@ use nalgebra::DMatrix;
 
 /// Directions of the table.
 const LATTICE: usize = 2048;
-/// Published schedule …
+/// Published schedule.
 const EPOCHS: usize = 100;
 const BATCH: usize = 64;
 const RATE: f64 = 7e-4;
-/// … but not fewer steps than this: LangSplat has the masks of hundreds of photos, a few photos give few batches.
-const LEAST_STEPS: usize = 2000;
 /// Weight of 1 − cosine beside the mean square error.
 const COSINE_WEIGHT: f32 = 1e-3;
 
@@ -55,8 +53,8 @@ fn unit_backward(y: &DMatrix<f32>, norms: &[f32], g: &DMatrix<f32>) -> DMatrix<f
 }
 
 impl Autoencoder {
-    /// Trains on unit rows `[N, dim]`.
-    pub fn train(features: &[f32], dim: usize, seed: u64) -> Result<Self> {
+    /// Trains on unit rows `[N, dim]` for the published epochs, but at least `least_steps`.
+    pub fn train(features: &[f32], dim: usize, least_steps: usize, seed: u64) -> Result<Self> {
         let count = features.len() / dim.max(1);
         if count == 0 {
             return Err(Error::work("autoencoder: the scene has no region features"));
@@ -71,7 +69,7 @@ impl Autoencoder {
         let mut adam = Adam::new(RATE);
         let mut order: Vec<usize> = (0..count).collect();
         let batch = BATCH.min(count);
-        let steps = (EPOCHS * count.div_ceil(batch)).max(LEAST_STEPS);
+        let steps = (EPOCHS * count.div_ceil(batch)).max(least_steps);
         let (mut done, mut at) = (0, count);
         while done < steps {
             if at + batch > count {
@@ -142,11 +140,15 @@ fn lattice() -> Vec<f32> {
 }
 
 /// One codebook per level, all over the same lattice; every entry gets the direction nearest to its encoding.
-pub(in crate::language) fn build(levels: &[Vec<CodeEntry>], seed: u64) -> Result<(Vec<Built>, f64)> {
+pub(in crate::language) fn build(
+    levels: &[Vec<CodeEntry>],
+    least_steps: usize,
+    seed: u64,
+) -> Result<(Vec<Built>, f64)> {
     let first = levels.iter().flatten().next();
     let dim = first.map_or(0, |e| e.embedding.len());
     let all: Vec<f32> = levels.iter().flatten().flat_map(|e| e.embedding.iter().copied()).collect();
-    let model = Autoencoder::train(&all, dim, seed)?;
+    let model = Autoencoder::train(&all, dim, least_steps, seed)?;
     let codes = lattice();
     let embeddings = model.decode(&DMatrix::from_column_slice(3, LATTICE, &codes));
     let chord = min_chord(&codes, 3);
@@ -208,10 +210,10 @@ mod tests {
 
     #[test]
     fn few_features_are_restored_and_many_are_not() {
-        let few = Autoencoder::train(&unit_rows(4, 32, 1000), 32, 0).unwrap();
+        let few = Autoencoder::train(&unit_rows(4, 32, 1000), 32, 2000, 0).unwrap();
         assert!(few.cosine > 0.95, "{}", few.cosine);
         // 300 unrelated directions do not fit on a sphere: that is what the bijection avoids
-        let many = Autoencoder::train(&unit_rows(300, 32, 1000), 32, 0).unwrap();
+        let many = Autoencoder::train(&unit_rows(300, 32, 1000), 32, 2000, 0).unwrap();
         assert!(many.cosine < 0.8 && many.cosine > 0.2, "{}", many.cosine);
     }
 
@@ -227,7 +229,7 @@ mod tests {
         let rows = unit_rows(5, 16, 1002);
         let entry = |row: &[f32]| CodeEntry { embedding: row.to_vec(), weight: 10.0, members: vec![(0, 0)] };
         let entries: Vec<CodeEntry> = rows.chunks_exact(16).map(entry).collect();
-        let (built, cosine) = build(&[entries.clone(), Vec::new()], 0).unwrap();
+        let (built, cosine) = build(&[entries.clone(), Vec::new()], 2000, 0).unwrap();
         assert!(built[1].codebook.is_empty() && built[0].code_of.len() == 5);
         let book = &built[0].codebook;
         let restored: f32 = entries

@@ -54,7 +54,7 @@ fn seeds(width: usize, height: usize) -> Vec<usize> {
 }
 
 /// Rows of `b` with the largest dot product; ties go to the lowest index.
-fn best_descriptors(a: &Descriptors, rows: &[usize], b: &Descriptors) -> Vec<usize> {
+pub(crate) fn best_descriptors(a: &Descriptors, rows: &[usize], b: &Descriptors) -> Vec<usize> {
     let d = a.dim;
     // Sixteen queries share each pass over B, which is far larger than the caches.
     rows.par_chunks(16)

@@ -17,6 +17,7 @@ use crate::scene::{Camera, Pose, RgbImage};
 use crate::{Error, Result};
 use adjust::Adjustment;
 use glam::{DVec2, DVec3};
+pub(crate) use matches::best_descriptors;
 pub use matches::{descriptor_matches, point_matches};
 use pairs::Edge;
 

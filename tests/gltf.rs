@@ -1,0 +1,131 @@
+//! glTF files: what is written reads back, and what is not a readable file of Gaussians is refused in one line.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::indexing_slicing)] // a panic is how a test fails
+use serde_json::{Value, json};
+use splatvk::format::gaussians;
+use splatvk::scene::Splats;
+use std::path::Path;
+
+fn splats(n: usize, sh_degree: u32) -> Splats {
+    let mut next = 0u32;
+    let mut value = || {
+        next += 1;
+        (f64::from(next) * 12.9898).sin() as f32
+    };
+    let mut s = Splats { sh_degree, ..Splats::default() };
+    for _ in 0..n {
+        s.means.push([value(), value(), value()]);
+        s.log_scales.push([value(), value(), value()]);
+        let q = [value(), value(), value(), value()];
+        let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt();
+        s.quats.push(q.map(|v| v / norm));
+        s.opacity_logits.push(value());
+        s.sh.extend((0..s.sh_len() * 3).map(|_| value()));
+    }
+    s
+}
+
+fn close(a: &[f32], b: &[f32], bound: f32, what: &str) {
+    assert_eq!(a.len(), b.len(), "{what}");
+    let worst = a.iter().zip(b).fold(0f32, |m, (x, y)| m.max((x - y).abs()));
+    assert!(worst <= bound, "{what}: {worst}");
+}
+
+#[test]
+fn both_kinds_round_trip() {
+    let folder = tempfile::tempdir().unwrap();
+    for degree in 0..=3 {
+        let s = splats(9, degree);
+        for name in ["a.glb", "a.gltf"] {
+            let path = folder.path().join(name);
+            gaussians::write(&path, &s, None).unwrap();
+            let back = gaussians::read(&path).unwrap().0;
+            assert_eq!((back.len(), back.sh_degree), (9, degree));
+            assert_eq!(back.means, s.means);
+            close(back.log_scales.as_flattened(), s.log_scales.as_flattened(), 1e-6, "log scales");
+            close(&back.opacity_logits, &s.opacity_logits, 1e-6, "opacities");
+            close(&back.sh, &s.sh, 1e-6, "SH");
+            for (a, b) in back.quats.iter().zip(&s.quats) {
+                let dot: f32 = a.iter().zip(b).map(|(x, y)| x * y).sum();
+                assert!(dot.abs() > 1.0 - 1e-6);
+            }
+        }
+    }
+}
+
+/// A text file of three Gaussians, changed by `change`, and what reading it says.
+fn refused(folder: &Path, change: impl FnOnce(&mut Value)) -> String {
+    let path = folder.join("b.gltf");
+    gaussians::write(&path, &splats(3, 1), None).unwrap();
+    let mut root: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    change(&mut root);
+    std::fs::write(&path, root.to_string()).unwrap();
+    let e = gaussians::read(&path).expect_err("a file that must be refused was read");
+    assert_eq!((e.exit_code(), e.to_string().lines().count()), (2, 1), "{e}");
+    e.to_string()
+}
+
+#[test]
+fn unreadable_files_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let said = |change: fn(&mut Value), words: &str| {
+        let text = refused(folder.path(), change);
+        assert!(text.contains(words), "{text}: says nothing of {words}");
+    };
+    said(|r| r["meshes"][0]["primitives"][0]["extensions"] = json!({}), "not a file of Gaussians");
+    said(|r| r["meshes"][0]["primitives"][0]["mode"] = json!(4), "mode 0");
+    said(
+        |r| r["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["kernel"] = json!("disc"),
+        "kernel disc",
+    );
+    said(
+        |r| {
+            r["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["colorSpace"] =
+                json!("lin_rec709_display");
+        },
+        "colorSpace lin_rec709_display",
+    );
+    said(
+        |r| {
+            let attributes = r["meshes"][0]["primitives"][0]["attributes"].as_object_mut().unwrap();
+            attributes.remove("KHR_gaussian_splatting:SH_DEGREE_1_COEF_0");
+        },
+        "SH_DEGREE_1_COEF_0 is missing",
+    );
+    said(|r| r["extensionsRequired"] = json!(["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression");
+    said(|r| r["nodes"][0]["scale"] = json!([1, 2, 1]), "stretches or mirrors");
+    said(|r| r["nodes"][0]["scale"] = json!([1, 1, -1]), "stretches or mirrors");
+    said(|r| r["nodes"][0]["children"] = json!([0]), "form a tree");
+    said(|r| r["scenes"][0]["nodes"] = json!([7]), "no node 7");
+    said(|r| r["nodes"][0]["mesh"] = json!(3), "no mesh 3");
+    said(|r| r["accessors"][1]["count"] = json!(2), "different numbers");
+    said(|r| r["accessors"][1]["count"] = json!(u64::MAX / 8), "ends early");
+    said(|r| r["accessors"][1]["componentType"] = json!(5125), "unknown type");
+    said(|r| r["accessors"][1]["type"] = json!("VEC2"), "VEC4 is needed");
+    said(|r| r["accessors"][1]["sparse"] = json!({}), "sparse");
+    said(|r| r["bufferViews"][2]["byteLength"] = json!(8), "ends early");
+    said(|r| r["bufferViews"][2]["byteStride"] = json!(4), "ends early");
+    said(|r| r["buffers"][0]["uri"] = json!("missing.bin"), "missing.bin");
+    said(|r| r["buffers"][0]["uri"] = json!("https://example.org/a.bin"), "not a local file");
+    said(|r| r["buffers"][0]["uri"] = json!("data:;base64,!"), "base64");
+    // Scales of the drafts were logarithms: here the accessor of SCALE is that of the means, some of them negative.
+    said(
+        |r| {
+            let attributes = r["meshes"][0]["primitives"][0]["attributes"].as_object_mut().unwrap();
+            attributes["KHR_gaussian_splatting:SCALE"] = attributes["POSITION"].clone();
+        },
+        "a scale is negative",
+    );
+}
+
+#[test]
+fn cut_files_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.glb");
+    gaussians::write(&path, &splats(3, 0), None).unwrap();
+    let whole = std::fs::read(&path).unwrap();
+    for cut in 0..whole.len() {
+        std::fs::write(&path, &whole[..cut]).unwrap();
+        let e = gaussians::read(&path).err().unwrap_or_else(|| panic!("cut at {cut} is read"));
+        assert_eq!((e.exit_code(), e.to_string().lines().count()), (2, 1), "cut at {cut}: {e}");
+    }
+}
