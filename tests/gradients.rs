@@ -1,9 +1,9 @@
 //! Gradients of the whole render on the GPU against the f64 twin, which is itself checked by central differences.
 mod support;
 use splatvk::gpu::{Options, TestDevice, test_device};
-use splatvk::pass::Ways;
 use splatvk::pass::close::Tolerance;
 use splatvk::pass::raster_backward::Summation;
+use splatvk::pass::{FeatureMode, Ways};
 use support::{GpuGradients, Scene, assert_close};
 
 /// Relative 1e-3 by class in the L2 sense (ALGORITHMS 7.8; measured 4e-7 to 4e-6). Single elements are sums of many
@@ -89,7 +89,7 @@ fn edge_cases_match_the_twin() {
     assert_eq!(gradients.splats.sh[7 * 48], 0.0);
 }
 
-/// Linear features, and features at exactly zero in the gauge, where the Jacobian is 1/ε.
+/// Linear features, and features at exactly zero in the gauge, where the Jacobian is 1/ε; one gauge, and one per level.
 #[test]
 fn both_feature_modes_match_the_twin() {
     let device = test_device();
@@ -97,8 +97,10 @@ fn both_feature_modes_match_the_twin() {
     scene.features[6..12].fill(0.0);
     let upstream = scene.upstream(5);
     assert_gradients(&scene, &scene.gradients(&device, &upstream), 5);
-    scene.options.feature_mode = splatvk::pass::FeatureMode::Linear;
-    assert_gradients(&scene, &scene.gradients(&device, &upstream), 5);
+    for mode in [FeatureMode::Gauge { epsilon: 1e-3, blocks: 2 }, FeatureMode::Linear] {
+        scene.options.feature_mode = mode;
+        assert_gradients(&scene, &scene.gradients(&device, &upstream), 5);
+    }
 }
 
 /// Without coupling, the features' part of the loss moves the features alone.

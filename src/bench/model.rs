@@ -50,7 +50,6 @@ impl Work {
             // Seven separable blurs of 11 taps per value and 40 operations for SSIM and its derivatives.
             "SSIM + L1" => (3.0 * pixels * 12.0, 3.0 * pixels * (7.0 * 44.0 + 40.0)),
             "feature loss" => (pixels * (8.0 * d + 8.0), 3.0 * pixels * d),
-            "feature gauge" => (20.0 * n * d, 8.0 * n * d),
             "regularisers" => (8.0 * pixels + 36.0 * n, 10.0 * n),
             // Gradients of a projected splat are added once per list entry: read and written.
             "raster backward" => (
@@ -58,7 +57,7 @@ impl Work {
                 blended * (WEIGH + WEIGH_BACK + 4.0 * channels),
             ),
             "projection backward" => {
-                (n * (2.0 * (GEOMETRY + colour) + PROJECTED + 8.0 * d), n * (600.0 + 12.0 * sh))
+                (n * (2.0 * (GEOMETRY + colour) + PROJECTED + 12.0 * d), n * (600.0 + 12.0 * sh))
             }
             "Adam" => {
                 let parameters = n * (11.0 + 3.0 * sh + d);

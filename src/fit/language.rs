@@ -9,7 +9,7 @@ use super::views::Views;
 use crate::gpu::{Buffer, Device, Program, Recorder};
 use crate::pass::rasterizer::RasterOptions;
 use crate::pass::twin::FeatureMode;
-use crate::pass::{codes, codes::Mode, gauge, sum};
+use crate::pass::{codes, codes::Mode, sum};
 use crate::progress::Progress;
 use crate::scene::{Camera, LEVEL_NAMES, LanguageField, LevelField, RgbImage, Splats};
 use crate::{Error, Result};
@@ -114,8 +114,6 @@ pub(crate) struct Run<'a> {
     width: usize,
     extent: f64,
     pub(super) model: Model,
-    /// [N, levels·d] what Adam moves; the rendered features themselves when linear.
-    pub(super) raw: Buffer,
     pub(super) views: Views,
     cameras: &'a [Camera],
     targets: CodeTargets,
@@ -144,20 +142,16 @@ impl<'a> Run<'a> {
         let targets = CodeTargets::new(device, levels, images, 1.0 - options.image_weight)?;
         let raster = RasterOptions {
             sh_degree: splats.sh_degree,
-            feature_mode: FeatureMode::Linear,
+            feature_mode: match options.gauge {
+                FeatureGauge::Normalised { epsilon } => FeatureMode::Gauge { epsilon, blocks: levels.len() },
+                FeatureGauge::Linear => FeatureMode::Linear,
+            },
             features_move_geometry: !options.detach_geometry,
         };
-        let mut start = vec![0.0; splats.len() * channels];
         if options.lift {
-            start = lift(device, &mut views, cameras, &model, &raster, &targets, options.gauge)?;
+            let start = lift(device, &mut views, cameras, &model, &raster, &targets, options.gauge)?;
+            model.values.features.write(&start)?;
         }
-        let raw = match options.gauge {
-            FeatureGauge::Linear => {
-                model.values.features.write(&start)?;
-                model.values.features.clone()
-            }
-            FeatureGauge::Normalised { .. } => device.buffer_from("raw features", &start)?,
-        };
         let losses = views
             .stages
             .iter()
@@ -175,7 +169,6 @@ impl<'a> Run<'a> {
             width,
             extent: scale.extent,
             model,
-            raw,
             views,
             cameras,
             targets,
@@ -189,7 +182,8 @@ impl<'a> Run<'a> {
     }
 
     fn train(&mut self, progress: &dyn Progress, done: u64) -> Result<()> {
-        if self.options.check_every > 0 {
+        // A run that is measured once, at its end, needs no start to compare with.
+        if (1..self.options.iterations).contains(&self.options.check_every) {
             self.measure(0)?;
             self.tell(progress, done);
         }
@@ -259,7 +253,6 @@ impl<'a> Run<'a> {
         let (item, stage) = (&self.views.list[view], self.views.stage(view));
         let frame = stage.raster.frame();
         let mut rec = Recorder::new(&self.device, "language step");
-        self.record_gauge(&mut rec);
         stage.raster.record_forward(&mut rec, &self.model.values, &self.raster);
         if !self.options.detach_geometry {
             let weights = IMAGE_WEIGHTS.map(|w| w * self.options.image_weight);
@@ -276,42 +269,15 @@ impl<'a> Run<'a> {
         codes::record(&mut rec, &self.targets.of(view), frame, loss, Mode::Loss);
         sum::record(&mut rec, loss, &self.partials, &stage.sums, LANGUAGE_SUM);
         stage.raster.record_backward(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
-        if let FeatureGauge::Normalised { epsilon } = self.options.gauge {
-            let gradients = &self.model.gradients.features;
-            gauge::record_backward(&mut rec, &self.raw, gradients, self.blocks(), self.width, epsilon);
-        }
-        self.model.record_feature_step(&mut rec, &self.raw, &frame.status);
+        self.model.record_feature_step(&mut rec, &frame.status);
         if !self.options.detach_geometry {
             self.model.record_step(&mut rec, &frame.status);
         }
         rec
     }
 
-    /// One block of d channels per splat and level.
-    fn blocks(&self) -> usize {
-        self.model.count() * self.levels.len()
-    }
-
-    /// Rendered features from raw ones.
-    fn record_gauge(&self, rec: &mut Recorder) {
-        if let FeatureGauge::Normalised { epsilon } = self.options.gauge {
-            let features = &self.model.values.features;
-            gauge::record(rec, &self.raw, features, self.blocks(), self.width, epsilon);
-        }
-    }
-
-    fn update_rendered(&self) -> Result<()> {
-        if self.options.gauge == FeatureGauge::Linear {
-            return Ok(());
-        }
-        let mut rec = Recorder::new(&self.device, "feature gauge");
-        self.record_gauge(&mut rec);
-        rec.run()
-    }
-
     /// Renders all training views and counts the labelled pixels that decode to their label.
     fn measure(&mut self, step: usize) -> Result<()> {
-        self.update_rendered()?;
         let mut counts = vec![[0usize; 2]; self.levels.len()];
         for view in 0..self.cameras.len() {
             self.views.set_camera(view, &self.cameras[view])?;
@@ -339,12 +305,17 @@ impl<'a> Run<'a> {
 
     /// Splats and, per level, features [N, d] as rendered.
     fn finish(&mut self) -> Result<(Splats, Vec<Vec<f32>>)> {
-        self.update_rendered()?;
         let splats = self.model.splats()?;
         let (levels, d) = (self.levels.len(), self.width);
-        let all = self.model.values.features.read_range::<f32>(0..splats.len() * levels * d)?;
+        let mut all = self.model.values.features.read_range::<f32>(0..splats.len() * levels * d)?;
         if !all.iter().all(|v| v.is_finite()) {
             return Err(Error::work("the language stage produced features that are not finite"));
+        }
+        if let FeatureGauge::Normalised { epsilon } = self.options.gauge {
+            for feature in all.chunks_exact_mut(d) {
+                let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
+                feature.iter_mut().for_each(|v| *v /= norm + epsilon);
+            }
         }
         let level =
             |l: usize| all.chunks_exact(levels * d).flat_map(move |f| &f[l * d..(l + 1) * d]).copied();

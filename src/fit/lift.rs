@@ -6,6 +6,7 @@ use super::views::Views;
 use crate::gpu::{Buffer, Device, Recorder};
 use crate::pass::codes::{self, Mode, Targets};
 use crate::pass::rasterizer::RasterOptions;
+use crate::pass::twin::FeatureMode;
 use crate::scene::{Camera, Codebook, LevelField, RgbImage};
 use crate::{Error, Result};
 
@@ -107,6 +108,8 @@ pub(super) fn lift(
     let d = targets.width as usize;
     let total = model.count() * d * targets.levels as usize;
     let mut sums = vec![0.0f32; total];
+    // The sums are gradients by what is rendered, whatever is stored.
+    let raster = &RasterOptions { feature_mode: FeatureMode::Linear, ..*raster };
     for (view, camera) in cameras.iter().enumerate() {
         views.set_camera(view, camera)?;
         let at = views.list[view].stage;

@@ -104,10 +104,17 @@ impl Model {
     }
 
     /// Records the Adam step of the raw features, whose gradient stands in the feature gradients.
-    pub(super) fn record_feature_step(&self, rec: &mut Recorder, raw: &Buffer, guard: &Buffer) {
+    pub(super) fn record_feature_step(&self, rec: &mut Recorder, guard: &Buffer) {
         let count = self.count() * self.values.feature_dim;
         let class = Class { slot: FEATURE_ROW as u32, count, stride: 1, head: 1 };
-        self.schedule.record(rec, class, raw, &self.gradients.features, &self.feature_moments, guard);
+        self.schedule.record(
+            rec,
+            class,
+            &self.values.features,
+            &self.gradients.features,
+            &self.feature_moments,
+            guard,
+        );
     }
 
     /// Fails if any step so far has met a gradient that is not finite.

@@ -59,6 +59,6 @@ impl Steps for LanguageRun<'_> {
 impl LanguageRun<'_> {
     /// Replaces the raw features [N, levels·d].
     pub(crate) fn set_features(&self, features: &[f32]) -> Result<()> {
-        self.raw.write(features)
+        self.model.values.features.write(features)
     }
 }

@@ -6,7 +6,6 @@ pub mod codes;
 pub mod compact;
 pub mod decode;
 pub mod densify;
-pub mod gauge;
 pub mod metrics;
 pub mod pack;
 pub mod pairs;

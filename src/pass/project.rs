@@ -49,7 +49,13 @@ pub fn record_features(rec: &mut Recorder, splats: &SplatBuffers, frame: &FrameB
     let (count, dim) = (splats.count as u32, splats.feature_dim as u32);
     let call = shaders::features_forward::call(
         &shaders::features_forward::Bindings { features: &splats.features, codes: &frame.codes },
-        &shaders::features_forward::Push { count, dim, stride: frame.code_stride(), epsilon: mode.epsilon() },
+        &shaders::features_forward::Push {
+            count,
+            dim,
+            stride: frame.code_stride(),
+            width: mode.width(splats.feature_dim) as u32,
+            epsilon: mode.epsilon(),
+        },
     );
     rec.dispatch_threads(call, [count, 1, 1]);
 }
@@ -161,8 +167,8 @@ pub(super) fn raw_colour(params: &Params, i: usize, view: &View) -> DVec3 {
 pub fn features_twin(features: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
     match mode {
         FeatureMode::Linear => features.to_vec(),
-        FeatureMode::Gauge(epsilon) => features
-            .chunks(dim.max(1))
+        FeatureMode::Gauge { epsilon, .. } => features
+            .chunks(mode.width(dim))
             .flat_map(|f| {
                 let length = f.iter().map(|x| x * x).sum::<f64>().sqrt();
                 f.iter().map(move |x| x / (length + f64::from(epsilon)))

@@ -79,6 +79,7 @@ pub fn record_features(
             count,
             dim,
             stride: frame.code_stride(),
+            width: mode.width(splats.feature_dim) as u32,
             epsilon: mode.epsilon(),
         },
     );
@@ -235,9 +236,9 @@ fn outer(a: DVec3, b: DVec3) -> DMat3 {
 /// ∂(rendered features) → ∂(raw features), both [N, d] (ALGORITHMS 8.4):
 /// `∂f = (∂f̂ − f̂'(f̂'·∂f̂)·‖f‖/(‖f‖+ε)) / (‖f‖+ε)` with f̂' = f/‖f‖.
 pub fn features_twin(features: &[f64], upstream: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
-    let FeatureMode::Gauge(epsilon) = mode else { return upstream.to_vec() };
+    let FeatureMode::Gauge { epsilon, .. } = mode else { return upstream.to_vec() };
     let mut out = Vec::with_capacity(upstream.len());
-    for (f, g) in features.chunks(dim.max(1)).zip(upstream.chunks(dim.max(1))) {
+    for (f, g) in features.chunks(mode.width(dim)).zip(upstream.chunks(mode.width(dim))) {
         let length = f.iter().map(|x| x * x).sum::<f64>().sqrt();
         let scale = length + f64::from(epsilon);
         let along: f64 = f.iter().zip(g).map(|(x, y)| x * y).sum();

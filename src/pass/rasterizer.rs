@@ -160,7 +160,11 @@ pub struct RasterOptions {
 impl Default for RasterOptions {
     /// Degree 0; ε = 1e-3 as ALGORITHMS 8.4.
     fn default() -> Self {
-        RasterOptions { sh_degree: 0, feature_mode: FeatureMode::Gauge(1e-3), features_move_geometry: true }
+        RasterOptions {
+            sh_degree: 0,
+            feature_mode: FeatureMode::Gauge { epsilon: 1e-3, blocks: 1 },
+            features_move_geometry: true,
+        }
     }
 }
 

@@ -11,8 +11,13 @@ use glam::{DVec3, DVec4};
 /// How stored features become rendered ones (ALGORITHMS 8.4).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FeatureMode {
-    /// f̂ = f / (‖f‖ + ε), the parameterisation of the paper; the value is ε.
-    Gauge(f32),
+    /// f̂ = f / (‖f‖ + ε), the parameterisation of the paper, for each of several blocks of equal length (one per level).
+    Gauge {
+        /// ε
+        epsilon: f32,
+        /// Blocks.
+        blocks: usize,
+    },
     /// f̂ = f.
     Linear,
 }
@@ -21,9 +26,18 @@ impl FeatureMode {
     /// As the shaders take it: ε, negative for [`FeatureMode::Linear`].
     pub fn epsilon(self) -> f32 {
         match self {
-            FeatureMode::Gauge(epsilon) => epsilon,
+            FeatureMode::Gauge { epsilon, .. } => epsilon,
             FeatureMode::Linear => -1.0,
         }
+    }
+
+    /// Length of a block of `dim` features.
+    pub fn width(self, dim: usize) -> usize {
+        match self {
+            FeatureMode::Gauge { blocks, .. } => dim / blocks,
+            FeatureMode::Linear => dim,
+        }
+        .max(1)
     }
 }
 

@@ -110,12 +110,12 @@ fn one_splat() {
 
 #[test]
 fn ten_splats_gauge_features() {
-    check(scene(10, 3, 8, 6), FeatureMode::Gauge(1e-3), 40);
+    check(scene(10, 3, 8, 6), FeatureMode::Gauge { epsilon: 1e-3, blocks: 2 }, 40);
 }
 
 #[test]
 fn hundred_splats() {
-    check(scene(100, 2, 3, 7), FeatureMode::Gauge(1e-3), 20);
+    check(scene(100, 2, 3, 7), FeatureMode::Gauge { epsilon: 1e-3, blocks: 1 }, 20);
 }
 
 #[test]
@@ -149,8 +149,8 @@ fn clamped_jacobian_and_clamped_alpha() {
 
 #[test]
 fn gauge_jacobian_at_zero_features_is_one_over_epsilon() {
-    let raw =
-        super::project_backward::features_twin(&[0.0; 3], &[1.0, -2.0, 0.5], 3, FeatureMode::Gauge(1e-3));
+    let mode = FeatureMode::Gauge { epsilon: 1e-3, blocks: 1 };
+    let raw = super::project_backward::features_twin(&[0.0; 3], &[1.0, -2.0, 0.5], 3, mode);
     for (a, b) in raw.iter().zip([1.0, -2.0, 0.5]) {
         assert!((a - b / f64::from(1e-3f32)).abs() < 1e-9);
     }

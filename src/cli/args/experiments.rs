@@ -56,7 +56,7 @@ pub struct AblateArgs {
     /// Optimisation steps of the colour stage, instead of draft's
     #[arg(long, value_name = "N")]
     pub iterations: Option<usize>,
-    /// Optimisation steps of the language stage, instead of draft's
+    /// Optimisation steps of the language stage [default: 30]
     #[arg(long, value_name = "N")]
     pub language_iterations: Option<usize>,
     /// Device and models
