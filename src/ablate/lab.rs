@@ -435,7 +435,8 @@ impl Scale {
         let scale = |c: usize| {
             let (low, high) =
                 meaning.values().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(v[c]), h.max(v[c])));
-            if high > low { 1.0 / (high - low).powi(2) } else { 0.0 }
+            // Coordinates of unit vectors that differ by less than this differ by rounding.
+            if high - low > 1e-4 { 1.0 / (high - low).powi(2) } else { 0.0 }
         };
         Scale((0..dim).map(scale).collect())
     }

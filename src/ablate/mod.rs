@@ -87,14 +87,21 @@ pub fn run(lab: &mut Lab, plan: &Plan, table: Table) -> Result<Finished> {
     let sources = plan.source.clone().map_or_else(|| sources(table, plan.seed), |s| vec![s]);
     let rows = rows(table, &base, &sources, &lab.means());
     let mut finished = Finished { table, seen: Vec::new(), rows: Vec::new() };
-    for row in rows {
+    for mut row in rows {
         let done = match &row.setup {
             Some(setup) => {
                 for frame in lab.frames(setup.views)?.into_iter().filter(|f| f.split == Split::Test) {
                     finished.seen.push(frame.stem);
                 }
-                let outcome = lab.outcome(setup)?;
-                Done { bytes: Some(outcome.feature_bytes), outcome: Some(outcome), row }
+                match lab.outcome(setup) {
+                    Ok(outcome) => Done { bytes: Some(outcome.feature_bytes), outcome: Some(outcome), row },
+                    // What a device cannot hold is a finding about it; the other rows still count.
+                    Err(Error::Gpu(why)) => {
+                        row.note = why;
+                        Done { bytes: None, outcome: None, row }
+                    }
+                    Err(e) => return Err(e),
+                }
             }
             None if table == Table::Bijection => {
                 let setup = Setup { source: find(&sources, &row.group), ..base.clone() };

@@ -73,7 +73,7 @@ def graph(args, name, module, inputs, outputs, dynamic=None, reference=None):
         if a.shape != b.shape:
             sys.exit("%s: %s has shape %s in ONNX Runtime, %s in PyTorch" % (path, output, a.shape, b.shape))
         error = float(np.abs(a - b).max() / max(np.abs(b).max(), 1e-12))
-        worst = max(worst, error)
+        worst = max(worst, error) if np.isfinite(error) else np.inf
         print("  %-24s %-22s relative error %.1e" % (output, list(b.shape), error))
     weights = sum(p.numel() for p in module.parameters()) / 1e6
     print("%s: %.1f M weights, ONNX Runtime %.2f s, PyTorch %.2f s, peak memory %.1f GB" % (

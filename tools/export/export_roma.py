@@ -19,7 +19,7 @@ def inverse(a):
     if n <= 50:
         # Newton's iteration doubles the digits each round. The start (Ben-Israel) converges for every such matrix, and the
         # eigenvalues lie between the noise 0.1 and n: log2(500) rounds to arrive, a few more to settle.
-        eye = torch.eye(n)
+        eye = torch.eye(n, dtype=a.dtype)
         x = eye / a.abs().sum(-1).max()
         for _ in range(22):
             x = x @ (2 * eye - a @ x)
@@ -31,18 +31,18 @@ def inverse(a):
     s = inverse(s - q.transpose(-1, -2) @ pq)
     corner = -pq @ s
     upper = torch.cat([p - corner @ pq.transpose(-1, -2), corner], dim=-1)
-    return torch.cat([upper, torch.cat([corner.transpose(-1, -2), s], dim=-1)], dim=-2)
+    x = torch.cat([upper, torch.cat([corner.transpose(-1, -2), s], dim=-1)], dim=-2)
+    # Errors grow by the square of |q| from level to level; one round of Newton's takes them back to rounding.
+    return x @ (2 * torch.eye(n, dtype=a.dtype) - a @ x)
 
 
 def gaussian_process(self, x, y, **_):
     b, _, h, w = x.shape
     f = self.get_pos_enc(y)
     x, y, f = self.reshape(x.float()), self.reshape(y.float()), self.reshape(f)
+    # In float32 a Schur complement of 1600 tokens may lose its smallest eigenvalues, and Newton's iteration then diverges.
     a = self.K(y, y) + self.sigma_noise * torch.eye(h * w)[None]
-    approximate = inverse(a)
-    u = approximate @ f
-    for _ in range(2):  # the residual carries the digits that the inverse lost
-        u = u + approximate @ (f - a @ u)
+    u = (inverse(a.double()) @ f.double()).float()
     return (self.K(x, y) @ u).permute(0, 2, 1).reshape(b, -1, h, w)
 
 
