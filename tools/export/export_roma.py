@@ -25,13 +25,14 @@ def inverse(a):
             x = x @ (2 * eye - a @ x)
         return x
     h = n // 2
-    p, q, s = a[..., :h, :h], a[..., :h, h:], a[..., h:, h:]
+    # No transposes: both corners are slices, and ONNX Runtime fuses a transpose with a product for float32 only.
+    p, q, t, s = a[..., :h, :h], a[..., :h, h:], a[..., h:, :h], a[..., h:, h:]
     p = inverse(p)
-    pq = p @ q
-    s = inverse(s - q.transpose(-1, -2) @ pq)
+    pq, tp = p @ q, t @ p
+    s = inverse(s - t @ pq)
     corner = -pq @ s
-    upper = torch.cat([p - corner @ pq.transpose(-1, -2), corner], dim=-1)
-    x = torch.cat([upper, torch.cat([corner.transpose(-1, -2), s], dim=-1)], dim=-2)
+    upper = torch.cat([p - corner @ tp, corner], dim=-1)
+    x = torch.cat([upper, torch.cat([-s @ tp, s], dim=-1)], dim=-2)
     # Errors grow by the square of |q| from level to level; one round of Newton's takes them back to rounding.
     return x @ (2 * torch.eye(n, dtype=a.dtype) - a @ x)
 
