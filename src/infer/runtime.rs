@@ -195,11 +195,19 @@ fn floats(value: &ort::value::DynValue) -> ort::Result<Tensor> {
     })
 }
 
+/// Files from this size on, bytes, are networks whose memory counts for more than the time of allocating it.
+const LARGE: u64 = 200 << 20;
+
 fn build(environment: &Environment, file: &Path, threads: usize) -> ort::Result<ort::session::Session> {
-    ort::session::Session::builder(environment)?
+    let mut builder = ort::session::Session::builder(environment)?
         .with_optimization_level(GraphOptimizationLevel::Level3)?
-        .with_intra_threads(threads)?
-        .commit_from_file(file)
+        .with_intra_threads(threads)?;
+    if file.metadata().is_ok_and(|m| m.len() >= LARGE) {
+        // The arena doubles what it takes and keeps it until the session ends.
+        let plain = ort::ep::CPU::default().with_arena_allocator(false).build();
+        builder = builder.with_memory_pattern(false)?.with_execution_providers([plain])?;
+    }
+    builder.commit_from_file(file)
 }
 
 fn line(error: &ort::Error) -> String {

@@ -125,16 +125,18 @@ def read_gltf(path):
     c = np.clip(0.5 + C0 * own("SH_DEGREE_0_COEF_0").astype("f8"), 0, 1)
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     close("glTF COLOR_0", values("COLOR_0") / 65535, np.column_stack([linear, a]), 1e-5)
-    return turned({
-        "means": means, "scales": np.log(own("SCALE")), "quats": own("ROTATION")[:, [3, 0, 1, 2]],
+    x, y, z, w = own("ROTATION").T
+    return {**turned({
+        "means": means, "scales": np.log(own("SCALE")), "quats": own("ROTATION"),
         "opacities": np.log(a / (1 - a)), "sh0": own("SH_DEGREE_0_COEF_0"),
         "shN": np.stack(rest, axis=1) if rest else np.zeros((len(means), 0, 3)),
-    })
+    }), "quats": np.stack([x, -w, z, -y], 1)}  # the scene is turned, not the splats' own axes
 
 
 def write_gltf(path, s):
     """The same layout, interleaved and half of it quantised, below a node that turns and doubles it; by pygltflib."""
-    t = turned(s)
+    w, x, y, z = s["quats"].T
+    t = {**turned(s), "quats": np.stack([-x, w, -z, y], 1)}
     turn = np.sqrt(0.5)  # a quarter turn about z: the file's x is the scene's -y
     n, k = t["shN"].shape[:2]
     back = {"means": np.stack([t["means"][:, 1], -t["means"][:, 0], t["means"][:, 2]], 1) / 2}
