@@ -39,7 +39,7 @@ pub(super) struct Model {
 }
 
 impl Model {
-    /// Uploads splats and reserves rendered features [N, feature_dim].
+    /// Uploads splats and reserves features [N, feature_dim], all zero.
     pub(super) fn new(device: &Device, splats: &Splats, feature_dim: usize) -> Result<Self> {
         let zeros = vec![0.0; splats.len() * feature_dim];
         let values = SplatBuffers::upload(device, splats, &zeros, feature_dim)?;
