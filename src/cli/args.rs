@@ -1,4 +1,6 @@
 //! What the user typed. `super::plan` says what it means.
+use crate::infer::provider;
+use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -18,6 +20,9 @@ pub struct Cli {
     /// Progress and messages on standard error: for people, or one JSON object per line
     #[arg(long, global = true, value_enum, default_value = "text", value_name = "FORMAT")]
     pub log: LogFormat,
+    /// What computes the networks, as far as the ONNX Runtime library can; auto: a GPU that answers, or else the CPU
+    #[arg(long, global = true, value_parser = PossibleValuesParser::new(provider::NAMES), value_name = "NAME")]
+    pub provider: Option<String>,
 }
 
 /// What goes to standard error.

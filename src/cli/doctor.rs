@@ -9,8 +9,10 @@ use std::fmt::Write;
 
 pub fn doctor(args: &DoctorArgs) -> Result<()> {
     let mut lines = vulkan(args.device.device.as_deref());
-    lines.push(match infer::runtime() {
-        Ok(path) => line("ONNX Runtime", Status::Ok, path.display().to_string(), None),
+    lines.push(match infer::runtime().and_then(|path| Ok((path, infer::provider::name()?))) {
+        Ok((path, provider)) => {
+            line("ONNX Runtime", Status::Ok, format!("{} · provider {provider}", path.display()), None)
+        }
         Err(error) => line("ONNX Runtime", Status::Missing, "not usable".to_owned(), Some(error.to_string())),
     });
     let status = Registry::open(args.device.models.as_deref())?.status();

@@ -34,6 +34,9 @@ pub fn main() -> ExitCode {
     };
     progress::set_format(cli.log);
     progress::stop_on_signal();
+    if let Some(name) = &cli.provider {
+        crate::infer::provider::choose(name);
+    }
     match execute(cli.command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

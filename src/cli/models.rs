@@ -3,7 +3,7 @@ use super::args::{ModelsAction, ModelsArgs};
 use super::{print, print_json};
 use crate::infer::check::{Measured, check};
 use crate::infer::installed::{Installed, Inventory, Known, inventory, known};
-use crate::infer::{ModelStatus, Registry};
+use crate::infer::{ModelStatus, Registry, provider};
 use crate::{Error, Result};
 use serde_json::json;
 use std::fmt::Write;
@@ -108,6 +108,10 @@ fn installed(text: &mut String, m: &Installed) {
             "",
             graph.path.display()
         );
+        for (file, pinned) in &graph.pinned {
+            let name = file.file_name().unwrap_or_default().to_string_lossy();
+            let _ = writeln!(text, "{:10}   sha256 {pinned} pinned for {name}", "");
+        }
     }
 }
 
@@ -128,6 +132,9 @@ fn check_all(registry: &Registry, as_json: bool) -> Result<()> {
     if !as_json {
         let mut text = String::new();
         status.iter().for_each(|m| built_in(&mut text, m));
+        if !found.models.is_empty() {
+            let _ = writeln!(text, "\nNetworks, computed by provider {}", provider::name()?);
+        }
         print(&text)?;
     }
     for model in &found.models {
@@ -145,7 +152,9 @@ fn check_all(registry: &Registry, as_json: bool) -> Result<()> {
     }
     if as_json {
         let models: Vec<_> = status.iter().map(to_json).collect();
-        print_json(&json!({ "models": models, "networks": results, "problems": problems }))?;
+        print_json(
+            &json!({ "models": models, "provider": provider::name().ok(), "networks": results, "problems": problems }),
+        )?;
     }
     match problems.into_iter().next() {
         Some(first) => Err(Error::missing(first)),
@@ -187,6 +196,7 @@ fn installed_json(m: &Installed) -> serde_json::Value {
     let graph = |g: &crate::infer::graph::GraphFile| {
         json!({
             "part": g.binding.part, "file": g.path, "parameters": g.parameters, "bytes": g.bytes(), "opset": g.opset,
+            "sha256": g.pinned.iter().map(|(file, hash)| json!({ "file": file, "pinned": hash })).collect::<Vec<_>>(),
         })
     };
     json!({

@@ -173,6 +173,9 @@ pub struct Adapter {
     /// The weights were never trained: results mean nothing, and nothing is expected of them.
     #[serde(default)]
     pub untrained: bool,
+    /// What the files beside it must hash to, by name; files without an entry may be anything.
+    #[serde(default)]
+    pub sha256: BTreeMap<String, String>,
     #[serde(default)]
     graph: Vec<GraphSpec>,
 }

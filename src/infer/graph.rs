@@ -3,6 +3,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::adapter::{Adapter, Binding};
+use super::cache::fingerprint;
 use super::contract::{Slot, relayout, unify};
 use super::onnx::{self, Dim, Header};
 use super::runtime::{Input, Session, Tensor};
@@ -25,6 +26,8 @@ pub struct GraphFile {
     pub opset: i64,
     /// Files with the rest of the weights.
     pub external: Vec<PathBuf>,
+    /// The sha256 that the adapter pins of these files.
+    pub pinned: Vec<(PathBuf, String)>,
 }
 
 impl GraphFile {
@@ -40,8 +43,14 @@ impl GraphFile {
                 absent.display()
             )));
         }
+        let pin = |p: &PathBuf| {
+            let name = p.file_name()?.to_str()?;
+            Some((p.clone(), adapter.sha256.get(name)?.to_ascii_lowercase()))
+        };
+        let own = path.to_path_buf();
         Ok(GraphFile {
-            path: path.to_path_buf(),
+            pinned: std::iter::once(&own).chain(&header.external).filter_map(pin).collect(),
+            path: own,
             binding,
             checkpoint: adapter.checkpoint,
             untrained: adapter.untrained,
@@ -72,9 +81,18 @@ impl GraphFile {
         self.binding.ports.contains_key(role)
     }
 
-    /// Loads it.
+    /// Loads it, if its files are what the adapter pins.
     pub fn load(&self) -> Result<Graph> {
-        let session = Session::load(&self.path).map_err(|e| match e {
+        for (file, wanted) in &self.pinned {
+            let found = fingerprint(file).map_err(Error::io(file))?;
+            if found != *wanted {
+                return Err(Error::missing(format!(
+                    "{}: has sha256 {found}, its adapter pins {wanted}; copy or export it again",
+                    file.display()
+                )));
+            }
+        }
+        let session = Session::load_sized(&self.path, self.bytes()).map_err(|e| match e {
             Error::Missing(text) if text.contains("pset") => Error::missing(format!(
                 "{text}; the file asks for operator set {}: export it with opset_version=17, or install a newer ONNX Runtime",
                 self.opset

@@ -18,6 +18,7 @@ mod multiview;
 pub mod onnx;
 pub mod pairs;
 pub mod prepare;
+pub mod provider;
 mod registry;
 mod runtime;
 pub mod sam;
@@ -31,7 +32,7 @@ pub mod words;
 pub mod xfeat;
 
 pub use registry::{ModelStatus, Registry, Role, home};
-pub use runtime::{Input, Session, Tensor, runtime, runtime_build};
+pub use runtime::{Input, Session, Tensor, runtime};
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 

@@ -4,10 +4,12 @@ use std::sync::OnceLock;
 
 use ort::environment::Environment;
 use ort::logging::LogLevel;
-use ort::session::{SessionInputValue, builder::GraphOptimizationLevel};
+use ort::session::SessionInputValue;
+use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use ort::value::{Tensor as OrtTensor, TensorElementType};
 
 use super::contract::reorder;
+use super::provider::{self, Provider};
 use super::registry::home;
 use crate::{Error, Result};
 
@@ -27,13 +29,7 @@ pub fn runtime() -> Result<PathBuf> {
     Ok(loaded()?.0.clone())
 }
 
-/// What the library in use says about its own build (version, commit, flags).
-pub fn runtime_build() -> Result<&'static str> {
-    loaded()?;
-    Ok(ort::info())
-}
-
-fn loaded() -> Result<&'static (PathBuf, Environment)> {
+pub(super) fn loaded() -> Result<&'static (PathBuf, Environment)> {
     LOADED.get_or_init(load).as_ref().map_err(|e| Error::missing(e.as_str()))
 }
 
@@ -136,17 +132,56 @@ impl Input {
 pub struct Session {
     inner: ort::session::Session,
     file: PathBuf,
+    /// After `inner`, whose memory it hands back: fields are dropped in order.
+    _memory: Option<HandBack>,
+}
+
+/// Makes glibc return freed memory to the system when dropped. It keeps what it can: a loaded network would occupy twice its
+/// weights, a dropped one still once.
+struct HandBack;
+
+impl Drop for HandBack {
+    fn drop(&mut self) {
+        #[cfg(all(target_os = "linux", target_env = "gnu"))]
+        // SAFETY: no argument has requirements; it locks what it touches.
+        unsafe {
+            libc::malloc_trim(0);
+        }
+    }
 }
 
 impl Session {
-    /// Loads a graph; it computes on as many threads as the machine has cores.
+    /// Loads a graph for the chosen provider; on the CPU it computes on as many threads as there are cores.
     pub fn load(file: &Path) -> Result<Self> {
+        let bytes = file.metadata().map_or(0, |m| m.len());
+        Session::load_sized(file, bytes)
+    }
+
+    /// [`Session::load`] of a graph whose weights may lie in other files: `bytes` counts them all.
+    pub(super) fn load_sized(file: &Path, bytes: u64) -> Result<Self> {
         let environment = &loaded()?.1;
-        let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        let inner = build(environment, file, threads).map_err(|e| {
+        let large = bytes >= LARGE;
+        let build = |provider| settings(environment, provider, large)?.commit_from_file(file);
+        let provider = provider::chosen()?;
+        let built = match build(provider) {
+            Err(e) if provider.is_some() && provider::replaceable() => {
+                let name = provider::name().unwrap_or_default();
+                provider::note(format!(
+                    "{}: not on {name} ({}); the CPU computes it",
+                    file.display(),
+                    line(&e)
+                ));
+                build(None)
+            }
+            built => built,
+        };
+        let inner = built.map_err(|e| {
             Error::missing(format!("{}: ONNX Runtime cannot load it: {}", file.display(), line(&e)))
         })?;
-        Ok(Session { inner, file: file.to_path_buf() })
+        if large {
+            drop(HandBack);
+        }
+        Ok(Session { inner, file: file.to_path_buf(), _memory: large.then(|| HandBack) })
     }
 
     /// Runs the graph once and returns the named outputs as 32-bit floats.
@@ -198,18 +233,41 @@ fn floats(value: &ort::value::DynValue) -> ort::Result<Tensor> {
 /// Files from this size on, bytes, are networks whose memory counts for more than the time of allocating it.
 const LARGE: u64 = 200 << 20;
 
-fn build(environment: &Environment, file: &Path, threads: usize) -> ort::Result<ort::session::Session> {
-    let mut builder = ort::session::Session::builder(environment)?
+fn settings(
+    environment: &Environment,
+    provider: Option<&Provider>,
+    large: bool,
+) -> ort::Result<SessionBuilder> {
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let builder = ort::session::Session::builder(environment)?
         .with_optimization_level(GraphOptimizationLevel::Level3)?
         .with_intra_threads(threads)?;
-    if file.metadata().is_ok_and(|m| m.len() >= LARGE) {
+    let mut providers: Vec<_> = provider.iter().map(|p| p.registration()).collect();
+    if large {
         // The arena doubles what it takes and keeps it until the session ends.
-        let plain = ort::ep::CPU::default().with_arena_allocator(false).build();
-        builder = builder.with_memory_pattern(false)?.with_execution_providers([plain])?;
+        providers.push(ort::ep::CPU::default().with_arena_allocator(false).build());
     }
-    builder.commit_from_file(file)
+    // DirectML refuses memory patterns, too.
+    Ok(builder.with_memory_pattern(!large && provider.is_none())?.with_execution_providers(providers)?)
 }
 
-fn line(error: &ort::Error) -> String {
+/// y = Relu(x) of one float, as an ONNX file: a sequence of (field and kind, length, content).
+const PROBE: &[u8] = b"\x08\x08\x3a\x33\
+    \x0a\x0c\x0a\x01x\x12\x01y\x22\x04Relu\x12\x01g\
+    \x5a\x0f\x0a\x01x\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01\
+    \x62\x0f\x0a\x01y\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01\
+    \x42\x04\x0a\x00\x10\x11";
+
+/// Computes a graph of one node: a library may list a provider, and even register it, on a machine without its device.
+pub(super) fn probe(environment: &Environment, provider: Option<&Provider>) -> ort::Result<()> {
+    let mut session = settings(environment, provider, false)?.commit_from_memory(PROBE)?;
+    let computed = session.run(ort::inputs!["x" => OrtTensor::from_array(([1usize], vec![2f32]))?])?;
+    match computed["y"].try_extract_tensor::<f32>()?.1 {
+        [2.0] => Ok(()),
+        other => Err(ort::Error::new(format!("it computes max(2, 0) = {other:?}"))),
+    }
+}
+
+pub(super) fn line(error: &ort::Error) -> String {
     error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
 }

@@ -5,6 +5,7 @@ use super::clip::Clip;
 use super::contract::Part;
 use super::graph::GraphFile;
 use super::installed::{Duty, inventory, known};
+use super::registry::sha256;
 use super::testing::{Attribute, FLOAT, INT64, Onnx};
 use super::{Input, RegionEncoder, Registry, cache, pairs, warp};
 use crate::photo::{Affine, Frame, Photo};
@@ -197,6 +198,14 @@ fn bad_files_are_named_with_the_mend() {
         .node("Mul", "mean zero", "nothing", &[])
         .node("Div", "nothing zero", "image_embeds", &[]);
     let error = refused(&nan, &[]);
+    assert!(error.contains("image_embeds holds NaN"), "{error}");
+
+    let adapter = |hash: &str| format!("family = \"clip\"\n[sha256]\n\"graph.onnx\" = \"{hash}\"\n");
+    let error = refused(&image_tower(), &[("adapter.toml", &adapter("00ff"))]);
+    let own = sha256(&image_tower().encode());
+    assert!(error.contains(&format!("has sha256 {own}, its adapter pins 00ff")), "{error}");
+    // With its own hash the file loads; the NaN is what is refused then.
+    let error = refused(&nan, &[("adapter.toml", &adapter(&sha256(&nan.encode())))]);
     assert!(error.contains("image_embeds holds NaN"), "{error}");
 
     let split = image_tower().external("far", &[4], "weights.bin");

@@ -18,7 +18,7 @@ use crate::fit::{self, LanguageOptions, Preset, RgbOptions};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras};
 use crate::gpu::{self, Device};
-use crate::infer::Registry;
+use crate::infer::{Registry, provider};
 use crate::language;
 use crate::language::sam::SamOptions;
 use crate::photo::{self, Photo};
@@ -259,6 +259,7 @@ pub fn save(outcome: &mut Outcome, out: &Path, force: bool, progress: &dyn Progr
 fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded) -> Result<Outcome> {
     let registry = Registry::open(plan.models.as_deref())?;
     // Whatever can be refused is read before the long work, not after it.
+    provider::report(progress)?;
     let networks = Networks::of(plan, &registry)?;
     networks.warn_untrained(progress);
     let init = match &plan.init {
@@ -309,6 +310,7 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
         language_options(plan, preset),
         progress,
     )?;
+    provider::report(progress)?;
 
     progress.begin("query", 1);
     let frames = view::decode_all(device, &spoken.splats, &spoken.field, &trained.cameras)?;

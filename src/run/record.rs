@@ -2,6 +2,7 @@
 use super::{Answers, Outcome};
 use crate::Result;
 use crate::fit::{CurvePoint, FitStats, LanguagePoint};
+use crate::infer::provider;
 use crate::report::viewer::Scene3d;
 use crate::report::{self, AnswerShown, Curve, ModelUsed, QueryShown, Report, RunRecord, ViewShown};
 use crate::scene::LEVEL_NAMES;
@@ -13,7 +14,7 @@ pub fn run_record(o: &Outcome) -> RunRecord {
     let used = |m: &&crate::infer::ModelStatus| m.installed;
     RunRecord {
         program: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
-        config: json!({ "plan": o.plan, "preset": o.preset }),
+        config: json!({ "plan": o.plan, "preset": o.preset, "provider": provider::name().ok() }),
         seed: o.plan.seed,
         device: o.device.name.clone(),
         device_is_cpu: o.device.is_cpu,

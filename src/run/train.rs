@@ -3,7 +3,7 @@ use crate::fit::{self, Preset, RgbOptions};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras, colmap, ply};
 use crate::gpu::{self, Device};
-use crate::infer::Registry;
+use crate::infer::{Registry, provider};
 use crate::photo::{self, Photo};
 use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, InitChoice};
@@ -154,7 +154,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let curves = super::record::curves(&trained.stats, &[]);
     let record = RunRecord {
         program: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
-        config: json!({ "plan": plan, "preset": preset }),
+        config: json!({ "plan": plan, "preset": preset, "provider": provider::name().ok() }),
         seed: plan.seed,
         device: device.info().name.clone(),
         device_is_cpu: device.info().is_cpu,

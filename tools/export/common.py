@@ -1,7 +1,7 @@
 """What every export script does: write the graph, its adapter and a reference, and compare ONNX Runtime with PyTorch.
 
     NAME.onnx              the graph, opset 17
-    adapter.toml           family, checkpoint (hash of the weights), untrained = true for --random
+    adapter.toml           family, checkpoint (hash of the weights), untrained = true for --random, sha256 of the files
     NAME.reference.npz     one input and PyTorch's answer, which `splatvk models check` repeats through its own loader
 """
 import argparse
@@ -46,6 +46,10 @@ def adapter(args, family, weights, text=""):
     lines = ['family = "%s"' % family, 'checkpoint = "%s"' % weights]
     if args.random is not None:
         lines.append("untrained = true")
+    lines.append("[sha256]")
+    for file in sorted(args.out.glob("*.onnx*")):
+        with file.open("rb") as f:
+            lines.append('"%s" = "%s"' % (file.name, hashlib.file_digest(f, "sha256").hexdigest()))
     (args.out / "adapter.toml").write_text("\n".join(lines) + "\n" + text)
 
 

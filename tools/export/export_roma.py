@@ -51,11 +51,13 @@ def local_correlation(f0, f1, radius, warp, **_):
     _, c, h, w = f0.shape
     n = 2 * radius + 1
     step = lambda size: torch.linspace(-2 * radius / size, 2 * radius / size, n)
-    rows, columns = torch.meshgrid(step(h), step(w), indexing="ij")
-    window = torch.stack([columns, rows], dim=-1).reshape(1, 1, 1, n * n, 2)
-    at = (warp.permute(0, 2, 3, 1)[:, :, :, None] + window).reshape(1, h, w * n * n, 2)
-    seen = F.grid_sample(f1, at, align_corners=False).reshape(c, h, w, n * n)
-    return (f0[0, ..., None] / c ** 0.5 * seen).sum(dim=0).permute(2, 0, 1)[None]
+    centre, found = warp.permute(0, 2, 3, 1)[:, :, :, None], []
+    for row in step(h):
+        # Row by row of the window: what is seen through a whole one takes 700 MB, twice.
+        window = torch.stack([step(w), row.expand(n)], dim=-1).reshape(1, 1, 1, n, 2)
+        seen = F.grid_sample(f1, (centre + window).reshape(1, h, w * n, 2), align_corners=False).reshape(c, h, w, n)
+        found.append((f0[0, ..., None] / c ** 0.5 * seen).sum(dim=0))
+    return torch.cat(found, dim=-1).permute(2, 0, 1)[None]
 
 
 class Warp(torch.nn.Module):

@@ -4,10 +4,32 @@ onnxruntime segment-anything, and a checkpoint from https://github.com/facebookr
 
     python tools/export/export_sam.py --model vit_b --checkpoint sam_vit_b_01ec64.pth --out ~/.local/share/splatvk/models/sam_vit_b
 """
-import segment_anything
 import torch
 
 import common
+
+
+class Attention(torch.nn.Module):
+    """Attention over the whole picture, head by head: the 4096 × 4096 weights of all heads at once take 800 MB, several times over."""
+
+    def __init__(self, original):
+        super().__init__()
+        self.original = original
+
+    def forward(self, x):
+        o, (b, rows, columns, c) = self.original, x.shape
+        q, k, v = o.qkv(x).reshape(b, rows * columns, 3, o.num_heads, c // o.num_heads).permute(2, 3, 0, 1, 4)
+        # [place, channel, other place]: what a query says to a key that is so many rows or columns away
+        away = lambda n, table: table[torch.arange(n)[:, None] - torch.arange(n) + n - 1].transpose(1, 2)
+        by_row, by_column = away(rows, o.rel_pos_h), away(columns, o.rel_pos_w)
+        heads = []
+        for h in range(o.num_heads):
+            at = q[h].reshape(b, rows, columns, -1)
+            down = (at @ by_row)[..., None]
+            across = (at.transpose(1, 2) @ by_column).transpose(1, 2)[..., None, :]
+            weights = (o.scale * q[h] @ k[h].transpose(1, 2)).reshape(b, rows, columns, rows, columns) + down + across
+            heads.append(weights.reshape(b, rows * columns, -1).softmax(dim=-1) @ v[h])
+        return o.proj(torch.cat(heads, dim=-1).reshape(b, rows, columns, c))
 
 
 class Decoder(torch.nn.Module):
@@ -43,28 +65,33 @@ class Decoder(torch.nn.Module):
         return masks, d.iou_prediction_head(hidden[:, 0])
 
 
-def main():
-    args = common.arguments(__doc__, model={"default": "vit_b", "choices": ["vit_b", "vit_l", "vit_h"]}, checkpoint={})
-    if args.random is None and not args.checkpoint:
-        raise SystemExit("give --checkpoint FILE, or --random SEED")
-    sam = segment_anything.sam_model_registry[args.model](checkpoint=None if args.random is not None else args.checkpoint).eval()
-    if args.random is not None:
-        with torch.no_grad():
-            # Untrained, hardly any mask would pass the filters and what follows would have nothing to do: the predicted
-            # IoU is lifted over its threshold and logits spread as far as trained ones, so that the work is the real one.
-            sam.mask_decoder.iou_prediction_head.layers[-1].bias.fill_(0.9)
-            for mlp in sam.mask_decoder.output_hypernetworks_mlps:
-                mlp.layers[-1].weight.mul_(480)
-                mlp.layers[-1].bias.mul_(8)
-            for p in sam.image_encoder.parameters():
-                if not p.abs().any():
-                    p.normal_(std=0.02)  # position tables start at zero, which would prove nothing
+def untrained(sam):
+    with torch.no_grad():
+        # Untrained, hardly any mask would pass the filters and what follows would have nothing to do: the predicted
+        # IoU is lifted over its threshold and logits spread as far as trained ones, so that the work is the real one.
+        sam.mask_decoder.iou_prediction_head.layers[-1].bias.fill_(0.9)
+        for mlp in sam.mask_decoder.output_hypernetworks_mlps:
+            mlp.layers[-1].weight.mul_(480)
+            mlp.layers[-1].bias.mul_(8)
+        for p in sam.image_encoder.parameters():
+            if not p.abs().any():
+                p.normal_(std=0.02)  # position tables start at zero, which would prove nothing
+
+
+def export(args, sam):
+    """Writes both graphs of `sam`, a segment_anything Sam or one of a package that copies it."""
     weights = common.checkpoint(sam.mask_decoder, sam.prompt_encoder)
-    print("SAM %s: %d weights" % (args.model, sum(p.numel() for p in sam.parameters())))
     image = common.photo((1024, 768))[0]
     image = common.normalise(image, [0.485, 0.456, 0.406], [0.229, 0.224, 0.225])
     image = torch.nn.functional.pad(image, (0, 0, 0, 256))
+    with torch.no_grad():
+        wanted = sam.image_encoder(image).numpy()
+    for block in getattr(sam.image_encoder, "blocks", []):
+        if block.window_size == 0:
+            block.attn = Attention(block.attn)
     embedding = common.graph(args, "encoder", sam.image_encoder, {"image": image}, ["image_embeddings"])[0]
+    error = abs(embedding - wanted).max() / abs(wanted).max()
+    assert error < 1e-4, "image_embeddings differ from the official encoder by %g" % error
     inputs = lambda n: {
         "image_embeddings": torch.from_numpy(embedding),
         "point_coords": torch.cat([torch.rand(n, 1, 2) * torch.tensor([1024.0, 768.0]), torch.zeros(n, 1, 2)], dim=1),
@@ -85,4 +112,17 @@ def main():
     common.adapter(args, "sam", weights)
 
 
-main()
+def main():
+    import segment_anything  # not above: export_mobile_sam.py does without it
+    args = common.arguments(__doc__, model={"default": "vit_b", "choices": ["vit_b", "vit_l", "vit_h"]}, checkpoint={})
+    if args.random is None and not args.checkpoint:
+        raise SystemExit("give --checkpoint FILE, or --random SEED")
+    sam = segment_anything.sam_model_registry[args.model](checkpoint=None if args.random is not None else args.checkpoint).eval()
+    if args.random is not None:
+        untrained(sam)
+    print("SAM %s: %d weights" % (args.model, sum(p.numel() for p in sam.parameters())))
+    export(args, sam)
+
+
+if __name__ == "__main__":
+    main()
