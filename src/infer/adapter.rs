@@ -384,13 +384,7 @@ impl GraphSpec {
         let Some(dims) = &port.dims else {
             return Ok(Some(Bound { name: port.name.clone(), layout: None, dims: None }));
         };
-        let lengths: Vec<Option<usize>> = dims
-            .iter()
-            .map(|d| match d {
-                Dim::Fixed(n) => Some(*n),
-                Dim::Free => None,
-            })
-            .collect();
+        let lengths: Vec<Option<usize>> = dims.iter().map(Dim::length).collect();
         let wanted = self.layouts.get(slot.role);
         let layout = std::iter::once(&slot.shape)
             .chain(slot.layouts)

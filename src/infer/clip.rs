@@ -51,8 +51,14 @@ pub struct Clip {
 
 impl Clip {
     /// Checks that the towers belong together; after that they are loaded when first used.
-    pub fn load(model: Installed) -> Result<Clip> {
+    pub fn load(mut model: Installed) -> Result<Clip> {
         let text = model.graph(Part::TextTower)?.clone();
+        if let (Some(dense), Some(dim)) =
+            (model.graphs.get_mut(&Part::DenseFeatures), text.fixed("embedding", "D"))
+        {
+            // A picture of fixed size is as long as it is wide or high: only the texts tell which axis holds the features.
+            dense.settle("features", "D", dim);
+        }
         let (visual, axis) = match model.graph(Part::ImageTower) {
             Ok(tower) => (tower.clone(), "embedding"),
             Err(_) => (model.graph(Part::DenseFeatures)?.clone(), "features"),

@@ -70,9 +70,19 @@ impl GraphFile {
     pub fn fixed(&self, role: &str, axis: &str) -> Option<usize> {
         let bound = self.binding.ports.get(role)?;
         let place = super::contract::axes(bound.layout?).position(|a| a == axis)?;
-        match bound.dims.as_ref()?.get(place)? {
-            Dim::Fixed(n) => Some(*n),
-            Dim::Free => None,
+        bound.dims.as_ref()?.get(place)?.length()
+    }
+
+    /// Of the layouts that an output's lengths allow, takes the first in which `axis` has `length`, if there is one.
+    pub(super) fn settle(&mut self, role: &str, axis: &str, length: usize) {
+        let Some(slot) = self.binding.part.contract().slot(role) else { return };
+        let Some(bound) = self.binding.ports.get_mut(role) else { return };
+        let Some(dims) = &bound.dims else { return };
+        let lengths: Vec<Option<usize>> = dims.iter().map(Dim::length).collect();
+        let has = |layout: &&&'static str| unify(layout, &lengths, &mut vec![(axis, length)]);
+        let own = bound.layout;
+        if let Some(layout) = own.iter().chain(std::iter::once(&slot.shape)).chain(slot.layouts).find(has) {
+            bound.layout = Some(*layout);
         }
     }
 

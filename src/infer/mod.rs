@@ -19,6 +19,8 @@ pub mod onnx;
 pub mod pairs;
 pub mod prepare;
 pub mod provider;
+#[cfg(test)]
+mod public_exports;
 mod registry;
 mod runtime;
 pub mod sam;

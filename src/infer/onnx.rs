@@ -30,6 +30,16 @@ pub enum Dim {
     Free,
 }
 
+impl Dim {
+    /// The length, where the file fixes it.
+    pub fn length(&self) -> Option<usize> {
+        match self {
+            Dim::Fixed(n) => Some(*n),
+            Dim::Free => None,
+        }
+    }
+}
+
 /// An input or output of a graph.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Port {

@@ -156,6 +156,7 @@ mod tests {
 
     #[test]
     fn what_the_library_lacks_is_refused_with_what_it_has() {
+        loaded().expect("tools/setup");
         // The default pack's library is a CPU build; a tester's own may not be.
         let absent =
             PROVIDERS.iter().find(|p| !(p.listed)().unwrap_or(false)).expect("no build has them all");
