@@ -15,6 +15,8 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
         }
         Err(error) => line("ONNX Runtime", Status::Missing, "not usable".to_owned(), Some(error.to_string())),
     });
+    let notes = infer::provider::notes().unwrap_or_default();
+    lines.extend(notes.into_iter().map(|n| line("ONNX Runtime", Status::Note, n, None)));
     let status = Registry::open(args.device.models.as_deref())?.status();
     for m in &status {
         let found = format!(

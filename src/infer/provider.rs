@@ -114,7 +114,10 @@ fn find(asked: &str) -> Result<Option<&'static Provider>, String> {
 /// What went wrong, without the place in ONNX Runtime's source that precedes it.
 fn reason(error: &ort::Error) -> String {
     let text = line(error);
-    text.rsplit(" was false. ").next().unwrap_or(&text).to_owned()
+    [" was false. ", " FAIL : "]
+        .iter()
+        .fold(text.as_str(), |t, mark| t.rsplit(mark).next().unwrap_or(t))
+        .to_owned()
 }
 
 /// The name of what computes the networks.
@@ -131,11 +134,15 @@ pub(super) fn note(text: String) {
     NOTES.lock().unwrap_or_else(PoisonError::into_inner).push(text);
 }
 
-/// Finds the provider, and tells what did not work since the last call.
-pub fn report(progress: &dyn Progress) -> Result<()> {
+/// Finds the provider, and returns what did not work since the last call, a sentence each.
+pub fn notes() -> Result<Vec<String>> {
     chosen()?;
-    let notes = std::mem::take(&mut *NOTES.lock().unwrap_or_else(PoisonError::into_inner));
-    notes.iter().for_each(|n| progress.warn(n));
+    Ok(std::mem::take(&mut *NOTES.lock().unwrap_or_else(PoisonError::into_inner)))
+}
+
+/// Warns of [`notes`].
+pub fn report(progress: &dyn Progress) -> Result<()> {
+    notes()?.iter().for_each(|n| progress.warn(n));
     Ok(())
 }
 

@@ -8,10 +8,12 @@ import argparse
 import hashlib
 import resource
 import sys
+import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime
 import torch
 
@@ -57,9 +59,17 @@ def graph(args, name, module, inputs, outputs, dynamic=None, reference=None):
     """Exports `module` called with the dict `inputs`, then runs both on `reference` (default: the same inputs)."""
     path = args.out / (name + ".onnx")
     module = module.eval()
-    with torch.no_grad():
-        torch.onnx.export(module, tuple(inputs.values()), str(path), input_names=list(inputs), output_names=outputs,
+    with torch.no_grad(), tempfile.TemporaryDirectory(dir=args.out) as folder:
+        written = Path(folder) / path.name
+        torch.onnx.export(module, tuple(inputs.values()), str(written), input_names=list(inputs), output_names=outputs,
                           dynamic_axes=dynamic or {}, opset_version=OPSET, do_constant_folding=True, dynamo=False)
+        if len(list(Path(folder).iterdir())) == 1:
+            written.replace(path)
+        else:
+            # Beyond protobuf's 2 GB the exporter writes a file per weight; one is easier to carry.
+            beside = path.with_name(path.name + ".data")
+            beside.unlink(missing_ok=True)
+            onnx.save_model(onnx.load(written), path, save_as_external_data=True, location=beside.name)
         inputs = reference or inputs
         began = time.time()
         wanted = module(*inputs.values())
