@@ -113,6 +113,14 @@ fn installed(text: &mut String, m: &Installed) {
             let _ = writeln!(text, "{:10}   sha256 {pinned} pinned for {name}", "");
         }
     }
+    unused(text, m);
+}
+
+/// Graphs beside a whole model, such as CLIP's two towers in one file, do no harm but may be what somebody meant.
+fn unused(text: &mut String, m: &Installed) {
+    for why in &m.unused {
+        let _ = writeln!(text, "{:10}   not used: {why}", "");
+    }
 }
 
 fn of_entry<'f>(k: &Known, found: &'f Inventory) -> Option<&'f Installed> {
@@ -172,6 +180,7 @@ pub fn checked(model: &Installed, steps: Option<&[Measured]>) -> String {
         let memory = s.peak_memory as f64 / 1e9;
         let _ = writeln!(text, "  {:<44} {:8.2} s {memory:6.2} GB{error}", s.step, s.seconds);
     }
+    unused(&mut text, model);
     text
 }
 
@@ -200,7 +209,7 @@ fn installed_json(m: &Installed) -> serde_json::Value {
         })
     };
     json!({
-        "name": m.name, "family": m.family, "duties": m.duties, "folder": m.folder, "untrained": m.untrained(),
+        "name": m.name, "family": m.family, "duties": m.duties, "folder": m.folder, "untrained": m.untrained(), "unused": m.unused,
         "graphs": m.graphs.values().map(graph).collect::<Vec<_>>(),
     })
 }

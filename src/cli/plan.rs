@@ -201,6 +201,7 @@ mod tests {
             duties: vec![duty],
             graphs: Default::default(),
             folder: PathBuf::new(),
+            unused: Vec::new(),
         };
         let models = [
             ("sam_vit_b", Duty::Masks),

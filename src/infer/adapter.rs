@@ -154,9 +154,8 @@ struct GraphSpec {
     /// Roles without which it is another model, although the contract could do without.
     #[serde(default)]
     needs: Vec<String>,
-    /// A mask decoder that adds the padding point to a prompt itself.
-    #[serde(default)]
-    pads: bool,
+    /// A mask decoder that adds the padding point to a prompt itself; most do not.
+    pads: Option<bool>,
     #[serde(skip)]
     family: String,
 }
@@ -321,6 +320,8 @@ impl GraphSpec {
         spec.names.extend(self.names.clone());
         spec.layouts.extend(self.layouts.clone());
         spec.apply.extend(self.apply.clone());
+        spec.needs.extend(self.needs.clone());
+        spec.pads = self.pads.or(spec.pads);
         spec.image = self.image.clone().or(spec.image);
         spec
     }
@@ -353,7 +354,7 @@ impl GraphSpec {
             return Err(Misfit { bound: ports.len(), complaints });
         }
         let (image, apply, family) = (self.image.clone(), self.apply.clone(), self.family.clone());
-        Ok(Binding { part: self.part, family, ports, image, apply, pads: self.pads })
+        Ok(Binding { part: self.part, family, ports, image, apply, pads: self.pads.unwrap_or_default() })
     }
 
     fn bind<'s>(

@@ -103,6 +103,8 @@ pub struct Installed {
     pub graphs: BTreeMap<Part, GraphFile>,
     /// Where it lies.
     pub folder: PathBuf,
+    /// Graphs beside it that it does without, and why each cannot be used.
+    pub unused: Vec<String>,
 }
 
 impl Installed {
@@ -192,16 +194,18 @@ pub fn inventory(registry: &Registry) -> Inventory {
 
 fn group(folder: PathBuf, name: String, files: &[PathBuf], found: &mut Inventory) {
     let mut graphs: BTreeMap<Part, GraphFile> = BTreeMap::new();
+    let mut failed: Vec<(PathBuf, String)> = Vec::new();
     for file in files {
         match GraphFile::recognise(file) {
             // The first of several variants (quantised, half precision): the plain name sorts first.
             Ok(graph) => {
                 graphs.entry(graph.binding.part).or_insert(graph);
             }
-            Err(e) => found.broken.push((file.clone(), e.to_string())),
+            Err(e) => failed.push((file.clone(), e.to_string())),
         }
     }
     if graphs.is_empty() {
+        found.broken.extend(failed);
         return;
     }
     let has = |parts: &&(&[Part], &[Duty])| parts.0.iter().all(|p| graphs.contains_key(p));
@@ -216,6 +220,7 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], found: &mut Inventory
             have.join(", "),
             lacks.join(" or ")
         );
+        found.broken.extend(failed);
         found.broken.push((folder, text));
         return;
     };
@@ -240,7 +245,8 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], found: &mut Inventory
     if used.iter().any(|g| g.has("desc1")) {
         duties.push(Duty::Matcher);
     }
-    let mut model = Installed { name, family, duties, graphs, folder };
+    let unused = failed.into_iter().map(|(_, why)| why).collect();
+    let mut model = Installed { name, family, duties, graphs, folder, unused };
     if let Some(known) = model.known().filter(|k| model.duties.contains(&k.role)) {
         model.family.clone_from(&known.family);
     }

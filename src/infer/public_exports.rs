@@ -90,8 +90,8 @@ fn sam_2_hands_its_fine_features_to_the_decoder_and_fills_the_square() {
         .input("image_embed", FLOAT, "1 3 4 4")
         .input("high_res_feats_0", FLOAT, "1 3 16 16")
         .input("high_res_feats_1", FLOAT, "1 3 8 8")
-        .input("point_coords", FLOAT, "labels points 2")
-        .input("point_labels", FLOAT, "labels points")
+        .input("point_coords", FLOAT, "labels 1 2")
+        .input("point_labels", FLOAT, "labels 1")
         .input("mask_input", FLOAT, "labels 1 16 16")
         .input("has_mask_input", FLOAT, "labels")
         .output("masks", "labels 4 8 8")
@@ -104,6 +104,14 @@ fn sam_2_hands_its_fine_features_to_the_decoder_and_fills_the_square() {
     // Columns 8 and 24 of 32 are 16 and 48 of 64; a photo of the mean colour leaves 7 in the fine features.
     near(&logits, &[123.0, 223.0, 323.0, 155.0, 255.0, 355.0]);
     near(&scores, &[0.2, 0.3, 0.4, 0.2, 0.3, 0.4]);
+
+    // A graph that leaves the padding point to its caller wants two.
+    let adapter = "family = \"sam2\"\n[[graph]]\npart = \"mask-decoder\"\npads = false\n";
+    std::fs::write(dir.path().join("sam2/adapter.toml"), adapter).unwrap();
+    let mut sam = Sam::load(&Registry::of(&[dir.path()]).installed(Duty::Masks, "sam2").unwrap()).unwrap();
+    let encoded = sam.encode(&flat(32, 16, [0.5; 3])).unwrap();
+    let error = sam.decode(&encoded, &[[8.0, 4.0]]).err().unwrap().to_string();
+    assert!(error.contains("point_") && error.contains("Expected: 1"), "{error}");
 }
 
 #[test]

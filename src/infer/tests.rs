@@ -105,6 +105,28 @@ fn towers_are_recognised_by_their_tensors_and_proven_to_belong_together() {
     assert_eq!(strangers.exit_code(), 2);
 }
 
+/// Folders from a hub hold both towers in one graph beside the two, and variants whose download stopped.
+#[test]
+fn a_whole_model_does_without_what_cannot_be_used_beside_it() {
+    let dir = tempfile::tempdir().unwrap();
+    clip_in(dir.path(), [0, 1, 2]);
+    let both = image_tower().input("input_ids", INT64, "batch 8").output("logits_per_image", "batch batch");
+    both.write(&dir.path().join("clip_toy/model.onnx"));
+    std::fs::write(dir.path().join("clip_toy/vision_model_fp16.onnx"), "cut").unwrap();
+    let found = inventory(&Registry::of(&[dir.path()]));
+    assert!(found.broken.is_empty() && found.models.len() == 1, "{:?}", found.broken);
+    let unused = &found.models[0].unused;
+    assert_eq!(unused.len(), 2, "{unused:?}");
+    assert!(
+        unused[0].contains("model.onnx: fits no known model") && unused[1].contains("fp16"),
+        "{unused:?}"
+    );
+    // Without a tower they are all there is, and each says why it is none.
+    std::fs::remove_file(dir.path().join("clip_toy/text_model.onnx")).unwrap();
+    let found = inventory(&Registry::of(&[dir.path()]));
+    assert_eq!((found.models.len(), found.broken.len()), (0, 3), "{:?}", found.broken);
+}
+
 #[test]
 fn towers_of_other_widths_or_checkpoints_are_refused() {
     let _uncached = cache::off();

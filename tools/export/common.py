@@ -55,6 +55,12 @@ def adapter(args, family, weights, text=""):
     (args.out / "adapter.toml").write_text("\n".join(lines) + "\n" + text)
 
 
+def session(path):
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
 def graph(args, name, module, inputs, outputs, dynamic=None, reference=None):
     """Exports `module` called with the dict `inputs`, then runs both on `reference` (default: the same inputs)."""
     path = args.out / (name + ".onnx")
@@ -70,17 +76,16 @@ def graph(args, name, module, inputs, outputs, dynamic=None, reference=None):
             beside = path.with_name(path.name + ".data")
             beside.unlink(missing_ok=True)
             onnx.save_model(onnx.load(written), path, save_as_external_data=True, location=beside.name)
+            beside.chmod(path.stat().st_mode)
         inputs = reference or inputs
         began = time.time()
         wanted = module(*inputs.values())
         torch_seconds = time.time() - began
     wanted = [w.detach().numpy() for w in (wanted if isinstance(wanted, (tuple, list)) else [wanted])]
     fed = {k: v.numpy() for k, v in inputs.items()}
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    running = session(path)
     began = time.time()
-    given = session.run(outputs, {k: v for k, v in fed.items() if k in {i.name for i in session.get_inputs()}})
+    given = running.run(outputs, {k: v for k, v in fed.items() if k in {i.name for i in running.get_inputs()}})
     seconds = time.time() - began
     worst = 0.0
     for output, a, b in zip(outputs, given, wanted):
@@ -100,12 +105,12 @@ def graph(args, name, module, inputs, outputs, dynamic=None, reference=None):
     return wanted
 
 
-def photo(size):
-    """[1, 3, H, W] in [0, 1]: a real photo of the repository's test scene, stretched to (width, height)."""
+def photo(size, count=2):
+    """`count` of [1, 3, H, W] in [0, 1]: real photos of the repository's test scene, at most 4, stretched to (width, height)."""
     from PIL import Image
     folder = Path(__file__).resolve().parents[2] / "tests/data/breakfast/images"
     return [torch.from_numpy(np.asarray(Image.open(p).convert("RGB").resize(size, Image.BICUBIC)).astype(np.float32) / 255)
-            .permute(2, 0, 1)[None].contiguous() for p in sorted(folder.iterdir())[:2]]
+            .permute(2, 0, 1)[None].contiguous() for p in sorted(folder.iterdir())[:count]]
 
 
 def normalise(image, mean, std):
