@@ -63,7 +63,7 @@ pub(super) fn decoded(
     }
     progress.end();
     if !model.untrained() {
-        plausible(model, &pairs)?;
+        plausible(model, &prepared, &pairs)?;
     }
     drop(network);
     Ok((prepared, pairs))
@@ -248,29 +248,140 @@ fn unpack(values: &[f32], size: [&Prepared; 2]) -> Option<Decoded> {
     rest.is_empty().then_some(Decoded { maps: [a, b], descriptors: [da, db] })
 }
 
-/// Refuses output that a trained network cannot give: most often an activation that the export left out.
-fn plausible(model: &Installed, pairs: &[PairPointmaps]) -> Result<()> {
-    let wrong = |what: &str| {
-        Error::missing(format!(
-            "{}: model {}: {what}; either two outputs are swapped or the export left an activation to the program: say \
-             apply.points = \"expm1-norm\" and apply.conf = \"one-plus-exp\" in its adapter (docs/models.md)",
-            model.folder.display(),
-            model.name
-        ))
+/// Refuses output that a trained network cannot give: an activation that the export left out, or outputs in the wrong order.
+fn plausible(model: &Installed, prepared: &[Prepared], pairs: &[PairPointmaps]) -> Result<()> {
+    let wrong = |what: &str, mend: &str| {
+        Error::missing(format!("{}: model {}: {what}; {mend}", model.folder.display(), model.name))
     };
+    let raw = "either two outputs are swapped or the export left an activation to the program: say apply.points = \
+               \"expm1-norm\" and apply.conf = \"one-plus-exp\" in its adapter (docs/models.md)";
+    let (mut judged, mut crossed) = (0, 0);
     for pair in pairs {
         for map in [&pair.x11, &pair.x21, &pair.x22, &pair.x12] {
             // 1 + e^x rounds to 1 at least.
             if map.confidence.iter().any(|c| *c < 0.999) {
-                return Err(wrong("a confidence is below 1"));
+                return Err(wrong("a confidence is below 1", raw));
             }
         }
-        for map in [&pair.x11, &pair.x22] {
-            let ahead = map.points.iter().filter(|p| p[2] > 0.0).count();
-            if 2 * ahead < map.points.len() {
-                return Err(wrong("most points lie behind the camera that sees them"));
+        let (first, second) = (&prepared[pair.first], &prepared[pair.second]);
+        for (own, other, ready) in [(&pair.x11, &pair.x21, first), (&pair.x22, &pair.x12, second)] {
+            let ahead = own.points.iter().filter(|p| p[2] > 0.0).count();
+            if 2 * ahead < own.points.len() {
+                return Err(wrong("most points lie behind the camera that sees them", raw));
+            }
+            if own.points.len() == other.points.len() {
+                // Seen from the first camera, only the first view's points lie on the rays of its pixels.
+                let [a, b] = [own, other].map(|m| off_the_rays(m, ready.width, ready.height));
+                judged += 1;
+                crossed += usize::from(b < 0.05 && a > 2.0 * b);
             }
         }
     }
+    if 2 * crossed > judged {
+        let mend = "swap names.points1 with names.points2 in its adapter, and with them conf and desc (docs/models.md)";
+        return Err(wrong(
+            "the second view's points lie on the first view's rays, so the two are swapped",
+            mend,
+        ));
+    }
     Ok(())
+}
+
+/// How far points project from their own pixels with the focal length that suits them best: median, in widths of the picture.
+fn off_the_rays(map: &Pointmap, width: usize, height: usize) -> f64 {
+    let centre = [0.5 * width as f64, 0.5 * height as f64];
+    // (slopes of the point's ray, pixel from the centre)
+    let rays: Vec<([f64; 2], [f64; 2])> = map
+        .points
+        .iter()
+        .enumerate()
+        .filter(|(_, p)| p[2] > 0.0)
+        .map(|(k, p)| {
+            let pixel = [(k % width) as f64 + 0.5 - centre[0], (k / width) as f64 + 0.5 - centre[1]];
+            ([0, 1].map(|c| f64::from(p[c] / p[2])), pixel)
+        })
+        .collect();
+    let dot = |a: [f64; 2], b: [f64; 2]| a[0] * b[0] + a[1] * b[1];
+    let Some(focal) = median(rays.iter().map(|(s, p)| dot(*s, *p) / dot(*s, *s)).collect()) else {
+        return f64::INFINITY;
+    };
+    let apart = |(s, p): &([f64; 2], [f64; 2])| (focal * s[0] - p[0]).hypot(focal * s[1] - p[1]);
+    median(rays.iter().map(apart).collect()).unwrap_or(f64::INFINITY) / width as f64
+}
+
+/// The middle of what is finite.
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.retain(|v| v.is_finite());
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::cache::off;
+    use super::super::installed::Duty;
+    use super::super::testing::{Attribute, FLOAT, Onnx};
+    use super::super::tests::photo;
+    use super::super::{Registry, breakfast};
+    use super::*;
+    use crate::progress::Silent;
+    use crate::scene::{Camera, Pose, RgbImage};
+
+    /// The true pointmaps of two breakfast views from one graph, which knows them by the brightness of its first input.
+    #[test]
+    fn swapped_pointmaps_are_seen_by_the_rays_they_lie_on() {
+        let _uncached = off();
+        let views = breakfast::train_views();
+        let (w, h) = (64usize, 48);
+        // View k in the camera of view c, every tenth pixel.
+        let points = |k: usize, c: usize| -> Vec<f32> {
+            let to = views[c].camera.pose.compose(&views[k].camera.pose.inverse());
+            let at = |p: usize| {
+                let (x, y) = (10 * (p % w) + 5, 10 * (p / w) + 5);
+                let camera = Camera { pose: Pose::IDENTITY, ..views[k].camera.clone() };
+                let pixel = glam::DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
+                to.transform(camera.unproject(pixel, f64::from(views[k].depth.at(x, y)))).as_vec3().to_array()
+            };
+            (0..w * h).flat_map(at).collect()
+        };
+        let dims = [1, h as u64, w as u64, 3];
+        let [own, other] = [[points(0, 0), points(1, 1)], [points(1, 0), points(0, 1)]];
+        let graph = |first: &str, second: &str| {
+            let mut graph = Onnx::new().input("img1", FLOAT, "1 3 48 64").input("img2", FLOAT, "1 3 48 64");
+            for (name, [dark, light]) in [("own", &own), ("other", &other)] {
+                let step: Vec<f32> = light.iter().zip(dark).map(|(b, a)| b - a).collect();
+                graph = graph.weight(&format!("{name}_0"), &dims, dark).weight(
+                    &format!("{name}_step"),
+                    &dims,
+                    &step,
+                );
+            }
+            graph = graph.node("ReduceMean", "img1", "light", &[("keepdims", Attribute::Int(1))]);
+            for (name, port) in [("own", first), ("other", second)] {
+                graph = graph
+                    .output(port, "1 48 64 3")
+                    .node("Mul", &format!("{name}_step light"), &format!("{name}_more"), &[])
+                    .node("Add", &format!("{name}_0 {name}_more"), port, &[]);
+            }
+            for k in ["conf_1", "conf_2"] {
+                graph = graph
+                    .output(k, "1 48 64")
+                    .weight(&format!("sure_{k}"), &[1, h as u64, w as u64], &vec![2.0; w * h])
+                    .node("Identity", &format!("sure_{k}"), k, &[]);
+            }
+            graph
+        };
+        // 0 and 1 after the network's normalisation to [−1, 1].
+        let plain = |v: f32| RgbImage { width: 640, height: 480, data: vec![[v; 3]; 640 * 480] };
+        let photos = [photo("dark", plain(0.5)), photo("light", plain(1.0))];
+        let dir = tempfile::tempdir().unwrap();
+        let ask = |first: &str, second: &str| {
+            graph(first, second).write(&dir.path().join("dust3r/model.onnx"));
+            let model = Registry::of(&[dir.path()]).installed(Duty::Geometry, "dust3r").unwrap();
+            pointmaps(&model, &photos, &Silent).map(drop)
+        };
+        ask("pts3d_1", "pts3d_2").unwrap();
+        let error = ask("pts3d_2", "pts3d_1").unwrap_err().to_string();
+        assert!(error.contains("swap names.points1 with names.points2"), "{error}");
+    }
 }

@@ -36,33 +36,37 @@ class Decoder(torch.nn.Module):
     """Points in, low-resolution logits and predicted IoU out, one row per prompt: splatvk upsamples by itself, so that no
     full-size mask ever leaves the graph."""
 
-    def __init__(self, sam):
+    def __init__(self, prompt, decoder):
         super().__init__()
-        self.prompt, self.decoder, self.size = sam.prompt_encoder, sam.mask_decoder, float(sam.image_encoder.img_size)
-        self.register_buffer("position", sam.prompt_encoder.get_dense_pe())
+        self.prompt, self.decoder = prompt, decoder
+        self.register_buffer("position", prompt.get_dense_pe())
 
     def points(self, coords, labels):
         encoder = self.prompt
-        at = encoder.pe_layer._pe_encoding((coords + 0.5) / self.size)
+        at = encoder.pe_layer._pe_encoding((coords + 0.5) / float(encoder.input_image_size[0]))
         labels = labels.unsqueeze(-1)
         at = at * (labels != -1).to(at.dtype) + encoder.not_a_point_embed.weight * (labels == -1).to(at.dtype)
         for k, embedding in enumerate(encoder.point_embeddings):
             at = at + embedding.weight * (labels == k).to(at.dtype)
         return at
 
-    def forward(self, image_embeddings, point_coords, point_labels):
-        d, sparse = self.decoder, self.points(point_coords, point_labels)
-        prompts = sparse.shape[0]
-        out = torch.cat([d.iou_token.weight, d.mask_tokens.weight], dim=0)
+    def masks(self, image, sparse, upscale, first=()):
+        """`first`: tokens before those of masks; `upscale`: [prompts, C, h, w] → [prompts, C / 8, 4 h, 4 w]"""
+        d, prompts = self.decoder, sparse.shape[0]
+        out = torch.cat([*first, d.iou_token.weight, d.mask_tokens.weight], dim=0)
         tokens = torch.cat([out.unsqueeze(0).expand(prompts, -1, -1), sparse], dim=1)
-        source = image_embeddings + self.prompt.no_mask_embed.weight.reshape(1, -1, 1, 1)
+        source = image + self.prompt.no_mask_embed.weight.reshape(1, -1, 1, 1)
         source = source.expand(prompts, -1, -1, -1)
         hidden, source_out = d.transformer(source, self.position.expand(prompts, -1, -1, -1), tokens)
-        _, c, h, w = image_embeddings.shape
-        up = d.output_upscaling(source_out.transpose(1, 2).reshape(prompts, c, h, w))
+        hidden = hidden[:, len(first):]
+        _, c, h, w = image.shape
+        up = upscale(source_out.transpose(1, 2).reshape(prompts, c, h, w))
         weights = torch.stack([m(hidden[:, 1 + k]) for k, m in enumerate(d.output_hypernetworks_mlps)], dim=1)
         masks = (weights @ up.flatten(2)).reshape(prompts, -1, 4 * h, 4 * w)
         return masks, d.iou_prediction_head(hidden[:, 0])
+
+    def forward(self, image_embeddings, point_coords, point_labels):
+        return self.masks(image_embeddings, self.points(point_coords, point_labels), self.decoder.output_upscaling)
 
 
 def untrained(sam):
@@ -98,11 +102,12 @@ def export(args, sam):
         "point_labels": torch.tensor([[1.0, -1.0]]).repeat(n, 1),
     }
     reference, outputs = inputs(5), ["low_res_masks", "iou_predictions"]
-    masks, scores = common.graph(args, "decoder", Decoder(sam), inputs(3), outputs, {
+    masks, scores = common.graph(args, "decoder", Decoder(sam.prompt_encoder, sam.mask_decoder), inputs(3), outputs, {
         "point_coords": {0: "prompts"}, "point_labels": {0: "prompts"}, "low_res_masks": {0: "prompts"}, "iou_predictions": {0: "prompts"},
     }, reference)
     with torch.no_grad():
-        sparse, dense = sam.prompt_encoder(points=(reference["point_coords"][:, :1], reference["point_labels"][:, :1]), boxes=None, masks=None)
+        lone = reference["point_coords"][:, :1], reference["point_labels"][:, :1]
+        sparse, dense = sam.prompt_encoder(points=lone, boxes=None, masks=None)
         official = sam.mask_decoder.predict_masks(
             image_embeddings=reference["image_embeddings"], image_pe=sam.prompt_encoder.get_dense_pe(),
             sparse_prompt_embeddings=sparse, dense_prompt_embeddings=dense)

@@ -9,6 +9,7 @@ from sam2.build_sam import build_sam2
 from sam2.sam2_image_predictor import SAM2ImagePredictor
 
 import common
+import export_sam
 
 CONFIGURATIONS = {"tiny": "t", "small": "s", "base_plus": "b+", "large": "l"}
 SIZE = (1024, 768)
@@ -33,42 +34,17 @@ class Encoder(torch.nn.Module):
         return coarse + self.no_memory.reshape(1, -1, 1, 1), self.conv_s0(fine), self.conv_s1(middle)
 
 
-class Decoder(torch.nn.Module):
-    """As export_sam.py's, with the finer features added on the way up. It appends the padding point itself, as the built-in adapter
-    expects of SAM 2 decoders."""
-
-    def __init__(self, sam):
-        super().__init__()
-        self.prompt, self.decoder = sam.sam_prompt_encoder, sam.sam_mask_decoder
-        self.register_buffer("position", sam.sam_prompt_encoder.get_dense_pe())
-
-    def points(self, coords, labels):
-        encoder = self.prompt
-        at = encoder.pe_layer._pe_encoding((coords + 0.5) / float(encoder.input_image_size[0]))
-        labels = labels.unsqueeze(-1)
-        padding = encoder.not_a_point_embed.weight
-        at = at * (labels != -1).to(at.dtype) + padding * (labels == -1).to(at.dtype)
-        for k, embedding in enumerate(encoder.point_embeddings):
-            at = at + embedding.weight * (labels == k).to(at.dtype)
-        return torch.cat([at, padding.unsqueeze(0).expand(at.shape[0], -1, -1)], dim=1)
+class Decoder(export_sam.Decoder):
+    """With the finer features added on the way up. It appends the padding point itself, as the built-in adapter expects of SAM 2
+    decoders."""
 
     def forward(self, image_embed, high_res_feats_0, high_res_feats_1, point_coords, point_labels):
         d, sparse = self.decoder, self.points(point_coords, point_labels)
-        prompts = sparse.shape[0]
-        first = [d.obj_score_token.weight] if d.pred_obj_scores else []
-        out = torch.cat([*first, d.iou_token.weight, d.mask_tokens.weight], dim=0)
-        tokens = torch.cat([out.unsqueeze(0).expand(prompts, -1, -1), sparse], dim=1)
-        source = image_embed + self.prompt.no_mask_embed.weight.reshape(1, -1, 1, 1)
-        source = source.expand(prompts, -1, -1, -1)
-        hidden, source_out = d.transformer(source, self.position.expand(prompts, -1, -1, -1), tokens)
-        hidden = hidden[:, len(first):]
-        _, c, h, w = image_embed.shape
+        padding = self.prompt.not_a_point_embed.weight.unsqueeze(0).expand(sparse.shape[0], -1, -1)
         up_1, norm, gelu_1, up_0, gelu_0 = d.output_upscaling
-        up = gelu_1(norm(up_1(source_out.transpose(1, 2).reshape(prompts, c, h, w)) + high_res_feats_1))
-        up = gelu_0(up_0(up) + high_res_feats_0)
-        weights = torch.stack([m(hidden[:, 1 + k]) for k, m in enumerate(d.output_hypernetworks_mlps)], dim=1)
-        masks = (weights @ up.flatten(2)).reshape(prompts, -1, 4 * h, 4 * w)
-        return masks, d.iou_prediction_head(hidden[:, 0])
+        upscale = lambda x: gelu_0(up_0(gelu_1(norm(up_1(x) + high_res_feats_1))) + high_res_feats_0)
+        first = [d.obj_score_token.weight] if d.pred_obj_scores else []
+        return self.masks(image_embed, torch.cat([sparse, padding], dim=1), upscale, first)
 
 
 def untrained(sam):
@@ -107,7 +83,7 @@ def main():
     photo = common.photo(SIZE)[0][0].permute(1, 2, 0).mul(255).round().byte().numpy()
     predictor = SAM2ImagePredictor(sam)
     predictor.set_image(photo)
-    encoder, decoder = Encoder(sam), Decoder(sam)
+    encoder, decoder = Encoder(sam), Decoder(sam.sam_prompt_encoder, sam.sam_mask_decoder)
     weights = common.checkpoint(decoder)
     used = {id(p): p.numel() for m in (encoder, decoder) for p in m.parameters()}
     print("SAM 2.1 %s: %d weights for images" % (args.model, sum(used.values())))
