@@ -8,6 +8,7 @@ use super::installed::Installed;
 use super::prepare::{Prepared, prepare};
 use super::runtime::{Input, Tensor};
 use crate::photo::Photo;
+use crate::pose::numeric::median;
 use crate::pose::pointmap::{Descriptors, ModelView, PairPointmaps, Pointmap};
 use crate::progress::Progress;
 use crate::{Error, Result};
@@ -302,18 +303,13 @@ fn off_the_rays(map: &Pointmap, width: usize, height: usize) -> f64 {
         })
         .collect();
     let dot = |a: [f64; 2], b: [f64; 2]| a[0] * b[0] + a[1] * b[1];
-    let Some(focal) = median(rays.iter().map(|(s, p)| dot(*s, *p) / dot(*s, *s)).collect()) else {
-        return f64::INFINITY;
-    };
+    // The ray along the axis says nothing about it.
+    let mut ratios: Vec<f64> = rays.iter().map(|(s, p)| dot(*s, *p) / dot(*s, *s)).collect();
+    ratios.retain(|r| r.is_finite());
+    let Some(focal) = median(&mut ratios) else { return f64::INFINITY };
     let apart = |(s, p): &([f64; 2], [f64; 2])| (focal * s[0] - p[0]).hypot(focal * s[1] - p[1]);
-    median(rays.iter().map(apart).collect()).unwrap_or(f64::INFINITY) / width as f64
-}
-
-/// The middle of what is finite.
-fn median(mut values: Vec<f64>) -> Option<f64> {
-    values.retain(|v| v.is_finite());
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+    let mut distances: Vec<f64> = rays.iter().map(apart).collect();
+    median(&mut distances).unwrap_or(f64::INFINITY) / width as f64
 }
 
 #[cfg(test)]

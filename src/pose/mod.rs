@@ -4,7 +4,7 @@ mod bundle;
 mod initialise;
 pub mod matching;
 mod minimal;
-mod numeric;
+pub(crate) mod numeric;
 pub mod pointmap;
 mod resect;
 pub mod sfm;
