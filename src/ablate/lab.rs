@@ -181,9 +181,9 @@ impl<'a> Lab<'a> {
                 InitChoice::Cameras(frames.iter().map(named).collect())
             }
         };
-        let geometry = pose::initialise(
+        let (photos, geometry) = pose::initialise(
             &self.device,
-            &photos,
+            photos,
             &choice,
             &self.registry,
             &StereoOptions::preset(Preset::Draft),

@@ -11,11 +11,8 @@ use crate::scene::Camera;
 use crate::{Error, Result};
 
 /// Where cameras and points come from.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub enum InitChoice {
-    /// The best that is available: `Sfm`.
-    #[default]
-    Auto,
     /// Structure from motion over the photos; needs no large model.
     Sfm,
     /// Known cameras, joined to the photos by file name without extension; any resolution of the same aspect.
@@ -27,21 +24,24 @@ pub enum InitChoice {
 /// Above this σ of ln f the depth of the scene is guessed more than measured: say so.
 const UNSURE_FOCAL: f64 = 0.05;
 
-/// Photos to cameras, depth maps and points (ALGORITHMS 2.6).
-pub fn initialise(
-    device: &Device,
-    photos: &[Photo],
-    choice: &InitChoice,
+/// Photos whose cameras are known, as every later stage sees them.
+pub struct Placed {
+    /// The photos, ready for dense stages.
+    pub photos: Vec<Photo>,
+    /// Their cameras and sparse points.
+    pub model: SparseModel,
+    /// Where the cameras come from, for run.json.
+    pub method: String,
+}
+
+/// Cameras of the photos, from the photos themselves (`cameras` = None) or as given.
+pub fn place(
+    photos: Vec<Photo>,
+    cameras: Option<&[Camera]>,
     registry: &Registry,
-    stereo: &StereoOptions,
     progress: &dyn Progress,
-) -> Result<Geometry> {
-    let cameras = match choice {
-        InitChoice::Auto | InitChoice::Sfm => None,
-        InitChoice::Cameras(cameras) => Some(cameras.as_slice()),
-        InitChoice::Pointmaps(views, pairs) => return pointmap::reconstruct(views, pairs, progress),
-    };
-    let model = sparse(photos, cameras, Some(registry), progress)?;
+) -> Result<Placed> {
+    let model = sparse(&photos, cameras, Some(registry), progress)?;
     if let Some(sigma) = model.focal_log_sigma.filter(|s| *s > UNSURE_FOCAL) {
         progress.warn(&format!(
             "the photos leave the focal length open by ±{:.0} %: depth may be stretched; photos from more different \
@@ -50,20 +50,45 @@ pub fn initialise(
         ));
     }
     progress.check()?;
+    let method = if cameras.is_some() { "cameras + stereo" } else { "sfm (corners + XFeat) + stereo" };
+    Ok(Placed { photos, model, method: method.into() })
+}
+
+/// Depth maps and points of placed photos by stereo.
+pub fn dense(
+    device: &Device,
+    photos: &[Photo],
+    model: SparseModel,
+    method: String,
+    options: &StereoOptions,
+    progress: &dyn Progress,
+) -> Result<Geometry> {
     let images: Vec<_> = photos.iter().map(|p| p.image.clone()).collect();
     let positions: Vec<_> = model.points.iter().map(|p| p.position).collect();
-    let (depths, points) = stereo::dense(device, &images, &model.cameras, &positions, stereo, progress)?;
-    Ok(Geometry {
-        cameras: model.cameras,
-        depths,
-        points,
-        focal_log_sigma: model.focal_log_sigma,
-        method: if cameras.is_some() {
-            "cameras + stereo".into()
-        } else {
-            "sfm (corners + XFeat) + stereo".into()
-        },
-    })
+    let (depths, points) = stereo::dense(device, &images, &model.cameras, &positions, options, progress)?;
+    let focal_log_sigma = model.focal_log_sigma;
+    Ok(Geometry { cameras: model.cameras, depths, points, focal_log_sigma, method })
+}
+
+/// Photos to cameras, depth maps and points (ALGORITHMS 2.6); the photos come back as the later stages are to see them.
+pub fn initialise(
+    device: &Device,
+    photos: Vec<Photo>,
+    choice: &InitChoice,
+    registry: &Registry,
+    stereo: &StereoOptions,
+    progress: &dyn Progress,
+) -> Result<(Vec<Photo>, Geometry)> {
+    let cameras = match choice {
+        InitChoice::Sfm => None,
+        InitChoice::Cameras(cameras) => Some(cameras.as_slice()),
+        InitChoice::Pointmaps(views, pairs) => {
+            return Ok((photos, pointmap::reconstruct(views, pairs, progress)?));
+        }
+    };
+    let Placed { photos, model, method } = place(photos, cameras, registry, progress)?;
+    let geometry = dense(device, &photos, model, method, stereo, progress)?;
+    Ok((photos, geometry))
 }
 
 /// Keypoints kept per photo from the learned detector.

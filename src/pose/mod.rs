@@ -14,7 +14,7 @@ pub mod stereo;
 mod testing;
 mod two_view;
 
-pub use initialise::{InitChoice, initialise, learned_features, sparse};
+pub use initialise::{InitChoice, Placed, dense, initialise, learned_features, place, sparse};
 pub use matching::Features;
 
 use crate::scene::{Camera, DepthMap, PointCloud};

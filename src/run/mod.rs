@@ -23,7 +23,7 @@ use crate::language;
 use crate::language::sam::SamOptions;
 use crate::photo::{self, Photo};
 use crate::pose::stereo::StereoOptions;
-use crate::pose::{self, Geometry, InitChoice};
+use crate::pose::{self, Geometry, Placed, SparseModel};
 use crate::progress::{Progress, Recorded, StageRecord};
 use crate::query::{Highlight, QueryOptions, QueryResult};
 use crate::report::ModelUsed;
@@ -262,15 +262,27 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
     provider::report(progress)?;
     let networks = Networks::of(plan, &registry)?;
     networks.warn_untrained(progress);
-    let init = match &plan.init {
-        InitSource::Sfm | InitSource::Network(_) => InitChoice::Sfm,
-        InitSource::Cameras(file) => InitChoice::Cameras(cameras::read(file)?),
-        InitSource::Given(cameras) => InitChoice::Cameras(cameras.clone()),
+    let known = match &plan.init {
+        InitSource::Sfm | InitSource::Network(_) => None,
+        InitSource::Cameras(file) => Some(cameras::read(file)?),
+        InitSource::Given(cameras) => Some(cameras.clone()),
     };
     let given = sources::given_masks(&plan.masks, &plan.features, &photos)?;
     let encoder = sources::encoder(&plan.features, &registry)?;
 
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
+    let start = match &networks.geometry {
+        Some(model) => networks::geometry_of(model, &photos, progress)?,
+        None => None,
+    };
+    // Placed photos are without lens distortion and in one light: what comes after sees them so.
+    let (photos, start) = match start {
+        Some(geometry) => (photos, Start::Geometry(geometry)),
+        None => {
+            let Placed { photos, model, method } = pose::place(photos, known.as_deref(), &registry, progress)?;
+            (photos, Start::Cameras(model, method))
+        }
+    };
     let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
     let describer = Describer {
         plan,
@@ -282,11 +294,9 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
         encoder,
     };
     let stereo = StereoOptions::preset(preset);
-    let initialise =
-        |init: &InitChoice| pose::initialise(device, &photos, init, &registry, &stereo, progress);
-    let reconstruct = || match &networks.geometry {
-        Some(model) => networks::geometry_of(model, &photos, initialise, progress),
-        None => initialise(&init),
+    let reconstruct = || match start {
+        Start::Geometry(geometry) => Ok(geometry),
+        Start::Cameras(model, method) => pose::dense(device, &photos, model, method, &stereo, progress),
     };
     let train = |geometry: &Geometry| {
         fit::train_rgb(
@@ -338,6 +348,14 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
         seconds: progress.seconds(),
         warnings: progress.warnings(),
     })
+}
+
+/// What is known of the cameras before the two lanes part.
+enum Start {
+    /// Cameras and sparse points, and how they were found; depth is still to come.
+    Cameras(SparseModel, String),
+    /// All of it, from a network.
+    Geometry(Geometry),
 }
 
 /// Geometry and splats on this thread; masks, features and alignment beside them on another. The first error stops both.

@@ -3,7 +3,7 @@ use super::{FeatureSource, InitSource, MaskSource, MatchSource, RunPlan};
 use crate::infer::installed::{Duty, Installed};
 use crate::infer::{Registry, pairs};
 use crate::photo::Photo;
-use crate::pose::{Geometry, InitChoice};
+use crate::pose::{Geometry, pointmap};
 use crate::progress::Progress;
 use crate::report::ModelUsed;
 use crate::{Error, Result};
@@ -74,26 +74,24 @@ impl Networks {
     }
 }
 
-/// Cameras and depth from a network's pointmaps. Untrained weights give no geometry: then the photos themselves must.
+/// Cameras and depth from a network's pointmaps; `None` where untrained weights give no geometry: then the photos
+/// themselves must.
 pub(super) fn geometry_of(
     model: &Installed,
     photos: &[Photo],
-    initialise: impl Fn(&InitChoice) -> Result<Geometry>,
     progress: &dyn Progress,
-) -> Result<Geometry> {
+) -> Result<Option<Geometry>> {
     let (views, maps) = pairs::pointmaps(model, photos, progress)?;
-    let init = InitChoice::Pointmaps(views, maps);
-    match initialise(&init) {
+    match pointmap::reconstruct(&views, &maps, progress) {
         Err(Error::Cancelled) => Err(Error::Cancelled),
         Err(error) if model.untrained() => {
-            drop(init);
             progress.warn(&format!(
                 "{}: no geometry in untrained pointmaps ({error}); cameras from sfm",
                 model.name
             ));
-            initialise(&InitChoice::Sfm)
+            Ok(None)
         }
-        Ok(geometry) => Ok(Geometry { method: format!("{} pointmaps", model.name), ..geometry }),
+        Ok(geometry) => Ok(Some(Geometry { method: format!("{} pointmaps", model.name), ..geometry })),
         Err(error) => Err(error),
     }
 }

@@ -119,11 +119,14 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     })?;
     let registry = Registry::open(plan.models.as_deref())?;
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
-    let geometry = match given {
-        Some(cloud) => from_points(&photos, &known, cloud)?,
+    let (photos, geometry) = match given {
+        Some(cloud) => {
+            let geometry = from_points(&photos, &known, cloud)?;
+            (photos, geometry)
+        }
         None => {
             let (init, stereo) = (InitChoice::Cameras(known), StereoOptions::preset(preset));
-            pose::initialise(&device, &photos, &init, &registry, &stereo, progress)?
+            pose::initialise(&device, photos, &init, &registry, &stereo, progress)?
         }
     };
     let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
