@@ -189,6 +189,7 @@ fn pictures() -> Vec<Photo> {
             to_working: Affine::IDENTITY,
             frame: Frame::default(),
             exif_focal: None,
+            lens: crate::scene::Lens::NONE,
             camera_model: None,
             image,
         }

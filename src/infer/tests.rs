@@ -326,6 +326,7 @@ pub(super) fn photo(stem: &str, image: RgbImage) -> Photo {
         to_working: Affine::IDENTITY,
         frame: Frame::default(),
         exif_focal: None,
+            lens: crate::scene::Lens::NONE,
         camera_model: None,
         image,
     }

@@ -244,6 +244,7 @@ mod tests {
                 offset: [0.0; 2],
             },
             exif_focal: None,
+            lens: crate::scene::Lens::NONE,
             camera_model: None,
         }
     }

@@ -5,15 +5,18 @@ mod decode;
 mod exif_tags;
 mod frame;
 mod resize;
+mod straighten;
 
 pub use affine::Affine;
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
 pub use frame::Frame;
 pub use resize::Kernel;
+pub use straighten::straighten;
 
 use crate::progress::Progress;
-use crate::scene::RgbImage;
+use crate::scene::{Camera, Lens, RgbImage};
 use crate::{Error, Result};
+use glam::DVec2;
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
@@ -43,8 +46,21 @@ pub struct Photo {
     pub to_working: Affine,
     /// Focal length from EXIF in working pixels, if the file tells.
     pub exif_focal: Option<f64>,
+    /// Radial distortion that was taken out of the image.
+    pub lens: Lens,
     /// Camera make and model from EXIF: photos that share it may share one focal length.
     pub camera_model: Option<String>,
+}
+
+impl Photo {
+    /// Takes the lens out of the working image; `camera` is the pinhole that remains, at the working resolution.
+    pub fn straighten(&mut self, lens: Lens, camera: &Camera) {
+        if !lens.is_none() {
+            let centre = DVec2::new(camera.cx, camera.cy);
+            self.image = straighten(&self.image, lens, 0.5 * (camera.fx + camera.fy), centre);
+            self.lens = lens;
+        }
+    }
 }
 
 /// Reads one photo: EXIF orientation applied, alpha composited on black, height at most [`WORKING_HEIGHT`].
@@ -103,6 +119,7 @@ fn working(
         original_size: (w as u32, h as u32),
         to_working: Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32)),
         exif_focal: None,
+        lens: Lens::NONE,
         camera_model: None,
     })
 }

@@ -50,6 +50,10 @@ pub fn place(
         ));
     }
     progress.check()?;
+    let mut photos = photos;
+    for ((photo, fitted), camera) in photos.iter_mut().zip(&model.fitted).zip(&model.cameras) {
+        photo.straighten(fitted.lens, camera);
+    }
     let method = if cameras.is_some() { "cameras + stereo" } else { "sfm (corners + XFeat) + stereo" };
     Ok(Placed { photos, model, method: method.into() })
 }

@@ -6,11 +6,13 @@
 mod camera;
 mod image;
 mod language;
+mod lens;
 mod points;
 mod splats;
 
 pub use camera::{Camera, Pose};
 pub use image::{DepthMap, Plane, RgbImage};
 pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField};
+pub use lens::Lens;
 pub use points::PointCloud;
 pub use splats::{Splats, sh_coefficients};

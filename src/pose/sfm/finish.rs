@@ -1,0 +1,179 @@
+//! From a grown model to the final one: what the lens does, sightings refined to sub-pixel, further points.
+use super::model::{Freedom, Model, Sighting, Track};
+use super::patch::Shades;
+use super::tracks::{self, Link};
+use super::{MARGIN, Putative, THRESHOLD, cameras_of, colour_at, matching, refine};
+use crate::Result;
+use crate::photo::{Photo, straighten};
+use crate::pose::bundle::Outcome;
+use crate::pose::two_view::{fundamental, sampson};
+use crate::pose::{Fitted, SparseModel, SparsePoint};
+use crate::progress::Progress;
+use crate::scene::{Lens, Plane, RgbImage};
+use glam::DVec2;
+use rayon::prelude::*;
+
+/// What the model was grown from.
+pub(super) struct Evidence {
+    pub(super) putative: Vec<Putative>,
+    /// Per view, numbered as the links number them.
+    pub(super) keypoints: Vec<Vec<Sighting>>,
+}
+
+/// Settles the model: outliers out, weights from the residuals, the optics that the photos tell, every sighting refined to
+/// sub-pixel and further points added where the geometry predicts them.
+pub(super) fn finish(
+    photos: &[Photo],
+    mut model: Model,
+    evidence: &Evidence,
+    progress: &dyn Progress,
+) -> Result<SparseModel> {
+    let long = photos[0].image.width.max(photos[0].image.height) as f64;
+    let threshold = THRESHOLD * long;
+    model.triangulate_all(threshold);
+    model.prune(threshold);
+    model.adjust(f64::INFINITY, 1.5, 60)?;
+    settle(&mut model)?;
+    learn_optics(&mut model)?;
+    if bend(&model, photos) > REMATCH {
+        // The pinhole took what the lens displaces for outliers, above all near the corners: match again.
+        rematch(&mut model, evidence, threshold);
+        settle(&mut model)?;
+        learn_optics(&mut model)?;
+    }
+    progress.check()?;
+    let straight: Vec<RgbImage> = (0..photos.len()).map(|v| straightened(&model, v, &photos[v].image)).collect();
+    let shades: Vec<Shades> = straight.par_iter().map(|image| Shades::new(&image.luma())).collect();
+    let valid: Vec<Plane<bool>> = photos
+        .iter()
+        .zip(&straight)
+        .map(|(p, image)| matching::valid_area(image, p.frame, MARGIN))
+        .collect();
+    on_straight(&mut model, |m| refine::refine(m, &shades));
+    settle(&mut model)?;
+    progress.check()?;
+    progress.step(4, "more points");
+    model.prune(0.5 * threshold);
+    on_straight(&mut model, |m| {
+        refine::extend(m, &shades, &valid);
+    });
+    model.prune(0.5 * threshold);
+    settle(&mut model)?;
+    let outcome = learn_optics(&mut model)?;
+    model.normalise();
+    sparse_model(photos, &model, outcome)
+}
+
+/// Adjusts with weights from the residuals. Weights and geometry depend on each other; two rounds settle them to a percent.
+fn settle(model: &mut Model) -> Result<Outcome> {
+    model.weigh();
+    model.adjust(f64::INFINITY, 2.0, 60)?;
+    model.weigh();
+    model.adjust(f64::INFINITY, 2.0, 60)
+}
+
+/// Decides what of the optics the photos tell, by what each freedom gains in the robust cost, and adjusts with it.
+fn learn_optics(model: &mut Model) -> Result<Outcome> {
+    let mut best: Option<(f64, Model, Outcome)> = None;
+    let observations: usize = model.tracks.iter().map(|t| 2 * t.sightings.len()).sum();
+    for freedom in Freedom::ALL {
+        let mut trial = Model { freedom, ..model.clone() };
+        let outcome = trial.adjust(f64::INFINITY, 2.0, 60)?;
+        let value = outcome.cost + trial.parameters() as f64 * (observations as f64).ln();
+        if std::env::var_os("SPLATVK_DEBUG").is_some() {
+            eprintln!("{freedom:?} cost {:.1} value {value:.1} n {observations} {:?} σ {:?}", outcome.cost, trial.optics, outcome.sigmas);
+        }
+        if best.as_ref().is_none_or(|b| value < b.0) {
+            best = Some((value, trial, outcome));
+        }
+    }
+    if let Some((_, chosen, outcome)) = best {
+        *model = chosen;
+        return Ok(outcome);
+    }
+    settle(model)
+}
+
+/// Displacement at a corner above which matching starts anew, pixels: three times the noise of keypoints.
+const REMATCH: f64 = 1.0;
+
+/// Largest displacement by the lens at a corner of a photo, pixels.
+fn bend(model: &Model, photos: &[Photo]) -> f64 {
+    let corner = |(v, p): (usize, &Photo)| {
+        let half = DVec2::new(p.image.width as f64, p.image.height as f64) * 0.5;
+        let x = half / model.focal(v);
+        (model.lens(v).distort(x) - x).length() * model.focal(v)
+    };
+    photos.iter().enumerate().map(corner).fold(0.0, f64::max)
+}
+
+/// Links of the putative matches that agree with the model's cameras within `threshold` pixels.
+pub(super) fn explained(model: &Model, putative: &[Putative], threshold: f64) -> Vec<Link> {
+    let of_pair = |pair: &Putative| -> Vec<Link> {
+        let (i, j) = (pair.first, pair.second);
+        let (Some(a), Some(b)) = (model.poses[i], model.poses[j]) else { return Vec::new() };
+        let f = fundamental(&b.compose(&a.inverse()), model.focal(i), model.focal(j));
+        let close = |m: &&(DVec2, DVec2, Link)| {
+            sampson(&f, model.straight(i, m.0), model.straight(j, m.1)) < threshold * threshold
+        };
+        pair.matches.iter().filter(close).map(|m| m.2).collect()
+    };
+    putative.par_iter().flat_map_iter(of_pair).collect()
+}
+
+/// New tracks from all matches that agree with the cameras.
+fn rematch(model: &mut Model, evidence: &Evidence, threshold: f64) {
+    let mut links = explained(model, &evidence.putative, threshold);
+    model.tracks = tracks::join(&mut links, &evidence.keypoints)
+        .into_iter()
+        .map(|sightings| Track { position: None, sightings })
+        .collect();
+    model.triangulate_all(threshold);
+    model.prune(threshold);
+}
+
+/// A view's image as a pinhole would show it.
+fn straightened(model: &Model, view: usize, image: &RgbImage) -> RgbImage {
+    match model.lens(view) {
+        lens if lens.is_none() => image.clone(),
+        lens => straighten(image, lens, model.focal(view), model.principal_point(view)),
+    }
+}
+
+/// Runs a step that knows only pinholes on the model with its sightings moved to where a pinhole would show them.
+fn on_straight(model: &mut Model, step: impl FnOnce(&mut Model)) {
+    let optics = model.optics.clone();
+    let lensed = model.clone_optics();
+    for s in model.tracks.iter_mut().flat_map(|t| &mut t.sightings) {
+        s.pixel = lensed.straight(s.view, s.pixel) + lensed.principal_point(s.view);
+    }
+    model.optics.iter_mut().for_each(|o| o.lens = Lens::NONE);
+    step(model);
+    model.optics = optics;
+    for s in model.tracks.iter_mut().flat_map(|t| &mut t.sightings) {
+        let f = lensed.focal(s.view);
+        let x = (s.pixel - lensed.principal_point(s.view)) / f;
+        s.pixel = lensed.lens(s.view).distort(x) * f + lensed.principal_point(s.view);
+    }
+}
+
+fn sparse_model(photos: &[Photo], model: &Model, outcome: Outcome) -> Result<SparseModel> {
+    let cameras = cameras_of(photos, model)?;
+    let point = |t: &Track| {
+        let views: Vec<(usize, DVec2)> = t
+            .sightings
+            .iter()
+            .map(|s| (s.view, model.straight(s.view, s.pixel) + model.principal_point(s.view)))
+            .collect();
+        let s = t.sightings.first()?;
+        Some(SparsePoint { position: t.position?, colour: colour_at(&photos[s.view].image, s.pixel), views })
+    };
+    let points = model.tracks.iter().filter_map(point).collect();
+    let fitted = |v: usize| Fitted { lens: model.lens(v), sigmas: outcome.sigmas[model.group[v]] };
+    Ok(SparseModel {
+        cameras,
+        points,
+        focal_log_sigma: outcome.sigmas.first().map(|s| s[0]),
+        fitted: (0..photos.len()).map(fitted).collect(),
+    })
+}
