@@ -189,7 +189,8 @@ fn pictures() -> Vec<Photo> {
             to_working: Affine::IDENTITY,
             frame: Frame::default(),
             exif_focal: None,
-            lens: crate::scene::Lens::NONE,
+            fine: None,
+            straightened: None,
             camera_model: None,
             image,
         }

@@ -326,7 +326,8 @@ pub(super) fn photo(stem: &str, image: RgbImage) -> Photo {
         to_working: Affine::IDENTITY,
         frame: Frame::default(),
         exif_focal: None,
-            lens: crate::scene::Lens::NONE,
+        fine: None,
+        straightened: None,
         camera_model: None,
         image,
     }

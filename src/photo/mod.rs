@@ -11,15 +11,16 @@ pub use affine::Affine;
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
 pub use frame::Frame;
 pub use resize::Kernel;
-pub use straighten::straighten;
+pub use straighten::Straightening;
 
 use crate::progress::Progress;
-use crate::scene::{Camera, Lens, RgbImage};
+use crate::scene::{Camera, Lens, Plane, RgbImage};
 use crate::{Error, Result};
 use glam::DVec2;
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Greatest height of the working image, pixels (ALGORITHMS 1.2).
@@ -46,8 +47,10 @@ pub struct Photo {
     pub to_working: Affine,
     /// Focal length from EXIF in working pixels, if the file tells.
     pub exif_focal: Option<f64>,
-    /// Radial distortion that was taken out of the image.
-    pub lens: Lens,
+    /// Luma of the photo at more pixels than the working image has, for measuring positions; where there are more.
+    pub fine: Option<Arc<Plane<f32>>>,
+    /// The lens that was taken out of the image.
+    pub straightened: Option<Straightening>,
     /// Camera make and model from EXIF: photos that share it may share one focal length.
     pub camera_model: Option<String>,
 }
@@ -56,10 +59,28 @@ impl Photo {
     /// Takes the lens out of the working image; `camera` is the pinhole that remains, at the working resolution.
     pub fn straighten(&mut self, lens: Lens, camera: &Camera) {
         if !lens.is_none() {
-            let centre = DVec2::new(camera.cx, camera.cy);
-            self.image = straighten(&self.image, lens, 0.5 * (camera.fx + camera.fy), centre);
-            self.lens = lens;
+            let (focal, centre) = (0.5 * (camera.fx + camera.fy), DVec2::new(camera.cx, camera.cy));
+            let how = Straightening { lens, focal, centre };
+            self.image = how.image(&self.image);
+            self.straightened = Some(how);
         }
+    }
+
+    /// The lens that was taken out of the image.
+    pub fn lens(&self) -> Lens {
+        self.straightened.map_or(Lens::NONE, |s| s.lens)
+    }
+
+    /// Where the photo as it was read, at the working resolution, has what the image shows at `p`.
+    pub fn source(&self, p: DVec2) -> DVec2 {
+        self.straightened.map_or(p, |s| s.source(p))
+    }
+
+    /// The camera of the working image as one of the photo's file: its size, its pixels, its name. [`Photo::lens`] belongs
+    /// to it.
+    pub fn original_camera(&self, camera: &Camera) -> Camera {
+        let name = self.path.file_name().map_or_else(|| self.stem.clone(), |n| n.to_string_lossy().into());
+        Camera { name, ..self.to_working.inverse().camera(camera, self.original_size) }
     }
 }
 
@@ -108,7 +129,8 @@ fn working(
         )));
     }
     let (working_w, working_h) = working_size(w, h);
-    let mut image = resize::area_average((w, h), (working_w, working_h), at);
+    let mut image = resize::area_average((w, h), (working_w, working_h), &at);
+    let fine = fine((w, h), (working_w, working_h), &at);
     let frame = Frame::of(&image);
     frame.continue_picture(&mut image);
     Ok(Photo {
@@ -119,9 +141,26 @@ fn working(
         original_size: (w as u32, h as u32),
         to_working: Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32)),
         exif_focal: None,
-        lens: Lens::NONE,
+        fine,
+        straightened: None,
         camera_model: None,
     })
+}
+
+/// Largest long side of [`Photo::fine`], pixels.
+const FINE: usize = 3072;
+/// Fewer more pixels than this show nothing new.
+const LEAST_GAIN: f64 = 1.25;
+
+fn fine(
+    (w, h): (usize, usize),
+    working: (usize, usize),
+    at: &(impl Fn(usize, usize) -> [f32; 3] + Sync),
+) -> Option<Arc<Plane<f32>>> {
+    let share = (FINE as f64 / w.max(h) as f64).min(1.0);
+    let size = ((w as f64 * share).round() as usize, (h as f64 * share).round() as usize);
+    (size.0 as f64 > LEAST_GAIN * working.0 as f64)
+        .then(|| Arc::new(resize::area_average((w, h), size, at).luma()))
 }
 
 /// Working (width, height) of an upright size: the height is capped, sizes truncated (ALGORITHMS 1.2).

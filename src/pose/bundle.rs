@@ -49,6 +49,11 @@ impl OpticsPrior {
         usize::from(self.log_focal.1 > 0.0) + radial + 2 * usize::from(self.shift > 0.0)
     }
 
+    /// σ of every parameter, in the order of [`Outcome::sigmas`].
+    pub(crate) fn sigmas(&self) -> [f64; OPTICS] {
+        [self.log_focal.1, self.lens[0], self.lens[1], self.shift, self.shift]
+    }
+
     /// (distance from the prior's mean, σ) of every parameter.
     fn deviations(&self, o: &Optics) -> [(f64, f64); OPTICS] {
         [

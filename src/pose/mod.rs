@@ -31,6 +31,8 @@ pub struct Geometry {
     pub points: PointCloud,
     /// One standard deviation of ln f, if the focal length was estimated.
     pub focal_log_sigma: Option<f64>,
+    /// What was found of the optics, one per photo, if it was estimated.
+    pub fitted: Vec<Fitted>,
     /// Name of the initialiser and of what it used, for run.json.
     pub method: String,
 }
@@ -53,6 +55,8 @@ pub struct Fitted {
     pub lens: Lens,
     /// One standard deviation of ln f, k1, k2 and the principal point (x, y; original pixels); 0 = held where it is.
     pub sigmas: [f64; 5],
+    /// Median distance of its sightings from where the model projects their points, working pixels.
+    pub residual: f64,
 }
 
 /// Cameras and the sparse points that fix them. World frame: camera 0; unit: the median depth of the points is

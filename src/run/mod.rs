@@ -284,6 +284,11 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
             (photos, Start::Cameras(model, method))
         }
     };
+    // Masks from a folder belong to the photos as they were read.
+    let given = match photos.iter().any(|p| p.straightened.is_some()) {
+        true => sources::given_masks(&plan.masks, &plan.features, &photos)?,
+        false => given,
+    };
     let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
     let describer = Describer {
         plan,

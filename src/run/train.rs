@@ -226,6 +226,7 @@ fn from_points(photos: &[Photo], known: &[Camera], cloud: PointCloud) -> Result<
         cameras,
         depths: Vec::new(),
         focal_log_sigma: None,
+        fitted: Vec::new(),
         method: "cameras+points".into(),
     })
 }

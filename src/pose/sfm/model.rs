@@ -36,8 +36,7 @@ pub(super) enum Freedom {
 }
 
 impl Freedom {
-    pub(super) const ALL: [Freedom; 4] =
-        [Freedom::Focal, Freedom::Radial, Freedom::Centre, Freedom::Full];
+    pub(super) const ALL: [Freedom; 4] = [Freedom::Focal, Freedom::Radial, Freedom::Centre, Freedom::Full];
 
     /// The prior with everything else held.
     fn of(self, prior: &OpticsPrior) -> OpticsPrior {
@@ -104,6 +103,18 @@ impl Model {
         self.priors.iter().map(|p| self.freedom.of(p).count()).sum()
     }
 
+    /// The same model on images of another size: `ratios` per view.
+    pub(super) fn magnify(&mut self, ratios: &[f64]) {
+        for (v, r) in ratios.iter().enumerate() {
+            self.centres[v] *= *r;
+            self.zoom[v] *= *r;
+        }
+        for s in self.tracks.iter_mut().flat_map(|t| &mut t.sightings) {
+            s.pixel *= ratios[s.view];
+            s.sigma *= ratios[s.view];
+        }
+    }
+
     /// The model without its tracks.
     pub(super) fn clone_optics(&self) -> Model {
         Model {
@@ -138,6 +149,16 @@ impl Model {
     /// Reprojection distance in pixels; infinite when it cannot be seen.
     pub(super) fn error(&self, s: &Sighting, world: DVec3) -> f64 {
         self.project(s.view, world).map_or(f64::INFINITY, |(p, _)| (p - s.pixel).length())
+    }
+
+    /// Median reprojection distance of a view's sightings, pixels; 0 without any.
+    pub(super) fn residual(&self, view: usize) -> f64 {
+        let of_track = |t: &Track| {
+            let s = t.sightings.iter().find(|s| s.view == view)?;
+            Some(self.error(s, t.position?)).filter(|e| e.is_finite())
+        };
+        let mut all: Vec<f64> = self.tracks.iter().filter_map(of_track).collect();
+        crate::pose::numeric::median(&mut all).unwrap_or(0.0)
     }
 
     /// Position from the registered sightings: least squares on ray distances, then Gauss–Newton on pixels. `None` when

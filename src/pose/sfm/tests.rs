@@ -149,37 +149,3 @@ fn two_photos_of_different_size_and_known_focal_are_enough() {
     assert!(turn < 0.8 && aim < 0.8, "{turn} {aim}");
     assert!(model.focal_log_sigma.unwrap() > 0.002);
 }
-
-#[test]
-#[ignore]
-fn scratch_sets() {
-    for dir in std::env::var("SETS").unwrap().split(',') {
-        let start = std::time::Instant::now();
-        let folder = std::path::PathBuf::from(dir);
-        let json: serde_json::Value = serde_json::from_slice(&std::fs::read(folder.join("ground_truth.json")).unwrap()).unwrap();
-        let mut cams = Vec::new();
-        let mut paths = Vec::new();
-        for f in json["frames"].as_array().unwrap().iter().filter(|f| f["split"] == "train") {
-            let n = |k: &str| f[k].as_f64().unwrap();
-            let m: Vec<f64> = f["world_to_camera"].as_array().unwrap().iter().take(3).flat_map(|r| r.as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect::<Vec<_>>()).collect();
-            let rotation = glam::DMat3::from_cols(glam::DVec3::new(m[0], m[4], m[8]), glam::DVec3::new(m[1], m[5], m[9]), glam::DVec3::new(m[2], m[6], m[10]));
-            let path = folder.join(f["file"].as_str().unwrap());
-            cams.push(Camera { name: "x".into(), width: json["width"].as_u64().unwrap() as u32, height: json["height"].as_u64().unwrap() as u32, fx: n("fx"), fy: n("fy"), cx: n("cx"), cy: n("cy"), pose: crate::scene::Pose { rotation, translation: glam::DVec3::new(m[3], m[7], m[11]) } });
-            paths.push(path);
-        }
-        let photos: Vec<Photo> = paths.iter().map(|p| crate::photo::load(p).unwrap()).collect();
-        let features = learned(&photos);
-        let model = match reconstruct(&photos, &features, &Silent) { Ok(m) => m, Err(e) => { println!("{dir}: {e}"); continue } };
-        let e = pose_errors(&model.cameras, &cams, 1.0);
-        let mut worst = (0f64, 0f64);
-        for i in 0..cams.len() { for j in 0..i {
-            let rel = |c: &[Camera]| c[i].pose.compose(&c[j].pose.inverse());
-            let (a, b) = (rel(&model.cameras), rel(&cams));
-            worst.0 = worst.0.max(crate::pose::numeric::rotation_angle(&(a.rotation * b.rotation.transpose())).to_degrees());
-            worst.1 = worst.1.max(a.translation.angle_between(b.translation).to_degrees());
-        }}
-        let max = |v: &[f64]| v.iter().copied().fold(0.0, f64::max);
-        let s = photos[0].to_working.scale[0];
-        println!("{dir}: rot {:.4} centre/m {:.4} focal {:.3}% +- {:.3}% pair {:.3} {:.3} lens {:?} sig {:?} c {:.1} {:.1} (truth {:.1} {:.1}) pts {} {:.1}s", max(&e.rotation_degrees), max(&e.centre), 100.0*e.focal[0], 100.0*model.focal_log_sigma.unwrap(), worst.0, worst.1, model.fitted[0].lens, model.fitted[0].sigmas, model.cameras[0].cx/s, model.cameras[0].cy/s, cams[0].cx, cams[0].cy, model.points.len(), start.elapsed().as_secs_f64());
-    }
-}
