@@ -321,6 +321,12 @@ pub struct EvalArgs {
     /// What is read and how it is scored
     #[arg(long, value_enum, default_value = "field")]
     pub protocol: ProtocolArg,
+    /// Score held-out frames a second time, from cameras moved until the frozen scene fits their photos best: `refined`
+    #[arg(long)]
+    pub refine_views: bool,
+    /// Print a short table instead of JSON; --out DIR keeps eval.json
+    #[arg(long, conflicts_with = "json")]
+    pub text: bool,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,

@@ -6,6 +6,7 @@ pub mod matching;
 mod minimal;
 pub(crate) mod numeric;
 pub mod pointmap;
+pub mod relative;
 mod resect;
 pub mod sfm;
 mod sift;

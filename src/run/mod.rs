@@ -6,6 +6,7 @@ pub mod live;
 mod method;
 mod networks;
 mod record;
+pub mod refine;
 pub mod score;
 pub mod sources;
 pub mod train;
