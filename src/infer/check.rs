@@ -190,6 +190,7 @@ fn pictures() -> Vec<Photo> {
             frame: Frame::default(),
             exif_focal: None,
             camera_model: None,
+            light: crate::photo::Light::NONE,
             image,
         }
     };

@@ -327,6 +327,7 @@ pub(super) fn photo(stem: &str, image: RgbImage) -> Photo {
         frame: Frame::default(),
         exif_focal: None,
         camera_model: None,
+        light: crate::photo::Light::NONE,
         image,
     }
 }

@@ -245,6 +245,7 @@ mod tests {
             },
             exif_focal: None,
             camera_model: None,
+            light: crate::photo::Light::NONE,
         }
     }
 

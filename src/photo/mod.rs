@@ -4,11 +4,13 @@ mod choose;
 mod decode;
 mod exif_tags;
 mod frame;
+pub mod light;
 mod resize;
 
 pub use affine::Affine;
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
 pub use frame::Frame;
+pub use light::Light;
 pub use resize::Kernel;
 
 use crate::progress::Progress;
@@ -45,6 +47,8 @@ pub struct Photo {
     pub exif_focal: Option<f64>,
     /// Camera make and model from EXIF: photos that share it may share one focal length.
     pub camera_model: Option<String>,
+    /// Exposure, white balance and vignetting that were taken out of `image`.
+    pub light: Light,
 }
 
 /// Reads one photo: EXIF orientation applied, alpha composited on black, height at most [`WORKING_HEIGHT`].
@@ -104,6 +108,7 @@ fn working(
         to_working: Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32)),
         exif_focal: None,
         camera_model: None,
+        light: Light::NONE,
     })
 }
 

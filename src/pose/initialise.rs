@@ -1,7 +1,7 @@
 //! Choosing and running a geometry initialiser.
 use super::pointmap::{self, ModelView, PairPointmaps};
 use super::stereo::{self, StereoOptions};
-use super::{Features, Geometry, SparseModel, sfm};
+use super::{Features, Geometry, SparseModel, light, sfm};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
@@ -50,6 +50,7 @@ pub fn place(
         ));
     }
     progress.check()?;
+    let photos = light::equalised(photos, &model, progress);
     let method = if cameras.is_some() { "cameras + stereo" } else { "sfm (corners + XFeat) + stereo" };
     Ok(Placed { photos, model, method: method.into() })
 }

@@ -2,6 +2,7 @@
 pub mod ask;
 mod describe;
 pub mod encoder;
+mod light;
 pub mod live;
 mod method;
 mod networks;
@@ -279,7 +280,8 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
     let (photos, start) = match start {
         Some(geometry) => (photos, Start::Geometry(geometry)),
         None => {
-            let Placed { photos, model, method } = pose::place(photos, known.as_deref(), &registry, progress)?;
+            let Placed { photos, model, method } =
+                pose::place(photos, known.as_deref(), &registry, progress)?;
             (photos, Start::Cameras(model, method))
         }
     };

@@ -8,9 +8,11 @@ mod image;
 mod language;
 mod points;
 mod splats;
+mod transfer;
 
 pub use camera::{Camera, Pose};
 pub use image::{DepthMap, Plane, RgbImage};
 pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField};
 pub use points::PointCloud;
 pub use splats::{Splats, sh_coefficients};
+pub use transfer::{to_linear, to_srgb};
