@@ -2,12 +2,12 @@
 #![allow(clippy::unwrap_used)] // helpers of tests
 use glam::{DMat3, DVec2, DVec3};
 use splatvk::fit::{self, Preset, RgbOptions};
-use splatvk::format::npy;
+use splatvk::format::{npy, ply};
 use splatvk::gpu::Device;
 use splatvk::pass::Renderer;
 use splatvk::pass::metrics::{psnr, psnr_masked, ssim};
 use splatvk::progress::Progress;
-use splatvk::scene::{Camera, DepthMap, Plane, PointCloud, Pose, RgbImage};
+use splatvk::scene::{Camera, DepthMap, Plane, PointCloud, Pose, RgbImage, to_linear, to_srgb};
 use std::path::{Path, PathBuf};
 
 /// A posed photo with exact depth.
@@ -187,4 +187,36 @@ fn breakfast_with_exact_geometry() {
         trained.stats.splats,
         trained.stats.seconds
     );
+}
+
+/// Six times the light of the 8-bit photos: what shows nearly white there is far above 1 here. It must come back from the
+/// trained scene, through a file as well.
+#[test]
+fn light_above_one_is_learnt_and_rendered() {
+    let mut train = load("train", 8);
+    for view in &mut train {
+        view.image.data.iter_mut().flatten().for_each(|v| *v = to_srgb(6.0 * to_linear(*v)));
+    }
+    let device = Device::open(None).unwrap();
+    let images: Vec<RgbImage> = train.iter().map(|v| v.image.clone()).collect();
+    let cameras: Vec<Camera> = train.iter().map(|v| v.camera.clone()).collect();
+    let options = RgbOptions { poses: None, ..RgbOptions::preset(Preset::Draft).with_iterations(120) };
+    let trained =
+        fit::train_rgb(&device, &images, &cameras, &points(&train), None, &options, &Print).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("bright.ply");
+    ply::write_splats(&file, &trained.splats, ply::PlyOptions::default()).unwrap();
+    let splats = ply::read_splats(&file).unwrap();
+    let frame = Renderer::new(&device, &splats, &[], 0).unwrap().render(&cameras[0]).unwrap();
+    let bright: Vec<(f32, f32)> = (0..images[0].data.len())
+        .map(|i| (to_linear(frame.rgb.data[i][1]), to_linear(images[0].data[i][1])))
+        .filter(|(_, target)| *target > 2.5)
+        .collect();
+    let mut ratio: Vec<f32> = bright.iter().map(|(shown, target)| shown / target).collect();
+    ratio.sort_by(f32::total_cmp);
+    println!("{} bright pixels, median ratio {:?}", ratio.len(), ratio.get(ratio.len() / 2));
+    assert!(ratio.len() > 100, "{} bright pixels", ratio.len());
+    // Edges between bright and dark are blurred in 120 steps; most of the bright area is not.
+    assert!((ratio[ratio.len() / 2] - 1.0).abs() < 0.1, "{}", ratio[ratio.len() / 2]);
+    assert!(bright.iter().any(|(shown, _)| *shown > 2.5));
 }

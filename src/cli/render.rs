@@ -9,7 +9,7 @@ use crate::format::{cameras, scene_dir};
 use crate::gpu::Device;
 use crate::report::colour;
 use crate::run::view::{DecodedFrame, Viewer};
-use crate::scene::{LEVEL_NAMES, LanguageField, Plane, RgbImage};
+use crate::scene::{LEVEL_NAMES, LanguageField, Plane, RgbImage, to_linear};
 use crate::{Error, Result};
 
 pub fn render(args: &RenderArgs) -> Result<()> {
@@ -122,8 +122,11 @@ fn false_colour(features: &[f32], d: usize, like: &Plane<f32>) -> RgbImage {
 fn exr(out: &mut Outputs, stem: &str, channels: &[Channel], view: &DecodedFrame) -> Result<()> {
     let frame = &view.frame;
     let has = |c: Channel| channels.contains(&c);
+    // OpenEXR holds linear light; what programs that read it expect.
+    let linear = has(Channel::Rgb)
+        .then(|| RgbImage { data: frame.rgb.data.iter().map(|c| c.map(to_linear)).collect(), ..frame.rgb });
     let planes = Planes {
-        rgb: has(Channel::Rgb).then_some(&frame.rgb),
+        rgb: linear.as_ref(),
         alpha: has(Channel::Alpha).then_some(&frame.alpha),
         depth: has(Channel::Depth).then_some(&frame.depth),
         features: has(Channel::Features).then_some((frame.feature_dim, frame.features.as_slice())),

@@ -3,6 +3,9 @@ use crate::scene::Splats;
 use crate::{Error, Result};
 use std::path::Path;
 
+/// Largest base colour that a byte holds.
+pub const BRIGHTEST: f32 = 1.0;
+
 /// Bytes of a Gaussian.
 const ROW: usize = 32;
 

@@ -192,6 +192,7 @@ fn pictures() -> Vec<Photo> {
             fine: None,
             straightened: None,
             camera_model: None,
+            light: crate::photo::Light::NONE,
             image,
         }
     };

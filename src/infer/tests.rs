@@ -329,6 +329,7 @@ pub(super) fn photo(stem: &str, image: RgbImage) -> Photo {
         fine: None,
         straightened: None,
         camera_model: None,
+        light: crate::photo::Light::NONE,
         image,
     }
 }

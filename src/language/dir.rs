@@ -253,6 +253,7 @@ mod tests {
             fine: None,
             straightened: None,
             camera_model: None,
+            light: crate::photo::Light::NONE,
         }
     }
 

@@ -12,7 +12,7 @@ pub fn psnr_masked(rendered: &RgbImage, target: &RgbImage, keep: impl Fn(usize) 
     let (mut sum, mut count) = (0.0f64, 0usize);
     for (i, (a, b)) in rendered.data.iter().zip(&target.data).enumerate() {
         if keep(i) {
-            sum += (0..3).map(|c| (a[c].clamp(0.0, 1.0) - b[c]).powi(2) as f64).sum::<f64>();
+            sum += (0..3).map(|c| (a[c].clamp(0.0, 1.0) - b[c].clamp(0.0, 1.0)).powi(2) as f64).sum::<f64>();
             count += 3;
         }
     }
@@ -22,7 +22,7 @@ pub fn psnr_masked(rendered: &RgbImage, target: &RgbImage, keep: impl Fn(usize) 
 /// Mean SSIM of two equally sized images (window and constants of [`super::ssim_l1`]).
 pub fn ssim(rendered: &RgbImage, target: &RgbImage) -> f64 {
     let x: Vec<f64> = planar(rendered).iter().map(|v| v.clamp(0.0, 1.0) as f64).collect();
-    let y: Vec<f64> = planar(target).iter().map(|&v| v as f64).collect();
+    let y: Vec<f64> = planar(target).iter().map(|v| v.clamp(0.0, 1.0) as f64).collect();
     ssim_l1(&x, &y, rendered.width, rendered.height, 0.0, 1.0).0.ssim
 }
 

@@ -4,12 +4,14 @@ mod choose;
 mod decode;
 mod exif_tags;
 mod frame;
+pub mod light;
 mod resize;
 mod straighten;
 
 pub use affine::Affine;
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
 pub use frame::Frame;
+pub use light::Light;
 pub use resize::Kernel;
 pub use straighten::Straightening;
 
@@ -53,6 +55,8 @@ pub struct Photo {
     pub straightened: Option<Straightening>,
     /// Camera make and model from EXIF: photos that share it may share one focal length.
     pub camera_model: Option<String>,
+    /// Exposure, white balance and vignetting that were taken out of `image`.
+    pub light: Light,
 }
 
 impl Photo {
@@ -144,6 +148,7 @@ fn working(
         fine,
         straightened: None,
         camera_model: None,
+        light: Light::NONE,
     })
 }
 

@@ -1,7 +1,7 @@
 //! Choosing and running a geometry initialiser.
 use super::pointmap::{self, ModelView, PairPointmaps};
 use super::stereo::{self, StereoOptions};
-use super::{Features, Fitted, Geometry, SparseModel, sfm};
+use super::{Features, Fitted, Geometry, SparseModel, light, sfm};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
@@ -57,6 +57,7 @@ pub fn place(
     }
     // Only the cameras were measured on them.
     photos.iter_mut().for_each(|p| p.fine = None);
+    let photos = light::equalised(photos, &model, progress);
     let method = if cameras.is_some() { "cameras + stereo" } else { "sfm (corners + XFeat) + stereo" };
     Ok(Placed { photos, model, method: method.into() })
 }

@@ -2,6 +2,7 @@
 pub mod align;
 mod bundle;
 mod initialise;
+pub mod light;
 pub mod matching;
 mod minimal;
 pub(crate) mod numeric;

@@ -81,8 +81,12 @@ fn curve(curve: &Curve) -> String {
 }
 
 fn view_row(v: &ViewShown) -> Result<String> {
-    let mut row =
-        format!("<h3>{}</h3><div class=\"row views\">{}", escape(v.name), figure(v.photo, "photo")?);
+    let light = match v.light.is_none() {
+        true => String::new(),
+        false => format!(", evened out: {}", v.light.summary()),
+    };
+    let photo = figure(v.photo, &format!("photo{light}"))?;
+    let mut row = format!("<h3>{}</h3><div class=\"row views\">{photo}", escape(v.name));
     if let Some(render) = v.render {
         let caption = v.psnr.map_or("render".to_string(), |p| format!("render, {p:.1} dB"));
         row.push_str(&figure(render, &caption)?);
@@ -195,6 +199,7 @@ fn run_tables(report: &Report) -> String {
 mod tests {
     use super::super::{AnswerShown, RunRecord};
     use super::*;
+    use crate::photo::Light;
     use crate::progress::StageRecord;
     use crate::scene::Plane;
 
@@ -227,6 +232,7 @@ mod tests {
             depth: Some(&depth),
             levels: &levels,
             psnr: Some(31.25),
+            light: Light { gain: [1.2; 3], ..Light::NONE },
         };
         let answer =
             AnswerShown { view: 0, relevancy: &relevancy, mask: None, score: 0.9, found: true, level: "l" };
@@ -253,6 +259,7 @@ mod tests {
         assert!(!html.contains("http") && !html.contains("<script>") && html.contains("&lt;script&gt;"));
         for text in [
             "31.2 dB",
+            "evened out: +0.26 EV",
             "about a thousand everyday things",
             "CLIP is the full",
             "a &lt; b",

@@ -11,6 +11,7 @@ pub use summary::{duration, table};
 pub use crate::progress::StageRecord;
 
 use crate::format::{create_folder, picture};
+use crate::photo::Light;
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
 use serde::Serialize;
@@ -74,6 +75,8 @@ pub struct ViewShown<'a> {
     pub levels: &'a [(&'a str, Plane<i32>)],
     /// PSNR of the render, dB.
     pub psnr: Option<f64>,
+    /// What was taken out of the photo.
+    pub light: Light,
 }
 
 /// The answer to one text in one view.

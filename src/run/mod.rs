@@ -2,6 +2,7 @@
 pub mod ask;
 mod describe;
 pub mod encoder;
+mod light;
 pub mod live;
 mod method;
 mod networks;

@@ -55,6 +55,7 @@ fn statistics(o: &Outcome) -> serde_json::Value {
             "focal_log_sigma": o.geometry.focal_log_sigma,
             "optics": optics(o),
         },
+        "light": super::light::record(&o.photos),
         "splats": { "start": o.rgb.splats[0], "end": o.splats.len() },
         "psnr_train": o.rgb.psnr, "poses_refined": o.rgb.poses_refined,
         "loss": o.rgb.curve.iter().map(|p| json!([p.step, p.loss])).collect::<Vec<_>>(),
@@ -151,6 +152,7 @@ fn figures(o: &Outcome) -> Vec<(String, String)> {
         list.push(("focal length".to_owned(), format!("{:.1} px ± {:.2} %", camera.fx, 100.0 * sigma)));
     }
     list.extend(lens_figure(o).map(|text| ("lens".to_owned(), text)));
+    list.extend(super::light::figure(&o.photos));
     let codes = |k: usize| o.field.levels.get(k).map_or(0, |l| l.codebook.len());
     list.push(("things s/m/l".to_owned(), format!("{} / {} / {}", codes(0), codes(1), codes(2))));
     for a in &o.answers {
@@ -186,6 +188,7 @@ pub(super) fn write(folder: &Path, o: &Outcome) -> Result<()> {
             depth: Some(&o.frames[i].frame.depth),
             levels: &levels[i],
             psnr: o.rgb.psnr.get(i).copied(),
+            light: p.light,
         })
         .collect();
     let title = o.plan.out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();

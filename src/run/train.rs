@@ -166,17 +166,19 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         stages,
         statistics: json!({
             "geometry": { "method": geometry.method, "points": geometry.points.len() },
+            "light": super::light::record(&photos),
             "splats": { "start": trained.stats.splats[0], "end": trained.splats.len() },
             "psnr_train": trained.stats.psnr, "poses_refined": trained.stats.poses_refined,
             "curves": curves,
         }),
         warnings: progress.warnings(),
     };
-    let figures = vec![
+    let mut figures = vec![
         ("device".to_owned(), device.info().name.clone()),
         ("splats".to_owned(), trained.splats.len().to_string()),
         ("train PSNR".to_owned(), format!("{:.2} dB", trained.stats.mean_psnr())),
     ];
+    figures.extend(super::light::figure(&photos));
     let views = photos.iter().zip(&frames).zip(&trained.stats.psnr);
     let views = views.map(|((p, f), psnr)| ViewShown {
         name: &p.stem,
@@ -185,6 +187,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         depth: Some(&f.frame.depth),
         levels: &[],
         psnr: Some(*psnr),
+        light: p.light,
     });
     let title = plan.out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     let shown = Report {

@@ -9,6 +9,7 @@ mod language;
 mod lens;
 mod points;
 mod splats;
+mod transfer;
 
 pub use camera::{Camera, Pose};
 pub use image::{DepthMap, Plane, RgbImage};
@@ -16,3 +17,4 @@ pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField};
 pub use lens::Lens;
 pub use points::PointCloud;
 pub use splats::{Splats, sh_coefficients};
+pub use transfer::{to_linear, to_srgb};

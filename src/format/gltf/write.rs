@@ -1,7 +1,7 @@
 //! Writing.
 use super::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
 use crate::format::{SH_C0, moved, sigmoid};
-use crate::scene::Splats;
+use crate::scene::{Splats, to_linear};
 use crate::{Error, Result};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -111,7 +111,7 @@ fn document(splats: &Splats) -> (Value, Vec<u8>) {
 /// The base colour of a splat in linear light, as glTF's vertex colours are.
 fn linear(dc: f32) -> f32 {
     let v = (0.5 + SH_C0 * dc).clamp(0.0, 1.0);
-    if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
+    to_linear(v)
 }
 
 /// Attributes one after the other in one buffer.

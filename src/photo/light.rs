@@ -1,0 +1,156 @@
+//! What one photo's exposure, white balance and lens do to the scene's light, and how to take it out.
+use crate::scene::{RgbImage, to_linear, to_srgb};
+use rayon::prelude::*;
+use serde::Serialize;
+
+/// A photo shows `gain[c] · exp(falloff[0] r² + falloff[1] r⁴)` times the scene's light, in linear light; r is the
+/// distance from the image centre in half diagonals, 1 in the corners.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Light {
+    /// Per channel; 1 = the scene's light.
+    pub gain: [f64; 3],
+    /// Vignetting as ln per r² and r⁴; 0 = none.
+    pub falloff: [f64; 2],
+    /// One standard deviation of the exposure, EV; 0 where nothing was estimated.
+    pub doubt_ev: f64,
+    /// One standard deviation of the corner's brightness, as a share of it; 0 where nothing was estimated.
+    pub doubt_corner: f64,
+}
+
+impl Default for Light {
+    fn default() -> Self {
+        Light::NONE
+    }
+}
+
+impl Light {
+    /// The scene's own light: nothing to take out.
+    pub const NONE: Light = Light { gain: [1.0; 3], falloff: [0.0; 2], doubt_ev: 0.0, doubt_corner: 0.0 };
+
+    /// True where the photo is left as it is.
+    pub fn is_none(&self) -> bool {
+        self.gain == [1.0; 3] && self.falloff == [0.0; 2]
+    }
+
+    /// Exposure against the scene's light, EV: the mean over the channels in log light.
+    pub fn exposure_ev(&self) -> f64 {
+        self.gain.iter().map(|g| g.log2()).sum::<f64>() / 3.0
+    }
+
+    /// Red and blue against green, 1 = as the scene's light.
+    pub fn white_balance(&self) -> [f64; 2] {
+        [self.gain[0] / self.gain[1], self.gain[2] / self.gain[1]]
+    }
+
+    /// Brightness in the corners as a share of the centre's.
+    pub fn corner(&self) -> f64 {
+        (self.falloff[0] + self.falloff[1]).exp()
+    }
+
+    /// "+0.31 EV, red +3 %, blue −2 %, corners −17 %": what is not zero at this precision; empty for [`Light::NONE`].
+    pub fn summary(&self) -> String {
+        let percent = |v: f64| (100.0 * (v - 1.0)).round();
+        let signed = |v: f64| if v < 0.0 { format!("−{}", -v) } else { format!("+{v}") };
+        let ev = (100.0 * self.exposure_ev()).round() / 100.0;
+        let mut parts = Vec::new();
+        if ev != 0.0 {
+            parts.push(format!("{} EV", signed(ev)));
+        }
+        let [red, blue] = self.white_balance().map(percent);
+        for (name, value) in [("red", red), ("blue", blue), ("corners", percent(self.corner()))] {
+            if value != 0.0 {
+                parts.push(format!("{name} {} %", signed(value)));
+            }
+        }
+        parts.join(", ")
+    }
+
+    /// ln of the vignetting at r².
+    fn ln_vignetting(&self, r2: f64) -> f64 {
+        (self.falloff[0] + self.falloff[1] * r2) * r2
+    }
+
+    /// The image in the scene's light. Values may exceed 1: where the photo is brighter than the scene's light would
+    /// make it, nothing is lost by that.
+    pub fn removed(&self, image: &RgbImage) -> RgbImage {
+        self.scaled(image, -1.0)
+    }
+
+    /// An image in the scene's light as this photo shows it.
+    pub fn applied(&self, image: &RgbImage) -> RgbImage {
+        self.scaled(image, 1.0)
+    }
+
+    fn scaled(&self, image: &RgbImage, sign: f64) -> RgbImage {
+        if self.is_none() {
+            return image.clone();
+        }
+        let size = (image.width, image.height);
+        let gains = self.gain.map(|g| g.powf(sign));
+        let mut out = image.clone();
+        out.data.par_chunks_mut(image.width.max(1)).enumerate().for_each(|(y, line)| {
+            for (x, colour) in line.iter_mut().enumerate() {
+                let lens = (sign * self.ln_vignetting(radius2(x as f64 + 0.5, y as f64 + 0.5, size))).exp();
+                for (v, g) in colour.iter_mut().zip(gains) {
+                    *v = to_srgb(to_linear(*v) * (g * lens) as f32);
+                }
+            }
+        });
+        out
+    }
+}
+
+/// Squared distance of a pixel position from the image centre, half diagonals.
+pub fn radius2(x: f64, y: f64, (width, height): (usize, usize)) -> f64 {
+    let (w, h) = (width as f64, height as f64);
+    ((2.0 * x - w).powi(2) + (2.0 * y - h).powi(2)) / (w * w + h * h)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picture() -> RgbImage {
+        let data = (0..40 * 30).map(|k| [(k % 40) as f32 / 39.0, (k / 40) as f32 / 29.0, 0.3]).collect();
+        RgbImage { width: 40, height: 30, data }
+    }
+
+    #[test]
+    fn light_goes_out_as_it_came_in() {
+        let light = Light { gain: [1.4, 0.7, 1.1], falloff: [-0.3, -0.1], ..Light::NONE };
+        let (image, lit) = (picture(), light.applied(&picture()));
+        let back = light.removed(&lit);
+        for (a, b) in back.data.iter().flatten().zip(image.data.iter().flatten()) {
+            // A few f32 roundings of two powers.
+            assert!((a - b).abs() < 1e-5, "{a} {b}");
+        }
+        // In linear light, the centre changes by the gain and the outermost pixel nearly by gain and corner.
+        let ratio = |x: usize, y: usize, c: usize| to_linear(lit.at(x, y)[c]) / to_linear(image.at(x, y)[c]);
+        assert!((ratio(20, 15, 2) - 1.1).abs() < 2e-3 && (ratio(20, 15, 0) - 1.4).abs() < 2e-3);
+        let r2 = radius2(39.5, 29.5, (40, 30));
+        let expected = 1.1 * (-0.3 * r2 - 0.1 * r2 * r2).exp();
+        assert!((ratio(39, 29, 2) as f64 - expected).abs() < 1e-4);
+        assert!((light.exposure_ev() - (1.4f64 * 0.7 * 1.1).log2() / 3.0).abs() < 1e-12);
+        assert!((light.corner() - (-0.4f64).exp()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_summary_names_what_is_there() {
+        let light = Light { gain: [1.1, 1.0, 0.95], falloff: [-0.2, 0.0], ..Light::NONE };
+        assert_eq!(light.summary(), "+0.02 EV, red +10 %, blue −5 %, corners −18 %");
+        assert_eq!(Light::NONE.summary(), "");
+    }
+
+    #[test]
+    fn no_light_changes_no_bit() {
+        assert_eq!(Light::NONE.removed(&picture()), picture());
+        assert!(Light::default().is_none());
+    }
+
+    #[test]
+    fn colours_above_one_are_kept() {
+        let light = Light { gain: [0.5; 3], ..Light::NONE };
+        let white = RgbImage { width: 1, height: 1, data: vec![[1.0; 3]] };
+        assert!((to_linear(light.removed(&white).data[0][0]) - 2.0).abs() < 1e-5);
+    }
+}

@@ -1,0 +1,108 @@
+//! Exposure, white balance and vignetting of the photos, from how bright they show the same points.
+//!
+//! In linear light, a matt point p looks as bright from every side, and photo v shows it as
+//! `ln I = ln a_p + ln gain_v + falloff · (r², r⁴)`. Differences between two photos of a point leave out a_p; what is left
+//! is a small linear problem, solved robustly because highlights and wrong matches are no matt points. The mean of the
+//! channels in log light gives exposure and vignetting, its differences to red and blue the white balance: these are
+//! separate problems, since texture that two views sample differently moves all channels together.
+mod sample;
+mod solve;
+#[cfg(test)]
+mod tests;
+
+use super::SparseModel;
+use crate::photo::{Light, Photo};
+use crate::progress::Progress;
+use rayon::prelude::*;
+use sample::pairs_of;
+use solve::{Solution, System, exposure};
+
+/// Difference in brightness left in parts of a photo, ln, that the user should know of: half an f-stop.
+const UNEXPLAINED: f64 = 0.35;
+/// Fewest points that tell light from content.
+const MIN_POINTS: usize = 50;
+
+/// What was found out about the light.
+#[derive(Clone, Debug, Default)]
+pub struct Found {
+    /// One per photo; all [`Light::NONE`] when nothing exceeds its doubt.
+    pub lights: Vec<Light>,
+    /// Per photo: ln difference to the other photos that is left in the tenth of its cells that fits worst.
+    pub unexplained: Vec<f64>,
+}
+
+/// The photos in one light, as far as exposure, white balance and vignetting explain the differences; warns of the rest.
+pub fn equalised(mut photos: Vec<Photo>, model: &SparseModel, progress: &dyn Progress) -> Vec<Photo> {
+    let found = estimate(&photos, model);
+    photos.par_iter_mut().zip(&found.lights).filter(|(_, light)| !light.is_none()).for_each(
+        |(photo, light)| {
+            photo.image = light.removed(&photo.image);
+            photo.light = *light;
+        },
+    );
+    let odd = photos.iter().zip(&found.unexplained).filter(|(_, left)| **left > UNEXPLAINED);
+    let odd: Vec<String> =
+        odd.map(|(p, left)| format!("{} (±{:.0} %)", p.stem, 100.0 * left.exp_m1())).collect();
+    if !odd.is_empty() {
+        progress.warn(&format!(
+            "parts of these photos are lit differently than in the others, beyond exposure, white balance and vignetting \
+             (flash, a moving shadow, highlights): {}; colours there are uncertain",
+            odd.join(", ")
+        ));
+    }
+    photos
+}
+
+/// Exposure, white balance and vignetting of placed photos.
+pub fn estimate(photos: &[Photo], model: &SparseModel) -> Found {
+    let none = Found { lights: vec![Light::NONE; photos.len()], unexplained: vec![0.0; photos.len()] };
+    let pairs = pairs_of(photos, model);
+    if photos.len() < 2 || pairs.iter().map(|p| p.share).sum::<f64>() < 0.5 * MIN_POINTS as f64 {
+        return none;
+    }
+    let lenses = lenses(photos);
+    let grey = System { pairs: &pairs, views: photos.len(), lenses: &lenses, channel: 0 };
+    let exposure = exposure(&grey);
+    let colour = [1, 2].map(|channel| System { channel, ..grey }.gains(exposure.reference));
+    let coloured = colour.iter().any(Solution::gains_matter);
+    let mut lights: Vec<Light> = (0..photos.len())
+        .map(|v| {
+            let [red, blue] = [0, 1].map(|k| if coloured { colour[k].gain[v] } else { 0.0 });
+            let e = exposure.gain[v];
+            Light {
+                gain: [e + red, e - red - blue, e + blue].map(f64::exp),
+                falloff: exposure.falloff[lenses[v]],
+                doubt_ev: exposure.doubt[v] / std::f64::consts::LN_2,
+                doubt_corner: exposure.corner_doubt[lenses[v]],
+            }
+        })
+        .collect();
+    if lights.iter().all(Light::is_none) {
+        lights = none.lights;
+    }
+    Found { unexplained: grey.unexplained(&exposure), lights }
+}
+
+/// Photos taken through the same lens share their vignetting: one size, camera and zoom. Group of every photo.
+fn lenses(photos: &[Photo]) -> Vec<usize> {
+    let zoom = |p: &Photo| p.exif_focal.map(|f| f / p.to_working.scale[1]);
+    // EXIF focal lengths of one zoom setting agree to rounding.
+    let near = |a: Option<f64>, b: Option<f64>| match (a, b) {
+        (Some(a), Some(b)) => (a / b - 1.0).abs() < 0.03,
+        (a, b) => a.is_none() && b.is_none(),
+    };
+    let size =
+        |p: &Photo| (p.original_size.0.max(p.original_size.1), p.original_size.0.min(p.original_size.1));
+    let alike = |a: &Photo, b: &Photo| {
+        size(a) == size(b) && a.camera_model == b.camera_model && near(zoom(a), zoom(b))
+    };
+    let mut firsts: Vec<usize> = Vec::new();
+    (0..photos.len())
+        .map(|v| {
+            firsts.iter().position(|f| alike(&photos[*f], &photos[v])).unwrap_or_else(|| {
+                firsts.push(v);
+                firsts.len() - 1
+            })
+        })
+        .collect()
+}

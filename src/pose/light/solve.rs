@@ -1,0 +1,221 @@
+//! Gains and vignetting from differences of brightness: robust linear least squares with honest doubts.
+use super::sample::Pair;
+use crate::pose::numeric::{cauchy_weight, median, quantile};
+use nalgebra::{DMatrix, DVector};
+use std::collections::BTreeMap;
+
+/// Prior σ of ln gain: four photos in a thousand are farther apart than 3 EV; it only holds photos without points.
+const GAIN_PRIOR: f64 = 1.0;
+/// Prior σ of the vignetting terms: open lenses lose about a third in the corners.
+const FALLOFF_PRIOR: [f64; 2] = [0.3, 0.15];
+/// Cauchy scale in standard deviations: 95 % efficiency on Gaussian noise (Holland & Welsch 1977).
+const CAUCHY: f64 = 2.385;
+/// Rounds of re-weighting; the estimate moves by less than its doubt after five.
+const ROUNDS: usize = 12;
+/// Doubts that an effect must exceed before it is taken out.
+const SIGNIFICANT: f64 = 4.0;
+/// Smallest exposure or colour difference worth touching photos for, ln.
+const LEAST_GAIN: f64 = 0.01;
+/// Smallest loss in the corners worth touching photos for, ln.
+const LEAST_FALLOFF: f64 = 0.03;
+
+/// One of the three linear problems.
+#[derive(Clone, Copy)]
+pub(super) struct System<'a> {
+    pub(super) pairs: &'a [Pair],
+    pub(super) views: usize,
+    /// Lens of every view.
+    pub(super) lenses: &'a [usize],
+    /// Which difference is explained: 0 = brightness, 1 = red, 2 = blue.
+    pub(super) channel: usize,
+}
+
+/// Which unknowns are estimated; the others are 0.
+#[derive(Clone, Debug, PartialEq)]
+struct Free {
+    gains: bool,
+    /// Per lens.
+    falloff: Vec<bool>,
+}
+
+/// Unknowns of a [`System`] with one standard deviation each.
+#[derive(Clone, Debug)]
+pub(super) struct Solution {
+    /// ln, per view.
+    pub(super) gain: Vec<f64>,
+    pub(super) doubt: Vec<f64>,
+    /// Per lens.
+    pub(super) falloff: Vec<[f64; 2]>,
+    pub(super) corner_doubt: Vec<f64>,
+    pub(super) reference: usize,
+}
+
+impl Solution {
+    pub(super) fn gains_matter(&self) -> bool {
+        self.gain.iter().zip(&self.doubt).any(|(g, d)| g.abs() > LEAST_GAIN.max(SIGNIFICANT * d))
+    }
+
+    /// Per lens: darker corners than chance explains. Brighter ones are no vignetting.
+    fn falloff_matters(&self) -> Vec<bool> {
+        let corner = self.falloff.iter().map(|f| f[0] + f[1]);
+        corner.zip(&self.corner_doubt).map(|(v, d)| -v > LEAST_FALLOFF.max(SIGNIFICANT * d)).collect()
+    }
+}
+
+/// Exposure and vignetting, each only if it exceeds its doubt. The photo of median exposure is the reference: its light is
+/// the scene's, so that the scene looks as one of the photos and few values leave the range of the files.
+pub(super) fn exposure(system: &System) -> Solution {
+    let lenses = system.lenses.iter().max().map_or(0, |l| l + 1);
+    let mut free = Free { gains: true, falloff: vec![true; lenses] };
+    let first = system.solve(&free, 0);
+    let mut order: Vec<usize> = (0..system.views).collect();
+    order.sort_by(|a, b| first.gain[*a].total_cmp(&first.gain[*b]));
+    // Of two middle ones the darker: the brighter photos then lose nothing when they are darkened to it.
+    let reference = order[(system.views - 1) / 2];
+    let mut found = system.solve(&free, reference);
+    free.falloff = found.falloff_matters();
+    if free.falloff.contains(&false) {
+        found = system.solve(&free, reference);
+    }
+    if !found.gains_matter() {
+        free.gains = false;
+        found = system.solve(&free, reference);
+    }
+    found
+}
+
+impl System<'_> {
+    pub(super) fn gains(&self, reference: usize) -> Solution {
+        let lenses = self.lenses.iter().max().map_or(0, |l| l + 1);
+        self.solve(&Free { gains: true, falloff: vec![false; lenses] }, reference)
+    }
+
+    /// Columns that a pair touches, with their coefficients.
+    fn row(&self, pair: &Pair, column: &Columns) -> Vec<(usize, f64)> {
+        let mut row = Vec::with_capacity(6);
+        for (k, sign) in [(0, 1.0), (1, -1.0)] {
+            let view = pair.views[k];
+            row.extend(column.gain[view].map(|c| (c, sign)));
+            if let Some(c) = column.falloff[self.lenses[view]] {
+                row.extend([(c, sign * pair.r[k][0]), (c + 1, sign * pair.r[k][1])]);
+            }
+        }
+        row
+    }
+
+    fn variance(&self, pair: &Pair) -> f64 {
+        pair.variance[self.channel.min(1)]
+    }
+
+    /// Re-weighted least squares; doubts from the spread of the cells' votes (the sandwich estimator for clusters, Liang &
+    /// Zeger 1986), since residuals within a cell have causes in common.
+    fn solve(&self, free: &Free, reference: usize) -> Solution {
+        let columns = Columns::new(free, self.views, reference);
+        let rows: Vec<_> = self.pairs.iter().map(|p| self.row(p, &columns)).collect();
+        let mut x = DVector::zeros(columns.prior.len());
+        let (mut h, mut residuals) = (DMatrix::from_diagonal(&columns.prior), Vec::new());
+        let mut weights = vec![0.0; rows.len()];
+        for _ in 0..ROUNDS {
+            residuals = self.residuals(&rows, &x);
+            let mut sizes: Vec<f64> =
+                self.pairs.iter().zip(&residuals).map(|(p, r)| r.abs() / self.variance(p).sqrt()).collect();
+            // 1.4826 median |u| is σ of Gaussian u; below a tenth of the expected noise the model is exact.
+            let scale = (1.4826 * median(&mut sizes).unwrap_or(1.0)).max(0.1);
+            h = DMatrix::from_diagonal(&columns.prior);
+            let mut g = DVector::zeros(x.len());
+            for (((pair, row), r), weight) in self.pairs.iter().zip(&rows).zip(&residuals).zip(&mut weights) {
+                let variance = scale * scale * self.variance(pair);
+                *weight = pair.share * cauchy_weight(r * r / variance, CAUCHY) / variance;
+                for (a, ca) in row {
+                    g[*a] += *weight * ca * pair.difference[self.channel];
+                    for (b, cb) in row {
+                        h[(*a, *b)] += *weight * ca * cb;
+                    }
+                }
+            }
+            let Some(factor) = h.clone().cholesky() else { break };
+            x = factor.solve(&g);
+        }
+        let mut votes: BTreeMap<(usize, usize), DVector<f64>> = BTreeMap::new();
+        for (((pair, row), r), weight) in self.pairs.iter().zip(&rows).zip(&residuals).zip(&weights) {
+            let vote = votes.entry((pair.views[0], pair.cells[0])).or_insert_with(|| DVector::zeros(x.len()));
+            row.iter().for_each(|(a, c)| vote[*a] += weight * r * c);
+        }
+        let spread = votes.len() as f64 / (votes.len() as f64 - 1.0).max(1.0);
+        let mut middle = DMatrix::from_diagonal(&columns.prior);
+        votes.values().for_each(|v| middle += spread * v * v.transpose());
+        let covariance = h.try_inverse().map(|i| &i * middle * &i);
+        columns.solution(&x, covariance.as_ref(), reference)
+    }
+
+    fn residuals(&self, rows: &[Vec<(usize, f64)>], x: &DVector<f64>) -> Vec<f64> {
+        let of = |(p, row): (&Pair, &Vec<(usize, f64)>)| {
+            p.difference[self.channel] - row.iter().map(|(a, c)| c * x[*a]).sum::<f64>()
+        };
+        self.pairs.iter().zip(rows).map(of).collect()
+    }
+
+    /// Per view: the |ln| difference to the others that is left, in the tenth of its cells that fits worst. A cell takes
+    /// the median of its pairs, so that noise and single highlights do not count.
+    pub(super) fn unexplained(&self, found: &Solution) -> Vec<f64> {
+        let mut cells: BTreeMap<(usize, usize), Vec<f64>> = BTreeMap::new();
+        for p in self.pairs {
+            let shown = |k: usize| {
+                let f = found.falloff[self.lenses[p.views[k]]];
+                found.gain[p.views[k]] + f[0] * p.r[k][0] + f[1] * p.r[k][1]
+            };
+            let left = p.difference[self.channel] - shown(0) + shown(1);
+            cells.entry((p.views[0], p.cells[0])).or_default().push(left);
+            cells.entry((p.views[1], p.cells[1])).or_default().push(-left);
+        }
+        let mut per_view = vec![Vec::new(); self.views];
+        for ((view, _), mut left) in cells {
+            // Fewer pairs have no median to speak of.
+            if left.len() >= 5 {
+                per_view[view].extend(median(&mut left).map(f64::abs));
+            }
+        }
+        per_view.iter_mut().map(|v| quantile(v, 0.9).unwrap_or(0.0)).collect()
+    }
+}
+
+/// Where the unknowns stand.
+struct Columns {
+    gain: Vec<Option<usize>>,
+    falloff: Vec<Option<usize>>,
+    /// 1 / prior variance.
+    prior: DVector<f64>,
+}
+
+impl Columns {
+    fn new(free: &Free, views: usize, reference: usize) -> Columns {
+        let mut prior: Vec<f64> = Vec::new();
+        let mut take = |wanted: bool, sigmas: &[f64]| {
+            wanted.then(|| {
+                prior.extend(sigmas.iter().map(|s| 1.0 / (s * s)));
+                prior.len() - sigmas.len()
+            })
+        };
+        let gain = (0..views).map(|v| take(free.gains && v != reference, &[GAIN_PRIOR])).collect();
+        let falloff = free.falloff.iter().map(|f| take(*f, &FALLOFF_PRIOR)).collect();
+        Columns { gain, falloff, prior: DVector::from_vec(prior) }
+    }
+
+    fn solution(&self, x: &DVector<f64>, covariance: Option<&DMatrix<f64>>, reference: usize) -> Solution {
+        let variance = |a: usize, b: usize| covariance.map_or(f64::INFINITY, |c| c[(a, b)]);
+        let gain = |c: &Option<usize>| c.map_or(0.0, |c| x[c]);
+        let falloff = |c: &Option<usize>| c.map_or([0.0; 2], |c| [x[c], x[c + 1]]);
+        let corner = |c: &Option<usize>| {
+            c.map_or(0.0, |c| {
+                (variance(c, c) + 2.0 * variance(c, c + 1) + variance(c + 1, c + 1)).max(0.0).sqrt()
+            })
+        };
+        Solution {
+            gain: self.gain.iter().map(gain).collect(),
+            doubt: self.gain.iter().map(|c| c.map_or(0.0, |c| variance(c, c).max(0.0).sqrt())).collect(),
+            falloff: self.falloff.iter().map(falloff).collect(),
+            corner_doubt: self.falloff.iter().map(corner).collect(),
+            reference,
+        }
+    }
+}

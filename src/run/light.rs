@@ -1,0 +1,65 @@
+//! What run.json, the report and the closing table say about the light that was taken out of the photos.
+use crate::photo::{Light, Photo};
+use serde_json::{Value, json};
+
+/// Per photo, for run.json; `None` where every photo was left as it is.
+pub(super) fn record(photos: &[Photo]) -> Option<Value> {
+    let one = |p: &Photo| {
+        let Light { gain, falloff, doubt_ev, doubt_corner } = p.light;
+        json!({
+            "photo": p.stem, "exposure_ev": p.light.exposure_ev(), "exposure_doubt_ev": doubt_ev,
+            "red_to_green": gain[0] / gain[1], "blue_to_green": gain[2] / gain[1],
+            "corner": p.light.corner(), "corner_doubt": doubt_corner, "gain": gain, "falloff": falloff,
+        })
+    };
+    taken(photos).then(|| photos.iter().map(one).collect())
+}
+
+/// A line of the closing table: the range over the photos.
+pub(super) fn figure(photos: &[Photo]) -> Option<(String, String)> {
+    if !taken(photos) {
+        return None;
+    }
+    let range = |of: &dyn Fn(&Light) -> f64| {
+        let values = photos.iter().map(|p| of(&p.light));
+        values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)))
+    };
+    let (dark, bright) = range(&Light::exposure_ev);
+    let doubt = range(&|l| l.doubt_ev).1;
+    let colour = |k: usize| {
+        let (low, high) = range(&|l| l.white_balance()[k]);
+        100.0 * (high / low - 1.0)
+    };
+    let corner = 100.0 * (1.0 - range(&Light::corner).0);
+    let text = format!(
+        "exposures {:.2} ± {doubt:.2} EV apart, colours {:.0} %, corners −{corner:.0} %: evened out",
+        bright - dark,
+        colour(0).max(colour(1)),
+    );
+    Some(("light".to_owned(), text))
+}
+
+fn taken(photos: &[Photo]) -> bool {
+    photos.iter().any(|p| !p.light.is_none())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::RgbImage;
+
+    #[test]
+    fn only_light_that_was_taken_out_is_told() {
+        let image = RgbImage { width: 64, height: 64, data: vec![[0.5; 3]; 64 * 64] };
+        let photo = |name: &str| crate::photo::from_pixels(name.as_ref(), &image, None).unwrap();
+        let mut photos = vec![photo("a.png"), photo("b.png")];
+        assert!(record(&photos).is_none() && figure(&photos).is_none());
+        photos[1].light =
+            Light { gain: [2.2, 2.0, 2.0], falloff: [-0.2, 0.0], doubt_ev: 0.04, doubt_corner: 0.01 };
+        let json = record(&photos).unwrap();
+        assert_eq!((&json[0]["exposure_ev"], &json[1]["photo"]), (&json!(0.0), &json!("b")));
+        assert!((json[1]["corner"].as_f64().unwrap() - (-0.2f64).exp()).abs() < 1e-12);
+        let text = figure(&photos).unwrap().1;
+        assert_eq!(text, "exposures 1.05 ± 0.04 EV apart, colours 10 %, corners −18 %: evened out");
+    }
+}
