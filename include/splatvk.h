@@ -417,11 +417,11 @@ typedef struct {
      */
     const char *name;
     /*
-     JPEG or PNG file; with SvkTrainOptions.views a folder of them, too.
+     Image file (JPEG, PNG, HEIC, AVIF, WebP, TIFF); with SvkTrainOptions.views a folder of them, too.
      */
     const char *path;
     /*
-     A JPEG or PNG file in memory.
+     Such an image file in memory.
      */
     const uint8_t *encoded;
     /*

@@ -108,7 +108,7 @@ pub struct DeviceArgs {
 /// `splatvk run`
 #[derive(Debug, Args)]
 pub struct RunArgs {
-    /// Photos, or folders of photos (JPEG, PNG)
+    /// Photos, or folders of photos (JPEG, PNG, HEIC, AVIF, WebP, TIFF)
     #[arg(required = true, value_name = "INPUT")]
     pub inputs: Vec<PathBuf>,
     /// How many photos to use, spread over the sorted names

@@ -4,6 +4,8 @@ mod choose;
 mod decode;
 mod exif_tags;
 mod frame;
+mod heif;
+mod kind;
 pub mod light;
 mod resize;
 mod straighten;
@@ -24,6 +26,11 @@ use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+
+/// What the machine has for HEIC and AVIF photos, in words, and what to do about what it lacks.
+pub fn heif_support() -> (String, Option<String>) {
+    heif::status()
+}
 
 /// Greatest height of the working image, pixels (ALGORITHMS 1.2).
 pub const WORKING_HEIGHT: usize = 1080;
@@ -96,7 +103,7 @@ pub fn load(path: &Path) -> Result<Photo> {
     from_bytes(path, bytes)
 }
 
-/// [`load`] of a JPEG or PNG file that is in memory already; `name` stands for its path.
+/// [`load`] of an image file that is in memory already; `name` stands for its path.
 pub fn from_bytes(name: &Path, bytes: Vec<u8>) -> Result<Photo> {
     let decoded = decode::decode(bytes, name)?;
     let photo = working(name, decoded.size, |x, y| decoded.at(x, y))?;
@@ -183,7 +190,7 @@ pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progres
     if let Some(first) = found.ignored.first() {
         let more = found.ignored.len() - 1;
         let others = if more > 0 { format!(" and {more} more") } else { String::new() };
-        progress.warn(&format!("not a JPEG or PNG photo, ignored: {}{others}", first.display()));
+        progress.warn(&format!("not a photo that can be read, ignored: {}{others}", first.display()));
     }
     let paths = choose(&found.photos, views)?;
     if views.is_none() && paths.len() < found.photos.len() {
