@@ -550,6 +550,11 @@ typedef struct {
      Given to `progress`.
      */
     void *user;
+    /*
+     Longer side of the working images, pixels: larger photos are scaled down, none is enlarged. 0 = 800 on a CPU device,
+     1600 on a GPU.
+     */
+    uint64_t max_size;
 } SvkTrainOptions;
 
 /*

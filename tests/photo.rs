@@ -55,12 +55,12 @@ fn a_tall_photo_is_scaled_with_its_focal_and_orientation() {
 
     let photo = photo::load(&path).unwrap();
     assert_eq!(photo.original_size, (1200, 2000));
-    assert_eq!((photo.image.width, photo.image.height), (648, 1080));
-    assert!(photo.image.at(324, 20)[0] > 0.8 && photo.image.at(324, 1060)[2] > 0.8, "upright");
-    let expected = 28.0 / 43.2666 * 1200f64.hypot(2000.0) * 0.54;
+    assert_eq!((photo.image.width, photo.image.height), (960, 1600));
+    assert!(photo.image.at(480, 20)[0] > 0.8 && photo.image.at(480, 1580)[2] > 0.8, "upright");
+    let expected = 28.0 / 43.2666 * 1200f64.hypot(2000.0) * 0.8;
     assert!((photo.exif_focal.unwrap() - expected).abs() < 0.1);
     assert_eq!(photo.camera_model.as_deref(), Some("Phone"));
-    assert_eq!(photo.to_working.apply([1200.0, 2000.0]), [648.0, 1080.0]);
+    assert_eq!(photo.to_working.apply([1200.0, 2000.0]), [960.0, 1600.0]);
 }
 
 /// A photo that a decoder of the system must read.

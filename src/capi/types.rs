@@ -263,6 +263,9 @@ pub struct SvkTrainOptions {
     pub progress: SvkProgressFunction,
     /// Given to `progress`.
     pub user: *mut c_void,
+    /// Longer side of the working images, pixels: larger photos are scaled down, none is enlarged. 0 = 800 on a CPU device,
+    /// 1600 on a GPU.
+    pub max_size: u64,
 }
 
 /// What a scene holds.

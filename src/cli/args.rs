@@ -166,6 +166,9 @@ pub struct RunArgs {
     /// One model per level as in the paper, instead of one geometry for all three
     #[arg(long)]
     pub per_level: bool,
+    /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged [default: 800 on a CPU device, 1600 on a GPU]
+    #[arg(long, value_name = "N")]
+    pub max_size: Option<usize>,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -195,6 +198,9 @@ pub struct TrainArgs {
     /// Optimisation steps, instead of the preset's
     #[arg(long, value_name = "N")]
     pub iterations: Option<usize>,
+    /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged [default: 800 on a CPU device, 1600 on a GPU]
+    #[arg(long, value_name = "N")]
+    pub max_size: Option<usize>,
     /// Seed of everything random
     #[arg(long, default_value_t = 0)]
     pub seed: u64,

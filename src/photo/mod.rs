@@ -32,8 +32,18 @@ pub fn heif_support() -> (String, Option<String>) {
     heif::status()
 }
 
-/// Greatest height of the working image, pixels (ALGORITHMS 1.2).
-pub const WORKING_HEIGHT: usize = 1080;
+/// Greatest side of a working image on a GPU, pixels: where the reference implementation of Gaussian splatting stops (Kerbl
+/// et al. 2023 scale wider photos down to it). A portrait keeps as many pixels as the same photo lying on its side.
+pub const MAX_SIZE: usize = 1600;
+
+/// Greatest side of a working image on a CPU device, pixels: photos of 4:3 then have 1.56 times the pixels of 640 × 480,
+/// which keeps a run within twice its time (docs/performance.md).
+pub const MAX_SIZE_CPU: usize = 800;
+
+/// The greatest side that suits the device.
+pub fn default_max_size(is_cpu: bool) -> usize {
+    if is_cpu { MAX_SIZE_CPU } else { MAX_SIZE }
+}
 
 /// Smallest side of a usable photo, pixels: feature networks work at 1/8 resolution, below 8 × 8 cells nothing is left
 /// to match.
@@ -95,25 +105,31 @@ impl Photo {
     }
 }
 
-/// Reads one photo: EXIF orientation applied, alpha composited on black, height at most [`WORKING_HEIGHT`].
+/// [`load_at`] with [`MAX_SIZE`].
 pub fn load(path: &Path) -> Result<Photo> {
+    load_at(path, MAX_SIZE)
+}
+
+/// Reads one photo: EXIF orientation applied, alpha composited on black, scaled down to `max_size` pixels along its longer
+/// side if it is larger.
+pub fn load_at(path: &Path, max_size: usize) -> Result<Photo> {
     let bytes = std::fs::read(path).map_err(|e| {
         Error::input(format!("{}: {e}; check the name and that you may read it", path.display()))
     })?;
-    from_bytes(path, bytes)
+    from_bytes(path, bytes, max_size)
 }
 
-/// [`load`] of an image file that is in memory already; `name` stands for its path.
-pub fn from_bytes(name: &Path, bytes: Vec<u8>) -> Result<Photo> {
+/// [`load_at`] of an image file that is in memory already; `name` stands for its path.
+pub fn from_bytes(name: &Path, bytes: Vec<u8>, max_size: usize) -> Result<Photo> {
     let decoded = decode::decode(bytes, name)?;
-    let photo = working(name, decoded.size, |x, y| decoded.at(x, y))?;
-    // The two scales differ by the rounding of the size only; the height is the exact one.
+    let photo = working(name, decoded.size, max_size, |x, y| decoded.at(x, y))?;
+    // The two scales differ by the rounding of the size only.
     let exif_focal = decoded.lens.focal.map(|f| f * photo.to_working.scale[1]);
     Ok(Photo { exif_focal, camera_model: decoded.lens.camera_model, ..photo })
 }
 
 /// A photo from upright sRGB pixels in [0, 1]; `focal` is in their pixels, where it is known.
-pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>) -> Result<Photo> {
+pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>, max_size: usize) -> Result<Photo> {
     if image.data.len() != image.width * image.height {
         return Err(Error::input(format!(
             "{}: {} pixels do not make {} × {}",
@@ -123,7 +139,7 @@ pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>) -> Result<
             image.height
         )));
     }
-    let photo = working(name, (image.width, image.height), |x, y| image.at(x, y))?;
+    let photo = working(name, (image.width, image.height), max_size, |x, y| image.at(x, y))?;
     Ok(Photo { exif_focal: focal.map(|f| f * photo.to_working.scale[1]), ..photo })
 }
 
@@ -131,6 +147,7 @@ pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>) -> Result<
 fn working(
     name: &Path,
     (w, h): (usize, usize),
+    max_size: usize,
     at: impl Fn(usize, usize) -> [f32; 3] + Sync,
 ) -> Result<Photo> {
     if w.min(h) < SMALLEST_SIDE {
@@ -139,7 +156,7 @@ fn working(
             name.display()
         )));
     }
-    let (working_w, working_h) = working_size(w, h);
+    let (working_w, working_h) = working_size(w, h, max_size);
     let mut image = resize::area_average((w, h), (working_w, working_h), &at);
     let fine = fine((w, h), (working_w, working_h), &at);
     let frame = Frame::of(&image);
@@ -175,17 +192,32 @@ fn fine(
         .then(|| Arc::new(resize::area_average((w, h), size, at).luma()))
 }
 
-/// Working (width, height) of an upright size: the height is capped, sizes truncated (ALGORITHMS 1.2).
-fn working_size(w: usize, h: usize) -> (usize, usize) {
-    if h <= WORKING_HEIGHT {
+/// Working (width, height) of a photo of that size: the longer side is capped, the other one rounded. Never larger than
+/// the photo, and its shorter side never below [`SMALLEST_SIDE`]: a panorama keeps what the networks need.
+pub fn working_size(w: usize, h: usize, max_size: usize) -> (usize, usize) {
+    let (long, short) = (w.max(h), w.min(h));
+    let floor = (SMALLEST_SIDE * long).div_ceil(short.max(1));
+    let target = max_size.max(floor);
+    if long <= target {
         return (w, h);
     }
-    ((w * WORKING_HEIGHT / h).max(1), WORKING_HEIGHT)
+    let scaled = |side: usize| ((side * target + long / 2) / long).max(1);
+    (scaled(w), scaled(h))
 }
 
-/// Finds, chooses and reads the photos of a run; refuses sets that cannot give geometry (the same photo twice) or that
-/// would mix up files (the same name twice).
+/// [`load_all_at`] with [`MAX_SIZE`].
 pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progress) -> Result<Vec<Photo>> {
+    load_all_at(inputs, views, MAX_SIZE, progress)
+}
+
+/// Finds, chooses and reads the photos of a run, each scaled down to `max_size` where it is larger; refuses sets that cannot give geometry (the same photo twice) or that
+/// would mix up files (the same name twice).
+pub fn load_all_at(
+    inputs: &[PathBuf],
+    views: Option<usize>,
+    max_size: usize,
+    progress: &dyn Progress,
+) -> Result<Vec<Photo>> {
     let found = find(inputs)?;
     if let Some(first) = found.ignored.first() {
         let more = found.ignored.len() - 1;
@@ -204,7 +236,7 @@ pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progres
     let done = AtomicU64::new(0);
     let one = |path: &PathBuf| {
         progress.check()?;
-        let photo = load(path)?;
+        let photo = load_at(path, max_size)?;
         progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
         Ok(photo)
     };
@@ -252,10 +284,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_height_is_capped_and_sizes_truncated() {
-        assert_eq!(working_size(640, 480), (640, 480));
-        assert_eq!(working_size(1920, 1080), (1920, 1080));
-        assert_eq!(working_size(4032, 3024), (1440, 1080));
-        assert_eq!(working_size(3024, 4033), (809, 1080));
+    fn the_longer_side_is_capped_and_nothing_is_enlarged() {
+        assert_eq!(working_size(640, 480, 800), (640, 480));
+        assert_eq!(working_size(800, 800, 800), (800, 800));
+        assert_eq!(working_size(4032, 3024, 800), (800, 600));
+        assert_eq!(working_size(3024, 4032, 800), (600, 800));
+        assert_eq!(working_size(4032, 3024, MAX_SIZE), (1600, 1200));
+        assert_eq!(working_size(4032, 3024, usize::MAX / 8192), (4032, 3024));
+        // A panorama keeps a usable height.
+        assert_eq!(working_size(8000, 1200, 800), (800, 120));
+        assert_eq!(working_size(12000, 400, 800), (1920, 64));
     }
 }

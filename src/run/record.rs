@@ -49,6 +49,7 @@ fn statistics(o: &Outcome) -> serde_json::Value {
         .collect();
     json!({
         "photos": o.photos.iter().map(|p| p.path.display().to_string()).collect::<Vec<_>>(),
+        "working_sizes": working_sizes(&o.photos),
         "geometry": {
             "method": o.geometry.method, "points": o.geometry.points.len(),
             "focal_px": o.cameras.iter().map(|c| c.fx).collect::<Vec<_>>(),
@@ -145,6 +146,7 @@ fn figures(o: &Outcome) -> Vec<(String, String)> {
     let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
     let mut list = vec![
         ("device".to_owned(), format!("{}{cpu}", o.device.name)),
+        ("photos".to_owned(), sizes(&o.photos)),
         ("splats".to_owned(), o.splats.len().to_string()),
         ("train PSNR".to_owned(), format!("{:.2} dB", o.rgb.mean_psnr())),
     ];
@@ -159,6 +161,33 @@ fn figures(o: &Outcome) -> Vec<(String, String)> {
         list.push((format!("“{}”", a.text), format!("found in {} of {} photos", a.found(), a.views.len())));
     }
     list
+}
+
+/// Per photo its working and its original (width, height).
+pub(super) fn working_sizes(photos: &[Photo]) -> serde_json::Value {
+    let size = |p: &Photo| json!({ "working": [p.image.width, p.image.height], "original": [p.original_size.0, p.original_size.1] });
+    photos.iter().map(size).collect()
+}
+
+/// How many photos were used, at which size, and how to change that where they were scaled down.
+pub(super) fn sizes(photos: &[Photo]) -> String {
+    let mut pairs: Vec<(usize, usize, u32, u32)> = Vec::new();
+    for p in photos {
+        let pair = (p.image.width, p.image.height, p.original_size.0, p.original_size.1);
+        if !pairs.contains(&pair) {
+            pairs.push(pair);
+        }
+    }
+    let scaled = |p: &(usize, usize, u32, u32)| (p.0, p.1) != (p.2 as usize, p.3 as usize);
+    let one = |p: &(usize, usize, u32, u32)| match scaled(p) {
+        true => format!("{} × {} of {} × {}", p.0, p.1, p.2, p.3),
+        false => format!("{} × {}", p.0, p.1),
+    };
+    // More than a few sizes would not fit a line; run.json has them all.
+    let shown: Vec<String> = pairs.iter().take(3).map(one).collect();
+    let more = if pairs.len() > 3 { ", …" } else { "" };
+    let hint = if pairs.iter().any(scaled) { " (--max-size changes it)" } else { "" };
+    format!("{} at {}{more}{hint}", photos.len(), shown.join(", "))
 }
 
 /// The table that ends `splatvk run`.
