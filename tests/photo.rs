@@ -103,7 +103,7 @@ fn damaged_heic_is_one_line() {
     for name in ["turned.heic", "small.avif"] {
         let whole = std::fs::read(data(&format!("photos/{name}"))).unwrap();
         for cut in (0..whole.len()).step_by(53) {
-            let e = photo::from_bytes(Path::new(name), whole[..cut].to_vec());
+            let e = photo::from_bytes(Path::new(name), whole[..cut].to_vec(), photo::MAX_SIZE);
             let e = e.err().unwrap_or_else(|| panic!("{name} cut at {cut} of {} was read", whole.len()));
             let message = e.to_string();
             assert_eq!((e.exit_code(), message.lines().count()), (2, 1), "{message}");
