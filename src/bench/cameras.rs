@@ -7,6 +7,7 @@ use crate::pose::relative::{auc, pair_errors};
 use crate::pose::{self, Placed};
 use crate::progress::Progress;
 use crate::query::eval::{Frame, GroundTruth, Split, StatedLens};
+use crate::scene::Lens;
 use crate::{Error, Result};
 use serde::Serialize;
 use std::fmt::Write;
@@ -58,6 +59,8 @@ pub struct CameraFigures {
     pub auc: [Option<f64>; 3],
     /// Worst offset of the principal point from the true one, over the width.
     pub principal_point: f64,
+    /// The lens that was found, of the first photo.
+    pub lens: Lens,
     /// The true lens, if the data state it.
     pub true_lens: Option<StatedLens>,
 }
@@ -81,12 +84,22 @@ pub struct CameraReport {
     pub mean_auc: [Option<f64>; 3],
 }
 
+/// What of the photos is used.
+#[derive(Clone, Copy, Debug)]
+pub struct Reading {
+    /// Longer side of the working image, pixels.
+    pub max_size: usize,
+    /// Only the working image, as if the files were no larger.
+    pub copies: bool,
+}
+
 /// Degrees up to which recall is added up.
 const AUC_DEGREES: [f64; 3] = [3.0, 5.0, 30.0];
 
 /// Finds the cameras of every set's train frames, by themselves.
 pub fn measure(
     sets: &[PathBuf],
+    reading: Reading,
     registry: &Registry,
     progress: &dyn Progress,
     done: &mut dyn FnMut(&CameraRow) -> Result<()>,
@@ -94,17 +107,22 @@ pub fn measure(
     let truths = sets.iter().map(|s| GroundTruth::read(s)).collect::<Result<Vec<_>>>()?;
     let mut rows = Vec::new();
     for truth in &truths {
-        let row = one(truth, registry, progress)?;
+        let row = one(truth, reading, registry, progress)?;
         done(&row)?;
         rows.push(row);
     }
     Ok(together(rows))
 }
 
-fn one(truth: &GroundTruth, registry: &Registry, progress: &dyn Progress) -> Result<CameraRow> {
+fn one(
+    truth: &GroundTruth,
+    reading: Reading,
+    registry: &Registry,
+    progress: &dyn Progress,
+) -> Result<CameraRow> {
     let frames: Vec<&Frame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
     let clock = Instant::now();
-    let found = placed(&truth.folder, &frames, registry, progress);
+    let found = placed(&truth.folder, &frames, reading, registry, progress);
     let seconds = clock.elapsed().as_secs_f64();
     let outcome = match found {
         Ok(placed) => CameraOutcome::Figures(Box::new(figures(truth, &frames, &placed)?)),
@@ -115,8 +133,18 @@ fn one(truth: &GroundTruth, registry: &Registry, progress: &dyn Progress) -> Res
 }
 
 /// What a run does before its first dense stage.
-fn placed(folder: &Path, frames: &[&Frame], registry: &Registry, progress: &dyn Progress) -> Result<Placed> {
-    let photos = frames.iter().map(|f| photo::load(&folder.join(&f.file))).collect::<Result<Vec<_>>>()?;
+fn placed(
+    folder: &Path,
+    frames: &[&Frame],
+    reading: Reading,
+    registry: &Registry,
+    progress: &dyn Progress,
+) -> Result<Placed> {
+    let load = |f: &&Frame| photo::load_at(&folder.join(&f.file), reading.max_size);
+    let mut photos = frames.iter().map(load).collect::<Result<Vec<_>>>()?;
+    if reading.copies {
+        photos.iter_mut().for_each(|p| p.fine = None);
+    }
     pose::place(photos, None, registry, progress)
 }
 
@@ -155,7 +183,7 @@ fn figures(truth: &GroundTruth, frames: &[&Frame], placed: &Placed) -> Result<Ca
         pair_direction_degrees: of_pairs(&|p| p.direction_degrees.unwrap_or(0.0)),
         auc: AUC_DEGREES.map(|d| auc(&pairs, asked - pairs.len().min(asked), d)),
         principal_point: offset.fold(0.0, f64::max),
-        // A lens that the model states goes here, beside the true one.
+        lens: model.fitted.first().map_or(Lens::NONE, |f| f.lens),
         true_lens: frames.first().and_then(|f| f.lens),
     })
 }

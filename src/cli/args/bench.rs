@@ -61,6 +61,12 @@ pub struct BenchArgs {
     /// cameras: folders with ground_truth.json and photos
     #[arg(long, num_args = 1.., value_name = "DIR")]
     pub data: Vec<PathBuf>,
+    /// cameras: longer side of the working image, pixels
+    #[arg(long, default_value_t = crate::photo::MAX_SIZE_CPU, value_name = "N")]
+    pub max_size: usize,
+    /// cameras: use copies of the photos of that size, not the photos themselves
+    #[arg(long)]
+    pub copies: bool,
     /// query, models, cameras: folder of the models
     #[arg(long, value_name = "DIR")]
     pub models: Option<PathBuf>,
