@@ -5,7 +5,7 @@ use splatvk::format::{
     cameras, colmap, gaussians, ply, ply_packed, scene_dir, side_file, splat, spz, transforms,
 };
 use splatvk::photo;
-use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, PointCloud, Pose, Splats};
+use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, Lens, PointCloud, Pose, Splats};
 use std::path::{Path, PathBuf};
 
 fn data(name: &str) -> PathBuf {
@@ -500,5 +500,26 @@ fn stems_join_cameras_to_photos() {
         (".png", ".png"),
     ] {
         assert_eq!(cameras::stem(name), stem);
+    }
+}
+
+#[test]
+fn cameras_of_photos_as_taken_carry_their_lens() {
+    let dir = tempfile::tempdir().unwrap();
+    let list = some_cameras();
+    let lenses = [Lens { k1: -0.12, k2: 0.03 }, Lens { k1: 0.05, k2: 0.0 }, Lens::NONE];
+    colmap::write_lensed(dir.path(), &list, &lenses).unwrap();
+    let text = std::fs::read_to_string(dir.path().join("cameras.txt")).unwrap();
+    let line = text.lines().find(|l| l.starts_with("1 ")).unwrap();
+    assert!(line.starts_with("1 OPENCV 640 ") && line.ends_with(" -0.12 0.03 0 0"), "{line}");
+    let file = dir.path().join("transforms.json");
+    transforms::write_lensed(&file, &list, &lenses).unwrap();
+    let json: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    assert_eq!(json["camera_model"], "OPENCV");
+    assert_eq!((&json["frames"][0]["k1"], &json["frames"][0]["k2"]), (&(-0.12).into(), &0.03.into()));
+    // A pinhole reader must not take them for pinholes.
+    for path in [dir.path(), file.as_path()] {
+        let e = cameras::read(path).unwrap_err();
+        assert!(e.exit_code() == 2 && e.to_string().contains("distortion"), "{e}");
     }
 }

@@ -415,4 +415,59 @@ mod tests {
         assert!(sigma > 1e-4 && sigma < 0.02, "{sigma}");
         assert!((p.optics[0].focal / 600.0).ln().abs() < 3.9 * sigma, "{} {sigma}", p.optics[0].focal);
     }
+
+    #[test]
+    fn lens_and_principal_point_are_recovered_where_they_are_free() {
+        let (mut p, _) = scene(0.0);
+        let truth = Optics { focal: 600.0, lens: Lens { k1: -0.12, k2: 0.03 }, shift: DVec2::new(4.0, -3.0) };
+        let (mut wide, _) = scene(0.0);
+        wide.optics[0] = truth;
+        // The rig of `scene` before it was disturbed, seen through that lens.
+        let (_, rig) = scene(0.0);
+        wide.poses.clone_from(&rig.poses);
+        wide.points.clone_from(&rig.points);
+        for (k, o) in wide.observations.iter().enumerate() {
+            p.observations[k].pixel = wide.project(o).1;
+        }
+        let free = OpticsPrior { log_focal: (576f64.ln(), 0.35), lens: [0.5; 2], shift: 20.0 };
+        let mut held = p.clone();
+        p.priors[0] = free;
+        p.solve(1e3, 100).unwrap();
+        let found = p.optics[0];
+        assert!((found.focal / 600.0 - 1.0).abs() < 1e-3, "{found:?}");
+        assert!((found.lens.k1 + 0.12).abs() < 2e-3 && (found.lens.k2 - 0.03).abs() < 1e-2, "{found:?}");
+        assert!((found.shift - truth.shift).length() < 0.5, "{found:?}");
+        let out = held.solve(1e3, 100).unwrap();
+        assert_eq!((held.optics[0].lens, held.optics[0].shift), (Lens::NONE, DVec2::ZERO));
+        assert_eq!(out.sigmas[0][1..], [0.0; 4], "what is held has no doubt");
+    }
+
+    #[test]
+    fn the_gradient_is_the_derivative_of_the_cost() {
+        let (mut p, _) = scene(1.0);
+        p.priors[0] = OpticsPrior { log_focal: (576f64.ln(), 0.35), lens: [0.1; 2], shift: 5.0 };
+        p.optics[0] = Optics { focal: 620.0, lens: Lens { k1: 0.05, k2: -0.04 }, shift: DVec2::new(2.0, 1.0) };
+        let c = 1e3;
+        let normal = p.linearise(c);
+        let pose_size = 6 * (p.poses.len() - 1);
+        let change = |k: usize, h: f64| {
+            let mut q = p.clone();
+            let o = &mut q.optics[0];
+            match k {
+                0 => o.focal *= h.exp(),
+                1 => o.lens.k1 += h,
+                2 => o.lens.k2 += h,
+                3 => o.shift.x += h,
+                _ => o.shift.y += h,
+            }
+            q.cost(c)
+        };
+        for k in 0..OPTICS {
+            let h = 1e-6;
+            let numeric = (change(k, h) - change(k, -h)) / (2.0 * h);
+            // The normal equations hold half the derivative; 1e-4 of it is the error of the difference.
+            let analytic = 2.0 * normal.g[pose_size + k];
+            assert!((numeric - analytic).abs() < 1e-4 * analytic.abs().max(1.0), "{k}: {numeric} {analytic}");
+        }
+    }
 }

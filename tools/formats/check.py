@@ -306,6 +306,11 @@ def cameras():
     print("ok  models written by pycolmap")
 
 
+def linear(v):
+    a = np.abs(v)
+    return np.copysign(np.where(a <= 0.04045, a / 12.92, ((a + 0.055) / 1.055) ** 2.4), v)
+
+
 def images():
     channels = "rgb,alpha,depth,features,codes"
     run("render", SCENE, "--cameras", SCENE / "cameras/transforms.json", "--out", WORK / "maps", "--channels", channels,
@@ -315,7 +320,8 @@ def images():
             got = {name: c.pixels for name, c in file.channels().items()}
         load = lambda part: np.load(WORK / "maps" / f"{stem}_{part}.npy")
         for k, name in enumerate("RGB"):
-            close(f"EXR {name}", got[name], load("rgb")[..., k], 0)
+            # OpenEXR holds linear light, npy what the splats hold: sRGB, continued above 1.
+            close(f"EXR {name}", got[name], linear(load("rgb")[..., k]), 1e-5)
         close("EXR A", got["A"], load("alpha"), 0)
         close("EXR Z", got["Z"], load("depth"), 0)
         first = 0

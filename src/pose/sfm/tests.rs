@@ -149,3 +149,41 @@ fn two_photos_of_different_size_and_known_focal_are_enough() {
     assert!(turn < 0.8 && aim < 0.8, "{turn} {aim}");
     assert!(model.focal_log_sigma.unwrap() > 0.002);
 }
+
+/// A photo of the same view through a lens about the middle of the image.
+fn lensed(photo: &Photo, focal: f64, lens: Lens) -> Photo {
+    let mut out = photo.clone();
+    let (w, h) = (photo.image.width, photo.image.height);
+    let middle = DVec2::new(w as f64, h as f64) * 0.5;
+    for y in 0..h {
+        for x in 0..w {
+            let seen = (DVec2::new(x as f64 + 0.5, y as f64 + 0.5) - middle) / focal;
+            let p = lens.undistort(seen) * focal + middle;
+            out.image.data[y * w + x] = bilinear(&photo.image, p.x - 0.5, p.y - 0.5);
+        }
+    }
+    out
+}
+
+#[test]
+fn a_lens_is_found_and_a_pinhole_stays_one() {
+    let truth = testing::train(&testing::folder());
+    let focal = truth.cameras[0].fx;
+    let model = reconstruct(&truth.photos, &[], &Silent).unwrap();
+    assert!(model.fitted.iter().all(|f| f.lens.is_none()), "{:?}", model.fitted);
+    assert_eq!((model.cameras[0].cx, model.cameras[0].cy), (320.0, 240.0));
+    let lens = Lens { k1: -0.12, k2: 0.03 };
+    let photos: Vec<Photo> = truth.photos.iter().map(|p| lensed(p, focal, lens)).collect();
+    let model = reconstruct(&photos, &[], &Silent).unwrap();
+    let e = pose_errors(&model.cameras, &truth.cameras, truth.mean_depth);
+    let found = model.fitted[0];
+    // Where both lenses image the corner of the undistorted picture.
+    let corner = DVec2::new(320.0, 240.0) / focal;
+    let miss = (found.lens.distort(corner) - lens.distort(corner)).length() * focal;
+    println!("{found:?}: corner {miss:.2} px, {e:?}");
+    // The corner moves by 16 px; matches reach to about 20 px from it.
+    assert!(miss < 1.0, "{miss}");
+    assert!(e.rotation_degrees.iter().all(|v| *v < 0.05), "{:?}", e.rotation_degrees);
+    assert!(e.centre.iter().all(|v| *v < 0.001) && e.focal.iter().all(|v| *v < 0.005), "{e:?}");
+    assert!(e.focal[0] < 2.0 * found.sigmas[0], "{e:?}");
+}
