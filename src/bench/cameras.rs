@@ -316,7 +316,8 @@ mod tests {
         }
         std::fs::write(dir.path().join("ground_truth.json"), truth.to_string()).unwrap();
         let mut seen = Vec::new();
-        let report = measure(&[breakfast, dir.path().into()], &registry, &Silent, &mut |row| {
+        let reading = Reading { max_size: crate::photo::MAX_SIZE_CPU, copies: false };
+        let report = measure(&[breakfast, dir.path().into()], reading, &registry, &Silent, &mut |row| {
             seen.push(row.text());
             Ok(())
         })
