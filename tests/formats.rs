@@ -5,7 +5,7 @@ use splatvk::format::{
     cameras, colmap, gaussians, ply, ply_packed, scene_dir, side_file, splat, spz, transforms,
 };
 use splatvk::photo;
-use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, Lens, PointCloud, Pose, Splats};
+use splatvk::scene::{Camera, Codebook, LanguageField, Lens, LevelField, PointCloud, Pose, Splats};
 use std::path::{Path, PathBuf};
 
 fn data(name: &str) -> PathBuf {

@@ -115,8 +115,9 @@ fn cameras(args: &BenchArgs) -> Result<()> {
     let reading = bench::cameras::Reading { max_size: args.max_size, copies: args.copies };
     print(&bench::cameras::header())?;
     let progress = progress::here();
-    let report =
-        bench::cameras::measure(&args.data, reading, &registry, progress.as_ref(), &mut |row| print(&row.text()))?;
+    let report = bench::cameras::measure(&args.data, reading, &registry, progress.as_ref(), &mut |row| {
+        print(&row.text())
+    })?;
     if let Some(file) = &args.json {
         let value = serde_json::to_value(&report).map_err(|e| Error::work(format!("bench report: {e}")))?;
         write_json(file, &value)?;

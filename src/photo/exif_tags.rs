@@ -15,6 +15,8 @@ pub(super) struct Lens {
     pub focal: Option<f64>,
     /// "Make Model".
     pub camera_model: Option<String>,
+    /// Name of the lens, if it says that it is a fisheye.
+    pub fisheye: Option<String>,
 }
 
 /// Reads the lens facts out of a raw EXIF block; a damaged block yields what could be read. `size` is the size of the
@@ -55,7 +57,7 @@ impl TiffTags {
 type Fields<'a> = &'a dyn Fn(Tag) -> Option<&'a Field>;
 
 fn of(fields: Fields, size: (u32, u32)) -> Lens {
-    Lens { focal: focal(fields, size), camera_model: camera_model(fields) }
+    Lens { focal: focal(fields, size), camera_model: camera_model(fields), fisheye: fisheye(fields) }
 }
 
 fn number(fields: Fields, tag: Tag) -> Option<f64> {
@@ -102,15 +104,25 @@ fn focal_plane(fields: Fields, long_side: f64) -> Option<f64> {
     Some(mm * resolution / unit_mm * scale)
 }
 
-fn camera_model(fields: Fields) -> Option<String> {
-    let text = |tag| match &fields(tag)?.value {
+/// Makers call the lens so; a wide lens that is none (GoPro's "linear", phones' 0.5×) does not.
+fn fisheye(fields: Fields) -> Option<String> {
+    let name = ascii(fields, Tag::LensModel)?;
+    let plain = name.to_lowercase().replace(['-', ' '], "");
+    plain.contains("fisheye").then_some(name)
+}
+
+fn ascii(fields: Fields, tag: Tag) -> Option<String> {
+    match &fields(tag)?.value {
         Value::Ascii(v) => {
             let s = String::from_utf8_lossy(v.first()?).trim_matches(['\0', ' ']).to_string();
             (!s.is_empty()).then_some(s)
         }
         _ => None,
-    };
-    match (text(Tag::Make), text(Tag::Model)) {
+    }
+}
+
+fn camera_model(fields: Fields) -> Option<String> {
+    match (ascii(fields, Tag::Make), ascii(fields, Tag::Model)) {
         (Some(make), Some(model)) if model.starts_with(&make) => Some(model),
         (Some(make), Some(model)) => Some(format!("{make} {model}")),
         (make, model) => model.or(make),
@@ -168,6 +180,18 @@ pub(super) mod tests {
         fields.push((Tag::FocalLengthIn35mmFilm, Value::Short(vec![85])));
         let contradicted = lens(block(&fields), size).focal.unwrap();
         assert!((contradicted - 85.0 / 43.2666 * 3000f64.hypot(2000.0)).abs() < 0.1);
+    }
+
+    #[test]
+    fn a_fisheye_is_told_by_its_name() {
+        let named = |name: &str| {
+            lens(block(&[(Tag::LensModel, Value::Ascii(vec![name.into()]))]), (4000, 3000)).fisheye
+        };
+        assert_eq!(
+            named("Samyang 8mm f/3.5 UMC Fish-Eye CS").as_deref(),
+            Some("Samyang 8mm f/3.5 UMC Fish-Eye CS")
+        );
+        assert_eq!(named("iPhone 15 back camera 2.22mm f/2.2"), None);
     }
 
     #[test]

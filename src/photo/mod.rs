@@ -122,6 +122,13 @@ pub fn load_at(path: &Path, max_size: usize) -> Result<Photo> {
 /// [`load_at`] of an image file that is in memory already; `name` stands for its path.
 pub fn from_bytes(name: &Path, bytes: Vec<u8>, max_size: usize) -> Result<Photo> {
     let decoded = decode::decode(bytes, name)?;
+    if let Some(lens) = &decoded.lens.fisheye {
+        return Err(Error::input(format!(
+            "{}: taken with a fisheye lens ({lens}), which radial distortion does not describe; make it rectilinear first, \
+             with the camera maker's program or darktable's lens correction",
+            name.display()
+        )));
+    }
     let photo = working(name, decoded.size, max_size, |x, y| decoded.at(x, y))?;
     // The two scales differ by the rounding of the size only.
     let exif_focal = decoded.lens.focal.map(|f| f * photo.to_working.scale[1]);

@@ -446,7 +446,8 @@ mod tests {
     fn the_gradient_is_the_derivative_of_the_cost() {
         let (mut p, _) = scene(1.0);
         p.priors[0] = OpticsPrior { log_focal: (576f64.ln(), 0.35), lens: [0.1; 2], shift: 5.0 };
-        p.optics[0] = Optics { focal: 620.0, lens: Lens { k1: 0.05, k2: -0.04 }, shift: DVec2::new(2.0, 1.0) };
+        p.optics[0] =
+            Optics { focal: 620.0, lens: Lens { k1: 0.05, k2: -0.04 }, shift: DVec2::new(2.0, 1.0) };
         let c = 1e3;
         let normal = p.linearise(c);
         let pose_size = 6 * (p.poses.len() - 1);
