@@ -8,7 +8,7 @@ RUN tools/setup && . "$HOME/.cargo/env" && tools/install --prefix /usr/local
 
 FROM debian:12-slim
 RUN apt-get update -q \
-    && apt-get install -q -y --no-install-recommends libvulkan1 mesa-vulkan-drivers libgcc-s1 libstdc++6 \
+    && apt-get install -q -y --no-install-recommends libvulkan1 mesa-vulkan-drivers libgcc-s1 libstdc++6 libheif1 ffmpeg \
     && rm -rf /var/lib/apt/lists/*
 COPY --from=build /usr/local/bin/splatvk /usr/local/bin/splatvk
 COPY --from=build /usr/local/lib/libsplatvk.so* /usr/local/lib/

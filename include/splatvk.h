@@ -417,11 +417,11 @@ typedef struct {
      */
     const char *name;
     /*
-     JPEG or PNG file; with SvkTrainOptions.views a folder of them, too.
+     Image file (JPEG, PNG, HEIC, AVIF, WebP, TIFF); with SvkTrainOptions.views a folder of them, too.
      */
     const char *path;
     /*
-     A JPEG or PNG file in memory.
+     Such an image file in memory.
      */
     const uint8_t *encoded;
     /*
@@ -550,6 +550,11 @@ typedef struct {
      Given to `progress`.
      */
     void *user;
+    /*
+     Longer side of the working images, pixels: larger photos are scaled down, none is enlarged. 0 = 800 on a CPU device,
+     1600 on a GPU.
+     */
+    uint64_t max_size;
 } SvkTrainOptions;
 
 /*

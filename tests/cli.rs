@@ -76,6 +76,22 @@ fn photos_that_cannot_be_used() {
 }
 
 #[test]
+fn heic_without_its_library_says_what_to_do() {
+    let folder = tempfile::tempdir().unwrap();
+    let photo = |name: &str| data(name);
+    let mut command = splatvk();
+    command.env("SPLATVK_LIBHEIF", folder.path().join("libheif.so.1"));
+    command.arg("run").args([photo("photos/turned.heic"), photo("breakfast/images/train_00.jpg")]);
+    command.arg("--out").arg(folder.path().join("scene"));
+    refuses(&mut command, 2, &["turned.heic", "libheif", "SPLATVK_LIBHEIF"]);
+    assert!(names(folder.path()).is_empty(), "left behind: {:?}", names(folder.path()));
+    let mut doctor = splatvk();
+    let output = doctor.arg("doctor").env("SPLATVK_LIBHEIF", "/nowhere/libheif.so").output().unwrap();
+    let line = text(&output.stdout).lines().find(|l| l.contains("HEIC")).unwrap().to_owned();
+    assert!(line.starts_with("note") && line.contains("cannot be read"), "{line}");
+}
+
+#[test]
 fn photos_without_overlap_are_named() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::copy(data("breakfast/images/train_00.jpg"), folder.path().join("table.jpg")).unwrap();

@@ -361,6 +361,7 @@ impl<'a> Lab<'a> {
             &spoken.field,
             &described.queries,
             evaluation,
+            false,
             self.progress,
             &mut |frame, decoded| {
                 let (Some(level), Some(objects)) = (whole, self.truth.objects(frame)?) else { return Ok(()) };

@@ -3,6 +3,7 @@
 //!
 //! The steps are those of [`crate::fit`], recorded by the code that trains; learning rates are zero, so that every
 //! repetition does the same work on the same scene. The photo to fit is the scene's own render, a little paler.
+pub mod cameras;
 pub mod compare;
 mod growth;
 mod latency;

@@ -107,14 +107,17 @@ pub unsafe trait Versioned: Copy {
     const FIRST: usize;
 }
 
+/// A structure that has grown is followed by the field that its first version ended before.
 macro_rules! versioned {
-    ($($name:ident),*) => {$(
+    ($($name:ident $(before $added:ident)?),*) => {$(
         // SAFETY: integers, floats, raw pointers and optional functions behind a leading size, all `repr(C)`.
         unsafe impl Versioned for $name {
             const NAME: &'static str = stringify!($name);
-            const FIRST: usize = size_of::<$name>();
+            const FIRST: usize = versioned!(@first $name $($added)?);
         }
     )*};
+    (@first $name:ident) => { size_of::<$name>() };
+    (@first $name:ident $added:ident) => { std::mem::offset_of!($name, $added) };
 }
 
 versioned!(
@@ -122,7 +125,7 @@ versioned!(
     SvkVulkanDevice,
     SvkCamera,
     SvkPhoto,
-    SvkTrainOptions,
+    SvkTrainOptions before max_size,
     SvkSceneInfo,
     SvkOutput,
     SvkSync,

@@ -33,7 +33,12 @@ pub unsafe extern "C" fn svk_train(
             // What is wrong with the options is said before the photos are read.
             let mut plan = RunPlan { models: context.models.clone(), ..plan(&options)? };
             let progress = Callback::new(options.progress, options.user);
-            let (photos, cameras) = gather(&given, options.views as usize, &progress)?;
+            let max_size = match options.max_size as usize {
+                0 => photo::default_max_size(context.device.info().is_cpu),
+                n if n < photo::SMALLEST_SIDE => return argument(format!("SvkTrainOptions.max_size is {n}")),
+                n => n,
+            };
+            let (photos, cameras) = gather(&given, options.views as usize, max_size, &progress)?;
             plan.inputs = photos.iter().map(|p| p.path.clone()).collect();
             if !cameras.is_empty() {
                 if plan.init != InitSource::Sfm {
@@ -53,6 +58,7 @@ pub unsafe extern "C" fn svk_train(
 unsafe fn gather(
     given: &[SvkPhoto],
     views: usize,
+    max_size: usize,
     progress: &dyn Progress,
 ) -> Result<(Vec<Photo>, Vec<Camera>), Fault> {
     // SAFETY: per the header.
@@ -62,10 +68,11 @@ unsafe fn gather(
     let photos = if !in_memory && paths.iter().all(Option::is_some) {
         let paths: Vec<PathBuf> = paths.into_iter().flatten().collect();
         let all = if views > 0 || paths.iter().any(|p| p.is_dir()) { None } else { Some(paths.len()) };
-        photo::load_all(&paths, if views > 0 { Some(views) } else { all }, progress)?
+        photo::load_all_at(&paths, if views > 0 { Some(views) } else { all }, max_size, progress)?
     } else {
-        let one =
-            |(i, (photo, path)): (usize, (&SvkPhoto, Option<PathBuf>))| unsafe { single(photo, path, i) };
+        let one = |(i, (photo, path)): (usize, (&SvkPhoto, Option<PathBuf>))| unsafe {
+            single(photo, path, i, max_size)
+        };
         given.iter().zip(paths).enumerate().map(one).collect::<Result<Vec<_>, Fault>>()?
     };
     let mut cameras = Vec::new();
@@ -79,7 +86,12 @@ unsafe fn gather(
     Ok((photos, cameras))
 }
 
-unsafe fn single(given: &SvkPhoto, path: Option<PathBuf>, index: usize) -> Result<Photo, Fault> {
+unsafe fn single(
+    given: &SvkPhoto,
+    path: Option<PathBuf>,
+    index: usize,
+    max_size: usize,
+) -> Result<Photo, Fault> {
     let sources =
         [path.is_some(), !given.encoded.is_null(), !given.pixels.is_null()].iter().filter(|s| **s).count();
     if sources != 1 {
@@ -89,17 +101,17 @@ unsafe fn single(given: &SvkPhoto, path: Option<PathBuf>, index: usize) -> Resul
     let name = unsafe { boundary::text(given.name, "SvkPhoto.name") }?;
     let name = PathBuf::from(name.unwrap_or_else(|| format!("photo_{index:02}")));
     if let Some(path) = path {
-        return Ok(photo::load(&path)?);
+        return Ok(photo::load_at(&path, max_size)?);
     }
     if !given.encoded.is_null() {
         // SAFETY: the caller's file of that length.
         let bytes = unsafe { std::slice::from_raw_parts(given.encoded, given.encoded_bytes) };
-        return Ok(photo::from_bytes(&name, bytes.to_vec())?);
+        return Ok(photo::from_bytes(&name, bytes.to_vec(), max_size)?);
     }
     // SAFETY: per the header.
     let image = unsafe { pixels(given, &name) }?;
     let focal = (given.focal > 0.0).then_some(given.focal);
-    Ok(photo::from_pixels(&name, &image, focal)?)
+    Ok(photo::from_pixels(&name, &image, focal, max_size)?)
 }
 
 unsafe fn pixels(given: &SvkPhoto, name: &Path) -> Result<RgbImage, Fault> {

@@ -188,9 +188,9 @@ pub struct SvkPhoto {
     pub size: usize,
     /// File name for messages, masks and cameras; NULL = that of `path`, or "photo_00", "photo_01", ...
     pub name: *const c_char,
-    /// JPEG or PNG file; with SvkTrainOptions.views a folder of them, too.
+    /// Image file (JPEG, PNG, HEIC, AVIF, WebP, TIFF); with SvkTrainOptions.views a folder of them, too.
     pub path: *const c_char,
-    /// A JPEG or PNG file in memory.
+    /// Such an image file in memory.
     pub encoded: *const u8,
     /// Its length in bytes.
     pub encoded_bytes: usize,
@@ -263,6 +263,9 @@ pub struct SvkTrainOptions {
     pub progress: SvkProgressFunction,
     /// Given to `progress`.
     pub user: *mut c_void,
+    /// Longer side of the working images, pixels: larger photos are scaled down, none is enlarged. 0 = 800 on a CPU device,
+    /// 1600 on a GPU.
+    pub max_size: u64,
 }
 
 /// What a scene holds.

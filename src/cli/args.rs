@@ -108,7 +108,7 @@ pub struct DeviceArgs {
 /// `splatvk run`
 #[derive(Debug, Args)]
 pub struct RunArgs {
-    /// Photos, or folders of photos (JPEG, PNG)
+    /// Photos, or folders of photos (JPEG, PNG, HEIC, AVIF, WebP, TIFF)
     #[arg(required = true, value_name = "INPUT")]
     pub inputs: Vec<PathBuf>,
     /// How many photos to use, spread over the sorted names
@@ -166,6 +166,9 @@ pub struct RunArgs {
     /// One model per level as in the paper, instead of one geometry for all three
     #[arg(long)]
     pub per_level: bool,
+    /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged [default: 800 on a CPU device, 1600 on a GPU]
+    #[arg(long, value_name = "N")]
+    pub max_size: Option<usize>,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -195,6 +198,9 @@ pub struct TrainArgs {
     /// Optimisation steps, instead of the preset's
     #[arg(long, value_name = "N")]
     pub iterations: Option<usize>,
+    /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged [default: 800 on a CPU device, 1600 on a GPU]
+    #[arg(long, value_name = "N")]
+    pub max_size: Option<usize>,
     /// Seed of everything random
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
@@ -321,6 +327,12 @@ pub struct EvalArgs {
     /// What is read and how it is scored
     #[arg(long, value_enum, default_value = "field")]
     pub protocol: ProtocolArg,
+    /// Score held-out frames a second time, from cameras moved until the frozen scene fits their photos best: `refined`
+    #[arg(long)]
+    pub refine_views: bool,
+    /// Print a short table instead of JSON; --out DIR keeps eval.json
+    #[arg(long, conflicts_with = "json")]
+    pub text: bool,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,

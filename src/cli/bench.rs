@@ -1,7 +1,7 @@
 //! `splatvk bench`
 use super::args::{BenchArgs, BenchPart};
 use super::models::checked;
-use super::print;
+use super::{print, progress};
 use crate::bench::{self, Bench, Budget, Report, Workload, compare};
 use crate::format::{scene_dir, write_json};
 use crate::gpu::Device;
@@ -23,6 +23,9 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         return print(&files.map(|f| format!("{}\n", f.display())).concat());
     }
     let has = |part| args.parts.contains(&part);
+    if has(BenchPart::Cameras) {
+        return cameras(args);
+    }
     if has(BenchPart::Models) {
         models(&Registry::open(args.models.as_deref())?)?;
         if args.parts == [BenchPart::Models] {
@@ -97,6 +100,27 @@ fn models(registry: &Registry) -> Result<()> {
         print(&checked(model, Some(&check_model(model)?)))?;
     }
     Ok(())
+}
+
+/// Photos → cameras on data with a known answer; needs no device.
+fn cameras(args: &BenchArgs) -> Result<()> {
+    if args.parts.len() > 1 {
+        return Err(Error::input("bench cameras: runs alone; leave the other parts out"));
+    }
+    if args.data.is_empty() {
+        return Err(Error::input("bench cameras: give folders with ground_truth.json with --data DIR..."));
+    }
+    writable(args.json.as_deref())?;
+    let registry = Registry::open(args.models.as_deref())?;
+    print(&bench::cameras::header())?;
+    let progress = progress::here();
+    let report =
+        bench::cameras::measure(&args.data, &registry, progress.as_ref(), &mut |row| print(&row.text()))?;
+    if let Some(file) = &args.json {
+        let value = serde_json::to_value(&report).map_err(|e| Error::work(format!("bench report: {e}")))?;
+        write_json(file, &value)?;
+    }
+    print(&report.text())
 }
 
 /// The scene to ask and the model that speaks its language.

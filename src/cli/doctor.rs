@@ -3,6 +3,7 @@ use super::args::DoctorArgs;
 use super::{models, print, print_json};
 use crate::gpu::report::{Line, Status, vulkan};
 use crate::infer::{self, Registry};
+use crate::photo;
 use crate::{Error, Result};
 use serde_json::json;
 use std::fmt::Write;
@@ -29,6 +30,9 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
         let state = if m.installed { Status::Ok } else { Status::Missing };
         lines.push(line(&format!("model {}", m.name), state, found, m.fix.clone()));
     }
+    // Photos of other kinds are read without it, so this is no fault of the machine.
+    let (found, advice) = photo::heif_support();
+    lines.push(line("HEIC, AVIF", if advice.is_some() { Status::Note } else { Status::Ok }, found, advice));
     let missing = lines.iter().filter(|l| l.status == Status::Missing).count();
     if args.device.json {
         let lines: Vec<_> = lines

@@ -28,10 +28,16 @@ pub fn eval(args: &EvalArgs) -> Result<()> {
         ProtocolArg::Field if args.cameras.is_some() => Err(Error::input(
             "--cameras: with --protocol field the cameras stand in ground_truth.json; leave it out",
         )),
-        ProtocolArg::Field => report(&field(&scene, args)?, args),
-        ProtocolArg::Lerf => report(&published(Kind::Lerf, &scene, args)?, args),
-        ProtocolArg::Ovs => report(&published(Kind::Ovs, &scene, args)?, args),
-        ProtocolArg::Scannet => report(&published(Kind::ScanNet, &scene, args)?, args),
+        ProtocolArg::Field => {
+            let found = field(&scene, args)?;
+            report(&found, args, Some(found.text()))
+        }
+        _ if args.refine_views || args.text => {
+            Err(Error::input("--refine-views and --text belong to --protocol field; leave them out"))
+        }
+        ProtocolArg::Lerf => report(&published(Kind::Lerf, &scene, args)?, args, None),
+        ProtocolArg::Ovs => report(&published(Kind::Ovs, &scene, args)?, args, None),
+        ProtocolArg::Scannet => report(&published(Kind::ScanNet, &scene, args)?, args, None),
     }
 }
 
@@ -59,6 +65,7 @@ fn field(scene: &Scene, args: &EvalArgs) -> Result<Report> {
         field,
         &queries,
         evaluation,
+        args.refine_views,
         progress::here().as_ref(),
         &mut |_, _| Ok(()),
     )
@@ -105,11 +112,14 @@ fn write(out: &Path, stem: &str, rgb: &crate::scene::RgbImage, masks: Masks) -> 
     Ok(())
 }
 
-/// The report is JSON in any case; `--json` keeps it on one line.
-fn report(report: &impl Serialize, args: &EvalArgs) -> Result<()> {
+/// The report is JSON unless `--text` is given; `--json` keeps it on one line.
+fn report(report: &impl Serialize, args: &EvalArgs, table: Option<String>) -> Result<()> {
     let value = serde_json::to_value(report).map_err(|e| Error::work(format!("eval report: {e}")))?;
     if let Some(out) = &args.out {
         write_json(&out.join("eval.json"), &value)?;
+    }
+    if let Some(table) = table.filter(|_| args.text) {
+        return print(&table);
     }
     if args.device.json {
         return print_json(&value);

@@ -4,7 +4,7 @@ use super::progress;
 use super::{print, print_json};
 use crate::format::Workspace;
 use crate::synth::regions::Flaws;
-use crate::synth::{self, Knobs};
+use crate::synth::{self, Effects, Knobs};
 use crate::{Error, Result};
 
 pub fn generate(args: &GenerateArgs) -> Result<()> {
@@ -36,6 +36,9 @@ fn flaws(args: &GenerateArgs) -> Result<Flaws> {
 fn knobs(args: &GenerateArgs) -> Result<Knobs> {
     let size = args.size.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let size = size.ok_or_else(|| Error::input(format!("--size {}: write it as 640x480", args.size)))?;
+    let effects = effects(args);
+    // The sensor's own noise stands in for the even one.
+    let usual = if effects.sensor_noise { 0.0 } else { Knobs::default().photo_noise };
     Ok(Knobs {
         seed: args.seed,
         views: args.views,
@@ -48,6 +51,20 @@ fn knobs(args: &GenerateArgs) -> Result<Knobs> {
         occlusion: args.occlusion,
         similar: args.similar,
         pose_noise: args.pose_noise,
-        photo_noise: args.photo_noise,
+        photo_noise: args.photo_noise.unwrap_or(usual),
+        effects,
     })
+}
+
+/// `--phone` turns everything on; the single flags say the rest.
+fn effects(args: &GenerateArgs) -> Effects {
+    let phone = if args.phone { Effects::PHONE } else { Effects::default() };
+    Effects {
+        focal: args.focal || phone.focal,
+        lens: args.lens || phone.lens,
+        centre: args.centre || phone.centre,
+        light: args.light || phone.light,
+        sensor_noise: args.sensor_noise || phone.sensor_noise,
+        jpeg: args.jpeg.or(phone.jpeg),
+    }
 }

@@ -3,6 +3,7 @@ use super::args::{DeviceArgs, MethodArg, PresetArg, RunArgs};
 use crate::infer::installed::{Duty, Inventory, known};
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;
+use crate::photo::SMALLEST_SIDE;
 use crate::run::{FeatureSource, InitSource, MaskSource, MatchSource, Method, RunPlan};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -51,10 +52,21 @@ pub fn run(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         method,
         feature_dim,
         per_level: args.per_level,
+        max_size: max_size(args.max_size)?,
         device: args.device.device.clone(),
         deterministic: args.deterministic,
         models: models(&args.device),
     })
+}
+
+/// `--max-size`, if it leaves enough to work with.
+pub fn max_size(given: Option<usize>) -> Result<Option<usize>> {
+    match given {
+        Some(n) if n < SMALLEST_SIDE => Err(Error::input(format!(
+            "--max-size {n}: give at least {SMALLEST_SIDE} pixels, or leave it out"
+        ))),
+        _ => Ok(given),
+    }
 }
 
 /// The folder of `--models`.
@@ -248,6 +260,7 @@ mod tests {
             (["--init", "colmap"], "auto, sfm, cameras:FILE, mast3r, dust3r"),
             (["--masks", "clip"], "auto, graph, dir:DIR, sam"),
             (["--mask-points", "0"], "1 to 128"),
+            (["--max-size", "63"], "at least 64 pixels"),
             (["--masks", "dir:nowhere"], "does not exist"),
             (["--features", "sam"], "auto, words, dir:DIR, clip"),
             (["--matcher", "sift"], "auto, xfeat, mast3r, roma"),

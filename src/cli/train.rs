@@ -17,6 +17,7 @@ pub fn train(args: &TrainArgs) -> Result<()> {
         preset: args.preset.map(plan::preset),
         iterations: args.iterations,
         seed: args.seed,
+        max_size: plan::max_size(args.max_size)?,
         device: args.device.device.clone(),
         deterministic: args.deterministic,
         models: plan::models(&args.device),

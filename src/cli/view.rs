@@ -85,7 +85,8 @@ fn questions(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
 
 fn page(scene: &Scene, args: &ViewArgs, names: &Names, mute: Option<&str>) -> Result<String> {
     // Photos are decoration here: a scene whose pictures were deleted still shows.
-    let load = |c: &crate::scene::Camera| photo::load(&scene.path.join("cameras").join(&c.name)).ok();
+    let load =
+        |c: &crate::scene::Camera| photo::load_at(&scene.path.join("cameras").join(&c.name), usize::MAX).ok();
     let photos: Option<Vec<_>> = scene.cameras.iter().map(load).collect();
     let images: Vec<RgbImage> = photos.unwrap_or_default().into_iter().map(|p| p.image).collect();
     let path = args.scene.canonicalize().unwrap_or_else(|_| args.scene.clone());

@@ -1,5 +1,5 @@
 //! COLMAP models, text and binary. World → camera, OpenCV axes, first pixel centre at 0.5.
-use crate::scene::{Camera, PointCloud, Pose};
+use crate::scene::{Camera, Lens, PointCloud, Pose};
 use crate::{Error, Result};
 use glam::{DMat3, DQuat, DVec3};
 use std::collections::HashMap;
@@ -258,6 +258,20 @@ const MOST_POINTS: usize = 100_000;
 
 /// Writes a text model with PINHOLE cameras. Rust prints the shortest digits that read back exactly.
 pub fn write(folder: &Path, cameras: &[Camera], points: Option<&PointCloud>) -> Result<()> {
+    write_text(folder, cameras, None, points)
+}
+
+/// Writes a text model of photos as they were taken, with OPENCV cameras: one lens per camera.
+pub fn write_lensed(folder: &Path, cameras: &[Camera], lenses: &[Lens]) -> Result<()> {
+    write_text(folder, cameras, Some(lenses), None)
+}
+
+fn write_text(
+    folder: &Path,
+    cameras: &[Camera],
+    lenses: Option<&[Lens]>,
+    points: Option<&PointCloud>,
+) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
     let mut intrinsics = String::from("# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n");
     let mut images =
@@ -265,8 +279,11 @@ pub fn write(folder: &Path, cameras: &[Camera], points: Option<&PointCloud>) -> 
     for (i, c) in cameras.iter().enumerate() {
         let id = i + 1;
         // Writing to a String cannot fail.
-        let _ =
-            writeln!(intrinsics, "{id} PINHOLE {} {} {} {} {} {}", c.width, c.height, c.fx, c.fy, c.cx, c.cy);
+        let pinhole = format!("{} {} {} {} {} {}", c.width, c.height, c.fx, c.fy, c.cx, c.cy);
+        let _ = match lenses.and_then(|l| l.get(i)) {
+            Some(Lens { k1, k2 }) => writeln!(intrinsics, "{id} OPENCV {pinhole} {k1} {k2} 0 0"),
+            None => writeln!(intrinsics, "{id} PINHOLE {pinhole}"),
+        };
         let q = DQuat::from_mat3(&c.pose.rotation).normalize();
         let t = c.pose.translation;
         let _ = writeln!(

@@ -94,6 +94,9 @@ pub fn write(folder: &Path, c: &Contents) -> Result<()> {
         named.iter_mut().for_each(|camera| camera.name = format!("images/{}", camera.name));
     }
     transforms::write(&camera_folder.join("transforms.json"), &named, Some("../point_cloud.ply"))?;
+    if !c.photos.is_empty() {
+        write_originals(&camera_folder.join("original"), c)?;
+    }
     let language = c.language.map(|l| write_language(folder, l, c.splats.len())).transpose()?;
     if let (Some(_), Some(table)) = (&language, c.text_embeddings) {
         let to = folder.join(TEXT_EMBEDDINGS);
@@ -109,6 +112,15 @@ pub fn write(folder: &Path, c: &Contents) -> Result<()> {
         language,
     };
     super::write_json(&folder.join(MANIFEST), &manifest)
+}
+
+/// The cameras of the photos as they were taken: at their own size, with their lens.
+fn write_originals(folder: &Path, c: &Contents) -> Result<()> {
+    let cameras: Vec<Camera> =
+        c.photos.iter().zip(c.cameras).map(|(photo, camera)| photo.original_camera(camera)).collect();
+    let lenses: Vec<_> = c.photos.iter().map(Photo::lens).collect();
+    colmap::write_lensed(&folder.join("colmap"), &cameras, &lenses)?;
+    transforms::write_lensed(&folder.join("transforms.json"), &cameras, &lenses)
 }
 
 fn write_language(folder: &Path, field: &LanguageField, splats: usize) -> Result<LanguageManifest> {

@@ -1,6 +1,6 @@
 //! nerfstudio `transforms.json`: camera → world in OpenGL axes (x right, y up, z backward).
 use crate::Result;
-use crate::scene::{Camera, Pose};
+use crate::scene::{Camera, Lens, Pose};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -112,15 +112,32 @@ struct OutFrame<'a> {
     cy: f64,
     w: u32,
     h: u32,
+    #[serde(flatten)]
+    lens: Option<Lens>,
     transform_matrix: [[f64; 4]; 4],
 }
 
 /// Writes `transforms.json`; every frame carries its own intrinsics. `ply_file_path`, relative to the file, names points
 /// or splats for tools that start from them.
 pub fn write(path: &Path, cameras: &[Camera], ply_file_path: Option<&str>) -> Result<()> {
+    write_frames(path, cameras, None, ply_file_path)
+}
+
+/// Writes `transforms.json` of photos as they were taken: every frame with its `k1` and `k2`.
+pub fn write_lensed(path: &Path, cameras: &[Camera], lenses: &[Lens]) -> Result<()> {
+    write_frames(path, cameras, Some(lenses), None)
+}
+
+fn write_frames(
+    path: &Path,
+    cameras: &[Camera],
+    lenses: Option<&[Lens]>,
+    ply_file_path: Option<&str>,
+) -> Result<()> {
     let frames: Vec<OutFrame> = cameras
         .iter()
-        .map(|c| {
+        .enumerate()
+        .map(|(i, c)| {
             let to_world = c.pose.inverse();
             let (r, t) = (to_world.rotation, to_world.translation);
             let row = |k: usize| [r.x_axis[k], -r.y_axis[k], -r.z_axis[k], t[k]];
@@ -132,12 +149,14 @@ pub fn write(path: &Path, cameras: &[Camera], ply_file_path: Option<&str>) -> Re
                 cy: c.cy,
                 w: c.width,
                 h: c.height,
+                lens: lenses.and_then(|l| l.get(i)).copied(),
                 transform_matrix: [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
             }
         })
         .collect();
+    let model = if lenses.is_some() { "OPENCV" } else { "PINHOLE" };
     let mut file =
-        serde_json::json!({ "camera_model": "PINHOLE", "orientation_override": "none", "frames": frames });
+        serde_json::json!({ "camera_model": model, "orientation_override": "none", "frames": frames });
     if let Some(ply) = ply_file_path {
         file["ply_file_path"] = ply.into();
     }

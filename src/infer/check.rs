@@ -189,6 +189,8 @@ fn pictures() -> Vec<Photo> {
             to_working: Affine::IDENTITY,
             frame: Frame::default(),
             exif_focal: None,
+            fine: None,
+            straightened: None,
             camera_model: None,
             light: crate::photo::Light::NONE,
             image,

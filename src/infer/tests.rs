@@ -326,6 +326,8 @@ pub(super) fn photo(stem: &str, image: RgbImage) -> Photo {
         to_working: Affine::IDENTITY,
         frame: Frame::default(),
         exif_focal: None,
+        fine: None,
+        straightened: None,
         camera_model: None,
         light: crate::photo::Light::NONE,
         image,

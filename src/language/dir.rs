@@ -4,9 +4,10 @@
 //! `<stem>_f.npy` (N×D) or −1. `text_embeddings.npz` maps phrases to D-vectors of the same space.
 use super::{LevelMasks, ViewMasks};
 use crate::format::npy::{self, NpyData};
-use crate::photo::Photo;
+use crate::photo::{Affine, Photo};
 use crate::scene::Plane;
 use crate::{Error, Result};
+use glam::DVec2;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -39,7 +40,7 @@ pub fn read_view(dir: &Path, photo: &Photo, with_features: bool) -> Result<ViewM
     let mut out = ViewMasks::default();
     for labels in levels {
         let labels = Plane { width, height, data: labels };
-        let labels = if (width, height) == working { labels } else { to_working(&labels, photo) };
+        let labels = to_working(labels, photo);
         out.levels.push(compact(labels, features.as_ref(), &path)?);
     }
     Ok(out)
@@ -108,15 +109,20 @@ pub fn normalise_rows(rows: &mut [f32], dim: usize) {
     }
 }
 
-/// Nearest-neighbour resampling from the original size to the working size through the photo's affine map.
-fn to_working(labels: &Plane<i32>, photo: &Photo) -> Plane<i32> {
+/// Labels of the original or the working size as the photo's image shows them: nearest pixels, through the photo's affine
+/// map and the lens that was taken out.
+fn to_working(labels: Plane<i32>, photo: &Photo) -> Plane<i32> {
     let (width, height) = (photo.image.width, photo.image.height);
+    let same = (labels.width, labels.height) == (width, height);
+    if same && photo.straightened.is_none() {
+        return labels;
+    }
     let mut out = Plane::filled(width, height, -1);
-    let map = &photo.to_working;
+    let back = if same { Affine::IDENTITY } else { photo.to_working.inverse() };
     for y in 0..height {
         for x in 0..width {
-            let u = (x as f64 + 0.5 - map.offset[0]) / map.scale[0];
-            let v = (y as f64 + 0.5 - map.offset[1]) / map.scale[1];
+            let seen = photo.source(DVec2::new(x as f64 + 0.5, y as f64 + 0.5));
+            let [u, v] = back.apply(seen.to_array());
             if u >= 0.0 && v >= 0.0 && (u as usize) < labels.width && (v as usize) < labels.height {
                 out.data[y * width + x] = labels.at(u as usize, v as usize);
             }
@@ -244,6 +250,8 @@ mod tests {
                 offset: [0.0; 2],
             },
             exif_focal: None,
+            fine: None,
+            straightened: None,
             camera_model: None,
             light: crate::photo::Light::NONE,
         }

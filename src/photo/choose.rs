@@ -1,4 +1,5 @@
 //! Which files are the photos, and which of them the run uses.
+use super::kind::{READ, is_foreign_name, is_photo_name, is_video_name};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
@@ -7,19 +8,6 @@ pub const MOST_VIEWS: usize = 16;
 
 /// Views used when more photos are given and `--views` is not (ALGORITHMS 0.6).
 pub const DEFAULT_VIEWS: usize = 4;
-
-const PHOTO: [&str; 4] = ["jpg", "jpeg", "jpe", "png"];
-const VIDEO: [&str; 10] = ["mp4", "m4v", "mov", "avi", "mkv", "webm", "mpg", "mpeg", "wmv", "3gp"];
-const OTHER_IMAGE: [&str; 12] =
-    ["heic", "heif", "avif", "webp", "tif", "tiff", "bmp", "gif", "dng", "cr2", "nef", "arw"];
-
-fn has_extension(path: &Path, list: &[&str]) -> bool {
-    path.extension().is_some_and(|e| list.iter().any(|l| e.eq_ignore_ascii_case(l)))
-}
-
-pub(super) fn is_video_name(path: &Path) -> bool {
-    has_extension(path, &VIDEO)
-}
 
 /// The photos behind the inputs and what was left out of the folders.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -41,7 +29,11 @@ pub fn find(inputs: &[PathBuf]) -> Result<Found> {
         if kind.is_dir() {
             list(input, &mut found)?;
         } else if is_video_name(input) {
-            return Err(Error::input(format!("{}: {}", input.display(), super::decode::VIDEO)));
+            return Err(Error::input(format!(
+                "{}: {}",
+                input.display(),
+                "is a video; take 3 or 4 still photos, or save frames of it as JPEG"
+            )));
         } else {
             found.photos.push(input.clone());
         }
@@ -53,14 +45,14 @@ pub fn find(inputs: &[PathBuf]) -> Result<Found> {
     let place = inputs.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ");
     match (found.photos.as_slice(), found.ignored.first()) {
         ([], None) => Err(Error::input(format!(
-            "{place}: no photos; give a folder with 2 to {MOST_VIEWS} JPEG or PNG files"
+            "{place}: no photos; give a folder with 2 to {MOST_VIEWS} photos ({READ})"
         ))),
         ([], Some(v)) if is_video_name(v) => Err(Error::input(format!(
             "{}: this is a video and there are no photos beside it; take 3 or 4 still photos, or save frames as JPEG",
             v.display()
         ))),
         ([], Some(other)) => Err(Error::input(format!(
-            "{}: no JPEG or PNG photos beside this file; save the photos as JPEG or PNG",
+            "{}: this kind of image is not read and there are no photos beside it; save the photos as JPEG or PNG",
             other.display()
         ))),
         ([one], _) if !is_video_name(one) => Err(Error::input(format!(
@@ -78,9 +70,9 @@ fn list(folder: &Path, found: &mut Found) -> Result<()> {
         if hidden || path.is_dir() {
             continue;
         }
-        if has_extension(&path, &PHOTO) {
+        if is_photo_name(&path) {
             found.photos.push(path);
-        } else if has_extension(&path, &VIDEO) || has_extension(&path, &OTHER_IMAGE) {
+        } else if is_video_name(&path) || is_foreign_name(&path) {
             found.ignored.push(path);
         }
     }

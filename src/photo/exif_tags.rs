@@ -1,5 +1,5 @@
 //! What EXIF says about the lens.
-use exif::{Exif, In, Reader, Tag, Value};
+use exif::{Context, Field, In, Reader, Tag, Value};
 
 /// Diagonal of the 36 × 24 mm frame that "35 mm equivalent" refers to (CIPA DCG-001: equal diagonal angle of view).
 const FULL_FRAME_DIAGONAL_MM: f64 = 43.266615305567875;
@@ -22,13 +22,44 @@ pub(super) struct Lens {
 pub(super) fn lens(raw: Vec<u8>, size: (u32, u32)) -> Lens {
     let read = Reader::new().continue_on_error(true).read_raw(raw);
     match read.or_else(|e| e.distill_partial_result(|_| ())) {
-        Ok(exif) => Lens { focal: focal(&exif, size), camera_model: camera_model(&exif) },
+        Ok(exif) => of(&|tag| exif.get_field(tag, In::PRIMARY), size),
         Err(_) => Lens::default(),
     }
 }
 
-fn number(exif: &Exif, tag: Tag) -> Option<f64> {
-    let value = match &exif.get_field(tag, In::PRIMARY)?.value {
+/// The tags of the first image of a TIFF file.
+pub(super) struct TiffTags(Vec<Field>);
+
+/// Reads them without copying the pixels; `None` where they are damaged.
+pub(super) fn of_tiff(bytes: &[u8]) -> Option<TiffTags> {
+    Some(TiffTags(exif::parse_exif(bytes).ok()?.0))
+}
+
+impl TiffTags {
+    fn field(&self, tag: Tag) -> Option<&Field> {
+        self.0.iter().find(|f| f.tag == tag && f.ifd_num == In::PRIMARY)
+    }
+
+    pub fn lens(&self, size: (u32, u32)) -> Lens {
+        of(&|tag| self.field(tag), size)
+    }
+
+    /// ExtraSamples 1: colours are stored multiplied by alpha (TIFF 6.0, section 18).
+    pub fn has_associated_alpha(&self) -> bool {
+        let extra = self.field(Tag(Context::Tiff, 338));
+        extra.and_then(|f| f.value.get_uint(0)) == Some(1)
+    }
+}
+
+/// The first field of a tag that describes the primary image.
+type Fields<'a> = &'a dyn Fn(Tag) -> Option<&'a Field>;
+
+fn of(fields: Fields, size: (u32, u32)) -> Lens {
+    Lens { focal: focal(fields, size), camera_model: camera_model(fields) }
+}
+
+fn number(fields: Fields, tag: Tag) -> Option<f64> {
+    let value = match &fields(tag)?.value {
         Value::Rational(v) => v.first()?.to_f64(),
         Value::SRational(v) => v.first()?.to_f64(),
         other => other.get_uint(0)? as f64,
@@ -38,13 +69,13 @@ fn number(exif: &Exif, tag: Tag) -> Option<f64> {
 
 /// The focal plane tags are exact where they are right, the 35 mm tag is a whole number of millimetres (2 % at 26 mm)
 /// but hard to get wrong: the former count only when the latter agrees or is absent.
-fn focal(exif: &Exif, (w, h): (u32, u32)) -> Option<f64> {
+fn focal(fields: Fields, (w, h): (u32, u32)) -> Option<f64> {
     let (w, h) = (w as f64, h as f64);
     let believable = |f: &f64| BELIEVABLE.contains(&(f / w.max(h)));
-    let equivalent = number(exif, Tag::FocalLengthIn35mmFilm)
+    let equivalent = number(fields, Tag::FocalLengthIn35mmFilm)
         .map(|mm| mm / FULL_FRAME_DIAGONAL_MM * w.hypot(h))
         .filter(believable);
-    let plane = focal_plane(exif, w.max(h)).filter(believable);
+    let plane = focal_plane(fields, w.max(h)).filter(believable);
     match (plane, equivalent) {
         // 12 %: rounding of a short 35 mm figure plus the width-based equivalents that some makers write.
         (Some(p), Some(e)) if (p / e).ln().abs() < 0.12 => Some(p),
@@ -54,10 +85,10 @@ fn focal(exif: &Exif, (w, h): (u32, u32)) -> Option<f64> {
 }
 
 /// Focal length in pixels from FocalLength and the sensor's pixels per unit length.
-fn focal_plane(exif: &Exif, long_side: f64) -> Option<f64> {
-    let mm = number(exif, Tag::FocalLength)?;
-    let resolution = number(exif, Tag::FocalPlaneXResolution)?;
-    let unit_mm = match number(exif, Tag::FocalPlaneResolutionUnit).unwrap_or(2.0) as u32 {
+fn focal_plane(fields: Fields, long_side: f64) -> Option<f64> {
+    let mm = number(fields, Tag::FocalLength)?;
+    let resolution = number(fields, Tag::FocalPlaneXResolution)?;
+    let unit_mm = match number(fields, Tag::FocalPlaneResolutionUnit).unwrap_or(2.0) as u32 {
         2 => 25.4,
         3 => 10.0,
         4 => 1.0,
@@ -65,14 +96,14 @@ fn focal_plane(exif: &Exif, long_side: f64) -> Option<f64> {
         _ => return None,
     };
     // The resolution counts pixels of the image as the camera wrote it; PixelXDimension tells when it was scaled since.
-    let written = [Tag::PixelXDimension, Tag::PixelYDimension].map(|t| number(exif, t).unwrap_or(0.0));
+    let written = [Tag::PixelXDimension, Tag::PixelYDimension].map(|t| number(fields, t).unwrap_or(0.0));
     let written = written[0].max(written[1]);
     let scale = if written > 0.0 { long_side / written } else { 1.0 };
     Some(mm * resolution / unit_mm * scale)
 }
 
-fn camera_model(exif: &Exif) -> Option<String> {
-    let text = |tag| match &exif.get_field(tag, In::PRIMARY)?.value {
+fn camera_model(fields: Fields) -> Option<String> {
+    let text = |tag| match &fields(tag)?.value {
         Value::Ascii(v) => {
             let s = String::from_utf8_lossy(v.first()?).trim_matches(['\0', ' ']).to_string();
             (!s.is_empty()).then_some(s)
@@ -89,8 +120,8 @@ fn camera_model(exif: &Exif) -> Option<String> {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
+    use exif::Rational;
     use exif::experimental::Writer;
-    use exif::{Field, Rational};
 
     /// An EXIF block (TIFF bytes) with the given fields.
     pub fn block(fields: &[(Tag, Value)]) -> Vec<u8> {

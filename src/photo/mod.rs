@@ -4,25 +4,46 @@ mod choose;
 mod decode;
 mod exif_tags;
 mod frame;
+mod heif;
+mod kind;
 pub mod light;
 mod resize;
+mod straighten;
 
 pub use affine::Affine;
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
 pub use frame::Frame;
 pub use light::Light;
 pub use resize::Kernel;
+pub use straighten::Straightening;
 
 use crate::progress::Progress;
-use crate::scene::RgbImage;
+use crate::scene::{Camera, Lens, Plane, RgbImage};
 use crate::{Error, Result};
+use glam::DVec2;
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Greatest height of the working image, pixels (ALGORITHMS 1.2).
-pub const WORKING_HEIGHT: usize = 1080;
+/// What the machine has for HEIC and AVIF photos, in words, and what to do about what it lacks.
+pub fn heif_support() -> (String, Option<String>) {
+    heif::status()
+}
+
+/// Greatest side of a working image on a GPU, pixels: where the reference implementation of Gaussian splatting stops (Kerbl
+/// et al. 2023 scale wider photos down to it). A portrait keeps as many pixels as the same photo lying on its side.
+pub const MAX_SIZE: usize = 1600;
+
+/// Greatest side of a working image on a CPU device, pixels: photos of 4:3 then have 1.56 times the pixels of 640 × 480,
+/// which keeps a run within twice its time (docs/performance.md).
+pub const MAX_SIZE_CPU: usize = 800;
+
+/// The greatest side that suits the device.
+pub fn default_max_size(is_cpu: bool) -> usize {
+    if is_cpu { MAX_SIZE_CPU } else { MAX_SIZE }
+}
 
 /// Smallest side of a usable photo, pixels: feature networks work at 1/8 resolution, below 8 × 8 cells nothing is left
 /// to match.
@@ -45,31 +66,70 @@ pub struct Photo {
     pub to_working: Affine,
     /// Focal length from EXIF in working pixels, if the file tells.
     pub exif_focal: Option<f64>,
+    /// Luma of the photo at more pixels than the working image has, for measuring positions; where there are more.
+    pub fine: Option<Arc<Plane<f32>>>,
+    /// The lens that was taken out of the image.
+    pub straightened: Option<Straightening>,
     /// Camera make and model from EXIF: photos that share it may share one focal length.
     pub camera_model: Option<String>,
     /// Exposure, white balance and vignetting that were taken out of `image`.
     pub light: Light,
 }
 
-/// Reads one photo: EXIF orientation applied, alpha composited on black, height at most [`WORKING_HEIGHT`].
+impl Photo {
+    /// Takes the lens out of the working image; `camera` is the pinhole that remains, at the working resolution.
+    pub fn straighten(&mut self, lens: Lens, camera: &Camera) {
+        if !lens.is_none() {
+            let (focal, centre) = (0.5 * (camera.fx + camera.fy), DVec2::new(camera.cx, camera.cy));
+            let how = Straightening { lens, focal, centre };
+            self.image = how.image(&self.image);
+            self.straightened = Some(how);
+        }
+    }
+
+    /// The lens that was taken out of the image.
+    pub fn lens(&self) -> Lens {
+        self.straightened.map_or(Lens::NONE, |s| s.lens)
+    }
+
+    /// Where the photo as it was read, at the working resolution, has what the image shows at `p`.
+    pub fn source(&self, p: DVec2) -> DVec2 {
+        self.straightened.map_or(p, |s| s.source(p))
+    }
+
+    /// The camera of the working image as one of the photo's file: its size, its pixels, its name. [`Photo::lens`] belongs
+    /// to it.
+    pub fn original_camera(&self, camera: &Camera) -> Camera {
+        let name = self.path.file_name().map_or_else(|| self.stem.clone(), |n| n.to_string_lossy().into());
+        Camera { name, ..self.to_working.inverse().camera(camera, self.original_size) }
+    }
+}
+
+/// [`load_at`] with [`MAX_SIZE`].
 pub fn load(path: &Path) -> Result<Photo> {
+    load_at(path, MAX_SIZE)
+}
+
+/// Reads one photo: EXIF orientation applied, alpha composited on black, scaled down to `max_size` pixels along its longer
+/// side if it is larger.
+pub fn load_at(path: &Path, max_size: usize) -> Result<Photo> {
     let bytes = std::fs::read(path).map_err(|e| {
         Error::input(format!("{}: {e}; check the name and that you may read it", path.display()))
     })?;
-    from_bytes(path, bytes)
+    from_bytes(path, bytes, max_size)
 }
 
-/// [`load`] of a JPEG or PNG file that is in memory already; `name` stands for its path.
-pub fn from_bytes(name: &Path, bytes: Vec<u8>) -> Result<Photo> {
+/// [`load_at`] of an image file that is in memory already; `name` stands for its path.
+pub fn from_bytes(name: &Path, bytes: Vec<u8>, max_size: usize) -> Result<Photo> {
     let decoded = decode::decode(bytes, name)?;
-    let photo = working(name, decoded.size, |x, y| decoded.at(x, y))?;
-    // The two scales differ by the rounding of the size only; the height is the exact one.
+    let photo = working(name, decoded.size, max_size, |x, y| decoded.at(x, y))?;
+    // The two scales differ by the rounding of the size only.
     let exif_focal = decoded.lens.focal.map(|f| f * photo.to_working.scale[1]);
     Ok(Photo { exif_focal, camera_model: decoded.lens.camera_model, ..photo })
 }
 
 /// A photo from upright sRGB pixels in [0, 1]; `focal` is in their pixels, where it is known.
-pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>) -> Result<Photo> {
+pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>, max_size: usize) -> Result<Photo> {
     if image.data.len() != image.width * image.height {
         return Err(Error::input(format!(
             "{}: {} pixels do not make {} × {}",
@@ -79,7 +139,7 @@ pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>) -> Result<
             image.height
         )));
     }
-    let photo = working(name, (image.width, image.height), |x, y| image.at(x, y))?;
+    let photo = working(name, (image.width, image.height), max_size, |x, y| image.at(x, y))?;
     Ok(Photo { exif_focal: focal.map(|f| f * photo.to_working.scale[1]), ..photo })
 }
 
@@ -87,6 +147,7 @@ pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>) -> Result<
 fn working(
     name: &Path,
     (w, h): (usize, usize),
+    max_size: usize,
     at: impl Fn(usize, usize) -> [f32; 3] + Sync,
 ) -> Result<Photo> {
     if w.min(h) < SMALLEST_SIDE {
@@ -95,8 +156,9 @@ fn working(
             name.display()
         )));
     }
-    let (working_w, working_h) = working_size(w, h);
-    let mut image = resize::area_average((w, h), (working_w, working_h), at);
+    let (working_w, working_h) = working_size(w, h, max_size);
+    let mut image = resize::area_average((w, h), (working_w, working_h), &at);
+    let fine = fine((w, h), (working_w, working_h), &at);
     let frame = Frame::of(&image);
     frame.continue_picture(&mut image);
     Ok(Photo {
@@ -107,27 +169,60 @@ fn working(
         original_size: (w as u32, h as u32),
         to_working: Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32)),
         exif_focal: None,
+        fine,
+        straightened: None,
         camera_model: None,
         light: Light::NONE,
     })
 }
 
-/// Working (width, height) of an upright size: the height is capped, sizes truncated (ALGORITHMS 1.2).
-fn working_size(w: usize, h: usize) -> (usize, usize) {
-    if h <= WORKING_HEIGHT {
-        return (w, h);
-    }
-    ((w * WORKING_HEIGHT / h).max(1), WORKING_HEIGHT)
+/// Largest long side of [`Photo::fine`], pixels.
+const FINE: usize = 3072;
+/// Fewer more pixels than this show nothing new.
+const LEAST_GAIN: f64 = 1.25;
+
+fn fine(
+    (w, h): (usize, usize),
+    working: (usize, usize),
+    at: &(impl Fn(usize, usize) -> [f32; 3] + Sync),
+) -> Option<Arc<Plane<f32>>> {
+    let share = (FINE as f64 / w.max(h) as f64).min(1.0);
+    let size = ((w as f64 * share).round() as usize, (h as f64 * share).round() as usize);
+    (size.0 as f64 > LEAST_GAIN * working.0 as f64)
+        .then(|| Arc::new(resize::area_average((w, h), size, at).luma()))
 }
 
-/// Finds, chooses and reads the photos of a run; refuses sets that cannot give geometry (the same photo twice) or that
-/// would mix up files (the same name twice).
+/// Working (width, height) of a photo of that size: the longer side is capped, the other one rounded. Never larger than
+/// the photo, and its shorter side never below [`SMALLEST_SIDE`]: a panorama keeps what the networks need.
+pub fn working_size(w: usize, h: usize, max_size: usize) -> (usize, usize) {
+    let (long, short) = (w.max(h), w.min(h));
+    let floor = (SMALLEST_SIDE * long).div_ceil(short.max(1));
+    let target = max_size.max(floor);
+    if long <= target {
+        return (w, h);
+    }
+    let scaled = |side: usize| ((side * target + long / 2) / long).max(1);
+    (scaled(w), scaled(h))
+}
+
+/// [`load_all_at`] with [`MAX_SIZE`].
 pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progress) -> Result<Vec<Photo>> {
+    load_all_at(inputs, views, MAX_SIZE, progress)
+}
+
+/// Finds, chooses and reads the photos of a run, each scaled down to `max_size` where it is larger; refuses sets that cannot give geometry (the same photo twice) or that
+/// would mix up files (the same name twice).
+pub fn load_all_at(
+    inputs: &[PathBuf],
+    views: Option<usize>,
+    max_size: usize,
+    progress: &dyn Progress,
+) -> Result<Vec<Photo>> {
     let found = find(inputs)?;
     if let Some(first) = found.ignored.first() {
         let more = found.ignored.len() - 1;
         let others = if more > 0 { format!(" and {more} more") } else { String::new() };
-        progress.warn(&format!("not a JPEG or PNG photo, ignored: {}{others}", first.display()));
+        progress.warn(&format!("not a photo that can be read, ignored: {}{others}", first.display()));
     }
     let paths = choose(&found.photos, views)?;
     if views.is_none() && paths.len() < found.photos.len() {
@@ -141,7 +236,7 @@ pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progres
     let done = AtomicU64::new(0);
     let one = |path: &PathBuf| {
         progress.check()?;
-        let photo = load(path)?;
+        let photo = load_at(path, max_size)?;
         progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
         Ok(photo)
     };
@@ -153,8 +248,23 @@ pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progres
     if !framed.is_empty() {
         progress.warn(&format!("plain frame around the picture left out: {}", framed.join(", ")));
     }
+    let bright: Vec<&str> =
+        photos.iter().filter(|p| mostly_above_white(&p.image)).map(|p| p.stem.as_str()).collect();
+    if !bright.is_empty() {
+        progress.warn(&format!(
+            "most of the picture is brighter than white (1.0): {}; if these are not overexposed, scale the values in the \
+             files so that white paper is near 1",
+            bright.join(", ")
+        ));
+    }
     check_set(&photos)?;
     Ok(photos)
+}
+
+/// Files of high dynamic range in another unit: matching and training expect diffuse surfaces below 1.
+fn mostly_above_white(image: &RgbImage) -> bool {
+    let above = image.data.iter().filter(|c| c.iter().any(|v| *v > 1.0)).count();
+    2 * above > image.data.len()
 }
 
 /// Refuses sets that cannot give geometry (one photo, or the same photo twice) or that would mix up files (the same name
@@ -189,10 +299,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_height_is_capped_and_sizes_truncated() {
-        assert_eq!(working_size(640, 480), (640, 480));
-        assert_eq!(working_size(1920, 1080), (1920, 1080));
-        assert_eq!(working_size(4032, 3024), (1440, 1080));
-        assert_eq!(working_size(3024, 4033), (809, 1080));
+    fn files_in_another_unit_are_noticed() {
+        let image = |v: f32| RgbImage { width: 2, height: 2, data: vec![[v; 3], [v; 3], [v; 3], [0.1; 3]] };
+        assert!(mostly_above_white(&image(3.0)) && !mostly_above_white(&image(1.0)));
+    }
+
+    #[test]
+    fn the_longer_side_is_capped_and_nothing_is_enlarged() {
+        assert_eq!(working_size(640, 480, 800), (640, 480));
+        assert_eq!(working_size(800, 800, 800), (800, 800));
+        assert_eq!(working_size(4032, 3024, 800), (800, 600));
+        assert_eq!(working_size(3024, 4032, 800), (600, 800));
+        assert_eq!(working_size(4032, 3024, MAX_SIZE), (1600, 1200));
+        assert_eq!(working_size(4032, 3024, usize::MAX / 8192), (4032, 3024));
+        // A panorama keeps a usable height.
+        assert_eq!(working_size(8000, 1200, 800), (800, 120));
+        assert_eq!(working_size(12000, 400, 800), (1920, 64));
     }
 }

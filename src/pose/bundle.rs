@@ -1,7 +1,7 @@
-//! Bundle adjustment: cameras, focal lengths and points that minimise the robust reprojection error (Levenberg–Marquardt
+//! Bundle adjustment: cameras, their optics and points that minimise the robust reprojection error (Levenberg–Marquardt
 //! in f64, points eliminated by the Schur complement).
 use super::numeric::{cauchy, cauchy_weight, skew};
-use crate::scene::Pose;
+use crate::scene::{Lens, Pose};
 use crate::{Error, Result};
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
@@ -17,21 +17,70 @@ pub(crate) struct Observation {
     pub(crate) sigma: f64,
 }
 
+/// What the photos of one camera share.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Optics {
+    /// Focal length, original pixels.
+    pub(crate) focal: f64,
+    /// Radial distortion.
+    pub(crate) lens: Lens,
+    /// Principal point from the middle of the photo, original pixels.
+    pub(crate) shift: DVec2,
+}
+
+/// Number of parameters of [`Optics`]: ln f, k1, k2, shift.
+const OPTICS: usize = 5;
+
+/// What is known of optics before the images are seen, as normal deviates. σ = 0 holds a parameter where it is.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct OpticsPrior {
+    /// ln f and its σ.
+    pub(crate) log_focal: (f64, f64),
+    /// σ of k1 and k2 around 0.
+    pub(crate) lens: [f64; 2],
+    /// σ of the shift around 0, original pixels.
+    pub(crate) shift: f64,
+}
+
+impl OpticsPrior {
+    /// Number of parameters that it leaves free.
+    pub(crate) fn count(&self) -> usize {
+        let radial = self.lens.iter().filter(|s| **s > 0.0).count();
+        usize::from(self.log_focal.1 > 0.0) + radial + 2 * usize::from(self.shift > 0.0)
+    }
+
+    /// σ of every parameter, in the order of [`Outcome::sigmas`].
+    pub(crate) fn sigmas(&self) -> [f64; OPTICS] {
+        [self.log_focal.1, self.lens[0], self.lens[1], self.shift, self.shift]
+    }
+
+    /// (distance from the prior's mean, σ) of every parameter.
+    fn deviations(&self, o: &Optics) -> [(f64, f64); OPTICS] {
+        [
+            (o.focal.ln() - self.log_focal.0, self.log_focal.1),
+            (o.lens.k1, self.lens[0]),
+            (o.lens.k2, self.lens[1]),
+            (o.shift.x, self.shift),
+            (o.shift.y, self.shift),
+        ]
+    }
+}
+
 /// Everything the adjustment changes, and what it may not.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Problem {
     /// World → camera; camera 0 stays fixed.
     pub(crate) poses: Vec<Pose>,
-    /// Principal point per camera, pixels, fixed.
+    /// Middle of each photo, pixels.
     pub(crate) centres: Vec<DVec2>,
-    /// Which focal length each camera uses.
+    /// Which optics each camera uses.
     pub(crate) group: Vec<usize>,
-    /// Pixels of each camera per unit of its focal length: photos of one camera may be scaled differently.
+    /// Pixels of each camera per original pixel of its optics: photos of one camera may be scaled differently.
     pub(crate) zoom: Vec<f64>,
-    /// Focal lengths.
-    pub(crate) focals: Vec<f64>,
-    /// (ln f, σ of ln f) before seeing the images; σ = 0 holds the focal length fixed.
-    pub(crate) priors: Vec<(f64, f64)>,
+    /// Per group.
+    pub(crate) optics: Vec<Optics>,
+    /// Per group.
+    pub(crate) priors: Vec<OpticsPrior>,
     pub(crate) points: Vec<DVec3>,
     pub(crate) observations: Vec<Observation>,
 }
@@ -39,8 +88,10 @@ pub(crate) struct Problem {
 /// What an adjustment found.
 #[derive(Clone, Debug)]
 pub(crate) struct Outcome {
-    /// σ of ln f per focal group.
-    pub(crate) focal_log_sigma: Vec<f64>,
+    /// Robust cost, in squared standard deviations.
+    pub(crate) cost: f64,
+    /// σ of ln f, k1, k2 and the shift per group, from the observations and the priors; 0 where held.
+    pub(crate) sigmas: Vec<[f64; OPTICS]>,
 }
 
 /// Normal equations: camera block (poses 1.., then focal groups), and per point its own block and coupling.
@@ -61,8 +112,9 @@ impl Problem {
     /// Projection in camera frame and its pixel.
     fn project(&self, o: &Observation) -> (DVec3, DVec2) {
         let t = self.poses[o.camera].transform(self.points[o.point]);
-        let f = self.focals[self.group[o.camera]] * self.zoom[o.camera];
-        (t, DVec2::new(f * t.x / t.z, f * t.y / t.z) + self.centres[o.camera])
+        let (optics, zoom) = (&self.optics[self.group[o.camera]], self.zoom[o.camera]);
+        let seen = optics.lens.distort(DVec2::new(t.x, t.y) / t.z);
+        (t, seen * (optics.focal * zoom) + optics.shift * zoom + self.centres[o.camera])
     }
 
     /// Reprojection residual of an observation, pixels; infinite behind the camera.
@@ -90,12 +142,8 @@ impl Problem {
     }
 
     fn prior_cost(&self) -> f64 {
-        self.focals
-            .iter()
-            .zip(&self.priors)
-            .filter(|(_, p)| p.1 > 0.0)
-            .map(|(f, p)| ((f.ln() - p.0) / p.1).powi(2))
-            .sum()
+        let all = self.optics.iter().zip(&self.priors).flat_map(|(o, p)| p.deviations(o));
+        all.filter(|(_, sigma)| *sigma > 0.0).map(|(d, sigma)| (d / sigma).powi(2)).sum()
     }
 
     fn camera_offset(&self, camera: usize) -> Option<usize> {
@@ -104,7 +152,7 @@ impl Problem {
 
     fn linearise(&self, c: f64) -> Normal {
         let pose_size = 6 * (self.poses.len() - 1);
-        let n = pose_size + self.focals.len();
+        let n = pose_size + OPTICS * self.optics.len();
         let mut normal = Normal { h: DMatrix::zeros(n, n), g: DVector::zeros(n), points: Vec::new() };
         normal.points = (0..self.points.len())
             .map(|_| PointBlock { v: DMat3::ZERO, g: DVec3::ZERO, coupling: Vec::new() })
@@ -116,10 +164,18 @@ impl Problem {
             }
             let r = (p - o.pixel) / o.sigma;
             let w = cauchy_weight(r.length_squared(), c);
-            let f = self.focals[self.group[o.camera]] * self.zoom[o.camera];
-            let s = f / (t.z * o.sigma);
-            // Rows of ∂(u, v)/∂t, each a 3-vector.
-            let rows = [DVec3::new(s, 0.0, -s * t.x / t.z), DVec3::new(0.0, s, -s * t.y / t.z)];
+            let (optics, zoom) = (&self.optics[self.group[o.camera]], self.zoom[o.camera]);
+            let f = optics.focal * zoom / o.sigma;
+            let x = DVec2::new(t.x, t.y) / t.z;
+            let bend = optics.lens.jacobian(x);
+            // Rows of ∂(u, v)/∂t, each a 3-vector: through x = (X, Y)/Z and the lens.
+            let rows = [0, 1].map(|axis| {
+                let by = bend.row(axis) * (f / t.z);
+                DVec3::new(by.x, by.y, -by.dot(x))
+            });
+            let r2 = x.length_squared();
+            let seen = optics.lens.distort(x);
+            let free = self.priors[self.group[o.camera]].deviations(optics).map(|d| d.1 > 0.0);
             let rotation = self.poses[o.camera].rotation;
             let (rt, kt) = (rotation.transpose(), skew(t));
             let block = &mut normal.points[o.point];
@@ -128,17 +184,17 @@ impl Problem {
                 // δt = ρ − [t]× θ, so ∂/∂θ = −rowᵀ[t]× = ([t]× row)ᵀ.
                 let jt = kt * *row;
                 // ∂(u, v)/∂ ln f is the centred pixel itself.
-                let jf = s * [t.x, t.y][axis];
-                let mut entries: Vec<(usize, f64)> = Vec::with_capacity(7);
+                let mut by = [f * seen[axis], f * x[axis] * r2, f * x[axis] * r2 * r2, 0.0, 0.0];
+                by[3 + axis] = zoom / o.sigma;
+                let mut entries: Vec<(usize, f64)> = Vec::with_capacity(6 + OPTICS);
                 if let Some(base) = self.camera_offset(o.camera) {
                     for k in 0..3 {
                         entries.push((base + k, row[k]));
                         entries.push((base + 3 + k, jt[k]));
                     }
                 }
-                if self.priors[self.group[o.camera]].1 > 0.0 {
-                    entries.push((pose_size + self.group[o.camera], jf));
-                }
+                let base = pose_size + OPTICS * self.group[o.camera];
+                entries.extend((0..OPTICS).filter(|k| free[*k] && by[*k] != 0.0).map(|k| (base + k, by[k])));
                 let residual = r[axis];
                 for &(i, a) in &entries {
                     normal.g[i] += w * a * residual;
@@ -154,11 +210,12 @@ impl Problem {
                 block.v += DMat3::from_cols(jp * jp.x, jp * jp.y, jp * jp.z) * w;
             }
         }
-        for (k, (f, p)) in self.focals.iter().zip(&self.priors).enumerate() {
+        let all = self.optics.iter().zip(&self.priors).flat_map(|(o, p)| p.deviations(o));
+        for (k, (distance, sigma)) in all.enumerate() {
             let i = pose_size + k;
-            if p.1 > 0.0 {
-                normal.h[(i, i)] += 1.0 / (p.1 * p.1);
-                normal.g[i] += (f.ln() - p.0) / (p.1 * p.1);
+            if sigma > 0.0 {
+                normal.h[(i, i)] += 1.0 / (sigma * sigma);
+                normal.g[i] += distance / (sigma * sigma);
             } else {
                 normal.h[(i, i)] += 1.0;
             }
@@ -206,9 +263,13 @@ impl Problem {
             next.poses[k] = step.compose(&self.poses[k]).orthonormalised();
         }
         let pose_size = 6 * (self.poses.len() - 1);
-        for k in 0..self.focals.len() {
-            // A step of more than e^0.5 in focal length is outside the linear range.
-            next.focals[k] *= (-d[pose_size + k]).clamp(-0.5, 0.5).exp();
+        for (k, optics) in next.optics.iter_mut().enumerate() {
+            let step = |j: usize| -d[pose_size + OPTICS * k + j];
+            // Steps beyond e^0.5 in focal length or 0.1 in the lens are outside the linear range.
+            optics.focal *= step(0).clamp(-0.5, 0.5).exp();
+            optics.lens.k1 += step(1).clamp(-0.1, 0.1);
+            optics.lens.k2 += step(2).clamp(-0.1, 0.1);
+            optics.shift += DVec2::new(step(3), step(4));
         }
         for (k, p) in normal.points.iter().enumerate() {
             let mut g = p.g;
@@ -245,11 +306,11 @@ impl Problem {
                 break;
             }
         }
-        Ok(Outcome { focal_log_sigma: self.focal_sigma(c) })
+        Ok(Outcome { cost, sigmas: self.sigmas(c) })
     }
 
-    /// σ of ln f per group from the inverse of the reduced system, scaled by the observed residual variance.
-    fn focal_sigma(&self, c: f64) -> Vec<f64> {
+    /// σ of the optics from the inverse of the reduced system, scaled by the observed residual variance.
+    fn sigmas(&self, c: f64) -> Vec<[f64; OPTICS]> {
         let normal = self.linearise(c);
         // Marginalise the points without damping; λ = 1e-9 only keeps numerical zeros positive.
         let (mut s, _, _) = Self::reduce(&normal, 1e-9);
@@ -271,19 +332,17 @@ impl Problem {
             }
         }
         let variance = sum / freedom.max(1.0);
-        let Some(inverse) = s.cholesky().map(|f| f.inverse()) else {
-            return vec![f64::INFINITY; self.focals.len()];
+        let inverse = s.cholesky().map(|f| f.inverse());
+        let sigma = |group: usize, k: usize, prior: f64| {
+            let i = pose_size + OPTICS * group + k;
+            let seen = inverse.as_ref().map_or(f64::INFINITY, |m| (m[(i, i)] * variance).sqrt());
+            seen.min(prior)
         };
-        (0..self.focals.len())
-            .map(|k| {
-                let i = pose_size + k;
-                if self.priors[k].1 > 0.0 {
-                    (inverse[(i, i)] * variance).sqrt().min(self.priors[k].1)
-                } else {
-                    0.0
-                }
-            })
-            .collect()
+        let of = |(group, (o, p)): (usize, (&Optics, &OpticsPrior))| {
+            let priors = p.deviations(o).map(|d| d.1);
+            std::array::from_fn(|k| sigma(group, k, priors[k]))
+        };
+        self.optics.iter().zip(&self.priors).enumerate().map(of).collect()
     }
 }
 
@@ -299,8 +358,8 @@ mod tests {
             centres: vec![DVec2::new(320.0, 240.0); 4],
             group: vec![0; 4],
             zoom: vec![1.0; 4],
-            focals: vec![600.0],
-            priors: vec![(576f64.ln(), 0.35)],
+            optics: vec![Optics { focal: 600.0, lens: Lens::NONE, shift: DVec2::ZERO }],
+            priors: vec![OpticsPrior { log_focal: (576f64.ln(), 0.35), ..Default::default() }],
             ..Default::default()
         };
         for k in 0..4 {
@@ -319,7 +378,7 @@ mod tests {
             }
         }
         let truth = p.clone();
-        p.focals[0] *= 1.15;
+        p.optics[0] = Optics { focal: p.optics[0].focal * 1.15, lens: Lens::NONE, shift: DVec2::ZERO };
         for k in 1..4 {
             let v = |rng: &mut Rng| DVec3::new(rng.normal(), rng.normal(), rng.normal()) * 0.02;
             p.poses[k] = Pose::exp(v(&mut rng), v(&mut rng)).compose(&p.poses[k]);
@@ -337,10 +396,10 @@ mod tests {
         for o in p.observations.iter_mut().step_by(7) {
             o.pixel += DVec2::new(rng.normal(), rng.normal()) * 40.0;
         }
-        p.priors[0].1 = 100.0;
+        p.priors[0].log_focal.1 = 100.0;
         p.solve(4.0, 60).unwrap();
         p.solve(0.02, 60).unwrap();
-        assert!((p.focals[0] / 600.0 - 1.0).abs() < 1e-4, "{}", p.focals[0]);
+        assert!((p.optics[0].focal / 600.0 - 1.0).abs() < 1e-4, "{}", p.optics[0].focal);
         for (a, b) in p.poses.iter().zip(&truth.poses) {
             assert!(rotation_angle(&(a.rotation * b.rotation.transpose())) < 1e-4);
         }
@@ -352,8 +411,8 @@ mod tests {
         // deviate exceeds once in 10,000.
         let (mut p, _) = scene(1.0);
         let out = p.solve(1e3, 60).unwrap();
-        let sigma = out.focal_log_sigma[0];
+        let sigma = out.sigmas[0][0];
         assert!(sigma > 1e-4 && sigma < 0.02, "{sigma}");
-        assert!((p.focals[0] / 600.0).ln().abs() < 3.9 * sigma, "{} {sigma}", p.focals[0]);
+        assert!((p.optics[0].focal / 600.0).ln().abs() < 3.9 * sigma, "{} {sigma}", p.optics[0].focal);
     }
 }

@@ -1,7 +1,7 @@
 //! Choosing and running a geometry initialiser.
 use super::pointmap::{self, ModelView, PairPointmaps};
 use super::stereo::{self, StereoOptions};
-use super::{Features, Geometry, SparseModel, light, sfm};
+use super::{Features, Fitted, Geometry, SparseModel, light, sfm};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
@@ -49,7 +49,14 @@ pub fn place(
             100.0 * sigma
         ));
     }
+    warn_of_misfits(&photos, &model.fitted, progress);
     progress.check()?;
+    let mut photos = photos;
+    for ((photo, fitted), camera) in photos.iter_mut().zip(&model.fitted).zip(&model.cameras) {
+        photo.straighten(fitted.lens, camera);
+    }
+    // Only the cameras were measured on them.
+    photos.iter_mut().for_each(|p| p.fine = None);
     let photos = light::equalised(photos, &model, progress);
     let method = if cameras.is_some() { "cameras + stereo" } else { "sfm (corners + XFeat) + stereo" };
     Ok(Placed { photos, model, method: method.into() })
@@ -67,8 +74,8 @@ pub fn dense(
     let images: Vec<_> = photos.iter().map(|p| p.image.clone()).collect();
     let positions: Vec<_> = model.points.iter().map(|p| p.position).collect();
     let (depths, points) = stereo::dense(device, &images, &model.cameras, &positions, options, progress)?;
-    let focal_log_sigma = model.focal_log_sigma;
-    Ok(Geometry { cameras: model.cameras, depths, points, focal_log_sigma, method })
+    let SparseModel { cameras, focal_log_sigma, fitted, .. } = model;
+    Ok(Geometry { cameras, depths, points, focal_log_sigma, fitted, method })
 }
 
 /// Photos to cameras, depth maps and points (ALGORITHMS 2.6); the photos come back as the later stages are to see them.
@@ -90,6 +97,28 @@ pub fn initialise(
     let Placed { photos, model, method } = place(photos, cameras, registry, progress)?;
     let geometry = dense(device, &photos, model, method, stereo, progress)?;
     Ok((photos, geometry))
+}
+
+/// A photo whose matches miss by so many times what those of the other photos miss …
+const STRANGE: f64 = 4.0;
+/// … and by at least this share of the long side (half a pixel at 640) does not fit the model.
+const STRANGE_SHARE: f64 = 0.5 / 640.0;
+
+/// Names photos whose content, lens or file does not fit the cameras that explain the others.
+fn warn_of_misfits(photos: &[Photo], fitted: &[Fitted], progress: &dyn Progress) {
+    for (v, (photo, own)) in photos.iter().zip(fitted).enumerate() {
+        let mut others: Vec<f64> =
+            fitted.iter().enumerate().filter(|(o, _)| *o != v).map(|(_, f)| f.residual).collect();
+        let Some(usual) = super::numeric::median(&mut others) else { continue };
+        let long = photo.image.width.max(photo.image.height) as f64;
+        if own.residual > STRANGE * usual && own.residual > STRANGE_SHARE * long {
+            progress.warn(&format!(
+                "{}: its matches miss the model by {:.1} px, those of the other photos by {usual:.1}; something moved, or its \
+                 lens is not what radial distortion explains",
+                photo.stem, own.residual
+            ));
+        }
+    }
 }
 
 /// Keypoints kept per photo from the learned detector.

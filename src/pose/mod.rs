@@ -7,6 +7,7 @@ pub mod matching;
 mod minimal;
 pub(crate) mod numeric;
 pub mod pointmap;
+pub mod relative;
 mod resect;
 pub mod sfm;
 mod sift;
@@ -18,7 +19,7 @@ mod two_view;
 pub use initialise::{InitChoice, Placed, dense, initialise, learned_features, place, sparse};
 pub use matching::Features;
 
-use crate::scene::{Camera, DepthMap, PointCloud};
+use crate::scene::{Camera, DepthMap, Lens, PointCloud};
 use glam::{DVec2, DVec3};
 
 /// What every geometry initialiser returns (ALGORITHMS 2.6). World frame: camera 0 of the run, OpenCV axes.
@@ -32,6 +33,8 @@ pub struct Geometry {
     pub points: PointCloud,
     /// One standard deviation of ln f, if the focal length was estimated.
     pub focal_log_sigma: Option<f64>,
+    /// What was found of the optics, one per photo, if it was estimated.
+    pub fitted: Vec<Fitted>,
     /// Name of the initialiser and of what it used, for run.json.
     pub method: String,
 }
@@ -47,6 +50,17 @@ pub struct SparsePoint {
     pub views: Vec<(usize, DVec2)>,
 }
 
+/// What the photos told of the optics of one of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Fitted {
+    /// Its lens.
+    pub lens: Lens,
+    /// One standard deviation of ln f, k1, k2 and the principal point (x, y; original pixels); 0 = held where it is.
+    pub sigmas: [f64; 5],
+    /// Median distance of its sightings from where the model projects their points, working pixels.
+    pub residual: f64,
+}
+
 /// Cameras and the sparse points that fix them. World frame: camera 0; unit: the median depth of the points is
 /// 1 where it is free, that of the given cameras otherwise.
 #[derive(Clone, Debug, Default)]
@@ -57,4 +71,7 @@ pub struct SparseModel {
     pub points: Vec<SparsePoint>,
     /// One standard deviation of ln f, if the focal length was estimated.
     pub focal_log_sigma: Option<f64>,
+    /// One per photo, if the optics were estimated. The cameras and the points' pixels are those of the pinhole that remains
+    /// when the lens is taken out of the photo.
+    pub fitted: Vec<Fitted>,
 }

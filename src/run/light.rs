@@ -51,7 +51,9 @@ mod tests {
     #[test]
     fn only_light_that_was_taken_out_is_told() {
         let image = RgbImage { width: 64, height: 64, data: vec![[0.5; 3]; 64 * 64] };
-        let photo = |name: &str| crate::photo::from_pixels(name.as_ref(), &image, None).unwrap();
+        let photo = |name: &str| {
+            crate::photo::from_pixels(name.as_ref(), &image, None, crate::photo::MAX_SIZE).unwrap()
+        };
         let mut photos = vec![photo("a.png"), photo("b.png")];
         assert!(record(&photos).is_none() && figure(&photos).is_none());
         photos[1].light =

@@ -175,7 +175,7 @@ fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
     let workspace = Workspace::create(path, replace)?;
     let folder = scene.path.join("cameras");
     // A scene without its photos is still whole.
-    let photos = scene.cameras.iter().map(|c| photo::load(&folder.join(&c.name)));
+    let photos = scene.cameras.iter().map(|c| photo::load_at(&folder.join(&c.name), usize::MAX));
     let photos = photos.collect::<Result<Vec<_>>>().unwrap_or_default();
     let points = colmap::read_points(&folder.join("colmap")).ok();
     let table = scene.path.join(scene_dir::TEXT_EMBEDDINGS);

@@ -7,6 +7,7 @@ pub mod live;
 mod method;
 mod networks;
 mod record;
+pub mod refine;
 pub mod score;
 pub mod sources;
 pub mod train;
@@ -118,6 +119,8 @@ pub struct RunPlan {
     pub feature_dim: usize,
     /// One model per level.
     pub per_level: bool,
+    /// Greatest side of the working images, pixels; `None` = [`photo::default_max_size`] of the device.
+    pub max_size: Option<usize>,
     /// Vulkan device.
     pub device: Option<String>,
     /// The same bits on every run: see [`crate::gpu::Options`].
@@ -147,6 +150,7 @@ impl Default for RunPlan {
             method: Method::default(),
             feature_dim: FEATURE_DIM,
             per_level: false,
+            max_size: None,
             device: None,
             deterministic: false,
             models: None,
@@ -228,11 +232,13 @@ pub struct Outcome {
 pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     let progress = &Recorded::new(progress);
     let workspace = Workspace::create(&plan.out, plan.force)?;
-    let photos = photo::load_all(&plan.inputs, plan.views, progress)?;
+    // The device comes first: it says how large the photos may be.
     let device = Device::with(&gpu::Options {
         deterministic: plan.deterministic,
         ..gpu::Options::from_env(plan.device.as_deref())
     })?;
+    let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
+    let photos = photo::load_all_at(&plan.inputs, plan.views, max_size, progress)?;
     let outcome = work(plan, &device, photos, progress)?;
     write(workspace, &outcome, progress)?;
     Ok(outcome)
@@ -284,6 +290,11 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
                 pose::place(photos, known.as_deref(), &registry, progress)?;
             (photos, Start::Cameras(model, method))
         }
+    };
+    // Masks from a folder belong to the photos as they were read.
+    let given = match photos.iter().any(|p| p.straightened.is_some()) {
+        true => sources::given_masks(&plan.masks, &plan.features, &photos)?,
+        false => given,
     };
     let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
     let describer = Describer {

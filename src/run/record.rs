@@ -3,9 +3,11 @@ use super::{Answers, Outcome};
 use crate::Result;
 use crate::fit::{CurvePoint, FitStats, LanguagePoint};
 use crate::infer::provider;
+use crate::photo::Photo;
+use crate::pose::Fitted;
 use crate::report::viewer::Scene3d;
 use crate::report::{self, AnswerShown, Curve, ModelUsed, QueryShown, Report, RunRecord, ViewShown};
-use crate::scene::LEVEL_NAMES;
+use crate::scene::{Camera, LEVEL_NAMES};
 use serde_json::json;
 use std::path::Path;
 
@@ -47,10 +49,12 @@ fn statistics(o: &Outcome) -> serde_json::Value {
         .collect();
     json!({
         "photos": o.photos.iter().map(|p| p.path.display().to_string()).collect::<Vec<_>>(),
+        "working_sizes": working_sizes(&o.photos),
         "geometry": {
             "method": o.geometry.method, "points": o.geometry.points.len(),
             "focal_px": o.cameras.iter().map(|c| c.fx).collect::<Vec<_>>(),
             "focal_log_sigma": o.geometry.focal_log_sigma,
+            "optics": optics(o),
         },
         "light": super::light::record(&o.photos),
         "splats": { "start": o.rgb.splats[0], "end": o.splats.len() },
@@ -61,6 +65,44 @@ fn statistics(o: &Outcome) -> serde_json::Value {
         "alignment": o.alignment.report,
         "queries": o.answers.iter().map(answer_json).collect::<Vec<_>>(),
     })
+}
+
+/// Per photo what was found of its lens, and the camera of its file.
+fn optics(o: &Outcome) -> Vec<serde_json::Value> {
+    let one = |((photo, camera), fitted): ((&Photo, &Camera), &Fitted)| {
+        let taken = photo.original_camera(camera);
+        json!({
+            "photo": photo.stem, "focal_px": taken.fx, "cx": taken.cx, "cy": taken.cy,
+            "k1": fitted.lens.k1, "k2": fitted.lens.k2,
+            "sigma": { "log_focal": fitted.sigmas[0], "k1": fitted.sigmas[1], "k2": fitted.sigmas[2],
+                "cx": fitted.sigmas[3], "cy": fitted.sigmas[4] },
+            "residual_px": fitted.residual,
+        })
+    };
+    o.photos.iter().zip(&o.cameras).zip(&o.geometry.fitted).map(one).collect()
+}
+
+/// What was assumed about the lens: the strongest distortion taken out, and how far the principal point is from the middle.
+fn lens_figure(o: &Outcome) -> Option<String> {
+    let corner = |(photo, camera): (&Photo, &Camera)| {
+        let half = glam::DVec2::new(0.5 * camera.width as f64, 0.5 * camera.height as f64) / camera.fx;
+        (photo.lens().distort(half).length() / half.length() - 1.0, photo.lens())
+    };
+    let all = o.photos.iter().zip(&o.cameras).map(corner);
+    let (share, lens) = all.max_by(|a, b| a.0.abs().total_cmp(&b.0.abs()))?;
+    let camera = o.cameras.first()?;
+    let shift = [camera.cx / camera.width as f64 - 0.5, camera.cy / camera.height as f64 - 0.5];
+    let bend = match lens.is_none() {
+        true => "no distortion seen".to_owned(),
+        false => {
+            format!("k1 {:.3}, k2 {:.3} ({:+.1} % at the corner), taken out", lens.k1, lens.k2, 100.0 * share)
+        }
+    };
+    let centre = match shift.iter().all(|s| s.abs() < 1e-9) {
+        true => String::new(),
+        false => format!("; centre off by {:+.1}, {:+.1} %", 100.0 * shift[0], 100.0 * shift[1]),
+    };
+    (!o.geometry.fitted.is_empty()).then(|| bend + &centre)
 }
 
 /// Figures over the steps of the colour stage and, where there was one, of the language stage.
@@ -104,12 +146,14 @@ fn figures(o: &Outcome) -> Vec<(String, String)> {
     let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
     let mut list = vec![
         ("device".to_owned(), format!("{}{cpu}", o.device.name)),
+        ("photos".to_owned(), sizes(&o.photos)),
         ("splats".to_owned(), o.splats.len().to_string()),
         ("train PSNR".to_owned(), format!("{:.2} dB", o.rgb.mean_psnr())),
     ];
     if let (Some(sigma), Some(camera)) = (o.geometry.focal_log_sigma, o.cameras.first()) {
         list.push(("focal length".to_owned(), format!("{:.1} px ± {:.2} %", camera.fx, 100.0 * sigma)));
     }
+    list.extend(lens_figure(o).map(|text| ("lens".to_owned(), text)));
     list.extend(super::light::figure(&o.photos));
     let codes = |k: usize| o.field.levels.get(k).map_or(0, |l| l.codebook.len());
     list.push(("things s/m/l".to_owned(), format!("{} / {} / {}", codes(0), codes(1), codes(2))));
@@ -117,6 +161,33 @@ fn figures(o: &Outcome) -> Vec<(String, String)> {
         list.push((format!("“{}”", a.text), format!("found in {} of {} photos", a.found(), a.views.len())));
     }
     list
+}
+
+/// Per photo its working and its original (width, height).
+pub(super) fn working_sizes(photos: &[Photo]) -> serde_json::Value {
+    let size = |p: &Photo| json!({ "working": [p.image.width, p.image.height], "original": [p.original_size.0, p.original_size.1] });
+    photos.iter().map(size).collect()
+}
+
+/// How many photos were used, at which size, and how to change that where they were scaled down.
+pub(super) fn sizes(photos: &[Photo]) -> String {
+    let mut pairs: Vec<(usize, usize, u32, u32)> = Vec::new();
+    for p in photos {
+        let pair = (p.image.width, p.image.height, p.original_size.0, p.original_size.1);
+        if !pairs.contains(&pair) {
+            pairs.push(pair);
+        }
+    }
+    let scaled = |p: &(usize, usize, u32, u32)| (p.0, p.1) != (p.2 as usize, p.3 as usize);
+    let one = |p: &(usize, usize, u32, u32)| match scaled(p) {
+        true => format!("{} × {} of {} × {}", p.0, p.1, p.2, p.3),
+        false => format!("{} × {}", p.0, p.1),
+    };
+    // More than a few sizes would not fit a line; run.json has them all.
+    let shown: Vec<String> = pairs.iter().take(3).map(one).collect();
+    let more = if pairs.len() > 3 { ", …" } else { "" };
+    let hint = if pairs.iter().any(scaled) { " (--max-size changes it)" } else { "" };
+    format!("{} at {}{more}{hint}", photos.len(), shown.join(", "))
 }
 
 /// The table that ends `splatvk run`.

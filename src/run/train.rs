@@ -34,6 +34,8 @@ pub struct TrainPlan {
     pub iterations: Option<usize>,
     /// Seed of everything random.
     pub seed: u64,
+    /// Greatest side of the working images, pixels; `None` = [`photo::default_max_size`] of the device.
+    pub max_size: Option<usize>,
     /// Vulkan device.
     pub device: Option<String>,
     /// The same bits on every run: see [`crate::gpu::Options`].
@@ -51,7 +53,12 @@ pub struct TrainOutcome {
 }
 
 /// Photos that have a camera, in name order; photos without one are named in a warning.
-fn matched(plan: &TrainPlan, known: &[Camera], progress: &dyn Progress) -> Result<Vec<Photo>> {
+fn matched(
+    plan: &TrainPlan,
+    known: &[Camera],
+    max_size: usize,
+    progress: &dyn Progress,
+) -> Result<Vec<Photo>> {
     let found = photo::find(std::slice::from_ref(&plan.images))?;
     let has = |p: &&PathBuf| {
         let stem = p.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
@@ -71,7 +78,7 @@ fn matched(plan: &TrainPlan, known: &[Camera], progress: &dyn Progress) -> Resul
         progress
             .warn(&format!("{} photos have no camera and are left out", found.photos.len() - paths.len()));
     }
-    photo::load_all(&paths, Some(paths.len()), progress)
+    photo::load_all_at(&paths, Some(paths.len()), max_size, progress)
 }
 
 fn points(path: &Path) -> Result<PointCloud> {
@@ -112,11 +119,12 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let workspace = Workspace::create(&plan.out, plan.force)?;
     let known = cameras::read(&plan.cameras)?;
     let given = plan.points.as_deref().map(points).transpose()?;
-    let photos = matched(plan, &known, progress)?;
     let device = Device::with(&gpu::Options {
         deterministic: plan.deterministic,
         ..gpu::Options::from_env(plan.device.as_deref())
     })?;
+    let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
+    let photos = matched(plan, &known, max_size, progress)?;
     let registry = Registry::open(plan.models.as_deref())?;
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
     let (photos, geometry) = match given {
@@ -165,6 +173,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         seconds: progress.seconds(),
         stages,
         statistics: json!({
+            "working_sizes": super::record::working_sizes(&photos),
             "geometry": { "method": geometry.method, "points": geometry.points.len() },
             "light": super::light::record(&photos),
             "splats": { "start": trained.stats.splats[0], "end": trained.splats.len() },
@@ -175,6 +184,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     };
     let mut figures = vec![
         ("device".to_owned(), device.info().name.clone()),
+        ("photos".to_owned(), super::record::sizes(&photos)),
         ("splats".to_owned(), trained.splats.len().to_string()),
         ("train PSNR".to_owned(), format!("{:.2} dB", trained.stats.mean_psnr())),
     ];
@@ -229,6 +239,7 @@ fn from_points(photos: &[Photo], known: &[Camera], cloud: PointCloud) -> Result<
         cameras,
         depths: Vec::new(),
         focal_log_sigma: None,
+        fitted: Vec::new(),
         method: "cameras+points".into(),
     })
 }

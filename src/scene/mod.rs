@@ -6,6 +6,7 @@
 mod camera;
 mod image;
 mod language;
+mod lens;
 mod points;
 mod splats;
 mod transfer;
@@ -13,6 +14,7 @@ mod transfer;
 pub use camera::{Camera, Pose};
 pub use image::{DepthMap, Plane, RgbImage};
 pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField};
+pub use lens::Lens;
 pub use points::PointCloud;
 pub use splats::{Splats, sh_coefficients};
 pub use transfer::{to_linear, to_srgb};

@@ -1,7 +1,7 @@
 //! Synthetic scenes on disk, in the layout of a ground-truth folder.
 use super::regions::{self, Flaws};
 use super::render::{self, Seen};
-use super::scene::{Knobs, world};
+use super::scene::{Knobs, World, world};
 use crate::format::npy::{self, NpyArray, NpyData};
 use crate::format::{cameras, create_folder, picture, write_json};
 use crate::progress::Progress;
@@ -12,7 +12,7 @@ use half::f16;
 use serde_json::json;
 use std::path::Path;
 
-/// JPEG quality of the photos: no visible artefacts.
+/// JPEG quality of held-out views, and of photos unless asked otherwise: no visible artefacts.
 const QUALITY: u8 = 95;
 
 /// Makes a scene and writes it: photos, held-out views, depth, masks, cameras, and regions without and with flaws.
@@ -21,19 +21,7 @@ pub fn generate(folder: &Path, knobs: &Knobs, flaws: &Flaws, progress: &dyn Prog
     for name in ["images", "held_out", "depth", "masks"] {
         create_folder(&folder.join(name))?;
     }
-    let all =
-        world.train.iter().map(|c| (c, Split::Train)).chain(world.test.iter().map(|c| (c, Split::Test)));
-    let all: Vec<(&Camera, Split)> = all.collect();
-    progress.begin("render", all.len() as u64);
-    let mut frames = Vec::new();
-    for (i, (camera, split)) in all.into_iter().enumerate() {
-        progress.check()?;
-        let seen = render::render(&world, camera, knobs.photo_noise, knobs.seed.wrapping_add(i as u64));
-        let file = write_view(folder, camera, split, &seen)?;
-        frames.push(frame_json(camera, split, &file));
-        progress.step(i as u64 + 1, "");
-    }
-    progress.end();
+    let frames = write_views(folder, &world, knobs, progress)?;
     let labels: serde_json::Map<String, serde_json::Value> =
         world.things.iter().map(|t| (t.label.to_string(), json!(t.phrase))).collect();
     let truth = json!({
@@ -43,6 +31,47 @@ pub fn generate(folder: &Path, knobs: &Knobs, flaws: &Flaws, progress: &dyn Prog
     write_json(&folder.join("ground_truth.json"), &truth)?;
     cameras::write_json(&folder.join("cameras_noisy.json"), &world.noisy)?;
     write_regions(folder, folder, flaws)
+}
+
+/// Renders and writes every view; the frames of the ground truth.
+fn write_views(
+    folder: &Path,
+    world: &World,
+    knobs: &Knobs,
+    progress: &dyn Progress,
+) -> Result<Vec<serde_json::Value>> {
+    let quality = knobs.effects.jpeg.unwrap_or(QUALITY);
+    // Held-out views show what is there, not what a phone would make of it.
+    let held_out_noise = if knobs.effects.any() { 0.0 } else { knobs.photo_noise };
+    progress.begin("render", (world.shots.len() + world.test.len()) as u64);
+    let mut frames = Vec::new();
+    for i in 0..world.shots.len() + world.test.len() {
+        progress.check()?;
+        let seed = knobs.seed.wrapping_add(i as u64);
+        frames.push(match world.shots.get(i) {
+            Some(shot) => {
+                let seen = render::photo(world, shot, knobs.photo_noise, seed);
+                let file = write_view(folder, &shot.camera, Split::Train, &seen, quality)?;
+                let mut frame = frame_json(&shot.camera, Split::Train, &file);
+                if let Some(lens) = &shot.lens {
+                    frame["lens"] = json!(lens);
+                }
+                if let Some(light) = &shot.light {
+                    frame["light"] = json!(light);
+                }
+                frame
+            }
+            None => {
+                let camera = &world.test[i - world.shots.len()];
+                let seen = render::render(world, camera, held_out_noise, seed);
+                let file = write_view(folder, camera, Split::Test, &seen, QUALITY)?;
+                frame_json(camera, Split::Test, &file)
+            }
+        });
+        progress.step(i as u64 + 1, "");
+    }
+    progress.end();
+    Ok(frames)
 }
 
 /// Writes `regions_exact/` and `regions_flawed/` for the photos of a ground-truth folder that has masks.
@@ -56,11 +85,11 @@ pub fn write_regions(data: &Path, out: &Path, flaws: &Flaws) -> Result<()> {
     Ok(())
 }
 
-fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &Seen) -> Result<String> {
+fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &Seen, quality: u8) -> Result<String> {
     let place = if split == Split::Train { "images" } else { "held_out" };
     let (name, file) = (&camera.name, format!("{place}/{}.jpg", camera.name));
     let path = folder.join(&file);
-    std::fs::write(&path, picture::jpeg_bytes(&seen.image, QUALITY)?).map_err(Error::io(&path))?;
+    std::fs::write(&path, picture::jpeg_bytes(&seen.image, quality)?).map_err(Error::io(&path))?;
     let shape = vec![seen.depth.height, seen.depth.width];
     let depth = NpyData::F16(seen.depth.data.iter().map(|z| f16::from_f32(*z)).collect());
     let path = folder.join("depth").join(format!("{name}.npz"));

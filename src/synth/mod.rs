@@ -1,11 +1,13 @@
 //! Data with a known answer: scenes with exact cameras, depth, masks and phrases, and regions with injected errors.
 mod folder;
+mod phone;
 pub mod regions;
 mod render;
 mod scene;
 mod shapes;
 
 pub use folder::{generate, write_regions};
-pub use render::{Seen, render};
+pub use phone::{Effects, Lens, Light, Shot, to_linear, to_srgb};
+pub use render::{Seen, photo, render};
 pub use scene::{Knobs, Thing, World, world};
 pub use shapes::{Hit, Paint, Shape};

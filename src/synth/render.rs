@@ -1,4 +1,5 @@
 //! Ray casting: photo, depth and mask of a synthetic scene.
+use super::phone::{Lens, Shot};
 use super::scene::{Thing, World};
 use super::shapes::Hit;
 use crate::fit::schedule::Random;
@@ -29,38 +30,61 @@ fn first(world: &World, from: DVec3, ray: DVec3) -> Option<(&Thing, Hit)> {
     hits.min_by(|a, b| a.1.t.total_cmp(&b.1.t))
 }
 
+/// Mean colour over the rays of a pixel, sRGB values; black where nothing is.
+fn colour(world: &World, camera: &Camera, lens: Option<&Lens>, (x, y): (f64, f64)) -> [f64; 3] {
+    let to_world = camera.pose.inverse();
+    let mut sum = [0.0; 3];
+    for k in 0..SAMPLES * SAMPLES {
+        let at = |i: usize| (i as f64 + 0.5) / SAMPLES as f64;
+        let pixel = DVec2::new(x + at(k % SAMPLES), y + at(k / SAMPLES));
+        let ray = lens.map_or_else(|| camera.ray(pixel), |l| l.ray(camera, pixel));
+        if let Some((thing, hit)) = first(world, to_world.translation, to_world.rotation * ray) {
+            let light = AMBIENT + (1.0 - AMBIENT) * hit.normal.dot(LIGHT).max(0.0);
+            let colour = thing.paint.at(hit.place);
+            (0..3).for_each(|c| sum[c] += light * colour[c]);
+        }
+    }
+    sum.map(|v| v / (SAMPLES * SAMPLES) as f64)
+}
+
+/// The picture alone, with a lens if there is one: each ray goes where the lens sends it, so nothing is resampled.
+fn picture(world: &World, camera: &Camera, lens: Option<&Lens>, noise: f64, seed: u64) -> RgbImage {
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let pixel = |p: usize| {
+        let shown = colour(world, camera, lens, ((p % width) as f64, (p / width) as f64));
+        let mut random = Random::new(seed ^ (p as u64).wrapping_mul(0x2545_f491_4f6c_dd1d));
+        let shown = shown.map(|v| v + noise * random.normal());
+        shown.map(|v| v.clamp(0.0, 1.0) as f32)
+    };
+    RgbImage { width, height, data: (0..width * height).into_par_iter().map(pixel).collect() }
+}
+
 /// Renders a view; `noise` is the standard deviation of the photo's noise.
 pub fn render(world: &World, camera: &Camera, noise: f64, seed: u64) -> Seen {
-    let (w, h) = (camera.width as usize, camera.height as usize);
+    let (width, height) = (camera.width as usize, camera.height as usize);
     let to_world = camera.pose.inverse();
-    let centre = to_world.translation;
     // The ray has camera z 1: its parameter is the depth.
-    let cast = |u: f64, v: f64| first(world, centre, to_world.rotation * camera.ray(DVec2::new(u, v)));
-    let pixels: Vec<([f32; 3], f32, u32)> = (0..w * h)
-        .into_par_iter()
-        .map(|p| {
-            let (x, y) = ((p % w) as f64, (p / w) as f64);
-            let (depth, label) = cast(x + 0.5, y + 0.5).map_or((0.0, 0), |(t, h)| (h.t as f32, t.label));
-            let mut sum = [0.0; 3];
-            for k in 0..SAMPLES * SAMPLES {
-                let at = |i: usize| (i as f64 + 0.5) / SAMPLES as f64;
-                if let Some((thing, hit)) = cast(x + at(k % SAMPLES), y + at(k / SAMPLES)) {
-                    let light = AMBIENT + (1.0 - AMBIENT) * hit.normal.dot(LIGHT).max(0.0);
-                    let colour = thing.paint.at(hit.place);
-                    (0..3).for_each(|c| sum[c] += light * colour[c]);
-                }
-            }
-            let mut random = Random::new(seed ^ (p as u64).wrapping_mul(0x2545_f491_4f6c_dd1d));
-            let shown = sum.map(|v| v / (SAMPLES * SAMPLES) as f64 + noise * random.normal());
-            (shown.map(|v| v.clamp(0.0, 1.0) as f32), depth, label)
-        })
-        .collect();
-    let (width, height) = (w, h);
+    let cast = |p: usize| {
+        let pixel = DVec2::new((p % width) as f64 + 0.5, (p / width) as f64 + 0.5);
+        let hit = first(world, to_world.translation, to_world.rotation * camera.ray(pixel));
+        hit.map_or((0.0, 0), |(t, h)| (h.t as f32, t.label))
+    };
+    let pixels: Vec<(f32, u32)> = (0..width * height).into_par_iter().map(cast).collect();
     Seen {
-        image: RgbImage { width, height, data: pixels.iter().map(|p| p.0).collect() },
-        depth: Plane { width, height, data: pixels.iter().map(|p| p.1).collect() },
-        objects: Plane { width, height, data: pixels.iter().map(|p| p.2).collect() },
+        image: picture(world, camera, None, noise, seed),
+        depth: Plane { width, height, data: pixels.iter().map(|p| p.0).collect() },
+        objects: Plane { width, height, data: pixels.iter().map(|p| p.1).collect() },
     }
+}
+
+/// A view as its phone takes it; depth and mask are those of the undistorted pinhole.
+pub fn photo(world: &World, shot: &Shot, noise: f64, seed: u64) -> Seen {
+    let mut seen = render(world, &shot.camera, noise, seed);
+    if let Some(lens) = &shot.lens {
+        seen.image = picture(world, &shot.camera, Some(lens), noise, seed);
+    }
+    shot.expose(&mut seen.image);
+    seen
 }
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
 //! Small scenes with everything known: a table with objects before a wall, and the knobs that make them hard.
+use super::phone::{self, Effects, Shot};
 use super::shapes::{Paint, Shape};
 use crate::fit::schedule::Random;
 use crate::scene::{Camera, Pose};
@@ -33,6 +34,8 @@ pub struct Knobs {
     pub pose_noise: f64,
     /// Standard deviation of the photos' noise, in units of full white.
     pub photo_noise: f64,
+    /// What a phone does to the photos; held-out views then are clean.
+    pub effects: Effects,
 }
 
 impl Default for Knobs {
@@ -50,6 +53,7 @@ impl Default for Knobs {
             similar: 0,
             pose_noise: 0.1,
             photo_noise: 0.005,
+            effects: Effects::default(),
         }
     }
 }
@@ -72,8 +76,10 @@ pub struct Thing {
 pub struct World {
     /// Background first.
     pub things: Vec<Thing>,
-    /// True cameras of the photos.
+    /// True cameras of the photos, without distortion.
     pub train: Vec<Camera>,
+    /// What each photo goes through.
+    pub shots: Vec<Shot>,
     /// True cameras of the held-out views.
     pub test: Vec<Camera>,
     /// The photos' cameras with errors, to start from.
@@ -125,10 +131,15 @@ pub fn world(knobs: &Knobs) -> Result<World> {
         camera(&format!("train_{i:02}"), azimuth, 32.0 + 8.0 * (random.uniform() - 0.5), knobs.size)
     });
     let train: Vec<Camera> = train.collect();
+    let shots = phone::shots(&train, &knobs.effects, knobs.seed)?;
+    let train: Vec<Camera> = shots.iter().map(|s| s.camera.clone()).collect();
     let test = (0..knobs.held_out).map(|i| {
         let azimuth = (random.uniform() - 0.5) * (2.0 * middle * knobs.baseline + 6.0);
         let name = format!("test_{:02}", knobs.views + i);
-        camera(&name, azimuth, 25.0 + 18.0 * random.uniform(), knobs.size)
+        let made = camera(&name, azimuth, 25.0 + 18.0 * random.uniform(), knobs.size);
+        // The same phone, with its principal point in the middle.
+        let (fx, fy) = train.first().map_or((made.fx, made.fy), |c| (c.fx, c.fy));
+        Camera { fx, fy, ..made }
     });
     let test: Vec<Camera> = test.collect();
     let sigma = knobs.pose_noise.to_radians();
@@ -139,7 +150,7 @@ pub fn world(knobs: &Knobs) -> Result<World> {
         Camera { pose: error.compose(&c.pose), ..c.clone() }
     });
     let noisy = noisy.collect();
-    Ok(World { things, train, test, noisy })
+    Ok(World { things, train, shots, test, noisy })
 }
 
 fn paint(colour: [f64; 3], contrast: f64, grain: f64, random: &mut Random) -> Paint {

@@ -15,6 +15,8 @@ pub enum BenchPart {
     Models,
     /// The limits of the device
     Roofline,
+    /// Photos to cameras on every --data folder: errors, and whether the stated focal uncertainty is right
+    Cameras,
 }
 
 /// `splatvk bench`
@@ -56,7 +58,10 @@ pub struct BenchArgs {
     /// query: what to look for
     #[arg(long, default_value = "a cup", value_name = "TEXT")]
     pub query: String,
-    /// query, models: folder of the models
+    /// cameras: folders with ground_truth.json and photos
+    #[arg(long, num_args = 1.., value_name = "DIR")]
+    pub data: Vec<PathBuf>,
+    /// query, models, cameras: folder of the models
     #[arg(long, value_name = "DIR")]
     pub models: Option<PathBuf>,
     /// Repeat each measurement for this long

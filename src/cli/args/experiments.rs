@@ -106,9 +106,31 @@ pub struct GenerateArgs {
     /// Error of the starting cameras in cameras_noisy.json, degrees
     #[arg(long, default_value_t = 0.1, value_name = "DEG")]
     pub pose_noise: f64,
-    /// Noise of the photos, share of full white
-    #[arg(long, default_value_t = 0.005, value_name = "SHARE")]
-    pub photo_noise: f64,
+    /// Noise of the photos, share of full white [default: 0.005; 0 with --sensor-noise]
+    #[arg(long, value_name = "SHARE")]
+    pub photo_noise: Option<f64>,
+    /// Photos as a phone takes them: --focal --lens --centre --light --sensor-noise --jpeg 82; held-out views stay clean, and depth
+    /// and masks are those of the undistorted photo
+    #[arg(long)]
+    pub phone: bool,
+    /// Focal length drawn from 0.7 to 1.2 widths, one for all views [default: 1.025 widths]
+    #[arg(long)]
+    pub focal: bool,
+    /// Radial distortion of the photos, one lens for all: k1 within ±0.15, k2 within a third of k1
+    #[arg(long)]
+    pub lens: bool,
+    /// Principal point of the photos off the middle, up to 1 % of the width along x and along y
+    #[arg(long)]
+    pub centre: bool,
+    /// Light of the photos: exposure within ±0.35 stops and white balance within ±6 % per photo, up to 35 % lost in the corners
+    #[arg(long)]
+    pub light: bool,
+    /// Shot and read noise of a small sensor near ISO 200: 3000 electrons at full white, 4 electrons read noise
+    #[arg(long)]
+    pub sensor_noise: bool,
+    /// JPEG quality of the photos [default: 95; 82 with --phone]
+    #[arg(long, value_name = "1-100", value_parser = clap::value_parser!(u8).range(1..=100))]
+    pub jpeg: Option<u8>,
     /// regions_flawed/: rate of masks cut in two
     #[arg(long, default_value_t = 0.2, value_name = "RATE")]
     pub split: f64,

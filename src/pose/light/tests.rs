@@ -42,7 +42,13 @@ fn spots(lights: &[Light], noise: f64, seed: u64) -> (Vec<Photo>, SparseModel) {
         model.points.push(SparsePoint { position: glam::DVec3::Z, colour: [0.5; 3], views });
     }
     let photos = images.iter().zip(lights).enumerate().map(|(v, (image, light))| {
-        crate::photo::from_pixels(format!("{v}.png").as_ref(), &light.applied(image), None).unwrap()
+        crate::photo::from_pixels(
+            format!("{v}.png").as_ref(),
+            &light.applied(image),
+            None,
+            crate::photo::MAX_SIZE,
+        )
+        .unwrap()
     });
     (photos.collect(), model)
 }

@@ -37,6 +37,7 @@ pub(super) fn output(views: &[ModelView], canonical: &[Canonical], a: &Adjustmen
         depths,
         points: fuse(views, &layers),
         focal_log_sigma: Some(a.focal_log_sigma),
+        fitted: Vec::new(),
         method: "pointmap".into(),
     }
 }

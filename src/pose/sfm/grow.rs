@@ -28,7 +28,7 @@ pub(super) fn seed_score(pair: &Pair) -> f64 {
     pair.geometry.inliers.len() as f64 * (pair.geometry.parallax / 10.0).min(1.0)
 }
 
-/// Grows a model over all views. `empty` holds centres, groups, focals and priors; `threshold` in pixels.
+/// Grows a model over all views. `empty` holds centres, groups, optics and priors; `threshold` in pixels.
 pub(super) fn grow(
     empty: &Model,
     tracks: &[Sightings],
@@ -81,7 +81,7 @@ fn resection(model: &Model, view: usize, threshold: f64) -> Option<(Pose, usize)
         let Some(x) = t.position else { continue };
         if let Some(s) = t.sightings.iter().find(|s| s.view == view) {
             world.push(x);
-            pixels.push(s.pixel - model.centres[view]);
+            pixels.push(model.straight(view, s.pixel));
         }
     }
     let r = resect(&world, &pixels, model.focal(view), 2.0 * threshold, 500)?;

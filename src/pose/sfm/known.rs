@@ -1,15 +1,13 @@
 //! Sparse points for cameras that are known already.
-use super::model::{MIN_ANGLE_DEGREES, Model, Sighting};
-use super::{Features, THRESHOLD, colour_at, corner_families, matching, pairs_of, tracks};
+use super::model::{Freedom, MIN_ANGLE_DEGREES, Model, Sighting};
+use super::{Features, THRESHOLD, colour_at, corner_families, matching, tracks};
 use crate::photo::Photo;
-use crate::pose::two_view::{fundamental, sampson};
+use crate::pose::bundle::{Optics, OpticsPrior};
 use crate::pose::{SparseModel, SparsePoint};
 use crate::progress::Progress;
-use crate::scene::Camera;
+use crate::scene::{Camera, Lens};
 use crate::{Error, Result};
 use glam::DVec2;
-use rayon::prelude::*;
-use tracks::Link;
 
 /// Fewest points that tell the depth range of a scene.
 const MIN_POINTS: usize = 20;
@@ -40,24 +38,21 @@ pub fn with_cameras(
         centres: vec![DVec2::ZERO; cameras.len()],
         group: (0..cameras.len()).collect(),
         zoom: vec![1.0; cameras.len()],
-        focals: cameras.iter().map(focal).collect(),
-        priors: vec![(0.0, 0.0); cameras.len()],
+        optics: cameras
+            .iter()
+            .map(|c| Optics { focal: focal(c), lens: Lens::NONE, shift: DVec2::ZERO })
+            .collect(),
+        priors: vec![OpticsPrior::default(); cameras.len()],
+        freedom: Freedom::Focal,
         tracks: Vec::new(),
     };
-    let per_pair: Vec<(usize, Vec<Link>)> = pairs_of(photos.len())
-        .into_par_iter()
-        .map(|(i, j)| {
-            let relative = cameras[j].pose.compose(&cameras[i].pose.inverse());
-            let f = fundamental(&relative, focal(&cameras[i]), focal(&cameras[j]));
-            let put = super::putative(&families, i, j);
-            let close = move |m: &(DVec2, DVec2, Link)| {
-                sampson(&f, flat(&cameras[i], m.0), flat(&cameras[j], m.1)) < threshold * threshold
-            };
-            (put.len(), put.into_iter().filter(close).map(|m| m.2).collect())
-        })
-        .collect();
-    let tried: usize = per_pair.iter().map(|p| p.0).sum();
-    let mut links: Vec<Link> = per_pair.into_iter().flat_map(|p| p.1).collect();
+    let mut putative = super::putative_matches(&families, progress)?;
+    for pair in &mut putative {
+        let (a, b) = (&cameras[pair.first], &cameras[pair.second]);
+        pair.matches.iter_mut().for_each(|m| (m.0, m.1) = (flat(a, m.0), flat(b, m.1)));
+    }
+    let tried: usize = putative.iter().map(|p| p.matches.len()).sum();
+    let mut links = super::finish::explained(&model, &putative, threshold);
     let agreement = links.len() as f64 / tried.max(1) as f64;
     let keypoints: Vec<Vec<Sighting>> = (0..photos.len())
         .map(|v| {
@@ -101,7 +96,7 @@ pub fn with_cameras(
             Some(SparsePoint { position: t.position?, colour: colour_at(&photos[v].image, p), views })
         })
         .collect();
-    Ok(SparseModel { cameras: placed, points, focal_log_sigma: None })
+    Ok(SparseModel { cameras: placed, points, focal_log_sigma: None, fitted: Vec::new() })
 }
 
 /// Masked features of all detectors, per family and photo.

@@ -1,4 +1,5 @@
 //! Structure from motion: the built-in initialiser that needs no large model.
+mod finish;
 mod grow;
 mod known;
 mod model;
@@ -6,19 +7,19 @@ mod patch;
 mod refine;
 mod tracks;
 
-use super::bundle::Outcome;
+use super::bundle::{Optics, OpticsPrior};
 use super::matching::{self, Features, Match};
 use super::two_view::{self, TwoView};
-use super::{SparseModel, SparsePoint, sift};
+use super::{SparseModel, sift};
 use crate::photo::Photo;
 use crate::progress::Progress;
-use crate::scene::{Camera, Plane, RgbImage};
+use crate::scene::{Camera, Lens, Plane, RgbImage};
 use crate::{Error, Result};
+use finish::{Evidence, finish};
 use glam::DVec2;
 use grow::{Pair, grow};
 pub use known::with_cameras;
-use model::{Model, Sighting};
-use patch::Shades;
+use model::{Freedom, Model, Sighting};
 use rayon::prelude::*;
 use tracks::Link;
 
@@ -27,6 +28,11 @@ const FOCAL_GUESS: f64 = 0.9;
 const FOCAL_SIGMA: f64 = 0.35;
 /// EXIF focal lengths are rounded and sensors are cropped.
 const EXIF_SIGMA: f64 = 0.05;
+/// Radial distortion at the corner of a photo, as a share of the radius: below a hundredth where a phone has corrected it, a
+/// twentieth for plain wide lenses.
+const LENS_SIGMA: f64 = 0.05;
+/// Principal point from the middle, as a share of the long side: stabilised sensors move by up to a hundredth.
+const SHIFT_SIGMA: f64 = 0.007;
 /// Agreement threshold as a fraction of the long side: 3 px at 640, three times the noise of learned keypoints.
 const THRESHOLD: f64 = 3.0 / 640.0;
 /// Fewest verified matches of a usable pair: five are fitted by anything, 20 agree by chance in few cases.
@@ -54,12 +60,14 @@ pub fn reconstruct(photos: &[Photo], features: &[Features], progress: &dyn Progr
     let families = corner_families(photos, features, progress)?;
     progress.step(1, "matches");
     let empty = empty_model(photos);
-    let relations = relate_all(photos, &families, &empty, progress)?;
+    let putative = putative_matches(&families, progress)?;
+    let relations = relate_all(photos, &putative, &empty, progress)?;
     explain(photos, &relations)?;
     progress.step(2, "poses");
-    let model = assemble(photos, &families, empty, relations, progress)?;
+    let keypoints: Vec<Vec<Sighting>> = (0..photos.len()).map(|v| keypoints(&families, v)).collect();
+    let model = assemble(photos, &keypoints, empty, relations, progress)?;
     progress.step(3, "refining");
-    let model = finish(photos, model, progress)?;
+    let model = finish(photos, model, &Evidence { putative, keypoints }, progress)?;
     progress.step(STEPS, &format!("{} points", model.points.len()));
     progress.end();
     Ok(model)
@@ -138,11 +146,24 @@ fn empty_model(photos: &[Photo]) -> Model {
         });
         group.push(g);
     }
-    let priors: Vec<(f64, f64)> = firsts
+    let priors: Vec<OpticsPrior> = firsts
         .iter()
-        .map(|&v| match exif(v) {
-            Some(f) => (f.ln(), EXIF_SIGMA),
-            None => ((FOCAL_GUESS * long(v) as f64).ln(), FOCAL_SIGMA),
+        .enumerate()
+        .map(|(g, &v)| {
+            let log_focal = match exif(v) {
+                Some(f) => (f.ln(), EXIF_SIGMA),
+                None => ((FOCAL_GUESS * long(v) as f64).ln(), FOCAL_SIGMA),
+            };
+            let short = photos[v].original_size.0.min(photos[v].original_size.1);
+            let corner = 0.5 * f64::hypot(long(v) as f64, short as f64) / log_focal.0.exp();
+            // Upright photos of a camera that was turned hold its principal point in other places.
+            let members = || photos.iter().zip(&group).filter(|m| *m.1 == g).map(|m| m.0);
+            let one_way = members().all(|p| p.original_size == photos[v].original_size);
+            OpticsPrior {
+                log_focal,
+                lens: [LENS_SIGMA / corner.powi(2), 0.5 * LENS_SIGMA / corner.powi(4)],
+                shift: if one_way { SHIFT_SIGMA * long(v) as f64 } else { 0.0 },
+            }
         })
         .collect();
     Model {
@@ -153,8 +174,12 @@ fn empty_model(photos: &[Photo]) -> Model {
             .collect(),
         group,
         zoom,
-        focals: priors.iter().map(|p| p.0.exp()).collect(),
+        optics: priors
+            .iter()
+            .map(|p| Optics { focal: p.log_focal.0.exp(), lens: Lens::NONE, shift: DVec2::ZERO })
+            .collect(),
         priors,
+        freedom: Freedom::Focal,
         tracks: Vec::new(),
     }
 }
@@ -166,25 +191,44 @@ fn pairs_of(n: usize) -> Vec<(usize, usize)> {
 
 fn relate_all(
     photos: &[Photo],
-    families: &[Vec<Features>],
+    putative: &[Putative],
     empty: &Model,
     progress: &dyn Progress,
 ) -> Result<Vec<(usize, usize, Relation)>> {
-    let out = pairs_of(photos.len())
-        .into_par_iter()
-        .map(|(i, j)| {
+    let out = putative
+        .par_iter()
+        .map(|pair| {
             let relation = match progress.cancelled() {
                 true => Relation::Apart,
-                false => relate(photos, families, empty, i, j),
+                false => relate(photos, pair, empty),
             };
-            (i, j, relation)
+            (pair.first, pair.second, relation)
         })
         .collect();
     progress.check()?;
     Ok(out)
 }
 
-/// Matches by descriptor between two views, all families, best first: (pixel, pixel, link).
+/// What two views have in common by the looks of their features.
+struct Putative {
+    first: usize,
+    second: usize,
+    /// (pixel, pixel, link), best first.
+    matches: Vec<(DVec2, DVec2, Link)>,
+}
+
+fn putative_matches(families: &[Vec<Features>], progress: &dyn Progress) -> Result<Vec<Putative>> {
+    let pair = |(first, second)| {
+        let matches = if progress.cancelled() { Vec::new() } else { putative(families, first, second) };
+        Putative { first, second, matches }
+    };
+    let views = families.first().map_or(0, Vec::len);
+    let out = pairs_of(views).into_par_iter().map(pair).collect();
+    progress.check()?;
+    Ok(out)
+}
+
+/// Matches by descriptor between two views, all families, best first.
 fn putative(families: &[Vec<Features>], i: usize, j: usize) -> Vec<(DVec2, DVec2, Link)> {
     let mut all: Vec<(DVec2, DVec2, Link)> = Vec::new();
     let (mut start_i, mut start_j) = (0, 0);
@@ -204,17 +248,18 @@ fn putative(families: &[Vec<Features>], i: usize, j: usize) -> Vec<(DVec2, DVec2
     all
 }
 
-fn relate(photos: &[Photo], families: &[Vec<Features>], empty: &Model, i: usize, j: usize) -> Relation {
+fn relate(photos: &[Photo], pair: &Putative, empty: &Model) -> Relation {
+    let (i, j, all) = (pair.first, pair.second, &pair.matches);
     if same_picture(&photos[i].image, &photos[j].image) {
         return Relation::Same;
     }
-    let all = putative(families, i, j);
     let centred = |view: usize, p: DVec2| (p - empty.centres[view]) / empty.focal(view);
     let x: Vec<DVec2> = all.iter().map(|m| centred(i, m.0)).collect();
     let y: Vec<DVec2> = all.iter().map(|m| centred(j, m.1)).collect();
     let long = photos[i].image.width.max(photos[i].image.height) as f64;
     let threshold = THRESHOLD * long / empty.focal(i);
-    let sigma = empty.priors[empty.group[i]].1.max(empty.priors[empty.group[j]].1);
+    let sigma = |v: usize| empty.priors[empty.group[v]].log_focal.1;
+    let sigma = sigma(i).max(sigma(j));
     let Some(found) = two_view::estimate(&x, &y, threshold, sigma) else { return Relation::Apart };
     if found.inliers.len() < MIN_INLIERS {
         return Relation::Apart;
@@ -284,12 +329,11 @@ fn keypoints(families: &[Vec<Features>], view: usize) -> Vec<Sighting> {
 
 fn assemble(
     photos: &[Photo],
-    families: &[Vec<Features>],
+    points: &[Vec<Sighting>],
     mut empty: Model,
     relations: Vec<(usize, usize, Relation)>,
     progress: &dyn Progress,
 ) -> Result<Model> {
-    let points: Vec<Vec<Sighting>> = (0..photos.len()).map(|v| keypoints(families, v)).collect();
     let (mut pairs, mut links) = (Vec::new(), Vec::new());
     for (first, second, relation) in relations {
         if let Relation::Usable(geometry, l) = relation {
@@ -297,16 +341,16 @@ fn assemble(
             pairs.push(Pair { first, second, geometry });
         }
     }
-    let tracks = tracks::join(&mut links, &points);
+    let tracks = tracks::join(&mut links, points);
     // The pair estimates vote on the focal stretch, weighted by matches and parallax.
-    for g in 0..empty.focals.len() {
+    for g in 0..empty.optics.len() {
         let (mut sum, mut weight) = (0.0, 1e-9);
         for p in pairs.iter().filter(|p| empty.group[p.first] == g || empty.group[p.second] == g) {
             let w = grow::seed_score(p);
             sum += w * p.geometry.stretch.ln();
             weight += w;
         }
-        empty.focals[g] *= (sum / weight).exp();
+        empty.optics[g].focal *= (sum / weight).exp();
     }
     let long = photos[0].image.width.max(photos[0].image.height) as f64;
     let threshold = THRESHOLD * long;
@@ -326,48 +370,6 @@ fn assemble(
     )))
 }
 
-/// Settles the model: outliers out, weights from the residuals, every sighting refined to sub-pixel and further points
-/// added where the geometry predicts them.
-fn finish(photos: &[Photo], mut model: Model, progress: &dyn Progress) -> Result<SparseModel> {
-    let long = photos[0].image.width.max(photos[0].image.height) as f64;
-    let threshold = THRESHOLD * long;
-    model.triangulate_all(threshold);
-    model.prune(threshold);
-    model.adjust(f64::INFINITY, 1.5, 60)?;
-    settle(&mut model)?;
-    let shades: Vec<Shades> = photos.par_iter().map(|p| Shades::new(&p.image)).collect();
-    let valid: Vec<Plane<bool>> =
-        photos.iter().map(|p| matching::valid_area(&p.image, p.frame, MARGIN)).collect();
-    refine::refine(&mut model, &shades);
-    settle(&mut model)?;
-    progress.check()?;
-    progress.step(4, "more points");
-    model.prune(0.5 * threshold);
-    refine::extend(&mut model, &shades, &valid);
-    model.prune(0.5 * threshold);
-    let outcome = settle(&mut model)?;
-    model.normalise();
-    let cameras = cameras_of(photos, &model)?;
-    let points = model
-        .tracks
-        .iter()
-        .filter_map(|t| {
-            let views: Vec<(usize, DVec2)> = t.sightings.iter().map(|s| (s.view, s.pixel)).collect();
-            let (v, p) = *views.first()?;
-            Some(SparsePoint { position: t.position?, colour: colour_at(&photos[v].image, p), views })
-        })
-        .collect();
-    Ok(SparseModel { cameras, points, focal_log_sigma: outcome.focal_log_sigma.first().copied() })
-}
-
-/// Adjusts with weights from the residuals. Weights and geometry depend on each other; two rounds settle them to a percent.
-fn settle(model: &mut Model) -> Result<Outcome> {
-    model.weigh();
-    model.adjust(f64::INFINITY, 2.0, 60)?;
-    model.weigh();
-    model.adjust(f64::INFINITY, 2.0, 60)
-}
-
 fn colour_at(image: &RgbImage, p: DVec2) -> [f32; 3] {
     image.at((p.x.max(0.0) as usize).min(image.width - 1), (p.y.max(0.0) as usize).min(image.height - 1))
 }
@@ -385,8 +387,8 @@ fn cameras_of(photos: &[Photo], model: &Model) -> Result<Vec<Camera>> {
                 height: p.image.height as u32,
                 fx: model.focal(v),
                 fy: model.focal(v),
-                cx: model.centres[v].x,
-                cy: model.centres[v].y,
+                cx: model.principal_point(v).x,
+                cy: model.principal_point(v).y,
                 pose,
             })
         })

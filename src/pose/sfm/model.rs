@@ -1,7 +1,7 @@
 //! The growing reconstruction: cameras, points and their sightings.
 use crate::Result;
-use crate::pose::bundle::{Observation, Outcome, Problem};
-use crate::scene::Pose;
+use crate::pose::bundle::{Observation, Optics, OpticsPrior, Outcome, Problem};
+use crate::scene::{Lens, Pose};
 use glam::{DMat3, DVec2, DVec3};
 
 /// One sighting of a point.
@@ -22,20 +22,62 @@ pub(super) struct Track {
     pub(super) sightings: Vec<Sighting>,
 }
 
+/// What of the optics an adjustment may change.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Freedom {
+    /// The focal length.
+    Focal,
+    /// Focal length and radial distortion.
+    Radial,
+    /// Focal length and principal point.
+    Centre,
+    /// All of it.
+    Full,
+}
+
+impl Freedom {
+    pub(super) const ALL: [Freedom; 4] = [Freedom::Focal, Freedom::Radial, Freedom::Centre, Freedom::Full];
+
+    /// The prior with everything else held.
+    fn of(self, prior: &OpticsPrior) -> OpticsPrior {
+        let (radial, centre) = (
+            matches!(self, Freedom::Radial | Freedom::Full),
+            matches!(self, Freedom::Centre | Freedom::Full),
+        );
+        OpticsPrior {
+            lens: if radial { prior.lens } else { [0.0; 2] },
+            shift: if centre { prior.shift } else { 0.0 },
+            ..*prior
+        }
+    }
+
+    /// The optics with everything that is not free at its prior.
+    fn reset(self, optics: &Optics) -> Optics {
+        let prior = self.of(&OpticsPrior { log_focal: (0.0, 1.0), lens: [1.0; 2], shift: 1.0 });
+        Optics {
+            lens: if prior.lens[0] > 0.0 { optics.lens } else { Lens::NONE },
+            shift: if prior.shift > 0.0 { optics.shift } else { DVec2::ZERO },
+            ..*optics
+        }
+    }
+}
+
 /// Cameras by view (`None` = not registered) and tracks.
 #[derive(Clone, Debug)]
 pub(super) struct Model {
     pub(super) poses: Vec<Option<Pose>>,
-    /// Principal points, pixels.
+    /// Middle of each photo, pixels.
     pub(super) centres: Vec<DVec2>,
-    /// Focal group of each view.
+    /// Optics of each view.
     pub(super) group: Vec<usize>,
-    /// Working pixels per pixel of the group's focal length.
+    /// Pixels of the view per original pixel.
     pub(super) zoom: Vec<f64>,
-    /// Focal lengths per group, original pixels.
-    pub(super) focals: Vec<f64>,
-    /// (ln f, σ) per group.
-    pub(super) priors: Vec<(f64, f64)>,
+    /// Per group.
+    pub(super) optics: Vec<Optics>,
+    /// Per group.
+    pub(super) priors: Vec<OpticsPrior>,
+    /// What adjustments change; nothing where the prior's σ is 0.
+    pub(super) freedom: Freedom,
     pub(super) tracks: Vec<Track>,
 }
 
@@ -44,23 +86,79 @@ pub(super) const MIN_ANGLE_DEGREES: f64 = 1.0;
 
 impl Model {
     pub(super) fn focal(&self, view: usize) -> f64 {
-        self.focals[self.group[view]] * self.zoom[view]
+        self.optics[self.group[view]].focal * self.zoom[view]
+    }
+
+    pub(super) fn lens(&self, view: usize) -> Lens {
+        self.optics[self.group[view]].lens
+    }
+
+    /// Principal point, pixels.
+    pub(super) fn principal_point(&self, view: usize) -> DVec2 {
+        self.centres[view] + self.optics[self.group[view]].shift * self.zoom[view]
+    }
+
+    /// Parameters of the optics that adjustments change.
+    pub(super) fn parameters(&self) -> usize {
+        self.priors.iter().map(|p| self.freedom.of(p).count()).sum()
+    }
+
+    /// The same model on images of another size: `ratios` per view.
+    pub(super) fn magnify(&mut self, ratios: &[f64]) {
+        for (v, r) in ratios.iter().enumerate() {
+            self.centres[v] *= *r;
+            self.zoom[v] *= *r;
+        }
+        for s in self.tracks.iter_mut().flat_map(|t| &mut t.sightings) {
+            s.pixel *= ratios[s.view];
+            s.sigma *= ratios[s.view];
+        }
+    }
+
+    /// The model without its tracks.
+    pub(super) fn clone_optics(&self) -> Model {
+        Model {
+            poses: self.poses.clone(),
+            centres: self.centres.clone(),
+            group: self.group.clone(),
+            zoom: self.zoom.clone(),
+            optics: self.optics.clone(),
+            priors: self.priors.clone(),
+            freedom: self.freedom,
+            tracks: Vec::new(),
+        }
     }
 
     /// Camera-frame ray, z = 1.
     pub(super) fn ray(&self, view: usize, pixel: DVec2) -> DVec3 {
-        ((pixel - self.centres[view]) / self.focal(view)).extend(1.0)
+        self.lens(view).undistort((pixel - self.principal_point(view)) / self.focal(view)).extend(1.0)
+    }
+
+    /// Where a pinhole of the same focal length around the principal point would show the pixel, relative to that point.
+    pub(super) fn straight(&self, view: usize, pixel: DVec2) -> DVec2 {
+        self.ray(view, pixel).truncate() * self.focal(view)
     }
 
     /// Pixel and depth of a world point in a registered view.
     pub(super) fn project(&self, view: usize, world: DVec3) -> Option<(DVec2, f64)> {
         let t = self.poses[view]?.transform(world);
-        (t.z > 1e-9).then(|| (DVec2::new(t.x, t.y) * (self.focal(view) / t.z) + self.centres[view], t.z))
+        let seen = || self.lens(view).distort(DVec2::new(t.x, t.y) / t.z);
+        (t.z > 1e-9).then(|| (seen() * self.focal(view) + self.principal_point(view), t.z))
     }
 
     /// Reprojection distance in pixels; infinite when it cannot be seen.
     pub(super) fn error(&self, s: &Sighting, world: DVec3) -> f64 {
         self.project(s.view, world).map_or(f64::INFINITY, |(p, _)| (p - s.pixel).length())
+    }
+
+    /// Median reprojection distance of a view's sightings, pixels; 0 without any.
+    pub(super) fn residual(&self, view: usize) -> f64 {
+        let of_track = |t: &Track| {
+            let s = t.sightings.iter().find(|s| s.view == view)?;
+            Some(self.error(s, t.position?)).filter(|e| e.is_finite())
+        };
+        let mut all: Vec<f64> = self.tracks.iter().filter_map(of_track).collect();
+        crate::pose::numeric::median(&mut all).unwrap_or(0.0)
     }
 
     /// Position from the registered sightings: least squares on ray distances, then Gauss–Newton on pixels. `None` when
@@ -89,9 +187,11 @@ impl Model {
                 if t.z <= 1e-9 {
                     return None;
                 }
-                let f = self.focal(s.view) / t.z;
-                let r = DVec2::new(t.x, t.y) * f + self.centres[s.view] - s.pixel;
-                let rows = [DVec3::new(f, 0.0, -f * t.x / t.z), DVec3::new(0.0, f, -f * t.y / t.z)];
+                let (f, lens) = (self.focal(s.view), self.lens(s.view));
+                let at = DVec2::new(t.x, t.y) / t.z;
+                let r = lens.distort(at) * f + self.principal_point(s.view) - s.pixel;
+                let bend = lens.jacobian(at) * (f / t.z);
+                let rows = [0, 1].map(|k| bend.row(k).extend(-bend.row(k).dot(at)));
                 for (row, r) in rows.iter().zip([r.x, r.y]) {
                     let j = pose.rotation.transpose() * *row / s.sigma;
                     h += DMat3::from_cols(j * j.x, j * j.y, j * j.z);
@@ -152,13 +252,16 @@ impl Model {
         }
     }
 
-    /// Adjusts cameras and points over the sightings within `gate` pixels; `c` is the Cauchy scale in standard
-    /// deviations. The first registered view stays where it is.
-    pub(super) fn adjust(&mut self, gate: f64, c: f64, steps: usize) -> Result<Outcome> {
+    /// The registered views and triangulated points as an adjustment problem, over the sightings within `gate` pixels; and
+    /// which views and tracks stand behind its cameras and points.
+    fn problem(&self, gate: f64, freedom: Freedom) -> (Problem, Vec<usize>, Vec<usize>) {
         let views: Vec<usize> = (0..self.poses.len()).filter(|v| self.poses[*v].is_some()).collect();
         let mut local = vec![usize::MAX; self.poses.len()];
-        let mut problem =
-            Problem { focals: self.focals.clone(), priors: self.priors.clone(), ..Default::default() };
+        let mut problem = Problem {
+            optics: self.optics.iter().map(|o| freedom.reset(o)).collect(),
+            priors: self.priors.iter().map(|p| freedom.of(p)).collect(),
+            ..Default::default()
+        };
         for (k, &v) in views.iter().enumerate() {
             local[v] = k;
             problem.poses.extend(self.poses[v]);
@@ -183,11 +286,18 @@ impl Model {
                 sigma: s.sigma,
             }));
         }
+        (problem, views, used)
+    }
+
+    /// Adjusts cameras and points over the sightings within `gate` pixels; `c` is the Cauchy scale in standard
+    /// deviations. The first registered view stays where it is.
+    pub(super) fn adjust(&mut self, gate: f64, c: f64, steps: usize) -> Result<Outcome> {
+        let (mut problem, views, used) = self.problem(gate, self.freedom);
         let outcome = problem.solve(c, steps)?;
         for (k, &v) in views.iter().enumerate() {
             self.poses[v] = Some(problem.poses[k]);
         }
-        self.focals = problem.focals;
+        self.optics = problem.optics;
         for (k, x) in used.into_iter().zip(problem.points) {
             self.tracks[k].position = Some(x);
         }

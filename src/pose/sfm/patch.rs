@@ -1,7 +1,7 @@
 //! Photometric alignment of small planar patches between views with known cameras.
 use super::model::Model;
 use crate::pose::sift::blurred;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::Plane;
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
 
@@ -25,8 +25,8 @@ pub(super) struct Shades {
 }
 
 impl Shades {
-    pub(super) fn new(image: &RgbImage) -> Shades {
-        let value = blurred(&image.luma(), BLUR);
+    pub(super) fn new(luma: &Plane<f32>) -> Shades {
+        let value = blurred(luma, BLUR);
         let (w, h) = (value.width, value.height);
         let at = |x: usize, y: usize| value.data[y * w + x];
         let (mut dx, mut dy) = (vec![0f32; w * h], vec![0f32; w * h]);
@@ -128,7 +128,7 @@ impl Warp {
             m: relative.rotation,
             shift: relative.translation,
             f: model.focal(other),
-            centre: model.centres[other],
+            centre: model.principal_point(other),
         })
     }
     fn position(&self, ray: DVec3, a: f64, slant: DVec2, d: DVec2) -> Option<DVec2> {

@@ -5,8 +5,10 @@ use crate::scene::Plane;
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
-/// Family of photometrically aligned sightings, after those of the detectors.
+/// Family of photometrically aligned sightings, after those of the detectors …
 pub(super) const REFINED: usize = 2;
+/// … and of those aligned on images with more pixels.
+pub(super) const FINE: usize = 3;
 /// Least correlation of an aligned patch; views 75° apart reach 0.8 on a true match.
 const MIN_NCC: f64 = 0.8;
 /// Farthest a refined sighting may be from the keypoint it started at, pixels: about three times the detectors' noise.
@@ -82,13 +84,14 @@ fn central(model: &Model, track: &Track, x: DVec3) -> usize {
 }
 
 /// Moves every sighting onto the patch of its track's central view. Sightings that do not align keep their position and
-/// family; aligned ones change family, so that their noise is estimated apart.
-pub(super) fn refine(model: &mut Model, shades: &[Shades]) {
+/// family; aligned ones change to `family`, so that their noise is estimated apart. `reach`: pixels within which the
+/// neighbours of a point lie on one plane with it.
+pub(super) fn refine(model: &mut Model, shades: &[Shades], family: usize, reach: f64) {
     let seen: Vec<Seen> = (0..model.poses.len()).map(|v| Seen::new(model, v)).collect();
     let fixed = &*model;
     let aligner = Aligner::new(fixed, shades);
     let moved: Vec<Option<Vec<Sighting>>> =
-        fixed.tracks.par_iter().map(|t| refined(&aligner, &seen, t)).collect();
+        fixed.tracks.par_iter().map(|t| refined(&aligner, &seen, t, family, reach)).collect();
     for (t, m) in model.tracks.iter_mut().zip(moved) {
         if let Some(m) = m {
             t.sightings = m;
@@ -96,7 +99,13 @@ pub(super) fn refine(model: &mut Model, shades: &[Shades]) {
     }
 }
 
-fn refined(aligner: &Aligner, seen: &[Seen], track: &Track) -> Option<Vec<Sighting>> {
+fn refined(
+    aligner: &Aligner,
+    seen: &[Seen],
+    track: &Track,
+    family: usize,
+    reach: f64,
+) -> Option<Vec<Sighting>> {
     let (model, x) = (aligner.model, track.position?);
     let reference = central(model, track, x);
     let base = track.sightings[reference];
@@ -106,7 +115,7 @@ fn refined(aligner: &Aligner, seen: &[Seen], track: &Track) -> Option<Vec<Sighti
         others.iter().filter_map(|s| Some((s.view, s.pixel - aligner.expected(f, s.view)?))).collect()
     };
     let flat = Facet { view: base.view, pixel: base.pixel, inverse_depth: 1.0 / z, slant: DVec2::ZERO };
-    let leaning = seen[base.view].plane(base.pixel, 80.0).map(|p| Facet { slant: p.1, ..flat });
+    let leaning = seen[base.view].plane(base.pixel, reach).map(|p| Facet { slant: p.1, ..flat });
     let template = aligner.template(&flat)?;
     let score = |f: &Facet| -> f64 {
         start(f).iter().filter_map(|(v, s)| aligner.ncc(&template, f, *v, *s)).map(|n| n.max(0.0)).sum()
@@ -123,7 +132,7 @@ fn refined(aligner: &Aligner, seen: &[Seen], track: &Track) -> Option<Vec<Sighti
         let good = (s.pixel - a.pixel).length() < MAX_MOVE
             && aligner.round_trip(&facet, a.view, a.pixel).is_some_and(|m| m < MAX_MISS);
         if good {
-            *s = Sighting { pixel: a.pixel, family: REFINED, ..*s };
+            *s = Sighting { pixel: a.pixel, family, ..*s };
             count += 1;
         }
     }
@@ -131,7 +140,7 @@ fn refined(aligner: &Aligner, seen: &[Seen], track: &Track) -> Option<Vec<Sighti
         return None;
     }
     // The reference patch defines the point, so its own position is exact.
-    out[reference].family = REFINED;
+    out[reference].family = family;
     Some(out)
 }
 

@@ -3,19 +3,24 @@
 //! A caller opens [`GroundTruth`], asks [`Evaluation::cameras`] for every frame's camera in the scene's world, renders
 //! it, answers each label's phrase with [`super::answer`] and hands both to [`Evaluation::add_frame`]; the figures
 //! agree with an independent scorer that reads only the files written.
+mod figures;
+mod text;
 mod truth;
 
 #[cfg(test)]
 mod tests;
 
-pub use truth::{Frame, GroundTruth, Split};
+pub use figures::{DepthScore, colour_fit, depth_score, iou};
+pub use truth::{Frame, GroundTruth, Split, StatedLens};
 
 use super::QueryResult;
 use crate::format::picture;
 use crate::pass::metrics;
 use crate::pose::align::{PoseErrors, Similarity, pose_errors};
+use crate::pose::relative::{auc, pair_errors};
 use crate::scene::{Camera, Plane, Pose, RgbImage};
 use crate::{Error, Result};
+use figures::quantised;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -28,18 +33,23 @@ pub const BACKGROUND_LABELS: [&str; 6] =
 pub const MIN_OBJECT_PIXELS: usize = 100;
 
 /// What the figures of the report are.
-const DEFINITIONS: [&str; 5] = [
+const DEFINITIONS: [&str; 8] = [
     "poses: after the similarity that maps the scene's cameras of the train frames onto the true ones",
-    "images: PSNR and SSIM of the 8-bit render; depth: median of |z - z_true| / z_true where both are known",
+    "relative_poses: over all pairs of train frames, the angle between the relative rotations and between the directions of \
+     the baselines; auc_N: area under the share of pairs whose larger angle is below x, x from 0 to N degrees, exact",
+    "images: PSNR and SSIM of the 8-bit render; psnr_colour_fit: after the gain and offset per channel that bring the render \
+     closest to the photo (least squares per frame), for photos whose exposure and white balance differ",
+    "depth: median of |z - z_true| / z_true at the cameras' scale where both are known; AbsRel (mean of |s z - z_true| / \
+     z_true) and delta (share with a ratio below 1.25) with s = median z_true / median z per frame, as usual for depth \
+     without known scale",
     "mask: the codes of the chosen level that are nearly as relevant as the best one in the frame, without smoothing; objects \
      of at least 100 pixels, surfaces behind them left out",
     "miou: plain mean of IoU over all (object, frame) pairs; localisation: share of pairs whose most relevant pixel lies on \
      the object",
     "train: photos that the scene was made from; test: held-out frames",
+    "refined: held-out frames again, each from a camera moved until the frozen scene's render is closest to the photo; the move \
+     is kept only where psnr_colour_fit rises. Everything outside `refined` is from the cameras as given",
 ];
-
-/// Pixels less opaque than this have no depth to compare.
-const SOLID: f32 = 0.5;
 
 /// One rendered frame.
 #[derive(Clone, Debug, Default)]
@@ -76,8 +86,14 @@ pub struct ImageScore {
     pub psnr: f64,
     /// Structural similarity, 11×11 Gaussian window.
     pub ssim: f64,
+    /// dB, after a gain and an offset per channel.
+    pub psnr_colour_fit: f64,
     /// Median of |z − z_true| / z_true where both are known.
     pub depth_median_relative: Option<f64>,
+    /// Mean of |s z − z_true| / z_true, s from the medians.
+    pub depth_abs_rel: Option<f64>,
+    /// Share of pixels whose depth, so scaled, is off by less than 1.25.
+    pub depth_delta: Option<f64>,
 }
 
 /// How one phrase did in one frame.
@@ -110,14 +126,70 @@ pub struct Summary {
     pub psnr: Option<f64>,
     /// Mean SSIM.
     pub ssim: Option<f64>,
+    /// Mean PSNR after the colour fit, dB.
+    pub psnr_colour_fit: Option<f64>,
     /// Mean over frames of the median relative depth error.
     pub depth_median_relative: Option<f64>,
+    /// Mean over frames of AbsRel.
+    pub depth_abs_rel: Option<f64>,
+    /// Mean over frames of the share with a ratio below 1.25.
+    pub depth_delta: Option<f64>,
     /// Plain mean over all (object, view) pairs.
     pub miou: Option<f64>,
     /// Share of (object, view) pairs whose most relevant pixel lies on the object.
     pub localisation: Option<f64>,
     /// Mean IoU per phrase.
     pub iou: BTreeMap<String, f64>,
+}
+
+/// One pair of train views.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct PairScore {
+    /// Frame file stems.
+    pub frames: [String; 2],
+    /// Angle between the relative rotations, degrees.
+    pub rotation_degrees: f64,
+    /// Angle between the directions of the baselines, degrees.
+    pub direction_degrees: Option<f64>,
+}
+
+/// Relative poses of the train views.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct RelativeScore {
+    /// All pairs of train views that the scene has.
+    pub pairs: Vec<PairScore>,
+    /// Area under the recall curve up to 3 degrees; pairs with a frame that the scene lacks count as failures.
+    pub auc_3: Option<f64>,
+    /// Up to 5 degrees.
+    pub auc_5: Option<f64>,
+    /// Up to 30 degrees.
+    pub auc_30: Option<f64>,
+}
+
+/// How far a held-out camera was moved.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct RefinedView {
+    /// Frame file stem.
+    pub frame: String,
+    /// Whether the moved camera is used.
+    pub kept: bool,
+    /// Turn, degrees.
+    pub rotation_degrees: f64,
+    /// Shift of the centre over the scene's median depth.
+    pub centre_fraction: f64,
+}
+
+/// Held-out frames from refined cameras.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct RefinedScore {
+    /// What moved.
+    pub views: Vec<RefinedView>,
+    /// As in the report.
+    pub images: Vec<ImageScore>,
+    /// As in the report.
+    pub masks: Vec<MaskScore>,
+    /// Means.
+    pub summary: Summary,
 }
 
 /// Everything `splatvk eval` reports.
@@ -127,12 +199,17 @@ pub struct Report {
     pub definitions: Vec<String>,
     /// Per train view.
     pub poses: Vec<PoseScore>,
+    /// Per pair of train views.
+    pub relative_poses: RelativeScore,
     /// Per rendered frame.
     pub images: Vec<ImageScore>,
     /// Per object and frame; background labels are not listed.
     pub masks: Vec<MaskScore>,
     /// Means per split, `train` and `test`.
     pub summary: BTreeMap<String, Summary>,
+    /// Held-out frames from refined cameras, if asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub refined: Option<RefinedScore>,
 }
 
 /// Collects scores frame by frame.
@@ -148,6 +225,7 @@ impl Evaluation {
     /// them alone. With `out`, renders and masks are written there.
     pub fn new(truth: GroundTruth, scene: &[Camera], out: Option<&Path>) -> Result<Self> {
         let mut pairs: Vec<(Camera, &Frame)> = Vec::new();
+        let asked = truth.frames.iter().filter(|f| f.split == Split::Train).count();
         for frame in truth.frames.iter().filter(|f| f.split == Split::Train) {
             let found = scene.iter().find(|c| stem(&c.name) == frame.stem);
             pairs.extend(found.map(|c| (c.clone(), frame)));
@@ -165,7 +243,8 @@ impl Evaluation {
         let estimated: Vec<Camera> = pairs.iter().map(|(c, _)| c.clone()).collect();
         let known: Vec<Camera> = frames.iter().map(|f| f.camera.clone()).collect();
         let errors = pose_errors(&estimated, &known, mean_depth);
-        let report = Report { poses: pose_scores(&frames, &errors), ..Report::default() };
+        let relative_poses = relative(&frames, &estimated, &known, asked);
+        let report = Report { poses: pose_scores(&frames, &errors), relative_poses, ..Report::default() };
         Ok(Evaluation { similarity: errors.similarity, out: out.map(Path::to_path_buf), report, truth })
     }
 
@@ -180,6 +259,11 @@ impl Evaluation {
         all.filter(|(_, p)| !BACKGROUND_LABELS.contains(&p.as_str())).map(|(k, p)| (*k, p.clone())).collect()
     }
 
+    /// The photo of a frame.
+    pub fn photo(&self, frame: &Frame) -> Result<RgbImage> {
+        self.truth.image(frame)
+    }
+
     /// Scores one frame; `answers` holds the result per asked object index, in frame size.
     pub fn add_frame(
         &mut self,
@@ -187,6 +271,36 @@ impl Evaluation {
         rendered: &Rendered,
         answers: &[(u32, QueryResult)],
     ) -> Result<()> {
+        let (image, masks) = self.score(frame, rendered, answers, self.out.as_deref())?;
+        self.report.images.push(image);
+        self.report.masks.extend(masks);
+        Ok(())
+    }
+
+    /// Scores a held-out frame again, from a refined camera; its files go into `refined/`.
+    pub fn add_refined(
+        &mut self,
+        frame: &Frame,
+        view: RefinedView,
+        rendered: &Rendered,
+        answers: &[(u32, QueryResult)],
+    ) -> Result<()> {
+        let out = self.out.as_ref().map(|o| o.join("refined"));
+        let (image, masks) = self.score(frame, rendered, answers, out.as_deref())?;
+        let refined = self.report.refined.get_or_insert_default();
+        refined.views.push(view);
+        refined.images.push(image);
+        refined.masks.extend(masks);
+        Ok(())
+    }
+
+    fn score(
+        &self,
+        frame: &Frame,
+        rendered: &Rendered,
+        answers: &[(u32, QueryResult)],
+        out: Option<&Path>,
+    ) -> Result<(ImageScore, Vec<MaskScore>)> {
         let target = self.truth.image(frame)?;
         let shown = quantised(&rendered.rgb);
         if (shown.width, shown.height) != (target.width, target.height) {
@@ -196,27 +310,30 @@ impl Evaluation {
             )));
         }
         let depth = self.truth.depth(frame)?;
+        let depth =
+            depth.and_then(|d| depth_score(&rendered.depth, &rendered.alpha, &d, self.similarity.scale));
         // A white or black frame around a photo is no part of the scene.
         let border = crate::photo::Frame::of(&target);
         let (inner, photo) = (border.crop(&shown), border.crop(&target));
-        self.report.images.push(ImageScore {
+        let image = ImageScore {
             frame: frame.stem.clone(),
             split: frame.split,
             psnr: metrics::psnr(&inner, &photo),
             ssim: metrics::ssim(&inner, &photo),
-            depth_median_relative: depth.and_then(|d| depth_error(rendered, &d, self.similarity.scale)),
-        });
-        if let Some(out) = &self.out {
-            let path = out.join("renders").join(format!("{}.png", frame.stem));
-            make_parent(&path)?;
-            picture::write_png(&path, &shown)?;
-            for (label, answer) in answers {
-                let path = out.join("masks").join(label.to_string()).join(format!("{}.png", frame.stem));
-                make_parent(&path)?;
-                picture::write_mask_png(&path, &answer.mask)?;
-            }
+            psnr_colour_fit: metrics::psnr(&colour_fit(&inner, &photo), &photo),
+            depth_median_relative: depth.map(|d| d.median_relative),
+            depth_abs_rel: depth.map(|d| d.abs_rel),
+            depth_delta: depth.map(|d| d.delta),
+        };
+        if let Some(out) = out {
+            write_files(out, &frame.stem, &shown, answers)?;
         }
-        let Some(objects) = self.truth.objects(frame)? else { return Ok(()) };
+        Ok((image, self.mask_scores(frame, answers)?))
+    }
+
+    fn mask_scores(&self, frame: &Frame, answers: &[(u32, QueryResult)]) -> Result<Vec<MaskScore>> {
+        let Some(objects) = self.truth.objects(frame)? else { return Ok(Vec::new()) };
+        let mut scores = Vec::new();
         for (label, answer) in answers {
             let Some(phrase) = self.truth.labels.get(label) else { continue };
             let size = objects.data.iter().filter(|&&o| o == *label).count();
@@ -224,7 +341,7 @@ impl Evaluation {
                 continue;
             }
             let (x, y) = answer.location;
-            self.report.masks.push(MaskScore {
+            scores.push(MaskScore {
                 frame: frame.stem.clone(),
                 split: frame.split,
                 label: *label,
@@ -236,15 +353,18 @@ impl Evaluation {
                 found: answer.found,
             });
         }
-        Ok(())
+        Ok(scores)
     }
 
     /// The report with its means.
     pub fn finish(mut self) -> Report {
         self.report.definitions = DEFINITIONS.map(String::from).to_vec();
         for split in [Split::Train, Split::Test] {
-            let summary = summarise(&self.report, split);
+            let summary = summarise(&self.report.images, &self.report.masks, split);
             self.report.summary.insert(split.name().to_string(), summary);
+        }
+        if let Some(refined) = &mut self.report.refined {
+            refined.summary = summarise(&refined.images, &refined.masks, Split::Test);
         }
         self.report
     }
@@ -261,10 +381,27 @@ fn pose_scores(frames: &[&Frame], errors: &PoseErrors) -> Vec<PoseScore> {
     rows.map(score).collect()
 }
 
-fn summarise(report: &Report, split: Split) -> Summary {
+/// `asked`: train frames of the truth; a frame that the scene lacks fails in all its pairs.
+fn relative(frames: &[&Frame], estimated: &[Camera], known: &[Camera], asked: usize) -> RelativeScore {
+    let errors = pair_errors(estimated, known);
+    let missing = asked * asked.saturating_sub(1) / 2 - errors.len();
+    let pairs = errors.iter().map(|e| PairScore {
+        frames: e.pair.map(|k| frames[k].stem.clone()),
+        rotation_degrees: e.rotation_degrees,
+        direction_degrees: e.direction_degrees,
+    });
+    RelativeScore {
+        pairs: pairs.collect(),
+        auc_3: auc(&errors, missing, 3.0),
+        auc_5: auc(&errors, missing, 5.0),
+        auc_30: auc(&errors, missing, 30.0),
+    }
+}
+
+fn summarise(images: &[ImageScore], masks: &[MaskScore], split: Split) -> Summary {
     let mean = |v: Vec<f64>| (!v.is_empty()).then(|| v.iter().sum::<f64>() / v.len() as f64);
-    let images: Vec<&ImageScore> = report.images.iter().filter(|i| i.split == split).collect();
-    let masks: Vec<&MaskScore> = report.masks.iter().filter(|m| m.split == split).collect();
+    let images: Vec<&ImageScore> = images.iter().filter(|i| i.split == split).collect();
+    let masks: Vec<&MaskScore> = masks.iter().filter(|m| m.split == split).collect();
     let mut per_phrase: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     for m in &masks {
         per_phrase.entry(m.phrase.clone()).or_default().push(m.iou);
@@ -272,30 +409,14 @@ fn summarise(report: &Report, split: Split) -> Summary {
     Summary {
         psnr: mean(images.iter().map(|i| i.psnr).collect()),
         ssim: mean(images.iter().map(|i| i.ssim).collect()),
+        psnr_colour_fit: mean(images.iter().map(|i| i.psnr_colour_fit).collect()),
         depth_median_relative: mean(images.iter().filter_map(|i| i.depth_median_relative).collect()),
+        depth_abs_rel: mean(images.iter().filter_map(|i| i.depth_abs_rel).collect()),
+        depth_delta: mean(images.iter().filter_map(|i| i.depth_delta).collect()),
         miou: mean(masks.iter().map(|m| m.iou).collect()),
         localisation: mean(masks.iter().map(|m| f64::from(m.localised)).collect()),
         iou: per_phrase.into_iter().filter_map(|(k, v)| mean(v).map(|m| (k, m))).collect(),
     }
-}
-
-/// Intersection over union of a mask (resampled to the truth's size by nearest pixel) and one object; 0 when both are
-/// empty.
-pub fn iou(mask: &Plane<bool>, objects: &Plane<u32>, label: u32) -> Result<f64> {
-    if mask.data.len() != mask.width * mask.height || mask.data.is_empty() {
-        return Err(Error::work("eval: a mask without pixels"));
-    }
-    let (mut both, mut either) = (0u64, 0u64);
-    for y in 0..objects.height {
-        let my = ((y as f64 + 0.5) * mask.height as f64 / objects.height as f64) as usize;
-        for x in 0..objects.width {
-            let mx = ((x as f64 + 0.5) * mask.width as f64 / objects.width as f64) as usize;
-            let (p, t) = (mask.at(mx, my), objects.at(x, y) == label);
-            both += u64::from(p && t);
-            either += u64::from(p || t);
-        }
-    }
-    Ok(both as f64 / either.max(1) as f64)
 }
 
 /// A camera of the true world in the scene's world: the truth is `s R x + t` of the scene.
@@ -309,22 +430,16 @@ pub fn to_scene(camera: &Camera, scene_to_truth: &Similarity) -> Camera {
     Camera { pose, ..camera.clone() }
 }
 
-fn depth_error(rendered: &Rendered, truth: &Plane<f32>, scale: f64) -> Option<f64> {
-    let pairs = rendered.depth.data.iter().zip(&rendered.alpha.data).zip(&truth.data);
-    let solid = pairs.filter(|((z, a), t)| **z > 0.0 && **a >= SOLID && **t > 0.0);
-    let mut errors: Vec<f64> =
-        solid.map(|((z, _), t)| (*z as f64 * scale - *t as f64).abs() / *t as f64).collect();
-    if errors.is_empty() {
-        return None;
+fn write_files(out: &Path, stem: &str, shown: &RgbImage, answers: &[(u32, QueryResult)]) -> Result<()> {
+    let path = out.join("renders").join(format!("{stem}.png"));
+    make_parent(&path)?;
+    picture::write_png(&path, shown)?;
+    for (label, answer) in answers {
+        let path = out.join("masks").join(label.to_string()).join(format!("{stem}.png"));
+        make_parent(&path)?;
+        picture::write_mask_png(&path, &answer.mask)?;
     }
-    let middle = errors.len() / 2;
-    Some(*errors.select_nth_unstable_by(middle, f64::total_cmp).1)
-}
-
-/// The picture as an 8-bit file holds it, so that figures can be recomputed from the files.
-fn quantised(image: &RgbImage) -> RgbImage {
-    let data = image.data.iter().map(|c| c.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() / 255.0)).collect();
-    RgbImage { width: image.width, height: image.height, data }
+    Ok(())
 }
 
 fn stem(name: &str) -> &str {

@@ -62,6 +62,10 @@ fn a_perfect_scene_scores_perfectly_and_its_files_say_so() {
     assert!(train.psnr.unwrap() > 60.0 && train.ssim.unwrap() > 0.999);
     // f16 depth, divided and multiplied again in f32
     assert!(train.depth_median_relative.unwrap() < 1e-5);
+    assert!(train.depth_abs_rel.unwrap() < 1e-4 && train.depth_delta.unwrap() > 0.999);
+    assert!(train.psnr_colour_fit.unwrap() >= train.psnr.unwrap() - 1e-6);
+    assert_eq!(report.relative_poses.pairs.len(), 6);
+    assert!(report.relative_poses.auc_3.unwrap() > 0.999 && report.refined.is_none());
     let mask = image::open(dir.path().join("masks/7/test_05.png")).unwrap().to_luma8();
     let frame = truth.frames.iter().find(|f| f.stem == "test_05").unwrap();
     let objects = truth.objects(frame).unwrap().unwrap();
@@ -78,20 +82,6 @@ fn iou_counts_pixels_and_resamples_masks() {
     assert_eq!(iou(&mask(vec![true, false], 2), &objects, 1).unwrap(), 1.0);
     assert_eq!(iou(&mask(vec![false; 8], 4), &objects, 9).unwrap(), 0.0);
     assert!(iou(&mask(vec![], 1), &objects, 1).is_err());
-}
-
-#[test]
-fn depth_error_is_a_median_over_solid_pixels() {
-    let plane = |data: Vec<f32>| Plane { width: data.len(), height: 1, data };
-    let rendered = Rendered {
-        rgb: RgbImage::default(),
-        alpha: plane(vec![1.0, 1.0, 1.0, 0.2, 1.0]),
-        depth: plane(vec![1.0, 2.2, 4.0, 9.0, 0.0]),
-    };
-    let truth = plane(vec![2.0, 4.0, 4.0, 1.0, 1.0]);
-    let error = depth_error(&rendered, &truth, 2.0).unwrap();
-    assert!((error - 0.1).abs() < 1e-6, "{error}");
-    assert_eq!(depth_error(&rendered, &plane(vec![0.0; 5]), 1.0), None);
 }
 
 #[test]

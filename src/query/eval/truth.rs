@@ -38,6 +38,17 @@ pub struct Frame {
     pub split: Split,
     /// Intrinsics and pose in the true world.
     pub camera: Camera,
+    /// Radial distortion of the photo, if the set states it; [`Frame::camera`] is without it.
+    pub lens: Option<StatedLens>,
+}
+
+/// Radial distortion `x_d = x_u (1 + k1 r² + k2 r⁴)` about the principal point, r in units of the focal length.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct StatedLens {
+    /// Term of r².
+    pub k1: f64,
+    /// Term of r⁴.
+    pub k2: f64,
 }
 
 /// A ground-truth folder.
@@ -69,6 +80,8 @@ struct FileFrame {
     cx: f64,
     cy: f64,
     world_to_camera: [[f64; 4]; 4],
+    #[serde(default)]
+    lens: Option<StatedLens>,
 }
 
 impl GroundTruth {
@@ -90,7 +103,7 @@ impl GroundTruth {
             let pose = Pose { rotation, translation: column(3) };
             let camera =
                 Camera { name: f.file.clone(), width, height, fx: f.fx, fy: f.fy, cx: f.cx, cy: f.cy, pose };
-            Frame { file: f.file, stem, split: f.split, camera }
+            Frame { file: f.file, stem, split: f.split, camera, lens: f.lens }
         };
         let frames = file.frames.into_iter().map(frame).collect();
         Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, frames })

@@ -1,0 +1,313 @@
+//! Photos → cameras on data with a known answer, without training: how far off they are, and whether the stated
+//! uncertainty of the focal length is right.
+use crate::infer::Registry;
+use crate::photo;
+use crate::pose::align::pose_errors;
+use crate::pose::relative::{auc, pair_errors};
+use crate::pose::{self, Placed};
+use crate::progress::Progress;
+use crate::query::eval::{Frame, GroundTruth, Split, StatedLens};
+use crate::{Error, Result};
+use serde::Serialize;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// One data set.
+#[derive(Clone, Debug, Serialize)]
+pub struct CameraRow {
+    /// Its folder.
+    pub data: PathBuf,
+    /// Train frames.
+    pub photos: usize,
+    /// From files to cameras.
+    pub seconds: f64,
+    /// The figures, or why there are none.
+    #[serde(flatten)]
+    pub outcome: CameraOutcome,
+}
+
+/// Figures or the reason why there are none.
+#[derive(Clone, Debug, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CameraOutcome {
+    /// Cameras were found.
+    Figures(Box<CameraFigures>),
+    /// The error that a run would end with.
+    Failure(String),
+}
+
+/// How far off the cameras of one data set are.
+#[derive(Clone, Debug, Serialize)]
+pub struct CameraFigures {
+    /// f / f_true − 1, mean over the photos.
+    pub focal_error: f64,
+    /// Stated standard deviation of ln f.
+    pub focal_sigma: Option<f64>,
+    /// |ln f − ln f_true| over that.
+    pub focal_sigmas: Option<f64>,
+    /// Worst rotation after the similarity that maps all cameras onto the true ones, degrees.
+    pub rotation_degrees: f64,
+    /// Worst distance of a centre after it, over the mean depth.
+    pub centre_fraction: f64,
+    /// Worst angle between the relative rotations of a pair, degrees.
+    pub pair_rotation_degrees: f64,
+    /// Worst angle between the baseline directions of a pair, degrees.
+    pub pair_direction_degrees: f64,
+    /// Area under the recall curve up to 3, 5 and 30 degrees.
+    pub auc: [Option<f64>; 3],
+    /// Worst offset of the principal point from the true one, over the width.
+    pub principal_point: f64,
+    /// The true lens, if the data state it.
+    pub true_lens: Option<StatedLens>,
+}
+
+/// Data sets and what they say together.
+#[derive(Clone, Debug, Serialize)]
+pub struct CameraReport {
+    /// In the order given.
+    pub rows: Vec<CameraRow>,
+    /// Data sets whose photos gave no cameras.
+    pub failures: usize,
+    /// Share of the sets with a stated focal length whose error is within 2 σ.
+    pub within_2_sigma: Option<f64>,
+    /// Median of |f / f_true − 1|.
+    pub median_focal_error: Option<f64>,
+    /// Median over the sets of the worst rotation, degrees.
+    pub median_rotation_degrees: Option<f64>,
+    /// Median over the sets of the worst centre.
+    pub median_centre_fraction: Option<f64>,
+    /// Mean AUC up to 3, 5 and 30 degrees; a set without cameras counts 0.
+    pub mean_auc: [Option<f64>; 3],
+}
+
+/// Degrees up to which recall is added up.
+const AUC_DEGREES: [f64; 3] = [3.0, 5.0, 30.0];
+
+/// Finds the cameras of every set's train frames, by themselves.
+pub fn measure(
+    sets: &[PathBuf],
+    registry: &Registry,
+    progress: &dyn Progress,
+    done: &mut dyn FnMut(&CameraRow) -> Result<()>,
+) -> Result<CameraReport> {
+    let truths = sets.iter().map(|s| GroundTruth::read(s)).collect::<Result<Vec<_>>>()?;
+    let mut rows = Vec::new();
+    for truth in &truths {
+        let row = one(truth, registry, progress)?;
+        done(&row)?;
+        rows.push(row);
+    }
+    Ok(together(rows))
+}
+
+fn one(truth: &GroundTruth, registry: &Registry, progress: &dyn Progress) -> Result<CameraRow> {
+    let frames: Vec<&Frame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
+    let clock = Instant::now();
+    let found = placed(&truth.folder, &frames, registry, progress);
+    let seconds = clock.elapsed().as_secs_f64();
+    let outcome = match found {
+        Ok(placed) => CameraOutcome::Figures(Box::new(figures(truth, &frames, &placed)?)),
+        Err(Error::Cancelled) => return Err(Error::Cancelled),
+        Err(e) => CameraOutcome::Failure(e.to_string()),
+    };
+    Ok(CameraRow { data: truth.folder.clone(), photos: frames.len(), seconds, outcome })
+}
+
+/// What a run does before its first dense stage.
+fn placed(folder: &Path, frames: &[&Frame], registry: &Registry, progress: &dyn Progress) -> Result<Placed> {
+    let photos = frames.iter().map(|f| photo::load(&folder.join(&f.file))).collect::<Result<Vec<_>>>()?;
+    pose::place(photos, None, registry, progress)
+}
+
+fn figures(truth: &GroundTruth, frames: &[&Frame], placed: &Placed) -> Result<CameraFigures> {
+    let model = &placed.model;
+    let joined: Vec<(usize, &Frame)> = placed
+        .photos
+        .iter()
+        .enumerate()
+        .filter_map(|(k, p)| Some((k, *frames.iter().find(|f| f.stem == p.stem)?)))
+        .collect();
+    let estimated: Vec<_> = joined.iter().map(|(k, _)| model.cameras[*k].clone()).collect();
+    let known: Vec<_> = joined.iter().map(|(_, f)| f.camera.clone()).collect();
+    let errors = pose_errors(&estimated, &known, truth.mean_depth(frames)?);
+    let pairs = pair_errors(&estimated, &known);
+    let asked = frames.len() * frames.len().saturating_sub(1) / 2;
+    let n = joined.len().max(1) as f64;
+    let both = || estimated.iter().zip(&known);
+    let logs = both().map(|(e, t)| (e.fx / f64::from(e.width) * f64::from(t.width) / t.fx).ln());
+    let log_error = logs.sum::<f64>() / n;
+    let offset = both().map(|(e, t)| {
+        let at = |c: &crate::scene::Camera| (c.cx / f64::from(c.width), c.cy / f64::from(c.width));
+        let ((x, y), (tx, ty)) = (at(e), at(t));
+        (x - tx).hypot(y - ty)
+    });
+    let worst = |values: &[f64]| values.iter().copied().fold(0.0, f64::max);
+    let of_pairs =
+        |value: &dyn Fn(&pose::relative::PairError) -> f64| pairs.iter().map(value).fold(0.0, f64::max);
+    Ok(CameraFigures {
+        focal_error: log_error.exp() - 1.0,
+        focal_sigma: model.focal_log_sigma,
+        focal_sigmas: model.focal_log_sigma.map(|s| log_error.abs() / s),
+        rotation_degrees: worst(&errors.rotation_degrees),
+        centre_fraction: worst(&errors.centre),
+        pair_rotation_degrees: of_pairs(&|p| p.rotation_degrees),
+        pair_direction_degrees: of_pairs(&|p| p.direction_degrees.unwrap_or(0.0)),
+        auc: AUC_DEGREES.map(|d| auc(&pairs, asked - pairs.len().min(asked), d)),
+        principal_point: offset.fold(0.0, f64::max),
+        // A lens that the model states goes here, beside the true one.
+        true_lens: frames.first().and_then(|f| f.lens),
+    })
+}
+
+fn together(rows: Vec<CameraRow>) -> CameraReport {
+    let good: Vec<&CameraFigures> = rows
+        .iter()
+        .filter_map(|r| match &r.outcome {
+            CameraOutcome::Figures(f) => Some(f.as_ref()),
+            CameraOutcome::Failure(_) => None,
+        })
+        .collect();
+    let median = |value: &dyn Fn(&CameraFigures) -> f64| {
+        let mut values: Vec<f64> = good.iter().map(|f| value(f)).collect();
+        values.sort_by(f64::total_cmp);
+        let n = values.len();
+        (n > 0).then(|| (values[n / 2] + values[(n - 1) / 2]) / 2.0)
+    };
+    let stated: Vec<f64> = good.iter().filter_map(|f| f.focal_sigmas).collect();
+    let within = stated.iter().filter(|s| **s <= 2.0).count();
+    let mean_auc = [0, 1, 2].map(|k| {
+        let sum: f64 = good.iter().filter_map(|f| f.auc[k]).sum();
+        (!rows.is_empty()).then(|| sum / rows.len() as f64)
+    });
+    CameraReport {
+        failures: rows.len() - good.len(),
+        within_2_sigma: (!stated.is_empty()).then(|| within as f64 / stated.len() as f64),
+        median_focal_error: median(&|f| f.focal_error.abs()),
+        median_rotation_degrees: median(&|f| f.rotation_degrees),
+        median_centre_fraction: median(&|f| f.centre_fraction),
+        mean_auc,
+        rows,
+    }
+}
+
+/// Heads of the columns of [`CameraRow::text`].
+pub fn header() -> String {
+    format!(
+        "{:<24}{:>9}{:>9}{:>6}{:>10}{:>9}{:>11}{:>11}{:>7}{:>7}{:>7}{:>8}\n",
+        "data",
+        "focal %",
+        "sigma %",
+        "/ s",
+        "rotation",
+        "centre %",
+        "pair rot.",
+        "pair dir.",
+        "@3",
+        "@5",
+        "@30",
+        "seconds"
+    )
+}
+
+impl CameraRow {
+    /// One line of the table.
+    pub fn text(&self) -> String {
+        let name = self
+            .data
+            .file_name()
+            .map_or_else(|| self.data.display().to_string(), |n| n.to_string_lossy().into());
+        let f = match &self.outcome {
+            CameraOutcome::Failure(why) => return format!("{name:<24}no cameras: {why}\n"),
+            CameraOutcome::Figures(f) => f,
+        };
+        let number =
+            |v: Option<f64>, digits: usize| v.map_or_else(|| "-".into(), |v| format!("{v:.digits$}"));
+        format!(
+            "{name:<24}{:>9.2}{:>9}{:>6}{:>10.3}{:>9.2}{:>11.3}{:>11.3}{:>7}{:>7}{:>7}{:>8.1}\n",
+            100.0 * f.focal_error,
+            number(f.focal_sigma.map(|s| 100.0 * s), 2),
+            number(f.focal_sigmas, 1),
+            f.rotation_degrees,
+            100.0 * f.centre_fraction,
+            f.pair_rotation_degrees,
+            f.pair_direction_degrees,
+            number(f.auc[0], 3),
+            number(f.auc[1], 3),
+            number(f.auc[2], 3),
+            self.seconds,
+        )
+    }
+}
+
+impl CameraReport {
+    /// The lines below the table.
+    pub fn text(&self) -> String {
+        let number =
+            |v: Option<f64>, digits: usize| v.map_or_else(|| "-".into(), |v| format!("{v:.digits$}"));
+        let hundred = |v: Option<f64>| v.map(|v| 100.0 * v);
+        let mut out = String::new();
+        let _ = writeln!(
+            out,
+            "{} sets, {} without cameras; focal length within 2 sigma in {} % of those that state it; median focal error {} %, \
+             rotation {} degrees, centre {} %; mean AUC@3 {} @5 {} @30 {}",
+            self.rows.len(),
+            self.failures,
+            number(hundred(self.within_2_sigma), 0),
+            number(hundred(self.median_focal_error), 2),
+            number(self.median_rotation_degrees, 3),
+            number(hundred(self.median_centre_fraction), 2),
+            number(self.mean_auc[0], 3),
+            number(self.mean_auc[1], 3),
+            number(self.mean_auc[2], 3),
+        );
+        out
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::progress::Silent;
+
+    #[test]
+    fn breakfast_is_measured_and_photos_without_parallax_are_counted_as_failures() {
+        let Ok(registry) = Registry::open(None) else { return };
+        let breakfast = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast");
+        // Two train frames whose photos are one and the same: no cameras.
+        let dir = tempfile::tempdir().unwrap();
+        let mut truth: serde_json::Value =
+            serde_json::from_str(&std::fs::read_to_string(breakfast.join("ground_truth.json")).unwrap())
+                .unwrap();
+        let frames = truth["frames"].as_array_mut().unwrap();
+        frames.truncate(2);
+        std::fs::create_dir(dir.path().join("images")).unwrap();
+        for f in frames.iter() {
+            let to = dir.path().join(f["file"].as_str().unwrap());
+            std::fs::copy(breakfast.join("images/train_00.jpg"), to).unwrap();
+        }
+        std::fs::write(dir.path().join("ground_truth.json"), truth.to_string()).unwrap();
+        let mut seen = Vec::new();
+        let report = measure(&[breakfast, dir.path().into()], &registry, &Silent, &mut |row| {
+            seen.push(row.text());
+            Ok(())
+        })
+        .unwrap();
+        let CameraOutcome::Figures(f) = &report.rows[0].outcome else { panic!("{}", seen[0]) };
+        assert!(
+            f.rotation_degrees < 0.03 && f.centre_fraction < 0.0005 && f.focal_error.abs() < 0.002,
+            "{f:?}"
+        );
+        assert!(
+            f.auc[0].unwrap() > 0.97 && f.pair_direction_degrees < 0.1 && f.principal_point < 1e-9,
+            "{f:?}"
+        );
+        assert!(
+            (f.focal_sigmas.unwrap() - f.focal_error.ln_1p().abs() / f.focal_sigma.unwrap()).abs() < 1e-9
+        );
+        assert_eq!((report.failures, report.rows.len()), (1, 2));
+        assert!(seen[1].contains("identical photos"), "{}", seen[1]);
+        assert!((report.mean_auc[0].unwrap() - f.auc[0].unwrap() / 2.0).abs() < 1e-12);
+        assert!(report.text().contains("2 sets, 1 without cameras"));
+    }
+}

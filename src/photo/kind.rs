@@ -1,0 +1,173 @@
+//! What kind of file it is, by its first bytes or its name, and what to do with the kinds that are not read.
+use image::ImageFormat;
+use std::path::Path;
+
+/// Names of photos that are read. OpenEXR and Radiance hold linear light.
+const PHOTO: [&str; 14] =
+    ["jpg", "jpeg", "jpe", "jfif", "png", "webp", "tif", "tiff", "heic", "heif", "hif", "avif", "exr", "hdr"];
+const VIDEO: [&str; 14] =
+    ["mp4", "m4v", "mov", "qt", "avi", "mkv", "webm", "mpg", "mpeg", "wmv", "3gp", "3g2", "mts", "m2ts"];
+const RAW: [&str; 14] =
+    ["dng", "cr2", "cr3", "crw", "nef", "nrw", "arw", "srf", "sr2", "orf", "raf", "rw2", "pef", "srw"];
+const OTHER_IMAGE: [&str; 8] = ["bmp", "gif", "jxl", "jp2", "psd", "tga", "svg", "pdf"];
+
+/// The kinds that are read, for messages.
+pub(super) const READ: &str = "JPEG, PNG, HEIC, AVIF, WebP or TIFF";
+
+const RAW_ADVICE: &str = "is a camera raw file; develop it to JPEG or 16-bit TIFF";
+const GIF: &str = "is a GIF; save its frames as PNG";
+const BMP: &str = "is a BMP image; save it as PNG";
+const JXL: &str = "is a JPEG XL image; save it as JPEG or PNG";
+const JP2: &str = "is a JPEG 2000 image; save it as JPEG or PNG";
+const PSD: &str = "is a Photoshop file; save it as JPEG or TIFF";
+
+fn has_extension(path: &Path, list: &[&str]) -> bool {
+    path.extension().is_some_and(|e| list.iter().any(|l| e.eq_ignore_ascii_case(l)))
+}
+
+pub(super) fn is_photo_name(path: &Path) -> bool {
+    has_extension(path, &PHOTO)
+}
+
+pub(super) fn is_video_name(path: &Path) -> bool {
+    has_extension(path, &VIDEO)
+}
+
+/// Images that nothing here reads: worth a word when a folder holds them.
+pub(super) fn is_foreign_name(path: &Path) -> bool {
+    has_extension(path, &RAW) || has_extension(path, &OTHER_IMAGE)
+}
+
+/// What reads a file, or why nothing does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Kind {
+    /// A codec of the `image` crate.
+    Image(ImageFormat),
+    /// HEIC, HEIF or AVIF: libheif.
+    Heif,
+    Video,
+    /// Completes "NAME: ".
+    Refused(&'static str),
+    Unknown,
+}
+
+/// The kind of a file's bytes; the name decides where they say nothing.
+pub(super) fn kind(bytes: &[u8], path: &Path) -> Kind {
+    if let Some(brand) = brand(bytes) {
+        return brand;
+    }
+    let starts = |magic: &[u8]| bytes.starts_with(magic);
+    match image::guess_format(bytes) {
+        Ok(ImageFormat::Tiff) if is_raw(bytes) || has_extension(path, &RAW) => {
+            return Kind::Refused(RAW_ADVICE);
+        }
+        Ok(
+            f @ (ImageFormat::Jpeg
+            | ImageFormat::Png
+            | ImageFormat::WebP
+            | ImageFormat::Tiff
+            | ImageFormat::OpenExr
+            | ImageFormat::Hdr),
+        ) => return Kind::Image(f),
+        _ => {}
+    }
+    if starts(b"GIF8") {
+        Kind::Refused(GIF)
+    } else if starts(b"BM") {
+        Kind::Refused(BMP)
+    } else if starts(b"\xff\x0a") || starts(b"\0\0\0\x0cJXL ") {
+        Kind::Refused(JXL)
+    } else if starts(b"\0\0\0\x0cjP  ") {
+        Kind::Refused(JP2)
+    } else if starts(b"8BPS") {
+        Kind::Refused(PSD)
+    } else if starts(b"FUJIFILM") || starts(b"IIRO") || starts(b"IIU\0") || has_extension(path, &RAW) {
+        Kind::Refused(RAW_ADVICE)
+    } else if starts(&[0x1a, 0x45, 0xdf, 0xa3])
+        || (starts(b"RIFF") && bytes.get(8..12) == Some(b"AVI "))
+        || is_video_name(path)
+    {
+        Kind::Video
+    } else {
+        Kind::Unknown
+    }
+}
+
+/// Files of ISO boxes by their brands: HEIF, Canon's raw, or else a video.
+fn brand(bytes: &[u8]) -> Option<Kind> {
+    const HEIF: [&[u8; 4]; 12] = [
+        b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"mif2", b"msf1", b"miaf", b"avif",
+        b"avis",
+    ];
+    if bytes.get(4..8) != Some(b"ftyp") {
+        return None;
+    }
+    let main: &[u8; 4] = bytes.get(8..12)?.try_into().ok()?;
+    Some(match main {
+        b"crx " => Kind::Refused(RAW_ADVICE),
+        brand if HEIF.contains(&brand) => Kind::Heif,
+        _ => Kind::Video,
+    })
+}
+
+/// Raw files in the clothes of TIFF: their first image is a thumbnail or a mosaic, and would pass for the photo.
+fn is_raw(bytes: &[u8]) -> bool {
+    use exif::{Context, In, Tag};
+    if bytes.get(8..10) == Some(b"CR") {
+        return true;
+    }
+    let Ok((fields, _)) = exif::parse_exif(bytes) else { return false };
+    let first =
+        |tag: u16| fields.iter().find(|f| f.ifd_num == In::PRIMARY && f.tag == Tag(Context::Tiff, tag));
+    // DNGVersion; a first image that is declared a reduced copy, with the real one in SubIFDs; a colour filter array.
+    let reduced = first(0xfe).and_then(|f| f.value.get_uint(0)).is_some_and(|v| v & 1 == 1);
+    let mosaic = first(0x106).and_then(|f| f.value.get_uint(0)) == Some(32803);
+    first(0xc612).is_some() || (reduced && first(0x14a).is_some()) || mosaic
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::exif_tags::tests::block;
+    use super::*;
+    use exif::{Context, Tag, Value};
+
+    #[test]
+    fn files_are_told_by_their_bytes() {
+        use ImageFormat as F;
+        let cases: [(&[u8], &str, Kind); 14] = [
+            (b"\0\0\0\x18ftypmp42....", "a.jpg", Kind::Video),
+            (b"\0\0\0\x14ftypqt  ....", "a.heic", Kind::Video),
+            (b"\0\0\0\x18ftypheic....", "a.jpg", Kind::Heif),
+            (b"\0\0\0\x18ftypmif1....", "a.mov", Kind::Heif),
+            (b"\0\0\0\x18ftypavif....", "a", Kind::Heif),
+            (b"\0\0\0\x18ftypcrx ....", "a.cr3", Kind::Refused(RAW_ADVICE)),
+            (b"RIFF....WEBPVP8 ", "a.png", Kind::Image(F::WebP)),
+            (b"RIFF....AVI LIST", "a.png", Kind::Video),
+            (b"\x89PNG\r\n\x1a\n", "a.jpg", Kind::Image(F::Png)),
+            (b"GIF89a", "a.jpg", Kind::Refused(GIF)),
+            (b"BM......", "a.bmp", Kind::Refused(BMP)),
+            (b"hello world, not an image", "clip.MOV", Kind::Video),
+            (b"hello world, not an image", "a.txt", Kind::Unknown),
+            (b"#?RADIANCE\n", "a.hdr", Kind::Image(F::Hdr)),
+        ];
+        for (bytes, name, expected) in cases {
+            assert_eq!(kind(bytes, Path::new(name)), expected, "{name}");
+        }
+    }
+
+    #[test]
+    fn raw_files_are_not_taken_for_tiff() {
+        let long = |v| Value::Long(vec![v]);
+        let tiff = |tags: &[(u16, Value)]| {
+            let tags: Vec<_> = tags.iter().map(|(t, v)| (Tag(Context::Tiff, *t), v.clone())).collect();
+            kind(&block(&tags), Path::new("a.tif"))
+        };
+        assert_eq!(tiff(&[(0x100, long(10))]), Kind::Image(ImageFormat::Tiff));
+        // A page of a multi-page file may be called reduced; only with the real image elsewhere is it a thumbnail.
+        assert_eq!(tiff(&[(0xfe, long(1))]), Kind::Image(ImageFormat::Tiff));
+        assert_eq!(tiff(&[(0xc612, Value::Byte(vec![1, 4, 0, 0]))]), Kind::Refused(RAW_ADVICE));
+        assert_eq!(tiff(&[(0xfe, long(1)), (0x14a, long(99))]), Kind::Refused(RAW_ADVICE));
+        assert_eq!(tiff(&[(0x106, Value::Short(vec![32803]))]), Kind::Refused(RAW_ADVICE));
+        assert_eq!(kind(b"II*\0\x10\0\0\0CR\x02\0", Path::new("a.jpg")), Kind::Refused(RAW_ADVICE));
+    }
+}

@@ -1,0 +1,234 @@
+//! From a grown model to the final one: what the lens does, sightings refined to sub-pixel, further points.
+use super::model::{Freedom, Model, Sighting, Track};
+use super::patch::Shades;
+use super::tracks::{self, Link};
+use super::{MARGIN, Putative, THRESHOLD, cameras_of, colour_at, matching, refine};
+use crate::Result;
+use crate::photo::{Photo, Straightening};
+use crate::pose::bundle::Outcome;
+use crate::pose::two_view::{fundamental, sampson};
+use crate::pose::{Fitted, SparseModel, SparsePoint};
+use crate::progress::Progress;
+use crate::scene::{Lens, Plane, RgbImage};
+use glam::DVec2;
+use rayon::prelude::*;
+
+/// What the model was grown from.
+pub(super) struct Evidence {
+    pub(super) putative: Vec<Putative>,
+    /// Per view, numbered as the links number them.
+    pub(super) keypoints: Vec<Vec<Sighting>>,
+}
+
+/// Settles the model: outliers out, weights from the residuals, the optics that the photos tell, every sighting refined to
+/// sub-pixel and further points added where the geometry predicts them.
+pub(super) fn finish(
+    photos: &[Photo],
+    mut model: Model,
+    evidence: &Evidence,
+    progress: &dyn Progress,
+) -> Result<SparseModel> {
+    let long = photos[0].image.width.max(photos[0].image.height) as f64;
+    let threshold = THRESHOLD * long;
+    model.triangulate_all(threshold);
+    model.prune(threshold);
+    model.adjust(f64::INFINITY, 1.5, 60)?;
+    settle(&mut model)?;
+    learn_optics(&mut model)?;
+    if bend(&model, photos) > REMATCH {
+        // The pinhole took what the lens displaces for outliers, above all near the corners: match again.
+        rematch(&mut model, evidence, threshold);
+        settle(&mut model)?;
+        learn_optics(&mut model)?;
+    }
+    progress.check()?;
+    let straight: Vec<RgbImage> =
+        (0..photos.len()).map(|v| straightened(&model, v, &photos[v].image)).collect();
+    let shades: Vec<Shades> = straight.par_iter().map(|image| Shades::new(&image.luma())).collect();
+    let valid: Vec<Plane<bool>> =
+        photos.iter().zip(&straight).map(|(p, image)| matching::valid_area(image, p.frame, MARGIN)).collect();
+    on_straight(&mut model, |m| refine::refine(m, &shades, refine::REFINED, REACH));
+    settle(&mut model)?;
+    progress.check()?;
+    progress.step(4, "more points");
+    model.prune(0.5 * threshold);
+    on_straight(&mut model, |m| {
+        refine::extend(m, &shades, &valid);
+    });
+    model.prune(0.5 * threshold);
+    settle(&mut model)?;
+    let mut outcome = learn_optics(&mut model)?;
+    if sharpen(&mut model, photos) {
+        progress.check()?;
+        settle(&mut model)?;
+        model.prune(0.5 * threshold);
+        settle(&mut model)?;
+        outcome = learn_optics(&mut model)?;
+    }
+    model.normalise();
+    sparse_model(photos, &model, outcome)
+}
+
+/// Pixels of the working image within which the neighbours of a point lie on one plane with it.
+const REACH: f64 = 80.0;
+
+/// Refines all sightings on the larger images of the photos; false where no photo has one.
+fn sharpen(model: &mut Model, photos: &[Photo]) -> bool {
+    let ratios: Vec<f64> = photos
+        .iter()
+        .map(|p| p.fine.as_ref().map_or(1.0, |f| f.width as f64 / p.image.width as f64))
+        .collect();
+    let largest = ratios.iter().copied().fold(1.0, f64::max);
+    if largest == 1.0 {
+        return false;
+    }
+    let sizes: Vec<f64> = ratios.iter().map(|r| 1.0 / r).collect();
+    model.magnify(&ratios);
+    let shades: Vec<Shades> = photos
+        .par_iter()
+        .enumerate()
+        .map(|(v, p)| {
+            let luma = || p.image.luma();
+            let plane = p.fine.as_ref().map_or_else(luma, |f| f.as_ref().clone());
+            match model.lens(v) {
+                lens if lens.is_none() => Shades::new(&plane),
+                _ => Shades::new(&straightening(model, v).plane(&plane)),
+            }
+        })
+        .collect();
+    on_straight(model, |m| refine::refine(m, &shades, refine::FINE, REACH * largest));
+    model.magnify(&sizes);
+    true
+}
+
+/// Adjusts with weights from the residuals. Weights and geometry depend on each other; two rounds settle them to a percent.
+fn settle(model: &mut Model) -> Result<Outcome> {
+    model.weigh();
+    model.adjust(f64::INFINITY, 2.0, 60)?;
+    model.weigh();
+    model.adjust(f64::INFINITY, 2.0, 60)
+}
+
+/// Independent observations that the sightings of a set are worth at most. Neighbours err alike: what shifts one (a bent
+/// surface taken for flat, JPEG, a moved shadow) shifts those around it, and however many thousand sightings there are, what
+/// they say together of the optics is limited. On undistorted photos of the tuning sets they gain up to 3 % in cost by optics
+/// that are not there, whatever their number; with 400 this passes for chance.
+const INDEPENDENT: f64 = 400.0;
+
+/// Decides what of the optics the photos tell, by the Bayesian information criterion with unknown noise, and adjusts with it.
+/// The doubt that comes back is that of all optics together: what was not believed may be there all the same.
+fn learn_optics(model: &mut Model) -> Result<Outcome> {
+    let observations: usize = model.tracks.iter().map(|t| 2 * t.sightings.len()).sum();
+    let worth = INDEPENDENT.min(observations as f64);
+    let mut best: Option<(f64, Model, Outcome)> = None;
+    let mut doubt = Vec::new();
+    for freedom in Freedom::ALL {
+        let mut trial = Model { freedom, ..model.clone() };
+        let outcome = trial.adjust(f64::INFINITY, 2.0, 60)?;
+        let value = worth * outcome.cost.max(1e-9).ln() + trial.parameters() as f64 * worth.ln();
+        doubt.clone_from(&outcome.sigmas);
+        if best.as_ref().is_none_or(|b| value < b.0) {
+            best = Some((value, trial, outcome));
+        }
+    }
+    let Some((_, chosen, outcome)) = best else { return settle(model) };
+    *model = chosen;
+    let wider = (observations as f64 / worth).sqrt();
+    for (sigmas, prior) in doubt.iter_mut().zip(&model.priors) {
+        sigmas.iter_mut().zip(prior.sigmas()).for_each(|(s, most)| *s = (*s * wider).min(most));
+    }
+    Ok(Outcome { sigmas: doubt, ..outcome })
+}
+
+/// Displacement at a corner above which matching starts anew, pixels: three times the noise of keypoints.
+const REMATCH: f64 = 1.0;
+
+/// Largest displacement by the lens at a corner of a photo, pixels.
+fn bend(model: &Model, photos: &[Photo]) -> f64 {
+    let corner = |(v, p): (usize, &Photo)| {
+        let half = DVec2::new(p.image.width as f64, p.image.height as f64) * 0.5;
+        let x = half / model.focal(v);
+        (model.lens(v).distort(x) - x).length() * model.focal(v)
+    };
+    photos.iter().enumerate().map(corner).fold(0.0, f64::max)
+}
+
+/// Links of the putative matches that agree with the model's cameras within `threshold` pixels.
+pub(super) fn explained(model: &Model, putative: &[Putative], threshold: f64) -> Vec<Link> {
+    let of_pair = |pair: &Putative| -> Vec<Link> {
+        let (i, j) = (pair.first, pair.second);
+        let (Some(a), Some(b)) = (model.poses[i], model.poses[j]) else { return Vec::new() };
+        let f = fundamental(&b.compose(&a.inverse()), model.focal(i), model.focal(j));
+        let close = |m: &&(DVec2, DVec2, Link)| {
+            sampson(&f, model.straight(i, m.0), model.straight(j, m.1)) < threshold * threshold
+        };
+        pair.matches.iter().filter(close).map(|m| m.2).collect()
+    };
+    putative.par_iter().flat_map_iter(of_pair).collect()
+}
+
+/// New tracks from all matches that agree with the cameras.
+fn rematch(model: &mut Model, evidence: &Evidence, threshold: f64) {
+    let mut links = explained(model, &evidence.putative, threshold);
+    model.tracks = tracks::join(&mut links, &evidence.keypoints)
+        .into_iter()
+        .map(|sightings| Track { position: None, sightings })
+        .collect();
+    model.triangulate_all(threshold);
+    model.prune(threshold);
+}
+
+fn straightening(model: &Model, view: usize) -> Straightening {
+    let (focal, centre) = (model.focal(view), model.principal_point(view));
+    Straightening { lens: model.lens(view), focal, centre }
+}
+
+/// A view's image as a pinhole would show it.
+fn straightened(model: &Model, view: usize, image: &RgbImage) -> RgbImage {
+    match model.lens(view) {
+        lens if lens.is_none() => image.clone(),
+        _ => straightening(model, view).image(image),
+    }
+}
+
+/// Runs a step that knows only pinholes on the model with its sightings moved to where a pinhole would show them.
+fn on_straight(model: &mut Model, step: impl FnOnce(&mut Model)) {
+    let optics = model.optics.clone();
+    let lensed = model.clone_optics();
+    for s in model.tracks.iter_mut().flat_map(|t| &mut t.sightings) {
+        s.pixel = lensed.straight(s.view, s.pixel) + lensed.principal_point(s.view);
+    }
+    model.optics.iter_mut().for_each(|o| o.lens = Lens::NONE);
+    step(model);
+    model.optics = optics;
+    for s in model.tracks.iter_mut().flat_map(|t| &mut t.sightings) {
+        let f = lensed.focal(s.view);
+        let x = (s.pixel - lensed.principal_point(s.view)) / f;
+        s.pixel = lensed.lens(s.view).distort(x) * f + lensed.principal_point(s.view);
+    }
+}
+
+fn sparse_model(photos: &[Photo], model: &Model, outcome: Outcome) -> Result<SparseModel> {
+    let cameras = cameras_of(photos, model)?;
+    let point = |t: &Track| {
+        let views: Vec<(usize, DVec2)> = t
+            .sightings
+            .iter()
+            .map(|s| (s.view, model.straight(s.view, s.pixel) + model.principal_point(s.view)))
+            .collect();
+        let s = t.sightings.first()?;
+        Some(SparsePoint { position: t.position?, colour: colour_at(&photos[s.view].image, s.pixel), views })
+    };
+    let points = model.tracks.iter().filter_map(point).collect();
+    let fitted = |v: usize| Fitted {
+        lens: model.lens(v),
+        sigmas: outcome.sigmas[model.group[v]],
+        residual: model.residual(v),
+    };
+    Ok(SparseModel {
+        cameras,
+        points,
+        focal_log_sigma: outcome.sigmas.first().map(|s| s[0]),
+        fitted: (0..photos.len()).map(fitted).collect(),
+    })
+}

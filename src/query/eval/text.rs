@@ -1,0 +1,55 @@
+//! The report for people.
+use super::{Report, Summary};
+use std::fmt::Write;
+
+impl Report {
+    /// A few lines of the figures that matter; the whole is in the JSON.
+    pub fn text(&self) -> String {
+        let mut out = String::new();
+        let worst = |v: &dyn Fn(&super::PoseScore) -> f64| self.poses.iter().map(v).fold(0.0, f64::max);
+        let _ = writeln!(
+            out,
+            "cameras  {} train views; worst rotation {:.3} degrees, centre {:.2} %, focal {:.2} %; AUC@3 {} @5 {} @30 {}",
+            self.poses.len(),
+            worst(&|p| p.rotation_degrees),
+            100.0 * worst(&|p| p.centre_fraction),
+            100.0 * worst(&|p| p.focal_relative),
+            percent(self.relative_poses.auc_3),
+            percent(self.relative_poses.auc_5),
+            percent(self.relative_poses.auc_30),
+        );
+        let _ = writeln!(
+            out,
+            "{:<9}{:>8}{:>10}{:>7}{:>11}{:>9}{:>9}{:>8}{:>11}",
+            "", "PSNR", "+colours", "SSIM", "depth med", "AbsRel", "d<1.25", "mIoU", "localised"
+        );
+        let refined = self.refined.as_ref().map(|r| ("refined", &r.summary));
+        let rows = ["train", "test"].into_iter().filter_map(|k| Some((k, self.summary.get(k)?)));
+        rows.chain(refined).for_each(|(name, summary)| row(&mut out, name, summary));
+        if let Some(refined) = &self.refined {
+            let kept = refined.views.iter().filter(|v| v.kept).count();
+            let _ = writeln!(out, "refined: {kept} of {} held-out cameras moved", refined.views.len());
+        }
+        out
+    }
+}
+
+fn row(out: &mut String, name: &str, s: &Summary) {
+    let number = |v: Option<f64>, digits: usize| v.map_or_else(|| "-".into(), |v| format!("{v:.digits$}"));
+    let _ = writeln!(
+        out,
+        "{name:<9}{:>8}{:>10}{:>7}{:>11}{:>9}{:>9}{:>8}{:>11}",
+        number(s.psnr, 2),
+        number(s.psnr_colour_fit, 2),
+        number(s.ssim, 3),
+        percent(s.depth_median_relative),
+        percent(s.depth_abs_rel),
+        percent(s.depth_delta),
+        number(s.miou, 3),
+        number(s.localisation, 3),
+    );
+}
+
+fn percent(v: Option<f64>) -> String {
+    v.map_or_else(|| "-".into(), |v| format!("{:.2} %", 100.0 * v))
+}
