@@ -2,6 +2,7 @@
 use super::exif_tags::{Lens, lens};
 use super::heif;
 use super::kind::{Kind, READ, kind};
+use crate::scene::to_srgb;
 use crate::{Error, Result};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits};
@@ -36,18 +37,11 @@ impl Decoded {
         Decoded { pixels, orientation, premultiplied, size: if sideways { (h, w) } else { (w, h) }, lens }
     }
 
-    /// Upright pixel as sRGB in [0, 1]; alpha composited on black. Linear light above 1 is cut off.
+    /// Upright pixel as sRGB; alpha composited on black. 1 is the white of an 8- or 16-bit file; floating-point files
+    /// (OpenEXR, Radiance, float TIFF) go beyond it on the same curve, in the scale that they were written in.
     pub fn at(&self, x: usize, y: usize) -> [f32; 3] {
         let c = self.stored(x, y);
-        if self.is_linear() { c.map(srgb_from_linear) } else { c }
-    }
-
-    /// Upright pixel in linear light; alpha composited on black. 1 is the white of an 8- or 16-bit file; floating-point
-    /// files (OpenEXR, Radiance, float TIFF) go beyond it, in the scale that they were written in.
-    #[cfg_attr(not(test), expect(dead_code, reason = "what reads high dynamic range begins here"))]
-    pub fn linear(&self, x: usize, y: usize) -> [f32; 3] {
-        let c = self.stored(x, y);
-        if self.is_linear() { c } else { c.map(linear_from_srgb) }
+        if self.is_linear() { c.map(to_srgb) } else { c }
     }
 
     /// Whether the file holds linear light in floating point, as all formats with floats do by convention.
@@ -99,20 +93,6 @@ fn sample(image: &DynamicImage, x: u32, y: u32) -> ([f32; 3], f32) {
 /// Light is not negative; renderers and sensors leave NaN, infinities and values just below zero behind.
 fn finite(v: f32) -> f32 {
     if v.is_finite() { v.max(0.0) } else { 0.0 }
-}
-
-/// IEC 61966-2-1.
-fn srgb_from_linear(v: f32) -> f32 {
-    match v {
-        v if v >= 1.0 => 1.0,
-        v if v <= 0.003_130_8 => 12.92 * v,
-        v => 1.055 * v.powf(1.0 / 2.4) - 0.055,
-    }
-}
-
-/// IEC 61966-2-1.
-fn linear_from_srgb(v: f32) -> f32 {
-    if v <= 0.040_45 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
 }
 
 /// Decodes the bytes of a file; `path` only names it in messages.
@@ -303,19 +283,21 @@ mod tests {
         DynamicImage::ImageRgba32F(half).write_to(&mut exr, ImageFormat::OpenExr).unwrap();
         // OpenEXR stores colours multiplied by alpha: it must not be applied again.
         let d = decode(exr.into_inner(), Path::new("a.exr")).unwrap();
-        assert_eq!(d.linear(1, 1), [0.25, 4.0, 0.0]);
-        // sRGB of 0.25 by IEC 61966-2-1 is 0.53710; f32 powers are good to 1e-6.
+        // By IEC 61966-2-1, 0.25 is 0.53710 and 4 is 1.055 · 4^(1/2.4) − 0.055; f32 powers are good to 1e-6.
         let srgb = d.at(0, 1);
-        assert!((srgb[0] - 0.537_099).abs() < 1e-5 && srgb[1..] == [1.0, 0.0], "{srgb:?}");
+        let right =
+            (srgb[0] - 0.537_099).abs() < 1e-5 && (srgb[1] - 1.824_796).abs() < 1e-5 && srgb[2] == 0.0;
+        assert!(right, "{srgb:?}");
         let mut hdr = Cursor::new(Vec::new());
         let bright = image::Rgb32FImage::from_pixel(16, 2, image::Rgb([8.0, 2.0, 0.5]));
         DynamicImage::ImageRgb32F(bright).write_to(&mut hdr, ImageFormat::Hdr).unwrap();
         // Powers of two, which the shared exponent of Radiance files holds exactly.
-        assert_eq!(decode(hdr.into_inner(), Path::new("a.hdr")).unwrap().linear(3, 1), [8.0, 2.0, 0.5]);
-        let grey = image::ImageBuffer::<image::Luma<u8>, _>::from_pixel(2, 2, image::Luma([188]));
-        let d = decode(png(&grey.into(), None), Path::new("a.png")).unwrap();
-        // 188 is the middle grey whose linear light is 0.5029.
-        assert!((d.linear(0, 0)[0] - 0.502_886).abs() < 1e-5, "{:?}", d.linear(0, 0));
+        let back =
+            decode(hdr.into_inner(), Path::new("a.hdr")).unwrap().at(3, 1).map(crate::scene::to_linear);
+        assert!(
+            back.iter().zip([8.0, 2.0, 0.5]).all(|(a, b): (&f32, f32)| (a / b - 1.0).abs() < 1e-5),
+            "{back:?}"
+        );
     }
 
     #[test]

@@ -255,8 +255,23 @@ pub fn load_all_at(
     if !framed.is_empty() {
         progress.warn(&format!("plain frame around the picture left out: {}", framed.join(", ")));
     }
+    let bright: Vec<&str> =
+        photos.iter().filter(|p| mostly_above_white(&p.image)).map(|p| p.stem.as_str()).collect();
+    if !bright.is_empty() {
+        progress.warn(&format!(
+            "most of the picture is brighter than white (1.0): {}; if these are not overexposed, scale the values in the \
+             files so that white paper is near 1",
+            bright.join(", ")
+        ));
+    }
     check_set(&photos)?;
     Ok(photos)
+}
+
+/// Files of high dynamic range in another unit: matching and training expect diffuse surfaces below 1.
+fn mostly_above_white(image: &RgbImage) -> bool {
+    let above = image.data.iter().filter(|c| c.iter().any(|v| *v > 1.0)).count();
+    2 * above > image.data.len()
 }
 
 /// Refuses sets that cannot give geometry (one photo, or the same photo twice) or that would mix up files (the same name
@@ -289,6 +304,12 @@ pub fn check_set(photos: &[Photo]) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn files_in_another_unit_are_noticed() {
+        let image = |v: f32| RgbImage { width: 2, height: 2, data: vec![[v; 3], [v; 3], [v; 3], [0.1; 3]] };
+        assert!(mostly_above_white(&image(3.0)) && !mostly_above_white(&image(1.0)));
+    }
 
     #[test]
     fn the_longer_side_is_capped_and_nothing_is_enlarged() {
