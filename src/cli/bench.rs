@@ -113,11 +113,11 @@ fn cameras(args: &BenchArgs) -> Result<()> {
     writable(args.json.as_deref())?;
     let registry = Registry::open(args.models.as_deref())?;
     let reading = bench::cameras::Reading { max_size: args.max_size, copies: args.copies };
-    print(&bench::cameras::header())?;
     let progress = progress::here();
-    let report = bench::cameras::measure(&args.data, reading, &registry, progress.as_ref(), &mut |row| {
-        print(&row.text())
-    })?;
+    let mut header = Some(bench::cameras::header());
+    let mut show =
+        |row: &bench::cameras::CameraRow| print(&(header.take().unwrap_or_default() + &row.text()));
+    let report = bench::cameras::measure(&args.data, reading, &registry, progress.as_ref(), &mut show)?;
     if let Some(file) = &args.json {
         let value = serde_json::to_value(&report).map_err(|e| Error::work(format!("bench report: {e}")))?;
         write_json(file, &value)?;

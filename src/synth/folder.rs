@@ -114,6 +114,8 @@ fn frame_json(c: &Camera, split: Split, file: &str) -> serde_json::Value {
 mod tests {
     use super::*;
     use crate::progress::Silent;
+    use crate::synth::{Effects, Lens};
+    use glam::DVec2;
 
     #[test]
     fn a_generated_folder_reads_back_as_ground_truth() {
@@ -141,5 +143,53 @@ mod tests {
             let view = crate::language::dir::read_view(&dir.path().join(name), &photo, true).unwrap();
             assert!(view.levels.iter().all(|l| !l.quality.is_empty()));
         }
+    }
+
+    /// Value of a picture between pixels, bilinear.
+    fn between(image: &crate::scene::RgbImage, at: DVec2) -> Option<[f32; 3]> {
+        let (x, y) = (at.x - 0.5, at.y - 0.5);
+        let inside = x >= 0.0 && y >= 0.0 && x + 1.0 < image.width as f64 && y + 1.0 < image.height as f64;
+        inside.then(|| {
+            let (i, j, fx, fy) = (x as usize, y as usize, x.fract() as f32, y.fract() as f32);
+            let row = |j: usize, c: usize| image.at(i, j)[c] * (1.0 - fx) + image.at(i + 1, j)[c] * fx;
+            [0, 1, 2].map(|c| row(j, c) * (1.0 - fy) + row(j + 1, c) * fy)
+        })
+    }
+
+    #[test]
+    fn photos_undone_by_the_lens_in_the_file_are_the_stated_pinhole() {
+        let dir = tempfile::tempdir().unwrap();
+        let effects = Effects { focal: true, lens: true, centre: true, ..Effects::default() };
+        let knobs = Knobs {
+            seed: 1003,
+            size: (320, 240),
+            views: 2,
+            held_out: 1,
+            effects,
+            photo_noise: 0.0,
+            ..Knobs::default()
+        };
+        generate(dir.path(), &knobs, &Flaws::NONE, &Silent).unwrap();
+        let truth = GroundTruth::read(dir.path()).unwrap();
+        let made = world(&knobs).unwrap();
+        let frame = &truth.frames[0];
+        let stated = frame.lens.unwrap();
+        let photo = truth.image(frame).unwrap();
+        let pinhole = render::render(&made, &frame.camera, 0.0, 0).image;
+        // mean square difference to the pinhole, with and without the lens
+        let error = |lens: Lens| {
+            let (mut sum, mut count) = (0.0, 0);
+            for p in 0..320 * 240 {
+                let pixel = DVec2::new((p % 320) as f64 + 0.5, (p / 320) as f64 + 0.5);
+                let world = frame.camera.unproject(pixel, 1.0);
+                let Some(shown) = between(&photo, lens.project(&frame.camera, world)) else { continue };
+                sum += (0..3).map(|c| f64::from(shown[c] - pinhole.data[p][c]).powi(2)).sum::<f64>();
+                count += 1;
+            }
+            sum / f64::from(count)
+        };
+        let (undone, ignored) = (error(Lens { k1: stated.k1, k2: stated.k2 }), error(Lens::default()));
+        assert!(undone < 0.25 * ignored, "{undone} {ignored}");
+        assert!(truth.frames[2].lens.is_none() && stated.k1.abs() > 0.02, "{stated:?}");
     }
 }
