@@ -190,10 +190,11 @@ pub(super) fn sizes(photos: &[Photo]) -> String {
     format!("{} at {}{more}{hint}", photos.len(), shown.join(", "))
 }
 
-/// The table that ends `splatvk run`.
+/// The table that ends `splatvk run`; what is doubtful stands first.
 pub fn closing_table(o: &Outcome) -> String {
+    let doubts: String = o.warnings.iter().map(|w| format!("  doubtful: {w}\n")).collect();
     format!(
-        "{}  {:<12}  {}\n",
+        "{doubts}{}  {:<12}  {}\n",
         report::table(&o.stages, o.seconds, &figures(o)),
         "scene",
         o.plan.out.display()
