@@ -1,5 +1,6 @@
 //! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (ALGORITHMS 0.4, 1.1, 1.2).
 mod affine;
+mod candidate;
 mod choose;
 mod decode;
 mod exif_tags;
@@ -7,9 +8,11 @@ mod frame;
 mod heif;
 mod kind;
 mod resize;
+mod video;
 
 pub use affine::Affine;
-pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
+pub use candidate::{Candidate, gather};
+pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, find, spread, wanted};
 pub use frame::Frame;
 pub use resize::Kernel;
 
@@ -24,6 +27,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// What the machine has for HEIC and AVIF photos, in words, and what to do about what it lacks.
 pub fn heif_support() -> (String, Option<String>) {
     heif::status()
+}
+
+/// What the machine has for videos, in words, and what to do about what it lacks.
+pub fn video_support() -> (String, Option<String>) {
+    video::status()
 }
 
 /// Greatest height of the working image, pixels (ALGORITHMS 1.2).
@@ -56,19 +64,25 @@ pub struct Photo {
 
 /// Reads one photo: EXIF orientation applied, alpha composited on black, height at most [`WORKING_HEIGHT`].
 pub fn load(path: &Path) -> Result<Photo> {
-    let bytes = std::fs::read(path).map_err(|e| {
+    from_bytes(path, read(path)?)
+}
+
+fn read(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).map_err(|e| {
         Error::input(format!("{}: {e}; check the name and that you may read it", path.display()))
-    })?;
-    from_bytes(path, bytes)
+    })
 }
 
 /// [`load`] of an image file that is in memory already; `name` stands for its path.
 pub fn from_bytes(name: &Path, bytes: Vec<u8>) -> Result<Photo> {
-    let decoded = decode::decode(bytes, name)?;
+    from_decoded(name, &decode::decode(bytes, name)?)
+}
+
+fn from_decoded(name: &Path, decoded: &decode::Decoded) -> Result<Photo> {
     let photo = working(name, decoded.size, |x, y| decoded.at(x, y))?;
     // The two scales differ by the rounding of the size only; the height is the exact one.
     let exif_focal = decoded.lens.focal.map(|f| f * photo.to_working.scale[1]);
-    Ok(Photo { exif_focal, camera_model: decoded.lens.camera_model, ..photo })
+    Ok(Photo { exif_focal, camera_model: decoded.lens.camera_model.clone(), ..photo })
 }
 
 /// A photo from upright sRGB pixels in [0, 1]; `focal` is in their pixels, where it is known.
@@ -92,12 +106,7 @@ fn working(
     (w, h): (usize, usize),
     at: impl Fn(usize, usize) -> [f32; 3] + Sync,
 ) -> Result<Photo> {
-    if w.min(h) < SMALLEST_SIDE {
-        return Err(Error::input(format!(
-            "{}: {w} × {h} pixels are too few; each side needs at least {SMALLEST_SIDE}",
-            name.display()
-        )));
-    }
+    check_size(name, (w, h))?;
     let (working_w, working_h) = working_size(w, h);
     let mut image = resize::area_average((w, h), (working_w, working_h), at);
     let frame = Frame::of(&image);
@@ -114,6 +123,16 @@ fn working(
     })
 }
 
+fn check_size(name: &Path, (w, h): (usize, usize)) -> Result<()> {
+    if w.min(h) < SMALLEST_SIDE {
+        return Err(Error::input(format!(
+            "{}: {w} × {h} pixels are too few; each side needs at least {SMALLEST_SIDE}",
+            name.display()
+        )));
+    }
+    Ok(())
+}
+
 /// Working (width, height) of an upright size: the height is capped, sizes truncated (ALGORITHMS 1.2).
 fn working_size(w: usize, h: usize) -> (usize, usize) {
     if h <= WORKING_HEIGHT {
@@ -122,33 +141,26 @@ fn working_size(w: usize, h: usize) -> (usize, usize) {
     ((w * WORKING_HEIGHT / h).max(1), WORKING_HEIGHT)
 }
 
-/// Finds, chooses and reads the photos of a run; refuses sets that cannot give geometry (the same photo twice) or that
-/// would mix up files (the same name twice).
-pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progress) -> Result<Vec<Photo>> {
-    let found = find(inputs)?;
-    if let Some(first) = found.ignored.first() {
-        let more = found.ignored.len() - 1;
-        let others = if more > 0 { format!(" and {more} more") } else { String::new() };
-        progress.warn(&format!("not a photo that can be read, ignored: {}{others}", first.display()));
-    }
-    let paths = choose(&found.photos, views)?;
-    if views.is_none() && paths.len() < found.photos.len() {
-        progress.warn(&format!(
-            "using {} of {} photos, spread over their names; --views changes how many",
-            paths.len(),
-            found.photos.len()
-        ));
-    }
-    progress.begin("photos", paths.len() as u64);
+/// Finds and reads all photos of files and folders; [`crate::pose::choose::load_photos`] chooses among too many.
+pub fn load_all(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Photo>> {
+    let found = gather(inputs, progress)?;
+    wanted(found.len(), Some(found.len()))?;
+    load_each(&found, progress)
+}
+
+/// Reads the photos of a run; refuses sets that cannot give geometry (the same photo twice) or that would mix up files (the
+/// same name twice).
+pub fn load_each(candidates: &[Candidate], progress: &dyn Progress) -> Result<Vec<Photo>> {
+    progress.begin("photos", candidates.len() as u64);
     let done = AtomicU64::new(0);
-    let one = |path: &PathBuf| {
+    let one = |candidate: &Candidate| {
         progress.check()?;
-        let photo = load(path)?;
+        let photo = candidate.load(progress)?;
         progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
         Ok(photo)
     };
     // Collected before errors are looked at: the first in the order of the photos is reported, whichever came first.
-    let all: Vec<Result<Photo>> = paths.par_iter().map(one).collect();
+    let all: Vec<Result<Photo>> = candidates.par_iter().map(one).collect();
     let photos = all.into_iter().collect::<Result<Vec<_>>>()?;
     progress.end();
     let framed: Vec<&str> = photos.iter().filter(|p| !p.frame.is_none()).map(|p| p.stem.as_str()).collect();

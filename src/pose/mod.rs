@@ -1,10 +1,12 @@
 //! Photos to cameras, depth and points.
 pub mod align;
 mod bundle;
+pub mod choose;
 mod initialise;
 pub mod matching;
 mod minimal;
 pub(crate) mod numeric;
+mod overlap;
 pub mod pointmap;
 mod resect;
 pub mod sfm;

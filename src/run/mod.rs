@@ -227,7 +227,7 @@ pub struct Outcome {
 pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     let progress = &Recorded::new(progress);
     let workspace = Workspace::create(&plan.out, plan.force)?;
-    let photos = photo::load_all(&plan.inputs, plan.views, progress)?;
+    let photos = pose::choose::load_photos(&plan.inputs, plan.views, progress)?;
     let device = Device::with(&gpu::Options {
         deterministic: plan.deterministic,
         ..gpu::Options::from_env(plan.device.as_deref())

@@ -71,7 +71,7 @@ fn matched(plan: &TrainPlan, known: &[Camera], progress: &dyn Progress) -> Resul
         progress
             .warn(&format!("{} photos have no camera and are left out", found.photos.len() - paths.len()));
     }
-    photo::load_all(&paths, Some(paths.len()), progress)
+    photo::load_all(&paths, progress)
 }
 
 fn points(path: &Path) -> Result<PointCloud> {
