@@ -61,6 +61,11 @@ fn photos_that_cannot_be_used() {
     std::fs::write(dir.join("clip.mp4"), b"\0\0\0\x18ftypmp42........").unwrap();
     run_refuses(&[dir], &[], &["clip.mp4", "video"]);
     run_refuses(&[&dir.join("clip.mp4")], &[], &["clip.mp4", "video"]);
+    // Without ffmpeg.
+    let mut command = splatvk();
+    command.env("PATH", dir).arg("run").arg(dir.join("clip.mp4")).arg("--out").arg(dir.join("scene"));
+    refuses(&mut command, 2, &["clip.mp4", "ffprobe", "install"]);
+    assert_eq!(names(dir), ["clip.mp4"]);
     let photo = |i: usize| data(&format!("breakfast/images/train_{i:02}.jpg"));
     std::fs::copy(photo(0), dir.join("a.jpg")).unwrap();
     run_refuses(&[dir], &[], &["a.jpg", "only one photo"]);

@@ -1,6 +1,7 @@
 //! Photo loading from real files: kinds of JPEG and PNG, EXIF, and sets that must be refused.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 use splatvk::photo::{self, Photo};
+use splatvk::pose::choose;
 use splatvk::progress::Silent;
 use std::path::{Path, PathBuf};
 
@@ -114,7 +115,7 @@ fn damaged_heic_is_one_line() {
 
 #[test]
 fn a_folder_is_read_in_order() {
-    let photos = photo::load_all(&[data("breakfast/images")], Some(4), &Silent).unwrap();
+    let photos = photo::load_all(&[data("breakfast/images")], &Silent).unwrap();
     let stems: Vec<_> = photos.iter().map(|p| p.stem.as_str()).collect();
     assert_eq!(stems, ["train_00", "train_01", "train_02", "train_03"], "held-out views must not be here");
     assert!(photos.iter().all(|p| (p.image.width, p.image.height) == (640, 480) && p.exif_focal.is_none()));
@@ -125,7 +126,7 @@ fn unusable_sets_are_refused_in_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let dir = folder.path();
     let refuse = |inputs: &[PathBuf], views: Option<usize>, words: &[&str]| {
-        let e = photo::load_all(inputs, views, &Silent).unwrap_err();
+        let e = choose::load_photos(inputs, views, &Silent).unwrap_err();
         let message = e.to_string();
         assert_eq!((e.exit_code(), message.lines().count()), (2, 1), "{message}");
         assert!(words.iter().all(|w| message.contains(w)), "{message}");
@@ -134,7 +135,7 @@ fn unusable_sets_are_refused_in_one_line() {
     refuse(&[dir.join("nothing")], None, &["nothing", "No such file"]);
     std::fs::write(dir.join("clip.mp4"), b"\0\0\0\x18ftypmp42").unwrap();
     refuse(&[dir.to_path_buf()], None, &["clip.mp4", "video"]);
-    refuse(&[dir.join("clip.mp4")], None, &["clip.mp4"]);
+    refuse(&[dir.join("clip.mp4")], None, &["clip.mp4", "video"]);
     let source = |i: u32| data(&format!("breakfast/images/train_{i:02}.jpg"));
     std::fs::copy(source(0), dir.join("a.jpg")).unwrap();
     refuse(&[dir.to_path_buf()], None, &["a.jpg", "only one photo"]);
@@ -150,4 +151,74 @@ fn unusable_sets_are_refused_in_one_line() {
     let whole = std::fs::read(source(2)).unwrap();
     std::fs::write(dir.join("b.jpg"), &whole[..whole.len() / 2]).unwrap();
     refuse(&[dir.join("a.jpg"), dir.join("b.jpg")], None, &["b.jpg", "cut off"]);
+}
+
+/// A program that makes test data, or `None` with a word about it where it is not installed.
+fn program(name: &str) -> Option<std::process::Command> {
+    let there = std::process::Command::new(name).arg("-version").output().is_ok();
+    if !there {
+        eprintln!("{name} is not installed: videos are NOT tested here");
+    }
+    there.then(|| std::process::Command::new(name))
+}
+
+/// The four photos as a video of twelve frames, two of them blurred; `options` go before the output.
+fn clip(folder: &Path, name: &str, options: &[&str]) -> Option<PathBuf> {
+    let frames = folder.join("frames");
+    std::fs::create_dir_all(&frames).unwrap();
+    // Each photo three times, as a camera that stands still: repeated frames must not be chosen together.
+    for i in 0..12 {
+        let photo = data(&format!("breakfast/images/train_{:02}.jpg", i / 3));
+        std::fs::copy(photo, frames.join(format!("{i:02}.jpg"))).unwrap();
+    }
+    let path = folder.join(name);
+    let blur = "gblur=sigma=4:enable='eq(n,0)+eq(n,4)'";
+    let mut ffmpeg = program("ffmpeg")?;
+    ffmpeg.args(["-loglevel", "error", "-nostdin", "-framerate", "5", "-i"]).arg(frames.join("%02d.jpg"));
+    ffmpeg.args(["-vf", blur, "-c:v", "mpeg4", "-q:v", "2", "-pix_fmt", "yuv420p"]).args(options).arg(&path);
+    assert!(ffmpeg.status().unwrap().success());
+    Some(path)
+}
+
+#[test]
+fn a_video_gives_sharp_frames_from_different_places() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(path) = clip(folder.path(), "my.clip.mp4", &[]) else { return };
+    let candidates = photo::gather(std::slice::from_ref(&path), &Silent).unwrap();
+    let names: Vec<_> = candidates.iter().map(photo::Candidate::name).collect();
+    assert_eq!((names.len(), names[1].as_str()), (12, "my_clip_0000200"));
+    let (chosen, choice) = choose::choose(&candidates, 4, &Silent).unwrap();
+    let places: Vec<usize> = chosen.iter().map(|i| i / 3).collect();
+    assert_eq!(places, [0, 1, 2, 3], "one frame of each place: {choice:?}");
+    assert!(!chosen.contains(&0) && !chosen.contains(&4), "blurred: {choice:?}");
+    let photos = choose::load_photos(&[path], None, &Silent).unwrap();
+    assert_eq!(photos.len(), 4);
+    assert!(photos.iter().all(|p| (p.image.width, p.image.height) == (640, 480) && p.exif_focal.is_none()));
+    assert_eq!(photos[0].stem, names[chosen[0]]);
+    // Frames are what the photos were, up to the codec.
+    let original = photo::load(&data("breakfast/images/train_03.jpg")).unwrap();
+    let off: f64 =
+        photos[3].image.data.iter().zip(&original.image.data).map(|(a, b)| (a[1] - b[1]).abs() as f64).sum();
+    assert!(off / (640.0 * 480.0) < 0.03, "{}", off / (640.0 * 480.0));
+}
+
+#[test]
+fn bad_videos_are_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(path) = clip(folder.path(), "clip.mp4", &[]) else { return };
+    let refuse = |path: &Path, words: &[&str]| {
+        let e = choose::load_photos(&[path.to_path_buf()], None, &Silent).unwrap_err();
+        let message = e.to_string();
+        assert_eq!((e.exit_code(), message.lines().count()), (2, 1), "{message}");
+        assert!(words.iter().all(|w| message.contains(w)), "{message}");
+    };
+    let whole = std::fs::read(&path).unwrap();
+    std::fs::write(folder.path().join("cut.mp4"), &whole[..whole.len() / 2]).unwrap();
+    refuse(&folder.path().join("cut.mp4"), &["cut.mp4", "cannot be read"]);
+    std::fs::write(folder.path().join("text.mov"), b"no video at all").unwrap();
+    refuse(&folder.path().join("text.mov"), &["text.mov", "cannot be read"]);
+    // A list of other addresses in the clothes of a video.
+    let list = "#EXTM3U\n#EXTINF:1,\nhttp://localhost/x.ts\n#EXT-X-ENDLIST\n";
+    std::fs::write(folder.path().join("list.mp4"), list).unwrap();
+    refuse(&folder.path().join("list.mp4"), &["list.mp4", "cannot be read"]);
 }

@@ -168,7 +168,7 @@ impl<'a> Lab<'a> {
         }
         let frames = self.frames(setup.views)?;
         let paths: Vec<PathBuf> = frames.iter().map(|f| self.truth.folder.join(&f.file)).collect();
-        let photos = photo::load_all(&paths, Some(paths.len()), self.progress)?;
+        let photos = photo::load_all(&paths, self.progress)?;
         let choice = match &setup.init {
             Init::Sfm => InitChoice::Sfm,
             Init::Network(name) => {

@@ -6,6 +6,7 @@ use super::scene::{SvkScene, camera_in};
 use super::types::*;
 use crate::fit::Preset;
 use crate::photo::{self, Photo};
+use crate::pose::choose;
 use crate::progress::Progress;
 use crate::run::live::LiveScene;
 use crate::run::{self, FEATURE_DIM, FeatureSource, InitSource, MaskSource, RunPlan};
@@ -68,7 +69,8 @@ unsafe fn gather(
     let photos = if !in_memory && paths.iter().all(Option::is_some) {
         let paths: Vec<PathBuf> = paths.into_iter().flatten().collect();
         let all = if views > 0 || paths.iter().any(|p| p.is_dir()) { None } else { Some(paths.len()) };
-        photo::load_all_at(&paths, if views > 0 { Some(views) } else { all }, max_size, progress)?
+        let chosen = choose::photos(&paths, if views > 0 { Some(views) } else { all }, progress)?;
+        photo::load_each(&chosen, max_size, progress)?
     } else {
         let one = |(i, (photo, path)): (usize, (&SvkPhoto, Option<PathBuf>))| unsafe {
             single(photo, path, i, max_size)

@@ -108,10 +108,10 @@ pub struct DeviceArgs {
 /// `splatvk run`
 #[derive(Debug, Args)]
 pub struct RunArgs {
-    /// Photos, or folders of photos (JPEG, PNG, HEIC, AVIF, WebP, TIFF)
+    /// Photos, folders of photos (JPEG, PNG, HEIC, AVIF, WebP, TIFF), or a video
     #[arg(required = true, value_name = "INPUT")]
     pub inputs: Vec<PathBuf>,
-    /// How many photos to use, spread over the sorted names
+    /// How many photos to use: sharp ones that overlap, from different places [default: all, at most 4]
     #[arg(long, value_name = "N")]
     pub views: Option<usize>,
     /// Scene directory to write [default: out/NAME, after the input]

@@ -33,6 +33,8 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
     // Photos of other kinds are read without it, so this is no fault of the machine.
     let (found, advice) = photo::heif_support();
     lines.push(line("HEIC, AVIF", if advice.is_some() { Status::Note } else { Status::Ok }, found, advice));
+    let (found, advice) = photo::video_support();
+    lines.push(line("video", if advice.is_some() { Status::Note } else { Status::Ok }, found, advice));
     let missing = lines.iter().filter(|l| l.status == Status::Missing).count();
     if args.device.json {
         let lines: Vec<_> = lines

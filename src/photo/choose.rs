@@ -1,4 +1,5 @@
-//! Which files are the photos, and which of them the run uses.
+//! Which files are the photos, and how many of them the run uses.
+use super::Candidate;
 use super::kind::{READ, is_foreign_name, is_photo_name, is_video_name};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -14,7 +15,9 @@ pub const DEFAULT_VIEWS: usize = 4;
 pub struct Found {
     /// Sorted by file name.
     pub photos: Vec<PathBuf>,
-    /// Videos and images of other kinds in the folders, which nothing reads.
+    /// Videos that were named, or that are all there is in the folders.
+    pub videos: Vec<PathBuf>,
+    /// Videos beside photos and images of other kinds in the folders, which nothing reads.
     pub ignored: Vec<PathBuf>,
 }
 
@@ -29,37 +32,40 @@ pub fn find(inputs: &[PathBuf]) -> Result<Found> {
         if kind.is_dir() {
             list(input, &mut found)?;
         } else if is_video_name(input) {
-            return Err(Error::input(format!(
-                "{}: {}",
-                input.display(),
-                "is a video; take 3 or 4 still photos, or save frames of it as JPEG"
-            )));
+            found.videos.push(input.clone());
         } else {
             found.photos.push(input.clone());
         }
     }
+    if found.photos.is_empty() && found.videos.is_empty() {
+        (found.videos, found.ignored) = found.ignored.into_iter().partition(|p| is_video_name(p));
+    }
     let key = |p: &PathBuf| (p.file_name().map(|n| n.to_os_string()), p.clone());
-    found.photos.sort_by_key(key);
-    found.photos.dedup();
-    found.ignored.sort_by_key(key);
+    for list in [&mut found.photos, &mut found.videos, &mut found.ignored] {
+        list.sort_by_key(key);
+        list.dedup();
+    }
     let place = inputs.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ");
-    match (found.photos.as_slice(), found.ignored.first()) {
-        ([], None) => Err(Error::input(format!(
-            "{place}: no photos; give a folder with 2 to {MOST_VIEWS} photos ({READ})"
+    match (found.photos.is_empty() && found.videos.is_empty(), found.ignored.first()) {
+        (true, None) => Err(Error::input(format!(
+            "{place}: no photos; give a folder with 2 to {MOST_VIEWS} photos ({READ}), or a video"
         ))),
-        ([], Some(v)) if is_video_name(v) => Err(Error::input(format!(
-            "{}: this is a video and there are no photos beside it; take 3 or 4 still photos, or save frames as JPEG",
-            v.display()
-        ))),
-        ([], Some(other)) => Err(Error::input(format!(
+        (true, Some(other)) => Err(Error::input(format!(
             "{}: this kind of image is not read and there are no photos beside it; save the photos as JPEG or PNG",
             other.display()
         ))),
-        ([one], _) if !is_video_name(one) => Err(Error::input(format!(
-            "{}: only one photo; at least 2 are needed, 3 or 4 work best",
-            one.display()
-        ))),
         _ => Ok(found),
+    }
+}
+
+/// Refuses a single photo.
+pub(super) fn check_count(candidates: &[Candidate]) -> Result<()> {
+    match candidates {
+        [one] => Err(Error::input(format!(
+            "{}: only one photo; at least 2 are needed, 3 or 4 work best",
+            one.path.display()
+        ))),
+        _ => Ok(()),
     }
 }
 
@@ -79,14 +85,13 @@ fn list(folder: &Path, found: &mut Found) -> Result<()> {
     Ok(())
 }
 
-/// Indices of `views` of `count` photos: `linspace(0, count − 1, views)` truncated to whole numbers (ALGORITHMS 0.6).
+/// Indices of `views` of `count` frames: `linspace(0, count − 1, views)` truncated to whole numbers (ALGORITHMS 0.6).
 pub fn spread(count: usize, views: usize) -> Vec<usize> {
     (0..views).map(|i| if views > 1 { i * (count - 1) / (views - 1) } else { 0 }).collect()
 }
 
-/// The photos that a run uses. `views` is what the user asked for.
-pub fn choose(photos: &[PathBuf], views: Option<usize>) -> Result<Vec<PathBuf>> {
-    let count = photos.len();
+/// How many of `count` photos a run uses. `views` is what the user asked for.
+pub fn wanted(count: usize, views: Option<usize>) -> Result<usize> {
     let wanted = views.unwrap_or(count.min(DEFAULT_VIEWS));
     if wanted < 2 {
         return Err(Error::input(format!("--views {wanted}: at least 2 views are needed, 3 or 4 work best")));
@@ -101,7 +106,7 @@ pub fn choose(photos: &[PathBuf], views: Option<usize>) -> Result<Vec<PathBuf>> 
             "--views {wanted}: at most {MOST_VIEWS} views are supported; lower --views"
         )));
     }
-    Ok(spread(count, wanted).into_iter().map(|i| photos[i].clone()).collect())
+    Ok(wanted)
 }
 
 #[cfg(test)]
@@ -126,11 +131,11 @@ mod tests {
 
     #[test]
     fn view_counts_are_checked() {
-        let photos: Vec<PathBuf> = (0..20).map(|i| format!("{i:02}.jpg").into()).collect();
-        assert_eq!(choose(&photos, None).unwrap().len(), DEFAULT_VIEWS);
-        assert_eq!(choose(&photos[..3], None).unwrap().len(), 3);
+        assert_eq!(wanted(20, None).unwrap(), DEFAULT_VIEWS);
+        assert_eq!(wanted(3, None).unwrap(), 3);
+        assert_eq!(wanted(20, Some(6)).unwrap(), 6);
         for (n, views) in [(3, 4), (3, 1), (3, 0), (20, 17)] {
-            let e = choose(&photos[..n], Some(views)).unwrap_err();
+            let e = wanted(n, Some(views)).unwrap_err();
             assert!(e.exit_code() == 2 && e.to_string().starts_with(&format!("--views {views}:")), "{e}");
         }
     }

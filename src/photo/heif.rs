@@ -141,13 +141,6 @@ pub(super) fn status() -> (String, Option<String>) {
     (format!("libheif {version} · {found}"), advice)
 }
 
-/// Whether the library is there and reads HEIC.
-#[cfg(test)]
-pub(super) fn reads_hevc() -> bool {
-    // SAFETY: as in `status`.
-    api().is_ok_and(|api| unsafe { (api.heif_have_decoder_for_format)(FORMAT_HEVC) } != 0)
-}
-
 /// The primary image of a file, upright: libheif applies the rotation and mirroring that the container states, and those
 /// count, not the orientation in EXIF (ISO/IEC 23008-12).
 pub(super) struct Image {

@@ -1,5 +1,6 @@
 //! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (ALGORITHMS 0.4, 1.1, 1.2).
 mod affine;
+mod candidate;
 mod choose;
 mod decode;
 mod exif_tags;
@@ -9,9 +10,11 @@ mod kind;
 pub mod light;
 mod resize;
 mod straighten;
+mod video;
 
 pub use affine::Affine;
-pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
+pub use candidate::{Candidate, gather};
+pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, find, spread, wanted};
 pub use frame::Frame;
 pub use light::Light;
 pub use resize::Kernel;
@@ -30,6 +33,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// What the machine has for HEIC and AVIF photos, in words, and what to do about what it lacks.
 pub fn heif_support() -> (String, Option<String>) {
     heif::status()
+}
+
+/// What the machine has for videos, in words, and what to do about what it lacks.
+pub fn video_support() -> (String, Option<String>) {
+    video::status()
 }
 
 /// Greatest side of a working image on a GPU, pixels: where the reference implementation of Gaussian splatting stops (Kerbl
@@ -113,10 +121,13 @@ pub fn load(path: &Path) -> Result<Photo> {
 /// Reads one photo: EXIF orientation applied, alpha composited on black, scaled down to `max_size` pixels along its longer
 /// side if it is larger.
 pub fn load_at(path: &Path, max_size: usize) -> Result<Photo> {
-    let bytes = std::fs::read(path).map_err(|e| {
+    from_bytes(path, read(path)?, max_size)
+}
+
+fn read(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).map_err(|e| {
         Error::input(format!("{}: {e}; check the name and that you may read it", path.display()))
-    })?;
-    from_bytes(path, bytes, max_size)
+    })
 }
 
 /// [`load_at`] of an image file that is in memory already; `name` stands for its path.
@@ -132,7 +143,7 @@ pub fn from_bytes(name: &Path, bytes: Vec<u8>, max_size: usize) -> Result<Photo>
     let photo = working(name, decoded.size, max_size, |x, y| decoded.at(x, y))?;
     // The two scales differ by the rounding of the size only.
     let exif_focal = decoded.lens.focal.map(|f| f * photo.to_working.scale[1]);
-    Ok(Photo { exif_focal, camera_model: decoded.lens.camera_model, ..photo })
+    Ok(Photo { exif_focal, camera_model: decoded.lens.camera_model.clone(), ..photo })
 }
 
 /// A photo from upright sRGB pixels in [0, 1]; `focal` is in their pixels, where it is known.
@@ -157,12 +168,7 @@ fn working(
     max_size: usize,
     at: impl Fn(usize, usize) -> [f32; 3] + Sync,
 ) -> Result<Photo> {
-    if w.min(h) < SMALLEST_SIDE {
-        return Err(Error::input(format!(
-            "{}: {w} × {h} pixels are too few; each side needs at least {SMALLEST_SIDE}",
-            name.display()
-        )));
-    }
+    check_size(name, (w, h))?;
     let (working_w, working_h) = working_size(w, h, max_size);
     let mut image = resize::area_average((w, h), (working_w, working_h), &at);
     let fine = fine((w, h), (working_w, working_h), &at);
@@ -181,6 +187,16 @@ fn working(
         camera_model: None,
         light: Light::NONE,
     })
+}
+
+fn check_size(name: &Path, (w, h): (usize, usize)) -> Result<()> {
+    if w.min(h) < SMALLEST_SIDE {
+        return Err(Error::input(format!(
+            "{}: {w} × {h} pixels are too few; each side needs at least {SMALLEST_SIDE}",
+            name.display()
+        )));
+    }
+    Ok(())
 }
 
 /// Largest long side of [`Photo::fine`], pixels.
@@ -212,43 +228,30 @@ pub fn working_size(w: usize, h: usize, max_size: usize) -> (usize, usize) {
     (scaled(w), scaled(h))
 }
 
-/// [`load_all_at`] with [`MAX_SIZE`].
-pub fn load_all(inputs: &[PathBuf], views: Option<usize>, progress: &dyn Progress) -> Result<Vec<Photo>> {
-    load_all_at(inputs, views, MAX_SIZE, progress)
+/// Finds and reads all photos of files and folders at [`MAX_SIZE`]; [`crate::pose::choose::photos`] chooses among too many.
+pub fn load_all(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Photo>> {
+    let found = gather(inputs, progress)?;
+    wanted(found.len(), Some(found.len()))?;
+    load_each(&found, MAX_SIZE, progress)
 }
 
-/// Finds, chooses and reads the photos of a run, each scaled down to `max_size` where it is larger; refuses sets that cannot give geometry (the same photo twice) or that
-/// would mix up files (the same name twice).
-pub fn load_all_at(
-    inputs: &[PathBuf],
-    views: Option<usize>,
+/// Reads the photos of a run, each scaled down to `max_size` where it is larger; refuses sets that cannot give geometry (the
+/// same photo twice) or that would mix up files (the same name twice).
+pub fn load_each(
+    candidates: &[Candidate],
     max_size: usize,
     progress: &dyn Progress,
 ) -> Result<Vec<Photo>> {
-    let found = find(inputs)?;
-    if let Some(first) = found.ignored.first() {
-        let more = found.ignored.len() - 1;
-        let others = if more > 0 { format!(" and {more} more") } else { String::new() };
-        progress.warn(&format!("not a photo that can be read, ignored: {}{others}", first.display()));
-    }
-    let paths = choose(&found.photos, views)?;
-    if views.is_none() && paths.len() < found.photos.len() {
-        progress.warn(&format!(
-            "using {} of {} photos, spread over their names; --views changes how many",
-            paths.len(),
-            found.photos.len()
-        ));
-    }
-    progress.begin("photos", paths.len() as u64);
+    progress.begin("photos", candidates.len() as u64);
     let done = AtomicU64::new(0);
-    let one = |path: &PathBuf| {
+    let one = |candidate: &Candidate| {
         progress.check()?;
-        let photo = load_at(path, max_size)?;
+        let photo = candidate.load(max_size, progress)?;
         progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
         Ok(photo)
     };
     // Collected before errors are looked at: the first in the order of the photos is reported, whichever came first.
-    let all: Vec<Result<Photo>> = paths.par_iter().map(one).collect();
+    let all: Vec<Result<Photo>> = candidates.par_iter().map(one).collect();
     let photos = all.into_iter().collect::<Result<Vec<_>>>()?;
     progress.end();
     let framed: Vec<&str> = photos.iter().filter(|p| !p.frame.is_none()).map(|p| p.stem.as_str()).collect();

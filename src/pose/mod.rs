@@ -1,11 +1,13 @@
 //! Photos to cameras, depth and points.
 pub mod align;
 mod bundle;
+pub mod choose;
 mod initialise;
 pub mod light;
 pub mod matching;
 mod minimal;
 pub(crate) mod numeric;
+mod overlap;
 pub mod pointmap;
 pub mod relative;
 mod resect;

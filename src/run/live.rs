@@ -17,9 +17,9 @@ use std::path::{Path, PathBuf};
 ///
 /// ```no_run
 /// # fn main() -> splatvk::Result<()> {
-/// use splatvk::{gpu::Device, photo, progress::Silent, run::{self, RunPlan, live::LiveScene}};
+/// use splatvk::{gpu::Device, pose::choose, progress::Silent, run::{self, RunPlan, live::LiveScene}};
 /// let device = Device::open(None)?;
-/// let photos = photo::load_all(&["my-photos".into()], Some(4), &Silent)?;
+/// let photos = choose::load_photos(&["my-photos".into()], Some(4), &Silent)?;
 /// let outcome = run::reconstruct(&RunPlan::default(), &device, photos, &Silent)?;
 /// let mut scene = LiveScene::trained(&device, outcome, None)?;
 /// let camera = scene.cameras()[0].clone();

@@ -238,7 +238,8 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
         ..gpu::Options::from_env(plan.device.as_deref())
     })?;
     let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
-    let photos = photo::load_all_at(&plan.inputs, plan.views, max_size, progress)?;
+    let chosen = pose::choose::photos(&plan.inputs, plan.views, progress)?;
+    let photos = photo::load_each(&chosen, max_size, progress)?;
     let outcome = work(plan, &device, photos, progress)?;
     write(workspace, &outcome, progress)?;
     Ok(outcome)

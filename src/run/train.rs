@@ -4,7 +4,7 @@ use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras, colmap, ply};
 use crate::gpu::{self, Device};
 use crate::infer::{Registry, provider};
-use crate::photo::{self, Photo};
+use crate::photo::{self, Candidate, Photo};
 use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, InitChoice};
 use crate::progress::{Progress, Recorded};
@@ -78,7 +78,8 @@ fn matched(
         progress
             .warn(&format!("{} photos have no camera and are left out", found.photos.len() - paths.len()));
     }
-    photo::load_all_at(&paths, Some(paths.len()), max_size, progress)
+    let files: Vec<Candidate> = paths.iter().map(|p| Candidate::file(p)).collect();
+    photo::load_each(&files, max_size, progress)
 }
 
 fn points(path: &Path) -> Result<PointCloud> {

@@ -1,0 +1,83 @@
+//! What may become a photo of a run: a file, or a frame of a video.
+use super::video::Video;
+use super::{Found, Photo, choose, decode, find, from_bytes, load_at, resize};
+use crate::Result;
+use crate::progress::Progress;
+use crate::scene::RgbImage;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+#[derive(Clone, Debug)]
+enum Source {
+    File,
+    /// Seconds from the start.
+    Frame(Arc<Video>, f64),
+}
+
+/// A photo that has not been read yet.
+#[derive(Clone, Debug)]
+pub struct Candidate {
+    /// The file; for a frame the video's path with the frame's name behind it.
+    pub path: PathBuf,
+    source: Source,
+}
+
+impl Candidate {
+    /// A photo file.
+    pub fn file(path: &Path) -> Candidate {
+        Candidate { path: path.to_path_buf(), source: Source::File }
+    }
+
+    /// File name without folder.
+    pub fn name(&self) -> String {
+        self.path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
+    }
+
+    /// At working resolution, see [`super::load_at`].
+    pub fn load(&self, max_size: usize, progress: &dyn Progress) -> Result<Photo> {
+        match &self.source {
+            Source::File => load_at(&self.path, max_size),
+            Source::Frame(video, at) => from_bytes(&self.path, video.frame(*at, None, progress)?, max_size),
+        }
+    }
+
+    /// Upright pixels, at most `side` on the longer side; `None` past the end of a video that is shorter than it says.
+    /// Only one decoded file is held while it is made.
+    pub fn thumbnail(&self, side: usize, progress: &dyn Progress) -> Result<Option<RgbImage>> {
+        let bytes = match &self.source {
+            Source::File => super::read(&self.path)?,
+            Source::Frame(video, at) => match video.frame(*at, Some(side), progress)? {
+                bytes if bytes.is_empty() => return Ok(None),
+                bytes => bytes,
+            },
+        };
+        let decoded = decode::decode(bytes, &self.path)?;
+        super::check_size(&self.path, decoded.size)?;
+        let (w, h) = decoded.size;
+        let scale = (side as f64 / w.max(h) as f64).min(1.0);
+        let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
+        // Two samples a side for every pixel of the thumbnail; all sixteen of a large photo would take as long as decoding.
+        let step = ((0.5 / scale) as usize).max(1);
+        let pixel = |x: usize, y: usize| decoded.at(x * step, y * step);
+        Ok(Some(resize::area_average((w / step, h / step), (to(w), to(h)), pixel)))
+    }
+}
+
+/// The candidates behind files, folders and videos, in the order of their names; frames in the order of time. Warns of what
+/// folders hold besides.
+pub fn gather(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Candidate>> {
+    let Found { photos, videos, ignored } = find(inputs)?;
+    if let Some(first) = ignored.first() {
+        let more = ignored.len() - 1;
+        let others = if more > 0 { format!(" and {more} more") } else { String::new() };
+        progress.warn(&format!("not a photo that can be read, ignored: {}{others}", first.display()));
+    }
+    let mut all: Vec<Candidate> = photos.iter().map(|p| Candidate::file(p)).collect();
+    for path in videos {
+        let video = Arc::new(Video::open(&path, progress)?);
+        let frame = |at| Candidate { path: video.frame_name(at), source: Source::Frame(video.clone(), at) };
+        all.extend(video.times().into_iter().map(frame));
+    }
+    choose::check_count(&all)?;
+    Ok(all)
+}

@@ -1,0 +1,119 @@
+//! How much two photos show of the same, from matches that nothing has verified yet.
+use glam::DVec2;
+
+/// What two photos have in common.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Link {
+    /// Matches that agree.
+    pub matches: usize,
+    /// Median distance of the agreeing matches from the similarity that explains them best, over the image diagonal: what
+    /// turning and zooming the camera does not explain, so about the parallax.
+    pub parallax: f64,
+}
+
+/// How far a match may lie from the similarity, over the diagonal. Generous: depth moves corners by about as much between
+/// photos 30° apart, and wrong matches are spread over the whole photo, of which this circle covers 7 %.
+const AGREES: f64 = 0.1;
+
+/// Zoom between two photos beyond which matches are wrong more often than right.
+const LARGEST_ZOOM: f64 = 3.0;
+
+/// A similarity of the plane, q = a p + b with complex a: turn, zoom and shift.
+#[derive(Clone, Copy)]
+struct Similarity {
+    a: DVec2,
+    b: DVec2,
+}
+
+impl Similarity {
+    fn times(x: DVec2, y: DVec2) -> DVec2 {
+        DVec2::new(x.x * y.x - x.y * y.y, x.x * y.y + x.y * y.x)
+    }
+
+    /// Least squares over pairs of positions; `None` where they do not fix one.
+    fn fit(pairs: &[(DVec2, DVec2)]) -> Option<Similarity> {
+        let n = pairs.len() as f64;
+        let mean = pairs.iter().fold((DVec2::ZERO, DVec2::ZERO), |m, p| (m.0 + p.0 / n, m.1 + p.1 / n));
+        let (mut top, mut bottom) = (DVec2::ZERO, 0.0);
+        for (p, q) in pairs {
+            let (p, q) = (*p - mean.0, *q - mean.1);
+            top += Similarity::times(DVec2::new(p.x, -p.y), q);
+            bottom += p.length_squared();
+        }
+        let a = top / bottom;
+        let believable = (1.0 / LARGEST_ZOOM..LARGEST_ZOOM).contains(&a.length());
+        believable.then(|| Similarity { a, b: mean.1 - Similarity::times(a, mean.0) })
+    }
+
+    fn distance(&self, (p, q): &(DVec2, DVec2)) -> f64 {
+        (Similarity::times(self.a, *p) + self.b - *q).length()
+    }
+}
+
+/// The largest group of matches that one similarity explains roughly. Positions over the image diagonal; better matches
+/// first. Deterministic: pairs of neighbours in the list make the hypotheses.
+pub(super) fn agreement(matches: &[(DVec2, DVec2)]) -> Link {
+    let inliers = |s: &Similarity| -> Vec<(DVec2, DVec2)> {
+        matches.iter().filter(|m| s.distance(m) < AGREES).copied().collect()
+    };
+    let mut best: Vec<(DVec2, DVec2)> = Vec::new();
+    // Six pairings of each match: at a third of right matches, 200 matches give over a hundred right hypotheses.
+    for stride in [1, 2, 3, 5, 8, 13] {
+        for (m, n) in matches.iter().zip(matches.iter().skip(stride)) {
+            // Closer points fix turn and zoom too badly.
+            if (m.0 - n.0).length() < 0.1 {
+                continue;
+            }
+            let found = Similarity::fit(&[*m, *n]).map(|s| inliers(&s)).unwrap_or_default();
+            if found.len() > best.len() {
+                best = found;
+            }
+        }
+    }
+    let Some(fitted) = (best.len() > 2).then(|| Similarity::fit(&best)).flatten() else {
+        return Link::default();
+    };
+    let mut distances: Vec<f64> = inliers(&fitted).iter().map(|m| fitted.distance(m)).collect();
+    distances.sort_by(f64::total_cmp);
+    let parallax = distances.get(distances.len() / 2).copied().unwrap_or(0.0);
+    Link { matches: distances.len(), parallax }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn scattered(n: usize, seed: u32) -> Vec<DVec2> {
+        let mut state = seed;
+        let mut next = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f64 / (1 << 24) as f64
+        };
+        (0..n).map(|_| DVec2::new(0.8 * next(), 0.6 * next())).collect()
+    }
+
+    #[test]
+    fn turned_and_zoomed_matches_agree_without_parallax() {
+        let turn = |p: DVec2| DVec2::new(0.1 - 0.8 * p.y, 0.2 + 0.8 * p.x);
+        let mut pairs: Vec<_> = scattered(60, 1).into_iter().map(|p| (p, turn(p))).collect();
+        pairs.extend(scattered(60, 2).into_iter().zip(scattered(60, 3)));
+        let link = agreement(&pairs);
+        // Of 60 random ones some fall into the circle.
+        assert!((60..72).contains(&link.matches) && link.parallax < 0.01, "{link:?}");
+    }
+
+    #[test]
+    fn random_matches_do_not() {
+        let pairs: Vec<_> = scattered(60, 2).into_iter().zip(scattered(60, 3)).collect();
+        assert!(agreement(&pairs).matches < 16, "{:?}", agreement(&pairs));
+        assert_eq!(agreement(&[]), Link::default());
+    }
+
+    #[test]
+    fn depth_shows_as_parallax() {
+        let moved = |(k, p): (usize, DVec2)| (p, p + DVec2::new(if k % 2 == 0 { 0.03 } else { -0.03 }, 0.0));
+        let pairs: Vec<_> = scattered(80, 4).into_iter().enumerate().map(moved).collect();
+        let link = agreement(&pairs);
+        assert!(link.matches == 80 && (link.parallax - 0.03).abs() < 0.005, "{link:?}");
+    }
+}
