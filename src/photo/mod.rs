@@ -5,11 +5,13 @@ mod decode;
 mod exif_tags;
 mod frame;
 mod resize;
+mod sizes;
 
 pub use affine::Affine;
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, choose, find, spread};
 pub use frame::Frame;
 pub use resize::Kernel;
+pub use sizes::{sizes, sizes_of};
 
 use crate::progress::Progress;
 use crate::scene::RgbImage;
@@ -173,7 +175,10 @@ pub fn load_all_at(
         Ok(photo)
     };
     // Collected before errors are looked at: the first in the order of the photos is reported, whichever came first.
-    let all: Vec<Result<Photo>> = paths.par_iter().map(one).collect();
+    let mut all: Vec<Result<Photo>> = Vec::with_capacity(paths.len());
+    for wave in sizes::waves(&paths) {
+        all.par_extend(paths[wave].par_iter().map(one));
+    }
     let photos = all.into_iter().collect::<Result<Vec<_>>>()?;
     progress.end();
     let framed: Vec<&str> = photos.iter().filter(|p| !p.frame.is_none()).map(|p| p.stem.as_str()).collect();

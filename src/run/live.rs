@@ -5,6 +5,7 @@ use crate::format::scene_dir::{self, Contents, Scene};
 use crate::format::{Workspace, colmap, gaussians};
 use crate::gpu::Device;
 use crate::infer::{RegionEncoder, Registry};
+use crate::pass::bands::Band;
 use crate::pass::rasterizer::FrameBuffers;
 use crate::photo;
 use crate::progress::Silent;
@@ -107,7 +108,17 @@ impl LiveScene {
         (widths.iter().take(level).sum(), widths.get(level).copied().unwrap_or(0))
     }
 
-    /// Renders one camera. The frame stays on the device, and valid until the next call.
+    /// Renders one camera band by band and shows every band while it is on the device.
+    pub fn draw_bands(
+        &mut self,
+        camera: &Camera,
+        seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
+    ) -> Result<()> {
+        check(camera)?;
+        self.viewer.draw_bands(camera, seen)
+    }
+
+    /// Renders one camera that the device holds at once. The frame stays on the device, and valid until the next call.
     pub fn draw(&mut self, camera: &Camera) -> Result<&FrameBuffers> {
         check(camera)?;
         self.viewer.draw(camera)
