@@ -6,14 +6,14 @@ layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };       // [N, 3]
 layout(std430, binding = 1) readonly buffer DepthPairs { uvec2 depth_pairs[]; };   // [N] (key, splat), sorted
 layout(std430, binding = 2) writeonly buffer TileCounts { uint tile_counts[]; };   // [N]
-layout(push_constant) uniform Push { uint count; uint tiles_x; uint tiles_y; };
+layout(push_constant) uniform Push { uint count; uint tiles_x; uint first_row; uint end_row; };
 
 #include "shared/tiles.glsl"
 
 void main() {
     uint rank = gl_GlobalInvocationID.x;
     if (rank >= count) return;
-    Ellipse e = ellipse_of(depth_pairs[rank].y, tiles_y);
+    Ellipse e = ellipse_of(depth_pairs[rank].y, first_row, end_row);
     uint sum = 0;
     for (int row = e.first_row; row <= e.last_row; row++) {
         ivec2 interval = interval_of(e, row, tiles_x);

@@ -4,6 +4,8 @@
 // every other, so a splat that covers the screen is shared by many. If the entries do not fit, there are none, and the
 // status says how much room is needed: an image without splats, never one with a few of them missing. Twin: pass::bin.
 //
+// Rows of tiles from first_row up to end_row of the image are binned; tile 0 is the first of these.
+//
 // GROUPING 0 (counting, see bin_scatter.comp): entries are (tile, splat), and the lane counts them per tile.
 // GROUPING 1 (sorting, see bin_ranges.comp): entries are (tile, own index), and `entry_splats` keeps the splat.
 #extension GL_GOOGLE_include_directive : require
@@ -24,7 +26,9 @@ layout(std430, binding = 6) buffer Counters { uint counters[]; };               
 #else
 layout(std430, binding = 7) writeonly buffer EntrySplats { uint entry_splats[]; };   // [capacity]
 #endif
-layout(push_constant) uniform Push { uint count; uint tiles_x; uint tiles_y; uint lanes; uint capacity; };
+layout(push_constant) uniform Push {
+    uint count; uint tiles_x; uint first_row; uint end_row; uint lanes; uint capacity;
+};
 
 #include "shared/tiles.glsl"
 
@@ -51,7 +55,7 @@ void main() {
     if (!fits || begin >= end) return;
 
     uint rank = rank_of(begin), entry = starts[rank], splat = depth_pairs[rank].y;
-    Ellipse e = ellipse_of(splat, tiles_y);
+    Ellipse e = ellipse_of(splat, first_row, end_row);
     int row = e.first_row - 1, x = 0, last = -1;
     // One flat loop over (splat, row, tile): lanes with small splats do not wait for lanes with large ones.
     while (entry < end && rank < count) {
@@ -61,7 +65,7 @@ void main() {
             if (row > e.last_row) {
                 rank++;
                 splat = depth_pairs[rank].y;
-                e = ellipse_of(splat, tiles_y);
+                e = ellipse_of(splat, first_row, end_row);
                 row = e.first_row;
             }
             ivec2 interval = interval_of(e, row, tiles_x);
@@ -73,7 +77,7 @@ void main() {
             entry += uint(skip);
         }
         if (x <= last) {
-            uint tile = uint(row) * tiles_x + uint(x);
+            uint tile = (uint(row) - first_row) * tiles_x + uint(x);
 #if GROUPING == 0
             entries[entry] = uvec2(tile, splat);
             counters[tile * lanes + lane]++;

@@ -8,8 +8,9 @@ layout(std430, binding = 1) readonly buffer TileCounts { uint tile_counts[]; }; 
 layout(std430, binding = 2) readonly buffer Starts { uint starts[]; };            // [N] in that order
 layout(std430, binding = 3) readonly buffer EntryCount { uint entry_count; };     // 0 if the entries did not fit
 layout(std430, binding = 4) readonly buffer Entries { vec4 entries[]; };          // [entries, vectors]
-layout(std430, binding = 5) writeonly buffer Sums { vec4 sums[]; };               // [N, vectors]
-layout(push_constant) uniform Push { uint count; uint vectors; };
+layout(std430, binding = 5) buffer Sums { vec4 sums[]; };                         // [N, stride], from first_vector on
+// add: 0 overwrites the sums, 1 adds to those of other tiles.
+layout(push_constant) uniform Push { uint count; uint vectors; uint stride; uint first_vector; uint add; };
 
 void main() {
     uint thread = (gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x) * 256u + gl_LocalInvocationID.x;
@@ -18,5 +19,6 @@ void main() {
     uint first = starts[rank], last = entry_count > 0 ? first + tile_counts[rank] : first;
     vec4 sum = vec4(0.0);
     for (uint entry = first; entry < last; entry++) sum += entries[entry * vectors + vector];
-    sums[depth_pairs[rank].y * vectors + vector] = sum;
+    uint at = depth_pairs[rank].y * stride + first_vector + vector;
+    sums[at] = add > 0 ? sums[at] + sum : sum;
 }

@@ -2,12 +2,15 @@
 // Planes of a rendered frame to texels as hosts want them. Twin: pass::pack.
 layout(local_size_x = 128) in; // as relevancy_map.comp
 
-layout(std430, binding = 0) readonly buffer Planes { float planes[]; };              // [C, P]
-layout(std430, binding = 1) readonly buffer Transmittance { float transmittance[]; }; // [P]
+layout(std430, binding = 0) readonly buffer Planes { float planes[]; };              // [C, stride]
+layout(std430, binding = 1) readonly buffer Transmittance { float transmittance[]; }; // [stride]
 layout(std430, binding = 2) writeonly buffer Texels { uint texels[]; };              // [layers, P, group] in `encoding`
 // source 0: colour and alpha, 1: alpha, 2: expected depth, 3: `channels` planes from `first` on.
 // encoding 0: 32-bit float, 1: 16-bit float, 2: 8-bit unorm; 1 and 2 with groups of four.
-layout(push_constant) uniform Push { uint pixels; uint source; uint first; uint channels; uint group; uint encoding; };
+// `count` pixels from `from` on of the planes, pixels `to` and following of the `pixels` of the texels.
+layout(push_constant) uniform Push {
+    uint pixels; uint source; uint first; uint channels; uint group; uint encoding; uint stride; uint from; uint to; uint count;
+};
 
 const float DEPTH_ALPHA_MIN = 0.5; // pass::renderer::DEPTH_ALPHA_MIN
 
@@ -15,15 +18,15 @@ float value(uint pixel, uint k) {
     if (k >= channels) return 0.0;
     float alpha = 1.0 - transmittance[pixel];
     if (source == 1 || (source == 0 && k == 3)) return alpha;
-    if (source == 2) return alpha >= DEPTH_ALPHA_MIN ? planes[3 * pixels + pixel] / alpha : 0.0;
-    return planes[(first + k) * pixels + pixel];
+    if (source == 2) return alpha >= DEPTH_ALPHA_MIN ? planes[3 * stride + pixel] / alpha : 0.0;
+    return planes[(first + k) * stride + pixel];
 }
 
 void main() {
-    uint pixel = gl_GlobalInvocationID.x;
-    if (pixel >= pixels) return;
+    uint index = gl_GlobalInvocationID.x, pixel = from + index;
+    if (index >= count) return;
     for (uint layer = 0; layer * group < channels; layer++) {
-        uint texel = layer * pixels + pixel, k = layer * group;
+        uint texel = layer * pixels + to + index, k = layer * group;
         if (encoding == 0) {
             for (uint j = 0; j < group; j++) texels[texel * group + j] = floatBitsToUint(value(pixel, k + j));
         } else {

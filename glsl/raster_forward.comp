@@ -21,10 +21,12 @@ layout(std430, binding = 5) writeonly buffer Planes { float planes[]; };        
 layout(std430, binding = 6) writeonly buffer Transmittance { float transmittances[]; }; // [H, W]
 layout(std430, binding = 7) writeonly buffer MedianDepth { float median_depths[]; };    // [H, W]
 #endif
-// Features of this block start at vector first_vector of a splat's code and fill `features` planes from
+// `planes` hold `rows` rows of the image, from row `top` on. The dispatch begins at row `first_row` of the image's tiles,
+// the lists at row `list_row`. Features of this block start at vector first_vector of a splat's code and fill `features` planes from
 // first_plane + (4 if the block has RGB and depth).
 layout(push_constant) uniform Push {
-    uint width; uint height; uint tiles_x; uint code_vectors; uint first_vector; uint first_plane; uint features;
+    uint width; uint top; uint rows; uint first_row; uint list_row;
+    uint tiles_x; uint code_vectors; uint first_vector; uint first_plane; uint features;
 };
 
 #include "shared/camera.glsl"
@@ -32,8 +34,9 @@ layout(push_constant) uniform Push {
 
 void main() {
     uint lane = gl_SubgroupInvocationID;
-    uint tile = gl_WorkGroupID.y * tiles_x + gl_WorkGroupID.x;
-    uvec2 corner = gl_WorkGroupID.xy * 8 + uvec2(lane % LANES_X, lane / LANES_X);
+    uint tile_row = gl_WorkGroupID.y + first_row, bottom = top + rows;
+    uint tile = (tile_row - list_row) * tiles_x + gl_WorkGroupID.x;
+    uvec2 corner = uvec2(gl_WorkGroupID.x, tile_row) * 8 + uvec2(lane % LANES_X, lane / LANES_X);
     vec2 origin = vec2(corner);
     uint first = tile_ranges[tile], last = tile_ranges[tile + 1];
 
@@ -41,7 +44,7 @@ void main() {
     float T[PIXELS], sum[CHANNELS * PIXELS], median[PIXELS];
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
-        T[k] = x < width && y < height ? 1.0 : -1.0;
+        T[k] = x < width && y < bottom ? 1.0 : -1.0;
         median[k] = 0.0;
     }
     [[unroll]] for (int k = 0; k < CHANNELS * PIXELS; k++) sum[k] = 0.0;
@@ -83,11 +86,11 @@ void main() {
         if (all_stopped(T)) break;
     }
 
-    uint pixels = width * height;
+    uint pixels = width * rows;
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
-        if (x < width && y < height) {
-            uint pixel = y * width + x;
+        if (x < width && y < bottom) {
+            uint pixel = (y - top) * width + x;
 #if BASE
             vec3 background = camera_background() * abs(T[k]);
             planes[pixel] = sum[k] + background.r;

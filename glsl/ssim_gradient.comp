@@ -11,7 +11,8 @@ layout(std430, binding = 2) readonly buffer Slopes { vec2 slopes[]; };  // [C, H
 layout(std430, binding = 3) readonly buffer Cross { float cross_slopes[]; };  // [C, H, W]
 layout(std430, binding = 4) writeonly buffer Gradient { float gradient[]; };  // [C, H, W]: the first planes of the upstream stack
 layout(std430, binding = 5) writeonly buffer Sums { float sums[]; };  // [C, strips, W] sum of |x-y| over each strip
-layout(push_constant) uniform Push { int width; int height; float l1_weight; float dssim_weight; };
+// Rows outside first .. end belong to other bands of the image: no gradient, no loss.
+layout(push_constant) uniform Push { int width; int height; float l1_weight; float dssim_weight; int first; int end; };
 #include "shared/ssim.glsl"
 
 void main() {
@@ -42,8 +43,10 @@ void main() {
         if (y0 + k < height) {
             int q = base + (y0 + k) * width + x;
             float u = rendered[q], v = target_image[q];
-            gradient[q] = l1_weight * sign(u - v) - dssim_weight * (a[k] + 2.0 * u * b[k] + v * c[k]);
-            sum += abs(u - v);
+            bool counts = y0 + k >= first && y0 + k < end;
+            float slope = l1_weight * sign(u - v) - dssim_weight * (a[k] + 2.0 * u * b[k] + v * c[k]);
+            gradient[q] = counts ? slope : 0.0;
+            sum += counts ? abs(u - v) : 0.0;
         }
     }
     sums[(channel * int(gl_NumWorkGroups.y) + int(gl_WorkGroupID.y)) * width + x] = sum;

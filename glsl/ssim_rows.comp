@@ -9,7 +9,8 @@ layout(std430, binding = 1) readonly buffer Moments { vec2 moments[]; };  // [C,
 layout(std430, binding = 2) writeonly buffer Slopes { vec2 slopes[]; };  // [C, H, W] blurred (dS/dE[x], dS/dE[x²])
 layout(std430, binding = 3) writeonly buffer Cross { float cross_slopes[]; };  // [C, H, W] blurred dS/dE[xy]
 layout(std430, binding = 4) writeonly buffer Sums { float sums[]; };  // [C, H, strips] sum of S over each strip
-layout(push_constant) uniform Push { int width; int height; int strips; };
+// Rows outside first .. end have their part in the derivatives of others, but are not summed.
+layout(push_constant) uniform Push { int width; int height; int strips; int first; int end; };
 #include "shared/ssim.glsl"
 
 void main() {
@@ -66,5 +67,5 @@ void main() {
             cross_slopes[base + x0 + k] = oc[k];
         }
     }
-    sums[(int(gl_WorkGroupID.z) * height + y) * strips + strip] = sum;
+    sums[(int(gl_WorkGroupID.z) * height + y) * strips + strip] = y >= first && y < end ? sum : 0.0;
 }

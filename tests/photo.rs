@@ -18,6 +18,10 @@ fn assert_colours(photo: &Photo, expected: [[u8; 3]; 4], tolerance: f32) {
     }
 }
 
+fn read(inputs: &[PathBuf], views: Option<usize>) -> splatvk::Result<Vec<photo::Photo>> {
+    photo::load_each(&choose::photos(inputs, views, &Silent)?, photo::MAX_SIZE, &Silent)
+}
+
 #[test]
 fn kinds_of_files_agree_with_another_reader() {
     // JPEG decoders may differ by rounding of the inverse DCT and of the chroma interpolation: 3 of 255.
@@ -126,7 +130,7 @@ fn unusable_sets_are_refused_in_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let dir = folder.path();
     let refuse = |inputs: &[PathBuf], views: Option<usize>, words: &[&str]| {
-        let e = choose::load_photos(inputs, views, &Silent).unwrap_err();
+        let e = read(inputs, views).unwrap_err();
         let message = e.to_string();
         assert_eq!((e.exit_code(), message.lines().count()), (2, 1), "{message}");
         assert!(words.iter().all(|w| message.contains(w)), "{message}");
@@ -191,7 +195,7 @@ fn a_video_gives_sharp_frames_from_different_places() {
     let places: Vec<usize> = chosen.iter().map(|i| i / 3).collect();
     assert_eq!(places, [0, 1, 2, 3], "one frame of each place: {choice:?}");
     assert!(!chosen.contains(&0) && !chosen.contains(&4), "blurred: {choice:?}");
-    let photos = choose::load_photos(&[path], None, &Silent).unwrap();
+    let photos = read(&[path], None).unwrap();
     assert_eq!(photos.len(), 4);
     assert!(photos.iter().all(|p| (p.image.width, p.image.height) == (640, 480) && p.exif_focal.is_none()));
     assert_eq!(photos[0].stem, names[chosen[0]]);
@@ -207,7 +211,7 @@ fn bad_videos_are_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let Some(path) = clip(folder.path(), "clip.mp4", &[]) else { return };
     let refuse = |path: &Path, words: &[&str]| {
-        let e = choose::load_photos(&[path.to_path_buf()], None, &Silent).unwrap_err();
+        let e = read(&[path.to_path_buf()], None).unwrap_err();
         let message = e.to_string();
         assert_eq!((e.exit_code(), message.lines().count()), (2, 1), "{message}");
         assert!(words.iter().all(|w| message.contains(w)), "{message}");

@@ -35,6 +35,8 @@ layout(push_constant) uniform Push {
     uint parity;
     uint planes;
     float smoothness;
+    // Position of the view's first pixel among those of all views, whichever of them the buffers hold.
+    uint identity;
 } push;
 
 // Per pixel the luma of the 2 x 2 pixels from it to the right and below, 16 bits each: one load per bilinear sample.
@@ -67,7 +69,7 @@ vec3 random_cube() {
 }
 
 void start_random(ivec2 p) {
-    random_state = pcg(push.seed ^ pcg(push.first + uint(p.y) * push.width + uint(p.x)));
+    random_state = pcg(push.seed ^ pcg(push.identity + uint(p.y) * push.width + uint(p.x)));
 }
 
 vec3 ray_through(ivec2 p) {

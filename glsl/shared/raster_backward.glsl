@@ -11,7 +11,7 @@ layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; };
 #if CHANNELS != 4
 layout(std430, binding = 3) readonly buffer Codes { vec4 codes[]; };              // [N, code_vectors]
 #if BY_ENTRY
-layout(std430, binding = 4) writeonly buffer CodeEntries { vec4 code_entries[]; }; // [entries, code_vectors]
+layout(std430, binding = 4) writeonly buffer CodeEntries { vec4 code_entries[]; }; // [entries, FEATURE_VECTORS] of this block
 #else
 layout(std430, binding = 4) buffer CodesGrad { ATOMIC_FLOAT codes_grad[]; };      // [N, 4 * code_vectors], added to
 #endif
@@ -28,7 +28,8 @@ layout(std430, binding = 8) buffer ProjectedGrad { ATOMIC_FLOAT projected_grad[]
 #endif
 // As in raster_forward.comp; coupling 0 keeps the features' part of the loss from moving the geometry, 1 lets it.
 layout(push_constant) uniform Push {
-    uint width; uint height; uint tiles_x; uint code_vectors; uint first_vector; uint first_plane; uint features;
+    uint width; uint top; uint rows; uint first_row; uint list_row;
+    uint tiles_x; uint code_vectors; uint first_vector; uint first_plane; uint features;
     uint alpha_plane; float coupling;
 };
 
@@ -111,7 +112,7 @@ void store_gradients(uvec2 item, float sums[VALUES]) {
         vec4 f = vec4(0.0);
         [[unroll]] for (int n = 0; n < 4; n++)
             if (4 * k + n < FEATURES) f[n] = sums[VALUES - FEATURES + 4 * k + n];
-        if (uint(k) + first_vector < code_vectors) code_entries[item.y * code_vectors + first_vector + k] = f;
+        code_entries[item.y * FEATURE_VECTORS + k] = f;
     }
 #endif
 #else
@@ -127,15 +128,16 @@ void store_gradients(uvec2 item, float sums[VALUES]) {
 
 void main() {
     uint lane = gl_SubgroupInvocationID;
-    uint tile = gl_WorkGroupID.y * tiles_x + gl_WorkGroupID.x;
-    uvec2 corner = gl_WorkGroupID.xy * 8 + uvec2(lane % LANES_X, lane / LANES_X);
+    uint tile_row = gl_WorkGroupID.y + first_row, bottom = top + rows;
+    uint tile = (tile_row - list_row) * tiles_x + gl_WorkGroupID.x;
+    uvec2 corner = uvec2(gl_WorkGroupID.x, tile_row) * 8 + uvec2(lane % LANES_X, lane / LANES_X);
     vec2 origin = vec2(corner);
-    uint first = tile_ranges[tile], last = tile_ranges[tile + 1], pixels = width * height;
+    uint first = tile_ranges[tile], last = tile_ranges[tile + 1], pixels = width * rows;
 
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
-        bool inside = x < width && y < height;
-        uint pixel = inside ? y * width + x : 0;
+        bool inside = x < width && y < bottom;
+        uint pixel = inside ? (y - top) * width + x : 0;
         T[k] = inside ? 1.0 : -1.0;
         behind[k] = 0.0;
         [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {

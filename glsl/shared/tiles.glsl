@@ -15,7 +15,8 @@ struct Ellipse { // A' dx² + B' dx dy + C' dy² + k = 0, all coefficients but k
     int first_row, last_row;
 };
 
-Ellipse ellipse_of(uint splat, uint rows) {
+// Only rows of tiles from `begin` up to `end` count.
+Ellipse ellipse_of(uint splat, uint begin, uint end) {
     vec4 p = projected[3 * splat], q = projected[3 * splat + 1];
     precise float inv_a = 1.0 / p.z, det = q.z;
     precise float k = max(q.y - LOG2_ALPHA_MIN + MARGIN, 0.0) * p.z;
@@ -23,9 +24,8 @@ Ellipse ellipse_of(uint splat, uint rows) {
     precise float slope = -0.5 * p.w * inv_a, right_dy = -0.5 * p.w / q.x * half_width;
     Ellipse e = Ellipse(p.x, p.y, inv_a, det, k, slope, right_dy, 0, 0);
     // Clamping as floats first: a far splat must not overflow the conversion to int.
-    float last = float(rows) - 1.0;
-    e.first_row = int(clamp(ceil((e.v - half_height - float(TILE - 1)) / float(TILE)), 0.0, last + 1.0));
-    e.last_row = int(clamp(floor((e.v + half_height) / float(TILE)), -1.0, last));
+    e.first_row = int(clamp(ceil((e.v - half_height - float(TILE - 1)) / float(TILE)), float(begin), float(end)));
+    e.last_row = int(clamp(floor((e.v + half_height) / float(TILE)), float(begin) - 1.0, float(end) - 1.0));
     if (q.y < LOG2_ALPHA_MIN) e.last_row = -1;
     return e;
 }

@@ -291,6 +291,13 @@ mod tests {
         newer.known.size = 3;
         // SAFETY: as above.
         assert!(unsafe { read(&raw const newer.known) }.is_err(), "no version is that small");
+        // SAFETY: zero is a value.
+        let mut older: SvkTrainOptions = unsafe { std::mem::zeroed() };
+        older.size = std::mem::offset_of!(SvkTrainOptions, max_size);
+        (older.seed, older.max_size) = (3, 99);
+        // SAFETY: the structure is larger than it says.
+        let read = unsafe { read(&raw const older) }.ok().unwrap();
+        assert_eq!((read.seed, read.max_size), (3, 0), "a host of version 1 knows no max_size");
     }
 
     #[test]

@@ -121,12 +121,20 @@ fn pack_all(live: &mut LiveScene, camera: &Camera, wanted: &[Wanted]) -> Result<
         });
     }
     if packed.iter().any(Option::is_none) {
-        let frame = live.draw(camera)?;
+        let pixels = camera.width as usize * camera.height as usize;
         for (slot, w) in packed.iter_mut().zip(wanted) {
             if let What::Frame(source) = w.what {
-                *slot = Some(pack::pack(&device, frame, source, w.encoding)?);
+                *slot = Some(pack::texels(&device, pixels, source, w.encoding)?);
             }
         }
+        live.draw_bands(camera, |frame, band| {
+            for (slot, w) in packed.iter().zip(wanted) {
+                if let (Some(texels), What::Frame(source)) = (slot, &w.what) {
+                    pack::pack(&device, frame, band, *source, w.encoding, texels)?;
+                }
+            }
+            Ok(())
+        })?;
     }
     Ok(packed.into_iter().flatten().collect())
 }

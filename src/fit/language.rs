@@ -139,7 +139,7 @@ impl<'a> Run<'a> {
         let scale = SceneScale::measure(cameras, &splats.means);
         let model = Model::new(device, splats, channels)?;
         let mut views = Views::new(device, images, cameras, None, splats.len(), channels, scale.near())?;
-        let targets = CodeTargets::new(device, levels, images, 1.0 - options.image_weight)?;
+        let targets = CodeTargets::new(device, levels, images, &views, 1.0 - options.image_weight)?;
         let raster = RasterOptions {
             sh_degree: splats.sh_degree,
             feature_mode: match options.gauge {
@@ -155,10 +155,7 @@ impl<'a> Run<'a> {
         let losses = views
             .stages
             .iter()
-            .map(|s| {
-                let frame = s.raster.frame();
-                device.buffer::<f32>("language loss", frame.width as usize * frame.height as usize)
-            })
+            .map(|s| device.buffer::<f32>("language loss", s.raster.frame().bands.pixels()))
             .collect::<Result<_>>()?;
         Ok(Run {
             device: device.clone(),
@@ -244,8 +241,7 @@ impl<'a> Run<'a> {
                 }
             }
         }
-        let sums = self.views.stages[at].sums.read::<f32>()?;
-        self.recent.push(f64::from(sums[LANGUAGE_SUM as usize]));
+        self.recent.push(self.views.stages[at].total()?[LANGUAGE_SUM as usize]);
         Ok(())
     }
 
@@ -253,22 +249,20 @@ impl<'a> Run<'a> {
         let (item, stage) = (&self.views.list[view], self.views.stage(view));
         let frame = stage.raster.frame();
         let mut rec = Recorder::new(&self.device, "language step");
-        stage.raster.record_forward(&mut rec, &self.model.values, &self.raster);
-        if !self.options.detach_geometry {
-            let weights = IMAGE_WEIGHTS.map(|w| w * self.options.image_weight);
-            stage.loss.record(
-                &mut rec,
-                &frame.planes,
-                &item.target,
-                &frame.planes_grad,
-                weights,
-                (&stage.sums, 0),
-            );
-        }
+        stage.raster.record_projection(&mut rec, &self.model.values, &self.raster);
+        let weights = IMAGE_WEIGHTS.map(|w| w * self.options.image_weight);
         let loss = &self.losses[item.stage];
-        codes::record(&mut rec, &self.targets.of(view), frame, loss, Mode::Loss);
-        sum::record(&mut rec, loss, &self.partials, &stage.sums, LANGUAGE_SUM);
-        stage.raster.record_backward(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
+        for band in frame.bands.iter() {
+            stage.raster.record_band(&mut rec, &self.model.values, &band);
+            if !self.options.detach_geometry {
+                let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(&band)));
+                stage.loss.record(&mut rec, &band, &frame.planes, target, &frame.planes_grad, weights, sums);
+            }
+            codes::record(&mut rec, &self.targets.of(view, &band), frame, loss, Mode::Loss);
+            sum::record(&mut rec, loss, &self.partials, &stage.sums, stage.slot(&band) + LANGUAGE_SUM);
+            stage.raster.record_band_backward(&mut rec, &self.model.values, &self.raster, &band);
+        }
+        stage.raster.record_gradients(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
         self.model.record_feature_step(&mut rec, &frame.status);
         if !self.options.detach_geometry {
             self.model.record_step(&mut rec, &frame.status);
@@ -283,18 +277,20 @@ impl<'a> Run<'a> {
             self.views.set_camera(view, &self.cameras[view])?;
             let at = self.views.list[view].stage;
             let stage = &mut self.views.stages[at];
-            stage.raster.forward(&self.model.values, &self.raster)?;
-            let frame = stage.raster.frame();
-            let pixels = frame.width as usize * frame.height as usize;
-            let planes = frame.planes.read::<f32>()?;
-            for (l, level) in self.levels.iter().enumerate() {
-                let Some(labels) = level.targets.get(view) else { continue };
-                let first = (4 + l * self.width) * pixels;
-                let block = &planes[first..first + self.width * pixels];
-                let [right, valid] = decoded_right(level, &labels.data, block);
-                counts[l][0] += right;
-                counts[l][1] += valid;
-            }
+            let (levels, width) = (&self.levels, self.width);
+            stage.raster.forward_bands(&self.model.values, &self.raster, |frame, band| {
+                let pixels = frame.bands.pixels();
+                for (l, level) in levels.iter().enumerate() {
+                    let Some(labels) = level.targets.get(view) else { continue };
+                    let labels = frame.bands.cut_inner(band, &labels.data, -1);
+                    let first = (4 + l * width) * pixels;
+                    let block = frame.planes.read_range::<f32>(first..first + width * pixels)?;
+                    let [right, valid] = decoded_right(level, &labels, &block);
+                    counts[l][0] += right;
+                    counts[l][1] += valid;
+                }
+                Ok(())
+            })?;
         }
         let accuracy = counts.iter().map(|c| c[0] as f64 / c[1].max(1) as f64).collect();
         let loss = self.recent.iter().sum::<f64>() / self.recent.len().max(1) as f64;

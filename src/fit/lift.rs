@@ -4,6 +4,7 @@ use super::model::Model;
 use super::options::FeatureGauge;
 use super::views::Views;
 use crate::gpu::{Buffer, Device, Recorder};
+use crate::pass::bands::Band;
 use crate::pass::codes::{self, Mode, Targets};
 use crate::pass::rasterizer::RasterOptions;
 use crate::pass::twin::FeatureMode;
@@ -22,8 +23,8 @@ pub(super) struct CodeTargets {
     width: u32,
     /// [ΣK, d], all levels.
     codes: Buffer,
-    /// Per view: [levels, H·W] rows of `codes`, −1 = none.
-    labels: Vec<Buffer>,
+    /// Per view and band: [levels, rows·W] rows of `codes`, −1 = none, or another band's.
+    labels: Vec<Vec<Buffer>>,
     /// Per view: [levels] weight of one labelled value.
     weights: Vec<Buffer>,
 }
@@ -35,6 +36,7 @@ impl CodeTargets {
         device: &Device,
         levels: &[&LevelField],
         images: &[RgbImage],
+        views: &Views,
         weight: f64,
     ) -> Result<Self> {
         let width = levels[0].codebook.code_dim;
@@ -52,7 +54,9 @@ impl CodeTargets {
                 scale.push((weight / (levels.len() * valid * width) as f64) as f32);
                 first += level.codebook.len() as i32;
             }
-            labels.push(device.buffer_from("code labels", &rows)?);
+            let bands = &views.stage(view).raster.frame().bands;
+            let band = |b| device.buffer_from("code labels", &bands.cut_inner(&b, &rows, -1));
+            labels.push(bands.iter().map(band).collect::<Result<_>>()?);
             weights.push(device.buffer_from("code weights", &scale)?);
         }
         Ok(CodeTargets {
@@ -64,10 +68,10 @@ impl CodeTargets {
         })
     }
 
-    /// What the language loss of one view reads.
-    pub(super) fn of(&self, view: usize) -> Targets<'_> {
+    /// What the language loss of one band of a view reads.
+    pub(super) fn of(&self, view: usize, band: &Band) -> Targets<'_> {
         Targets {
-            labels: &self.labels[view],
+            labels: &self.labels[view][band.index],
             codes: &self.codes,
             weights: &self.weights[view],
             levels: self.levels,
@@ -114,13 +118,23 @@ pub(super) fn lift(
         views.set_camera(view, camera)?;
         let at = views.list[view].stage;
         let stage = &mut views.stages[at];
-        stage.raster.forward(&model.values, raster)?;
-        let frame = stage.raster.frame();
-        let scratch = device.buffer::<f32>("language loss", (frame.width * frame.height) as usize)?;
-        let mut rec = Recorder::new(device, "lift");
-        codes::record(&mut rec, &targets.of(view), frame, &scratch, Mode::Lift);
-        stage.raster.record_backward(&mut rec, &model.values, raster, &model.gradients);
-        rec.run()?;
+        let scratch = device.buffer::<f32>("language loss", stage.raster.frame().bands.pixels())?;
+        loop {
+            let frame = stage.raster.frame();
+            let mut rec = Recorder::new(device, "lift");
+            stage.raster.record_projection(&mut rec, &model.values, raster);
+            for band in frame.bands.iter() {
+                stage.raster.record_band(&mut rec, &model.values, &band);
+                codes::record(&mut rec, &targets.of(view, &band), frame, &scratch, Mode::Lift);
+                stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
+            }
+            stage.raster.record_gradients(&mut rec, &model.values, raster, &model.gradients);
+            rec.run()?;
+            match stage.raster.overflow()? {
+                Some(needed) => stage.raster.grow(needed)?,
+                None => break,
+            }
+        }
         let seen = model.gradients.features.read_range::<f32>(0..total)?;
         sums.iter_mut().zip(seen).for_each(|(s, v)| *s += v);
     }

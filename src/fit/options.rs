@@ -98,6 +98,15 @@ impl RgbOptions {
         }
     }
 
+    /// No more than `most` splats in the end; `planned` is how many there would be with those beyond the photos' borders.
+    pub fn limit_splats(&mut self, most: usize, planned: usize) {
+        let beyond = planned.saturating_sub(self.init.max_points);
+        self.init.max_points = self.init.max_points.min(most.saturating_sub(beyond));
+        if let Some(densify) = &mut self.densify {
+            densify.max_splats = densify.max_splats.min(most);
+        }
+    }
+
     /// The same options for another number of steps; schedules end with the run.
     pub fn with_iterations(mut self, iterations: usize) -> Self {
         self.iterations = iterations;

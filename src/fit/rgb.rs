@@ -261,8 +261,8 @@ impl<'a> Run<'a> {
             }
         }
         let stage = self.views.stage(view);
-        let sums = stage.sums.read::<f32>()?;
-        self.recent.push(stage.loss.loss([sums[0], sums[1]]));
+        let [l1, ssim, ..] = stage.total()?;
+        self.recent.push(stage.loss.loss([l1, ssim]));
         self.move_camera(view, iteration)
     }
 
@@ -275,23 +275,21 @@ impl<'a> Run<'a> {
         let (item, stage) = (&self.views.list[view], self.views.stage(view));
         let frame = stage.raster.frame();
         let mut rec = Recorder::new(&self.device, "rgb step");
-        stage.raster.record_forward(&mut rec, &self.model.values, &self.raster);
+        stage.raster.record_projection(&mut rec, &self.model.values, &self.raster);
         let weights = [self.options.l1_weight, self.options.dssim_weight];
-        stage.loss.record(
-            &mut rec,
-            &frame.planes,
-            &item.target,
-            &frame.planes_grad,
-            weights,
-            (&stage.sums, 0),
-        );
-        // Without depth of its own, a view clears what another of its size may have left.
-        let (reference, pixels) = match &item.depth {
-            Some((reference, count)) => (Some(reference), *count as f64),
-            None => (None, 1.0),
-        };
-        regularise::record_depth(&mut rec, frame, reference, self.options.depth_weight / pixels);
-        stage.raster.record_backward(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
+        for band in frame.bands.iter() {
+            stage.raster.record_band(&mut rec, &self.model.values, &band);
+            let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(&band)));
+            stage.loss.record(&mut rec, &band, &frame.planes, target, &frame.planes_grad, weights, sums);
+            // Without depth of its own, a view clears what another of its size may have left.
+            let (reference, pixels) = match &item.depth {
+                Some((references, count)) => (Some(&references[band.index]), *count as f64),
+                None => (None, 1.0),
+            };
+            regularise::record_depth(&mut rec, frame, reference, self.options.depth_weight / pixels);
+            stage.raster.record_band_backward(&mut rec, &self.model.values, &self.raster, &band);
+        }
+        stage.raster.record_gradients(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
         if let Some(stats) = &self.stats {
             stats.record(&mut rec, frame, self.model.count());
         }
@@ -325,7 +323,13 @@ impl<'a> Run<'a> {
             return Ok(None);
         }
         self.model.check(step)?;
-        let shown = self.views.shown(self.last)?;
+        let shown = match self.views.shown(self.last)? {
+            Some(shown) => shown,
+            None => {
+                let camera = self.cameras[self.last].clone();
+                self.views.render(self.last, &camera, &self.model, &self.raster)?
+            }
+        };
         self.psnr[self.last] = Some(psnr(&shown, &self.images[self.last]).min(MOST_PSNR));
         let known: Vec<f64> = self.psnr.iter().flatten().copied().collect();
         let n = self.recent.len().max(1) as f64;

@@ -1,7 +1,8 @@
-//! The training views in GPU memory, and one rasteriser per image size.
+//! The training views in GPU memory, in the bands that the device binds, and one rasteriser per image size.
 use crate::gpu::{Buffer, Device};
+use crate::pass::bands::Band;
 use crate::pass::metrics::planar;
-use crate::pass::rasterizer::{RasterOptions, Rasterizer};
+use crate::pass::rasterizer::{FrameBuffers, RasterOptions, Rasterizer};
 use crate::pass::ssim_l1::SsimL1;
 use crate::pass::view::View;
 use crate::scene::{Camera, DepthMap, RgbImage};
@@ -13,18 +14,41 @@ use super::model::Model;
 pub(super) struct TrainView {
     /// Index into [`Views::stages`].
     pub(super) stage: usize,
-    /// [3, H, W] photo.
-    pub(super) target: Buffer,
-    /// [H, W] depth where it is trusted, else 0; and the number of trusted pixels.
-    pub(super) depth: Option<(Buffer, usize)>,
+    /// Per band [3, rows, W] of the photo.
+    pub(super) target: Vec<Buffer>,
+    /// Per band [rows, W] depth where it is trusted and the band's own, else 0; and the number of trusted pixels.
+    pub(super) depth: Option<(Vec<Buffer>, usize)>,
 }
 
 /// What views of one size share.
 pub(super) struct Stage {
     pub(super) raster: Rasterizer,
     pub(super) loss: SsimL1,
-    /// Σ|x−y|, ΣSSIM, language loss.
+    /// Per band Σ|x−y|, ΣSSIM, language loss, unused: [`SUMS`] floats.
     pub(super) sums: Buffer,
+}
+
+/// Loss sums of a band.
+pub(super) const SUMS: usize = 4;
+
+impl Stage {
+    fn new(device: &Device, capacity: usize, feature_dim: usize, size: [u32; 2]) -> Result<Stage> {
+        let raster = Rasterizer::new(device, capacity, feature_dim, size[0], size[1])?;
+        let loss = SsimL1::new(device, &raster.frame().bands)?;
+        let sums = device.buffer::<f32>("loss sums", SUMS * raster.frame().bands.count())?;
+        Ok(Stage { raster, loss, sums })
+    }
+
+    /// Where the sums of a band begin.
+    pub(super) fn slot(&self, band: &Band) -> u32 {
+        (SUMS * band.index) as u32
+    }
+
+    /// [`SUMS`] numbers added up over the bands.
+    pub(super) fn total(&self) -> Result<[f64; SUMS]> {
+        let sums = self.sums.read::<f32>()?;
+        Ok(std::array::from_fn(|k| sums.iter().skip(k).step_by(SUMS).map(|v| f64::from(*v)).sum()))
+    }
 }
 
 /// All views.
@@ -54,11 +78,7 @@ impl Views {
             let stage = match views.stages.iter().position(same) {
                 Some(found) => found,
                 None => {
-                    views.stages.push(Stage {
-                        raster: Rasterizer::new(device, capacity, feature_dim, size[0], size[1])?,
-                        loss: SsimL1::new(device, image.width, image.height)?,
-                        sums: device.buffer::<f32>("loss sums", 4)?,
-                    });
+                    views.stages.push(Stage::new(device, capacity, feature_dim, size)?);
                     views.stages.len() - 1
                 }
             };
@@ -66,11 +86,18 @@ impl Views {
                 Some((maps, least)) => maps.get(i).map(|m| trusted(m, least, image)).transpose()?.flatten(),
                 None => None,
             };
+            let bands = &views.stages[stage].raster.frame().bands;
             let depth = match depth {
-                Some((map, count)) => Some((device.buffer_from("stereo depth", &map)?, count)),
+                Some((map, count)) => {
+                    let band = |b| device.buffer_from("stereo depth", &bands.cut_inner(&b, &map, 0.0));
+                    Some((bands.iter().map(band).collect::<Result<_>>()?, count))
+                }
                 None => None,
             };
-            views.list.push(TrainView { stage, target: device.buffer_from("photo", &planar(image))?, depth });
+            let photo = planar(image);
+            let target = bands.iter().map(|b| device.buffer_from("photo", &bands.cut(&b, &photo)));
+            let target = target.collect::<Result<_>>()?;
+            views.list.push(TrainView { stage, target, depth });
         }
         Ok(views)
     }
@@ -105,19 +132,32 @@ impl Views {
         self.set_camera(view, camera)?;
         let at = self.list[view].stage;
         let stage = &mut self.stages[at];
-        stage.raster.forward(&model.values, options)?;
-        self.shown(view)
+        let (width, height) = (camera.width as usize, camera.height as usize);
+        let mut image = RgbImage { width, height, data: Vec::with_capacity(width * height) };
+        let seen = |frame: &FrameBuffers, band: &Band| {
+            image.data.extend(colours(frame, band)?);
+            Ok(())
+        };
+        stage.raster.forward_bands(&model.values, options, seen)?;
+        Ok(image)
     }
 
-    /// What the view's rasteriser last rendered: colours clipped to [0, 1].
-    pub(super) fn shown(&self, view: usize) -> Result<RgbImage> {
+    /// What the view's rasteriser last rendered: colours clipped to [0, 1]. `None` where that was only a band of it.
+    pub(super) fn shown(&self, view: usize) -> Result<Option<RgbImage>> {
         let frame = self.stage(view).raster.frame();
-        let (width, height) = (frame.width as usize, frame.height as usize);
-        let pixels = width * height;
-        let planes = frame.planes.read_range::<f32>(0..3 * pixels)?;
-        let data = (0..pixels).map(|i| [0, 1, 2].map(|c| planes[c * pixels + i].clamp(0.0, 1.0))).collect();
-        Ok(RgbImage { width, height, data })
+        if frame.bands.count() > 1 {
+            return Ok(None);
+        }
+        let data = colours(frame, &frame.bands.get(0))?;
+        Ok(Some(RgbImage { width: frame.width as usize, height: frame.height as usize, data }))
     }
+}
+
+/// What a band answers for, clipped to [0, 1].
+fn colours(frame: &FrameBuffers, band: &Band) -> Result<Vec<[f32; 3]>> {
+    let (stride, rows) = (frame.bands.pixels(), frame.bands.stored(band));
+    let planes = frame.planes.read_range::<f32>(0..3 * stride)?;
+    Ok(rows.map(|i| [0, 1, 2].map(|c| planes[c * stride + i].clamp(0.0, 1.0))).collect())
 }
 
 /// Depth where confidence suffices, and how many pixels that are; `None` when there are none.

@@ -22,17 +22,22 @@ pub struct Options {
     pub staging: bool,
     /// Only passes that give the same bits on every run of this device, even where others are faster.
     pub deterministic: bool,
+    /// No buffer larger than this, bytes, although the device would bind more: to test what is done in blocks.
+    pub max_binding: Option<u64>,
     /// Use the compare-and-swap loop although the device has float atomics (to test it).
     pub no_float_atomics: bool,
 }
 
 impl Options {
-    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`.
+    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`; `SPLATVK_MAX_BINDING` in MiB.
     pub fn from_env(choice: Option<&str>) -> Self {
         let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
         Options {
             choice: choice.map(str::to_owned).or_else(|| variable("SPLATVK_DEVICE")),
             validation: variable("SPLATVK_VALIDATION").is_some_and(|v| v == "1"),
+            max_binding: variable("SPLATVK_MAX_BINDING")
+                .and_then(|v| v.parse::<u64>().ok())
+                .map(|mib| mib.saturating_mul(1 << 20)),
             ..Options::default()
         }
     }
@@ -65,6 +70,8 @@ pub struct DeviceInfo {
     pub capabilities: BTreeSet<Capability>,
     /// Largest buffer a shader can see, bytes.
     pub max_storage_range: u64,
+    /// Memory of the largest heap that is the device's own, bytes.
+    pub memory: u64,
     /// Largest dispatch, in workgroups.
     pub max_groups: [u32; 3],
     /// Threads in a workgroup at most.

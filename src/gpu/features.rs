@@ -160,10 +160,15 @@ fn describe(
         properties = properties.push_next(&mut control);
     }
     // SAFETY: plain queries on a physical device of this instance, with structures it knows.
-    let families = unsafe {
+    let (families, memory) = unsafe {
         instance.get_physical_device_properties2(candidate.physical, &mut properties);
-        instance.get_physical_device_queue_family_properties(candidate.physical)
+        (
+            instance.get_physical_device_queue_family_properties(candidate.physical),
+            instance.get_physical_device_memory_properties(candidate.physical),
+        )
     };
+    let own = |heap: &&vk::MemoryHeap| heap.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL);
+    let memory = memory.memory_heaps_as_slice().iter().filter(own).map(|heap| heap.size).max().unwrap_or(0);
     let limits = candidate.properties.limits;
     let pins = offer.subgroup_control
         && control.required_subgroup_size_stages.contains(vk::ShaderStageFlags::COMPUTE);
@@ -196,7 +201,9 @@ fn describe(
         float_atomics,
         deterministic: options.deterministic,
         capabilities: capabilities(offer, &v11, float_atomics),
-        max_storage_range: u64::from(limits.max_storage_buffer_range),
+        max_storage_range: u64::from(limits.max_storage_buffer_range)
+            .min(options.max_binding.unwrap_or(u64::MAX)),
+        memory,
         max_groups: limits.max_compute_work_group_count,
         max_workgroup_threads: limits.max_compute_work_group_invocations,
         shared_memory: limits.max_compute_shared_memory_size,

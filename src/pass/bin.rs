@@ -12,6 +12,7 @@ use super::scan::Scan;
 use super::sort::Sort;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
+use std::ops::Range;
 
 /// Tile edge, pixels. 8 evaluates 2.9 times the pairs it blends, 16 six times (measured on the seeded scene).
 pub const TILE: u32 = 8;
@@ -69,7 +70,7 @@ impl TileLists {
     ) -> Result<TileLists> {
         let group = match grouping {
             Grouping::Counting => {
-                let lanes = counting_lanes(tiles);
+                let lanes = counting_lanes(tiles, device.info().max_storage_range);
                 let counters = device.buffer::<u32>("tile counters", tiles * lanes as usize)?;
                 Group::Counting { counters, lanes }
             }
@@ -93,23 +94,40 @@ impl TileLists {
 }
 
 /// Few lanes keep a CPU device busy, and more only add counters to clear and scan; their number is also bounded by
-/// memory: 16 M counters are 64 MiB, half of the smallest buffer limit Vulkan drivers have in practice.
-fn counting_lanes(tiles: usize) -> u32 {
-    let bound = ((1 << 24) / tiles.max(1)).max(8) as u32;
+/// memory: 16 M counters are 64 MiB, half of the smallest buffer limit that Vulkan allows.
+fn counting_lanes(tiles: usize, binding: u64) -> u32 {
+    let counters = (binding / 4).min(1 << 24) as usize;
+    let bound = (counters / tiles.max(1)).max(8) as u32;
     64.min(bound) / 8 * 8
 }
 
+/// Bytes per entry of the widest list.
+const ENTRY_BYTES: u64 = 8;
+
+/// Entries that the device binds.
+pub(super) fn most_entries(device: &Device) -> usize {
+    (device.info().max_storage_range / ENTRY_BYTES) as usize
+}
+
 /// Records counting, writing and grouping of the entries of `count` depth-sorted splats (`splat_count` holds the same
-/// number on the device); the lists land in `frame.lists`, the number of entries needed in `frame.status`.
-pub(super) fn record(rec: &mut Recorder, frame: &FrameBuffers, count: usize, splat_count: &Buffer) {
-    let ([tiles_x, tiles_y], count, lists) = (frame.tiles(), count as u32, &frame.lists);
+/// number on the device) on these rows of tiles; the lists land in `frame.lists`, the number of entries needed in
+/// `frame.status`.
+pub(super) fn record(
+    rec: &mut Recorder,
+    frame: &FrameBuffers,
+    rows: &Range<u32>,
+    count: usize,
+    splat_count: &Buffer,
+) {
+    let (tiles_x, count, lists) = (frame.tiles()[0], count as u32, &frame.lists);
+    let (first_row, end_row, tiles) = (rows.start, rows.end, tiles_x * (rows.end - rows.start));
     let call = shaders::bin_count::call(
         &shaders::bin_count::Bindings {
             projected: &frame.projected,
             depth_pairs: &frame.depth_pairs,
             tile_counts: &lists.counts,
         },
-        &shaders::bin_count::Push { count, tiles_x, tiles_y },
+        &shaders::bin_count::Push { count, tiles_x, first_row, end_row },
     );
     rec.dispatch_threads(call, [count, 1, 1]);
     lists.scan.record(rec, &lists.counts, splat_count, &lists.starts, &frame.status);
@@ -137,16 +155,19 @@ pub(super) fn record(rec: &mut Recorder, frame: &FrameBuffers, count: usize, spl
             counters,
             entry_splats,
         },
-        &shaders::bin_emit::Push { count, tiles_x, tiles_y, lanes, capacity: lists.capacity as u32 },
+        &shaders::bin_emit::Push {
+            count,
+            tiles_x,
+            first_row,
+            end_row,
+            lanes,
+            capacity: lists.capacity as u32,
+        },
     );
     rec.dispatch_threads(call, [lanes, 1, 1]);
     match &lists.group {
-        Group::Counting { counters, lanes } => {
-            group_by_counting(rec, lists, tiles_x * tiles_y, counters, *lanes)
-        }
-        Group::Sorting { entry_splats, sort } => {
-            group_by_sorting(rec, lists, tiles_x * tiles_y, entry_splats, sort)
-        }
+        Group::Counting { counters, lanes } => group_by_counting(rec, lists, tiles, counters, *lanes),
+        Group::Sorting { entry_splats, sort } => group_by_sorting(rec, lists, tiles, entry_splats, sort),
     }
 }
 

@@ -26,10 +26,11 @@ pub enum Mode {
     Lift,
 }
 
-/// Records the loss of a frame: writes the feature planes of `frame.planes_grad` and, per pixel, `loss` [H·W].
+/// Records the loss of a frame, or of the band in its planes: writes the feature planes of `frame.planes_grad` and, per
+/// pixel, `loss` [H·W].
 pub fn record(rec: &mut Recorder, targets: &Targets, frame: &FrameBuffers, loss: &Buffer, mode: Mode) {
     rec.pass("feature loss");
-    let pixels = frame.width * frame.height;
+    let pixels = frame.pixels();
     record_planes(rec, targets, &frame.planes, &frame.planes_grad, loss, pixels, mode);
 }
 

@@ -1,5 +1,6 @@
 //! One file per GPU pass, each with its CPU twin.
 pub mod adam;
+pub mod bands;
 pub mod bin;
 pub mod close;
 pub mod codes;

@@ -1,4 +1,5 @@
 //! Planes of a rendered frame to texels as host programs want them.
+use super::bands::Band;
 use super::raster_forward::BASE_CHANNELS;
 use super::rasterizer::FrameBuffers;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
@@ -82,37 +83,47 @@ impl Encoding {
     }
 }
 
-/// Packs a part of a rendered frame into a new buffer of exactly [`Encoding::bytes`]. Twin: [`texels_of`].
-pub fn pack(device: &Device, frame: &FrameBuffers, source: Source, encoding: Encoding) -> Result<Buffer> {
-    let pixels = frame.width as usize * frame.height as usize;
+/// A buffer of exactly [`Encoding::bytes`] for a part of an image.
+pub fn texels(device: &Device, pixels: usize, source: Source, encoding: Encoding) -> Result<Buffer> {
+    device.buffer::<u32>("texels", encoding.bytes(source.channels(), pixels) / 4)
+}
+
+/// Packs what a band of a rendered frame answers for into the [`texels`] of the image. Twin: [`texels_of`].
+pub fn pack(
+    device: &Device,
+    frame: &FrameBuffers,
+    band: &Band,
+    source: Source,
+    encoding: Encoding,
+    texels: &Buffer,
+) -> Result<()> {
+    let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
     if let Source::Features(first, count) = source
         && (count == 0 || first + count > frame.feature_dim)
     {
         return Err(Error::work(format!("the frame has no features {first} to {}", first + count)));
     }
     let channels = source.channels();
-    let texels = device.buffer::<u32>("texels", encoding.bytes(channels, pixels) / 4)?;
     let mut rec = Recorder::new(device, "pack");
     rec.dispatch_threads(
         shaders::pack::call(
-            &shaders::pack::Bindings {
-                planes: &frame.planes,
-                transmittance: &frame.transmittance,
-                texels: &texels,
-            },
+            &shaders::pack::Bindings { planes: &frame.planes, transmittance: &frame.transmittance, texels },
             &shaders::pack::Push {
-                pixels: pixels as u32,
+                pixels: frame.width * frame.height,
                 source: source.index(),
                 first: source.first() as u32,
                 channels: channels as u32,
                 group: encoding.texel(channels).0 as u32,
                 encoding: encoding.index(),
+                stride: frame.pixels(),
+                from: stored.start as u32,
+                to: inner.start as u32,
+                count: inner.len() as u32,
             },
         ),
-        [pixels as u32, 1, 1],
+        [inner.len() as u32, 1, 1],
     );
-    rec.run()?;
-    Ok(texels)
+    rec.run()
 }
 
 /// Twin of [`pack`]: bytes of the texels from `planes` [C, P] and `transmittance` [P].
@@ -161,11 +172,14 @@ mod tests {
         let noise = |i: usize| ((i * 7919 + 13) % 97) as f32 / 64.0;
         let planes: Vec<f32> = (0..(BASE_CHANNELS + dim) * pixels).map(noise).collect();
         let transmittance: Vec<f32> = (0..pixels).map(|i| (i % 9) as f32 / 8.0).collect();
+        let band = raster.frame().bands.get(0);
         raster.frame().planes.write(&planes).unwrap();
         raster.frame().transmittance.write(&transmittance).unwrap();
         for source in [Source::Colour, Source::Alpha, Source::Depth, Source::Features(1, 5)] {
             for encoding in [Encoding::F32, Encoding::F32x4, Encoding::F16x4, Encoding::Unorm8x4] {
-                let got = pack(&device, raster.frame(), source, encoding).unwrap().read::<u8>().unwrap();
+                let out = texels(&device, pixels, source, encoding).unwrap();
+                pack(&device, raster.frame(), &band, source, encoding, &out).unwrap();
+                let got = out.read::<u8>().unwrap();
                 let expected = texels_of(&planes, &transmittance, source, encoding);
                 assert_eq!(got.len(), encoding.bytes(source.channels(), pixels), "{source:?} {encoding:?}");
                 if encoding == Encoding::F16x4 && source == Source::Depth {
@@ -179,6 +193,7 @@ mod tests {
                 }
             }
         }
-        assert!(pack(&device, raster.frame(), Source::Features(2, 5), Encoding::F32).is_err());
+        let out = device.buffer::<u32>("texels", 5 * pixels).unwrap();
+        assert!(pack(&device, raster.frame(), &band, Source::Features(2, 5), Encoding::F32, &out).is_err());
     }
 }

@@ -62,16 +62,39 @@ pub trait Matcher {
     fn planes(&self) -> Result<Vec<Vec4>>;
 }
 
-/// Matching at one resolution on the device.
+/// Matching at one resolution on the device. Where it does not bind the planes of all views at once, those of a reference
+/// and its sources are brought together for every pass.
 pub struct GpuMatcher {
     device: Device,
-    quads: Buffer,
     sources: Buffer,
+    /// What a pass binds: all views, or one group.
+    quads: Buffer,
     planes: Buffer,
+    /// Every view on its own, where they are grouped.
+    views: Vec<ViewBuffers>,
+    /// Pixels of all views.
+    pixels: usize,
+}
+
+/// One view of a grouped matcher.
+struct ViewBuffers {
+    quads: Buffer,
+    planes: Buffer,
+    /// Views that a pass with this reference needs, itself first.
+    group: Vec<usize>,
+}
+
+/// Bytes of a plane.
+const PLANE_BYTES: usize = size_of::<[f32; 4]>();
+
+/// Bytes of the largest buffer that matching needs for these views: `groups` are the pixels of each reference and its
+/// sources together, `all` those of all views.
+pub fn binding(all: usize, groups: impl Iterator<Item = usize>) -> usize {
+    PLANE_BYTES * groups.max().unwrap_or(0).min(all)
 }
 
 impl GpuMatcher {
-    /// `luma` and `planes` (π, cost) hold all views one after the other, `widths` one entry per view and its pixels.
+    /// `luma` and `planes` (π, cost) hold all views one after the other, as the references say.
     pub fn new(
         device: &Device,
         luma: &[f32],
@@ -80,13 +103,73 @@ impl GpuMatcher {
         planes: &[Vec4],
     ) -> Result<Self> {
         let planes: Vec<[f32; 4]> = planes.iter().map(Vec4::to_array).collect();
+        let quads = quads(luma, references);
+        let (device, pixels) = (device.clone(), luma.len());
+        if (PLANE_BYTES * pixels) as u64 <= device.info().max_storage_range {
+            return Ok(GpuMatcher {
+                quads: device.buffer_from("stereo quads", &quads)?,
+                sources: device.buffer_from("stereo sources", sources)?,
+                planes: device.buffer_from("stereo planes", &planes)?,
+                views: Vec::new(),
+                device,
+                pixels,
+            });
+        }
+        let (mut views, mut grouped, mut largest) = (Vec::new(), sources.to_vec(), 0);
+        for (view, r) in references.iter().enumerate() {
+            let (mut group, mut held) = (vec![view], pixels_of(r));
+            for source in &mut grouped[r.first_source as usize..(r.first_source + r.sources) as usize] {
+                group.extend(references.iter().position(|other| other.first == source.size[2]));
+                // Where the source's pixels lie in the group.
+                let own = (source.size[0] * source.size[1]) as usize;
+                source.size[2] = held as u32;
+                held += own;
+            }
+            largest = largest.max(held);
+            let own = r.first as usize..r.first as usize + pixels_of(r);
+            views.push(ViewBuffers {
+                quads: device.buffer_from("stereo quads", &quads[own.clone()])?,
+                planes: device.buffer_from("stereo planes", &planes[own])?,
+                group,
+            });
+        }
         Ok(GpuMatcher {
-            device: device.clone(),
-            quads: device.buffer_from("stereo quads", &quads(luma, references))?,
-            sources: device.buffer_from("stereo sources", sources)?,
-            planes: device.buffer_from("stereo planes", &planes)?,
+            quads: device.buffer::<[u32; 2]>("stereo quads", largest)?,
+            sources: device.buffer_from("stereo sources", &grouped)?,
+            planes: device.buffer::<[f32; 4]>("stereo planes", largest)?,
+            views,
+            device,
+            pixels,
         })
     }
+
+    /// The view of a reference, where views are grouped.
+    fn view_of(&self, r: &Reference) -> Option<&ViewBuffers> {
+        let mut first = 0;
+        self.views.iter().find(|view| {
+            let found = first == r.first as usize;
+            first += view.planes.len::<[f32; 4]>();
+            found
+        })
+    }
+
+    /// Records one pass: `dispatch` gets where the reference's pixels begin in the buffers.
+    fn record(&self, rec: &mut Recorder, r: &Reference, dispatch: impl FnOnce(&mut Recorder, u32)) {
+        let Some(view) = self.view_of(r) else { return dispatch(rec, r.first) };
+        let (mut quad, mut plane) = (0, 0);
+        for member in view.group.iter().map(|&v| &self.views[v]) {
+            rec.copy_bytes(&member.quads, 0, &self.quads, quad, member.quads.bytes());
+            rec.copy_bytes(&member.planes, 0, &self.planes, plane, member.planes.bytes());
+            quad += member.quads.bytes();
+            plane += member.planes.bytes();
+        }
+        dispatch(rec, 0);
+        rec.copy_bytes(&self.planes, 0, &view.planes, 0, view.planes.bytes());
+    }
+}
+
+fn pixels_of(r: &Reference) -> usize {
+    r.width as usize * r.height as usize
 }
 
 /// Per pixel its own luma and that of the pixels to the right, below and diagonally below, 16 bits each.
@@ -110,7 +193,7 @@ fn quads(luma: &[f32], references: &[Reference]) -> Vec<[u32; 2]> {
 }
 
 macro_rules! push {
-    ($shader:ident, $r:expr) => {
+    ($shader:ident, $r:expr, $first:expr) => {
         $shader::Push {
             intrinsics: $r.intrinsics,
             range: $r.range,
@@ -118,12 +201,13 @@ macro_rules! push {
             seed: $r.seed,
             width: $r.width,
             height: $r.height,
-            first: $r.first,
+            first: $first,
             first_source: $r.first_source,
             sources: $r.sources,
             parity: $r.parity,
             planes: $r.planes,
             smoothness: $r.smoothness,
+            identity: $r.first,
         }
     };
 }
@@ -133,7 +217,10 @@ impl Matcher for GpuMatcher {
         let bindings =
             plane_sweep::Bindings { quads: &self.quads, sources: &self.sources, planes: &self.planes };
         let mut rec = Recorder::new(&self.device, "plane sweep");
-        rec.dispatch_threads(plane_sweep::call(&bindings, &push!(plane_sweep, r)), [r.width, r.height, 1]);
+        self.record(&mut rec, r, |rec, first| {
+            let call = plane_sweep::call(&bindings, &push!(plane_sweep, r, first));
+            rec.dispatch_threads(call, [r.width, r.height, 1]);
+        });
         rec.run()
     }
 
@@ -141,12 +228,20 @@ impl Matcher for GpuMatcher {
         let bindings =
             plane_sweep_refine::Bindings { quads: &self.quads, sources: &self.sources, planes: &self.planes };
         let mut rec = Recorder::new(&self.device, "plane refinement");
-        let call = plane_sweep_refine::call(&bindings, &push!(plane_sweep_refine, r));
-        rec.dispatch_threads(call, [r.width.div_ceil(2), r.height, 1]);
+        self.record(&mut rec, r, |rec, first| {
+            let call = plane_sweep_refine::call(&bindings, &push!(plane_sweep_refine, r, first));
+            rec.dispatch_threads(call, [r.width.div_ceil(2), r.height, 1]);
+        });
         rec.run()
     }
 
     fn planes(&self) -> Result<Vec<Vec4>> {
-        Ok(self.planes.read::<[f32; 4]>()?.into_iter().map(Vec4::from).collect())
+        let mut planes = Vec::with_capacity(self.pixels);
+        let whole = [&self.planes];
+        let own: Vec<&Buffer> = self.views.iter().map(|v| &v.planes).collect();
+        for buffer in if own.is_empty() { &whole[..] } else { &own[..] } {
+            planes.extend(buffer.read::<[f32; 4]>()?.into_iter().map(Vec4::from));
+        }
+        Ok(planes)
     }
 }

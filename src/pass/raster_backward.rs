@@ -10,7 +10,7 @@
 //! ∂(A, B, C) = (−½ m₃, −m₄, −½ m₅).
 use super::adam::rows_of_groups;
 use super::raster_forward::{BASE_CHANNELS, Block, Cutoffs, TwinScene, blocks, channels_of, push, walk};
-use super::rasterizer::FrameBuffers;
+use super::rasterizer::{FrameBuffers, Tiles};
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 
@@ -18,6 +18,16 @@ use crate::gpu::{Buffer, Device, Recorder, shaders};
 pub const MOMENTS: usize = 6;
 /// Floats per splat in the gradient buffer: moments, RGB and z in whole vectors.
 pub(super) const GRADIENT_FLOATS: usize = 12;
+
+/// Bytes per entry of the widest buffer that [`Summation::Entries`] needs: the features of one launch.
+pub(super) fn entry_bytes(feature_dim: usize) -> usize {
+    4 * GRADIENT_FLOATS.max(4 * widest_block(feature_dim) as usize)
+}
+
+/// Vectors of features in the widest launch.
+fn widest_block(feature_dim: usize) -> u32 {
+    blocks(feature_dim as u32).iter().map(Block::vectors).max().unwrap_or(0)
+}
 
 /// How the gradients that one splat gets from several tiles are added up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,7 +46,7 @@ pub(super) struct GradientEntries(std::sync::Mutex<Option<EntryBuffers>>);
 #[derive(Clone)]
 struct EntryBuffers {
     capacity: usize,
-    /// [capacity, 12] as `projected_grad`, and [capacity, code stride].
+    /// [capacity, 12] as `projected_grad`, and [capacity, vectors of a block] for one block after the other.
     splats: Buffer,
     codes: Buffer,
 }
@@ -59,51 +69,71 @@ impl GradientEntries {
         let buffers = EntryBuffers {
             capacity,
             splats: floats("gradient entries", GRADIENT_FLOATS)?,
-            codes: floats("code gradient entries", frame.code_stride() as usize)?,
+            codes: floats("code gradient entries", 4 * widest_block(frame.feature_dim) as usize)?,
         };
         *made = Some(buffers.clone());
         Ok(buffers)
     }
 }
 
-/// Records the way from `frame.planes_grad` to `frame.projected_grad` and `frame.codes_grad` (overwritten) of `count`
-/// splats. `features_move_geometry` = false keeps the features' part of the loss away from everything but the features.
-pub(super) fn record(rec: &mut Recorder, frame: &FrameBuffers, count: usize, features_move_geometry: bool) {
+/// Clears the sums that [`record`] adds to.
+pub(super) fn record_clear(rec: &mut Recorder, frame: &FrameBuffers) {
+    rec.fill(&frame.projected_grad, 0);
+    if frame.feature_dim > 0 {
+        rec.fill(&frame.codes_grad, 0);
+    }
+}
+
+/// Records the way from `frame.planes_grad` to `frame.projected_grad` and `frame.codes_grad` of `count` splats, for some
+/// rows of tiles, whose lists are there. Adds to what [`record_clear`] cleared; where these are `all` tiles of the image,
+/// sums by entries need no clearing. `features_move_geometry` = false keeps the features' part of the loss away from
+/// everything but the features.
+pub(super) fn record(
+    rec: &mut Recorder,
+    frame: &FrameBuffers,
+    tiles: &Tiles,
+    count: usize,
+    features_move_geometry: bool,
+    all: bool,
+) {
     let coupling = if features_move_geometry { 1.0 } else { 0.0 };
+    let blocks = blocks(frame.feature_dim as u32);
     match frame.summation {
         Summation::Atomics => {
-            rec.fill(&frame.projected_grad, 0);
-            if frame.feature_dim > 0 {
-                rec.fill(&frame.codes_grad, 0);
-            }
-            for block in blocks(frame.feature_dim as u32) {
-                record_atomic(rec, frame, block, coupling);
+            for block in blocks {
+                record_atomic(rec, frame, tiles, block, coupling);
             }
         }
         Summation::Entries => match frame.gradient_entries.buffers(rec.device(), frame) {
             Ok(entries) => {
-                for block in blocks(frame.feature_dim as u32) {
-                    record_entries(rec, frame, &entries, block, coupling);
+                let sum = |rec: &mut Recorder, from, to, vectors, stride, first_vector| {
+                    let columns = Columns { vectors, stride, first_vector };
+                    record_sum(rec, frame, count, from, to, columns, !all);
+                };
+                for block in blocks {
+                    record_entries(rec, frame, tiles, &entries, block, coupling);
+                    if block.features > 0 {
+                        // The block's own number of vectors, and no more than there are.
+                        let stride = frame.code_stride() / 4;
+                        sum(
+                            rec,
+                            &entries.codes,
+                            &frame.codes_grad,
+                            block.vectors(),
+                            stride,
+                            block.first_vector,
+                        );
+                    }
                 }
-                record_sum(
-                    rec,
-                    frame,
-                    count,
-                    &entries.splats,
-                    &frame.projected_grad,
-                    GRADIENT_FLOATS as u32 / 4,
-                );
-                if frame.feature_dim > 0 {
-                    record_sum(rec, frame, count, &entries.codes, &frame.codes_grad, frame.code_stride() / 4);
-                }
+                let vectors = GRADIENT_FLOATS as u32 / 4;
+                sum(rec, &entries.splats, &frame.projected_grad, vectors, vectors, 0);
             }
             Err(e) => rec.fail(e),
         },
     }
 }
 
-fn record_atomic(rec: &mut Recorder, frame: &FrameBuffers, block: Block, coupling: f32) {
-    let tiles = frame.tiles();
+fn record_atomic(rec: &mut Recorder, frame: &FrameBuffers, tiles: &Tiles, block: Block, coupling: f32) {
     let call = shaders::raster_backward::call(
         shaders::raster_backward::Variant { channels: block.channels },
         &shaders::raster_backward::Bindings {
@@ -117,19 +147,19 @@ fn record_atomic(rec: &mut Recorder, frame: &FrameBuffers, block: Block, couplin
             transmittance: &frame.transmittance,
             projected_grad: &frame.projected_grad,
         },
-        &push!(raster_backward, frame, block, alpha_plane: alpha_plane(frame), coupling: coupling),
+        &push!(raster_backward, frame, tiles, block, alpha_plane: alpha_plane(frame), coupling: coupling),
     );
-    rec.dispatch(call, [tiles[0], tiles[1], 1]);
+    rec.dispatch(call, [frame.tiles()[0], tiles.rows.len() as u32, 1]);
 }
 
 fn record_entries(
     rec: &mut Recorder,
     frame: &FrameBuffers,
+    tiles: &Tiles,
     entries: &EntryBuffers,
     block: Block,
     coupling: f32,
 ) {
-    let tiles = frame.tiles();
     let call = shaders::raster_backward_entries::call(
         shaders::raster_backward_entries::Variant { channels: block.channels },
         &shaders::raster_backward_entries::Bindings {
@@ -143,9 +173,9 @@ fn record_entries(
             transmittance: &frame.transmittance,
             splat_entries: &entries.splats,
         },
-        &push!(raster_backward_entries, frame, block, alpha_plane: alpha_plane(frame), coupling: coupling),
+        &push!(raster_backward_entries, frame, tiles, block, alpha_plane: alpha_plane(frame), coupling: coupling),
     );
-    rec.dispatch(call, [tiles[0], tiles[1], 1]);
+    rec.dispatch(call, [frame.tiles()[0], tiles.rows.len() as u32, 1]);
 }
 
 /// Where the alpha plane lies in the stack.
@@ -153,15 +183,24 @@ fn alpha_plane(frame: &FrameBuffers) -> u32 {
     (BASE_CHANNELS + frame.feature_dim) as u32
 }
 
-/// `to` [N, vectors] = the sums of `from` [entries, vectors] per splat, in vectors of four.
+/// Where the columns of [`record_sum`] go, in vectors of four.
+struct Columns {
+    vectors: u32,
+    stride: u32,
+    first_vector: u32,
+}
+
+/// The sums of `from` [entries, vectors] per splat, written or `add`ed to columns of `to` [N, stride].
 fn record_sum(
     rec: &mut Recorder,
     frame: &FrameBuffers,
     count: usize,
     from: &Buffer,
     to: &Buffer,
-    vectors: u32,
+    columns: Columns,
+    add: bool,
 ) {
+    let Columns { vectors, stride, first_vector } = columns;
     let call = shaders::gradient_sum::call(
         &shaders::gradient_sum::Bindings {
             depth_pairs: &frame.depth_pairs,
@@ -171,7 +210,13 @@ fn record_sum(
             entries: from,
             sums: to,
         },
-        &shaders::gradient_sum::Push { count: count as u32, vectors },
+        &shaders::gradient_sum::Push {
+            count: count as u32,
+            vectors,
+            stride,
+            first_vector,
+            add: u32::from(add),
+        },
     );
     rec.dispatch(call, rows_of_groups(count * vectors as usize));
 }

@@ -5,7 +5,7 @@
 //! adds `c α T`, then `T ← T(1 − α)`. Channels: RGB (plus T_f · background), Σ w z (expected depth, not yet
 //! divided by alpha), d features (no background). Median depth is the z at which T falls below ½.
 use super::project::Projected;
-use super::rasterizer::FrameBuffers;
+use super::rasterizer::{FrameBuffers, Tiles};
 use super::view::View;
 use crate::gpu::{Buffer, Recorder, shaders};
 
@@ -24,6 +24,14 @@ pub(super) struct Block {
     pub first_plane: u32,
     /// Features in this block (the rest of the variant's room stays unused).
     pub features: u32,
+}
+
+impl Block {
+    /// Vectors of four features that the variant has room for.
+    pub(super) fn vectors(&self) -> u32 {
+        let base = if self.channels == 16 { 0 } else { BASE_CHANNELS as u32 };
+        (self.channels - base).div_ceil(4)
+    }
 }
 
 /// Features of one launch.
@@ -54,10 +62,13 @@ pub(super) fn blocks(dim: u32) -> Vec<Block> {
 
 /// The push constants of a raster shader; what only some of them have goes behind.
 macro_rules! push {
-    ($shader:ident, $frame:expr, $block:expr $(, $field:ident: $value:expr)*) => {
+    ($shader:ident, $frame:expr, $tiles:expr, $block:expr $(, $field:ident: $value:expr)*) => {
         shaders::$shader::Push {
             width: $frame.width,
-            height: $frame.height,
+            top: $tiles.top,
+            rows: $frame.bands.rows as u32,
+            first_row: $tiles.rows.start,
+            list_row: $tiles.list_row,
             tiles_x: $frame.tiles()[0],
             code_vectors: $frame.code_stride() / 4,
             first_vector: $block.first_vector,
@@ -70,8 +81,7 @@ macro_rules! push {
 pub(super) use push;
 
 /// Records the blending of the binned splats into `frame.planes`, `frame.transmittance`, `frame.median_depth`.
-pub fn record(rec: &mut Recorder, camera: &Buffer, frame: &FrameBuffers) {
-    let tiles = frame.tiles();
+pub(super) fn record(rec: &mut Recorder, camera: &Buffer, frame: &FrameBuffers, tiles: &Tiles) {
     for block in blocks(frame.feature_dim as u32) {
         let call = shaders::raster_forward::call(
             shaders::raster_forward::Variant { channels: block.channels },
@@ -85,9 +95,9 @@ pub fn record(rec: &mut Recorder, camera: &Buffer, frame: &FrameBuffers) {
                 transmittance: &frame.transmittance,
                 median_depth: &frame.median_depth,
             },
-            &push!(raster_forward, frame, block),
+            &push!(raster_forward, frame, tiles, block),
         );
-        rec.dispatch(call, [tiles[0], tiles[1], 1]);
+        rec.dispatch(call, [frame.tiles()[0], tiles.rows.len() as u32, 1]);
     }
 }
 

@@ -29,6 +29,11 @@
 //!
 //! Recordings hold the buffers they were made with: record again after `grow`, after changing the number of splats,
 //! the SH degree or the options.
+//!
+//! An image that is too large for the device is rendered in bands ([`super::bands`]), one after the other in the same
+//! planes: [`Rasterizer::record_projection`], then for every band [`Rasterizer::record_band`], loss,
+//! [`Rasterizer::record_band_backward`], and at the end [`Rasterizer::record_gradients`]. An image that fits is one band.
+use super::bands::{Band, Bands};
 use super::bin::{Grouping, TileLists};
 use super::raster_backward::{GradientEntries, Summation};
 use super::sort::Sort;
@@ -38,6 +43,7 @@ use super::{bin, project, project_backward, raster_backward, raster_forward};
 use crate::gpu::{Buffer, Device, Recorder};
 use crate::scene::{Splats, sh_coefficients};
 use crate::{Error, Result};
+use std::ops::Range;
 
 /// Raw parameters of N splats, or gradients by them, on the GPU.
 #[derive(Clone)]
@@ -168,12 +174,14 @@ impl Default for RasterOptions {
     }
 }
 
-/// Buffers of one frame; pixel planes are planar [C, H, W], f32.
+/// Buffers of one frame; pixel planes are planar [C, H, W], f32, with H the rows of one band where there are several.
 pub struct FrameBuffers {
     /// Pixels.
     pub width: u32,
     /// Pixels.
     pub height: u32,
+    /// How the image is divided; one band if it fits.
+    pub bands: Bands,
     /// d.
     pub feature_dim: usize,
     /// [4 + d, H, W]: RGB on the background, Σ w z, features. Written by the forward pass.
@@ -200,7 +208,22 @@ pub struct FrameBuffers {
     pub(super) lists: TileLists,
 }
 
+/// Rows of tiles of the image that a raster pass works on.
+#[derive(Clone)]
+pub(super) struct Tiles {
+    pub rows: Range<u32>,
+    /// First row of tiles in the lists.
+    pub list_row: u32,
+    /// First row of pixels in the planes.
+    pub top: u32,
+}
+
 impl FrameBuffers {
+    /// Pixels that the planes hold: the image's, or a band's.
+    pub fn pixels(&self) -> u32 {
+        self.bands.pixels() as u32
+    }
+
     /// Tiles along x and y.
     pub(super) fn tiles(&self) -> [u32; 2] {
         [self.width.div_ceil(bin::TILE), self.height.div_ceil(bin::TILE)]
@@ -227,6 +250,17 @@ impl Ways {
     }
 }
 
+/// Entries that the device binds, with the gradients that some ways of adding up keep for each.
+fn most_entries(device: &Device, summation: Summation, feature_dim: usize) -> usize {
+    let gradients = match summation {
+        Summation::Atomics => usize::MAX,
+        Summation::Entries => {
+            device.info().max_storage_range as usize / raster_backward::entry_bytes(feature_dim)
+        }
+    };
+    bin::most_entries(device).min(gradients)
+}
+
 /// Renders up to N splats with d features at a fixed image size, and back.
 pub struct Rasterizer {
     device: Device,
@@ -234,6 +268,8 @@ pub struct Rasterizer {
     camera: Buffer,
     frame: FrameBuffers,
     grouping: Grouping,
+    /// Rows of tiles whose lists are made at once.
+    strip: u32,
     sort: Sort,
     /// [1] u32: N, where the sort reads it.
     count: Buffer,
@@ -263,16 +299,18 @@ impl Rasterizer {
         if width == 0 || height == 0 {
             return Err(Error::work("an image of zero size cannot be rendered"));
         }
-        let tiles = width.div_ceil(bin::TILE) as usize * height.div_ceil(bin::TILE) as usize;
-        let pixels = width as usize * height as usize;
         let planes = raster_forward::BASE_CHANNELS + feature_dim;
+        let bands = Bands::new(device.info(), width as usize, height as usize, planes)?;
+        let (pixels, strip) = (bands.pixels(), (bands.rows as u32).div_ceil(bin::TILE));
+        let tiles = width.div_ceil(bin::TILE) as usize * strip as usize;
         let splats = capacity.max(1);
         let stride = feature_dim.next_multiple_of(4);
         // About five entries per splat on the seeded scene; `forward` grows the list if that is too few.
-        let entries = 8 * splats + 4 * tiles;
+        let entries = (8 * splats + 4 * tiles).min(most_entries(device, ways.summation, feature_dim));
         let frame = FrameBuffers {
             width,
             height,
+            bands,
             feature_dim,
             planes: device.buffer::<f32>("planes", planes * pixels)?,
             transmittance: device.buffer::<f32>("transmittance", pixels)?,
@@ -300,6 +338,7 @@ impl Rasterizer {
             camera,
             frame,
             grouping: ways.grouping,
+            strip,
             sort,
             count,
         })
@@ -326,20 +365,11 @@ impl Rasterizer {
         self.camera.write(&view.to_gpu())
     }
 
-    /// Records projection, depth sort, binning and blending.
+    /// Records projection, depth sort, binning and blending of an image that is one band.
     pub fn record_forward(&self, rec: &mut Recorder, params: &SplatBuffers, options: &RasterOptions) {
-        let sh_degree = options.sh_degree.min(params.sh_degree);
-        rec.pass("projection");
-        project::record(rec, params, &self.camera, &self.frame, sh_degree);
-        project::record_features(rec, params, &self.frame, options.feature_mode);
-        rec.pass("depth sort");
-        // Keys are the bits of camera z. The sort is stable, so equal depths keep the order of the splats.
-        rec.fill(&self.count, params.count as u32);
-        self.sort.record(rec, &self.frame.depth_pairs, &self.count, 32);
-        rec.pass("binning");
-        bin::record(rec, &self.frame, params.count, &self.count);
-        rec.pass("raster forward");
-        raster_forward::record(rec, &self.camera, &self.frame);
+        self.refuse_bands(rec);
+        self.record_projection(rec, params, options);
+        self.record_band(rec, params, &self.frame.bands.get(0));
     }
 
     /// Records the way back from `frame().planes_grad` to `gradients` (overwritten; zero for unseen splats) and
@@ -351,27 +381,143 @@ impl Rasterizer {
         options: &RasterOptions,
         gradients: &SplatBuffers,
     ) {
+        self.refuse_bands(rec);
+        self.record_band_backward(rec, params, options, &self.frame.bands.get(0));
+        self.record_gradients(rec, params, options, gradients);
+    }
+
+    fn refuse_bands(&self, rec: &mut Recorder) {
+        if self.frame.bands.count() > 1 {
+            let (w, h, n) = (self.frame.width, self.frame.height, self.frame.bands.count());
+            rec.fail(format!("an image of {w} × {h} is rendered in {n} bands here, not at once"));
+        }
+    }
+
+    /// Records projection and depth sort, which all bands share.
+    pub fn record_projection(&self, rec: &mut Recorder, params: &SplatBuffers, options: &RasterOptions) {
         let sh_degree = options.sh_degree.min(params.sh_degree);
+        rec.pass("projection");
+        project::record(rec, params, &self.camera, &self.frame, sh_degree);
+        project::record_features(rec, params, &self.frame, options.feature_mode);
+        rec.pass("depth sort");
+        // Keys are the bits of camera z. The sort is stable, so equal depths keep the order of the splats.
+        rec.fill(&self.count, params.count as u32);
+        self.sort.record(rec, &self.frame.depth_pairs, &self.count, 32);
+    }
+
+    /// Records binning and blending of a band.
+    pub fn record_band(&self, rec: &mut Recorder, params: &SplatBuffers, band: &Band) {
+        for tiles in self.strips(band, band.top..band.top + band.rows) {
+            self.record_lists(rec, params, &tiles);
+            rec.pass("raster forward");
+            raster_forward::record(rec, &self.camera, &self.frame, &tiles);
+        }
+    }
+
+    /// Records the way back from `frame().planes_grad` of the band that was blended last to the splats on the screen: the
+    /// first band overwrites, the others add.
+    pub fn record_band_backward(
+        &self,
+        rec: &mut Recorder,
+        params: &SplatBuffers,
+        options: &RasterOptions,
+        band: &Band,
+    ) {
         rec.pass("raster backward");
-        raster_backward::record(rec, &self.frame, params.count, options.features_move_geometry);
+        let listed = self.strips(band, band.top..band.top + band.rows);
+        let all = self.frame.bands.count() == 1 && listed.len() == 1;
+        if band.index == 0 && !(all && self.frame.summation == Summation::Entries) {
+            raster_backward::record_clear(rec, &self.frame);
+        }
+        let inner = self.strips(band, band.inner.clone());
+        let strips = match listed.as_slice() {
+            // The lists are still there. Sums by entries read every entry, so that the halo writes its zeros.
+            [one] if self.frame.summation == Summation::Entries => vec![one.clone()],
+            [one] => {
+                let rows = inner.first().map_or(0, |t| t.rows.start)..inner.last().map_or(0, |t| t.rows.end);
+                vec![Tiles { rows, ..*one }]
+            }
+            _ => inner,
+        };
+        for tiles in strips {
+            if listed.len() > 1 {
+                self.record_lists(rec, params, &tiles);
+                rec.pass("raster backward");
+            }
+            let coupled = options.features_move_geometry;
+            raster_backward::record(rec, &self.frame, &tiles, params.count, coupled, all);
+        }
+    }
+
+    /// Records the rest of the way, from the splats on the screen to `gradients` (overwritten; zero for unseen splats) and
+    /// `frame().camera_grad`.
+    pub fn record_gradients(
+        &self,
+        rec: &mut Recorder,
+        params: &SplatBuffers,
+        options: &RasterOptions,
+        gradients: &SplatBuffers,
+    ) {
+        let sh_degree = options.sh_degree.min(params.sh_degree);
         rec.pass("projection backward");
         let camera_grad = &self.frame.camera_grad;
         project_backward::record(rec, params, &self.camera, &self.frame, sh_degree, gradients, camera_grad);
         project_backward::record_features(rec, params, &self.frame, options.feature_mode, gradients);
     }
 
-    /// Runs the forward pass now; grows the tile lists and repeats when they were too short.
+    fn record_lists(&self, rec: &mut Recorder, params: &SplatBuffers, tiles: &Tiles) {
+        rec.pass("binning");
+        bin::record(rec, &self.frame, &tiles.rows, params.count, &self.count);
+    }
+
+    /// Some rows of pixels of a band as rows of tiles, as many at once as have room in the lists.
+    fn strips(&self, band: &Band, pixels: Range<usize>) -> Vec<Tiles> {
+        let rows = pixels.start as u32 / bin::TILE..(pixels.end as u32).div_ceil(bin::TILE);
+        rows.clone()
+            .step_by(self.strip.max(1) as usize)
+            .map(|first| Tiles {
+                rows: first..(first + self.strip).min(rows.end),
+                list_row: first,
+                top: band.top as u32,
+            })
+            .collect()
+    }
+
+    /// Runs the forward pass of an image that is one band; grows the tile lists and repeats when they were too short.
     pub fn forward(&mut self, params: &SplatBuffers, options: &RasterOptions) -> Result<()> {
-        self.check(params)?;
-        loop {
-            let mut rec = Recorder::new(&self.device, "forward");
-            self.record_forward(&mut rec, params, options);
-            rec.run()?;
-            match self.overflow()? {
-                Some(needed) => self.grow(needed)?,
-                None => return Ok(()),
-            }
+        let bands = self.frame.bands.count();
+        if bands > 1 {
+            let (w, h) = (self.frame.width, self.frame.height);
+            return Err(Error::work(format!("an image of {w} × {h} is rendered in {bands} bands here")));
         }
+        self.forward_bands(params, options, |_, _| Ok(()))
+    }
+
+    /// Runs the forward pass band by band, and shows every band; grows the tile lists when they were too short.
+    pub fn forward_bands(
+        &mut self,
+        params: &SplatBuffers,
+        options: &RasterOptions,
+        mut seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
+    ) -> Result<()> {
+        self.check(params)?;
+        for index in 0..self.frame.bands.count() {
+            let band = self.frame.bands.get(index);
+            loop {
+                let mut rec = Recorder::new(&self.device, "forward");
+                if index == 0 {
+                    self.record_projection(&mut rec, params, options);
+                }
+                self.record_band(&mut rec, params, &band);
+                rec.run()?;
+                match self.overflow()? {
+                    Some(needed) => self.grow(needed)?,
+                    None => break,
+                }
+            }
+            seen(&self.frame, &band)?;
+        }
+        Ok(())
     }
 
     /// Entries that a frame needed since the last [`Rasterizer::grow`], if they did not fit; `None` when all was well.
@@ -380,11 +526,25 @@ impl Rasterizer {
         Ok((needed > 0).then_some(needed))
     }
 
-    /// Makes room for tile lists of `needed` entries and a quarter more. Earlier recordings must not be run again.
+    /// Makes room for tile lists of `needed` entries and a quarter more, or lists fewer rows of tiles at once where the
+    /// device binds no longer lists. Earlier recordings must not be run again.
     pub fn grow(&mut self, needed: usize) -> Result<()> {
-        let capacity = needed + needed / 4;
-        let tiles = self.frame.tiles();
-        let (splats, tiles) = (self.capacity.max(1), tiles[0] as usize * tiles[1] as usize);
+        let most = most_entries(&self.device, self.frame.summation, self.frame.feature_dim);
+        let wanted = needed + needed / 4;
+        if needed > most {
+            if self.strip <= 1 {
+                return Err(Error::gpu(format!(
+                    "{needed} entries of one row of tiles are more than {} binds ({most}): fewer splats or a smaller \
+                     --max-size",
+                    self.device.info().name
+                )));
+            }
+            self.strip = ((u64::from(self.strip) * most as u64 / wanted as u64) as u32).max(1);
+        }
+        let splats = self.capacity.max(1);
+        let tiles =
+            self.frame.tiles()[0] as usize * (self.frame.bands.rows as u32).div_ceil(bin::TILE) as usize;
+        let capacity = wanted.min(most);
         self.frame.lists = TileLists::new(&self.device, self.grouping, splats, tiles, capacity)?;
         self.frame.status.write(&[0u32, 0])
     }

@@ -6,7 +6,7 @@ use crate::gpu::{Buffer, Recorder, shaders};
 /// reference both gradients become zero. Weight: divide by the number of pixels for a mean.
 pub fn record_depth(rec: &mut Recorder, frame: &FrameBuffers, reference: Option<&Buffer>, weight: f64) {
     rec.pass("regularisers");
-    let pixels = frame.width * frame.height;
+    let pixels = frame.pixels();
     let alpha_plane = 4 + frame.feature_dim as u32;
     let call = match reference {
         Some(reference) => shaders::depth_l1::call(

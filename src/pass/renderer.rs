@@ -1,6 +1,7 @@
 //! Renders a scene that stays on the GPU to images on the host.
+use super::bands::Band;
 use super::raster_forward::BASE_CHANNELS;
-use super::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
+use super::rasterizer::{FrameBuffers, RasterOptions, Rasterizer, SplatBuffers};
 use super::view::View;
 use crate::gpu::Device;
 use crate::scene::{Camera, Plane, RgbImage, Splats};
@@ -75,13 +76,39 @@ impl Renderer {
         self
     }
 
-    /// Renders one view and copies it to the host.
-    pub fn render(&mut self, camera: &Camera) -> Result<Frame> {
-        read_frame(self.draw(camera)?, true)
+    /// d.
+    pub fn feature_dim(&self) -> usize {
+        self.splats.feature_dim
     }
 
-    /// Renders one view, which stays on the device.
+    /// Renders one view and copies it to the host.
+    pub fn render(&mut self, camera: &Camera) -> Result<Frame> {
+        let mut out = Frame::empty(camera.width as usize, camera.height as usize, self.splats.feature_dim);
+        self.draw_bands(camera, |frame, band| out.read_band(frame, band))?;
+        Ok(out)
+    }
+
+    /// Renders one view that the device holds at once; it stays on the device.
     pub fn draw(&mut self, camera: &Camera) -> Result<&Rasterizer> {
+        let options = self.options;
+        let (rasterizer, splats) = self.ready(camera)?;
+        rasterizer.forward(splats, &options)?;
+        Ok(rasterizer)
+    }
+
+    /// Renders one view band by band and shows every band while it is on the device.
+    pub fn draw_bands(
+        &mut self,
+        camera: &Camera,
+        seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
+    ) -> Result<()> {
+        let options = self.options;
+        let (rasterizer, splats) = self.ready(camera)?;
+        rasterizer.forward_bands(splats, &options, seen)
+    }
+
+    /// A rasteriser that is set to the camera, and the splats.
+    fn ready(&mut self, camera: &Camera) -> Result<(&mut Rasterizer, &SplatBuffers)> {
         if self.near <= 0.0 {
             self.near = 0.01 * self.median_depth(camera)?;
         }
@@ -97,8 +124,7 @@ impl Renderer {
             return Err(Error::work("the renderer lost its rasterizer"));
         };
         rasterizer.set_view(&View::new(camera, self.near).with_background(self.background))?;
-        rasterizer.forward(&self.splats, &self.options)?;
-        Ok(rasterizer)
+        Ok((rasterizer, &self.splats))
     }
 
     /// Median camera z of the splats in front of the camera; 1 when there are none.
@@ -120,34 +146,41 @@ impl Renderer {
     }
 }
 
-/// Copies the planes of the last forward pass to the host; without `features` the frame has none.
-pub fn read_frame(rasterizer: &Rasterizer, features: bool) -> Result<Frame> {
-    let frame = rasterizer.frame();
-    let (width, height) = (frame.width as usize, frame.height as usize);
-    let dim = if features { frame.feature_dim } else { 0 };
-    let pixels = width * height;
-    let planes = frame.planes.read_range::<f32>(0..(BASE_CHANNELS + dim) * pixels)?;
-    let transmittance = frame.transmittance.read::<f32>()?;
-    let plane = |data| Plane { width, height, data };
-    let rgb = (0..pixels).map(|p| [planes[p], planes[pixels + p], planes[2 * pixels + p]]).collect();
-    let alpha: Vec<f32> = transmittance.iter().map(|t| 1.0 - t).collect();
-    let depth = alpha
-        .iter()
-        .zip(&planes[3 * pixels..4 * pixels])
-        .map(|(&a, &z)| if a >= DEPTH_ALPHA_MIN { z / a } else { 0.0 })
-        .collect();
-    let mut features = vec![0.0; pixels * dim];
-    for (k, source) in planes[BASE_CHANNELS * pixels..].chunks_exact(pixels).enumerate() {
-        for (p, &value) in source.iter().enumerate() {
-            features[p * dim + k] = value;
+impl Frame {
+    /// A frame that nothing was rendered into.
+    pub fn empty(width: usize, height: usize, feature_dim: usize) -> Frame {
+        Frame {
+            rgb: RgbImage { width, height, data: vec![[0.0; 3]; width * height] },
+            alpha: Plane::filled(width, height, 0.0),
+            depth: Plane::filled(width, height, 0.0),
+            median_depth: Plane::filled(width, height, 0.0),
+            feature_dim,
+            features: vec![0.0; width * height * feature_dim],
         }
     }
-    Ok(Frame {
-        rgb: RgbImage { width, height, data: rgb },
-        alpha: plane(alpha),
-        depth: plane(depth),
-        median_depth: plane(frame.median_depth.read::<f32>()?),
-        feature_dim: dim,
-        features,
-    })
+
+    /// Copies what a band answers for to the host; features only where this frame has them.
+    pub fn read_band(&mut self, frame: &FrameBuffers, band: &Band) -> Result<()> {
+        let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
+        let stride = frame.bands.pixels();
+        let plane =
+            |k: usize| frame.planes.read_range::<f32>(k * stride + stored.start..k * stride + stored.end);
+        for channel in 0..3 {
+            let values = plane(channel)?;
+            self.rgb.data[inner.clone()].iter_mut().zip(values).for_each(|(out, v)| out[channel] = v);
+        }
+        let transmittance = frame.transmittance.read_range::<f32>(stored.clone())?;
+        let outputs = self.alpha.data[inner.clone()].iter_mut().zip(&mut self.depth.data[inner.clone()]);
+        for ((alpha, depth), (t, z)) in outputs.zip(transmittance.into_iter().zip(plane(3)?)) {
+            *alpha = 1.0 - t;
+            *depth = if *alpha >= DEPTH_ALPHA_MIN { z / *alpha } else { 0.0 };
+        }
+        let median = frame.median_depth.read_range::<f32>(stored.clone())?;
+        self.median_depth.data[inner.clone()].copy_from_slice(&median);
+        for k in 0..self.feature_dim {
+            let pixels = self.features[inner.start * self.feature_dim..].chunks_exact_mut(self.feature_dim);
+            pixels.zip(plane(BASE_CHANNELS + k)?).for_each(|(out, v)| out[k] = v);
+        }
+        Ok(())
+    }
 }

@@ -4,6 +4,7 @@
 //! normalised, zero padding, per channel, C1 = 1e-4, C2 = 9e-4, mean over all pixels and channels.
 //! With ∗ the (symmetric) window and S = A1·A2/(B1·B2), the derivative is three more blurs:
 //! `∂/∂x = ∗(∂S/∂μx) + 2x·∗(∂S/∂E[x²]) + y·∗(∂S/∂E[xy])`.
+use super::bands::{Band, Bands};
 use super::sum;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
@@ -119,10 +120,9 @@ const STRIP: usize = 16;
 /// Colour channels.
 const CHANNELS: usize = 3;
 
-/// The GPU pass for one image size: scratch memory, reused for every view of that size.
+/// The GPU pass for one image size: scratch memory, reused for every view of that size and all its bands.
 pub struct SsimL1 {
-    width: usize,
-    height: usize,
+    bands: Bands,
     means: Buffer,
     moments: Buffer,
     slopes: Buffer,
@@ -133,13 +133,13 @@ pub struct SsimL1 {
 }
 
 impl SsimL1 {
-    /// Allocates for `width × height` RGB images.
-    pub fn new(device: &Device, width: usize, height: usize) -> Result<Self> {
+    /// Allocates for RGB images that are divided like this.
+    pub fn new(device: &Device, bands: &Bands) -> Result<Self> {
+        let (width, height) = (bands.width, bands.rows);
         let values = CHANNELS * width * height;
         let pairs = |name| device.buffer::<[f32; 2]>(name, values);
         Ok(SsimL1 {
-            width,
-            height,
+            bands: bands.clone(),
             means: pairs("ssim means")?,
             moments: pairs("ssim moments")?,
             slopes: pairs("ssim slopes")?,
@@ -150,11 +150,13 @@ impl SsimL1 {
         })
     }
 
-    /// Records the pass. `rendered` and `gradient` are planar `[≥3, H, W]` stacks whose first three planes count,
-    /// `target` `[3, H, W]`. Afterwards `loss[slot]` is Σ|x−y| and `loss[slot+1]` ΣSSIM: see [`SsimL1::loss`].
+    /// Records the pass for a band. `rendered` and `gradient` are planar `[≥3, rows, W]` stacks whose first three planes
+    /// count, `target` `[3, rows, W]`. Afterwards `loss[slot]` is Σ|x−y| and `loss[slot+1]` ΣSSIM of the band: see
+    /// [`SsimL1::loss`].
     pub fn record(
         &self,
         rec: &mut Recorder,
+        band: &Band,
         rendered: &Buffer,
         target: &Buffer,
         gradient: &Buffer,
@@ -162,10 +164,11 @@ impl SsimL1 {
         loss: (&Buffer, u32),
     ) {
         rec.pass("SSIM + L1");
-        let (width, height) = (self.width as i32, self.height as i32);
-        let count = (CHANNELS * self.width * self.height) as f64;
+        let (width, height) = (self.bands.width as i32, self.bands.rows as i32);
+        let (first, end) = ((band.inner.start - band.top) as i32, (band.inner.end - band.top) as i32);
+        let count = self.values();
         let strips = |n: usize| n.div_ceil(STRIP) as u32;
-        let columns = [(self.width as u32).div_ceil(64), strips(self.height), CHANNELS as u32];
+        let columns = [(width as u32).div_ceil(64), strips(self.bands.rows), CHANNELS as u32];
         let call = shaders::ssim_columns::call(
             &shaders::ssim_columns::Bindings { rendered, target, means: &self.means, moments: &self.moments },
             &shaders::ssim_columns::Push { width, height },
@@ -179,9 +182,9 @@ impl SsimL1 {
                 cross: &self.cross,
                 sums: &self.ssim_sums,
             },
-            &shaders::ssim_rows::Push { width, height, strips: strips(self.width) as i32 },
+            &shaders::ssim_rows::Push { width, height, strips: strips(self.bands.width) as i32, first, end },
         );
-        rec.dispatch_threads(call, [strips(self.width), self.height as u32, CHANNELS as u32]);
+        rec.dispatch_threads(call, [strips(self.bands.width), height as u32, CHANNELS as u32]);
         let call = shaders::ssim_gradient::call(
             &shaders::ssim_gradient::Bindings {
                 rendered,
@@ -196,6 +199,8 @@ impl SsimL1 {
                 height,
                 l1_weight: (weights[0] / count) as f32,
                 dssim_weight: (weights[1] / count) as f32,
+                first,
+                end,
             },
         );
         rec.dispatch(call, columns);
@@ -203,10 +208,14 @@ impl SsimL1 {
         sum::record(rec, &self.ssim_sums, &self.partials, loss.0, loss.1 + 1);
     }
 
-    /// The loss parts from the two sums that [`SsimL1::record`] leaves.
-    pub fn loss(&self, sums: [f32; 2]) -> ImageLoss {
-        let count = (CHANNELS * self.width * self.height) as f64;
-        ImageLoss { l1: f64::from(sums[0]) / count, ssim: f64::from(sums[1]) / count }
+    /// The loss parts from the two sums that [`SsimL1::record`] leaves, added up over the bands.
+    pub fn loss(&self, sums: [f64; 2]) -> ImageLoss {
+        let count = self.values();
+        ImageLoss { l1: sums[0] / count, ssim: sums[1] / count }
+    }
+
+    fn values(&self) -> f64 {
+        (CHANNELS * self.bands.width * self.bands.height) as f64
     }
 }
 
@@ -261,16 +270,17 @@ mod tests {
                 (0..3 * w * h).map(|i| (0.7 * noise(i) + 0.3 * noise(i + 7777)) as f32).collect();
             let wide = |v: &[f32]| v.iter().map(|&a| f64::from(a)).collect::<Vec<_>>();
             let (expected, gradient) = ssim_l1(&wide(&x), &wide(&y), w, h, 0.8, 0.2);
-            let pass = SsimL1::new(&device, w, h).unwrap();
+            let bands = Bands::whole(w, h);
+            let pass = SsimL1::new(&device, &bands).unwrap();
             let rendered = device.buffer_from("x", &x).unwrap();
             let target = device.buffer_from("y", &y).unwrap();
             let out = device.buffer::<f32>("gradient", 3 * w * h).unwrap();
             let sums = device.buffer::<f32>("loss", 4).unwrap();
             let mut rec = Recorder::new(&device, "ssim");
-            pass.record(&mut rec, &rendered, &target, &out, [0.8, 0.2], (&sums, 1));
+            pass.record(&mut rec, &bands.get(0), &rendered, &target, &out, [0.8, 0.2], (&sums, 1));
             rec.run().unwrap();
             let sums = sums.read::<f32>().unwrap();
-            let loss = pass.loss([sums[1], sums[2]]);
+            let loss = pass.loss([sums[1], sums[2]].map(f64::from));
             // f32 sums of about 10⁴ values of order one: 1e-5.
             assert!((loss.l1 - expected.l1).abs() < 1e-5 && (loss.ssim - expected.ssim).abs() < 1e-5);
             let scale = gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));

@@ -9,6 +9,7 @@ mod heif;
 mod kind;
 pub mod light;
 mod resize;
+mod sizes;
 mod straighten;
 mod video;
 
@@ -18,6 +19,7 @@ pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, find, spread, wanted};
 pub use frame::Frame;
 pub use light::Light;
 pub use resize::Kernel;
+pub use sizes::sizes_of;
 pub use straighten::Straightening;
 
 use crate::progress::Progress;
@@ -237,11 +239,7 @@ pub fn load_all(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Photo
 
 /// Reads the photos of a run, each scaled down to `max_size` where it is larger; refuses sets that cannot give geometry (the
 /// same photo twice) or that would mix up files (the same name twice).
-pub fn load_each(
-    candidates: &[Candidate],
-    max_size: usize,
-    progress: &dyn Progress,
-) -> Result<Vec<Photo>> {
+pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progress) -> Result<Vec<Photo>> {
     progress.begin("photos", candidates.len() as u64);
     let done = AtomicU64::new(0);
     let one = |candidate: &Candidate| {
@@ -251,7 +249,10 @@ pub fn load_each(
         Ok(photo)
     };
     // Collected before errors are looked at: the first in the order of the photos is reported, whichever came first.
-    let all: Vec<Result<Photo>> = candidates.par_iter().map(one).collect();
+    let mut all: Vec<Result<Photo>> = Vec::with_capacity(candidates.len());
+    for wave in sizes::waves(candidates) {
+        all.par_extend(candidates[wave].par_iter().map(one));
+    }
     let photos = all.into_iter().collect::<Result<Vec<_>>>()?;
     progress.end();
     let framed: Vec<&str> = photos.iter().filter(|p| !p.frame.is_none()).map(|p| p.stem.as_str()).collect();

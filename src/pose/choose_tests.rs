@@ -88,9 +88,8 @@ fn blurred_repeated_and_foreign_photos_are_left_out() {
 
 #[test]
 fn as_many_photos_as_views_are_all_used() {
-    let photos = load_photos(&[breakfast("images")], Some(4), &Silent).unwrap();
-    assert_eq!(photos.len(), 4);
-    let e = load_photos(&[breakfast("images")], Some(5), &Silent).unwrap_err();
+    assert_eq!(photos(&[breakfast("images")], Some(4), &Silent).unwrap().len(), 4);
+    let e = photos(&[breakfast("images")], Some(5), &Silent).unwrap_err();
     assert!(e.to_string().starts_with("--views 5: only 4"), "{e}");
 }
 

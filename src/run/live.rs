@@ -5,6 +5,7 @@ use crate::format::scene_dir::{self, Contents, Scene};
 use crate::format::{Workspace, colmap, gaussians};
 use crate::gpu::Device;
 use crate::infer::{RegionEncoder, Registry};
+use crate::pass::bands::Band;
 use crate::pass::rasterizer::FrameBuffers;
 use crate::photo;
 use crate::progress::Silent;
@@ -17,9 +18,10 @@ use std::path::{Path, PathBuf};
 ///
 /// ```no_run
 /// # fn main() -> splatvk::Result<()> {
-/// use splatvk::{gpu::Device, pose::choose, progress::Silent, run::{self, RunPlan, live::LiveScene}};
+/// use splatvk::{gpu::Device, photo, pose::choose, progress::Silent, run::{self, RunPlan, live::LiveScene}};
 /// let device = Device::open(None)?;
-/// let photos = choose::load_photos(&["my-photos".into()], Some(4), &Silent)?;
+/// let chosen = choose::photos(&["my-photos".into()], Some(4), &Silent)?;
+/// let photos = photo::load_each(&chosen, photo::MAX_SIZE, &Silent)?;
 /// let outcome = run::reconstruct(&RunPlan::default(), &device, photos, &Silent)?;
 /// let mut scene = LiveScene::trained(&device, outcome, None)?;
 /// let camera = scene.cameras()[0].clone();
@@ -107,7 +109,17 @@ impl LiveScene {
         (widths.iter().take(level).sum(), widths.get(level).copied().unwrap_or(0))
     }
 
-    /// Renders one camera. The frame stays on the device, and valid until the next call.
+    /// Renders one camera band by band and shows every band while it is on the device.
+    pub fn draw_bands(
+        &mut self,
+        camera: &Camera,
+        seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
+    ) -> Result<()> {
+        check(camera)?;
+        self.viewer.draw_bands(camera, seen)
+    }
+
+    /// Renders one camera that the device holds at once. The frame stays on the device, and valid until the next call.
     pub fn draw(&mut self, camera: &Camera) -> Result<&FrameBuffers> {
         check(camera)?;
         self.viewer.draw(camera)

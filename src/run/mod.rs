@@ -1,5 +1,6 @@
 //! The whole pipeline on one page: photos → cameras, depth and points → splats → language → scene directory.
 pub mod ask;
+pub mod budget;
 mod describe;
 pub mod encoder;
 mod light;
@@ -239,6 +240,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     })?;
     let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let chosen = pose::choose::photos(&plan.inputs, plan.views, progress)?;
+    budget(plan, &device, &photo::sizes_of(&chosen), max_size)?;
     let photos = photo::load_each(&chosen, max_size, progress)?;
     let outcome = work(plan, &device, photos, progress)?;
     write(workspace, &outcome, progress)?;
@@ -254,6 +256,8 @@ pub fn reconstruct(
     progress: &dyn Progress,
 ) -> Result<Outcome> {
     photo::check_set(&photos)?;
+    let sizes: Vec<_> = photos.iter().map(|p| (p.image.width, p.image.height)).collect();
+    budget(plan, device, &sizes, usize::MAX)?;
     work(plan, device, photos, &Recorded::new(progress))
 }
 
@@ -278,7 +282,7 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
     let given = sources::given_masks(&plan.masks, &plan.features, &photos)?;
     let encoder = sources::encoder(&plan.features, &registry)?;
 
-    let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
+    let preset = preset_of(plan, device);
     let start = match &networks.geometry {
         Some(model) => networks::geometry_of(model, &photos, progress)?,
         None => None,
@@ -319,7 +323,7 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
             &geometry.cameras,
             &geometry.points,
             Some(&geometry.depths),
-            &rgb_options(plan, preset),
+            &rgb_options(plan, preset, device, images.len()),
             progress,
         )
     };
@@ -414,8 +418,20 @@ impl RunPlan {
     }
 }
 
-fn rgb_options(plan: &RunPlan, preset: Preset) -> RgbOptions {
+fn preset_of(plan: &RunPlan, device: &Device) -> Preset {
+    plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default })
+}
+
+/// Refuses photos of these (width, height) where they cannot be worked with at that size.
+fn budget(plan: &RunPlan, device: &Device, sizes: &[(usize, usize)], max_size: usize) -> Result<()> {
+    let work = budget::Work::language(plan.feature_dim, plan.per_level, preset_of(plan, device), sizes.len());
+    budget::check(&budget::Limits::now(device.info()), sizes, max_size, &work)
+}
+
+fn rgb_options(plan: &RunPlan, preset: Preset, device: &Device, photos: usize) -> RgbOptions {
     let mut options = RgbOptions::preset(preset);
+    let work = budget::Work::language(plan.feature_dim, plan.per_level, preset, photos);
+    options.limit_splats(budget::most_splats(device.info(), work.features), work.splats);
     options.seed = plan.seed;
     if let Some(n) = plan.iterations {
         options = options.with_iterations(n);

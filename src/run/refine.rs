@@ -86,7 +86,12 @@ impl ViewRefiner {
         progress: &dyn Progress,
     ) -> Result<Pose> {
         let mut raster = Rasterizer::new(&self.device, self.params.count, 0, camera.width, camera.height)?;
-        let loss = SsimL1::new(&self.device, photo.width, photo.height)?;
+        // An image that the device holds only in parts is left at what the coarser level found.
+        let bands = raster.frame().bands.clone();
+        if bands.count() > 1 {
+            return Ok(camera.pose);
+        }
+        let loss = SsimL1::new(&self.device, &bands)?;
         let sums = self.device.buffer::<f32>("loss sums", 4)?;
         raster.set_view(&View::new(camera, scale.near()))?;
         raster.forward(&self.params, &self.options)?;
@@ -113,7 +118,7 @@ impl ViewRefiner {
                 break;
             }
             let s = sums.read::<f32>()?;
-            let total = loss.loss([s[0], s[1]]).total(WEIGHTS[0], WEIGHTS[1]);
+            let total = loss.loss([s[0], s[1]].map(f64::from)).total(WEIGHTS[0], WEIGHTS[1]);
             if total < best.0 {
                 best = (total, pose);
             }
@@ -130,7 +135,8 @@ impl ViewRefiner {
         let frame = raster.frame();
         let mut rec = Recorder::new(&self.device, "refine view");
         raster.record_forward(&mut rec, &self.params, &self.options);
-        loss.record(&mut rec, &frame.planes, target, &frame.planes_grad, WEIGHTS, (sums, 0));
+        let whole = frame.bands.get(0);
+        loss.record(&mut rec, &whole, &frame.planes, target, &frame.planes_grad, WEIGHTS, (sums, 0));
         raster.record_backward(&mut rec, &self.params, &self.options, &self.gradients);
         rec
     }

@@ -9,6 +9,7 @@ use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, InitChoice};
 use crate::progress::{Progress, Recorded};
 use crate::report::{self, Report, RunRecord, ViewShown};
+use crate::run::budget::{self, Limits, Work};
 use crate::run::view::Viewer;
 use crate::scene::{Camera, LanguageField, PointCloud, RgbImage};
 use crate::{Error, Result};
@@ -57,6 +58,8 @@ fn matched(
     plan: &TrainPlan,
     known: &[Camera],
     max_size: usize,
+    work: impl Fn(usize) -> Work,
+    device: &Device,
     progress: &dyn Progress,
 ) -> Result<Vec<Photo>> {
     let found = photo::find(std::slice::from_ref(&plan.images))?;
@@ -79,6 +82,8 @@ fn matched(
             .warn(&format!("{} photos have no camera and are left out", found.photos.len() - paths.len()));
     }
     let files: Vec<Candidate> = paths.iter().map(|p| Candidate::file(p)).collect();
+    let limits = Limits::now(device.info());
+    budget::check(&limits, &photo::sizes_of(&files), max_size, &work(files.len()))?;
     photo::load_each(&files, max_size, progress)
 }
 
@@ -125,9 +130,10 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         ..gpu::Options::from_env(plan.device.as_deref())
     })?;
     let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
-    let photos = matched(plan, &known, max_size, progress)?;
-    let registry = Registry::open(plan.models.as_deref())?;
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
+    let work = |photos| Work::colour(preset, photos);
+    let photos = matched(plan, &known, max_size, work, &device, progress)?;
+    let registry = Registry::open(plan.models.as_deref())?;
     let (photos, geometry) = match given {
         Some(cloud) => {
             let geometry = from_points(&photos, &known, cloud)?;
@@ -140,6 +146,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     };
     let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
     let mut options = RgbOptions::preset(preset);
+    options.limit_splats(budget::most_splats(device.info(), 0), work(photos.len()).splats);
     options.seed = plan.seed;
     if let Some(n) = plan.iterations {
         options = options.with_iterations(n);

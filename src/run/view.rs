@@ -1,10 +1,11 @@
 //! A scene with language seen from cameras: rendered and decoded.
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder};
+use crate::pass::bands::Band;
 use crate::pass::decode::Codes;
 use crate::pass::raster_forward::BASE_CHANNELS;
 use crate::pass::rasterizer::FrameBuffers;
-use crate::pass::renderer::{Frame, Renderer, read_frame};
+use crate::pass::renderer::{Frame, Renderer};
 use crate::scene::{Camera, LanguageField, Plane, Splats};
 
 /// A rendered frame and the code of every pixel per level (−1 = none).
@@ -60,54 +61,76 @@ impl Viewer {
         self.seen(camera, true)
     }
 
-    /// Renders one camera. The frame stays on the device, and valid until the next call.
+    /// Renders one camera that the device holds at once. The frame stays on the device, and valid until the next call.
     pub fn draw(&mut self, camera: &Camera) -> Result<&FrameBuffers> {
         Ok(self.renderer.draw(camera)?.frame())
     }
 
+    /// Renders one camera band by band and shows every band while it is on the device.
+    pub fn draw_bands(
+        &mut self,
+        camera: &Camera,
+        seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
+    ) -> Result<()> {
+        self.renderer.draw_bands(camera, seen)
+    }
+
     /// Only the codes of one camera, as [`DecodedFrame::codes`].
     pub fn codes(&mut self, camera: &Camera) -> Result<Vec<Plane<i32>>> {
-        let rasterizer = self.renderer.draw(camera)?;
-        decode(&self.device, &self.levels, &mut self.output, rasterizer.frame())
+        let mut codes = empty(self.levels.len(), camera);
+        let (device, levels, output) = (&self.device, &self.levels, &mut self.output);
+        self.renderer
+            .draw_bands(camera, |frame, band| decode(device, levels, output, frame, band, &mut codes))?;
+        Ok(codes)
     }
 
     fn seen(&mut self, camera: &Camera, features: bool) -> Result<DecodedFrame> {
-        let rasterizer = self.renderer.draw(camera)?;
-        let codes = decode(&self.device, &self.levels, &mut self.output, rasterizer.frame())?;
-        Ok(DecodedFrame { frame: read_frame(rasterizer, features)?, codes })
+        let mut codes = empty(self.levels.len(), camera);
+        let dim = if features { self.renderer.feature_dim() } else { 0 };
+        let mut shown = Frame::empty(camera.width as usize, camera.height as usize, dim);
+        let (device, levels, output) = (&self.device, &self.levels, &mut self.output);
+        self.renderer.draw_bands(camera, |frame, band| {
+            decode(device, levels, output, frame, band, &mut codes)?;
+            shown.read_band(frame, band)
+        })?;
+        Ok(DecodedFrame { frame: shown, codes })
     }
 }
 
-/// Decodes every level of a rendered frame; `output` keeps the buffers for the next frame of the same size.
+/// Codes of no pixel yet.
+fn empty(levels: usize, camera: &Camera) -> Vec<Plane<i32>> {
+    vec![Plane::filled(camera.width as usize, camera.height as usize, -1); levels]
+}
+
+/// Decodes every level of a band into `codes`; `output` keeps the buffers for the next one of the same size.
 fn decode(
     device: &Device,
     levels: &[Option<(usize, Codes)>],
     output: &mut Option<(Buffer, Buffer)>,
     frame: &FrameBuffers,
-) -> Result<Vec<Plane<i32>>> {
-    let (width, height) = (frame.width as usize, frame.height as usize);
-    let pixels = width * height;
-    let (decoded, margin) = match output.take().filter(|o| o.0.bytes() == 4 * pixels as u64) {
+    band: &Band,
+    codes: &mut [Plane<i32>],
+) -> Result<()> {
+    let pixels = frame.pixels();
+    let (decoded, margin) = match output.take().filter(|o| o.0.bytes() == 4 * u64::from(pixels)) {
         Some(fits) => fits,
-        None => (device.buffer::<i32>("decoded", pixels)?, device.buffer::<f32>("margin", pixels)?),
+        None => {
+            let len = pixels as usize;
+            (device.buffer::<i32>("decoded", len)?, device.buffer::<f32>("margin", len)?)
+        }
     };
-    let mut codes = Vec::with_capacity(levels.len());
-    for level in levels {
-        let data = match level {
-            None => vec![-1; pixels],
-            Some((first, table)) => {
-                let mut rec = Recorder::new(device, "decode");
-                let plane = (BASE_CHANNELS + first) as u32;
-                let (planes, transmittance) = (&frame.planes, &frame.transmittance);
-                table.record(&mut rec, planes, plane, transmittance, pixels as u32, &decoded, &margin);
-                rec.run()?;
-                decoded.read::<i32>()?
-            }
-        };
-        codes.push(Plane { width, height, data });
+    for (plane, level) in codes.iter_mut().zip(levels) {
+        let Some((first, table)) = level else { continue };
+        let mut rec = Recorder::new(device, "decode");
+        let at = (BASE_CHANNELS + first) as u32;
+        let (planes, transmittance) = (&frame.planes, &frame.transmittance);
+        table.record(&mut rec, planes, at, transmittance, pixels, &decoded, &margin);
+        rec.run()?;
+        let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
+        plane.data[inner].copy_from_slice(&decoded.read_range::<i32>(stored)?);
     }
     *output = Some((decoded, margin));
-    Ok(codes)
+    Ok(())
 }
 
 /// The scene from every camera.

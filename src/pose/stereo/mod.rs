@@ -37,6 +37,8 @@ pub struct StereoOptions {
     pub smoothness: f32,
     /// Seed of the hashed random numbers.
     pub seed: u32,
+    /// Bytes that the device binds at once: larger photos are matched at half their size, or less.
+    pub binding: u64,
 }
 
 impl Default for StereoOptions {
@@ -52,6 +54,8 @@ impl Default for StereoOptions {
             // photos of a room (dining) 0.05 leaves 21 % and 0.4 20 % of the pixels wrong by a tenth, 0.1 leaves 18 %.
             smoothness: 0.1,
             seed: 1,
+            // What every Vulkan device binds.
+            binding: 1 << 27,
         }
     }
 }
@@ -81,6 +85,7 @@ pub fn dense(
     options: &StereoOptions,
     progress: &dyn Progress,
 ) -> Result<(Vec<DepthMap>, PointCloud)> {
+    let options = &StereoOptions { binding: device.info().max_storage_range, ..options.clone() };
     let levels = pyramid(images, cameras, sparse, options)?;
     let planes = run_schedule(&levels, options, progress, |level, start| {
         GpuMatcher::new(device, &level.luma, &level.references, &level.sources, &start)

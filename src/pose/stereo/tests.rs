@@ -111,6 +111,27 @@ fn within(errors: &[f32], limit: f32) -> f32 {
     errors.iter().filter(|&&e| e < limit).count() as f32 / errors.len() as f32
 }
 
+/// With one source each, a reference and its source fit where all three views do not.
+#[test]
+fn views_are_matched_in_groups_as_all_together() {
+    let set = synthetic(96, 72);
+    let run = |binding: u64| {
+        let options =
+            crate::gpu::Options { max_binding: Some(binding), ..crate::gpu::Options::from_env(None) };
+        let device = crate::gpu::TestDevice::with(&options).unwrap();
+        let options = StereoOptions { sources: 1, binding, ..StereoOptions::default() };
+        let levels = pyramid(&set.images, &set.cameras, &set.sparse, &options).unwrap();
+        run_schedule(&levels, &options, &Silent, |level, start| {
+            GpuMatcher::new(&device, &level.luma, &level.references, &level.sources, &start)
+        })
+        .unwrap()
+    };
+    let view = 96 * 72 * 16;
+    let (grouped, whole) = (run(5 * view / 2), run(3 * view));
+    assert_eq!(grouped.len(), 3 * 96 * 72);
+    assert!(grouped == whole, "other planes");
+}
+
 #[test]
 fn device_and_twin_choose_the_same_planes() {
     let device = test_device();

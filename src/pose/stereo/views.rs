@@ -1,6 +1,6 @@
 //! What the matcher reads: the image pyramid, the source views of every view, the inverse depth range.
 use super::StereoOptions;
-use crate::pass::plane_sweep::{MAX_SOURCES, Reference, Source};
+use crate::pass::plane_sweep::{MAX_SOURCES, Reference, Source, binding};
 use crate::scene::{Camera, RgbImage};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3, Vec4};
@@ -73,8 +73,7 @@ pub fn pyramid(
         .collect();
     let tolerance: Vec<f32> = (0..cameras.len()).map(|v| tolerance(v, cameras, &chosen[v], sparse)).collect();
     let mut guide = images.to_vec();
-    // A storage buffer holds at least 128 MiB everywhere: 16 bytes per pixel for the planes of all views.
-    while guide.iter().map(|g| g.data.len()).sum::<usize>() * 16 > 1 << 27 {
+    while needed(&guide, &chosen) as u64 > options.binding {
         guide = guide.iter().map(halved).collect();
     }
     let mut levels = vec![level(&guide, cameras, &chosen, &ranges, &tolerance)];
@@ -87,6 +86,14 @@ pub fn pyramid(
     }
     levels.reverse();
     Ok(levels)
+}
+
+/// Bytes that matching binds at once.
+fn needed(guide: &[RgbImage], chosen: &[Vec<usize>]) -> usize {
+    let pixels = |view: usize| guide[view].data.len();
+    let groups =
+        (0..guide.len()).map(|view| pixels(view) + chosen[view].iter().map(|&s| pixels(s)).sum::<usize>());
+    binding((0..guide.len()).map(pixels).sum(), groups)
 }
 
 /// Inverse depths between which a view is searched: the 1st and 99th percentile of the sparse points in front of it,

@@ -1,0 +1,81 @@
+//! Sizes of photos before they are decoded: what memory a run needs, and how many files may be decoded at once.
+use super::Candidate;
+use image::metadata::Orientation;
+use image::{ImageDecoder, ImageReader};
+use std::ops::Range;
+use std::path::Path;
+
+/// Decoded bytes that may be held at once. A photo of 12 megapixels is 36 MB, one of 100 megapixels 300 MB, and two cores are
+/// busy with two of either.
+const DECODED_AT_ONCE: u64 = 640 << 20;
+
+/// Bytes of a decoded pixel: 8-bit RGB, and as much again that some decoders hold while they work.
+const DECODED_PIXEL: u64 = 6;
+
+/// Taken for a photo whose size only its decoder tells (HEIC, frames of videos): the 48 megapixels of today's phones.
+const ASSUMED: (usize, usize) = (8064, 6048);
+
+/// Upright (width, height) of photos that have not been read yet.
+pub fn sizes_of(candidates: &[Candidate]) -> Vec<(usize, usize)> {
+    candidates.iter().map(|c| size_of_file(&c.path).unwrap_or(ASSUMED)).collect()
+}
+
+fn size_of_file(path: &Path) -> Option<(usize, usize)> {
+    let mut decoder = ImageReader::open(path).ok()?.with_guessed_format().ok()?.into_decoder().ok()?;
+    let (w, h) = decoder.dimensions();
+    let sideways = matches!(
+        decoder.orientation().unwrap_or(Orientation::NoTransforms),
+        Orientation::Rotate90
+            | Orientation::Rotate270
+            | Orientation::Rotate90FlipH
+            | Orientation::Rotate270FlipH
+    );
+    let (w, h) = (w as usize, h as usize);
+    Some(if sideways { (h, w) } else { (w, h) })
+}
+
+/// Consecutive photos that may be decoded side by side.
+pub(super) fn waves(candidates: &[Candidate]) -> Vec<Range<usize>> {
+    let bytes: Vec<u64> = sizes_of(candidates).iter().map(|(w, h)| (w * h) as u64 * DECODED_PIXEL).collect();
+    grouped(&bytes)
+}
+
+fn grouped(bytes: &[u64]) -> Vec<Range<usize>> {
+    let mut waves: Vec<Range<usize>> = Vec::new();
+    let mut held = 0;
+    for (i, &own) in bytes.iter().enumerate() {
+        match waves.last_mut().filter(|_| held + own <= DECODED_AT_ONCE) {
+            Some(wave) => wave.end = i + 1,
+            None => {
+                waves.push(i..i + 1);
+                held = 0;
+            }
+        }
+        held += own;
+    }
+    waves
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn small_photos_are_decoded_together_and_large_ones_alone() {
+        let mp = |n: u64| n * 1_000_000 * DECODED_PIXEL;
+        assert_eq!(grouped(&[mp(12); 4]), [0..4]);
+        assert_eq!(grouped(&[mp(100); 3]), [0..1, 1..2, 2..3]);
+        assert_eq!(grouped(&[mp(1), mp(100), mp(12), mp(100)]), [0..2, 2..3, 3..4]);
+        assert!(grouped(&[]).is_empty());
+    }
+
+    #[test]
+    fn headers_tell_the_upright_size() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("wide.png");
+        image::RgbImage::new(300, 40).save(&path).unwrap();
+        std::fs::write(folder.path().join("none.png"), b"no image").unwrap();
+        let files = [Candidate::file(&path), Candidate::file(&folder.path().join("none.png"))];
+        assert_eq!(sizes_of(&files), [(300, 40), ASSUMED]);
+    }
+}

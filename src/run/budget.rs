@@ -1,0 +1,224 @@
+//! What a run needs of memory, known before it begins: bytes per stage from the number and the sizes of the photos, against
+//! what the device binds and holds and what the host has left.
+//!
+//! The figures per pixel and splat are those of the buffers that the stages make (`fit::views`, `fit::model`,
+//! `pass::rasterizer`, `pass::ssim_l1`, `pose::stereo`); those of the host are measured (docs/performance.md).
+use crate::fit::{Preset, RgbOptions};
+use crate::gpu::DeviceInfo;
+use crate::pass::bands::{Bands, widest};
+use crate::pass::raster_forward::BASE_CHANNELS;
+use crate::photo::{SMALLEST_SIDE, working_size};
+use crate::scene::LEVEL_NAMES;
+use crate::{Error, Result};
+
+/// Bytes of the host per pixel of all photos, at the stage that needs most of them (dense stereo).
+const HOST_PIXEL: u64 = 330;
+/// Bytes of the host whatever the photos: networks and their working memory, the program.
+const HOST_BASE: u64 = 900 << 20;
+/// Share of a device's memory that buffers may fill: drivers keep some, and allocations leave gaps.
+const HEAP_SHARE: f64 = 0.9;
+/// Splats that continue the surfaces beyond one photo's border, at most (`fit::margin`).
+const MARGIN: usize = 15_000;
+
+/// What there is.
+#[derive(Clone, Debug)]
+pub struct Limits {
+    /// The device.
+    pub device: DeviceInfo,
+    /// Memory of the host that is free, bytes; `None` where the system does not tell.
+    pub host: Option<u64>,
+}
+
+impl Limits {
+    /// Those of this machine, now.
+    pub fn now(device: &DeviceInfo) -> Limits {
+        Limits { device: device.clone(), host: available() }
+    }
+}
+
+/// What the run will do, as far as memory depends on it.
+#[derive(Clone, Copy, Debug)]
+pub struct Work {
+    /// Feature channels that are trained together; 0 without language.
+    pub features: usize,
+    /// Splats at most.
+    pub splats: usize,
+}
+
+impl Work {
+    /// A run with codes of this length, all levels together or one after the other.
+    pub fn language(code_dim: usize, per_level: bool, preset: Preset, photos: usize) -> Work {
+        let levels = if per_level { 1 } else { LEVEL_NAMES.len() };
+        Work { features: levels * code_dim, ..Work::colour(preset, photos) }
+    }
+
+    /// Colour only.
+    pub fn colour(preset: Preset, photos: usize) -> Work {
+        let options = RgbOptions::preset(preset);
+        let margin = if options.margin > 0.0 { MARGIN * photos } else { 0 };
+        Work { features: 0, splats: options.init.max_points + margin }
+    }
+}
+
+/// Bytes that a stage holds at its peak.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stage {
+    /// As the progress calls it.
+    pub name: &'static str,
+    /// On the device.
+    pub device: u64,
+    /// In the host's memory, without what a CPU device keeps there.
+    pub host: u64,
+}
+
+/// Bytes per stage for photos of these working sizes. An error where an image cannot even be rendered in bands.
+pub fn stages(device: &DeviceInfo, sizes: &[(usize, usize)], work: &Work) -> Result<Vec<Stage>> {
+    let all: u64 = sizes.iter().map(|(w, h)| (w * h) as u64).sum();
+    let host = HOST_BASE + HOST_PIXEL * all;
+    let training = |features: usize| -> Result<u64> {
+        let (channels, splats) = (BASE_CHANNELS + features, work.splats as u64);
+        let mut distinct: Vec<(usize, usize)> = Vec::new();
+        sizes.iter().for_each(|s| {
+            if !distinct.contains(s) {
+                distinct.push(*s)
+            }
+        });
+        let mut bytes = 0;
+        for &(w, h) in &distinct {
+            let stored = Bands::new(device, w, h, channels)?.pixels() as u64;
+            // Planes and their gradients; transmittance, median, loss; SSIM: three vec2 and one float per colour.
+            bytes += stored * (4 * (2 * channels as u64 + 1) + 12 + 84);
+            // On the screen: 12 + 12 floats, the features and their gradients, depth keys and their sort; eight entries of
+            // 20 bytes in the lists.
+            bytes += splats * (96 + 8 * features as u64 + 16 + 160);
+        }
+        // Photo, depth, and a label per level.
+        bytes += all * (12 + if features > 0 { 12 } else { 4 });
+        // Value, gradient and two moments of each parameter, at SH degree 0.
+        Ok(bytes + splats * 16 * (14 + features as u64))
+    };
+    let stereo = Stage { name: "dense stereo", device: 24 * all, host };
+    let colour = Stage { name: "splats", device: training(0)?, host };
+    let mut stages = vec![stereo, colour];
+    if work.features > 0 {
+        stages.push(Stage { name: "language", device: training(work.features)?, host });
+    }
+    Ok(stages)
+}
+
+/// Why photos of these sizes do not work, or nothing.
+fn obstacle(limits: &Limits, sizes: &[(usize, usize)], work: &Work) -> Option<String> {
+    let device = &limits.device;
+    let gib = |b: u64| b as f64 / f64::from(1 << 30);
+    let stages = match stages(device, sizes, work) {
+        Ok(stages) => stages,
+        Err(_) => {
+            let most = widest(device, BASE_CHANNELS + work.features);
+            return Some(format!("{} renders images up to {most} pixels wide", device.name));
+        }
+    };
+    for stage in stages {
+        let heap = (device.memory as f64 * HEAP_SHARE) as u64;
+        if !device.is_cpu && stage.device > heap {
+            return Some(format!(
+                "{} needs {:.1} GiB of {}, which has {:.1}",
+                stage.name,
+                gib(stage.device),
+                device.name,
+                gib(device.memory)
+            ));
+        }
+        let needed = stage.host + if device.is_cpu { stage.device } else { 0 };
+        if let Some(free) = limits.host.filter(|free| needed > *free) {
+            return Some(format!(
+                "{} needs about {:.1} GiB of memory, {:.1} are free",
+                stage.name,
+                gib(needed),
+                gib(free)
+            ));
+        }
+    }
+    None
+}
+
+/// Refuses a working size that cannot be done, and names the largest that can. `originals` are the (width, height) of the
+/// photos.
+pub fn check(limits: &Limits, originals: &[(usize, usize)], max_size: usize, work: &Work) -> Result<()> {
+    let at = |size: usize| -> Vec<(usize, usize)> {
+        originals.iter().map(|&(w, h)| working_size(w, h, size)).collect()
+    };
+    let Some(why) = obstacle(limits, &at(max_size), work) else { return Ok(()) };
+    let longest = originals.iter().map(|s| s.0.max(s.1)).max().unwrap_or(0).min(max_size);
+    let works = |size: usize| obstacle(limits, &at(size), work).is_none();
+    if longest <= SMALLEST_SIDE || !works(SMALLEST_SIDE) {
+        return Err(Error::input(format!("{} photos are too many for this machine: {why}", originals.len())));
+    }
+    let (mut good, mut bad) = (SMALLEST_SIDE, longest);
+    while bad - good > 1 {
+        let middle = good + (bad - good) / 2;
+        if works(middle) { good = middle } else { bad = middle }
+    }
+    Err(Error::input(format!(
+        "photos of {longest} pixels are too large for this machine: {why}; the largest that works is --max-size {good}"
+    )))
+}
+
+/// Splats that the device binds with this many features: a feature's two moments are the widest row.
+pub fn most_splats(device: &DeviceInfo, features: usize) -> usize {
+    let row = (8 * features).max(96);
+    (device.max_storage_range / row as u64) as usize
+}
+
+/// Memory of the host that can be had without taking it from others, bytes.
+fn available() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"))?;
+    line.split_whitespace().next()?.parse::<u64>().ok().map(|kib| kib * 1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::test_device;
+
+    fn limits(gib: u64) -> Limits {
+        let mut device = test_device().info().clone();
+        device.max_storage_range = 128 << 20;
+        Limits { device, host: Some(gib << 30) }
+    }
+
+    const PHOTOS: [(usize, usize); 4] = [(4032, 3024); 4];
+
+    #[test]
+    fn what_fits_is_let_through_and_the_named_size_works() {
+        let work = Work::language(16, false, Preset::Draft, 4);
+        assert!(check(&limits(4), &PHOTOS, 800, &work).is_ok());
+        let e = check(&limits(4), &PHOTOS, 4032, &work).unwrap_err();
+        assert_eq!(e.exit_code(), 2);
+        let message = e.to_string();
+        let named: usize = message.rsplit(' ').next().unwrap().parse().unwrap();
+        assert!((800..4032).contains(&named), "{message}");
+        assert!(check(&limits(4), &PHOTOS, named, &work).is_ok());
+        assert!(check(&limits(4), &PHOTOS, named + 1, &work).is_err());
+        assert!(check(&limits(1), &PHOTOS, 800, &work).unwrap_err().to_string().contains("GiB"));
+    }
+
+    #[test]
+    fn images_wider_than_a_band_are_refused_by_width() {
+        let work = Work::language(16, false, Preset::Draft, 2);
+        let wide = [(40_000, 2000); 2];
+        let message = check(&limits(1000), &wide, 40_000, &work).unwrap_err().to_string();
+        assert!(message.contains("pixels wide") && message.contains("--max-size"), "{message}");
+        assert!(check(&limits(1000), &wide, 8000, &work).is_ok());
+    }
+
+    #[test]
+    fn a_gpu_is_held_to_its_own_memory() {
+        let mut limits = limits(1000);
+        (limits.device.is_cpu, limits.device.memory) = (false, 2 << 30);
+        let work = Work::language(16, false, Preset::Default, 4);
+        assert!(check(&limits, &PHOTOS, 1600, &work).is_ok());
+        let many = [(4032, 3024); 16];
+        assert!(check(&limits, &many, 4032, &work).unwrap_err().to_string().contains("which has 2.0"));
+    }
+}

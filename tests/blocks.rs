@@ -1,0 +1,253 @@
+//! What a device cannot bind at once is done in blocks, with the results of the whole.
+mod support;
+use glam::DVec3;
+use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions};
+use splatvk::gpu::{Device, Options, Recorder, TestDevice, test_device};
+use splatvk::pass::raster_backward::Summation;
+use splatvk::pass::rasterizer::Rasterizer;
+use splatvk::pass::{Frame, Renderer, SplatBuffers, Ways, seeded};
+use splatvk::progress::Silent;
+use splatvk::query::{QueryOptions, TextQuery, answer};
+use splatvk::run::view::Viewer;
+use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, Plane, Pose, RgbImage, Splats};
+use support::{GpuGradients, Scene};
+
+const MIB: u64 = 1 << 20;
+
+/// A device that binds no more than this.
+fn limited(bytes: u64, deterministic: bool) -> TestDevice {
+    TestDevice::with(&Options { max_binding: Some(bytes), deterministic, ..Options::from_env(None) }).unwrap()
+}
+
+/// Frame and gradients band by band, and the number of bands.
+fn in_bands(
+    scene: &Scene,
+    device: &Device,
+    summation: Summation,
+    upstream: &[f32],
+) -> (Vec<f32>, GpuGradients, usize) {
+    let params = SplatBuffers::upload(device, &scene.splats, &scene.features, scene.dim).unwrap();
+    let [width, height] = scene.view.size;
+    let ways = Ways { summation, ..Ways::of(device) };
+    let mut raster = Rasterizer::with(device, scene.splats.len(), scene.dim, width, height, ways).unwrap();
+    raster.set_view(&scene.view).unwrap();
+    let pixels = scene.pixels();
+    let mut image = vec![f32::NAN; (4 + scene.dim) * pixels];
+    // Also grows the lists.
+    let seen = |frame: &splatvk::pass::rasterizer::FrameBuffers, band: &splatvk::pass::bands::Band| {
+        let planes = frame.planes.read::<f32>()?;
+        let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
+        for (to, from) in image.chunks_exact_mut(pixels).zip(planes.chunks_exact(frame.bands.pixels())) {
+            to[inner.clone()].copy_from_slice(&from[stored.clone()]);
+        }
+        Ok(())
+    };
+    raster.forward_bands(&params, &scene.options, seen).unwrap();
+    let gradients = params.zeros_like(device).unwrap();
+    let bands = raster.frame().bands.clone();
+    let run = |record: &dyn Fn(&mut Recorder)| {
+        let mut rec = Recorder::new(device, "bands");
+        record(&mut rec);
+        rec.run().unwrap();
+    };
+    run(&|rec| raster.record_projection(rec, &params, &scene.options));
+    for band in bands.iter() {
+        run(&|rec| raster.record_band(rec, &params, &band));
+        raster.frame().planes_grad.write(&bands.cut_inner(&band, upstream, 0.0)).unwrap();
+        run(&|rec| raster.record_band_backward(rec, &params, &scene.options, &band));
+    }
+    run(&|rec| raster.record_gradients(rec, &params, &scene.options, &gradients));
+    let (splats, features) = gradients.download().unwrap();
+    let camera = raster.frame().camera_grad.read().unwrap();
+    (image, GpuGradients { splats, features, camera }, bands.count())
+}
+
+/// Largest difference, relative to the largest value.
+fn difference(a: &[f32], b: &[f32]) -> f32 {
+    assert_eq!(a.len(), b.len());
+    let scale = a.iter().fold(1e-12f32, |m, v| m.max(v.abs()));
+    a.iter().zip(b).fold(0.0f32, |m, (x, y)| m.max((x - y).abs())) / scale
+}
+
+#[track_caller]
+fn assert_alike(a: &GpuGradients, b: &GpuGradients, what: &str) {
+    let flat = |s: &Splats| {
+        [
+            s.means.as_flattened().to_vec(),
+            s.log_scales.as_flattened().to_vec(),
+            s.quats.as_flattened().to_vec(),
+            s.opacity_logits.clone(),
+            s.sh.clone(),
+        ]
+    };
+    let mut pairs: Vec<(Vec<f32>, Vec<f32>)> = flat(&a.splats).into_iter().zip(flat(&b.splats)).collect();
+    pairs.push((a.features.clone(), b.features.clone()));
+    pairs.push((a.camera.clone(), b.camera.clone()));
+    for (k, (x, y)) in pairs.iter().enumerate() {
+        // The same numbers added up in another order: about 1e-6 for sums of a thousand values of both signs.
+        let off = difference(x, y);
+        assert!(off < 2e-5, "{what}, class {k}: {off}");
+    }
+}
+
+/// 800 × 600 with 52 channels is 97 MiB of gradients: whole, in two bands and in twelve. The lists of 16 MiB are too short
+/// for all entries at once where gradients are kept per entry.
+#[test]
+fn frames_and_gradients_are_those_of_the_whole() {
+    let (splats, camera) = seeded::benchmark(4000, 800, 600, 1, 3);
+    let scene = Scene::new(splats, &camera, 48, 3);
+    let upstream = scene.upstream(5);
+    let whole = limited(128 * MIB, false);
+    let (image, atomics, one) = in_bands(&scene, &whole, Summation::Atomics, &upstream);
+    assert!(one == 1 && image.iter().all(|v| v.is_finite()));
+    for (mib, bands) in [(128, 1), (64, 2), (16, 12)] {
+        let device = limited(mib * MIB, false);
+        for summation in [Summation::Atomics, Summation::Entries] {
+            let (planes, gradients, count) = in_bands(&scene, &device, summation, &upstream);
+            assert_eq!(count, bands, "{mib} MiB");
+            assert!(planes == image, "{mib} MiB {summation:?}: other planes");
+            assert_alike(&atomics, &gradients, &format!("{mib} MiB {summation:?}"));
+        }
+    }
+}
+
+/// Code gradients of all features at once would be 205.7 MiB for so many splats, whatever the image.
+#[test]
+fn gradients_by_entry_fit_for_many_splats() {
+    let (splats, camera) = seeded::benchmark(130_000, 320, 240, 0, 4);
+    let scene = Scene::new(splats, &camera, 48, 4);
+    let upstream = scene.upstream(6);
+    let device = test_device();
+    let (_, atomics, _) = in_bands(&scene, &device, Summation::Atomics, &upstream);
+    let (_, entries, _) = in_bands(&scene, &device, Summation::Entries, &upstream);
+    assert_alike(&atomics, &entries, "130,000 splats");
+}
+
+#[test]
+fn an_image_too_large_for_the_device_is_rendered_in_bands() {
+    // 700,000 pixels: two bands at 128 MiB.
+    let (splats, camera) = seeded::benchmark(2000, 1000, 700, 0, 3);
+    let features = seeded::features(2000, 48, 1);
+    let frame = |mib: u64| -> Frame {
+        let device = limited(mib * MIB, false);
+        Renderer::new(&device, &splats, &features, 48).unwrap().render(&camera).unwrap()
+    };
+    assert!(frame(128) == frame(24));
+}
+
+/// Landscape, portrait and panorama, and what the splats look like in them.
+fn photos(device: &Device, splats: &Splats, sizes: &[(u32, u32)]) -> (Vec<Camera>, Vec<RgbImage>) {
+    let mut renderer = Renderer::new(device, splats, &[], 0).unwrap();
+    let camera = |(i, &(width, height)): (usize, &(u32, u32))| {
+        let a = i as f64 - 0.5;
+        let pose = Pose::exp(DVec3::new(-0.3 * a, 0.1 * a, 0.0), DVec3::new(0.01 * a, 0.05 * a, 0.0));
+        seeded::camera(width, height, pose)
+    };
+    let cameras: Vec<Camera> = sizes.iter().enumerate().map(camera).collect();
+    let images = cameras.iter().map(|c| renderer.render(c).unwrap().rgb).collect();
+    (cameras, images)
+}
+
+#[test]
+fn colours_are_trained_in_bands_as_in_whole_images() {
+    let (truth, _) = seeded::benchmark(1500, 320, 240, 0, 9);
+    let (cameras, images) = photos(&test_device(), &truth, &[(320, 240), (240, 320), (600, 90), (317, 235)]);
+    let mut start = truth.clone();
+    start.sh.iter_mut().for_each(|v| *v *= 0.7);
+    let options = RgbOptions {
+        iterations: 8,
+        coarse: 0.0,
+        report_every: 1,
+        poses: None,
+        ..RgbOptions::preset(Preset::Draft)
+    };
+    let scale = fit::scale::SceneScale::measure(&cameras, &truth.means);
+    let trained = |bytes: u64| {
+        let device = limited(bytes, true);
+        fit::fit_rgb(&device, &images, &cameras, start.clone(), scale, None, &options, &Silent).unwrap()
+    };
+    // 1 MiB: 136 rows of 320 pixels.
+    let (whole, bands) = (trained(128 * MIB), trained(MIB));
+    for (a, b) in whole.stats.curve.iter().zip(&bands.stats.curve) {
+        assert!((a.loss - b.loss).abs() < 1e-5 && (a.ssim - b.ssim).abs() < 1e-5, "{a:?} {b:?}");
+    }
+    // Adam's first steps are as long for tiny gradients as for large ones: single splats may part.
+    let close = whole.splats.sh.iter().zip(&bands.splats.sh).filter(|(a, b)| (*a - *b).abs() < 1e-3).count();
+    assert!(close * 100 > 99 * whole.splats.sh.len(), "{close} of {}", whole.splats.sh.len());
+    assert!(whole.stats.psnr.iter().zip(&bands.stats.psnr).all(|(a, b)| (a - b).abs() < 0.01));
+}
+
+/// Three levels of eight codes of 16 numbers, labels in squares, none in every fifth.
+fn field(images: &[RgbImage]) -> LanguageField {
+    let level = |l: u64| {
+        let mut codes = seeded::features(8, 16, 40 + l);
+        for code in codes.chunks_exact_mut(16) {
+            let norm = code.iter().map(|v| v * v).sum::<f32>().sqrt();
+            code.iter_mut().for_each(|v| *v /= norm);
+        }
+        let target = |image: &RgbImage| {
+            let square = |i: usize| i % image.width / 50 + 3 * (i / image.width / 50) + l as usize;
+            let label = |i: usize| if square(i) % 5 == 0 { -1 } else { (square(i) % 8) as i32 };
+            let data = (0..image.data.len()).map(label).collect();
+            Plane { width: image.width, height: image.height, data }
+        };
+        let embeddings = (0..64).map(|i| f32::from(u8::from(i % 9 == 0))).collect();
+        LevelField {
+            codebook: Codebook {
+                embedding_dim: 8,
+                code_dim: 16,
+                embeddings,
+                codes,
+                weights: vec![1.0; 8],
+                members: vec![Vec::new(); 8],
+                min_chord: 0.5,
+            },
+            features: Vec::new(),
+            targets: images.iter().map(target).collect(),
+        }
+    };
+    LanguageField { levels: (0..3).map(level).collect(), space: "test".into() }
+}
+
+#[test]
+fn language_is_trained_decoded_and_asked_in_bands_as_in_whole_images() {
+    let (splats, _) = seeded::benchmark(3000, 640, 480, 0, 9);
+    let whole = limited(128 * MIB, true);
+    let (cameras, images) = photos(&whole, &splats, &[(640, 480), (480, 640)]);
+    let untrained = field(&images);
+    let options = LanguageOptions { iterations: 2, check_every: 1, ..LanguageOptions::preset(Preset::Draft) };
+    let train = |device: &Device| {
+        fit::train_language(device, &images, &cameras, &splats, untrained.clone(), &options, &Silent).unwrap()
+    };
+    let reference = train(&whole);
+    let query = TextQuery {
+        text: "third".into(),
+        embedding: (0..8).map(|k| f32::from(u8::from(k == 3))).collect(),
+        canonicals: (0..8).map(|k| f32::from(u8::from(k == 5))).collect(),
+    };
+    let seen = |device: &Device, field: &LanguageField, camera: &Camera| {
+        let view = Viewer::new(device, &splats, field).unwrap().view_with_features(camera).unwrap();
+        let answer = answer(&view.codes, field, &query, &QueryOptions::default()).unwrap();
+        (view.frame, view.codes, answer.relevancy)
+    };
+    for mib in [16, 64] {
+        let device = limited(mib * MIB, true);
+        let trained = train(&device);
+        for (a, b) in reference.curve.iter().zip(&trained.curve) {
+            assert!((a.loss - b.loss).abs() < 1e-5, "{mib} MiB: {a:?} {b:?}");
+            let off = a.accuracy.iter().zip(&b.accuracy).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(off < 1e-3, "{mib} MiB: {a:?} {b:?}");
+        }
+        for (a, b) in reference.field.levels.iter().zip(&trained.field.levels) {
+            let close = a.features.iter().zip(&b.features).filter(|(a, b)| (*a - *b).abs() < 1e-3).count();
+            assert!(close * 100 > 99 * a.features.len(), "{mib} MiB: {close} of {}", a.features.len());
+        }
+        for camera in &cameras {
+            // The same scene on both devices: the same bits.
+            assert!(
+                seen(&whole, &reference.field, camera) == seen(&device, &reference.field, camera),
+                "{mib} MiB"
+            );
+        }
+    }
+}
