@@ -1,0 +1,99 @@
+//! The headline figures of one small run, from photos to scored answers through the command line: a stage that breaks
+//! shows here even if it still runs.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Held-out frames that are scored: one between the photos, one at the side.
+const HELD_OUT: [&str; 2] = ["test_05", "test_08"];
+
+fn data() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast")
+}
+
+fn splatvk(args: &[&str]) -> Vec<u8> {
+    let output = Command::new(env!("CARGO_BIN_EXE_splatvk")).args(args).output().unwrap();
+    assert!(output.status.success(), "{args:?}\n{}", String::from_utf8_lossy(&output.stderr));
+    output.stdout
+}
+
+/// The photos at half size, where the whole pipeline takes seconds, and the truth of the frames to score.
+fn prepare(folder: &Path) -> (PathBuf, PathBuf) {
+    let (photos, truth) = (folder.join("photos"), folder.join("truth"));
+    let mut json: Value =
+        serde_json::from_str(&std::fs::read_to_string(data().join("ground_truth.json")).unwrap()).unwrap();
+    std::fs::create_dir(&photos).unwrap();
+    for name in ["images", "held_out", "masks", "depth"] {
+        std::fs::create_dir_all(truth.join(name)).unwrap();
+    }
+    let frames = json["frames"].as_array_mut().unwrap();
+    frames.retain(|f| {
+        f["split"] == "train" || HELD_OUT.iter().any(|h| f["file"].as_str().unwrap().contains(h))
+    });
+    assert_eq!(frames.len(), 6);
+    for frame in frames {
+        let file = Path::new(frame["file"].as_str().unwrap());
+        let stem = file.file_stem().unwrap().to_str().unwrap();
+        for part in [file.to_owned(), format!("masks/{stem}.png").into(), format!("depth/{stem}.npz").into()]
+        {
+            std::fs::copy(data().join(&part), truth.join(&part)).unwrap();
+        }
+        if frame["split"] == "train" {
+            let small = image::open(data().join(file)).unwrap().resize_exact(
+                320,
+                240,
+                image::imageops::FilterType::Triangle,
+            );
+            small.to_rgb8().save(photos.join(format!("{stem}.png"))).unwrap();
+        }
+    }
+    std::fs::write(truth.join("ground_truth.json"), json.to_string()).unwrap();
+    (photos, truth)
+}
+
+#[test]
+fn a_small_run_reaches_its_figures() {
+    let folder = tempfile::tempdir().unwrap();
+    let (photos, truth) = prepare(folder.path());
+    let (scene, out) = (folder.path().join("scene"), folder.path().join("eval"));
+    let [photos, truth, scene, out] = [&photos, &truth, &scene, &out].map(|p| p.to_str().unwrap());
+    let short = ["--preset", "draft", "--iterations", "120", "--language-iterations", "30", "--seed", "1"];
+    splatvk(&[&["run", photos, "--out", scene, "--query", "lemon", "--json"], &short[..]].concat());
+    let report = splatvk(&["eval", scene, "--ground-truth", truth, "--out", out, "--json"]);
+    let report: Value = serde_json::from_slice(&report).unwrap();
+    let (train, test) = (&report["summary"]["train"], &report["summary"]["test"]);
+    let figure = |of: &Value, name: &str| of[name].as_f64().unwrap();
+    let worst = |name: &str| {
+        let poses = report["poses"].as_array().unwrap();
+        poses.iter().map(|p| p[name].as_f64().unwrap()).fold(0.0, f64::max)
+    };
+    let lemon = |split: &str| {
+        let masks = report["masks"].as_array().unwrap().iter();
+        masks
+            .filter(|m| m["phrase"] == "lemon" && m["split"] == split)
+            .map(|m| m["localised"] == true)
+            .collect::<Vec<_>>()
+    };
+    println!(
+        "rotation {:.3} centre {:.5} focal {:.4} auc_3 {:.3}\ntrain {train:#}\ntest {test:#}\nlemon {:?} {:?}",
+        worst("rotation_degrees"),
+        worst("centre_fraction"),
+        worst("focal_relative"),
+        figure(&report["relative_poses"], "auc_3"),
+        lemon("train"),
+        lemon("test"),
+    );
+    // Measured: 0.061 degrees, 0.056 %, 0.08 %, 0.967; depth 0.47 % and 0.44 %; 30.2 and 24.9 dB; localised 0.875, mIoU
+    // 0.677. Float atomics and drivers move these by a few percent, a broken stage by far more.
+    assert!(worst("rotation_degrees") < 0.15, "rotation");
+    assert!(worst("centre_fraction") < 0.0015, "centre");
+    assert!(worst("focal_relative") < 0.004, "focal");
+    assert!(figure(&report["relative_poses"], "auc_3") > 0.93, "auc");
+    assert!(figure(train, "depth_median_relative") < 0.008, "train depth");
+    assert!(figure(test, "depth_median_relative") < 0.008, "held-out depth");
+    assert!(figure(train, "psnr") > 28.5, "train PSNR");
+    assert!(figure(test, "psnr") > 23.5, "held-out PSNR");
+    assert!(lemon("train").iter().chain(&lemon("test")).all(|l| *l), "lemon");
+    assert!(figure(train, "localisation") > 0.74 && figure(train, "miou") > 0.55, "language");
+}
