@@ -84,14 +84,16 @@ fn a_small_run_reaches_its_figures() {
         lemon("train"),
         lemon("test"),
     );
-    assert!(worst("rotation_degrees") < 0.2, "rotation");
-    assert!(worst("centre_fraction") < 0.003, "centre");
-    assert!(worst("focal_relative") < 0.01, "focal");
-    assert!(figure(&report["relative_poses"], "auc_3") > 0.9, "auc");
-    assert!(figure(train, "depth_median_relative") < 0.01, "train depth");
-    assert!(figure(test, "depth_median_relative") < 0.02, "held-out depth");
-    assert!(figure(train, "psnr") > 24.0, "train PSNR");
-    assert!(figure(test, "psnr") > 21.0, "held-out PSNR");
+    // Measured: 0.061 degrees, 0.056 %, 0.08 %, 0.967; depth 0.47 % and 0.44 %; 30.2 and 24.9 dB; localised 0.875, mIoU
+    // 0.677. Float atomics and drivers move these by a few percent, a broken stage by far more.
+    assert!(worst("rotation_degrees") < 0.15, "rotation");
+    assert!(worst("centre_fraction") < 0.0015, "centre");
+    assert!(worst("focal_relative") < 0.004, "focal");
+    assert!(figure(&report["relative_poses"], "auc_3") > 0.93, "auc");
+    assert!(figure(train, "depth_median_relative") < 0.008, "train depth");
+    assert!(figure(test, "depth_median_relative") < 0.008, "held-out depth");
+    assert!(figure(train, "psnr") > 28.5, "train PSNR");
+    assert!(figure(test, "psnr") > 23.5, "held-out PSNR");
     assert!(lemon("train").iter().chain(&lemon("test")).all(|l| *l), "lemon");
-    assert!(figure(train, "localisation") > 0.6 && figure(train, "miou") > 0.3, "language");
+    assert!(figure(train, "localisation") > 0.74 && figure(train, "miou") > 0.55, "language");
 }
