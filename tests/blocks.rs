@@ -1,4 +1,5 @@
 //! What a device cannot bind at once is done in blocks, with the results of the whole.
+#![allow(clippy::unwrap_used)] // helpers of tests
 mod support;
 use glam::DVec3;
 use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions};

@@ -108,6 +108,19 @@ fn photos_without_overlap_are_named() {
     run_refuses(&[folder.path()], &[], &["overlap", "noise", "table"]);
 }
 
+/// With 4 MiB at once, 52 channels fit for 314 pixels side by side.
+#[test]
+fn a_size_that_cannot_be_done_is_refused_with_one_that_can() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = splatvk();
+    command.env("SPLATVK_MAX_BINDING", "4").arg("run").arg(data("breakfast/images"));
+    command.arg("--out").arg(folder.path().join("scene"));
+    let start = Instant::now();
+    refuses(&mut command, 2, &["640 pixels", "pixels wide", "--max-size 314"]);
+    assert!(start.elapsed() < Duration::from_secs(30), "before any long stage");
+    assert!(names(folder.path()).is_empty(), "left behind: {:?}", names(folder.path()));
+}
+
 #[test]
 fn views_must_fit_the_photos() {
     let photos = data("breakfast/images");

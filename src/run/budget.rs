@@ -6,15 +6,24 @@
 use crate::fit::{Preset, RgbOptions};
 use crate::gpu::DeviceInfo;
 use crate::pass::bands::{Bands, widest};
+use crate::pass::plane_sweep::MAX_SOURCES;
 use crate::pass::raster_forward::BASE_CHANNELS;
 use crate::photo::{SMALLEST_SIDE, working_size};
 use crate::scene::LEVEL_NAMES;
 use crate::{Error, Result};
 
-/// Bytes of the host per pixel of all photos, at the stage that needs most of them (dense stereo).
-const HOST_PIXEL: u64 = 330;
-/// Bytes of the host whatever the photos: networks and their working memory, the program.
-const HOST_BASE: u64 = 900 << 20;
+/// Bytes of the host per pixel of all photos: pictures, depth, points, masks, labels, and at the end every view with its codes.
+const HOST_PIXEL: u64 = 150;
+/// Bytes of the host per pixel of all photos at the size that they are matched at: planes, and the surfaces made of them.
+const STEREO_PIXEL: u64 = 150;
+/// Bytes of the host per pixel of one photo, as the edge network sees it: three maps of 64 channels.
+const NETWORK_PIXEL: u64 = 768;
+/// Longer side that this network sees at most (`infer::hed`).
+const NETWORK_SIDE: usize = 1600;
+/// Bytes of the host whatever the photos: networks, texts, the program.
+const HOST_BASE: u64 = 300 << 20;
+/// Views that stereo binds at once: a reference and its sources.
+const STEREO_VIEWS: u64 = MAX_SOURCES as u64 + 1;
 /// Share of a device's memory that buffers may fill: drivers keep some, and allocations leave gaps.
 const HEAP_SHARE: f64 = 0.9;
 /// Splats that continue the surfaces beyond one photo's border, at most (`fit::margin`).
@@ -73,8 +82,16 @@ pub struct Stage {
 
 /// Bytes per stage for photos of these working sizes. An error where an image cannot even be rendered in bands.
 pub fn stages(device: &DeviceInfo, sizes: &[(usize, usize)], work: &Work) -> Result<Vec<Stage>> {
-    let all: u64 = sizes.iter().map(|(w, h)| (w * h) as u64).sum();
-    let host = HOST_BASE + HOST_PIXEL * all;
+    let pixels = |s: &(usize, usize)| (s.0 * s.1) as u64;
+    let all: u64 = sizes.iter().map(pixels).sum();
+    // `pose::stereo` halves the size until a reference and its sources fit; this is what they hold then at most.
+    let group = 16 * all.min(STEREO_VIEWS * sizes.iter().map(pixels).max().unwrap_or(0));
+    let share = (device.max_storage_range as f64 / group.max(1) as f64).min(1.0);
+    let matched = (all as f64 * share) as u64;
+    let seen = |s: &(usize, usize)| pixels(&working_size(s.0, s.1, NETWORK_SIDE));
+    let network = NETWORK_PIXEL * sizes.iter().map(seen).max().unwrap_or(0);
+    // Freed memory stays with the process, so that the largest of everything counts in all stages.
+    let host = HOST_BASE + HOST_PIXEL * all + STEREO_PIXEL * matched + network;
     let training = |features: usize| -> Result<u64> {
         let (channels, splats) = (BASE_CHANNELS + features, work.splats as u64);
         let mut distinct: Vec<(usize, usize)> = Vec::new();
@@ -97,7 +114,7 @@ pub fn stages(device: &DeviceInfo, sizes: &[(usize, usize)], work: &Work) -> Res
         // Value, gradient and two moments of each parameter, at SH degree 0.
         Ok(bytes + splats * 16 * (14 + features as u64))
     };
-    let stereo = Stage { name: "dense stereo", device: 24 * all, host };
+    let stereo = Stage { name: "dense stereo", device: 24 * matched, host };
     let colour = Stage { name: "splats", device: training(0)?, host };
     let mut stages = vec![stereo, colour];
     if work.features > 0 {
