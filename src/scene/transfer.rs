@@ -23,7 +23,7 @@ mod tests {
     fn the_transfer_goes_both_ways_and_beyond_one() {
         // IEC 61966-2-1: mid grey 0.5 is 0.21404 linear.
         assert!((to_linear(0.5) - 0.214_041).abs() < 1e-5);
-        assert_eq!((to_linear(1.0), to_srgb(1.0)), (1.0, 1.0));
+        assert!((to_linear(1.0) - 1.0).abs() < 1e-6 && (to_srgb(1.0) - 1.0).abs() < 1e-6);
         for k in -50..400 {
             let v = k as f32 * 0.01;
             // A few f32 roundings of a power.
