@@ -2,7 +2,7 @@
 //!
 //! What exceeds a binding first are the planes of an image: 4 bytes per pixel and channel, 52 channels with three levels of
 //! 16 features. A band has its own planes, targets and labels; splats are projected and sorted once for all bands, and what
-//! flows back from every band adds up in the same gradients. Bands overlap by [`HALO`] rows on either side, which are
+//! flows back from every band adds up in the same gradients. Bands overlap by 16 rows on either side, which are
 //! rendered for the windows of SSIM and have no loss of their own. An image that fits is one band: the whole.
 use crate::gpu::DeviceInfo;
 use crate::{Error, Result};
