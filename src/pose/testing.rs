@@ -1,7 +1,7 @@
 //! Ground truth for tests: photos, cameras and depth of the breakfast set (and any set in its layout).
 use crate::photo::{self, Photo};
-use crate::scene::{Camera, Pose};
-use glam::{DMat3, DVec3};
+use crate::scene::{Camera, Lens, Pose, RgbImage};
+use glam::{DMat3, DVec2, DVec3};
 use std::path::{Path, PathBuf};
 
 pub(crate) struct Truth {
@@ -55,4 +55,30 @@ pub(crate) fn train(folder: &Path) -> Truth {
 /// Camera z per pixel, row-major, 0 = unknown.
 pub(crate) fn depth(folder: &Path, stem: &str) -> Vec<f32> {
     crate::format::npy::read_npz(folder.join(format!("depth/{stem}.npz"))).unwrap()["depth"].to_f32()
+}
+
+/// Colour between pixels; `x` and `y` are index coordinates.
+pub(crate) fn bilinear(image: &RgbImage, x: f64, y: f64) -> [f32; 3] {
+    let (x, y) = (x.clamp(0.0, image.width as f64 - 1.001), y.clamp(0.0, image.height as f64 - 1.001));
+    let (i, j, fx, fy) = (x as usize, y as usize, x.fract() as f32, y.fract() as f32);
+    std::array::from_fn(|k| {
+        let top = image.at(i, j)[k] * (1.0 - fx) + image.at(i + 1, j)[k] * fx;
+        let low = image.at(i, j + 1)[k] * (1.0 - fx) + image.at(i + 1, j + 1)[k] * fx;
+        top * (1.0 - fy) + low * fy
+    })
+}
+
+/// A photo of the same view through a lens about the middle of the image.
+pub(crate) fn lensed(photo: &Photo, focal: f64, lens: Lens) -> Photo {
+    let mut out = photo.clone();
+    let (w, h) = (photo.image.width, photo.image.height);
+    let middle = DVec2::new(w as f64, h as f64) * 0.5;
+    for y in 0..h {
+        for x in 0..w {
+            let seen = (DVec2::new(x as f64 + 0.5, y as f64 + 0.5) - middle) / focal;
+            let p = lens.undistort(seen) * focal + middle;
+            out.image.data[y * w + x] = bilinear(&photo.image, p.x - 0.5, p.y - 0.5);
+        }
+    }
+    out
 }
