@@ -6,7 +6,7 @@ use crate::pose::align::pose_errors;
 use crate::pose::relative::{auc, pair_errors};
 use crate::pose::{self, Placed};
 use crate::progress::Progress;
-use crate::query::eval::{Frame, GroundTruth, Split, StatedLens};
+use crate::query::eval::{Frame, GroundTruth, Split};
 use crate::scene::Lens;
 use crate::{Error, Result};
 use serde::Serialize;
@@ -62,7 +62,7 @@ pub struct CameraFigures {
     /// The lens that was found, of the first photo.
     pub lens: Lens,
     /// The true lens, if the data state it.
-    pub true_lens: Option<StatedLens>,
+    pub true_lens: Option<Lens>,
 }
 
 /// Data sets and what they say together.

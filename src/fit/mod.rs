@@ -5,7 +5,6 @@ pub mod index_head;
 pub mod init;
 mod language;
 mod lift;
-mod margin;
 mod model;
 pub mod options;
 pub mod pose;
@@ -13,6 +12,7 @@ mod rgb;
 pub mod scale;
 pub mod schedule;
 mod steps;
+mod unseen;
 mod views;
 
 pub(crate) use language::Run as LanguageRun;

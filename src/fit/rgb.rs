@@ -2,12 +2,12 @@
 use super::coarse::Halved;
 use super::densify::densify;
 use super::init::splats_from_points;
-use super::margin::margin_splats;
 use super::model::Model;
 use super::options::RgbOptions;
 use super::pose::PoseAdam;
 use super::scale::SceneScale;
 use super::schedule::{Random, ViewOrder};
+use super::unseen::unseen_splats;
 use super::views::Views;
 use crate::gpu::{Device, Program, Recorder};
 use crate::pass::densify::GradientStats;
@@ -89,7 +89,7 @@ pub fn train_rgb(
     let mut start = splats_from_points(points, &options.init, options.seed)?;
     if let Some(depths) = depths.filter(|_| options.margin > 0.0) {
         let (reach, confidence) = (options.margin, options.min_confidence);
-        start.append(margin_splats(images, cameras, depths, reach, confidence, options.seed));
+        start.append(unseen_splats(images, cameras, depths, reach, confidence, options.seed));
     }
     super::init::raise_sh_degree(&mut start, options.sh_degree);
     let scale = SceneScale::of(cameras, points);

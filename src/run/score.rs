@@ -1,5 +1,5 @@
 //! A scene scored against ground truth: rendered from every known camera, asked for every object.
-use super::refine::ViewRefiner;
+use super::refine::{Moved, ViewRefiner};
 use super::view::{DecodedFrame, Viewer};
 use crate::Result;
 use crate::gpu::Device;
@@ -40,9 +40,17 @@ pub fn score_field(
         evaluation.add_frame(frame, &rendered(&view), &answer_all(&view)?)?;
         if let Some(refiner) = refiner.as_ref().filter(|_| frame.split == Split::Test) {
             let photo = evaluation.photo(frame)?;
-            let (moved, score) = refined(refiner, &mut viewer, (camera, &view), &photo, progress)?;
-            let shown = moved.as_ref().unwrap_or(&view);
-            let score = RefinedView { frame: frame.stem.clone(), ..score };
+            let believed = evaluation.as_believed(camera);
+            let (closer, moved) = refined(refiner, &mut viewer, (&believed, &view), &photo, progress)?;
+            let score = RefinedView {
+                frame: frame.stem.clone(),
+                kept: closer.is_some(),
+                rotation_degrees: moved.rotation_degrees,
+                centre_fraction: moved.centre_fraction,
+                focal_relative: believed.fx / camera.fx - 1.0,
+                centre_shift: [believed.cx - camera.cx, believed.cy - camera.cy],
+            };
+            let shown = closer.as_ref().unwrap_or(&view);
             evaluation.add_refined(frame, score, &rendered(shown), &answer_all(shown)?)?;
         }
         progress.step(i as u64 + 1, "");
@@ -56,26 +64,20 @@ fn rendered(view: &DecodedFrame) -> Rendered {
     Rendered { rgb: frame.rgb.clone(), alpha: frame.alpha.clone(), depth: frame.depth.clone() }
 }
 
-/// The frame from its refined camera, if that is closer to the photo, and how far the camera moved.
+/// The frame from its refined camera, if that is closer to the photo, and how the camera moved. `camera` is the start,
+/// `given` what the true one shows.
 fn refined(
     refiner: &ViewRefiner,
     viewer: &mut Viewer,
     (camera, given): (&Camera, &DecodedFrame),
     photo: &RgbImage,
     progress: &dyn Progress,
-) -> Result<(Option<DecodedFrame>, RefinedView)> {
+) -> Result<(Option<DecodedFrame>, Moved)> {
     let border = crate::photo::Frame::of(photo);
     let inner = border.crop(photo);
     let closeness =
         |view: &DecodedFrame| metrics::psnr(&colour_fit(&border.crop(&view.frame.rgb), &inner), &inner);
     let moved = refiner.refine(camera, photo, progress)?;
     let view = viewer.view(&moved.camera)?;
-    let kept = closeness(&view) > closeness(given);
-    let score = RefinedView {
-        frame: String::new(),
-        kept,
-        rotation_degrees: moved.rotation_degrees,
-        centre_fraction: moved.centre_fraction,
-    };
-    Ok((kept.then_some(view), score))
+    Ok(((closeness(&view) > closeness(given)).then_some(view), moved))
 }

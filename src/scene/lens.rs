@@ -1,5 +1,6 @@
 //! Radial lens distortion.
-use glam::{DMat2, DVec2};
+use super::Camera;
+use glam::{DMat2, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
 /// Radial distortion in normalised camera coordinates, `x_d = x (1 + k1 r² + k2 r⁴)` with `x = (X/Z, Y/Z)` and `r = |x|`
@@ -62,6 +63,18 @@ impl Lens {
             }
         }
         y * (r / target)
+    }
+
+    /// Where a world point shows in the photo that a camera takes through this lens, pixels.
+    pub fn project(&self, camera: &Camera, world: DVec3) -> DVec2 {
+        let t = camera.pose.transform(world);
+        let d = self.distort(t.truncate() / t.z);
+        DVec2::new(camera.fx * d.x + camera.cx, camera.fy * d.y + camera.cy)
+    }
+
+    /// Camera-frame ray with z = 1 through a pixel position of that photo.
+    pub fn ray(&self, camera: &Camera, pixel: DVec2) -> DVec3 {
+        self.undistort(camera.ray(pixel).truncate()).extend(1.0)
     }
 
     /// Whether the distortion grows with the radius up to `radius` (normalised): beyond a fold it cannot be undone.

@@ -114,7 +114,8 @@ fn frame_json(c: &Camera, split: Split, file: &str) -> serde_json::Value {
 mod tests {
     use super::*;
     use crate::progress::Silent;
-    use crate::synth::{Effects, Lens};
+    use crate::scene::Lens;
+    use crate::synth::Effects;
     use glam::DVec2;
 
     #[test]
@@ -188,7 +189,7 @@ mod tests {
             }
             sum / f64::from(count)
         };
-        let (undone, ignored) = (error(Lens { k1: stated.k1, k2: stated.k2 }), error(Lens::default()));
+        let (undone, ignored) = (error(stated), error(Lens::NONE));
         assert!(undone < 0.25 * ignored, "{undone} {ignored}");
         assert!(truth.frames[2].lens.is_none() && stated.k1.abs() > 0.02, "{stated:?}");
     }

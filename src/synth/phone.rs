@@ -1,8 +1,8 @@
 //! What a phone does to a picture: lens, light, sensor noise. The distributions are stated in docs/data.md.
 use crate::fit::schedule::Random;
-use crate::scene::{Camera, RgbImage};
+use crate::scene::{Camera, Lens, RgbImage};
 use crate::{Error, Result};
-use glam::{DVec2, DVec3};
+use glam::DVec2;
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -56,71 +56,21 @@ impl Effects {
     }
 }
 
-/// Radial distortion `x_d = x_u (1 + k1 r² + k2 r⁴)` about the principal point, in units of the focal length; r is the
-/// undistorted radius.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Lens {
-    /// Term of r².
-    pub k1: f64,
-    /// Term of r⁴.
-    pub k2: f64,
-}
-
-impl Lens {
-    fn slope(&self, r: f64) -> f64 {
-        let s = r * r;
-        1.0 + s * (3.0 * self.k1 + 5.0 * self.k2 * s)
-    }
-
-    /// Undistorted → distorted, normalised camera coordinates.
-    pub fn distort(&self, undistorted: DVec2) -> DVec2 {
-        let s = undistorted.length_squared();
-        undistorted * (1.0 + s * (self.k1 + self.k2 * s))
-    }
-
-    /// Distorted → undistorted; exact where the lens is invertible.
-    pub fn undistort(&self, distorted: DVec2) -> DVec2 {
-        let wanted = distorted.length();
-        if wanted == 0.0 {
-            return distorted;
+/// The slope stays well above 0 out to every corner, so that each pixel has one ray.
+fn fits(lens: &Lens, camera: &Camera) -> bool {
+    let (w, h) = (f64::from(camera.width), f64::from(camera.height));
+    let corners = [(0.0, 0.0), (w, 0.0), (0.0, h), (w, h)];
+    let reach = corners.map(|(x, y)| camera.ray(DVec2::new(x, y)).truncate().length());
+    let reach = reach.into_iter().fold(0.0, f64::max);
+    // Walk outwards until the distorted radius covers the farthest corner.
+    let mut x = DVec2::ZERO;
+    while lens.distort(x).x < reach {
+        if lens.jacobian(x).x_axis.x < LEAST_SLOPE {
+            return false;
         }
-        // Newton's method on the radius, which grows steadily over the picture; ten steps leave rounding only.
-        let mut r = wanted;
-        for _ in 0..10 {
-            let error = r * (1.0 + r * r * (self.k1 + self.k2 * r * r)) - wanted;
-            r -= error / self.slope(r).max(LEAST_SLOPE);
-        }
-        distorted * (r / wanted)
+        x.x += 0.01 * reach;
     }
-
-    /// Where a world point shows in the distorted picture of a pinhole camera, pixels.
-    pub fn project(&self, camera: &Camera, world: DVec3) -> DVec2 {
-        let t = camera.pose.transform(world);
-        let d = self.distort(t.truncate() / t.z);
-        DVec2::new(camera.fx * d.x + camera.cx, camera.fy * d.y + camera.cy)
-    }
-
-    /// Camera-frame ray with z = 1 through a pixel position of the distorted picture.
-    pub fn ray(&self, camera: &Camera, pixel: DVec2) -> DVec3 {
-        self.undistort(camera.ray(pixel).truncate()).extend(1.0)
-    }
-
-    /// The slope stays well above 0 out to every corner, so that each pixel has one ray.
-    fn fits(&self, camera: &Camera) -> bool {
-        let (w, h) = (f64::from(camera.width), f64::from(camera.height));
-        let corners = [(0.0, 0.0), (w, 0.0), (0.0, h), (w, h)];
-        let reach = corners.map(|(x, y)| camera.ray(DVec2::new(x, y)).truncate().length());
-        let reach = reach.into_iter().fold(0.0, f64::max);
-        // Walk outwards until the distorted radius covers the farthest corner.
-        let mut r = 0.0;
-        while r * (1.0 + r * r * (self.k1 + self.k2 * r * r)) < reach {
-            if self.slope(r) < LEAST_SLOPE {
-                return false;
-            }
-            r += 0.01 * reach;
-        }
-        true
-    }
+    true
 }
 
 /// How one photo was lit.
@@ -170,7 +120,7 @@ pub fn shots(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<Sho
         let drawn = (0..1000).find_map(|_| {
             let k1 = between(&mut optics, -K1, K1);
             let lens = Lens { k1, k2: k1 * between(&mut optics, -K2_SHARE, K2_SHARE) };
-            lens.fits(camera).then_some(lens)
+            fits(&lens, camera).then_some(lens)
         });
         lens = Some(drawn.ok_or_else(|| Error::work("generate: no lens covers the picture"))?);
     }
@@ -243,6 +193,7 @@ mod tests {
     use super::super::scene::{Knobs, Thing, World, world};
     use super::super::shapes::{Paint, Shape};
     use super::*;
+    use glam::DVec3;
 
     fn knobs(seed: u64, effects: Effects) -> Knobs {
         Knobs { seed, size: (320, 240), photo_noise: 0.0, effects, ..Knobs::default() }

@@ -1,9 +1,9 @@
 //! Ray casting: photo, depth and mask of a synthetic scene.
-use super::phone::{Lens, Shot};
+use super::phone::Shot;
 use super::scene::{Thing, World};
 use super::shapes::Hit;
 use crate::fit::schedule::Random;
-use crate::scene::{Camera, Plane, RgbImage};
+use crate::scene::{Camera, Lens, Plane, RgbImage};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 

@@ -11,7 +11,7 @@ mod truth;
 mod tests;
 
 pub use figures::{DepthScore, colour_fit, depth_score, iou};
-pub use truth::{Frame, GroundTruth, Split, StatedLens};
+pub use truth::{Frame, GroundTruth, Split};
 
 use super::QueryResult;
 use crate::format::picture;
@@ -47,8 +47,9 @@ const DEFINITIONS: [&str; 8] = [
     "miou: plain mean of IoU over all (object, frame) pairs; localisation: share of pairs whose most relevant pixel lies on \
      the object",
     "train: photos that the scene was made from; test: held-out frames",
-    "refined: held-out frames again, each from a camera moved until the frozen scene's render is closest to the photo; the move \
-     is kept only where psnr_colour_fit rises. Everything outside `refined` is from the cameras as given",
+    "refined: held-out frames again, each with the focal length and principal point that the scene found for its own photos \
+     (focal_relative and centre_shift against the truth's), from a camera moved until the frozen scene's render is closest to \
+     the photo; kept only where psnr_colour_fit rises. Everything outside `refined` is from the cameras as given",
 ];
 
 /// One rendered frame.
@@ -177,6 +178,37 @@ pub struct RefinedView {
     pub rotation_degrees: f64,
     /// Shift of the centre over the scene's median depth.
     pub centre_fraction: f64,
+    /// Focal length that it has over the true one, minus 1.
+    pub focal_relative: f64,
+    /// Principal point that it has minus the true one, pixels.
+    pub centre_shift: [f64; 2],
+}
+
+/// What a scene believes of the camera that took its photos, against the truth: medians over the train frames.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Belief {
+    /// Focal length over the true one.
+    focal: f64,
+    /// Principal point minus the true one, share of the width and of the height.
+    centre: [f64; 2],
+}
+
+impl Belief {
+    fn of(estimated: &[Camera], known: &[Camera]) -> Belief {
+        let median = |value: &dyn Fn(&Camera, &Camera) -> f64| {
+            let mut all: Vec<f64> = estimated.iter().zip(known).map(|(e, k)| value(e, k)).collect();
+            crate::pose::numeric::median(&mut all).unwrap_or(0.0)
+        };
+        let of_width = |c: &Camera, x: f64| x / f64::from(c.width);
+        let of_height = |c: &Camera, y: f64| y / f64::from(c.height);
+        Belief {
+            focal: median(&|e, k| of_width(e, e.fx) / of_width(k, k.fx)),
+            centre: [
+                median(&|e, k| of_width(e, e.cx) - of_width(k, k.cx)),
+                median(&|e, k| of_height(e, e.cy) - of_height(k, k.cy)),
+            ],
+        }
+    }
 }
 
 /// Held-out frames from refined cameras.
@@ -216,6 +248,7 @@ pub struct Report {
 pub struct Evaluation {
     truth: GroundTruth,
     similarity: Similarity,
+    belief: Belief,
     out: Option<PathBuf>,
     report: Report,
 }
@@ -245,12 +278,26 @@ impl Evaluation {
         let errors = pose_errors(&estimated, &known, mean_depth);
         let relative_poses = relative(&frames, &estimated, &known, asked);
         let report = Report { poses: pose_scores(&frames, &errors), relative_poses, ..Report::default() };
-        Ok(Evaluation { similarity: errors.similarity, out: out.map(Path::to_path_buf), report, truth })
+        let (similarity, belief) = (errors.similarity, Belief::of(&estimated, &known));
+        Ok(Evaluation { similarity, belief, out: out.map(Path::to_path_buf), report, truth })
     }
 
     /// The frames and, for each, the camera of the truth expressed in the scene's world, at the truth's size.
     pub fn cameras(&self) -> Vec<(Frame, Camera)> {
         self.truth.frames.iter().map(|f| (f.clone(), to_scene(&f.camera, &self.similarity))).collect()
+    }
+
+    /// A camera of the truth with the optics that the scene found for its own photos: what a photo taken with the same
+    /// camera shows of the scene if the scene is right about itself.
+    pub fn as_believed(&self, camera: &Camera) -> Camera {
+        let Belief { focal, centre: [x, y] } = self.belief;
+        Camera {
+            fx: camera.fx * focal,
+            fy: camera.fy * focal,
+            cx: camera.cx + x * f64::from(camera.width),
+            cy: camera.cy + y * f64::from(camera.height),
+            ..camera.clone()
+        }
     }
 
     /// (object index, phrase) to ask for; background labels are left out.

@@ -1,6 +1,6 @@
 //! Ground-truth folders: `ground_truth.json`, photos, `masks/<stem>.png`, `depth/<stem>.npz`.
 use crate::format::npy;
-use crate::scene::{Camera, Plane, Pose, RgbImage};
+use crate::scene::{Camera, Lens, Plane, Pose, RgbImage};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
@@ -39,16 +39,7 @@ pub struct Frame {
     /// Intrinsics and pose in the true world.
     pub camera: Camera,
     /// Radial distortion of the photo, if the set states it; [`Frame::camera`] is without it.
-    pub lens: Option<StatedLens>,
-}
-
-/// Radial distortion `x_d = x_u (1 + k1 r² + k2 r⁴)` about the principal point, r in units of the focal length.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct StatedLens {
-    /// Term of r².
-    pub k1: f64,
-    /// Term of r⁴.
-    pub k2: f64,
+    pub lens: Option<Lens>,
 }
 
 /// A ground-truth folder.
@@ -81,7 +72,7 @@ struct FileFrame {
     cy: f64,
     world_to_camera: [[f64; 4]; 4],
     #[serde(default)]
-    lens: Option<StatedLens>,
+    lens: Option<Lens>,
 }
 
 impl GroundTruth {

@@ -1,0 +1,262 @@
+//! Surfaces continued where no photo shows them.
+//!
+//! Between a few views, a camera soon sees past what any photo shows, beyond its borders and behind its objects, and finds
+//! black there. Planes have an inverse depth that is affine in the pixel position, so floors, tables and walls continue
+//! exactly: coarse flat splats extend the plane that ends at a photo's border or at a depth edge, in its mean colour. No
+//! training view sees them, so they change no loss.
+mod anchor;
+
+use super::init::SH_C0;
+use super::schedule::Random;
+use crate::scene::{Camera, DepthMap, RgbImage, Splats};
+use anchor::{Anchor, Shown};
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use rayon::prelude::*;
+use std::collections::HashSet;
+
+/// Grid of the splats in units of the longer image side: only the mean colour is known, so finer splats tell no more.
+const STEP: f64 = 0.01;
+/// Relative depth by which a splat must stand behind what a photo shows there: above stereo noise.
+const BEHIND: f64 = 1.05;
+/// How far behind a depth edge a plane goes on, in units of the longer image side: at a field of view of 55°, a camera turned
+/// by 20° about what stands in front sees 0.12 of what is half as far again.
+const REVEALED: f64 = 0.12;
+/// Standard deviation in units of the grid: neighbours at 0.7 blend without gaps.
+const OVERLAP: f64 = 0.7;
+/// Opacity logit of these splats: about 0.98.
+const LOGIT: f32 = 4.0;
+
+/// One splat to be.
+struct Candidate {
+    /// From where the surface ends, pixels.
+    distance: f64,
+    position: DVec3,
+    /// World steps of one grid cell along x and y.
+    steps: [DVec3; 2],
+    colour: [f32; 3],
+}
+
+/// Flat splats around all photos and behind their depth edges, up to `reach` times the longer side away from where the
+/// surface ends; depth counts from `min_confidence` on.
+pub fn unseen_splats(
+    images: &[RgbImage],
+    cameras: &[Camera],
+    depths: &[DepthMap],
+    reach: f64,
+    min_confidence: f32,
+    seed: u64,
+) -> Splats {
+    let of_view = |view: usize| -> Vec<Candidate> {
+        let shown =
+            Shown { image: &images[view], camera: &cameras[view], depth: &depths[view], min_confidence };
+        let mut random = Random::new(seed ^ 0x3a61 ^ ((view as u64) << 32));
+        let mut own = candidates(&shown, reach * shown.long(), &mut random);
+        own.retain(|c| !(0..depths.len()).any(|v| v != view && in_the_way(c, &cameras[v], &depths[v])));
+        own
+    };
+    let views = images.len().min(depths.len());
+    let mut all: Vec<Candidate> = (0..views).into_par_iter().flat_map_iter(of_view).collect();
+    // Where several photos continue one surface, the nearest end knows best.
+    all.sort_by(|a, b| a.distance.total_cmp(&b.distance));
+    let mut taken = HashSet::new();
+    let mut splats = Splats::default();
+    for c in &all {
+        let size = c.steps[0].length().min(c.steps[1].length()).max(1e-12);
+        let octave = size.log2().round();
+        let cell = (c.position / (octave.exp2() * 1.5)).floor().as_i64vec3();
+        if taken.insert((octave as i64, cell)) {
+            push(&mut splats, c);
+        }
+    }
+    splats
+}
+
+/// Splats around one photo and behind what it shows, up to `reach` pixels from where their surfaces end.
+fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<Candidate> {
+    let size = shown.size();
+    // What is hidden is seen through narrow cracks: twice as fine as beyond the borders.
+    let (step, fine) = (STEP * shown.long(), 0.5 * STEP * shown.long());
+    let borders = anchor::at_border(shown, random);
+    let edges = anchor::at_edges(shown, fine, random);
+    let continued = |anchor: &Anchor, pixel: DVec2, step: f64| {
+        candidate(shown.camera, anchor, pixel, anchor.at.distance(pixel), step)
+    };
+    let mut out = Vec::new();
+    for pixel in shown.cells(step, reach) {
+        let border = pixel.clamp(DVec2::ZERO, size);
+        let outside = border != pixel && border.distance(pixel) < reach;
+        let Some(front) = Anchor::nearest(borders.iter(), border).filter(|_| outside) else { continue };
+        out.extend(continued(front, pixel, step));
+        // What continues there may end before the next surface does.
+        let next = borders.iter().chain(&edges).filter(|a| a.inverse(pixel) * BEHIND < front.inverse(pixel));
+        let next = Anchor::nearest(next, pixel).filter(|a| a.at.distance(pixel) < reach);
+        out.extend(next.and_then(|a| continued(a, pixel, step)));
+    }
+    for pixel in shown.cells(fine, 0.0).filter(|p| p.x < size.x && p.y < size.y) {
+        let depth = shown.depth_at(pixel.x as usize, pixel.y as usize);
+        // Nearer to the end of a surface that stands there itself, nothing is revealed: what lies behind would only shine
+        // through what training leaves transparent.
+        let next = Anchor::nearest(edges.iter(), pixel)
+            .filter(|a| a.at.distance(pixel) < REVEALED * shown.long())
+            .filter(|a| depth.is_some_and(|z| a.inverse(pixel) * z * BEHIND < 1.0));
+        out.extend(next.and_then(|a| continued(a, pixel, fine)));
+    }
+    out
+}
+
+/// True where a candidate would stand before, or on, what another photo shows (or should show).
+fn in_the_way(c: &Candidate, camera: &Camera, depth: &DepthMap) -> bool {
+    let (pixel, z) = camera.project(c.position);
+    let (w, h) = (f64::from(camera.width), f64::from(camera.height));
+    if z <= 0.0 || pixel.x < 0.0 || pixel.y < 0.0 || pixel.x >= w || pixel.y >= h {
+        return false;
+    }
+    let known = f64::from(depth.depth.at(pixel.x as usize, pixel.y as usize));
+    known <= 0.0 || z < BEHIND * known
+}
+
+/// The splat that continues an anchor's plane at a pixel that does not show it; `None` near or past the horizon.
+fn candidate(camera: &Camera, anchor: &Anchor, pixel: DVec2, distance: f64, step: f64) -> Option<Candidate> {
+    let inverse = |p: DVec2| anchor.inverse(p);
+    // Beyond three times the distance of its end, or nearer than half of it, a plane is a guess too far.
+    let value = inverse(pixel);
+    if value < anchor.w / 3.0 || value > anchor.w * 2.0 {
+        return None;
+    }
+    let world = |p: DVec2| camera.unproject(p, 1.0 / inverse(p).max(anchor.w / 4.0));
+    let position = world(pixel);
+    let steps = [DVec2::X, DVec2::Y].map(|e| world(pixel + 0.5 * step * e) - world(pixel - 0.5 * step * e));
+    Some(Candidate { distance, position, steps, colour: anchor.colour })
+}
+
+/// A flat splat that spans one grid cell of the plane.
+fn push(splats: &mut Splats, c: &Candidate) {
+    let (long, short) = if c.steps[0].length() >= c.steps[1].length() {
+        (c.steps[0], c.steps[1])
+    } else {
+        (c.steps[1], c.steps[0])
+    };
+    let x = long.normalize_or(DVec3::X);
+    let normal = x.cross(short).normalize_or(x.any_orthonormal_vector());
+    let y = normal.cross(x);
+    let q = DQuat::from_mat3(&DMat3::from_cols(x, y, normal));
+    let (sx, sy) = (OVERLAP * long.length(), OVERLAP * short.dot(y).abs());
+    // A tenth of the short side keeps the splat visible from a grazing camera and below the needle limit of 8 ... 10.
+    let sizes = [sx, sy.max(sx / 8.0), (0.1 * sy).max(sx / 8.0)];
+    splats.means.push(c.position.as_vec3().into());
+    splats.log_scales.push(sizes.map(|s| s.max(1e-12).ln() as f32));
+    splats.quats.push([q.w as f32, q.x as f32, q.y as f32, q.z as f32]);
+    splats.opacity_logits.push(LOGIT);
+    splats.sh.extend(c.colour.map(|v| (v - 0.5) / SH_C0));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Plane, Pose};
+
+    fn camera() -> Camera {
+        Camera {
+            name: "a".into(),
+            width: 160,
+            height: 120,
+            fx: 140.0,
+            fy: 140.0,
+            cx: 80.0,
+            cy: 60.0,
+            pose: Pose::exp(DVec3::new(0.1, -0.2, 0.3), DVec3::new(0.2, 0.1, -0.1)),
+        }
+    }
+
+    /// Depth of the world plane n·p = offset, with a small nearer object in the middle of the lower border.
+    fn scene(n: DVec3, offset: f64) -> (RgbImage, DepthMap) {
+        let camera = camera();
+        let centre = camera.pose.centre();
+        let mut image = RgbImage { width: 160, height: 120, data: Vec::new() };
+        let mut depth = Plane::filled(160, 120, 0.0f32);
+        for i in 0..160 * 120 {
+            let pixel = DVec2::new((i % 160) as f64 + 0.5, (i / 160) as f64 + 0.5);
+            let ray = camera.pose.inverse().rotation * camera.ray(pixel);
+            let object = pixel.distance(DVec2::new(80.0, 118.0)) < 5.0;
+            let z = (offset - n.dot(centre)) / n.dot(ray);
+            depth.data[i] = (if object { 0.7 * z } else { z }) as f32;
+            image.data.push(if object { [1.0, 0.0, 0.0] } else { [0.2, 0.5, 0.7] });
+        }
+        let confidence = Plane::filled(160, 120, 1.0);
+        (image, DepthMap { depth, confidence })
+    }
+
+    #[test]
+    fn a_plane_continues_as_itself() {
+        let n = DVec3::new(0.1, -0.3, 1.0).normalize();
+        let (image, depth) = scene(n, 3.0);
+        let known = depth.clone();
+        let splats = unseen_splats(&[image], &[camera()], &[depth], 0.2, 0.5, 0);
+        // 32 px around 160 × 120 on a grid of 1.6 px is about 7000 cells (rounded corners).
+        assert!(splats.len() > 2500, "{}", splats.len());
+        let mut off = 0;
+        for i in 0..splats.len() {
+            let p = DVec3::from(splats.means[i].map(f64::from));
+            let (pixel, z) = camera().project(p);
+            let inside = pixel.x > 0.0 && pixel.y > 0.0 && pixel.x < 160.0 && pixel.y < 120.0;
+            let hidden = || z > f64::from(known.depth.at(pixel.x as usize, pixel.y as usize));
+            assert!(!inside || hidden(), "nothing before what the photo shows");
+            off +=
+                usize::from((n.dot(p) - 3.0).abs() > 0.01 || (splats.sh[3 * i] * SH_C0 + 0.3).abs() > 0.02);
+            let [w, x, y, z] = splats.quats[i].map(f64::from);
+            let normal = DQuat::from_xyzw(x, y, z, w) * DVec3::Z;
+            off += usize::from(normal.dot(n).abs() < 0.99);
+        }
+        // The object may continue itself at its own 10 of the 560 border pixels, 1.8 %.
+        assert!(off <= splats.len() / 50, "{off} of {} leave the plane or its colour", splats.len());
+    }
+
+    #[test]
+    fn a_plane_continues_behind_what_stands_before_it() {
+        let n = DVec3::new(0.1, -0.3, 1.0).normalize();
+        let (mut image, mut depth) = scene(n, 3.0);
+        let covered = |x: usize, y: usize| (60..100).contains(&x) && (45..75).contains(&y);
+        for i in (0..160 * 120).filter(|i| covered(i % 160, i / 160)) {
+            depth.depth.data[i] *= 0.6;
+            image.data[i] = [0.9, 0.1, 0.1];
+        }
+        let splats = unseen_splats(&[image], &[camera()], &[depth], 0.2, 0.5, 0);
+        let mut behind = 0;
+        for (mean, sh) in splats.means.iter().zip(splats.sh.chunks(3)) {
+            let p = DVec3::from(mean.map(f64::from));
+            let (pixel, z) = camera().project(p);
+            if !(pixel.x > 0.0 && pixel.y > 0.0 && covered(pixel.x as usize, pixel.y as usize)) {
+                continue;
+            }
+            behind += 1;
+            // On the plane, in its colour; the object's own plane has nothing behind it.
+            assert!((n.dot(p) - 3.0).abs() < 0.01, "{p} at {z}");
+            assert!((sh[0] * SH_C0 + 0.3).abs() < 0.02, "{}", sh[0]);
+        }
+        // 40 × 30 px on a grid of 0.8 px, of which one in two to three survives where cells in space are shared.
+        assert!(behind > 600, "{behind}");
+    }
+
+    #[test]
+    fn nothing_stands_in_front_of_another_photo() {
+        let n = DVec3::Z;
+        let (image, depth) = scene(n, 3.0);
+        let mut beside = camera();
+        // Turned by 17°: it sees part of the margin of the first.
+        beside.pose = Pose::exp(DVec3::ZERO, DVec3::new(0.0, 0.3, 0.0)).compose(&beside.pose);
+        let images = [image.clone(), image];
+        let splats =
+            unseen_splats(&images, &[camera(), beside.clone()], &[depth.clone(), depth.clone()], 0.2, 0.5, 0);
+        assert!(splats.len() > 1000);
+        for p in &splats.means {
+            let c = Candidate {
+                distance: 0.0,
+                position: DVec3::from(p.map(f64::from)),
+                steps: [DVec3::X; 2],
+                colour: [0.0; 3],
+            };
+            // A splat belongs to one view and must not disturb the other; its own photo it cannot reach.
+            assert!(!in_the_way(&c, &beside, &depth) && !in_the_way(&c, &camera(), &depth));
+        }
+    }
+}
