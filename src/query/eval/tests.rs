@@ -96,3 +96,19 @@ fn another_scenes_truth_is_refused() {
     let camera = breakfast().frames[0].camera.clone();
     assert_eq!(to_scene(&camera, &same), camera);
 }
+
+#[test]
+fn held_out_frames_take_the_optics_that_the_scene_found() {
+    let (truth, mut scene, _) = moved();
+    for c in &mut scene {
+        // As a scene at half the size that takes the focal length for a tenth shorter and the centre for 2 % off.
+        *c = c.resized(320, 240);
+        (c.fx, c.fy, c.cx) = (0.9 * c.fx, 0.9 * c.fy, c.cx + 0.02 * 320.0);
+    }
+    let eval = Evaluation::new(truth, &scene, None).unwrap();
+    let (frame, camera) = eval.cameras().into_iter().find(|(f, _)| f.split == Split::Test).unwrap();
+    let believed = eval.as_believed(&camera);
+    assert!((believed.fx / frame.camera.fx - 0.9).abs() < 1e-9 && believed.pose == camera.pose);
+    assert!((believed.cx - frame.camera.cx - 0.02 * 640.0).abs() < 1e-6);
+    assert!((believed.cy - frame.camera.cy).abs() < 1e-6);
+}
