@@ -53,8 +53,8 @@ pub struct RgbOptions {
     pub seed: u64,
     /// Start of the splats.
     pub init: InitOptions,
-    /// How far surfaces are continued beyond the photo borders, in units of the longer image side (needs depth maps);
-    /// 0 = not at all.
+    /// How far surfaces are continued beyond the photo borders, in units of the longer image side (needs depth maps); 0 =
+    /// nothing is continued, behind depth edges neither.
     pub margin: f64,
     /// Learning rates.
     pub rates: Rates,

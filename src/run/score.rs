@@ -81,3 +81,52 @@ fn refined(
     let view = viewer.view(&moved.camera)?;
     Ok(((closeness(&view) > closeness(given)).then_some(view), moved))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::format::picture::write_png;
+    use crate::pass::{Renderer, seeded};
+    use crate::progress::Silent;
+    use crate::query::eval::GroundTruth;
+    use crate::scene::Pose;
+    use glam::DVec3;
+    use serde_json::json;
+
+    #[test]
+    fn a_truth_of_another_focal_length_is_met_with_the_scene_s_own() {
+        let device = Device::open(None).unwrap();
+        let (splats, camera) = seeded::small(400, 96, 72, 1, 5);
+        let mut renderer = Renderer::new(&device, &splats, &[], 0).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let shifts = [DVec3::new(-0.3, 0.0, 0.0), DVec3::new(0.3, 0.1, 0.0), DVec3::ZERO];
+        let (mut scene, mut frames) = (Vec::new(), Vec::new());
+        for (k, shift) in shifts.into_iter().enumerate() {
+            let pose = Pose::exp(shift, DVec3::ZERO).compose(&camera.pose);
+            let own = Camera { name: format!("{k}.png"), pose, ..camera.clone() };
+            write_png(&folder.path().join(&own.name), &renderer.render(&own).unwrap().rgb).unwrap();
+            let (r, t) = (pose.rotation.transpose(), pose.translation);
+            let row = |axis: DVec3, shift: f64| [axis.x, axis.y, axis.z, shift];
+            let matrix = [row(r.x_axis, t.x), row(r.y_axis, t.y), row(r.z_axis, t.z), [0.0, 0.0, 0.0, 1.0]];
+            // What it states is an eighth more than the focal length that the photos were taken with.
+            frames.push(json!({
+                "file": own.name, "split": if k < 2 { "train" } else { "test" }, "fx": 1.125 * own.fx,
+                "fy": 1.125 * own.fy, "cx": own.cx, "cy": own.cy, "world_to_camera": matrix,
+            }));
+            scene.extend((k < 2).then_some(own));
+        }
+        let text = json!({"width": 96, "height": 72, "frames": frames}).to_string();
+        std::fs::write(folder.path().join("ground_truth.json"), text).unwrap();
+        let evaluation = Evaluation::new(GroundTruth::read(folder.path()).unwrap(), &scene, None).unwrap();
+        let field = LanguageField::default();
+        let report =
+            score_field(&device, &splats, &field, &[], evaluation, true, &Silent, &mut |_, _| Ok(())).unwrap();
+        let given = report.images.iter().find(|i| i.split == Split::Test).unwrap().psnr_colour_fit;
+        let refined = report.refined.unwrap();
+        let (view, score) = (&refined.views[0], refined.images[0].psnr_colour_fit);
+        println!("given {given:.1} dB, refined {score:.1} dB");
+        assert!(view.kept && (view.focal_relative + 1.0 / 9.0).abs() < 1e-6, "{view:?}");
+        // Moving the camera alone cannot undo an eighth of magnification in a scene with depth.
+        assert!(score > given + 10.0 && score > 35.0, "{given} {score}");
+    }
+}

@@ -171,7 +171,7 @@ impl Shown<'_> {
     }
 }
 
-/// The plane with the most weight near the border: the best of 60 triples (99 % sure to hit a plane with half of the
+/// The plane with the most weight: the best of 60 triples (99 % sure to hit a plane with half of the
 /// samples, with a margin for noise), then least squares over its inliers.
 fn fit_plane(samples: &[Sample], random: &mut Random) -> Option<(f64, DVec2)> {
     let agrees =

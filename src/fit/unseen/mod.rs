@@ -117,13 +117,12 @@ fn in_the_way(c: &Candidate, camera: &Camera, depth: &DepthMap) -> bool {
 
 /// The splat that continues an anchor's plane at a pixel that does not show it; `None` near or past the horizon.
 fn candidate(camera: &Camera, anchor: &Anchor, pixel: DVec2, distance: f64, step: f64) -> Option<Candidate> {
-    let inverse = |p: DVec2| anchor.inverse(p);
     // Beyond three times the distance of its end, or nearer than half of it, a plane is a guess too far.
-    let value = inverse(pixel);
+    let value = anchor.inverse(pixel);
     if value < anchor.w / 3.0 || value > anchor.w * 2.0 {
         return None;
     }
-    let world = |p: DVec2| camera.unproject(p, 1.0 / inverse(p).max(anchor.w / 4.0));
+    let world = |p: DVec2| camera.unproject(p, 1.0 / anchor.inverse(p).max(anchor.w / 4.0));
     let position = world(pixel);
     let steps = [DVec2::X, DVec2::Y].map(|e| world(pixel + 0.5 * step * e) - world(pixel - 0.5 * step * e));
     Some(Candidate { distance, position, steps, colour: anchor.colour })
@@ -237,6 +236,54 @@ mod tests {
         assert!(behind > 600, "{behind}");
     }
 
+    /// Pixel and camera depth of every splat, and its red channel.
+    fn places(splats: &Splats) -> Vec<(DVec2, f64, f32)> {
+        let place = |(mean, sh): (&[f32; 3], &[f32])| {
+            let (pixel, z) = camera().project(DVec3::from(mean.map(f64::from)));
+            (pixel, z, 0.5 + sh[0] * SH_C0)
+        };
+        splats.means.iter().zip(splats.sh.chunks(3)).map(place).collect()
+    }
+
+    /// A photo of walls parallel to its image: depth and colour by pixel; depth 0 is unknown.
+    fn walls(at: impl Fn(usize, usize) -> (f32, [f32; 3])) -> (RgbImage, DepthMap) {
+        let pixels: Vec<_> = (0..160 * 120).map(|i| at(i % 160, i / 160)).collect();
+        let depth = Plane { width: 160, height: 120, data: pixels.iter().map(|p| p.0).collect() };
+        let image = RgbImage { width: 160, height: 120, data: pixels.iter().map(|p| p.1).collect() };
+        (image, DepthMap { depth, confidence: Plane::filled(160, 120, 1.0) })
+    }
+
+    #[test]
+    fn beyond_a_border_the_next_surface_goes_on_behind_the_first() {
+        // A wall above and a nearer one below row 60: beyond the left border the lower one continues, and may end.
+        let (image, depth) = walls(|_, y| if y < 60 { (3.0, [0.2; 3]) } else { (1.8, [0.8; 3]) });
+        let splats = unseen_splats(&[image], &[camera()], &[depth], 0.2, 0.5, 0);
+        let below: Vec<_> = places(&splats)
+            .into_iter()
+            .filter(|(p, ..)| (-20.0..-1.0).contains(&p.x) && (63.0..75.0).contains(&p.y))
+            .collect();
+        let near = below.iter().filter(|(_, z, red)| (z - 1.8).abs() < 0.02 && *red > 0.7).count();
+        let far = below.iter().filter(|(_, z, red)| (z - 3.0).abs() < 0.03 && *red < 0.3).count();
+        // 19 × 12 px on a grid of 1.6 px are about 90 cells; some share a cell in space.
+        assert!(near > 40 && far > 40 && near + far == below.len(), "{near} {far} {}", below.len());
+    }
+
+    #[test]
+    fn a_border_without_depth_takes_no_plane_of_another_colour() {
+        // Left: a grey wall without depth in the middle rows, and a red box before it.
+        let (image, depth) = walls(|x, y| match (x, (30..90).contains(&y)) {
+            (0..20, true) => (0.0, [0.5; 3]),
+            (20..60, true) => (1.5, [0.9, 0.1, 0.1]),
+            _ => (3.0, [0.5; 3]),
+        });
+        let splats = unseen_splats(&[image], &[camera()], &[depth], 0.2, 0.5, 0);
+        let left: Vec<_> = places(&splats).into_iter().filter(|(p, ..)| p.x < -1.0).collect();
+        assert!(left.len() > 500, "{}", left.len());
+        for (pixel, z, red) in left {
+            assert!((z - 3.0).abs() < 0.03 && red < 0.6, "{pixel} {z} {red}");
+        }
+    }
+
     #[test]
     fn nothing_stands_in_front_of_another_photo() {
         let n = DVec3::Z;
@@ -255,7 +302,7 @@ mod tests {
                 steps: [DVec3::X; 2],
                 colour: [0.0; 3],
             };
-            // A splat belongs to one view and must not disturb the other; its own photo it cannot reach.
+            // Every splat is outside each photo or behind what it shows.
             assert!(!in_the_way(&c, &beside, &depth) && !in_the_way(&c, &camera(), &depth));
         }
     }
