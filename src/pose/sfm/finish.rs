@@ -1,5 +1,6 @@
 //! From a grown model to the final one: what the lens does, sightings refined to sub-pixel, further points.
-use super::model::{Freedom, Model, Sighting, Track};
+use super::model::{Model, Sighting, Track};
+use super::optics::learn_optics;
 use super::patch::Shades;
 use super::tracks::{self, Link};
 use super::{MARGIN, Putative, THRESHOLD, cameras_of, colour_at, matching, refine};
@@ -109,38 +110,6 @@ fn settle(model: &mut Model) -> Result<Outcome> {
     model.adjust(f64::INFINITY, 2.0, 60)
 }
 
-/// Independent observations that the sightings of a set are worth at most. Neighbours err alike: what shifts one (a bent
-/// surface taken for flat, JPEG, a moved shadow) shifts those around it, so that thousands of sightings more say little more of
-/// the optics. On the tuning sets a principal point or lens that is not there lowers the cost by up to 0.3 %, one that moves
-/// pixels by 5 by 1.3 % and more; with 2000 the criterion asks for 0.8 %. The same number makes the stated doubt of the focal
-/// length as large as its errors there.
-const INDEPENDENT: f64 = 2000.0;
-
-/// Decides what of the optics the photos tell, by the Bayesian information criterion with unknown noise, and adjusts with it.
-/// The doubt that comes back is that of all optics together: what was not believed may be there all the same.
-fn learn_optics(model: &mut Model) -> Result<Outcome> {
-    let observations: usize = model.tracks.iter().map(|t| 2 * t.sightings.len()).sum();
-    let worth = INDEPENDENT.min(observations as f64);
-    let mut best: Option<(f64, Model, Outcome)> = None;
-    let mut doubt = Vec::new();
-    for freedom in Freedom::ALL {
-        let mut trial = Model { freedom, ..model.clone() };
-        let outcome = trial.adjust(f64::INFINITY, 2.0, 60)?;
-        let value = worth * outcome.cost.max(1e-9).ln() + trial.parameters() as f64 * worth.ln();
-        doubt.clone_from(&outcome.sigmas);
-        if best.as_ref().is_none_or(|b| value < b.0) {
-            best = Some((value, trial, outcome));
-        }
-    }
-    let Some((_, chosen, outcome)) = best else { return settle(model) };
-    *model = chosen;
-    let wider = (observations as f64 / worth).sqrt();
-    for (sigmas, prior) in doubt.iter_mut().zip(&model.priors) {
-        sigmas.iter_mut().zip(prior.sigmas()).for_each(|(s, most)| *s = (*s * wider).min(most));
-    }
-    Ok(Outcome { sigmas: doubt, ..outcome })
-}
-
 /// Displacement at a corner above which matching starts anew, pixels: three times the noise of keypoints.
 const REMATCH: f64 = 1.0;
 
@@ -229,7 +198,7 @@ fn sparse_model(photos: &[Photo], model: &Model, outcome: Outcome) -> Result<Spa
     Ok(SparseModel {
         cameras,
         points,
-        focal_log_sigma: outcome.sigmas.first().map(|s| s[0]),
+        focal_log_sigma: outcome.sigmas.iter().map(|s| s[0]).max_by(f64::total_cmp),
         fitted: (0..photos.len()).map(fitted).collect(),
     })
 }

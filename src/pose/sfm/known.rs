@@ -37,6 +37,7 @@ pub fn with_cameras(
         poses: cameras.iter().map(|c| Some(c.pose.compose(&back))).collect(),
         centres: vec![DVec2::ZERO; cameras.len()],
         group: (0..cameras.len()).collect(),
+        alike: (0..cameras.len()).collect(),
         zoom: vec![1.0; cameras.len()],
         optics: cameras
             .iter()

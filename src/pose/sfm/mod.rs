@@ -3,6 +3,7 @@ mod finish;
 mod grow;
 mod known;
 mod model;
+mod optics;
 mod patch;
 mod refine;
 mod tracks;
@@ -172,6 +173,7 @@ fn empty_model(photos: &[Photo]) -> Model {
             .iter()
             .map(|p| DVec2::new(p.image.width as f64, p.image.height as f64) * 0.5)
             .collect(),
+        alike: group.clone(),
         group,
         zoom,
         optics: priors

@@ -70,6 +70,8 @@ pub(super) struct Model {
     pub(super) centres: Vec<DVec2>,
     /// Optics of each view.
     pub(super) group: Vec<usize>,
+    /// The same if all photos that look alike by their files share a camera.
+    pub(super) alike: Vec<usize>,
     /// Pixels of the view per original pixel.
     pub(super) zoom: Vec<f64>,
     /// Per group.
@@ -103,6 +105,28 @@ impl Model {
         self.priors.iter().map(|p| self.freedom.of(p).count()).sum()
     }
 
+    /// Residual components of the sightings.
+    pub(super) fn observations(&self) -> usize {
+        self.tracks.iter().map(|t| 2 * t.sightings.len()).sum()
+    }
+
+    /// The same model with other photos sharing optics, each group with those of its first view. `group` numbers them in any
+    /// way; views of one group must have the same prior.
+    pub(super) fn regrouped(&self, group: &[usize]) -> Model {
+        let mut out = Model { group: Vec::new(), optics: Vec::new(), priors: Vec::new(), ..self.clone() };
+        let mut names = Vec::new();
+        for (view, name) in group.iter().enumerate() {
+            let known = names.iter().position(|n| n == name);
+            out.group.push(known.unwrap_or(names.len()));
+            if known.is_none() {
+                names.push(*name);
+                out.optics.push(self.optics[self.group[view]]);
+                out.priors.push(self.priors[self.group[view]]);
+            }
+        }
+        out
+    }
+
     /// The same model on images of another size: `ratios` per view.
     pub(super) fn magnify(&mut self, ratios: &[f64]) {
         for (v, r) in ratios.iter().enumerate() {
@@ -121,6 +145,7 @@ impl Model {
             poses: self.poses.clone(),
             centres: self.centres.clone(),
             group: self.group.clone(),
+            alike: self.alike.clone(),
             zoom: self.zoom.clone(),
             optics: self.optics.clone(),
             priors: self.priors.clone(),
