@@ -104,9 +104,21 @@ const STRANGE: f64 = 4.0;
 /// … and by at least this share of the long side (half a pixel at 640) does not fit the model.
 const STRANGE_SHARE: f64 = 0.5 / 640.0;
 
+/// A photo of whose matches fewer agree with the cameras is in doubt: 0.93 and more where they are right on the tuning sets, 0.28
+/// to 0.8 where one is wrong.
+const DOUBTFUL: f64 = 0.85;
+
 /// Names photos whose content, lens or file does not fit the cameras that explain the others.
 fn warn_of_misfits(photos: &[Photo], fitted: &[Fitted], progress: &dyn Progress) {
     for (v, (photo, own)) in photos.iter().zip(fitted).enumerate() {
+        if own.agreement < DOUBTFUL {
+            progress.warn(&format!(
+                "{}: only {:.0} % of its matches with other photos agree with the cameras that were found; its place, or the \
+                 others', is doubtful: leave it out, or add photos between it and the others",
+                photo.stem,
+                100.0 * own.agreement
+            ));
+        }
         let mut others: Vec<f64> =
             fitted.iter().enumerate().filter(|(o, _)| *o != v).map(|(_, f)| f.residual).collect();
         let Some(usual) = super::numeric::median(&mut others) else { continue };

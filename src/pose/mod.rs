@@ -61,6 +61,10 @@ pub struct Fitted {
     pub sigmas: [f64; 5],
     /// Median distance of its sightings from where the model projects their points, working pixels.
     pub residual: f64,
+    /// Share of its matches that agree with the cameras, of those on which its pairs with other photos agree by themselves.
+    pub agreement: f64,
+    /// Photos of one number were explained with the same optics.
+    pub camera: usize,
 }
 
 /// Cameras and the sparse points that fix them. World frame: camera 0; unit: the median depth of the points is

@@ -76,10 +76,32 @@ fn optics(o: &Outcome) -> Vec<serde_json::Value> {
             "k1": fitted.lens.k1, "k2": fitted.lens.k2,
             "sigma": { "log_focal": fitted.sigmas[0], "k1": fitted.sigmas[1], "k2": fitted.sigmas[2],
                 "cx": fitted.sigmas[3], "cy": fitted.sigmas[4] },
-            "residual_px": fitted.residual,
+            "residual_px": fitted.residual, "agreement": fitted.agreement, "camera": fitted.camera,
         })
     };
     o.photos.iter().zip(&o.cameras).zip(&o.geometry.fitted).map(one).collect()
+}
+
+/// The focal length of every camera that the photos were taken with, as far as it was measured.
+fn focal_figure(o: &Outcome) -> Option<String> {
+    let mut cameras: Vec<(usize, String, Vec<&str>)> = Vec::new();
+    for ((photo, camera), fitted) in o.photos.iter().zip(&o.cameras).zip(&o.geometry.fitted) {
+        match cameras.iter_mut().find(|c| c.0 == fitted.camera) {
+            Some(known) => known.2.push(&photo.stem),
+            None => {
+                let text = format!("{:.1} px ± {:.2} %", camera.fx, 100.0 * fitted.sigmas[0]);
+                cameras.push((fitted.camera, text, vec![&photo.stem]));
+            }
+        }
+    }
+    match cameras.as_slice() {
+        [] => None,
+        [(_, text, _)] => Some(text.clone()),
+        several => {
+            let each = several.iter().map(|(_, text, photos)| format!("{text} ({})", photos.join(", ")));
+            Some(each.collect::<Vec<_>>().join("; "))
+        }
+    }
 }
 
 /// What was assumed about the lens: the strongest distortion taken out, and how far the principal point is from the middle.
@@ -150,9 +172,7 @@ fn figures(o: &Outcome) -> Vec<(String, String)> {
         ("splats".to_owned(), o.splats.len().to_string()),
         ("train PSNR".to_owned(), format!("{:.2} dB", o.rgb.mean_psnr())),
     ];
-    if let (Some(sigma), Some(camera)) = (o.geometry.focal_log_sigma, o.cameras.first()) {
-        list.push(("focal length".to_owned(), format!("{:.1} px ± {:.2} %", camera.fx, 100.0 * sigma)));
-    }
+    list.extend(focal_figure(o).map(|text| ("focal length".to_owned(), text)));
     list.extend(lens_figure(o).map(|text| ("lens".to_owned(), text)));
     list.extend(super::light::figure(&o.photos));
     let codes = |k: usize| o.field.levels.get(k).map_or(0, |l| l.codebook.len());

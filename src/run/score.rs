@@ -120,7 +120,8 @@ mod tests {
         let evaluation = Evaluation::new(GroundTruth::read(folder.path()).unwrap(), &scene, None).unwrap();
         let field = LanguageField::default();
         let report =
-            score_field(&device, &splats, &field, &[], evaluation, true, &Silent, &mut |_, _| Ok(())).unwrap();
+            score_field(&device, &splats, &field, &[], evaluation, true, &Silent, &mut |_, _| Ok(()))
+                .unwrap();
         let given = report.images.iter().find(|i| i.split == Split::Test).unwrap().psnr_colour_fit;
         let refined = report.refined.unwrap();
         let (view, score) = (&refined.views[0], refined.images[0].psnr_colour_fit);

@@ -2,8 +2,9 @@
 use super::model::{Model, Sighting, Track};
 use super::optics::learn_optics;
 use super::patch::Shades;
+use super::relate::{Matches, Pair};
 use super::tracks::{self, Link};
-use super::{MARGIN, Putative, THRESHOLD, cameras_of, colour_at, matching, refine};
+use super::{MARGIN, THRESHOLD, cameras_of, colour_at, matching, refine};
 use crate::Result;
 use crate::photo::{Photo, Straightening};
 use crate::pose::bundle::Outcome;
@@ -16,7 +17,8 @@ use rayon::prelude::*;
 
 /// What the model was grown from.
 pub(super) struct Evidence {
-    pub(super) putative: Vec<Putative>,
+    pub(super) putative: Vec<Matches>,
+    pub(super) pairs: Vec<Pair>,
     /// Per view, numbered as the links number them.
     pub(super) keypoints: Vec<Vec<Sighting>>,
 }
@@ -67,7 +69,8 @@ pub(super) fn finish(
         outcome = learn_optics(&mut model)?;
     }
     model.normalise();
-    sparse_model(photos, &model, outcome)
+    let agreement = agreement(&model, &evidence.pairs, threshold);
+    sparse_model(photos, &model, outcome, &agreement)
 }
 
 /// Pixels of the working image within which the neighbours of a point lie on one plane with it.
@@ -123,18 +126,44 @@ fn bend(model: &Model, photos: &[Photo]) -> f64 {
     photos.iter().enumerate().map(corner).fold(0.0, f64::max)
 }
 
-/// Links of the putative matches that agree with the model's cameras within `threshold` pixels.
-pub(super) fn explained(model: &Model, putative: &[Putative], threshold: f64) -> Vec<Link> {
-    let of_pair = |pair: &Putative| -> Vec<Link> {
-        let (i, j) = (pair.first, pair.second);
-        let (Some(a), Some(b)) = (model.poses[i], model.poses[j]) else { return Vec::new() };
-        let f = fundamental(&b.compose(&a.inverse()), model.focal(i), model.focal(j));
-        let close = |m: &&(DVec2, DVec2, Link)| {
-            sampson(&f, model.straight(i, m.0), model.straight(j, m.1)) < threshold * threshold
-        };
-        pair.matches.iter().filter(close).map(|m| m.2).collect()
+/// Links of the matches that agree with the model's cameras within `threshold` pixels.
+pub(super) fn explained(model: &Model, matches: &[Matches], threshold: f64) -> Vec<Link> {
+    matches.par_iter().flat_map_iter(|pair| explained_of(model, pair, threshold)).collect()
+}
+
+fn explained_of(model: &Model, pair: &Matches, threshold: f64) -> Vec<Link> {
+    let (i, j) = (pair.first, pair.second);
+    let (Some(a), Some(b)) = (model.poses[i], model.poses[j]) else { return Vec::new() };
+    let f = fundamental(&b.compose(&a.inverse()), model.focal(i), model.focal(j));
+    let close = |m: &&(DVec2, DVec2, Link)| {
+        sampson(&f, model.straight(i, m.0), model.straight(j, m.1)) < threshold * threshold
     };
-    putative.par_iter().flat_map_iter(of_pair).collect()
+    pair.list.iter().filter(close).map(|m| m.2).collect()
+}
+
+/// Per view the share of its matches that agree with the model's cameras, of those on which its pairs with other views agree
+/// by themselves. The view that agrees least is counted first and its pairs then left out: the others are not to suffer for
+/// it.
+pub(super) fn agreement(model: &Model, pairs: &[Pair], threshold: f64) -> Vec<f64> {
+    let counted = |p: &Pair| (explained_of(model, &p.matches, threshold).len(), p.matches.list.len());
+    let counts: Vec<(usize, usize)> = pairs.par_iter().map(counted).collect();
+    let mut shares: Vec<Option<f64>> = vec![None; model.poses.len()];
+    loop {
+        let share = |view: usize| {
+            let own = pairs.iter().zip(&counts).filter(|(p, _)| {
+                let ends = [p.matches.first, p.matches.second];
+                ends.contains(&view) && ends.iter().all(|v| shares[*v].is_none_or(|s| s >= super::AGREED))
+            });
+            let (agree, all) = own.fold((0, 0), |sum, (_, c)| (sum.0 + c.0, sum.1 + c.1));
+            if all == 0 { 1.0 } else { agree as f64 / all as f64 }
+        };
+        let left = (0..shares.len()).filter(|v| shares[*v].is_none());
+        let Some((worst, view)) = left.map(|v| (share(v), v)).min_by(|a, b| a.0.total_cmp(&b.0)) else {
+            break;
+        };
+        shares[view] = Some(worst);
+    }
+    shares.into_iter().flatten().collect()
 }
 
 /// New tracks from all matches that agree with the cameras.
@@ -178,7 +207,7 @@ fn on_straight(model: &mut Model, step: impl FnOnce(&mut Model)) {
     }
 }
 
-fn sparse_model(photos: &[Photo], model: &Model, outcome: Outcome) -> Result<SparseModel> {
+fn sparse_model(photos: &[Photo], model: &Model, outcome: Outcome, agreement: &[f64]) -> Result<SparseModel> {
     let cameras = cameras_of(photos, model)?;
     let point = |t: &Track| {
         let views: Vec<(usize, DVec2)> = t
@@ -194,6 +223,8 @@ fn sparse_model(photos: &[Photo], model: &Model, outcome: Outcome) -> Result<Spa
         lens: model.lens(v),
         sigmas: outcome.sigmas[model.group[v]],
         residual: model.residual(v),
+        agreement: agreement[v],
+        camera: model.group[v],
     };
     Ok(SparseModel {
         cameras,

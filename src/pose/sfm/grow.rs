@@ -1,18 +1,11 @@
 //! From verified pairs to a reconstruction: the pair with most matches at good parallax first, the other views by
 //! resection, an adjustment after each.
 use super::model::{Model, Track};
+use super::relate::Pair;
 use super::tracks::Sightings;
 use crate::pose::resect::resect;
-use crate::pose::two_view::TwoView;
 use crate::scene::Pose;
 use glam::{DVec2, DVec3};
-
-/// A verified pair of views.
-pub(super) struct Pair {
-    pub(super) first: usize,
-    pub(super) second: usize,
-    pub(super) geometry: TwoView,
-}
 
 /// Why a reconstruction could not grow to all views.
 pub(super) struct Stuck {
@@ -38,8 +31,8 @@ pub(super) fn grow(
 ) -> Result<Model, Stuck> {
     let mut model = empty.clone();
     model.tracks = tracks.iter().map(|t| Track { position: None, sightings: t.clone() }).collect();
-    model.poses[seed.first] = Some(Pose::IDENTITY);
-    model.poses[seed.second] = Some(seed.geometry.pose);
+    model.poses[seed.matches.first] = Some(Pose::IDENTITY);
+    model.poses[seed.matches.second] = Some(seed.geometry.pose);
     model.triangulate_all(2.0 * threshold);
     settle(&mut model, threshold);
     let views = model.poses.len();
@@ -51,9 +44,13 @@ pub(super) fn grow(
         let best = left
             .iter()
             .map(|&v| (resection(&model, v, threshold), v))
-            .max_by_key(|(r, v)| (r.as_ref().map_or(0, |r| r.1), std::cmp::Reverse(*v)));
+            .max_by_key(|(r, v)| (r.as_ref().map_or(0, |r| r.count), std::cmp::Reverse(*v)));
         match best {
-            Some((Some((pose, count)), v)) if count >= MIN_RESECTION => model.poses[v] = Some(pose),
+            Some((Some(r), v)) if r.count >= MIN_RESECTION => {
+                model.poses[v] = Some(r.pose);
+                let group = model.group[v];
+                model.optics[group].focal *= r.stretch;
+            }
             _ => match by_pair(&model, pairs, &left, threshold) {
                 Some((v, pose)) => model.poses[v] = Some(pose),
                 None => return Err(Stuck { left }),
@@ -74,8 +71,20 @@ fn settle(model: &mut Model, threshold: f64) {
     }
 }
 
-/// Pose of a view from its sightings of triangulated points, and how many agree.
-fn resection(model: &Model, view: usize, threshold: f64) -> Option<(Pose, usize)> {
+/// A place for a view among triangulated points.
+struct Place {
+    pose: Pose,
+    /// Focal length as a multiple of the one that the view came with.
+    stretch: f64,
+    /// Points that agree.
+    count: usize,
+}
+
+/// Focal lengths tried for a view that shares its own with no placed view: resection bears half a step of 1.4.
+const STRETCHES: [f64; 5] = [1.0, 0.7, 1.4, 0.5, 2.0];
+
+/// Pose of a view from its sightings of triangulated points.
+fn resection(model: &Model, view: usize, threshold: f64) -> Option<Place> {
     let (mut world, mut pixels) = (Vec::<DVec3>::new(), Vec::<DVec2>::new());
     for t in &model.tracks {
         let Some(x) = t.position else { continue };
@@ -84,8 +93,16 @@ fn resection(model: &Model, view: usize, threshold: f64) -> Option<(Pose, usize)
             pixels.push(model.straight(view, s.pixel));
         }
     }
-    let r = resect(&world, &pixels, model.focal(view), 2.0 * threshold, 500)?;
-    Some((r.pose, r.inliers.len()))
+    let group = model.group[view];
+    let known = (0..model.poses.len()).any(|v| model.group[v] == group && model.poses[v].is_some());
+    let sigma = if known { 0.0 } else { model.priors[group].log_focal.1 };
+    // A ratio of two focal lengths has √2 of the doubt of one; two σ of it.
+    let tried = STRETCHES.into_iter().filter(|s| s.ln().abs() <= 2.0 * 2f64.sqrt() * sigma);
+    let place = |stretch: f64| {
+        let r = resect(&world, &pixels, model.focal(view) * stretch, 2.0 * threshold, 500)?;
+        Some(Place { pose: r.pose, stretch, count: r.inliers.len() })
+    };
+    tried.filter_map(place).max_by_key(|p| p.count)
 }
 
 /// Fallback for a view with few tracks into the model: the relative pose of its best pair with a placed view, scaled by
@@ -93,10 +110,11 @@ fn resection(model: &Model, view: usize, threshold: f64) -> Option<(Pose, usize)
 fn by_pair(model: &Model, pairs: &[Pair], left: &[usize], threshold: f64) -> Option<(usize, Pose)> {
     let mut best: Option<(usize, usize, Pose)> = None;
     for pair in pairs {
-        let (placed, new, relative) = if left.contains(&pair.second) && !left.contains(&pair.first) {
-            (pair.first, pair.second, pair.geometry.pose)
-        } else if left.contains(&pair.first) && !left.contains(&pair.second) {
-            (pair.second, pair.first, pair.geometry.pose.inverse())
+        let (first, second) = (pair.matches.first, pair.matches.second);
+        let (placed, new, relative) = if left.contains(&second) && !left.contains(&first) {
+            (first, second, pair.geometry.pose)
+        } else if left.contains(&first) && !left.contains(&second) {
+            (second, first, pair.geometry.pose.inverse())
         } else {
             continue;
         };

@@ -47,12 +47,12 @@ pub fn with_cameras(
         freedom: Freedom::Focal,
         tracks: Vec::new(),
     };
-    let mut putative = super::putative_matches(&families, progress)?;
+    let mut putative = super::relate::putative_matches(&families, progress)?;
     for pair in &mut putative {
         let (a, b) = (&cameras[pair.first], &cameras[pair.second]);
-        pair.matches.iter_mut().for_each(|m| (m.0, m.1) = (flat(a, m.0), flat(b, m.1)));
+        pair.list.iter_mut().for_each(|m| (m.0, m.1) = (flat(a, m.0), flat(b, m.1)));
     }
-    let tried: usize = putative.iter().map(|p| p.matches.len()).sum();
+    let tried: usize = putative.iter().map(|p| p.list.len()).sum();
     let mut links = super::finish::explained(&model, &putative, threshold);
     let agreement = links.len() as f64 / tried.max(1) as f64;
     let keypoints: Vec<Vec<Sighting>> = (0..photos.len())

@@ -6,22 +6,23 @@ mod model;
 mod optics;
 mod patch;
 mod refine;
+mod relate;
 mod tracks;
 
 use super::bundle::{Optics, OpticsPrior};
-use super::matching::{self, Features, Match};
-use super::two_view::{self, TwoView};
+use super::matching::{self, Features};
 use super::{SparseModel, sift};
 use crate::photo::Photo;
 use crate::progress::Progress;
 use crate::scene::{Camera, Lens, Plane, RgbImage};
 use crate::{Error, Result};
-use finish::{Evidence, finish};
+use finish::{Evidence, agreement, finish};
 use glam::DVec2;
-use grow::{Pair, grow};
+use grow::grow;
 pub use known::with_cameras;
 use model::{Freedom, Model, Sighting};
 use rayon::prelude::*;
+use relate::Pair;
 use tracks::Link;
 
 /// ln f of a photo without EXIF: 0.9 × the long side covers phones (0.8) to normal lenses (1.2) within one σ.
@@ -36,20 +37,6 @@ const LENS_SIGMA: f64 = 0.05;
 const SHIFT_SIGMA: f64 = 0.007;
 /// Agreement threshold as a fraction of the long side: 3 px at 640, three times the noise of learned keypoints.
 const THRESHOLD: f64 = 3.0 / 640.0;
-/// Fewest verified matches of a usable pair: five are fitted by anything, 20 agree by chance in few cases.
-const MIN_INLIERS: usize = 20;
-
-/// What two photos have in common.
-enum Relation {
-    Usable(TwoView, Vec<Link>),
-    /// Too few matches agree on any geometry.
-    Apart,
-    /// The camera only turned, or did not move.
-    NoParallax,
-    /// The same picture twice.
-    Same,
-}
-
 /// Cameras and sparse points from photos and their learned features (one per photo; may be empty, then only the
 /// built-in corner detector is used).
 pub fn reconstruct(photos: &[Photo], features: &[Features], progress: &dyn Progress) -> Result<SparseModel> {
@@ -61,14 +48,13 @@ pub fn reconstruct(photos: &[Photo], features: &[Features], progress: &dyn Progr
     let families = corner_families(photos, features, progress)?;
     progress.step(1, "matches");
     let empty = empty_model(photos);
-    let putative = putative_matches(&families, progress)?;
-    let relations = relate_all(photos, &putative, &empty, progress)?;
-    explain(photos, &relations)?;
+    let putative = relate::putative_matches(&families, progress)?;
+    let pairs = relate::pairs(photos, &putative, &empty, progress)?;
     progress.step(2, "poses");
     let keypoints: Vec<Vec<Sighting>> = (0..photos.len()).map(|v| keypoints(&families, v)).collect();
-    let model = assemble(photos, &keypoints, empty, relations, progress)?;
+    let model = assemble(photos, &keypoints, empty, &pairs, progress)?;
     progress.step(3, "refining");
-    let model = finish(photos, model, &Evidence { putative, keypoints }, progress)?;
+    let model = finish(photos, model, &Evidence { putative, pairs, keypoints }, progress)?;
     progress.step(STEPS, &format!("{} points", model.points.len()));
     progress.end();
     Ok(model)
@@ -186,168 +172,35 @@ fn empty_model(photos: &[Photo]) -> Model {
     }
 }
 
-/// All pairs (i < j), in order.
-fn pairs_of(n: usize) -> Vec<(usize, usize)> {
-    (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).collect()
-}
-
-fn relate_all(
-    photos: &[Photo],
-    putative: &[Putative],
-    empty: &Model,
-    progress: &dyn Progress,
-) -> Result<Vec<(usize, usize, Relation)>> {
-    let out = putative
-        .par_iter()
-        .map(|pair| {
-            let relation = match progress.cancelled() {
-                true => Relation::Apart,
-                false => relate(photos, pair, empty),
-            };
-            (pair.first, pair.second, relation)
-        })
-        .collect();
-    progress.check()?;
-    Ok(out)
-}
-
-/// What two views have in common by the looks of their features.
-struct Putative {
-    first: usize,
-    second: usize,
-    /// (pixel, pixel, link), best first.
-    matches: Vec<(DVec2, DVec2, Link)>,
-}
-
-fn putative_matches(families: &[Vec<Features>], progress: &dyn Progress) -> Result<Vec<Putative>> {
-    let pair = |(first, second)| {
-        let matches = if progress.cancelled() { Vec::new() } else { putative(families, first, second) };
-        Putative { first, second, matches }
-    };
-    let views = families.first().map_or(0, Vec::len);
-    let out = pairs_of(views).into_par_iter().map(pair).collect();
-    progress.check()?;
-    Ok(out)
-}
-
-/// Matches by descriptor between two views, all families, best first.
-fn putative(families: &[Vec<Features>], i: usize, j: usize) -> Vec<(DVec2, DVec2, Link)> {
-    let mut all: Vec<(DVec2, DVec2, Link)> = Vec::new();
-    let (mut start_i, mut start_j) = (0, 0);
-    for (k, family) in families.iter().enumerate() {
-        let (a, b) = (&family[i], &family[j]);
-        // Learned descriptors are compared more leniently: their second-best is close by design of the training.
-        let ratio = if k == 0 { 0.85 } else { 0.97 };
-        all.extend(matching::mutual_matches(a, b, ratio).into_iter().map(|m: Match| {
-            let quality = m.quality / (1.0 - ratio as f64).max(0.1) * 0.15;
-            let link = Link { first: (i, start_i + m.first), second: (j, start_j + m.second), quality };
-            (a.points[m.first], b.points[m.second], link)
-        }));
-        start_i += a.points.len();
-        start_j += b.points.len();
-    }
-    all.sort_by(|a, b| b.2.quality.total_cmp(&a.2.quality).then(a.2.first.cmp(&b.2.first)));
-    all
-}
-
-fn relate(photos: &[Photo], pair: &Putative, empty: &Model) -> Relation {
-    let (i, j, all) = (pair.first, pair.second, &pair.matches);
-    if same_picture(&photos[i].image, &photos[j].image) {
-        return Relation::Same;
-    }
-    let centred = |view: usize, p: DVec2| (p - empty.centres[view]) / empty.focal(view);
-    let x: Vec<DVec2> = all.iter().map(|m| centred(i, m.0)).collect();
-    let y: Vec<DVec2> = all.iter().map(|m| centred(j, m.1)).collect();
-    let long = photos[i].image.width.max(photos[i].image.height) as f64;
-    let threshold = THRESHOLD * long / empty.focal(i);
-    let sigma = |v: usize| empty.priors[empty.group[v]].log_focal.1;
-    let sigma = sigma(i).max(sigma(j));
-    let Some(found) = two_view::estimate(&x, &y, threshold, sigma) else { return Relation::Apart };
-    if found.inliers.len() < MIN_INLIERS {
-        return Relation::Apart;
-    }
-    // Without translation nothing but noise remains after the rotation: 0.6 of the threshold is about two σ.
-    if found.rotation_residual < 0.6 * threshold {
-        return Relation::NoParallax;
-    }
-    let links = found.inliers.iter().map(|k| all[*k].2).collect();
-    Relation::Usable(found, links)
-}
-
-/// True when two photos differ by less than re-compression does.
-fn same_picture(a: &RgbImage, b: &RgbImage) -> bool {
-    if (a.width, a.height) != (b.width, b.height) {
-        return false;
-    }
-    let sum: f64 = a
-        .data
-        .iter()
-        .zip(&b.data)
-        .map(|(p, q)| (0..3).map(|k| (p[k] - q[k]).abs() as f64).sum::<f64>())
-        .sum();
-    sum / (3.0 * a.data.len().max(1) as f64) < 0.004
-}
-
-/// A clear error unless the usable pairs connect all photos.
-fn explain(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Result<()> {
-    let n = photos.len();
-    let name = |i: &usize, j: &usize| format!("{}–{}", photos[*i].stem, photos[*j].stem);
-    let list = |test: fn(&Relation) -> bool| {
-        relations.iter().filter(|r| test(&r.2)).map(|r| name(&r.0, &r.1)).collect::<Vec<_>>().join(", ")
-    };
-    let same = list(|r| matches!(r, Relation::Same));
-    if !same.is_empty() {
-        return Err(Error::input(format!("identical photos: {same}; give photos from different positions")));
-    }
-    let mut reached = vec![false; n];
-    reached[0] = true;
-    for _ in 0..n {
-        for (i, j, r) in relations {
-            if matches!(r, Relation::Usable(..)) && (reached[*i] || reached[*j]) {
-                (reached[*i], reached[*j]) = (true, true);
-            }
-        }
-    }
-    if reached.iter().all(|r| *r) {
-        return Ok(());
-    }
-    let turned = list(|r| matches!(r, Relation::NoParallax));
-    if !turned.is_empty() {
-        return Err(Error::input(format!(
-            "no parallax between {turned}: the camera only turned; take the photos from different positions"
-        )));
-    }
-    let apart = list(|r| matches!(r, Relation::Apart));
-    Err(Error::input(format!(
-        "photos do not overlap enough: {apart}; take photos that share at least half of what they show"
-    )))
-}
-
 /// All keypoints of a view, numbered as the links number them.
 fn keypoints(families: &[Vec<Features>], view: usize) -> Vec<Sighting> {
     let all = families.iter().enumerate().flat_map(|(k, f)| f[view].points.iter().map(move |p| (k, *p)));
     all.map(|(family, pixel)| Sighting { view, pixel, sigma: 1.0, family }).collect()
 }
 
+/// Seeds that a reconstruction may grow from.
+const SEEDS: usize = 3;
+
+/// Share of a photo's matches that agree with the cameras, from which on they are taken for right while growing: where they
+/// are it is 0.97 and more on the tuning sets, below 0.8 where cameras or focal lengths are wrong.
+const AGREED: f64 = 0.9;
+
+/// Cameras and triangulated tracks of all photos from the pairs that agree.
 fn assemble(
     photos: &[Photo],
     points: &[Vec<Sighting>],
     mut empty: Model,
-    relations: Vec<(usize, usize, Relation)>,
+    pairs: &[Pair],
     progress: &dyn Progress,
 ) -> Result<Model> {
-    let (mut pairs, mut links) = (Vec::new(), Vec::new());
-    for (first, second, relation) in relations {
-        if let Relation::Usable(geometry, l) = relation {
-            links.extend(l);
-            pairs.push(Pair { first, second, geometry });
-        }
-    }
+    let mut links: Vec<Link> = pairs.iter().flat_map(|p| p.matches.list.iter().map(|m| m.2)).collect();
     let tracks = tracks::join(&mut links, points);
     // The pair estimates vote on the focal stretch, weighted by matches and parallax.
     for g in 0..empty.optics.len() {
         let (mut sum, mut weight) = (0.0, 1e-9);
-        for p in pairs.iter().filter(|p| empty.group[p.first] == g || empty.group[p.second] == g) {
+        for p in
+            pairs.iter().filter(|p| [p.matches.first, p.matches.second].iter().any(|v| empty.group[*v] == g))
+        {
             let w = grow::seed_score(p);
             sum += w * p.geometry.stretch.ln();
             weight += w;
@@ -356,20 +209,42 @@ fn assemble(
     }
     let long = photos[0].image.width.max(photos[0].image.height) as f64;
     let threshold = THRESHOLD * long;
-    pairs.sort_by(|a, b| grow::seed_score(b).total_cmp(&grow::seed_score(a)));
-    let mut stuck: Option<Vec<usize>> = None;
-    for seed in pairs.iter().take(3) {
+    let mut seeds: Vec<&Pair> = pairs.iter().collect();
+    seeds.sort_by(|a, b| grow::seed_score(b).total_cmp(&grow::seed_score(a)));
+    seeds.truncate(SEEDS);
+    // Photos of one camera first; where that contradicts the pairs, every photo with its own focal length. That explains much
+    // that is wrong for other reasons, so it must settle the matter.
+    let views: Vec<usize> = (0..photos.len()).collect();
+    let apart = (empty.alike != views).then(|| empty.regrouped(&views));
+    let attempts =
+        std::iter::once(&empty).chain(&apart).flat_map(|start| seeds.iter().map(move |s| (start, *s)));
+    let mut best: Option<(f64, Model)> = None;
+    let mut stuck = Vec::new();
+    for (start, seed) in attempts {
         progress.check()?;
-        match grow(&empty, &tracks, &pairs, seed, threshold) {
-            Ok(model) => return Ok(model),
-            Err(s) => stuck = Some(s.left),
+        let model = match grow(start, &tracks, pairs, seed, threshold) {
+            Ok(model) => model,
+            Err(s) => {
+                stuck = s.left;
+                continue;
+            }
+        };
+        let worst = agreement(&model, pairs, threshold).into_iter().fold(1.0, f64::min);
+        let together = start.group == empty.group;
+        if worst > AGREED || best.as_ref().is_none_or(|b| together && worst > b.0) {
+            best = Some((worst, model));
+        }
+        if worst > AGREED {
+            break;
         }
     }
-    let names: Vec<&str> = stuck.unwrap_or_default().iter().map(|v| photos[*v].stem.as_str()).collect();
-    Err(Error::input(format!(
-        "no camera position found for {}; these photos share too little with the others: replace them or add photos in between",
-        names.join(", ")
-    )))
+    let names = || stuck.iter().map(|v| photos[*v].stem.as_str()).collect::<Vec<_>>().join(", ");
+    best.map(|b| b.1).ok_or_else(|| {
+        Error::input(format!(
+            "no camera position found for {}; these photos share too little with the others: replace them or add photos in between",
+            names()
+        ))
+    })
 }
 
 fn colour_at(image: &RgbImage, p: DVec2) -> [f32; 3] {

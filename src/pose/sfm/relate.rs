@@ -1,0 +1,175 @@
+//! What pairs of photos have in common: matches by the looks of their features, and the geometry on which they agree.
+use super::THRESHOLD;
+use super::model::Model;
+use super::tracks::Link;
+use crate::photo::Photo;
+use crate::pose::matching::{self, Features, Match};
+use crate::pose::two_view::{self, TwoView};
+use crate::progress::Progress;
+use crate::scene::RgbImage;
+use crate::{Error, Result};
+use glam::DVec2;
+use rayon::prelude::*;
+
+/// Matches between two views.
+pub(super) struct Matches {
+    pub(super) first: usize,
+    pub(super) second: usize,
+    /// (pixel, pixel, link), best first.
+    pub(super) list: Vec<(DVec2, DVec2, Link)>,
+}
+
+/// Two views whose matches agree on a geometry.
+pub(super) struct Pair {
+    /// Those that agree.
+    pub(super) matches: Matches,
+    pub(super) geometry: TwoView,
+}
+
+/// Fewest verified matches of a usable pair: five are fitted by anything, 20 agree by chance in few cases.
+const MIN_INLIERS: usize = 20;
+
+/// What two photos have in common.
+enum Relation {
+    Usable(Pair),
+    /// Too few matches agree on any geometry.
+    Apart,
+    /// The camera only turned, or did not move.
+    NoParallax,
+    /// The same picture twice.
+    Same,
+}
+
+/// All pairs (i < j), in order.
+fn pairs_of(n: usize) -> Vec<(usize, usize)> {
+    (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).collect()
+}
+
+/// The pairs that agree on a geometry. A clear error unless they connect all photos.
+pub(super) fn pairs(
+    photos: &[Photo],
+    putative: &[Matches],
+    empty: &Model,
+    progress: &dyn Progress,
+) -> Result<Vec<Pair>> {
+    let related = |pair: &Matches| {
+        let relation = match progress.cancelled() {
+            true => Relation::Apart,
+            false => relate(photos, pair, empty),
+        };
+        (pair.first, pair.second, relation)
+    };
+    let relations: Vec<_> = putative.par_iter().map(related).collect();
+    progress.check()?;
+    explain(photos, &relations)?;
+    let usable = |(_, _, relation)| match relation {
+        Relation::Usable(pair) => Some(pair),
+        _ => None,
+    };
+    Ok(relations.into_iter().filter_map(usable).collect())
+}
+
+/// Matches by descriptor between all views.
+pub(super) fn putative_matches(families: &[Vec<Features>], progress: &dyn Progress) -> Result<Vec<Matches>> {
+    let pair = |(first, second)| {
+        let list = if progress.cancelled() { Vec::new() } else { putative(families, first, second) };
+        Matches { first, second, list }
+    };
+    let views = families.first().map_or(0, Vec::len);
+    let out = pairs_of(views).into_par_iter().map(pair).collect();
+    progress.check()?;
+    Ok(out)
+}
+
+/// Matches by descriptor between two views, all families, best first.
+fn putative(families: &[Vec<Features>], i: usize, j: usize) -> Vec<(DVec2, DVec2, Link)> {
+    let mut all: Vec<(DVec2, DVec2, Link)> = Vec::new();
+    let (mut start_i, mut start_j) = (0, 0);
+    for (k, family) in families.iter().enumerate() {
+        let (a, b) = (&family[i], &family[j]);
+        // Learned descriptors are compared more leniently: their second-best is close by design of the training.
+        let ratio = if k == 0 { 0.85 } else { 0.97 };
+        all.extend(matching::mutual_matches(a, b, ratio).into_iter().map(|m: Match| {
+            let quality = m.quality / (1.0 - ratio as f64).max(0.1) * 0.15;
+            let link = Link { first: (i, start_i + m.first), second: (j, start_j + m.second), quality };
+            (a.points[m.first], b.points[m.second], link)
+        }));
+        start_i += a.points.len();
+        start_j += b.points.len();
+    }
+    all.sort_by(|a, b| b.2.quality.total_cmp(&a.2.quality).then(a.2.first.cmp(&b.2.first)));
+    all
+}
+
+fn relate(photos: &[Photo], pair: &Matches, empty: &Model) -> Relation {
+    let (i, j, all) = (pair.first, pair.second, &pair.list);
+    if same_picture(&photos[i].image, &photos[j].image) {
+        return Relation::Same;
+    }
+    let centred = |view: usize, p: DVec2| (p - empty.centres[view]) / empty.focal(view);
+    let x: Vec<DVec2> = all.iter().map(|m| centred(i, m.0)).collect();
+    let y: Vec<DVec2> = all.iter().map(|m| centred(j, m.1)).collect();
+    let long = photos[i].image.width.max(photos[i].image.height) as f64;
+    let threshold = THRESHOLD * long / empty.focal(i);
+    let sigma = |v: usize| empty.priors[empty.group[v]].log_focal.1;
+    let sigma = sigma(i).max(sigma(j));
+    let Some(found) = two_view::estimate(&x, &y, threshold, sigma) else { return Relation::Apart };
+    if found.inliers.len() < MIN_INLIERS {
+        return Relation::Apart;
+    }
+    // Without translation nothing but noise remains after the rotation: 0.6 of the threshold is about two σ.
+    if found.rotation_residual < 0.6 * threshold {
+        return Relation::NoParallax;
+    }
+    let list = found.inliers.iter().map(|k| all[*k]).collect();
+    Relation::Usable(Pair { matches: Matches { first: i, second: j, list }, geometry: found })
+}
+
+/// True when two photos differ by less than re-compression does.
+fn same_picture(a: &RgbImage, b: &RgbImage) -> bool {
+    if (a.width, a.height) != (b.width, b.height) {
+        return false;
+    }
+    let sum: f64 = a
+        .data
+        .iter()
+        .zip(&b.data)
+        .map(|(p, q)| (0..3).map(|k| (p[k] - q[k]).abs() as f64).sum::<f64>())
+        .sum();
+    sum / (3.0 * a.data.len().max(1) as f64) < 0.004
+}
+
+/// A clear error unless the usable pairs connect all photos.
+fn explain(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Result<()> {
+    let n = photos.len();
+    let name = |i: &usize, j: &usize| format!("{}–{}", photos[*i].stem, photos[*j].stem);
+    let list = |test: fn(&Relation) -> bool| {
+        relations.iter().filter(|r| test(&r.2)).map(|r| name(&r.0, &r.1)).collect::<Vec<_>>().join(", ")
+    };
+    let same = list(|r| matches!(r, Relation::Same));
+    if !same.is_empty() {
+        return Err(Error::input(format!("identical photos: {same}; give photos from different positions")));
+    }
+    let mut reached = vec![false; n];
+    reached[0] = true;
+    for _ in 0..n {
+        for (i, j, r) in relations {
+            if matches!(r, Relation::Usable(..)) && (reached[*i] || reached[*j]) {
+                (reached[*i], reached[*j]) = (true, true);
+            }
+        }
+    }
+    if reached.iter().all(|r| *r) {
+        return Ok(());
+    }
+    let turned = list(|r| matches!(r, Relation::NoParallax));
+    if !turned.is_empty() {
+        return Err(Error::input(format!(
+            "no parallax between {turned}: the camera only turned; take the photos from different positions"
+        )));
+    }
+    let apart = list(|r| matches!(r, Relation::Apart));
+    Err(Error::input(format!(
+        "photos do not overlap enough: {apart}; take photos that share at least half of what they show"
+    )))
+}
