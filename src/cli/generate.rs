@@ -66,5 +66,6 @@ fn effects(args: &GenerateArgs) -> Effects {
         light: args.light || phone.light,
         sensor_noise: args.sensor_noise || phone.sensor_noise,
         jpeg: args.jpeg.or(phone.jpeg),
+        two_cameras: args.two_cameras,
     }
 }

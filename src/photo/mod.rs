@@ -97,6 +97,16 @@ impl Photo {
         }
     }
 
+    /// Working pixels per original pixel.
+    pub fn zoom(&self) -> f64 {
+        0.5 * (self.to_working.scale[0] + self.to_working.scale[1])
+    }
+
+    /// Focal length by EXIF, original pixels.
+    pub fn original_focal(&self) -> Option<f64> {
+        self.exif_focal.map(|f| f / self.to_working.scale[1])
+    }
+
     /// The lens that was taken out of the image.
     pub fn lens(&self) -> Lens {
         self.straightened.map_or(Lens::NONE, |s| s.lens)
@@ -276,6 +286,33 @@ pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progr
 fn mostly_above_white(image: &RgbImage) -> bool {
     let above = image.data.iter().filter(|c| c.iter().any(|v| *v > 1.0)).count();
     2 * above > image.data.len()
+}
+
+/// EXIF focal lengths of one camera that differ more come from different zoom settings.
+const SAME_ZOOM: f64 = 0.03;
+
+/// Number of the camera of every photo, as far as the files tell: photos of one size, camera model and zoom have one, photos
+/// without EXIF share by size. Portrait and landscape of one camera share too.
+pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
+    let size = |p: &Photo| {
+        let (w, h) = p.original_size;
+        (w.max(h), w.min(h))
+    };
+    let alike = |a: &Photo, b: &Photo| {
+        let one_zoom = match (a.original_focal(), b.original_focal()) {
+            (Some(f), Some(g)) => (f / g - 1.0).abs() <= SAME_ZOOM,
+            (f, g) => f.is_none() && g.is_none(),
+        };
+        size(a) == size(b) && a.camera_model == b.camera_model && one_zoom
+    };
+    let mut firsts: Vec<&Photo> = Vec::new();
+    let mut number = |photo| {
+        firsts.iter().position(|f| alike(f, photo)).unwrap_or_else(|| {
+            firsts.push(photo);
+            firsts.len() - 1
+        })
+    };
+    photos.iter().map(&mut number).collect()
 }
 
 /// Refuses sets that cannot give geometry (one photo, or the same photo twice) or that would mix up files (the same name

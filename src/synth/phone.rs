@@ -43,12 +43,21 @@ pub struct Effects {
     pub sensor_noise: bool,
     /// JPEG quality of the photos, instead of 95.
     pub jpeg: Option<u8>,
+    /// Every other photo by a second camera, with optics and vignetting of its own.
+    pub two_cameras: bool,
 }
 
 impl Effects {
     /// As a phone takes photos.
-    pub const PHONE: Effects =
-        Effects { focal: true, lens: true, centre: true, light: true, sensor_noise: true, jpeg: Some(82) };
+    pub const PHONE: Effects = Effects {
+        focal: true,
+        lens: true,
+        centre: true,
+        light: true,
+        sensor_noise: true,
+        jpeg: Some(82),
+        two_cameras: false,
+    };
 
     /// Whether there is any.
     pub fn any(&self) -> bool {
@@ -107,33 +116,63 @@ pub struct Shot {
     pub noise: Option<u64>,
 }
 
-/// Draws what the photos of one scene go through. Effects that are off change nothing that is drawn for the others.
-pub fn shots(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<Shot>> {
-    let stream = |salt: u64| Random::new(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ salt);
-    let (mut optics, mut scene_light, mut light) = (stream(0x1e45), stream(0x71e), stream(0x116f7));
-    let between = |random: &mut Random, a: f64, b: f64| a + (b - a) * random.uniform();
+/// What the photos of one camera share.
+struct Optics {
+    /// Share of the width.
+    focal: f64,
+    /// Principal point from the middle, shares of the width.
+    offset: DVec2,
+    lens: Option<Lens>,
+    /// v2, v4 of [`Light::vignetting`].
+    vignetting: [f64; 2],
+}
+
+/// Draws a camera; `widest` is one of the pinholes that it is to replace.
+fn optics(widest: &Camera, effects: &Effects, seed: u64) -> Result<Optics> {
+    let (mut optics, mut light) = (Random::new(seed ^ 0x1e45), Random::new(seed ^ 0x71e));
     let focal = between(&mut optics, FOCAL.0, FOCAL.1);
     let offset = DVec2::new(between(&mut optics, -CENTRE, CENTRE), between(&mut optics, -CENTRE, CENTRE));
-    let cameras: Vec<Camera> = cameras.iter().map(|c| refocused(c, focal, offset, effects)).collect();
     let mut lens = None;
-    if let Some(camera) = cameras.first().filter(|_| effects.lens) {
+    if effects.lens {
+        let camera = refocused(widest, focal, offset, effects);
         let drawn = (0..1000).find_map(|_| {
             let k1 = between(&mut optics, -K1, K1);
             let lens = Lens { k1, k2: k1 * between(&mut optics, -K2_SHARE, K2_SHARE) };
-            fits(&lens, camera).then_some(lens)
+            fits(&lens, &camera).then_some(lens)
         });
         lens = Some(drawn.ok_or_else(|| Error::work("generate: no lens covers the picture"))?);
     }
     // The share that is lost in the corner, and how late the fall-off sets in: 0 = with ρ², 1 = with ρ⁴.
-    let (lost, late) = (between(&mut scene_light, 0.0, VIGNETTING), scene_light.uniform());
-    let shots = cameras.into_iter().enumerate().map(|(i, camera)| {
+    let (lost, late) = (between(&mut light, 0.0, VIGNETTING), light.uniform());
+    Ok(Optics { focal, offset, lens, vignetting: [-lost * (1.0 - late), -lost * late] })
+}
+
+fn between(random: &mut Random, a: f64, b: f64) -> f64 {
+    a + (b - a) * random.uniform()
+}
+
+/// Draws what the photos of one scene go through. Effects that are off change nothing that is drawn for the others.
+pub fn shots(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<Shot>> {
+    let Some(first) = cameras.first() else { return Ok(Vec::new()) };
+    let stream = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    let mut taken_with = vec![optics(first, effects, stream)?];
+    if effects.two_cameras {
+        taken_with.push(optics(first, effects, stream ^ 0x2cab_0000)?);
+    }
+    let mut light = Random::new(stream ^ 0x116f7);
+    let shots = cameras.iter().enumerate().map(|(i, camera)| {
+        let own = &taken_with[i % taken_with.len()];
         let drawn = Light {
             exposure_ev: between(&mut light, -EXPOSURE, EXPOSURE),
             white_balance: [(); 3].map(|()| 1.0 + between(&mut light, -WHITE_BALANCE, WHITE_BALANCE)),
-            vignetting: [-lost * (1.0 - late), -lost * late],
+            vignetting: own.vignetting,
         };
-        let noise = effects.sensor_noise.then_some(seed.wrapping_mul(0x100_0000_01b3) ^ (i as u64) << 48);
-        Shot { camera, lens, light: effects.light.then_some(drawn), noise }
+        Shot {
+            camera: refocused(camera, own.focal, own.offset, effects),
+            lens: own.lens,
+            light: effects.light.then_some(drawn),
+            noise: effects.sensor_noise.then_some(seed.wrapping_mul(0x100_0000_01b3) ^ (i as u64) << 48),
+        }
     });
     Ok(shots.collect())
 }
@@ -346,5 +385,10 @@ mod tests {
         assert_eq!(lens.shots[0].camera.fx, phone.shots[0].camera.fx);
         let light = world(&knobs(1000, Effects { light: true, ..Effects::default() })).unwrap();
         assert_eq!(light.shots[2].light, phone.shots[2].light);
+        let two = world(&knobs(1000, Effects { two_cameras: true, ..Effects::PHONE })).unwrap();
+        let (first, second) = (&two.shots[0], &two.shots[1]);
+        assert_eq!(first.camera, phone.shots[0].camera);
+        assert!(second.lens != first.lens && second.camera.fx != first.camera.fx);
+        assert_eq!((two.shots[3].lens, two.shots[3].camera.fx), (second.lens, second.camera.fx));
     }
 }

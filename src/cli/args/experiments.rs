@@ -131,6 +131,10 @@ pub struct GenerateArgs {
     /// JPEG quality of the photos [default: 95; 82 with --phone]
     #[arg(long, value_name = "1-100", value_parser = clap::value_parser!(u8).range(1..=100))]
     pub jpeg: Option<u8>,
+    /// Every other photo by a second camera: focal length, lens, principal point and vignetting of its own, where the other options
+    /// ask for them
+    #[arg(long)]
+    pub two_cameras: bool,
     /// regions_flawed/: rate of masks cut in two
     #[arg(long, default_value_t = 0.2, value_name = "RATE")]
     pub split: f64,

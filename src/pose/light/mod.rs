@@ -60,7 +60,11 @@ pub fn estimate(photos: &[Photo], model: &SparseModel) -> Found {
     if photos.len() < 2 || pairs.iter().map(|p| p.share).sum::<f64>() < 0.5 * MIN_POINTS as f64 {
         return none;
     }
-    let lenses = lenses(photos);
+    // Photos taken through the same lens share their vignetting.
+    let lenses = match model.fitted.as_slice() {
+        [] => crate::photo::cameras_by_file(photos),
+        fitted => fitted.iter().map(|f| f.camera).collect(),
+    };
     let grey = System { pairs: &pairs, views: photos.len(), lenses: &lenses, channel: 0 };
     let exposure = exposure(&grey);
     let colour = [1, 2].map(|channel| System { channel, ..grey }.gains(exposure.reference));
@@ -81,28 +85,4 @@ pub fn estimate(photos: &[Photo], model: &SparseModel) -> Found {
         lights = none.lights;
     }
     Found { unexplained: grey.unexplained(&exposure), lights }
-}
-
-/// Photos taken through the same lens share their vignetting: one size, camera and zoom. Group of every photo.
-fn lenses(photos: &[Photo]) -> Vec<usize> {
-    let zoom = |p: &Photo| p.exif_focal.map(|f| f / p.to_working.scale[1]);
-    // EXIF focal lengths of one zoom setting agree to rounding.
-    let near = |a: Option<f64>, b: Option<f64>| match (a, b) {
-        (Some(a), Some(b)) => (a / b - 1.0).abs() < 0.03,
-        (a, b) => a.is_none() && b.is_none(),
-    };
-    let size =
-        |p: &Photo| (p.original_size.0.max(p.original_size.1), p.original_size.0.min(p.original_size.1));
-    let alike = |a: &Photo, b: &Photo| {
-        size(a) == size(b) && a.camera_model == b.camera_model && near(zoom(a), zoom(b))
-    };
-    let mut firsts: Vec<usize> = Vec::new();
-    (0..photos.len())
-        .map(|v| {
-            firsts.iter().position(|f| alike(&photos[*f], &photos[v])).unwrap_or_else(|| {
-                firsts.push(v);
-                firsts.len() - 1
-            })
-        })
-        .collect()
 }

@@ -101,43 +101,19 @@ fn within(f: &Features, valid: &Plane<bool>) -> Features {
     out
 }
 
-/// EXIF focal lengths of one camera that differ more come from different zoom settings.
-const SAME_ZOOM: f64 = 0.03;
-
-/// Focal groups and priors: photos of one size, camera model and zoom share a focal length; photos without EXIF share by
-/// size. Portrait and landscape of one camera share too, although their working sizes differ.
+/// Groups and priors of the optics by what the files say.
 fn empty_model(photos: &[Photo]) -> Model {
-    let zoom: Vec<f64> =
-        photos.iter().map(|p| 0.5 * (p.to_working.scale[0] + p.to_working.scale[1])).collect();
-    // Focal length in original pixels.
-    let exif = |v: usize| photos[v].exif_focal.map(|f| f / zoom[v]);
+    let zoom: Vec<f64> = photos.iter().map(Photo::zoom).collect();
     let long = |v: usize| photos[v].original_size.0.max(photos[v].original_size.1);
-    let alike = |a: usize, b: usize| {
-        let (p, q) = (&photos[a], &photos[b]);
-        let size =
-            |p: &Photo| (p.original_size.0.max(p.original_size.1), p.original_size.0.min(p.original_size.1));
-        let zoomed = match (exif(a), exif(b)) {
-            (Some(f), Some(g)) => (f / g - 1.0).abs() > SAME_ZOOM,
-            (None, None) => false,
-            _ => true,
-        };
-        size(p) == size(q) && p.camera_model == q.camera_model && !zoomed
-    };
+    let group = crate::photo::cameras_by_file(photos);
     // The first photo of each group stands for it.
-    let mut firsts: Vec<usize> = Vec::new();
-    let mut group = Vec::new();
-    for v in 0..photos.len() {
-        let g = firsts.iter().position(|f| alike(*f, v)).unwrap_or_else(|| {
-            firsts.push(v);
-            firsts.len() - 1
-        });
-        group.push(g);
-    }
+    let cameras = group.iter().max().map_or(0, |g| g + 1);
+    let firsts: Vec<usize> = (0..cameras).filter_map(|g| group.iter().position(|o| *o == g)).collect();
     let priors: Vec<OpticsPrior> = firsts
         .iter()
         .enumerate()
         .map(|(g, &v)| {
-            let log_focal = match exif(v) {
+            let log_focal = match photos[v].original_focal() {
                 Some(f) => (f.ln(), EXIF_SIGMA),
                 None => ((FOCAL_GUESS * long(v) as f64).ln(), FOCAL_SIGMA),
             };

@@ -10,6 +10,11 @@ use crate::pose::bundle::Outcome;
 /// length as large as its errors there.
 const INDEPENDENT: f64 = 2000.0;
 
+/// Steps that any start needs at most.
+const STEPS: usize = 60;
+/// Steps from an optimum of the same sightings with one camera more: what is left of the cost after them decides nothing.
+const STEPS_JOINED: usize = 12;
+
 /// A way to explain the sightings.
 struct Explanation {
     /// Bayesian information criterion with unknown noise: less is better.
@@ -23,9 +28,9 @@ fn worth(model: &Model) -> f64 {
     INDEPENDENT.min(model.observations() as f64)
 }
 
-fn explain(model: &Model, freedom: Freedom) -> Result<Explanation> {
+fn explain(model: &Model, freedom: Freedom, steps: usize) -> Result<Explanation> {
     let mut model = Model { freedom, ..model.clone() };
-    let outcome = model.adjust(f64::INFINITY, 2.0, 60)?;
+    let outcome = model.adjust(f64::INFINITY, 2.0, steps)?;
     let worth = worth(&model);
     let value = worth * outcome.cost.max(1e-9).ln() + model.parameters() as f64 * worth.ln();
     Ok(Explanation { value, model, outcome })
@@ -33,7 +38,7 @@ fn explain(model: &Model, freedom: Freedom) -> Result<Explanation> {
 
 /// The best of `freedoms`, with the doubt that the last of them leaves.
 fn best_of(model: &Model, freedoms: &[Freedom]) -> Result<Explanation> {
-    let mut all = freedoms.iter().map(|f| explain(model, *f)).collect::<Result<Vec<_>>>()?;
+    let mut all = freedoms.iter().map(|f| explain(model, *f, STEPS)).collect::<Result<Vec<_>>>()?;
     let doubt = all.last().map(|e| e.outcome.sigmas.clone()).unwrap_or_default();
     all.sort_by(|a, b| a.value.total_cmp(&b.value));
     let mut best = all.swap_remove(0);
@@ -53,7 +58,7 @@ fn joined(mut best: Explanation) -> Result<Explanation> {
             tried.push(target);
             let mut group = best.model.group.clone();
             group[view] = target;
-            let trial = explain(&best.model.regrouped(&group), best.model.freedom)?;
+            let trial = explain(&best.model.regrouped(&group), best.model.freedom, STEPS_JOINED)?;
             if trial.value < best.value {
                 best = trial;
                 break;
@@ -66,9 +71,12 @@ fn joined(mut best: Explanation) -> Result<Explanation> {
 /// Decides what of the optics the photos tell and whether photos that look alike by their files share a camera, and adjusts
 /// with it. The doubt that comes back is that of all optics together: what was not believed may be there all the same.
 pub(super) fn learn_optics(model: &mut Model) -> Result<Outcome> {
-    let mut found = best_of(&model.regrouped(&model.alike), &Freedom::ALL)?;
     let views: Vec<usize> = (0..model.alike.len()).collect();
-    if model.alike != views {
+    // Which of the photos that look alike share a camera is decided once.
+    let decided = model.group != model.alike && model.group != views;
+    let mut found =
+        best_of(&if decided { model.clone() } else { model.regrouped(&model.alike) }, &Freedom::ALL)?;
+    if !decided && model.alike != views {
         let apart = best_of(&model.regrouped(&views), &[Freedom::Focal, Freedom::Radial])?;
         if apart.value < found.value {
             found = best_of(&joined(apart)?.model, &Freedom::ALL)?;
