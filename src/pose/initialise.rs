@@ -1,7 +1,7 @@
 //! Choosing and running a geometry initialiser.
 use super::pointmap::{self, ModelView, PairPointmaps};
 use super::stereo::{self, StereoOptions};
-use super::{Features, Fitted, Geometry, SparseModel, light, sfm};
+use super::{Features, Geometry, SparseModel, light, sfm};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
@@ -9,6 +9,7 @@ use crate::photo::Photo;
 use crate::progress::Progress;
 use crate::scene::Camera;
 use crate::{Error, Result};
+use glam::DVec2;
 
 /// Where cameras and points come from.
 #[derive(Clone, Debug)]
@@ -49,7 +50,7 @@ pub fn place(
             100.0 * sigma
         ));
     }
-    warn_of_misfits(&photos, &model.fitted, progress);
+    warn_of_misfits(&photos, &model, progress);
     progress.check()?;
     let mut photos = photos;
     for ((photo, fitted), camera) in photos.iter_mut().zip(&model.fitted).zip(&model.cameras) {
@@ -108,26 +109,40 @@ const STRANGE_SHARE: f64 = 0.5 / 640.0;
 /// to 0.8 where one is wrong.
 const DOUBTFUL: f64 = 0.85;
 
+/// Distance of the principal point from the middle, share of the long side, that no lens has: stabilised sensors move by a
+/// hundredth.
+const OFF_CENTRE: f64 = 0.03;
+
 /// Names photos whose content, lens or file does not fit the cameras that explain the others.
-fn warn_of_misfits(photos: &[Photo], fitted: &[Fitted], progress: &dyn Progress) {
-    for (v, (photo, own)) in photos.iter().zip(fitted).enumerate() {
+fn warn_of_misfits(photos: &[Photo], model: &SparseModel, progress: &dyn Progress) {
+    for (v, ((photo, own), camera)) in photos.iter().zip(&model.fitted).zip(&model.cameras).enumerate() {
+        let (stem, long) = (&photo.stem, photo.image.width.max(photo.image.height) as f64);
         if own.agreement < DOUBTFUL {
             progress.warn(&format!(
-                "{}: only {:.0} % of its matches with other photos agree with the cameras that were found; its place, or the \
-                 others', is doubtful: leave it out, or add photos between it and the others",
-                photo.stem,
+                "{stem}: only {:.0} % of its matches with other photos agree with the cameras that were found; its place, or \
+                 the others', is doubtful: leave it out, or add photos between it and the others",
                 100.0 * own.agreement
             ));
         }
-        let mut others: Vec<f64> =
-            fitted.iter().enumerate().filter(|(o, _)| *o != v).map(|(_, f)| f.residual).collect();
-        let Some(usual) = super::numeric::median(&mut others) else { continue };
-        let long = photo.image.width.max(photo.image.height) as f64;
+        let half = DVec2::new(photo.image.width as f64, photo.image.height as f64) * 0.5;
+        let off = (DVec2::new(camera.cx, camera.cy) - half).length() / long;
+        if off > OFF_CENTRE {
+            progress.warn(&format!(
+                "{stem}: its optical axis was found {:.0} % of the photo away from the middle; either it is cut out of a larger \
+                 photo, which would serve better, or the cameras are doubtful",
+                100.0 * off
+            ));
+        }
+        let others = model.fitted.iter().enumerate().filter(|(o, _)| *o != v);
+        let Some(usual) = super::numeric::median(&mut others.map(|(_, f)| f.residual).collect::<Vec<_>>())
+        else {
+            continue;
+        };
         if own.residual > STRANGE * usual && own.residual > STRANGE_SHARE * long {
             progress.warn(&format!(
-                "{}: its matches miss the model by {:.1} px, those of the other photos by {usual:.1}; something moved, or its \
-                 lens is not what radial distortion explains",
-                photo.stem, own.residual
+                "{stem}: its matches miss the model by {:.1} px, those of the other photos by {usual:.1}; something moved, or \
+                 its lens is not what radial distortion explains",
+                own.residual
             ));
         }
     }
@@ -209,9 +224,35 @@ mod tests {
     use super::*;
     use crate::pass::metrics::psnr;
     use crate::photo::Light;
-    use crate::pose::testing;
-    use crate::progress::Silent;
+    use crate::pose::{Fitted, testing};
+    use crate::progress::{Recorded, Silent};
     use crate::scene::Lens;
+
+    #[test]
+    fn photos_that_do_not_fit_are_named_with_what_does_not() {
+        let truth = testing::train(&testing::folder());
+        let good = Fitted { agreement: 0.98, residual: 0.1, ..Fitted::default() };
+        let mut model =
+            SparseModel { cameras: truth.cameras.clone(), fitted: vec![good; 4], ..Default::default() };
+        let warned = |model: &SparseModel| {
+            let recorded = Recorded::new(&Silent);
+            warn_of_misfits(&truth.photos, model, &recorded);
+            recorded.warnings()
+        };
+        assert!(warned(&model).is_empty());
+        model.fitted[0].agreement = 0.28;
+        model.cameras[1].cx += 40.0;
+        model.fitted[2].residual = 2.0;
+        let all = warned(&model);
+        assert_eq!(all.len(), 3, "{all:?}");
+        assert!(all[0].starts_with("train_00: only 28 % of its matches"), "{}", all[0]);
+        assert!(
+            all[1].starts_with("train_01: its optical axis was found 6 % of the photo away"),
+            "{}",
+            all[1]
+        );
+        assert!(all[2].starts_with("train_02: its matches miss the model by 2.0 px"), "{}", all[2]);
+    }
 
     #[test]
     fn placed_photos_are_straight_and_in_one_light() {
