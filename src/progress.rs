@@ -16,6 +16,10 @@ pub trait Progress: Send + Sync {
     fn end(&self);
     /// Something the user should know, one line.
     fn warn(&self, message: &str);
+    /// What was decided for the user and is as it should be, one line. Hosts that keep this default get it as a warning.
+    fn inform(&self, message: &str) {
+        self.warn(message);
+    }
     /// True once the caller wants the work to stop.
     fn cancelled(&self) -> bool {
         false
@@ -137,6 +141,9 @@ impl Progress for Recorded<'_> {
         lock(&self.warnings).push(message.to_owned());
         self.inner.warn(message);
     }
+    fn inform(&self, message: &str) {
+        self.inner.inform(message);
+    }
     fn cancelled(&self) -> bool {
         self.stopped.load(Ordering::SeqCst) || self.inner.cancelled()
     }
@@ -169,6 +176,9 @@ impl Progress for Beside<'_> {
     }
     fn warn(&self, message: &str) {
         self.owner.warn(message);
+    }
+    fn inform(&self, message: &str) {
+        self.inner.inform(message);
     }
     fn cancelled(&self) -> bool {
         self.owner.cancelled()
@@ -204,6 +214,7 @@ mod tests {
         recorded.end();
         recorded.begin("align", 1);
         recorded.warn("few matches");
+        recorded.inform("two of three photos");
         recorded.begin("write", 1);
         recorded.end();
         let stages = recorded.stages();

@@ -19,7 +19,7 @@ fn assert_colours(photo: &Photo, expected: [[u8; 3]; 4], tolerance: f32) {
 }
 
 fn read(inputs: &[PathBuf], views: Option<usize>) -> splatvk::Result<Vec<photo::Photo>> {
-    photo::load_each(&choose::photos(inputs, views, &Silent)?, photo::MAX_SIZE, &Silent)
+    photo::load_each(&choose::photos(inputs, views, &Silent)?.0, photo::MAX_SIZE, &Silent)
 }
 
 #[test]

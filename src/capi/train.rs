@@ -69,7 +69,7 @@ unsafe fn gather(
     let photos = if !in_memory && paths.iter().all(Option::is_some) {
         let paths: Vec<PathBuf> = paths.into_iter().flatten().collect();
         let all = if views > 0 || paths.iter().any(|p| p.is_dir()) { None } else { Some(paths.len()) };
-        let chosen = choose::photos(&paths, if views > 0 { Some(views) } else { all }, progress)?;
+        let (chosen, _) = choose::photos(&paths, if views > 0 { Some(views) } else { all }, progress)?;
         photo::load_each(&chosen, max_size, progress)?
     } else {
         let one = |(i, (photo, path)): (usize, (&SvkPhoto, Option<PathBuf>))| unsafe {

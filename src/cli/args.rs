@@ -30,7 +30,7 @@ pub struct Cli {
 pub enum LogFormat {
     /// Bars on a terminal, a line per stage elsewhere
     Text,
-    /// One JSON object per line: begin, step, figures, end, warning, error
+    /// One JSON object per line: begin, step, figures, end, message, warning, error
     Json,
 }
 

@@ -95,6 +95,9 @@ impl Progress for JsonLines {
     fn warn(&self, message: &str) {
         warned(message);
     }
+    fn inform(&self, message: &str) {
+        write_event("message", json!({ "message": message }));
+    }
     fn cancelled(&self) -> bool {
         stopped()
     }
@@ -173,6 +176,9 @@ impl Progress for Terminal {
     }
     fn warn(&self, message: &str) {
         self.print(&format!("warning: {message}"));
+    }
+    fn inform(&self, message: &str) {
+        self.print(message);
     }
     fn cancelled(&self) -> bool {
         stopped()

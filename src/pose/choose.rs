@@ -60,20 +60,20 @@ pub enum Reason {
 }
 
 /// Finds the photos of files, folders and videos and chooses `views` of them (`None`: all, at most
-/// [`photo::DEFAULT_VIEWS`]), for [`photo::load_each`]. Says what it chose.
+/// [`photo::DEFAULT_VIEWS`]), for [`photo::load_each`]. Says what it chose; without a choice, all are used.
 pub fn photos(
     inputs: &[std::path::PathBuf],
     views: Option<usize>,
     progress: &dyn Progress,
-) -> Result<Vec<Candidate>> {
+) -> Result<(Vec<Candidate>, Option<Choice>)> {
     let candidates = photo::gather(inputs, progress)?;
     let wanted = photo::wanted(candidates.len(), views)?;
     if wanted == candidates.len() {
-        return Ok(candidates);
+        return Ok((candidates, None));
     }
     let (chosen, choice) = choose(&candidates, wanted, progress)?;
-    progress.warn(&choice.message());
-    Ok(chosen.into_iter().map(|i| candidates[i].clone()).collect())
+    progress.inform(&choice.message());
+    Ok((chosen.into_iter().map(|i| candidates[i].clone()).collect(), Some(choice)))
 }
 
 impl Choice {

@@ -88,7 +88,7 @@ fn blurred_repeated_and_foreign_photos_are_left_out() {
 
 #[test]
 fn as_many_photos_as_views_are_all_used() {
-    assert_eq!(photos(&[breakfast("images")], Some(4), &Silent).unwrap().len(), 4);
+    assert_eq!(photos(&[breakfast("images")], Some(4), &Silent).unwrap().0.len(), 4);
     let e = photos(&[breakfast("images")], Some(5), &Silent).unwrap_err();
     assert!(e.to_string().starts_with("--views 5: only 4"), "{e}");
 }
@@ -102,4 +102,24 @@ fn long_lists_are_cut_short() {
         message.contains("using 2 of 32 photos: a.jpg, b.jpg") && message.contains("05.jpg and 24 more"),
         "{message}"
     );
+}
+
+#[test]
+fn photos_of_two_places_are_not_mixed() {
+    // Photos 0-2 and 6-8 show one place, 3-5 and 9-10 another.
+    let place = |i: usize| i % 6 >= 3;
+    let n = 11;
+    let link = |i: usize, j: usize| {
+        let matches = if i != j && place(i) == place(j) { 60 } else { 3 };
+        Link { matches, parallax: 0.05 }
+    };
+    let links = (0..n).map(|i| (0..n).map(|j| link(i, j)).collect()).collect();
+    let graph = Graph { links, quality: vec![1.0; n], same: vec![vec![false; n]; n] };
+    let chosen = graph.choose(4);
+    // Two of each place would show more in all, but no camera of one could be placed among those of the other.
+    assert!(chosen.iter().all(|i| !place(*i)), "{chosen:?}");
+    let names: Vec<String> = (0..n).map(|i| i.to_string()).collect();
+    assert_eq!(graph.reason(4, &chosen, &names), Reason::NothingInCommon);
+    let left = [0, 1, 2, 6, 7, 8].into_iter().find(|i| !chosen.contains(i)).unwrap();
+    assert_eq!(graph.reason(left, &chosen, &names), Reason::AddsLittle);
 }

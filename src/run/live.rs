@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 /// # fn main() -> splatvk::Result<()> {
 /// use splatvk::{gpu::Device, photo, pose::choose, progress::Silent, run::{self, RunPlan, live::LiveScene}};
 /// let device = Device::open(None)?;
-/// let chosen = choose::photos(&["my-photos".into()], Some(4), &Silent)?;
+/// let (chosen, _) = choose::photos(&["my-photos".into()], Some(4), &Silent)?;
 /// let photos = photo::load_each(&chosen, photo::MAX_SIZE, &Silent)?;
 /// let outcome = run::reconstruct(&RunPlan::default(), &device, photos, &Silent)?;
 /// let mut scene = LiveScene::trained(&device, outcome, None)?;

@@ -195,6 +195,8 @@ pub struct Outcome {
     pub preset: Preset,
     /// The device that was used.
     pub device: crate::gpu::DeviceInfo,
+    /// Which photos were used and why, where there were more than wanted.
+    pub choice: Option<pose::choose::Choice>,
     /// Photos at working resolution.
     pub photos: Vec<Photo>,
     /// Geometry before training.
@@ -239,10 +241,10 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
         ..gpu::Options::from_env(plan.device.as_deref())
     })?;
     let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
-    let chosen = pose::choose::photos(&plan.inputs, plan.views, progress)?;
+    let (chosen, choice) = pose::choose::photos(&plan.inputs, plan.views, progress)?;
     budget(plan, &device, &photo::sizes_of(&chosen), max_size)?;
     let photos = photo::load_each(&chosen, max_size, progress)?;
-    let outcome = work(plan, &device, photos, progress)?;
+    let outcome = Outcome { choice, ..work(plan, &device, photos, progress)? };
     write(workspace, &outcome, progress)?;
     Ok(outcome)
 }
@@ -349,6 +351,7 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
         plan: plan.clone(),
         preset,
         device: device.info().clone(),
+        choice: None,
         photos,
         geometry,
         cameras: trained.cameras,

@@ -49,6 +49,7 @@ fn statistics(o: &Outcome) -> serde_json::Value {
         .collect();
     json!({
         "photos": o.photos.iter().map(|p| p.path.display().to_string()).collect::<Vec<_>>(),
+        "choice": o.choice,
         "working_sizes": working_sizes(&o.photos),
         "geometry": {
             "method": o.geometry.method, "points": o.geometry.points.len(),
@@ -83,18 +84,18 @@ fn optics(o: &Outcome) -> Vec<serde_json::Value> {
 }
 
 /// The focal length of every camera that the photos were taken with, as far as it was measured.
-fn focal_figure(o: &Outcome) -> Option<String> {
-    let mut cameras: Vec<(usize, String, Vec<&str>)> = Vec::new();
-    for ((photo, camera), fitted) in o.photos.iter().zip(&o.cameras).zip(&o.geometry.fitted) {
-        match cameras.iter_mut().find(|c| c.0 == fitted.camera) {
+fn focal_figure(photos: &[Photo], cameras: &[Camera], fitted: &[Fitted]) -> Option<String> {
+    let mut groups: Vec<(usize, String, Vec<&str>)> = Vec::new();
+    for ((photo, camera), fitted) in photos.iter().zip(cameras).zip(fitted) {
+        match groups.iter_mut().find(|c| c.0 == fitted.camera) {
             Some(known) => known.2.push(&photo.stem),
             None => {
                 let text = format!("{:.1} px ± {:.2} %", camera.fx, 100.0 * fitted.sigmas[0]);
-                cameras.push((fitted.camera, text, vec![&photo.stem]));
+                groups.push((fitted.camera, text, vec![&photo.stem]));
             }
         }
     }
-    match cameras.as_slice() {
+    match groups.as_slice() {
         [] => None,
         [(_, text, _)] => Some(text.clone()),
         several => {
@@ -172,7 +173,10 @@ fn figures(o: &Outcome) -> Vec<(String, String)> {
         ("splats".to_owned(), o.splats.len().to_string()),
         ("train PSNR".to_owned(), format!("{:.2} dB", o.rgb.mean_psnr())),
     ];
-    list.extend(focal_figure(o).map(|text| ("focal length".to_owned(), text)));
+    list.extend(o.choice.as_ref().map(|c| ("choice".to_owned(), c.message())));
+    list.extend(
+        focal_figure(&o.photos, &o.cameras, &o.geometry.fitted).map(|text| ("focal length".to_owned(), text)),
+    );
     list.extend(lens_figure(o).map(|text| ("lens".to_owned(), text)));
     list.extend(super::light::figure(&o.photos));
     let codes = |k: usize| o.field.levels.get(k).map_or(0, |l| l.codebook.len());
@@ -283,4 +287,25 @@ fn shown(a: &Answers) -> QueryShown<'_> {
         })
         .collect();
     QueryShown { text: &a.text, answers }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pass::seeded;
+    use crate::scene::RgbImage;
+
+    #[test]
+    fn the_focal_length_is_told_per_camera() {
+        let image = RgbImage { width: 64, height: 64, data: vec![[0.5; 3]; 64 * 64] };
+        let photo = |name: &str| crate::photo::from_pixels(name.as_ref(), &image, None, 64).unwrap();
+        let photos = ["a.png", "b.png", "c.png", "d.png"].map(photo);
+        let camera = seeded::small(1, 64, 64, 0, 1).1;
+        let cameras = [300.0, 400.0, 300.0, 400.0].map(|fx| Camera { fx, ..camera.clone() });
+        let fitted = |camera| Fitted { camera, sigmas: [0.002, 0.0, 0.0, 0.0, 0.0], ..Fitted::default() };
+        let text = |of: [usize; 4]| focal_figure(&photos, &cameras, &of.map(fitted)).unwrap();
+        assert_eq!(text([0; 4]), "300.0 px ± 0.20 %");
+        assert_eq!(text([0, 1, 0, 1]), "300.0 px ± 0.20 % (a, c); 400.0 px ± 0.20 % (b, d)");
+        assert_eq!(focal_figure(&photos, &cameras, &[]), None);
+    }
 }

@@ -57,6 +57,13 @@ impl OpticsPrior {
         [self.log_focal.1, self.lens[0], self.lens[1], self.shift, self.shift]
     }
 
+    /// Multiplies every σ.
+    pub(crate) fn narrow(&mut self, scale: f64) {
+        self.log_focal.1 *= scale;
+        self.lens.iter_mut().for_each(|s| *s *= scale);
+        self.shift *= scale;
+    }
+
     /// (distance from the prior's mean, σ) of every parameter.
     fn deviations(&self, o: &Optics) -> [(f64, f64); OPTICS] {
         [

@@ -76,6 +76,21 @@ fn errors(found: &[Light], truth: &[Light]) -> [f64; 4] {
 }
 
 #[test]
+fn photos_of_cameras_told_apart_have_corners_of_their_own() {
+    let truth: Vec<Light> = [[-0.3, -0.05], [0.0, 0.0], [-0.3, -0.05], [0.0, 0.0]]
+        .map(|falloff| Light { falloff, ..Light::NONE })
+        .to_vec();
+    let (photos, mut model) = spots(&truth, 0.01, 3);
+    let fitted = |camera| crate::pose::Fitted { camera, ..Default::default() };
+    model.fitted = [0, 1, 0, 1].map(fitted).to_vec();
+    let found = estimate(&photos, &model).lights;
+    for (f, t) in found.iter().zip(&truth) {
+        // As one camera they would all lose half of it.
+        assert!((f.corner() - t.corner()).abs() < 0.05, "{} {}", f.corner(), t.corner());
+    }
+}
+
+#[test]
 fn known_light_is_recovered_within_its_doubt() {
     let truth =
         [light(-0.35, 0.04, -0.03), light(0.0, 0.0, 0.0), light(0.3, -0.05, 0.02), light(0.5, 0.0, 0.06)];

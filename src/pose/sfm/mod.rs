@@ -174,9 +174,8 @@ fn assemble(
     // The pair estimates vote on the focal stretch, weighted by matches and parallax.
     for g in 0..empty.optics.len() {
         let (mut sum, mut weight) = (0.0, 1e-9);
-        for p in
-            pairs.iter().filter(|p| [p.matches.first, p.matches.second].iter().any(|v| empty.group[*v] == g))
-        {
+        let of_group = |p: &&Pair| [p.matches.first, p.matches.second].iter().any(|v| empty.group[*v] == g);
+        for p in pairs.iter().filter(of_group) {
             let w = grow::seed_score(p);
             sum += w * p.geometry.stretch.ln();
             weight += w;
@@ -190,8 +189,7 @@ fn assemble(
     seeds.truncate(SEEDS);
     // Photos of one camera first; where that contradicts the pairs, every photo with its own focal length. That explains much
     // that is wrong for other reasons, so it must settle the matter.
-    let views: Vec<usize> = (0..photos.len()).collect();
-    let apart = (empty.alike != views).then(|| empty.regrouped(&views));
+    let apart = empty.apart();
     let attempts =
         std::iter::once(&empty).chain(&apart).flat_map(|start| seeds.iter().map(move |s| (start, *s)));
     let mut best: Option<(f64, Model)> = None;

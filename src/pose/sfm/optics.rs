@@ -1,14 +1,7 @@
 //! What the photos tell of their optics, and which of them share a camera.
-use super::model::{Freedom, Model};
+use super::model::{Freedom, Model, worth};
 use crate::Result;
 use crate::pose::bundle::Outcome;
-
-/// Independent observations that the sightings of a set are worth at most. Neighbours err alike: what shifts one (a bent
-/// surface taken for flat, JPEG, a moved shadow) shifts those around it, so that thousands of sightings more say little more of
-/// the optics. On the tuning sets a principal point or lens that is not there lowers the cost by up to 0.3 %, one that moves
-/// pixels by 5 by 1.3 % and more; with 2000 the criterion asks for 0.8 %. The same number makes the stated doubt of the focal
-/// length as large as its errors there.
-const INDEPENDENT: f64 = 2000.0;
 
 /// Steps that any start needs at most.
 const STEPS: usize = 60;
@@ -23,15 +16,10 @@ struct Explanation {
     outcome: Outcome,
 }
 
-/// Independent observations that the model's sightings are worth.
-fn worth(model: &Model) -> f64 {
-    INDEPENDENT.min(model.observations() as f64)
-}
-
 fn explain(model: &Model, freedom: Freedom, steps: usize) -> Result<Explanation> {
     let mut model = Model { freedom, ..model.clone() };
     let outcome = model.adjust(f64::INFINITY, 2.0, steps)?;
-    let worth = worth(&model);
+    let worth = worth(model.observations());
     let value = worth * outcome.cost.max(1e-9).ln() + model.parameters() as f64 * worth.ln();
     Ok(Explanation { value, model, outcome })
 }
@@ -71,19 +59,19 @@ fn joined(mut best: Explanation) -> Result<Explanation> {
 /// Decides what of the optics the photos tell and whether photos that look alike by their files share a camera, and adjusts
 /// with it. The doubt that comes back is that of all optics together: what was not believed may be there all the same.
 pub(super) fn learn_optics(model: &mut Model) -> Result<Outcome> {
-    let views: Vec<usize> = (0..model.alike.len()).collect();
+    let apart = model.apart();
     // Which of the photos that look alike share a camera is decided once.
-    let decided = model.group != model.alike && model.group != views;
-    let mut found =
-        best_of(&if decided { model.clone() } else { model.regrouped(&model.alike) }, &Freedom::ALL)?;
-    if !decided && model.alike != views {
-        let apart = best_of(&model.regrouped(&views), &[Freedom::Focal, Freedom::Radial])?;
+    let decided = model.group != model.alike && apart.as_ref().is_some_and(|a| a.group != model.group);
+    let start = if decided { model.clone() } else { model.regrouped(&model.alike) };
+    let mut found = best_of(&start, &Freedom::ALL)?;
+    if let Some(apart) = apart.filter(|_| !decided) {
+        let apart = best_of(&apart, &[Freedom::Focal, Freedom::Radial])?;
         if apart.value < found.value {
             found = best_of(&joined(apart)?.model, &Freedom::ALL)?;
         }
     }
     let Explanation { model: chosen, mut outcome, .. } = found;
-    let wider = (chosen.observations() as f64 / worth(&chosen)).sqrt();
+    let wider = (chosen.observations() as f64 / worth(chosen.observations())).sqrt();
     for (sigmas, prior) in outcome.sigmas.iter_mut().zip(&chosen.priors) {
         sigmas.iter_mut().zip(prior.sigmas()).for_each(|(s, most)| *s = (*s * wider).min(most));
     }
