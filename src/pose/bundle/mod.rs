@@ -32,7 +32,7 @@ pub(crate) struct Optics {
 }
 
 /// Number of parameters of [`Optics`]: ln f, k1, k2, shift.
-const OPTICS: usize = 5;
+pub(crate) const OPTICS: usize = 5;
 
 /// What is known of optics before the images are seen, as normal deviates. σ = 0 holds a parameter where it is.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -38,6 +38,7 @@ pub fn with_cameras(
         centres: vec![DVec2::ZERO; cameras.len()],
         group: (0..cameras.len()).collect(),
         alike: (0..cameras.len()).collect(),
+        separable: (0..cameras.len()).collect(),
         zoom: vec![1.0; cameras.len()],
         optics: cameras
             .iter()

@@ -101,6 +101,14 @@ fn within(f: &Features, valid: &Plane<bool>) -> Features {
     out
 }
 
+/// Cameras, numbered in any way, if photos share one only where their files name it and its zoom. What such photos say against
+/// it is then image stabilisation, which moves the lens from photo to photo, and no other camera.
+fn separable(photos: &[Photo], group: &[usize]) -> Vec<usize> {
+    let named = |p: &Photo| p.camera_model.is_some() && p.exif_focal.is_some();
+    let first = |v: usize| group.iter().position(|g| *g == group[v]).unwrap_or(v);
+    photos.iter().enumerate().map(|(v, p)| if named(p) { first(v) } else { v }).collect()
+}
+
 /// Groups and priors of the optics by what the files say.
 fn empty_model(photos: &[Photo]) -> Model {
     let zoom: Vec<f64> = photos.iter().map(Photo::zoom).collect();
@@ -136,6 +144,7 @@ fn empty_model(photos: &[Photo]) -> Model {
             .map(|p| DVec2::new(p.image.width as f64, p.image.height as f64) * 0.5)
             .collect(),
         alike: group.clone(),
+        separable: separable(photos, &group),
         group,
         zoom,
         optics: priors

@@ -84,6 +84,8 @@ pub(super) struct Model {
     pub(super) group: Vec<usize>,
     /// The same if all photos that look alike by their files share a camera.
     pub(super) alike: Vec<usize>,
+    /// The same, numbered in any way, if only photos share one whose files name camera and zoom.
+    pub(super) separable: Vec<usize>,
     /// Pixels of the view per original pixel.
     pub(super) zoom: Vec<f64>,
     /// Per group.
@@ -139,10 +141,10 @@ impl Model {
         out
     }
 
-    /// The same model with optics of its own for every view; `None` where no two views may share a camera.
+    /// The same model with optics of its own for every view that may have some; `None` where all that look alike must share.
     pub(super) fn apart(&self) -> Option<Model> {
-        let views: Vec<usize> = (0..self.alike.len()).collect();
-        (self.alike != views).then(|| self.regrouped(&views))
+        let apart = self.regrouped(&self.separable);
+        (apart.group != self.alike).then_some(apart)
     }
 
     /// The same model on images of another size: `ratios` per view.
@@ -164,6 +166,7 @@ impl Model {
             centres: self.centres.clone(),
             group: self.group.clone(),
             alike: self.alike.clone(),
+            separable: self.separable.clone(),
             zoom: self.zoom.clone(),
             optics: self.optics.clone(),
             priors: self.priors.clone(),
@@ -424,6 +427,7 @@ mod tests {
                 centres: vec![DVec2::splat(50.0); 2],
                 group: vec![0; 2],
                 alike: vec![0; 2],
+                separable: vec![0; 2],
                 zoom: vec![1.0; 2],
                 optics: vec![Optics { focal: 100.0, lens: Lens::NONE, shift: DVec2::ZERO }],
                 priors: vec![prior],

@@ -1,7 +1,7 @@
 //! What the photos tell of their optics, and which of them share a camera.
 use super::model::{Freedom, Model, worth};
 use crate::Result;
-use crate::pose::bundle::Outcome;
+use crate::pose::bundle::{OPTICS, OpticsPrior, Outcome};
 
 /// Steps that any start needs at most.
 const STEPS: usize = 60;
@@ -67,14 +67,47 @@ pub(super) fn learn_optics(model: &mut Model) -> Result<Outcome> {
     if let Some(apart) = apart.filter(|_| !decided) {
         let apart = best_of(&apart, &[Freedom::Focal, Freedom::Radial])?;
         if apart.value < found.value {
-            found = best_of(&joined(apart)?.model, &Freedom::ALL)?;
+            let several = best_of(&joined(apart)?.model, &Freedom::ALL)?;
+            if several.tells_cameras_apart() {
+                found = several;
+            }
         }
     }
-    let Explanation { model: chosen, mut outcome, .. } = found;
-    let wider = (chosen.observations() as f64 / worth(chosen.observations())).sqrt();
-    for (sigmas, prior) in outcome.sigmas.iter_mut().zip(&chosen.priors) {
-        sigmas.iter_mut().zip(prior.sigmas()).for_each(|(s, most)| *s = (*s * wider).min(most));
+    found.outcome.sigmas = found.doubt();
+    *model = found.model;
+    Ok(found.outcome)
+}
+
+/// Standard deviations by which two cameras must differ.
+const APART: f64 = 3.0;
+
+impl Explanation {
+    /// σ of the optics, as many sightings as they are worth taken for independent.
+    fn doubt(&self) -> Vec<[f64; OPTICS]> {
+        let observations = self.model.observations();
+        let wider = (observations as f64 / worth(observations)).sqrt();
+        let one = |(sigmas, prior): (&[f64; OPTICS], &OpticsPrior)| {
+            let most = prior.sigmas();
+            std::array::from_fn(|k| (sigmas[k] * wider).min(most[k]))
+        };
+        self.outcome.sigmas.iter().zip(&self.model.priors).map(one).collect()
     }
-    *model = chosen;
-    Ok(outcome)
+
+    /// Whether any two cameras of photos that look alike differ in focal length or lens by more than is doubtful. Where they
+    /// do not, what made them explain more is something else: principal points that image stabilisation moves, a rolling
+    /// shutter. Optics of their own would turn that into wrong focal lengths.
+    fn tells_cameras_apart(&self) -> bool {
+        let (model, doubt) = (&self.model, self.doubt());
+        let values =
+            |g: usize| [model.optics[g].focal.ln(), model.optics[g].lens.k1, model.optics[g].lens.k2];
+        let differ = |g: usize, h: usize| {
+            let (a, b) = (values(g), values(h));
+            (0..3).any(|k| (a[k] - b[k]).abs() > APART * doubt[g][k].hypot(doubt[h][k]))
+        };
+        let views = || 0..model.group.len();
+        let pairs = views().flat_map(|v| views().map(move |w| (v, w)));
+        pairs
+            .filter(|(v, w)| model.alike[*v] == model.alike[*w] && model.group[*v] != model.group[*w])
+            .any(|(v, w)| differ(model.group[v], model.group[w]))
+    }
 }

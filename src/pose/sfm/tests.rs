@@ -226,6 +226,43 @@ fn photos_that_only_look_like_one_camera_are_told_apart() {
     }
 }
 
+/// The part of a photo that a lens moved by image stabilisation would show: 600 × 440 pixels, off the middle by `shift`.
+fn moved(photo: &Photo, shift: [i32; 2]) -> Photo {
+    let (width, height) = (600, 440);
+    let at = |x: i32, y: i32| photo.image.at((x + 20 + shift[0]) as usize, (y + 20 + shift[1]) as usize);
+    let data = (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| at(x, y)).collect();
+    let image = RgbImage { width: width as usize, height: height as usize, data };
+    crate::photo::from_pixels(&photo.path, &image, None, 600).unwrap()
+}
+
+#[test]
+fn a_moving_lens_does_not_make_another_camera() {
+    let truth = testing::train(&testing::folder());
+    let shifts = [[0, 0], [12, -6], [-10, 8], [6, 10]];
+    let moved = |(p, s): (&Photo, [i32; 2])| moved(p, s);
+    let photos: Vec<Photo> = truth.photos.iter().zip(shifts).map(moved).collect();
+    let model = reconstruct(&photos, &[], &Silent).unwrap();
+    let of: Vec<usize> = model.fitted.iter().map(|f| f.camera).collect();
+    let focal: Vec<f64> = model.cameras.iter().map(|c| c.fx / truth.cameras[0].fx - 1.0).collect();
+    println!("{of:?} {focal:?} {:?}", model.fitted[0].sigmas);
+    assert_eq!(of, [0; 4]);
+    assert!(focal.iter().all(|f| f.abs() < 0.02), "{focal:?}");
+}
+
+#[test]
+fn photos_whose_files_name_camera_and_zoom_share_it() {
+    let mut photos = testing::train(&testing::folder()).photos;
+    let apart = |photos: &[Photo]| empty_model(photos).apart().map(|m| m.group);
+    assert_eq!(apart(&photos), Some(vec![0, 1, 2, 3]));
+    for p in &mut photos[..3] {
+        (p.camera_model, p.exif_focal) = (Some("phone".into()), Some(600.0));
+    }
+    photos[3].camera_model = Some("phone".into());
+    assert_eq!(apart(&photos), None, "two cameras by their files");
+    photos[2].exif_focal = None;
+    assert_eq!(apart(&photos), Some(vec![0, 0, 1, 2]));
+}
+
 #[test]
 fn larger_images_make_cameras_better() {
     let mut truth = testing::train(&testing::folder());
