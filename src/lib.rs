@@ -56,7 +56,9 @@
 pub mod ablate;
 pub mod bench;
 pub mod capi;
+pub mod checkpoint;
 pub mod error;
+mod files;
 pub mod fit;
 pub mod format;
 pub mod gpu;
@@ -64,6 +66,7 @@ pub mod infer;
 pub mod language;
 pub mod pass;
 pub mod photo;
+pub mod pipeline;
 pub mod pose;
 pub mod progress;
 pub mod query;

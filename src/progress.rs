@@ -1,4 +1,5 @@
 //! How long work tells its caller where it is, and learns that it should stop.
+use crate::checkpoint::Checkpoint;
 use crate::{Error, Result};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -27,6 +28,10 @@ pub trait Progress: Send + Sync {
     /// `Err(Error::Cancelled)` once the caller wants the work to stop.
     fn check(&self) -> Result<()> {
         if self.cancelled() { Err(Error::Cancelled) } else { Ok(()) }
+    }
+    /// Where long work keeps its state, if it is kept at all.
+    fn checkpoint(&self) -> Option<&Checkpoint> {
+        None
     }
     /// Where work that goes on beside this one reports: its stages and this one's do not end each other. Hosts that
     /// show one stage at a time keep this default and see nothing of the other.

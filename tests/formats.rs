@@ -55,7 +55,8 @@ fn some_cameras() -> Vec<Camera> {
         .collect()
 }
 
-/// Camera centres and rotations must survive text files (ALGORITHMS 10.3: 1e-9); centres relative to their size.
+/// Camera centres and rotations must survive text files (docs/method.md#camera-files: 1e-9); centres relative to their
+/// size.
 fn assert_same_cameras(a: &[Camera], b: &[Camera]) {
     assert_eq!(a.len(), b.len());
     for (a, b) in a.iter().zip(b) {

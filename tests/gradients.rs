@@ -6,9 +6,9 @@ use splatvk::pass::raster_backward::Summation;
 use splatvk::pass::{FeatureMode, Ways};
 use support::{GpuGradients, Scene, assert_close};
 
-/// Relative 1e-3 by class in the L2 sense (ALGORITHMS 7.8; measured 4e-7 to 4e-6). Single elements are sums of many
-/// terms of both signs, so each is also allowed 2e-3 of the class's root mean square; a contribution at the α threshold
-/// that one side counts and the other does not may push 2 % of the elements of a small class beyond that.
+/// Relative 1e-3 by class in the L2 sense (docs/method.md#tolerances; measured 4e-7 to 4e-6). Single elements are sums
+/// of many terms of both signs, so each is also allowed 2e-3 of the class's root mean square; a contribution at the α
+/// threshold that one side counts and the other does not may push 2 % of the elements of a small class beyond that.
 fn tolerance(reference: &[f64]) -> Tolerance {
     let rms = (reference.iter().map(|x| x * x).sum::<f64>() / reference.len().max(1) as f64).sqrt();
     Tolerance {
@@ -60,7 +60,8 @@ fn random_scenes_match_the_twin() {
     }
 }
 
-/// Edge cases of ALGORITHMS 7.8: clamped α, clamped Jacobian, needle, behind, hidden, outside, a clamped colour.
+/// Edge cases of docs/method.md#tolerances: clamped α, clamped Jacobian, needle, behind, hidden, outside, a clamped
+/// colour.
 #[test]
 fn edge_cases_match_the_twin() {
     let device = test_device();

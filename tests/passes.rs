@@ -180,7 +180,7 @@ fn tile_lists_contain_the_twins() {
     assert!(total > 1000 && extra * 100 < total, "{extra} of {total}");
 }
 
-/// 20 000 splats in one tile (the 10⁵ of the specification take the twin too long): nothing overflows, saturates or
+/// 20 000 splats in one tile (10⁵ take the twin too long): nothing overflows, saturates or
 /// loses its order.
 #[test]
 fn crowded_tile_matches_the_twin() {

@@ -61,6 +61,8 @@ pub enum Command {
     Bench(BenchArgs),
     /// What this machine has and what is missing
     Doctor(DoctorArgs),
+    /// What earlier runs left to be used again: shows it, or frees it
+    Clean(CleanArgs),
     /// Completions of a shell on standard output: bash, elvish, fish, powershell, zsh
     Completions(CompletionsArgs),
     /// Man pages into a folder
@@ -120,6 +122,12 @@ pub struct RunArgs {
     /// Replace a scene that is already there
     #[arg(long)]
     pub force: bool,
+    /// Go on after a run that ended early, or change a late option: stages with the same photos and settings are not run again
+    #[arg(long)]
+    pub resume: bool,
+    /// How often training keeps its state for --resume, seconds
+    #[arg(long, default_value_t = crate::run::CHECKPOINT_SECONDS, value_name = "N")]
+    pub checkpoint_seconds: u64,
     /// Time against quality [default: draft on a CPU device, default on a GPU]
     #[arg(long, value_enum)]
     pub preset: Option<PresetArg>,
@@ -192,6 +200,12 @@ pub struct TrainArgs {
     /// Replace a scene that is already there
     #[arg(long)]
     pub force: bool,
+    /// Go on after a training that ended early: stages with the same photos and settings are not run again
+    #[arg(long)]
+    pub resume: bool,
+    /// How often training keeps its state for --resume, seconds
+    #[arg(long, default_value_t = crate::run::CHECKPOINT_SECONDS, value_name = "N")]
+    pub checkpoint_seconds: u64,
     /// Time against quality [default: draft on a CPU device, default on a GPU]
     #[arg(long, value_enum)]
     pub preset: Option<PresetArg>,
@@ -408,6 +422,17 @@ pub struct DoctorArgs {
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
+}
+
+/// `splatvk clean`
+#[derive(Debug, Args)]
+pub struct CleanArgs {
+    /// Delete it
+    #[arg(long)]
+    pub delete: bool,
+    /// Print one JSON object on standard output
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `splatvk completions`

@@ -2,6 +2,7 @@
 mod ablate;
 pub mod args;
 mod bench;
+mod clean;
 mod doctor;
 mod eval;
 mod export;
@@ -59,6 +60,7 @@ fn execute(command: Command) -> Result<()> {
         Command::Export(args) => export::export(&args),
         Command::Models(args) => models::models(&args),
         Command::Bench(args) => bench::bench(&args),
+        Command::Clean(args) => clean::clean(&args),
         Command::Doctor(args) => doctor::doctor(&args),
         Command::Completions(args) => shell::completions(&args),
         Command::Manuals(args) => shell::manuals(&args),

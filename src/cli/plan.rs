@@ -39,6 +39,8 @@ pub fn run(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         views: args.views,
         out: args.out.clone().unwrap_or_else(|| default_out(&args.inputs)),
         force: args.force,
+        resume: args.resume,
+        checkpoint_seconds: args.checkpoint_seconds,
         preset: args.preset.map(preset),
         init: init(&args.init, installed)?,
         matcher: matcher(&args.matcher, installed)?,

@@ -14,6 +14,8 @@ pub fn train(args: &TrainArgs) -> Result<()> {
         points: args.points.clone(),
         out: args.out.clone(),
         force: args.force,
+        resume: args.resume,
+        checkpoint_seconds: args.checkpoint_seconds,
         preset: args.preset.map(plan::preset),
         iterations: args.iterations,
         seed: args.seed,

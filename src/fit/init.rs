@@ -1,4 +1,5 @@
-//! Splats from points: size from the pixel footprint and the nearest neighbours, colour from the photos (ALGORITHMS 7.1).
+//! Splats from points: size from the pixel footprint and the nearest neighbours, colour from the photos
+//! (docs/method.md#splats-from-points).
 use super::options::InitOptions;
 use super::schedule::Random;
 use crate::scene::{PointCloud, Splats, sh_coefficients};

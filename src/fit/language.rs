@@ -1,11 +1,12 @@
-//! The language stage: features on the splats that render to each pixel's code (ALGORITHMS 8),
+//! The language stage: features on the splats that render to each pixel's code (docs/method.md#language-training),
 //! `L = λ2·L_img + (1−λ2)·L_sem`, starting from lifted features.
 use super::lift::{CodeTargets, lift};
-use super::model::Model;
+use super::model::{self, Model};
 use super::options::{FeatureGauge, LanguageOptions};
 use super::scale::SceneScale;
 use super::schedule::ViewOrder;
 use super::views::Views;
+use crate::checkpoint::Checkpoint;
 use crate::gpu::{Buffer, Device, Program, Recorder};
 use crate::pass::rasterizer::RasterOptions;
 use crate::pass::twin::FeatureMode;
@@ -14,17 +15,18 @@ use crate::progress::Progress;
 use crate::scene::{Camera, LEVEL_NAMES, LanguageField, LevelField, RgbImage, Splats};
 use crate::{Error, Result};
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
 /// L_img in this stage weighs L1 and D-SSIM as in the first (the paper).
 const IMAGE_WEIGHTS: [f64; 2] = [0.8, 0.2];
 /// Slots of the loss sums: Σ|x−y|, ΣSSIM, language loss.
 const LANGUAGE_SUM: u32 = 2;
-/// Two measurements that gain less than this share of the pixels end the training (ALGORITHMS 8.5).
+/// Two measurements that gain less than this share of the pixels end the training (docs/method.md#stopping).
 const MIN_GAIN: f64 = 1e-3;
 
 /// One measurement during the language stage.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LanguagePoint {
     /// 1-based step; 0 = after lifting.
     pub step: usize,
@@ -42,7 +44,7 @@ impl LanguagePoint {
 }
 
 /// The result of the language stage.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct TrainedLanguage {
     /// Splats of the shared model (or the given ones, with `per_level`).
     pub splats: Splats,
@@ -85,7 +87,9 @@ pub fn train_language(
     };
     for (g, group) in groups.iter().enumerate() {
         let levels: Vec<&LevelField> = group.iter().map(|&l| &out.field.levels[l]).collect();
-        let mut run = Run::new(device, images, cameras, splats, &levels, options)?;
+        let mut run = Run { group: g, ..Run::new(device, images, cameras, splats, &levels, options)? };
+        let kept = progress.checkpoint().and_then(|c| c.load::<State>()).filter(|k| k.group == g);
+        kept.map_or(Ok(()), |k| run.restore(k))?;
         run.train(progress, (g * options.iterations) as u64)?;
         let (trained, features) = run.finish()?;
         out.curve.append(&mut run.curve);
@@ -104,9 +108,26 @@ pub fn train_language(
     Ok(out)
 }
 
+/// Everything of a [`Run`] that steps change, for going on after a kill. Of models trained one after the other only the
+/// state of the current one is kept; those before it are trained again.
+#[derive(Serialize, Deserialize)]
+struct State {
+    group: usize,
+    /// Steps that are done.
+    done: usize,
+    model: model::State,
+    order: ViewOrder,
+    recent: Vec<f64>,
+    curve: Vec<LanguagePoint>,
+}
+
 /// The training of one model: all levels together, or one.
 pub(crate) struct Run<'a> {
     device: Device,
+    /// Which of the models this is.
+    group: usize,
+    /// Steps that an earlier process has done.
+    done: usize,
     options: &'a LanguageOptions,
     pub(super) raster: RasterOptions,
     levels: Vec<&'a LevelField>,
@@ -159,6 +180,8 @@ impl<'a> Run<'a> {
             .collect::<Result<_>>()?;
         Ok(Run {
             device: device.clone(),
+            group: 0,
+            done: 0,
             options,
             raster,
             levels: levels.to_vec(),
@@ -178,14 +201,32 @@ impl<'a> Run<'a> {
         })
     }
 
+    /// Takes over a state.
+    fn restore(&mut self, kept: State) -> Result<()> {
+        self.model = Model::restored(&self.device, &kept.model)?;
+        let State { done, order, recent, curve, .. } = kept;
+        (self.done, self.order, self.recent, self.curve) = (done, order, recent, curve);
+        Ok(())
+    }
+
+    /// Writes the state after `done` steps, if somebody keeps it.
+    fn keep(&self, done: usize, progress: &dyn Progress) -> Result<()> {
+        let Some(checkpoint) = progress.checkpoint() else { return Ok(()) };
+        let (order, recent, curve) = (self.order.clone(), self.recent.clone(), self.curve.clone());
+        checkpoint.save(&State { group: self.group, done, model: self.model.state()?, order, recent, curve })
+    }
+
     fn train(&mut self, progress: &dyn Progress, done: u64) -> Result<()> {
         // A run that is measured once, at its end, needs no start to compare with.
-        if (1..self.options.iterations).contains(&self.options.check_every) {
+        if self.done == 0 && (1..self.options.iterations).contains(&self.options.check_every) {
             self.measure(0)?;
             self.tell(progress, done);
         }
-        for iteration in 0..self.options.iterations {
-            progress.check()?;
+        for iteration in self.done..self.options.iterations {
+            if progress.cancelled() {
+                self.keep(iteration, progress)?;
+                return Err(Error::Cancelled);
+            }
             self.step(iteration)?;
             let step = iteration + 1;
             if self.options.check_every > 0 && step % self.options.check_every == 0 {
@@ -201,6 +242,9 @@ impl<'a> Run<'a> {
                 format!("{} decoded {}", self.names, shares.join(" "))
             });
             progress.step(done + step as u64, &note);
+            if progress.checkpoint().is_some_and(Checkpoint::due) {
+                self.keep(step, progress)?;
+            }
         }
         self.model.check(self.options.iterations)
     }

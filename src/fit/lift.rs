@@ -1,5 +1,5 @@
 //! Code targets in GPU memory, and lifting: features that start as the blending-weighted mean of the codes each splat
-//! is seen with (ALGORITHMS 8.4).
+//! is seen with (docs/method.md#lifting).
 use super::model::Model;
 use super::options::FeatureGauge;
 use super::views::Views;
@@ -12,7 +12,7 @@ use crate::scene::{Camera, Codebook, LevelField, RgbImage};
 use crate::{Error, Result};
 
 /// Splats that labelled pixels saw with less weight than this (in pixels) start without a feature: their direction
-/// would be noise (ALGORITHMS 8.4).
+/// would be noise (docs/method.md#lifting).
 const MIN_WEIGHT: f32 = 0.05;
 /// Length of a lifted raw feature in the normalised gauge: far above ε, so steps turn it without collapsing it.
 const LIFTED_LENGTH: f32 = 0.5;
@@ -147,7 +147,7 @@ pub(super) fn lift(
     Ok(sums)
 }
 
-/// `argmax_k F·c_k`, the lowest k on ties (ALGORITHMS 6.3, step 6).
+/// `argmax_k F·c_k`, the lowest k on ties (docs/method.md#decoding-codes).
 pub(super) fn decode(codebook: &Codebook, feature: &[f32]) -> usize {
     let mut best = (f32::NEG_INFINITY, 0);
     for (k, code) in codebook.codes.chunks_exact(codebook.code_dim).enumerate() {

@@ -6,6 +6,7 @@ use crate::pass::compact;
 use crate::pass::rasterizer::SplatBuffers;
 use crate::scene::Splats;
 use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
 
 /// The parameter classes, in the order of the schedule's rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,7 +39,37 @@ pub(super) struct Model {
     step: usize,
 }
 
+/// Everything of a [`Model`] that steps change.
+#[derive(Serialize, Deserialize)]
+pub(super) struct State {
+    pub(super) splats: Splats,
+    features: Vec<f32>,
+    feature_dim: usize,
+    /// Per class, and of the features.
+    moments: Vec<Vec<f32>>,
+    step: usize,
+}
+
 impl Model {
+    /// Reads the state.
+    pub(super) fn state(&self) -> Result<State> {
+        let (splats, features) = self.values.download()?;
+        let all = self.moments.iter().chain([&self.feature_moments]);
+        let moments = all.map(|m| m.buffer.read::<f32>()).collect::<Result<_>>()?;
+        Ok(State { splats, features, feature_dim: self.values.feature_dim, moments, step: self.step })
+    }
+
+    /// The model that a state was read from.
+    pub(super) fn restored(device: &Device, state: &State) -> Result<Self> {
+        let mut model = Model::new(device, &state.splats, state.feature_dim)?;
+        model.values.features.write(&state.features)?;
+        for (own, kept) in model.moments.iter().chain([&model.feature_moments]).zip(&state.moments) {
+            own.buffer.write(kept)?;
+        }
+        model.step = state.step;
+        Ok(model)
+    }
+
     /// Uploads splats and reserves features [N, feature_dim], all zero.
     pub(super) fn new(device: &Device, splats: &Splats, feature_dim: usize) -> Result<Self> {
         let zeros = vec![0.0; splats.len() * feature_dim];

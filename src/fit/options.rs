@@ -10,11 +10,11 @@ pub enum Preset {
     Draft,
     /// The recommended length on a GPU.
     Default,
-    /// The constants of the reference implementation behind the paper (ALGORITHMS 7.2, column [AUTH]).
+    /// The constants of the reference implementation behind the paper (docs/method.md#schedules).
     Paper,
 }
 
-/// How splats start (ALGORITHMS 7.1).
+/// How splats start (docs/method.md#splats-from-points).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct InitOptions {
     /// At most this many splats; more points are thinned to an even density by voxels.
@@ -192,7 +192,7 @@ impl RgbOptions {
     }
 }
 
-/// How raw splat features become what is rendered (ALGORITHMS 8.4).
+/// How raw splat features become what is rendered (docs/method.md#feature-gauge).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FeatureGauge {
     /// `f̂ = f/(‖f‖+ε)` per level, as the paper.
@@ -213,7 +213,7 @@ pub struct LanguageOptions {
     pub seed: u64,
     /// λ2 of `L = λ2·L_img + (1−λ2)·L_sem`.
     pub image_weight: f64,
-    /// Learning rates of everything but the features (reduced, ALGORITHMS 8.2).
+    /// Learning rates of everything but the features (reduced, docs/method.md#language-rates).
     pub rates: Rates,
     /// Learning rate of the features.
     pub feature_rate: f64,

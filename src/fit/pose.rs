@@ -1,14 +1,15 @@
-//! Camera pose refinement by Adam on left twists, `T ← exp(−lr·m̂/(√v̂+ε))·T` (ALGORITHMS 7.6).
+//! Camera pose refinement by Adam on left twists, `T ← exp(−lr·m̂/(√v̂+ε))·T` (docs/method.md#pose-refinement).
 use super::schedule::Exponential;
 use crate::scene::Pose;
 use glam::DVec3;
+use serde::{Deserialize, Serialize};
 
 /// Largest rotation (rad) and translation (in units of the scene scale) of one step: a single bad gradient must not
 /// throw a camera out of the scene.
 const MAX_STEP: f64 = 1e-3;
 
 /// Adam state of one camera.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct PoseAdam {
     step: i32,
     first: [f64; 6],

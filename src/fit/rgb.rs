@@ -1,14 +1,15 @@
-//! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (ALGORITHMS 7).
+//! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (docs/method.md#splats).
 use super::coarse::Halved;
 use super::densify::densify;
 use super::init::splats_from_points;
-use super::model::Model;
+use super::model::{self, Model};
 use super::options::RgbOptions;
 use super::pose::PoseAdam;
 use super::scale::SceneScale;
 use super::schedule::{Random, ViewOrder};
 use super::unseen::unseen_splats;
 use super::views::Views;
+use crate::checkpoint::Checkpoint;
 use crate::gpu::{Device, Program, Recorder};
 use crate::pass::densify::GradientStats;
 use crate::pass::metrics::psnr;
@@ -18,16 +19,17 @@ use crate::pass::{compact, regularise, ssim_l1::ImageLoss};
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, PointCloud, RgbImage, Splats};
 use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
 /// Photos of 8 bits cannot show more than their rounding noise, 10·log10(12·255²) = 58.9 dB: a render that happens to
 /// match exactly must not outweigh all other views.
 const MOST_PSNR: f64 = 60.0;
-/// Scale ratios above this are penalised (ALGORITHMS 7.7).
+/// Scale ratios above this are penalised (docs/method.md#regularisers).
 const RATIO_LIMIT: f32 = 8.0;
 
 /// One point of the training curve.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CurvePoint {
     /// 1-based step.
     pub step: usize,
@@ -43,7 +45,7 @@ pub struct CurvePoint {
 }
 
 /// What happened during a fit.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct FitStats {
     /// The loss over time.
     pub curve: Vec<CurvePoint>,
@@ -65,7 +67,7 @@ impl FitStats {
 }
 
 /// The result of the RGB stage.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Trained {
     /// Fitted splats.
     pub splats: Splats,
@@ -115,11 +117,19 @@ pub fn fit_rgb(
         Some(half) => (half.images.as_slice(), half.cameras.as_slice(), half.depths.as_deref()),
         None => (images, cameras, depths),
     };
-    let mut run = Run::new(device, first.0, first.1, &start, scale, first.2, options)?;
-    for iteration in 0..options.iterations {
-        progress.check()?;
-        if coarse > 0 && iteration == coarse {
+    let kept = progress.checkpoint().and_then(|c| c.load::<State>());
+    let (done, from) = kept.as_ref().map_or((0, &start), |k| (k.done, &k.model.splats));
+    let mut run = Run::new(device, first.0, first.1, from, scale, first.2, options)?;
+    kept.map_or(Ok(()), |k| run.restore(k))?;
+    let mut small = coarse > 0;
+    for iteration in done..options.iterations {
+        if progress.cancelled() {
+            run.keep(iteration, progress)?;
+            return Err(Error::Cancelled);
+        }
+        if small && iteration >= coarse {
             run.look_at(images, cameras, depths)?;
+            small = false;
         }
         run.step(iteration)?;
         if let Some(point) = run.report(iteration)? {
@@ -132,6 +142,9 @@ pub fn fit_rgb(
         }
         run.prune(iteration)?;
         run.densify(iteration)?;
+        if progress.checkpoint().is_some_and(Checkpoint::due) {
+            run.keep(iteration + 1, progress)?;
+        }
     }
     progress.step(options.iterations as u64, "");
     run.model.check(options.iterations)?;
@@ -152,7 +165,24 @@ fn used<'d>(depths: Option<&'d [DepthMap]>, options: &RgbOptions) -> Option<(&'d
     depths.filter(|_| options.depth_weight > 0.0).map(|d| (d, options.min_confidence))
 }
 
-/// The state of one fit.
+/// Everything of a [`Run`] that steps change, for going on after a kill.
+#[derive(Serialize, Deserialize)]
+struct State {
+    /// Steps that are done.
+    done: usize,
+    model: model::State,
+    cameras: Vec<Camera>,
+    poses: Vec<PoseAdam>,
+    order: ViewOrder,
+    random: Random,
+    stats: Option<Vec<f32>>,
+    recent: Vec<ImageLoss>,
+    last: usize,
+    psnr: Vec<Option<f64>>,
+    curve: Vec<CurvePoint>,
+}
+
+/// One fit.
 pub(crate) struct Run<'a> {
     device: Device,
     options: &'a RgbOptions,
@@ -213,6 +243,36 @@ impl<'a> Run<'a> {
             psnr: vec![None; cameras.len()],
             curve: Vec::new(),
         })
+    }
+
+    /// Writes the state after `done` steps, if somebody keeps it.
+    fn keep(&self, done: usize, progress: &dyn Progress) -> Result<()> {
+        let Some(checkpoint) = progress.checkpoint() else { return Ok(()) };
+        checkpoint.save(&State {
+            done,
+            model: self.model.state()?,
+            cameras: self.cameras.clone(),
+            poses: self.poses.clone(),
+            order: self.order.clone(),
+            random: self.random.clone(),
+            stats: self.stats.as_ref().map(GradientStats::values).transpose()?,
+            recent: self.recent.clone(),
+            last: self.last,
+            psnr: self.psnr.clone(),
+            curve: self.curve.clone(),
+        })
+    }
+
+    /// Takes over a state; the run was made for its splats.
+    fn restore(&mut self, kept: State) -> Result<()> {
+        self.model = Model::restored(&self.device, &kept.model)?;
+        if let (Some(own), Some(values)) = (&mut self.stats, &kept.stats) {
+            own.restore(values)?;
+        }
+        let State { cameras, poses, order, random, recent, last, psnr, curve, .. } = kept;
+        (self.cameras, self.poses, self.order, self.random) = (cameras, poses, order, random);
+        (self.recent, self.last, self.psnr, self.curve) = (recent, last, psnr, curve);
+        Ok(())
     }
 
     /// Goes on with the same photos at another size; the poses found so far stay.

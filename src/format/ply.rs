@@ -1,4 +1,5 @@
-//! PLY files: a table reader for one element, and the Gaussian layout that 3DGS viewers expect (ALGORITHMS 10.1).
+//! PLY files: a table reader for one element, and the Gaussian layout that 3DGS viewers expect
+//! (docs/method.md#gaussian-ply).
 use super::ply_packed;
 use crate::scene::{LanguageField, LevelField, PointCloud, Splats, sh_coefficients};
 use crate::{Error, Result};

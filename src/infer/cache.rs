@@ -9,11 +9,15 @@ use std::time::SystemTime;
 use sha2::{Digest, Sha256};
 
 use super::graph::GraphFile;
-use super::registry::{content_hash, home, sha256};
+use super::registry::home;
 use crate::Result;
+use crate::files::{self, content_hash, sha256};
 
 /// Bytes that the folder may hold: the pointmaps and descriptors of a dozen scenes, or the masks of hundreds.
 const CAPACITY: u64 = 4 << 30;
+
+/// Extension of the files.
+const EXTENSION: &str = "f32";
 
 /// Identifies a result by everything that it depends on.
 pub struct Key {
@@ -59,8 +63,18 @@ impl Key {
 
     fn file(self) -> PathBuf {
         let kind = self.kind;
-        home().join("cache").join(format!("{kind}-{}.f32", self.short()))
+        folder().join(format!("{kind}-{}.{EXTENSION}", self.short()))
     }
+}
+
+/// Where answers are kept.
+pub fn folder() -> PathBuf {
+    home().join("cache")
+}
+
+/// What is kept, with sizes in bytes.
+pub fn files() -> Vec<(PathBuf, u64)> {
+    files::in_folder(&folder(), EXTENSION)
 }
 
 thread_local! {
@@ -89,59 +103,15 @@ pub fn remember(key: Key, compute: impl FnOnce() -> Result<Vec<f32>>) -> Result<
         return compute();
     }
     let file = key.file();
-    if let Some(values) = read(&file) {
-        return Ok(values);
+    if let Some(body) = files::read_sealed(&file).filter(|b| b.len() % 4 == 0) {
+        return Ok(bytemuck::pod_collect_to_vec(&body));
     }
     let values = compute()?;
     // Not being able to keep it costs time only.
-    let body: &[u8] = bytemuck::cast_slice(&values);
-    if write(&file, &[sha256(body).as_bytes(), body].concat()).is_ok() {
-        prune(&file);
+    if files::write_sealed(&file, bytemuck::cast_slice(&values)).is_ok() {
+        files::prune(&file, EXTENSION, CAPACITY);
     }
     Ok(values)
-}
-
-fn read(file: &Path) -> Option<Vec<f32>> {
-    let bytes = std::fs::read(file).ok()?;
-    let (sum, body) = bytes.split_at_checked(64)?;
-    if body.len() % 4 != 0 || *sum != *sha256(body).as_bytes() {
-        return None;
-    }
-    // Remembers the use, for `prune`; a folder that cannot be written to prunes nothing either.
-    let _ = std::fs::File::options().append(true).open(file).and_then(|f| f.set_modified(SystemTime::now()));
-    Some(bytemuck::pod_collect_to_vec(body))
-}
-
-fn write(file: &Path, bytes: &[u8]) -> std::io::Result<()> {
-    let partial = file.with_extension(format!("partial-{}", std::process::id()));
-    let kept = std::fs::create_dir_all(file.parent().unwrap_or(file))
-        .and_then(|()| std::fs::write(&partial, bytes))
-        .and_then(|()| std::fs::rename(&partial, file));
-    kept.inspect_err(|_| {
-        let _ = std::fs::remove_file(&partial);
-    })
-}
-
-/// Removes what was not used for longest until the rest fits.
-fn prune(newest: &Path) {
-    let Some(folder) = newest.parent() else { return };
-    let entry = |e: std::fs::DirEntry| {
-        let meta = e.metadata().ok()?;
-        Some((meta.modified().ok()?, meta.len(), e.path()))
-    };
-    let list = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    let mut files: Vec<_> =
-        list.filter_map(entry).filter(|f| f.2.extension().is_some_and(|e| e == "f32")).collect();
-    files.sort();
-    let mut total: u64 = files.iter().map(|f| f.1).sum();
-    for (_, size, path) in files {
-        if total <= CAPACITY || path == newest {
-            break;
-        }
-        if std::fs::remove_file(&path).is_ok() {
-            total -= size;
-        }
-    }
 }
 
 /// sha256 of a file, remembered across processes by its place, size and time of change: hashing gigabytes takes seconds.
@@ -149,14 +119,14 @@ pub(super) fn fingerprint(path: &Path) -> std::io::Result<String> {
     let meta = std::fs::metadata(path)?;
     let age = meta.modified()?.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     let stamp = format!("{}:{}:{}", path.canonicalize()?.display(), meta.len(), age.as_nanos());
-    let note = home().join("cache").join("sums").join(&sha256(stamp.as_bytes())[..16]);
+    let note = folder().join("sums").join(&sha256(stamp.as_bytes())[..16]);
     if let Ok(known) = std::fs::read_to_string(&note)
         && known.len() == 64
     {
         return Ok(known);
     }
     let hash = content_hash(path)?;
-    let _ = write(&note, hash.as_bytes());
+    let _ = files::write(&note, &[hash.as_bytes()]);
     Ok(hash)
 }
 

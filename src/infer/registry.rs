@@ -2,15 +2,11 @@
 //!
 //! The table is `tools/models/pack.json`, the same one that the set-up script builds from, so the two cannot disagree.
 use std::collections::HashMap;
-use std::fmt::Write as _;
-use std::io::Read as _;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, OnceLock};
-use std::time::SystemTime;
 
 use serde::Deserialize;
-use sha2::{Digest, Sha256};
 
+use crate::files::content_hash;
 use crate::{Error, Result};
 
 const PACK: &str = include_str!("../../tools/models/pack.json");
@@ -198,46 +194,6 @@ impl Registry {
             fix,
         }
     }
-}
-
-/// sha256 of a file in lower-case hex; remembered per path, size and modification time.
-pub(super) fn content_hash(path: &Path) -> std::io::Result<String> {
-    type Known = HashMap<PathBuf, (u64, SystemTime, String)>;
-    static KNOWN: OnceLock<Mutex<Known>> = OnceLock::new();
-    let known = KNOWN.get_or_init(Mutex::default);
-    let meta = std::fs::metadata(path)?;
-    let stamp = (meta.len(), meta.modified()?);
-    if let Ok(known) = known.lock()
-        && let Some((size, time, hash)) = known.get(path)
-        && (*size, *time) == stamp
-    {
-        return Ok(hash.clone());
-    }
-    let mut file = std::fs::File::open(path)?;
-    let (mut digest, mut block) = (Sha256::new(), vec![0u8; 1 << 18]);
-    loop {
-        match file.read(&mut block)? {
-            0 => break,
-            n => digest.update(&block[..n]),
-        }
-    }
-    let hash = hex(&digest.finalize());
-    if let Ok(mut known) = known.lock() {
-        known.insert(path.to_path_buf(), (stamp.0, stamp.1, hash.clone()));
-    }
-    Ok(hash)
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().fold(String::new(), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}");
-        text
-    })
-}
-
-/// sha256 of some bytes in lower-case hex.
-pub(super) fn sha256(bytes: &[u8]) -> String {
-    hex(&Sha256::digest(bytes))
 }
 
 #[cfg(test)]

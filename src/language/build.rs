@@ -5,12 +5,13 @@ use super::codebook::{self, Built, CodeEntry, autoencoder, quantise};
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, LanguageField, LevelField, Plane};
 use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
 
 /// How embeddings become the short codes that splats carry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Reducer {
-    /// One code per distinct embedding, bound to it (ALGORITHMS 6).
+    /// One code per distinct embedding, bound to it (docs/method.md#codebook).
     Bijection,
     /// A scene autoencoder to three dimensions and back, as LangSplat; `feature_dim` is then 3.
     Autoencoder {
@@ -38,7 +39,8 @@ pub struct BuildOptions {
 
 impl Default for BuildOptions {
     fn default() -> Self {
-        // 16: codes of up to 200 things stay ghost-free at borders, where 3 gives 95 % ghosts (ALGORITHMS 6.2)
+        // 16: codes of up to 200 things stay ghost-free at borders, where 3 gives 95 % ghosts
+        // (docs/method.md#code-length)
         BuildOptions {
             align: AlignOptions::default(),
             reducer: Reducer::Bijection,
@@ -50,7 +52,7 @@ impl Default for BuildOptions {
 }
 
 /// What [`build`] produces.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Language {
     /// Codebooks and training targets; splat features are empty until training fills them.
     pub field: LanguageField,

@@ -3,6 +3,7 @@
 //! [`dir`] or [`graph`] give masks, a [`crate::infer::RegionEncoder`] or `dir` their features, [`matcher`] the dense
 //! matches between views; [`build()`] aligns everything and turns it into codebooks and training targets.
 use crate::scene::Plane;
+use serde::{Deserialize, Serialize};
 
 pub mod align;
 mod build;
@@ -15,7 +16,7 @@ pub mod sam;
 pub use build::{BuildOptions, Language, Reducer, attach_features, build};
 
 /// The label map of one level of one view.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct LevelMasks {
     /// [H, W] mask index, −1 = hole.
     pub labels: Plane<i32>,
@@ -26,7 +27,7 @@ pub struct LevelMasks {
 }
 
 /// The masks of one view, index as in [`crate::scene::LEVEL_NAMES`].
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct ViewMasks {
     /// Three levels.
     pub levels: Vec<LevelMasks>,

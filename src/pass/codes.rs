@@ -1,5 +1,5 @@
-//! The language loss: L1 between rendered features and the code of each labelled pixel (ALGORITHMS 8.1), and the upstream
-//! that lifts codes onto splats (8.4).
+//! The language loss: L1 between rendered features and the code of each labelled pixel (docs/method.md#language-loss),
+//! and the upstream that lifts codes onto splats (docs/method.md#lifting).
 use super::rasterizer::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 

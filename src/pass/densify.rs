@@ -43,6 +43,16 @@ impl GradientStats {
         Ok(())
     }
 
+    /// [N, 2] sums and numbers of views.
+    pub fn values(&self) -> Result<Vec<f32>> {
+        self.stats.read_range::<f32>(0..2 * self.count)
+    }
+
+    /// Goes on from [`GradientStats::values`] of as many splats.
+    pub fn restore(&mut self, values: &[f32]) -> Result<()> {
+        self.stats.write(values)
+    }
+
     /// [N] mean over the views that saw each splat, 0 where none did.
     pub fn mean(&self) -> Result<Vec<f32>> {
         let stats = self.stats.read_range::<[f32; 2]>(0..self.count)?;

@@ -1,9 +1,9 @@
-//! Projection of splats to the screen (EWA, Zwicker et al. 2002; Kerbl et al. 2023, ALGORITHMS 7.4).
+//! Projection of splats to the screen (EWA, Zwicker et al. 2002; Kerbl et al. 2023, docs/method.md#projection).
 //!
 //! Per splat, with R_q of the unit quaternion, s = exp(log scale):
 //! `t = R μ + τ`, `M = R_q diag(s)`, `B = J R M` (2×3), `Σ' = B Bᵀ + 0.3 I`, `(A, B, C) = Σ'⁻¹`,
 //! `u = fx t_x/t_z + cx − ½`, colour = max(0, Σ_k B_k(dir) sh_k + ½), opacity = σ(logit).
-//! J is evaluated at t_x/t_z clamped to the image border plus 30 %, so that splats far outside do not explode.
+//! J is evaluated at t_x/t_z clamped to the image border plus 30 % of the half width, so that splats far outside do not explode.
 use super::rasterizer::{FrameBuffers, SplatBuffers};
 use super::sh;
 use super::twin::{FeatureMode, Params};
@@ -163,7 +163,7 @@ pub(super) fn raw_colour(params: &Params, i: usize, view: &View) -> DVec3 {
     params.sh_of(i).iter().zip(basis).map(|(&c, b)| c * b).sum()
 }
 
-/// Raw features [N, d] → rendered ones (ALGORITHMS 8.4).
+/// Raw features [N, d] → rendered ones (docs/method.md#feature-gauge).
 pub fn features_twin(features: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
     match mode {
         FeatureMode::Linear => features.to_vec(),

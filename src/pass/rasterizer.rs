@@ -159,12 +159,12 @@ pub struct RasterOptions {
     pub sh_degree: u32,
     /// From stored to rendered features.
     pub feature_mode: FeatureMode,
-    /// Whether the loss on the features reaches means, scales, rotations and opacities (`--sem-detach-geometry` = false).
+    /// Whether the loss on the features reaches means, scales, rotations and opacities.
     pub features_move_geometry: bool,
 }
 
 impl Default for RasterOptions {
-    /// Degree 0; ε = 1e-3 as ALGORITHMS 8.4.
+    /// Degree 0; ε = 1e-3 as in docs/method.md#feature-gauge.
     fn default() -> Self {
         RasterOptions {
             sh_degree: 0,

@@ -7,7 +7,8 @@ use crate::gpu::Device;
 use crate::scene::{Camera, Plane, RgbImage, Splats};
 use crate::{Error, Result};
 
-/// Alpha from which a pixel has a depth: below, Σ w z says little about any surface (ALGORITHMS 7.4).
+/// Alpha from which a pixel has a depth: below, Σ w z says little about any surface
+/// (docs/method.md#forward-rasterisation).
 pub const DEPTH_ALPHA_MIN: f32 = 0.5;
 
 /// One rendered view.

@@ -8,6 +8,7 @@ use super::bands::{Band, Bands};
 use super::sum;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
+use serde::{Deserialize, Serialize};
 
 /// Taps of the SSIM window.
 pub const WINDOW: usize = 11;
@@ -18,7 +19,7 @@ const C1: f64 = 1e-4; // (0.01)², Wang et al. 2004
 const C2: f64 = 9e-4; // (0.03)²
 
 /// The two parts of the image loss before weighting.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ImageLoss {
     /// Mean absolute difference.
     pub l1: f64,

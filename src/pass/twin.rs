@@ -8,7 +8,7 @@ use super::view::View;
 use crate::scene::{Splats, sh_coefficients};
 use glam::{DVec3, DVec4};
 
-/// How stored features become rendered ones (ALGORITHMS 8.4).
+/// How stored features become rendered ones (docs/method.md#feature-gauge).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FeatureMode {
     /// f̂ = f / (‖f‖ + ε), the parameterisation of the paper, for each of several blocks of equal length (one per level).

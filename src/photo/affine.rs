@@ -1,8 +1,9 @@
 //! Where a pixel goes when an image is resized, cropped or padded.
 use crate::scene::Camera;
+use serde::{Deserialize, Serialize};
 
-/// Axis-aligned affine map of pixel positions, `u' = s·u + o` per axis (ALGORITHMS 0.4).
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// Axis-aligned affine map of pixel positions, `u' = s·u + o` per axis (docs/method.md#pixel-maps).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Affine {
     /// Scale along x and y.
     pub scale: [f64; 2],

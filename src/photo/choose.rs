@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 /// Largest number of views: the pair count grows with its square, and the method is made for a few photos.
 pub const MOST_VIEWS: usize = 16;
 
-/// Views used when more photos are given and `--views` is not (ALGORITHMS 0.6).
+/// Views used when more photos are given and `--views` is not (docs/method.md#choice-of-photos).
 pub const DEFAULT_VIEWS: usize = 4;
 
 /// The photos behind the inputs and what was left out of the folders.
@@ -85,7 +85,8 @@ fn list(folder: &Path, found: &mut Found) -> Result<()> {
     Ok(())
 }
 
-/// Indices of `views` of `count` frames: `linspace(0, count − 1, views)` truncated to whole numbers (ALGORITHMS 0.6).
+/// Indices of `views` of `count` frames: `linspace(0, count − 1, views)` truncated to whole numbers
+/// (docs/method.md#choice-of-photos).
 pub fn spread(count: usize, views: usize) -> Vec<usize> {
     (0..views).map(|i| if views > 1 { i * (count - 1) / (views - 1) } else { 0 }).collect()
 }

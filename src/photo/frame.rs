@@ -1,9 +1,10 @@
 //! Plain frames around photos: scans, rectified and letterboxed pictures. They stand still while the scene moves, so they
 //! are neither matched nor learned: their pixels continue the picture instead.
 use crate::scene::RgbImage;
+use serde::{Deserialize, Serialize};
 
 /// Lines that belong to the frame on each side, pixels.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Frame {
     /// Columns on the left.
     pub left: usize,

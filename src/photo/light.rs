@@ -1,11 +1,11 @@
 //! What one photo's exposure, white balance and lens do to the scene's light, and how to take it out.
 use crate::scene::{RgbImage, to_linear, to_srgb};
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// A photo shows `gain[c] · exp(falloff[0] r² + falloff[1] r⁴)` times the scene's light, in linear light; r is the
 /// distance from the image centre in half diagonals, 1 in the corners.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Light {
     /// Per channel; 1 = the scene's light.
     pub gain: [f64; 3],

@@ -1,4 +1,4 @@
-//! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (ALGORITHMS 0.4, 1.1, 1.2).
+//! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (docs/method.md#photos).
 mod affine;
 mod candidate;
 mod choose;
@@ -27,6 +27,7 @@ use crate::scene::{Camera, Lens, Plane, RgbImage};
 use crate::{Error, Result};
 use glam::DVec2;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -60,7 +61,7 @@ pub fn default_max_size(is_cpu: bool) -> usize {
 pub const SMALLEST_SIDE: usize = 64;
 
 /// One decoded photo at working resolution, upright.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Photo {
     /// Where it was read from.
     pub path: PathBuf,
@@ -77,6 +78,7 @@ pub struct Photo {
     /// Focal length from EXIF in working pixels, if the file tells.
     pub exif_focal: Option<f64>,
     /// Luma of the photo at more pixels than the working image has, for measuring positions; where there are more.
+    #[serde(skip)]
     pub fine: Option<Arc<Plane<f32>>>,
     /// The lens that was taken out of the image.
     pub straightened: Option<Straightening>,

@@ -2,9 +2,10 @@
 use crate::scene::{Lens, Plane, RgbImage};
 use glam::DVec2;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 /// A lens and the pinhole that remains when it is taken out of a picture: same size, focal length and principal point.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Straightening {
     /// What is taken out.
     pub lens: Lens,

@@ -79,7 +79,8 @@ pub fn dense(
     Ok(Geometry { cameras, depths, points, focal_log_sigma, fitted, method })
 }
 
-/// Photos to cameras, depth maps and points (ALGORITHMS 2.6); the photos come back as the later stages are to see them.
+/// Photos to cameras, depth maps and points (docs/method.md#geometry); the photos come back as the later stages are to
+/// see them.
 pub fn initialise(
     device: &Device,
     photos: Vec<Photo>,

@@ -23,9 +23,10 @@ pub use matching::Features;
 
 use crate::scene::{Camera, DepthMap, Lens, PointCloud};
 use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
 
-/// What every geometry initialiser returns (ALGORITHMS 2.6). World frame: camera 0 of the run, OpenCV axes.
-#[derive(Clone, Debug, Default)]
+/// What every geometry initialiser returns (docs/method.md#geometry). World frame: camera 0 of the run, OpenCV axes.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Geometry {
     /// One per photo, at the photo's working resolution.
     pub cameras: Vec<Camera>,
@@ -42,7 +43,7 @@ pub struct Geometry {
 }
 
 /// A triangulated point and where the photos show it.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SparsePoint {
     /// World units.
     pub position: DVec3,
@@ -53,7 +54,7 @@ pub struct SparsePoint {
 }
 
 /// What the photos told of the optics of one of them.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Fitted {
     /// Its lens.
     pub lens: Lens,
@@ -69,7 +70,7 @@ pub struct Fitted {
 
 /// Cameras and the sparse points that fix them. World frame: camera 0; unit: the median depth of the points is
 /// 1 where it is free, that of the given cameras otherwise.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct SparseModel {
     /// One per photo, at the photo's working resolution.
     pub cameras: Vec<Camera>,

@@ -1,4 +1,4 @@
-//! Smoothing and the LERF mask (ALGORITHMS 9.2, 9.3).
+//! Smoothing and the LERF mask (docs/method.md#smoothing, docs/method.md#lerf-ovs).
 use crate::scene::Plane;
 use rayon::prelude::*;
 

@@ -70,7 +70,7 @@ impl Method {
     }
 }
 
-/// Codes of up to 200 things stay apart at borders; with 3 numbers they do not (ALGORITHMS 6.2).
+/// Codes of up to 200 things stay apart at borders; with 3 numbers they do not (docs/method.md#code-length).
 pub const FEATURE_DIM: usize = 16;
 
 /// LangSplat trains on the masks of hundreds of photos; 100 epochs of those of a few photos would leave it half trained.

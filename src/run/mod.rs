@@ -1,9 +1,9 @@
 //! The whole pipeline on one page: photos → cameras, depth and points → splats → language → scene directory.
 pub mod ask;
 pub mod budget;
-mod describe;
 pub mod encoder;
 mod light;
+mod list;
 pub mod live;
 mod method;
 mod networks;
@@ -11,32 +11,32 @@ mod record;
 pub mod refine;
 pub mod score;
 pub mod sources;
+mod stages;
 pub mod train;
 pub mod view;
 
 pub use method::{AUTOENCODER, FEATURE_DIM, Method, Recipe};
 pub use record::{closing_table, run_record};
 
+use crate::Result;
 use crate::fit::{self, LanguageOptions, Preset, RgbOptions};
+use crate::format::Workspace;
 use crate::format::scene_dir::{self, Contents};
-use crate::format::{Workspace, cameras};
 use crate::gpu::{self, Device};
-use crate::infer::{Registry, provider};
+use crate::infer::{Registry, home, provider};
 use crate::language;
 use crate::language::sam::SamOptions;
 use crate::photo::{self, Photo};
-use crate::pose::stereo::StereoOptions;
-use crate::pose::{self, Geometry, Placed, SparseModel};
+use crate::pipeline::{Graph, Store};
+use crate::pose::{self, Geometry};
 use crate::progress::{Progress, Recorded, StageRecord};
-use crate::query::{Highlight, QueryOptions, QueryResult};
+use crate::query::{Highlight, QueryResult};
 use crate::report::ModelUsed;
 use crate::report::viewer::{Names, ShownAnswer};
-use crate::scene::{Camera, LanguageField, RgbImage, Splats};
-use crate::{Error, Result};
-use describe::{Described, Describer, both};
+use crate::scene::{Camera, LanguageField, Splats};
 use networks::Networks;
 use std::path::{Path, PathBuf};
-use std::sync::{OnceLock, mpsc};
+use std::time::Duration;
 use view::DecodedFrame;
 
 /// Where cameras and points come from.
@@ -94,6 +94,10 @@ pub struct RunPlan {
     pub out: PathBuf,
     /// Replace an existing scene.
     pub force: bool,
+    /// Use the stages that an earlier run with the same photos and settings has finished.
+    pub resume: bool,
+    /// Seconds between states of training on disk.
+    pub checkpoint_seconds: u64,
     /// `None` = draft on a CPU device, default elsewhere.
     pub preset: Option<Preset>,
     /// Cameras and points.
@@ -138,6 +142,8 @@ impl Default for RunPlan {
             views: None,
             out: PathBuf::new(),
             force: false,
+            resume: false,
+            checkpoint_seconds: CHECKPOINT_SECONDS,
             preset: None,
             init: InitSource::Sfm,
             matcher: MatchSource::Xfeat,
@@ -244,7 +250,8 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     let (chosen, choice) = pose::choose::photos(&plan.inputs, plan.views, progress)?;
     budget(plan, &device, &photo::sizes_of(&chosen), max_size)?;
     let photos = photo::load_each(&chosen, max_size, progress)?;
-    let outcome = Outcome { choice, ..work(plan, &device, photos, progress)? };
+    let store = store(plan.resume, plan.checkpoint_seconds);
+    let outcome = Outcome { choice, ..work(plan, &device, photos, &store, progress)? };
     write(workspace, &outcome, progress)?;
     Ok(outcome)
 }
@@ -260,7 +267,7 @@ pub fn reconstruct(
     photo::check_set(&photos)?;
     let sizes: Vec<_> = photos.iter().map(|p| (p.image.width, p.image.height)).collect();
     budget(plan, device, &sizes, usize::MAX)?;
-    work(plan, device, photos, &Recorded::new(progress))
+    work(plan, device, photos, &Store::none(), &Recorded::new(progress))
 }
 
 /// Writes what [`reconstruct`] made as a scene directory, whole or not at all; `force` replaces a scene.
@@ -270,99 +277,41 @@ pub fn save(outcome: &mut Outcome, out: &Path, force: bool, progress: &dyn Progr
     write(workspace, outcome, progress)
 }
 
-fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded) -> Result<Outcome> {
+fn work(
+    plan: &RunPlan,
+    device: &Device,
+    photos: Vec<Photo>,
+    store: &Store,
+    progress: &Recorded,
+) -> Result<Outcome> {
     let registry = Registry::open(plan.models.as_deref())?;
     // Whatever can be refused is read before the long work, not after it.
     provider::report(progress)?;
     let networks = Networks::of(plan, &registry)?;
     networks.warn_untrained(progress);
-    let known = match &plan.init {
-        InitSource::Sfm | InitSource::Network(_) => None,
-        InitSource::Cameras(file) => Some(cameras::read(file)?),
-        InitSource::Given(cameras) => Some(cameras.clone()),
-    };
-    let given = sources::given_masks(&plan.masks, &plan.features, &photos)?;
-    let encoder = sources::encoder(&plan.features, &registry)?;
-
+    sources::given_masks(&plan.masks, &plan.features, &photos)?;
     let preset = preset_of(plan, device);
-    let start = match &networks.geometry {
-        Some(model) => networks::geometry_of(model, &photos, progress)?,
-        None => None,
-    };
-    // Placed photos are without lens distortion and in one light: what comes after sees them so.
-    let (photos, start) = match start {
-        Some(geometry) => (photos, Start::Geometry(geometry)),
-        None => {
-            let Placed { photos, model, method } =
-                pose::place(photos, known.as_deref(), &registry, progress)?;
-            (photos, Start::Cameras(model, method))
-        }
-    };
-    // Masks from a folder belong to the photos as they were read.
-    let given = match photos.iter().any(|p| p.straightened.is_some()) {
-        true => sources::given_masks(&plan.masks, &plan.features, &photos)?,
-        false => given,
-    };
-    let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
-    let describer = Describer {
-        plan,
-        photos: &photos,
-        images: &images,
-        registry: &registry,
-        networks: &networks,
-        given,
-        encoder,
-    };
-    let stereo = StereoOptions::preset(preset);
-    let reconstruct = || match start {
-        Start::Geometry(geometry) => Ok(geometry),
-        Start::Cameras(model, method) => pose::dense(device, &photos, model, method, &stereo, progress),
-    };
-    let train = |geometry: &Geometry| {
-        fit::train_rgb(
-            device,
-            &images,
-            &geometry.cameras,
-            &geometry.points,
-            Some(&geometry.depths),
-            &rgb_options(plan, preset, device, images.len()),
-            progress,
-        )
-    };
-    let (geometry, trained, described) = side_by_side(reconstruct, train, describer, progress)?;
-    let Described { queries, language: built, names } = described;
-    let spoken = plan.recipe().speak(
-        device,
-        &images,
-        &trained.cameras,
-        &trained.splats,
-        built.field,
-        language_options(plan, preset),
-        progress,
-    )?;
+    let mut graph = Graph::default();
+    let scene = list::scene(&mut graph, plan, preset, device, photos, &networks, &registry)?;
+    let mut made = graph.run(&scene.targets(), device, &registry, store, progress)?;
     provider::report(progress)?;
-
-    progress.begin("query", 1);
-    let frames = view::decode_all(device, &spoken.splats, &spoken.field, &trained.cameras)?;
-    let answer = |query| ask::answers(&frames, &spoken.field, query, &QueryOptions::default());
-    let answers = queries.iter().map(answer).collect::<Result<Vec<_>>>()?;
-    progress.end();
+    let (trained, language) = (made.take(scene.trained)?, made.take(scene.language)?);
     Ok(Outcome {
         plan: plan.clone(),
         preset,
         device: device.info().clone(),
         choice: None,
-        photos,
-        geometry,
+        photos: made.take(scene.placed)?.photos,
+        geometry: made.take(scene.geometry)?,
         cameras: trained.cameras,
-        splats: spoken.splats,
+        splats: language.splats,
         rgb: trained.stats,
-        field: spoken.field,
-        alignment: built.alignment,
-        language_curve: spoken.curve,
-        frames,
-        answers,
-        names,
+        field: language.field,
+        alignment: made.take(scene.aligned)?.alignment,
+        language_curve: language.curve,
+        frames: made.take(scene.frames)?,
+        answers: made.take(scene.answers)?,
+        names: made.take(scene.names)?,
         models: registry.status(),
         networks: networks.used()?,
         stages: progress.stages(),
@@ -371,47 +320,17 @@ fn work(plan: &RunPlan, device: &Device, photos: Vec<Photo>, progress: &Recorded
     })
 }
 
-/// What is known of the cameras before the two lanes part.
-enum Start {
-    /// Cameras and sparse points, and how they were found; depth is still to come.
-    Cameras(SparseModel, String),
-    /// All of it, from a network.
-    Geometry(Geometry),
+/// Training states are some ten megabytes for scenes of a few photos: written in a fraction of a second.
+pub const CHECKPOINT_SECONDS: u64 = 30;
+
+/// What stages made, on disk.
+fn store(resume: bool, checkpoint_seconds: u64) -> Store {
+    Store::at(stage_folder(), resume, Duration::from_secs(checkpoint_seconds))
 }
 
-/// Geometry and splats on this thread; masks, features and alignment beside them on another. The first error stops both.
-fn side_by_side(
-    reconstruct: impl FnOnce() -> Result<Geometry>,
-    train: impl FnOnce(&Geometry) -> Result<fit::Trained>,
-    describer: Describer,
-    progress: &Recorded,
-) -> Result<(Geometry, fit::Trained, Described)> {
-    let geometry = OnceLock::new();
-    let (ready, wait) = mpsc::channel();
-    let ended = || Error::Cancelled;
-    let (trained, described) = std::thread::scope(|scope| {
-        let beside = progress.beside();
-        let geometry = &geometry;
-        let other = scope.spawn(move || {
-            let known = || wait.recv().ok().and_then(|()| geometry.get()).ok_or_else(ended);
-            describer.run(known, beside.as_ref()).inspect_err(|_| progress.stop())
-        });
-        let front = reconstruct().and_then(|found| {
-            let found = geometry.get_or_init(|| found);
-            // The receiver is gone only when the other lane has failed, which the training then notices.
-            let _ = ready.send(());
-            train(found)
-        });
-        drop(ready);
-        if front.is_err() {
-            progress.stop();
-        }
-        // A panic over there goes on here, as if there had been one thread.
-        let described = other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
-        both(front, described)
-    })?;
-    let geometry = geometry.into_inner().ok_or_else(ended)?;
-    Ok((geometry, trained, described))
+/// Where runs keep what their stages made.
+pub fn stage_folder() -> PathBuf {
+    home().join("stages")
 }
 
 impl RunPlan {

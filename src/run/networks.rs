@@ -1,12 +1,10 @@
 //! The networks that users bring, as a run uses them: found before any work, named in run.json.
 use super::{FeatureSource, InitSource, MaskSource, MatchSource, RunPlan};
+use crate::Result;
+use crate::infer::Registry;
 use crate::infer::installed::{Duty, Installed};
-use crate::infer::{Registry, pairs};
-use crate::photo::Photo;
-use crate::pose::{Geometry, pointmap};
 use crate::progress::Progress;
 use crate::report::ModelUsed;
-use crate::{Error, Result};
 
 /// The networks that a plan asks for.
 pub(super) struct Networks {
@@ -71,27 +69,5 @@ impl Networks {
                 names.join(", ")
             ));
         }
-    }
-}
-
-/// Cameras and depth from a network's pointmaps; `None` where untrained weights give no geometry: then the photos
-/// themselves must.
-pub(super) fn geometry_of(
-    model: &Installed,
-    photos: &[Photo],
-    progress: &dyn Progress,
-) -> Result<Option<Geometry>> {
-    let (views, maps) = pairs::pointmaps(model, photos, progress)?;
-    match pointmap::reconstruct(&views, &maps, progress) {
-        Err(Error::Cancelled) => Err(Error::Cancelled),
-        Err(error) if model.untrained() => {
-            progress.warn(&format!(
-                "{}: no geometry in untrained pointmaps ({error}); cameras from sfm",
-                model.name
-            ));
-            Ok(None)
-        }
-        Ok(geometry) => Ok(Some(Geometry { method: format!("{} pointmaps", model.name), ..geometry })),
-        Err(error) => Err(error),
     }
 }

@@ -167,13 +167,16 @@ fn answer_json(a: &Answers) -> serde_json::Value {
 /// Figures for the head of the report and the closing table: (label, value).
 fn figures(o: &Outcome) -> Vec<(String, String)> {
     let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
+    // Which, and why, is said when they are chosen, and in run.json.
+    let chosen = o.choice.as_ref().map_or(String::new(), |c| {
+        format!("; {} chosen of {}", c.used.len(), c.used.len() + c.left_out.len())
+    });
     let mut list = vec![
         ("device".to_owned(), format!("{}{cpu}", o.device.name)),
-        ("photos".to_owned(), sizes(&o.photos)),
+        ("photos".to_owned(), sizes(&o.photos) + &chosen),
         ("splats".to_owned(), o.splats.len().to_string()),
         ("train PSNR".to_owned(), format!("{:.2} dB", o.rgb.mean_psnr())),
     ];
-    list.extend(o.choice.as_ref().map(|c| ("choice".to_owned(), c.message())));
     list.extend(
         focal_figure(&o.photos, &o.cameras, &o.geometry.fitted).map(|text| ("focal length".to_owned(), text)),
     );

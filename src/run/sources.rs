@@ -1,5 +1,6 @@
 //! Masks, features and text embeddings from wherever the plan says they come from.
 use super::{FeatureSource, MaskSource};
+use crate::files::content_hash;
 use crate::infer::clip::Clip;
 use crate::infer::hed::Hed;
 use crate::infer::installed::{Duty, Installed};
@@ -84,6 +85,20 @@ pub fn encoder(source: &FeatureSource, registry: &Registry) -> Result<Box<dyn Re
         FeatureSource::Words => Ok(Box::new(RegionWords::load(registry.clone())?)),
         FeatureSource::Dir(dir) => table(&dir.join(TEXT_TABLE)),
         FeatureSource::Network(name) => Ok(Box::new(Clip::load(registry.installed(Duty::Features, name)?)?)),
+    }
+}
+
+/// What [`encoder`] loads: checksums of the models; those of the default pack are part of the program.
+pub fn encoder_identity(source: &FeatureSource, registry: &Registry) -> Result<String> {
+    match source {
+        FeatureSource::Words => Ok("words".to_owned()),
+        FeatureSource::Dir(dir) => {
+            let file = dir.join(TEXT_TABLE);
+            content_hash(&file).map_err(Error::io(&file))
+        }
+        FeatureSource::Network(name) => {
+            Ok(format!("{:?}", registry.installed(Duty::Features, name)?.files()?))
+        }
     }
 }
 

@@ -1,17 +1,18 @@
 //! Posed photos → scene without language: `splatvk train`.
-use crate::fit::{self, Preset, RgbOptions};
+use crate::fit::{Preset, RgbOptions};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras, colmap, ply};
 use crate::gpu::{self, Device};
 use crate::infer::{Registry, provider};
 use crate::photo::{self, Candidate, Photo};
-use crate::pose::stereo::StereoOptions;
-use crate::pose::{self, Geometry, InitChoice};
+use crate::pipeline::Graph;
+use crate::pose::Geometry;
 use crate::progress::{Progress, Recorded};
 use crate::report::{self, Report, RunRecord, ViewShown};
 use crate::run::budget::{self, Limits, Work};
+use crate::run::stages::{self, CameraSource};
 use crate::run::view::Viewer;
-use crate::scene::{Camera, LanguageField, PointCloud, RgbImage};
+use crate::scene::{Camera, LanguageField, PointCloud};
 use crate::{Error, Result};
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -29,6 +30,10 @@ pub struct TrainPlan {
     pub out: PathBuf,
     /// Replace an existing scene.
     pub force: bool,
+    /// Use the stages that an earlier training with the same photos and settings has finished.
+    pub resume: bool,
+    /// Seconds between states of training on disk.
+    pub checkpoint_seconds: u64,
     /// `None` = draft on a CPU device, default elsewhere.
     pub preset: Option<Preset>,
     /// Steps instead of the preset's.
@@ -134,26 +139,25 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let work = |photos| Work::colour(preset, photos);
     let photos = matched(plan, &known, max_size, work, &device, progress)?;
     let registry = Registry::open(plan.models.as_deref())?;
-    let (photos, geometry) = match given {
-        Some(cloud) => {
-            let geometry = from_points(&photos, &known, cloud)?;
-            (photos, geometry)
-        }
-        None => {
-            let (init, stereo) = (InitChoice::Cameras(known), StereoOptions::preset(preset));
-            pose::initialise(&device, photos, &init, &registry, &stereo, progress)?
-        }
+    let source = match given {
+        Some(cloud) => CameraSource::Complete(from_points(&photos, &known, cloud)?),
+        None => CameraSource::Known(known),
     };
-    let images: Vec<RgbImage> = photos.iter().map(|p| p.image.clone()).collect();
     let mut options = RgbOptions::preset(preset);
     options.limit_splats(budget::most_splats(device.info(), 0), work(photos.len()).splats);
     options.seed = plan.seed;
     if let Some(n) = plan.iterations {
         options = options.with_iterations(n);
     }
-    let depths = (!geometry.depths.is_empty()).then_some(geometry.depths.as_slice());
-    let trained =
-        fit::train_rgb(&device, &images, &geometry.cameras, &geometry.points, depths, &options, progress)?;
+    let mut graph = Graph::default();
+    let placed = graph.add(stages::Cameras::new(photos, source)?, ());
+    let geometry = graph.add(stages::Depth { preset }, (placed,));
+    let trained = graph.add(stages::TrainColour { options }, (placed, geometry));
+    let targets = [placed.target(), geometry.target(), trained.target()];
+    let store = super::store(plan.resume, plan.checkpoint_seconds);
+    let mut made = graph.run(&targets, &device, &registry, &store, progress)?;
+    let (photos, geometry) = (made.take(placed)?.photos, made.take(geometry)?);
+    let trained = made.take(trained)?;
 
     progress.begin("write", 1);
     let nothing = LanguageField::default();
@@ -218,7 +222,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
             title: &title,
             splats: &trained.splats,
             cameras: &trained.cameras,
-            photos: images.iter().collect(),
+            photos: photos.iter().map(|p| &p.image).collect(),
             language: None,
             names: &Vec::new(),
             answers: Vec::new(),

@@ -1,7 +1,8 @@
 //! Images and per-pixel maps.
+use serde::{Deserialize, Serialize};
 
 /// A row-major map of one value per pixel, `data[y * width + x]`.
-#[derive(Clone, Debug, PartialEq, Default)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct Plane<T> {
     /// Pixels.
     pub width: usize,
@@ -26,7 +27,7 @@ impl<T: Copy> Plane<T> {
 }
 
 /// An RGB image: `[H, W, 3]` in [0, 1].
-#[derive(Clone, Debug, PartialEq, Default)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct RgbImage {
     /// Pixels.
     pub width: usize,
@@ -49,7 +50,7 @@ impl RgbImage {
 }
 
 /// Depth (camera z, world units, 0 = unknown) and confidence of one view, at the photo's working resolution.
-#[derive(Clone, Debug, PartialEq, Default)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct DepthMap {
     /// [H, W] camera z; 0 = unknown.
     pub depth: Plane<f32>,

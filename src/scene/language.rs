@@ -1,11 +1,13 @@
 //! What the scene knows about words: per-level features on the splats and the codebook that gives them meaning.
 use super::Plane;
+use serde::{Deserialize, Serialize};
 
 /// Level names, finest first: subpart, part, whole (internal level index 0, 1, 2).
 pub const LEVEL_NAMES: [&str; 3] = ["s", "m", "l"];
 
-/// The bijection of one level: K distinct unit vectors of the text/image space and their unit codes (ALGORITHMS 6).
-#[derive(Clone, Debug, PartialEq, Default)]
+/// The bijection of one level: K distinct unit vectors of the text/image space and their unit codes
+/// (docs/method.md#codebook).
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct Codebook {
     /// Width D of the embedding space (512 for CLIP B/16).
     pub embedding_dim: usize,
@@ -35,7 +37,7 @@ impl Codebook {
 }
 
 /// One level of the language field.
-#[derive(Clone, Debug, PartialEq, Default)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct LevelField {
     /// The bijection.
     pub codebook: Codebook,
@@ -46,7 +48,7 @@ pub struct LevelField {
 }
 
 /// All levels (index as in [`LEVEL_NAMES`]); a level without masks has an empty codebook.
-#[derive(Clone, Debug, PartialEq, Default)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct LanguageField {
     /// Three levels.
     pub levels: Vec<LevelField>,

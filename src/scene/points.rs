@@ -1,7 +1,8 @@
 //! Coloured points, as geometry initialisers produce them.
+use serde::{Deserialize, Serialize};
 
 /// Structure of arrays; all vectors have the same length N.
-#[derive(Clone, Debug, PartialEq, Default)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct PointCloud {
     /// [N, 3] world units, OpenCV axes.
     pub positions: Vec<[f32; 3]>,

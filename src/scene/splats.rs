@@ -1,4 +1,5 @@
 //! The Gaussians of a scene, as raw (pre-activation) parameters.
+use serde::{Deserialize, Serialize};
 
 /// Number of spherical-harmonics coefficients per channel at a degree 0–3.
 pub const fn sh_coefficients(degree: u32) -> usize {
@@ -6,7 +7,7 @@ pub const fn sh_coefficients(degree: u32) -> usize {
 }
 
 /// Structure of arrays of N Gaussians (Kerbl et al. 2023), raw parameters as 3DGS files store them.
-#[derive(Clone, Debug, PartialEq, Default)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct Splats {
     /// [N, 3] world units, OpenCV axes.
     pub means: Vec<[f32; 3]>,

@@ -114,8 +114,8 @@ pub fn rendered(raster: &Rasterizer) -> Rendered {
     }
 }
 
-/// Image bound of ALGORITHMS 7.8. A contribution at the α threshold of 1/255 may be counted by one side and not by
-/// the other, which is worth up to 1/255 of a channel value; at most 2 pixels in 10 000 may show that.
+/// Image bound of docs/method.md#tolerances. A contribution at the α threshold of 1/255 may be counted by one side and
+/// not by the other, which is worth up to 1/255 of a channel value; at most 2 pixels in 10 000 may show that.
 pub const IMAGE: Tolerance =
     Tolerance { relative_l2: 1e-4, absolute: 1e-4, relative: 1e-5, outliers: 2e-4, outlier_factor: 200.0 };
 

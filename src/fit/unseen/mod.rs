@@ -140,8 +140,8 @@ fn push(splats: &mut Splats, c: &Candidate) {
     let y = normal.cross(x);
     let q = DQuat::from_mat3(&DMat3::from_cols(x, y, normal));
     let (sx, sy) = (OVERLAP * long.length(), OVERLAP * short.dot(y).abs());
-    // A tenth of the short side keeps the splat visible from a grazing camera and below the needle limit of 8 ... 10.
-    let sizes = [sx, sy.max(sx / 8.0), (0.1 * sy).max(sx / 8.0)];
+    // An eighth of the long side keeps the splat visible from a grazing camera and below the needle limit of 8 ... 10.
+    let sizes = [sx, sy.max(sx / 8.0), sx / 8.0];
     splats.means.push(c.position.as_vec3().into());
     splats.log_scales.push(sizes.map(|s| s.max(1e-12).ln() as f32));
     splats.quats.push([q.w as f32, q.x as f32, q.y as f32, q.z as f32]);

@@ -1,10 +1,11 @@
-//! Accepted edges → things (ALGORITHMS 5.6).
+//! Accepted edges → things (docs/method.md#components).
 use super::Edge;
 use super::score::LevelState;
+use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// One thing of the scene: masks of different views that show it.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Component {
     /// (view, mask), ascending.
     pub members: Vec<(u32, u32)>,

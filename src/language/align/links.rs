@@ -1,23 +1,26 @@
-//! Pixel correspondences between two views: from dense matches (5.3) and from depth and poses (5.5).
+//! Pixel correspondences between two views: from dense matches (docs/method.md#pixel-matching) and from depth and poses
+//! (docs/method.md#reprojection).
 use super::super::DenseWarp;
 use crate::scene::{Camera, DepthMap, Plane};
 use glam::DVec2;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 /// No correspondence.
 const NONE: u32 = u32::MAX;
 
-/// RoMa's probability above which a match counts (ALGORITHMS 0.6).
+/// RoMa's probability above which a match counts (docs/method.md#pixel-matching).
 const MIN_CERTAINTY: f32 = 0.35;
 
-/// Relative depth difference that occlusion tests and the round trip allow (ALGORITHMS 5.5).
+/// Relative depth difference that occlusion tests and the round trip allow (docs/method.md#reprojection).
 const DEPTH_TOLERANCE: f64 = 0.05;
 
-/// Bilinear depth is used only where its four neighbours lie on one surface: max/min below this (ALGORITHMS 5.5).
+/// Bilinear depth is used only where its four neighbours lie on one surface: max/min below this
+/// (docs/method.md#reprojection).
 const SAME_SURFACE: f32 = 1.06;
 
 /// Where each pixel of one view lands in the other.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Links {
     /// [H·W] pixel index in the other view, `u32::MAX` = none.
     target: Vec<u32>,
@@ -44,7 +47,7 @@ impl Links {
 }
 
 /// Correspondences of one unordered pair of views, both ways.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct PairLinks {
     /// First view.
     pub i: usize,

@@ -1,4 +1,4 @@
-//! Three-step semantic alignment (ALGORITHMS 5): which masks of different views are the same thing.
+//! Three-step semantic alignment (docs/method.md#alignment): which masks of different views are the same thing.
 //!
 //! Step 1 scores mask pairs by dense matches, step 2 fuses masks that one view splits and another keeps whole,
 //! step 3 re-scores by reprojection through depth and poses. Accepted pairs are undirected edges; connected
@@ -16,9 +16,9 @@ pub use links::{PairLinks, links_from_depth, links_from_warps};
 
 use super::ViewMasks;
 use crate::{Error, Result};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
-/// How the share of a target mask is measured (ALGORITHMS 5.2, row 5).
+/// How the share of a target mask is measured (docs/method.md#pixel-matching).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum AreaScore {
@@ -28,7 +28,7 @@ pub enum AreaScore {
     Paper,
 }
 
-/// Thresholds of the alignment; the defaults are those of ALGORITHMS 0.6 and section 5.
+/// Thresholds of the alignment; the defaults are explained in docs/method.md#alignment.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct AlignOptions {
     /// Acceptance threshold of step 1.
@@ -81,7 +81,7 @@ impl AlignOptions {
 }
 
 /// An accepted pair of masks.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Edge {
     /// 1 dense matching, 2 dense matching after fusion, 3 reprojection.
     pub step: u8,
@@ -98,7 +98,7 @@ pub struct Edge {
 }
 
 /// What alignment did on one level, for run.json.
-#[derive(Clone, Debug, Default, Serialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct LevelReport {
     /// Accepted edges, best first.
     pub edges: Vec<Edge>,
@@ -113,7 +113,7 @@ pub struct LevelReport {
 }
 
 /// The outcome: masks with fused labels, and per level the things they form.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Alignment {
     /// The input masks; fused masks carry the smallest id of their set (absorbed ids have no pixel left).
     pub views: Vec<ViewMasks>,

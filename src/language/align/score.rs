@@ -1,4 +1,4 @@
-//! Proposals, fusion and reprojection scores of one level (ALGORITHMS 5.3 to 5.5).
+//! Proposals, fusion and reprojection scores of one level (docs/method.md#alignment).
 use super::super::ViewMasks;
 use super::links::{Links, PairLinks};
 use super::{AlignOptions, AreaScore, Edge};
@@ -44,7 +44,7 @@ impl LevelState {
     pub fn cosine(&self, a: (u32, u32), b: (u32, u32)) -> f64 {
         self.feature(a).iter().zip(self.feature(b)).map(|(x, y)| *x as f64 * *y as f64).sum()
     }
-    /// Weight of a mask in its component: pixels times quality (ALGORITHMS 5.6).
+    /// Weight of a mask in its component: pixels times quality (docs/method.md#components).
     pub fn weight(&self, (view, mask): (u32, u32)) -> f64 {
         self.areas[view as usize][mask as usize] as f64 * self.quality[view as usize][mask as usize] as f64
     }
@@ -129,7 +129,7 @@ fn edge(
     Edge { step, from, to, area, lang, score: options.lambda * lang + (1.0 - options.lambda) * area }
 }
 
-/// Step 1 (5.3): every mask proposes the mask that most of its matches fall into.
+/// Step 1 (docs/method.md#pixel-matching): every mask proposes the mask that most of its matches fall into.
 pub(super) fn match_proposals(
     state: &LevelState,
     pairs: &[PairLinks],
@@ -178,7 +178,7 @@ struct FusionSet {
     coverage: f64,
 }
 
-/// Step 2 (5.4): relabels every fusion set to its smallest id; returns (view, kept, absorbed).
+/// Step 2 (docs/method.md#mask-fusion): relabels every fusion set to its smallest id; returns (view, kept, absorbed).
 pub(super) fn fuse(
     state: &mut LevelState,
     pairs: &[PairLinks],
@@ -203,7 +203,7 @@ pub(super) fn fuse(
             join(&mut parent[set.view], members[0], m);
         }
         let root = find(&parent[set.view], members[0]);
-        // the fused mask means what the mask that sees it whole means ([P])
+        // the fused mask means what the mask that sees it whole means (docs/method.md#mask-fusion)
         let at = root * target.len();
         state.features[set.view][at..at + target.len()].copy_from_slice(&target);
     }
@@ -279,8 +279,8 @@ fn fusion_sets(state: &LevelState, pairs: &[PairLinks], options: &AlignOptions) 
     sets
 }
 
-/// Step 3 (5.5): mutual best partners through depth and poses; they replace weaker matches from the same source and
-/// delete matches that geometry contradicts.
+/// Step 3 (docs/method.md#reprojection): mutual best partners through depth and poses; they replace weaker matches from
+/// the same source and delete matches that geometry contradicts.
 pub(super) fn add_reprojections(
     table: &mut Table,
     state: &LevelState,

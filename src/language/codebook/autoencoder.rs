@@ -1,5 +1,5 @@
-//! The scene autoencoder of LangSplat (Qin et al. 2024, ALGORITHMS 6.1) as another way to make a codebook, so that a
-//! comparison with the bijection changes nothing else.
+//! The scene autoencoder of LangSplat (Qin et al. 2024, docs/method.md#other-codebooks) as another way to make a
+//! codebook, so that a comparison with the bijection changes nothing else.
 //!
 //! An encoder D → 3 and a decoder 3 → D are trained on the scene's features. Splats carry points of the unit sphere, and a
 //! rendered point means whatever the decoder makes of it. The sphere is tabulated: the codebook is a lattice of

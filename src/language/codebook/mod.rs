@@ -1,4 +1,4 @@
-//! The bijection between embeddings and the short codes that splats carry (ALGORITHMS 6).
+//! The bijection between embeddings and the short codes that splats carry (docs/method.md#codebook).
 pub(super) mod autoencoder;
 mod network;
 mod pca;
@@ -9,13 +9,14 @@ use crate::scene::{Codebook, Plane};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
-/// Embeddings with a larger cosine cannot be told apart by any text query and share a code (ALGORITHMS 6.3, step 1).
+/// Embeddings with a larger cosine cannot be told apart by any text query and share a code
+/// (docs/method.md#code-construction, step 1).
 const SAME_EMBEDDING: f64 = 0.9995;
 
-/// Smallest distance between two codes that the construction accepts (ALGORITHMS 6.3, step 5).
+/// Smallest distance between two codes that the construction accepts (docs/method.md#code-construction, step 5).
 const MIN_CHORD: f32 = 0.02;
 
-/// Pixels less opaque than this show nothing of the scene (ALGORITHMS 6.3, step 6).
+/// Pixels less opaque than this show nothing of the scene (docs/method.md#decoding-codes).
 pub const VOID_ALPHA: f32 = 0.5;
 
 /// One distinct embedding and what stands behind it.

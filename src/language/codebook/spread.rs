@@ -1,4 +1,4 @@
-//! Spreads codes over the sphere so that they stay apart (ALGORITHMS 6.3, step 4).
+//! Spreads codes over the sphere so that they stay apart (docs/method.md#code-construction, step 4).
 use rayon::prelude::*;
 
 /// Gradient steps; the minimum distance no longer grows after about 200 on 50 to 600 codes.

@@ -13,7 +13,7 @@ pub(super) struct Candidate {
     pub runs: Vec<u32>,
 }
 
-/// Logit offset of the stability test [SAM].
+/// Logit offset of the stability test (docs/method.md#masks-from-points).
 const OFFSET: f32 = 1.0;
 
 /// One axis of the enlargement: first source index and the weight of the next one, per target pixel.

@@ -1,5 +1,6 @@
-//! Masks from a network that answers points (ALGORITHMS 3): a grid of points over the photo and over four overlapping crops,
-//! three masks each, one list per level; poor, unstable and doubled ones are dropped and the rest painted into label maps.
+//! Masks from a network that answers points (docs/method.md#masks-from-points): a grid of points over the photo and
+//! over four overlapping crops, three masks each, one list per level; poor, unstable and doubled ones are dropped and
+//! the rest painted into label maps.
 mod bits;
 mod filter;
 mod nms;
@@ -59,7 +60,7 @@ impl Default for SamOptions {
 /// Proposals below these are not kept, so that thresholds can be lowered to them without asking the network again.
 const KEPT: (f32, f32) = (0.5, 0.5);
 
-/// Boxes nearer than this to a crop's border are cut off there, pixels [SAM].
+/// Boxes nearer than this to a crop's border are cut off there, pixels (docs/method.md#masks-from-points).
 const BORDER: i32 = 20;
 
 /// A rectangle of the photo, pixels, ends excluded.
@@ -71,7 +72,7 @@ struct Crop {
     y1: usize,
 }
 
-/// The photo and, if asked for, the four overlapping quarters of layer 1 [SAM].
+/// The photo and, if asked for, the four overlapping quarters of layer 1 (docs/method.md#masks-from-points).
 fn crops(width: usize, height: usize, quarters: bool) -> Vec<Crop> {
     let mut all = vec![Crop { x0: 0, y0: 0, x1: width, y1: height }];
     if quarters {

@@ -389,7 +389,7 @@ impl Adjustment {
                 }
                 lambda *= 10.0;
             }
-            // The invariances of ALGORITHMS 2.7 (1e-6) need a tighter end than a picture would.
+            // The invariances of docs/method.md#pointmap-adjustment (1e-6) need a tighter end than a picture would.
             if halvings == 3 && before - after <= 1e-11 * before {
                 break;
             }

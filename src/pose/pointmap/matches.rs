@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 const PITCH: usize = 8;
 /// Rounds before a wandering seed is given up (MASt3R).
 const ROUNDS: usize = 10;
-/// Most matches per ordered pair, and the grid over which they are spread.
+/// Most matches per pair, and the grid over which they are spread.
 const CAP: usize = 8192;
 const CELLS: usize = 16;
 

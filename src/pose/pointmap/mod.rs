@@ -1,5 +1,5 @@
-//! Pairwise pointmaps to cameras and dense points (ALGORITHMS 2.5): what networks such as MASt3R, DUSt3R and VGGT predict
-//! for pairs of photos is brought to one scale, one set of cameras and one set of depth maps.
+//! Pairwise pointmaps to cameras and dense points (docs/method.md#pointmaps): what networks such as MASt3R, DUSt3R and
+//! VGGT predict for pairs of photos is brought to one scale, one set of cameras and one set of depth maps.
 //!
 //! Positions are continuous pixels of the network's input ("model pixels"); the centre of the first pixel is 0.5.
 mod adjust;

@@ -1,16 +1,16 @@
-//! Depth maps of all views to one set of points (ALGORITHMS 2.6).
+//! Depth maps of all views to one set of points (docs/method.md#fusion).
 use super::Level;
 use super::surface::{Links, Surface, neighbours, ray};
 use crate::scene::PointCloud;
 use glam::Vec3;
 
-/// Relative depth step to a neighbour above which a pixel may float between two surfaces (ALGORITHMS 2.5 G).
+/// Relative depth step to a neighbour above which a pixel may float between two surfaces (docs/method.md#fusion).
 const FLYING: f32 = 0.06;
 /// Confidence from which a pixel counts as matched rather than filled.
 pub const MATCHED: f32 = 0.5;
 
 /// Matched pixels of all views first, filled ones after; within each, views by decreasing mean confidence. A pixel is
-/// skipped when a point already kept projects onto it at the same depth (within 1 %).
+/// skipped when a point already kept projects onto it at the same depth, within the view's tolerance.
 pub fn fuse(level: &Level, links: &Links, surface: &Surface) -> PointCloud {
     let mut order: Vec<usize> = (0..level.cameras.len()).collect();
     let mean = |view: usize| {

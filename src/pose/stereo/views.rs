@@ -97,7 +97,7 @@ fn needed(guide: &[RgbImage], chosen: &[Vec<usize>]) -> usize {
 }
 
 /// Inverse depths between which a view is searched: the 1st and 99th percentile of the sparse points in front of it,
-/// widened by half the nearest and to three times the farthest depth, since sparse points miss the extremes.
+/// widened to 0.6 of the nearest and twice the farthest depth, since sparse points miss the extremes.
 fn inverse_depth_range(camera: &Camera, sparse: &[DVec3]) -> Result<[f64; 2]> {
     let mut depths: Vec<f64> = sparse
         .iter()

@@ -1,4 +1,4 @@
-//! LERF-OVS as LangSplat evaluates it (ALGORITHMS 9.3, 9.4): polygons and boxes per labelled frame.
+//! LERF-OVS as LangSplat evaluates it (docs/method.md#lerf-ovs): polygons and boxes per labelled frame.
 use super::super::filter;
 use super::summarise;
 use super::{Kind, Masks, OwnLabels, Protocol, Report, Score, Seen, View, mask_iou, mean, place, polygon};

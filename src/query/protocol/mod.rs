@@ -1,4 +1,4 @@
-//! The published evaluation protocols, from their public file layouts (ALGORITHMS 9.3 to 9.5).
+//! The published evaluation protocols, from their public file layouts (docs/method.md#protocols).
 //!
 //! [`open`] reads a data set's labels and says which cameras to look from and which texts to ask; the caller renders and
 //! decodes each frame and hands it to [`Protocol::add`]; [`Protocol::finish`] gives the figures with the definitions they

@@ -1,4 +1,4 @@
-//! 3D-OVS (ALGORITHMS 9.5): the paper's rule, the rule of the authors' script, and the data set's own argmax.
+//! 3D-OVS (docs/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and the data set's own argmax.
 use super::summarise;
 use super::{Kind, Masks, OwnLabels, Protocol, Report, Score, Seen, View, mask_iou, mean, nearest, place};
 use crate::query::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, Split};

@@ -28,7 +28,7 @@ const MAGIC: &[u8; 8] = b"SVKVIEW1";
 const BLOCK: usize = 256;
 /// Constant of the lowest spherical harmonic, ½ √(1/π).
 const SH0: f32 = 0.282_094_8;
-/// A fainter splat is never drawn (ALGORITHMS 7.4).
+/// A fainter splat is never drawn (docs/method.md#forward-rasterisation).
 const LEAST_ALPHA: f32 = 1.0 / 255.0;
 
 /// A packed scene.

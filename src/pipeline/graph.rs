@@ -1,0 +1,367 @@
+//! The graph and its schedule.
+use super::store::{Codec, Key, Store};
+use super::{Context, Lane, Stage};
+use crate::checkpoint::Checkpoint;
+use crate::gpu::Device;
+use crate::infer::Registry;
+use crate::progress::{Progress, Recorded};
+use crate::{Error, Result};
+use std::any::Any;
+use std::collections::BTreeSet;
+use std::marker::PhantomData;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
+
+type Value = Arc<dyn Any + Send + Sync>;
+
+/// What a stage of a graph will make.
+pub struct Output<T> {
+    node: usize,
+    made: PhantomData<fn() -> T>,
+}
+
+impl<T> Clone for Output<T> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<T> Copy for Output<T> {}
+
+/// Tuples of [`Output`]s.
+pub trait Inputs {
+    /// References to what was made.
+    type Values<'v>;
+    /// The stages that make them.
+    fn nodes(&self) -> Vec<usize>;
+    /// What was made, in the order of [`Inputs::nodes`]; `None` if that is something else.
+    fn values(made: &[Value]) -> Option<Self::Values<'_>>;
+}
+
+macro_rules! inputs {
+    ($($name:ident $at:tt),*) => {
+        impl<$($name: Send + Sync + 'static),*> Inputs for ($(Output<$name>,)*) {
+            type Values<'v> = ($(&'v $name,)*);
+            fn nodes(&self) -> Vec<usize> {
+                vec![$(self.$at.node),*]
+            }
+            fn values(_made: &[Value]) -> Option<Self::Values<'_>> {
+                Some(($(_made.get($at)?.downcast_ref::<$name>()?,)*))
+            }
+        }
+    };
+}
+
+inputs!();
+inputs!(A 0);
+inputs!(A 0, B 1);
+inputs!(A 0, B 1, C 2);
+inputs!(A 0, B 1, C 2, D 3);
+
+type Work<'g> = Box<dyn FnOnce(&[Value], &Context) -> Result<Value> + Send + 'g>;
+type Load<'g> = Box<dyn Fn(&Store, &Key) -> Option<(Vec<String>, Value)> + Send + Sync + 'g>;
+type Save<'g> = Box<dyn Fn(&Store, &Key, &[String], &Value) -> Result<bool> + Send + Sync + 'g>;
+
+struct Node<'g> {
+    name: &'static str,
+    lane: Lane,
+    needs: Vec<usize>,
+    settings: String,
+    work: Mutex<Option<Work<'g>>>,
+    load: Load<'g>,
+    save: Save<'g>,
+}
+
+/// Stages and what they need of each other. Stages of one lane start in the order in which they were added, as far as their
+/// inputs allow.
+#[derive(Default)]
+pub struct Graph<'g> {
+    nodes: Vec<Node<'g>>,
+}
+
+/// What a graph made.
+pub struct Made {
+    values: Vec<Option<Value>>,
+}
+
+impl Made {
+    /// Takes out an output that was asked for.
+    pub fn take<T: Send + Sync + 'static>(&mut self, output: Output<T>) -> Result<T> {
+        let value = self.values[output.node].take().and_then(|v| v.downcast::<T>().ok());
+        // Nobody else holds outputs once the graph has run.
+        value.and_then(Arc::into_inner).ok_or_else(|| Error::work("pipeline: an output was not asked for"))
+    }
+}
+
+impl<'g> Graph<'g> {
+    /// Adds a stage with its inputs.
+    pub fn add<S: Stage + 'g>(&mut self, stage: S, inputs: S::Inputs) -> Output<S::Output> {
+        let settings = stage.settings();
+        let work = move |made: &[Value], context: &Context| {
+            let inputs =
+                S::Inputs::values(made).ok_or_else(|| Error::work("pipeline: inputs of another type"))?;
+            Ok(Arc::new(stage.run(inputs, context)?) as Value)
+        };
+        let load = |store: &Store, key: &Key| {
+            let found = S::codec().and_then(|c: Codec<S::Output>| store.load(S::NAME, key, &c));
+            found.map(|(warnings, value)| (warnings, Arc::new(value) as Value))
+        };
+        let save = |store: &Store, key: &Key, warnings: &[String], value: &Value| match (
+            S::codec(),
+            value.downcast_ref(),
+        ) {
+            (Some(codec), Some(value)) => store.save(S::NAME, key, &codec, warnings, value),
+            _ => Ok(false),
+        };
+        self.nodes.push(Node {
+            name: S::NAME,
+            lane: S::LANE,
+            needs: inputs.nodes(),
+            settings,
+            work: Mutex::new(Some(Box::new(work))),
+            load: Box::new(load),
+            save: Box::new(save),
+        });
+        Output { node: self.nodes.len() - 1, made: PhantomData }
+    }
+
+    /// Makes `targets` ([`Output::of`] several), reading from `store` what it has and keeping there what was made. The first
+    /// error stops everything.
+    pub fn run(
+        &self,
+        targets: &[usize],
+        device: &Device,
+        registry: &Registry,
+        store: &Store,
+        progress: &Recorded,
+    ) -> Result<Made> {
+        let keys = self.keys(device);
+        let mut state = self.planned(targets, store, &keys);
+        targets.iter().for_each(|t| state.users[*t] += 1);
+        self.say_what_is_kept(&state, progress);
+        let shared = Shared { graph: self, keys, store, state: Mutex::new(state), changed: Condvar::new() };
+        let beside = progress.beside();
+        let front = Context { device, registry, progress };
+        let (front, other) = std::thread::scope(|scope| {
+            let other = scope.spawn(|| {
+                let context = Context { device, registry, progress: beside.as_ref() };
+                shared.work(Lane::Processor, &context, progress)
+            });
+            let front = shared.work(Lane::Device, &front, progress);
+            // A panic over there goes on here, as if there had been one thread.
+            (front, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+        });
+        let state = shared.state.into_inner().unwrap_or_else(PoisonError::into_inner);
+        if let Err(error) = both(front, other) {
+            if !state.kept.is_empty() {
+                let names = state.kept.join(", ");
+                progress.inform(&format!("kept: {names}; the same command with --resume goes on from there"));
+            }
+            return Err(error);
+        }
+        Ok(Made { values: state.values })
+    }
+
+    fn keys(&self, device: &Device) -> Vec<Key> {
+        let info = device.info();
+        let machine = format!("{} {} {}", info.name, info.driver, info.deterministic);
+        let mut keys: Vec<Key> = Vec::with_capacity(self.nodes.len());
+        for node in &self.nodes {
+            let machine = if node.lane == Lane::Device { machine.as_str() } else { "" };
+            let inputs: Vec<&Key> = node.needs.iter().map(|n| &keys[*n]).collect();
+            keys.push(Key::of(node.name, &[program(), machine, &node.settings], &inputs));
+        }
+        keys
+    }
+
+    /// What must be made for the targets, and what the store has of it.
+    fn planned(&self, targets: &[usize], store: &Store, keys: &[Key]) -> State {
+        let n = self.nodes.len();
+        let mut state = State {
+            waiting: BTreeSet::new(),
+            values: vec![None; n],
+            warnings: vec![Vec::new(); n],
+            users: vec![0; n],
+            kept: Vec::new(),
+            failed: false,
+        };
+        let mut asked: BTreeSet<usize> = targets.iter().copied().collect();
+        // Inputs precede the stages that need them.
+        while let Some(node) = asked.pop_last() {
+            if let Some((warnings, value)) = (self.nodes[node].load)(store, &keys[node]) {
+                (state.warnings[node], state.values[node]) = (warnings, Some(value));
+                state.kept.push(self.nodes[node].name);
+            } else {
+                state.waiting.insert(node);
+                for &need in &self.nodes[node].needs {
+                    state.users[need] += 1;
+                    asked.insert(need);
+                }
+            }
+        }
+        state
+    }
+
+    /// Names the stages that need not run, and repeats what was warned of when they did.
+    fn say_what_is_kept(&self, state: &State, progress: &dyn Progress) {
+        if !state.kept.is_empty() {
+            progress.inform(&format!("kept from an earlier run: {}", state.kept.join(", ")));
+        }
+        let mut said = BTreeSet::new();
+        let warnings = state.warnings.iter().flatten().filter(|w| said.insert(w.as_str()));
+        warnings.for_each(|w| progress.warn(w));
+    }
+}
+
+impl<T> Output<T> {
+    /// For [`Graph::run`].
+    pub fn target(self) -> usize {
+        self.node
+    }
+}
+
+/// Checksum of the running program: another build may work differently.
+fn program() -> &'static str {
+    static PROGRAM: OnceLock<String> = OnceLock::new();
+    PROGRAM.get_or_init(|| {
+        let bytes = std::env::current_exe().and_then(std::fs::read);
+        bytes.map_or_else(|_| env!("CARGO_PKG_VERSION").to_owned(), |b| crate::files::sha256(&b))
+    })
+}
+
+/// How far the graph is.
+struct State {
+    /// Stages that must still start.
+    waiting: BTreeSet<usize>,
+    values: Vec<Option<Value>>,
+    /// What was warned of while each was made, and its inputs.
+    warnings: Vec<Vec<String>>,
+    /// Stages that must still run, and targets, that each output serves: without one it is dropped.
+    users: Vec<usize>,
+    /// Stages whose output is on disk now.
+    kept: Vec<&'static str>,
+    failed: bool,
+}
+
+struct Shared<'s, 'g> {
+    graph: &'s Graph<'g>,
+    keys: Vec<Key>,
+    store: &'s Store,
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+impl Shared<'_, '_> {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Runs the stages of a lane until none is left or one has failed anywhere.
+    fn work(&self, lane: Lane, context: &Context, progress: &Recorded) -> Result<()> {
+        // Also when a stage panics.
+        let failing = Failing(self, progress);
+        while let Some((node, inputs)) = self.next(lane) {
+            let at = &self.graph.nodes[node];
+            let work = at.work.lock().unwrap_or_else(PoisonError::into_inner).take();
+            let work = work.ok_or_else(|| Error::work("pipeline: a graph runs once"))?;
+            let checkpoint = self.store.checkpoint(at.name, &self.keys[node]);
+            let noting = Noting { inner: context.progress, warnings: Mutex::default(), checkpoint };
+            let value = work(&inputs, &Context { progress: &noting, ..*context })?;
+            drop(inputs);
+            let mut warnings = noting.warnings.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            // Those of its inputs as well: with its output kept they need not be looked at again.
+            warnings.splice(0..0, at.needs.iter().flat_map(|n| self.lock().warnings[*n].clone()));
+            let kept = (at.save)(self.store, &self.keys[node], &warnings, &value)?;
+            noting.checkpoint.iter().for_each(Checkpoint::remove);
+            let mut state = self.lock();
+            state.kept.extend(kept.then_some(at.name));
+            state.values[node] = Some(value);
+            state.warnings[node] = warnings;
+            for &need in &at.needs {
+                state.users[need] -= 1;
+                if state.users[need] == 0 {
+                    state.values[need] = None;
+                }
+            }
+            self.changed.notify_all();
+        }
+        std::mem::forget(failing);
+        Ok(())
+    }
+
+    /// The first stage of the lane whose inputs are there, waiting for them; `None` when no more will come.
+    fn next(&self, lane: Lane) -> Option<(usize, Vec<Value>)> {
+        let mut state = self.lock();
+        loop {
+            let of_lane = |n: &&usize| self.graph.nodes[**n].lane == lane;
+            if state.failed || !state.waiting.iter().any(|n| of_lane(&n)) {
+                return None;
+            }
+            let inputs = |n: &usize| -> Option<Vec<Value>> {
+                self.graph.nodes[*n].needs.iter().map(|need| state.values[*need].clone()).collect()
+            };
+            let ready = state.waiting.iter().filter(of_lane).find_map(|n| Some((*n, inputs(n)?)));
+            if let Some((node, inputs)) = ready {
+                state.waiting.remove(&node);
+                return Some((node, inputs));
+            }
+            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+}
+
+/// Passes everything on and keeps the warnings.
+struct Noting<'a> {
+    inner: &'a dyn Progress,
+    warnings: Mutex<Vec<String>>,
+    checkpoint: Option<Checkpoint>,
+}
+
+impl Progress for Noting<'_> {
+    fn begin(&self, stage: &'static str, steps: u64) {
+        self.inner.begin(stage, steps);
+    }
+    fn step(&self, done: u64, note: &str) {
+        self.inner.step(done, note);
+    }
+    fn figures(&self, step: u64, figures: &[(&str, f64)]) {
+        self.inner.figures(step, figures);
+    }
+    fn end(&self) {
+        self.inner.end();
+    }
+    fn warn(&self, message: &str) {
+        self.warnings.lock().unwrap_or_else(PoisonError::into_inner).push(message.to_owned());
+        self.inner.warn(message);
+    }
+    fn inform(&self, message: &str) {
+        self.inner.inform(message);
+    }
+    fn cancelled(&self) -> bool {
+        self.inner.cancelled()
+    }
+    fn checkpoint(&self) -> Option<&Checkpoint> {
+        self.checkpoint.as_ref()
+    }
+    fn beside(&self) -> Box<dyn Progress + '_> {
+        self.inner.beside()
+    }
+}
+
+/// Stops the other lane when dropped.
+struct Failing<'s, 'r>(&'s Shared<'s, 'r>, &'s Recorded<'s>);
+
+impl Drop for Failing<'_, '_> {
+    fn drop(&mut self) {
+        self.0.lock().failed = true;
+        self.0.changed.notify_all();
+        self.1.stop();
+    }
+}
+
+/// The results of two lanes; of two errors the one that is not the mere consequence of the other.
+fn both<A, B>(front: Result<A>, beside: Result<B>) -> Result<(A, B)> {
+    match (front, beside) {
+        (Ok(a), Ok(b)) => Ok((a, b)),
+        (Err(Error::Cancelled), Err(e)) | (Err(e), _) | (_, Err(e)) => Err(e),
+    }
+}

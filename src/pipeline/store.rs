@@ -1,0 +1,114 @@
+//! Outputs of stages on disk, by everything that they depend on.
+use crate::checkpoint::Checkpoint;
+use crate::files;
+use crate::{Error, Result};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use sha2::{Digest, Sha256};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// Bytes that the folder may hold: the stages of some twenty scenes of four photos.
+const CAPACITY: u64 = 4 << 30;
+
+/// Extension of the files.
+const EXTENSION: &str = "stage";
+
+/// Identifies an output by everything that it depends on.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Key(String);
+
+impl Key {
+    /// From the stage's name, what it depends on, and the keys of its inputs.
+    pub(super) fn of(name: &str, settings: &[&str], inputs: &[&Key]) -> Key {
+        let mut digest = Sha256::new();
+        let all = std::iter::once(&name).chain(settings).copied().chain(inputs.iter().map(|k| k.0.as_str()));
+        for text in all {
+            digest.update((text.len() as u64).to_le_bytes());
+            digest.update(text);
+        }
+        // The number of settings is fixed, that of inputs is not.
+        Key(files::hex(&digest.finalize())[..32].to_owned())
+    }
+}
+
+/// Turns outputs into bytes and back.
+pub struct Codec<T> {
+    /// To bytes.
+    pub write: fn(&T) -> Result<Vec<u8>>,
+    /// Back; `None` where the bytes are not such an output.
+    pub read: fn(&[u8]) -> Option<T>,
+}
+
+/// The codec of everything that serde knows.
+pub fn kept<T: Serialize + DeserializeOwned>() -> Option<Codec<T>> {
+    let write = |value: &T| postcard::to_stdvec(value).map_err(unwritable);
+    Some(Codec { write, read: |bytes| postcard::from_bytes(bytes).ok() })
+}
+
+fn unwritable(e: postcard::Error) -> Error {
+    Error::work(format!("stage store: {e}"))
+}
+
+/// A folder of outputs; any odd file in it is made again and written over.
+#[derive(Clone, Debug, Default)]
+pub struct Store {
+    folder: Option<PathBuf>,
+    resume: bool,
+    every: Duration,
+}
+
+impl Store {
+    /// Keeps nothing.
+    pub fn none() -> Store {
+        Store::default()
+    }
+
+    /// Keeps outputs in `folder`, and the state of training every so often; with `resume` what is there is used.
+    pub fn at(folder: impl Into<PathBuf>, resume: bool, every: Duration) -> Store {
+        Store { folder: Some(folder.into()), resume, every }
+    }
+
+    /// Where a stage keeps its state while it works.
+    pub(super) fn checkpoint(&self, name: &str, key: &Key) -> Option<Checkpoint> {
+        let file = Store::file(self.folder.as_ref()?, &format!("{name}-state"), key);
+        Some(Checkpoint::new(file, self.every, self.resume))
+    }
+
+    fn file(folder: &Path, name: &str, key: &Key) -> PathBuf {
+        folder.join(format!("{name}-{}.{EXTENSION}", key.0))
+    }
+
+    /// What was warned of while it was made, and the output.
+    pub(super) fn load<T>(&self, name: &str, key: &Key, codec: &Codec<T>) -> Option<(Vec<String>, T)> {
+        let folder = self.folder.as_ref().filter(|_| self.resume)?;
+        let bytes = files::read_sealed(&Store::file(folder, name, key))?;
+        let (warnings, body) = postcard::take_from_bytes(&bytes).ok()?;
+        Some((warnings, (codec.read)(body)?))
+    }
+
+    /// Whether it is there now: a disk that is full costs the next run time, not this one its result.
+    pub(super) fn save<T>(
+        &self,
+        name: &str,
+        key: &Key,
+        codec: &Codec<T>,
+        warnings: &[String],
+        value: &T,
+    ) -> Result<bool> {
+        let Some(folder) = &self.folder else { return Ok(false) };
+        let file = Store::file(folder, name, key);
+        let warnings = postcard::to_stdvec(warnings).map_err(unwritable)?;
+        let body = [warnings, (codec.write)(value)?].concat();
+        let written = files::write_sealed(&file, &body).is_ok();
+        if written {
+            files::prune(&file, EXTENSION, CAPACITY);
+        }
+        Ok(written)
+    }
+
+    /// What is kept in a folder, with sizes in bytes.
+    pub fn list(folder: &Path) -> Vec<(PathBuf, u64)> {
+        files::in_folder(folder, EXTENSION)
+    }
+}

@@ -1,0 +1,173 @@
+//! Graphs of small stages: what runs, beside what, and what is not run again.
+use super::*;
+use crate::Error;
+use crate::progress::{Recorded, Silent};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, mpsc};
+use std::time::Duration;
+
+/// Adds to what it gets, and counts.
+struct Add {
+    by: u64,
+    runs: Arc<AtomicUsize>,
+    warning: Option<&'static str>,
+}
+
+impl Stage for Add {
+    const NAME: &'static str = "add";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<u64>,);
+    type Output = u64;
+    fn settings(&self) -> String {
+        self.by.to_string()
+    }
+    fn codec() -> Option<Codec<u64>> {
+        kept()
+    }
+    fn run(self, (value,): (&u64,), context: &Context) -> Result<u64> {
+        self.runs.fetch_add(1, Ordering::SeqCst);
+        self.warning.into_iter().for_each(|w| context.progress.warn(w));
+        Ok(value + self.by)
+    }
+}
+
+/// A number that is made again each time, on the other lane.
+struct Number(u64, Arc<AtomicUsize>);
+
+impl Stage for Number {
+    const NAME: &'static str = "number";
+    const LANE: Lane = Lane::Device;
+    type Inputs = ();
+    type Output = u64;
+    fn settings(&self) -> String {
+        self.0.to_string()
+    }
+    fn run(self, (): (), context: &Context) -> Result<u64> {
+        self.1.fetch_add(1, Ordering::SeqCst);
+        context.progress.warn("a number");
+        Ok(self.0)
+    }
+}
+
+struct Machine {
+    device: Device,
+    registry: Registry,
+}
+
+impl Machine {
+    fn new() -> Machine {
+        Machine { device: Device::open(None).unwrap(), registry: Registry::open(None).unwrap() }
+    }
+
+    fn run(&self, graph: &Graph, targets: &[usize], store: &Store) -> Result<(Made, Vec<String>)> {
+        let progress = Recorded::new(&Silent);
+        let made = graph.run(targets, &self.device, &self.registry, store, &progress)?;
+        Ok((made, progress.warnings()))
+    }
+}
+
+/// number → + 1 → + `last`; the runs of each, the result, and the warnings.
+fn chain(machine: &Machine, store: &Store, last: u64) -> ([usize; 3], u64, Vec<String>) {
+    let runs: [Arc<AtomicUsize>; 3] = Default::default();
+    let mut graph = Graph::default();
+    let number = graph.add(Number(5, runs[0].clone()), ());
+    let add = |by, k: usize, warning| Add { by, runs: runs[k].clone(), warning };
+    let one = graph.add(add(1, 1, Some("one more")), (number,));
+    let two = graph.add(add(last, 2, None), (one,));
+    let (mut made, warnings) = machine.run(&graph, &[two.target()], store).unwrap();
+    (runs.map(|r| r.load(Ordering::SeqCst)), made.take(two).unwrap(), warnings)
+}
+
+#[test]
+fn finished_stages_are_not_run_again_and_their_warnings_stay() {
+    let (machine, folder) = (Machine::new(), tempfile::tempdir().unwrap());
+    let kept = |resume| Store::at(folder.path(), resume, PATIENCE);
+    assert_eq!(chain(&machine, &kept(true), 2).0, [1, 1, 1]);
+    // Without asking for it everything runs.
+    assert_eq!(chain(&machine, &kept(false), 2).0, [1, 1, 1]);
+    let (runs, value, warnings) = chain(&machine, &kept(true), 2);
+    assert_eq!((runs, value), ([0, 0, 0], 8));
+    assert_eq!(warnings, ["a number", "one more"], "of stages that were not even looked at");
+    // Another last setting: the stage before comes from the store.
+    let (runs, value, warnings) = chain(&machine, &kept(true), 3);
+    assert_eq!((runs, value), ([0, 0, 1], 9));
+    assert_eq!(warnings, ["a number", "one more"]);
+    // A damaged file is as good as none.
+    for (file, _) in Store::list(folder.path()) {
+        let mut bytes = std::fs::read(&file).unwrap();
+        *bytes.last_mut().unwrap() ^= 1;
+        std::fs::write(&file, bytes).unwrap();
+    }
+    assert_eq!(chain(&machine, &kept(true), 3).0, [1, 1, 1]);
+    let list = Store::list(folder.path());
+    assert!(list.len() == 3 && list.iter().all(|(_, bytes)| *bytes > 64), "{list:?}");
+}
+
+/// Waits for a word from elsewhere, then says one.
+struct Talk {
+    hear: Option<mpsc::Receiver<()>>,
+    say: Option<mpsc::Sender<()>>,
+    end: fn(&Context) -> Result<()>,
+}
+
+/// Long enough for any machine; only a wrong schedule waits for it.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+macro_rules! talking {
+    ($name:ident, $lane:expr) => {
+        struct $name(Mutex<Talk>);
+        impl Stage for $name {
+            const NAME: &'static str = stringify!($name);
+            const LANE: Lane = $lane;
+            type Inputs = ();
+            type Output = ();
+            fn settings(&self) -> String {
+                String::new()
+            }
+            fn run(self, (): (), context: &Context) -> Result<()> {
+                let talk = self.0.into_inner().unwrap();
+                if let Some(say) = talk.say {
+                    say.send(()).unwrap();
+                }
+                if let Some(hear) = talk.hear {
+                    hear.recv_timeout(PATIENCE).map_err(|_| Error::work("nobody spoke"))?;
+                }
+                (talk.end)(context)
+            }
+        }
+    };
+}
+
+talking!(OnDevice, Lane::Device);
+talking!(OnProcessor, Lane::Processor);
+
+fn pair(ends: [fn(&Context) -> Result<()>; 2]) -> Result<()> {
+    let machine = Machine::new();
+    let (there, back) = (mpsc::channel(), mpsc::channel());
+    let mut graph = Graph::default();
+    let front = Talk { hear: Some(back.1), say: Some(there.0), end: ends[0] };
+    let beside = Talk { hear: Some(there.1), say: Some(back.0), end: ends[1] };
+    let front = graph.add(OnDevice(Mutex::new(front)), ());
+    let beside = graph.add(OnProcessor(Mutex::new(beside)), ());
+    machine.run(&graph, &[front.target(), beside.target()], &Store::none()).map(|_| ())
+}
+
+/// Until it is told to stop.
+fn long(context: &Context) -> Result<()> {
+    let started = std::time::Instant::now();
+    while started.elapsed() < PATIENCE {
+        context.progress.check()?;
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    Err(Error::work("nobody stopped it"))
+}
+
+#[test]
+fn lanes_work_beside_each_other_and_the_cause_of_a_stop_is_reported() {
+    pair([|_| Ok(()), |_| Ok(())]).unwrap();
+    let error = |ends| pair(ends).unwrap_err().to_string();
+    assert_eq!(error([long, |_| Err(Error::input("bad mask"))]), "bad mask");
+    assert_eq!(error([|_| Err(Error::input("bad photo")), long]), "bad photo");
+    let panicked = std::panic::catch_unwind(|| pair([long, |_| std::panic::panic_any("oh")]));
+    assert_eq!(panicked.unwrap_err().downcast_ref::<&str>(), Some(&"oh"));
+}

@@ -1,0 +1,55 @@
+//! The finished scene seen from the photos' cameras, and what it answers.
+use crate::Result;
+use crate::fit::{Trained, TrainedLanguage};
+use crate::pipeline::{Context, Lane, Output, Stage};
+use crate::query::{QueryOptions, TextQuery};
+use crate::run::view::{self, DecodedFrame};
+use crate::run::{Answers, ask};
+
+/// Renders and decodes every photo's view.
+pub struct Decode;
+
+impl Stage for Decode {
+    const NAME: &'static str = "decode";
+    const LANE: Lane = Lane::Device;
+    type Inputs = (Output<Trained>, Output<TrainedLanguage>);
+    type Output = Vec<DecodedFrame>;
+
+    fn settings(&self) -> String {
+        String::new()
+    }
+
+    fn run(
+        self,
+        (trained, language): (&Trained, &TrainedLanguage),
+        context: &Context,
+    ) -> Result<Vec<DecodedFrame>> {
+        view::decode_all(context.device, &language.splats, &language.field, &trained.cameras)
+    }
+}
+
+/// Answers the questions.
+pub struct Answer;
+
+impl Stage for Answer {
+    const NAME: &'static str = "query";
+    const LANE: Lane = Lane::Device;
+    type Inputs = (Output<Vec<DecodedFrame>>, Output<TrainedLanguage>, Output<Vec<TextQuery>>);
+    type Output = Vec<Answers>;
+
+    fn settings(&self) -> String {
+        String::new()
+    }
+
+    fn run(
+        self,
+        (frames, language, queries): (&Vec<DecodedFrame>, &TrainedLanguage, &Vec<TextQuery>),
+        context: &Context,
+    ) -> Result<Vec<Answers>> {
+        context.progress.begin("query", queries.len() as u64);
+        let answer = |query| ask::answers(frames, &language.field, query, &QueryOptions::default());
+        let answers = queries.iter().map(answer).collect();
+        context.progress.end();
+        answers
+    }
+}

@@ -1,0 +1,157 @@
+//! Photos → cameras → depth and points.
+use crate::fit::Preset;
+use crate::infer::installed::Installed;
+use crate::infer::pairs;
+use crate::photo::Photo;
+use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
+use crate::pose::stereo::StereoOptions;
+use crate::pose::{self, Geometry, SparseModel, pointmap};
+use crate::scene::Camera;
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+/// Where cameras come from.
+pub enum CameraSource {
+    /// Structure from motion.
+    Sfm,
+    /// Known ones, joined to the photos by name.
+    Known(Vec<Camera>),
+    /// Pointmaps of a network, with depth; structure from motion where an untrained one gives no geometry.
+    Network(Installed),
+    /// Nowhere: cameras and points were given.
+    Complete(Geometry),
+}
+
+/// Photos as all later stages see them, without lens distortion and in one light, and what is known of their cameras.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Placed {
+    /// The photos.
+    pub photos: Vec<Photo>,
+    /// How far geometry is known.
+    pub start: Start,
+}
+
+/// What is known once the photos are placed.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub enum Start {
+    /// Cameras and sparse points, and how they were found; depth is still to come.
+    Cameras(SparseModel, String),
+    /// All of it, from a network.
+    Geometry(Geometry),
+}
+
+/// Finds cameras and places photos.
+pub struct Cameras {
+    photos: Vec<Photo>,
+    source: CameraSource,
+    settings: String,
+}
+
+impl Cameras {
+    /// Of these photos.
+    pub fn new(photos: Vec<Photo>, source: CameraSource) -> Result<Cameras> {
+        let source_name = match &source {
+            CameraSource::Sfm => "sfm".to_owned(),
+            CameraSource::Known(cameras) => format!("{cameras:?}"),
+            CameraSource::Network(model) => super::identity(model)?,
+            CameraSource::Complete(geometry) => format!("{geometry:?}"),
+        };
+        let photos_name: Vec<String> = photos.iter().map(identity).collect();
+        let settings = format!("{source_name} {photos_name:?}");
+        Ok(Cameras { photos, source, settings })
+    }
+}
+
+/// Everything of a photo that stages look at.
+fn identity(photo: &Photo) -> String {
+    let mut digest = Sha256::new();
+    digest.update(bytemuck::cast_slice::<_, u8>(&photo.image.data));
+    if let Some(fine) = &photo.fine {
+        digest.update(bytemuck::cast_slice::<_, u8>(&fine.data));
+    }
+    let pixels = crate::files::hex(&digest.finalize());
+    let Photo { path, image, frame, original_size, to_working, exif_focal, camera_model, .. } = photo;
+    let size = (image.width, image.height);
+    format!(
+        "{path:?} {size:?} {frame:?} {original_size:?} {to_working:?} {exif_focal:?} {camera_model:?} {pixels}"
+    )
+}
+
+impl Stage for Cameras {
+    const NAME: &'static str = "cameras";
+    const LANE: Lane = Lane::Device;
+    type Inputs = ();
+    type Output = Placed;
+
+    fn settings(&self) -> String {
+        self.settings.clone()
+    }
+
+    fn codec() -> Option<Codec<Placed>> {
+        kept()
+    }
+
+    fn run(self, (): (), context: &Context) -> Result<Placed> {
+        let (progress, photos) = (context.progress, self.photos);
+        let known = match &self.source {
+            CameraSource::Network(model) => {
+                let (views, maps) = pairs::pointmaps(model, &photos, progress)?;
+                match pointmap::reconstruct(&views, &maps, progress) {
+                    Ok(geometry) => {
+                        let method = format!("{} pointmaps", model.name);
+                        return Ok(Placed {
+                            photos,
+                            start: Start::Geometry(Geometry { method, ..geometry }),
+                        });
+                    }
+                    Err(Error::Cancelled) => return Err(Error::Cancelled),
+                    Err(error) if model.untrained() => progress.warn(&format!(
+                        "{}: no geometry in untrained pointmaps ({error}); cameras from sfm",
+                        model.name
+                    )),
+                    Err(error) => return Err(error),
+                }
+                None
+            }
+            CameraSource::Complete(geometry) => {
+                return Ok(Placed { photos, start: Start::Geometry(geometry.clone()) });
+            }
+            CameraSource::Sfm => None,
+            CameraSource::Known(cameras) => Some(cameras.as_slice()),
+        };
+        let pose::Placed { photos, model, method } = pose::place(photos, known, context.registry, progress)?;
+        Ok(Placed { photos, start: Start::Cameras(model, method) })
+    }
+}
+
+/// Depth maps and points by stereo, where no network has given them.
+pub struct Depth {
+    /// Time against quality.
+    pub preset: Preset,
+}
+
+impl Stage for Depth {
+    const NAME: &'static str = "depth";
+    const LANE: Lane = Lane::Device;
+    type Inputs = (Output<Placed>,);
+    type Output = Geometry;
+
+    fn settings(&self) -> String {
+        format!("{:?}", StereoOptions::preset(self.preset))
+    }
+
+    fn codec() -> Option<Codec<Geometry>> {
+        kept()
+    }
+
+    fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Geometry> {
+        match placed.start.clone() {
+            Start::Geometry(geometry) => Ok(geometry),
+            Start::Cameras(model, method) => {
+                let options = StereoOptions::preset(self.preset);
+                pose::dense(context.device, &placed.photos, model, method, &options, context.progress)
+            }
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! Masks → aligned things with codes → splats that carry them; and what texts mean.
+use super::Placed;
+use crate::Result;
+use crate::fit::{LanguageOptions, Trained, TrainedLanguage};
+use crate::infer::RegionEncoder;
+use crate::language::align::PairLinks;
+use crate::language::{self, Language, ViewMasks};
+use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
+use crate::pose::Geometry;
+use crate::query::TextQuery;
+use crate::report::viewer::Names;
+use crate::run::method::Recipe;
+use crate::run::{ask, sources};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// An encoder that several stages ask, one at a time.
+#[derive(Clone)]
+pub struct SharedEncoder {
+    encoder: Arc<Mutex<Box<dyn RegionEncoder>>>,
+    identity: String,
+    space: String,
+}
+
+impl SharedEncoder {
+    /// `identity` names the models behind it, with checksums.
+    pub fn new(encoder: Box<dyn RegionEncoder>, identity: String) -> SharedEncoder {
+        let space = encoder.space().to_owned();
+        SharedEncoder {
+            encoder: Arc::new(Mutex::new(encoder)),
+            identity: format!("{space} {identity}"),
+            space,
+        }
+    }
+
+    /// Name of the embedding space.
+    pub fn space(&self) -> &str {
+        &self.space
+    }
+
+    pub(super) fn identity(&self) -> &str {
+        &self.identity
+    }
+
+    /// Asks it.
+    pub fn with<T>(&self, ask: impl FnOnce(&mut dyn RegionEncoder) -> T) -> T {
+        ask(self.encoder.lock().unwrap_or_else(PoisonError::into_inner).as_mut())
+    }
+}
+
+/// Embeds the questions.
+pub struct Embed {
+    /// By whom.
+    pub encoder: SharedEncoder,
+    /// What is asked.
+    pub texts: Vec<String>,
+}
+
+impl Stage for Embed {
+    const NAME: &'static str = "queries";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = ();
+    type Output = Vec<TextQuery>;
+
+    fn settings(&self) -> String {
+        format!("{} {:?}", self.encoder.identity(), self.texts)
+    }
+
+    fn run(self, (): (), _: &Context) -> Result<Vec<TextQuery>> {
+        self.encoder.with(|e| sources::queries(&self.texts, e))
+    }
+}
+
+/// Aligns masks across photos and gives every thing a code.
+pub struct Align {
+    /// The method.
+    pub recipe: Recipe,
+    /// Name of the embedding space.
+    pub space: String,
+    /// Seed of the code layout.
+    pub seed: u64,
+}
+
+impl Stage for Align {
+    const NAME: &'static str = "alignment";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Vec<ViewMasks>>, Output<Vec<PairLinks>>, Output<Geometry>);
+    type Output = Language;
+
+    fn settings(&self) -> String {
+        format!("{:?}", self.recipe.build(&self.space, self.seed))
+    }
+
+    fn codec() -> Option<Codec<Language>> {
+        kept()
+    }
+
+    fn run(
+        self,
+        (masks, matches, geometry): (&Vec<ViewMasks>, &Vec<PairLinks>, &Geometry),
+        context: &Context,
+    ) -> Result<Language> {
+        let options = self.recipe.build(&self.space, self.seed);
+        language::build(masks, &geometry.cameras, &geometry.depths, matches, &options, context.progress)
+    }
+}
+
+/// The text model's own phrases for every code.
+pub struct Name {
+    /// Whose.
+    pub encoder: SharedEncoder,
+}
+
+impl Stage for Name {
+    const NAME: &'static str = "names";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Language>,);
+    type Output = Names;
+
+    fn settings(&self) -> String {
+        self.encoder.identity().to_owned()
+    }
+
+    fn run(self, (language,): (&Language,), _: &Context) -> Result<Names> {
+        // As many as the page shows beside a selected thing.
+        self.encoder.with(|e| ask::names(e, &language.field, ask::NAMES))
+    }
+}
+
+/// The language stage.
+pub struct TrainLanguage {
+    /// The method.
+    pub recipe: Recipe,
+    /// How.
+    pub options: LanguageOptions,
+}
+
+impl Stage for TrainLanguage {
+    const NAME: &'static str = "language";
+    const LANE: Lane = Lane::Device;
+    type Inputs = (Output<Placed>, Output<Trained>, Output<Language>);
+    type Output = TrainedLanguage;
+
+    fn settings(&self) -> String {
+        format!("{:?} {:?}", self.recipe, self.options)
+    }
+
+    fn codec() -> Option<Codec<TrainedLanguage>> {
+        kept()
+    }
+
+    fn run(
+        self,
+        (placed, trained, language): (&Placed, &Trained, &Language),
+        context: &Context,
+    ) -> Result<TrainedLanguage> {
+        self.recipe.speak(
+            context.device,
+            &super::images(&placed.photos),
+            &trained.cameras,
+            &trained.splats,
+            language.field.clone(),
+            self.options,
+            context.progress,
+        )
+    }
+}

@@ -1,0 +1,180 @@
+//! Photos → masks with features.
+use super::{Placed, SharedEncoder};
+use crate::Result;
+use crate::infer::installed::Installed;
+use crate::language::sam::{self, SamOptions};
+use crate::language::{ViewMasks, dir};
+use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
+use crate::pose::Geometry;
+use crate::run::sources;
+use crate::scene::Plane;
+use std::path::PathBuf;
+
+/// Learned contours of every photo, for [`GraphMasks`].
+pub struct Edges;
+
+impl Stage for Edges {
+    const NAME: &'static str = "edges";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Placed>,);
+    type Output = Vec<Plane<f32>>;
+
+    fn settings(&self) -> String {
+        String::new()
+    }
+
+    fn codec() -> Option<Codec<Vec<Plane<f32>>>> {
+        kept()
+    }
+
+    fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Vec<Plane<f32>>> {
+        sources::edges(&super::images(&placed.photos), context.registry, context.progress)
+    }
+}
+
+/// The built-in masks, where no network has given any.
+pub struct GraphMasks;
+
+impl Stage for GraphMasks {
+    const NAME: &'static str = "graph-masks";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Placed>, Output<Vec<Plane<f32>>>, Output<Geometry>);
+    type Output = Vec<ViewMasks>;
+
+    fn settings(&self) -> String {
+        String::new()
+    }
+
+    fn run(
+        self,
+        (placed, edges, geometry): (&Placed, &Vec<Plane<f32>>, &Geometry),
+        context: &Context,
+    ) -> Result<Vec<ViewMasks>> {
+        sources::graph_masks(&super::images(&placed.photos), edges, geometry, context.progress)
+    }
+}
+
+/// A network's masks, or the built-in ones where it gave none: untrained weights rarely give a stable mask, and the stages
+/// after this one need some to work on.
+pub struct MasksOr;
+
+impl Stage for MasksOr {
+    const NAME: &'static str = "masks-or";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Vec<ViewMasks>>, Output<Vec<ViewMasks>>);
+    type Output = Vec<ViewMasks>;
+
+    fn settings(&self) -> String {
+        String::new()
+    }
+
+    fn run(
+        self,
+        (network, built_in): (&Vec<ViewMasks>, &Vec<ViewMasks>),
+        context: &Context,
+    ) -> Result<Vec<ViewMasks>> {
+        if network.iter().flat_map(|m| &m.levels).any(|l| !l.quality.is_empty()) {
+            return Ok(network.clone());
+        }
+        context.progress.warn("no mask passes in untrained weights; built-in masks instead");
+        Ok(built_in.clone())
+    }
+}
+
+/// Masks of a network.
+pub struct NetworkMasks {
+    model: Installed,
+    options: SamOptions,
+    settings: String,
+}
+
+impl NetworkMasks {
+    /// The network and how it is asked.
+    pub fn new(model: Installed, options: SamOptions) -> Result<NetworkMasks> {
+        let settings = format!("{} {options:?}", super::identity(&model)?);
+        Ok(NetworkMasks { model, options, settings })
+    }
+}
+
+impl Stage for NetworkMasks {
+    const NAME: &'static str = "network-masks";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Placed>,);
+    type Output = Vec<ViewMasks>;
+
+    fn settings(&self) -> String {
+        self.settings.clone()
+    }
+
+    fn codec() -> Option<Codec<Vec<ViewMasks>>> {
+        kept()
+    }
+
+    fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Vec<ViewMasks>> {
+        sam::masks(&self.model, &super::images(&placed.photos), &self.options, context.progress)
+    }
+}
+
+/// Masks from a folder, with their features if it has them.
+pub struct GivenMasks {
+    /// The folder.
+    pub dir: PathBuf,
+    /// Whether features are read, too.
+    pub features: bool,
+}
+
+impl Stage for GivenMasks {
+    const NAME: &'static str = "given-masks";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Placed>,);
+    type Output = Vec<ViewMasks>;
+
+    fn settings(&self) -> String {
+        // Not kept; what is made of it is, so the files count.
+        let sums: Vec<Option<String>> =
+            files_in(&self.dir).iter().map(|f| crate::files::content_hash(f).ok()).collect();
+        format!("{:?} {} {sums:?}", self.dir, self.features)
+    }
+
+    fn run(self, (placed,): (&Placed,), _: &Context) -> Result<Vec<ViewMasks>> {
+        placed.photos.iter().map(|p| dir::read_view(&self.dir, p, self.features)).collect()
+    }
+}
+
+fn files_in(dir: &std::path::Path) -> Vec<PathBuf> {
+    let mut files: Vec<PathBuf> = std::fs::read_dir(dir)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|e| e.path())
+        .filter(|p| p.is_file())
+        .collect();
+    files.sort();
+    files
+}
+
+/// Features of the masks that came without.
+pub struct Regions {
+    /// Whose.
+    pub encoder: SharedEncoder,
+}
+
+impl Stage for Regions {
+    const NAME: &'static str = "regions";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Placed>, Output<Vec<ViewMasks>>);
+    type Output = Vec<ViewMasks>;
+
+    fn settings(&self) -> String {
+        self.encoder.identity().to_owned()
+    }
+
+    fn codec() -> Option<Codec<Vec<ViewMasks>>> {
+        kept()
+    }
+
+    fn run(self, (placed, masks): (&Placed, &Vec<ViewMasks>), context: &Context) -> Result<Vec<ViewMasks>> {
+        let images = super::images(&placed.photos);
+        self.encoder.with(|e| sources::with_features(masks.clone(), &images, e, context.progress))
+    }
+}

@@ -1,0 +1,171 @@
+//! Citations of the documents: every `docs/<name>.md#<anchor>` in sources and documents, and every relative link of a
+//! Markdown file, leads to a file and a heading that exist. No compiler reads comments, so nothing else would notice a
+//! section that was renamed.
+#![allow(clippy::unwrap_used)] // a panic is how a test fails
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// What is read, relative to the repository.
+const PLACES: [&str; 7] = ["src", "glsl", "tests", "tools", "docs", "README.md", "build.rs"];
+
+/// Fewer citations than this mean that they are no longer recognised.
+const LEAST: usize = 50;
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Every text file of [`PLACES`] with its content; what is not UTF-8 is no text.
+fn texts() -> Vec<(PathBuf, String)> {
+    let mut all = Vec::new();
+    PLACES.iter().for_each(|place| collect(&root().join(place), &mut all));
+    assert!(!all.is_empty());
+    all
+}
+
+fn collect(path: &Path, all: &mut Vec<(PathBuf, String)>) {
+    if path.is_dir() {
+        let mut inside: Vec<PathBuf> = std::fs::read_dir(path).unwrap().map(|e| e.unwrap().path()).collect();
+        inside.sort();
+        inside.iter().for_each(|p| collect(p, all));
+    } else if let Ok(text) = std::fs::read_to_string(path) {
+        all.push((path.to_path_buf(), text));
+    }
+}
+
+/// "src/lib.rs:12".
+fn place(path: &Path, line: usize) -> String {
+    format!("{}:{line}", path.strip_prefix(root()).unwrap_or(path).display())
+}
+
+/// The letters, digits, `-` and `_` that a text starts with.
+fn word(text: &str) -> &str {
+    let end = text.find(|c: char| !(c.is_alphanumeric() || c == '-' || c == '_'));
+    &text[..end.unwrap_or(text.len())]
+}
+
+/// (file, anchor) of the citations in a line.
+fn citations(line: &str) -> Vec<(String, &str)> {
+    let mut all = Vec::new();
+    for (at, start) in line.match_indices("docs/") {
+        let rest = &line[at + start.len()..];
+        let name = word(rest);
+        if let Some(anchor) = rest[name.len()..].strip_prefix(".md#").filter(|_| !name.is_empty()) {
+            all.push((format!("docs/{name}.md"), word(anchor)));
+        }
+    }
+    all
+}
+
+/// Targets of the Markdown links in a line.
+fn links(line: &str) -> Vec<&str> {
+    let starts = line.match_indices("](").map(|(at, start)| &line[at + start.len()..]);
+    starts.filter_map(|rest| Some(&rest[..rest.find(')')?])).collect()
+}
+
+/// Lines of a Markdown file outside fenced code, numbered from 1.
+fn prose(text: &str) -> Vec<(usize, &str)> {
+    let (mut lines, mut fenced) = (Vec::new(), false);
+    for (at, line) in text.lines().enumerate() {
+        if line.trim_start().starts_with("```") {
+            fenced = !fenced;
+        } else if !fenced {
+            lines.push((at + 1, line));
+        }
+    }
+    lines
+}
+
+/// The anchor that GitHub gives a heading: lower case, spaces to `-`, punctuation dropped.
+fn slug(heading: &str) -> String {
+    let kept = heading.chars().filter(|c| c.is_alphanumeric() || matches!(c, ' ' | '-' | '_'));
+    kept.flat_map(char::to_lowercase).map(|c| if c == ' ' { '-' } else { c }).collect()
+}
+
+/// Anchors of a Markdown file; a heading that was there before gets a number.
+fn anchors(text: &str) -> Vec<String> {
+    let mut seen: BTreeMap<String, usize> = BTreeMap::new();
+    let mut all = Vec::new();
+    for (_, line) in prose(text) {
+        let title = line.trim_start_matches('#');
+        if !(1..=6).contains(&(line.len() - title.len())) || !title.starts_with(' ') {
+            continue;
+        }
+        let own = slug(title.trim());
+        let before = seen.entry(own.clone()).or_default();
+        all.push(if *before == 0 { own } else { format!("{own}-{before}") });
+        *before += 1;
+    }
+    all
+}
+
+/// What is wrong with a reference to a file, or to a heading of it.
+fn fault(file: &Path, anchor: Option<&str>) -> Option<String> {
+    if !file.exists() {
+        return Some("there is no such file".to_owned());
+    }
+    let anchor = anchor.filter(|_| file.extension().is_some_and(|e| e == "md"))?;
+    let text = std::fs::read_to_string(file).unwrap();
+    let there = anchors(&text).iter().any(|a| a == anchor);
+    (!there).then(|| "there is no such heading".to_owned())
+}
+
+#[test]
+fn every_citation_leads_to_a_heading() {
+    let (mut faults, mut count) = (Vec::new(), 0);
+    for (path, text) in texts() {
+        for (at, line) in text.lines().enumerate() {
+            for (file, anchor) in citations(line) {
+                count += 1;
+                let found = fault(&root().join(&file), Some(anchor));
+                faults.extend(found.map(|f| format!("{}: {file}#{anchor}: {f}", place(&path, at + 1))));
+            }
+        }
+    }
+    assert!(faults.is_empty(), "{}", faults.join("\n"));
+    assert!(count >= LEAST, "only {count} citations were found");
+}
+
+#[test]
+fn relative_links_lead_somewhere() {
+    let mut faults = Vec::new();
+    for (path, text) in texts().iter().filter(|(p, _)| p.extension().is_some_and(|e| e == "md")) {
+        for (at, line) in prose(text) {
+            for target in links(line).into_iter().filter(|t| !t.contains("://")) {
+                let (file, anchor) = target.split_once('#').map_or((target, None), |(f, a)| (f, Some(a)));
+                let file = if file.is_empty() { path.clone() } else { path.with_file_name(file) };
+                faults.extend(fault(&file, anchor).map(|f| format!("{}: {target}: {f}", place(path, at))));
+            }
+        }
+    }
+    assert!(faults.is_empty(), "{}", faults.join("\n"));
+}
+
+/// Nobody else can look into the document that comments cited before docs/method.md was there.
+#[test]
+fn nothing_outside_the_repository_is_cited() {
+    let word = ["ALGO", "RITHMS"].concat();
+    let mut faults = Vec::new();
+    for (path, text) in texts() {
+        let named = text.lines().enumerate().filter(|(_, line)| line.contains(&word));
+        faults.extend(named.map(|(at, line)| format!("{}: {}", place(&path, at + 1), line.trim())));
+    }
+    assert!(faults.is_empty(), "{}", faults.join("\n"));
+}
+
+#[test]
+fn headings_become_the_anchors_that_github_makes() {
+    assert_eq!(slug("Forward rasterisation"), "forward-rasterisation");
+    assert_eq!(slug("3D-OVS"), "3d-ovs");
+    assert_eq!(slug("Language beside a file: `NAME.language.npz`"), "language-beside-a-file-namelanguagenpz");
+    let text = "# One\n## Über `x`\n```sh\n# no heading\n```\n#none\n### One\n";
+    assert_eq!(anchors(text), ["one", "über-x", "one-1"]);
+}
+
+#[test]
+fn citations_and_links_are_recognised() {
+    // In two pieces, or this line would be a citation itself.
+    let line = ["as docs/", "method.md#code-length, step 1; docs/", "data.md has no anchor"].concat();
+    assert_eq!(citations(&line), [("docs/method.md".to_owned(), "code-length")]);
+    assert_eq!(links("a [b](c.md#d), [e](#f) and [g] (h)"), ["c.md#d", "#f"]);
+}

@@ -1,0 +1,154 @@
+//! A run that is killed goes on with `--resume`, and ends with the same bits as one that was left alone.
+#![allow(clippy::unwrap_used)] // a panic is how a test fails
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// Times that the run is killed. `tools/test-long` asks for 20.
+const KILLS: &str = "SPLATVK_TEST_KILLS";
+
+/// Two photos that do for cameras, at a size at which a run takes seconds.
+struct Scene {
+    folder: tempfile::TempDir,
+}
+
+impl Scene {
+    fn new() -> Scene {
+        let folder = tempfile::tempdir().unwrap();
+        let photos = folder.path().join("photos");
+        std::fs::create_dir(&photos).unwrap();
+        let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast/images");
+        for k in 0..3 {
+            let name = format!("train_{k:02}.jpg");
+            std::fs::copy(data.join(&name), photos.join(&name)).unwrap();
+        }
+        Scene { folder }
+    }
+
+    fn at(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// `splatvk run`, with stages kept in the folder `home`.
+    fn run(&self, home: &str, out: &str, extra: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+        let models = splatvk::infer::Registry::open(None).unwrap().folders().to_vec();
+        command
+            .env("SPLATVK_MODELS", std::env::join_paths(models).unwrap())
+            .env("SPLATVK_HOME", self.at(home))
+            .arg("run")
+            .arg(self.at("photos"))
+            .args([
+                "--max-size",
+                "200",
+                "--preset",
+                "draft",
+                "--iterations",
+                "40",
+                "--language-iterations",
+                "20",
+            ])
+            .args(["--deterministic", "--query", "lemon", "--log", "json", "--out"])
+            .arg(self.at(out))
+            .args(extra)
+            .stdout(Stdio::null());
+        command
+    }
+
+    /// Runs to the end; what it said.
+    fn finished(&self, home: &str, out: &str, extra: &[&str]) -> String {
+        let output = self.run(home, out, extra).stderr(Stdio::piped()).output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.success(), "{said}");
+        said
+    }
+}
+
+/// Everything of a scene that does not tell the time.
+fn content(scene: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut files = Vec::new();
+    let mut folders = vec![scene.to_path_buf()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(&folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if !["run.json", "report.html"].iter().any(|n| path.ends_with(n)) {
+                files.push((path.strip_prefix(scene).unwrap().to_path_buf(), std::fs::read(&path).unwrap()));
+            }
+        }
+    }
+    files.sort();
+    files
+}
+
+/// What a scene's run.json says of the photos, the cameras and the answers.
+fn statistics(scene: &Path) -> Value {
+    let run: Value = serde_json::from_slice(&std::fs::read(scene.join("run.json")).unwrap()).unwrap();
+    let part = |name: &str| run["statistics"][name].clone();
+    serde_json::json!([part("geometry"), part("light"), part("psnr_train"), part("queries"), run["warnings"]])
+}
+
+/// Kills a child as a power cut would, unless it has ended by itself before; whether it has.
+fn killed_after(mut child: Child, time: Duration) -> bool {
+    let began = Instant::now();
+    while began.elapsed() < time {
+        if let Some(status) = child.try_wait().unwrap() {
+            assert!(status.success());
+            return true;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    false
+}
+
+#[test]
+fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
+    let scene = Scene::new();
+    let began = Instant::now();
+    scene.finished("home-a", "whole", &[]);
+    let whole = began.elapsed();
+    let kills: u32 = std::env::var(KILLS).map_or(3, |n| n.parse().unwrap());
+    let mut state = 1u64;
+    let mut done = false;
+    for _ in 0..kills {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        let share = (state >> 33) as f64 / f64::from(1u32 << 31);
+        let child = scene.run("home-b", "resumed", &["--resume"]).stderr(Stdio::null()).spawn().unwrap();
+        done = killed_after(child, whole.mul_f64(share));
+        if done {
+            break;
+        }
+        assert!(!scene.at("resumed").exists(), "a scene appears whole or not at all");
+    }
+    if !done {
+        scene.finished("home-b", "resumed", &["--resume"]);
+    }
+    let (whole, resumed) = (scene.at("whole"), scene.at("resumed"));
+    let names = |c: &[(PathBuf, Vec<u8>)]| c.iter().map(|f| f.0.clone()).collect::<Vec<_>>();
+    let (a, b) = (content(&whole), content(&resumed));
+    assert_eq!(names(&a), names(&b));
+    for ((name, a), (_, b)) in a.iter().zip(&b) {
+        assert!(a == b, "{} differs", name.display());
+    }
+    assert_eq!(statistics(&whole), statistics(&resumed));
+
+    // Everything is there: nothing but decoding runs again. Then another late option: cameras, depth and splats stay.
+    let said = scene.finished("home-b", "again", &["--resume"]);
+    let kept = |said: &str| said.lines().find(|l| l.contains("kept from an earlier run")).unwrap().to_owned();
+    for stage in ["cameras", "depth", "splats", "alignment", "language"] {
+        assert!(kept(&said).contains(stage), "{stage}: {said}");
+    }
+    assert!(!said.contains("\"begin\",\"stage\":\"rgb"), "{said}");
+    assert!(content(&scene.at("again")) == b, "the same scene");
+    let said = scene.finished("home-b", "other", &["--resume", "--method", "langsplat"]);
+    let kept = kept(&said);
+    assert!(kept.contains("splats") && !kept.contains("language") && !kept.contains("alignment"), "{kept}");
+    // Without asking for it nothing is taken from earlier runs.
+    let said = scene.finished("home-b", "fresh", &[]);
+    assert!(!said.contains("kept from an earlier run"), "{said}");
+    assert!(content(&scene.at("fresh")) == b, "the same bits again");
+}
