@@ -1,4 +1,5 @@
 //! A run that is killed goes on with `--resume`, and ends with the same bits as one that was left alone.
+#![cfg(unix)]
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -30,13 +31,23 @@ impl Scene {
         self.folder.path().join(name)
     }
 
+    /// A folder like the one that set-up fills, without stages.
+    fn home(&self, name: &str) -> PathBuf {
+        let home = self.at(name);
+        if !home.exists() {
+            std::fs::create_dir(&home).unwrap();
+            for part in ["lib", "models"] {
+                std::os::unix::fs::symlink(splatvk::infer::home().join(part), home.join(part)).unwrap();
+            }
+        }
+        home
+    }
+
     /// `splatvk run`, with stages kept in the folder `home`.
     fn run(&self, home: &str, out: &str, extra: &[&str]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));
-        let models = splatvk::infer::Registry::open(None).unwrap().folders().to_vec();
         command
-            .env("SPLATVK_MODELS", std::env::join_paths(models).unwrap())
-            .env("SPLATVK_HOME", self.at(home))
+            .env("SPLATVK_HOME", self.home(home))
             .arg("run")
             .arg(self.at("photos"))
             .args([
@@ -49,7 +60,16 @@ impl Scene {
                 "--language-iterations",
                 "20",
             ])
-            .args(["--deterministic", "--query", "lemon", "--log", "json", "--out"])
+            .args([
+                "--checkpoint-seconds",
+                "0",
+                "--deterministic",
+                "--query",
+                "lemon",
+                "--log",
+                "json",
+                "--out",
+            ])
             .arg(self.at(out))
             .args(extra)
             .stdout(Stdio::null());
