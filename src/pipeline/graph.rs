@@ -3,7 +3,7 @@ use super::store::{Codec, Key, Store};
 use super::{Context, Lane, Stage};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::Device;
-use crate::infer::Registry;
+use crate::infer::{Registry, provider};
 use crate::progress::{Progress, Recorded};
 use crate::{Error, Result};
 use std::any::Any;
@@ -124,7 +124,7 @@ impl<'g> Graph<'g> {
         Output { node: self.nodes.len() - 1, made: PhantomData }
     }
 
-    /// Makes `targets` ([`Output::of`] several), reading from `store` what it has and keeping there what was made. The first
+    /// Makes `targets` ([`Output::target`]), reading from `store` what it has and keeping there what was made. The first
     /// error stops everything.
     pub fn run(
         &self,
@@ -163,10 +163,12 @@ impl<'g> Graph<'g> {
 
     fn keys(&self, device: &Device) -> Vec<Key> {
         let info = device.info();
-        let machine = format!("{} {} {}", info.name, info.driver, info.deterministic);
+        // Without ONNX Runtime no stage gets as far as keeping anything.
+        let provider = provider::name().unwrap_or_default();
+        let machine = format!("{} {} {} {provider}", info.name, info.driver, info.deterministic);
         let mut keys: Vec<Key> = Vec::with_capacity(self.nodes.len());
         for node in &self.nodes {
-            let machine = if node.lane == Lane::Device { machine.as_str() } else { "" };
+            let machine = if node.lane == Lane::Device { machine.as_str() } else { provider };
             let inputs: Vec<&Key> = node.needs.iter().map(|n| &keys[*n]).collect();
             keys.push(Key::of(node.name, &[program(), machine, &node.settings], &inputs));
         }
@@ -198,6 +200,7 @@ impl<'g> Graph<'g> {
                 }
             }
         }
+        state.kept.reverse();
         state
     }
 
@@ -284,6 +287,7 @@ impl Shared<'_, '_> {
             }
             self.changed.notify_all();
         }
+        // The lane is done, or the other one has failed and said so.
         std::mem::forget(failing);
         Ok(())
     }

@@ -44,8 +44,8 @@ pub trait Stage: Send {
     /// What it makes.
     type Output: Send + Sync + 'static;
 
-    /// Everything that the output depends on besides the inputs, the program and, on the device's lane, the device:
-    /// options, seeds, checksums of models and files.
+    /// Everything that the output depends on besides the inputs, the program, what computes networks and, on the device's
+    /// lane, the device: options, seeds, checksums of models and files.
     fn settings(&self) -> String;
 
     /// How the output is kept on disk; `None` for what is made again sooner than read.
