@@ -44,23 +44,14 @@ impl Scene {
         home
     }
 
-    /// `splatvk run`, with stages kept in the folder `home`.
-    fn run(&self, home: &str, out: &str, extra: &[&str]) -> Command {
+    /// `splatvk run` with `language` steps of semantic training, and with stages kept in the folder `home`.
+    fn run(&self, home: &str, out: &str, language: u32, resume: bool) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));
         command
             .env("SPLATVK_HOME", self.home(home))
             .arg("run")
             .arg(self.at("photos"))
-            .args([
-                "--max-size",
-                "200",
-                "--preset",
-                "draft",
-                "--iterations",
-                "40",
-                "--language-iterations",
-                "20",
-            ])
+            .args(["--max-size", "200", "--preset", "draft", "--iterations", "40"])
             .args([
                 "--checkpoint-seconds",
                 "0",
@@ -72,14 +63,15 @@ impl Scene {
                 "--out",
             ])
             .arg(self.at(out))
-            .args(extra)
+            .args(["--language-iterations", &language.to_string()])
+            .args(resume.then_some("--resume"))
             .stdout(Stdio::null());
         command
     }
 
     /// Runs to the end; what it said.
-    fn finished(&self, home: &str, out: &str, extra: &[&str]) -> String {
-        let output = self.run(home, out, extra).stderr(Stdio::piped()).output().unwrap();
+    fn finished(&self, home: &str, out: &str, language: u32, resume: bool) -> String {
+        let output = self.run(home, out, language, resume).stderr(Stdio::piped()).output().unwrap();
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(output.status.success(), "{said}");
         said
@@ -130,7 +122,7 @@ fn killed_after(mut child: Child, time: Duration) -> bool {
 fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
     let scene = Scene::new();
     let began = Instant::now();
-    scene.finished("home-a", "whole", &[]);
+    scene.finished("home-a", "whole", 20, false);
     let whole = began.elapsed();
     let kills: u32 = std::env::var(KILLS).map_or(3, |n| n.parse().unwrap());
     let mut state = 1u64;
@@ -138,7 +130,7 @@ fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
     for _ in 0..kills {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         let share = (state >> 33) as f64 / f64::from(1u32 << 31);
-        let child = scene.run("home-b", "resumed", &["--resume"]).stderr(Stdio::null()).spawn().unwrap();
+        let child = scene.run("home-b", "resumed", 20, true).stderr(Stdio::null()).spawn().unwrap();
         done = killed_after(child, whole.mul_f64(share));
         if done {
             break;
@@ -146,7 +138,7 @@ fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
         assert!(!scene.at("resumed").exists(), "a scene appears whole or not at all");
     }
     if !done {
-        scene.finished("home-b", "resumed", &["--resume"]);
+        scene.finished("home-b", "resumed", 20, true);
     }
     let (whole, resumed) = (scene.at("whole"), scene.at("resumed"));
     let names = |c: &[(PathBuf, Vec<u8>)]| c.iter().map(|f| f.0.clone()).collect::<Vec<_>>();
@@ -158,14 +150,14 @@ fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
     assert_eq!(statistics(&whole), statistics(&resumed));
 
     // Everything is there: nothing but decoding runs again. Then another late option: what precedes it stays.
-    let said = scene.finished("home-b", "again", &["--resume"]);
+    let said = scene.finished("home-b", "again", 20, true);
     let kept = |said: &str| said.lines().find(|l| l.contains("kept from an earlier run")).unwrap().to_owned();
     for stage in ["cameras", "depth", "splats", "alignment", "language"] {
         assert!(kept(&said).contains(stage), "{stage}: {said}");
     }
     assert!(!said.contains("\"begin\",\"stage\":\"rgb"), "{said}");
     assert!(content(&scene.at("again")) == b, "the same scene");
-    let said = scene.finished("home-b", "other", &["--resume", "--language-iterations", "10"]);
+    let said = scene.finished("home-b", "other", 10, true);
     let kept = kept(&said);
     assert!(kept.contains("splats") && kept.contains("alignment") && !kept.contains("language"), "{kept}");
 }
