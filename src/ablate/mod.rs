@@ -1,29 +1,30 @@
 //! `splatvk ablate`: the tables of the paper's experiments on a data set with ground truth.
 //!
-//! A table is a list of setups ([`Setup`]) that differ in one thing. The [`Lab`] runs them and shares every stage that two
-//! setups have in common: cameras, points and splats are made once for most tables. Figures are those of protocol `field`
-//! on held-out frames.
+//! A table is a list of setups ([`Setup`]) that differ in one thing. The [`Lab`] runs each as a graph of stages over one
+//! store in memory: cameras, points and splats are made once for most tables. Figures are those of protocol `field` on
+//! held-out frames.
 mod lab;
-mod setup;
+mod stages;
 mod table;
+mod tables;
 
-pub use lab::{Lab, Meaning, Outcome, feature_bytes};
-pub use setup::{Init, Row, Setup, Source, Table, rows};
+pub use lab::{Lab, Outcome, feature_bytes};
+pub use stages::{Meaning, Scored};
 pub use table::{Done, Finished, figures};
+pub use tables::{Available, Regions, Row, Runs, Setup, TABLES, Table, table};
 
 use crate::fit::{LanguageOptions, Preset, RgbOptions};
 use crate::query::eval::Split;
-use crate::run::Method;
-use crate::synth::regions::Flaws;
+use crate::run::{method::SPARSELGS, sources};
 use crate::{Error, Result};
 
 /// What to run.
-#[derive(Clone, Debug, serde::Serialize)]
+#[derive(Clone, serde::Serialize)]
 pub struct Plan {
     /// In order.
-    pub tables: Vec<Table>,
+    pub tables: Vec<&'static Table>,
     /// Masks and features for every table; none = what each table is about.
-    pub source: Option<Source>,
+    pub regions: Option<Regions>,
     /// Photos of the default row; none = all train frames, at most [`crate::photo::DEFAULT_VIEWS`].
     pub views: Option<usize>,
     /// Take the true cameras in every row, for photos that alone would give none.
@@ -39,8 +40,8 @@ pub struct Plan {
 impl Default for Plan {
     fn default() -> Self {
         Plan {
-            tables: Table::ALL.to_vec(),
-            source: None,
+            tables: TABLES.iter().collect(),
+            regions: None,
             views: None,
             true_cameras: false,
             seed: 0,
@@ -51,22 +52,8 @@ impl Default for Plan {
     }
 }
 
-/// Masks and features that a table is run with when the user does not say.
-fn sources(table: Table, seed: u64) -> Vec<Source> {
-    let flawed = Source::Flawed(Flaws::usual(seed));
-    match table {
-        // What these are about is errors of masks and features; the built-in models make few on an easy scene.
-        Table::Alignment | Table::Bijection | Table::Methods => vec![Source::BuiltIn, flawed],
-        Table::Features => vec![Source::BuiltIn, flawed, Source::Exact],
-        Table::Dimension => vec![Source::BuiltIn],
-        // Perfect regions leave geometry as the only cause of a difference.
-        Table::ImageLoss | Table::Points | Table::Initializer => vec![Source::Exact],
-        Table::Views => vec![flawed],
-    }
-}
-
 /// Runs one table.
-pub fn run(lab: &mut Lab, plan: &Plan, table: Table) -> Result<Finished> {
+pub fn run(lab: &mut Lab, plan: &Plan, table: &'static Table) -> Result<Finished> {
     let count = |split| lab.truth.frames.iter().filter(|f| f.split == split).count();
     let (train, test) = (count(Split::Train), count(Split::Test));
     if train < 2 || test == 0 {
@@ -75,48 +62,49 @@ pub fn run(lab: &mut Lab, plan: &Plan, table: Table) -> Result<Finished> {
             lab.truth.folder.display()
         )));
     }
-    let base = Setup {
-        views: plan.views.unwrap_or(train.min(crate::photo::DEFAULT_VIEWS)),
-        init: if plan.true_cameras { Init::TrueCameras } else { Init::Sfm },
-        max_points: None,
-        source: Source::BuiltIn,
-        recipe: Method::SparseLgs.recipe(),
-        iterations: plan.iterations,
-        language_iterations: plan.language_iterations,
-    };
-    let sources = plan.source.clone().map_or_else(|| sources(table, plan.seed), |s| vec![s]);
-    let rows = rows(table, &base, &sources, &lab.means());
+    let available = lab.available();
+    let given = plan.regions.clone().map(|regions| vec![regions]);
     let mut finished = Finished { table, seen: Vec::new(), rows: Vec::new() };
-    for mut row in rows {
-        let done = match &row.setup {
-            Some(setup) => {
-                for frame in lab.frames(setup.views)?.into_iter().filter(|f| f.split == Split::Test) {
-                    finished.seen.push(frame.stem);
-                }
-                match lab.outcome(setup) {
-                    Ok(outcome) => Done { bytes: Some(outcome.feature_bytes), outcome: Some(outcome), row },
-                    // What a device cannot hold is a finding about it; the other rows still count.
-                    Err(Error::Gpu(why)) => {
-                        row.note = why;
-                        Done { bytes: None, outcome: None, row }
-                    }
-                    Err(e) => return Err(e),
-                }
-            }
-            None if table == Table::Bijection => {
-                let setup = Setup { source: find(&sources, &row.group), ..base.clone() };
-                let (splats, pixels, dim) = lab.sizes(&setup)?;
-                Done { bytes: Some(feature_bytes(splats, 3 * dim, pixels)), outcome: None, row }
-            }
-            None => Done { bytes: None, outcome: None, row },
+    for regions in given.unwrap_or_else(|| (table.regions)(plan.seed, &available)) {
+        let base = Setup {
+            views: plan.views.unwrap_or(train.min(crate::photo::DEFAULT_VIEWS)),
+            init: sources::default::<sources::Geometry>(),
+            true_cameras: plan.true_cameras,
+            max_points: None,
+            regions,
+            recipe: SPARSELGS.recipe,
+            iterations: plan.iterations,
+            language_iterations: plan.language_iterations,
         };
-        finished.rows.push(done);
+        let group = tables::Group { base, available: &available };
+        for row in (table.rows)(&group) {
+            finished.rows.push(done(lab, row, &mut finished.seen)?);
+        }
     }
     finished.seen.sort();
     finished.seen.dedup();
     Ok(finished)
 }
 
-fn find(sources: &[Source], name: &str) -> Source {
-    sources.iter().find(|s| s.name() == name).cloned().unwrap_or(Source::BuiltIn)
+/// Runs a row; `seen` collects held-out frames that it has seen as photos.
+fn done(lab: &mut Lab, mut row: Row, seen: &mut Vec<String>) -> Result<Done> {
+    let setup = match &row.runs {
+        Runs::Scored(setup) => setup,
+        Runs::Unreduced(setup) => {
+            let bytes = Some(lab.unreduced_bytes(setup)?);
+            return Ok(Done { bytes, outcome: None, row });
+        }
+        Runs::Nothing => return Ok(Done { bytes: None, outcome: None, row }),
+    };
+    let photos = lab.frames(setup.views)?.into_iter();
+    seen.extend(photos.filter(|f| f.split == Split::Test).map(|f| f.stem));
+    match lab.outcome(setup) {
+        Ok(outcome) => Ok(Done { bytes: Some(outcome.feature_bytes), outcome: Some(outcome), row }),
+        // What a device cannot hold is a finding about it; the other rows still count.
+        Err(Error::Gpu(why)) => {
+            row.note = why;
+            Ok(Done { bytes: None, outcome: None, row })
+        }
+        Err(e) => Err(e),
+    }
 }

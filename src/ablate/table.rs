@@ -1,18 +1,17 @@
 //! Finished rows as text, JSON and a chart.
 use super::lab::Outcome;
-use super::setup::{Row, Table};
+use super::tables::{Column, Row, Runs, Table};
 use crate::query::eval::Split;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::fmt::Write;
-use std::rc::Rc;
 
 /// A row and what it gave.
 pub struct Done {
     /// What it was.
     pub row: Row,
     /// What it gave; none for a row without a setup.
-    pub outcome: Option<Rc<Outcome>>,
+    pub outcome: Option<Outcome>,
     /// Bytes of the features in training.
     pub bytes: Option<u64>,
 }
@@ -20,29 +19,16 @@ pub struct Done {
 /// A table that ran.
 pub struct Finished {
     /// Which.
-    pub table: Table,
+    pub table: &'static Table,
     /// Frames that no row may be scored on, because some row has seen them as photos.
     pub seen: Vec<String>,
     /// Rows in order.
     pub rows: Vec<Done>,
 }
 
-/// Column name, decimals.
-type Column = (&'static str, usize);
-
-const FIGURES: [Column; 2] = [("mIoU", 3), ("mAcc", 3)];
-
-fn columns(table: Table) -> Vec<Column> {
-    let mut out = FIGURES.to_vec();
-    out.extend_from_slice(match table {
-        Table::Alignment => &[("SIM", 3), ("MSE", 4), ("codes", 0)][..],
-        Table::Bijection | Table::Dimension | Table::Methods => &[("SIM", 3), ("MB", 0)],
-        Table::ImageLoss => &[("PSNR", 2), ("SIM", 3)],
-        Table::Points | Table::Views | Table::Initializer => &[("PSNR", 2), ("splats", 0)],
-        Table::Features => &[("SIM", 3), ("codes", 0)],
-    });
-    out.extend([("mIoU photos", 3), ("seconds", 0)]);
-    out
+fn columns(table: &Table) -> Vec<Column> {
+    let (first, last) = ([("mIoU", 3), ("mAcc", 3)], [("mIoU photos", 3), ("seconds", 0)]);
+    first.iter().chain(table.columns).chain(&last).copied().collect()
 }
 
 fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
@@ -59,15 +45,15 @@ pub fn figures(done: &Done, seen: &[String]) -> BTreeMap<&'static str, f64> {
     put("MB", done.bytes.map(|b| b as f64 / 1e6));
     let Some(o) = &done.outcome else { return out };
     let held_out = |split: Split, frame: &String| split == Split::Test && !seen.contains(frame);
-    let masks = || o.report.masks.iter().filter(|m| held_out(m.split, &m.frame));
+    let masks = || o.scored.report.masks.iter().filter(|m| held_out(m.split, &m.frame));
     put("mIoU", mean(masks().map(|m| m.iou)));
     put("mAcc", mean(masks().map(|m| f64::from(m.localised))));
-    let images = o.report.images.iter().filter(|i| held_out(i.split, &i.frame));
+    let images = o.scored.report.images.iter().filter(|i| held_out(i.split, &i.frame));
     put("PSNR", mean(images.map(|i| i.psnr)));
-    let meaning = || o.meaning.iter().filter(|m| held_out(m.split, &m.frame));
+    let meaning = || o.scored.meaning.iter().filter(|m| held_out(m.split, &m.frame));
     put("SIM", mean(meaning().map(|m| m.similarity)));
     put("MSE", mean(meaning().map(|m| m.mse)));
-    put("mIoU photos", mean(o.report.masks.iter().filter(|m| m.split == Split::Train).map(|m| m.iou)));
+    put("mIoU photos", mean(o.scored.report.masks.iter().filter(|m| m.split == Split::Train).map(|m| m.iou)));
     put("splats", Some(o.splats as f64));
     put("codes", Some(o.codes.iter().sum::<usize>() as f64));
     put("seconds", Some(o.seconds));
@@ -79,7 +65,7 @@ impl Finished {
     pub fn text(&self) -> String {
         let columns = columns(self.table);
         let mut cells: Vec<Vec<String>> = vec![
-            std::iter::once(self.table.name().to_owned()).chain(columns.iter().map(|c| c.0.into())).collect(),
+            std::iter::once(self.table.name.to_owned()).chain(columns.iter().map(|c| c.0.into())).collect(),
         ];
         let mut group = String::new();
         for done in &self.rows {
@@ -128,11 +114,15 @@ impl Finished {
     /// Everything, for other programs.
     pub fn json(&self) -> Value {
         let row = |done: &Done| {
+            let setup = match &done.row.runs {
+                Runs::Scored(setup) => Some(setup),
+                Runs::Unreduced(_) | Runs::Nothing => None,
+            };
             json!({
-                "group": done.row.group, "label": done.row.label, "note": done.row.note, "setup": done.row.setup,
+                "group": done.row.group, "label": done.row.label, "note": done.row.note, "setup": setup,
                 "figures": figures(done, &self.seen),
                 "paper": done.row.paper.iter().map(|p| (p.0.to_owned(), json!(p.1))).collect::<serde_json::Map<_, _>>(),
-                "iou": done.outcome.as_ref().and_then(|o| o.report.summary.get("test")).map(|s| s.iou.clone()),
+                "iou": done.outcome.as_ref().and_then(|o| o.scored.report.summary.get("test")).map(|s| s.iou.clone()),
             })
         };
         json!({
@@ -159,7 +149,7 @@ impl Finished {
             .collect();
         crate::report::chart::bar_chart(
             &bars,
-            &format!("{}: mIoU on held-out views, tick = paper", self.table.name()),
+            &format!("{}: mIoU on held-out views, tick = paper", self.table.name),
         )
     }
 }
@@ -167,7 +157,8 @@ impl Finished {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ablate::lab::Meaning;
+    use crate::ablate::stages::{Meaning, Scored};
+    use crate::ablate::tables::table;
     use crate::query::eval::{MaskScore, Report};
 
     fn mask(frame: &str, split: Split, iou: f64, localised: bool) -> MaskScore {
@@ -194,8 +185,10 @@ mod tests {
         ];
         let meaning = Meaning { frame: "c".into(), split: Split::Test, similarity: 0.5, mse: 0.1 };
         let outcome = Outcome {
-            report: Report { masks, ..Report::default() },
-            meaning: vec![meaning],
+            scored: std::sync::Arc::new(Scored {
+                report: Report { masks, ..Report::default() },
+                meaning: vec![meaning],
+            }),
             splats: 7,
             codes: vec![1, 2],
             feature_bytes: 5_000_000,
@@ -204,21 +197,19 @@ mod tests {
         let row = |label: &str, paper: Vec<(&'static str, f64)>| Row {
             label: label.into(),
             group: "g".into(),
-            setup: None,
+            runs: Runs::Nothing,
             note: String::new(),
             paper,
         };
-        let done = Done {
-            row: row("one", vec![("mIoU", 0.538)]),
-            outcome: Some(Rc::new(outcome)),
-            bytes: Some(5_000_000),
-        };
+        let done =
+            Done { row: row("one", vec![("mIoU", 0.538)]), outcome: Some(outcome), bytes: Some(5_000_000) };
         let f = figures(&done, &["a".to_string()]);
         assert_eq!((f["mIoU"], f["mAcc"], f["mIoU photos"], f["codes"]), (0.8, 1.0, 0.9, 3.0));
         assert_eq!(figures(&done, &[])["mIoU"], 0.6);
         let none =
             Done { row: Row { note: "why".into(), ..row("two", vec![]) }, outcome: None, bytes: Some(1) };
-        let finished = Finished { table: Table::Alignment, seen: vec!["a".into()], rows: vec![done, none] };
+        let finished =
+            Finished { table: table("alignment").unwrap(), seen: vec!["a".into()], rows: vec![done, none] };
         let text = finished.text();
         assert!(text.contains("0.800 (0.538)") && text.contains("why") && text.contains("[g]"), "{text}");
         let json = finished.json();

@@ -73,8 +73,8 @@ impl<'a> Bench<'a> {
     /// A text query in all views of a scene.
     pub fn query(
         &mut self,
-        scene: (&Splats, &LanguageField, &[Camera]),
-        encoder: &mut dyn RegionEncoder,
+        scene: (&Splats, LanguageField, &[Camera]),
+        encoder: Box<dyn RegionEncoder>,
         text: &str,
     ) -> Result<()> {
         let section = latency::measure(self.device, scene, encoder, text, &self.budget)?;

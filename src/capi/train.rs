@@ -5,11 +5,14 @@ use super::progress::Callback;
 use super::scene::{SvkScene, camera_in};
 use super::types::*;
 use crate::fit::Preset;
+use crate::infer::Registry;
+use crate::infer::installed::{Inventory, inventory};
 use crate::photo::{self, Photo};
 use crate::pose::choose;
 use crate::progress::Progress;
 use crate::run::live::LiveScene;
-use crate::run::{self, FEATURE_DIM, FeatureSource, InitSource, MaskSource, RunPlan};
+use crate::run::sources::{self, Kind, SourceChoice, choose};
+use crate::run::{self, Method, RunPlan};
 use crate::scene::{Camera, RgbImage};
 use std::path::{Path, PathBuf};
 
@@ -32,7 +35,8 @@ pub unsafe extern "C" fn svk_train(
             let options = boundary::read_or_default(options)?;
             let given = boundary::read_array(photos, photo_count)?;
             // What is wrong with the options is said before the photos are read.
-            let mut plan = RunPlan { models: context.models.clone(), ..plan(&options)? };
+            let networks = inventory(&Registry::open(context.models.as_deref())?);
+            let mut plan = RunPlan { models: context.models.clone(), ..plan(&options, &networks)? };
             let progress = Callback::new(options.progress, options.user);
             let max_size = match options.max_size as usize {
                 0 => photo::default_max_size(context.device.info().is_cpu),
@@ -42,10 +46,12 @@ pub unsafe extern "C" fn svk_train(
             let (photos, cameras) = gather(&given, options.views as usize, max_size, &progress)?;
             plan.inputs = photos.iter().map(|p| p.path.clone()).collect();
             if !cameras.is_empty() {
-                if plan.init != InitSource::Sfm {
-                    return argument("cameras are given with the photos and as a file; give one of them");
+                if plan.init != RunPlan::default().init {
+                    return argument(
+                        "cameras are given with the photos and in the options; give one of them",
+                    );
                 }
-                plan.init = InitSource::Given(cameras);
+                plan.cameras = cameras;
             }
             let outcome = run::reconstruct(&plan, &context.device, photos, &progress)?;
             let live = LiveScene::trained(&context.device, outcome, context.models.as_deref())?;
@@ -133,7 +139,7 @@ unsafe fn pixels(given: &SvkPhoto, name: &Path) -> Result<RgbImage, Fault> {
     Ok(RgbImage { width, height, data })
 }
 
-unsafe fn plan(o: &SvkTrainOptions) -> Result<RunPlan, Fault> {
+unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Fault> {
     let preset = match o.preset {
         0 => None,
         1 => Some(Preset::Draft),
@@ -144,25 +150,52 @@ unsafe fn plan(o: &SvkTrainOptions) -> Result<RunPlan, Fault> {
     if ![0, 3, 8, 16].contains(&o.feature_dim) {
         return argument(format!("SvkTrainOptions.feature_dim is {}; 3, 8 or 16", o.feature_dim));
     }
-    // SAFETY: per the header.
-    let (file, masks, features) = unsafe {
-        (
-            boundary::path(o.cameras, "SvkTrainOptions.cameras")?,
-            boundary::path(o.masks, "SvkTrainOptions.masks")?,
-            boundary::path(o.features, "SvkTrainOptions.features")?,
-        )
-    };
+    // SAFETY: texts per the header.
+    let text = |pointer, field: &str| unsafe { boundary::text(pointer, &format!("SvkTrainOptions.{field}")) };
+    // SAFETY: as above.
+    let path = |pointer, field: &str| unsafe { boundary::path(pointer, &format!("SvkTrainOptions.{field}")) };
     let count = |n: u64| usize::try_from(n).ok().filter(|n| *n > 0);
+    let method = text(o.method, "method")?.map(|name| Method::named(&name)).transpose()?;
+    let method = method.unwrap_or(RunPlan::default().method);
     Ok(RunPlan {
         preset,
-        init: file.map_or(InitSource::Sfm, InitSource::Cameras),
-        masks: masks.map_or(MaskSource::Graph, MaskSource::Dir),
-        features: features.map_or(FeatureSource::Words, FeatureSource::Dir),
+        init: source::<sources::Geometry>(
+            text(o.init, "init")?,
+            path(o.cameras, "cameras")?.map(|file| SourceChoice::with("cameras", file)),
+            networks,
+        )?,
+        matcher: source::<sources::Matches>(text(o.matcher, "matcher")?, None, networks)?,
+        masks: source::<sources::Masks>(
+            text(o.mask_source, "mask_source")?,
+            path(o.masks, "masks")?.map(|dir| SourceChoice::with("dir", dir)),
+            networks,
+        )?,
+        features: source::<sources::Features>(
+            text(o.feature_source, "feature_source")?,
+            path(o.features, "features")?.map(|dir| SourceChoice::with("dir", dir)),
+            networks,
+        )?,
         seed: o.seed,
         iterations: count(o.iterations),
         language_iterations: count(o.language_iterations),
-        feature_dim: if o.feature_dim == 0 { FEATURE_DIM } else { o.feature_dim as usize },
+        method,
+        feature_dim: if o.feature_dim == 0 { method.recipe.feature_dim } else { o.feature_dim as usize },
         per_level: o.per_level != 0,
         ..RunPlan::default()
     })
+}
+
+/// A source by its name, or by the file or folder that an older field holds, or the built-in one.
+fn source<K: Kind>(
+    named: Option<String>,
+    given: Option<SourceChoice>,
+    networks: &Inventory,
+) -> Result<SourceChoice, Fault> {
+    match (named, given) {
+        (Some(_), Some(given)) => {
+            argument(format!("{}: {given} is given twice; give one of the two", K::OPTION))
+        }
+        (Some(text), None) => Ok(choose::<K>(&text, networks)?),
+        (None, given) => Ok(given.unwrap_or_else(sources::default::<K>)),
+    }
 }

@@ -266,6 +266,17 @@ pub struct SvkTrainOptions {
     /// Longer side of the working images, pixels: larger photos are scaled down, none is enlarged. 0 = 800 on a CPU device,
     /// 1600 on a GPU.
     pub max_size: u64,
+    /// Cameras and points, as `splatvk run --init` takes it: "sfm", "cameras:FILE", the name of an installed network, or "auto"
+    /// for the best of them. NULL = `cameras`, or else "sfm".
+    pub init: *const c_char,
+    /// Dense matches, as --matcher takes it. NULL = built-in.
+    pub matcher: *const c_char,
+    /// Masks, as --masks takes it. NULL = `masks`, or else built-in.
+    pub mask_source: *const c_char,
+    /// Region features, as --features takes it. NULL = `features`, or else built-in.
+    pub feature_source: *const c_char,
+    /// How language gets onto the splats, as --method takes it. NULL = "sparselgs".
+    pub method: *const c_char,
 }
 
 /// What a scene holds.

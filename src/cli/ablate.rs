@@ -1,14 +1,13 @@
 //! `splatvk ablate`
-use super::args::{AblateArgs, TableArg};
+use super::args::AblateArgs;
 use super::plan::existing;
 use super::progress;
 use super::{print, print_json};
-use crate::ablate::{self, Finished, Lab, Plan, Source, Table};
+use crate::ablate::{self, Finished, Lab, Plan, Regions, TABLES, Table};
 use crate::format::{create_folder, write_json};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::query::eval::GroundTruth;
-use crate::synth::regions::Flaws;
 use crate::{Error, Result};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -32,7 +31,7 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
     let mut lab = Lab::open(device, registry, truth, plan.seed, progress.as_ref());
     let mut tables: Vec<Value> = Vec::new();
     let mut report = Value::Null;
-    for &table in &plan.tables {
+    for table in plan.tables.iter().copied() {
         let finished = ablate::run(&mut lab, &plan, table)?;
         tables.push(finished.json());
         report = json!({
@@ -52,7 +51,7 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
 }
 
 fn write(out: &Path, finished: &Finished, report: &Value) -> Result<()> {
-    let file = |extension: &str| out.join(format!("{}.{extension}", finished.table.name()));
+    let file = |extension: &str| out.join(format!("{}.{extension}", finished.table.name));
     std::fs::write(file("txt"), finished.text()).map_err(Error::io(file("txt")))?;
     std::fs::write(file("svg"), finished.svg()).map_err(Error::io(file("svg")))?;
     write_json(&out.join("ablate.json"), report)
@@ -74,8 +73,8 @@ fn plan(args: &AblateArgs) -> Result<Plan> {
         }
     }
     Ok(Plan {
-        tables: args.tables.iter().flat_map(|&t| tables(t)).collect(),
-        source: args.regions.as_deref().map(|s| source(s, args.seed)).transpose()?,
+        tables: args.tables.iter().flat_map(|t| tables(t)).collect(),
+        regions: args.regions.as_deref().map(|s| regions(s, args.seed)).transpose()?,
         views: args.views,
         true_cameras: args.true_cameras,
         seed: args.seed,
@@ -84,27 +83,16 @@ fn plan(args: &AblateArgs) -> Result<Plan> {
     })
 }
 
-fn tables(table: TableArg) -> Vec<Table> {
-    match table {
-        TableArg::All => Table::ALL.to_vec(),
-        TableArg::Alignment => vec![Table::Alignment],
-        TableArg::Bijection => vec![Table::Bijection],
-        TableArg::Dimension => vec![Table::Dimension],
-        TableArg::ImageLoss => vec![Table::ImageLoss],
-        TableArg::Features => vec![Table::Features],
-        TableArg::Points => vec![Table::Points],
-        TableArg::Views => vec![Table::Views],
-        TableArg::Initializer => vec![Table::Initializer],
-        TableArg::Methods => vec![Table::Methods],
-    }
+fn tables(name: &str) -> Vec<&'static Table> {
+    TABLES.iter().filter(|t| name == "all" || t.name == name).collect()
 }
 
-fn source(text: &str, seed: u64) -> Result<Source> {
+fn regions(text: &str, seed: u64) -> Result<Regions> {
     match text.split_once(':') {
-        Some(("dir", dir)) if !dir.is_empty() => Ok(Source::Dir(existing("--regions", dir)?)),
-        None if text == "built-in" => Ok(Source::BuiltIn),
-        None if text == "flawed" => Ok(Source::Flawed(Flaws::usual(seed))),
-        None if text == "exact" => Ok(Source::Exact),
+        Some(("dir", dir)) if !dir.is_empty() => Ok(Regions::given(existing("--regions", dir)?)),
+        None if text == "built-in" => Ok(Regions::built_in()),
+        None if text == "flawed" => Ok(Regions::flawed(seed)),
+        None if text == "exact" => Ok(Regions::EXACT),
         _ => Err(Error::input(format!(
             "--regions {text}: unknown; use one of: built-in, flawed, exact, dir:DIR"
         ))),

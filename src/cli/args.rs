@@ -7,8 +7,9 @@ use std::path::PathBuf;
 mod bench;
 mod experiments;
 
+pub use super::run::RunArgs;
 pub use bench::{BenchArgs, BenchPart};
-pub use experiments::{AblateArgs, GenerateArgs, TableArg};
+pub use experiments::{AblateArgs, GenerateArgs};
 
 /// Photos in, a 3D scene that answers text queries out.
 #[derive(Debug, Parser)]
@@ -80,19 +81,6 @@ pub enum PresetArg {
     Paper,
 }
 
-/// Methods to compare; each changes only what its authors do differently to language.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum MethodArg {
-    /// Alignment across views, a code per thing, photos in the loss
-    Sparselgs,
-    /// No alignment, a scene autoencoder to 3 numbers, features only
-    Langsplat,
-    /// No alignment, 128 quantised features read by an index head, smoothed in space
-    Legaussians,
-    /// No alignment, features lifted onto the stereo points in one pass, nothing optimised
-    Lsm,
-}
-
 /// Options that every command working on a device takes.
 #[derive(Clone, Debug, Default, Args)]
 pub struct DeviceArgs {
@@ -105,81 +93,6 @@ pub struct DeviceArgs {
     /// Print one JSON object on standard output
     #[arg(long)]
     pub json: bool,
-}
-
-/// `splatvk run`
-#[derive(Debug, Args)]
-pub struct RunArgs {
-    /// Photos, folders of photos (JPEG, PNG, HEIC, AVIF, WebP, TIFF), or a video
-    #[arg(required = true, value_name = "INPUT")]
-    pub inputs: Vec<PathBuf>,
-    /// How many photos to use: sharp ones that overlap, from different places [default: all, at most 4]
-    #[arg(long, value_name = "N")]
-    pub views: Option<usize>,
-    /// Scene directory to write [default: out/NAME, after the input]
-    #[arg(long, value_name = "DIR")]
-    pub out: Option<PathBuf>,
-    /// Replace a scene that is already there
-    #[arg(long)]
-    pub force: bool,
-    /// Go on after a run that ended early, or change a late option: stages with the same photos and settings are not run again
-    #[arg(long)]
-    pub resume: bool,
-    /// How often training keeps its state for --resume, seconds
-    #[arg(long, default_value_t = crate::run::CHECKPOINT_SECONDS, value_name = "N")]
-    pub checkpoint_seconds: u64,
-    /// Time against quality [default: draft on a CPU device, default on a GPU]
-    #[arg(long, value_enum)]
-    pub preset: Option<PresetArg>,
-    /// Cameras and points: auto (the best network installed, else sfm), sfm, cameras:FILE (transforms.json, COLMAP folder, cameras.json), or an installed network:
-    /// mast3r, dust3r, vggt, da3
-    #[arg(long, default_value = "auto", value_name = "SOURCE")]
-    pub init: String,
-    /// Dense matches for the alignment of masks: auto (as above, else xfeat), xfeat, or an installed network: roma, mast3r
-    #[arg(long, default_value = "auto", value_name = "NAME")]
-    pub matcher: String,
-    /// Masks on three levels: auto (as above, else graph), graph, dir:DIR (STEM_s.npy), or an installed network: sam, sam2
-    #[arg(long, default_value = "auto", value_name = "SOURCE")]
-    pub masks: String,
-    /// Points along each side of a photo at which a mask network is asked
-    #[arg(long, default_value_t = 32, value_name = "N")]
-    pub mask_points: usize,
-    /// Do not ask the mask network about four overlapping crops as well: five times faster, misses small things
-    #[arg(long)]
-    pub no_mask_crops: bool,
-    /// Region features: auto (as above, else words), words, dir:DIR (STEM_f.npy, text_embeddings.npz), or an installed network: clip, lseg
-    #[arg(long, default_value = "auto", value_name = "SOURCE")]
-    pub features: String,
-    /// Ask the finished scene; may be repeated
-    #[arg(long = "query", value_name = "TEXT")]
-    pub queries: Vec<String>,
-    /// Seed of everything random
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
-    /// Same bits on every run on one machine: training adds up gradients in a fixed order, about a tenth slower
-    #[arg(long)]
-    pub deterministic: bool,
-    /// Optimisation steps of the colour stage, instead of the preset's
-    #[arg(long, value_name = "N")]
-    pub iterations: Option<usize>,
-    /// Optimisation steps of the language stage, instead of the preset's
-    #[arg(long, value_name = "N")]
-    pub language_iterations: Option<usize>,
-    /// Length of the codes that splats carry: 3, 8 or 16 [default: 16; langsplat 3, legaussians 8]
-    #[arg(long, value_name = "D")]
-    pub feature_dim: Option<usize>,
-    /// How language gets onto the splats: this program's way, or a baseline on the same geometry to compare with
-    #[arg(long, value_enum, default_value = "sparselgs")]
-    pub method: MethodArg,
-    /// One model per level as in the paper, instead of one geometry for all three
-    #[arg(long)]
-    pub per_level: bool,
-    /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged [default: 800 on a CPU device, 1600 on a GPU]
-    #[arg(long, value_name = "N")]
-    pub max_size: Option<usize>,
-    /// Device and models
-    #[command(flatten)]
-    pub device: DeviceArgs,
 }
 
 /// `splatvk train`

@@ -35,7 +35,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     // Everything that can be wrong with the input comes before the first measurement.
     let workload =
         if has(BenchPart::Training) || !args.sweep.is_empty() { Some(workload(args)?) } else { None };
-    let mut asked = if has(BenchPart::Query) { Some(asked(args)?) } else { None };
+    let asked = if has(BenchPart::Query) { Some(asked(args)?) } else { None };
     writable(args.json.as_deref())?;
     let device = Device::open(args.device.as_deref())?;
     let mut bench = Bench::new(&device, budget)?;
@@ -50,9 +50,9 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     if has(BenchPart::Sort) {
         bench.sort(args.keys)?;
     }
-    if let Some((scene, encoder)) = &mut asked {
-        let field = scene.language.as_ref().ok_or_else(|| Error::work("the scene lost its language"))?;
-        bench.query((&scene.splats, field, &scene.cameras), encoder.as_mut(), &args.query)?;
+    if let Some((scene, encoder)) = asked {
+        let field = scene.language.ok_or_else(|| Error::work("the scene lost its language"))?;
+        bench.query((&scene.splats, field, &scene.cameras), encoder, &args.query)?;
     }
     if let Some(file) = &args.json {
         write_json(file, &bench.report)?;

@@ -2,8 +2,10 @@
 use super::args::DoctorArgs;
 use super::{models, print, print_json};
 use crate::gpu::report::{Line, Status, vulkan};
+use crate::infer::installed::inventory;
 use crate::infer::{self, Registry};
 use crate::photo;
+use crate::run::sources;
 use crate::{Error, Result};
 use serde_json::json;
 use std::fmt::Write;
@@ -18,7 +20,8 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
     });
     let notes = infer::provider::notes().unwrap_or_default();
     lines.extend(notes.into_iter().map(|n| line("ONNX Runtime", Status::Note, n, None)));
-    let status = Registry::open(args.device.models.as_deref())?.status();
+    let registry = Registry::open(args.device.models.as_deref())?;
+    let status = registry.status();
     for m in &status {
         let found = format!(
             "{} · {:.1} MB · {} · sha256 {}",
@@ -30,6 +33,10 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
         let state = if m.installed { Status::Ok } else { Status::Missing };
         lines.push(line(&format!("model {}", m.name), state, found, m.fix.clone()));
     }
+    let networks = inventory(&registry);
+    lines.extend(
+        sources::list(&networks).into_iter().map(|(option, found)| line(&option, Status::Ok, found, None)),
+    );
     // Photos of other kinds are read without it, so this is no fault of the machine.
     let (found, advice) = photo::heif_support();
     lines.push(line("HEIC, AVIF", if advice.is_some() { Status::Note } else { Status::Ok }, found, advice));

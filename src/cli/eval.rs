@@ -10,9 +10,9 @@ use crate::query::TextQuery;
 use crate::query::eval::{Evaluation, GroundTruth, Report};
 use crate::query::protocol::{self, CodeScores, Kind, Masks, Seen};
 use crate::report::file_name;
+use crate::run::ask;
 use crate::run::encoder;
 use crate::run::score::score_field;
-use crate::run::sources;
 use crate::run::view::Viewer;
 use crate::scene::LanguageField;
 use crate::{Error, Result};
@@ -48,7 +48,7 @@ fn ask(scene: &Scene, texts: &[String], args: &EvalArgs) -> Result<Vec<TextQuery
     }
     let registry = Registry::open(args.device.models.as_deref())?;
     let mut encoder = encoder::of_scene(scene, registry)?;
-    sources::queries(texts, encoder.as_mut())
+    ask::embedded(texts, encoder.as_mut())
 }
 
 fn field(scene: &Scene, args: &EvalArgs) -> Result<Report> {

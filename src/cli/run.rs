@@ -1,18 +1,269 @@
 //! `splatvk run`
-use super::args::RunArgs;
+use super::args::{DeviceArgs, PresetArg};
 use super::progress;
 use super::{plan, print, print_json};
 use crate::infer::Registry;
-use crate::infer::installed::inventory;
+use crate::infer::installed::{Inventory, inventory};
+use crate::language::Reducer;
+use crate::language::sam::SamOptions;
+use crate::run::method::METHODS;
+use crate::run::sources::{self, Features, Geometry, Masks, Matches, choose};
+use crate::run::{Method, RunPlan};
 use crate::{Error, Result};
+use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser};
+use std::path::{Path, PathBuf};
+
+/// `splatvk run`
+#[derive(Debug, Args)]
+pub struct RunArgs {
+    /// Photos, folders of photos (JPEG, PNG, HEIC, AVIF, WebP, TIFF), or a video
+    #[arg(required = true, value_name = "INPUT")]
+    pub inputs: Vec<PathBuf>,
+    /// How many photos to use: sharp ones that overlap, from different places [default: all, at most 4]
+    #[arg(long, value_name = "N")]
+    pub views: Option<usize>,
+    /// Scene directory to write [default: out/NAME, after the input]
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Replace a scene that is already there
+    #[arg(long)]
+    pub force: bool,
+    /// Go on after a run that ended early, or change a late option: stages with the same photos and settings are not run again
+    #[arg(long)]
+    pub resume: bool,
+    /// How often training keeps its state for --resume, seconds
+    #[arg(long, default_value_t = crate::run::CHECKPOINT_SECONDS, value_name = "N")]
+    pub checkpoint_seconds: u64,
+    /// Time against quality [default: draft on a CPU device, default on a GPU]
+    #[arg(long, value_enum)]
+    pub preset: Option<PresetArg>,
+    /// A source of the table
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<Geometry>())]
+    pub init: String,
+    /// A source of the table
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<Matches>())]
+    pub matcher: String,
+    /// A source of the table
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<Masks>())]
+    pub masks: String,
+    /// Points along each side of a photo at which a mask network is asked
+    #[arg(long, default_value_t = 32, value_name = "N")]
+    pub mask_points: usize,
+    /// Do not ask the mask network about four overlapping crops as well: five times faster, misses small things
+    #[arg(long)]
+    pub no_mask_crops: bool,
+    /// A source of the table
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<Features>())]
+    pub features: String,
+    /// Ask the finished scene; may be repeated
+    #[arg(long = "query", value_name = "TEXT")]
+    pub queries: Vec<String>,
+    /// Seed of everything random
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Same bits on every run on one machine: training adds up gradients in a fixed order, about a tenth slower
+    #[arg(long)]
+    pub deterministic: bool,
+    /// Optimisation steps of the colour stage, instead of the preset's
+    #[arg(long, value_name = "N")]
+    pub iterations: Option<usize>,
+    /// Optimisation steps of the language stage, instead of the preset's
+    #[arg(long, value_name = "N")]
+    pub language_iterations: Option<usize>,
+    /// Length of the codes that splats carry: 3, 8 or 16 [default: 16; langsplat 3, legaussians 8]
+    #[arg(long, value_name = "D")]
+    pub feature_dim: Option<usize>,
+    /// How language gets onto the splats: this program's way, or a baseline on the same geometry to compare with
+    #[arg(long, value_parser = methods(), default_value = METHODS[0].name, value_name = "METHOD")]
+    pub method: String,
+    /// One model per level as in the paper, instead of one geometry for all three
+    #[arg(long)]
+    pub per_level: bool,
+    /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged [default: 800 on a CPU device, 1600 on a GPU]
+    #[arg(long, value_name = "N")]
+    pub max_size: Option<usize>,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+fn methods() -> PossibleValuesParser {
+    PossibleValuesParser::new(METHODS.map(|m| PossibleValue::new(m.name).help(m.about)))
+}
 
 pub fn run(args: &RunArgs) -> Result<()> {
-    let installed = inventory(&Registry::open(plan::models(&args.device).as_deref())?);
-    let plan = plan::run(args, &installed)?;
+    let installed = inventory(&Registry::open(args.device.models.as_deref())?);
+    let plan = plan(args, &installed)?;
     let outcome = crate::run::run(&plan, progress::here().as_ref())?;
     if args.device.json {
         let record = serde_json::to_value(crate::run::run_record(&outcome));
         return print_json(&record.map_err(|e| Error::work(format!("run record: {e}")))?);
     }
     print(&crate::run::closing_table(&outcome))
+}
+
+/// What the arguments mean: defaults resolved, names understood, contradictions refused; `auto` is the best of `installed`, or
+/// what is built in. No work happens here.
+fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
+    let method = Method::named(&args.method)?;
+    let recipe = method.recipe;
+    let feature_dim = args.feature_dim.unwrap_or(recipe.feature_dim);
+    if ![3, 8, 16].contains(&feature_dim) {
+        return Err(Error::input(format!("--feature-dim {feature_dim}: choose 3, 8 or 16")));
+    }
+    if matches!(recipe.reducer, Reducer::Autoencoder { .. }) && feature_dim != 3 {
+        return Err(Error::input(format!(
+            "--feature-dim {feature_dim}: the autoencoder of --method langsplat has 3 dimensions; leave it out"
+        )));
+    }
+    for (flag, value) in
+        [("--iterations", args.iterations), ("--language-iterations", args.language_iterations)]
+    {
+        if value == Some(0) {
+            return Err(Error::input(format!("{flag} 0: give at least 1, or leave it out")));
+        }
+    }
+    if args.mask_points == 0 || args.mask_points > 128 {
+        return Err(Error::input(format!("--mask-points {}: give 1 to 128", args.mask_points)));
+    }
+    if let Some(blank) = args.queries.iter().find(|q| q.trim().is_empty()) {
+        return Err(Error::input(format!("--query \"{blank}\": give a few words")));
+    }
+    Ok(RunPlan {
+        inputs: args.inputs.clone(),
+        views: args.views,
+        out: args.out.clone().unwrap_or_else(|| default_out(&args.inputs)),
+        force: args.force,
+        resume: args.resume,
+        checkpoint_seconds: args.checkpoint_seconds,
+        preset: args.preset.map(plan::preset),
+        init: choose::<Geometry>(&args.init, installed)?,
+        matcher: choose::<Matches>(&args.matcher, installed)?,
+        masks: choose::<Masks>(&args.masks, installed)?,
+        sam: SamOptions { points: args.mask_points, crops: !args.no_mask_crops, ..SamOptions::default() },
+        features: choose::<Features>(&args.features, installed)?,
+        queries: args.queries.clone(),
+        seed: args.seed,
+        iterations: args.iterations,
+        language_iterations: args.language_iterations,
+        method,
+        feature_dim,
+        per_level: args.per_level,
+        max_size: plan::max_size(args.max_size)?,
+        device: args.device.device.clone(),
+        deterministic: args.deterministic,
+        cameras: Vec::new(),
+        models: args.device.models.clone(),
+    })
+}
+
+/// `out/<name>` beside where the command runs; a folder called `images` takes its parent's name.
+fn default_out(inputs: &[PathBuf]) -> PathBuf {
+    let first = inputs.first().map(PathBuf::as_path).unwrap_or(Path::new("scene"));
+    let folder = if first.is_file() { first.parent().unwrap_or(first) } else { first };
+    let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_path_buf());
+    let generic = |p: &Path| p.file_name().is_some_and(|n| n == "images" || n == "photos" || n == "input");
+    let named = if generic(&folder) { folder.parent().unwrap_or(&folder) } else { &folder };
+    Path::new("out").join(named.file_name().unwrap_or("scene".as_ref()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::args::{Cli, Command};
+    use crate::infer::installed::{Duty, Installed};
+    use crate::run::sources::SourceChoice;
+    use clap::Parser;
+
+    fn named(name: &str) -> SourceChoice {
+        SourceChoice::named(name)
+    }
+
+    fn plan(extra: &[&str]) -> Result<RunPlan> {
+        plan_with(extra, &Inventory::default())
+    }
+
+    fn plan_with(extra: &[&str], installed: &Inventory) -> Result<RunPlan> {
+        let line = ["splatvk", "run", "tests/data/breakfast/images"].iter().chain(extra);
+        match Cli::try_parse_from(line).unwrap().command {
+            Command::Run(args) => super::plan(&args, installed),
+            _ => unreachable!(),
+        }
+    }
+
+    #[test]
+    fn defaults_are_the_built_in_models() {
+        let plan = plan(&[]).unwrap();
+        assert_eq!(plan.out, Path::new("out/breakfast"));
+        assert_eq!((plan.init, plan.masks), (named("sfm"), named("graph")));
+        assert_eq!((plan.features, plan.feature_dim), (named("words"), 16));
+        assert_eq!(plan.method.name, "sparselgs");
+        assert_eq!((plan.matcher, plan.sam), (named("xfeat"), SamOptions::default()));
+    }
+
+    #[test]
+    fn auto_takes_the_most_preferred_network_there_is() {
+        let model = |name: &str, duty| Installed {
+            name: name.to_owned(),
+            family: String::new(),
+            duties: vec![duty],
+            graphs: Default::default(),
+            folder: PathBuf::new(),
+            unused: Vec::new(),
+        };
+        let models = [
+            ("sam_vit_b", Duty::Masks),
+            ("sam_vit_h", Duty::Masks),
+            ("mine", Duty::Features),
+            ("da3", Duty::Geometry),
+            ("mast3r_512", Duty::Geometry),
+        ];
+        let installed = Inventory { models: models.map(|(n, d)| model(n, d)).into(), broken: Vec::new() };
+        let plan = plan_with(&[], &installed).unwrap();
+        assert_eq!(plan.masks, named("sam_vit_h"));
+        assert_eq!(plan.features, named("mine"));
+        assert_eq!(plan.init, named("mast3r_512"));
+        assert_eq!(plan.matcher, named("xfeat"));
+        let plan =
+            plan_with(&["--masks", "graph", "--init", "sfm", "--features", "words"], &installed).unwrap();
+        assert_eq!((plan.init, plan.masks, plan.features), (named("sfm"), named("graph"), named("words")));
+    }
+
+    #[test]
+    fn each_method_has_its_own_code_length() {
+        for (name, dim) in [("sparselgs", 16), ("langsplat", 3), ("legaussians", 8), ("lsm", 16)] {
+            assert_eq!(plan(&["--method", name]).unwrap().feature_dim, dim, "{name}");
+        }
+    }
+
+    #[test]
+    fn families_and_names_of_networks_are_understood() {
+        let plan =
+            plan(&["--init", "dust3r", "--matcher", "roma", "--masks", "sam_vit_h", "--features", "clip"])
+                .unwrap();
+        assert_eq!(plan.init, named("dust3r"));
+        assert_eq!(plan.matcher, named("roma"));
+        assert_eq!(plan.masks, named("sam_vit_h"));
+        assert_eq!(plan.features, named("clip"));
+    }
+
+    #[test]
+    fn what_cannot_be_meant_is_refused_with_the_choices() {
+        for (extra, says) in [
+            (["--init", "colmap"], "auto, sfm, cameras:FILE, mast3r, dust3r"),
+            (["--masks", "clip"], "auto, graph, dir:DIR, sam"),
+            (["--mask-points", "0"], "1 to 128"),
+            (["--max-size", "63"], "at least 64 pixels"),
+            (["--masks", "dir:nowhere"], "does not exist"),
+            (["--features", "sam"], "auto, words, dir:DIR, clip"),
+            (["--matcher", "sift"], "auto, xfeat, mast3r, roma"),
+            (["--feature-dim", "5"], "3, 8 or 16"),
+            (["--query", " "], "a few words"),
+            (["--method=langsplat", "--feature-dim=16"], "has 3 dimensions"),
+        ] {
+            let error = plan(&extra).unwrap_err();
+            assert!(error.exit_code() == 2 && error.to_string().contains(says), "{extra:?}: {error}");
+        }
+    }
 }

@@ -13,7 +13,7 @@ use crate::pose::pointmap::{Descriptors, ModelView, PairPointmaps, Pointmap};
 use crate::progress::Progress;
 use crate::{Error, Result};
 
-/// What a network says about all pairs of photos, for [`crate::pose::InitChoice::Pointmaps`].
+/// What a network says about all pairs of photos, for [`crate::pose::pointmap::reconstruct`].
 pub fn pointmaps(
     model: &Installed,
     photos: &[Photo],

@@ -1,17 +1,15 @@
 //! The graph and its schedule.
-use super::store::{Codec, Key, Store};
+use super::store::{Codec, Key, Store, Value};
 use super::{Context, Lane, Stage};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::Device;
 use crate::infer::{Registry, provider};
 use crate::progress::{Progress, Recorded};
 use crate::{Error, Result};
-use std::any::Any;
 use std::collections::BTreeSet;
 use std::marker::PhantomData;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
-
-type Value = Arc<dyn Any + Send + Sync>;
+use std::time::Instant;
 
 /// What a stage of a graph will make.
 pub struct Output<T> {
@@ -81,14 +79,26 @@ pub struct Graph<'g> {
 /// What a graph made.
 pub struct Made {
     values: Vec<Option<Value>>,
+    seconds: Vec<f64>,
 }
 
 impl Made {
-    /// Takes out an output that was asked for.
+    /// An output that was asked for.
+    pub fn get<T: Send + Sync + 'static>(&self, output: Output<T>) -> Result<Arc<T>> {
+        let value = self.values[output.node].clone().and_then(|v| v.downcast::<T>().ok());
+        value.ok_or_else(|| Error::work("pipeline: an output was not asked for"))
+    }
+
+    /// Seconds that an output took to make, in this process; 0 for what was read from disk.
+    pub fn seconds<T>(&self, output: Output<T>) -> f64 {
+        self.seconds[output.node]
+    }
+
+    /// Takes out an output that was asked for, of a graph whose store does not hold it, too.
     pub fn take<T: Send + Sync + 'static>(&mut self, output: Output<T>) -> Result<T> {
-        let value = self.values[output.node].take().and_then(|v| v.downcast::<T>().ok());
-        // Nobody else holds outputs once the graph has run.
-        value.and_then(Arc::into_inner).ok_or_else(|| Error::work("pipeline: an output was not asked for"))
+        let value = self.get(output);
+        self.values[output.node] = None;
+        Arc::into_inner(value?).ok_or_else(|| Error::work("pipeline: an output is held elsewhere"))
     }
 }
 
@@ -158,7 +168,7 @@ impl<'g> Graph<'g> {
             }
             return Err(error);
         }
-        Ok(Made { values: state.values })
+        Ok(Made { values: state.values, seconds: state.seconds })
     }
 
     fn keys(&self, device: &Device) -> Vec<Key> {
@@ -181,6 +191,7 @@ impl<'g> Graph<'g> {
         let mut state = State {
             waiting: BTreeSet::new(),
             values: vec![None; n],
+            seconds: vec![0.0; n],
             warnings: vec![Vec::new(); n],
             users: vec![0; n],
             kept: Vec::new(),
@@ -189,7 +200,10 @@ impl<'g> Graph<'g> {
         let mut asked: BTreeSet<usize> = targets.iter().copied().collect();
         // Inputs precede the stages that need them.
         while let Some(node) = asked.pop_last() {
-            if let Some((warnings, value)) = (self.nodes[node].load)(store, &keys[node]) {
+            if let Some((value, seconds)) = store.recall(&keys[node]) {
+                // Its warnings have been heard in this process.
+                (state.values[node], state.seconds[node]) = (Some(value), seconds);
+            } else if let Some((warnings, value)) = (self.nodes[node].load)(store, &keys[node]) {
                 (state.warnings[node], state.values[node]) = (warnings, Some(value));
                 state.kept.push(self.nodes[node].name);
             } else {
@@ -236,6 +250,8 @@ struct State {
     /// Stages that must still start.
     waiting: BTreeSet<usize>,
     values: Vec<Option<Value>>,
+    /// That each took to make.
+    seconds: Vec<f64>,
     /// What was warned of while each was made, and its inputs.
     warnings: Vec<Vec<String>>,
     /// Stages that must still run, and targets, that each output serves: without one it is dropped.
@@ -268,16 +284,19 @@ impl Shared<'_, '_> {
             let work = work.ok_or_else(|| Error::work("pipeline: a graph runs once"))?;
             let checkpoint = self.store.checkpoint(at.name, &self.keys[node]);
             let noting = Noting { inner: context.progress, warnings: Mutex::default(), checkpoint };
+            let began = Instant::now();
             let value = work(&inputs, &Context { progress: &noting, ..*context })?;
             drop(inputs);
             let mut warnings = noting.warnings.lock().unwrap_or_else(PoisonError::into_inner).clone();
             // Those of its inputs as well: with its output kept they need not be looked at again.
             warnings.splice(0..0, at.needs.iter().flat_map(|n| self.lock().warnings[*n].clone()));
+            let seconds = began.elapsed().as_secs_f64();
+            self.store.remember(&self.keys[node], &value, seconds);
             let kept = (at.save)(self.store, &self.keys[node], &warnings, &value)?;
             noting.checkpoint.iter().for_each(Checkpoint::remove);
             let mut state = self.lock();
             state.kept.extend(kept.then_some(at.name));
-            state.values[node] = Some(value);
+            (state.values[node], state.seconds[node]) = (Some(value), seconds);
             state.warnings[node] = warnings;
             for &need in &at.needs {
                 state.users[need] -= 1;

@@ -5,7 +5,10 @@ use crate::{Error, Result};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
+use std::any::Any;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 /// Bytes that the folder may hold: the stages of some twenty scenes of four photos.
@@ -50,12 +53,16 @@ fn unwritable(e: postcard::Error) -> Error {
     Error::work(format!("stage store: {e}"))
 }
 
-/// A folder of outputs; any odd file in it is made again and written over.
-#[derive(Clone, Debug, Default)]
+/// An output as graphs pass it on.
+pub(super) type Value = Arc<dyn Any + Send + Sync>;
+
+/// Outputs by everything that they depend on. In a folder, any odd file is made again and written over.
+#[derive(Default)]
 pub struct Store {
     folder: Option<PathBuf>,
     resume: bool,
     every: Duration,
+    memory: Option<Mutex<BTreeMap<String, (Value, f64)>>>,
 }
 
 impl Store {
@@ -64,9 +71,30 @@ impl Store {
         Store::default()
     }
 
+    /// Keeps every output of the graphs that run with it, as long as it lives.
+    pub fn in_memory() -> Store {
+        Store { memory: Some(Mutex::default()), ..Store::default() }
+    }
+
     /// Keeps outputs in `folder`, and the state of training every so often; with `resume` what is there is used.
     pub fn at(folder: impl Into<PathBuf>, resume: bool, every: Duration) -> Store {
-        Store { folder: Some(folder.into()), resume, every }
+        Store { folder: Some(folder.into()), resume, every, memory: None }
+    }
+
+    /// What this process has made, and the seconds that it took.
+    pub(super) fn recall(&self, key: &Key) -> Option<(Value, f64)> {
+        let memory = self.memory.as_ref()?.lock().unwrap_or_else(PoisonError::into_inner);
+        memory.get(&key.0).cloned()
+    }
+
+    /// Keeps it for [`Store::recall`], in a store that does.
+    pub(super) fn remember(&self, key: &Key, value: &Value, seconds: f64) {
+        if let Some(memory) = &self.memory {
+            memory
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .insert(key.0.clone(), (value.clone(), seconds));
+        }
     }
 
     /// Where a stage keeps its state while it works.

@@ -1,5 +1,4 @@
-//! Choosing and running a geometry initialiser.
-use super::pointmap::{self, ModelView, PairPointmaps};
+//! Photos to cameras, and from cameras to depth (docs/method.md#geometry).
 use super::stereo::{self, StereoOptions};
 use super::{Features, Geometry, SparseModel, light, sfm};
 use crate::gpu::Device;
@@ -10,17 +9,6 @@ use crate::progress::Progress;
 use crate::scene::Camera;
 use crate::{Error, Result};
 use glam::DVec2;
-
-/// Where cameras and points come from.
-#[derive(Clone, Debug)]
-pub enum InitChoice {
-    /// Structure from motion over the photos; needs no large model.
-    Sfm,
-    /// Known cameras, joined to the photos by file name without extension; any resolution of the same aspect.
-    Cameras(Vec<Camera>),
-    /// Pairwise pointmaps of a network such as MASt3R, DUSt3R or VGGT, one view per photo.
-    Pointmaps(Vec<ModelView>, Vec<PairPointmaps>),
-}
 
 /// Above this σ of ln f the depth of the scene is guessed more than measured: say so.
 const UNSURE_FOCAL: f64 = 0.05;
@@ -77,28 +65,6 @@ pub fn dense(
     let (depths, points) = stereo::dense(device, &images, &model.cameras, &positions, options, progress)?;
     let SparseModel { cameras, focal_log_sigma, fitted, .. } = model;
     Ok(Geometry { cameras, depths, points, focal_log_sigma, fitted, method })
-}
-
-/// Photos to cameras, depth maps and points (docs/method.md#geometry); the photos come back as the later stages are to
-/// see them.
-pub fn initialise(
-    device: &Device,
-    photos: Vec<Photo>,
-    choice: &InitChoice,
-    registry: &Registry,
-    stereo: &StereoOptions,
-    progress: &dyn Progress,
-) -> Result<(Vec<Photo>, Geometry)> {
-    let cameras = match choice {
-        InitChoice::Sfm => None,
-        InitChoice::Cameras(cameras) => Some(cameras.as_slice()),
-        InitChoice::Pointmaps(views, pairs) => {
-            return Ok((photos, pointmap::reconstruct(views, pairs, progress)?));
-        }
-    };
-    let Placed { photos, model, method } = place(photos, cameras, registry, progress)?;
-    let geometry = dense(device, &photos, model, method, stereo, progress)?;
-    Ok((photos, geometry))
 }
 
 /// A photo whose matches miss by so many times what those of the other photos miss …

@@ -18,7 +18,7 @@ pub mod stereo;
 mod testing;
 mod two_view;
 
-pub use initialise::{InitChoice, Placed, dense, initialise, learned_features, place, sparse};
+pub use initialise::{Placed, dense, learned_features, place, sparse};
 pub use matching::Features;
 
 use crate::scene::{Camera, DepthMap, Lens, PointCloud};

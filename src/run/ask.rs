@@ -123,3 +123,19 @@ pub fn answers(
     let highlight = query::highlight(&codes, field, query, &views)?;
     Ok(Answers { text: query.text.clone(), views, highlight })
 }
+
+/// Embeds texts for [`crate::query::answer`].
+pub fn embedded(texts: &[String], encoder: &mut dyn RegionEncoder) -> Result<Vec<TextQuery>> {
+    if texts.is_empty() {
+        return Ok(Vec::new());
+    }
+    let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
+    let list: Vec<&str> = texts.iter().map(String::as_str).collect();
+    let rows = encoder.embed_texts(&list)?;
+    let query = |(text, row): (&String, &[f32])| TextQuery {
+        text: text.clone(),
+        embedding: row.to_vec(),
+        canonicals: canonicals.clone(),
+    };
+    Ok(texts.iter().zip(rows.chunks_exact(encoder.dim())).map(query).collect())
+}

@@ -1,5 +1,5 @@
 //! The text model that speaks a scene's language.
-use super::{FeatureSource, sources};
+use super::sources::{self, SourceChoice};
 use crate::format::scene_dir::{Scene, TEXT_EMBEDDINGS};
 use crate::infer::{RegionEncoder, Registry};
 use crate::{Error, Result};
@@ -13,8 +13,8 @@ pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncod
     let space = scene.language.as_ref().map_or("", |l| l.space.as_str());
     // "clip:0123456789abcdef" was made with a network of the family clip.
     let source = match space.split_once(':') {
-        Some((family, _)) => FeatureSource::Network(family.to_owned()),
-        None => FeatureSource::Words,
+        Some((family, _)) => SourceChoice::named(family),
+        None => sources::default::<sources::Features>(),
     };
     let encoder = sources::encoder(&source, &registry)?;
     if encoder.space() != space {

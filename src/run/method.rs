@@ -1,7 +1,6 @@
 //! The compared methods as configurations of one engine: each shares photos, cameras, stereo points and every pass with the
 //! default, and changes only what its authors do differently to language.
 use super::view::Viewer;
-use crate::Result;
 use crate::fit::scale::SceneScale;
 use crate::fit::{self, LanguageOptions, RgbOptions, TrainedLanguage, index_head};
 use crate::gpu::Device;
@@ -9,23 +8,68 @@ use crate::language::align::AlignOptions;
 use crate::language::{BuildOptions, Reducer};
 use crate::progress::Progress;
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
+use crate::{Error, Result};
 use serde::Serialize;
 
 /// A method of the paper's comparison. All start from dense points of the photos, as the paper's "-s" rows.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Method {
-    /// Alignment in three steps, bijection, image loss.
-    #[default]
-    SparseLgs,
-    /// A scene autoencoder to 3 dimensions, features only, no alignment (Qin et al. 2024).
-    LangSplat,
-    /// A quantised feature codebook with an index head and smoothing in space, no alignment (Shi et al. 2024).
-    LeGaussians,
-    /// Features lifted in one pass onto the points as stereo gives them; nothing is optimised for the scene, and nothing
-    /// aligned (in the manner of LSM, Fan et al. 2024; its network is not part of this program).
-    Lsm,
+#[derive(Debug, PartialEq)]
+pub struct Method {
+    /// As users write it.
+    pub name: &'static str,
+    /// What it does, in a line.
+    pub about: &'static str,
+    /// What it decides, with codes of the length its authors use.
+    pub recipe: Recipe,
 }
+
+impl Serialize for Method {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name)
+    }
+}
+
+/// The method of this program.
+pub static SPARSELGS: Method = Method {
+    name: "sparselgs",
+    about: "Alignment across views, a code per thing, photos in the loss",
+    recipe: OURS,
+};
+
+/// A scene autoencoder (Qin et al. 2024).
+pub static LANGSPLAT: Method = Method {
+    name: "langsplat",
+    about: "No alignment, a scene autoencoder to 3 numbers, features only",
+    recipe: Recipe { reducer: AUTOENCODER, feature_dim: 3, ..UNALIGNED },
+};
+
+/// A quantised feature codebook with an index head and smoothing in space (Shi et al. 2024).
+pub static LEGAUSSIANS: Method = Method {
+    name: "legaussians",
+    about: "No alignment, 128 quantised features read by an index head, smoothed in space",
+    recipe: Recipe { reducer: Reducer::Quantised, feature_dim: 8, index_head: true, ..UNALIGNED },
+};
+
+/// In the manner of LSM (Fan et al. 2024; its network is not part of this program): nothing is optimised for the scene.
+pub static LSM: Method = Method {
+    name: "lsm",
+    about: "No alignment, features lifted onto the stereo points in one pass, nothing optimised",
+    recipe: Recipe { optimise: false, ..UNALIGNED },
+};
+
+/// What `--method` takes, the default first.
+pub static METHODS: [&Method; 4] = [&SPARSELGS, &LANGSPLAT, &LEGAUSSIANS, &LSM];
+
+const OURS: Recipe = Recipe {
+    steps: [true; 3],
+    reducer: Reducer::Bijection,
+    feature_dim: FEATURE_DIM,
+    image_weight: IMAGE_WEIGHT,
+    features_only: false,
+    optimise: true,
+    index_head: false,
+};
+
+const UNALIGNED: Recipe = Recipe { steps: [false; 3], image_weight: 0.0, features_only: true, ..OURS };
 
 /// What a method decides.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -47,26 +91,12 @@ pub struct Recipe {
 }
 
 impl Method {
-    /// What the method does, with codes of the length its authors use.
-    pub fn recipe(self) -> Recipe {
-        let ours = Recipe {
-            steps: [true; 3],
-            reducer: Reducer::Bijection,
-            feature_dim: FEATURE_DIM,
-            image_weight: IMAGE_WEIGHT,
-            features_only: false,
-            optimise: true,
-            index_head: false,
-        };
-        let theirs = Recipe { steps: [false; 3], image_weight: 0.0, features_only: true, ..ours };
-        match self {
-            Method::SparseLgs => ours,
-            Method::LangSplat => Recipe { reducer: AUTOENCODER, feature_dim: 3, ..theirs },
-            Method::LeGaussians => {
-                Recipe { reducer: Reducer::Quantised, feature_dim: 8, index_head: true, ..theirs }
-            }
-            Method::Lsm => Recipe { optimise: false, ..theirs },
-        }
+    /// The one of a name.
+    pub fn named(name: &str) -> Result<&'static Method> {
+        METHODS.iter().find(|m| m.name == name).copied().ok_or_else(|| {
+            let names: Vec<&str> = METHODS.iter().map(|m| m.name).collect();
+            Error::input(format!("--method {name}: unknown; use one of: {}", names.join(", ")))
+        })
     }
 }
 
@@ -98,7 +128,7 @@ impl Recipe {
     }
 
     /// The language stage of this recipe, from codes and targets to features.
-    pub fn speak(
+    pub fn train_language(
         &self,
         device: &Device,
         images: &[RgbImage],
@@ -109,11 +139,11 @@ impl Recipe {
         progress: &dyn Progress,
     ) -> Result<TrainedLanguage> {
         let (options, seed) = (self.language(options.clone()), options.seed);
-        let mut spoken = fit::train_language(device, images, cameras, splats, field, &options, progress)?;
+        let mut trained = fit::train_language(device, images, cameras, splats, field, &options, progress)?;
         if self.index_head {
-            read_by_index(device, cameras, &mut spoken, seed)?;
+            read_by_index(device, cameras, &mut trained, seed)?;
         }
-        Ok(spoken)
+        Ok(trained)
     }
 
     /// The options of the language stage.
@@ -136,21 +166,26 @@ impl Recipe {
 const HEAD_SAMPLES: usize = 4000;
 
 /// Smooths the features in space and trains the index head of every level on what the photos' views then show.
-fn read_by_index(device: &Device, cameras: &[Camera], spoken: &mut TrainedLanguage, seed: u64) -> Result<()> {
-    let extent = SceneScale::measure(cameras, &spoken.splats.means).extent;
-    for level in &mut spoken.field.levels {
-        let d = level.features.len() / spoken.splats.len().max(1);
-        index_head::smooth(&spoken.splats, &mut level.features, d, extent);
+fn read_by_index(
+    device: &Device,
+    cameras: &[Camera],
+    trained: &mut TrainedLanguage,
+    seed: u64,
+) -> Result<()> {
+    let extent = SceneScale::measure(cameras, &trained.splats.means).extent;
+    for level in &mut trained.field.levels {
+        let d = level.features.len() / trained.splats.len().max(1);
+        index_head::smooth(&trained.splats, &mut level.features, d, extent);
     }
-    let mut viewer = Viewer::new(device, &spoken.splats, &spoken.field)?;
+    let mut viewer = Viewer::new(device, &trained.splats, &trained.field)?;
     let dims: Vec<usize> =
-        spoken.field.levels.iter().map(|l| l.features.len() / spoken.splats.len().max(1)).collect();
+        trained.field.levels.iter().map(|l| l.features.len() / trained.splats.len().max(1)).collect();
     let total: usize = dims.iter().sum();
     let mut samples: Vec<(Vec<f32>, Vec<u32>)> = vec![Default::default(); dims.len()];
     for (view, camera) in cameras.iter().enumerate() {
         let frame = viewer.view_with_features(camera)?.frame;
         let mut first = 0;
-        for ((level, &d), (features, labels)) in spoken.field.levels.iter().zip(&dims).zip(&mut samples) {
+        for ((level, &d), (features, labels)) in trained.field.levels.iter().zip(&dims).zip(&mut samples) {
             let Some(targets) = level.targets.get(view) else { continue };
             let step = targets.data.len().div_ceil(HEAD_SAMPLES).max(1);
             for (p, &label) in targets.data.iter().enumerate().step_by(step) {
@@ -163,7 +198,7 @@ fn read_by_index(device: &Device, cameras: &[Camera], spoken: &mut TrainedLangua
             first += d;
         }
     }
-    for (level, (features, labels)) in spoken.field.levels.iter_mut().zip(samples) {
+    for (level, (features, labels)) in trained.field.levels.iter_mut().zip(samples) {
         index_head::train_head(&mut level.codebook, &features, &labels, seed);
     }
     Ok(())
@@ -177,19 +212,19 @@ mod tests {
     #[test]
     fn the_default_changes_nothing_and_each_baseline_what_it_should() {
         let preset = LanguageOptions::preset(Preset::Draft);
-        let ours = Method::default().recipe();
+        let ours = SPARSELGS.recipe;
         assert_eq!(ours.language(preset.clone()), preset);
         assert_eq!(ours.rgb(RgbOptions::preset(Preset::Draft)), RgbOptions::preset(Preset::Draft));
         let build = ours.build("x", 3);
         assert_eq!(build, BuildOptions { space: "x".into(), seed: 3, ..BuildOptions::default() });
-        for method in [Method::LangSplat, Method::LeGaussians, Method::Lsm] {
-            let recipe = method.recipe();
+        for method in &METHODS[1..] {
+            let recipe = method.recipe;
             let align = recipe.build("x", 0).align;
-            assert!(!align.matching && !align.fusion && !align.reprojection, "{method:?}");
+            assert!(!align.matching && !align.fusion && !align.reprojection, "{}", method.name);
             let language = recipe.language(preset.clone());
             assert!(language.detach_geometry && language.image_weight == 0.0);
-            assert_eq!(language.iterations == 0, method == Method::Lsm);
+            assert_eq!(language.iterations == 0, method.name == LSM.name);
         }
-        assert_eq!(Method::Lsm.recipe().rgb(RgbOptions::preset(Preset::Draft)).iterations, 0);
+        assert_eq!(LSM.recipe.rgb(RgbOptions::preset(Preset::Draft)).iterations, 0);
     }
 }

@@ -5,27 +5,28 @@ pub mod encoder;
 mod light;
 mod list;
 pub mod live;
-mod method;
+pub mod method;
 mod networks;
+mod plan;
 mod record;
 pub mod refine;
 pub mod score;
 pub mod sources;
-mod stages;
+pub(crate) mod stages;
 pub mod train;
 pub mod view;
 
-pub use method::{AUTOENCODER, FEATURE_DIM, Method, Recipe};
+pub use method::{FEATURE_DIM, Method, Recipe};
+pub use plan::RunPlan;
 pub use record::{closing_table, run_record};
 
 use crate::Result;
-use crate::fit::{self, LanguageOptions, Preset, RgbOptions};
+use crate::fit::{self, Preset};
 use crate::format::Workspace;
 use crate::format::scene_dir::{self, Contents};
 use crate::gpu::{self, Device};
 use crate::infer::{Registry, home, provider};
 use crate::language;
-use crate::language::sam::SamOptions;
 use crate::photo::{self, Photo};
 use crate::pipeline::{Graph, Store};
 use crate::pose::{self, Geometry};
@@ -35,135 +36,10 @@ use crate::report::ModelUsed;
 use crate::report::viewer::{Names, ShownAnswer};
 use crate::scene::{Camera, LanguageField, Splats};
 use networks::Networks;
+use sources::Build;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use view::DecodedFrame;
-
-/// Where cameras and points come from.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
-pub enum InitSource {
-    /// Structure from motion over the photos and stereo.
-    Sfm,
-    /// Known cameras from a file; stereo.
-    Cameras(PathBuf),
-    /// Known cameras, joined to the photos by name; stereo.
-    Given(Vec<Camera>),
-    /// Pointmaps of an installed network (DUSt3R, MASt3R, VGGT and others).
-    Network(String),
-}
-
-/// Where dense matches between photos come from.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
-pub enum MatchSource {
-    /// XFeat descriptors along epipolar lines.
-    Xfeat,
-    /// An installed dense matcher (RoMa).
-    Network(String),
-}
-
-/// Where masks come from.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
-pub enum MaskSource {
-    /// The built-in graph segmentation.
-    Graph,
-    /// Label maps `<stem>_s.npy` in a folder.
-    Dir(PathBuf),
-    /// An installed network that answers points (SAM and others).
-    Network(String),
-}
-
-/// Where region features and text embeddings come from.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
-pub enum FeatureSource {
-    /// The built-in classifier and sentence encoder.
-    Words,
-    /// `<stem>_f.npy` and `text_embeddings.npz` in a folder.
-    Dir(PathBuf),
-    /// An installed pair of image and text towers (CLIP).
-    Network(String),
-}
-
-/// What to do, with every default that does not depend on the machine resolved.
-#[derive(Clone, Debug, serde::Serialize)]
-pub struct RunPlan {
-    /// Photos or folders of photos.
-    pub inputs: Vec<PathBuf>,
-    /// How many to use; `None` = as many as there are, at most [`photo::DEFAULT_VIEWS`].
-    pub views: Option<usize>,
-    /// Scene directory.
-    pub out: PathBuf,
-    /// Replace an existing scene.
-    pub force: bool,
-    /// Use the stages that an earlier run with the same photos and settings has finished.
-    pub resume: bool,
-    /// Seconds between states of training on disk.
-    pub checkpoint_seconds: u64,
-    /// `None` = draft on a CPU device, default elsewhere.
-    pub preset: Option<Preset>,
-    /// Cameras and points.
-    pub init: InitSource,
-    /// Dense matches.
-    pub matcher: MatchSource,
-    /// Masks.
-    pub masks: MaskSource,
-    /// How a mask network is asked.
-    pub sam: SamOptions,
-    /// Features.
-    pub features: FeatureSource,
-    /// Texts to answer once the scene is there.
-    pub queries: Vec<String>,
-    /// Seed of everything random.
-    pub seed: u64,
-    /// Steps of the colour stage instead of the preset's.
-    pub iterations: Option<usize>,
-    /// Steps of the language stage instead of the preset's.
-    pub language_iterations: Option<usize>,
-    /// The method compared, [`Method::SparseLgs`] unless a baseline is wanted.
-    pub method: Method,
-    /// Length of the codes.
-    pub feature_dim: usize,
-    /// One model per level.
-    pub per_level: bool,
-    /// Greatest side of the working images, pixels; `None` = [`photo::default_max_size`] of the device.
-    pub max_size: Option<usize>,
-    /// Vulkan device.
-    pub device: Option<String>,
-    /// The same bits on every run: see [`crate::gpu::Options`].
-    pub deterministic: bool,
-    /// Folder of the models.
-    pub models: Option<PathBuf>,
-}
-
-impl Default for RunPlan {
-    /// Built-in models, everything else as the device suggests; no inputs, and nowhere to write.
-    fn default() -> Self {
-        RunPlan {
-            inputs: Vec::new(),
-            views: None,
-            out: PathBuf::new(),
-            force: false,
-            resume: false,
-            checkpoint_seconds: CHECKPOINT_SECONDS,
-            preset: None,
-            init: InitSource::Sfm,
-            matcher: MatchSource::Xfeat,
-            masks: MaskSource::Graph,
-            sam: SamOptions::default(),
-            features: FeatureSource::Words,
-            queries: Vec::new(),
-            seed: 0,
-            iterations: None,
-            language_iterations: None,
-            method: Method::default(),
-            feature_dim: FEATURE_DIM,
-            per_level: false,
-            max_size: None,
-            device: None,
-            deterministic: false,
-            models: None,
-        }
-    }
-}
 
 /// The answers to one text, one per photo.
 #[derive(Clone, Debug)]
@@ -248,7 +124,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     })?;
     let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let (chosen, choice) = pose::choose::photos(&plan.inputs, plan.views, progress)?;
-    budget(plan, &device, &photo::sizes_of(&chosen), max_size)?;
+    plan.check_budget(&device, &photo::sizes_of(&chosen), max_size)?;
     let photos = photo::load_each(&chosen, max_size, progress)?;
     let store = store(plan.resume, plan.checkpoint_seconds);
     let outcome = Outcome { choice, ..work(plan, &device, photos, &store, progress)? };
@@ -266,7 +142,7 @@ pub fn reconstruct(
 ) -> Result<Outcome> {
     photo::check_set(&photos)?;
     let sizes: Vec<_> = photos.iter().map(|p| (p.image.width, p.image.height)).collect();
-    budget(plan, device, &sizes, usize::MAX)?;
+    plan.check_budget(device, &sizes, usize::MAX)?;
     work(plan, device, photos, &Store::none(), &Recorded::new(progress))
 }
 
@@ -289,11 +165,11 @@ fn work(
     provider::report(progress)?;
     let networks = Networks::of(plan, &registry)?;
     networks.warn_untrained(progress);
-    sources::given_masks(&plan.masks, &plan.features, &photos)?;
-    let preset = preset_of(plan, device);
-    let mut graph = Graph::default();
-    let scene = list::scene(&mut graph, plan, preset, device, photos, &networks, &registry)?;
-    let mut made = graph.run(&scene.targets(), device, &registry, store, progress)?;
+    list::check(plan, &photos, &registry)?;
+    let preset = plan.preset_on(device);
+    let mut build = Build { graph: Graph::default(), registry: registry.clone(), plan: plan.clone(), preset };
+    let scene = list::scene(&mut build, device, photos)?;
+    let mut made = build.graph.run(&scene.targets(), device, &registry, store, progress)?;
     provider::report(progress)?;
     let (trained, language) = (made.take(scene.trained)?, made.take(scene.language)?);
     Ok(Outcome {
@@ -333,49 +209,10 @@ pub fn stage_folder() -> PathBuf {
     home().join("stages")
 }
 
-impl RunPlan {
-    /// What the method does, with the plan's code length.
-    pub fn recipe(&self) -> Recipe {
-        Recipe { feature_dim: self.feature_dim, ..self.method.recipe() }
-    }
-}
-
-fn preset_of(plan: &RunPlan, device: &Device) -> Preset {
-    plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default })
-}
-
-/// Refuses photos of these (width, height) where they cannot be worked with at that size.
-fn budget(plan: &RunPlan, device: &Device, sizes: &[(usize, usize)], max_size: usize) -> Result<()> {
-    let work = budget::Work::language(plan.feature_dim, plan.per_level, preset_of(plan, device), sizes.len());
-    budget::check(&budget::Limits::now(device.info()), sizes, max_size, &work)
-}
-
-fn rgb_options(plan: &RunPlan, preset: Preset, device: &Device, photos: usize) -> RgbOptions {
-    let mut options = RgbOptions::preset(preset);
-    let work = budget::Work::language(plan.feature_dim, plan.per_level, preset, photos);
-    options.limit_splats(budget::most_splats(device.info(), work.features), work.splats);
-    options.seed = plan.seed;
-    if let Some(n) = plan.iterations {
-        options = options.with_iterations(n);
-    }
-    plan.recipe().rgb(options)
-}
-
-fn language_options(plan: &RunPlan, preset: Preset) -> LanguageOptions {
-    let mut options = LanguageOptions::preset(preset);
-    options.seed = plan.seed;
-    options.per_level |= plan.per_level;
-    options.iterations = plan.language_iterations.unwrap_or(options.iterations);
-    options
-}
-
 fn write(workspace: Workspace, outcome: &Outcome, progress: &dyn Progress) -> Result<()> {
     progress.begin("write", 2);
     progress.check()?;
-    let table = match &outcome.plan.features {
-        FeatureSource::Dir(dir) => Some(dir.join(sources::TEXT_TABLE)),
-        FeatureSource::Words | FeatureSource::Network(_) => None,
-    };
+    let table = sources::text_table(&outcome.plan.features);
     let contents = Contents {
         splats: &outcome.splats,
         cameras: &outcome.cameras,

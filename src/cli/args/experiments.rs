@@ -1,39 +1,22 @@
 //! `splatvk ablate` and `splatvk generate`: tables, and data with a known answer.
 use super::DeviceArgs;
-use clap::{Args, ValueEnum};
+use crate::ablate::TABLES;
+use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser};
 use std::path::PathBuf;
 
-/// Which tables `ablate` runs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum TableArg {
-    /// Every table, shared stages once
-    All,
-    /// None, step 1, steps 1 and 2, step 3, all three
-    Alignment,
-    /// Bijection, autoencoder, no reduction
-    Bijection,
-    /// This program's way and the baselines
-    Methods,
-    /// Codes of 3, 8 and 16 numbers
-    Dimension,
-    /// Language training with and without the image loss
-    ImageLoss,
-    /// Masks and features: built-in, with injected errors, exact
-    Features,
-    /// At most 50k, 500k, or all splats at the start
-    Points,
-    /// 2, 4 and 6 photos
-    Views,
-    /// Cameras and points from photos alone, or from the true cameras
-    Initializer,
+fn tables() -> PossibleValuesParser {
+    let all = PossibleValue::new("all").help("Every table, shared stages once");
+    let each = TABLES.iter().map(|t| PossibleValue::new(t.name).help(t.about));
+    PossibleValuesParser::new(std::iter::once(all).chain(each))
 }
 
 /// `splatvk ablate`
 #[derive(Debug, Args)]
 pub struct AblateArgs {
     /// Which tables
-    #[arg(value_enum, required = true, value_name = "TABLE")]
-    pub tables: Vec<TableArg>,
+    #[arg(value_parser = tables(), required = true, value_name = "TABLE")]
+    pub tables: Vec<String>,
     /// Folder with ground_truth.json, photos and masks
     #[arg(long, value_name = "DIR")]
     pub data: PathBuf,

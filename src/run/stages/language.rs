@@ -1,6 +1,5 @@
 //! Masks → aligned things with codes → splats that carry them; and what texts mean.
 use super::Placed;
-use crate::Result;
 use crate::fit::{LanguageOptions, Trained, TrainedLanguage};
 use crate::infer::RegionEncoder;
 use crate::language::align::PairLinks;
@@ -9,8 +8,9 @@ use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::Geometry;
 use crate::query::TextQuery;
 use crate::report::viewer::Names;
+use crate::run::ask;
 use crate::run::method::Recipe;
-use crate::run::{ask, sources};
+use crate::{Error, Result};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// An encoder that several stages ask, one at a time.
@@ -37,7 +37,14 @@ impl SharedEncoder {
         &self.space
     }
 
-    pub(super) fn identity(&self) -> &str {
+    /// The encoder, of one who shares it with nobody.
+    pub fn into_inner(self) -> Result<Box<dyn RegionEncoder>> {
+        let alone = Arc::into_inner(self.encoder).ok_or_else(|| Error::work("the encoder is in use"))?;
+        Ok(alone.into_inner().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// The models behind it.
+    pub fn identity(&self) -> &str {
         &self.identity
     }
 
@@ -66,7 +73,7 @@ impl Stage for Embed {
     }
 
     fn run(self, (): (), _: &Context) -> Result<Vec<TextQuery>> {
-        self.encoder.with(|e| sources::queries(&self.texts, e))
+        self.encoder.with(|e| ask::embedded(&self.texts, e))
     }
 }
 
@@ -153,7 +160,7 @@ impl Stage for TrainLanguage {
         (placed, trained, language): (&Placed, &Trained, &Language),
         context: &Context,
     ) -> Result<TrainedLanguage> {
-        self.recipe.speak(
+        self.recipe.train_language(
             context.device,
             &super::images(&placed.photos),
             &trained.cameras,

@@ -1,14 +1,18 @@
 //! Photos → masks with features.
 use super::{Placed, SharedEncoder};
 use crate::Result;
+use crate::infer::RegionEncoder;
+use crate::infer::hed::Hed;
 use crate::infer::installed::Installed;
 use crate::language::sam::{self, SamOptions};
-use crate::language::{ViewMasks, dir};
+use crate::language::{ViewMasks, dir, graph};
+use crate::photo::Photo;
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::Geometry;
-use crate::run::sources;
 use crate::scene::Plane;
+use rayon::prelude::*;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Learned contours of every photo, for [`GraphMasks`].
 pub struct Edges;
@@ -28,11 +32,21 @@ impl Stage for Edges {
     }
 
     fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Vec<Plane<f32>>> {
-        sources::edges(&super::images(&placed.photos), context.registry, context.progress)
+        let progress = context.progress;
+        progress.begin("edges", placed.photos.len() as u64);
+        let mut network = Hed::load(context.registry)?;
+        let mut edges = Vec::with_capacity(placed.photos.len());
+        for photo in &placed.photos {
+            progress.check()?;
+            edges.push(network.edges(&photo.image)?);
+            progress.step(edges.len() as u64, "");
+        }
+        progress.end();
+        Ok(edges)
     }
 }
 
-/// The built-in masks, where no network has given any.
+/// The built-in masks, helped by learned edges and stereo depth.
 pub struct GraphMasks;
 
 impl Stage for GraphMasks {
@@ -50,7 +64,20 @@ impl Stage for GraphMasks {
         (placed, edges, geometry): (&Placed, &Vec<Plane<f32>>, &Geometry),
         context: &Context,
     ) -> Result<Vec<ViewMasks>> {
-        sources::graph_masks(&super::images(&placed.photos), edges, geometry, context.progress)
+        let progress = context.progress;
+        progress.begin("masks", placed.photos.len() as u64);
+        let done = AtomicU64::new(0);
+        let options = graph::GraphOptions::default();
+        let one = |(i, photo): (usize, &Photo)| {
+            progress.check()?;
+            let depth = Some((&geometry.cameras[i], &geometry.depths[i]));
+            let masks = graph::segment(&photo.image, edges.get(i), depth, &options)?;
+            progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
+            Ok(masks)
+        };
+        let masks = placed.photos.par_iter().enumerate().map(one).collect::<Result<_>>()?;
+        progress.end();
+        Ok(masks)
     }
 }
 
@@ -174,7 +201,23 @@ impl Stage for Regions {
     }
 
     fn run(self, (placed, masks): (&Placed, &Vec<ViewMasks>), context: &Context) -> Result<Vec<ViewMasks>> {
-        let images = super::images(&placed.photos);
-        self.encoder.with(|e| sources::with_features(masks.clone(), &images, e, context.progress))
+        let (progress, mut masks) = (context.progress, masks.clone());
+        progress.begin("regions", masks.iter().map(|m| m.levels.len() as u64).sum());
+        let mut done = 0;
+        for (view, photo) in masks.iter_mut().zip(&placed.photos) {
+            for level in &mut view.levels {
+                progress.check()?;
+                let count = level.quality.len();
+                if level.features.is_empty() && count > 0 {
+                    let embed =
+                        |e: &mut dyn RegionEncoder| e.embed_regions(&photo.image, &level.labels, count);
+                    level.features = self.encoder.with(embed)?;
+                }
+                done += 1;
+                progress.step(done, "");
+            }
+        }
+        progress.end();
+        Ok(masks)
     }
 }

@@ -2,11 +2,12 @@
 use super::Placed;
 use crate::Result;
 use crate::infer::installed::Installed;
-use crate::infer::xfeat::DenseFeatures;
-use crate::language::align::PairLinks;
+use crate::infer::warp;
+use crate::infer::xfeat::{DenseFeatures, XFeat};
+use crate::language::align::{PairLinks, links_from_warps};
+use crate::language::matcher;
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::Geometry;
-use crate::run::sources;
 
 /// Dense descriptors of every photo.
 pub struct Descriptors;
@@ -22,7 +23,17 @@ impl Stage for Descriptors {
     }
 
     fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Vec<DenseFeatures>> {
-        sources::dense(&super::images(&placed.photos), context.registry, context.progress)
+        let progress = context.progress;
+        progress.begin("descriptors", placed.photos.len() as u64);
+        let mut xfeat = XFeat::load(context.registry)?;
+        let mut dense = Vec::with_capacity(placed.photos.len());
+        for photo in &placed.photos {
+            progress.check()?;
+            dense.push(xfeat.dense(&photo.image)?);
+            progress.step(dense.len() as u64, "");
+        }
+        progress.end();
+        Ok(dense)
     }
 }
 
@@ -48,7 +59,19 @@ impl Stage for DescriptorMatches {
         (dense, geometry): (&Vec<DenseFeatures>, &Geometry),
         context: &Context,
     ) -> Result<Vec<PairLinks>> {
-        sources::matches(dense, geometry, context.progress)
+        let progress = context.progress;
+        let pairs: Vec<(usize, usize)> = pairs(dense.len()).collect();
+        progress.begin("match", pairs.len() as u64);
+        let mut links = Vec::with_capacity(pairs.len());
+        for (i, j) in pairs {
+            progress.check()?;
+            let cameras = (&geometry.cameras[i], &geometry.cameras[j]);
+            let (forward, backward) = matcher::xfeat(&dense[i], &dense[j], cameras);
+            links.push(links_from_warps(i, j, &forward, &backward));
+            progress.step(links.len() as u64, "");
+        }
+        progress.end();
+        Ok(links)
     }
 }
 
@@ -81,6 +104,13 @@ impl Stage for NetworkMatches {
     }
 
     fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Vec<PairLinks>> {
-        sources::network_matches(&self.model, &placed.photos, context.progress)
+        let mut warps = warp::warps(&self.model, &placed.photos, context.progress)?.into_iter();
+        let links = |((i, j), (there, back)): (_, (_, _))| links_from_warps(i, j, &there, &back);
+        Ok(pairs(placed.photos.len()).zip(&mut warps).map(links).collect())
     }
+}
+
+/// Every unordered pair of views.
+fn pairs(views: usize) -> impl Iterator<Item = (usize, usize)> {
+    (0..views).flat_map(move |i| (i + 1..views).map(move |j| (i, j)))
 }

@@ -24,7 +24,7 @@ fn images(photos: &[crate::photo::Photo]) -> Vec<RgbImage> {
 }
 
 /// What an installed network is, for [`crate::pipeline::Stage::settings`].
-fn identity(model: &Installed) -> Result<String> {
+pub fn identity(model: &Installed) -> Result<String> {
     let sums: Vec<String> = model.files()?.into_iter().map(|(_, sha256)| sha256).collect();
     Ok(format!("{} {sums:?}", model.name))
 }

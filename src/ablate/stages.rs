@@ -1,0 +1,284 @@
+//! What only experiments do: masks and features from ground truth, the true meaning of objects, and figures.
+use crate::fit::{Trained, TrainedLanguage};
+use crate::format::cameras::stem;
+use crate::language::{ViewMasks, dir};
+use crate::photo::Photo;
+use crate::pipeline::{Context, Lane, Output, Stage};
+use crate::query::TextQuery;
+use crate::query::eval::{Evaluation, Frame, GroundTruth, Report, Split};
+use crate::run::score::score_field;
+use crate::run::stages::{Placed, SharedEncoder};
+use crate::scene::{Codebook, Plane};
+use crate::synth::regions::{self, Flaws};
+use crate::{Error, Result};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// Object index → unit embedding of what it is.
+pub(super) type Meanings = BTreeMap<u32, Vec<f32>>;
+
+/// Agreement of the rendered meaning with the true one in one frame.
+#[derive(Clone, Debug, Serialize)]
+pub struct Meaning {
+    /// Frame file stem.
+    pub frame: String,
+    /// Held out or not.
+    pub split: Split,
+    /// Mean cosine over labelled pixels.
+    pub similarity: f64,
+    /// Mean square difference with every coordinate scaled to [0, 1] over the true meanings.
+    pub mse: f64,
+}
+
+/// The figures of a scene.
+#[derive(Clone, Debug, Default)]
+pub struct Scored {
+    /// Of protocol `field`.
+    pub report: Report,
+    /// Per frame.
+    pub meaning: Vec<Meaning>,
+}
+
+/// The frame of each photo.
+fn frames_of<'t>(truth: &'t GroundTruth, photos: &[Photo]) -> Result<Vec<&'t Frame>> {
+    let find = |p: &Photo| {
+        let frame = truth.frames.iter().find(|f| stem(&f.file) == p.stem);
+        frame.ok_or_else(|| Error::work(format!("{}: not a frame of the data set", p.path.display())))
+    };
+    photos.iter().map(find).collect()
+}
+
+/// True masks with synthetic features.
+pub(super) struct SyntheticMasks {
+    pub(super) truth: Arc<GroundTruth>,
+    pub(super) flaws: Flaws,
+}
+
+impl Stage for SyntheticMasks {
+    const NAME: &'static str = "synthetic-masks";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Placed>,);
+    type Output = Vec<ViewMasks>;
+
+    fn settings(&self) -> String {
+        format!("{:?} {:?}", self.truth.folder, self.flaws)
+    }
+
+    fn run(self, (placed,): (&Placed,), _: &Context) -> Result<Vec<ViewMasks>> {
+        Ok(regions::regions(&self.truth, &frames_of(&self.truth, &placed.photos)?, &self.flaws)?.masks)
+    }
+}
+
+/// What objects mean in the space of [`SyntheticMasks`].
+pub(super) struct SyntheticMeaning {
+    pub(super) truth: Arc<GroundTruth>,
+    pub(super) flaws: Flaws,
+}
+
+impl Stage for SyntheticMeaning {
+    const NAME: &'static str = "synthetic-meaning";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Placed>,);
+    type Output = Meanings;
+
+    fn settings(&self) -> String {
+        format!("{:?} {:?}", self.truth.folder, self.flaws)
+    }
+
+    fn run(self, (placed,): (&Placed,), _: &Context) -> Result<Meanings> {
+        Ok(regions::regions(&self.truth, &frames_of(&self.truth, &placed.photos)?, &self.flaws)?.meaning)
+    }
+}
+
+/// What an encoder says of each object's true mask, averaged over the photos.
+pub(super) struct EncoderMeaning {
+    pub(super) truth: Arc<GroundTruth>,
+    pub(super) encoder: SharedEncoder,
+}
+
+impl Stage for EncoderMeaning {
+    const NAME: &'static str = "encoder-meaning";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Placed>,);
+    type Output = Meanings;
+
+    fn settings(&self) -> String {
+        format!("{:?} {}", self.truth.folder, self.encoder.identity())
+    }
+
+    fn run(self, (placed,): (&Placed,), _: &Context) -> Result<Meanings> {
+        let mut sums: Option<Sums> = None;
+        for (frame, photo) in frames_of(&self.truth, &placed.photos)?.into_iter().zip(&placed.photos) {
+            let Some(objects) = self.truth.objects(frame)? else { continue };
+            let top = self.truth.labels.keys().max().map_or(0, |k| *k as usize);
+            let data = objects.data.iter().map(|&o| o as i32).collect();
+            let labels = Plane { width: objects.width, height: objects.height, data };
+            let (dim, rows) = self
+                .encoder
+                .with(|e| e.embed_regions(&photo.image, &labels, top + 1).map(|rows| (e.dim(), rows)))?;
+            let sums = sums.get_or_insert_with(|| Sums::new(dim));
+            for (label, row) in rows.chunks_exact(dim).enumerate() {
+                sums.add(label as u32, row, 1.0);
+            }
+        }
+        Ok(sums.map(Sums::unit).unwrap_or_default())
+    }
+}
+
+/// What the given wholes say of each object, averaged over its pixels.
+pub(super) struct MaskMeaning {
+    pub(super) truth: Arc<GroundTruth>,
+}
+
+impl Stage for MaskMeaning {
+    const NAME: &'static str = "mask-meaning";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Placed>, Output<Vec<ViewMasks>>);
+    type Output = Meanings;
+
+    fn settings(&self) -> String {
+        format!("{:?}", self.truth.folder)
+    }
+
+    fn run(self, (placed, masks): (&Placed, &Vec<ViewMasks>), _: &Context) -> Result<Meanings> {
+        let levels = masks.iter().flat_map(|v| &v.levels);
+        let dim = levels.into_iter().find_map(|l| l.features.len().checked_div(l.quality.len()));
+        let mut sums = Sums::new(dim.unwrap_or(0));
+        for (frame, view) in frames_of(&self.truth, &placed.photos)?.into_iter().zip(masks) {
+            let (Some(objects), Some(whole)) = (self.truth.objects(frame)?, view.levels.last()) else {
+                continue;
+            };
+            if (objects.width, objects.height) != (whole.labels.width, whole.labels.height) {
+                return Err(Error::input("ablate: masks and ground truth differ in size"));
+            }
+            for (&label, &mask) in objects.data.iter().zip(&whole.labels.data) {
+                if let Ok(mask) = usize::try_from(mask) {
+                    sums.add(label, &whole.features[mask * sums.dim..(mask + 1) * sums.dim], 1.0);
+                }
+            }
+        }
+        Ok(sums.unit())
+    }
+}
+
+/// Asks the finished scene for every object in every frame.
+pub(super) struct Score {
+    pub(super) truth: Arc<GroundTruth>,
+    /// The evaluation's phrases, in its order.
+    pub(super) queries: Vec<TextQuery>,
+}
+
+impl Stage for Score {
+    const NAME: &'static str = "score";
+    const LANE: Lane = Lane::Device;
+    type Inputs = (Output<Trained>, Output<TrainedLanguage>, Output<Meanings>);
+    type Output = Scored;
+
+    fn settings(&self) -> String {
+        // The space of the queries is that of the language.
+        format!("{:?}", self.truth.folder)
+    }
+
+    fn run(
+        self,
+        (trained, language, meanings): (&Trained, &TrainedLanguage, &Meanings),
+        context: &Context,
+    ) -> Result<Scored> {
+        let evaluation = Evaluation::new((*self.truth).clone(), &trained.cameras, None)?;
+        let mut meaning = Vec::new();
+        let scale = Scale::of(meanings);
+        let levels = &language.field.levels;
+        let whole = levels.iter().rposition(|l| !l.codebook.is_empty());
+        let report = score_field(
+            context.device,
+            &language.splats,
+            &language.field,
+            &self.queries,
+            evaluation,
+            false,
+            context.progress,
+            &mut |frame, decoded| {
+                let (Some(level), Some(objects)) = (whole, self.truth.objects(frame)?) else { return Ok(()) };
+                let book = &levels[level].codebook;
+                meaning.extend(agreement(frame, &decoded.codes[level], book, &objects, meanings, &scale));
+                Ok(())
+            },
+        )?;
+        Ok(Scored { report, meaning })
+    }
+}
+
+/// Weighted sums of vectors per object.
+struct Sums {
+    dim: usize,
+    rows: Meanings,
+}
+
+impl Sums {
+    fn new(dim: usize) -> Self {
+        Sums { dim, rows: Meanings::new() }
+    }
+    fn add(&mut self, label: u32, row: &[f32], weight: f32) {
+        let sum = self.rows.entry(label).or_insert_with(|| vec![0.0; self.dim]);
+        sum.iter_mut().zip(row).for_each(|(s, v)| *s += weight * v);
+    }
+    /// Unit vectors of those that are not zero.
+    fn unit(mut self) -> Meanings {
+        self.rows.values_mut().for_each(|row| dir::normalise_rows(row, self.dim));
+        self.rows.retain(|_, row| row.iter().any(|v| *v != 0.0));
+        self.rows
+    }
+}
+
+/// 1 / (max − min) per coordinate over the true meanings, squared; 0 where they do not differ.
+struct Scale(Vec<f32>);
+
+impl Scale {
+    fn of(meaning: &Meanings) -> Self {
+        let dim = meaning.values().next().map_or(0, Vec::len);
+        let scale = |c: usize| {
+            let (low, high) =
+                meaning.values().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(v[c]), h.max(v[c])));
+            // Coordinates of unit vectors that differ by less than this differ by rounding.
+            if high - low > 1e-4 { 1.0 / (high - low).powi(2) } else { 0.0 }
+        };
+        Scale((0..dim).map(scale).collect())
+    }
+}
+
+/// How well a decoded level agrees with the true meaning of each pixel's object; pixels without code or truth are left
+/// out.
+fn agreement(
+    frame: &Frame,
+    codes: &Plane<i32>,
+    book: &Codebook,
+    objects: &Plane<u32>,
+    meaning: &Meanings,
+    scale: &Scale,
+) -> Option<Meaning> {
+    let mut pairs: BTreeMap<(i32, u32), usize> = BTreeMap::new();
+    if codes.data.len() != objects.data.len() {
+        return None;
+    }
+    for (&k, &o) in codes.data.iter().zip(&objects.data).filter(|(k, _)| **k >= 0) {
+        *pairs.entry((k, o)).or_default() += 1;
+    }
+    let (mut cosine, mut square, mut total) = (0.0f64, 0.0f64, 0usize);
+    for ((k, o), n) in pairs {
+        let Some(truth) = meaning.get(&o) else { continue };
+        let d = book.embedding_dim;
+        let row = &book.embeddings[k as usize * d..(k as usize + 1) * d];
+        let dot: f32 = row.iter().zip(truth).map(|(a, b)| a * b).sum();
+        let sum: f32 = row.iter().zip(truth).zip(&scale.0).map(|((a, b), s)| s * (a - b) * (a - b)).sum();
+        cosine += n as f64 * f64::from(dot);
+        square += n as f64 * f64::from(sum) / d as f64;
+        total += n;
+    }
+    (total > 0).then(|| Meaning {
+        frame: frame.stem.clone(),
+        split: frame.split,
+        similarity: cosine / total as f64,
+        mse: square / total as f64,
+    })
+}

@@ -1,0 +1,144 @@
+//! What to run, and what follows from it for the stages.
+use super::method::{self, FEATURE_DIM, Method, Recipe};
+use super::sources::{self, SourceChoice};
+use super::{CHECKPOINT_SECONDS, budget};
+use crate::Result;
+use crate::fit::{LanguageOptions, Preset, RgbOptions};
+use crate::gpu::Device;
+use crate::language::sam::SamOptions;
+use crate::scene::Camera;
+use std::path::PathBuf;
+
+/// What to do, with every default that does not depend on the machine resolved.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct RunPlan {
+    /// Photos or folders of photos.
+    pub inputs: Vec<PathBuf>,
+    /// How many to use; `None` = as many as there are, at most [`photo::DEFAULT_VIEWS`].
+    pub views: Option<usize>,
+    /// Scene directory.
+    pub out: PathBuf,
+    /// Replace an existing scene.
+    pub force: bool,
+    /// Use the stages that an earlier run with the same photos and settings has finished.
+    pub resume: bool,
+    /// Seconds between states of training on disk.
+    pub checkpoint_seconds: u64,
+    /// `None` = draft on a CPU device, default elsewhere.
+    pub preset: Option<Preset>,
+    /// Cameras and points.
+    pub init: SourceChoice,
+    /// Known cameras in memory, one per photo with its name, instead of those of `init`.
+    #[serde(skip)]
+    pub cameras: Vec<Camera>,
+    /// Dense matches.
+    pub matcher: SourceChoice,
+    /// Masks.
+    pub masks: SourceChoice,
+    /// How a mask network is asked.
+    pub sam: SamOptions,
+    /// Features.
+    pub features: SourceChoice,
+    /// Texts to answer once the scene is there.
+    pub queries: Vec<String>,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Steps of the colour stage instead of the preset's.
+    pub iterations: Option<usize>,
+    /// Steps of the language stage instead of the preset's.
+    pub language_iterations: Option<usize>,
+    /// What gets language onto the splats: [`super::method::SPARSELGS`] unless a baseline is wanted.
+    pub method: &'static Method,
+    /// Length of the codes.
+    pub feature_dim: usize,
+    /// One model per level.
+    pub per_level: bool,
+    /// Greatest side of the working images, pixels; `None` = [`photo::default_max_size`] of the device.
+    pub max_size: Option<usize>,
+    /// Vulkan device.
+    pub device: Option<String>,
+    /// The same bits on every run: see [`crate::gpu::Options`].
+    pub deterministic: bool,
+    /// Folder of the models.
+    pub models: Option<PathBuf>,
+}
+
+impl Default for RunPlan {
+    /// Built-in models, everything else as the device suggests; no inputs, and nowhere to write.
+    fn default() -> Self {
+        RunPlan {
+            inputs: Vec::new(),
+            views: None,
+            out: PathBuf::new(),
+            force: false,
+            resume: false,
+            checkpoint_seconds: CHECKPOINT_SECONDS,
+            preset: None,
+            init: sources::default::<sources::Geometry>(),
+            cameras: Vec::new(),
+            matcher: sources::default::<sources::Matches>(),
+            masks: sources::default::<sources::Masks>(),
+            sam: SamOptions::default(),
+            features: sources::default::<sources::Features>(),
+            queries: Vec::new(),
+            seed: 0,
+            iterations: None,
+            language_iterations: None,
+            method: &method::SPARSELGS,
+            feature_dim: FEATURE_DIM,
+            per_level: false,
+            max_size: None,
+            device: None,
+            deterministic: false,
+            models: None,
+        }
+    }
+}
+
+impl RunPlan {
+    /// What the method does, with the plan's code length.
+    pub fn recipe(&self) -> Recipe {
+        Recipe { feature_dim: self.feature_dim, ..self.method.recipe }
+    }
+
+    /// The preset, or the device's.
+    pub(super) fn preset_on(&self, device: &Device) -> Preset {
+        self.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default })
+    }
+
+    /// Refuses photos of these (width, height) where they cannot be worked with at that size.
+    pub(super) fn check_budget(
+        &self,
+        device: &Device,
+        sizes: &[(usize, usize)],
+        max_size: usize,
+    ) -> Result<()> {
+        let work = self.work(self.preset_on(device), sizes.len());
+        budget::check(&budget::Limits::now(device.info()), sizes, max_size, &work)
+    }
+
+    fn work(&self, preset: Preset, photos: usize) -> budget::Work {
+        budget::Work::language(self.feature_dim, self.per_level, preset, photos)
+    }
+
+    /// The colour stage.
+    pub(super) fn rgb_options(&self, preset: Preset, device: &Device, photos: usize) -> RgbOptions {
+        let mut options = RgbOptions::preset(preset);
+        let work = self.work(preset, photos);
+        options.limit_splats(budget::most_splats(device.info(), work.features), work.splats);
+        options.seed = self.seed;
+        if let Some(n) = self.iterations {
+            options = options.with_iterations(n);
+        }
+        self.recipe().rgb(options)
+    }
+
+    /// The language stage.
+    pub(super) fn language_options(&self, preset: Preset) -> LanguageOptions {
+        let mut options = LanguageOptions::preset(preset);
+        options.seed = self.seed;
+        options.per_level |= self.per_level;
+        options.iterations = self.language_iterations.unwrap_or(options.iterations);
+        options
+    }
+}

@@ -1,0 +1,57 @@
+//! Masks of the photos on three levels.
+use super::{Build, Kind, NO_CHECK, PosedPhotos, Source};
+use crate::Result;
+use crate::infer::Role;
+use crate::infer::installed::{Duty, Installed};
+use crate::language::{ViewMasks, dir};
+use crate::pipeline::Output;
+use crate::run::stages::{Edges, GivenMasks, GraphMasks, MasksOr, NetworkMasks};
+
+/// `--masks`
+pub struct Masks;
+
+impl Kind for Masks {
+    const OPTION: &'static str = "masks";
+    const ABOUT: &'static str = "Masks on three levels";
+    const DUTY: Duty = Duty::Masks;
+    const SOURCES: &'static [Source<Self>] = &[
+        Source {
+            name: "graph",
+            argument: None,
+            about: "segmentation by colour, learned edges and depth",
+            needs: &[Role::Edges],
+            check: NO_CHECK,
+            make: |_, (build, photos)| Ok(graph(build, photos)),
+        },
+        Source {
+            name: "dir",
+            argument: Some("DIR"),
+            about: "STEM_s.npy",
+            needs: &[],
+            check: |dir, plan, photos| {
+                photos.iter().try_for_each(|p| dir::read_view(dir, p, plan.features.name == "dir").map(drop))
+            },
+            make: |dir, (build, photos)| {
+                let features = build.plan.features.name == "dir";
+                Ok(build.graph.add(GivenMasks { dir: dir.to_path_buf(), features }, (photos.placed,)))
+            },
+        },
+    ];
+    type Input<'i> = (&'i mut Build, PosedPhotos);
+    type Output = Output<Vec<ViewMasks>>;
+
+    fn network(model: Installed, (build, photos): Self::Input<'_>) -> Result<Self::Output> {
+        let untrained = model.untrained();
+        let found = build.graph.add(NetworkMasks::new(model, build.plan.sam)?, (photos.placed,));
+        if !untrained {
+            return Ok(found);
+        }
+        let built_in = graph(build, photos);
+        Ok(build.graph.add(MasksOr, (found, built_in)))
+    }
+}
+
+fn graph(build: &mut Build, photos: PosedPhotos) -> Output<Vec<ViewMasks>> {
+    let edges = build.graph.add(Edges, (photos.placed,));
+    build.graph.add(GraphMasks, (photos.placed, edges, photos.geometry))
+}
