@@ -102,34 +102,33 @@ fn status(e: &Error) -> SvkStatus {
 pub unsafe trait Versioned: Copy {
     /// For messages.
     const NAME: &'static str;
-    /// Size of the first version: what every caller has at least. Once a structure grows, this becomes the number of bytes
-    /// that it had in version 1 of the interface.
+    /// Size of the first version: what every caller has at least.
     const FIRST: usize;
 }
 
-/// A structure that has grown is followed by the field that its first version ended before.
+/// Sizes of the first versions in bytes, where pointers have 64 bits: literal, so that a field that is appended does not change
+/// them.
 macro_rules! versioned {
-    ($($name:ident $(before $added:ident)?),*) => {$(
+    ($($name:ident $first:literal),*) => {$(
         // SAFETY: integers, floats, raw pointers and optional functions behind a leading size, all `repr(C)`.
         unsafe impl Versioned for $name {
             const NAME: &'static str = stringify!($name);
-            const FIRST: usize = versioned!(@first $name $($added)?);
+            const FIRST: usize = if cfg!(target_pointer_width = "64") { $first } else { size_of::<$name>() };
         }
+        const _: () = assert!(<$name as Versioned>::FIRST <= size_of::<$name>(), "a structure never shrinks");
     )*};
-    (@first $name:ident) => { size_of::<$name>() };
-    (@first $name:ident $added:ident) => { std::mem::offset_of!($name, $added) };
 }
 
 versioned!(
-    SvkContextOptions,
-    SvkVulkanDevice,
-    SvkCamera,
-    SvkPhoto,
-    SvkTrainOptions before max_size,
-    SvkSceneInfo,
-    SvkOutput,
-    SvkSync,
-    SvkAnswer
+    SvkContextOptions 32,
+    SvkVulkanDevice 96,
+    SvkCamera 144,
+    SvkPhoto 88,
+    SvkTrainOptions 88,
+    SvkSceneInfo 48,
+    SvkOutput 80,
+    SvkSync 40,
+    SvkAnswer 48
 );
 
 fn stated_size<T: Versioned>(pointer: *const T) -> Result<usize, Fault> {

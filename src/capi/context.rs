@@ -3,8 +3,9 @@ use super::boundary::{self, Fault, LastError, argument, guard_creation, guard_nu
 use super::types::*;
 use crate::gpu::vk::{self, Handle};
 use crate::gpu::{Device, EnabledFeatures, HostDevice, Options, QueueLock};
+use crate::infer::provider::NAMES;
+use crate::infer::{Compute, Registry};
 use std::ffi::{CStr, c_char, c_void};
-use std::path::PathBuf;
 
 /// Version of this interface: major × 65536 + minor. A program runs with any library of the same major version and the
 /// same or a higher minor one.
@@ -13,7 +14,7 @@ pub const SVK_ABI_VERSION: u32 = 0x1_0000;
 /// A Vulkan device and where the models are.
 pub struct SvkContext {
     pub(super) device: Device,
-    pub(super) models: Option<PathBuf>,
+    pub(super) registry: Registry,
     pub(super) error: LastError,
 }
 
@@ -78,7 +79,13 @@ pub unsafe extern "C" fn svk_context_adopt(
 unsafe fn boxed(device: Device, options: &SvkContextOptions) -> Result<*mut SvkContext, Fault> {
     // SAFETY: passed on.
     let models = unsafe { boundary::path(options.models, "SvkContextOptions.models") }?;
-    Ok(Box::into_raw(Box::new(SvkContext { device, models, error: LastError::default() })))
+    // SAFETY: passed on.
+    let provider = unsafe { boundary::text(options.provider, "SvkContextOptions.provider") }?;
+    if let Some(unknown) = provider.as_deref().filter(|p| !NAMES.contains(p)) {
+        return argument(format!("SvkContextOptions.provider is {unknown}; use one of {}", NAMES.join(", ")));
+    }
+    let registry = Registry::with(models.as_deref(), Compute::by(provider.as_deref()))?;
+    Ok(Box::into_raw(Box::new(SvkContext { device, registry, error: LastError::default() })))
 }
 
 unsafe fn host_device(given: &SvkVulkanDevice) -> Result<HostDevice, Fault> {

@@ -77,7 +77,7 @@ pub unsafe extern "C" fn svk_scene_load(
         // SAFETY: per the header.
         let (slot, path) = unsafe { (boundary::slot(scene)?, boundary::path(path, "path")?) };
         let Some(path) = path else { return argument("the path is null") };
-        *slot = SvkScene::boxed(LiveScene::load(&context.device, &path, context.models.as_deref())?);
+        *slot = SvkScene::boxed(LiveScene::load(&context.device, &path, &context.registry)?);
         Ok(())
     })
 }

@@ -5,7 +5,6 @@ use super::progress::Callback;
 use super::scene::{SvkScene, camera_in};
 use super::types::*;
 use crate::fit::Preset;
-use crate::infer::Registry;
 use crate::infer::installed::{Inventory, inventory};
 use crate::photo::{self, Photo};
 use crate::pose::choose;
@@ -35,8 +34,8 @@ pub unsafe extern "C" fn svk_train(
             let options = boundary::read_or_default(options)?;
             let given = boundary::read_array(photos, photo_count)?;
             // What is wrong with the options is said before the photos are read.
-            let networks = inventory(&Registry::open(context.models.as_deref())?);
-            let mut plan = RunPlan { models: context.models.clone(), ..plan(&options, &networks)? };
+            let networks = inventory(&context.registry);
+            let mut plan = plan(&options, &networks)?;
             let progress = Callback::new(options.progress, options.user);
             let max_size = match options.max_size as usize {
                 0 => photo::default_max_size(context.device.info().is_cpu),
@@ -53,8 +52,8 @@ pub unsafe extern "C" fn svk_train(
                 }
                 plan.cameras = cameras;
             }
-            let outcome = run::reconstruct(&plan, &context.device, photos, &progress)?;
-            let live = LiveScene::trained(&context.device, outcome, context.models.as_deref())?;
+            let outcome = run::reconstruct(&plan, &context.device, &context.registry, photos, &progress)?;
+            let live = LiveScene::trained(&context.device, outcome, &context.registry)?;
             *slot = SvkScene::boxed(live);
         }
         Ok(())

@@ -115,6 +115,8 @@ pub struct SvkContextOptions {
     pub deterministic: u32,
     /// 1 = with the Khronos validation layer. Not for svk_context_adopt.
     pub validation: u32,
+    /// What computes the networks, as --provider takes it; NULL = the environment variable SPLATVK_PROVIDER, or else "auto".
+    pub provider: *const c_char,
 }
 
 /// A pointer to vkGetInstanceProcAddr, cast to this type.

@@ -6,7 +6,6 @@ use super::{print, print_json};
 use crate::ablate::{self, Finished, Lab, Plan, Regions, TABLES, Table};
 use crate::format::{create_folder, write_json};
 use crate::gpu::Device;
-use crate::infer::Registry;
 use crate::query::eval::GroundTruth;
 use crate::{Error, Result};
 use serde_json::{Value, json};
@@ -24,7 +23,7 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
     }
     let out = args.out.clone().unwrap_or_else(|| default_out(&args.data));
     create_folder(&out).map_err(|e| Error::input(format!("{e}; choose another --out")))?;
-    let registry = Registry::open(args.device.models.as_deref())?;
+    let registry = args.device.registry()?;
     let device = Device::open(args.device.device.as_deref())?;
     let (clock, name) = (Instant::now(), device.info().name.clone());
     let progress = progress::here();

@@ -1,5 +1,6 @@
 //! What the user typed. `super::plan` says what it means.
-use crate::infer::provider;
+use crate::Result;
+use crate::infer::{Compute, Registry, provider};
 use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
@@ -70,6 +71,34 @@ pub enum Command {
     Manuals(ManualsArgs),
 }
 
+impl Command {
+    /// Where a command that loads networks keeps `--provider`.
+    pub fn provider(&mut self) -> Option<&mut Option<String>> {
+        let device = match self {
+            Command::Run(args) => &mut args.device,
+            Command::Train(args) => &mut args.device,
+            Command::Query(args) => &mut args.device,
+            Command::View(args) => &mut args.device,
+            Command::Eval(args) => &mut args.device,
+            Command::Ablate(args) => &mut args.device,
+            Command::Models(args) => match &mut args.action {
+                ModelsAction::List(device) | ModelsAction::Check(device) | ModelsAction::Path(device) => {
+                    device
+                }
+            },
+            Command::Doctor(args) => &mut args.device,
+            Command::Bench(args) => return Some(&mut args.provider),
+            Command::Render(_)
+            | Command::Generate(_)
+            | Command::Export(_)
+            | Command::Clean(_)
+            | Command::Completions(_)
+            | Command::Manuals(_) => return None,
+        };
+        Some(&mut device.provider)
+    }
+}
+
 /// How much time a run may take.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum PresetArg {
@@ -93,6 +122,16 @@ pub struct DeviceArgs {
     /// Print one JSON object on standard output
     #[arg(long)]
     pub json: bool,
+    /// `--provider`, which stands before or after the command.
+    #[arg(skip)]
+    pub provider: Option<String>,
+}
+
+impl DeviceArgs {
+    /// The models.
+    pub fn registry(&self) -> Result<Registry> {
+        Registry::with(self.models.as_deref(), Compute::by(self.provider.as_deref()))
+    }
 }
 
 /// `splatvk train`

@@ -27,7 +27,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         return cameras(args);
     }
     if has(BenchPart::Models) {
-        models(&Registry::open(args.models.as_deref())?)?;
+        models(&args.registry()?.uncached())?;
         if args.parts == [BenchPart::Models] {
             return Ok(());
         }
@@ -111,7 +111,7 @@ fn cameras(args: &BenchArgs) -> Result<()> {
         return Err(Error::input("bench cameras: give folders with ground_truth.json with --data DIR..."));
     }
     writable(args.json.as_deref())?;
-    let registry = Registry::open(args.models.as_deref())?;
+    let registry = args.registry()?;
     let reading = bench::cameras::Reading { max_size: args.max_size, copies: args.copies };
     let progress = progress::here();
     let mut header = Some(bench::cameras::header());
@@ -135,7 +135,7 @@ fn asked(args: &BenchArgs) -> Result<(scene_dir::Scene, Box<dyn RegionEncoder>)>
         let path = path.display();
         return Err(Error::input(format!("{path}: the scene has no language; make one with splatvk run")));
     }
-    let encoder = encoder::of_scene(&scene, Registry::open(args.models.as_deref())?)?;
+    let encoder = encoder::of_scene(&scene, args.registry()?)?;
     Ok((scene, encoder))
 }
 

@@ -2,8 +2,8 @@
 use super::args::DoctorArgs;
 use super::{models, print, print_json};
 use crate::gpu::report::{Line, Status, vulkan};
+use crate::infer;
 use crate::infer::installed::inventory;
-use crate::infer::{self, Registry};
 use crate::photo;
 use crate::run::sources;
 use crate::{Error, Result};
@@ -11,16 +11,16 @@ use serde_json::json;
 use std::fmt::Write;
 
 pub fn doctor(args: &DoctorArgs) -> Result<()> {
+    let registry = args.device.registry()?;
     let mut lines = vulkan(args.device.device.as_deref());
-    lines.push(match infer::runtime().and_then(|path| Ok((path, infer::provider::name()?))) {
+    lines.push(match infer::runtime().and_then(|path| Ok((path, registry.compute().name()?))) {
         Ok((path, provider)) => {
             line("ONNX Runtime", Status::Ok, format!("{} · provider {provider}", path.display()), None)
         }
         Err(error) => line("ONNX Runtime", Status::Missing, "not usable".to_owned(), Some(error.to_string())),
     });
-    let notes = infer::provider::notes().unwrap_or_default();
+    let notes = registry.compute().notes().unwrap_or_default();
     lines.extend(notes.into_iter().map(|n| line("ONNX Runtime", Status::Note, n, None)));
-    let registry = Registry::open(args.device.models.as_deref())?;
     let status = registry.status();
     for m in &status {
         let found = format!(

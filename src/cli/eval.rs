@@ -5,7 +5,6 @@ use super::{print, print_json};
 use crate::format::scene_dir::Scene;
 use crate::format::{cameras, create_folder, picture, scene_dir, write_json};
 use crate::gpu::Device;
-use crate::infer::Registry;
 use crate::query::TextQuery;
 use crate::query::eval::{Evaluation, GroundTruth, Report};
 use crate::query::protocol::{self, CodeScores, Kind, Masks, Seen};
@@ -46,7 +45,7 @@ fn ask(scene: &Scene, texts: &[String], args: &EvalArgs) -> Result<Vec<TextQuery
     if scene.language.is_none() || texts.is_empty() {
         return Ok(Vec::new());
     }
-    let registry = Registry::open(args.device.models.as_deref())?;
+    let registry = args.device.registry()?;
     let mut encoder = encoder::of_scene(scene, registry)?;
     ask::embedded(texts, encoder.as_mut())
 }

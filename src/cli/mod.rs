@@ -35,10 +35,11 @@ pub fn main() -> ExitCode {
     };
     progress::set_format(cli.log);
     progress::stop_on_signal();
-    if let Some(name) = &cli.provider {
-        crate::infer::provider::choose(name);
+    let mut command = cli.command;
+    if let Some(provider) = command.provider() {
+        *provider = cli.provider;
     }
-    match execute(cli.command) {
+    match execute(command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             progress::failed(&one_line(&error.to_string()), error.exit_code());

@@ -3,7 +3,7 @@ use super::args::{ModelsAction, ModelsArgs};
 use super::{print, print_json};
 use crate::infer::check::{Measured, check};
 use crate::infer::installed::{Installed, Inventory, Known, inventory, known};
-use crate::infer::{ModelStatus, Registry, provider};
+use crate::infer::{ModelStatus, Registry};
 use crate::{Error, Result};
 use serde_json::json;
 use std::fmt::Write;
@@ -11,15 +11,15 @@ use std::fmt::Write;
 pub fn models(args: &ModelsArgs) -> Result<()> {
     match &args.action {
         ModelsAction::List(device) => {
-            let registry = Registry::open(device.models.as_deref())?;
+            let registry = device.registry()?;
             list(&registry, &inventory(&registry), device.json)
         }
         ModelsAction::Check(device) => {
-            let registry = Registry::open(device.models.as_deref())?;
-            check_all(&registry, device.json)
+            let registry = device.registry()?;
+            check_all(&registry.uncached(), device.json)
         }
         ModelsAction::Path(device) => {
-            let registry = Registry::open(device.models.as_deref())?;
+            let registry = device.registry()?;
             let paths: Vec<String> = registry.folders().iter().map(|f| f.display().to_string()).collect();
             if device.json {
                 print_json(&json!({ "path": paths.first(), "paths": paths }))
@@ -141,7 +141,7 @@ fn check_all(registry: &Registry, as_json: bool) -> Result<()> {
         let mut text = String::new();
         status.iter().for_each(|m| built_in(&mut text, m));
         if !found.models.is_empty() {
-            let _ = writeln!(text, "\nNetworks, computed by provider {}", provider::name()?);
+            let _ = writeln!(text, "\nNetworks, computed by provider {}", registry.compute().name()?);
         }
         print(&text)?;
     }
@@ -161,7 +161,7 @@ fn check_all(registry: &Registry, as_json: bool) -> Result<()> {
     if as_json {
         let models: Vec<_> = status.iter().map(to_json).collect();
         print_json(
-            &json!({ "models": models, "provider": provider::name().ok(), "networks": results, "problems": problems }),
+            &json!({ "models": models, "provider": registry.compute().name().ok(), "networks": results, "problems": problems }),
         )?;
     }
     match problems.into_iter().next() {

@@ -1,5 +1,5 @@
 //! What arguments that several commands take mean. No work happens here.
-use super::args::{DeviceArgs, PresetArg};
+use super::args::PresetArg;
 use crate::photo::SMALLEST_SIDE;
 use crate::{Error, Result};
 use std::path::PathBuf;
@@ -12,11 +12,6 @@ pub fn max_size(given: Option<usize>) -> Result<Option<usize>> {
         ))),
         _ => Ok(given),
     }
-}
-
-/// The folder of `--models`.
-pub fn models(args: &DeviceArgs) -> Option<PathBuf> {
-    args.models.clone()
 }
 
 /// The library's preset.

@@ -6,7 +6,6 @@ use super::{print, print_json, views};
 use crate::format::ply::{self, PlyOptions};
 use crate::format::{cameras, picture, scene_dir, write_json};
 use crate::gpu::Device;
-use crate::infer::Registry;
 use crate::query::{QueryOptions, QueryResult};
 use crate::report::{colour, file_name};
 use crate::run::ask::QueryScene;
@@ -48,7 +47,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
             )));
         }
     }
-    let registry = Registry::open(args.device.models.as_deref())?;
+    let registry = args.device.registry()?;
     let encoder = encoder::of_scene(&scene, registry)?;
     let mut out = Outputs::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;

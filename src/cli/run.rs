@@ -2,7 +2,6 @@
 use super::args::{DeviceArgs, PresetArg};
 use super::progress;
 use super::{plan, print, print_json};
-use crate::infer::Registry;
 use crate::infer::installed::{Inventory, inventory};
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;
@@ -93,7 +92,7 @@ fn methods() -> PossibleValuesParser {
 }
 
 pub fn run(args: &RunArgs) -> Result<()> {
-    let installed = inventory(&Registry::open(args.device.models.as_deref())?);
+    let installed = inventory(&args.device.registry()?);
     let plan = plan(args, &installed)?;
     let outcome = crate::run::run(&plan, progress::here().as_ref())?;
     if args.device.json {
@@ -155,6 +154,7 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         deterministic: args.deterministic,
         cameras: Vec::new(),
         models: args.device.models.clone(),
+        provider: args.device.provider.clone(),
     })
 }
 

@@ -22,7 +22,8 @@ pub fn train(args: &TrainArgs) -> Result<()> {
         max_size: plan::max_size(args.max_size)?,
         device: args.device.device.clone(),
         deterministic: args.deterministic,
-        models: plan::models(&args.device),
+        models: args.device.models.clone(),
+        provider: args.device.provider.clone(),
     };
     let trained = run(&plan, progress::here().as_ref())?;
     if args.device.json {

@@ -3,7 +3,6 @@ use super::args::ViewArgs;
 use super::{print, print_json, progress};
 use crate::format::scene_dir::{self, Scene};
 use crate::gpu::Device;
-use crate::infer::Registry;
 use crate::photo;
 use crate::query::QueryOptions;
 use crate::report::viewer::{self, Names, SCENE_PATH, Scene3d};
@@ -76,7 +75,7 @@ fn port_of(server: &Server) -> Result<u16> {
 /// The scene ready for questions, looked at from its own cameras.
 fn questions(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
     let field = scene.language.clone().ok_or_else(|| Error::input("this scene has no language"))?;
-    let encoder = encoder::of_scene(scene, Registry::open(args.device.models.as_deref())?)?;
+    let encoder = encoder::of_scene(scene, args.device.registry()?)?;
     let device = Device::open(args.device.device.as_deref())?;
     let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
     ready.look(&scene.cameras)?;

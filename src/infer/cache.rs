@@ -2,7 +2,6 @@
 //!
 //! The folder is a cache: anything odd about a file, and it is computed and written again. The least recently used files go
 //! when it grows beyond its capacity.
-use std::cell::Cell;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -77,31 +76,8 @@ pub fn files() -> Vec<(PathBuf, u64)> {
     files::in_folder(&folder(), EXTENSION)
 }
 
-thread_local! {
-    static OFF: Cell<bool> = const { Cell::new(false) };
-}
-
-/// No cache on this thread while this lives: what is measured or tested must be computed.
-pub(crate) struct Off {
-    before: bool,
-}
-
-/// Computes everything until the result is dropped.
-pub(crate) fn off() -> Off {
-    Off { before: OFF.replace(true) }
-}
-
-impl Drop for Off {
-    fn drop(&mut self) {
-        OFF.set(self.before);
-    }
-}
-
 /// `compute`, or what it gave the last time with the same key.
-pub fn remember(key: Key, compute: impl FnOnce() -> Result<Vec<f32>>) -> Result<Vec<f32>> {
-    if OFF.get() {
-        return compute();
-    }
+pub(super) fn remember(key: Key, compute: impl FnOnce() -> Result<Vec<f32>>) -> Result<Vec<f32>> {
     let file = key.file();
     if let Some(body) = files::read_sealed(&file).filter(|b| b.len() % 4 == 0) {
         return Ok(bytemuck::pod_collect_to_vec(&body));

@@ -2,7 +2,6 @@
 use std::path::Path;
 use std::time::Instant;
 
-use super::cache;
 use super::clip::Clip;
 use super::graph::GraphFile;
 use super::installed::{Duty, Installed};
@@ -41,9 +40,8 @@ fn measured<T>(step: String, steps: &mut Vec<Measured>, work: impl FnOnce() -> R
 }
 
 /// Repeats the reference of every graph that has one, then the model's duty on two built-in pictures. An error names the
-/// file and what it did wrong.
+/// file and what it did wrong. For a model of an uncached registry ([`super::Registry::uncached`]): the steps are measured.
 pub fn check(model: &Installed) -> Result<Vec<Measured>> {
-    let _uncached = cache::off();
     let mut steps = Vec::new();
     for graph in model.graphs.values() {
         let reference = graph.path.with_extension("reference.npz");

@@ -32,7 +32,7 @@ pub(super) struct Extent {
 impl Classifier {
     /// Loads the network of the model pack.
     pub fn load(registry: &Registry) -> Result<Self> {
-        Ok(Classifier { session: Session::load(&registry.path(Role::Classifier)?)? })
+        Ok(Classifier { session: registry.session(Role::Classifier)? })
     }
 
     /// [count, 1000] class probabilities of the regions `0..count` of `labels`; a zero row for a region without pixels.

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use tokenizers::Tokenizer;
 
 use super::RegionEncoder;
-use super::cache::{Key, remember};
+use super::cache::Key;
 use super::classify::{crop, extents};
 use super::contract::Part;
 use super::graph::{Graph, GraphFile};
@@ -95,7 +95,7 @@ impl Clip {
         const OTHERS: [&str; 5] =
             ["a dog", "a city street at night", "a page of text", "a person on a bicycle", "a plate of food"];
         let key = Key::new("towers").model(visual)?.model(text)?;
-        let seen = remember(key, || {
+        let seen = visual.compute.remember(key, || {
             let texts: Vec<&str> = COLOURS.iter().map(|c| c.0).chain(OTHERS).collect();
             let names = self.embed_texts(&texts)?;
             let mut cosines = Vec::new();
@@ -243,7 +243,8 @@ impl RegionEncoder for Clip {
         let graph = self.model.graph(if dense { Part::DenseFeatures } else { Part::ImageTower })?;
         let key = Key::new("features").model(graph)?.values(&image.data).values(&labels.data);
         let key = key.values(&[image.width as u64, count as u64]);
-        let mut rows = remember(key, || {
+        let compute = graph.compute.clone();
+        let mut rows = compute.remember(key, || {
             if dense {
                 self.pixel_features(image, labels, count)
             } else {

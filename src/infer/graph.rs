@@ -6,6 +6,7 @@ use super::adapter::{Adapter, Binding};
 use super::cache::fingerprint;
 use super::contract::{Slot, relayout, unify};
 use super::onnx::{self, Dim, Header};
+use super::provider::Compute;
 use super::runtime::{Input, Session, Tensor};
 use crate::{Error, Result};
 
@@ -28,6 +29,8 @@ pub struct GraphFile {
     pub external: Vec<PathBuf>,
     /// The sha256 that the adapter pins of these files.
     pub pinned: Vec<(PathBuf, String)>,
+    /// How it is computed.
+    pub compute: Compute,
 }
 
 impl GraphFile {
@@ -57,6 +60,7 @@ impl GraphFile {
             parameters: header.parameters,
             opset: header.opset,
             external: header.external,
+            compute: Compute::default(),
         })
     }
 
@@ -102,7 +106,7 @@ impl GraphFile {
                 )));
             }
         }
-        let session = Session::load_sized(&self.path, self.bytes()).map_err(|e| match e {
+        let session = Session::load_sized(&self.path, self.bytes(), &self.compute).map_err(|e| match e {
             Error::Missing(text) if text.contains("pset") => Error::missing(format!(
                 "{text}; the file asks for operator set {}: export it with opset_version=17, or install a newer ONNX Runtime",
                 self.opset

@@ -17,7 +17,7 @@ pub struct Hed {
 impl Hed {
     /// Loads the network of the model pack.
     pub fn load(registry: &Registry) -> Result<Self> {
-        Ok(Hed { session: Session::load(&registry.path(Role::Edges)?)? })
+        Ok(Hed { session: registry.session(Role::Edges)? })
     }
 
     /// Probability in [0, 1] that a person would draw a contour through each pixel.

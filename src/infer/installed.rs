@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::cache::fingerprint;
 use super::contract::Part;
 use super::graph::GraphFile;
+use super::provider::Compute;
 use super::registry::Registry;
 use crate::{Error, Result};
 
@@ -115,6 +116,11 @@ impl Installed {
         })
     }
 
+    /// How it is computed.
+    pub fn compute(&self) -> Compute {
+        self.graphs.values().next().map(|g| g.compute.clone()).unwrap_or_default()
+    }
+
     /// Whether none of it was trained.
     pub fn untrained(&self) -> bool {
         self.graphs.values().any(|g| g.untrained)
@@ -186,19 +192,20 @@ pub fn inventory(registry: &Registry) -> Inventory {
             }
         }
         for ((folder, name), files) in groups {
-            group(folder, name, &files, &mut found);
+            group(folder, name, &files, registry.compute(), &mut found);
         }
     }
     found
 }
 
-fn group(folder: PathBuf, name: String, files: &[PathBuf], found: &mut Inventory) {
+fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, found: &mut Inventory) {
     let mut graphs: BTreeMap<Part, GraphFile> = BTreeMap::new();
     let mut failed: Vec<(PathBuf, String)> = Vec::new();
     for file in files {
         match GraphFile::recognise(file) {
             // The first of several variants (quantised, half precision): the plain name sorts first.
             Ok(graph) => {
+                let graph = GraphFile { compute: compute.clone(), ..graph };
                 graphs.entry(graph.binding.part).or_insert(graph);
             }
             Err(e) => failed.push((file.clone(), e.to_string())),

@@ -33,10 +33,9 @@ pub mod warp;
 pub mod words;
 pub mod xfeat;
 
+pub use provider::Compute;
 pub use registry::{ModelStatus, Registry, Role, home};
 pub use runtime::{Input, Session, Tensor, runtime};
-
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::Result;
 use crate::scene::{Plane, RgbImage};
@@ -53,13 +52,6 @@ pub(crate) fn nearest(regions: &[f32], rows: &[f32], dim: usize, best: usize) ->
         list
     };
     regions.par_chunks_exact(dim).map(of).collect()
-}
-
-/// Held while a large network is loaded: stages that run beside each other take turns, so that a run needs the memory of one
-/// network and every network has all cores.
-pub(crate) fn alone() -> MutexGuard<'static, ()> {
-    static TURN: Mutex<()> = Mutex::new(());
-    TURN.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Puts image regions and texts into one space of unit vectors, so that a cosine says how well a phrase names a

@@ -2,7 +2,7 @@
 //! pointmaps of every pair follow.
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
-use super::cache::{Key, remember};
+use super::cache::Key;
 use super::graph::{GraphFile, Outputs};
 use super::prepare::Prepared;
 use super::runtime::Input;
@@ -33,7 +33,7 @@ pub(super) fn pointmaps(
         key = key.values(&p.data);
     }
     let pixels = width * height;
-    let values = remember(key, || {
+    let values = graph.compute.remember(key, || {
         let data = prepared.iter().flat_map(|p| p.data.iter().copied()).collect();
         let mut outputs =
             graph.load()?.run(vec![("images", Input::F32(vec![1, count, 3, height, width], data))])?;

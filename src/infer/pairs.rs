@@ -1,7 +1,6 @@
 //! Geometry networks: DUSt3R and MASt3R see two photos at a time, VGGT and its like all of them. Both give pointmaps of pairs
 //! ([`PairPointmaps`]), which [`crate::pose::pointmap`] brings to one scene.
-use super::alone;
-use super::cache::{Key, remember};
+use super::cache::Key;
 use super::contract::Part;
 use super::graph::{Graph, GraphFile, Outputs};
 use super::installed::Installed;
@@ -20,7 +19,7 @@ pub fn pointmaps(
     progress: &dyn Progress,
 ) -> Result<(Vec<ModelView>, Vec<PairPointmaps>)> {
     if let Ok(graph) = model.graph(Part::MultiView) {
-        let _alone = alone();
+        let _turn = graph.compute.turn();
         return super::multiview::pointmaps(graph, photos, progress);
     }
     let (prepared, pairs) = decoded(model, photos, progress)?;
@@ -33,7 +32,8 @@ pub(super) fn decoded(
     photos: &[Photo],
     progress: &dyn Progress,
 ) -> Result<(Vec<Prepared>, Vec<PairPointmaps>)> {
-    let _alone = alone();
+    let compute = model.compute();
+    let _turn = compute.turn();
     let prepared = match model.graph(Part::Pair) {
         Ok(graph) => inputs(graph, "image1", photos)?,
         Err(_) => inputs(model.graph(Part::PairEncoder)?, "image", photos)?,
@@ -140,7 +140,7 @@ impl<'a> Network<'a> {
             key = key.model(graph)?;
         }
         let key = key.values(&a.data).values(&b.data);
-        let values = remember(key, || pack(self.forward(i, j)?))?;
+        let values = self.model.compute().remember(key, || pack(self.forward(i, j)?))?;
         unpack(&values, [a, b]).ok_or_else(|| {
             let size = format!("{}×{} and {}×{}", a.width, a.height, b.width, b.height);
             Error::work(format!(
@@ -314,7 +314,6 @@ fn off_the_rays(map: &Pointmap, width: usize, height: usize) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::cache::off;
     use super::super::installed::Duty;
     use super::super::testing::{Attribute, FLOAT, Onnx};
     use super::super::tests::photo;
@@ -326,7 +325,6 @@ mod tests {
     /// The true pointmaps of two breakfast views from one graph, which knows them by the brightness of its first input.
     #[test]
     fn swapped_pointmaps_are_seen_by_the_rays_they_lie_on() {
-        let _uncached = off();
         let views = breakfast::train_views();
         let (w, h) = (64usize, 48);
         // View k in the camera of view c, every tenth pixel.

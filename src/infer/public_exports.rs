@@ -7,7 +7,7 @@ use super::installed::Duty;
 use super::sam::Sam;
 use super::testing::{Attribute, FLOAT, INT64, Onnx};
 use super::tests::{clip_in, photo};
-use super::{RegionEncoder, Registry, cache, pairs, warp};
+use super::{RegionEncoder, Registry, pairs, warp};
 use crate::pose::pointmap;
 use crate::progress::Silent;
 use crate::scene::{Plane, RgbImage};
@@ -182,7 +182,6 @@ fn an_encoder_with_preprocessing_inside_gets_bytes_as_rows_of_pixels_and_the_off
 
 #[test]
 fn dense_features_are_averaged_over_regions() {
-    let _uncached = cache::off();
     let dir = tempfile::tempdir().unwrap();
     clip_in(dir.path(), [0, 1, 2]);
     let (from, to) = (dir.path().join("clip_toy"), dir.path().join("lseg"));
@@ -218,7 +217,6 @@ fn dense_features_are_averaged_over_regions() {
 
 #[test]
 fn roma_2_answers_both_directions_at_once_with_probabilities() {
-    let _uncached = cache::off();
     let field = |shift: f32| -> Vec<f32> {
         let place = |k: usize| (2.0 * (k as f32 + 0.5) / 8.0) - 1.0;
         (0..64).flat_map(|k| [place(k % 8) + shift, place(k / 8)]).collect()
@@ -257,7 +255,6 @@ fn roma_2_answers_both_directions_at_once_with_probabilities() {
 /// The breakfast views with a graph that returns their true depth and cameras, as VGGT says them and as Depth Anything 3 does.
 #[test]
 fn multi_view_networks_that_say_the_truth_give_the_true_cameras() {
-    let _uncached = cache::off();
     let views = super::breakfast::train_views();
     let n = views.len();
     let (w, h) = (112usize, 84);

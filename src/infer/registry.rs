@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
+use super::provider::Compute;
+use super::runtime::Session;
 use crate::files::content_hash;
 use crate::{Error, Result};
 
@@ -91,12 +93,18 @@ pub fn home() -> PathBuf {
 pub struct Registry {
     folders: Vec<PathBuf>,
     pack: Pack,
+    compute: Compute,
 }
 
 impl Registry {
     /// The folders of `models_dir`, else of `SPLATVK_MODELS` (both may be lists, written like `PATH`), else `models` under
     /// [`home`]. Opening does not look at the files.
     pub fn open(models_dir: Option<&Path>) -> Result<Self> {
+        Registry::with(models_dir, Compute::default())
+    }
+
+    /// [`Registry::open`], for networks that are computed like this.
+    pub fn with(models_dir: Option<&Path>, compute: Compute) -> Result<Self> {
         let pack =
             serde_json::from_str(PACK).map_err(|e| Error::work(format!("built-in model table: {e}")))?;
         let list = |text: &std::ffi::OsStr| -> Vec<PathBuf> {
@@ -115,14 +123,30 @@ impl Registry {
                 None => vec![home().join("models")],
             },
         };
-        Ok(Registry { folders, pack })
+        Ok(Registry { folders, pack, compute })
     }
 
-    /// Looks in these folders.
+    /// Looks in these folders, and computes everything.
     #[cfg(test)]
     pub(crate) fn of(folders: &[&Path]) -> Registry {
         let pack = serde_json::from_str(PACK).unwrap();
-        Registry { folders: folders.iter().map(|f| f.to_path_buf()).collect(), pack }
+        let compute = Compute::default().uncached();
+        Registry { folders: folders.iter().map(|f| f.to_path_buf()).collect(), pack, compute }
+    }
+
+    /// How the networks are computed.
+    pub fn compute(&self) -> &Compute {
+        &self.compute
+    }
+
+    /// The same models, and everything is computed.
+    pub fn uncached(&self) -> Registry {
+        Registry { compute: self.compute.uncached(), ..self.clone() }
+    }
+
+    /// Loads the model for `role`.
+    pub(super) fn session(&self, role: Role) -> Result<Session> {
+        Session::load(&self.path(role)?, &self.compute)
     }
 
     /// The folders that are searched, first to last.

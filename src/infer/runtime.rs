@@ -9,7 +9,7 @@ use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use ort::value::{Tensor as OrtTensor, TensorElementType};
 
 use super::contract::reorder;
-use super::provider::{self, Provider};
+use super::provider::{Compute, Provider};
 use super::registry::home;
 use crate::{Error, Result};
 
@@ -152,21 +152,21 @@ impl Drop for HandBack {
 
 impl Session {
     /// Loads a graph for the chosen provider; on the CPU it computes on as many threads as there are cores.
-    pub fn load(file: &Path) -> Result<Self> {
+    pub fn load(file: &Path, compute: &Compute) -> Result<Self> {
         let bytes = file.metadata().map_or(0, |m| m.len());
-        Session::load_sized(file, bytes)
+        Session::load_sized(file, bytes, compute)
     }
 
     /// [`Session::load`] of a graph whose weights may lie in other files: `bytes` counts them all.
-    pub(super) fn load_sized(file: &Path, bytes: u64) -> Result<Self> {
+    pub(super) fn load_sized(file: &Path, bytes: u64, compute: &Compute) -> Result<Self> {
         let environment = &loaded()?.1;
         let large = bytes >= LARGE;
         let build = |provider| settings(environment, provider, large)?.commit_from_file(file);
-        let provider = provider::chosen()?;
+        let provider = compute.chosen()?;
         let built = match build(provider) {
-            Err(e) if provider.is_some() && provider::replaceable() => {
-                let name = provider::name().unwrap_or_default();
-                provider::note(format!(
+            Err(e) if provider.is_some() && compute.replaceable() => {
+                let name = compute.name().unwrap_or_default();
+                compute.note(format!(
                     "{}: not on {name} ({}); the CPU computes it",
                     file.display(),
                     line(&e)

@@ -6,7 +6,7 @@ use super::contract::Part;
 use super::graph::GraphFile;
 use super::installed::{Duty, inventory, known};
 use super::testing::{Attribute, FLOAT, INT64, Onnx};
-use super::{Input, RegionEncoder, Registry, cache, pairs, warp};
+use super::{Input, RegionEncoder, Registry, pairs, warp};
 use crate::files::sha256;
 use crate::photo::{Affine, Frame, Photo};
 use crate::progress::Silent;
@@ -75,7 +75,6 @@ fn refused(graph: &Onnx, extra: &[(&str, &str)]) -> String {
 
 #[test]
 fn towers_are_recognised_by_their_tensors_and_proven_to_belong_together() {
-    let _uncached = cache::off();
     let dir = tempfile::tempdir().unwrap();
     clip_in(dir.path(), [0, 1, 2]);
     let registry = Registry::of(&[dir.path()]);
@@ -129,7 +128,6 @@ fn a_whole_model_does_without_what_cannot_be_used_beside_it() {
 
 #[test]
 fn towers_of_other_widths_or_checkpoints_are_refused() {
-    let _uncached = cache::off();
     let dir = tempfile::tempdir().unwrap();
     clip_in(dir.path(), [0, 1, 2]);
     let registry = Registry::of(&[dir.path()]);
@@ -337,7 +335,6 @@ pub(super) fn photo(stem: &str, image: RgbImage) -> Photo {
 /// One graph for both views, channels first, raw activations: the adapter says what is left to do.
 #[test]
 fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_the_adapter() {
-    let _uncached = cache::off();
     let (w, h) = (32u64, 16);
     let pixels = (w * h) as usize;
     // ln 3 along z: e^d − 1 = 2. A mark of the first image's brightness in x tells the two orders apart.
@@ -381,7 +378,6 @@ fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_t
 /// MASt3R as a matcher: pixels of one colour have one descriptor, and every colour occurs once in each photo.
 #[test]
 fn descriptors_of_a_pair_network_match_photos() {
-    let _uncached = cache::off();
     let (w, h) = (32u64, 16);
     let pixels = (w * h) as usize;
     let mut graph = Onnx::new().input("img1", FLOAT, "1 3 16 32").input("img2", FLOAT, "1 3 16 32");
@@ -426,7 +422,6 @@ fn descriptors_of_a_pair_network_match_photos() {
 /// A matcher that moves everything a quarter of the width to the right, sure as a logit of 2.
 #[test]
 fn a_warp_is_brought_to_the_photos_pixels() {
-    let _uncached = cache::off();
     let mut flow = Vec::new();
     for y in 0..8 {
         for x in 0..8 {

@@ -24,7 +24,7 @@ impl TextEncoder {
         let mut tokenizer = Tokenizer::from_file(&file).map_err(failed)?;
         // The file pads every text to 128 tokens; padding would only cost time here.
         tokenizer.with_padding(None);
-        Ok(TextEncoder { session: Session::load(&registry.path(Role::Text)?)?, tokenizer })
+        Ok(TextEncoder { session: registry.session(Role::Text)?, tokenizer })
     }
 
     /// Token ids of a text, with its start and end marks; cut at 128.

@@ -2,8 +2,7 @@
 //! themselves; MASt3R gives descriptors, whose nearest neighbours do.
 use rayon::prelude::*;
 
-use super::alone;
-use super::cache::{Key, remember};
+use super::cache::Key;
 use super::contract::Part;
 use super::graph::Graph;
 use super::installed::Installed;
@@ -23,27 +22,28 @@ pub fn warps(
     progress: &dyn Progress,
 ) -> Result<Vec<(DenseWarp, DenseWarp)>> {
     let Ok(file) = model.graph(Part::Warp) else { return by_descriptors(model, photos, progress) };
-    let _alone = alone();
+    let _turn = file.compute.turn();
     let prepared = super::pairs::inputs(file, "image1", photos)?;
     let both = file.has("warp21") && file.has("certainty21");
     let mut graph: Option<Graph> = None;
     let mut forward = |i: usize, j: usize| -> Result<Vec<Field>> {
         let (a, b) = (&prepared[i], &prepared[j]);
-        let values = remember(Key::new("warp").model(file)?.values(&a.data).values(&b.data), || {
-            let net = match graph.take() {
-                Some(net) => net,
-                None => file.load()?,
-            };
-            let net = graph.insert(net);
-            let mut outputs = net.run(vec![("image1", a.input()), ("image2", b.input())])?;
-            let mut all = Vec::new();
-            let ends = [("warp12", "certainty12"), ("warp21", "certainty21")];
-            for (warp, certainty) in ends.into_iter().take(if both { 2 } else { 1 }) {
-                let (warp, sure) = (outputs.take(warp)?, outputs.take(certainty)?);
-                all.extend(field_values(warp, sure, file)?);
-            }
-            Ok(all)
-        })?;
+        let values =
+            file.compute.remember(Key::new("warp").model(file)?.values(&a.data).values(&b.data), || {
+                let net = match graph.take() {
+                    Some(net) => net,
+                    None => file.load()?,
+                };
+                let net = graph.insert(net);
+                let mut outputs = net.run(vec![("image1", a.input()), ("image2", b.input())])?;
+                let mut all = Vec::new();
+                let ends = [("warp12", "certainty12"), ("warp21", "certainty21")];
+                for (warp, certainty) in ends.into_iter().take(if both { 2 } else { 1 }) {
+                    let (warp, sure) = (outputs.take(warp)?, outputs.take(certainty)?);
+                    all.extend(field_values(warp, sure, file)?);
+                }
+                Ok(all)
+            })?;
         Ok(fields(&values))
     };
     let count = photos.len();

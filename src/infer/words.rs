@@ -17,7 +17,7 @@
 //! the canonical phrases of the relevancy score should be.
 //!
 //! It knows about a thousand everyday things and eleven colours. CLIP is the full model.
-use super::cache::{Key, remember};
+use super::cache::Key;
 use super::classify::{CLASSES, Classifier};
 use super::registry::{Registry, Role};
 use super::text::{self, TextEncoder, normalise};
@@ -189,8 +189,9 @@ impl Vocabulary {
         // Naming a thousand classes takes seconds, which a single query should not pay.
         let used = registry.status_of(&[Role::Text, Role::Tokenizer, Role::Classes]);
         let key = used.iter().fold(Key::new("class-names"), |key, file| key.text(&file.sha256));
-        let mut names =
-            remember(key, || encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>()))?;
+        let mut names = registry
+            .compute()
+            .remember(key, || encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>()))?;
         let mut mean = vec![0f32; text::DIM];
         for name in names.chunks_exact(text::DIM) {
             mean.iter_mut().zip(name).for_each(|(m, n)| *m += n / CLASSES as f32);

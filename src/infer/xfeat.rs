@@ -133,7 +133,7 @@ pub struct XFeat {
 impl XFeat {
     /// Loads the network of the model pack.
     pub fn load(registry: &Registry) -> Result<Self> {
-        Ok(XFeat { session: Session::load(&registry.path(Role::Keypoints)?)? })
+        Ok(XFeat { session: registry.session(Role::Keypoints)? })
     }
 
     /// At most `max_keypoints` keypoints, best first.

@@ -3,7 +3,7 @@ use super::store::{Codec, Key, Store, Value};
 use super::{Context, Lane, Stage};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::Device;
-use crate::infer::{Registry, provider};
+use crate::infer::Registry;
 use crate::progress::{Progress, Recorded};
 use crate::{Error, Result};
 use std::collections::BTreeSet;
@@ -144,7 +144,7 @@ impl<'g> Graph<'g> {
         store: &Store,
         progress: &Recorded,
     ) -> Result<Made> {
-        let keys = self.keys(device);
+        let keys = self.keys(device, registry);
         let mut state = self.planned(targets, store, &keys);
         targets.iter().for_each(|t| state.users[*t] += 1);
         self.say_what_is_kept(&state, progress);
@@ -171,10 +171,10 @@ impl<'g> Graph<'g> {
         Ok(Made { values: state.values, seconds: state.seconds })
     }
 
-    fn keys(&self, device: &Device) -> Vec<Key> {
+    fn keys(&self, device: &Device, registry: &Registry) -> Vec<Key> {
         let info = device.info();
         // Without ONNX Runtime no stage gets as far as keeping anything.
-        let provider = provider::name().unwrap_or_default();
+        let provider = registry.compute().name().unwrap_or_default();
         let machine = format!("{} {} {} {provider}", info.name, info.driver, info.deterministic);
         let mut keys: Vec<Key> = Vec::with_capacity(self.nodes.len());
         for node in &self.nodes {

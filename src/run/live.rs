@@ -12,18 +12,19 @@ use crate::progress::Silent;
 use crate::query::{self, CANONICAL_PHRASES, QueryOptions, QueryResult, TextQuery};
 use crate::scene::{Camera, LanguageField, Plane, Splats};
 use crate::{Error, Result};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// A trained or loaded scene on a device.
 ///
 /// ```no_run
 /// # fn main() -> splatvk::Result<()> {
-/// use splatvk::{gpu::Device, photo, pose::choose, progress::Silent, run::{self, RunPlan, live::LiveScene}};
+/// use splatvk::{gpu::Device, infer::Registry, photo, pose::choose, progress::Silent, run::{self, RunPlan, live::LiveScene}};
 /// let device = Device::open(None)?;
 /// let (chosen, _) = choose::photos(&["my-photos".into()], Some(4), &Silent)?;
 /// let photos = photo::load_each(&chosen, photo::MAX_SIZE, &Silent)?;
-/// let outcome = run::reconstruct(&RunPlan::default(), &device, photos, &Silent)?;
-/// let mut scene = LiveScene::trained(&device, outcome, None)?;
+/// let models = Registry::open(None)?;
+/// let outcome = run::reconstruct(&RunPlan::default(), &device, &models, photos, &Silent)?;
+/// let mut scene = LiveScene::trained(&device, outcome, &models)?;
 /// let camera = scene.cameras()[0].clone();
 /// let answer = scene.ask("blue mug", &camera)?;
 /// println!("found: {}, at {:?}", answer.found, answer.location);
@@ -34,7 +35,7 @@ use std::path::{Path, PathBuf};
 pub struct LiveScene {
     device: Device,
     source: Source,
-    models: Option<PathBuf>,
+    registry: Registry,
     viewer: Viewer,
     /// The text encoder and the [C, D] unit rows of the canonical phrases; loaded with the first question.
     speaker: Option<(Box<dyn RegionEncoder>, Vec<f32>)>,
@@ -50,23 +51,29 @@ enum Source {
 impl LiveScene {
     /// Loads a scene directory, or a file of Gaussians that has no language. `models` is the folder of the models,
     /// where the text encoder is taken from; `None` = the default one.
-    pub fn load(device: &Device, path: &Path, models: Option<&Path>) -> Result<LiveScene> {
-        LiveScene::new(device, Source::Loaded(Box::new(scene_dir::load(path)?)), models)
+    pub fn load(device: &Device, path: &Path, registry: &Registry) -> Result<LiveScene> {
+        LiveScene::new(device, Source::Loaded(Box::new(scene_dir::load(path)?)), registry)
     }
 
     /// Takes over what a run made.
-    pub fn trained(device: &Device, outcome: Outcome, models: Option<&Path>) -> Result<LiveScene> {
-        LiveScene::new(device, Source::Trained(Box::new(outcome)), models)
+    pub fn trained(device: &Device, outcome: Outcome, registry: &Registry) -> Result<LiveScene> {
+        LiveScene::new(device, Source::Trained(Box::new(outcome)), registry)
     }
 
-    fn new(device: &Device, source: Source, models: Option<&Path>) -> Result<LiveScene> {
+    fn new(device: &Device, source: Source, registry: &Registry) -> Result<LiveScene> {
         let (splats, field) = match &source {
             Source::Trained(o) => (&o.splats, Some(&o.field)),
             Source::Loaded(s) => (&s.splats, s.language.as_ref()),
         };
         let viewer = Viewer::new(device, splats, field.unwrap_or(&LanguageField::default()))?;
-        let models = models.map(Path::to_path_buf);
-        Ok(LiveScene { device: device.clone(), source, models, viewer, speaker: None, seen: None })
+        Ok(LiveScene {
+            device: device.clone(),
+            source,
+            registry: registry.clone(),
+            viewer,
+            speaker: None,
+            seen: None,
+        })
     }
 
     /// The device that it is drawn on.
@@ -158,10 +165,9 @@ impl LiveScene {
     }
 
     fn speaker(&self) -> Result<(Box<dyn RegionEncoder>, Vec<f32>)> {
-        let registry = Registry::open(self.models.as_deref())?;
         let mut encoder = match &self.source {
-            Source::Trained(o) => sources::encoder(&o.plan.features, &registry)?,
-            Source::Loaded(s) => encoder::of_scene(s, registry)?,
+            Source::Trained(o) => sources::encoder(&o.plan.features, &self.registry)?,
+            Source::Loaded(s) => encoder::of_scene(s, self.registry.clone())?,
         };
         let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
         Ok((encoder, canonicals))

@@ -25,7 +25,7 @@ use crate::fit::{self, Preset};
 use crate::format::Workspace;
 use crate::format::scene_dir::{self, Contents};
 use crate::gpu::{self, Device};
-use crate::infer::{Registry, home, provider};
+use crate::infer::{Registry, home};
 use crate::language;
 use crate::photo::{self, Photo};
 use crate::pipeline::{Graph, Store};
@@ -101,6 +101,8 @@ pub struct Outcome {
     pub answers: Vec<Answers>,
     /// The text model's own phrases per level and code.
     pub names: Names,
+    /// What computed the networks.
+    pub provider: Option<&'static str>,
     /// Built-in models.
     pub models: Vec<crate::infer::ModelStatus>,
     /// Files of the networks that were used.
@@ -126,24 +128,26 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     let (chosen, choice) = pose::choose::photos(&plan.inputs, plan.views, progress)?;
     plan.check_budget(&device, &photo::sizes_of(&chosen), max_size)?;
     let photos = photo::load_each(&chosen, max_size, progress)?;
+    let registry = plan.registry()?;
     let store = store(plan.resume, plan.checkpoint_seconds);
-    let outcome = Outcome { choice, ..work(plan, &device, photos, &store, progress)? };
+    let outcome = Outcome { choice, ..work(plan, &device, &registry, photos, &store, progress)? };
     write(workspace, &outcome, progress)?;
     Ok(outcome)
 }
 
-/// The run without its files, for programs that hold photos and device themselves. Of the plan, everything about inputs,
-/// output and device goes unread.
+/// The run without its files, for programs that hold photos, device and models themselves. Of the plan, everything about
+/// inputs, output, device and models goes unread.
 pub fn reconstruct(
     plan: &RunPlan,
     device: &Device,
+    registry: &Registry,
     photos: Vec<Photo>,
     progress: &dyn Progress,
 ) -> Result<Outcome> {
     photo::check_set(&photos)?;
     let sizes: Vec<_> = photos.iter().map(|p| (p.image.width, p.image.height)).collect();
     plan.check_budget(device, &sizes, usize::MAX)?;
-    work(plan, device, photos, &Store::none(), &Recorded::new(progress))
+    work(plan, device, registry, photos, &Store::none(), &Recorded::new(progress))
 }
 
 /// Writes what [`reconstruct`] made as a scene directory, whole or not at all; `force` replaces a scene.
@@ -156,21 +160,21 @@ pub fn save(outcome: &mut Outcome, out: &Path, force: bool, progress: &dyn Progr
 fn work(
     plan: &RunPlan,
     device: &Device,
+    registry: &Registry,
     photos: Vec<Photo>,
     store: &Store,
     progress: &Recorded,
 ) -> Result<Outcome> {
-    let registry = Registry::open(plan.models.as_deref())?;
     // Whatever can be refused is read before the long work, not after it.
-    provider::report(progress)?;
-    let networks = Networks::of(plan, &registry)?;
+    registry.compute().report(progress)?;
+    let networks = Networks::of(plan, registry)?;
     networks.warn_untrained(progress);
-    list::check(plan, &photos, &registry)?;
+    list::check(plan, &photos, registry)?;
     let preset = plan.preset_on(device);
     let mut build = Build { graph: Graph::default(), registry: registry.clone(), plan: plan.clone(), preset };
     let scene = list::scene(&mut build, device, photos)?;
-    let mut made = build.graph.run(&scene.targets(), device, &registry, store, progress)?;
-    provider::report(progress)?;
+    let mut made = build.graph.run(&scene.targets(), device, registry, store, progress)?;
+    registry.compute().report(progress)?;
     let (trained, language) = (made.take(scene.trained)?, made.take(scene.language)?);
     Ok(Outcome {
         plan: plan.clone(),
@@ -188,6 +192,7 @@ fn work(
         frames: made.take(scene.frames)?,
         answers: made.take(scene.answers)?,
         names: made.take(scene.names)?,
+        provider: registry.compute().name().ok(),
         models: registry.status(),
         networks: networks.used()?,
         stages: progress.stages(),

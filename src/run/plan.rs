@@ -5,6 +5,7 @@ use super::{CHECKPOINT_SECONDS, budget};
 use crate::Result;
 use crate::fit::{LanguageOptions, Preset, RgbOptions};
 use crate::gpu::Device;
+use crate::infer::{Compute, Registry};
 use crate::language::sam::SamOptions;
 use crate::scene::Camera;
 use std::path::PathBuf;
@@ -61,6 +62,8 @@ pub struct RunPlan {
     pub deterministic: bool,
     /// Folder of the models.
     pub models: Option<PathBuf>,
+    /// What computes the networks, one of [`crate::infer::provider::NAMES`]; `None` = see [`Compute::by`].
+    pub provider: Option<String>,
 }
 
 impl Default for RunPlan {
@@ -91,6 +94,7 @@ impl Default for RunPlan {
             device: None,
             deterministic: false,
             models: None,
+            provider: None,
         }
     }
 }
@@ -99,6 +103,11 @@ impl RunPlan {
     /// What the method does, with the plan's code length.
     pub fn recipe(&self) -> Recipe {
         Recipe { feature_dim: self.feature_dim, ..self.method.recipe }
+    }
+
+    /// The models that the plan names.
+    pub fn registry(&self) -> Result<Registry> {
+        Registry::with(self.models.as_deref(), Compute::by(self.provider.as_deref()))
     }
 
     /// The preset, or the device's.

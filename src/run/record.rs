@@ -2,7 +2,6 @@
 use super::{Answers, Outcome};
 use crate::Result;
 use crate::fit::{CurvePoint, FitStats, LanguagePoint};
-use crate::infer::provider;
 use crate::photo::Photo;
 use crate::pose::Fitted;
 use crate::report::viewer::Scene3d;
@@ -16,7 +15,7 @@ pub fn run_record(o: &Outcome) -> RunRecord {
     let used = |m: &&crate::infer::ModelStatus| m.installed;
     RunRecord {
         program: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
-        config: json!({ "plan": o.plan, "preset": o.preset, "provider": provider::name().ok() }),
+        config: json!({ "plan": o.plan, "preset": o.preset, "provider": o.provider }),
         seed: o.plan.seed,
         device: o.device.name.clone(),
         device_is_cpu: o.device.is_cpu,

@@ -3,7 +3,7 @@ use crate::fit::{Preset, RgbOptions};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras, colmap, ply};
 use crate::gpu::{self, Device};
-use crate::infer::{Registry, provider};
+use crate::infer::{Compute, Registry};
 use crate::photo::{self, Candidate, Photo};
 use crate::pipeline::Graph;
 use crate::pose::Geometry;
@@ -48,6 +48,8 @@ pub struct TrainPlan {
     pub deterministic: bool,
     /// Folder of the models.
     pub models: Option<PathBuf>,
+    /// What computes the networks, one of [`crate::infer::provider::NAMES`]; `None` = see [`Compute::by`].
+    pub provider: Option<String>,
 }
 
 /// What a finished training tells.
@@ -138,7 +140,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
     let work = |photos| Work::colour(preset, photos);
     let photos = matched(plan, &known, max_size, work, &device, progress)?;
-    let registry = Registry::open(plan.models.as_deref())?;
+    let registry = Registry::with(plan.models.as_deref(), Compute::by(plan.provider.as_deref()))?;
     let source = match given {
         Some(cloud) => CameraSource::Complete(from_points(&photos, &known, cloud)?),
         None => CameraSource::Known(known),
@@ -177,7 +179,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let curves = super::record::curves(&trained.stats, &[]);
     let record = RunRecord {
         program: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
-        config: json!({ "plan": plan, "preset": preset, "provider": provider::name().ok() }),
+        config: json!({ "plan": plan, "preset": preset, "provider": registry.compute().name().ok() }),
         seed: plan.seed,
         device: device.info().name.clone(),
         device_is_cpu: device.info().is_cpu,

@@ -1,4 +1,6 @@
 //! `splatvk bench`: what to measure, and on what.
+use crate::Result;
+use crate::infer::{Compute, Registry};
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 
@@ -88,4 +90,14 @@ pub struct BenchArgs {
     /// Vulkan device: part of its name, or its number in `splatvk doctor`
     #[arg(long, value_name = "NAME|INDEX")]
     pub device: Option<String>,
+    /// `--provider`, which stands before or after the command.
+    #[arg(skip)]
+    pub provider: Option<String>,
+}
+
+impl BenchArgs {
+    /// The models.
+    pub fn registry(&self) -> Result<Registry> {
+        Registry::with(self.models.as_deref(), Compute::by(self.provider.as_deref()))
+    }
 }

@@ -10,8 +10,7 @@ mod paint;
 mod tests;
 
 use super::ViewMasks;
-use crate::infer::alone;
-use crate::infer::cache::{Key, remember};
+use crate::infer::cache::Key;
 use crate::infer::contract::Part;
 use crate::infer::installed::Installed;
 use crate::infer::sam::{BATCH, MASKS, Proposals, Sam};
@@ -106,7 +105,8 @@ pub fn masks(
     if options.points == 0 {
         return Err(Error::input("masks: give at least one point per side"));
     }
-    let _alone = alone();
+    let compute = model.compute();
+    let _turn = compute.turn();
     let mut network: Option<Sam> = None;
     let looks = if options.crops { 5 } else { 1 };
     let calls = options.points.pow(2).div_ceil(BATCH) * looks;
@@ -122,7 +122,7 @@ pub fn masks(
             u64::from(options.crops),
         ]);
         let before = (k * calls) as u64;
-        let values = remember(key, || {
+        let values = compute.remember(key, || {
             let net = match network.take() {
                 Some(net) => net,
                 None => Sam::load(model)?,

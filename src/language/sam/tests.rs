@@ -61,7 +61,6 @@ fn disc_network(folder: &Path, iou: [f32; 4]) {
 }
 
 fn toy(iou: [f32; 4], options: &SamOptions, size: (usize, usize)) -> ViewMasks {
-    let _uncached = crate::infer::cache::off();
     let dir = tempfile::tempdir().unwrap();
     disc_network(dir.path(), iou);
     let model = Registry::of(&[dir.path()]).installed(Duty::Masks, "sam").unwrap();
