@@ -4,7 +4,7 @@ mod support;
 use glam::DVec3;
 use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions};
 use splatvk::gpu::{Device, Options, Recorder, TestDevice, test_device};
-use splatvk::pass::raster_backward::Summation;
+use splatvk::pass::Summation;
 use splatvk::pass::rasterizer::Rasterizer;
 use splatvk::pass::{Frame, Renderer, SplatBuffers, Ways, seeded};
 use splatvk::progress::Silent;
@@ -35,7 +35,7 @@ fn in_bands(
     let pixels = scene.pixels();
     let mut image = vec![f32::NAN; (4 + scene.dim) * pixels];
     // Also grows the lists.
-    let seen = |frame: &splatvk::pass::rasterizer::FrameBuffers, band: &splatvk::pass::bands::Band| {
+    let seen = |frame: &splatvk::pass::FrameBuffers, band: &splatvk::pass::bands::Band| {
         let planes = frame.planes.read::<f32>()?;
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
         for (to, from) in image.chunks_exact_mut(pixels).zip(planes.chunks_exact(frame.bands.pixels())) {

@@ -2,8 +2,7 @@
 mod support;
 use splatvk::gpu::{Options, TestDevice, test_device};
 use splatvk::pass::close::Tolerance;
-use splatvk::pass::raster_backward::Summation;
-use splatvk::pass::{FeatureMode, Ways};
+use splatvk::pass::{FeatureMode, Summation, Ways};
 use support::{GpuGradients, Scene, assert_close};
 
 /// Relative 1e-3 by class in the L2 sense (docs/method.md#tolerances; measured 4e-7 to 4e-6). Single elements are sums

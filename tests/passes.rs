@@ -2,9 +2,11 @@
 mod support;
 use glam::DVec3;
 use splatvk::gpu::{Recorder, test_device};
-use splatvk::pass::raster_forward::BASE_CHANNELS;
+use splatvk::pass::channels::BASE_CHANNELS;
 use splatvk::pass::seeded::{self, Random};
-use splatvk::pass::{FeatureMode, RasterOptions, Rasterizer, Renderer, SplatBuffers, View, Ways, bin};
+use splatvk::pass::{
+    FeatureMode, Grouping, RasterOptions, Rasterizer, Renderer, SplatBuffers, View, Ways, bin,
+};
 use splatvk::scene::{Pose, Splats};
 use support::{IMAGE, Scene, assert_close, assert_images, rendered};
 
@@ -167,8 +169,8 @@ fn tile_lists_contain_the_twins() {
         raster.forward(&params, &scene.options).unwrap();
         raster.tile_lists().unwrap()
     };
-    let counted = lists(bin::Grouping::Counting);
-    assert_eq!(counted, lists(bin::Grouping::Sorting));
+    let counted = lists(Grouping::Counting);
+    assert_eq!(counted, lists(Grouping::Sorting));
     assert_eq!(counted.len(), expected.len());
     let mut extra = 0;
     for (list, expected) in counted.iter().zip(&expected) {

@@ -6,8 +6,7 @@ use super::views::Views;
 use crate::gpu::{Buffer, Device, Recorder};
 use crate::pass::bands::Band;
 use crate::pass::codes::{self, Mode, Targets};
-use crate::pass::rasterizer::RasterOptions;
-use crate::pass::twin::FeatureMode;
+use crate::pass::options::{FeatureMode, RasterOptions};
 use crate::scene::{Camera, Codebook, LevelField, RgbImage};
 use crate::{Error, Result};
 

@@ -2,9 +2,9 @@
 use crate::gpu::{Buffer, Device};
 use crate::pass::bands::Band;
 use crate::pass::metrics::planar;
-use crate::pass::rasterizer::{FrameBuffers, RasterOptions, Rasterizer};
 use crate::pass::ssim_l1::SsimL1;
 use crate::pass::view::View;
+use crate::pass::{FrameBuffers, RasterOptions, Rasterizer};
 use crate::scene::{Camera, DepthMap, RgbImage};
 use crate::{Error, Result};
 

@@ -1,10 +1,10 @@
 //! Storage buffers.
-use super::device::{Device, lock, vk_error};
+use super::device::Device;
+use super::error::{lock, vk_error};
+use super::memory::Block;
 use crate::{Error, Result};
 use ash::vk;
 use bytemuck::Pod;
-use gpu_allocator::MemoryLocation;
-use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
 use std::ops::Range;
 use std::sync::{Arc, Mutex};
 
@@ -20,7 +20,7 @@ struct Inner {
     raw: vk::Buffer,
     bytes: u64,
     /// `None` only while dropping.
-    allocation: Mutex<Option<Allocation>>,
+    block: Mutex<Option<Block>>,
 }
 
 impl Device {
@@ -61,33 +61,14 @@ impl Buffer {
             )));
         }
         let fail = |e: String| Error::gpu(format!("buffer `{name}` of {:.1} MiB: {e}", mib(bytes)));
-        let size = padded(bytes);
-        let usage = vk::BufferUsageFlags::STORAGE_BUFFER
-            | vk::BufferUsageFlags::TRANSFER_SRC
-            | vk::BufferUsageFlags::TRANSFER_DST
-            | vk::BufferUsageFlags::INDIRECT_BUFFER;
-        let vulkan = &device.0.device;
-        let info = vk::BufferCreateInfo::default().size(size).usage(usage);
-        // SAFETY: plain object creation on a live device.
-        let raw = unsafe { vulkan.create_buffer(&info, None) }.map_err(|e| fail(e.to_string()))?;
-        let bound = bind(device, name, raw, mapped);
-        match bound {
-            Ok(allocation) => {
-                device.0.memory.add(allocation.size());
-                Ok(Buffer(Arc::new(Inner {
-                    device: device.clone(),
-                    name: name.to_owned(),
-                    raw,
-                    bytes,
-                    allocation: Mutex::new(Some(allocation)),
-                })))
-            }
-            Err(e) => {
-                // SAFETY: the buffer was never used.
-                unsafe { vulkan.destroy_buffer(raw, None) };
-                Err(fail(e))
-            }
-        }
+        let block = device.0.heap.buffer(&device.0.device, name, padded(bytes), mapped).map_err(fail)?;
+        Ok(Buffer(Arc::new(Inner {
+            device: device.clone(),
+            name: name.to_owned(),
+            raw: block.raw,
+            bytes,
+            block: Mutex::new(Some(block)),
+        })))
     }
 
     /// The name it was made with.
@@ -148,7 +129,7 @@ impl Buffer {
         if start == end {
             return Ok(Vec::new());
         }
-        if let Some(memory) = lock(&self.0.allocation).as_ref().and_then(Allocation::mapped_slice) {
+        if let Some(memory) = lock(&self.0.block).as_ref().and_then(|b| b.memory.mapped_slice()) {
             return Ok(bytemuck::pod_collect_to_vec(&memory[start..end]));
         }
         let staging = Buffer::create(&self.0.device, "staging", bytes.end - bytes.start, true)?;
@@ -157,8 +138,8 @@ impl Buffer {
             // SAFETY: ranges were checked, both buffers outlive the submit.
             unsafe { self.0.device.0.device.cmd_copy_buffer(commands, self.raw(), staging.raw(), &region) }
         })?;
-        let memory = lock(&staging.0.allocation);
-        let mapped = memory.as_ref().and_then(Allocation::mapped_slice).ok_or_else(not_mapped)?;
+        let memory = lock(&staging.0.block);
+        let mapped = memory.as_ref().and_then(|b| b.memory.mapped_slice()).ok_or_else(not_mapped)?;
         Ok(bytemuck::pod_collect_to_vec(&mapped[..end - start]))
     }
 
@@ -174,7 +155,7 @@ impl Buffer {
         if bytes.is_empty() {
             return Ok(());
         }
-        if let Some(memory) = lock(&self.0.allocation).as_mut().and_then(Allocation::mapped_slice_mut) {
+        if let Some(memory) = lock(&self.0.block).as_mut().and_then(|b| b.memory.mapped_slice_mut()) {
             memory[range.start as usize..range.end as usize].copy_from_slice(bytes);
             return Ok(());
         }
@@ -188,7 +169,7 @@ impl Buffer {
     }
 
     fn clear(&self) -> Result<()> {
-        if let Some(memory) = lock(&self.0.allocation).as_mut().and_then(Allocation::mapped_slice_mut) {
+        if let Some(memory) = lock(&self.0.block).as_mut().and_then(|b| b.memory.mapped_slice_mut()) {
             memory.fill(0);
             return Ok(());
         }
@@ -214,38 +195,6 @@ impl Buffer {
 
 fn not_mapped() -> Error {
     Error::gpu("staging memory is not mapped")
-}
-
-fn bind(
-    device: &Device,
-    name: &str,
-    raw: vk::Buffer,
-    mapped: bool,
-) -> std::result::Result<Allocation, String> {
-    let vulkan = &device.0.device;
-    // SAFETY: the buffer is alive and unbound.
-    let requirements = unsafe { vulkan.get_buffer_memory_requirements(raw) };
-    let mut guard = lock(&device.0.allocator);
-    let allocator = guard.as_mut().ok_or("the device is closing")?;
-    // GpuToCpu is cached host memory: read-backs and CPU devices need it, uploads do not suffer.
-    let location = if mapped { MemoryLocation::GpuToCpu } else { MemoryLocation::GpuOnly };
-    let allocation = allocator
-        .allocate(&AllocationCreateDesc {
-            name,
-            requirements,
-            location,
-            linear: true,
-            allocation_scheme: AllocationScheme::GpuAllocatorManaged,
-        })
-        .map_err(|e| e.to_string())?;
-    // SAFETY: memory and offset come from the allocator for these requirements.
-    match unsafe { vulkan.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) } {
-        Ok(()) => Ok(allocation),
-        Err(e) => {
-            let _ = allocator.free(allocation);
-            Err(e.to_string())
-        }
-    }
 }
 
 impl Device {
@@ -303,13 +252,9 @@ impl std::fmt::Debug for Buffer {
 
 impl Drop for Inner {
     fn drop(&mut self) {
-        // SAFETY: every submit waits and programs hold their buffers, so nothing uses it any more.
-        unsafe { self.device.0.device.destroy_buffer(self.raw, None) };
-        if let (Some(allocation), Some(allocator)) =
-            (lock(&self.allocation).take(), lock(&self.device.0.allocator).as_mut())
-        {
-            self.device.0.memory.remove(allocation.size());
-            let _ = allocator.free(allocation);
+        if let Some(block) = lock(&self.block).take() {
+            // SAFETY: every submit waits and programs hold their buffers, so nothing uses it any more.
+            unsafe { self.device.0.heap.release(&self.device.0.device, block) };
         }
     }
 }

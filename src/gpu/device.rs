@@ -1,118 +1,17 @@
 //! The logical device and everything that lives as long as it.
-use super::adopt::QueueLock;
-use super::module::{Call, Capability, Module};
+use super::error::{lock, vk_error};
+use super::info::DeviceInfo;
+use super::memory::{Heap, Memory};
+use super::module::Module;
 use super::pipeline::Pipeline;
-use super::select;
 use super::validation::Sink;
-use crate::{Error, Result};
+use crate::Result;
 use ash::vk;
-use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
-use std::collections::{BTreeSet, HashMap};
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
 
-/// How a device is opened.
-#[derive(Clone, Debug, Default)]
-pub struct Options {
-    /// Index in the order of preference, or part of the name; `None` takes the first usable one.
-    pub choice: Option<String>,
-    /// Khronos validation layer with synchronization validation.
-    pub validation: bool,
-    /// Keep buffers out of host-visible memory, as on a GPU, even on a CPU device (to test the staging path).
-    pub staging: bool,
-    /// Only passes that give the same bits on every run of this device, even where others are faster.
-    pub deterministic: bool,
-    /// No buffer larger than this, bytes, although the device would bind more: to test what is done in blocks.
-    pub max_binding: Option<u64>,
-    /// Use the compare-and-swap loop although the device has float atomics (to test it).
-    pub no_float_atomics: bool,
-}
-
-impl Options {
-    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`; `SPLATVK_MAX_BINDING` in MiB.
-    pub fn from_env(choice: Option<&str>) -> Self {
-        let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
-        Options {
-            choice: choice.map(str::to_owned).or_else(|| variable("SPLATVK_DEVICE")),
-            validation: variable("SPLATVK_VALIDATION").is_some_and(|v| v == "1"),
-            max_binding: variable("SPLATVK_MAX_BINDING")
-                .and_then(|v| v.parse::<u64>().ok())
-                .map(|mib| mib.saturating_mul(1 << 20)),
-            ..Options::default()
-        }
-    }
-}
-
-/// What the device is and can do.
-#[derive(Clone, Debug)]
-pub struct DeviceInfo {
-    /// As the driver reports it.
-    pub name: String,
-    /// Driver name and version.
-    pub driver: String,
-    /// Vulkan version of the device: major, minor, patch.
-    pub api_version: (u32, u32, u32),
-    /// A software device on the CPU.
-    pub is_cpu: bool,
-    /// Buffers are mapped directly instead of staged.
-    pub mapped: bool,
-    /// Default subgroup size.
-    pub subgroup_size: u32,
-    /// Smallest and largest size that can be pinned; both `subgroup_size` without subgroup size control.
-    pub subgroup_sizes: (u32, u32),
-    /// Subgroup sizes can be pinned per pipeline.
-    pub subgroup_control: bool,
-    /// Asked to give the same bits on every run ([`Options::deterministic`]).
-    pub deterministic: bool,
-    /// `atomicAdd` on float in storage buffers is native.
-    pub float_atomics: bool,
-    /// Capabilities that shaders may use here.
-    pub capabilities: BTreeSet<Capability>,
-    /// Largest buffer a shader can see, bytes.
-    pub max_storage_range: u64,
-    /// Memory of the largest heap that is the device's own, bytes.
-    pub memory: u64,
-    /// Largest dispatch, in workgroups.
-    pub max_groups: [u32; 3],
-    /// Threads in a workgroup at most.
-    pub max_workgroup_threads: u32,
-    /// Shared memory per workgroup, bytes.
-    pub shared_memory: u32,
-    /// Storage buffers in one shader at most.
-    pub max_bindings: u32,
-    /// Nanoseconds per timestamp tick; 0 when the queue has no timestamps.
-    pub timestamp_period: f64,
-}
-
-/// Memory of the buffers of a device, staging included.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Memory {
-    /// Bytes now.
-    pub current: u64,
-    /// Most bytes at any time since the device was opened or [`Device::reset_peak_memory`].
-    pub peak: u64,
-    /// Buffers made so far.
-    pub allocations: u64,
-}
-
-/// [`Memory`] as it is counted.
-#[derive(Default)]
-pub(super) struct MemoryCount {
-    current: AtomicU64,
-    peak: AtomicU64,
-    allocations: AtomicU64,
-}
-
-impl MemoryCount {
-    pub fn add(&self, bytes: u64) {
-        let now = self.current.fetch_add(bytes, Ordering::Relaxed) + bytes;
-        self.peak.fetch_max(now, Ordering::Relaxed);
-        self.allocations.fetch_add(1, Ordering::Relaxed);
-    }
-    pub fn remove(&self, bytes: u64) {
-        self.current.fetch_sub(bytes, Ordering::Relaxed);
-    }
-}
+/// Runs a closure while nothing else uses the host's queue.
+pub type QueueLock = Box<dyn Fn(&mut dyn FnMut()) + Send + Sync>;
 
 /// A logical device, made by us or by the host, ready for [`Device::assemble`].
 pub(super) struct Setup {
@@ -143,11 +42,9 @@ pub(super) struct Inner {
     pub timeline: bool,
     /// Device and instance are ours to destroy.
     pub owned: bool,
-    /// `None` only while dropping: it must go before the device.
-    pub allocator: Mutex<Option<Allocator>>,
-    pub memory: MemoryCount,
-    pub pipelines: Mutex<HashMap<&'static str, Arc<Pipeline>>>,
-    pub pipeline_cache: vk::PipelineCache,
+    pub heap: Heap,
+    pipelines: Mutex<HashMap<&'static str, Arc<Pipeline>>>,
+    pipeline_cache: vk::PipelineCache,
     /// Set where synchronization2 comes from the extension instead of Vulkan 1.3.
     sync2: Option<ash::khr::synchronization2::Device>,
     messenger: Option<(ash::ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
@@ -157,66 +54,7 @@ pub(super) struct Inner {
     _entry: ash::Entry,
 }
 
-/// Turns a Vulkan result into an error that says what was being done.
-pub(super) fn vk_error(what: impl std::fmt::Display) -> impl FnOnce(vk::Result) -> Error {
-    move |e| Error::gpu(format!("{what}: {e}"))
-}
-
-/// Locks, ignoring poison: the guarded values stay consistent, a panic elsewhere is reported by its own thread.
-pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
-}
-
 impl Device {
-    /// Opens the preferred device (discrete, integrated, virtual, CPU), or the one whose index or name part is `choice`.
-    /// `SPLATVK_DEVICE` is used when `choice` is `None`; `SPLATVK_VALIDATION=1` turns the validation layer on.
-    pub fn open(choice: Option<&str>) -> Result<Device> {
-        Self::with(&Options::from_env(choice))
-    }
-
-    /// Opens a device with all options spelled out.
-    pub fn with(options: &Options) -> Result<Device> {
-        let entry = select::load()?;
-        let sink = options.validation.then(Sink::default);
-        let instance = select::instance(&entry, sink.as_ref())?;
-        // A clone keeps the loader in memory: `build` drops its entry on failure, and the instance must be destroyed after.
-        match Self::build(entry.clone(), &instance, sink, options) {
-            Ok(device) => Ok(device),
-            Err(e) => {
-                // SAFETY: nothing made from the instance is alive after the failure.
-                unsafe { instance.destroy_instance(None) };
-                Err(e)
-            }
-        }
-    }
-
-    fn build(
-        entry: ash::Entry,
-        instance: &ash::Instance,
-        sink: Option<Sink>,
-        options: &Options,
-    ) -> Result<Device> {
-        let candidate = select::choose(select::candidates(instance)?, options.choice.as_deref())?;
-        let physical = candidate.physical;
-        let queue_family = select::queue_family(instance, physical)
-            .ok_or_else(|| Error::gpu(format!("{} has no compute queue", candidate.name)))?;
-        let (device, info) = super::features::create(instance, &candidate, queue_family, options)?;
-        // SAFETY: the queue was requested in `create`.
-        let queue = unsafe { device.get_device_queue(queue_family, 0) };
-        let setup = Setup {
-            instance: instance.clone(),
-            device,
-            info,
-            queue,
-            queue_family,
-            sync2_extension: candidate.properties.api_version < vk::API_VERSION_1_3,
-            timeline: false,
-            queue_lock: None,
-            owned: true,
-        };
-        Self::assemble(entry, physical, sink, setup)
-    }
-
     /// Adds what splatvk keeps beside a logical device. On failure the device is destroyed if it is ours; the instance
     /// stays with the caller.
     pub(super) fn assemble(
@@ -228,26 +66,17 @@ impl Device {
         let Setup { instance, device, info, queue, queue_family, timeline, queue_lock, owned, .. } = setup;
         let sync2 =
             setup.sync2_extension.then(|| ash::khr::synchronization2::Device::new(&instance, &device));
-        let finish = || -> Result<(vk::PipelineCache, Allocator)> {
+        let finish = || -> Result<(vk::PipelineCache, Heap)> {
             // SAFETY: the device is alive.
             let cache =
                 unsafe { device.create_pipeline_cache(&vk::PipelineCacheCreateInfo::default(), None) }
                     .map_err(vk_error("pipeline cache"))?;
-            let allocator = Allocator::new(&AllocatorCreateDesc {
-                instance: instance.clone(),
-                device: device.clone(),
-                physical_device: physical,
-                debug_settings: gpu_allocator::AllocatorDebugSettings::default(),
-                buffer_device_address: false,
-                allocation_sizes: gpu_allocator::AllocationSizes::default(),
-            });
-            allocator.map(|a| (cache, a)).map_err(|e| {
+            Heap::new(&instance, &device, physical).map(|heap| (cache, heap)).inspect_err(|_| {
                 // SAFETY: the cache was never used.
                 unsafe { device.destroy_pipeline_cache(cache, None) };
-                Error::gpu(format!("memory allocator: {e}"))
             })
         };
-        let (pipeline_cache, allocator) = match finish() {
+        let (pipeline_cache, heap) = match finish() {
             Ok(parts) => parts,
             Err(e) => {
                 if owned {
@@ -271,8 +100,7 @@ impl Device {
             queue_lock,
             timeline,
             owned,
-            allocator: Mutex::new(Some(allocator)),
-            memory: MemoryCount::default(),
+            heap,
             pipelines: Mutex::new(HashMap::new()),
             pipeline_cache,
             sync2,
@@ -290,18 +118,12 @@ impl Device {
 
     /// Memory of all buffers made on this device.
     pub fn memory(&self) -> Memory {
-        let count = &self.0.memory;
-        Memory {
-            current: count.current.load(Ordering::Relaxed),
-            peak: count.peak.load(Ordering::Relaxed),
-            allocations: count.allocations.load(Ordering::Relaxed),
-        }
+        self.0.heap.figures()
     }
 
     /// Starts measuring [`Memory::peak`] anew.
     pub fn reset_peak_memory(&self) {
-        let now = self.0.memory.current.load(Ordering::Relaxed);
-        self.0.memory.peak.store(now, Ordering::Relaxed);
+        self.0.heap.reset_peak();
     }
 
     /// What the validation layer has said so far; always empty without validation.
@@ -317,32 +139,15 @@ impl Device {
         assert!(messages.is_empty(), "Vulkan validation:\n{}", messages.join("\n"));
     }
 
-    /// The compiled variant that serves a call on this device.
-    pub(super) fn resolve(&self, call: &Call) -> Result<&'static Module> {
-        let family = call.family;
-        let info = self.info();
-        let named: Vec<&Module> = family.modules.iter().filter(|m| m.variant == call.variant).collect();
-        if named.is_empty() {
-            let known: BTreeSet<&[u32]> = family.modules.iter().map(|m| m.variant).collect();
-            return Err(Error::gpu(format!(
-                "glsl/{}.comp was not compiled for {:?} = {:?}, only for {known:?}: extend its `// variants:` line",
-                family.name, family.axes, call.variant
-            )));
+    /// The pipeline of a module, made on first use (20–300 ms on lavapipe).
+    pub(super) fn pipeline(&self, module: &'static Module) -> Result<Arc<Pipeline>> {
+        let mut known = lock(&self.0.pipelines);
+        if let Some(pipeline) = known.get(module.name) {
+            return Ok(pipeline.clone());
         }
-        let (low, high) = info.subgroup_sizes;
-        named
-            .iter()
-            .filter(|m| m.float_atomics.is_none_or(|native| native == info.float_atomics))
-            .filter(|m| m.subgroup_size.is_none_or(|s| (low..=high).contains(&s)))
-            // The device's own size first, then the largest that can be pinned.
-            .max_by_key(|m| m.subgroup_size.map_or((true, 0), |s| (s == info.subgroup_size, s)))
-            .copied()
-            .ok_or_else(|| {
-                Error::gpu(format!(
-                    "glsl/{}.comp has no variant for subgroups of {low} to {high} threads ({}): extend its `// subgroups:` line",
-                    family.name, info.name
-                ))
-            })
+        let made = Arc::new(Pipeline::new(&self.0.device, self.info(), self.0.pipeline_cache, module)?);
+        known.insert(module.name, made.clone());
+        Ok(made)
     }
 
     /// Records with synchronization2, wherever it comes from.
@@ -405,7 +210,7 @@ impl Drop for Inner {
                 pipeline.destroy(&self.device);
             }
             self.device.destroy_pipeline_cache(self.pipeline_cache, None);
-            drop(lock(&self.allocator).take());
+            self.heap.close();
             if !self.owned {
                 return;
             }

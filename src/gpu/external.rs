@@ -1,6 +1,7 @@
 //! Handing results to buffers and images of the host program, on a device that it shares with splatvk.
-use super::Buffer;
-use super::device::{Device, vk_error};
+use super::buffer::Buffer;
+use super::device::Device;
+use super::error::vk_error;
 use crate::{Error, Result};
 use ash::vk;
 

@@ -1,6 +1,7 @@
 //! Device features: which there are, which get enabled, what they mean for shaders.
-use super::adopt::EnabledFeatures;
-use super::device::{DeviceInfo, Options, vk_error};
+use super::enabled::EnabledFeatures;
+use super::error::vk_error;
+use super::info::{DeviceInfo, Options};
 use super::module::Capability;
 use super::select::{self, Candidate};
 use crate::{Error, Result};

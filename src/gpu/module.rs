@@ -1,5 +1,4 @@
 //! What build.rs knows about the compiled shaders, as data.
-use super::Buffer;
 
 /// How a module touches a buffer.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -73,26 +72,4 @@ pub struct Family {
     pub axes: &'static [&'static str],
     /// Every combination of variant, subgroup size and atomics.
     pub modules: &'static [Module],
-}
-
-/// A shader with its buffers and push constants, built by the generated `call` functions.
-#[derive(Clone, Debug)]
-pub struct Call {
-    pub(crate) family: &'static Family,
-    pub(crate) variant: Vec<u32>,
-    pub(crate) buffers: Vec<(u32, Buffer)>,
-    pub(crate) push: Vec<u8>,
-}
-
-impl Call {
-    /// For generated code; use `shaders::NAME::call`.
-    #[doc(hidden)]
-    pub fn new(
-        family: &'static Family,
-        variant: Vec<u32>,
-        buffers: Vec<(u32, Buffer)>,
-        push: Vec<u8>,
-    ) -> Self {
-        Call { family, variant, buffers, push }
-    }
 }

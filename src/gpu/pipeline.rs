@@ -1,9 +1,9 @@
-//! Compute pipelines, made on first use and kept by the device.
-use super::device::{Device, lock, vk_error};
+//! Compute pipelines.
+use super::error::vk_error;
+use super::info::DeviceInfo;
 use super::module::Module;
 use crate::{Error, Result};
 use ash::vk;
-use std::sync::Arc;
 
 pub(super) struct Pipeline {
     pub raw: vk::Pipeline,
@@ -13,68 +13,35 @@ pub(super) struct Pipeline {
 }
 
 impl Pipeline {
-    /// # Safety
-    /// No command buffer that uses the pipeline is pending.
-    pub unsafe fn destroy(&self, device: &ash::Device) {
-        // SAFETY: per the contract; null handles are allowed.
-        unsafe {
-            device.destroy_pipeline(self.raw, None);
-            device.destroy_pipeline_layout(self.layout, None);
-            device.destroy_descriptor_set_layout(self.set_layout, None);
-            device.destroy_shader_module(self.module, None);
-        }
-    }
-}
-
-impl Device {
-    /// The pipeline of a module; the first request compiles it (20–300 ms on lavapipe).
-    pub(super) fn pipeline(&self, module: &'static Module) -> Result<Arc<Pipeline>> {
-        let mut known = lock(&self.0.pipelines);
-        if let Some(pipeline) = known.get(module.name) {
-            return Ok(pipeline.clone());
-        }
-        self.check_module(module)?;
+    /// Compiles a module for a device.
+    pub fn new(
+        device: &ash::Device,
+        info: &DeviceInfo,
+        cache: vk::PipelineCache,
+        module: &Module,
+    ) -> Result<Pipeline> {
+        check(info, module)?;
         let mut made = Pipeline {
             raw: vk::Pipeline::null(),
             layout: vk::PipelineLayout::null(),
             set_layout: vk::DescriptorSetLayout::null(),
             module: vk::ShaderModule::null(),
         };
-        if let Err(e) = self.create(module, &mut made) {
+        if let Err(e) = made.create(device, info, cache, module) {
             // SAFETY: nothing was recorded with it.
-            unsafe { made.destroy(&self.0.device) };
+            unsafe { made.destroy(device) };
             return Err(e);
         }
-        let made = Arc::new(made);
-        known.insert(module.name, made.clone());
         Ok(made)
     }
 
-    fn check_module(&self, module: &Module) -> Result<()> {
-        let info = self.info();
-        let fail = |what: String| Err(Error::gpu(format!("shader {} {what} ({})", module.name, info.name)));
-        if let Some(missing) = module.capabilities.iter().find(|c| !info.capabilities.contains(c)) {
-            return fail(format!("needs {missing:?}, which this device lacks"));
-        }
-        if module.bindings.len() as u32 > info.max_bindings {
-            return fail(format!(
-                "binds {} buffers, the device allows {}",
-                module.bindings.len(),
-                info.max_bindings
-            ));
-        }
-        let threads = module.workgroup.iter().product::<u32>();
-        if threads > info.max_workgroup_threads {
-            return fail(format!(
-                "has {threads} threads a group, the device allows {}",
-                info.max_workgroup_threads
-            ));
-        }
-        Ok(())
-    }
-
-    fn create(&self, module: &Module, made: &mut Pipeline) -> Result<()> {
-        let device = &self.0.device;
+    fn create(
+        &mut self,
+        device: &ash::Device,
+        info: &DeviceInfo,
+        cache: vk::PipelineCache,
+        module: &Module,
+    ) -> Result<()> {
         let error = || vk_error(format!("shader {}", module.name));
         let code = ash::util::read_spv(&mut std::io::Cursor::new(module.spirv))
             .map_err(|e| Error::gpu(format!("shader {}: {e}", module.name)))?;
@@ -94,35 +61,70 @@ impl Device {
             .size(module.push_bytes)];
         // SAFETY: plain object creation on a live device; all pointers outlive the calls.
         unsafe {
-            made.module = device
+            self.module = device
                 .create_shader_module(&vk::ShaderModuleCreateInfo::default().code(&code), None)
                 .map_err(error())?;
-            made.set_layout = device
+            self.set_layout = device
                 .create_descriptor_set_layout(
                     &vk::DescriptorSetLayoutCreateInfo::default().bindings(&bindings),
                     None,
                 )
                 .map_err(error())?;
-            let sets = [made.set_layout];
+            let sets = [self.set_layout];
             let layout = vk::PipelineLayoutCreateInfo::default()
                 .set_layouts(&sets)
                 .push_constant_ranges(if module.push_bytes > 0 { &push } else { &[] });
-            made.layout = device.create_pipeline_layout(&layout, None).map_err(error())?;
+            self.layout = device.create_pipeline_layout(&layout, None).map_err(error())?;
         }
         let mut pinned = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default();
         let mut stage = vk::PipelineShaderStageCreateInfo::default()
             .stage(vk::ShaderStageFlags::COMPUTE)
-            .module(made.module)
+            .module(self.module)
             .name(c"main");
-        if let (Some(size), true) = (module.subgroup_size, self.info().subgroup_control) {
+        if let (Some(size), true) = (module.subgroup_size, info.subgroup_control) {
             pinned = pinned.required_subgroup_size(size);
             stage = stage.push_next(&mut pinned);
         }
-        let create = vk::ComputePipelineCreateInfo::default().stage(stage).layout(made.layout);
+        let create = vk::ComputePipelineCreateInfo::default().stage(stage).layout(self.layout);
         // SAFETY: as above.
-        let pipelines = unsafe { device.create_compute_pipelines(self.0.pipeline_cache, &[create], None) }
+        let pipelines = unsafe { device.create_compute_pipelines(cache, &[create], None) }
             .map_err(|(_, e)| error()(e))?;
-        made.raw = pipelines.first().copied().unwrap_or_default();
+        self.raw = pipelines.first().copied().unwrap_or_default();
         Ok(())
     }
+
+    /// # Safety
+    /// No command buffer that uses the pipeline is pending.
+    pub unsafe fn destroy(&self, device: &ash::Device) {
+        // SAFETY: per the contract; null handles are allowed.
+        unsafe {
+            device.destroy_pipeline(self.raw, None);
+            device.destroy_pipeline_layout(self.layout, None);
+            device.destroy_descriptor_set_layout(self.set_layout, None);
+            device.destroy_shader_module(self.module, None);
+        }
+    }
+}
+
+/// Whether the device can run it at all.
+fn check(info: &DeviceInfo, module: &Module) -> Result<()> {
+    let fail = |what: String| Err(Error::gpu(format!("shader {} {what} ({})", module.name, info.name)));
+    if let Some(missing) = module.capabilities.iter().find(|c| !info.capabilities.contains(c)) {
+        return fail(format!("needs {missing:?}, which this device lacks"));
+    }
+    if module.bindings.len() as u32 > info.max_bindings {
+        return fail(format!(
+            "binds {} buffers, the device allows {}",
+            module.bindings.len(),
+            info.max_bindings
+        ));
+    }
+    let threads = module.workgroup.iter().product::<u32>();
+    if threads > info.max_workgroup_threads {
+        return fail(format!(
+            "has {threads} threads a group, the device allows {}",
+            info.max_workgroup_threads
+        ));
+    }
+    Ok(())
 }

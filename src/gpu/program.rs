@@ -1,8 +1,10 @@
 //! A compiled recording: command buffers that can be submitted again and again.
-use super::device::{Device, lock, vk_error};
+use super::call::Call;
+use super::command::{self, Command, Groups, Op};
+use super::device::Device;
+use super::error::{lock, vk_error};
 use super::hazard::{self, Barrier, Scope, Stage, Step};
-use super::module::{Call, Module};
-use super::recorder::{self, Command, Groups, Op};
+use super::module::Module;
 use crate::{Error, Result};
 use ash::vk;
 use std::collections::HashMap;
@@ -31,7 +33,7 @@ struct Raw {
 impl Program {
     pub(super) fn new(device: Device, label: String, commands: Vec<Command>) -> Result<Program> {
         let touches: Vec<_> = commands.iter().map(Command::touches).collect();
-        recorder::check_aliases(&label, &commands, &touches)?;
+        command::check_aliases(&label, &commands, &touches)?;
         let steps = hazard::derive(&touches);
         if let Some(h) = hazard::check(&touches, &steps).first() {
             let name = commands[h.later].buffer(h.buffer).map_or("?", |b| b.name());
@@ -98,7 +100,7 @@ impl Program {
         Ok(self.commands.iter().zip(ticks.chunks_exact(2)).map(|(c, t)| (c.label.clone(), ms(t))).collect())
     }
 
-    /// Submits and waits; milliseconds per pass (see [`recorder::Recorder::pass`]), in the order of their first commands.
+    /// Submits and waits; milliseconds per pass (see [`super::Recorder::pass`]), in the order of their first commands.
     pub fn run_passes(&self) -> Result<Vec<(&'static str, f64)>> {
         let times = self.run_timed()?;
         let mut passes: Vec<(&'static str, f64)> = Vec::new();

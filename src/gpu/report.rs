@@ -1,5 +1,5 @@
 //! What `splatvk doctor` says about Vulkan.
-use super::device::DeviceInfo;
+use super::info::DeviceInfo;
 use super::{features, select};
 use crate::Error;
 use ash::vk;

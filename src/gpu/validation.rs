@@ -1,10 +1,8 @@
 //! The Khronos validation layer with synchronization validation, its messages collected so that tests can fail on them.
-use super::device::{Device, Options};
 use crate::{Error, Result};
 use ash::vk;
 use std::ffi::{CStr, c_void};
-use std::ops::Deref;
-use std::sync::{Mutex, MutexGuard, OnceLock};
+use std::sync::{Mutex, MutexGuard};
 
 pub(super) const LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
 
@@ -68,42 +66,4 @@ pub(super) fn require_layer(entry: &ash::Entry) -> Result<()> {
     Err(Error::missing(
         "the Vulkan validation layer is not installed; on Debian or Ubuntu: apt install vulkan-validationlayers",
     ))
-}
-
-/// The device that all tests of a process share, with validation on. Dropping the handle fails the test if the layer has
-/// said anything so far.
-pub struct TestDevice(Device);
-
-/// See [`TestDevice`]. `SPLATVK_DEVICE` picks another device than the first.
-#[allow(clippy::panic)] // for tests only: a missing device or layer must fail them, not skip them
-pub fn test_device() -> TestDevice {
-    static SHARED: OnceLock<Result<Device>> = OnceLock::new();
-    let opened =
-        SHARED.get_or_init(|| Device::with(&Options { validation: true, ..Options::from_env(None) }));
-    match opened {
-        Ok(device) => TestDevice(device.clone()),
-        Err(e) => panic!("tests need a Vulkan device with validation: {e}"),
-    }
-}
-
-impl TestDevice {
-    /// A device of its own for tests that need other options than the shared one.
-    pub fn with(options: &Options) -> Result<TestDevice> {
-        Device::with(&Options { validation: true, ..options.clone() }).map(TestDevice)
-    }
-}
-
-impl Deref for TestDevice {
-    type Target = Device;
-    fn deref(&self) -> &Device {
-        &self.0
-    }
-}
-
-impl Drop for TestDevice {
-    fn drop(&mut self) {
-        if !std::thread::panicking() {
-            self.0.assert_no_validation_messages();
-        }
-    }
 }

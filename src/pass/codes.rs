@@ -1,6 +1,6 @@
 //! The language loss: L1 between rendered features and the code of each labelled pixel (docs/method.md#language-loss),
 //! and the upstream that lifts codes onto splats (docs/method.md#lifting).
-use super::rasterizer::FrameBuffers;
+use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 
 /// What one view is compared with.

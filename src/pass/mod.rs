@@ -2,14 +2,18 @@
 pub mod adam;
 pub mod bands;
 pub mod bin;
+pub mod channels;
 pub mod close;
 pub mod codes;
 pub mod compact;
 pub mod decode;
 pub mod densify;
+pub mod frame;
 pub mod metrics;
+pub mod options;
 pub mod pack;
 pub mod pairs;
+pub mod params;
 pub mod plane_sweep;
 pub mod plane_sweep_cpu;
 pub mod project;
@@ -24,14 +28,19 @@ pub mod scan;
 pub mod seeded;
 pub mod sh;
 pub mod sort;
+pub mod splat_buffers;
 pub mod ssim_l1;
 pub mod sum;
+pub mod tile_lists;
 pub mod twin;
 pub mod view;
 
-pub use rasterizer::{RasterOptions, Rasterizer, SplatBuffers, Ways};
+pub use frame::{FrameBuffers, Summation};
+pub use options::{FeatureMode, RasterOptions};
+pub use rasterizer::{Rasterizer, Ways};
 pub use renderer::{Frame, Renderer};
-pub use twin::FeatureMode;
+pub use splat_buffers::SplatBuffers;
+pub use tile_lists::Grouping;
 pub use view::View;
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! Planes of a rendered frame to texels as host programs want them.
 use super::bands::Band;
-use super::raster_forward::BASE_CHANNELS;
-use super::rasterizer::FrameBuffers;
+use super::channels::BASE_CHANNELS;
+use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 use crate::{Error, Result};
 

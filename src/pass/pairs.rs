@@ -27,9 +27,10 @@ pub fn count(device: &Device, raster: &Rasterizer) -> Result<[f64; 2]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::pass::params::Params;
     use crate::pass::raster_forward::{Cutoffs, TwinScene, walk};
-    use crate::pass::rasterizer::{RasterOptions, SplatBuffers};
-    use crate::pass::twin::{self, FeatureMode, Params};
+    use crate::pass::twin;
+    use crate::pass::{FeatureMode, RasterOptions, SplatBuffers};
     use crate::pass::{View, seeded};
 
     #[test]

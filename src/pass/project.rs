@@ -4,9 +4,11 @@
 //! `t = R μ + τ`, `M = R_q diag(s)`, `B = J R M` (2×3), `Σ' = B Bᵀ + 0.3 I`, `(A, B, C) = Σ'⁻¹`,
 //! `u = fx t_x/t_z + cx − ½`, colour = max(0, Σ_k B_k(dir) sh_k + ½), opacity = σ(logit).
 //! J is evaluated at t_x/t_z clamped to the image border plus 30 % of the half width, so that splats far outside do not explode.
-use super::rasterizer::{FrameBuffers, SplatBuffers};
+use super::frame::FrameBuffers;
+use super::options::FeatureMode;
+use super::params::Params;
 use super::sh;
-use super::twin::{FeatureMode, Params};
+use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::{Buffer, Recorder, shaders};
 use glam::{DMat3, DVec3, DVec4};

@@ -5,11 +5,13 @@
 //! `∂J = ∂B Mᵀ Rᵀ`, `∂R_cov Rᵀ = Jᵀ ∂J`. From there means, log scales, raw quaternion (through its
 //! normalisation), opacity logit, SH coefficients, and the left pose twist ξ = (ρ, θ), T_cw ← exp(ξ) T_cw:
 //! `∂ρ = Σ ∂t + R g_sh`, `∂θ = Σ t × ∂t + vee(Jᵀ∂J)`.
+use super::frame::FrameBuffers;
+use super::options::FeatureMode;
+use super::params::{Gradients, Params};
 use super::project::{Geometry, geometry, raw_colour};
 use super::raster_backward::SplatGradient;
-use super::rasterizer::{FrameBuffers, SplatBuffers};
 use super::sh;
-use super::twin::{FeatureMode, Gradients, Params};
+use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::{Buffer, Recorder, shaders};
 use glam::{DMat3, DVec3, DVec4};

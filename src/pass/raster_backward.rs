@@ -9,73 +9,13 @@
 //! Every geometry gradient follows per splat: ∂o = m₀/o, ∂(u, v) = −(A m₁ + B m₂, C m₂ + B m₁),
 //! ∂(A, B, C) = (−½ m₃, −m₄, −½ m₅).
 use super::adam::rows_of_groups;
-use super::raster_forward::{BASE_CHANNELS, Block, Cutoffs, TwinScene, blocks, channels_of, push, walk};
-use super::rasterizer::{FrameBuffers, Tiles};
-use crate::Result;
-use crate::gpu::{Buffer, Device, Recorder, shaders};
+use super::channels::{BASE_CHANNELS, Block, blocks};
+use super::frame::{EntryBuffers, FrameBuffers, GRADIENT_FLOATS, Summation, Tiles};
+use super::raster_forward::{Cutoffs, TwinScene, channels_of, push, walk};
+use crate::gpu::{Buffer, Recorder, shaders};
 
 /// Moments of one splat in the gradient buffer; RGB and z follow.
 pub const MOMENTS: usize = 6;
-/// Floats per splat in the gradient buffer: moments, RGB and z in whole vectors.
-pub(super) const GRADIENT_FLOATS: usize = 12;
-
-/// Bytes per entry of the widest buffer that [`Summation::Entries`] needs: the features of one launch.
-pub(super) fn entry_bytes(feature_dim: usize) -> usize {
-    4 * GRADIENT_FLOATS.max(4 * widest_block(feature_dim) as usize)
-}
-
-/// Vectors of features in the widest launch.
-fn widest_block(feature_dim: usize) -> u32 {
-    blocks(feature_dim as u32).iter().map(Block::vectors).max().unwrap_or(0)
-}
-
-/// How the gradients that one splat gets from several tiles are added up.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Summation {
-    /// Float atomics: no memory, but the order of the additions, and so the last digits, differ from run to run.
-    Atomics,
-    /// Every tile stores what it adds, and a second pass sums per splat: the same bits on every run, for 48 bytes per
-    /// entry and about a tenth more time per step (lavapipe, 100,000 splats).
-    Entries,
-}
-
-/// Gradients per entry of the tile lists; made when first needed, since rendering alone does not.
-#[derive(Default)]
-pub(super) struct GradientEntries(std::sync::Mutex<Option<EntryBuffers>>);
-
-#[derive(Clone)]
-struct EntryBuffers {
-    capacity: usize,
-    /// [capacity, 12] as `projected_grad`, and [capacity, vectors of a block] for one block after the other.
-    splats: Buffer,
-    codes: Buffer,
-}
-
-impl Summation {
-    /// The faster way, unless the device was opened to be deterministic.
-    pub fn of(device: &Device) -> Summation {
-        if device.info().deterministic { Summation::Entries } else { Summation::Atomics }
-    }
-}
-
-impl GradientEntries {
-    fn buffers(&self, device: &Device, frame: &FrameBuffers) -> Result<EntryBuffers> {
-        let mut made = self.0.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-        let capacity = frame.lists.capacity;
-        if let Some(buffers) = made.as_ref().filter(|b| b.capacity == capacity) {
-            return Ok(buffers.clone());
-        }
-        let floats = |name, each: usize| device.buffer::<f32>(name, (capacity * each).max(4));
-        let buffers = EntryBuffers {
-            capacity,
-            splats: floats("gradient entries", GRADIENT_FLOATS)?,
-            codes: floats("code gradient entries", 4 * widest_block(frame.feature_dim) as usize)?,
-        };
-        *made = Some(buffers.clone());
-        Ok(buffers)
-    }
-}
-
 /// Clears the sums that [`record`] adds to.
 pub(super) fn record_clear(rec: &mut Recorder, frame: &FrameBuffers) {
     rec.fill(&frame.projected_grad, 0);

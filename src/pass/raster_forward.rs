@@ -4,61 +4,13 @@
 //! splat with α < 1/255 is skipped; the pixel stops before the splat that would bring T below 1e-4; every channel
 //! adds `c α T`, then `T ← T(1 − α)`. Channels: RGB (plus T_f · background), Σ w z (expected depth, not yet
 //! divided by alpha), d features (no background). Median depth is the z at which T falls below ½.
+use super::channels::blocks;
+use super::frame::{FrameBuffers, Tiles};
 use super::project::Projected;
-use super::rasterizer::{FrameBuffers, Tiles};
 use super::view::View;
 use crate::gpu::{Buffer, Recorder, shaders};
 
-/// RGB and depth come before the d features in every stack of planes.
-pub const BASE_CHANNELS: usize = 4;
-
-/// A block of channels that one launch of the raster kernels handles: their cost per pixel and splat has a fixed part,
-/// but their registers grow with the channels, so 48 features go in three launches of at most 16.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Block {
-    /// The kernel variant: 4, 7, 12, 20 with RGB and depth, 16 without.
-    pub channels: u32,
-    /// First vector of four in a splat's code.
-    pub first_vector: u32,
-    /// First plane of the block.
-    pub first_plane: u32,
-    /// Features in this block (the rest of the variant's room stays unused).
-    pub features: u32,
-}
-
-impl Block {
-    /// Vectors of four features that the variant has room for.
-    pub(super) fn vectors(&self) -> u32 {
-        let base = if self.channels == 16 { 0 } else { BASE_CHANNELS as u32 };
-        (self.channels - base).div_ceil(4)
-    }
-}
-
-/// Features of one launch.
-const BLOCK_FEATURES: u32 = 16;
-
-/// Splits d features into launches; the first carries RGB and depth too.
-pub(super) fn blocks(dim: u32) -> Vec<Block> {
-    let features = dim.min(BLOCK_FEATURES);
-    let channels = match features {
-        0 => 4,
-        1..=3 => 7,
-        4..=8 => 12,
-        _ => 20,
-    };
-    let mut blocks = vec![Block { channels, first_vector: 0, first_plane: 0, features }];
-    let mut done = features;
-    while done < dim {
-        blocks.push(Block {
-            channels: 16,
-            first_vector: done / 4,
-            first_plane: BASE_CHANNELS as u32 + done,
-            features: (dim - done).min(BLOCK_FEATURES),
-        });
-        done += BLOCK_FEATURES;
-    }
-    blocks
-}
+pub use super::channels::BASE_CHANNELS;
 
 /// The push constants of a raster shader; what only some of them have goes behind.
 macro_rules! push {
@@ -227,25 +179,4 @@ pub fn twin(scene: &TwinScene, cutoffs: &Cutoffs) -> Image {
         }
     }
     image
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn blocks_cover_every_feature_once() {
-        for dim in [0, 1, 3, 5, 8, 16, 17, 48, 50] {
-            let blocks = blocks(dim);
-            assert_eq!(blocks.iter().map(|b| b.features).sum::<u32>(), dim);
-            let mut next = 0;
-            for (k, block) in blocks.iter().enumerate() {
-                let base = if k == 0 { BASE_CHANNELS as u32 } else { 0 };
-                assert!(block.features + base <= block.channels);
-                assert_eq!(block.first_vector * 4, next);
-                assert_eq!(block.first_plane + base, 4 + next);
-                next += block.features;
-            }
-        }
-    }
 }

@@ -34,205 +34,19 @@
 //! planes: [`Rasterizer::record_projection`], then for every band [`Rasterizer::record_band`], loss,
 //! [`Rasterizer::record_band_backward`], and at the end [`Rasterizer::record_gradients`]. An image that fits is one band.
 use super::bands::{Band, Bands};
-use super::bin::{Grouping, TileLists};
-use super::raster_backward::{GradientEntries, Summation};
+use super::channels::BASE_CHANNELS;
+use super::frame::{GRADIENT_FLOATS, GradientEntries, Summation, Tiles, entry_bytes};
 use super::sort::Sort;
-use super::twin::FeatureMode;
+use super::tile_lists::{self, Grouping, TILE, TileLists};
 use super::view::{VIEW_FLOATS, View};
 use super::{bin, project, project_backward, raster_backward, raster_forward};
 use crate::gpu::{Buffer, Device, Recorder};
-use crate::scene::{Splats, sh_coefficients};
 use crate::{Error, Result};
 use std::ops::Range;
 
-/// Raw parameters of N splats, or gradients by them, on the GPU.
-#[derive(Clone)]
-pub struct SplatBuffers {
-    /// N. Buffers may be longer (after pruning); only the first N splats are used.
-    pub count: usize,
-    /// Degree of the stored coefficients, 0–3.
-    pub sh_degree: u32,
-    /// d.
-    pub feature_dim: usize,
-    /// [N, 3] f32, world units.
-    pub means: Buffer,
-    /// [N, 3] f32, natural logs.
-    pub log_scales: Buffer,
-    /// [N, 4] f32 (w, x, y, z), not necessarily normalised.
-    pub quats: Buffer,
-    /// [N] f32.
-    pub opacity_logits: Buffer,
-    /// [N, (sh_degree+1)², 3] f32, DC first, RGB interleaved.
-    pub sh: Buffer,
-    /// [N, d] f32 raw features (a single unused float when d = 0).
-    pub features: Buffer,
-}
-
-impl SplatBuffers {
-    /// Copies splats and their features [N, d] to the GPU (`features` empty and d = 0 for none).
-    pub fn upload(
-        device: &Device,
-        splats: &Splats,
-        features: &[f32],
-        feature_dim: usize,
-    ) -> Result<SplatBuffers> {
-        let n = splats.len();
-        let lengths = [splats.log_scales.len(), splats.quats.len(), splats.opacity_logits.len()];
-        if lengths.iter().any(|&l| l != n) || splats.sh.len() != n * 3 * splats.sh_len() {
-            return Err(Error::work(format!("splats with {n} means have other arrays of different lengths")));
-        }
-        if features.len() != n * feature_dim {
-            let given = features.len();
-            return Err(Error::work(format!("{given} feature values do not make {n} × {feature_dim}")));
-        }
-        let out = SplatBuffers::zeros(device, "splats", n, splats.sh_degree, feature_dim)?;
-        if n > 0 {
-            out.means.write(&splats.means)?;
-            out.log_scales.write(&splats.log_scales)?;
-            out.quats.write(&splats.quats)?;
-            out.opacity_logits.write(&splats.opacity_logits)?;
-            out.sh.write(&splats.sh)?;
-        }
-        if !features.is_empty() {
-            out.features.write(features)?;
-        }
-        Ok(out)
-    }
-
-    /// Zero-filled buffers for `count` splats; `label` begins their names.
-    pub fn zeros(
-        device: &Device,
-        label: &str,
-        count: usize,
-        sh_degree: u32,
-        feature_dim: usize,
-    ) -> Result<SplatBuffers> {
-        let make =
-            |name: &str, floats: usize| device.buffer::<f32>(&format!("{label} {name}"), floats.max(4));
-        Ok(SplatBuffers {
-            count,
-            sh_degree,
-            feature_dim,
-            means: make("means", 3 * count)?,
-            log_scales: make("log_scales", 3 * count)?,
-            quats: make("quats", 4 * count)?,
-            opacity_logits: make("opacity_logits", count)?,
-            sh: make("sh", 3 * count * sh_coefficients(sh_degree))?,
-            features: make("features", count * feature_dim)?,
-        })
-    }
-
-    /// Zero-filled buffers of the same shape, for gradients or optimiser moments.
-    pub fn zeros_like(&self, device: &Device) -> Result<SplatBuffers> {
-        SplatBuffers::zeros(device, "gradient", self.count, self.sh_degree, self.feature_dim)
-    }
-
-    /// SH coefficients per channel.
-    pub fn sh_len(&self) -> usize {
-        sh_coefficients(self.sh_degree)
-    }
-
-    /// Back to the host: splats and features [N, d].
-    pub fn download(&self) -> Result<(Splats, Vec<f32>)> {
-        let n = self.count;
-        let floats = |b: &Buffer, len: usize| b.read_range::<f32>(0..len);
-        let splats = Splats {
-            means: triples(&floats(&self.means, 3 * n)?),
-            log_scales: triples(&floats(&self.log_scales, 3 * n)?),
-            quats: floats(&self.quats, 4 * n)?.chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect(),
-            opacity_logits: floats(&self.opacity_logits, n)?,
-            sh_degree: self.sh_degree,
-            sh: floats(&self.sh, 3 * n * self.sh_len())?,
-        };
-        Ok((splats, floats(&self.features, n * self.feature_dim)?))
-    }
-}
-
-fn triples(values: &[f32]) -> Vec<[f32; 3]> {
-    values.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect()
-}
-
-/// How to render.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RasterOptions {
-    /// Degree used, at most the stored one.
-    pub sh_degree: u32,
-    /// From stored to rendered features.
-    pub feature_mode: FeatureMode,
-    /// Whether the loss on the features reaches means, scales, rotations and opacities.
-    pub features_move_geometry: bool,
-}
-
-impl Default for RasterOptions {
-    /// Degree 0; ε = 1e-3 as in docs/method.md#feature-gauge.
-    fn default() -> Self {
-        RasterOptions {
-            sh_degree: 0,
-            feature_mode: FeatureMode::Gauge { epsilon: 1e-3, blocks: 1 },
-            features_move_geometry: true,
-        }
-    }
-}
-
-/// Buffers of one frame; pixel planes are planar [C, H, W], f32, with H the rows of one band where there are several.
-pub struct FrameBuffers {
-    /// Pixels.
-    pub width: u32,
-    /// Pixels.
-    pub height: u32,
-    /// How the image is divided; one band if it fits.
-    pub bands: Bands,
-    /// d.
-    pub feature_dim: usize,
-    /// [4 + d, H, W]: RGB on the background, Σ w z, features. Written by the forward pass.
-    pub planes: Buffer,
-    /// [H, W] final transmittance T_f; alpha = 1 − T_f.
-    pub transmittance: Buffer,
-    /// [H, W] camera z where T falls below ½, 0 where it does not.
-    pub median_depth: Buffer,
-    /// [4 + d + 1, H, W]: the loss's gradient by `planes` and, last, by alpha. Zero at first; a loss overwrites the planes
-    /// it uses. Read by the backward pass.
-    pub planes_grad: Buffer,
-    /// [10]: gradient by the left pose twist (ρ, θ) and by fx, fy, cx, cy. Written by the backward pass.
-    pub camera_grad: Buffer,
-    /// [2] u32: tile-list entries of this frame; the number needed if a frame did not fit since the last `grow`, else 0.
-    pub status: Buffer,
-    pub(super) projected: Buffer,
-    pub(super) projected_grad: Buffer,
-    pub(super) camera_parts: Buffer,
-    pub(super) summation: Summation,
-    pub(super) gradient_entries: GradientEntries,
-    pub(super) codes: Buffer,
-    pub(super) codes_grad: Buffer,
-    pub(super) depth_pairs: Buffer,
-    pub(super) lists: TileLists,
-}
-
-/// Rows of tiles of the image that a raster pass works on.
-#[derive(Clone)]
-pub(super) struct Tiles {
-    pub rows: Range<u32>,
-    /// First row of tiles in the lists.
-    pub list_row: u32,
-    /// First row of pixels in the planes.
-    pub top: u32,
-}
-
-impl FrameBuffers {
-    /// Pixels that the planes hold: the image's, or a band's.
-    pub fn pixels(&self) -> u32 {
-        self.bands.pixels() as u32
-    }
-
-    /// Tiles along x and y.
-    pub(super) fn tiles(&self) -> [u32; 2] {
-        [self.width.div_ceil(bin::TILE), self.height.div_ceil(bin::TILE)]
-    }
-    /// Floats per splat in `codes`: d, rounded up to whole vectors.
-    pub(super) fn code_stride(&self) -> u32 {
-        (self.feature_dim as u32).next_multiple_of(4)
-    }
-}
+pub use super::frame::FrameBuffers;
+pub use super::options::RasterOptions;
+pub use super::splat_buffers::SplatBuffers;
 
 /// Choices among passes that lead to the same result.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -254,11 +68,9 @@ impl Ways {
 fn most_entries(device: &Device, summation: Summation, feature_dim: usize) -> usize {
     let gradients = match summation {
         Summation::Atomics => usize::MAX,
-        Summation::Entries => {
-            device.info().max_storage_range as usize / raster_backward::entry_bytes(feature_dim)
-        }
+        Summation::Entries => device.info().max_storage_range as usize / entry_bytes(feature_dim),
     };
-    bin::most_entries(device).min(gradients)
+    tile_lists::most_entries(device).min(gradients)
 }
 
 /// Renders up to N splats with d features at a fixed image size, and back.
@@ -299,10 +111,10 @@ impl Rasterizer {
         if width == 0 || height == 0 {
             return Err(Error::work("an image of zero size cannot be rendered"));
         }
-        let planes = raster_forward::BASE_CHANNELS + feature_dim;
+        let planes = BASE_CHANNELS + feature_dim;
         let bands = Bands::new(device.info(), width as usize, height as usize, planes)?;
-        let (pixels, strip) = (bands.pixels(), (bands.rows as u32).div_ceil(bin::TILE));
-        let tiles = width.div_ceil(bin::TILE) as usize * strip as usize;
+        let (pixels, strip) = (bands.pixels(), (bands.rows as u32).div_ceil(TILE));
+        let tiles = width.div_ceil(TILE) as usize * strip as usize;
         let splats = capacity.max(1);
         let stride = feature_dim.next_multiple_of(4);
         // About five entries per splat on the seeded scene; `forward` grows the list if that is too few.
@@ -319,8 +131,7 @@ impl Rasterizer {
             camera_grad: device.buffer::<f32>("camera_grad", 10)?,
             status: device.buffer::<u32>("status", 2)?,
             projected: device.buffer::<f32>("projected", 12 * splats)?,
-            projected_grad: device
-                .buffer::<f32>("projected_grad", raster_backward::GRADIENT_FLOATS * splats)?,
+            projected_grad: device.buffer::<f32>("projected_grad", GRADIENT_FLOATS * splats)?,
             camera_parts: device.buffer::<f32>("camera_parts", 10 * project_backward::CAMERA_PARTS)?,
             summation: ways.summation,
             gradient_entries: GradientEntries::default(),
@@ -472,7 +283,7 @@ impl Rasterizer {
 
     /// Some rows of pixels of a band as rows of tiles, as many at once as have room in the lists.
     fn strips(&self, band: &Band, pixels: Range<usize>) -> Vec<Tiles> {
-        let rows = pixels.start as u32 / bin::TILE..(pixels.end as u32).div_ceil(bin::TILE);
+        let rows = pixels.start as u32 / TILE..(pixels.end as u32).div_ceil(TILE);
         rows.clone()
             .step_by(self.strip.max(1) as usize)
             .map(|first| Tiles {
@@ -542,8 +353,7 @@ impl Rasterizer {
             self.strip = ((u64::from(self.strip) * most as u64 / wanted as u64) as u32).max(1);
         }
         let splats = self.capacity.max(1);
-        let tiles =
-            self.frame.tiles()[0] as usize * (self.frame.bands.rows as u32).div_ceil(bin::TILE) as usize;
+        let tiles = self.frame.tiles()[0] as usize * (self.frame.bands.rows as u32).div_ceil(TILE) as usize;
         let capacity = wanted.min(most);
         self.frame.lists = TileLists::new(&self.device, self.grouping, splats, tiles, capacity)?;
         self.frame.status.write(&[0u32, 0])

@@ -1,5 +1,5 @@
 //! Regularisers of the RGB stage (docs/method.md#regularisers): depth near the stereo depth, and no needles.
-use super::rasterizer::FrameBuffers;
+use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 
 /// Records `weight · Σ |D − A·d|/d` over pixels with reference depth d > 0, as gradients by D = Σwz and A; without a

@@ -1,7 +1,10 @@
 //! Renders a scene that stays on the GPU to images on the host.
 use super::bands::Band;
-use super::raster_forward::BASE_CHANNELS;
-use super::rasterizer::{FrameBuffers, RasterOptions, Rasterizer, SplatBuffers};
+use super::channels::BASE_CHANNELS;
+use super::frame::FrameBuffers;
+use super::options::RasterOptions;
+use super::rasterizer::Rasterizer;
+use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::Device;
 use crate::scene::{Camera, Plane, RgbImage, Splats};

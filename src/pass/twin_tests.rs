@@ -1,7 +1,9 @@
 //! Central differences of the twin itself: the analytic backward is right before any shader is compared with it.
+use super::options::FeatureMode;
+use super::params::Params;
 use super::raster_forward::Cutoffs;
 use super::seeded::{self, Random};
-use super::twin::{FeatureMode, Params, backward, forward, forward_in_order};
+use super::twin::{backward, forward, forward_in_order};
 use super::view::View;
 use crate::scene::Pose;
 use glam::DVec3;

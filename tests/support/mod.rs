@@ -2,11 +2,11 @@
 #![allow(dead_code, clippy::unwrap_used, clippy::expect_used, clippy::panic)] // each test binary uses its own part
 use splatvk::gpu::{Device, Recorder};
 use splatvk::pass::close::{Distance, Tolerance, compare};
+use splatvk::pass::params::{Gradients, Params};
 use splatvk::pass::raster_forward::Cutoffs;
-use splatvk::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers, Ways};
 use splatvk::pass::seeded;
-use splatvk::pass::twin::{self, Forward, Gradients, Params};
-use splatvk::pass::view::View;
+use splatvk::pass::twin::{self, Forward};
+use splatvk::pass::{RasterOptions, Rasterizer, SplatBuffers, View, Ways};
 use splatvk::scene::{Camera, Splats};
 
 /// A scene with everything a render needs.

@@ -1,0 +1,83 @@
+//! Commands as plain data.
+use super::buffer::Buffer;
+use super::call::Call;
+use super::hazard::{self, Stage, Touch};
+use super::module::Module;
+use crate::{Error, Result};
+
+/// What a command does.
+pub(super) enum Op {
+    Fill { buffer: Buffer, value: u32 },
+    Copy { from: Buffer, to: Buffer, from_byte: u64, to_byte: u64, bytes: u64 },
+    Dispatch { module: &'static Module, call: Call, groups: Groups },
+}
+
+/// How many workgroups run.
+pub(super) enum Groups {
+    Direct([u32; 3]),
+    Indirect { args: Buffer, byte: u64 },
+}
+
+pub(super) struct Command {
+    pub label: String,
+    /// The pass it belongs to, see [`Recorder::pass`].
+    pub pass: &'static str,
+    pub op: Op,
+}
+
+impl Command {
+    /// Declared accesses; for a dispatch they come from the compiled module.
+    pub fn touches(&self) -> Vec<Touch> {
+        let touch = |b: &Buffer, stage, read, write| Touch { buffer: b.id(), stage, read, write };
+        match &self.op {
+            Op::Fill { buffer, .. } => vec![touch(buffer, Stage::Transfer, false, true)],
+            Op::Copy { from, to, .. } => {
+                vec![touch(from, Stage::Transfer, true, false), touch(to, Stage::Transfer, false, true)]
+            }
+            Op::Dispatch { module, call, groups } => {
+                let mut touches = Vec::with_capacity(call.buffers.len() + 1);
+                if let Groups::Indirect { args, .. } = groups {
+                    touches.push(touch(args, Stage::Indirect, true, false));
+                }
+                for binding in module.bindings.iter().filter(|b| b.access.read || b.access.write) {
+                    if let Some((_, buffer)) = call.buffers.iter().find(|(n, _)| *n == binding.number) {
+                        touches.push(touch(
+                            buffer,
+                            Stage::Compute,
+                            binding.access.read,
+                            binding.access.write,
+                        ));
+                    }
+                }
+                touches
+            }
+        }
+    }
+
+    /// One of its buffers by identity.
+    pub fn buffer(&self, id: u64) -> Option<&Buffer> {
+        let (first, second, bound): (Option<&Buffer>, Option<&Buffer>, &[(u32, Buffer)]) = match &self.op {
+            Op::Fill { buffer, .. } => (Some(buffer), None, &[]),
+            Op::Copy { from, to, .. } => (Some(from), Some(to), &[]),
+            Op::Dispatch { call, groups: Groups::Indirect { args, .. }, .. } => {
+                (Some(args), None, &call.buffers)
+            }
+            Op::Dispatch { call, .. } => (None, None, &call.buffers),
+        };
+        first.into_iter().chain(second).chain(bound.iter().map(|(_, b)| b)).find(|b| b.id() == id)
+    }
+}
+
+/// Refuses a command that touches one buffer twice with a write: the shader would see itself.
+pub(super) fn check_aliases(label: &str, commands: &[Command], touches: &[Vec<Touch>]) -> Result<()> {
+    for (command, touches) in commands.iter().zip(touches) {
+        if let Some(id) = hazard::aliased(touches) {
+            return Err(Error::gpu(format!(
+                "{label}: {} has buffer `{}` twice and writes to it",
+                command.label,
+                command.buffer(id).map_or("?", |b| b.name())
+            )));
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,14 @@
+//! Vulkan results as errors, and locks that outlive a panic.
+use crate::Error;
+use ash::vk;
+use std::sync::{Mutex, MutexGuard};
+
+/// Turns a Vulkan result into an error that says what was being done.
+pub(super) fn vk_error(what: impl std::fmt::Display) -> impl FnOnce(vk::Result) -> Error {
+    move |e| Error::gpu(format!("{what}: {e}"))
+}
+
+/// Locks, ignoring poison: the guarded values stay consistent, a panic elsewhere is reported by its own thread.
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
+}

@@ -1,0 +1,76 @@
+//! What a device is asked for and what it is.
+use super::module::Capability;
+use std::collections::BTreeSet;
+
+/// How a device is opened.
+#[derive(Clone, Debug, Default)]
+pub struct Options {
+    /// Index in the order of preference, or part of the name; `None` takes the first usable one.
+    pub choice: Option<String>,
+    /// Khronos validation layer with synchronization validation.
+    pub validation: bool,
+    /// Keep buffers out of host-visible memory, as on a GPU, even on a CPU device (to test the staging path).
+    pub staging: bool,
+    /// Only passes that give the same bits on every run of this device, even where others are faster.
+    pub deterministic: bool,
+    /// No buffer larger than this, bytes, although the device would bind more: to test what is done in blocks.
+    pub max_binding: Option<u64>,
+    /// Use the compare-and-swap loop although the device has float atomics (to test it).
+    pub no_float_atomics: bool,
+}
+
+impl Options {
+    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`; `SPLATVK_MAX_BINDING` in MiB.
+    pub fn from_env(choice: Option<&str>) -> Self {
+        let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
+        Options {
+            choice: choice.map(str::to_owned).or_else(|| variable("SPLATVK_DEVICE")),
+            validation: variable("SPLATVK_VALIDATION").is_some_and(|v| v == "1"),
+            max_binding: variable("SPLATVK_MAX_BINDING")
+                .and_then(|v| v.parse::<u64>().ok())
+                .map(|mib| mib.saturating_mul(1 << 20)),
+            ..Options::default()
+        }
+    }
+}
+
+/// What the device is and can do.
+#[derive(Clone, Debug)]
+pub struct DeviceInfo {
+    /// As the driver reports it.
+    pub name: String,
+    /// Driver name and version.
+    pub driver: String,
+    /// Vulkan version of the device: major, minor, patch.
+    pub api_version: (u32, u32, u32),
+    /// A software device on the CPU.
+    pub is_cpu: bool,
+    /// Buffers are mapped directly instead of staged.
+    pub mapped: bool,
+    /// Default subgroup size.
+    pub subgroup_size: u32,
+    /// Smallest and largest size that can be pinned; both `subgroup_size` without subgroup size control.
+    pub subgroup_sizes: (u32, u32),
+    /// Subgroup sizes can be pinned per pipeline.
+    pub subgroup_control: bool,
+    /// Asked to give the same bits on every run ([`Options::deterministic`]).
+    pub deterministic: bool,
+    /// `atomicAdd` on float in storage buffers is native.
+    pub float_atomics: bool,
+    /// Capabilities that shaders may use here.
+    pub capabilities: BTreeSet<Capability>,
+    /// Largest buffer a shader can see, bytes.
+    pub max_storage_range: u64,
+    /// Memory of the largest heap that is the device's own, bytes.
+    pub memory: u64,
+    /// Largest dispatch, in workgroups.
+    pub max_groups: [u32; 3],
+    /// Threads in a workgroup at most.
+    pub max_workgroup_threads: u32,
+    /// Shared memory per workgroup, bytes.
+    pub shared_memory: u32,
+    /// Storage buffers in one shader at most.
+    pub max_bindings: u32,
+    /// Nanoseconds per timestamp tick; 0 when the queue has no timestamps.
+    pub timestamp_period: f64,
+}

@@ -1,0 +1,58 @@
+//! Opening a device of our own.
+use super::device::{Device, Setup};
+use super::info::Options;
+use super::validation::Sink;
+use super::{features, select};
+use crate::{Error, Result};
+use ash::vk;
+
+impl Device {
+    /// Opens the preferred device (discrete, integrated, virtual, CPU), or the one whose index or name part is `choice`.
+    /// `SPLATVK_DEVICE` is used when `choice` is `None`; `SPLATVK_VALIDATION=1` turns the validation layer on.
+    pub fn open(choice: Option<&str>) -> Result<Device> {
+        Self::with(&Options::from_env(choice))
+    }
+
+    /// Opens a device with all options spelled out.
+    pub fn with(options: &Options) -> Result<Device> {
+        let entry = select::load()?;
+        let sink = options.validation.then(Sink::default);
+        let instance = select::instance(&entry, sink.as_ref())?;
+        // A clone keeps the loader in memory: `build` drops its entry on failure, and the instance must be destroyed after.
+        match Self::build(entry.clone(), &instance, sink, options) {
+            Ok(device) => Ok(device),
+            Err(e) => {
+                // SAFETY: nothing made from the instance is alive after the failure.
+                unsafe { instance.destroy_instance(None) };
+                Err(e)
+            }
+        }
+    }
+
+    fn build(
+        entry: ash::Entry,
+        instance: &ash::Instance,
+        sink: Option<Sink>,
+        options: &Options,
+    ) -> Result<Device> {
+        let candidate = select::choose(select::candidates(instance)?, options.choice.as_deref())?;
+        let physical = candidate.physical;
+        let queue_family = select::queue_family(instance, physical)
+            .ok_or_else(|| Error::gpu(format!("{} has no compute queue", candidate.name)))?;
+        let (device, info) = features::create(instance, &candidate, queue_family, options)?;
+        // SAFETY: the queue was requested in `create`.
+        let queue = unsafe { device.get_device_queue(queue_family, 0) };
+        let setup = Setup {
+            instance: instance.clone(),
+            device,
+            info,
+            queue,
+            queue_family,
+            sync2_extension: candidate.properties.api_version < vk::API_VERSION_1_3,
+            timeline: false,
+            queue_lock: None,
+            owned: true,
+        };
+        Self::assemble(entry, physical, sink, setup)
+    }
+}

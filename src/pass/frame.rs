@@ -1,0 +1,127 @@
+//! Buffers of one frame, and the gradients that its backward pass keeps per entry of the tile lists.
+use super::bands::Bands;
+use super::channels::{Block, blocks};
+use super::tile_lists::{TILE, TileLists};
+use crate::Result;
+use crate::gpu::{Buffer, Device};
+use std::ops::Range;
+
+/// Buffers of one frame; pixel planes are planar [C, H, W], f32, with H the rows of one band where there are several.
+pub struct FrameBuffers {
+    /// Pixels.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// How the image is divided; one band if it fits.
+    pub bands: Bands,
+    /// d.
+    pub feature_dim: usize,
+    /// [4 + d, H, W]: RGB on the background, Σ w z, features. Written by the forward pass.
+    pub planes: Buffer,
+    /// [H, W] final transmittance T_f; alpha = 1 − T_f.
+    pub transmittance: Buffer,
+    /// [H, W] camera z where T falls below ½, 0 where it does not.
+    pub median_depth: Buffer,
+    /// [4 + d + 1, H, W]: the loss's gradient by `planes` and, last, by alpha. Zero at first; a loss overwrites the planes
+    /// it uses. Read by the backward pass.
+    pub planes_grad: Buffer,
+    /// [10]: gradient by the left pose twist (ρ, θ) and by fx, fy, cx, cy. Written by the backward pass.
+    pub camera_grad: Buffer,
+    /// [2] u32: tile-list entries of this frame; the number needed if a frame did not fit since the last `grow`, else 0.
+    pub status: Buffer,
+    pub(super) projected: Buffer,
+    pub(super) projected_grad: Buffer,
+    pub(super) camera_parts: Buffer,
+    pub(super) summation: Summation,
+    pub(super) gradient_entries: GradientEntries,
+    pub(super) codes: Buffer,
+    pub(super) codes_grad: Buffer,
+    pub(super) depth_pairs: Buffer,
+    pub(super) lists: TileLists,
+}
+
+/// Rows of tiles of the image that a raster pass works on.
+#[derive(Clone)]
+pub(super) struct Tiles {
+    pub rows: Range<u32>,
+    /// First row of tiles in the lists.
+    pub list_row: u32,
+    /// First row of pixels in the planes.
+    pub top: u32,
+}
+
+impl FrameBuffers {
+    /// Pixels that the planes hold: the image's, or a band's.
+    pub fn pixels(&self) -> u32 {
+        self.bands.pixels() as u32
+    }
+
+    /// Tiles along x and y.
+    pub(super) fn tiles(&self) -> [u32; 2] {
+        [self.width.div_ceil(TILE), self.height.div_ceil(TILE)]
+    }
+    /// Floats per splat in `codes`: d, rounded up to whole vectors.
+    pub(super) fn code_stride(&self) -> u32 {
+        (self.feature_dim as u32).next_multiple_of(4)
+    }
+}
+
+/// Floats per splat in the gradient buffer: moments, RGB and z in whole vectors.
+pub(super) const GRADIENT_FLOATS: usize = 12;
+
+/// Bytes per entry of the widest buffer that [`Summation::Entries`] needs: the features of one launch.
+pub(super) fn entry_bytes(feature_dim: usize) -> usize {
+    4 * GRADIENT_FLOATS.max(4 * widest_block(feature_dim) as usize)
+}
+
+/// Vectors of features in the widest launch.
+fn widest_block(feature_dim: usize) -> u32 {
+    blocks(feature_dim as u32).iter().map(Block::vectors).max().unwrap_or(0)
+}
+
+/// How the gradients that one splat gets from several tiles are added up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Summation {
+    /// Float atomics: no memory, but the order of the additions, and so the last digits, differ from run to run.
+    Atomics,
+    /// Every tile stores what it adds, and a second pass sums per splat: the same bits on every run, for 48 bytes per
+    /// entry and about a tenth more time per step (lavapipe, 100,000 splats).
+    Entries,
+}
+
+/// Gradients per entry of the tile lists; made when first needed, since rendering alone does not.
+#[derive(Default)]
+pub(super) struct GradientEntries(std::sync::Mutex<Option<EntryBuffers>>);
+
+#[derive(Clone)]
+pub(super) struct EntryBuffers {
+    capacity: usize,
+    /// [capacity, 12] as `projected_grad`, and [capacity, vectors of a block] for one block after the other.
+    pub splats: Buffer,
+    pub codes: Buffer,
+}
+
+impl Summation {
+    /// The faster way, unless the device was opened to be deterministic.
+    pub fn of(device: &Device) -> Summation {
+        if device.info().deterministic { Summation::Entries } else { Summation::Atomics }
+    }
+}
+
+impl GradientEntries {
+    pub fn buffers(&self, device: &Device, frame: &FrameBuffers) -> Result<EntryBuffers> {
+        let mut made = self.0.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let capacity = frame.lists.capacity;
+        if let Some(buffers) = made.as_ref().filter(|b| b.capacity == capacity) {
+            return Ok(buffers.clone());
+        }
+        let floats = |name, each: usize| device.buffer::<f32>(name, (capacity * each).max(4));
+        let buffers = EntryBuffers {
+            capacity,
+            splats: floats("gradient entries", GRADIENT_FLOATS)?,
+            codes: floats("code gradient entries", 4 * widest_block(frame.feature_dim) as usize)?,
+        };
+        *made = Some(buffers.clone());
+        Ok(buffers)
+    }
+}

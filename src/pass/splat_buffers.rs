@@ -1,0 +1,111 @@
+//! Raw splat parameters in GPU memory.
+use crate::gpu::{Buffer, Device};
+use crate::scene::{Splats, sh_coefficients};
+use crate::{Error, Result};
+
+/// Raw parameters of N splats, or gradients by them, on the GPU.
+#[derive(Clone)]
+pub struct SplatBuffers {
+    /// N. Buffers may be longer (after pruning); only the first N splats are used.
+    pub count: usize,
+    /// Degree of the stored coefficients, 0–3.
+    pub sh_degree: u32,
+    /// d.
+    pub feature_dim: usize,
+    /// [N, 3] f32, world units.
+    pub means: Buffer,
+    /// [N, 3] f32, natural logs.
+    pub log_scales: Buffer,
+    /// [N, 4] f32 (w, x, y, z), not necessarily normalised.
+    pub quats: Buffer,
+    /// [N] f32.
+    pub opacity_logits: Buffer,
+    /// [N, (sh_degree+1)², 3] f32, DC first, RGB interleaved.
+    pub sh: Buffer,
+    /// [N, d] f32 raw features (a single unused float when d = 0).
+    pub features: Buffer,
+}
+
+impl SplatBuffers {
+    /// Copies splats and their features [N, d] to the GPU (`features` empty and d = 0 for none).
+    pub fn upload(
+        device: &Device,
+        splats: &Splats,
+        features: &[f32],
+        feature_dim: usize,
+    ) -> Result<SplatBuffers> {
+        let n = splats.len();
+        let lengths = [splats.log_scales.len(), splats.quats.len(), splats.opacity_logits.len()];
+        if lengths.iter().any(|&l| l != n) || splats.sh.len() != n * 3 * splats.sh_len() {
+            return Err(Error::work(format!("splats with {n} means have other arrays of different lengths")));
+        }
+        if features.len() != n * feature_dim {
+            let given = features.len();
+            return Err(Error::work(format!("{given} feature values do not make {n} × {feature_dim}")));
+        }
+        let out = SplatBuffers::zeros(device, "splats", n, splats.sh_degree, feature_dim)?;
+        if n > 0 {
+            out.means.write(&splats.means)?;
+            out.log_scales.write(&splats.log_scales)?;
+            out.quats.write(&splats.quats)?;
+            out.opacity_logits.write(&splats.opacity_logits)?;
+            out.sh.write(&splats.sh)?;
+        }
+        if !features.is_empty() {
+            out.features.write(features)?;
+        }
+        Ok(out)
+    }
+
+    /// Zero-filled buffers for `count` splats; `label` begins their names.
+    pub fn zeros(
+        device: &Device,
+        label: &str,
+        count: usize,
+        sh_degree: u32,
+        feature_dim: usize,
+    ) -> Result<SplatBuffers> {
+        let make =
+            |name: &str, floats: usize| device.buffer::<f32>(&format!("{label} {name}"), floats.max(4));
+        Ok(SplatBuffers {
+            count,
+            sh_degree,
+            feature_dim,
+            means: make("means", 3 * count)?,
+            log_scales: make("log_scales", 3 * count)?,
+            quats: make("quats", 4 * count)?,
+            opacity_logits: make("opacity_logits", count)?,
+            sh: make("sh", 3 * count * sh_coefficients(sh_degree))?,
+            features: make("features", count * feature_dim)?,
+        })
+    }
+
+    /// Zero-filled buffers of the same shape, for gradients or optimiser moments.
+    pub fn zeros_like(&self, device: &Device) -> Result<SplatBuffers> {
+        SplatBuffers::zeros(device, "gradient", self.count, self.sh_degree, self.feature_dim)
+    }
+
+    /// SH coefficients per channel.
+    pub fn sh_len(&self) -> usize {
+        sh_coefficients(self.sh_degree)
+    }
+
+    /// Back to the host: splats and features [N, d].
+    pub fn download(&self) -> Result<(Splats, Vec<f32>)> {
+        let n = self.count;
+        let floats = |b: &Buffer, len: usize| b.read_range::<f32>(0..len);
+        let splats = Splats {
+            means: triples(&floats(&self.means, 3 * n)?),
+            log_scales: triples(&floats(&self.log_scales, 3 * n)?),
+            quats: floats(&self.quats, 4 * n)?.chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect(),
+            opacity_logits: floats(&self.opacity_logits, n)?,
+            sh_degree: self.sh_degree,
+            sh: floats(&self.sh, 3 * n * self.sh_len())?,
+        };
+        Ok((splats, floats(&self.features, n * self.feature_dim)?))
+    }
+}
+
+fn triples(values: &[f32]) -> Vec<[f32; 3]> {
+    values.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect()
+}
