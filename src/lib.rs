@@ -64,6 +64,7 @@ pub mod format;
 pub mod gpu;
 pub mod infer;
 pub mod language;
+pub mod math;
 pub mod pass;
 pub mod photo;
 pub mod pipeline;

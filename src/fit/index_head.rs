@@ -1,6 +1,6 @@
 //! What LEGaussians does to features after they are splatted: smoothing in space, and a head that reads the index of a
 //! codebook entry from a rendered feature (Shi et al. 2024).
-use super::schedule::Random;
+use crate::math::Random;
 use crate::scene::{Codebook, Splats};
 use rayon::prelude::*;
 use std::collections::HashMap;

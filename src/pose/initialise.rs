@@ -135,7 +135,7 @@ fn warn_of_misfits(photos: &[Photo], model: &SparseModel, progress: &dyn Progres
             ));
         }
         let others = model.fitted.iter().enumerate().filter(|(o, _)| *o != v);
-        let Some(usual) = super::numeric::median(&mut others.map(|(_, f)| f.residual).collect::<Vec<_>>())
+        let Some(usual) = crate::math::median(&mut others.map(|(_, f)| f.residual).collect::<Vec<_>>())
         else {
             continue;
         };

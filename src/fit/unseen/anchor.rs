@@ -1,6 +1,6 @@
 //! Where surfaces end in a photo: planes fitted at its borders and at its depth edges.
 use super::{BEHIND, STEP};
-use crate::fit::schedule::Random;
+use crate::math::Random;
 use crate::scene::{Camera, DepthMap, RgbImage};
 use glam::{DMat3, DVec2, DVec3};
 

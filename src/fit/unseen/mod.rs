@@ -7,7 +7,7 @@
 mod anchor;
 
 use super::init::SH_C0;
-use super::schedule::Random;
+use crate::math::Random;
 use crate::scene::{Camera, DepthMap, RgbImage, Splats};
 use anchor::{Anchor, Shown};
 use glam::{DMat3, DQuat, DVec2, DVec3};

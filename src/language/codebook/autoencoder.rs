@@ -7,7 +7,7 @@
 //! far more, and the rest of the engine sees an ordinary codebook.
 use super::network::{Adam, Network, Step};
 use super::{Built, CodeEntry, min_chord};
-use crate::fit::schedule::Random;
+use crate::math::Random;
 use crate::scene::Codebook;
 use crate::{Error, Result};
 use nalgebra::DMatrix;

@@ -5,6 +5,7 @@ mod pca;
 pub(super) mod quantise;
 mod spread;
 
+use crate::math::Random;
 use crate::scene::{Codebook, Plane};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -161,9 +162,9 @@ fn assert_bijection(codebook: &Codebook, seed: u64) -> Result<()> {
             codebook.code_dim
         )));
     }
-    let mut random = spread::Random::new(seed ^ 0x5eed);
+    let mut random = Random::new(seed ^ 0x5eed);
     for (k, code) in codebook.codes.chunks_exact(codebook.code_dim).enumerate() {
-        let direction = random.unit(codebook.code_dim);
+        let direction = spread::unit(&mut random, codebook.code_dim);
         let amplitude = 0.45 * chord * random.uniform() as f32;
         let noisy: Vec<f32> = code.iter().zip(&direction).map(|(c, n)| c + amplitude * *n as f32).collect();
         if decode_one(codebook, code) != Some(k) || decode_one(codebook, &noisy) != Some(k) {

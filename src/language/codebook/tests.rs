@@ -1,11 +1,12 @@
-use super::spread::Random;
+use super::spread::unit;
 use super::*;
+use crate::math::Random;
 
 fn entries(count: usize, dim: usize, seed: u64) -> Vec<CodeEntry> {
     let mut random = Random::new(seed);
     (0..count)
         .map(|k| CodeEntry {
-            embedding: random.unit(dim).iter().map(|&v| v as f32).collect(),
+            embedding: unit(&mut random, dim).iter().map(|&v| v as f32).collect(),
             weight: 10.0 + k as f64,
             members: vec![(0, k as u32)],
         })

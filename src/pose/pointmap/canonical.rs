@@ -1,6 +1,6 @@
 //! Steps B and C: one depth map per view from all pairs that contain it, and the focal lengths.
 use super::{ModelView, PairPointmaps, Pointmap, centre, point};
-use crate::pose::numeric::median;
+use crate::math::median;
 use glam::{DVec2, DVec3};
 
 /// What all pairs together say about one view, in the scale of its reference pair.

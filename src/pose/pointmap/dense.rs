@@ -2,8 +2,8 @@
 use super::adjust::Adjustment;
 use super::canonical::Canonical;
 use super::{ModelView, centre, working_camera};
+use crate::math::quantile;
 use crate::pose::Geometry;
-use crate::pose::numeric::quantile;
 use crate::scene::{Camera, DepthMap, Plane, PointCloud};
 use glam::DVec2;
 

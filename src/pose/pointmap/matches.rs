@@ -213,11 +213,11 @@ fn split(points: &[[f32; 3]], order: &mut [u32], axis: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::numeric::Rng;
+    use crate::math::Random;
 
     #[test]
     fn every_match_is_mutual_by_brute_force() {
-        let mut rng = Rng::new(9);
+        let mut rng = Random::new(9);
         let (w, h, d) = (32, 24, 8);
         let mut random = |n: usize| Descriptors {
             dim: d,
@@ -252,7 +252,7 @@ mod tests {
 
     #[test]
     fn tree_search_equals_brute_force() {
-        let mut rng = Rng::new(1);
+        let mut rng = Random::new(1);
         let points: Vec<[f32; 3]> = (0..500).map(|_| std::array::from_fn(|_| rng.normal() as f32)).collect();
         let tree = Tree::new(&points);
         for _ in 0..200 {

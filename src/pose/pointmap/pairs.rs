@@ -1,7 +1,8 @@
 //! Step D: the relative pose and scale of each pair, estimated twice and compared.
 use super::canonical::{Canonical, Focals};
 use super::{ModelView, PairPointmaps, Pointmap, centre, point};
-use crate::pose::numeric::{cauchy_weight, from_na, median, rotation_angle, to_na};
+use crate::math::median;
+use crate::pose::numeric::{cauchy_weight, from_na, rotation_angle, to_na};
 use crate::pose::resect::resect;
 use crate::scene::Pose;
 use glam::{DMat3, DVec2, DVec3};

@@ -59,7 +59,7 @@ fn known_cameras_give_points_on_the_true_surface() {
             break;
         }
     }
-    assert!(super::super::numeric::median(&mut errors).unwrap() < 0.005);
+    assert!(crate::math::median(&mut errors).unwrap() < 0.005);
     // Cameras of other photos must be refused: mirror the rig.
     let mut wrong = truth.cameras.clone();
     wrong.reverse();

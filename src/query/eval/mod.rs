@@ -197,7 +197,7 @@ impl Belief {
     fn of(estimated: &[Camera], known: &[Camera]) -> Belief {
         let median = |value: &dyn Fn(&Camera, &Camera) -> f64| {
             let mut all: Vec<f64> = estimated.iter().zip(known).map(|(e, k)| value(e, k)).collect();
-            crate::pose::numeric::median(&mut all).unwrap_or(0.0)
+            crate::math::median(&mut all).unwrap_or(0.0)
         };
         let of_width = |c: &Camera, x: f64| x / f64::from(c.width);
         let of_height = |c: &Camera, y: f64| y / f64::from(c.height);
