@@ -1,13 +1,12 @@
 //! Runs setups, each stage once: setups that agree up to a stage share what that stage made.
 use super::setup::{Init, Means, Setup, Source};
 use crate::fit::{self, LanguageOptions, Preset, RgbOptions, Trained};
-use crate::format::cameras::stem;
 use crate::gpu::Device;
 use crate::infer::installed::{Duty, inventory, known};
 use crate::infer::{RegionEncoder, Registry, pairs};
 use crate::language::align::PairLinks;
 use crate::language::{self, ViewMasks};
-use crate::photo::{self, Photo};
+use crate::photo::{self, Photo, stem};
 use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, InitChoice};
 use crate::progress::Progress;

@@ -119,17 +119,3 @@ pub fn write_json(path: &Path, cameras: &[Camera]) -> Result<()> {
     let entries: Vec<Entry> = cameras.iter().enumerate().map(entry).collect();
     super::write_json(path, &entries)
 }
-
-/// File name of a camera without folder and extension: what joins it to photos, masks and renders.
-pub fn stem(name: &str) -> String {
-    // Only known image extensions are cut: labels such as "view.2" are names of their own.
-    let base = name.rsplit(['/', '\\']).next().unwrap_or(name);
-    match base.rsplit_once('.') {
-        Some((stem, ext))
-            if !stem.is_empty() && ext.len() <= 4 && ext.chars().any(|c| c.is_ascii_alphabetic()) =>
-        {
-            stem.to_string()
-        }
-        _ => base.to_string(),
-    }
-}

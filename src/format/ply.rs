@@ -419,9 +419,7 @@ fn nearest_code(level: &LevelField, i: usize) -> i32 {
     if feature.iter().all(|v| *v == 0.0) {
         return -1;
     }
-    let dots = level.codebook.codes.chunks_exact(level.codebook.code_dim);
-    let dots = dots.map(|c| c.iter().zip(&feature).map(|(a, b)| a * b).sum::<f32>());
-    dots.enumerate().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(-1, |(k, _)| k as i32)
+    level.codebook.decode(&feature).map_or(-1, |k| k as i32)
 }
 
 /// Writes a coloured point cloud as other tools expect it: `x y z nx ny nz` float, `red green blue` uchar.

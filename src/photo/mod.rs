@@ -17,6 +17,7 @@ pub use affine::Affine;
 pub use candidate::{Candidate, gather};
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, find, spread, wanted};
 pub use frame::Frame;
+pub use kind::stem;
 pub use light::Light;
 pub use resize::Kernel;
 pub use sizes::sizes_of;
@@ -65,7 +66,7 @@ pub const SMALLEST_SIDE: usize = 64;
 pub struct Photo {
     /// Where it was read from.
     pub path: PathBuf,
-    /// File name without extension: the key that joins masks, cameras and renders.
+    /// [`stem`] of the file: the key that joins masks, cameras and renders.
     pub stem: String,
     /// Upright pixels at working resolution; on a plain frame, the nearest pixels of the picture.
     pub image: RgbImage,
@@ -190,7 +191,7 @@ fn working(
     frame.continue_picture(&mut image);
     Ok(Photo {
         path: name.to_path_buf(),
-        stem: name.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
+        stem: stem(&name.to_string_lossy()).to_string(),
         image,
         frame,
         original_size: (w as u32, h as u32),

@@ -5,7 +5,7 @@ use super::{Features, Geometry, SparseModel, light, sfm};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
-use crate::photo::Photo;
+use crate::photo::{Photo, stem};
 use crate::progress::Progress;
 use crate::scene::Camera;
 use crate::{Error, Result};
@@ -190,9 +190,6 @@ pub fn sparse(
 
 /// One camera per photo, at working resolution, by file name without extension.
 fn assigned(photos: &[Photo], cameras: &[Camera]) -> Result<Vec<Camera>> {
-    let stem = |name: &str| {
-        std::path::Path::new(name).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default()
-    };
     photos
         .iter()
         .map(|p| {

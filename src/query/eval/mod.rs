@@ -16,6 +16,7 @@ pub use truth::{Frame, GroundTruth, Split};
 use super::QueryResult;
 use crate::format::picture;
 use crate::pass::metrics;
+use crate::photo::stem;
 use crate::pose::align::{PoseErrors, Similarity, pose_errors};
 use crate::pose::relative::{auc, pair_errors};
 use crate::scene::{Camera, Plane, Pose, RgbImage};
@@ -487,10 +488,6 @@ fn write_files(out: &Path, stem: &str, shown: &RgbImage, answers: &[(u32, QueryR
         picture::write_mask_png(&path, &answer.mask)?;
     }
     Ok(())
-}
-
-fn stem(name: &str) -> &str {
-    Path::new(name).file_stem().and_then(|s| s.to_str()).unwrap_or(name)
 }
 
 fn make_parent(path: &Path) -> Result<()> {

@@ -13,7 +13,7 @@ mod tests;
 
 use super::eval::{Evaluation, GroundTruth, Split, to_scene};
 use super::{TextQuery, relevancy_map};
-use crate::format::cameras::stem;
+use crate::photo::stem;
 use crate::pose::align::pose_errors;
 use crate::scene::{Camera, LanguageField, Plane};
 use crate::{Error, Result};
@@ -217,7 +217,7 @@ fn mask_iou(predicted: &Plane<bool>, truth: &Plane<bool>) -> Result<f64> {
 fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Result<Vec<View>> {
     let own = |s: &str| scene.iter().find(|c| stem(&c.name) == s);
     let shared: Vec<(Camera, Camera)> =
-        known.iter().filter_map(|k| own(&stem(&k.name)).map(|c| (c.clone(), k.clone()))).collect();
+        known.iter().filter_map(|k| own(stem(&k.name)).map(|c| (c.clone(), k.clone()))).collect();
     // One shared photo leaves the scale open.
     let similarity = (shared.len() >= 2).then(|| {
         let (estimated, truth): (Vec<_>, Vec<_>) = shared.into_iter().unzip();

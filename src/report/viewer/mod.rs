@@ -151,7 +151,7 @@ fn view(camera: &Camera, photo: Option<&RgbImage>) -> Result<Value> {
     // glam is column-major; the page wants rows.
     let rotation = camera.pose.rotation.transpose().to_cols_array();
     Ok(json!({
-        "name": crate::format::cameras::stem(&camera.name), "width": camera.width, "height": camera.height,
+        "name": crate::photo::stem(&camera.name), "width": camera.width, "height": camera.height,
         "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
         "rotation": rotation, "translation": camera.pose.translation.to_array(), "thumbnail": thumbnail,
     }))
