@@ -69,6 +69,7 @@ pub mod pass;
 pub mod photo;
 pub mod pipeline;
 pub mod pose;
+pub mod preset;
 pub mod progress;
 pub mod query;
 pub mod report;

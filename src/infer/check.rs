@@ -10,8 +10,9 @@ use super::runtime::Input;
 use super::sam::{BATCH, MASKS, Sam};
 use super::{RegionEncoder, pairs, warp};
 use crate::format::npy::{self, NpyData};
-use crate::photo::{Affine, Frame, Photo};
+use crate::photo::{Frame, Photo};
 use crate::progress::{Silent, peak_memory, reset_peak_memory};
+use crate::scene::Affine;
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
 

@@ -7,9 +7,8 @@ use super::graph::{GraphFile, Outputs};
 use super::prepare::Prepared;
 use super::runtime::Input;
 use crate::photo::Photo;
-use crate::pose::pointmap::{ModelView, PairPointmaps, Pointmap};
 use crate::progress::Progress;
-use crate::scene::{Camera, Pose};
+use crate::scene::{Camera, ModelView, PairPointmaps, Pointmap, Pose};
 use crate::{Error, Result};
 
 pub(super) fn pointmaps(

@@ -9,8 +9,8 @@ use super::prepare::{Prepared, prepare};
 use super::runtime::{Input, Tensor};
 use crate::math::median;
 use crate::photo::Photo;
-use crate::pose::pointmap::{Descriptors, ModelView, PairPointmaps, Pointmap};
 use crate::progress::Progress;
+use crate::scene::{Descriptors, ModelView, PairPointmaps, Pointmap};
 use crate::{Error, Result};
 
 /// What a network says about all pairs of photos, for [`crate::pose::InitChoice::Pointmaps`].

@@ -2,7 +2,8 @@
 use super::adapter::{Filter, Fit, ImageSpec};
 use super::graph::GraphFile;
 use super::runtime::Input;
-use crate::photo::{Affine, Kernel};
+use crate::photo::Kernel;
+use crate::scene::Affine;
 use crate::scene::RgbImage;
 
 /// A photo as a network sees it.

@@ -1,5 +1,4 @@
 //! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (docs/method.md#photos).
-mod affine;
 mod candidate;
 mod choose;
 mod decode;
@@ -13,7 +12,6 @@ mod sizes;
 mod straighten;
 mod video;
 
-pub use affine::Affine;
 pub use candidate::{Candidate, gather};
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, find, spread, wanted};
 pub use frame::Frame;
@@ -24,7 +22,7 @@ pub use sizes::sizes_of;
 pub use straighten::Straightening;
 
 use crate::progress::Progress;
-use crate::scene::{Camera, Lens, Plane, RgbImage};
+use crate::scene::{Affine, Camera, Lens, Plane, RgbImage};
 use crate::{Error, Result};
 use glam::DVec2;
 use rayon::prelude::*;

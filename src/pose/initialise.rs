@@ -1,5 +1,5 @@
 //! Choosing and running a geometry initialiser.
-use super::pointmap::{self, ModelView, PairPointmaps};
+use super::pointmap;
 use super::stereo::{self, StereoOptions};
 use super::{Features, Geometry, SparseModel, light, sfm};
 use crate::gpu::Device;
@@ -7,7 +7,7 @@ use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
 use crate::photo::{Photo, stem};
 use crate::progress::Progress;
-use crate::scene::Camera;
+use crate::scene::{Camera, ModelView, PairPointmaps};
 use crate::{Error, Result};
 use glam::DVec2;
 

@@ -16,7 +16,7 @@ mod write;
 pub use read::read_splats;
 pub use write::{write_glb, write_gltf};
 
-use crate::pose::align::Similarity;
+use crate::scene::Similarity;
 use glam::{DMat3, DVec3};
 
 const EXTENSION: &str = "KHR_gaussian_splatting";

@@ -4,6 +4,8 @@ use crate::pose::align::{PoseErrors, pose_errors};
 use crate::pose::numeric::rotation_angle;
 use crate::pose::testing::{self, Truth};
 use crate::progress::Silent;
+use crate::scene::{Affine, Camera, Pointmap};
+use glam::{DVec2, DVec3};
 
 /// What is wrong with the pointmaps and matches.
 #[derive(Clone, Copy)]

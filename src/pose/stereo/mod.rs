@@ -13,9 +13,9 @@ mod void;
 pub use views::{Level, pyramid};
 
 use crate::Result;
-use crate::fit::Preset;
 use crate::gpu::Device;
 use crate::pass::plane_sweep::{GpuMatcher, MAX_SOURCES, Matcher, Reference};
+use crate::preset::Preset;
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, Plane, PointCloud, RgbImage};
 use glam::{DVec3, Vec4};
