@@ -10,8 +10,7 @@ use super::{Input, RegionEncoder, Registry, cache, pairs, warp};
 use crate::files::sha256;
 use crate::photo::{Frame, Photo};
 use crate::progress::Silent;
-use crate::scene::Affine;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Affine, Plane, RgbImage};
 
 /// Mean colour of the image, as embedding.
 fn image_tower() -> Onnx {

@@ -22,7 +22,7 @@ pub fn warps(
 ) -> Result<Vec<(DenseWarp, DenseWarp)>> {
     let Ok(file) = model.graph(Part::Warp) else { return by_descriptors(model, photos, progress) };
     let _alone = alone();
-    let prepared = super::pairs::inputs(file, "image1", photos)?;
+    let prepared = super::prepare::inputs(file, "image1", photos)?;
     let both = file.has("warp21") && file.has("certainty21");
     let mut graph: Option<Graph> = None;
     let mut forward = |i: usize, j: usize| -> Result<Vec<Field>> {

@@ -5,8 +5,7 @@
 use super::{LevelMasks, ViewMasks};
 use crate::format::npy::{self, NpyData};
 use crate::photo::Photo;
-use crate::scene::Affine;
-use crate::scene::Plane;
+use crate::scene::{Affine, Plane};
 use crate::{Error, Result};
 use glam::DVec2;
 use std::collections::BTreeMap;
@@ -236,8 +235,7 @@ fn key(phrase: &str) -> String {
 mod tests {
     use super::*;
     use crate::format::npy::NpyArray;
-    use crate::scene::Affine;
-    use crate::scene::RgbImage;
+    use crate::scene::{Affine, RgbImage};
 
     fn photo(width: usize, height: usize, original: (u32, u32)) -> Photo {
         Photo {

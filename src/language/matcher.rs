@@ -5,8 +5,7 @@
 //! where neighbours agree, and spread over their cells by a local affine fit. Both directions come from one set of
 //! matches, so they are each other's inverse.
 use crate::infer::xfeat::DenseFeatures;
-use crate::scene::DenseWarp;
-use crate::scene::{Camera, DepthMap, Plane};
+use crate::scene::{Camera, DenseWarp, DepthMap, Plane};
 use glam::{DMat2, DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 

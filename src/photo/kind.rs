@@ -14,6 +14,10 @@ const OTHER_IMAGE: [&str; 8] = ["bmp", "gif", "jxl", "jp2", "psd", "tga", "svg",
 /// The kinds that are read, for messages.
 pub(super) const READ: &str = "JPEG, PNG, HEIC, AVIF, WebP or TIFF";
 
+/// Most memory a decoded file may take: four times the largest photo that phones write (200 megapixels, 8 bit).
+pub(super) const LARGEST_DECODED: u64 = 2 << 30;
+pub(super) const TOO_LARGE: &str = "the image needs more than 2 GiB of memory; make it smaller";
+
 const RAW_ADVICE: &str = "is a camera raw file; develop it to JPEG or 16-bit TIFF";
 const GIF: &str = "is a GIF; save its frames as PNG";
 const BMP: &str = "is a BMP image; save it as PNG";

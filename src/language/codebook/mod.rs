@@ -5,7 +5,7 @@ mod pca;
 pub(super) mod quantise;
 mod spread;
 
-use crate::math::Random;
+use crate::math::{Random, dot};
 use crate::scene::Codebook;
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -75,7 +75,7 @@ fn deduplicate(entries: &[CodeEntry]) -> (Vec<CodeEntry>, Vec<u32>) {
     let mut heaviest: Vec<f64> = Vec::new();
     let mut code_of = Vec::with_capacity(entries.len());
     for e in entries {
-        let same = kept.iter().position(|k| cosine(&k.embedding, &e.embedding) > SAME_EMBEDDING);
+        let same = kept.iter().position(|k| dot(&k.embedding, &e.embedding) > SAME_EMBEDDING);
         match same {
             Some(k) => {
                 kept[k].weight += e.weight;
@@ -94,10 +94,6 @@ fn deduplicate(entries: &[CodeEntry]) -> (Vec<CodeEntry>, Vec<u32>) {
         }
     }
     (kept, code_of)
-}
-
-fn cosine(a: &[f32], b: &[f32]) -> f64 {
-    a.iter().zip(b).map(|(x, y)| *x as f64 * *y as f64).sum()
 }
 
 /// `c_k = e_k`: with no more codes than dimensions a mix of two codes is never nearest to a third.

@@ -1,5 +1,5 @@
 //! Spreads codes over the sphere so that they stay apart (docs/method.md#code-construction, step 4).
-use crate::math::Random;
+use crate::math::{Random, dot};
 use rayon::prelude::*;
 
 /// Gradient steps; the minimum distance no longer grows after about 200 on 50 to 600 codes.
@@ -122,7 +122,7 @@ fn nearest(embeddings: &[f32], dim: usize, count: usize) -> Vec<Vec<usize>> {
         .into_par_iter()
         .map(|k| {
             let mut order: Vec<(f64, usize)> =
-                (0..count).filter(|&l| l != k).map(|l| (super::cosine(rows[k], rows[l]), l)).collect();
+                (0..count).filter(|&l| l != k).map(|l| (dot(rows[k], rows[l]), l)).collect();
             order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
             order.truncate(NEIGHBOURS);
             order.into_iter().map(|(_, l)| l).collect()

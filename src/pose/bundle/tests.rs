@@ -1,6 +1,7 @@
 use super::*;
 use crate::math::Random;
 use crate::pose::numeric::rotation_angle;
+use crate::scene::Lens;
 use nalgebra::DMatrix;
 
 /// Four cameras on an arc of 60° around 200 points; pixel noise `noise`.

@@ -8,8 +8,7 @@ use crate::Result;
 use crate::math::median;
 use crate::pose::numeric::{cauchy, cauchy_weight, skew};
 use crate::progress::Progress;
-use crate::scene::Pose;
-use crate::scene::{ModelView, PairPointmaps};
+use crate::scene::{ModelView, PairPointmaps, Pose};
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
 

@@ -3,8 +3,7 @@ use super::adjust::Adjustment;
 use super::canonical::Canonical;
 use crate::math::quantile;
 use crate::pose::Geometry;
-use crate::scene::ModelView;
-use crate::scene::{Camera, DepthMap, Plane, PointCloud};
+use crate::scene::{Camera, DepthMap, ModelView, Plane, PointCloud};
 use glam::DVec2;
 
 /// A less confident point this much in front of another view's surface is wrong (depth noise is about this large).

@@ -3,8 +3,7 @@ use super::canonical::{Canonical, Focals};
 use crate::math::median;
 use crate::pose::numeric::{cauchy_weight, from_na, rotation_angle, to_na};
 use crate::pose::resect::resect;
-use crate::scene::Pose;
-use crate::scene::{ModelView, PairPointmaps, Pointmap};
+use crate::scene::{ModelView, PairPointmaps, Pointmap, Pose};
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{Matrix3, Vector3};
 

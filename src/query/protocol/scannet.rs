@@ -1,5 +1,5 @@
 //! ScanNet with the eight labels of LSM (paper, "Comparison with Feed-forward LSM").
-use super::{Kind, Masks, Protocol, Report, Score, Seen, Summary, View, nearest, place};
+use super::score::{Kind, Masks, Protocol, Report, Score, Seen, Summary, View, nearest, place};
 use crate::photo::stem;
 use crate::query::eval::Split;
 use crate::scene::{Camera, Plane, Pose};

@@ -1,7 +1,9 @@
 //! Each protocol against a plain computation in f64 that shares no code with it.
 use super::*;
 use crate::math::Random;
-use crate::scene::{Codebook, LevelField, Pose};
+use crate::query::TextQuery;
+use crate::query::eval::{GroundTruth, Split};
+use crate::scene::{Codebook, LanguageField, LevelField, Plane, Pose};
 use glam::DVec3;
 
 fn unit(random: &mut Random) -> Vec<f32> {
