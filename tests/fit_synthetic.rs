@@ -1,9 +1,10 @@
 //! Training on small scenes that are made of splats themselves, so that the truth is known exactly.
 #![allow(clippy::unwrap_used)] // helpers of tests
 use glam::DVec3;
-use splatvk::fit::schedule::{Exponential, Random};
+use splatvk::fit::schedule::Exponential;
 use splatvk::fit::{self, FeatureGauge, LanguageOptions, Preset, RgbOptions};
 use splatvk::gpu::{Device, Options, TestDevice, test_device};
+use splatvk::math::Random;
 use splatvk::pass::{FeatureMode, RasterOptions, Renderer};
 use splatvk::progress::Silent;
 use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, Plane, Pose, RgbImage, Splats};

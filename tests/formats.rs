@@ -4,7 +4,7 @@ use glam::{DQuat, DVec3};
 use splatvk::format::{
     cameras, colmap, gaussians, ply, ply_packed, scene_dir, side_file, splat, spz, transforms,
 };
-use splatvk::photo;
+use splatvk::photo::{self, stem};
 use splatvk::scene::{Camera, Codebook, LanguageField, Lens, LevelField, PointCloud, Pose, Splats};
 use std::path::{Path, PathBuf};
 
@@ -61,7 +61,7 @@ fn assert_same_cameras(a: &[Camera], b: &[Camera]) {
     assert_eq!(a.len(), b.len());
     for (a, b) in a.iter().zip(b) {
         assert_eq!((a.width, a.height), (b.width, b.height));
-        assert_eq!(cameras::stem(&a.name), cameras::stem(&b.name));
+        assert_eq!(stem(&a.name), stem(&b.name));
         for (x, y) in [(a.fx, b.fx), (a.fy, b.fy), (a.cx, b.cx), (a.cy, b.cy)] {
             assert_eq!(x, y);
         }
@@ -475,7 +475,7 @@ fn scene_directory_round_trip() {
     let scene = scene_dir::load(folder.path()).unwrap();
     assert_eq!(scene.splats, s, "with its own SH degree, though the PLY is padded to 3");
     assert_eq!(scene.language.as_ref(), Some(&language));
-    let stems: Vec<_> = scene.cameras.iter().map(|c| cameras::stem(&c.name)).collect();
+    let stems: Vec<_> = scene.cameras.iter().map(|c| stem(&c.name)).collect();
     assert_eq!(stems, photos.iter().map(|p| p.stem.clone()).collect::<Vec<_>>());
     assert!((scene.cameras[2].pose.centre() - cams[2].pose.centre()).length() < 1e-6);
     assert_eq!(colmap::read(&folder.path().join("cameras/colmap")).unwrap().len(), 3);
@@ -490,19 +490,6 @@ fn scene_directory_round_trip() {
     assert!(scene_dir::load(folder.path()).unwrap_err().to_string().contains("update it"));
     std::fs::remove_file(&manifest).unwrap();
     assert!(scene_dir::load(folder.path()).unwrap_err().to_string().contains("not a scene directory"));
-}
-
-#[test]
-fn stems_join_cameras_to_photos() {
-    for (name, stem) in [
-        ("images/a b.jpg", "a b"),
-        ("a.tar.png", "a.tar"),
-        ("view.2", "view.2"),
-        ("x", "x"),
-        (".png", ".png"),
-    ] {
-        assert_eq!(cameras::stem(name), stem);
-    }
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! What only experiments do: masks and features from ground truth, the true meaning of objects, and figures.
 use crate::fit::{Trained, TrainedLanguage};
-use crate::format::cameras::stem;
+use crate::photo::stem;
 use crate::language::{ViewMasks, dir};
 use crate::photo::Photo;
 use crate::pipeline::{Context, Lane, Output, Stage};

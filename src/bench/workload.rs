@@ -132,7 +132,7 @@ fn read_camera(path: &Path) -> Result<Camera> {
         cy: field("cy")?,
         pose: Pose { rotation, translation },
     };
-    cameras::checked(camera).map_err(bad)
+    camera.checked().map_err(bad)
 }
 
 #[cfg(test)]

@@ -60,7 +60,7 @@ pub(super) unsafe fn camera_in(pointer: *const SvkCamera) -> Result<Camera, Faul
         cy: c.cy,
         pose,
     };
-    crate::format::cameras::checked(camera).map_err(|e| Fault::Error(Error::input(e)))
+    camera.checked().map_err(|e| Fault::Error(Error::input(e)))
 }
 
 /// Loads a scene directory, or a file of Gaussians (which has no language). On failure `*scene` is NULL and the text is the

@@ -1,7 +1,7 @@
 //! Clone and split where splats are pulled hard across the screen (Kerbl et al. 2023; docs/method.md#densification).
 //! Optional: with stereo points the density is already one per pixel, and cloning fits each view's residual error with
 //! floaters.
-use super::schedule::Random;
+use crate::math::Random;
 use crate::pass::compact::NEW;
 use crate::scene::Splats;
 use glam::{Quat, Vec3};

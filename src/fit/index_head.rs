@@ -1,6 +1,6 @@
 //! What LEGaussians does to features after they are splatted: smoothing in space, and a head that reads the index of a
 //! codebook entry from a rendered feature (Shi et al. 2024).
-use super::schedule::Random;
+use crate::math::Random;
 use crate::scene::{Codebook, Splats};
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -82,7 +82,6 @@ pub fn train_head(book: &mut Codebook, features: &[f32], labels: &[u32], seed: u
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::language::codebook::decode_one;
 
     #[test]
     fn a_head_learns_to_name_entries_that_the_start_confuses() {
@@ -106,7 +105,7 @@ mod tests {
         };
         let right = |book: &Codebook| {
             let all = features.chunks_exact(d).zip(&labels);
-            all.filter(|(f, l)| decode_one(book, f) == Some(**l as usize)).count()
+            all.filter(|(f, l)| book.decode(f) == Some(**l as usize)).count()
         };
         let before = right(&book);
         train_head(&mut book, &features, &labels, 0);

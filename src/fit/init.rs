@@ -1,7 +1,7 @@
 //! Splats from points: size from the pixel footprint and the nearest neighbours, colour from the photos
 //! (docs/method.md#splats-from-points).
 use super::options::InitOptions;
-use super::schedule::Random;
+use crate::math::Random;
 use crate::scene::{PointCloud, Splats, sh_coefficients};
 use crate::{Error, Result};
 use glam::Vec3;

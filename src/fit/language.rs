@@ -376,8 +376,7 @@ fn decoded_right(level: &LevelField, labels: &[i32], features: &[f32]) -> [usize
         .filter(|(_, label)| **label >= 0)
         .map(|(p, &label)| {
             let feature: Vec<f32> = (0..d).map(|k| features[k * pixels + p]).collect();
-            let decoded = crate::fit::lift::decode(&level.codebook, &feature);
-            [usize::from(decoded == label as usize), 1]
+            [usize::from(level.codebook.decode(&feature) == Some(label as usize)), 1]
         })
         .reduce(|| [0, 0], |a, b| [a[0] + b[0], a[1] + b[1]])
 }

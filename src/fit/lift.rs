@@ -7,7 +7,7 @@ use crate::gpu::{Buffer, Device, Recorder};
 use crate::pass::bands::Band;
 use crate::pass::codes::{self, Mode, Targets};
 use crate::pass::options::{FeatureMode, RasterOptions};
-use crate::scene::{Camera, Codebook, LevelField, RgbImage};
+use crate::scene::{Camera, LevelField, RgbImage};
 use crate::{Error, Result};
 
 /// Splats that labelled pixels saw with less weight than this (in pixels) start without a feature: their direction
@@ -144,16 +144,4 @@ pub(super) fn lift(
         feature.iter_mut().for_each(|v| *v *= scale);
     }
     Ok(sums)
-}
-
-/// `argmax_k F·c_k`, the lowest k on ties (docs/method.md#decoding-codes).
-pub(super) fn decode(codebook: &Codebook, feature: &[f32]) -> usize {
-    let mut best = (f32::NEG_INFINITY, 0);
-    for (k, code) in codebook.codes.chunks_exact(codebook.code_dim).enumerate() {
-        let dot: f32 = code.iter().zip(feature).map(|(a, b)| a * b).sum();
-        if dot > best.0 {
-            best = (dot, k);
-        }
-    }
-    best.1
 }

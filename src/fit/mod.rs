@@ -15,9 +15,10 @@ mod steps;
 mod unseen;
 mod views;
 
+pub use crate::preset::Preset;
 pub(crate) use language::Run as LanguageRun;
 pub use language::{LanguagePoint, TrainedLanguage, train_language};
-pub use options::{FeatureGauge, InitOptions, LanguageOptions, Preset, Rates, RgbOptions};
+pub use options::{FeatureGauge, InitOptions, LanguageOptions, Rates, RgbOptions};
 pub(crate) use rgb::Run as RgbRun;
 pub use rgb::{CurvePoint, FitStats, Trained, fit_rgb, train_rgb};
 pub(crate) use steps::Steps;

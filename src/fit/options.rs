@@ -2,17 +2,7 @@
 use super::densify::DensifyOptions;
 use super::pose::PoseOptions;
 use super::schedule::Exponential;
-
-/// How much time a fit may take.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
-pub enum Preset {
-    /// A few hundred steps: minutes on a CPU device.
-    Draft,
-    /// The recommended length on a GPU.
-    Default,
-    /// The constants of the reference implementation behind the paper (docs/method.md#schedules).
-    Paper,
-}
+use crate::preset::Preset;
 
 /// How splats start (docs/method.md#splats-from-points).
 #[derive(Clone, Copy, Debug, PartialEq)]

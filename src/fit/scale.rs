@@ -1,4 +1,5 @@
 //! Length scales of a scene, from its cameras and points.
+use crate::math::median;
 use crate::scene::{Camera, PointCloud};
 use glam::DVec3;
 
@@ -26,8 +27,7 @@ impl SceneScale {
                 }
             }
         }
-        depths.sort_by(f64::total_cmp);
-        let median_depth = depths.get(depths.len() / 2).copied().unwrap_or(1.0);
+        let median_depth = median(&mut depths).unwrap_or(1.0);
         let centres: Vec<DVec3> = cameras.iter().map(|c| c.pose.centre()).collect();
         let mean = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
         let radius = 1.1 * centres.iter().map(|c| c.distance(mean)).fold(0.0, f64::max);

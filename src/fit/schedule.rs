@@ -1,4 +1,5 @@
 //! Learning-rate schedules and the order in which views are seen.
+use crate::math::Random;
 use serde::{Deserialize, Serialize};
 
 /// Log-linear interpolation from `start` to `end` over `steps`, constant afterwards (docs/method.md#schedules).
@@ -24,44 +25,6 @@ impl Exponential {
         }
         let x = (step as f64 / self.steps.max(1) as f64).min(1.0);
         ((1.0 - x) * self.start.ln() + x * self.end.max(f64::MIN_POSITIVE).ln()).exp()
-    }
-}
-
-/// SplitMix64 (Steele et al. 2014): tiny, seedable, the same on every platform.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Random(u64);
-
-impl Random {
-    /// A generator for a seed.
-    pub fn new(seed: u64) -> Self {
-        Random(seed)
-    }
-    /// 64 random bits.
-    pub fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-    /// Uniform in [0, 1).
-    pub fn uniform(&mut self) -> f64 {
-        (self.bits() >> 11) as f64 / (1u64 << 53) as f64
-    }
-    /// Uniform in 0..n (n > 0).
-    pub fn below(&mut self, n: usize) -> usize {
-        ((self.uniform() * n as f64) as usize).min(n.saturating_sub(1))
-    }
-    /// Standard normal (Box–Muller).
-    pub fn normal(&mut self) -> f64 {
-        let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
-        radius * (std::f64::consts::TAU * self.uniform()).cos()
-    }
-    /// Fisher–Yates.
-    pub fn shuffle<T>(&mut self, items: &mut [T]) {
-        for i in (1..items.len()).rev() {
-            items.swap(i, self.below(i + 1));
-        }
     }
 }
 
@@ -110,14 +73,5 @@ mod tests {
             round.sort_unstable();
             assert_eq!(round, [0, 1, 2, 3]);
         }
-    }
-
-    #[test]
-    fn normal_numbers_have_unit_variance() {
-        let mut random = Random::new(1);
-        let samples: Vec<f64> = (0..20000).map(|_| random.normal()).collect();
-        let mean = samples.iter().sum::<f64>() / 20000.0;
-        let variance = samples.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 20000.0;
-        assert!(mean.abs() < 0.03 && (variance - 1.0).abs() < 0.04, "4 standard errors at 20000 samples");
     }
 }

@@ -67,7 +67,7 @@ impl Entry {
         // The rows of camera → world are the columns of world → camera.
         let rotation = DMat3::from_cols_array_2d(&self.rotation);
         let pose = Pose { rotation, translation: -(rotation * DVec3::from_array(self.position)) };
-        checked(Camera {
+        Camera {
             name: self.img_name,
             width: self.width,
             height: self.height,
@@ -76,30 +76,9 @@ impl Entry {
             cx: self.cx.unwrap_or(self.width as f64 / 2.0),
             cy: self.cy.unwrap_or(self.height as f64 / 2.0),
             pose,
-        })
+        }
+        .checked()
     }
-}
-
-/// Refuses what no pinhole camera can be.
-pub(crate) fn checked(c: Camera) -> Result<Camera, String> {
-    let finite =
-        [c.fx, c.fy, c.cx, c.cy].iter().chain(&c.pose.rotation.to_cols_array()).all(|v| v.is_finite())
-            && c.pose.translation.is_finite();
-    let r = c.pose.rotation;
-    let off =
-        (r * r.transpose() - DMat3::IDENTITY).to_cols_array().iter().fold(0.0f64, |m, v| m.max(v.abs()));
-    if !finite || c.fx <= 0.0 || c.fy <= 0.0 || c.width == 0 || c.height == 0 {
-        return Err(format!(
-            "camera {:?}: sizes and focal lengths must be positive, all numbers finite",
-            c.name
-        ));
-    }
-    // Files with 6 printed digits reach 1e-5; a scaled or sheared matrix is far above.
-    if off > 1e-3 || r.determinant() < 0.0 {
-        return Err(format!("camera {:?}: its matrix is not a rotation (off by {off:.1e})", c.name));
-    }
-    let pose = if off > 1e-12 { c.pose.orthonormalised() } else { c.pose };
-    Ok(Camera { pose, ..c })
 }
 
 /// Writes `cameras.json`.
@@ -118,18 +97,4 @@ pub fn write_json(path: &Path, cameras: &[Camera]) -> Result<()> {
     };
     let entries: Vec<Entry> = cameras.iter().enumerate().map(entry).collect();
     super::write_json(path, &entries)
-}
-
-/// File name of a camera without folder and extension: what joins it to photos, masks and renders.
-pub fn stem(name: &str) -> String {
-    // Only known image extensions are cut: labels such as "view.2" are names of their own.
-    let base = name.rsplit(['/', '\\']).next().unwrap_or(name);
-    match base.rsplit_once('.') {
-        Some((stem, ext))
-            if !stem.is_empty() && ext.len() <= 4 && ext.chars().any(|c| c.is_ascii_alphabetic()) =>
-        {
-            stem.to_string()
-        }
-        _ => base.to_string(),
-    }
 }

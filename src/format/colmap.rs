@@ -75,16 +75,8 @@ pub fn read(folder: &Path) -> Result<Vec<Camera>> {
             let rotation = DMat3::from_quat(DQuat::from_xyzw(s.q[1], s.q[2], s.q[3], s.q[0]).normalize());
             let pose = Pose { rotation, translation: DVec3::from_array(s.t) };
             let (width, height) = k.size;
-            super::cameras::checked(Camera {
-                name: s.name,
-                width,
-                height,
-                fx: k.f[0],
-                fy: k.f[1],
-                cx: k.c[0],
-                cy: k.c[1],
-                pose,
-            })
+            Camera { name: s.name, width, height, fx: k.f[0], fy: k.f[1], cx: k.c[0], cy: k.c[1], pose }
+                .checked()
         })
         .collect();
     let out = out.map_err(named(&images))?;

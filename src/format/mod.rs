@@ -8,6 +8,7 @@ pub mod npy;
 pub mod picture;
 pub mod ply;
 pub mod ply_packed;
+mod ply_table;
 pub mod scene_dir;
 pub mod side_file;
 pub mod splat;

@@ -1,7 +1,6 @@
 //! Gaussians in other axes.
 use crate::pass::sh;
-use crate::pose::align::Similarity;
-use crate::scene::Splats;
+use crate::scene::{Similarity, Splats};
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use nalgebra::DMatrix;
 

@@ -1,6 +1,6 @@
 //! Compressed PLY as SuperSplat writes it: chunks of 256 Gaussians with their bounds, each Gaussian in four 32-bit words,
 //! SH in bytes. About a quarter of the size of a plain PLY without SH.
-use super::ply::{self, Kind};
+use super::ply_table::{self as table, Kind};
 use crate::scene::{Splats, sh_coefficients};
 use crate::{Error, Result};
 use std::path::Path;
@@ -43,8 +43,8 @@ pub(super) fn is_packed(columns: &[(String, Kind)]) -> bool {
 
 /// Reads the bytes of a file.
 pub(super) fn parse(bytes: &[u8]) -> Result<Splats, String> {
-    let chunks = ply::rows(bytes, "chunk")?;
-    let vertices = ply::rows(bytes, "vertex")?;
+    let chunks = table::rows(bytes, "chunk")?;
+    let vertices = table::rows(bytes, "vertex")?;
     let words = vertices.all(WORDS)?;
     // Before version 2 of SuperSplat, chunks had no bounds of the colour: it spans 0 to 1.
     let bounds: Vec<Option<usize>> = BOUNDS.iter().map(|n| chunks.find(n)).collect();
@@ -54,7 +54,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Splats, String> {
     if chunks.len() != vertices.len().div_ceil(CHUNK) {
         return Err(format!("{} chunks for {} Gaussians", chunks.len(), vertices.len()));
     }
-    let sh = if ply::has(bytes, "sh") { Some(ply::rows(bytes, "sh")?) } else { None };
+    let sh = if table::has(bytes, "sh") { Some(table::rows(bytes, "sh")?) } else { None };
     let columns = sh.as_ref().map(|s| s.series("f_rest_")).unwrap_or_default();
     if sh.as_ref().is_some_and(|s| s.len() != vertices.len()) {
         return Err("the sh element has another number of rows".into());

@@ -1,10 +1,12 @@
 //! Language beside a file of Gaussians: `NAME.language.npz`, for formats that have no place for it. Described in
 //! docs/formats.md.
 use super::npy::{self, NpyArray};
-use super::scene_dir::VERSION;
 use crate::scene::{Codebook, LEVEL_NAMES, LanguageField, LevelField};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
+
+/// Version of the layout; readers refuse newer ones.
+const VERSION: u32 = 1;
 
 /// Where the language of a file is.
 pub fn path(splats: &Path) -> PathBuf {

@@ -74,7 +74,7 @@ fn camera(shared: &Intrinsics, frame: &Frame, index: usize, folder: &Path) -> Re
     })?;
     let fx = pick(|i| i.fl_x).or_else(|| pick(|i| i.camera_angle_x).map(|a| 0.5 * w / (0.5 * a).tan()));
     let fx = fx.ok_or_else(|| format!("frame {name:?}: no focal length (fl_x or camera_angle_x)"))?;
-    super::cameras::checked(Camera {
+    Camera {
         width: w as u32,
         height: h as u32,
         fx,
@@ -84,7 +84,8 @@ fn camera(shared: &Intrinsics, frame: &Frame, index: usize, folder: &Path) -> Re
         pose: pose(&frame.transform_matrix)
             .ok_or_else(|| format!("frame {name:?}: transform_matrix must be 4 × 4"))?,
         name,
-    })
+    }
+    .checked()
 }
 
 fn size_of_image(folder: &Path, name: &str) -> Option<(f64, f64)> {

@@ -7,7 +7,6 @@ use std::time::SystemTime;
 
 use sha2::{Digest, Sha256};
 
-use super::graph::GraphFile;
 use super::registry::home;
 use crate::Result;
 use crate::files::{self, content_hash, sha256};
@@ -43,14 +42,6 @@ impl Key {
         self.digest.update((values.len() as u64).to_le_bytes());
         self.digest.update(bytemuck::cast_slice::<T, u8>(values));
         self
-    }
-
-    /// Depends on the content of a model's files and on how they are spoken to.
-    pub fn model(mut self, graph: &GraphFile) -> Result<Key> {
-        for file in std::iter::once(&graph.path).chain(&graph.external) {
-            self = self.text(&fingerprint(file).map_err(crate::Error::io(file))?);
-        }
-        Ok(self.text(&format!("{:?}", graph.binding)))
     }
 
     /// 16 hexadecimal digits.

@@ -9,9 +9,9 @@ use super::runtime::Input;
 use super::sam::{BATCH, MASKS, Sam};
 use super::{RegionEncoder, pairs, warp};
 use crate::format::npy::{self, NpyData};
-use crate::photo::{Affine, Frame, Photo};
+use crate::photo::{Frame, Photo};
 use crate::progress::{Silent, peak_memory, reset_peak_memory};
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Affine, Plane, RgbImage};
 use crate::{Error, Result};
 
 /// Largest difference to the reference, relative to its largest value: what float32 sums in another order may cost.
@@ -101,7 +101,7 @@ fn repeat(file: &GraphFile, reference: &Path) -> Result<f32> {
         // Layouts that differ from the contract's are for the toy graphs of the tests; exports use the contract's own, up to
         // the channel axis of warps.
         let given = outputs.take(role)?;
-        let raw = super::contract::relayout(
+        let raw = super::graph::relayout(
             given,
             file.binding.part.contract().slot(role).map_or("", |s| s.shape),
             bound.layout.unwrap_or_default(),

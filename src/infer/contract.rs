@@ -3,7 +3,6 @@
 //!
 //! A shape is a row of axis names: "B H W 3" has a free batch, height and width, and three channels. An axis that occurs
 //! twice in one contract has one length.
-use super::runtime::Tensor;
 use serde::{Deserialize, Serialize};
 
 /// What a graph does.
@@ -245,13 +244,7 @@ pub fn unify<'s>(shape: &'s str, dims: &[Option<usize>], known: &mut Vec<(&'s st
 }
 
 /// Reorders axes: those that `to` lacks must have length 1 and go, those that `from` lacks come with length 1. `None`
-/// when the tensor does not have the shape `from`.
-pub fn relayout(tensor: Tensor, from: &str, to: &str) -> Option<Tensor> {
-    let (shape, data) = reorder(tensor.shape, tensor.data, from, to)?;
-    Some(Tensor { shape, data })
-}
-
-/// [`relayout`] of any values.
+/// when the values do not have the shape `from`.
 pub fn reorder<T: Copy>(
     shape: Vec<usize>,
     data: Vec<T>,
@@ -290,6 +283,8 @@ fn gather<T: Copy>(data: &[T], axes: &[(usize, usize)], at: usize, out: &mut Vec
 
 #[cfg(test)]
 mod tests {
+    use super::super::graph::relayout;
+    use super::super::runtime::Tensor;
     use super::*;
 
     #[test]

@@ -3,8 +3,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::adapter::{Adapter, Binding};
-use super::cache::fingerprint;
-use super::contract::{Slot, relayout, unify};
+use super::cache::{Key, fingerprint};
+use super::contract::{Slot, reorder, unify};
 use super::onnx::{self, Dim, Header};
 use super::provider::Compute;
 use super::runtime::{Input, Session, Tensor};
@@ -215,4 +215,20 @@ impl Graph {
             ))
         })
     }
+}
+
+impl Key {
+    /// Depends on the content of a model's files and on how they are spoken to.
+    pub fn model(mut self, graph: &GraphFile) -> Result<Key> {
+        for file in std::iter::once(&graph.path).chain(&graph.external) {
+            self = self.text(&fingerprint(file).map_err(crate::Error::io(file))?);
+        }
+        Ok(self.text(&format!("{:?}", graph.binding)))
+    }
+}
+
+/// [`reorder`] of a tensor.
+pub fn relayout(tensor: Tensor, from: &str, to: &str) -> Option<Tensor> {
+    let (shape, data) = reorder(tensor.shape, tensor.data, from, to)?;
+    Some(Tensor { shape, data })
 }

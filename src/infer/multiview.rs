@@ -7,9 +7,8 @@ use super::graph::{GraphFile, Outputs};
 use super::prepare::Prepared;
 use super::runtime::Input;
 use crate::photo::Photo;
-use crate::pose::pointmap::{ModelView, PairPointmaps, Pointmap};
 use crate::progress::Progress;
-use crate::scene::{Camera, Pose};
+use crate::scene::{Camera, ModelView, PairPointmaps, Pointmap, Pose};
 use crate::{Error, Result};
 
 pub(super) fn pointmaps(
@@ -26,7 +25,7 @@ pub(super) fn pointmaps(
     }
     progress.begin("pointmaps", 1);
     let prepared = same_size(graph, photos)?;
-    let views = super::pairs::views(photos, &prepared, progress);
+    let views = super::prepare::views(photos, &prepared, progress);
     let (width, height) = prepared.first().map_or((0, 0), |p| (p.width, p.height));
     let mut key = Key::new("views").model(graph)?.values(&[width as u64, height as u64]);
     for p in &prepared {
@@ -83,7 +82,7 @@ pub(super) fn pointmaps(
 
 /// All photos at the first one's input size, since they share a tensor.
 fn same_size(graph: &GraphFile, photos: &[Photo]) -> Result<Vec<Prepared>> {
-    let mut prepared = super::pairs::inputs(graph, "images", photos)?;
+    let mut prepared = super::prepare::inputs(graph, "images", photos)?;
     let Some((width, height)) = prepared.first().map(|p| (p.width, p.height)) else { return Ok(prepared) };
     for (ready, photo) in prepared.iter_mut().zip(photos) {
         if (ready.width, ready.height) != (width, height) {

@@ -4,12 +4,12 @@ use super::cache::Key;
 use super::contract::Part;
 use super::graph::{Graph, GraphFile, Outputs};
 use super::installed::Installed;
-use super::prepare::{Prepared, prepare};
+use super::prepare::{Prepared, inputs, views};
 use super::runtime::{Input, Tensor};
+use crate::math::median;
 use crate::photo::Photo;
-use crate::pose::numeric::median;
-use crate::pose::pointmap::{Descriptors, ModelView, PairPointmaps, Pointmap};
 use crate::progress::Progress;
+use crate::scene::{Descriptors, ModelView, PairPointmaps, Pointmap};
 use crate::{Error, Result};
 
 /// What a network says about all pairs of photos, for [`crate::pose::pointmap::reconstruct`].
@@ -68,50 +68,6 @@ pub(super) fn decoded(
     }
     drop(network);
     Ok((prepared, pairs))
-}
-
-/// Every photo as the graph sees it.
-pub(super) fn inputs(graph: &GraphFile, role: &str, photos: &[Photo]) -> Result<Vec<Prepared>> {
-    let spec =
-        graph.binding.image.as_ref().ok_or_else(|| {
-            Error::work(format!("{}: its adapter has no image range", graph.path.display()))
-        })?;
-    Ok(photos.iter().map(|p| prepare(&p.image, graph, spec, role)).collect())
-}
-
-/// The views of [`crate::pose::pointmap`]; warns of what a crop cost.
-pub(super) fn views(photos: &[Photo], prepared: &[Prepared], progress: &dyn Progress) -> Vec<ModelView> {
-    let mut groups: Vec<(Option<&str>, (u32, u32))> = Vec::new();
-    let mut lost = 0.0f64;
-    let mut views = Vec::with_capacity(photos.len());
-    for (photo, ready) in photos.iter().zip(prepared) {
-        let group = (photo.camera_model.as_deref(), photo.original_size);
-        let camera_group = groups.iter().position(|g| *g == group).unwrap_or_else(|| {
-            groups.push(group);
-            groups.len() - 1
-        });
-        let scale = ready.from_photo.scale;
-        let kept = (ready.width as f64 / scale[0] / photo.image.width as f64)
-            * (ready.height as f64 / scale[1] / photo.image.height as f64);
-        lost = lost.max(1.0 - kept);
-        views.push(ModelView {
-            name: photo.stem.clone(),
-            image: photo.image.clone(),
-            width: ready.width,
-            height: ready.height,
-            from_working: ready.from_photo,
-            exif_focal: photo.exif_focal.map(|f| f * scale[1]),
-            camera_group,
-        });
-    }
-    // A few rows go with the rounding to whole patches.
-    if lost > 0.1 {
-        progress.warn(&format!(
-            "the geometry network's input cuts {:.0} % off a photo; an export for another aspect would use all of it",
-            100.0 * lost
-        ));
-    }
-    views
 }
 
 /// One decoding: first and second view, both in the first camera.

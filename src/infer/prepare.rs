@@ -2,8 +2,10 @@
 use super::adapter::{Filter, Fit, ImageSpec};
 use super::graph::GraphFile;
 use super::runtime::Input;
-use crate::photo::{Affine, Kernel};
-use crate::scene::RgbImage;
+use crate::photo::{Kernel, Photo};
+use crate::progress::Progress;
+use crate::scene::{Affine, ModelView, RgbImage};
+use crate::{Error, Result};
 
 /// A photo as a network sees it.
 #[derive(Clone, Debug)]
@@ -83,4 +85,48 @@ pub fn prepare(image: &RgbImage, graph: &GraphFile, spec: &ImageSpec, role: &str
     let resize = Affine::resize((image.width as u32, image.height as u32), (inner.0 as u32, inner.1 as u32));
     let from_photo = resize.then(&Affine::crop(x0 as f64, y0 as f64));
     Prepared { width: outer.0, height: outer.1, filled, data, from_photo }
+}
+
+/// Every photo as the graph sees it.
+pub(super) fn inputs(graph: &GraphFile, role: &str, photos: &[Photo]) -> Result<Vec<Prepared>> {
+    let spec =
+        graph.binding.image.as_ref().ok_or_else(|| {
+            Error::work(format!("{}: its adapter has no image range", graph.path.display()))
+        })?;
+    Ok(photos.iter().map(|p| prepare(&p.image, graph, spec, role)).collect())
+}
+
+/// The views of [`crate::pose::pointmap`]; warns of what a crop cost.
+pub(super) fn views(photos: &[Photo], prepared: &[Prepared], progress: &dyn Progress) -> Vec<ModelView> {
+    let mut groups: Vec<(Option<&str>, (u32, u32))> = Vec::new();
+    let mut lost = 0.0f64;
+    let mut views = Vec::with_capacity(photos.len());
+    for (photo, ready) in photos.iter().zip(prepared) {
+        let group = (photo.camera_model.as_deref(), photo.original_size);
+        let camera_group = groups.iter().position(|g| *g == group).unwrap_or_else(|| {
+            groups.push(group);
+            groups.len() - 1
+        });
+        let scale = ready.from_photo.scale;
+        let kept = (ready.width as f64 / scale[0] / photo.image.width as f64)
+            * (ready.height as f64 / scale[1] / photo.image.height as f64);
+        lost = lost.max(1.0 - kept);
+        views.push(ModelView {
+            name: photo.stem.clone(),
+            image: photo.image.clone(),
+            width: ready.width,
+            height: ready.height,
+            from_working: ready.from_photo,
+            exif_focal: photo.exif_focal.map(|f| f * scale[1]),
+            camera_group,
+        });
+    }
+    // A few rows go with the rounding to whole patches.
+    if lost > 0.1 {
+        progress.warn(&format!(
+            "the geometry network's input cuts {:.0} % off a photo; an export for another aspect would use all of it",
+            100.0 * lost
+        ));
+    }
+    views
 }

@@ -8,9 +8,9 @@ use super::installed::{Duty, inventory, known};
 use super::testing::{Attribute, FLOAT, INT64, Onnx};
 use super::{Input, RegionEncoder, Registry, pairs, warp};
 use crate::files::sha256;
-use crate::photo::{Affine, Frame, Photo};
+use crate::photo::{Frame, Photo};
 use crate::progress::Silent;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Affine, Plane, RgbImage};
 
 /// Mean colour of the image, as embedding.
 fn image_tower() -> Onnx {

@@ -8,11 +8,9 @@ use super::graph::Graph;
 use super::installed::Installed;
 use super::prepare::Prepared;
 use super::runtime::Tensor;
-use crate::language::DenseWarp;
 use crate::photo::Photo;
-use crate::pose::pointmap::{Descriptors, best_descriptors};
 use crate::progress::Progress;
-use crate::scene::Plane;
+use crate::scene::{DenseWarp, Descriptors, Plane};
 use crate::{Error, Result};
 
 /// Both directions for every unordered pair (i, j), i < j, in order.
@@ -23,7 +21,7 @@ pub fn warps(
 ) -> Result<Vec<(DenseWarp, DenseWarp)>> {
     let Ok(file) = model.graph(Part::Warp) else { return by_descriptors(model, photos, progress) };
     let _turn = file.compute.turn();
-    let prepared = super::pairs::inputs(file, "image1", photos)?;
+    let prepared = super::prepare::inputs(file, "image1", photos)?;
     let both = file.has("warp21") && file.has("certainty21");
     let mut graph: Option<Graph> = None;
     let mut forward = |i: usize, j: usize| -> Result<Vec<Field>> {
@@ -149,7 +147,7 @@ impl Field {
         // The middle of a cell lies half a pixel before that of its seed, and so does what it sees.
         let share = |at: usize, of: usize| 2.0 * at as f32 / of as f32 - 1.0;
         let end = |q: usize| [share(q % to.1.width, to.1.width), share(q / to.1.width, to.1.height), 1.0];
-        let found = best_descriptors(from.0, &seeds, to.0);
+        let found = from.0.nearest(&seeds, to.0);
         Field { width, height, data: found.into_iter().map(end).collect() }
     }
 

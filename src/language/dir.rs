@@ -4,8 +4,8 @@
 //! `<stem>_f.npy` (N×D) or −1. `text_embeddings.npz` maps phrases to D-vectors of the same space.
 use super::{LevelMasks, ViewMasks};
 use crate::format::npy::{self, NpyData};
-use crate::photo::{Affine, Photo};
-use crate::scene::Plane;
+use crate::photo::Photo;
+use crate::scene::{Affine, Plane};
 use crate::{Error, Result};
 use glam::DVec2;
 use std::collections::BTreeMap;
@@ -235,8 +235,7 @@ fn key(phrase: &str) -> String {
 mod tests {
     use super::*;
     use crate::format::npy::NpyArray;
-    use crate::photo::Affine;
-    use crate::scene::RgbImage;
+    use crate::scene::{Affine, RgbImage};
 
     fn photo(width: usize, height: usize, original: (u32, u32)) -> Photo {
         Photo {

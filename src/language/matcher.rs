@@ -4,9 +4,8 @@
 //! XFeat's descriptors on an 8×8 grid are matched mutually along epipolar lines (the poses are known by then), kept
 //! where neighbours agree, and spread over their cells by a local affine fit. Both directions come from one set of
 //! matches, so they are each other's inverse.
-use super::DenseWarp;
 use crate::infer::xfeat::DenseFeatures;
-use crate::scene::{Camera, DepthMap, Plane};
+use crate::scene::{Camera, DenseWarp, DepthMap, Plane};
 use glam::{DMat2, DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 

@@ -2,42 +2,15 @@
 //!
 //! [`dir`] or [`graph`] give masks, a [`crate::infer::RegionEncoder`] or `dir` their features, [`matcher`] the dense
 //! matches between views; [`build()`] aligns everything and turns it into codebooks and training targets.
-use crate::scene::Plane;
-use serde::{Deserialize, Serialize};
 
 pub mod align;
 mod build;
 pub mod codebook;
 pub mod dir;
 pub mod graph;
+mod masks;
 pub mod matcher;
 pub mod sam;
 
 pub use build::{BuildOptions, Language, Reducer, attach_features, build};
-
-/// The label map of one level of one view.
-#[derive(Clone, Debug, Default, Serialize, Deserialize)]
-pub struct LevelMasks {
-    /// [H, W] mask index, −1 = hole.
-    pub labels: Plane<i32>,
-    /// [M] quality weight of each mask (predicted IoU · stability; 1 when unknown).
-    pub quality: Vec<f32>,
-    /// [M, D] unit feature per mask, row-major; empty until region features ran.
-    pub features: Vec<f32>,
-}
-
-/// The masks of one view, index as in [`crate::scene::LEVEL_NAMES`].
-#[derive(Clone, Debug, Default, Serialize, Deserialize)]
-pub struct ViewMasks {
-    /// Three levels.
-    pub levels: Vec<LevelMasks>,
-}
-
-/// A dense match field from view i to view j at the working resolution of view i.
-#[derive(Clone, Debug, Default)]
-pub struct DenseWarp {
-    /// [H, W] pixel position in view j.
-    pub target: Plane<[f32; 2]>,
-    /// [H, W] probability in [0, 1]; 0 where there is no match.
-    pub certainty: Plane<f32>,
-}
+pub use masks::{LevelMasks, ViewMasks};

@@ -130,7 +130,7 @@ pub fn adam(parameters: &mut [f64], gradients: &[f64], moments: &mut [[f64; 2]],
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fit::schedule::Random;
+    use crate::math::Random;
 
     #[test]
     fn gpu_equals_the_twin_over_many_steps_and_rates() {

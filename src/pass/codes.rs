@@ -85,7 +85,7 @@ pub fn code_l1(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fit::schedule::Random;
+    use crate::math::Random;
 
     #[test]
     fn gpu_equals_the_twin_and_unlabelled_pixels_have_no_influence() {

@@ -50,7 +50,7 @@ pub fn gather_rows<T: Copy + Default>(from: &[T], index: &[u32], stride: usize) 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fit::schedule::Random;
+    use crate::math::Random;
 
     #[test]
     fn gpu_equals_the_twin() {

@@ -78,7 +78,7 @@ pub fn ratio_penalty(log_scales: [f64; 3], weight: f64, limit: f64) -> (f64, [f6
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fit::schedule::Random;
+    use crate::math::Random;
 
     #[test]
     fn ratio_gradient_matches_differences_and_the_gpu() {

@@ -2,22 +2,18 @@
 use crate::scene::{Camera, Pose, Splats, sh_coefficients};
 use glam::{DVec2, DVec3};
 
-/// SplitMix64 (Steele et al. 2014): small, seedable, good enough for test scenes.
+/// [`crate::math::Random`] with the draws that test scenes are made of.
 #[derive(Clone, Debug)]
-pub struct Random(u64);
+pub struct Random(crate::math::Random);
 
 impl Random {
     /// Equal seeds give equal sequences on every machine.
     pub fn new(seed: u64) -> Random {
-        Random(seed)
+        Random(crate::math::Random::new(seed))
     }
     /// 64 random bits.
     pub fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
+        self.0.bits()
     }
     /// Uniform in [low, high).
     pub fn uniform(&mut self, low: f64, high: f64) -> f64 {

@@ -1,9 +1,11 @@
 //! What may become a photo of a run: a file, or a frame of a video.
+use super::choose::{Found, find};
+use super::read::{self, Photo, from_bytes, load_at};
 use super::video::Video;
-use super::{Found, Photo, choose, decode, find, from_bytes, load_at, resize};
-use crate::Result;
+use super::{decode, resize};
 use crate::progress::Progress;
 use crate::scene::RgbImage;
+use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -45,14 +47,14 @@ impl Candidate {
     /// Only one decoded file is held while it is made.
     pub fn thumbnail(&self, side: usize, progress: &dyn Progress) -> Result<Option<RgbImage>> {
         let bytes = match &self.source {
-            Source::File => super::read(&self.path)?,
+            Source::File => read::read(&self.path)?,
             Source::Frame(video, at) => match video.frame(*at, Some(side), progress)? {
                 bytes if bytes.is_empty() => return Ok(None),
                 bytes => bytes,
             },
         };
         let decoded = decode::decode(bytes, &self.path)?;
-        super::check_size(&self.path, decoded.size)?;
+        read::check_size(&self.path, decoded.size)?;
         let (w, h) = decoded.size;
         let scale = (side as f64 / w.max(h) as f64).min(1.0);
         let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
@@ -78,6 +80,17 @@ pub fn gather(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Candida
         let frame = |at| Candidate { path: video.frame_name(at), source: Source::Frame(video.clone(), at) };
         all.extend(video.times().into_iter().map(frame));
     }
-    choose::check_count(&all)?;
+    check_count(&all)?;
     Ok(all)
+}
+
+/// Refuses a single photo.
+fn check_count(candidates: &[Candidate]) -> Result<()> {
+    match candidates {
+        [one] => Err(Error::input(format!(
+            "{}: only one photo; at least 2 are needed, 3 or 4 work best",
+            one.path.display()
+        ))),
+        _ => Ok(()),
+    }
 }

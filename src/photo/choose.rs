@@ -1,5 +1,4 @@
 //! Which files are the photos, and how many of them the run uses.
-use super::Candidate;
 use super::kind::{READ, is_foreign_name, is_photo_name, is_video_name};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -55,17 +54,6 @@ pub fn find(inputs: &[PathBuf]) -> Result<Found> {
             other.display()
         ))),
         _ => Ok(found),
-    }
-}
-
-/// Refuses a single photo.
-pub(super) fn check_count(candidates: &[Candidate]) -> Result<()> {
-    match candidates {
-        [one] => Err(Error::input(format!(
-            "{}: only one photo; at least 2 are needed, 3 or 4 work best",
-            one.path.display()
-        ))),
-        _ => Ok(()),
     }
 }
 

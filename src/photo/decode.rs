@@ -1,17 +1,13 @@
 //! Bytes of an image file to upright pixels.
 use super::exif_tags::{Lens, lens};
 use super::heif;
-use super::kind::{Kind, READ, kind};
+use super::kind::{Kind, LARGEST_DECODED, READ, TOO_LARGE, kind};
 use crate::scene::to_srgb;
 use crate::{Error, Result};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits};
 use std::io::Cursor;
 use std::path::Path;
-
-/// Most memory a decoded file may take: four times the largest photo that phones write (200 megapixels, 8 bit).
-pub(super) const LARGEST_DECODED: u64 = 2 << 30;
-pub(super) const TOO_LARGE: &str = "the image needs more than 2 GiB of memory; make it smaller";
 
 /// A decoded file: stored pixels, read through [`Decoded::at`] as the upright image.
 pub(super) struct Decoded {

@@ -1,6 +1,6 @@
 //! HEIC, HEIF and AVIF through libheif's C interface, loaded at run time: its HEVC decoders are under the LGPL and
 //! patents, so splatvk runs without it and never links it. The signatures are those of libheif 1.12 (2021), unchanged since.
-use super::decode::LARGEST_DECODED;
+use super::kind::{LARGEST_DECODED, TOO_LARGE};
 use image::{DynamicImage, ImageBuffer};
 use libloading::Library;
 use std::ffi::{CStr, c_char, c_int, c_void};
@@ -240,7 +240,7 @@ impl Shape {
         let bytes = w.max(0) as u64 * h.max(0) as u64 * (3 + u64::from(alpha)) * (1 + u64::from(shape.deep));
         match bytes {
             0 => Err(Failure::Input("the image is damaged (no pixels); copy the photo again".to_owned())),
-            b if b > LARGEST_DECODED => Err(Failure::Input(super::decode::TOO_LARGE.to_owned())),
+            b if b > LARGEST_DECODED => Err(Failure::Input(TOO_LARGE.to_owned())),
             _ => Ok(shape),
         }
     }

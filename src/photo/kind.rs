@@ -14,6 +14,10 @@ const OTHER_IMAGE: [&str; 8] = ["bmp", "gif", "jxl", "jp2", "psd", "tga", "svg",
 /// The kinds that are read, for messages.
 pub(super) const READ: &str = "JPEG, PNG, HEIC, AVIF, WebP or TIFF";
 
+/// Most memory a decoded file may take: four times the largest photo that phones write (200 megapixels, 8 bit).
+pub(super) const LARGEST_DECODED: u64 = 2 << 30;
+pub(super) const TOO_LARGE: &str = "the image needs more than 2 GiB of memory; make it smaller";
+
 const RAW_ADVICE: &str = "is a camera raw file; develop it to JPEG or 16-bit TIFF";
 const GIF: &str = "is a GIF; save its frames as PNG";
 const BMP: &str = "is a BMP image; save it as PNG";
@@ -23,6 +27,18 @@ const PSD: &str = "is a Photoshop file; save it as JPEG or TIFF";
 
 fn has_extension(path: &Path, list: &[&str]) -> bool {
     path.extension().is_some_and(|e| list.iter().any(|l| e.eq_ignore_ascii_case(l)))
+}
+
+/// What joins a photo to its camera, masks and renders: its file name without folder and extension. Only the extensions of
+/// pictures are cut, so that the stem of a stem is itself, and "view.2" a name of its own.
+pub fn stem(file: &str) -> &str {
+    let name = file.rsplit(['/', '\\']).next().unwrap_or(file);
+    let picture =
+        |e: &str| [&PHOTO[..], &RAW, &OTHER_IMAGE].concat().iter().any(|l| e.eq_ignore_ascii_case(l));
+    match name.rsplit_once('.') {
+        Some((stem, extension)) if !stem.is_empty() && picture(extension) => stem,
+        _ => name,
+    }
 }
 
 pub(super) fn is_photo_name(path: &Path) -> bool {
@@ -152,6 +168,24 @@ mod tests {
         ];
         for (bytes, name, expected) in cases {
             assert_eq!(kind(bytes, Path::new(name)), expected, "{name}");
+        }
+    }
+
+    #[test]
+    fn stems_join_cameras_to_photos() {
+        let cases = [
+            ("images/a b.jpg", "a b"),
+            ("left\\IMG_1.HEIC", "IMG_1"),
+            ("sparse/cam0/a.b.jpg", "a.b"),
+            ("a.b", "a.b"),
+            ("a.tar.png", "a.tar"),
+            ("raw.CR2", "raw"),
+            ("view.2", "view.2"),
+            ("x", "x"),
+            (".png", ".png"),
+        ];
+        for (name, expected) in cases {
+            assert_eq!((stem(name), stem(stem(name))), (expected, expected));
         }
     }
 

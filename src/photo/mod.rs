@@ -1,5 +1,4 @@
 //! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (docs/method.md#photos).
-mod affine;
 mod candidate;
 mod choose;
 mod decode;
@@ -8,29 +7,31 @@ mod frame;
 mod heif;
 mod kind;
 pub mod light;
+mod read;
 mod resize;
 mod sizes;
 mod straighten;
 mod video;
 
-pub use affine::Affine;
 pub use candidate::{Candidate, gather};
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, find, spread, wanted};
 pub use frame::Frame;
+pub use kind::stem;
 pub use light::Light;
+pub use read::{
+    MAX_SIZE, MAX_SIZE_CPU, Photo, SMALLEST_SIDE, default_max_size, from_bytes, from_pixels, load, load_at,
+    working_size,
+};
 pub use resize::Kernel;
 pub use sizes::sizes_of;
 pub use straighten::Straightening;
 
 use crate::progress::Progress;
-use crate::scene::{Camera, Lens, Plane, RgbImage};
+use crate::scene::RgbImage;
 use crate::{Error, Result};
-use glam::DVec2;
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// What the machine has for HEIC and AVIF photos, in words, and what to do about what it lacks.
@@ -41,205 +42,6 @@ pub fn heif_support() -> (String, Option<String>) {
 /// What the machine has for videos, in words, and what to do about what it lacks.
 pub fn video_support() -> (String, Option<String>) {
     video::status()
-}
-
-/// Greatest side of a working image on a GPU, pixels: where the reference implementation of Gaussian splatting stops (Kerbl
-/// et al. 2023 scale wider photos down to it). A portrait keeps as many pixels as the same photo lying on its side.
-pub const MAX_SIZE: usize = 1600;
-
-/// Greatest side of a working image on a CPU device, pixels: photos of 4:3 then have 1.56 times the pixels of 640 × 480,
-/// which keeps a run within twice its time (docs/performance.md).
-pub const MAX_SIZE_CPU: usize = 800;
-
-/// The greatest side that suits the device.
-pub fn default_max_size(is_cpu: bool) -> usize {
-    if is_cpu { MAX_SIZE_CPU } else { MAX_SIZE }
-}
-
-/// Smallest side of a usable photo, pixels: feature networks work at 1/8 resolution, below 8 × 8 cells nothing is left
-/// to match.
-pub const SMALLEST_SIDE: usize = 64;
-
-/// One decoded photo at working resolution, upright.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Photo {
-    /// Where it was read from.
-    pub path: PathBuf,
-    /// File name without extension: the key that joins masks, cameras and renders.
-    pub stem: String,
-    /// Upright pixels at working resolution; on a plain frame, the nearest pixels of the picture.
-    pub image: RgbImage,
-    /// The white or black frame that was around the picture, working pixels.
-    pub frame: Frame,
-    /// Upright size of the file, pixels.
-    pub original_size: (u32, u32),
-    /// Original (upright) pixels → working pixels.
-    pub to_working: Affine,
-    /// Focal length from EXIF in working pixels, if the file tells.
-    pub exif_focal: Option<f64>,
-    /// Luma of the photo at more pixels than the working image has, for measuring positions; where there are more.
-    #[serde(skip)]
-    pub fine: Option<Arc<Plane<f32>>>,
-    /// The lens that was taken out of the image.
-    pub straightened: Option<Straightening>,
-    /// Camera make and model from EXIF: photos that share it may share one focal length.
-    pub camera_model: Option<String>,
-    /// Exposure, white balance and vignetting that were taken out of `image`.
-    pub light: Light,
-}
-
-impl Photo {
-    /// Takes the lens out of the working image; `camera` is the pinhole that remains, at the working resolution.
-    pub fn straighten(&mut self, lens: Lens, camera: &Camera) {
-        if !lens.is_none() {
-            let (focal, centre) = (0.5 * (camera.fx + camera.fy), DVec2::new(camera.cx, camera.cy));
-            let how = Straightening { lens, focal, centre };
-            self.image = how.image(&self.image);
-            self.straightened = Some(how);
-        }
-    }
-
-    /// Working pixels per original pixel.
-    pub fn zoom(&self) -> f64 {
-        0.5 * (self.to_working.scale[0] + self.to_working.scale[1])
-    }
-
-    /// Focal length by EXIF, original pixels.
-    pub fn original_focal(&self) -> Option<f64> {
-        self.exif_focal.map(|f| f / self.to_working.scale[1])
-    }
-
-    /// The lens that was taken out of the image.
-    pub fn lens(&self) -> Lens {
-        self.straightened.map_or(Lens::NONE, |s| s.lens)
-    }
-
-    /// Where the photo as it was read, at the working resolution, has what the image shows at `p`.
-    pub fn source(&self, p: DVec2) -> DVec2 {
-        self.straightened.map_or(p, |s| s.source(p))
-    }
-
-    /// The camera of the working image as one of the photo's file: its size, its pixels, its name. [`Photo::lens`] belongs
-    /// to it.
-    pub fn original_camera(&self, camera: &Camera) -> Camera {
-        let name = self.path.file_name().map_or_else(|| self.stem.clone(), |n| n.to_string_lossy().into());
-        Camera { name, ..self.to_working.inverse().camera(camera, self.original_size) }
-    }
-}
-
-/// [`load_at`] with [`MAX_SIZE`].
-pub fn load(path: &Path) -> Result<Photo> {
-    load_at(path, MAX_SIZE)
-}
-
-/// Reads one photo: EXIF orientation applied, alpha composited on black, scaled down to `max_size` pixels along its longer
-/// side if it is larger.
-pub fn load_at(path: &Path, max_size: usize) -> Result<Photo> {
-    from_bytes(path, read(path)?, max_size)
-}
-
-fn read(path: &Path) -> Result<Vec<u8>> {
-    std::fs::read(path).map_err(|e| {
-        Error::input(format!("{}: {e}; check the name and that you may read it", path.display()))
-    })
-}
-
-/// [`load_at`] of an image file that is in memory already; `name` stands for its path.
-pub fn from_bytes(name: &Path, bytes: Vec<u8>, max_size: usize) -> Result<Photo> {
-    let decoded = decode::decode(bytes, name)?;
-    if let Some(lens) = &decoded.lens.fisheye {
-        return Err(Error::input(format!(
-            "{}: taken with a fisheye lens ({lens}), which radial distortion does not describe; make it rectilinear first, \
-             with the camera maker's program or darktable's lens correction",
-            name.display()
-        )));
-    }
-    let photo = working(name, decoded.size, max_size, |x, y| decoded.at(x, y))?;
-    // The two scales differ by the rounding of the size only.
-    let exif_focal = decoded.lens.focal.map(|f| f * photo.to_working.scale[1]);
-    Ok(Photo { exif_focal, camera_model: decoded.lens.camera_model.clone(), ..photo })
-}
-
-/// A photo from upright sRGB pixels in [0, 1]; `focal` is in their pixels, where it is known.
-pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>, max_size: usize) -> Result<Photo> {
-    if image.data.len() != image.width * image.height {
-        return Err(Error::input(format!(
-            "{}: {} pixels do not make {} × {}",
-            name.display(),
-            image.data.len(),
-            image.width,
-            image.height
-        )));
-    }
-    let photo = working(name, (image.width, image.height), max_size, |x, y| image.at(x, y))?;
-    Ok(Photo { exif_focal: focal.map(|f| f * photo.to_working.scale[1]), ..photo })
-}
-
-/// Upright pixels at working resolution, nothing known about the lens.
-fn working(
-    name: &Path,
-    (w, h): (usize, usize),
-    max_size: usize,
-    at: impl Fn(usize, usize) -> [f32; 3] + Sync,
-) -> Result<Photo> {
-    check_size(name, (w, h))?;
-    let (working_w, working_h) = working_size(w, h, max_size);
-    let mut image = resize::area_average((w, h), (working_w, working_h), &at);
-    let fine = fine((w, h), (working_w, working_h), &at);
-    let frame = Frame::of(&image);
-    frame.continue_picture(&mut image);
-    Ok(Photo {
-        path: name.to_path_buf(),
-        stem: name.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
-        image,
-        frame,
-        original_size: (w as u32, h as u32),
-        to_working: Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32)),
-        exif_focal: None,
-        fine,
-        straightened: None,
-        camera_model: None,
-        light: Light::NONE,
-    })
-}
-
-fn check_size(name: &Path, (w, h): (usize, usize)) -> Result<()> {
-    if w.min(h) < SMALLEST_SIDE {
-        return Err(Error::input(format!(
-            "{}: {w} × {h} pixels are too few; each side needs at least {SMALLEST_SIDE}",
-            name.display()
-        )));
-    }
-    Ok(())
-}
-
-/// Largest long side of [`Photo::fine`], pixels.
-const FINE: usize = 3072;
-/// Fewer more pixels than this show nothing new.
-const LEAST_GAIN: f64 = 1.25;
-
-fn fine(
-    (w, h): (usize, usize),
-    working: (usize, usize),
-    at: &(impl Fn(usize, usize) -> [f32; 3] + Sync),
-) -> Option<Arc<Plane<f32>>> {
-    let share = (FINE as f64 / w.max(h) as f64).min(1.0);
-    let size = ((w as f64 * share).round() as usize, (h as f64 * share).round() as usize);
-    (size.0 as f64 > LEAST_GAIN * working.0 as f64)
-        .then(|| Arc::new(resize::area_average((w, h), size, at).luma()))
-}
-
-/// Working (width, height) of a photo of that size: the longer side is capped, the other one rounded. Never larger than
-/// the photo, and its shorter side never below [`SMALLEST_SIDE`]: a panorama keeps what the networks need.
-pub fn working_size(w: usize, h: usize, max_size: usize) -> (usize, usize) {
-    let (long, short) = (w.max(h), w.min(h));
-    let floor = (SMALLEST_SIDE * long).div_ceil(short.max(1));
-    let target = max_size.max(floor);
-    if long <= target {
-        return (w, h);
-    }
-    let scaled = |side: usize| ((side * target + long / 2) / long).max(1);
-    (scaled(w), scaled(h))
 }
 
 /// Finds and reads all photos of files and folders at [`MAX_SIZE`]; [`crate::pose::choose::photos`] chooses among too many.

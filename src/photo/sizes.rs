@@ -1,5 +1,5 @@
 //! Sizes of photos before they are decoded: what memory a run needs, and how many files may be decoded at once.
-use super::Candidate;
+use super::candidate::Candidate;
 use image::metadata::Orientation;
 use image::{ImageDecoder, ImageReader};
 use std::ops::Range;

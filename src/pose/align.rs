@@ -1,25 +1,7 @@
 //! Comparing estimated cameras with known ones: the error measures of `eval` and of the tests.
 use super::numeric::{nearest_rotation, rotation_angle};
-use crate::scene::Camera;
+use crate::scene::{Camera, Similarity};
 use glam::{DMat3, DVec3};
-
-/// `x ↦ scale · rotation · x + translation`.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Similarity {
-    /// Uniform scale.
-    pub scale: f64,
-    /// Rotation.
-    pub rotation: DMat3,
-    /// Translation, target units.
-    pub translation: DVec3,
-}
-
-impl Similarity {
-    /// The image of a point.
-    pub fn transform(&self, p: DVec3) -> DVec3 {
-        self.rotation * p * self.scale + self.translation
-    }
-}
 
 /// Errors per camera after the similarity that best maps the estimate onto the truth.
 #[derive(Clone, Debug)]

@@ -269,9 +269,8 @@ struct Cost {
 
 impl Graph {
     fn new(seen: &[Seen], links: Vec<Vec<Link>>) -> Graph {
-        let mut sorted: Vec<f64> = seen.iter().map(|s| s.sharpness).collect();
-        sorted.sort_by(f64::total_cmp);
-        let median = sorted.get(sorted.len() / 2).copied().unwrap_or(1.0).max(1e-9);
+        let mut all: Vec<f64> = seen.iter().map(|s| s.sharpness).collect();
+        let median = crate::math::median(&mut all).unwrap_or(1.0).max(1e-9);
         let same = |i: usize, j: usize| {
             let fewer = seen[i].features.points.len().min(seen[j].features.points.len());
             let link = links[i][j];

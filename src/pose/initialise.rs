@@ -4,9 +4,9 @@ use super::{Features, Geometry, SparseModel, light, sfm};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
-use crate::photo::Photo;
+use crate::photo::{Photo, stem};
 use crate::progress::Progress;
-use crate::scene::Camera;
+use crate::scene::{Camera, ModelView, PairPointmaps};
 use crate::{Error, Result};
 use glam::DVec2;
 
@@ -101,7 +101,7 @@ fn warn_of_misfits(photos: &[Photo], model: &SparseModel, progress: &dyn Progres
             ));
         }
         let others = model.fitted.iter().enumerate().filter(|(o, _)| *o != v);
-        let Some(usual) = super::numeric::median(&mut others.map(|(_, f)| f.residual).collect::<Vec<_>>())
+        let Some(usual) = crate::math::median(&mut others.map(|(_, f)| f.residual).collect::<Vec<_>>())
         else {
             continue;
         };
@@ -156,9 +156,6 @@ pub fn sparse(
 
 /// One camera per photo, at working resolution, by file name without extension.
 fn assigned(photos: &[Photo], cameras: &[Camera]) -> Result<Vec<Camera>> {
-    let stem = |name: &str| {
-        std::path::Path::new(name).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default()
-    };
     photos
         .iter()
         .map(|p| {

@@ -304,9 +304,10 @@ pub(crate) fn triangulate_two(pose: &Pose, x: DVec3, y: DVec3) -> Option<DVec3> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::numeric::{Rng, rotation_angle};
+    use crate::math::Random;
+    use crate::pose::numeric::rotation_angle;
 
-    fn random_pose(rng: &mut Rng) -> Pose {
+    fn random_pose(rng: &mut Random) -> Pose {
         let mut v = || DVec3::new(rng.normal(), rng.normal(), rng.normal());
         Pose::exp(v() * 0.5, v() * 0.3)
     }
@@ -314,7 +315,7 @@ mod tests {
     #[test]
     fn five_points_recover_the_essential_matrix() {
         let solver = FivePoint::new();
-        let mut rng = Rng::new(7);
+        let mut rng = Random::new(7);
         let mut worst: Vec<f64> = Vec::new();
         for _ in 0..200 {
             let pose = random_pose(&mut rng);
@@ -342,7 +343,7 @@ mod tests {
 
     #[test]
     fn three_points_recover_the_pose() {
-        let mut rng = Rng::new(3);
+        let mut rng = Random::new(3);
         let mut good = 0;
         for _ in 0..200 {
             let pose = random_pose(&mut rng);

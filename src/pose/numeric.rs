@@ -2,64 +2,6 @@
 use glam::{DMat3, DVec3};
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
-/// SplitMix64: a fixed-seed generator, so that every run draws the same samples.
-pub(crate) struct Rng(u64);
-
-impl Rng {
-    pub(crate) fn new(seed: u64) -> Self {
-        Rng(seed)
-    }
-    pub(crate) fn next_u64(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
-    }
-    /// Uniform in [0, n); n > 0.
-    pub(crate) fn below(&mut self, n: usize) -> usize {
-        ((self.next_u64() as u128 * n as u128) >> 64) as usize
-    }
-    /// `N` different indices below n; n ≥ N.
-    pub(crate) fn sample<const N: usize>(&mut self, n: usize) -> [usize; N] {
-        let mut out = [usize::MAX; N];
-        let mut k = 0;
-        while k < N {
-            let i = self.below(n);
-            if !out[..k].contains(&i) {
-                out[k] = i;
-                k += 1;
-            }
-        }
-        out
-    }
-    /// Uniform in [0, 1).
-    #[cfg(test)]
-    pub(crate) fn uniform(&mut self) -> f64 {
-        (self.next_u64() >> 11) as f64 / (1u64 << 53) as f64
-    }
-    /// Standard normal (Box–Muller).
-    #[cfg(test)]
-    pub(crate) fn normal(&mut self) -> f64 {
-        let u = 1.0 - self.uniform();
-        (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * self.uniform()).cos()
-    }
-}
-
-/// Middle value (upper of the two for an even count); `None` when empty. Reorders the slice.
-pub(crate) fn median(values: &mut [f64]) -> Option<f64> {
-    quantile(values, 0.5)
-}
-
-/// The value below which a fraction `q` lies; `None` when empty. Reorders the slice.
-pub(crate) fn quantile(values: &mut [f64], q: f64) -> Option<f64> {
-    if values.is_empty() {
-        return None;
-    }
-    let k = ((values.len() as f64 * q) as usize).min(values.len() - 1);
-    Some(*values.select_nth_unstable_by(k, |a, b| a.total_cmp(b)).1)
-}
-
 /// Weight of the Cauchy loss `ρ = c² ln(1 + r²/c²)` with respect to squared error, from r².
 pub(crate) fn cauchy_weight(r2: f64, c: f64) -> f64 {
     1.0 / (1.0 + r2 / (c * c))

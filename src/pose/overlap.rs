@@ -1,4 +1,5 @@
 //! How much two photos show of the same, from matches that nothing has verified yet.
+use crate::math::median;
 use glam::DVec2;
 
 /// What two photos have in common.
@@ -74,9 +75,7 @@ pub(super) fn agreement(matches: &[(DVec2, DVec2)]) -> Link {
         return Link::default();
     };
     let mut distances: Vec<f64> = inliers(&fitted).iter().map(|m| fitted.distance(m)).collect();
-    distances.sort_by(f64::total_cmp);
-    let parallax = distances.get(distances.len() / 2).copied().unwrap_or(0.0);
-    Link { matches: distances.len(), parallax }
+    Link { matches: distances.len(), parallax: median(&mut distances).unwrap_or(0.0) }
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! Absolute pose from points of known position (PnP): RANSAC over three points, then least squares.
 use super::minimal::three_point;
-use super::numeric::{Rng, cauchy_weight, minimise_small};
+use super::numeric::{cauchy_weight, minimise_small};
+use crate::math::Random;
 use crate::scene::Pose;
 use glam::{DVec2, DVec3};
 
@@ -35,7 +36,7 @@ pub(crate) fn resect(
     }
     let t2 = threshold * threshold;
     let score = |p: &Pose| (0..n).map(|k| error2(p, focal, world[k], pixels[k]).min(t2)).sum::<f64>();
-    let mut rng = Rng::new(0x5eed_0003);
+    let mut rng = Random::new(0x5eed_0003);
     let mut best: Option<(f64, Pose)> = None;
     for _ in 0..iterations {
         let s = rng.sample::<3>(n);
@@ -93,7 +94,7 @@ mod tests {
 
     #[test]
     fn half_outliers_are_survived() {
-        let mut rng = Rng::new(11);
+        let mut rng = Random::new(11);
         let truth = Pose::exp(DVec3::new(0.4, -0.2, 0.5), DVec3::new(0.2, -0.5, 0.1));
         let (mut world, mut pixels) = (Vec::new(), Vec::new());
         for k in 0..300 {

@@ -1,7 +1,8 @@
 //! Two-view geometry with an uncertain focal length: RANSAC over five points, local optimisation of rotation,
 //! translation and focal length together, and detection of views that hold no parallax.
 use super::minimal::{FivePoint, decompose_essential, essential, triangulate_two};
-use super::numeric::{Rng, median, minimise_small};
+use super::numeric::minimise_small;
+use crate::math::{Random, median};
 use crate::scene::Pose;
 use glam::{DMat3, DVec2, DVec3};
 
@@ -123,7 +124,7 @@ impl Data<'_> {
     /// RANSAC at a fixed stretch. Matches are sorted best first; samples prefer the front of the list.
     fn ransac(&self, m: f64, iterations: usize, prior_sigma: f64, seed: u64) -> Option<(f64, Pose, f64)> {
         let solver = FivePoint::new();
-        let mut rng = Rng::new(seed);
+        let mut rng = Random::new(seed);
         let n = self.x.len();
         let mut best: Option<(f64, Pose, f64)> = None;
         let mut needed = iterations;
@@ -228,13 +229,13 @@ mod tests {
     use crate::pose::numeric::rotation_angle;
 
     fn views(pose: &Pose, focal: f64, n: usize, flat: bool) -> (Vec<DVec2>, Vec<DVec2>) {
-        let mut rng = Rng::new(21);
+        let mut rng = Random::new(21);
         let (mut x, mut y) = (Vec::new(), Vec::new());
         while x.len() < n {
             let depth = if flat { 0.0 } else { rng.normal() * 0.5 };
             let p = DVec3::new(rng.normal(), rng.normal() * 0.8, 4.0 + depth);
             let q = pose.transform(p);
-            let noise = |rng: &mut Rng| DVec2::new(rng.normal(), rng.normal()) * 1.1;
+            let noise = |rng: &mut Random| DVec2::new(rng.normal(), rng.normal()) * 1.1;
             let (a, b) = (
                 DVec2::new(p.x, p.y) * (focal / p.z) + noise(&mut rng),
                 DVec2::new(q.x, q.y) * (focal / q.z) + noise(&mut rng),

@@ -5,12 +5,11 @@
 //! smoothed map; the mask of the `field` protocol is chosen on codes, so smoothing never moves its edges.
 pub mod eval;
 pub mod filter;
-mod highlight;
+pub mod highlight;
 pub mod protocol;
 pub mod select;
 
-pub use highlight::{Highlight, highlight};
-
+use crate::math::dot;
 use crate::scene::{Codebook, LanguageField, Plane};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -115,10 +114,6 @@ pub fn code_relevancy(codebook: &Codebook, query: &TextQuery) -> Result<Vec<f32>
     }
     let one = |phi: &[f32]| relevancy(phi, dot(phi, &query.embedding), &query.canonicals);
     Ok(codebook.embeddings.chunks_exact(d).map(one).collect())
-}
-
-fn dot(a: &[f32], b: &[f32]) -> f64 {
-    a.iter().zip(b).map(|(x, y)| *x as f64 * *y as f64).sum()
 }
 
 /// Relevancy of a text whose cosine to the region embedding `phi` is known, against canonical rows [C, D].

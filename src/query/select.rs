@@ -28,7 +28,7 @@ pub fn splat_codes(level: &LevelField) -> Vec<Option<usize>> {
     let d = level.codebook.code_dim.max(1);
     let one = |f: &[f32]| {
         let length = f.iter().map(|v| v * v).sum::<f32>().sqrt();
-        if length < LEAST_LENGTH { None } else { crate::language::codebook::decode_one(&level.codebook, f) }
+        if length < LEAST_LENGTH { None } else { level.codebook.decode(f) }
     };
     level.features.par_chunks_exact(d).map(one).collect()
 }

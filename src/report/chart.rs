@@ -91,7 +91,7 @@ pub fn bar_chart(bars: &[Bar], title: &str) -> String {
                 body,
                 "<text x=\"8\" y=\"{:.1}\" font-weight=\"bold\">{}</text>",
                 y + 15.0,
-                escaped(group)
+                escape(group)
             );
             y += ROW;
         }
@@ -101,7 +101,7 @@ pub fn bar_chart(bars: &[Bar], title: &str) -> String {
             "<text x=\"{}\" y=\"{text:.1}\" text-anchor=\"end\">{}</text><rect x=\"{BAR_LEFT}\" y=\"{:.1}\" \
              width=\"{:.1}\" height=\"{:.1}\" fill=\"#3b7dd8\"/><text x=\"{:.1}\" y=\"{text:.1}\">{:.3}</text>",
             BAR_LEFT - 8.0,
-            escaped(&bar.label),
+            escape(&bar.label),
             y + 3.0,
             px(bar.value) - BAR_LEFT,
             ROW - 6.0,
@@ -124,12 +124,13 @@ pub fn bar_chart(bars: &[Bar], title: &str) -> String {
          font-size=\"13\"><rect width=\"100%\" height=\"100%\" fill=\"white\"/><text x=\"8\" y=\"18\" \
          font-size=\"14\">{}</text>{body}</svg>\n",
         y + 8.0,
-        escaped(title)
+        escape(title)
     )
 }
 
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+/// Text as HTML and SVG show it.
+pub(super) fn escape(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
 #[cfg(test)]
@@ -154,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn bars_are_as_long_as_their_values_and_text_is_escaped() {
+    fn bars_are_as_long_as_their_values_and_text_is_escape() {
         let bar =
             |label: &str, value, reference| Bar { group: "g".into(), label: label.into(), value, reference };
         let svg = bar_chart(&[bar("a<b", 0.5, None), bar("c", 1.0, Some(0.25))], "t");

@@ -1,4 +1,5 @@
 //! `report.html`: one self-contained file, readable on a phone.
+use super::chart::escape;
 use super::{Curve, QueryShown, Report, ViewShown, chart, colour, duration, viewer};
 use crate::format::picture;
 use crate::scene::RgbImage;
@@ -16,10 +17,6 @@ const STYLE: &str = include_str!("report.css");
 pub fn write_html(folder: &Path, report: &Report) -> Result<()> {
     let path = folder.join("report.html");
     std::fs::write(&path, page(report)?).map_err(Error::io(&path))
-}
-
-pub(super) fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
 fn figure(image: &RgbImage, caption: &str) -> Result<String> {

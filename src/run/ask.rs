@@ -120,7 +120,7 @@ pub fn answers(
 ) -> Result<Answers> {
     let codes: Vec<&[Plane<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
     let views = query::answer_all(&codes, field, query, options)?;
-    let highlight = query::highlight(&codes, field, query, &views)?;
+    let highlight = query::highlight::highlight(&codes, field, query, &views)?;
     Ok(Answers { text: query.text.clone(), views, highlight })
 }
 

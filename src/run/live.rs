@@ -211,5 +211,5 @@ fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
 
 /// Cameras come from outside: refuses what cannot be rendered.
 fn check(camera: &Camera) -> Result<()> {
-    crate::format::cameras::checked(camera.clone()).map(drop).map_err(Error::input)
+    camera.clone().checked().map(drop).map_err(Error::input)
 }

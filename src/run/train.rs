@@ -4,7 +4,7 @@ use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras, colmap, ply};
 use crate::gpu::{self, Device};
 use crate::infer::{Compute, Registry};
-use crate::photo::{self, Candidate, Photo};
+use crate::photo::{self, Candidate, Photo, stem};
 use crate::pipeline::Graph;
 use crate::pose::Geometry;
 use crate::progress::{Progress, Recorded};
@@ -70,10 +70,7 @@ fn matched(
     progress: &dyn Progress,
 ) -> Result<Vec<Photo>> {
     let found = photo::find(std::slice::from_ref(&plan.images))?;
-    let has = |p: &&PathBuf| {
-        let stem = p.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
-        known.iter().any(|c| cameras::stem(&c.name) == stem)
-    };
+    let has = |p: &&PathBuf| known.iter().any(|c| stem(&c.name) == stem(&p.to_string_lossy()));
     let paths: Vec<PathBuf> = found.photos.iter().filter(has).cloned().collect();
     if paths.len() < 2 {
         return Err(Error::input(format!(
@@ -261,7 +258,7 @@ fn from_points(photos: &[Photo], known: &[Camera], cloud: PointCloud) -> Result<
 /// The photo's camera at its working resolution; sizes may differ, the aspect may not.
 fn camera_of(photo: &Photo, known: &[Camera]) -> Result<Camera> {
     let bad = |what: &str| Error::input(format!("{}: {what}", photo.path.display()));
-    let camera = known.iter().find(|c| cameras::stem(&c.name) == photo.stem);
+    let camera = known.iter().find(|c| stem(&c.name) == photo.stem);
     let camera = camera.ok_or_else(|| bad("no camera with this name"))?;
     let (w, h) = (photo.image.width as f64, photo.image.height as f64);
     // 1 %: sizes are whole numbers, and working sizes are truncated.

@@ -88,6 +88,28 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// Refuses what no pinhole camera can be.
+    pub fn checked(self) -> Result<Camera, String> {
+        let c = self;
+        let finite =
+            [c.fx, c.fy, c.cx, c.cy].iter().chain(&c.pose.rotation.to_cols_array()).all(|v| v.is_finite())
+                && c.pose.translation.is_finite();
+        let r = c.pose.rotation;
+        let off =
+            (r * r.transpose() - DMat3::IDENTITY).to_cols_array().iter().fold(0.0f64, |m, v| m.max(v.abs()));
+        if !finite || c.fx <= 0.0 || c.fy <= 0.0 || c.width == 0 || c.height == 0 {
+            return Err(format!(
+                "camera {:?}: sizes and focal lengths must be positive, all numbers finite",
+                c.name
+            ));
+        }
+        // Files with 6 printed digits reach 1e-5; a scaled or sheared matrix is far above.
+        if off > 1e-3 || r.determinant() < 0.0 {
+            return Err(format!("camera {:?}: its matrix is not a rotation (off by {off:.1e})", c.name));
+        }
+        let pose = if off > 1e-12 { c.pose.orthonormalised() } else { c.pose };
+        Ok(Camera { pose, ..c })
+    }
     /// Pixel position of a world point and its depth; the depth may be ≤ 0 (behind the camera).
     pub fn project(&self, world: DVec3) -> (DVec2, f64) {
         let t = self.pose.transform(world);

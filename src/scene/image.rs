@@ -1,4 +1,5 @@
 //! Images and per-pixel maps.
+use glam::DVec2;
 use serde::{Deserialize, Serialize};
 
 /// A row-major map of one value per pixel, `data[y * width + x]`.
@@ -41,6 +42,10 @@ impl RgbImage {
     /// Colour at column x, row y.
     pub fn at(&self, x: usize, y: usize) -> [f32; 3] {
         self.data[y * self.width + x]
+    }
+    /// Colour of the pixel that holds a continuous position, or of the nearest one.
+    pub fn nearest(&self, p: DVec2) -> [f32; 3] {
+        self.at((p.x.max(0.0) as usize).min(self.width - 1), (p.y.max(0.0) as usize).min(self.height - 1))
     }
     /// Rec. 601 luma per pixel.
     pub fn luma(&self) -> Plane<f32> {

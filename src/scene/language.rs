@@ -34,6 +34,17 @@ impl Codebook {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
+    /// `argmax_k F·c_k` (docs/method.md#decoding-codes); ties take the lowest k; `None` without codes.
+    pub fn decode(&self, feature: &[f32]) -> Option<usize> {
+        let mut best: Option<(f32, usize)> = None;
+        for (k, code) in self.codes.chunks_exact(self.code_dim.max(1)).enumerate() {
+            let dot: f32 = feature.iter().zip(code).map(|(a, b)| a * b).sum();
+            if best.is_none_or(|(d, _)| dot > d) {
+                best = Some((dot, k));
+            }
+        }
+        best.map(|(_, k)| k)
+    }
 }
 
 /// One level of the language field.

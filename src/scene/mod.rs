@@ -3,18 +3,26 @@
 //! Conventions used everywhere: camera frame OpenCV (+x right, +y down, +z forward), pixel (column c, row r) covers
 //! `[c, c+1) × [r, r+1)` with its centre at `(c+0.5, r+0.5)`, quaternions `(w, x, y, z)`, depth = camera z, images
 //! row-major RGB in [0, 1] (sRGB values as they are).
+mod affine;
 mod camera;
 mod image;
 mod language;
 mod lens;
+mod pointmap;
 mod points;
+mod similarity;
 mod splats;
 mod transfer;
+mod warp;
 
+pub use affine::Affine;
 pub use camera::{Camera, Pose};
 pub use image::{DepthMap, Plane, RgbImage};
 pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField};
 pub use lens::Lens;
+pub use pointmap::{Descriptors, ModelView, PairPointmaps, Pointmap};
 pub use points::PointCloud;
+pub use similarity::Similarity;
 pub use splats::{Splats, sh_coefficients};
 pub use transfer::{to_linear, to_srgb};
+pub use warp::DenseWarp;

@@ -1,5 +1,5 @@
 //! What a phone does to a picture: lens, light, sensor noise. The distributions are stated in docs/data.md.
-use crate::fit::schedule::Random;
+use crate::math::Random;
 use crate::scene::{Camera, Lens, RgbImage};
 use crate::{Error, Result};
 use glam::DVec2;

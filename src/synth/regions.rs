@@ -4,11 +4,12 @@
 //! different objects still have a cosine near 0.65 and the same object from another side near 0.9, while an image and its
 //! phrase reach only about 0.25. Words have fixed directions, so phrases that share a word are alike ("red can", "red
 //! book"), and any phrase has an embedding.
-use crate::fit::schedule::Random;
+use crate::format::create_folder;
 use crate::format::npy::{self, NpyArray};
-use crate::format::{cameras::stem, create_folder};
 use crate::language::dir::normalise_rows;
 use crate::language::{LevelMasks, ViewMasks};
+use crate::math::Random;
+use crate::photo::stem;
 use crate::query::eval::{BACKGROUND_LABELS, Frame, GroundTruth};
 use crate::query::{CANONICAL_PHRASES, TextQuery};
 use crate::scene::Plane;

@@ -2,7 +2,7 @@
 use super::phone::Shot;
 use super::scene::{Thing, World};
 use super::shapes::Hit;
-use crate::fit::schedule::Random;
+use crate::math::Random;
 use crate::scene::{Camera, Lens, Plane, RgbImage};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;

@@ -1,7 +1,7 @@
 //! Small scenes with everything known: a table with objects before a wall, and the knobs that make them hard.
 use super::phone::{self, Effects, Shot};
 use super::shapes::{Paint, Shape};
-use crate::fit::schedule::Random;
+use crate::math::Random;
 use crate::scene::{Camera, Pose};
 use crate::{Error, Result};
 use glam::{DMat3, DVec2, DVec3};

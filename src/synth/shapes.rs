@@ -157,7 +157,7 @@ mod tests {
             Shape::Can(DVec3::new(0.05, -0.1, 0.0), 0.2, 0.4),
             Shape::Plane(DVec3::new(0.0, 0.6, 0.8), 0.1),
         ];
-        let mut random = crate::fit::schedule::Random::new(1000);
+        let mut random = crate::math::Random::new(1000);
         let mut hits = 0;
         for shape in &shapes {
             for _ in 0..300 {

@@ -1,8 +1,12 @@
 //! Where surfaces end in a photo: planes fitted at its borders and at its depth edges.
-use super::{BEHIND, STEP};
-use crate::fit::schedule::Random;
+use crate::math::Random;
 use crate::scene::{Camera, DepthMap, RgbImage};
 use glam::{DMat3, DVec2, DVec3};
+
+/// Grid of the splats in units of the longer image side: only the mean colour is known, so finer splats tell no more.
+pub(super) const STEP: f64 = 0.01;
+/// Relative depth by which a splat must stand behind what a photo shows there: above stereo noise.
+pub(super) const BEHIND: f64 = 1.05;
 
 /// Half-width of the first window that a plane is fitted in, over the longer side; doubled up to twice where depth is
 /// missing.

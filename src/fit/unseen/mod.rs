@@ -7,17 +7,13 @@
 mod anchor;
 
 use super::init::SH_C0;
-use super::schedule::Random;
+use crate::math::Random;
 use crate::scene::{Camera, DepthMap, RgbImage, Splats};
-use anchor::{Anchor, Shown};
+use anchor::{Anchor, BEHIND, STEP, Shown};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
-/// Grid of the splats in units of the longer image side: only the mean colour is known, so finer splats tell no more.
-const STEP: f64 = 0.01;
-/// Relative depth by which a splat must stand behind what a photo shows there: above stereo noise.
-const BEHIND: f64 = 1.05;
 /// How far behind a depth edge a plane goes on, in units of the longer image side: at a field of view of 55°, a camera turned
 /// by 20° about what stands in front sees 0.12 of what is half as far again.
 const REVEALED: f64 = 0.12;

@@ -1,8 +1,7 @@
 //! Reading: every primitive of the default scene that has the extension, moved by the nodes above it.
-use super::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
+use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
 use crate::format::{logit, moved};
-use crate::pose::align::Similarity;
-use crate::scene::{Splats, sh_coefficients};
+use crate::scene::{Similarity, Splats, sh_coefficients};
 use crate::{Error, Result};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;

@@ -1,5 +1,5 @@
 //! Writing.
-use super::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
+use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
 use crate::format::{SH_C0, moved, sigmoid};
 use crate::scene::{Splats, to_linear};
 use crate::{Error, Result};

@@ -1,7 +1,6 @@
 //! Pixel correspondences between two views: from dense matches (docs/method.md#pixel-matching) and from depth and poses
 //! (docs/method.md#reprojection).
-use super::super::DenseWarp;
-use crate::scene::{Camera, DepthMap, Plane};
+use crate::scene::{Camera, DenseWarp, DepthMap, Plane};
 use glam::DVec2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};

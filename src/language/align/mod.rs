@@ -6,6 +6,7 @@
 //! in a fixed order, so the result depends neither on the thread count nor on the order of the views.
 mod components;
 mod links;
+mod options;
 mod score;
 
 #[cfg(test)]
@@ -13,89 +14,11 @@ mod tests;
 
 pub use components::Component;
 pub use links::{PairLinks, links_from_depth, links_from_warps};
+pub use options::{AlignOptions, AreaScore, Edge};
 
 use super::ViewMasks;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
-
-/// How the share of a target mask is measured (docs/method.md#pixel-matching).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum AreaScore {
-    /// Share of the target's own pixels whose reverse match lands in the source: independent of image scale.
-    Coverage,
-    /// Matched source pixels over target pixels, at most 1: the paper's ratio.
-    Paper,
-}
-
-/// Thresholds of the alignment; the defaults are explained in docs/method.md#alignment.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct AlignOptions {
-    /// Acceptance threshold of step 1.
-    pub tau1: f64,
-    /// Acceptance threshold of step 3.
-    pub tau2: f64,
-    /// Weight of the feature cosine; the area share has 1 − λ.
-    pub lambda: f64,
-    /// Area share.
-    pub area: AreaScore,
-    /// Matched pixels needed, as a share of the image ([`AlignOptions::min_matches`]).
-    pub min_match_share: f64,
-    /// Smallest cosine between two masks that may become one thing.
-    pub veto: f64,
-    /// Share of a mask's matches that must fall into the fusion target.
-    pub containment: f64,
-    /// Masks above this share of the image are background and never a fusion target.
-    pub background_share: f64,
-    /// Run step 1 (dense matches).
-    pub matching: bool,
-    /// Run step 2 (fusion; levels m and l only).
-    pub fusion: bool,
-    /// Run step 3 (reprojection).
-    pub reprojection: bool,
-}
-
-impl Default for AlignOptions {
-    fn default() -> Self {
-        AlignOptions {
-            tau1: 0.5,
-            tau2: 0.5,
-            lambda: 0.3,
-            area: AreaScore::Coverage,
-            min_match_share: 2.05e-4,
-            veto: 0.5,
-            containment: 0.6,
-            background_share: 0.6,
-            matching: true,
-            fusion: true,
-            reprojection: true,
-        }
-    }
-}
-
-impl AlignOptions {
-    /// Matched pixels that make a pair of masks worth scoring: 150 at 0.73 megapixels, at least 32.
-    pub fn min_matches(&self, pixels: usize) -> u32 {
-        ((self.min_match_share * pixels as f64).round() as u32).max(32)
-    }
-}
-
-/// An accepted pair of masks.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Edge {
-    /// 1 dense matching, 2 dense matching after fusion, 3 reprojection.
-    pub step: u8,
-    /// Source view and mask.
-    pub from: (u32, u32),
-    /// Target view and mask.
-    pub to: (u32, u32),
-    /// Area share of the target.
-    pub area: f64,
-    /// Cosine of the features, at least 0.
-    pub lang: f64,
-    /// λ·lang + (1 − λ)·area.
-    pub score: f64,
-}
 
 /// What alignment did on one level, for run.json.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]

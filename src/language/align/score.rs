@@ -2,6 +2,7 @@
 use super::super::ViewMasks;
 use super::links::{Links, PairLinks};
 use super::{AlignOptions, AreaScore, Edge};
+use crate::math::dot;
 use crate::scene::Plane;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -42,7 +43,7 @@ impl LevelState {
     }
     /// Cosine of two unit features.
     pub fn cosine(&self, a: (u32, u32), b: (u32, u32)) -> f64 {
-        self.feature(a).iter().zip(self.feature(b)).map(|(x, y)| *x as f64 * *y as f64).sum()
+        dot(self.feature(a), self.feature(b))
     }
     /// Weight of a mask in its component: pixels times quality (docs/method.md#components).
     pub fn weight(&self, (view, mask): (u32, u32)) -> f64 {

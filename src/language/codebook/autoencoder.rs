@@ -7,7 +7,7 @@
 //! far more, and the rest of the engine sees an ordinary codebook.
 use super::network::{Adam, Network, Step};
 use super::{Built, CodeEntry, min_chord};
-use crate::fit::schedule::Random;
+use crate::math::Random;
 use crate::scene::Codebook;
 use crate::{Error, Result};
 use nalgebra::DMatrix;
@@ -168,7 +168,7 @@ pub(in crate::language) fn build(
         let mut code_of = Vec::with_capacity(entries.len());
         for entry in entries {
             let code = model.encode(&DMatrix::from_column_slice(dim, 1, &entry.embedding));
-            let k = super::decode_one(&codebook, code.as_slice()).unwrap_or(0);
+            let k = codebook.decode(code.as_slice()).unwrap_or(0);
             codebook.weights[k] += entry.weight as f32;
             codebook.members[k].extend_from_slice(&entry.members);
             code_of.push(k as u32);

@@ -5,7 +5,8 @@ mod pca;
 pub(super) mod quantise;
 mod spread;
 
-use crate::scene::{Codebook, Plane};
+use crate::math::{Random, dot};
+use crate::scene::Codebook;
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -15,9 +16,6 @@ const SAME_EMBEDDING: f64 = 0.9995;
 
 /// Smallest distance between two codes that the construction accepts (docs/method.md#code-construction, step 5).
 const MIN_CHORD: f32 = 0.02;
-
-/// Pixels less opaque than this show nothing of the scene (docs/method.md#decoding-codes).
-pub const VOID_ALPHA: f32 = 0.5;
 
 /// One distinct embedding and what stands behind it.
 #[derive(Clone, Debug, PartialEq)]
@@ -77,7 +75,7 @@ fn deduplicate(entries: &[CodeEntry]) -> (Vec<CodeEntry>, Vec<u32>) {
     let mut heaviest: Vec<f64> = Vec::new();
     let mut code_of = Vec::with_capacity(entries.len());
     for e in entries {
-        let same = kept.iter().position(|k| cosine(&k.embedding, &e.embedding) > SAME_EMBEDDING);
+        let same = kept.iter().position(|k| dot(&k.embedding, &e.embedding) > SAME_EMBEDDING);
         match same {
             Some(k) => {
                 kept[k].weight += e.weight;
@@ -98,10 +96,6 @@ fn deduplicate(entries: &[CodeEntry]) -> (Vec<CodeEntry>, Vec<u32>) {
     (kept, code_of)
 }
 
-fn cosine(a: &[f32], b: &[f32]) -> f64 {
-    a.iter().zip(b).map(|(x, y)| *x as f64 * *y as f64).sum()
-}
-
 /// `c_k = e_k`: with no more codes than dimensions a mix of two codes is never nearest to a third.
 fn one_hot(count: usize, dim: usize) -> Vec<f32> {
     (0..count * dim).map(|i| if i / dim == i % dim { 1.0 } else { 0.0 }).collect()
@@ -119,37 +113,6 @@ pub fn min_chord(codes: &[f32], dim: usize) -> f32 {
     (0..rows.len()).into_par_iter().map(nearest).reduce(|| 4.0, f32::min).sqrt()
 }
 
-/// `argmax_k F·c_k` over all codes of the level; ties take the lowest k; `None` without codes.
-pub fn decode_one(codebook: &Codebook, feature: &[f32]) -> Option<usize> {
-    let mut best: Option<(f32, usize)> = None;
-    for (k, code) in codebook.codes.chunks_exact(codebook.code_dim.max(1)).enumerate() {
-        let dot: f32 = feature.iter().zip(code).map(|(a, b)| a * b).sum();
-        if best.is_none_or(|(d, _)| dot > d) {
-            best = Some((dot, k));
-        }
-    }
-    best.map(|(_, k)| k)
-}
-
-/// Code index per pixel of rendered features `[H·W, d]`; −1 where alpha < [`VOID_ALPHA`]. Twin of the GPU pass.
-pub fn decode_map(codebook: &Codebook, features: &[f32], alpha: &Plane<f32>) -> Result<Plane<i32>> {
-    let (dim, pixels) = (codebook.code_dim, alpha.data.len());
-    if features.len() != pixels * dim {
-        return Err(Error::work(format!(
-            "decode: {} feature values for {pixels} pixels of {dim} channels",
-            features.len()
-        )));
-    }
-    let code = |p: usize| {
-        if alpha.data[p] < VOID_ALPHA {
-            return -1;
-        }
-        decode_one(codebook, &features[p * dim..(p + 1) * dim]).map_or(-1, |k| k as i32)
-    };
-    let data = (0..pixels).into_par_iter().map(code).collect();
-    Ok(Plane { width: alpha.width, height: alpha.height, data })
-}
-
 /// The bijection guarantee: codes are distinct, decode(encode(k)) = k, also with uniform noise of amplitude 0.45 δ_min
 /// along a random direction.
 fn assert_bijection(codebook: &Codebook, seed: u64) -> Result<()> {
@@ -161,12 +124,12 @@ fn assert_bijection(codebook: &Codebook, seed: u64) -> Result<()> {
             codebook.code_dim
         )));
     }
-    let mut random = spread::Random::new(seed ^ 0x5eed);
+    let mut random = Random::new(seed ^ 0x5eed);
     for (k, code) in codebook.codes.chunks_exact(codebook.code_dim).enumerate() {
-        let direction = random.unit(codebook.code_dim);
+        let direction = spread::unit(&mut random, codebook.code_dim);
         let amplitude = 0.45 * chord * random.uniform() as f32;
         let noisy: Vec<f32> = code.iter().zip(&direction).map(|(c, n)| c + amplitude * *n as f32).collect();
-        if decode_one(codebook, code) != Some(k) || decode_one(codebook, &noisy) != Some(k) {
+        if codebook.decode(code) != Some(k) || codebook.decode(&noisy) != Some(k) {
             return Err(Error::work(format!("codebook: code {k} does not decode to itself")));
         }
     }

@@ -1,5 +1,5 @@
 //! A small fully connected network with hand-written gradients, for the scene autoencoder. Batches are columns.
-use crate::fit::schedule::Random;
+use crate::math::Random;
 use nalgebra::{DMatrix, DVector};
 
 /// Added to a batch variance (the published default).

@@ -1,8 +1,8 @@
 //! The quantised feature codebook of LEGaussians (Shi et al. 2024) as another way to make a codebook: at most 128 mean
 //! features stand for all, and what splats carry is free until an index head is trained on it.
 use super::{Built, CodeEntry, min_chord};
-use crate::fit::schedule::Random;
 use crate::language::dir::normalise_rows;
+use crate::math::Random;
 use crate::scene::Codebook;
 
 /// Entries of the published codebook.

@@ -1,4 +1,5 @@
 //! Spreads codes over the sphere so that they stay apart (docs/method.md#code-construction, step 4).
+use crate::math::{Random, dot};
 use rayon::prelude::*;
 
 /// Gradient steps; the minimum distance no longer grows after about 200 on 50 to 600 codes.
@@ -9,35 +10,11 @@ const STEPS: usize = 300;
 const NEIGHBOURS: usize = 3;
 const ATTRACTION: f64 = 0.02;
 
-/// SplitMix64: small, seedable, identical everywhere.
-pub(super) struct Random(u64);
-
-impl Random {
-    pub fn new(seed: u64) -> Self {
-        Random(seed)
-    }
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-    /// Uniform in [0, 1).
-    pub fn uniform(&mut self) -> f64 {
-        (self.next() >> 11) as f64 / (1u64 << 53) as f64
-    }
-    /// Standard normal (Box–Muller).
-    pub fn normal(&mut self) -> f64 {
-        let (a, b) = (1.0 - self.uniform(), self.uniform());
-        (-2.0 * a.ln()).sqrt() * (std::f64::consts::TAU * b).cos()
-    }
-    /// A uniformly random direction.
-    pub fn unit(&mut self, dim: usize) -> Vec<f64> {
-        let mut v: Vec<f64> = (0..dim).map(|_| self.normal()).collect();
-        normalise(&mut v);
-        v
-    }
+/// A uniformly random direction.
+pub(super) fn unit(random: &mut Random, dim: usize) -> Vec<f64> {
+    let mut v: Vec<f64> = (0..dim).map(|_| random.normal()).collect();
+    normalise(&mut v);
+    v
 }
 
 fn normalise(v: &mut [f64]) {
@@ -145,7 +122,7 @@ fn nearest(embeddings: &[f32], dim: usize, count: usize) -> Vec<Vec<usize>> {
         .into_par_iter()
         .map(|k| {
             let mut order: Vec<(f64, usize)> =
-                (0..count).filter(|&l| l != k).map(|l| (super::cosine(rows[k], rows[l]), l)).collect();
+                (0..count).filter(|&l| l != k).map(|l| (dot(rows[k], rows[l]), l)).collect();
             order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
             order.truncate(NEIGHBOURS);
             order.into_iter().map(|(_, l)| l).collect()

@@ -1,11 +1,12 @@
-use super::spread::Random;
+use super::spread::unit;
 use super::*;
+use crate::math::Random;
 
 fn entries(count: usize, dim: usize, seed: u64) -> Vec<CodeEntry> {
     let mut random = Random::new(seed);
     (0..count)
         .map(|k| CodeEntry {
-            embedding: random.unit(dim).iter().map(|&v| v as f32).collect(),
+            embedding: unit(&mut random, dim).iter().map(|&v| v as f32).collect(),
             weight: 10.0 + k as f64,
             members: vec![(0, k as u32)],
         })
@@ -21,7 +22,7 @@ fn every_count_round_trips_under_noise() {
         assert_eq!(built.code_of, (0..count as u32).collect::<Vec<_>>());
         for (k, code) in book.codes.chunks_exact(dim).enumerate() {
             assert!((code.iter().map(|c| c * c).sum::<f32>() - 1.0).abs() < 1e-5);
-            assert_eq!(decode_one(book, code), Some(k));
+            assert_eq!(book.decode(code), Some(k));
         }
     }
 }
@@ -65,18 +66,17 @@ fn a_gradient_between_two_codes_switches_once_when_codes_are_axes() {
     let built = build(&entries(12, 48, 3), 16, 7).unwrap();
     let book = &built.codebook;
     let (a, b) = (&book.codes[2 * 16..3 * 16], &book.codes[7 * 16..8 * 16]);
-    let features: Vec<f32> = (0..100)
-        .flat_map(|x| {
-            let t = x as f32 / 99.0;
-            a.iter().zip(b).map(move |(a, b)| (1.0 - t) * a + t * b).collect::<Vec<_>>()
-        })
-        .collect();
-    let mut alpha = Plane::filled(100, 1, 1.0);
-    alpha.data[99] = 0.49;
-    let map = decode_map(book, &features, &alpha).unwrap();
-    assert!(map.data[..50].iter().all(|&k| k == 2) && map.data[50..99].iter().all(|&k| k == 7));
-    assert_eq!(map.data[99], -1);
-    assert!(decode_map(book, &features[1..], &alpha).is_err());
+    // [16, 100], opaque but for the last pixel
+    let mix = |i: usize| {
+        let t = (i % 100) as f32 / 99.0;
+        (1.0 - t) * a[i / 100] + t * b[i / 100]
+    };
+    let features: Vec<f32> = (0..1600).map(mix).collect();
+    let mut alpha = [1.0; 100];
+    alpha[99] = 0.49;
+    let (codes, _) = crate::pass::decode::decode_pixels(&book.codes, 16, &features, &alpha);
+    assert!(codes[..50].iter().all(|&k| k == 2) && codes[50..99].iter().all(|&k| k == 7));
+    assert_eq!(codes[99], -1);
 }
 
 #[test]

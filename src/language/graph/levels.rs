@@ -4,8 +4,8 @@
 //! that forms early and is absorbed late, so level l is the set of disjoint nodes with the largest total persistence
 //! (the excess-of-mass rule of HDBSCAN, Campello et al. 2013), m the best such set strictly inside l's nodes, s inside
 //! m's.
+use super::options::{Cues, GraphOptions};
 use super::tree::Tree;
-use super::{Cues, GraphOptions};
 use crate::language::{LevelMasks, ViewMasks};
 use crate::scene::Plane;
 use std::collections::BTreeMap;

@@ -1,7 +1,7 @@
 //! Hierarchical region merging: superpixels → one binary tree.
+use super::options::{Cues, MergeOptions};
 use super::pixels::{self, BINS, COLOUR_BINS};
 use super::plane::PlaneFit;
-use super::{Cues, MergeOptions};
 use std::cmp::Ordering;
 use std::collections::{BTreeMap, BinaryHeap};
 

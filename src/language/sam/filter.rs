@@ -1,6 +1,18 @@
 //! Logits at points → proposals: enlarged to the photo, tested for stability, cut-off ones dropped, kept as runs.
-use super::{BORDER, Crop, MASKS, Proposals};
+use crate::infer::sam::{MASKS, Proposals};
 use rayon::prelude::*;
+
+/// Boxes nearer than this to a crop's border are cut off there, pixels (docs/method.md#masks-from-points).
+pub(super) const BORDER: i32 = 20;
+
+/// A rectangle of the photo, pixels, ends excluded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Crop {
+    pub x0: usize,
+    pub y0: usize,
+    pub x1: usize,
+    pub y1: usize,
+}
 
 /// A mask that the network proposed, in pixels of the whole photo.
 #[derive(Clone, Debug, PartialEq)]

@@ -13,12 +13,13 @@ use super::ViewMasks;
 use crate::infer::cache::Key;
 use crate::infer::contract::Part;
 use crate::infer::installed::Installed;
-use crate::infer::sam::{BATCH, MASKS, Proposals, Sam};
+use crate::infer::sam::{BATCH, MASKS, Sam};
 use crate::progress::Progress;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
 use bits::Bits;
-use filter::Candidate;
+use filter::{Candidate, Crop};
+use nms::Mask;
 
 /// How masks are proposed and chosen; the defaults are the paper's (LangSplat's).
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
@@ -58,18 +59,6 @@ impl Default for SamOptions {
 
 /// Proposals below these are not kept, so that thresholds can be lowered to them without asking the network again.
 const KEPT: (f32, f32) = (0.5, 0.5);
-
-/// Boxes nearer than this to a crop's border are cut off there, pixels (docs/method.md#masks-from-points).
-const BORDER: i32 = 20;
-
-/// A rectangle of the photo, pixels, ends excluded.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Crop {
-    x0: usize,
-    y0: usize,
-    x1: usize,
-    y1: usize,
-}
 
 /// The photo and, if asked for, the four overlapping quarters of layer 1 (docs/method.md#masks-from-points).
 fn crops(width: usize, height: usize, quarters: bool) -> Vec<Crop> {
@@ -175,23 +164,6 @@ fn cut(image: &RgbImage, crop: Crop) -> RgbImage {
     let rows = (crop.y0..crop.y1)
         .flat_map(|y| image.data[y * image.width + crop.x0..y * image.width + crop.x1].iter());
     RgbImage { width: crop.x1 - crop.x0, height: crop.y1 - crop.y0, data: rows.copied().collect() }
-}
-
-/// A mask that is still in the running.
-#[derive(Clone, Debug)]
-struct Mask {
-    bits: Bits,
-    iou: f32,
-    stability: f32,
-    crop: usize,
-    /// Cleaned up since the network gave it.
-    changed: bool,
-}
-
-impl Mask {
-    fn score(&self) -> f32 {
-        self.iou * self.stability
-    }
 }
 
 /// Proposals → label maps of the three levels.

@@ -1,7 +1,24 @@
 //! Non-maximum suppression: of masks that say the same the better one stays.
-use super::Mask;
+use super::bits::Bits;
 use rayon::prelude::*;
 use std::ops::Range;
+
+/// A mask that is still in the running.
+#[derive(Clone, Debug)]
+pub(super) struct Mask {
+    pub bits: Bits,
+    pub iou: f32,
+    pub stability: f32,
+    pub crop: usize,
+    /// Cleaned up since the network gave it.
+    pub changed: bool,
+}
+
+impl Mask {
+    pub fn score(&self) -> f32 {
+        self.iou * self.stability
+    }
+}
 
 /// Largest share of the inner mask that may be seen as lying inside another, and the other's share below which it is the
 /// larger one (docs/method.md#masks-from-points).

@@ -1,5 +1,5 @@
 //! Masks → one label per pixel.
-use super::Mask;
+use super::nms::Mask;
 use crate::language::LevelMasks;
 use crate::language::dir::MIN_MASK_PIXELS;
 use crate::scene::Plane;

@@ -1,10 +1,12 @@
 use super::*;
-use crate::pose::numeric::{Rng, rotation_angle};
+use crate::math::Random;
+use crate::pose::numeric::rotation_angle;
+use crate::scene::Lens;
 use nalgebra::DMatrix;
 
 /// Four cameras on an arc of 60° around 200 points; pixel noise `noise`.
 fn scene(noise: f64) -> (Problem, Problem) {
-    let mut rng = Rng::new(5);
+    let mut rng = Random::new(5);
     let mut p = Problem {
         centres: vec![DVec2::new(320.0, 240.0); 4],
         group: vec![0; 4],
@@ -31,7 +33,7 @@ fn scene(noise: f64) -> (Problem, Problem) {
     let truth = p.clone();
     p.optics[0] = Optics { focal: p.optics[0].focal * 1.15, lens: Lens::NONE, shift: DVec2::ZERO };
     for k in 1..4 {
-        let v = |rng: &mut Rng| DVec3::new(rng.normal(), rng.normal(), rng.normal()) * 0.02;
+        let v = |rng: &mut Random| DVec3::new(rng.normal(), rng.normal(), rng.normal()) * 0.02;
         p.poses[k] = Pose::exp(v(&mut rng), v(&mut rng)).compose(&p.poses[k]);
     }
     for x in &mut p.points {
@@ -43,7 +45,7 @@ fn scene(noise: f64) -> (Problem, Problem) {
 #[test]
 fn exact_data_with_outliers_is_recovered() {
     let (mut p, truth) = scene(0.0);
-    let mut rng = Rng::new(8);
+    let mut rng = Random::new(8);
     for o in p.observations.iter_mut().step_by(7) {
         o.pixel += DVec2::new(rng.normal(), rng.normal()) * 40.0;
     }

@@ -1,6 +1,7 @@
 //! Gains and vignetting from differences of brightness: robust linear least squares with honest doubts.
 use super::sample::Pair;
-use crate::pose::numeric::{cauchy_weight, median, quantile};
+use crate::math::{median, quantile};
+use crate::pose::numeric::cauchy_weight;
 use nalgebra::{DMatrix, DVector};
 use std::collections::BTreeMap;
 

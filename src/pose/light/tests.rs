@@ -1,5 +1,5 @@
 use super::*;
-use crate::pose::numeric::Rng;
+use crate::math::Random;
 use crate::pose::{SparsePoint, sparse, testing};
 use crate::progress::Silent;
 use crate::scene::{Camera, Pose, RgbImage, to_linear, to_srgb};
@@ -9,7 +9,7 @@ const SIZE: (usize, usize) = (320, 240);
 
 /// Photos of spots of plain colour at random places, lit as told, with noise in ln; every spot is seen by all photos.
 fn spots(lights: &[Light], noise: f64, seed: u64) -> (Vec<Photo>, SparseModel) {
-    let mut rng = Rng::new(seed);
+    let mut rng = Random::new(seed);
     let mut images =
         vec![RgbImage { width: SIZE.0, height: SIZE.1, data: vec![[0.5; 3]; SIZE.0 * SIZE.1] }; lights.len()];
     let camera = Camera {

@@ -1,12 +1,14 @@
 //! Step F: cameras, focal lengths, view scales and a smooth depth correction per view, adjusted together to the matches
 //! (Levenberg–Marquardt in f64, dense Cholesky).
 use super::canonical::{Canonical, Focals};
+use super::cholesky;
+use super::matches::PairMatches;
 use super::tree::Placement;
-use super::{ModelView, PairMatches, PairPointmaps, centre, cholesky};
 use crate::Result;
-use crate::pose::numeric::{cauchy, cauchy_weight, median, skew};
+use crate::math::median;
+use crate::pose::numeric::{cauchy, cauchy_weight, skew};
 use crate::progress::Progress;
-use crate::scene::Pose;
+use crate::scene::{ModelView, PairPointmaps, Pose};
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
 
@@ -130,7 +132,7 @@ impl Adjustment {
                 ((p.x.max(0.0) as usize).min(v.width - 1), (p.y.max(0.0) as usize).min(v.height - 1));
             let depth = canonical[view].points[y * v.width + x].z;
             let (corners, weights) = lattices[view].corners(p);
-            (depth > 0.0).then_some(End { view, pixel: p - centre(v), depth, corners, weights })
+            (depth > 0.0).then_some(End { view, pixel: p - v.centre(), depth, corners, weights })
         };
         let mut links = Vec::new();
         for (k, (pair, m)) in pairs.iter().zip(matches).enumerate() {

@@ -1,6 +1,6 @@
 //! Steps B and C: one depth map per view from all pairs that contain it, and the focal lengths.
-use super::{ModelView, PairPointmaps, Pointmap, centre, point};
-use crate::pose::numeric::median;
+use crate::math::median;
+use crate::scene::{ModelView, PairPointmaps, Pointmap};
 use glam::{DVec2, DVec3};
 
 /// What all pairs together say about one view, in the scale of its reference pair.
@@ -61,7 +61,7 @@ fn of_view(size: usize, maps: &[&Pointmap]) -> Canonical {
         let (mut sum, mut weight, mut squares) = (DVec3::ZERO, 0.0, 0.0);
         let (mut log, mut log2) = (0.0, 0.0);
         for (m, s) in maps.iter().zip(&scales) {
-            let (Some(s), p) = (*s, point(m.points[k])) else { continue };
+            let (Some(s), p) = (*s, m.point(k)) else { continue };
             if !(p.is_finite() && p.z > 0.0) {
                 continue;
             }
@@ -105,7 +105,7 @@ impl Focals {
 
 /// Weighted Weiszfeld estimate: minimises `Σ w |p − f·(x/z, y/z)|` over f.
 pub(super) fn weiszfeld(view: &ModelView, c: &Canonical) -> Option<(f64, f64)> {
-    let middle = centre(view);
+    let middle = view.centre();
     // Every third pixel in both axes: the estimate averages over tens of thousands all the same.
     let samples: Vec<(DVec2, DVec2, f64)> = (0..c.points.len())
         .filter(|k| (k % view.width).is_multiple_of(3) && (k / view.width).is_multiple_of(3))

@@ -46,11 +46,11 @@ pub(super) fn solve(mut a: DMatrix<f64>, b: &DVector<f64>) -> Option<DVector<f64
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::numeric::Rng;
+    use crate::math::Random;
 
     #[test]
     fn agrees_with_the_unblocked_factorisation_across_block_edges() {
-        let mut rng = Rng::new(2);
+        let mut rng = Random::new(2);
         for n in [1, 95, 96, 97, 300] {
             let j = DMatrix::from_fn(n + 5, n, |_, _| rng.normal());
             let a = j.transpose() * &j;

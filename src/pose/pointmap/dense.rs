@@ -1,10 +1,9 @@
 //! Step G: depth maps at working resolution, cleaned and masked, and de-duplicated points.
 use super::adjust::Adjustment;
 use super::canonical::Canonical;
-use super::{ModelView, centre, working_camera};
+use crate::math::quantile;
 use crate::pose::Geometry;
-use crate::pose::numeric::quantile;
-use crate::scene::{Camera, DepthMap, Plane, PointCloud};
+use crate::scene::{Camera, DepthMap, ModelView, Plane, PointCloud};
 use glam::DVec2;
 
 /// A less confident point this much in front of another view's surface is wrong (depth noise is about this large).
@@ -30,8 +29,7 @@ pub(super) fn output(views: &[ModelView], canonical: &[Canonical], a: &Adjustmen
         mask_edges(l);
     }
     let depths = views.iter().zip(&layers).map(|(v, l)| to_working(v, l)).collect();
-    let cameras =
-        (0..views.len()).map(|v| working_camera(&views[v], a.focal(v), &a.state.poses[v])).collect();
+    let cameras = (0..views.len()).map(|v| views[v].working_camera(a.focal(v), &a.state.poses[v])).collect();
     Geometry {
         cameras,
         depths,
@@ -43,7 +41,7 @@ pub(super) fn output(views: &[ModelView], canonical: &[Canonical], a: &Adjustmen
 }
 
 fn layer(view: &ModelView, c: &Canonical, a: &Adjustment, index: usize) -> Layer {
-    let middle = centre(view);
+    let middle = view.centre();
     let f = a.focal(index);
     let depth = (0..view.width * view.height)
         .map(|k| {

@@ -1,5 +1,5 @@
 //! Step A: matched pixels by reciprocal nearest neighbours, of descriptors or of 3-D points.
-use super::{Descriptors, ModelView, PairMatches, PairPointmaps, Pointmap};
+use crate::scene::{Descriptors, ModelView, PairPointmaps, Pointmap};
 use glam::DVec2;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -11,6 +11,13 @@ const ROUNDS: usize = 10;
 /// Most matches per pair, and the grid over which they are spread.
 const CAP: usize = 8192;
 const CELLS: usize = 16;
+
+/// Matched pixels of a pair: (position in the first, position in the second, weight > 0).
+#[derive(Clone, Debug, Default)]
+pub struct PairMatches {
+    /// Model pixels.
+    pub matches: Vec<(DVec2, DVec2, f64)>,
+}
 
 /// Follows seeds back and forth between two images until they return to themselves: every result is a pair of mutual
 /// nearest neighbours. `forward` maps pixels of A to their nearest in B, `backward` the reverse.
@@ -53,26 +60,6 @@ fn seeds(width: usize, height: usize) -> Vec<usize> {
         .collect()
 }
 
-/// Rows of `b` with the largest dot product; ties go to the lowest index.
-pub(crate) fn best_descriptors(a: &Descriptors, rows: &[usize], b: &Descriptors) -> Vec<usize> {
-    let d = a.dim;
-    // Sixteen queries share each pass over B, which is far larger than the caches.
-    rows.par_chunks(16)
-        .flat_map_iter(|chunk| {
-            let mut best = vec![(f32::NEG_INFINITY, 0usize); chunk.len()];
-            for (k, other) in b.data.chunks_exact(d).enumerate() {
-                for (slot, &row) in best.iter_mut().zip(chunk) {
-                    let dot: f32 = a.data[row * d..(row + 1) * d].iter().zip(other).map(|(x, y)| x * y).sum();
-                    if dot > slot.0 {
-                        *slot = (dot, k);
-                    }
-                }
-            }
-            best.into_iter().map(|s| s.1)
-        })
-        .collect()
-}
-
 /// Mutual nearest neighbours of dense descriptors (pixel of A, pixel of B), sorted; seeds from both images. `size` are
 /// (width, height) of A and B.
 pub fn descriptor_matches(
@@ -80,7 +67,7 @@ pub fn descriptor_matches(
     b: &Descriptors,
     size: [(usize, usize); 2],
 ) -> Vec<(usize, usize)> {
-    both_ways(size, |rows| best_descriptors(a, rows, b), |rows| best_descriptors(b, rows, a))
+    both_ways(size, |rows| a.nearest(rows, b), |rows| b.nearest(rows, a))
 }
 
 /// Mutual nearest neighbours of two pointmaps in one frame (pixel of A, pixel of B), sorted; seeds from both images.
@@ -213,11 +200,11 @@ fn split(points: &[[f32; 3]], order: &mut [u32], axis: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::numeric::Rng;
+    use crate::math::Random;
 
     #[test]
     fn every_match_is_mutual_by_brute_force() {
-        let mut rng = Rng::new(9);
+        let mut rng = Random::new(9);
         let (w, h, d) = (32, 24, 8);
         let mut random = |n: usize| Descriptors {
             dim: d,
@@ -252,7 +239,7 @@ mod tests {
 
     #[test]
     fn tree_search_equals_brute_force() {
-        let mut rng = Rng::new(1);
+        let mut rng = Random::new(1);
         let points: Vec<[f32; 3]> = (0..500).map(|_| std::array::from_fn(|_| rng.normal() as f32)).collect();
         let tree = Tree::new(&points);
         for _ in 0..200 {

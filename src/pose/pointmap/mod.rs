@@ -11,81 +11,12 @@ mod pairs;
 mod tree;
 
 use super::Geometry;
-use crate::photo::Affine;
 use crate::progress::Progress;
-use crate::scene::{Camera, Pose, RgbImage};
+use crate::scene::{ModelView, PairPointmaps};
 use crate::{Error, Result};
 use adjust::Adjustment;
-use glam::{DVec2, DVec3};
-pub(crate) use matches::best_descriptors;
-pub use matches::{descriptor_matches, point_matches};
+pub use matches::{PairMatches, descriptor_matches, point_matches};
 use pairs::Edge;
-
-/// One view as the network saw it.
-#[derive(Clone, Debug)]
-pub struct ModelView {
-    /// Name of the photo, for cameras and messages.
-    pub name: String,
-    /// Working-resolution photo: output size and colours.
-    pub image: RgbImage,
-    /// Width of the network's input.
-    pub width: usize,
-    /// Height of the network's input.
-    pub height: usize,
-    /// Working pixels → model pixels.
-    pub from_working: Affine,
-    /// Focal length from EXIF in model pixels.
-    pub exif_focal: Option<f64>,
-    /// Photos of one camera and size share this number.
-    pub camera_group: usize,
-}
-
-/// A point and a confidence (≥ 1) per pixel.
-#[derive(Clone, Debug, Default)]
-pub struct Pointmap {
-    /// [H, W] points; OpenCV axes of the camera that the pair names.
-    pub points: Vec<[f32; 3]>,
-    /// [H, W] confidence ≥ 1.
-    pub confidence: Vec<f32>,
-}
-
-/// Dense descriptors of one image.
-#[derive(Clone, Debug, Default)]
-pub struct Descriptors {
-    /// Descriptor length.
-    pub dim: usize,
-    /// [H, W, dim] unit vectors.
-    pub data: Vec<f32>,
-    /// [H, W] descriptor confidence ≥ 0.
-    pub confidence: Vec<f32>,
-}
-
-/// What a network says about a pair of views, decoded in both directions. The two directions, and different pairs, may
-/// have different scales.
-#[derive(Clone, Debug, Default)]
-pub struct PairPointmaps {
-    /// Index of the first view.
-    pub first: usize,
-    /// Index of the second view.
-    pub second: usize,
-    /// First view's pixels in the first camera.
-    pub x11: Pointmap,
-    /// Second view's pixels in the first camera.
-    pub x21: Pointmap,
-    /// Second view's pixels in the second camera.
-    pub x22: Pointmap,
-    /// First view's pixels in the second camera.
-    pub x12: Pointmap,
-    /// Descriptors D11, D21 (first decoding) and D12, D22 (second decoding), if the network has them.
-    pub descriptors: Option<[Descriptors; 4]>,
-}
-
-/// Matched pixels of a pair: (position in the first, position in the second, weight > 0).
-#[derive(Clone, Debug, Default)]
-pub struct PairMatches {
-    /// Model pixels.
-    pub matches: Vec<(DVec2, DVec2, f64)>,
-}
 
 /// Steps A–G.
 pub fn reconstruct(
@@ -194,31 +125,6 @@ fn parallax(views: &[ModelView], adjustment: &Adjustment) -> Result<()> {
         )));
     }
     Ok(())
-}
-
-/// Principal point of a model image: its centre.
-fn centre(view: &ModelView) -> DVec2 {
-    DVec2::new(view.width as f64, view.height as f64) * 0.5
-}
-
-/// Camera of the working-resolution photo.
-fn working_camera(view: &ModelView, focal: f64, pose: &Pose) -> Camera {
-    let c = centre(view);
-    let model = Camera {
-        name: view.name.clone(),
-        width: view.width as u32,
-        height: view.height as u32,
-        fx: focal,
-        fy: focal,
-        cx: c.x,
-        cy: c.y,
-        pose: *pose,
-    };
-    view.from_working.inverse().camera(&model, (view.image.width as u32, view.image.height as u32))
-}
-
-fn point(p: [f32; 3]) -> DVec3 {
-    DVec3::new(p[0] as f64, p[1] as f64, p[2] as f64)
 }
 
 #[cfg(test)]

@@ -1,9 +1,9 @@
 //! Step D: the relative pose and scale of each pair, estimated twice and compared.
 use super::canonical::{Canonical, Focals};
-use super::{ModelView, PairPointmaps, Pointmap, centre, point};
-use crate::pose::numeric::{cauchy_weight, from_na, median, rotation_angle, to_na};
+use crate::math::median;
+use crate::pose::numeric::{cauchy_weight, from_na, rotation_angle, to_na};
 use crate::pose::resect::resect;
-use crate::scene::Pose;
+use crate::scene::{ModelView, PairPointmaps, Pointmap, Pose};
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{Matrix3, Vector3};
 
@@ -80,10 +80,12 @@ impl Direction<'_> {
     fn solve(&self, views: &[ModelView], canonical: &[Canonical], focals: &Focals) -> Option<Relative> {
         let view = &views[self.seen];
         let chosen = confident(self.cross, self.own);
-        let world: Vec<DVec3> = chosen.iter().map(|&k| point(self.cross.points[k])).collect();
+        let world: Vec<DVec3> = chosen.iter().map(|&k| self.cross.point(k)).collect();
         let pixels: Vec<DVec2> = chosen
             .iter()
-            .map(|&k| DVec2::new((k % view.width) as f64 + 0.5, (k / view.width) as f64 + 0.5) - centre(view))
+            .map(|&k| {
+                DVec2::new((k % view.width) as f64 + 0.5, (k / view.width) as f64 + 0.5) - view.centre()
+            })
             .collect();
         let threshold = (0.005 * view.width as f64).max(2.0);
         let found = resect(&world, &pixels, focals.of(self.seen), threshold, 512)?;
@@ -108,7 +110,7 @@ impl Direction<'_> {
 
     /// Rotation frame → seen by aligning both predictions of the seen view, three robust rounds.
     fn procrustes(&self, chosen: &[usize], world: &[DVec3]) -> Option<DMat3> {
-        let own: Vec<DVec3> = chosen.iter().map(|&k| point(self.own.points[k])).collect();
+        let own: Vec<DVec3> = chosen.iter().map(|&k| self.own.point(k)).collect();
         let base: Vec<f64> = chosen
             .iter()
             .map(|&k| (self.own.confidence[k] as f64 * self.cross.confidence[k] as f64).sqrt())
@@ -132,9 +134,8 @@ impl Direction<'_> {
 /// Up to SAMPLES pixels, most confident half first thinned evenly.
 fn confident(cross: &Pointmap, own: &Pointmap) -> Vec<usize> {
     let value = |k: usize| (cross.confidence[k] * own.confidence[k]) as f64;
-    let usable: Vec<usize> = (0..cross.points.len())
-        .filter(|&k| point(cross.points[k]).is_finite() && point(own.points[k]).is_finite())
-        .collect();
+    let usable: Vec<usize> =
+        (0..cross.points.len()).filter(|&k| cross.point(k).is_finite() && own.point(k).is_finite()).collect();
     let Some(middle) = median(&mut usable.iter().map(|&k| value(k)).collect::<Vec<_>>()) else {
         return Vec::new();
     };

@@ -1,8 +1,11 @@
 use super::*;
+use crate::math::Random;
 use crate::pose::align::{PoseErrors, pose_errors};
-use crate::pose::numeric::{Rng, rotation_angle};
+use crate::pose::numeric::rotation_angle;
 use crate::pose::testing::{self, Truth};
 use crate::progress::Silent;
+use crate::scene::{Affine, Camera, Pointmap};
+use glam::{DVec2, DVec3};
 
 /// What is wrong with the pointmaps and matches.
 #[derive(Clone, Copy)]
@@ -58,7 +61,7 @@ impl Case {
     }
 
     /// Pixels of `v` as points in camera `frame`, scaled, with depth noise.
-    fn map(&self, v: usize, frame: usize, scale: f64, noise: f64, rng: &mut Rng) -> Pointmap {
+    fn map(&self, v: usize, frame: usize, scale: f64, noise: f64, rng: &mut Random) -> Pointmap {
         let n = self.depths[v].len();
         let points = (0..n)
             .map(|k| {
@@ -69,7 +72,7 @@ impl Case {
         Pointmap { points, confidence: (0..n).map(|_| 4.0 + 4.0 * rng.uniform() as f32).collect() }
     }
 
-    fn pair(&self, i: usize, j: usize, f: Faults, rng: &mut Rng) -> (PairPointmaps, PairMatches) {
+    fn pair(&self, i: usize, j: usize, f: Faults, rng: &mut Random) -> (PairPointmaps, PairMatches) {
         let mut scale = || (0.7 * rng.normal()).exp();
         let (s, t) = (scale(), scale());
         let pair = PairPointmaps {
@@ -102,7 +105,7 @@ impl Case {
     }
 
     fn input(&self, f: Faults) -> (Vec<PairPointmaps>, Vec<PairMatches>) {
-        let mut rng = Rng::new(12);
+        let mut rng = Random::new(12);
         let n = self.views.len();
         (0..n)
             .flat_map(|i| (i + 1..n).map(move |j| (i, j)))
@@ -145,7 +148,7 @@ fn noisy_pointmaps_place_cameras_and_depth() {
             .map(|(z, t)| (*z as f64 * e.similarity.scale / *t as f64 - 1.0).abs())
             .collect();
         assert!(errors.len() * 10 > full.len() * 4, "view {v}: {} of {}", errors.len(), full.len());
-        let middle = crate::pose::numeric::median(&mut errors).unwrap();
+        let middle = crate::math::median(&mut errors).unwrap();
         assert!(middle < 0.01, "view {v}: {middle}");
     }
     assert!(g.points.len() > 30_000, "{}", g.points.len());
@@ -217,7 +220,7 @@ fn residual_gradients_agree_with_differences() {
 #[test]
 fn matches_are_found_from_the_points_themselves() {
     let case = case();
-    let mut rng = Rng::new(3);
+    let mut rng = Random::new(3);
     let exact = Faults { depth: 0.0, pixels: 0.0, outliers: 0.0 };
     let (pair, _) = case.pair(0, 1, exact, &mut rng);
     let found = matches::of_pair(&case.views[0], &case.views[1], &pair);
@@ -232,7 +235,7 @@ fn matches_are_found_from_the_points_themselves() {
         })
         .collect();
     // Nearest pixels: up to 0.71 px off by rounding.
-    assert!(crate::pose::numeric::median(&mut errors).unwrap() < 0.75);
+    assert!(crate::math::median(&mut errors).unwrap() < 0.75);
 }
 
 #[test]
@@ -246,7 +249,7 @@ fn views_without_geometry_are_refused_by_name() {
     let error = align(&case.views, &p, &m, &Silent).unwrap_err();
     assert!(error.exit_code() == 2 && error.to_string().contains("train_00–train_02"), "{error}");
     // Identical photos: every map in the same frame.
-    let mut rng = Rng::new(5);
+    let mut rng = Random::new(5);
     let twin =
         Case { cameras: vec![case.cameras[0].clone(); 2], depths: vec![case.depths[0].clone(); 2], ..case };
     let (p, m) = twin.pair(0, 1, FAULTS, &mut rng);

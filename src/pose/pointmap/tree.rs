@@ -164,11 +164,12 @@ fn average_translations(p: &mut Placement, edges: &[Edge]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::numeric::{Rng, rotation_angle};
+    use crate::math::Random;
+    use crate::pose::numeric::rotation_angle;
 
     #[test]
     fn averaging_outvotes_a_wrong_edge() {
-        let mut rng = Rng::new(4);
+        let mut rng = Random::new(4);
         let truth: Vec<Pose> = (0..5)
             .map(|k| {
                 let k = k as f64;

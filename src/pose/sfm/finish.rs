@@ -1,19 +1,25 @@
 //! From a grown model to the final one: what the lens does, sightings refined to sub-pixel, further points.
+use super::families::MARGIN;
 use super::model::{Model, Sighting, Track};
 use super::optics::learn_optics;
 use super::patch::Shades;
-use super::relate::{Matches, Pair};
+use super::refine;
+use super::relate::{Matches, Pair, THRESHOLD};
 use super::tracks::{self, Link};
-use super::{MARGIN, THRESHOLD, cameras_of, colour_at, matching, refine};
-use crate::Result;
 use crate::photo::{Photo, Straightening};
 use crate::pose::bundle::Outcome;
+use crate::pose::matching;
 use crate::pose::two_view::{fundamental, sampson};
 use crate::pose::{Fitted, SparseModel, SparsePoint};
 use crate::progress::Progress;
-use crate::scene::{Lens, Plane, RgbImage};
+use crate::scene::{Camera, Lens, Plane, RgbImage};
+use crate::{Error, Result};
 use glam::DVec2;
 use rayon::prelude::*;
+
+/// Share of a photo's matches that agree with the cameras, from which on they are taken for right while growing: where they
+/// are it is 0.97 and more on the tuning sets, below 0.8 where cameras or focal lengths are wrong.
+pub(super) const AGREED: f64 = 0.9;
 
 /// What the model was grown from.
 pub(super) struct Evidence {
@@ -152,7 +158,7 @@ pub(super) fn agreement(model: &Model, pairs: &[Pair], threshold: f64) -> Vec<f6
         let share = |view: usize| {
             let own = pairs.iter().zip(&counts).filter(|(p, _)| {
                 let ends = [p.matches.first, p.matches.second];
-                ends.contains(&view) && ends.iter().all(|v| shares[*v].is_none_or(|s| s >= super::AGREED))
+                ends.contains(&view) && ends.iter().all(|v| shares[*v].is_none_or(|s| s >= AGREED))
             });
             let (agree, all) = own.fold((0, 0), |sum, (_, c)| (sum.0 + c.0, sum.1 + c.1));
             if all == 0 { 1.0 } else { agree as f64 / all as f64 }
@@ -216,7 +222,7 @@ fn sparse_model(photos: &[Photo], model: &Model, outcome: Outcome, agreement: &[
             .map(|s| (s.view, model.straight(s.view, s.pixel) + model.principal_point(s.view)))
             .collect();
         let s = t.sightings.first()?;
-        Some(SparsePoint { position: t.position?, colour: colour_at(&photos[s.view].image, s.pixel), views })
+        Some(SparsePoint { position: t.position?, colour: photos[s.view].image.nearest(s.pixel), views })
     };
     let points = model.tracks.iter().filter_map(point).collect();
     let fitted = |v: usize| Fitted {
@@ -232,4 +238,25 @@ fn sparse_model(photos: &[Photo], model: &Model, outcome: Outcome, agreement: &[
         focal_log_sigma: outcome.sigmas.iter().map(|s| s[0]).max_by(f64::total_cmp),
         fitted: (0..photos.len()).map(fitted).collect(),
     })
+}
+
+fn cameras_of(photos: &[Photo], model: &Model) -> Result<Vec<Camera>> {
+    photos
+        .iter()
+        .enumerate()
+        .map(|(v, p)| {
+            let pose = model.poses[v]
+                .ok_or_else(|| Error::work(format!("no camera position found for {}", p.stem)))?;
+            Ok(Camera {
+                name: p.path.file_name().map_or_else(|| p.stem.clone(), |n| n.to_string_lossy().into()),
+                width: p.image.width as u32,
+                height: p.image.height as u32,
+                fx: model.focal(v),
+                fy: model.focal(v),
+                cx: model.principal_point(v).x,
+                cy: model.principal_point(v).y,
+                pose,
+            })
+        })
+        .collect()
 }

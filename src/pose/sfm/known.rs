@@ -1,8 +1,12 @@
 //! Sparse points for cameras that are known already.
-use super::model::{Freedom, MIN_ANGLE_DEGREES, Model, Sighting};
-use super::{Features, THRESHOLD, colour_at, corner_families, matching, tracks};
+use super::families::{corner_families, keypoints};
+use super::finish::explained;
+use super::model::{Freedom, MIN_ANGLE_DEGREES, Model, Sighting, Track};
+use super::relate::{THRESHOLD, putative_matches};
+use super::tracks;
 use crate::photo::Photo;
 use crate::pose::bundle::{Optics, OpticsPrior};
+use crate::pose::matching::Features;
 use crate::pose::{SparseModel, SparsePoint};
 use crate::progress::Progress;
 use crate::scene::{Camera, Lens};
@@ -48,24 +52,24 @@ pub fn with_cameras(
         freedom: Freedom::Focal,
         tracks: Vec::new(),
     };
-    let mut putative = super::relate::putative_matches(&families, progress)?;
+    let mut putative = putative_matches(&families, progress)?;
     for pair in &mut putative {
         let (a, b) = (&cameras[pair.first], &cameras[pair.second]);
         pair.list.iter_mut().for_each(|m| (m.0, m.1) = (flat(a, m.0), flat(b, m.1)));
     }
     let tried: usize = putative.iter().map(|p| p.list.len()).sum();
-    let mut links = super::finish::explained(&model, &putative, threshold);
+    let mut links = explained(&model, &putative, threshold);
     let agreement = links.len() as f64 / tried.max(1) as f64;
     let keypoints: Vec<Vec<Sighting>> = (0..photos.len())
         .map(|v| {
-            let mut all = super::keypoints(&families, v);
+            let mut all = keypoints(&families, v);
             all.iter_mut().for_each(|s| s.pixel = flat(&cameras[v], s.pixel));
             all
         })
         .collect();
     model.tracks = tracks::join(&mut links, &keypoints)
         .into_iter()
-        .map(|sightings| super::model::Track { position: None, sightings })
+        .map(|sightings| Track { position: None, sightings })
         .collect();
     model.triangulate_all(threshold);
     model.prune(threshold);
@@ -95,17 +99,8 @@ pub fn with_cameras(
                 })
                 .collect();
             let (v, p) = *views.first()?;
-            Some(SparsePoint { position: t.position?, colour: colour_at(&photos[v].image, p), views })
+            Some(SparsePoint { position: t.position?, colour: photos[v].image.nearest(p), views })
         })
         .collect();
     Ok(SparseModel { cameras: placed, points, focal_log_sigma: None, fitted: Vec::new() })
-}
-
-/// Masked features of all detectors, per family and photo.
-pub(super) fn masked(photos: &[Photo], features: &[Features]) -> Vec<Features> {
-    photos
-        .iter()
-        .zip(features)
-        .map(|(p, f)| super::within(f, &matching::valid_area(&p.image, p.frame, super::MARGIN)))
-        .collect()
 }

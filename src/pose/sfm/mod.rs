@@ -1,4 +1,5 @@
 //! Structure from motion: the built-in initialiser that needs no large model.
+mod families;
 mod finish;
 mod grow;
 mod known;
@@ -9,20 +10,20 @@ mod refine;
 mod relate;
 mod tracks;
 
+use super::SparseModel;
 use super::bundle::{Optics, OpticsPrior};
-use super::matching::{self, Features};
-use super::{SparseModel, sift};
+use super::matching::Features;
 use crate::photo::Photo;
 use crate::progress::Progress;
-use crate::scene::{Camera, Lens, Plane, RgbImage};
+use crate::scene::Lens;
 use crate::{Error, Result};
-use finish::{Evidence, agreement, finish};
+use families::{corner_families, keypoints};
+use finish::{AGREED, Evidence, agreement, finish};
 use glam::DVec2;
 use grow::grow;
 pub use known::with_cameras;
 use model::{Freedom, Model, Sighting};
-use rayon::prelude::*;
-use relate::Pair;
+use relate::{Pair, THRESHOLD};
 use tracks::Link;
 
 /// ln f of a photo without EXIF: 0.9 × the long side covers phones (0.8) to normal lenses (1.2) within one σ.
@@ -35,8 +36,6 @@ const EXIF_SIGMA: f64 = 0.05;
 const LENS_SIGMA: f64 = 0.05;
 /// Principal point from the middle, as a share of the long side: stabilised sensors move by up to a hundredth.
 const SHIFT_SIGMA: f64 = 0.007;
-/// Agreement threshold as a fraction of the long side: 3 px at 640, three times the noise of learned keypoints.
-const THRESHOLD: f64 = 3.0 / 640.0;
 /// Cameras and sparse points from photos and their learned features (one per photo; may be empty, then only the
 /// built-in corner detector is used).
 pub fn reconstruct(photos: &[Photo], features: &[Features], progress: &dyn Progress) -> Result<SparseModel> {
@@ -62,44 +61,6 @@ pub fn reconstruct(photos: &[Photo], features: &[Features], progress: &dyn Progr
 
 /// Steps of the progress bar: corners, matches, poses, refinement, extension.
 const STEPS: u64 = 5;
-
-/// Strongest corners kept per photo: matching stays below a second for four photos.
-const MAX_CORNERS: usize = 4000;
-
-/// Pixels next to the image edge that hold no features: their neighbourhood is cut off.
-const MARGIN: usize = 4;
-
-/// Features per detector family (built-in corners first, then the learned ones if given) and photo.
-fn corner_families(
-    photos: &[Photo],
-    features: &[Features],
-    progress: &dyn Progress,
-) -> Result<Vec<Vec<Features>>> {
-    progress.check()?;
-    let own: Vec<Features> = photos
-        .par_iter()
-        .map(|p| sift::detect(&p.image.luma(), &matching::valid_area(&p.image, p.frame, MARGIN), MAX_CORNERS))
-        .collect();
-    progress.check()?;
-    let mut families = vec![own];
-    if features.len() == photos.len() {
-        families.push(known::masked(photos, features));
-    }
-    Ok(families)
-}
-
-/// Features on valid pixels.
-fn within(f: &Features, valid: &Plane<bool>) -> Features {
-    let mut out = Features { dim: f.dim, ..Default::default() };
-    for (k, p) in f.points.iter().enumerate() {
-        let (x, y) = (p.x.max(0.0) as usize, p.y.max(0.0) as usize);
-        if x < valid.width && y < valid.height && valid.at(x, y) {
-            out.points.push(*p);
-            out.descriptors.extend_from_slice(&f.descriptors[k * f.dim..(k + 1) * f.dim]);
-        }
-    }
-    out
-}
 
 /// Cameras, numbered in any way, if photos share one only where their files name it and its zoom. What such photos say against
 /// it is then image stabilisation, which moves the lens from photo to photo, and no other camera.
@@ -157,18 +118,8 @@ fn empty_model(photos: &[Photo]) -> Model {
     }
 }
 
-/// All keypoints of a view, numbered as the links number them.
-fn keypoints(families: &[Vec<Features>], view: usize) -> Vec<Sighting> {
-    let all = families.iter().enumerate().flat_map(|(k, f)| f[view].points.iter().map(move |p| (k, *p)));
-    all.map(|(family, pixel)| Sighting { view, pixel, sigma: 1.0, family }).collect()
-}
-
 /// Seeds that a reconstruction may grow from.
 const SEEDS: usize = 3;
-
-/// Share of a photo's matches that agree with the cameras, from which on they are taken for right while growing: where they
-/// are it is 0.97 and more on the tuning sets, below 0.8 where cameras or focal lengths are wrong.
-const AGREED: f64 = 0.9;
 
 /// Cameras and triangulated tracks of all photos from the pairs that agree.
 fn assemble(
@@ -228,31 +179,6 @@ fn assemble(
             names()
         ))
     })
-}
-
-fn colour_at(image: &RgbImage, p: DVec2) -> [f32; 3] {
-    image.at((p.x.max(0.0) as usize).min(image.width - 1), (p.y.max(0.0) as usize).min(image.height - 1))
-}
-
-fn cameras_of(photos: &[Photo], model: &Model) -> Result<Vec<Camera>> {
-    photos
-        .iter()
-        .enumerate()
-        .map(|(v, p)| {
-            let pose = model.poses[v]
-                .ok_or_else(|| Error::work(format!("no camera position found for {}", p.stem)))?;
-            Ok(Camera {
-                name: p.path.file_name().map_or_else(|| p.stem.clone(), |n| n.to_string_lossy().into()),
-                width: p.image.width as u32,
-                height: p.image.height as u32,
-                fx: model.focal(v),
-                fy: model.focal(v),
-                cx: model.principal_point(v).x,
-                cy: model.principal_point(v).y,
-                pose,
-            })
-        })
-        .collect()
 }
 
 #[cfg(test)]

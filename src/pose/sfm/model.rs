@@ -204,7 +204,7 @@ impl Model {
             Some(self.error(s, t.position?)).filter(|e| e.is_finite())
         };
         let mut all: Vec<f64> = self.tracks.iter().filter_map(of_track).collect();
-        crate::pose::numeric::median(&mut all).unwrap_or(0.0)
+        crate::math::median(&mut all).unwrap_or(0.0)
     }
 
     /// Position from the registered sightings: least squares on ray distances, then Gauss–Newton on pixels. `None` when
@@ -379,7 +379,7 @@ impl Model {
                 squares.extend(of_family.map(|s| self.error(s, x).powi(2) * share).filter(|e| e.is_finite()));
             }
             // The median of the squared length of a 2-D normal deviate is 2 ln 2 σ².
-            let Some(middle) = crate::pose::numeric::median(&mut squares) else { continue };
+            let Some(middle) = crate::math::median(&mut squares) else { continue };
             // Below 0.05 px the lens, not the detector, limits; a smaller σ would only freeze the solution.
             let sigma = (middle / (2.0 * std::f64::consts::LN_2)).sqrt().max(0.05);
             for s in self.tracks.iter_mut().flat_map(|t| &mut t.sightings).filter(|s| s.family == family) {
@@ -399,7 +399,7 @@ impl Model {
             .flat_map(|(t, x)| t.sightings.iter().filter_map(move |s| model.project(s.view, x)))
             .map(|(_, z)| z)
             .collect();
-        let Some(scale) = crate::pose::numeric::median(&mut depths) else { return };
+        let Some(scale) = crate::math::median(&mut depths) else { return };
         let back = first.inverse();
         for pose in self.poses.iter_mut().flatten() {
             *pose = pose.compose(&back).orthonormalised();

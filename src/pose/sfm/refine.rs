@@ -48,7 +48,7 @@ impl Seen {
         near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.2.total_cmp(&b.2)));
         near.truncate(NEIGHBOURS);
         let mut middle: Vec<f64> = near.iter().map(|n| n.2).collect();
-        let scale = crate::pose::numeric::median(&mut middle)?;
+        let scale = crate::math::median(&mut middle)?;
         let mut x = DVec3::new(scale, 0.0, 0.0);
         for _ in 0..3 {
             let (mut h, mut g) = (DMat3::ZERO, DVec3::ZERO);

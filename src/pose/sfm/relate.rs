@@ -1,5 +1,4 @@
 //! What pairs of photos have in common: matches by the looks of their features, and the geometry on which they agree.
-use super::THRESHOLD;
 use super::model::Model;
 use super::tracks::Link;
 use crate::photo::Photo;
@@ -10,6 +9,9 @@ use crate::scene::RgbImage;
 use crate::{Error, Result};
 use glam::DVec2;
 use rayon::prelude::*;
+
+/// Agreement threshold as a fraction of the long side: 3 px at 640, three times the noise of learned keypoints.
+pub(super) const THRESHOLD: f64 = 3.0 / 640.0;
 
 /// Matches between two views.
 pub(super) struct Matches {

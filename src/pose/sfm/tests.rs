@@ -2,6 +2,7 @@ use super::*;
 use crate::pose::align::pose_errors;
 use crate::pose::testing::{self, bilinear, lensed};
 use crate::progress::Silent;
+use crate::scene::{Camera, RgbImage};
 
 /// Learned features when the model pack is installed.
 fn learned(photos: &[Photo]) -> Vec<Features> {
@@ -59,7 +60,7 @@ fn known_cameras_give_points_on_the_true_surface() {
             break;
         }
     }
-    assert!(super::super::numeric::median(&mut errors).unwrap() < 0.005);
+    assert!(crate::math::median(&mut errors).unwrap() < 0.005);
     // Cameras of other photos must be refused: mirror the rig.
     let mut wrong = truth.cameras.clone();
     wrong.reverse();
@@ -123,7 +124,7 @@ fn two_photos_of_different_size_and_known_focal_are_enough() {
     // The second photo comes from a file of 1.6 times its size, as another working resolution of the same camera.
     let half = &mut truth.photos[1];
     half.original_size = (1024, 768);
-    half.to_working = crate::photo::Affine::resize(half.original_size, (640, 480));
+    half.to_working = crate::scene::Affine::resize(half.original_size, (640, 480));
     for (p, c) in truth.photos.iter_mut().zip(&truth.cameras) {
         p.exif_focal = Some(c.fx * 1.02);
     }

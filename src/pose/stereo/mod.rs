@@ -3,6 +3,7 @@
 mod colours;
 mod fill;
 mod fuse;
+mod options;
 mod planes;
 mod surface;
 #[cfg(test)]
@@ -10,67 +11,15 @@ mod tests;
 mod views;
 mod void;
 
+pub use options::StereoOptions;
 pub use views::{Level, pyramid};
 
 use crate::Result;
-use crate::fit::Preset;
 use crate::gpu::Device;
-use crate::pass::plane_sweep::{GpuMatcher, MAX_SOURCES, Matcher, Reference};
+use crate::pass::plane_sweep::{GpuMatcher, Matcher, Reference};
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, Plane, PointCloud, RgbImage};
 use glam::{DVec3, Vec4};
-
-/// How dense stereo works; the defaults are meant for 3–4 photos of about 640 × 480.
-#[derive(Clone, Debug, PartialEq)]
-pub struct StereoOptions {
-    /// Source views per reference view, at most 4.
-    pub sources: usize,
-    /// Inverse depths of the initial sweep at the coarsest resolution.
-    pub planes: u32,
-    /// Photometric propagation rounds at the coarsest resolution.
-    pub coarse_rounds: u32,
-    /// Rounds with the geometric term per resolution, coarsest first; the length is the number of resolutions.
-    pub rounds: Vec<u32>,
-    /// Weight of the geometric term per pixel of forward–backward reprojection error.
-    pub geometric: f32,
-    /// Weight of the disagreement with the neighbours' depth: carries planes over weak texture.
-    pub smoothness: f32,
-    /// Seed of the hashed random numbers.
-    pub seed: u32,
-    /// Bytes that the device binds at once: larger photos are matched at half their size, or less.
-    pub binding: u64,
-}
-
-impl Default for StereoOptions {
-    fn default() -> Self {
-        StereoOptions {
-            sources: MAX_SOURCES,
-            planes: 48,
-            coarse_rounds: 6,
-            rounds: vec![4, 4, 3],
-            // 0.1 per pixel, saturating at 3 px: the same strength as ACMM's.
-            geometric: 0.1,
-            // A fully different neighbourhood costs as much as 0.1 of correlation, less than real texture tells. On dark
-            // photos of a room (dining) 0.05 leaves 21 % and 0.4 20 % of the pixels wrong by a tenth, 0.1 leaves 18 %.
-            smoothness: 0.1,
-            seed: 1,
-            // What every Vulkan device binds.
-            binding: 1 << 27,
-        }
-    }
-}
-
-impl StereoOptions {
-    /// The options of a preset. A draft looks at the finest resolution once: three rounds there take three times as long
-    /// and gain 0.1 dB on breakfast, while depth at half the photos' size loses 1.4 dB.
-    pub fn preset(preset: Preset) -> StereoOptions {
-        let full = StereoOptions::default();
-        match preset {
-            Preset::Draft => StereoOptions { rounds: vec![4, 4, 1], ..full },
-            Preset::Default | Preset::Paper => full,
-        }
-    }
-}
 
 /// Depth of every photo (complete but for white borders; confidence tells matched from filled) and fused points, from
 /// cameras at the photos' working resolutions. `sparse` are points of the scene in world coordinates: they set the

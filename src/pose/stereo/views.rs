@@ -45,7 +45,7 @@ fn tolerance(view: usize, cameras: &[Camera], chosen: &[usize], sparse: &[DVec3]
         sources.map(|&s| parallax(&cameras[view], &cameras[s], *p)).reduce(f64::max)
     };
     let mut all: Vec<f64> = sparse.iter().filter(|p| seen(&cameras[view], **p)).filter_map(best).collect();
-    let typical = crate::pose::numeric::median(&mut all).unwrap_or(f64::INFINITY);
+    let typical = crate::math::median(&mut all).unwrap_or(f64::INFINITY);
     (REPROJECTION_TOLERANCE / typical as f32).clamp(DEPTH_TOLERANCE, COARSEST_TOLERANCE)
 }
 

@@ -1,4 +1,5 @@
 //! The figures of one frame: colour fit, depth, masks.
+use crate::math::median;
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
 use serde::Serialize;
@@ -51,7 +52,7 @@ pub fn depth_score(
     let pairs = depth.data.iter().zip(&alpha.data).zip(&truth.data);
     let solid = pairs.filter(|((z, a), t)| **z > 0.0 && **a >= SOLID && **t > 0.0);
     let pairs: Vec<(f64, f64)> = solid.map(|((z, _), t)| (f64::from(*z), f64::from(*t))).collect();
-    let median_of = |of: &dyn Fn(&(f64, f64)) -> f64| median(pairs.iter().map(of).collect());
+    let median_of = |of: &dyn Fn(&(f64, f64)) -> f64| median(&mut pairs.iter().map(of).collect::<Vec<_>>());
     let own = median_of(&|p| p.1)? / median_of(&|p| p.0)?;
     let n = pairs.len() as f64;
     let near = |p: &&(f64, f64)| (own * p.0 / p.1).max(p.1 / (own * p.0)) < 1.25;
@@ -60,15 +61,6 @@ pub fn depth_score(
         abs_rel: pairs.iter().map(|(z, t)| (own * z - t).abs() / t).sum::<f64>() / n,
         delta: pairs.iter().filter(near).count() as f64 / n,
     })
-}
-
-/// The upper of the two middle values of an even number.
-fn median(mut values: Vec<f64>) -> Option<f64> {
-    if values.is_empty() {
-        return None;
-    }
-    let middle = values.len() / 2;
-    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 /// Intersection over union of a mask (resampled to the truth's size by nearest pixel) and one object; 0 when both are

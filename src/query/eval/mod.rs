@@ -16,9 +16,10 @@ pub use truth::{Frame, GroundTruth, Split};
 use super::QueryResult;
 use crate::format::picture;
 use crate::pass::metrics;
-use crate::pose::align::{PoseErrors, Similarity, pose_errors};
+use crate::photo::stem;
+use crate::pose::align::{PoseErrors, pose_errors};
 use crate::pose::relative::{auc, pair_errors};
-use crate::scene::{Camera, Plane, Pose, RgbImage};
+use crate::scene::{Camera, Plane, Pose, RgbImage, Similarity};
 use crate::{Error, Result};
 use figures::quantised;
 use serde::Serialize;
@@ -197,7 +198,7 @@ impl Belief {
     fn of(estimated: &[Camera], known: &[Camera]) -> Belief {
         let median = |value: &dyn Fn(&Camera, &Camera) -> f64| {
             let mut all: Vec<f64> = estimated.iter().zip(known).map(|(e, k)| value(e, k)).collect();
-            crate::pose::numeric::median(&mut all).unwrap_or(0.0)
+            crate::math::median(&mut all).unwrap_or(0.0)
         };
         let of_width = |c: &Camera, x: f64| x / f64::from(c.width);
         let of_height = |c: &Camera, y: f64| y / f64::from(c.height);
@@ -487,10 +488,6 @@ fn write_files(out: &Path, stem: &str, shown: &RgbImage, answers: &[(u32, QueryR
         picture::write_mask_png(&path, &answer.mask)?;
     }
     Ok(())
-}
-
-fn stem(name: &str) -> &str {
-    Path::new(name).file_stem().and_then(|s| s.to_str()).unwrap_or(name)
 }
 
 fn make_parent(path: &Path) -> Result<()> {

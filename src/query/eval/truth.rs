@@ -1,5 +1,6 @@
 //! Ground-truth folders: `ground_truth.json`, photos, `masks/<stem>.png`, `depth/<stem>.npz`.
 use crate::format::npy;
+use crate::photo::stem;
 use crate::scene::{Camera, Lens, Plane, Pose, RgbImage};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
@@ -89,8 +90,7 @@ impl GroundTruth {
             let m = f.world_to_camera;
             let column = |c: usize| DVec3::new(m[0][c], m[1][c], m[2][c]);
             let rotation = DMat3::from_cols(column(0), column(1), column(2));
-            let stem = Path::new(&f.file).file_stem().map(|s| s.to_string_lossy().into_owned());
-            let stem = stem.unwrap_or_default();
+            let stem = stem(&f.file).to_string();
             let pose = Pose { rotation, translation: column(3) };
             let camera =
                 Camera { name: f.file.clone(), width, height, fx: f.fx, fy: f.fy, cx: f.cx, cy: f.cy, pose };

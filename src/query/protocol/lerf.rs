@@ -1,7 +1,9 @@
 //! LERF-OVS as LangSplat evaluates it (docs/method.md#lerf-ovs): polygons and boxes per labelled frame.
 use super::super::filter;
-use super::summarise;
-use super::{Kind, Masks, OwnLabels, Protocol, Report, Score, Seen, View, mask_iou, mean, place, polygon};
+use super::polygon;
+use super::score::{
+    Kind, Masks, OwnLabels, Protocol, Report, Score, Seen, View, mask_iou, mean, place, summarise,
+};
 use crate::query::eval::MIN_OBJECT_PIXELS;
 use crate::scene::{Camera, Plane};
 use crate::{Error, Result};

@@ -1,6 +1,7 @@
 //! 3D-OVS (docs/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and the data set's own argmax.
-use super::summarise;
-use super::{Kind, Masks, OwnLabels, Protocol, Report, Score, Seen, View, mask_iou, mean, nearest, place};
+use super::score::{
+    Kind, Masks, OwnLabels, Protocol, Report, Score, Seen, View, mask_iou, mean, nearest, place, summarise,
+};
 use crate::query::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, Split};
 use crate::scene::{Camera, Plane};
 use crate::{Error, Result};

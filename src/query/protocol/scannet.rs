@@ -1,6 +1,6 @@
 //! ScanNet with the eight labels of LSM (paper, "Comparison with Feed-forward LSM").
-use super::{Kind, Masks, Protocol, Report, Score, Seen, Summary, View, nearest, place};
-use crate::format::cameras::stem;
+use super::score::{Kind, Masks, Protocol, Report, Score, Seen, Summary, View, nearest, place};
+use crate::photo::stem;
 use crate::query::eval::Split;
 use crate::scene::{Camera, Plane, Pose};
 use crate::{Error, Result};
@@ -51,7 +51,7 @@ impl ScanNet {
         for entry in std::fs::read_dir(&labels).map_err(Error::io(&labels))? {
             let path = entry.map_err(Error::io(&labels))?.path();
             if path.extension().is_some_and(|e| e == "png") {
-                stems.push(stem(&path.to_string_lossy()));
+                stems.push(stem(&path.to_string_lossy()).to_string());
             }
         }
         stems.sort_by_key(|s| (s.len(), s.clone()));

@@ -1,24 +1,15 @@
 //! Each protocol against a plain computation in f64 that shares no code with it.
 use super::*;
-use crate::scene::{Codebook, LevelField, Pose};
+use crate::math::Random;
+use crate::query::TextQuery;
+use crate::query::eval::{GroundTruth, Split};
+use crate::scene::{Codebook, LanguageField, LevelField, Plane, Pose};
 use glam::DVec3;
 
-/// SplitMix64.
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-    }
-    fn unit(&mut self) -> Vec<f32> {
-        let v: Vec<f64> = (0..3).map(|_| self.next() - 0.5).collect();
-        let n = v.iter().map(|x| x * x).sum::<f64>().sqrt();
-        v.iter().map(|x| (x / n) as f32).collect()
-    }
+fn unit(random: &mut Random) -> Vec<f32> {
+    let v: Vec<f64> = (0..3).map(|_| random.uniform() - 0.5).collect();
+    let n = v.iter().map(|x| x * x).sum::<f64>().sqrt();
+    v.iter().map(|x| (x / n) as f32).collect()
 }
 
 /// Levels s and l with five codes each, m without any.
@@ -27,7 +18,7 @@ fn field(random: &mut Random) -> LanguageField {
         codebook: Codebook {
             embedding_dim: 3,
             code_dim: 1,
-            embeddings: (0..codes).flat_map(|_| random.unit()).collect(),
+            embeddings: (0..codes).flat_map(|_| unit(random)).collect(),
             ..Codebook::default()
         },
         ..LevelField::default()
@@ -38,15 +29,15 @@ fn field(random: &mut Random) -> LanguageField {
 fn query(text: &str, random: &mut Random) -> TextQuery {
     TextQuery {
         text: text.into(),
-        embedding: random.unit(),
-        canonicals: (0..4).flat_map(|_| random.unit()).collect(),
+        embedding: unit(random),
+        canonicals: (0..4).flat_map(|_| unit(random)).collect(),
     }
 }
 
 /// Blocks of random codes, some void.
 fn codes(width: usize, height: usize, random: &mut Random) -> Vec<Plane<i32>> {
     let one = |random: &mut Random| {
-        let blocks: Vec<i32> = (0..48).map(|_| (random.next() * 6.0) as i32 - 1).collect();
+        let blocks: Vec<i32> = (0..48).map(|_| (random.uniform() * 6.0) as i32 - 1).collect();
         let data = (0..width * height).map(|p| blocks[p / width * 6 / height * 8 + p % width * 8 / width]);
         Plane { width, height, data: data.collect() }
     };
@@ -163,7 +154,7 @@ fn lerf_equals_a_plain_computation() {
     std::fs::write(folder.path().join("frame_00001.json"), lerf_label().to_string()).unwrap();
     let scene = [camera("frame_00001", 0.0, (W as u32, H as u32))];
     for seed in 1000..1008 {
-        let mut random = Random(seed);
+        let mut random = Random::new(seed);
         let (field, codes) = (field(&mut random), codes(W, H, &mut random));
         let mut protocol = open(Kind::Lerf, folder.path(), &scene, &[]).unwrap();
         assert_eq!(protocol.prompts(), ["cup", "plate"]);
@@ -232,7 +223,7 @@ fn lerf_ties_go_to_the_finer_level_and_larger_labels_resample() {
     });
     std::fs::write(folder.path().join("a.json"), label.to_string()).unwrap();
     let scene = [camera("a", 0.0, (W as u32, H as u32))];
-    let mut random = Random(7);
+    let mut random = Random::new(7);
     let mut field = field(&mut random);
     field.levels[2] = field.levels[0].clone();
     let q = query("x", &mut random);
@@ -255,10 +246,10 @@ fn lerf_ties_go_to_the_finer_level_and_larger_labels_resample() {
 
 #[test]
 fn polygons_equal_crossing_numbers_and_outlines() {
-    let mut random = Random(1001);
+    let mut random = Random::new(1001);
     for case in 0..200 {
         let n = 1 + case % 7;
-        let polygon: Vec<[f64; 2]> = (0..n).map(|_| [0; 2].map(|_| random.next() * 50.0 - 10.0)).collect();
+        let polygon: Vec<[f64; 2]> = (0..n).map(|_| [0; 2].map(|_| random.uniform() * 50.0 - 10.0)).collect();
         let mut mask = Plane::filled(30, 30, false);
         polygon::fill(&mut mask, &polygon);
         let p: Vec<[f64; 2]> = polygon.iter().map(|v| v.map(f64::trunc)).collect();
@@ -315,7 +306,7 @@ fn ovs_rules_equal_plain_computations() {
     let down = |mask: &[bool]| -> Vec<bool> { (0..W * H).map(|p| mask[up(p)]).collect() };
     let (mut passed, mut substituted) = (0, 0);
     for seed in 1000..1030 {
-        let mut random = Random(seed);
+        let mut random = Random::new(seed);
         let (field, codes) = (field(&mut random), codes(2 * W, 2 * H, &mut random));
         let mut protocol = open(Kind::Ovs, folder.path(), &scene, &[]).unwrap();
         assert_eq!(protocol.prompts(), ["hand", "wood wall", "cat"]);
@@ -455,7 +446,7 @@ fn scannet_counts_eight_labels_and_places_frames_by_their_poses() {
     let expected = turn * DVec3::new(2.0, 0.4, 0.0) * 0.5;
     assert!((views[2].camera.pose.centre() - expected).length() < 1e-9);
 
-    let mut random = Random(1004);
+    let mut random = Random::new(1004);
     let (field, codes) = (field(&mut random), codes(W, H, &mut random));
     let queries: Vec<TextQuery> = protocol.prompts().iter().map(|p| query(p, &mut random)).collect();
     let scores = CodeScores::new(&field, &queries).unwrap();

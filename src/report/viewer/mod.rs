@@ -10,7 +10,7 @@ pub use pack::{Packed, pack};
 use super::colour;
 use crate::Result;
 use crate::format::picture;
-use crate::query::Highlight;
+use crate::query::highlight::Highlight;
 use crate::scene::{Camera, LEVEL_NAMES, LanguageField, RgbImage, Splats};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -108,7 +108,7 @@ impl Scene3d<'_> {
         let mut manifest = self.manifest(mute.unwrap_or_default())?;
         manifest["live"] = mute.is_none().into();
         manifest["scene"] = SCENE_PATH.into();
-        let title = super::html::escape(self.title);
+        let title = super::chart::escape(self.title);
         Ok(format!(
             "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><meta name=\"viewport\" \
              content=\"width=device-width, initial-scale=1, viewport-fit=cover\"><title>{title} · splatvk</title>\
@@ -151,7 +151,7 @@ fn view(camera: &Camera, photo: Option<&RgbImage>) -> Result<Value> {
     // glam is column-major; the page wants rows.
     let rotation = camera.pose.rotation.transpose().to_cols_array();
     Ok(json!({
-        "name": crate::format::cameras::stem(&camera.name), "width": camera.width, "height": camera.height,
+        "name": crate::photo::stem(&camera.name), "width": camera.width, "height": camera.height,
         "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
         "rotation": rotation, "translation": camera.pose.translation.to_array(), "thumbnail": thumbnail,
     }))

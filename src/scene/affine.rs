@@ -1,5 +1,5 @@
 //! Where a pixel goes when an image is resized, cropped or padded.
-use crate::scene::Camera;
+use super::Camera;
 use serde::{Deserialize, Serialize};
 
 /// Axis-aligned affine map of pixel positions, `u' = s·u + o` per axis (docs/method.md#pixel-maps).

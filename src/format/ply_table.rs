@@ -1,0 +1,245 @@
+//! Elements of PLY files as tables.
+use crate::{Error, Result};
+use std::path::Path;
+
+/// A column of a PLY element.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Kind {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Kind {
+    fn parse(name: &str) -> Option<Kind> {
+        Some(match name {
+            "char" | "int8" => Kind::I8,
+            "uchar" | "uint8" => Kind::U8,
+            "short" | "int16" => Kind::I16,
+            "ushort" | "uint16" => Kind::U16,
+            "int" | "int32" => Kind::I32,
+            "uint" | "uint32" => Kind::U32,
+            "float" | "float32" => Kind::F32,
+            "double" | "float64" => Kind::F64,
+            _ => return None,
+        })
+    }
+    const fn size(self) -> usize {
+        match self {
+            Kind::I8 | Kind::U8 => 1,
+            Kind::I16 | Kind::U16 => 2,
+            Kind::I32 | Kind::U32 | Kind::F32 => 4,
+            Kind::F64 => 8,
+        }
+    }
+    /// `bytes` holds exactly this kind's size; `N` extra bytes are never read.
+    fn value(self, bytes: &[u8], little: bool) -> f64 {
+        let mut raw = [0u8; 8];
+        let size = self.size();
+        for (k, b) in bytes.iter().take(size).enumerate() {
+            raw[if little { k } else { size - 1 - k }] = *b;
+        }
+        let bits = u64::from_le_bytes(raw);
+        match self {
+            Kind::I8 => bits as u8 as i8 as f64,
+            Kind::U8 => bits as f64,
+            Kind::I16 => bits as u16 as i16 as f64,
+            Kind::U16 => bits as f64,
+            Kind::I32 => bits as u32 as i32 as f64,
+            Kind::U32 => bits as f64,
+            Kind::F32 => f32::from_bits(bits as u32) as f64,
+            Kind::F64 => f64::from_bits(bits),
+        }
+    }
+}
+
+/// The `vertex` element of a PLY file.
+pub(super) struct Table {
+    pub rows: usize,
+    pub columns: Vec<(String, Kind)>,
+    /// [rows, columns]
+    values: Vec<f32>,
+}
+
+impl Table {
+    fn column(&self, name: &str) -> Option<usize> {
+        self.columns.iter().position(|c| c.0 == name)
+    }
+    pub fn at(&self, row: usize, column: usize) -> f32 {
+        self.values[row * self.columns.len() + column]
+    }
+    /// Column numbers of all the names, or the first name that is missing.
+    pub fn all<const N: usize>(&self, names: [&str; N]) -> Result<[usize; N], String> {
+        let mut out = [0; N];
+        for (o, name) in out.iter_mut().zip(names) {
+            *o = self.column(name).ok_or_else(|| name.to_string())?;
+        }
+        Ok(out)
+    }
+    /// Columns `prefix0, prefix1, …` as long as they go on.
+    pub fn series(&self, prefix: &str) -> Vec<usize> {
+        (0..).map_while(|k| self.column(&format!("{prefix}{k}"))).collect()
+    }
+}
+
+pub(super) struct Header {
+    ascii: bool,
+    little: bool,
+    /// Bytes (binary) or lines (ASCII) before the vertex rows.
+    skip: usize,
+    rows: usize,
+    pub columns: Vec<(String, Kind)>,
+    /// First byte after the header.
+    body: usize,
+}
+
+/// What the header says about the element `wanted`.
+pub(super) fn header(bytes: &[u8], wanted: &str) -> Result<Header, String> {
+    if !bytes.starts_with(b"ply") {
+        return Err("not a PLY file (it does not start with \"ply\")".into());
+    }
+    let mark = b"end_header";
+    let end = bytes.windows(mark.len()).position(|w| w == mark).ok_or("the header has no end_header line")?;
+    let body =
+        end + bytes[end..].iter().position(|&b| b == b'\n').ok_or("the file ends with its header")? + 1;
+    let text = String::from_utf8_lossy(&bytes[..end]);
+    let mut h = Header { ascii: false, little: true, skip: 0, rows: 0, columns: Vec::new(), body };
+    // (name, rows, columns) of the elements before and up to the wanted one.
+    let mut element = (String::new(), 0usize, Vec::new());
+    let mut found = false;
+    for line in text.lines().chain(["element end 0"]) {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        match words.as_slice() {
+            ["format", kind, _] => match *kind {
+                "ascii" => h.ascii = true,
+                "binary_little_endian" => {}
+                "binary_big_endian" => h.little = false,
+                other => return Err(format!("unknown PLY format {other:?}")),
+            },
+            ["element", name, count] => {
+                let done = std::mem::replace(&mut element, (name.to_string(), 0, Vec::new()));
+                element.1 = count.parse().map_err(|_| format!("bad element count {count:?}"))?;
+                if done.0 == wanted {
+                    (h.rows, h.columns, found) = (done.1, done.2, true);
+                } else if !found {
+                    let width: usize = done.2.iter().map(|c: &(String, Kind)| c.1.size()).sum();
+                    h.skip += done.1.saturating_mul(if h.ascii { 1 } else { width });
+                }
+            }
+            ["property", "list", ..] if !found && element.0 != "face" => {
+                return Err(format!("element {} has a list property, which is not supported", element.0));
+            }
+            ["property", kind, name] => {
+                let kind = Kind::parse(kind).ok_or_else(|| format!("unknown property type {kind:?}"))?;
+                element.2.push((name.to_string(), kind));
+            }
+            _ => {}
+        }
+    }
+    if found { Ok(h) } else { Err(format!("there is no {wanted} element")) }
+}
+
+/// The rows of one element of a binary file, with every digit of their values.
+pub(super) struct Rows<'a> {
+    columns: Vec<(String, Kind)>,
+    offsets: Vec<usize>,
+    width: usize,
+    little: bool,
+    bytes: &'a [u8],
+}
+
+impl Rows<'_> {
+    pub fn len(&self) -> usize {
+        self.bytes.len() / self.width.max(1)
+    }
+    pub fn find(&self, name: &str) -> Option<usize> {
+        self.columns.iter().position(|c| c.0 == name)
+    }
+    /// Column numbers of all the names.
+    pub fn all<const N: usize>(&self, names: [&str; N]) -> Result<[usize; N], String> {
+        let mut out = [0; N];
+        for (o, name) in out.iter_mut().zip(names) {
+            *o = self.find(name).ok_or_else(|| format!("no column {name}"))?;
+        }
+        Ok(out)
+    }
+    /// Columns `prefix0, prefix1, …` as long as they go on.
+    pub fn series(&self, prefix: &str) -> Vec<usize> {
+        (0..).map_while(|k| self.find(&format!("{prefix}{k}"))).collect()
+    }
+    pub fn value(&self, row: usize, column: usize) -> f64 {
+        let at = row * self.width + self.offsets[column];
+        let kind = self.columns[column].1;
+        kind.value(&self.bytes[at..at + kind.size()], self.little)
+    }
+}
+
+/// Whether the file has such an element.
+pub(super) fn has(bytes: &[u8], element: &str) -> bool {
+    header(bytes, element).is_ok()
+}
+
+/// One element of a binary file.
+pub(super) fn rows<'a>(bytes: &'a [u8], element: &str) -> Result<Rows<'a>, String> {
+    let h = header(bytes, element)?;
+    if h.ascii {
+        return Err("an ASCII file cannot hold packed columns".into());
+    }
+    let mut width = 0;
+    let mut offsets = Vec::with_capacity(h.columns.len());
+    for (_, kind) in &h.columns {
+        offsets.push(width);
+        width += kind.size();
+    }
+    let end = h.rows.checked_mul(width).and_then(|n| n.checked_add(h.skip)).unwrap_or(usize::MAX);
+    let body = bytes.get(h.body..).unwrap_or_default();
+    let rows = body.get(h.skip..end).ok_or("the file ends early; copy it again")?;
+    Ok(Rows { columns: h.columns, offsets, width, little: h.little, bytes: rows })
+}
+
+pub(super) fn table(bytes: &[u8]) -> Result<Table, String> {
+    let h = header(bytes, "vertex")?;
+    let (width, wide) = (h.columns.iter().map(|c| c.1.size()).sum::<usize>(), h.columns.len());
+    let body = bytes.get(h.body..).unwrap_or_default();
+    let mut values = Vec::new();
+    if h.ascii {
+        let text = std::str::from_utf8(body).map_err(|_| "the ASCII body is not text".to_string())?;
+        for line in text.lines().skip(h.skip).take(h.rows) {
+            let before = values.len();
+            for word in line.split_whitespace().take(wide) {
+                values.push(word.parse::<f32>().map_err(|_| format!("{word:?} is not a number"))?);
+            }
+            if values.len() - before != wide {
+                return Err(format!("row {} has fewer than {wide} values", before / wide.max(1)));
+            }
+        }
+    } else {
+        // Sizes are checked before anything is allocated: the counts come from the file.
+        let end = h.rows.checked_mul(width).and_then(|n| n.checked_add(h.skip)).unwrap_or(usize::MAX);
+        let rows = body.get(h.skip..end).ok_or_else(|| {
+            format!("{} rows of {width} bytes are announced but the file ends early; copy it again", h.rows)
+        })?;
+        values.reserve_exact(h.rows * wide);
+        for row in rows.chunks_exact(width.max(1)) {
+            let mut at = 0;
+            for (_, kind) in &h.columns {
+                values.push(kind.value(&row[at..at + kind.size()], h.little) as f32);
+                at += kind.size();
+            }
+        }
+    }
+    if values.len() != h.rows * wide {
+        return Err(format!("{} rows are announced but the file ends early; copy it again", h.rows));
+    }
+    Ok(Table { rows: h.rows, columns: h.columns, values })
+}
+
+pub(super) fn open(path: &Path) -> Result<Table> {
+    let bytes = std::fs::read(path).map_err(Error::io(path))?;
+    table(&bytes).map_err(|e| Error::input(format!("{}: {e}", path.display())))
+}
