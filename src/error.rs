@@ -6,6 +6,7 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 /// Everything that can go wrong. [`Error::exit_code`] maps it to the process exit code.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum Error {
     /// What the user typed or supplied cannot be used: the message names it and says what to do.
     #[error("{0}")]

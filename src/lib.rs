@@ -55,6 +55,7 @@
 
 pub mod ablate;
 pub mod bench;
+#[cfg(feature = "capi")]
 pub mod capi;
 pub mod checkpoint;
 pub mod error;
@@ -77,6 +78,7 @@ pub mod run;
 pub mod scene;
 pub mod synth;
 
+#[cfg(feature = "cli")]
 #[doc(hidden)]
 pub mod cli;
 
