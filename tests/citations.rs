@@ -6,7 +6,19 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// What is read, relative to the repository.
-const PLACES: [&str; 7] = ["src", "glsl", "tests", "tools", "docs", "README.md", "build.rs"];
+const PLACES: [&str; 11] = [
+    "src",
+    "glsl",
+    "tests",
+    "tools",
+    "docs",
+    "README.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    "CHANGELOG.md",
+    "THIRD_PARTY.md",
+    "build.rs",
+];
 
 /// Fewer citations than this mean that they are no longer recognised.
 const LEAST: usize = 50;
