@@ -4,10 +4,12 @@ use super::info::DeviceInfo;
 use super::memory::{Heap, Memory};
 use super::module::Module;
 use super::pipeline::Pipeline;
+use super::staging::Staging;
 use super::validation::Sink;
 use crate::Result;
 use ash::vk;
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 /// Runs a closure while nothing else uses the host's queue.
@@ -43,6 +45,9 @@ pub(super) struct Inner {
     /// Device and instance are ours to destroy.
     pub owned: bool,
     pub heap: Heap,
+    submissions: AtomicU64,
+    /// Locked while something is submitted, so that what waits in it keeps its place in the queue.
+    pub staging: Mutex<Staging>,
     pipelines: Mutex<HashMap<&'static str, Arc<Pipeline>>>,
     pipeline_cache: vk::PipelineCache,
     /// Set where synchronization2 comes from the extension instead of Vulkan 1.3.
@@ -101,6 +106,8 @@ impl Device {
             timeline,
             owned,
             heap,
+            submissions: AtomicU64::new(0),
+            staging: Mutex::default(),
             pipelines: Mutex::new(HashMap::new()),
             pipeline_cache,
             sync2,
@@ -119,6 +126,11 @@ impl Device {
     /// Memory of all buffers made on this device.
     pub fn memory(&self) -> Memory {
         self.0.heap.figures()
+    }
+
+    /// Submissions to the queue so far: a call of the driver each, and nearly always a wait.
+    pub fn submissions(&self) -> u64 {
+        self.0.submissions.load(Ordering::Relaxed)
     }
 
     /// Starts measuring [`Memory::peak`] anew.
@@ -167,6 +179,7 @@ impl Device {
         infos: &[vk::SubmitInfo<'_>],
         fence: vk::Fence,
     ) -> std::result::Result<(), vk::Result> {
+        self.0.submissions.fetch_add(1, Ordering::Relaxed);
         let queue = lock(&self.0.queue);
         let mut outcome = Ok(());
         // SAFETY: our threads are kept apart by the lock, the host's by `queue_lock` or its promise (see HostDevice).
@@ -176,18 +189,6 @@ impl Device {
             None => submit(),
         }
         outcome
-    }
-
-    /// Submits and waits until the device is done.
-    pub(super) fn submit(&self, commands: vk::CommandBuffer, fence: vk::Fence, what: &str) -> Result<()> {
-        let device = &self.0.device;
-        let commands = [commands];
-        let submit = vk::SubmitInfo::default().command_buffers(&commands);
-        self.queue_submit(&[submit], fence).map_err(vk_error(what))?;
-        // SAFETY: the fence was submitted above.
-        unsafe { device.wait_for_fences(&[fence], true, u64::MAX) }.map_err(vk_error(what))?;
-        // SAFETY: the fence is signalled and not in use.
-        unsafe { device.reset_fences(&[fence]) }.map_err(vk_error(what))
     }
 }
 
@@ -210,6 +211,7 @@ impl Drop for Inner {
                 pipeline.destroy(&self.device);
             }
             self.device.destroy_pipeline_cache(self.pipeline_cache, None);
+            lock(&self.staging).close(&self.device, &self.heap);
             self.heap.close();
             if !self.owned {
                 return;

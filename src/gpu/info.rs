@@ -20,12 +20,14 @@ pub struct Options {
 }
 
 impl Options {
-    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`; `SPLATVK_MAX_BINDING` in MiB.
+    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`, staging when `SPLATVK_STAGING` is;
+    /// `SPLATVK_MAX_BINDING` in MiB.
     pub fn from_env(choice: Option<&str>) -> Self {
         let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
         Options {
             choice: choice.map(str::to_owned).or_else(|| variable("SPLATVK_DEVICE")),
             validation: variable("SPLATVK_VALIDATION").is_some_and(|v| v == "1"),
+            staging: variable("SPLATVK_STAGING").is_some_and(|v| v == "1"),
             max_binding: variable("SPLATVK_MAX_BINDING")
                 .and_then(|v| v.parse::<u64>().ok())
                 .map(|mib| mib.saturating_mul(1 << 20)),

@@ -59,6 +59,7 @@
 //! `mesa-vulkan-drivers` (which includes the CPU device lavapipe). The tests also need `vulkan-validationlayers`.
 //! At build time: libshaderc (see `.cargo/config.toml`), nothing of Vulkan.
 mod adopt;
+mod barrier;
 mod buffer;
 mod call;
 mod command;
@@ -77,7 +78,9 @@ mod program;
 mod recorder;
 pub mod report;
 mod select;
+mod staging;
 mod testing;
+mod transfer;
 mod validation;
 
 pub use adopt::HostDevice;

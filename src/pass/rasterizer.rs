@@ -320,6 +320,7 @@ impl Rasterizer {
                     self.record_projection(&mut rec, params, options);
                 }
                 self.record_band(&mut rec, params, &band);
+                rec.download(&self.frame.status);
                 rec.run()?;
                 match self.overflow()? {
                     Some(needed) => self.grow(needed)?,
