@@ -74,7 +74,7 @@ mod tests {
     use crate::scene::{Camera, Codebook, LevelField, Plane, Pose, RgbImage, Splats};
     use glam::DVec3;
 
-    const STEPS: usize = 8;
+    const COUNTED: usize = 8;
 
     /// What a stage costs per step once every view has been recorded, and what it ends with.
     #[derive(Debug, PartialEq)]
@@ -105,15 +105,15 @@ mod tests {
     }
 
     fn measure(device: &Device, run: &mut dyn Steps) -> Outcome {
-        for iteration in 0..STEPS {
+        for iteration in 0..COUNTED {
             run.step(iteration).unwrap();
         }
         let before = (device.submissions(), device.memory().allocations);
-        for iteration in STEPS..2 * STEPS {
+        for iteration in COUNTED..2 * COUNTED {
             run.step(iteration).unwrap();
         }
-        let submissions = (device.submissions() - before.0) as f64 / STEPS as f64;
-        let allocations = (device.memory().allocations - before.1) as f64 / STEPS as f64;
+        let submissions = (device.submissions() - before.0) as f64 / COUNTED as f64;
+        let allocations = (device.memory().allocations - before.1) as f64 / COUNTED as f64;
         let parts = run.parts();
         let (splats, features) = parts.params.download().unwrap();
         let camera = parts.raster.camera().read::<f32>().unwrap();
@@ -123,7 +123,7 @@ mod tests {
     fn colour(device: &Device) -> Outcome {
         let (splats, cameras, images) = scene();
         let mut options = RgbOptions::preset(Preset::Draft);
-        let rate = Exponential { start: 1e-3, end: 1e-4, steps: 2 * STEPS };
+        let rate = Exponential { start: 1e-3, end: 1e-4, steps: 2 * COUNTED };
         options.poses = Some(PoseOptions { start: 0, rate });
         let scale = SceneScale::measure(&cameras, &splats.means);
         let mut run = RgbRun::new(device, &images, &cameras, &splats, scale, None, &options).unwrap();

@@ -17,7 +17,7 @@ const SAME_EMBEDDING: f64 = 0.9995;
 const MIN_CHORD: f32 = 0.02;
 
 /// Pixels less opaque than this show nothing of the scene (docs/method.md#decoding-codes).
-pub const VOID_ALPHA: f32 = 0.5;
+pub const VOID_ALPHA: f32 = crate::gpu::shaders::decode::VOID_ALPHA as f32;
 
 /// One distinct embedding and what stands behind it.
 #[derive(Clone, Debug, PartialEq)]
