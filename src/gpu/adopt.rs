@@ -87,6 +87,7 @@ impl Device {
             timeline: host.features.timeline_semaphore,
             queue_lock: host.queue_lock,
             owned: false,
+            pipelines: None,
         };
         Device::assemble(entry, candidate.physical, None, setup)
     }

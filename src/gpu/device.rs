@@ -4,11 +4,13 @@ use super::info::DeviceInfo;
 use super::memory::{Heap, Memory};
 use super::module::Module;
 use super::pipeline::Pipeline;
+use super::pipeline_cache::Store;
 use super::staging::Staging;
 use super::validation::Sink;
 use crate::Result;
 use ash::vk;
 use std::collections::HashMap;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
@@ -27,6 +29,8 @@ pub(super) struct Setup {
     pub timeline: bool,
     pub queue_lock: Option<QueueLock>,
     pub owned: bool,
+    /// Folder of the compiled pipelines.
+    pub pipelines: Option<PathBuf>,
 }
 
 /// A Vulkan device; clones share it.
@@ -50,6 +54,7 @@ pub(super) struct Inner {
     pub staging: Mutex<Staging>,
     pipelines: Mutex<HashMap<&'static str, Arc<Pipeline>>>,
     pipeline_cache: vk::PipelineCache,
+    store: Option<Store>,
     /// Set where synchronization2 comes from the extension instead of Vulkan 1.3.
     sync2: Option<ash::khr::synchronization2::Device>,
     messenger: Option<(ash::ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
@@ -71,11 +76,17 @@ impl Device {
         let Setup { instance, device, info, queue, queue_family, timeline, queue_lock, owned, .. } = setup;
         let sync2 =
             setup.sync2_extension.then(|| ash::khr::synchronization2::Device::new(&instance, &device));
+        // SAFETY: the physical device belongs to the instance.
+        let properties = unsafe { instance.get_physical_device_properties(physical) };
+        let store = setup.pipelines.as_ref().map(|folder| Store::new(folder, &properties));
         let finish = || -> Result<(vk::PipelineCache, Heap)> {
-            // SAFETY: the device is alive.
-            let cache =
-                unsafe { device.create_pipeline_cache(&vk::PipelineCacheCreateInfo::default(), None) }
-                    .map_err(vk_error("pipeline cache"))?;
+            let kept = store.as_ref().map(Store::read).unwrap_or_default();
+            let create = |data: &[u8]| {
+                let info = vk::PipelineCacheCreateInfo::default().initial_data(data);
+                // SAFETY: the device is alive; the data is what its driver gave, by checksum and header, or empty.
+                unsafe { device.create_pipeline_cache(&info, None) }
+            };
+            let cache = create(&kept).or_else(|_| create(&[])).map_err(vk_error("pipeline cache"))?;
             Heap::new(&instance, &device, physical).map(|heap| (cache, heap)).inspect_err(|_| {
                 // SAFETY: the cache was never used.
                 unsafe { device.destroy_pipeline_cache(cache, None) };
@@ -110,6 +121,7 @@ impl Device {
             staging: Mutex::default(),
             pipelines: Mutex::new(HashMap::new()),
             pipeline_cache,
+            store,
             sync2,
             messenger,
             instance,
@@ -136,6 +148,12 @@ impl Device {
     /// Starts measuring [`Memory::peak`] anew.
     pub fn reset_peak_memory(&self) {
         self.0.heap.reset_peak();
+    }
+
+    /// Where its pipelines are kept.
+    #[cfg(test)]
+    pub(super) fn store(&self) -> Option<&Store> {
+        self.0.store.as_ref()
     }
 
     /// What the validation layer has said so far; always empty without validation.
@@ -206,6 +224,11 @@ impl Drop for Inner {
                 // Every submit was waited for; this is for what a driver may do on its own. On the host's device it would
                 // take all of the host's queues.
                 let _ = self.device.device_wait_idle();
+            }
+            if let Some(store) = &self.store
+                && let Ok(data) = self.device.get_pipeline_cache_data(self.pipeline_cache)
+            {
+                store.write(&data);
             }
             for (_, pipeline) in lock(&self.pipelines).drain() {
                 pipeline.destroy(&self.device);

@@ -79,6 +79,7 @@ mod memory;
 mod module;
 mod open;
 mod pipeline;
+mod pipeline_cache;
 mod program;
 mod recorder;
 pub mod report;
