@@ -1,9 +1,12 @@
 //! Compiles `glsl/*.comp` to SPIR-V 1.5 and writes `OUT_DIR/shaders.rs`: for every shader a Rust module with typed
-//! bindings, push constants and workgroup size, reflected from the compiled code so that host and shader cannot drift.
+//! bindings, push constants, workgroup size and constants, and the structures of storage buffers, so that host and shader
+//! cannot drift.
 //! The form of the generated code is documented in `src/gpu/mod.rs`.
 
 #[path = "build/compile.rs"]
 mod compile;
+#[path = "build/constants.rs"]
+mod constants;
 #[path = "build/generate.rs"]
 mod generate;
 #[path = "build/reflect.rs"]
@@ -45,7 +48,9 @@ fn build() -> Result<(), String> {
     if !errors.is_empty() {
         return Err(errors.join("\n"));
     }
-    let code = generate::shaders(&families)?;
+    let shared: Vec<_> =
+        source::shared(glsl)?.into_iter().map(|(name, text)| (name, constants::of(&text))).collect();
+    let code = generate::shaders(&families, &shared)?;
     let path = out_dir.join("shaders.rs");
     std::fs::write(&path, code).map_err(|e| format!("{}: {e}", path.display()))
 }

@@ -1,5 +1,6 @@
 //! GLSL to SPIR-V with shaderc, once unoptimised for reflection (the optimiser drops all names) and once optimised for
 //! embedding, behind a cache in OUT_DIR keyed by everything the result depends on.
+use crate::constants::{self, Constant};
 use crate::reflect::{self, Reflection};
 use crate::source::Source;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -15,6 +16,7 @@ pub struct Family {
     pub path: PathBuf,
     /// Macro names the host chooses, in the order of the file.
     pub axes: Vec<String>,
+    pub constants: Vec<Constant>,
     pub modules: Vec<Module>,
 }
 
@@ -50,7 +52,8 @@ impl Compiler {
             modules.push(Module { variant, subgroup_size, float_atomics, spirv, reflection });
         }
         let axes = source.axes.iter().map(|(n, _)| n.clone()).collect();
-        Ok(Family { name: source.name.clone(), path: source.path.clone(), axes, modules })
+        let constants = constants::of(&source.text);
+        Ok(Family { name: source.name.clone(), path: source.path.clone(), axes, constants, modules })
     }
 
     /// Fills the cache on all cores. Errors are left to [`Compiler::family`], which meets them again in a fixed order.

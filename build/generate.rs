@@ -1,12 +1,16 @@
 //! Writes the Rust side of the shaders.
 use crate::compile::{Family, Module};
-use crate::reflect::{Access, Binding, Member, Scalar};
+use crate::constants::{self, Constant};
+use crate::reflect::{Access, Binding, Layout, Member, Scalar};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
 /// The whole of `OUT_DIR/shaders.rs`.
-pub fn shaders(families: &[Family]) -> Result<String, String> {
+pub fn shaders(families: &[Family], shared: &[(String, Vec<Constant>)]) -> Result<String, String> {
     let mut out = String::new();
+    shared_files(&mut out, shared);
+    structures(&mut out, families)?;
+    constant_table(&mut out, families, shared);
     for family in families {
         let module = one(family).map_err(|e| format!("{}: error: {e}", family.path.display()))?;
         out.push_str(&module);
@@ -18,6 +22,60 @@ pub fn shaders(families: &[Family]) -> Result<String, String> {
         names.join(", ")
     );
     Ok(out)
+}
+
+/// A module per file of `glsl/shared` that has constants.
+fn shared_files(w: &mut String, shared: &[(String, Vec<Constant>)]) {
+    let _ = writeln!(w, "/// Constants of `glsl/shared`.\npub mod shared {{");
+    for (name, constants) in shared.iter().filter(|(_, c)| !c.is_empty()) {
+        let file = format!("glsl/shared/{name}.glsl");
+        let _ = writeln!(w, "    /// `{file}`.\n    pub mod {name} {{");
+        constants::declarations(w, &file, constants, "        ");
+        let _ = writeln!(w, "    }}");
+    }
+    let _ = writeln!(w, "}}");
+}
+
+/// The structures that buffers hold; one name has one layout in all shaders.
+fn structures(w: &mut String, families: &[Family]) -> Result<(), String> {
+    let mut all: BTreeMap<&str, &Layout> = BTreeMap::new();
+    for layout in families.iter().flat_map(|f| &f.modules).flat_map(|m| &m.reflection.layouts) {
+        if *all.entry(&layout.name).or_insert(layout) != layout {
+            return Err(format!("two structures are called `{}`", layout.name));
+        }
+    }
+    let _ = writeln!(
+        w,
+        "/// Structures of storage buffers, laid out as the shaders read them.\npub mod structs {{"
+    );
+    for (name, layout) in all {
+        let _ = writeln!(w, "    /// `{name}`, {} bytes.", layout.bytes);
+        let _ = writeln!(
+            w,
+            "    #[repr(C)]\n    #[derive(Clone, Copy, Debug, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]"
+        );
+        let _ = writeln!(w, "    pub struct {name} {{");
+        for m in &layout.members {
+            let _ = writeln!(w, "        /// Byte {}.\n        pub {}: {},", m.offset, m.name, rust_type(m));
+        }
+        let _ = writeln!(w, "    }}\n    const _: () = assert!(size_of::<{name}>() == {});", layout.bytes);
+    }
+    let _ = writeln!(w, "}}");
+    Ok(())
+}
+
+/// Every constant with its file, for the test that looks for repetitions.
+fn constant_table(w: &mut String, families: &[Family], shared: &[(String, Vec<Constant>)]) {
+    let _ = writeln!(w, "/// File, name and values of every constant of the shaders.");
+    let _ = writeln!(w, "pub static CONSTANTS: &[(&str, &str, &[f64])] = &[");
+    let own = families.iter().map(|f| (f.path.display().to_string(), &f.constants));
+    let shared = shared.iter().map(|(name, c)| (format!("glsl/shared/{name}.glsl"), c));
+    for (file, constants) in own.chain(shared) {
+        for c in constants {
+            let _ = writeln!(w, "    ({file:?}, {:?}, &{:?}),", c.name, c.values);
+        }
+    }
+    let _ = writeln!(w, "];");
 }
 
 fn one(family: &Family) -> Result<String, String> {
@@ -37,6 +95,7 @@ fn one(family: &Family) -> Result<String, String> {
     if family.modules.iter().all(|m| m.reflection.workgroup == workgroup) {
         let _ = writeln!(w, "    /// `local_size`.\n    pub const WORKGROUP: [u32; 3] = {workgroup:?};");
     }
+    constants::declarations(w, &family.path.display().to_string(), &family.constants, "    ");
     bindings_struct(w, &bindings);
     if !push.is_empty() {
         push_struct(w, push, family.modules[0].reflection.push_bytes);

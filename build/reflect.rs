@@ -19,7 +19,7 @@ pub struct Binding {
     pub access: Access,
 }
 
-/// Scalar kinds that push constants may hold.
+/// Scalar kinds that members may hold.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scalar {
     F32,
@@ -27,7 +27,7 @@ pub enum Scalar {
     U32,
 }
 
-/// A push constant member: array of columns of rows of scalars, each level optional.
+/// A member of the push constants or of a structure: array of columns of rows of scalars, each level optional.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Member {
     pub name: String,
@@ -41,10 +41,20 @@ pub struct Member {
     pub array: Option<(u32, u32)>,
 }
 
+/// A structure that a storage buffer holds, one or many.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Layout {
+    pub name: String,
+    pub members: Vec<Member>,
+    /// Size, and distance of two in an array.
+    pub bytes: u32,
+}
+
 /// What one module looks like from the host.
 #[derive(Clone, Debug, Default)]
 pub struct Reflection {
     pub bindings: Vec<Binding>,
+    pub layouts: Vec<Layout>,
     pub push: Vec<Member>,
     pub push_bytes: u32,
     pub workgroup: [u32; 3],
@@ -76,6 +86,7 @@ enum Type {
     Vector(u32, u32),
     Matrix(u32, u32),
     Array(u32, u32),
+    RuntimeArray(u32),
     Struct(Vec<u32>),
     Pointer(u32),
     Other,
@@ -141,7 +152,8 @@ impl Reader {
                 self.types.insert(o[0], Type::Scalar(scalar));
             }
             22 if o[1] == 32 => drop(self.types.insert(o[0], Type::Scalar(Scalar::F32))),
-            21 | 22 | 29 => drop(self.types.insert(o[0], Type::Other)),
+            29 => drop(self.types.insert(o[0], Type::RuntimeArray(o[1]))),
+            21 | 22 => drop(self.types.insert(o[0], Type::Other)),
             23 => drop(self.types.insert(o[0], Type::Vector(o[1], o[2]))),
             24 => drop(self.types.insert(o[0], Type::Matrix(o[1], o[2]))),
             28 => drop(self.types.insert(o[0], Type::Array(o[1], o[2]))),
@@ -214,6 +226,9 @@ impl Reader {
                 STORAGE_BUFFER => {
                     let binding = self.binding(id, pointee)?;
                     self.out.bindings.push(binding);
+                    if let Some(layout) = self.layout(pointee)? {
+                        self.out.layouts.push(layout);
+                    }
                 }
                 STORAGE_PUSH_CONSTANT => self.push(pointee)?,
                 0 | 2 => {
@@ -258,6 +273,40 @@ impl Reader {
             write: used.write && !declared(NON_WRITABLE),
         };
         Ok(Binding { number, block: name, access })
+    }
+
+    /// The structure in a block whose one member is a structure or an array of them.
+    fn layout(&self, block: u32) -> Result<Option<Layout>, String> {
+        let Some(Type::Struct(block_members)) = self.types.get(&block) else { return Ok(None) };
+        let &[member] = block_members.as_slice() else { return Ok(None) };
+        let (id, stride) = match self.types.get(&member) {
+            Some(&Type::RuntimeArray(element)) => (element, self.decorations.get(&(member, ARRAY_STRIDE))),
+            _ => (member, None),
+        };
+        let Some(Type::Struct(members)) = self.types.get(&id) else { return Ok(None) };
+        let name = self.names.get(&id).cloned().unwrap_or_default();
+        let (mut out, mut end) = (Vec::new(), 0);
+        for (index, &kind) in members.iter().enumerate() {
+            let index = index as u32;
+            let member_name = self.member_names.get(&(id, index)).cloned().unwrap_or_default();
+            let offset = self.member_decorations.get(&(id, index, OFFSET)).copied().unwrap_or(0);
+            let member = self.member(id, index, kind, member_name.clone(), offset).ok_or_else(|| {
+                format!("`{name}.{member_name}`: a structure holds scalars, vectors and arrays of them")
+            })?;
+            if offset != end || !member.is_packed() {
+                return Err(format!("`{name}.{member_name}` has a gap before or in it: name the padding"));
+            }
+            end = member.end();
+            out.push(member);
+        }
+        let bytes = stride.copied().unwrap_or(end);
+        if bytes != end {
+            return Err(format!(
+                "`{name}` has {} bytes behind its last member: name the padding",
+                bytes - end
+            ));
+        }
+        Ok(Some(Layout { name, members: out, bytes }))
     }
 
     fn push(&mut self, block: u32) -> Result<(), String> {
@@ -310,6 +359,14 @@ impl Reader {
 }
 
 impl Member {
+    /// Whether its elements follow each other as they do in Rust.
+    fn is_packed(&self) -> bool {
+        let column = 4 * self.rows;
+        let element = column * self.columns.map_or(1, |(n, _)| n);
+        self.columns.is_none_or(|(_, stride)| stride == column)
+            && self.array.is_none_or(|(_, stride)| stride == element)
+    }
+
     /// First byte behind the member.
     fn end(&self) -> u32 {
         let last_element = self.array.map_or(0, |(n, stride)| (n - 1) * stride);

@@ -34,6 +34,21 @@ pub fn collect(glsl: &Path) -> Result<Vec<Source>, String> {
     paths.iter().map(|p| read(glsl, p)).collect()
 }
 
+/// Name and text of every `glsl/shared/*.glsl`, sorted by name.
+pub fn shared(glsl: &Path) -> Result<Vec<(String, String)>, String> {
+    let folder = glsl.join("shared");
+    let entries = std::fs::read_dir(&folder).map_err(|e| format!("{}: {e}", folder.display()))?;
+    let mut files = Vec::new();
+    for path in entries.filter_map(|e| e.ok().map(|e| e.path())) {
+        if path.extension().is_some_and(|x| x == "glsl") {
+            let name = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+            files.push((name, read_text(&path)?));
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
 fn read(glsl: &Path, path: &Path) -> Result<Source, String> {
     let text = read_text(path)?;
     let name = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();

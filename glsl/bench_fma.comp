@@ -4,7 +4,7 @@
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) buffer Values { float values[]; }; // [threads]
 const int CHAINS = 16;
-const int STEPS = 256; // CHAINS * STEPS fused multiply-adds per thread; bench::roofline counts with the same numbers
+const int STEPS = 256; // CHAINS * STEPS fused multiply-adds per thread
 
 void main() {
     uint i = gl_GlobalInvocationID.x;

@@ -1,10 +1,16 @@
 #version 450
-// Code per pixel: k* = argmax_k F.c_k, ties to the lowest k, with the margin to the second best. -1 where alpha < 0.5,
-// and where |F| < alpha / 4: splats without features are what the pixel shows (see pass::decode).
+// Code per pixel: k* = argmax_k F.c_k, ties to the lowest k, with the margin to the second best. -1 where alpha < VOID_ALPHA,
+// and where |F| < SPOKEN_SHARE alpha: splats without features are what the pixel shows.
 // Twin: pass::decode::decode_pixels.
 // variants: DIM=4,8,16,32
 #extension GL_EXT_control_flow_attributes : require
 // Every thread takes four pixels, so that each code is loaded once for four: on lavapipe a load costs as much as seven FMAs.
+// Pixels less opaque than this show nothing of the scene.
+const float VOID_ALPHA = 0.5;
+// Pixels whose feature is shorter than this share of their alpha have no code: surfaces continued beyond the photos carry no
+// features, and a blend of nothing has no code. Splat features are unit vectors, so |F| is the alpha they contribute, less
+// what differing codes cancel (sqrt(1/2) where two meet); a quarter separates that from stray contributions.
+const float SPOKEN_SHARE = 0.25;
 #define PIXELS 4u
 #define QUADS (DIM / 4)
 layout(local_size_x = 64) in;
@@ -65,8 +71,7 @@ void main() {
         float rival = count > 1u ? second[j] : -norm;
         if (pixel < pixels) {
             float alpha = 1.0 - transmittance[pixel];
-            // Less opaque pixels show nothing of the scene; those with shorter features nothing that has words.
-            bool shown = alpha >= 0.5 && norm >= 0.25 * alpha;
+            bool shown = alpha >= VOID_ALPHA && norm >= SPOKEN_SHARE * alpha;
             decoded[pixel] = shown ? chosen[j] : -1;
             margin[pixel] = shown && norm > 0.0 && count > 0u ? (best[j] - rival) / norm : 0.0;
         }

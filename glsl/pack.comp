@@ -12,7 +12,8 @@ layout(push_constant) uniform Push {
     uint pixels; uint source; uint first; uint channels; uint group; uint encoding; uint stride; uint from; uint to; uint count;
 };
 
-const float DEPTH_ALPHA_MIN = 0.5; // pass::renderer::DEPTH_ALPHA_MIN
+// Below, the sum of w z says little about any surface (docs/method.md#forward-rasterisation).
+const float DEPTH_ALPHA_MIN = 0.5;
 
 float value(uint pixel, uint k) {
     if (k >= channels) return 0.0;

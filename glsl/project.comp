@@ -5,7 +5,6 @@
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 
-layout(std430, binding = 0) readonly buffer Camera { vec4 camera[]; };                   // [6]
 layout(std430, binding = 1) readonly buffer Means { float means[]; };                    // [N, 3]
 layout(std430, binding = 2) readonly buffer LogScales { float log_scales[]; };           // [N, 3]
 layout(std430, binding = 3) readonly buffer Quats { vec4 quats[]; };                     // [N]
@@ -17,11 +16,11 @@ layout(std430, binding = 7) writeonly buffer DepthPairs { uvec2 depth_pairs[]; }
 layout(push_constant) uniform Push { uint count; uint sh_stride; };
 
 #include "shared/camera.glsl"
+#include "shared/cutoffs.glsl"
 #include "shared/sh.glsl"
 #include "shared/splat.glsl"
 
 const float LOG2_E = 1.4426950408889634;
-const float LOG2_ALPHA_MIN = -7.994353436858858; // log2(1/255)
 
 void main() {
     uint i = gl_GlobalInvocationID.x;

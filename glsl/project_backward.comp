@@ -7,7 +7,6 @@
 #extension GL_KHR_shader_subgroup_arithmetic : require
 layout(local_size_x = 64) in;
 
-layout(std430, binding = 0) readonly buffer Camera { vec4 camera[]; };                  // [6]
 layout(std430, binding = 1) readonly buffer Means { float means[]; };                   // [N, 3]
 layout(std430, binding = 2) readonly buffer LogScales { float log_scales[]; };          // [N, 3]
 layout(std430, binding = 3) readonly buffer Quats { vec4 quats[]; };                    // [N]
@@ -22,7 +21,9 @@ layout(std430, binding = 11) writeonly buffer ShGrad { float sh_grad[]; };
 layout(std430, binding = 12) writeonly buffer CameraParts { float camera_parts[]; };    // [10, PARTS]
 layout(push_constant) uniform Push { uint count; uint sh_stride; };
 
-const uint THREADS = 4096, PARTS = THREADS / 64 * 16; // as pass::project_backward
+// Each thread walks every THREADS-th splat, so that few parts of the camera gradient are left to sum: room for 16
+// subgroups in each workgroup of 64, and zero where there are fewer.
+const uint THREADS = 4096, PARTS = THREADS / 64 * 16;
 
 #include "shared/camera.glsl"
 #include "shared/sh.glsl"

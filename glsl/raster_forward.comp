@@ -9,7 +9,6 @@
 #extension GL_KHR_shader_subgroup_shuffle : require
 layout(local_size_x = SUBGROUP_SIZE) in;
 
-layout(std430, binding = 0) readonly buffer Camera { vec4 camera[]; };
 layout(std430, binding = 1) readonly buffer Projected { vec4 projected[]; };      // [N, 3], see project.comp
 layout(std430, binding = 2) readonly buffer TileRanges { uint tile_ranges[]; };   // [tiles + 1]
 layout(std430, binding = 3) readonly buffer TileSplats { uvec2 tile_splats[]; };  // [capacity] (splat, entry)

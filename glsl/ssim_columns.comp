@@ -3,7 +3,6 @@
 // registers, so each input is loaded once per strip (+10 halo rows) and no shared memory or barrier is needed.
 // Threads along x are neighbours in memory: coalesced on a GPU, one vector load on a CPU device.
 #extension GL_EXT_control_flow_attributes : require
-#define STRIP 16
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Rendered { float rendered[]; };  // [C, H, W]
 layout(std430, binding = 1) readonly buffer Target { float target_image[]; };  // [C, H, W]

@@ -3,7 +3,6 @@
 //   l1_weight * mean|x-y| + dssim_weight * (1 - mean SSIM)
 // by x; the weights arrive divided by the number of values. Also the sum of |x-y| per strip.
 #extension GL_EXT_control_flow_attributes : require
-#define STRIP 16
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Rendered { float rendered[]; };  // [C, H, W]
 layout(std430, binding = 1) readonly buffer Target { float target_image[]; };  // [C, H, W]

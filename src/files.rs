@@ -7,6 +7,14 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, OnceLock};
 use std::time::SystemTime;
 
+/// The folder that set-up fills: `SPLATVK_HOME`, else `splatvk` in the user's data folder.
+pub fn home() -> PathBuf {
+    let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    let data =
+        || set("XDG_DATA_HOME").unwrap_or_else(|| set("HOME").unwrap_or_default().join(".local/share"));
+    set("SPLATVK_HOME").unwrap_or_else(|| data().join("splatvk"))
+}
+
 /// Hexadecimal digits of the checksum.
 const SUM: usize = 64;
 

@@ -1,4 +1,5 @@
 //! Every shipped shader module, in all variants: naga parses and validates it, and the reflection agrees with itself.
+#![allow(clippy::unwrap_used)] // helpers of tests
 use naga::front::spv;
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use splatvk::gpu::{Module, shaders};
@@ -57,4 +58,63 @@ fn access_follows_from_the_code() {
     assert_eq!(access("relevancy_map", "codes"), (true, false));
     assert_eq!(access("relevancy_map", "relevancy"), (false, true));
     assert_eq!(access("scatter_sum", "sums"), (true, true));
+}
+
+/// Every `const NAME: TYPE = VALUE;` of the Rust sources.
+fn rust_constants(folder: &std::path::Path, found: &mut Vec<(String, String, String)>) {
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            rust_constants(&path, found);
+        } else if path.extension().is_some_and(|x| x == "rs") {
+            let text = std::fs::read_to_string(&path).unwrap();
+            for part in text.split("const ").skip(1) {
+                let Some((declared, value)) = part.split(';').next().and_then(|s| s.split_once('=')) else {
+                    continue;
+                };
+                let name = declared.split(':').next().unwrap_or_default().trim().to_owned();
+                found.push((path.display().to_string(), name, value.trim().to_owned()));
+            }
+        }
+    }
+}
+
+/// The numbers in a Rust value; none if it names anything.
+fn literals(value: &str) -> Vec<f64> {
+    let parts = value.split(['[', ']', ',', ' ']).filter(|p| !p.is_empty());
+    parts.map(|p| p.replace('_', "").parse()).collect::<Result<_, _>>().unwrap_or_default()
+}
+
+#[test]
+fn constants_of_shaders_stand_in_one_place() {
+    let (mut rust, mut repeated) = (Vec::new(), Vec::new());
+    rust_constants(std::path::Path::new("src"), &mut rust);
+    assert!(rust.len() > 100 && shaders::CONSTANTS.len() > 20);
+    for (file, name, values) in shaders::CONSTANTS {
+        let same = |v: &[f64]| {
+            v.len() == values.len() && v.iter().zip(*values).all(|(a, b)| (a - b).abs() <= 1e-7 * b.abs())
+        };
+        let mut hits: Vec<&str> = rust
+            .iter()
+            .filter(|(_, n, v)| n == name && same(&literals(v)))
+            .map(|(f, ..)| f.as_str())
+            .collect();
+        hits.extend(
+            shaders::CONSTANTS.iter().filter(|(f, n, v)| n == name && f != file && same(v)).map(|c| c.0),
+        );
+        repeated.extend(hits.iter().map(|other| format!("`{name}` of {file} stands in {other} again")));
+    }
+    assert!(repeated.is_empty(), "{}", repeated.join("\n"));
+}
+
+#[test]
+fn constants_are_what_the_sources_say() {
+    use shaders::shared::{cutoffs, plane_sweep, ssim, tiles};
+    assert_eq!((tiles::TILE, shaders::sort_sweep::TILE, shaders::decode::PIXELS), (8, 2048, 4));
+    assert_eq!(shaders::project_backward::PARTS, 1024);
+    assert_eq!(plane_sweep::VIEW_SHARES, [0.6, 0.3, 0.1, 0.0]);
+    assert_eq!(ssim::WINDOW.len() as i32, 2 * ssim::HALF + 1);
+    assert_eq!(cutoffs::ALPHA_MIN, 1.0 / 255.0);
+    assert!((cutoffs::ALPHA_MIN.log2() - cutoffs::LOG2_ALPHA_MIN).abs() < 1e-15);
+    assert_eq!(size_of::<shaders::structs::CameraView>(), 96);
 }

@@ -1,25 +1,39 @@
 // Slanted-plane matching, shared by plane_sweep.comp and plane_sweep_refine.comp. A hypothesis is the plane pi.X = 1 in
 // the reference camera's frame: 1/z = pi.ray, and the warp into a source view is the homography K_s (R + t pi^T).
-// Same constants and same order of operations as the CPU twin, src/pass/plane_sweep_cpu.rs, which gives the reasons.
+// Same order of operations as the CPU twin, src/pass/plane_sweep_cpu.rs.
 #extension GL_EXT_control_flow_attributes : require
 
+// Taps along one side of the matching window.
 const int TAPS = 5;
+// Pixels between two taps: 5 taps at every second pixel cover a 9 x 9 window at 31 % of its cost.
 const int TAP_STEP = 2;
+// Cost of a source view that sees nothing of the plane; also where costs saturate, so that one occluded view cannot
+// outvote the others. Unrelated patches have ZNCC about 0.
 const float COST_LIMIT = 1.0;
+// Luma difference at which a tap's weight falls to 1/e: less and texture is lost, more and edges grow fat.
 const float SIGMA_COLOUR = 0.03;
+// Pixel distance of the spatial Gaussian, as in ACMM.
 const float SIGMA_SPACE = 3.5;
+// Shares of the best, second, ... source view in the aggregated cost: the second view confirms, but a pixel seen by one
+// other view only still prefers the right plane.
 const vec4 VIEW_SHARES = vec4(0.6, 0.3, 0.1, 0.0);
+// Reprojection error (pixels) at which the geometric term saturates, as in ACMM.
 const float GEOMETRIC_LIMIT = 3.0;
+// Added to both variances: (1.5 grey levels)^2, the noise of an 8-bit JPEG. Flat patches get cost 1 instead of noise.
 const float VARIANCE_FLOOR = 3.5e-5;
+// Relative difference of inverse depth at which the disagreement with a neighbour saturates: steps cost no more.
 const float SMOOTH_LIMIT = 0.03;
-const int NEIGHBOURS = 8;
+// Neighbours whose depth a plane should continue into: the four at one pixel and the four at three, all of the other
+// checkerboard colour, so that they stand still during a step.
+const int SMOOTH_NEIGHBOURS = 8;
 
+// One source view as seen from a reference view.
 struct Source {
-    vec4 forward[3];
-    vec4 back[3];
-    vec4 centre;
-    vec4 intrinsics;
-    uvec4 size;
+    vec4 forward[3]; // rows of K_s [R | t]: (ray, 1/z) of the reference -> homogeneous source pixel, scaled by the inverse depth
+    vec4 back[3];    // rows of the inverse mapping: (ray, 1/z) of the source -> homogeneous reference pixel
+    vec4 centre;     // source camera centre in the reference frame; w unused
+    vec4 intrinsics; // fx, fy, cx, cy of the source, pixels
+    uvec4 size;      // width, height, index of the view's first pixel in the shared image and plane buffers, unused
 };
 
 layout(push_constant) uniform Push {
@@ -170,8 +184,8 @@ float source_cost(uint index, ivec2 p, vec3 ray, vec3 plane) {
 }
 
 // Depth and weight of the neighbours that a plane should continue into.
-float neighbour_inverse[NEIGHBOURS];
-float neighbour_weight[NEIGHBOURS];
+float neighbour_inverse[SMOOTH_NEIGHBOURS];
+float neighbour_weight[SMOOTH_NEIGHBOURS];
 
 ivec2 neighbour_offset(int n) {
     int step = n < 4 ? 1 : 3;
@@ -180,13 +194,13 @@ ivec2 neighbour_offset(int n) {
 
 void load_neighbours(ivec2 p) {
     float centre = luma_at(p);
-    [[unroll]] for (int n = 0; n < NEIGHBOURS; n++) {
+    [[unroll]] for (int n = 0; n < SMOOTH_NEIGHBOURS; n++) {
         ivec2 q = p + neighbour_offset(n);
         bool inside = all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(push.width, push.height)));
         neighbour_weight[n] = 0.0;
         neighbour_inverse[n] = 1.0;
         if (inside) {
-            neighbour_weight[n] = exp(-abs(luma_at(q) - centre) / SIGMA_COLOUR) * push.smoothness / float(NEIGHBOURS);
+            neighbour_weight[n] = exp(-abs(luma_at(q) - centre) / SIGMA_COLOUR) * push.smoothness / float(SMOOTH_NEIGHBOURS);
             neighbour_inverse[n] = dot(planes[push.first + uint(q.y) * push.width + uint(q.x)].xyz, ray_through(q));
         }
     }
@@ -195,7 +209,7 @@ void load_neighbours(ivec2 p) {
 // How badly a plane continues into the neighbours' surfaces.
 float roughness(ivec2 p, vec3 plane) {
     float sum = 0.0;
-    [[unroll]] for (int n = 0; n < NEIGHBOURS; n++) {
+    [[unroll]] for (int n = 0; n < SMOOTH_NEIGHBOURS; n++) {
         float there = dot(plane, ray_through(p + neighbour_offset(n)));
         float off = abs(there - neighbour_inverse[n]) / (SMOOTH_LIMIT * max(neighbour_inverse[n], 1e-9));
         sum += neighbour_weight[n] * min(off, 1.0);

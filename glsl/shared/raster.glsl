@@ -19,9 +19,7 @@
 #define ROWS (8 / LANES_Y)
 #define PIXELS (COLUMNS * ROWS)
 
-const float LOG2_ALPHA_MIN = -7.994353436858858; // log2(1/255)
-const float ALPHA_MAX = 0.99;
-const float TRANSMITTANCE_MIN = 1e-4;
+#include "shared/cutoffs.glsl"
 
 // One splat per lane.
 float own_u, own_v, own_a, own_b, own_c, own_log2_opacity;

@@ -3,7 +3,7 @@
 // interval, whose ends follow from two chords. `precise`: counting and writing must take exactly the same decisions.
 // Needs `projected`.
 const int TILE = 8;
-const float LOG2_ALPHA_MIN = -7.994353436858858; // log2(1/255)
+#include "shared/cutoffs.glsl"
 // The raster pass evaluates the same power in another order; 1e-3 covers the difference of up to 1e4 in size.
 const float MARGIN = 1e-3;
 

@@ -6,9 +6,9 @@ use crate::gpu::{Device, Recorder, shaders};
 use crate::pass::adam::rows_of_groups;
 
 /// vec4 per thread in `glsl/bench_copy.comp`.
-const COPY_STEPS: usize = 8;
+const COPY_STEPS: usize = shaders::bench_copy::STEPS as usize;
 /// Fused multiply-adds per thread in `glsl/bench_fma.comp`.
-const FMA_PER_THREAD: usize = 16 * 256;
+const FMA_PER_THREAD: usize = (shaders::bench_fma::CHAINS * shaders::bench_fma::STEPS) as usize;
 
 /// What the device can do at most.
 #[derive(Clone, Copy, Debug, PartialEq)]

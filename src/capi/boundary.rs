@@ -131,8 +131,12 @@ versioned!(
     SvkAnswer 48
 );
 
-fn stated_size<T: Versioned>(pointer: *const T) -> Result<usize, Fault> {
-    // SAFETY: every versioned structure starts with its size.
+/// The size that a structure says it has.
+///
+/// # Safety
+/// `pointer` leads to a versioned structure.
+unsafe fn stated_size<T: Versioned>(pointer: *const T) -> Result<usize, Fault> {
+    // SAFETY: per the contract; every versioned structure starts with its size.
     let size = unsafe { pointer.cast::<usize>().read() };
     // Far beyond anything a later version may add: an uninitialised field.
     if size < T::FIRST || size > T::FIRST + 4096 {
@@ -147,7 +151,8 @@ pub unsafe fn read<T: Versioned>(pointer: *const T) -> Result<T, Fault> {
     if pointer.is_null() {
         return argument(format!("the pointer to {} is null", T::NAME));
     }
-    let size = stated_size(pointer)?;
+    // SAFETY: not null, so the caller's structure.
+    let size = unsafe { stated_size(pointer) }?;
     let mut value = std::mem::MaybeUninit::<T>::zeroed();
     let known = size.min(size_of::<T>());
     // SAFETY: the caller's structure has `size` bytes; zero bytes are a value of T.
@@ -179,7 +184,8 @@ pub unsafe fn read_array<T: Versioned>(pointer: *const T, count: usize) -> Resul
     if pointer.is_null() {
         return argument(format!("the pointer to {} is null", T::NAME));
     }
-    let stride = stated_size(pointer)?;
+    // SAFETY: not null, so the first of the caller's structures.
+    let stride = unsafe { stated_size(pointer) }?;
     // SAFETY: the caller gives `count` structures of this size.
     (0..count).map(|i| unsafe { read(pointer.cast::<u8>().add(i * stride).cast::<T>()) }).collect()
 }
@@ -189,7 +195,8 @@ pub unsafe fn write<T: Versioned>(pointer: *mut T, value: &T) -> Result<(), Faul
     if pointer.is_null() {
         return argument(format!("the pointer to {} is null", T::NAME));
     }
-    let known = stated_size(pointer)?.min(size_of::<T>());
+    // SAFETY: not null, so the caller's structure.
+    let known = unsafe { stated_size(pointer) }?.min(size_of::<T>());
     let head = size_of::<usize>();
     // SAFETY: the caller's structure has at least `known` bytes, the first of which hold its size.
     unsafe {

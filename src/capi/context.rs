@@ -163,6 +163,7 @@ pub unsafe extern "C" fn svk_context_device_name(
 ) -> usize {
     // SAFETY: per the header.
     guard_number(|| match unsafe { context.as_ref() } {
+        // SAFETY: per the header.
         Some(context) => unsafe { boundary::copy_text(&context.device.info().name, text, bytes) },
         None => 0,
     })

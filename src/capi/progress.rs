@@ -30,7 +30,9 @@ fn c_text(text: &str) -> CString {
 }
 
 impl Callback {
-    pub fn new(call: SvkProgressFunction, user: *mut c_void) -> Callback {
+    /// # Safety
+    /// The function may be called with `user` from any thread, one call at a time, until this is dropped.
+    pub unsafe fn new(call: SvkProgressFunction, user: *mut c_void) -> Callback {
         Callback { call, user, cancelled: AtomicBool::new(false), stage: Mutex::default() }
     }
 
@@ -49,7 +51,7 @@ impl Callback {
             total: stage.total,
             note: note.as_ptr(),
         };
-        // SAFETY: the host's function with the host's pointer; the texts live until it returns.
+        // SAFETY: allowed by the contract of `new`; the texts live until it returns.
         if unsafe { call(self.user, &raw const progress) } != 0 {
             self.cancelled.store(true, Ordering::SeqCst);
         }

@@ -77,6 +77,7 @@ unsafe fn gather(
         let (chosen, _) = choose::photos(&paths, if views > 0 { Some(views) } else { all }, progress)?;
         photo::load_each(&chosen, max_size, progress)?
     } else {
+        // SAFETY: photos of the host, as the header describes them.
         let one = |(i, (photo, path)): (usize, (&SvkPhoto, Option<PathBuf>))| unsafe {
             single(photo, path, i, max_size)
         };

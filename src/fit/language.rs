@@ -310,6 +310,8 @@ impl<'a> Run<'a> {
         if !self.options.detach_geometry {
             self.model.record_step(&mut rec, &frame.status);
         }
+        rec.download(&frame.status);
+        rec.download(&stage.sums);
         rec
     }
 

@@ -128,6 +128,7 @@ pub(super) fn lift(
                 stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
             }
             stage.raster.record_gradients(&mut rec, &model.values, raster, &model.gradients);
+            rec.download(&frame.status);
             rec.run()?;
             match stage.raster.overflow()? {
                 Some(needed) => stage.raster.grow(needed)?,

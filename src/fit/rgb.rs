@@ -360,6 +360,11 @@ impl<'a> Run<'a> {
             regularise::record_ratio(&mut rec, values, gradients, count, weight, RATIO_LIMIT);
         }
         self.model.record_step(&mut rec, &frame.status);
+        rec.download(&frame.status);
+        rec.download(&stage.sums);
+        if self.options.poses.is_some() {
+            rec.download(&frame.camera_grad);
+        }
         rec
     }
 

@@ -52,6 +52,7 @@ impl Device {
             None => select::load()?,
         };
         // A missing function becomes a stub that aborts when called, so ask for the newest ones that are used.
+        // SAFETY: a live instance, per the contract, and a name that ends with zero.
         let instance_has =
             |name: &CStr| unsafe { entry.get_instance_proc_addr(host.instance, name.as_ptr()) };
         if instance_has(c"vkGetPhysicalDeviceProperties2").is_none() {
@@ -87,6 +88,7 @@ impl Device {
             timeline: host.features.timeline_semaphore,
             queue_lock: host.queue_lock,
             owned: false,
+            pipelines: None,
         };
         Device::assemble(entry, candidate.physical, None, setup)
     }

@@ -1,16 +1,19 @@
 //! Storage buffers.
 use super::device::Device;
-use super::error::{lock, vk_error};
+use super::error::lock;
 use super::memory::Block;
 use crate::{Error, Result};
 use ash::vk;
 use bytemuck::Pod;
 use std::ops::Range;
-use std::sync::{Arc, Mutex};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, OnceLock};
 
 /// A storage buffer in device memory. Clones share it; it lives as long as any clone, or any program that uses it.
 ///
-/// Reading and writing from the host is synchronous. Do not write from one thread what a program run by another uses.
+/// On memory that is not mapped, what the host writes waits for the next submission and goes along with it, and what a
+/// recording has downloaded ([`super::Recorder::download`]) is read without one; other reads submit and wait. Do not write
+/// from one thread what a program run by another uses.
 #[derive(Clone)]
 pub struct Buffer(Arc<Inner>);
 
@@ -21,6 +24,9 @@ struct Inner {
     bytes: u64,
     /// `None` only while dropping.
     block: Mutex<Option<Block>>,
+    /// Where recorded downloads go, and whether it holds what the buffer does.
+    host: OnceLock<Buffer>,
+    fetched: AtomicBool,
 }
 
 impl Device {
@@ -68,6 +74,8 @@ impl Buffer {
             raw: block.raw,
             bytes,
             block: Mutex::new(Some(block)),
+            host: OnceLock::new(),
+            fetched: AtomicBool::new(false),
         })))
     }
 
@@ -129,18 +137,17 @@ impl Buffer {
         if start == end {
             return Ok(Vec::new());
         }
-        if let Some(memory) = lock(&self.0.block).as_ref().and_then(|b| b.memory.mapped_slice()) {
+        if let Some(memory) = lock(&self.0.block).as_ref().and_then(Block::bytes) {
             return Ok(bytemuck::pod_collect_to_vec(&memory[start..end]));
         }
-        let staging = Buffer::create(&self.0.device, "staging", bytes.end - bytes.start, true)?;
-        let region = [vk::BufferCopy::default().src_offset(bytes.start).size(bytes.end - bytes.start)];
-        self.0.device.one_time("read back", |commands| {
-            // SAFETY: ranges were checked, both buffers outlive the submit.
-            unsafe { self.0.device.0.device.cmd_copy_buffer(commands, self.raw(), staging.raw(), &region) }
-        })?;
-        let memory = lock(&staging.0.block);
-        let mapped = memory.as_ref().and_then(|b| b.memory.mapped_slice()).ok_or_else(not_mapped)?;
-        Ok(bytemuck::pod_collect_to_vec(&mapped[..end - start]))
+        if let Some(copy) = self.0.host.get().filter(|_| self.0.fetched.load(Ordering::Acquire))
+            && let Some(memory) = lock(&copy.0.block).as_ref().and_then(Block::bytes)
+        {
+            return Ok(bytemuck::pod_collect_to_vec(&memory[start..end]));
+        }
+        let mut out = Vec::with_capacity(end - start);
+        self.0.device.staged_read(self.raw(), bytes, &mut |piece| out.extend_from_slice(piece))?;
+        Ok(bytemuck::pod_collect_to_vec(&out))
     }
 
     /// Replaces the first elements.
@@ -155,28 +162,40 @@ impl Buffer {
         if bytes.is_empty() {
             return Ok(());
         }
-        if let Some(memory) = lock(&self.0.block).as_mut().and_then(|b| b.memory.mapped_slice_mut()) {
+        if let Some(memory) = lock(&self.0.block).as_mut().and_then(Block::bytes_mut) {
             memory[range.start as usize..range.end as usize].copy_from_slice(bytes);
             return Ok(());
         }
-        let staging = Buffer::create(&self.0.device, "staging", bytes.len() as u64, true)?;
-        staging.write(bytes)?;
-        let region = [vk::BufferCopy::default().dst_offset(range.start).size(bytes.len() as u64)];
-        self.0.device.one_time("upload", |commands| {
-            // SAFETY: ranges were checked, both buffers outlive the submit.
-            unsafe { self.0.device.0.device.cmd_copy_buffer(commands, staging.raw(), self.raw(), &region) }
-        })
+        self.set_fetched(false);
+        self.0.device.staged_write(self.raw(), range.start, bytes)
     }
 
     fn clear(&self) -> Result<()> {
-        if let Some(memory) = lock(&self.0.block).as_mut().and_then(|b| b.memory.mapped_slice_mut()) {
+        if let Some(memory) = lock(&self.0.block).as_mut().and_then(Block::bytes_mut) {
             memory.fill(0);
             return Ok(());
         }
-        self.0.device.one_time("clear", |commands| {
-            // SAFETY: the whole buffer is filled, it outlives the submit.
-            unsafe { self.0.device.0.device.cmd_fill_buffer(commands, self.raw(), 0, vk::WHOLE_SIZE, 0) }
-        })
+        self.0.device.staged_clear(self.raw())
+    }
+
+    /// The mapped buffer that recorded downloads copy to.
+    pub(super) fn host_copy(&self) -> Result<&Buffer> {
+        if let Some(copy) = self.0.host.get() {
+            return Ok(copy);
+        }
+        let name = format!("{} on the host", self.0.name);
+        let made = Buffer::create(&self.0.device, &name, self.0.bytes, true)?;
+        Ok(self.0.host.get_or_init(|| made))
+    }
+
+    /// Whether `other` is what [`Buffer::host_copy`] made.
+    pub(super) fn is_fetched_to(&self, other: &Buffer) -> bool {
+        self.0.host.get().is_some_and(|copy| copy.id() == other.id())
+    }
+
+    /// Says whether the host's copy is what the buffer holds.
+    pub(super) fn set_fetched(&self, fetched: bool) {
+        self.0.fetched.store(fetched, Ordering::Release);
     }
 
     fn byte_range<T>(&self, range: Range<usize>) -> Result<Range<u64>> {
@@ -193,57 +212,6 @@ impl Buffer {
     }
 }
 
-fn not_mapped() -> Error {
-    Error::gpu("staging memory is not mapped")
-}
-
-impl Device {
-    /// Records, submits and waits: for uploads and read-backs on devices without mapped buffers.
-    fn one_time(&self, what: &str, record: impl FnOnce(vk::CommandBuffer)) -> Result<()> {
-        let device = &self.0.device;
-        let pool_info = vk::CommandPoolCreateInfo::default().queue_family_index(self.0.queue_family);
-        // SAFETY: objects are created, used and destroyed on one live device; the submit waits before they go.
-        unsafe {
-            let pool = device.create_command_pool(&pool_info, None).map_err(vk_error(what))?;
-            let work = || -> Result<()> {
-                let allocate =
-                    vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
-                let buffers = device.allocate_command_buffers(&allocate).map_err(vk_error(what))?;
-                let commands = buffers.first().copied().unwrap_or_default();
-                device
-                    .begin_command_buffer(commands, &vk::CommandBufferBeginInfo::default())
-                    .map_err(vk_error(what))?;
-                self.cmd_edge_barrier(commands);
-                record(commands);
-                self.cmd_edge_barrier(commands);
-                device.end_command_buffer(commands).map_err(vk_error(what))?;
-                let fence =
-                    device.create_fence(&vk::FenceCreateInfo::default(), None).map_err(vk_error(what))?;
-                let done = self.submit(commands, fence, what);
-                device.destroy_fence(fence, None);
-                done
-            };
-            let done = work();
-            device.destroy_command_pool(pool, None);
-            done
-        }
-    }
-
-    /// Orders a command buffer after everything before it and makes its results visible to the host and to what comes
-    /// next: put at both ends of every command buffer, so that derivation inside may start from a clean state.
-    pub(super) fn cmd_edge_barrier(&self, commands: vk::CommandBuffer) {
-        let work = vk::PipelineStageFlags2::COMPUTE_SHADER
-            | vk::PipelineStageFlags2::ALL_TRANSFER
-            | vk::PipelineStageFlags2::DRAW_INDIRECT;
-        let barrier = [vk::MemoryBarrier2::default()
-            .src_stage_mask(work)
-            .src_access_mask(vk::AccessFlags2::MEMORY_WRITE)
-            .dst_stage_mask(work | vk::PipelineStageFlags2::HOST)
-            .dst_access_mask(vk::AccessFlags2::MEMORY_READ | vk::AccessFlags2::MEMORY_WRITE)];
-        self.cmd_barrier(commands, &vk::DependencyInfo::default().memory_barriers(&barrier));
-    }
-}
-
 impl std::fmt::Debug for Buffer {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "Buffer({}, {} bytes)", self.0.name, self.0.bytes)
@@ -253,8 +221,7 @@ impl std::fmt::Debug for Buffer {
 impl Drop for Inner {
     fn drop(&mut self) {
         if let Some(block) = lock(&self.block).take() {
-            // SAFETY: every submit waits and programs hold their buffers, so nothing uses it any more.
-            unsafe { self.device.0.heap.release(&self.device.0.device, block) };
+            lock(&self.device.0.staging).bury(&self.device.0.device, &self.device.0.heap, block);
         }
     }
 }

@@ -4,10 +4,14 @@ use super::info::DeviceInfo;
 use super::memory::{Heap, Memory};
 use super::module::Module;
 use super::pipeline::Pipeline;
+use super::pipeline_cache::Store;
+use super::staging::Staging;
 use super::validation::Sink;
 use crate::Result;
 use ash::vk;
 use std::collections::HashMap;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 /// Runs a closure while nothing else uses the host's queue.
@@ -25,6 +29,8 @@ pub(super) struct Setup {
     pub timeline: bool,
     pub queue_lock: Option<QueueLock>,
     pub owned: bool,
+    /// Folder of the compiled pipelines.
+    pub pipelines: Option<PathBuf>,
 }
 
 /// A Vulkan device; clones share it.
@@ -43,8 +49,12 @@ pub(super) struct Inner {
     /// Device and instance are ours to destroy.
     pub owned: bool,
     pub heap: Heap,
+    submissions: AtomicU64,
+    /// Locked while something is submitted, so that what waits in it keeps its place in the queue.
+    pub staging: Mutex<Staging>,
     pipelines: Mutex<HashMap<&'static str, Arc<Pipeline>>>,
     pipeline_cache: vk::PipelineCache,
+    store: Option<Store>,
     /// Set where synchronization2 comes from the extension instead of Vulkan 1.3.
     sync2: Option<ash::khr::synchronization2::Device>,
     messenger: Option<(ash::ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
@@ -66,11 +76,17 @@ impl Device {
         let Setup { instance, device, info, queue, queue_family, timeline, queue_lock, owned, .. } = setup;
         let sync2 =
             setup.sync2_extension.then(|| ash::khr::synchronization2::Device::new(&instance, &device));
+        // SAFETY: the physical device belongs to the instance.
+        let properties = unsafe { instance.get_physical_device_properties(physical) };
+        let store = setup.pipelines.as_ref().map(|folder| Store::new(folder, &properties));
         let finish = || -> Result<(vk::PipelineCache, Heap)> {
-            // SAFETY: the device is alive.
-            let cache =
-                unsafe { device.create_pipeline_cache(&vk::PipelineCacheCreateInfo::default(), None) }
-                    .map_err(vk_error("pipeline cache"))?;
+            let kept = store.as_ref().map(Store::read).unwrap_or_default();
+            let create = |data: &[u8]| {
+                let info = vk::PipelineCacheCreateInfo::default().initial_data(data);
+                // SAFETY: the device is alive; the data is what its driver gave, by checksum and header, or empty.
+                unsafe { device.create_pipeline_cache(&info, None) }
+            };
+            let cache = create(&kept).or_else(|_| create(&[])).map_err(vk_error("pipeline cache"))?;
             Heap::new(&instance, &device, physical).map(|heap| (cache, heap)).inspect_err(|_| {
                 // SAFETY: the cache was never used.
                 unsafe { device.destroy_pipeline_cache(cache, None) };
@@ -101,8 +117,11 @@ impl Device {
             timeline,
             owned,
             heap,
+            submissions: AtomicU64::new(0),
+            staging: Mutex::default(),
             pipelines: Mutex::new(HashMap::new()),
             pipeline_cache,
+            store,
             sync2,
             messenger,
             instance,
@@ -121,9 +140,20 @@ impl Device {
         self.0.heap.figures()
     }
 
+    /// Submissions to the queue so far: a call of the driver each, and nearly always a wait.
+    pub fn submissions(&self) -> u64 {
+        self.0.submissions.load(Ordering::Relaxed)
+    }
+
     /// Starts measuring [`Memory::peak`] anew.
     pub fn reset_peak_memory(&self) {
         self.0.heap.reset_peak();
+    }
+
+    /// Where its pipelines are kept.
+    #[cfg(test)]
+    pub(super) fn store(&self) -> Option<&Store> {
+        self.0.store.as_ref()
     }
 
     /// What the validation layer has said so far; always empty without validation.
@@ -167,6 +197,7 @@ impl Device {
         infos: &[vk::SubmitInfo<'_>],
         fence: vk::Fence,
     ) -> std::result::Result<(), vk::Result> {
+        self.0.submissions.fetch_add(1, Ordering::Relaxed);
         let queue = lock(&self.0.queue);
         let mut outcome = Ok(());
         // SAFETY: our threads are kept apart by the lock, the host's by `queue_lock` or its promise (see HostDevice).
@@ -176,18 +207,6 @@ impl Device {
             None => submit(),
         }
         outcome
-    }
-
-    /// Submits and waits until the device is done.
-    pub(super) fn submit(&self, commands: vk::CommandBuffer, fence: vk::Fence, what: &str) -> Result<()> {
-        let device = &self.0.device;
-        let commands = [commands];
-        let submit = vk::SubmitInfo::default().command_buffers(&commands);
-        self.queue_submit(&[submit], fence).map_err(vk_error(what))?;
-        // SAFETY: the fence was submitted above.
-        unsafe { device.wait_for_fences(&[fence], true, u64::MAX) }.map_err(vk_error(what))?;
-        // SAFETY: the fence is signalled and not in use.
-        unsafe { device.reset_fences(&[fence]) }.map_err(vk_error(what))
     }
 }
 
@@ -206,10 +225,16 @@ impl Drop for Inner {
                 // take all of the host's queues.
                 let _ = self.device.device_wait_idle();
             }
+            if let Some(store) = &self.store
+                && let Ok(data) = self.device.get_pipeline_cache_data(self.pipeline_cache)
+            {
+                store.write(&data);
+            }
             for (_, pipeline) in lock(&self.pipelines).drain() {
                 pipeline.destroy(&self.device);
             }
             self.device.destroy_pipeline_cache(self.pipeline_cache, None);
+            lock(&self.staging).close(&self.device, &self.heap);
             self.heap.close();
             if !self.owned {
                 return;

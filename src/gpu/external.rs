@@ -66,6 +66,7 @@ impl Device {
                 "timeline semaphores are off; make the Vulkan device with timelineSemaphore",
             ));
         }
+        self.flush()?;
         let error = || vk_error("delivering to the host");
         let device = &self.0.device;
         let pool = vk::CommandPoolCreateInfo::default().queue_family_index(self.0.queue_family);

@@ -1,6 +1,7 @@
 //! What a device is asked for and what it is.
 use super::module::Capability;
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 
 /// How a device is opened.
 #[derive(Clone, Debug, Default)]
@@ -15,20 +16,25 @@ pub struct Options {
     pub deterministic: bool,
     /// No buffer larger than this, bytes, although the device would bind more: to test what is done in blocks.
     pub max_binding: Option<u64>,
+    /// Folder that keeps compiled pipelines from one process to the next; `None` keeps none. Not used on a host's device.
+    pub pipeline_cache: Option<PathBuf>,
     /// Use the compare-and-swap loop although the device has float atomics (to test it).
     pub no_float_atomics: bool,
 }
 
 impl Options {
-    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`; `SPLATVK_MAX_BINDING` in MiB.
+    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`, staging when `SPLATVK_STAGING` is;
+    /// `SPLATVK_MAX_BINDING` in MiB; pipelines in `SPLATVK_HOME`.
     pub fn from_env(choice: Option<&str>) -> Self {
         let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
         Options {
             choice: choice.map(str::to_owned).or_else(|| variable("SPLATVK_DEVICE")),
             validation: variable("SPLATVK_VALIDATION").is_some_and(|v| v == "1"),
+            staging: variable("SPLATVK_STAGING").is_some_and(|v| v == "1"),
             max_binding: variable("SPLATVK_MAX_BINDING")
                 .and_then(|v| v.parse::<u64>().ok())
                 .map(|mib| mib.saturating_mul(1 << 20)),
+            pipeline_cache: Some(crate::files::home().join("cache")),
             ..Options::default()
         }
     }

@@ -32,7 +32,21 @@ pub(super) struct Heap {
 /// A Vulkan buffer and the memory it is bound to.
 pub(super) struct Block {
     pub raw: vk::Buffer,
-    pub memory: Allocation,
+    memory: Allocation,
+    mapped: bool,
+}
+
+impl Block {
+    /// What the host reads; `None` unless it was made mapped. Memory that merely happens to be visible to the host (all
+    /// of a CPU device's is) does not count, so that transfers are the same on every device.
+    pub fn bytes(&self) -> Option<&[u8]> {
+        self.memory.mapped_slice().filter(|_| self.mapped)
+    }
+
+    /// What the host writes; as [`Block::bytes`].
+    pub fn bytes_mut(&mut self) -> Option<&mut [u8]> {
+        self.memory.mapped_slice_mut().filter(|_| self.mapped)
+    }
 }
 
 impl Heap {
@@ -74,7 +88,7 @@ impl Heap {
                 let now = self.current.fetch_add(memory.size(), Ordering::Relaxed) + memory.size();
                 self.peak.fetch_max(now, Ordering::Relaxed);
                 self.allocations.fetch_add(1, Ordering::Relaxed);
-                Ok(Block { raw, memory })
+                Ok(Block { raw, memory, mapped })
             }
             Err(e) => {
                 // SAFETY: the buffer was never used.

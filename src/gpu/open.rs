@@ -52,6 +52,7 @@ impl Device {
             timeline: false,
             queue_lock: None,
             owned: true,
+            pipelines: options.pipeline_cache.clone(),
         };
         Self::assemble(entry, physical, sink, setup)
     }

@@ -1,9 +1,11 @@
 //! A compiled recording: command buffers that can be submitted again and again.
+use super::barrier;
+use super::buffer::Buffer;
 use super::call::Call;
 use super::command::{self, Command, Groups, Op};
 use super::device::Device;
 use super::error::{lock, vk_error};
-use super::hazard::{self, Barrier, Scope, Stage, Step};
+use super::hazard::{self, Barrier, Step};
 use super::module::Module;
 use crate::{Error, Result};
 use ash::vk;
@@ -16,6 +18,8 @@ pub struct Program {
     label: String,
     commands: Vec<Command>,
     steps: Vec<Step>,
+    /// Buffers it writes, and whether the host has a copy of what they are in the end.
+    results: Vec<(Buffer, bool)>,
     /// Runs of one program exclude each other: the command buffers are not for simultaneous use.
     raw: Mutex<Raw>,
 }
@@ -61,7 +65,8 @@ impl Program {
             plain: vk::CommandBuffer::null(),
             timed: None,
         };
-        let program = Program { device, label, commands, steps, raw: Mutex::new(raw) };
+        let results = results(&commands);
+        let program = Program { device, label, commands, steps, results, raw: Mutex::new(raw) };
         // From here on Drop cleans up whatever has been made.
         program.prepare()?;
         Ok(program)
@@ -70,7 +75,14 @@ impl Program {
     /// Submits and waits.
     pub fn run(&self) -> Result<()> {
         let raw = lock(&self.raw);
-        self.device.submit(raw.plain, raw.fence, &self.label)
+        self.submit(raw.plain, raw.fence)
+    }
+
+    fn submit(&self, commands: vk::CommandBuffer, fence: vk::Fence) -> Result<()> {
+        self.results.iter().for_each(|(buffer, _)| buffer.set_fetched(false));
+        self.device.submit(commands, fence, &self.label)?;
+        self.results.iter().for_each(|(buffer, fetched)| buffer.set_fetched(*fetched));
+        Ok(())
     }
 
     /// Submits and waits; milliseconds per command, in order.
@@ -88,7 +100,7 @@ impl Program {
                 timed
             }
         };
-        self.device.submit(commands, raw.fence, &self.label)?;
+        self.submit(commands, raw.fence)?;
         let mut ticks = vec![0u64; 2 * self.commands.len()];
         if !ticks.is_empty() {
             let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
@@ -310,53 +322,34 @@ impl Program {
             .iter()
             .filter_map(|b| {
                 let buffer = self.commands.iter().find_map(|c| c.buffer(b.buffer))?;
-                Some(
-                    vk::BufferMemoryBarrier2::default()
-                        .src_stage_mask(stages(b.from))
-                        .src_access_mask(accesses(Scope { reads: 0, writes: b.from.writes }))
-                        .dst_stage_mask(stages(b.to))
-                        .dst_access_mask(accesses(b.to))
-                        .src_queue_family_index(vk::QUEUE_FAMILY_IGNORED)
-                        .dst_queue_family_index(vk::QUEUE_FAMILY_IGNORED)
-                        .buffer(buffer.raw())
-                        .size(vk::WHOLE_SIZE),
-                )
+                Some(barrier::of(b, buffer.raw()))
             })
             .collect();
         self.device.cmd_barrier(out, &vk::DependencyInfo::default().buffer_memory_barriers(&raw));
     }
 }
 
-const STAGES: [Stage; 3] = [Stage::Compute, Stage::Transfer, Stage::Indirect];
-
-fn stages(scope: Scope) -> vk::PipelineStageFlags2 {
-    let mut flags = vk::PipelineStageFlags2::NONE;
-    for stage in STAGES.into_iter().filter(|&s| (scope.reads | scope.writes) & s as u8 != 0) {
-        flags |= match stage {
-            Stage::Compute => vk::PipelineStageFlags2::COMPUTE_SHADER,
-            Stage::Transfer => vk::PipelineStageFlags2::ALL_TRANSFER,
-            Stage::Indirect => vk::PipelineStageFlags2::DRAW_INDIRECT,
-        };
-    }
-    flags
-}
-
-fn accesses(scope: Scope) -> vk::AccessFlags2 {
-    let mut flags = vk::AccessFlags2::NONE;
-    for stage in STAGES {
-        let (read, write) = match stage {
-            Stage::Compute => (vk::AccessFlags2::SHADER_STORAGE_READ, vk::AccessFlags2::SHADER_STORAGE_WRITE),
-            Stage::Transfer => (vk::AccessFlags2::TRANSFER_READ, vk::AccessFlags2::TRANSFER_WRITE),
-            Stage::Indirect => (vk::AccessFlags2::INDIRECT_COMMAND_READ, vk::AccessFlags2::NONE),
-        };
-        if scope.reads & stage as u8 != 0 {
-            flags |= read;
+/// Every buffer that the commands write, with whether its last change is followed by a download.
+fn results(commands: &[Command]) -> Vec<(Buffer, bool)> {
+    let mut results: Vec<(Buffer, bool)> = Vec::new();
+    let mut note = |buffer: &Buffer, fetched| match results.iter_mut().find(|r| r.0.id() == buffer.id()) {
+        Some(known) => known.1 = fetched,
+        None => results.push((buffer.clone(), fetched)),
+    };
+    for command in commands {
+        if let Op::Copy { from, to, .. } = &command.op
+            && from.is_fetched_to(to)
+        {
+            note(from, true);
+            continue;
         }
-        if scope.writes & stage as u8 != 0 {
-            flags |= write;
+        for touch in command.touches().iter().filter(|t| t.write) {
+            if let Some(buffer) = command.buffer(touch.buffer) {
+                note(buffer, false);
+            }
         }
     }
-    flags
+    results
 }
 
 impl std::fmt::Debug for Program {

@@ -58,6 +58,21 @@ impl Recorder {
         }
     }
 
+    /// Brings a buffer to the host with the same submission: until something writes it again, [`Buffer::read`] returns
+    /// what it holds here without another one. For small results that every run is asked for; the copy in mapped memory
+    /// stays as long as the buffer. Nothing where buffers are mapped.
+    pub fn download(&mut self, buffer: &Buffer) {
+        if self.device.info().mapped {
+            return;
+        }
+        match buffer.host_copy() {
+            Ok(copy) => self.copy(buffer, copy),
+            Err(e) => {
+                self.error.get_or_insert(e);
+            }
+        }
+    }
+
     /// Runs `groups` workgroups; nothing when one of the counts is 0.
     pub fn dispatch(&mut self, call: Call, groups: [u32; 3]) {
         if let Some(module) = self.resolve(&call) {

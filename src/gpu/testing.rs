@@ -14,7 +14,7 @@ pub struct TestDevice(Device);
 pub fn test_device() -> TestDevice {
     static SHARED: OnceLock<Result<Device>> = OnceLock::new();
     let opened =
-        SHARED.get_or_init(|| Device::with(&Options { validation: true, ..Options::from_env(None) }));
+        SHARED.get_or_init(|| TestDevice::with(&Options::from_env(None)).map(|device| device.0.clone()));
     match opened {
         Ok(device) => TestDevice(device.clone()),
         Err(e) => panic!("tests need a Vulkan device with validation: {e}"),
@@ -24,7 +24,7 @@ pub fn test_device() -> TestDevice {
 impl TestDevice {
     /// A device of its own for tests that need other options than the shared one.
     pub fn with(options: &Options) -> Result<TestDevice> {
-        Device::with(&Options { validation: true, ..options.clone() }).map(TestDevice)
+        Device::with(&Options { validation: true, pipeline_cache: None, ..options.clone() }).map(TestDevice)
     }
 }
 

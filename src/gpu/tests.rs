@@ -82,6 +82,77 @@ fn staged_buffers_behave_like_mapped_ones() {
     assert_eq!(buffer.read_range::<u16>(6..7).unwrap(), [7]);
 }
 
+fn staged() -> TestDevice {
+    TestDevice::with(&Options { staging: true, ..Options::from_env(None) }).unwrap()
+}
+
+#[test]
+fn transfers_wait_for_a_submission_and_share_it() {
+    let device = staged();
+    let a = device.buffer::<u32>("a", 1000).unwrap();
+    let b = device.buffer_from("b", &[1u32; 1000]).unwrap();
+    // Overlapping writes take effect in their order.
+    a.write(&[2u32; 700]).unwrap();
+    a.write_at(500, &[3u32; 400]).unwrap();
+    device.buffer_from("gone", &[9u32; 10]).unwrap();
+    assert_eq!(device.submissions(), 0);
+    let mut rec = Recorder::new(&device, "both");
+    rec.copy_bytes(&a, 0, &b, 400, 3600);
+    rec.download(&b);
+    let program = rec.compile().unwrap();
+    program.run().unwrap();
+    let expected: Vec<u32> = [vec![1; 100], vec![2; 500], vec![3; 400]].concat();
+    assert_eq!(b.read::<u32>().unwrap(), expected);
+    assert_eq!(device.submissions(), 1);
+    // A change makes the copy on the host worthless, whoever made it.
+    b.write(&[7u32]).unwrap();
+    assert_eq!(b.read_range::<u32>(0..2).unwrap(), [7, 1]);
+    assert_eq!(device.submissions(), 2);
+    program.run().unwrap();
+    let mut rec = Recorder::new(&device, "fill");
+    rec.fill(&b, 5);
+    rec.run().unwrap();
+    assert_eq!(b.read::<u32>().unwrap(), [5; 1000]);
+    assert_eq!(device.submissions(), 5);
+}
+
+#[test]
+fn large_transfers_go_in_pieces() {
+    let device = staged();
+    let count = (2 * super::staging::MOST as usize + 4096) / 4;
+    let values: Vec<u32> = (0..count as u32).map(|i| i.wrapping_mul(2654435761)).collect();
+    let buffer = device.buffer_from("large", &values).unwrap();
+    assert!(buffer.read::<u32>().unwrap() == values);
+    // Two full pieces on the way there; the rest of it goes with the first of three on the way back.
+    assert_eq!(device.submissions(), 5);
+    let again = || {
+        buffer.write(&values).unwrap();
+        assert!(buffer.read::<u32>().unwrap() == values);
+        device.memory().allocations
+    };
+    // Once more, until both ways have memory of that size.
+    assert_eq!(again(), again(), "the memory is used again");
+}
+
+#[test]
+fn buffers_may_go_while_another_thread_submits_their_writes() {
+    let device = staged();
+    let kept = device.buffer::<u32>("kept", 1 << 16).unwrap();
+    let mut rec = Recorder::new(&device, "fill");
+    rec.fill(&kept, 1);
+    let program = rec.compile().unwrap();
+    std::thread::scope(|scope| {
+        let runs = scope.spawn(|| (0..200).for_each(|_| program.run().unwrap()));
+        for i in 0..2000u32 {
+            let buffer = device.buffer_from("short-lived", &[i; 64]).unwrap();
+            if i % 100 == 0 {
+                assert_eq!(buffer.read::<u32>().unwrap(), [i; 64]);
+            }
+        }
+        runs.join().unwrap();
+    });
+}
+
 #[test]
 fn buffers_check_their_bounds_and_sizes() {
     let device = test_device();

@@ -9,6 +9,7 @@ use serde::Deserialize;
 use super::provider::Compute;
 use super::runtime::Session;
 use crate::files::content_hash;
+pub use crate::files::home;
 use crate::{Error, Result};
 
 const PACK: &str = include_str!("../../tools/models/pack.json");
@@ -78,14 +79,6 @@ struct PackFile {
 struct Pack {
     packages: HashMap<String, Package>,
     files: Vec<PackFile>,
-}
-
-/// The folder that set-up fills: `SPLATVK_HOME`, else `splatvk` in the user's data folder.
-pub fn home() -> PathBuf {
-    let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
-    let data =
-        || set("XDG_DATA_HOME").unwrap_or_else(|| set("HOME").unwrap_or_default().join(".local/share"));
-    set("SPLATVK_HOME").unwrap_or_else(|| data().join("splatvk"))
 }
 
 /// Finds model files and vouches for them.

@@ -3,11 +3,11 @@ use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 
 /// β1, β2 of every 3D Gaussian splatting implementation.
-pub const BETA: [f64; 2] = [0.9, 0.999];
+pub const BETA: [f64; 2] = [shaders::adam::BETA1, shaders::adam::BETA2];
 /// ε: tiny, since gradients are (Kerbl et al. 2023 use 1e-15).
-pub const EPSILON: f64 = 1e-15;
+pub const EPSILON: f64 = shaders::adam::EPS;
 /// Threads per workgroup in `glsl/adam.comp` and `glsl/gather.comp`.
-const GROUP: usize = 256;
+const GROUP: usize = shaders::adam::WORKGROUP[0] as usize;
 
 /// Workgroup counts for `threads` in a shader that numbers its groups row by row: at most 32768 a row, since one
 /// dimension may end at 65535.

@@ -128,7 +128,7 @@ pub fn twin(projected: &[Option<Projected>], order: &[u32], size: [u32; 2]) -> V
         let Some(p) = &projected[i as usize] else { continue };
         for (t, list) in lists.iter_mut().enumerate() {
             let (x0, y0) = (t as u32 % tiles[0] * TILE, t as u32 / tiles[0] * TILE);
-            if largest_alpha(p, x0, y0) >= 1.0 / 255.0 {
+            if largest_alpha(p, x0, y0) >= shaders::shared::cutoffs::ALPHA_MIN {
                 list.push(i);
             }
         }

@@ -1,21 +1,13 @@
 //! Rendered features to code indices: `k*(p) = argmax_k F(p)·c_k`, brute force over the codes of a level.
+use crate::gpu::shaders::decode::{PIXELS, SPOKEN_SHARE, VOID_ALPHA, WORKGROUP};
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 use crate::{Error, Result};
-
-/// Pixels less opaque than this show nothing of the scene; the shader holds the same value.
-const VOID_ALPHA: f32 = 0.5;
-
-/// Pixels whose feature is shorter than this share of their alpha have no code; the shader holds the same value. Surfaces
-/// continued beyond the photos carry no features, and a blend of nothing has no code. Splat features are unit vectors, so
-/// ‖F‖ is the alpha they contribute, less what differing codes cancel (√½ where two meet); a quarter separates that from
-/// stray contributions.
-const SPOKEN_SHARE: f64 = 0.25;
 
 /// Code widths that glsl/decode.comp is compiled for; others are padded with zeros to the next.
 const WIDTHS: [usize; 4] = [4, 8, 16, 32];
 
-/// Pixels per workgroup of glsl/decode.comp: 64 threads with four each.
-const PIXELS_PER_GROUP: u32 = 256;
+/// Pixels per workgroup.
+const PIXELS_PER_GROUP: u32 = WORKGROUP[0] * PIXELS;
 
 /// The codes of one level on the device.
 pub struct Codes {
@@ -85,7 +77,7 @@ pub fn decode_pixels(codes: &[f32], dim: usize, features: &[f32], alpha: &[f32])
                 second = score;
             }
         }
-        let shown = alpha[p] >= VOID_ALPHA && norm >= SPOKEN_SHARE * f64::from(alpha[p]);
+        let shown = alpha[p] >= VOID_ALPHA as f32 && norm >= SPOKEN_SHARE * f64::from(alpha[p]);
         if !shown || chosen < 0 {
             (if shown { chosen } else { -1 }, 0.0)
         } else {

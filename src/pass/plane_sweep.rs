@@ -1,27 +1,14 @@
 //! Slanted-plane multi-view matching on the device. What the shaders compute is written down in the CPU twin,
 //! [`super::plane_sweep_cpu`].
 use crate::Result;
+use crate::gpu::shaders::shared::plane_sweep::VIEW_SHARES;
+pub use crate::gpu::shaders::structs::Source;
 use crate::gpu::shaders::{plane_sweep, plane_sweep_refine};
 use crate::gpu::{Buffer, Device, Recorder};
 use glam::Vec4;
 
 /// Most source views that one reference view is matched against: a fifth adds cost, hardly accuracy.
-pub const MAX_SOURCES: usize = 4;
-/// One source view as seen from a reference view; the layout of the shader's `sources` buffer.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Default, bytemuck::Pod, bytemuck::Zeroable)]
-pub struct Source {
-    /// Rows of `K_s [R | t]`: `(ray, 1/z)` of the reference → homogeneous source pixel, scaled by the inverse depth.
-    pub forward: [[f32; 4]; 3],
-    /// Rows of the inverse mapping: `(ray, 1/z)` of the source → homogeneous reference pixel.
-    pub back: [[f32; 4]; 3],
-    /// Source camera centre in the reference frame; w unused.
-    pub centre: [f32; 4],
-    /// fx, fy, cx, cy of the source, pixels.
-    pub intrinsics: [f32; 4],
-    /// Width, height, index of the view's first pixel in the shared image and plane buffers, unused.
-    pub size: [u32; 4],
-}
+pub const MAX_SOURCES: usize = VIEW_SHARES.len();
 
 /// The reference view and the search; the shader's push constants.
 #[derive(Clone, Copy, Debug, Default)]

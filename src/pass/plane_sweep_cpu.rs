@@ -6,32 +6,19 @@
 //! checkerboard with adaptive candidate areas (Xu and Tao 2019, ACMM, section 3.1).
 use super::plane_sweep::{MAX_SOURCES, Matcher, Reference, Source};
 use crate::Result;
+use crate::gpu::shaders::shared::plane_sweep as shared;
 use glam::{Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 
-/// Taps along one side of the matching window.
-pub const TAPS: usize = 5;
-/// Pixels between two taps: 5 taps at every second pixel cover a 9 × 9 window at 31 % of its cost.
-pub const TAP_STEP: i32 = 2;
-/// Cost of a source view that sees nothing of the plane; also where costs saturate, so that one occluded view cannot
-/// outvote the others. Unrelated patches have ZNCC about 0.
-pub const COST_LIMIT: f32 = 1.0;
-/// Added to both variances: (1.5 grey levels)², the noise of an 8-bit JPEG. Flat patches get cost ≈ 1 instead of noise.
-pub const VARIANCE_FLOOR: f32 = 3.5e-5;
-/// Luma difference at which a tap's weight falls to 1/e: less and texture is lost, more and edges grow fat.
-pub const SIGMA_COLOUR: f32 = 0.03;
-/// Pixel distance of the spatial Gaussian, as in ACMM.
-pub const SIGMA_SPACE: f32 = 3.5;
-/// Shares of the best, second, ... source view in the aggregated cost: the second view confirms, but a pixel seen
-/// by one other view only still prefers the right plane.
-pub const VIEW_SHARES: [f32; MAX_SOURCES] = [0.6, 0.3, 0.1, 0.0];
-/// Neighbours whose depth a plane should continue into: the four at one pixel and the four at three, all of the other
-/// checkerboard colour, so that they stand still during a step.
-pub const NEIGHBOURS: usize = 8;
-/// Relative difference of inverse depth at which the disagreement with a neighbour saturates: steps cost no more.
-pub const SMOOTH_LIMIT: f32 = 0.03;
-/// Reprojection error (pixels) at which the geometric term saturates, as in ACMM.
-pub const GEOMETRIC_LIMIT: f32 = 3.0;
+// The shader's constants (glsl/shared/plane_sweep.glsl gives the reasons), in the twin's types.
+const TAPS: usize = shared::TAPS as usize;
+const NEIGHBOURS: usize = shared::SMOOTH_NEIGHBOURS as usize;
+const COST_LIMIT: f32 = shared::COST_LIMIT as f32;
+const VARIANCE_FLOOR: f32 = shared::VARIANCE_FLOOR as f32;
+const SIGMA_COLOUR: f32 = shared::SIGMA_COLOUR as f32;
+const SIGMA_SPACE: f32 = shared::SIGMA_SPACE as f32;
+const SMOOTH_LIMIT: f32 = shared::SMOOTH_LIMIT as f32;
+const GEOMETRIC_LIMIT: f32 = shared::GEOMETRIC_LIMIT as f32;
 
 /// PCG-like integer hash (Jarzynski and Olano 2020): deterministic, the same in GLSL.
 pub fn hash(mut v: u32) -> u32 {
@@ -79,7 +66,7 @@ pub struct Inputs<'a> {
 }
 
 fn offset(tap: usize) -> i32 {
-    (tap as i32 - (TAPS as i32 - 1) / 2) * TAP_STEP
+    (tap as i32 - (TAPS as i32 - 1) / 2) * shared::TAP_STEP
 }
 
 impl Inputs<'_> {
@@ -202,7 +189,7 @@ impl Inputs<'_> {
         error.length().min(GEOMETRIC_LIMIT)
     }
 
-    /// Aggregated cost of a plane at a pixel: the sorted source costs mixed by [`VIEW_SHARES`].
+    /// Aggregated cost of a plane at a pixel: the sorted source costs mixed by [`shared::VIEW_SHARES`].
     pub fn cost(&self, planes: &[Vec4], window: &Window, x: i32, y: i32, ray: Vec3, plane: Vec3) -> f32 {
         let r = &self.reference;
         let mut best = [COST_LIMIT + r.geometric * GEOMETRIC_LIMIT; MAX_SOURCES];
@@ -218,7 +205,7 @@ impl Inputs<'_> {
                 }
             }
         }
-        (0..MAX_SOURCES).map(|k| VIEW_SHARES[k] * best[k]).sum()
+        (0..MAX_SOURCES).map(|k| shared::VIEW_SHARES[k] as f32 * best[k]).sum()
     }
 
     /// A plane through `1/z = inverse_depth` at the pixel with a given normal, or None if it is seen too obliquely or

@@ -10,11 +10,9 @@ use super::params::Params;
 use super::sh;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
+use crate::gpu::shaders::shared::splat::DILATION;
 use crate::gpu::{Buffer, Recorder, shaders};
 use glam::{DMat3, DVec3, DVec4};
-
-/// Added to the diagonal of the screen covariance: a splat never gets thinner than about a pixel (INRIA's value).
-pub const DILATION: f64 = 0.3;
 
 /// Records the projection of all splats, with the first (sh_degree + 1)² coefficients, to `frame.projected`
 /// and `frame.depth_pairs`.

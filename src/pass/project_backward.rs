@@ -13,13 +13,9 @@ use super::raster_backward::SplatGradient;
 use super::sh;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
+use crate::gpu::shaders::project_backward::{PARTS, THREADS};
 use crate::gpu::{Buffer, Recorder, shaders};
 use glam::{DMat3, DVec3, DVec4};
-
-/// Threads of the GPU pass: each walks every THREADS-th splat, so that few parts of the camera gradient are left to sum.
-const THREADS: u32 = 4096;
-/// Parts of the camera gradient: room for 16 subgroups in each workgroup of 64, and zero where there are fewer.
-pub(super) const CAMERA_PARTS: usize = THREADS as usize / 64 * 16;
 
 /// Records the gradients by all raw parameters (overwritten in `gradients`, zero where a splat was not seen) and by
 /// the camera (`camera_grad` [10]: ρ, θ, fx, fy, cx, cy).
@@ -55,7 +51,7 @@ pub fn record(
     rec.dispatch_threads(call, [THREADS, 1, 1]);
     let call = shaders::camera_sum::call(
         &shaders::camera_sum::Bindings { camera_parts: &frame.camera_parts, camera_grad },
-        &shaders::camera_sum::Push { parts: CAMERA_PARTS as u32 },
+        &shaders::camera_sum::Push { parts: PARTS },
     );
     rec.dispatch(call, [1, 1, 1]);
 }

@@ -8,6 +8,7 @@ use super::channels::blocks;
 use super::frame::{FrameBuffers, Tiles};
 use super::project::Projected;
 use super::view::View;
+use crate::gpu::shaders::shared::cutoffs::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
 use crate::gpu::{Buffer, Recorder, shaders};
 
 pub use super::channels::BASE_CHANNELS;
@@ -67,9 +68,9 @@ pub struct Cutoffs {
 impl Cutoffs {
     /// The values every 3DGS renderer uses, and the shaders here.
     pub const STANDARD: Cutoffs =
-        Cutoffs { alpha_min: 1.0 / 255.0, alpha_max: 0.99, transmittance_min: 1e-4 };
+        Cutoffs { alpha_min: ALPHA_MIN, alpha_max: ALPHA_MAX, transmittance_min: TRANSMITTANCE_MIN };
     /// Without the two jumps (the α clamp is continuous and stays).
-    pub const SMOOTH: Cutoffs = Cutoffs { alpha_min: 0.0, alpha_max: 0.99, transmittance_min: 0.0 };
+    pub const SMOOTH: Cutoffs = Cutoffs { alpha_min: 0.0, alpha_max: ALPHA_MAX, transmittance_min: 0.0 };
 }
 
 /// What the raster twins read.

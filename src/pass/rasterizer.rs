@@ -38,9 +38,10 @@ use super::channels::BASE_CHANNELS;
 use super::frame::{GRADIENT_FLOATS, GradientEntries, Summation, Tiles, entry_bytes};
 use super::sort::Sort;
 use super::tile_lists::{self, Grouping, TILE, TileLists};
-use super::view::{VIEW_FLOATS, View};
+use super::view::View;
 use super::{bin, project, project_backward, raster_backward, raster_forward};
-use crate::gpu::{Buffer, Device, Recorder};
+use crate::gpu::shaders::structs::CameraView;
+use crate::gpu::{Buffer, Device, Recorder, shaders};
 use crate::{Error, Result};
 use std::ops::Range;
 
@@ -132,7 +133,8 @@ impl Rasterizer {
             status: device.buffer::<u32>("status", 2)?,
             projected: device.buffer::<f32>("projected", 12 * splats)?,
             projected_grad: device.buffer::<f32>("projected_grad", GRADIENT_FLOATS * splats)?,
-            camera_parts: device.buffer::<f32>("camera_parts", 10 * project_backward::CAMERA_PARTS)?,
+            camera_parts: device
+                .buffer::<f32>("camera_parts", 10 * shaders::project_backward::PARTS as usize)?,
             summation: ways.summation,
             gradient_entries: GradientEntries::default(),
             codes: device.buffer::<f32>("codes", (stride * splats).max(4))?,
@@ -140,7 +142,7 @@ impl Rasterizer {
             depth_pairs: device.buffer::<[u32; 2]>("depth_pairs", splats)?,
             lists: TileLists::new(device, ways.grouping, splats, tiles, entries)?,
         };
-        let camera = device.buffer::<f32>("camera", VIEW_FLOATS)?;
+        let camera = device.buffer::<CameraView>("camera", 1)?;
         let sort = Sort::new(device, splats)?;
         let count = device.buffer::<u32>("splat count", 1)?;
         Ok(Rasterizer {
@@ -160,7 +162,7 @@ impl Rasterizer {
         &self.frame
     }
 
-    /// [6] rows of four floats, layout of [`View::to_gpu`]: what later runs of any recording render.
+    /// One [`CameraView`]: what later runs of any recording render.
     pub fn camera(&self) -> &Buffer {
         &self.camera
     }
@@ -173,7 +175,7 @@ impl Rasterizer {
                 view.size[0], view.size[1], self.frame.width, self.frame.height
             )));
         }
-        self.camera.write(&view.to_gpu())
+        self.camera.write(&[view.to_gpu()])
     }
 
     /// Records projection, depth sort, binning and blending of an image that is one band.
@@ -320,6 +322,7 @@ impl Rasterizer {
                     self.record_projection(&mut rec, params, options);
                 }
                 self.record_band(&mut rec, params, &band);
+                rec.download(&self.frame.status);
                 rec.run()?;
                 match self.overflow()? {
                     Some(needed) => self.grow(needed)?,

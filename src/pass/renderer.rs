@@ -6,13 +6,13 @@ use super::options::RasterOptions;
 use super::rasterizer::Rasterizer;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
-use crate::gpu::Device;
+use crate::gpu::{Device, shaders};
 use crate::scene::{Camera, Plane, RgbImage, Splats};
 use crate::{Error, Result};
 
 /// Alpha from which a pixel has a depth: below, Σ w z says little about any surface
 /// (docs/method.md#forward-rasterisation).
-pub const DEPTH_ALPHA_MIN: f32 = 0.5;
+pub const DEPTH_ALPHA_MIN: f32 = shaders::pack::DEPTH_ALPHA_MIN as f32;
 
 /// One rendered view.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -41,9 +41,9 @@ enum Work {
 /// Bits per pass: 256 counters for each of 8 lanes are 8 KiB of shared memory.
 const DIGIT_BITS: u32 = 8;
 /// Pairs per tile in `glsl/sort_sweep.comp`.
-const TILE: usize = 2048;
+const TILE: usize = shaders::sort_sweep::TILE as usize;
 /// Pairs per thread in `glsl/sort_digits.comp`.
-const EACH: usize = 32;
+const EACH: usize = shaders::sort_digits::EACH as usize;
 
 /// What one call sorts by.
 #[derive(Clone, Copy)]

@@ -7,16 +7,15 @@
 use super::bands::{Band, Bands};
 use super::sum;
 use crate::Result;
+use crate::gpu::shaders::shared::ssim::{self as shared, C1, C2};
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 use serde::{Deserialize, Serialize};
 
 /// Taps of the SSIM window.
-pub const WINDOW: usize = 11;
+pub const WINDOW: usize = shared::WINDOW.len();
 /// Half of the window: how far a pixel's influence reaches.
-pub const HALF: usize = WINDOW / 2;
+pub const HALF: usize = shared::HALF as usize;
 const SIGMA: f64 = 1.5;
-const C1: f64 = 1e-4; // (0.01)², Wang et al. 2004
-const C2: f64 = 9e-4; // (0.03)²
 
 /// The two parts of the image loss before weighting.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -116,8 +115,8 @@ fn ssim_plane(x: &[f64], y: &[f64], width: usize, height: usize) -> (f64, Vec<f6
     (sum, (0..x.len()).map(|i| p[i] + 2.0 * x[i] * q[i] + y[i] * r[i]).collect())
 }
 
-/// Outputs per thread in the shaders (`STRIP`).
-const STRIP: usize = 16;
+/// Outputs per thread in the shaders.
+const STRIP: usize = shared::STRIP as usize;
 /// Colour channels.
 const CHANNELS: usize = 3;
 
@@ -229,6 +228,13 @@ mod tests {
         let mut z = (i as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
         ((z ^ (z >> 27)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    #[test]
+    fn the_shaders_have_the_taps_of_the_twin() {
+        for (own, shader) in taps().iter().zip(shared::WINDOW) {
+            assert!((own - shader).abs() < 1e-8, "{own} {shader}");
+        }
     }
 
     #[test]

@@ -1,9 +1,7 @@
-//! The camera as the passes see it: a twin form in f64 and the 24 floats that the shaders read.
+//! The camera as the passes see it: a twin form in f64 and the structure that the shaders read.
+use crate::gpu::shaders::structs::CameraView;
 use crate::scene::Camera;
 use glam::{DMat3, DVec3};
-
-/// Number of floats of [`View::to_gpu`] (`glsl/shared/camera.glsl`).
-pub const VIEW_FLOATS: usize = 24;
 
 /// A pinhole view plus what rasterisation needs to know beside the camera.
 #[derive(Clone, Debug, PartialEq)]
@@ -64,28 +62,21 @@ impl View {
         -(self.rotation.transpose() * self.translation)
     }
 
-    /// The layout of `glsl/shared/camera.glsl`: three rows (R | τ), then (fx, fy, cx, cy), (W, H, near, 0) and
-    /// (background, 0).
-    pub fn to_gpu(&self) -> [f32; VIEW_FLOATS] {
-        let mut out = [0.0; VIEW_FLOATS];
-        for row in 0..3 {
+    /// What the shaders read.
+    pub fn to_gpu(&self) -> CameraView {
+        let narrow = |v: [f64; 2]| v.map(|x| x as f32);
+        let row = |row: usize| {
             let r = self.rotation.row(row);
-            out[row * 4..row * 4 + 4].copy_from_slice(&[
-                r.x as f32,
-                r.y as f32,
-                r.z as f32,
-                self.translation[row] as f32,
-            ]);
+            [r.x as f32, r.y as f32, r.z as f32, self.translation[row] as f32]
+        };
+        CameraView {
+            world_to_camera: [0, 1, 2].map(row),
+            focal: narrow(self.focal),
+            centre: narrow(self.centre),
+            size: self.size.map(|s| s as f32),
+            near: self.near as f32,
+            background: self.background.map(|c| c as f32),
+            ..CameraView::default()
         }
-        for axis in 0..2 {
-            out[12 + axis] = self.focal[axis] as f32;
-            out[14 + axis] = self.centre[axis] as f32;
-            out[16 + axis] = self.size[axis] as f32;
-        }
-        out[18] = self.near as f32;
-        for channel in 0..3 {
-            out[20 + channel] = self.background[channel] as f32;
-        }
-        out
     }
 }
