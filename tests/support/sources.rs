@@ -184,7 +184,7 @@ impl Crate {
             }
         }
         let of = |(module, source): (&Module, &Source)| -> Vec<Module> {
-            source.tests.iter().map(|t| [module.as_slice(), &[t.clone()]].concat()).collect()
+            source.tests.iter().map(|t| [module.as_slice(), std::slice::from_ref(t)].concat()).collect()
         };
         let tests: Vec<Module> = files.iter().flat_map(of).collect();
         files.retain(|module, _| !tests.iter().any(|t| module.starts_with(t)));
