@@ -1,6 +1,6 @@
 #version 460
 // Rows of a [N, stride] array by index: to[i] = from[index[i]]; index 0xffffffff makes a row of zeros.
-// Serves pruning, compaction and densification for parameters and for optimiser state alike.
+// Serves pruning and compaction for parameters and for optimiser state alike.
 layout(local_size_x = 256) in;
 layout(std430, binding = 0) readonly buffer Index { uint index[]; };
 layout(std430, binding = 1) readonly buffer From { uint from[]; };

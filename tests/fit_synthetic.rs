@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)] // helpers of tests
 use glam::DVec3;
 use splatvk::fit::schedule::Exponential;
-use splatvk::fit::{self, FeatureGauge, LanguageOptions, Preset, RgbOptions};
+use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions};
 use splatvk::gpu::{Device, Options, TestDevice, test_device};
 use splatvk::math::Random;
 use splatvk::pass::{FeatureMode, RasterOptions, Renderer};
@@ -137,27 +137,6 @@ fn faint_splats_are_pruned_and_broken_input_is_refused() {
     assert!(wrong.unwrap_err().to_string().contains("one camera per photo"));
 }
 
-#[test]
-fn densification_adds_splats_where_detail_is_missing() {
-    let device = test_device();
-    let cameras = cameras(2);
-    let images = photos(&device, &wall(900, 8), &cameras);
-    let mut options = RgbOptions::preset(Preset::Draft);
-    options.iterations = 40;
-    options.densify = Some(fit::densify::DensifyOptions {
-        from: 10,
-        until: 30,
-        every: 10,
-        max_splats: 400,
-        ..Default::default()
-    });
-    let start = wall(200, 77);
-    let scale = fit::scale::SceneScale::measure(&cameras, &start.means);
-    let trained = fit::fit_rgb(&device, &images, &cameras, start, scale, None, &options, &Silent).unwrap();
-    let n = trained.splats.len();
-    assert!(n > 220 && n <= 400, "{n}");
-}
-
 /// Two objects, left and right of x = 0: labels where the pixel is opaque, from the true features.
 fn two_objects(device: &Device, splats: &Splats, cameras: &[Camera]) -> LanguageField {
     let object = |p: &[f32; 3]| usize::from(p[0] > 0.0);
@@ -203,12 +182,10 @@ fn two_objects_are_told_apart_in_every_parameterisation() {
     let cameras = cameras(3);
     let images = photos(&device, &splats, &cameras);
     let field = two_objects(&device, &splats, &cameras);
-    let gauge = FeatureGauge::Normalised { epsilon: 1e-3 };
     let base = language_options();
     let zero = LanguageOptions { lift: false, feature_rate: 7e-3, iterations: 120, ..base.clone() };
     let cases = [
-        ("lifted", LanguageOptions { gauge, ..base.clone() }),
-        ("linear", LanguageOptions { gauge: FeatureGauge::Linear, feature_rate: 5e-3, ..base.clone() }),
+        ("lifted", base.clone()),
         ("from zero", zero),
         ("per level", LanguageOptions { per_level: true, ..base.clone() }),
         ("detached", LanguageOptions { detach_geometry: true, ..base }),
@@ -237,7 +214,7 @@ fn only_the_ratio_of_rate_and_epsilon_matters_from_zero() {
     let field = two_objects(&device, &splats, &cameras);
     let run = |epsilon: f32, feature_rate: f64| {
         let options = LanguageOptions {
-            gauge: FeatureGauge::Normalised { epsilon },
+            epsilon,
             feature_rate,
             lift: false,
             detach_geometry: true,

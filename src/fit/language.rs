@@ -2,7 +2,7 @@
 //! `L = λ2·L_img + (1−λ2)·L_sem`, starting from lifted features.
 use super::lift::{CodeTargets, lift};
 use super::model::{self, Model};
-use super::options::{FeatureGauge, LanguageOptions};
+use super::options::LanguageOptions;
 use super::scale::SceneScale;
 use super::schedule::ViewOrder;
 use super::views::Views;
@@ -162,14 +162,11 @@ impl<'a> Run<'a> {
         let targets = CodeTargets::new(device, levels, images, &views, 1.0 - options.image_weight)?;
         let raster = RasterOptions {
             sh_degree: splats.sh_degree,
-            feature_mode: match options.gauge {
-                FeatureGauge::Normalised { epsilon } => FeatureMode::Gauge { epsilon, blocks: levels.len() },
-                FeatureGauge::Linear => FeatureMode::Linear,
-            },
+            feature_mode: FeatureMode::Gauge { epsilon: options.epsilon, blocks: levels.len() },
             features_move_geometry: !options.detach_geometry,
         };
         if options.lift {
-            let start = lift(device, &mut views, cameras, &model, &raster, &targets, options.gauge)?;
+            let start = lift(device, &mut views, cameras, &model, &raster, &targets)?;
             model.values.features.write(&start)?;
         }
         let losses = views
@@ -352,11 +349,9 @@ impl<'a> Run<'a> {
         if !all.iter().all(|v| v.is_finite()) {
             return Err(Error::work("the language stage produced features that are not finite"));
         }
-        if let FeatureGauge::Normalised { epsilon } = self.options.gauge {
-            for feature in all.chunks_exact_mut(d) {
-                let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
-                feature.iter_mut().for_each(|v| *v /= norm + epsilon);
-            }
+        for feature in all.chunks_exact_mut(d) {
+            let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
+            feature.iter_mut().for_each(|v| *v /= norm + self.options.epsilon);
         }
         let level =
             |l: usize| all.chunks_exact(levels * d).flat_map(move |f| &f[l * d..(l + 1) * d]).copied();

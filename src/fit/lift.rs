@@ -1,7 +1,6 @@
 //! Code targets in GPU memory, and lifting: features that start as the blending-weighted mean of the codes each splat
 //! is seen with (docs/method.md#lifting).
 use super::model::Model;
-use super::options::FeatureGauge;
 use super::views::Views;
 use crate::gpu::{Buffer, Device, Recorder};
 use crate::pass::bands::Band;
@@ -13,7 +12,7 @@ use crate::{Error, Result};
 /// Splats that labelled pixels saw with less weight than this (in pixels) start without a feature: their direction
 /// would be noise (docs/method.md#lifting).
 const MIN_WEIGHT: f32 = 0.05;
-/// Length of a lifted raw feature in the normalised gauge: far above ε, so steps turn it without collapsing it.
+/// Length of a lifted raw feature: far above ε, so steps turn it without collapsing it.
 const LIFTED_LENGTH: f32 = 0.5;
 
 /// Labels, codes and loss weights of all views and levels.
@@ -106,7 +105,6 @@ pub(super) fn lift(
     model: &Model,
     raster: &RasterOptions,
     targets: &CodeTargets,
-    gauge: FeatureGauge,
 ) -> Result<Vec<f32>> {
     let d = targets.width as usize;
     let total = model.count() * d * targets.levels as usize;
@@ -138,10 +136,9 @@ pub(super) fn lift(
         let seen = model.gradients.features.read_range::<f32>(0..total)?;
         sums.iter_mut().zip(seen).for_each(|(s, v)| *s += v);
     }
-    let length = if gauge == FeatureGauge::Linear { 1.0 } else { LIFTED_LENGTH };
     for feature in sums.chunks_exact_mut(d) {
         let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
-        let scale = if norm > MIN_WEIGHT { length / norm } else { 0.0 };
+        let scale = if norm > MIN_WEIGHT { LIFTED_LENGTH / norm } else { 0.0 };
         feature.iter_mut().for_each(|v| *v *= scale);
     }
     Ok(sums)

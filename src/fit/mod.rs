@@ -1,6 +1,5 @@
 //! Training: losses, schedules, pruning, pose refinement.
 mod coarse;
-pub mod densify;
 pub mod index_head;
 pub mod init;
 mod language;
@@ -18,7 +17,7 @@ mod views;
 pub use crate::preset::Preset;
 pub(crate) use language::Run as LanguageRun;
 pub use language::{LanguagePoint, TrainedLanguage, train_language};
-pub use options::{FeatureGauge, InitOptions, LanguageOptions, Rates, RgbOptions};
+pub use options::{InitOptions, LanguageOptions, Rates, RgbOptions};
 pub(crate) use rgb::Run as RgbRun;
 pub use rgb::{CurvePoint, FitStats, Trained, fit_rgb, train_rgb};
 pub(crate) use steps::Steps;

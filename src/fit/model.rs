@@ -159,7 +159,7 @@ impl Model {
         }
     }
 
-    /// Keeps the given rows, optimiser state included; [`compact::NEW`] makes a row of zeros. Features start anew.
+    /// Keeps the given rows, optimiser state included. Features start anew.
     pub(super) fn keep(&mut self, rows: &[u32]) -> Result<()> {
         let (device, n) = (&self.device, rows.len());
         let index = device.buffer_from("kept rows", rows)?;
@@ -176,16 +176,6 @@ impl Model {
         self.gradients = values.zeros_like(device)?;
         self.values = values;
         Ok(())
-    }
-
-    /// Replaces the splats; rows take the optimiser state of the old row `source[i]`, if any.
-    pub(super) fn replace(&mut self, splats: &Splats, source: &[u32]) -> Result<()> {
-        self.keep(source)?;
-        self.values.means.write(&splats.means)?;
-        self.values.log_scales.write(&splats.log_scales)?;
-        self.values.quats.write(&splats.quats)?;
-        self.values.opacity_logits.write(&splats.opacity_logits)?;
-        self.values.sh.write(&splats.sh)
     }
 
     /// Reads the splats back; an error if any value is not finite.

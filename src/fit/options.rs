@@ -1,5 +1,4 @@
 //! What the training stages can be told, and the presets.
-use super::densify::DensifyOptions;
 use super::pose::PoseOptions;
 use super::schedule::Exponential;
 use crate::preset::Preset;
@@ -39,7 +38,7 @@ pub struct Rates {
 pub struct RgbOptions {
     /// Optimisation steps; one view each.
     pub iterations: usize,
-    /// Seeds the view order, thinning and densification.
+    /// Seeds the view order and thinning.
     pub seed: u64,
     /// Start of the splats.
     pub init: InitOptions,
@@ -66,8 +65,6 @@ pub struct RgbOptions {
     pub prune_every: usize,
     /// … from this step on.
     pub prune_from: usize,
-    /// Clone and split, if at all.
-    pub densify: Option<DensifyOptions>,
     /// Camera refinement, if at all. Camera 0 never moves.
     pub poses: Option<PoseOptions>,
     /// SH degree of the result, 0–3.
@@ -92,9 +89,6 @@ impl RgbOptions {
     pub fn limit_splats(&mut self, most: usize, planned: usize) {
         let beyond = planned.saturating_sub(self.init.max_points);
         self.init.max_points = self.init.max_points.min(most.saturating_sub(beyond));
-        if let Some(densify) = &mut self.densify {
-            densify.max_splats = densify.max_splats.min(most);
-        }
     }
 
     /// The same options for another number of steps; schedules end with the run.
@@ -174,24 +168,11 @@ impl RgbOptions {
             prune_opacity: 0.005,
             prune_every: 100,
             prune_from: 200,
-            densify: None,
             poses: Some(PoseOptions { start: 0, rate: Exponential { start: 1e-4, end: 1e-6, steps: 1000 } }),
             sh_degree: 0,
             report_every: 10,
         }
     }
-}
-
-/// How raw splat features become what is rendered (docs/method.md#feature-gauge).
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum FeatureGauge {
-    /// `f̂ = f/(‖f‖+ε)` per level, as the paper.
-    Normalised {
-        /// ε; only the ratio of ε and learning rate matters when features start at zero.
-        epsilon: f32,
-    },
-    /// Features are rendered as they are.
-    Linear,
 }
 
 /// Options of [`super::train_language`].
@@ -207,8 +188,9 @@ pub struct LanguageOptions {
     pub rates: Rates,
     /// Learning rate of the features.
     pub feature_rate: f64,
-    /// Parameterisation.
-    pub gauge: FeatureGauge,
+    /// ε of `f̂ = f/(‖f‖+ε)` per level (docs/method.md#feature-gauge); only the ratio of ε and learning rate matters when
+    /// features start at zero.
+    pub epsilon: f32,
     /// Start from the weighted mean of the codes each splat sees instead of from zero.
     pub lift: bool,
     /// Train every level on its own copy of the splats, as the paper; otherwise all levels share one geometry.
@@ -244,7 +226,7 @@ impl LanguageOptions {
             },
             // From zero: the paper's dynamics (7e-9 at ε = 1e-9) scaled to numbers f32 holds. After lifting: 2.5e-3.
             feature_rate: if paper { 7e-3 } else { 2.5e-3 },
-            gauge: FeatureGauge::Normalised { epsilon: 1e-3 },
+            epsilon: 1e-3,
             lift: !paper,
             per_level: paper,
             detach_geometry: false,

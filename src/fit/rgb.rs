@@ -1,6 +1,5 @@
 //! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (docs/method.md#splats).
 use super::coarse::Halved;
-use super::densify::densify;
 use super::init::splats_from_points;
 use super::model::{self, Model};
 use super::options::RgbOptions;
@@ -11,8 +10,6 @@ use super::unseen::unseen_splats;
 use super::views::Views;
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Device, Program, Recorder};
-use crate::math::Random;
-use crate::pass::densify::GradientStats;
 use crate::pass::metrics::psnr;
 use crate::pass::options::{FeatureMode, RasterOptions};
 use crate::pass::{compact, regularise, ssim_l1::ImageLoss};
@@ -141,7 +138,6 @@ pub fn fit_rgb(
             progress.figures(point.step as u64, &figures);
         }
         run.prune(iteration)?;
-        run.densify(iteration)?;
         if progress.checkpoint().is_some_and(Checkpoint::due) {
             run.keep(iteration + 1, progress)?;
         }
@@ -174,8 +170,6 @@ struct State {
     cameras: Vec<Camera>,
     poses: Vec<PoseAdam>,
     order: ViewOrder,
-    random: Random,
-    stats: Option<Vec<f32>>,
     recent: Vec<ImageLoss>,
     last: usize,
     psnr: Vec<Option<f64>>,
@@ -193,8 +187,6 @@ pub(crate) struct Run<'a> {
     cameras: Vec<Camera>,
     poses: Vec<PoseAdam>,
     order: ViewOrder,
-    random: Random,
-    stats: Option<GradientStats>,
     /// One recorded step per view; empty after anything they bind has changed.
     programs: Vec<Option<Program>>,
     recent: Vec<ImageLoss>,
@@ -216,10 +208,6 @@ impl<'a> Run<'a> {
         depths: Option<&[DepthMap]>,
         options: &'a RgbOptions,
     ) -> Result<Self> {
-        let stats = match options.densify {
-            Some(_) => Some(GradientStats::new(device, start.len())?),
-            None => None,
-        };
         Ok(Run {
             device: device.clone(),
             options,
@@ -234,8 +222,6 @@ impl<'a> Run<'a> {
             cameras: cameras.to_vec(),
             poses: vec![PoseAdam::default(); cameras.len()],
             order: ViewOrder::new(cameras.len(), options.seed),
-            random: Random::new(options.seed ^ 0x5eed),
-            stats,
             programs: cameras.iter().map(|_| None).collect(),
             recent: Vec::new(),
             images,
@@ -254,8 +240,6 @@ impl<'a> Run<'a> {
             cameras: self.cameras.clone(),
             poses: self.poses.clone(),
             order: self.order.clone(),
-            random: self.random.clone(),
-            stats: self.stats.as_ref().map(GradientStats::values).transpose()?,
             recent: self.recent.clone(),
             last: self.last,
             psnr: self.psnr.clone(),
@@ -266,11 +250,8 @@ impl<'a> Run<'a> {
     /// Takes over a state; the run was made for its splats.
     fn restore(&mut self, kept: State) -> Result<()> {
         self.model = Model::restored(&self.device, &kept.model)?;
-        if let (Some(own), Some(values)) = (&mut self.stats, &kept.stats) {
-            own.restore(values)?;
-        }
-        let State { cameras, poses, order, random, recent, last, psnr, curve, .. } = kept;
-        (self.cameras, self.poses, self.order, self.random) = (cameras, poses, order, random);
+        let State { cameras, poses, order, recent, last, psnr, curve, .. } = kept;
+        (self.cameras, self.poses, self.order) = (cameras, poses, order);
         (self.recent, self.last, self.psnr, self.curve) = (recent, last, psnr, curve);
         Ok(())
     }
@@ -350,9 +331,6 @@ impl<'a> Run<'a> {
             stage.raster.record_band_backward(&mut rec, &self.model.values, &self.raster, &band);
         }
         stage.raster.record_gradients(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
-        if let Some(stats) = &self.stats {
-            stats.record(&mut rec, frame, self.model.count());
-        }
         if self.options.ratio_weight > 0.0 {
             let count = self.model.count();
             let (values, gradients) = (&self.model.values.log_scales, &self.model.gradients.log_scales);
@@ -425,27 +403,8 @@ impl<'a> Run<'a> {
         }
         if rows.len() < self.model.count() {
             self.model.keep(&rows)?;
-            if let Some(stats) = &mut self.stats {
-                stats.keep(&self.device, &rows)?;
-            }
             self.forget_recordings();
         }
-        Ok(())
-    }
-
-    fn densify(&mut self, iteration: usize) -> Result<()> {
-        let step = iteration + 1;
-        let (Some(options), Some(stats)) = (self.options.densify, &self.stats) else { return Ok(()) };
-        if step < options.from || step > options.until || !step.is_multiple_of(options.every.max(1)) {
-            return Ok(());
-        }
-        let splats = self.model.splats()?;
-        let mean = stats.mean()?;
-        let (splats, source) = densify(&splats, &mean, self.scale.extent as f32, &options, &mut self.random);
-        self.model.replace(&splats, &source)?;
-        self.stats = Some(GradientStats::new(&self.device, splats.len())?);
-        self.views.resize(splats.len(), 0)?;
-        self.forget_recordings();
         Ok(())
     }
 

@@ -53,7 +53,6 @@ impl Stage {
 
 /// All views.
 pub(super) struct Views {
-    device: Device,
     pub(super) list: Vec<TrainView>,
     pub(super) stages: Vec<Stage>,
     near: f64,
@@ -71,7 +70,7 @@ impl Views {
         near: f64,
     ) -> Result<Self> {
         check_inputs(images, cameras)?;
-        let mut views = Views { device: device.clone(), list: Vec::new(), stages: Vec::new(), near };
+        let mut views = Views { list: Vec::new(), stages: Vec::new(), near };
         for (i, image) in images.iter().enumerate() {
             let size = [image.width as u32, image.height as u32];
             let same = |s: &Stage| [s.raster.frame().width, s.raster.frame().height] == size;
@@ -110,15 +109,6 @@ impl Views {
     /// Chooses what the next run renders.
     pub(super) fn set_camera(&self, view: usize, camera: &Camera) -> Result<()> {
         self.stage(view).raster.set_view(&View::new(camera, self.near))
-    }
-
-    /// Makes the rasterisers anew for another number of splats.
-    pub(super) fn resize(&mut self, capacity: usize, feature_dim: usize) -> Result<()> {
-        for stage in &mut self.stages {
-            let (w, h) = (stage.raster.frame().width, stage.raster.frame().height);
-            stage.raster = Rasterizer::new(&self.device, capacity, feature_dim, w, h)?;
-        }
-        Ok(())
     }
 
     /// Renders the model from a camera: colours clipped to [0, 1].

@@ -167,34 +167,3 @@ fn entries(alignment: &Alignment, level: usize) -> Vec<CodeEntry> {
     };
     alignment.components[level].iter().map(entry).collect()
 }
-
-/// Fills the features of a view's masks from an encoder; masks it cannot describe become holes.
-pub fn attach_features(
-    encoder: &mut dyn crate::infer::RegionEncoder,
-    image: &crate::scene::RgbImage,
-    masks: &mut ViewMasks,
-) -> Result<()> {
-    let dim = encoder.dim();
-    for level in &mut masks.levels {
-        let features = encoder.embed_regions(image, &level.labels, level.quality.len())?;
-        if features.len() != level.quality.len() * dim {
-            return Err(Error::work(format!(
-                "region features: {} values for {} masks of {dim} dimensions",
-                features.len(),
-                level.quality.len()
-            )));
-        }
-        let mut index = vec![-1; level.quality.len()];
-        let (mut rows, mut quality) = (Vec::new(), Vec::new());
-        for (k, row) in features.chunks_exact(dim).enumerate() {
-            if row.iter().any(|&v| v != 0.0) {
-                index[k] = quality.len() as i32;
-                quality.push(level.quality[k]);
-                rows.extend_from_slice(row);
-            }
-        }
-        level.labels.data.iter_mut().filter(|l| **l >= 0).for_each(|l| *l = index[*l as usize]);
-        (level.features, level.quality) = (rows, quality);
-    }
-    Ok(())
-}

@@ -12,5 +12,5 @@ mod masks;
 pub mod matcher;
 pub mod sam;
 
-pub use build::{BuildOptions, Language, Reducer, attach_features, build};
+pub use build::{BuildOptions, Language, Reducer, build};
 pub use masks::{LevelMasks, ViewMasks};

@@ -372,5 +372,4 @@ impl Graph {
 }
 
 #[cfg(test)]
-#[path = "choose_tests.rs"]
 mod tests;

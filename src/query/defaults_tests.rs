@@ -6,7 +6,9 @@ use crate::infer::words::RegionWords;
 use crate::infer::{RegionEncoder, Registry, hed::Hed, xfeat::XFeat};
 use crate::language::align::{PairLinks, links_from_warps};
 use crate::language::graph::{GraphOptions, segment};
-use crate::language::{BuildOptions, ViewMasks, attach_features, build, matcher};
+use crate::language::{BuildOptions, ViewMasks, build, matcher};
+use crate::progress::Silent;
+use crate::run::sources;
 use crate::scene::DepthMap;
 
 struct Inputs {
@@ -27,13 +29,13 @@ fn inputs() -> Inputs {
         let known = v.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect();
         let depth = DepthMap { depth: v.depth.clone(), confidence: Plane { data: known, ..v.depth } };
         let edges = hed.edges(&v.image).unwrap();
-        let mut m =
-            segment(&v.image, Some(&edges), Some((&v.camera, &depth)), &GraphOptions::default()).unwrap();
-        attach_features(&mut words, &v.image, &mut m).unwrap();
+        let m = segment(&v.image, Some(&edges), Some((&v.camera, &depth)), &GraphOptions::default()).unwrap();
         dense.push(net.dense(&v.image).unwrap());
         masks.push(m);
         depths.push(depth);
     }
+    let images: Vec<_> = views.iter().map(|v| v.image.clone()).collect();
+    let masks = sources::with_features(masks, &images, &mut words, &Silent).unwrap();
     let mut matched = Vec::new();
     for i in 0..views.len() {
         for j in i + 1..views.len() {
@@ -53,9 +55,7 @@ fn inputs() -> Inputs {
 /// (IoU, localised) per phrase and view.
 fn score(x: &Inputs) -> Vec<(String, Vec<(f32, bool)>)> {
     let cameras: Vec<_> = x.views.iter().map(|v| v.camera.clone()).collect();
-    let built =
-        build(&x.masks, &cameras, &x.depths, &x.matched, &BuildOptions::default(), &crate::progress::Silent)
-            .unwrap();
+    let built = build(&x.masks, &cameras, &x.depths, &x.matched, &BuildOptions::default(), &Silent).unwrap();
     let mut out = Vec::new();
     for (k, query) in &x.queries {
         let mut row = Vec::new();

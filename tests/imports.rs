@@ -1,0 +1,97 @@
+//! Who may use whom: the folders in one direction, the files without circles. Tests may use what they like.
+#![allow(clippy::unwrap_used)] // a panic is how a test fails
+
+#[path = "support/sources.rs"]
+mod sources;
+
+use sources::Crate;
+use std::collections::BTreeSet;
+use std::path::Path;
+
+/// Each folder, or file beside them, and those that it uses; all of them stand above it.
+const FOLDERS: &[(&str, &str)] = &[
+    ("error", ""),
+    ("files", ""),
+    ("math", ""),
+    ("preset", ""),
+    ("checkpoint", "error files"),
+    ("progress", "error checkpoint"),
+    ("scene", ""),
+    ("gpu", "error"),
+    ("pass", "error math scene gpu"),
+    ("photo", "error progress scene"),
+    ("format", "error scene pass photo"),
+    ("infer", "error files math progress scene photo format"),
+    ("pose", "error math preset progress scene gpu pass photo infer"),
+    ("fit", "error math preset checkpoint progress scene gpu pass"),
+    ("language", "error math progress scene photo format infer"),
+    ("query", "error math scene pass photo format pose"),
+    ("report", "error progress scene photo format query"),
+    ("synth", "error math progress scene photo format language query"),
+    ("pipeline", "error files checkpoint progress gpu infer"),
+    (
+        "run",
+        "error files preset progress scene gpu pass photo format infer pose fit language query report pipeline",
+    ),
+    ("ablate", "error preset progress scene gpu photo infer pose fit language query report synth run"),
+    ("bench", "error preset progress scene gpu pass photo format infer pose fit query run"),
+    ("capi", "error preset progress scene gpu pass photo pose run"),
+    (
+        "cli",
+        "error preset progress scene gpu photo format infer language query report synth pipeline run ablate bench",
+    ),
+];
+
+/// Files that use each other in a circle, still.
+const CIRCLES: &[&str] = &[
+    "bench/report bench/roofline bench/training",
+    "cli cli/ablate cli/bench cli/clean cli/doctor cli/eval cli/export cli/generate cli/models cli/query cli/render \
+     cli/run cli/shell cli/train cli/view",
+    "cli/args cli/args/experiments",
+    "gpu/adopt gpu/buffer gpu/device gpu/features gpu/module gpu/pipeline gpu/select gpu/validation",
+    "gpu/program gpu/recorder",
+    "infer/provider infer/runtime",
+    "pass/bin pass/project pass/project_backward pass/raster_backward pass/raster_forward pass/rasterizer pass/twin",
+    "pipeline pipeline/graph",
+    "run run/ask run/list run/networks run/record run/sources run/stages run/stages/answers run/stages/cameras \
+     run/stages/language run/stages/masks run/stages/matches run/stages/splats",
+];
+
+fn all() -> Crate {
+    Crate::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("src"))
+}
+
+#[test]
+fn folders_use_what_stands_above_them_and_nothing_else() {
+    let mut stated = BTreeSet::new();
+    for (k, (folder, used)) in FOLDERS.iter().enumerate() {
+        for other in used.split_whitespace() {
+            assert!(
+                FOLDERS[..k].iter().any(|f| f.0 == other),
+                "{folder} uses {other}, which must stand above it"
+            );
+            stated.insert((folder.to_string(), other.to_string()));
+        }
+    }
+    let mut found = BTreeSet::new();
+    for (file, used) in all().edges() {
+        for other in used.iter().filter(|o| o[0] != file[0]) {
+            let edge = (file[0].clone(), other[0].clone());
+            let (file, other) = (file.join("/"), other.join("/"));
+            assert!(stated.contains(&edge), "{file} uses {other}, but {} may not use {}", edge.0, edge.1);
+            found.insert(edge);
+        }
+    }
+    let unused: Vec<_> = stated.difference(&found).collect();
+    assert!(unused.is_empty(), "no longer used, take them out of FOLDERS: {unused:?}");
+}
+
+#[test]
+fn files_do_not_use_each_other_in_circles() {
+    let found: BTreeSet<String> = all().circles().into_iter().map(|c| c.join(" ")).collect();
+    let known: BTreeSet<String> = CIRCLES.iter().map(|c| c.to_string()).collect();
+    let new: Vec<_> = found.difference(&known).collect();
+    assert!(new.is_empty(), "files that use each other in a circle: {new:#?}");
+    let gone: Vec<_> = known.difference(&found).collect();
+    assert!(gone.is_empty(), "no longer circles, take them out of CIRCLES: {gone:#?}");
+}
