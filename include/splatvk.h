@@ -293,6 +293,10 @@ typedef struct {
      1 = with the Khronos validation layer. Not for svk_context_adopt.
      */
     uint32_t validation;
+    /*
+     What computes the networks, as --provider takes it; NULL = the environment variable SPLATVK_PROVIDER, or else "auto".
+     */
+    const char *provider;
 } SvkContextOptions;
 
 /*
@@ -555,6 +559,27 @@ typedef struct {
      1600 on a GPU.
      */
     uint64_t max_size;
+    /*
+     Cameras and points, as `splatvk run --init` takes it: "sfm", "cameras:FILE", the name of an installed network, or "auto"
+     for the best of them. NULL = `cameras`, or else "sfm".
+     */
+    const char *init;
+    /*
+     Dense matches, as --matcher takes it. NULL = built-in.
+     */
+    const char *matcher;
+    /*
+     Masks, as --masks takes it. NULL = `masks`, or else built-in.
+     */
+    const char *mask_source;
+    /*
+     Region features, as --features takes it. NULL = `features`, or else built-in.
+     */
+    const char *feature_source;
+    /*
+     How language gets onto the splats, as --method takes it. NULL = "sparselgs".
+     */
+    const char *method;
 } SvkTrainOptions;
 
 /*

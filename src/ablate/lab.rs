@@ -5,15 +5,16 @@ use crate::fit::{LanguageOptions, Preset, RgbOptions, Trained, TrainedLanguage};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::installed::{Duty, inventory, known};
+use crate::language::sam::SamOptions;
 use crate::language::{Language, ViewMasks};
 use crate::photo;
 use crate::pipeline::{Graph, Output, Store};
 use crate::progress::{Progress, Recorded};
 use crate::query::TextQuery;
 use crate::query::eval::{BACKGROUND_LABELS, Frame, GroundTruth, Split};
+use crate::run::ask;
 use crate::run::sources::{self, Build, Features, Geometry, Masks, Matches, PosedPhotos};
 use crate::run::stages::{self, CameraSource, Placed};
-use crate::run::{RunPlan, ask};
 use crate::scene::Camera;
 use crate::synth::regions;
 use crate::{Error, Result};
@@ -128,13 +129,15 @@ impl<'a> Lab<'a> {
         let frames = self.frames(setup.views)?;
         let paths: Vec<PathBuf> = frames.iter().map(|f| self.truth.folder.join(&f.file)).collect();
         let photos = photo::load_all(&paths, self.progress)?;
-        let mut plan = RunPlan { init: setup.init.clone(), seed: self.seed, ..RunPlan::default() };
-        if let Regions::Found { masks, features } = &setup.regions {
-            (plan.masks, plan.features) = (masks.clone(), features.clone());
-        }
         let registry = &self.registry;
-        let mut build =
-            Build { graph: Graph::default(), registry: registry.clone(), plan, preset: Preset::Draft };
+        let given = |r: &Regions| matches!(r, Regions::Found { features, .. } if features.argument.is_some());
+        let mut build = Build {
+            graph: Graph::default(),
+            registry: registry.clone(),
+            sam: SamOptions::default(),
+            given_features: given(&setup.regions),
+            preset: Preset::Draft,
+        };
         let posed = if setup.true_cameras {
             let named = |f: &Frame| Camera { name: f.stem.clone(), ..f.camera.clone() };
             build.posed(photos, CameraSource::Known(frames.iter().map(named).collect()))?
@@ -142,8 +145,8 @@ impl<'a> Lab<'a> {
             sources::make::<Geometry>(&setup.init, registry, (&mut build, photos))?
         };
         let PosedPhotos { placed, geometry } = posed;
-        let matcher = build.plan.matcher.clone();
-        let matches = sources::make::<Matches>(&matcher, registry, (&mut build, posed))?;
+        let matches =
+            sources::make::<Matches>(&sources::default::<Matches>(), registry, (&mut build, posed))?;
         let options = self.rgb_options(setup);
         let trained = build.graph.add(stages::TrainColour { options }, (placed, geometry));
         let Described { masks, meaning, queries, space } = self.described(setup, &mut build, posed)?;

@@ -1,8 +1,8 @@
 //! What only experiments do: masks and features from ground truth, the true meaning of objects, and figures.
 use crate::fit::{Trained, TrainedLanguage};
-use crate::photo::stem;
 use crate::language::{ViewMasks, dir};
 use crate::photo::Photo;
+use crate::photo::stem;
 use crate::pipeline::{Context, Lane, Output, Stage};
 use crate::query::TextQuery;
 use crate::query::eval::{Evaluation, Frame, GroundTruth, Report, Split};

@@ -6,7 +6,7 @@ use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
 use crate::photo::{Photo, stem};
 use crate::progress::Progress;
-use crate::scene::{Camera, ModelView, PairPointmaps};
+use crate::scene::Camera;
 use crate::{Error, Result};
 use glam::DVec2;
 

@@ -3,12 +3,12 @@
 use super::*;
 use crate::infer::breakfast::{View, phrases, train_views};
 use crate::infer::words::RegionWords;
-use crate::infer::{RegionEncoder, Registry, hed::Hed, xfeat::XFeat};
+use crate::infer::{Registry, hed::Hed, xfeat::XFeat};
 use crate::language::align::{PairLinks, links_from_warps};
 use crate::language::graph::{GraphOptions, segment};
 use crate::language::{BuildOptions, ViewMasks, build, matcher};
 use crate::progress::Silent;
-use crate::run::sources;
+use crate::run::stages::{SharedEncoder, masks::describe};
 use crate::scene::DepthMap;
 
 struct Inputs {
@@ -23,7 +23,7 @@ fn inputs() -> Inputs {
     let views = train_views();
     let open = || Registry::open(None).unwrap();
     let (mut hed, mut net) = (Hed::load(&open()).unwrap(), XFeat::load(&open()).unwrap());
-    let mut words = RegionWords::load(open()).unwrap();
+    let words = SharedEncoder::new(Box::new(RegionWords::load(open()).unwrap()), String::new());
     let (mut masks, mut depths, mut dense) = (Vec::new(), Vec::new(), Vec::new());
     for v in &views {
         let known = v.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect();
@@ -34,8 +34,7 @@ fn inputs() -> Inputs {
         masks.push(m);
         depths.push(depth);
     }
-    let images: Vec<_> = views.iter().map(|v| v.image.clone()).collect();
-    let masks = sources::with_features(masks, &images, &mut words, &Silent).unwrap();
+    describe(&mut masks, views.iter().map(|v| &v.image), &words, &Silent).unwrap();
     let mut matched = Vec::new();
     for i in 0..views.len() {
         for j in i + 1..views.len() {
@@ -43,9 +42,9 @@ fn inputs() -> Inputs {
             matched.push(links_from_warps(i, j, &there, &back));
         }
     }
-    let canonicals = words.embed_texts(&CANONICAL_PHRASES).unwrap();
+    let canonicals = words.with(|e| e.embed_texts(&CANONICAL_PHRASES)).unwrap();
     let ask = |(k, text): (i32, String)| {
-        let embedding = words.embed_texts(&[&text]).unwrap();
+        let embedding = words.with(|e| e.embed_texts(&[&text])).unwrap();
         (k, TextQuery { text, embedding, canonicals: canonicals.clone() })
     };
     let queries = phrases().into_iter().filter(|(k, _)| *k > 3).map(ask).collect();

@@ -1,5 +1,5 @@
 //! A loaded scene that is kept ready for questions: what viewers, `splatvk query` and benchmarks call.
-use super::Answers;
+use super::outcome::Answers;
 use super::view::{DecodedFrame, Viewer};
 use crate::gpu::Device;
 use crate::infer::RegionEncoder;

@@ -8,7 +8,7 @@ use crate::{Error, Result};
 pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncoder>> {
     let table = scene.path.join(TEXT_EMBEDDINGS);
     if table.is_file() {
-        return sources::table(&table);
+        return sources::table_encoder(&table);
     }
     let space = scene.language.as_ref().map_or("", |l| l.space.as_str());
     // "clip:0123456789abcdef" was made with a network of the family clip.

@@ -1,7 +1,8 @@
 //! The stages of `splatvk run`.
-use super::sources::{self, Build, Features, Geometry, Masks, Matches, PosedPhotos};
+use super::outcome::Answers;
+use super::plan::RunPlan;
+use super::sources::{self, Build, Features, Geometry, Given, Masks, Matches, PosedPhotos};
 use super::stages::{self, CameraSource, Placed};
-use super::{Answers, RunPlan};
 use crate::Result;
 use crate::fit::{Trained, TrainedLanguage};
 use crate::gpu::Device;
@@ -43,15 +44,16 @@ impl Scene {
 
 /// Refuses, before any work, what a source of the plan would refuse later.
 pub(super) fn check(plan: &RunPlan, photos: &[Photo], registry: &Registry) -> Result<()> {
-    sources::check::<Geometry>(&plan.init, plan, photos, registry)?;
-    sources::check::<Matches>(&plan.matcher, plan, photos, registry)?;
-    sources::check::<Features>(&plan.features, plan, photos, registry)?;
-    sources::check::<Masks>(&plan.masks, plan, photos, registry)
+    let given = Given { photos, masks: &plan.masks, features: &plan.features };
+    sources::check::<Geometry>(&plan.init, &given, registry)?;
+    sources::check::<Matches>(&plan.matcher, &given, registry)?;
+    sources::check::<Features>(&plan.features, &given, registry)?;
+    sources::check::<Masks>(&plan.masks, &given, registry)
 }
 
 /// Adds the stages of the plan. Within a lane they start in this order, so what needs no geometry comes before what does.
-pub(super) fn scene(build: &mut Build, device: &Device, photos: Vec<Photo>) -> Result<Scene> {
-    let (plan, preset, registry) = (build.plan.clone(), build.preset, build.registry.clone());
+pub(super) fn scene(build: &mut Build, plan: &RunPlan, device: &Device, photos: Vec<Photo>) -> Result<Scene> {
+    let (preset, registry) = (build.preset, build.registry.clone());
     let encoder = sources::make::<Features>(&plan.features, &registry, &registry)?;
     let options = plan.rgb_options(preset, device, photos.len());
     let posed = if plan.cameras.is_empty() {

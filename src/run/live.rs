@@ -1,6 +1,8 @@
 //! A scene that a program holds in memory: drawn, asked and saved on demand. What the C interface is made of.
+use super::execute::save;
+use super::outcome::Outcome;
 use super::view::Viewer;
-use super::{Outcome, encoder, save, sources};
+use super::{encoder, sources};
 use crate::format::scene_dir::{self, Contents, Scene};
 use crate::format::{Workspace, colmap, gaussians};
 use crate::gpu::Device;

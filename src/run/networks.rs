@@ -1,5 +1,5 @@
 //! The networks that users bring, as a run uses them: found before any work, named in run.json.
-use super::RunPlan;
+use super::plan::RunPlan;
 use super::sources::{Features, Geometry, Masks, Matches, installed};
 use crate::Result;
 use crate::infer::Registry;

@@ -1,7 +1,7 @@
 //! What to run, and what follows from it for the stages.
+use super::budget;
 use super::method::{self, FEATURE_DIM, Method, Recipe};
 use super::sources::{self, SourceChoice};
-use super::{CHECKPOINT_SECONDS, budget};
 use crate::Result;
 use crate::fit::{LanguageOptions, Preset, RgbOptions};
 use crate::gpu::Device;
@@ -9,6 +9,9 @@ use crate::infer::{Compute, Registry};
 use crate::language::sam::SamOptions;
 use crate::scene::Camera;
 use std::path::PathBuf;
+
+/// Training states are some ten megabytes for scenes of a few photos: written in a fraction of a second.
+pub const CHECKPOINT_SECONDS: u64 = 30;
 
 /// What to do, with every default that does not depend on the machine resolved.
 #[derive(Clone, Debug, serde::Serialize)]

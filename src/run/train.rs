@@ -153,7 +153,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let geometry = graph.add(stages::Depth { preset }, (placed,));
     let trained = graph.add(stages::TrainColour { options }, (placed, geometry));
     let targets = [placed.target(), geometry.target(), trained.target()];
-    let store = super::store(plan.resume, plan.checkpoint_seconds);
+    let store = super::execute::store(plan.resume, plan.checkpoint_seconds);
     let mut made = graph.run(&targets, &device, &registry, &store, progress)?;
     let (photos, geometry) = (made.take(placed)?.photos, made.take(geometry)?);
     let trained = made.take(trained)?;

@@ -1,5 +1,5 @@
 //! Features of regions, and the embeddings of texts that they are compared with.
-use super::{Kind, NO_CHECK, Source, SourceChoice, make};
+use super::table::{Kind, NO_CHECK, Source, SourceChoice, make};
 use crate::files::content_hash;
 use crate::infer::clip::Clip;
 use crate::infer::installed::{Duty, Installed};
@@ -42,7 +42,7 @@ impl Kind for Features {
             argument: Some("DIR"),
             about: "STEM_f.npy, text_embeddings.npz",
             needs: &[],
-            check: |dir, plan, _| match &plan.masks {
+            check: |dir, given| match given.masks {
                 SourceChoice { name, argument: Some(masks) } if name == "dir" && masks == dir => Ok(()),
                 SourceChoice { name, .. } if name == "dir" => {
                     Err(Error::input("--masks and --features: give the same dir: folder for both"))
@@ -55,7 +55,7 @@ impl Kind for Features {
             make: |dir, _| {
                 let file = dir.join(TEXT_TABLE);
                 let sum = content_hash(&file).map_err(Error::io(&file))?;
-                Ok(SharedEncoder::new(table(&file)?, sum))
+                Ok(SharedEncoder::new(table_encoder(&file)?, sum))
             },
         },
     ];
@@ -79,7 +79,7 @@ pub fn text_table(choice: &SourceChoice) -> Option<PathBuf> {
 }
 
 /// The encoder of a table of text embeddings.
-pub fn table(path: &Path) -> Result<Box<dyn RegionEncoder>> {
+pub fn table_encoder(path: &Path) -> Result<Box<dyn RegionEncoder>> {
     Ok(Box::new(Table { texts: TextEmbeddings::read(path)?, space: DIR_SPACE.to_owned() }))
 }
 

@@ -1,5 +1,5 @@
 //! Cameras, depth and points.
-use super::{Build, Kind, NO_CHECK, PosedPhotos, Source};
+use super::table::{Build, Kind, NO_CHECK, PosedPhotos, Source};
 use crate::Result;
 use crate::format::cameras;
 use crate::infer::Role;

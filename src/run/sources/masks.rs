@@ -1,5 +1,5 @@
 //! Masks of the photos on three levels.
-use super::{Build, Kind, NO_CHECK, PosedPhotos, Source};
+use super::table::{Build, Kind, NO_CHECK, PosedPhotos, Source};
 use crate::Result;
 use crate::infer::Role;
 use crate::infer::installed::{Duty, Installed};
@@ -28,11 +28,12 @@ impl Kind for Masks {
             argument: Some("DIR"),
             about: "STEM_s.npy",
             needs: &[],
-            check: |dir, plan, photos| {
-                photos.iter().try_for_each(|p| dir::read_view(dir, p, plan.features.name == "dir").map(drop))
+            check: |dir, given| {
+                let features = given.features.name == "dir";
+                given.photos.iter().try_for_each(|p| dir::read_view(dir, p, features).map(drop))
             },
             make: |dir, (build, photos)| {
-                let features = build.plan.features.name == "dir";
+                let features = build.given_features;
                 Ok(build.graph.add(GivenMasks { dir: dir.to_path_buf(), features }, (photos.placed,)))
             },
         },
@@ -42,7 +43,7 @@ impl Kind for Masks {
 
     fn network(model: Installed, (build, photos): Self::Input<'_>) -> Result<Self::Output> {
         let untrained = model.untrained();
-        let found = build.graph.add(NetworkMasks::new(model, build.plan.sam)?, (photos.placed,));
+        let found = build.graph.add(NetworkMasks::new(model, build.sam)?, (photos.placed,));
         if !untrained {
             return Ok(found);
         }

@@ -1,5 +1,5 @@
 //! Dense matches between every two photos, for step 1 of the alignment.
-use super::{Build, Kind, NO_CHECK, PosedPhotos, Source};
+use super::table::{Build, Kind, NO_CHECK, PosedPhotos, Source};
 use crate::Result;
 use crate::infer::Role;
 use crate::infer::installed::{Duty, Installed};

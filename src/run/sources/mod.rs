@@ -4,211 +4,18 @@ mod features;
 mod geometry;
 mod masks;
 mod matches;
+mod table;
 
-pub use features::{Features, encoder, table, text_table};
+pub use features::{Features, encoder, table_encoder, text_table};
 pub use geometry::Geometry;
 pub use masks::Masks;
 pub use matches::Matches;
+pub use table::{
+    Build, Given, Kind, PosedPhotos, Source, SourceChoice, check, choose, default, help, installed, make,
+};
 
-use super::RunPlan;
-use super::stages::Placed;
-use crate::fit::Preset;
-use crate::infer::installed::{Duty, Installed, Inventory, known};
-use crate::infer::{Registry, Role};
-use crate::photo::Photo;
-use crate::pipeline::{Graph, Output};
-use crate::{Error, Result, pose};
-use std::fmt;
-use std::path::{Path, PathBuf};
-
-/// A source as users write it: `NAME`, or `NAME:ARGUMENT`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct SourceChoice {
-    /// Of an entry of the table, or of an installed network or a family of them.
-    pub name: String,
-    /// The file or folder, for entries that take one.
-    pub argument: Option<PathBuf>,
-}
-
-impl SourceChoice {
-    /// One that takes no argument.
-    pub fn named(name: &str) -> SourceChoice {
-        SourceChoice { name: name.to_owned(), argument: None }
-    }
-
-    /// One with its file or folder.
-    pub fn with(name: &str, argument: impl Into<PathBuf>) -> SourceChoice {
-        SourceChoice { name: name.to_owned(), argument: Some(argument.into()) }
-    }
-
-    fn path(&self) -> &Path {
-        self.argument.as_deref().unwrap_or(Path::new(""))
-    }
-}
-
-impl fmt::Display for SourceChoice {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match &self.argument {
-            Some(argument) => write!(f, "{}:{}", self.name, argument.display()),
-            None => f.write_str(&self.name),
-        }
-    }
-}
-
-impl serde::Serialize for SourceChoice {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
-    }
-}
-
-/// A kind of thing that has several sources: a command-line option, and the table behind it.
-pub trait Kind: 'static {
-    /// Name of the option, without dashes.
-    const OPTION: &'static str;
-    /// What the option chooses.
-    const ABOUT: &'static str;
-    /// What a network must do to be a source of it.
-    const DUTY: Duty;
-    /// The sources that need no network of the user's; `auto` takes the first where none is installed.
-    const SOURCES: &'static [Source<Self>];
-    /// What a source is given.
-    type Input<'i>;
-    /// What it makes: a loaded model, or stages that are added to the graph.
-    type Output;
-    /// Makes it with an installed network.
-    fn network(model: Installed, input: Self::Input<'_>) -> Result<Self::Output>;
-}
-
-/// An entry of a table.
-pub struct Source<K: Kind + ?Sized> {
-    /// As users write it.
-    pub name: &'static str,
-    /// What follows the name and a colon, for `--help`; `None` for a source without argument.
-    pub argument: Option<&'static str>,
-    /// What is not clear from the name; may be empty.
-    pub about: &'static str,
-    /// Models of the default pack.
-    pub needs: &'static [Role],
-    /// Refuses, before any work, what would be refused later.
-    pub check: fn(&Path, &RunPlan, &[Photo]) -> Result<()>,
-    /// Makes it; the path is the argument.
-    pub make: fn(&Path, K::Input<'_>) -> Result<K::Output>,
-}
-
-/// For sources of which nothing can be refused before they work.
-const NO_CHECK: fn(&Path, &RunPlan, &[Photo]) -> Result<()> = |_, _, _| Ok(());
-
-/// What sources that are stages add them to.
-pub struct Build {
-    /// The stages so far.
-    pub graph: Graph<'static>,
-    /// Where models are found.
-    pub registry: Registry,
-    /// What was asked for.
-    pub plan: RunPlan,
-    /// Time against quality.
-    pub preset: Preset,
-}
-
-/// Photos with their geometry, as stages of a graph.
-#[derive(Clone, Copy)]
-pub struct PosedPhotos {
-    /// Photos without distortion, in one light.
-    pub placed: Output<Placed>,
-    /// Cameras, depth and points.
-    pub geometry: Output<pose::Geometry>,
-}
-
-fn built_in<K: Kind>(choice: &SourceChoice) -> Option<&'static Source<K>> {
-    K::SOURCES.iter().find(|s| s.name == choice.name)
-}
-
-/// The network behind a choice, `None` for a built-in source.
-pub fn installed<K: Kind>(choice: &SourceChoice, registry: &Registry) -> Result<Option<Installed>> {
-    match built_in::<K>(choice) {
-        Some(_) => Ok(None),
-        None => registry.installed(K::DUTY, &choice.name).map(Some),
-    }
-}
-
-/// Refuses, before any work, what the chosen source would refuse later.
-pub fn check<K: Kind>(
-    choice: &SourceChoice,
-    plan: &RunPlan,
-    photos: &[Photo],
-    registry: &Registry,
-) -> Result<()> {
-    let Some(source) = built_in::<K>(choice) else { return Ok(()) };
-    source.needs.iter().try_for_each(|role| registry.path(*role).map(drop))?;
-    (source.check)(choice.path(), plan, photos)
-}
-
-/// Makes what the chosen source gives.
-pub fn make<K: Kind>(choice: &SourceChoice, registry: &Registry, input: K::Input<'_>) -> Result<K::Output> {
-    match built_in::<K>(choice) {
-        Some(source) => (source.make)(choice.path(), input),
-        None => K::network(registry.installed(K::DUTY, &choice.name)?, input),
-    }
-}
-
-/// The choice of users who make none and have no network: the first of the table.
-pub fn default<K: Kind>() -> SourceChoice {
-    K::SOURCES.first().map_or_else(|| SourceChoice::named(""), |s| SourceChoice::named(s.name))
-}
-
-/// What a text means: `auto`, an entry of the table, or the name of a network or of a family of them, whether installed or
-/// not. Files and folders must exist.
-pub fn choose<K: Kind>(text: &str, networks: &Inventory) -> Result<SourceChoice> {
-    if text == "auto" {
-        let best = networks.best(K::DUTY).map(|model| SourceChoice::named(&model.name));
-        return Ok(best.unwrap_or_else(default::<K>));
-    }
-    let (name, argument) = text.split_once(':').map_or((text, None), |(name, path)| (name, Some(path)));
-    let source = K::SOURCES.iter().find(|s| s.name == name);
-    let network = || known().iter().any(|k| k.does(K::DUTY) && (k.family == name || k.id == name));
-    match (source.map(|s| s.argument), argument) {
-        (Some(None), None) => Ok(SourceChoice::named(name)),
-        (Some(Some(_)), Some(path)) if !path.is_empty() && Path::new(path).exists() => {
-            Ok(SourceChoice::with(name, path))
-        }
-        (Some(Some(_)), Some(path)) if !path.is_empty() => {
-            Err(Error::input(format!("--{}: {path} does not exist; check the path", K::OPTION)))
-        }
-        (None, None) if network() => Ok(SourceChoice::named(name)),
-        _ => {
-            let own = K::SOURCES.iter().map(Source::syntax);
-            let choices: Vec<String> = std::iter::once("auto".to_owned()).chain(own).collect();
-            let families = families(K::DUTY).into_iter().filter(|f| K::SOURCES.iter().all(|s| s.name != *f));
-            let choices =
-                choices.into_iter().chain(families.map(str::to_owned)).collect::<Vec<_>>().join(", ");
-            Err(Error::input(format!("--{} {text}: unknown; use one of: {choices}", K::OPTION)))
-        }
-    }
-}
-
-/// The help of the option.
-pub fn help<K: Kind>() -> String {
-    let first = K::SOURCES.first().map_or("", |s| s.name);
-    let own = K::SOURCES.iter().map(|s| match s.about {
-        "" => s.syntax(),
-        about => format!("{} ({about})", s.syntax()),
-    });
-    format!(
-        "{}: auto (the best network installed, else {first}), {}, or an installed network: {}",
-        K::ABOUT,
-        own.collect::<Vec<_>>().join(", "),
-        families(K::DUTY).join(", ")
-    )
-}
-
-/// One line about an option for `splatvk doctor`: (option, what `auto` takes and what else there is).
-fn listed<K: Kind>(networks: &Inventory) -> (String, String) {
-    let auto = networks.best(K::DUTY).map_or(K::SOURCES.first().map_or("", |s| s.name), |m| &m.name);
-    let own = K::SOURCES.iter().map(Source::syntax);
-    let brought = networks.models.iter().filter(|m| m.duties.contains(&K::DUTY)).map(|m| m.name.clone());
-    let all = own.chain(brought).collect::<Vec<_>>().join(", ");
-    (format!("--{}", K::OPTION), format!("auto takes {auto} · there are {all}"))
-}
+use crate::infer::installed::Inventory;
+use table::listed;
 
 /// A line per kind.
 pub fn list(networks: &Inventory) -> Vec<(String, String)> {
@@ -218,22 +25,6 @@ pub fn list(networks: &Inventory) -> Vec<(String, String)> {
         listed::<Masks>(networks),
         listed::<Features>(networks),
     ]
-}
-
-fn families(duty: Duty) -> Vec<&'static str> {
-    let mut all: Vec<&str> = Vec::new();
-    for model in known().iter().filter(|k| k.does(duty)) {
-        if !all.contains(&model.family.as_str()) {
-            all.push(&model.family);
-        }
-    }
-    all
-}
-
-impl<K: Kind> Source<K> {
-    fn syntax(&self) -> String {
-        self.argument.map_or_else(|| self.name.to_owned(), |argument| format!("{}:{argument}", self.name))
-    }
 }
 
 #[cfg(test)]

@@ -3,8 +3,9 @@ use crate::Result;
 use crate::fit::{Trained, TrainedLanguage};
 use crate::pipeline::{Context, Lane, Output, Stage};
 use crate::query::{QueryOptions, TextQuery};
+use crate::run::ask;
+use crate::run::outcome::Answers;
 use crate::run::view::{self, DecodedFrame};
-use crate::run::{Answers, ask};
 
 /// Renders and decodes every photo's view.
 pub struct Decode;

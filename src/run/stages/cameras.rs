@@ -1,4 +1,5 @@
 //! Photos → cameras → depth and points.
+use super::shared;
 use crate::fit::Preset;
 use crate::infer::installed::Installed;
 use crate::infer::pairs;
@@ -54,7 +55,7 @@ impl Cameras {
         let source_name = match &source {
             CameraSource::Sfm => "sfm".to_owned(),
             CameraSource::Known(cameras) => format!("{cameras:?}"),
-            CameraSource::Network(model) => super::identity(model)?,
+            CameraSource::Network(model) => shared::identity(model)?,
             CameraSource::Complete(geometry) => format!("{geometry:?}"),
         };
         let photos_name: Vec<String> = photos.iter().map(identity).collect();

@@ -1,5 +1,6 @@
 //! Masks → aligned things with codes → splats that carry them; and what texts mean.
-use super::Placed;
+use super::cameras::Placed;
+use super::shared;
 use crate::fit::{LanguageOptions, Trained, TrainedLanguage};
 use crate::infer::RegionEncoder;
 use crate::language::align::PairLinks;
@@ -162,7 +163,7 @@ impl Stage for TrainLanguage {
     ) -> Result<TrainedLanguage> {
         self.recipe.train_language(
             context.device,
-            &super::images(&placed.photos),
+            &shared::images(&placed.photos),
             &trained.cameras,
             &trained.splats,
             language.field.clone(),

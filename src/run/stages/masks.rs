@@ -1,7 +1,8 @@
 //! Photos → masks with features.
-use super::{Placed, SharedEncoder};
+use super::cameras::Placed;
+use super::language::SharedEncoder;
+use super::shared;
 use crate::Result;
-use crate::infer::RegionEncoder;
 use crate::infer::hed::Hed;
 use crate::infer::installed::Installed;
 use crate::language::sam::{self, SamOptions};
@@ -9,7 +10,8 @@ use crate::language::{ViewMasks, dir, graph};
 use crate::photo::Photo;
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::Geometry;
-use crate::scene::Plane;
+use crate::progress::Progress;
+use crate::scene::{Plane, RgbImage};
 use rayon::prelude::*;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -118,7 +120,7 @@ pub struct NetworkMasks {
 impl NetworkMasks {
     /// The network and how it is asked.
     pub fn new(model: Installed, options: SamOptions) -> Result<NetworkMasks> {
-        let settings = format!("{} {options:?}", super::identity(&model)?);
+        let settings = format!("{} {options:?}", shared::identity(&model)?);
         Ok(NetworkMasks { model, options, settings })
     }
 }
@@ -138,7 +140,7 @@ impl Stage for NetworkMasks {
     }
 
     fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Vec<ViewMasks>> {
-        sam::masks(&self.model, &super::images(&placed.photos), &self.options, context.progress)
+        sam::masks(&self.model, &shared::images(&placed.photos), &self.options, context.progress)
     }
 }
 
@@ -201,23 +203,32 @@ impl Stage for Regions {
     }
 
     fn run(self, (placed, masks): (&Placed, &Vec<ViewMasks>), context: &Context) -> Result<Vec<ViewMasks>> {
-        let (progress, mut masks) = (context.progress, masks.clone());
-        progress.begin("regions", masks.iter().map(|m| m.levels.len() as u64).sum());
-        let mut done = 0;
-        for (view, photo) in masks.iter_mut().zip(&placed.photos) {
-            for level in &mut view.levels {
-                progress.check()?;
-                let count = level.quality.len();
-                if level.features.is_empty() && count > 0 {
-                    let embed =
-                        |e: &mut dyn RegionEncoder| e.embed_regions(&photo.image, &level.labels, count);
-                    level.features = self.encoder.with(embed)?;
-                }
-                done += 1;
-                progress.step(done, "");
-            }
-        }
-        progress.end();
+        let (mut masks, images) = (masks.clone(), placed.photos.iter().map(|p| &p.image));
+        describe(&mut masks, images, &self.encoder, context.progress)?;
         Ok(masks)
     }
+}
+
+/// Gives features to the masks that came without.
+pub fn describe<'i>(
+    masks: &mut [ViewMasks],
+    images: impl Iterator<Item = &'i RgbImage>,
+    encoder: &SharedEncoder,
+    progress: &dyn Progress,
+) -> Result<()> {
+    progress.begin("regions", masks.iter().map(|m| m.levels.len() as u64).sum());
+    let mut done = 0;
+    for (view, image) in masks.iter_mut().zip(images) {
+        for level in &mut view.levels {
+            progress.check()?;
+            let count = level.quality.len();
+            if level.features.is_empty() && count > 0 {
+                level.features = encoder.with(|e| e.embed_regions(image, &level.labels, count))?;
+            }
+            done += 1;
+            progress.step(done, "");
+        }
+    }
+    progress.end();
+    Ok(())
 }

@@ -1,5 +1,6 @@
 //! Photos → dense matches between every two of them.
-use super::Placed;
+use super::cameras::Placed;
+use super::shared;
 use crate::Result;
 use crate::infer::installed::Installed;
 use crate::infer::warp;
@@ -84,7 +85,7 @@ pub struct NetworkMatches {
 impl NetworkMatches {
     /// The network.
     pub fn new(model: Installed) -> Result<NetworkMatches> {
-        let settings = super::identity(&model)?;
+        let settings = shared::identity(&model)?;
         Ok(NetworkMatches { model, settings })
     }
 }

@@ -1,5 +1,6 @@
 //! Photos and geometry → splats.
-use super::Placed;
+use super::cameras::Placed;
+use super::shared;
 use crate::Result;
 use crate::fit::{self, RgbOptions, Trained};
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
@@ -29,7 +30,7 @@ impl Stage for TrainColour {
         let depths = (!geometry.depths.is_empty()).then_some(geometry.depths.as_slice());
         fit::train_rgb(
             context.device,
-            &super::images(&placed.photos),
+            &shared::images(&placed.photos),
             &geometry.cameras,
             &geometry.points,
             depths,

@@ -1,0 +1,141 @@
+//! Running a plan: photos → cameras, depth and points → splats → language → scene directory.
+use super::list;
+use super::networks::Networks;
+use super::outcome::Outcome;
+use super::plan::RunPlan;
+use super::record;
+use super::sources::{self, Build};
+use crate::Result;
+use crate::format::Workspace;
+use crate::format::scene_dir::{self, Contents};
+use crate::gpu::{self, Device};
+use crate::infer::{Registry, home};
+use crate::photo::{self, Photo};
+use crate::pipeline::{Graph, Store};
+use crate::pose;
+use crate::progress::{Progress, Recorded};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// Runs the plan and writes the scene directory, whole or not at all.
+pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
+    let progress = &Recorded::new(progress);
+    let workspace = Workspace::create(&plan.out, plan.force)?;
+    // The device comes first: it says how large the photos may be.
+    let device = Device::with(&gpu::Options {
+        deterministic: plan.deterministic,
+        ..gpu::Options::from_env(plan.device.as_deref())
+    })?;
+    let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
+    let (chosen, choice) = pose::choose::photos(&plan.inputs, plan.views, progress)?;
+    plan.check_budget(&device, &photo::sizes_of(&chosen), max_size)?;
+    let photos = photo::load_each(&chosen, max_size, progress)?;
+    let registry = plan.registry()?;
+    let store = store(plan.resume, plan.checkpoint_seconds);
+    let outcome = Outcome { choice, ..work(plan, &device, &registry, photos, &store, progress)? };
+    write(workspace, &outcome, progress)?;
+    Ok(outcome)
+}
+
+/// The run without its files, for programs that hold photos, device and models themselves. Of the plan, everything about
+/// inputs, output, device and models goes unread.
+pub fn reconstruct(
+    plan: &RunPlan,
+    device: &Device,
+    registry: &Registry,
+    photos: Vec<Photo>,
+    progress: &dyn Progress,
+) -> Result<Outcome> {
+    photo::check_set(&photos)?;
+    let sizes: Vec<_> = photos.iter().map(|p| (p.image.width, p.image.height)).collect();
+    plan.check_budget(device, &sizes, usize::MAX)?;
+    work(plan, device, registry, photos, &Store::none(), &Recorded::new(progress))
+}
+
+/// Writes what [`reconstruct`] made as a scene directory, whole or not at all; `force` replaces a scene.
+pub fn save(outcome: &mut Outcome, out: &Path, force: bool, progress: &dyn Progress) -> Result<()> {
+    let workspace = Workspace::create(out, force)?;
+    outcome.plan.out = out.to_path_buf();
+    write(workspace, outcome, progress)
+}
+
+fn work(
+    plan: &RunPlan,
+    device: &Device,
+    registry: &Registry,
+    photos: Vec<Photo>,
+    store: &Store,
+    progress: &Recorded,
+) -> Result<Outcome> {
+    // Whatever can be refused is read before the long work, not after it.
+    registry.compute().report(progress)?;
+    let networks = Networks::of(plan, registry)?;
+    networks.warn_untrained(progress);
+    list::check(plan, &photos, registry)?;
+    let preset = plan.preset_on(device);
+    let mut build = Build {
+        graph: Graph::default(),
+        registry: registry.clone(),
+        sam: plan.sam,
+        given_features: plan.features.argument.is_some(),
+        preset,
+    };
+    let scene = list::scene(&mut build, plan, device, photos)?;
+    let mut made = build.graph.run(&scene.targets(), device, registry, store, progress)?;
+    registry.compute().report(progress)?;
+    let (trained, language) = (made.take(scene.trained)?, made.take(scene.language)?);
+    Ok(Outcome {
+        plan: plan.clone(),
+        preset,
+        device: device.info().clone(),
+        choice: None,
+        photos: made.take(scene.placed)?.photos,
+        geometry: made.take(scene.geometry)?,
+        cameras: trained.cameras,
+        splats: language.splats,
+        rgb: trained.stats,
+        field: language.field,
+        alignment: made.take(scene.aligned)?.alignment,
+        language_curve: language.curve,
+        frames: made.take(scene.frames)?,
+        answers: made.take(scene.answers)?,
+        names: made.take(scene.names)?,
+        provider: registry.compute().name().ok(),
+        models: registry.status(),
+        networks: networks.used()?,
+        stages: progress.stages(),
+        seconds: progress.seconds(),
+        warnings: progress.warnings(),
+    })
+}
+
+/// What stages made, on disk.
+pub(super) fn store(resume: bool, checkpoint_seconds: u64) -> Store {
+    Store::at(stage_folder(), resume, Duration::from_secs(checkpoint_seconds))
+}
+
+/// Where runs keep what their stages made.
+pub fn stage_folder() -> PathBuf {
+    home().join("stages")
+}
+
+fn write(workspace: Workspace, outcome: &Outcome, progress: &dyn Progress) -> Result<()> {
+    progress.begin("write", 2);
+    progress.check()?;
+    let table = sources::text_table(&outcome.plan.features);
+    let contents = Contents {
+        splats: &outcome.splats,
+        cameras: &outcome.cameras,
+        photos: &outcome.photos,
+        points: Some(&outcome.geometry.points),
+        language: Some(&outcome.field),
+        text_embeddings: table.as_deref(),
+    };
+    scene_dir::write(workspace.path(), &contents)?;
+    progress.step(1, "");
+    record::write(workspace.path(), outcome)?;
+    progress.check()?;
+    workspace.commit()?;
+    progress.end();
+    Ok(())
+}

@@ -1,0 +1,88 @@
+//! What a finished run knows.
+use super::plan::RunPlan;
+use super::view::DecodedFrame;
+use crate::fit;
+use crate::language;
+use crate::photo::Photo;
+use crate::pose::{self, Geometry};
+use crate::preset::Preset;
+use crate::progress::StageRecord;
+use crate::query::QueryResult;
+use crate::query::highlight::Highlight;
+use crate::report::ModelUsed;
+use crate::report::viewer::{Names, ShownAnswer};
+use crate::scene::{Camera, LanguageField, Splats};
+
+/// The answers to one text, one per photo.
+#[derive(Clone, Debug)]
+pub struct Answers {
+    /// What was asked.
+    pub text: String,
+    /// Per photo.
+    pub views: Vec<QueryResult>,
+    /// For the scene as a whole.
+    pub highlight: Highlight,
+}
+
+impl Answers {
+    /// For the interactive view.
+    pub fn shown(&self) -> ShownAnswer<'_> {
+        ShownAnswer {
+            text: &self.text,
+            found: self.found(),
+            views: self.views.len(),
+            highlight: &self.highlight,
+        }
+    }
+
+    /// Photos in which the text was found.
+    pub fn found(&self) -> usize {
+        self.views.iter().filter(|v| v.found).count()
+    }
+}
+
+/// Everything a finished run knows; [`crate::report`] turns it into run.json, report.html and the summary.
+pub struct Outcome {
+    /// What was asked for.
+    pub plan: RunPlan,
+    /// The preset that was used.
+    pub preset: Preset,
+    /// The device that was used.
+    pub device: crate::gpu::DeviceInfo,
+    /// Which photos were used and why, where there were more than wanted.
+    pub choice: Option<pose::choose::Choice>,
+    /// Photos at working resolution.
+    pub photos: Vec<Photo>,
+    /// Geometry before training.
+    pub geometry: Geometry,
+    /// Refined cameras.
+    pub cameras: Vec<Camera>,
+    /// The scene.
+    pub splats: Splats,
+    /// Figures of the colour stage.
+    pub rgb: fit::FitStats,
+    /// The scene's language.
+    pub field: LanguageField,
+    /// Masks, edges and components behind it.
+    pub alignment: language::align::Alignment,
+    /// Decode accuracy over the language stage.
+    pub language_curve: Vec<fit::LanguagePoint>,
+    /// The trained scene seen from every photo's camera.
+    pub frames: Vec<DecodedFrame>,
+    /// One per query of the plan.
+    pub answers: Vec<Answers>,
+    /// The text model's own phrases per level and code.
+    pub names: Names,
+    /// What computed the networks.
+    pub provider: Option<&'static str>,
+    /// Built-in models.
+    pub models: Vec<crate::infer::ModelStatus>,
+    /// Files of the networks that were used.
+    pub networks: Vec<ModelUsed>,
+    /// Times and memory per stage, up to the writing of the scene.
+    pub stages: Vec<StageRecord>,
+    /// Wall seconds up to there; less than the stages together, since some overlap.
+    pub seconds: f64,
+    /// What the user was warned of.
+    pub warnings: Vec<String>,
+}
