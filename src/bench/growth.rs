@@ -1,7 +1,7 @@
 //! Seconds per step against intersections, over seeded scenes of growing size.
 use super::measure::Budget;
-use super::report::{Clock, Section};
-use super::roofline::Roofline;
+use super::model::Roofline;
+use super::report::{Clock, STEP, Section};
 use super::training;
 use super::workload::Workload;
 use crate::Result;
@@ -21,7 +21,7 @@ pub fn measure(
     for &n in sizes {
         let workload = Workload::seeded(n, camera.width, camera.height, degree, 0)?;
         let step = training::colour(device, &workload, limits)?;
-        let row = step.row(training::STEP).map(|r| r.ms).unwrap_or_default();
+        let row = step.row(STEP).map(|r| r.ms).unwrap_or_default();
         let pairs = step.value("intersections").unwrap_or(f64::NAN);
         section.time(format!("step, {n} splats"), Clock::Wall, row);
         section.figure(format!("intersections, {n} splats"), pairs, "tile–splat pairs");

@@ -16,8 +16,8 @@ mod training;
 pub mod workload;
 
 pub use measure::{Budget, Spread};
+pub use model::Roofline;
 pub use report::{Report, Row, Section};
-pub use roofline::Roofline;
 pub use workload::Workload;
 
 use crate::gpu::Device;

@@ -3,6 +3,21 @@
 //!
 //! Floats per splat: 11 of geometry and opacity, 3 per SH coefficient, d features; a projected splat has 12 floats.
 //! Operations are counted from the formulas of the passes, a fused multiply-add as two, an exponential as one.
+/// What the device can do at most.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Roofline {
+    /// Bytes read plus bytes written by a copy, per second.
+    pub bytes_per_second: f64,
+    /// Floating-point operations, two per fused multiply-add, per second.
+    pub flops_per_second: f64,
+}
+
+impl Roofline {
+    /// Least milliseconds for this much work.
+    pub fn floor_ms(&self, bytes: f64, flops: f64) -> f64 {
+        (bytes / self.bytes_per_second).max(flops / self.flops_per_second) * 1e3
+    }
+}
 
 /// Sizes of a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -1,7 +1,6 @@
 //! What a benchmark found, as a table and as JSON.
 use super::measure::{Budget, Spread, cores, processor_ms};
-use super::model::Work;
-use super::roofline::Roofline;
+use super::model::{Roofline, Work};
 use crate::gpu::{Device, Program, Recorder};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -11,6 +10,10 @@ use std::path::Path;
 /// Name and version of the JSON layout; readers refuse others.
 const FORMAT: &str = "splatvk-bench 1";
 
+/// Name of the section of steps on colour; others begin with it.
+pub const COLOUR: &str = "training step";
+/// Row of the whole step.
+pub const STEP: &str = "training step";
 /// Row that adds up the passes above it.
 pub const SUM: &str = "sum of the passes";
 /// Passes that a render consists of.
@@ -148,9 +151,9 @@ impl Report {
 
     /// Adds the figures that need two sections: steps with features by the step without.
     pub fn relate(&mut self) {
-        let step = |s: &Section| s.row(super::training::STEP).map(|r| r.ms.median);
-        let Some(base) = self.section(super::training::COLOUR).and_then(step) else { return };
-        let prefix = format!("{}, ", super::training::COLOUR);
+        let step = |s: &Section| s.row(STEP).map(|r| r.ms.median);
+        let Some(base) = self.section(COLOUR).and_then(step) else { return };
+        let prefix = format!("{}, ", COLOUR);
         for section in self.sections.iter_mut().filter(|s| s.name.starts_with(&prefix)) {
             if let Some(ms) = step(section) {
                 section.figure("step / step on colour alone", ms / base, "");
@@ -250,7 +253,7 @@ impl Section {
                 }
             }
         }
-        let composed = ["forward", "forward + backward", super::training::STEP];
+        let composed = ["forward", "forward + backward", STEP];
         for row in &mut self.rows {
             match composed.iter().position(|c| *c == row.name) {
                 Some(at) => row.set_floor(sums[at]),

@@ -1,5 +1,6 @@
 //! The device's own limits, by small shaders, in the same run as what is compared with them.
 use super::measure::Budget;
+use super::model::Roofline;
 use super::report::Section;
 use crate::Result;
 use crate::gpu::{Device, Recorder, shaders};
@@ -9,22 +10,6 @@ use crate::pass::adam::rows_of_groups;
 const COPY_STEPS: usize = shaders::bench_copy::STEPS as usize;
 /// Fused multiply-adds per thread in `glsl/bench_fma.comp`.
 const FMA_PER_THREAD: usize = (shaders::bench_fma::CHAINS * shaders::bench_fma::STEPS) as usize;
-
-/// What the device can do at most.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Roofline {
-    /// Bytes read plus bytes written by a copy, per second.
-    pub bytes_per_second: f64,
-    /// Floating-point operations, two per fused multiply-add, per second.
-    pub flops_per_second: f64,
-}
-
-impl Roofline {
-    /// Least milliseconds for this much work.
-    pub fn floor_ms(&self, bytes: f64, flops: f64) -> f64 {
-        (bytes / self.bytes_per_second).max(flops / self.flops_per_second) * 1e3
-    }
-}
 
 /// Measures both limits. The best run counts: a limit is what the device can do, not what it usually does.
 pub fn measure(device: &Device, budget: &Budget) -> Result<(Roofline, Section)> {

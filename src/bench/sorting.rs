@@ -1,7 +1,7 @@
 //! The radix sort by itself.
 use super::measure::Budget;
+use super::model::Roofline;
 use super::report::Section;
-use super::roofline::Roofline;
 use crate::gpu::{Device, Recorder};
 use crate::pass::seeded::Random;
 use crate::pass::sort::Sort;

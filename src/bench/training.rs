@@ -1,8 +1,7 @@
 //! The training step: each pass by timestamps on the device, the whole by wall clock.
 use super::measure::{Budget, Spread};
-use super::model::Work;
-use super::report::{Clock, SUM, Section};
-use super::roofline::Roofline;
+use super::model::{Roofline, Work};
+use super::report::{COLOUR, Clock, STEP, SUM, Section};
 use super::workload::Workload;
 use crate::Result;
 use crate::fit::options::Rates;
@@ -14,10 +13,6 @@ use crate::pass::renderer::Renderer;
 use crate::pass::{pairs, seeded};
 use crate::scene::{Codebook, LevelField, Plane, RgbImage};
 
-/// Name of the section of steps on colour; others begin with it.
-pub const COLOUR: &str = "training step";
-/// Row of the whole step.
-pub const STEP: &str = "training step";
 /// Codes per level of the synthetic feature targets; a scene of four photos has about as many.
 const CODES: usize = 32;
 /// Far behind the schedule's end: all SH bands are in use (one more every 1000 steps).

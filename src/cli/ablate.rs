@@ -1,8 +1,8 @@
 //! `splatvk ablate`
 use super::args::AblateArgs;
 use super::plan::existing;
+use super::print::{print, print_json};
 use super::progress;
-use super::{print, print_json};
 use crate::ablate::{self, Finished, Lab, Plan, Regions, TABLES, Table};
 use crate::format::{create_folder, write_json};
 use crate::gpu::Device;

@@ -1,16 +1,17 @@
-//! What the user typed. `super::plan` says what it means.
-use crate::Result;
-use crate::infer::{Compute, Registry, provider};
+//! What the user typed.
+use crate::infer::provider;
 use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
 mod bench;
 mod experiments;
+mod shared;
 
 pub use super::run::RunArgs;
 pub use bench::{BenchArgs, BenchPart};
 pub use experiments::{AblateArgs, GenerateArgs};
+pub use shared::{DeviceArgs, LogFormat, PresetArg};
 
 /// Photos in, a 3D scene that answers text queries out.
 #[derive(Debug, Parser)]
@@ -25,15 +26,6 @@ pub struct Cli {
     /// What computes the networks, as far as the ONNX Runtime library can; auto: a GPU that answers, or else the CPU
     #[arg(long, global = true, value_parser = PossibleValuesParser::new(provider::NAMES), value_name = "NAME")]
     pub provider: Option<String>,
-}
-
-/// What goes to standard error.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum LogFormat {
-    /// Bars on a terminal, a line per stage elsewhere
-    Text,
-    /// One JSON object per line: begin, step, figures, end, message, warning, error
-    Json,
 }
 
 /// One variant per command; each has its own file in `cli/`.
@@ -96,41 +88,6 @@ impl Command {
             | Command::Manuals(_) => return None,
         };
         Some(&mut device.provider)
-    }
-}
-
-/// How much time a run may take.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum PresetArg {
-    /// Minutes on a 2-core CPU
-    Draft,
-    /// Best quality for the time on a GPU
-    Default,
-    /// The paper's schedule and constants
-    Paper,
-}
-
-/// Options that every command working on a device takes.
-#[derive(Clone, Debug, Default, Args)]
-pub struct DeviceArgs {
-    /// Vulkan device: part of its name, or its number in `splatvk doctor`
-    #[arg(long, value_name = "NAME|INDEX")]
-    pub device: Option<String>,
-    /// Folder of the models
-    #[arg(long, value_name = "DIR")]
-    pub models: Option<PathBuf>,
-    /// Print one JSON object on standard output
-    #[arg(long)]
-    pub json: bool,
-    /// `--provider`, which stands before or after the command.
-    #[arg(skip)]
-    pub provider: Option<String>,
-}
-
-impl DeviceArgs {
-    /// The models.
-    pub fn registry(&self) -> Result<Registry> {
-        Registry::with(self.models.as_deref(), Compute::by(self.provider.as_deref()))
     }
 }
 

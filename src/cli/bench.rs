@@ -1,7 +1,8 @@
 //! `splatvk bench`
 use super::args::{BenchArgs, BenchPart};
 use super::models::checked;
-use super::{print, progress};
+use super::print::print;
+use super::progress;
 use crate::bench::{self, Bench, Budget, Report, Workload, compare};
 use crate::format::{scene_dir, write_json};
 use crate::gpu::Device;

@@ -1,6 +1,6 @@
 //! `splatvk clean`: what earlier runs left to be used again, and how to free it.
 use super::args::CleanArgs;
-use super::{print, print_json};
+use super::print::{print, print_json};
 use crate::infer::cache;
 use crate::pipeline::Store;
 use crate::{Error, Result};

@@ -1,6 +1,7 @@
 //! `splatvk doctor`: what this machine has, and what to do about what it lacks.
 use super::args::DoctorArgs;
-use super::{models, print, print_json};
+use super::models;
+use super::print::{print, print_json};
 use crate::gpu::report::{Line, Status, vulkan};
 use crate::infer;
 use crate::infer::installed::inventory;

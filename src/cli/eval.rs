@@ -1,7 +1,7 @@
 //! `splatvk eval`
 use super::args::{EvalArgs, ProtocolArg};
+use super::print::{print, print_json};
 use super::progress;
-use super::{print, print_json};
 use crate::format::scene_dir::Scene;
 use crate::format::{cameras, create_folder, picture, scene_dir, write_json};
 use crate::gpu::Device;

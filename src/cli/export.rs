@@ -1,6 +1,7 @@
 //! `splatvk export`
 use super::args::{ExportArgs, ExportFormat};
-use super::{listing, progress};
+use super::print::listing;
+use super::progress;
 use crate::format::{
     SH_C0, colmap, create_folder, gaussians, gltf, ply, ply_packed, scene_dir, splat, spz, transforms, whole,
 };

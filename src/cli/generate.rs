@@ -1,7 +1,7 @@
 //! `splatvk generate`
 use super::args::GenerateArgs;
+use super::print::{print, print_json};
 use super::progress;
-use super::{print, print_json};
 use crate::format::Workspace;
 use crate::synth::regions::Flaws;
 use crate::synth::{self, Effects, Knobs};

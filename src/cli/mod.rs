@@ -10,6 +10,7 @@ mod generate;
 mod models;
 mod outputs;
 mod plan;
+mod print;
 mod progress;
 mod query;
 mod render;
@@ -19,11 +20,10 @@ mod train;
 mod view;
 mod views;
 
-use crate::{Error, Result};
+use crate::Result;
 use args::{Cli, Command};
 use clap::Parser;
 use clap::error::ErrorKind;
-use std::io::Write;
 use std::process::ExitCode;
 
 /// Runs the command line of this process: one error line at most, and an exit code that says what kind it was
@@ -89,26 +89,4 @@ fn usage(error: &clap::Error) -> ExitCode {
 
 fn one_line(message: &str) -> String {
     message.split_whitespace().collect::<Vec<_>>().join(" ")
-}
-
-/// Prints to standard output. A reader that closed the pipe (`| head`) ends the process quietly.
-fn print(text: &str) -> Result<()> {
-    let mut out = std::io::stdout().lock();
-    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => std::process::exit(0),
-        outcome => outcome.map_err(Error::io("standard output")),
-    }
-}
-
-/// Prints one JSON object on a line of its own.
-fn print_json(value: &serde_json::Value) -> Result<()> {
-    print(&format!("{value}\n"))
-}
-
-/// Names the files that a command wrote.
-fn listing(files: &[std::path::PathBuf], as_json: bool) -> Result<()> {
-    if as_json {
-        return print_json(&serde_json::json!({ "files": files }));
-    }
-    print(&files.iter().map(|f| format!("{}\n", f.display())).collect::<String>())
 }

@@ -1,6 +1,6 @@
 //! `splatvk models list|check|path`
 use super::args::{ModelsAction, ModelsArgs};
-use super::{print, print_json};
+use super::print::{print, print_json};
 use crate::infer::check::{Measured, check};
 use crate::infer::installed::{Installed, Inventory, Known, inventory, known};
 use crate::infer::{ModelStatus, Registry};

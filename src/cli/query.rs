@@ -1,8 +1,9 @@
 //! `splatvk query`
 use super::args::QueryArgs;
 use super::outputs::Outputs;
+use super::print::{print, print_json};
 use super::progress;
-use super::{print, print_json, views};
+use super::views;
 use crate::format::ply::{self, PlyOptions};
 use crate::format::{cameras, picture, scene_dir, write_json};
 use crate::gpu::Device;

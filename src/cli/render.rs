@@ -1,8 +1,9 @@
 //! `splatvk render`
 use super::args::{Channel, ImageFormat, RenderArgs};
 use super::outputs::Outputs;
+use super::print::listing;
 use super::progress;
-use super::{listing, views};
+use super::views;
 use crate::format::npy::{self, NpyArray};
 use crate::format::picture::{self, Planes};
 use crate::format::{cameras, scene_dir};

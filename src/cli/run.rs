@@ -1,7 +1,8 @@
 //! `splatvk run`
 use super::args::{DeviceArgs, PresetArg};
+use super::plan;
+use super::print::{print, print_json};
 use super::progress;
-use super::{plan, print, print_json};
 use crate::infer::installed::{Inventory, inventory};
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;

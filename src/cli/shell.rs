@@ -1,7 +1,7 @@
 //! `splatvk completions`, `splatvk manuals`: what tools/install puts beside the program.
 use super::args::{Cli, CompletionsArgs, ManualsArgs};
 use super::outputs::Outputs;
-use super::print;
+use super::print::print;
 use crate::{Error, Result};
 use clap::CommandFactory;
 

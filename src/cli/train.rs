@@ -1,8 +1,8 @@
 //! `splatvk train`
 use super::args::TrainArgs;
 use super::plan;
+use super::print::{print, print_json};
 use super::progress;
-use super::{print, print_json};
 use crate::Result;
 use crate::run::train::{TrainPlan, train as run};
 use serde_json::json;

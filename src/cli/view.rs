@@ -1,6 +1,7 @@
 //! `splatvk view`: the interactive view of a scene, served to the browser of this machine.
 use super::args::ViewArgs;
-use super::{print, print_json, progress};
+use super::print::{print, print_json};
+use super::progress;
 use crate::format::scene_dir::{self, Scene};
 use crate::gpu::Device;
 use crate::photo;

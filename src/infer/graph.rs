@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use super::adapter::{Adapter, Binding};
 use super::cache::{Key, fingerprint};
+use super::compute::Compute;
 use super::contract::{Slot, reorder, unify};
 use super::onnx::{self, Dim, Header};
-use super::provider::Compute;
 use super::runtime::{Input, Session, Tensor};
 use crate::{Error, Result};
 

@@ -9,9 +9,9 @@ use std::sync::OnceLock;
 use serde::{Deserialize, Serialize};
 
 use super::cache::fingerprint;
+use super::compute::Compute;
 use super::contract::Part;
 use super::graph::GraphFile;
-use super::provider::Compute;
 use super::registry::Registry;
 use crate::{Error, Result};
 

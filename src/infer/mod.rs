@@ -10,10 +10,12 @@ pub mod check;
 mod classify;
 pub mod clip;
 mod colour;
+mod compute;
 pub mod contract;
 pub mod graph;
 pub mod hed;
 pub mod installed;
+mod library;
 mod multiview;
 pub mod onnx;
 pub mod pairs;
@@ -33,9 +35,10 @@ pub mod warp;
 pub mod words;
 pub mod xfeat;
 
-pub use provider::Compute;
+pub use compute::Compute;
+pub use library::runtime;
 pub use registry::{ModelStatus, Registry, Role, home};
-pub use runtime::{Input, Session, Tensor, runtime};
+pub use runtime::{Input, Session, Tensor};
 
 use crate::Result;
 use crate::scene::{Plane, RgbImage};

@@ -1,19 +1,16 @@
 //! Execution providers of ONNX Runtime: which device computes the networks. The CPU always can; a GPU does when the installed
 //! library was built for it and answers.
-use std::fmt;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
-
 use ort::ep::{self, ExecutionProvider, ExecutionProviderDispatch};
 
-use super::cache::{self, Key};
-use super::runtime::{line, loaded, probe};
-use crate::progress::Progress;
-use crate::{Error, Result};
+use super::library::{line, loaded};
+use ort::environment::Environment;
+use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
+use ort::value::Tensor as OrtTensor;
 
 /// A way to compute networks other than on the CPU.
 pub(super) struct Provider {
     /// What users write.
-    name: &'static str,
+    pub(super) name: &'static str,
     listed: fn() -> ort::Result<bool>,
     registration: fn() -> ExecutionProviderDispatch,
     /// `auto` takes it: where it answers, there is a GPU.
@@ -52,95 +49,8 @@ static PROVIDERS: [Provider; 7] = [
 pub const NAMES: [&str; 9] =
     ["auto", "cpu", "cuda", "migraphx", "rocm", "directml", "coreml", "webgpu", "openvino"];
 
-/// How networks are computed: by which provider, and whether their answers are kept. Clones share it; several in one process may
-/// differ, except that they share the one loaded library.
-#[derive(Clone)]
-pub struct Compute(Arc<Shared>);
-
-struct Shared {
-    asked: String,
-    cached: bool,
-    chosen: OnceLock<Result<Option<&'static Provider>, String>>,
-    notes: Mutex<Vec<String>>,
-    turn: Mutex<()>,
-}
-
-impl fmt::Debug for Compute {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "Compute({}, cached: {})", self.0.asked, self.0.cached)
-    }
-}
-
-impl Default for Compute {
-    fn default() -> Self {
-        Compute::by(None)
-    }
-}
-
-impl Compute {
-    /// By one of [`NAMES`]; by default what `SPLATVK_PROVIDER` says, and without it `auto`.
-    pub fn by(asked: Option<&str>) -> Compute {
-        let variable = || std::env::var("SPLATVK_PROVIDER").ok().filter(|v| !v.is_empty());
-        let asked = asked.map(str::to_owned).or_else(variable).unwrap_or_else(|| "auto".to_owned());
-        Compute::new(asked, true)
-    }
-
-    fn new(asked: String, cached: bool) -> Compute {
-        let (chosen, notes, turn) = Default::default();
-        Compute(Arc::new(Shared { asked, cached, chosen, notes, turn }))
-    }
-
-    /// By the same provider, and everything is computed: what is measured must be.
-    pub fn uncached(&self) -> Compute {
-        Compute::new(self.0.asked.clone(), false)
-    }
-
-    /// `compute`, or what it gave the last time with the same key.
-    pub(crate) fn remember(&self, key: Key, compute: impl FnOnce() -> Result<Vec<f32>>) -> Result<Vec<f32>> {
-        if self.0.cached { cache::remember(key, compute) } else { compute() }
-    }
-
-    /// Held while a large network is loaded: stages that run beside each other take turns, so that a run needs the memory of
-    /// one network and every network has all cores.
-    pub(crate) fn turn(&self) -> MutexGuard<'_, ()> {
-        self.0.turn.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// The provider of new sessions, `None` for the CPU: found by computing a graph of one node on it. Asked for by name, one
-    /// that does not answer is an error.
-    pub(super) fn chosen(&self) -> Result<Option<&'static Provider>> {
-        let found = || find(&self.0.asked, &mut |text| self.note(text));
-        self.0.chosen.get_or_init(found).clone().map_err(Error::missing)
-    }
-
-    /// The name of what computes the networks.
-    pub fn name(&self) -> Result<&'static str> {
-        Ok(self.chosen()?.map_or("cpu", |p| p.name))
-    }
-
-    /// A network that the chosen provider refuses is computed by the CPU if nobody asked for the provider by name.
-    pub(super) fn replaceable(&self) -> bool {
-        self.0.asked == "auto"
-    }
-
-    pub(super) fn note(&self, text: String) {
-        self.0.notes.lock().unwrap_or_else(PoisonError::into_inner).push(text);
-    }
-
-    /// Finds the provider, and returns what did not work since the last call, a sentence each.
-    pub fn notes(&self) -> Result<Vec<String>> {
-        self.chosen()?;
-        Ok(std::mem::take(&mut *self.0.notes.lock().unwrap_or_else(PoisonError::into_inner)))
-    }
-
-    /// Warns of [`Compute::notes`].
-    pub fn report(&self, progress: &dyn Progress) -> Result<()> {
-        self.notes()?.iter().for_each(|n| progress.warn(n));
-        Ok(())
-    }
-}
-
-fn find(asked: &str, note: &mut dyn FnMut(String)) -> Result<Option<&'static Provider>, String> {
+/// The provider that is asked for: found by computing a graph of one node on it.
+pub(super) fn find(asked: &str, note: &mut dyn FnMut(String)) -> Result<Option<&'static Provider>, String> {
     let (library, environment) = loaded().map_err(|e| e.to_string())?;
     let library = library.display();
     let listed: Vec<&Provider> = PROVIDERS.iter().filter(|p| (p.listed)().unwrap_or(false)).collect();
@@ -189,6 +99,42 @@ fn reason(error: &ort::Error) -> String {
         .to_owned()
 }
 
+/// What sessions are made with.
+pub(super) fn settings(
+    environment: &Environment,
+    provider: Option<&Provider>,
+    large: bool,
+) -> ort::Result<SessionBuilder> {
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let builder = ort::session::Session::builder(environment)?
+        .with_optimization_level(GraphOptimizationLevel::Level3)?
+        .with_intra_threads(threads)?;
+    let mut providers: Vec<_> = provider.iter().map(|p| p.registration()).collect();
+    if large {
+        // The arena doubles what it takes and keeps it until the session ends.
+        providers.push(ort::ep::CPU::default().with_arena_allocator(false).build());
+    }
+    // DirectML refuses memory patterns, too.
+    Ok(builder.with_memory_pattern(!large && provider.is_none())?.with_execution_providers(providers)?)
+}
+
+/// y = Relu(x) of one float, as an ONNX file: a sequence of (field and kind, length, content).
+const PROBE: &[u8] = b"\x08\x08\x3a\x33\
+    \x0a\x0c\x0a\x01x\x12\x01y\x22\x04Relu\x12\x01g\
+    \x5a\x0f\x0a\x01x\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01\
+    \x62\x0f\x0a\x01y\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01\
+    \x42\x04\x0a\x00\x10\x11";
+
+/// Computes a graph of one node: a library may list a provider, and even register it, on a machine without its device.
+fn probe(environment: &Environment, provider: Option<&Provider>) -> ort::Result<()> {
+    let mut session = settings(environment, provider, false)?.commit_from_memory(PROBE)?;
+    let computed = session.run(ort::inputs!["x" => OrtTensor::from_array(([1usize], vec![2f32]))?])?;
+    match computed["y"].try_extract_tensor::<f32>()?.1 {
+        [2.0] => Ok(()),
+        other => Err(ort::Error::new(format!("it computes max(2, 0) = {other:?}"))),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -217,18 +163,5 @@ mod tests {
         );
         assert!(find("cpu", &mut |_| ()).is_ok_and(|p| p.is_none()));
         assert!(find("gpu", &mut |_| ()).err().is_some_and(|e| e.contains("auto, cpu, cuda")));
-    }
-
-    #[test]
-    fn two_in_one_process_differ() {
-        let (cpu, absent) = (Compute::by(Some("cpu")), Compute::by(Some("gpu")));
-        assert_eq!(cpu.name().unwrap(), "cpu");
-        assert!(absent.name().unwrap_err().to_string().contains("auto, cpu, cuda"));
-        // Answers are kept by one and not by the other.
-        let key = || Key::new("test").text("two").values(&[std::process::id()]);
-        let value = |compute: &Compute, v: f32| compute.remember(key(), || Ok(vec![v])).unwrap();
-        assert_eq!(value(&cpu, 1.0), [1.0]);
-        assert_eq!(value(&cpu, 2.0), [1.0]);
-        assert_eq!(value(&cpu.uncached(), 3.0), [3.0]);
     }
 }

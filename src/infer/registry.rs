@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::provider::Compute;
+use super::compute::Compute;
 use super::runtime::Session;
 use crate::files::content_hash;
 pub use crate::files::home;

@@ -1,63 +1,14 @@
 //! ONNX Runtime, loaded at run time from a shared library, and sessions with plain tensors in and out.
 use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
 
-use ort::environment::Environment;
-use ort::logging::LogLevel;
 use ort::session::SessionInputValue;
-use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use ort::value::{Tensor as OrtTensor, TensorElementType};
 
+use super::compute::Compute;
 use super::contract::reorder;
-use super::provider::{Compute, Provider};
-use super::registry::home;
+use super::library::{line, loaded};
+use super::provider::settings;
 use crate::{Error, Result};
-
-#[cfg(target_os = "macos")]
-const LIBRARY: &str = "libonnxruntime.dylib";
-#[cfg(windows)]
-const LIBRARY: &str = "onnxruntime.dll";
-#[cfg(not(any(target_os = "macos", windows)))]
-const LIBRARY: &str = "libonnxruntime.so";
-
-/// The library's path and the environment made with it, or what went wrong.
-static LOADED: OnceLock<Result<(PathBuf, Environment), String>> = OnceLock::new();
-
-/// The library in use, loaded on the first call: `ORT_DYLIB_PATH`, else `lib` under [`home`], else the system's.
-pub fn runtime() -> Result<PathBuf> {
-    // ort panics when used without a library, so every session goes through this check first.
-    Ok(loaded()?.0.clone())
-}
-
-pub(super) fn loaded() -> Result<&'static (PathBuf, Environment)> {
-    LOADED.get_or_init(load).as_ref().map_err(|e| Error::missing(e.as_str()))
-}
-
-fn load() -> Result<(PathBuf, Environment), String> {
-    let fix = "run tools/setup (or tools/models/build) to get it, or set ORT_DYLIB_PATH";
-    if let Some(path) = std::env::var_os("ORT_DYLIB_PATH").filter(|v| !v.is_empty()).map(PathBuf::from) {
-        let failed =
-            |e| format!("ONNX Runtime: ORT_DYLIB_PATH={} cannot be loaded ({e}); {fix}", path.display());
-        return try_load(&path).map(|e| (path.clone(), e)).map_err(failed);
-    }
-    let own = home().join("lib").join(LIBRARY);
-    if own.exists() {
-        let failed = |e| format!("ONNX Runtime: {} cannot be loaded ({e}); {fix}", own.display());
-        return try_load(&own).map(|e| (own.clone(), e)).map_err(failed);
-    }
-    let system = PathBuf::from(LIBRARY);
-    let failed =
-        |_| format!("ONNX Runtime: neither {} nor a system {LIBRARY} is there; {fix}", own.display());
-    try_load(&system).map(|e| (system.clone(), e)).map_err(failed)
-}
-
-fn try_load(path: &Path) -> Result<Environment, String> {
-    let one_line = |e: String| e.split_whitespace().collect::<Vec<_>>().join(" ");
-    let builder = ort::environment::init_from(path).map_err(|e| one_line(e.to_string()))?;
-    let environment = builder.with_name("splatvk").with_telemetry(false).build().map_err(|e| line(&e))?;
-    environment.set_log_level(LogLevel::Error);
-    Ok(environment)
-}
 
 /// A dense tensor of 32-bit floats.
 #[derive(Clone, Debug, Default)]
@@ -232,42 +183,3 @@ fn floats(value: &ort::value::DynValue) -> ort::Result<Tensor> {
 
 /// Files from this size on, bytes, are networks whose memory counts for more than the time of allocating it.
 const LARGE: u64 = 200 << 20;
-
-fn settings(
-    environment: &Environment,
-    provider: Option<&Provider>,
-    large: bool,
-) -> ort::Result<SessionBuilder> {
-    let threads = std::thread::available_parallelism().map_or(1, usize::from);
-    let builder = ort::session::Session::builder(environment)?
-        .with_optimization_level(GraphOptimizationLevel::Level3)?
-        .with_intra_threads(threads)?;
-    let mut providers: Vec<_> = provider.iter().map(|p| p.registration()).collect();
-    if large {
-        // The arena doubles what it takes and keeps it until the session ends.
-        providers.push(ort::ep::CPU::default().with_arena_allocator(false).build());
-    }
-    // DirectML refuses memory patterns, too.
-    Ok(builder.with_memory_pattern(!large && provider.is_none())?.with_execution_providers(providers)?)
-}
-
-/// y = Relu(x) of one float, as an ONNX file: a sequence of (field and kind, length, content).
-const PROBE: &[u8] = b"\x08\x08\x3a\x33\
-    \x0a\x0c\x0a\x01x\x12\x01y\x22\x04Relu\x12\x01g\
-    \x5a\x0f\x0a\x01x\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01\
-    \x62\x0f\x0a\x01y\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01\
-    \x42\x04\x0a\x00\x10\x11";
-
-/// Computes a graph of one node: a library may list a provider, and even register it, on a machine without its device.
-pub(super) fn probe(environment: &Environment, provider: Option<&Provider>) -> ort::Result<()> {
-    let mut session = settings(environment, provider, false)?.commit_from_memory(PROBE)?;
-    let computed = session.run(ort::inputs!["x" => OrtTensor::from_array(([1usize], vec![2f32]))?])?;
-    match computed["y"].try_extract_tensor::<f32>()?.1 {
-        [2.0] => Ok(()),
-        other => Err(ort::Error::new(format!("it computes max(2, 0) = {other:?}"))),
-    }
-}
-
-pub(super) fn line(error: &ort::Error) -> String {
-    error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
-}

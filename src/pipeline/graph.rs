@@ -1,6 +1,7 @@
 //! The graph and its schedule.
-use super::store::{Codec, Key, Store, Value};
-use super::{Context, Lane, Stage};
+use super::output::{Inputs, Output, Value};
+use super::stage::{Context, Lane, Stage};
+use super::store::{Codec, Key, Store};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::Device;
 use crate::infer::Registry;
@@ -10,50 +11,6 @@ use std::collections::BTreeSet;
 use std::marker::PhantomData;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Instant;
-
-/// What a stage of a graph will make.
-pub struct Output<T> {
-    node: usize,
-    made: PhantomData<fn() -> T>,
-}
-
-impl<T> Clone for Output<T> {
-    fn clone(&self) -> Self {
-        *self
-    }
-}
-
-impl<T> Copy for Output<T> {}
-
-/// Tuples of [`Output`]s.
-pub trait Inputs {
-    /// References to what was made.
-    type Values<'v>;
-    /// The stages that make them.
-    fn nodes(&self) -> Vec<usize>;
-    /// What was made, in the order of [`Inputs::nodes`]; `None` if that is something else.
-    fn values(made: &[Value]) -> Option<Self::Values<'_>>;
-}
-
-macro_rules! inputs {
-    ($($name:ident $at:tt),*) => {
-        impl<$($name: Send + Sync + 'static),*> Inputs for ($(Output<$name>,)*) {
-            type Values<'v> = ($(&'v $name,)*);
-            fn nodes(&self) -> Vec<usize> {
-                vec![$(self.$at.node),*]
-            }
-            fn values(_made: &[Value]) -> Option<Self::Values<'_>> {
-                Some(($(_made.get($at)?.downcast_ref::<$name>()?,)*))
-            }
-        }
-    };
-}
-
-inputs!();
-inputs!(A 0);
-inputs!(A 0, B 1);
-inputs!(A 0, B 1, C 2);
-inputs!(A 0, B 1, C 2, D 3);
 
 type Work<'g> = Box<dyn FnOnce(&[Value], &Context) -> Result<Value> + Send + 'g>;
 type Load<'g> = Box<dyn Fn(&Store, &Key) -> Option<(Vec<String>, Value)> + Send + Sync + 'g>;
@@ -226,13 +183,6 @@ impl<'g> Graph<'g> {
         let mut said = BTreeSet::new();
         let warnings = state.warnings.iter().flatten().filter(|w| said.insert(w.as_str()));
         warnings.for_each(|w| progress.warn(w));
-    }
-}
-
-impl<T> Output<T> {
-    /// For [`Graph::run`].
-    pub fn target(self) -> usize {
-        self.node
     }
 }
 

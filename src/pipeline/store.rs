@@ -1,14 +1,14 @@
 //! Outputs of stages on disk, by everything that they depend on.
+use super::output::Value;
 use crate::checkpoint::Checkpoint;
 use crate::files;
 use crate::{Error, Result};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
-use std::any::Any;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 /// Bytes that the folder may hold: the stages of some twenty scenes of four photos.
@@ -52,9 +52,6 @@ pub fn kept<T: Serialize + DeserializeOwned>() -> Option<Codec<T>> {
 fn unwritable(e: postcard::Error) -> Error {
     Error::work(format!("stage store: {e}"))
 }
-
-/// An output as graphs pass it on.
-pub(super) type Value = Arc<dyn Any + Send + Sync>;
 
 /// Outputs by everything that they depend on. In a folder, any odd file is made again and written over.
 #[derive(Default)]

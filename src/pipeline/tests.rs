@@ -1,6 +1,9 @@
 //! Graphs of small stages: what runs, beside what, and what is not run again.
 use super::*;
 use crate::Error;
+use crate::Result;
+use crate::gpu::Device;
+use crate::infer::Registry;
 use crate::progress::{Recorded, Silent};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, mpsc};

@@ -1,11 +1,11 @@
 //! A loaded scene that is kept ready for questions: what viewers, `splatvk query` and benchmarks call.
-use super::outcome::Answers;
 use super::view::{DecodedFrame, Viewer};
 use crate::gpu::Device;
 use crate::infer::RegionEncoder;
+use crate::query::highlight::Highlight;
 use crate::query::select::{Selection, select};
-use crate::query::{self, CANONICAL_PHRASES, QueryOptions, TextQuery};
-use crate::report::viewer::Names;
+use crate::query::{self, CANONICAL_PHRASES, QueryOptions, QueryResult, TextQuery};
+use crate::report::viewer::{Names, ShownAnswer};
 use crate::scene::{Camera, LanguageField, Plane, Splats};
 use crate::{Error, Result};
 
@@ -86,6 +86,34 @@ impl QueryScene {
         let embedding = self.encoder.embed_texts(&[text])?;
         let query = TextQuery { text: text.to_owned(), embedding, canonicals: self.canonicals.clone() };
         answers(&self.frames, &self.field, &query, options)
+    }
+}
+
+/// The answers to one text, one per photo.
+#[derive(Clone, Debug)]
+pub struct Answers {
+    /// What was asked.
+    pub text: String,
+    /// Per photo.
+    pub views: Vec<QueryResult>,
+    /// For the scene as a whole.
+    pub highlight: Highlight,
+}
+
+impl Answers {
+    /// For the interactive view.
+    pub fn shown(&self) -> ShownAnswer<'_> {
+        ShownAnswer {
+            text: &self.text,
+            found: self.found(),
+            views: self.views.len(),
+            highlight: &self.highlight,
+        }
+    }
+
+    /// Photos in which the text was found.
+    pub fn found(&self) -> usize {
+        self.views.iter().filter(|v| v.found).count()
     }
 }
 

@@ -1,5 +1,5 @@
 //! The stages of `splatvk run`.
-use super::outcome::Answers;
+use super::ask::Answers;
 use super::plan::RunPlan;
 use super::sources::{self, Build, Features, Geometry, Given, Masks, Matches, PosedPhotos};
 use super::stages::{self, CameraSource, Placed};

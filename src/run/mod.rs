@@ -18,8 +18,9 @@ pub(crate) mod stages;
 pub mod train;
 pub mod view;
 
+pub use ask::Answers;
 pub use execute::{reconstruct, run, save, stage_folder};
 pub use method::{FEATURE_DIM, Method, Recipe};
-pub use outcome::{Answers, Outcome};
+pub use outcome::Outcome;
 pub use plan::{CHECKPOINT_SECONDS, RunPlan};
 pub use record::{closing_table, run_record};

@@ -1,4 +1,5 @@
 //! What a finished run knows.
+use super::ask::Answers;
 use super::plan::RunPlan;
 use super::view::DecodedFrame;
 use crate::fit;
@@ -7,39 +8,9 @@ use crate::photo::Photo;
 use crate::pose::{self, Geometry};
 use crate::preset::Preset;
 use crate::progress::StageRecord;
-use crate::query::QueryResult;
-use crate::query::highlight::Highlight;
 use crate::report::ModelUsed;
-use crate::report::viewer::{Names, ShownAnswer};
+use crate::report::viewer::Names;
 use crate::scene::{Camera, LanguageField, Splats};
-
-/// The answers to one text, one per photo.
-#[derive(Clone, Debug)]
-pub struct Answers {
-    /// What was asked.
-    pub text: String,
-    /// Per photo.
-    pub views: Vec<QueryResult>,
-    /// For the scene as a whole.
-    pub highlight: Highlight,
-}
-
-impl Answers {
-    /// For the interactive view.
-    pub fn shown(&self) -> ShownAnswer<'_> {
-        ShownAnswer {
-            text: &self.text,
-            found: self.found(),
-            views: self.views.len(),
-            highlight: &self.highlight,
-        }
-    }
-
-    /// Photos in which the text was found.
-    pub fn found(&self) -> usize {
-        self.views.iter().filter(|v| v.found).count()
-    }
-}
 
 /// Everything a finished run knows; [`crate::report`] turns it into run.json, report.html and the summary.
 pub struct Outcome {

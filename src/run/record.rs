@@ -1,5 +1,6 @@
 //! What a finished run says about itself: `run.json`, the report and the closing table, made from [`Outcome`].
-use super::outcome::{Answers, Outcome};
+use super::ask::Answers;
+use super::outcome::Outcome;
 use crate::Result;
 use crate::fit::{CurvePoint, FitStats, LanguagePoint};
 use crate::photo::Photo;

@@ -1,5 +1,5 @@
 //! `splatvk ablate` and `splatvk generate`: tables, and data with a known answer.
-use super::DeviceArgs;
+use super::shared::DeviceArgs;
 use crate::ablate::TABLES;
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser};

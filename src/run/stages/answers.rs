@@ -3,8 +3,7 @@ use crate::Result;
 use crate::fit::{Trained, TrainedLanguage};
 use crate::pipeline::{Context, Lane, Output, Stage};
 use crate::query::{QueryOptions, TextQuery};
-use crate::run::ask;
-use crate::run::outcome::Answers;
+use crate::run::ask::{self, Answers};
 use crate::run::view::{self, DecodedFrame};
 
 /// Renders and decodes every photo's view.

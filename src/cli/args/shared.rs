@@ -1,0 +1,49 @@
+//! Options of several commands.
+use crate::Result;
+use crate::infer::{Compute, Registry};
+use clap::{Args, ValueEnum};
+use std::path::PathBuf;
+
+/// What goes to standard error.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum LogFormat {
+    /// Bars on a terminal, a line per stage elsewhere
+    Text,
+    /// One JSON object per line: begin, step, figures, end, message, warning, error
+    Json,
+}
+
+/// How much time a run may take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum PresetArg {
+    /// Minutes on a 2-core CPU
+    Draft,
+    /// Best quality for the time on a GPU
+    Default,
+    /// The paper's schedule and constants
+    Paper,
+}
+
+/// Options that every command working on a device takes.
+#[derive(Clone, Debug, Default, Args)]
+pub struct DeviceArgs {
+    /// Vulkan device: part of its name, or its number in `splatvk doctor`
+    #[arg(long, value_name = "NAME|INDEX")]
+    pub device: Option<String>,
+    /// Folder of the models
+    #[arg(long, value_name = "DIR")]
+    pub models: Option<PathBuf>,
+    /// Print one JSON object on standard output
+    #[arg(long)]
+    pub json: bool,
+    /// `--provider`, which stands before or after the command.
+    #[arg(skip)]
+    pub provider: Option<String>,
+}
+
+impl DeviceArgs {
+    /// The models.
+    pub fn registry(&self) -> Result<Registry> {
+        Registry::with(self.models.as_deref(), Compute::by(self.provider.as_deref()))
+    }
+}
