@@ -8,6 +8,7 @@ mod bench;
 mod experiments;
 mod shared;
 
+pub use super::export::ExportArgs;
 pub use super::run::RunArgs;
 pub use bench::{BenchArgs, BenchPart};
 pub use experiments::{AblateArgs, GenerateArgs};
@@ -259,51 +260,6 @@ pub struct EvalArgs {
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
-}
-
-/// What `export` writes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum ExportFormat {
-    /// INRIA .ply
-    Ply,
-    /// Compressed .ply, as SuperSplat writes it
-    CompressedPly,
-    /// .splat
-    Splat,
-    /// .spz version 4
-    Spz,
-    /// glTF with KHR_gaussian_splatting, binary
-    Glb,
-    /// the same as text
-    Gltf,
-    /// COLMAP text model
-    Colmap,
-    /// COLMAP binary model
-    ColmapBin,
-    /// nerfstudio transforms.json
-    Transforms,
-}
-
-/// `splatvk export`
-#[derive(Debug, Args)]
-pub struct ExportArgs {
-    /// Scene directory, or a file of Gaussians: .ply (compressed, too), .splat, .spz
-    pub scene: PathBuf,
-    /// What to write; language goes beside splat, spz and compressed-ply, into OUT.language.npz
-    #[arg(long, value_enum)]
-    pub format: ExportFormat,
-    /// File, or folder (colmap, colmap-bin)
-    #[arg(long, value_name = "PATH")]
-    pub out: PathBuf,
-    /// ply: spherical-harmonics degree of the file, padded with zeros; most viewers ask for 3
-    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(0..=3), value_name = "0-3")]
-    pub ply_degree: u32,
-    /// ply: add the language features and codes as extra columns
-    #[arg(long)]
-    pub with_features: bool,
-    /// Print one JSON object on standard output
-    #[arg(long)]
-    pub json: bool,
 }
 
 /// `splatvk models`

@@ -1,21 +1,54 @@
 //! `splatvk export`
-use super::args::{ExportArgs, ExportFormat};
 use super::print::listing;
 use super::progress;
-use crate::format::{
-    SH_C0, colmap, create_folder, gaussians, gltf, ply, ply_packed, scene_dir, splat, spz, transforms, whole,
-};
+use crate::format::gaussians::{self, FORMATS, SplatFormat};
+use crate::format::{SH_C0, colmap, create_folder, ply, scene_dir, transforms, whole};
 use crate::scene::{Camera, Splats};
 use crate::{Error, Result};
-use std::path::Path;
+use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser};
+use std::path::PathBuf;
+
+/// `splatvk export`
+#[derive(Debug, Args)]
+pub struct ExportArgs {
+    /// Scene directory, or a file of Gaussians: .ply (compressed, too), .splat, .spz, .glb, .gltf
+    pub scene: PathBuf,
+    /// What to write; language goes beside the files of Gaussians, into OUT.language.npz (ply: --with-features)
+    #[arg(long, value_parser = formats(), value_name = "FORMAT")]
+    pub format: String,
+    /// File, or folder (colmap, colmap-bin)
+    #[arg(long, value_name = "PATH")]
+    pub out: PathBuf,
+    /// ply: spherical-harmonics degree of the file, padded with zeros; most viewers ask for 3
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(0..=3), value_name = "0-3")]
+    pub ply_degree: u32,
+    /// ply: add the language features and codes as extra columns
+    #[arg(long)]
+    pub with_features: bool,
+    /// Print one JSON object on standard output
+    #[arg(long)]
+    pub json: bool,
+}
+
+fn formats() -> PossibleValuesParser {
+    let splats = FORMATS.iter().map(|f| PossibleValue::new(f.name).help(f.about));
+    let cameras = [
+        ("colmap", "COLMAP text model"),
+        ("colmap-bin", "COLMAP binary model"),
+        ("transforms", "nerfstudio transforms.json"),
+    ];
+    PossibleValuesParser::new(splats.chain(cameras.map(|(name, about)| PossibleValue::new(name).help(about))))
+}
 
 pub fn export(args: &ExportArgs) -> Result<()> {
     let scene = scene_dir::load(&args.scene)?;
     if let Some(parent) = args.out.parent().filter(|p| !p.as_os_str().is_empty()) {
         create_folder(parent).map_err(|e| Error::input(format!("{e}; choose another --out")))?;
     }
-    match args.format {
-        ExportFormat::Ply => {
+    match args.format.as_str() {
+        // Alone of all formats it can hold the language itself, and any degree.
+        "ply" => {
             let language = if args.with_features { scene.language.as_ref() } else { None };
             if args.with_features && language.is_none() {
                 return Err(Error::input(format!(
@@ -26,28 +59,23 @@ pub fn export(args: &ExportArgs) -> Result<()> {
             let options = ply::PlyOptions { degree: args.ply_degree, language };
             whole(&args.out, |path| ply::write_splats(path, &scene.splats, options))?;
         }
-        ExportFormat::Splat => {
-            warn_of_range(&scene.splats, splat::BRIGHTEST);
-            packed(args, &scene, splat::write_splats)?
-        }
-        ExportFormat::CompressedPly => packed(args, &scene, ply_packed::write_splats)?,
-        // These keep the scene's order.
-        ExportFormat::Spz => {
-            warn_of_range(&scene.splats, spz::BRIGHTEST);
-            packed(args, &scene, in_order(spz::write_splats))?
-        }
-        ExportFormat::Glb => packed(args, &scene, in_order(gltf::write_glb))?,
-        ExportFormat::Gltf => packed(args, &scene, in_order(gltf::write_gltf))?,
-        ExportFormat::Transforms => {
+        "transforms" => {
             let cameras = cameras(&scene, args)?;
             whole(&args.out, |path| transforms::write(path, cameras, None))?;
         }
-        ExportFormat::Colmap | ExportFormat::ColmapBin => {
+        "colmap" | "colmap-bin" => {
             let cameras = cameras(&scene, args)?;
             let points = colmap::read_points(&args.scene.join("cameras/colmap")).ok();
-            let write =
-                if args.format == ExportFormat::Colmap { colmap::write } else { colmap::write_binary };
+            let write = if args.format == "colmap" { colmap::write } else { colmap::write_binary };
             write(&args.out, cameras, points.as_ref())?;
+        }
+        name => {
+            let format =
+                SplatFormat::named(name).ok_or_else(|| Error::input(format!("--format {name}: unknown")))?;
+            if let Some(brightest) = format.brightest {
+                warn_of_range(&scene.splats, brightest);
+            }
+            gaussians::write_as(&args.out, &scene.splats, scene.language.as_ref(), format)?;
         }
     }
     listing(std::slice::from_ref(&args.out), args.json)
@@ -76,19 +104,6 @@ fn warn_of_range(splats: &Splats, brightest: f32) {
              compressed-ply, glb and gltf keep them"
         ));
     }
-}
-
-fn in_order(write: fn(&Path, &Splats) -> Result<()>) -> impl FnOnce(&Path, &Splats) -> Result<Vec<u32>> {
-    move |path, splats| write(path, splats).map(|()| Vec::new())
-}
-
-/// A format that only keeps what viewers draw, with the language in a file beside it.
-fn packed(
-    args: &ExportArgs,
-    scene: &scene_dir::Scene,
-    write: impl FnOnce(&Path, &Splats) -> Result<Vec<u32>>,
-) -> Result<()> {
-    gaussians::write_as(&args.out, &scene.splats, scene.language.as_ref(), write)
 }
 
 fn cameras<'a>(scene: &'a scene_dir::Scene, args: &ExportArgs) -> Result<&'a [Camera]> {

@@ -1,47 +1,93 @@
-//! Files of Gaussians: one reader and one writer for every kind, chosen by the end of the file's name.
-use super::{gltf, ply, ply_packed, side_file, splat, spz, whole};
+//! Files of Gaussians: one reader and one writer for every format, chosen by the end of the file's name or by the format's.
+pub mod gltf;
+pub mod ply;
+pub mod ply_packed;
+mod ply_table;
+pub mod splat;
+pub mod spz;
+
+use super::{side_file, whole};
 use crate::scene::{LanguageField, Splats};
 use crate::{Error, Result};
 use std::path::Path;
 
-/// A kind of file.
-struct Kind {
-    /// End of the names.
-    ending: &'static str,
+/// A format of Gaussians.
+pub struct SplatFormat {
+    /// As `splatvk export --format` takes it.
+    pub name: &'static str,
+    /// What it is.
+    pub about: &'static str,
+    /// End of the files' names.
+    pub ending: &'static str,
+    /// Brightest base colour that it holds; `None` = any.
+    pub brightest: Option<f32>,
     read: fn(&Path) -> Result<Splats>,
     /// Returns the order of the rows; empty = the scene's own.
     write: fn(&Path, &Splats) -> Result<Vec<u32>>,
 }
 
-/// All kinds; an ending comes before those that it ends with.
-static KINDS: [Kind; 6] = [
-    Kind { ending: ".compressed.ply", read: ply::read_splats, write: ply_packed::write_splats },
-    Kind {
+/// All formats; an ending comes before those that it ends with.
+pub static FORMATS: [SplatFormat; 6] = [
+    SplatFormat {
+        name: "compressed-ply",
+        about: "compressed .ply, as SuperSplat writes it",
+        ending: ".compressed.ply",
+        brightest: None,
+        read: ply::read_splats,
+        write: ply_packed::write_splats,
+    },
+    SplatFormat {
+        name: "ply",
+        about: "INRIA .ply",
         ending: ".ply",
+        brightest: None,
         read: ply::read_splats,
         write: |path, s| ply::write_splats(path, s, ply::PlyOptions::default()).map(|()| Vec::new()),
     },
-    Kind { ending: ".splat", read: splat::read_splats, write: splat::write_splats },
-    Kind {
+    SplatFormat {
+        name: "splat",
+        about: ".splat",
+        ending: ".splat",
+        brightest: Some(splat::BRIGHTEST),
+        read: splat::read_splats,
+        write: splat::write_splats,
+    },
+    SplatFormat {
+        name: "spz",
+        about: ".spz version 4",
         ending: ".spz",
+        brightest: Some(spz::BRIGHTEST),
         read: spz::read_splats,
         write: |path, s| spz::write_splats(path, s).map(|()| Vec::new()),
     },
-    Kind {
+    SplatFormat {
+        name: "glb",
+        about: "glTF with KHR_gaussian_splatting, binary",
         ending: ".glb",
+        brightest: None,
         read: gltf::read_splats,
         write: |path, s| gltf::write_glb(path, s).map(|()| Vec::new()),
     },
-    Kind {
+    SplatFormat {
+        name: "gltf",
+        about: "the same as text",
         ending: ".gltf",
+        brightest: None,
         read: gltf::read_splats,
         write: |path, s| gltf::write_gltf(path, s).map(|()| Vec::new()),
     },
 ];
 
-fn find(path: &Path) -> Option<&'static Kind> {
+impl SplatFormat {
+    /// The one of a name.
+    pub fn named(name: &str) -> Option<&'static SplatFormat> {
+        FORMATS.iter().find(|f| f.name == name)
+    }
+}
+
+fn find(path: &Path) -> Option<&'static SplatFormat> {
     let name = path.file_name()?.to_string_lossy().to_lowercase();
-    KINDS.iter().find(|k| name.ends_with(k.ending))
+    FORMATS.iter().find(|k| name.ends_with(k.ending))
 }
 
 /// Whether the name is one of a file of Gaussians.
@@ -49,38 +95,38 @@ pub fn is_named(path: &Path) -> bool {
     find(path).is_some()
 }
 
-fn kind(path: &Path) -> Result<&'static Kind> {
+fn format(path: &Path) -> Result<&'static SplatFormat> {
     find(path).ok_or_else(|| {
-        let endings = KINDS.iter().map(|k| k.ending).collect::<Vec<_>>().join(", ");
+        let endings = FORMATS.iter().map(|k| k.ending).collect::<Vec<_>>().join(", ");
         let path = path.display();
-        Error::input(format!("{path}: no known kind of splat file; the name must end in one of {endings}"))
+        Error::input(format!("{path}: no known format of splats; the name must end in one of {endings}"))
     })
 }
 
 /// Reads a file of Gaussians, and the language beside it, if any.
 pub fn read(path: &Path) -> Result<(Splats, Option<LanguageField>)> {
-    let splats = (kind(path)?.read)(path)?;
+    let splats = (format(path)?.read)(path)?;
     let language = side_file::read(path, splats.len())?;
     Ok((splats, language))
 }
 
 /// Writes a file of Gaussians, and beside it ([`side_file`]) their language, if they have any.
 pub fn write(path: &Path, splats: &Splats, language: Option<&LanguageField>) -> Result<()> {
-    write_as(path, splats, language, kind(path)?.write)
+    write_as(path, splats, language, format(path)?)
 }
 
-/// [`write()`] with a writer that returns the order of its rows (empty = the scene's own), whatever the file is called.
+/// [`write()`] in a format, whatever the file is called.
 pub fn write_as(
     path: &Path,
     splats: &Splats,
     language: Option<&LanguageField>,
-    write: impl FnOnce(&Path, &Splats) -> Result<Vec<u32>>,
+    format: &SplatFormat,
 ) -> Result<()> {
-    let spoken = language.filter(|l| l.levels.iter().any(|l| !l.codebook.is_empty()));
+    let with_codes = language.filter(|l| l.levels.iter().any(|l| !l.codebook.is_empty()));
     whole(path, |partial| {
-        let order = write(partial, splats)?;
+        let order = (format.write)(partial, splats)?;
         let beside = side_file::path(path);
-        match spoken {
+        match with_codes {
             // Language first: a file with the wrong language beside it would be worse than one that is missing.
             Some(field) => whole(&beside, |p| side_file::write(p, field, splats.len(), &order)),
             // So would be that of an older file.

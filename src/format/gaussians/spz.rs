@@ -18,7 +18,7 @@ const FIXED_MAX: f32 = 8_388_607.0;
 /// Slope of the base colour: byte = (f_dc · 0.15 + 0.5) · 255.
 const COLOUR_SCALE: f32 = 0.15;
 /// Largest base colour that a byte holds: f_dc ends at 0.5 / 0.15.
-pub const BRIGHTEST: f32 = 0.5 + super::SH_C0 * 0.5 / COLOUR_SCALE;
+pub const BRIGHTEST: f32 = 0.5 + crate::format::SH_C0 * 0.5 / COLOUR_SCALE;
 /// Most Gaussians that are read, so that a damaged count does not take all memory: ten times the largest scenes shared.
 const MOST: usize = 100_000_000;
 
@@ -162,7 +162,7 @@ fn splats(head: &Head, [positions, alphas, colours, scales, rotations, sh]: [&[u
             .map(|b| [0, 1, 2].map(|k| f32::from(b[k]) / 16.0 - 10.0))
             .collect(),
         quats: rotations.chunks_exact(width).map(|b| turned(rotation(b))).collect(),
-        opacity_logits: alphas.iter().map(|a| super::logit(f32::from(*a) / 255.0)).collect(),
+        opacity_logits: alphas.iter().map(|a| crate::format::logit(f32::from(*a) / 255.0)).collect(),
         sh_degree: head.degree,
         sh: all,
     }
@@ -264,7 +264,7 @@ fn pack(s: &Splats, bits: u32) -> [Vec<u8>; 6] {
             let fixed = (v * scale).round().clamp(-FIXED_MAX, FIXED_MAX) as i32;
             parts[0].extend_from_slice(&fixed.to_le_bytes()[..3]);
         }
-        parts[1].push(byte(255.0 * super::sigmoid(s.opacity_logits[i])));
+        parts[1].push(byte(255.0 * crate::format::sigmoid(s.opacity_logits[i])));
         let sh = &s.sh[i * width..(i + 1) * width];
         parts[2].extend(sh[..3].iter().map(|v| byte((v * COLOUR_SCALE + 0.5) * 255.0)));
         parts[3].extend(s.log_scales[i].map(|v| byte((v + 10.0) * 16.0)));

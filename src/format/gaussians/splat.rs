@@ -27,8 +27,8 @@ pub fn read_splats(path: &Path) -> Result<Splats> {
         s.means.push([0, 1, 2].map(float));
         // A flat Gaussian has a scale of 0, of which there is no logarithm.
         s.log_scales.push([3, 4, 5].map(|k| float(k).max(f32::MIN_POSITIVE).ln()));
-        s.sh.extend([0, 1, 2].map(|k| (share(k) - 0.5) / super::SH_C0));
-        s.opacity_logits.push(super::logit(share(3)));
+        s.sh.extend([0, 1, 2].map(|k| (share(k) - 0.5) / crate::format::SH_C0));
+        s.opacity_logits.push(crate::format::logit(share(3)));
         s.quats.push([4, 5, 6, 7].map(|k| (f32::from(row[24 + k]) - 128.0) / 128.0));
     }
     if s.means.iter().chain(&s.log_scales).flatten().any(|v| !v.is_finite()) {
@@ -44,7 +44,7 @@ pub fn read_splats(path: &Path) -> Result<Splats> {
 /// (w, x, y, z as `128 q + 128`), the most visible splats first, as progressive viewers expect: row r of the file is
 /// number `order[r]` of the scene.
 pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
-    let alpha = |i: usize| super::sigmoid(s.opacity_logits[i]);
+    let alpha = |i: usize| crate::format::sigmoid(s.opacity_logits[i]);
     let volume = |i: usize| s.log_scales[i].iter().sum::<f32>().exp();
     let mut order: Vec<(f32, usize)> = (0..s.len()).map(|i| (alpha(i) * volume(i), i)).collect();
     order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
@@ -54,8 +54,8 @@ pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
         for v in s.means[i].into_iter().chain(s.log_scales[i].map(f32::exp)) {
             bytes.extend_from_slice(&v.to_le_bytes());
         }
-        bytes.extend([0, 1, 2].map(|k| super::to_byte(0.5 + super::SH_C0 * s.sh[base + k])));
-        bytes.push(super::to_byte(alpha(i)));
+        bytes.extend([0, 1, 2].map(|k| crate::format::to_byte(0.5 + crate::format::SH_C0 * s.sh[base + k])));
+        bytes.push(crate::format::to_byte(alpha(i)));
         let q = s.quats[i];
         let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
         bytes.extend(q.map(|v| (v / norm * 128.0 + 128.0).round().clamp(0.0, 255.0) as u8));

@@ -61,7 +61,7 @@ pub fn read_points(path: &Path) -> Result<PointCloud> {
                 let full = if matches!(t.columns[c].1, Kind::F32 | Kind::F64) { 1.0 } else { 255.0 };
                 (t.at(r, c) / full).clamp(0.0, 1.0)
             }),
-            (None, Some(c)) => c.map(|c| (0.5 + super::SH_C0 * t.at(r, c)).clamp(0.0, 1.0)),
+            (None, Some(c)) => c.map(|c| (0.5 + crate::format::SH_C0 * t.at(r, c)).clamp(0.0, 1.0)),
             (None, None) => [0.5; 3],
         });
     }
@@ -193,7 +193,7 @@ pub fn write_points(path: &Path, p: &PointCloud) -> Result<()> {
         for v in position.iter().chain(&[0.0; 3]) {
             bytes.extend_from_slice(&v.to_le_bytes());
         }
-        bytes.extend(colour.map(super::to_byte));
+        bytes.extend(colour.map(crate::format::to_byte));
     }
     std::fs::write(path, bytes).map_err(Error::io(path))
 }

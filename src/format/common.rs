@@ -1,0 +1,47 @@
+//! What several formats need.
+use crate::{Error, Result};
+use std::path::Path;
+
+/// Constant of the first spherical harmonic, `1 / (2 √π)`: colour = 0.5 + SH_C0 · f_dc.
+pub const SH_C0: f32 = 0.282_094_8;
+
+/// Opacity of a raw parameter.
+pub(crate) fn sigmoid(v: f32) -> f32 {
+    1.0 / (1.0 + (-v).exp())
+}
+
+/// The raw parameter of an opacity; 0 and 1 give the largest ones that f32 tells from them.
+pub(crate) fn logit(a: f32) -> f32 {
+    let a = a.clamp(1e-7, 1.0 - 1e-7);
+    (a / (1.0 - a)).ln()
+}
+
+/// [0, 1] → 0–255, clamped; NaN becomes 0.
+pub fn to_byte(v: f32) -> u8 {
+    (v.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+/// Writes pretty JSON.
+pub fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<()> {
+    let text =
+        serde_json::to_string_pretty(value).map_err(|e| Error::work(format!("{}: {e}", path.display())))?;
+    std::fs::write(path, text + "\n").map_err(Error::io(path))
+}
+
+/// Creates a folder and its parents.
+pub fn create_folder(path: &Path) -> Result<()> {
+    std::fs::create_dir_all(path).map_err(Error::io(path))
+}
+
+/// Writes a file beside its target and renames it: one that was there stays until the new one is whole.
+pub fn whole(out: &Path, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+    let mut name = out.file_name().unwrap_or_default().to_os_string();
+    name.push(format!(".partial-{}", std::process::id()));
+    let partial = out.with_file_name(name);
+    let outcome = write(&partial).and_then(|()| std::fs::rename(&partial, out).map_err(Error::io(out)));
+    if outcome.is_err() {
+        // The error is what matters; the partial file may not even exist.
+        let _ = std::fs::remove_file(&partial);
+    }
+    outcome
+}
