@@ -1,6 +1,8 @@
 //! Execution providers of ONNX Runtime: which device computes the networks. The CPU always can; a GPU does when the installed
 //! library was built for it and answers.
-use ort::ep::{self, ExecutionProvider, ExecutionProviderDispatch};
+#[cfg(feature = "networks")]
+use ort::ep;
+use ort::ep::ExecutionProviderDispatch;
 
 use super::library::{line, loaded};
 use ort::environment::Environment;
@@ -18,7 +20,8 @@ pub(super) struct Provider {
 }
 
 impl Provider {
-    const fn new<P: ExecutionProvider>(
+    #[cfg(feature = "networks")]
+    const fn new<P: ep::ExecutionProvider>(
         name: &'static str,
         automatic: bool,
         registration: fn() -> ExecutionProviderDispatch,
@@ -33,7 +36,8 @@ impl Provider {
 }
 
 /// Best first.
-static PROVIDERS: [Provider; 7] = [
+#[cfg(feature = "networks")]
+static PROVIDERS: &[Provider] = &[
     // Shortened products (TF32) move keypoints by more than the poses are exact to.
     Provider::new::<ep::CUDA>("cuda", true, || ep::CUDA::default().with_tf32(false).build()),
     Provider::new::<ep::MIGraphX>("migraphx", true, || ep::MIGraphX::default().build()),
@@ -44,6 +48,9 @@ static PROVIDERS: [Provider; 7] = [
     // Answers everywhere, on a CPU no faster than the CPU's own way and with twice its memory.
     Provider::new::<ep::OpenVINO>("openvino", false, || ep::OpenVINO::default().build()),
 ];
+
+#[cfg(not(feature = "networks"))]
+static PROVIDERS: &[Provider] = &[];
 
 /// What `--provider` and `SPLATVK_PROVIDER` take.
 pub const NAMES: [&str; 9] =
@@ -139,6 +146,7 @@ fn probe(environment: &Environment, provider: Option<&Provider>) -> ort::Result<
 mod tests {
     use super::*;
 
+    #[cfg(feature = "networks")]
     #[test]
     fn every_name_is_a_provider_or_a_rule() {
         let names: Vec<&str> = ["auto", "cpu"].into_iter().chain(PROVIDERS.iter().map(|p| p.name)).collect();
@@ -150,6 +158,7 @@ mod tests {
         probe(&loaded().expect("tools/setup").1, None).expect("one node");
     }
 
+    #[cfg(feature = "networks")]
     #[test]
     fn what_the_library_lacks_is_refused_with_what_it_has() {
         loaded().expect("tools/setup");
