@@ -165,7 +165,7 @@ pub enum ImageFormat {
 /// `splatvk render`
 #[derive(Debug, Args)]
 pub struct RenderArgs {
-    /// Scene directory, or a file of Gaussians (.ply, .splat, .spz)
+    /// Scene directory, or a file of Gaussians (.ply, .splat, .spz, .glb, .gltf)
     pub scene: PathBuf,
     /// Cameras: transforms.json, a COLMAP model folder, or cameras.json
     #[arg(long, value_name = "FILE")]
@@ -209,7 +209,7 @@ pub struct QueryArgs {
 /// `splatvk view`
 #[derive(Debug, Args)]
 pub struct ViewArgs {
-    /// Scene directory, or a Gaussian .ply
+    /// Scene directory, or a file of Gaussians (.ply, .splat, .spz, .glb, .gltf)
     pub scene: PathBuf,
     /// Port on 127.0.0.1; 0 takes a free one
     #[arg(long, default_value_t = 0, value_name = "N")]

@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 /// `splatvk run`
 #[derive(Debug, Args)]
 pub struct RunArgs {
-    /// Photos, folders of photos (JPEG, PNG, HEIC, AVIF, WebP, TIFF), or a video
+    /// Photos, folders of photos (JPEG, PNG, HEIC, AVIF, WebP, TIFF, EXR, HDR), or a video
     #[arg(required = true, value_name = "INPUT")]
     pub inputs: Vec<PathBuf>,
     /// How many photos to use: sharp ones that overlap, from different places [default: all, at most 4]

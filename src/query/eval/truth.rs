@@ -81,7 +81,7 @@ impl GroundTruth {
     pub fn read(folder: &Path) -> Result<Self> {
         let path = folder.join("ground_truth.json");
         let text = std::fs::read_to_string(&path).map_err(|e| {
-            Error::input(format!("{}: {e}; --ground-truth wants a folder with that file", path.display()))
+            Error::input(format!("{}: {e}; a folder with ground truth has that file", path.display()))
         })?;
         let file: File = serde_json::from_str(&text)
             .map_err(|e| Error::input(format!("{}: not a ground truth file: {e}", path.display())))?;
