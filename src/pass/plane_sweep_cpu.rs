@@ -125,7 +125,7 @@ impl Inputs<'_> {
         top + fy * (bottom - top)
     }
 
-    /// 1 − ZNCC of the window warped by `plane` into one source view, at most [`COST_LIMIT`].
+    /// 1 − ZNCC of the window warped by `plane` into one source view, at most `COST_LIMIT`.
     pub fn source_cost(&self, source: &Source, window: &Window, ray: Vec3, plane: Vec3) -> f32 {
         let rows = source.forward.map(Vec4::from);
         let [fx, fy, ..] = self.reference.intrinsics;
