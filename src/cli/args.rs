@@ -12,7 +12,7 @@ pub use super::export::ExportArgs;
 pub use super::run::RunArgs;
 pub use bench::{BenchArgs, BenchPart};
 pub use experiments::{AblateArgs, GenerateArgs};
-pub use shared::{DeviceArgs, LogFormat, PresetArg};
+pub use shared::{DeviceArgs, LogFormat, MakingArgs, PresetArg};
 
 /// Photos in, a 3D scene that answers text queries out.
 #[derive(Debug, Parser)]
@@ -107,18 +107,9 @@ pub struct TrainArgs {
     /// Scene directory to write
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Replace a scene that is already there
-    #[arg(long)]
-    pub force: bool,
-    /// Go on after a training that ended early: stages with the same photos and settings are not run again
-    #[arg(long)]
-    pub resume: bool,
-    /// How often training keeps its state for --resume, seconds
-    #[arg(long, default_value_t = crate::run::CHECKPOINT_SECONDS, value_name = "N")]
-    pub checkpoint_seconds: u64,
-    /// Time against quality [default: draft on a CPU device, default on a GPU]
-    #[arg(long, value_enum)]
-    pub preset: Option<PresetArg>,
+    /// How the scene is made
+    #[command(flatten)]
+    pub making: MakingArgs,
     /// Optimisation steps, instead of the preset's
     #[arg(long, value_name = "N")]
     pub iterations: Option<usize>,

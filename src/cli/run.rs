@@ -1,5 +1,5 @@
 //! `splatvk run`
-use super::args::{DeviceArgs, PresetArg};
+use super::args::{DeviceArgs, MakingArgs};
 use super::plan;
 use super::print::{print, print_json};
 use super::progress;
@@ -26,18 +26,9 @@ pub struct RunArgs {
     /// Scene directory to write [default: out/NAME, after the input]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Replace a scene that is already there
-    #[arg(long)]
-    pub force: bool,
-    /// Go on after a run that ended early, or change a late option: stages with the same photos and settings are not run again
-    #[arg(long)]
-    pub resume: bool,
-    /// How often training keeps its state for --resume, seconds
-    #[arg(long, default_value_t = crate::run::CHECKPOINT_SECONDS, value_name = "N")]
-    pub checkpoint_seconds: u64,
-    /// Time against quality [default: draft on a CPU device, default on a GPU]
-    #[arg(long, value_enum)]
-    pub preset: Option<PresetArg>,
+    /// How the scene is made
+    #[command(flatten)]
+    pub making: MakingArgs,
     /// A source of the table
     #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<Geometry>())]
     pub init: String,
@@ -134,10 +125,10 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         inputs: args.inputs.clone(),
         views: args.views,
         out: args.out.clone().unwrap_or_else(|| default_out(&args.inputs)),
-        force: args.force,
-        resume: args.resume,
-        checkpoint_seconds: args.checkpoint_seconds,
-        preset: args.preset.map(plan::preset),
+        force: args.making.force,
+        resume: args.making.resume,
+        checkpoint_seconds: args.making.checkpoint_seconds,
+        preset: args.making.preset.map(plan::preset),
         init: choose::<Geometry>(&args.init, installed)?,
         matcher: choose::<Matches>(&args.matcher, installed)?,
         masks: choose::<Masks>(&args.masks, installed)?,

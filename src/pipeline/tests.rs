@@ -77,8 +77,8 @@ fn chain(machine: &Machine, store: &Store, last: u64) -> ([usize; 3], u64, Vec<S
     let add = |by, k: usize, warning| Add { by, runs: runs[k].clone(), warning };
     let one = graph.add(add(1, 1, Some("one more")), (number,));
     let two = graph.add(add(last, 2, None), (one,));
-    let (mut made, warnings) = machine.run(&graph, &[two.target()], store).unwrap();
-    (runs.map(|r| r.load(Ordering::SeqCst)), made.take(two).unwrap(), warnings)
+    let (made, warnings) = machine.run(&graph, &[two.target()], store).unwrap();
+    (runs.map(|r| r.load(Ordering::SeqCst)), *made.get(two).unwrap(), warnings)
 }
 
 #[test]
@@ -104,6 +104,19 @@ fn finished_stages_are_not_run_again_and_their_warnings_stay() {
     assert_eq!(chain(&machine, &kept(true), 3).0, [1, 1, 1]);
     let list = Store::list(folder.path());
     assert!(list.len() == 3 && list.iter().all(|(_, bytes)| *bytes > 64), "{list:?}");
+}
+
+#[test]
+fn graphs_of_one_store_in_memory_share_their_stages() {
+    let (machine, store) = (Machine::new(), Store::in_memory());
+    let (runs, value, warnings) = chain(&machine, &store, 2);
+    assert_eq!((runs, value, warnings.len()), ([1, 1, 1], 8, 2));
+    let (runs, value, warnings) = chain(&machine, &store, 2);
+    assert_eq!((runs, value), ([0, 0, 0], 8));
+    assert!(warnings.is_empty(), "heard in this process: {warnings:?}");
+    assert_eq!(chain(&machine, &store, 3).0, [0, 0, 1]);
+    // Another store knows nothing of it.
+    assert_eq!(chain(&machine, &Store::in_memory(), 3).0, [1, 1, 1]);
 }
 
 /// Waits for a word from elsewhere, then says one.

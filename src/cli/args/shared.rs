@@ -24,6 +24,23 @@ pub enum PresetArg {
     Paper,
 }
 
+/// Options of the commands that make scenes.
+#[derive(Clone, Debug, Args)]
+pub struct MakingArgs {
+    /// Replace a scene that is already there
+    #[arg(long)]
+    pub force: bool,
+    /// Go on where an earlier command ended, or change a late option: stages with the same photos and settings are not run again
+    #[arg(long)]
+    pub resume: bool,
+    /// How often training keeps its state for --resume, seconds
+    #[arg(long, default_value_t = crate::run::CHECKPOINT_SECONDS, value_name = "N")]
+    pub checkpoint_seconds: u64,
+    /// Time against quality [default: draft on a CPU device, default on a GPU]
+    #[arg(long, value_enum)]
+    pub preset: Option<PresetArg>,
+}
+
 /// Options that every command working on a device takes.
 #[derive(Clone, Debug, Default, Args)]
 pub struct DeviceArgs {
