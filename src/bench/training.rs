@@ -7,7 +7,7 @@ use crate::Result;
 use crate::fit::options::Rates;
 use crate::fit::scale::SceneScale;
 use crate::fit::schedule::Exponential;
-use crate::fit::{LanguageOptions, LanguageRun, Preset, RgbOptions, RgbRun, Steps};
+use crate::fit::{LanguageOptions, LanguageRun, Photos, Preset, RgbOptions, RgbRun, Training};
 use crate::gpu::{Device, Recorder};
 use crate::pass::renderer::Renderer;
 use crate::pass::{pairs, seeded};
@@ -39,10 +39,12 @@ pub fn colour(device: &Device, workload: &Workload, limits: (&Budget, &Roofline)
         rates: still(),
         sh_degree: workload.splats.sh_degree,
         poses: None,
+        coarse: 0.0,
         ..RgbOptions::preset(Preset::Default)
     };
     let scale = SceneScale::measure(&cameras, &workload.splats.means);
-    let mut run = RgbRun::new(device, &target, &cameras, &workload.splats, scale, None, &options)?;
+    let photos = Photos { images: &target, cameras: &cameras, depths: None };
+    let mut run = RgbRun::new(device, photos, &workload.splats, scale, &options)?;
     let mut section = Section::new(COLOUR, workload.describe(0));
     measure(device, &mut run, limits, &mut section)?;
     let mut renderer = Renderer::new(device, &workload.splats, &[], 0)?;
@@ -103,14 +105,14 @@ fn level(image: &RgbImage, width: usize, seed: u64) -> LevelField {
 
 fn measure(
     device: &Device,
-    run: &mut dyn Steps,
+    run: &mut impl Training,
     limits: (&Budget, &Roofline),
     section: &mut Section,
 ) -> Result<()> {
     let (budget, roofline) = limits;
     // Also grows the tile lists to what the scene needs, before anything is recorded.
     run.step(ITERATION)?;
-    let runs = section.passes(device, &|| run.record(), budget)?;
+    let runs = section.passes(device, &|| run.record(0), budget)?;
     let sums: Vec<f64> = runs.iter().map(|r| r.iter().map(|p| p.1).sum()).collect();
     let processor = section.rows.iter().map(|r| r.ms.processor).sum();
     section.time(SUM, Clock::Device, Spread { processor, ..Spread::of(&sums) });
@@ -129,8 +131,8 @@ fn measure(
 }
 
 /// Forward, and forward with backward, as programs of their own.
-fn parts(device: &Device, run: &dyn Steps, budget: &Budget, section: &mut Section) -> Result<()> {
-    let p = run.parts();
+fn parts(device: &Device, run: &impl Training, budget: &Budget, section: &mut Section) -> Result<()> {
+    let p = run.trainer().parts();
     for (name, backward) in [("forward", false), ("forward + backward", true)] {
         let mut rec = Recorder::new(device, name);
         p.raster.record_forward(&mut rec, p.params, p.options);
@@ -144,8 +146,8 @@ fn parts(device: &Device, run: &dyn Steps, budget: &Budget, section: &mut Sectio
 }
 
 /// How much work a step is, and the least time for it.
-fn counts(device: &Device, run: &dyn Steps, roofline: &Roofline, section: &mut Section) -> Result<()> {
-    let p = run.parts();
+fn counts(device: &Device, run: &impl Training, roofline: &Roofline, section: &mut Section) -> Result<()> {
+    let p = run.trainer().parts();
     let frame = p.raster.frame();
     let intersections = f64::from(frame.status.read::<u32>()?[0]);
     let [evaluated, blended] = pairs::count(device, p.raster)?;

@@ -1,15 +1,26 @@
 //! Training first at half the photos' size: there a step costs less than half, and what it fits is what matters early on.
 use crate::scene::{Camera, DepthMap, Plane, RgbImage};
 
-/// What training looks at, halved.
+/// What training compares with.
+#[derive(Clone, Copy)]
+pub(crate) struct Photos<'a> {
+    pub(crate) images: &'a [RgbImage],
+    /// One per photo.
+    pub(crate) cameras: &'a [Camera],
+    /// One per photo, if any.
+    pub(crate) depths: Option<&'a [DepthMap]>,
+}
+
+/// The same at half the size.
 pub(super) struct Halved {
-    pub(super) images: Vec<RgbImage>,
-    pub(super) cameras: Vec<Camera>,
-    pub(super) depths: Option<Vec<DepthMap>>,
+    images: Vec<RgbImage>,
+    cameras: Vec<Camera>,
+    depths: Option<Vec<DepthMap>>,
 }
 
 impl Halved {
-    pub(super) fn of(images: &[RgbImage], cameras: &[Camera], depths: Option<&[DepthMap]>) -> Halved {
+    pub(super) fn of(photos: &Photos) -> Halved {
+        let Photos { images, cameras, depths } = *photos;
         let image = |i: &RgbImage| i.resized_by_area(half(i.width), half(i.height));
         let camera = |c: &Camera| c.resized(half(c.width as usize) as u32, half(c.height as usize) as u32);
         let depth = |d: &DepthMap| DepthMap { depth: sampled(&d.depth), confidence: sampled(&d.confidence) };
@@ -18,6 +29,10 @@ impl Halved {
             cameras: cameras.iter().map(camera).collect(),
             depths: depths.map(|all| all.iter().map(depth).collect()),
         }
+    }
+
+    pub(super) fn photos(&self) -> Photos<'_> {
+        Photos { images: &self.images, cameras: &self.cameras, depths: self.depths.as_deref() }
     }
 }
 

@@ -1,13 +1,12 @@
 //! The language stage: features on the splats that render to each pixel's code (docs/method.md#language-training),
 //! `L = λ2·L_img + (1−λ2)·L_sem`, starting from lifted features.
 use super::lift::{CodeTargets, lift};
-use super::model::{self, Model};
+use super::model::Model;
 use super::options::LanguageOptions;
 use super::scale::SceneScale;
-use super::schedule::ViewOrder;
+use super::training::{self, Review, Trainer, Training};
 use super::views::Views;
-use crate::checkpoint::Checkpoint;
-use crate::gpu::{Buffer, Device, Program, Recorder};
+use crate::gpu::{Buffer, Device, Recorder};
 use crate::pass::options::{FeatureMode, RasterOptions};
 use crate::pass::{codes, codes::Mode, sum};
 use crate::progress::Progress;
@@ -86,10 +85,8 @@ pub fn train_language(
     };
     for (g, group) in groups.iter().enumerate() {
         let levels: Vec<&LevelField> = group.iter().map(|&l| &out.field.levels[l]).collect();
-        let mut run = Run { group: g, ..Run::new(device, images, cameras, splats, &levels, options)? };
-        let kept = progress.checkpoint().and_then(|c| c.load::<State>()).filter(|k| k.group == g);
-        kept.map_or(Ok(()), |k| run.restore(k))?;
-        run.train(progress, (g * options.iterations) as u64)?;
+        let mut run = Run::new(device, images, cameras, splats, &levels, options)?;
+        training::train(&mut run, g, options.iterations, progress)?;
         let (trained, features) = run.finish()?;
         out.curve.append(&mut run.curve);
         for (&level, features) in group.iter().zip(features) {
@@ -107,40 +104,25 @@ pub fn train_language(
     Ok(out)
 }
 
-/// Everything of a [`Run`] that steps change, for going on after a kill. Of models trained one after the other only the
-/// state of the current one is kept; those before it are trained again.
-#[derive(Serialize, Deserialize)]
-struct State {
-    group: usize,
-    /// Steps that are done.
-    done: usize,
-    model: model::State,
-    order: ViewOrder,
-    recent: Vec<f64>,
-    curve: Vec<LanguagePoint>,
-}
-
 /// The training of one model: all levels together, or one.
 pub(crate) struct Run<'a> {
-    device: Device,
-    /// Which of the models this is.
-    group: usize,
-    /// Steps that an earlier process has done.
-    done: usize,
+    trainer: Trainer,
     options: &'a LanguageOptions,
-    pub(super) raster: RasterOptions,
     levels: Vec<&'a LevelField>,
     names: String,
     width: usize,
     extent: f64,
-    pub(super) model: Model,
-    pub(super) views: Views,
-    cameras: &'a [Camera],
     targets: CodeTargets,
     losses: Vec<Buffer>,
     partials: Buffer,
-    programs: Vec<Option<Program>>,
-    order: ViewOrder,
+    /// Losses since the last measurement.
+    recent: Vec<f64>,
+    curve: Vec<LanguagePoint>,
+}
+
+/// What steps change beside the model.
+#[derive(Serialize, Deserialize)]
+pub(crate) struct Figures {
     recent: Vec<f64>,
     curve: Vec<LanguagePoint>,
 }
@@ -149,7 +131,7 @@ impl<'a> Run<'a> {
     pub(crate) fn new(
         device: &Device,
         images: &[RgbImage],
-        cameras: &'a [Camera],
+        cameras: &[Camera],
         splats: &Splats,
         levels: &[&'a LevelField],
         options: &'a LanguageOptions,
@@ -175,82 +157,18 @@ impl<'a> Run<'a> {
             .map(|s| device.buffer::<f32>("language loss", s.raster.frame().bands.pixels()))
             .collect::<Result<_>>()?;
         Ok(Run {
-            device: device.clone(),
-            group: 0,
-            done: 0,
+            trainer: Trainer::new(device, raster, model, views, cameras, options.seed),
             options,
-            raster,
             levels: levels.to_vec(),
             names: level_names(levels.len()),
             width,
             extent: scale.extent,
-            model,
-            views,
-            cameras,
             targets,
             losses,
             partials: device.buffer::<f32>("loss partials", sum::PARTIALS)?,
-            programs: cameras.iter().map(|_| None).collect(),
-            order: ViewOrder::new(cameras.len(), options.seed),
             recent: Vec::new(),
             curve: Vec::new(),
         })
-    }
-
-    /// Takes over a state.
-    fn restore(&mut self, kept: State) -> Result<()> {
-        self.model = Model::restored(&self.device, &kept.model)?;
-        let State { done, order, recent, curve, .. } = kept;
-        (self.done, self.order, self.recent, self.curve) = (done, order, recent, curve);
-        Ok(())
-    }
-
-    /// Writes the state after `done` steps, if somebody keeps it.
-    fn keep(&self, done: usize, progress: &dyn Progress) -> Result<()> {
-        let Some(checkpoint) = progress.checkpoint() else { return Ok(()) };
-        let (order, recent, curve) = (self.order.clone(), self.recent.clone(), self.curve.clone());
-        checkpoint.save(&State { group: self.group, done, model: self.model.state()?, order, recent, curve })
-    }
-
-    fn train(&mut self, progress: &dyn Progress, done: u64) -> Result<()> {
-        // A run that is measured once, at its end, needs no start to compare with.
-        if self.done == 0 && (1..self.options.iterations).contains(&self.options.check_every) {
-            self.measure(0)?;
-            self.tell(progress, done);
-        }
-        for iteration in self.done..self.options.iterations {
-            if progress.cancelled() {
-                self.keep(iteration, progress)?;
-                return Err(Error::Cancelled);
-            }
-            self.step(iteration)?;
-            let step = iteration + 1;
-            if self.options.check_every > 0 && step % self.options.check_every == 0 {
-                self.model.check(step)?;
-                self.measure(step)?;
-                self.tell(progress, done);
-                if self.settled() {
-                    break;
-                }
-            }
-            let note = self.curve.last().map_or(String::new(), |p| {
-                let shares: Vec<String> = p.accuracy.iter().map(|a| format!("{:.1} %", 100.0 * a)).collect();
-                format!("{} decoded {}", self.names, shares.join(" "))
-            });
-            progress.step(done + step as u64, &note);
-            if progress.checkpoint().is_some_and(Checkpoint::due) {
-                self.keep(step, progress)?;
-            }
-        }
-        self.model.check(self.options.iterations)
-    }
-
-    /// Passes the last measurement on.
-    fn tell(&self, progress: &dyn Progress, done: u64) {
-        if let Some(point) = self.curve.last() {
-            let figures = [("loss", point.loss), ("accuracy", point.mean_accuracy())];
-            progress.figures(done + point.step as u64, &figures);
-        }
     }
 
     /// True when the last two measurements together gained less than [`MIN_GAIN`].
@@ -261,66 +179,14 @@ impl<'a> Run<'a> {
         }
     }
 
-    pub(super) fn step(&mut self, iteration: usize) -> Result<()> {
-        let view = self.order.draw();
-        let at = self.views.list[view].stage;
-        self.model.set_rates(&self.options.rates, self.options.feature_rate, self.extent, iteration)?;
-        self.views.set_camera(view, &self.cameras[view])?;
-        loop {
-            let program = match self.programs[view].take() {
-                Some(program) => program,
-                None => self.record(view).compile()?,
-            };
-            program.run()?;
-            self.programs[view] = Some(program);
-            match self.views.stages[at].raster.overflow()? {
-                None => break,
-                Some(needed) => {
-                    self.views.stages[at].raster.grow(needed)?;
-                    self.programs.iter_mut().for_each(|p| *p = None);
-                }
-            }
-        }
-        self.recent.push(self.views.stages[at].total()?[LANGUAGE_SUM as usize]);
-        Ok(())
-    }
-
-    pub(super) fn record(&self, view: usize) -> Recorder {
-        let (item, stage) = (&self.views.list[view], self.views.stage(view));
-        let frame = stage.raster.frame();
-        let mut rec = Recorder::new(&self.device, "language step");
-        stage.raster.record_projection(&mut rec, &self.model.values, &self.raster);
-        let weights = IMAGE_WEIGHTS.map(|w| w * self.options.image_weight);
-        let loss = &self.losses[item.stage];
-        for band in frame.bands.iter() {
-            stage.raster.record_band(&mut rec, &self.model.values, &band);
-            if !self.options.detach_geometry {
-                let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(&band)));
-                stage.loss.record(&mut rec, &band, &frame.planes, target, &frame.planes_grad, weights, sums);
-            }
-            codes::record(&mut rec, &self.targets.of(view, &band), frame, loss, Mode::Loss);
-            sum::record(&mut rec, loss, &self.partials, &stage.sums, stage.slot(&band) + LANGUAGE_SUM);
-            stage.raster.record_band_backward(&mut rec, &self.model.values, &self.raster, &band);
-        }
-        stage.raster.record_gradients(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
-        self.model.record_feature_step(&mut rec, &frame.status);
-        if !self.options.detach_geometry {
-            self.model.record_step(&mut rec, &frame.status);
-        }
-        rec.download(&frame.status);
-        rec.download(&stage.sums);
-        rec
-    }
-
     /// Renders all training views and counts the labelled pixels that decode to their label.
-    fn measure(&mut self, step: usize) -> Result<()> {
+    fn measure(&mut self, step: usize) -> Result<LanguagePoint> {
         let mut counts = vec![[0usize; 2]; self.levels.len()];
-        for view in 0..self.cameras.len() {
-            self.views.set_camera(view, &self.cameras[view])?;
-            let at = self.views.list[view].stage;
-            let stage = &mut self.views.stages[at];
-            let (levels, width) = (&self.levels, self.width);
-            stage.raster.forward_bands(&self.model.values, &self.raster, |frame, band| {
+        let (t, levels, width) = (&mut self.trainer, &self.levels, self.width);
+        for (view, camera) in t.cameras.iter().enumerate() {
+            t.views.set_camera(view, camera)?;
+            let raster = &mut t.views.stage_mut(view).raster;
+            raster.forward_bands(&t.model.values, &t.raster, |frame, band| {
                 let pixels = frame.bands.pixels();
                 for (l, level) in levels.iter().enumerate() {
                     let Some(labels) = level.targets.get(view) else { continue };
@@ -337,15 +203,20 @@ impl<'a> Run<'a> {
         let accuracy = counts.iter().map(|c| c[0] as f64 / c[1].max(1) as f64).collect();
         let loss = self.recent.iter().sum::<f64>() / self.recent.len().max(1) as f64;
         self.recent.clear();
-        self.curve.push(LanguagePoint { step, loss, accuracy });
-        Ok(())
+        Ok(LanguagePoint { step, loss, accuracy })
+    }
+
+    /// Replaces the raw features [N, levels·d].
+    pub(crate) fn set_features(&self, features: &[f32]) -> Result<()> {
+        self.trainer.model.values.features.write(features)
     }
 
     /// Splats and, per level, features [N, d] as rendered.
     fn finish(&mut self) -> Result<(Splats, Vec<Vec<f32>>)> {
-        let splats = self.model.splats()?;
+        let model = &self.trainer.model;
+        let splats = model.splats()?;
         let (levels, d) = (self.levels.len(), self.width);
-        let mut all = self.model.values.features.read_range::<f32>(0..splats.len() * levels * d)?;
+        let mut all = model.values.features.read_range::<f32>(0..splats.len() * levels * d)?;
         if !all.iter().all(|v| v.is_finite()) {
             return Err(Error::work("the language stage produced features that are not finite"));
         }
@@ -356,6 +227,79 @@ impl<'a> Run<'a> {
         let level =
             |l: usize| all.chunks_exact(levels * d).flat_map(move |f| &f[l * d..(l + 1) * d]).copied();
         Ok((splats, (0..levels).map(|l| level(l).collect()).collect()))
+    }
+}
+
+impl Training for Run<'_> {
+    type Figures = Figures;
+
+    fn trainer(&self) -> &Trainer {
+        &self.trainer
+    }
+    fn trainer_mut(&mut self) -> &mut Trainer {
+        &mut self.trainer
+    }
+
+    fn schedule(&mut self, iteration: usize) -> Result<()> {
+        let model = &mut self.trainer.model;
+        model.set_rates(&self.options.rates, self.options.feature_rate, self.extent, iteration)
+    }
+
+    fn record(&self, view: usize) -> Recorder {
+        let Trainer { device, raster, model, views, .. } = &self.trainer;
+        let (item, stage) = (&views.list[view], views.stage(view));
+        let frame = stage.raster.frame();
+        let mut rec = Recorder::new(device, "language step");
+        stage.raster.record_projection(&mut rec, &model.values, raster);
+        let weights = IMAGE_WEIGHTS.map(|w| w * self.options.image_weight);
+        let loss = &self.losses[item.stage];
+        for band in frame.bands.iter() {
+            stage.raster.record_band(&mut rec, &model.values, &band);
+            if !self.options.detach_geometry {
+                let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(&band)));
+                stage.loss.record(&mut rec, &band, &frame.planes, target, &frame.planes_grad, weights, sums);
+            }
+            codes::record(&mut rec, &self.targets.of(view, &band), frame, loss, Mode::Loss);
+            sum::record(&mut rec, loss, &self.partials, &stage.sums, stage.slot(&band) + LANGUAGE_SUM);
+            stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
+        }
+        stage.raster.record_gradients(&mut rec, &model.values, raster, &model.gradients);
+        model.record_feature_step(&mut rec, &frame.status);
+        if !self.options.detach_geometry {
+            model.record_step(&mut rec, &frame.status);
+        }
+        rec.download(&frame.status);
+        rec.download(&stage.sums);
+        rec
+    }
+
+    fn read_back(&mut self, view: usize, _: usize) -> Result<()> {
+        self.recent.push(self.trainer.views.stage(view).total()?[LANGUAGE_SUM as usize]);
+        Ok(())
+    }
+
+    fn review(&mut self, step: usize) -> Result<Review> {
+        let every = self.options.check_every;
+        // A run that is measured once, at its end, needs no start to compare with.
+        let once = step == 0 && every >= self.options.iterations;
+        if every == 0 || !step.is_multiple_of(every) || once {
+            return Ok(Review::default());
+        }
+        self.trainer.model.check(step)?;
+        let point = self.measure(step)?;
+        let figures = vec![("loss", point.loss), ("accuracy", point.mean_accuracy())];
+        let shares: Vec<String> = point.accuracy.iter().map(|a| format!("{:.1} %", 100.0 * a)).collect();
+        let note = Some(format!("{} decoded {}", self.names, shares.join(" ")));
+        self.curve.push(point);
+        Ok(Review { figures, note, finished: self.settled() })
+    }
+
+    fn figures(&self) -> Figures {
+        Figures { recent: self.recent.clone(), curve: self.curve.clone() }
+    }
+
+    fn set_figures(&mut self, kept: Figures) {
+        (self.recent, self.curve) = (kept.recent, kept.curve);
     }
 }
 

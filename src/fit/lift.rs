@@ -113,8 +113,7 @@ pub(super) fn lift(
     let raster = &RasterOptions { feature_mode: FeatureMode::Linear, ..*raster };
     for (view, camera) in cameras.iter().enumerate() {
         views.set_camera(view, camera)?;
-        let at = views.list[view].stage;
-        let stage = &mut views.stages[at];
+        let stage = views.stage_mut(view);
         let scratch = device.buffer::<f32>("language loss", stage.raster.frame().bands.pixels())?;
         loop {
             let frame = stage.raster.frame();

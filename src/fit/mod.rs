@@ -10,14 +10,15 @@ pub mod pose;
 mod rgb;
 pub mod scale;
 pub mod schedule;
-mod steps;
+mod training;
 mod unseen;
 mod views;
 
 pub use crate::preset::Preset;
+pub(crate) use coarse::Photos;
 pub(crate) use language::Run as LanguageRun;
 pub use language::{LanguagePoint, TrainedLanguage, train_language};
 pub use options::{InitOptions, LanguageOptions, Rates, RgbOptions};
 pub(crate) use rgb::Run as RgbRun;
 pub use rgb::{CurvePoint, FitStats, Trained, fit_rgb, train_rgb};
-pub(crate) use steps::Steps;
+pub(crate) use training::Training;

@@ -1,15 +1,14 @@
 //! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (docs/method.md#splats).
-use super::coarse::Halved;
+use super::coarse::{Halved, Photos};
 use super::init::splats_from_points;
-use super::model::{self, Model};
+use super::model::Model;
 use super::options::RgbOptions;
 use super::pose::PoseAdam;
 use super::scale::SceneScale;
-use super::schedule::ViewOrder;
+use super::training::{self, Review, Trainer, Training};
 use super::unseen::unseen_splats;
 use super::views::Views;
-use crate::checkpoint::Checkpoint;
-use crate::gpu::{Device, Program, Recorder};
+use crate::gpu::{Device, Recorder};
 use crate::pass::metrics::psnr;
 use crate::pass::options::{FeatureMode, RasterOptions};
 use crate::pass::{compact, regularise, ssim_l1::ImageLoss};
@@ -108,43 +107,9 @@ pub fn fit_rgb(
 ) -> Result<Trained> {
     let clock = Instant::now();
     progress.begin("splats", options.iterations as u64);
-    let coarse = (options.coarse * options.iterations as f64) as usize;
-    let half = (coarse > 0).then(|| Halved::of(images, cameras, depths));
-    let first = match &half {
-        Some(half) => (half.images.as_slice(), half.cameras.as_slice(), half.depths.as_deref()),
-        None => (images, cameras, depths),
-    };
-    let kept = progress.checkpoint().and_then(|c| c.load::<State>());
-    let (done, from) = kept.as_ref().map_or((0, &start), |k| (k.done, &k.model.splats));
-    let mut run = Run::new(device, first.0, first.1, from, scale, first.2, options)?;
-    kept.map_or(Ok(()), |k| run.restore(k))?;
-    let mut small = coarse > 0;
-    for iteration in done..options.iterations {
-        if progress.cancelled() {
-            run.keep(iteration, progress)?;
-            return Err(Error::Cancelled);
-        }
-        if small && iteration >= coarse {
-            run.look_at(images, cameras, depths)?;
-            small = false;
-        }
-        run.step(iteration)?;
-        if let Some(point) = run.report(iteration)? {
-            let note = format!("loss {:.4}, PSNR {:.1}, {} splats", point.loss, point.psnr, point.splats);
-            progress.step(iteration as u64 + 1, &note);
-            let splats = point.splats as f64;
-            let figures =
-                [("loss", point.loss), ("ssim", point.ssim), ("psnr", point.psnr), ("splats", splats)];
-            progress.figures(point.step as u64, &figures);
-        }
-        run.prune(iteration)?;
-        if progress.checkpoint().is_some_and(Checkpoint::due) {
-            run.keep(iteration + 1, progress)?;
-        }
-    }
-    progress.step(options.iterations as u64, "");
-    run.model.check(options.iterations)?;
-    let (splats, cameras, psnr, poses_refined) = run.finish(images, cameras)?;
+    let mut run = Run::new(device, Photos { images, cameras, depths }, &start, scale, options)?;
+    training::train(&mut run, 0, options.iterations, progress)?;
+    let (splats, cameras, psnr, poses_refined) = run.finish()?;
     progress.end();
     let stats = FitStats {
         curve: run.curve,
@@ -161,36 +126,17 @@ fn used<'d>(depths: Option<&'d [DepthMap]>, options: &RgbOptions) -> Option<(&'d
     depths.filter(|_| options.depth_weight > 0.0).map(|d| (d, options.min_confidence))
 }
 
-/// Everything of a [`Run`] that steps change, for going on after a kill.
-#[derive(Serialize, Deserialize)]
-struct State {
-    /// Steps that are done.
-    done: usize,
-    model: model::State,
-    cameras: Vec<Camera>,
-    poses: Vec<PoseAdam>,
-    order: ViewOrder,
-    recent: Vec<ImageLoss>,
-    last: usize,
-    psnr: Vec<Option<f64>>,
-    curve: Vec<CurvePoint>,
-}
-
 /// One fit.
 pub(crate) struct Run<'a> {
-    device: Device,
+    trainer: Trainer,
     options: &'a RgbOptions,
     scale: SceneScale,
-    pub(super) raster: RasterOptions,
-    pub(super) model: Model,
-    pub(super) views: Views,
-    cameras: Vec<Camera>,
+    photos: Photos<'a>,
+    /// What the first steps see instead of the photos.
+    half: Option<Halved>,
     poses: Vec<PoseAdam>,
-    order: ViewOrder,
-    /// One recorded step per view; empty after anything they bind has changed.
-    programs: Vec<Option<Program>>,
+    /// Losses since the last report.
     recent: Vec<ImageLoss>,
-    images: &'a [RgbImage],
     /// The view of the last step.
     last: usize,
     /// Per view its last PSNR, dB.
@@ -198,152 +144,59 @@ pub(crate) struct Run<'a> {
     curve: Vec<CurvePoint>,
 }
 
+/// What steps change beside the model.
+#[derive(Serialize, Deserialize)]
+pub(crate) struct Figures {
+    poses: Vec<PoseAdam>,
+    recent: Vec<ImageLoss>,
+    last: usize,
+    psnr: Vec<Option<f64>>,
+    curve: Vec<CurvePoint>,
+}
+
 impl<'a> Run<'a> {
     pub(crate) fn new(
         device: &Device,
-        images: &'a [RgbImage],
-        cameras: &[Camera],
+        photos: Photos<'a>,
         start: &Splats,
         scale: SceneScale,
-        depths: Option<&[DepthMap]>,
         options: &'a RgbOptions,
     ) -> Result<Self> {
+        let half = (coarse_steps(options) > 0).then(|| Halved::of(&photos));
+        let seen = half.as_ref().map_or(photos, Halved::photos);
+        let raster =
+            RasterOptions { sh_degree: 0, feature_mode: FeatureMode::Linear, features_move_geometry: true };
+        let depths = used(seen.depths, options);
+        let views = Views::new(device, seen.images, seen.cameras, depths, start.len(), 0, scale.near())?;
+        let model = Model::new(device, start, 0)?;
+        let trainer = Trainer::new(device, raster, model, views, seen.cameras, options.seed);
         Ok(Run {
-            device: device.clone(),
+            trainer,
             options,
             scale,
-            raster: RasterOptions {
-                sh_degree: 0,
-                feature_mode: FeatureMode::Linear,
-                features_move_geometry: true,
-            },
-            model: Model::new(device, start, 0)?,
-            views: Views::new(device, images, cameras, used(depths, options), start.len(), 0, scale.near())?,
-            cameras: cameras.to_vec(),
-            poses: vec![PoseAdam::default(); cameras.len()],
-            order: ViewOrder::new(cameras.len(), options.seed),
-            programs: cameras.iter().map(|_| None).collect(),
+            photos,
+            half,
+            poses: vec![PoseAdam::default(); photos.cameras.len()],
             recent: Vec::new(),
-            images,
             last: 0,
-            psnr: vec![None; cameras.len()],
+            psnr: vec![None; photos.cameras.len()],
             curve: Vec::new(),
         })
     }
 
-    /// Writes the state after `done` steps, if somebody keeps it.
-    fn keep(&self, done: usize, progress: &dyn Progress) -> Result<()> {
-        let Some(checkpoint) = progress.checkpoint() else { return Ok(()) };
-        checkpoint.save(&State {
-            done,
-            model: self.model.state()?,
-            cameras: self.cameras.clone(),
-            poses: self.poses.clone(),
-            order: self.order.clone(),
-            recent: self.recent.clone(),
-            last: self.last,
-            psnr: self.psnr.clone(),
-            curve: self.curve.clone(),
-        })
-    }
-
-    /// Takes over a state; the run was made for its splats.
-    fn restore(&mut self, kept: State) -> Result<()> {
-        self.model = Model::restored(&self.device, &kept.model)?;
-        let State { cameras, poses, order, recent, last, psnr, curve, .. } = kept;
-        (self.cameras, self.poses, self.order) = (cameras, poses, order);
-        (self.recent, self.last, self.psnr, self.curve) = (recent, last, psnr, curve);
-        Ok(())
-    }
-
-    /// Goes on with the same photos at another size; the poses found so far stay.
-    fn look_at(
-        &mut self,
-        images: &'a [RgbImage],
-        cameras: &[Camera],
-        depths: Option<&[DepthMap]>,
-    ) -> Result<()> {
+    /// Goes on with the photos at their full size; the poses found so far stay.
+    fn leave_half_size(&mut self) -> Result<()> {
+        if self.half.take().is_none() {
+            return Ok(());
+        }
+        let (t, Photos { images, cameras, depths }) = (&mut self.trainer, self.photos);
         let (depths, near) = (used(depths, self.options), self.scale.near());
-        self.views = Views::new(&self.device, images, cameras, depths, self.model.count(), 0, near)?;
-        self.images = images;
-        for (own, camera) in self.cameras.iter_mut().zip(cameras) {
+        t.views = Views::new(&t.device, images, cameras, depths, t.model.count(), 0, near)?;
+        for (own, camera) in t.cameras.iter_mut().zip(cameras) {
             *own = Camera { pose: own.pose, ..camera.clone() };
         }
-        self.forget_recordings();
+        t.forget_recordings();
         Ok(())
-    }
-
-    /// One step on the next view; repeated with longer tile lists if they overflowed.
-    pub(super) fn step(&mut self, iteration: usize) -> Result<()> {
-        // One more SH band per 1000 steps (Kerbl et al. 2023), so that the low bands settle first.
-        let degree = self.options.sh_degree.min((iteration / 1000) as u32);
-        if degree != self.raster.sh_degree {
-            self.raster.sh_degree = degree;
-            self.forget_recordings();
-        }
-        let view = self.order.draw();
-        self.last = view;
-        self.model.set_rates(&self.options.rates, 0.0, self.scale.extent, iteration)?;
-        self.views.set_camera(view, &self.cameras[view])?;
-        loop {
-            let program = match self.programs[view].take() {
-                Some(program) => program,
-                None => self.record(view).compile()?,
-            };
-            program.run()?;
-            self.programs[view] = Some(program);
-            let at = self.views.list[view].stage;
-            match self.views.stages[at].raster.overflow()? {
-                None => break,
-                Some(needed) => {
-                    self.views.stages[at].raster.grow(needed)?;
-                    self.forget_recordings();
-                }
-            }
-        }
-        let stage = self.views.stage(view);
-        let [l1, ssim, ..] = stage.total()?;
-        self.recent.push(stage.loss.loss([l1, ssim]));
-        self.move_camera(view, iteration)
-    }
-
-    fn forget_recordings(&mut self) {
-        self.programs.iter_mut().for_each(|p| *p = None);
-    }
-
-    /// Forward, losses, backward and Adam of one view.
-    pub(super) fn record(&self, view: usize) -> Recorder {
-        let (item, stage) = (&self.views.list[view], self.views.stage(view));
-        let frame = stage.raster.frame();
-        let mut rec = Recorder::new(&self.device, "rgb step");
-        stage.raster.record_projection(&mut rec, &self.model.values, &self.raster);
-        let weights = [self.options.l1_weight, self.options.dssim_weight];
-        for band in frame.bands.iter() {
-            stage.raster.record_band(&mut rec, &self.model.values, &band);
-            let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(&band)));
-            stage.loss.record(&mut rec, &band, &frame.planes, target, &frame.planes_grad, weights, sums);
-            // Without depth of its own, a view clears what another of its size may have left.
-            let (reference, pixels) = match &item.depth {
-                Some((references, count)) => (Some(&references[band.index]), *count as f64),
-                None => (None, 1.0),
-            };
-            regularise::record_depth(&mut rec, frame, reference, self.options.depth_weight / pixels);
-            stage.raster.record_band_backward(&mut rec, &self.model.values, &self.raster, &band);
-        }
-        stage.raster.record_gradients(&mut rec, &self.model.values, &self.raster, &self.model.gradients);
-        if self.options.ratio_weight > 0.0 {
-            let count = self.model.count();
-            let (values, gradients) = (&self.model.values.log_scales, &self.model.gradients.log_scales);
-            let weight = self.options.ratio_weight / count as f64;
-            regularise::record_ratio(&mut rec, values, gradients, count, weight, RATIO_LIMIT);
-        }
-        self.model.record_step(&mut rec, &frame.status);
-        rec.download(&frame.status);
-        rec.download(&stage.sums);
-        if self.options.poses.is_some() {
-            rec.download(&frame.camera_grad);
-        }
-        rec
     }
 
     /// Pose refinement; camera 0 fixes the world frame.
@@ -351,29 +204,24 @@ impl<'a> Run<'a> {
         let Some(poses) = self.options.poses.filter(|p| view > 0 && iteration >= p.start) else {
             return Ok(());
         };
-        let g = self.views.stage(view).raster.frame().camera_grad.read::<f32>()?;
+        let g = self.trainer.views.stage(view).raster.frame().camera_grad.read::<f32>()?;
         let twist = [g[0], g[1], g[2], g[3], g[4], g[5]].map(f64::from);
         let rate = poses.rate.at(iteration);
-        let pose = &mut self.cameras[view].pose;
+        let pose = &mut self.trainer.cameras[view].pose;
         *pose = self.poses[view].update(pose, twist, rate, self.scale.median_depth);
         Ok(())
     }
 
-    /// A point of the loss curve now and then, and with it the check for broken numbers.
-    fn report(&mut self, iteration: usize) -> Result<Option<CurvePoint>> {
-        let step = iteration + 1;
-        if !step.is_multiple_of(self.options.report_every.max(1)) && step != self.options.iterations {
-            return Ok(None);
-        }
-        self.model.check(step)?;
-        let shown = match self.views.shown(self.last)? {
+    /// A point of the loss curve, and with it the check for broken numbers.
+    fn measure(&mut self, step: usize) -> Result<CurvePoint> {
+        let t = &mut self.trainer;
+        t.model.check(step)?;
+        let shown = match t.views.shown(self.last)? {
             Some(shown) => shown,
-            None => {
-                let camera = self.cameras[self.last].clone();
-                self.views.render(self.last, &camera, &self.model, &self.raster)?
-            }
+            None => t.views.render(self.last, &t.cameras[self.last], &t.model, &t.raster)?,
         };
-        self.psnr[self.last] = Some(psnr(&shown, &self.images[self.last]).min(MOST_PSNR));
+        let seen = self.half.as_ref().map_or(self.photos, Halved::photos);
+        self.psnr[self.last] = Some(psnr(&shown, &seen.images[self.last]).min(MOST_PSNR));
         let known: Vec<f64> = self.psnr.iter().flatten().copied().collect();
         let n = self.recent.len().max(1) as f64;
         let total = |l: &ImageLoss| l.total(self.options.l1_weight, self.options.dssim_weight);
@@ -382,57 +230,157 @@ impl<'a> Run<'a> {
             loss: self.recent.iter().map(total).sum::<f64>() / n,
             ssim: self.recent.iter().map(|l| l.ssim).sum::<f64>() / n,
             psnr: known.iter().sum::<f64>() / known.len().max(1) as f64,
-            splats: self.model.count(),
+            splats: t.model.count(),
         };
         self.recent.clear();
         self.curve.push(point);
-        Ok(Some(point))
+        Ok(point)
     }
 
-    fn prune(&mut self, iteration: usize) -> Result<()> {
-        let (step, every) = (iteration + 1, self.options.prune_every);
+    fn prune(&mut self, step: usize) -> Result<()> {
+        let every = self.options.prune_every;
         if every == 0 || step < self.options.prune_from || !step.is_multiple_of(every) {
             return Ok(());
         }
-        let logits = self.model.values.opacity_logits.read_range::<f32>(0..self.model.count())?;
+        let model = &mut self.trainer.model;
+        let logits = model.values.opacity_logits.read_range::<f32>(0..model.count())?;
         let rows = compact::kept(&logits, self.options.prune_opacity);
         if rows.is_empty() {
             return Err(Error::work(format!(
                 "every splat faded away by step {step}: cameras and photos do not fit together"
             )));
         }
-        if rows.len() < self.model.count() {
-            self.model.keep(&rows)?;
-            self.forget_recordings();
+        if rows.len() < model.count() {
+            model.keep(&rows)?;
+            self.trainer.forget_recordings();
         }
         Ok(())
     }
 
     /// Reads everything back and keeps the refined cameras only if they explain the photos better.
-    fn finish(
-        &mut self,
-        images: &[RgbImage],
-        initial: &[Camera],
-    ) -> Result<(Splats, Vec<Camera>, Vec<f64>, bool)> {
-        let splats = self.model.splats()?;
+    fn finish(&mut self) -> Result<(Splats, Vec<Camera>, Vec<f64>, bool)> {
+        self.leave_half_size()?;
+        let (t, Photos { images, cameras: initial, .. }) = (&mut self.trainer, self.photos);
+        let splats = t.model.splats()?;
         let mut score = |cameras: &[Camera]| -> Result<Vec<f64>> {
             (0..images.len())
                 .map(|i| {
-                    let rendered = self.views.render(i, &cameras[i], &self.model, &self.raster)?;
+                    let rendered = t.views.render(i, &cameras[i], &t.model, &t.raster)?;
                     Ok(psnr(&rendered, &images[i]).min(MOST_PSNR))
                 })
                 .collect()
         };
-        let refined = score(&self.cameras)?;
+        let refined = score(&t.cameras)?;
         if self.options.poses.is_none() {
             return Ok((splats, initial.to_vec(), refined, false));
         }
         let before = score(initial)?;
         let sum = |v: &[f64]| v.iter().sum::<f64>();
         if sum(&refined) > sum(&before) {
-            Ok((splats, self.cameras.clone(), refined, true))
+            Ok((splats, t.cameras.clone(), refined, true))
         } else {
             Ok((splats, initial.to_vec(), before, false))
         }
     }
+}
+
+impl Training for Run<'_> {
+    type Figures = Figures;
+
+    fn trainer(&self) -> &Trainer {
+        &self.trainer
+    }
+    fn trainer_mut(&mut self) -> &mut Trainer {
+        &mut self.trainer
+    }
+
+    fn schedule(&mut self, iteration: usize) -> Result<()> {
+        if iteration >= coarse_steps(self.options) {
+            self.leave_half_size()?;
+        }
+        // One more SH band per 1000 steps (Kerbl et al. 2023), so that the low bands settle first.
+        let degree = self.options.sh_degree.min((iteration / 1000) as u32);
+        let t = &mut self.trainer;
+        if degree != t.raster.sh_degree {
+            t.raster.sh_degree = degree;
+            t.forget_recordings();
+        }
+        t.model.set_rates(&self.options.rates, 0.0, self.scale.extent, iteration)
+    }
+
+    fn record(&self, view: usize) -> Recorder {
+        let Trainer { device, raster, model, views, .. } = &self.trainer;
+        let (item, stage) = (&views.list[view], views.stage(view));
+        let frame = stage.raster.frame();
+        let mut rec = Recorder::new(device, "rgb step");
+        stage.raster.record_projection(&mut rec, &model.values, raster);
+        let weights = [self.options.l1_weight, self.options.dssim_weight];
+        for band in frame.bands.iter() {
+            stage.raster.record_band(&mut rec, &model.values, &band);
+            let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(&band)));
+            stage.loss.record(&mut rec, &band, &frame.planes, target, &frame.planes_grad, weights, sums);
+            // Without depth of its own, a view clears what another of its size may have left.
+            let (reference, pixels) = match &item.depth {
+                Some((references, count)) => (Some(&references[band.index]), *count as f64),
+                None => (None, 1.0),
+            };
+            regularise::record_depth(&mut rec, frame, reference, self.options.depth_weight / pixels);
+            stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
+        }
+        stage.raster.record_gradients(&mut rec, &model.values, raster, &model.gradients);
+        if self.options.ratio_weight > 0.0 {
+            let count = model.count();
+            let (values, gradients) = (&model.values.log_scales, &model.gradients.log_scales);
+            let weight = self.options.ratio_weight / count as f64;
+            regularise::record_ratio(&mut rec, values, gradients, count, weight, RATIO_LIMIT);
+        }
+        model.record_step(&mut rec, &frame.status);
+        rec.download(&frame.status);
+        rec.download(&stage.sums);
+        if self.options.poses.is_some() {
+            rec.download(&frame.camera_grad);
+        }
+        rec
+    }
+
+    fn read_back(&mut self, view: usize, iteration: usize) -> Result<()> {
+        self.last = view;
+        let stage = self.trainer.views.stage(view);
+        let [l1, ssim, ..] = stage.total()?;
+        self.recent.push(stage.loss.loss([l1, ssim]));
+        self.move_camera(view, iteration)
+    }
+
+    fn review(&mut self, step: usize) -> Result<Review> {
+        let mut review = Review::default();
+        let every = self.options.report_every.max(1);
+        if step > 0 && (step.is_multiple_of(every) || step == self.options.iterations) {
+            let CurvePoint { loss, ssim, psnr, splats, .. } = self.measure(step)?;
+            review.note = Some(format!("loss {loss:.4}, PSNR {psnr:.1}, {splats} splats"));
+            review.figures = vec![("loss", loss), ("ssim", ssim), ("psnr", psnr), ("splats", splats as f64)];
+        }
+        self.prune(step)?;
+        Ok(review)
+    }
+
+    fn figures(&self) -> Figures {
+        let Run { poses, recent, last, psnr, curve, .. } = self;
+        Figures {
+            poses: poses.clone(),
+            recent: recent.clone(),
+            last: *last,
+            psnr: psnr.clone(),
+            curve: curve.clone(),
+        }
+    }
+
+    fn set_figures(&mut self, kept: Figures) {
+        (self.poses, self.recent, self.last) = (kept.poses, kept.recent, kept.last);
+        (self.psnr, self.curve) = (kept.psnr, kept.curve);
+    }
+}
+
+/// Steps at half the photos' size, at the beginning.
+fn coarse_steps(options: &RgbOptions) -> usize {
+    (options.coarse * options.iterations as f64) as usize
 }

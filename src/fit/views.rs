@@ -106,6 +106,11 @@ impl Views {
         &self.stages[self.list[view].stage]
     }
 
+    /// The same, to change it.
+    pub(super) fn stage_mut(&mut self, view: usize) -> &mut Stage {
+        &mut self.stages[self.list[view].stage]
+    }
+
     /// Chooses what the next run renders.
     pub(super) fn set_camera(&self, view: usize, camera: &Camera) -> Result<()> {
         self.stage(view).raster.set_view(&View::new(camera, self.near))
@@ -120,15 +125,13 @@ impl Views {
         options: &RasterOptions,
     ) -> Result<RgbImage> {
         self.set_camera(view, camera)?;
-        let at = self.list[view].stage;
-        let stage = &mut self.stages[at];
         let (width, height) = (camera.width as usize, camera.height as usize);
         let mut image = RgbImage { width, height, data: Vec::with_capacity(width * height) };
         let seen = |frame: &FrameBuffers, band: &Band| {
             image.data.extend(colours(frame, band)?);
             Ok(())
         };
-        stage.raster.forward_bands(&model.values, options, seen)?;
+        self.stage_mut(view).raster.forward_bands(&model.values, options, seen)?;
         Ok(image)
     }
 
