@@ -4,17 +4,19 @@ use super::tables::{Available, Regions, Setup};
 use crate::fit::{LanguageOptions, Preset, RgbOptions, Trained, TrainedLanguage};
 use crate::gpu::Device;
 use crate::infer::Registry;
-use crate::infer::installed::{Duty, inventory, known};
+use crate::infer::installed::{Task, catalogue, inventory};
 use crate::language::sam::SamOptions;
 use crate::language::{Language, ViewMasks};
 use crate::photo;
 use crate::pipeline::{Graph, Output, Store};
 use crate::progress::{Progress, Recorded};
 use crate::query::TextQuery;
-use crate::query::eval::{BACKGROUND_LABELS, Frame, GroundTruth, Split};
+use crate::query::eval::{BACKGROUND_LABELS, GroundTruth, Split, TruthFrame};
 use crate::run::ask;
-use crate::run::sources::{self, Build, Features, Geometry, Masks, Matches, PosedPhotos};
-use crate::run::stages::{self, CameraSource, Placed};
+use crate::run::sources::{
+    self, FeatureSources, GeometrySources, GraphBuilder, MaskSources, MatchSources, PosedPhotos,
+};
+use crate::run::stages::{self, CameraOrigin, PlacedPhotos};
 use crate::scene::Camera;
 use crate::synth::regions;
 use crate::{Error, Result};
@@ -23,7 +25,7 @@ use std::sync::Arc;
 
 /// What came out of a setup.
 #[derive(Clone)]
-pub struct Outcome {
+pub struct RowFigures {
     /// Figures of protocol `field`, and how well the rendered meaning agrees with the true one.
     pub scored: Arc<Scored>,
     /// Splats of the finished scene.
@@ -49,8 +51,8 @@ pub struct Lab<'a> {
 
 /// The stages of a setup.
 struct Stages {
-    build: Build,
-    placed: Output<Placed>,
+    build: GraphBuilder,
+    placed: Output<PlacedPhotos>,
     trained: Output<Trained>,
     aligned: Output<Language>,
     language: Output<TrainedLanguage>,
@@ -64,7 +66,7 @@ pub fn feature_bytes(splats: usize, channels: usize, pixels: usize) -> u64 {
     4 * channels as u64 * (5 * splats as u64 + 2 * pixels as u64)
 }
 
-fn pixels(placed: &Placed) -> usize {
+fn pixels(placed: &PlacedPhotos) -> usize {
     placed.photos.iter().map(|p| p.image.data.len()).max().unwrap_or(0)
 }
 
@@ -82,10 +84,11 @@ impl<'a> Lab<'a> {
 
     /// Frames whose photos a scene of so many views is made from: train frames spread over their order, and held-out ones
     /// when they do not suffice.
-    pub fn frames(&self, views: usize) -> Result<Vec<Frame>> {
-        let of = |split| -> Vec<&Frame> { self.truth.frames.iter().filter(|f| f.split == split).collect() };
+    pub fn frames(&self, views: usize) -> Result<Vec<TruthFrame>> {
+        let of =
+            |split| -> Vec<&TruthFrame> { self.truth.frames.iter().filter(|f| f.split == split).collect() };
         let (train, test) = (of(Split::Train), of(Split::Test));
-        let pick = |from: &[&Frame], n: usize| -> Vec<Frame> {
+        let pick = |from: &[&TruthFrame], n: usize| -> Vec<TruthFrame> {
             photo::spread(from.len(), n).into_iter().map(|i| from[i].clone()).collect()
         };
         if views < 2 || views > train.len() + test.len() {
@@ -106,13 +109,13 @@ impl<'a> Lab<'a> {
     pub fn available(&self) -> Available {
         let of = |split| self.truth.frames.iter().filter(|f| f.split == split).count();
         let there = inventory(&self.registry);
-        let families = |duty| {
+        let families = |task| {
             let mut all: Vec<(String, bool)> = Vec::new();
-            for model in known().iter().filter(|k| k.role == duty) {
+            for model in catalogue().iter().filter(|k| k.task == task) {
                 let installed = there
                     .models
                     .iter()
-                    .any(|m| m.duties.contains(&duty) && m.family == model.family && !m.untrained());
+                    .any(|m| m.tasks.contains(&task) && m.family == model.family && !m.untrained());
                 if all.iter().all(|(name, _)| *name != model.family) {
                     all.push((model.family.clone(), installed));
                 }
@@ -121,7 +124,7 @@ impl<'a> Lab<'a> {
         };
         // Half of the held-out frames must stay held out.
         let views = of(Split::Train) + of(Split::Test) / 2;
-        Available { views, geometry: families(Duty::Geometry), features: families(Duty::Features) }
+        Available { views, geometry: families(Task::Geometry), features: families(Task::Features) }
     }
 
     /// The stages of a setup, up to its figures.
@@ -131,7 +134,7 @@ impl<'a> Lab<'a> {
         let photos = photo::load_all(&paths, self.progress)?;
         let registry = &self.registry;
         let given = |r: &Regions| matches!(r, Regions::Found { features, .. } if features.argument.is_some());
-        let mut build = Build {
+        let mut build = GraphBuilder {
             graph: Graph::default(),
             registry: registry.clone(),
             sam: SamOptions::default(),
@@ -139,14 +142,17 @@ impl<'a> Lab<'a> {
             preset: Preset::Draft,
         };
         let posed = if setup.true_cameras {
-            let named = |f: &Frame| Camera { name: f.stem.clone(), ..f.camera.clone() };
-            build.posed(photos, CameraSource::Known(frames.iter().map(named).collect()))?
+            let named = |f: &TruthFrame| Camera { name: f.stem.clone(), ..f.camera.clone() };
+            build.posed(photos, CameraOrigin::Known(frames.iter().map(named).collect()))?
         } else {
-            sources::make::<Geometry>(&setup.init, registry, (&mut build, photos))?
+            sources::make::<GeometrySources>(&setup.init, registry, (&mut build, photos))?
         };
         let PosedPhotos { placed, geometry } = posed;
-        let matches =
-            sources::make::<Matches>(&sources::default::<Matches>(), registry, (&mut build, posed))?;
+        let matches = sources::make::<MatchSources>(
+            &sources::default::<MatchSources>(),
+            registry,
+            (&mut build, posed),
+        )?;
         let options = self.rgb_options(setup);
         let trained = build.graph.add(stages::TrainColour { options }, (placed, geometry));
         let Described { masks, meaning, queries, space } = self.described(setup, &mut build, posed)?;
@@ -173,7 +179,7 @@ impl<'a> Lab<'a> {
     }
 
     /// Masks with features, what the objects mean in the space of these features, and the questions.
-    fn described(&self, setup: &Setup, build: &mut Build, posed: PosedPhotos) -> Result<Described> {
+    fn described(&self, setup: &Setup, build: &mut GraphBuilder, posed: PosedPhotos) -> Result<Described> {
         let (truth, placed) = (&self.truth, posed.placed);
         let (masks, features) = match &setup.regions {
             Regions::Synthetic(flaws) => {
@@ -188,9 +194,9 @@ impl<'a> Lab<'a> {
             }
             Regions::Found { masks, features } => (masks, features),
         };
-        let encoder = sources::make::<Features>(features, &self.registry, &self.registry)?;
-        let found = sources::make::<Masks>(masks, &self.registry, (build, posed))?;
-        let masks = build.graph.add(stages::Regions { encoder: encoder.clone() }, (placed, found));
+        let encoder = sources::make::<FeatureSources>(features, &self.registry, &self.registry)?;
+        let found = sources::make::<MaskSources>(masks, &self.registry, (build, posed))?;
+        let masks = build.graph.add(stages::RegionFeatures { encoder: encoder.clone() }, (placed, found));
         let queries = encoder.with(|e| ask::embedded(&self.phrases(), e))?;
         let space = encoder.space().to_owned();
         let truth = truth.clone();
@@ -209,7 +215,7 @@ impl<'a> Lab<'a> {
     }
 
     /// Runs a setup, as far as it was not run before.
-    pub fn outcome(&mut self, setup: &Setup) -> Result<Outcome> {
+    pub fn outcome(&mut self, setup: &Setup) -> Result<RowFigures> {
         let s = self.stages(setup)?;
         let targets = [s.placed.target(), s.aligned.target(), s.language.target(), s.scored.target()];
         let progress = Recorded::new(self.progress);
@@ -218,7 +224,7 @@ impl<'a> Lab<'a> {
         let levels = &language.field.levels;
         let codes = levels.iter().map(|l| l.codebook.members.iter().filter(|m| !m.is_empty()).count());
         let channels: usize = levels.iter().map(|l| l.codebook.code_dim).sum();
-        Ok(Outcome {
+        Ok(RowFigures {
             splats: language.splats.len(),
             codes: codes.collect(),
             feature_bytes: feature_bytes(language.splats.len(), channels, pixels(&placed)),

@@ -8,7 +8,7 @@ mod stages;
 mod table;
 mod tables;
 
-pub use lab::{Lab, Outcome, feature_bytes};
+pub use lab::{Lab, RowFigures, feature_bytes};
 pub use stages::{Meaning, Scored};
 pub use table::{Done, Finished, figures};
 pub use tables::{Available, Regions, Row, Runs, Setup, TABLES, Table, table};
@@ -68,7 +68,7 @@ pub fn run(lab: &mut Lab, plan: &Plan, table: &'static Table) -> Result<Finished
     for regions in given.unwrap_or_else(|| (table.regions)(plan.seed, &available)) {
         let base = Setup {
             views: plan.views.unwrap_or(train.min(crate::photo::DEFAULT_VIEWS)),
-            init: sources::default::<sources::Geometry>(),
+            init: sources::default::<sources::GeometrySources>(),
             true_cameras: plan.true_cameras,
             max_points: None,
             regions,

@@ -5,11 +5,11 @@ use crate::photo::Photo;
 use crate::photo::stem;
 use crate::pipeline::{Context, Lane, Output, Stage};
 use crate::query::TextQuery;
-use crate::query::eval::{Evaluation, Frame, GroundTruth, Report, Split};
+use crate::query::eval::{Evaluation, GroundTruth, Report, Split, TruthFrame};
 use crate::run::score::score_field;
-use crate::run::stages::{Placed, SharedEncoder};
+use crate::run::stages::{PlacedPhotos, SharedEncoder};
 use crate::scene::{Codebook, Plane};
-use crate::synth::regions::{self, Flaws};
+use crate::synth::regions::{self, InjectedErrors};
 use crate::{Error, Result};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -41,7 +41,7 @@ pub struct Scored {
 }
 
 /// The frame of each photo.
-fn frames_of<'t>(truth: &'t GroundTruth, photos: &[Photo]) -> Result<Vec<&'t Frame>> {
+fn frames_of<'t>(truth: &'t GroundTruth, photos: &[Photo]) -> Result<Vec<&'t TruthFrame>> {
     let find = |p: &Photo| {
         let frame = truth.frames.iter().find(|f| stem(&f.file) == p.stem);
         frame.ok_or_else(|| Error::work(format!("{}: not a frame of the data set", p.path.display())))
@@ -52,20 +52,20 @@ fn frames_of<'t>(truth: &'t GroundTruth, photos: &[Photo]) -> Result<Vec<&'t Fra
 /// True masks with synthetic features.
 pub(super) struct SyntheticMasks {
     pub(super) truth: Arc<GroundTruth>,
-    pub(super) flaws: Flaws,
+    pub(super) flaws: InjectedErrors,
 }
 
 impl Stage for SyntheticMasks {
     const NAME: &'static str = "synthetic-masks";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>,);
+    type Inputs = (Output<PlacedPhotos>,);
     type Output = Vec<ViewMasks>;
 
     fn settings(&self) -> String {
         format!("{:?} {:?}", self.truth.folder, self.flaws)
     }
 
-    fn run(self, (placed,): (&Placed,), _: &Context) -> Result<Vec<ViewMasks>> {
+    fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<Vec<ViewMasks>> {
         Ok(regions::regions(&self.truth, &frames_of(&self.truth, &placed.photos)?, &self.flaws)?.masks)
     }
 }
@@ -73,20 +73,20 @@ impl Stage for SyntheticMasks {
 /// What objects mean in the space of [`SyntheticMasks`].
 pub(super) struct SyntheticMeaning {
     pub(super) truth: Arc<GroundTruth>,
-    pub(super) flaws: Flaws,
+    pub(super) flaws: InjectedErrors,
 }
 
 impl Stage for SyntheticMeaning {
     const NAME: &'static str = "synthetic-meaning";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>,);
+    type Inputs = (Output<PlacedPhotos>,);
     type Output = Meanings;
 
     fn settings(&self) -> String {
         format!("{:?} {:?}", self.truth.folder, self.flaws)
     }
 
-    fn run(self, (placed,): (&Placed,), _: &Context) -> Result<Meanings> {
+    fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<Meanings> {
         Ok(regions::regions(&self.truth, &frames_of(&self.truth, &placed.photos)?, &self.flaws)?.meaning)
     }
 }
@@ -100,14 +100,14 @@ pub(super) struct EncoderMeaning {
 impl Stage for EncoderMeaning {
     const NAME: &'static str = "encoder-meaning";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>,);
+    type Inputs = (Output<PlacedPhotos>,);
     type Output = Meanings;
 
     fn settings(&self) -> String {
         format!("{:?} {}", self.truth.folder, self.encoder.identity())
     }
 
-    fn run(self, (placed,): (&Placed,), _: &Context) -> Result<Meanings> {
+    fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<Meanings> {
         let mut sums: Option<Sums> = None;
         for (frame, photo) in frames_of(&self.truth, &placed.photos)?.into_iter().zip(&placed.photos) {
             let Some(objects) = self.truth.objects(frame)? else { continue };
@@ -134,14 +134,14 @@ pub(super) struct MaskMeaning {
 impl Stage for MaskMeaning {
     const NAME: &'static str = "mask-meaning";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>, Output<Vec<ViewMasks>>);
+    type Inputs = (Output<PlacedPhotos>, Output<Vec<ViewMasks>>);
     type Output = Meanings;
 
     fn settings(&self) -> String {
         format!("{:?}", self.truth.folder)
     }
 
-    fn run(self, (placed, masks): (&Placed, &Vec<ViewMasks>), _: &Context) -> Result<Meanings> {
+    fn run(self, (placed, masks): (&PlacedPhotos, &Vec<ViewMasks>), _: &Context) -> Result<Meanings> {
         let levels = masks.iter().flat_map(|v| &v.levels);
         let dim = levels.into_iter().find_map(|l| l.features.len().checked_div(l.quality.len()));
         let mut sums = Sums::new(dim.unwrap_or(0));
@@ -250,7 +250,7 @@ impl Scale {
 /// How well a decoded level agrees with the true meaning of each pixel's object; pixels without code or truth are left
 /// out.
 fn agreement(
-    frame: &Frame,
+    frame: &TruthFrame,
     codes: &Plane<i32>,
     book: &Codebook,
     objects: &Plane<u32>,

@@ -1,5 +1,5 @@
 //! Finished rows as text, JSON and a chart.
-use super::lab::Outcome;
+use super::lab::RowFigures;
 use super::tables::{Column, Row, Runs, Table};
 use crate::query::eval::Split;
 use serde_json::{Value, json};
@@ -11,7 +11,7 @@ pub struct Done {
     /// What it was.
     pub row: Row,
     /// What it gave; none for a row without a setup.
-    pub outcome: Option<Outcome>,
+    pub outcome: Option<RowFigures>,
     /// Bytes of the features in training.
     pub bytes: Option<u64>,
 }
@@ -184,7 +184,7 @@ mod tests {
             mask("c", Split::Test, 1.0, true),
         ];
         let meaning = Meaning { frame: "c".into(), split: Split::Test, similarity: 0.5, mse: 0.1 };
-        let outcome = Outcome {
+        let outcome = RowFigures {
             scored: std::sync::Arc::new(Scored {
                 report: Report { masks, ..Report::default() },
                 meaning: vec![meaning],

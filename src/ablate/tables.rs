@@ -1,8 +1,8 @@
 //! The tables of the paper's experiments, as data: each is a list of setups that differ in one thing.
 use crate::language::Reducer;
 use crate::run::method::{AUTOENCODER, LANGSPLAT, LEGAUSSIANS, LSM, METHODS, Recipe};
-use crate::run::sources::{self, Features, Masks, SourceChoice};
-use crate::synth::regions::Flaws;
+use crate::run::sources::{self, FeatureSources, MaskSources, SourceChoice};
+use crate::synth::regions::InjectedErrors;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -178,7 +178,7 @@ pub static TABLES: [Table; 9] = [
         regions: |_, _| vec![Regions::EXACT],
         rows: |group| {
             let from = |init: SourceChoice, true_cameras| Setup { init, true_cameras, ..group.base.clone() };
-            let sfm = sources::default::<sources::Geometry>();
+            let sfm = sources::default::<sources::GeometrySources>();
             let mut rows = vec![
                 group.row(&sfm.name, from(sfm.clone(), false), &[]),
                 group.row("true cameras", from(sfm, true), &[]),
@@ -209,21 +209,24 @@ pub enum Regions {
         features: SourceChoice,
     },
     /// True masks and synthetic features, with errors injected.
-    Synthetic(Flaws),
+    Synthetic(InjectedErrors),
 }
 
 impl Regions {
     /// Without an error.
-    pub const EXACT: Regions = Regions::Synthetic(Flaws::NONE);
+    pub const EXACT: Regions = Regions::Synthetic(InjectedErrors::NONE);
 
     /// What `splatvk run` uses on its own.
     pub fn built_in() -> Regions {
-        Regions::Found { masks: sources::default::<Masks>(), features: sources::default::<Features>() }
+        Regions::Found {
+            masks: sources::default::<MaskSources>(),
+            features: sources::default::<FeatureSources>(),
+        }
     }
 
     /// With the usual errors.
     pub fn flawed(seed: u64) -> Regions {
-        Regions::Synthetic(Flaws::usual(seed))
+        Regions::Synthetic(InjectedErrors::default_rates(seed))
     }
 
     /// Masks and features from a folder.
@@ -233,7 +236,7 @@ impl Regions {
 
     /// Built-in masks, features of an installed network.
     pub fn described_by(network: &str) -> Regions {
-        Regions::Found { masks: sources::default::<Masks>(), features: SourceChoice::named(network) }
+        Regions::Found { masks: sources::default::<MaskSources>(), features: SourceChoice::named(network) }
     }
 
     /// For the rows of a table.
@@ -346,7 +349,7 @@ mod tests {
     fn rows_differ_in_what_their_table_is_about() {
         let base = Setup {
             views: 4,
-            init: sources::default::<sources::Geometry>(),
+            init: sources::default::<sources::GeometrySources>(),
             true_cameras: false,
             max_points: None,
             regions: Regions::EXACT,

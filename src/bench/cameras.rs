@@ -4,9 +4,9 @@ use crate::infer::Registry;
 use crate::photo;
 use crate::pose::align::pose_errors;
 use crate::pose::relative::{auc, pair_errors};
-use crate::pose::{self, Placed};
+use crate::pose::{self, SolvedCameras};
 use crate::progress::Progress;
-use crate::query::eval::{Frame, GroundTruth, Split};
+use crate::query::eval::{GroundTruth, Split, TruthFrame};
 use crate::scene::Lens;
 use crate::{Error, Result};
 use serde::Serialize;
@@ -120,7 +120,7 @@ fn one(
     registry: &Registry,
     progress: &dyn Progress,
 ) -> Result<CameraRow> {
-    let frames: Vec<&Frame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
+    let frames: Vec<&TruthFrame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
     let clock = Instant::now();
     let found = placed(&truth.folder, &frames, reading, registry, progress);
     let seconds = clock.elapsed().as_secs_f64();
@@ -135,12 +135,12 @@ fn one(
 /// What a run does before its first dense stage.
 fn placed(
     folder: &Path,
-    frames: &[&Frame],
+    frames: &[&TruthFrame],
     reading: Reading,
     registry: &Registry,
     progress: &dyn Progress,
-) -> Result<Placed> {
-    let load = |f: &&Frame| photo::load_at(&folder.join(&f.file), reading.max_size);
+) -> Result<SolvedCameras> {
+    let load = |f: &&TruthFrame| photo::load_at(&folder.join(&f.file), reading.max_size);
     let mut photos = frames.iter().map(load).collect::<Result<Vec<_>>>()?;
     if reading.copies {
         photos.iter_mut().for_each(|p| p.fine = None);
@@ -148,9 +148,9 @@ fn placed(
     pose::place(photos, None, registry, progress)
 }
 
-fn figures(truth: &GroundTruth, frames: &[&Frame], placed: &Placed) -> Result<CameraFigures> {
+fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) -> Result<CameraFigures> {
     let model = &placed.model;
-    let joined: Vec<(usize, &Frame)> = placed
+    let joined: Vec<(usize, &TruthFrame)> = placed
         .photos
         .iter()
         .enumerate()

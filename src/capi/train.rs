@@ -10,7 +10,7 @@ use crate::photo::{self, Photo};
 use crate::pose::choose;
 use crate::progress::Progress;
 use crate::run::live::LiveScene;
-use crate::run::sources::{self, Kind, SourceChoice, choose};
+use crate::run::sources::{self, SourceChoice, SourceKind, choose};
 use crate::run::{self, Method, RunPlan};
 use crate::scene::{Camera, RgbImage};
 use std::path::{Path, PathBuf};
@@ -159,18 +159,18 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Fau
     let method = method.unwrap_or(RunPlan::default().method);
     Ok(RunPlan {
         preset,
-        init: source::<sources::Geometry>(
+        init: source::<sources::GeometrySources>(
             text(o.init, "init")?,
             path(o.cameras, "cameras")?.map(|file| SourceChoice::with("cameras", file)),
             networks,
         )?,
-        matcher: source::<sources::Matches>(text(o.matcher, "matcher")?, None, networks)?,
-        masks: source::<sources::Masks>(
+        matcher: source::<sources::MatchSources>(text(o.matcher, "matcher")?, None, networks)?,
+        masks: source::<sources::MaskSources>(
             text(o.mask_source, "mask_source")?,
             path(o.masks, "masks")?.map(|dir| SourceChoice::with("dir", dir)),
             networks,
         )?,
-        features: source::<sources::Features>(
+        features: source::<sources::FeatureSources>(
             text(o.feature_source, "feature_source")?,
             path(o.features, "features")?.map(|dir| SourceChoice::with("dir", dir)),
             networks,
@@ -186,7 +186,7 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Fau
 }
 
 /// A source by its name, or by the file or folder that an older field holds, or the built-in one.
-fn source<K: Kind>(
+fn source<K: SourceKind>(
     named: Option<String>,
     given: Option<SourceChoice>,
     networks: &Inventory,

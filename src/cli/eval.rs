@@ -7,7 +7,7 @@ use crate::format::{cameras, create_folder, picture, scene_dir, write_json};
 use crate::gpu::Device;
 use crate::query::TextQuery;
 use crate::query::eval::{Evaluation, GroundTruth, Report};
-use crate::query::protocol::{self, CodeScores, Kind, Masks, Seen};
+use crate::query::protocol::{self, CodeScores, Masks, ProtocolKind, Seen};
 use crate::report::file_name;
 use crate::run::ask;
 use crate::run::encoder;
@@ -34,9 +34,9 @@ pub fn eval(args: &EvalArgs) -> Result<()> {
         _ if args.refine_views || args.text => {
             Err(Error::input("--refine-views and --text belong to --protocol field; leave them out"))
         }
-        ProtocolArg::Lerf => report(&published(Kind::Lerf, &scene, args)?, args, None),
-        ProtocolArg::Ovs => report(&published(Kind::Ovs, &scene, args)?, args, None),
-        ProtocolArg::Scannet => report(&published(Kind::ScanNet, &scene, args)?, args, None),
+        ProtocolArg::Lerf => report(&published(ProtocolKind::Lerf, &scene, args)?, args, None),
+        ProtocolArg::Ovs => report(&published(ProtocolKind::Ovs, &scene, args)?, args, None),
+        ProtocolArg::Scannet => report(&published(ProtocolKind::ScanNet, &scene, args)?, args, None),
     }
 }
 
@@ -70,7 +70,7 @@ fn field(scene: &Scene, args: &EvalArgs) -> Result<Report> {
     )
 }
 
-fn published(kind: Kind, scene: &Scene, args: &EvalArgs) -> Result<protocol::Report> {
+fn published(kind: ProtocolKind, scene: &Scene, args: &EvalArgs) -> Result<protocol::Report> {
     let Some(field) = &scene.language else {
         return Err(Error::input(format!(
             "{}: the scene has no language; make one with splatvk run",
@@ -91,7 +91,7 @@ fn published(kind: Kind, scene: &Scene, args: &EvalArgs) -> Result<protocol::Rep
         let decoded = viewer.view(&view.camera)?;
         let masks = protocol.add(i, &Seen { codes: &decoded.codes, scores: &scores })?;
         if let Some(out) = &args.out {
-            write(out, &view.stem, &decoded.frame.rgb, masks)?;
+            write(out, &view.stem, &decoded.rendered.rgb, masks)?;
         }
         progress.step(i as u64 + 1, "");
     }

@@ -101,7 +101,7 @@ impl Progress for JsonLines {
     fn cancelled(&self) -> bool {
         stopped()
     }
-    fn beside(&self) -> Box<dyn Progress + '_> {
+    fn second_lane(&self) -> Box<dyn Progress + '_> {
         Box::new(JsonLines::default())
     }
 }
@@ -183,7 +183,7 @@ impl Progress for Terminal {
     fn cancelled(&self) -> bool {
         stopped()
     }
-    fn beside(&self) -> Box<dyn Progress + '_> {
+    fn second_lane(&self) -> Box<dyn Progress + '_> {
         Box::new(Terminal { bars: self.bars.clone(), current: Mutex::default() })
     }
 }

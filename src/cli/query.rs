@@ -22,14 +22,14 @@ const AT_ONCE: usize = 16;
 
 pub fn query(args: &QueryArgs) -> Result<()> {
     let mut scene = scene_dir::load(&args.scene)?;
-    let mute = || {
+    let no_language = || {
         Error::input(format!(
             "{}: the scene has no language; make one with splatvk run",
             args.scene.display()
         ))
     };
     if scene.language.is_none() {
-        return Err(mute());
+        return Err(no_language());
     }
     let cameras = match &args.cameras {
         Some(file) => cameras::read(file)?,
@@ -52,7 +52,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let encoder = encoder::of_scene(&scene, registry)?;
     let mut out = Outputs::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
-    let field = scene.language.take().ok_or_else(mute)?;
+    let field = scene.language.take().ok_or_else(no_language)?;
     let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
     let progress = progress::here();
     progress.begin("query", cameras.len() as u64);
@@ -66,7 +66,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
             let answers = ready.ask(text, &QueryOptions::default())?;
             latency[q] += 1e3 * clock.elapsed().as_secs_f64();
             for ((frame, stem), answer) in ready.frames().iter().zip(stems).zip(&answers.views) {
-                write(&mut out, stem, &folders[q], &frame.frame.rgb, answer)?;
+                write(&mut out, stem, &folders[q], &frame.rendered.rgb, answer)?;
                 views[q].push(to_json(stem, &folders[q], answer));
             }
         }

@@ -65,7 +65,7 @@ fn levels(field: &LanguageField) -> Vec<(&'static str, usize, usize, usize)> {
 }
 
 fn part(view: &DecodedFrame, first: usize, d: usize) -> Vec<f32> {
-    let pixels = view.frame.features.chunks_exact(view.frame.feature_dim.max(1));
+    let pixels = view.rendered.features.chunks_exact(view.rendered.feature_dim.max(1));
     pixels.flat_map(|f| f[first..first + d].iter().copied()).collect()
 }
 
@@ -77,7 +77,7 @@ fn png(
     view: &DecodedFrame,
     field: &LanguageField,
 ) -> Result<()> {
-    let frame = &view.frame;
+    let frame = &view.rendered;
     for channel in channels {
         match channel {
             Channel::Rgb => picture::write_png(&out.file(&format!("{stem}.png"))?, &frame.rgb)?,
@@ -121,7 +121,7 @@ fn false_colour(features: &[f32], d: usize, like: &Plane<f32>) -> RgbImage {
 }
 
 fn exr(out: &mut Outputs, stem: &str, channels: &[Channel], view: &DecodedFrame) -> Result<()> {
-    let frame = &view.frame;
+    let frame = &view.rendered;
     let has = |c: Channel| channels.contains(&c);
     // OpenEXR holds linear light; what programs that read it expect.
     let linear = has(Channel::Rgb)
@@ -143,7 +143,7 @@ fn arrays(
     view: &DecodedFrame,
     field: &LanguageField,
 ) -> Result<()> {
-    let frame = &view.frame;
+    let frame = &view.rendered;
     let size = (frame.rgb.width, frame.rgb.height);
     for channel in channels {
         match channel {

@@ -7,7 +7,7 @@ use std::path::Path;
 use serde::Deserialize;
 
 use super::contract::{Contract, Part, Slot, unify};
-use super::onnx::{Dim, Header, Kind, Port, listed};
+use super::onnx::{Dim, ElementType, Header, Port, listed};
 use super::runtime::Tensor;
 use crate::{Error, Result};
 
@@ -181,7 +181,7 @@ pub struct Adapter {
 
 impl Adapter {
     /// The adapter of a model file: `NAME.toml` beside it, else `adapter.toml` in its folder, else none of its own.
-    pub fn beside(model: &Path) -> Result<Adapter> {
+    pub fn of_file(model: &Path) -> Result<Adapter> {
         for path in [model.with_extension("toml"), model.with_file_name("adapter.toml")] {
             if path.is_file() {
                 let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
@@ -375,9 +375,9 @@ impl GraphSpec {
             return Err(format!("no {side} for {} [{}]", slot.role, slot.shape));
         };
         let kind_fits = match port.kind {
-            Kind::Float => true,
-            Kind::Integer => slot.integer,
-            Kind::Other => false,
+            ElementType::Float => true,
+            ElementType::Integer => slot.integer,
+            ElementType::Other => false,
         };
         if !kind_fits {
             return Err(format!("{side} {port} for {} has an element type that it cannot have", slot.role));

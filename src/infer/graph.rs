@@ -1,4 +1,4 @@
-//! A loaded graph that is spoken to by role: layouts, element types and activations are its own affair.
+//! A loaded graph with inputs and outputs by role: layouts, element types and activations are handled here.
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -37,7 +37,7 @@ impl GraphFile {
     /// Reads the file's header and finds its part; the error names the file and the mend.
     pub fn recognise(path: &Path) -> Result<GraphFile> {
         let header: Header = onnx::read(path)?;
-        let adapter = Adapter::beside(path)?;
+        let adapter = Adapter::of_file(path)?;
         let binding = adapter.fit(path, &header)?;
         if let Some(absent) = header.external.iter().find(|p| !p.is_file()) {
             return Err(Error::missing(format!(
@@ -78,7 +78,7 @@ impl GraphFile {
     }
 
     /// Of the layouts that an output's lengths allow, takes the first in which `axis` has `length`, if there is one.
-    pub(super) fn settle(&mut self, role: &str, axis: &str, length: usize) {
+    pub(super) fn fix_axis(&mut self, role: &str, axis: &str, length: usize) {
         let Some(slot) = self.binding.part.contract().slot(role) else { return };
         let Some(bound) = self.binding.ports.get_mut(role) else { return };
         let Some(dims) = &bound.dims else { return };
@@ -218,7 +218,7 @@ impl Graph {
 }
 
 impl Key {
-    /// Depends on the content of a model's files and on how they are spoken to.
+    /// Depends on the content of a model's files and on their adapters.
     pub fn model(mut self, graph: &GraphFile) -> Result<Key> {
         for file in std::iter::once(&graph.path).chain(&graph.external) {
             self = self.text(&fingerprint(file).map_err(crate::Error::io(file))?);

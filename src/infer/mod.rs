@@ -37,7 +37,7 @@ pub mod xfeat;
 
 pub use compute::Compute;
 pub use library::runtime;
-pub use registry::{ModelStatus, Registry, Role, home};
+pub use registry::{ModelStatus, PackFileKind, Registry, home};
 pub use runtime::{Input, Session, Tensor};
 
 use crate::Result;

@@ -270,7 +270,7 @@ fn off_the_rays(map: &Pointmap, width: usize, height: usize) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::installed::Duty;
+    use super::super::installed::Task;
     use super::super::testing::{Attribute, FLOAT, Onnx};
     use super::super::tests::photo;
     use super::super::{Registry, breakfast};
@@ -327,7 +327,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let ask = |first: &str, second: &str| {
             graph(first, second).write(&dir.path().join("dust3r/model.onnx"));
-            let model = Registry::of(&[dir.path()]).installed(Duty::Geometry, "dust3r").unwrap();
+            let model = Registry::of(&[dir.path()]).installed(Task::Geometry, "dust3r").unwrap();
             pointmaps(&model, &photos, &Silent).map(drop)
         };
         ask("pts3d_1", "pts3d_2").unwrap();

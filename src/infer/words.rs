@@ -19,7 +19,7 @@
 //! It knows about a thousand everyday things and eleven colours. CLIP is the full model.
 use super::cache::Key;
 use super::classify::{CLASSES, Classifier};
-use super::registry::{Registry, Role};
+use super::registry::{PackFileKind, Registry};
 use super::text::{self, TextEncoder, normalise};
 use super::{RegionEncoder, colour, nearest};
 use crate::scene::{Plane, RgbImage};
@@ -63,8 +63,10 @@ struct Vocabulary {
 impl RegionWords {
     /// Checks that the pack is complete; the networks are loaded when first used.
     pub fn load(registry: Registry) -> Result<Self> {
-        for role in [Role::Classifier, Role::Classes, Role::Text, Role::Tokenizer] {
-            registry.path(role)?;
+        for kind in
+            [PackFileKind::Classifier, PackFileKind::Classes, PackFileKind::Text, PackFileKind::Tokenizer]
+        {
+            registry.path(kind)?;
         }
         Ok(RegionWords { registry, classifier: None, vocabulary: None })
     }
@@ -173,7 +175,7 @@ fn region_colours(image: &RgbImage, labels: &Plane<i32>, count: usize) -> Vec<Op
 
 impl Vocabulary {
     fn load(registry: &Registry) -> Result<Self> {
-        let file = registry.path(Role::Classes)?;
+        let file = registry.path(PackFileKind::Classes)?;
         let table = std::fs::read_to_string(&file).map_err(Error::io(&file))?;
         // The first of a class's names: "lemon"; the rest are synonyms and Latin.
         let first = |line: &str| line.split(['\t', ',']).next().unwrap_or_default().to_string();
@@ -187,7 +189,7 @@ impl Vocabulary {
         }
         let mut encoder = TextEncoder::load(registry)?;
         // Naming a thousand classes takes seconds, which a single query should not pay.
-        let used = registry.status_of(&[Role::Text, Role::Tokenizer, Role::Classes]);
+        let used = registry.status_of(&[PackFileKind::Text, PackFileKind::Tokenizer, PackFileKind::Classes]);
         let key = used.iter().fold(Key::new("class-names"), |key, file| key.text(&file.sha256));
         let mut names = registry
             .compute()

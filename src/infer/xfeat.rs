@@ -1,7 +1,7 @@
 //! XFeat keypoints and descriptors (Potje et al., CVPR 2024).
 use rayon::prelude::*;
 
-use super::registry::{Registry, Role};
+use super::registry::{PackFileKind, Registry};
 use super::runtime::{Input, Session};
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
@@ -133,7 +133,7 @@ pub struct XFeat {
 impl XFeat {
     /// Loads the network of the model pack.
     pub fn load(registry: &Registry) -> Result<Self> {
-        Ok(XFeat { session: registry.session(Role::Keypoints)? })
+        Ok(XFeat { session: registry.session(PackFileKind::Keypoints)? })
     }
 
     /// At most `max_keypoints` keypoints, best first.

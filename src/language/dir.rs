@@ -242,7 +242,7 @@ mod tests {
             path: "in/a.jpg".into(),
             stem: "a".into(),
             image: RgbImage { width, height, data: vec![[0.5; 3]; width * height] },
-            frame: crate::photo::Frame::default(),
+            border: crate::photo::PlainBorder::default(),
             original_size: original,
             to_working: Affine {
                 scale: [width as f64 / original.0 as f64, height as f64 / original.1 as f64],

@@ -1,9 +1,9 @@
 //! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (docs/method.md#photos).
+mod border;
 mod candidate;
 mod choose;
 mod decode;
 mod exif_tags;
-mod frame;
 mod heif;
 mod kind;
 pub mod light;
@@ -13,9 +13,9 @@ mod sizes;
 mod straighten;
 mod video;
 
+pub use border::PlainBorder;
 pub use candidate::{Candidate, gather};
 pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, find, spread, wanted};
-pub use frame::Frame;
 pub use kind::stem;
 pub use light::Light;
 pub use read::{
@@ -69,7 +69,7 @@ pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progr
     }
     let photos = all.into_iter().collect::<Result<Vec<_>>>()?;
     progress.end();
-    let framed: Vec<&str> = photos.iter().filter(|p| !p.frame.is_none()).map(|p| p.stem.as_str()).collect();
+    let framed: Vec<&str> = photos.iter().filter(|p| !p.border.is_none()).map(|p| p.stem.as_str()).collect();
     if !framed.is_empty() {
         progress.warn(&format!("plain frame around the picture left out: {}", framed.join(", ")));
     }

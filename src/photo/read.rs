@@ -1,5 +1,5 @@
 //! One photo from its file.
-use super::frame::Frame;
+use super::border::PlainBorder;
 use super::kind::stem;
 use super::light::Light;
 use super::straighten::Straightening;
@@ -35,10 +35,10 @@ pub struct Photo {
     pub path: PathBuf,
     /// [`stem`] of the file: the key that joins masks, cameras and renders.
     pub stem: String,
-    /// Upright pixels at working resolution; on a plain frame, the nearest pixels of the picture.
+    /// Upright pixels at working resolution; on a plain border, the nearest pixels of the picture.
     pub image: RgbImage,
-    /// The white or black frame that was around the picture, working pixels.
-    pub frame: Frame,
+    /// The white or black border that was around the picture, working pixels.
+    pub border: PlainBorder,
     /// Upright size of the file, pixels.
     pub original_size: (u32, u32),
     /// Original (upright) pixels → working pixels.
@@ -154,13 +154,13 @@ fn working(
     let (working_w, working_h) = working_size(w, h, max_size);
     let mut image = resize::area_average((w, h), (working_w, working_h), &at);
     let fine = fine((w, h), (working_w, working_h), &at);
-    let frame = Frame::of(&image);
-    frame.continue_picture(&mut image);
+    let border = PlainBorder::of(&image);
+    border.continue_picture(&mut image);
     Ok(Photo {
         path: name.to_path_buf(),
         stem: stem(&name.to_string_lossy()).to_string(),
         image,
-        frame,
+        border,
         original_size: (w as u32, h as u32),
         to_working: Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32)),
         exif_focal: None,

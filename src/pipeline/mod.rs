@@ -7,7 +7,7 @@ mod store;
 #[cfg(test)]
 mod tests;
 
-pub use graph::{Graph, Made};
+pub use graph::{Graph, Outputs};
 pub use output::{Inputs, Output};
 pub use stage::{Context, Lane, Stage};
 pub use store::{Codec, Key, Store, kept};

@@ -79,13 +79,13 @@ impl Store {
     }
 
     /// What this process has made, and the seconds that it took.
-    pub(super) fn recall(&self, key: &Key) -> Option<(Value, f64)> {
+    pub(super) fn memory_get(&self, key: &Key) -> Option<(Value, f64)> {
         let memory = self.memory.as_ref()?.lock().unwrap_or_else(PoisonError::into_inner);
         memory.get(&key.0).cloned()
     }
 
-    /// Keeps it for [`Store::recall`], in a store that does.
-    pub(super) fn remember(&self, key: &Key, value: &Value, seconds: f64) {
+    /// Keeps it for [`Store::memory_get`], in a store that does.
+    pub(super) fn memory_put(&self, key: &Key, value: &Value, seconds: f64) {
         if let Some(memory) = &self.memory {
             memory
                 .lock()

@@ -4,7 +4,7 @@ use super::matching::{Features, mutual_matches, valid_area};
 use super::overlap::{self, Link};
 use super::sift;
 use crate::Result;
-use crate::photo::{self, Candidate, Frame};
+use crate::photo::{self, Candidate, PlainBorder};
 use crate::progress::Progress;
 use crate::scene::RgbImage;
 use rayon::prelude::*;
@@ -134,7 +134,7 @@ impl Seen {
         let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
         let small = image.resized_by_area(to(image.width), to(image.height));
         // Margin 4: the descriptor's window at the finest scale.
-        let valid = valid_area(&small, Frame::default(), 4);
+        let valid = valid_area(&small, PlainBorder::default(), 4);
         Seen {
             features: sift::detect(&small.luma(), &valid, FEATURES),
             diagonal: (small.width as f64).hypot(small.height as f64),

@@ -1,5 +1,5 @@
 //! Keypoint features, their matches between two photos, and the parts of photos that cannot hold features.
-use crate::photo::Frame;
+use crate::photo::PlainBorder;
 use crate::scene::{Plane, RgbImage};
 use glam::DVec2;
 use rayon::prelude::*;
@@ -89,11 +89,11 @@ pub(crate) fn mutual_matches(a: &Features, b: &Features, ratio: f32) -> Vec<Matc
     out
 }
 
-/// True where features may lie: away from the image edge, from a frame that was found on loading and from uniform saturated margins (undistorted or scanned photos
+/// True where features may lie: away from the image edge, from a border that was found on loading and from uniform saturated margins (undistorted or scanned photos
 /// have white or black borders; their outline stands still while the scene moves and would pass for a match).
-pub(crate) fn valid_area(image: &RgbImage, frame: Frame, margin: usize) -> Plane<bool> {
+pub(crate) fn valid_area(image: &RgbImage, border: PlainBorder, margin: usize) -> Plane<bool> {
     let (w, h) = (image.width, image.height);
-    let mut border: Vec<bool> = (0..w * h).map(|i| frame.covers(i % w, i / w, w, h)).collect();
+    let mut excluded: Vec<bool> = (0..w * h).map(|i| border.covers(i % w, i / w, w, h)).collect();
     for white in [true, false] {
         let saturated = |i: usize| {
             let c = image.data[i];
@@ -126,12 +126,12 @@ pub(crate) fn valid_area(image: &RgbImage, frame: Frame, margin: usize) -> Plane
                 stack.push(i + w);
             }
         }
-        // A frame touches a good part of the outline; an overexposed window at the edge touches less.
+        // A border touches a good part of the outline; an overexposed window at the edge touches less.
         if touching * 5 > 2 * (w + h) {
-            border.iter_mut().zip(&seen).for_each(|(b, s)| *b |= s);
+            excluded.iter_mut().zip(&seen).for_each(|(b, s)| *b |= s);
         }
     }
-    let blocked = Plane { width: w, height: h, data: border };
+    let blocked = Plane { width: w, height: h, data: excluded };
     let near = dilated(&blocked, 2 * margin);
     let data = (0..w * h)
         .map(|i| {
@@ -184,7 +184,7 @@ mod tests {
                 image.data[y * 100 + x] = [1.0; 3];
             }
         }
-        let open = valid_area(&image, Frame::default(), 2);
+        let open = valid_area(&image, PlainBorder::default(), 2);
         assert!(open.at(12, 35) && !open.at(1, 35) && open.at(3, 60));
         for y in 0..80 {
             for x in 0..100 {
@@ -193,7 +193,7 @@ mod tests {
                 }
             }
         }
-        let framed = valid_area(&image, Frame::default(), 2);
+        let framed = valid_area(&image, PlainBorder::default(), 2);
         assert!(!framed.at(9, 50) && framed.at(12, 50) && framed.at(50, 40) && !framed.at(50, 3));
     }
 

@@ -42,8 +42,8 @@ impl Similarity {
             bottom += p.length_squared();
         }
         let a = top / bottom;
-        let believable = (1.0 / LARGEST_ZOOM..LARGEST_ZOOM).contains(&a.length());
-        believable.then(|| Similarity { a, b: mean.1 - Similarity::times(a, mean.0) })
+        let plausible = (1.0 / LARGEST_ZOOM..LARGEST_ZOOM).contains(&a.length());
+        plausible.then(|| Similarity { a, b: mean.1 - Similarity::times(a, mean.0) })
     }
 
     fn distance(&self, (p, q): &(DVec2, DVec2)) -> f64 {

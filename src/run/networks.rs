@@ -1,6 +1,6 @@
 //! The networks that users bring, as a run uses them: found before any work, named in run.json.
 use super::plan::RunPlan;
-use super::sources::{Features, Geometry, Masks, Matches, installed};
+use super::sources::{FeatureSources, GeometrySources, MaskSources, MatchSources, installed};
 use crate::Result;
 use crate::infer::Registry;
 use crate::infer::installed::Installed;
@@ -14,10 +14,10 @@ impl Networks {
     /// Finds them all before any work; the error says what is missing.
     pub(super) fn of(plan: &RunPlan, registry: &Registry) -> Result<Networks> {
         let found = [
-            installed::<Geometry>(&plan.init, registry)?,
-            installed::<Matches>(&plan.matcher, registry)?,
-            installed::<Masks>(&plan.masks, registry)?,
-            installed::<Features>(&plan.features, registry)?,
+            installed::<GeometrySources>(&plan.init, registry)?,
+            installed::<MatchSources>(&plan.matcher, registry)?,
+            installed::<MaskSources>(&plan.masks, registry)?,
+            installed::<FeatureSources>(&plan.features, registry)?,
         ];
         Ok(Networks(found.into_iter().flatten().collect()))
     }
@@ -26,7 +26,7 @@ impl Networks {
     pub(super) fn used(&self) -> Result<Vec<ModelUsed>> {
         let mut used = Vec::new();
         for model in &self.0 {
-            let licence = model.known().map_or("unknown", |k| k.licence.as_str());
+            let licence = model.catalogue_entry().map_or("unknown", |k| k.licence.as_str());
             for (file, sha256) in model.files()? {
                 let file = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
                 let name =

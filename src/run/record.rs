@@ -1,6 +1,6 @@
-//! What a finished run says about itself: `run.json`, the report and the closing table, made from [`Outcome`].
+//! What a finished run says about itself: `run.json`, the report and the closing table, made from [`RunOutcome`].
 use super::ask::Answers;
-use super::outcome::Outcome;
+use super::outcome::RunOutcome;
 use crate::Result;
 use crate::fit::{CurvePoint, FitStats, LanguagePoint};
 use crate::photo::Photo;
@@ -12,7 +12,7 @@ use serde_json::json;
 use std::path::Path;
 
 /// `run.json`.
-pub fn run_record(o: &Outcome) -> RunRecord {
+pub fn run_record(o: &RunOutcome) -> RunRecord {
     let used = |m: &&crate::infer::ModelStatus| m.installed;
     RunRecord {
         program: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
@@ -34,7 +34,7 @@ pub fn run_record(o: &Outcome) -> RunRecord {
     }
 }
 
-fn statistics(o: &Outcome) -> serde_json::Value {
+fn statistics(o: &RunOutcome) -> serde_json::Value {
     let curves = curves(&o.rgb, &o.language_curve);
     let levels: Vec<_> = LEVEL_NAMES
         .iter()
@@ -69,7 +69,7 @@ fn statistics(o: &Outcome) -> serde_json::Value {
 }
 
 /// Per photo what was found of its lens, and the camera of its file.
-fn optics(o: &Outcome) -> Vec<serde_json::Value> {
+fn optics(o: &RunOutcome) -> Vec<serde_json::Value> {
     let one = |((photo, camera), fitted): ((&Photo, &Camera), &Fitted)| {
         let taken = photo.original_camera(camera);
         json!({
@@ -106,7 +106,7 @@ fn focal_figure(photos: &[Photo], cameras: &[Camera], fitted: &[Fitted]) -> Opti
 }
 
 /// What was assumed about the lens: the strongest distortion taken out, and how far the principal point is from the middle.
-fn lens_figure(o: &Outcome) -> Option<String> {
+fn lens_figure(o: &RunOutcome) -> Option<String> {
     let corner = |(photo, camera): (&Photo, &Camera)| {
         let half = glam::DVec2::new(0.5 * camera.width as f64, 0.5 * camera.height as f64) / camera.fx;
         (photo.lens().distort(half).length() / half.length() - 1.0, photo.lens())
@@ -165,7 +165,7 @@ fn answer_json(a: &Answers) -> serde_json::Value {
 }
 
 /// Figures for the head of the report and the closing table: (label, value).
-fn figures(o: &Outcome) -> Vec<(String, String)> {
+fn figures(o: &RunOutcome) -> Vec<(String, String)> {
     let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
     // Which, and why, is said when they are chosen, and in run.json.
     let chosen = o.choice.as_ref().map_or(String::new(), |c| {
@@ -217,11 +217,11 @@ pub(super) fn sizes(photos: &[Photo]) -> String {
     format!("{} at {}{more}{hint}", photos.len(), shown.join(", "))
 }
 
-/// The table that ends `splatvk run`; what is doubtful stands first.
-pub fn closing_table(o: &Outcome) -> String {
-    let doubts: String = o.warnings.iter().map(|w| format!("  doubtful: {w}\n")).collect();
+/// The table that ends `splatvk run`; warnings stand first.
+pub fn closing_table(o: &RunOutcome) -> String {
+    let warnings: String = o.warnings.iter().map(|w| format!("  warning: {w}\n")).collect();
     format!(
-        "{doubts}{}  {:<12}  {}\n",
+        "{warnings}{}  {:<12}  {}\n",
         report::table(&o.stages, o.seconds, &figures(o)),
         "scene",
         o.plan.out.display()
@@ -229,7 +229,7 @@ pub fn closing_table(o: &Outcome) -> String {
 }
 
 /// Writes `run.json`, `report.html` and `previews/`.
-pub(super) fn write(folder: &Path, o: &Outcome) -> Result<()> {
+pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
     let record = run_record(o);
     record.write(folder)?;
     let levels: Vec<Vec<_>> =
@@ -241,8 +241,8 @@ pub(super) fn write(folder: &Path, o: &Outcome) -> Result<()> {
         .map(|(i, p)| ViewShown {
             name: &p.stem,
             photo: &p.image,
-            render: Some(&o.frames[i].frame.rgb),
-            depth: Some(&o.frames[i].frame.depth),
+            render: Some(&o.frames[i].rendered.rgb),
+            depth: Some(&o.frames[i].rendered.depth),
             levels: &levels[i],
             psnr: o.rgb.psnr.get(i).copied(),
             light: p.light,
@@ -263,7 +263,7 @@ pub(super) fn write(folder: &Path, o: &Outcome) -> Result<()> {
     report::write_previews(folder, &report)
 }
 
-fn scene<'a>(title: &'a str, o: &'a Outcome) -> Scene3d<'a> {
+fn scene<'a>(title: &'a str, o: &'a RunOutcome) -> Scene3d<'a> {
     Scene3d {
         title,
         splats: &o.splats,

@@ -9,7 +9,7 @@ use crate::pass::metrics::planar;
 use crate::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
 use crate::pass::ssim_l1::SsimL1;
 use crate::pass::view::View;
-use crate::photo::Frame as Border;
+use crate::photo::PlainBorder as Border;
 use crate::pose::numeric::rotation_angle;
 use crate::progress::Progress;
 use crate::scene::{Camera, Pose, RgbImage, Splats};

@@ -10,7 +10,7 @@ use crate::pose::Geometry;
 use crate::progress::{Progress, Recorded};
 use crate::report::{self, Report, RunRecord, ViewShown};
 use crate::run::budget::{self, Limits, Work};
-use crate::run::stages::{self, CameraSource};
+use crate::run::stages::{self, CameraOrigin};
 use crate::run::view::Viewer;
 use crate::scene::{Camera, LanguageField, PointCloud};
 use crate::{Error, Result};
@@ -139,8 +139,8 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let photos = matched(plan, &known, max_size, work, &device, progress)?;
     let registry = Registry::with(plan.models.as_deref(), Compute::by(plan.provider.as_deref()))?;
     let source = match given {
-        Some(cloud) => CameraSource::Complete(from_points(&photos, &known, cloud)?),
-        None => CameraSource::Known(known),
+        Some(cloud) => CameraOrigin::GivenGeometry(from_points(&photos, &known, cloud)?),
+        None => CameraOrigin::Known(known),
     };
     let mut options = RgbOptions::preset(preset);
     options.limit_splats(budget::most_splats(device.info(), 0), work(photos.len()).splats);
@@ -150,7 +150,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     }
     let mut graph = Graph::default();
     let placed = graph.add(stages::Cameras::new(photos, source)?, ());
-    let geometry = graph.add(stages::Depth { preset }, (placed,));
+    let geometry = graph.add(stages::DenseDepth { preset }, (placed,));
     let trained = graph.add(stages::TrainColour { options }, (placed, geometry));
     let targets = [placed.target(), geometry.target(), trained.target()];
     let store = super::execute::store(plan.resume, plan.checkpoint_seconds);
@@ -204,8 +204,8 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let views = views.map(|((p, f), psnr)| ViewShown {
         name: &p.stem,
         photo: &p.image,
-        render: Some(&f.frame.rgb),
-        depth: Some(&f.frame.depth),
+        render: Some(&f.rendered.rgb),
+        depth: Some(&f.rendered.depth),
         levels: &[],
         psnr: Some(*psnr),
         light: p.light,

@@ -1,11 +1,11 @@
 //! Synthetic scenes on disk, in the layout of a ground-truth folder.
-use super::regions::{self, Flaws};
+use super::regions::{self, InjectedErrors};
 use super::render::{self, Seen};
-use super::scene::{Knobs, World, world};
+use super::scene::{SceneSpec, SyntheticScene, world};
 use crate::format::npy::{self, NpyArray, NpyData};
 use crate::format::{cameras, create_folder, picture, write_json};
 use crate::progress::Progress;
-use crate::query::eval::{Frame, GroundTruth, Split};
+use crate::query::eval::{GroundTruth, Split, TruthFrame};
 use crate::scene::Camera;
 use crate::{Error, Result};
 use half::f16;
@@ -16,7 +16,12 @@ use std::path::Path;
 const QUALITY: u8 = 95;
 
 /// Makes a scene and writes it: photos, held-out views, depth, masks, cameras, and regions without and with flaws.
-pub fn generate(folder: &Path, knobs: &Knobs, flaws: &Flaws, progress: &dyn Progress) -> Result<()> {
+pub fn generate(
+    folder: &Path,
+    knobs: &SceneSpec,
+    flaws: &InjectedErrors,
+    progress: &dyn Progress,
+) -> Result<()> {
     let world = world(knobs)?;
     for name in ["images", "held_out", "depth", "masks"] {
         create_folder(&folder.join(name))?;
@@ -36,8 +41,8 @@ pub fn generate(folder: &Path, knobs: &Knobs, flaws: &Flaws, progress: &dyn Prog
 /// Renders and writes every view; the frames of the ground truth.
 fn write_views(
     folder: &Path,
-    world: &World,
-    knobs: &Knobs,
+    world: &SyntheticScene,
+    knobs: &SceneSpec,
     progress: &dyn Progress,
 ) -> Result<Vec<serde_json::Value>> {
     let quality = knobs.effects.jpeg.unwrap_or(QUALITY);
@@ -75,11 +80,11 @@ fn write_views(
 }
 
 /// Writes `regions_exact/` and `regions_flawed/` for the photos of a ground-truth folder that has masks.
-pub fn write_regions(data: &Path, out: &Path, flaws: &Flaws) -> Result<()> {
+pub fn write_regions(data: &Path, out: &Path, flaws: &InjectedErrors) -> Result<()> {
     let truth = GroundTruth::read(data)?;
-    let photos: Vec<&Frame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
+    let photos: Vec<&TruthFrame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
     let phrases: Vec<String> = truth.labels.values().cloned().collect();
-    for (name, flaws) in [("regions_exact", &Flaws::NONE), ("regions_flawed", flaws)] {
+    for (name, flaws) in [("regions_exact", &InjectedErrors::NONE), ("regions_flawed", flaws)] {
         regions::write(&out.join(name), &photos, &regions::regions(&truth, &photos, flaws)?, &phrases)?;
     }
     Ok(())
@@ -121,8 +126,8 @@ mod tests {
     #[test]
     fn a_generated_folder_reads_back_as_ground_truth() {
         let dir = tempfile::tempdir().unwrap();
-        let knobs = Knobs { seed: 1000, size: (160, 120), views: 3, held_out: 2, ..Knobs::default() };
-        generate(dir.path(), &knobs, &Flaws::usual(1000), &Silent).unwrap();
+        let knobs = SceneSpec { seed: 1000, size: (160, 120), views: 3, held_out: 2, ..SceneSpec::default() };
+        generate(dir.path(), &knobs, &InjectedErrors::default_rates(1000), &Silent).unwrap();
         let truth = GroundTruth::read(dir.path()).unwrap();
         let made = world(&knobs).unwrap();
         assert_eq!((truth.frames.len(), truth.labels.len()), (5, made.things.len()));
@@ -161,16 +166,16 @@ mod tests {
     fn photos_undone_by_the_lens_in_the_file_are_the_stated_pinhole() {
         let dir = tempfile::tempdir().unwrap();
         let effects = Effects { focal: true, lens: true, centre: true, ..Effects::default() };
-        let knobs = Knobs {
+        let knobs = SceneSpec {
             seed: 1003,
             size: (320, 240),
             views: 2,
             held_out: 1,
             effects,
             photo_noise: 0.0,
-            ..Knobs::default()
+            ..SceneSpec::default()
         };
-        generate(dir.path(), &knobs, &Flaws::NONE, &Silent).unwrap();
+        generate(dir.path(), &knobs, &InjectedErrors::NONE, &Silent).unwrap();
         let truth = GroundTruth::read(dir.path()).unwrap();
         let made = world(&knobs).unwrap();
         let frame = &truth.frames[0];

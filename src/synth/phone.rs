@@ -84,7 +84,7 @@ fn fits(lens: &Lens, camera: &Camera) -> bool {
 
 /// How one photo was lit.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Light {
+pub struct TrueLight {
     /// Stops; the linear values are multiplied by 2 to this power.
     pub exposure_ev: f64,
     /// Gain of R, G and B beside the exposure.
@@ -93,7 +93,7 @@ pub struct Light {
     pub vignetting: [f64; 2],
 }
 
-impl Light {
+impl TrueLight {
     /// Factor of the linear value per channel at a pixel position.
     pub fn gain(&self, camera: &Camera, pixel: DVec2) -> [f64; 3] {
         let half = DVec2::new(f64::from(camera.width), f64::from(camera.height)).length() / 2.0;
@@ -105,13 +105,13 @@ impl Light {
 
 /// What one photo goes through, in this order: lens, light, noise, 8 bits and JPEG.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Shot {
+pub struct PhotoEffects {
     /// The undistorted pinhole.
     pub camera: Camera,
     /// Its lens.
     pub lens: Option<Lens>,
     /// Its light.
-    pub light: Option<Light>,
+    pub light: Option<TrueLight>,
     /// Seed of its noise.
     pub noise: Option<u64>,
 }
@@ -123,7 +123,7 @@ struct Optics {
     /// Principal point from the middle, shares of the width.
     offset: DVec2,
     lens: Option<Lens>,
-    /// v2, v4 of [`Light::vignetting`].
+    /// v2, v4 of [`TrueLight::vignetting`].
     vignetting: [f64; 2],
 }
 
@@ -152,7 +152,7 @@ fn between(random: &mut Random, a: f64, b: f64) -> f64 {
 }
 
 /// Draws what the photos of one scene go through. Effects that are off change nothing that is drawn for the others.
-pub fn shots(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<Shot>> {
+pub fn shots(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<PhotoEffects>> {
     let Some(first) = cameras.first() else { return Ok(Vec::new()) };
     let stream = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
     let mut taken_with = vec![optics(first, effects, stream)?];
@@ -162,12 +162,12 @@ pub fn shots(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<Sho
     let mut light = Random::new(stream ^ 0x116f7);
     let shots = cameras.iter().enumerate().map(|(i, camera)| {
         let own = &taken_with[i % taken_with.len()];
-        let drawn = Light {
+        let drawn = TrueLight {
             exposure_ev: between(&mut light, -EXPOSURE, EXPOSURE),
             white_balance: [(); 3].map(|()| 1.0 + between(&mut light, -WHITE_BALANCE, WHITE_BALANCE)),
             vignetting: own.vignetting,
         };
-        Shot {
+        PhotoEffects {
             camera: refocused(camera, own.focal, own.offset, effects),
             lens: own.lens,
             light: effects.light.then_some(drawn),
@@ -191,7 +191,7 @@ fn refocused(camera: &Camera, focal: f64, offset: DVec2, effects: &Effects) -> C
     camera
 }
 
-impl Shot {
+impl PhotoEffects {
     /// Puts light and noise on a rendered picture (sRGB values).
     pub fn expose(&self, image: &mut RgbImage) {
         if self.light.is_none() && self.noise.is_none() {
@@ -229,18 +229,18 @@ pub fn to_srgb(v: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::super::render::photo;
-    use super::super::scene::{Knobs, Thing, World, world};
+    use super::super::scene::{SceneObject, SceneSpec, SyntheticScene, world};
     use super::super::shapes::{Paint, Shape};
     use super::*;
     use glam::DVec3;
 
-    fn knobs(seed: u64, effects: Effects) -> Knobs {
-        Knobs { seed, size: (320, 240), photo_noise: 0.0, effects, ..Knobs::default() }
+    fn knobs(seed: u64, effects: Effects) -> SceneSpec {
+        SceneSpec { seed, size: (320, 240), photo_noise: 0.0, effects, ..SceneSpec::default() }
     }
 
     /// Small white discs before nothing, and for each its centre and its rim. They lie flat, so that each has one
     /// brightness; rows above would see them from the side.
-    fn markers(camera: &Camera, lens: &Lens) -> (World, Vec<(DVec3, Vec<DVec3>)>) {
+    fn markers(camera: &Camera, lens: &Lens) -> (SyntheticScene, Vec<(DVec3, Vec<DVec3>)>) {
         let to_world = camera.pose.inverse();
         let (mut things, mut places) = (Vec::new(), Vec::new());
         for (i, j) in (2..6).flat_map(|j| (0..8).map(move |i| (i, j))) {
@@ -248,7 +248,7 @@ mod tests {
             let at = to_world.transform(lens.ray(camera, pixel));
             let radius = 10.0 / camera.fx;
             let paint = Paint { colour: [1.0; 3], contrast: 0.0, grain: 1.0, seed: 0 };
-            things.push(Thing {
+            things.push(SceneObject {
                 label: 1,
                 phrase: "disc".into(),
                 shape: Shape::Can(at, radius, 1e-6),
@@ -257,7 +257,7 @@ mod tests {
             let rim = (0..256).map(|k| DVec2::from_angle(std::f64::consts::TAU * f64::from(k) / 256.0));
             places.push((at, rim.map(|d| at + (radius * d).extend(0.0)).collect()));
         }
-        (World { things, train: vec![], shots: vec![], test: vec![], noisy: vec![] }, places)
+        (SyntheticScene { things, train: vec![], shots: vec![], test: vec![], noisy: vec![] }, places)
     }
 
     /// Centre of mass of a polygon.
@@ -332,7 +332,7 @@ mod tests {
         let plain = world(&dark).unwrap();
         let before: Vec<RgbImage> = plain.shots.iter().map(|s| photo(&plain, s, 0.0, 0).image).collect();
         let effects = Effects { light: true, sensor_noise: true, ..Effects::default() };
-        let lit = world(&Knobs { effects, ..dark }).unwrap();
+        let lit = world(&SceneSpec { effects, ..dark }).unwrap();
         let mut first = Vec::new();
         for (shot, before) in lit.shots.iter().zip(&before) {
             let image = photo(&lit, shot, 0.0, 0).image;
@@ -361,7 +361,7 @@ mod tests {
     #[test]
     fn sensor_noise_has_the_stated_spread() {
         let camera = world(&knobs(1000, Effects::default())).unwrap().train[0].clone();
-        let shot = Shot { camera, lens: None, light: None, noise: Some(5) };
+        let shot = PhotoEffects { camera, lens: None, light: None, noise: Some(5) };
         let grey = to_srgb(0.18) as f32;
         let mut image = RgbImage { width: 320, height: 240, data: vec![[grey; 3]; 320 * 240] };
         shot.expose(&mut image);

@@ -10,7 +10,7 @@ use crate::language::dir::normalise_rows;
 use crate::language::{LevelMasks, ViewMasks};
 use crate::math::Random;
 use crate::photo::stem;
-use crate::query::eval::{BACKGROUND_LABELS, Frame, GroundTruth};
+use crate::query::eval::{BACKGROUND_LABELS, GroundTruth, TruthFrame};
 use crate::query::{CANONICAL_PHRASES, TextQuery};
 use crate::scene::Plane;
 use crate::{Error, Result};
@@ -26,7 +26,7 @@ const MEANING: f32 = 0.6;
 
 /// How often segmentation and description go wrong. Rates are per (view, object, level).
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
-pub struct Flaws {
+pub struct InjectedErrors {
     /// Everything below is drawn from this.
     pub seed: u64,
     /// A mask of level m or l is cut in two, and the pieces look like pieces.
@@ -39,14 +39,15 @@ pub struct Flaws {
     pub noise: f64,
 }
 
-impl Flaws {
+impl InjectedErrors {
     /// Exact masks, exact features.
-    pub const NONE: Flaws = Flaws { seed: 0, split: 0.0, merge: 0.0, wrong: 0.0, noise: 0.0 };
+    pub const NONE: InjectedErrors =
+        InjectedErrors { seed: 0, split: 0.0, merge: 0.0, wrong: 0.0, noise: 0.0 };
 
     /// The rates that `ablate` injects: every fifth mask is cut and every fifth feature mistaken, about what the paper's
     /// figures show of SAM and CLIP between views far apart.
-    pub fn usual(seed: u64) -> Flaws {
-        Flaws { seed, split: 0.2, merge: 0.05, wrong: 0.2, noise: 0.35 }
+    pub fn default_rates(seed: u64) -> InjectedErrors {
+        InjectedErrors { seed, split: 0.2, merge: 0.05, wrong: 0.2, noise: 0.35 }
     }
 }
 
@@ -123,7 +124,7 @@ fn region_feature(
 }
 
 /// Makes regions for frames of a ground truth that has masks; parts of objects need depth and are left out without it.
-pub fn regions(truth: &GroundTruth, frames: &[&Frame], flaws: &Flaws) -> Result<Regions> {
+pub fn regions(truth: &GroundTruth, frames: &[&TruthFrame], flaws: &InjectedErrors) -> Result<Regions> {
     let mut objects = Vec::new();
     for frame in frames {
         objects.push(truth.objects(frame)?.ok_or_else(|| {
@@ -154,7 +155,7 @@ pub fn regions(truth: &GroundTruth, frames: &[&Frame], flaws: &Flaws) -> Result<
 
 /// Per frame and pixel the quarter of its object, 0 to 3: signs along the object's two longest axes in space, so that all
 /// views agree.
-fn parts(truth: &GroundTruth, frames: &[&Frame], objects: &[Plane<u32>]) -> Result<Vec<Vec<u8>>> {
+fn parts(truth: &GroundTruth, frames: &[&TruthFrame], objects: &[Plane<u32>]) -> Result<Vec<Vec<u8>>> {
     let mut points: BTreeMap<u32, Vec<DVec3>> = BTreeMap::new();
     let mut places = Vec::new();
     for (frame, objects) in frames.iter().zip(objects) {
@@ -217,7 +218,7 @@ fn one_level(
     objects: &Plane<u32>,
     parts: &[u8],
     level: usize,
-    flaws: &Flaws,
+    flaws: &InjectedErrors,
     random: &mut Random,
 ) -> LevelMasks {
     let mut out =
@@ -266,7 +267,7 @@ fn swallowed(
     labels: &BTreeMap<u32, String>,
     objects: &Plane<u32>,
     level: usize,
-    flaws: &Flaws,
+    flaws: &InjectedErrors,
     random: &mut Random,
 ) -> Vec<(u32, u32)> {
     let mut out = Vec::new();
@@ -331,7 +332,7 @@ fn compacted(masks: LevelMasks) -> LevelMasks {
 }
 
 /// Writes regions as a `dir:` folder, with the embeddings of `phrases`.
-pub fn write(folder: &Path, frames: &[&Frame], regions: &Regions, phrases: &[String]) -> Result<()> {
+pub fn write(folder: &Path, frames: &[&TruthFrame], regions: &Regions, phrases: &[String]) -> Result<()> {
     create_folder(folder)?;
     for (frame, view) in frames.iter().zip(&regions.masks) {
         let name = stem(&frame.file);
@@ -382,8 +383,8 @@ mod tests {
     #[test]
     fn without_flaws_every_whole_is_its_object_and_parts_agree_between_views() {
         let truth = breakfast();
-        let frames: Vec<&Frame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
-        let made = regions(&truth, &frames, &Flaws::NONE).unwrap();
+        let frames: Vec<&TruthFrame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
+        let made = regions(&truth, &frames, &InjectedErrors::NONE).unwrap();
         for (frame, view) in frames.iter().zip(&made.masks) {
             let objects = truth.objects(frame).unwrap().unwrap();
             let whole = &view.levels[2];
@@ -406,19 +407,20 @@ mod tests {
     #[test]
     fn flaws_come_at_their_rates_and_a_seed_repeats_them() {
         let truth = breakfast();
-        let frames: Vec<&Frame> = truth.frames.iter().collect();
-        let count = |flaws: &Flaws| -> usize {
+        let frames: Vec<&TruthFrame> = truth.frames.iter().collect();
+        let count = |flaws: &InjectedErrors| -> usize {
             let made = regions(&truth, &frames, flaws).unwrap();
             made.masks.iter().map(|v| v.levels[2].quality.len()).sum()
         };
-        let exact = count(&Flaws::NONE);
-        let split = count(&Flaws { split: 0.5, seed: 1000, ..Flaws::NONE });
-        let merged = count(&Flaws { merge: 0.5, seed: 1000, ..Flaws::NONE });
+        let exact = count(&InjectedErrors::NONE);
+        let split = count(&InjectedErrors { split: 0.5, seed: 1000, ..InjectedErrors::NONE });
+        let merged = count(&InjectedErrors { merge: 0.5, seed: 1000, ..InjectedErrors::NONE });
         // 12 views of 8 objects: 48 more, ± 3 σ of 96 draws
         assert!((split - exact) > 33 && (split - exact) < 63, "{exact} {split}");
         assert!(merged + 5 < exact, "{exact} {merged}");
-        let (a, b) = (Flaws::usual(1001), Flaws::usual(1002));
-        let first = |f: &Flaws| regions(&truth, &frames, f).unwrap().masks[0].levels[2].features.clone();
+        let (a, b) = (InjectedErrors::default_rates(1001), InjectedErrors::default_rates(1002));
+        let first =
+            |f: &InjectedErrors| regions(&truth, &frames, f).unwrap().masks[0].levels[2].features.clone();
         assert_eq!(first(&a), first(&a));
         assert_ne!(first(&a), first(&b));
     }
@@ -426,8 +428,8 @@ mod tests {
     #[test]
     fn a_written_folder_reads_back() {
         let truth = breakfast();
-        let frames: Vec<&Frame> = truth.frames.iter().take(2).collect();
-        let made = regions(&truth, &frames, &Flaws::usual(1003)).unwrap();
+        let frames: Vec<&TruthFrame> = truth.frames.iter().take(2).collect();
+        let made = regions(&truth, &frames, &InjectedErrors::default_rates(1003)).unwrap();
         let dir = tempfile::tempdir().unwrap();
         let phrases: Vec<String> = truth.labels.values().cloned().collect();
         write(dir.path(), &frames, &made, &phrases).unwrap();

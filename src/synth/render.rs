@@ -1,6 +1,6 @@
 //! Ray casting: photo, depth and mask of a synthetic scene.
-use super::phone::Shot;
-use super::scene::{Thing, World};
+use super::phone::PhotoEffects;
+use super::scene::{SceneObject, SyntheticScene};
 use super::shapes::Hit;
 use crate::math::Random;
 use crate::scene::{Camera, Lens, Plane, RgbImage};
@@ -25,13 +25,13 @@ pub struct Seen {
     pub objects: Plane<u32>,
 }
 
-fn first(world: &World, from: DVec3, ray: DVec3) -> Option<(&Thing, Hit)> {
+fn first(world: &SyntheticScene, from: DVec3, ray: DVec3) -> Option<(&SceneObject, Hit)> {
     let hits = world.things.iter().filter_map(|t| t.shape.hit(from, ray).map(|h| (t, h)));
     hits.min_by(|a, b| a.1.t.total_cmp(&b.1.t))
 }
 
 /// Mean colour over the rays of a pixel, sRGB values; black where nothing is.
-fn colour(world: &World, camera: &Camera, lens: Option<&Lens>, (x, y): (f64, f64)) -> [f64; 3] {
+fn colour(world: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, (x, y): (f64, f64)) -> [f64; 3] {
     let to_world = camera.pose.inverse();
     let mut sum = [0.0; 3];
     for k in 0..SAMPLES * SAMPLES {
@@ -48,7 +48,7 @@ fn colour(world: &World, camera: &Camera, lens: Option<&Lens>, (x, y): (f64, f64
 }
 
 /// The picture alone, with a lens if there is one: each ray goes where the lens sends it, so nothing is resampled.
-fn picture(world: &World, camera: &Camera, lens: Option<&Lens>, noise: f64, seed: u64) -> RgbImage {
+fn picture(world: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, noise: f64, seed: u64) -> RgbImage {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let pixel = |p: usize| {
         let shown = colour(world, camera, lens, ((p % width) as f64, (p / width) as f64));
@@ -60,7 +60,7 @@ fn picture(world: &World, camera: &Camera, lens: Option<&Lens>, noise: f64, seed
 }
 
 /// Renders a view; `noise` is the standard deviation of the photo's noise.
-pub fn render(world: &World, camera: &Camera, noise: f64, seed: u64) -> Seen {
+pub fn render(world: &SyntheticScene, camera: &Camera, noise: f64, seed: u64) -> Seen {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let to_world = camera.pose.inverse();
     // The ray has camera z 1: its parameter is the depth.
@@ -78,7 +78,7 @@ pub fn render(world: &World, camera: &Camera, noise: f64, seed: u64) -> Seen {
 }
 
 /// A view as its phone takes it; depth and mask are those of the undistorted pinhole.
-pub fn photo(world: &World, shot: &Shot, noise: f64, seed: u64) -> Seen {
+pub fn photo(world: &SyntheticScene, shot: &PhotoEffects, noise: f64, seed: u64) -> Seen {
     let mut seen = render(world, &shot.camera, noise, seed);
     if let Some(lens) = &shot.lens {
         seen.image = picture(world, &shot.camera, Some(lens), noise, seed);
@@ -89,11 +89,12 @@ pub fn photo(world: &World, shot: &Shot, noise: f64, seed: u64) -> Seen {
 
 #[cfg(test)]
 mod tests {
-    use super::super::scene::{Knobs, world};
+    use super::super::scene::{SceneSpec, world};
     use super::*;
 
-    fn small(seed: u64) -> (World, Vec<Seen>) {
-        let knobs = Knobs { seed, size: (160, 120), thin: 1, similar: 1, held_out: 2, ..Knobs::default() };
+    fn small(seed: u64) -> (SyntheticScene, Vec<Seen>) {
+        let knobs =
+            SceneSpec { seed, size: (160, 120), thin: 1, similar: 1, held_out: 2, ..SceneSpec::default() };
         let world = world(&knobs).unwrap();
         let seen = world.train.iter().map(|c| render(&world, c, 0.0, 0)).collect();
         (world, seen)
@@ -146,8 +147,8 @@ mod tests {
 
     #[test]
     fn knobs_do_what_they_say() {
-        let base = Knobs { seed: 1000, size: (160, 120), ..Knobs::default() };
-        let of = |knobs: &Knobs| {
+        let base = SceneSpec { seed: 1000, size: (160, 120), ..SceneSpec::default() };
+        let of = |knobs: &SceneSpec| {
             let world = world(knobs).unwrap();
             let seen = render(&world, &world.train[0], knobs.photo_noise, 1);
             (world, seen)
@@ -159,18 +160,18 @@ mod tests {
                 (0..l.data.len() - 1).filter(|&p| s.objects.data[p] == 1 && s.objects.data[p + 1] == 1);
             pairs.map(|p| (l.data[p] - l.data[p + 1]).abs() as f64).sum::<f64>()
         };
-        let quiet = Knobs { photo_noise: 0.0, ..base.clone() };
-        let bare = Knobs { texture: 0.0, ..quiet.clone() };
+        let quiet = SceneSpec { photo_noise: 0.0, ..base.clone() };
+        let bare = SceneSpec { texture: 0.0, ..quiet.clone() };
         assert!(rough(&of(&quiet).1) > 20.0 * rough(&of(&bare).1));
         // wide baselines
-        let angle = |k: &Knobs| {
+        let angle = |k: &SceneSpec| {
             let w = world(k).unwrap();
             let axis = |c: &Camera| c.pose.rotation.transpose() * DVec3::Z;
             axis(&w.train[0]).angle_between(axis(&w.train[1])).to_degrees()
         };
-        assert!(angle(&Knobs { baseline: 40.0, ..base.clone() }) > angle(&base) + 10.0);
+        assert!(angle(&SceneSpec { baseline: 40.0, ..base.clone() }) > angle(&base) + 10.0);
         // poses err by what was asked
-        let error = |k: &Knobs| {
+        let error = |k: &SceneSpec| {
             let w = world(k).unwrap();
             let off = |(a, b): (&Camera, &Camera)| {
                 let r = a.pose.rotation * b.pose.rotation.transpose();
@@ -179,15 +180,15 @@ mod tests {
             w.train.iter().zip(&w.noisy).map(off).sum::<f64>() / w.train.len() as f64
         };
         // acos near 1 keeps half of the digits
-        assert!(error(&Knobs { pose_noise: 0.0, ..base.clone() }) < 1e-5);
+        assert!(error(&SceneSpec { pose_noise: 0.0, ..base.clone() }) < 1e-5);
         // the mean length of three normal numbers is 1.6 σ; four cameras scatter by a quarter of that
-        let two = error(&Knobs { pose_noise: 2.0, ..base.clone() });
+        let two = error(&SceneSpec { pose_noise: 2.0, ..base.clone() });
         assert!((1.5..5.5).contains(&two), "{two}");
         for bad in [
-            Knobs { views: 1, ..base.clone() },
-            Knobs { objects: 13, ..base.clone() },
-            Knobs { similar: 5, ..base.clone() },
-            Knobs { texture: 2.0, ..base.clone() },
+            SceneSpec { views: 1, ..base.clone() },
+            SceneSpec { objects: 13, ..base.clone() },
+            SceneSpec { similar: 5, ..base.clone() },
+            SceneSpec { texture: 2.0, ..base.clone() },
         ] {
             assert_eq!(world(&bad).unwrap_err().exit_code(), 2);
         }

@@ -1,5 +1,5 @@
-//! Small scenes with everything known: a table with objects before a wall, and the knobs that make them hard.
-use super::phone::{self, Effects, Shot};
+//! Small scenes with everything known: a table with objects before a wall, and the settings that make them hard.
+use super::phone::{self, Effects, PhotoEffects};
 use super::shapes::{Paint, Shape};
 use crate::math::Random;
 use crate::scene::{Camera, Pose};
@@ -9,7 +9,7 @@ use serde::Serialize;
 
 /// What to make and what should be hard about it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Knobs {
+pub struct SceneSpec {
     /// Everything random.
     pub seed: u64,
     /// Photos, at least 2.
@@ -34,13 +34,13 @@ pub struct Knobs {
     pub pose_noise: f64,
     /// Standard deviation of the photos' noise, in units of full white.
     pub photo_noise: f64,
-    /// What a phone does to the photos; held-out views then are clean.
+    /// Effects of a phone camera on the photos; held-out views then are clean.
     pub effects: Effects,
 }
 
-impl Default for Knobs {
+impl Default for SceneSpec {
     fn default() -> Self {
-        Knobs {
+        SceneSpec {
             seed: 0,
             views: 4,
             held_out: 6,
@@ -58,9 +58,9 @@ impl Default for Knobs {
     }
 }
 
-/// A thing with a name.
+/// An object with a name.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Thing {
+pub struct SceneObject {
     /// Index in the masks.
     pub label: u32,
     /// What it is called.
@@ -73,13 +73,13 @@ pub struct Thing {
 
 /// A finished scene.
 #[derive(Clone, Debug, PartialEq)]
-pub struct World {
+pub struct SyntheticScene {
     /// Background first.
-    pub things: Vec<Thing>,
+    pub things: Vec<SceneObject>,
     /// True cameras of the photos, without distortion.
     pub train: Vec<Camera>,
     /// What each photo goes through.
-    pub shots: Vec<Shot>,
+    pub shots: Vec<PhotoEffects>,
     /// True cameras of the held-out views.
     pub test: Vec<Camera>,
     /// The photos' cameras with errors, to start from.
@@ -97,7 +97,7 @@ const COLOURS: [(&str, [f64; 3]); 6] = [
 ];
 const NOUNS: [&str; 6] = ["ball", "box", "can", "book", "brick", "drum"];
 
-impl Knobs {
+impl SceneSpec {
     fn check(&self) -> Result<()> {
         let bad = |what: &str| Err(Error::input(format!("generate: {what}")));
         match self {
@@ -120,7 +120,7 @@ impl Knobs {
 }
 
 /// Builds the scene of a set of knobs.
-pub fn world(knobs: &Knobs) -> Result<World> {
+pub fn world(knobs: &SceneSpec) -> Result<SyntheticScene> {
     knobs.check()?;
     let mut random = Random::new(knobs.seed ^ 0x5ce7e);
     let mut things = background(knobs, &mut random);
@@ -150,15 +150,15 @@ pub fn world(knobs: &Knobs) -> Result<World> {
         Camera { pose: error.compose(&c.pose), ..c.clone() }
     });
     let noisy = noisy.collect();
-    Ok(World { things, train, shots, test, noisy })
+    Ok(SyntheticScene { things, train, shots, test, noisy })
 }
 
 fn paint(colour: [f64; 3], contrast: f64, grain: f64, random: &mut Random) -> Paint {
     Paint { colour, contrast, grain, seed: random.bits() }
 }
 
-fn background(knobs: &Knobs, random: &mut Random) -> Vec<Thing> {
-    let mut thing = |label, phrase: &str, shape, colour, grain| Thing {
+fn background(knobs: &SceneSpec, random: &mut Random) -> Vec<SceneObject> {
+    let mut thing = |label, phrase: &str, shape, colour, grain| SceneObject {
         label,
         phrase: phrase.into(),
         shape,
@@ -173,7 +173,7 @@ fn background(knobs: &Knobs, random: &mut Random) -> Vec<Thing> {
 }
 
 /// Names and solids, placed without overlap; look-alikes and poles last.
-fn objects(knobs: &Knobs, random: &mut Random, things: &mut Vec<Thing>) -> Result<()> {
+fn objects(knobs: &SceneSpec, random: &mut Random, things: &mut Vec<SceneObject>) -> Result<()> {
     let mut names: Vec<(usize, usize)> =
         (0..COLOURS.len()).flat_map(|c| (0..NOUNS.len()).map(move |n| (c, n))).collect();
     random.shuffle(&mut names);
@@ -206,7 +206,12 @@ fn objects(knobs: &Knobs, random: &mut Random, things: &mut Vec<Thing>) -> Resul
         };
         taken.push((at, footprint));
         let contrast = if noun == "pole" { 0.2 } else { 0.7 } * knobs.texture;
-        things.push(Thing { label, phrase, shape: make(at), paint: paint(colour, contrast, 0.03, random) });
+        things.push(SceneObject {
+            label,
+            phrase,
+            shape: make(at),
+            paint: paint(colour, contrast, 0.03, random),
+        });
     }
     Ok(())
 }

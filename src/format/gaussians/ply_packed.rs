@@ -1,6 +1,6 @@
 //! Compressed PLY as SuperSplat writes it: chunks of 256 Gaussians with their bounds, each Gaussian in four 32-bit words,
 //! SH in bytes. About a quarter of the size of a plain PLY without SH.
-use super::ply_table::{self as table, Kind};
+use super::ply_table::{self as table, PropertyType};
 use crate::scene::{Splats, sh_coefficients};
 use crate::{Error, Result};
 use std::path::Path;
@@ -37,7 +37,7 @@ const SH_RANGE: f32 = 8.0;
 const LOGIT_MAX: f32 = 10.0;
 
 /// Whether the columns of the vertices are packed ones.
-pub(super) fn is_packed(columns: &[(String, Kind)]) -> bool {
+pub(super) fn is_packed(columns: &[(String, PropertyType)]) -> bool {
     columns.iter().any(|c| c.0 == WORDS[0])
 }
 

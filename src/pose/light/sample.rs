@@ -21,7 +21,7 @@ const PLAIN_SIGMA: f64 = 0.02;
 /// ln error per relative contrast of a patch: the views cut different pieces out of the texture.
 const TEXTURE_SIGMA: f64 = 0.3;
 /// Cells per side of a photo: residuals within a cell share highlight, shadow and texture, so they count as one when the
-/// doubt is estimated.
+/// standard deviation is estimated.
 const CELLS: f64 = 6.0;
 
 /// One photo's sight of a point.

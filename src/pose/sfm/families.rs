@@ -23,7 +23,9 @@ pub(super) fn corner_families(
     progress.check()?;
     let own: Vec<Features> = photos
         .par_iter()
-        .map(|p| sift::detect(&p.image.luma(), &matching::valid_area(&p.image, p.frame, MARGIN), MAX_CORNERS))
+        .map(|p| {
+            sift::detect(&p.image.luma(), &matching::valid_area(&p.image, p.border, MARGIN), MAX_CORNERS)
+        })
         .collect();
     progress.check()?;
     let mut families = vec![own];
@@ -51,7 +53,7 @@ pub(super) fn masked(photos: &[Photo], features: &[Features]) -> Vec<Features> {
     photos
         .iter()
         .zip(features)
-        .map(|(p, f)| within(f, &matching::valid_area(&p.image, p.frame, MARGIN)))
+        .map(|(p, f)| within(f, &matching::valid_area(&p.image, p.border, MARGIN)))
         .collect()
 }
 

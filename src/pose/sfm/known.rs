@@ -1,6 +1,6 @@
 //! Sparse points for cameras that are known already.
 use super::families::{corner_families, keypoints};
-use super::finish::explained;
+use super::finish::inlier_matches;
 use super::model::{Freedom, MIN_ANGLE_DEGREES, Model, Sighting, Track};
 use super::relate::{THRESHOLD, putative_matches};
 use super::tracks;
@@ -58,7 +58,7 @@ pub fn with_cameras(
         pair.list.iter_mut().for_each(|m| (m.0, m.1) = (flat(a, m.0), flat(b, m.1)));
     }
     let tried: usize = putative.iter().map(|p| p.list.len()).sum();
-    let mut links = explained(&model, &putative, threshold);
+    let mut links = inlier_matches(&model, &putative, threshold);
     let agreement = links.len() as f64 / tried.max(1) as f64;
     let keypoints: Vec<Vec<Sighting>> = (0..photos.len())
         .map(|v| {

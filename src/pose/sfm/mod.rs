@@ -149,7 +149,7 @@ fn assemble(
     seeds.truncate(SEEDS);
     // Photos of one camera first; where that contradicts the pairs, every photo with its own focal length. That explains much
     // that is wrong for other reasons, so it must settle the matter.
-    let apart = empty.apart();
+    let apart = empty.with_separate_optics();
     let attempts =
         std::iter::once(&empty).chain(&apart).flat_map(|start| seeds.iter().map(move |s| (start, *s)));
     let mut best: Option<(f64, Model)> = None;

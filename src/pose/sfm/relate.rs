@@ -63,7 +63,7 @@ pub(super) fn pairs(
     };
     let relations: Vec<_> = putative.par_iter().map(related).collect();
     progress.check()?;
-    explain(photos, &relations)?;
+    check_overlap(photos, &relations)?;
     let usable = |(_, _, relation)| match relation {
         Relation::Usable(pair) => Some(pair),
         _ => None,
@@ -142,7 +142,7 @@ fn same_picture(a: &RgbImage, b: &RgbImage) -> bool {
 }
 
 /// A clear error unless the usable pairs connect all photos.
-fn explain(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Result<()> {
+fn check_overlap(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Result<()> {
     let n = photos.len();
     let name = |i: &usize, j: &usize| format!("{}–{}", photos[*i].stem, photos[*j].stem);
     let list = |test: fn(&Relation) -> bool| {

@@ -254,15 +254,15 @@ fn a_moving_lens_does_not_make_another_camera() {
 #[test]
 fn photos_whose_files_name_camera_and_zoom_share_it() {
     let mut photos = testing::train(&testing::folder()).photos;
-    let apart = |photos: &[Photo]| empty_model(photos).apart().map(|m| m.group);
-    assert_eq!(apart(&photos), Some(vec![0, 1, 2, 3]));
+    let separate = |photos: &[Photo]| empty_model(photos).with_separate_optics().map(|m| m.group);
+    assert_eq!(separate(&photos), Some(vec![0, 1, 2, 3]));
     for p in &mut photos[..3] {
         (p.camera_model, p.exif_focal) = (Some("phone".into()), Some(600.0));
     }
     photos[3].camera_model = Some("phone".into());
-    assert_eq!(apart(&photos), None, "two cameras by their files");
+    assert_eq!(separate(&photos), None, "two cameras by their files");
     photos[2].exif_focal = None;
-    assert_eq!(apart(&photos), Some(vec![0, 0, 1, 2]));
+    assert_eq!(separate(&photos), Some(vec![0, 0, 1, 2]));
 }
 
 #[test]

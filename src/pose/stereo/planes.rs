@@ -1,4 +1,4 @@
-//! The scene's large planes (tables, walls, floors), found in the believed points of all views.
+//! The scene's large planes (tables, walls, floors), found in the consistent points of all views.
 use super::Level;
 use super::surface::{Surface, ray};
 use crate::pass::plane_sweep_cpu::hash;
@@ -82,8 +82,8 @@ fn lies_on(plane: &WorldPlane, s: &Sample) -> bool {
 }
 
 fn gather(level: &Level, surface: &Surface) -> Vec<Sample> {
-    let believed = surface.confidence.iter().filter(|&&c| c > 0.0).count();
-    let stride = (believed / SAMPLES).max(1);
+    let consistent = surface.confidence.iter().filter(|&&c| c > 0.0).count();
+    let stride = (consistent / SAMPLES).max(1);
     let mut samples = Vec::new();
     let mut counter = 0;
     for (view, r) in level.references.iter().enumerate() {

@@ -2,7 +2,7 @@
 use super::super::filter;
 use super::polygon;
 use super::score::{
-    Kind, Masks, OwnLabels, Protocol, Report, Score, Seen, View, mask_iou, mean, place, summarise,
+    Masks, OwnLabels, Protocol, ProtocolKind, Report, Score, Seen, View, mask_iou, mean, place, summarise,
 };
 use crate::query::eval::MIN_OBJECT_PIXELS;
 use crate::scene::{Camera, Plane};
@@ -193,7 +193,7 @@ impl Protocol for Lerf {
             out
         };
         Report {
-            protocol: Kind::Lerf,
+            protocol: ProtocolKind::Lerf,
             definitions: [
                 "per frame and prompt: relevancy smoothed by a 30x30 mean, averaged with itself; the level with the \
                  highest peak answers (ties: the finer)",

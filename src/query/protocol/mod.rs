@@ -12,7 +12,7 @@ mod score;
 #[cfg(test)]
 mod tests;
 
-pub use score::{CodeScores, Kind, Masks, Protocol, Report, Score, Seen, Summary, View};
+pub use score::{CodeScores, Masks, Protocol, ProtocolKind, Report, Score, Seen, Summary, View};
 
 use crate::Result;
 use crate::scene::Camera;
@@ -20,10 +20,15 @@ use std::path::Path;
 
 /// Reads the labels of `folder`. `scene` are the scene's cameras; `known` the data set's own cameras, which place the
 /// frames that the scene was not made from (without them only the scene's own photos are scored).
-pub fn open(kind: Kind, folder: &Path, scene: &[Camera], known: &[Camera]) -> Result<Box<dyn Protocol>> {
+pub fn open(
+    kind: ProtocolKind,
+    folder: &Path,
+    scene: &[Camera],
+    known: &[Camera],
+) -> Result<Box<dyn Protocol>> {
     Ok(match kind {
-        Kind::Lerf => Box::new(lerf::Lerf::open(folder, scene, known)?),
-        Kind::Ovs => Box::new(ovs::Ovs::open(folder, scene, known)?),
-        Kind::ScanNet => Box::new(scannet::ScanNet::open(folder, scene, known)?),
+        ProtocolKind::Lerf => Box::new(lerf::Lerf::open(folder, scene, known)?),
+        ProtocolKind::Ovs => Box::new(ovs::Ovs::open(folder, scene, known)?),
+        ProtocolKind::ScanNet => Box::new(scannet::ScanNet::open(folder, scene, known)?),
     })
 }

@@ -1,5 +1,5 @@
 //! ScanNet with the eight labels of LSM (paper, "Comparison with Feed-forward LSM").
-use super::score::{Kind, Masks, Protocol, Report, Score, Seen, Summary, View, nearest, place};
+use super::score::{Masks, Protocol, ProtocolKind, Report, Score, Seen, Summary, View, nearest, place};
 use crate::photo::stem;
 use crate::query::eval::Split;
 use crate::scene::{Camera, Plane, Pose};
@@ -191,7 +191,7 @@ impl Protocol for ScanNet {
             }
         }
         Report {
-            protocol: Kind::ScanNet,
+            protocol: ProtocolKind::ScanNet,
             definitions: [
                 "eight labels from NYU40: wall 1, floor 2, ceiling 22, chair 5, table 7, sofa 6, bed 4, other = the rest; \
                  id 0 is unlabelled and left out",

@@ -13,7 +13,7 @@ use std::path::Path;
 /// Which published protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Kind {
+pub enum ProtocolKind {
     /// LERF-OVS: one JSON of polygons and boxes per frame.
     Lerf,
     /// 3D-OVS: `segmentations/classes.txt` and one mask per frame and class.
@@ -69,7 +69,7 @@ pub struct Summary {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Report {
     /// Name of the protocol.
-    pub protocol: Kind,
+    pub protocol: ProtocolKind,
     /// What each figure is, one line each.
     pub definitions: Vec<String>,
     /// Every single score.
@@ -129,18 +129,18 @@ impl Seen<'_> {
     /// (level, relevancy map) of the levels that have codes; 0 where nothing is.
     pub(super) fn relevancy(&self, prompt: usize) -> Vec<(usize, Plane<f32>)> {
         let levels = self.codes.iter().zip(&self.scores.relevancy[prompt]).enumerate();
-        let spoken = levels.filter(|(_, (_, values))| !values.is_empty());
-        spoken.map(|(level, (codes, values))| (level, relevancy_map(codes, values))).collect()
+        let levels_with_codes = levels.filter(|(_, (_, values))| !values.is_empty());
+        levels_with_codes.map(|(level, (codes, values))| (level, relevancy_map(codes, values))).collect()
     }
 
     /// (level, cosine map) of the levels that have codes; −∞ where nothing is.
     pub(super) fn cosine(&self, prompt: usize) -> Vec<(usize, Plane<f32>)> {
         let levels = self.codes.iter().zip(&self.scores.cosine[prompt]).enumerate();
-        let spoken = levels.filter(|(_, (_, values))| !values.is_empty());
+        let levels_with_codes = levels.filter(|(_, (_, values))| !values.is_empty());
         let at = |values: &[f32], k: i32| {
             usize::try_from(k).ok().and_then(|k| values.get(k)).copied().unwrap_or(f32::NEG_INFINITY)
         };
-        spoken
+        levels_with_codes
             .map(|(level, (codes, values))| {
                 let data = codes.data.par_iter().map(|&k| at(values, k)).collect();
                 (level, Plane { width: codes.width, height: codes.height, data })
@@ -234,8 +234,11 @@ impl OwnLabels {
         let truth = GroundTruth::read(folder)?;
         let evaluation = Evaluation::new(truth.clone(), scene, None)?;
         let phrases = evaluation.phrases();
-        let view =
-            |(f, camera): (crate::query::eval::Frame, Camera)| View { stem: f.stem, split: f.split, camera };
+        let view = |(f, camera): (crate::query::eval::TruthFrame, Camera)| View {
+            stem: f.stem,
+            split: f.split,
+            camera,
+        };
         Ok(Some(OwnLabels { truth, views: evaluation.cameras().into_iter().map(view).collect(), phrases }))
     }
 

@@ -103,10 +103,10 @@ impl Scene3d<'_> {
         Ok((section(&manifest, &splats), note))
     }
 
-    /// The whole page of a server that answers `POST query` and sends [`SCENE_PATH`]; `mute` says why it cannot answer.
-    pub fn served(&self, mute: Option<&str>) -> Result<String> {
-        let mut manifest = self.manifest(mute.unwrap_or_default())?;
-        manifest["live"] = mute.is_none().into();
+    /// The whole page of a server that answers `POST query` and sends [`SCENE_PATH`]; `no_questions` says why it cannot answer.
+    pub fn served(&self, no_questions: Option<&str>) -> Result<String> {
+        let mut manifest = self.manifest(no_questions.unwrap_or_default())?;
+        manifest["live"] = no_questions.is_none().into();
         manifest["scene"] = SCENE_PATH.into();
         let title = super::chart::escape(self.title);
         Ok(format!(

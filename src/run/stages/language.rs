@@ -1,5 +1,5 @@
 //! Masks → aligned things with codes → splats that carry them; and what texts mean.
-use super::cameras::Placed;
+use super::cameras::PlacedPhotos;
 use super::shared;
 use crate::fit::{LanguageOptions, Trained, TrainedLanguage};
 use crate::infer::RegionEncoder;
@@ -56,14 +56,14 @@ impl SharedEncoder {
 }
 
 /// Embeds the questions.
-pub struct Embed {
+pub struct EmbedQueries {
     /// By whom.
     pub encoder: SharedEncoder,
     /// What is asked.
     pub texts: Vec<String>,
 }
 
-impl Stage for Embed {
+impl Stage for EmbedQueries {
     const NAME: &'static str = "queries";
     const LANE: Lane = Lane::Processor;
     type Inputs = ();
@@ -113,12 +113,12 @@ impl Stage for Align {
 }
 
 /// The text model's own phrases for every code.
-pub struct Name {
+pub struct NameCodes {
     /// Whose.
     pub encoder: SharedEncoder,
 }
 
-impl Stage for Name {
+impl Stage for NameCodes {
     const NAME: &'static str = "names";
     const LANE: Lane = Lane::Processor;
     type Inputs = (Output<Language>,);
@@ -145,7 +145,7 @@ pub struct TrainLanguage {
 impl Stage for TrainLanguage {
     const NAME: &'static str = "language";
     const LANE: Lane = Lane::Device;
-    type Inputs = (Output<Placed>, Output<Trained>, Output<Language>);
+    type Inputs = (Output<PlacedPhotos>, Output<Trained>, Output<Language>);
     type Output = TrainedLanguage;
 
     fn settings(&self) -> String {
@@ -158,7 +158,7 @@ impl Stage for TrainLanguage {
 
     fn run(
         self,
-        (placed, trained, language): (&Placed, &Trained, &Language),
+        (placed, trained, language): (&PlacedPhotos, &Trained, &Language),
         context: &Context,
     ) -> Result<TrainedLanguage> {
         self.recipe.train_language(
