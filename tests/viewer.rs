@@ -406,7 +406,7 @@ fn a_static_page_answers_what_was_asked() {
     let device = Device::open(None).unwrap();
     let field = scene.language.clone().unwrap();
     let mut ready = QueryScene::open(&device, &scene.splats, field, encoder).unwrap();
-    ready.look(&scene.cameras).unwrap();
+    ready.set_views(&scene.cameras).unwrap();
     let answers = ["lemon", "loaf of bread"].map(|t| ready.ask(t, &QueryOptions::default()).unwrap());
     let names = ready.names().unwrap();
     let view = Scene3d {

@@ -1,5 +1,7 @@
 //! Runs setups as graphs of stages that share one store: setups that agree up to a stage share what that stage made.
-use super::stages::{EncoderMeaning, MaskMeaning, Meanings, Score, Scored, SyntheticMasks, SyntheticMeaning};
+use super::stages::{
+    EncoderEmbeddings, MaskEmbeddings, ObjectEmbeddings, Score, Scored, SyntheticEmbeddings, SyntheticMasks,
+};
 use super::tables::{Available, Regions, Setup};
 use crate::fit::{LanguageOptions, Preset, RgbOptions, Trained, TrainedLanguage};
 use crate::gpu::Device;
@@ -26,7 +28,7 @@ use std::sync::Arc;
 /// What came out of a setup.
 #[derive(Clone)]
 pub struct RowFigures {
-    /// Figures of protocol `field`, and how well the rendered meaning agrees with the true one.
+    /// Figures of protocol `field`, and agreement of decoded embeddings with the true ones.
     pub scored: Arc<Scored>,
     /// Splats of the finished scene.
     pub splats: usize,
@@ -39,7 +41,7 @@ pub struct RowFigures {
 }
 
 /// The machine, the data, and everything made so far.
-pub struct Lab<'a> {
+pub struct Runner<'a> {
     device: Device,
     registry: Registry,
     /// The data set.
@@ -70,7 +72,7 @@ fn pixels(placed: &PlacedPhotos) -> usize {
     placed.photos.iter().map(|p| p.image.data.len()).max().unwrap_or(0)
 }
 
-impl<'a> Lab<'a> {
+impl<'a> Runner<'a> {
     /// Opens the machine and the data.
     pub fn open(
         device: Device,
@@ -79,7 +81,7 @@ impl<'a> Lab<'a> {
         seed: u64,
         progress: &'a dyn Progress,
     ) -> Self {
-        Lab { device, registry, truth: Arc::new(truth), seed, progress, store: Store::in_memory() }
+        Runner { device, registry, truth: Arc::new(truth), seed, progress, store: Store::in_memory() }
     }
 
     /// Frames whose photos a scene of so many views is made from: train frames spread over their order, and held-out ones
@@ -155,7 +157,7 @@ impl<'a> Lab<'a> {
         )?;
         let options = self.rgb_options(setup);
         let trained = build.graph.add(stages::TrainColour { options }, (placed, geometry));
-        let Described { masks, meaning, queries, space } = self.described(setup, &mut build, posed)?;
+        let RegionData { masks, embeddings, queries, space } = self.described(setup, &mut build, posed)?;
         let (recipe, seed) = (setup.recipe, self.seed);
         let aligned = build.graph.add(stages::Align { recipe, space, seed }, (masks, matches, geometry));
         let options = LanguageOptions {
@@ -167,7 +169,7 @@ impl<'a> Lab<'a> {
         };
         let language = build.graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
         let score = Score { truth: self.truth.clone(), queries: queries.clone() };
-        let scored = build.graph.add(score, (trained, language, meaning));
+        let scored = build.graph.add(score, (trained, language, embeddings));
         Ok(Stages { build, placed, trained, aligned, language, scored, queries })
     }
 
@@ -178,16 +180,16 @@ impl<'a> Lab<'a> {
         setup.recipe.rgb(options)
     }
 
-    /// Masks with features, what the objects mean in the space of these features, and the questions.
-    fn described(&self, setup: &Setup, build: &mut GraphBuilder, posed: PosedPhotos) -> Result<Described> {
+    /// Masks with features, the true embedding of every object in the space of these features, and the questions.
+    fn described(&self, setup: &Setup, build: &mut GraphBuilder, posed: PosedPhotos) -> Result<RegionData> {
         let (truth, placed) = (&self.truth, posed.placed);
         let (masks, features) = match &setup.regions {
             Regions::Synthetic(flaws) => {
                 let (truth, flaws) = (truth.clone(), *flaws);
                 let queries = self.phrases().iter().map(|p| regions::query(p)).collect();
-                return Ok(Described {
+                return Ok(RegionData {
                     masks: build.graph.add(SyntheticMasks { truth: truth.clone(), flaws }, (placed,)),
-                    meaning: build.graph.add(SyntheticMeaning { truth, flaws }, (placed,)),
+                    embeddings: build.graph.add(SyntheticEmbeddings { truth, flaws }, (placed,)),
                     queries,
                     space: "synthetic".into(),
                 });
@@ -200,12 +202,12 @@ impl<'a> Lab<'a> {
         let queries = encoder.with(|e| ask::embedded(&self.phrases(), e))?;
         let space = encoder.space().to_owned();
         let truth = truth.clone();
-        let meaning = if features.argument.is_some() {
-            build.graph.add(MaskMeaning { truth }, (placed, masks))
+        let embeddings = if features.argument.is_some() {
+            build.graph.add(MaskEmbeddings { truth }, (placed, masks))
         } else {
-            build.graph.add(EncoderMeaning { truth, encoder }, (placed,))
+            build.graph.add(EncoderEmbeddings { truth, encoder }, (placed,))
         };
-        Ok(Described { masks, meaning, queries, space })
+        Ok(RegionData { masks, embeddings, queries, space })
     }
 
     /// Phrases that the evaluation asks for, in its order.
@@ -245,10 +247,10 @@ impl<'a> Lab<'a> {
     }
 }
 
-/// What [`Lab::described`] adds.
-struct Described {
+/// What [`Runner::described`] adds.
+struct RegionData {
     masks: Output<Vec<ViewMasks>>,
-    meaning: Output<Meanings>,
+    embeddings: Output<ObjectEmbeddings>,
     queries: Vec<TextQuery>,
     space: String,
 }

@@ -20,7 +20,7 @@ pub struct Table {
     /// The regions under which it is run when the user does not say; one group of rows each.
     pub(super) regions: fn(u64, &Available) -> Vec<Regions>,
     /// The rows of a group.
-    pub(super) rows: fn(&Group) -> Vec<Row>,
+    pub(super) rows: fn(&Group) -> Vec<TableRow>,
 }
 
 impl Serialize for Table {
@@ -66,8 +66,8 @@ pub static TABLES: [Table; 9] = [
                 group.recipe("bijection, 3 dimensions", short, &[]),
                 group.recipe("autoencoder, 100 epochs", published, &[("mIoU", 0.463), ("mAcc", 0.640)]),
                 group.recipe("autoencoder, 2000 steps", longer, &[]),
-                Row {
-                    runs: Runs::Unreduced(group.base.clone()),
+                TableRow {
+                    runs: RowWork::MemoryOnly(group.base.clone()),
                     note: "not trained: memory only".into(),
                     ..group.row("no reduction", group.base.clone(), &[])
                 },
@@ -166,7 +166,7 @@ pub static TABLES: [Table; 9] = [
                     return row;
                 }
                 let note = format!("the data set has {} photos to spare", group.available.views);
-                Row { runs: Runs::Nothing, note, ..row }
+                TableRow { runs: RowWork::Nothing, note, ..row }
             };
             [(2, 0.7341, 0.9), (4, 0.7264, 0.9), (6, 0.7313, 0.85)].map(row).into()
         },
@@ -273,24 +273,24 @@ pub struct Setup {
 
 /// What a row takes.
 #[derive(Clone, Debug)]
-pub enum Runs {
+pub enum RowWork {
     /// All of it, scored.
-    Scored(Setup),
+    Score(Setup),
     /// Nothing is trained: the bytes that features of full length would take are stated.
-    Unreduced(Setup),
+    MemoryOnly(Setup),
     /// Nothing; the note says why.
     Nothing,
 }
 
 /// One row before it ran.
 #[derive(Clone, Debug)]
-pub struct Row {
+pub struct TableRow {
     /// What this row is, within its group.
     pub label: String,
     /// Rows are compared within their group.
     pub group: String,
     /// What to run.
-    pub runs: Runs,
+    pub runs: RowWork,
     /// What the reader should know about this row.
     pub note: String,
     /// The paper's figures for this row, by column.
@@ -316,27 +316,27 @@ pub(super) struct Group<'a> {
 }
 
 impl Group<'_> {
-    fn row(&self, label: &str, setup: Setup, paper: &[(&'static str, f64)]) -> Row {
-        Row {
+    fn row(&self, label: &str, setup: Setup, paper: &[(&'static str, f64)]) -> TableRow {
+        TableRow {
             label: label.to_owned(),
             group: self.base.regions.name(),
-            runs: Runs::Scored(setup),
+            runs: RowWork::Score(setup),
             note: String::new(),
             paper: paper.to_vec(),
         }
     }
 
-    fn recipe(&self, label: &str, recipe: Recipe, paper: &[(&'static str, f64)]) -> Row {
+    fn recipe(&self, label: &str, recipe: Recipe, paper: &[(&'static str, f64)]) -> TableRow {
         self.row(label, Setup { recipe, ..self.base.clone() }, paper)
     }
 
     /// A network has a row also where it is not, which says so.
-    fn if_installed(&self, name: &str, setup: Setup, there: bool) -> Row {
+    fn if_installed(&self, name: &str, setup: Setup, there: bool) -> TableRow {
         let row = self.row(name, setup, &[]);
         if there {
             return row;
         }
-        Row { runs: Runs::Nothing, note: "not installed (splatvk models list)".to_owned(), ..row }
+        TableRow { runs: RowWork::Nothing, note: "not installed (splatvk models list)".to_owned(), ..row }
     }
 }
 
@@ -369,14 +369,14 @@ mod tests {
                 let setups: Vec<&Setup> = rows
                     .iter()
                     .filter_map(|r| match &r.runs {
-                        Runs::Scored(setup) => Some(setup),
-                        Runs::Unreduced(_) | Runs::Nothing => None,
+                        RowWork::Score(setup) => Some(setup),
+                        RowWork::MemoryOnly(_) | RowWork::Nothing => None,
                     })
                     .collect();
                 for (i, a) in setups.iter().enumerate() {
                     assert!(setups[..i].iter().all(|b| a != b), "{}: two rows of one setup", table.name);
                 }
-                for row in rows.iter().filter(|r| !matches!(r.runs, Runs::Scored(_))) {
+                for row in rows.iter().filter(|r| !matches!(r.runs, RowWork::Score(_))) {
                     assert!(!row.note.is_empty(), "{}: {} says not why", table.name, row.label);
                 }
                 for (column, _) in rows.iter().flat_map(|r| &r.paper) {

@@ -12,7 +12,7 @@ pub fn generate(args: &GenerateArgs) -> Result<()> {
     let workspace = Workspace::create(&args.out, false)?;
     match &args.from {
         Some(data) => synth::write_regions(data, workspace.path(), &flaws)?,
-        None => synth::generate(workspace.path(), &knobs(args)?, &flaws, progress::here().as_ref())?,
+        None => synth::generate(workspace.path(), &knobs(args)?, &flaws, progress::reporter().as_ref())?,
     }
     let folder = workspace.commit()?;
     if args.json {

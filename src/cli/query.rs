@@ -54,13 +54,13 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let device = Device::open(args.device.device.as_deref())?;
     let field = scene.language.take().ok_or_else(no_language)?;
     let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
-    let progress = progress::here();
+    let progress = progress::reporter();
     progress.begin("query", cameras.len() as u64);
     let mut views: Vec<Vec<Value>> = vec![Vec::new(); args.texts.len()];
     let mut latency = vec![0.0; args.texts.len()];
     for (part, (cameras, stems)) in cameras.chunks(AT_ONCE).zip(stems.chunks(AT_ONCE)).enumerate() {
         progress.check()?;
-        ready.look(cameras)?;
+        ready.set_views(cameras)?;
         for (q, text) in args.texts.iter().enumerate() {
             let clock = Instant::now();
             let answers = ready.ask(text, &QueryOptions::default())?;

@@ -29,7 +29,7 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     let mut out = Outputs::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
-    let progress = progress::here();
+    let progress = progress::reporter();
     progress.begin("render", cameras.len() as u64);
     for (i, (camera, stem)) in cameras.iter().zip(&stems).enumerate() {
         progress.check()?;

@@ -86,7 +86,7 @@ fn methods() -> PossibleValuesParser {
 pub fn run(args: &RunArgs) -> Result<()> {
     let installed = inventory(&args.device.registry()?);
     let plan = plan(args, &installed)?;
-    let outcome = crate::run::run(&plan, progress::here().as_ref())?;
+    let outcome = crate::run::run(&plan, progress::reporter().as_ref())?;
     if args.device.json {
         let record = serde_json::to_value(crate::run::run_record(&outcome));
         return print_json(&record.map_err(|e| Error::work(format!("run record: {e}")))?);

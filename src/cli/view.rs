@@ -20,7 +20,7 @@ use tiny_http::{Header, Method, Request, Response, Server};
 /// How soon Ctrl-C is noticed between requests.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Longest request body: a question is a few words.
-const MOST_BYTES: u64 = 4096;
+const MAX_BYTES: u64 = 4096;
 /// What the page may do: run what it carries, ask its own server, and nothing else.
 const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'unsafe-inline' data:; worker-src data:; style-src 'unsafe-inline'; \
                       img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
@@ -37,7 +37,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         Err(error) => (None, Some(error.to_string())),
     };
     if let Some(reason) = no_questions.as_deref().filter(|_| scene.language.is_some()) {
-        progress::here().warn(&format!("no questions: {reason}"));
+        progress::reporter().warn(&format!("no questions: {reason}"));
     }
     let names = ready.as_mut().map_or(Ok(Names::new()), QueryScene::names)?;
     let content = Content {
@@ -80,7 +80,7 @@ fn questions(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
     let encoder = encoder::of_scene(scene, args.device.registry()?)?;
     let device = Device::open(args.device.device.as_deref())?;
     let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
-    ready.look(&scene.cameras)?;
+    ready.set_views(&scene.cameras)?;
     Ok(ready)
 }
 
@@ -173,7 +173,7 @@ impl Content {
 
 fn question(request: &mut Request) -> Option<String> {
     let mut body = String::new();
-    request.as_reader().take(MOST_BYTES).read_to_string(&mut body).ok()?;
+    request.as_reader().take(MAX_BYTES).read_to_string(&mut body).ok()?;
     let body: Value = serde_json::from_str(&body).ok()?;
     let text = body["text"].as_str()?.trim();
     (!text.is_empty()).then(|| text.to_owned())

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use tokenizers::Tokenizer;
 
 use super::RegionEncoder;
-use super::cache::Key;
+use super::cache::OutputKey;
 use super::classify::{crop, extents};
 use super::contract::Part;
 use super::graph::{Graph, GraphFile};
@@ -71,7 +71,8 @@ impl Clip {
         }
         let tokenizer = tokenizer(&model)?;
         // The space is the weights: features may be compared with texts only when both came from them.
-        let space = format!("{}:{}", model.family, Key::new("space").model(&visual)?.model(&text)?.short());
+        let space =
+            format!("{}:{}", model.family, OutputKey::new("space").model(&visual)?.model(&text)?.short());
         let mut clip = Clip { model, space, tokenizer, image: None, text: None, dim: 0 };
         clip.tokens_are_right(&text)?;
         clip.dim = match widths.0.or(widths.1) {
@@ -94,7 +95,7 @@ impl Clip {
         ];
         const OTHERS: [&str; 5] =
             ["a dog", "a city street at night", "a page of text", "a person on a bicycle", "a plate of food"];
-        let key = Key::new("towers").model(visual)?.model(text)?;
+        let key = OutputKey::new("towers").model(visual)?.model(text)?;
         let seen = visual.compute.remember(key, || {
             let texts: Vec<&str> = COLOURS.iter().map(|c| c.0).chain(OTHERS).collect();
             let names = self.embed_texts(&texts)?;
@@ -241,7 +242,7 @@ impl RegionEncoder for Clip {
     fn embed_regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
         let dense = self.model.graph(Part::ImageTower).is_err();
         let graph = self.model.graph(if dense { Part::DenseFeatures } else { Part::ImageTower })?;
-        let key = Key::new("features").model(graph)?.values(&image.data).values(&labels.data);
+        let key = OutputKey::new("features").model(graph)?.values(&image.data).values(&labels.data);
         let key = key.values(&[image.width as u64, count as u64]);
         let compute = graph.compute.clone();
         let mut rows = compute.remember(key, || {

@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::adapter::{Adapter, Binding};
-use super::cache::{Key, fingerprint};
+use super::cache::{OutputKey, fingerprint};
 use super::compute::Compute;
 use super::contract::{Slot, reorder, unify};
 use super::onnx::{self, Dim, Header};
@@ -217,9 +217,9 @@ impl Graph {
     }
 }
 
-impl Key {
+impl OutputKey {
     /// Depends on the content of a model's files and on their adapters.
-    pub fn model(mut self, graph: &GraphFile) -> Result<Key> {
+    pub fn model(mut self, graph: &GraphFile) -> Result<OutputKey> {
         for file in std::iter::once(&graph.path).chain(&graph.external) {
             self = self.text(&fingerprint(file).map_err(crate::Error::io(file))?);
         }

@@ -1,6 +1,6 @@
 //! Geometry networks: DUSt3R and MASt3R see two photos at a time, VGGT and its like all of them. Both give pointmaps of pairs
 //! ([`PairPointmaps`]), which [`crate::pose::pointmap`] brings to one scene.
-use super::cache::Key;
+use super::cache::OutputKey;
 use super::contract::Part;
 use super::graph::{Graph, GraphFile, Outputs};
 use super::installed::Installed;
@@ -91,7 +91,8 @@ impl<'a> Network<'a> {
 
     fn decode(&mut self, i: usize, j: usize) -> Result<Decoded> {
         let (a, b) = (&self.prepared[i], &self.prepared[j]);
-        let mut key = Key::new("pair").values(&[a.width, a.height, b.width, b.height].map(|n| n as u64));
+        let mut key =
+            OutputKey::new("pair").values(&[a.width, a.height, b.width, b.height].map(|n| n as u64));
         for graph in self.model.graphs.values() {
             key = key.model(graph)?;
         }

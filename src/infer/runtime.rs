@@ -113,7 +113,7 @@ impl Session {
         let environment = &loaded()?.1;
         let large = bytes >= LARGE;
         let build = |provider| settings(environment, provider, large)?.commit_from_file(file);
-        let provider = compute.chosen()?;
+        let provider = compute.selected()?;
         let built = match build(provider) {
             Err(e) if provider.is_some() && compute.replaceable() => {
                 let name = compute.name().unwrap_or_default();

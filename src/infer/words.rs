@@ -17,7 +17,7 @@
 //! the canonical phrases of the relevancy score should be.
 //!
 //! It knows about a thousand everyday things and eleven colours. CLIP is the full model.
-use super::cache::Key;
+use super::cache::OutputKey;
 use super::classify::{CLASSES, Classifier};
 use super::registry::{PackFileKind, Registry};
 use super::text::{self, TextEncoder, normalise};
@@ -190,7 +190,7 @@ impl Vocabulary {
         let mut encoder = TextEncoder::load(registry)?;
         // Naming a thousand classes takes seconds, which a single query should not pay.
         let used = registry.status_of(&[PackFileKind::Text, PackFileKind::Tokenizer, PackFileKind::Classes]);
-        let key = used.iter().fold(Key::new("class-names"), |key, file| key.text(&file.sha256));
+        let key = used.iter().fold(OutputKey::new("class-names"), |key, file| key.text(&file.sha256));
         let mut names = registry
             .compute()
             .remember(key, || encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>()))?;
@@ -238,7 +238,7 @@ impl Vocabulary {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::infer::breakfast::{View, phrases, views};
+    use crate::infer::breakfast::{TestView, phrases, views};
 
     fn dot(a: &[f32], b: &[f32]) -> f32 {
         a.iter().zip(b).map(|(p, q)| p * q).sum()
@@ -252,7 +252,7 @@ mod tests {
 
     /// Rank (1 = first) of the right region among the view's regions, and its score.
     fn rank(
-        view: &View,
+        view: &TestView,
         regions: &[f32],
         object: i32,
         query: &[f32],
@@ -319,7 +319,7 @@ mod tests {
     fn views_of_one_thing_agree() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
         let views = views("train");
-        let mut of = |v: &View| words.embed_regions(&v.image, &v.masks, 12).unwrap();
+        let mut of = |v: &TestView| words.embed_regions(&v.image, &v.masks, 12).unwrap();
         let (a, b) = (of(&views[1]), of(&views[2]));
         let row = |all: &[f32], i: usize| all[i * DIM..(i + 1) * DIM].to_vec();
         // The eight objects. Measured: the same one 0.8 to 0.98, another 0.38 in the middle and 0.76 at most.

@@ -1,7 +1,7 @@
 //! Masks with features → aligned things → codebooks and training targets.
 use super::ViewMasks;
 use super::align::{self, AlignOptions, Alignment, PairLinks, links_from_depth};
-use super::codebook::{self, Built, CodeEntry, autoencoder, quantise};
+use super::codebook::{self, CodeEntry, EncodedLevel, autoencoder, quantise};
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, LanguageField, LevelField, Plane};
 use crate::{Error, Result};
@@ -122,7 +122,7 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
     let built = match options.reducer {
         Reducer::Bijection => {
             let one = |e: &Vec<CodeEntry>| codebook::build(e, options.feature_dim, options.seed);
-            entries.iter().map(one).collect::<Result<Vec<Built>>>()?
+            entries.iter().map(one).collect::<Result<Vec<EncodedLevel>>>()?
         }
         Reducer::Quantised => {
             let one = |e: &Vec<CodeEntry>| quantise::build(e, options.feature_dim, options.seed);

@@ -241,11 +241,11 @@ fn spread(
 mod tests {
     use super::*;
     use crate::infer::Registry;
-    use crate::infer::breakfast::{View, train_views};
+    use crate::infer::breakfast::{TestView, train_views};
     use crate::infer::xfeat::XFeat;
     use crate::language::align::links_from_warps;
 
-    fn depth(view: &View) -> DepthMap {
+    fn depth(view: &TestView) -> DepthMap {
         let known = view.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect();
         DepthMap { depth: view.depth.clone(), confidence: Plane { data: known, ..view.depth } }
     }

@@ -1,5 +1,5 @@
 //! What may become a photo of a run: a file, or a frame of a video.
-use super::choose::{Found, find};
+use super::choose::{FoundFiles, find};
 use super::read::{self, Photo, from_bytes, load_at};
 use super::video::Video;
 use super::{decode, resize};
@@ -70,7 +70,7 @@ impl Candidate {
 /// The candidates behind files, folders and videos, in the order of their names; frames in the order of time. Warns of what
 /// folders hold besides.
 pub fn gather(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Candidate>> {
-    let Found { photos, videos, ignored } = find(inputs)?;
+    let FoundFiles { photos, videos, ignored } = find(inputs)?;
     if let Some(first) = ignored.first() {
         let more = ignored.len() - 1;
         let others = if more > 0 { format!(" and {more} more") } else { String::new() };

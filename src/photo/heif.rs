@@ -171,7 +171,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Image, Failure> {
         let mut handle = ptr::null_mut();
         check(api, (api.heif_context_get_primary_image_handle)(context.pointer, &mut handle))?;
         let handle = owned(handle, api.heif_image_handle_release);
-        let shape = Shape::of(api, handle.pointer)?;
+        let shape = HeifLayout::of(api, handle.pointer)?;
         let mut image = ptr::null_mut();
         let decode = api.heif_decode_image;
         check(api, decode(handle.pointer, &mut image, COLORSPACE_RGB, shape.chroma(), ptr::null()))?;
@@ -219,13 +219,13 @@ fn check(api: &Api, status: Status) -> Result<(), Failure> {
 }
 
 /// How the samples are asked for.
-struct Shape {
+struct HeifLayout {
     deep: bool,
     alpha: bool,
 }
 
-impl Shape {
-    unsafe fn of(api: &Api, handle: Pointer) -> Result<Shape, Failure> {
+impl HeifLayout {
+    unsafe fn of(api: &Api, handle: Pointer) -> Result<HeifLayout, Failure> {
         // SAFETY: the caller's valid handle.
         let (w, h, bits, alpha) = unsafe {
             (
@@ -236,7 +236,7 @@ impl Shape {
                     && (api.heif_image_handle_is_premultiplied_alpha)(handle) == 0,
             )
         };
-        let shape = Shape { deep: bits > 8, alpha };
+        let shape = HeifLayout { deep: bits > 8, alpha };
         let bytes = w.max(0) as u64 * h.max(0) as u64 * (3 + u64::from(alpha)) * (1 + u64::from(shape.deep));
         match bytes {
             0 => Err(Failure::Input("the image is damaged (no pixels); copy the photo again".to_owned())),

@@ -15,7 +15,7 @@ mod video;
 
 pub use border::PlainBorder;
 pub use candidate::{Candidate, gather};
-pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, find, spread, wanted};
+pub use choose::{DEFAULT_VIEWS, FoundFiles, MAX_VIEWS, find, photo_count, spread};
 pub use kind::stem;
 pub use light::Light;
 pub use read::{
@@ -47,7 +47,7 @@ pub fn video_support() -> (String, Option<String>) {
 /// Finds and reads all photos of files and folders at [`MAX_SIZE`]; [`crate::pose::choose::photos`] chooses among too many.
 pub fn load_all(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Photo>> {
     let found = gather(inputs, progress)?;
-    wanted(found.len(), Some(found.len()))?;
+    photo_count(found.len(), Some(found.len()))?;
     load_each(&found, MAX_SIZE, progress)
 }
 
@@ -122,8 +122,8 @@ pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
 /// Refuses sets that cannot give geometry (one photo, or the same photo twice) or that would mix up files (the same name
 /// twice). [`load_all`] has done it; for photos from memory.
 pub fn check_set(photos: &[Photo]) -> Result<()> {
-    if !(2..=MOST_VIEWS).contains(&photos.len()) {
-        return Err(Error::input(format!("{} photos; give 2 to {MOST_VIEWS}", photos.len())));
+    if !(2..=MAX_VIEWS).contains(&photos.len()) {
+        return Err(Error::input(format!("{} photos; give 2 to {MAX_VIEWS}", photos.len())));
     }
     let digests: Vec<_> =
         photos.iter().map(|p| Sha256::digest(bytemuck::cast_slice(&p.image.data))).collect();

@@ -184,7 +184,7 @@ pub(super) fn check_size(name: &Path, (w, h): (usize, usize)) -> Result<()> {
 /// Largest long side of [`Photo::fine`], pixels.
 const FINE: usize = 3072;
 /// Fewer more pixels than this show nothing new.
-const LEAST_GAIN: f64 = 1.25;
+const MIN_GAIN: f64 = 1.25;
 
 fn fine(
     (w, h): (usize, usize),
@@ -193,7 +193,7 @@ fn fine(
 ) -> Option<Arc<Plane<f32>>> {
     let share = (FINE as f64 / w.max(h) as f64).min(1.0);
     let size = ((w as f64 * share).round() as usize, (h as f64 * share).round() as usize);
-    (size.0 as f64 > LEAST_GAIN * working.0 as f64)
+    (size.0 as f64 > MIN_GAIN * working.0 as f64)
         .then(|| Arc::new(resize::area_average((w, h), size, at).luma()))
 }
 

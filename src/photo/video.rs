@@ -15,7 +15,7 @@ const CANDIDATES: u64 = 60;
 const LONGEST: Duration = Duration::from_secs(120);
 
 /// Largest frame, pixels: beyond 8K.
-const MOST_PIXELS: u64 = 64 << 20;
+const MAX_PIXELS: u64 = 64 << 20;
 
 /// Containers that cameras and phones write. Playlists are not among them: they name other files.
 const CONTAINERS: &str = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,asf";
@@ -66,7 +66,7 @@ impl Video {
         if w * h == 0 {
             return Err(bad("there is no picture in this video"));
         }
-        if w.saturating_mul(h) > MOST_PIXELS {
+        if w.saturating_mul(h) > MAX_PIXELS {
             return Err(bad(&format!("{w} × {h} pixels are too many for a video; scale it down")));
         }
         let duration = number(&stream["duration"]).or_else(|| number(&found["format"]["duration"]));
@@ -109,7 +109,7 @@ impl Video {
         }
         command.args(["-c:v", "png", "-pix_fmt", "rgb24", "-f", "image2pipe", "pipe:1"]);
         // Uncompressed, plus the PNG's own framing.
-        output(command, &self.path, 3 * MOST_PIXELS + (1 << 20), progress)
+        output(command, &self.path, 3 * MAX_PIXELS + (1 << 20), progress)
     }
 }
 

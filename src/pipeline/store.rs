@@ -107,7 +107,7 @@ impl Store {
     /// What was warned of while it was made, and the output.
     pub(super) fn load<T>(&self, name: &str, key: &Key, codec: &Codec<T>) -> Option<(Vec<String>, T)> {
         let folder = self.folder.as_ref().filter(|_| self.resume)?;
-        let bytes = files::read_sealed(&Store::file(folder, name, key))?;
+        let bytes = files::read_with_checksum(&Store::file(folder, name, key))?;
         let (warnings, body) = postcard::take_from_bytes(&bytes).ok()?;
         Some((warnings, (codec.read)(body)?))
     }
@@ -125,7 +125,7 @@ impl Store {
         let file = Store::file(folder, name, key);
         let warnings = postcard::to_stdvec(warnings).map_err(unwritable)?;
         let body = [warnings, (codec.write)(value)?].concat();
-        let written = files::write_sealed(&file, &body).is_ok();
+        let written = files::write_with_checksum(&file, &body).is_ok();
         if written {
             files::prune(&file, EXTENSION, CAPACITY);
         }

@@ -1,6 +1,6 @@
 //! Photos to cameras, and from cameras to depth (docs/method.md#geometry).
 use super::stereo::{self, StereoOptions};
-use super::{Features, Geometry, SparseModel, light, sfm};
+use super::{Geometry, Keypoints, SparseModel, light, sfm};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
@@ -123,13 +123,13 @@ pub fn learned_features(
     photos: &[Photo],
     registry: &Registry,
     progress: &dyn Progress,
-) -> Result<Vec<Features>> {
+) -> Result<Vec<Keypoints>> {
     let mut xfeat = XFeat::load(registry)?;
     progress.begin("features", photos.len() as u64);
     let mut out = Vec::with_capacity(photos.len());
     for (k, p) in photos.iter().enumerate() {
         progress.check()?;
-        out.push(Features::from(xfeat.detect(&p.image, MAX_LEARNED)?));
+        out.push(Keypoints::from(xfeat.detect(&p.image, MAX_LEARNED)?));
         progress.step(k as u64 + 1, &p.stem);
     }
     progress.end();

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 /// Keypoints with unit descriptors of one photo.
 #[derive(Clone, Debug, Default)]
-pub struct Features {
+pub struct Keypoints {
     /// Pixel positions (centre of the first pixel 0.5).
     pub points: Vec<DVec2>,
     /// Descriptor length.
@@ -15,9 +15,9 @@ pub struct Features {
     pub descriptors: Vec<f32>,
 }
 
-impl From<crate::infer::xfeat::Features> for Features {
-    fn from(f: crate::infer::xfeat::Features) -> Features {
-        Features {
+impl From<crate::infer::xfeat::XFeatKeypoints> for Keypoints {
+    fn from(f: crate::infer::xfeat::XFeatKeypoints) -> Keypoints {
+        Keypoints {
             points: f.keypoints.iter().map(|k| DVec2::new(k[0] as f64, k[1] as f64)).collect(),
             dim: crate::infer::xfeat::DIM,
             descriptors: f.descriptors,
@@ -34,7 +34,7 @@ pub(crate) struct Match {
 }
 
 /// Best and second-best similarity of each row of `a` among the rows of `b`.
-fn nearest(a: &Features, b: &Features) -> Vec<(usize, f32, f32)> {
+fn nearest(a: &Keypoints, b: &Keypoints) -> Vec<(usize, f32, f32)> {
     let d = a.dim;
     a.descriptors
         .par_chunks(d.max(1))
@@ -65,7 +65,7 @@ fn nearest(a: &Features, b: &Features) -> Vec<(usize, f32, f32)> {
 
 /// Mutual nearest neighbours whose distance is below `ratio` of the distance to the second-best elsewhere, best first.
 /// Descriptor lengths must be multiples of 8 and equal; otherwise there are no matches.
-pub(crate) fn mutual_matches(a: &Features, b: &Features, ratio: f32) -> Vec<Match> {
+pub(crate) fn mutual_matches(a: &Keypoints, b: &Keypoints, ratio: f32) -> Vec<Match> {
     if a.dim != b.dim || !a.dim.is_multiple_of(8) || a.points.is_empty() || b.points.is_empty() {
         return Vec::new();
     }
@@ -205,10 +205,10 @@ mod tests {
             v
         };
         let at = |n: usize| (0..n).map(|k| DVec2::new(10.0 * k as f64, 0.0)).collect::<Vec<_>>();
-        let a = Features { points: at(3), dim: 8, descriptors: [unit(0), unit(1), unit(2)].concat() };
+        let a = Keypoints { points: at(3), dim: 8, descriptors: [unit(0), unit(1), unit(2)].concat() };
         // Two copies of descriptor 1 far apart are ambiguous.
         let b =
-            Features { points: at(4), dim: 8, descriptors: [unit(2), unit(1), unit(1), unit(0)].concat() };
+            Keypoints { points: at(4), dim: 8, descriptors: [unit(2), unit(1), unit(1), unit(0)].concat() };
         let m: Vec<_> = mutual_matches(&a, &b, 0.9).iter().map(|m| (m.first, m.second)).collect();
         assert_eq!(m, [(0, 3), (2, 0)]);
     }

@@ -21,4 +21,4 @@ mod two_view;
 
 pub use geometry::{Fitted, Geometry, SparseModel, SparsePoint};
 pub use initialise::{SolvedCameras, dense, learned_features, place, sparse};
-pub use matching::Features;
+pub use matching::Keypoints;

@@ -4,7 +4,7 @@ use glam::DVec2;
 
 /// What two photos have in common.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Link {
+pub(super) struct SimilarityInliers {
     /// Matches that agree.
     pub matches: usize,
     /// Median distance of the agreeing matches from the similarity that explains them best, over the image diagonal: what
@@ -53,7 +53,7 @@ impl Similarity {
 
 /// The largest group of matches that one similarity explains roughly. Positions over the image diagonal; better matches
 /// first. Deterministic: pairs of neighbours in the list make the hypotheses.
-pub(super) fn agreement(matches: &[(DVec2, DVec2)]) -> Link {
+pub(super) fn agreement(matches: &[(DVec2, DVec2)]) -> SimilarityInliers {
     let inliers = |s: &Similarity| -> Vec<(DVec2, DVec2)> {
         matches.iter().filter(|m| s.distance(m) < AGREES).copied().collect()
     };
@@ -72,10 +72,10 @@ pub(super) fn agreement(matches: &[(DVec2, DVec2)]) -> Link {
         }
     }
     let Some(fitted) = (best.len() > 2).then(|| Similarity::fit(&best)).flatten() else {
-        return Link::default();
+        return SimilarityInliers::default();
     };
     let mut distances: Vec<f64> = inliers(&fitted).iter().map(|m| fitted.distance(m)).collect();
-    Link { matches: distances.len(), parallax: median(&mut distances).unwrap_or(0.0) }
+    SimilarityInliers { matches: distances.len(), parallax: median(&mut distances).unwrap_or(0.0) }
 }
 
 #[cfg(test)]
@@ -105,7 +105,7 @@ mod tests {
     fn random_matches_do_not() {
         let pairs: Vec<_> = scattered(60, 2).into_iter().zip(scattered(60, 3)).collect();
         assert!(agreement(&pairs).matches < 16, "{:?}", agreement(&pairs));
-        assert_eq!(agreement(&[]), Link::default());
+        assert_eq!(agreement(&[]), SimilarityInliers::default());
     }
 
     #[test]

@@ -108,7 +108,7 @@ pub struct Curve {
 
 /// Everything that `report.html` and `previews/` show.
 #[derive(Clone, Debug)]
-pub struct Report<'a> {
+pub struct HtmlReport<'a> {
     /// Headline, usually the name of the photo folder.
     pub title: &'a str,
     /// Training views.

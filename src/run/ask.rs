@@ -19,7 +19,7 @@ use crate::{Error, Result};
 /// let field = scene.language.ok_or_else(|| splatvk::Error::input("no language"))?;
 /// let encoder = Box::new(RegionWords::load(Registry::open(None)?)?);
 /// let mut ready = QueryScene::open(&Device::open(None)?, &scene.splats, field, encoder)?;
-/// ready.look(&scene.cameras)?;
+/// ready.set_views(&scene.cameras)?;
 /// let answers = ready.ask("lemon", &Default::default())?;
 /// println!("found in {} of {} views", answers.found(), answers.views.len());
 /// # Ok(())
@@ -51,7 +51,7 @@ impl QueryScene {
     }
 
     /// Renders and decodes the cameras that questions are answered for from now on.
-    pub fn look(&mut self, cameras: &[Camera]) -> Result<&[DecodedFrame]> {
+    pub fn set_views(&mut self, cameras: &[Camera]) -> Result<&[DecodedFrame]> {
         self.frames.clear();
         for camera in cameras {
             self.frames.push(self.viewer.view(camera)?);

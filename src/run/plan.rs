@@ -129,8 +129,8 @@ impl RunPlan {
         budget::check(&budget::Limits::now(device.info()), sizes, max_size, &work)
     }
 
-    fn work(&self, preset: Preset, photos: usize) -> budget::Work {
-        budget::Work::language(self.feature_dim, self.per_level, preset, photos)
+    fn work(&self, preset: Preset, photos: usize) -> budget::MemoryDemand {
+        budget::MemoryDemand::language(self.feature_dim, self.per_level, preset, photos)
     }
 
     /// The colour stage.

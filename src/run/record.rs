@@ -6,7 +6,7 @@ use crate::fit::{CurvePoint, FitStats, LanguagePoint};
 use crate::photo::Photo;
 use crate::pose::Fitted;
 use crate::report::viewer::Scene3d;
-use crate::report::{self, AnswerShown, Curve, ModelUsed, QueryShown, Report, RunRecord, ViewShown};
+use crate::report::{self, AnswerShown, Curve, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown};
 use crate::scene::{Camera, LEVEL_NAMES};
 use serde_json::json;
 use std::path::Path;
@@ -249,7 +249,7 @@ pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
         })
         .collect();
     let title = o.plan.out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    let report = Report {
+    let report = HtmlReport {
         title: &title,
         views,
         queries: o.answers.iter().map(shown).collect(),

@@ -1,11 +1,11 @@
 //! A scene scored against ground truth: rendered from every known camera, asked for every object.
-use super::refine::{Moved, ViewRefiner};
+use super::refine::{RefinedCamera, ViewRefiner};
 use super::view::{DecodedFrame, Viewer};
 use crate::Result;
 use crate::gpu::Device;
 use crate::pass::metrics;
 use crate::progress::Progress;
-use crate::query::eval::{Evaluation, RefinedView, Rendered, Report, Split, TruthFrame, colour_fit};
+use crate::query::eval::{EvalReport, Evaluation, RefinedView, Rendered, Split, TruthFrame, colour_fit};
 use crate::query::{QueryOptions, QueryResult, TextQuery, answer_with, field_relevancy};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
 
@@ -21,7 +21,7 @@ pub fn score_field(
     refine: bool,
     progress: &dyn Progress,
     look: &mut dyn FnMut(&TruthFrame, &DecodedFrame) -> Result<()>,
-) -> Result<Report> {
+) -> Result<EvalReport> {
     let labels: Vec<u32> = evaluation.phrases().into_iter().map(|p| p.0).collect();
     let options = QueryOptions::default();
     let relevancy = queries.iter().map(|q| field_relevancy(field, q)).collect::<Result<Vec<_>>>()?;
@@ -72,7 +72,7 @@ fn refined(
     (camera, given): (&Camera, &DecodedFrame),
     photo: &RgbImage,
     progress: &dyn Progress,
-) -> Result<(Option<DecodedFrame>, Moved)> {
+) -> Result<(Option<DecodedFrame>, RefinedCamera)> {
     let border = crate::photo::PlainBorder::of(photo);
     let inner = border.crop(photo);
     let closeness =

@@ -8,8 +8,8 @@ use crate::photo::{self, Candidate, Photo, stem};
 use crate::pipeline::Graph;
 use crate::pose::Geometry;
 use crate::progress::{Progress, Recorded};
-use crate::report::{self, Report, RunRecord, ViewShown};
-use crate::run::budget::{self, Limits, Work};
+use crate::report::{self, HtmlReport, RunRecord, ViewShown};
+use crate::run::budget::{self, Limits, MemoryDemand};
 use crate::run::stages::{self, CameraOrigin};
 use crate::run::view::Viewer;
 use crate::scene::{Camera, LanguageField, PointCloud};
@@ -65,7 +65,7 @@ fn matched(
     plan: &TrainPlan,
     known: &[Camera],
     max_size: usize,
-    work: impl Fn(usize) -> Work,
+    work: impl Fn(usize) -> MemoryDemand,
     device: &Device,
     progress: &dyn Progress,
 ) -> Result<Vec<Photo>> {
@@ -135,7 +135,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     })?;
     let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
-    let work = |photos| Work::colour(preset, photos);
+    let work = |photos| MemoryDemand::colour(preset, photos);
     let photos = matched(plan, &known, max_size, work, &device, progress)?;
     let registry = Registry::with(plan.models.as_deref(), Compute::by(plan.provider.as_deref()))?;
     let source = match given {
@@ -211,7 +211,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         light: p.light,
     });
     let title = plan.out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    let shown = Report {
+    let shown = HtmlReport {
         title: &title,
         views: views.collect(),
         queries: Vec::new(),

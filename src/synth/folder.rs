@@ -1,6 +1,6 @@
 //! Synthetic scenes on disk, in the layout of a ground-truth folder.
 use super::regions::{self, InjectedErrors};
-use super::render::{self, Seen};
+use super::render::{self, RayCast};
 use super::scene::{SceneSpec, SyntheticScene, world};
 use crate::format::npy::{self, NpyArray, NpyData};
 use crate::format::{cameras, create_folder, picture, write_json};
@@ -90,7 +90,7 @@ pub fn write_regions(data: &Path, out: &Path, flaws: &InjectedErrors) -> Result<
     Ok(())
 }
 
-fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &Seen, quality: u8) -> Result<String> {
+fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &RayCast, quality: u8) -> Result<String> {
     let place = if split == Split::Train { "images" } else { "held_out" };
     let (name, file) = (&camera.name, format!("{place}/{}.jpg", camera.name));
     let path = folder.join(&file);

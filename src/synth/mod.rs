@@ -8,6 +8,6 @@ mod shapes;
 
 pub use folder::{generate, write_regions};
 pub use phone::{Effects, PhotoEffects, TrueLight, to_linear, to_srgb};
-pub use render::{Seen, photo, render};
+pub use render::{RayCast, photo, render};
 pub use scene::{SceneObject, SceneSpec, SyntheticScene, world};
 pub use shapes::{Hit, Paint, Shape};

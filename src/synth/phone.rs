@@ -14,7 +14,7 @@ const K1: f64 = 0.15;
 const K2_SHARE: f64 = 1.0 / 3.0;
 /// Least slope of the distorted by the undistorted radius anywhere in the picture: below it the corners are squeezed to a
 /// quarter and no lens of a phone looks like that.
-const LEAST_SLOPE: f64 = 0.25;
+const MIN_SLOPE: f64 = 0.25;
 /// Largest offset of the principal point along x and along y, share of the width.
 const CENTRE: f64 = 0.01;
 /// Largest change of exposure between a photo and the scene's own light, stops.
@@ -74,7 +74,7 @@ fn fits(lens: &Lens, camera: &Camera) -> bool {
     // Walk outwards until the distorted radius covers the farthest corner.
     let mut x = DVec2::ZERO;
     while lens.distort(x).x < reach {
-        if lens.jacobian(x).x_axis.x < LEAST_SLOPE {
+        if lens.jacobian(x).x_axis.x < MIN_SLOPE {
             return false;
         }
         x.x += 0.01 * reach;

@@ -22,7 +22,7 @@ use std::path::Path;
 pub const DIM: usize = 512;
 
 /// Share of what an image feature has in common with its phrase, next to a common part of length 1.
-const MEANING: f32 = 0.6;
+const PHRASE_SHARE: f32 = 0.6;
 
 /// How often segmentation and description go wrong. Rates are per (view, object, level).
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
@@ -51,13 +51,13 @@ impl InjectedErrors {
     }
 }
 
-/// Masks with features per view, and what the phrases mean in that space.
+/// Masks with features per view, and the exact feature of every object.
 #[derive(Clone, Debug, Default)]
 pub struct Regions {
     /// One per frame, three levels.
     pub masks: Vec<ViewMasks>,
-    /// Object index → the flawless feature of the whole object.
-    pub meaning: BTreeMap<u32, Vec<f32>>,
+    /// Object index → the exact feature of the whole object.
+    pub embeddings: BTreeMap<u32, Vec<f32>>,
 }
 
 /// A direction that belongs to a name.
@@ -75,8 +75,8 @@ fn add(to: &mut [f32], v: &[f32], weight: f32) {
     to.iter_mut().zip(v).for_each(|(a, b)| *a += weight * b);
 }
 
-/// What a phrase means: its last word counts half as much again.
-fn meaning(phrase: &str) -> Vec<f32> {
+/// Direction of a phrase: the sum of those of its words, the last one 1.5 times.
+fn phrase_direction(phrase: &str) -> Vec<f32> {
     let words: Vec<String> = phrase.to_lowercase().split_whitespace().map(str::to_owned).collect();
     let mut sum = vec![0.0; DIM];
     for (k, word) in words.iter().enumerate() {
@@ -89,7 +89,7 @@ fn meaning(phrase: &str) -> Vec<f32> {
 /// Unit embedding of any text.
 pub fn text_embedding(phrase: &str) -> Vec<f32> {
     let mut sum = direction("every text");
-    add(&mut sum, &meaning(phrase), MEANING);
+    add(&mut sum, &phrase_direction(phrase), PHRASE_SHARE);
     normalise_rows(&mut sum, DIM);
     sum
 }
@@ -103,7 +103,7 @@ pub fn query(text: &str) -> TextQuery {
     }
 }
 
-/// Unit feature of an image region: what it means by `share`, and directions of its own.
+/// Unit feature of an image region: its phrase by `share`, and directions of its own.
 fn region_feature(
     phrase: &str,
     share: f32,
@@ -112,7 +112,7 @@ fn region_feature(
     random: &mut Random,
 ) -> Vec<f32> {
     let mut sum = direction("every image");
-    add(&mut sum, &meaning(phrase), share);
+    add(&mut sum, &phrase_direction(phrase), share);
     for (name, weight) in own {
         add(&mut sum, &direction(name), *weight);
     }
@@ -146,11 +146,11 @@ pub fn regions(truth: &GroundTruth, frames: &[&TruthFrame], flaws: &InjectedErro
         }
         masks.push(view);
     }
-    let meaning = truth
+    let embeddings = truth
         .labels
         .iter()
-        .map(|(&k, phrase)| (k, region_feature(phrase, MEANING, &[], 0.0, &mut Random::new(0))));
-    Ok(Regions { masks, meaning: meaning.collect() })
+        .map(|(&k, phrase)| (k, region_feature(phrase, PHRASE_SHARE, &[], 0.0, &mut Random::new(0))));
+    Ok(Regions { masks, embeddings: embeddings.collect() })
 }
 
 /// Per frame and pixel the quarter of its object, 0 to 3: signs along the object's two longest axes in space, so that all
@@ -241,14 +241,14 @@ fn one_level(
                 for (half, piece) in halves(&group, objects.width).into_iter().enumerate() {
                     let piece_name = format!("piece {phrase} {k} {half} {}", random.bits());
                     let own = [(piece_name.as_str(), 0.6)];
-                    let f = region_feature(shown, 0.55 * MEANING, &own, flaws.noise as f32, random);
+                    let f = region_feature(shown, 0.55 * PHRASE_SHARE, &own, flaws.noise as f32, random);
                     push(&mut out, &piece, f);
                 }
                 continue;
             }
             let part = format!("part {phrase} {level} {k}");
             let own: &[(&str, f32)] = &[(part.as_str(), [0.5, 0.35, 0.0][level])];
-            let share = if kinds == 1 { MEANING } else { [0.65, 0.8][level] * MEANING };
+            let share = if kinds == 1 { PHRASE_SHARE } else { [0.65, 0.8][level] * PHRASE_SHARE };
             let own = if kinds == 1 { &[][..] } else { own };
             push(&mut out, &group, region_feature(shown, share, own, flaws.noise as f32, random));
         }
@@ -369,7 +369,7 @@ mod tests {
     #[test]
     fn cosines_are_those_of_crops_and_phrases() {
         let mut random = Random::new(1000);
-        let mut f = |phrase: &str| region_feature(phrase, MEANING, &[], 0.35, &mut random);
+        let mut f = |phrase: &str| region_feature(phrase, PHRASE_SHARE, &[], 0.35, &mut random);
         let (a, b, c) = (f("blue mug"), f("blue mug"), f("lemon"));
         assert!((0.85..0.96).contains(&dot(&a, &b)), "same object {}", dot(&a, &b));
         assert!((0.55..0.75).contains(&dot(&a, &c)), "two objects {}", dot(&a, &c));
@@ -389,7 +389,7 @@ mod tests {
             let objects = truth.objects(frame).unwrap().unwrap();
             let whole = &view.levels[2];
             for (p, &l) in whole.labels.data.iter().enumerate() {
-                let expected = made.meaning.get(&objects.data[p]);
+                let expected = made.embeddings.get(&objects.data[p]);
                 let feature = usize::try_from(l).ok().map(|l| &whole.features[l * DIM..(l + 1) * DIM]);
                 if let (Some(e), Some(f)) = (expected, feature) {
                     assert!(dot(e, f) > 0.999);

@@ -16,7 +16,7 @@ const SAMPLES: usize = 2;
 
 /// One view of a scene; depth and mask are those of the pixel centres.
 #[derive(Clone, Debug)]
-pub struct Seen {
+pub struct RayCast {
     /// The photo.
     pub image: RgbImage,
     /// Camera z, metres.
@@ -60,7 +60,7 @@ fn picture(world: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, noise: 
 }
 
 /// Renders a view; `noise` is the standard deviation of the photo's noise.
-pub fn render(world: &SyntheticScene, camera: &Camera, noise: f64, seed: u64) -> Seen {
+pub fn render(world: &SyntheticScene, camera: &Camera, noise: f64, seed: u64) -> RayCast {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let to_world = camera.pose.inverse();
     // The ray has camera z 1: its parameter is the depth.
@@ -70,7 +70,7 @@ pub fn render(world: &SyntheticScene, camera: &Camera, noise: f64, seed: u64) ->
         hit.map_or((0.0, 0), |(t, h)| (h.t as f32, t.label))
     };
     let pixels: Vec<(f32, u32)> = (0..width * height).into_par_iter().map(cast).collect();
-    Seen {
+    RayCast {
         image: picture(world, camera, None, noise, seed),
         depth: Plane { width, height, data: pixels.iter().map(|p| p.0).collect() },
         objects: Plane { width, height, data: pixels.iter().map(|p| p.1).collect() },
@@ -78,7 +78,7 @@ pub fn render(world: &SyntheticScene, camera: &Camera, noise: f64, seed: u64) ->
 }
 
 /// A view as its phone takes it; depth and mask are those of the undistorted pinhole.
-pub fn photo(world: &SyntheticScene, shot: &PhotoEffects, noise: f64, seed: u64) -> Seen {
+pub fn photo(world: &SyntheticScene, shot: &PhotoEffects, noise: f64, seed: u64) -> RayCast {
     let mut seen = render(world, &shot.camera, noise, seed);
     if let Some(lens) = &shot.lens {
         seen.image = picture(world, &shot.camera, Some(lens), noise, seed);
@@ -92,7 +92,7 @@ mod tests {
     use super::super::scene::{SceneSpec, world};
     use super::*;
 
-    fn small(seed: u64) -> (SyntheticScene, Vec<Seen>) {
+    fn small(seed: u64) -> (SyntheticScene, Vec<RayCast>) {
         let knobs =
             SceneSpec { seed, size: (160, 120), thin: 1, similar: 1, held_out: 2, ..SceneSpec::default() };
         let world = world(&knobs).unwrap();
@@ -154,7 +154,7 @@ mod tests {
             (world, seen)
         };
         // bare surfaces: neighbouring pixels of the table are alike
-        let rough = |s: &Seen| {
+        let rough = |s: &RayCast| {
             let l = s.image.luma();
             let pairs =
                 (0..l.data.len() - 1).filter(|&p| s.objects.data[p] == 1 && s.objects.data[p + 1] == 1);

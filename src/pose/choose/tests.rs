@@ -74,10 +74,10 @@ fn blurred_repeated_and_foreign_photos_are_left_out() {
     assert!(["b.jpg", "f.jpg", "h.jpg"].iter().all(|n| used.iter().any(|u| u == n)), "{choice:?}");
     let reason = |name: &str| choice.left_out.iter().find(|(n, _)| n == name).map(|(_, r)| r.clone());
     assert_eq!(reason("a_blurred.png"), Some(Reason::Blurred));
-    assert_eq!(reason("z_elsewhere.png"), Some(Reason::NothingInCommon));
+    assert_eq!(reason("z_elsewhere.png"), Some(Reason::NoOverlap));
     let (other, same) =
         choice.left_out.iter().find(|(n, _)| ["d.jpg", "e_again.png"].contains(&n.as_str())).unwrap();
-    assert!(matches!(same, Reason::NearlyTheSameAs(n) if n != other && used.contains(n)), "{choice:?}");
+    assert!(matches!(same, Reason::Duplicate(n) if n != other && used.contains(n)), "{choice:?}");
     let message = choice.message();
     assert!(
         message.starts_with("using 4 of 7 photos: ") && message.contains("a_blurred.png (blurred)"),
@@ -95,7 +95,7 @@ fn as_many_photos_as_views_are_all_used() {
 
 #[test]
 fn long_lists_are_cut_short() {
-    let left_out = (0..30).map(|i| (format!("{i:02}.jpg"), Reason::AddsLittle)).collect();
+    let left_out = (0..30).map(|i| (format!("{i:02}.jpg"), Reason::LittleNewArea)).collect();
     let choice = Choice { used: vec!["a.jpg".into(), "b.jpg".into()], left_out };
     let message = choice.message();
     assert!(
@@ -111,7 +111,7 @@ fn photos_of_two_places_are_not_mixed() {
     let n = 11;
     let link = |i: usize, j: usize| {
         let matches = if i != j && place(i) == place(j) { 60 } else { 3 };
-        Link { matches, parallax: 0.05 }
+        SimilarityInliers { matches, parallax: 0.05 }
     };
     let links = (0..n).map(|i| (0..n).map(|j| link(i, j)).collect()).collect();
     let graph = Graph { links, quality: vec![1.0; n], same: vec![vec![false; n]; n] };
@@ -119,7 +119,7 @@ fn photos_of_two_places_are_not_mixed() {
     // Two of each place would show more in all, but no camera of one could be placed among those of the other.
     assert!(chosen.iter().all(|i| !place(*i)), "{chosen:?}");
     let names: Vec<String> = (0..n).map(|i| i.to_string()).collect();
-    assert_eq!(graph.reason(4, &chosen, &names), Reason::NothingInCommon);
+    assert_eq!(graph.reason(4, &chosen, &names), Reason::NoOverlap);
     let left = [0, 1, 2, 6, 7, 8].into_iter().find(|i| !chosen.contains(i)).unwrap();
-    assert_eq!(graph.reason(left, &chosen, &names), Reason::AddsLittle);
+    assert_eq!(graph.reason(left, &chosen, &names), Reason::LittleNewArea);
 }

@@ -16,9 +16,9 @@ const ROUNDS: usize = 12;
 /// Standard deviations that an effect must exceed before it is taken out.
 const SIGNIFICANT: f64 = 4.0;
 /// Smallest exposure or colour difference worth touching photos for, ln.
-const LEAST_GAIN: f64 = 0.01;
+const MIN_GAIN: f64 = 0.01;
 /// Smallest loss in the corners worth touching photos for, ln.
-const LEAST_FALLOFF: f64 = 0.03;
+const MIN_FALLOFF: f64 = 0.03;
 
 /// One of the three linear problems.
 #[derive(Clone, Copy)]
@@ -53,13 +53,13 @@ pub(super) struct Solution {
 
 impl Solution {
     pub(super) fn gains_matter(&self) -> bool {
-        self.gain.iter().zip(&self.sigma).any(|(g, d)| g.abs() > LEAST_GAIN.max(SIGNIFICANT * d))
+        self.gain.iter().zip(&self.sigma).any(|(g, d)| g.abs() > MIN_GAIN.max(SIGNIFICANT * d))
     }
 
     /// Per lens: darker corners than chance explains. Brighter ones are no vignetting.
     fn falloff_matters(&self) -> Vec<bool> {
         let corner = self.falloff.iter().map(|f| f[0] + f[1]);
-        corner.zip(&self.corner_sigma).map(|(v, d)| -v > LEAST_FALLOFF.max(SIGNIFICANT * d)).collect()
+        corner.zip(&self.corner_sigma).map(|(v, d)| -v > MIN_FALLOFF.max(SIGNIFICANT * d)).collect()
     }
 }
 

@@ -5,7 +5,7 @@ use super::optics::learn_optics;
 use super::patch::Shades;
 use super::refine;
 use super::relate::{Matches, Pair, THRESHOLD};
-use super::tracks::{self, Link};
+use super::tracks::{self, KeypointMatch};
 use crate::photo::{Photo, Straightening};
 use crate::pose::bundle::Adjusted;
 use crate::pose::matching;
@@ -136,15 +136,15 @@ fn bend(model: &Model, photos: &[Photo]) -> f64 {
 }
 
 /// Links of the matches that agree with the model's cameras within `threshold` pixels.
-pub(super) fn inlier_matches(model: &Model, matches: &[Matches], threshold: f64) -> Vec<Link> {
+pub(super) fn inlier_matches(model: &Model, matches: &[Matches], threshold: f64) -> Vec<KeypointMatch> {
     matches.par_iter().flat_map_iter(|pair| inliers_of(model, pair, threshold)).collect()
 }
 
-fn inliers_of(model: &Model, pair: &Matches, threshold: f64) -> Vec<Link> {
+fn inliers_of(model: &Model, pair: &Matches, threshold: f64) -> Vec<KeypointMatch> {
     let (i, j) = (pair.first, pair.second);
     let (Some(a), Some(b)) = (model.poses[i], model.poses[j]) else { return Vec::new() };
     let f = fundamental(&b.compose(&a.inverse()), model.focal(i), model.focal(j));
-    let close = |m: &&(DVec2, DVec2, Link)| {
+    let close = |m: &&(DVec2, DVec2, KeypointMatch)| {
         sampson(&f, model.straight(i, m.0), model.straight(j, m.1)) < threshold * threshold
     };
     pair.list.iter().filter(close).map(|m| m.2).collect()

@@ -6,7 +6,7 @@ use super::relate::{THRESHOLD, putative_matches};
 use super::tracks;
 use crate::photo::Photo;
 use crate::pose::bundle::{Optics, OpticsPrior};
-use crate::pose::matching::Features;
+use crate::pose::matching::Keypoints;
 use crate::pose::{SparseModel, SparsePoint};
 use crate::progress::Progress;
 use crate::scene::{Camera, Lens};
@@ -24,7 +24,7 @@ const MIN_AGREEMENT: f64 = 0.1;
 pub fn with_cameras(
     photos: &[Photo],
     cameras: &[Camera],
-    features: &[Features],
+    features: &[Keypoints],
     progress: &dyn Progress,
 ) -> Result<SparseModel> {
     if photos.len() < 2 || photos.len() != cameras.len() {

@@ -5,13 +5,13 @@ use crate::progress::Silent;
 use crate::scene::{Camera, RgbImage};
 
 /// Learned features when the model pack is installed.
-fn learned(photos: &[Photo]) -> Vec<Features> {
+fn learned(photos: &[Photo]) -> Vec<Keypoints> {
     let Ok(registry) = crate::infer::Registry::open(None) else { return Vec::new() };
     let Ok(mut xfeat) = crate::infer::xfeat::XFeat::load(&registry) else { return Vec::new() };
-    photos.iter().map(|p| Features::from(xfeat.detect(&p.image, 4096).unwrap())).collect()
+    photos.iter().map(|p| Keypoints::from(xfeat.detect(&p.image, 4096).unwrap())).collect()
 }
 
-fn check(name: &str, features: impl Fn(&[Photo]) -> Vec<Features>, rotation: f64, centre: f64, focal: f64) {
+fn check(name: &str, features: impl Fn(&[Photo]) -> Vec<Keypoints>, rotation: f64, centre: f64, focal: f64) {
     let truth = testing::train(&testing::folder());
     let start = std::time::Instant::now();
     let features = features(&truth.photos);

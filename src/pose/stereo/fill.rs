@@ -3,7 +3,7 @@
 use super::Level;
 use super::colours::ColourModel;
 use super::planes::WorldPlane;
-use super::surface::{Links, Surface, Visibility, free_space, neighbours, ray};
+use super::surface::{RelativePoses, Surface, Visibility, free_space, neighbours, ray};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::cmp::Reverse;
@@ -57,7 +57,13 @@ pub fn open_rims(level: &Level, surface: &Surface, radius: usize) -> Surface {
 }
 
 /// Gives every pixel that is not void a plane. `surface` holds the consistent pixels, its planes smoothed.
-pub fn fill(level: &Level, links: &Links, surface: &Surface, large: &[WorldPlane], void: &[bool]) -> Surface {
+pub fn fill(
+    level: &Level,
+    links: &RelativePoses,
+    surface: &Surface,
+    large: &[WorldPlane],
+    void: &[bool],
+) -> Surface {
     let views: Vec<(Vec<Vec3>, Vec<f32>)> = (0..level.cameras.len())
         .into_par_iter()
         .map(|view| ViewFill::new(level, links, surface, void, view).run(large))
@@ -72,7 +78,7 @@ pub fn fill(level: &Level, links: &Links, surface: &Surface, large: &[WorldPlane
 
 struct ViewFill<'a> {
     level: &'a Level,
-    links: &'a Links,
+    links: &'a RelativePoses,
     surface: &'a Surface,
     void: &'a [bool],
     view: usize,
@@ -82,7 +88,13 @@ struct ViewFill<'a> {
 }
 
 impl<'a> ViewFill<'a> {
-    fn new(level: &'a Level, links: &'a Links, surface: &'a Surface, void: &'a [bool], view: usize) -> Self {
+    fn new(
+        level: &'a Level,
+        links: &'a RelativePoses,
+        surface: &'a Surface,
+        void: &'a [bool],
+        view: usize,
+    ) -> Self {
         let r = &level.references[view];
         let (width, height, first) = (r.width as usize, r.height as usize, r.first as usize);
         ViewFill { level, links, surface, void, view, width, height, first }

@@ -103,7 +103,7 @@ pub fn finish(
     options: &StereoOptions,
 ) -> (Vec<DepthMap>, PointCloud) {
     let void = void::white_border(level);
-    let links = surface::Links::new(level);
+    let links = surface::RelativePoses::new(level);
     let consistent = surface::consistent_surface(level, &links, matched, &void);
     let fitted = surface::smoothed(level, &consistent, FIT_RADIUS);
     let large = planes::large_planes(level, &fitted, options.seed);

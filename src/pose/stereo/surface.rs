@@ -57,15 +57,15 @@ pub enum Visibility {
 }
 
 /// Maps between the cameras of a level, in f32.
-pub struct Links {
+pub struct RelativePoses {
     /// `to[a * views + b]`: rotation and translation of frame a → frame b.
     to: Vec<(glam::Mat3, Vec3)>,
     views: usize,
 }
 
-impl Links {
+impl RelativePoses {
     /// Precomputes all pairs.
-    pub fn new(level: &Level) -> Links {
+    pub fn new(level: &Level) -> RelativePoses {
         let views = level.cameras.len();
         let mut to = Vec::with_capacity(views * views);
         for a in &level.cameras {
@@ -75,7 +75,7 @@ impl Links {
                 to.push((r.as_mat3(), relative.translation.as_vec3()));
             }
         }
-        Links { to, views }
+        RelativePoses { to, views }
     }
 
     /// Depth and pixel of a point of frame `a` in view `b`, if it falls into the image.
@@ -163,7 +163,7 @@ pub fn map_pixels<T: Send>(level: &Level, f: impl Fn(usize, usize, usize, usize)
 }
 
 /// Keeps what at least one other view confirms and none that confirmed itself contradicts more often.
-pub fn consistent_surface(level: &Level, links: &Links, matched: &[Vec4], void: &[bool]) -> Surface {
+pub fn consistent_surface(level: &Level, links: &RelativePoses, matched: &[Vec4], void: &[bool]) -> Surface {
     let mut surface = Surface {
         planes: matched.iter().map(|p| p.truncate()).collect(),
         confidence: matched
@@ -206,7 +206,7 @@ pub fn consistent_surface(level: &Level, links: &Links, matched: &[Vec4], void: 
 /// confirmation means occlusion or error, and nothing is added.
 fn with_plausible(
     level: &Level,
-    links: &Links,
+    links: &RelativePoses,
     confirmed: &Surface,
     matched: &[Vec4],
     void: &[bool],

@@ -123,7 +123,7 @@ pub struct MaskScore {
 
 /// Means over one split.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Summary {
+pub struct SplitSummary {
     /// Mean PSNR, dB.
     pub psnr: Option<f64>,
     /// Mean SSIM.
@@ -222,12 +222,12 @@ pub struct RefinedScore {
     /// As in the report.
     pub masks: Vec<MaskScore>,
     /// Means.
-    pub summary: Summary,
+    pub summary: SplitSummary,
 }
 
 /// Everything `splatvk eval` reports.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Report {
+pub struct EvalReport {
     /// What each figure is, one line each.
     pub definitions: Vec<String>,
     /// Per train view.
@@ -239,7 +239,7 @@ pub struct Report {
     /// Per object and frame; background labels are not listed.
     pub masks: Vec<MaskScore>,
     /// Means per split, `train` and `test`.
-    pub summary: BTreeMap<String, Summary>,
+    pub summary: BTreeMap<String, SplitSummary>,
     /// Held-out frames from refined cameras, if asked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refined: Option<RefinedScore>,
@@ -251,7 +251,7 @@ pub struct Evaluation {
     similarity: Similarity,
     optics_offset: OpticsOffset,
     out: Option<PathBuf>,
-    report: Report,
+    report: EvalReport,
 }
 
 impl Evaluation {
@@ -278,7 +278,8 @@ impl Evaluation {
         let known: Vec<Camera> = frames.iter().map(|f| f.camera.clone()).collect();
         let errors = pose_errors(&estimated, &known, mean_depth);
         let relative_poses = relative(&frames, &estimated, &known, asked);
-        let report = Report { poses: pose_scores(&frames, &errors), relative_poses, ..Report::default() };
+        let report =
+            EvalReport { poses: pose_scores(&frames, &errors), relative_poses, ..EvalReport::default() };
         let (similarity, optics_offset) = (errors.similarity, OpticsOffset::of(&estimated, &known));
         Ok(Evaluation { similarity, optics_offset, out: out.map(Path::to_path_buf), report, truth })
     }
@@ -405,7 +406,7 @@ impl Evaluation {
     }
 
     /// The report with its means.
-    pub fn finish(mut self) -> Report {
+    pub fn finish(mut self) -> EvalReport {
         self.report.definitions = DEFINITIONS.map(String::from).to_vec();
         for split in [Split::Train, Split::Test] {
             let summary = summarise(&self.report.images, &self.report.masks, split);
@@ -446,7 +447,7 @@ fn relative(frames: &[&TruthFrame], estimated: &[Camera], known: &[Camera], aske
     }
 }
 
-fn summarise(images: &[ImageScore], masks: &[MaskScore], split: Split) -> Summary {
+fn summarise(images: &[ImageScore], masks: &[MaskScore], split: Split) -> SplitSummary {
     let mean = |v: Vec<f64>| (!v.is_empty()).then(|| v.iter().sum::<f64>() / v.len() as f64);
     let images: Vec<&ImageScore> = images.iter().filter(|i| i.split == split).collect();
     let masks: Vec<&MaskScore> = masks.iter().filter(|m| m.split == split).collect();
@@ -454,7 +455,7 @@ fn summarise(images: &[ImageScore], masks: &[MaskScore], split: Split) -> Summar
     for m in &masks {
         per_phrase.entry(m.phrase.clone()).or_default().push(m.iou);
     }
-    Summary {
+    SplitSummary {
         psnr: mean(images.iter().map(|i| i.psnr).collect()),
         ssim: mean(images.iter().map(|i| i.ssim).collect()),
         psnr_colour_fit: mean(images.iter().map(|i| i.psnr_colour_fit).collect()),

@@ -12,7 +12,10 @@ mod score;
 #[cfg(test)]
 mod tests;
 
-pub use score::{CodeScores, Masks, Protocol, ProtocolKind, Report, Score, Seen, Summary, View};
+pub use score::{
+    CodeScores, DecodedView, LabelledView, Masks, Protocol, ProtocolKind, ProtocolReport, ProtocolSummary,
+    Score,
+};
 
 use crate::Result;
 use crate::scene::Camera;

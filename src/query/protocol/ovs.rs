@@ -1,7 +1,7 @@
 //! 3D-OVS (docs/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and the data set's own argmax.
 use super::score::{
-    Masks, OwnLabels, Protocol, ProtocolKind, Report, Score, Seen, View, mask_iou, mean, nearest, place,
-    summarise,
+    DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score, mask_iou,
+    mean, nearest, place, summarise,
 };
 use crate::query::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, Split};
 use crate::scene::{Camera, Plane};
@@ -26,7 +26,7 @@ const ARGMAX: &str = "argmax";
 
 /// The labels and what was scored so far.
 pub(super) struct Ovs {
-    views: Vec<View>,
+    views: Vec<LabelledView>,
     source: LabelSource,
     classes: Vec<String>,
     scores: Vec<Score>,
@@ -59,7 +59,7 @@ impl Ovs {
     }
 
     /// Mask per class of a frame; `None` where the frame does not label it.
-    fn truth(&self, view: &View) -> Result<Vec<Option<Plane<bool>>>> {
+    fn truth(&self, view: &LabelledView) -> Result<Vec<Option<Plane<bool>>>> {
         match &self.source {
             LabelSource::Folder(root) => {
                 let one = |class: &String| {
@@ -171,7 +171,7 @@ pub(super) fn authors_rule(levels: &[(usize, Plane<f32>)]) -> Option<Answer> {
 }
 
 impl Protocol for Ovs {
-    fn views(&self) -> &[View] {
+    fn views(&self) -> &[LabelledView] {
         &self.views
     }
 
@@ -179,7 +179,7 @@ impl Protocol for Ovs {
         self.classes.clone()
     }
 
-    fn add(&mut self, index: usize, seen: &Seen) -> Result<Masks> {
+    fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks> {
         let view = self.views[index].clone();
         let truth = self.truth(&view)?;
         let (mut masks, classes) = (Masks::new(), self.classes.clone());
@@ -218,7 +218,7 @@ impl Protocol for Ovs {
         Ok(masks)
     }
 
-    fn finish(self: Box<Self>) -> Report {
+    fn finish(self: Box<Self>) -> ProtocolReport {
         let figures = |of: &[&Score]| {
             let mut out = BTreeMap::new();
             for (rule, name) in [(PAPER, "miou"), (AUTHORS, "miou_authors"), (ARGMAX, "miou_argmax")] {
@@ -235,7 +235,7 @@ impl Protocol for Ovs {
             out.insert("substituted".into(), substituted as f64);
             out
         };
-        Report {
+        ProtocolReport {
             protocol: ProtocolKind::Ovs,
             definitions: [
                 "miou (the paper's text): per level relevancy > 0.8; of the levels with more than 2000 such pixels the one \

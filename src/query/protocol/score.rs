@@ -25,7 +25,7 @@ pub enum ProtocolKind {
 
 /// A frame to look from.
 #[derive(Clone, Debug, PartialEq)]
-pub struct View {
+pub struct LabelledView {
     /// File stem, the key of its labels.
     pub stem: String,
     /// Train = the scene was made from this photo.
@@ -57,7 +57,7 @@ pub struct Score {
 
 /// Means over one split.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Summary {
+pub struct ProtocolSummary {
     /// `miou` and the protocol's other figures.
     #[serde(flatten)]
     pub figures: BTreeMap<String, f64>,
@@ -67,7 +67,7 @@ pub struct Summary {
 
 /// The figures and what they mean.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Report {
+pub struct ProtocolReport {
     /// Name of the protocol.
     pub protocol: ProtocolKind,
     /// What each figure is, one line each.
@@ -75,7 +75,7 @@ pub struct Report {
     /// Every single score.
     pub scores: Vec<Score>,
     /// Per split that has frames.
-    pub summary: BTreeMap<String, Summary>,
+    pub summary: BTreeMap<String, ProtocolSummary>,
 }
 
 /// A predicted mask, for whoever wants to keep it: (phrase, mask).
@@ -84,13 +84,13 @@ pub type Masks = Vec<(String, Plane<bool>)>;
 /// A data set under a protocol.
 pub trait Protocol {
     /// Labelled frames that have a camera.
-    fn views(&self) -> &[View];
+    fn views(&self) -> &[LabelledView];
     /// The texts to ask, in the order that [`CodeScores`] holds them.
     fn prompts(&self) -> Vec<String>;
     /// Scores the frame `views()[index]`; returns the masks of the protocol's first rule.
-    fn add(&mut self, index: usize, seen: &Seen) -> Result<Masks>;
+    fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks>;
     /// The figures.
-    fn finish(self: Box<Self>) -> Report;
+    fn finish(self: Box<Self>) -> ProtocolReport;
 }
 
 /// What each code says to each prompt.
@@ -118,14 +118,14 @@ impl CodeScores {
 }
 
 /// One decoded frame.
-pub struct Seen<'a> {
+pub struct DecodedView<'a> {
     /// Per level, code per pixel, −1 = nothing there.
     pub codes: &'a [Plane<i32>],
     /// Scores of those codes.
     pub scores: &'a CodeScores,
 }
 
-impl Seen<'_> {
+impl DecodedView<'_> {
     /// (level, relevancy map) of the levels that have codes; 0 where nothing is.
     pub(super) fn relevancy(&self, prompt: usize) -> Vec<(usize, Plane<f32>)> {
         let levels = self.codes.iter().zip(&self.scores.relevancy[prompt]).enumerate();
@@ -192,7 +192,7 @@ pub(super) fn mask_iou(predicted: &Plane<bool>, truth: &Plane<bool>) -> Result<f
 
 /// Where the labelled frames stand: the scene's own cameras for its photos; for others the known ones, carried over by
 /// the similarity that the shared photos give.
-pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Result<Vec<View>> {
+pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Result<Vec<LabelledView>> {
     let own = |s: &str| scene.iter().find(|c| stem(&c.name) == s);
     let shared: Vec<(Camera, Camera)> =
         known.iter().filter_map(|k| own(stem(&k.name)).map(|c| (c.clone(), k.clone()))).collect();
@@ -204,9 +204,9 @@ pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Res
     let mut views = Vec::new();
     for name in stems {
         if let Some(camera) = own(name) {
-            views.push(View { stem: name.clone(), split: Split::Train, camera: camera.clone() });
+            views.push(LabelledView { stem: name.clone(), split: Split::Train, camera: camera.clone() });
         } else if let (Some(s), Some(camera)) = (&similarity, known.iter().find(|k| stem(&k.name) == *name)) {
-            views.push(View { stem: name.clone(), split: Split::Test, camera: to_scene(camera, s) });
+            views.push(LabelledView { stem: name.clone(), split: Split::Test, camera: to_scene(camera, s) });
         }
     }
     if views.is_empty() {
@@ -222,7 +222,7 @@ pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Res
 /// Labels of a `ground_truth.json` folder for the protocols that score masks per phrase.
 pub(super) struct OwnLabels {
     pub(super) truth: GroundTruth,
-    pub(super) views: Vec<View>,
+    pub(super) views: Vec<LabelledView>,
     pub(super) phrases: Vec<(u32, String)>,
 }
 
@@ -234,7 +234,7 @@ impl OwnLabels {
         let truth = GroundTruth::read(folder)?;
         let evaluation = Evaluation::new(truth.clone(), scene, None)?;
         let phrases = evaluation.phrases();
-        let view = |(f, camera): (crate::query::eval::TruthFrame, Camera)| View {
+        let view = |(f, camera): (crate::query::eval::TruthFrame, Camera)| LabelledView {
             stem: f.stem,
             split: f.split,
             camera,
@@ -243,7 +243,7 @@ impl OwnLabels {
     }
 
     /// Object index per pixel of a view.
-    pub(super) fn objects(&self, view: &View) -> Result<Option<Plane<u32>>> {
+    pub(super) fn objects(&self, view: &LabelledView) -> Result<Option<Plane<u32>>> {
         match self.truth.frames.iter().find(|f| f.stem == view.stem) {
             Some(frame) => self.truth.objects(frame),
             None => Ok(None),
@@ -261,7 +261,7 @@ pub(super) fn summarise(
     scores: &[Score],
     rule: &str,
     figures: impl Fn(&[&Score]) -> BTreeMap<String, f64>,
-) -> BTreeMap<String, Summary> {
+) -> BTreeMap<String, ProtocolSummary> {
     let mut out = BTreeMap::new();
     for split in [Split::Train, Split::Test] {
         let of: Vec<&Score> = scores.iter().filter(|s| s.split == split).collect();
@@ -273,7 +273,7 @@ pub(super) fn summarise(
             iou.entry(s.phrase.clone()).or_default().push(s.iou);
         }
         let iou = iou.into_iter().filter_map(|(k, v)| mean(v.into_iter()).map(|m| (k, m))).collect();
-        out.insert(split.name().to_string(), Summary { figures: figures(&of), iou });
+        out.insert(split.name().to_string(), ProtocolSummary { figures: figures(&of), iou });
     }
     out
 }

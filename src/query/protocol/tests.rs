@@ -160,7 +160,7 @@ fn lerf_equals_a_plain_computation() {
         assert_eq!(protocol.prompts(), ["cup", "plate"]);
         let queries: Vec<TextQuery> = protocol.prompts().iter().map(|p| query(p, &mut random)).collect();
         let scores = CodeScores::new(&field, &queries).unwrap();
-        let masks = protocol.add(0, &Seen { codes: &codes, scores: &scores }).unwrap();
+        let masks = protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
         let report = protocol.finish();
         assert_eq!(report.scores.len(), 4);
         let mut ious = Vec::new();
@@ -236,7 +236,7 @@ fn lerf_ties_go_to_the_finer_level_and_larger_labels_resample() {
     let codes = vec![map.clone(), Plane::filled(W, H, -1), map];
     let mut protocol = open(ProtocolKind::Lerf, folder.path(), &scene, &[]).unwrap();
     let scores = CodeScores::new(&field, &[q]).unwrap();
-    protocol.add(0, &Seen { codes: &codes, scores: &scores }).unwrap();
+    protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
     let report = protocol.finish();
     assert_eq!(report.scores[0].level, Some(0));
     assert_eq!(report.scores[0].localised, Some(true));
@@ -318,7 +318,7 @@ fn ovs_rules_equal_plain_computations() {
             }
         }
         let scores = CodeScores::new(&field, &queries).unwrap();
-        protocol.add(0, &Seen { codes: &codes, scores: &scores }).unwrap();
+        protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
         let report = protocol.finish();
         let value = |level: usize, c: usize, p: usize| -> Option<f64> {
             let k = usize::try_from(codes[level].data[p]).ok()?;
@@ -451,7 +451,7 @@ fn scannet_counts_eight_labels_and_places_frames_by_their_poses() {
     let queries: Vec<TextQuery> = protocol.prompts().iter().map(|p| query(p, &mut random)).collect();
     let scores = CodeScores::new(&field, &queries).unwrap();
     for index in 0..3 {
-        protocol.add(index, &Seen { codes: &codes, scores: &scores }).unwrap();
+        protocol.add(index, &DecodedView { codes: &codes, scores: &scores }).unwrap();
     }
     let report = protocol.finish();
     let label = |x: usize, y: usize| match raw(x, y) {
@@ -500,7 +500,7 @@ fn scannet_counts_eight_labels_and_places_frames_by_their_poses() {
     // without the table, raw ids beyond NYU40 are refused
     std::fs::remove_file(folder.path().join("scannetv2-labels.combined.tsv")).unwrap();
     let mut bare = open(ProtocolKind::ScanNet, &dir, &scene, &[]).unwrap();
-    let error = bare.add(0, &Seen { codes: &codes, scores: &scores }).unwrap_err().to_string();
+    let error = bare.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap_err().to_string();
     assert!(error.contains("scannetv2-labels.combined.tsv"), "{error}");
 }
 
@@ -529,7 +529,7 @@ fn own_ground_truth_serves_lerf_and_ovs() {
         assert_eq!(protocol.views().len(), 12);
         let queries: Vec<TextQuery> = protocol.prompts().iter().map(ask).collect();
         let scores = CodeScores::new(&field, &queries).unwrap();
-        protocol.add(0, &Seen { codes: &codes, scores: &scores }).unwrap();
+        protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
         let figures = protocol.finish().summary["train"].figures.clone();
         assert_eq!(figures[figure], 1.0, "{kind:?}");
         match kind {
