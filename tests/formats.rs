@@ -5,7 +5,7 @@ use splatvk::format::{
     cameras, colmap, gaussians, ply, ply_packed, scene_dir, side_file, splat, spz, transforms,
 };
 use splatvk::photo::{self, stem};
-use splatvk::scene::{Camera, Codebook, LanguageField, Lens, LevelField, PointCloud, Pose, Splats};
+use splatvk::scene::{Camera, Codebook, LanguageField, Lens, LevelField, MaskId, PointCloud, Pose, Splats};
 use std::path::{Path, PathBuf};
 
 fn data(name: &str) -> PathBuf {
@@ -134,7 +134,7 @@ fn field(n: usize) -> LanguageField {
         embeddings: vec![1.0, 0.0, 0.0, 0.0, 0.6, 0.8],
         codes: vec![1.0, 0.0, 0.0, 1.0],
         weights: vec![12.0, 3.5],
-        members: vec![vec![(0, 4), (2, 1)], vec![]],
+        members: vec![vec![MaskId::new(0, 4), MaskId::new(2, 1)], vec![]],
         min_chord: 2f32.sqrt(),
     };
     let mut features = vec![0.0; n * 2];

@@ -2,7 +2,7 @@
 use super::stages::{
     EncoderEmbeddings, MaskEmbeddings, ObjectEmbeddings, Score, Scored, SyntheticEmbeddings, SyntheticMasks,
 };
-use super::tables::{Available, Regions, Setup};
+use super::tables::{Available, NetworkFamily, Regions, Setup};
 use crate::fit::{LanguageOptions, Preset, RgbOptions, Trained, TrainedLanguage};
 use crate::gpu::Device;
 use crate::infer::Registry;
@@ -112,14 +112,14 @@ impl<'a> Runner<'a> {
         let of = |split| self.truth.frames.iter().filter(|f| f.split == split).count();
         let there = inventory(&self.registry);
         let families = |task| {
-            let mut all: Vec<(String, bool)> = Vec::new();
+            let mut all: Vec<NetworkFamily> = Vec::new();
             for model in catalogue().iter().filter(|k| k.task == task) {
                 let installed = there
                     .models
                     .iter()
                     .any(|m| m.tasks.contains(&task) && m.family == model.family && !m.untrained());
-                if all.iter().all(|(name, _)| *name != model.family) {
-                    all.push((model.family.clone(), installed));
+                if all.iter().all(|f| f.name != model.family) {
+                    all.push(NetworkFamily { name: model.family.clone(), installed });
                 }
             }
             all

@@ -11,7 +11,7 @@ mod tables;
 pub use lab::{RowFigures, Runner, feature_bytes};
 pub use stages::{EmbeddingAgreement, Scored};
 pub use table::{FinishedRow, FinishedTable, figures};
-pub use tables::{Available, Regions, RowWork, Setup, TABLES, Table, TableRow, table};
+pub use tables::{Available, NetworkFamily, Regions, RowWork, Setup, TABLES, Table, TableRow, table};
 
 use crate::fit::{LanguageOptions, Preset, RgbOptions};
 use crate::query::eval::Split;

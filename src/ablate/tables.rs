@@ -126,13 +126,11 @@ pub static TABLES: [Table; 9] = [
         columns: &[("SIM", 3), ("codes", 0)],
         regions: |seed, available| {
             let own = [Regions::built_in(), Regions::flawed(seed), Regions::EXACT];
-            own.into_iter()
-                .chain(available.features.iter().map(|(name, _)| Regions::described_by(name)))
-                .collect()
+            own.into_iter().chain(available.features.iter().map(|f| Regions::described_by(&f.name))).collect()
         },
         rows: |group| {
             let name = group.base.regions.name();
-            let absent = group.available.features.iter().any(|(n, there)| *n == name && !there);
+            let absent = group.available.features.iter().any(|f| f.name == name && !f.installed);
             vec![group.if_installed(&name, group.base.clone(), !absent)]
         },
     },
@@ -184,8 +182,8 @@ pub static TABLES: [Table; 9] = [
                 group.row("true cameras", from(sfm, true), &[]),
             ];
             let networks = group.available.geometry.iter();
-            rows.extend(networks.map(|(name, there)| {
-                group.if_installed(name, from(SourceChoice::named(name), false), *there)
+            rows.extend(networks.map(|f| {
+                group.if_installed(&f.name, from(SourceChoice::named(&f.name), false), f.installed)
             }));
             rows
         },
@@ -297,15 +295,24 @@ pub struct TableRow {
     pub paper: Vec<(&'static str, f64)>,
 }
 
+/// A family of networks.
+#[derive(Clone, Debug)]
+pub struct NetworkFamily {
+    /// As the options call it.
+    pub name: String,
+    /// A trained one is on this machine.
+    pub installed: bool,
+}
+
 /// What a machine and a data set have for the tables to compare.
 #[derive(Clone, Debug, Default)]
 pub struct Available {
     /// Frames that may be photos.
     pub views: usize,
-    /// Known families of geometry networks, and whether one is installed.
-    pub geometry: Vec<(String, bool)>,
+    /// Known families of geometry networks.
+    pub geometry: Vec<NetworkFamily>,
     /// The same for features.
-    pub features: Vec<(String, bool)>,
+    pub features: Vec<NetworkFamily>,
 }
 
 /// Rows under the same regions.
@@ -357,10 +364,11 @@ mod tests {
             iterations: 10,
             language_iterations: 2,
         };
+        let family = |name: &str, installed| NetworkFamily { name: name.into(), installed };
         let available = Available {
             views: 4,
-            geometry: vec![("there".into(), true), ("not".into(), false)],
-            features: vec![("absent".into(), false)],
+            geometry: vec![family("there", true), family("not", false)],
+            features: vec![family("absent", false)],
         };
         for table in &TABLES {
             for regions in (table.regions)(1, &available) {

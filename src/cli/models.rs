@@ -2,7 +2,7 @@
 use super::args::{ModelsAction, ModelsArgs};
 use super::print::{print, print_json};
 use crate::infer::check::{Measured, check};
-use crate::infer::installed::{CatalogueEntry, Installed, Inventory, catalogue, inventory};
+use crate::infer::installed::{CatalogueEntry, HashedFile, Installed, Inventory, catalogue, inventory};
 use crate::infer::{ModelStatus, Registry};
 use crate::{Error, Result};
 use serde_json::json;
@@ -37,7 +37,7 @@ fn list(registry: &Registry, found: &Inventory, as_json: bool) -> Result<()> {
             "models": status.iter().map(to_json).collect::<Vec<_>>(),
             "known": catalogue().iter().map(|k| known_json(k, registry, found)).collect::<Vec<_>>(),
             "networks": found.models.iter().map(installed_json).collect::<Vec<_>>(),
-            "broken": found.broken.iter().map(|(file, why)| json!({ "file": file, "fix": why })).collect::<Vec<_>>(),
+            "broken": found.broken.iter().map(|b| json!({ "file": b.path, "fix": b.reason })).collect::<Vec<_>>(),
         }));
     }
     let mut text = String::from("Built-in pack: what splatvk uses unless told otherwise\n");
@@ -61,7 +61,8 @@ fn list(registry: &Registry, found: &Inventory, as_json: bool) -> Result<()> {
     }
     if !found.broken.is_empty() {
         text.push_str("\nNot usable\n");
-        found.broken.iter().for_each(|(_, why)| {
+        found.broken.iter().for_each(|b| {
+            let why = &b.reason;
             let _ = writeln!(text, "  → {why}");
         });
     }
@@ -108,7 +109,7 @@ fn installed(text: &mut String, m: &Installed) {
             "",
             graph.path.display()
         );
-        for (file, pinned) in &graph.pinned {
+        for HashedFile { path: file, sha256: pinned } in &graph.pinned {
             let name = file.file_name().unwrap_or_default().to_string_lossy();
             let _ = writeln!(text, "{:10}   sha256 {pinned} pinned for {name}", "");
         }
@@ -135,7 +136,7 @@ fn check_all(registry: &Registry, as_json: bool) -> Result<()> {
     let found = inventory(registry);
     let status = registry.status();
     let mut problems: Vec<String> = status.iter().filter_map(|m| m.fix.clone()).collect();
-    problems.extend(found.broken.iter().map(|(_, why)| why.clone()));
+    problems.extend(found.broken.iter().map(|b| b.reason.clone()));
     let mut results = Vec::new();
     if !as_json {
         let mut text = String::new();
@@ -205,7 +206,7 @@ fn installed_json(m: &Installed) -> serde_json::Value {
     let graph = |g: &crate::infer::graph::GraphFile| {
         json!({
             "part": g.binding.part, "file": g.path, "parameters": g.parameters, "bytes": g.bytes(), "opset": g.opset,
-            "sha256": g.pinned.iter().map(|(file, hash)| json!({ "file": file, "pinned": hash })).collect::<Vec<_>>(),
+            "sha256": g.pinned.iter().map(|f| json!({ "file": f.path, "pinned": f.sha256 })).collect::<Vec<_>>(),
         })
     };
     json!({

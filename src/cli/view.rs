@@ -6,7 +6,7 @@ use crate::format::scene_dir::{self, Scene};
 use crate::gpu::Device;
 use crate::photo;
 use crate::query::QueryOptions;
-use crate::report::viewer::{self, Names, SCENE_PATH, Scene3d};
+use crate::report::viewer::{self, CodeNames, SCENE_PATH, Scene3d};
 use crate::run::ask::QueryScene;
 use crate::run::encoder;
 use crate::scene::RgbImage;
@@ -39,7 +39,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     if let Some(reason) = no_questions.as_deref().filter(|_| scene.language.is_some()) {
         progress::reporter().warn(&format!("no questions: {reason}"));
     }
-    let names = ready.as_mut().map_or(Ok(Names::new()), QueryScene::names)?;
+    let names = ready.as_mut().map_or(Ok(CodeNames::new()), QueryScene::names)?;
     let content = Content {
         page: page(&scene, args, &names, no_questions.as_deref())?,
         splats: viewer::pack(&scene.splats, scene.language.as_ref(), usize::MAX)?.bytes,
@@ -84,7 +84,7 @@ fn questions(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
     Ok(ready)
 }
 
-fn page(scene: &Scene, args: &ViewArgs, names: &Names, no_questions: Option<&str>) -> Result<String> {
+fn page(scene: &Scene, args: &ViewArgs, names: &CodeNames, no_questions: Option<&str>) -> Result<String> {
     // Photos are decoration here: a scene whose pictures were deleted still shows.
     let load =
         |c: &crate::scene::Camera| photo::load_at(&scene.path.join("cameras").join(&c.name), usize::MAX).ok();

@@ -10,6 +10,15 @@ use super::onnx::{self, Dim, Header};
 use super::runtime::{Input, Session, Tensor};
 use crate::{Error, Result};
 
+/// A file with its checksum.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HashedFile {
+    /// Where it lies.
+    pub path: PathBuf,
+    /// In hexadecimal digits.
+    pub sha256: String,
+}
+
 /// A model file that was recognised, not yet loaded.
 #[derive(Clone, Debug)]
 pub struct GraphFile {
@@ -28,7 +37,7 @@ pub struct GraphFile {
     /// Files with the rest of the weights.
     pub external: Vec<PathBuf>,
     /// The sha256 that the adapter pins of these files.
-    pub pinned: Vec<(PathBuf, String)>,
+    pub pinned: Vec<HashedFile>,
     /// How it is computed.
     pub compute: Compute,
 }
@@ -48,7 +57,7 @@ impl GraphFile {
         }
         let pin = |p: &PathBuf| {
             let name = p.file_name()?.to_str()?;
-            Some((p.clone(), adapter.sha256.get(name)?.to_ascii_lowercase()))
+            Some(HashedFile { path: p.clone(), sha256: adapter.sha256.get(name)?.to_ascii_lowercase() })
         };
         let own = path.to_path_buf();
         Ok(GraphFile {
@@ -97,7 +106,7 @@ impl GraphFile {
 
     /// Loads it, if its files are what the adapter pins.
     pub fn load(&self) -> Result<Graph> {
-        for (file, wanted) in &self.pinned {
+        for HashedFile { path: file, sha256: wanted } in &self.pinned {
             let found = fingerprint(file).map_err(Error::io(file))?;
             if found != *wanted {
                 return Err(Error::missing(format!(

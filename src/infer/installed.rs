@@ -12,6 +12,7 @@ use super::cache::fingerprint;
 use super::compute::Compute;
 use super::contract::Part;
 use super::graph::GraphFile;
+pub use super::graph::HashedFile;
 use super::registry::Registry;
 use crate::{Error, Result};
 
@@ -127,10 +128,12 @@ impl Installed {
         self.graphs.values().any(|g| g.untrained)
     }
 
-    /// (file, sha256) of everything that it consists of.
-    pub fn files(&self) -> Result<Vec<(PathBuf, String)>> {
+    /// The files that it consists of.
+    pub fn files(&self) -> Result<Vec<HashedFile>> {
         let files = self.graphs.values().flat_map(|g| std::iter::once(&g.path).chain(&g.external));
-        let hash = |file: &PathBuf| Ok((file.clone(), fingerprint(file).map_err(Error::io(file))?));
+        let hash = |file: &PathBuf| {
+            Ok(HashedFile { path: file.clone(), sha256: fingerprint(file).map_err(Error::io(file))? })
+        };
         files.map(hash).collect()
     }
 
@@ -146,13 +149,22 @@ impl Installed {
     }
 }
 
+/// A file or folder that is no usable model.
+#[derive(Clone, Debug)]
+pub struct BrokenFile {
+    /// Where it lies.
+    pub path: PathBuf,
+    /// One line that says why and what to do.
+    pub reason: String,
+}
+
 /// What the model folders hold beside the built-in pack.
 #[derive(Debug, Default)]
 pub struct Inventory {
     /// Whole models.
     pub models: Vec<Installed>,
-    /// Files that cannot be used: one line each, saying why and what to do.
-    pub broken: Vec<(PathBuf, String)>,
+    /// Files that cannot be used.
+    pub broken: Vec<BrokenFile>,
 }
 
 impl Inventory {
@@ -201,7 +213,7 @@ pub fn inventory(registry: &Registry) -> Inventory {
 
 fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, found: &mut Inventory) {
     let mut graphs: BTreeMap<Part, GraphFile> = BTreeMap::new();
-    let mut failed: Vec<(PathBuf, String)> = Vec::new();
+    let mut failed: Vec<BrokenFile> = Vec::new();
     for file in files {
         match GraphFile::recognise(file) {
             // The first of several variants (quantised, half precision): the plain name sorts first.
@@ -209,7 +221,7 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
                 let graph = GraphFile { compute: compute.clone(), ..graph };
                 graphs.entry(graph.binding.part).or_insert(graph);
             }
-            Err(e) => failed.push((file.clone(), e.to_string())),
+            Err(e) => failed.push(BrokenFile { path: file.clone(), reason: e.to_string() }),
         }
     }
     if graphs.is_empty() {
@@ -229,7 +241,7 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
             lacks.join(" or ")
         );
         found.broken.extend(failed);
-        found.broken.push((folder, text));
+        found.broken.push(BrokenFile { path: folder, reason: text });
         return;
     };
     let stray = |a: &&GraphFile, b: &&GraphFile| {
@@ -244,7 +256,7 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
             pair[0].checkpoint.as_deref().unwrap_or_default(),
             pair[1].checkpoint.as_deref().unwrap_or_default()
         );
-        found.broken.push((folder, text));
+        found.broken.push(BrokenFile { path: folder, reason: text });
         return;
     }
     // Encoders are alike in several families; the last part decides.
@@ -253,7 +265,7 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
     if used.iter().any(|g| g.has("desc1")) {
         tasks.push(Task::Matcher);
     }
-    let unused = failed.into_iter().map(|(_, why)| why).collect();
+    let unused = failed.into_iter().map(|f| f.reason).collect();
     let mut model = Installed { name, family, tasks, graphs, folder, unused };
     if let Some(known) = model.catalogue_entry().filter(|k| model.tasks.contains(&k.task)) {
         model.family.clone_from(&known.family);
@@ -279,8 +291,8 @@ impl Registry {
             let text = path.to_string_lossy();
             catalogue().iter().any(|k| k.family == name && text.contains(&k.id)) || text.contains(name)
         };
-        if let Some((_, why)) = inventory.broken.iter().find(|(path, _)| about(path)) {
-            return Err(Error::missing(why.clone()));
+        if let Some(broken) = inventory.broken.iter().find(|b| about(&b.path)) {
+            return Err(Error::missing(broken.reason.clone()));
         }
         let place = self.folders().first().map(|f| f.display().to_string()).unwrap_or_default();
         let how = catalogue().iter().find(|k| k.family == name && k.does(task));

@@ -241,7 +241,7 @@ fn bad_files_are_named_with_the_mend() {
     }
     std::fs::write(&path, "<html>404 Not Found</html>").unwrap();
     assert!(GraphFile::recognise(&path).unwrap_err().to_string().contains("of another format"));
-    assert!(inventory(&Registry::of(&[dir.path()])).broken[0].1.contains("cut.onnx"));
+    assert!(inventory(&Registry::of(&[dir.path()])).broken[0].reason.contains("cut.onnx"));
 }
 
 #[test]

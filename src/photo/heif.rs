@@ -1,5 +1,6 @@
 //! HEIC, HEIF and AVIF through libheif's C interface, loaded at run time: its HEVC decoders are under the LGPL and
 //! patents, so splatvk runs without it and never links it. The signatures are those of libheif 1.12 (2021), unchanged since.
+use super::Support;
 use super::kind::{LARGEST_DECODED, TOO_LARGE};
 use image::{DynamicImage, ImageBuffer};
 use libloading::Library;
@@ -122,10 +123,10 @@ fn load() -> Result<Api, String> {
 }
 
 /// "libheif 1.15.1 · HEVC, AV1", or what is missing and what to do: `(found, advice)`.
-pub(super) fn status() -> (String, Option<String>) {
+pub(super) fn status() -> Support {
     let api = match api() {
         Ok(api) => api,
-        Err(what) => return ("HEIC and AVIF photos cannot be read".to_owned(), Some(what.to_owned())),
+        Err(what) => return Support::none("HEIC and AVIF photos cannot be read", what.to_owned()),
     };
     // SAFETY: a constant string of the library; the query takes any number.
     let (version, decoders) = unsafe {
@@ -138,7 +139,7 @@ pub(super) fn status() -> (String, Option<String>) {
     let found = if there.is_empty() { "no decoders".to_owned() } else { there };
     let advice =
         (!missing.is_empty()).then(|| format!("libheif has no decoder for {missing}; {INSTALL_DECODER}"));
-    (format!("libheif {version} · {found}"), advice)
+    Support { found: format!("libheif {version} · {found}"), advice }
 }
 
 /// The primary image of a file, upright: libheif applies the rotation and mirroring that the container states, and those

@@ -34,13 +34,28 @@ use sha2::{Digest, Sha256};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// What the machine has for HEIC and AVIF photos, in words, and what to do about what it lacks.
-pub fn heif_support() -> (String, Option<String>) {
+/// What the machine has for a kind of files.
+#[derive(Clone, Debug)]
+pub struct Support {
+    /// What is there, in words.
+    pub found: String,
+    /// What to do about what is missing.
+    pub advice: Option<String>,
+}
+
+impl Support {
+    fn none(what: &str, advice: String) -> Support {
+        Support { found: what.to_owned(), advice: Some(advice) }
+    }
+}
+
+/// Support for HEIC and AVIF photos.
+pub fn heif_support() -> Support {
     heif::status()
 }
 
-/// What the machine has for videos, in words, and what to do about what it lacks.
-pub fn video_support() -> (String, Option<String>) {
+/// Support for videos.
+pub fn video_support() -> Support {
     video::status()
 }
 

@@ -1,5 +1,6 @@
 //! Frames of a video through `ffprobe` and `ffmpeg`, as child processes: without a shell, reading local files only, within
 //! bounded time and memory.
+use super::Support;
 use crate::progress::Progress;
 use crate::{Error, Result};
 use std::ffi::OsString;
@@ -35,16 +36,16 @@ pub(super) struct Video {
 }
 
 /// "ffmpeg 5.1.9", or what is missing and what to do: `(found, advice)`.
-pub(super) fn status() -> (String, Option<String>) {
+pub(super) fn status() -> Support {
     let version = |program: &str| {
         let output = Command::new(program).arg("-version").stdin(Stdio::null()).output().ok()?;
         let text = String::from_utf8_lossy(&output.stdout).into_owned();
         output.status.success().then(|| text.split_whitespace().nth(2).unwrap_or("").to_owned())
     };
     match (version("ffmpeg"), version("ffprobe")) {
-        (Some(version), Some(_)) => (format!("ffmpeg {version}"), None),
-        (None, _) => ("videos cannot be read".to_owned(), Some(format!("ffmpeg is not there; {INSTALL}"))),
-        (_, None) => ("videos cannot be read".to_owned(), Some(format!("ffprobe is not there; {INSTALL}"))),
+        (Some(version), Some(_)) => Support { found: format!("ffmpeg {version}"), advice: None },
+        (None, _) => Support::none("videos cannot be read", format!("ffmpeg is not there; {INSTALL}")),
+        (_, None) => Support::none("videos cannot be read", format!("ffprobe is not there; {INSTALL}")),
     }
 }
 

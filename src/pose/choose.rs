@@ -41,8 +41,24 @@ const BLURRED: f64 = 0.6;
 pub struct Choice {
     /// Names of the photos used, in order.
     pub used: Vec<String>,
-    /// Names of the others, each with the reason.
-    pub left_out: Vec<(String, Reason)>,
+    /// The others, each with the reason.
+    pub left_out: Vec<LeftOut>,
+}
+
+/// A photo that is not used. Stored as `[photo, reason]`.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(into = "(String, Reason)")]
+pub struct LeftOut {
+    /// Its name.
+    pub photo: String,
+    /// Why it is not used.
+    pub reason: Reason,
+}
+
+impl From<LeftOut> for (String, Reason) {
+    fn from(l: LeftOut) -> (String, Reason) {
+        (l.photo, l.reason)
+    }
 }
 
 /// Why a photo is not used.
@@ -90,7 +106,7 @@ impl Choice {
             if more > 0 { format!("{shown} and {more} more") } else { shown }
         };
         let of = |wanted: &dyn Fn(&Reason) -> bool| -> Vec<&str> {
-            self.left_out.iter().filter(|(_, r)| wanted(r)).map(|(n, _)| n.as_str()).collect()
+            self.left_out.iter().filter(|l| wanted(&l.reason)).map(|l| l.photo.as_str()).collect()
         };
         let mut parts = Vec::new();
         for (reason, words) in [
@@ -194,7 +210,7 @@ pub fn choose(
         used: chosen.iter().map(|i| names[*i].clone()).collect(),
         left_out: (0..names.len())
             .filter(|i| !chosen.contains(i))
-            .map(|i| (names[i].clone(), graph.reason(i, &chosen, &names)))
+            .map(|i| LeftOut { photo: names[i].clone(), reason: graph.reason(i, &chosen, &names) })
             .collect(),
     };
     Ok((chosen.into_iter().map(|i| there[i]).collect(), choice))

@@ -5,7 +5,7 @@ use crate::infer::RegionEncoder;
 use crate::query::highlight::Highlight;
 use crate::query::select::{Selection, select};
 use crate::query::{self, CANONICAL_PHRASES, QueryOptions, QueryResult, TextQuery};
-use crate::report::viewer::{Names, ShownAnswer};
+use crate::report::viewer::{CodeNames, ShownAnswer};
 use crate::scene::{Camera, LanguageField, Plane, Splats};
 use crate::{Error, Result};
 
@@ -60,7 +60,7 @@ impl QueryScene {
     }
 
     /// The phrases of the text model that name each code best: see [`RegionEncoder::names`].
-    pub fn names(&mut self) -> Result<Names> {
+    pub fn names(&mut self) -> Result<CodeNames> {
         names(self.encoder.as_mut(), &self.field, NAMES)
     }
 
@@ -122,7 +122,7 @@ pub const NAMES: usize = 5;
 
 /// Per level and code the `best` phrases with their relevancy, best first; without phrases where the text model has no
 /// list of its own.
-pub fn names(encoder: &mut dyn RegionEncoder, field: &LanguageField, best: usize) -> Result<Names> {
+pub fn names(encoder: &mut dyn RegionEncoder, field: &LanguageField, best: usize) -> Result<CodeNames> {
     let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
     let mut levels = Vec::with_capacity(field.levels.len());
     for level in &field.levels {

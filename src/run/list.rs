@@ -13,7 +13,7 @@ use crate::language::Language;
 use crate::photo::Photo;
 use crate::pipeline::Output;
 use crate::pose;
-use crate::report::viewer::Names;
+use crate::report::viewer::CodeNames;
 use crate::run::view::DecodedFrame;
 
 /// What a run asks of its stages.
@@ -22,7 +22,7 @@ pub(super) struct SceneOutputs {
     pub(super) geometry: Output<pose::Geometry>,
     pub(super) trained: Output<Trained>,
     pub(super) aligned: Output<Language>,
-    pub(super) names: Output<Names>,
+    pub(super) names: Output<CodeNames>,
     pub(super) language: Output<TrainedLanguage>,
     pub(super) frames: Output<Vec<DecodedFrame>>,
     pub(super) answers: Output<Vec<Answers>>,

@@ -3,7 +3,7 @@ use super::plan::RunPlan;
 use super::sources::{FeatureSources, GeometrySources, MaskSources, MatchSources, installed};
 use crate::Result;
 use crate::infer::Registry;
-use crate::infer::installed::Installed;
+use crate::infer::installed::{HashedFile, Installed};
 use crate::progress::Progress;
 use crate::report::ModelUsed;
 
@@ -27,7 +27,7 @@ impl Networks {
         let mut used = Vec::new();
         for model in &self.0 {
             let licence = model.catalogue_entry().map_or("unknown", |k| k.licence.as_str());
-            for (file, sha256) in model.files()? {
+            for HashedFile { path: file, sha256 } in model.files()? {
                 let file = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
                 let name =
                     format!("{} {file}{}", model.name, if model.untrained() { " (untrained)" } else { "" });
@@ -41,7 +41,7 @@ impl Networks {
         let names: Vec<&str> = self.0.iter().filter(|m| m.untrained()).map(|m| m.name.as_str()).collect();
         if !names.is_empty() {
             progress.warn(&format!(
-                "{}: untrained weights; what they say means nothing, only time and memory do",
+                "{}: untrained weights; their outputs carry no meaning, only time and memory are real",
                 names.join(", ")
             ));
         }

@@ -9,7 +9,7 @@ use crate::pose::{self, Geometry};
 use crate::preset::Preset;
 use crate::progress::StageRecord;
 use crate::report::ModelUsed;
-use crate::report::viewer::Names;
+use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, LanguageField, Splats};
 
 /// Everything a finished run knows; [`crate::report`] turns it into run.json, report.html and the summary.
@@ -43,7 +43,7 @@ pub struct RunOutcome {
     /// One per query of the plan.
     pub answers: Vec<Answers>,
     /// The text model's own phrases per level and code.
-    pub names: Names,
+    pub names: CodeNames,
     /// What computed the networks.
     pub provider: Option<&'static str>,
     /// Built-in models.

@@ -198,17 +198,26 @@ pub(super) fn working_sizes(photos: &[Photo]) -> serde_json::Value {
 
 /// How many photos were used, at which size, and how to change that where they were scaled down.
 pub(super) fn sizes(photos: &[Photo]) -> String {
-    let mut pairs: Vec<(usize, usize, u32, u32)> = Vec::new();
+    #[derive(PartialEq)]
+    struct Sizes {
+        working: (usize, usize),
+        original: (usize, usize),
+    }
+    let mut pairs: Vec<Sizes> = Vec::new();
     for p in photos {
-        let pair = (p.image.width, p.image.height, p.original_size.0, p.original_size.1);
+        let original = (p.original_size.0 as usize, p.original_size.1 as usize);
+        let pair = Sizes { working: (p.image.width, p.image.height), original };
         if !pairs.contains(&pair) {
             pairs.push(pair);
         }
     }
-    let scaled = |p: &(usize, usize, u32, u32)| (p.0, p.1) != (p.2 as usize, p.3 as usize);
-    let one = |p: &(usize, usize, u32, u32)| match scaled(p) {
-        true => format!("{} × {} of {} × {}", p.0, p.1, p.2, p.3),
-        false => format!("{} × {}", p.0, p.1),
+    let scaled = |s: &Sizes| s.working != s.original;
+    let one = |s: &Sizes| {
+        let ((w, h), (original_w, original_h)) = (s.working, s.original);
+        match scaled(s) {
+            true => format!("{w} × {h} of {original_w} × {original_h}"),
+            false => format!("{w} × {h}"),
+        }
     };
     // More than a few sizes would not fit a line; run.json has them all.
     let shown: Vec<String> = pairs.iter().take(3).map(one).collect();

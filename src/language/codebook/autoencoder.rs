@@ -181,6 +181,7 @@ pub(in crate::language) fn build(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::MaskId;
 
     fn unit_rows(count: usize, dim: usize, seed: u64) -> Vec<f32> {
         let mut random = Random::new(seed);
@@ -227,7 +228,11 @@ mod tests {
             assert!(best.acos().to_degrees() < 3.4, "{}", best.acos().to_degrees());
         }
         let rows = unit_rows(5, 16, 1002);
-        let entry = |row: &[f32]| CodeEntry { embedding: row.to_vec(), weight: 10.0, members: vec![(0, 0)] };
+        let entry = |row: &[f32]| CodeEntry {
+            embedding: row.to_vec(),
+            weight: 10.0,
+            members: vec![MaskId::new(0, 0)],
+        };
         let entries: Vec<CodeEntry> = rows.chunks_exact(16).map(entry).collect();
         let (built, cosine) = build(&[entries.clone(), Vec::new()], 2000, 0).unwrap();
         assert!(built[1].codebook.is_empty() && built[0].code_of.len() == 5);

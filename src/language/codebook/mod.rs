@@ -6,7 +6,7 @@ pub(super) mod quantise;
 mod spread;
 
 use crate::math::{Random, dot};
-use crate::scene::Codebook;
+use crate::scene::{Codebook, MaskId};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -17,15 +17,15 @@ const SAME_EMBEDDING: f64 = 0.9995;
 /// Smallest distance between two codes that the construction accepts (docs/method.md#code-construction, step 5).
 const MIN_CHORD: f32 = 0.02;
 
-/// One distinct embedding and what stands behind it.
+/// One distinct embedding and the masks that have it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CodeEntry {
     /// [D] unit vector.
     pub embedding: Vec<f32>,
     /// Pixels.
     pub weight: f64,
-    /// (view, mask) pairs.
-    pub members: Vec<(u32, u32)>,
+    /// The masks that share it.
+    pub members: Vec<MaskId>,
 }
 
 /// A codebook and, for every input entry, the code it received.

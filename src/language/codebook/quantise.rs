@@ -78,12 +78,13 @@ pub(in crate::language) fn build(entries: &[CodeEntry], dim: usize, seed: u64) -
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::MaskId;
 
     fn entry(embedding: Vec<f32>) -> CodeEntry {
         let mut embedding = embedding;
         let d = embedding.len();
         normalise_rows(&mut embedding, d);
-        CodeEntry { embedding, weight: 1.0, members: vec![(0, 0)] }
+        CodeEntry { embedding, weight: 1.0, members: vec![MaskId::new(0, 0)] }
     }
 
     #[test]

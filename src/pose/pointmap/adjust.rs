@@ -136,10 +136,10 @@ impl Adjustment {
         };
         let mut links = Vec::new();
         for (k, (pair, m)) in pairs.iter().zip(matches).enumerate() {
-            let mean = m.matches.iter().map(|x| x.2).sum::<f64>() / m.matches.len().max(1) as f64;
-            for (p, q, w) in &m.matches {
-                if let (Some(a), Some(b)) = (end(pair.first, *p), end(pair.second, *q)) {
-                    links.push(MatchResidual { ends: [a, b], weight: w / mean, pair: k });
+            let mean = m.matches.iter().map(|x| x.weight).sum::<f64>() / m.matches.len().max(1) as f64;
+            for x in &m.matches {
+                if let (Some(a), Some(b)) = (end(pair.first, x.a), end(pair.second, x.b)) {
+                    links.push(MatchResidual { ends: [a, b], weight: x.weight / mean, pair: k });
                 }
             }
         }

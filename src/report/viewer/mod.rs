@@ -65,7 +65,7 @@ impl ShownAnswer<'_> {
 }
 
 /// Phrases with their relevancy, best first, per level and code.
-pub type Names = Vec<Vec<Vec<(String, f32)>>>;
+pub type CodeNames = Vec<Vec<Vec<(String, f32)>>>;
 
 /// What the view shows.
 #[derive(Clone, Debug)]
@@ -81,7 +81,7 @@ pub struct Scene3d<'a> {
     /// What the scene knows about words.
     pub language: Option<&'a LanguageField>,
     /// The text model's own phrases for every code; may be empty.
-    pub names: &'a Names,
+    pub names: &'a CodeNames,
     /// Queries that were run.
     pub answers: Vec<ShownAnswer<'a>>,
 }

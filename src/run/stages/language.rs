@@ -8,7 +8,7 @@ use crate::language::{self, Language, ViewMasks};
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::Geometry;
 use crate::query::TextQuery;
-use crate::report::viewer::Names;
+use crate::report::viewer::CodeNames;
 use crate::run::ask;
 use crate::run::method::Recipe;
 use crate::{Error, Result};
@@ -122,13 +122,13 @@ impl Stage for NameCodes {
     const NAME: &'static str = "names";
     const LANE: Lane = Lane::Processor;
     type Inputs = (Output<Language>,);
-    type Output = Names;
+    type Output = CodeNames;
 
     fn settings(&self) -> String {
         self.encoder.identity().to_owned()
     }
 
-    fn run(self, (language,): (&Language,), _: &Context) -> Result<Names> {
+    fn run(self, (language,): (&Language,), _: &Context) -> Result<CodeNames> {
         // As many as the page shows beside a selected thing.
         self.encoder.with(|e| ask::names(e, &language.field, ask::NAMES))
     }
