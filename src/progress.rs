@@ -21,11 +21,11 @@ pub trait Progress: Send + Sync {
     fn inform(&self, message: &str) {
         self.warn(message);
     }
-    /// True once the caller wants the work to stop.
+    /// True once the caller has requested that the work stops.
     fn cancelled(&self) -> bool {
         false
     }
-    /// `Err(Error::Cancelled)` once the caller wants the work to stop.
+    /// `Err(Error::Cancelled)` once the caller has requested that the work stops.
     fn check(&self) -> Result<()> {
         if self.cancelled() { Err(Error::Cancelled) } else { Ok(()) }
     }

@@ -91,7 +91,7 @@ impl Stage for SyntheticEmbeddings {
     }
 }
 
-/// What an encoder says of each object's true mask, averaged over the photos.
+/// Embedding of each object's true mask by an encoder, averaged over the photos.
 pub(super) struct EncoderEmbeddings {
     pub(super) truth: Arc<GroundTruth>,
     pub(super) encoder: SharedEncoder,
@@ -126,7 +126,7 @@ impl Stage for EncoderEmbeddings {
     }
 }
 
-/// What the given wholes say of each object, averaged over its pixels.
+/// Embedding of each object by the given masks of level l, averaged over its pixels.
 pub(super) struct MaskEmbeddings {
     pub(super) truth: Arc<GroundTruth>,
 }

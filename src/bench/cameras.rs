@@ -65,7 +65,7 @@ pub struct CameraFigures {
     pub true_lens: Option<Lens>,
 }
 
-/// Data sets and what they say together.
+/// Data sets and their summary.
 #[derive(Clone, Debug, Serialize)]
 pub struct CameraReport {
     /// In the order given.

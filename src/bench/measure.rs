@@ -1,4 +1,4 @@
-//! Repeating a measurement and what its times say.
+//! Repeated measurements and the quartiles of their times.
 use crate::Result;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;

@@ -1,4 +1,4 @@
-//! What a benchmark found, as a table and as JSON.
+//! Figures of a benchmark, as a table and as JSON.
 use super::measure::{Budget, Quartiles, cores, processor_ms};
 use super::model::{PassWork, Roofline};
 use crate::gpu::{Device, Program, Recorder};

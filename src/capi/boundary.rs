@@ -35,7 +35,7 @@ impl LastError {
     fn set(&self, text: String) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = text;
     }
-    /// Copies the text out as C wants it: see [`copy_text`].
+    /// Copies the text out as a C string: see [`copy_text`].
     pub unsafe fn copy(&self, out: *mut c_char, bytes: usize) -> usize {
         // SAFETY: passed on.
         unsafe { copy_text(&self.0.lock().unwrap_or_else(PoisonError::into_inner), out, bytes) }
@@ -131,7 +131,7 @@ versioned!(
     SvkAnswer 48
 );
 
-/// The size that a structure says it has.
+/// The size that a structure states.
 ///
 /// # Safety
 /// `pointer` leads to a versioned structure.

@@ -126,7 +126,7 @@ fn cameras(args: &BenchArgs) -> Result<()> {
     print(&report.text())
 }
 
-/// The scene to ask and the model that speaks its language.
+/// The scene and the text encoder of its space.
 fn scene_and_encoder(args: &BenchArgs) -> Result<(scene_dir::Scene, Box<dyn RegionEncoder>)> {
     let Some(path) = &args.scene else {
         return Err(Error::input("bench query: give a scene with language with --scene DIR"));

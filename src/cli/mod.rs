@@ -1,4 +1,4 @@
-//! Command line: [`args`] = what the user typed, `plan` = what it means, one file per command.
+//! Command line: [`args`] = arguments, `plan` = the plan that they describe, one file per command.
 mod ablate;
 pub mod args;
 mod bench;

@@ -1,6 +1,6 @@
 //! `splatvk query`
 use super::args::QueryArgs;
-use super::outputs::Outputs;
+use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
 use super::progress;
 use super::views;
@@ -50,7 +50,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     }
     let registry = args.device.registry()?;
     let encoder = encoder::of_scene(&scene, registry)?;
-    let mut out = Outputs::open(&args.out)?;
+    let mut out = WrittenFiles::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
     let field = scene.language.take().ok_or_else(no_language)?;
     let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
@@ -96,7 +96,13 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     if args.device.json { print_json(&report) } else { print(&table(&args.texts, &views, &latency, args)) }
 }
 
-fn write(out: &mut Outputs, stem: &str, folder: &str, picture: &RgbImage, a: &QueryResult) -> Result<()> {
+fn write(
+    out: &mut WrittenFiles,
+    stem: &str,
+    folder: &str,
+    picture: &RgbImage,
+    a: &QueryResult,
+) -> Result<()> {
     let name = |kind: &str| format!("{folder}/{stem}_{kind}");
     let heat = colour::heat_image(picture, &a.relevancy, Some(&a.mask));
     picture::write_png(&out.file(&name("heat.png"))?, &heat)?;

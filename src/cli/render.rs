@@ -1,6 +1,6 @@
 //! `splatvk render`
 use super::args::{Channel, ImageFormat, RenderArgs};
-use super::outputs::Outputs;
+use super::outputs::WrittenFiles;
 use super::print::listing;
 use super::progress;
 use super::views;
@@ -26,7 +26,7 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     }
     let nothing = LanguageField::default();
     let field = if wants_language { scene.language.as_ref().unwrap_or(&nothing) } else { &nothing };
-    let mut out = Outputs::open(&args.out)?;
+    let mut out = WrittenFiles::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
     let progress = progress::reporter();
@@ -71,7 +71,7 @@ fn part(view: &DecodedFrame, first: usize, d: usize) -> Vec<f32> {
 
 /// Previews: exact values are in the EXR and npy files.
 fn png(
-    out: &mut Outputs,
+    out: &mut WrittenFiles,
     stem: &str,
     channels: &[Channel],
     view: &DecodedFrame,
@@ -120,7 +120,7 @@ fn false_colour(features: &[f32], d: usize, like: &Plane<f32>) -> RgbImage {
     }
 }
 
-fn exr(out: &mut Outputs, stem: &str, channels: &[Channel], view: &DecodedFrame) -> Result<()> {
+fn exr(out: &mut WrittenFiles, stem: &str, channels: &[Channel], view: &DecodedFrame) -> Result<()> {
     let frame = &view.rendered;
     let has = |c: Channel| channels.contains(&c);
     // OpenEXR holds linear light; what programs that read it expect.
@@ -137,7 +137,7 @@ fn exr(out: &mut Outputs, stem: &str, channels: &[Channel], view: &DecodedFrame)
 }
 
 fn arrays(
-    out: &mut Outputs,
+    out: &mut WrittenFiles,
     stem: &str,
     channels: &[Channel],
     view: &DecodedFrame,

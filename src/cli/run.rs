@@ -29,13 +29,13 @@ pub struct RunArgs {
     /// How the scene is made
     #[command(flatten)]
     pub making: MakingArgs,
-    /// A source of the table
+    /// Source of cameras, depth and points
     #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<GeometrySources>())]
     pub init: String,
-    /// A source of the table
+    /// Source of dense matches
     #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<MatchSources>())]
     pub matcher: String,
-    /// A source of the table
+    /// Source of masks
     #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<MaskSources>())]
     pub masks: String,
     /// Points along each side of a photo at which a mask network is asked
@@ -44,7 +44,7 @@ pub struct RunArgs {
     /// Do not ask the mask network about four overlapping crops as well: five times faster, misses small things
     #[arg(long)]
     pub no_mask_crops: bool,
-    /// A source of the table
+    /// Source of features
     #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<FeatureSources>())]
     pub features: String,
     /// Ask the finished scene; may be repeated

@@ -27,7 +27,7 @@ pub struct Scene {
     pub splats: Splats,
     /// Training cameras at working resolution; empty for a bare PLY.
     pub cameras: Vec<Camera>,
-    /// What it knows about words.
+    /// Codebooks and features; `None` without language.
     pub language: Option<LanguageField>,
 }
 

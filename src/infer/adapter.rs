@@ -1,6 +1,6 @@
 //! Adapters: how one file's tensor names, layouts and value ranges map to the roles of a [`Contract`]. Adapters are data, TOML
 //! files: the built-in ones cover the public exports, a user's own lies beside the model (`adapter.toml` in its folder, or
-//! `NAME.toml` beside `NAME.onnx`) and needs to say only what differs from the built-in one of the same family.
+//! `NAME.toml` beside `NAME.onnx`) and needs to state only what differs from the built-in one of the same family.
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -139,7 +139,7 @@ impl Names {
     }
 }
 
-/// What an adapter says about one graph.
+/// One graph of an adapter.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct GraphSpec {
@@ -276,7 +276,7 @@ fn unknown_role(contract: &Contract, role: &str) -> String {
 pub struct Bound {
     /// Its name in the graph.
     pub name: String,
-    /// Its layout, as far as the file tells.
+    /// Its layout, as far as the file states it.
     pub layout: Option<&'static str>,
     /// Its axes.
     pub dims: Option<Vec<Dim>>,

@@ -1,4 +1,4 @@
-//! What networks said about a photo, kept by the content of the photo and of the model: a second run asks nobody.
+//! Outputs of networks on disk, by the content of the photo and of the model: a second run computes none of them again.
 //!
 //! The folder is a cache: anything odd about a file, and it is computed and written again. The least recently used files go
 //! when it grows beyond its capacity.

@@ -1,4 +1,4 @@
-//! What an image region shows: EfficientNet-Lite0 (Tan 2020) on the region cut out of its surroundings.
+//! Class probabilities of an image region: EfficientNet-Lite0 (Tan 2020) on the region cut out of its surroundings.
 use rayon::prelude::*;
 
 use super::registry::{PackFileKind, Registry};

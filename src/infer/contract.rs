@@ -1,4 +1,4 @@
-//! What splatvk asks of a graph: for every part of a model the roles of its inputs and outputs and the shapes in which the
+//! What splatvk requires of a graph: for every part of a model the roles of its inputs and outputs and the shapes in which the
 //! rest of the program sees them. Which name, layout and range a file uses for a role is data: see [`super::adapter`].
 //!
 //! A shape is a row of axis names: "B H W 3" has a free batch, height and width, and three channels. An axis that occurs

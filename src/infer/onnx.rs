@@ -1,4 +1,4 @@
-//! What an ONNX file says about itself, read without its weights: inputs, outputs, operator set, and which files hold the
+//! The header of an ONNX file, read without its weights: inputs, outputs, operator set, and which files hold the
 //! rest. A file of several gigabytes is looked at in milliseconds, and a truncated one is found out before it is loaded.
 //!
 //! Field numbers are those of the published onnx.proto3.
@@ -47,7 +47,7 @@ pub struct Port {
     pub name: String,
     /// Its element type.
     pub kind: ElementType,
-    /// Its axes, outermost first; `None` when the file does not tell.
+    /// Its axes, outermost first; `None` when the file does not state them.
     pub dims: Option<Vec<Dim>>,
 }
 

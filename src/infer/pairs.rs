@@ -12,7 +12,7 @@ use crate::progress::Progress;
 use crate::scene::{Descriptors, ModelView, PairPointmaps, Pointmap};
 use crate::{Error, Result};
 
-/// What a network says about all pairs of photos, for [`crate::pose::pointmap::reconstruct`].
+/// Pointmaps of all pairs of photos, for [`crate::pose::pointmap::reconstruct`].
 pub fn pointmaps(
     model: &Installed,
     photos: &[Photo],
@@ -26,7 +26,7 @@ pub fn pointmaps(
     Ok((views(photos, &prepared, progress), pairs))
 }
 
-/// The photos as a pair network sees them, and what it says about all pairs.
+/// The photos as inputs of a pair network, and its pointmaps of all pairs.
 pub(super) fn decoded(
     model: &Installed,
     photos: &[Photo],
@@ -260,7 +260,7 @@ fn off_the_rays(map: &Pointmap, width: usize, height: usize) -> f64 {
         })
         .collect();
     let dot = |a: [f64; 2], b: [f64; 2]| a[0] * b[0] + a[1] * b[1];
-    // The ray along the axis says nothing about it.
+    // The ray along the axis does not determine it.
     let mut ratios: Vec<f64> = rays.iter().map(|(s, p)| dot(*s, *p) / dot(*s, *s)).collect();
     ratios.retain(|r| r.is_finite());
     let Some(focal) = median(&mut ratios) else { return f64::INFINITY };

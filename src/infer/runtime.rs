@@ -19,7 +19,7 @@ pub struct Tensor {
     pub data: Vec<f32>,
 }
 
-/// What a session is fed. Floats and integers are converted to the element type that the graph asks for.
+/// Input of a session. Floats and integers are converted to the element type of the graph.
 #[derive(Clone)]
 pub enum Input {
     /// Row-major floats.

@@ -10,13 +10,13 @@
 //!
 //! The class block is what separates things: a dot product of square roots is a Bhattacharyya coefficient, and the
 //! steep softmax asks for the class that the phrase means instead of all that are vaguely alike. The meaning block ranks
-//! what no class names. Sentence embeddings have the class names' mean removed, for it says nothing.
+//! what no class names. Sentence embeddings have the class names' mean removed, which carries no information.
 //!
 //! A 1397th coordinate, zero for regions, takes up the length that a text leaves: a text that no class resembles
 //! ("object", "stuff": softmax against a constant 0.55) and that says no colour is nearly orthogonal to every region, as
 //! the canonical phrases of the relevancy score should be.
 //!
-//! It knows about a thousand everyday things and eleven colours. CLIP is the full model.
+//! It covers about a thousand everyday things and eleven colours. CLIP is the full model.
 use super::cache::OutputKey;
 use super::classify::{CLASSES, Classifier};
 use super::registry::{PackFileKind, Registry};

@@ -1,4 +1,4 @@
-//! What may become a photo of a run: a file, or a frame of a video.
+//! Candidates for the photos of a run: files and frames of videos.
 use super::choose::{FoundFiles, find};
 use super::read::{self, Photo, from_bytes, load_at};
 use super::video::Video;

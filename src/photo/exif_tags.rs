@@ -1,4 +1,4 @@
-//! What EXIF says about the lens.
+//! Camera and lens in EXIF data.
 use exif::{Context, Field, In, Reader, Tag, Value};
 
 /// Diagonal of the 36 × 24 mm frame that "35 mm equivalent" refers to (CIPA DCG-001: equal diagonal angle of view).
@@ -11,11 +11,11 @@ const PLAUSIBLE_FOCAL: std::ops::Range<f64> = 0.18..28.0;
 /// Lens facts of one file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Lens {
-    /// Focal length in pixels of the upright original, from the tags that tell it.
+    /// Focal length in pixels of the upright original, from the tags that state it.
     pub focal: Option<f64>,
     /// "Make Model".
     pub camera_model: Option<String>,
-    /// Name of the lens, if it says that it is a fisheye.
+    /// Name of the lens, if it states that it is a fisheye.
     pub fisheye: Option<String>,
 }
 

@@ -219,7 +219,7 @@ fn check(api: &Api, status: Status) -> Result<(), Failure> {
     })
 }
 
-/// How the samples are asked for.
+/// Layout of the samples that libheif is to return.
 struct HeifLayout {
     deep: bool,
     alpha: bool,

@@ -1,4 +1,4 @@
-//! What one photo's exposure, white balance and lens do to the scene's light, and how to take it out.
+//! Exposure, white balance and vignetting of one photo relative to the scene's light, and their removal.
 use crate::scene::{RgbImage, to_linear, to_srgb};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};

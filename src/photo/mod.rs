@@ -110,7 +110,7 @@ fn mostly_above_white(image: &RgbImage) -> bool {
 /// EXIF focal lengths of one camera that differ more come from different zoom settings.
 const SAME_ZOOM: f64 = 0.03;
 
-/// Number of the camera of every photo, as far as the files tell: photos of one size, camera model and zoom have one, photos
+/// Number of the camera of every photo, as far as the files state it: photos of one size, camera model and zoom have one, photos
 /// without EXIF share by size. Portrait and landscape of one camera share too.
 pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
     let size = |p: &Photo| {

@@ -43,7 +43,7 @@ pub struct Photo {
     pub original_size: (u32, u32),
     /// Original (upright) pixels → working pixels.
     pub to_working: Affine,
-    /// Focal length from EXIF in working pixels, if the file tells.
+    /// Focal length from EXIF in working pixels, if the file states it.
     pub exif_focal: Option<f64>,
     /// Luma of the photo at more pixels than the working image has, for measuring positions; where there are more.
     #[serde(skip)]

@@ -33,14 +33,14 @@ pub struct Graph<'g> {
     nodes: Vec<Node<'g>>,
 }
 
-/// What [`Graph::run`] returns: the outputs that were asked for.
+/// What [`Graph::run`] returns: the targets.
 pub struct Outputs {
     values: Vec<Option<Value>>,
     seconds: Vec<f64>,
 }
 
 impl Outputs {
-    /// An output that was asked for.
+    /// The output of a target.
     pub fn get<T: Send + Sync + 'static>(&self, output: Output<T>) -> Result<Arc<T>> {
         let value = self.values[output.node].clone().and_then(|v| v.downcast::<T>().ok());
         value.ok_or_else(|| Error::work("pipeline: an output was not asked for"))
@@ -51,7 +51,7 @@ impl Outputs {
         self.seconds[output.node]
     }
 
-    /// Takes out an output that was asked for, of a graph whose store does not hold it, too.
+    /// Takes out the output of a target that no store in memory holds too.
     pub fn take<T: Send + Sync + 'static>(&mut self, output: Output<T>) -> Result<T> {
         let value = self.get(output);
         self.values[output.node] = None;

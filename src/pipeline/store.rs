@@ -43,7 +43,7 @@ pub struct Codec<T> {
     pub read: fn(&[u8]) -> Option<T>,
 }
 
-/// The codec of everything that serde knows.
+/// The codec of everything that serde can write.
 pub fn kept<T: Serialize + DeserializeOwned>() -> Option<Codec<T>> {
     let write = |value: &T| postcard::to_stdvec(value).map_err(unwritable);
     Some(Codec { write, read: |bytes| postcard::from_bytes(bytes).ok() })

@@ -1,4 +1,4 @@
-//! Which photos a run uses when there are more than it wants: sharp ones that overlap, from different places, and that
+//! Which photos a run uses when more are given: sharp ones that overlap, from different places, and that
 //! together show what all show.
 use super::matching::{Keypoints, mutual_matches, valid_area};
 use super::overlap::{self, SimilarityInliers};
@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Long side at which sharpness is judged: near the working resolution, so that what is blurred there is blurred here.
 const SHARPNESS_SIDE: usize = 1000;
-/// Long side at which corners are matched: enough to tell overlap, and cheap enough for a hundred photos.
+/// Long side at which corners are matched: enough to measure overlap, and cheap enough for a hundred photos.
 const FEATURE_SIDE: usize = 320;
 /// Corners per photo. Matching costs their square: 5 ms a pair.
 const FEATURES: usize = 300;
@@ -136,7 +136,7 @@ impl Choice {
     }
 }
 
-/// What is known of a candidate.
+/// Features and sharpness of a candidate.
 struct CandidateFeatures {
     features: Keypoints,
     /// Image diagonal in the features' pixels.

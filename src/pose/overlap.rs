@@ -1,8 +1,8 @@
-//! How much two photos show of the same, from matches that nothing has verified yet.
+//! Overlap of two photos, from matches before geometric verification.
 use crate::math::median;
 use glam::DVec2;
 
-/// What two photos have in common.
+/// Inliers of the similarity between two photos.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct SimilarityInliers {
     /// Matches that agree.

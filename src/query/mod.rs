@@ -23,7 +23,7 @@ const LOGIT_SCALE: f64 = 10.0;
 /// A text query in the field's embedding space.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TextQuery {
-    /// What was asked.
+    /// The text of the query.
     pub text: String,
     /// [D] unit vector.
     pub embedding: Vec<f32>,
@@ -179,7 +179,7 @@ pub fn answer_with(
         .collect();
     let chosen = choose_level(&candidates, options)
         .ok_or_else(|| Error::work("the scene has no language level to query"))?;
-    // With masks of codes the other levels have a say in the location: the whole "plate" may hold a lemon, which finer
+    // With masks of codes the other levels count for the location: the whole "plate" may hold a lemon, which finer
     // levels tell apart. The published protocols use the chosen level alone (docs/method.md#lerf-ovs).
     let all = matches!(options.mask, MaskRule::Codes(_)).then(|| filter::box30(&sum(&candidates)));
     let best = candidates.swap_remove(chosen);

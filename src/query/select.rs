@@ -1,4 +1,4 @@
-//! Which splats a text means: selection in space, without any view (docs/method.md#selection-in-space).
+//! Splats that a query selects in space, without any view (docs/method.md#selection-in-space).
 use super::{MaskRule, QueryOptions, TextQuery, field_relevancy, margin};
 use crate::Result;
 use crate::scene::{LanguageField, LevelField};

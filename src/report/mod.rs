@@ -1,4 +1,4 @@
-//! What a run tells about itself: `run.json`, `report.html`, `previews/`, the closing table on the terminal.
+//! Records of a run: `run.json`, `report.html`, `previews/`, the closing table on the terminal.
 pub mod chart;
 pub mod colour;
 mod contents;

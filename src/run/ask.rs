@@ -1,4 +1,4 @@
-//! A loaded scene that is kept ready for questions: what viewers, `splatvk query` and benchmarks call.
+//! A loaded scene that is kept on the device for queries: what viewers, `splatvk query` and benchmarks call.
 use super::view::{DecodedFrame, Viewer};
 use crate::gpu::Device;
 use crate::infer::RegionEncoder;
@@ -9,7 +9,7 @@ use crate::report::viewer::{CodeNames, ShownAnswer};
 use crate::scene::{Camera, LanguageField, Plane, Splats};
 use crate::{Error, Result};
 
-/// The scene on the device, its code maps from the cameras looked from, and the text encoder. A question costs the
+/// The scene on the device, its code maps in the set views, and the text encoder. A query costs the
 /// embedding of its text and a gather and five box filters per camera; nothing is rendered for it.
 ///
 /// ```no_run
@@ -50,7 +50,7 @@ impl QueryScene {
         Ok(QueryScene { viewer, field, encoder, canonicals, frames: Vec::new() })
     }
 
-    /// Renders and decodes the cameras that questions are answered for from now on.
+    /// Renders and decodes the cameras that later queries are answered for.
     pub fn set_views(&mut self, cameras: &[Camera]) -> Result<&[DecodedFrame]> {
         self.frames.clear();
         for camera in cameras {
@@ -92,7 +92,7 @@ impl QueryScene {
 /// The answers to one text, one per photo.
 #[derive(Clone, Debug)]
 pub struct Answers {
-    /// What was asked.
+    /// The text of the query.
     pub text: String,
     /// Per photo.
     pub views: Vec<QueryResult>,

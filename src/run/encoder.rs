@@ -1,4 +1,4 @@
-//! The text model that speaks a scene's language.
+//! The text encoder of a scene's embedding space.
 use super::sources::{self, SourceChoice};
 use crate::format::scene_dir::{Scene, TEXT_EMBEDDINGS};
 use crate::infer::{RegionEncoder, Registry};

@@ -1,4 +1,4 @@
-//! What run.json, the report and the closing table say about the light that was taken out of the photos.
+//! The light that was taken out of the photos, in run.json, the report and the closing table.
 use crate::photo::{Light, Photo};
 use serde_json::{Value, json};
 

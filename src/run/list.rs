@@ -16,7 +16,7 @@ use crate::pose;
 use crate::report::viewer::CodeNames;
 use crate::run::view::DecodedFrame;
 
-/// What a run asks of its stages.
+/// Outputs of the stages of a run.
 pub(super) struct SceneOutputs {
     pub(super) placed: Output<PlacedPhotos>,
     pub(super) geometry: Output<pose::Geometry>,

@@ -1,4 +1,4 @@
-//! A scene that a program holds in memory: drawn, asked and saved on demand. What the C interface is made of.
+//! A scene that a program holds in memory: rendered, queried and saved on demand. What the C interface is made of.
 use super::execute::save;
 use super::outcome::RunOutcome;
 use super::view::Viewer;
@@ -41,7 +41,7 @@ pub struct LiveScene {
     viewer: Viewer,
     /// The text encoder and the [C, D] unit rows of the canonical phrases; loaded with the first question.
     text_encoder: Option<(Box<dyn RegionEncoder>, Vec<f32>)>,
-    /// Decoded codes of the camera asked last.
+    /// Decoded codes of the last query's camera.
     seen: Option<(Camera, Vec<Plane<i32>>)>,
 }
 

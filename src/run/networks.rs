@@ -7,7 +7,7 @@ use crate::infer::installed::{HashedFile, Installed};
 use crate::progress::Progress;
 use crate::report::ModelUsed;
 
-/// The networks that a plan asks for.
+/// The networks of a plan.
 pub(super) struct Networks(Vec<Installed>);
 
 impl Networks {
@@ -22,7 +22,7 @@ impl Networks {
         Ok(Networks(found.into_iter().flatten().collect()))
     }
 
-    /// What run.json says about them.
+    /// Their entries in run.json.
     pub(super) fn used(&self) -> Result<Vec<ModelUsed>> {
         let mut used = Vec::new();
         for model in &self.0 {

@@ -1,4 +1,4 @@
-//! What a finished run knows.
+//! The result of a run.
 use super::ask::Answers;
 use super::plan::RunPlan;
 use super::view::DecodedFrame;
@@ -12,9 +12,9 @@ use crate::report::ModelUsed;
 use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, LanguageField, Splats};
 
-/// Everything a finished run knows; [`crate::report`] turns it into run.json, report.html and the summary.
+/// Everything that a run made; [`crate::report`] turns it into run.json, report.html and the summary.
 pub struct RunOutcome {
-    /// What was asked for.
+    /// The plan that was run.
     pub plan: RunPlan,
     /// The preset that was used.
     pub preset: Preset,

@@ -39,7 +39,7 @@ pub struct RunPlan {
     pub matcher: SourceChoice,
     /// Masks.
     pub masks: SourceChoice,
-    /// How a mask network is asked.
+    /// Prompts of a mask network.
     pub sam: SamOptions,
     /// Features.
     pub features: SourceChoice,

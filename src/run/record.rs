@@ -1,4 +1,4 @@
-//! What a finished run says about itself: `run.json`, the report and the closing table, made from [`RunOutcome`].
+//! Records of a finished run: `run.json`, the report and the closing table, made from [`RunOutcome`].
 use super::ask::Answers;
 use super::outcome::RunOutcome;
 use crate::Result;

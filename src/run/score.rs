@@ -1,4 +1,4 @@
-//! A scene scored against ground truth: rendered from every known camera, asked for every object.
+//! A scene scored against ground truth: rendered from every known camera, queried for every object.
 use super::refine::{RefinedCamera, ViewRefiner};
 use super::view::{DecodedFrame, Viewer};
 use crate::Result;

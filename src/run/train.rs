@@ -52,7 +52,7 @@ pub struct TrainPlan {
     pub provider: Option<String>,
 }
 
-/// What a finished training tells.
+/// Figures of a finished training.
 pub struct TrainOutcome {
     /// Content of run.json.
     pub record: RunRecord,
@@ -95,7 +95,7 @@ fn points(path: &Path) -> Result<PointCloud> {
     if path.is_dir() { colmap::read_points(path) } else { ply::read_points(path) }
 }
 
-/// Gives points from a file the footprint that initialisation wants: `z / f` in the camera that sees them nearest.
+/// Gives points from a file the footprint that initialisation needs: `z / f` in the camera that sees them nearest.
 fn with_footprints(mut cloud: PointCloud, list: &[Camera]) -> Result<PointCloud> {
     let mut keep = PointCloud::default();
     for i in 0..cloud.len() {

@@ -1,4 +1,4 @@
-//! What a phone does to a picture: lens, light, sensor noise. The distributions are stated in docs/data.md.
+//! Effects of a phone camera: lens, light, sensor noise. The distributions are stated in docs/data.md.
 use crate::math::Random;
 use crate::scene::{Camera, Lens, RgbImage};
 use crate::{Error, Result};
@@ -103,7 +103,7 @@ impl TrueLight {
     }
 }
 
-/// What one photo goes through, in this order: lens, light, noise, 8 bits and JPEG.
+/// Effects on one photo, in this order: lens, light, noise, 8 bits and JPEG.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PhotoEffects {
     /// The undistorted pinhole.
@@ -116,7 +116,7 @@ pub struct PhotoEffects {
     pub noise: Option<u64>,
 }
 
-/// What the photos of one camera share.
+/// Optics that the photos of one camera share.
 struct Optics {
     /// Share of the width.
     focal: f64,
@@ -177,7 +177,7 @@ pub fn shots(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<Pho
     Ok(shots.collect())
 }
 
-/// The camera with the focal length and the principal point that the effects ask for.
+/// The camera with the focal length and the principal point of the effects.
 fn refocused(camera: &Camera, focal: f64, offset: DVec2, effects: &Effects) -> Camera {
     let (mut camera, width) = (camera.clone(), f64::from(camera.width));
     if effects.focal {

@@ -29,7 +29,7 @@ const BOUNDS: [&str; 18] = [
     "max_b",
 ];
 const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
-/// Log scales beyond these say nothing (1e-9 to 5e8 units) and would cost the others of the chunk their precision.
+/// Log scales beyond these carry no information (1e-9 to 5e8 units) and would cost the others of the chunk their precision.
 const LOG_SCALE_MAX: f32 = 20.0;
 /// Bytes of SH hold −4 to 4.
 const SH_RANGE: f32 = 8.0;

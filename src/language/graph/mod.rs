@@ -1,4 +1,4 @@
-//! EncodedLevel-in masks without a large model: hierarchical merging of superpixels by colour, texture, a learned boundary map
+//! Built-in masks without a large model: hierarchical merging of superpixels by colour, texture, a learned boundary map
 //! and, where depth is known, depth steps and creases; three cuts of the tree are the three levels.
 mod levels;
 mod options;

@@ -5,7 +5,7 @@ use super::plane::PlaneFit;
 use std::cmp::Ordering;
 use std::collections::{BTreeMap, BinaryHeap};
 
-/// What a node of the tree knows about its pixels.
+/// Statistics of the pixels of a node.
 #[derive(Clone)]
 pub(super) struct Region {
     pub area: f32,
@@ -15,7 +15,7 @@ pub(super) struct Region {
     pub perimeter: f32,
     /// Pixel sides on the image border.
     pub frame: f32,
-    /// Σ over the border, without the image border, of how much speaks for a contour there, each in [0, 1].
+    /// Σ over the border, without the image border, of the evidence for a contour there, each in [0, 1].
     pub contour: f32,
     lab: [f32; 3],
     histogram: [f32; BINS],

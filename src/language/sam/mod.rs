@@ -1,4 +1,4 @@
-//! Masks from a network that answers points (docs/method.md#masks-from-points): a grid of points over the photo and
+//! Masks from a network that is prompted with points (docs/method.md#masks-from-points): a grid of points over the photo and
 //! over four overlapping crops, three masks each, one list per level; poor, unstable and doubled ones are dropped and
 //! the rest painted into label maps.
 mod bits;

@@ -1,4 +1,4 @@
-//! The generator against a decoder whose masks are known exactly: discs around the point that was asked about.
+//! The generator against a decoder whose masks are known exactly: discs around the prompt point.
 use super::*;
 use crate::infer::Registry;
 use crate::infer::installed::Task;

@@ -19,7 +19,7 @@ use solve::{Solution, System, exposure};
 
 /// Difference in brightness left in parts of a photo, ln, that the user should know of: half an f-stop.
 const UNEXPLAINED: f64 = 0.35;
-/// Fewest points that tell light from content.
+/// Fewest points that separate light from content.
 const MIN_POINTS: usize = 50;
 
 /// Light of the photos and what it leaves unexplained.

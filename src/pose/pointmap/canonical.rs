@@ -3,7 +3,7 @@ use crate::math::median;
 use crate::scene::{ModelView, PairPointmaps, Pointmap};
 use glam::{DVec2, DVec3};
 
-/// What all pairs together say about one view, in the scale of its reference pair.
+/// Depth of one view from all its pairs, in the scale of its reference pair.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Canonical {
     /// [H, W] points in the view's own camera frame.

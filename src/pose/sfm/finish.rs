@@ -29,7 +29,7 @@ pub(super) struct Evidence {
     pub(super) keypoints: Vec<Vec<Sighting>>,
 }
 
-/// Settles the model: outliers out, weights from the residuals, the optics that the photos tell, every sighting refined to
+/// Final adjustment: outliers out, weights from the residuals, the optics that the sightings determine, every sighting refined to
 /// sub-pixel and further points added where the geometry predicts them.
 pub(super) fn finish(
     photos: &[Photo],
@@ -199,7 +199,7 @@ fn straightened(model: &Model, view: usize, image: &RgbImage) -> RgbImage {
     }
 }
 
-/// Runs a step that knows only pinholes on the model with its sightings moved to where a pinhole would show them.
+/// Runs a step for pinholes on the model with its sightings moved to where a pinhole would show them.
 fn on_straight(model: &mut Model, step: impl FnOnce(&mut Model)) {
     let optics = model.optics.clone();
     let lensed = model.clone_optics();

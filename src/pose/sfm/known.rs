@@ -13,7 +13,7 @@ use crate::scene::{Camera, Lens};
 use crate::{Error, Result};
 use glam::DVec2;
 
-/// Fewest points that tell the depth range of a scene.
+/// Fewest points that determine the depth range of a scene.
 const MIN_POINTS: usize = 20;
 /// Least share of the matches by appearance that must obey the given cameras: chance gives about 2 % (a band of 2 × 3 px
 /// in 480), true cameras 20 % and more.

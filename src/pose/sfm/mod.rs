@@ -70,7 +70,7 @@ fn separable(photos: &[Photo], group: &[usize]) -> Vec<usize> {
     photos.iter().enumerate().map(|(v, p)| if named(p) { first(v) } else { v }).collect()
 }
 
-/// Groups and priors of the optics by what the files say.
+/// Groups and priors of the optics from the files.
 fn empty_model(photos: &[Photo]) -> Model {
     let zoom: Vec<f64> = photos.iter().map(Photo::zoom).collect();
     let long = |v: usize| photos[v].original_size.0.max(photos[v].original_size.1);

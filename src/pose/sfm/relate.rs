@@ -1,4 +1,4 @@
-//! What pairs of photos have in common: matches by the looks of their features, and the geometry on which they agree.
+//! What pairs of photos have in common: matches by descriptors, and the geometry on which they agree.
 use super::model::Model;
 use super::tracks::KeypointMatch;
 use crate::photo::Photo;

@@ -3,7 +3,7 @@ use crate::scene::RgbImage;
 
 /// Bins per channel; finer ones stay empty for small planes.
 const BINS: usize = 12;
-/// Pixels added to every bin: a colour never seen on any consistent pixel tells nothing.
+/// Pixels added to every bin: a colour of no consistent pixel gives no evidence.
 const PRIOR: f32 = 2.0;
 
 /// Colour histogram of the consistent pixels on one surface, normalised against all consistent pixels.

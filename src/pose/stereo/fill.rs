@@ -1,4 +1,4 @@
-//! Depth where matching fails (weak texture, seen by one view only, rims of objects): the planes of consistent pixels
+//! Depth where matching fails (weak texture, in one view only, rims of objects): the planes of consistent pixels
 //! are carried on along paths of similar colour, never into space that another view sees through.
 use super::Level;
 use super::colours::ColourModel;

@@ -1,6 +1,6 @@
 //! The published evaluation protocols, from their public file layouts (docs/method.md#protocols).
 //!
-//! [`open`] reads a data set's labels and says which cameras to look from and which texts to ask; the caller renders and
+//! [`open`] reads a data set's labels and lists the cameras to render and the texts to query; the caller renders and
 //! decodes each frame and hands it to [`Protocol::add`]; [`Protocol::finish`] gives the figures with the definitions they
 //! follow. The project's own protocol, `field`, is [`super::eval`].
 mod lerf;

@@ -1,4 +1,4 @@
-//! What the protocols share: frames, scores, and what is seen of a scene.
+//! What the protocols share: frames, scores, and the decoded views of a scene.
 use crate::photo::stem;
 use crate::pose::align::pose_errors;
 use crate::query::eval::{Evaluation, GroundTruth, Split, to_scene};
@@ -41,7 +41,7 @@ pub struct Score {
     pub frame: String,
     /// `train` or `test`.
     pub split: Split,
-    /// What was asked.
+    /// The text of the query.
     pub phrase: String,
     /// How the mask was cut.
     pub rule: &'static str,
@@ -85,7 +85,7 @@ pub type Masks = Vec<(String, Plane<bool>)>;
 pub trait Protocol {
     /// Labelled frames that have a camera.
     fn views(&self) -> &[LabelledView];
-    /// The texts to ask, in the order that [`CodeScores`] holds them.
+    /// The texts to query, in the order that [`CodeScores`] holds them.
     fn prompts(&self) -> Vec<String>;
     /// Scores the frame `views()[index]`; returns the masks of the protocol's first rule.
     fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks>;
@@ -93,7 +93,7 @@ pub trait Protocol {
     fn finish(self: Box<Self>) -> ProtocolReport;
 }
 
-/// What each code says to each prompt.
+/// Score of each code for each prompt.
 pub struct CodeScores {
     /// [prompt][level][K]
     relevancy: Vec<Vec<Vec<f32>>>,

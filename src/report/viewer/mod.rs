@@ -43,11 +43,11 @@ pub const STYLE: &str = include_str!("viewer.css");
 /// One answered query as the page shows it.
 #[derive(Clone, Copy, Debug)]
 pub struct ShownAnswer<'a> {
-    /// What was asked.
+    /// The text of the query.
     pub text: &'a str,
     /// Views in which it was found.
     pub found: usize,
-    /// Views that were asked.
+    /// Views that were queried.
     pub views: usize,
     /// What lights up.
     pub highlight: &'a Highlight,
@@ -78,7 +78,7 @@ pub struct Scene3d<'a> {
     pub cameras: &'a [Camera],
     /// The photos, for thumbnails; as many as cameras, or none.
     pub photos: Vec<&'a RgbImage>,
-    /// What the scene knows about words.
+    /// Codebooks and features, where the scene has language.
     pub language: Option<&'a LanguageField>,
     /// The text model's own phrases for every code; may be empty.
     pub names: &'a CodeNames,
@@ -148,7 +148,7 @@ fn view(camera: &Camera, photo: Option<&RgbImage>) -> Result<Value> {
         }
         _ => None,
     };
-    // glam is column-major; the page wants rows.
+    // glam is column-major; the page reads rows.
     let rotation = camera.pose.rotation.transpose().to_cols_array();
     Ok(json!({
         "name": crate::photo::stem(&camera.name), "width": camera.width, "height": camera.height,

@@ -73,7 +73,7 @@ impl SourceKind for FeatureSources {
     }
 }
 
-/// The encoder of a choice, for those who only ask.
+/// The encoder of a choice, for queries alone.
 pub fn encoder(choice: &SourceChoice, registry: &Registry) -> Result<Box<dyn RegionEncoder>> {
     make::<FeatureSources>(choice, registry, registry)?.into_inner()
 }

@@ -103,7 +103,7 @@ pub struct GraphBuilder {
     pub graph: Graph<'static>,
     /// Where models are found.
     pub registry: Registry,
-    /// How a mask network is asked.
+    /// Prompts of a mask network.
     pub sam: SamOptions,
     /// Whether features are read with the masks.
     pub given_features: bool,

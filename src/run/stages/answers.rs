@@ -1,4 +1,4 @@
-//! The finished scene seen from the photos' cameras, and what it answers.
+//! The finished scene seen from the photos' cameras, and the answers to the queries.
 use crate::Result;
 use crate::fit::{Trained, TrainedLanguage};
 use crate::pipeline::{Context, Lane, Output, Stage};
@@ -28,7 +28,7 @@ impl Stage for DecodeViews {
     }
 }
 
-/// Answers the questions.
+/// Answers the queries.
 pub struct AnswerQueries;
 
 impl Stage for AnswerQueries {

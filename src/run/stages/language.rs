@@ -1,4 +1,4 @@
-//! Masks → aligned things with codes → splats that carry them; and what texts mean.
+//! Masks → aligned things with codes → splats that carry them; and embeddings of texts.
 use super::cameras::PlacedPhotos;
 use super::shared;
 use crate::fit::{LanguageOptions, Trained, TrainedLanguage};
@@ -14,7 +14,7 @@ use crate::run::method::Recipe;
 use crate::{Error, Result};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// An encoder that several stages ask, one at a time.
+/// An encoder that several stages use, one at a time.
 #[derive(Clone)]
 pub struct SharedEncoder {
     encoder: Arc<Mutex<Box<dyn RegionEncoder>>>,
@@ -38,7 +38,7 @@ impl SharedEncoder {
         &self.space
     }
 
-    /// The encoder, of one who shares it with nobody.
+    /// The encoder itself, once nothing else shares it.
     pub fn into_inner(self) -> Result<Box<dyn RegionEncoder>> {
         let alone = Arc::into_inner(self.encoder).ok_or_else(|| Error::work("the encoder is in use"))?;
         Ok(alone.into_inner().unwrap_or_else(PoisonError::into_inner))
@@ -59,7 +59,7 @@ impl SharedEncoder {
 pub struct EmbedQueries {
     /// By whom.
     pub encoder: SharedEncoder,
-    /// What is asked.
+    /// Texts of the queries.
     pub texts: Vec<String>,
 }
 

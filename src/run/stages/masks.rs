@@ -118,7 +118,7 @@ pub struct NetworkMasks {
 }
 
 impl NetworkMasks {
-    /// The network and how it is asked.
+    /// The network and its prompts.
     pub fn new(model: Installed, options: SamOptions) -> Result<NetworkMasks> {
         let settings = format!("{} {options:?}", shared::identity(&model)?);
         Ok(NetworkMasks { model, options, settings })

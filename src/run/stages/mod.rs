@@ -1,4 +1,4 @@
-//! The stages of the commands, one kind of work per file. Each says what it needs and what it depends on
+//! The stages of the commands, one kind of work per file. Each declares its inputs and its settings
 //! ([`crate::pipeline`]); the commands are lists of them.
 mod answers;
 mod cameras;

@@ -51,7 +51,7 @@ fn document(splats: &Splats) -> (Value, Vec<u8>) {
         let bound = |pick: fn(f32, f32) -> f32, from: f32| {
             s.means.iter().fold([from; 3], |b, m| [0, 1, 2].map(|k| pick(b[k], m[k])))
         };
-        // glTF wants the extent of positions.
+        // glTF requires the extent of positions.
         position["min"] = json!(bound(f32::min, f32::INFINITY));
         position["max"] = json!(bound(f32::max, f32::NEG_INFINITY));
     }
