@@ -3,12 +3,12 @@
 //! A table is a list of setups ([`Setup`]) that differ in one thing. The [`Runner`] runs each as a graph of stages over one
 //! store in memory: cameras, points and splats are made once for most tables. Figures are those of protocol `field` on
 //! held-out frames.
-mod lab;
+mod runner;
 mod stages;
 mod table;
 mod tables;
 
-pub use lab::{RowFigures, Runner, feature_bytes};
+pub use runner::{RowFigures, Runner, feature_bytes};
 pub use stages::{EmbeddingAgreement, Scored};
 pub use table::{FinishedRow, FinishedTable, figures};
 pub use tables::{Available, NetworkFamily, Regions, RowWork, Setup, TABLES, Table, TableRow, table};

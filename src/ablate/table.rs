@@ -1,5 +1,5 @@
 //! Finished rows as text, JSON and a chart.
-use super::lab::RowFigures;
+use super::runner::RowFigures;
 use super::tables::{Column, RowWork, Table, TableRow};
 use crate::query::eval::Split;
 use serde_json::{Value, json};

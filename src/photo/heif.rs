@@ -1,7 +1,7 @@
 //! HEIC, HEIF and AVIF through libheif's C interface, loaded at run time: its HEVC decoders are under the LGPL and
 //! patents, so splatvk runs without it and never links it. The signatures are those of libheif 1.12 (2021), unchanged since.
-use super::Support;
 use super::kind::{LARGEST_DECODED, TOO_LARGE};
+use super::support::Support;
 use image::{DynamicImage, ImageBuffer};
 use libloading::Library;
 use std::ffi::{CStr, c_char, c_int, c_void};

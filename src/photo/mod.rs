@@ -11,6 +11,7 @@ mod read;
 mod resize;
 mod sizes;
 mod straighten;
+mod support;
 mod video;
 
 pub use border::PlainBorder;
@@ -25,6 +26,7 @@ pub use read::{
 pub use resize::Kernel;
 pub use sizes::sizes_of;
 pub use straighten::Straightening;
+pub use support::Support;
 
 use crate::progress::Progress;
 use crate::scene::RgbImage;
@@ -33,21 +35,6 @@ use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
-
-/// What the machine has for a kind of files.
-#[derive(Clone, Debug)]
-pub struct Support {
-    /// What is there, in words.
-    pub found: String,
-    /// What to do about what is missing.
-    pub advice: Option<String>,
-}
-
-impl Support {
-    fn none(what: &str, advice: String) -> Support {
-        Support { found: what.to_owned(), advice: Some(advice) }
-    }
-}
 
 /// Support for HEIC and AVIF photos.
 pub fn heif_support() -> Support {

@@ -1,6 +1,6 @@
 //! Frames of a video through `ffprobe` and `ffmpeg`, as child processes: without a shell, reading local files only, within
 //! bounded time and memory.
-use super::Support;
+use super::support::Support;
 use crate::progress::Progress;
 use crate::{Error, Result};
 use std::ffi::OsString;

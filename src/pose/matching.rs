@@ -89,8 +89,9 @@ pub(crate) fn mutual_matches(a: &Keypoints, b: &Keypoints, ratio: f32) -> Vec<Ma
     out
 }
 
-/// True where features may lie: away from the image edge, from a border that was found on loading and from uniform saturated margins (undistorted or scanned photos
-/// have white or black borders; their outline stands still while the scene moves and would pass for a match).
+/// True where features may lie: away from the image edge, from a border that was found on loading and from uniform
+/// saturated margins (undistorted or scanned photos have white or black borders; their outline does not move with the
+/// scene and would pass for a match).
 pub(crate) fn valid_area(image: &RgbImage, border: PlainBorder, margin: usize) -> Plane<bool> {
     let (w, h) = (image.width, image.height);
     let mut excluded: Vec<bool> = (0..w * h).map(|i| border.covers(i % w, i / w, w, h)).collect();

@@ -108,8 +108,8 @@ impl System<'_> {
         pair.variance[self.channel.min(1)]
     }
 
-    /// Re-weighted least squares; standard deviations from the spread of the cells' scores (the sandwich estimator for clusters, Liang &
-    /// Zeger 1986), since residuals within a cell have causes in common.
+    /// Re-weighted least squares; standard deviations from the spread of the cells' scores (the sandwich estimator for
+    /// clusters, Liang & Zeger 1986), since residuals within a cell have causes in common.
     fn solve(&self, free: &Free, reference: usize) -> Solution {
         let columns = Columns::new(free, self.views, reference);
         let rows: Vec<_> = self.pairs.iter().map(|p| self.row(p, &columns)).collect();
