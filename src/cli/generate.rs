@@ -12,7 +12,7 @@ pub fn generate(args: &GenerateArgs) -> Result<()> {
     let workspace = Workspace::create(&args.out, false)?;
     match &args.from {
         Some(data) => synth::write_regions(data, workspace.path(), &flaws)?,
-        None => synth::generate(workspace.path(), &knobs(args)?, &flaws, progress::reporter().as_ref())?,
+        None => synth::generate(workspace.path(), &spec(args)?, &flaws, progress::reporter().as_ref())?,
     }
     let folder = workspace.commit()?;
     if args.json {
@@ -39,7 +39,7 @@ fn flaws(args: &GenerateArgs) -> Result<InjectedErrors> {
     })
 }
 
-fn knobs(args: &GenerateArgs) -> Result<SceneSpec> {
+fn spec(args: &GenerateArgs) -> Result<SceneSpec> {
     let size = args.size.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let size = size.ok_or_else(|| Error::input(format!("--size {}: write it as 640x480", args.size)))?;
     let effects = effects(args);

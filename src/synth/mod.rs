@@ -9,5 +9,5 @@ mod shapes;
 pub use folder::{generate, write_regions};
 pub use phone::{Effects, PhotoEffects, TrueLight, to_linear, to_srgb};
 pub use render::{RayCast, photo, render};
-pub use scene::{SceneObject, SceneSpec, SyntheticScene, world};
+pub use scene::{SceneObject, SceneSpec, SyntheticScene, build_scene};
 pub use shapes::{Hit, Paint, Shape};
