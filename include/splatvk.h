@@ -547,7 +547,7 @@ typedef struct {
      */
     const char *features;
     /*
-     Hears of the progress and may stop it; may be NULL.
+     Called with the progress; a result other than 0 stops the run; may be NULL.
      */
     SvkProgressFunction progress;
     /*

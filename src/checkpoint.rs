@@ -22,7 +22,7 @@ impl Checkpoint {
 
     /// The state of an earlier process, if there is one.
     pub fn load<T: DeserializeOwned>(&self) -> Option<T> {
-        let bytes = self.resume.then(|| files::read_sealed(&self.file))??;
+        let bytes = self.resume.then(|| files::read_with_checksum(&self.file))??;
         postcard::from_bytes(&bytes).ok()
     }
 
@@ -34,7 +34,7 @@ impl Checkpoint {
     /// Writes the state. A disk that is full costs the next process time, not this one its result.
     pub fn save<T: Serialize>(&self, state: &T) -> Result<()> {
         let bytes = postcard::to_stdvec(state).map_err(|e| Error::work(format!("checkpoint: {e}")))?;
-        let _ = files::write_sealed(&self.file, &bytes);
+        let _ = files::write_with_checksum(&self.file, &bytes);
         *self.last.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
         Ok(())
     }

@@ -16,7 +16,7 @@ pub fn home() -> PathBuf {
 }
 
 /// Hexadecimal digits of the checksum.
-const SUM: usize = 64;
+const CHECKSUM_DIGITS: usize = 64;
 
 /// Lower-case hexadecimal digits.
 pub(crate) fn hex(bytes: &[u8]) -> String {
@@ -34,9 +34,9 @@ pub(crate) fn sha256(bytes: &[u8]) -> String {
 
 /// sha256 of a file in lower-case hex; remembered per path, size and modification time.
 pub(crate) fn content_hash(path: &Path) -> std::io::Result<String> {
-    type Known = HashMap<PathBuf, (u64, SystemTime, String)>;
-    static KNOWN: OnceLock<Mutex<Known>> = OnceLock::new();
-    let known = KNOWN.get_or_init(Mutex::default);
+    type HashCache = HashMap<PathBuf, (u64, SystemTime, String)>;
+    static CACHE: OnceLock<Mutex<HashCache>> = OnceLock::new();
+    let known = CACHE.get_or_init(Mutex::default);
     let meta = std::fs::metadata(path)?;
     let stamp = (meta.len(), meta.modified()?);
     if let Ok(known) = known.lock()
@@ -76,20 +76,20 @@ pub(crate) fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
 }
 
 /// [`write`] with the checksum of `body` in front.
-pub(crate) fn write_sealed(path: &Path, body: &[u8]) -> std::io::Result<()> {
+pub(crate) fn write_with_checksum(path: &Path, body: &[u8]) -> std::io::Result<()> {
     write(path, &[sha256(body).as_bytes(), body])
 }
 
-/// What [`write_sealed`] wrote; `None` if it is not there or not what was written. Counts as a use for [`prune`].
-pub(crate) fn read_sealed(path: &Path) -> Option<Vec<u8>> {
+/// What [`write_with_checksum`] wrote; `None` if it is not there or not what was written. Counts as a use for [`prune`].
+pub(crate) fn read_with_checksum(path: &Path) -> Option<Vec<u8>> {
     let mut bytes = std::fs::read(path).ok()?;
-    let (sum, body) = bytes.split_at_checked(SUM)?;
+    let (sum, body) = bytes.split_at_checked(CHECKSUM_DIGITS)?;
     if *sum != *sha256(body).as_bytes() {
         return None;
     }
     // A folder that cannot be written to prunes nothing either.
     let _ = std::fs::File::options().append(true).open(path).and_then(|f| f.set_modified(SystemTime::now()));
-    bytes.drain(..SUM);
+    bytes.drain(..CHECKSUM_DIGITS);
     Some(bytes)
 }
 
@@ -134,15 +134,15 @@ mod tests {
     fn what_is_damaged_or_half_written_is_not_there() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("deep/a.kept");
-        assert_eq!(read_sealed(&file), None);
-        write_sealed(&file, b"body").unwrap();
-        assert_eq!(read_sealed(&file).as_deref(), Some(&b"body"[..]));
+        assert_eq!(read_with_checksum(&file), None);
+        write_with_checksum(&file, b"body").unwrap();
+        assert_eq!(read_with_checksum(&file).as_deref(), Some(&b"body"[..]));
         let mut bytes = std::fs::read(&file).unwrap();
         bytes.pop();
         std::fs::write(&file, &bytes).unwrap();
-        assert_eq!(read_sealed(&file), None);
+        assert_eq!(read_with_checksum(&file), None);
         std::fs::write(&file, b"short").unwrap();
-        assert_eq!(read_sealed(&file), None);
+        assert_eq!(read_with_checksum(&file), None);
     }
 
     #[test]

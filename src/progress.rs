@@ -1,4 +1,4 @@
-//! How long work tells its caller where it is, and learns that it should stop.
+//! Progress of long work, and the request that it should stop.
 use crate::checkpoint::Checkpoint;
 use crate::{Error, Result};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,11 +21,11 @@ pub trait Progress: Send + Sync {
     fn inform(&self, message: &str) {
         self.warn(message);
     }
-    /// True once the caller wants the work to stop.
+    /// True once the caller has requested that the work stops.
     fn cancelled(&self) -> bool {
         false
     }
-    /// `Err(Error::Cancelled)` once the caller wants the work to stop.
+    /// `Err(Error::Cancelled)` once the caller has requested that the work stops.
     fn check(&self) -> Result<()> {
         if self.cancelled() { Err(Error::Cancelled) } else { Ok(()) }
     }
@@ -33,9 +33,9 @@ pub trait Progress: Send + Sync {
     fn checkpoint(&self) -> Option<&Checkpoint> {
         None
     }
-    /// Where work that goes on beside this one reports: its stages and this one's do not end each other. Hosts that
-    /// show one stage at a time keep this default and see nothing of the other.
-    fn beside(&self) -> Box<dyn Progress + '_> {
+    /// Progress of work that goes on in parallel to this one: stages of the two lanes do not end each other. Hosts that
+    /// show one stage at a time keep this default, which ignores the second lane.
+    fn second_lane(&self) -> Box<dyn Progress + '_> {
         Box::new(Silent)
     }
 }
@@ -152,19 +152,19 @@ impl Progress for Recorded<'_> {
     fn cancelled(&self) -> bool {
         self.stopped.load(Ordering::SeqCst) || self.inner.cancelled()
     }
-    fn beside(&self) -> Box<dyn Progress + '_> {
-        Box::new(Beside { owner: self, inner: self.inner.beside(), lane: Current::default() })
+    fn second_lane(&self) -> Box<dyn Progress + '_> {
+        Box::new(SecondLane { owner: self, inner: self.inner.second_lane(), lane: Current::default() })
     }
 }
 
 /// A further lane of a [`Recorded`].
-struct Beside<'a> {
+struct SecondLane<'a> {
     owner: &'a Recorded<'a>,
     inner: Box<dyn Progress + 'a>,
     lane: Current,
 }
 
-impl Progress for Beside<'_> {
+impl Progress for SecondLane<'_> {
     fn begin(&self, stage: &'static str, steps: u64) {
         self.owner.open(&self.lane, stage);
         self.inner.begin(stage, steps);
@@ -188,8 +188,8 @@ impl Progress for Beside<'_> {
     fn cancelled(&self) -> bool {
         self.owner.cancelled()
     }
-    fn beside(&self) -> Box<dyn Progress + '_> {
-        self.owner.beside()
+    fn second_lane(&self) -> Box<dyn Progress + '_> {
+        self.owner.second_lane()
     }
 }
 
@@ -235,23 +235,23 @@ mod tests {
     }
 
     #[test]
-    fn work_beside_overlaps_and_a_failure_of_one_stops_both() {
+    fn lanes_overlap_and_a_failure_of_one_stops_both() {
         let recorded = Recorded::new(&Silent);
-        let beside = recorded.beside();
+        let second = recorded.second_lane();
         recorded.begin("splats", 1);
-        beside.begin("masks", 1);
+        second.begin("masks", 1);
         recorded.end();
         recorded.begin("language", 1);
-        beside.warn("no masks");
-        beside.end();
+        second.warn("no masks");
+        second.end();
         recorded.end();
         let stages = recorded.stages();
         let names: Vec<_> = stages.iter().map(|s| s.name.as_str()).collect();
         assert_eq!(names, ["splats", "masks", "language"]);
         assert!(stages[1].start + stages[1].seconds >= stages[2].start, "masks end after language begins");
         assert_eq!(recorded.warnings(), ["no masks"]);
-        assert!(beside.check().is_ok());
+        assert!(second.check().is_ok());
         recorded.stop();
-        assert!(beside.check().is_err() && recorded.check().is_err());
+        assert!(second.check().is_err() && recorded.check().is_err());
     }
 }

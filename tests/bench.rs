@@ -1,14 +1,14 @@
 //! `splatvk bench` on small scenes: its figures fit together, its files are read back, and it refuses what it cannot use.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 use splatvk::bench::report::{Clock, SUM};
-use splatvk::bench::{Bench, Budget, Report, Section, Spread, Workload, compare};
+use splatvk::bench::{Bench, BenchReport, Budget, Quartiles, Section, Workload, compare};
 use splatvk::gpu::{Options, TestDevice, test_device};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
 const ONCE: Budget = Budget { seconds: 1.0, repeats: Some(3) };
 
-fn is_ordered(s: &Spread) -> bool {
+fn is_ordered(s: &Quartiles) -> bool {
     0.0 < s.best && s.best <= s.lower_quartile && s.lower_quartile <= s.median && s.median <= s.upper_quartile
 }
 
@@ -83,19 +83,19 @@ fn sort_and_growth() {
 fn reports_are_read_back_and_compared() {
     let device = test_device();
     let folder = tempfile::tempdir().unwrap();
-    let mut a = Report::new(&device);
+    let mut a = BenchReport::new(&device);
     let mut section = Section::new("training step", "a scene");
-    section.time("projection", Clock::Device, Spread::of(&[1.0, 2.0, 4.0]));
+    section.time("projection", Clock::Device, Quartiles::of(&[1.0, 2.0, 4.0]));
     section.figure("intersections", 100.0, "pairs");
     section.figure("nothing was measured", f64::NAN, "");
     a.sections.push(section);
-    let write = |name: &str, report: &Report| {
+    let write = |name: &str, report: &BenchReport| {
         let file = folder.path().join(name);
         std::fs::write(&file, serde_json::to_string(report).unwrap()).unwrap();
         file
     };
     let file = write("a.json", &a);
-    assert_eq!(Report::read(&file).unwrap(), a);
+    assert_eq!(BenchReport::read(&file).unwrap(), a);
     let mut b = a.clone();
     b.sections[0].rows[0].ms.median = 3.0;
     let other = write("b.json", &b);
@@ -169,6 +169,6 @@ fn a_written_scene_is_the_scene_that_was_measured() {
         json.to_str().unwrap(),
     ]);
     assert!(measured.status.success(), "{}", String::from_utf8_lossy(&measured.stderr));
-    let report = Report::read(Path::new(&json)).unwrap();
+    let report = BenchReport::read(Path::new(&json)).unwrap();
     assert!(report.section("training step").unwrap().workload.contains("300 splats, 64 × 48"));
 }

@@ -229,7 +229,7 @@ fn language_is_trained_decoded_and_asked_in_bands_as_in_whole_images() {
     let seen = |device: &Device, field: &LanguageField, camera: &Camera| {
         let view = Viewer::new(device, &splats, field).unwrap().view_with_features(camera).unwrap();
         let answer = answer(&view.codes, field, &query, &QueryOptions::default()).unwrap();
-        (view.frame, view.codes, answer.relevancy)
+        (view.rendered, view.codes, answer.relevancy)
     };
     for mib in [16, 64] {
         let device = limited(mib * MIB, true);

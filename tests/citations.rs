@@ -21,7 +21,7 @@ const PLACES: [&str; 11] = [
 ];
 
 /// Fewer citations than this mean that they are no longer recognised.
-const LEAST: usize = 50;
+const MIN_CITATIONS: usize = 50;
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -135,7 +135,7 @@ fn every_citation_leads_to_a_heading() {
         }
     }
     assert!(faults.is_empty(), "{}", faults.join("\n"));
-    assert!(count >= LEAST, "only {count} citations were found");
+    assert!(count >= MIN_CITATIONS, "only {count} citations were found");
 }
 
 #[test]

@@ -5,7 +5,7 @@ use splatvk::format::{
     cameras, colmap, gaussians, ply, ply_packed, scene_dir, side_file, splat, spz, transforms,
 };
 use splatvk::photo::{self, stem};
-use splatvk::scene::{Camera, Codebook, LanguageField, Lens, LevelField, PointCloud, Pose, Splats};
+use splatvk::scene::{Camera, Codebook, LanguageField, Lens, LevelField, MaskId, PointCloud, Pose, Splats};
 use std::path::{Path, PathBuf};
 
 fn data(name: &str) -> PathBuf {
@@ -134,7 +134,7 @@ fn field(n: usize) -> LanguageField {
         embeddings: vec![1.0, 0.0, 0.0, 0.0, 0.6, 0.8],
         codes: vec![1.0, 0.0, 0.0, 1.0],
         weights: vec![12.0, 3.5],
-        members: vec![vec![(0, 4), (2, 1)], vec![]],
+        members: vec![vec![MaskId::new(0, 4), MaskId::new(2, 1)], vec![]],
         min_chord: 2f32.sqrt(),
     };
     let mut features = vec![0.0; n * 2];
@@ -241,7 +241,7 @@ fn packed_formats_round_trip_within_their_precision() {
         ] {
             let path = folder.path().join(name);
             gaussians::write(&path, &s, Some(&language)).unwrap();
-            let (back, spoken) = gaussians::read(&path).unwrap();
+            let (back, field) = gaussians::read(&path).unwrap();
             // Row r of a compressed PLY is splat order[r].
             let order = match name {
                 "a.spz" => (0..700).collect(),
@@ -250,7 +250,7 @@ fn packed_formats_round_trip_within_their_precision() {
             let rows: Vec<usize> =
                 (0..700).map(|j| order.iter().position(|i| *i == j as u32).unwrap()).collect();
             // The language went with its splats: the two that have features are 0 and 1.
-            let features = &spoken.unwrap().levels[0].features;
+            let features = &field.unwrap().levels[0].features;
             assert_eq!(features[2 * rows[0]..2 * rows[0] + 2], [3.0, 4.0], "{name}");
             assert_eq!(features[2 * rows[1]..2 * rows[1] + 2], [2.0, 0.5], "{name}");
             let pick = |v: &[f32], w: usize| {

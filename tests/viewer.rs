@@ -256,7 +256,7 @@ fn draws_what_the_engine_draws(page: &mut Page, scene: &Path) {
     let device = Device::open(None).unwrap();
     let mut viewer = Viewer::new(&device, &loaded.splats, &LanguageField::default()).unwrap();
     for (i, camera) in loaded.cameras.iter().enumerate() {
-        let engine = viewer.view(camera).unwrap().frame;
+        let engine = viewer.view(camera).unwrap().rendered;
         let likeness = psnr(&to_float(&page.picture(i)), &engine.rgb);
         println!("view {i}: {likeness:.1} dB against splatvk render");
         // What bytes and half floats cost; 25 dB would show a wrong blend.
@@ -264,7 +264,8 @@ fn draws_what_the_engine_draws(page: &mut Page, scene: &Path) {
     }
     page.run("splatvk.show('depth')");
     let depth = to_float(&page.picture(0));
-    let engine = splatvk::report::colour::depth_image(&viewer.view(&loaded.cameras[0]).unwrap().frame.depth);
+    let engine =
+        splatvk::report::colour::depth_image(&viewer.view(&loaded.cameras[0]).unwrap().rendered.depth);
     // The page takes the range of depth from the splats, the engine from the pixels: the same picture, not the same shades.
     assert!(psnr(&depth, &engine) > 15.0, "{}", psnr(&depth, &engine));
     page.run("splatvk.show('colour')");
@@ -405,7 +406,7 @@ fn a_static_page_answers_what_was_asked() {
     let device = Device::open(None).unwrap();
     let field = scene.language.clone().unwrap();
     let mut ready = QueryScene::open(&device, &scene.splats, field, encoder).unwrap();
-    ready.look(&scene.cameras).unwrap();
+    ready.set_views(&scene.cameras).unwrap();
     let answers = ["lemon", "loaf of bread"].map(|t| ready.ask(t, &QueryOptions::default()).unwrap());
     let names = ready.names().unwrap();
     let view = Scene3d {
@@ -491,7 +492,7 @@ fn pictures_of_a_real_scene() {
     let loaded = scene_dir::load(&scene).unwrap();
     let device = Device::open(None).unwrap();
     let mut viewer = Viewer::new(&device, &loaded.splats, &LanguageField::default()).unwrap();
-    let engine = viewer.view(&loaded.cameras[0]).unwrap().frame.rgb;
+    let engine = viewer.view(&loaded.cameras[0]).unwrap().rendered.rgb;
     let likeness = psnr(&to_float(&page.picture(0)), &engine);
     println!("{likeness:.1} dB against splatvk render, {} splats", loaded.splats.len());
     assert!(likeness > 25.0);

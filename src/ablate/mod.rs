@@ -1,17 +1,17 @@
 //! `splatvk ablate`: the tables of the paper's experiments on a data set with ground truth.
 //!
-//! A table is a list of setups ([`Setup`]) that differ in one thing. The [`Lab`] runs each as a graph of stages over one
+//! A table is a list of setups ([`Setup`]) that differ in one thing. The [`Runner`] runs each as a graph of stages over one
 //! store in memory: cameras, points and splats are made once for most tables. Figures are those of protocol `field` on
 //! held-out frames.
-mod lab;
+mod runner;
 mod stages;
 mod table;
 mod tables;
 
-pub use lab::{Lab, Outcome, feature_bytes};
-pub use stages::{Meaning, Scored};
-pub use table::{Done, Finished, figures};
-pub use tables::{Available, Regions, Row, Runs, Setup, TABLES, Table, table};
+pub use runner::{RowFigures, Runner, feature_bytes};
+pub use stages::{EmbeddingAgreement, Scored};
+pub use table::{FinishedRow, FinishedTable, figures};
+pub use tables::{Available, NetworkFamily, Regions, RowWork, Setup, TABLES, Table, TableRow, table};
 
 use crate::fit::{LanguageOptions, Preset, RgbOptions};
 use crate::query::eval::Split;
@@ -53,7 +53,7 @@ impl Default for Plan {
 }
 
 /// Runs one table.
-pub fn run(lab: &mut Lab, plan: &Plan, table: &'static Table) -> Result<Finished> {
+pub fn run(lab: &mut Runner, plan: &Plan, table: &'static Table) -> Result<FinishedTable> {
     let count = |split| lab.truth.frames.iter().filter(|f| f.split == split).count();
     let (train, test) = (count(Split::Train), count(Split::Test));
     if train < 2 || test == 0 {
@@ -64,11 +64,11 @@ pub fn run(lab: &mut Lab, plan: &Plan, table: &'static Table) -> Result<Finished
     }
     let available = lab.available();
     let given = plan.regions.clone().map(|regions| vec![regions]);
-    let mut finished = Finished { table, seen: Vec::new(), rows: Vec::new() };
+    let mut finished = FinishedTable { table, seen: Vec::new(), rows: Vec::new() };
     for regions in given.unwrap_or_else(|| (table.regions)(plan.seed, &available)) {
         let base = Setup {
             views: plan.views.unwrap_or(train.min(crate::photo::DEFAULT_VIEWS)),
-            init: sources::default::<sources::Geometry>(),
+            init: sources::default::<sources::GeometrySources>(),
             true_cameras: plan.true_cameras,
             max_points: None,
             regions,
@@ -87,23 +87,23 @@ pub fn run(lab: &mut Lab, plan: &Plan, table: &'static Table) -> Result<Finished
 }
 
 /// Runs a row; `seen` collects held-out frames that it has seen as photos.
-fn done(lab: &mut Lab, mut row: Row, seen: &mut Vec<String>) -> Result<Done> {
+fn done(lab: &mut Runner, mut row: TableRow, seen: &mut Vec<String>) -> Result<FinishedRow> {
     let setup = match &row.runs {
-        Runs::Scored(setup) => setup,
-        Runs::Unreduced(setup) => {
+        RowWork::Score(setup) => setup,
+        RowWork::MemoryOnly(setup) => {
             let bytes = Some(lab.unreduced_bytes(setup)?);
-            return Ok(Done { bytes, outcome: None, row });
+            return Ok(FinishedRow { bytes, outcome: None, row });
         }
-        Runs::Nothing => return Ok(Done { bytes: None, outcome: None, row }),
+        RowWork::Nothing => return Ok(FinishedRow { bytes: None, outcome: None, row }),
     };
     let photos = lab.frames(setup.views)?.into_iter();
     seen.extend(photos.filter(|f| f.split == Split::Test).map(|f| f.stem));
     match lab.outcome(setup) {
-        Ok(outcome) => Ok(Done { bytes: Some(outcome.feature_bytes), outcome: Some(outcome), row }),
+        Ok(outcome) => Ok(FinishedRow { bytes: Some(outcome.feature_bytes), outcome: Some(outcome), row }),
         // What a device cannot hold is a finding about it; the other rows still count.
         Err(Error::Gpu(why)) => {
             row.note = why;
-            Ok(Done { bytes: None, outcome: None, row })
+            Ok(FinishedRow { bytes: None, outcome: None, row })
         }
         Err(e) => Err(e),
     }

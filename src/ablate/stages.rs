@@ -1,33 +1,33 @@
-//! What only experiments do: masks and features from ground truth, the true meaning of objects, and figures.
+//! What only experiments do: masks and features from ground truth, the true embeddings of objects, and figures.
 use crate::fit::{Trained, TrainedLanguage};
 use crate::language::{ViewMasks, dir};
 use crate::photo::Photo;
 use crate::photo::stem;
 use crate::pipeline::{Context, Lane, Output, Stage};
 use crate::query::TextQuery;
-use crate::query::eval::{Evaluation, Frame, GroundTruth, Report, Split};
+use crate::query::eval::{EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
 use crate::run::score::score_field;
-use crate::run::stages::{Placed, SharedEncoder};
+use crate::run::stages::{PlacedPhotos, SharedEncoder};
 use crate::scene::{Codebook, Plane};
-use crate::synth::regions::{self, Flaws};
+use crate::synth::regions::{self, InjectedErrors};
 use crate::{Error, Result};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Object index → unit embedding of what it is.
-pub(super) type Meanings = BTreeMap<u32, Vec<f32>>;
+/// Object index → its true unit embedding.
+pub(super) type ObjectEmbeddings = BTreeMap<u32, Vec<f32>>;
 
-/// Agreement of the rendered meaning with the true one in one frame.
+/// Agreement of decoded embeddings with the true ones in one frame.
 #[derive(Clone, Debug, Serialize)]
-pub struct Meaning {
+pub struct EmbeddingAgreement {
     /// Frame file stem.
     pub frame: String,
     /// Held out or not.
     pub split: Split,
     /// Mean cosine over labelled pixels.
     pub similarity: f64,
-    /// Mean square difference with every coordinate scaled to [0, 1] over the true meanings.
+    /// Mean square difference with every coordinate scaled to [0, 1] over the true embeddings.
     pub mse: f64,
 }
 
@@ -35,13 +35,13 @@ pub struct Meaning {
 #[derive(Clone, Debug, Default)]
 pub struct Scored {
     /// Of protocol `field`.
-    pub report: Report,
+    pub report: EvalReport,
     /// Per frame.
-    pub meaning: Vec<Meaning>,
+    pub agreement: Vec<EmbeddingAgreement>,
 }
 
 /// The frame of each photo.
-fn frames_of<'t>(truth: &'t GroundTruth, photos: &[Photo]) -> Result<Vec<&'t Frame>> {
+fn frames_of<'t>(truth: &'t GroundTruth, photos: &[Photo]) -> Result<Vec<&'t TruthFrame>> {
     let find = |p: &Photo| {
         let frame = truth.frames.iter().find(|f| stem(&f.file) == p.stem);
         frame.ok_or_else(|| Error::work(format!("{}: not a frame of the data set", p.path.display())))
@@ -52,62 +52,62 @@ fn frames_of<'t>(truth: &'t GroundTruth, photos: &[Photo]) -> Result<Vec<&'t Fra
 /// True masks with synthetic features.
 pub(super) struct SyntheticMasks {
     pub(super) truth: Arc<GroundTruth>,
-    pub(super) flaws: Flaws,
+    pub(super) flaws: InjectedErrors,
 }
 
 impl Stage for SyntheticMasks {
     const NAME: &'static str = "synthetic-masks";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>,);
+    type Inputs = (Output<PlacedPhotos>,);
     type Output = Vec<ViewMasks>;
 
     fn settings(&self) -> String {
         format!("{:?} {:?}", self.truth.folder, self.flaws)
     }
 
-    fn run(self, (placed,): (&Placed,), _: &Context) -> Result<Vec<ViewMasks>> {
+    fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<Vec<ViewMasks>> {
         Ok(regions::regions(&self.truth, &frames_of(&self.truth, &placed.photos)?, &self.flaws)?.masks)
     }
 }
 
 /// What objects mean in the space of [`SyntheticMasks`].
-pub(super) struct SyntheticMeaning {
+pub(super) struct SyntheticEmbeddings {
     pub(super) truth: Arc<GroundTruth>,
-    pub(super) flaws: Flaws,
+    pub(super) flaws: InjectedErrors,
 }
 
-impl Stage for SyntheticMeaning {
-    const NAME: &'static str = "synthetic-meaning";
+impl Stage for SyntheticEmbeddings {
+    const NAME: &'static str = "synthetic-embeddings";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>,);
-    type Output = Meanings;
+    type Inputs = (Output<PlacedPhotos>,);
+    type Output = ObjectEmbeddings;
 
     fn settings(&self) -> String {
         format!("{:?} {:?}", self.truth.folder, self.flaws)
     }
 
-    fn run(self, (placed,): (&Placed,), _: &Context) -> Result<Meanings> {
-        Ok(regions::regions(&self.truth, &frames_of(&self.truth, &placed.photos)?, &self.flaws)?.meaning)
+    fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<ObjectEmbeddings> {
+        Ok(regions::regions(&self.truth, &frames_of(&self.truth, &placed.photos)?, &self.flaws)?.embeddings)
     }
 }
 
-/// What an encoder says of each object's true mask, averaged over the photos.
-pub(super) struct EncoderMeaning {
+/// Embedding of each object's true mask by an encoder, averaged over the photos.
+pub(super) struct EncoderEmbeddings {
     pub(super) truth: Arc<GroundTruth>,
     pub(super) encoder: SharedEncoder,
 }
 
-impl Stage for EncoderMeaning {
-    const NAME: &'static str = "encoder-meaning";
+impl Stage for EncoderEmbeddings {
+    const NAME: &'static str = "encoder-embeddings";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>,);
-    type Output = Meanings;
+    type Inputs = (Output<PlacedPhotos>,);
+    type Output = ObjectEmbeddings;
 
     fn settings(&self) -> String {
         format!("{:?} {}", self.truth.folder, self.encoder.identity())
     }
 
-    fn run(self, (placed,): (&Placed,), _: &Context) -> Result<Meanings> {
+    fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<ObjectEmbeddings> {
         let mut sums: Option<Sums> = None;
         for (frame, photo) in frames_of(&self.truth, &placed.photos)?.into_iter().zip(&placed.photos) {
             let Some(objects) = self.truth.objects(frame)? else { continue };
@@ -126,22 +126,22 @@ impl Stage for EncoderMeaning {
     }
 }
 
-/// What the given wholes say of each object, averaged over its pixels.
-pub(super) struct MaskMeaning {
+/// Embedding of each object by the given masks of level l, averaged over its pixels.
+pub(super) struct MaskEmbeddings {
     pub(super) truth: Arc<GroundTruth>,
 }
 
-impl Stage for MaskMeaning {
-    const NAME: &'static str = "mask-meaning";
+impl Stage for MaskEmbeddings {
+    const NAME: &'static str = "mask-embeddings";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>, Output<Vec<ViewMasks>>);
-    type Output = Meanings;
+    type Inputs = (Output<PlacedPhotos>, Output<Vec<ViewMasks>>);
+    type Output = ObjectEmbeddings;
 
     fn settings(&self) -> String {
         format!("{:?}", self.truth.folder)
     }
 
-    fn run(self, (placed, masks): (&Placed, &Vec<ViewMasks>), _: &Context) -> Result<Meanings> {
+    fn run(self, (placed, masks): (&PlacedPhotos, &Vec<ViewMasks>), _: &Context) -> Result<ObjectEmbeddings> {
         let levels = masks.iter().flat_map(|v| &v.levels);
         let dim = levels.into_iter().find_map(|l| l.features.len().checked_div(l.quality.len()));
         let mut sums = Sums::new(dim.unwrap_or(0));
@@ -172,7 +172,7 @@ pub(super) struct Score {
 impl Stage for Score {
     const NAME: &'static str = "score";
     const LANE: Lane = Lane::Device;
-    type Inputs = (Output<Trained>, Output<TrainedLanguage>, Output<Meanings>);
+    type Inputs = (Output<Trained>, Output<TrainedLanguage>, Output<ObjectEmbeddings>);
     type Output = Scored;
 
     fn settings(&self) -> String {
@@ -182,12 +182,12 @@ impl Stage for Score {
 
     fn run(
         self,
-        (trained, language, meanings): (&Trained, &TrainedLanguage, &Meanings),
+        (trained, language, embeddings): (&Trained, &TrainedLanguage, &ObjectEmbeddings),
         context: &Context,
     ) -> Result<Scored> {
         let evaluation = Evaluation::new((*self.truth).clone(), &trained.cameras, None)?;
-        let mut meaning = Vec::new();
-        let scale = Scale::of(meanings);
+        let mut agreements = Vec::new();
+        let scale = Scale::of(embeddings);
         let levels = &language.field.levels;
         let whole = levels.iter().rposition(|l| !l.codebook.is_empty());
         let report = score_field(
@@ -201,45 +201,52 @@ impl Stage for Score {
             &mut |frame, decoded| {
                 let (Some(level), Some(objects)) = (whole, self.truth.objects(frame)?) else { return Ok(()) };
                 let book = &levels[level].codebook;
-                meaning.extend(agreement(frame, &decoded.codes[level], book, &objects, meanings, &scale));
+                agreements.extend(agreement(
+                    frame,
+                    &decoded.codes[level],
+                    book,
+                    &objects,
+                    embeddings,
+                    &scale,
+                ));
                 Ok(())
             },
         )?;
-        Ok(Scored { report, meaning })
+        Ok(Scored { report, agreement: agreements })
     }
 }
 
 /// Weighted sums of vectors per object.
 struct Sums {
     dim: usize,
-    rows: Meanings,
+    rows: ObjectEmbeddings,
 }
 
 impl Sums {
     fn new(dim: usize) -> Self {
-        Sums { dim, rows: Meanings::new() }
+        Sums { dim, rows: ObjectEmbeddings::new() }
     }
     fn add(&mut self, label: u32, row: &[f32], weight: f32) {
         let sum = self.rows.entry(label).or_insert_with(|| vec![0.0; self.dim]);
         sum.iter_mut().zip(row).for_each(|(s, v)| *s += weight * v);
     }
     /// Unit vectors of those that are not zero.
-    fn unit(mut self) -> Meanings {
+    fn unit(mut self) -> ObjectEmbeddings {
         self.rows.values_mut().for_each(|row| dir::normalise_rows(row, self.dim));
         self.rows.retain(|_, row| row.iter().any(|v| *v != 0.0));
         self.rows
     }
 }
 
-/// 1 / (max − min) per coordinate over the true meanings, squared; 0 where they do not differ.
+/// 1 / (max − min) per coordinate over the true embeddings, squared; 0 where they do not differ.
 struct Scale(Vec<f32>);
 
 impl Scale {
-    fn of(meaning: &Meanings) -> Self {
-        let dim = meaning.values().next().map_or(0, Vec::len);
+    fn of(embeddings: &ObjectEmbeddings) -> Self {
+        let dim = embeddings.values().next().map_or(0, Vec::len);
         let scale = |c: usize| {
             let (low, high) =
-                meaning.values().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(v[c]), h.max(v[c])));
+                embeddings.values().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(v[c]), h.max(v[c])));
             // Coordinates of unit vectors that differ by less than this differ by rounding.
             if high - low > 1e-4 { 1.0 / (high - low).powi(2) } else { 0.0 }
         };
@@ -247,16 +254,16 @@ impl Scale {
     }
 }
 
-/// How well a decoded level agrees with the true meaning of each pixel's object; pixels without code or truth are left
+/// How well a decoded level agrees with the true embedding of each pixel's object; pixels without code or truth are left
 /// out.
 fn agreement(
-    frame: &Frame,
+    frame: &TruthFrame,
     codes: &Plane<i32>,
     book: &Codebook,
     objects: &Plane<u32>,
-    meaning: &Meanings,
+    embeddings: &ObjectEmbeddings,
     scale: &Scale,
-) -> Option<Meaning> {
+) -> Option<EmbeddingAgreement> {
     let mut pairs: BTreeMap<(i32, u32), usize> = BTreeMap::new();
     if codes.data.len() != objects.data.len() {
         return None;
@@ -266,7 +273,7 @@ fn agreement(
     }
     let (mut cosine, mut square, mut total) = (0.0f64, 0.0f64, 0usize);
     for ((k, o), n) in pairs {
-        let Some(truth) = meaning.get(&o) else { continue };
+        let Some(truth) = embeddings.get(&o) else { continue };
         let d = book.embedding_dim;
         let row = &book.embeddings[k as usize * d..(k as usize + 1) * d];
         let dot: f32 = row.iter().zip(truth).map(|(a, b)| a * b).sum();
@@ -275,7 +282,7 @@ fn agreement(
         square += n as f64 * f64::from(sum) / d as f64;
         total += n;
     }
-    (total > 0).then(|| Meaning {
+    (total > 0).then(|| EmbeddingAgreement {
         frame: frame.stem.clone(),
         split: frame.split,
         similarity: cosine / total as f64,

@@ -1,29 +1,29 @@
 //! Finished rows as text, JSON and a chart.
-use super::lab::Outcome;
-use super::tables::{Column, Row, Runs, Table};
+use super::runner::RowFigures;
+use super::tables::{Column, RowWork, Table, TableRow};
 use crate::query::eval::Split;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
 /// A row and what it gave.
-pub struct Done {
+pub struct FinishedRow {
     /// What it was.
-    pub row: Row,
+    pub row: TableRow,
     /// What it gave; none for a row without a setup.
-    pub outcome: Option<Outcome>,
+    pub outcome: Option<RowFigures>,
     /// Bytes of the features in training.
     pub bytes: Option<u64>,
 }
 
 /// A table that ran.
-pub struct Finished {
+pub struct FinishedTable {
     /// Which.
     pub table: &'static Table,
     /// Frames that no row may be scored on, because some row has seen them as photos.
     pub seen: Vec<String>,
     /// Rows in order.
-    pub rows: Vec<Done>,
+    pub rows: Vec<FinishedRow>,
 }
 
 fn columns(table: &Table) -> Vec<Column> {
@@ -37,7 +37,7 @@ fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
 }
 
 /// The figures of a row on the frames that count.
-pub fn figures(done: &Done, seen: &[String]) -> BTreeMap<&'static str, f64> {
+pub fn figures(done: &FinishedRow, seen: &[String]) -> BTreeMap<&'static str, f64> {
     let mut out = BTreeMap::new();
     let mut put = |name: &'static str, value: Option<f64>| {
         out.extend(value.map(|v| (name, v)));
@@ -50,9 +50,9 @@ pub fn figures(done: &Done, seen: &[String]) -> BTreeMap<&'static str, f64> {
     put("mAcc", mean(masks().map(|m| f64::from(m.localised))));
     let images = o.scored.report.images.iter().filter(|i| held_out(i.split, &i.frame));
     put("PSNR", mean(images.map(|i| i.psnr)));
-    let meaning = || o.scored.meaning.iter().filter(|m| held_out(m.split, &m.frame));
-    put("SIM", mean(meaning().map(|m| m.similarity)));
-    put("MSE", mean(meaning().map(|m| m.mse)));
+    let agreement = || o.scored.agreement.iter().filter(|m| held_out(m.split, &m.frame));
+    put("SIM", mean(agreement().map(|m| m.similarity)));
+    put("MSE", mean(agreement().map(|m| m.mse)));
     put("mIoU photos", mean(o.scored.report.masks.iter().filter(|m| m.split == Split::Train).map(|m| m.iou)));
     put("splats", Some(o.splats as f64));
     put("codes", Some(o.codes.iter().sum::<usize>() as f64));
@@ -60,7 +60,7 @@ pub fn figures(done: &Done, seen: &[String]) -> BTreeMap<&'static str, f64> {
     out
 }
 
-impl Finished {
+impl FinishedTable {
     /// As text, the paper's figure in brackets beside ours.
     pub fn text(&self) -> String {
         let columns = columns(self.table);
@@ -113,10 +113,10 @@ impl Finished {
 
     /// Everything, for other programs.
     pub fn json(&self) -> Value {
-        let row = |done: &Done| {
+        let row = |done: &FinishedRow| {
             let setup = match &done.row.runs {
-                Runs::Scored(setup) => Some(setup),
-                Runs::Unreduced(_) | Runs::Nothing => None,
+                RowWork::Score(setup) => Some(setup),
+                RowWork::MemoryOnly(_) | RowWork::Nothing => None,
             };
             json!({
                 "group": done.row.group, "label": done.row.label, "note": done.row.note, "setup": setup,
@@ -157,9 +157,9 @@ impl Finished {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ablate::stages::{Meaning, Scored};
+    use crate::ablate::stages::{EmbeddingAgreement, Scored};
     use crate::ablate::tables::table;
-    use crate::query::eval::{MaskScore, Report};
+    use crate::query::eval::{EvalReport, MaskScore};
 
     fn mask(frame: &str, split: Split, iou: f64, localised: bool) -> MaskScore {
         MaskScore {
@@ -183,33 +183,43 @@ mod tests {
             mask("b", Split::Test, 0.6, true),
             mask("c", Split::Test, 1.0, true),
         ];
-        let meaning = Meaning { frame: "c".into(), split: Split::Test, similarity: 0.5, mse: 0.1 };
-        let outcome = Outcome {
+        let agreement =
+            EmbeddingAgreement { frame: "c".into(), split: Split::Test, similarity: 0.5, mse: 0.1 };
+        let outcome = RowFigures {
             scored: std::sync::Arc::new(Scored {
-                report: Report { masks, ..Report::default() },
-                meaning: vec![meaning],
+                report: EvalReport { masks, ..EvalReport::default() },
+                agreement: vec![agreement],
             }),
             splats: 7,
             codes: vec![1, 2],
             feature_bytes: 5_000_000,
             seconds: 1.0,
         };
-        let row = |label: &str, paper: Vec<(&'static str, f64)>| Row {
+        let row = |label: &str, paper: Vec<(&'static str, f64)>| TableRow {
             label: label.into(),
             group: "g".into(),
-            runs: Runs::Nothing,
+            runs: RowWork::Nothing,
             note: String::new(),
             paper,
         };
-        let done =
-            Done { row: row("one", vec![("mIoU", 0.538)]), outcome: Some(outcome), bytes: Some(5_000_000) };
+        let done = FinishedRow {
+            row: row("one", vec![("mIoU", 0.538)]),
+            outcome: Some(outcome),
+            bytes: Some(5_000_000),
+        };
         let f = figures(&done, &["a".to_string()]);
         assert_eq!((f["mIoU"], f["mAcc"], f["mIoU photos"], f["codes"]), (0.8, 1.0, 0.9, 3.0));
         assert_eq!(figures(&done, &[])["mIoU"], 0.6);
-        let none =
-            Done { row: Row { note: "why".into(), ..row("two", vec![]) }, outcome: None, bytes: Some(1) };
-        let finished =
-            Finished { table: table("alignment").unwrap(), seen: vec!["a".into()], rows: vec![done, none] };
+        let none = FinishedRow {
+            row: TableRow { note: "why".into(), ..row("two", vec![]) },
+            outcome: None,
+            bytes: Some(1),
+        };
+        let finished = FinishedTable {
+            table: table("alignment").unwrap(),
+            seen: vec!["a".into()],
+            rows: vec![done, none],
+        };
         let text = finished.text();
         assert!(text.contains("0.800 (0.538)") && text.contains("why") && text.contains("[g]"), "{text}");
         let json = finished.json();

@@ -1,8 +1,8 @@
 //! The tables of the paper's experiments, as data: each is a list of setups that differ in one thing.
 use crate::language::Reducer;
 use crate::run::method::{AUTOENCODER, LANGSPLAT, LEGAUSSIANS, LSM, METHODS, Recipe};
-use crate::run::sources::{self, Features, Masks, SourceChoice};
-use crate::synth::regions::Flaws;
+use crate::run::sources::{self, FeatureSources, MaskSources, SourceChoice};
+use crate::synth::regions::InjectedErrors;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -20,7 +20,7 @@ pub struct Table {
     /// The regions under which it is run when the user does not say; one group of rows each.
     pub(super) regions: fn(u64, &Available) -> Vec<Regions>,
     /// The rows of a group.
-    pub(super) rows: fn(&Group) -> Vec<Row>,
+    pub(super) rows: fn(&Group) -> Vec<TableRow>,
 }
 
 impl Serialize for Table {
@@ -66,8 +66,8 @@ pub static TABLES: [Table; 9] = [
                 group.recipe("bijection, 3 dimensions", short, &[]),
                 group.recipe("autoencoder, 100 epochs", published, &[("mIoU", 0.463), ("mAcc", 0.640)]),
                 group.recipe("autoencoder, 2000 steps", longer, &[]),
-                Row {
-                    runs: Runs::Unreduced(group.base.clone()),
+                TableRow {
+                    runs: RowWork::MemoryOnly(group.base.clone()),
                     note: "not trained: memory only".into(),
                     ..group.row("no reduction", group.base.clone(), &[])
                 },
@@ -126,13 +126,11 @@ pub static TABLES: [Table; 9] = [
         columns: &[("SIM", 3), ("codes", 0)],
         regions: |seed, available| {
             let own = [Regions::built_in(), Regions::flawed(seed), Regions::EXACT];
-            own.into_iter()
-                .chain(available.features.iter().map(|(name, _)| Regions::described_by(name)))
-                .collect()
+            own.into_iter().chain(available.features.iter().map(|f| Regions::described_by(&f.name))).collect()
         },
         rows: |group| {
             let name = group.base.regions.name();
-            let absent = group.available.features.iter().any(|(n, there)| *n == name && !there);
+            let absent = group.available.features.iter().any(|f| f.name == name && !f.installed);
             vec![group.if_installed(&name, group.base.clone(), !absent)]
         },
     },
@@ -166,7 +164,7 @@ pub static TABLES: [Table; 9] = [
                     return row;
                 }
                 let note = format!("the data set has {} photos to spare", group.available.views);
-                Row { runs: Runs::Nothing, note, ..row }
+                TableRow { runs: RowWork::Nothing, note, ..row }
             };
             [(2, 0.7341, 0.9), (4, 0.7264, 0.9), (6, 0.7313, 0.85)].map(row).into()
         },
@@ -178,14 +176,14 @@ pub static TABLES: [Table; 9] = [
         regions: |_, _| vec![Regions::EXACT],
         rows: |group| {
             let from = |init: SourceChoice, true_cameras| Setup { init, true_cameras, ..group.base.clone() };
-            let sfm = sources::default::<sources::Geometry>();
+            let sfm = sources::default::<sources::GeometrySources>();
             let mut rows = vec![
                 group.row(&sfm.name, from(sfm.clone(), false), &[]),
                 group.row("true cameras", from(sfm, true), &[]),
             ];
             let networks = group.available.geometry.iter();
-            rows.extend(networks.map(|(name, there)| {
-                group.if_installed(name, from(SourceChoice::named(name), false), *there)
+            rows.extend(networks.map(|f| {
+                group.if_installed(&f.name, from(SourceChoice::named(&f.name), false), f.installed)
             }));
             rows
         },
@@ -209,21 +207,24 @@ pub enum Regions {
         features: SourceChoice,
     },
     /// True masks and synthetic features, with errors injected.
-    Synthetic(Flaws),
+    Synthetic(InjectedErrors),
 }
 
 impl Regions {
     /// Without an error.
-    pub const EXACT: Regions = Regions::Synthetic(Flaws::NONE);
+    pub const EXACT: Regions = Regions::Synthetic(InjectedErrors::NONE);
 
     /// What `splatvk run` uses on its own.
     pub fn built_in() -> Regions {
-        Regions::Found { masks: sources::default::<Masks>(), features: sources::default::<Features>() }
+        Regions::Found {
+            masks: sources::default::<MaskSources>(),
+            features: sources::default::<FeatureSources>(),
+        }
     }
 
     /// With the usual errors.
     pub fn flawed(seed: u64) -> Regions {
-        Regions::Synthetic(Flaws::usual(seed))
+        Regions::Synthetic(InjectedErrors::default_rates(seed))
     }
 
     /// Masks and features from a folder.
@@ -233,7 +234,7 @@ impl Regions {
 
     /// Built-in masks, features of an installed network.
     pub fn described_by(network: &str) -> Regions {
-        Regions::Found { masks: sources::default::<Masks>(), features: SourceChoice::named(network) }
+        Regions::Found { masks: sources::default::<MaskSources>(), features: SourceChoice::named(network) }
     }
 
     /// For the rows of a table.
@@ -270,28 +271,37 @@ pub struct Setup {
 
 /// What a row takes.
 #[derive(Clone, Debug)]
-pub enum Runs {
+pub enum RowWork {
     /// All of it, scored.
-    Scored(Setup),
+    Score(Setup),
     /// Nothing is trained: the bytes that features of full length would take are stated.
-    Unreduced(Setup),
+    MemoryOnly(Setup),
     /// Nothing; the note says why.
     Nothing,
 }
 
 /// One row before it ran.
 #[derive(Clone, Debug)]
-pub struct Row {
+pub struct TableRow {
     /// What this row is, within its group.
     pub label: String,
     /// Rows are compared within their group.
     pub group: String,
     /// What to run.
-    pub runs: Runs,
+    pub runs: RowWork,
     /// What the reader should know about this row.
     pub note: String,
     /// The paper's figures for this row, by column.
     pub paper: Vec<(&'static str, f64)>,
+}
+
+/// A family of networks.
+#[derive(Clone, Debug)]
+pub struct NetworkFamily {
+    /// As the options call it.
+    pub name: String,
+    /// A trained one is on this machine.
+    pub installed: bool,
 }
 
 /// What a machine and a data set have for the tables to compare.
@@ -299,10 +309,10 @@ pub struct Row {
 pub struct Available {
     /// Frames that may be photos.
     pub views: usize,
-    /// Known families of geometry networks, and whether one is installed.
-    pub geometry: Vec<(String, bool)>,
+    /// Known families of geometry networks.
+    pub geometry: Vec<NetworkFamily>,
     /// The same for features.
-    pub features: Vec<(String, bool)>,
+    pub features: Vec<NetworkFamily>,
 }
 
 /// Rows under the same regions.
@@ -313,27 +323,27 @@ pub(super) struct Group<'a> {
 }
 
 impl Group<'_> {
-    fn row(&self, label: &str, setup: Setup, paper: &[(&'static str, f64)]) -> Row {
-        Row {
+    fn row(&self, label: &str, setup: Setup, paper: &[(&'static str, f64)]) -> TableRow {
+        TableRow {
             label: label.to_owned(),
             group: self.base.regions.name(),
-            runs: Runs::Scored(setup),
+            runs: RowWork::Score(setup),
             note: String::new(),
             paper: paper.to_vec(),
         }
     }
 
-    fn recipe(&self, label: &str, recipe: Recipe, paper: &[(&'static str, f64)]) -> Row {
+    fn recipe(&self, label: &str, recipe: Recipe, paper: &[(&'static str, f64)]) -> TableRow {
         self.row(label, Setup { recipe, ..self.base.clone() }, paper)
     }
 
     /// A network has a row also where it is not, which says so.
-    fn if_installed(&self, name: &str, setup: Setup, there: bool) -> Row {
+    fn if_installed(&self, name: &str, setup: Setup, there: bool) -> TableRow {
         let row = self.row(name, setup, &[]);
         if there {
             return row;
         }
-        Row { runs: Runs::Nothing, note: "not installed (splatvk models list)".to_owned(), ..row }
+        TableRow { runs: RowWork::Nothing, note: "not installed (splatvk models list)".to_owned(), ..row }
     }
 }
 
@@ -346,7 +356,7 @@ mod tests {
     fn rows_differ_in_what_their_table_is_about() {
         let base = Setup {
             views: 4,
-            init: sources::default::<sources::Geometry>(),
+            init: sources::default::<sources::GeometrySources>(),
             true_cameras: false,
             max_points: None,
             regions: Regions::EXACT,
@@ -354,10 +364,11 @@ mod tests {
             iterations: 10,
             language_iterations: 2,
         };
+        let family = |name: &str, installed| NetworkFamily { name: name.into(), installed };
         let available = Available {
             views: 4,
-            geometry: vec![("there".into(), true), ("not".into(), false)],
-            features: vec![("absent".into(), false)],
+            geometry: vec![family("there", true), family("not", false)],
+            features: vec![family("absent", false)],
         };
         for table in &TABLES {
             for regions in (table.regions)(1, &available) {
@@ -366,14 +377,14 @@ mod tests {
                 let setups: Vec<&Setup> = rows
                     .iter()
                     .filter_map(|r| match &r.runs {
-                        Runs::Scored(setup) => Some(setup),
-                        Runs::Unreduced(_) | Runs::Nothing => None,
+                        RowWork::Score(setup) => Some(setup),
+                        RowWork::MemoryOnly(_) | RowWork::Nothing => None,
                     })
                     .collect();
                 for (i, a) in setups.iter().enumerate() {
                     assert!(setups[..i].iter().all(|b| a != b), "{}: two rows of one setup", table.name);
                 }
-                for row in rows.iter().filter(|r| !matches!(r.runs, Runs::Scored(_))) {
+                for row in rows.iter().filter(|r| !matches!(r.runs, RowWork::Score(_))) {
                     assert!(!row.note.is_empty(), "{}: {} says not why", table.name, row.label);
                 }
                 for (column, _) in rows.iter().flat_map(|r| &r.paper) {

@@ -4,9 +4,9 @@ use crate::infer::Registry;
 use crate::photo;
 use crate::pose::align::pose_errors;
 use crate::pose::relative::{auc, pair_errors};
-use crate::pose::{self, Placed};
+use crate::pose::{self, SolvedCameras};
 use crate::progress::Progress;
-use crate::query::eval::{Frame, GroundTruth, Split};
+use crate::query::eval::{GroundTruth, Split, TruthFrame};
 use crate::scene::Lens;
 use crate::{Error, Result};
 use serde::Serialize;
@@ -65,7 +65,7 @@ pub struct CameraFigures {
     pub true_lens: Option<Lens>,
 }
 
-/// Data sets and what they say together.
+/// Data sets and their summary.
 #[derive(Clone, Debug, Serialize)]
 pub struct CameraReport {
     /// In the order given.
@@ -84,9 +84,9 @@ pub struct CameraReport {
     pub mean_auc: [Option<f64>; 3],
 }
 
-/// What of the photos is used.
+/// Which pixels of the photos are used.
 #[derive(Clone, Copy, Debug)]
-pub struct Reading {
+pub struct PhotoInput {
     /// Longer side of the working image, pixels.
     pub max_size: usize,
     /// Only the working image, as if the files were no larger.
@@ -99,7 +99,7 @@ const AUC_DEGREES: [f64; 3] = [3.0, 5.0, 30.0];
 /// Finds the cameras of every set's train frames, by themselves.
 pub fn measure(
     sets: &[PathBuf],
-    reading: Reading,
+    input: PhotoInput,
     registry: &Registry,
     progress: &dyn Progress,
     done: &mut dyn FnMut(&CameraRow) -> Result<()>,
@@ -107,22 +107,22 @@ pub fn measure(
     let truths = sets.iter().map(|s| GroundTruth::read(s)).collect::<Result<Vec<_>>>()?;
     let mut rows = Vec::new();
     for truth in &truths {
-        let row = one(truth, reading, registry, progress)?;
+        let row = measure_set(truth, input, registry, progress)?;
         done(&row)?;
         rows.push(row);
     }
-    Ok(together(rows))
+    Ok(summarise(rows))
 }
 
-fn one(
+fn measure_set(
     truth: &GroundTruth,
-    reading: Reading,
+    input: PhotoInput,
     registry: &Registry,
     progress: &dyn Progress,
 ) -> Result<CameraRow> {
-    let frames: Vec<&Frame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
+    let frames: Vec<&TruthFrame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
     let clock = Instant::now();
-    let found = placed(&truth.folder, &frames, reading, registry, progress);
+    let found = find_cameras(&truth.folder, &frames, input, registry, progress);
     let seconds = clock.elapsed().as_secs_f64();
     let outcome = match found {
         Ok(placed) => CameraOutcome::Figures(Box::new(figures(truth, &frames, &placed)?)),
@@ -133,24 +133,24 @@ fn one(
 }
 
 /// What a run does before its first dense stage.
-fn placed(
+fn find_cameras(
     folder: &Path,
-    frames: &[&Frame],
-    reading: Reading,
+    frames: &[&TruthFrame],
+    input: PhotoInput,
     registry: &Registry,
     progress: &dyn Progress,
-) -> Result<Placed> {
-    let load = |f: &&Frame| photo::load_at(&folder.join(&f.file), reading.max_size);
+) -> Result<SolvedCameras> {
+    let load = |f: &&TruthFrame| photo::load_at(&folder.join(&f.file), input.max_size);
     let mut photos = frames.iter().map(load).collect::<Result<Vec<_>>>()?;
-    if reading.copies {
+    if input.copies {
         photos.iter_mut().for_each(|p| p.fine = None);
     }
     pose::place(photos, None, registry, progress)
 }
 
-fn figures(truth: &GroundTruth, frames: &[&Frame], placed: &Placed) -> Result<CameraFigures> {
+fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) -> Result<CameraFigures> {
     let model = &placed.model;
-    let joined: Vec<(usize, &Frame)> = placed
+    let joined: Vec<(usize, &TruthFrame)> = placed
         .photos
         .iter()
         .enumerate()
@@ -188,7 +188,7 @@ fn figures(truth: &GroundTruth, frames: &[&Frame], placed: &Placed) -> Result<Ca
     })
 }
 
-fn together(rows: Vec<CameraRow>) -> CameraReport {
+fn summarise(rows: Vec<CameraRow>) -> CameraReport {
     let good: Vec<&CameraFigures> = rows
         .iter()
         .filter_map(|r| match &r.outcome {
@@ -316,8 +316,8 @@ mod tests {
         }
         std::fs::write(dir.path().join("ground_truth.json"), truth.to_string()).unwrap();
         let mut seen = Vec::new();
-        let reading = Reading { max_size: crate::photo::MAX_SIZE_CPU, copies: false };
-        let report = measure(&[breakfast, dir.path().into()], reading, &registry, &Silent, &mut |row| {
+        let input = PhotoInput { max_size: crate::photo::MAX_SIZE_CPU, copies: false };
+        let report = measure(&[breakfast, dir.path().into()], input, &registry, &Silent, &mut |row| {
             seen.push(row.text());
             Ok(())
         })

@@ -1,9 +1,9 @@
 //! Two reports side by side.
-use super::report::Report;
+use super::report::BenchReport;
 use std::fmt::Write;
 
 /// A table of the medians and figures that both reports have, with the ratio B / A.
-pub fn table(a: &Report, b: &Report) -> String {
+pub fn table(a: &BenchReport, b: &BenchReport) -> String {
     // Writing to a String cannot fail.
     let mut text = format!("A: {} · {} · splatvk {}\n", a.device.name, a.device.driver, a.program);
     let _ = writeln!(text, "B: {} · {} · splatvk {}", b.device.name, b.device.driver, b.program);

@@ -23,7 +23,7 @@ pub fn measure(
     let mut section = Section::new("query", place);
     let encoding = budget.wall(|| encoder.embed_texts(&[text]).map(drop))?;
     let mut scene = QueryScene::open(device, splats, field, encoder)?;
-    let rendering = budget.wall(|| scene.look(cameras).map(drop))?;
+    let rendering = budget.wall(|| scene.set_views(cameras).map(drop))?;
     section.time("render and decode all views", Clock::Wall, rendering);
     section.time("encode the text", Clock::Wall, encoding);
     let query = budget.wall(|| scene.ask(text, &QueryOptions::default()).map(drop))?;

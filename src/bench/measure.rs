@@ -1,4 +1,4 @@
-//! Repeating a measurement and what its times say.
+//! Repeated measurements and the quartiles of their times.
 use crate::Result;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -6,14 +6,14 @@ use std::time::Instant;
 /// How long one measurement runs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Budget {
-    /// Repeats for this long, but at least [`LEAST`] times.
+    /// Repeats for this long, but at least [`MIN_RUNS`] times.
     pub seconds: f64,
     /// Exactly this often instead.
     pub repeats: Option<usize>,
 }
 
 /// Fewer runs have no quartiles.
-pub const LEAST: usize = 5;
+pub const MIN_RUNS: usize = 5;
 /// Runs that are not counted: the driver compiles shaders at the first, caches and clocks settle at the second …
 const WARM_UP: usize = 2;
 /// … and, when a time is given, for this share of it.
@@ -41,7 +41,7 @@ impl Budget {
         loop {
             let done = match self.repeats {
                 Some(n) => results.len() >= n.max(1),
-                None => results.len() >= LEAST && start.elapsed().as_secs_f64() >= self.seconds,
+                None => results.len() >= MIN_RUNS && start.elapsed().as_secs_f64() >= self.seconds,
             };
             if done {
                 return Ok(results);
@@ -51,7 +51,7 @@ impl Budget {
     }
 
     /// Wall-clock milliseconds of each call.
-    pub fn wall(&self, mut run: impl FnMut() -> Result<()>) -> Result<Spread> {
+    pub fn wall(&self, mut run: impl FnMut() -> Result<()>) -> Result<Quartiles> {
         let runs = self.repeat(|| {
             let (processor, start) = (processor_ms(), Instant::now());
             run()?;
@@ -59,8 +59,8 @@ impl Budget {
             Ok((wall, (processor_ms() - processor) / cores()))
         })?;
         let times: Vec<f64> = runs.iter().map(|r| r.0).collect();
-        let processor = Spread::of(&runs.iter().map(|r| r.1).collect::<Vec<_>>()).median;
-        Ok(Spread { processor, ..Spread::of(&times) })
+        let processor = Quartiles::of(&runs.iter().map(|r| r.1).collect::<Vec<_>>()).median;
+        Ok(Quartiles { processor, ..Quartiles::of(&times) })
     }
 }
 
@@ -81,7 +81,7 @@ pub(super) fn cores() -> f64 {
 
 /// The distribution of repeated times, milliseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Spread {
+pub struct Quartiles {
     /// Half of the runs took at most this.
     pub median: f64,
     /// A quarter took at most this …
@@ -98,9 +98,9 @@ pub struct Spread {
     pub processor: f64,
 }
 
-impl Spread {
+impl Quartiles {
     /// Of the given times; all zero when there are none.
-    pub fn of(times: &[f64]) -> Spread {
+    pub fn of(times: &[f64]) -> Quartiles {
         let mut sorted = times.to_vec();
         sorted.sort_by(f64::total_cmp);
         // Linear interpolation between the order statistics.
@@ -112,7 +112,7 @@ impl Spread {
                 _ => 0.0,
             }
         };
-        Spread {
+        Quartiles {
             median: at(0.5),
             lower_quartile: at(0.25),
             upper_quartile: at(0.75),
@@ -129,11 +129,11 @@ mod tests {
 
     #[test]
     fn quartiles_of_known_times() {
-        let s = Spread::of(&[5.0, 1.0, 2.0, 4.0, 3.0]);
+        let s = Quartiles::of(&[5.0, 1.0, 2.0, 4.0, 3.0]);
         assert_eq!((s.best, s.lower_quartile, s.median, s.upper_quartile, s.runs), (1.0, 2.0, 3.0, 4.0, 5));
-        let s = Spread::of(&[1.0, 2.0]);
+        let s = Quartiles::of(&[1.0, 2.0]);
         assert_eq!((s.lower_quartile, s.median), (1.25, 1.5));
-        assert_eq!(Spread::of(&[]), Spread::default());
+        assert_eq!(Quartiles::of(&[]), Quartiles::default());
     }
 
     #[test]
@@ -147,6 +147,6 @@ mod tests {
             })
             .unwrap();
         assert_eq!(seen, [3, 4, 5]);
-        assert_eq!(Budget { seconds: 0.0, repeats: None }.repeat(|| Ok(())).unwrap().len(), LEAST);
+        assert_eq!(Budget { seconds: 0.0, repeats: None }.repeat(|| Ok(())).unwrap().len(), MIN_RUNS);
     }
 }

@@ -15,9 +15,9 @@ mod sorting;
 mod training;
 pub mod workload;
 
-pub use measure::{Budget, Spread};
+pub use measure::{Budget, Quartiles};
 pub use model::Roofline;
-pub use report::{Report, Row, Section};
+pub use report::{BenchReport, PassRow, Section};
 pub use workload::Workload;
 
 use crate::gpu::Device;
@@ -31,14 +31,14 @@ pub struct Bench<'a> {
     budget: Budget,
     roofline: Roofline,
     /// What was found so far.
-    pub report: Report,
+    pub report: BenchReport,
 }
 
 impl<'a> Bench<'a> {
     /// Measures the device's limits.
     pub fn new(device: &'a Device, budget: Budget) -> Result<Bench<'a>> {
         let (roofline, section) = roofline::measure(device, &budget)?;
-        let mut report = Report::new(device);
+        let mut report = BenchReport::new(device);
         report.sections.push(section);
         Ok(Bench { device, budget, roofline, report })
     }

@@ -21,7 +21,7 @@ impl Roofline {
 
 /// Sizes of a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Work {
+pub struct PassWork {
     /// N.
     pub splats: f64,
     /// SH coefficients per channel.
@@ -49,10 +49,10 @@ const WEIGH: f64 = 14.0;
 /// Gradient of alpha from what lies behind (6), of the power and its six moments (24).
 const WEIGH_BACK: f64 = 30.0;
 
-impl Work {
+impl PassWork {
     /// (bytes, operations) of a pass by its name in a recording; `None` for passes without a model.
     pub fn of(&self, pass: &str) -> Option<(f64, f64)> {
-        let Work { splats: n, sh, features: d, pixels, intersections, blended } = *self;
+        let PassWork { splats: n, sh, features: d, pixels, intersections, blended } = *self;
         let (colour, channels) = (12.0 * sh, 4.0 + d);
         let listed = intersections * (4.0 + PROJECTED + 4.0 * d);
         Some(match pass {
@@ -91,8 +91,8 @@ mod tests {
     #[test]
     fn work_grows_with_what_it_depends_on() {
         let small =
-            Work { splats: 1e5, sh: 1.0, pixels: 3e5, intersections: 5e5, blended: 1e7, features: 0.0 };
-        let more = Work { features: 16.0, ..small };
+            PassWork { splats: 1e5, sh: 1.0, pixels: 3e5, intersections: 5e5, blended: 1e7, features: 0.0 };
+        let more = PassWork { features: 16.0, ..small };
         for pass in ["projection", "raster forward", "raster backward", "Adam"] {
             let (a, b) = (small.of(pass).unwrap(), more.of(pass).unwrap());
             assert!(b.0 > a.0, "{pass}: features have bytes");

@@ -1,6 +1,6 @@
-//! What a benchmark found, as a table and as JSON.
-use super::measure::{Budget, Spread, cores, processor_ms};
-use super::model::{Roofline, Work};
+//! Figures of a benchmark, as a table and as JSON.
+use super::measure::{Budget, Quartiles, cores, processor_ms};
+use super::model::{PassWork, Roofline};
 use crate::gpu::{Device, Program, Recorder};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -21,7 +21,7 @@ const FORWARD: [&str; 4] = ["projection", "depth sort", "binning", "raster forwa
 
 /// Everything one run of `splatvk bench` measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Report {
+pub struct BenchReport {
     /// `splatvk-bench 1`.
     pub format: String,
     /// Version of this program.
@@ -57,20 +57,20 @@ pub struct Section {
     /// On what.
     pub workload: String,
     /// Times.
-    pub rows: Vec<Row>,
+    pub rows: Vec<PassRow>,
     /// Counts and derived figures.
     pub figures: Vec<Figure>,
 }
 
 /// One timed thing.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Row {
+pub struct PassRow {
     /// Pass or part of a step.
     pub name: String,
     /// How it was timed.
     pub clock: Clock,
     /// Milliseconds.
-    pub ms: Spread,
+    pub ms: Quartiles,
     /// Bytes that have to move, estimated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bytes: Option<f64>,
@@ -93,7 +93,7 @@ pub enum Clock {
     Wall,
 }
 
-impl Row {
+impl PassRow {
     /// Bytes, operations and the least milliseconds for them.
     fn set_floor(&mut self, [bytes, flops, ms]: [f64; 3]) {
         (self.bytes, self.flops, self.floor_ms) = (Some(bytes), Some(flops), Some(ms));
@@ -111,12 +111,12 @@ pub struct Figure {
     pub unit: String,
 }
 
-impl Report {
+impl BenchReport {
     /// An empty report of a device.
-    pub fn new(device: &Device) -> Report {
+    pub fn new(device: &Device) -> BenchReport {
         let info = device.info();
         let (major, minor, patch) = info.api_version;
-        Report {
+        BenchReport {
             format: FORMAT.to_owned(),
             program: env!("CARGO_PKG_VERSION").to_owned(),
             device: DeviceRecord {
@@ -132,11 +132,11 @@ impl Report {
     }
 
     /// Reads a report from its JSON file.
-    pub fn read(path: &Path) -> Result<Report> {
+    pub fn read(path: &Path) -> Result<BenchReport> {
         let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
         let text = std::fs::read_to_string(path)
             .map_err(|e| bad(format!("{e}; give a file of splatvk bench --json")))?;
-        let report: Report = serde_json::from_str(&text)
+        let report: BenchReport = serde_json::from_str(&text)
             .map_err(|e| bad(format!("not a report of splatvk bench --json: {e}")))?;
         if report.format != FORMAT {
             return Err(bad(format!("layout {:?}; this program reads {FORMAT:?}", report.format)));
@@ -182,7 +182,7 @@ impl Section {
     }
 
     /// The row of a name.
-    pub fn row(&self, name: &str) -> Option<&Row> {
+    pub fn row(&self, name: &str) -> Option<&PassRow> {
         self.rows.iter().find(|r| r.name == name)
     }
 
@@ -192,8 +192,8 @@ impl Section {
     }
 
     /// Adds a time.
-    pub fn time(&mut self, name: impl Into<String>, clock: Clock, ms: Spread) {
-        self.rows.push(Row { name: name.into(), clock, ms, ..Row::default() });
+    pub fn time(&mut self, name: impl Into<String>, clock: Clock, ms: Quartiles) {
+        self.rows.push(PassRow { name: name.into(), clock, ms, ..PassRow::default() });
     }
 
     /// Adds a figure, if it is a number: a ratio by nothing is left out.
@@ -215,7 +215,7 @@ impl Section {
         let first = self.rows.len();
         for (at, (name, _)) in runs.first().into_iter().flatten().enumerate() {
             let times: Vec<f64> = runs.iter().map(|r| r[at].1).collect();
-            self.time(*name, Clock::Device, Spread::of(&times));
+            self.time(*name, Clock::Device, Quartiles::of(&times));
         }
         // Where the host is the device, the processor time of a pass tells what it takes when nothing else runs.
         if device.info().is_cpu {
@@ -232,14 +232,14 @@ impl Section {
                 let of_row = |run: &Vec<(&str, f64)>| {
                     run.iter().filter(|p| p.0 == row.name).map(|p| p.1).sum::<f64>() / cores()
                 };
-                row.ms.processor = Spread::of(&runs.iter().map(of_row).collect::<Vec<_>>()).median;
+                row.ms.processor = Quartiles::of(&runs.iter().map(of_row).collect::<Vec<_>>()).median;
             }
         }
         Ok(runs)
     }
 
     /// Fills in bytes, operations and floors of the passes, and of the rows that are made of them.
-    pub(super) fn bound(&mut self, work: &Work, roofline: &Roofline) {
+    pub(super) fn bound(&mut self, work: &PassWork, roofline: &Roofline) {
         let mut sums = [[0.0; 3]; 3];
         for row in self.rows.iter_mut().filter(|r| r.clock == Clock::Device) {
             let Some((bytes, flops)) = work.of(&row.name) else { continue };

@@ -1,6 +1,6 @@
 //! The training step: each pass by timestamps on the device, the whole by wall clock.
-use super::measure::{Budget, Spread};
-use super::model::{Roofline, Work};
+use super::measure::{Budget, Quartiles};
+use super::model::{PassWork, Roofline};
 use super::report::{COLOUR, Clock, STEP, SUM, Section};
 use super::workload::Workload;
 use crate::Result;
@@ -115,7 +115,7 @@ fn measure(
     let runs = section.passes(device, &|| run.record(0), budget)?;
     let sums: Vec<f64> = runs.iter().map(|r| r.iter().map(|p| p.1).sum()).collect();
     let processor = section.rows.iter().map(|r| r.ms.processor).sum();
-    section.time(SUM, Clock::Device, Spread { processor, ..Spread::of(&sums) });
+    section.time(SUM, Clock::Device, Quartiles { processor, ..Quartiles::of(&sums) });
     let before = device.memory().allocations;
     let mut steps = 0usize;
     let step = budget.wall(|| {
@@ -153,7 +153,7 @@ fn counts(device: &Device, run: &impl Training, roofline: &Roofline, section: &m
     let [evaluated, blended] = pairs::count(device, p.raster)?;
     let seconds = section.row(STEP).map_or(f64::NAN, |r| r.ms.median / 1e3);
     let pixels = f64::from(frame.width) * f64::from(frame.height);
-    let work = Work {
+    let work = PassWork {
         splats: p.params.count as f64,
         sh: p.params.sh_len() as f64,
         features: p.params.feature_dim as f64,

@@ -9,22 +9,22 @@ use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 
 /// What goes wrong in a call.
-pub enum Fault {
+pub enum CallError {
     /// The library's own error.
     Error(Error),
     /// The calling program's mistake.
     Argument(String),
 }
 
-impl From<Error> for Fault {
+impl From<Error> for CallError {
     fn from(e: Error) -> Self {
-        Fault::Error(e)
+        CallError::Error(e)
     }
 }
 
 /// A mistake of the calling program.
-pub fn argument<T>(what: impl Into<String>) -> Result<T, Fault> {
-    Err(Fault::Argument(what.into()))
+pub fn bad_argument<T>(what: impl Into<String>) -> Result<T, CallError> {
+    Err(CallError::Argument(what.into()))
 }
 
 /// Text of the last failure.
@@ -35,7 +35,7 @@ impl LastError {
     fn set(&self, text: String) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = text;
     }
-    /// Copies the text out as C wants it: see [`copy_text`].
+    /// Copies the text out as a C string: see [`copy_text`].
     pub unsafe fn copy(&self, out: *mut c_char, bytes: usize) -> usize {
         // SAFETY: passed on.
         unsafe { copy_text(&self.0.lock().unwrap_or_else(PoisonError::into_inner), out, bytes) }
@@ -48,12 +48,12 @@ thread_local! {
 }
 
 /// Runs the body of a function with a handle: nothing unwinds into C, and a failure leaves its text with the handle.
-pub fn guard(store: &LastError, body: impl FnOnce() -> Result<(), Fault>) -> SvkStatus {
+pub fn guard(store: &LastError, body: impl FnOnce() -> Result<(), CallError>) -> SvkStatus {
     caught(|text| store.set(text), body)
 }
 
 /// [`guard`] for functions without a handle; the thread keeps the text.
-pub fn guard_creation(body: impl FnOnce() -> Result<(), Fault>) -> SvkStatus {
+pub fn guard_creation(body: impl FnOnce() -> Result<(), CallError>) -> SvkStatus {
     caught(|text| CREATION.with(|c| *c.borrow_mut() = text), body)
 }
 
@@ -68,11 +68,11 @@ pub fn guard_number<T: Default>(body: impl FnOnce() -> T) -> T {
     catch_unwind(AssertUnwindSafe(body)).unwrap_or_default()
 }
 
-fn caught(store: impl FnOnce(String), body: impl FnOnce() -> Result<(), Fault>) -> SvkStatus {
+fn caught(store: impl FnOnce(String), body: impl FnOnce() -> Result<(), CallError>) -> SvkStatus {
     let (status, text) = match catch_unwind(AssertUnwindSafe(body)) {
         Ok(Ok(())) => return SvkStatus::Ok,
-        Ok(Err(Fault::Error(e))) => (status(&e), e.to_string()),
-        Ok(Err(Fault::Argument(text))) => (SvkStatus::Argument, text),
+        Ok(Err(CallError::Error(e))) => (status(&e), e.to_string()),
+        Ok(Err(CallError::Argument(text))) => (SvkStatus::Argument, text),
         Err(panic) => (SvkStatus::Internal, format!("internal error: {}", panic_text(panic.as_ref()))),
     };
     store(text);
@@ -131,25 +131,25 @@ versioned!(
     SvkAnswer 48
 );
 
-/// The size that a structure says it has.
+/// The size that a structure states.
 ///
 /// # Safety
 /// `pointer` leads to a versioned structure.
-unsafe fn stated_size<T: Versioned>(pointer: *const T) -> Result<usize, Fault> {
+unsafe fn stated_size<T: Versioned>(pointer: *const T) -> Result<usize, CallError> {
     // SAFETY: per the contract; every versioned structure starts with its size.
     let size = unsafe { pointer.cast::<usize>().read() };
     // Far beyond anything a later version may add: an uninitialised field.
     if size < T::FIRST || size > T::FIRST + 4096 {
-        return argument(format!("{}.size is {size}; set it to sizeof({})", T::NAME, T::NAME));
+        return bad_argument(format!("{}.size is {size}; set it to sizeof({})", T::NAME, T::NAME));
     }
     Ok(size)
 }
 
 /// Reads a structure that may be of an older or newer version. Fields that only we know are zero; fields that only the
 /// caller knows must be zero.
-pub unsafe fn read<T: Versioned>(pointer: *const T) -> Result<T, Fault> {
+pub unsafe fn read<T: Versioned>(pointer: *const T) -> Result<T, CallError> {
     if pointer.is_null() {
-        return argument(format!("the pointer to {} is null", T::NAME));
+        return bad_argument(format!("the pointer to {} is null", T::NAME));
     }
     // SAFETY: not null, so the caller's structure.
     let size = unsafe { stated_size(pointer) }?;
@@ -160,14 +160,17 @@ pub unsafe fn read<T: Versioned>(pointer: *const T) -> Result<T, Fault> {
         std::ptr::copy_nonoverlapping(pointer.cast::<u8>(), value.as_mut_ptr().cast::<u8>(), known);
         let rest = std::slice::from_raw_parts(pointer.cast::<u8>().add(known), size - known);
         if rest.iter().any(|b| *b != 0) {
-            return argument(format!("{} uses fields that this version of splatvk does not know", T::NAME));
+            return bad_argument(format!(
+                "{} uses fields that this version of splatvk does not know",
+                T::NAME
+            ));
         }
         Ok(value.assume_init())
     }
 }
 
 /// [`read`] that takes null for all zero.
-pub unsafe fn read_or_default<T: Versioned>(pointer: *const T) -> Result<T, Fault> {
+pub unsafe fn read_or_default<T: Versioned>(pointer: *const T) -> Result<T, CallError> {
     if pointer.is_null() {
         // SAFETY: zero bytes are a value of T.
         return Ok(unsafe { std::mem::zeroed() });
@@ -177,12 +180,12 @@ pub unsafe fn read_or_default<T: Versioned>(pointer: *const T) -> Result<T, Faul
 }
 
 /// [`read`] of an array; the elements are as far apart as the first one says it is large.
-pub unsafe fn read_array<T: Versioned>(pointer: *const T, count: usize) -> Result<Vec<T>, Fault> {
+pub unsafe fn read_array<T: Versioned>(pointer: *const T, count: usize) -> Result<Vec<T>, CallError> {
     if count == 0 {
         return Ok(Vec::new());
     }
     if pointer.is_null() {
-        return argument(format!("the pointer to {} is null", T::NAME));
+        return bad_argument(format!("the pointer to {} is null", T::NAME));
     }
     // SAFETY: not null, so the first of the caller's structures.
     let stride = unsafe { stated_size(pointer) }?;
@@ -191,9 +194,9 @@ pub unsafe fn read_array<T: Versioned>(pointer: *const T, count: usize) -> Resul
 }
 
 /// Fills a structure of the caller, as far as its version goes; its size stays.
-pub unsafe fn write<T: Versioned>(pointer: *mut T, value: &T) -> Result<(), Fault> {
+pub unsafe fn write<T: Versioned>(pointer: *mut T, value: &T) -> Result<(), CallError> {
     if pointer.is_null() {
-        return argument(format!("the pointer to {} is null", T::NAME));
+        return bad_argument(format!("the pointer to {} is null", T::NAME));
     }
     // SAFETY: not null, so the caller's structure.
     let known = unsafe { stated_size(pointer) }?.min(size_of::<T>());
@@ -207,19 +210,19 @@ pub unsafe fn write<T: Versioned>(pointer: *mut T, value: &T) -> Result<(), Faul
 }
 
 /// A text of the caller; `None` for null.
-pub unsafe fn text(pointer: *const c_char, what: &str) -> Result<Option<String>, Fault> {
+pub unsafe fn text(pointer: *const c_char, what: &str) -> Result<Option<String>, CallError> {
     if pointer.is_null() {
         return Ok(None);
     }
     // SAFETY: a null-terminated text, per the header.
     match unsafe { CStr::from_ptr(pointer) }.to_str() {
         Ok(text) => Ok(Some(text.to_owned())),
-        Err(_) => argument(format!("{what} is not UTF-8")),
+        Err(_) => bad_argument(format!("{what} is not UTF-8")),
     }
 }
 
 /// A path of the caller; `None` for null.
-pub unsafe fn path(pointer: *const c_char, what: &str) -> Result<Option<PathBuf>, Fault> {
+pub unsafe fn path(pointer: *const c_char, what: &str) -> Result<Option<PathBuf>, CallError> {
     // SAFETY: passed on.
     Ok(unsafe { text(pointer, what) }?.map(PathBuf::from))
 }
@@ -241,23 +244,23 @@ pub unsafe fn copy_text(text: &str, out: *mut c_char, bytes: usize) -> usize {
 }
 
 /// A handle that the caller gives.
-pub unsafe fn handle<'a, T>(pointer: *const T, name: &str) -> Result<&'a T, Fault> {
+pub unsafe fn handle<'a, T>(pointer: *const T, name: &str) -> Result<&'a T, CallError> {
     // SAFETY: null or a live handle, per the header.
     match unsafe { pointer.as_ref() } {
         Some(handle) => Ok(handle),
-        None => argument(format!("the {name} is null")),
+        None => bad_argument(format!("the {name} is null")),
     }
 }
 
 /// Where a new handle goes; null until there is one.
-pub unsafe fn slot<'a, T>(pointer: *mut *mut T) -> Result<&'a mut *mut T, Fault> {
+pub unsafe fn slot<'a, T>(pointer: *mut *mut T) -> Result<&'a mut *mut T, CallError> {
     // SAFETY: null or a writable pointer, per the header.
     match unsafe { pointer.as_mut() } {
         Some(slot) => {
             *slot = std::ptr::null_mut();
             Ok(slot)
         }
-        None => argument("the pointer to the new handle is null"),
+        None => bad_argument("the pointer to the new handle is null"),
     }
 }
 

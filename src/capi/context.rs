@@ -1,5 +1,5 @@
 //! Versions and contexts.
-use super::boundary::{self, Fault, LastError, argument, guard_creation, guard_number};
+use super::boundary::{self, CallError, LastError, bad_argument, guard_creation, guard_number};
 use super::types::*;
 use crate::gpu::vk::{self, Handle};
 use crate::gpu::{Device, EnabledFeatures, HostDevice, Options, QueueLock};
@@ -76,23 +76,26 @@ pub unsafe extern "C" fn svk_context_adopt(
     })
 }
 
-unsafe fn boxed(device: Device, options: &SvkContextOptions) -> Result<*mut SvkContext, Fault> {
+unsafe fn boxed(device: Device, options: &SvkContextOptions) -> Result<*mut SvkContext, CallError> {
     // SAFETY: passed on.
     let models = unsafe { boundary::path(options.models, "SvkContextOptions.models") }?;
     // SAFETY: passed on.
     let provider = unsafe { boundary::text(options.provider, "SvkContextOptions.provider") }?;
     if let Some(unknown) = provider.as_deref().filter(|p| !NAMES.contains(p)) {
-        return argument(format!("SvkContextOptions.provider is {unknown}; use one of {}", NAMES.join(", ")));
+        return bad_argument(format!(
+            "SvkContextOptions.provider is {unknown}; use one of {}",
+            NAMES.join(", ")
+        ));
     }
     let registry = Registry::with(models.as_deref(), Compute::by(provider.as_deref()))?;
     Ok(Box::into_raw(Box::new(SvkContext { device, registry, error: LastError::default() })))
 }
 
-unsafe fn host_device(given: &SvkVulkanDevice) -> Result<HostDevice, Fault> {
+unsafe fn host_device(given: &SvkVulkanDevice) -> Result<HostDevice, CallError> {
     let mut extensions = Vec::new();
     if given.extension_count > 0 {
         if given.extensions.is_null() {
-            return argument("SvkVulkanDevice.extensions is null but extension_count is not 0");
+            return bad_argument("SvkVulkanDevice.extensions is null but extension_count is not 0");
         }
         // SAFETY: as many texts as the structure says.
         let names = unsafe { std::slice::from_raw_parts(given.extensions, given.extension_count as usize) };
@@ -126,11 +129,11 @@ unsafe impl Send for User {}
 // SAFETY: as above.
 unsafe impl Sync for User {}
 
-fn queue_lock(given: &SvkVulkanDevice) -> Result<Option<QueueLock>, Fault> {
+fn queue_lock(given: &SvkVulkanDevice) -> Result<Option<QueueLock>, CallError> {
     let (lock, unlock) = match (given.lock_queue, given.unlock_queue) {
         (None, None) => return Ok(None),
         (Some(lock), Some(unlock)) => (lock, unlock),
-        _ => return argument("SvkVulkanDevice: set both lock_queue and unlock_queue, or none"),
+        _ => return bad_argument("SvkVulkanDevice: set both lock_queue and unlock_queue, or none"),
     };
     let user = User(given.user);
     Ok(Some(Box::new(move |work: &mut dyn FnMut()| {

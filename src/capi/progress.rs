@@ -10,11 +10,11 @@ pub struct Callback {
     user: *mut c_void,
     cancelled: AtomicBool,
     /// Held during a call, so that there is never a second one.
-    stage: Mutex<Stage>,
+    stage: Mutex<StageProgress>,
 }
 
 #[derive(Default)]
-struct Stage {
+struct StageProgress {
     name: CString,
     total: u64,
 }
@@ -36,11 +36,11 @@ impl Callback {
         Callback { call, user, cancelled: AtomicBool::new(false), stage: Mutex::default() }
     }
 
-    fn tell(&self, kind: SvkProgressKind, done: u64, note: &str, begin: Option<(&str, u64)>) {
+    fn report(&self, kind: SvkProgressKind, done: u64, note: &str, begin: Option<(&str, u64)>) {
         let Some(call) = self.call else { return };
         let mut stage = self.stage.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((name, total)) = begin {
-            *stage = Stage { name: c_text(name), total };
+            *stage = StageProgress { name: c_text(name), total };
         }
         let note = c_text(note);
         let progress = SvkProgress {
@@ -60,16 +60,16 @@ impl Callback {
 
 impl Progress for Callback {
     fn begin(&self, stage: &'static str, steps: u64) {
-        self.tell(SvkProgressKind::Begin, 0, "", Some((stage, steps)));
+        self.report(SvkProgressKind::Begin, 0, "", Some((stage, steps)));
     }
     fn step(&self, done: u64, note: &str) {
-        self.tell(SvkProgressKind::Step, done, note, None);
+        self.report(SvkProgressKind::Step, done, note, None);
     }
     fn end(&self) {
-        self.tell(SvkProgressKind::End, 0, "", None);
+        self.report(SvkProgressKind::End, 0, "", None);
     }
     fn warn(&self, message: &str) {
-        self.tell(SvkProgressKind::Warning, 0, message, None);
+        self.report(SvkProgressKind::Warning, 0, message, None);
     }
     fn cancelled(&self) -> bool {
         self.cancelled.load(Ordering::SeqCst)

@@ -1,5 +1,5 @@
 //! Rendering into memory, buffers and images of the host.
-use super::boundary::{self, Fault, argument, guard};
+use super::boundary::{self, CallError, bad_argument, guard};
 use super::scene::{SvkScene, camera_in, lock};
 use super::types::*;
 use crate::gpu::Buffer;
@@ -40,23 +40,23 @@ pub unsafe extern "C" fn svk_scene_wait(scene: *mut SvkScene) -> SvkStatus {
     let Ok(scene) = (unsafe { boundary::handle(scene, "scene") }) else { return SvkStatus::Argument };
     guard(&scene.error, || {
         let under_way = std::mem::take(&mut *lock(&scene.deliveries));
-        under_way.iter().try_for_each(|d| d.wait()).map_err(Fault::from)
+        under_way.iter().try_for_each(|d| d.wait()).map_err(CallError::from)
     })
 }
 
 /// An output that was checked.
-struct Wanted {
-    what: What,
+struct RenderRequest {
+    what: RenderContent,
     encoding: Encoding,
-    place: Place,
+    place: RenderDestination,
 }
 
-enum What {
+enum RenderContent {
     Frame(Source),
     Relevancy(String),
 }
 
-enum Place {
+enum RenderDestination {
     Host(*mut u8),
     Device(Target),
 }
@@ -66,21 +66,21 @@ unsafe fn render(
     camera: &Camera,
     outputs: &[SvkOutput],
     sync: &SvkSync,
-) -> Result<(), Fault> {
+) -> Result<(), CallError> {
     let mut live = lock(&scene.live);
     // SAFETY: per the header.
-    let check = |(i, o): (usize, &SvkOutput)| unsafe { wanted(&live, camera, o, i) };
+    let check = |(i, o): (usize, &SvkOutput)| unsafe { checked_request(&live, camera, o, i) };
     let wanted = outputs.iter().enumerate().map(check).collect::<Result<Vec<_>, _>>()?;
     let packed = pack_all(&mut live, camera, &wanted)?;
     let mut copies = Vec::new();
     for (buffer, wanted) in packed.into_iter().zip(&wanted) {
         match wanted.place {
-            Place::Host(memory) => {
+            RenderDestination::Host(memory) => {
                 let bytes = buffer.read::<u8>()?;
                 // SAFETY: `wanted` has checked that the host's memory is that long.
                 unsafe { std::ptr::copy_nonoverlapping(bytes.as_ptr(), memory, bytes.len()) };
             }
-            Place::Device(target) => copies.push((buffer, target)),
+            RenderDestination::Device(target) => copies.push((buffer, target)),
         }
     }
     let point =
@@ -101,14 +101,18 @@ unsafe fn render(
 }
 
 /// One buffer per output, of exactly its bytes.
-fn pack_all(live: &mut LiveScene, camera: &Camera, wanted: &[Wanted]) -> Result<Vec<Buffer>, Fault> {
+fn pack_all(
+    live: &mut LiveScene,
+    camera: &Camera,
+    wanted: &[RenderRequest],
+) -> Result<Vec<Buffer>, CallError> {
     let device = live.device().clone();
     // Answers first: they render on their own where the camera is new, and the frame below must be the last one.
     let mut packed: Vec<Option<Buffer>> = Vec::with_capacity(wanted.len());
     for w in wanted {
         packed.push(match &w.what {
-            What::Frame(_) => None,
-            What::Relevancy(text) => {
+            RenderContent::Frame(_) => None,
+            RenderContent::Relevancy(text) => {
                 let map = live.ask(text, camera)?.relevancy.data;
                 Some(match w.encoding {
                     Encoding::F32x4 => {
@@ -123,13 +127,13 @@ fn pack_all(live: &mut LiveScene, camera: &Camera, wanted: &[Wanted]) -> Result<
     if packed.iter().any(Option::is_none) {
         let pixels = camera.width as usize * camera.height as usize;
         for (slot, w) in packed.iter_mut().zip(wanted) {
-            if let What::Frame(source) = w.what {
+            if let RenderContent::Frame(source) = w.what {
                 *slot = Some(pack::texels(&device, pixels, source, w.encoding)?);
             }
         }
         live.draw_bands(camera, |frame, band| {
             for (slot, w) in packed.iter().zip(wanted) {
-                if let (Some(texels), What::Frame(source)) = (slot, &w.what) {
+                if let (Some(texels), RenderContent::Frame(source)) = (slot, &w.what) {
                     pack::pack(&device, frame, band, *source, w.encoding, texels)?;
                 }
             }
@@ -139,50 +143,63 @@ fn pack_all(live: &mut LiveScene, camera: &Camera, wanted: &[Wanted]) -> Result<
     Ok(packed.into_iter().flatten().collect())
 }
 
-unsafe fn wanted(live: &LiveScene, camera: &Camera, o: &SvkOutput, i: usize) -> Result<Wanted, Fault> {
+unsafe fn checked_request(
+    live: &LiveScene,
+    camera: &Camera,
+    o: &SvkOutput,
+    i: usize,
+) -> Result<RenderRequest, CallError> {
     let encoding = match o.encoding {
         0 => Encoding::F32,
         1 => Encoding::F32x4,
         2 => Encoding::F16x4,
         3 => Encoding::Unorm8x4,
-        other => return argument(format!("output {i}: there is no encoding {other}")),
+        other => return bad_argument(format!("output {i}: there is no encoding {other}")),
     };
     let what = match o.channel {
-        0 => What::Frame(Source::Colour),
-        1 => What::Frame(Source::Alpha),
-        2 => What::Frame(Source::Depth),
+        0 => RenderContent::Frame(Source::Colour),
+        1 => RenderContent::Frame(Source::Alpha),
+        2 => RenderContent::Frame(Source::Depth),
         3 => match live.features(o.level as usize) {
-            (_, 0) => return argument(format!("output {i}: the scene has no features at level {}", o.level)),
-            (first, count) => What::Frame(Source::Features(first, count)),
+            (_, 0) => {
+                return bad_argument(format!("output {i}: the scene has no features at level {}", o.level));
+            }
+            (first, count) => RenderContent::Frame(Source::Features(first, count)),
         },
         // SAFETY: per the header.
         4 => match unsafe { boundary::text(o.text, "SvkOutput.text") }? {
-            Some(text) if matches!(encoding, Encoding::F32 | Encoding::F32x4) => What::Relevancy(text),
-            Some(_) => return argument(format!("output {i}: relevancy is written in 32-bit floats only")),
-            None => return argument(format!("output {i}: relevancy needs a text")),
+            Some(text) if matches!(encoding, Encoding::F32 | Encoding::F32x4) => {
+                RenderContent::Relevancy(text)
+            }
+            Some(_) => {
+                return bad_argument(format!("output {i}: relevancy is written in 32-bit floats only"));
+            }
+            None => return bad_argument(format!("output {i}: relevancy needs a text")),
         },
-        other => return argument(format!("output {i}: there is no channel {other}")),
+        other => return bad_argument(format!("output {i}: there is no channel {other}")),
     };
     let channels = match &what {
-        What::Frame(source) => source.channels(),
-        What::Relevancy(_) => 1,
+        RenderContent::Frame(source) => source.channels(),
+        RenderContent::Relevancy(_) => 1,
     };
     let bytes = encoding.bytes(channels, camera.width as usize * camera.height as usize);
     let place = match (o.host.is_null(), o.buffer, o.image) {
-        (false, 0, 0) => Place::Host(o.host.cast::<u8>()),
+        (false, 0, 0) => RenderDestination::Host(o.host.cast::<u8>()),
         (true, buffer, 0) if buffer != 0 => {
             if !o.offset.is_multiple_of(4) {
-                return argument(format!("output {i}: the offset {} is no multiple of 4", o.offset));
+                return bad_argument(format!("output {i}: the offset {} is no multiple of 4", o.offset));
             }
-            Place::Device(Target::Buffer { raw: vk::Buffer::from_raw(buffer), offset: o.offset })
+            RenderDestination::Device(Target::Buffer { raw: vk::Buffer::from_raw(buffer), offset: o.offset })
         }
-        (true, 0, image) if image != 0 => Place::Device(image_target(o, i, camera, encoding, channels)?),
-        _ => return argument(format!("output {i}: set exactly one of host, buffer and image")),
+        (true, 0, image) if image != 0 => {
+            RenderDestination::Device(image_target(o, i, camera, encoding, channels)?)
+        }
+        _ => return bad_argument(format!("output {i}: set exactly one of host, buffer and image")),
     };
     if o.image == 0 && o.bytes < bytes {
-        return argument(format!("output {i}: {bytes} bytes are needed, {} are there", o.bytes));
+        return bad_argument(format!("output {i}: {bytes} bytes are needed, {} are there", o.bytes));
     }
-    Ok(Wanted { what, encoding, place })
+    Ok(RenderRequest { what, encoding, place })
 }
 
 fn image_target(
@@ -191,21 +208,21 @@ fn image_target(
     camera: &Camera,
     encoding: Encoding,
     channels: usize,
-) -> Result<Target, Fault> {
+) -> Result<Target, CallError> {
     if encoding == Encoding::F32 && channels != 1 && channels != 4 {
-        return argument(format!(
+        return bad_argument(format!(
             "output {i}: no image format has {channels} values; take SVK_ENCODING_F32_X4"
         ));
     }
     let layers = encoding.layers(channels) as u32;
     if o.layers != layers {
-        return argument(format!(
+        return bad_argument(format!(
             "output {i}: {layers} array layers are written, the image has {}",
             o.layers
         ));
     }
     if o.new_layout == vk::ImageLayout::UNDEFINED.as_raw() as u32 {
-        return argument(format!("output {i}: new_layout must not be VK_IMAGE_LAYOUT_UNDEFINED"));
+        return bad_argument(format!("output {i}: new_layout must not be VK_IMAGE_LAYOUT_UNDEFINED"));
     }
     Ok(Target::Image {
         raw: vk::Image::from_raw(o.image),

@@ -1,5 +1,5 @@
 //! Scenes: loading, reading, asking, saving.
-use super::boundary::{self, Fault, LastError, argument, guard, guard_number};
+use super::boundary::{self, CallError, LastError, bad_argument, guard, guard_number};
 use super::context::SvkContext;
 use super::types::*;
 use crate::Error;
@@ -32,7 +32,7 @@ impl SvkScene {
 }
 
 /// Runs a function of a scene.
-unsafe fn with(scene: *const SvkScene, body: impl FnOnce(&SvkScene) -> Result<(), Fault>) -> SvkStatus {
+unsafe fn with(scene: *const SvkScene, body: impl FnOnce(&SvkScene) -> Result<(), CallError>) -> SvkStatus {
     // SAFETY: per the header.
     match unsafe { scene.as_ref() } {
         Some(scene) => guard(&scene.error, || body(scene)),
@@ -40,7 +40,7 @@ unsafe fn with(scene: *const SvkScene, body: impl FnOnce(&SvkScene) -> Result<()
     }
 }
 
-pub(super) unsafe fn camera_in(pointer: *const SvkCamera) -> Result<Camera, Fault> {
+pub(super) unsafe fn camera_in(pointer: *const SvkCamera) -> Result<Camera, CallError> {
     // SAFETY: per the header.
     let c = unsafe { boundary::read(pointer) }?;
     let [x, y, z] = c.world_to_camera;
@@ -60,7 +60,7 @@ pub(super) unsafe fn camera_in(pointer: *const SvkCamera) -> Result<Camera, Faul
         cy: c.cy,
         pose,
     };
-    camera.checked().map_err(|e| Fault::Error(Error::input(e)))
+    camera.checked().map_err(|e| CallError::Error(Error::input(e)))
 }
 
 /// Loads a scene directory, or a file of Gaussians (which has no language). On failure `*scene` is NULL and the text is the
@@ -76,7 +76,7 @@ pub unsafe extern "C" fn svk_scene_load(
     guard(&context.error, || {
         // SAFETY: per the header.
         let (slot, path) = unsafe { (boundary::slot(scene)?, boundary::path(path, "path")?) };
-        let Some(path) = path else { return argument("the path is null") };
+        let Some(path) = path else { return bad_argument("the path is null") };
         *slot = SvkScene::boxed(LiveScene::load(&context.device, &path, &context.registry)?);
         Ok(())
     })
@@ -136,7 +136,7 @@ pub unsafe extern "C" fn svk_scene_camera(
         with(scene, |scene| {
             let live = lock(&scene.live);
             let Some(c) = live.cameras().get(index as usize) else {
-                return argument(format!("there is no camera {index}, only {}", live.cameras().len()));
+                return bad_argument(format!("there is no camera {index}, only {}", live.cameras().len()));
             };
             let (r, t) = (c.pose.rotation, c.pose.translation);
             let row = |k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], t[k]];
@@ -175,10 +175,10 @@ pub unsafe extern "C" fn svk_scene_read(
                 2 => s.quats.as_flattened(),
                 3 => &s.opacity_logits,
                 4 => &s.sh,
-                other => return argument(format!("there is no array {other}")),
+                other => return bad_argument(format!("there is no array {other}")),
             };
             if values.is_null() || all.len() != count {
-                return argument(format!(
+                return bad_argument(format!(
                     "array {array} has {} floats; give room for exactly these",
                     all.len()
                 ));
@@ -204,11 +204,11 @@ pub unsafe extern "C" fn svk_scene_query(
     // SAFETY: per the header.
     unsafe {
         with(scene, |scene| {
-            let Some(text) = boundary::text(text, "text")? else { return argument("the text is null") };
+            let Some(text) = boundary::text(text, "text")? else { return bad_argument("the text is null") };
             let camera = camera_in(camera)?;
             let pixels = camera.width as usize * camera.height as usize;
             if !mask.is_null() && mask_bytes != pixels {
-                return argument(format!("the mask has {mask_bytes} bytes, the view {pixels} pixels"));
+                return bad_argument(format!("the mask has {mask_bytes} bytes, the view {pixels} pixels"));
             }
             let found = lock(&scene.live).ask(&text, &camera)?;
             let value = SvkAnswer {
@@ -242,7 +242,7 @@ pub unsafe extern "C" fn svk_scene_save(
     // SAFETY: per the header.
     unsafe {
         with(scene, |scene| {
-            let Some(path) = boundary::path(path, "path")? else { return argument("the path is null") };
+            let Some(path) = boundary::path(path, "path")? else { return bad_argument("the path is null") };
             Ok(lock(&scene.live).save(&path, replace != 0)?)
         })
     }

@@ -1,5 +1,5 @@
 //! Photos to a scene.
-use super::boundary::{self, Fault, argument, guard};
+use super::boundary::{self, CallError, bad_argument, guard};
 use super::context::SvkContext;
 use super::progress::Callback;
 use super::scene::{SvkScene, camera_in};
@@ -10,7 +10,7 @@ use crate::photo::{self, Photo};
 use crate::pose::choose;
 use crate::progress::Progress;
 use crate::run::live::LiveScene;
-use crate::run::sources::{self, Kind, SourceChoice, choose};
+use crate::run::sources::{self, SourceChoice, SourceKind, choose};
 use crate::run::{self, Method, RunPlan};
 use crate::scene::{Camera, RgbImage};
 use std::path::{Path, PathBuf};
@@ -39,14 +39,16 @@ pub unsafe extern "C" fn svk_train(
             let progress = Callback::new(options.progress, options.user);
             let max_size = match options.max_size as usize {
                 0 => photo::default_max_size(context.device.info().is_cpu),
-                n if n < photo::SMALLEST_SIDE => return argument(format!("SvkTrainOptions.max_size is {n}")),
+                n if n < photo::SMALLEST_SIDE => {
+                    return bad_argument(format!("SvkTrainOptions.max_size is {n}"));
+                }
                 n => n,
             };
             let (photos, cameras) = gather(&given, options.views as usize, max_size, &progress)?;
             plan.inputs = photos.iter().map(|p| p.path.clone()).collect();
             if !cameras.is_empty() {
                 if plan.init != RunPlan::default().init {
-                    return argument(
+                    return bad_argument(
                         "cameras are given with the photos and in the options; give one of them",
                     );
                 }
@@ -66,7 +68,7 @@ unsafe fn gather(
     views: usize,
     max_size: usize,
     progress: &dyn Progress,
-) -> Result<(Vec<Photo>, Vec<Camera>), Fault> {
+) -> Result<(Vec<Photo>, Vec<Camera>), CallError> {
     // SAFETY: per the header.
     let paths = given.iter().map(|p| unsafe { boundary::path(p.path, "SvkPhoto.path") });
     let paths = paths.collect::<Result<Vec<Option<PathBuf>>, _>>()?;
@@ -81,7 +83,7 @@ unsafe fn gather(
         let one = |(i, (photo, path)): (usize, (&SvkPhoto, Option<PathBuf>))| unsafe {
             single(photo, path, i, max_size)
         };
-        given.iter().zip(paths).enumerate().map(one).collect::<Result<Vec<_>, Fault>>()?
+        given.iter().zip(paths).enumerate().map(one).collect::<Result<Vec<_>, CallError>>()?
     };
     let mut cameras = Vec::new();
     for (photo, given) in photos.iter().zip(given).filter(|(_, g)| !g.camera.is_null()) {
@@ -89,7 +91,7 @@ unsafe fn gather(
         cameras.push(Camera { name: photo.stem.clone(), ..unsafe { camera_in(given.camera) }? });
     }
     if !cameras.is_empty() && (cameras.len() != photos.len() || photos.len() != given.len()) {
-        return argument("SvkPhoto.camera: give a camera with every photo, or with none");
+        return bad_argument("SvkPhoto.camera: give a camera with every photo, or with none");
     }
     Ok((photos, cameras))
 }
@@ -99,11 +101,11 @@ unsafe fn single(
     path: Option<PathBuf>,
     index: usize,
     max_size: usize,
-) -> Result<Photo, Fault> {
+) -> Result<Photo, CallError> {
     let sources =
         [path.is_some(), !given.encoded.is_null(), !given.pixels.is_null()].iter().filter(|s| **s).count();
     if sources != 1 {
-        return argument(format!("photo {index}: set exactly one of path, encoded and pixels"));
+        return bad_argument(format!("photo {index}: set exactly one of path, encoded and pixels"));
     }
     // SAFETY: per the header.
     let name = unsafe { boundary::text(given.name, "SvkPhoto.name") }?;
@@ -122,11 +124,11 @@ unsafe fn single(
     Ok(photo::from_pixels(&name, &image, focal, max_size)?)
 }
 
-unsafe fn pixels(given: &SvkPhoto, name: &Path) -> Result<RgbImage, Fault> {
+unsafe fn pixels(given: &SvkPhoto, name: &Path) -> Result<RgbImage, CallError> {
     let (width, height, bytes) = (given.width as usize, given.height as usize, given.pixel_bytes as usize);
     let row = if given.row_bytes == 0 { width * bytes } else { given.row_bytes };
     if !(3..=4).contains(&bytes) || width == 0 || height == 0 || row < width * bytes {
-        return argument(format!(
+        return bad_argument(format!(
             "{}: {width} × {height} pixels of {bytes} bytes in rows of {row} bytes make no image",
             name.display()
         ));
@@ -139,16 +141,16 @@ unsafe fn pixels(given: &SvkPhoto, name: &Path) -> Result<RgbImage, Fault> {
     Ok(RgbImage { width, height, data })
 }
 
-unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Fault> {
+unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, CallError> {
     let preset = match o.preset {
         0 => None,
         1 => Some(Preset::Draft),
         2 => Some(Preset::Default),
         3 => Some(Preset::Paper),
-        other => return argument(format!("SvkTrainOptions.preset is {other}")),
+        other => return bad_argument(format!("SvkTrainOptions.preset is {other}")),
     };
     if ![0, 3, 8, 16].contains(&o.feature_dim) {
-        return argument(format!("SvkTrainOptions.feature_dim is {}; 3, 8 or 16", o.feature_dim));
+        return bad_argument(format!("SvkTrainOptions.feature_dim is {}; 3, 8 or 16", o.feature_dim));
     }
     // SAFETY: texts per the header.
     let text = |pointer, field: &str| unsafe { boundary::text(pointer, &format!("SvkTrainOptions.{field}")) };
@@ -159,18 +161,18 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Fau
     let method = method.unwrap_or(RunPlan::default().method);
     Ok(RunPlan {
         preset,
-        init: source::<sources::Geometry>(
+        init: source::<sources::GeometrySources>(
             text(o.init, "init")?,
             path(o.cameras, "cameras")?.map(|file| SourceChoice::with("cameras", file)),
             networks,
         )?,
-        matcher: source::<sources::Matches>(text(o.matcher, "matcher")?, None, networks)?,
-        masks: source::<sources::Masks>(
+        matcher: source::<sources::MatchSources>(text(o.matcher, "matcher")?, None, networks)?,
+        masks: source::<sources::MaskSources>(
             text(o.mask_source, "mask_source")?,
             path(o.masks, "masks")?.map(|dir| SourceChoice::with("dir", dir)),
             networks,
         )?,
-        features: source::<sources::Features>(
+        features: source::<sources::FeatureSources>(
             text(o.feature_source, "feature_source")?,
             path(o.features, "features")?.map(|dir| SourceChoice::with("dir", dir)),
             networks,
@@ -186,14 +188,14 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Fau
 }
 
 /// A source by its name, or by the file or folder that an older field holds, or the built-in one.
-fn source<K: Kind>(
+fn source<K: SourceKind>(
     named: Option<String>,
     given: Option<SourceChoice>,
     networks: &Inventory,
-) -> Result<SourceChoice, Fault> {
+) -> Result<SourceChoice, CallError> {
     match (named, given) {
         (Some(_), Some(given)) => {
-            argument(format!("{}: {given} is given twice; give one of the two", K::OPTION))
+            bad_argument(format!("{}: {given} is given twice; give one of the two", K::OPTION))
         }
         (Some(text), None) => Ok(choose::<K>(&text, networks)?),
         (None, given) => Ok(given.unwrap_or_else(sources::default::<K>)),

@@ -261,7 +261,7 @@ pub struct SvkTrainOptions {
     pub masks: *const c_char,
     /// Folder of precomputed features (STEM_f.npy, text_embeddings.npz), the same as `masks`; NULL = built-in.
     pub features: *const c_char,
-    /// Hears of the progress and may stop it; may be NULL.
+    /// Called with the progress; a result other than 0 stops the run; may be NULL.
     pub progress: SvkProgressFunction,
     /// Given to `progress`.
     pub user: *mut c_void,

@@ -3,7 +3,7 @@ use super::args::AblateArgs;
 use super::plan::existing;
 use super::print::{print, print_json};
 use super::progress;
-use crate::ablate::{self, Finished, Lab, Plan, Regions, TABLES, Table};
+use crate::ablate::{self, FinishedTable, Plan, Regions, Runner, TABLES, Table};
 use crate::format::{create_folder, write_json};
 use crate::gpu::Device;
 use crate::query::eval::GroundTruth;
@@ -26,8 +26,8 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
     let registry = args.device.registry()?;
     let device = Device::open(args.device.device.as_deref())?;
     let (clock, name) = (Instant::now(), device.info().name.clone());
-    let progress = progress::here();
-    let mut lab = Lab::open(device, registry, truth, plan.seed, progress.as_ref());
+    let progress = progress::reporter();
+    let mut lab = Runner::open(device, registry, truth, plan.seed, progress.as_ref());
     let mut tables: Vec<Value> = Vec::new();
     let mut report = Value::Null;
     for table in plan.tables.iter().copied() {
@@ -49,7 +49,7 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
     print(&format!("tables and charts are in {} ({:.0} s)\n", out.display(), clock.elapsed().as_secs_f64()))
 }
 
-fn write(out: &Path, finished: &Finished, report: &Value) -> Result<()> {
+fn write(out: &Path, finished: &FinishedTable, report: &Value) -> Result<()> {
     let file = |extension: &str| out.join(format!("{}.{extension}", finished.table.name));
     std::fs::write(file("txt"), finished.text()).map_err(Error::io(file("txt")))?;
     std::fs::write(file("svg"), finished.svg()).map_err(Error::io(file("svg")))?;

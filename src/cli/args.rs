@@ -1,4 +1,4 @@
-//! What the user typed.
+//! Command-line arguments.
 use crate::infer::provider;
 use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};

@@ -3,7 +3,7 @@ use super::args::{BenchArgs, BenchPart};
 use super::models::checked;
 use super::print::print;
 use super::progress;
-use crate::bench::{self, Bench, Budget, Report, Workload, compare};
+use crate::bench::{self, Bench, BenchReport, Budget, Workload, compare};
 use crate::format::{scene_dir, write_json};
 use crate::gpu::Device;
 use crate::infer::check::check as check_model;
@@ -15,7 +15,7 @@ use std::path::Path;
 
 pub fn bench(args: &BenchArgs) -> Result<()> {
     if let Some([a, b]) = args.compare.as_deref() {
-        return print(&compare::table(&Report::read(a)?, &Report::read(b)?));
+        return print(&compare::table(&BenchReport::read(a)?, &BenchReport::read(b)?));
     }
     let budget = check(args)?;
     if let Some(folder) = &args.write_scene {
@@ -36,7 +36,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     // Everything that can be wrong with the input comes before the first measurement.
     let workload =
         if has(BenchPart::Training) || !args.sweep.is_empty() { Some(workload(args)?) } else { None };
-    let asked = if has(BenchPart::Query) { Some(asked(args)?) } else { None };
+    let asked = if has(BenchPart::Query) { Some(scene_and_encoder(args)?) } else { None };
     writable(args.json.as_deref())?;
     let device = Device::open(args.device.as_deref())?;
     let mut bench = Bench::new(&device, budget)?;
@@ -113,8 +113,8 @@ fn cameras(args: &BenchArgs) -> Result<()> {
     }
     writable(args.json.as_deref())?;
     let registry = args.registry()?;
-    let reading = bench::cameras::Reading { max_size: args.max_size, copies: args.copies };
-    let progress = progress::here();
+    let reading = bench::cameras::PhotoInput { max_size: args.max_size, copies: args.copies };
+    let progress = progress::reporter();
     let mut header = Some(bench::cameras::header());
     let mut show =
         |row: &bench::cameras::CameraRow| print(&(header.take().unwrap_or_default() + &row.text()));
@@ -126,8 +126,8 @@ fn cameras(args: &BenchArgs) -> Result<()> {
     print(&report.text())
 }
 
-/// The scene to ask and the model that speaks its language.
-fn asked(args: &BenchArgs) -> Result<(scene_dir::Scene, Box<dyn RegionEncoder>)> {
+/// The scene and the text encoder of its space.
+fn scene_and_encoder(args: &BenchArgs) -> Result<(scene_dir::Scene, Box<dyn RegionEncoder>)> {
     let Some(path) = &args.scene else {
         return Err(Error::input("bench query: give a scene with language with --scene DIR"));
     };

@@ -8,13 +8,13 @@ use serde_json::json;
 use std::path::{Path, PathBuf};
 
 /// Kept things of one kind.
-struct Row {
+struct KeptRow {
     what: &'static str,
     folder: PathBuf,
     files: Vec<(PathBuf, u64)>,
 }
 
-impl Row {
+impl KeptRow {
     fn bytes(&self) -> u64 {
         self.files.iter().map(|f| f.1).sum()
     }
@@ -23,8 +23,8 @@ impl Row {
 pub fn clean(args: &CleanArgs) -> Result<()> {
     let stages = crate::run::stage_folder();
     let rows = [
-        Row { what: "stages of runs, for --resume", files: Store::list(&stages), folder: stages },
-        Row { what: "answers of networks", files: cache::files(), folder: cache::folder() },
+        KeptRow { what: "stages of runs, for --resume", files: Store::list(&stages), folder: stages },
+        KeptRow { what: "answers of networks", files: cache::files(), folder: cache::folder() },
     ];
     if args.delete {
         for (file, _) in rows.iter().flat_map(|r| &r.files) {
@@ -32,7 +32,7 @@ pub fn clean(args: &CleanArgs) -> Result<()> {
         }
     }
     if args.json {
-        let one = |r: &Row| json!({ "what": r.what, "folder": r.folder, "files": r.files.len(), "bytes": r.bytes() });
+        let one = |r: &KeptRow| json!({ "what": r.what, "folder": r.folder, "files": r.files.len(), "bytes": r.bytes() });
         return print_json(
             &json!({ "deleted": args.delete, "kept": rows.iter().map(one).collect::<Vec<_>>() }),
         );

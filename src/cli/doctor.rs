@@ -5,7 +5,7 @@ use super::print::{print, print_json};
 use crate::gpu::report::{Line, Status, vulkan};
 use crate::infer;
 use crate::infer::installed::inventory;
-use crate::photo;
+use crate::photo::{self, Support};
 use crate::run::sources;
 use crate::{Error, Result};
 use serde_json::json;
@@ -39,9 +39,9 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
         sources::list(&networks).into_iter().map(|(option, found)| line(&option, Status::Ok, found, None)),
     );
     // Photos of other kinds are read without it, so this is no fault of the machine.
-    let (found, advice) = photo::heif_support();
+    let Support { found, advice } = photo::heif_support();
     lines.push(line("HEIC, AVIF", if advice.is_some() { Status::Note } else { Status::Ok }, found, advice));
-    let (found, advice) = photo::video_support();
+    let Support { found, advice } = photo::video_support();
     lines.push(line("video", if advice.is_some() { Status::Note } else { Status::Ok }, found, advice));
     let missing = lines.iter().filter(|l| l.status == Status::Missing).count();
     if args.device.json {

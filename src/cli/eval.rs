@@ -6,8 +6,8 @@ use crate::format::scene_dir::Scene;
 use crate::format::{cameras, create_folder, picture, scene_dir, write_json};
 use crate::gpu::Device;
 use crate::query::TextQuery;
-use crate::query::eval::{Evaluation, GroundTruth, Report};
-use crate::query::protocol::{self, CodeScores, Kind, Masks, Seen};
+use crate::query::eval::{EvalReport, Evaluation, GroundTruth};
+use crate::query::protocol::{self, CodeScores, DecodedView, Masks, ProtocolKind};
 use crate::report::file_name;
 use crate::run::ask;
 use crate::run::encoder;
@@ -34,9 +34,9 @@ pub fn eval(args: &EvalArgs) -> Result<()> {
         _ if args.refine_views || args.text => {
             Err(Error::input("--refine-views and --text belong to --protocol field; leave them out"))
         }
-        ProtocolArg::Lerf => report(&published(Kind::Lerf, &scene, args)?, args, None),
-        ProtocolArg::Ovs => report(&published(Kind::Ovs, &scene, args)?, args, None),
-        ProtocolArg::Scannet => report(&published(Kind::ScanNet, &scene, args)?, args, None),
+        ProtocolArg::Lerf => report(&published(ProtocolKind::Lerf, &scene, args)?, args, None),
+        ProtocolArg::Ovs => report(&published(ProtocolKind::Ovs, &scene, args)?, args, None),
+        ProtocolArg::Scannet => report(&published(ProtocolKind::ScanNet, &scene, args)?, args, None),
     }
 }
 
@@ -50,7 +50,7 @@ fn ask(scene: &Scene, texts: &[String], args: &EvalArgs) -> Result<Vec<TextQuery
     ask::embedded(texts, encoder.as_mut())
 }
 
-fn field(scene: &Scene, args: &EvalArgs) -> Result<Report> {
+fn field(scene: &Scene, args: &EvalArgs) -> Result<EvalReport> {
     let truth = GroundTruth::read(&args.ground_truth)?;
     let evaluation = Evaluation::new(truth, &scene.cameras, args.out.as_deref())?;
     let phrases: Vec<String> = evaluation.phrases().into_iter().map(|p| p.1).collect();
@@ -65,12 +65,12 @@ fn field(scene: &Scene, args: &EvalArgs) -> Result<Report> {
         &queries,
         evaluation,
         args.refine_views,
-        progress::here().as_ref(),
+        progress::reporter().as_ref(),
         &mut |_, _| Ok(()),
     )
 }
 
-fn published(kind: Kind, scene: &Scene, args: &EvalArgs) -> Result<protocol::Report> {
+fn published(kind: ProtocolKind, scene: &Scene, args: &EvalArgs) -> Result<protocol::ProtocolReport> {
     let Some(field) = &scene.language else {
         return Err(Error::input(format!(
             "{}: the scene has no language; make one with splatvk run",
@@ -83,15 +83,15 @@ fn published(kind: Kind, scene: &Scene, args: &EvalArgs) -> Result<protocol::Rep
     let scores = CodeScores::new(field, &queries)?;
     let device = Device::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
-    let progress = progress::here();
+    let progress = progress::reporter();
     let views = protocol.views().to_vec();
     progress.begin("eval", views.len() as u64);
     for (i, view) in views.iter().enumerate() {
         progress.check()?;
         let decoded = viewer.view(&view.camera)?;
-        let masks = protocol.add(i, &Seen { codes: &decoded.codes, scores: &scores })?;
+        let masks = protocol.add(i, &DecodedView { codes: &decoded.codes, scores: &scores })?;
         if let Some(out) = &args.out {
-            write(out, &view.stem, &decoded.frame.rgb, masks)?;
+            write(out, &view.stem, &decoded.rendered.rgb, masks)?;
         }
         progress.step(i as u64 + 1, "");
     }

@@ -2,7 +2,7 @@
 use super::print::listing;
 use super::progress;
 use crate::format::gaussians::{self, FORMATS, SplatFormat};
-use crate::format::{SH_C0, colmap, create_folder, ply, scene_dir, transforms, whole};
+use crate::format::{SH_C0, colmap, create_folder, ply, scene_dir, transforms, write_whole_file};
 use crate::scene::{Camera, Splats};
 use crate::{Error, Result};
 use clap::Args;
@@ -57,11 +57,11 @@ pub fn export(args: &ExportArgs) -> Result<()> {
                 )));
             }
             let options = ply::PlyOptions { degree: args.ply_degree, language };
-            whole(&args.out, |path| ply::write_splats(path, &scene.splats, options))?;
+            write_whole_file(&args.out, |path| ply::write_splats(path, &scene.splats, options))?;
         }
         "transforms" => {
             let cameras = cameras(&scene, args)?;
-            whole(&args.out, |path| transforms::write(path, cameras, None))?;
+            write_whole_file(&args.out, |path| transforms::write(path, cameras, None))?;
         }
         "colmap" | "colmap-bin" => {
             let cameras = cameras(&scene, args)?;
@@ -99,7 +99,7 @@ fn warn_of_range(splats: &Splats, brightest: f32) {
         }
     }
     if cut as f64 > UNNOTICED * solid as f64 {
-        progress::here().warn(&format!(
+        progress::reporter().warn(&format!(
             "the format ends at {brightest:.2} of white and {cut} splats are brighter: they are cut off; ply, \
              compressed-ply, glb and gltf keep them"
         ));

@@ -3,8 +3,8 @@ use super::args::GenerateArgs;
 use super::print::{print, print_json};
 use super::progress;
 use crate::format::Workspace;
-use crate::synth::regions::Flaws;
-use crate::synth::{self, Effects, Knobs};
+use crate::synth::regions::InjectedErrors;
+use crate::synth::{self, Effects, SceneSpec};
 use crate::{Error, Result};
 
 pub fn generate(args: &GenerateArgs) -> Result<()> {
@@ -12,7 +12,7 @@ pub fn generate(args: &GenerateArgs) -> Result<()> {
     let workspace = Workspace::create(&args.out, false)?;
     match &args.from {
         Some(data) => synth::write_regions(data, workspace.path(), &flaws)?,
-        None => synth::generate(workspace.path(), &knobs(args)?, &flaws, progress::here().as_ref())?,
+        None => synth::generate(workspace.path(), &spec(args)?, &flaws, progress::reporter().as_ref())?,
     }
     let folder = workspace.commit()?;
     if args.json {
@@ -21,7 +21,7 @@ pub fn generate(args: &GenerateArgs) -> Result<()> {
     print(&format!("data is in {}\n", folder.display()))
 }
 
-fn flaws(args: &GenerateArgs) -> Result<Flaws> {
+fn flaws(args: &GenerateArgs) -> Result<InjectedErrors> {
     for (flag, rate) in [("--split", args.split), ("--merge", args.merge), ("--wrong", args.wrong)] {
         if !(0.0..=1.0).contains(&rate) {
             return Err(Error::input(format!("{flag} {rate}: a rate lies between 0 and 1")));
@@ -30,16 +30,22 @@ fn flaws(args: &GenerateArgs) -> Result<Flaws> {
     if !(args.noise >= 0.0 && args.noise.is_finite()) {
         return Err(Error::input(format!("--noise {}: give 0 or more", args.noise)));
     }
-    Ok(Flaws { seed: args.seed, split: args.split, merge: args.merge, wrong: args.wrong, noise: args.noise })
+    Ok(InjectedErrors {
+        seed: args.seed,
+        split: args.split,
+        merge: args.merge,
+        wrong: args.wrong,
+        noise: args.noise,
+    })
 }
 
-fn knobs(args: &GenerateArgs) -> Result<Knobs> {
+fn spec(args: &GenerateArgs) -> Result<SceneSpec> {
     let size = args.size.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let size = size.ok_or_else(|| Error::input(format!("--size {}: write it as 640x480", args.size)))?;
     let effects = effects(args);
     // The sensor's own noise stands in for the even one.
-    let usual = if effects.sensor_noise { 0.0 } else { Knobs::default().photo_noise };
-    Ok(Knobs {
+    let usual = if effects.sensor_noise { 0.0 } else { SceneSpec::default().photo_noise };
+    Ok(SceneSpec {
         seed: args.seed,
         views: args.views,
         held_out: args.held_out,

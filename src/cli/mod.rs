@@ -1,4 +1,4 @@
-//! Command line: [`args`] = what the user typed, `plan` = what it means, one file per command.
+//! Command line: [`args`] = arguments, `plan` = the plan that they describe, one file per command.
 mod ablate;
 pub mod args;
 mod bench;
@@ -31,7 +31,7 @@ use std::process::ExitCode;
 pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
-        Err(error) => return usage(&error),
+        Err(error) => return print_usage_error(&error),
     };
     progress::set_format(cli.log);
     progress::stop_on_signal();
@@ -42,7 +42,7 @@ pub fn main() -> ExitCode {
     match execute(command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            progress::failed(&one_line(&error.to_string()), error.exit_code());
+            progress::print_error(&one_line(&error.to_string()), error.exit_code());
             ExitCode::from(error.exit_code())
         }
     }
@@ -69,7 +69,7 @@ fn execute(command: Command) -> Result<()> {
 }
 
 /// Help and version go to standard output; what cannot be parsed is one line like every other error, exit code 2.
-fn usage(error: &clap::Error) -> ExitCode {
+fn print_usage_error(error: &clap::Error) -> ExitCode {
     let help = matches!(
         error.kind(),
         ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand | ErrorKind::MissingSubcommand

@@ -2,7 +2,7 @@
 use super::args::{ModelsAction, ModelsArgs};
 use super::print::{print, print_json};
 use crate::infer::check::{Measured, check};
-use crate::infer::installed::{Installed, Inventory, Known, inventory, known};
+use crate::infer::installed::{CatalogueEntry, HashedFile, Installed, Inventory, catalogue, inventory};
 use crate::infer::{ModelStatus, Registry};
 use crate::{Error, Result};
 use serde_json::json;
@@ -35,9 +35,9 @@ fn list(registry: &Registry, found: &Inventory, as_json: bool) -> Result<()> {
     if as_json {
         return print_json(&json!({
             "models": status.iter().map(to_json).collect::<Vec<_>>(),
-            "known": known().iter().map(|k| known_json(k, registry, found)).collect::<Vec<_>>(),
+            "known": catalogue().iter().map(|k| known_json(k, registry, found)).collect::<Vec<_>>(),
             "networks": found.models.iter().map(installed_json).collect::<Vec<_>>(),
-            "broken": found.broken.iter().map(|(file, why)| json!({ "file": file, "fix": why })).collect::<Vec<_>>(),
+            "broken": found.broken.iter().map(|b| json!({ "file": b.path, "fix": b.reason })).collect::<Vec<_>>(),
         }));
     }
     let mut text = String::from("Built-in pack: what splatvk uses unless told otherwise\n");
@@ -49,18 +49,20 @@ fn list(registry: &Registry, found: &Inventory, as_json: bool) -> Result<()> {
     ];
     for (pack, title) in packs {
         let _ = writeln!(text, "\n{title}");
-        let of_pack =
-            |k: &&Known| if pack.is_empty() { k.packs.is_empty() } else { k.packs.iter().any(|p| p == pack) };
-        known().iter().filter(of_pack).for_each(|k| entry(&mut text, k, registry, found));
+        let of_pack = |k: &&CatalogueEntry| {
+            if pack.is_empty() { k.packs.is_empty() } else { k.packs.iter().any(|p| p == pack) }
+        };
+        catalogue().iter().filter(of_pack).for_each(|k| entry(&mut text, k, registry, found));
     }
-    let strangers: Vec<&Installed> = found.models.iter().filter(|m| m.known().is_none()).collect();
-    if !strangers.is_empty() {
+    let unlisted: Vec<&Installed> = found.models.iter().filter(|m| m.catalogue_entry().is_none()).collect();
+    if !unlisted.is_empty() {
         text.push_str("\nInstalled, not in the catalogue\n");
-        strangers.iter().for_each(|m| installed(&mut text, m));
+        unlisted.iter().for_each(|m| installed(&mut text, m));
     }
     if !found.broken.is_empty() {
         text.push_str("\nNot usable\n");
-        found.broken.iter().for_each(|(_, why)| {
+        found.broken.iter().for_each(|b| {
+            let why = &b.reason;
             let _ = writeln!(text, "  → {why}");
         });
     }
@@ -68,24 +70,24 @@ fn list(registry: &Registry, found: &Inventory, as_json: bool) -> Result<()> {
 }
 
 fn built_in(text: &mut String, m: &ModelStatus) {
-    let role = format!("{:?}", m.role).to_lowercase();
+    let kind = format!("{:?}", m.kind).to_lowercase();
     let state = if m.installed { "installed" } else { "MISSING" };
     let size = m.bytes as f64 / 1e6;
     // Writing to a String cannot fail.
     let _ =
-        writeln!(text, "{role:<10} {:<40} {state:<9} {size:7.1} MB  {:<28} {}", m.name, m.licence, m.source);
+        writeln!(text, "{kind:<10} {:<40} {state:<9} {size:7.1} MB  {:<28} {}", m.name, m.licence, m.source);
     let _ = writeln!(text, "{:10} sha256 {}", "", m.sha256);
     if let Some(fix) = &m.fix {
         let _ = writeln!(text, "{:10} → {fix}", "");
     }
 }
 
-fn entry(text: &mut String, k: &Known, registry: &Registry, found: &Inventory) {
+fn entry(text: &mut String, k: &CatalogueEntry, registry: &Registry, found: &Inventory) {
     let model = of_entry(k, found);
     let state = if model.is_some() { "installed" } else { "-" };
-    let (role, size) = (k.role.name(), f64::from(k.megabytes));
+    let (task, size) = (k.task.name(), f64::from(k.megabytes));
     let _ =
-        writeln!(text, "{role:<10} {:<40} {state:<9} {size:7.1} MB  {:<28} {}", k.name, k.licence, k.source);
+        writeln!(text, "{task:<10} {:<40} {state:<9} {size:7.1} MB  {:<28} {}", k.name, k.licence, k.source);
     match model {
         Some(m) => installed(text, m),
         None => {
@@ -95,10 +97,9 @@ fn entry(text: &mut String, k: &Known, registry: &Registry, found: &Inventory) {
 }
 
 fn installed(text: &mut String, m: &Installed) {
-    let duties: Vec<&str> = m.duties.iter().map(|d| d.name()).collect();
+    let tasks: Vec<&str> = m.tasks.iter().map(|d| d.name()).collect();
     let untrained = if m.untrained() { ", UNTRAINED weights" } else { "" };
-    let _ =
-        writeln!(text, "{:10} {} in {}: {}{untrained}", "", m.name, m.folder.display(), duties.join(", "));
+    let _ = writeln!(text, "{:10} {} in {}: {}{untrained}", "", m.name, m.folder.display(), tasks.join(", "));
     for graph in m.graphs.values() {
         let (millions, size) = (graph.parameters as f64 / 1e6, graph.bytes() as f64 / 1e6);
         let part = graph.binding.part.name();
@@ -108,7 +109,7 @@ fn installed(text: &mut String, m: &Installed) {
             "",
             graph.path.display()
         );
-        for (file, pinned) in &graph.pinned {
+        for HashedFile { path: file, sha256: pinned } in &graph.pinned {
             let name = file.file_name().unwrap_or_default().to_string_lossy();
             let _ = writeln!(text, "{:10}   sha256 {pinned} pinned for {name}", "");
         }
@@ -123,11 +124,11 @@ fn unused(text: &mut String, m: &Installed) {
     }
 }
 
-fn of_entry<'f>(k: &Known, found: &'f Inventory) -> Option<&'f Installed> {
-    found.models.iter().find(|m| m.known().is_some_and(|known| known.id == k.id))
+fn of_entry<'f>(k: &CatalogueEntry, found: &'f Inventory) -> Option<&'f Installed> {
+    found.models.iter().find(|m| m.catalogue_entry().is_some_and(|known| known.id == k.id))
 }
 
-fn place(k: &Known, registry: &Registry) -> String {
+fn place(k: &CatalogueEntry, registry: &Registry) -> String {
     registry.folders().first().map_or(k.id.clone(), |f| f.join(&k.id).display().to_string())
 }
 
@@ -135,7 +136,7 @@ fn check_all(registry: &Registry, as_json: bool) -> Result<()> {
     let found = inventory(registry);
     let status = registry.status();
     let mut problems: Vec<String> = status.iter().filter_map(|m| m.fix.clone()).collect();
-    problems.extend(found.broken.iter().map(|(_, why)| why.clone()));
+    problems.extend(found.broken.iter().map(|b| b.reason.clone()));
     let mut results = Vec::new();
     if !as_json {
         let mut text = String::new();
@@ -187,15 +188,15 @@ pub fn checked(model: &Installed, steps: Option<&[Measured]>) -> String {
 /// The JSON of one built-in model, as `models list --json`, `doctor --json` and `run.json` print it.
 pub fn to_json(m: &ModelStatus) -> serde_json::Value {
     json!({
-        "role": format!("{:?}", m.role).to_lowercase(), "name": m.name, "file": m.file, "installed": m.installed,
+        "role": format!("{:?}", m.kind).to_lowercase(), "name": m.name, "file": m.file, "installed": m.installed,
         "bytes": m.bytes, "sha256": m.sha256, "actual_sha256": m.actual_sha256, "licence": m.licence,
         "source": m.source, "fix": m.fix, "pack": "built-in",
     })
 }
 
-fn known_json(k: &Known, registry: &Registry, found: &Inventory) -> serde_json::Value {
+fn known_json(k: &CatalogueEntry, registry: &Registry, found: &Inventory) -> serde_json::Value {
     json!({
-        "role": k.role, "id": k.id, "name": k.name, "family": k.family, "packs": k.packs, "licence": k.licence,
+        "role": k.task, "id": k.id, "name": k.name, "family": k.family, "packs": k.packs, "licence": k.licence,
         "megabytes": k.megabytes, "source": k.source, "export": k.export, "looked_for": place(k, registry),
         "installed": of_entry(k, found).is_some(),
     })
@@ -205,11 +206,11 @@ fn installed_json(m: &Installed) -> serde_json::Value {
     let graph = |g: &crate::infer::graph::GraphFile| {
         json!({
             "part": g.binding.part, "file": g.path, "parameters": g.parameters, "bytes": g.bytes(), "opset": g.opset,
-            "sha256": g.pinned.iter().map(|(file, hash)| json!({ "file": file, "pinned": hash })).collect::<Vec<_>>(),
+            "sha256": g.pinned.iter().map(|f| json!({ "file": f.path, "pinned": f.sha256 })).collect::<Vec<_>>(),
         })
     };
     json!({
-        "name": m.name, "family": m.family, "duties": m.duties, "folder": m.folder, "untrained": m.untrained(), "unused": m.unused,
+        "name": m.name, "family": m.family, "duties": m.tasks, "folder": m.folder, "untrained": m.untrained(), "unused": m.unused,
         "graphs": m.graphs.values().map(graph).collect::<Vec<_>>(),
     })
 }

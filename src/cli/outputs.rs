@@ -2,19 +2,19 @@
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// Keeps track of what was written; dropped without [`Outputs::keep`], it removes those files and the folders it made.
-pub struct Outputs {
+/// Keeps track of what was written; dropped without [`WrittenFiles::keep`], it removes those files and the folders it made.
+pub struct WrittenFiles {
     folder: PathBuf,
     files: Vec<PathBuf>,
     folders: Vec<PathBuf>,
     kept: bool,
 }
 
-impl Outputs {
+impl WrittenFiles {
     /// Opens a folder for writing, creating it where needed. A place that cannot be written is bad input.
-    pub fn open(folder: &Path) -> Result<Outputs> {
+    pub fn open(folder: &Path) -> Result<WrittenFiles> {
         let mut outputs =
-            Outputs { folder: folder.to_path_buf(), files: vec![], folders: vec![], kept: false };
+            WrittenFiles { folder: folder.to_path_buf(), files: vec![], folders: vec![], kept: false };
         outputs.make(folder).map_err(|e| {
             Error::input(format!("{}: cannot write there ({e}); choose another --out", folder.display()))
         })?;
@@ -46,7 +46,7 @@ impl Outputs {
     }
 }
 
-impl Drop for Outputs {
+impl Drop for WrittenFiles {
     fn drop(&mut self) {
         if self.kept {
             return;
@@ -69,17 +69,17 @@ mod tests {
     fn all_or_nothing() {
         let base = tempfile::tempdir().unwrap();
         let out = base.path().join("a/b");
-        let mut o = Outputs::open(&out).unwrap();
+        let mut o = WrittenFiles::open(&out).unwrap();
         std::fs::write(o.file("x/y.png").unwrap(), "1").unwrap();
         drop(o);
         assert!(!base.path().join("a").exists());
-        let mut o = Outputs::open(&out).unwrap();
+        let mut o = WrittenFiles::open(&out).unwrap();
         std::fs::write(o.file("y.png").unwrap(), "1").unwrap();
         assert_eq!(o.keep(), [out.join("y.png")]);
-        let mut o = Outputs::open(&out).unwrap();
+        let mut o = WrittenFiles::open(&out).unwrap();
         std::fs::write(o.file("z.png").unwrap(), "1").unwrap();
         drop(o);
         assert!(out.join("y.png").exists() && !out.join("z.png").exists());
-        assert_eq!(Outputs::open(&out.join("y.png/deeper")).err().unwrap().exit_code(), 2);
+        assert_eq!(WrittenFiles::open(&out.join("y.png/deeper")).err().unwrap().exit_code(), 2);
     }
 }

@@ -1,4 +1,4 @@
-//! What arguments that several commands take mean. No work happens here.
+//! Plans from the arguments that several commands share. No work happens here.
 use super::args::PresetArg;
 use crate::photo::SMALLEST_SIDE;
 use crate::{Error, Result};

@@ -27,7 +27,7 @@ fn as_json() -> bool {
 }
 
 /// Where the commands of this process report to.
-pub fn here() -> Box<dyn Progress> {
+pub fn reporter() -> Box<dyn Progress> {
     if as_json() { Box::new(JsonLines::default()) } else { Box::new(Terminal::new()) }
 }
 
@@ -37,14 +37,14 @@ pub fn stopped() -> bool {
 }
 
 /// The error that ends the process.
-pub fn failed(message: &str, exit_code: u8) {
+pub fn print_error(message: &str, exit_code: u8) {
     match as_json() {
         true => write_event("error", json!({ "message": message, "exit_code": exit_code })),
         false => eprintln!("splatvk: {message}"),
     }
 }
 
-fn warned(message: &str) {
+fn print_warning(message: &str) {
     match as_json() {
         true => write_event("warning", json!({ "message": message })),
         false => eprintln!("warning: {message}"),
@@ -55,7 +55,7 @@ fn warned(message: &str) {
 fn write_event(event: &str, mut fields: Value) {
     fields["event"] = event.into();
     fields["time"] = ((BEGAN.elapsed().as_secs_f64() * 1e3).round() / 1e3).into();
-    // Nobody is left to tell when standard error is closed.
+    // There is nothing to do when standard error is closed.
     let _ = writeln!(std::io::stderr().lock(), "{fields}");
 }
 
@@ -93,7 +93,7 @@ impl Progress for JsonLines {
         }
     }
     fn warn(&self, message: &str) {
-        warned(message);
+        print_warning(message);
     }
     fn inform(&self, message: &str) {
         write_event("message", json!({ "message": message }));
@@ -101,7 +101,7 @@ impl Progress for JsonLines {
     fn cancelled(&self) -> bool {
         stopped()
     }
-    fn beside(&self) -> Box<dyn Progress + '_> {
+    fn second_lane(&self) -> Box<dyn Progress + '_> {
         Box::new(JsonLines::default())
     }
 }
@@ -118,7 +118,7 @@ pub fn stop_on_signal() {
         }
     });
     if let Err(error) = outcome {
-        warned(&format!("Ctrl-C cannot be caught: {error}"));
+        print_warning(&format!("Ctrl-C cannot be caught: {error}"));
     }
 }
 
@@ -183,7 +183,7 @@ impl Progress for Terminal {
     fn cancelled(&self) -> bool {
         stopped()
     }
-    fn beside(&self) -> Box<dyn Progress + '_> {
+    fn second_lane(&self) -> Box<dyn Progress + '_> {
         Box::new(Terminal { bars: self.bars.clone(), current: Mutex::default() })
     }
 }

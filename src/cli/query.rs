@@ -1,6 +1,6 @@
 //! `splatvk query`
 use super::args::QueryArgs;
-use super::outputs::Outputs;
+use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
 use super::progress;
 use super::views;
@@ -22,14 +22,14 @@ const AT_ONCE: usize = 16;
 
 pub fn query(args: &QueryArgs) -> Result<()> {
     let mut scene = scene_dir::load(&args.scene)?;
-    let mute = || {
+    let no_language = || {
         Error::input(format!(
             "{}: the scene has no language; make one with splatvk run",
             args.scene.display()
         ))
     };
     if scene.language.is_none() {
-        return Err(mute());
+        return Err(no_language());
     }
     let cameras = match &args.cameras {
         Some(file) => cameras::read(file)?,
@@ -50,23 +50,23 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     }
     let registry = args.device.registry()?;
     let encoder = encoder::of_scene(&scene, registry)?;
-    let mut out = Outputs::open(&args.out)?;
+    let mut out = WrittenFiles::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
-    let field = scene.language.take().ok_or_else(mute)?;
+    let field = scene.language.take().ok_or_else(no_language)?;
     let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
-    let progress = progress::here();
+    let progress = progress::reporter();
     progress.begin("query", cameras.len() as u64);
     let mut views: Vec<Vec<Value>> = vec![Vec::new(); args.texts.len()];
     let mut latency = vec![0.0; args.texts.len()];
     for (part, (cameras, stems)) in cameras.chunks(AT_ONCE).zip(stems.chunks(AT_ONCE)).enumerate() {
         progress.check()?;
-        ready.look(cameras)?;
+        ready.set_views(cameras)?;
         for (q, text) in args.texts.iter().enumerate() {
             let clock = Instant::now();
             let answers = ready.ask(text, &QueryOptions::default())?;
             latency[q] += 1e3 * clock.elapsed().as_secs_f64();
             for ((frame, stem), answer) in ready.frames().iter().zip(stems).zip(&answers.views) {
-                write(&mut out, stem, &folders[q], &frame.frame.rgb, answer)?;
+                write(&mut out, stem, &folders[q], &frame.rendered.rgb, answer)?;
                 views[q].push(to_json(stem, &folders[q], answer));
             }
         }
@@ -96,7 +96,13 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     if args.device.json { print_json(&report) } else { print(&table(&args.texts, &views, &latency, args)) }
 }
 
-fn write(out: &mut Outputs, stem: &str, folder: &str, picture: &RgbImage, a: &QueryResult) -> Result<()> {
+fn write(
+    out: &mut WrittenFiles,
+    stem: &str,
+    folder: &str,
+    picture: &RgbImage,
+    a: &QueryResult,
+) -> Result<()> {
     let name = |kind: &str| format!("{folder}/{stem}_{kind}");
     let heat = colour::heat_image(picture, &a.relevancy, Some(&a.mask));
     picture::write_png(&out.file(&name("heat.png"))?, &heat)?;

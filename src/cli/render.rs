@@ -1,6 +1,6 @@
 //! `splatvk render`
 use super::args::{Channel, ImageFormat, RenderArgs};
-use super::outputs::Outputs;
+use super::outputs::WrittenFiles;
 use super::print::listing;
 use super::progress;
 use super::views;
@@ -26,10 +26,10 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     }
     let nothing = LanguageField::default();
     let field = if wants_language { scene.language.as_ref().unwrap_or(&nothing) } else { &nothing };
-    let mut out = Outputs::open(&args.out)?;
+    let mut out = WrittenFiles::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
-    let progress = progress::here();
+    let progress = progress::reporter();
     progress.begin("render", cameras.len() as u64);
     for (i, (camera, stem)) in cameras.iter().zip(&stems).enumerate() {
         progress.check()?;
@@ -65,19 +65,19 @@ fn levels(field: &LanguageField) -> Vec<(&'static str, usize, usize, usize)> {
 }
 
 fn part(view: &DecodedFrame, first: usize, d: usize) -> Vec<f32> {
-    let pixels = view.frame.features.chunks_exact(view.frame.feature_dim.max(1));
+    let pixels = view.rendered.features.chunks_exact(view.rendered.feature_dim.max(1));
     pixels.flat_map(|f| f[first..first + d].iter().copied()).collect()
 }
 
 /// Previews: exact values are in the EXR and npy files.
 fn png(
-    out: &mut Outputs,
+    out: &mut WrittenFiles,
     stem: &str,
     channels: &[Channel],
     view: &DecodedFrame,
     field: &LanguageField,
 ) -> Result<()> {
-    let frame = &view.frame;
+    let frame = &view.rendered;
     for channel in channels {
         match channel {
             Channel::Rgb => picture::write_png(&out.file(&format!("{stem}.png"))?, &frame.rgb)?,
@@ -120,8 +120,8 @@ fn false_colour(features: &[f32], d: usize, like: &Plane<f32>) -> RgbImage {
     }
 }
 
-fn exr(out: &mut Outputs, stem: &str, channels: &[Channel], view: &DecodedFrame) -> Result<()> {
-    let frame = &view.frame;
+fn exr(out: &mut WrittenFiles, stem: &str, channels: &[Channel], view: &DecodedFrame) -> Result<()> {
+    let frame = &view.rendered;
     let has = |c: Channel| channels.contains(&c);
     // OpenEXR holds linear light; what programs that read it expect.
     let linear = has(Channel::Rgb)
@@ -137,13 +137,13 @@ fn exr(out: &mut Outputs, stem: &str, channels: &[Channel], view: &DecodedFrame)
 }
 
 fn arrays(
-    out: &mut Outputs,
+    out: &mut WrittenFiles,
     stem: &str,
     channels: &[Channel],
     view: &DecodedFrame,
     field: &LanguageField,
 ) -> Result<()> {
-    let frame = &view.frame;
+    let frame = &view.rendered;
     let size = (frame.rgb.width, frame.rgb.height);
     for channel in channels {
         match channel {

@@ -7,7 +7,7 @@ use crate::infer::installed::{Inventory, inventory};
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;
 use crate::run::method::METHODS;
-use crate::run::sources::{self, Features, Geometry, Masks, Matches, choose};
+use crate::run::sources::{self, FeatureSources, GeometrySources, MaskSources, MatchSources, choose};
 use crate::run::{Method, RunPlan};
 use crate::{Error, Result};
 use clap::Args;
@@ -29,14 +29,14 @@ pub struct RunArgs {
     /// How the scene is made
     #[command(flatten)]
     pub making: MakingArgs,
-    /// A source of the table
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<Geometry>())]
+    /// Source of cameras, depth and points
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<GeometrySources>())]
     pub init: String,
-    /// A source of the table
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<Matches>())]
+    /// Source of dense matches
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<MatchSources>())]
     pub matcher: String,
-    /// A source of the table
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<Masks>())]
+    /// Source of masks
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<MaskSources>())]
     pub masks: String,
     /// Points along each side of a photo at which a mask network is asked
     #[arg(long, default_value_t = 32, value_name = "N")]
@@ -44,8 +44,8 @@ pub struct RunArgs {
     /// Do not ask the mask network about four overlapping crops as well: five times faster, misses small things
     #[arg(long)]
     pub no_mask_crops: bool,
-    /// A source of the table
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<Features>())]
+    /// Source of features
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<FeatureSources>())]
     pub features: String,
     /// Ask the finished scene; may be repeated
     #[arg(long = "query", value_name = "TEXT")]
@@ -86,7 +86,7 @@ fn methods() -> PossibleValuesParser {
 pub fn run(args: &RunArgs) -> Result<()> {
     let installed = inventory(&args.device.registry()?);
     let plan = plan(args, &installed)?;
-    let outcome = crate::run::run(&plan, progress::here().as_ref())?;
+    let outcome = crate::run::run(&plan, progress::reporter().as_ref())?;
     if args.device.json {
         let record = serde_json::to_value(crate::run::run_record(&outcome));
         return print_json(&record.map_err(|e| Error::work(format!("run record: {e}")))?);
@@ -129,11 +129,11 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         resume: args.making.resume,
         checkpoint_seconds: args.making.checkpoint_seconds,
         preset: args.making.preset.map(plan::preset),
-        init: choose::<Geometry>(&args.init, installed)?,
-        matcher: choose::<Matches>(&args.matcher, installed)?,
-        masks: choose::<Masks>(&args.masks, installed)?,
+        init: choose::<GeometrySources>(&args.init, installed)?,
+        matcher: choose::<MatchSources>(&args.matcher, installed)?,
+        masks: choose::<MaskSources>(&args.masks, installed)?,
         sam: SamOptions { points: args.mask_points, crops: !args.no_mask_crops, ..SamOptions::default() },
-        features: choose::<Features>(&args.features, installed)?,
+        features: choose::<FeatureSources>(&args.features, installed)?,
         queries: args.queries.clone(),
         seed: args.seed,
         iterations: args.iterations,
@@ -164,7 +164,7 @@ fn default_out(inputs: &[PathBuf]) -> PathBuf {
 mod tests {
     use super::*;
     use crate::cli::args::{Cli, Command};
-    use crate::infer::installed::{Duty, Installed};
+    use crate::infer::installed::{Installed, Task};
     use crate::run::sources::SourceChoice;
     use clap::Parser;
 
@@ -196,20 +196,20 @@ mod tests {
 
     #[test]
     fn auto_takes_the_most_preferred_network_there_is() {
-        let model = |name: &str, duty| Installed {
+        let model = |name: &str, task| Installed {
             name: name.to_owned(),
             family: String::new(),
-            duties: vec![duty],
+            tasks: vec![task],
             graphs: Default::default(),
             folder: PathBuf::new(),
             unused: Vec::new(),
         };
         let models = [
-            ("sam_vit_b", Duty::Masks),
-            ("sam_vit_h", Duty::Masks),
-            ("mine", Duty::Features),
-            ("da3", Duty::Geometry),
-            ("mast3r_512", Duty::Geometry),
+            ("sam_vit_b", Task::Masks),
+            ("sam_vit_h", Task::Masks),
+            ("mine", Task::Features),
+            ("da3", Task::Geometry),
+            ("mast3r_512", Task::Geometry),
         ];
         let installed = Inventory { models: models.map(|(n, d)| model(n, d)).into(), broken: Vec::new() };
         let plan = plan_with(&[], &installed).unwrap();

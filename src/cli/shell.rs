@@ -1,6 +1,6 @@
 //! `splatvk completions`, `splatvk manuals`: what tools/install puts beside the program.
 use super::args::{Cli, CompletionsArgs, ManualsArgs};
-use super::outputs::Outputs;
+use super::outputs::WrittenFiles;
 use super::print::print;
 use crate::{Error, Result};
 use clap::CommandFactory;
@@ -12,7 +12,7 @@ pub fn completions(args: &CompletionsArgs) -> Result<()> {
 }
 
 pub fn manuals(args: &ManualsArgs) -> Result<()> {
-    let outputs = Outputs::open(&args.out)?;
+    let outputs = WrittenFiles::open(&args.out)?;
     clap_mangen::generate_to(Cli::command(), &args.out).map_err(Error::io(&args.out))?;
     outputs.keep();
     Ok(())

@@ -25,7 +25,7 @@ pub fn train(args: &TrainArgs) -> Result<()> {
         models: args.device.models.clone(),
         provider: args.device.provider.clone(),
     };
-    let trained = run(&plan, progress::here().as_ref())?;
+    let trained = run(&plan, progress::reporter().as_ref())?;
     if args.device.json {
         return print_json(&json!({ "out": plan.out, "run": trained.record }));
     }

@@ -6,7 +6,7 @@ use crate::format::scene_dir::{self, Scene};
 use crate::gpu::Device;
 use crate::photo;
 use crate::query::QueryOptions;
-use crate::report::viewer::{self, Names, SCENE_PATH, Scene3d};
+use crate::report::viewer::{self, CodeNames, SCENE_PATH, Scene3d};
 use crate::run::ask::QueryScene;
 use crate::run::encoder;
 use crate::scene::RgbImage;
@@ -18,11 +18,11 @@ use std::time::{Duration, Instant};
 use tiny_http::{Header, Method, Request, Response, Server};
 
 /// How soon Ctrl-C is noticed between requests.
-const PATIENCE: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Longest request body: a question is a few words.
-const MOST_BYTES: u64 = 4096;
+const MAX_BYTES: u64 = 4096;
 /// What the page may do: run what it carries, ask its own server, and nothing else.
-const POLICY: &str = "default-src 'none'; script-src 'unsafe-inline' data:; worker-src data:; style-src 'unsafe-inline'; \
+const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'unsafe-inline' data:; worker-src data:; style-src 'unsafe-inline'; \
                       img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
 pub fn view(args: &ViewArgs) -> Result<()> {
@@ -32,16 +32,16 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     }
     // Bound first: a port that is taken is said before the scene is prepared.
     let server = listen(args.port)?;
-    let (mut ready, mute) = match questions(&scene, args) {
+    let (mut ready, no_questions) = match questions(&scene, args) {
         Ok(ready) => (Some(ready), None),
         Err(error) => (None, Some(error.to_string())),
     };
-    if let Some(reason) = mute.as_deref().filter(|_| scene.language.is_some()) {
-        progress::here().warn(&format!("no questions: {reason}"));
+    if let Some(reason) = no_questions.as_deref().filter(|_| scene.language.is_some()) {
+        progress::reporter().warn(&format!("no questions: {reason}"));
     }
-    let names = ready.as_mut().map_or(Ok(Names::new()), QueryScene::names)?;
+    let names = ready.as_mut().map_or(Ok(CodeNames::new()), QueryScene::names)?;
     let content = Content {
-        page: page(&scene, args, &names, mute.as_deref())?,
+        page: page(&scene, args, &names, no_questions.as_deref())?,
         splats: viewer::pack(&scene.splats, scene.language.as_ref(), usize::MAX)?.bytes,
         port: port_of(&server)?,
     };
@@ -52,7 +52,8 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         print(&format!("{} is at {address}  (Ctrl-C ends)\n", args.scene.display()))?;
     }
     while !progress::stopped() {
-        let request = server.recv_timeout(PATIENCE).map_err(Error::io("the connection to the browser"))?;
+        let request =
+            server.recv_timeout(POLL_INTERVAL).map_err(Error::io("the connection to the browser"))?;
         if let Some(request) = request {
             // A browser that closed the page does not wait for the answer.
             let _ = content.serve(request, ready.as_mut());
@@ -79,11 +80,11 @@ fn questions(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
     let encoder = encoder::of_scene(scene, args.device.registry()?)?;
     let device = Device::open(args.device.device.as_deref())?;
     let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
-    ready.look(&scene.cameras)?;
+    ready.set_views(&scene.cameras)?;
     Ok(ready)
 }
 
-fn page(scene: &Scene, args: &ViewArgs, names: &Names, mute: Option<&str>) -> Result<String> {
+fn page(scene: &Scene, args: &ViewArgs, names: &CodeNames, no_questions: Option<&str>) -> Result<String> {
     // Photos are decoration here: a scene whose pictures were deleted still shows.
     let load =
         |c: &crate::scene::Camera| photo::load_at(&scene.path.join("cameras").join(&c.name), usize::MAX).ok();
@@ -100,7 +101,7 @@ fn page(scene: &Scene, args: &ViewArgs, names: &Names, mute: Option<&str>) -> Re
         names,
         answers: Vec::new(),
     };
-    view.served(mute)
+    view.served(no_questions)
 }
 
 /// What is sent.
@@ -122,7 +123,7 @@ impl Content {
         for (name, value) in [
             ("Content-Type", kind),
             ("Cache-Control", "no-store"),
-            ("Content-Security-Policy", POLICY),
+            ("Content-Security-Policy", CONTENT_SECURITY_POLICY),
             ("X-Content-Type-Options", "nosniff"),
         ] {
             if let Ok(header) = Header::from_bytes(name, value) {
@@ -172,7 +173,7 @@ impl Content {
 
 fn question(request: &mut Request) -> Option<String> {
     let mut body = String::new();
-    request.as_reader().take(MOST_BYTES).read_to_string(&mut body).ok()?;
+    request.as_reader().take(MAX_BYTES).read_to_string(&mut body).ok()?;
     let body: Value = serde_json::from_str(&body).ok()?;
     let text = body["text"].as_str()?.trim();
     (!text.is_empty()).then(|| text.to_owned())

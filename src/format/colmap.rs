@@ -246,7 +246,7 @@ fn binary_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
 }
 
 /// Most points that `points3D.txt` gets: other tools only start from them, and text takes 70 bytes a point.
-const MOST_POINTS: usize = 100_000;
+const MAX_POINTS: usize = 100_000;
 
 /// Writes a text model with PINHOLE cameras. Rust prints the shortest digits that read back exactly.
 pub fn write(folder: &Path, cameras: &[Camera], points: Option<&PointCloud>) -> Result<()> {
@@ -286,7 +286,7 @@ fn write_text(
     }
     let mut cloud = String::from("# POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
     if let Some(p) = points {
-        let stride = p.len().div_ceil(MOST_POINTS).max(1);
+        let stride = p.len().div_ceil(MAX_POINTS).max(1);
         for (id, i) in (0..p.len()).step_by(stride).enumerate() {
             let ([x, y, z], [r, g, b]) = (p.positions[i], p.colours[i].map(super::to_byte));
             let _ = writeln!(cloud, "{} {x} {y} {z} {r} {g} {b} 0", id + 1);

@@ -34,7 +34,7 @@ pub fn create_folder(path: &Path) -> Result<()> {
 }
 
 /// Writes a file beside its target and renames it: one that was there stays until the new one is whole.
-pub fn whole(out: &Path, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+pub fn write_whole_file(out: &Path, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
     let mut name = out.file_name().unwrap_or_default().to_os_string();
     name.push(format!(".partial-{}", std::process::id()));
     let partial = out.with_file_name(name);

@@ -6,7 +6,7 @@ mod ply_table;
 pub mod splat;
 pub mod spz;
 
-use super::{side_file, whole};
+use super::{side_file, write_whole_file};
 use crate::scene::{LanguageField, Splats};
 use crate::{Error, Result};
 use std::path::Path;
@@ -123,14 +123,14 @@ pub fn write_as(
     format: &SplatFormat,
 ) -> Result<()> {
     let with_codes = language.filter(|l| l.levels.iter().any(|l| !l.codebook.is_empty()));
-    whole(path, |partial| {
+    write_whole_file(path, |partial| {
         let order = (format.write)(partial, splats)?;
-        let beside = side_file::path(path);
+        let side = side_file::path(path);
         match with_codes {
             // Language first: a file with the wrong language beside it would be worse than one that is missing.
-            Some(field) => whole(&beside, |p| side_file::write(p, field, splats.len(), &order)),
+            Some(field) => write_whole_file(&side, |p| side_file::write(p, field, splats.len(), &order)),
             // So would be that of an older file.
-            None if beside.is_file() => std::fs::remove_file(&beside).map_err(Error::io(&beside)),
+            None if side.is_file() => std::fs::remove_file(&side).map_err(Error::io(&side)),
             None => Ok(()),
         }
     })

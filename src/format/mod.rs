@@ -3,15 +3,15 @@ pub mod cameras;
 pub mod colmap;
 mod common;
 pub mod gaussians;
-mod moved;
 pub mod npy;
 pub mod picture;
 pub mod scene_dir;
 pub mod side_file;
+mod transform;
 pub mod transforms;
 mod workspace;
 
-pub use common::{SH_C0, create_folder, to_byte, whole, write_json};
+pub use common::{SH_C0, create_folder, to_byte, write_json, write_whole_file};
 pub(crate) use common::{logit, sigmoid};
 pub use gaussians::{gltf, ply, ply_packed, splat, spz};
 pub use workspace::{Workspace, remove_unfinished};

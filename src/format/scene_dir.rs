@@ -3,7 +3,7 @@ use super::npy::{self, NpyArray};
 use super::workspace::MANIFEST;
 use super::{cameras, colmap, create_folder, gaussians, picture, ply, transforms};
 use crate::photo::Photo;
-use crate::scene::{Camera, Codebook, LEVEL_NAMES, LanguageField, LevelField, PointCloud, Splats};
+use crate::scene::{Camera, Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId, PointCloud, Splats};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -27,7 +27,7 @@ pub struct Scene {
     pub splats: Splats,
     /// Training cameras at working resolution; empty for a bare PLY.
     pub cameras: Vec<Camera>,
-    /// What it knows about words.
+    /// Codebooks and features; `None` without language.
     pub language: Option<LanguageField>,
 }
 
@@ -153,7 +153,7 @@ fn write_codebook(path: &Path, book: &Codebook, space: &str) -> Result<()> {
     let mut offsets = vec![0i32];
     let mut members = Vec::new();
     for list in &book.members {
-        members.extend(list.iter().flat_map(|(view, mask)| [*view as i32, *mask as i32]));
+        members.extend(list.iter().flat_map(|m| [m.view as i32, m.mask as i32]));
         offsets.push(members.len() as i32 / 2);
     }
     let count = members.len() / 2;
@@ -268,9 +268,13 @@ fn read_codebook(path: &Path) -> Result<Codebook> {
     };
     let (members, offsets) = (get("members")?.to_i32(), get("offsets")?.to_i32());
     let bounds = |w: &[i32]| members.get(w[0].max(0) as usize * 2..w[1].max(0) as usize * 2);
-    let members: Option<Vec<Vec<(u32, u32)>>> = offsets
+    let members: Option<Vec<Vec<MaskId>>> = offsets
         .windows(2)
-        .map(|w| Some(bounds(w)?.chunks_exact(2).map(|p| (p[0] as u32, p[1] as u32)).collect()))
+        .map(|w| {
+            Some(
+                bounds(w)?.chunks_exact(2).map(|p| MaskId { view: p[0] as u32, mask: p[1] as u32 }).collect(),
+            )
+        })
         .collect();
     let members = members.filter(|m| k == k2 && m.len() == k);
     let members = members.ok_or_else(|| {

@@ -28,7 +28,7 @@ struct Intrinsics {
 }
 
 #[derive(Debug, Deserialize)]
-struct Frame {
+struct TransformsFrame {
     #[serde(default)]
     file_path: String,
     transform_matrix: Vec<Vec<f64>>,
@@ -40,7 +40,7 @@ struct Frame {
 struct File {
     #[serde(flatten)]
     shared: Intrinsics,
-    frames: Vec<Frame>,
+    frames: Vec<TransformsFrame>,
 }
 
 /// Cameras of a parsed file; `folder` is where its image paths start, for files that do not state the image size.
@@ -49,7 +49,12 @@ pub(super) fn parse(value: Value, folder: &Path) -> Result<Vec<Camera>, String> 
     file.frames.iter().enumerate().map(|(i, f)| camera(&file.shared, f, i, folder)).collect()
 }
 
-fn camera(shared: &Intrinsics, frame: &Frame, index: usize, folder: &Path) -> Result<Camera, String> {
+fn camera(
+    shared: &Intrinsics,
+    frame: &TransformsFrame,
+    index: usize,
+    folder: &Path,
+) -> Result<Camera, String> {
     let name = if frame.file_path.is_empty() { format!("{index:05}") } else { frame.file_path.clone() };
     let own = &frame.own;
     let model = own.camera_model.as_ref().or(shared.camera_model.as_ref());

@@ -26,7 +26,7 @@ pub struct Workspace {
 pub(super) const MANIFEST: &str = "scene.json";
 
 impl Workspace {
-    /// Claims `out`: it must not exist, be an empty folder, or, with `force`, hold a scene. Nothing at `out` changes
+    /// Reserves `out`: it must not exist, be an empty folder, or, with `force`, hold a scene. Nothing at `out` changes
     /// before [`Workspace::commit`].
     pub fn create(out: &Path, force: bool) -> Result<Workspace> {
         let bad = |what: &str| Error::input(format!("{}: {what}", out.display()));

@@ -36,7 +36,9 @@ impl Store {
 
     /// What an earlier process has left; nothing if it is damaged or another driver's.
     pub fn read(&self) -> Vec<u8> {
-        files::read_sealed(&self.path).filter(|data| data.starts_with(&self.header)).unwrap_or_default()
+        files::read_with_checksum(&self.path)
+            .filter(|data| data.starts_with(&self.header))
+            .unwrap_or_default()
     }
 
     /// Keeps what the driver gave, if it is more than a header and not what is there already. A folder that cannot be
@@ -45,7 +47,7 @@ impl Store {
         if data.len() > HEADER
             && data.starts_with(&self.header)
             && self.read() != data
-            && files::write_sealed(&self.path, data).is_ok()
+            && files::write_with_checksum(&self.path, data).is_ok()
         {
             files::prune(&self.path, EXTENSION, CAPACITY);
         }
@@ -83,7 +85,7 @@ mod tests {
         let foreign = [[9; HEADER].as_slice(), b"compiled"].concat();
         newer.write(&foreign);
         assert!(!newer.path.exists());
-        files::write_sealed(&newer.path, &foreign).unwrap();
+        files::write_with_checksum(&newer.path, &foreign).unwrap();
         assert!(newer.read().is_empty());
         let mut bytes = std::fs::read(&own.path).unwrap();
         let middle = bytes.len() - 3;

@@ -1,13 +1,13 @@
 //! Adapters: how one file's tensor names, layouts and value ranges map to the roles of a [`Contract`]. Adapters are data, TOML
 //! files: the built-in ones cover the public exports, a user's own lies beside the model (`adapter.toml` in its folder, or
-//! `NAME.toml` beside `NAME.onnx`) and needs to say only what differs from the built-in one of the same family.
+//! `NAME.toml` beside `NAME.onnx`) and needs to state only what differs from the built-in one of the same family.
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::Deserialize;
 
 use super::contract::{Contract, Part, Slot, unify};
-use super::onnx::{Dim, Header, Kind, Port, listed};
+use super::onnx::{Dim, ElementType, Header, Port, listed};
 use super::runtime::Tensor;
 use crate::{Error, Result};
 
@@ -139,7 +139,7 @@ impl Names {
     }
 }
 
-/// What an adapter says about one graph.
+/// One graph of an adapter.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct GraphSpec {
@@ -181,7 +181,7 @@ pub struct Adapter {
 
 impl Adapter {
     /// The adapter of a model file: `NAME.toml` beside it, else `adapter.toml` in its folder, else none of its own.
-    pub fn beside(model: &Path) -> Result<Adapter> {
+    pub fn of_file(model: &Path) -> Result<Adapter> {
         for path in [model.with_extension("toml"), model.with_file_name("adapter.toml")] {
             if path.is_file() {
                 let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
@@ -276,7 +276,7 @@ fn unknown_role(contract: &Contract, role: &str) -> String {
 pub struct Bound {
     /// Its name in the graph.
     pub name: String,
-    /// Its layout, as far as the file tells.
+    /// Its layout, as far as the file states it.
     pub layout: Option<&'static str>,
     /// Its axes.
     pub dims: Option<Vec<Dim>>,
@@ -375,9 +375,9 @@ impl GraphSpec {
             return Err(format!("no {side} for {} [{}]", slot.role, slot.shape));
         };
         let kind_fits = match port.kind {
-            Kind::Float => true,
-            Kind::Integer => slot.integer,
-            Kind::Other => false,
+            ElementType::Float => true,
+            ElementType::Integer => slot.integer,
+            ElementType::Other => false,
         };
         if !kind_fits {
             return Err(format!("{side} {port} for {} has an element type that it cannot have", slot.role));

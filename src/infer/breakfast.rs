@@ -6,7 +6,7 @@ use glam::{DMat3, DVec3};
 use crate::format::npy;
 use crate::scene::{Camera, Plane, Pose, RgbImage};
 
-pub struct View {
+pub struct TestView {
     pub image: RgbImage,
     /// Object index per pixel.
     pub masks: Plane<i32>,
@@ -32,18 +32,18 @@ pub fn phrases() -> Vec<(i32, String)> {
     found
 }
 
-pub fn train_views() -> Vec<View> {
+pub fn train_views() -> Vec<TestView> {
     views("train")
 }
 
 /// The views of a split: "train" or "test".
-pub fn views(split: &str) -> Vec<View> {
+pub fn views(split: &str) -> Vec<TestView> {
     let truth = ground_truth();
     let frames = truth["frames"].as_array().unwrap();
     frames.iter().filter(|f| f["split"] == split).map(view).collect()
 }
 
-fn view(frame: &serde_json::Value) -> View {
+fn view(frame: &serde_json::Value) -> TestView {
     let file = frame["file"].as_str().unwrap();
     let stem = PathBuf::from(file).file_stem().unwrap().to_str().unwrap().to_string();
     let photo = image::open(folder().join(file)).unwrap().to_rgb8();
@@ -56,7 +56,7 @@ fn view(frame: &serde_json::Value) -> View {
     let column = |c: usize| DVec3::new(matrix(0, c), matrix(1, c), matrix(2, c));
     let pose = Pose { rotation: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) };
     let (fx, fy, cx, cy) = (number("fx"), number("fy"), number("cx"), number("cy"));
-    View {
+    TestView {
         image: RgbImage { width, height, data },
         masks: Plane { width, height, data: masks.pixels().map(|p| p.0[0] as i32).collect() },
         depth: Plane { width, height, data: depth },

@@ -1,4 +1,4 @@
-//! What networks said about a photo, kept by the content of the photo and of the model: a second run asks nobody.
+//! Outputs of networks on disk, by the content of the photo and of the model: a second run computes none of them again.
 //!
 //! The folder is a cache: anything odd about a file, and it is computed and written again. The least recently used files go
 //! when it grows beyond its capacity.
@@ -18,27 +18,27 @@ const CAPACITY: u64 = 4 << 30;
 const EXTENSION: &str = "f32";
 
 /// Identifies a result by everything that it depends on.
-pub struct Key {
+pub struct OutputKey {
     kind: &'static str,
     digest: Sha256,
 }
 
-impl Key {
+impl OutputKey {
     /// A kind of result; the word is part of the file name.
-    pub fn new(kind: &'static str) -> Key {
+    pub fn new(kind: &'static str) -> OutputKey {
         // Another version may prepare photos otherwise.
-        Key { kind, digest: Sha256::new() }.text(kind).text(env!("CARGO_PKG_VERSION"))
+        OutputKey { kind, digest: Sha256::new() }.text(kind).text(env!("CARGO_PKG_VERSION"))
     }
 
     /// Depends on a text.
-    pub fn text(mut self, text: &str) -> Key {
+    pub fn text(mut self, text: &str) -> OutputKey {
         self.digest.update((text.len() as u64).to_le_bytes());
         self.digest.update(text);
         self
     }
 
     /// Depends on values.
-    pub fn values<T: bytemuck::NoUninit>(mut self, values: &[T]) -> Key {
+    pub fn values<T: bytemuck::NoUninit>(mut self, values: &[T]) -> OutputKey {
         self.digest.update((values.len() as u64).to_le_bytes());
         self.digest.update(bytemuck::cast_slice::<T, u8>(values));
         self
@@ -68,14 +68,14 @@ pub fn files() -> Vec<(PathBuf, u64)> {
 }
 
 /// `compute`, or what it gave the last time with the same key.
-pub(super) fn remember(key: Key, compute: impl FnOnce() -> Result<Vec<f32>>) -> Result<Vec<f32>> {
+pub(super) fn remember(key: OutputKey, compute: impl FnOnce() -> Result<Vec<f32>>) -> Result<Vec<f32>> {
     let file = key.file();
-    if let Some(body) = files::read_sealed(&file).filter(|b| b.len() % 4 == 0) {
+    if let Some(body) = files::read_with_checksum(&file).filter(|b| b.len() % 4 == 0) {
         return Ok(bytemuck::pod_collect_to_vec(&body));
     }
     let values = compute()?;
     // Not being able to keep it costs time only.
-    if files::write_sealed(&file, bytemuck::cast_slice(&values)).is_ok() {
+    if files::write_with_checksum(&file, bytemuck::cast_slice(&values)).is_ok() {
         files::prune(&file, EXTENSION, CAPACITY);
     }
     Ok(values)
@@ -103,7 +103,7 @@ mod tests {
 
     #[test]
     fn a_damaged_file_is_computed_again() {
-        let key = || Key::new("test").text("damaged").values(&[std::process::id()]);
+        let key = || OutputKey::new("test").text("damaged").values(&[std::process::id()]);
         let file = key().file();
         let count = std::cell::Cell::new(0);
         let ask = || {
@@ -121,6 +121,9 @@ mod tests {
         assert_eq!(ask().unwrap(), [1.0, 2.0]);
         assert_eq!(count.get(), 2);
         std::fs::remove_file(&file).unwrap();
-        assert_ne!(Key::new("test").text("a").text("b").file(), Key::new("test").text("ab").text("").file());
+        assert_ne!(
+            OutputKey::new("test").text("a").text("b").file(),
+            OutputKey::new("test").text("ab").text("").file()
+        );
     }
 }

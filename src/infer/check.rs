@@ -4,12 +4,12 @@ use std::time::Instant;
 
 use super::clip::Clip;
 use super::graph::GraphFile;
-use super::installed::{Duty, Installed};
+use super::installed::{Installed, Task};
 use super::runtime::Input;
 use super::sam::{BATCH, MASKS, Sam};
 use super::{RegionEncoder, pairs, warp};
 use crate::format::npy::{self, NpyData};
-use crate::photo::{Frame, Photo};
+use crate::photo::{Photo, PlainBorder};
 use crate::progress::{Silent, peak_memory, reset_peak_memory};
 use crate::scene::{Affine, Plane, RgbImage};
 use crate::{Error, Result};
@@ -39,7 +39,7 @@ fn measured<T>(step: String, steps: &mut Vec<Measured>, work: impl FnOnce() -> R
     Ok(done)
 }
 
-/// Repeats the reference of every graph that has one, then the model's duty on two built-in pictures. An error names the
+/// Repeats the reference of every graph that has one, then the model's task on two built-in pictures. An error names the
 /// file and what it did wrong. For a model of an uncached registry ([`super::Registry::uncached`]): the steps are measured.
 pub fn check(model: &Installed) -> Result<Vec<Measured>> {
     let mut steps = Vec::new();
@@ -54,9 +54,9 @@ pub fn check(model: &Installed) -> Result<Vec<Measured>> {
         }
     }
     let photos = pictures();
-    for duty in &model.duties {
-        match duty {
-            Duty::Geometry => {
+    for task in &model.tasks {
+        match task {
+            Task::Geometry => {
                 // Networks that see all photos at once may ask for a certain number.
                 let count = model.graphs.values().find_map(|g| g.fixed("images", "N")).unwrap_or(2);
                 let some: Vec<Photo> = photos.iter().cycle().take(count).cloned().collect();
@@ -64,14 +64,14 @@ pub fn check(model: &Installed) -> Result<Vec<Measured>> {
                     pairs::pointmaps(model, &some, &Silent)
                 })?;
             }
-            Duty::Matcher => {
+            Task::Matcher => {
                 let step = "matches of a pair, both ways".to_string();
                 measured(step, &mut steps, || warp::warps(model, &photos, &Silent))?;
             }
-            Duty::Masks => masks(model, &photos[0].image, &mut steps)?,
-            Duty::Features => features(model, &photos[0].image, &mut steps)?,
+            Task::Masks => masks(model, &photos[0].image, &mut steps)?,
+            Task::Features => features(model, &photos[0].image, &mut steps)?,
             // Runs with the features.
-            Duty::Text => {}
+            Task::Text => {}
         }
     }
     Ok(steps)
@@ -185,7 +185,7 @@ fn pictures() -> Vec<Photo> {
             stem: format!("built-in {k}"),
             original_size: (width as u32, height as u32),
             to_working: Affine::IDENTITY,
-            frame: Frame::default(),
+            border: PlainBorder::default(),
             exif_focal: None,
             fine: None,
             straightened: None,

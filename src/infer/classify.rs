@@ -1,7 +1,7 @@
-//! What an image region shows: EfficientNet-Lite0 (Tan 2020) on the region cut out of its surroundings.
+//! Class probabilities of an image region: EfficientNet-Lite0 (Tan 2020) on the region cut out of its surroundings.
 use rayon::prelude::*;
 
-use super::registry::{Registry, Role};
+use super::registry::{PackFileKind, Registry};
 use super::runtime::{Input, Session};
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
@@ -32,7 +32,7 @@ pub(super) struct Extent {
 impl Classifier {
     /// Loads the network of the model pack.
     pub fn load(registry: &Registry) -> Result<Self> {
-        Ok(Classifier { session: registry.session(Role::Classifier)? })
+        Ok(Classifier { session: registry.session(PackFileKind::Classifier)? })
     }
 
     /// [count, 1000] class probabilities of the regions `0..count` of `labels`; a zero row for a region without pixels.

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use tokenizers::Tokenizer;
 
 use super::RegionEncoder;
-use super::cache::Key;
+use super::cache::OutputKey;
 use super::classify::{crop, extents};
 use super::contract::Part;
 use super::graph::{Graph, GraphFile};
@@ -57,7 +57,7 @@ impl Clip {
             (model.graphs.get_mut(&Part::DenseFeatures), text.fixed("embedding", "D"))
         {
             // A picture of fixed size is as long as it is wide or high: only the texts tell which axis holds the features.
-            dense.settle("features", "D", dim);
+            dense.fix_axis("features", "D", dim);
         }
         let (visual, axis) = match model.graph(Part::ImageTower) {
             Ok(tower) => (tower.clone(), "embedding"),
@@ -67,11 +67,12 @@ impl Clip {
         if let (Some(a), Some(b)) = widths
             && a != b
         {
-            return Err(strangers(&visual, &text, &format!("embeddings of {a} and {b} values")));
+            return Err(towers_differ(&visual, &text, &format!("embeddings of {a} and {b} values")));
         }
         let tokenizer = tokenizer(&model)?;
         // The space is the weights: features may be compared with texts only when both came from them.
-        let space = format!("{}:{}", model.family, Key::new("space").model(&visual)?.model(&text)?.short());
+        let space =
+            format!("{}:{}", model.family, OutputKey::new("space").model(&visual)?.model(&text)?.short());
         let mut clip = Clip { model, space, tokenizer, image: None, text: None, dim: 0 };
         clip.tokens_are_right(&text)?;
         clip.dim = match widths.0.or(widths.1) {
@@ -79,14 +80,14 @@ impl Clip {
             None => clip.embed_texts(&["a"])?.len(),
         };
         if !clip.model.untrained() {
-            clip.acquainted(&visual, &text)?;
+            clip.check_towers_match(&visual, &text)?;
         }
         Ok(clip)
     }
 
     /// Refuses towers of different checkpoints: plain red, green and blue squares must each be nearest to their own name.
-    /// Chance passes one pair of strangers in 512.
-    fn acquainted(&mut self, visual: &GraphFile, text: &GraphFile) -> Result<()> {
+    /// Chance passes one pair of unrelated towers in 512.
+    fn check_towers_match(&mut self, visual: &GraphFile, text: &GraphFile) -> Result<()> {
         const COLOURS: [(&str, [f32; 3]); 3] = [
             ("a red square", [0.9, 0.05, 0.05]),
             ("a green square", [0.05, 0.7, 0.1]),
@@ -94,7 +95,7 @@ impl Clip {
         ];
         const OTHERS: [&str; 5] =
             ["a dog", "a city street at night", "a page of text", "a person on a bicycle", "a plate of food"];
-        let key = Key::new("towers").model(visual)?.model(text)?;
+        let key = OutputKey::new("towers").model(visual)?.model(text)?;
         let seen = visual.compute.remember(key, || {
             let texts: Vec<&str> = COLOURS.iter().map(|c| c.0).chain(OTHERS).collect();
             let names = self.embed_texts(&texts)?;
@@ -111,7 +112,7 @@ impl Clip {
         if seen.len() == 24 && seen.chunks_exact(8).enumerate().all(own) {
             return Ok(());
         }
-        Err(strangers(visual, text, "a red, a green and a blue square are not nearest to their names"))
+        Err(towers_differ(visual, text, "a red, a green and a blue square are not nearest to their names"))
     }
 
     /// A tokenizer with CLIP's vocabulary must give CLIP's ids; another vocabulary is its model's own affair.
@@ -241,7 +242,7 @@ impl RegionEncoder for Clip {
     fn embed_regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
         let dense = self.model.graph(Part::ImageTower).is_err();
         let graph = self.model.graph(if dense { Part::DenseFeatures } else { Part::ImageTower })?;
-        let key = Key::new("features").model(graph)?.values(&image.data).values(&labels.data);
+        let key = OutputKey::new("features").model(graph)?.values(&image.data).values(&labels.data);
         let key = key.values(&[image.width as u64, count as u64]);
         let compute = graph.compute.clone();
         let mut rows = compute.remember(key, || {
@@ -280,7 +281,7 @@ impl RegionEncoder for Clip {
     }
 }
 
-fn strangers(visual: &GraphFile, text: &GraphFile, why: &str) -> Error {
+fn towers_differ(visual: &GraphFile, text: &GraphFile, why: &str) -> Error {
     Error::missing(format!(
         "{} and {} do not belong together ({why}); export both towers from one checkpoint",
         visual.path.display(),

@@ -1,4 +1,4 @@
-//! The eleven basic colour terms of English (Berlin & Kay 1969): which of them a patch shows, which of them a text says.
+//! The eleven basic colour terms of English (Berlin & Kay 1969): which of them a patch shows, which of them a text names.
 use std::sync::OnceLock;
 
 /// Terms that languages with eleven colour words share.
@@ -58,7 +58,7 @@ pub fn terms_near(rgb: [f32; 3]) -> &'static [f32; COUNT] {
     &table[(r * CELLS + g) * CELLS + b]
 }
 
-/// The terms in a text, evenly weighted; `None` if it says no colour.
+/// The terms in a text, evenly weighted; `None` if it names no colour.
 pub fn terms_in(text: &str) -> Option<[f32; COUNT]> {
     let text = text.to_lowercase();
     let words: Vec<&str> = text.split(|c: char| !c.is_alphanumeric()).collect();
@@ -78,7 +78,7 @@ pub fn nearest_term(towards: &[f32]) -> (&'static str, f32) {
 }
 
 /// Distribution over terms → direction: square roots (so that a dot product is a Bhattacharyya coefficient) less what
-/// all terms share, unit length. An even distribution says nothing and gives zero.
+/// all terms share, unit length. An even distribution gives zero.
 pub fn direction(distribution: &[f32; COUNT]) -> [f32; COUNT] {
     let roots = distribution.map(f32::sqrt);
     let mean = roots.iter().sum::<f32>() / COUNT as f32;

@@ -1,5 +1,5 @@
 //! How networks are computed.
-use super::cache::{self, Key};
+use super::cache::{self, OutputKey};
 use super::provider::{Provider, find};
 use crate::progress::Progress;
 use crate::{Error, Result};
@@ -50,7 +50,11 @@ impl Compute {
     }
 
     /// `compute`, or what it gave the last time with the same key.
-    pub(crate) fn remember(&self, key: Key, compute: impl FnOnce() -> Result<Vec<f32>>) -> Result<Vec<f32>> {
+    pub(crate) fn remember(
+        &self,
+        key: OutputKey,
+        compute: impl FnOnce() -> Result<Vec<f32>>,
+    ) -> Result<Vec<f32>> {
         if self.0.cached { cache::remember(key, compute) } else { compute() }
     }
 
@@ -62,14 +66,14 @@ impl Compute {
 
     /// The provider of new sessions, `None` for the CPU: found by computing a graph of one node on it. Asked for by name, one
     /// that does not answer is an error.
-    pub(super) fn chosen(&self) -> Result<Option<&'static Provider>> {
+    pub(super) fn selected(&self) -> Result<Option<&'static Provider>> {
         let found = || find(&self.0.asked, &mut |text| self.note(text));
         self.0.chosen.get_or_init(found).clone().map_err(Error::missing)
     }
 
     /// The name of what computes the networks.
     pub fn name(&self) -> Result<&'static str> {
-        Ok(self.chosen()?.map_or("cpu", |p| p.name))
+        Ok(self.selected()?.map_or("cpu", |p| p.name))
     }
 
     /// A network that the chosen provider refuses is computed by the CPU if nobody asked for the provider by name.
@@ -83,7 +87,7 @@ impl Compute {
 
     /// Finds the provider, and returns what did not work since the last call, a sentence each.
     pub fn notes(&self) -> Result<Vec<String>> {
-        self.chosen()?;
+        self.selected()?;
         Ok(std::mem::take(&mut *self.0.notes.lock().unwrap_or_else(PoisonError::into_inner)))
     }
 
@@ -104,7 +108,7 @@ mod tests {
         assert_eq!(cpu.name().unwrap(), "cpu");
         assert!(absent.name().unwrap_err().to_string().contains("auto, cpu, cuda"));
         // Answers are kept by one and not by the other.
-        let key = || Key::new("test").text("two").values(&[std::process::id()]);
+        let key = || OutputKey::new("test").text("two").values(&[std::process::id()]);
         let value = |compute: &Compute, v: f32| compute.remember(key(), || Ok(vec![v])).unwrap();
         assert_eq!(value(&cpu, 1.0), [1.0]);
         assert_eq!(value(&cpu, 2.0), [1.0]);

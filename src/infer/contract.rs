@@ -1,4 +1,4 @@
-//! What splatvk asks of a graph: for every part of a model the roles of its inputs and outputs and the shapes in which the
+//! What splatvk requires of a graph: for every part of a model the roles of its inputs and outputs and the shapes in which the
 //! rest of the program sees them. Which name, layout and range a file uses for a role is data: see [`super::adapter`].
 //!
 //! A shape is a row of axis names: "B H W 3" has a free batch, height and width, and three channels. An axis that occurs
@@ -95,7 +95,7 @@ const fn maybe(role: &'static str, shape: &'static str, layouts: &'static [&'sta
     Slot { role, shape, layouts, optional: true, integer: false }
 }
 
-const fn whole(s: Slot) -> Slot {
+const fn integer(s: Slot) -> Slot {
     Slot { integer: true, ..s }
 }
 
@@ -106,7 +106,7 @@ static IMAGE_TOWER: Contract = Contract {
 };
 static TEXT_TOWER: Contract = Contract {
     name: "text-tower",
-    inputs: &[whole(slot("tokens", "B L", &[])), whole(maybe("mask", "B L", &[]))],
+    inputs: &[integer(slot("tokens", "B L", &[])), integer(maybe("mask", "B L", &[]))],
     outputs: &[slot("embedding", "B D", &[])],
 };
 static DENSE_FEATURES: Contract = Contract {
@@ -132,7 +132,7 @@ static MASK_DECODER: Contract = Contract {
         maybe("high1", "B C1 h1 w1", &[]),
         maybe("position", "B Cp hp wp", &[]),
         slot("points", "P N 2", &["b P N 2"]),
-        whole(slot("labels", "P N", &["b P N"])),
+        integer(slot("labels", "P N", &["b P N"])),
         maybe("mask", "b 1 m n", &[]),
         maybe("has_mask", "q", &[]),
         maybe("size", "2", &[]),
@@ -159,23 +159,23 @@ static PAIR: Contract = Contract {
     inputs: &[
         slot("image1", "B 3 H W", &["B H W 3"]),
         slot("image2", "B 3 I J", &["B I J 3"]),
-        whole(maybe("shape1", "B 2", &[])),
-        whole(maybe("shape2", "B 2", &[])),
+        integer(maybe("shape1", "B 2", &[])),
+        integer(maybe("shape2", "B 2", &[])),
     ],
     outputs: pair_outputs!(),
 };
 static PAIR_ENCODER: Contract = Contract {
     name: "pair-encoder",
-    inputs: &[slot("image", "B 3 H W", &["B H W 3"]), whole(maybe("shape", "B 2", &[]))],
-    outputs: &[slot("tokens", "B L C", &[]), whole(maybe("position", "B L 2", &[]))],
+    inputs: &[slot("image", "B 3 H W", &["B H W 3"]), integer(maybe("shape", "B 2", &[]))],
+    outputs: &[slot("tokens", "B L C", &[]), integer(maybe("position", "B L 2", &[]))],
 };
 static PAIR_DECODER: Contract = Contract {
     name: "pair-decoder",
     inputs: &[
         slot("tokens1", "B L C", &[]),
         slot("tokens2", "B K C", &[]),
-        whole(maybe("position1", "B L 2", &[])),
-        whole(maybe("position2", "B K 2", &[])),
+        integer(maybe("position1", "B L 2", &[])),
+        integer(maybe("position2", "B K 2", &[])),
     ],
     outputs: pair_outputs!(),
 };

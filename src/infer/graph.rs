@@ -1,14 +1,23 @@
-//! A loaded graph that is spoken to by role: layouts, element types and activations are its own affair.
+//! A loaded graph with inputs and outputs by role: layouts, element types and activations are handled here.
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::adapter::{Adapter, Binding};
-use super::cache::{Key, fingerprint};
+use super::cache::{OutputKey, fingerprint};
 use super::compute::Compute;
 use super::contract::{Slot, reorder, unify};
 use super::onnx::{self, Dim, Header};
 use super::runtime::{Input, Session, Tensor};
 use crate::{Error, Result};
+
+/// A file with its checksum.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HashedFile {
+    /// Where it lies.
+    pub path: PathBuf,
+    /// In hexadecimal digits.
+    pub sha256: String,
+}
 
 /// A model file that was recognised, not yet loaded.
 #[derive(Clone, Debug)]
@@ -28,7 +37,7 @@ pub struct GraphFile {
     /// Files with the rest of the weights.
     pub external: Vec<PathBuf>,
     /// The sha256 that the adapter pins of these files.
-    pub pinned: Vec<(PathBuf, String)>,
+    pub pinned: Vec<HashedFile>,
     /// How it is computed.
     pub compute: Compute,
 }
@@ -37,7 +46,7 @@ impl GraphFile {
     /// Reads the file's header and finds its part; the error names the file and the mend.
     pub fn recognise(path: &Path) -> Result<GraphFile> {
         let header: Header = onnx::read(path)?;
-        let adapter = Adapter::beside(path)?;
+        let adapter = Adapter::of_file(path)?;
         let binding = adapter.fit(path, &header)?;
         if let Some(absent) = header.external.iter().find(|p| !p.is_file()) {
             return Err(Error::missing(format!(
@@ -48,7 +57,7 @@ impl GraphFile {
         }
         let pin = |p: &PathBuf| {
             let name = p.file_name()?.to_str()?;
-            Some((p.clone(), adapter.sha256.get(name)?.to_ascii_lowercase()))
+            Some(HashedFile { path: p.clone(), sha256: adapter.sha256.get(name)?.to_ascii_lowercase() })
         };
         let own = path.to_path_buf();
         Ok(GraphFile {
@@ -78,7 +87,7 @@ impl GraphFile {
     }
 
     /// Of the layouts that an output's lengths allow, takes the first in which `axis` has `length`, if there is one.
-    pub(super) fn settle(&mut self, role: &str, axis: &str, length: usize) {
+    pub(super) fn fix_axis(&mut self, role: &str, axis: &str, length: usize) {
         let Some(slot) = self.binding.part.contract().slot(role) else { return };
         let Some(bound) = self.binding.ports.get_mut(role) else { return };
         let Some(dims) = &bound.dims else { return };
@@ -97,7 +106,7 @@ impl GraphFile {
 
     /// Loads it, if its files are what the adapter pins.
     pub fn load(&self) -> Result<Graph> {
-        for (file, wanted) in &self.pinned {
+        for HashedFile { path: file, sha256: wanted } in &self.pinned {
             let found = fingerprint(file).map_err(Error::io(file))?;
             if found != *wanted {
                 return Err(Error::missing(format!(
@@ -217,9 +226,9 @@ impl Graph {
     }
 }
 
-impl Key {
-    /// Depends on the content of a model's files and on how they are spoken to.
-    pub fn model(mut self, graph: &GraphFile) -> Result<Key> {
+impl OutputKey {
+    /// Depends on the content of a model's files and on their adapters.
+    pub fn model(mut self, graph: &GraphFile) -> Result<OutputKey> {
         for file in std::iter::once(&graph.path).chain(&graph.external) {
             self = self.text(&fingerprint(file).map_err(crate::Error::io(file))?);
         }

@@ -1,5 +1,5 @@
 //! HED edge detection (Xie & Tu, ICCV 2015; BSDS500 weights).
-use super::registry::{Registry, Role};
+use super::registry::{PackFileKind, Registry};
 use super::runtime::{Input, Session};
 use crate::photo::Kernel;
 use crate::scene::{Plane, RgbImage};
@@ -17,7 +17,7 @@ pub struct Hed {
 impl Hed {
     /// Loads the network of the model pack.
     pub fn load(registry: &Registry) -> Result<Self> {
-        Ok(Hed { session: registry.session(Role::Edges)? })
+        Ok(Hed { session: registry.session(PackFileKind::Edges)? })
     }
 
     /// Probability in [0, 1] that a person would draw a contour through each pixel.

@@ -12,13 +12,14 @@ use super::cache::fingerprint;
 use super::compute::Compute;
 use super::contract::Part;
 use super::graph::GraphFile;
+pub use super::graph::HashedFile;
 use super::registry::Registry;
 use crate::{Error, Result};
 
 /// What a model does in a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Deserialize, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Duty {
+pub enum Task {
     /// Cameras, depth and points.
     Geometry,
     /// Dense matches between photos.
@@ -31,15 +32,15 @@ pub enum Duty {
     Text,
 }
 
-impl Duty {
+impl Task {
     /// The name on the command line.
     pub fn name(self) -> &'static str {
         match self {
-            Duty::Geometry => "geometry",
-            Duty::Matcher => "matcher",
-            Duty::Masks => "masks",
-            Duty::Features => "features",
-            Duty::Text => "text",
+            Task::Geometry => "geometry",
+            Task::Matcher => "matcher",
+            Task::Masks => "masks",
+            Task::Features => "features",
+            Task::Text => "text",
         }
     }
 }
@@ -47,16 +48,17 @@ impl Duty {
 /// A network that splatvk knows and does not ship.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Known {
+pub struct CatalogueEntry {
     /// Folder or beginning of the file names under which it is looked for.
     pub id: String,
     /// What people call it.
     pub name: String,
     /// What it does.
-    pub role: Duty,
+    #[serde(rename = "role")]
+    pub task: Task,
     /// What it can do besides.
-    #[serde(default)]
-    pub also: Vec<Duty>,
+    #[serde(default, rename = "also")]
+    pub other_tasks: Vec<Task>,
     /// What `--init`, `--matcher`, `--masks` or `--features` call it.
     pub family: String,
     /// "paper", "open".
@@ -71,20 +73,20 @@ pub struct Known {
     pub export: String,
 }
 
-impl Known {
+impl CatalogueEntry {
     /// Whether it does this, mainly or besides.
-    pub fn does(&self, duty: Duty) -> bool {
-        self.role == duty || self.also.contains(&duty)
+    pub fn does(&self, task: Task) -> bool {
+        self.task == task || self.other_tasks.contains(&task)
     }
 }
 
 /// The known networks, in order of preference within a family.
-pub fn known() -> &'static [Known] {
+pub fn catalogue() -> &'static [CatalogueEntry] {
     #[derive(Default, Deserialize)]
     struct Catalogue {
-        model: Vec<Known>,
+        model: Vec<CatalogueEntry>,
     }
-    static KNOWN: OnceLock<Vec<Known>> = OnceLock::new();
+    static KNOWN: OnceLock<Vec<CatalogueEntry>> = OnceLock::new();
     KNOWN.get_or_init(|| {
         // A test reads the same text; a mistake in it cannot reach users.
         toml::from_str::<Catalogue>(include_str!("catalogue.toml")).unwrap_or_default().model
@@ -99,7 +101,7 @@ pub struct Installed {
     /// What `--init` and the others call it.
     pub family: String,
     /// What it does.
-    pub duties: Vec<Duty>,
+    pub tasks: Vec<Task>,
     /// Its graphs, one per part.
     pub graphs: BTreeMap<Part, GraphFile>,
     /// Where it lies.
@@ -126,23 +128,34 @@ impl Installed {
         self.graphs.values().any(|g| g.untrained)
     }
 
-    /// (file, sha256) of everything that it consists of.
-    pub fn files(&self) -> Result<Vec<(PathBuf, String)>> {
+    /// The files that it consists of.
+    pub fn files(&self) -> Result<Vec<HashedFile>> {
         let files = self.graphs.values().flat_map(|g| std::iter::once(&g.path).chain(&g.external));
-        let hash = |file: &PathBuf| Ok((file.clone(), fingerprint(file).map_err(Error::io(file))?));
+        let hash = |file: &PathBuf| {
+            Ok(HashedFile { path: file.clone(), sha256: fingerprint(file).map_err(Error::io(file))? })
+        };
         files.map(hash).collect()
     }
 
     /// Place in the catalogue's order of preference; networks that it does not know come last.
     fn rank(&self) -> usize {
-        known().iter().position(|k| self.name.starts_with(&k.id)).unwrap_or(usize::MAX)
+        catalogue().iter().position(|k| self.name.starts_with(&k.id)).unwrap_or(usize::MAX)
     }
 
     /// The catalogue entry with its name.
-    pub fn known(&self) -> Option<&'static Known> {
+    pub fn catalogue_entry(&self) -> Option<&'static CatalogueEntry> {
         // "sam_vit_b" is longer, so more specific, than "sam".
-        known().iter().filter(|k| self.name.starts_with(&k.id)).max_by_key(|k| k.id.len())
+        catalogue().iter().filter(|k| self.name.starts_with(&k.id)).max_by_key(|k| k.id.len())
     }
+}
+
+/// A file or folder that is no usable model.
+#[derive(Clone, Debug)]
+pub struct BrokenFile {
+    /// Where it lies.
+    pub path: PathBuf,
+    /// One line that says why and what to do.
+    pub reason: String,
 }
 
 /// What the model folders hold beside the built-in pack.
@@ -150,28 +163,28 @@ impl Installed {
 pub struct Inventory {
     /// Whole models.
     pub models: Vec<Installed>,
-    /// Files that cannot be used: one line each, saying why and what to do.
-    pub broken: Vec<(PathBuf, String)>,
+    /// Files that cannot be used.
+    pub broken: Vec<BrokenFile>,
 }
 
 impl Inventory {
-    /// The most preferred network for a duty that has trained weights.
-    pub fn best(&self, duty: Duty) -> Option<&Installed> {
-        let fitting = self.models.iter().filter(|m| m.duties.contains(&duty) && !m.untrained());
+    /// The most preferred network for a task that has trained weights.
+    pub fn best(&self, task: Task) -> Option<&Installed> {
+        let fitting = self.models.iter().filter(|m| m.tasks.contains(&task) && !m.untrained());
         // What a network is made for comes before what it can do besides.
-        fitting.min_by_key(|m| (m.duties.first() != Some(&duty), m.rank()))
+        fitting.min_by_key(|m| (m.tasks.first() != Some(&task), m.rank()))
     }
 }
 
 /// Sets of parts that make a model, and what it then does.
-const WHOLE: [(&[Part], &[Duty]); 7] = [
-    (&[Part::Pair], &[Duty::Geometry]),
-    (&[Part::PairEncoder, Part::PairDecoder], &[Duty::Geometry]),
-    (&[Part::MultiView], &[Duty::Geometry]),
-    (&[Part::Warp], &[Duty::Matcher]),
-    (&[Part::MaskEncoder, Part::MaskDecoder], &[Duty::Masks]),
-    (&[Part::ImageTower, Part::TextTower], &[Duty::Features, Duty::Text]),
-    (&[Part::DenseFeatures, Part::TextTower], &[Duty::Features, Duty::Text]),
+const WHOLE: [(&[Part], &[Task]); 7] = [
+    (&[Part::Pair], &[Task::Geometry]),
+    (&[Part::PairEncoder, Part::PairDecoder], &[Task::Geometry]),
+    (&[Part::MultiView], &[Task::Geometry]),
+    (&[Part::Warp], &[Task::Matcher]),
+    (&[Part::MaskEncoder, Part::MaskDecoder], &[Task::Masks]),
+    (&[Part::ImageTower, Part::TextTower], &[Task::Features, Task::Text]),
+    (&[Part::DenseFeatures, Part::TextTower], &[Task::Features, Task::Text]),
 ];
 
 /// Looks at every `.onnx` file in the folders of `registry` and one folder below.
@@ -200,7 +213,7 @@ pub fn inventory(registry: &Registry) -> Inventory {
 
 fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, found: &mut Inventory) {
     let mut graphs: BTreeMap<Part, GraphFile> = BTreeMap::new();
-    let mut failed: Vec<(PathBuf, String)> = Vec::new();
+    let mut failed: Vec<BrokenFile> = Vec::new();
     for file in files {
         match GraphFile::recognise(file) {
             // The first of several variants (quantised, half precision): the plain name sorts first.
@@ -208,15 +221,15 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
                 let graph = GraphFile { compute: compute.clone(), ..graph };
                 graphs.entry(graph.binding.part).or_insert(graph);
             }
-            Err(e) => failed.push((file.clone(), e.to_string())),
+            Err(e) => failed.push(BrokenFile { path: file.clone(), reason: e.to_string() }),
         }
     }
     if graphs.is_empty() {
         found.broken.extend(failed);
         return;
     }
-    let has = |parts: &&(&[Part], &[Duty])| parts.0.iter().all(|p| graphs.contains_key(p));
-    let Some((parts, duties)) = WHOLE.iter().find(has) else {
+    let has = |parts: &&(&[Part], &[Task])| parts.0.iter().all(|p| graphs.contains_key(p));
+    let Some((parts, tasks)) = WHOLE.iter().find(has) else {
         let have: Vec<&str> = graphs.keys().map(|p| p.name()).collect();
         let lacks = WHOLE.iter().filter(|w| w.0.iter().any(|p| graphs.contains_key(p)));
         let lacks: Vec<&str> =
@@ -228,7 +241,7 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
             lacks.join(" or ")
         );
         found.broken.extend(failed);
-        found.broken.push((folder, text));
+        found.broken.push(BrokenFile { path: folder, reason: text });
         return;
     };
     let stray = |a: &&GraphFile, b: &&GraphFile| {
@@ -243,18 +256,18 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
             pair[0].checkpoint.as_deref().unwrap_or_default(),
             pair[1].checkpoint.as_deref().unwrap_or_default()
         );
-        found.broken.push((folder, text));
+        found.broken.push(BrokenFile { path: folder, reason: text });
         return;
     }
-    // Encoders look alike in several families; what comes last tells them apart.
+    // Encoders are alike in several families; the last part decides.
     let family = used.last().map(|g| g.binding.family.clone()).unwrap_or_default();
-    let mut duties = duties.to_vec();
+    let mut tasks = tasks.to_vec();
     if used.iter().any(|g| g.has("desc1")) {
-        duties.push(Duty::Matcher);
+        tasks.push(Task::Matcher);
     }
-    let unused = failed.into_iter().map(|(_, why)| why).collect();
-    let mut model = Installed { name, family, duties, graphs, folder, unused };
-    if let Some(known) = model.known().filter(|k| model.duties.contains(&k.role)) {
+    let unused = failed.into_iter().map(|f| f.reason).collect();
+    let mut model = Installed { name, family, tasks, graphs, folder, unused };
+    if let Some(known) = model.catalogue_entry().filter(|k| model.tasks.contains(&k.task)) {
         model.family.clone_from(&known.family);
     }
     found.models.push(model);
@@ -263,12 +276,12 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
 impl Registry {
     /// The model that `--init`, `--masks` and so on call `name` (a family or a model's own name): of several the one that
     /// the catalogue names first. The error says what to do.
-    pub fn installed(&self, duty: Duty, name: &str) -> Result<Installed> {
+    pub fn installed(&self, task: Task, name: &str) -> Result<Installed> {
         let inventory = inventory(self);
         let mut fitting: Vec<Installed> = inventory
             .models
             .into_iter()
-            .filter(|m| m.duties.contains(&duty) && (m.family == name || m.name == name))
+            .filter(|m| m.tasks.contains(&task) && (m.family == name || m.name == name))
             .collect();
         fitting.sort_by_key(Installed::rank);
         if let Some(model) = fitting.into_iter().next() {
@@ -276,17 +289,17 @@ impl Registry {
         }
         let about = |path: &Path| {
             let text = path.to_string_lossy();
-            known().iter().any(|k| k.family == name && text.contains(&k.id)) || text.contains(name)
+            catalogue().iter().any(|k| k.family == name && text.contains(&k.id)) || text.contains(name)
         };
-        if let Some((_, why)) = inventory.broken.iter().find(|(path, _)| about(path)) {
-            return Err(Error::missing(why.clone()));
+        if let Some(broken) = inventory.broken.iter().find(|b| about(&b.path)) {
+            return Err(Error::missing(broken.reason.clone()));
         }
         let place = self.folders().first().map(|f| f.display().to_string()).unwrap_or_default();
-        let how = known().iter().find(|k| k.family == name && k.does(duty));
+        let how = catalogue().iter().find(|k| k.family == name && k.does(task));
         let how = how.map_or(String::new(), |k| format!(" (from {}, exported with {})", k.source, k.export));
         Err(Error::missing(format!(
             "no model \"{name}\" for {} in {place}; put its ONNX files{how} into {place}/{name}/, or see splatvk models list",
-            duty.name()
+            task.name()
         )))
     }
 }

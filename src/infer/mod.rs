@@ -1,7 +1,7 @@
 //! ONNX inference: sessions, model registry, one file per model family.
 //!
-//! Networks that users bring are recognised by what goes in and comes out: [`onnx`] reads a file's header, [`contract`] says
-//! what splatvk asks of each part of a model, [`adapter`] maps a file's names to it, [`graph`] runs it by role.
+//! Networks that users bring are recognised by what goes in and comes out: [`onnx`] reads a file's header, [`contract`] states
+//! what splatvk requires of each part of a model, [`adapter`] maps a file's names to it, [`graph`] runs it by role.
 pub mod adapter;
 #[cfg(test)]
 pub(crate) mod breakfast;
@@ -37,7 +37,7 @@ pub mod xfeat;
 
 pub use compute::Compute;
 pub use library::runtime;
-pub use registry::{ModelStatus, Registry, Role, home};
+pub use registry::{ModelStatus, PackFileKind, Registry, home};
 pub use runtime::{Input, Session, Tensor};
 
 use crate::Result;
@@ -57,7 +57,7 @@ pub(crate) fn nearest(regions: &[f32], rows: &[f32], dim: usize, best: usize) ->
     regions.par_chunks_exact(dim).map(of).collect()
 }
 
-/// Puts image regions and texts into one space of unit vectors, so that a cosine says how well a phrase names a
+/// Puts image regions and texts into one space of unit vectors, so that a cosine measures how well a phrase names a
 /// region. Implemented by `words` (the built-in default) and by user-supplied CLIP-like pairs of towers.
 pub trait RegionEncoder: Send {
     /// Name of the space; features and texts may be compared only when this agrees.
@@ -69,7 +69,7 @@ pub trait RegionEncoder: Send {
     fn embed_regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>>;
     /// [texts.len(), D] row-major unit vectors.
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>>;
-    /// Per region embedding ([count, D] rows) the `best` phrases that the encoder itself knows, with their cosine, best
+    /// Per region embedding ([count, D] rows) the `best` phrases of the encoder's own vocabulary, with their cosine, best
     /// first. None from an encoder that has no list of phrases.
     fn names(&mut self, regions: &[f32], _best: usize) -> Result<Vec<Vec<(String, f32)>>> {
         Ok(vec![Vec::new(); regions.len() / self.dim().max(1)])

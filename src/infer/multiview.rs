@@ -2,7 +2,7 @@
 //! pointmaps of every pair follow.
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
-use super::cache::Key;
+use super::cache::OutputKey;
 use super::graph::{GraphFile, Outputs};
 use super::prepare::Prepared;
 use super::runtime::Input;
@@ -27,7 +27,7 @@ pub(super) fn pointmaps(
     let prepared = same_size(graph, photos)?;
     let views = super::prepare::views(photos, &prepared, progress);
     let (width, height) = prepared.first().map_or((0, 0), |p| (p.width, p.height));
-    let mut key = Key::new("views").model(graph)?.values(&[width as u64, height as u64]);
+    let mut key = OutputKey::new("views").model(graph)?.values(&[width as u64, height as u64]);
     for p in &prepared {
         key = key.values(&p.data);
     }

@@ -1,4 +1,4 @@
-//! What an ONNX file says about itself, read without its weights: inputs, outputs, operator set, and which files hold the
+//! The header of an ONNX file, read without its weights: inputs, outputs, operator set, and which files hold the
 //! rest. A file of several gigabytes is looked at in milliseconds, and a truncated one is found out before it is loaded.
 //!
 //! Field numbers are those of the published onnx.proto3.
@@ -12,7 +12,7 @@ use crate::{Error, Result};
 
 /// Element type of a tensor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum ElementType {
     /// 16-, 32- or 64-bit floats.
     Float,
     /// 32- or 64-bit integers.
@@ -46,8 +46,8 @@ pub struct Port {
     /// Its name.
     pub name: String,
     /// Its element type.
-    pub kind: Kind,
-    /// Its axes, outermost first; `None` when the file does not tell.
+    pub kind: ElementType,
+    /// Its axes, outermost first; `None` when the file does not state them.
     pub dims: Option<Vec<Dim>>,
 }
 
@@ -167,7 +167,7 @@ impl Reader {
     }
 
     fn port(&mut self, length: u64) -> Option<Port> {
-        let mut port = Port { name: String::new(), kind: Kind::Other, dims: None };
+        let mut port = Port { name: String::new(), kind: ElementType::Other, dims: None };
         self.message(length, &mut |r, number, field| {
             match (number, field) {
                 (1, Field::Bytes(n)) => port.name = r.text(n)?,
@@ -187,9 +187,9 @@ impl Reader {
             match (number, field) {
                 (1, Field::Number(n)) => {
                     port.kind = match n {
-                        1 | 10 | 11 => Kind::Float,
-                        6 | 7 => Kind::Integer,
-                        _ => Kind::Other,
+                        1 | 10 | 11 => ElementType::Float,
+                        6 | 7 => ElementType::Integer,
+                        _ => ElementType::Other,
                     }
                 }
                 (2, Field::Bytes(n)) => port.dims = Some(r.shape(n)?),

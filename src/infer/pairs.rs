@@ -1,6 +1,6 @@
 //! Geometry networks: DUSt3R and MASt3R see two photos at a time, VGGT and its like all of them. Both give pointmaps of pairs
 //! ([`PairPointmaps`]), which [`crate::pose::pointmap`] brings to one scene.
-use super::cache::Key;
+use super::cache::OutputKey;
 use super::contract::Part;
 use super::graph::{Graph, GraphFile, Outputs};
 use super::installed::Installed;
@@ -12,7 +12,7 @@ use crate::progress::Progress;
 use crate::scene::{Descriptors, ModelView, PairPointmaps, Pointmap};
 use crate::{Error, Result};
 
-/// What a network says about all pairs of photos, for [`crate::pose::pointmap::reconstruct`].
+/// Pointmaps of all pairs of photos, for [`crate::pose::pointmap::reconstruct`].
 pub fn pointmaps(
     model: &Installed,
     photos: &[Photo],
@@ -26,7 +26,7 @@ pub fn pointmaps(
     Ok((views(photos, &prepared, progress), pairs))
 }
 
-/// The photos as a pair network sees them, and what it says about all pairs.
+/// The photos as inputs of a pair network, and its pointmaps of all pairs.
 pub(super) fn decoded(
     model: &Installed,
     photos: &[Photo],
@@ -91,7 +91,8 @@ impl<'a> Network<'a> {
 
     fn decode(&mut self, i: usize, j: usize) -> Result<Decoded> {
         let (a, b) = (&self.prepared[i], &self.prepared[j]);
-        let mut key = Key::new("pair").values(&[a.width, a.height, b.width, b.height].map(|n| n as u64));
+        let mut key =
+            OutputKey::new("pair").values(&[a.width, a.height, b.width, b.height].map(|n| n as u64));
         for graph in self.model.graphs.values() {
             key = key.model(graph)?;
         }
@@ -259,7 +260,7 @@ fn off_the_rays(map: &Pointmap, width: usize, height: usize) -> f64 {
         })
         .collect();
     let dot = |a: [f64; 2], b: [f64; 2]| a[0] * b[0] + a[1] * b[1];
-    // The ray along the axis says nothing about it.
+    // The ray along the axis does not determine it.
     let mut ratios: Vec<f64> = rays.iter().map(|(s, p)| dot(*s, *p) / dot(*s, *s)).collect();
     ratios.retain(|r| r.is_finite());
     let Some(focal) = median(&mut ratios) else { return f64::INFINITY };
@@ -270,7 +271,7 @@ fn off_the_rays(map: &Pointmap, width: usize, height: usize) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::installed::Duty;
+    use super::super::installed::Task;
     use super::super::testing::{Attribute, FLOAT, Onnx};
     use super::super::tests::photo;
     use super::super::{Registry, breakfast};
@@ -327,7 +328,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let ask = |first: &str, second: &str| {
             graph(first, second).write(&dir.path().join("dust3r/model.onnx"));
-            let model = Registry::of(&[dir.path()]).installed(Duty::Geometry, "dust3r").unwrap();
+            let model = Registry::of(&[dir.path()]).installed(Task::Geometry, "dust3r").unwrap();
             pointmaps(&model, &photos, &Silent).map(drop)
         };
         ask("pts3d_1", "pts3d_2").unwrap();

@@ -56,12 +56,15 @@ static PROVIDERS: &[Provider] = &[];
 pub const NAMES: [&str; 9] =
     ["auto", "cpu", "cuda", "migraphx", "rocm", "directml", "coreml", "webgpu", "openvino"];
 
-/// The provider that is asked for: found by computing a graph of one node on it.
-pub(super) fn find(asked: &str, note: &mut dyn FnMut(String)) -> Result<Option<&'static Provider>, String> {
+/// The provider that is requested: found by computing a graph of one node on it.
+pub(super) fn find(
+    requested: &str,
+    note: &mut dyn FnMut(String),
+) -> Result<Option<&'static Provider>, String> {
     let (library, environment) = loaded().map_err(|e| e.to_string())?;
     let library = library.display();
     let listed: Vec<&Provider> = PROVIDERS.iter().filter(|p| (p.listed)().unwrap_or(false)).collect();
-    match asked {
+    match requested {
         "cpu" => Ok(None),
         "auto" => {
             for provider in listed.into_iter().filter(|p| p.automatic) {

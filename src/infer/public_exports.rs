@@ -1,9 +1,9 @@
-//! The built-in adapters against graphs with the interfaces of public exports: each is spoken to through the whole path of its
+//! The built-in adapters against graphs with the interfaces of public exports: each is run through the whole path of its
 //! role, and answers with something that shows what it was given.
 use std::path::Path;
 
 use super::clip::Clip;
-use super::installed::Duty;
+use super::installed::Task;
 use super::sam::Sam;
 use super::testing::{Attribute, FLOAT, INT64, Onnx};
 use super::tests::{clip_in, photo};
@@ -59,7 +59,7 @@ fn scored(graph: Onnx, shape: &[u64], row: &[i64], values: &[f32], scores: &str)
 
 /// Asks a model about two pixels of a photo of 32 × 16: the first logit of each of their masks, and the scores.
 fn asked(folder: &Path, name: &str) -> (Vec<f32>, Vec<f32>) {
-    let model = Registry::of(&[folder]).installed(Duty::Masks, name).unwrap();
+    let model = Registry::of(&[folder]).installed(Task::Masks, name).unwrap();
     let mut sam = Sam::load(&model).unwrap();
     let encoded = sam.encode(&flat(32, 16, [0.485, 0.456, 0.406])).unwrap();
     let found = sam.decode(&encoded, &[[8.0, 4.0], [24.0, 4.0]]).unwrap();
@@ -108,7 +108,7 @@ fn sam_2_hands_its_fine_features_to_the_decoder_and_fills_the_square() {
     // A graph that leaves the padding point to its caller wants two.
     let adapter = "family = \"sam2\"\n[[graph]]\npart = \"mask-decoder\"\npads = false\n";
     std::fs::write(dir.path().join("sam2/adapter.toml"), adapter).unwrap();
-    let mut sam = Sam::load(&Registry::of(&[dir.path()]).installed(Duty::Masks, "sam2").unwrap()).unwrap();
+    let mut sam = Sam::load(&Registry::of(&[dir.path()]).installed(Task::Masks, "sam2").unwrap()).unwrap();
     let encoded = sam.encode(&flat(32, 16, [0.5; 3])).unwrap();
     let error = sam.decode(&encoded, &[[8.0, 4.0]]).err().unwrap().to_string();
     assert!(error.contains("point_") && error.contains("Expected: 1"), "{error}");
@@ -199,7 +199,7 @@ fn dense_features_are_averaged_over_regions() {
         )
         .write(&to.join("lseg.onnx"));
     let mut lseg =
-        Clip::load(Registry::of(&[dir.path()]).installed(Duty::Features, "lseg").unwrap()).unwrap();
+        Clip::load(Registry::of(&[dir.path()]).installed(Task::Features, "lseg").unwrap()).unwrap();
     let (mut image, mut labels) = (flat(32, 32, [0.5, 0.5, 1.0]), Plane::filled(32, 32, 1));
     for y in 0..32 {
         for x in 0..16 {
@@ -243,7 +243,7 @@ fn roma_2_answers_both_directions_at_once_with_probabilities() {
         .node("Mul", "unsure white", "overlap_BA", &[])
         .node("Identity", "precision", "precision_AB", &[])
         .write(&dir.path().join("romav2/warp.onnx"));
-    let model = Registry::of(&[dir.path()]).installed(Duty::Matcher, "romav2").unwrap();
+    let model = Registry::of(&[dir.path()]).installed(Task::Matcher, "romav2").unwrap();
     let photos = [photo("a", flat(80, 40, [1.0; 3])), photo("b", flat(160, 100, [0.5; 3]))];
     let (there, back) = &warp::warps(&model, &photos, &Silent).unwrap()[0];
     // A quarter of the width to the right, and back.
@@ -299,7 +299,7 @@ fn multi_view_networks_that_say_the_truth_give_the_true_cameras() {
     let photos: Vec<_> =
         views.iter().enumerate().map(|(k, v)| photo(&format!("view{k}"), v.image.clone())).collect();
     for name in ["vggt", "da3"] {
-        let model = Registry::of(&[dir.path()]).installed(Duty::Geometry, name).unwrap();
+        let model = Registry::of(&[dir.path()]).installed(Task::Geometry, name).unwrap();
         let (seen, maps) = pairs::pointmaps(&model, &photos, &Silent).unwrap();
         let geometry = pointmap::reconstruct(&seen, &maps, &Silent).unwrap();
         for (k, (camera, v)) in geometry.cameras.iter().zip(&views).enumerate() {

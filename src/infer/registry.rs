@@ -19,7 +19,7 @@ const FIX: &str = "run tools/setup (or tools/models/build) to get it";
 /// What a model file is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Role {
+pub enum PackFileKind {
     /// Keypoints and descriptors.
     Keypoints,
     /// Edge probability.
@@ -38,7 +38,7 @@ pub enum Role {
 #[derive(Clone, Debug)]
 pub struct ModelStatus {
     /// What it is for.
-    pub role: Role,
+    pub kind: PackFileKind,
     /// The model's name.
     pub name: String,
     /// Where it is, or should be.
@@ -67,7 +67,8 @@ struct Package {
 
 #[derive(Clone, Deserialize)]
 struct PackFile {
-    role: Role,
+    #[serde(rename = "role")]
+    kind: PackFileKind,
     name: String,
     package: String,
     file: String,
@@ -81,7 +82,7 @@ struct Pack {
     files: Vec<PackFile>,
 }
 
-/// Finds model files and vouches for them.
+/// Finds model files and checks their content.
 #[derive(Clone)]
 pub struct Registry {
     folders: Vec<PathBuf>,
@@ -91,7 +92,7 @@ pub struct Registry {
 
 impl Registry {
     /// The folders of `models_dir`, else of `SPLATVK_MODELS` (both may be lists, written like `PATH`), else `models` under
-    /// [`home`]. Opening does not look at the files.
+    /// [`home`]. Opening does not read the files.
     pub fn open(models_dir: Option<&Path>) -> Result<Self> {
         Registry::with(models_dir, Compute::default())
     }
@@ -137,9 +138,9 @@ impl Registry {
         Registry { compute: self.compute.uncached(), ..self.clone() }
     }
 
-    /// Loads the model for `role`.
-    pub(super) fn session(&self, role: Role) -> Result<Session> {
-        Session::load(&self.path(role)?, &self.compute)
+    /// Loads the model for `kind`.
+    pub(super) fn session(&self, kind: PackFileKind) -> Result<Session> {
+        Session::load(&self.path(kind)?, &self.compute)
     }
 
     /// The folders that are searched, first to last.
@@ -157,20 +158,20 @@ impl Registry {
         self.pack.files.iter().map(|f| self.inspect(f)).collect()
     }
 
-    /// The files for some roles, read and hashed.
-    pub fn status_of(&self, roles: &[Role]) -> Vec<ModelStatus> {
-        let wanted = self.pack.files.iter().filter(|f| roles.contains(&f.role));
+    /// The files of some kinds, read and hashed.
+    pub fn status_of(&self, kinds: &[PackFileKind]) -> Vec<ModelStatus> {
+        let wanted = self.pack.files.iter().filter(|f| kinds.contains(&f.kind));
         wanted.map(|f| self.inspect(f)).collect()
     }
 
-    /// The file for `role`, present and with the right content; otherwise an error that names the file, the sha256 it
+    /// The file for `kind`, present and with the right content; otherwise an error that names the file, the sha256 it
     /// should have and how to get it. Content is hashed once per process and file version.
-    pub fn path(&self, role: Role) -> Result<PathBuf> {
-        let found = self.pack.files.iter().find(|f| f.role == role).map(|f| self.inspect(f));
+    pub fn path(&self, kind: PackFileKind) -> Result<PathBuf> {
+        let found = self.pack.files.iter().find(|f| f.kind == kind).map(|f| self.inspect(f));
         match found {
             Some(ModelStatus { fix: Some(fix), .. }) => Err(Error::missing(fix)),
             Some(status) => Ok(status.file),
-            None => Err(Error::work(format!("no model for {role:?} in the model table"))),
+            None => Err(Error::work(format!("no model for {kind:?} in the model table"))),
         }
     }
 
@@ -199,7 +200,7 @@ impl Registry {
             )
         });
         ModelStatus {
-            role: entry.role,
+            kind: entry.kind,
             name: entry.name.clone(),
             installed: fix.is_none(),
             file,
@@ -221,8 +222,8 @@ mod tests {
     fn copied_pack() -> tempfile::TempDir {
         let from = Registry::open(None).unwrap();
         let dir = tempfile::tempdir().unwrap();
-        for role in [Role::Classes, Role::Keypoints] {
-            let path = from.path(role).unwrap();
+        for kind in [PackFileKind::Classes, PackFileKind::Keypoints] {
+            let path = from.path(kind).unwrap();
             std::fs::copy(&path, dir.path().join(path.file_name().unwrap())).unwrap();
         }
         dir
@@ -241,24 +242,24 @@ mod tests {
     fn missing_truncated_and_corrupt_files_are_named_with_hash_and_remedy() {
         let dir = copied_pack();
         let registry = Registry::open(Some(dir.path())).unwrap();
-        assert!(registry.path(Role::Classes).is_ok());
-        let missing = registry.path(Role::Edges).unwrap_err();
-        let wanted = registry.status().into_iter().find(|s| s.role == Role::Edges).unwrap();
+        assert!(registry.path(PackFileKind::Classes).is_ok());
+        let missing = registry.path(PackFileKind::Edges).unwrap_err();
+        let wanted = registry.status().into_iter().find(|s| s.kind == PackFileKind::Edges).unwrap();
         for part in ["hed.onnx is missing", &wanted.sha256, "tools/setup"] {
             assert!(missing.to_string().contains(part), "{missing}");
         }
         assert_eq!(missing.exit_code(), 2);
 
-        let file = registry.path(Role::Keypoints).unwrap();
+        let file = registry.path(PackFileKind::Keypoints).unwrap();
         let mut bytes = std::fs::read(&file).unwrap();
         std::fs::write(&file, &bytes[..bytes.len() / 2]).unwrap();
-        let truncated = registry.path(Role::Keypoints).unwrap_err().to_string();
+        let truncated = registry.path(PackFileKind::Keypoints).unwrap_err().to_string();
         assert!(truncated.contains("xfeat.onnx is truncated"), "{truncated}");
 
         let middle = bytes.len() / 2;
         bytes[middle] ^= 1;
         std::fs::write(&file, &bytes).unwrap();
-        let corrupt = registry.path(Role::Keypoints).unwrap_err().to_string();
+        let corrupt = registry.path(PackFileKind::Keypoints).unwrap_err().to_string();
         assert!(corrupt.contains("is corrupt"), "{corrupt}");
         assert!(!corrupt.contains('\n'));
     }

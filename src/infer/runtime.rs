@@ -19,7 +19,7 @@ pub struct Tensor {
     pub data: Vec<f32>,
 }
 
-/// What a session is fed. Floats and integers are converted to the element type that the graph asks for.
+/// Input of a session. Floats and integers are converted to the element type of the graph.
 #[derive(Clone)]
 pub enum Input {
     /// Row-major floats.
@@ -113,7 +113,7 @@ impl Session {
         let environment = &loaded()?.1;
         let large = bytes >= LARGE;
         let build = |provider| settings(environment, provider, large)?.commit_from_file(file);
-        let provider = compute.chosen()?;
+        let provider = compute.selected()?;
         let built = match build(provider) {
             Err(e) if provider.is_some() && compute.replaceable() => {
                 let name = compute.name().unwrap_or_default();

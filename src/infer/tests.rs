@@ -4,11 +4,11 @@ use std::path::Path;
 use super::clip::Clip;
 use super::contract::Part;
 use super::graph::GraphFile;
-use super::installed::{Duty, inventory, known};
+use super::installed::{Task, catalogue, inventory};
 use super::testing::{Attribute, FLOAT, INT64, Onnx};
 use super::{Input, RegionEncoder, Registry, pairs, warp};
 use crate::files::sha256;
-use crate::photo::{Frame, Photo};
+use crate::photo::{Photo, PlainBorder};
 use crate::progress::Silent;
 use crate::scene::{Affine, Plane, RgbImage};
 
@@ -78,7 +78,7 @@ fn towers_are_recognised_by_their_tensors_and_proven_to_belong_together() {
     let dir = tempfile::tempdir().unwrap();
     clip_in(dir.path(), [0, 1, 2]);
     let registry = Registry::of(&[dir.path()]);
-    let model = registry.installed(Duty::Features, "clip").unwrap();
+    let model = registry.installed(Task::Features, "clip").unwrap();
     assert_eq!((model.name.as_str(), model.family.as_str()), ("clip_toy", "clip"));
     let mut clip = Clip::load(model).unwrap();
     assert_eq!((clip.dim(), clip.tokens("Red dog").unwrap()), (3, vec![1, 4]));
@@ -99,9 +99,9 @@ fn towers_are_recognised_by_their_tensors_and_proven_to_belong_together() {
     assert_eq!(regions[6..], [0.0; 3]);
 
     clip_in(dir.path(), [1, 2, 0]);
-    let strangers = Clip::load(registry.installed(Duty::Features, "clip").unwrap()).err().unwrap();
-    assert!(strangers.to_string().contains("do not belong together"), "{strangers}");
-    assert_eq!(strangers.exit_code(), 2);
+    let mismatched = Clip::load(registry.installed(Task::Features, "clip").unwrap()).err().unwrap();
+    assert!(mismatched.to_string().contains("do not belong together"), "{mismatched}");
+    assert_eq!(mismatched.exit_code(), 2);
 }
 
 /// Folders from a hub hold both towers in one graph beside the two, and variants whose download stopped.
@@ -134,7 +134,7 @@ fn towers_of_other_widths_or_checkpoints_are_refused() {
     let folder = dir.path().join("clip_toy");
     std::fs::write(folder.join("vision_model.toml"), "family = \"clip\"\ncheckpoint = \"a\"").unwrap();
     std::fs::write(folder.join("text_model.toml"), "family = \"clip\"\ncheckpoint = \"b\"").unwrap();
-    let apart = registry.installed(Duty::Features, "clip").unwrap_err().to_string();
+    let apart = registry.installed(Task::Features, "clip").unwrap_err().to_string();
     assert!(apart.contains("different checkpoints (a and b)"), "{apart}");
     std::fs::remove_file(folder.join("text_model.toml")).unwrap();
     Onnx::new()
@@ -142,10 +142,10 @@ fn towers_of_other_widths_or_checkpoints_are_refused() {
         .output("text_embeds", "1 8")
         .node("Cast", "input_ids", "text_embeds", &[("to", Attribute::Int(1))])
         .write(&folder.join("text_model.onnx"));
-    let wide = Clip::load(registry.installed(Duty::Features, "clip").unwrap()).err().unwrap().to_string();
+    let wide = Clip::load(registry.installed(Task::Features, "clip").unwrap()).err().unwrap().to_string();
     assert!(wide.contains("embeddings of 3 and 8 values"), "{wide}");
     std::fs::remove_file(folder.join("text_model.onnx")).unwrap();
-    let half = registry.installed(Duty::Features, "clip").unwrap_err().to_string();
+    let half = registry.installed(Task::Features, "clip").unwrap_err().to_string();
     assert!(half.contains("only its image-tower") && half.contains("text-tower"), "{half}");
 }
 
@@ -241,7 +241,7 @@ fn bad_files_are_named_with_the_mend() {
     }
     std::fs::write(&path, "<html>404 Not Found</html>").unwrap();
     assert!(GraphFile::recognise(&path).unwrap_err().to_string().contains("of another format"));
-    assert!(inventory(&Registry::of(&[dir.path()])).broken[0].1.contains("cut.onnx"));
+    assert!(inventory(&Registry::of(&[dir.path()])).broken[0].reason.contains("cut.onnx"));
 }
 
 #[test]
@@ -266,8 +266,8 @@ fn swapped_outputs_of_a_mask_decoder_are_seen() {
 
 #[test]
 fn the_catalogue_is_sound_and_a_missing_model_is_explained() {
-    assert!(known().len() >= 12);
-    for model in known() {
+    assert!(catalogue().len() >= 12);
+    for model in catalogue() {
         assert!(model.source.starts_with("https://") && !model.licence.is_empty(), "{}", model.id);
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join(&model.export);
         assert!(model.export.starts_with("https://") || script.is_file(), "{}: {}", model.id, model.export);
@@ -275,15 +275,15 @@ fn the_catalogue_is_sound_and_a_missing_model_is_explained() {
         assert!(!(model.packs.contains(&"open".into()) && model.licence.contains("NC")), "{}", model.id);
     }
     for pack in ["paper", "open"] {
-        for role in [Duty::Geometry, Duty::Matcher, Duty::Masks, Duty::Features] {
+        for task in [Task::Geometry, Task::Matcher, Task::Masks, Task::Features] {
             assert!(
-                known().iter().any(|k| k.role == role && k.packs.contains(&pack.into())),
-                "{pack} {role:?}"
+                catalogue().iter().any(|k| k.task == task && k.packs.contains(&pack.into())),
+                "{pack} {task:?}"
             );
         }
     }
     let dir = tempfile::tempdir().unwrap();
-    let error = Registry::of(&[dir.path()]).installed(Duty::Geometry, "dust3r").unwrap_err();
+    let error = Registry::of(&[dir.path()]).installed(Task::Geometry, "dust3r").unwrap_err();
     let text = error.to_string();
     assert!(text.contains("tools/export/export_dust3r.py") && text.contains("naver/dust3r"), "{text}");
     assert_eq!(error.exit_code(), 2);
@@ -310,9 +310,9 @@ fn files_side_by_side_belong_together_by_name_and_the_catalogue_decides_which_is
             .write(&dir.path().join(format!("{name}_decoder.onnx")));
     }
     let registry = Registry::of(&[dir.path()]);
-    assert_eq!(registry.installed(Duty::Masks, "sam").unwrap().name, "sam_vit_h");
-    assert_eq!(registry.installed(Duty::Masks, "sam_vit_b").unwrap().name, "sam_vit_b");
-    let model = registry.installed(Duty::Masks, "sam").unwrap();
+    assert_eq!(registry.installed(Task::Masks, "sam").unwrap().name, "sam_vit_h");
+    assert_eq!(registry.installed(Task::Masks, "sam_vit_b").unwrap().name, "sam_vit_b");
+    let model = registry.installed(Task::Masks, "sam").unwrap();
     assert_eq!(model.graph(Part::MaskDecoder).unwrap().fixed("points", "P"), Some(1));
 }
 
@@ -322,7 +322,7 @@ pub(super) fn photo(stem: &str, image: RgbImage) -> Photo {
         stem: stem.into(),
         original_size: (image.width as u32, image.height as u32),
         to_working: Affine::IDENTITY,
-        frame: Frame::default(),
+        border: PlainBorder::default(),
         exif_focal: None,
         fine: None,
         straightened: None,
@@ -358,7 +358,7 @@ fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_t
     let registry = Registry::of(&[dir.path()]);
     let grey = |v: f32| RgbImage { width: 64, height: 32, data: vec![[v; 3]; 64 * 32] };
     let photos = [photo("dark", grey(0.5)), photo("light", grey(1.0))];
-    let model = registry.installed(Duty::Geometry, "dust3r").unwrap();
+    let model = registry.installed(Task::Geometry, "dust3r").unwrap();
     // ln 3 = 1.1 is no confidence of 4, but it is at least 1: nothing to see here yet.
     let (views, maps) = pairs::pointmaps(&model, &photos, &Silent).unwrap();
     assert_eq!((views[0].width, views[0].height, maps.len()), (32, 16, 1));
@@ -366,7 +366,7 @@ fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_t
 
     let adapter = "family = \"dust3r\"\n[[graph]]\npart = \"pair\"\napply.points = \"expm1-norm\"\napply.conf = \"one-plus-exp\"";
     std::fs::write(dir.path().join("dust3r/adapter.toml"), adapter).unwrap();
-    let model = registry.installed(Duty::Geometry, "dust3r").unwrap();
+    let model = registry.installed(Task::Geometry, "dust3r").unwrap();
     let (_, maps) = pairs::pointmaps(&model, &photos, &Silent).unwrap();
     let pair = &maps[0];
     assert!((pair.x21.points[7][2] - 2.0).abs() < 1e-5 && (pair.x12.points[7][2] - 2.0).abs() < 1e-5);
@@ -395,8 +395,8 @@ fn descriptors_of_a_pair_network_match_photos() {
     let dir = tempfile::tempdir().unwrap();
     graph.write(&dir.path().join("mast3r/model.onnx"));
     let registry = Registry::of(&[dir.path()]);
-    let model = registry.installed(Duty::Matcher, "mast3r").unwrap();
-    assert_eq!(model.duties, [Duty::Geometry, Duty::Matcher]);
+    let model = registry.installed(Task::Matcher, "mast3r").unwrap();
+    assert_eq!(model.tasks, [Task::Geometry, Task::Matcher]);
     // A direction on a cone per pixel: no two pixels share one, neighbours are near each other. The second photo is the first
     // moved by eight pixels.
     let colours = |shift: usize| {
@@ -442,7 +442,7 @@ fn a_warp_is_brought_to_the_photos_pixels() {
     let dir = tempfile::tempdir().unwrap();
     graph("certainty").write(&dir.path().join("roma/warp.onnx"));
     let registry = Registry::of(&[dir.path()]);
-    let model = registry.installed(Duty::Matcher, "roma").unwrap();
+    let model = registry.installed(Task::Matcher, "roma").unwrap();
     let grey = |w: usize, h: usize| RgbImage { width: w, height: h, data: vec![[0.5; 3]; w * h] };
     let photos = [photo("a", grey(80, 40)), photo("b", grey(160, 100))];
     let found = warp::warps(&model, &photos, &Silent).unwrap();
@@ -459,6 +459,6 @@ fn a_warp_is_brought_to_the_photos_pixels() {
                fit = \"squash\" }";
     std::fs::write(dir.path().join("roma/adapter.toml"), raw).unwrap();
     let error =
-        warp::warps(&registry.installed(Duty::Matcher, "roma").unwrap(), &photos, &Silent).unwrap_err();
+        warp::warps(&registry.installed(Task::Matcher, "roma").unwrap(), &photos, &Silent).unwrap_err();
     assert!(error.to_string().contains("apply.certainty"), "{error}");
 }

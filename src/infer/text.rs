@@ -1,7 +1,7 @@
 //! Sentence embeddings: all-MiniLM-L6-v2 (Reimers & Gurevych 2019; Wang et al. 2020), int8 weights.
 use tokenizers::Tokenizer;
 
-use super::registry::{Registry, Role};
+use super::registry::{PackFileKind, Registry};
 use super::runtime::{Input, Session};
 use crate::{Error, Result};
 
@@ -19,12 +19,12 @@ pub struct TextEncoder {
 impl TextEncoder {
     /// Loads both from the model pack.
     pub fn load(registry: &Registry) -> Result<Self> {
-        let file = registry.path(Role::Tokenizer)?;
+        let file = registry.path(PackFileKind::Tokenizer)?;
         let failed = |e: tokenizers::Error| Error::missing(format!("{}: {e}", file.display()));
         let mut tokenizer = Tokenizer::from_file(&file).map_err(failed)?;
         // The file pads every text to 128 tokens; padding would only cost time here.
         tokenizer.with_padding(None);
-        Ok(TextEncoder { session: registry.session(Role::Text)?, tokenizer })
+        Ok(TextEncoder { session: registry.session(PackFileKind::Text)?, tokenizer })
     }
 
     /// Token ids of a text, with its start and end marks; cut at 128.

@@ -2,7 +2,7 @@
 //! themselves; MASt3R gives descriptors, whose nearest neighbours do.
 use rayon::prelude::*;
 
-use super::cache::Key;
+use super::cache::OutputKey;
 use super::contract::Part;
 use super::graph::Graph;
 use super::installed::Installed;
@@ -26,8 +26,9 @@ pub fn warps(
     let mut graph: Option<Graph> = None;
     let mut forward = |i: usize, j: usize| -> Result<Vec<Field>> {
         let (a, b) = (&prepared[i], &prepared[j]);
-        let values =
-            file.compute.remember(Key::new("warp").model(file)?.values(&a.data).values(&b.data), || {
+        let values = file.compute.remember(
+            OutputKey::new("warp").model(file)?.values(&a.data).values(&b.data),
+            || {
                 let net = match graph.take() {
                     Some(net) => net,
                     None => file.load()?,
@@ -41,7 +42,8 @@ pub fn warps(
                     all.extend(field_values(warp, sure, file)?);
                 }
                 Ok(all)
-            })?;
+            },
+        )?;
         Ok(fields(&values))
     };
     let count = photos.len();

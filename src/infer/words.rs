@@ -10,16 +10,16 @@
 //!
 //! The class block is what separates things: a dot product of square roots is a Bhattacharyya coefficient, and the
 //! steep softmax asks for the class that the phrase means instead of all that are vaguely alike. The meaning block ranks
-//! what no class names. Sentence embeddings have the class names' mean removed, for it says nothing.
+//! what no class names. Sentence embeddings have the class names' mean removed, which carries no information.
 //!
 //! A 1397th coordinate, zero for regions, takes up the length that a text leaves: a text that no class resembles
 //! ("object", "stuff": softmax against a constant 0.55) and that says no colour is nearly orthogonal to every region, as
 //! the canonical phrases of the relevancy score should be.
 //!
-//! It knows about a thousand everyday things and eleven colours. CLIP is the full model.
-use super::cache::Key;
+//! It covers about a thousand everyday things and eleven colours. CLIP is the full model.
+use super::cache::OutputKey;
 use super::classify::{CLASSES, Classifier};
-use super::registry::{Registry, Role};
+use super::registry::{PackFileKind, Registry};
 use super::text::{self, TextEncoder, normalise};
 use super::{RegionEncoder, colour, nearest};
 use crate::scene::{Plane, RgbImage};
@@ -63,8 +63,10 @@ struct Vocabulary {
 impl RegionWords {
     /// Checks that the pack is complete; the networks are loaded when first used.
     pub fn load(registry: Registry) -> Result<Self> {
-        for role in [Role::Classifier, Role::Classes, Role::Text, Role::Tokenizer] {
-            registry.path(role)?;
+        for kind in
+            [PackFileKind::Classifier, PackFileKind::Classes, PackFileKind::Text, PackFileKind::Tokenizer]
+        {
+            registry.path(kind)?;
         }
         Ok(RegionWords { registry, classifier: None, vocabulary: None })
     }
@@ -173,7 +175,7 @@ fn region_colours(image: &RgbImage, labels: &Plane<i32>, count: usize) -> Vec<Op
 
 impl Vocabulary {
     fn load(registry: &Registry) -> Result<Self> {
-        let file = registry.path(Role::Classes)?;
+        let file = registry.path(PackFileKind::Classes)?;
         let table = std::fs::read_to_string(&file).map_err(Error::io(&file))?;
         // The first of a class's names: "lemon"; the rest are synonyms and Latin.
         let first = |line: &str| line.split(['\t', ',']).next().unwrap_or_default().to_string();
@@ -187,8 +189,8 @@ impl Vocabulary {
         }
         let mut encoder = TextEncoder::load(registry)?;
         // Naming a thousand classes takes seconds, which a single query should not pay.
-        let used = registry.status_of(&[Role::Text, Role::Tokenizer, Role::Classes]);
-        let key = used.iter().fold(Key::new("class-names"), |key, file| key.text(&file.sha256));
+        let used = registry.status_of(&[PackFileKind::Text, PackFileKind::Tokenizer, PackFileKind::Classes]);
+        let key = used.iter().fold(OutputKey::new("class-names"), |key, file| key.text(&file.sha256));
         let mut names = registry
             .compute()
             .remember(key, || encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>()))?;
@@ -236,7 +238,7 @@ impl Vocabulary {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::infer::breakfast::{View, phrases, views};
+    use crate::infer::breakfast::{TestView, phrases, views};
 
     fn dot(a: &[f32], b: &[f32]) -> f32 {
         a.iter().zip(b).map(|(p, q)| p * q).sum()
@@ -250,7 +252,7 @@ mod tests {
 
     /// Rank (1 = first) of the right region among the view's regions, and its score.
     fn rank(
-        view: &View,
+        view: &TestView,
         regions: &[f32],
         object: i32,
         query: &[f32],
@@ -317,7 +319,7 @@ mod tests {
     fn views_of_one_thing_agree() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
         let views = views("train");
-        let mut of = |v: &View| words.embed_regions(&v.image, &v.masks, 12).unwrap();
+        let mut of = |v: &TestView| words.embed_regions(&v.image, &v.masks, 12).unwrap();
         let (a, b) = (of(&views[1]), of(&views[2]));
         let row = |all: &[f32], i: usize| all[i * DIM..(i + 1) * DIM].to_vec();
         // The eight objects. Measured: the same one 0.8 to 0.98, another 0.38 in the middle and 0.76 at most.

@@ -1,7 +1,7 @@
 //! XFeat keypoints and descriptors (Potje et al., CVPR 2024).
 use rayon::prelude::*;
 
-use super::registry::{Registry, Role};
+use super::registry::{PackFileKind, Registry};
 use super::runtime::{Input, Session};
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
@@ -17,7 +17,7 @@ const THRESHOLD: f32 = 0.05;
 
 /// Keypoints of one image, best first.
 #[derive(Clone, Debug, Default)]
-pub struct Features {
+pub struct XFeatKeypoints {
     /// [N] continuous (u, v) pixels of the input image; the centre of the first pixel is (0.5, 0.5).
     pub keypoints: Vec<[f32; 2]>,
     /// [N] keypoint probability × reliability, in (0, 1].
@@ -26,14 +26,14 @@ pub struct Features {
     pub descriptors: Vec<f32>,
 }
 
-impl Features {
+impl XFeatKeypoints {
     /// Descriptor `i`.
     pub fn descriptor(&self, i: usize) -> &[f32] {
         &self.descriptors[i * DIM..(i + 1) * DIM]
     }
 
     /// Pairs (index here, index in `other`, cosine) that are each other's best match, with cosine ≥ `min_cosine`.
-    pub fn mutual_matches(&self, other: &Features, min_cosine: f32) -> Vec<(usize, usize, f32)> {
+    pub fn mutual_matches(&self, other: &XFeatKeypoints, min_cosine: f32) -> Vec<(usize, usize, f32)> {
         let forward = best_matches(&self.descriptors, &other.descriptors);
         let backward = best_matches(&other.descriptors, &self.descriptors);
         let mutual = forward.into_iter().enumerate().filter_map(|(i, best)| {
@@ -133,11 +133,11 @@ pub struct XFeat {
 impl XFeat {
     /// Loads the network of the model pack.
     pub fn load(registry: &Registry) -> Result<Self> {
-        Ok(XFeat { session: registry.session(Role::Keypoints)? })
+        Ok(XFeat { session: registry.session(PackFileKind::Keypoints)? })
     }
 
     /// At most `max_keypoints` keypoints, best first.
-    pub fn detect(&mut self, image: &RgbImage, max_keypoints: usize) -> Result<Features> {
+    pub fn detect(&mut self, image: &RgbImage, max_keypoints: usize) -> Result<XFeatKeypoints> {
         let (dense, heat) = self.forward(image)?;
         let scale = [dense.pixels_per_cell[0] / CELL as f32, dense.pixels_per_cell[1] / CELL as f32];
         let mut found: Vec<([f32; 2], f32)> = local_maxima(&heat)
@@ -153,7 +153,7 @@ impl XFeat {
         found.truncate(max_keypoints);
         let descriptors = found.par_iter().flat_map_iter(|(at, _)| dense.sample(at[0], at[1])).collect();
         let (keypoints, scores) = found.into_iter().unzip();
-        Ok(Features { keypoints, scores, descriptors })
+        Ok(XFeatKeypoints { keypoints, scores, descriptors })
     }
 
     /// A descriptor and a reliability for every 8×8 cell.
@@ -258,11 +258,11 @@ fn peak_offset(heat: &Plane<f32>, x: usize, y: usize) -> [f32; 2] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::infer::breakfast::{View, train_views};
+    use crate::infer::breakfast::{TestView, train_views};
     use glam::DVec2;
 
     /// Distance in pixels between each match and where the exact depth and cameras put it; hidden points are left out.
-    fn errors(a: &View, b: &View, fa: &Features, fb: &Features) -> Vec<f64> {
+    fn errors(a: &TestView, b: &TestView, fa: &XFeatKeypoints, fb: &XFeatKeypoints) -> Vec<f64> {
         let one = |(i, j, _): (usize, usize, f32)| {
             let [u, v] = fa.keypoints[i];
             let depth = a.depth.at(u as usize, v as usize) as f64;

@@ -1,7 +1,7 @@
 //! Masks with features → aligned things → codebooks and training targets.
 use super::ViewMasks;
 use super::align::{self, AlignOptions, Alignment, PairLinks, links_from_depth};
-use super::codebook::{self, Built, CodeEntry, autoencoder, quantise};
+use super::codebook::{self, CodeEntry, EncodedLevel, autoencoder, quantise};
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, LanguageField, LevelField, Plane};
 use crate::{Error, Result};
@@ -122,7 +122,7 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
     let built = match options.reducer {
         Reducer::Bijection => {
             let one = |e: &Vec<CodeEntry>| codebook::build(e, options.feature_dim, options.seed);
-            entries.iter().map(one).collect::<Result<Vec<Built>>>()?
+            entries.iter().map(one).collect::<Result<Vec<EncodedLevel>>>()?
         }
         Reducer::Quantised => {
             let one = |e: &Vec<CodeEntry>| quantise::build(e, options.feature_dim, options.seed);
@@ -138,8 +138,8 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
         let mut code_of: Vec<Vec<i32>> =
             alignment.views.iter().map(|v| vec![-1; v.levels[level].quality.len()]).collect();
         for (component, &code) in components.iter().zip(&built.code_of) {
-            for &(view, mask) in &component.members {
-                code_of[view as usize][mask as usize] = code as i32;
+            for m in &component.members {
+                code_of[m.view as usize][m.mask as usize] = code as i32;
             }
         }
         let targets = alignment.views.iter().zip(&code_of).map(|(view, codes)| {
@@ -153,12 +153,12 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
     Ok(field)
 }
 
-/// What the components of a level mean.
+/// Embedding, weight and members of every component of a level.
 fn entries(alignment: &Alignment, level: usize) -> Vec<CodeEntry> {
     let entry = |c: &align::Component| {
-        let masks = &alignment.views[c.medoid.0 as usize].levels[level];
+        let masks = &alignment.views[c.medoid.view as usize].levels[level];
         let dim = masks.features.len() / masks.quality.len().max(1);
-        let at = c.medoid.1 as usize * dim;
+        let at = c.medoid.mask as usize * dim;
         CodeEntry {
             embedding: masks.features[at..at + dim].to_vec(),
             weight: c.weight,

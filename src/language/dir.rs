@@ -74,13 +74,13 @@ fn read_labels(path: &Path, photo: &Photo) -> Result<(Vec<Vec<i32>>, usize, usiz
 }
 
 /// Rows of unit vectors.
-struct Features {
+struct FeatureRows {
     dim: usize,
     rows: Vec<f32>,
     path: PathBuf,
 }
 
-fn read_features(dir: &Path, photo: &Photo) -> Result<Features> {
+fn read_features(dir: &Path, photo: &Photo) -> Result<FeatureRows> {
     let path = dir.join(format!("{}_f.npy", photo.stem));
     if !path.exists() {
         return Err(Error::input(format!(
@@ -97,7 +97,7 @@ fn read_features(dir: &Path, photo: &Photo) -> Result<Features> {
         return Err(Error::input(format!("{}: holds values that are not finite", path.display())));
     }
     normalise_rows(&mut rows, dim);
-    Ok(Features { dim, rows, path })
+    Ok(FeatureRows { dim, rows, path })
 }
 
 /// Scales every row to unit length; rows without a direction become zero.
@@ -132,7 +132,7 @@ fn to_working(labels: Plane<i32>, photo: &Photo) -> Plane<i32> {
 }
 
 /// Global rows → compact per-level indices; regions that are too small or have no feature become holes.
-fn compact(labels: Plane<i32>, features: Option<&Features>, path: &Path) -> Result<LevelMasks> {
+fn compact(labels: Plane<i32>, features: Option<&FeatureRows>, path: &Path) -> Result<LevelMasks> {
     let mut area: BTreeMap<i32, usize> = BTreeMap::new();
     for &l in labels.data.iter().filter(|&&l| l >= 0) {
         *area.entry(l).or_default() += 1;
@@ -242,7 +242,7 @@ mod tests {
             path: "in/a.jpg".into(),
             stem: "a".into(),
             image: RgbImage { width, height, data: vec![[0.5; 3]; width * height] },
-            frame: crate::photo::Frame::default(),
+            border: crate::photo::PlainBorder::default(),
             original_size: original,
             to_working: Affine {
                 scale: [width as f64 / original.0 as f64, height as f64 / original.1 as f64],

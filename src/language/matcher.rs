@@ -16,9 +16,9 @@ const DIM: usize = crate::infer::xfeat::DIM;
 /// quantisation on each side, and half a cell for pose errors.
 const BAND_CELLS: f64 = 1.5;
 
-/// When a descriptor match is believed.
+/// Which descriptor matches are accepted.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Belief {
+struct MatchLimits {
     /// Cosine of certainty 0; 1 has certainty 1.
     cosine: f32,
     /// Neighbouring matches must move alike to within this many cells.
@@ -30,7 +30,7 @@ struct Belief {
 /// Chosen for what alignment counts, pixels that land on the right thing. Breakfast views 0 and 1 (25° apart): 42 % of the
 /// co-visible pixels are matched, 98.2 % of them on the same object and 62 % within 8 px; asking for 7 neighbours at
 /// cosine 0.85 gives 92 % within 8 px and 99.4 % on the same object, but 6 % of the pixels, too few for an area share.
-const BELIEF: Belief = Belief { cosine: 0.6, agreement: 0.5, neighbours: 3 };
+const MATCH_LIMITS: MatchLimits = MatchLimits { cosine: 0.6, agreement: 0.5, neighbours: 3 };
 
 /// One match between cell centres, refined below the cell in the second view.
 #[derive(Clone, Copy)]
@@ -44,14 +44,14 @@ struct Match {
 /// Dense warps i → j and j → i from XFeat descriptors; `cameras` have the working resolution the features were
 /// computed at.
 pub fn xfeat(a: &DenseFeatures, b: &DenseFeatures, cameras: (&Camera, &Camera)) -> (DenseWarp, DenseWarp) {
-    believed(a, b, cameras, BELIEF)
+    accepted(a, b, cameras, MATCH_LIMITS)
 }
 
-fn believed(
+fn accepted(
     a: &DenseFeatures,
     b: &DenseFeatures,
     cameras: (&Camera, &Camera),
-    belief: Belief,
+    limits: MatchLimits,
 ) -> (DenseWarp, DenseWarp) {
     let epipolar = fundamental(cameras.0, cameras.1);
     let forward = best_cells(a, b, &epipolar);
@@ -65,10 +65,10 @@ fn believed(
             matches.push(Match { cell, a: centre(a, cell), b: refine(a, b, cell, target), cosine });
         }
     }
-    let fits = local_fits(a, &matches, belief);
+    let fits = local_fits(a, &matches, limits);
     let kept: Vec<(Match, DMat2)> =
         matches.into_iter().zip(fits).filter_map(|(m, f)| f.map(|f| (m, f))).collect();
-    let certainty = |m: &Match| ((m.cosine - belief.cosine) / (1.0 - belief.cosine)).clamp(0.0, 1.0);
+    let certainty = |m: &Match| ((m.cosine - limits.cosine) / (1.0 - limits.cosine)).clamp(0.0, 1.0);
     let size = |c: &Camera| (c.width as usize, c.height as usize);
     let there = spread(size(cameras.0), a, kept.iter().map(|(m, j)| (m.a, m.b, *j, certainty(m))));
     let back = spread(size(cameras.1), b, kept.iter().map(|(m, j)| (m.b, m.a, j.inverse(), certainty(m))));
@@ -173,7 +173,7 @@ fn refine(a: &DenseFeatures, b: &DenseFeatures, cell: usize, target: usize) -> D
 }
 
 /// Local Jacobian of each match from the neighbours that move alike; `None` where too few do.
-fn local_fits(a: &DenseFeatures, matches: &[Match], belief: Belief) -> Vec<Option<DMat2>> {
+fn local_fits(a: &DenseFeatures, matches: &[Match], limits: MatchLimits) -> Vec<Option<DMat2>> {
     let mut at = vec![None; a.width * a.height];
     for (k, m) in matches.iter().enumerate() {
         at[m.cell] = Some(k);
@@ -191,7 +191,7 @@ fn local_fits(a: &DenseFeatures, matches: &[Match], belief: Belief) -> Vec<Optio
                 continue;
             };
             let (u, v) = (other.a - m.a, other.b - m.b);
-            if (u - v).length() <= belief.agreement * cell {
+            if (u - v).length() <= limits.agreement * cell {
                 agreeing += 1;
                 normal += DMat2::from_cols(u * u.x, u * u.y);
                 moved += DMat2::from_cols(v * u.x, v * u.y);
@@ -201,7 +201,7 @@ fn local_fits(a: &DenseFeatures, matches: &[Match], belief: Belief) -> Vec<Optio
         let ridge = 4.0 * cell * cell;
         let identity = DMat2::from_diagonal(DVec2::splat(ridge));
         let jacobian = (moved + identity) * (normal + identity).inverse();
-        (agreeing >= belief.neighbours && jacobian.determinant() > 0.1).then_some(jacobian)
+        (agreeing >= limits.neighbours && jacobian.determinant() > 0.1).then_some(jacobian)
     };
     matches.par_iter().map(fit).collect()
 }
@@ -241,11 +241,11 @@ fn spread(
 mod tests {
     use super::*;
     use crate::infer::Registry;
-    use crate::infer::breakfast::{View, train_views};
+    use crate::infer::breakfast::{TestView, train_views};
     use crate::infer::xfeat::XFeat;
     use crate::language::align::links_from_warps;
 
-    fn depth(view: &View) -> DepthMap {
+    fn depth(view: &TestView) -> DepthMap {
         let known = view.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect();
         DepthMap { depth: view.depth.clone(), confidence: Plane { data: known, ..view.depth } }
     }
@@ -258,8 +258,8 @@ mod tests {
         let (a, b) = (&views[0], &views[1]);
         let exact = geometry(&a.camera, &depth(a), &b.camera, &depth(b));
         let total = exact.certainty.data.iter().filter(|&&c| c > 0.0).count();
-        let score = |belief: Belief| {
-            let (there, back) = believed(&f[0], &f[1], (&a.camera, &b.camera), belief);
+        let score = |limits: MatchLimits| {
+            let (there, back) = accepted(&f[0], &f[1], (&a.camera, &b.camera), limits);
             let links = links_from_warps(0, 1, &there, &back);
             let (mut kept, mut close, mut label) = (0, 0, 0);
             for p in 0..there.target.data.len() {
@@ -272,10 +272,10 @@ mod tests {
                 close += usize::from((q[0] - e[0]).hypot(q[1] - e[1]) < 8.0);
                 label += usize::from(a.masks.data[p] == b.masks.at(q[0] as usize, q[1] as usize));
             }
-            println!("{belief:?}: {kept} of {total}, {close} within 8 px, {label} on the same object");
+            println!("{limits:?}: {kept} of {total}, {close} within 8 px, {label} on the same object");
             (kept, close, label)
         };
-        let (kept, close, label) = score(BELIEF);
+        let (kept, close, label) = score(MATCH_LIMITS);
         assert!(kept > total / 3 && 2 * close > kept, "{kept} {close}");
         // 70 % of the image is table and wall: matches spread evenly would agree in about half of the cases
         assert!(label as f64 > 0.97 * kept as f64, "{label} of {kept}");

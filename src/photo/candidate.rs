@@ -1,5 +1,5 @@
-//! What may become a photo of a run: a file, or a frame of a video.
-use super::choose::{Found, find};
+//! Candidates for the photos of a run: files and frames of videos.
+use super::choose::{FoundFiles, find};
 use super::read::{self, Photo, from_bytes, load_at};
 use super::video::Video;
 use super::{decode, resize};
@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 #[derive(Clone, Debug)]
-enum Source {
+enum CandidateOrigin {
     File,
     /// Seconds from the start.
     Frame(Arc<Video>, f64),
@@ -21,13 +21,13 @@ enum Source {
 pub struct Candidate {
     /// The file; for a frame the video's path with the frame's name behind it.
     pub path: PathBuf,
-    source: Source,
+    source: CandidateOrigin,
 }
 
 impl Candidate {
     /// A photo file.
     pub fn file(path: &Path) -> Candidate {
-        Candidate { path: path.to_path_buf(), source: Source::File }
+        Candidate { path: path.to_path_buf(), source: CandidateOrigin::File }
     }
 
     /// File name without folder.
@@ -38,8 +38,10 @@ impl Candidate {
     /// At working resolution, see [`super::load_at`].
     pub fn load(&self, max_size: usize, progress: &dyn Progress) -> Result<Photo> {
         match &self.source {
-            Source::File => load_at(&self.path, max_size),
-            Source::Frame(video, at) => from_bytes(&self.path, video.frame(*at, None, progress)?, max_size),
+            CandidateOrigin::File => load_at(&self.path, max_size),
+            CandidateOrigin::Frame(video, at) => {
+                from_bytes(&self.path, video.frame(*at, None, progress)?, max_size)
+            }
         }
     }
 
@@ -47,8 +49,8 @@ impl Candidate {
     /// Only one decoded file is held while it is made.
     pub fn thumbnail(&self, side: usize, progress: &dyn Progress) -> Result<Option<RgbImage>> {
         let bytes = match &self.source {
-            Source::File => read::read(&self.path)?,
-            Source::Frame(video, at) => match video.frame(*at, Some(side), progress)? {
+            CandidateOrigin::File => read::read(&self.path)?,
+            CandidateOrigin::Frame(video, at) => match video.frame(*at, Some(side), progress)? {
                 bytes if bytes.is_empty() => return Ok(None),
                 bytes => bytes,
             },
@@ -68,7 +70,7 @@ impl Candidate {
 /// The candidates behind files, folders and videos, in the order of their names; frames in the order of time. Warns of what
 /// folders hold besides.
 pub fn gather(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Candidate>> {
-    let Found { photos, videos, ignored } = find(inputs)?;
+    let FoundFiles { photos, videos, ignored } = find(inputs)?;
     if let Some(first) = ignored.first() {
         let more = ignored.len() - 1;
         let others = if more > 0 { format!(" and {more} more") } else { String::new() };
@@ -77,7 +79,8 @@ pub fn gather(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Candida
     let mut all: Vec<Candidate> = photos.iter().map(|p| Candidate::file(p)).collect();
     for path in videos {
         let video = Arc::new(Video::open(&path, progress)?);
-        let frame = |at| Candidate { path: video.frame_name(at), source: Source::Frame(video.clone(), at) };
+        let frame =
+            |at| Candidate { path: video.frame_name(at), source: CandidateOrigin::Frame(video.clone(), at) };
         all.extend(video.times().into_iter().map(frame));
     }
     check_count(&all)?;

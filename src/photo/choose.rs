@@ -4,14 +4,14 @@ use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Largest number of views: the pair count grows with its square, and the method is made for a few photos.
-pub const MOST_VIEWS: usize = 16;
+pub const MAX_VIEWS: usize = 16;
 
 /// Views used when more photos are given and `--views` is not (docs/method.md#choice-of-photos).
 pub const DEFAULT_VIEWS: usize = 4;
 
 /// The photos behind the inputs and what was left out of the folders.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Found {
+pub struct FoundFiles {
     /// Sorted by file name.
     pub photos: Vec<PathBuf>,
     /// Videos that were named, or that are all there is in the folders.
@@ -22,8 +22,8 @@ pub struct Found {
 
 /// Lists the photos of files and folders (not their subfolders), sorted by file name. A file that is named must exist; its
 /// content is judged when it is read.
-pub fn find(inputs: &[PathBuf]) -> Result<Found> {
-    let mut found = Found::default();
+pub fn find(inputs: &[PathBuf]) -> Result<FoundFiles> {
+    let mut found = FoundFiles::default();
     for input in inputs {
         let kind = std::fs::metadata(input).map_err(|e| {
             Error::input(format!("{}: {e}; give photo files or a folder of photos", input.display()))
@@ -47,7 +47,7 @@ pub fn find(inputs: &[PathBuf]) -> Result<Found> {
     let place = inputs.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ");
     match (found.photos.is_empty() && found.videos.is_empty(), found.ignored.first()) {
         (true, None) => Err(Error::input(format!(
-            "{place}: no photos; give a folder with 2 to {MOST_VIEWS} photos ({READ}), or a video"
+            "{place}: no photos; give a folder with 2 to {MAX_VIEWS} photos ({READ}), or a video"
         ))),
         (true, Some(other)) => Err(Error::input(format!(
             "{}: this kind of image is not read and there are no photos beside it; save the photos as JPEG or PNG",
@@ -57,7 +57,7 @@ pub fn find(inputs: &[PathBuf]) -> Result<Found> {
     }
 }
 
-fn list(folder: &Path, found: &mut Found) -> Result<()> {
+fn list(folder: &Path, found: &mut FoundFiles) -> Result<()> {
     for entry in std::fs::read_dir(folder).map_err(Error::io(folder))? {
         let path = entry.map_err(Error::io(folder))?.path();
         let hidden = path.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
@@ -80,7 +80,7 @@ pub fn spread(count: usize, views: usize) -> Vec<usize> {
 }
 
 /// How many of `count` photos a run uses. `views` is what the user asked for.
-pub fn wanted(count: usize, views: Option<usize>) -> Result<usize> {
+pub fn photo_count(count: usize, views: Option<usize>) -> Result<usize> {
     let wanted = views.unwrap_or(count.min(DEFAULT_VIEWS));
     if wanted < 2 {
         return Err(Error::input(format!("--views {wanted}: at least 2 views are needed, 3 or 4 work best")));
@@ -90,9 +90,9 @@ pub fn wanted(count: usize, views: Option<usize>) -> Result<usize> {
             "--views {wanted}: only {count} photos were given; add photos or lower --views"
         )));
     }
-    if wanted > MOST_VIEWS {
+    if wanted > MAX_VIEWS {
         return Err(Error::input(format!(
-            "--views {wanted}: at most {MOST_VIEWS} views are supported; lower --views"
+            "--views {wanted}: at most {MAX_VIEWS} views are supported; lower --views"
         )));
     }
     Ok(wanted)
@@ -120,11 +120,11 @@ mod tests {
 
     #[test]
     fn view_counts_are_checked() {
-        assert_eq!(wanted(20, None).unwrap(), DEFAULT_VIEWS);
-        assert_eq!(wanted(3, None).unwrap(), 3);
-        assert_eq!(wanted(20, Some(6)).unwrap(), 6);
+        assert_eq!(photo_count(20, None).unwrap(), DEFAULT_VIEWS);
+        assert_eq!(photo_count(3, None).unwrap(), 3);
+        assert_eq!(photo_count(20, Some(6)).unwrap(), 6);
         for (n, views) in [(3, 4), (3, 1), (3, 0), (20, 17)] {
-            let e = wanted(n, Some(views)).unwrap_err();
+            let e = photo_count(n, Some(views)).unwrap_err();
             assert!(e.exit_code() == 2 && e.to_string().starts_with(&format!("--views {views}:")), "{e}");
         }
     }

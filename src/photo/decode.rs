@@ -1,7 +1,7 @@
 //! Bytes of an image file to upright pixels.
 use super::exif_tags::{Lens, lens};
 use super::heif;
-use super::kind::{Kind, LARGEST_DECODED, READ, TOO_LARGE, kind};
+use super::kind::{FileKind, LARGEST_DECODED, READ, TOO_LARGE, kind};
 use crate::scene::to_srgb;
 use crate::{Error, Result};
 use image::metadata::Orientation;
@@ -99,8 +99,8 @@ pub(super) fn decode(bytes: Vec<u8>, path: &Path) -> Result<Decoded> {
         return Err(fail("the file is empty (0 bytes); copy the photo again"));
     }
     match kind(&bytes, path) {
-        Kind::Image(format) => coded(bytes, format).map_err(|what| fail(&what)),
-        Kind::Heif => match heif::decode(&bytes) {
+        FileKind::Image(format) => coded(bytes, format).map_err(|what| fail(&what)),
+        FileKind::Heif => match heif::decode(&bytes) {
             Ok(heif::Image { pixels, exif }) => {
                 let size = (pixels.width(), pixels.height());
                 let lens = exif.map(|raw| lens(raw, size)).unwrap_or_default();
@@ -109,9 +109,9 @@ pub(super) fn decode(bytes: Vec<u8>, path: &Path) -> Result<Decoded> {
             Err(heif::Failure::Input(what)) => Err(fail(&what)),
             Err(heif::Failure::Missing(what)) => Err(Error::missing(named(&what))),
         },
-        Kind::Video => Err(fail("is a video, not a photo")),
-        Kind::Refused(what) => Err(fail(what)),
-        Kind::Unknown => Err(fail(&format!("is not an image; photos must be {READ}"))),
+        FileKind::Video => Err(fail("is a video, not a photo")),
+        FileKind::Refused(what) => Err(fail(what)),
+        FileKind::Unknown => Err(fail(&format!("is not an image; photos must be {READ}"))),
     }
 }
 

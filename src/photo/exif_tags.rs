@@ -1,21 +1,21 @@
-//! What EXIF says about the lens.
+//! Camera and lens in EXIF data.
 use exif::{Context, Field, In, Reader, Tag, Value};
 
 /// Diagonal of the 36 × 24 mm frame that "35 mm equivalent" refers to (CIPA DCG-001: equal diagonal angle of view).
 const FULL_FRAME_DIAGONAL_MM: f64 = 43.266615305567875;
 
-/// Shortest and longest believable focal length over the long side of the image: a 140° fisheye and a 1,000 mm
+/// Shortest and longest plausible focal length over the long side of the image: a 140° fisheye and a 1,000 mm
 /// telephoto lens on full frame. Tags outside are typing errors or placeholders.
-const BELIEVABLE: std::ops::Range<f64> = 0.18..28.0;
+const PLAUSIBLE_FOCAL: std::ops::Range<f64> = 0.18..28.0;
 
 /// Lens facts of one file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Lens {
-    /// Focal length in pixels of the upright original, from the tags that tell it.
+    /// Focal length in pixels of the upright original, from the tags that state it.
     pub focal: Option<f64>,
     /// "Make Model".
     pub camera_model: Option<String>,
-    /// Name of the lens, if it says that it is a fisheye.
+    /// Name of the lens, if it states that it is a fisheye.
     pub fisheye: Option<String>,
 }
 
@@ -73,11 +73,11 @@ fn number(fields: Fields, tag: Tag) -> Option<f64> {
 /// but hard to get wrong: the former count only when the latter agrees or is absent.
 fn focal(fields: Fields, (w, h): (u32, u32)) -> Option<f64> {
     let (w, h) = (w as f64, h as f64);
-    let believable = |f: &f64| BELIEVABLE.contains(&(f / w.max(h)));
+    let plausible = |f: &f64| PLAUSIBLE_FOCAL.contains(&(f / w.max(h)));
     let equivalent = number(fields, Tag::FocalLengthIn35mmFilm)
         .map(|mm| mm / FULL_FRAME_DIAGONAL_MM * w.hypot(h))
-        .filter(believable);
-    let plane = focal_plane(fields, w.max(h)).filter(believable);
+        .filter(plausible);
+    let plane = focal_plane(fields, w.max(h)).filter(plausible);
     match (plane, equivalent) {
         // 12 %: rounding of a short 35 mm figure plus the width-based equivalents that some makers write.
         (Some(p), Some(e)) if (p / e).ln().abs() < 0.12 => Some(p),

@@ -1,6 +1,7 @@
 //! HEIC, HEIF and AVIF through libheif's C interface, loaded at run time: its HEVC decoders are under the LGPL and
 //! patents, so splatvk runs without it and never links it. The signatures are those of libheif 1.12 (2021), unchanged since.
 use super::kind::{LARGEST_DECODED, TOO_LARGE};
+use super::support::Support;
 use image::{DynamicImage, ImageBuffer};
 use libloading::Library;
 use std::ffi::{CStr, c_char, c_int, c_void};
@@ -122,10 +123,10 @@ fn load() -> Result<Api, String> {
 }
 
 /// "libheif 1.15.1 · HEVC, AV1", or what is missing and what to do: `(found, advice)`.
-pub(super) fn status() -> (String, Option<String>) {
+pub(super) fn status() -> Support {
     let api = match api() {
         Ok(api) => api,
-        Err(what) => return ("HEIC and AVIF photos cannot be read".to_owned(), Some(what.to_owned())),
+        Err(what) => return Support::none("HEIC and AVIF photos cannot be read", what.to_owned()),
     };
     // SAFETY: a constant string of the library; the query takes any number.
     let (version, decoders) = unsafe {
@@ -138,7 +139,7 @@ pub(super) fn status() -> (String, Option<String>) {
     let found = if there.is_empty() { "no decoders".to_owned() } else { there };
     let advice =
         (!missing.is_empty()).then(|| format!("libheif has no decoder for {missing}; {INSTALL_DECODER}"));
-    (format!("libheif {version} · {found}"), advice)
+    Support { found: format!("libheif {version} · {found}"), advice }
 }
 
 /// The primary image of a file, upright: libheif applies the rotation and mirroring that the container states, and those
@@ -171,7 +172,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Image, Failure> {
         let mut handle = ptr::null_mut();
         check(api, (api.heif_context_get_primary_image_handle)(context.pointer, &mut handle))?;
         let handle = owned(handle, api.heif_image_handle_release);
-        let shape = Shape::of(api, handle.pointer)?;
+        let shape = HeifLayout::of(api, handle.pointer)?;
         let mut image = ptr::null_mut();
         let decode = api.heif_decode_image;
         check(api, decode(handle.pointer, &mut image, COLORSPACE_RGB, shape.chroma(), ptr::null()))?;
@@ -218,14 +219,14 @@ fn check(api: &Api, status: Status) -> Result<(), Failure> {
     })
 }
 
-/// How the samples are asked for.
-struct Shape {
+/// Layout of the samples that libheif is to return.
+struct HeifLayout {
     deep: bool,
     alpha: bool,
 }
 
-impl Shape {
-    unsafe fn of(api: &Api, handle: Pointer) -> Result<Shape, Failure> {
+impl HeifLayout {
+    unsafe fn of(api: &Api, handle: Pointer) -> Result<HeifLayout, Failure> {
         // SAFETY: the caller's valid handle.
         let (w, h, bits, alpha) = unsafe {
             (
@@ -236,7 +237,7 @@ impl Shape {
                     && (api.heif_image_handle_is_premultiplied_alpha)(handle) == 0,
             )
         };
-        let shape = Shape { deep: bits > 8, alpha };
+        let shape = HeifLayout { deep: bits > 8, alpha };
         let bytes = w.max(0) as u64 * h.max(0) as u64 * (3 + u64::from(alpha)) * (1 + u64::from(shape.deep));
         match bytes {
             0 => Err(Failure::Input("the image is damaged (no pixels); copy the photo again".to_owned())),

@@ -56,7 +56,7 @@ pub(super) fn is_foreign_name(path: &Path) -> bool {
 
 /// What reads a file, or why nothing does.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Kind {
+pub(super) enum FileKind {
     /// A codec of the `image` crate.
     Image(ImageFormat),
     /// HEIC, HEIF or AVIF: libheif.
@@ -68,14 +68,14 @@ pub(super) enum Kind {
 }
 
 /// The kind of a file's bytes; the name decides where they say nothing.
-pub(super) fn kind(bytes: &[u8], path: &Path) -> Kind {
+pub(super) fn kind(bytes: &[u8], path: &Path) -> FileKind {
     if let Some(brand) = brand(bytes) {
         return brand;
     }
     let starts = |magic: &[u8]| bytes.starts_with(magic);
     match image::guess_format(bytes) {
         Ok(ImageFormat::Tiff) if is_raw(bytes) || has_extension(path, &RAW) => {
-            return Kind::Refused(RAW_ADVICE);
+            return FileKind::Refused(RAW_ADVICE);
         }
         Ok(
             f @ (ImageFormat::Jpeg
@@ -84,33 +84,33 @@ pub(super) fn kind(bytes: &[u8], path: &Path) -> Kind {
             | ImageFormat::Tiff
             | ImageFormat::OpenExr
             | ImageFormat::Hdr),
-        ) => return Kind::Image(f),
+        ) => return FileKind::Image(f),
         _ => {}
     }
     if starts(b"GIF8") {
-        Kind::Refused(GIF)
+        FileKind::Refused(GIF)
     } else if starts(b"BM") {
-        Kind::Refused(BMP)
+        FileKind::Refused(BMP)
     } else if starts(b"\xff\x0a") || starts(b"\0\0\0\x0cJXL ") {
-        Kind::Refused(JXL)
+        FileKind::Refused(JXL)
     } else if starts(b"\0\0\0\x0cjP  ") {
-        Kind::Refused(JP2)
+        FileKind::Refused(JP2)
     } else if starts(b"8BPS") {
-        Kind::Refused(PSD)
+        FileKind::Refused(PSD)
     } else if starts(b"FUJIFILM") || starts(b"IIRO") || starts(b"IIU\0") || has_extension(path, &RAW) {
-        Kind::Refused(RAW_ADVICE)
+        FileKind::Refused(RAW_ADVICE)
     } else if starts(&[0x1a, 0x45, 0xdf, 0xa3])
         || (starts(b"RIFF") && bytes.get(8..12) == Some(b"AVI "))
         || is_video_name(path)
     {
-        Kind::Video
+        FileKind::Video
     } else {
-        Kind::Unknown
+        FileKind::Unknown
     }
 }
 
 /// Files of ISO boxes by their brands: HEIF, Canon's raw, or else a video.
-fn brand(bytes: &[u8]) -> Option<Kind> {
+fn brand(bytes: &[u8]) -> Option<FileKind> {
     const HEIF: [&[u8; 4]; 12] = [
         b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"mif2", b"msf1", b"miaf", b"avif",
         b"avis",
@@ -120,9 +120,9 @@ fn brand(bytes: &[u8]) -> Option<Kind> {
     }
     let main: &[u8; 4] = bytes.get(8..12)?.try_into().ok()?;
     Some(match main {
-        b"crx " => Kind::Refused(RAW_ADVICE),
-        brand if HEIF.contains(&brand) => Kind::Heif,
-        _ => Kind::Video,
+        b"crx " => FileKind::Refused(RAW_ADVICE),
+        brand if HEIF.contains(&brand) => FileKind::Heif,
+        _ => FileKind::Video,
     })
 }
 
@@ -150,21 +150,21 @@ mod tests {
     #[test]
     fn files_are_told_by_their_bytes() {
         use ImageFormat as F;
-        let cases: [(&[u8], &str, Kind); 14] = [
-            (b"\0\0\0\x18ftypmp42....", "a.jpg", Kind::Video),
-            (b"\0\0\0\x14ftypqt  ....", "a.heic", Kind::Video),
-            (b"\0\0\0\x18ftypheic....", "a.jpg", Kind::Heif),
-            (b"\0\0\0\x18ftypmif1....", "a.mov", Kind::Heif),
-            (b"\0\0\0\x18ftypavif....", "a", Kind::Heif),
-            (b"\0\0\0\x18ftypcrx ....", "a.cr3", Kind::Refused(RAW_ADVICE)),
-            (b"RIFF....WEBPVP8 ", "a.png", Kind::Image(F::WebP)),
-            (b"RIFF....AVI LIST", "a.png", Kind::Video),
-            (b"\x89PNG\r\n\x1a\n", "a.jpg", Kind::Image(F::Png)),
-            (b"GIF89a", "a.jpg", Kind::Refused(GIF)),
-            (b"BM......", "a.bmp", Kind::Refused(BMP)),
-            (b"hello world, not an image", "clip.MOV", Kind::Video),
-            (b"hello world, not an image", "a.txt", Kind::Unknown),
-            (b"#?RADIANCE\n", "a.hdr", Kind::Image(F::Hdr)),
+        let cases: [(&[u8], &str, FileKind); 14] = [
+            (b"\0\0\0\x18ftypmp42....", "a.jpg", FileKind::Video),
+            (b"\0\0\0\x14ftypqt  ....", "a.heic", FileKind::Video),
+            (b"\0\0\0\x18ftypheic....", "a.jpg", FileKind::Heif),
+            (b"\0\0\0\x18ftypmif1....", "a.mov", FileKind::Heif),
+            (b"\0\0\0\x18ftypavif....", "a", FileKind::Heif),
+            (b"\0\0\0\x18ftypcrx ....", "a.cr3", FileKind::Refused(RAW_ADVICE)),
+            (b"RIFF....WEBPVP8 ", "a.png", FileKind::Image(F::WebP)),
+            (b"RIFF....AVI LIST", "a.png", FileKind::Video),
+            (b"\x89PNG\r\n\x1a\n", "a.jpg", FileKind::Image(F::Png)),
+            (b"GIF89a", "a.jpg", FileKind::Refused(GIF)),
+            (b"BM......", "a.bmp", FileKind::Refused(BMP)),
+            (b"hello world, not an image", "clip.MOV", FileKind::Video),
+            (b"hello world, not an image", "a.txt", FileKind::Unknown),
+            (b"#?RADIANCE\n", "a.hdr", FileKind::Image(F::Hdr)),
         ];
         for (bytes, name, expected) in cases {
             assert_eq!(kind(bytes, Path::new(name)), expected, "{name}");
@@ -196,12 +196,12 @@ mod tests {
             let tags: Vec<_> = tags.iter().map(|(t, v)| (Tag(Context::Tiff, *t), v.clone())).collect();
             kind(&block(&tags), Path::new("a.tif"))
         };
-        assert_eq!(tiff(&[(0x100, long(10))]), Kind::Image(ImageFormat::Tiff));
+        assert_eq!(tiff(&[(0x100, long(10))]), FileKind::Image(ImageFormat::Tiff));
         // A page of a multi-page file may be called reduced; only with the real image elsewhere is it a thumbnail.
-        assert_eq!(tiff(&[(0xfe, long(1))]), Kind::Image(ImageFormat::Tiff));
-        assert_eq!(tiff(&[(0xc612, Value::Byte(vec![1, 4, 0, 0]))]), Kind::Refused(RAW_ADVICE));
-        assert_eq!(tiff(&[(0xfe, long(1)), (0x14a, long(99))]), Kind::Refused(RAW_ADVICE));
-        assert_eq!(tiff(&[(0x106, Value::Short(vec![32803]))]), Kind::Refused(RAW_ADVICE));
-        assert_eq!(kind(b"II*\0\x10\0\0\0CR\x02\0", Path::new("a.jpg")), Kind::Refused(RAW_ADVICE));
+        assert_eq!(tiff(&[(0xfe, long(1))]), FileKind::Image(ImageFormat::Tiff));
+        assert_eq!(tiff(&[(0xc612, Value::Byte(vec![1, 4, 0, 0]))]), FileKind::Refused(RAW_ADVICE));
+        assert_eq!(tiff(&[(0xfe, long(1)), (0x14a, long(99))]), FileKind::Refused(RAW_ADVICE));
+        assert_eq!(tiff(&[(0x106, Value::Short(vec![32803]))]), FileKind::Refused(RAW_ADVICE));
+        assert_eq!(kind(b"II*\0\x10\0\0\0CR\x02\0", Path::new("a.jpg")), FileKind::Refused(RAW_ADVICE));
     }
 }

@@ -1,4 +1,4 @@
-//! What one photo's exposure, white balance and lens do to the scene's light, and how to take it out.
+//! Exposure, white balance and vignetting of one photo relative to the scene's light, and their removal.
 use crate::scene::{RgbImage, to_linear, to_srgb};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -12,9 +12,9 @@ pub struct Light {
     /// Vignetting as ln per r² and r⁴; 0 = none.
     pub falloff: [f64; 2],
     /// One standard deviation of the exposure, EV; 0 where nothing was estimated.
-    pub doubt_ev: f64,
+    pub sigma_ev: f64,
     /// One standard deviation of the corner's brightness, as a share of it; 0 where nothing was estimated.
-    pub doubt_corner: f64,
+    pub sigma_corner: f64,
 }
 
 impl Default for Light {
@@ -25,7 +25,7 @@ impl Default for Light {
 
 impl Light {
     /// The scene's own light: nothing to take out.
-    pub const NONE: Light = Light { gain: [1.0; 3], falloff: [0.0; 2], doubt_ev: 0.0, doubt_corner: 0.0 };
+    pub const NONE: Light = Light { gain: [1.0; 3], falloff: [0.0; 2], sigma_ev: 0.0, sigma_corner: 0.0 };
 
     /// True where the photo is left as it is.
     pub fn is_none(&self) -> bool {

@@ -1,9 +1,9 @@
 //! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (docs/method.md#photos).
+mod border;
 mod candidate;
 mod choose;
 mod decode;
 mod exif_tags;
-mod frame;
 mod heif;
 mod kind;
 pub mod light;
@@ -11,11 +11,12 @@ mod read;
 mod resize;
 mod sizes;
 mod straighten;
+mod support;
 mod video;
 
+pub use border::PlainBorder;
 pub use candidate::{Candidate, gather};
-pub use choose::{DEFAULT_VIEWS, Found, MOST_VIEWS, find, spread, wanted};
-pub use frame::Frame;
+pub use choose::{DEFAULT_VIEWS, FoundFiles, MAX_VIEWS, find, photo_count, spread};
 pub use kind::stem;
 pub use light::Light;
 pub use read::{
@@ -25,6 +26,7 @@ pub use read::{
 pub use resize::Kernel;
 pub use sizes::sizes_of;
 pub use straighten::Straightening;
+pub use support::Support;
 
 use crate::progress::Progress;
 use crate::scene::RgbImage;
@@ -34,20 +36,20 @@ use sha2::{Digest, Sha256};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// What the machine has for HEIC and AVIF photos, in words, and what to do about what it lacks.
-pub fn heif_support() -> (String, Option<String>) {
+/// Support for HEIC and AVIF photos.
+pub fn heif_support() -> Support {
     heif::status()
 }
 
-/// What the machine has for videos, in words, and what to do about what it lacks.
-pub fn video_support() -> (String, Option<String>) {
+/// Support for videos.
+pub fn video_support() -> Support {
     video::status()
 }
 
 /// Finds and reads all photos of files and folders at [`MAX_SIZE`]; [`crate::pose::choose::photos`] chooses among too many.
 pub fn load_all(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Photo>> {
     let found = gather(inputs, progress)?;
-    wanted(found.len(), Some(found.len()))?;
+    photo_count(found.len(), Some(found.len()))?;
     load_each(&found, MAX_SIZE, progress)
 }
 
@@ -69,7 +71,7 @@ pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progr
     }
     let photos = all.into_iter().collect::<Result<Vec<_>>>()?;
     progress.end();
-    let framed: Vec<&str> = photos.iter().filter(|p| !p.frame.is_none()).map(|p| p.stem.as_str()).collect();
+    let framed: Vec<&str> = photos.iter().filter(|p| !p.border.is_none()).map(|p| p.stem.as_str()).collect();
     if !framed.is_empty() {
         progress.warn(&format!("plain frame around the picture left out: {}", framed.join(", ")));
     }
@@ -95,7 +97,7 @@ fn mostly_above_white(image: &RgbImage) -> bool {
 /// EXIF focal lengths of one camera that differ more come from different zoom settings.
 const SAME_ZOOM: f64 = 0.03;
 
-/// Number of the camera of every photo, as far as the files tell: photos of one size, camera model and zoom have one, photos
+/// Number of the camera of every photo, as far as the files state it: photos of one size, camera model and zoom have one, photos
 /// without EXIF share by size. Portrait and landscape of one camera share too.
 pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
     let size = |p: &Photo| {
@@ -122,8 +124,8 @@ pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
 /// Refuses sets that cannot give geometry (one photo, or the same photo twice) or that would mix up files (the same name
 /// twice). [`load_all`] has done it; for photos from memory.
 pub fn check_set(photos: &[Photo]) -> Result<()> {
-    if !(2..=MOST_VIEWS).contains(&photos.len()) {
-        return Err(Error::input(format!("{} photos; give 2 to {MOST_VIEWS}", photos.len())));
+    if !(2..=MAX_VIEWS).contains(&photos.len()) {
+        return Err(Error::input(format!("{} photos; give 2 to {MAX_VIEWS}", photos.len())));
     }
     let digests: Vec<_> =
         photos.iter().map(|p| Sha256::digest(bytemuck::cast_slice(&p.image.data))).collect();

@@ -1,5 +1,5 @@
 //! One photo from its file.
-use super::frame::Frame;
+use super::border::PlainBorder;
 use super::kind::stem;
 use super::light::Light;
 use super::straighten::Straightening;
@@ -35,15 +35,15 @@ pub struct Photo {
     pub path: PathBuf,
     /// [`stem`] of the file: the key that joins masks, cameras and renders.
     pub stem: String,
-    /// Upright pixels at working resolution; on a plain frame, the nearest pixels of the picture.
+    /// Upright pixels at working resolution; on a plain border, the nearest pixels of the picture.
     pub image: RgbImage,
-    /// The white or black frame that was around the picture, working pixels.
-    pub frame: Frame,
+    /// The white or black border that was around the picture, working pixels.
+    pub border: PlainBorder,
     /// Upright size of the file, pixels.
     pub original_size: (u32, u32),
     /// Original (upright) pixels → working pixels.
     pub to_working: Affine,
-    /// Focal length from EXIF in working pixels, if the file tells.
+    /// Focal length from EXIF in working pixels, if the file states it.
     pub exif_focal: Option<f64>,
     /// Luma of the photo at more pixels than the working image has, for measuring positions; where there are more.
     #[serde(skip)]
@@ -154,13 +154,13 @@ fn working(
     let (working_w, working_h) = working_size(w, h, max_size);
     let mut image = resize::area_average((w, h), (working_w, working_h), &at);
     let fine = fine((w, h), (working_w, working_h), &at);
-    let frame = Frame::of(&image);
-    frame.continue_picture(&mut image);
+    let border = PlainBorder::of(&image);
+    border.continue_picture(&mut image);
     Ok(Photo {
         path: name.to_path_buf(),
         stem: stem(&name.to_string_lossy()).to_string(),
         image,
-        frame,
+        border,
         original_size: (w as u32, h as u32),
         to_working: Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32)),
         exif_focal: None,
@@ -184,7 +184,7 @@ pub(super) fn check_size(name: &Path, (w, h): (usize, usize)) -> Result<()> {
 /// Largest long side of [`Photo::fine`], pixels.
 const FINE: usize = 3072;
 /// Fewer more pixels than this show nothing new.
-const LEAST_GAIN: f64 = 1.25;
+const MIN_GAIN: f64 = 1.25;
 
 fn fine(
     (w, h): (usize, usize),
@@ -193,7 +193,7 @@ fn fine(
 ) -> Option<Arc<Plane<f32>>> {
     let share = (FINE as f64 / w.max(h) as f64).min(1.0);
     let size = ((w as f64 * share).round() as usize, (h as f64 * share).round() as usize);
-    (size.0 as f64 > LEAST_GAIN * working.0 as f64)
+    (size.0 as f64 > MIN_GAIN * working.0 as f64)
         .then(|| Arc::new(resize::area_average((w, h), size, at).luma()))
 }
 

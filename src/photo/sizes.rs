@@ -12,7 +12,7 @@ const DECODED_AT_ONCE: u64 = 640 << 20;
 /// Bytes of a decoded pixel: 8-bit RGB, and as much again that some decoders hold while they work.
 const DECODED_PIXEL: u64 = 6;
 
-/// Taken for a photo whose size only its decoder tells (HEIC, frames of videos): the 48 megapixels of today's phones.
+/// Taken for a photo whose size only its decoder finds (HEIC, frames of videos): the 48 megapixels of today's phones.
 const ASSUMED: (usize, usize) = (8064, 6048);
 
 /// Upright (width, height) of photos that have not been read yet.

@@ -1,4 +1,4 @@
-//! Photos as a pinhole would have taken them.
+//! Photos resampled to a pinhole without distortion.
 use crate::scene::{Lens, Plane, RgbImage};
 use glam::DVec2;
 use rayon::prelude::*;

@@ -1,5 +1,6 @@
 //! Frames of a video through `ffprobe` and `ffmpeg`, as child processes: without a shell, reading local files only, within
 //! bounded time and memory.
+use super::support::Support;
 use crate::progress::Progress;
 use crate::{Error, Result};
 use std::ffi::OsString;
@@ -15,7 +16,7 @@ const CANDIDATES: u64 = 60;
 const LONGEST: Duration = Duration::from_secs(120);
 
 /// Largest frame, pixels: beyond 8K.
-const MOST_PIXELS: u64 = 64 << 20;
+const MAX_PIXELS: u64 = 64 << 20;
 
 /// Containers that cameras and phones write. Playlists are not among them: they name other files.
 const CONTAINERS: &str = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,asf";
@@ -35,16 +36,16 @@ pub(super) struct Video {
 }
 
 /// "ffmpeg 5.1.9", or what is missing and what to do: `(found, advice)`.
-pub(super) fn status() -> (String, Option<String>) {
+pub(super) fn status() -> Support {
     let version = |program: &str| {
         let output = Command::new(program).arg("-version").stdin(Stdio::null()).output().ok()?;
         let text = String::from_utf8_lossy(&output.stdout).into_owned();
         output.status.success().then(|| text.split_whitespace().nth(2).unwrap_or("").to_owned())
     };
     match (version("ffmpeg"), version("ffprobe")) {
-        (Some(version), Some(_)) => (format!("ffmpeg {version}"), None),
-        (None, _) => ("videos cannot be read".to_owned(), Some(format!("ffmpeg is not there; {INSTALL}"))),
-        (_, None) => ("videos cannot be read".to_owned(), Some(format!("ffprobe is not there; {INSTALL}"))),
+        (Some(version), Some(_)) => Support { found: format!("ffmpeg {version}"), advice: None },
+        (None, _) => Support::none("videos cannot be read", format!("ffmpeg is not there; {INSTALL}")),
+        (_, None) => Support::none("videos cannot be read", format!("ffprobe is not there; {INSTALL}")),
     }
 }
 
@@ -66,7 +67,7 @@ impl Video {
         if w * h == 0 {
             return Err(bad("there is no picture in this video"));
         }
-        if w.saturating_mul(h) > MOST_PIXELS {
+        if w.saturating_mul(h) > MAX_PIXELS {
             return Err(bad(&format!("{w} × {h} pixels are too many for a video; scale it down")));
         }
         let duration = number(&stream["duration"]).or_else(|| number(&found["format"]["duration"]));
@@ -109,7 +110,7 @@ impl Video {
         }
         command.args(["-c:v", "png", "-pix_fmt", "rgb24", "-f", "image2pipe", "pipe:1"]);
         // Uncompressed, plus the PNG's own framing.
-        output(command, &self.path, 3 * MOST_PIXELS + (1 << 20), progress)
+        output(command, &self.path, 3 * MAX_PIXELS + (1 << 20), progress)
     }
 }
 

@@ -33,14 +33,14 @@ pub struct Graph<'g> {
     nodes: Vec<Node<'g>>,
 }
 
-/// What a graph made.
-pub struct Made {
+/// What [`Graph::run`] returns: the targets.
+pub struct Outputs {
     values: Vec<Option<Value>>,
     seconds: Vec<f64>,
 }
 
-impl Made {
-    /// An output that was asked for.
+impl Outputs {
+    /// The output of a target.
     pub fn get<T: Send + Sync + 'static>(&self, output: Output<T>) -> Result<Arc<T>> {
         let value = self.values[output.node].clone().and_then(|v| v.downcast::<T>().ok());
         value.ok_or_else(|| Error::work("pipeline: an output was not asked for"))
@@ -51,7 +51,7 @@ impl Made {
         self.seconds[output.node]
     }
 
-    /// Takes out an output that was asked for, of a graph whose store does not hold it, too.
+    /// Takes out the output of a target that no store in memory holds too.
     pub fn take<T: Send + Sync + 'static>(&mut self, output: Output<T>) -> Result<T> {
         let value = self.get(output);
         self.values[output.node] = None;
@@ -100,32 +100,32 @@ impl<'g> Graph<'g> {
         registry: &Registry,
         store: &Store,
         progress: &Recorded,
-    ) -> Result<Made> {
+    ) -> Result<Outputs> {
         let keys = self.keys(device, registry);
         let mut state = self.planned(targets, store, &keys);
         targets.iter().for_each(|t| state.users[*t] += 1);
-        self.say_what_is_kept(&state, progress);
+        self.report_kept(&state, progress);
         let shared = Shared { graph: self, keys, store, state: Mutex::new(state), changed: Condvar::new() };
-        let beside = progress.beside();
-        let front = Context { device, registry, progress };
-        let (front, other) = std::thread::scope(|scope| {
+        let processor_progress = progress.second_lane();
+        let context = Context { device, registry, progress };
+        let (device_lane, processor_lane) = std::thread::scope(|scope| {
             let other = scope.spawn(|| {
-                let context = Context { device, registry, progress: beside.as_ref() };
+                let context = Context { device, registry, progress: processor_progress.as_ref() };
                 shared.work(Lane::Processor, &context, progress)
             });
-            let front = shared.work(Lane::Device, &front, progress);
-            // A panic over there goes on here, as if there had been one thread.
-            (front, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            let device_lane = shared.work(Lane::Device, &context, progress);
+            // A panic of the other thread continues in this one.
+            (device_lane, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
         });
         let state = shared.state.into_inner().unwrap_or_else(PoisonError::into_inner);
-        if let Err(error) = both(front, other) {
+        if let Err(error) = both(device_lane, processor_lane) {
             if !state.kept.is_empty() {
                 let names = state.kept.join(", ");
                 progress.inform(&format!("kept: {names}; the same command with --resume goes on from there"));
             }
             return Err(error);
         }
-        Ok(Made { values: state.values, seconds: state.seconds })
+        Ok(Outputs { values: state.values, seconds: state.seconds })
     }
 
     fn keys(&self, device: &Device, registry: &Registry) -> Vec<Key> {
@@ -157,8 +157,8 @@ impl<'g> Graph<'g> {
         let mut asked: BTreeSet<usize> = targets.iter().copied().collect();
         // Inputs precede the stages that need them.
         while let Some(node) = asked.pop_last() {
-            if let Some((value, seconds)) = store.recall(&keys[node]) {
-                // Its warnings have been heard in this process.
+            if let Some((value, seconds)) = store.memory_get(&keys[node]) {
+                // Its warnings were given in this process.
                 (state.values[node], state.seconds[node]) = (Some(value), seconds);
             } else if let Some((warnings, value)) = (self.nodes[node].load)(store, &keys[node]) {
                 (state.warnings[node], state.values[node]) = (warnings, Some(value));
@@ -176,12 +176,12 @@ impl<'g> Graph<'g> {
     }
 
     /// Names the stages that need not run, and repeats what was warned of when they did.
-    fn say_what_is_kept(&self, state: &State, progress: &dyn Progress) {
+    fn report_kept(&self, state: &State, progress: &dyn Progress) {
         if !state.kept.is_empty() {
             progress.inform(&format!("kept from an earlier run: {}", state.kept.join(", ")));
         }
-        let mut said = BTreeSet::new();
-        let warnings = state.warnings.iter().flatten().filter(|w| said.insert(w.as_str()));
+        let mut repeated = BTreeSet::new();
+        let warnings = state.warnings.iter().flatten().filter(|w| repeated.insert(w.as_str()));
         warnings.for_each(|w| progress.warn(w));
     }
 }
@@ -227,23 +227,24 @@ impl Shared<'_, '_> {
     /// Runs the stages of a lane until none is left or one has failed anywhere.
     fn work(&self, lane: Lane, context: &Context, progress: &Recorded) -> Result<()> {
         // Also when a stage panics.
-        let failing = Failing(self, progress);
+        let guard = StopOnDrop { shared: self, progress };
         while let Some((node, inputs)) = self.next(lane) {
             let at = &self.graph.nodes[node];
             let work = at.work.lock().unwrap_or_else(PoisonError::into_inner).take();
             let work = work.ok_or_else(|| Error::work("pipeline: a graph runs once"))?;
             let checkpoint = self.store.checkpoint(at.name, &self.keys[node]);
-            let noting = Noting { inner: context.progress, warnings: Mutex::default(), checkpoint };
+            let recorder =
+                WarningRecorder { inner: context.progress, warnings: Mutex::default(), checkpoint };
             let began = Instant::now();
-            let value = work(&inputs, &Context { progress: &noting, ..*context })?;
+            let value = work(&inputs, &Context { progress: &recorder, ..*context })?;
             drop(inputs);
-            let mut warnings = noting.warnings.lock().unwrap_or_else(PoisonError::into_inner).clone();
-            // Those of its inputs as well: with its output kept they need not be looked at again.
+            let mut warnings = recorder.warnings.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            // Those of its inputs as well: with its output kept they need not be read again.
             warnings.splice(0..0, at.needs.iter().flat_map(|n| self.lock().warnings[*n].clone()));
             let seconds = began.elapsed().as_secs_f64();
-            self.store.remember(&self.keys[node], &value, seconds);
+            self.store.memory_put(&self.keys[node], &value, seconds);
             let kept = (at.save)(self.store, &self.keys[node], &warnings, &value)?;
-            noting.checkpoint.iter().for_each(Checkpoint::remove);
+            recorder.checkpoint.iter().for_each(Checkpoint::remove);
             let mut state = self.lock();
             state.kept.extend(kept.then_some(at.name));
             (state.values[node], state.seconds[node]) = (Some(value), seconds);
@@ -256,8 +257,8 @@ impl Shared<'_, '_> {
             }
             self.changed.notify_all();
         }
-        // The lane is done, or the other one has failed and said so.
-        std::mem::forget(failing);
+        // The lane is done, or the other one has failed and has set the flag.
+        std::mem::forget(guard);
         Ok(())
     }
 
@@ -283,13 +284,13 @@ impl Shared<'_, '_> {
 }
 
 /// Passes everything on and keeps the warnings.
-struct Noting<'a> {
+struct WarningRecorder<'a> {
     inner: &'a dyn Progress,
     warnings: Mutex<Vec<String>>,
     checkpoint: Option<Checkpoint>,
 }
 
-impl Progress for Noting<'_> {
+impl Progress for WarningRecorder<'_> {
     fn begin(&self, stage: &'static str, steps: u64) {
         self.inner.begin(stage, steps);
     }
@@ -315,25 +316,28 @@ impl Progress for Noting<'_> {
     fn checkpoint(&self) -> Option<&Checkpoint> {
         self.checkpoint.as_ref()
     }
-    fn beside(&self) -> Box<dyn Progress + '_> {
-        self.inner.beside()
+    fn second_lane(&self) -> Box<dyn Progress + '_> {
+        self.inner.second_lane()
     }
 }
 
 /// Stops the other lane when dropped.
-struct Failing<'s, 'r>(&'s Shared<'s, 'r>, &'s Recorded<'s>);
+struct StopOnDrop<'s, 'g> {
+    shared: &'s Shared<'s, 'g>,
+    progress: &'s Recorded<'s>,
+}
 
-impl Drop for Failing<'_, '_> {
+impl Drop for StopOnDrop<'_, '_> {
     fn drop(&mut self) {
-        self.0.lock().failed = true;
-        self.0.changed.notify_all();
-        self.1.stop();
+        self.shared.lock().failed = true;
+        self.shared.changed.notify_all();
+        self.progress.stop();
     }
 }
 
 /// The results of two lanes; of two errors the one that is not the mere consequence of the other.
-fn both<A, B>(front: Result<A>, beside: Result<B>) -> Result<(A, B)> {
-    match (front, beside) {
+fn both<A, B>(device: Result<A>, processor: Result<B>) -> Result<(A, B)> {
+    match (device, processor) {
         (Ok(a), Ok(b)) => Ok((a, b)),
         (Err(Error::Cancelled), Err(e)) | (Err(e), _) | (_, Err(e)) => Err(e),
     }

@@ -1,4 +1,4 @@
-//! What stages hand to each other.
+//! Typed outputs and inputs of stages.
 use std::any::Any;
 use std::marker::PhantomData;
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! What a stage says of itself.
+//! The interface of a stage.
 use super::output::Inputs;
 use super::store::Codec;
 use crate::Result;

@@ -43,7 +43,7 @@ pub struct Codec<T> {
     pub read: fn(&[u8]) -> Option<T>,
 }
 
-/// The codec of everything that serde knows.
+/// The codec of everything that serde can write.
 pub fn kept<T: Serialize + DeserializeOwned>() -> Option<Codec<T>> {
     let write = |value: &T| postcard::to_stdvec(value).map_err(unwritable);
     Some(Codec { write, read: |bytes| postcard::from_bytes(bytes).ok() })
@@ -79,13 +79,13 @@ impl Store {
     }
 
     /// What this process has made, and the seconds that it took.
-    pub(super) fn recall(&self, key: &Key) -> Option<(Value, f64)> {
+    pub(super) fn memory_get(&self, key: &Key) -> Option<(Value, f64)> {
         let memory = self.memory.as_ref()?.lock().unwrap_or_else(PoisonError::into_inner);
         memory.get(&key.0).cloned()
     }
 
-    /// Keeps it for [`Store::recall`], in a store that does.
-    pub(super) fn remember(&self, key: &Key, value: &Value, seconds: f64) {
+    /// Keeps it for [`Store::memory_get`], in a store that does.
+    pub(super) fn memory_put(&self, key: &Key, value: &Value, seconds: f64) {
         if let Some(memory) = &self.memory {
             memory
                 .lock()
@@ -107,7 +107,7 @@ impl Store {
     /// What was warned of while it was made, and the output.
     pub(super) fn load<T>(&self, name: &str, key: &Key, codec: &Codec<T>) -> Option<(Vec<String>, T)> {
         let folder = self.folder.as_ref().filter(|_| self.resume)?;
-        let bytes = files::read_sealed(&Store::file(folder, name, key))?;
+        let bytes = files::read_with_checksum(&Store::file(folder, name, key))?;
         let (warnings, body) = postcard::take_from_bytes(&bytes).ok()?;
         Some((warnings, (codec.read)(body)?))
     }
@@ -125,7 +125,7 @@ impl Store {
         let file = Store::file(folder, name, key);
         let warnings = postcard::to_stdvec(warnings).map_err(unwritable)?;
         let body = [warnings, (codec.write)(value)?].concat();
-        let written = files::write_sealed(&file, &body).is_ok();
+        let written = files::write_with_checksum(&file, &body).is_ok();
         if written {
             files::prune(&file, EXTENSION, CAPACITY);
         }

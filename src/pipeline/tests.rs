@@ -1,4 +1,4 @@
-//! Graphs of small stages: what runs, beside what, and what is not run again.
+//! Graphs of small stages: what runs, in parallel to what, and what is not run again.
 use super::*;
 use crate::Error;
 use crate::Result;
@@ -62,7 +62,7 @@ impl Machine {
         Machine { device: Device::open(None).unwrap(), registry: Registry::open(None).unwrap() }
     }
 
-    fn run(&self, graph: &Graph, targets: &[usize], store: &Store) -> Result<(Made, Vec<String>)> {
+    fn run(&self, graph: &Graph, targets: &[usize], store: &Store) -> Result<(Outputs, Vec<String>)> {
         let progress = Recorded::new(&Silent);
         let made = graph.run(targets, &self.device, &self.registry, store, &progress)?;
         Ok((made, progress.warnings()))
@@ -84,7 +84,7 @@ fn chain(machine: &Machine, store: &Store, last: u64) -> ([usize; 3], u64, Vec<S
 #[test]
 fn finished_stages_are_not_run_again_and_their_warnings_stay() {
     let (machine, folder) = (Machine::new(), tempfile::tempdir().unwrap());
-    let kept = |resume| Store::at(folder.path(), resume, PATIENCE);
+    let kept = |resume| Store::at(folder.path(), resume, TIMEOUT);
     assert_eq!(chain(&machine, &kept(true), 2).0, [1, 1, 1]);
     // Without asking for it everything runs.
     assert_eq!(chain(&machine, &kept(false), 2).0, [1, 1, 1]);
@@ -113,25 +113,25 @@ fn graphs_of_one_store_in_memory_share_their_stages() {
     assert_eq!((runs, value, warnings.len()), ([1, 1, 1], 8, 2));
     let (runs, value, warnings) = chain(&machine, &store, 2);
     assert_eq!((runs, value), ([0, 0, 0], 8));
-    assert!(warnings.is_empty(), "heard in this process: {warnings:?}");
+    assert!(warnings.is_empty(), "given in this process: {warnings:?}");
     assert_eq!(chain(&machine, &store, 3).0, [0, 0, 1]);
-    // Another store knows nothing of it.
+    // Another store does not have it.
     assert_eq!(chain(&machine, &Store::in_memory(), 3).0, [1, 1, 1]);
 }
 
-/// Waits for a word from elsewhere, then says one.
-struct Talk {
-    hear: Option<mpsc::Receiver<()>>,
-    say: Option<mpsc::Sender<()>>,
+/// Sends to the other stage, then waits for its message.
+struct Handshake {
+    receive: Option<mpsc::Receiver<()>>,
+    send: Option<mpsc::Sender<()>>,
     end: fn(&Context) -> Result<()>,
 }
 
 /// Long enough for any machine; only a wrong schedule waits for it.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
-macro_rules! talking {
+macro_rules! handshake_stage {
     ($name:ident, $lane:expr) => {
-        struct $name(Mutex<Talk>);
+        struct $name(Mutex<Handshake>);
         impl Stage for $name {
             const NAME: &'static str = stringify!($name);
             const LANE: Lane = $lane;
@@ -141,45 +141,45 @@ macro_rules! talking {
                 String::new()
             }
             fn run(self, (): (), context: &Context) -> Result<()> {
-                let talk = self.0.into_inner().unwrap();
-                if let Some(say) = talk.say {
-                    say.send(()).unwrap();
+                let handshake = self.0.into_inner().unwrap();
+                if let Some(send) = handshake.send {
+                    send.send(()).unwrap();
                 }
-                if let Some(hear) = talk.hear {
-                    hear.recv_timeout(PATIENCE).map_err(|_| Error::work("nobody spoke"))?;
+                if let Some(receive) = handshake.receive {
+                    receive.recv_timeout(TIMEOUT).map_err(|_| Error::work("no message"))?;
                 }
-                (talk.end)(context)
+                (handshake.end)(context)
             }
         }
     };
 }
 
-talking!(OnDevice, Lane::Device);
-talking!(OnProcessor, Lane::Processor);
+handshake_stage!(OnDevice, Lane::Device);
+handshake_stage!(OnProcessor, Lane::Processor);
 
 fn pair(ends: [fn(&Context) -> Result<()>; 2]) -> Result<()> {
     let machine = Machine::new();
     let (there, back) = (mpsc::channel(), mpsc::channel());
     let mut graph = Graph::default();
-    let front = Talk { hear: Some(back.1), say: Some(there.0), end: ends[0] };
-    let beside = Talk { hear: Some(there.1), say: Some(back.0), end: ends[1] };
-    let front = graph.add(OnDevice(Mutex::new(front)), ());
-    let beside = graph.add(OnProcessor(Mutex::new(beside)), ());
-    machine.run(&graph, &[front.target(), beside.target()], &Store::none()).map(|_| ())
+    let device = Handshake { receive: Some(back.1), send: Some(there.0), end: ends[0] };
+    let processor = Handshake { receive: Some(there.1), send: Some(back.0), end: ends[1] };
+    let device = graph.add(OnDevice(Mutex::new(device)), ());
+    let processor = graph.add(OnProcessor(Mutex::new(processor)), ());
+    machine.run(&graph, &[device.target(), processor.target()], &Store::none()).map(|_| ())
 }
 
 /// Until it is told to stop.
 fn long(context: &Context) -> Result<()> {
     let started = std::time::Instant::now();
-    while started.elapsed() < PATIENCE {
+    while started.elapsed() < TIMEOUT {
         context.progress.check()?;
         std::thread::sleep(Duration::from_millis(1));
     }
-    Err(Error::work("nobody stopped it"))
+    Err(Error::work("was not stopped"))
 }
 
 #[test]
-fn lanes_work_beside_each_other_and_the_cause_of_a_stop_is_reported() {
+fn lanes_work_in_parallel_and_the_cause_of_a_stop_is_reported() {
     pair([|_| Ok(()), |_| Ok(())]).unwrap();
     let error = |ends| pair(ends).unwrap_err().to_string();
     assert_eq!(error([long, |_| Err(Error::input("bad mask"))]), "bad mask");

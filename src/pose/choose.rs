@@ -1,10 +1,10 @@
-//! Which photos a run uses when there are more than it wants: sharp ones that overlap, from different places, and that
+//! Which photos a run uses when more are given: sharp ones that overlap, from different places, and that
 //! together show what all show.
-use super::matching::{Features, mutual_matches, valid_area};
-use super::overlap::{self, Link};
+use super::matching::{Keypoints, mutual_matches, valid_area};
+use super::overlap::{self, SimilarityInliers};
 use super::sift;
 use crate::Result;
-use crate::photo::{self, Candidate, Frame};
+use crate::photo::{self, Candidate, PlainBorder};
 use crate::progress::Progress;
 use crate::scene::RgbImage;
 use rayon::prelude::*;
@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Long side at which sharpness is judged: near the working resolution, so that what is blurred there is blurred here.
 const SHARPNESS_SIDE: usize = 1000;
-/// Long side at which corners are matched: enough to tell overlap, and cheap enough for a hundred photos.
+/// Long side at which corners are matched: enough to measure overlap, and cheap enough for a hundred photos.
 const FEATURE_SIDE: usize = 320;
 /// Corners per photo. Matching costs their square: 5 ms a pair.
 const FEATURES: usize = 300;
@@ -41,8 +41,24 @@ const BLURRED: f64 = 0.6;
 pub struct Choice {
     /// Names of the photos used, in order.
     pub used: Vec<String>,
-    /// Names of the others, each with the reason.
-    pub left_out: Vec<(String, Reason)>,
+    /// The others, each with the reason.
+    pub left_out: Vec<LeftOut>,
+}
+
+/// A photo that is not used. Stored as `[photo, reason]`.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(into = "(String, Reason)")]
+pub struct LeftOut {
+    /// Its name.
+    pub photo: String,
+    /// Why it is not used.
+    pub reason: Reason,
+}
+
+impl From<LeftOut> for (String, Reason) {
+    fn from(l: LeftOut) -> (String, Reason) {
+        (l.photo, l.reason)
+    }
 }
 
 /// Why a photo is not used.
@@ -52,11 +68,14 @@ pub enum Reason {
     /// Less sharp than the others.
     Blurred,
     /// Too few matches with the photos used.
-    NothingInCommon,
+    #[serde(rename = "nothing_in_common")]
+    NoOverlap,
     /// The same picture, or taken from the same place, as this one.
-    NearlyTheSameAs(String),
-    /// The others show what it shows.
-    AddsLittle,
+    #[serde(rename = "nearly_the_same_as")]
+    Duplicate(String),
+    /// The photos used show most of what it shows.
+    #[serde(rename = "adds_little")]
+    LittleNewArea,
 }
 
 /// Finds the photos of files, folders and videos and chooses `views` of them (`None`: all, at most
@@ -67,7 +86,7 @@ pub fn photos(
     progress: &dyn Progress,
 ) -> Result<(Vec<Candidate>, Option<Choice>)> {
     let candidates = photo::gather(inputs, progress)?;
-    let wanted = photo::wanted(candidates.len(), views)?;
+    let wanted = photo::photo_count(candidates.len(), views)?;
     if wanted == candidates.len() {
         return Ok((candidates, None));
     }
@@ -87,13 +106,13 @@ impl Choice {
             if more > 0 { format!("{shown} and {more} more") } else { shown }
         };
         let of = |wanted: &dyn Fn(&Reason) -> bool| -> Vec<&str> {
-            self.left_out.iter().filter(|(_, r)| wanted(r)).map(|(n, _)| n.as_str()).collect()
+            self.left_out.iter().filter(|l| wanted(&l.reason)).map(|l| l.photo.as_str()).collect()
         };
         let mut parts = Vec::new();
         for (reason, words) in [
             (Reason::Blurred, "blurred"),
-            (Reason::NothingInCommon, "too little in common with the others"),
-            (Reason::AddsLittle, "the others show it"),
+            (Reason::NoOverlap, "too little in common with the others"),
+            (Reason::LittleNewArea, "the others show it"),
         ] {
             let names = of(&|r| *r == reason);
             if !names.is_empty() {
@@ -101,7 +120,7 @@ impl Choice {
             }
         }
         for same in &self.used {
-            let names = of(&|r| matches!(r, Reason::NearlyTheSameAs(n) if n == same));
+            let names = of(&|r| matches!(r, Reason::Duplicate(n) if n == same));
             if !names.is_empty() {
                 parts.push(format!("{} (nearly the same as {same})", list(&names)));
             }
@@ -117,9 +136,9 @@ impl Choice {
     }
 }
 
-/// What is known of a candidate.
-struct Seen {
-    features: Features,
+/// Features and sharpness of a candidate.
+struct CandidateFeatures {
+    features: Keypoints,
     /// Image diagonal in the features' pixels.
     diagonal: f64,
     sharpness: f64,
@@ -127,15 +146,15 @@ struct Seen {
     signature: Vec<f32>,
 }
 
-impl Seen {
-    fn of(image: &RgbImage) -> Seen {
+impl CandidateFeatures {
+    fn of(image: &RgbImage) -> CandidateFeatures {
         let sharpness = sharpness(image);
         let scale = (FEATURE_SIDE as f64 / image.width.max(image.height) as f64).min(1.0);
         let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
         let small = image.resized_by_area(to(image.width), to(image.height));
         // Margin 4: the descriptor's window at the finest scale.
-        let valid = valid_area(&small, Frame::default(), 4);
-        Seen {
+        let valid = valid_area(&small, PlainBorder::default(), 4);
+        CandidateFeatures {
             features: sift::detect(&small.luma(), &valid, FEATURES),
             diagonal: (small.width as f64).hypot(small.height as f64),
             sharpness,
@@ -173,16 +192,16 @@ pub fn choose(
     let done = AtomicU64::new(0);
     let look = |c: &Candidate| {
         progress.check()?;
-        let seen = c.thumbnail(SHARPNESS_SIDE, progress)?.map(|image| Seen::of(&image));
+        let seen = c.thumbnail(SHARPNESS_SIDE, progress)?.map(|image| CandidateFeatures::of(&image));
         progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
         Ok(seen)
     };
-    let looks: Vec<Result<Option<Seen>>> = candidates.par_iter().map(look).collect();
+    let looks: Vec<Result<Option<CandidateFeatures>>> = candidates.par_iter().map(look).collect();
     let looks = looks.into_iter().collect::<Result<Vec<_>>>()?;
     let there: Vec<usize> = (0..looks.len()).filter(|i| looks[*i].is_some()).collect();
-    let seen: Vec<Seen> = looks.into_iter().flatten().collect();
+    let seen: Vec<CandidateFeatures> = looks.into_iter().flatten().collect();
     progress.end();
-    photo::wanted(seen.len(), Some(wanted))?;
+    photo::photo_count(seen.len(), Some(wanted))?;
     let links = links(&seen, progress)?;
     let graph = Graph::new(&seen, links);
     let chosen = graph.choose(wanted);
@@ -191,14 +210,14 @@ pub fn choose(
         used: chosen.iter().map(|i| names[*i].clone()).collect(),
         left_out: (0..names.len())
             .filter(|i| !chosen.contains(i))
-            .map(|i| (names[i].clone(), graph.reason(i, &chosen, &names)))
+            .map(|i| LeftOut { photo: names[i].clone(), reason: graph.reason(i, &chosen, &names) })
             .collect(),
     };
     Ok((chosen.into_iter().map(|i| there[i]).collect(), choice))
 }
 
 /// [N, N] links, symmetric; pairs that were not compared are unlinked.
-fn links(seen: &[Seen], progress: &dyn Progress) -> Result<Vec<Vec<Link>>> {
+fn links(seen: &[CandidateFeatures], progress: &dyn Progress) -> Result<Vec<Vec<SimilarityInliers>>> {
     let n = seen.len();
     let pairs = pairs(seen);
     progress.begin("overlap", pairs.len() as u64);
@@ -207,7 +226,7 @@ fn links(seen: &[Seen], progress: &dyn Progress) -> Result<Vec<Vec<Link>>> {
         progress.check()?;
         let (a, b) = (&seen[i], &seen[j]);
         let matches = mutual_matches(&a.features, &b.features, RATIO);
-        let points = |f: &Features, d: f64, k: usize| f.points[k] / d;
+        let points = |f: &Keypoints, d: f64, k: usize| f.points[k] / d;
         let ends: Vec<_> = matches
             .iter()
             .map(|m| (points(&a.features, a.diagonal, m.first), points(&b.features, b.diagonal, m.second)))
@@ -216,7 +235,7 @@ fn links(seen: &[Seen], progress: &dyn Progress) -> Result<Vec<Vec<Link>>> {
         Ok((i, j, overlap::agreement(&ends)))
     };
     let found = pairs.par_iter().map(compare).collect::<Result<Vec<_>>>()?;
-    let mut links = vec![vec![Link::default(); n]; n];
+    let mut links = vec![vec![SimilarityInliers::default(); n]; n];
     for (i, j, link) in found {
         links[i][j] = link;
         links[j][i] = link;
@@ -226,7 +245,7 @@ fn links(seen: &[Seen], progress: &dyn Progress) -> Result<Vec<Vec<Link>>> {
 }
 
 /// The pairs to compare: all, or for many photos each with those of the most similar colours and its neighbours in order.
-fn pairs(seen: &[Seen]) -> Vec<(usize, usize)> {
+fn pairs(seen: &[CandidateFeatures]) -> Vec<(usize, usize)> {
     let n = seen.len();
     if n <= ALL_PAIRS {
         return (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).collect();
@@ -252,7 +271,7 @@ fn pairs(seen: &[Seen]) -> Vec<(usize, usize)> {
 
 /// Everything that the choice depends on.
 struct Graph {
-    links: Vec<Vec<Link>>,
+    links: Vec<Vec<SimilarityInliers>>,
     /// Sharpness over the median, at most 1.
     quality: Vec<f64>,
     same: Vec<Vec<bool>>,
@@ -268,7 +287,7 @@ struct Cost {
 }
 
 impl Graph {
-    fn new(seen: &[Seen], links: Vec<Vec<Link>>) -> Graph {
+    fn new(seen: &[CandidateFeatures], links: Vec<Vec<SimilarityInliers>>) -> Graph {
         let mut all: Vec<f64> = seen.iter().map(|s| s.sharpness).collect();
         let median = crate::math::median(&mut all).unwrap_or(1.0).max(1e-9);
         let same = |i: usize, j: usize| {
@@ -285,7 +304,7 @@ impl Graph {
     }
 
     /// Share of photo `i` that photo `j` shows, [0, 1].
-    fn shown(&self, i: usize, j: usize) -> f64 {
+    fn overlap_share(&self, i: usize, j: usize) -> f64 {
         let matches = self.links[i][j].matches as f64;
         if i == j || self.same[i][j] {
             1.0
@@ -311,7 +330,8 @@ impl Graph {
             }
         }
         let parts = (0..set.len()).filter(|k| group.contains(k)).count();
-        let best = |i: usize| set.iter().map(|&j| self.quality[j] * self.shown(i, j)).fold(0.0, f64::max);
+        let best =
+            |i: usize| set.iter().map(|&j| self.quality[j] * self.overlap_share(i, j)).fold(0.0, f64::max);
         // A photo that is linked to none shows another place, which is not to be covered.
         let counts = |i: &usize| self.links[*i].iter().any(|l| l.matches >= LINKED);
         let seen: f64 = (0..self.links.len()).filter(counts).map(best).sum();
@@ -362,11 +382,11 @@ impl Graph {
             return Reason::Blurred;
         }
         if let Some(&j) = chosen.iter().find(|&&j| self.same[i][j]) {
-            return Reason::NearlyTheSameAs(names[j].clone());
+            return Reason::Duplicate(names[j].clone());
         }
         match chosen.iter().any(|&j| self.links[i][j].matches >= LINKED) {
-            true => Reason::AddsLittle,
-            false => Reason::NothingInCommon,
+            true => Reason::LittleNewArea,
+            false => Reason::NoOverlap,
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What cameras and points are found for photos.
+//! Cameras, depth and points of photos.
 use crate::scene::{Camera, DepthMap, Lens, PointCloud};
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};

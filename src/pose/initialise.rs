@@ -1,6 +1,6 @@
 //! Photos to cameras, and from cameras to depth (docs/method.md#geometry).
 use super::stereo::{self, StereoOptions};
-use super::{Features, Geometry, SparseModel, light, sfm};
+use super::{Geometry, Keypoints, SparseModel, light, sfm};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
@@ -14,7 +14,7 @@ use glam::DVec2;
 const UNSURE_FOCAL: f64 = 0.05;
 
 /// Photos whose cameras are known, as every later stage sees them.
-pub struct Placed {
+pub struct SolvedCameras {
     /// The photos, ready for dense stages.
     pub photos: Vec<Photo>,
     /// Their cameras and sparse points.
@@ -29,7 +29,7 @@ pub fn place(
     cameras: Option<&[Camera]>,
     registry: &Registry,
     progress: &dyn Progress,
-) -> Result<Placed> {
+) -> Result<SolvedCameras> {
     let model = sparse(&photos, cameras, Some(registry), progress)?;
     if let Some(sigma) = model.focal_log_sigma.filter(|s| *s > UNSURE_FOCAL) {
         progress.warn(&format!(
@@ -48,7 +48,7 @@ pub fn place(
     photos.iter_mut().for_each(|p| p.fine = None);
     let photos = light::equalised(photos, &model, progress);
     let method = if cameras.is_some() { "cameras + stereo" } else { "sfm (corners + XFeat) + stereo" };
-    Ok(Placed { photos, model, method: method.into() })
+    Ok(SolvedCameras { photos, model, method: method.into() })
 }
 
 /// Depth maps and points of placed photos by stereo.
@@ -123,13 +123,13 @@ pub fn learned_features(
     photos: &[Photo],
     registry: &Registry,
     progress: &dyn Progress,
-) -> Result<Vec<Features>> {
+) -> Result<Vec<Keypoints>> {
     let mut xfeat = XFeat::load(registry)?;
     progress.begin("features", photos.len() as u64);
     let mut out = Vec::with_capacity(photos.len());
     for (k, p) in photos.iter().enumerate() {
         progress.check()?;
-        out.push(Features::from(xfeat.detect(&p.image, MAX_LEARNED)?));
+        out.push(Keypoints::from(xfeat.detect(&p.image, MAX_LEARNED)?));
         progress.step(k as u64 + 1, &p.stem);
     }
     progress.end();

@@ -1,12 +1,12 @@
 //! Keypoint features, their matches between two photos, and the parts of photos that cannot hold features.
-use crate::photo::Frame;
+use crate::photo::PlainBorder;
 use crate::scene::{Plane, RgbImage};
 use glam::DVec2;
 use rayon::prelude::*;
 
 /// Keypoints with unit descriptors of one photo.
 #[derive(Clone, Debug, Default)]
-pub struct Features {
+pub struct Keypoints {
     /// Pixel positions (centre of the first pixel 0.5).
     pub points: Vec<DVec2>,
     /// Descriptor length.
@@ -15,9 +15,9 @@ pub struct Features {
     pub descriptors: Vec<f32>,
 }
 
-impl From<crate::infer::xfeat::Features> for Features {
-    fn from(f: crate::infer::xfeat::Features) -> Features {
-        Features {
+impl From<crate::infer::xfeat::XFeatKeypoints> for Keypoints {
+    fn from(f: crate::infer::xfeat::XFeatKeypoints) -> Keypoints {
+        Keypoints {
             points: f.keypoints.iter().map(|k| DVec2::new(k[0] as f64, k[1] as f64)).collect(),
             dim: crate::infer::xfeat::DIM,
             descriptors: f.descriptors,
@@ -34,7 +34,7 @@ pub(crate) struct Match {
 }
 
 /// Best and second-best similarity of each row of `a` among the rows of `b`.
-fn nearest(a: &Features, b: &Features) -> Vec<(usize, f32, f32)> {
+fn nearest(a: &Keypoints, b: &Keypoints) -> Vec<(usize, f32, f32)> {
     let d = a.dim;
     a.descriptors
         .par_chunks(d.max(1))
@@ -65,7 +65,7 @@ fn nearest(a: &Features, b: &Features) -> Vec<(usize, f32, f32)> {
 
 /// Mutual nearest neighbours whose distance is below `ratio` of the distance to the second-best elsewhere, best first.
 /// Descriptor lengths must be multiples of 8 and equal; otherwise there are no matches.
-pub(crate) fn mutual_matches(a: &Features, b: &Features, ratio: f32) -> Vec<Match> {
+pub(crate) fn mutual_matches(a: &Keypoints, b: &Keypoints, ratio: f32) -> Vec<Match> {
     if a.dim != b.dim || !a.dim.is_multiple_of(8) || a.points.is_empty() || b.points.is_empty() {
         return Vec::new();
     }
@@ -89,11 +89,12 @@ pub(crate) fn mutual_matches(a: &Features, b: &Features, ratio: f32) -> Vec<Matc
     out
 }
 
-/// True where features may lie: away from the image edge, from a frame that was found on loading and from uniform saturated margins (undistorted or scanned photos
-/// have white or black borders; their outline stands still while the scene moves and would pass for a match).
-pub(crate) fn valid_area(image: &RgbImage, frame: Frame, margin: usize) -> Plane<bool> {
+/// True where features may lie: away from the image edge, from a border that was found on loading and from uniform
+/// saturated margins (undistorted or scanned photos have white or black borders; their outline does not move with the
+/// scene and would pass for a match).
+pub(crate) fn valid_area(image: &RgbImage, border: PlainBorder, margin: usize) -> Plane<bool> {
     let (w, h) = (image.width, image.height);
-    let mut border: Vec<bool> = (0..w * h).map(|i| frame.covers(i % w, i / w, w, h)).collect();
+    let mut excluded: Vec<bool> = (0..w * h).map(|i| border.covers(i % w, i / w, w, h)).collect();
     for white in [true, false] {
         let saturated = |i: usize| {
             let c = image.data[i];
@@ -126,12 +127,12 @@ pub(crate) fn valid_area(image: &RgbImage, frame: Frame, margin: usize) -> Plane
                 stack.push(i + w);
             }
         }
-        // A frame touches a good part of the outline; an overexposed window at the edge touches less.
+        // A border touches a good part of the outline; an overexposed window at the edge touches less.
         if touching * 5 > 2 * (w + h) {
-            border.iter_mut().zip(&seen).for_each(|(b, s)| *b |= s);
+            excluded.iter_mut().zip(&seen).for_each(|(b, s)| *b |= s);
         }
     }
-    let blocked = Plane { width: w, height: h, data: border };
+    let blocked = Plane { width: w, height: h, data: excluded };
     let near = dilated(&blocked, 2 * margin);
     let data = (0..w * h)
         .map(|i| {
@@ -184,7 +185,7 @@ mod tests {
                 image.data[y * 100 + x] = [1.0; 3];
             }
         }
-        let open = valid_area(&image, Frame::default(), 2);
+        let open = valid_area(&image, PlainBorder::default(), 2);
         assert!(open.at(12, 35) && !open.at(1, 35) && open.at(3, 60));
         for y in 0..80 {
             for x in 0..100 {
@@ -193,7 +194,7 @@ mod tests {
                 }
             }
         }
-        let framed = valid_area(&image, Frame::default(), 2);
+        let framed = valid_area(&image, PlainBorder::default(), 2);
         assert!(!framed.at(9, 50) && framed.at(12, 50) && framed.at(50, 40) && !framed.at(50, 3));
     }
 
@@ -205,10 +206,10 @@ mod tests {
             v
         };
         let at = |n: usize| (0..n).map(|k| DVec2::new(10.0 * k as f64, 0.0)).collect::<Vec<_>>();
-        let a = Features { points: at(3), dim: 8, descriptors: [unit(0), unit(1), unit(2)].concat() };
+        let a = Keypoints { points: at(3), dim: 8, descriptors: [unit(0), unit(1), unit(2)].concat() };
         // Two copies of descriptor 1 far apart are ambiguous.
         let b =
-            Features { points: at(4), dim: 8, descriptors: [unit(2), unit(1), unit(1), unit(0)].concat() };
+            Keypoints { points: at(4), dim: 8, descriptors: [unit(2), unit(1), unit(1), unit(0)].concat() };
         let m: Vec<_> = mutual_matches(&a, &b, 0.9).iter().map(|m| (m.first, m.second)).collect();
         assert_eq!(m, [(0, 3), (2, 0)]);
     }

@@ -20,5 +20,5 @@ mod testing;
 mod two_view;
 
 pub use geometry::{Fitted, Geometry, SparseModel, SparsePoint};
-pub use initialise::{Placed, dense, learned_features, place, sparse};
-pub use matching::Features;
+pub use initialise::{SolvedCameras, dense, learned_features, place, sparse};
+pub use matching::Keypoints;

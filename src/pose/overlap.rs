@@ -1,10 +1,10 @@
-//! How much two photos show of the same, from matches that nothing has verified yet.
+//! Overlap of two photos, from matches before geometric verification.
 use crate::math::median;
 use glam::DVec2;
 
-/// What two photos have in common.
+/// Inliers of the similarity between two photos.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Link {
+pub(super) struct SimilarityInliers {
     /// Matches that agree.
     pub matches: usize,
     /// Median distance of the agreeing matches from the similarity that explains them best, over the image diagonal: what
@@ -42,8 +42,8 @@ impl Similarity {
             bottom += p.length_squared();
         }
         let a = top / bottom;
-        let believable = (1.0 / LARGEST_ZOOM..LARGEST_ZOOM).contains(&a.length());
-        believable.then(|| Similarity { a, b: mean.1 - Similarity::times(a, mean.0) })
+        let plausible = (1.0 / LARGEST_ZOOM..LARGEST_ZOOM).contains(&a.length());
+        plausible.then(|| Similarity { a, b: mean.1 - Similarity::times(a, mean.0) })
     }
 
     fn distance(&self, (p, q): &(DVec2, DVec2)) -> f64 {
@@ -53,7 +53,7 @@ impl Similarity {
 
 /// The largest group of matches that one similarity explains roughly. Positions over the image diagonal; better matches
 /// first. Deterministic: pairs of neighbours in the list make the hypotheses.
-pub(super) fn agreement(matches: &[(DVec2, DVec2)]) -> Link {
+pub(super) fn agreement(matches: &[(DVec2, DVec2)]) -> SimilarityInliers {
     let inliers = |s: &Similarity| -> Vec<(DVec2, DVec2)> {
         matches.iter().filter(|m| s.distance(m) < AGREES).copied().collect()
     };
@@ -72,10 +72,10 @@ pub(super) fn agreement(matches: &[(DVec2, DVec2)]) -> Link {
         }
     }
     let Some(fitted) = (best.len() > 2).then(|| Similarity::fit(&best)).flatten() else {
-        return Link::default();
+        return SimilarityInliers::default();
     };
     let mut distances: Vec<f64> = inliers(&fitted).iter().map(|m| fitted.distance(m)).collect();
-    Link { matches: distances.len(), parallax: median(&mut distances).unwrap_or(0.0) }
+    SimilarityInliers { matches: distances.len(), parallax: median(&mut distances).unwrap_or(0.0) }
 }
 
 #[cfg(test)]
@@ -105,7 +105,7 @@ mod tests {
     fn random_matches_do_not() {
         let pairs: Vec<_> = scattered(60, 2).into_iter().zip(scattered(60, 3)).collect();
         assert!(agreement(&pairs).matches < 16, "{:?}", agreement(&pairs));
-        assert_eq!(agreement(&[]), Link::default());
+        assert_eq!(agreement(&[]), SimilarityInliers::default());
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Scale-invariant keypoints and descriptors (Lowe 2004; RootSIFT normalisation of Arandjelović & Zisserman 2012). They
 //! complement the learned features: fewer matches, but positions good to about 0.3 px without any model.
-use super::matching::Features;
+use super::matching::Keypoints;
 use crate::scene::Plane;
 use glam::DVec2;
 use rayon::prelude::*;
@@ -15,7 +15,7 @@ const EDGE_RATIO: f32 = 10.0;
 const DOUBLE_BELOW: usize = 1000;
 
 /// Keypoints of a luma image with 128-dimensional unit descriptors, strongest `limit` kept.
-pub(crate) fn detect(luma: &Plane<f32>, valid: &Plane<bool>, limit: usize) -> Features {
+pub(crate) fn detect(luma: &Plane<f32>, valid: &Plane<bool>, limit: usize) -> Keypoints {
     let double = luma.width.max(luma.height) <= DOUBLE_BELOW;
     let (base, step) = if double { (doubled(luma), 0.5) } else { (luma.clone(), 1.0) };
     // A camera image is taken to be blurred by 0.5 px already.
@@ -31,7 +31,7 @@ pub(crate) fn detect(luma: &Plane<f32>, valid: &Plane<bool>, limit: usize) -> Fe
     }
     found.sort_by(|a, b| b.strength.total_cmp(&a.strength).then(a.order().cmp(&b.order())));
     found.truncate(limit);
-    Features {
+    Keypoints {
         points: found.iter().map(|k| k.position).collect(),
         dim: 128,
         descriptors: found.iter().flat_map(|k| k.descriptor).collect(),

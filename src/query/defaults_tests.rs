@@ -1,7 +1,7 @@
 //! The built-in language defaults end to end in 2D: graph masks, `words` features, XFeat matches, alignment, codebook
 //! and queries on the training targets (what a perfectly trained field would show).
 use super::*;
-use crate::infer::breakfast::{View, phrases, train_views};
+use crate::infer::breakfast::{TestView, phrases, train_views};
 use crate::infer::words::RegionWords;
 use crate::infer::{Registry, hed::Hed, xfeat::XFeat};
 use crate::language::align::{PairLinks, links_from_warps};
@@ -12,7 +12,7 @@ use crate::run::stages::{SharedEncoder, masks::describe};
 use crate::scene::DepthMap;
 
 struct Inputs {
-    views: Vec<View>,
+    views: Vec<TestView>,
     masks: Vec<ViewMasks>,
     depths: Vec<DepthMap>,
     matched: Vec<PairLinks>,

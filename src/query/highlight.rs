@@ -1,4 +1,4 @@
-//! The answer to a query for the scene as a whole: which codes it lights up, seen from anywhere.
+//! The answer to a query for the scene as a whole: which codes are highlighted, in any view.
 use super::{QueryResult, TextQuery, field_relevancy};
 use crate::Result;
 use crate::scene::{LEVEL_NAMES, LanguageField, Plane};

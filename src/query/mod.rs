@@ -23,7 +23,7 @@ const LOGIT_SCALE: f64 = 10.0;
 /// A text query in the field's embedding space.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TextQuery {
-    /// What was asked.
+    /// The text of the query.
     pub text: String,
     /// [D] unit vector.
     pub embedding: Vec<f32>,
@@ -156,7 +156,7 @@ pub fn field_relevancy(field: &LanguageField, query: &TextQuery) -> Result<Vec<V
 }
 
 /// One level of a frame.
-struct Candidate {
+struct LevelCandidate {
     level: usize,
     raw: Plane<f32>,
     /// By what levels compete.
@@ -170,16 +170,16 @@ pub fn answer_with(
     options: &QueryOptions,
 ) -> Result<QueryResult> {
     let levels = codes.iter().zip(relevancy).enumerate().filter(|(_, (_, r))| !r.is_empty());
-    let mut candidates: Vec<Candidate> = levels
+    let mut candidates: Vec<LevelCandidate> = levels
         .map(|(level, (map, relevancy))| {
             let raw = relevancy_map(map, relevancy);
             let peak = level_peak(&raw, options.mask);
-            Candidate { level, raw, peak }
+            LevelCandidate { level, raw, peak }
         })
         .collect();
     let chosen = choose_level(&candidates, options)
         .ok_or_else(|| Error::work("the scene has no language level to query"))?;
-    // With masks of codes the other levels have a say in the location: the whole "plate" may hold a lemon, which finer
+    // With masks of codes the other levels count for the location: the whole "plate" may hold a lemon, which finer
     // levels tell apart. The published protocols use the chosen level alone (docs/method.md#lerf-ovs).
     let all = matches!(options.mask, MaskRule::Codes(_)).then(|| filter::box30(&sum(&candidates)));
     let best = candidates.swap_remove(chosen);
@@ -225,7 +225,7 @@ fn margin(relevancy: f32) -> f32 {
 }
 
 /// Index of the candidate that answers.
-fn choose_level(candidates: &[Candidate], options: &QueryOptions) -> Option<usize> {
+fn choose_level(candidates: &[LevelCandidate], options: &QueryOptions) -> Option<usize> {
     let peaks: Vec<f32> = candidates.iter().map(|c| c.peak).collect();
     match options.mask {
         MaskRule::Codes(_) => coarsest_good(&peaks, options.slack),
@@ -250,7 +250,7 @@ fn coarsest_good(peaks: &[f32], slack: Slack) -> Option<usize> {
 }
 
 /// Relevancy summed over the levels.
-fn sum(candidates: &[Candidate]) -> Plane<f32> {
+fn sum(candidates: &[LevelCandidate]) -> Plane<f32> {
     let Some((first, others)) = candidates.split_first() else { return Plane::default() };
     let mut sum = first.raw.clone();
     for other in others {

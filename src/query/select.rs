@@ -1,14 +1,14 @@
-//! Which splats a text means: selection in space, without any view (docs/method.md#selection-in-space).
+//! Splats that a query selects in space, without any view (docs/method.md#selection-in-space).
 use super::{MaskRule, QueryOptions, TextQuery, field_relevancy, margin};
 use crate::Result;
 use crate::scene::{LanguageField, LevelField};
 use rayon::prelude::*;
 
 /// Codes that fewer splats carry are specks: at a pixel per splat, less than a mask may be.
-const LEAST_SPLATS: usize = 32;
+const MIN_SPLATS: usize = 32;
 
 /// Splats whose feature is shorter have none: lifting leaves exact zeros, training moves them by less than this.
-const LEAST_LENGTH: f32 = 0.1;
+const MIN_LENGTH: f32 = 0.1;
 
 /// The splats that answer a query.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -28,7 +28,7 @@ pub fn splat_codes(level: &LevelField) -> Vec<Option<usize>> {
     let d = level.codebook.code_dim.max(1);
     let one = |f: &[f32]| {
         let length = f.iter().map(|v| v * v).sum::<f32>().sqrt();
-        if length < LEAST_LENGTH { None } else { level.codebook.decode(f) }
+        if length < MIN_LENGTH { None } else { level.codebook.decode(f) }
     };
     level.features.par_chunks_exact(d).map(one).collect()
 }
@@ -42,7 +42,7 @@ pub fn select(field: &LanguageField, query: &TextQuery, options: &QueryOptions) 
         let of = splat_codes(level);
         let mut carried = vec![0usize; values.len()];
         of.iter().flatten().for_each(|&k| carried[k] += 1);
-        let solid = values.iter().zip(&carried).filter(|(_, n)| **n >= LEAST_SPLATS).map(|(v, _)| *v);
+        let solid = values.iter().zip(&carried).filter(|(_, n)| **n >= MIN_SPLATS).map(|(v, _)| *v);
         if let Some(best) = solid.reduce(f32::max) {
             found.push((l, best, of));
         }

@@ -1,4 +1,4 @@
-//! What a run has to tell.
+//! Contents of run.json and the report.
 use super::viewer;
 use crate::Result;
 use crate::photo::Light;
@@ -89,7 +89,7 @@ pub struct AnswerShown<'a> {
 /// A query and its answers.
 #[derive(Clone, Debug)]
 pub struct QueryShown<'a> {
-    /// What was asked.
+    /// The text of the query.
     pub text: &'a str,
     /// One per view.
     pub answers: Vec<AnswerShown<'a>>,
@@ -108,7 +108,7 @@ pub struct Curve {
 
 /// Everything that `report.html` and `previews/` show.
 #[derive(Clone, Debug)]
-pub struct Report<'a> {
+pub struct HtmlReport<'a> {
     /// Headline, usually the name of the photo folder.
     pub title: &'a str,
     /// Training views.
@@ -117,7 +117,7 @@ pub struct Report<'a> {
     pub queries: Vec<QueryShown<'a>>,
     /// How training went.
     pub curves: Vec<Curve>,
-    /// Embedding space of the language field; `words/…` gets a plain statement of what it knows.
+    /// Embedding space of the language field; `words/…` gets a plain statement of what it covers.
     pub space: Option<&'a str>,
     /// The scene for the interactive view.
     pub scene: Option<viewer::Scene3d<'a>>,

@@ -1,6 +1,6 @@
 //! `report.html`: one self-contained file, readable on a phone.
 use super::chart::escape;
-use super::{Curve, QueryShown, Report, ViewShown, chart, colour, duration, viewer};
+use super::{Curve, HtmlReport, QueryShown, ViewShown, chart, colour, duration, viewer};
 use crate::format::picture;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
@@ -14,7 +14,7 @@ const PICTURE_WIDTH: usize = 640;
 const STYLE: &str = include_str!("report.css");
 
 /// Writes `report.html` into a scene folder.
-pub fn write_html(folder: &Path, report: &Report) -> Result<()> {
+pub fn write_html(folder: &Path, report: &HtmlReport) -> Result<()> {
     let path = folder.join("report.html");
     std::fs::write(&path, page(report)?).map_err(Error::io(&path))
 }
@@ -31,7 +31,7 @@ fn figure(image: &RgbImage, caption: &str) -> Result<String> {
     ))
 }
 
-fn page(report: &Report) -> Result<String> {
+fn page(report: &HtmlReport) -> Result<String> {
     let title = escape(report.title);
     let mut body = format!("<header><h1>{title}</h1><p>{}</p></header>", escape(&report.run.program));
     body.push_str("<section class=\"figures\">");
@@ -104,7 +104,7 @@ fn view_row(v: &ViewShown) -> Result<String> {
     Ok(row)
 }
 
-fn queries(report: &Report) -> Result<String> {
+fn queries(report: &HtmlReport) -> Result<String> {
     let mut out = String::new();
     if report.space.is_some_and(|s| s.starts_with("words")) {
         out.push_str(
@@ -124,7 +124,7 @@ fn queries(report: &Report) -> Result<String> {
     Ok(out)
 }
 
-fn query_row(report: &Report, q: &QueryShown) -> Result<String> {
+fn query_row(report: &HtmlReport, q: &QueryShown) -> Result<String> {
     let hits = q.answers.iter().filter(|a| a.found).count();
     let class = if hits > 0 { "yes" } else { "no" };
     let mut row = format!(
@@ -142,7 +142,7 @@ fn query_row(report: &Report, q: &QueryShown) -> Result<String> {
     Ok(row)
 }
 
-fn run_tables(report: &Report) -> String {
+fn run_tables(report: &HtmlReport) -> String {
     let run = report.run;
     let mut out = String::from(
         "<section><h2>Time and memory</h2><table class=\"time\"><tr><th>stage<th>time; bars show when<th>peak memory</tr>",
@@ -233,7 +233,7 @@ mod tests {
         };
         let answer =
             AnswerShown { view: 0, relevancy: &relevancy, mask: None, score: 0.9, found: true, level: "l" };
-        let report = Report {
+        let report = HtmlReport {
             title: "a <b> & \"c\"",
             views: vec![view],
             queries: vec![QueryShown { text: "<script>", answers: vec![answer] }],

@@ -1,4 +1,4 @@
-//! What a run tells about itself: `run.json`, `report.html`, `previews/`, the closing table on the terminal.
+//! Records of a run: `run.json`, `report.html`, `previews/`, the closing table on the terminal.
 pub mod chart;
 pub mod colour;
 mod contents;
@@ -6,7 +6,7 @@ mod html;
 mod summary;
 pub mod viewer;
 
-pub use contents::{AnswerShown, Curve, ModelUsed, QueryShown, Report, RunRecord, ViewShown};
+pub use contents::{AnswerShown, Curve, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown};
 pub use html::write_html;
 pub use summary::{duration, table};
 
@@ -18,7 +18,7 @@ use crate::{Error, Result};
 use std::path::Path;
 
 /// Writes `previews/`: render, depth and levels per view, a heat map per query and view.
-pub fn write_previews(folder: &Path, report: &Report) -> Result<()> {
+pub fn write_previews(folder: &Path, report: &HtmlReport) -> Result<()> {
     let folder = folder.join("previews");
     create_folder(&folder)?;
     let save = |name: String, image: &RgbImage| {

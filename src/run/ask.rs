@@ -1,15 +1,15 @@
-//! A loaded scene that is kept ready for questions: what viewers, `splatvk query` and benchmarks call.
+//! A loaded scene that is kept on the device for queries: what viewers, `splatvk query` and benchmarks call.
 use super::view::{DecodedFrame, Viewer};
 use crate::gpu::Device;
 use crate::infer::RegionEncoder;
 use crate::query::highlight::Highlight;
 use crate::query::select::{Selection, select};
 use crate::query::{self, CANONICAL_PHRASES, QueryOptions, QueryResult, TextQuery};
-use crate::report::viewer::{Names, ShownAnswer};
+use crate::report::viewer::{CodeNames, ShownAnswer};
 use crate::scene::{Camera, LanguageField, Plane, Splats};
 use crate::{Error, Result};
 
-/// The scene on the device, its code maps from the cameras looked from, and the text encoder. A question costs the
+/// The scene on the device, its code maps in the set views, and the text encoder. A query costs the
 /// embedding of its text and a gather and five box filters per camera; nothing is rendered for it.
 ///
 /// ```no_run
@@ -19,7 +19,7 @@ use crate::{Error, Result};
 /// let field = scene.language.ok_or_else(|| splatvk::Error::input("no language"))?;
 /// let encoder = Box::new(RegionWords::load(Registry::open(None)?)?);
 /// let mut ready = QueryScene::open(&Device::open(None)?, &scene.splats, field, encoder)?;
-/// ready.look(&scene.cameras)?;
+/// ready.set_views(&scene.cameras)?;
 /// let answers = ready.ask("lemon", &Default::default())?;
 /// println!("found in {} of {} views", answers.found(), answers.views.len());
 /// # Ok(())
@@ -50,8 +50,8 @@ impl QueryScene {
         Ok(QueryScene { viewer, field, encoder, canonicals, frames: Vec::new() })
     }
 
-    /// Renders and decodes the cameras that questions are answered for from now on.
-    pub fn look(&mut self, cameras: &[Camera]) -> Result<&[DecodedFrame]> {
+    /// Renders and decodes the cameras that later queries are answered for.
+    pub fn set_views(&mut self, cameras: &[Camera]) -> Result<&[DecodedFrame]> {
         self.frames.clear();
         for camera in cameras {
             self.frames.push(self.viewer.view(camera)?);
@@ -60,7 +60,7 @@ impl QueryScene {
     }
 
     /// The phrases of the text model that name each code best: see [`RegionEncoder::names`].
-    pub fn names(&mut self) -> Result<Names> {
+    pub fn names(&mut self) -> Result<CodeNames> {
         names(self.encoder.as_mut(), &self.field, NAMES)
     }
 
@@ -92,7 +92,7 @@ impl QueryScene {
 /// The answers to one text, one per photo.
 #[derive(Clone, Debug)]
 pub struct Answers {
-    /// What was asked.
+    /// The text of the query.
     pub text: String,
     /// Per photo.
     pub views: Vec<QueryResult>,
@@ -122,7 +122,7 @@ pub const NAMES: usize = 5;
 
 /// Per level and code the `best` phrases with their relevancy, best first; without phrases where the text model has no
 /// list of its own.
-pub fn names(encoder: &mut dyn RegionEncoder, field: &LanguageField, best: usize) -> Result<Names> {
+pub fn names(encoder: &mut dyn RegionEncoder, field: &LanguageField, best: usize) -> Result<CodeNames> {
     let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
     let mut levels = Vec::with_capacity(field.levels.len());
     for level in &field.levels {

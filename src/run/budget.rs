@@ -45,33 +45,33 @@ impl Limits {
     }
 }
 
-/// What the run will do, as far as memory depends on it.
+/// What the memory of a run depends on.
 #[derive(Clone, Copy, Debug)]
-pub struct Work {
+pub struct MemoryDemand {
     /// Feature channels that are trained together; 0 without language.
     pub features: usize,
     /// Splats at most.
     pub splats: usize,
 }
 
-impl Work {
+impl MemoryDemand {
     /// A run with codes of this length, all levels together or one after the other.
-    pub fn language(code_dim: usize, per_level: bool, preset: Preset, photos: usize) -> Work {
+    pub fn language(code_dim: usize, per_level: bool, preset: Preset, photos: usize) -> MemoryDemand {
         let levels = if per_level { 1 } else { LEVEL_NAMES.len() };
-        Work { features: levels * code_dim, ..Work::colour(preset, photos) }
+        MemoryDemand { features: levels * code_dim, ..MemoryDemand::colour(preset, photos) }
     }
 
     /// Colour only.
-    pub fn colour(preset: Preset, photos: usize) -> Work {
+    pub fn colour(preset: Preset, photos: usize) -> MemoryDemand {
         let options = RgbOptions::preset(preset);
         let margin = if options.margin > 0.0 { MARGIN * photos } else { 0 };
-        Work { features: 0, splats: options.init.max_points + margin }
+        MemoryDemand { features: 0, splats: options.init.max_points + margin }
     }
 }
 
 /// Bytes that a stage holds at its peak.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Stage {
+pub struct StageMemory {
     /// As the progress calls it.
     pub name: &'static str,
     /// On the device.
@@ -81,7 +81,11 @@ pub struct Stage {
 }
 
 /// Bytes per stage for photos of these working sizes. An error where an image cannot even be rendered in bands.
-pub fn stages(device: &DeviceInfo, sizes: &[(usize, usize)], work: &Work) -> Result<Vec<Stage>> {
+pub fn stages(
+    device: &DeviceInfo,
+    sizes: &[(usize, usize)],
+    work: &MemoryDemand,
+) -> Result<Vec<StageMemory>> {
     let pixels = |s: &(usize, usize)| (s.0 * s.1) as u64;
     let all: u64 = sizes.iter().map(pixels).sum();
     // `pose::stereo` halves the size until a reference and its sources fit; this is what they hold then at most.
@@ -114,17 +118,17 @@ pub fn stages(device: &DeviceInfo, sizes: &[(usize, usize)], work: &Work) -> Res
         // Value, gradient and two moments of each parameter, at SH degree 0.
         Ok(bytes + splats * 16 * (14 + features as u64))
     };
-    let stereo = Stage { name: "dense stereo", device: 24 * matched, host };
-    let colour = Stage { name: "splats", device: training(0)?, host };
+    let stereo = StageMemory { name: "dense stereo", device: 24 * matched, host };
+    let colour = StageMemory { name: "splats", device: training(0)?, host };
     let mut stages = vec![stereo, colour];
     if work.features > 0 {
-        stages.push(Stage { name: "language", device: training(work.features)?, host });
+        stages.push(StageMemory { name: "language", device: training(work.features)?, host });
     }
     Ok(stages)
 }
 
 /// Why photos of these sizes do not work, or nothing.
-fn obstacle(limits: &Limits, sizes: &[(usize, usize)], work: &Work) -> Option<String> {
+fn obstacle(limits: &Limits, sizes: &[(usize, usize)], work: &MemoryDemand) -> Option<String> {
     let device = &limits.device;
     let gib = |b: u64| b as f64 / f64::from(1 << 30);
     let stages = match stages(device, sizes, work) {
@@ -160,7 +164,12 @@ fn obstacle(limits: &Limits, sizes: &[(usize, usize)], work: &Work) -> Option<St
 
 /// Refuses a working size that cannot be done, and names the largest that can. `originals` are the (width, height) of the
 /// photos.
-pub fn check(limits: &Limits, originals: &[(usize, usize)], max_size: usize, work: &Work) -> Result<()> {
+pub fn check(
+    limits: &Limits,
+    originals: &[(usize, usize)],
+    max_size: usize,
+    work: &MemoryDemand,
+) -> Result<()> {
     let at = |size: usize| -> Vec<(usize, usize)> {
         originals.iter().map(|&(w, h)| working_size(w, h, size)).collect()
     };
@@ -208,7 +217,7 @@ mod tests {
 
     #[test]
     fn what_fits_is_let_through_and_the_named_size_works() {
-        let work = Work::language(16, false, Preset::Draft, 4);
+        let work = MemoryDemand::language(16, false, Preset::Draft, 4);
         assert!(check(&limits(4), &PHOTOS, 800, &work).is_ok());
         let e = check(&limits(4), &PHOTOS, 4032, &work).unwrap_err();
         assert_eq!(e.exit_code(), 2);
@@ -222,7 +231,7 @@ mod tests {
 
     #[test]
     fn images_wider_than_a_band_are_refused_by_width() {
-        let work = Work::language(16, false, Preset::Draft, 2);
+        let work = MemoryDemand::language(16, false, Preset::Draft, 2);
         let wide = [(40_000, 2000); 2];
         let message = check(&limits(1000), &wide, 40_000, &work).unwrap_err().to_string();
         assert!(message.contains("pixels wide") && message.contains("--max-size"), "{message}");
@@ -233,7 +242,7 @@ mod tests {
     fn a_gpu_is_held_to_its_own_memory() {
         let mut limits = limits(1000);
         (limits.device.is_cpu, limits.device.memory) = (false, 2 << 30);
-        let work = Work::language(16, false, Preset::Default, 4);
+        let work = MemoryDemand::language(16, false, Preset::Default, 4);
         assert!(check(&limits, &PHOTOS, 1600, &work).is_ok());
         let many = [(4032, 3024); 16];
         assert!(check(&limits, &many, 4032, &work).unwrap_err().to_string().contains("which has 2.0"));

@@ -1,4 +1,4 @@
-//! The text model that speaks a scene's language.
+//! The text encoder of a scene's embedding space.
 use super::sources::{self, SourceChoice};
 use crate::format::scene_dir::{Scene, TEXT_EMBEDDINGS};
 use crate::infer::{RegionEncoder, Registry};
@@ -14,7 +14,7 @@ pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncod
     // "clip:0123456789abcdef" was made with a network of the family clip.
     let source = match space.split_once(':') {
         Some((family, _)) => SourceChoice::named(family),
-        None => sources::default::<sources::Features>(),
+        None => sources::default::<sources::FeatureSources>(),
     };
     let encoder = sources::encoder(&source, &registry)?;
     if encoder.space() != space {

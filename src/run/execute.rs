@@ -1,10 +1,10 @@
 //! Running a plan: photos → cameras, depth and points → splats → language → scene directory.
 use super::list;
 use super::networks::Networks;
-use super::outcome::Outcome;
+use super::outcome::RunOutcome;
 use super::plan::RunPlan;
 use super::record;
-use super::sources::{self, Build};
+use super::sources::{self, GraphBuilder};
 use crate::Result;
 use crate::format::Workspace;
 use crate::format::scene_dir::{self, Contents};
@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Runs the plan and writes the scene directory, whole or not at all.
-pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
+pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     let progress = &Recorded::new(progress);
     let workspace = Workspace::create(&plan.out, plan.force)?;
     // The device comes first: it says how large the photos may be.
@@ -32,7 +32,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<Outcome> {
     let photos = photo::load_each(&chosen, max_size, progress)?;
     let registry = plan.registry()?;
     let store = store(plan.resume, plan.checkpoint_seconds);
-    let outcome = Outcome { choice, ..work(plan, &device, &registry, photos, &store, progress)? };
+    let outcome = RunOutcome { choice, ..work(plan, &device, &registry, photos, &store, progress)? };
     write(workspace, &outcome, progress)?;
     Ok(outcome)
 }
@@ -45,7 +45,7 @@ pub fn reconstruct(
     registry: &Registry,
     photos: Vec<Photo>,
     progress: &dyn Progress,
-) -> Result<Outcome> {
+) -> Result<RunOutcome> {
     photo::check_set(&photos)?;
     let sizes: Vec<_> = photos.iter().map(|p| (p.image.width, p.image.height)).collect();
     plan.check_budget(device, &sizes, usize::MAX)?;
@@ -53,7 +53,7 @@ pub fn reconstruct(
 }
 
 /// Writes what [`reconstruct`] made as a scene directory, whole or not at all; `force` replaces a scene.
-pub fn save(outcome: &mut Outcome, out: &Path, force: bool, progress: &dyn Progress) -> Result<()> {
+pub fn save(outcome: &mut RunOutcome, out: &Path, force: bool, progress: &dyn Progress) -> Result<()> {
     let workspace = Workspace::create(out, force)?;
     outcome.plan.out = out.to_path_buf();
     write(workspace, outcome, progress)
@@ -66,14 +66,14 @@ fn work(
     photos: Vec<Photo>,
     store: &Store,
     progress: &Recorded,
-) -> Result<Outcome> {
+) -> Result<RunOutcome> {
     // Whatever can be refused is read before the long work, not after it.
     registry.compute().report(progress)?;
     let networks = Networks::of(plan, registry)?;
     networks.warn_untrained(progress);
     list::check(plan, &photos, registry)?;
     let preset = plan.preset_on(device);
-    let mut build = Build {
+    let mut build = GraphBuilder {
         graph: Graph::default(),
         registry: registry.clone(),
         sam: plan.sam,
@@ -84,7 +84,7 @@ fn work(
     let mut made = build.graph.run(&scene.targets(), device, registry, store, progress)?;
     registry.compute().report(progress)?;
     let (trained, language) = (made.take(scene.trained)?, made.take(scene.language)?);
-    Ok(Outcome {
+    Ok(RunOutcome {
         plan: plan.clone(),
         preset,
         device: device.info().clone(),
@@ -119,7 +119,7 @@ pub fn stage_folder() -> PathBuf {
     home().join("stages")
 }
 
-fn write(workspace: Workspace, outcome: &Outcome, progress: &dyn Progress) -> Result<()> {
+fn write(workspace: Workspace, outcome: &RunOutcome, progress: &dyn Progress) -> Result<()> {
     progress.begin("write", 2);
     progress.check()?;
     let table = sources::text_table(&outcome.plan.features);

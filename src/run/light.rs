@@ -1,15 +1,15 @@
-//! What run.json, the report and the closing table say about the light that was taken out of the photos.
+//! The light that was taken out of the photos, in run.json, the report and the closing table.
 use crate::photo::{Light, Photo};
 use serde_json::{Value, json};
 
 /// Per photo, for run.json; `None` where every photo was left as it is.
 pub(super) fn record(photos: &[Photo]) -> Option<Value> {
     let one = |p: &Photo| {
-        let Light { gain, falloff, doubt_ev, doubt_corner } = p.light;
+        let Light { gain, falloff, sigma_ev, sigma_corner } = p.light;
         json!({
-            "photo": p.stem, "exposure_ev": p.light.exposure_ev(), "exposure_doubt_ev": doubt_ev,
+            "photo": p.stem, "exposure_ev": p.light.exposure_ev(), "exposure_doubt_ev": sigma_ev,
             "red_to_green": gain[0] / gain[1], "blue_to_green": gain[2] / gain[1],
-            "corner": p.light.corner(), "corner_doubt": doubt_corner, "gain": gain, "falloff": falloff,
+            "corner": p.light.corner(), "corner_doubt": sigma_corner, "gain": gain, "falloff": falloff,
         })
     };
     taken(photos).then(|| photos.iter().map(one).collect())
@@ -25,14 +25,14 @@ pub(super) fn figure(photos: &[Photo]) -> Option<(String, String)> {
         values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)))
     };
     let (dark, bright) = range(&Light::exposure_ev);
-    let doubt = range(&|l| l.doubt_ev).1;
+    let sigma = range(&|l| l.sigma_ev).1;
     let colour = |k: usize| {
         let (low, high) = range(&|l| l.white_balance()[k]);
         100.0 * (high / low - 1.0)
     };
     let corner = 100.0 * (1.0 - range(&Light::corner).0);
     let text = format!(
-        "exposures {:.2} ± {doubt:.2} EV apart, colours {:.0} %, corners −{corner:.0} %: evened out",
+        "exposures {:.2} ± {sigma:.2} EV apart, colours {:.0} %, corners −{corner:.0} %: evened out",
         bright - dark,
         colour(0).max(colour(1)),
     );
@@ -57,7 +57,7 @@ mod tests {
         let mut photos = vec![photo("a.png"), photo("b.png")];
         assert!(record(&photos).is_none() && figure(&photos).is_none());
         photos[1].light =
-            Light { gain: [2.2, 2.0, 2.0], falloff: [-0.2, 0.0], doubt_ev: 0.04, doubt_corner: 0.01 };
+            Light { gain: [2.2, 2.0, 2.0], falloff: [-0.2, 0.0], sigma_ev: 0.04, sigma_corner: 0.01 };
         let json = record(&photos).unwrap();
         assert_eq!((&json[0]["exposure_ev"], &json[1]["photo"]), (&json!(0.0), &json!("b")));
         assert!((json[1]["corner"].as_f64().unwrap() - (-0.2f64).exp()).abs() < 1e-12);

@@ -1,6 +1,6 @@
-//! A scene that a program holds in memory: drawn, asked and saved on demand. What the C interface is made of.
+//! A scene that a program holds in memory: rendered, queried and saved on demand. What the C interface is made of.
 use super::execute::save;
-use super::outcome::Outcome;
+use super::outcome::RunOutcome;
 use super::view::Viewer;
 use super::{encoder, sources};
 use crate::format::scene_dir::{self, Contents, Scene};
@@ -36,17 +36,17 @@ use std::path::Path;
 /// ```
 pub struct LiveScene {
     device: Device,
-    source: Source,
+    origin: SceneOrigin,
     registry: Registry,
     viewer: Viewer,
     /// The text encoder and the [C, D] unit rows of the canonical phrases; loaded with the first question.
-    speaker: Option<(Box<dyn RegionEncoder>, Vec<f32>)>,
-    /// Decoded codes of the camera asked last.
+    text_encoder: Option<(Box<dyn RegionEncoder>, Vec<f32>)>,
+    /// Decoded codes of the last query's camera.
     seen: Option<(Camera, Vec<Plane<i32>>)>,
 }
 
-enum Source {
-    Trained(Box<Outcome>),
+enum SceneOrigin {
+    Trained(Box<RunOutcome>),
     Loaded(Box<Scene>),
 }
 
@@ -54,26 +54,26 @@ impl LiveScene {
     /// Loads a scene directory, or a file of Gaussians that has no language. `models` is the folder of the models,
     /// where the text encoder is taken from; `None` = the default one.
     pub fn load(device: &Device, path: &Path, registry: &Registry) -> Result<LiveScene> {
-        LiveScene::new(device, Source::Loaded(Box::new(scene_dir::load(path)?)), registry)
+        LiveScene::new(device, SceneOrigin::Loaded(Box::new(scene_dir::load(path)?)), registry)
     }
 
     /// Takes over what a run made.
-    pub fn trained(device: &Device, outcome: Outcome, registry: &Registry) -> Result<LiveScene> {
-        LiveScene::new(device, Source::Trained(Box::new(outcome)), registry)
+    pub fn trained(device: &Device, outcome: RunOutcome, registry: &Registry) -> Result<LiveScene> {
+        LiveScene::new(device, SceneOrigin::Trained(Box::new(outcome)), registry)
     }
 
-    fn new(device: &Device, source: Source, registry: &Registry) -> Result<LiveScene> {
-        let (splats, field) = match &source {
-            Source::Trained(o) => (&o.splats, Some(&o.field)),
-            Source::Loaded(s) => (&s.splats, s.language.as_ref()),
+    fn new(device: &Device, origin: SceneOrigin, registry: &Registry) -> Result<LiveScene> {
+        let (splats, field) = match &origin {
+            SceneOrigin::Trained(o) => (&o.splats, Some(&o.field)),
+            SceneOrigin::Loaded(s) => (&s.splats, s.language.as_ref()),
         };
         let viewer = Viewer::new(device, splats, field.unwrap_or(&LanguageField::default()))?;
         Ok(LiveScene {
             device: device.clone(),
-            source,
+            origin,
             registry: registry.clone(),
             viewer,
-            speaker: None,
+            text_encoder: None,
             seen: None,
         })
     }
@@ -84,30 +84,30 @@ impl LiveScene {
     }
     /// The Gaussians.
     pub fn splats(&self) -> &Splats {
-        match &self.source {
-            Source::Trained(o) => &o.splats,
-            Source::Loaded(s) => &s.splats,
+        match &self.origin {
+            SceneOrigin::Trained(o) => &o.splats,
+            SceneOrigin::Loaded(s) => &s.splats,
         }
     }
     /// One per photo; none for a bare file.
     pub fn cameras(&self) -> &[Camera] {
-        match &self.source {
-            Source::Trained(o) => &o.cameras,
-            Source::Loaded(s) => &s.cameras,
+        match &self.origin {
+            SceneOrigin::Trained(o) => &o.cameras,
+            SceneOrigin::Loaded(s) => &s.cameras,
         }
     }
-    /// What the scene knows about words.
+    /// Codebooks and features, where the scene has language.
     pub fn language(&self) -> Option<&LanguageField> {
-        match &self.source {
-            Source::Trained(o) => Some(&o.field),
-            Source::Loaded(s) => s.language.as_ref(),
+        match &self.origin {
+            SceneOrigin::Trained(o) => Some(&o.field),
+            SceneOrigin::Loaded(s) => s.language.as_ref(),
         }
     }
     /// What the run was warned of; none for a loaded scene.
     pub fn warnings(&self) -> &[String] {
-        match &self.source {
-            Source::Trained(o) => &o.warnings,
-            Source::Loaded(_) => &[],
+        match &self.origin {
+            SceneOrigin::Trained(o) => &o.warnings,
+            SceneOrigin::Loaded(_) => &[],
         }
     }
     /// Feature channels of a level in what [`LiveScene::draw`] renders: (first, count); the count is 0 without codes.
@@ -145,9 +145,9 @@ impl LiveScene {
                 "the scene has no language; only scenes made from photos by a run have it",
             ));
         }
-        let (mut encoder, canonicals) = match self.speaker.take() {
+        let (mut encoder, canonicals) = match self.text_encoder.take() {
             Some(ready) => ready,
-            None => self.speaker()?,
+            None => self.open_text_encoder()?,
         };
         let embedding = encoder.embed_texts(&[text]);
         let query = embedding.map(|embedding| TextQuery {
@@ -155,21 +155,21 @@ impl LiveScene {
             embedding,
             canonicals: canonicals.clone(),
         });
-        self.speaker = Some((encoder, canonicals));
+        self.text_encoder = Some((encoder, canonicals));
         let query = query?;
         if self.seen.as_ref().is_none_or(|(c, _)| c != camera) {
             let codes = self.viewer.codes(camera)?;
             self.seen = Some((camera.clone(), codes));
         }
         let codes = self.seen.as_ref().map_or(&[][..], |(_, codes)| codes);
-        let field = self.language().ok_or_else(|| Error::work("the scene lost its language"))?;
+        let field = self.language().ok_or_else(|| Error::work("the scene has no language"))?;
         query::answer(codes, field, &query, &QueryOptions::default())
     }
 
-    fn speaker(&self) -> Result<(Box<dyn RegionEncoder>, Vec<f32>)> {
-        let mut encoder = match &self.source {
-            Source::Trained(o) => sources::encoder(&o.plan.features, &self.registry)?,
-            Source::Loaded(s) => encoder::of_scene(s, self.registry.clone())?,
+    fn open_text_encoder(&self) -> Result<(Box<dyn RegionEncoder>, Vec<f32>)> {
+        let mut encoder = match &self.origin {
+            SceneOrigin::Trained(o) => sources::encoder(&o.plan.features, &self.registry)?,
+            SceneOrigin::Loaded(s) => encoder::of_scene(s, self.registry.clone())?,
         };
         let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
         Ok((encoder, canonicals))
@@ -184,9 +184,9 @@ impl LiveScene {
             }
             return gaussians::write(path, self.splats(), self.language());
         }
-        match &mut self.source {
-            Source::Trained(outcome) => save(outcome, path, replace, &Silent),
-            Source::Loaded(scene) => save_loaded(scene, path, replace),
+        match &mut self.origin {
+            SceneOrigin::Trained(outcome) => save(outcome, path, replace, &Silent),
+            SceneOrigin::Loaded(scene) => save_loaded(scene, path, replace),
         }
     }
 }

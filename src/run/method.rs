@@ -141,7 +141,7 @@ impl Recipe {
         let (options, seed) = (self.language(options.clone()), options.seed);
         let mut trained = fit::train_language(device, images, cameras, splats, field, &options, progress)?;
         if self.index_head {
-            read_by_index(device, cameras, &mut trained, seed)?;
+            train_index_heads(device, cameras, &mut trained, seed)?;
         }
         Ok(trained)
     }
@@ -166,7 +166,7 @@ impl Recipe {
 const HEAD_SAMPLES: usize = 4000;
 
 /// Smooths the features in space and trains the index head of every level on what the photos' views then show.
-fn read_by_index(
+fn train_index_heads(
     device: &Device,
     cameras: &[Camera],
     trained: &mut TrainedLanguage,
@@ -183,7 +183,7 @@ fn read_by_index(
     let total: usize = dims.iter().sum();
     let mut samples: Vec<(Vec<f32>, Vec<u32>)> = vec![Default::default(); dims.len()];
     for (view, camera) in cameras.iter().enumerate() {
-        let frame = viewer.view_with_features(camera)?.frame;
+        let frame = viewer.view_with_features(camera)?.rendered;
         let mut first = 0;
         for ((level, &d), (features, labels)) in trained.field.levels.iter().zip(&dims).zip(&mut samples) {
             let Some(targets) = level.targets.get(view) else { continue };

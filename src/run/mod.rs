@@ -21,6 +21,6 @@ pub mod view;
 pub use ask::Answers;
 pub use execute::{reconstruct, run, save, stage_folder};
 pub use method::{FEATURE_DIM, Method, Recipe};
-pub use outcome::Outcome;
+pub use outcome::RunOutcome;
 pub use plan::{CHECKPOINT_SECONDS, RunPlan};
 pub use record::{closing_table, run_record};

@@ -1,33 +1,33 @@
 //! The networks that users bring, as a run uses them: found before any work, named in run.json.
 use super::plan::RunPlan;
-use super::sources::{Features, Geometry, Masks, Matches, installed};
+use super::sources::{FeatureSources, GeometrySources, MaskSources, MatchSources, installed};
 use crate::Result;
 use crate::infer::Registry;
-use crate::infer::installed::Installed;
+use crate::infer::installed::{HashedFile, Installed};
 use crate::progress::Progress;
 use crate::report::ModelUsed;
 
-/// The networks that a plan asks for.
+/// The networks of a plan.
 pub(super) struct Networks(Vec<Installed>);
 
 impl Networks {
     /// Finds them all before any work; the error says what is missing.
     pub(super) fn of(plan: &RunPlan, registry: &Registry) -> Result<Networks> {
         let found = [
-            installed::<Geometry>(&plan.init, registry)?,
-            installed::<Matches>(&plan.matcher, registry)?,
-            installed::<Masks>(&plan.masks, registry)?,
-            installed::<Features>(&plan.features, registry)?,
+            installed::<GeometrySources>(&plan.init, registry)?,
+            installed::<MatchSources>(&plan.matcher, registry)?,
+            installed::<MaskSources>(&plan.masks, registry)?,
+            installed::<FeatureSources>(&plan.features, registry)?,
         ];
         Ok(Networks(found.into_iter().flatten().collect()))
     }
 
-    /// What run.json says about them.
+    /// Their entries in run.json.
     pub(super) fn used(&self) -> Result<Vec<ModelUsed>> {
         let mut used = Vec::new();
         for model in &self.0 {
-            let licence = model.known().map_or("unknown", |k| k.licence.as_str());
-            for (file, sha256) in model.files()? {
+            let licence = model.catalogue_entry().map_or("unknown", |k| k.licence.as_str());
+            for HashedFile { path: file, sha256 } in model.files()? {
                 let file = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
                 let name =
                     format!("{} {file}{}", model.name, if model.untrained() { " (untrained)" } else { "" });
@@ -41,7 +41,7 @@ impl Networks {
         let names: Vec<&str> = self.0.iter().filter(|m| m.untrained()).map(|m| m.name.as_str()).collect();
         if !names.is_empty() {
             progress.warn(&format!(
-                "{}: untrained weights; what they say means nothing, only time and memory do",
+                "{}: untrained weights; their outputs carry no meaning, only time and memory are real",
                 names.join(", ")
             ));
         }

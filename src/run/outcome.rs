@@ -1,4 +1,4 @@
-//! What a finished run knows.
+//! The result of a run.
 use super::ask::Answers;
 use super::plan::RunPlan;
 use super::view::DecodedFrame;
@@ -9,12 +9,12 @@ use crate::pose::{self, Geometry};
 use crate::preset::Preset;
 use crate::progress::StageRecord;
 use crate::report::ModelUsed;
-use crate::report::viewer::Names;
+use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, LanguageField, Splats};
 
-/// Everything a finished run knows; [`crate::report`] turns it into run.json, report.html and the summary.
-pub struct Outcome {
-    /// What was asked for.
+/// Everything that a run made; [`crate::report`] turns it into run.json, report.html and the summary.
+pub struct RunOutcome {
+    /// The plan that was run.
     pub plan: RunPlan,
     /// The preset that was used.
     pub preset: Preset,
@@ -43,7 +43,7 @@ pub struct Outcome {
     /// One per query of the plan.
     pub answers: Vec<Answers>,
     /// The text model's own phrases per level and code.
-    pub names: Names,
+    pub names: CodeNames,
     /// What computed the networks.
     pub provider: Option<&'static str>,
     /// Built-in models.

@@ -39,7 +39,7 @@ pub struct RunPlan {
     pub matcher: SourceChoice,
     /// Masks.
     pub masks: SourceChoice,
-    /// How a mask network is asked.
+    /// Prompts of a mask network.
     pub sam: SamOptions,
     /// Features.
     pub features: SourceChoice,
@@ -80,12 +80,12 @@ impl Default for RunPlan {
             resume: false,
             checkpoint_seconds: CHECKPOINT_SECONDS,
             preset: None,
-            init: sources::default::<sources::Geometry>(),
+            init: sources::default::<sources::GeometrySources>(),
             cameras: Vec::new(),
-            matcher: sources::default::<sources::Matches>(),
-            masks: sources::default::<sources::Masks>(),
+            matcher: sources::default::<sources::MatchSources>(),
+            masks: sources::default::<sources::MaskSources>(),
             sam: SamOptions::default(),
-            features: sources::default::<sources::Features>(),
+            features: sources::default::<sources::FeatureSources>(),
             queries: Vec::new(),
             seed: 0,
             iterations: None,
@@ -129,8 +129,8 @@ impl RunPlan {
         budget::check(&budget::Limits::now(device.info()), sizes, max_size, &work)
     }
 
-    fn work(&self, preset: Preset, photos: usize) -> budget::Work {
-        budget::Work::language(self.feature_dim, self.per_level, preset, photos)
+    fn work(&self, preset: Preset, photos: usize) -> budget::MemoryDemand {
+        budget::MemoryDemand::language(self.feature_dim, self.per_level, preset, photos)
     }
 
     /// The colour stage.

@@ -1,18 +1,18 @@
-//! What a finished run says about itself: `run.json`, the report and the closing table, made from [`Outcome`].
+//! Records of a finished run: `run.json`, the report and the closing table, made from [`RunOutcome`].
 use super::ask::Answers;
-use super::outcome::Outcome;
+use super::outcome::RunOutcome;
 use crate::Result;
 use crate::fit::{CurvePoint, FitStats, LanguagePoint};
 use crate::photo::Photo;
 use crate::pose::Fitted;
 use crate::report::viewer::Scene3d;
-use crate::report::{self, AnswerShown, Curve, ModelUsed, QueryShown, Report, RunRecord, ViewShown};
+use crate::report::{self, AnswerShown, Curve, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown};
 use crate::scene::{Camera, LEVEL_NAMES};
 use serde_json::json;
 use std::path::Path;
 
 /// `run.json`.
-pub fn run_record(o: &Outcome) -> RunRecord {
+pub fn run_record(o: &RunOutcome) -> RunRecord {
     let used = |m: &&crate::infer::ModelStatus| m.installed;
     RunRecord {
         program: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
@@ -34,7 +34,7 @@ pub fn run_record(o: &Outcome) -> RunRecord {
     }
 }
 
-fn statistics(o: &Outcome) -> serde_json::Value {
+fn statistics(o: &RunOutcome) -> serde_json::Value {
     let curves = curves(&o.rgb, &o.language_curve);
     let levels: Vec<_> = LEVEL_NAMES
         .iter()
@@ -69,7 +69,7 @@ fn statistics(o: &Outcome) -> serde_json::Value {
 }
 
 /// Per photo what was found of its lens, and the camera of its file.
-fn optics(o: &Outcome) -> Vec<serde_json::Value> {
+fn optics(o: &RunOutcome) -> Vec<serde_json::Value> {
     let one = |((photo, camera), fitted): ((&Photo, &Camera), &Fitted)| {
         let taken = photo.original_camera(camera);
         json!({
@@ -106,7 +106,7 @@ fn focal_figure(photos: &[Photo], cameras: &[Camera], fitted: &[Fitted]) -> Opti
 }
 
 /// What was assumed about the lens: the strongest distortion taken out, and how far the principal point is from the middle.
-fn lens_figure(o: &Outcome) -> Option<String> {
+fn lens_figure(o: &RunOutcome) -> Option<String> {
     let corner = |(photo, camera): (&Photo, &Camera)| {
         let half = glam::DVec2::new(0.5 * camera.width as f64, 0.5 * camera.height as f64) / camera.fx;
         (photo.lens().distort(half).length() / half.length() - 1.0, photo.lens())
@@ -165,7 +165,7 @@ fn answer_json(a: &Answers) -> serde_json::Value {
 }
 
 /// Figures for the head of the report and the closing table: (label, value).
-fn figures(o: &Outcome) -> Vec<(String, String)> {
+fn figures(o: &RunOutcome) -> Vec<(String, String)> {
     let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
     // Which, and why, is said when they are chosen, and in run.json.
     let chosen = o.choice.as_ref().map_or(String::new(), |c| {
@@ -198,17 +198,26 @@ pub(super) fn working_sizes(photos: &[Photo]) -> serde_json::Value {
 
 /// How many photos were used, at which size, and how to change that where they were scaled down.
 pub(super) fn sizes(photos: &[Photo]) -> String {
-    let mut pairs: Vec<(usize, usize, u32, u32)> = Vec::new();
+    #[derive(PartialEq)]
+    struct Sizes {
+        working: (usize, usize),
+        original: (usize, usize),
+    }
+    let mut pairs: Vec<Sizes> = Vec::new();
     for p in photos {
-        let pair = (p.image.width, p.image.height, p.original_size.0, p.original_size.1);
+        let original = (p.original_size.0 as usize, p.original_size.1 as usize);
+        let pair = Sizes { working: (p.image.width, p.image.height), original };
         if !pairs.contains(&pair) {
             pairs.push(pair);
         }
     }
-    let scaled = |p: &(usize, usize, u32, u32)| (p.0, p.1) != (p.2 as usize, p.3 as usize);
-    let one = |p: &(usize, usize, u32, u32)| match scaled(p) {
-        true => format!("{} × {} of {} × {}", p.0, p.1, p.2, p.3),
-        false => format!("{} × {}", p.0, p.1),
+    let scaled = |s: &Sizes| s.working != s.original;
+    let one = |s: &Sizes| {
+        let ((w, h), (original_w, original_h)) = (s.working, s.original);
+        match scaled(s) {
+            true => format!("{w} × {h} of {original_w} × {original_h}"),
+            false => format!("{w} × {h}"),
+        }
     };
     // More than a few sizes would not fit a line; run.json has them all.
     let shown: Vec<String> = pairs.iter().take(3).map(one).collect();
@@ -217,11 +226,11 @@ pub(super) fn sizes(photos: &[Photo]) -> String {
     format!("{} at {}{more}{hint}", photos.len(), shown.join(", "))
 }
 
-/// The table that ends `splatvk run`; what is doubtful stands first.
-pub fn closing_table(o: &Outcome) -> String {
-    let doubts: String = o.warnings.iter().map(|w| format!("  doubtful: {w}\n")).collect();
+/// The table that ends `splatvk run`; warnings stand first.
+pub fn closing_table(o: &RunOutcome) -> String {
+    let warnings: String = o.warnings.iter().map(|w| format!("  warning: {w}\n")).collect();
     format!(
-        "{doubts}{}  {:<12}  {}\n",
+        "{warnings}{}  {:<12}  {}\n",
         report::table(&o.stages, o.seconds, &figures(o)),
         "scene",
         o.plan.out.display()
@@ -229,7 +238,7 @@ pub fn closing_table(o: &Outcome) -> String {
 }
 
 /// Writes `run.json`, `report.html` and `previews/`.
-pub(super) fn write(folder: &Path, o: &Outcome) -> Result<()> {
+pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
     let record = run_record(o);
     record.write(folder)?;
     let levels: Vec<Vec<_>> =
@@ -241,15 +250,15 @@ pub(super) fn write(folder: &Path, o: &Outcome) -> Result<()> {
         .map(|(i, p)| ViewShown {
             name: &p.stem,
             photo: &p.image,
-            render: Some(&o.frames[i].frame.rgb),
-            depth: Some(&o.frames[i].frame.depth),
+            render: Some(&o.frames[i].rendered.rgb),
+            depth: Some(&o.frames[i].rendered.depth),
             levels: &levels[i],
             psnr: o.rgb.psnr.get(i).copied(),
             light: p.light,
         })
         .collect();
     let title = o.plan.out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    let report = Report {
+    let report = HtmlReport {
         title: &title,
         views,
         queries: o.answers.iter().map(shown).collect(),
@@ -263,7 +272,7 @@ pub(super) fn write(folder: &Path, o: &Outcome) -> Result<()> {
     report::write_previews(folder, &report)
 }
 
-fn scene<'a>(title: &'a str, o: &'a Outcome) -> Scene3d<'a> {
+fn scene<'a>(title: &'a str, o: &'a RunOutcome) -> Scene3d<'a> {
     Scene3d {
         title,
         splats: &o.splats,

@@ -9,7 +9,7 @@ use crate::pass::metrics::planar;
 use crate::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
 use crate::pass::ssim_l1::SsimL1;
 use crate::pass::view::View;
-use crate::photo::Frame as Border;
+use crate::photo::PlainBorder as Border;
 use crate::pose::numeric::rotation_angle;
 use crate::progress::Progress;
 use crate::scene::{Camera, Pose, RgbImage, Splats};
@@ -33,7 +33,7 @@ pub struct ViewRefiner {
 
 /// A camera that was moved, and how far.
 #[derive(Clone, Debug)]
-pub struct Moved {
+pub struct RefinedCamera {
     /// The camera.
     pub camera: Camera,
     /// Turn, degrees.
@@ -56,7 +56,12 @@ impl ViewRefiner {
     }
 
     /// The camera that shows the photo best, near the given one; sizes are those of the photo.
-    pub fn refine(&self, camera: &Camera, photo: &RgbImage, progress: &dyn Progress) -> Result<Moved> {
+    pub fn refine(
+        &self,
+        camera: &Camera,
+        photo: &RgbImage,
+        progress: &dyn Progress,
+    ) -> Result<RefinedCamera> {
         let scale = SceneScale::measure(std::slice::from_ref(camera), &self.means);
         let mut photo = photo.clone();
         Border::of(&photo).continue_picture(&mut photo);
@@ -69,7 +74,7 @@ impl ViewRefiner {
             pose = self.descend(&at, &image, (steps, rate), &scale, progress)?;
         }
         let turn = pose.compose(&camera.pose.inverse()).rotation;
-        Ok(Moved {
+        Ok(RefinedCamera {
             rotation_degrees: rotation_angle(&turn).to_degrees(),
             centre_fraction: (pose.centre() - camera.pose.centre()).length() / scale.median_depth,
             camera: Camera { pose, ..camera.clone() },

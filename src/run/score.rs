@@ -1,11 +1,11 @@
-//! A scene scored against ground truth: rendered from every known camera, asked for every object.
-use super::refine::{Moved, ViewRefiner};
+//! A scene scored against ground truth: rendered from every known camera, queried for every object.
+use super::refine::{RefinedCamera, ViewRefiner};
 use super::view::{DecodedFrame, Viewer};
 use crate::Result;
 use crate::gpu::Device;
 use crate::pass::metrics;
 use crate::progress::Progress;
-use crate::query::eval::{Evaluation, Frame, RefinedView, Rendered, Report, Split, colour_fit};
+use crate::query::eval::{EvalReport, Evaluation, RefinedView, Rendered, Split, TruthFrame, colour_fit};
 use crate::query::{QueryOptions, QueryResult, TextQuery, answer_with, field_relevancy};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
 
@@ -20,8 +20,8 @@ pub fn score_field(
     mut evaluation: Evaluation,
     refine: bool,
     progress: &dyn Progress,
-    look: &mut dyn FnMut(&Frame, &DecodedFrame) -> Result<()>,
-) -> Result<Report> {
+    look: &mut dyn FnMut(&TruthFrame, &DecodedFrame) -> Result<()>,
+) -> Result<EvalReport> {
     let labels: Vec<u32> = evaluation.phrases().into_iter().map(|p| p.0).collect();
     let options = QueryOptions::default();
     let relevancy = queries.iter().map(|q| field_relevancy(field, q)).collect::<Result<Vec<_>>>()?;
@@ -40,15 +40,15 @@ pub fn score_field(
         evaluation.add_frame(frame, &rendered(&view), &answer_all(&view)?)?;
         if let Some(refiner) = refiner.as_ref().filter(|_| frame.split == Split::Test) {
             let photo = evaluation.photo(frame)?;
-            let believed = evaluation.as_believed(camera);
-            let (closer, moved) = refined(refiner, &mut viewer, (&believed, &view), &photo, progress)?;
+            let with_optics = evaluation.with_scene_optics(camera);
+            let (closer, moved) = refined(refiner, &mut viewer, (&with_optics, &view), &photo, progress)?;
             let score = RefinedView {
                 frame: frame.stem.clone(),
                 kept: closer.is_some(),
                 rotation_degrees: moved.rotation_degrees,
                 centre_fraction: moved.centre_fraction,
-                focal_relative: believed.fx / camera.fx - 1.0,
-                centre_shift: [believed.cx - camera.cx, believed.cy - camera.cy],
+                focal_relative: with_optics.fx / camera.fx - 1.0,
+                centre_shift: [with_optics.cx - camera.cx, with_optics.cy - camera.cy],
             };
             let shown = closer.as_ref().unwrap_or(&view);
             evaluation.add_refined(frame, score, &rendered(shown), &answer_all(shown)?)?;
@@ -60,7 +60,7 @@ pub fn score_field(
 }
 
 fn rendered(view: &DecodedFrame) -> Rendered {
-    let frame = &view.frame;
+    let frame = &view.rendered;
     Rendered { rgb: frame.rgb.clone(), alpha: frame.alpha.clone(), depth: frame.depth.clone() }
 }
 
@@ -72,11 +72,11 @@ fn refined(
     (camera, given): (&Camera, &DecodedFrame),
     photo: &RgbImage,
     progress: &dyn Progress,
-) -> Result<(Option<DecodedFrame>, Moved)> {
-    let border = crate::photo::Frame::of(photo);
+) -> Result<(Option<DecodedFrame>, RefinedCamera)> {
+    let border = crate::photo::PlainBorder::of(photo);
     let inner = border.crop(photo);
     let closeness =
-        |view: &DecodedFrame| metrics::psnr(&colour_fit(&border.crop(&view.frame.rgb), &inner), &inner);
+        |view: &DecodedFrame| metrics::psnr(&colour_fit(&border.crop(&view.rendered.rgb), &inner), &inner);
     let moved = refiner.refine(camera, photo, progress)?;
     let view = viewer.view(&moved.camera)?;
     Ok(((closeness(&view) > closeness(given)).then_some(view), moved))

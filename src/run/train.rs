@@ -8,9 +8,9 @@ use crate::photo::{self, Candidate, Photo, stem};
 use crate::pipeline::Graph;
 use crate::pose::Geometry;
 use crate::progress::{Progress, Recorded};
-use crate::report::{self, Report, RunRecord, ViewShown};
-use crate::run::budget::{self, Limits, Work};
-use crate::run::stages::{self, CameraSource};
+use crate::report::{self, HtmlReport, RunRecord, ViewShown};
+use crate::run::budget::{self, Limits, MemoryDemand};
+use crate::run::stages::{self, CameraOrigin};
 use crate::run::view::Viewer;
 use crate::scene::{Camera, LanguageField, PointCloud};
 use crate::{Error, Result};
@@ -52,7 +52,7 @@ pub struct TrainPlan {
     pub provider: Option<String>,
 }
 
-/// What a finished training tells.
+/// Figures of a finished training.
 pub struct TrainOutcome {
     /// Content of run.json.
     pub record: RunRecord,
@@ -65,7 +65,7 @@ fn matched(
     plan: &TrainPlan,
     known: &[Camera],
     max_size: usize,
-    work: impl Fn(usize) -> Work,
+    work: impl Fn(usize) -> MemoryDemand,
     device: &Device,
     progress: &dyn Progress,
 ) -> Result<Vec<Photo>> {
@@ -95,7 +95,7 @@ fn points(path: &Path) -> Result<PointCloud> {
     if path.is_dir() { colmap::read_points(path) } else { ply::read_points(path) }
 }
 
-/// Gives points from a file the footprint that initialisation wants: `z / f` in the camera that sees them nearest.
+/// Gives points from a file the footprint that initialisation needs: `z / f` in the camera that sees them nearest.
 fn with_footprints(mut cloud: PointCloud, list: &[Camera]) -> Result<PointCloud> {
     let mut keep = PointCloud::default();
     for i in 0..cloud.len() {
@@ -135,12 +135,12 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     })?;
     let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
-    let work = |photos| Work::colour(preset, photos);
+    let work = |photos| MemoryDemand::colour(preset, photos);
     let photos = matched(plan, &known, max_size, work, &device, progress)?;
     let registry = Registry::with(plan.models.as_deref(), Compute::by(plan.provider.as_deref()))?;
     let source = match given {
-        Some(cloud) => CameraSource::Complete(from_points(&photos, &known, cloud)?),
-        None => CameraSource::Known(known),
+        Some(cloud) => CameraOrigin::GivenGeometry(from_points(&photos, &known, cloud)?),
+        None => CameraOrigin::Known(known),
     };
     let mut options = RgbOptions::preset(preset);
     options.limit_splats(budget::most_splats(device.info(), 0), work(photos.len()).splats);
@@ -150,7 +150,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     }
     let mut graph = Graph::default();
     let placed = graph.add(stages::Cameras::new(photos, source)?, ());
-    let geometry = graph.add(stages::Depth { preset }, (placed,));
+    let geometry = graph.add(stages::DenseDepth { preset }, (placed,));
     let trained = graph.add(stages::TrainColour { options }, (placed, geometry));
     let targets = [placed.target(), geometry.target(), trained.target()];
     let store = super::execute::store(plan.resume, plan.checkpoint_seconds);
@@ -204,14 +204,14 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let views = views.map(|((p, f), psnr)| ViewShown {
         name: &p.stem,
         photo: &p.image,
-        render: Some(&f.frame.rgb),
-        depth: Some(&f.frame.depth),
+        render: Some(&f.rendered.rgb),
+        depth: Some(&f.rendered.depth),
         levels: &[],
         psnr: Some(*psnr),
         light: p.light,
     });
     let title = plan.out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    let shown = Report {
+    let shown = HtmlReport {
         title: &title,
         views: views.collect(),
         queries: Vec::new(),

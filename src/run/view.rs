@@ -12,7 +12,7 @@ use crate::scene::{Camera, LanguageField, Plane, Splats};
 #[derive(Clone, Debug)]
 pub struct DecodedFrame {
     /// Colour and depth; features only from [`Viewer::view_with_features`].
-    pub frame: Frame,
+    pub rendered: Frame,
     /// Per level, index as in [`crate::scene::LEVEL_NAMES`]; levels without codes are −1 everywhere.
     pub codes: Vec<Plane<i32>>,
 }
@@ -93,7 +93,7 @@ impl Viewer {
             decode(device, levels, output, frame, band, &mut codes)?;
             shown.read_band(frame, band)
         })?;
-        Ok(DecodedFrame { frame: shown, codes })
+        Ok(DecodedFrame { rendered: shown, codes })
     }
 }
 

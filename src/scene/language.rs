@@ -1,6 +1,35 @@
-//! What the scene knows about words: per-level features on the splats and the codebook that gives them meaning.
+//! Language of a scene: features of the splats per level, and the codebooks that map them to embeddings.
 use super::Plane;
 use serde::{Deserialize, Serialize};
+
+/// A mask of a view. Stored as the pair `[view, mask]`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(from = "(u32, u32)", into = "(u32, u32)")]
+pub struct MaskId {
+    /// View index.
+    pub view: u32,
+    /// Index of the mask within its view and level.
+    pub mask: u32,
+}
+
+impl MaskId {
+    /// From the indices that loops count with.
+    pub fn new(view: usize, mask: usize) -> MaskId {
+        MaskId { view: view as u32, mask: mask as u32 }
+    }
+}
+
+impl From<(u32, u32)> for MaskId {
+    fn from((view, mask): (u32, u32)) -> MaskId {
+        MaskId { view, mask }
+    }
+}
+
+impl From<MaskId> for (u32, u32) {
+    fn from(id: MaskId) -> (u32, u32) {
+        (id.view, id.mask)
+    }
+}
 
 /// Level names, finest first: subpart, part, whole (internal level index 0, 1, 2).
 pub const LEVEL_NAMES: [&str; 3] = ["s", "m", "l"];
@@ -19,8 +48,8 @@ pub struct Codebook {
     pub codes: Vec<f32>,
     /// [K] pixel area behind each code.
     pub weights: Vec<f32>,
-    /// (view, mask id) pairs behind each code.
-    pub members: Vec<Vec<(u32, u32)>>,
+    /// Masks behind each code.
+    pub members: Vec<Vec<MaskId>>,
     /// Smallest distance between two codes.
     pub min_chord: f32,
 }

@@ -18,7 +18,7 @@ mod warp;
 pub use affine::Affine;
 pub use camera::{Camera, Pose};
 pub use image::{DepthMap, Plane, RgbImage};
-pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField};
+pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId};
 pub use lens::Lens;
 pub use pointmap::{Descriptors, ModelView, PairPointmaps, Pointmap};
 pub use points::PointCloud;

@@ -1,4 +1,4 @@
-//! What geometry networks say about photos: a 3-D point for every pixel, in the camera of one of a pair.
+//! Output of geometry networks: a 3-D point for every pixel, in the camera of one of a pair.
 //!
 //! Positions are continuous pixels of the network's input ("model pixels"); the centre of the first pixel is 0.5.
 use super::{Affine, Camera, Pose, RgbImage};
@@ -97,7 +97,7 @@ impl Descriptors {
     }
 }
 
-/// What a network says about a pair of views, decoded in both directions. The two directions, and different pairs, may
+/// Output of a network for a pair of views, decoded in both directions. The two directions, and different pairs, may
 /// have different scales.
 #[derive(Clone, Debug, Default)]
 pub struct PairPointmaps {

@@ -1,11 +1,11 @@
 //! Synthetic scenes on disk, in the layout of a ground-truth folder.
-use super::regions::{self, Flaws};
-use super::render::{self, Seen};
-use super::scene::{Knobs, World, world};
+use super::regions::{self, InjectedErrors};
+use super::render::{self, RayCast};
+use super::scene::{SceneSpec, SyntheticScene, build_scene};
 use crate::format::npy::{self, NpyArray, NpyData};
 use crate::format::{cameras, create_folder, picture, write_json};
 use crate::progress::Progress;
-use crate::query::eval::{Frame, GroundTruth, Split};
+use crate::query::eval::{GroundTruth, Split, TruthFrame};
 use crate::scene::Camera;
 use crate::{Error, Result};
 use half::f16;
@@ -16,54 +16,59 @@ use std::path::Path;
 const QUALITY: u8 = 95;
 
 /// Makes a scene and writes it: photos, held-out views, depth, masks, cameras, and regions without and with flaws.
-pub fn generate(folder: &Path, knobs: &Knobs, flaws: &Flaws, progress: &dyn Progress) -> Result<()> {
-    let world = world(knobs)?;
+pub fn generate(
+    folder: &Path,
+    spec: &SceneSpec,
+    flaws: &InjectedErrors,
+    progress: &dyn Progress,
+) -> Result<()> {
+    let scene = build_scene(spec)?;
     for name in ["images", "held_out", "depth", "masks"] {
         create_folder(&folder.join(name))?;
     }
-    let frames = write_views(folder, &world, knobs, progress)?;
+    let frames = write_views(folder, &scene, spec, progress)?;
     let labels: serde_json::Map<String, serde_json::Value> =
-        world.things.iter().map(|t| (t.label.to_string(), json!(t.phrase))).collect();
+        scene.objects.iter().map(|t| (t.label.to_string(), json!(t.phrase))).collect();
     let truth = json!({
-        "width": knobs.size.0, "height": knobs.size.1, "labels": labels,
-        "convention": "OpenCV world-to-camera, metres, pinhole", "frames": frames, "knobs": knobs,
+        "width": spec.size.0, "height": spec.size.1, "labels": labels,
+        "convention": "OpenCV world-to-camera, metres, pinhole", "frames": frames, "knobs": spec,
     });
     write_json(&folder.join("ground_truth.json"), &truth)?;
-    cameras::write_json(&folder.join("cameras_noisy.json"), &world.noisy)?;
+    cameras::write_json(&folder.join("cameras_noisy.json"), &scene.noisy)?;
     write_regions(folder, folder, flaws)
 }
 
 /// Renders and writes every view; the frames of the ground truth.
 fn write_views(
     folder: &Path,
-    world: &World,
-    knobs: &Knobs,
+    scene: &SyntheticScene,
+    spec: &SceneSpec,
     progress: &dyn Progress,
 ) -> Result<Vec<serde_json::Value>> {
-    let quality = knobs.effects.jpeg.unwrap_or(QUALITY);
+    let quality = spec.effects.jpeg.unwrap_or(QUALITY);
     // Held-out views show what is there, not what a phone would make of it.
-    let held_out_noise = if knobs.effects.any() { 0.0 } else { knobs.photo_noise };
-    progress.begin("render", (world.shots.len() + world.test.len()) as u64);
+    let held_out_noise = if spec.effects.any() { 0.0 } else { spec.photo_noise };
+    progress.begin("render", (scene.photo_effects.len() + scene.test.len()) as u64);
     let mut frames = Vec::new();
-    for i in 0..world.shots.len() + world.test.len() {
+    for i in 0..scene.photo_effects.len() + scene.test.len() {
         progress.check()?;
-        let seed = knobs.seed.wrapping_add(i as u64);
-        frames.push(match world.shots.get(i) {
-            Some(shot) => {
-                let seen = render::photo(world, shot, knobs.photo_noise, seed);
-                let file = write_view(folder, &shot.camera, Split::Train, &seen, quality)?;
-                let mut frame = frame_json(&shot.camera, Split::Train, &file);
-                if let Some(lens) = &shot.lens {
+        let seed = spec.seed.wrapping_add(i as u64);
+        frames.push(match scene.photo_effects.get(i) {
+            Some(effects) => {
+                let seen = render::photo(scene, effects, spec.photo_noise, seed);
+                let file = write_view(folder, &effects.camera, Split::Train, &seen, quality)?;
+                let mut frame = frame_json(&effects.camera, Split::Train, &file);
+                if let Some(lens) = &effects.lens {
                     frame["lens"] = json!(lens);
                 }
-                if let Some(light) = &shot.light {
+                if let Some(light) = &effects.light {
                     frame["light"] = json!(light);
                 }
                 frame
             }
             None => {
-                let camera = &world.test[i - world.shots.len()];
-                let seen = render::render(world, camera, held_out_noise, seed);
+                let camera = &scene.test[i - scene.photo_effects.len()];
+                let seen = render::render(scene, camera, held_out_noise, seed);
                 let file = write_view(folder, camera, Split::Test, &seen, QUALITY)?;
                 frame_json(camera, Split::Test, &file)
             }
@@ -75,17 +80,17 @@ fn write_views(
 }
 
 /// Writes `regions_exact/` and `regions_flawed/` for the photos of a ground-truth folder that has masks.
-pub fn write_regions(data: &Path, out: &Path, flaws: &Flaws) -> Result<()> {
+pub fn write_regions(data: &Path, out: &Path, flaws: &InjectedErrors) -> Result<()> {
     let truth = GroundTruth::read(data)?;
-    let photos: Vec<&Frame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
+    let photos: Vec<&TruthFrame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
     let phrases: Vec<String> = truth.labels.values().cloned().collect();
-    for (name, flaws) in [("regions_exact", &Flaws::NONE), ("regions_flawed", flaws)] {
+    for (name, flaws) in [("regions_exact", &InjectedErrors::NONE), ("regions_flawed", flaws)] {
         regions::write(&out.join(name), &photos, &regions::regions(&truth, &photos, flaws)?, &phrases)?;
     }
     Ok(())
 }
 
-fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &Seen, quality: u8) -> Result<String> {
+fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &RayCast, quality: u8) -> Result<String> {
     let place = if split == Split::Train { "images" } else { "held_out" };
     let (name, file) = (&camera.name, format!("{place}/{}.jpg", camera.name));
     let path = folder.join(&file);
@@ -121,11 +126,11 @@ mod tests {
     #[test]
     fn a_generated_folder_reads_back_as_ground_truth() {
         let dir = tempfile::tempdir().unwrap();
-        let knobs = Knobs { seed: 1000, size: (160, 120), views: 3, held_out: 2, ..Knobs::default() };
-        generate(dir.path(), &knobs, &Flaws::usual(1000), &Silent).unwrap();
+        let spec = SceneSpec { seed: 1000, size: (160, 120), views: 3, held_out: 2, ..SceneSpec::default() };
+        generate(dir.path(), &spec, &InjectedErrors::default_rates(1000), &Silent).unwrap();
         let truth = GroundTruth::read(dir.path()).unwrap();
-        let made = world(&knobs).unwrap();
-        assert_eq!((truth.frames.len(), truth.labels.len()), (5, made.things.len()));
+        let made = build_scene(&spec).unwrap();
+        assert_eq!((truth.frames.len(), truth.labels.len()), (5, made.objects.len()));
         for (frame, camera) in truth.frames.iter().zip(made.train.iter().chain(&made.test)) {
             assert_eq!(frame.stem, camera.name);
             assert!((frame.camera.pose.centre() - camera.pose.centre()).length() < 1e-12);
@@ -161,18 +166,18 @@ mod tests {
     fn photos_undone_by_the_lens_in_the_file_are_the_stated_pinhole() {
         let dir = tempfile::tempdir().unwrap();
         let effects = Effects { focal: true, lens: true, centre: true, ..Effects::default() };
-        let knobs = Knobs {
+        let spec = SceneSpec {
             seed: 1003,
             size: (320, 240),
             views: 2,
             held_out: 1,
             effects,
             photo_noise: 0.0,
-            ..Knobs::default()
+            ..SceneSpec::default()
         };
-        generate(dir.path(), &knobs, &Flaws::NONE, &Silent).unwrap();
+        generate(dir.path(), &spec, &InjectedErrors::NONE, &Silent).unwrap();
         let truth = GroundTruth::read(dir.path()).unwrap();
-        let made = world(&knobs).unwrap();
+        let made = build_scene(&spec).unwrap();
         let frame = &truth.frames[0];
         let stated = frame.lens.unwrap();
         let photo = truth.image(frame).unwrap();
@@ -182,8 +187,8 @@ mod tests {
             let (mut sum, mut count) = (0.0, 0);
             for p in 0..320 * 240 {
                 let pixel = DVec2::new((p % 320) as f64 + 0.5, (p / 320) as f64 + 0.5);
-                let world = frame.camera.unproject(pixel, 1.0);
-                let Some(shown) = between(&photo, lens.project(&frame.camera, world)) else { continue };
+                let point = frame.camera.unproject(pixel, 1.0);
+                let Some(shown) = between(&photo, lens.project(&frame.camera, point)) else { continue };
                 sum += (0..3).map(|c| f64::from(shown[c] - pinhole.data[p][c]).powi(2)).sum::<f64>();
                 count += 1;
             }

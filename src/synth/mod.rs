@@ -7,7 +7,7 @@ mod scene;
 mod shapes;
 
 pub use folder::{generate, write_regions};
-pub use phone::{Effects, Light, Shot, to_linear, to_srgb};
-pub use render::{Seen, photo, render};
-pub use scene::{Knobs, Thing, World, world};
+pub use phone::{Effects, PhotoEffects, TrueLight, to_linear, to_srgb};
+pub use render::{RayCast, photo, render};
+pub use scene::{SceneObject, SceneSpec, SyntheticScene, build_scene};
 pub use shapes::{Hit, Paint, Shape};

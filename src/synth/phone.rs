@@ -1,4 +1,4 @@
-//! What a phone does to a picture: lens, light, sensor noise. The distributions are stated in docs/data.md.
+//! Effects of a phone camera: lens, light, sensor noise. The distributions are stated in docs/data.md.
 use crate::math::Random;
 use crate::scene::{Camera, Lens, RgbImage};
 use crate::{Error, Result};
@@ -14,7 +14,7 @@ const K1: f64 = 0.15;
 const K2_SHARE: f64 = 1.0 / 3.0;
 /// Least slope of the distorted by the undistorted radius anywhere in the picture: below it the corners are squeezed to a
 /// quarter and no lens of a phone looks like that.
-const LEAST_SLOPE: f64 = 0.25;
+const MIN_SLOPE: f64 = 0.25;
 /// Largest offset of the principal point along x and along y, share of the width.
 const CENTRE: f64 = 0.01;
 /// Largest change of exposure between a photo and the scene's own light, stops.
@@ -74,7 +74,7 @@ fn fits(lens: &Lens, camera: &Camera) -> bool {
     // Walk outwards until the distorted radius covers the farthest corner.
     let mut x = DVec2::ZERO;
     while lens.distort(x).x < reach {
-        if lens.jacobian(x).x_axis.x < LEAST_SLOPE {
+        if lens.jacobian(x).x_axis.x < MIN_SLOPE {
             return false;
         }
         x.x += 0.01 * reach;
@@ -84,7 +84,7 @@ fn fits(lens: &Lens, camera: &Camera) -> bool {
 
 /// How one photo was lit.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Light {
+pub struct TrueLight {
     /// Stops; the linear values are multiplied by 2 to this power.
     pub exposure_ev: f64,
     /// Gain of R, G and B beside the exposure.
@@ -93,7 +93,7 @@ pub struct Light {
     pub vignetting: [f64; 2],
 }
 
-impl Light {
+impl TrueLight {
     /// Factor of the linear value per channel at a pixel position.
     pub fn gain(&self, camera: &Camera, pixel: DVec2) -> [f64; 3] {
         let half = DVec2::new(f64::from(camera.width), f64::from(camera.height)).length() / 2.0;
@@ -103,27 +103,27 @@ impl Light {
     }
 }
 
-/// What one photo goes through, in this order: lens, light, noise, 8 bits and JPEG.
+/// Effects on one photo, in this order: lens, light, noise, 8 bits and JPEG.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Shot {
+pub struct PhotoEffects {
     /// The undistorted pinhole.
     pub camera: Camera,
     /// Its lens.
     pub lens: Option<Lens>,
     /// Its light.
-    pub light: Option<Light>,
+    pub light: Option<TrueLight>,
     /// Seed of its noise.
     pub noise: Option<u64>,
 }
 
-/// What the photos of one camera share.
+/// Optics that the photos of one camera share.
 struct Optics {
     /// Share of the width.
     focal: f64,
     /// Principal point from the middle, shares of the width.
     offset: DVec2,
     lens: Option<Lens>,
-    /// v2, v4 of [`Light::vignetting`].
+    /// v2, v4 of [`TrueLight::vignetting`].
     vignetting: [f64; 2],
 }
 
@@ -152,7 +152,7 @@ fn between(random: &mut Random, a: f64, b: f64) -> f64 {
 }
 
 /// Draws what the photos of one scene go through. Effects that are off change nothing that is drawn for the others.
-pub fn shots(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<Shot>> {
+pub fn photo_effects(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<PhotoEffects>> {
     let Some(first) = cameras.first() else { return Ok(Vec::new()) };
     let stream = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
     let mut taken_with = vec![optics(first, effects, stream)?];
@@ -160,24 +160,24 @@ pub fn shots(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<Sho
         taken_with.push(optics(first, effects, stream ^ 0x2cab_0000)?);
     }
     let mut light = Random::new(stream ^ 0x116f7);
-    let shots = cameras.iter().enumerate().map(|(i, camera)| {
+    let photo_effects = cameras.iter().enumerate().map(|(i, camera)| {
         let own = &taken_with[i % taken_with.len()];
-        let drawn = Light {
+        let drawn = TrueLight {
             exposure_ev: between(&mut light, -EXPOSURE, EXPOSURE),
             white_balance: [(); 3].map(|()| 1.0 + between(&mut light, -WHITE_BALANCE, WHITE_BALANCE)),
             vignetting: own.vignetting,
         };
-        Shot {
+        PhotoEffects {
             camera: refocused(camera, own.focal, own.offset, effects),
             lens: own.lens,
             light: effects.light.then_some(drawn),
             noise: effects.sensor_noise.then_some(seed.wrapping_mul(0x100_0000_01b3) ^ (i as u64) << 48),
         }
     });
-    Ok(shots.collect())
+    Ok(photo_effects.collect())
 }
 
-/// The camera with the focal length and the principal point that the effects ask for.
+/// The camera with the focal length and the principal point of the effects.
 fn refocused(camera: &Camera, focal: f64, offset: DVec2, effects: &Effects) -> Camera {
     let (mut camera, width) = (camera.clone(), f64::from(camera.width));
     if effects.focal {
@@ -191,7 +191,7 @@ fn refocused(camera: &Camera, focal: f64, offset: DVec2, effects: &Effects) -> C
     camera
 }
 
-impl Shot {
+impl PhotoEffects {
     /// Puts light and noise on a rendered picture (sRGB values).
     pub fn expose(&self, image: &mut RgbImage) {
         if self.light.is_none() && self.noise.is_none() {
@@ -229,26 +229,26 @@ pub fn to_srgb(v: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::super::render::photo;
-    use super::super::scene::{Knobs, Thing, World, world};
+    use super::super::scene::{SceneObject, SceneSpec, SyntheticScene, build_scene};
     use super::super::shapes::{Paint, Shape};
     use super::*;
     use glam::DVec3;
 
-    fn knobs(seed: u64, effects: Effects) -> Knobs {
-        Knobs { seed, size: (320, 240), photo_noise: 0.0, effects, ..Knobs::default() }
+    fn spec(seed: u64, effects: Effects) -> SceneSpec {
+        SceneSpec { seed, size: (320, 240), photo_noise: 0.0, effects, ..SceneSpec::default() }
     }
 
     /// Small white discs before nothing, and for each its centre and its rim. They lie flat, so that each has one
     /// brightness; rows above would see them from the side.
-    fn markers(camera: &Camera, lens: &Lens) -> (World, Vec<(DVec3, Vec<DVec3>)>) {
+    fn markers(camera: &Camera, lens: &Lens) -> (SyntheticScene, Vec<(DVec3, Vec<DVec3>)>) {
         let to_world = camera.pose.inverse();
-        let (mut things, mut places) = (Vec::new(), Vec::new());
+        let (mut objects, mut places) = (Vec::new(), Vec::new());
         for (i, j) in (2..6).flat_map(|j| (0..8).map(move |i| (i, j))) {
             let pixel = DVec2::new(20.0 + 40.0 * f64::from(i), 20.0 + 40.0 * f64::from(j));
             let at = to_world.transform(lens.ray(camera, pixel));
             let radius = 10.0 / camera.fx;
             let paint = Paint { colour: [1.0; 3], contrast: 0.0, grain: 1.0, seed: 0 };
-            things.push(Thing {
+            objects.push(SceneObject {
                 label: 1,
                 phrase: "disc".into(),
                 shape: Shape::Can(at, radius, 1e-6),
@@ -257,7 +257,10 @@ mod tests {
             let rim = (0..256).map(|k| DVec2::from_angle(std::f64::consts::TAU * f64::from(k) / 256.0));
             places.push((at, rim.map(|d| at + (radius * d).extend(0.0)).collect()));
         }
-        (World { things, train: vec![], shots: vec![], test: vec![], noisy: vec![] }, places)
+        (
+            SyntheticScene { objects, train: vec![], photo_effects: vec![], test: vec![], noisy: vec![] },
+            places,
+        )
     }
 
     /// Centre of mass of a polygon.
@@ -277,10 +280,10 @@ mod tests {
         let mut largest_shift: f64 = 0.0;
         for seed in 1000..1008 {
             let effects = Effects { focal: true, lens: true, centre: true, ..Effects::default() };
-            let shot = world(&knobs(seed, effects)).unwrap().shots[1].clone();
-            let (lens, camera) = (shot.lens.unwrap(), &shot.camera);
+            let photo_effects = build_scene(&spec(seed, effects)).unwrap().photo_effects[1].clone();
+            let (lens, camera) = (photo_effects.lens.unwrap(), &photo_effects.camera);
             let (discs, places) = markers(camera, &lens);
-            let image = photo(&discs, &shot, 0.0, 0).image;
+            let image = photo(&discs, &photo_effects, 0.0, 0).image;
             for (centre, rim) in places {
                 let rim: Vec<DVec2> = rim.into_iter().map(|p| lens.project(camera, p)).collect();
                 let stated = centroid(&rim);
@@ -303,11 +306,11 @@ mod tests {
 
     #[test]
     fn every_drawn_lens_has_one_ray_per_pixel() {
-        let cameras = world(&knobs(1000, Effects::default())).unwrap().train;
+        let cameras = build_scene(&spec(1000, Effects::default())).unwrap().train;
         let (mut barrel, mut pincushion) = (0, 0);
         for seed in 1000..1200 {
-            let shot = &shots(&cameras, &Effects::PHONE, seed).unwrap()[0];
-            let (lens, camera) = (shot.lens.unwrap(), &shot.camera);
+            let photo_effects = &photo_effects(&cameras, &Effects::PHONE, seed).unwrap()[0];
+            let (lens, camera) = (photo_effects.lens.unwrap(), &photo_effects.camera);
             assert!(lens.k1.abs() <= K1 && lens.k2.abs() <= lens.k1.abs() * K2_SHARE);
             assert!((FOCAL.0..FOCAL.1).contains(&(camera.fx / 320.0)));
             assert!((camera.cx - 160.0).abs() <= 3.2 && (camera.cy - 120.0).abs() <= 3.2);
@@ -328,21 +331,22 @@ mod tests {
 
     #[test]
     fn means_follow_the_stated_gains() {
-        let dark = knobs(1000, Effects::default());
-        let plain = world(&dark).unwrap();
-        let before: Vec<RgbImage> = plain.shots.iter().map(|s| photo(&plain, s, 0.0, 0).image).collect();
+        let dark = spec(1000, Effects::default());
+        let plain = build_scene(&dark).unwrap();
+        let before: Vec<RgbImage> =
+            plain.photo_effects.iter().map(|s| photo(&plain, s, 0.0, 0).image).collect();
         let effects = Effects { light: true, sensor_noise: true, ..Effects::default() };
-        let lit = world(&Knobs { effects, ..dark }).unwrap();
+        let lit = build_scene(&SceneSpec { effects, ..dark }).unwrap();
         let mut first = Vec::new();
-        for (shot, before) in lit.shots.iter().zip(&before) {
-            let image = photo(&lit, shot, 0.0, 0).image;
-            let light = shot.light.unwrap();
+        for (photo_effects, before) in lit.photo_effects.iter().zip(&before) {
+            let image = photo(&lit, photo_effects, 0.0, 0).image;
+            let light = photo_effects.light.unwrap();
             // a block of the middle and one of a corner, where the fall-off counts
             for (x0, y0) in [(140, 100), (0, 0)] {
                 let (mut sum, mut stated) = ([0.0; 3], [0.0; 3]);
                 for p in (y0..y0 + 40).flat_map(|y| (x0..x0 + 40).map(move |x| y * 320 + x)) {
                     let at = DVec2::new((p % 320) as f64 + 0.5, (p / 320) as f64 + 0.5);
-                    let gain = light.gain(&shot.camera, at);
+                    let gain = light.gain(&photo_effects.camera, at);
                     for c in 0..3 {
                         sum[c] += to_linear(f64::from(image.data[p][c]));
                         stated[c] += (to_linear(f64::from(before.data[p][c])) * gain[c]).min(1.0);
@@ -360,11 +364,11 @@ mod tests {
 
     #[test]
     fn sensor_noise_has_the_stated_spread() {
-        let camera = world(&knobs(1000, Effects::default())).unwrap().train[0].clone();
-        let shot = Shot { camera, lens: None, light: None, noise: Some(5) };
+        let camera = build_scene(&spec(1000, Effects::default())).unwrap().train[0].clone();
+        let photo_effects = PhotoEffects { camera, lens: None, light: None, noise: Some(5) };
         let grey = to_srgb(0.18) as f32;
         let mut image = RgbImage { width: 320, height: 240, data: vec![[grey; 3]; 320 * 240] };
-        shot.expose(&mut image);
+        photo_effects.expose(&mut image);
         let linear: Vec<f64> = image.data.iter().flatten().map(|v| to_linear(f64::from(*v))).collect();
         let mean = linear.iter().sum::<f64>() / linear.len() as f64;
         let sigma = (linear.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / linear.len() as f64).sqrt();
@@ -374,21 +378,27 @@ mod tests {
 
     #[test]
     fn effects_that_are_off_change_nothing_else() {
-        let plain = world(&knobs(1000, Effects::default())).unwrap();
-        let phone = world(&knobs(1000, Effects::PHONE)).unwrap();
-        assert!(plain.shots.iter().all(|s| s.lens.is_none() && s.light.is_none() && s.noise.is_none()));
-        assert_eq!(plain.things, phone.things);
+        let plain = build_scene(&spec(1000, Effects::default())).unwrap();
+        let phone = build_scene(&spec(1000, Effects::PHONE)).unwrap();
+        assert!(
+            plain.photo_effects.iter().all(|s| s.lens.is_none() && s.light.is_none() && s.noise.is_none())
+        );
+        assert_eq!(plain.objects, phone.objects);
         for (a, b) in plain.train.iter().zip(&phone.train) {
             assert_eq!(a.pose, b.pose);
         }
-        let lens = world(&knobs(1000, Effects { lens: true, focal: true, ..Effects::default() })).unwrap();
-        assert_eq!(lens.shots[0].camera.fx, phone.shots[0].camera.fx);
-        let light = world(&knobs(1000, Effects { light: true, ..Effects::default() })).unwrap();
-        assert_eq!(light.shots[2].light, phone.shots[2].light);
-        let two = world(&knobs(1000, Effects { two_cameras: true, ..Effects::PHONE })).unwrap();
-        let (first, second) = (&two.shots[0], &two.shots[1]);
-        assert_eq!(first.camera, phone.shots[0].camera);
+        let lens =
+            build_scene(&spec(1000, Effects { lens: true, focal: true, ..Effects::default() })).unwrap();
+        assert_eq!(lens.photo_effects[0].camera.fx, phone.photo_effects[0].camera.fx);
+        let light = build_scene(&spec(1000, Effects { light: true, ..Effects::default() })).unwrap();
+        assert_eq!(light.photo_effects[2].light, phone.photo_effects[2].light);
+        let two = build_scene(&spec(1000, Effects { two_cameras: true, ..Effects::PHONE })).unwrap();
+        let (first, second) = (&two.photo_effects[0], &two.photo_effects[1]);
+        assert_eq!(first.camera, phone.photo_effects[0].camera);
         assert!(second.lens != first.lens && second.camera.fx != first.camera.fx);
-        assert_eq!((two.shots[3].lens, two.shots[3].camera.fx), (second.lens, second.camera.fx));
+        assert_eq!(
+            (two.photo_effects[3].lens, two.photo_effects[3].camera.fx),
+            (second.lens, second.camera.fx)
+        );
     }
 }

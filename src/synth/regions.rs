@@ -10,7 +10,7 @@ use crate::language::dir::normalise_rows;
 use crate::language::{LevelMasks, ViewMasks};
 use crate::math::Random;
 use crate::photo::stem;
-use crate::query::eval::{BACKGROUND_LABELS, Frame, GroundTruth};
+use crate::query::eval::{BACKGROUND_LABELS, GroundTruth, TruthFrame};
 use crate::query::{CANONICAL_PHRASES, TextQuery};
 use crate::scene::Plane;
 use crate::{Error, Result};
@@ -22,11 +22,11 @@ use std::path::Path;
 pub const DIM: usize = 512;
 
 /// Share of what an image feature has in common with its phrase, next to a common part of length 1.
-const MEANING: f32 = 0.6;
+const PHRASE_SHARE: f32 = 0.6;
 
 /// How often segmentation and description go wrong. Rates are per (view, object, level).
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
-pub struct Flaws {
+pub struct InjectedErrors {
     /// Everything below is drawn from this.
     pub seed: u64,
     /// A mask of level m or l is cut in two, and the pieces look like pieces.
@@ -39,24 +39,25 @@ pub struct Flaws {
     pub noise: f64,
 }
 
-impl Flaws {
+impl InjectedErrors {
     /// Exact masks, exact features.
-    pub const NONE: Flaws = Flaws { seed: 0, split: 0.0, merge: 0.0, wrong: 0.0, noise: 0.0 };
+    pub const NONE: InjectedErrors =
+        InjectedErrors { seed: 0, split: 0.0, merge: 0.0, wrong: 0.0, noise: 0.0 };
 
     /// The rates that `ablate` injects: every fifth mask is cut and every fifth feature mistaken, about what the paper's
     /// figures show of SAM and CLIP between views far apart.
-    pub fn usual(seed: u64) -> Flaws {
-        Flaws { seed, split: 0.2, merge: 0.05, wrong: 0.2, noise: 0.35 }
+    pub fn default_rates(seed: u64) -> InjectedErrors {
+        InjectedErrors { seed, split: 0.2, merge: 0.05, wrong: 0.2, noise: 0.35 }
     }
 }
 
-/// Masks with features per view, and what the phrases mean in that space.
+/// Masks with features per view, and the exact feature of every object.
 #[derive(Clone, Debug, Default)]
 pub struct Regions {
     /// One per frame, three levels.
     pub masks: Vec<ViewMasks>,
-    /// Object index → the flawless feature of the whole object.
-    pub meaning: BTreeMap<u32, Vec<f32>>,
+    /// Object index → the exact feature of the whole object.
+    pub embeddings: BTreeMap<u32, Vec<f32>>,
 }
 
 /// A direction that belongs to a name.
@@ -74,8 +75,8 @@ fn add(to: &mut [f32], v: &[f32], weight: f32) {
     to.iter_mut().zip(v).for_each(|(a, b)| *a += weight * b);
 }
 
-/// What a phrase means: its last word counts half as much again.
-fn meaning(phrase: &str) -> Vec<f32> {
+/// Direction of a phrase: the sum of those of its words, the last one 1.5 times.
+fn phrase_direction(phrase: &str) -> Vec<f32> {
     let words: Vec<String> = phrase.to_lowercase().split_whitespace().map(str::to_owned).collect();
     let mut sum = vec![0.0; DIM];
     for (k, word) in words.iter().enumerate() {
@@ -88,7 +89,7 @@ fn meaning(phrase: &str) -> Vec<f32> {
 /// Unit embedding of any text.
 pub fn text_embedding(phrase: &str) -> Vec<f32> {
     let mut sum = direction("every text");
-    add(&mut sum, &meaning(phrase), MEANING);
+    add(&mut sum, &phrase_direction(phrase), PHRASE_SHARE);
     normalise_rows(&mut sum, DIM);
     sum
 }
@@ -102,7 +103,7 @@ pub fn query(text: &str) -> TextQuery {
     }
 }
 
-/// Unit feature of an image region: what it means by `share`, and directions of its own.
+/// Unit feature of an image region: its phrase by `share`, and directions of its own.
 fn region_feature(
     phrase: &str,
     share: f32,
@@ -111,7 +112,7 @@ fn region_feature(
     random: &mut Random,
 ) -> Vec<f32> {
     let mut sum = direction("every image");
-    add(&mut sum, &meaning(phrase), share);
+    add(&mut sum, &phrase_direction(phrase), share);
     for (name, weight) in own {
         add(&mut sum, &direction(name), *weight);
     }
@@ -123,7 +124,7 @@ fn region_feature(
 }
 
 /// Makes regions for frames of a ground truth that has masks; parts of objects need depth and are left out without it.
-pub fn regions(truth: &GroundTruth, frames: &[&Frame], flaws: &Flaws) -> Result<Regions> {
+pub fn regions(truth: &GroundTruth, frames: &[&TruthFrame], flaws: &InjectedErrors) -> Result<Regions> {
     let mut objects = Vec::new();
     for frame in frames {
         objects.push(truth.objects(frame)?.ok_or_else(|| {
@@ -145,16 +146,16 @@ pub fn regions(truth: &GroundTruth, frames: &[&Frame], flaws: &Flaws) -> Result<
         }
         masks.push(view);
     }
-    let meaning = truth
+    let embeddings = truth
         .labels
         .iter()
-        .map(|(&k, phrase)| (k, region_feature(phrase, MEANING, &[], 0.0, &mut Random::new(0))));
-    Ok(Regions { masks, meaning: meaning.collect() })
+        .map(|(&k, phrase)| (k, region_feature(phrase, PHRASE_SHARE, &[], 0.0, &mut Random::new(0))));
+    Ok(Regions { masks, embeddings: embeddings.collect() })
 }
 
 /// Per frame and pixel the quarter of its object, 0 to 3: signs along the object's two longest axes in space, so that all
 /// views agree.
-fn parts(truth: &GroundTruth, frames: &[&Frame], objects: &[Plane<u32>]) -> Result<Vec<Vec<u8>>> {
+fn parts(truth: &GroundTruth, frames: &[&TruthFrame], objects: &[Plane<u32>]) -> Result<Vec<Vec<u8>>> {
     let mut points: BTreeMap<u32, Vec<DVec3>> = BTreeMap::new();
     let mut places = Vec::new();
     for (frame, objects) in frames.iter().zip(objects) {
@@ -217,7 +218,7 @@ fn one_level(
     objects: &Plane<u32>,
     parts: &[u8],
     level: usize,
-    flaws: &Flaws,
+    flaws: &InjectedErrors,
     random: &mut Random,
 ) -> LevelMasks {
     let mut out =
@@ -240,14 +241,14 @@ fn one_level(
                 for (half, piece) in halves(&group, objects.width).into_iter().enumerate() {
                     let piece_name = format!("piece {phrase} {k} {half} {}", random.bits());
                     let own = [(piece_name.as_str(), 0.6)];
-                    let f = region_feature(shown, 0.55 * MEANING, &own, flaws.noise as f32, random);
+                    let f = region_feature(shown, 0.55 * PHRASE_SHARE, &own, flaws.noise as f32, random);
                     push(&mut out, &piece, f);
                 }
                 continue;
             }
             let part = format!("part {phrase} {level} {k}");
             let own: &[(&str, f32)] = &[(part.as_str(), [0.5, 0.35, 0.0][level])];
-            let share = if kinds == 1 { MEANING } else { [0.65, 0.8][level] * MEANING };
+            let share = if kinds == 1 { PHRASE_SHARE } else { [0.65, 0.8][level] * PHRASE_SHARE };
             let own = if kinds == 1 { &[][..] } else { own };
             push(&mut out, &group, region_feature(shown, share, own, flaws.noise as f32, random));
         }
@@ -266,7 +267,7 @@ fn swallowed(
     labels: &BTreeMap<u32, String>,
     objects: &Plane<u32>,
     level: usize,
-    flaws: &Flaws,
+    flaws: &InjectedErrors,
     random: &mut Random,
 ) -> Vec<(u32, u32)> {
     let mut out = Vec::new();
@@ -331,7 +332,7 @@ fn compacted(masks: LevelMasks) -> LevelMasks {
 }
 
 /// Writes regions as a `dir:` folder, with the embeddings of `phrases`.
-pub fn write(folder: &Path, frames: &[&Frame], regions: &Regions, phrases: &[String]) -> Result<()> {
+pub fn write(folder: &Path, frames: &[&TruthFrame], regions: &Regions, phrases: &[String]) -> Result<()> {
     create_folder(folder)?;
     for (frame, view) in frames.iter().zip(&regions.masks) {
         let name = stem(&frame.file);
@@ -368,7 +369,7 @@ mod tests {
     #[test]
     fn cosines_are_those_of_crops_and_phrases() {
         let mut random = Random::new(1000);
-        let mut f = |phrase: &str| region_feature(phrase, MEANING, &[], 0.35, &mut random);
+        let mut f = |phrase: &str| region_feature(phrase, PHRASE_SHARE, &[], 0.35, &mut random);
         let (a, b, c) = (f("blue mug"), f("blue mug"), f("lemon"));
         assert!((0.85..0.96).contains(&dot(&a, &b)), "same object {}", dot(&a, &b));
         assert!((0.55..0.75).contains(&dot(&a, &c)), "two objects {}", dot(&a, &c));
@@ -382,13 +383,13 @@ mod tests {
     #[test]
     fn without_flaws_every_whole_is_its_object_and_parts_agree_between_views() {
         let truth = breakfast();
-        let frames: Vec<&Frame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
-        let made = regions(&truth, &frames, &Flaws::NONE).unwrap();
+        let frames: Vec<&TruthFrame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
+        let made = regions(&truth, &frames, &InjectedErrors::NONE).unwrap();
         for (frame, view) in frames.iter().zip(&made.masks) {
             let objects = truth.objects(frame).unwrap().unwrap();
             let whole = &view.levels[2];
             for (p, &l) in whole.labels.data.iter().enumerate() {
-                let expected = made.meaning.get(&objects.data[p]);
+                let expected = made.embeddings.get(&objects.data[p]);
                 let feature = usize::try_from(l).ok().map(|l| &whole.features[l * DIM..(l + 1) * DIM]);
                 if let (Some(e), Some(f)) = (expected, feature) {
                     assert!(dot(e, f) > 0.999);
@@ -406,19 +407,20 @@ mod tests {
     #[test]
     fn flaws_come_at_their_rates_and_a_seed_repeats_them() {
         let truth = breakfast();
-        let frames: Vec<&Frame> = truth.frames.iter().collect();
-        let count = |flaws: &Flaws| -> usize {
+        let frames: Vec<&TruthFrame> = truth.frames.iter().collect();
+        let count = |flaws: &InjectedErrors| -> usize {
             let made = regions(&truth, &frames, flaws).unwrap();
             made.masks.iter().map(|v| v.levels[2].quality.len()).sum()
         };
-        let exact = count(&Flaws::NONE);
-        let split = count(&Flaws { split: 0.5, seed: 1000, ..Flaws::NONE });
-        let merged = count(&Flaws { merge: 0.5, seed: 1000, ..Flaws::NONE });
+        let exact = count(&InjectedErrors::NONE);
+        let split = count(&InjectedErrors { split: 0.5, seed: 1000, ..InjectedErrors::NONE });
+        let merged = count(&InjectedErrors { merge: 0.5, seed: 1000, ..InjectedErrors::NONE });
         // 12 views of 8 objects: 48 more, ± 3 σ of 96 draws
         assert!((split - exact) > 33 && (split - exact) < 63, "{exact} {split}");
         assert!(merged + 5 < exact, "{exact} {merged}");
-        let (a, b) = (Flaws::usual(1001), Flaws::usual(1002));
-        let first = |f: &Flaws| regions(&truth, &frames, f).unwrap().masks[0].levels[2].features.clone();
+        let (a, b) = (InjectedErrors::default_rates(1001), InjectedErrors::default_rates(1002));
+        let first =
+            |f: &InjectedErrors| regions(&truth, &frames, f).unwrap().masks[0].levels[2].features.clone();
         assert_eq!(first(&a), first(&a));
         assert_ne!(first(&a), first(&b));
     }
@@ -426,8 +428,8 @@ mod tests {
     #[test]
     fn a_written_folder_reads_back() {
         let truth = breakfast();
-        let frames: Vec<&Frame> = truth.frames.iter().take(2).collect();
-        let made = regions(&truth, &frames, &Flaws::usual(1003)).unwrap();
+        let frames: Vec<&TruthFrame> = truth.frames.iter().take(2).collect();
+        let made = regions(&truth, &frames, &InjectedErrors::default_rates(1003)).unwrap();
         let dir = tempfile::tempdir().unwrap();
         let phrases: Vec<String> = truth.labels.values().cloned().collect();
         write(dir.path(), &frames, &made, &phrases).unwrap();

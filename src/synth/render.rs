@@ -1,6 +1,6 @@
 //! Ray casting: photo, depth and mask of a synthetic scene.
-use super::phone::Shot;
-use super::scene::{Thing, World};
+use super::phone::PhotoEffects;
+use super::scene::{SceneObject, SyntheticScene};
 use super::shapes::Hit;
 use crate::math::Random;
 use crate::scene::{Camera, Lens, Plane, RgbImage};
@@ -16,7 +16,7 @@ const SAMPLES: usize = 2;
 
 /// One view of a scene; depth and mask are those of the pixel centres.
 #[derive(Clone, Debug)]
-pub struct Seen {
+pub struct RayCast {
     /// The photo.
     pub image: RgbImage,
     /// Camera z, metres.
@@ -25,22 +25,22 @@ pub struct Seen {
     pub objects: Plane<u32>,
 }
 
-fn first(world: &World, from: DVec3, ray: DVec3) -> Option<(&Thing, Hit)> {
-    let hits = world.things.iter().filter_map(|t| t.shape.hit(from, ray).map(|h| (t, h)));
+fn first(scene: &SyntheticScene, from: DVec3, ray: DVec3) -> Option<(&SceneObject, Hit)> {
+    let hits = scene.objects.iter().filter_map(|t| t.shape.hit(from, ray).map(|h| (t, h)));
     hits.min_by(|a, b| a.1.t.total_cmp(&b.1.t))
 }
 
 /// Mean colour over the rays of a pixel, sRGB values; black where nothing is.
-fn colour(world: &World, camera: &Camera, lens: Option<&Lens>, (x, y): (f64, f64)) -> [f64; 3] {
+fn colour(scene: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, (x, y): (f64, f64)) -> [f64; 3] {
     let to_world = camera.pose.inverse();
     let mut sum = [0.0; 3];
     for k in 0..SAMPLES * SAMPLES {
         let at = |i: usize| (i as f64 + 0.5) / SAMPLES as f64;
         let pixel = DVec2::new(x + at(k % SAMPLES), y + at(k / SAMPLES));
         let ray = lens.map_or_else(|| camera.ray(pixel), |l| l.ray(camera, pixel));
-        if let Some((thing, hit)) = first(world, to_world.translation, to_world.rotation * ray) {
+        if let Some((object, hit)) = first(scene, to_world.translation, to_world.rotation * ray) {
             let light = AMBIENT + (1.0 - AMBIENT) * hit.normal.dot(LIGHT).max(0.0);
-            let colour = thing.paint.at(hit.place);
+            let colour = object.paint.at(hit.place);
             (0..3).for_each(|c| sum[c] += light * colour[c]);
         }
     }
@@ -48,10 +48,10 @@ fn colour(world: &World, camera: &Camera, lens: Option<&Lens>, (x, y): (f64, f64
 }
 
 /// The picture alone, with a lens if there is one: each ray goes where the lens sends it, so nothing is resampled.
-fn picture(world: &World, camera: &Camera, lens: Option<&Lens>, noise: f64, seed: u64) -> RgbImage {
+fn picture(scene: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, noise: f64, seed: u64) -> RgbImage {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let pixel = |p: usize| {
-        let shown = colour(world, camera, lens, ((p % width) as f64, (p / width) as f64));
+        let shown = colour(scene, camera, lens, ((p % width) as f64, (p / width) as f64));
         let mut random = Random::new(seed ^ (p as u64).wrapping_mul(0x2545_f491_4f6c_dd1d));
         let shown = shown.map(|v| v + noise * random.normal());
         shown.map(|v| v.clamp(0.0, 1.0) as f32)
@@ -60,69 +60,70 @@ fn picture(world: &World, camera: &Camera, lens: Option<&Lens>, noise: f64, seed
 }
 
 /// Renders a view; `noise` is the standard deviation of the photo's noise.
-pub fn render(world: &World, camera: &Camera, noise: f64, seed: u64) -> Seen {
+pub fn render(scene: &SyntheticScene, camera: &Camera, noise: f64, seed: u64) -> RayCast {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let to_world = camera.pose.inverse();
     // The ray has camera z 1: its parameter is the depth.
     let cast = |p: usize| {
         let pixel = DVec2::new((p % width) as f64 + 0.5, (p / width) as f64 + 0.5);
-        let hit = first(world, to_world.translation, to_world.rotation * camera.ray(pixel));
+        let hit = first(scene, to_world.translation, to_world.rotation * camera.ray(pixel));
         hit.map_or((0.0, 0), |(t, h)| (h.t as f32, t.label))
     };
     let pixels: Vec<(f32, u32)> = (0..width * height).into_par_iter().map(cast).collect();
-    Seen {
-        image: picture(world, camera, None, noise, seed),
+    RayCast {
+        image: picture(scene, camera, None, noise, seed),
         depth: Plane { width, height, data: pixels.iter().map(|p| p.0).collect() },
         objects: Plane { width, height, data: pixels.iter().map(|p| p.1).collect() },
     }
 }
 
 /// A view as its phone takes it; depth and mask are those of the undistorted pinhole.
-pub fn photo(world: &World, shot: &Shot, noise: f64, seed: u64) -> Seen {
-    let mut seen = render(world, &shot.camera, noise, seed);
-    if let Some(lens) = &shot.lens {
-        seen.image = picture(world, &shot.camera, Some(lens), noise, seed);
+pub fn photo(scene: &SyntheticScene, effects: &PhotoEffects, noise: f64, seed: u64) -> RayCast {
+    let mut seen = render(scene, &effects.camera, noise, seed);
+    if let Some(lens) = &effects.lens {
+        seen.image = picture(scene, &effects.camera, Some(lens), noise, seed);
     }
-    shot.expose(&mut seen.image);
+    effects.expose(&mut seen.image);
     seen
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::scene::{Knobs, world};
+    use super::super::scene::{SceneSpec, build_scene};
     use super::*;
 
-    fn small(seed: u64) -> (World, Vec<Seen>) {
-        let knobs = Knobs { seed, size: (160, 120), thin: 1, similar: 1, held_out: 2, ..Knobs::default() };
-        let world = world(&knobs).unwrap();
-        let seen = world.train.iter().map(|c| render(&world, c, 0.0, 0)).collect();
-        (world, seen)
+    fn small(seed: u64) -> (SyntheticScene, Vec<RayCast>) {
+        let spec =
+            SceneSpec { seed, size: (160, 120), thin: 1, similar: 1, held_out: 2, ..SceneSpec::default() };
+        let scene = build_scene(&spec).unwrap();
+        let seen = scene.train.iter().map(|c| render(&scene, c, 0.0, 0)).collect();
+        (scene, seen)
     }
 
     #[test]
     fn views_agree_on_depth_and_label_where_they_see_the_same_place() {
         for seed in 1000..1003 {
-            let (world, seen) = small(seed);
+            let (scene, seen) = small(seed);
             let (mut same, mut agree, mut label) = (0, 0, 0);
             for p in 0..160 * 120 {
                 let pixel = DVec2::new((p % 160) as f64 + 0.5, (p / 160) as f64 + 0.5);
-                let x = world.train[0].unproject(pixel, f64::from(seen[0].depth.data[p]));
-                let (q, z) = world.train[1].project(x);
+                let x = scene.train[0].unproject(pixel, f64::from(seen[0].depth.data[p]));
+                let (q, z) = scene.train[1].project(x);
                 if z <= 0.0 || q.x < 0.0 || q.y < 0.0 || q.x >= 160.0 || q.y >= 120.0 {
                     continue;
                 }
                 // an exact ray at the exact position tells whether the other camera sees that place
-                let to_world = world.train[1].pose.inverse();
-                let ray = to_world.rotation * world.train[1].ray(q);
-                let (thing, hit) = first(&world, to_world.translation, ray).unwrap();
+                let to_world = scene.train[1].pose.inverse();
+                let ray = to_world.rotation * scene.train[1].ray(q);
+                let (object, hit) = first(&scene, to_world.translation, ray).unwrap();
                 if hit.t < z - 1e-4 {
                     continue;
                 }
                 same += 1;
                 agree += usize::from((hit.t - z).abs() < 1e-6);
-                label += usize::from(thing.label == seen[0].objects.data[p]);
+                label += usize::from(object.label == seen[0].objects.data[p]);
             }
-            // depth is stored as f32, and two things meet where an object stands on the table
+            // depth is stored as f32, and two objects meet where an object stands on the table
             assert!(same > 9000 && agree as f64 > 0.995 * same as f64, "{same} {agree}");
             assert!(label as f64 > 0.995 * same as f64, "{same} {label}");
         }
@@ -131,47 +132,47 @@ mod tests {
     #[test]
     fn every_thing_has_its_own_phrase_and_shows_somewhere() {
         for seed in 1000..1006 {
-            let (world, seen) = small(seed);
-            let mut phrases: Vec<&str> = world.things.iter().map(|t| t.phrase.as_str()).collect();
+            let (scene, seen) = small(seed);
+            let mut phrases: Vec<&str> = scene.objects.iter().map(|t| t.phrase.as_str()).collect();
             phrases.sort_unstable();
             let count = phrases.len();
             phrases.dedup();
             assert_eq!((phrases.len(), count), (12, 12), "{phrases:?}");
-            for thing in &world.things {
-                let shown = seen.iter().any(|s| s.objects.data.contains(&thing.label));
-                assert!(shown, "{} is nowhere", thing.phrase);
+            for object in &scene.objects {
+                let shown = seen.iter().any(|s| s.objects.data.contains(&object.label));
+                assert!(shown, "{} is nowhere", object.phrase);
             }
         }
     }
 
     #[test]
     fn knobs_do_what_they_say() {
-        let base = Knobs { seed: 1000, size: (160, 120), ..Knobs::default() };
-        let of = |knobs: &Knobs| {
-            let world = world(knobs).unwrap();
-            let seen = render(&world, &world.train[0], knobs.photo_noise, 1);
-            (world, seen)
+        let base = SceneSpec { seed: 1000, size: (160, 120), ..SceneSpec::default() };
+        let of = |spec: &SceneSpec| {
+            let scene = build_scene(spec).unwrap();
+            let seen = render(&scene, &scene.train[0], spec.photo_noise, 1);
+            (scene, seen)
         };
         // bare surfaces: neighbouring pixels of the table are alike
-        let rough = |s: &Seen| {
+        let rough = |s: &RayCast| {
             let l = s.image.luma();
             let pairs =
                 (0..l.data.len() - 1).filter(|&p| s.objects.data[p] == 1 && s.objects.data[p + 1] == 1);
             pairs.map(|p| (l.data[p] - l.data[p + 1]).abs() as f64).sum::<f64>()
         };
-        let quiet = Knobs { photo_noise: 0.0, ..base.clone() };
-        let bare = Knobs { texture: 0.0, ..quiet.clone() };
+        let quiet = SceneSpec { photo_noise: 0.0, ..base.clone() };
+        let bare = SceneSpec { texture: 0.0, ..quiet.clone() };
         assert!(rough(&of(&quiet).1) > 20.0 * rough(&of(&bare).1));
         // wide baselines
-        let angle = |k: &Knobs| {
-            let w = world(k).unwrap();
+        let angle = |k: &SceneSpec| {
+            let w = build_scene(k).unwrap();
             let axis = |c: &Camera| c.pose.rotation.transpose() * DVec3::Z;
             axis(&w.train[0]).angle_between(axis(&w.train[1])).to_degrees()
         };
-        assert!(angle(&Knobs { baseline: 40.0, ..base.clone() }) > angle(&base) + 10.0);
+        assert!(angle(&SceneSpec { baseline: 40.0, ..base.clone() }) > angle(&base) + 10.0);
         // poses err by what was asked
-        let error = |k: &Knobs| {
-            let w = world(k).unwrap();
+        let error = |k: &SceneSpec| {
+            let w = build_scene(k).unwrap();
             let off = |(a, b): (&Camera, &Camera)| {
                 let r = a.pose.rotation * b.pose.rotation.transpose();
                 ((r.x_axis.x + r.y_axis.y + r.z_axis.z - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees()
@@ -179,17 +180,17 @@ mod tests {
             w.train.iter().zip(&w.noisy).map(off).sum::<f64>() / w.train.len() as f64
         };
         // acos near 1 keeps half of the digits
-        assert!(error(&Knobs { pose_noise: 0.0, ..base.clone() }) < 1e-5);
+        assert!(error(&SceneSpec { pose_noise: 0.0, ..base.clone() }) < 1e-5);
         // the mean length of three normal numbers is 1.6 σ; four cameras scatter by a quarter of that
-        let two = error(&Knobs { pose_noise: 2.0, ..base.clone() });
+        let two = error(&SceneSpec { pose_noise: 2.0, ..base.clone() });
         assert!((1.5..5.5).contains(&two), "{two}");
         for bad in [
-            Knobs { views: 1, ..base.clone() },
-            Knobs { objects: 13, ..base.clone() },
-            Knobs { similar: 5, ..base.clone() },
-            Knobs { texture: 2.0, ..base.clone() },
+            SceneSpec { views: 1, ..base.clone() },
+            SceneSpec { objects: 13, ..base.clone() },
+            SceneSpec { similar: 5, ..base.clone() },
+            SceneSpec { texture: 2.0, ..base.clone() },
         ] {
-            assert_eq!(world(&bad).unwrap_err().exit_code(), 2);
+            assert_eq!(build_scene(&bad).unwrap_err().exit_code(), 2);
         }
     }
 }

@@ -1,5 +1,5 @@
-//! Small scenes with everything known: a table with objects before a wall, and the knobs that make them hard.
-use super::phone::{self, Effects, Shot};
+//! Small scenes with everything known: a table with objects before a wall, and the settings that make them hard.
+use super::phone::{self, Effects, PhotoEffects};
 use super::shapes::{Paint, Shape};
 use crate::math::Random;
 use crate::scene::{Camera, Pose};
@@ -9,7 +9,7 @@ use serde::Serialize;
 
 /// What to make and what should be hard about it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Knobs {
+pub struct SceneSpec {
     /// Everything random.
     pub seed: u64,
     /// Photos, at least 2.
@@ -34,13 +34,13 @@ pub struct Knobs {
     pub pose_noise: f64,
     /// Standard deviation of the photos' noise, in units of full white.
     pub photo_noise: f64,
-    /// What a phone does to the photos; held-out views then are clean.
+    /// Effects of a phone camera on the photos; held-out views then are clean.
     pub effects: Effects,
 }
 
-impl Default for Knobs {
+impl Default for SceneSpec {
     fn default() -> Self {
-        Knobs {
+        SceneSpec {
             seed: 0,
             views: 4,
             held_out: 6,
@@ -58,9 +58,9 @@ impl Default for Knobs {
     }
 }
 
-/// A thing with a name.
+/// An object with a name.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Thing {
+pub struct SceneObject {
     /// Index in the masks.
     pub label: u32,
     /// What it is called.
@@ -73,13 +73,13 @@ pub struct Thing {
 
 /// A finished scene.
 #[derive(Clone, Debug, PartialEq)]
-pub struct World {
+pub struct SyntheticScene {
     /// Background first.
-    pub things: Vec<Thing>,
+    pub objects: Vec<SceneObject>,
     /// True cameras of the photos, without distortion.
     pub train: Vec<Camera>,
     /// What each photo goes through.
-    pub shots: Vec<Shot>,
+    pub photo_effects: Vec<PhotoEffects>,
     /// True cameras of the held-out views.
     pub test: Vec<Camera>,
     /// The photos' cameras with errors, to start from.
@@ -97,7 +97,7 @@ const COLOURS: [(&str, [f64; 3]); 6] = [
 ];
 const NOUNS: [&str; 6] = ["ball", "box", "can", "book", "brick", "drum"];
 
-impl Knobs {
+impl SceneSpec {
     fn check(&self) -> Result<()> {
         let bad = |what: &str| Err(Error::input(format!("generate: {what}")));
         match self {
@@ -119,30 +119,30 @@ impl Knobs {
     }
 }
 
-/// Builds the scene of a set of knobs.
-pub fn world(knobs: &Knobs) -> Result<World> {
-    knobs.check()?;
-    let mut random = Random::new(knobs.seed ^ 0x5ce7e);
-    let mut things = background(knobs, &mut random);
-    objects(knobs, &mut random, &mut things)?;
-    let middle = (knobs.views - 1) as f64 / 2.0;
-    let train = (0..knobs.views).map(|i| {
-        let azimuth = (i as f64 - middle) * knobs.baseline + 4.0 * (random.uniform() - 0.5);
-        camera(&format!("train_{i:02}"), azimuth, 32.0 + 8.0 * (random.uniform() - 0.5), knobs.size)
+/// Builds the scene of a specification.
+pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
+    spec.check()?;
+    let mut random = Random::new(spec.seed ^ 0x5ce7e);
+    let mut objects = background(spec, &mut random);
+    place_objects(spec, &mut random, &mut objects)?;
+    let middle = (spec.views - 1) as f64 / 2.0;
+    let train = (0..spec.views).map(|i| {
+        let azimuth = (i as f64 - middle) * spec.baseline + 4.0 * (random.uniform() - 0.5);
+        camera(&format!("train_{i:02}"), azimuth, 32.0 + 8.0 * (random.uniform() - 0.5), spec.size)
     });
     let train: Vec<Camera> = train.collect();
-    let shots = phone::shots(&train, &knobs.effects, knobs.seed)?;
-    let train: Vec<Camera> = shots.iter().map(|s| s.camera.clone()).collect();
-    let test = (0..knobs.held_out).map(|i| {
-        let azimuth = (random.uniform() - 0.5) * (2.0 * middle * knobs.baseline + 6.0);
-        let name = format!("test_{:02}", knobs.views + i);
-        let made = camera(&name, azimuth, 25.0 + 18.0 * random.uniform(), knobs.size);
+    let photo_effects = phone::photo_effects(&train, &spec.effects, spec.seed)?;
+    let train: Vec<Camera> = photo_effects.iter().map(|s| s.camera.clone()).collect();
+    let test = (0..spec.held_out).map(|i| {
+        let azimuth = (random.uniform() - 0.5) * (2.0 * middle * spec.baseline + 6.0);
+        let name = format!("test_{:02}", spec.views + i);
+        let made = camera(&name, azimuth, 25.0 + 18.0 * random.uniform(), spec.size);
         // The same phone, with its principal point in the middle.
         let (fx, fy) = train.first().map_or((made.fx, made.fy), |c| (c.fx, c.fy));
         Camera { fx, fy, ..made }
     });
     let test: Vec<Camera> = test.collect();
-    let sigma = knobs.pose_noise.to_radians();
+    let sigma = spec.pose_noise.to_radians();
     let noisy = train.iter().map(|c| {
         let mut draw = || DVec3::new(random.normal(), random.normal(), random.normal()) * sigma;
         // The scene is about a metre away: an angle moves the picture as much as that length does.
@@ -150,40 +150,40 @@ pub fn world(knobs: &Knobs) -> Result<World> {
         Camera { pose: error.compose(&c.pose), ..c.clone() }
     });
     let noisy = noisy.collect();
-    Ok(World { things, train, shots, test, noisy })
+    Ok(SyntheticScene { objects, train, photo_effects, test, noisy })
 }
 
 fn paint(colour: [f64; 3], contrast: f64, grain: f64, random: &mut Random) -> Paint {
     Paint { colour, contrast, grain, seed: random.bits() }
 }
 
-fn background(knobs: &Knobs, random: &mut Random) -> Vec<Thing> {
-    let mut thing = |label, phrase: &str, shape, colour, grain| Thing {
+fn background(spec: &SceneSpec, random: &mut Random) -> Vec<SceneObject> {
+    let mut object = |label, phrase: &str, shape, colour, grain| SceneObject {
         label,
         phrase: phrase.into(),
         shape,
-        paint: paint(colour, 0.8 * knobs.texture, grain, random),
+        paint: paint(colour, 0.8 * spec.texture, grain, random),
     };
     let top = Shape::Block(DVec3::new(0.0, 0.0, -0.02), DVec3::new(0.62, 0.55, 0.02), 0.0);
     vec![
-        thing(1, "wooden table", top, [0.5, 0.35, 0.2], 0.05),
-        thing(2, "plaster wall", Shape::Plane(DVec3::Y, 1.0), [0.6, 0.58, 0.52], 0.12),
-        thing(3, "grey carpet", Shape::Plane(DVec3::Z, -0.6), [0.42, 0.42, 0.44], 0.12),
+        object(1, "wooden table", top, [0.5, 0.35, 0.2], 0.05),
+        object(2, "plaster wall", Shape::Plane(DVec3::Y, 1.0), [0.6, 0.58, 0.52], 0.12),
+        object(3, "grey carpet", Shape::Plane(DVec3::Z, -0.6), [0.42, 0.42, 0.44], 0.12),
     ]
 }
 
 /// Names and solids, placed without overlap; look-alikes and poles last.
-fn objects(knobs: &Knobs, random: &mut Random, things: &mut Vec<Thing>) -> Result<()> {
+fn place_objects(spec: &SceneSpec, random: &mut Random, objects: &mut Vec<SceneObject>) -> Result<()> {
     let mut names: Vec<(usize, usize)> =
         (0..COLOURS.len()).flat_map(|c| (0..NOUNS.len()).map(move |n| (c, n))).collect();
     random.shuffle(&mut names);
-    let kinds = knobs.objects - knobs.similar;
-    let reach = 0.42 - 0.16 * knobs.occlusion;
+    let kinds = spec.objects - spec.similar;
+    let reach = 0.42 - 0.16 * spec.occlusion;
     let mut taken: Vec<(DVec2, f64)> = Vec::new();
-    for (label, k) in (4..).zip(0..knobs.objects + knobs.thin) {
-        let like = k.checked_sub(kinds).filter(|_| k < knobs.objects);
-        let (phrase, colour, noun) = if k >= knobs.objects {
-            (format!("thin pole{}", number(k - knobs.objects)), [0.1, 0.1, 0.12], "pole")
+    for (label, k) in (4..).zip(0..spec.objects + spec.thin) {
+        let like = k.checked_sub(kinds).filter(|_| k < spec.objects);
+        let (phrase, colour, noun) = if k >= spec.objects {
+            (format!("thin pole{}", number(k - spec.objects)), [0.1, 0.1, 0.12], "pole")
         } else {
             let (c, n) = names[like.unwrap_or(k)];
             let n = NOUNS[n];
@@ -192,7 +192,7 @@ fn objects(knobs: &Knobs, random: &mut Random, things: &mut Vec<Thing>) -> Resul
             (format!("{word}{} {n}", COLOURS[c].0), COLOURS[c].1.map(|v| v * dim), n)
         };
         let (footprint, make) = solid(noun, random);
-        let gap = 0.05 * (1.0 - knobs.occlusion) + 0.01;
+        let gap = 0.05 * (1.0 - spec.occlusion) + 0.01;
         let at = (0..2000).find_map(|_| {
             let p = DVec2::new(random.uniform() - 0.5, random.uniform() - 0.5)
                 * 2.0
@@ -205,8 +205,13 @@ fn objects(knobs: &Knobs, random: &mut Random, things: &mut Vec<Thing>) -> Resul
             ));
         };
         taken.push((at, footprint));
-        let contrast = if noun == "pole" { 0.2 } else { 0.7 } * knobs.texture;
-        things.push(Thing { label, phrase, shape: make(at), paint: paint(colour, contrast, 0.03, random) });
+        let contrast = if noun == "pole" { 0.2 } else { 0.7 } * spec.texture;
+        objects.push(SceneObject {
+            label,
+            phrase,
+            shape: make(at),
+            paint: paint(colour, contrast, 0.03, random),
+        });
     }
     Ok(())
 }

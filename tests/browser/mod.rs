@@ -7,7 +7,7 @@ use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
 /// Software rendering on two busy cores may take its time.
-const PATIENCE: Duration = Duration::from_secs(90);
+const TIMEOUT: Duration = Duration::from_secs(90);
 
 /// Where Debian, Ubuntu, Fedora and Google put it; `CHROMIUM` overrides.
 const NAMES: [&str; 4] = ["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
@@ -108,7 +108,7 @@ impl Page {
         self.to.write_all(format!("{message}\0").as_bytes()).unwrap();
         let start = Instant::now();
         loop {
-            let left = PATIENCE.checked_sub(start.elapsed()).unwrap_or_default();
+            let left = TIMEOUT.checked_sub(start.elapsed()).unwrap_or_default();
             let reply = self.from.recv_timeout(left).unwrap_or_else(|e| panic!("{method}: {e}"));
             if reply["id"] == id {
                 assert!(reply["error"].is_null(), "{method}: {}", reply["error"]);
@@ -141,7 +141,7 @@ impl Page {
         self.call("Page.navigate", json!({ "url": url }));
         let start = Instant::now();
         while self.run("document.readyState + typeof splatvk") != "completeobject" {
-            assert!(start.elapsed() < PATIENCE, "{url} does not load: {:?}", self.complaints);
+            assert!(start.elapsed() < TIMEOUT, "{url} does not load: {:?}", self.complaints);
             std::thread::sleep(Duration::from_millis(50));
         }
         self.run("splatvk.ready.then(() => splatvk.settled())");

@@ -1,7 +1,7 @@
 //! PLY files: the Gaussian layout that 3DGS viewers expect
 //! (docs/method.md#gaussian-ply).
 use super::ply_packed;
-use super::ply_table::{Kind, Table, header, open, table};
+use super::ply_table::{PropertyType, Table, header, open, table};
 use crate::scene::{LanguageField, LevelField, PointCloud, Splats, sh_coefficients};
 use crate::{Error, Result};
 use std::fmt::Write as _;
@@ -58,7 +58,8 @@ pub fn read_points(path: &Path) -> Result<PointCloud> {
         p.positions.push(position.map(|c| t.at(r, c)));
         p.colours.push(match (colours, dc) {
             (Some(c), _) => c.map(|c| {
-                let full = if matches!(t.columns[c].1, Kind::F32 | Kind::F64) { 1.0 } else { 255.0 };
+                let full =
+                    if matches!(t.columns[c].1, PropertyType::F32 | PropertyType::F64) { 1.0 } else { 255.0 };
                 (t.at(r, c) / full).clamp(0.0, 1.0)
             }),
             (None, Some(c)) => c.map(|c| (0.5 + crate::format::SH_C0 * t.at(r, c)).clamp(0.0, 1.0)),

@@ -1,6 +1,6 @@
 //! Compressed PLY as SuperSplat writes it: chunks of 256 Gaussians with their bounds, each Gaussian in four 32-bit words,
 //! SH in bytes. About a quarter of the size of a plain PLY without SH.
-use super::ply_table::{self as table, Kind};
+use super::ply_table::{self as table, PropertyType};
 use crate::scene::{Splats, sh_coefficients};
 use crate::{Error, Result};
 use std::path::Path;
@@ -29,7 +29,7 @@ const BOUNDS: [&str; 18] = [
     "max_b",
 ];
 const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
-/// Log scales beyond these say nothing (1e-9 to 5e8 units) and would cost the others of the chunk their precision.
+/// Log scales beyond these carry no information (1e-9 to 5e8 units) and would cost the others of the chunk their precision.
 const LOG_SCALE_MAX: f32 = 20.0;
 /// Bytes of SH hold −4 to 4.
 const SH_RANGE: f32 = 8.0;
@@ -37,7 +37,7 @@ const SH_RANGE: f32 = 8.0;
 const LOGIT_MAX: f32 = 10.0;
 
 /// Whether the columns of the vertices are packed ones.
-pub(super) fn is_packed(columns: &[(String, Kind)]) -> bool {
+pub(super) fn is_packed(columns: &[(String, PropertyType)]) -> bool {
     columns.iter().any(|c| c.0 == WORDS[0])
 }
 

@@ -4,7 +4,7 @@ use std::path::Path;
 
 /// A column of a PLY element.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Kind {
+pub(super) enum PropertyType {
     I8,
     U8,
     I16,
@@ -15,26 +15,26 @@ pub(super) enum Kind {
     F64,
 }
 
-impl Kind {
-    fn parse(name: &str) -> Option<Kind> {
+impl PropertyType {
+    fn parse(name: &str) -> Option<PropertyType> {
         Some(match name {
-            "char" | "int8" => Kind::I8,
-            "uchar" | "uint8" => Kind::U8,
-            "short" | "int16" => Kind::I16,
-            "ushort" | "uint16" => Kind::U16,
-            "int" | "int32" => Kind::I32,
-            "uint" | "uint32" => Kind::U32,
-            "float" | "float32" => Kind::F32,
-            "double" | "float64" => Kind::F64,
+            "char" | "int8" => PropertyType::I8,
+            "uchar" | "uint8" => PropertyType::U8,
+            "short" | "int16" => PropertyType::I16,
+            "ushort" | "uint16" => PropertyType::U16,
+            "int" | "int32" => PropertyType::I32,
+            "uint" | "uint32" => PropertyType::U32,
+            "float" | "float32" => PropertyType::F32,
+            "double" | "float64" => PropertyType::F64,
             _ => return None,
         })
     }
     const fn size(self) -> usize {
         match self {
-            Kind::I8 | Kind::U8 => 1,
-            Kind::I16 | Kind::U16 => 2,
-            Kind::I32 | Kind::U32 | Kind::F32 => 4,
-            Kind::F64 => 8,
+            PropertyType::I8 | PropertyType::U8 => 1,
+            PropertyType::I16 | PropertyType::U16 => 2,
+            PropertyType::I32 | PropertyType::U32 | PropertyType::F32 => 4,
+            PropertyType::F64 => 8,
         }
     }
     /// `bytes` holds exactly this kind's size; `N` extra bytes are never read.
@@ -46,14 +46,14 @@ impl Kind {
         }
         let bits = u64::from_le_bytes(raw);
         match self {
-            Kind::I8 => bits as u8 as i8 as f64,
-            Kind::U8 => bits as f64,
-            Kind::I16 => bits as u16 as i16 as f64,
-            Kind::U16 => bits as f64,
-            Kind::I32 => bits as u32 as i32 as f64,
-            Kind::U32 => bits as f64,
-            Kind::F32 => f32::from_bits(bits as u32) as f64,
-            Kind::F64 => f64::from_bits(bits),
+            PropertyType::I8 => bits as u8 as i8 as f64,
+            PropertyType::U8 => bits as f64,
+            PropertyType::I16 => bits as u16 as i16 as f64,
+            PropertyType::U16 => bits as f64,
+            PropertyType::I32 => bits as u32 as i32 as f64,
+            PropertyType::U32 => bits as f64,
+            PropertyType::F32 => f32::from_bits(bits as u32) as f64,
+            PropertyType::F64 => f64::from_bits(bits),
         }
     }
 }
@@ -61,7 +61,7 @@ impl Kind {
 /// The `vertex` element of a PLY file.
 pub(super) struct Table {
     pub rows: usize,
-    pub columns: Vec<(String, Kind)>,
+    pub columns: Vec<(String, PropertyType)>,
     /// [rows, columns]
     values: Vec<f32>,
 }
@@ -93,7 +93,7 @@ pub(super) struct Header {
     /// Bytes (binary) or lines (ASCII) before the vertex rows.
     skip: usize,
     rows: usize,
-    pub columns: Vec<(String, Kind)>,
+    pub columns: Vec<(String, PropertyType)>,
     /// First byte after the header.
     body: usize,
 }
@@ -127,7 +127,7 @@ pub(super) fn header(bytes: &[u8], wanted: &str) -> Result<Header, String> {
                 if done.0 == wanted {
                     (h.rows, h.columns, found) = (done.1, done.2, true);
                 } else if !found {
-                    let width: usize = done.2.iter().map(|c: &(String, Kind)| c.1.size()).sum();
+                    let width: usize = done.2.iter().map(|c: &(String, PropertyType)| c.1.size()).sum();
                     h.skip += done.1.saturating_mul(if h.ascii { 1 } else { width });
                 }
             }
@@ -135,7 +135,8 @@ pub(super) fn header(bytes: &[u8], wanted: &str) -> Result<Header, String> {
                 return Err(format!("element {} has a list property, which is not supported", element.0));
             }
             ["property", kind, name] => {
-                let kind = Kind::parse(kind).ok_or_else(|| format!("unknown property type {kind:?}"))?;
+                let kind =
+                    PropertyType::parse(kind).ok_or_else(|| format!("unknown property type {kind:?}"))?;
                 element.2.push((name.to_string(), kind));
             }
             _ => {}
@@ -146,7 +147,7 @@ pub(super) fn header(bytes: &[u8], wanted: &str) -> Result<Header, String> {
 
 /// The rows of one element of a binary file, with every digit of their values.
 pub(super) struct Rows<'a> {
-    columns: Vec<(String, Kind)>,
+    columns: Vec<(String, PropertyType)>,
     offsets: Vec<usize>,
     width: usize,
     little: bool,

@@ -20,7 +20,7 @@ const COLOUR_SCALE: f32 = 0.15;
 /// Largest base colour that a byte holds: f_dc ends at 0.5 / 0.15.
 pub const BRIGHTEST: f32 = 0.5 + crate::format::SH_C0 * 0.5 / COLOUR_SCALE;
 /// Most Gaussians that are read, so that a damaged count does not take all memory: ten times the largest scenes shared.
-const MOST: usize = 100_000_000;
+const MAX_GAUSSIANS: usize = 100_000_000;
 
 /// Signs of the SH coefficients when y and z turn round: the parity of each basis function in (y, z) together.
 const SH_SIGNS: [f32; 16] =
@@ -50,7 +50,7 @@ impl Head {
         if !(2..=4).contains(&head.version) {
             return Err(format!("spz version {} is not supported (2 to 4 are)", head.version));
         }
-        if head.degree > 3 || head.fraction_bits > 24 || head.count > MOST {
+        if head.degree > 3 || head.fraction_bits > 24 || head.count > MAX_GAUSSIANS {
             return Err(format!(
                 "{} Gaussians of SH degree {} with {} fractional bits: not a readable .spz file",
                 head.count, head.degree, head.fraction_bits

@@ -1,16 +1,17 @@
 //! Accepted edges → things (docs/method.md#components).
 use super::Edge;
 use super::score::LevelState;
+use crate::scene::MaskId;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// One thing of the scene: masks of different views that show it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Component {
-    /// (view, mask), ascending.
-    pub members: Vec<(u32, u32)>,
+    /// Ascending.
+    pub members: Vec<MaskId>,
     /// The member whose feature stands for all: the weighted medoid, so an actual feature vector.
-    pub medoid: (u32, u32),
+    pub medoid: MaskId,
     /// Σ of the members' weights (pixels × quality).
     pub weight: f64,
 }
@@ -19,10 +20,10 @@ pub struct Component {
 /// together (fused masks already share a label) or when the medoids' cosine is below `veto`.
 pub(super) fn build(state: &LevelState, edges: &[Edge], veto: f64) -> Vec<Component> {
     let mut groups: Vec<Component> = Vec::new();
-    let mut owner: BTreeMap<(u32, u32), usize> = BTreeMap::new();
+    let mut owner: BTreeMap<MaskId, usize> = BTreeMap::new();
     for (view, areas) in state.areas.iter().enumerate() {
         for (mask, _) in areas.iter().enumerate().filter(|(_, a)| **a > 0) {
-            let key = (view as u32, mask as u32);
+            let key = MaskId::new(view, mask);
             owner.insert(key, groups.len());
             groups.push(Component { members: vec![key], medoid: key, weight: state.weight(key) });
         }
@@ -35,8 +36,8 @@ pub(super) fn build(state: &LevelState, edges: &[Edge], veto: f64) -> Vec<Compon
         if state.cosine(groups[a].medoid, groups[b].medoid) < veto {
             continue;
         }
-        let (keep, gone) = (a.min(b), a.max(b));
-        let moved = std::mem::take(&mut groups[gone].members);
+        let (keep, absorbed) = (a.min(b), a.max(b));
+        let moved = std::mem::take(&mut groups[absorbed].members);
         for key in &moved {
             owner.insert(*key, keep);
         }
@@ -50,12 +51,12 @@ pub(super) fn build(state: &LevelState, edges: &[Edge], veto: f64) -> Vec<Compon
 }
 
 fn shares_view(a: &Component, b: &Component) -> bool {
-    let views: BTreeSet<u32> = a.members.iter().map(|m| m.0).collect();
-    b.members.iter().any(|m| views.contains(&m.0))
+    let views: BTreeSet<u32> = a.members.iter().map(|m| m.view).collect();
+    b.members.iter().any(|m| views.contains(&m.view))
 }
 
 /// `argmax_m Σ_k ω_k L_m·L_k` and `Σ ω`; ties go to the first member.
-fn medoid(state: &LevelState, members: &[(u32, u32)]) -> ((u32, u32), f64) {
+fn medoid(state: &LevelState, members: &[MaskId]) -> (MaskId, f64) {
     let mut best = (f64::NEG_INFINITY, members[0]);
     for &m in members {
         let value: f64 = members.iter().map(|&k| state.weight(k) * state.cosine(m, k)).sum();

@@ -14,7 +14,7 @@ mod tests;
 
 pub use components::Component;
 pub use links::{PairLinks, links_from_depth, links_from_warps};
-pub use options::{AlignOptions, AreaScore, Edge};
+pub use options::{AlignOptions, AreaScore, Edge, Fusion};
 
 use super::ViewMasks;
 use crate::{Error, Result};
@@ -25,8 +25,8 @@ use serde::{Deserialize, Serialize};
 pub struct LevelReport {
     /// Accepted edges, best first.
     pub edges: Vec<Edge>,
-    /// Fused masks: (view, kept mask, absorbed mask).
-    pub fused: Vec<(u32, u32, u32)>,
+    /// Fused masks.
+    pub fused: Vec<Fusion>,
     /// Masks before alignment.
     pub masks: usize,
     /// Things after alignment.

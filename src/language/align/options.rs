@@ -1,4 +1,5 @@
-//! What alignment is told, and the pairs it accepts.
+//! Options of the alignment, and the pairs that it accepts.
+use crate::scene::MaskId;
 use serde::{Deserialize, Serialize};
 
 /// How the share of a target mask is measured (docs/method.md#pixel-matching).
@@ -69,13 +70,37 @@ pub struct Edge {
     /// 1 dense matching, 2 dense matching after fusion, 3 reprojection.
     pub step: u8,
     /// Source view and mask.
-    pub from: (u32, u32),
+    pub from: MaskId,
     /// Target view and mask.
-    pub to: (u32, u32),
+    pub to: MaskId,
     /// Area share of the target.
     pub area: f64,
     /// Cosine of the features, at least 0.
     pub lang: f64,
     /// λ·lang + (1 − λ)·area.
     pub score: f64,
+}
+
+/// Two masks of a view that fusion made one. Stored as `[view, kept, absorbed]`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "(u32, u32, u32)", into = "(u32, u32, u32)")]
+pub struct Fusion {
+    /// View index.
+    pub view: u32,
+    /// The mask that remains.
+    pub kept: u32,
+    /// The mask whose pixels went to it.
+    pub absorbed: u32,
+}
+
+impl From<(u32, u32, u32)> for Fusion {
+    fn from((view, kept, absorbed): (u32, u32, u32)) -> Fusion {
+        Fusion { view, kept, absorbed }
+    }
+}
+
+impl From<Fusion> for (u32, u32, u32) {
+    fn from(f: Fusion) -> (u32, u32, u32) {
+        (f.view, f.kept, f.absorbed)
+    }
 }

@@ -1,9 +1,9 @@
 //! Proposals, fusion and reprojection scores of one level (docs/method.md#alignment).
 use super::super::ViewMasks;
 use super::links::{Links, PairLinks};
-use super::{AlignOptions, AreaScore, Edge};
+use super::{AlignOptions, AreaScore, Edge, Fusion};
 use crate::math::dot;
-use crate::scene::Plane;
+use crate::scene::{MaskId, Plane};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// The masks of one level over all views, with the labels that fusion may change.
@@ -36,17 +36,17 @@ impl LevelState {
         }
         area
     }
-    pub fn feature(&self, (view, mask): (u32, u32)) -> &[f32] {
+    pub fn feature(&self, MaskId { view, mask }: MaskId) -> &[f32] {
         let dim = self.features[view as usize].len() / self.quality[view as usize].len().max(1);
         let at = mask as usize * dim;
         &self.features[view as usize][at..at + dim]
     }
     /// Cosine of two unit features.
-    pub fn cosine(&self, a: (u32, u32), b: (u32, u32)) -> f64 {
+    pub fn cosine(&self, a: MaskId, b: MaskId) -> f64 {
         dot(self.feature(a), self.feature(b))
     }
     /// Weight of a mask in its component: pixels times quality (docs/method.md#components).
-    pub fn weight(&self, (view, mask): (u32, u32)) -> f64 {
+    pub fn weight(&self, MaskId { view, mask }: MaskId) -> f64 {
         self.areas[view as usize][mask as usize] as f64 * self.quality[view as usize][mask as usize] as f64
     }
     /// Writes labels, features and quality back.
@@ -106,11 +106,11 @@ fn directions(pair: &PairLinks) -> [(usize, usize, &Links, &Links); 2] {
 }
 
 /// argmax of a count row; ties go to the higher cosine, then to the smaller index.
-fn best_partner(state: &LevelState, row: &[u32], source: (u32, u32), view: u32) -> Option<usize> {
+fn best_partner(state: &LevelState, row: &[u32], source: MaskId, view: u32) -> Option<usize> {
     let top = *row.iter().max().filter(|&&n| n > 0)?;
     let mut best: Option<(f64, usize)> = None;
     for (b, _) in row.iter().enumerate().filter(|(_, n)| **n == top) {
-        let cosine = state.cosine(source, (view, b as u32));
+        let cosine = state.cosine(source, MaskId { view, mask: b as u32 });
         if best.is_none_or(|(c, _)| cosine > c) {
             best = Some((cosine, b));
         }
@@ -118,14 +118,7 @@ fn best_partner(state: &LevelState, row: &[u32], source: (u32, u32), view: u32) 
     best.map(|(_, b)| b)
 }
 
-fn edge(
-    state: &LevelState,
-    step: u8,
-    from: (u32, u32),
-    to: (u32, u32),
-    area: f64,
-    options: &AlignOptions,
-) -> Edge {
+fn edge(state: &LevelState, step: u8, from: MaskId, to: MaskId, area: f64, options: &AlignOptions) -> Edge {
     let lang = state.cosine(from, to).max(0.0);
     Edge { step, from, to, area, lang, score: options.lambda * lang + (1.0 - options.lambda) * area }
 }
@@ -142,7 +135,7 @@ pub(super) fn match_proposals(
         let (there, back) = (state.counts(i, j, there), state.counts(j, i, back));
         let n_min = options.min_matches(state.labels[i].data.len());
         for a in 0..state.quality[i].len() {
-            let source = (i as u32, a as u32);
+            let source = MaskId::new(i, a);
             let Some(b) = best_partner(state, there.row(a), source, j as u32) else { continue };
             if there.at(a, b) < n_min {
                 continue;
@@ -152,9 +145,9 @@ pub(super) fn match_proposals(
                 AreaScore::Coverage => back.at(b, a) as f64 / size,
                 AreaScore::Paper => (there.at(a, b) as f64 / size).min(1.0),
             };
-            let e = edge(state, step, source, (j as u32, b as u32), area, options);
+            let e = edge(state, step, source, MaskId::new(j, b), area, options);
             if e.score > options.tau1 {
-                table.insert((source.0, source.1, j as u32), e);
+                table.insert((source.view, source.mask, j as u32), e);
             }
         }
     }
@@ -162,8 +155,8 @@ pub(super) fn match_proposals(
 }
 
 /// Edges between masks that fusion left alone belong to step 1.
-pub(super) fn mark_unfused(table: &mut Table, fused: &[(u32, u32, u32)]) {
-    let touched: BTreeSet<(u32, u32)> = fused.iter().map(|&(v, kept, _)| (v, kept)).collect();
+pub(super) fn mark_unfused(table: &mut Table, fused: &[Fusion]) {
+    let touched: BTreeSet<MaskId> = fused.iter().map(|f| MaskId { view: f.view, mask: f.kept }).collect();
     for e in table.values_mut() {
         if !touched.contains(&e.from) && !touched.contains(&e.to) {
             e.step = 1;
@@ -175,16 +168,12 @@ pub(super) fn mark_unfused(table: &mut Table, fused: &[(u32, u32, u32)]) {
 struct FusionSet {
     view: usize,
     members: Vec<usize>,
-    target: (u32, u32),
+    target: MaskId,
     coverage: f64,
 }
 
-/// Step 2 (docs/method.md#mask-fusion): relabels every fusion set to its smallest id; returns (view, kept, absorbed).
-pub(super) fn fuse(
-    state: &mut LevelState,
-    pairs: &[PairLinks],
-    options: &AlignOptions,
-) -> Vec<(u32, u32, u32)> {
+/// Step 2 (docs/method.md#mask-fusion): relabels every fusion set to its smallest id; returns what was fused.
+pub(super) fn fuse(state: &mut LevelState, pairs: &[PairLinks], options: &AlignOptions) -> Vec<Fusion> {
     let mut sets = fusion_sets(state, pairs, options);
     sets.sort_by(|x, y| {
         y.coverage.total_cmp(&x.coverage).then_with(|| (x.view, x.target).cmp(&(y.view, y.target)))
@@ -193,18 +182,18 @@ pub(super) fn fuse(
     let mut taken = BTreeSet::new();
     for set in &sets {
         // a mask joins at most one fusion set per target view
-        let fresh = |m: &usize| !taken.contains(&(set.view, *m, set.target.0));
+        let fresh = |m: &usize| !taken.contains(&(set.view, *m, set.target.view));
         let members: Vec<usize> = set.members.iter().copied().filter(fresh).collect();
         if members.len() < 2 {
             continue;
         }
         let target = state.feature(set.target).to_vec();
         for &m in &members {
-            taken.insert((set.view, m, set.target.0));
+            taken.insert((set.view, m, set.target.view));
             join(&mut parent[set.view], members[0], m);
         }
         let root = find(&parent[set.view], members[0]);
-        // the fused mask means what the mask that sees it whole means (docs/method.md#mask-fusion)
+        // the fused mask takes the feature of the mask that covers it whole (docs/method.md#mask-fusion)
         let at = root * target.len();
         state.features[set.view][at..at + target.len()].copy_from_slice(&target);
     }
@@ -219,7 +208,7 @@ pub(super) fn fuse(
             let (wa, wb) = (state.areas[view][root] as f32, state.areas[view][m] as f32);
             let quality = &mut state.quality[view];
             quality[root] = (quality[root] * wa + quality[m] * wb) / (wa + wb).max(1.0);
-            fused.push((view as u32, root as u32, m as u32));
+            fused.push(Fusion { view: view as u32, kept: root as u32, absorbed: m as u32 });
         }
         for l in state.labels[view].data.iter_mut().filter(|l| **l >= 0) {
             *l = find(parent, *l as usize) as i32;
@@ -249,7 +238,7 @@ fn fusion_sets(state: &LevelState, pairs: &[PairLinks], options: &AlignOptions) 
         let (there, back) = (state.counts(i, j, there), state.counts(j, i, back));
         let background = options.background_share * state.labels[j].data.len() as f64;
         for b in 0..state.quality[j].len() {
-            let target = (j as u32, b as u32);
+            let target = MaskId::new(j, b);
             let size = state.areas[j][b] as f64;
             if size == 0.0 || size > background {
                 continue;
@@ -268,10 +257,10 @@ fn fusion_sets(state: &LevelState, pairs: &[PairLinks], options: &AlignOptions) 
                 let others = members.iter().filter(|&&o| o != a);
                 others
                     .into_iter()
-                    .all(|&o| state.cosine((i as u32, a as u32), (i as u32, o as u32)) >= options.veto)
+                    .all(|&o| state.cosine(MaskId::new(i, a), MaskId::new(i, o)) >= options.veto)
             };
             let coverage = members.iter().map(|&a| back.at(b, a) as f64).sum::<f64>() / size;
-            // less than half of the target explained: the members need not be all of it
+            // less than half of the target covered: the members need not be all of it
             if coverage >= 0.5 && members.iter().all(contained) && members.iter().all(alike) {
                 sets.push(FusionSet { view: i, members, target, coverage });
             }
@@ -297,18 +286,18 @@ pub(super) fn add_reprojections(
             let n_min = options.min_matches(state.labels[i].data.len());
             drop_contradicted(table, (i, j), there, n_min);
             for a in 0..state.quality[i].len() {
-                let source = (i as u32, a as u32);
+                let source = MaskId::new(i, a);
                 let Some(b) = best_partner(state, there.row(a), source, j as u32) else { continue };
-                let mutual = best_partner(state, back.row(b), (j as u32, b as u32), i as u32) == Some(a);
+                let mutual = best_partner(state, back.row(b), MaskId::new(j, b), i as u32) == Some(a);
                 if there.at(a, b) < n_min || !mutual {
                     continue;
                 }
                 let area = back.at(b, a) as f64 / visible[b].max(1) as f64;
-                let e = edge(state, 3, source, (j as u32, b as u32), area, options);
+                let e = edge(state, 3, source, MaskId::new(j, b), area, options);
                 if e.score <= options.tau2 {
                     continue;
                 }
-                let slot = table.entry((source.0, source.1, j as u32)).or_insert(e);
+                let slot = table.entry((source.view, source.mask, j as u32)).or_insert(e);
                 if e.score >= slot.score {
                     *slot = e;
                 }
@@ -320,10 +309,10 @@ pub(super) fn add_reprojections(
 /// Removes matches i → j and j → i whose source projects into view j with enough pixels, none of them on the partner.
 fn drop_contradicted(table: &mut Table, (i, j): (usize, usize), there: &Counts, n_min: u32) {
     table.retain(|_, e| {
-        let (a, b) = if (e.from.0, e.to.0) == (i as u32, j as u32) {
-            (e.from.1 as usize, e.to.1 as usize)
-        } else if (e.to.0, e.from.0) == (i as u32, j as u32) {
-            (e.to.1 as usize, e.from.1 as usize)
+        let (a, b) = if (e.from.view, e.to.view) == (i as u32, j as u32) {
+            (e.from.mask as usize, e.to.mask as usize)
+        } else if (e.to.view, e.from.view) == (i as u32, j as u32) {
+            (e.to.mask as usize, e.from.mask as usize)
         } else {
             return true;
         };
@@ -334,7 +323,7 @@ fn drop_contradicted(table: &mut Table, (i, j): (usize, usize), there: &Counts, 
 
 /// One edge per unordered pair of masks, the larger score wins; best first, geometry first among equals.
 pub(super) fn undirected(table: Table) -> Vec<Edge> {
-    let mut best: BTreeMap<((u32, u32), (u32, u32)), Edge> = BTreeMap::new();
+    let mut best: BTreeMap<(MaskId, MaskId), Edge> = BTreeMap::new();
     for e in table.into_values() {
         let key = (e.from.min(e.to), e.from.max(e.to));
         let slot = best.entry(key).or_insert(e);
@@ -342,7 +331,7 @@ pub(super) fn undirected(table: Table) -> Vec<Edge> {
             *slot = e;
         }
     }
-    let mut edges: Vec<(((u32, u32), (u32, u32)), Edge)> = best.into_iter().collect();
+    let mut edges: Vec<((MaskId, MaskId), Edge)> = best.into_iter().collect();
     edges.sort_by(|(ka, a), (kb, b)| {
         b.score.total_cmp(&a.score).then((b.step == 3).cmp(&(a.step == 3))).then(ka.cmp(kb))
     });

@@ -6,7 +6,7 @@
 //! [`LATTICE`] directions, at most 3.4° from any point, 1.7° on average, each with its decoded embedding. The decoder itself errs by
 //! far more, and the rest of the engine sees an ordinary codebook.
 use super::network::{Adam, Network, Step};
-use super::{Built, CodeEntry, min_chord};
+use super::{CodeEntry, EncodedLevel, min_chord};
 use crate::math::Random;
 use crate::scene::Codebook;
 use crate::{Error, Result};
@@ -144,7 +144,7 @@ pub(in crate::language) fn build(
     levels: &[Vec<CodeEntry>],
     least_steps: usize,
     seed: u64,
-) -> Result<(Vec<Built>, f64)> {
+) -> Result<(Vec<EncodedLevel>, f64)> {
     let first = levels.iter().flatten().next();
     let dim = first.map_or(0, |e| e.embedding.len());
     let all: Vec<f32> = levels.iter().flatten().flat_map(|e| e.embedding.iter().copied()).collect();
@@ -154,7 +154,7 @@ pub(in crate::language) fn build(
     let chord = min_chord(&codes, 3);
     let level = |entries: &Vec<CodeEntry>| {
         if entries.is_empty() {
-            return Built::default();
+            return EncodedLevel::default();
         }
         let mut codebook = Codebook {
             embedding_dim: dim,
@@ -173,7 +173,7 @@ pub(in crate::language) fn build(
             codebook.members[k].extend_from_slice(&entry.members);
             code_of.push(k as u32);
         }
-        Built { codebook, code_of }
+        EncodedLevel { codebook, code_of }
     };
     Ok((levels.iter().map(level).collect(), model.cosine))
 }
@@ -181,6 +181,7 @@ pub(in crate::language) fn build(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::MaskId;
 
     fn unit_rows(count: usize, dim: usize, seed: u64) -> Vec<f32> {
         let mut random = Random::new(seed);
@@ -227,7 +228,11 @@ mod tests {
             assert!(best.acos().to_degrees() < 3.4, "{}", best.acos().to_degrees());
         }
         let rows = unit_rows(5, 16, 1002);
-        let entry = |row: &[f32]| CodeEntry { embedding: row.to_vec(), weight: 10.0, members: vec![(0, 0)] };
+        let entry = |row: &[f32]| CodeEntry {
+            embedding: row.to_vec(),
+            weight: 10.0,
+            members: vec![MaskId::new(0, 0)],
+        };
         let entries: Vec<CodeEntry> = rows.chunks_exact(16).map(entry).collect();
         let (built, cosine) = build(&[entries.clone(), Vec::new()], 2000, 0).unwrap();
         assert!(built[1].codebook.is_empty() && built[0].code_of.len() == 5);

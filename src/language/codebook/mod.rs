@@ -6,7 +6,7 @@ pub(super) mod quantise;
 mod spread;
 
 use crate::math::{Random, dot};
-use crate::scene::Codebook;
+use crate::scene::{Codebook, MaskId};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -17,20 +17,20 @@ const SAME_EMBEDDING: f64 = 0.9995;
 /// Smallest distance between two codes that the construction accepts (docs/method.md#code-construction, step 5).
 const MIN_CHORD: f32 = 0.02;
 
-/// One distinct embedding and what stands behind it.
+/// One distinct embedding and the masks that have it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CodeEntry {
     /// [D] unit vector.
     pub embedding: Vec<f32>,
     /// Pixels.
     pub weight: f64,
-    /// (view, mask) pairs.
-    pub members: Vec<(u32, u32)>,
+    /// The masks that share it.
+    pub members: Vec<MaskId>,
 }
 
 /// A codebook and, for every input entry, the code it received.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Built {
+pub struct EncodedLevel {
     /// The bijection.
     pub codebook: Codebook,
     /// [entries] code index.
@@ -39,13 +39,13 @@ pub struct Built {
 
 /// Builds the codebook of one level: merges indistinguishable embeddings, gives each of the K that remain a unit code
 /// of length `dim`, and proves that decoding inverts encoding, also under noise.
-pub fn build(entries: &[CodeEntry], dim: usize, seed: u64) -> Result<Built> {
+pub fn build(entries: &[CodeEntry], dim: usize, seed: u64) -> Result<EncodedLevel> {
     if dim == 0 {
         return Err(Error::input("the feature dimension must be at least 1"));
     }
     let (kept, code_of) = deduplicate(entries);
     if kept.is_empty() {
-        return Ok(Built::default());
+        return Ok(EncodedLevel::default());
     }
     let embedding_dim = kept[0].embedding.len();
     let embeddings: Vec<f32> = kept.iter().flat_map(|e| e.embedding.iter().copied()).collect();
@@ -66,7 +66,7 @@ pub fn build(entries: &[CodeEntry], dim: usize, seed: u64) -> Result<Built> {
         members: kept.into_iter().map(|e| e.members).collect(),
     };
     assert_bijection(&codebook, seed)?;
-    Ok(Built { codebook, code_of })
+    Ok(EncodedLevel { codebook, code_of })
 }
 
 /// Keeps the heaviest of indistinguishable entries; the order of first appearance stays.

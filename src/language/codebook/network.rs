@@ -98,7 +98,7 @@ pub(super) struct Network {
 }
 
 impl Network {
-    /// Linear layers of the given widths with ReLU between, and batch normalisation before each ReLU if asked for.
+    /// Linear layers of the given widths with ReLU between, and batch normalisation before each ReLU if requested.
     pub fn new(input: usize, widths: &[usize], normalise: bool, random: &mut Random) -> Self {
         let mut layers = Vec::new();
         let mut from = input;

@@ -1,6 +1,6 @@
 //! The quantised feature codebook of LEGaussians (Shi et al. 2024) as another way to make a codebook: at most 128 mean
 //! features stand for all, and what splats carry is free until an index head is trained on it.
-use super::{Built, CodeEntry, min_chord};
+use super::{CodeEntry, EncodedLevel, min_chord};
 use crate::language::dir::normalise_rows;
 use crate::math::Random;
 use crate::scene::Codebook;
@@ -51,9 +51,9 @@ fn cluster(entries: &[CodeEntry], count: usize) -> (Vec<Vec<f32>>, Vec<usize>) {
 }
 
 /// The codebook of one level: means of alike features, each with a random direction to start from.
-pub(in crate::language) fn build(entries: &[CodeEntry], dim: usize, seed: u64) -> Built {
+pub(in crate::language) fn build(entries: &[CodeEntry], dim: usize, seed: u64) -> EncodedLevel {
     if entries.is_empty() || dim == 0 {
-        return Built::default();
+        return EncodedLevel::default();
     }
     let (centres, of) = cluster(entries, ENTRIES.min(entries.len()));
     let mut random = Random::new(seed ^ 0x1e6);
@@ -72,18 +72,19 @@ pub(in crate::language) fn build(entries: &[CodeEntry], dim: usize, seed: u64) -
         codebook.weights[k] += e.weight as f32;
         codebook.members[k].extend_from_slice(&e.members);
     }
-    Built { codebook, code_of: of.into_iter().map(|k| k as u32).collect() }
+    EncodedLevel { codebook, code_of: of.into_iter().map(|k| k as u32).collect() }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::MaskId;
 
     fn entry(embedding: Vec<f32>) -> CodeEntry {
         let mut embedding = embedding;
         let d = embedding.len();
         normalise_rows(&mut embedding, d);
-        CodeEntry { embedding, weight: 1.0, members: vec![(0, 0)] }
+        CodeEntry { embedding, weight: 1.0, members: vec![MaskId::new(0, 0)] }
     }
 
     #[test]

@@ -8,7 +8,7 @@ fn entries(count: usize, dim: usize, seed: u64) -> Vec<CodeEntry> {
         .map(|k| CodeEntry {
             embedding: unit(&mut random, dim).iter().map(|&v| v as f32).collect(),
             weight: 10.0 + k as f64,
-            members: vec![(0, k as u32)],
+            members: vec![MaskId::new(0, k)],
         })
         .collect()
 }
@@ -43,7 +43,7 @@ fn duplicates_share_a_code_and_keep_their_members() {
     list[3].embedding = list[1].embedding.clone();
     let built = build(&list, 16, 0).unwrap();
     assert_eq!(built.code_of, [0, 1, 2, 1]);
-    assert_eq!(built.codebook.members[1], [(0, 1), (0, 3)]);
+    assert_eq!(built.codebook.members[1], [MaskId::new(0, 1), MaskId::new(0, 3)]);
     assert_eq!(built.codebook.weights[1], 24.0);
     assert!(build(&[], 16, 0).unwrap().codebook.is_empty());
     assert!(build(&list, 0, 0).is_err());

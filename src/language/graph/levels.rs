@@ -56,7 +56,7 @@ fn parts(tree: &Tree, node: usize, min_area: f32) -> Vec<usize> {
 
 /// Height at which the region was essentially complete: gaining or losing a share `same` of its area does not make it
 /// another region.
-fn born(tree: &Tree, node: usize, same: f32) -> f32 {
+fn birth(tree: &Tree, node: usize, same: f32) -> f32 {
     let limit = (1.0 - same) * tree.nodes[node].region.area;
     let mut n = node;
     while let Some((a, b)) = tree.nodes[n].children {
@@ -70,7 +70,7 @@ fn born(tree: &Tree, node: usize, same: f32) -> f32 {
 }
 
 /// Height at which the region became part of something else.
-fn gone(tree: &Tree, node: usize, same: f32) -> f32 {
+fn death(tree: &Tree, node: usize, same: f32) -> f32 {
     let limit = tree.nodes[node].region.area * (1.0 + same);
     let mut n = node;
     while tree.nodes[n].parent != NONE && tree.nodes[n].region.area <= limit {
@@ -86,11 +86,11 @@ fn most_persistent(tree: &Tree, starts: &[usize], min_area: f32, options: &Graph
         if node.region.area < min_area || node.parent == NONE {
             return 0.0;
         }
-        let born = born(tree, n, options.same).max(options.floor);
-        let gone = gone(tree, n, options.same).max(options.floor);
+        let birth = birth(tree, n, options.same).max(options.floor);
+        let death = death(tree, n, options.same).max(options.floor);
         let r = &node.region;
         let contour = r.contour / (r.perimeter - r.frame).max(1.0);
-        (gone / born).ln().powf(options.life_power)
+        (death / birth).ln().powf(options.life_power)
             * contour.powf(options.contour_power)
             * node.region.area.powf(options.area_power)
     };

@@ -49,7 +49,7 @@ impl PlaneFit {
         let z = 1.0 / mean.z.max(1e-9);
         (centre * z, plane.normalize_or_zero())
     }
-    /// How much speaks against two regions being one smooth or convex thing, in [0, 1]: 0 when one plane fits both, or
+    /// Evidence against two regions being one smooth or convex thing, in [0, 1]: 0 when one plane fits both, or
     /// when they meet in a convex ridge; towards 1 when they meet in a concave crease (where things stand on things).
     pub fn bend(a: &PlaneFit, b: &PlaneFit, noise: f64) -> f32 {
         let (Some((pa, ra)), Some((pb, rb))) = (a.solve(), b.solve()) else { return 0.0 };

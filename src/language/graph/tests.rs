@@ -1,5 +1,5 @@
 use super::*;
-use crate::infer::breakfast::{View, train_views};
+use crate::infer::breakfast::{TestView, train_views};
 use crate::infer::{Registry, hed::Hed};
 
 /// The eight objects of the breakfast set; 1 to 3 are table, wall and carpet.
@@ -21,7 +21,7 @@ fn best_iou(masks: &ViewMasks, truth: &Plane<i32>, object: i32) -> f32 {
 }
 
 /// Exact depth with independent noise of 1 % per pixel.
-fn noisy_depth(view: &View) -> DepthMap {
+fn noisy_depth(view: &TestView) -> DepthMap {
     let mut state = 1u64;
     let mut uniform = || {
         state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
@@ -35,7 +35,7 @@ fn noisy_depth(view: &View) -> DepthMap {
     DepthMap { confidence: Plane { data: confidence, ..depth.clone() }, depth }
 }
 
-fn mean_iou(views: &[View], mask: impl Fn(&View) -> ViewMasks) -> f32 {
+fn mean_iou(views: &[TestView], mask: impl Fn(&TestView) -> ViewMasks) -> f32 {
     let mut all = Vec::new();
     for view in views {
         let masks = mask(view);
@@ -53,7 +53,7 @@ fn finds_the_breakfast_objects() {
     let mut hed = Hed::load(&Registry::open(None).unwrap()).unwrap();
     let edges: Vec<Plane<f32>> = views.iter().map(|v| hed.edges(&v.image).unwrap()).collect();
     let options = GraphOptions::default();
-    let of = |v: &View| views.iter().position(|o| o.camera.name == v.camera.name).unwrap();
+    let of = |v: &TestView| views.iter().position(|o| o.camera.name == v.camera.name).unwrap();
     let learned = mean_iou(&views, |v| segment(&v.image, Some(&edges[of(v)]), None, &options).unwrap());
     let both = mean_iou(&views, |v| {
         let depth = noisy_depth(v);

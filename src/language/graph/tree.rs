@@ -5,7 +5,7 @@ use super::plane::PlaneFit;
 use std::cmp::Ordering;
 use std::collections::{BTreeMap, BinaryHeap};
 
-/// What a node of the tree knows about its pixels.
+/// Statistics of the pixels of a node.
 #[derive(Clone)]
 pub(super) struct Region {
     pub area: f32,
@@ -15,7 +15,7 @@ pub(super) struct Region {
     pub perimeter: f32,
     /// Pixel sides on the image border.
     pub frame: f32,
-    /// Σ over the border, without the image border, of how much speaks for a contour there, each in [0, 1].
+    /// Σ over the border, without the image border, of the evidence for a contour there, each in [0, 1].
     pub contour: f32,
     lab: [f32; 3],
     histogram: [f32; BINS],
@@ -66,18 +66,18 @@ pub(super) struct Tree {
 }
 
 #[derive(PartialEq)]
-struct Candidate {
+struct MergeCandidate {
     cost: f32,
     a: usize,
     b: usize,
 }
-impl Eq for Candidate {}
-impl PartialOrd for Candidate {
+impl Eq for MergeCandidate {}
+impl PartialOrd for MergeCandidate {
     fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
         Some(self.cmp(other))
     }
 }
-impl Ord for Candidate {
+impl Ord for MergeCandidate {
     // BinaryHeap pops the largest: the cheapest merge, then the smallest ids, must be largest
     fn cmp(&self, other: &Self) -> Ordering {
         other.cost.total_cmp(&self.cost).then((other.a, other.b).cmp(&(self.a, self.b)))
@@ -102,11 +102,11 @@ pub(super) fn build(cues: &Cues, options: &MergeOptions) -> Tree {
     };
     for a in 0..leaves {
         for (&b, border) in borders[a].range(a + 1..) {
-            heap.push(Candidate { cost: cost(&nodes, a, b, border), a, b });
+            heap.push(MergeCandidate { cost: cost(&nodes, a, b, border), a, b });
         }
     }
     let mut level = 0.0f32;
-    while let Some(Candidate { cost: c, a, b }) = heap.pop() {
+    while let Some(MergeCandidate { cost: c, a, b }) = heap.pop() {
         if nodes[a].parent != usize::MAX || nodes[b].parent != usize::MAX {
             continue;
         }
@@ -130,7 +130,7 @@ pub(super) fn build(cues: &Cues, options: &MergeOptions) -> Tree {
         }
         for (&other, border) in &mine {
             borders[other].insert(id, *border);
-            heap.push(Candidate { cost: cost(&nodes, other, id, border), a: other, b: id });
+            heap.push(MergeCandidate { cost: cost(&nodes, other, id, border), a: other, b: id });
         }
         borders.push(mine);
     }

@@ -16,7 +16,7 @@ pub(super) struct Crop {
 
 /// A mask that the network proposed, in pixels of the whole photo.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Candidate {
+pub(super) struct MaskProposal {
     pub level: usize,
     pub crop: usize,
     pub iou: f32,
@@ -50,7 +50,7 @@ pub(super) fn candidates(
     index: usize,
     photo: (usize, usize),
     least: (f32, f32),
-) -> Vec<Candidate> {
+) -> Vec<MaskProposal> {
     let (w, h) = (proposals.width, proposals.height);
     let columns = axis(crop.x1 - crop.x0, w, proposals.filled[0]);
     let rows = axis(crop.y1 - crop.y0, h, proposals.filled[1]);
@@ -67,7 +67,7 @@ pub(super) fn candidates(
         let bounds = bounds(&enlarged, crop_width)?;
         let whole = !cut_off(bounds, crop, photo);
         let runs = (stability >= least.1 && whole).then(|| runs(&enlarged, crop, photo))?;
-        Some(Candidate { level: k % MASKS, crop: index, iou, stability, runs })
+        Some(MaskProposal { level: k % MASKS, crop: index, iou, stability, runs })
     };
     (0..points.len() * MASKS).into_par_iter().filter_map(one).collect()
 }
@@ -134,7 +134,7 @@ fn runs(logits: &[f32], crop: Crop, photo: (usize, usize)) -> Vec<u32> {
 }
 
 /// Proposals as a row of values for the cache. Whole numbers stay exact: no photo has 2²⁴ pixels.
-pub(super) fn pack(all: &[Candidate]) -> Vec<f32> {
+pub(super) fn pack(all: &[MaskProposal]) -> Vec<f32> {
     let mut out = Vec::new();
     for c in all {
         out.extend([c.level as f32, c.crop as f32, c.iou, c.stability, c.runs.len() as f32]);
@@ -143,12 +143,12 @@ pub(super) fn pack(all: &[Candidate]) -> Vec<f32> {
     out
 }
 
-pub(super) fn unpack(mut values: &[f32]) -> Option<Vec<Candidate>> {
+pub(super) fn unpack(mut values: &[f32]) -> Option<Vec<MaskProposal>> {
     let mut all = Vec::new();
     while !values.is_empty() {
         let (head, rest) = values.split_at_checked(5)?;
         let (runs, rest) = rest.split_at_checked(head[4] as usize)?;
-        all.push(Candidate {
+        all.push(MaskProposal {
             level: head[0] as usize,
             crop: head[1] as usize,
             iou: head[2],

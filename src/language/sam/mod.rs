@@ -1,4 +1,4 @@
-//! Masks from a network that answers points (docs/method.md#masks-from-points): a grid of points over the photo and
+//! Masks from a network that is prompted with points (docs/method.md#masks-from-points): a grid of points over the photo and
 //! over four overlapping crops, three masks each, one list per level; poor, unstable and doubled ones are dropped and
 //! the rest painted into label maps.
 mod bits;
@@ -10,7 +10,7 @@ mod paint;
 mod tests;
 
 use super::ViewMasks;
-use crate::infer::cache::Key;
+use crate::infer::cache::OutputKey;
 use crate::infer::contract::Part;
 use crate::infer::installed::Installed;
 use crate::infer::sam::{BATCH, MASKS, Sam};
@@ -18,7 +18,7 @@ use crate::progress::Progress;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
 use bits::Bits;
-use filter::{Candidate, Crop};
+use filter::{Crop, MaskProposal};
 use nms::Mask;
 
 /// How masks are proposed and chosen; the defaults are the paper's (LangSplat's).
@@ -102,7 +102,7 @@ pub fn masks(
     progress.begin("masks", (calls * images.len()) as u64);
     let mut views = Vec::with_capacity(images.len());
     for (k, image) in images.iter().enumerate() {
-        let mut key = Key::new("masks")
+        let mut key = OutputKey::new("masks")
             .model(model.graph(Part::MaskEncoder)?)?
             .model(model.graph(Part::MaskDecoder)?)?;
         key = key.values(&image.data).values(&[
@@ -137,7 +137,7 @@ fn propose(
     options: &SamOptions,
     step: &dyn Fn(u64),
     progress: &dyn Progress,
-) -> Result<Vec<Candidate>> {
+) -> Result<Vec<MaskProposal>> {
     let (mut all, mut done) = (Vec::new(), 0);
     for (index, crop) in crops(image.width, image.height, options.crops).into_iter().enumerate() {
         progress.check()?;
@@ -167,7 +167,7 @@ fn cut(image: &RgbImage, crop: Crop) -> RgbImage {
 }
 
 /// Proposals → label maps of the three levels.
-fn choose(candidates: Vec<Candidate>, width: usize, height: usize, options: &SamOptions) -> ViewMasks {
+fn choose(candidates: Vec<MaskProposal>, width: usize, height: usize, options: &SamOptions) -> ViewMasks {
     let areas: Vec<usize> =
         crops(width, height, options.crops).iter().map(|c| (c.x1 - c.x0) * (c.y1 - c.y0)).collect();
     let level = |level: usize| {

@@ -1,4 +1,4 @@
-//! Non-maximum suppression: of masks that say the same the better one stays.
+//! Non-maximum suppression: of masks that overlap the better one stays.
 use super::bits::Bits;
 use rayon::prelude::*;
 use std::ops::Range;

@@ -1,7 +1,7 @@
-//! The generator against a decoder whose masks are known exactly: discs around the point that was asked about.
+//! The generator against a decoder whose masks are known exactly: discs around the prompt point.
 use super::*;
 use crate::infer::Registry;
-use crate::infer::installed::Duty;
+use crate::infer::installed::Task;
 use crate::infer::testing::{Attribute, FLOAT, Onnx};
 use crate::progress::Silent;
 use std::path::Path;
@@ -63,7 +63,7 @@ fn disc_network(folder: &Path, iou: [f32; 4]) {
 fn toy(iou: [f32; 4], options: &SamOptions, size: (usize, usize)) -> ViewMasks {
     let dir = tempfile::tempdir().unwrap();
     disc_network(dir.path(), iou);
-    let model = Registry::of(&[dir.path()]).installed(Duty::Masks, "sam").unwrap();
+    let model = Registry::of(&[dir.path()]).installed(Task::Masks, "sam").unwrap();
     let image = RgbImage { width: size.0, height: size.1, data: vec![[0.5; 3]; size.0 * size.1] };
     masks(&model, &[image], options, &Silent).unwrap().remove(0)
 }
@@ -114,7 +114,7 @@ fn a_decoder_with_one_mask_is_refused() {
         .output("low_res_masks", "1 1 64 64")
         .output("iou_predictions", "1 1")
         .write(&dir.path().join("sam_toy/decoder.onnx"));
-    let model = Registry::of(&[dir.path()]).installed(Duty::Masks, "sam").unwrap();
+    let model = Registry::of(&[dir.path()]).installed(Task::Masks, "sam").unwrap();
     let error = Sam::load(&model).err().unwrap().to_string();
     assert!(error.contains("--return-single-mask"), "{error}");
 }

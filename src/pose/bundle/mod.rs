@@ -9,7 +9,7 @@ use crate::{Error, Result};
 use glam::{DVec2, DVec3};
 use nalgebra::DVector;
 use normal::Normal;
-pub(crate) use problem::{OPTICS, Observation, Optics, OpticsPrior, Outcome, Problem};
+pub(crate) use problem::{Adjusted, OPTICS, Observation, Optics, OpticsPrior, Problem};
 
 impl Problem {
     fn stepped(&self, normal: &Normal, lambda: f64) -> Option<Problem> {
@@ -46,7 +46,7 @@ impl Problem {
     }
 
     /// Minimises the robust cost with Cauchy scale `c` (standard deviations).
-    pub(crate) fn solve(&mut self, c: f64, max_steps: usize) -> Result<Outcome> {
+    pub(crate) fn solve(&mut self, c: f64, max_steps: usize) -> Result<Adjusted> {
         if self.poses.len() < 2 || self.observations.is_empty() {
             return Err(Error::work("bundle adjustment: needs two cameras with common points"));
         }
@@ -70,7 +70,7 @@ impl Problem {
                 break;
             }
         }
-        Ok(Outcome { cost, sigmas: self.sigmas(c) })
+        Ok(Adjusted { cost, sigmas: self.sigmas(c) })
     }
 
     /// σ of the optics from the inverse of the reduced system, scaled by the observed residual variance.

@@ -46,7 +46,7 @@ impl OpticsPrior {
         usize::from(self.log_focal.1 > 0.0) + radial + 2 * usize::from(self.shift > 0.0)
     }
 
-    /// σ of every parameter, in the order of [`Outcome::sigmas`].
+    /// σ of every parameter, in the order of [`Adjusted::sigmas`].
     pub(crate) fn sigmas(&self) -> [f64; OPTICS] {
         [self.log_focal.1, self.lens[0], self.lens[1], self.shift, self.shift]
     }
@@ -92,7 +92,7 @@ pub(crate) struct Problem {
 
 /// What an adjustment found.
 #[derive(Clone, Debug)]
-pub(crate) struct Outcome {
+pub(crate) struct Adjusted {
     /// Robust cost, in squared standard deviations.
     pub(crate) cost: f64,
     /// σ of ln f, k1, k2 and the shift per group, from the observations and the priors; 0 where held.

@@ -93,7 +93,7 @@ fn lens_and_principal_point_are_recovered_where_they_are_free() {
     assert!((found.shift - truth.shift).length() < 0.5, "{found:?}");
     let out = held.solve(1e9, 100).unwrap();
     assert_eq!((held.optics[0].lens, held.optics[0].shift), (Lens::NONE, DVec2::ZERO));
-    assert_eq!(out.sigmas[0][1..], [0.0; 4], "what is held has no doubt");
+    assert_eq!(out.sigmas[0][1..], [0.0; 4], "what is held has no uncertainty");
 }
 
 /// The problem after a step in its parameters, numbered as in the normal equations and the points after them.

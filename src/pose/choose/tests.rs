@@ -72,12 +72,15 @@ fn blurred_repeated_and_foreign_photos_are_left_out() {
         |list: &[String]| list.iter().filter(|n| ["d.jpg", "e_again.png"].contains(&n.as_str())).count();
     assert_eq!(one_of_both(&used), 1, "{choice:?}");
     assert!(["b.jpg", "f.jpg", "h.jpg"].iter().all(|n| used.iter().any(|u| u == n)), "{choice:?}");
-    let reason = |name: &str| choice.left_out.iter().find(|(n, _)| n == name).map(|(_, r)| r.clone());
+    let reason = |name: &str| choice.left_out.iter().find(|l| l.photo == name).map(|l| l.reason.clone());
     assert_eq!(reason("a_blurred.png"), Some(Reason::Blurred));
-    assert_eq!(reason("z_elsewhere.png"), Some(Reason::NothingInCommon));
-    let (other, same) =
-        choice.left_out.iter().find(|(n, _)| ["d.jpg", "e_again.png"].contains(&n.as_str())).unwrap();
-    assert!(matches!(same, Reason::NearlyTheSameAs(n) if n != other && used.contains(n)), "{choice:?}");
+    assert_eq!(reason("z_elsewhere.png"), Some(Reason::NoOverlap));
+    let repeated =
+        choice.left_out.iter().find(|l| ["d.jpg", "e_again.png"].contains(&l.photo.as_str())).unwrap();
+    assert!(
+        matches!(&repeated.reason, Reason::Duplicate(n) if *n != repeated.photo && used.contains(n)),
+        "{choice:?}"
+    );
     let message = choice.message();
     assert!(
         message.starts_with("using 4 of 7 photos: ") && message.contains("a_blurred.png (blurred)"),
@@ -95,7 +98,8 @@ fn as_many_photos_as_views_are_all_used() {
 
 #[test]
 fn long_lists_are_cut_short() {
-    let left_out = (0..30).map(|i| (format!("{i:02}.jpg"), Reason::AddsLittle)).collect();
+    let left_out =
+        (0..30).map(|i| LeftOut { photo: format!("{i:02}.jpg"), reason: Reason::LittleNewArea }).collect();
     let choice = Choice { used: vec!["a.jpg".into(), "b.jpg".into()], left_out };
     let message = choice.message();
     assert!(
@@ -111,7 +115,7 @@ fn photos_of_two_places_are_not_mixed() {
     let n = 11;
     let link = |i: usize, j: usize| {
         let matches = if i != j && place(i) == place(j) { 60 } else { 3 };
-        Link { matches, parallax: 0.05 }
+        SimilarityInliers { matches, parallax: 0.05 }
     };
     let links = (0..n).map(|i| (0..n).map(|j| link(i, j)).collect()).collect();
     let graph = Graph { links, quality: vec![1.0; n], same: vec![vec![false; n]; n] };
@@ -119,7 +123,7 @@ fn photos_of_two_places_are_not_mixed() {
     // Two of each place would show more in all, but no camera of one could be placed among those of the other.
     assert!(chosen.iter().all(|i| !place(*i)), "{chosen:?}");
     let names: Vec<String> = (0..n).map(|i| i.to_string()).collect();
-    assert_eq!(graph.reason(4, &chosen, &names), Reason::NothingInCommon);
+    assert_eq!(graph.reason(4, &chosen, &names), Reason::NoOverlap);
     let left = [0, 1, 2, 6, 7, 8].into_iter().find(|i| !chosen.contains(i)).unwrap();
-    assert_eq!(graph.reason(left, &chosen, &names), Reason::AddsLittle);
+    assert_eq!(graph.reason(left, &chosen, &names), Reason::LittleNewArea);
 }

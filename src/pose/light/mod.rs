@@ -19,13 +19,13 @@ use solve::{Solution, System, exposure};
 
 /// Difference in brightness left in parts of a photo, ln, that the user should know of: half an f-stop.
 const UNEXPLAINED: f64 = 0.35;
-/// Fewest points that tell light from content.
+/// Fewest points that separate light from content.
 const MIN_POINTS: usize = 50;
 
-/// What was found out about the light.
+/// Light of the photos and what it leaves unexplained.
 #[derive(Clone, Debug, Default)]
-pub struct Found {
-    /// One per photo; all [`Light::NONE`] when nothing exceeds its doubt.
+pub struct LightEstimate {
+    /// One per photo; all [`Light::NONE`] when nothing is significant.
     pub lights: Vec<Light>,
     /// Per photo: ln difference to the other photos that is left in the tenth of its cells that fits worst.
     pub unexplained: Vec<f64>,
@@ -54,8 +54,9 @@ pub fn equalised(mut photos: Vec<Photo>, model: &SparseModel, progress: &dyn Pro
 }
 
 /// Exposure, white balance and vignetting of placed photos.
-pub fn estimate(photos: &[Photo], model: &SparseModel) -> Found {
-    let none = Found { lights: vec![Light::NONE; photos.len()], unexplained: vec![0.0; photos.len()] };
+pub fn estimate(photos: &[Photo], model: &SparseModel) -> LightEstimate {
+    let none =
+        LightEstimate { lights: vec![Light::NONE; photos.len()], unexplained: vec![0.0; photos.len()] };
     let pairs = pairs_of(photos, model);
     if photos.len() < 2 || pairs.iter().map(|p| p.share).sum::<f64>() < 0.5 * MIN_POINTS as f64 {
         return none;
@@ -76,13 +77,13 @@ pub fn estimate(photos: &[Photo], model: &SparseModel) -> Found {
             Light {
                 gain: [e + red, e - red - blue, e + blue].map(f64::exp),
                 falloff: exposure.falloff[lenses[v]],
-                doubt_ev: exposure.doubt[v] / std::f64::consts::LN_2,
-                doubt_corner: exposure.corner_doubt[lenses[v]],
+                sigma_ev: exposure.sigma[v] / std::f64::consts::LN_2,
+                sigma_corner: exposure.corner_sigma[lenses[v]],
             }
         })
         .collect();
     if lights.iter().all(Light::is_none) {
         lights = none.lights;
     }
-    Found { unexplained: grey.unexplained(&exposure), lights }
+    LightEstimate { unexplained: grey.unexplained(&exposure), lights }
 }

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 /// Half the side of the averaged patch as a fraction of the long side: 3 pixels at 640 outweigh noise and misplacement.
 const PATCH: f64 = 3.0 / 640.0;
 /// A patch grows with the view's scale, at most to this many times its size.
-const MOST_GROWTH: f64 = 3.0;
+const MAX_GROWTH: f64 = 3.0;
 /// An sRGB value at least this high may be clipped; JPEG leaves a few grey levels of ringing.
 const SATURATED: f32 = 0.98;
 /// Linear light below which quantisation and black level decide: 1 % is grey level 25 of 255.
@@ -21,7 +21,7 @@ const PLAIN_SIGMA: f64 = 0.02;
 /// ln error per relative contrast of a patch: the views cut different pieces out of the texture.
 const TEXTURE_SIGMA: f64 = 0.3;
 /// Cells per side of a photo: residuals within a cell share highlight, shadow and texture, so they count as one when the
-/// doubt is estimated.
+/// standard deviation is estimated.
 const CELLS: f64 = 6.0;
 
 /// One photo's sight of a point.
@@ -60,7 +60,7 @@ pub(super) fn pairs_of(photos: &[Photo], model: &SparseModel) -> Vec<Pair> {
         };
         let least = point.views.iter().map(|s| scale(s.0)).fold(f64::INFINITY, f64::min);
         for (v, pixel) in &point.views {
-            wanted[*v].push((k, *pixel, (scale(*v) / least).clamp(1.0, MOST_GROWTH)));
+            wanted[*v].push((k, *pixel, (scale(*v) / least).clamp(1.0, MAX_GROWTH)));
         }
     }
     let samples: Vec<Vec<(usize, Sample)>> = photos

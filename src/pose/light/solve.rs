@@ -1,4 +1,4 @@
-//! Gains and vignetting from differences of brightness: robust linear least squares with honest doubts.
+//! Gains and vignetting from differences of brightness: robust linear least squares with standard deviations.
 use super::sample::Pair;
 use crate::math::{median, quantile};
 use crate::pose::numeric::cauchy_weight;
@@ -11,14 +11,14 @@ const GAIN_PRIOR: f64 = 1.0;
 const FALLOFF_PRIOR: [f64; 2] = [0.3, 0.15];
 /// Cauchy scale in standard deviations: 95 % efficiency on Gaussian noise (Holland & Welsch 1977).
 const CAUCHY: f64 = 2.385;
-/// Rounds of re-weighting; the estimate moves by less than its doubt after five.
+/// Rounds of re-weighting; the estimate moves by less than one standard deviation after five.
 const ROUNDS: usize = 12;
-/// Doubts that an effect must exceed before it is taken out.
+/// Standard deviations that an effect must exceed before it is taken out.
 const SIGNIFICANT: f64 = 4.0;
 /// Smallest exposure or colour difference worth touching photos for, ln.
-const LEAST_GAIN: f64 = 0.01;
+const MIN_GAIN: f64 = 0.01;
 /// Smallest loss in the corners worth touching photos for, ln.
-const LEAST_FALLOFF: f64 = 0.03;
+const MIN_FALLOFF: f64 = 0.03;
 
 /// One of the three linear problems.
 #[derive(Clone, Copy)]
@@ -44,26 +44,26 @@ struct Free {
 pub(super) struct Solution {
     /// ln, per view.
     pub(super) gain: Vec<f64>,
-    pub(super) doubt: Vec<f64>,
+    pub(super) sigma: Vec<f64>,
     /// Per lens.
     pub(super) falloff: Vec<[f64; 2]>,
-    pub(super) corner_doubt: Vec<f64>,
+    pub(super) corner_sigma: Vec<f64>,
     pub(super) reference: usize,
 }
 
 impl Solution {
     pub(super) fn gains_matter(&self) -> bool {
-        self.gain.iter().zip(&self.doubt).any(|(g, d)| g.abs() > LEAST_GAIN.max(SIGNIFICANT * d))
+        self.gain.iter().zip(&self.sigma).any(|(g, d)| g.abs() > MIN_GAIN.max(SIGNIFICANT * d))
     }
 
     /// Per lens: darker corners than chance explains. Brighter ones are no vignetting.
     fn falloff_matters(&self) -> Vec<bool> {
         let corner = self.falloff.iter().map(|f| f[0] + f[1]);
-        corner.zip(&self.corner_doubt).map(|(v, d)| -v > LEAST_FALLOFF.max(SIGNIFICANT * d)).collect()
+        corner.zip(&self.corner_sigma).map(|(v, d)| -v > MIN_FALLOFF.max(SIGNIFICANT * d)).collect()
     }
 }
 
-/// Exposure and vignetting, each only if it exceeds its doubt. The photo of median exposure is the reference: its light is
+/// Exposure and vignetting, each only if it is significant. The photo of median exposure is the reference: its light is
 /// the scene's, so that the scene looks as one of the photos and few values leave the range of the files.
 pub(super) fn exposure(system: &System) -> Solution {
     let lenses = system.lenses.iter().max().map_or(0, |l| l + 1);
@@ -108,8 +108,8 @@ impl System<'_> {
         pair.variance[self.channel.min(1)]
     }
 
-    /// Re-weighted least squares; doubts from the spread of the cells' votes (the sandwich estimator for clusters, Liang &
-    /// Zeger 1986), since residuals within a cell have causes in common.
+    /// Re-weighted least squares; standard deviations from the spread of the cells' scores (the sandwich estimator for
+    /// clusters, Liang & Zeger 1986), since residuals within a cell have causes in common.
     fn solve(&self, free: &Free, reference: usize) -> Solution {
         let columns = Columns::new(free, self.views, reference);
         let rows: Vec<_> = self.pairs.iter().map(|p| self.row(p, &columns)).collect();
@@ -137,14 +137,15 @@ impl System<'_> {
             let Some(factor) = h.clone().cholesky() else { break };
             x = factor.solve(&g);
         }
-        let mut votes: BTreeMap<(usize, usize), DVector<f64>> = BTreeMap::new();
+        let mut scores: BTreeMap<(usize, usize), DVector<f64>> = BTreeMap::new();
         for (((pair, row), r), weight) in self.pairs.iter().zip(&rows).zip(&residuals).zip(&weights) {
-            let vote = votes.entry((pair.views[0], pair.cells[0])).or_insert_with(|| DVector::zeros(x.len()));
-            row.iter().for_each(|(a, c)| vote[*a] += weight * r * c);
+            let score =
+                scores.entry((pair.views[0], pair.cells[0])).or_insert_with(|| DVector::zeros(x.len()));
+            row.iter().for_each(|(a, c)| score[*a] += weight * r * c);
         }
-        let spread = votes.len() as f64 / (votes.len() as f64 - 1.0).max(1.0);
+        let spread = scores.len() as f64 / (scores.len() as f64 - 1.0).max(1.0);
         let mut middle = DMatrix::from_diagonal(&columns.prior);
-        votes.values().for_each(|v| middle += spread * v * v.transpose());
+        scores.values().for_each(|v| middle += spread * v * v.transpose());
         let covariance = h.try_inverse().map(|i| &i * middle * &i);
         columns.solution(&x, covariance.as_ref(), reference)
     }
@@ -171,7 +172,7 @@ impl System<'_> {
         }
         let mut per_view = vec![Vec::new(); self.views];
         for ((view, _), mut left) in cells {
-            // Fewer pairs have no median to speak of.
+            // Fewer pairs have no usable median.
             if left.len() >= 5 {
                 per_view[view].extend(median(&mut left).map(f64::abs));
             }
@@ -213,9 +214,9 @@ impl Columns {
         };
         Solution {
             gain: self.gain.iter().map(gain).collect(),
-            doubt: self.gain.iter().map(|c| c.map_or(0.0, |c| variance(c, c).max(0.0).sqrt())).collect(),
+            sigma: self.gain.iter().map(|c| c.map_or(0.0, |c| variance(c, c).max(0.0).sqrt())).collect(),
             falloff: self.falloff.iter().map(falloff).collect(),
-            corner_doubt: self.falloff.iter().map(corner).collect(),
+            corner_sigma: self.falloff.iter().map(corner).collect(),
             reference,
         }
     }

@@ -58,14 +58,14 @@ fn light(ev: f64, red: f64, blue: f64) -> Light {
     Light { gain: [e + red, e - red - blue, e + blue].map(f64::exp), falloff: [-0.15, -0.05], ..Light::NONE }
 }
 
-/// Largest errors against the truth: exposure (EV), exposure in its doubts, colour (ln), corner.
+/// Largest errors against the truth: exposure (EV), exposure in standard deviations, colour (ln), corner.
 fn errors(found: &[Light], truth: &[Light]) -> [f64; 4] {
-    let reference = found.iter().position(|l| l.doubt_ev == 0.0).unwrap();
+    let reference = found.iter().position(|l| l.sigma_ev == 0.0).unwrap();
     let mut out = [0.0f64; 4];
     for (f, t) in found.iter().zip(truth) {
         let ev = (f.exposure_ev() - (t.exposure_ev() - truth[reference].exposure_ev())).abs();
         out[0] = out[0].max(ev);
-        out[1] = out[1].max(if f.doubt_ev > 0.0 { ev / f.doubt_ev } else { 0.0 });
+        out[1] = out[1].max(if f.sigma_ev > 0.0 { ev / f.sigma_ev } else { 0.0 });
         for k in 0..2 {
             let against = truth[reference].white_balance()[k];
             out[2] = out[2].max((f.white_balance()[k] / (t.white_balance()[k] / against)).ln().abs());
@@ -91,7 +91,7 @@ fn photos_of_cameras_told_apart_have_corners_of_their_own() {
 }
 
 #[test]
-fn known_light_is_recovered_within_its_doubt() {
+fn known_light_is_recovered_within_its_sigma() {
     let truth =
         [light(-0.35, 0.04, -0.03), light(0.0, 0.0, 0.0), light(0.3, -0.05, 0.02), light(0.5, 0.0, 0.06)];
     let (photos, model) = spots(&truth, 0.05, 1);

@@ -23,7 +23,7 @@ const STEP_SIGMA: f64 = 0.02;
 /// The mean log scale is the gauge; any stiff value holds it.
 const GAUGE_SIGMA: f64 = 1e-3;
 /// Unknowns one residual touches: two poses, two focals, two scales, two grid cells of four corners.
-const MOST: usize = 24;
+const MAX_ENTRIES: usize = 24;
 
 /// What is adjusted.
 #[derive(Clone, Debug)]
@@ -74,20 +74,20 @@ struct End {
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Link {
+struct MatchResidual {
     ends: [End; 2],
     weight: f64,
     pair: usize,
 }
 
 /// Residuals (u, v in Cauchy scales; relative depth in Cauchy scales) with derivatives by unknown.
-struct Row {
+struct JacobianRow {
     r: [f64; 3],
-    entries: [(usize, [f64; 3]); MOST],
+    entries: [(usize, [f64; 3]); MAX_ENTRIES],
     count: usize,
 }
 
-impl Row {
+impl JacobianRow {
     fn push(&mut self, index: usize, d: [f64; 3]) {
         // The two views of a pair may share a focal length.
         if let Some(e) = self.entries[..self.count].iter_mut().find(|e| e.0 == index) {
@@ -108,7 +108,7 @@ pub(super) struct Adjustment {
     /// Disagreement of the pairs at each grid corner.
     spread: Vec<Vec<f64>>,
     start_kappa: f64,
-    links: Vec<Link>,
+    links: Vec<MatchResidual>,
     /// Cauchy scale of reprojections, pixels.
     pixel_scale: f64,
     long: f64,
@@ -136,10 +136,10 @@ impl Adjustment {
         };
         let mut links = Vec::new();
         for (k, (pair, m)) in pairs.iter().zip(matches).enumerate() {
-            let mean = m.matches.iter().map(|x| x.2).sum::<f64>() / m.matches.len().max(1) as f64;
-            for (p, q, w) in &m.matches {
-                if let (Some(a), Some(b)) = (end(pair.first, *p), end(pair.second, *q)) {
-                    links.push(Link { ends: [a, b], weight: w / mean, pair: k });
+            let mean = m.matches.iter().map(|x| x.weight).sum::<f64>() / m.matches.len().max(1) as f64;
+            for x in &m.matches {
+                if let (Some(a), Some(b)) = (end(pair.first, x.a), end(pair.second, x.b)) {
+                    links.push(MatchResidual { ends: [a, b], weight: x.weight / mean, pair: k });
                 }
             }
         }
@@ -223,9 +223,9 @@ impl Adjustment {
     }
 
     /// Residuals with their derivatives.
-    fn row(&self, s: &State, a: &End, b: &End) -> Option<Row> {
+    fn row(&self, s: &State, a: &End, b: &End) -> Option<JacobianRow> {
         let (r, y, t) = self.residual(s, a, b)?;
-        let mut row = Row { r, entries: [(0, [0.0; 3]); MOST], count: 0 };
+        let mut row = JacobianRow { r, entries: [(0, [0.0; 3]); MAX_ENTRIES], count: 0 };
         let f = s.log_focals[self.group[b.view]].exp();
         let k = f / (t.z * self.pixel_scale);
         let seen = self.depth(s, b);

@@ -3,7 +3,7 @@ use crate::math::median;
 use crate::scene::{ModelView, PairPointmaps, Pointmap};
 use glam::{DVec2, DVec3};
 
-/// What all pairs together say about one view, in the scale of its reference pair.
+/// Depth of one view from all its pairs, in the scale of its reference pair.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Canonical {
     /// [H, W] points in the view's own camera frame.
@@ -107,29 +107,36 @@ impl Focals {
 pub(super) fn weiszfeld(view: &ModelView, c: &Canonical) -> Option<(f64, f64)> {
     let middle = view.centre();
     // Every third pixel in both axes: the estimate averages over tens of thousands all the same.
-    let samples: Vec<(DVec2, DVec2, f64)> = (0..c.points.len())
+    struct Sample {
+        /// Pixel from the principal point.
+        pixel: DVec2,
+        /// (x, y) / z of its point.
+        direction: DVec2,
+        weight: f64,
+    }
+    let samples: Vec<Sample> = (0..c.points.len())
         .filter(|k| (k % view.width).is_multiple_of(3) && (k / view.width).is_multiple_of(3))
         .filter(|&k| c.points[k].z > 0.0)
         .map(|k| {
             let p = DVec2::new((k % view.width) as f64 + 0.5, (k / view.width) as f64 + 0.5) - middle;
             let x = c.points[k];
-            (p, DVec2::new(x.x, x.y) / x.z, c.confidence[k])
+            Sample { pixel: p, direction: DVec2::new(x.x, x.y) / x.z, weight: c.confidence[k] }
         })
         .collect();
-    let solve = |weight: &dyn Fn(&(DVec2, DVec2, f64)) -> f64| {
+    let solve = |weight: &dyn Fn(&Sample) -> f64| {
         let (mut a, mut b) = (0.0, 0.0);
         for s in &samples {
             let w = weight(s);
-            a += w * s.0.dot(s.1);
-            b += w * s.1.length_squared();
+            a += w * s.pixel.dot(s.direction);
+            b += w * s.direction.length_squared();
         }
         a / b
     };
-    let mut f = solve(&|s| s.2);
+    let mut f = solve(&|s| s.weight);
     for _ in 0..20 {
-        f = solve(&|s| s.2 / (s.0 - s.1 * f).length().max(1e-8));
+        f = solve(&|s| s.weight / (s.pixel - s.direction * f).length().max(1e-8));
     }
-    let total: f64 = samples.iter().map(|s| s.2).sum();
+    let total: f64 = samples.iter().map(|s| s.weight).sum();
     (f.is_finite() && f > 0.0).then_some((f, total))
 }
 

@@ -12,11 +12,22 @@ const ROUNDS: usize = 10;
 const CAP: usize = 8192;
 const CELLS: usize = 16;
 
-/// Matched pixels of a pair: (position in the first, position in the second, weight > 0).
+/// Two pixel positions that show one point.
+#[derive(Clone, Copy, Debug)]
+pub struct PixelMatch {
+    /// In the first view.
+    pub a: DVec2,
+    /// In the second view.
+    pub b: DVec2,
+    /// > 0.
+    pub weight: f64,
+}
+
+/// Matched pixels of a pair.
 #[derive(Clone, Debug, Default)]
 pub struct PairMatches {
     /// Model pixels.
-    pub matches: Vec<(DVec2, DVec2, f64)>,
+    pub matches: Vec<PixelMatch>,
 }
 
 /// Follows seeds back and forth between two images until they return to themselves: every result is a pair of mutual
@@ -134,7 +145,7 @@ pub(super) fn of_pair(first: &ModelView, second: &ModelView, pair: &PairPointmap
     let matches = (0..deepest)
         .flat_map(|k| cells.iter().filter_map(move |c| c.get(k)))
         .take(CAP)
-        .map(|&(w, a, b)| (centre(a, first.width), centre(b, second.width), w))
+        .map(|&(weight, a, b)| PixelMatch { a: centre(a, first.width), b: centre(b, second.width), weight })
         .collect();
     PairMatches { matches }
 }

@@ -15,7 +15,7 @@ use crate::progress::Progress;
 use crate::scene::{ModelView, PairPointmaps};
 use crate::{Error, Result};
 use adjust::Adjustment;
-pub use matches::{PairMatches, descriptor_matches, point_matches};
+pub use matches::{PairMatches, PixelMatch, descriptor_matches, point_matches};
 use pairs::Edge;
 
 /// Steps A–G.
@@ -48,7 +48,7 @@ pub fn align(
         .zip(matches)
         .filter_map(|(pair, m)| pairs::edge(views, pair, &m.matches, &canonical, &focals))
         .collect();
-    let start = tree::place(views.len(), &edges).map_err(|left| apart(views, &edges, &left))?;
+    let start = tree::place(views.len(), &edges).map_err(|left| not_connected(views, &edges, &left))?;
     progress.check()?;
     let mut adjustment = Adjustment::new(views, &canonical, &focals, &start, pairs, matches);
     adjustment.solve(progress)?;
@@ -90,7 +90,7 @@ fn check(views: &[ModelView], pairs: &[PairPointmaps]) -> Result<()> {
 }
 
 /// Names the pairs that hold the views together, and those that are missing.
-fn apart(views: &[ModelView], edges: &[Edge], left: &[usize]) -> Error {
+fn not_connected(views: &[ModelView], edges: &[Edge], left: &[usize]) -> Error {
     let bad: Vec<String> = left
         .iter()
         .flat_map(|l| (0..views.len()).filter(move |v| !left.contains(v)).map(move |v| (*l, v)))

@@ -1,5 +1,6 @@
 //! Step D: the relative pose and scale of each pair, estimated twice and compared.
 use super::canonical::{Canonical, Focals};
+use super::matches::PixelMatch;
 use crate::math::median;
 use crate::pose::numeric::{cauchy_weight, from_na, rotation_angle, to_na};
 use crate::pose::resect::resect;
@@ -158,7 +159,7 @@ fn median_ratio(c: &Canonical, map: &Pointmap) -> Option<f64> {
 pub(super) fn edge(
     views: &[ModelView],
     pair: &PairPointmaps,
-    matches: &[(DVec2, DVec2, f64)],
+    matches: &[PixelMatch],
     canonical: &[Canonical],
     focals: &Focals,
 ) -> Option<Edge> {
@@ -178,7 +179,7 @@ pub(super) fn edge(
         (Some(f), Some(b)) => Some(if b.inliers > f.inliers { b } else { f }),
         (f, b) => f.or(b),
     }?;
-    let mean = matches.iter().map(|m| m.2).sum::<f64>() / matches.len().max(1) as f64;
+    let mean = matches.iter().map(|m| m.weight).sum::<f64>() / matches.len().max(1) as f64;
     Some(Edge {
         first,
         second,

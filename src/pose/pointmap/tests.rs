@@ -91,14 +91,14 @@ impl Case {
             let p = DVec2::new((k % w) as f64 + 0.5, (k / w) as f64 + 0.5);
             if rng.uniform() < f.outliers {
                 let q = DVec2::new(rng.uniform() * w as f64, rng.uniform() * h as f64);
-                matches.push((p, q, 1.0));
+                matches.push(PixelMatch { a: p, b: q, weight: 1.0 });
                 continue;
             }
             let (q, z) = self.cameras[j].project(self.world(i, k, 1.0));
             let inside = q.x >= 2.0 && q.y >= 2.0 && q.x < w as f64 - 2.0 && q.y < h as f64 - 2.0;
             if inside && (self.depths[j][q.y as usize * w + q.x as usize] / z - 1.0).abs() < 0.01 {
                 let q = q + DVec2::new(rng.normal(), rng.normal()) * f.pixels;
-                matches.push((p, q, 1.0));
+                matches.push(PixelMatch { a: p, b: q, weight: 1.0 });
             }
         }
         (pair, PairMatches { matches })
@@ -229,9 +229,9 @@ fn matches_are_found_from_the_points_themselves() {
     let mut errors: Vec<f64> = found
         .matches
         .iter()
-        .map(|(p, q, _)| {
-            let x = case.world(0, p.y as usize * w + p.x as usize, 1.0);
-            (case.cameras[1].project(x).0 - *q).length()
+        .map(|m| {
+            let x = case.world(0, m.a.y as usize * w + m.a.x as usize, 1.0);
+            (case.cameras[1].project(x).0 - m.b).length()
         })
         .collect();
     // Nearest pixels: up to 0.71 px off by rounding.

@@ -1,8 +1,8 @@
-//! Features per detector and photo.
+//! Keypoints per detector and photo.
 use super::model::Sighting;
 use crate::Result;
 use crate::photo::Photo;
-use crate::pose::matching::{self, Features};
+use crate::pose::matching::{self, Keypoints};
 use crate::pose::sift;
 use crate::progress::Progress;
 use crate::scene::Plane;
@@ -14,16 +14,18 @@ const MAX_CORNERS: usize = 4000;
 /// Pixels next to the image edge that hold no features: their neighbourhood is cut off.
 pub(super) const MARGIN: usize = 4;
 
-/// Features per detector family (built-in corners first, then the learned ones if given) and photo.
+/// Keypoints per detector family (built-in corners first, then the learned ones if given) and photo.
 pub(super) fn corner_families(
     photos: &[Photo],
-    features: &[Features],
+    features: &[Keypoints],
     progress: &dyn Progress,
-) -> Result<Vec<Vec<Features>>> {
+) -> Result<Vec<Vec<Keypoints>>> {
     progress.check()?;
-    let own: Vec<Features> = photos
+    let own: Vec<Keypoints> = photos
         .par_iter()
-        .map(|p| sift::detect(&p.image.luma(), &matching::valid_area(&p.image, p.frame, MARGIN), MAX_CORNERS))
+        .map(|p| {
+            sift::detect(&p.image.luma(), &matching::valid_area(&p.image, p.border, MARGIN), MAX_CORNERS)
+        })
         .collect();
     progress.check()?;
     let mut families = vec![own];
@@ -33,9 +35,9 @@ pub(super) fn corner_families(
     Ok(families)
 }
 
-/// Features on valid pixels.
-fn within(f: &Features, valid: &Plane<bool>) -> Features {
-    let mut out = Features { dim: f.dim, ..Default::default() };
+/// Keypoints on valid pixels.
+fn within(f: &Keypoints, valid: &Plane<bool>) -> Keypoints {
+    let mut out = Keypoints { dim: f.dim, ..Default::default() };
     for (k, p) in f.points.iter().enumerate() {
         let (x, y) = (p.x.max(0.0) as usize, p.y.max(0.0) as usize);
         if x < valid.width && y < valid.height && valid.at(x, y) {
@@ -47,16 +49,16 @@ fn within(f: &Features, valid: &Plane<bool>) -> Features {
 }
 
 /// Masked features of all detectors, per family and photo.
-pub(super) fn masked(photos: &[Photo], features: &[Features]) -> Vec<Features> {
+pub(super) fn masked(photos: &[Photo], features: &[Keypoints]) -> Vec<Keypoints> {
     photos
         .iter()
         .zip(features)
-        .map(|(p, f)| within(f, &matching::valid_area(&p.image, p.frame, MARGIN)))
+        .map(|(p, f)| within(f, &matching::valid_area(&p.image, p.border, MARGIN)))
         .collect()
 }
 
 /// All keypoints of a view, numbered as the links number them.
-pub(super) fn keypoints(families: &[Vec<Features>], view: usize) -> Vec<Sighting> {
+pub(super) fn keypoints(families: &[Vec<Keypoints>], view: usize) -> Vec<Sighting> {
     let all = families.iter().enumerate().flat_map(|(k, f)| f[view].points.iter().map(move |p| (k, *p)));
     all.map(|(family, pixel)| Sighting { view, pixel, sigma: 1.0, family }).collect()
 }

@@ -5,9 +5,9 @@ use super::optics::learn_optics;
 use super::patch::Shades;
 use super::refine;
 use super::relate::{Matches, Pair, THRESHOLD};
-use super::tracks::{self, Link};
+use super::tracks::{self, KeypointMatch};
 use crate::photo::{Photo, Straightening};
-use crate::pose::bundle::Outcome;
+use crate::pose::bundle::Adjusted;
 use crate::pose::matching;
 use crate::pose::two_view::{fundamental, sampson};
 use crate::pose::{Fitted, SparseModel, SparsePoint};
@@ -29,7 +29,7 @@ pub(super) struct Evidence {
     pub(super) keypoints: Vec<Vec<Sighting>>,
 }
 
-/// Settles the model: outliers out, weights from the residuals, the optics that the photos tell, every sighting refined to
+/// Final adjustment: outliers out, weights from the residuals, the optics that the sightings determine, every sighting refined to
 /// sub-pixel and further points added where the geometry predicts them.
 pub(super) fn finish(
     photos: &[Photo],
@@ -42,22 +42,25 @@ pub(super) fn finish(
     model.triangulate_all(threshold);
     model.prune(threshold);
     model.adjust(f64::INFINITY, 1.5, 60)?;
-    settle(&mut model)?;
+    reweight_and_adjust(&mut model)?;
     learn_optics(&mut model)?;
     if bend(&model, photos) > REMATCH {
         // The pinhole took what the lens displaces for outliers, above all near the corners: match again.
         rematch(&mut model, evidence, threshold);
-        settle(&mut model)?;
+        reweight_and_adjust(&mut model)?;
         learn_optics(&mut model)?;
     }
     progress.check()?;
     let straight: Vec<RgbImage> =
         (0..photos.len()).map(|v| straightened(&model, v, &photos[v].image)).collect();
     let shades: Vec<Shades> = straight.par_iter().map(|image| Shades::new(&image.luma())).collect();
-    let valid: Vec<Plane<bool>> =
-        photos.iter().zip(&straight).map(|(p, image)| matching::valid_area(image, p.frame, MARGIN)).collect();
+    let valid: Vec<Plane<bool>> = photos
+        .iter()
+        .zip(&straight)
+        .map(|(p, image)| matching::valid_area(image, p.border, MARGIN))
+        .collect();
     on_straight(&mut model, |m| refine::refine(m, &shades, refine::REFINED, REACH));
-    settle(&mut model)?;
+    reweight_and_adjust(&mut model)?;
     progress.check()?;
     progress.step(4, "more points");
     model.prune(0.5 * threshold);
@@ -65,13 +68,13 @@ pub(super) fn finish(
         refine::extend(m, &shades, &valid);
     });
     model.prune(0.5 * threshold);
-    settle(&mut model)?;
+    reweight_and_adjust(&mut model)?;
     let mut outcome = learn_optics(&mut model)?;
     if sharpen(&mut model, photos) {
         progress.check()?;
-        settle(&mut model)?;
+        reweight_and_adjust(&mut model)?;
         model.prune(0.5 * threshold);
-        settle(&mut model)?;
+        reweight_and_adjust(&mut model)?;
         outcome = learn_optics(&mut model)?;
     }
     model.normalise();
@@ -111,8 +114,8 @@ fn sharpen(model: &mut Model, photos: &[Photo]) -> bool {
     true
 }
 
-/// Adjusts with weights from the residuals. Weights and geometry depend on each other; two rounds settle them to a percent.
-fn settle(model: &mut Model) -> Result<Outcome> {
+/// Adjusts with weights from the residuals. Weights and geometry depend on each other; they converge to a percent in two rounds.
+fn reweight_and_adjust(model: &mut Model) -> Result<Adjusted> {
     model.weigh();
     model.adjust(f64::INFINITY, 2.0, 60)?;
     model.weigh();
@@ -133,15 +136,15 @@ fn bend(model: &Model, photos: &[Photo]) -> f64 {
 }
 
 /// Links of the matches that agree with the model's cameras within `threshold` pixels.
-pub(super) fn explained(model: &Model, matches: &[Matches], threshold: f64) -> Vec<Link> {
-    matches.par_iter().flat_map_iter(|pair| explained_of(model, pair, threshold)).collect()
+pub(super) fn inlier_matches(model: &Model, matches: &[Matches], threshold: f64) -> Vec<KeypointMatch> {
+    matches.par_iter().flat_map_iter(|pair| inliers_of(model, pair, threshold)).collect()
 }
 
-fn explained_of(model: &Model, pair: &Matches, threshold: f64) -> Vec<Link> {
+fn inliers_of(model: &Model, pair: &Matches, threshold: f64) -> Vec<KeypointMatch> {
     let (i, j) = (pair.first, pair.second);
     let (Some(a), Some(b)) = (model.poses[i], model.poses[j]) else { return Vec::new() };
     let f = fundamental(&b.compose(&a.inverse()), model.focal(i), model.focal(j));
-    let close = |m: &&(DVec2, DVec2, Link)| {
+    let close = |m: &&(DVec2, DVec2, KeypointMatch)| {
         sampson(&f, model.straight(i, m.0), model.straight(j, m.1)) < threshold * threshold
     };
     pair.list.iter().filter(close).map(|m| m.2).collect()
@@ -151,7 +154,7 @@ fn explained_of(model: &Model, pair: &Matches, threshold: f64) -> Vec<Link> {
 /// by themselves. The view that agrees least is counted first and its pairs then left out: the others are not to suffer for
 /// it.
 pub(super) fn agreement(model: &Model, pairs: &[Pair], threshold: f64) -> Vec<f64> {
-    let counted = |p: &Pair| (explained_of(model, &p.matches, threshold).len(), p.matches.list.len());
+    let counted = |p: &Pair| (inliers_of(model, &p.matches, threshold).len(), p.matches.list.len());
     let counts: Vec<(usize, usize)> = pairs.par_iter().map(counted).collect();
     let mut shares: Vec<Option<f64>> = vec![None; model.poses.len()];
     loop {
@@ -174,7 +177,7 @@ pub(super) fn agreement(model: &Model, pairs: &[Pair], threshold: f64) -> Vec<f6
 
 /// New tracks from all matches that agree with the cameras.
 fn rematch(model: &mut Model, evidence: &Evidence, threshold: f64) {
-    let mut links = explained(model, &evidence.putative, threshold);
+    let mut links = inlier_matches(model, &evidence.putative, threshold);
     model.tracks = tracks::join(&mut links, &evidence.keypoints)
         .into_iter()
         .map(|sightings| Track { position: None, sightings })
@@ -196,7 +199,7 @@ fn straightened(model: &Model, view: usize, image: &RgbImage) -> RgbImage {
     }
 }
 
-/// Runs a step that knows only pinholes on the model with its sightings moved to where a pinhole would show them.
+/// Runs a step for pinholes on the model with its sightings moved to where a pinhole would show them.
 fn on_straight(model: &mut Model, step: impl FnOnce(&mut Model)) {
     let optics = model.optics.clone();
     let lensed = model.clone_optics();
@@ -213,7 +216,12 @@ fn on_straight(model: &mut Model, step: impl FnOnce(&mut Model)) {
     }
 }
 
-fn sparse_model(photos: &[Photo], model: &Model, outcome: Outcome, agreement: &[f64]) -> Result<SparseModel> {
+fn sparse_model(
+    photos: &[Photo],
+    model: &Model,
+    outcome: Adjusted,
+    agreement: &[f64],
+) -> Result<SparseModel> {
     let cameras = cameras_of(photos, model)?;
     let point = |t: &Track| {
         let views: Vec<(usize, DVec2)> = t

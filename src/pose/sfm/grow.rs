@@ -34,7 +34,7 @@ pub(super) fn grow(
     model.poses[seed.matches.first] = Some(Pose::IDENTITY);
     model.poses[seed.matches.second] = Some(seed.geometry.pose);
     model.triangulate_all(2.0 * threshold);
-    settle(&mut model, threshold);
+    adjust_and_triangulate(&mut model, threshold);
     let views = model.poses.len();
     loop {
         let left: Vec<usize> = (0..views).filter(|v| model.poses[*v].is_none()).collect();
@@ -57,13 +57,13 @@ pub(super) fn grow(
             },
         }
         model.triangulate_all(2.0 * threshold);
-        settle(&mut model, threshold);
+        adjust_and_triangulate(&mut model, threshold);
     }
     Ok(model)
 }
 
 /// Adjusts, triangulates again with the better cameras, adjusts.
-fn settle(model: &mut Model, threshold: f64) {
+fn adjust_and_triangulate(model: &mut Model, threshold: f64) {
     for gate in [4.0, 2.0] {
         // An adjustment that fails leaves the model as it is; too few points show up as a stuck view.
         let _ = model.adjust(gate * threshold, 1.5, 25);
@@ -71,8 +71,8 @@ fn settle(model: &mut Model, threshold: f64) {
     }
 }
 
-/// A place for a view among triangulated points.
-struct Place {
+/// Pose of a view from triangulated points that it shows.
+struct Resection {
     pose: Pose,
     /// Focal length as a multiple of the one that the view came with.
     stretch: f64,
@@ -84,7 +84,7 @@ struct Place {
 const STRETCHES: [f64; 5] = [1.0, 0.7, 1.4, 0.5, 2.0];
 
 /// Pose of a view from its sightings of triangulated points.
-fn resection(model: &Model, view: usize, threshold: f64) -> Option<Place> {
+fn resection(model: &Model, view: usize, threshold: f64) -> Option<Resection> {
     let (mut world, mut pixels) = (Vec::<DVec3>::new(), Vec::<DVec2>::new());
     for t in &model.tracks {
         let Some(x) = t.position else { continue };
@@ -96,11 +96,11 @@ fn resection(model: &Model, view: usize, threshold: f64) -> Option<Place> {
     let group = model.group[view];
     let known = (0..model.poses.len()).any(|v| model.group[v] == group && model.poses[v].is_some());
     let sigma = if known { 0.0 } else { model.priors[group].log_focal.1 };
-    // A ratio of two focal lengths has √2 of the doubt of one; two σ of it.
+    // A ratio of two focal lengths has √2 of the σ of one; two of it.
     let tried = STRETCHES.into_iter().filter(|s| s.ln().abs() <= 2.0 * 2f64.sqrt() * sigma);
     let place = |stretch: f64| {
         let r = resect(&world, &pixels, model.focal(view) * stretch, 2.0 * threshold, 500)?;
-        Some(Place { pose: r.pose, stretch, count: r.inliers.len() })
+        Some(Resection { pose: r.pose, stretch, count: r.inliers.len() })
     };
     tried.filter_map(place).max_by_key(|p| p.count)
 }

@@ -1,19 +1,19 @@
 //! Sparse points for cameras that are known already.
 use super::families::{corner_families, keypoints};
-use super::finish::explained;
+use super::finish::inlier_matches;
 use super::model::{Freedom, MIN_ANGLE_DEGREES, Model, Sighting, Track};
 use super::relate::{THRESHOLD, putative_matches};
 use super::tracks;
 use crate::photo::Photo;
 use crate::pose::bundle::{Optics, OpticsPrior};
-use crate::pose::matching::Features;
+use crate::pose::matching::Keypoints;
 use crate::pose::{SparseModel, SparsePoint};
 use crate::progress::Progress;
 use crate::scene::{Camera, Lens};
 use crate::{Error, Result};
 use glam::DVec2;
 
-/// Fewest points that tell the depth range of a scene.
+/// Fewest points that determine the depth range of a scene.
 const MIN_POINTS: usize = 20;
 /// Least share of the matches by appearance that must obey the given cameras: chance gives about 2 % (a band of 2 × 3 px
 /// in 480), true cameras 20 % and more.
@@ -24,7 +24,7 @@ const MIN_AGREEMENT: f64 = 0.1;
 pub fn with_cameras(
     photos: &[Photo],
     cameras: &[Camera],
-    features: &[Features],
+    features: &[Keypoints],
     progress: &dyn Progress,
 ) -> Result<SparseModel> {
     if photos.len() < 2 || photos.len() != cameras.len() {
@@ -58,7 +58,7 @@ pub fn with_cameras(
         pair.list.iter_mut().for_each(|m| (m.0, m.1) = (flat(a, m.0), flat(b, m.1)));
     }
     let tried: usize = putative.iter().map(|p| p.list.len()).sum();
-    let mut links = explained(&model, &putative, threshold);
+    let mut links = inlier_matches(&model, &putative, threshold);
     let agreement = links.len() as f64 / tried.max(1) as f64;
     let keypoints: Vec<Vec<Sighting>> = (0..photos.len())
         .map(|v| {

@@ -12,7 +12,7 @@ mod tracks;
 
 use super::SparseModel;
 use super::bundle::{Optics, OpticsPrior};
-use super::matching::Features;
+use super::matching::Keypoints;
 use crate::photo::Photo;
 use crate::progress::Progress;
 use crate::scene::Lens;
@@ -24,7 +24,7 @@ use grow::grow;
 pub use known::with_cameras;
 use model::{Freedom, Model, Sighting};
 use relate::{Pair, THRESHOLD};
-use tracks::Link;
+use tracks::KeypointMatch;
 
 /// ln f of a photo without EXIF: 0.9 × the long side covers phones (0.8) to normal lenses (1.2) within one σ.
 const FOCAL_GUESS: f64 = 0.9;
@@ -38,7 +38,7 @@ const LENS_SIGMA: f64 = 0.05;
 const SHIFT_SIGMA: f64 = 0.007;
 /// Cameras and sparse points from photos and their learned features (one per photo; may be empty, then only the
 /// built-in corner detector is used).
-pub fn reconstruct(photos: &[Photo], features: &[Features], progress: &dyn Progress) -> Result<SparseModel> {
+pub fn reconstruct(photos: &[Photo], features: &[Keypoints], progress: &dyn Progress) -> Result<SparseModel> {
     if photos.len() < 2 {
         return Err(Error::input("cameras need at least two photos; give two or more"));
     }
@@ -70,7 +70,7 @@ fn separable(photos: &[Photo], group: &[usize]) -> Vec<usize> {
     photos.iter().enumerate().map(|(v, p)| if named(p) { first(v) } else { v }).collect()
 }
 
-/// Groups and priors of the optics by what the files say.
+/// Groups and priors of the optics from the files.
 fn empty_model(photos: &[Photo]) -> Model {
     let zoom: Vec<f64> = photos.iter().map(Photo::zoom).collect();
     let long = |v: usize| photos[v].original_size.0.max(photos[v].original_size.1);
@@ -129,7 +129,8 @@ fn assemble(
     pairs: &[Pair],
     progress: &dyn Progress,
 ) -> Result<Model> {
-    let mut links: Vec<Link> = pairs.iter().flat_map(|p| p.matches.list.iter().map(|m| m.2)).collect();
+    let mut links: Vec<KeypointMatch> =
+        pairs.iter().flat_map(|p| p.matches.list.iter().map(|m| m.2)).collect();
     let tracks = tracks::join(&mut links, points);
     // The pair estimates vote on the focal stretch, weighted by matches and parallax.
     for g in 0..empty.optics.len() {
@@ -149,7 +150,7 @@ fn assemble(
     seeds.truncate(SEEDS);
     // Photos of one camera first; where that contradicts the pairs, every photo with its own focal length. That explains much
     // that is wrong for other reasons, so it must settle the matter.
-    let apart = empty.apart();
+    let apart = empty.with_separate_optics();
     let attempts =
         std::iter::once(&empty).chain(&apart).flat_map(|start| seeds.iter().map(move |s| (start, *s)));
     let mut best: Option<(f64, Model)> = None;

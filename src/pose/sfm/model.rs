@@ -1,19 +1,19 @@
 //! The growing reconstruction: cameras, points and their sightings.
 use crate::Result;
-use crate::pose::bundle::{Observation, Optics, OpticsPrior, Outcome, Problem};
+use crate::pose::bundle::{Adjusted, Observation, Optics, OpticsPrior, Problem};
 use crate::scene::{Lens, Pose};
 use glam::{DMat3, DVec2, DVec3};
 
-/// Independent observations that the sightings of a set are worth at most. Neighbours err alike: what shifts one (a bent
+/// Most independent observations that the sightings of a set count as. Neighbours err alike: what shifts one (a bent
 /// surface taken for flat, JPEG, a moved shadow) shifts those around it, so that thousands of sightings more say little more of
 /// the optics. On the tuning sets a principal point or lens that is not there lowers the cost by up to 0.3 %, one that moves
-/// pixels by 5 by 1.3 % and more; with 2000 the criterion asks for 0.8 %. The same number makes the stated doubt of the focal
+/// pixels by 5 by 1.3 % and more; with 2000 the criterion asks for 0.8 %. The same number makes the stated σ of the focal
 /// length as large as its errors there.
-const INDEPENDENT: f64 = 2000.0;
+const MAX_INDEPENDENT: f64 = 2000.0;
 
-/// Independent observations that so many residual components are worth.
-pub(super) fn worth(observations: usize) -> f64 {
-    INDEPENDENT.min(observations as f64)
+/// Independent observations that so many residual components count as.
+pub(super) fn effective_observations(observations: usize) -> f64 {
+    MAX_INDEPENDENT.min(observations as f64)
 }
 
 /// One sighting of a point.
@@ -142,9 +142,9 @@ impl Model {
     }
 
     /// The same model with optics of its own for every view that may have some; `None` where all that look alike must share.
-    pub(super) fn apart(&self) -> Option<Model> {
-        let apart = self.regrouped(&self.separable);
-        (apart.group != self.alike).then_some(apart)
+    pub(super) fn with_separate_optics(&self) -> Option<Model> {
+        let separate = self.regrouped(&self.separable);
+        (separate.group != self.alike).then_some(separate)
     }
 
     /// The same model on images of another size: `ratios` per view.
@@ -332,16 +332,16 @@ impl Model {
                 sigma: s.sigma,
             }));
         }
-        // The sightings count as fewer independent ones ([`INDEPENDENT`]); priors are weighed against those.
+        // The sightings count as fewer independent ones ([`MAX_INDEPENDENT`]); priors are weighed against those.
         let observations = 2 * problem.observations.len();
-        let scale = (worth(observations) / observations.max(1) as f64).sqrt();
+        let scale = (effective_observations(observations) / observations.max(1) as f64).sqrt();
         problem.priors.iter_mut().for_each(|p| p.narrow(scale));
         (problem, views, used)
     }
 
     /// Adjusts cameras and points over the sightings within `gate` pixels; `c` is the Cauchy scale in standard
     /// deviations. The first registered view stays where it is.
-    pub(super) fn adjust(&mut self, gate: f64, c: f64, steps: usize) -> Result<Outcome> {
+    pub(super) fn adjust(&mut self, gate: f64, c: f64, steps: usize) -> Result<Adjusted> {
         let (mut problem, views, used) = self.problem(gate, self.freedom);
         let outcome = problem.solve(c, steps)?;
         for (k, &v) in views.iter().enumerate() {

@@ -1,41 +1,41 @@
-//! What the photos tell of their optics, and which of them share a camera.
-use super::model::{Freedom, Model, worth};
+//! What the sightings determine of the optics, and which of them share a camera.
+use super::model::{Freedom, Model, effective_observations};
 use crate::Result;
-use crate::pose::bundle::{OPTICS, OpticsPrior, Outcome};
+use crate::pose::bundle::{Adjusted, OPTICS, OpticsPrior};
 
 /// Steps that any start needs at most.
 const STEPS: usize = 60;
 /// Steps from an optimum of the same sightings with one camera more: what is left of the cost after them decides nothing.
 const STEPS_JOINED: usize = 12;
 
-/// A way to explain the sightings.
-struct Explanation {
+/// Optics fitted with a choice of free parameters and groups of photos.
+struct OpticsFit {
     /// Bayesian information criterion with unknown noise: less is better.
     value: f64,
     model: Model,
-    outcome: Outcome,
+    outcome: Adjusted,
 }
 
-fn explain(model: &Model, freedom: Freedom, steps: usize) -> Result<Explanation> {
+fn fit_optics(model: &Model, freedom: Freedom, steps: usize) -> Result<OpticsFit> {
     let mut model = Model { freedom, ..model.clone() };
     let outcome = model.adjust(f64::INFINITY, 2.0, steps)?;
-    let worth = worth(model.observations());
-    let value = worth * outcome.cost.max(1e-9).ln() + model.parameters() as f64 * worth.ln();
-    Ok(Explanation { value, model, outcome })
+    let n = effective_observations(model.observations());
+    let value = n * outcome.cost.max(1e-9).ln() + model.parameters() as f64 * n.ln();
+    Ok(OpticsFit { value, model, outcome })
 }
 
-/// The best of `freedoms`, with the doubt that the last of them leaves.
-fn best_of(model: &Model, freedoms: &[Freedom]) -> Result<Explanation> {
-    let mut all = freedoms.iter().map(|f| explain(model, *f, STEPS)).collect::<Result<Vec<_>>>()?;
-    let doubt = all.last().map(|e| e.outcome.sigmas.clone()).unwrap_or_default();
+/// The best of `freedoms`, with the standard deviations of the last of them.
+fn best_of(model: &Model, freedoms: &[Freedom]) -> Result<OpticsFit> {
+    let mut all = freedoms.iter().map(|f| fit_optics(model, *f, STEPS)).collect::<Result<Vec<_>>>()?;
+    let sigmas = all.last().map(|e| e.outcome.sigmas.clone()).unwrap_or_default();
     all.sort_by(|a, b| a.value.total_cmp(&b.value));
     let mut best = all.swap_remove(0);
-    best.outcome.sigmas = doubt;
+    best.outcome.sigmas = sigmas;
     Ok(best)
 }
 
-/// Photos that agree on their optics share them again, as long as that explains the sightings better than apart.
-fn joined(mut best: Explanation) -> Result<Explanation> {
+/// Photos that agree on their optics share them again, as long as the criterion falls.
+fn joined(mut best: OpticsFit) -> Result<OpticsFit> {
     for view in 1..best.model.group.len() {
         let mut tried = Vec::new();
         for other in 0..view {
@@ -46,7 +46,7 @@ fn joined(mut best: Explanation) -> Result<Explanation> {
             tried.push(target);
             let mut group = best.model.group.clone();
             group[view] = target;
-            let trial = explain(&best.model.regrouped(&group), best.model.freedom, STEPS_JOINED)?;
+            let trial = fit_optics(&best.model.regrouped(&group), best.model.freedom, STEPS_JOINED)?;
             if trial.value < best.value {
                 best = trial;
                 break;
@@ -56,10 +56,10 @@ fn joined(mut best: Explanation) -> Result<Explanation> {
     Ok(best)
 }
 
-/// Decides what of the optics the photos tell and whether photos that look alike by their files share a camera, and adjusts
-/// with it. The doubt that comes back is that of all optics together: what was not believed may be there all the same.
-pub(super) fn learn_optics(model: &mut Model) -> Result<Outcome> {
-    let apart = model.apart();
+/// Decides which of the optics the photos determine and whether photos that look alike by their files share a camera, and adjusts
+/// with it. The standard deviations are those of all optics together: what the criterion leaves out may be there all the same.
+pub(super) fn learn_optics(model: &mut Model) -> Result<Adjusted> {
+    let apart = model.with_separate_optics();
     // Which of the photos that look alike share a camera is decided once.
     let decided = model.group != model.alike && apart.as_ref().is_some_and(|a| a.group != model.group);
     let start = if decided { model.clone() } else { model.regrouped(&model.alike) };
@@ -68,40 +68,40 @@ pub(super) fn learn_optics(model: &mut Model) -> Result<Outcome> {
         let apart = best_of(&apart, &[Freedom::Focal, Freedom::Radial])?;
         if apart.value < found.value {
             let several = best_of(&joined(apart)?.model, &Freedom::ALL)?;
-            if several.value < stabilised(&found)? {
+            if several.value < shared_camera_criterion(&found)? {
                 found = several;
             }
         }
     }
-    found.outcome.sigmas = found.doubt();
+    found.outcome.sigmas = found.sigmas();
     *model = found.model;
     Ok(found.outcome)
 }
 
-/// Cost that optics of their own must save over a principal point of its own for every photo. What is not modelled, as a rolling
-/// shutter, and what the held focal length and lens cost, gave 2 % on photos of one iPhone; two generated cameras, 0.5 %
-/// apart in focal length and 2 % in k1, 8 %.
-const BESIDES: f64 = 0.95;
+/// Share of the cost that optics of their own may leave, of that with a principal point of its own for every photo. What is
+/// not modelled, as a rolling shutter, and what the held focal length and lens cost, gave 0.98 on photos of one iPhone; two
+/// generated cameras, 0.5 % apart in focal length and 2 % in k1, 0.92.
+const MAX_COST_SHARE: f64 = 0.95;
 
-/// What the criterion must be below for several cameras: its value if one camera took the photos that look alike and only its
-/// principal point moved from photo to photo, as image stabilisation moves it, less [`BESIDES`]. Optics of their own would turn
-/// such movement into wrong focal lengths.
-fn stabilised(shared: &Explanation) -> Result<f64> {
+/// What the criterion must be below for several cameras: its value if one camera took the photos that look alike and only
+/// its principal point moved from photo to photo, as image stabilisation moves it, times [`MAX_COST_SHARE`] in cost. Optics
+/// of their own would turn such movement into wrong focal lengths.
+fn shared_camera_criterion(shared: &OpticsFit) -> Result<f64> {
     let mut model = shared.model.regrouped(&shared.model.separable);
     for (prior, optics) in model.priors.iter_mut().zip(&model.optics) {
         prior.log_focal = (optics.focal.ln(), 0.0);
         prior.lens = [0.0; 2];
     }
-    let moved = explain(&model, Freedom::Full, STEPS)?;
-    let worth = worth(model.observations());
-    Ok(moved.value + shared.model.parameters() as f64 * worth.ln() + worth * BESIDES.ln())
+    let moved = fit_optics(&model, Freedom::Full, STEPS)?;
+    let n = effective_observations(model.observations());
+    Ok(moved.value + shared.model.parameters() as f64 * n.ln() + n * MAX_COST_SHARE.ln())
 }
 
-impl Explanation {
-    /// σ of the optics, as many sightings as they are worth taken for independent.
-    fn doubt(&self) -> Vec<[f64; OPTICS]> {
+impl OpticsFit {
+    /// σ of the optics, with [`effective_observations`] taken for independent.
+    fn sigmas(&self) -> Vec<[f64; OPTICS]> {
         let observations = self.model.observations();
-        let wider = (observations as f64 / worth(observations)).sqrt();
+        let wider = (observations as f64 / effective_observations(observations)).sqrt();
         let one = |(sigmas, prior): (&[f64; OPTICS], &OpticsPrior)| {
             let most = prior.sigmas();
             std::array::from_fn(|k| (sigmas[k] * wider).min(most[k]))

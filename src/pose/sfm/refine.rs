@@ -19,12 +19,12 @@ const MAX_MISS: f64 = 0.3;
 const NEIGHBOURS: usize = 8;
 
 /// Points of the model as one view sees them: (pixel, inverse depth).
-struct Seen {
+struct ViewPoints {
     points: Vec<(DVec2, f64)>,
 }
 
-impl Seen {
-    fn new(model: &Model, view: usize) -> Seen {
+impl ViewPoints {
+    fn new(model: &Model, view: usize) -> ViewPoints {
         let points = model
             .tracks
             .iter()
@@ -34,7 +34,7 @@ impl Seen {
                 Some((s.pixel, 1.0 / z))
             })
             .collect();
-        Seen { points }
+        ViewPoints { points }
     }
 
     /// Local plane at a pixel from the nearest points, as inverse depth and relative slant; `None` with few neighbours
@@ -87,7 +87,7 @@ fn central(model: &Model, track: &Track, x: DVec3) -> usize {
 /// family; aligned ones change to `family`, so that their noise is estimated apart. `reach`: pixels within which the
 /// neighbours of a point lie on one plane with it.
 pub(super) fn refine(model: &mut Model, shades: &[Shades], family: usize, reach: f64) {
-    let seen: Vec<Seen> = (0..model.poses.len()).map(|v| Seen::new(model, v)).collect();
+    let seen: Vec<ViewPoints> = (0..model.poses.len()).map(|v| ViewPoints::new(model, v)).collect();
     let fixed = &*model;
     let aligner = Aligner::new(fixed, shades);
     let moved: Vec<Option<Vec<Sighting>>> =
@@ -101,7 +101,7 @@ pub(super) fn refine(model: &mut Model, shades: &[Shades], family: usize, reach:
 
 fn refined(
     aligner: &Aligner,
-    seen: &[Seen],
+    seen: &[ViewPoints],
     track: &Track,
     family: usize,
     reach: f64,
@@ -158,7 +158,7 @@ pub(super) fn extend(model: &mut Model, shades: &[Shades], valid: &[Plane<bool>]
     let aligner = Aligner::new(fixed, shades);
     let mut all: Vec<Track> = Vec::new();
     for view in 0..fixed.poses.len() {
-        let seen = Seen::new(fixed, view);
+        let seen = ViewPoints::new(fixed, view);
         let corners = free_corners(&shades[view], &valid[view], &seen);
         let found: Vec<Option<Track>> =
             corners.par_iter().map(|p| predicted(&aligner, &seen, valid, view, *p)).collect();
@@ -170,7 +170,7 @@ pub(super) fn extend(model: &mut Model, shades: &[Shades], valid: &[Plane<bool>]
 }
 
 /// The strongest corner of each grid cell that is not near a known point.
-fn free_corners(shades: &Shades, valid: &Plane<bool>, seen: &Seen) -> Vec<DVec2> {
+fn free_corners(shades: &Shades, valid: &Plane<bool>, seen: &ViewPoints) -> Vec<DVec2> {
     let (w, h) = shades.size();
     let margin = RADIUS as usize + 4;
     let (columns, rows) = (w / CELL + 1, h / CELL + 1);
@@ -201,7 +201,7 @@ fn free_corners(shades: &Shades, valid: &Plane<bool>, seen: &Seen) -> Vec<DVec2>
 
 fn predicted(
     aligner: &Aligner,
-    seen: &Seen,
+    seen: &ViewPoints,
     valid: &[Plane<bool>],
     view: usize,
     pixel: DVec2,

@@ -1,8 +1,8 @@
-//! What pairs of photos have in common: matches by the looks of their features, and the geometry on which they agree.
+//! What pairs of photos have in common: matches by descriptors, and the geometry on which they agree.
 use super::model::Model;
-use super::tracks::Link;
+use super::tracks::KeypointMatch;
 use crate::photo::Photo;
-use crate::pose::matching::{self, Features, Match};
+use crate::pose::matching::{self, Keypoints, Match};
 use crate::pose::two_view::{self, TwoView};
 use crate::progress::Progress;
 use crate::scene::RgbImage;
@@ -18,7 +18,7 @@ pub(super) struct Matches {
     pub(super) first: usize,
     pub(super) second: usize,
     /// (pixel, pixel, link), best first.
-    pub(super) list: Vec<(DVec2, DVec2, Link)>,
+    pub(super) list: Vec<(DVec2, DVec2, KeypointMatch)>,
 }
 
 /// Two views whose matches agree on a geometry.
@@ -63,7 +63,7 @@ pub(super) fn pairs(
     };
     let relations: Vec<_> = putative.par_iter().map(related).collect();
     progress.check()?;
-    explain(photos, &relations)?;
+    check_overlap(photos, &relations)?;
     let usable = |(_, _, relation)| match relation {
         Relation::Usable(pair) => Some(pair),
         _ => None,
@@ -72,7 +72,7 @@ pub(super) fn pairs(
 }
 
 /// Matches by descriptor between all views.
-pub(super) fn putative_matches(families: &[Vec<Features>], progress: &dyn Progress) -> Result<Vec<Matches>> {
+pub(super) fn putative_matches(families: &[Vec<Keypoints>], progress: &dyn Progress) -> Result<Vec<Matches>> {
     let pair = |(first, second)| {
         let list = if progress.cancelled() { Vec::new() } else { putative(families, first, second) };
         Matches { first, second, list }
@@ -84,8 +84,8 @@ pub(super) fn putative_matches(families: &[Vec<Features>], progress: &dyn Progre
 }
 
 /// Matches by descriptor between two views, all families, best first.
-fn putative(families: &[Vec<Features>], i: usize, j: usize) -> Vec<(DVec2, DVec2, Link)> {
-    let mut all: Vec<(DVec2, DVec2, Link)> = Vec::new();
+fn putative(families: &[Vec<Keypoints>], i: usize, j: usize) -> Vec<(DVec2, DVec2, KeypointMatch)> {
+    let mut all: Vec<(DVec2, DVec2, KeypointMatch)> = Vec::new();
     let (mut start_i, mut start_j) = (0, 0);
     for (k, family) in families.iter().enumerate() {
         let (a, b) = (&family[i], &family[j]);
@@ -93,7 +93,8 @@ fn putative(families: &[Vec<Features>], i: usize, j: usize) -> Vec<(DVec2, DVec2
         let ratio = if k == 0 { 0.85 } else { 0.97 };
         all.extend(matching::mutual_matches(a, b, ratio).into_iter().map(|m: Match| {
             let quality = m.quality / (1.0 - ratio as f64).max(0.1) * 0.15;
-            let link = Link { first: (i, start_i + m.first), second: (j, start_j + m.second), quality };
+            let link =
+                KeypointMatch { first: (i, start_i + m.first), second: (j, start_j + m.second), quality };
             (a.points[m.first], b.points[m.second], link)
         }));
         start_i += a.points.len();
@@ -142,7 +143,7 @@ fn same_picture(a: &RgbImage, b: &RgbImage) -> bool {
 }
 
 /// A clear error unless the usable pairs connect all photos.
-fn explain(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Result<()> {
+fn check_overlap(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Result<()> {
     let n = photos.len();
     let name = |i: &usize, j: &usize| format!("{}–{}", photos[*i].stem, photos[*j].stem);
     let list = |test: fn(&Relation) -> bool| {

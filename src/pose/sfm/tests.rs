@@ -5,13 +5,13 @@ use crate::progress::Silent;
 use crate::scene::{Camera, RgbImage};
 
 /// Learned features when the model pack is installed.
-fn learned(photos: &[Photo]) -> Vec<Features> {
+fn learned(photos: &[Photo]) -> Vec<Keypoints> {
     let Ok(registry) = crate::infer::Registry::open(None) else { return Vec::new() };
     let Ok(mut xfeat) = crate::infer::xfeat::XFeat::load(&registry) else { return Vec::new() };
-    photos.iter().map(|p| Features::from(xfeat.detect(&p.image, 4096).unwrap())).collect()
+    photos.iter().map(|p| Keypoints::from(xfeat.detect(&p.image, 4096).unwrap())).collect()
 }
 
-fn check(name: &str, features: impl Fn(&[Photo]) -> Vec<Features>, rotation: f64, centre: f64, focal: f64) {
+fn check(name: &str, features: impl Fn(&[Photo]) -> Vec<Keypoints>, rotation: f64, centre: f64, focal: f64) {
     let truth = testing::train(&testing::folder());
     let start = std::time::Instant::now();
     let features = features(&truth.photos);
@@ -254,15 +254,15 @@ fn a_moving_lens_does_not_make_another_camera() {
 #[test]
 fn photos_whose_files_name_camera_and_zoom_share_it() {
     let mut photos = testing::train(&testing::folder()).photos;
-    let apart = |photos: &[Photo]| empty_model(photos).apart().map(|m| m.group);
-    assert_eq!(apart(&photos), Some(vec![0, 1, 2, 3]));
+    let separate = |photos: &[Photo]| empty_model(photos).with_separate_optics().map(|m| m.group);
+    assert_eq!(separate(&photos), Some(vec![0, 1, 2, 3]));
     for p in &mut photos[..3] {
         (p.camera_model, p.exif_focal) = (Some("phone".into()), Some(600.0));
     }
     photos[3].camera_model = Some("phone".into());
-    assert_eq!(apart(&photos), None, "two cameras by their files");
+    assert_eq!(separate(&photos), None, "two cameras by their files");
     photos[2].exif_focal = None;
-    assert_eq!(apart(&photos), Some(vec![0, 0, 1, 2]));
+    assert_eq!(separate(&photos), Some(vec![0, 0, 1, 2]));
 }
 
 #[test]

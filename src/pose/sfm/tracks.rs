@@ -3,7 +3,7 @@ use super::model::Sighting;
 
 /// A verified match between two keypoints; keypoints are numbered per view.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Link {
+pub(super) struct KeypointMatch {
     pub(super) first: (usize, usize),
     pub(super) second: (usize, usize),
     pub(super) quality: f64,
@@ -14,7 +14,7 @@ pub(super) type Sightings = Vec<Sighting>;
 
 /// Joins links into tracks, best links first; a link that would put two keypoints of one view into a track is left out.
 /// `points[view][keypoint]` are all keypoints.
-pub(super) fn join(links: &mut [Link], points: &[Vec<Sighting>]) -> Vec<Sightings> {
+pub(super) fn join(links: &mut [KeypointMatch], points: &[Vec<Sighting>]) -> Vec<Sightings> {
     links.sort_by(|a, b| {
         b.quality.total_cmp(&a.quality).then(a.first.cmp(&b.first)).then(a.second.cmp(&b.second))
     });
@@ -71,7 +71,7 @@ mod tests {
             family: 0,
         };
         let points: Vec<Vec<Sighting>> = (0..3).map(|v| (0..2).map(|k| keypoint(v, k)).collect()).collect();
-        let link = |a, b, quality| Link { first: a, second: b, quality };
+        let link = |a, b, quality| KeypointMatch { first: a, second: b, quality };
         let mut links = [
             link((1, 0), (2, 0), 0.5),
             // Would join keypoints 0 and 1 of view 2.

@@ -3,10 +3,10 @@ use crate::scene::RgbImage;
 
 /// Bins per channel; finer ones stay empty for small planes.
 const BINS: usize = 12;
-/// Pixels added to every bin: a colour never seen on any believed pixel tells nothing.
+/// Pixels added to every bin: a colour of no consistent pixel gives no evidence.
 const PRIOR: f32 = 2.0;
 
-/// Colour histogram of the believed pixels on one surface, normalised against all believed pixels.
+/// Colour histogram of the consistent pixels on one surface, normalised against all consistent pixels.
 pub struct ColourModel {
     share: Vec<f32>,
 }
@@ -16,8 +16,8 @@ fn bin(colour: [f32; 3]) -> usize {
 }
 
 impl ColourModel {
-    /// From the pixels on the surface and all believed pixels (which include them).
-    pub fn new(guide: &RgbImage, on: &[u32], believed: &[u32]) -> ColourModel {
+    /// From the pixels on the surface and all consistent pixels (which include them).
+    pub fn new(guide: &RgbImage, on: &[u32], consistent: &[u32]) -> ColourModel {
         let count = |pixels: &[u32]| {
             let mut bins = vec![0.0f32; BINS * BINS * BINS];
             for &k in pixels {
@@ -25,11 +25,11 @@ impl ColourModel {
             }
             blurred(&bins)
         };
-        let (on, all) = (count(on), count(believed));
+        let (on, all) = (count(on), count(consistent));
         ColourModel { share: on.iter().zip(&all).map(|(o, a)| (o + 0.5 * PRIOR) / (a + PRIOR)).collect() }
     }
 
-    /// Share of the believed pixels of this colour that lie on the surface, 0 to 1; near 0.5 for unknown colours.
+    /// Share of the consistent pixels of this colour that lie on the surface, 0 to 1; near 0.5 for unknown colours.
     pub fn share(&self, colour: [f32; 3]) -> f32 {
         self.share[bin(colour)]
     }

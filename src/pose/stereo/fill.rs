@@ -1,9 +1,9 @@
-//! Depth where matching fails (weak texture, seen by one view only, rims of objects): the planes of believed pixels
+//! Depth where matching fails (weak texture, in one view only, rims of objects): the planes of consistent pixels
 //! are carried on along paths of similar colour, never into space that another view sees through.
 use super::Level;
 use super::colours::ColourModel;
 use super::planes::WorldPlane;
-use super::surface::{Links, Surface, Verdict, free_space, neighbours, ray};
+use super::surface::{RelativePoses, Surface, Visibility, free_space, neighbours, ray};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::cmp::Reverse;
@@ -29,7 +29,7 @@ const FILLED_CONFIDENCE: f32 = 0.3;
 /// Path cost at which a filled pixel's confidence has fallen to half.
 const HALF_CONFIDENCE_COST: f32 = 0.5;
 
-/// Distrusts believed pixels within `radius` of a depth step: there the matching window mixes two surfaces, and
+/// Rejects consistent pixels within `radius` of a depth step: there the matching window mixes two surfaces, and
 /// filling finds the colour edge more exactly.
 pub fn open_rims(level: &Level, surface: &Surface, radius: usize) -> Surface {
     let mut out = surface.clone();
@@ -56,8 +56,14 @@ pub fn open_rims(level: &Level, surface: &Surface, radius: usize) -> Surface {
     out
 }
 
-/// Gives every pixel that is not void a plane. `surface` holds the believed pixels, its planes smoothed.
-pub fn fill(level: &Level, links: &Links, surface: &Surface, large: &[WorldPlane], void: &[bool]) -> Surface {
+/// Gives every pixel that is not void a plane. `surface` holds the consistent pixels, its planes smoothed.
+pub fn fill(
+    level: &Level,
+    links: &RelativePoses,
+    surface: &Surface,
+    large: &[WorldPlane],
+    void: &[bool],
+) -> Surface {
     let views: Vec<(Vec<Vec3>, Vec<f32>)> = (0..level.cameras.len())
         .into_par_iter()
         .map(|view| ViewFill::new(level, links, surface, void, view).run(large))
@@ -72,7 +78,7 @@ pub fn fill(level: &Level, links: &Links, surface: &Surface, large: &[WorldPlane
 
 struct ViewFill<'a> {
     level: &'a Level,
-    links: &'a Links,
+    links: &'a RelativePoses,
     surface: &'a Surface,
     void: &'a [bool],
     view: usize,
@@ -82,7 +88,13 @@ struct ViewFill<'a> {
 }
 
 impl<'a> ViewFill<'a> {
-    fn new(level: &'a Level, links: &'a Links, surface: &'a Surface, void: &'a [bool], view: usize) -> Self {
+    fn new(
+        level: &'a Level,
+        links: &'a RelativePoses,
+        surface: &'a Surface,
+        void: &'a [bool],
+        view: usize,
+    ) -> Self {
         let r = &level.references[view];
         let (width, height, first) = (r.width as usize, r.height as usize, r.first as usize);
         ViewFill { level, links, surface, void, view, width, height, first }
@@ -104,19 +116,19 @@ impl<'a> ViewFill<'a> {
                 }
             }
         };
-        let believed: Vec<u32> =
+        let consistent: Vec<u32> =
             (0..pixels as u32).filter(|&k| self.surface.confidence[self.first + k as usize] > 0.0).collect();
-        let (carried, cost) = self.spread(&believed, None, None);
+        let (carried, cost) = self.spread(&consistent, None, None);
         consider(&carried, &cost, LOCAL_RELUCTANCE, &|source| self.surface.planes[self.first + source]);
         for plane in large {
             let Some(plane) = plane.in_camera(&self.level.cameras[self.view]) else { continue };
             let on: Vec<u32> =
-                believed.iter().copied().filter(|&k| self.lies_on(k as usize, plane)).collect();
+                consistent.iter().copied().filter(|&k| self.lies_on(k as usize, plane)).collect();
             // A handful of pixels that touch the plane by chance must not carry it over the image.
             if on.len() * 1000 < pixels {
                 continue;
             }
-            let colours = ColourModel::new(&self.level.guide[self.view], &on, &believed);
+            let colours = ColourModel::new(&self.level.guide[self.view], &on, &consistent);
             let (carried, cost) = self.spread(&on, Some(plane), Some(&colours));
             consider(&carried, &cost, 1.0, &|_| plane);
         }
@@ -140,7 +152,7 @@ impl<'a> ViewFill<'a> {
         (plane.dot(ray) - here).abs() < 0.5 * self.level.tolerance[self.view] * here
     }
 
-    /// Dijkstra from the given pixels over the pixels without belief: per pixel where its plane comes from
+    /// Dijkstra from the given pixels over the rejected pixels: per pixel where its plane comes from
     /// (`u32::MAX` = unreached) and the path cost. With `plane`, that plane is carried; else each source's own.
     fn spread(
         &self,
@@ -203,9 +215,9 @@ impl<'a> ViewFill<'a> {
         let mut evidence = (1.0, 0.0);
         for other in (0..self.level.cameras.len()).filter(|&o| o != self.view) {
             let pixel = [x as f32 + 0.5, y as f32 + 0.5];
-            match self.links.verdict(self.level, self.surface, self.view, other, pixel, point) {
-                Verdict::InTheWay => evidence.1 = BLOCKING,
-                Verdict::Agrees => {
+            match self.links.visibility(self.level, self.surface, self.view, other, pixel, point) {
+                Visibility::FreeSpace => evidence.1 = BLOCKING,
+                Visibility::Agrees => {
                     if self.same_colour(x, y, other, point) {
                         evidence.0 = CONFIRMED;
                     } else {

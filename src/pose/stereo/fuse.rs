@@ -1,6 +1,6 @@
 //! Depth maps of all views to one set of points (docs/method.md#fusion).
 use super::Level;
-use super::surface::{Links, Surface, neighbours, ray};
+use super::surface::{RelativePoses, Surface, neighbours, ray};
 use crate::scene::PointCloud;
 use glam::Vec3;
 
@@ -11,7 +11,7 @@ pub const MATCHED: f32 = 0.5;
 
 /// Matched pixels of all views first, filled ones after; within each, views by decreasing mean confidence. A pixel is
 /// skipped when a point already kept projects onto it at the same depth, within the view's tolerance.
-pub fn fuse(level: &Level, links: &Links, surface: &Surface) -> PointCloud {
+pub fn fuse(level: &Level, links: &RelativePoses, surface: &Surface) -> PointCloud {
     let mut order: Vec<usize> = (0..level.cameras.len()).collect();
     let mean = |view: usize| {
         let r = &level.references[view];
@@ -33,7 +33,7 @@ pub fn fuse(level: &Level, links: &Links, surface: &Surface) -> PointCloud {
 
 fn fuse_view(
     level: &Level,
-    links: &Links,
+    links: &RelativePoses,
     surface: &Surface,
     view: usize,
     matched: bool,

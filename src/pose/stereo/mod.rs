@@ -103,9 +103,9 @@ pub fn finish(
     options: &StereoOptions,
 ) -> (Vec<DepthMap>, PointCloud) {
     let void = void::white_border(level);
-    let links = surface::Links::new(level);
-    let believed = surface::believed(level, &links, matched, &void);
-    let fitted = surface::smoothed(level, &believed, FIT_RADIUS);
+    let links = surface::RelativePoses::new(level);
+    let consistent = surface::consistent_surface(level, &links, matched, &void);
+    let fitted = surface::smoothed(level, &consistent, FIT_RADIUS);
     let large = planes::large_planes(level, &fitted, options.seed);
     let opened = fill::open_rims(level, &fitted, rim_radius(level));
     let complete = fill::fill(level, &links, &opened, &large, &void);

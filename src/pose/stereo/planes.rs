@@ -1,4 +1,4 @@
-//! The scene's large planes (tables, walls, floors), found in the believed points of all views.
+//! The scene's large planes (tables, walls, floors), found in the consistent points of all views.
 use super::Level;
 use super::surface::{Surface, ray};
 use crate::pass::plane_sweep_cpu::hash;
@@ -30,7 +30,7 @@ const NORMAL_TOLERANCE: f64 = 0.906;
 /// Planes with a smaller share of all points are not large.
 const SMALLEST_SHARE: f64 = 0.02;
 /// Most planes looked for.
-const MOST_PLANES: usize = 8;
+const MAX_PLANES: usize = 8;
 /// Points looked at: enough that the smallest plane has about 200.
 const SAMPLES: usize = 10_000;
 /// Hypotheses per plane, each from one point and its normal: a plane with 2 % of the points is missed with
@@ -51,7 +51,7 @@ pub fn large_planes(level: &Level, surface: &Surface, seed: u32) -> Vec<WorldPla
     let total = samples.len();
     let mut planes = Vec::new();
     let mut state = seed;
-    while planes.len() < MOST_PLANES && samples.len() >= 100 {
+    while planes.len() < MAX_PLANES && samples.len() >= 100 {
         let mut best = (0, WorldPlane { normal: DVec3::Z, offset: 0.0 });
         for _ in 0..TRIALS {
             state = hash(state);
@@ -82,8 +82,8 @@ fn lies_on(plane: &WorldPlane, s: &Sample) -> bool {
 }
 
 fn gather(level: &Level, surface: &Surface) -> Vec<Sample> {
-    let believed = surface.confidence.iter().filter(|&&c| c > 0.0).count();
-    let stride = (believed / SAMPLES).max(1);
+    let consistent = surface.confidence.iter().filter(|&&c| c > 0.0).count();
+    let stride = (consistent / SAMPLES).max(1);
     let mut samples = Vec::new();
     let mut counter = 0;
     for (view, r) in level.references.iter().enumerate() {

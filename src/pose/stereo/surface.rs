@@ -1,21 +1,21 @@
-//! Which matched pixels to believe: agreement with the other views, and smooth local planes for those.
+//! Which matched pixels are kept: agreement with the other views, and smooth local planes for those.
 use super::Level;
 use super::views::{DEPTH_TOLERANCE, REPROJECTION_TOLERANCE};
 use crate::scene::Plane;
 use glam::{DMat3, DVec2, DVec3, Vec3, Vec4};
 use rayon::prelude::*;
 
-/// Matched planes of all views with how far each pixel can be trusted, at one resolution.
+/// Matched planes of all views with the confidence of each pixel, at one resolution.
 #[derive(Clone, Debug)]
 pub struct Surface {
     /// `π` per pixel (`1/z = π·ray`), all views one after the other.
     pub planes: Vec<Vec3>,
-    /// Confidence per pixel; 0 = not to be believed.
+    /// Confidence per pixel; 0 = rejected.
     pub confidence: Vec<f32>,
 }
 
 /// Where parallax is small, [`REPROJECTION_TOLERANCE`] corresponds to a larger depth difference; views that could not
-/// tell depths this far apart confirm nothing …
+/// distinguish depths this far apart confirm nothing …
 const UNINFORMATIVE: f32 = 0.06;
 /// … unless the view has nothing better: this many times its typical tolerance.
 const NOTHING_BETTER: f32 = 1.5;
@@ -27,14 +27,14 @@ pub fn free_space(level: &Level, view: usize) -> f32 {
     FREE_SPACE_TOLERANCE.max(2.0 * level.tolerance[view])
 }
 
-/// Aggregated cost above which even an agreeing pixel is not believed: half way between a perfect match in one view
+/// Aggregated cost above which even an agreeing pixel is rejected: half way between a perfect match in one view
 /// (0.4 + geometric limits) and none (1.0 and more).
 const COST_TOLERANCE: f32 = 0.75;
-/// Connected areas of believed pixels smaller than this share of the image are chance.
+/// Connected areas of consistent pixels smaller than this share of the image are chance.
 const SPECKLE_SHARE: f32 = 6e-4;
 /// Confidence by number of agreeing views.
 const CONFIDENCE: [f32; 3] = [0.0, 0.6, 0.9];
-/// Confidence of a pixel that nobody confirms but its surroundings: it shapes the surface, it is no measurement.
+/// Confidence of a pixel that only its surroundings confirm: it shapes the surface, it is no measurement.
 const PLAUSIBLE: f32 = 0.45;
 /// Aggregated cost above which not even such a pixel is kept: next to no correlation in any view.
 const PLAUSIBLE_COST: f32 = 0.95;
@@ -43,29 +43,29 @@ const SUPPORT: f32 = 0.6;
 /// The surroundings: 9 × 9 pixels, every second.
 const SUPPORT_TAPS: i32 = 4;
 
-/// What another view says about a point.
+/// Visibility of a point in another view.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Verdict {
-    /// Outside its image, or it knows nothing there.
-    Unseen,
-    /// It sees a surface at the same place.
+pub enum Visibility {
+    /// Outside its image, or the other view has no depth there.
+    Outside,
+    /// The other view has a surface at the same place.
     Agrees,
-    /// It sees something nearer.
-    Hidden,
-    /// It sees farther: the point would be in the way.
-    InTheWay,
+    /// The other view has a nearer surface.
+    Occluded,
+    /// The other view has a farther surface: the point lies in space that it shows to be free.
+    FreeSpace,
 }
 
 /// Maps between the cameras of a level, in f32.
-pub struct Links {
+pub struct RelativePoses {
     /// `to[a * views + b]`: rotation and translation of frame a → frame b.
     to: Vec<(glam::Mat3, Vec3)>,
     views: usize,
 }
 
-impl Links {
+impl RelativePoses {
     /// Precomputes all pairs.
-    pub fn new(level: &Level) -> Links {
+    pub fn new(level: &Level) -> RelativePoses {
         let views = level.cameras.len();
         let mut to = Vec::with_capacity(views * views);
         for a in &level.cameras {
@@ -75,7 +75,7 @@ impl Links {
                 to.push((r.as_mat3(), relative.translation.as_vec3()));
             }
         }
-        Links { to, views }
+        RelativePoses { to, views }
     }
 
     /// Depth and pixel of a point of frame `a` in view `b`, if it falls into the image.
@@ -105,8 +105,8 @@ impl Links {
         (REPROJECTION_TOLERANCE / du.hypot(dv).max(1e-6)).max(DEPTH_TOLERANCE)
     }
 
-    /// What view `b` says about a point of frame `a` seen at pixel position (x, y).
-    pub fn verdict(
+    /// Visibility in view `b` of a point of frame `a` seen at pixel position (x, y).
+    pub fn visibility(
         &self,
         level: &Level,
         surface: &Surface,
@@ -114,12 +114,12 @@ impl Links {
         b: usize,
         pixel: [f32; 2],
         point: Vec3,
-    ) -> Verdict {
-        let Some((u, v, z)) = self.project(level, a, b, point) else { return Verdict::Unseen };
+    ) -> Visibility {
+        let Some((u, v, z)) = self.project(level, a, b, point) else { return Visibility::Outside };
         let r = &level.references[b];
         let index = r.first as usize + v as usize * r.width as usize + u as usize;
         if surface.confidence[index] <= 0.0 {
-            return Verdict::Unseen;
+            return Visibility::Outside;
         }
         let [fx, fy, cx, cy] = r.intrinsics;
         let ray = Vec3::new((u - cx) / fx, (v - cy) / fy, 1.0);
@@ -127,10 +127,10 @@ impl Links {
         let tolerance = self.tolerance(level, a, b, point);
         let free = FREE_SPACE_TOLERANCE.max(2.0 * tolerance);
         if z < seen * (1.0 - free) {
-            return Verdict::InTheWay;
+            return Visibility::FreeSpace;
         }
         if z > seen * (1.0 + free) {
-            return Verdict::Hidden;
+            return Visibility::Occluded;
         }
         let agrees = tolerance < UNINFORMATIVE.max(NOTHING_BETTER * level.tolerance[a])
             && (z - seen).abs() < tolerance * seen
@@ -138,7 +138,7 @@ impl Links {
                 let (dx, dy) = (x - pixel[0], y - pixel[1]);
                 dx * dx + dy * dy < REPROJECTION_TOLERANCE * REPROJECTION_TOLERANCE
             });
-        if agrees { Verdict::Agrees } else { Verdict::Unseen }
+        if agrees { Visibility::Agrees } else { Visibility::Outside }
     }
 }
 
@@ -163,7 +163,7 @@ pub fn map_pixels<T: Send>(level: &Level, f: impl Fn(usize, usize, usize, usize)
 }
 
 /// Keeps what at least one other view confirms and none that confirmed itself contradicts more often.
-pub fn believed(level: &Level, links: &Links, matched: &[Vec4], void: &[bool]) -> Surface {
+pub fn consistent_surface(level: &Level, links: &RelativePoses, matched: &[Vec4], void: &[bool]) -> Surface {
     let mut surface = Surface {
         planes: matched.iter().map(|p| p.truncate()).collect(),
         confidence: matched
@@ -187,9 +187,9 @@ pub fn believed(level: &Level, links: &Links, matched: &[Vec4], void: &[bool]) -
             let (mut agree, mut against) = (0usize, 0usize);
             for other in (0..views).filter(|&o| o != view) {
                 let pixel = [x as f32 + 0.5, y as f32 + 0.5];
-                match links.verdict(level, &surface, view, other, pixel, ray / inverse) {
-                    Verdict::Agrees => agree += 1,
-                    Verdict::InTheWay => against += 1,
+                match links.visibility(level, &surface, view, other, pixel, ray / inverse) {
+                    Visibility::Agrees => agree += 1,
+                    Visibility::FreeSpace => against += 1,
                     _ => {}
                 }
             }
@@ -206,7 +206,7 @@ pub fn believed(level: &Level, links: &Links, matched: &[Vec4], void: &[bool]) -
 /// confirmation means occlusion or error, and nothing is added.
 fn with_plausible(
     level: &Level,
-    links: &Links,
+    links: &RelativePoses,
     confirmed: &Surface,
     matched: &[Vec4],
     void: &[bool],
@@ -223,9 +223,9 @@ fn with_plausible(
             return 0.0;
         }
         let pixel = [x as f32 + 0.5, y as f32 + 0.5];
-        let against = (0..level.cameras.len())
-            .filter(|&o| o != view)
-            .any(|o| links.verdict(level, confirmed, view, o, pixel, ray / inverse) == Verdict::InTheWay);
+        let against = (0..level.cameras.len()).filter(|&o| o != view).any(|o| {
+            links.visibility(level, confirmed, view, o, pixel, ray / inverse) == Visibility::FreeSpace
+        });
         if against { 0.0 } else { PLAUSIBLE }
     });
     Surface { planes: confirmed.planes.clone(), confidence }
@@ -251,7 +251,7 @@ fn support(level: &Level, matched: &[Vec4], view: usize, x: usize, y: usize, pla
     near as f32 / total as f32
 }
 
-/// Depth map of a view from its planes; 0 where not believed.
+/// Depth map of a view from its planes; 0 where rejected.
 pub fn depth(level: &Level, view: usize, surface: &Surface) -> Plane<f32> {
     let r = &level.references[view];
     let (width, height) = (r.width as usize, r.height as usize);
@@ -268,7 +268,7 @@ pub fn depth(level: &Level, view: usize, surface: &Surface) -> Plane<f32> {
     out
 }
 
-/// Distrusts small areas that are connected by depth.
+/// Rejects small areas that are connected by depth.
 fn remove_speckles(level: &Level, surface: &mut Surface) {
     for view in 0..level.cameras.len() {
         let depth = depth(level, view, surface);
@@ -316,7 +316,7 @@ pub fn neighbours(k: usize, width: usize, height: usize) -> impl Iterator<Item =
     .flatten()
 }
 
-/// Least-squares plane of the believed pixels around each believed pixel that lie on its plane, in inverse depth
+/// Least-squares plane of the consistent pixels around each consistent pixel that lie on its plane, in inverse depth
 /// (affine over the image). `radius` in pixels.
 pub fn smoothed(level: &Level, surface: &Surface, radius: i32) -> Surface {
     let planes = map_pixels(level, |view, x, y, k| {

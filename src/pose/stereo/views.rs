@@ -26,7 +26,7 @@ pub struct Level {
 pub const DEPTH_TOLERANCE: f32 = 0.01;
 /// Where parallax is small, this many pixels of matching noise are a larger depth difference …
 pub const REPROJECTION_TOLERANCE: f32 = 1.5;
-/// … up to here: coarser depth tells surfaces no longer apart.
+/// … up to here: coarser depth no longer separates surfaces.
 const COARSEST_TOLERANCE: f32 = 0.1;
 
 /// Pixels by which the image in `other` moves per relative change of the depth that `camera` sees a point at.

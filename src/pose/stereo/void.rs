@@ -1,4 +1,4 @@
-//! White frames around photos (rectified or cropped images): nothing to match, nothing to fill.
+//! White borders around photos (rectified or cropped images): nothing to match, nothing to fill.
 use super::Level;
 use super::surface::neighbours;
 

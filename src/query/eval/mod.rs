@@ -11,7 +11,7 @@ mod truth;
 mod tests;
 
 pub use figures::{DepthScore, colour_fit, depth_score, iou};
-pub use truth::{Frame, GroundTruth, Split};
+pub use truth::{GroundTruth, Split, TruthFrame};
 
 use super::QueryResult;
 use crate::format::picture;
@@ -123,7 +123,7 @@ pub struct MaskScore {
 
 /// Means over one split.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Summary {
+pub struct SplitSummary {
     /// Mean PSNR, dB.
     pub psnr: Option<f64>,
     /// Mean SSIM.
@@ -185,24 +185,24 @@ pub struct RefinedView {
     pub centre_shift: [f64; 2],
 }
 
-/// What a scene believes of the camera that took its photos, against the truth: medians over the train frames.
+/// Focal ratio and offset of the principal point of the scene's cameras against the truth: medians over the train frames.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Belief {
+struct OpticsOffset {
     /// Focal length over the true one.
     focal: f64,
     /// Principal point minus the true one, share of the width and of the height.
     centre: [f64; 2],
 }
 
-impl Belief {
-    fn of(estimated: &[Camera], known: &[Camera]) -> Belief {
+impl OpticsOffset {
+    fn of(estimated: &[Camera], known: &[Camera]) -> OpticsOffset {
         let median = |value: &dyn Fn(&Camera, &Camera) -> f64| {
             let mut all: Vec<f64> = estimated.iter().zip(known).map(|(e, k)| value(e, k)).collect();
             crate::math::median(&mut all).unwrap_or(0.0)
         };
         let of_width = |c: &Camera, x: f64| x / f64::from(c.width);
         let of_height = |c: &Camera, y: f64| y / f64::from(c.height);
-        Belief {
+        OpticsOffset {
             focal: median(&|e, k| of_width(e, e.fx) / of_width(k, k.fx)),
             centre: [
                 median(&|e, k| of_width(e, e.cx) - of_width(k, k.cx)),
@@ -222,12 +222,12 @@ pub struct RefinedScore {
     /// As in the report.
     pub masks: Vec<MaskScore>,
     /// Means.
-    pub summary: Summary,
+    pub summary: SplitSummary,
 }
 
 /// Everything `splatvk eval` reports.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Report {
+pub struct EvalReport {
     /// What each figure is, one line each.
     pub definitions: Vec<String>,
     /// Per train view.
@@ -239,7 +239,7 @@ pub struct Report {
     /// Per object and frame; background labels are not listed.
     pub masks: Vec<MaskScore>,
     /// Means per split, `train` and `test`.
-    pub summary: BTreeMap<String, Summary>,
+    pub summary: BTreeMap<String, SplitSummary>,
     /// Held-out frames from refined cameras, if asked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refined: Option<RefinedScore>,
@@ -249,16 +249,16 @@ pub struct Report {
 pub struct Evaluation {
     truth: GroundTruth,
     similarity: Similarity,
-    belief: Belief,
+    optics_offset: OpticsOffset,
     out: Option<PathBuf>,
-    report: Report,
+    report: EvalReport,
 }
 
 impl Evaluation {
     /// Matches the scene's cameras (by file stem) with the train frames and finds the similarity scene → truth from
     /// them alone. With `out`, renders and masks are written there.
     pub fn new(truth: GroundTruth, scene: &[Camera], out: Option<&Path>) -> Result<Self> {
-        let mut pairs: Vec<(Camera, &Frame)> = Vec::new();
+        let mut pairs: Vec<(Camera, &TruthFrame)> = Vec::new();
         let asked = truth.frames.iter().filter(|f| f.split == Split::Train).count();
         for frame in truth.frames.iter().filter(|f| f.split == Split::Train) {
             let found = scene.iter().find(|c| stem(&c.name) == frame.stem);
@@ -272,26 +272,27 @@ impl Evaluation {
                 pairs.len()
             )));
         }
-        let frames: Vec<&Frame> = pairs.iter().map(|(_, f)| *f).collect();
+        let frames: Vec<&TruthFrame> = pairs.iter().map(|(_, f)| *f).collect();
         let mean_depth = truth.mean_depth(&frames)?;
         let estimated: Vec<Camera> = pairs.iter().map(|(c, _)| c.clone()).collect();
         let known: Vec<Camera> = frames.iter().map(|f| f.camera.clone()).collect();
         let errors = pose_errors(&estimated, &known, mean_depth);
         let relative_poses = relative(&frames, &estimated, &known, asked);
-        let report = Report { poses: pose_scores(&frames, &errors), relative_poses, ..Report::default() };
-        let (similarity, belief) = (errors.similarity, Belief::of(&estimated, &known));
-        Ok(Evaluation { similarity, belief, out: out.map(Path::to_path_buf), report, truth })
+        let report =
+            EvalReport { poses: pose_scores(&frames, &errors), relative_poses, ..EvalReport::default() };
+        let (similarity, optics_offset) = (errors.similarity, OpticsOffset::of(&estimated, &known));
+        Ok(Evaluation { similarity, optics_offset, out: out.map(Path::to_path_buf), report, truth })
     }
 
     /// The frames and, for each, the camera of the truth expressed in the scene's world, at the truth's size.
-    pub fn cameras(&self) -> Vec<(Frame, Camera)> {
+    pub fn cameras(&self) -> Vec<(TruthFrame, Camera)> {
         self.truth.frames.iter().map(|f| (f.clone(), to_scene(&f.camera, &self.similarity))).collect()
     }
 
     /// A camera of the truth with the optics that the scene found for its own photos: what a photo taken with the same
     /// camera shows of the scene if the scene is right about itself.
-    pub fn as_believed(&self, camera: &Camera) -> Camera {
-        let Belief { focal, centre: [x, y] } = self.belief;
+    pub fn with_scene_optics(&self, camera: &Camera) -> Camera {
+        let OpticsOffset { focal, centre: [x, y] } = self.optics_offset;
         Camera {
             fx: camera.fx * focal,
             fy: camera.fy * focal,
@@ -308,14 +309,14 @@ impl Evaluation {
     }
 
     /// The photo of a frame.
-    pub fn photo(&self, frame: &Frame) -> Result<RgbImage> {
+    pub fn photo(&self, frame: &TruthFrame) -> Result<RgbImage> {
         self.truth.image(frame)
     }
 
     /// Scores one frame; `answers` holds the result per asked object index, in frame size.
     pub fn add_frame(
         &mut self,
-        frame: &Frame,
+        frame: &TruthFrame,
         rendered: &Rendered,
         answers: &[(u32, QueryResult)],
     ) -> Result<()> {
@@ -328,7 +329,7 @@ impl Evaluation {
     /// Scores a held-out frame again, from a refined camera; its files go into `refined/`.
     pub fn add_refined(
         &mut self,
-        frame: &Frame,
+        frame: &TruthFrame,
         view: RefinedView,
         rendered: &Rendered,
         answers: &[(u32, QueryResult)],
@@ -344,7 +345,7 @@ impl Evaluation {
 
     fn score(
         &self,
-        frame: &Frame,
+        frame: &TruthFrame,
         rendered: &Rendered,
         answers: &[(u32, QueryResult)],
         out: Option<&Path>,
@@ -361,7 +362,7 @@ impl Evaluation {
         let depth =
             depth.and_then(|d| depth_score(&rendered.depth, &rendered.alpha, &d, self.similarity.scale));
         // A white or black frame around a photo is no part of the scene.
-        let border = crate::photo::Frame::of(&target);
+        let border = crate::photo::PlainBorder::of(&target);
         let (inner, photo) = (border.crop(&shown), border.crop(&target));
         let image = ImageScore {
             frame: frame.stem.clone(),
@@ -379,7 +380,7 @@ impl Evaluation {
         Ok((image, self.mask_scores(frame, answers)?))
     }
 
-    fn mask_scores(&self, frame: &Frame, answers: &[(u32, QueryResult)]) -> Result<Vec<MaskScore>> {
+    fn mask_scores(&self, frame: &TruthFrame, answers: &[(u32, QueryResult)]) -> Result<Vec<MaskScore>> {
         let Some(objects) = self.truth.objects(frame)? else { return Ok(Vec::new()) };
         let mut scores = Vec::new();
         for (label, answer) in answers {
@@ -405,7 +406,7 @@ impl Evaluation {
     }
 
     /// The report with its means.
-    pub fn finish(mut self) -> Report {
+    pub fn finish(mut self) -> EvalReport {
         self.report.definitions = DEFINITIONS.map(String::from).to_vec();
         for split in [Split::Train, Split::Test] {
             let summary = summarise(&self.report.images, &self.report.masks, split);
@@ -418,9 +419,9 @@ impl Evaluation {
     }
 }
 
-fn pose_scores(frames: &[&Frame], errors: &PoseErrors) -> Vec<PoseScore> {
+fn pose_scores(frames: &[&TruthFrame], errors: &PoseErrors) -> Vec<PoseScore> {
     let rows = frames.iter().zip(&errors.rotation_degrees).zip(&errors.centre).zip(&errors.focal);
-    let score = |(((f, r), c), k): (((&&Frame, &f64), &f64), &f64)| PoseScore {
+    let score = |(((f, r), c), k): (((&&TruthFrame, &f64), &f64), &f64)| PoseScore {
         frame: f.stem.clone(),
         rotation_degrees: *r,
         centre_fraction: *c,
@@ -430,7 +431,7 @@ fn pose_scores(frames: &[&Frame], errors: &PoseErrors) -> Vec<PoseScore> {
 }
 
 /// `asked`: train frames of the truth; a frame that the scene lacks fails in all its pairs.
-fn relative(frames: &[&Frame], estimated: &[Camera], known: &[Camera], asked: usize) -> RelativeScore {
+fn relative(frames: &[&TruthFrame], estimated: &[Camera], known: &[Camera], asked: usize) -> RelativeScore {
     let errors = pair_errors(estimated, known);
     let missing = asked * asked.saturating_sub(1) / 2 - errors.len();
     let pairs = errors.iter().map(|e| PairScore {
@@ -446,7 +447,7 @@ fn relative(frames: &[&Frame], estimated: &[Camera], known: &[Camera], asked: us
     }
 }
 
-fn summarise(images: &[ImageScore], masks: &[MaskScore], split: Split) -> Summary {
+fn summarise(images: &[ImageScore], masks: &[MaskScore], split: Split) -> SplitSummary {
     let mean = |v: Vec<f64>| (!v.is_empty()).then(|| v.iter().sum::<f64>() / v.len() as f64);
     let images: Vec<&ImageScore> = images.iter().filter(|i| i.split == split).collect();
     let masks: Vec<&MaskScore> = masks.iter().filter(|m| m.split == split).collect();
@@ -454,7 +455,7 @@ fn summarise(images: &[ImageScore], masks: &[MaskScore], split: Split) -> Summar
     for m in &masks {
         per_phrase.entry(m.phrase.clone()).or_default().push(m.iou);
     }
-    Summary {
+    SplitSummary {
         psnr: mean(images.iter().map(|i| i.psnr).collect()),
         ssim: mean(images.iter().map(|i| i.ssim).collect()),
         psnr_colour_fit: mean(images.iter().map(|i| i.psnr_colour_fit).collect()),

@@ -107,8 +107,8 @@ fn held_out_frames_take_the_optics_that_the_scene_found() {
     }
     let eval = Evaluation::new(truth, &scene, None).unwrap();
     let (frame, camera) = eval.cameras().into_iter().find(|(f, _)| f.split == Split::Test).unwrap();
-    let believed = eval.as_believed(&camera);
-    assert!((believed.fx / frame.camera.fx - 0.9).abs() < 1e-9 && believed.pose == camera.pose);
-    assert!((believed.cx - frame.camera.cx - 0.02 * 640.0).abs() < 1e-6);
-    assert!((believed.cy - frame.camera.cy).abs() < 1e-6);
+    let with_optics = eval.with_scene_optics(&camera);
+    assert!((with_optics.fx / frame.camera.fx - 0.9).abs() < 1e-9 && with_optics.pose == camera.pose);
+    assert!((with_optics.cx - frame.camera.cx - 0.02 * 640.0).abs() < 1e-6);
+    assert!((with_optics.cy - frame.camera.cy).abs() < 1e-6);
 }

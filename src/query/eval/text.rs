@@ -1,8 +1,8 @@
 //! The report for people.
-use super::{Report, Summary};
+use super::{EvalReport, SplitSummary};
 use std::fmt::Write;
 
-impl Report {
+impl EvalReport {
     /// A few lines of the figures that matter; the whole is in the JSON.
     pub fn text(&self) -> String {
         let mut out = String::new();
@@ -34,7 +34,7 @@ impl Report {
     }
 }
 
-fn row(out: &mut String, name: &str, s: &Summary) {
+fn row(out: &mut String, name: &str, s: &SplitSummary) {
     let number = |v: Option<f64>, digits: usize| v.map_or_else(|| "-".into(), |v| format!("{v:.digits$}"));
     let _ = writeln!(
         out,

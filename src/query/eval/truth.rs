@@ -30,7 +30,7 @@ impl Split {
 
 /// One known view.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Frame {
+pub struct TruthFrame {
     /// Photo, relative to the folder.
     pub file: String,
     /// File name without extension.
@@ -39,7 +39,7 @@ pub struct Frame {
     pub split: Split,
     /// Intrinsics and pose in the true world.
     pub camera: Camera,
-    /// Radial distortion of the photo, if the set states it; [`Frame::camera`] is without it.
+    /// Radial distortion of the photo, if the set states it; [`TruthFrame::camera`] is without it.
     pub lens: Option<Lens>,
 }
 
@@ -51,7 +51,7 @@ pub struct GroundTruth {
     /// Object index → phrase; empty when the set has no labels.
     pub labels: BTreeMap<u32, String>,
     /// All views.
-    pub frames: Vec<Frame>,
+    pub frames: Vec<TruthFrame>,
 }
 
 #[derive(Deserialize)]
@@ -94,14 +94,14 @@ impl GroundTruth {
             let pose = Pose { rotation, translation: column(3) };
             let camera =
                 Camera { name: f.file.clone(), width, height, fx: f.fx, fy: f.fy, cx: f.cx, cy: f.cy, pose };
-            Frame { file: f.file, stem, split: f.split, camera, lens: f.lens }
+            TruthFrame { file: f.file, stem, split: f.split, camera, lens: f.lens }
         };
         let frames = file.frames.into_iter().map(frame).collect();
         Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, frames })
     }
 
     /// The photo of a frame.
-    pub fn image(&self, frame: &Frame) -> Result<RgbImage> {
+    pub fn image(&self, frame: &TruthFrame) -> Result<RgbImage> {
         let path = self.folder.join(&frame.file);
         let image = open(&path)?.to_rgb8();
         let data = image.pixels().map(|p| p.0.map(|v| v as f32 / 255.0)).collect();
@@ -109,7 +109,7 @@ impl GroundTruth {
     }
 
     /// Object index per pixel, if the set has masks.
-    pub fn objects(&self, frame: &Frame) -> Result<Option<Plane<u32>>> {
+    pub fn objects(&self, frame: &TruthFrame) -> Result<Option<Plane<u32>>> {
         let path = self.folder.join("masks").join(format!("{}.png", frame.stem));
         if self.labels.is_empty() || !path.exists() {
             return Ok(None);
@@ -120,7 +120,7 @@ impl GroundTruth {
     }
 
     /// Camera z per pixel, 0 = unknown, if the set has depth.
-    pub fn depth(&self, frame: &Frame) -> Result<Option<Plane<f32>>> {
+    pub fn depth(&self, frame: &TruthFrame) -> Result<Option<Plane<f32>>> {
         let path = self.folder.join("depth").join(format!("{}.npz", frame.stem));
         if !path.exists() {
             return Ok(None);
@@ -135,7 +135,7 @@ impl GroundTruth {
     }
 
     /// Mean over frames of their mean known depth; the largest camera distance from their mean where no depth exists.
-    pub fn mean_depth(&self, frames: &[&Frame]) -> Result<f64> {
+    pub fn mean_depth(&self, frames: &[&TruthFrame]) -> Result<f64> {
         let mut means = Vec::new();
         for frame in frames {
             let Some(depth) = self.depth(frame)? else { continue };

@@ -2,7 +2,8 @@
 use super::super::filter;
 use super::polygon;
 use super::score::{
-    Kind, Masks, OwnLabels, Protocol, Report, Score, Seen, View, mask_iou, mean, place, summarise,
+    DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score, mask_iou,
+    mean, place, summarise,
 };
 use crate::query::eval::MIN_OBJECT_PIXELS;
 use crate::scene::{Camera, Plane};
@@ -25,7 +26,7 @@ pub(super) struct Target {
 
 /// The labels and what was scored so far.
 pub(super) struct Lerf {
-    views: Vec<View>,
+    views: Vec<LabelledView>,
     /// Per view.
     targets: Vec<BTreeMap<String, Target>>,
     prompts: Vec<String>,
@@ -110,7 +111,7 @@ fn read_folder(folder: &Path) -> Result<BTreeMap<String, BTreeMap<String, Target
 }
 
 /// The masks of a ground-truth folder, each object with the box around it.
-fn from_masks(own: OwnLabels) -> Result<(Vec<View>, Vec<BTreeMap<String, Target>>)> {
+fn from_masks(own: OwnLabels) -> Result<(Vec<LabelledView>, Vec<BTreeMap<String, Target>>)> {
     let mut all = Vec::new();
     for view in &own.views {
         let mut targets = BTreeMap::new();
@@ -139,7 +140,7 @@ fn target_of(objects: &Plane<u32>, label: u32) -> Target {
 }
 
 impl Protocol for Lerf {
-    fn views(&self) -> &[View] {
+    fn views(&self) -> &[LabelledView] {
         &self.views
     }
 
@@ -147,7 +148,7 @@ impl Protocol for Lerf {
         self.prompts.clone()
     }
 
-    fn add(&mut self, index: usize, seen: &Seen) -> Result<Masks> {
+    fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks> {
         let view = &self.views[index];
         let mut masks = Masks::new();
         for (phrase, target) in &self.targets[index] {
@@ -178,7 +179,7 @@ impl Protocol for Lerf {
         Ok(masks)
     }
 
-    fn finish(self: Box<Self>) -> Report {
+    fn finish(self: Box<Self>) -> ProtocolReport {
         let figures = |of: &[&Score]| {
             let mut out = BTreeMap::new();
             for (_, rule, name) in THRESHOLDS {
@@ -192,8 +193,8 @@ impl Protocol for Lerf {
             out.insert("pairs".into(), first().count() as f64);
             out
         };
-        Report {
-            protocol: Kind::Lerf,
+        ProtocolReport {
+            protocol: ProtocolKind::Lerf,
             definitions: [
                 "per frame and prompt: relevancy smoothed by a 30x30 mean, averaged with itself; the level with the \
                  highest peak answers (ties: the finer)",

@@ -1,6 +1,6 @@
 //! The published evaluation protocols, from their public file layouts (docs/method.md#protocols).
 //!
-//! [`open`] reads a data set's labels and says which cameras to look from and which texts to ask; the caller renders and
+//! [`open`] reads a data set's labels and lists the cameras to render and the texts to query; the caller renders and
 //! decodes each frame and hands it to [`Protocol::add`]; [`Protocol::finish`] gives the figures with the definitions they
 //! follow. The project's own protocol, `field`, is [`super::eval`].
 mod lerf;
@@ -12,7 +12,10 @@ mod score;
 #[cfg(test)]
 mod tests;
 
-pub use score::{CodeScores, Kind, Masks, Protocol, Report, Score, Seen, Summary, View};
+pub use score::{
+    CodeScores, DecodedView, LabelledView, Masks, Protocol, ProtocolKind, ProtocolReport, ProtocolSummary,
+    Score,
+};
 
 use crate::Result;
 use crate::scene::Camera;
@@ -20,10 +23,15 @@ use std::path::Path;
 
 /// Reads the labels of `folder`. `scene` are the scene's cameras; `known` the data set's own cameras, which place the
 /// frames that the scene was not made from (without them only the scene's own photos are scored).
-pub fn open(kind: Kind, folder: &Path, scene: &[Camera], known: &[Camera]) -> Result<Box<dyn Protocol>> {
+pub fn open(
+    kind: ProtocolKind,
+    folder: &Path,
+    scene: &[Camera],
+    known: &[Camera],
+) -> Result<Box<dyn Protocol>> {
     Ok(match kind {
-        Kind::Lerf => Box::new(lerf::Lerf::open(folder, scene, known)?),
-        Kind::Ovs => Box::new(ovs::Ovs::open(folder, scene, known)?),
-        Kind::ScanNet => Box::new(scannet::ScanNet::open(folder, scene, known)?),
+        ProtocolKind::Lerf => Box::new(lerf::Lerf::open(folder, scene, known)?),
+        ProtocolKind::Ovs => Box::new(ovs::Ovs::open(folder, scene, known)?),
+        ProtocolKind::ScanNet => Box::new(scannet::ScanNet::open(folder, scene, known)?),
     })
 }

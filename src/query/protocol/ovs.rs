@@ -1,6 +1,7 @@
 //! 3D-OVS (docs/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and the data set's own argmax.
 use super::score::{
-    Kind, Masks, OwnLabels, Protocol, Report, Score, Seen, View, mask_iou, mean, nearest, place, summarise,
+    DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score, mask_iou,
+    mean, nearest, place, summarise,
 };
 use crate::query::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, Split};
 use crate::scene::{Camera, Plane};
@@ -25,15 +26,15 @@ const ARGMAX: &str = "argmax";
 
 /// The labels and what was scored so far.
 pub(super) struct Ovs {
-    views: Vec<View>,
-    source: Source,
+    views: Vec<LabelledView>,
+    source: LabelSource,
     classes: Vec<String>,
     scores: Vec<Score>,
     /// Per split: labelled pixels, those whose class was found.
     pixels: BTreeMap<&'static str, [u64; 2]>,
 }
 
-enum Source {
+enum LabelSource {
     /// `segmentations/`
     Folder(PathBuf),
     Own(OwnLabels),
@@ -45,29 +46,29 @@ impl Ovs {
             Some(own) => {
                 // The argmax needs every label to compete, also those of the background.
                 let classes = own.truth.labels.values().cloned().collect();
-                (own.views.clone(), classes, Source::Own(own))
+                (own.views.clone(), classes, LabelSource::Own(own))
             }
             None => {
                 let inner = folder.join("segmentations");
                 let root = if inner.is_dir() { inner } else { folder.to_path_buf() };
                 let classes = read_classes(&root)?;
-                (place(&frames(&root)?, scene, known)?, classes, Source::Folder(root))
+                (place(&frames(&root)?, scene, known)?, classes, LabelSource::Folder(root))
             }
         };
         Ok(Ovs { views, source, classes, scores: Vec::new(), pixels: BTreeMap::new() })
     }
 
     /// Mask per class of a frame; `None` where the frame does not label it.
-    fn truth(&self, view: &View) -> Result<Vec<Option<Plane<bool>>>> {
+    fn truth(&self, view: &LabelledView) -> Result<Vec<Option<Plane<bool>>>> {
         match &self.source {
-            Source::Folder(root) => {
+            LabelSource::Folder(root) => {
                 let one = |class: &String| {
                     let path = root.join(&view.stem).join(format!("{class}.png"));
                     path.is_file().then(|| read_mask(&path)).transpose()
                 };
                 self.classes.iter().map(one).collect()
             }
-            Source::Own(own) => {
+            LabelSource::Own(own) => {
                 let Some(objects) = own.objects(view)? else { return Ok(vec![None; self.classes.len()]) };
                 let one = |label: &u32| {
                     let data: Vec<bool> = objects.data.iter().map(|o| o == label).collect();
@@ -170,7 +171,7 @@ pub(super) fn authors_rule(levels: &[(usize, Plane<f32>)]) -> Option<Answer> {
 }
 
 impl Protocol for Ovs {
-    fn views(&self) -> &[View] {
+    fn views(&self) -> &[LabelledView] {
         &self.views
     }
 
@@ -178,7 +179,7 @@ impl Protocol for Ovs {
         self.classes.clone()
     }
 
-    fn add(&mut self, index: usize, seen: &Seen) -> Result<Masks> {
+    fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks> {
         let view = self.views[index].clone();
         let truth = self.truth(&view)?;
         let (mut masks, classes) = (Masks::new(), self.classes.clone());
@@ -217,7 +218,7 @@ impl Protocol for Ovs {
         Ok(masks)
     }
 
-    fn finish(self: Box<Self>) -> Report {
+    fn finish(self: Box<Self>) -> ProtocolReport {
         let figures = |of: &[&Score]| {
             let mut out = BTreeMap::new();
             for (rule, name) in [(PAPER, "miou"), (AUTHORS, "miou_authors"), (ARGMAX, "miou_argmax")] {
@@ -234,8 +235,8 @@ impl Protocol for Ovs {
             out.insert("substituted".into(), substituted as f64);
             out
         };
-        Report {
-            protocol: Kind::Ovs,
+        ProtocolReport {
+            protocol: ProtocolKind::Ovs,
             definitions: [
                 "miou (the paper's text): per level relevancy > 0.8; of the levels with more than 2000 such pixels the one \
                  with the highest mean answers; where none has, relevancy > 0.95 of the best level's maximum (counted in \

@@ -1,5 +1,8 @@
 //! ScanNet with the eight labels of LSM (paper, "Comparison with Feed-forward LSM").
-use super::score::{Kind, Masks, Protocol, Report, Score, Seen, Summary, View, nearest, place};
+use super::score::{
+    DecodedView, LabelledView, Masks, Protocol, ProtocolKind, ProtocolReport, ProtocolSummary, Score,
+    nearest, place,
+};
 use crate::photo::stem;
 use crate::query::eval::Split;
 use crate::scene::{Camera, Plane, Pose};
@@ -29,7 +32,7 @@ pub(super) fn from_nyu40(id: u32) -> Option<usize> {
 /// The labels and what was counted so far.
 pub(super) struct ScanNet {
     folder: PathBuf,
-    views: Vec<View>,
+    views: Vec<LabelledView>,
     /// Raw id → NYU40 id; none: the files hold NYU40 ids.
     table: Option<BTreeMap<u32, u32>>,
     /// Per split, [truth][predicted] pixels; the last column is "nothing there".
@@ -66,7 +69,7 @@ impl ScanNet {
     }
 
     /// Index in [`LABELS`] per pixel, −1 = unlabelled.
-    fn truth(&self, view: &View) -> Result<Plane<i32>> {
+    fn truth(&self, view: &LabelledView) -> Result<Plane<i32>> {
         let path = self.folder.join(format!("{}.png", view.stem));
         let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
         let image =
@@ -140,7 +143,7 @@ fn cameras(folder: &Path, stems: &[String]) -> Result<Vec<Camera>> {
 }
 
 impl Protocol for ScanNet {
-    fn views(&self) -> &[View] {
+    fn views(&self) -> &[LabelledView] {
         &self.views
     }
 
@@ -148,7 +151,7 @@ impl Protocol for ScanNet {
         LABELS.map(String::from).to_vec()
     }
 
-    fn add(&mut self, index: usize, seen: &Seen) -> Result<Masks> {
+    fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks> {
         let view = self.views[index].clone();
         let (truth, best) = (self.truth(&view)?, seen.best_prompt()?);
         let mut counts = [[0u64; 9]; 8];
@@ -183,15 +186,15 @@ impl Protocol for ScanNet {
         Ok((0..LABELS.len()).map(mask).collect())
     }
 
-    fn finish(self: Box<Self>) -> Report {
+    fn finish(self: Box<Self>) -> ProtocolReport {
         let mut summary = BTreeMap::new();
         for split in [Split::Train, Split::Test] {
             if let Some(counts) = self.confusion.get(split.name()) {
                 summary.insert(split.name().to_string(), figures(counts));
             }
         }
-        Report {
-            protocol: Kind::ScanNet,
+        ProtocolReport {
+            protocol: ProtocolKind::ScanNet,
             definitions: [
                 "eight labels from NYU40: wall 1, floor 2, ceiling 22, chair 5, table 7, sofa 6, bed 4, other = the rest; \
                  id 0 is unlabelled and left out",
@@ -219,12 +222,12 @@ fn ious(counts: &[[u64; 9]; 8]) -> [Option<f64>; 8] {
     })
 }
 
-fn figures(counts: &[[u64; 9]; 8]) -> Summary {
+fn figures(counts: &[[u64; 9]; 8]) -> ProtocolSummary {
     let per_label = ious(counts);
     let shown: Vec<f64> = per_label.iter().flatten().copied().collect();
     let pixels: u64 = counts.iter().flatten().sum();
     let right: u64 = (0..8).map(|k| counts[k][k]).sum();
-    let mut out = Summary::default();
+    let mut out = ProtocolSummary::default();
     out.figures.insert("pixels".into(), pixels as f64);
     if pixels > 0 {
         out.figures.insert("miou".into(), shown.iter().sum::<f64>() / shown.len() as f64);

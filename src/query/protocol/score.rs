@@ -1,4 +1,4 @@
-//! What the protocols share: frames, scores, and what is seen of a scene.
+//! What the protocols share: frames, scores, and the decoded views of a scene.
 use crate::photo::stem;
 use crate::pose::align::pose_errors;
 use crate::query::eval::{Evaluation, GroundTruth, Split, to_scene};
@@ -13,7 +13,7 @@ use std::path::Path;
 /// Which published protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Kind {
+pub enum ProtocolKind {
     /// LERF-OVS: one JSON of polygons and boxes per frame.
     Lerf,
     /// 3D-OVS: `segmentations/classes.txt` and one mask per frame and class.
@@ -25,7 +25,7 @@ pub enum Kind {
 
 /// A frame to look from.
 #[derive(Clone, Debug, PartialEq)]
-pub struct View {
+pub struct LabelledView {
     /// File stem, the key of its labels.
     pub stem: String,
     /// Train = the scene was made from this photo.
@@ -41,7 +41,7 @@ pub struct Score {
     pub frame: String,
     /// `train` or `test`.
     pub split: Split,
-    /// What was asked.
+    /// The text of the query.
     pub phrase: String,
     /// How the mask was cut.
     pub rule: &'static str,
@@ -57,7 +57,7 @@ pub struct Score {
 
 /// Means over one split.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Summary {
+pub struct ProtocolSummary {
     /// `miou` and the protocol's other figures.
     #[serde(flatten)]
     pub figures: BTreeMap<String, f64>,
@@ -67,15 +67,15 @@ pub struct Summary {
 
 /// The figures and what they mean.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Report {
+pub struct ProtocolReport {
     /// Name of the protocol.
-    pub protocol: Kind,
+    pub protocol: ProtocolKind,
     /// What each figure is, one line each.
     pub definitions: Vec<String>,
     /// Every single score.
     pub scores: Vec<Score>,
     /// Per split that has frames.
-    pub summary: BTreeMap<String, Summary>,
+    pub summary: BTreeMap<String, ProtocolSummary>,
 }
 
 /// A predicted mask, for whoever wants to keep it: (phrase, mask).
@@ -84,16 +84,16 @@ pub type Masks = Vec<(String, Plane<bool>)>;
 /// A data set under a protocol.
 pub trait Protocol {
     /// Labelled frames that have a camera.
-    fn views(&self) -> &[View];
-    /// The texts to ask, in the order that [`CodeScores`] holds them.
+    fn views(&self) -> &[LabelledView];
+    /// The texts to query, in the order that [`CodeScores`] holds them.
     fn prompts(&self) -> Vec<String>;
     /// Scores the frame `views()[index]`; returns the masks of the protocol's first rule.
-    fn add(&mut self, index: usize, seen: &Seen) -> Result<Masks>;
+    fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks>;
     /// The figures.
-    fn finish(self: Box<Self>) -> Report;
+    fn finish(self: Box<Self>) -> ProtocolReport;
 }
 
-/// What each code says to each prompt.
+/// Score of each code for each prompt.
 pub struct CodeScores {
     /// [prompt][level][K]
     relevancy: Vec<Vec<Vec<f32>>>,
@@ -118,29 +118,29 @@ impl CodeScores {
 }
 
 /// One decoded frame.
-pub struct Seen<'a> {
+pub struct DecodedView<'a> {
     /// Per level, code per pixel, −1 = nothing there.
     pub codes: &'a [Plane<i32>],
     /// Scores of those codes.
     pub scores: &'a CodeScores,
 }
 
-impl Seen<'_> {
+impl DecodedView<'_> {
     /// (level, relevancy map) of the levels that have codes; 0 where nothing is.
     pub(super) fn relevancy(&self, prompt: usize) -> Vec<(usize, Plane<f32>)> {
         let levels = self.codes.iter().zip(&self.scores.relevancy[prompt]).enumerate();
-        let spoken = levels.filter(|(_, (_, values))| !values.is_empty());
-        spoken.map(|(level, (codes, values))| (level, relevancy_map(codes, values))).collect()
+        let levels_with_codes = levels.filter(|(_, (_, values))| !values.is_empty());
+        levels_with_codes.map(|(level, (codes, values))| (level, relevancy_map(codes, values))).collect()
     }
 
     /// (level, cosine map) of the levels that have codes; −∞ where nothing is.
     pub(super) fn cosine(&self, prompt: usize) -> Vec<(usize, Plane<f32>)> {
         let levels = self.codes.iter().zip(&self.scores.cosine[prompt]).enumerate();
-        let spoken = levels.filter(|(_, (_, values))| !values.is_empty());
+        let levels_with_codes = levels.filter(|(_, (_, values))| !values.is_empty());
         let at = |values: &[f32], k: i32| {
             usize::try_from(k).ok().and_then(|k| values.get(k)).copied().unwrap_or(f32::NEG_INFINITY)
         };
-        spoken
+        levels_with_codes
             .map(|(level, (codes, values))| {
                 let data = codes.data.par_iter().map(|&k| at(values, k)).collect();
                 (level, Plane { width: codes.width, height: codes.height, data })
@@ -192,7 +192,7 @@ pub(super) fn mask_iou(predicted: &Plane<bool>, truth: &Plane<bool>) -> Result<f
 
 /// Where the labelled frames stand: the scene's own cameras for its photos; for others the known ones, carried over by
 /// the similarity that the shared photos give.
-pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Result<Vec<View>> {
+pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Result<Vec<LabelledView>> {
     let own = |s: &str| scene.iter().find(|c| stem(&c.name) == s);
     let shared: Vec<(Camera, Camera)> =
         known.iter().filter_map(|k| own(stem(&k.name)).map(|c| (c.clone(), k.clone()))).collect();
@@ -204,9 +204,9 @@ pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Res
     let mut views = Vec::new();
     for name in stems {
         if let Some(camera) = own(name) {
-            views.push(View { stem: name.clone(), split: Split::Train, camera: camera.clone() });
+            views.push(LabelledView { stem: name.clone(), split: Split::Train, camera: camera.clone() });
         } else if let (Some(s), Some(camera)) = (&similarity, known.iter().find(|k| stem(&k.name) == *name)) {
-            views.push(View { stem: name.clone(), split: Split::Test, camera: to_scene(camera, s) });
+            views.push(LabelledView { stem: name.clone(), split: Split::Test, camera: to_scene(camera, s) });
         }
     }
     if views.is_empty() {
@@ -222,7 +222,7 @@ pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Res
 /// Labels of a `ground_truth.json` folder for the protocols that score masks per phrase.
 pub(super) struct OwnLabels {
     pub(super) truth: GroundTruth,
-    pub(super) views: Vec<View>,
+    pub(super) views: Vec<LabelledView>,
     pub(super) phrases: Vec<(u32, String)>,
 }
 
@@ -234,13 +234,16 @@ impl OwnLabels {
         let truth = GroundTruth::read(folder)?;
         let evaluation = Evaluation::new(truth.clone(), scene, None)?;
         let phrases = evaluation.phrases();
-        let view =
-            |(f, camera): (crate::query::eval::Frame, Camera)| View { stem: f.stem, split: f.split, camera };
+        let view = |(f, camera): (crate::query::eval::TruthFrame, Camera)| LabelledView {
+            stem: f.stem,
+            split: f.split,
+            camera,
+        };
         Ok(Some(OwnLabels { truth, views: evaluation.cameras().into_iter().map(view).collect(), phrases }))
     }
 
     /// Object index per pixel of a view.
-    pub(super) fn objects(&self, view: &View) -> Result<Option<Plane<u32>>> {
+    pub(super) fn objects(&self, view: &LabelledView) -> Result<Option<Plane<u32>>> {
         match self.truth.frames.iter().find(|f| f.stem == view.stem) {
             Some(frame) => self.truth.objects(frame),
             None => Ok(None),
@@ -258,7 +261,7 @@ pub(super) fn summarise(
     scores: &[Score],
     rule: &str,
     figures: impl Fn(&[&Score]) -> BTreeMap<String, f64>,
-) -> BTreeMap<String, Summary> {
+) -> BTreeMap<String, ProtocolSummary> {
     let mut out = BTreeMap::new();
     for split in [Split::Train, Split::Test] {
         let of: Vec<&Score> = scores.iter().filter(|s| s.split == split).collect();
@@ -270,7 +273,7 @@ pub(super) fn summarise(
             iou.entry(s.phrase.clone()).or_default().push(s.iou);
         }
         let iou = iou.into_iter().filter_map(|(k, v)| mean(v.into_iter()).map(|m| (k, m))).collect();
-        out.insert(split.name().to_string(), Summary { figures: figures(&of), iou });
+        out.insert(split.name().to_string(), ProtocolSummary { figures: figures(&of), iou });
     }
     out
 }

@@ -156,11 +156,11 @@ fn lerf_equals_a_plain_computation() {
     for seed in 1000..1008 {
         let mut random = Random::new(seed);
         let (field, codes) = (field(&mut random), codes(W, H, &mut random));
-        let mut protocol = open(Kind::Lerf, folder.path(), &scene, &[]).unwrap();
+        let mut protocol = open(ProtocolKind::Lerf, folder.path(), &scene, &[]).unwrap();
         assert_eq!(protocol.prompts(), ["cup", "plate"]);
         let queries: Vec<TextQuery> = protocol.prompts().iter().map(|p| query(p, &mut random)).collect();
         let scores = CodeScores::new(&field, &queries).unwrap();
-        let masks = protocol.add(0, &Seen { codes: &codes, scores: &scores }).unwrap();
+        let masks = protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
         let report = protocol.finish();
         assert_eq!(report.scores.len(), 4);
         let mut ious = Vec::new();
@@ -234,9 +234,9 @@ fn lerf_ties_go_to_the_finer_level_and_larger_labels_resample() {
     let data = (0..W * H).map(|p| if p % W < W / 2 { best } else { -1 }).collect();
     let map = Plane { width: W, height: H, data };
     let codes = vec![map.clone(), Plane::filled(W, H, -1), map];
-    let mut protocol = open(Kind::Lerf, folder.path(), &scene, &[]).unwrap();
+    let mut protocol = open(ProtocolKind::Lerf, folder.path(), &scene, &[]).unwrap();
     let scores = CodeScores::new(&field, &[q]).unwrap();
-    protocol.add(0, &Seen { codes: &codes, scores: &scores }).unwrap();
+    protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
     let report = protocol.finish();
     assert_eq!(report.scores[0].level, Some(0));
     assert_eq!(report.scores[0].localised, Some(true));
@@ -308,7 +308,7 @@ fn ovs_rules_equal_plain_computations() {
     for seed in 1000..1030 {
         let mut random = Random::new(seed);
         let (field, codes) = (field(&mut random), codes(2 * W, 2 * H, &mut random));
-        let mut protocol = open(Kind::Ovs, folder.path(), &scene, &[]).unwrap();
+        let mut protocol = open(ProtocolKind::Ovs, folder.path(), &scene, &[]).unwrap();
         assert_eq!(protocol.prompts(), ["hand", "wood wall", "cat"]);
         let mut queries: Vec<TextQuery> = protocol.prompts().iter().map(|p| query(p, &mut random)).collect();
         if seed % 2 == 0 {
@@ -318,7 +318,7 @@ fn ovs_rules_equal_plain_computations() {
             }
         }
         let scores = CodeScores::new(&field, &queries).unwrap();
-        protocol.add(0, &Seen { codes: &codes, scores: &scores }).unwrap();
+        protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
         let report = protocol.finish();
         let value = |level: usize, c: usize, p: usize| -> Option<f64> {
             let k = usize::try_from(codes[level].data[p]).ok()?;
@@ -439,7 +439,7 @@ fn scannet_counts_eight_labels_and_places_frames_by_their_poses() {
             Camera { pose, ..camera(&k.to_string(), 0.0, (W as u32, H as u32)) }
         })
         .collect();
-    let mut protocol = open(Kind::ScanNet, &dir, &scene, &[]).unwrap();
+    let mut protocol = open(ProtocolKind::ScanNet, &dir, &scene, &[]).unwrap();
     let views = protocol.views().to_vec();
     let splits: Vec<_> = views.iter().map(|v| (v.stem.as_str(), v.split)).collect();
     assert_eq!(splits, [("0", Split::Train), ("10", Split::Train), ("20", Split::Test)]);
@@ -451,7 +451,7 @@ fn scannet_counts_eight_labels_and_places_frames_by_their_poses() {
     let queries: Vec<TextQuery> = protocol.prompts().iter().map(|p| query(p, &mut random)).collect();
     let scores = CodeScores::new(&field, &queries).unwrap();
     for index in 0..3 {
-        protocol.add(index, &Seen { codes: &codes, scores: &scores }).unwrap();
+        protocol.add(index, &DecodedView { codes: &codes, scores: &scores }).unwrap();
     }
     let report = protocol.finish();
     let label = |x: usize, y: usize| match raw(x, y) {
@@ -499,8 +499,8 @@ fn scannet_counts_eight_labels_and_places_frames_by_their_poses() {
     assert_eq!(report.summary["train"].figures["pixels"], 2.0 * all as f64);
     // without the table, raw ids beyond NYU40 are refused
     std::fs::remove_file(folder.path().join("scannetv2-labels.combined.tsv")).unwrap();
-    let mut bare = open(Kind::ScanNet, &dir, &scene, &[]).unwrap();
-    let error = bare.add(0, &Seen { codes: &codes, scores: &scores }).unwrap_err().to_string();
+    let mut bare = open(ProtocolKind::ScanNet, &dir, &scene, &[]).unwrap();
+    let error = bare.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap_err().to_string();
     assert!(error.contains("scannetv2-labels.combined.tsv"), "{error}");
 }
 
@@ -524,17 +524,17 @@ fn own_ground_truth_serves_lerf_and_ovs() {
         let axis = |k: u32| (0..13).map(|i| f32::from(u8::from(i == k))).collect::<Vec<f32>>();
         TextQuery { text: phrase.clone(), embedding: axis(*label), canonicals: axis(12) }
     };
-    for (kind, figure) in [(Kind::Lerf, "localisation"), (Kind::Ovs, "accuracy_argmax")] {
+    for (kind, figure) in [(ProtocolKind::Lerf, "localisation"), (ProtocolKind::Ovs, "accuracy_argmax")] {
         let mut protocol = open(kind, folder, &scene, &[]).unwrap();
         assert_eq!(protocol.views().len(), 12);
         let queries: Vec<TextQuery> = protocol.prompts().iter().map(ask).collect();
         let scores = CodeScores::new(&field, &queries).unwrap();
-        protocol.add(0, &Seen { codes: &codes, scores: &scores }).unwrap();
+        protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
         let figures = protocol.finish().summary["train"].figures.clone();
         assert_eq!(figures[figure], 1.0, "{kind:?}");
         match kind {
             // masks are cut from smoothed maps: edges and thin parts move
-            Kind::Lerf => assert!(figures["miou"] > 0.6, "{figures:?}"),
+            ProtocolKind::Lerf => assert!(figures["miou"] > 0.6, "{figures:?}"),
             _ => assert_eq!((figures["miou_argmax"], figures["miou_authors"]), (1.0, 1.0)),
         }
     }
@@ -544,16 +544,18 @@ fn own_ground_truth_serves_lerf_and_ovs() {
 fn folders_of_another_layout_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let scene = [camera("a", 0.0, (W as u32, H as u32))];
-    for (kind, says) in
-        [(Kind::Lerf, "frame_*.json"), (Kind::Ovs, "classes.txt"), (Kind::ScanNet, "label-filt")]
-    {
+    for (kind, says) in [
+        (ProtocolKind::Lerf, "frame_*.json"),
+        (ProtocolKind::Ovs, "classes.txt"),
+        (ProtocolKind::ScanNet, "label-filt"),
+    ] {
         let error = open(kind, folder.path(), &scene, &[]).err().unwrap();
         assert!(error.exit_code() == 2 && error.to_string().contains(says), "{error}");
     }
     std::fs::write(folder.path().join("b.json"), lerf_label().to_string()).unwrap();
-    let error = open(Kind::Lerf, folder.path(), &scene, &[]).err().unwrap().to_string();
+    let error = open(ProtocolKind::Lerf, folder.path(), &scene, &[]).err().unwrap().to_string();
     assert!(error.contains("--cameras"), "{error}");
     std::fs::write(folder.path().join("b.json"), "{}").unwrap();
-    let error = open(Kind::Lerf, folder.path(), &scene, &[]).err().unwrap().to_string();
+    let error = open(ProtocolKind::Lerf, folder.path(), &scene, &[]).err().unwrap().to_string();
     assert!(error.contains("not a LERF-OVS label file"), "{error}");
 }

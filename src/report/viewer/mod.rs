@@ -43,11 +43,11 @@ pub const STYLE: &str = include_str!("viewer.css");
 /// One answered query as the page shows it.
 #[derive(Clone, Copy, Debug)]
 pub struct ShownAnswer<'a> {
-    /// What was asked.
+    /// The text of the query.
     pub text: &'a str,
     /// Views in which it was found.
     pub found: usize,
-    /// Views that were asked.
+    /// Views that were queried.
     pub views: usize,
     /// What lights up.
     pub highlight: &'a Highlight,
@@ -65,7 +65,7 @@ impl ShownAnswer<'_> {
 }
 
 /// Phrases with their relevancy, best first, per level and code.
-pub type Names = Vec<Vec<Vec<(String, f32)>>>;
+pub type CodeNames = Vec<Vec<Vec<(String, f32)>>>;
 
 /// What the view shows.
 #[derive(Clone, Debug)]
@@ -78,10 +78,10 @@ pub struct Scene3d<'a> {
     pub cameras: &'a [Camera],
     /// The photos, for thumbnails; as many as cameras, or none.
     pub photos: Vec<&'a RgbImage>,
-    /// What the scene knows about words.
+    /// Codebooks and features, where the scene has language.
     pub language: Option<&'a LanguageField>,
     /// The text model's own phrases for every code; may be empty.
-    pub names: &'a Names,
+    pub names: &'a CodeNames,
     /// Queries that were run.
     pub answers: Vec<ShownAnswer<'a>>,
 }
@@ -103,10 +103,10 @@ impl Scene3d<'_> {
         Ok((section(&manifest, &splats), note))
     }
 
-    /// The whole page of a server that answers `POST query` and sends [`SCENE_PATH`]; `mute` says why it cannot answer.
-    pub fn served(&self, mute: Option<&str>) -> Result<String> {
-        let mut manifest = self.manifest(mute.unwrap_or_default())?;
-        manifest["live"] = mute.is_none().into();
+    /// The whole page of a server that answers `POST query` and sends [`SCENE_PATH`]; `no_questions` says why it cannot answer.
+    pub fn served(&self, no_questions: Option<&str>) -> Result<String> {
+        let mut manifest = self.manifest(no_questions.unwrap_or_default())?;
+        manifest["live"] = no_questions.is_none().into();
         manifest["scene"] = SCENE_PATH.into();
         let title = super::chart::escape(self.title);
         Ok(format!(
@@ -148,7 +148,7 @@ fn view(camera: &Camera, photo: Option<&RgbImage>) -> Result<Value> {
         }
         _ => None,
     };
-    // glam is column-major; the page wants rows.
+    // glam is column-major; the page reads rows.
     let rotation = camera.pose.rotation.transpose().to_cols_array();
     Ok(json!({
         "name": crate::photo::stem(&camera.name), "width": camera.width, "height": camera.height,

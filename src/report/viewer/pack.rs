@@ -29,7 +29,7 @@ const BLOCK: usize = 256;
 /// Constant of the lowest spherical harmonic, ½ √(1/π).
 const SH0: f32 = 0.282_094_8;
 /// A fainter splat is never drawn (docs/method.md#forward-rasterisation).
-const LEAST_ALPHA: f32 = 1.0 / 255.0;
+const MIN_ALPHA: f32 = 1.0 / 255.0;
 
 /// A packed scene.
 pub struct Packed {
@@ -43,7 +43,7 @@ pub struct Packed {
 
 /// Packs at most `most` splats, those that cover the most.
 pub fn pack(splats: &Splats, language: Option<&LanguageField>, most: usize) -> Result<Packed> {
-    let order = in_space(splats, chosen(splats, most));
+    let order = in_space(splats, most_visible(splats, most));
     let levels: Vec<&LevelField> = language.map_or(Vec::new(), |f| f.levels.iter().collect());
     let raw = write(splats, &levels, &order);
     // 6: a tenth larger than 9 and four times as fast.
@@ -60,9 +60,9 @@ fn alpha(splats: &Splats, i: usize) -> f32 {
 }
 
 /// Splats that can be seen; when there are more than `most`, those with the largest opacity times area.
-fn chosen(splats: &Splats, most: usize) -> Vec<usize> {
+fn most_visible(splats: &Splats, most: usize) -> Vec<usize> {
     let finite = |i: &usize| splats.means[*i].iter().chain(&splats.log_scales[*i]).all(|v| v.is_finite());
-    let seen = |i: &usize| alpha(splats, *i) >= LEAST_ALPHA && finite(i);
+    let seen = |i: &usize| alpha(splats, *i) >= MIN_ALPHA && finite(i);
     let mut list: Vec<usize> = (0..splats.len()).filter(seen).collect();
     if list.len() > most {
         let cover = |i: usize| {
@@ -248,7 +248,7 @@ mod tests {
         };
         let level = LevelField { codebook, features, targets: Vec::new() };
         let field = LanguageField { levels: vec![level, LevelField::default()], space: String::new() };
-        let order = in_space(&splats, chosen(&splats, usize::MAX));
+        let order = in_space(&splats, most_visible(&splats, usize::MAX));
         let packed = pack(&splats, Some(&field), usize::MAX).unwrap();
         let n = order.len();
         assert_eq!((packed.shown, packed.total), (n, 700));
@@ -330,8 +330,8 @@ mod tests {
         for (i, s) in splats.log_scales.iter_mut().enumerate() {
             *s = [-9.0, i as f32 * 0.1, i as f32 * 0.1];
         }
-        assert_eq!(chosen(&splats, 100).len(), 49, "one is too faint to be drawn");
-        let mut most = chosen(&splats, 3);
+        assert_eq!(most_visible(&splats, 100).len(), 49, "one is too faint to be drawn");
+        let mut most = most_visible(&splats, 3);
         most.sort_unstable();
         assert_eq!(most, [47, 48, 49]);
     }

@@ -1,10 +1,10 @@
 //! Features of regions, and the embeddings of texts that they are compared with.
-use super::table::{Kind, NO_CHECK, Source, SourceChoice, make};
+use super::table::{NO_CHECK, Source, SourceChoice, SourceKind, make};
 use crate::files::content_hash;
 use crate::infer::clip::Clip;
-use crate::infer::installed::{Duty, Installed};
+use crate::infer::installed::{Installed, Task};
 use crate::infer::words::RegionWords;
-use crate::infer::{RegionEncoder, Registry, Role, nearest};
+use crate::infer::{PackFileKind, RegionEncoder, Registry, nearest};
 use crate::language::dir::TextEmbeddings;
 use crate::query::CANONICAL_PHRASES;
 use crate::run::stages::{SharedEncoder, identity};
@@ -19,18 +19,23 @@ const TEXT_TABLE: &str = "text_embeddings.npz";
 const DIR_SPACE: &str = "dir";
 
 /// `--features`
-pub struct Features;
+pub struct FeatureSources;
 
-impl Kind for Features {
+impl SourceKind for FeatureSources {
     const OPTION: &'static str = "features";
     const ABOUT: &'static str = "Region features";
-    const DUTY: Duty = Duty::Features;
+    const TASK: Task = Task::Features;
     const SOURCES: &'static [Source<Self>] = &[
         Source {
             name: "words",
             argument: None,
             about: "the built-in classifier and sentence encoder",
-            needs: &[Role::Classifier, Role::Classes, Role::Text, Role::Tokenizer],
+            needs: &[
+                PackFileKind::Classifier,
+                PackFileKind::Classes,
+                PackFileKind::Text,
+                PackFileKind::Tokenizer,
+            ],
             check: NO_CHECK,
             // The models are the default pack's, and that is part of the program.
             make: |_, registry| {
@@ -68,9 +73,9 @@ impl Kind for Features {
     }
 }
 
-/// The encoder of a choice, for those who only ask.
+/// The encoder of a choice, for queries alone.
 pub fn encoder(choice: &SourceChoice, registry: &Registry) -> Result<Box<dyn RegionEncoder>> {
-    make::<Features>(choice, registry, registry)?.into_inner()
+    make::<FeatureSources>(choice, registry, registry)?.into_inner()
 }
 
 /// The table of text embeddings of a choice that has one.

@@ -1,50 +1,50 @@
 //! Cameras, depth and points.
-use super::table::{Build, Kind, NO_CHECK, PosedPhotos, Source};
+use super::table::{GraphBuilder, NO_CHECK, PosedPhotos, Source, SourceKind};
 use crate::Result;
 use crate::format::cameras;
-use crate::infer::Role;
-use crate::infer::installed::{Duty, Installed};
+use crate::infer::PackFileKind;
+use crate::infer::installed::{Installed, Task};
 use crate::photo::Photo;
-use crate::run::stages::{CameraSource, Cameras, Depth};
+use crate::run::stages::{CameraOrigin, Cameras, DenseDepth};
 
 /// `--init`
-pub struct Geometry;
+pub struct GeometrySources;
 
-impl Kind for Geometry {
+impl SourceKind for GeometrySources {
     const OPTION: &'static str = "init";
     const ABOUT: &'static str = "Cameras and points";
-    const DUTY: Duty = Duty::Geometry;
+    const TASK: Task = Task::Geometry;
     const SOURCES: &'static [Source<Self>] = &[
         Source {
             name: "sfm",
             argument: None,
             about: "",
-            needs: &[Role::Keypoints],
+            needs: &[PackFileKind::Keypoints],
             check: NO_CHECK,
-            make: |_, (build, photos)| build.posed(photos, CameraSource::Sfm),
+            make: |_, (build, photos)| build.posed(photos, CameraOrigin::Sfm),
         },
         Source {
             name: "cameras",
             argument: Some("FILE"),
             about: "transforms.json, COLMAP folder, cameras.json",
-            needs: &[Role::Keypoints],
+            needs: &[PackFileKind::Keypoints],
             check: NO_CHECK,
-            make: |file, (build, photos)| build.posed(photos, CameraSource::Known(cameras::read(file)?)),
+            make: |file, (build, photos)| build.posed(photos, CameraOrigin::Known(cameras::read(file)?)),
         },
     ];
-    type Input<'i> = (&'i mut Build, Vec<Photo>);
+    type Input<'i> = (&'i mut GraphBuilder, Vec<Photo>);
     type Output = PosedPhotos;
 
     fn network(model: Installed, (build, photos): Self::Input<'_>) -> Result<PosedPhotos> {
-        build.posed(photos, CameraSource::Network(model))
+        build.posed(photos, CameraOrigin::Network(model))
     }
 }
 
-impl Build {
+impl GraphBuilder {
     /// Photos with cameras from anywhere, and depth by stereo where a network has not given it.
-    pub fn posed(&mut self, photos: Vec<Photo>, source: CameraSource) -> Result<PosedPhotos> {
+    pub fn posed(&mut self, photos: Vec<Photo>, source: CameraOrigin) -> Result<PosedPhotos> {
         let placed = self.graph.add(Cameras::new(photos, source)?, ());
-        let geometry = self.graph.add(Depth { preset: self.preset }, (placed,));
+        let geometry = self.graph.add(DenseDepth { preset: self.preset }, (placed,));
         Ok(PosedPhotos { placed, geometry })
     }
 }

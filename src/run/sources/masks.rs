@@ -1,25 +1,25 @@
 //! Masks of the photos on three levels.
-use super::table::{Build, Kind, NO_CHECK, PosedPhotos, Source};
+use super::table::{GraphBuilder, NO_CHECK, PosedPhotos, Source, SourceKind};
 use crate::Result;
-use crate::infer::Role;
-use crate::infer::installed::{Duty, Installed};
+use crate::infer::PackFileKind;
+use crate::infer::installed::{Installed, Task};
 use crate::language::{ViewMasks, dir};
 use crate::pipeline::Output;
-use crate::run::stages::{Edges, GivenMasks, GraphMasks, MasksOr, NetworkMasks};
+use crate::run::stages::{ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMasks};
 
 /// `--masks`
-pub struct Masks;
+pub struct MaskSources;
 
-impl Kind for Masks {
+impl SourceKind for MaskSources {
     const OPTION: &'static str = "masks";
     const ABOUT: &'static str = "Masks on three levels";
-    const DUTY: Duty = Duty::Masks;
+    const TASK: Task = Task::Masks;
     const SOURCES: &'static [Source<Self>] = &[
         Source {
             name: "graph",
             argument: None,
             about: "segmentation by colour, learned edges and depth",
-            needs: &[Role::Edges],
+            needs: &[PackFileKind::Edges],
             check: NO_CHECK,
             make: |_, (build, photos)| Ok(graph(build, photos)),
         },
@@ -38,7 +38,7 @@ impl Kind for Masks {
             },
         },
     ];
-    type Input<'i> = (&'i mut Build, PosedPhotos);
+    type Input<'i> = (&'i mut GraphBuilder, PosedPhotos);
     type Output = Output<Vec<ViewMasks>>;
 
     fn network(model: Installed, (build, photos): Self::Input<'_>) -> Result<Self::Output> {
@@ -48,11 +48,11 @@ impl Kind for Masks {
             return Ok(found);
         }
         let built_in = graph(build, photos);
-        Ok(build.graph.add(MasksOr, (found, built_in)))
+        Ok(build.graph.add(MasksOrFallback, (found, built_in)))
     }
 }
 
-fn graph(build: &mut Build, photos: PosedPhotos) -> Output<Vec<ViewMasks>> {
-    let edges = build.graph.add(Edges, (photos.placed,));
+fn graph(build: &mut GraphBuilder, photos: PosedPhotos) -> Output<Vec<ViewMasks>> {
+    let edges = build.graph.add(ContourMaps, (photos.placed,));
     build.graph.add(GraphMasks, (photos.placed, edges, photos.geometry))
 }

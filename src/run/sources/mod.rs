@@ -6,12 +6,13 @@ mod masks;
 mod matches;
 mod table;
 
-pub use features::{Features, encoder, table_encoder, text_table};
-pub use geometry::Geometry;
-pub use masks::Masks;
-pub use matches::Matches;
+pub use features::{FeatureSources, encoder, table_encoder, text_table};
+pub use geometry::GeometrySources;
+pub use masks::MaskSources;
+pub use matches::MatchSources;
 pub use table::{
-    Build, Given, Kind, PosedPhotos, Source, SourceChoice, check, choose, default, help, installed, make,
+    Given, GraphBuilder, PosedPhotos, Source, SourceChoice, SourceKind, check, choose, default, help,
+    installed, make,
 };
 
 use crate::infer::installed::Inventory;
@@ -20,10 +21,10 @@ use table::listed;
 /// A line per kind.
 pub fn list(networks: &Inventory) -> Vec<(String, String)> {
     vec![
-        listed::<Geometry>(networks),
-        listed::<Matches>(networks),
-        listed::<Masks>(networks),
-        listed::<Features>(networks),
+        listed::<GeometrySources>(networks),
+        listed::<MatchSources>(networks),
+        listed::<MaskSources>(networks),
+        listed::<FeatureSources>(networks),
     ]
 }
 
@@ -34,7 +35,7 @@ mod tests {
     #[test]
     fn every_table_can_be_read_by_people_and_programs() {
         let none = Inventory::default();
-        fn of<K: Kind>(none: &Inventory) {
+        fn of<K: SourceKind>(none: &Inventory) {
             let mut names: Vec<&str> = K::SOURCES.iter().map(|s| s.name).collect();
             assert_eq!(choose::<K>("auto", none).unwrap().name, names[0]);
             for source in K::SOURCES {
@@ -53,9 +54,9 @@ mod tests {
             names.dedup();
             assert_eq!(names.len(), K::SOURCES.len(), "two sources of one name");
         }
-        of::<Geometry>(&none);
-        of::<Matches>(&none);
-        of::<Masks>(&none);
-        of::<Features>(&none);
+        of::<GeometrySources>(&none);
+        of::<MatchSources>(&none);
+        of::<MaskSources>(&none);
+        of::<FeatureSources>(&none);
     }
 }

@@ -1,11 +1,11 @@
 //! What a table of sources is, and everything that is read off it.
-use crate::infer::installed::{Duty, Installed, Inventory, known};
-use crate::infer::{Registry, Role};
+use crate::infer::installed::{Installed, Inventory, Task, catalogue};
+use crate::infer::{PackFileKind, Registry};
 use crate::language::sam::SamOptions;
 use crate::photo::Photo;
 use crate::pipeline::{Graph, Output};
 use crate::preset::Preset;
-use crate::run::stages::Placed;
+use crate::run::stages::PlacedPhotos;
 use crate::{Error, Result, pose};
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -51,13 +51,13 @@ impl serde::Serialize for SourceChoice {
 }
 
 /// A kind of thing that has several sources: a command-line option, and the table behind it.
-pub trait Kind: 'static {
+pub trait SourceKind: 'static {
     /// Name of the option, without dashes.
     const OPTION: &'static str;
     /// What the option chooses.
     const ABOUT: &'static str;
     /// What a network must do to be a source of it.
-    const DUTY: Duty;
+    const TASK: Task;
     /// The sources that need no network of the user's; `auto` takes the first where none is installed.
     const SOURCES: &'static [Source<Self>];
     /// What a source is given.
@@ -69,7 +69,7 @@ pub trait Kind: 'static {
 }
 
 /// An entry of a table.
-pub struct Source<K: Kind + ?Sized> {
+pub struct Source<K: SourceKind + ?Sized> {
     /// As users write it.
     pub name: &'static str,
     /// What follows the name and a colon, for `--help`; `None` for a source without argument.
@@ -77,7 +77,7 @@ pub struct Source<K: Kind + ?Sized> {
     /// What is not clear from the name; may be empty.
     pub about: &'static str,
     /// Models of the default pack.
-    pub needs: &'static [Role],
+    pub needs: &'static [PackFileKind],
     /// Refuses, before any work, what would be refused later.
     pub check: fn(&Path, &Given) -> Result<()>,
     /// Makes it; the path is the argument.
@@ -98,12 +98,12 @@ pub struct Given<'a> {
 }
 
 /// What sources that are stages add them to.
-pub struct Build {
+pub struct GraphBuilder {
     /// The stages so far.
     pub graph: Graph<'static>,
     /// Where models are found.
     pub registry: Registry,
-    /// How a mask network is asked.
+    /// Prompts of a mask network.
     pub sam: SamOptions,
     /// Whether features are read with the masks.
     pub given_features: bool,
@@ -115,53 +115,57 @@ pub struct Build {
 #[derive(Clone, Copy)]
 pub struct PosedPhotos {
     /// Photos without distortion, in one light.
-    pub placed: Output<Placed>,
+    pub placed: Output<PlacedPhotos>,
     /// Cameras, depth and points.
     pub geometry: Output<pose::Geometry>,
 }
 
-fn built_in<K: Kind>(choice: &SourceChoice) -> Option<&'static Source<K>> {
+fn built_in<K: SourceKind>(choice: &SourceChoice) -> Option<&'static Source<K>> {
     K::SOURCES.iter().find(|s| s.name == choice.name)
 }
 
 /// The network behind a choice, `None` for a built-in source.
-pub fn installed<K: Kind>(choice: &SourceChoice, registry: &Registry) -> Result<Option<Installed>> {
+pub fn installed<K: SourceKind>(choice: &SourceChoice, registry: &Registry) -> Result<Option<Installed>> {
     match built_in::<K>(choice) {
         Some(_) => Ok(None),
-        None => registry.installed(K::DUTY, &choice.name).map(Some),
+        None => registry.installed(K::TASK, &choice.name).map(Some),
     }
 }
 
 /// Refuses, before any work, what the chosen source would refuse later.
-pub fn check<K: Kind>(choice: &SourceChoice, given: &Given, registry: &Registry) -> Result<()> {
+pub fn check<K: SourceKind>(choice: &SourceChoice, given: &Given, registry: &Registry) -> Result<()> {
     let Some(source) = built_in::<K>(choice) else { return Ok(()) };
     source.needs.iter().try_for_each(|role| registry.path(*role).map(drop))?;
     (source.check)(choice.path(), given)
 }
 
 /// Makes what the chosen source gives.
-pub fn make<K: Kind>(choice: &SourceChoice, registry: &Registry, input: K::Input<'_>) -> Result<K::Output> {
+pub fn make<K: SourceKind>(
+    choice: &SourceChoice,
+    registry: &Registry,
+    input: K::Input<'_>,
+) -> Result<K::Output> {
     match built_in::<K>(choice) {
         Some(source) => (source.make)(choice.path(), input),
-        None => K::network(registry.installed(K::DUTY, &choice.name)?, input),
+        None => K::network(registry.installed(K::TASK, &choice.name)?, input),
     }
 }
 
 /// The choice of users who make none and have no network: the first of the table.
-pub fn default<K: Kind>() -> SourceChoice {
+pub fn default<K: SourceKind>() -> SourceChoice {
     K::SOURCES.first().map_or_else(|| SourceChoice::named(""), |s| SourceChoice::named(s.name))
 }
 
 /// What a text means: `auto`, an entry of the table, or the name of a network or of a family of them, whether installed or
 /// not. Files and folders must exist.
-pub fn choose<K: Kind>(text: &str, networks: &Inventory) -> Result<SourceChoice> {
+pub fn choose<K: SourceKind>(text: &str, networks: &Inventory) -> Result<SourceChoice> {
     if text == "auto" {
-        let best = networks.best(K::DUTY).map(|model| SourceChoice::named(&model.name));
+        let best = networks.best(K::TASK).map(|model| SourceChoice::named(&model.name));
         return Ok(best.unwrap_or_else(default::<K>));
     }
     let (name, argument) = text.split_once(':').map_or((text, None), |(name, path)| (name, Some(path)));
     let source = K::SOURCES.iter().find(|s| s.name == name);
-    let network = || known().iter().any(|k| k.does(K::DUTY) && (k.family == name || k.id == name));
+    let network = || catalogue().iter().any(|k| k.does(K::TASK) && (k.family == name || k.id == name));
     match (source.map(|s| s.argument), argument) {
         (Some(None), None) => Ok(SourceChoice::named(name)),
         (Some(Some(_)), Some(path)) if !path.is_empty() && Path::new(path).exists() => {
@@ -174,7 +178,7 @@ pub fn choose<K: Kind>(text: &str, networks: &Inventory) -> Result<SourceChoice>
         _ => {
             let own = K::SOURCES.iter().map(Source::syntax);
             let choices: Vec<String> = std::iter::once("auto".to_owned()).chain(own).collect();
-            let families = families(K::DUTY).into_iter().filter(|f| K::SOURCES.iter().all(|s| s.name != *f));
+            let families = families(K::TASK).into_iter().filter(|f| K::SOURCES.iter().all(|s| s.name != *f));
             let choices =
                 choices.into_iter().chain(families.map(str::to_owned)).collect::<Vec<_>>().join(", ");
             Err(Error::input(format!("--{} {text}: unknown; use one of: {choices}", K::OPTION)))
@@ -183,7 +187,7 @@ pub fn choose<K: Kind>(text: &str, networks: &Inventory) -> Result<SourceChoice>
 }
 
 /// The help of the option.
-pub fn help<K: Kind>() -> String {
+pub fn help<K: SourceKind>() -> String {
     let first = K::SOURCES.first().map_or("", |s| s.name);
     let own = K::SOURCES.iter().map(|s| match s.about {
         "" => s.syntax(),
@@ -193,22 +197,22 @@ pub fn help<K: Kind>() -> String {
         "{}: auto (the best network installed, else {first}), {}, or an installed network: {}",
         K::ABOUT,
         own.collect::<Vec<_>>().join(", "),
-        families(K::DUTY).join(", ")
+        families(K::TASK).join(", ")
     )
 }
 
 /// One line about an option for `splatvk doctor`: (option, what `auto` takes and what else there is).
-pub(super) fn listed<K: Kind>(networks: &Inventory) -> (String, String) {
-    let auto = networks.best(K::DUTY).map_or(K::SOURCES.first().map_or("", |s| s.name), |m| &m.name);
+pub(super) fn listed<K: SourceKind>(networks: &Inventory) -> (String, String) {
+    let auto = networks.best(K::TASK).map_or(K::SOURCES.first().map_or("", |s| s.name), |m| &m.name);
     let own = K::SOURCES.iter().map(Source::syntax);
-    let brought = networks.models.iter().filter(|m| m.duties.contains(&K::DUTY)).map(|m| m.name.clone());
+    let brought = networks.models.iter().filter(|m| m.tasks.contains(&K::TASK)).map(|m| m.name.clone());
     let all = own.chain(brought).collect::<Vec<_>>().join(", ");
     (format!("--{}", K::OPTION), format!("auto takes {auto} · there are {all}"))
 }
 
-fn families(duty: Duty) -> Vec<&'static str> {
+fn families(task: Task) -> Vec<&'static str> {
     let mut all: Vec<&str> = Vec::new();
-    for model in known().iter().filter(|k| k.does(duty)) {
+    for model in catalogue().iter().filter(|k| k.does(task)) {
         if !all.contains(&model.family.as_str()) {
             all.push(&model.family);
         }
@@ -216,7 +220,7 @@ fn families(duty: Duty) -> Vec<&'static str> {
     all
 }
 
-impl<K: Kind> Source<K> {
+impl<K: SourceKind> Source<K> {
     /// As users write it, with what stands for the argument.
     pub fn syntax(&self) -> String {
         self.argument.map_or_else(|| self.name.to_owned(), |argument| format!("{}:{argument}", self.name))

@@ -1,4 +1,4 @@
-//! The finished scene seen from the photos' cameras, and what it answers.
+//! The finished scene seen from the photos' cameras, and the answers to the queries.
 use crate::Result;
 use crate::fit::{Trained, TrainedLanguage};
 use crate::pipeline::{Context, Lane, Output, Stage};
@@ -7,9 +7,9 @@ use crate::run::ask::{self, Answers};
 use crate::run::view::{self, DecodedFrame};
 
 /// Renders and decodes every photo's view.
-pub struct Decode;
+pub struct DecodeViews;
 
-impl Stage for Decode {
+impl Stage for DecodeViews {
     const NAME: &'static str = "decode";
     const LANE: Lane = Lane::Device;
     type Inputs = (Output<Trained>, Output<TrainedLanguage>);
@@ -28,10 +28,10 @@ impl Stage for Decode {
     }
 }
 
-/// Answers the questions.
-pub struct Answer;
+/// Answers the queries.
+pub struct AnswerQueries;
 
-impl Stage for Answer {
+impl Stage for AnswerQueries {
     const NAME: &'static str = "query";
     const LANE: Lane = Lane::Device;
     type Inputs = (Output<Vec<DecodedFrame>>, Output<TrainedLanguage>, Output<Vec<TextQuery>>);

@@ -13,50 +13,50 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 /// Where cameras come from.
-pub enum CameraSource {
+pub enum CameraOrigin {
     /// Structure from motion.
     Sfm,
     /// Known ones, joined to the photos by name.
     Known(Vec<Camera>),
     /// Pointmaps of a network, with depth; structure from motion where an untrained one gives no geometry.
     Network(Installed),
-    /// Nowhere: cameras and points were given.
-    Complete(Geometry),
+    /// Cameras and points that were given.
+    GivenGeometry(Geometry),
 }
 
-/// Photos as all later stages see them, without lens distortion and in one light, and what is known of their cameras.
+/// Photos as all later stages take them, without lens distortion and in one light, and what is known of their cameras.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Placed {
+pub struct PlacedPhotos {
     /// The photos.
     pub photos: Vec<Photo>,
     /// How far geometry is known.
-    pub start: Start,
+    pub known: KnownGeometry,
 }
 
-/// What is known once the photos are placed.
+/// Geometry that the first stage leaves to the later ones.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub enum Start {
+pub enum KnownGeometry {
     /// Cameras and sparse points, and how they were found; depth is still to come.
-    Cameras(SparseModel, String),
-    /// All of it, from a network.
-    Geometry(Geometry),
+    Sparse(SparseModel, String),
+    /// Depth and points too, from a network or given.
+    Complete(Geometry),
 }
 
 /// Finds cameras and places photos.
 pub struct Cameras {
     photos: Vec<Photo>,
-    source: CameraSource,
+    source: CameraOrigin,
     settings: String,
 }
 
 impl Cameras {
     /// Of these photos.
-    pub fn new(photos: Vec<Photo>, source: CameraSource) -> Result<Cameras> {
+    pub fn new(photos: Vec<Photo>, source: CameraOrigin) -> Result<Cameras> {
         let source_name = match &source {
-            CameraSource::Sfm => "sfm".to_owned(),
-            CameraSource::Known(cameras) => format!("{cameras:?}"),
-            CameraSource::Network(model) => shared::identity(model)?,
-            CameraSource::Complete(geometry) => format!("{geometry:?}"),
+            CameraOrigin::Sfm => "sfm".to_owned(),
+            CameraOrigin::Known(cameras) => format!("{cameras:?}"),
+            CameraOrigin::Network(model) => shared::identity(model)?,
+            CameraOrigin::GivenGeometry(geometry) => format!("{geometry:?}"),
         };
         let photos_name: Vec<String> = photos.iter().map(identity).collect();
         let settings = format!("{source_name} {photos_name:?}");
@@ -64,7 +64,7 @@ impl Cameras {
     }
 }
 
-/// Everything of a photo that stages look at.
+/// Everything of a photo that stages read.
 fn identity(photo: &Photo) -> String {
     let mut digest = Sha256::new();
     digest.update(bytemuck::cast_slice::<_, u8>(&photo.image.data));
@@ -72,10 +72,10 @@ fn identity(photo: &Photo) -> String {
         digest.update(bytemuck::cast_slice::<_, u8>(&fine.data));
     }
     let pixels = crate::files::hex(&digest.finalize());
-    let Photo { path, image, frame, original_size, to_working, exif_focal, camera_model, .. } = photo;
+    let Photo { path, image, border, original_size, to_working, exif_focal, camera_model, .. } = photo;
     let size = (image.width, image.height);
     format!(
-        "{path:?} {size:?} {frame:?} {original_size:?} {to_working:?} {exif_focal:?} {camera_model:?} {pixels}"
+        "{path:?} {size:?} {border:?} {original_size:?} {to_working:?} {exif_focal:?} {camera_model:?} {pixels}"
     )
 }
 
@@ -83,27 +83,27 @@ impl Stage for Cameras {
     const NAME: &'static str = "cameras";
     const LANE: Lane = Lane::Device;
     type Inputs = ();
-    type Output = Placed;
+    type Output = PlacedPhotos;
 
     fn settings(&self) -> String {
         self.settings.clone()
     }
 
-    fn codec() -> Option<Codec<Placed>> {
+    fn codec() -> Option<Codec<PlacedPhotos>> {
         kept()
     }
 
-    fn run(self, (): (), context: &Context) -> Result<Placed> {
+    fn run(self, (): (), context: &Context) -> Result<PlacedPhotos> {
         let (progress, photos) = (context.progress, self.photos);
         let known = match &self.source {
-            CameraSource::Network(model) => {
+            CameraOrigin::Network(model) => {
                 let (views, maps) = pairs::pointmaps(model, &photos, progress)?;
                 match pointmap::reconstruct(&views, &maps, progress) {
                     Ok(geometry) => {
                         let method = format!("{} pointmaps", model.name);
-                        return Ok(Placed {
+                        return Ok(PlacedPhotos {
                             photos,
-                            start: Start::Geometry(Geometry { method, ..geometry }),
+                            known: KnownGeometry::Complete(Geometry { method, ..geometry }),
                         });
                     }
                     Err(Error::Cancelled) => return Err(Error::Cancelled),
@@ -115,27 +115,28 @@ impl Stage for Cameras {
                 }
                 None
             }
-            CameraSource::Complete(geometry) => {
-                return Ok(Placed { photos, start: Start::Geometry(geometry.clone()) });
+            CameraOrigin::GivenGeometry(geometry) => {
+                return Ok(PlacedPhotos { photos, known: KnownGeometry::Complete(geometry.clone()) });
             }
-            CameraSource::Sfm => None,
-            CameraSource::Known(cameras) => Some(cameras.as_slice()),
+            CameraOrigin::Sfm => None,
+            CameraOrigin::Known(cameras) => Some(cameras.as_slice()),
         };
-        let pose::Placed { photos, model, method } = pose::place(photos, known, context.registry, progress)?;
-        Ok(Placed { photos, start: Start::Cameras(model, method) })
+        let pose::SolvedCameras { photos, model, method } =
+            pose::place(photos, known, context.registry, progress)?;
+        Ok(PlacedPhotos { photos, known: KnownGeometry::Sparse(model, method) })
     }
 }
 
 /// Depth maps and points by stereo, where no network has given them.
-pub struct Depth {
+pub struct DenseDepth {
     /// Time against quality.
     pub preset: Preset,
 }
 
-impl Stage for Depth {
+impl Stage for DenseDepth {
     const NAME: &'static str = "depth";
     const LANE: Lane = Lane::Device;
-    type Inputs = (Output<Placed>,);
+    type Inputs = (Output<PlacedPhotos>,);
     type Output = Geometry;
 
     fn settings(&self) -> String {
@@ -146,10 +147,10 @@ impl Stage for Depth {
         kept()
     }
 
-    fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Geometry> {
-        match placed.start.clone() {
-            Start::Geometry(geometry) => Ok(geometry),
-            Start::Cameras(model, method) => {
+    fn run(self, (placed,): (&PlacedPhotos,), context: &Context) -> Result<Geometry> {
+        match placed.known.clone() {
+            KnownGeometry::Complete(geometry) => Ok(geometry),
+            KnownGeometry::Sparse(model, method) => {
                 let options = StereoOptions::preset(self.preset);
                 pose::dense(context.device, &placed.photos, model, method, &options, context.progress)
             }

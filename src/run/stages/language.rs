@@ -1,5 +1,5 @@
-//! Masks → aligned things with codes → splats that carry them; and what texts mean.
-use super::cameras::Placed;
+//! Masks → aligned things with codes → splats that carry them; and embeddings of texts.
+use super::cameras::PlacedPhotos;
 use super::shared;
 use crate::fit::{LanguageOptions, Trained, TrainedLanguage};
 use crate::infer::RegionEncoder;
@@ -8,13 +8,13 @@ use crate::language::{self, Language, ViewMasks};
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::Geometry;
 use crate::query::TextQuery;
-use crate::report::viewer::Names;
+use crate::report::viewer::CodeNames;
 use crate::run::ask;
 use crate::run::method::Recipe;
 use crate::{Error, Result};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// An encoder that several stages ask, one at a time.
+/// An encoder that several stages use, one at a time.
 #[derive(Clone)]
 pub struct SharedEncoder {
     encoder: Arc<Mutex<Box<dyn RegionEncoder>>>,
@@ -38,7 +38,7 @@ impl SharedEncoder {
         &self.space
     }
 
-    /// The encoder, of one who shares it with nobody.
+    /// The encoder itself, once nothing else shares it.
     pub fn into_inner(self) -> Result<Box<dyn RegionEncoder>> {
         let alone = Arc::into_inner(self.encoder).ok_or_else(|| Error::work("the encoder is in use"))?;
         Ok(alone.into_inner().unwrap_or_else(PoisonError::into_inner))
@@ -56,14 +56,14 @@ impl SharedEncoder {
 }
 
 /// Embeds the questions.
-pub struct Embed {
+pub struct EmbedQueries {
     /// By whom.
     pub encoder: SharedEncoder,
-    /// What is asked.
+    /// Texts of the queries.
     pub texts: Vec<String>,
 }
 
-impl Stage for Embed {
+impl Stage for EmbedQueries {
     const NAME: &'static str = "queries";
     const LANE: Lane = Lane::Processor;
     type Inputs = ();
@@ -113,22 +113,22 @@ impl Stage for Align {
 }
 
 /// The text model's own phrases for every code.
-pub struct Name {
+pub struct NameCodes {
     /// Whose.
     pub encoder: SharedEncoder,
 }
 
-impl Stage for Name {
+impl Stage for NameCodes {
     const NAME: &'static str = "names";
     const LANE: Lane = Lane::Processor;
     type Inputs = (Output<Language>,);
-    type Output = Names;
+    type Output = CodeNames;
 
     fn settings(&self) -> String {
         self.encoder.identity().to_owned()
     }
 
-    fn run(self, (language,): (&Language,), _: &Context) -> Result<Names> {
+    fn run(self, (language,): (&Language,), _: &Context) -> Result<CodeNames> {
         // As many as the page shows beside a selected thing.
         self.encoder.with(|e| ask::names(e, &language.field, ask::NAMES))
     }
@@ -145,7 +145,7 @@ pub struct TrainLanguage {
 impl Stage for TrainLanguage {
     const NAME: &'static str = "language";
     const LANE: Lane = Lane::Device;
-    type Inputs = (Output<Placed>, Output<Trained>, Output<Language>);
+    type Inputs = (Output<PlacedPhotos>, Output<Trained>, Output<Language>);
     type Output = TrainedLanguage;
 
     fn settings(&self) -> String {
@@ -158,7 +158,7 @@ impl Stage for TrainLanguage {
 
     fn run(
         self,
-        (placed, trained, language): (&Placed, &Trained, &Language),
+        (placed, trained, language): (&PlacedPhotos, &Trained, &Language),
         context: &Context,
     ) -> Result<TrainedLanguage> {
         self.recipe.train_language(

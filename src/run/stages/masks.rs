@@ -1,5 +1,5 @@
 //! Photos → masks with features.
-use super::cameras::Placed;
+use super::cameras::PlacedPhotos;
 use super::language::SharedEncoder;
 use super::shared;
 use crate::Result;
@@ -17,12 +17,12 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Learned contours of every photo, for [`GraphMasks`].
-pub struct Edges;
+pub struct ContourMaps;
 
-impl Stage for Edges {
+impl Stage for ContourMaps {
     const NAME: &'static str = "edges";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>,);
+    type Inputs = (Output<PlacedPhotos>,);
     type Output = Vec<Plane<f32>>;
 
     fn settings(&self) -> String {
@@ -33,7 +33,7 @@ impl Stage for Edges {
         kept()
     }
 
-    fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Vec<Plane<f32>>> {
+    fn run(self, (placed,): (&PlacedPhotos,), context: &Context) -> Result<Vec<Plane<f32>>> {
         let progress = context.progress;
         progress.begin("edges", placed.photos.len() as u64);
         let mut network = Hed::load(context.registry)?;
@@ -54,7 +54,7 @@ pub struct GraphMasks;
 impl Stage for GraphMasks {
     const NAME: &'static str = "graph-masks";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>, Output<Vec<Plane<f32>>>, Output<Geometry>);
+    type Inputs = (Output<PlacedPhotos>, Output<Vec<Plane<f32>>>, Output<Geometry>);
     type Output = Vec<ViewMasks>;
 
     fn settings(&self) -> String {
@@ -63,7 +63,7 @@ impl Stage for GraphMasks {
 
     fn run(
         self,
-        (placed, edges, geometry): (&Placed, &Vec<Plane<f32>>, &Geometry),
+        (placed, edges, geometry): (&PlacedPhotos, &Vec<Plane<f32>>, &Geometry),
         context: &Context,
     ) -> Result<Vec<ViewMasks>> {
         let progress = context.progress;
@@ -85,9 +85,9 @@ impl Stage for GraphMasks {
 
 /// A network's masks, or the built-in ones where it gave none: untrained weights rarely give a stable mask, and the stages
 /// after this one need some to work on.
-pub struct MasksOr;
+pub struct MasksOrFallback;
 
-impl Stage for MasksOr {
+impl Stage for MasksOrFallback {
     const NAME: &'static str = "masks-or";
     const LANE: Lane = Lane::Processor;
     type Inputs = (Output<Vec<ViewMasks>>, Output<Vec<ViewMasks>>);
@@ -118,7 +118,7 @@ pub struct NetworkMasks {
 }
 
 impl NetworkMasks {
-    /// The network and how it is asked.
+    /// The network and its prompts.
     pub fn new(model: Installed, options: SamOptions) -> Result<NetworkMasks> {
         let settings = format!("{} {options:?}", shared::identity(&model)?);
         Ok(NetworkMasks { model, options, settings })
@@ -128,7 +128,7 @@ impl NetworkMasks {
 impl Stage for NetworkMasks {
     const NAME: &'static str = "network-masks";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>,);
+    type Inputs = (Output<PlacedPhotos>,);
     type Output = Vec<ViewMasks>;
 
     fn settings(&self) -> String {
@@ -139,7 +139,7 @@ impl Stage for NetworkMasks {
         kept()
     }
 
-    fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Vec<ViewMasks>> {
+    fn run(self, (placed,): (&PlacedPhotos,), context: &Context) -> Result<Vec<ViewMasks>> {
         sam::masks(&self.model, &shared::images(&placed.photos), &self.options, context.progress)
     }
 }
@@ -155,7 +155,7 @@ pub struct GivenMasks {
 impl Stage for GivenMasks {
     const NAME: &'static str = "given-masks";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>,);
+    type Inputs = (Output<PlacedPhotos>,);
     type Output = Vec<ViewMasks>;
 
     fn settings(&self) -> String {
@@ -165,7 +165,7 @@ impl Stage for GivenMasks {
         format!("{:?} {} {sums:?}", self.dir, self.features)
     }
 
-    fn run(self, (placed,): (&Placed,), _: &Context) -> Result<Vec<ViewMasks>> {
+    fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<Vec<ViewMasks>> {
         placed.photos.iter().map(|p| dir::read_view(&self.dir, p, self.features)).collect()
     }
 }
@@ -183,15 +183,15 @@ fn files_in(dir: &std::path::Path) -> Vec<PathBuf> {
 }
 
 /// Features of the masks that came without.
-pub struct Regions {
+pub struct RegionFeatures {
     /// Whose.
     pub encoder: SharedEncoder,
 }
 
-impl Stage for Regions {
+impl Stage for RegionFeatures {
     const NAME: &'static str = "regions";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>, Output<Vec<ViewMasks>>);
+    type Inputs = (Output<PlacedPhotos>, Output<Vec<ViewMasks>>);
     type Output = Vec<ViewMasks>;
 
     fn settings(&self) -> String {
@@ -202,7 +202,11 @@ impl Stage for Regions {
         kept()
     }
 
-    fn run(self, (placed, masks): (&Placed, &Vec<ViewMasks>), context: &Context) -> Result<Vec<ViewMasks>> {
+    fn run(
+        self,
+        (placed, masks): (&PlacedPhotos, &Vec<ViewMasks>),
+        context: &Context,
+    ) -> Result<Vec<ViewMasks>> {
         let (mut masks, images) = (masks.clone(), placed.photos.iter().map(|p| &p.image));
         describe(&mut masks, images, &self.encoder, context.progress)?;
         Ok(masks)

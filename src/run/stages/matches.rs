@@ -1,5 +1,5 @@
 //! Photos → dense matches between every two of them.
-use super::cameras::Placed;
+use super::cameras::PlacedPhotos;
 use super::shared;
 use crate::Result;
 use crate::infer::installed::Installed;
@@ -16,14 +16,14 @@ pub struct Descriptors;
 impl Stage for Descriptors {
     const NAME: &'static str = "descriptors";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>,);
+    type Inputs = (Output<PlacedPhotos>,);
     type Output = Vec<DenseFeatures>;
 
     fn settings(&self) -> String {
         String::new()
     }
 
-    fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Vec<DenseFeatures>> {
+    fn run(self, (placed,): (&PlacedPhotos,), context: &Context) -> Result<Vec<DenseFeatures>> {
         let progress = context.progress;
         progress.begin("descriptors", placed.photos.len() as u64);
         let mut xfeat = XFeat::load(context.registry)?;
@@ -93,7 +93,7 @@ impl NetworkMatches {
 impl Stage for NetworkMatches {
     const NAME: &'static str = "network-matches";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<Placed>,);
+    type Inputs = (Output<PlacedPhotos>,);
     type Output = Vec<PairLinks>;
 
     fn settings(&self) -> String {
@@ -104,7 +104,7 @@ impl Stage for NetworkMatches {
         kept()
     }
 
-    fn run(self, (placed,): (&Placed,), context: &Context) -> Result<Vec<PairLinks>> {
+    fn run(self, (placed,): (&PlacedPhotos,), context: &Context) -> Result<Vec<PairLinks>> {
         let mut warps = warp::warps(&self.model, &placed.photos, context.progress)?.into_iter();
         let links = |((i, j), (there, back)): (_, (_, _))| links_from_warps(i, j, &there, &back);
         Ok(pairs(placed.photos.len()).zip(&mut warps).map(links).collect())

@@ -1,4 +1,4 @@
-//! The stages of the commands, one kind of work per file. Each says what it needs and what it depends on
+//! The stages of the commands, one kind of work per file. Each declares its inputs and its settings
 //! ([`crate::pipeline`]); the commands are lists of them.
 mod answers;
 mod cameras;
@@ -8,10 +8,10 @@ mod matches;
 mod shared;
 mod splats;
 
-pub use answers::{Answer, Decode};
-pub use cameras::{CameraSource, Cameras, Depth, Placed};
-pub use language::{Align, Embed, Name, SharedEncoder, TrainLanguage};
-pub use masks::{Edges, GivenMasks, GraphMasks, MasksOr, NetworkMasks, Regions};
+pub use answers::{AnswerQueries, DecodeViews};
+pub use cameras::{CameraOrigin, Cameras, DenseDepth, PlacedPhotos};
+pub use language::{Align, EmbedQueries, NameCodes, SharedEncoder, TrainLanguage};
+pub use masks::{ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMasks, RegionFeatures};
 pub use matches::{DescriptorMatches, Descriptors, NetworkMatches};
 pub use shared::identity;
 pub use splats::TrainColour;

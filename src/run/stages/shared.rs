@@ -10,6 +10,6 @@ pub(super) fn images(photos: &[crate::photo::Photo]) -> Vec<RgbImage> {
 
 /// What an installed network is, for [`crate::pipeline::Stage::settings`].
 pub fn identity(model: &Installed) -> Result<String> {
-    let sums: Vec<String> = model.files()?.into_iter().map(|(_, sha256)| sha256).collect();
+    let sums: Vec<String> = model.files()?.into_iter().map(|f| f.sha256).collect();
     Ok(format!("{} {sums:?}", model.name))
 }

@@ -1,5 +1,5 @@
 //! Photos and geometry → splats.
-use super::cameras::Placed;
+use super::cameras::PlacedPhotos;
 use super::shared;
 use crate::Result;
 use crate::fit::{self, RgbOptions, Trained};
@@ -15,7 +15,7 @@ pub struct TrainColour {
 impl Stage for TrainColour {
     const NAME: &'static str = "splats";
     const LANE: Lane = Lane::Device;
-    type Inputs = (Output<Placed>, Output<Geometry>);
+    type Inputs = (Output<PlacedPhotos>, Output<Geometry>);
     type Output = Trained;
 
     fn settings(&self) -> String {
@@ -26,7 +26,7 @@ impl Stage for TrainColour {
         kept()
     }
 
-    fn run(self, (placed, geometry): (&Placed, &Geometry), context: &Context) -> Result<Trained> {
+    fn run(self, (placed, geometry): (&PlacedPhotos, &Geometry), context: &Context) -> Result<Trained> {
         let depths = (!geometry.depths.is_empty()).then_some(geometry.depths.as_slice());
         fit::train_rgb(
             context.device,

@@ -1,6 +1,6 @@
 //! Reading: every primitive of the default scene that has the extension, moved by the nodes above it.
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
-use crate::format::{logit, moved};
+use crate::format::{logit, transform};
 use crate::scene::{Similarity, Splats, sh_coefficients};
 use crate::{Error, Result};
 use base64::Engine;
@@ -23,7 +23,7 @@ struct Root {
     #[serde(default)]
     accessors: Vec<Accessor>,
     #[serde(default)]
-    buffer_views: Vec<View>,
+    buffer_views: Vec<BufferView>,
     #[serde(default)]
     buffers: Vec<Buffer>,
     #[serde(default)]
@@ -78,7 +78,7 @@ struct Accessor {
 
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
-struct View {
+struct BufferView {
     buffer: usize,
     #[serde(default)]
     byte_offset: usize,
@@ -125,7 +125,7 @@ fn parse(bytes: &[u8], folder: &Path) -> Result<Splats, String> {
         }
         let matrix = above * local(node);
         for mut splats in document.gaussians(node)? {
-            moved::transform(&mut splats, &similarity(matrix, index)?);
+            transform::transform_splats(&mut splats, &similarity(matrix, index)?);
             parts.push(splats);
         }
         open.extend(node.children.iter().rev().map(|child| (*child, matrix)));
@@ -147,7 +147,7 @@ fn parse(bytes: &[u8], folder: &Path) -> Result<Splats, String> {
         }
         all.append(part);
     }
-    moved::transform(&mut all, &turned());
+    transform::transform_splats(&mut all, &turned());
     Ok(all)
 }
 

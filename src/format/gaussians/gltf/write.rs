@@ -1,6 +1,6 @@
 //! Writing.
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
-use crate::format::{SH_C0, moved, sigmoid};
+use crate::format::{SH_C0, sigmoid, transform};
 use crate::scene::{Splats, to_linear};
 use crate::{Error, Result};
 use base64::Engine;
@@ -44,14 +44,14 @@ pub fn write_gltf(path: &Path, splats: &Splats) -> Result<()> {
 /// The document without its buffer, and the buffer.
 fn document(splats: &Splats) -> (Value, Vec<u8>) {
     let mut s = splats.clone();
-    moved::transform(&mut s, &turned());
+    transform::transform_splats(&mut s, &turned());
     let mut parts = Parts { count: s.len(), ..Parts::default() };
     parts.floats("POSITION".into(), "VEC3", s.means.as_flattened());
     if let Some(position) = parts.accessors.last_mut() {
         let bound = |pick: fn(f32, f32) -> f32, from: f32| {
             s.means.iter().fold([from; 3], |b, m| [0, 1, 2].map(|k| pick(b[k], m[k])))
         };
-        // glTF wants the extent of positions.
+        // glTF requires the extent of positions.
         position["min"] = json!(bound(f32::min, f32::INFINITY));
         position["max"] = json!(bound(f32::max, f32::NEG_INFINITY));
     }

@@ -1,20 +1,24 @@
 //! Runs setups as graphs of stages that share one store: setups that agree up to a stage share what that stage made.
-use super::stages::{EncoderMeaning, MaskMeaning, Meanings, Score, Scored, SyntheticMasks, SyntheticMeaning};
-use super::tables::{Available, Regions, Setup};
+use super::stages::{
+    EncoderEmbeddings, MaskEmbeddings, ObjectEmbeddings, Score, Scored, SyntheticEmbeddings, SyntheticMasks,
+};
+use super::tables::{Available, NetworkFamily, Regions, Setup};
 use crate::fit::{LanguageOptions, Preset, RgbOptions, Trained, TrainedLanguage};
 use crate::gpu::Device;
 use crate::infer::Registry;
-use crate::infer::installed::{Duty, inventory, known};
+use crate::infer::installed::{Task, catalogue, inventory};
 use crate::language::sam::SamOptions;
 use crate::language::{Language, ViewMasks};
 use crate::photo;
 use crate::pipeline::{Graph, Output, Store};
 use crate::progress::{Progress, Recorded};
 use crate::query::TextQuery;
-use crate::query::eval::{BACKGROUND_LABELS, Frame, GroundTruth, Split};
+use crate::query::eval::{BACKGROUND_LABELS, GroundTruth, Split, TruthFrame};
 use crate::run::ask;
-use crate::run::sources::{self, Build, Features, Geometry, Masks, Matches, PosedPhotos};
-use crate::run::stages::{self, CameraSource, Placed};
+use crate::run::sources::{
+    self, FeatureSources, GeometrySources, GraphBuilder, MaskSources, MatchSources, PosedPhotos,
+};
+use crate::run::stages::{self, CameraOrigin, PlacedPhotos};
 use crate::scene::Camera;
 use crate::synth::regions;
 use crate::{Error, Result};
@@ -23,8 +27,8 @@ use std::sync::Arc;
 
 /// What came out of a setup.
 #[derive(Clone)]
-pub struct Outcome {
-    /// Figures of protocol `field`, and how well the rendered meaning agrees with the true one.
+pub struct RowFigures {
+    /// Figures of protocol `field`, and agreement of decoded embeddings with the true ones.
     pub scored: Arc<Scored>,
     /// Splats of the finished scene.
     pub splats: usize,
@@ -37,7 +41,7 @@ pub struct Outcome {
 }
 
 /// The machine, the data, and everything made so far.
-pub struct Lab<'a> {
+pub struct Runner<'a> {
     device: Device,
     registry: Registry,
     /// The data set.
@@ -49,8 +53,8 @@ pub struct Lab<'a> {
 
 /// The stages of a setup.
 struct Stages {
-    build: Build,
-    placed: Output<Placed>,
+    build: GraphBuilder,
+    placed: Output<PlacedPhotos>,
     trained: Output<Trained>,
     aligned: Output<Language>,
     language: Output<TrainedLanguage>,
@@ -64,11 +68,11 @@ pub fn feature_bytes(splats: usize, channels: usize, pixels: usize) -> u64 {
     4 * channels as u64 * (5 * splats as u64 + 2 * pixels as u64)
 }
 
-fn pixels(placed: &Placed) -> usize {
+fn pixels(placed: &PlacedPhotos) -> usize {
     placed.photos.iter().map(|p| p.image.data.len()).max().unwrap_or(0)
 }
 
-impl<'a> Lab<'a> {
+impl<'a> Runner<'a> {
     /// Opens the machine and the data.
     pub fn open(
         device: Device,
@@ -77,15 +81,16 @@ impl<'a> Lab<'a> {
         seed: u64,
         progress: &'a dyn Progress,
     ) -> Self {
-        Lab { device, registry, truth: Arc::new(truth), seed, progress, store: Store::in_memory() }
+        Runner { device, registry, truth: Arc::new(truth), seed, progress, store: Store::in_memory() }
     }
 
     /// Frames whose photos a scene of so many views is made from: train frames spread over their order, and held-out ones
     /// when they do not suffice.
-    pub fn frames(&self, views: usize) -> Result<Vec<Frame>> {
-        let of = |split| -> Vec<&Frame> { self.truth.frames.iter().filter(|f| f.split == split).collect() };
+    pub fn frames(&self, views: usize) -> Result<Vec<TruthFrame>> {
+        let of =
+            |split| -> Vec<&TruthFrame> { self.truth.frames.iter().filter(|f| f.split == split).collect() };
         let (train, test) = (of(Split::Train), of(Split::Test));
-        let pick = |from: &[&Frame], n: usize| -> Vec<Frame> {
+        let pick = |from: &[&TruthFrame], n: usize| -> Vec<TruthFrame> {
             photo::spread(from.len(), n).into_iter().map(|i| from[i].clone()).collect()
         };
         if views < 2 || views > train.len() + test.len() {
@@ -106,22 +111,22 @@ impl<'a> Lab<'a> {
     pub fn available(&self) -> Available {
         let of = |split| self.truth.frames.iter().filter(|f| f.split == split).count();
         let there = inventory(&self.registry);
-        let families = |duty| {
-            let mut all: Vec<(String, bool)> = Vec::new();
-            for model in known().iter().filter(|k| k.role == duty) {
+        let families = |task| {
+            let mut all: Vec<NetworkFamily> = Vec::new();
+            for model in catalogue().iter().filter(|k| k.task == task) {
                 let installed = there
                     .models
                     .iter()
-                    .any(|m| m.duties.contains(&duty) && m.family == model.family && !m.untrained());
-                if all.iter().all(|(name, _)| *name != model.family) {
-                    all.push((model.family.clone(), installed));
+                    .any(|m| m.tasks.contains(&task) && m.family == model.family && !m.untrained());
+                if all.iter().all(|f| f.name != model.family) {
+                    all.push(NetworkFamily { name: model.family.clone(), installed });
                 }
             }
             all
         };
         // Half of the held-out frames must stay held out.
         let views = of(Split::Train) + of(Split::Test) / 2;
-        Available { views, geometry: families(Duty::Geometry), features: families(Duty::Features) }
+        Available { views, geometry: families(Task::Geometry), features: families(Task::Features) }
     }
 
     /// The stages of a setup, up to its figures.
@@ -131,7 +136,7 @@ impl<'a> Lab<'a> {
         let photos = photo::load_all(&paths, self.progress)?;
         let registry = &self.registry;
         let given = |r: &Regions| matches!(r, Regions::Found { features, .. } if features.argument.is_some());
-        let mut build = Build {
+        let mut build = GraphBuilder {
             graph: Graph::default(),
             registry: registry.clone(),
             sam: SamOptions::default(),
@@ -139,17 +144,20 @@ impl<'a> Lab<'a> {
             preset: Preset::Draft,
         };
         let posed = if setup.true_cameras {
-            let named = |f: &Frame| Camera { name: f.stem.clone(), ..f.camera.clone() };
-            build.posed(photos, CameraSource::Known(frames.iter().map(named).collect()))?
+            let named = |f: &TruthFrame| Camera { name: f.stem.clone(), ..f.camera.clone() };
+            build.posed(photos, CameraOrigin::Known(frames.iter().map(named).collect()))?
         } else {
-            sources::make::<Geometry>(&setup.init, registry, (&mut build, photos))?
+            sources::make::<GeometrySources>(&setup.init, registry, (&mut build, photos))?
         };
         let PosedPhotos { placed, geometry } = posed;
-        let matches =
-            sources::make::<Matches>(&sources::default::<Matches>(), registry, (&mut build, posed))?;
+        let matches = sources::make::<MatchSources>(
+            &sources::default::<MatchSources>(),
+            registry,
+            (&mut build, posed),
+        )?;
         let options = self.rgb_options(setup);
         let trained = build.graph.add(stages::TrainColour { options }, (placed, geometry));
-        let Described { masks, meaning, queries, space } = self.described(setup, &mut build, posed)?;
+        let RegionData { masks, embeddings, queries, space } = self.described(setup, &mut build, posed)?;
         let (recipe, seed) = (setup.recipe, self.seed);
         let aligned = build.graph.add(stages::Align { recipe, space, seed }, (masks, matches, geometry));
         let options = LanguageOptions {
@@ -161,7 +169,7 @@ impl<'a> Lab<'a> {
         };
         let language = build.graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
         let score = Score { truth: self.truth.clone(), queries: queries.clone() };
-        let scored = build.graph.add(score, (trained, language, meaning));
+        let scored = build.graph.add(score, (trained, language, embeddings));
         Ok(Stages { build, placed, trained, aligned, language, scored, queries })
     }
 
@@ -172,34 +180,34 @@ impl<'a> Lab<'a> {
         setup.recipe.rgb(options)
     }
 
-    /// Masks with features, what the objects mean in the space of these features, and the questions.
-    fn described(&self, setup: &Setup, build: &mut Build, posed: PosedPhotos) -> Result<Described> {
+    /// Masks with features, the true embedding of every object in the space of these features, and the questions.
+    fn described(&self, setup: &Setup, build: &mut GraphBuilder, posed: PosedPhotos) -> Result<RegionData> {
         let (truth, placed) = (&self.truth, posed.placed);
         let (masks, features) = match &setup.regions {
             Regions::Synthetic(flaws) => {
                 let (truth, flaws) = (truth.clone(), *flaws);
                 let queries = self.phrases().iter().map(|p| regions::query(p)).collect();
-                return Ok(Described {
+                return Ok(RegionData {
                     masks: build.graph.add(SyntheticMasks { truth: truth.clone(), flaws }, (placed,)),
-                    meaning: build.graph.add(SyntheticMeaning { truth, flaws }, (placed,)),
+                    embeddings: build.graph.add(SyntheticEmbeddings { truth, flaws }, (placed,)),
                     queries,
                     space: "synthetic".into(),
                 });
             }
             Regions::Found { masks, features } => (masks, features),
         };
-        let encoder = sources::make::<Features>(features, &self.registry, &self.registry)?;
-        let found = sources::make::<Masks>(masks, &self.registry, (build, posed))?;
-        let masks = build.graph.add(stages::Regions { encoder: encoder.clone() }, (placed, found));
+        let encoder = sources::make::<FeatureSources>(features, &self.registry, &self.registry)?;
+        let found = sources::make::<MaskSources>(masks, &self.registry, (build, posed))?;
+        let masks = build.graph.add(stages::RegionFeatures { encoder: encoder.clone() }, (placed, found));
         let queries = encoder.with(|e| ask::embedded(&self.phrases(), e))?;
         let space = encoder.space().to_owned();
         let truth = truth.clone();
-        let meaning = if features.argument.is_some() {
-            build.graph.add(MaskMeaning { truth }, (placed, masks))
+        let embeddings = if features.argument.is_some() {
+            build.graph.add(MaskEmbeddings { truth }, (placed, masks))
         } else {
-            build.graph.add(EncoderMeaning { truth, encoder }, (placed,))
+            build.graph.add(EncoderEmbeddings { truth, encoder }, (placed,))
         };
-        Ok(Described { masks, meaning, queries, space })
+        Ok(RegionData { masks, embeddings, queries, space })
     }
 
     /// Phrases that the evaluation asks for, in its order.
@@ -209,7 +217,7 @@ impl<'a> Lab<'a> {
     }
 
     /// Runs a setup, as far as it was not run before.
-    pub fn outcome(&mut self, setup: &Setup) -> Result<Outcome> {
+    pub fn outcome(&mut self, setup: &Setup) -> Result<RowFigures> {
         let s = self.stages(setup)?;
         let targets = [s.placed.target(), s.aligned.target(), s.language.target(), s.scored.target()];
         let progress = Recorded::new(self.progress);
@@ -218,7 +226,7 @@ impl<'a> Lab<'a> {
         let levels = &language.field.levels;
         let codes = levels.iter().map(|l| l.codebook.members.iter().filter(|m| !m.is_empty()).count());
         let channels: usize = levels.iter().map(|l| l.codebook.code_dim).sum();
-        Ok(Outcome {
+        Ok(RowFigures {
             splats: language.splats.len(),
             codes: codes.collect(),
             feature_bytes: feature_bytes(language.splats.len(), channels, pixels(&placed)),
@@ -239,10 +247,10 @@ impl<'a> Lab<'a> {
     }
 }
 
-/// What [`Lab::described`] adds.
-struct Described {
+/// What [`Runner::described`] adds.
+struct RegionData {
     masks: Output<Vec<ViewMasks>>,
-    meaning: Output<Meanings>,
+    embeddings: Output<ObjectEmbeddings>,
     queries: Vec<TextQuery>,
     space: String,
 }

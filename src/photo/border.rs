@@ -1,11 +1,11 @@
-//! Plain frames around photos: scans, rectified and letterboxed pictures. They stand still while the scene moves, so they
-//! are neither matched nor learned: their pixels continue the picture instead.
+//! Plain borders around photos: scans, rectified and letterboxed pictures. They do not move with the scene, so they
+//! are neither matched nor trained on: their pixels continue the picture instead.
 use crate::scene::RgbImage;
 use serde::{Deserialize, Serialize};
 
-/// Lines that belong to the frame on each side, pixels.
+/// Lines that belong to the border on each side, pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Frame {
+pub struct PlainBorder {
     /// Columns on the left.
     pub left: usize,
     /// Rows at the top.
@@ -16,30 +16,30 @@ pub struct Frame {
     pub bottom: usize,
 }
 
-/// Frames are thin: plain white or black that reaches deeper is scene (sky, a studio background).
+/// Borders are thin: plain white or black that reaches deeper is scene (sky, a studio background).
 const DEEPEST_SHARE: f64 = 0.08;
-/// Share of plain pixels in an outermost line of a frame …
+/// Share of plain pixels in an outermost line of a border …
 const PLAIN: f64 = 0.9;
 /// … and below which a line belongs to the picture
-/// (bright windows may touch the frame, uneven edges leave steps in it).
+/// (bright windows may touch the border, uneven edges leave steps in it).
 const PICTURE: f64 = 0.3;
-/// Resampling and JPEG mix the frame into this many lines of the picture.
+/// Resampling and JPEG mix the border into this many lines of the picture.
 const MIXED: usize = 1;
 
-impl Frame {
-    /// The white or black frame of a picture. Opposite sides have one or neither: a bright sky has none below.
-    pub fn of(image: &RgbImage) -> Frame {
+impl PlainBorder {
+    /// The white or black border of a picture. Opposite sides have one or neither: a bright sky has none below.
+    pub fn of(image: &RgbImage) -> PlainBorder {
         // Compression leaves a few grey levels of ringing on saturated pixels.
         let white = |c: [f32; 3]| c.iter().all(|v| *v > 0.95);
         let black = |c: [f32; 3]| c.iter().all(|v| *v < 0.02);
-        let (a, b) = (Frame::plain(image, white), Frame::plain(image, black));
-        if a == Frame::default() { b } else { a }
+        let (a, b) = (PlainBorder::plain(image, white), PlainBorder::plain(image, black));
+        if a == PlainBorder::default() { b } else { a }
     }
 
-    fn plain(image: &RgbImage, plain: impl Fn([f32; 3]) -> bool) -> Frame {
+    fn plain(image: &RgbImage, plain: impl Fn([f32; 3]) -> bool) -> PlainBorder {
         let (w, h) = (image.width, image.height);
         let deepest = ((w.min(h) as f64 * DEEPEST_SHARE) as usize).min(w.min(h) / 4);
-        // The ends of a line belong to the frame's other sides.
+        // The ends of a line belong to the border's other sides.
         let share = |across: usize, at: &dyn Fn(usize) -> [f32; 3]| {
             let inner = deepest..across - deepest;
             inner.clone().filter(|&i| plain(at(i))).count() as f64 / inner.len().max(1) as f64
@@ -51,28 +51,29 @@ impl Frame {
             let first = (1..=deepest).find(|&d| share(across, &|i| at(d, i)) < PICTURE);
             first.map_or(0, |d| d + MIXED)
         };
-        let frame = Frame {
+        let border = PlainBorder {
             left: depth(h, &|d, i| image.at(d, i)),
             right: depth(h, &|d, i| image.at(w - 1 - d, i)),
             top: depth(w, &|d, i| image.at(i, d)),
             bottom: depth(w, &|d, i| image.at(i, h - 1 - d)),
         };
         let pair = |a: usize, b: usize| if a > 0 && b > 0 { (a, b) } else { (0, 0) };
-        let ((left, right), (top, bottom)) = (pair(frame.left, frame.right), pair(frame.top, frame.bottom));
-        Frame { left, top, right, bottom }
+        let ((left, right), (top, bottom)) =
+            (pair(border.left, border.right), pair(border.top, border.bottom));
+        PlainBorder { left, top, right, bottom }
     }
 
     /// Whether there is any.
     pub fn is_none(&self) -> bool {
-        *self == Frame::default()
+        *self == PlainBorder::default()
     }
 
-    /// True on the frame of a picture of this size.
+    /// True on the border of a picture of this size.
     pub fn covers(&self, x: usize, y: usize, width: usize, height: usize) -> bool {
         x < self.left || y < self.top || x + self.right >= width || y + self.bottom >= height
     }
 
-    /// Replaces the frame by the nearest pixels of the picture.
+    /// Replaces the border by the nearest pixels of the picture.
     pub fn continue_picture(&self, image: &mut RgbImage) {
         if self.is_none() {
             return;
@@ -89,7 +90,7 @@ impl Frame {
         }
     }
 
-    /// The picture without its frame.
+    /// The picture without its border.
     pub fn crop(&self, image: &RgbImage) -> RgbImage {
         let rows = self.top..image.height - self.bottom;
         let row = |y: usize| &image.data[y * image.width + self.left..(y + 1) * image.width - self.right];
@@ -113,10 +114,10 @@ mod tests {
 
     #[test]
     fn an_uneven_white_frame_is_replaced_by_its_neighbours() {
-        let frame = |x: usize, y: usize| x < 4 + y / 60 || y < 3 || x >= 115 || y >= 98;
-        let mut image = picture(|x, y| if frame(x, y) { [1.0; 3] } else { scene(x, y) });
-        let found = Frame::of(&image);
-        assert_eq!(found, Frame { left: 6, top: 4, right: 6, bottom: 3 });
+        let border = |x: usize, y: usize| x < 4 + y / 60 || y < 3 || x >= 115 || y >= 98;
+        let mut image = picture(|x, y| if border(x, y) { [1.0; 3] } else { scene(x, y) });
+        let found = PlainBorder::of(&image);
+        assert_eq!(found, PlainBorder { left: 6, top: 4, right: 6, bottom: 3 });
         let inside = found.crop(&image);
         assert_eq!((inside.width, inside.height), (108, 93));
         assert_eq!(inside.at(0, 0), scene(6, 4));
@@ -130,12 +131,12 @@ mod tests {
     #[test]
     fn letterbox_bars_are_frames_and_bright_scenes_are_not() {
         let bars = picture(|x, y| if !(7..93).contains(&y) { [0.0; 3] } else { scene(x, y) });
-        assert_eq!(Frame::of(&bars), Frame { top: 8, bottom: 8, ..Frame::default() });
+        assert_eq!(PlainBorder::of(&bars), PlainBorder { top: 8, bottom: 8, ..PlainBorder::default() });
         let sky = picture(|x, y| if y < 6 { [1.0; 3] } else { scene(x, y) });
-        assert!(Frame::of(&sky).is_none());
+        assert!(PlainBorder::of(&sky).is_none());
         let studio = picture(|x, y| if (40..80).contains(&x) && y > 30 { scene(x, y) } else { [1.0; 3] });
-        assert!(Frame::of(&studio).is_none());
-        assert!(Frame::of(&picture(scene)).is_none());
-        assert!(Frame::of(&picture(|_, _| [1.0; 3])).is_none());
+        assert!(PlainBorder::of(&studio).is_none());
+        assert!(PlainBorder::of(&picture(scene)).is_none());
+        assert!(PlainBorder::of(&picture(|_, _| [1.0; 3])).is_none());
     }
 }

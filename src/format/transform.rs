@@ -9,7 +9,7 @@ const DIRECTIONS: usize = 24;
 
 /// Moves, turns and scales the Gaussians; `by.rotation` is a proper rotation, `by.scale` > 0. Colours turn with them: what a
 /// splat showed in direction d, it shows in direction R·d.
-pub fn transform(splats: &mut Splats, by: &Similarity) {
+pub fn transform_splats(splats: &mut Splats, by: &Similarity) {
     let turn = DQuat::from_mat3(&by.rotation);
     let growth = by.scale.ln() as f32;
     for mean in &mut splats.means {
@@ -44,7 +44,7 @@ fn turned_basis(rotation: &DMat3, degree: u32) -> DMatrix<f64> {
     let first = (degree * degree) as usize;
     let at = |turn: DMat3| {
         DMatrix::from_fn(DIRECTIONS, functions, |row, column| {
-            sh::basis(turn * spread(row), degree)[first + column]
+            sh::basis(turn * spiral_direction(row), degree)[first + column]
         })
     };
     let (new, old) = (at(DMat3::IDENTITY), at(rotation.transpose()));
@@ -55,7 +55,7 @@ fn turned_basis(rotation: &DMat3, degree: u32) -> DMatrix<f64> {
 }
 
 /// Direction `k` of a spiral over the sphere.
-fn spread(k: usize) -> DVec3 {
+fn spiral_direction(k: usize) -> DVec3 {
     let z = 1.0 - (2 * k + 1) as f64 / DIRECTIONS as f64;
     let (sin, cos) = (k as f64 * 2.399_963_229_728_653).sin_cos();
     let r = (1.0 - z * z).sqrt();
@@ -79,13 +79,13 @@ mod tests {
         };
         let rotation = DMat3::from_quat(DQuat::from_xyzw(0.3, -0.5, 0.2, 0.7).normalize());
         let by = Similarity { scale: 2.5, rotation, translation: DVec3::new(0.5, 1.0, -4.0) };
-        transform(&mut s, &by);
+        transform_splats(&mut s, &by);
         let colour = |sh: &[f32], d: DVec3, channel: usize| {
             let b = sh::basis(d, 3);
             (0..16).map(|k| b[k] * f64::from(sh[3 * k + channel])).sum::<f64>()
         };
         for k in 0..DIRECTIONS {
-            let d = DMat3::from_rotation_y(0.4) * spread(k);
+            let d = DMat3::from_rotation_y(0.4) * spiral_direction(k);
             for channel in 0..3 {
                 let (before, after) = (colour(&sh, d, channel), colour(&s.sh, rotation * d, channel));
                 assert!((before - after).abs() < 1e-5, "direction {k}: {before} {after}");
