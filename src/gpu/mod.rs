@@ -1,27 +1,27 @@
 //! The Vulkan engine: device, buffers, shaders with typed bindings, and a recorder that derives the barriers.
 //!
 //! # A pass in full
-//! `glsl/relevancy_map.comp` declares blocks `Codes`, `Scores`, `Relevancy` and a push block with `uint pixels`.
-//! build.rs turns that into `shaders::relevancy_map` and the host call is
+//! `glsl/gather.comp` declares blocks `Index`, `From`, `To` and a push block with `uint rows, stride`.
+//! build.rs turns that into `shaders::gather` and the host call is
 //!
 //! ```no_run
 //! # fn main() -> splatvk::Result<()> {
 //! use splatvk::gpu::{Device, Recorder, shaders};
 //! let device = Device::open(None)?;
-//! let codes = device.buffer_from("codes", &[0i32, 1, -1])?;
-//! let scores = device.buffer_from("scores", &[0.25f32, 0.75])?;
-//! let relevancy = device.buffer::<f32>("relevancy", 3)?;
+//! let index = device.buffer_from("index", &[2u32, 0])?;
+//! let from = device.buffer_from("from", &[10u32, 20, 30])?;
+//! let to = device.buffer::<u32>("to", 2)?;
 //!
-//! let mut rec = Recorder::new(&device, "relevancy");
+//! let mut rec = Recorder::new(&device, "gather");
 //! rec.dispatch_threads(
-//!     shaders::relevancy_map::call(
-//!         &shaders::relevancy_map::Bindings { codes: &codes, scores: &scores, relevancy: &relevancy },
-//!         &shaders::relevancy_map::Push { pixels: 3 },
+//!     shaders::gather::call(
+//!         &shaders::gather::Bindings { index: &index, from: &from, to: &to },
+//!         &shaders::gather::Push { rows: 2, stride: 1 },
 //!     ),
-//!     [3, 1, 1],
+//!     [2, 1, 1],
 //! );
 //! rec.run()?;
-//! assert_eq!(relevancy.read::<f32>()?, [0.25, 0.75, 0.0]);
+//! assert_eq!(to.read::<u32>()?, [30, 10]);
 //! # Ok(())
 //! # }
 //! ```

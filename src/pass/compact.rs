@@ -3,9 +3,6 @@ use super::adam::rows_of_groups;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 
-/// Index of a row that has no source: it becomes zeros (the optimiser state of new splats).
-pub const NEW: u32 = u32::MAX;
-
 /// Indices of the splats whose opacity is finite and at least `min_opacity`, in order.
 pub fn kept(opacity_logits: &[f32], min_opacity: f32) -> Vec<u32> {
     let limit = (min_opacity / (1.0 - min_opacity)).ln();
@@ -17,7 +14,7 @@ pub fn kept(opacity_logits: &[f32], min_opacity: f32) -> Vec<u32> {
         .collect()
 }
 
-/// A buffer with the rows `index` of `from`, each `stride` 32-bit words; [`NEW`] rows are zero.
+/// A buffer with the rows `index` of `from`, each `stride` 32-bit words.
 pub fn gather(
     device: &Device,
     name: &'static str,
@@ -38,13 +35,8 @@ pub fn gather(
 }
 
 /// The CPU twin of [`gather`].
-pub fn gather_rows<T: Copy + Default>(from: &[T], index: &[u32], stride: usize) -> Vec<T> {
-    index
-        .iter()
-        .flat_map(|&i| {
-            (0..stride).map(move |k| if i == NEW { T::default() } else { from[i as usize * stride + k] })
-        })
-        .collect()
+pub fn gather_rows<T: Copy>(from: &[T], index: &[u32], stride: usize) -> Vec<T> {
+    index.iter().flat_map(|&i| &from[i as usize * stride..][..stride]).copied().collect()
 }
 
 #[cfg(test)]
@@ -59,7 +51,7 @@ mod tests {
         let logits: Vec<f32> = (0..1003).map(|_| random.normal() as f32 * 4.0).collect();
         let mut index = kept(&logits, 0.1);
         assert!(index.len() > 100 && index.len() < 900);
-        index.extend([NEW, 5, 5, NEW]);
+        index.extend([5, 5]);
         let index_buffer = device.buffer_from("index", &index).unwrap();
         for stride in [1, 3, 8] {
             let rows: Vec<f32> = (0..1003 * stride).map(|_| random.normal() as f32).collect();

@@ -20,8 +20,6 @@ pub struct FrameBuffers {
     pub planes: Buffer,
     /// [H, W] final transmittance T_f; alpha = 1 − T_f.
     pub transmittance: Buffer,
-    /// [H, W] camera z where T falls below ½, 0 where it does not.
-    pub median_depth: Buffer,
     /// [4 + d + 1, H, W]: the loss's gradient by `planes` and, last, by alpha. Zero at first; a loss overwrites the planes
     /// it uses. Read by the backward pass.
     pub planes_grad: Buffer,

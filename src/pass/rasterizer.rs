@@ -127,7 +127,6 @@ impl Rasterizer {
             feature_dim,
             planes: device.buffer::<f32>("planes", planes * pixels)?,
             transmittance: device.buffer::<f32>("transmittance", pixels)?,
-            median_depth: device.buffer::<f32>("median_depth", pixels)?,
             planes_grad: device.buffer::<f32>("planes_grad", (planes + 1) * pixels)?,
             camera_grad: device.buffer::<f32>("camera_grad", 10)?,
             status: device.buffer::<u32>("status", 2)?,
