@@ -147,7 +147,7 @@ fn parts(device: &Device, run: &dyn Steps, budget: &Budget, section: &mut Sectio
 fn counts(device: &Device, run: &dyn Steps, roofline: &Roofline, section: &mut Section) -> Result<()> {
     let p = run.parts();
     let frame = p.raster.frame();
-    let intersections = f64::from(frame.status.read::<u32>()?[0]);
+    let intersections = f64::from(frame.status.read()?[0]);
     let [evaluated, blended] = pairs::count(device, p.raster)?;
     let seconds = section.row(STEP).map_or(f64::NAN, |r| r.ms.median / 1e3);
     let pixels = f64::from(frame.width) * f64::from(frame.height);

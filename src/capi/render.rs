@@ -76,7 +76,7 @@ unsafe fn render(
     for (buffer, wanted) in packed.into_iter().zip(&wanted) {
         match wanted.place {
             Place::Host(memory) => {
-                let bytes = buffer.read::<u8>()?;
+                let bytes = buffer.cast::<u8>().read()?;
                 // SAFETY: `wanted` has checked that the host's memory is that long.
                 unsafe { std::ptr::copy_nonoverlapping(bytes.as_ptr(), memory, bytes.len()) };
             }
@@ -101,10 +101,10 @@ unsafe fn render(
 }
 
 /// One buffer per output, of exactly its bytes.
-fn pack_all(live: &mut LiveScene, camera: &Camera, wanted: &[Wanted]) -> Result<Vec<Buffer>, Fault> {
+fn pack_all(live: &mut LiveScene, camera: &Camera, wanted: &[Wanted]) -> Result<Vec<Buffer<u32>>, Fault> {
     let device = live.device().clone();
     // Answers first: they render on their own where the camera is new, and the frame below must be the last one.
-    let mut packed: Vec<Option<Buffer>> = Vec::with_capacity(wanted.len());
+    let mut packed: Vec<Option<Buffer<u32>>> = Vec::with_capacity(wanted.len());
     for w in wanted {
         packed.push(match &w.what {
             What::Frame(_) => None,
@@ -113,9 +113,9 @@ fn pack_all(live: &mut LiveScene, camera: &Camera, wanted: &[Wanted]) -> Result<
                 Some(match w.encoding {
                     Encoding::F32x4 => {
                         let texels: Vec<[f32; 4]> = map.iter().map(|v| [*v, 0.0, 0.0, 0.0]).collect();
-                        device.buffer_from("relevancy", &texels)?
+                        device.buffer_from("relevancy", &texels)?.cast()
                     }
-                    _ => device.buffer_from("relevancy", &map)?,
+                    _ => device.buffer_from("relevancy", &map)?.cast(),
                 })
             }
         });

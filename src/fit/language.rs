@@ -137,8 +137,8 @@ pub(crate) struct Run<'a> {
     pub(super) views: Views,
     cameras: &'a [Camera],
     targets: CodeTargets,
-    losses: Vec<Buffer>,
-    partials: Buffer,
+    losses: Vec<Buffer<f32>>,
+    partials: Buffer<f32>,
     programs: Vec<Option<Program>>,
     order: ViewOrder,
     recent: Vec<f64>,
@@ -326,7 +326,7 @@ impl<'a> Run<'a> {
                     let Some(labels) = level.targets.get(view) else { continue };
                     let labels = frame.bands.cut_inner(band, &labels.data, -1);
                     let first = (4 + l * width) * pixels;
-                    let block = frame.planes.read_range::<f32>(first..first + width * pixels)?;
+                    let block = frame.planes.read_range(first..first + width * pixels)?;
                     let [right, valid] = decoded_right(level, &labels, &block);
                     counts[l][0] += right;
                     counts[l][1] += valid;
@@ -345,7 +345,7 @@ impl<'a> Run<'a> {
     fn finish(&mut self) -> Result<(Splats, Vec<Vec<f32>>)> {
         let splats = self.model.splats()?;
         let (levels, d) = (self.levels.len(), self.width);
-        let mut all = self.model.values.features.read_range::<f32>(0..splats.len() * levels * d)?;
+        let mut all = self.model.values.features.read_range(0..splats.len() * levels * d)?;
         if !all.iter().all(|v| v.is_finite()) {
             return Err(Error::work("the language stage produced features that are not finite"));
         }

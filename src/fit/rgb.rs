@@ -351,7 +351,7 @@ impl<'a> Run<'a> {
         let Some(poses) = self.options.poses.filter(|p| view > 0 && iteration >= p.start) else {
             return Ok(());
         };
-        let g = self.views.stage(view).raster.frame().camera_grad.read::<f32>()?;
+        let g = self.views.stage(view).raster.frame().camera_grad.read()?;
         let twist = [g[0], g[1], g[2], g[3], g[4], g[5]].map(f64::from);
         let rate = poses.rate.at(iteration);
         let pose = &mut self.cameras[view].pose;
@@ -394,7 +394,7 @@ impl<'a> Run<'a> {
         if every == 0 || step < self.options.prune_from || !step.is_multiple_of(every) {
             return Ok(());
         }
-        let logits = self.model.values.opacity_logits.read_range::<f32>(0..self.model.count())?;
+        let logits = self.model.values.opacity_logits.read_range(0..self.model.count())?;
         let rows = compact::kept(&logits, self.options.prune_opacity);
         if rows.is_empty() {
             return Err(Error::work(format!(

@@ -21,14 +21,28 @@
 //!     [2, 1, 1],
 //! );
 //! rec.run()?;
-//! assert_eq!(to.read::<u32>()?, [30, 10]);
+//! assert_eq!(to.read()?, [30, 10]);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! A buffer of another element does not compile:
+//!
+//! ```compile_fail,E0308
+//! # fn main() -> splatvk::Result<()> {
+//! # use splatvk::gpu::{Device, shaders};
+//! # let device = Device::open(None)?;
+//! # let index = device.buffer_from("index", &[2u32, 0])?;
+//! # let to = device.buffer::<u32>("to", 2)?;
+//! let from = device.buffer_from("from", &[10.0f32, 20.0, 30.0])?;
+//! let bindings = shaders::gather::Bindings { index: &index, from: &from, to: &to };
 //! # Ok(())
 //! # }
 //! ```
 //!
 //! # What build.rs generates for `glsl/NAME.comp` (only storage buffers in set 0 and push constants are allowed)
-//! - `shaders::NAME::Bindings<'a> { block_name: &'a Buffer, .. }`: one field per buffer block, the block's name in snake
-//!   case. Read / write access comes from what the compiled code does, bounded by `readonly` / `writeonly`.
+//! - `shaders::NAME::Bindings<'a> { block_name: &'a Buffer<T>, .. }`: one field per buffer block, the block's name in snake
+//!   case; `T` is the scalar or the structure that it holds (see [`Buffer`]). Read / write access comes from what the compiled code does, bounded by `readonly` / `writeonly`.
 //! - `shaders::NAME::Push { .. }`: the push constant block (float, int, uint, vectors, matrices, arrays; at most 128 bytes)
 //!   with natural Rust types; the reflected offsets are applied when it is written, so there is no padding to keep in step.
 //! - `shaders::NAME::call(&Bindings, &Push) -> Call`; without a push block `call(&Bindings)`.
@@ -47,9 +61,9 @@
 //!
 //! # Signatures
 //! - [`Device::open`]`(choice: Option<&str>)`: name part or index; [`Device::info`]; tests use [`test_device`]`()`.
-//! - [`Device::buffer`]`::<T>(name, len)` (zero-filled), [`Device::buffer_from`]`(name, &[T])`; [`Buffer::read`]`::<T>()`,
-//!   [`Buffer::read_range`], [`Buffer::write`]`(&[T])`, [`Buffer::write_at`]`(first, &[T])`. Element types are
-//!   [`bytemuck::Pod`]; lengths count elements. `Buffer` is a cheap clone of a handle.
+//! - [`Device::buffer`]`::<T>(name, len)` (zero-filled), [`Device::buffer_from`]`(name, &[T])`; [`Buffer::read`]`()`,
+//!   [`Buffer::read_range`], [`Buffer::write`]`(&[T])`, [`Buffer::write_at`]`(first, &[T])`, [`Buffer::cast`]`::<U>()`.
+//!   Element types are [`bytemuck::Pod`]; lengths count elements. `Buffer<T>` is a cheap clone of a handle.
 //! - [`Recorder::download`]`(&buffer)` at the end of a recording brings small results to the host with its submission.
 //! - [`Recorder::new`]`(&device, label)`; [`Recorder::fill`]`(&buffer, u32)`, [`Recorder::copy`]`(&from, &to)`,
 //!   [`Recorder::dispatch`]`(call, groups)`, [`Recorder::dispatch_threads`]`(call, threads)`,

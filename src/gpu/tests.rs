@@ -34,8 +34,8 @@ fn check_scans(device: &Device) {
     program.run().unwrap();
     // 0, 1, 2, .. after the first scan; their sums 0, 0, 1, 3, 6, .. after the second.
     let expected: Vec<u32> = (0..512u32).map(|i| i * i.saturating_sub(1) / 2).collect();
-    assert_eq!(sums.read::<u32>().unwrap(), expected);
-    assert_eq!(total.read::<u32>().unwrap(), [512 * 511 / 2]);
+    assert_eq!(sums.read().unwrap(), expected);
+    assert_eq!(total.read().unwrap(), [512 * 511 / 2]);
 }
 
 #[test]
@@ -55,11 +55,11 @@ fn staged_buffers_behave_like_mapped_ones() {
     assert!(!device.info().mapped);
     check_scans(&device);
     let buffer = device.buffer::<u32>("numbers", 5).unwrap();
-    assert_eq!(buffer.read::<u32>().unwrap(), [0; 5]);
+    assert_eq!(buffer.read().unwrap(), [0; 5]);
     buffer.write_at(3, &[7u32, 8]).unwrap();
     buffer.write(&[1u32]).unwrap();
-    assert_eq!(buffer.read::<u32>().unwrap(), [1, 0, 0, 7, 8]);
-    assert_eq!(buffer.read_range::<u16>(6..7).unwrap(), [7]);
+    assert_eq!(buffer.read().unwrap(), [1, 0, 0, 7, 8]);
+    assert_eq!(buffer.cast::<u16>().read_range(6..7).unwrap(), [7]);
 }
 
 fn staged() -> TestDevice {
@@ -82,17 +82,17 @@ fn transfers_wait_for_a_submission_and_share_it() {
     let program = rec.compile().unwrap();
     program.run().unwrap();
     let expected: Vec<u32> = [vec![1; 100], vec![2; 500], vec![3; 400]].concat();
-    assert_eq!(b.read::<u32>().unwrap(), expected);
+    assert_eq!(b.read().unwrap(), expected);
     assert_eq!(device.submissions(), 1);
     // A change makes the copy on the host worthless, whoever made it.
     b.write(&[7u32]).unwrap();
-    assert_eq!(b.read_range::<u32>(0..2).unwrap(), [7, 1]);
+    assert_eq!(b.read_range(0..2).unwrap(), [7, 1]);
     assert_eq!(device.submissions(), 2);
     program.run().unwrap();
     let mut rec = Recorder::new(&device, "fill");
     rec.fill(&b, 5);
     rec.run().unwrap();
-    assert_eq!(b.read::<u32>().unwrap(), [5; 1000]);
+    assert_eq!(b.read().unwrap(), [5; 1000]);
     assert_eq!(device.submissions(), 5);
 }
 
@@ -102,12 +102,12 @@ fn large_transfers_go_in_pieces() {
     let count = (2 * super::staging::MOST as usize + 4096) / 4;
     let values: Vec<u32> = (0..count as u32).map(|i| i.wrapping_mul(2654435761)).collect();
     let buffer = device.buffer_from("large", &values).unwrap();
-    assert!(buffer.read::<u32>().unwrap() == values);
+    assert!(buffer.read().unwrap() == values);
     // Two full pieces on the way there; the rest of it goes with the first of three on the way back.
     assert_eq!(device.submissions(), 5);
     let again = || {
         buffer.write(&values).unwrap();
-        assert!(buffer.read::<u32>().unwrap() == values);
+        assert!(buffer.read().unwrap() == values);
         device.memory().allocations
     };
     // Once more, until both ways have memory of that size.
@@ -126,7 +126,7 @@ fn buffers_may_go_while_another_thread_submits_their_writes() {
         for i in 0..2000u32 {
             let buffer = device.buffer_from("short-lived", &[i; 64]).unwrap();
             if i % 100 == 0 {
-                assert_eq!(buffer.read::<u32>().unwrap(), [i; 64]);
+                assert_eq!(buffer.read().unwrap(), [i; 64]);
             }
         }
         runs.join().unwrap();
@@ -137,11 +137,13 @@ fn buffers_may_go_while_another_thread_submits_their_writes() {
 fn buffers_check_their_bounds_and_sizes() {
     let device = test_device();
     let buffer = device.buffer_from("five", &[1u8, 2, 3, 4, 5]).unwrap();
-    assert_eq!(buffer.read::<u8>().unwrap(), [1, 2, 3, 4, 5]);
-    assert!(buffer.read::<u32>().unwrap_err().to_string().contains("`five`"));
+    assert_eq!((buffer.len(), buffer.read().unwrap()), (5, vec![1, 2, 3, 4, 5]));
+    let words = buffer.cast::<u32>();
+    assert_eq!((words.len(), words.read_range(0..1).unwrap()), (1, vec![u32::from_le_bytes([1, 2, 3, 4])]));
+    assert!(words.read().unwrap_err().to_string().contains("`five`"));
     assert!(buffer.write_at(4, &[1u8, 2]).is_err());
-    assert!(buffer.read_range::<u8>(4..6).is_err());
-    assert!(device.buffer::<f32>("empty", 0).unwrap().read::<f32>().unwrap().is_empty());
+    assert!(buffer.read_range(4..6).is_err());
+    assert!(device.buffer::<f32>("empty", 0).unwrap().read().unwrap().is_empty());
     let too_long = device.info().max_storage_range as usize + 1;
     let message = device.buffer::<u8>("huge", too_long).unwrap_err().to_string();
     assert!(message.contains("huge") && message.contains("MiB"), "{message}");
@@ -156,8 +158,8 @@ fn copies_and_timestamps() {
     rec.copy(&a, &b);
     rec.copy_bytes(&b, 4, &a, 0, 8);
     let times = rec.run_timed().unwrap();
-    assert_eq!(a.read::<u32>().unwrap(), [2, 3, 3, 4]);
-    assert_eq!(b.read::<u32>().unwrap(), [1, 2, 3, 4, 0, 0]);
+    assert_eq!(a.read().unwrap(), [2, 3, 3, 4]);
+    assert_eq!(b.read().unwrap(), [1, 2, 3, 4, 0, 0]);
     assert_eq!(times.len(), 2);
     assert_eq!(times[0].0, "copy a to b");
     assert!(times.iter().all(|(_, ms)| (0.0..10_000.0).contains(ms)), "{times:?}");
@@ -180,7 +182,7 @@ fn indirect_dispatch_reads_its_size_on_the_device() {
     rec.dispatch_indirect(call, &args, 4);
     rec.run().unwrap();
     let reached = 2 * shaders::gather::WORKGROUP[0] as usize;
-    let out = out.read::<u32>().unwrap();
+    let out = out.read().unwrap();
     assert!(out[..reached].iter().all(|&v| v == 1));
     assert!(out[reached..].iter().all(|&v| v == 0));
 }

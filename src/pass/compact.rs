@@ -2,6 +2,7 @@
 use super::adam::rows_of_groups;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
+use bytemuck::Pod;
 
 /// Indices of the splats whose opacity is finite and at least `min_opacity`, in order.
 pub fn kept(opacity_logits: &[f32], min_opacity: f32) -> Vec<u32> {
@@ -14,24 +15,25 @@ pub fn kept(opacity_logits: &[f32], min_opacity: f32) -> Vec<u32> {
         .collect()
 }
 
-/// A buffer with the rows `index` of `from`, each `stride` 32-bit words.
-pub fn gather(
+/// A buffer with the rows `index` of `from`, each `stride` elements of 32 bits.
+pub fn gather<T: Pod>(
     device: &Device,
     name: &'static str,
-    from: &Buffer,
-    index: &Buffer,
+    from: &Buffer<T>,
+    index: &Buffer<u32>,
     rows: usize,
     stride: usize,
-) -> Result<Buffer> {
+) -> Result<Buffer<T>> {
+    const { assert!(size_of::<T>() == 4) };
     let to = device.buffer::<u32>(name, (rows * stride).max(1))?;
     let mut rec = Recorder::new(device, "gather");
     let call = shaders::gather::call(
-        &shaders::gather::Bindings { index, from, to: &to },
+        &shaders::gather::Bindings { index, from: &from.cast(), to: &to },
         &shaders::gather::Push { rows: rows as u32, stride: stride as u32 },
     );
     rec.dispatch(call, rows_of_groups(rows * stride));
     rec.run()?;
-    Ok(to)
+    Ok(to.cast())
 }
 
 /// The CPU twin of [`gather`].
@@ -57,7 +59,7 @@ mod tests {
             let rows: Vec<f32> = (0..1003 * stride).map(|_| random.normal() as f32).collect();
             let from = device.buffer_from("rows", &rows).unwrap();
             let to = gather(&device, "compacted", &from, &index_buffer, index.len(), stride).unwrap();
-            assert_eq!(to.read::<f32>().unwrap(), gather_rows(&rows, &index, stride));
+            assert_eq!(to.read().unwrap(), gather_rows(&rows, &index, stride));
         }
     }
 

@@ -11,7 +11,7 @@ const PIXELS_PER_GROUP: u32 = WORKGROUP[0] * PIXELS;
 
 /// The codes of one level on the device.
 pub struct Codes {
-    buffer: Buffer,
+    buffer: Buffer<f32>,
     count: u32,
     dim: u32,
     width: u32,
@@ -38,11 +38,11 @@ impl Codes {
     pub fn record(
         &self,
         rec: &mut Recorder,
-        features: &Buffer,
+        features: &Buffer<f32>,
         first_plane: u32,
-        transmittance: &Buffer,
+        transmittance: &Buffer<f32>,
         pixels: u32,
-        decoded: &Buffer,
+        decoded: &Buffer<i32>,
     ) {
         let planes = u64::from(first_plane + self.dim);
         if features.bytes() < planes * u64::from(pixels) * 4 {
@@ -169,8 +169,9 @@ mod tests {
         assert!(Codes::upload(&device, &[0.0; 66], 33).is_err());
         let codes = Codes::upload(&device, &[1.0, 0.0], 2).unwrap();
         let one = device.buffer::<f32>("one", 4).unwrap();
+        let decoded = device.buffer::<i32>("decoded", 4).unwrap();
         let mut rec = Recorder::new(&device, "decode");
-        codes.record(&mut rec, &one, 0, &one, 4, &one);
+        codes.record(&mut rec, &one, 0, &one, 4, &decoded);
         assert!(rec.run().unwrap_err().to_string().contains("planes"));
     }
 }

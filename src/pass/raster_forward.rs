@@ -9,6 +9,7 @@ use super::frame::{FrameBuffers, Tiles};
 use super::project::Projected;
 use super::view::View;
 use crate::gpu::shaders::shared::cutoffs::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
+use crate::gpu::shaders::structs::CameraView;
 use crate::gpu::{Buffer, Recorder, shaders};
 
 pub use super::channels::BASE_CHANNELS;
@@ -34,7 +35,7 @@ macro_rules! push {
 pub(super) use push;
 
 /// Records the blending of the binned splats into `frame.planes` and `frame.transmittance`.
-pub(super) fn record(rec: &mut Recorder, camera: &Buffer, frame: &FrameBuffers, tiles: &Tiles) {
+pub(super) fn record(rec: &mut Recorder, camera: &Buffer<CameraView>, frame: &FrameBuffers, tiles: &Tiles) {
     for block in blocks(frame.feature_dim as u32) {
         let call = shaders::raster_forward::call(
             shaders::raster_forward::Variant { channels: block.channels },

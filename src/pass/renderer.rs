@@ -132,7 +132,7 @@ impl Renderer {
 
     /// Median camera z of the splats in front of the camera; 1 when there are none.
     fn median_depth(&self, camera: &Camera) -> Result<f64> {
-        let means = self.splats.means.read_range::<f32>(0..3 * self.splats.count)?;
+        let means = self.splats.means.read_range(0..3 * self.splats.count)?;
         let axis = camera.pose.rotation.row(2);
         let depth = |m: &[f32]| {
             axis.x * f64::from(m[0])
@@ -161,13 +161,12 @@ impl Frame {
     pub fn read_band(&mut self, frame: &FrameBuffers, band: &Band) -> Result<()> {
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
         let stride = frame.bands.pixels();
-        let plane =
-            |k: usize| frame.planes.read_range::<f32>(k * stride + stored.start..k * stride + stored.end);
+        let plane = |k: usize| frame.planes.read_range(k * stride + stored.start..k * stride + stored.end);
         for channel in 0..3 {
             let values = plane(channel)?;
             self.rgb.data[inner.clone()].iter_mut().zip(values).for_each(|(out, v)| out[channel] = v);
         }
-        let transmittance = frame.transmittance.read_range::<f32>(stored.clone())?;
+        let transmittance = frame.transmittance.read_range(stored.clone())?;
         let outputs = self.alpha.data[inner.clone()].iter_mut().zip(&mut self.depth.data[inner.clone()]);
         for ((alpha, depth), (t, z)) in outputs.zip(transmittance.into_iter().zip(plane(3)?)) {
             *alpha = 1.0 - t;

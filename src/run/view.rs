@@ -24,7 +24,7 @@ pub struct Viewer {
     /// Per level its first feature channel and its codes; `None` for a level without codes.
     levels: Vec<Option<(usize, Codes)>>,
     /// Decoded codes, of the size of the last view.
-    output: Option<Buffer>,
+    output: Option<Buffer<i32>>,
 }
 
 impl Viewer {
@@ -106,7 +106,7 @@ fn empty(levels: usize, camera: &Camera) -> Vec<Plane<i32>> {
 fn decode(
     device: &Device,
     levels: &[Option<(usize, Codes)>],
-    output: &mut Option<Buffer>,
+    output: &mut Option<Buffer<i32>>,
     frame: &FrameBuffers,
     band: &Band,
     codes: &mut [Plane<i32>],
@@ -124,7 +124,7 @@ fn decode(
         table.record(&mut rec, planes, at, transmittance, pixels, &decoded);
         rec.run()?;
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
-        plane.data[inner].copy_from_slice(&decoded.read_range::<i32>(stored)?);
+        plane.data[inner].copy_from_slice(&decoded.read_range(stored)?);
     }
     *output = Some(decoded);
     Ok(())
