@@ -1,7 +1,7 @@
 //! Writes the Rust side of the shaders.
 use crate::compile::{Family, Module};
 use crate::constants::{self, Constant};
-use crate::reflect::{Access, Binding, Layout, Member, Scalar};
+use crate::reflect::{Access, Binding, Element, Layout, Member, Scalar};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
@@ -102,7 +102,7 @@ fn one(family: &Family) -> Result<String, String> {
     }
     variant_struct(w, family);
     call_function(w, family, &bindings, !push.is_empty());
-    family_static(w, family);
+    family_static(w, family, &bindings);
     let _ = writeln!(w, "}}");
     Ok(out)
 }
@@ -110,8 +110,17 @@ fn one(family: &Family) -> Result<String, String> {
 /// The bindings of all variants together: a variant may leave some out, but a number has one name and a name one number.
 fn union(family: &Family) -> Result<Vec<Binding>, String> {
     let mut all: BTreeMap<u32, Binding> = BTreeMap::new();
-    for binding in family.modules.iter().flat_map(|m| &m.reflection.bindings) {
+    // Modules with native float atomics first: their blocks say what the others keep as bits.
+    let mut modules: Vec<&Module> = family.modules.iter().collect();
+    modules.sort_by_key(|m| m.float_atomics == Some(false));
+    for (module, binding) in modules.iter().flat_map(|m| m.reflection.bindings.iter().map(move |b| (m, b))) {
         let entry = all.entry(binding.number).or_insert_with(|| binding.clone());
+        let pair = (&entry.element, &binding.element);
+        let bits = module.float_atomics == Some(false)
+            && matches!(pair, (Element::Scalar(Scalar::F32), Element::Scalar(Scalar::U32)));
+        if pair.0 != pair.1 && !bits {
+            return Err(format!("`{}` holds different elements in different variants", binding.block));
+        }
         if entry.block != binding.block {
             return Err(format!(
                 "binding {} is both `{}` and `{}`",
@@ -134,9 +143,29 @@ fn bindings_struct(w: &mut String, bindings: &[Binding]) {
     let _ = writeln!(w, "    /// The buffers.\n    #[derive(Clone, Copy)]\n    pub struct Bindings<'a> {{");
     for b in bindings {
         let _ = writeln!(w, "        /// Binding {}, {}.", b.number, words(b.access));
-        let _ = writeln!(w, "        pub {}: &'a Buffer,", snake(&b.block));
+        let element = match &b.element {
+            Element::Scalar(_) => element_name(b),
+            Element::Structure(name) => format!("super::structs::{name}"),
+        };
+        let _ = writeln!(w, "        pub {}: &'a Buffer<{element}>,", snake(&b.block));
     }
     let _ = writeln!(w, "    }}");
+}
+
+/// The element as Rust writes it, a structure by its name alone.
+fn element_name(b: &Binding) -> String {
+    match &b.element {
+        Element::Scalar(scalar) => scalar_name(*scalar).to_owned(),
+        Element::Structure(name) => name.clone(),
+    }
+}
+
+fn scalar_name(scalar: Scalar) -> &'static str {
+    match scalar {
+        Scalar::F32 => "f32",
+        Scalar::I32 => "i32",
+        Scalar::U32 => "u32",
+    }
 }
 
 fn words(access: Access) -> &'static str {
@@ -167,12 +196,7 @@ fn push_struct(w: &mut String, push: &[Member], bytes: u32) {
 }
 
 fn rust_type(m: &Member) -> String {
-    let mut t = match m.scalar {
-        Scalar::F32 => "f32",
-        Scalar::I32 => "i32",
-        Scalar::U32 => "u32",
-    }
-    .to_owned();
+    let mut t = scalar_name(m.scalar).to_owned();
     if m.rows > 1 {
         t = format!("[{t}; {}]", m.rows);
     }
@@ -220,7 +244,7 @@ fn call_function(w: &mut String, family: &Family, bindings: &[Binding], push: bo
     let push_parameter = if push { ", push: &Push" } else { "" };
     let axes: Vec<String> = family.axes.iter().map(|a| format!("variant.{}", a.to_lowercase())).collect();
     let buffers: Vec<String> =
-        bindings.iter().map(|b| format!("({}, bindings.{}.clone())", b.number, snake(&b.block))).collect();
+        bindings.iter().map(|b| format!("({}, bindings.{}.cast())", b.number, snake(&b.block))).collect();
     let push_bytes = if push { "push.bytes().to_vec()" } else { "Vec::new()" };
     let _ = writeln!(w, "    /// One call of the shader, for `Recorder::dispatch`.");
     let _ = writeln!(w, "    pub fn call({variant_parameter}bindings: &Bindings{push_parameter}) -> Call {{");
@@ -232,7 +256,7 @@ fn call_function(w: &mut String, family: &Family, bindings: &[Binding], push: bo
     );
 }
 
-fn family_static(w: &mut String, family: &Family) {
+fn family_static(w: &mut String, family: &Family, all: &[Binding]) {
     let _ = writeln!(w, "    /// All compiled variants.");
     let _ = writeln!(
         w,
@@ -260,7 +284,8 @@ fn family_static(w: &mut String, family: &Family) {
             .map(|b| {
                 let Access { read, write } = b.access;
                 let name = snake(&b.block);
-                format!("Binding {{ number: {}, name: {name:?}, access: Access {{ read: {read}, write: {write} }} }}", b.number)
+                let element = all.iter().find(|a| a.number == b.number).map(element_name).unwrap_or_default();
+                format!("Binding {{ number: {}, name: {name:?}, access: Access {{ read: {read}, write: {write} }}, element: {element:?} }}", b.number)
             })
             .collect();
         let _ = writeln!(w, "            bindings: &[{}],", bindings.join(", "));

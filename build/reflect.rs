@@ -17,6 +17,16 @@ pub struct Binding {
     /// The block name in the GLSL file.
     pub block: String,
     pub access: Access,
+    pub element: Element,
+}
+
+/// What a block holds, one or many.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Element {
+    /// The scalar of scalars, vectors and arrays of them.
+    Scalar(Scalar),
+    /// A structure, by its name.
+    Structure(String),
 }
 
 /// Scalar kinds that members may hold.
@@ -272,7 +282,28 @@ impl Reader {
             read: used.read && !declared(NON_READABLE),
             write: used.write && !declared(NON_WRITABLE),
         };
-        Ok(Binding { number, block: name, access })
+        let &[member] = members.as_slice() else {
+            return Err(format!(
+                "`{name}` has several members: give each its own block, or make them a structure"
+            ));
+        };
+        let element = self
+            .element(member)
+            .ok_or_else(|| format!("`{name}` holds neither 32-bit scalars nor a structure"))?;
+        Ok(Binding { number, block: name, access, element })
+    }
+
+    /// The scalar or structure under arrays and vectors.
+    fn element(&self, kind: u32) -> Option<Element> {
+        match self.types.get(&kind)? {
+            Type::Scalar(scalar) => Some(Element::Scalar(*scalar)),
+            Type::Vector(inner, _)
+            | Type::Matrix(inner, _)
+            | Type::Array(inner, _)
+            | Type::RuntimeArray(inner) => self.element(*inner),
+            Type::Struct(_) => Some(Element::Structure(self.names.get(&kind)?.clone())),
+            Type::Pointer(_) | Type::Other => None,
+        }
     }
 
     /// The structure in a block whose one member is a structure or an array of them.

@@ -1,5 +1,5 @@
 #version 450
-// Code per pixel: k* = argmax_k F.c_k, ties to the lowest k, with the margin to the second best. -1 where alpha < VOID_ALPHA,
+// Code per pixel: k* = argmax_k F.c_k, ties to the lowest k. -1 where alpha < VOID_ALPHA,
 // and where |F| < SPOKEN_SHARE alpha: splats without features are what the pixel shows.
 // Twin: pass::decode::decode_pixels.
 // variants: DIM=4,8,16,32
@@ -19,7 +19,6 @@ layout(std430, binding = 0) readonly buffer Features { float features[]; };  // 
 layout(std430, binding = 1) readonly buffer Transmittance { float transmittance[]; }; // [P]
 layout(std430, binding = 2) readonly buffer Codes { vec4 codes[]; };         // [K, DIM / 4], zero padded
 layout(std430, binding = 3) writeonly buffer Decoded { int decoded[]; };     // [P]
-layout(std430, binding = 4) writeonly buffer Margin { float margin[]; };     // [P]
 // The features are planes first_plane .. first_plane + dim.
 layout(push_constant) uniform Push { uint pixels; uint count; uint dim; uint first_plane; };
 
@@ -38,11 +37,9 @@ void main() {
     }
     const float LOWEST = -3.4e38;
     float best[PIXELS];
-    float second[PIXELS];
     int chosen[PIXELS];
     [[unroll]] for (uint j = 0u; j < PIXELS; j++) {
         best[j] = LOWEST;
-        second[j] = LOWEST;
         chosen[j] = -1;
     }
     for (uint k = 0u; k < count; k++) {
@@ -53,7 +50,6 @@ void main() {
             [[unroll]] for (uint q = 0u; q < QUADS; q++) sums += code[q] * feature[j * QUADS + q];
             float score = sums.x + sums.y + sums.z + sums.w;
             bool better = score > best[j];
-            second[j] = max(second[j], better ? best[j] : score);
             best[j] = better ? score : best[j];
             chosen[j] = better ? int(k) : chosen[j];
         }
@@ -67,13 +63,10 @@ void main() {
                 norm2 += q * 4u + c < dim ? f * f : 0.0;
             }
         float norm = sqrt(norm2);
-        // A lone code competes with the least a product can be.
-        float rival = count > 1u ? second[j] : -norm;
         if (pixel < pixels) {
             float alpha = 1.0 - transmittance[pixel];
             bool shown = alpha >= VOID_ALPHA && norm >= SPOKEN_SHARE * alpha;
             decoded[pixel] = shown ? chosen[j] : -1;
-            margin[pixel] = shown && norm > 0.0 && count > 0u ? (best[j] - rival) / norm : 0.0;
         }
     }
 }

@@ -1,6 +1,5 @@
 #version 460
-// Rows of a [N, stride] array by index: to[i] = from[index[i]]; index 0xffffffff makes a row of zeros.
-// Serves pruning and compaction for parameters and for optimiser state alike.
+// Rows of a [N, stride] array by index: to[i] = from[index[i]]. Serves pruning for parameters and for optimiser state alike.
 layout(local_size_x = 256) in;
 layout(std430, binding = 0) readonly buffer Index { uint index[]; };
 layout(std430, binding = 1) readonly buffer From { uint from[]; };
@@ -11,6 +10,5 @@ void main() {
     uint i = (gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x) * 256u + gl_LocalInvocationID.x;
     if (i >= rows * stride) return;
     uint row = i / stride;
-    uint source = index[row];
-    to[i] = source == 0xffffffffu ? 0u : from[source * stride + (i - row * stride)];
+    to[i] = from[index[row] * stride + (i - row * stride)];
 }

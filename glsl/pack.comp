@@ -1,6 +1,6 @@
 #version 450
 // Planes of a rendered frame to texels as hosts want them. Twin: pass::pack.
-layout(local_size_x = 128) in; // as relevancy_map.comp
+layout(local_size_x = 128) in;
 
 layout(std430, binding = 0) readonly buffer Planes { float planes[]; };              // [C, stride]
 layout(std430, binding = 1) readonly buffer Transmittance { float transmittance[]; }; // [stride]

@@ -18,7 +18,6 @@ layout(std430, binding = 4) readonly buffer Codes { vec4 codes[]; };            
 layout(std430, binding = 5) writeonly buffer Planes { float planes[]; };          // [4 + d, H, W]
 #if CHANNELS != 16
 layout(std430, binding = 6) writeonly buffer Transmittance { float transmittances[]; }; // [H, W]
-layout(std430, binding = 7) writeonly buffer MedianDepth { float median_depths[]; };    // [H, W]
 #endif
 // `planes` hold `rows` rows of the image, from row `top` on. The dispatch begins at row `first_row` of the image's tiles,
 // the lists at row `list_row`. Features of this block start at vector first_vector of a splat's code and fill `features` planes from
@@ -40,11 +39,10 @@ void main() {
     uint first = tile_ranges[tile], last = tile_ranges[tile + 1];
 
     // Negative T marks a pixel that has stopped; pixels beyond the border never start.
-    float T[PIXELS], sum[CHANNELS * PIXELS], median[PIXELS];
+    float T[PIXELS], sum[CHANNELS * PIXELS];
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
         T[k] = x < width && y < bottom ? 1.0 : -1.0;
-        median[k] = 0.0;
     }
     [[unroll]] for (int k = 0; k < CHANNELS * PIXELS; k++) sum[k] = 0.0;
 
@@ -55,9 +53,6 @@ void main() {
             float dx0 = subgroupShuffle(own_u, i) - origin.x, dy0 = subgroupShuffle(own_v, i) - origin.y;
             float a = subgroupShuffle(own_a, i), b = subgroupShuffle(own_b, i), c = subgroupShuffle(own_c, i);
             float log2_opacity = subgroupShuffle(own_log2_opacity, i);
-#if BASE
-            float depth = subgroupShuffle(own_value[3], i);
-#endif
             float weight[PIXELS];
             [[unroll]] for (int n = 0; n < COLUMNS; n++) {
                 float dx = dx0 - float(n * LANES_X);
@@ -70,9 +65,6 @@ void main() {
                     float w = alpha * T[k], next = T[k] - w;
                     bool stop = next < TRANSMITTANCE_MIN;
                     weight[k] = stop ? 0.0 : w;
-#if BASE
-                    median[k] = T[k] >= 0.5 && next < 0.5 ? depth : median[k];
-#endif
                     T[k] = stop ? -abs(T[k]) : next;
                 }
             }
@@ -97,7 +89,6 @@ void main() {
             planes[2 * pixels + pixel] = sum[2 * PIXELS + k] + background.b;
             planes[3 * pixels + pixel] = sum[3 * PIXELS + k];
             transmittances[pixel] = abs(T[k]);
-            median_depths[pixel] = median[k];
 #endif
             [[unroll]] for (int channel = CHANNELS - FEATURES; channel < CHANNELS; channel++)
                 if (channel - (CHANNELS - FEATURES) < features)

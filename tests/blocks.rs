@@ -36,7 +36,7 @@ fn in_bands(
     let mut image = vec![f32::NAN; (4 + scene.dim) * pixels];
     // Also grows the lists.
     let seen = |frame: &splatvk::pass::FrameBuffers, band: &splatvk::pass::bands::Band| {
-        let planes = frame.planes.read::<f32>()?;
+        let planes = frame.planes.read()?;
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
         for (to, from) in image.chunks_exact_mut(pixels).zip(planes.chunks_exact(frame.bands.pixels())) {
             to[inner.clone()].copy_from_slice(&from[stored.clone()]);

@@ -238,7 +238,6 @@ fn renderer_returns_the_planes_as_maps() {
         let (x, y) = (p % 75, p / 75);
         assert_eq!(frame.rgb.at(x, y)[1], out.planes[pixels + p]);
         assert_eq!(frame.alpha.at(x, y), 1.0 - out.transmittance[p]);
-        assert_eq!(frame.median_depth.at(x, y), out.median_depth[p]);
         assert_eq!(frame.features[3 * p + 2], out.planes[(BASE_CHANNELS + 2) * pixels + p]);
         let alpha = 1.0 - out.transmittance[p];
         let depth = if alpha >= 0.5 { out.planes[3 * pixels + p] / alpha } else { 0.0 };

@@ -55,9 +55,60 @@ fn access_follows_from_the_code() {
         let binding = family.modules[0].bindings.iter().find(|b| b.name == name).unwrap();
         (binding.access.read, binding.access.write)
     };
-    assert_eq!(access("relevancy_map", "codes"), (true, false));
-    assert_eq!(access("relevancy_map", "relevancy"), (false, true));
-    assert_eq!(access("scatter_sum", "sums"), (true, true));
+    assert_eq!(access("gather", "from"), (true, false));
+    assert_eq!(access("gather", "to"), (false, true));
+    assert_eq!(access("scan_lanes", "sums"), (true, true));
+    assert_eq!(access("raster_backward", "projected_grad"), (true, true));
+}
+
+/// What a block of a module holds: a scalar's name, or the bytes of a structure.
+fn element_of(module: &naga::Module, block: naga::Handle<naga::Type>) -> String {
+    use naga::{ScalarKind, TypeInner};
+    let TypeInner::Struct { members, .. } = &module.types[block].inner else { return "no block".to_owned() };
+    assert_eq!(members.len(), 1, "a block has one member");
+    let mut kind = members[0].ty;
+    loop {
+        match &module.types[kind].inner {
+            TypeInner::Array { base, .. } => kind = *base,
+            TypeInner::Struct { span, .. } => return format!("{span} bytes"),
+            TypeInner::Scalar(s) | TypeInner::Atomic(s) | TypeInner::Vector { scalar: s, .. } => {
+                let letter = match s.kind {
+                    ScalarKind::Float => "f",
+                    ScalarKind::Sint => "i",
+                    ScalarKind::Uint => "u",
+                    _ => "?",
+                };
+                return format!("{letter}{}", 8 * s.width);
+            }
+            other => return format!("{other:?}"),
+        }
+    }
+}
+
+/// `Binding::element` and the type of the field in `Bindings` are written by build.rs from one value.
+#[test]
+fn elements_are_what_the_modules_read() {
+    let structures = [
+        ("CameraView", size_of::<shaders::structs::CameraView>()),
+        ("Source", size_of::<shaders::structs::Source>()),
+    ];
+    let mut kinds = std::collections::BTreeSet::new();
+    for module in modules() {
+        let parsed = spv::parse_u8_slice(module.spirv, &spv::Options::default()).unwrap();
+        for (_, variable) in parsed.global_variables.iter() {
+            let Some(place) = &variable.binding else { continue };
+            let binding = module.bindings.iter().find(|b| b.number == place.binding).unwrap();
+            let found = element_of(&parsed, variable.ty);
+            let structure = structures.iter().find(|s| s.0 == binding.element);
+            let expected = structure.map_or(binding.element.to_owned(), |s| format!("{} bytes", s.1));
+            // Without native float atomics, the bits of floats.
+            let bits =
+                module.float_atomics == Some(false) && (binding.element, found.as_str()) == ("f32", "u32");
+            assert!(found == expected || bits, "{}: `{}` holds {found}", module.name, binding.name);
+            kinds.insert(binding.element);
+        }
+    }
+    assert_eq!(kinds.into_iter().collect::<Vec<_>>(), ["CameraView", "Source", "f32", "i32", "u32"]);
 }
 
 /// Every `const NAME: TYPE = VALUE;` of the Rust sources.

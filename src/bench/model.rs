@@ -60,7 +60,7 @@ impl PassWork {
             "depth sort" => (n * 2.0 * PAIR * SORT_PASSES, 0.0),
             "binning" => (n * (PAIR + 24.0) + 4.0 * intersections, 30.0 * intersections),
             "raster forward" => {
-                (listed + 4.0 * pixels * (channels + 2.0), blended * (WEIGH + 2.0 * channels))
+                (listed + 4.0 * pixels * (channels + 1.0), blended * (WEIGH + 2.0 * channels))
             }
             // Seven separable blurs of 11 taps per value and 40 operations for SSIM and its derivatives.
             "SSIM + L1" => (3.0 * pixels * 12.0, 3.0 * pixels * (7.0 * 44.0 + 40.0)),

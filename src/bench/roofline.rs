@@ -27,8 +27,8 @@ fn copy(device: &Device, budget: &Budget, section: &mut Section) -> Result<f64> 
     let mib = if device.info().is_cpu { 64 } else { 256 };
     let limit = device.info().max_storage_range as usize;
     let vectors = (mib << 16).min(limit / 16).next_multiple_of(256 * COPY_STEPS);
-    let from = device.buffer::<[f32; 4]>("copy source", vectors)?;
-    let to = device.buffer::<[f32; 4]>("copy target", vectors)?;
+    let from = device.buffer::<f32>("copy source", 4 * vectors)?;
+    let to = device.buffer::<f32>("copy target", 4 * vectors)?;
     let record = || {
         let mut rec = Recorder::new(device, "copy bandwidth");
         rec.pass("copy by shader");
@@ -92,8 +92,8 @@ mod tests {
         let bindings = shaders::bench_fma::Bindings { values: &values };
         rec.dispatch(shaders::bench_fma::call(&bindings), [1, 1, 1]);
         rec.run().unwrap();
-        assert_eq!(to.read::<f32>().unwrap(), from.read::<f32>().unwrap());
+        assert_eq!(to.read().unwrap(), from.read().unwrap());
         // x ← x/2 + 1/4 converges to 1/2 in each of the 16 chains.
-        assert!(values.read::<f32>().unwrap().iter().all(|v| (v - 8.0).abs() < 1e-5));
+        assert!(values.read().unwrap().iter().all(|v| (v - 8.0).abs() < 1e-5));
     }
 }

@@ -19,8 +19,8 @@ pub fn measure(device: &Device, keys: usize, limits: (&Budget, &Roofline)) -> Re
     let (budget, roofline) = limits;
     let mut random = Random::new(1);
     let pairs: Vec<[u32; 2]> = (0..keys as u32).map(|i| [random.bits() as u32, i]).collect();
-    let unsorted = device.buffer_from("unsorted", &pairs)?;
-    let sorted = device.buffer::<[u32; 2]>("sorted", keys)?;
+    let unsorted = device.buffer_from("unsorted", pairs.as_flattened())?;
+    let sorted = device.buffer::<u32>("sorted", 2 * keys)?;
     let count = device.buffer_from("count", &[keys as u32])?;
     let sort = Sort::new(device, keys)?;
     let record = || {
@@ -33,7 +33,8 @@ pub fn measure(device: &Device, keys: usize, limits: (&Budget, &Roofline)) -> Re
     };
     let mut section = Section::new("radix sort", format!("{keys} random 32-bit keys with 32-bit values"));
     section.passes(device, &record, budget)?;
-    let result = sorted.read::<[u32; 2]>()?;
+    let result = sorted.read()?;
+    let (result, _) = result.as_chunks::<2>();
     let in_order = result.windows(2).all(|w| w[0][0] <= w[1][0]);
     if !in_order || result.iter().any(|[key, value]| pairs[*value as usize][0] != *key) {
         return Err(Error::gpu(format!("{}: the radix sort of {keys} keys is wrong", device.info().name)));

@@ -149,7 +149,7 @@ fn parts(device: &Device, run: &impl Training, budget: &Budget, section: &mut Se
 fn counts(device: &Device, run: &impl Training, roofline: &Roofline, section: &mut Section) -> Result<()> {
     let p = run.trainer().parts();
     let frame = p.raster.frame();
-    let intersections = f64::from(frame.status.read::<u32>()?[0]);
+    let intersections = f64::from(frame.status.read()?[0]);
     let [evaluated, blended] = pairs::count(device, p.raster)?;
     let seconds = section.row(STEP).map_or(f64::NAN, |r| r.ms.median / 1e3);
     let pixels = f64::from(frame.width) * f64::from(frame.height);

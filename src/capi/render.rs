@@ -76,7 +76,7 @@ unsafe fn render(
     for (buffer, wanted) in packed.into_iter().zip(&wanted) {
         match wanted.place {
             RenderDestination::Host(memory) => {
-                let bytes = buffer.read::<u8>()?;
+                let bytes = buffer.cast::<u8>().read()?;
                 // SAFETY: `wanted` has checked that the host's memory is that long.
                 unsafe { std::ptr::copy_nonoverlapping(bytes.as_ptr(), memory, bytes.len()) };
             }
@@ -105,10 +105,10 @@ fn pack_all(
     live: &mut LiveScene,
     camera: &Camera,
     wanted: &[RenderRequest],
-) -> Result<Vec<Buffer>, CallError> {
+) -> Result<Vec<Buffer<u32>>, CallError> {
     let device = live.device().clone();
     // Answers first: they render on their own where the camera is new, and the frame below must be the last one.
-    let mut packed: Vec<Option<Buffer>> = Vec::with_capacity(wanted.len());
+    let mut packed: Vec<Option<Buffer<u32>>> = Vec::with_capacity(wanted.len());
     for w in wanted {
         packed.push(match &w.what {
             RenderContent::Frame(_) => None,
@@ -117,9 +117,9 @@ fn pack_all(
                 Some(match w.encoding {
                     Encoding::F32x4 => {
                         let texels: Vec<[f32; 4]> = map.iter().map(|v| [*v, 0.0, 0.0, 0.0]).collect();
-                        device.buffer_from("relevancy", &texels)?
+                        device.buffer_from("relevancy", &texels)?.cast()
                     }
-                    _ => device.buffer_from("relevancy", &map)?,
+                    _ => device.buffer_from("relevancy", &map)?.cast(),
                 })
             }
         });

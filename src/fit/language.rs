@@ -113,8 +113,8 @@ pub(crate) struct Run<'a> {
     width: usize,
     extent: f64,
     targets: CodeTargets,
-    losses: Vec<Buffer>,
-    partials: Buffer,
+    losses: Vec<Buffer<f32>>,
+    partials: Buffer<f32>,
     /// Losses since the last measurement.
     recent: Vec<f64>,
     curve: Vec<LanguagePoint>,
@@ -192,7 +192,7 @@ impl<'a> Run<'a> {
                     let Some(labels) = level.targets.get(view) else { continue };
                     let labels = frame.bands.cut_inner(band, &labels.data, -1);
                     let first = (4 + l * width) * pixels;
-                    let block = frame.planes.read_range::<f32>(first..first + width * pixels)?;
+                    let block = frame.planes.read_range(first..first + width * pixels)?;
                     let [right, valid] = decoded_right(level, &labels, &block);
                     counts[l][0] += right;
                     counts[l][1] += valid;
@@ -216,7 +216,7 @@ impl<'a> Run<'a> {
         let model = &self.trainer.model;
         let splats = model.splats()?;
         let (levels, d) = (self.levels.len(), self.width);
-        let mut all = model.values.features.read_range::<f32>(0..splats.len() * levels * d)?;
+        let mut all = model.values.features.read_range(0..splats.len() * levels * d)?;
         if !all.iter().all(|v| v.is_finite()) {
             return Err(Error::work("the language stage produced features that are not finite"));
         }

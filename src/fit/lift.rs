@@ -20,11 +20,11 @@ pub(super) struct CodeTargets {
     levels: u32,
     width: u32,
     /// [ΣK, d], all levels.
-    codes: Buffer,
+    codes: Buffer<f32>,
     /// Per view and band: [levels, rows·W] rows of `codes`, −1 = none, or another band's.
-    labels: Vec<Vec<Buffer>>,
+    labels: Vec<Vec<Buffer<i32>>>,
     /// Per view: [levels] weight of one labelled value.
-    weights: Vec<Buffer>,
+    weights: Vec<Buffer<f32>>,
 }
 
 impl CodeTargets {
@@ -132,7 +132,7 @@ pub(super) fn lift(
                 None => break,
             }
         }
-        let seen = model.gradients.features.read_range::<f32>(0..total)?;
+        let seen = model.gradients.features.read_range(0..total)?;
         sums.iter_mut().zip(seen).for_each(|(s, v)| *s += v);
     }
     for feature in sums.chunks_exact_mut(d) {

@@ -55,7 +55,7 @@ impl Model {
     pub(super) fn state(&self) -> Result<State> {
         let (splats, features) = self.values.download()?;
         let all = self.moments.iter().chain([&self.feature_moments]);
-        let moments = all.map(|m| m.buffer.read::<f32>()).collect::<Result<_>>()?;
+        let moments = all.map(|m| m.buffer.read()).collect::<Result<_>>()?;
         Ok(State { splats, features, feature_dim: self.values.feature_dim, moments, step: self.step })
     }
 
@@ -120,7 +120,7 @@ impl Model {
     }
 
     /// Records the Adam step of geometry, opacity and colour; void where the frame's `guard` says so.
-    pub(super) fn record_step(&self, rec: &mut Recorder, guard: &Buffer) {
+    pub(super) fn record_step(&self, rec: &mut Recorder, guard: &Buffer<u32>) {
         for kind in GEOMETRY_AND_COLOUR {
             let w = width(&self.values, kind);
             let class = Class {
@@ -135,7 +135,7 @@ impl Model {
     }
 
     /// Records the Adam step of the raw features, whose gradient stands in the feature gradients.
-    pub(super) fn record_feature_step(&self, rec: &mut Recorder, guard: &Buffer) {
+    pub(super) fn record_feature_step(&self, rec: &mut Recorder, guard: &Buffer<u32>) {
         let count = self.count() * self.values.feature_dim;
         let class = Class { slot: FEATURE_ROW as u32, count, stride: 1, head: 1 };
         self.schedule.record(
@@ -205,7 +205,7 @@ fn width(splats: &SplatBuffers, kind: Kind) -> usize {
     }
 }
 
-fn buffer(splats: &SplatBuffers, kind: Kind) -> &Buffer {
+fn buffer(splats: &SplatBuffers, kind: Kind) -> &Buffer<f32> {
     match kind {
         Kind::Means => &splats.means,
         Kind::LogScales => &splats.log_scales,
@@ -215,7 +215,7 @@ fn buffer(splats: &SplatBuffers, kind: Kind) -> &Buffer {
     }
 }
 
-fn buffer_mut(splats: &mut SplatBuffers, kind: Kind) -> &mut Buffer {
+fn buffer_mut(splats: &mut SplatBuffers, kind: Kind) -> &mut Buffer<f32> {
     match kind {
         Kind::Means => &mut splats.means,
         Kind::LogScales => &mut splats.log_scales,

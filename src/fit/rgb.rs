@@ -204,7 +204,7 @@ impl<'a> Run<'a> {
         let Some(poses) = self.options.poses.filter(|p| view > 0 && iteration >= p.start) else {
             return Ok(());
         };
-        let g = self.trainer.views.stage(view).raster.frame().camera_grad.read::<f32>()?;
+        let g = self.trainer.views.stage(view).raster.frame().camera_grad.read()?;
         let twist = [g[0], g[1], g[2], g[3], g[4], g[5]].map(f64::from);
         let rate = poses.rate.at(iteration);
         let pose = &mut self.trainer.cameras[view].pose;
@@ -243,7 +243,7 @@ impl<'a> Run<'a> {
             return Ok(());
         }
         let model = &mut self.trainer.model;
-        let logits = model.values.opacity_logits.read_range::<f32>(0..model.count())?;
+        let logits = model.values.opacity_logits.read_range(0..model.count())?;
         let rows = compact::kept(&logits, self.options.prune_opacity);
         if rows.is_empty() {
             return Err(Error::work(format!(

@@ -262,7 +262,7 @@ mod tests {
         let allocations = (device.memory().allocations - before.1) as f64 / COUNTED as f64;
         let parts = run.trainer().parts();
         let (splats, features) = parts.params.download().unwrap();
-        let camera = parts.raster.camera().read::<f32>().unwrap();
+        let camera = parts.raster.camera().cast::<f32>().read().unwrap();
         Outcome { submissions, allocations, splats, features, camera }
     }
 

@@ -15,9 +15,9 @@ pub(super) struct TrainView {
     /// Index into [`Views::stages`].
     pub(super) stage: usize,
     /// Per band [3, rows, W] of the photo.
-    pub(super) target: Vec<Buffer>,
+    pub(super) target: Vec<Buffer<f32>>,
     /// Per band [rows, W] depth where it is trusted and the band's own, else 0; and the number of trusted pixels.
-    pub(super) depth: Option<(Vec<Buffer>, usize)>,
+    pub(super) depth: Option<(Vec<Buffer<f32>>, usize)>,
 }
 
 /// What views of one size share.
@@ -25,7 +25,7 @@ pub(super) struct Stage {
     pub(super) raster: Rasterizer,
     pub(super) loss: SsimL1,
     /// Per band Σ|x−y|, ΣSSIM, language loss, unused: [`SUMS`] floats.
-    pub(super) sums: Buffer,
+    pub(super) sums: Buffer<f32>,
 }
 
 /// Loss sums of a band.
@@ -46,7 +46,7 @@ impl Stage {
 
     /// [`SUMS`] numbers added up over the bands.
     pub(super) fn total(&self) -> Result<[f64; SUMS]> {
-        let sums = self.sums.read::<f32>()?;
+        let sums = self.sums.read()?;
         Ok(std::array::from_fn(|k| sums.iter().skip(k).step_by(SUMS).map(|v| f64::from(*v)).sum()))
     }
 }
@@ -149,7 +149,7 @@ impl Views {
 /// What a band answers for, clipped to [0, 1].
 fn colours(frame: &FrameBuffers, band: &Band) -> Result<Vec<[f32; 3]>> {
     let (stride, rows) = (frame.bands.pixels(), frame.bands.stored(band));
-    let planes = frame.planes.read_range::<f32>(0..3 * stride)?;
+    let planes = frame.planes.read_range(0..3 * stride)?;
     Ok(rows.map(|i| [0, 1, 2].map(|c| planes[c * stride + i].clamp(0.0, 1.0))).collect())
 }
 

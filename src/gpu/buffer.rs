@@ -5,17 +5,21 @@ use super::memory::Block;
 use crate::{Error, Result};
 use ash::vk;
 use bytemuck::Pod;
+use std::marker::PhantomData;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
-/// A storage buffer in device memory. Clones share it; it lives as long as any clone, or any program that uses it.
+/// A storage buffer of `T` in device memory. Clones share it; it lives as long as any clone, or any program that uses it.
+///
+/// The bindings of a shader ask for the element that its source declares: the scalar of scalars, vectors and arrays of
+/// them, so that a `vec4[]` and a `float[]` are both `Buffer<f32>` and their lengths count floats; the generated structure
+/// of structures. [`Buffer::cast`] is for memory that is declared in two ways.
 ///
 /// On memory that is not mapped, what the host writes waits for the next submission and goes along with it, and what a
 /// recording has downloaded ([`super::Recorder::download`]) is read without one; other reads submit and wait. Do not write
 /// from one thread what a program run by another uses.
-#[derive(Clone)]
-pub struct Buffer(Arc<Inner>);
+pub struct Buffer<T = u32>(Arc<Inner>, PhantomData<fn() -> T>);
 
 struct Inner {
     device: Device,
@@ -31,14 +35,14 @@ struct Inner {
 
 impl Device {
     /// A zero-filled buffer of `len` elements of `T`.
-    pub fn buffer<T: Pod>(&self, name: &str, len: usize) -> Result<Buffer> {
+    pub fn buffer<T: Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
         let buffer = Buffer::create(self, name, byte_len::<T>(len), self.info().mapped)?;
         buffer.clear()?;
         Ok(buffer)
     }
 
     /// A buffer with these elements.
-    pub fn buffer_from<T: Pod>(&self, name: &str, data: &[T]) -> Result<Buffer> {
+    pub fn buffer_from<T: Pod>(&self, name: &str, data: &[T]) -> Result<Buffer<T>> {
         let buffer = Buffer::create(self, name, byte_len::<T>(data.len()), self.info().mapped)?;
         buffer.write(data)?;
         Ok(buffer)
@@ -54,8 +58,14 @@ fn padded(bytes: u64) -> u64 {
     bytes.max(16).next_multiple_of(16)
 }
 
-impl Buffer {
-    fn create(device: &Device, name: &str, bytes: u64, mapped: bool) -> Result<Buffer> {
+impl<T> Clone for Buffer<T> {
+    fn clone(&self) -> Self {
+        self.cast()
+    }
+}
+
+impl<T> Buffer<T> {
+    fn create(device: &Device, name: &str, bytes: u64, mapped: bool) -> Result<Self> {
         let limit = device.info().max_storage_range;
         let mib = |b: u64| b as f64 / f64::from(1 << 20);
         if bytes > limit {
@@ -68,7 +78,7 @@ impl Buffer {
         }
         let fail = |e: String| Error::gpu(format!("buffer `{name}` of {:.1} MiB: {e}", mib(bytes)));
         let block = device.0.heap.buffer(&device.0.device, name, padded(bytes), mapped).map_err(fail)?;
-        Ok(Buffer(Arc::new(Inner {
+        let inner = Inner {
             device: device.clone(),
             name: name.to_owned(),
             raw: block.raw,
@@ -76,7 +86,14 @@ impl Buffer {
             block: Mutex::new(Some(block)),
             host: OnceLock::new(),
             fetched: AtomicBool::new(false),
-        })))
+        };
+        Ok(Buffer(Arc::new(inner), PhantomData))
+    }
+
+    /// The same memory with elements of another type; both handles share it. What does not fill a last element is not
+    /// counted by [`Buffer::len`].
+    pub fn cast<U>(&self) -> Buffer<U> {
+        Buffer(self.0.clone(), PhantomData)
     }
 
     /// The name it was made with.
@@ -89,8 +106,8 @@ impl Buffer {
         self.0.bytes
     }
 
-    /// Length in elements of `T`, rounded down.
-    pub fn len<T: Pod>(&self) -> usize {
+    /// Length in elements, rounded down.
+    pub fn len(&self) -> usize {
         (self.0.bytes / size_of::<T>().max(1) as u64) as usize
     }
 
@@ -117,59 +134,6 @@ impl Buffer {
         Arc::ptr_eq(&self.0.device.0, &device.0)
     }
 
-    /// All elements. The size must be a multiple of `T`'s.
-    pub fn read<T: Pod>(&self) -> Result<Vec<T>> {
-        if !self.0.bytes.is_multiple_of(size_of::<T>().max(1) as u64) {
-            return Err(Error::gpu(format!(
-                "buffer `{}` of {} bytes is no whole number of {}-byte elements",
-                self.0.name,
-                self.0.bytes,
-                size_of::<T>()
-            )));
-        }
-        self.read_range(0..self.len::<T>())
-    }
-
-    /// Elements of a range.
-    pub fn read_range<T: Pod>(&self, range: Range<usize>) -> Result<Vec<T>> {
-        let bytes = self.byte_range::<T>(range)?;
-        let (start, end) = (bytes.start as usize, bytes.end as usize);
-        if start == end {
-            return Ok(Vec::new());
-        }
-        if let Some(memory) = lock(&self.0.block).as_ref().and_then(Block::bytes) {
-            return Ok(bytemuck::pod_collect_to_vec(&memory[start..end]));
-        }
-        if let Some(copy) = self.0.host.get().filter(|_| self.0.fetched.load(Ordering::Acquire))
-            && let Some(memory) = lock(&copy.0.block).as_ref().and_then(Block::bytes)
-        {
-            return Ok(bytemuck::pod_collect_to_vec(&memory[start..end]));
-        }
-        let mut out = Vec::with_capacity(end - start);
-        self.0.device.staged_read(self.raw(), bytes, &mut |piece| out.extend_from_slice(piece))?;
-        Ok(bytemuck::pod_collect_to_vec(&out))
-    }
-
-    /// Replaces the first elements.
-    pub fn write<T: Pod>(&self, data: &[T]) -> Result<()> {
-        self.write_at(0, data)
-    }
-
-    /// Replaces the elements from `first` on.
-    pub fn write_at<T: Pod>(&self, first: usize, data: &[T]) -> Result<()> {
-        let range = self.byte_range::<T>(first..first.saturating_add(data.len()))?;
-        let bytes: &[u8] = bytemuck::cast_slice(data);
-        if bytes.is_empty() {
-            return Ok(());
-        }
-        if let Some(memory) = lock(&self.0.block).as_mut().and_then(Block::bytes_mut) {
-            memory[range.start as usize..range.end as usize].copy_from_slice(bytes);
-            return Ok(());
-        }
-        self.set_fetched(false);
-        self.0.device.staged_write(self.raw(), range.start, bytes)
-    }
-
     fn clear(&self) -> Result<()> {
         if let Some(memory) = lock(&self.0.block).as_mut().and_then(Block::bytes_mut) {
             memory.fill(0);
@@ -189,7 +153,7 @@ impl Buffer {
     }
 
     /// Whether `other` is what [`Buffer::host_copy`] made.
-    pub(super) fn is_fetched_to(&self, other: &Buffer) -> bool {
+    pub(super) fn is_fetched_to<U>(&self, other: &Buffer<U>) -> bool {
         self.0.host.get().is_some_and(|copy| copy.id() == other.id())
     }
 
@@ -198,7 +162,7 @@ impl Buffer {
         self.0.fetched.store(fetched, Ordering::Release);
     }
 
-    fn byte_range<T>(&self, range: Range<usize>) -> Result<Range<u64>> {
+    fn byte_range(&self, range: Range<usize>) -> Result<Range<u64>> {
         let bytes = byte_len::<T>(range.start)..byte_len::<T>(range.end);
         if bytes.start > bytes.end || bytes.end > self.0.bytes {
             return Err(Error::gpu(format!(
@@ -212,7 +176,62 @@ impl Buffer {
     }
 }
 
-impl std::fmt::Debug for Buffer {
+impl<T: Pod> Buffer<T> {
+    /// All elements. After a [`Buffer::cast`] the size must still be a whole number of them.
+    pub fn read(&self) -> Result<Vec<T>> {
+        if !self.0.bytes.is_multiple_of(size_of::<T>().max(1) as u64) {
+            return Err(Error::gpu(format!(
+                "buffer `{}` of {} bytes is no whole number of {}-byte elements",
+                self.0.name,
+                self.0.bytes,
+                size_of::<T>()
+            )));
+        }
+        self.read_range(0..self.len())
+    }
+
+    /// Elements of a range.
+    pub fn read_range(&self, range: Range<usize>) -> Result<Vec<T>> {
+        let bytes = self.byte_range(range)?;
+        let (start, end) = (bytes.start as usize, bytes.end as usize);
+        if start == end {
+            return Ok(Vec::new());
+        }
+        if let Some(memory) = lock(&self.0.block).as_ref().and_then(Block::bytes) {
+            return Ok(bytemuck::pod_collect_to_vec(&memory[start..end]));
+        }
+        if let Some(copy) = self.0.host.get().filter(|_| self.0.fetched.load(Ordering::Acquire))
+            && let Some(memory) = lock(&copy.0.block).as_ref().and_then(Block::bytes)
+        {
+            return Ok(bytemuck::pod_collect_to_vec(&memory[start..end]));
+        }
+        let mut out = Vec::with_capacity(end - start);
+        self.0.device.staged_read(self.raw(), bytes, &mut |piece| out.extend_from_slice(piece))?;
+        Ok(bytemuck::pod_collect_to_vec(&out))
+    }
+
+    /// Replaces the first elements.
+    pub fn write(&self, data: &[T]) -> Result<()> {
+        self.write_at(0, data)
+    }
+
+    /// Replaces the elements from `first` on.
+    pub fn write_at(&self, first: usize, data: &[T]) -> Result<()> {
+        let range = self.byte_range(first..first.saturating_add(data.len()))?;
+        let bytes: &[u8] = bytemuck::cast_slice(data);
+        if bytes.is_empty() {
+            return Ok(());
+        }
+        if let Some(memory) = lock(&self.0.block).as_mut().and_then(Block::bytes_mut) {
+            memory[range.start as usize..range.end as usize].copy_from_slice(bytes);
+            return Ok(());
+        }
+        self.set_fetched(false);
+        self.0.device.staged_write(self.raw(), range.start, bytes)
+    }
+}
+
+impl<T> std::fmt::Debug for Buffer<T> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "Buffer({}, {} bytes)", self.0.name, self.0.bytes)
     }

@@ -1,34 +1,48 @@
 //! The Vulkan engine: device, buffers, shaders with typed bindings, and a recorder that derives the barriers.
 //!
 //! # A pass in full
-//! `glsl/relevancy_map.comp` declares blocks `Codes`, `Scores`, `Relevancy` and a push block with `uint pixels`.
-//! build.rs turns that into `shaders::relevancy_map` and the host call is
+//! `glsl/gather.comp` declares blocks `Index`, `From`, `To` and a push block with `uint rows, stride`.
+//! build.rs turns that into `shaders::gather` and the host call is
 //!
 //! ```no_run
 //! # fn main() -> splatvk::Result<()> {
 //! use splatvk::gpu::{Device, Recorder, shaders};
 //! let device = Device::open(None)?;
-//! let codes = device.buffer_from("codes", &[0i32, 1, -1])?;
-//! let scores = device.buffer_from("scores", &[0.25f32, 0.75])?;
-//! let relevancy = device.buffer::<f32>("relevancy", 3)?;
+//! let index = device.buffer_from("index", &[2u32, 0])?;
+//! let from = device.buffer_from("from", &[10u32, 20, 30])?;
+//! let to = device.buffer::<u32>("to", 2)?;
 //!
-//! let mut rec = Recorder::new(&device, "relevancy");
+//! let mut rec = Recorder::new(&device, "gather");
 //! rec.dispatch_threads(
-//!     shaders::relevancy_map::call(
-//!         &shaders::relevancy_map::Bindings { codes: &codes, scores: &scores, relevancy: &relevancy },
-//!         &shaders::relevancy_map::Push { pixels: 3 },
+//!     shaders::gather::call(
+//!         &shaders::gather::Bindings { index: &index, from: &from, to: &to },
+//!         &shaders::gather::Push { rows: 2, stride: 1 },
 //!     ),
-//!     [3, 1, 1],
+//!     [2, 1, 1],
 //! );
 //! rec.run()?;
-//! assert_eq!(relevancy.read::<f32>()?, [0.25, 0.75, 0.0]);
+//! assert_eq!(to.read()?, [30, 10]);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! A buffer of another element does not compile:
+//!
+//! ```compile_fail,E0308
+//! # fn main() -> splatvk::Result<()> {
+//! # use splatvk::gpu::{Device, shaders};
+//! # let device = Device::open(None)?;
+//! # let index = device.buffer_from("index", &[2u32, 0])?;
+//! # let to = device.buffer::<u32>("to", 2)?;
+//! let from = device.buffer_from("from", &[10.0f32, 20.0, 30.0])?;
+//! let bindings = shaders::gather::Bindings { index: &index, from: &from, to: &to };
 //! # Ok(())
 //! # }
 //! ```
 //!
 //! # What build.rs generates for `glsl/NAME.comp` (only storage buffers in set 0 and push constants are allowed)
-//! - `shaders::NAME::Bindings<'a> { block_name: &'a Buffer, .. }`: one field per buffer block, the block's name in snake
-//!   case. Read / write access comes from what the compiled code does, bounded by `readonly` / `writeonly`.
+//! - `shaders::NAME::Bindings<'a> { block_name: &'a Buffer<T>, .. }`: one field per buffer block, the block's name in snake
+//!   case; `T` is the scalar or the structure that it holds (see [`Buffer`]). Read / write access comes from what the compiled code does, bounded by `readonly` / `writeonly`.
 //! - `shaders::NAME::Push { .. }`: the push constant block (float, int, uint, vectors, matrices, arrays; at most 128 bytes)
 //!   with natural Rust types; the reflected offsets are applied when it is written, so there is no padding to keep in step.
 //! - `shaders::NAME::call(&Bindings, &Push) -> Call`; without a push block `call(&Bindings)`.
@@ -47,9 +61,9 @@
 //!
 //! # Signatures
 //! - [`Device::open`]`(choice: Option<&str>)`: name part or index; [`Device::info`]; tests use [`test_device`]`()`.
-//! - [`Device::buffer`]`::<T>(name, len)` (zero-filled), [`Device::buffer_from`]`(name, &[T])`; [`Buffer::read`]`::<T>()`,
-//!   [`Buffer::read_range`], [`Buffer::write`]`(&[T])`, [`Buffer::write_at`]`(first, &[T])`. Element types are
-//!   [`bytemuck::Pod`]; lengths count elements. `Buffer` is a cheap clone of a handle.
+//! - [`Device::buffer`]`::<T>(name, len)` (zero-filled), [`Device::buffer_from`]`(name, &[T])`; [`Buffer::read`]`()`,
+//!   [`Buffer::read_range`], [`Buffer::write`]`(&[T])`, [`Buffer::write_at`]`(first, &[T])`, [`Buffer::cast`]`::<U>()`.
+//!   Element types are [`bytemuck::Pod`]; lengths count elements. `Buffer<T>` is a cheap clone of a handle.
 //! - [`Recorder::download`]`(&buffer)` at the end of a recording brings small results to the host with its submission.
 //! - [`Recorder::new`]`(&device, label)`; [`Recorder::fill`]`(&buffer, u32)`, [`Recorder::copy`]`(&from, &to)`,
 //!   [`Recorder::dispatch`]`(call, groups)`, [`Recorder::dispatch_threads`]`(call, threads)`,

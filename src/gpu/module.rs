@@ -18,6 +18,9 @@ pub struct Binding {
     pub name: &'static str,
     /// What this variant does with it.
     pub access: Access,
+    /// What its block holds: `f32`, `i32`, `u32` or a structure of `shaders::structs`, as the element of [`super::Buffer`].
+    /// Floats that are added to atomically are `f32` also where the module keeps their bits.
+    pub element: &'static str,
 }
 
 /// What a module needs beyond Vulkan 1.2's minimum.

@@ -112,7 +112,7 @@ mod tests {
             let bindings = shaders::sum::Bindings { values: &values, result: &result };
             rec.dispatch(shaders::sum::call(&bindings, &shaders::sum::Push { count: 2, slot: 0 }), [1, 1, 1]);
             rec.run().unwrap();
-            assert_eq!(result.read::<f32>().unwrap(), [3.0]);
+            assert_eq!(result.read().unwrap(), [3.0]);
             device.assert_no_validation_messages();
             device.store().unwrap().path.clone()
         };

@@ -35,25 +35,34 @@ impl Recorder {
     }
 
     /// Sets every 32-bit word of the buffer.
-    pub fn fill(&mut self, buffer: &Buffer, value: u32) {
-        self.own(&[buffer]);
+    pub fn fill<T>(&mut self, buffer: &Buffer<T>, value: u32) {
+        let buffer = buffer.cast();
+        self.own(&[&buffer]);
         let op = Op::Fill { buffer: buffer.clone(), value };
         self.push(format!("fill {}", buffer.name()), op);
     }
 
     /// Copies a whole buffer onto the start of one that is at least as long.
-    pub fn copy(&mut self, from: &Buffer, to: &Buffer) {
+    pub fn copy<T, U>(&mut self, from: &Buffer<T>, to: &Buffer<U>) {
         self.copy_bytes(from, 0, to, 0, from.bytes());
     }
 
     /// Copies `bytes` bytes from one offset to another; offsets are in bytes.
-    pub fn copy_bytes(&mut self, from: &Buffer, from_byte: u64, to: &Buffer, to_byte: u64, bytes: u64) {
-        self.own(&[from, to]);
+    pub fn copy_bytes<T, U>(
+        &mut self,
+        from: &Buffer<T>,
+        from_byte: u64,
+        to: &Buffer<U>,
+        to_byte: u64,
+        bytes: u64,
+    ) {
+        let (from, to) = (from.cast(), to.cast());
+        self.own(&[&from, &to]);
         let label = format!("copy {} to {}", from.name(), to.name());
         if from_byte.saturating_add(bytes) > from.bytes() || to_byte.saturating_add(bytes) > to.bytes() {
             self.fail(format!("{label}: {bytes} bytes from {from_byte} to {to_byte} reach beyond the end"));
         } else if bytes > 0 {
-            let op = Op::Copy { from: from.clone(), to: to.clone(), from_byte, to_byte, bytes };
+            let op = Op::Copy { from, to, from_byte, to_byte, bytes };
             self.push(label, op);
         }
     }
@@ -61,7 +70,7 @@ impl Recorder {
     /// Brings a buffer to the host with the same submission: until something writes it again, [`Buffer::read`] returns
     /// what it holds here without another one. For small results that every run is asked for; the copy in mapped memory
     /// stays as long as the buffer. Nothing where buffers are mapped.
-    pub fn download(&mut self, buffer: &Buffer) {
+    pub fn download<T>(&mut self, buffer: &Buffer<T>) {
         if self.device.info().mapped {
             return;
         }

@@ -1,85 +1,65 @@
 //! The engine on a real device, with validation on.
 use super::*;
 
-fn relevancy(device: &Device, codes: &[i32], scores: &[f32]) -> crate::Result<Vec<f32>> {
-    let codes_buffer = device.buffer_from("codes", codes)?;
-    let scores_buffer = device.buffer_from("scores", scores)?;
-    let relevancy = device.buffer::<f32>("relevancy", codes.len())?;
-    let mut rec = Recorder::new(device, "relevancy");
+fn gathered(device: &Device, from: &[u32], index: &[u32]) -> crate::Result<Vec<u32>> {
+    let from_buffer = device.buffer_from("from", from)?;
+    let index_buffer = device.buffer_from("index", index)?;
+    let to = device.buffer::<u32>("to", index.len())?;
+    let mut rec = Recorder::new(device, "gather");
     rec.dispatch_threads(
-        shaders::relevancy_map::call(
-            &shaders::relevancy_map::Bindings {
-                codes: &codes_buffer,
-                scores: &scores_buffer,
-                relevancy: &relevancy,
-            },
-            &shaders::relevancy_map::Push { pixels: codes.len() as u32 },
+        shaders::gather::call(
+            &shaders::gather::Bindings { index: &index_buffer, from: &from_buffer, to: &to },
+            &shaders::gather::Push { rows: index.len() as u32, stride: 1 },
         ),
-        [codes.len() as u32, 1, 1],
+        [index.len() as u32, 1, 1],
     );
     rec.run()?;
-    relevancy.read()
+    to.read()
 }
 
-/// Sums `values` into `bins.max() + 1` bins, twice in a row so that a read-modify-write chain needs its barrier.
-fn sums_twice(device: &Device, values: &[f32], bins: &[u32]) -> crate::Result<Vec<f32>> {
-    use shaders::scatter_sum::{Bindings, Push, call};
-    let values_buffer = device.buffer_from("values", values)?;
-    let bins_buffer = device.buffer_from("bins", bins)?;
-    let sums = device.buffer::<f32>("sums", 1 + *bins.iter().max().unwrap_or(&0) as usize)?;
-    let mut rec = Recorder::new(device, "sums");
-    rec.fill(&sums, 0);
-    let n = values.len() as u32;
+/// An exclusive scan of ones, twice in a row so that a read-modify-write chain needs its barrier.
+fn check_scans(device: &Device) {
+    use shaders::scan_lanes::{Bindings, Push, call};
+    let sums = device.buffer::<u32>("sums", 512).unwrap();
+    let total = device.buffer::<u32>("total", 1).unwrap();
+    let mut rec = Recorder::new(device, "scans");
+    rec.fill(&sums, 1);
     for _ in 0..2 {
-        let bindings = Bindings { values: &values_buffer, bins: &bins_buffer, sums: &sums };
-        rec.dispatch_threads(call(&bindings, &Push { count: n }), [n, 1, 1]);
+        rec.dispatch(call(&Bindings { sums: &sums, total: &total }, &Push { lanes: 512 }), [1, 1, 1]);
     }
-    let program = rec.compile()?;
+    let program = rec.compile().unwrap();
     assert_eq!(program.counts(), (3, 2));
     // Replays start from the fill again.
-    program.run()?;
-    program.run()?;
-    sums.read()
-}
-
-fn check_sums(device: &Device) {
-    // Multiples of 1/4 add exactly in any order.
-    let values: Vec<f32> = (0..1000).map(|i| (i % 9) as f32 * 0.25 - 1.0).collect();
-    let bins: Vec<u32> = (0..1000).map(|i| (i * 7 % 13) as u32).collect();
-    let mut expected = vec![0f32; 13];
-    for (v, &b) in values.iter().zip(&bins) {
-        expected[b as usize] += 2.0 * v;
-    }
-    assert_eq!(sums_twice(device, &values, &bins).unwrap(), expected);
+    program.run().unwrap();
+    program.run().unwrap();
+    // 0, 1, 2, .. after the first scan; their sums 0, 0, 1, 3, 6, .. after the second.
+    let expected: Vec<u32> = (0..512u32).map(|i| i * i.saturating_sub(1) / 2).collect();
+    assert_eq!(sums.read().unwrap(), expected);
+    assert_eq!(total.read().unwrap(), [512 * 511 / 2]);
 }
 
 #[test]
 fn a_pass_computes_what_its_twin_says() {
     let device = test_device();
-    let out = relevancy(&device, &[0, 1, -1, 1], &[0.25, 0.75]).unwrap();
-    assert_eq!(out, [0.25, 0.75, 0.0, 0.75]);
+    assert_eq!(gathered(&device, &[10, 20, 30], &[0, 2, 2, 1]).unwrap(), [10, 30, 30, 20]);
 }
 
 #[test]
-fn float_atomics_and_their_fallback_agree() {
-    let device = test_device();
-    check_sums(&device);
-    let fallback = TestDevice::with(&Options { no_float_atomics: true, ..Options::from_env(None) }).unwrap();
-    assert!(!fallback.info().float_atomics);
-    check_sums(&fallback);
+fn a_chain_of_changes_is_ordered() {
+    check_scans(&test_device());
 }
 
 #[test]
 fn staged_buffers_behave_like_mapped_ones() {
     let device = TestDevice::with(&Options { staging: true, ..Options::from_env(None) }).unwrap();
     assert!(!device.info().mapped);
-    check_sums(&device);
+    check_scans(&device);
     let buffer = device.buffer::<u32>("numbers", 5).unwrap();
-    assert_eq!(buffer.read::<u32>().unwrap(), [0; 5]);
+    assert_eq!(buffer.read().unwrap(), [0; 5]);
     buffer.write_at(3, &[7u32, 8]).unwrap();
     buffer.write(&[1u32]).unwrap();
-    assert_eq!(buffer.read::<u32>().unwrap(), [1, 0, 0, 7, 8]);
-    assert_eq!(buffer.read_range::<u16>(6..7).unwrap(), [7]);
+    assert_eq!(buffer.read().unwrap(), [1, 0, 0, 7, 8]);
+    assert_eq!(buffer.cast::<u16>().read_range(6..7).unwrap(), [7]);
 }
 
 fn staged() -> TestDevice {
@@ -102,17 +82,17 @@ fn transfers_wait_for_a_submission_and_share_it() {
     let program = rec.compile().unwrap();
     program.run().unwrap();
     let expected: Vec<u32> = [vec![1; 100], vec![2; 500], vec![3; 400]].concat();
-    assert_eq!(b.read::<u32>().unwrap(), expected);
+    assert_eq!(b.read().unwrap(), expected);
     assert_eq!(device.submissions(), 1);
     // A change makes the copy on the host worthless, whoever made it.
     b.write(&[7u32]).unwrap();
-    assert_eq!(b.read_range::<u32>(0..2).unwrap(), [7, 1]);
+    assert_eq!(b.read_range(0..2).unwrap(), [7, 1]);
     assert_eq!(device.submissions(), 2);
     program.run().unwrap();
     let mut rec = Recorder::new(&device, "fill");
     rec.fill(&b, 5);
     rec.run().unwrap();
-    assert_eq!(b.read::<u32>().unwrap(), [5; 1000]);
+    assert_eq!(b.read().unwrap(), [5; 1000]);
     assert_eq!(device.submissions(), 5);
 }
 
@@ -122,12 +102,12 @@ fn large_transfers_go_in_pieces() {
     let count = (2 * super::staging::MOST as usize + 4096) / 4;
     let values: Vec<u32> = (0..count as u32).map(|i| i.wrapping_mul(2654435761)).collect();
     let buffer = device.buffer_from("large", &values).unwrap();
-    assert!(buffer.read::<u32>().unwrap() == values);
+    assert!(buffer.read().unwrap() == values);
     // Two full pieces on the way there; the rest of it goes with the first of three on the way back.
     assert_eq!(device.submissions(), 5);
     let again = || {
         buffer.write(&values).unwrap();
-        assert!(buffer.read::<u32>().unwrap() == values);
+        assert!(buffer.read().unwrap() == values);
         device.memory().allocations
     };
     // Once more, until both ways have memory of that size.
@@ -146,7 +126,7 @@ fn buffers_may_go_while_another_thread_submits_their_writes() {
         for i in 0..2000u32 {
             let buffer = device.buffer_from("short-lived", &[i; 64]).unwrap();
             if i % 100 == 0 {
-                assert_eq!(buffer.read::<u32>().unwrap(), [i; 64]);
+                assert_eq!(buffer.read().unwrap(), [i; 64]);
             }
         }
         runs.join().unwrap();
@@ -157,11 +137,13 @@ fn buffers_may_go_while_another_thread_submits_their_writes() {
 fn buffers_check_their_bounds_and_sizes() {
     let device = test_device();
     let buffer = device.buffer_from("five", &[1u8, 2, 3, 4, 5]).unwrap();
-    assert_eq!(buffer.read::<u8>().unwrap(), [1, 2, 3, 4, 5]);
-    assert!(buffer.read::<u32>().unwrap_err().to_string().contains("`five`"));
+    assert_eq!((buffer.len(), buffer.read().unwrap()), (5, vec![1, 2, 3, 4, 5]));
+    let words = buffer.cast::<u32>();
+    assert_eq!((words.len(), words.read_range(0..1).unwrap()), (1, vec![u32::from_le_bytes([1, 2, 3, 4])]));
+    assert!(words.read().unwrap_err().to_string().contains("`five`"));
     assert!(buffer.write_at(4, &[1u8, 2]).is_err());
-    assert!(buffer.read_range::<u8>(4..6).is_err());
-    assert!(device.buffer::<f32>("empty", 0).unwrap().read::<f32>().unwrap().is_empty());
+    assert!(buffer.read_range(4..6).is_err());
+    assert!(device.buffer::<f32>("empty", 0).unwrap().read().unwrap().is_empty());
     let too_long = device.info().max_storage_range as usize + 1;
     let message = device.buffer::<u8>("huge", too_long).unwrap_err().to_string();
     assert!(message.contains("huge") && message.contains("MiB"), "{message}");
@@ -176,8 +158,8 @@ fn copies_and_timestamps() {
     rec.copy(&a, &b);
     rec.copy_bytes(&b, 4, &a, 0, 8);
     let times = rec.run_timed().unwrap();
-    assert_eq!(a.read::<u32>().unwrap(), [2, 3, 3, 4]);
-    assert_eq!(b.read::<u32>().unwrap(), [1, 2, 3, 4, 0, 0]);
+    assert_eq!(a.read().unwrap(), [2, 3, 3, 4]);
+    assert_eq!(b.read().unwrap(), [1, 2, 3, 4, 0, 0]);
     assert_eq!(times.len(), 2);
     assert_eq!(times[0].0, "copy a to b");
     assert!(times.iter().all(|(_, ms)| (0.0..10_000.0).contains(ms)), "{times:?}");
@@ -186,38 +168,38 @@ fn copies_and_timestamps() {
 #[test]
 fn indirect_dispatch_reads_its_size_on_the_device() {
     let device = test_device();
-    let codes = device.buffer_from("codes", &[0i32; 1000]).unwrap();
-    let scores = device.buffer_from("scores", &[1f32]).unwrap();
-    let out = device.buffer::<f32>("out", 1000).unwrap();
+    let index = device.buffer_from("index", &[0u32; 1000]).unwrap();
+    let from = device.buffer_from("from", &[1u32]).unwrap();
+    let out = device.buffer::<u32>("out", 1000).unwrap();
     let source = device.buffer_from("source", &[9u32, 2, 1, 1]).unwrap();
     let args = device.buffer::<u32>("args", 4).unwrap();
     let mut rec = Recorder::new(&device, "indirect");
     rec.copy(&source, &args);
-    let call = shaders::relevancy_map::call(
-        &shaders::relevancy_map::Bindings { codes: &codes, scores: &scores, relevancy: &out },
-        &shaders::relevancy_map::Push { pixels: 1000 },
+    let call = shaders::gather::call(
+        &shaders::gather::Bindings { index: &index, from: &from, to: &out },
+        &shaders::gather::Push { rows: 1000, stride: 1 },
     );
     rec.dispatch_indirect(call, &args, 4);
     rec.run().unwrap();
-    let reached = 2 * shaders::relevancy_map::WORKGROUP[0] as usize;
-    let out = out.read::<f32>().unwrap();
-    assert!(out[..reached].iter().all(|&v| v == 1.0));
-    assert!(out[reached..].iter().all(|&v| v == 0.0));
+    let reached = 2 * shaders::gather::WORKGROUP[0] as usize;
+    let out = out.read().unwrap();
+    assert!(out[..reached].iter().all(|&v| v == 1));
+    assert!(out[reached..].iter().all(|&v| v == 0));
 }
 
 #[test]
 fn mistakes_are_reported_not_run() {
     let device = test_device();
-    let a = device.buffer_from("a", &[0i32; 4]).unwrap();
+    let a = device.buffer_from("a", &[0u32; 4]).unwrap();
     let run = |f: &dyn Fn(&mut Recorder)| {
         let mut rec = Recorder::new(&device, "mistake");
         f(&mut rec);
         rec.run().unwrap_err().to_string()
     };
     let call = || {
-        shaders::relevancy_map::call(
-            &shaders::relevancy_map::Bindings { codes: &a, scores: &a, relevancy: &a },
-            &shaders::relevancy_map::Push { pixels: 4 },
+        shaders::gather::call(
+            &shaders::gather::Bindings { index: &a, from: &a, to: &a },
+            &shaders::gather::Push { rows: 4, stride: 1 },
         )
     };
     assert!(run(&|r| r.dispatch(call(), [1; 3])).contains("`a` twice"));

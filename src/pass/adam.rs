@@ -20,14 +20,14 @@ pub(crate) fn rows_of_groups(threads: usize) -> [u32; 3] {
 /// The moving averages of one parameter buffer: `[count]` pairs (m, v).
 #[derive(Clone)]
 pub struct Moments {
-    /// (m, v) per parameter.
-    pub buffer: Buffer,
+    /// (m, v) per parameter, `[count, 2]`.
+    pub buffer: Buffer<f32>,
 }
 
 impl Moments {
     /// Fresh (zero) state for `count` parameters.
     pub fn new(device: &Device, count: usize) -> Result<Self> {
-        Ok(Moments { buffer: device.buffer::<[f32; 2]>("adam moments", count.max(1))? })
+        Ok(Moments { buffer: device.buffer::<f32>("adam moments", 2 * count.max(1))? })
     }
 }
 
@@ -46,8 +46,8 @@ pub struct Class {
 
 /// The rates of the current step in GPU memory, one row per class, and the count of bad gradients.
 pub struct Schedule {
-    rates: Buffer,
-    faults: Buffer,
+    rates: Buffer<f32>,
+    faults: Buffer<u32>,
     rows: Vec<[f32; 4]>,
 }
 
@@ -55,7 +55,7 @@ impl Schedule {
     /// Room for `classes` rows.
     pub fn new(device: &Device, classes: usize) -> Result<Self> {
         Ok(Schedule {
-            rates: device.buffer::<[f32; 4]>("adam rates", classes)?,
+            rates: device.buffer::<f32>("adam rates", 4 * classes)?,
             faults: device.buffer::<u32>("adam faults", 1)?,
             rows: vec![[0.0; 4]; classes],
         })
@@ -66,12 +66,12 @@ impl Schedule {
         for (row, rate) in self.rows.iter_mut().zip(rates) {
             *row = row_of(step, *rate);
         }
-        self.rates.write(&self.rows)
+        self.rates.write(self.rows.as_flattened())
     }
 
     /// How many non-finite gradients the steps so far have met (and skipped).
     pub fn faults(&self) -> Result<u32> {
-        Ok(self.faults.read::<u32>()?.first().copied().unwrap_or(0))
+        Ok(self.faults.read()?.first().copied().unwrap_or(0))
     }
 
     /// Records one step of one class; `guard[1] ≠ 0` on the GPU makes it void (see the rasteriser's status).
@@ -79,10 +79,10 @@ impl Schedule {
         &self,
         rec: &mut Recorder,
         class: Class,
-        parameters: &Buffer,
-        gradients: &Buffer,
+        parameters: &Buffer<f32>,
+        gradients: &Buffer<f32>,
         moments: &Moments,
-        guard: &Buffer,
+        guard: &Buffer<u32>,
     ) {
         rec.pass("Adam");
         let call = shaders::adam::call(
@@ -162,7 +162,7 @@ mod tests {
                 adam(&mut twin[range.clone()], &[f64::from(g[i])], &mut state[range], rate, step);
             }
         }
-        for (i, (p, t)) in parameters.read::<f32>().unwrap().into_iter().zip(&twin).enumerate() {
+        for (i, (p, t)) in parameters.read().unwrap().into_iter().zip(&twin).enumerate() {
             // 20 steps of 2e-3, each rounded in f32.
             assert!((f64::from(p) - t).abs() < 2e-6, "{i}: {p} {t}");
         }
@@ -185,10 +185,10 @@ mod tests {
             rec.run().unwrap();
         };
         step();
-        assert_eq!(parameters.read::<f32>().unwrap(), [1.0, 2.0, 3.0], "a guarded step is void");
+        assert_eq!(parameters.read().unwrap(), [1.0, 2.0, 3.0], "a guarded step is void");
         guard.write(&[0u32, 0]).unwrap();
         step();
-        let p = parameters.read::<f32>().unwrap();
+        let p = parameters.read().unwrap();
         assert_eq!((p[0], p[1]), (1.0, 2.0));
         assert!((p[2] - 2.5).abs() < 1e-6, "the first Adam step has the length of the rate");
         assert_eq!(schedule.faults().unwrap(), 2);

@@ -21,7 +21,7 @@ pub(super) fn record(
     frame: &FrameBuffers,
     rows: &Range<u32>,
     count: usize,
-    splat_count: &Buffer,
+    splat_count: &Buffer<u32>,
 ) {
     let (tiles_x, count, lists) = (frame.tiles()[0], count as u32, &frame.lists);
     let (first_row, end_row, tiles) = (rows.start, rows.end, tiles_x * (rows.end - rows.start));
@@ -75,7 +75,7 @@ pub(super) fn record(
     }
 }
 
-fn group_by_counting(rec: &mut Recorder, lists: &TileLists, tiles: u32, counters: &Buffer, lanes: u32) {
+fn group_by_counting(rec: &mut Recorder, lists: &TileLists, tiles: u32, counters: &Buffer<u32>, lanes: u32) {
     let tile_ranges = &lists.ranges;
     let call = shaders::bin_sum::call(
         &shaders::bin_sum::Bindings { counters, tile_ranges },
@@ -104,7 +104,13 @@ fn group_by_counting(rec: &mut Recorder, lists: &TileLists, tiles: u32, counters
     rec.dispatch_threads(call, [lanes, 1, 1]);
 }
 
-fn group_by_sorting(rec: &mut Recorder, lists: &TileLists, tiles: u32, entry_splats: &Buffer, sort: &Sort) {
+fn group_by_sorting(
+    rec: &mut Recorder,
+    lists: &TileLists,
+    tiles: u32,
+    entry_splats: &Buffer<u32>,
+    sort: &Sort,
+) {
     let bits = u32::BITS - tiles.leading_zeros();
     sort.record(rec, &lists.entries, &lists.entry_count, bits);
     let call = shaders::bin_ranges::call(

@@ -6,11 +6,11 @@ use crate::gpu::{Buffer, Recorder, shaders};
 /// What one view is compared with.
 pub struct Targets<'a> {
     /// [levels, H·W] row of `codes`, −1 = none.
-    pub labels: &'a Buffer,
+    pub labels: &'a Buffer<i32>,
     /// [ΣK, width] codes of all levels.
-    pub codes: &'a Buffer,
+    pub codes: &'a Buffer<f32>,
     /// [levels] weight of one labelled value.
-    pub weights: &'a Buffer,
+    pub weights: &'a Buffer<f32>,
     /// Number of levels.
     pub levels: u32,
     /// Code length d.
@@ -28,7 +28,7 @@ pub enum Mode {
 
 /// Records the loss of a frame, or of the band in its planes: writes the feature planes of `frame.planes_grad` and, per
 /// pixel, `loss` [H·W].
-pub fn record(rec: &mut Recorder, targets: &Targets, frame: &FrameBuffers, loss: &Buffer, mode: Mode) {
+pub fn record(rec: &mut Recorder, targets: &Targets, frame: &FrameBuffers, loss: &Buffer<f32>, mode: Mode) {
     rec.pass("feature loss");
     let pixels = frame.pixels();
     record_planes(rec, targets, &frame.planes, &frame.planes_grad, loss, pixels, mode);
@@ -37,9 +37,9 @@ pub fn record(rec: &mut Recorder, targets: &Targets, frame: &FrameBuffers, loss:
 fn record_planes(
     rec: &mut Recorder,
     targets: &Targets,
-    planes: &Buffer,
-    upstream: &Buffer,
-    loss: &Buffer,
+    planes: &Buffer<f32>,
+    upstream: &Buffer<f32>,
+    loss: &Buffer<f32>,
     pixels: u32,
     mode: Mode,
 ) {
@@ -120,7 +120,7 @@ mod tests {
             let mut rec = Recorder::new(&device, "codes");
             record_planes(&mut rec, &targets, &planes, &upstream, &loss, pixels as u32, mode);
             rec.run().unwrap();
-            (upstream.read::<f32>().unwrap(), loss.read::<f32>().unwrap())
+            (upstream.read().unwrap(), loss.read().unwrap())
         };
         let (upstream, loss) = run(&planes, Mode::Loss);
         let wide = |v: &[f32]| v.iter().map(|&a| f64::from(a)).collect::<Vec<_>>();

@@ -2,9 +2,7 @@
 use super::adam::rows_of_groups;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
-
-/// Index of a row that has no source: it becomes zeros (the optimiser state of new splats).
-pub const NEW: u32 = u32::MAX;
+use bytemuck::Pod;
 
 /// Indices of the splats whose opacity is finite and at least `min_opacity`, in order.
 pub fn kept(opacity_logits: &[f32], min_opacity: f32) -> Vec<u32> {
@@ -17,34 +15,30 @@ pub fn kept(opacity_logits: &[f32], min_opacity: f32) -> Vec<u32> {
         .collect()
 }
 
-/// A buffer with the rows `index` of `from`, each `stride` 32-bit words; [`NEW`] rows are zero.
-pub fn gather(
+/// A buffer with the rows `index` of `from`, each `stride` elements of 32 bits.
+pub fn gather<T: Pod>(
     device: &Device,
     name: &'static str,
-    from: &Buffer,
-    index: &Buffer,
+    from: &Buffer<T>,
+    index: &Buffer<u32>,
     rows: usize,
     stride: usize,
-) -> Result<Buffer> {
+) -> Result<Buffer<T>> {
+    const { assert!(size_of::<T>() == 4) };
     let to = device.buffer::<u32>(name, (rows * stride).max(1))?;
     let mut rec = Recorder::new(device, "gather");
     let call = shaders::gather::call(
-        &shaders::gather::Bindings { index, from, to: &to },
+        &shaders::gather::Bindings { index, from: &from.cast(), to: &to },
         &shaders::gather::Push { rows: rows as u32, stride: stride as u32 },
     );
     rec.dispatch(call, rows_of_groups(rows * stride));
     rec.run()?;
-    Ok(to)
+    Ok(to.cast())
 }
 
 /// The CPU twin of [`gather`].
-pub fn gather_rows<T: Copy + Default>(from: &[T], index: &[u32], stride: usize) -> Vec<T> {
-    index
-        .iter()
-        .flat_map(|&i| {
-            (0..stride).map(move |k| if i == NEW { T::default() } else { from[i as usize * stride + k] })
-        })
-        .collect()
+pub fn gather_rows<T: Copy>(from: &[T], index: &[u32], stride: usize) -> Vec<T> {
+    index.iter().flat_map(|&i| &from[i as usize * stride..][..stride]).copied().collect()
 }
 
 #[cfg(test)]
@@ -59,13 +53,13 @@ mod tests {
         let logits: Vec<f32> = (0..1003).map(|_| random.normal() as f32 * 4.0).collect();
         let mut index = kept(&logits, 0.1);
         assert!(index.len() > 100 && index.len() < 900);
-        index.extend([NEW, 5, 5, NEW]);
+        index.extend([5, 5]);
         let index_buffer = device.buffer_from("index", &index).unwrap();
         for stride in [1, 3, 8] {
             let rows: Vec<f32> = (0..1003 * stride).map(|_| random.normal() as f32).collect();
             let from = device.buffer_from("rows", &rows).unwrap();
             let to = gather(&device, "compacted", &from, &index_buffer, index.len(), stride).unwrap();
-            assert_eq!(to.read::<f32>().unwrap(), gather_rows(&rows, &index, stride));
+            assert_eq!(to.read().unwrap(), gather_rows(&rows, &index, stride));
         }
     }
 

@@ -17,26 +17,24 @@ pub struct FrameBuffers {
     /// d.
     pub feature_dim: usize,
     /// [4 + d, H, W]: RGB on the background, Σ w z, features. Written by the forward pass.
-    pub planes: Buffer,
+    pub planes: Buffer<f32>,
     /// [H, W] final transmittance T_f; alpha = 1 − T_f.
-    pub transmittance: Buffer,
-    /// [H, W] camera z where T falls below ½, 0 where it does not.
-    pub median_depth: Buffer,
+    pub transmittance: Buffer<f32>,
     /// [4 + d + 1, H, W]: the loss's gradient by `planes` and, last, by alpha. Zero at first; a loss overwrites the planes
     /// it uses. Read by the backward pass.
-    pub planes_grad: Buffer,
+    pub planes_grad: Buffer<f32>,
     /// [10]: gradient by the left pose twist (ρ, θ) and by fx, fy, cx, cy. Written by the backward pass.
-    pub camera_grad: Buffer,
+    pub camera_grad: Buffer<f32>,
     /// [2] u32: tile-list entries of this frame; the number needed if a frame did not fit since the last `grow`, else 0.
-    pub status: Buffer,
-    pub(super) projected: Buffer,
-    pub(super) projected_grad: Buffer,
-    pub(super) camera_parts: Buffer,
+    pub status: Buffer<u32>,
+    pub(super) projected: Buffer<f32>,
+    pub(super) projected_grad: Buffer<f32>,
+    pub(super) camera_parts: Buffer<f32>,
     pub(super) summation: Summation,
     pub(super) gradient_entries: GradientEntries,
-    pub(super) codes: Buffer,
-    pub(super) codes_grad: Buffer,
-    pub(super) depth_pairs: Buffer,
+    pub(super) codes: Buffer<f32>,
+    pub(super) codes_grad: Buffer<f32>,
+    pub(super) depth_pairs: Buffer<u32>,
     pub(super) lists: TileLists,
 }
 
@@ -97,8 +95,8 @@ pub(super) struct GradientEntries(std::sync::Mutex<Option<EntryBuffers>>);
 pub(super) struct EntryBuffers {
     capacity: usize,
     /// [capacity, 12] as `projected_grad`, and [capacity, vectors of a block] for one block after the other.
-    pub splats: Buffer,
-    pub codes: Buffer,
+    pub splats: Buffer<f32>,
+    pub codes: Buffer<f32>,
 }
 
 impl Summation {

@@ -84,7 +84,7 @@ impl Encoding {
 }
 
 /// A buffer of exactly [`Encoding::bytes`] for a part of an image.
-pub fn texels(device: &Device, pixels: usize, source: Source, encoding: Encoding) -> Result<Buffer> {
+pub fn texels(device: &Device, pixels: usize, source: Source, encoding: Encoding) -> Result<Buffer<u32>> {
     device.buffer::<u32>("texels", encoding.bytes(source.channels(), pixels) / 4)
 }
 
@@ -95,7 +95,7 @@ pub fn pack(
     band: &Band,
     source: Source,
     encoding: Encoding,
-    texels: &Buffer,
+    texels: &Buffer<u32>,
 ) -> Result<()> {
     let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
     if let Source::Features(first, count) = source
@@ -179,7 +179,7 @@ mod tests {
             for encoding in [Encoding::F32, Encoding::F32x4, Encoding::F16x4, Encoding::Unorm8x4] {
                 let out = texels(&device, pixels, source, encoding).unwrap();
                 pack(&device, raster.frame(), &band, source, encoding, &out).unwrap();
-                let got = out.read::<u8>().unwrap();
+                let got = out.cast::<u8>().read().unwrap();
                 let expected = texels_of(&planes, &transmittance, source, encoding);
                 assert_eq!(got.len(), encoding.bytes(source.channels(), pixels), "{source:?} {encoding:?}");
                 if encoding == Encoding::F16x4 && source == Source::Depth {

@@ -7,7 +7,7 @@ use crate::gpu::{Device, Recorder, shaders};
 pub fn count(device: &Device, raster: &Rasterizer) -> Result<[f64; 2]> {
     let frame = raster.frame();
     let tiles = frame.tiles();
-    let counts = device.buffer::<[u32; 2]>("pair counts", 64 * (tiles[0] * tiles[1]) as usize)?;
+    let counts = device.buffer::<u32>("pair counts", 2 * 64 * (tiles[0] * tiles[1]) as usize)?;
     let call = shaders::count_pairs::call(
         &shaders::count_pairs::Bindings {
             projected: &frame.projected,
@@ -20,8 +20,8 @@ pub fn count(device: &Device, raster: &Rasterizer) -> Result<[f64; 2]> {
     let mut rec = Recorder::new(device, "pair counts");
     rec.dispatch(call, [tiles[0], tiles[1], 1]);
     rec.run()?;
-    let counts = counts.read::<[u32; 2]>()?;
-    Ok([0, 1].map(|k| counts.iter().map(|c| f64::from(c[k])).sum()))
+    let counts = counts.read()?;
+    Ok([0, 1].map(|k| counts.iter().skip(k).step_by(2).map(|&c| f64::from(c)).sum()))
 }
 
 #[cfg(test)]

@@ -53,10 +53,10 @@ pub trait Matcher {
 /// and its sources are brought together for every pass.
 pub struct GpuMatcher {
     device: Device,
-    sources: Buffer,
+    sources: Buffer<Source>,
     /// What a pass binds: all views, or one group.
-    quads: Buffer,
-    planes: Buffer,
+    quads: Buffer<u32>,
+    planes: Buffer<f32>,
     /// Every view on its own, where they are grouped.
     views: Vec<ViewBuffers>,
     /// Pixels of all views.
@@ -65,8 +65,8 @@ pub struct GpuMatcher {
 
 /// One view of a grouped matcher.
 struct ViewBuffers {
-    quads: Buffer,
-    planes: Buffer,
+    quads: Buffer<u32>,
+    planes: Buffer<f32>,
     /// Views that a pass with this reference needs, itself first.
     group: Vec<usize>,
 }
@@ -94,9 +94,9 @@ impl GpuMatcher {
         let (device, pixels) = (device.clone(), luma.len());
         if (PLANE_BYTES * pixels) as u64 <= device.info().max_storage_range {
             return Ok(GpuMatcher {
-                quads: device.buffer_from("stereo quads", &quads)?,
+                quads: device.buffer_from("stereo quads", quads.as_flattened())?,
                 sources: device.buffer_from("stereo sources", sources)?,
-                planes: device.buffer_from("stereo planes", &planes)?,
+                planes: device.buffer_from("stereo planes", planes.as_flattened())?,
                 views: Vec::new(),
                 device,
                 pixels,
@@ -115,15 +115,15 @@ impl GpuMatcher {
             largest = largest.max(held);
             let own = r.first as usize..r.first as usize + pixels_of(r);
             views.push(ViewBuffers {
-                quads: device.buffer_from("stereo quads", &quads[own.clone()])?,
-                planes: device.buffer_from("stereo planes", &planes[own])?,
+                quads: device.buffer_from("stereo quads", quads[own.clone()].as_flattened())?,
+                planes: device.buffer_from("stereo planes", planes[own].as_flattened())?,
                 group,
             });
         }
         Ok(GpuMatcher {
-            quads: device.buffer::<[u32; 2]>("stereo quads", largest)?,
+            quads: device.buffer::<u32>("stereo quads", 2 * largest)?,
             sources: device.buffer_from("stereo sources", &grouped)?,
-            planes: device.buffer::<[f32; 4]>("stereo planes", largest)?,
+            planes: device.buffer::<f32>("stereo planes", 4 * largest)?,
             views,
             device,
             pixels,
@@ -135,7 +135,7 @@ impl GpuMatcher {
         let mut first = 0;
         self.views.iter().find(|view| {
             let found = first == r.first as usize;
-            first += view.planes.len::<[f32; 4]>();
+            first += view.planes.len() / 4;
             found
         })
     }
@@ -225,9 +225,9 @@ impl Matcher for GpuMatcher {
     fn planes(&self) -> Result<Vec<Vec4>> {
         let mut planes = Vec::with_capacity(self.pixels);
         let whole = [&self.planes];
-        let own: Vec<&Buffer> = self.views.iter().map(|v| &v.planes).collect();
+        let own: Vec<&Buffer<f32>> = self.views.iter().map(|v| &v.planes).collect();
         for buffer in if own.is_empty() { &whole[..] } else { &own[..] } {
-            planes.extend(buffer.read::<[f32; 4]>()?.into_iter().map(Vec4::from));
+            planes.extend(buffer.read()?.chunks_exact(4).map(Vec4::from_slice));
         }
         Ok(planes)
     }

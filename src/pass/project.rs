@@ -11,6 +11,7 @@ use super::sh;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::shaders::shared::splat::DILATION;
+use crate::gpu::shaders::structs::CameraView;
 use crate::gpu::{Buffer, Recorder, shaders};
 use glam::{DMat3, DVec3, DVec4};
 
@@ -19,7 +20,7 @@ use glam::{DMat3, DVec3, DVec4};
 pub fn record(
     rec: &mut Recorder,
     splats: &SplatBuffers,
-    camera: &Buffer,
+    camera: &Buffer<CameraView>,
     frame: &FrameBuffers,
     sh_degree: u32,
 ) {

@@ -14,6 +14,7 @@ use super::sh;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::shaders::project_backward::{PARTS, THREADS};
+use crate::gpu::shaders::structs::CameraView;
 use crate::gpu::{Buffer, Recorder, shaders};
 use glam::{DMat3, DVec3, DVec4};
 
@@ -22,11 +23,11 @@ use glam::{DMat3, DVec3, DVec4};
 pub fn record(
     rec: &mut Recorder,
     splats: &SplatBuffers,
-    camera: &Buffer,
+    camera: &Buffer<CameraView>,
     frame: &FrameBuffers,
     sh_degree: u32,
     gradients: &SplatBuffers,
-    camera_grad: &Buffer,
+    camera_grad: &Buffer<f32>,
 ) {
     let count = splats.count as u32;
     let call = shaders::project_backward::call(

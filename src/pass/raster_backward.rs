@@ -135,8 +135,8 @@ fn record_sum(
     rec: &mut Recorder,
     frame: &FrameBuffers,
     count: usize,
-    from: &Buffer,
-    to: &Buffer,
+    from: &Buffer<f32>,
+    to: &Buffer<f32>,
     columns: Columns,
     add: bool,
 ) {

@@ -9,6 +9,7 @@ use super::frame::{FrameBuffers, Tiles};
 use super::project::Projected;
 use super::view::View;
 use crate::gpu::shaders::shared::cutoffs::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
+use crate::gpu::shaders::structs::CameraView;
 use crate::gpu::{Buffer, Recorder, shaders};
 
 pub use super::channels::BASE_CHANNELS;
@@ -33,8 +34,8 @@ macro_rules! push {
 }
 pub(super) use push;
 
-/// Records the blending of the binned splats into `frame.planes`, `frame.transmittance`, `frame.median_depth`.
-pub(super) fn record(rec: &mut Recorder, camera: &Buffer, frame: &FrameBuffers, tiles: &Tiles) {
+/// Records the blending of the binned splats into `frame.planes` and `frame.transmittance`.
+pub(super) fn record(rec: &mut Recorder, camera: &Buffer<CameraView>, frame: &FrameBuffers, tiles: &Tiles) {
     for block in blocks(frame.feature_dim as u32) {
         let call = shaders::raster_forward::call(
             shaders::raster_forward::Variant { channels: block.channels },
@@ -46,7 +47,6 @@ pub(super) fn record(rec: &mut Recorder, camera: &Buffer, frame: &FrameBuffers, 
                 codes: &frame.codes,
                 planes: &frame.planes,
                 transmittance: &frame.transmittance,
-                median_depth: &frame.median_depth,
             },
             &push!(raster_forward, frame, tiles, block),
         );
@@ -94,8 +94,6 @@ pub struct Image {
     pub planes: Vec<f64>,
     /// [H, W] T_f; alpha is 1 − T_f.
     pub transmittance: Vec<f64>,
-    /// [H, W] camera z where T falls below ½; 0 where it does not.
-    pub median_depth: Vec<f64>,
 }
 
 /// One contribution to a pixel.
@@ -155,11 +153,7 @@ pub fn twin(scene: &TwinScene, cutoffs: &Cutoffs) -> Image {
     let pixels = width as usize * height as usize;
     let channels = BASE_CHANNELS + scene.feature_dim;
     let values: Vec<_> = (0..scene.projected.len()).map(|i| channels_of(scene, i)).collect();
-    let mut image = Image {
-        planes: vec![0.0; channels * pixels],
-        transmittance: vec![1.0; pixels],
-        median_depth: vec![0.0; pixels],
-    };
+    let mut image = Image { planes: vec![0.0; channels * pixels], transmittance: vec![1.0; pixels] };
     for y in 0..height {
         for x in 0..width {
             let pixel = (y * width + x) as usize;
@@ -168,9 +162,6 @@ pub fn twin(scene: &TwinScene, cutoffs: &Cutoffs) -> Image {
                 let weight = c.alpha * c.transmittance;
                 for (k, value) in values[c.splat].iter().enumerate() {
                     image.planes[k * pixels + pixel] += weight * value;
-                }
-                if c.transmittance >= 0.5 && c.transmittance * (1.0 - c.alpha) < 0.5 {
-                    image.median_depth[pixel] = values[c.splat][3];
                 }
             }
             for k in 0..3 {

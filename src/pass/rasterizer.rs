@@ -16,7 +16,7 @@
 //! raster.record_backward(&mut rec, &params, &options, &grads);
 //! // … an optimiser pass reads grads and writes params …
 //! rec.run()?;
-//! let twist = raster.frame().camera_grad.read::<f32>()?; // ρ (3), θ (3), fx, fy, cx, cy
+//! let twist = raster.frame().camera_grad.read()?; // ρ (3), θ (3), fx, fy, cx, cy
 //! # Ok(())
 //! # }
 //! ```
@@ -78,14 +78,14 @@ fn most_entries(device: &Device, summation: Summation, feature_dim: usize) -> us
 pub struct Rasterizer {
     device: Device,
     capacity: usize,
-    camera: Buffer,
+    camera: Buffer<CameraView>,
     frame: FrameBuffers,
     grouping: Grouping,
     /// Rows of tiles whose lists are made at once.
     strip: u32,
     sort: Sort,
     /// [1] u32: N, where the sort reads it.
-    count: Buffer,
+    count: Buffer<u32>,
 }
 
 impl Rasterizer {
@@ -127,7 +127,6 @@ impl Rasterizer {
             feature_dim,
             planes: device.buffer::<f32>("planes", planes * pixels)?,
             transmittance: device.buffer::<f32>("transmittance", pixels)?,
-            median_depth: device.buffer::<f32>("median_depth", pixels)?,
             planes_grad: device.buffer::<f32>("planes_grad", (planes + 1) * pixels)?,
             camera_grad: device.buffer::<f32>("camera_grad", 10)?,
             status: device.buffer::<u32>("status", 2)?,
@@ -139,7 +138,7 @@ impl Rasterizer {
             gradient_entries: GradientEntries::default(),
             codes: device.buffer::<f32>("codes", (stride * splats).max(4))?,
             codes_grad: device.buffer::<f32>("codes_grad", (stride * splats).max(4))?,
-            depth_pairs: device.buffer::<[u32; 2]>("depth_pairs", splats)?,
+            depth_pairs: device.buffer::<u32>("depth_pairs", 2 * splats)?,
             lists: TileLists::new(device, ways.grouping, splats, tiles, entries)?,
         };
         let camera = device.buffer::<CameraView>("camera", 1)?;
@@ -163,7 +162,7 @@ impl Rasterizer {
     }
 
     /// One [`CameraView`]: what later runs of any recording render.
-    pub fn camera(&self) -> &Buffer {
+    pub fn camera(&self) -> &Buffer<CameraView> {
         &self.camera
     }
 
@@ -336,7 +335,7 @@ impl Rasterizer {
 
     /// Entries that a frame needed since the last [`Rasterizer::grow`], if they did not fit; `None` when all was well.
     pub fn overflow(&self) -> Result<Option<usize>> {
-        let needed = self.frame.status.read::<u32>()?[1] as usize;
+        let needed = self.frame.status.read()?[1] as usize;
         Ok((needed > 0).then_some(needed))
     }
 
@@ -359,14 +358,15 @@ impl Rasterizer {
         let tiles = self.frame.tiles()[0] as usize * (self.frame.bands.rows as u32).div_ceil(TILE) as usize;
         let capacity = wanted.min(most);
         self.frame.lists = TileLists::new(&self.device, self.grouping, splats, tiles, capacity)?;
-        self.frame.status.write(&[0u32, 0])
+        self.frame.status.write(&[0, 0])
     }
 
     /// The tile lists of the last forward pass, row by row of tiles, nearest splat first. For tests and statistics.
     pub fn tile_lists(&self) -> Result<Vec<Vec<u32>>> {
-        let ranges = self.frame.lists.ranges.read::<u32>()?;
-        let splats = self.frame.lists.splats.read::<[u32; 2]>()?;
-        let list = |r: &[u32]| splats[r[0] as usize..r[1] as usize].iter().map(|s| s[0]).collect();
+        let ranges = self.frame.lists.ranges.read()?;
+        let splats = self.frame.lists.splats.read()?;
+        let list =
+            |r: &[u32]| splats[2 * r[0] as usize..2 * r[1] as usize].iter().step_by(2).copied().collect();
         Ok(ranges.windows(2).map(list).collect())
     }
 

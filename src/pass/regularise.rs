@@ -4,7 +4,7 @@ use crate::gpu::{Buffer, Recorder, shaders};
 
 /// Records `weight · Σ |D − A·d|/d` over pixels with reference depth d > 0, as gradients by D = Σwz and A; without a
 /// reference both gradients become zero. Weight: divide by the number of pixels for a mean.
-pub fn record_depth(rec: &mut Recorder, frame: &FrameBuffers, reference: Option<&Buffer>, weight: f64) {
+pub fn record_depth(rec: &mut Recorder, frame: &FrameBuffers, reference: Option<&Buffer<f32>>, weight: f64) {
     rec.pass("regularisers");
     let pixels = frame.pixels();
     let alpha_plane = 4 + frame.feature_dim as u32;
@@ -45,8 +45,8 @@ pub fn depth_l1(depth: &[f64], alpha: &[f64], reference: &[f64], weight: f64) ->
 /// Records `gradients += ∂/∂log_scales (weight · Σ max(0, s_max/s_min − limit))`, both [N, 3].
 pub fn record_ratio(
     rec: &mut Recorder,
-    log_scales: &Buffer,
-    gradients: &Buffer,
+    log_scales: &Buffer<f32>,
+    gradients: &Buffer<f32>,
     count: usize,
     weight: f64,
     limit: f32,
@@ -85,13 +85,13 @@ mod tests {
         let device = crate::gpu::test_device();
         let mut random = Random::new(2);
         let rows: Vec<[f32; 3]> = (0..97).map(|_| [0; 3].map(|_| random.normal() as f32 * 2.0)).collect();
-        let log_scales = device.buffer_from("log scales", &rows).unwrap();
-        let gradients = device.buffer_from("gradients", &vec![[1.0f32; 3]; 97]).unwrap();
+        let log_scales = device.buffer_from("log scales", rows.as_flattened()).unwrap();
+        let gradients = device.buffer_from("gradients", &[1.0f32; 3 * 97]).unwrap();
         let mut rec = Recorder::new(&device, "ratio");
         record_ratio(&mut rec, &log_scales, &gradients, 97, 0.5, 8.0);
         rec.run().unwrap();
         let mut active = 0;
-        for (row, got) in rows.iter().zip(gradients.read::<[f32; 3]>().unwrap()) {
+        for (row, got) in rows.iter().zip(gradients.read().unwrap().chunks_exact(3)) {
             let row = row.map(f64::from);
             let (_, gradient) = ratio_penalty(row, 0.5, 8.0);
             active += usize::from(gradient != [0.0; 3]);
@@ -128,7 +128,7 @@ mod tests {
         let mut rec = Recorder::new(&device, "depth");
         record_depth(&mut rec, frame, Some(&buffer), 0.25);
         rec.run().unwrap();
-        let upstream = frame.planes_grad.read::<f32>().unwrap();
+        let upstream = frame.planes_grad.read().unwrap();
         let (_, gradient) = depth_l1(&depth, &alpha, &reference, 0.25);
         for i in 0..pixels {
             let loss = |d: f64, a: f64| depth_l1(&[d], &[a], &[reference[i]], 0.25).0;
@@ -143,6 +143,6 @@ mod tests {
         let mut rec = Recorder::new(&device, "clear");
         record_depth(&mut rec, frame, None, 0.0);
         rec.run().unwrap();
-        assert!(frame.planes_grad.read::<f32>().unwrap().iter().all(|&g| g == 0.0));
+        assert!(frame.planes_grad.read().unwrap().iter().all(|&g| g == 0.0));
     }
 }

@@ -7,6 +7,7 @@ use super::rasterizer::Rasterizer;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::{Device, shaders};
+use crate::math::median;
 use crate::scene::{Camera, Plane, RgbImage, Splats};
 use crate::{Error, Result};
 
@@ -23,8 +24,6 @@ pub struct Frame {
     pub alpha: Plane<f32>,
     /// [H, W] expected camera z, Σ w z / alpha, world units; 0 where alpha < ½.
     pub depth: Plane<f32>,
-    /// [H, W] camera z at which the light is half used up, world units; 0 where it is not.
-    pub median_depth: Plane<f32>,
     /// d.
     pub feature_dim: usize,
     /// [H, W, d] blended features, not divided by alpha.
@@ -133,7 +132,7 @@ impl Renderer {
 
     /// Median camera z of the splats in front of the camera; 1 when there are none.
     fn median_depth(&self, camera: &Camera) -> Result<f64> {
-        let means = self.splats.means.read_range::<f32>(0..3 * self.splats.count)?;
+        let means = self.splats.means.read_range(0..3 * self.splats.count)?;
         let axis = camera.pose.rotation.row(2);
         let depth = |m: &[f32]| {
             axis.x * f64::from(m[0])
@@ -142,11 +141,7 @@ impl Renderer {
                 + camera.pose.translation.z
         };
         let mut depths: Vec<f64> = means.chunks_exact(3).map(depth).filter(|&z| z > 0.0).collect();
-        if depths.is_empty() {
-            return Ok(1.0);
-        }
-        let middle = depths.len() / 2;
-        Ok(*depths.select_nth_unstable_by(middle, f64::total_cmp).1)
+        Ok(median(&mut depths).unwrap_or(1.0))
     }
 }
 
@@ -157,7 +152,6 @@ impl Frame {
             rgb: RgbImage { width, height, data: vec![[0.0; 3]; width * height] },
             alpha: Plane::filled(width, height, 0.0),
             depth: Plane::filled(width, height, 0.0),
-            median_depth: Plane::filled(width, height, 0.0),
             feature_dim,
             features: vec![0.0; width * height * feature_dim],
         }
@@ -167,20 +161,17 @@ impl Frame {
     pub fn read_band(&mut self, frame: &FrameBuffers, band: &Band) -> Result<()> {
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
         let stride = frame.bands.pixels();
-        let plane =
-            |k: usize| frame.planes.read_range::<f32>(k * stride + stored.start..k * stride + stored.end);
+        let plane = |k: usize| frame.planes.read_range(k * stride + stored.start..k * stride + stored.end);
         for channel in 0..3 {
             let values = plane(channel)?;
             self.rgb.data[inner.clone()].iter_mut().zip(values).for_each(|(out, v)| out[channel] = v);
         }
-        let transmittance = frame.transmittance.read_range::<f32>(stored.clone())?;
+        let transmittance = frame.transmittance.read_range(stored.clone())?;
         let outputs = self.alpha.data[inner.clone()].iter_mut().zip(&mut self.depth.data[inner.clone()]);
         for ((alpha, depth), (t, z)) in outputs.zip(transmittance.into_iter().zip(plane(3)?)) {
             *alpha = 1.0 - t;
             *depth = if *alpha >= DEPTH_ALPHA_MIN { z / *alpha } else { 0.0 };
         }
-        let median = frame.median_depth.read_range::<f32>(stored.clone())?;
-        self.median_depth.data[inner.clone()].copy_from_slice(&median);
         for k in 0..self.feature_dim {
             let pixels = self.features[inner.start * self.feature_dim..].chunks_exact_mut(self.feature_dim);
             pixels.zip(plane(BASE_CHANNELS + k)?).for_each(|(out, v)| out[k] = v);

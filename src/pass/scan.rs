@@ -4,7 +4,7 @@ use crate::gpu::{Buffer, Device, Recorder, shaders};
 
 /// Scratch space; the length of the input is only known to the device.
 pub struct Scan {
-    sums: Buffer,
+    sums: Buffer<u32>,
     lanes: u32,
 }
 
@@ -22,10 +22,10 @@ impl Scan {
     pub fn record(
         &self,
         rec: &mut Recorder,
-        values: &Buffer,
-        count: &Buffer,
-        starts: &Buffer,
-        total: &Buffer,
+        values: &Buffer<u32>,
+        count: &Buffer<u32>,
+        starts: &Buffer<u32>,
+        total: &Buffer<u32>,
     ) {
         let (lanes, sums) = (self.lanes, &self.sums);
         rec.dispatch_threads(
@@ -87,8 +87,8 @@ mod tests {
             rec.run().unwrap();
             let (mut expected, sum) = exclusive_scan(&values);
             expected.push(99);
-            assert_eq!(starts.read::<u32>().unwrap(), expected, "{n} values");
-            assert_eq!(total.read::<u32>().unwrap(), [sum], "{n} values");
+            assert_eq!(starts.read().unwrap(), expected, "{n} values");
+            assert_eq!(total.read().unwrap(), [sum], "{n} values");
         }
     }
 }

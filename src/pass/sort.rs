@@ -27,15 +27,15 @@ impl Shape {
 
 /// Scratch space for sorting up to `capacity` pairs.
 pub struct Sort {
-    scratch: Buffer,
+    scratch: Buffer<u32>,
     work: Work,
 }
 
 enum Work {
     /// [lanes, 256] digit counts.
-    Chunks { histogram: Buffer, lanes: u32 },
+    Chunks { histogram: Buffer<u32>, lanes: u32 },
     /// [4, 256] digit counts of the passes, and what the tiles of a pass tell each other.
-    Sweep { digits: Buffer, tiles: Buffer },
+    Sweep { digits: Buffer<u32>, tiles: Buffer<u32> },
 }
 
 /// Bits per pass: 256 counters for each of 8 lanes are 8 KiB of shared memory.
@@ -65,22 +65,22 @@ impl Sort {
                 // 256 measured best on lavapipe for 100k to 1M pairs.
                 let lanes = 256;
                 Work::Chunks {
-                    histogram: device.buffer::<[u32; 256]>("sort histogram", lanes)?,
+                    histogram: device.buffer::<u32>("sort histogram", 256 * lanes)?,
                     lanes: lanes as u32,
                 }
             }
             Shape::Sweep => Work::Sweep {
-                digits: device.buffer::<[u32; 256]>("sort digits", 4)?,
+                digits: device.buffer::<u32>("sort digits", 4 * 256)?,
                 tiles: device.buffer::<u32>("sort tiles", 1 + 256 * capacity.div_ceil(TILE))?,
             },
         };
-        Ok(Sort { scratch: device.buffer::<[u32; 2]>("sort scratch", capacity)?, work })
+        Ok(Sort { scratch: device.buffer::<u32>("sort scratch", 2 * capacity)?, work })
     }
 
     /// Sorts the first `count[0]` elements of `pairs` (`[N]` of (key, value)) by the lowest `bits` bits of the key,
     /// keeping the order of equal keys; what lies behind them is undefined afterwards. `count` is read on the device.
     /// Twin: [`sort_pairs`].
-    pub fn record(&self, rec: &mut Recorder, pairs: &Buffer, count: &Buffer, bits: u32) {
+    pub fn record(&self, rec: &mut Recorder, pairs: &Buffer<u32>, count: &Buffer<u32>, bits: u32) {
         if pairs.bytes() > self.scratch.bytes() {
             rec.fail(format!("sort: `{}` has more pairs than the capacity of the sort", pairs.name()));
         }
@@ -110,9 +110,9 @@ impl Sort {
 
 fn record_chunks(
     rec: &mut Recorder,
-    (from, to): (&Buffer, &Buffer),
-    count: &Buffer,
-    (histogram, lanes): (&Buffer, u32),
+    (from, to): (&Buffer<u32>, &Buffer<u32>),
+    count: &Buffer<u32>,
+    (histogram, lanes): (&Buffer<u32>, u32),
     (key, pass): (Key, u32),
 ) {
     let (shift, mask) = (pass * DIGIT_BITS, key.mask);
@@ -141,7 +141,13 @@ fn record_chunks(
 }
 
 /// Where the elements with each digit begin, for all passes.
-fn record_digits(rec: &mut Recorder, pairs: &Buffer, count: &Buffer, digits: &Buffer, key: Key) {
+fn record_digits(
+    rec: &mut Recorder,
+    pairs: &Buffer<u32>,
+    count: &Buffer<u32>,
+    digits: &Buffer<u32>,
+    key: Key,
+) {
     rec.fill(digits, 0);
     let call = shaders::sort_digits::call(
         &shaders::sort_digits::Bindings { pairs, count, digits },
@@ -154,9 +160,9 @@ fn record_digits(rec: &mut Recorder, pairs: &Buffer, count: &Buffer, digits: &Bu
 
 fn record_sweep(
     rec: &mut Recorder,
-    (from, to): (&Buffer, &Buffer),
-    count: &Buffer,
-    (digits, tiles): (&Buffer, &Buffer),
+    (from, to): (&Buffer<u32>, &Buffer<u32>),
+    count: &Buffer<u32>,
+    (digits, tiles): (&Buffer<u32>, &Buffer<u32>),
     (key, pass): (Key, u32),
 ) {
     rec.fill(tiles, 0);
@@ -171,7 +177,7 @@ fn record_sweep(
 }
 
 /// Pairs in a buffer.
-fn capacity(pairs: &Buffer) -> usize {
+fn capacity(pairs: &Buffer<u32>) -> usize {
     pairs.bytes() as usize / std::mem::size_of::<[u32; 2]>()
 }
 
@@ -207,13 +213,13 @@ mod tests {
     }
 
     fn sorted_in(device: &Device, pairs: &[[u32; 2]], n: usize, bits: u32, shape: Shape) -> Vec<[u32; 2]> {
-        let buffer = device.buffer_from("pairs", pairs).unwrap();
+        let buffer = device.buffer_from("pairs", pairs.as_flattened()).unwrap();
         let count = device.buffer_from("count", &[n as u32]).unwrap();
         let sort = Sort::with(device, pairs.len(), shape).unwrap();
         let mut rec = Recorder::new(device, "sort");
         sort.record(&mut rec, &buffer, &count, bits);
         rec.run().unwrap();
-        buffer.read().unwrap()
+        buffer.read().unwrap().as_chunks().0.to_vec()
     }
 
     #[test]

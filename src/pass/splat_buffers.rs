@@ -13,17 +13,17 @@ pub struct SplatBuffers {
     /// d.
     pub feature_dim: usize,
     /// [N, 3] f32, world units.
-    pub means: Buffer,
+    pub means: Buffer<f32>,
     /// [N, 3] f32, natural logs.
-    pub log_scales: Buffer,
+    pub log_scales: Buffer<f32>,
     /// [N, 4] f32 (w, x, y, z), not necessarily normalised.
-    pub quats: Buffer,
+    pub quats: Buffer<f32>,
     /// [N] f32.
-    pub opacity_logits: Buffer,
+    pub opacity_logits: Buffer<f32>,
     /// [N, (sh_degree+1)², 3] f32, DC first, RGB interleaved.
-    pub sh: Buffer,
+    pub sh: Buffer<f32>,
     /// [N, d] f32 raw features (a single unused float when d = 0).
-    pub features: Buffer,
+    pub features: Buffer<f32>,
 }
 
 impl SplatBuffers {
@@ -45,9 +45,9 @@ impl SplatBuffers {
         }
         let out = SplatBuffers::zeros(device, "splats", n, splats.sh_degree, feature_dim)?;
         if n > 0 {
-            out.means.write(&splats.means)?;
-            out.log_scales.write(&splats.log_scales)?;
-            out.quats.write(&splats.quats)?;
+            out.means.write(splats.means.as_flattened())?;
+            out.log_scales.write(splats.log_scales.as_flattened())?;
+            out.quats.write(splats.quats.as_flattened())?;
             out.opacity_logits.write(&splats.opacity_logits)?;
             out.sh.write(&splats.sh)?;
         }
@@ -93,7 +93,7 @@ impl SplatBuffers {
     /// Back to the host: splats and features [N, d].
     pub fn download(&self) -> Result<(Splats, Vec<f32>)> {
         let n = self.count;
-        let floats = |b: &Buffer, len: usize| b.read_range::<f32>(0..len);
+        let floats = |b: &Buffer<f32>, len: usize| b.read_range(0..len);
         let splats = Splats {
             means: triples(&floats(&self.means, 3 * n)?),
             log_scales: triples(&floats(&self.log_scales, 3 * n)?),

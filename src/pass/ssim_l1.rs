@@ -123,13 +123,13 @@ const CHANNELS: usize = 3;
 /// The GPU pass for one image size: scratch memory, reused for every view of that size and all its bands.
 pub struct SsimL1 {
     bands: Bands,
-    means: Buffer,
-    moments: Buffer,
-    slopes: Buffer,
-    cross: Buffer,
-    ssim_sums: Buffer,
-    l1_sums: Buffer,
-    partials: Buffer,
+    means: Buffer<f32>,
+    moments: Buffer<f32>,
+    slopes: Buffer<f32>,
+    cross: Buffer<f32>,
+    ssim_sums: Buffer<f32>,
+    l1_sums: Buffer<f32>,
+    partials: Buffer<f32>,
 }
 
 impl SsimL1 {
@@ -137,7 +137,7 @@ impl SsimL1 {
     pub fn new(device: &Device, bands: &Bands) -> Result<Self> {
         let (width, height) = (bands.width, bands.rows);
         let values = CHANNELS * width * height;
-        let pairs = |name| device.buffer::<[f32; 2]>(name, values);
+        let pairs = |name| device.buffer::<f32>(name, 2 * values);
         Ok(SsimL1 {
             bands: bands.clone(),
             means: pairs("ssim means")?,
@@ -157,11 +157,11 @@ impl SsimL1 {
         &self,
         rec: &mut Recorder,
         band: &Band,
-        rendered: &Buffer,
-        target: &Buffer,
-        gradient: &Buffer,
+        rendered: &Buffer<f32>,
+        target: &Buffer<f32>,
+        gradient: &Buffer<f32>,
         weights: [f64; 2],
-        loss: (&Buffer, u32),
+        loss: (&Buffer<f32>, u32),
     ) {
         rec.pass("SSIM + L1");
         let (width, height) = (self.bands.width as i32, self.bands.rows as i32);
@@ -286,12 +286,12 @@ mod tests {
             let mut rec = Recorder::new(&device, "ssim");
             pass.record(&mut rec, &bands.get(0), &rendered, &target, &out, [0.8, 0.2], (&sums, 1));
             rec.run().unwrap();
-            let sums = sums.read::<f32>().unwrap();
+            let sums = sums.read().unwrap();
             let loss = pass.loss([sums[1], sums[2]].map(f64::from));
             // f32 sums of about 10⁴ values of order one: 1e-5.
             assert!((loss.l1 - expected.l1).abs() < 1e-5 && (loss.ssim - expected.ssim).abs() < 1e-5);
             let scale = gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
-            for (g, e) in out.read::<f32>().unwrap().into_iter().zip(gradient) {
+            for (g, e) in out.read().unwrap().into_iter().zip(gradient) {
                 // E[x²]−E[x]² cancels about three digits in f32, amplified by 1/C2 in flat regions.
                 assert!((f64::from(g) - e).abs() < 1e-3 * scale, "{w}x{h}: {g} {e}");
             }

@@ -5,7 +5,13 @@ use crate::gpu::{Buffer, Recorder, shaders};
 pub const PARTIALS: usize = 64;
 
 /// Records `result[slot] = Σ values`. `partials` holds [`PARTIALS`] floats of scratch.
-pub fn record(rec: &mut Recorder, values: &Buffer, partials: &Buffer, result: &Buffer, slot: u32) {
+pub fn record(
+    rec: &mut Recorder,
+    values: &Buffer<f32>,
+    partials: &Buffer<f32>,
+    result: &Buffer<f32>,
+    slot: u32,
+) {
     let count = (values.bytes() / 4) as u32;
     let call = shaders::sum::call(
         &shaders::sum::Bindings { values, result: partials },

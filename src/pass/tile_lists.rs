@@ -26,24 +26,24 @@ impl Grouping {
 /// The tile lists of one frame and what it takes to make them.
 pub(super) struct TileLists {
     /// [tiles + 1]
-    pub ranges: Buffer,
+    pub ranges: Buffer<u32>,
     /// [capacity] (splat, entry), grouped by tile, nearest first.
-    pub splats: Buffer,
+    pub splats: Buffer<u32>,
     /// [N] entries of each splat, in depth order, and where they begin.
-    pub counts: Buffer,
-    pub starts: Buffer,
+    pub counts: Buffer<u32>,
+    pub starts: Buffer<u32>,
     /// [1] entries of this frame, 0 when they did not fit.
-    pub entry_count: Buffer,
+    pub entry_count: Buffer<u32>,
     /// Entries there is room for.
     pub capacity: usize,
-    pub entries: Buffer,
+    pub entries: Buffer<u32>,
     pub scan: Scan,
     pub group: Group,
 }
 
 pub(super) enum Group {
-    Counting { counters: Buffer, lanes: u32 },
-    Sorting { entry_splats: Buffer, sort: Sort },
+    Counting { counters: Buffer<u32>, lanes: u32 },
+    Sorting { entry_splats: Buffer<u32>, sort: Sort },
 }
 
 /// Lanes that write entries before a sort, and that read them behind it: enough to fill any GPU.
@@ -71,12 +71,12 @@ impl TileLists {
         };
         Ok(TileLists {
             ranges: device.buffer::<u32>("tile_ranges", tiles + 1)?,
-            splats: device.buffer::<[u32; 2]>("tile_splats", capacity)?,
+            splats: device.buffer::<u32>("tile_splats", 2 * capacity)?,
             counts: device.buffer::<u32>("tile_counts", splats)?,
             starts: device.buffer::<u32>("tile_starts", splats)?,
             entry_count: device.buffer::<u32>("entry_count", 1)?,
             capacity,
-            entries: device.buffer::<[u32; 2]>("entries", capacity)?,
+            entries: device.buffer::<u32>("entries", 2 * capacity)?,
             scan: Scan::new(device)?,
             group,
         })

@@ -107,8 +107,8 @@ pub fn stages(
         let mut bytes = 0;
         for &(w, h) in &distinct {
             let stored = Bands::new(device, w, h, channels)?.pixels() as u64;
-            // Planes and their gradients; transmittance, median, loss; SSIM: three vec2 and one float per colour.
-            bytes += stored * (4 * (2 * channels as u64 + 1) + 12 + 84);
+            // Planes and their gradients; transmittance, loss; SSIM: three vec2 and one float per colour.
+            bytes += stored * (4 * (2 * channels as u64 + 1) + 8 + 84);
             // On the screen: 12 + 12 floats, the features and their gradients, depth keys and their sort; eight entries of
             // 20 bytes in the lists.
             bytes += splats * (96 + 8 * features as u64 + 16 + 160);

@@ -122,13 +122,13 @@ impl ViewRefiner {
                 }
                 break;
             }
-            let s = sums.read::<f32>()?;
+            let s = sums.read()?;
             let total = loss.loss([s[0], s[1]].map(f64::from)).total(WEIGHTS[0], WEIGHTS[1]);
             if total < best.0 {
                 best = (total, pose);
             }
             if step < steps {
-                let g = raster.frame().camera_grad.read::<f32>()?;
+                let g = raster.frame().camera_grad.read()?;
                 let twist = [g[0], g[1], g[2], g[3], g[4], g[5]].map(f64::from);
                 pose = adam.update(&pose, twist, rate.at(step), scale.median_depth);
             }
@@ -136,7 +136,13 @@ impl ViewRefiner {
         Ok(best.1)
     }
 
-    fn record(&self, raster: &Rasterizer, loss: &SsimL1, target: &Buffer, sums: &Buffer) -> Recorder {
+    fn record(
+        &self,
+        raster: &Rasterizer,
+        loss: &SsimL1,
+        target: &Buffer<f32>,
+        sums: &Buffer<f32>,
+    ) -> Recorder {
         let frame = raster.frame();
         let mut rec = Recorder::new(&self.device, "refine view");
         raster.record_forward(&mut rec, &self.params, &self.options);
@@ -151,8 +157,8 @@ impl ViewRefiner {
 /// and white balance do not pull at the camera. Where the scene shows nothing, there is nothing to compare either.
 fn target(photo: &RgbImage, raster: &Rasterizer) -> Result<RgbImage> {
     let pixels = photo.data.len();
-    let planes = raster.frame().planes.read_range::<f32>(0..3 * pixels)?;
-    let left = raster.frame().transmittance.read_range::<f32>(0..pixels)?;
+    let planes = raster.frame().planes.read_range(0..3 * pixels)?;
+    let left = raster.frame().transmittance.read_range(0..pixels)?;
     let seen: Vec<usize> = (0..pixels).filter(|&p| left[p] < 0.5).collect();
     let n = seen.len().max(1) as f64;
     let moments = |value: &dyn Fn(usize) -> f32| {

@@ -23,8 +23,8 @@ pub struct Viewer {
     renderer: Renderer,
     /// Per level its first feature channel and its codes; `None` for a level without codes.
     levels: Vec<Option<(usize, Codes)>>,
-    /// Decoded codes and their margins, of the size of the last view.
-    output: Option<(Buffer, Buffer)>,
+    /// Decoded codes, of the size of the last view.
+    output: Option<Buffer<i32>>,
 }
 
 impl Viewer {
@@ -106,30 +106,27 @@ fn empty(levels: usize, camera: &Camera) -> Vec<Plane<i32>> {
 fn decode(
     device: &Device,
     levels: &[Option<(usize, Codes)>],
-    output: &mut Option<(Buffer, Buffer)>,
+    output: &mut Option<Buffer<i32>>,
     frame: &FrameBuffers,
     band: &Band,
     codes: &mut [Plane<i32>],
 ) -> Result<()> {
     let pixels = frame.pixels();
-    let (decoded, margin) = match output.take().filter(|o| o.0.bytes() == 4 * u64::from(pixels)) {
+    let decoded = match output.take().filter(|o| o.bytes() == 4 * u64::from(pixels)) {
         Some(fits) => fits,
-        None => {
-            let len = pixels as usize;
-            (device.buffer::<i32>("decoded", len)?, device.buffer::<f32>("margin", len)?)
-        }
+        None => device.buffer::<i32>("decoded", pixels as usize)?,
     };
     for (plane, level) in codes.iter_mut().zip(levels) {
         let Some((first, table)) = level else { continue };
         let mut rec = Recorder::new(device, "decode");
         let at = (BASE_CHANNELS + first) as u32;
         let (planes, transmittance) = (&frame.planes, &frame.transmittance);
-        table.record(&mut rec, planes, at, transmittance, pixels, &decoded, &margin);
+        table.record(&mut rec, planes, at, transmittance, pixels, &decoded);
         rec.run()?;
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
-        plane.data[inner].copy_from_slice(&decoded.read_range::<i32>(stored)?);
+        plane.data[inner].copy_from_slice(&decoded.read_range(stored)?);
     }
-    *output = Some((decoded, margin));
+    *output = Some(decoded);
     Ok(())
 }
 
