@@ -101,8 +101,8 @@ fn done(lab: &mut Lab, mut row: Row, seen: &mut Vec<String>) -> Result<Done> {
     match lab.outcome(setup) {
         Ok(outcome) => Ok(Done { bytes: Some(outcome.feature_bytes), outcome: Some(outcome), row }),
         // What a device cannot hold is a finding about it; the other rows still count.
-        Err(Error::Gpu(why)) => {
-            row.note = why;
+        Err(e @ (Error::Gpu { .. } | Error::OutOfDeviceMemory { .. })) => {
+            row.note = e.to_string();
             Ok(Done { bytes: None, outcome: None, row })
         }
         Err(e) => Err(e),

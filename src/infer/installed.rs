@@ -112,7 +112,8 @@ impl Installed {
     /// The graph of a part.
     pub fn graph(&self, part: Part) -> Result<&GraphFile> {
         self.graphs.get(&part).ok_or_else(|| {
-            Error::missing(format!("{}: model {} has no {}", self.folder.display(), self.name, part.name()))
+            let (folder, name) = (self.folder.display(), &self.name);
+            Error::missing_model(name, format!("{folder}: model {name} has no {}", part.name()))
         })
     }
 
@@ -279,15 +280,16 @@ impl Registry {
             known().iter().any(|k| k.family == name && text.contains(&k.id)) || text.contains(name)
         };
         if let Some((_, why)) = inventory.broken.iter().find(|(path, _)| about(path)) {
-            return Err(Error::missing(why.clone()));
+            return Err(Error::missing_model(name, why.clone()));
         }
         let place = self.folders().first().map(|f| f.display().to_string()).unwrap_or_default();
         let how = known().iter().find(|k| k.family == name && k.does(duty));
         let how = how.map_or(String::new(), |k| format!(" (from {}, exported with {})", k.source, k.export));
-        Err(Error::missing(format!(
+        let message = format!(
             "no model \"{name}\" for {} in {place}; put its ONNX files{how} into {place}/{name}/, or see splatvk models list",
             duty.name()
-        )))
+        );
+        Err(Error::missing_model(name, message))
     }
 }
 

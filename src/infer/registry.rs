@@ -168,7 +168,7 @@ impl Registry {
     pub fn path(&self, role: Role) -> Result<PathBuf> {
         let found = self.pack.files.iter().find(|f| f.role == role).map(|f| self.inspect(f));
         match found {
-            Some(ModelStatus { fix: Some(fix), .. }) => Err(Error::missing(fix)),
+            Some(ModelStatus { name, fix: Some(fix), .. }) => Err(Error::missing_model(name, fix)),
             Some(status) => Ok(status.file),
             None => Err(Error::work(format!("no model for {role:?} in the model table"))),
         }

@@ -127,7 +127,10 @@ impl Session {
             built => built,
         };
         let inner = built.map_err(|e| {
-            Error::missing(format!("{}: ONNX Runtime cannot load it: {}", file.display(), line(&e)))
+            Error::missing_model(
+                file.display(),
+                format!("{}: ONNX Runtime cannot load it: {}", file.display(), line(&e)),
+            )
         })?;
         if large {
             drop(HandBack);

@@ -491,5 +491,5 @@ fn write_files(out: &Path, stem: &str, shown: &RgbImage, answers: &[(u32, QueryR
 }
 
 fn make_parent(path: &Path) -> Result<()> {
-    path.parent().map_or(Ok(()), |p| std::fs::create_dir_all(p).map_err(Error::io(p)))
+    path.parent().map_or(Ok(()), |p| std::fs::create_dir_all(p).map_err(Error::unwritable(p)))
 }
