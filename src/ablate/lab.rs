@@ -23,6 +23,7 @@ use std::sync::Arc;
 
 /// What came out of a setup.
 #[derive(Clone)]
+#[non_exhaustive]
 pub struct Outcome {
     /// Figures of protocol `field`, and how well the rendered meaning agrees with the true one.
     pub scored: Arc<Scored>,

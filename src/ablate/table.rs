@@ -17,6 +17,7 @@ pub struct Done {
 }
 
 /// A table that ran.
+#[non_exhaustive]
 pub struct Finished {
     /// Which.
     pub table: &'static Table,

@@ -200,6 +200,7 @@ pub fn table(name: &str) -> Option<&'static Table> {
 /// Where masks and features come from.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Regions {
     /// Found in the photos, or read from a folder.
     Found {
@@ -270,6 +271,7 @@ pub struct Setup {
 
 /// What a row takes.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub enum Runs {
     /// All of it, scored.
     Scored(Setup),

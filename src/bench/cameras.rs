@@ -31,6 +31,7 @@ pub struct CameraRow {
 /// Figures or the reason why there are none.
 #[derive(Clone, Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum CameraOutcome {
     /// Cameras were found.
     Figures(Box<CameraFigures>),
@@ -67,6 +68,7 @@ pub struct CameraFigures {
 
 /// Data sets and what they say together.
 #[derive(Clone, Debug, Serialize)]
+#[non_exhaustive]
 pub struct CameraReport {
     /// In the order given.
     pub rows: Vec<CameraRow>,

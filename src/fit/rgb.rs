@@ -43,6 +43,7 @@ pub struct CurvePoint {
 
 /// What happened during a fit.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct FitStats {
     /// The loss over time.
     pub curve: Vec<CurvePoint>,
@@ -65,6 +66,7 @@ impl FitStats {
 
 /// The result of the RGB stage.
 #[derive(Clone, Debug, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct Trained {
     /// Fitted splats.
     pub splats: Splats,

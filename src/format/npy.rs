@@ -9,6 +9,7 @@ const MAGIC: &[u8] = b"\x93NUMPY";
 
 /// The values of an array in its stored type.
 #[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum NpyData {
     /// `<f2`
     F16(Vec<f16>),

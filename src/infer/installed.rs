@@ -18,6 +18,7 @@ use crate::{Error, Result};
 /// What a model does in a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Deserialize, Serialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum Duty {
     /// Cameras, depth and points.
     Geometry,

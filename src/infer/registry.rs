@@ -19,6 +19,7 @@ const FIX: &str = "run tools/setup (or tools/models/build) to get it";
 /// What a model file is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum Role {
     /// Keypoints and descriptors.
     Keypoints,
@@ -36,6 +37,7 @@ pub enum Role {
 
 /// One file of the pack as found on this machine.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct ModelStatus {
     /// What it is for.
     pub role: Role,

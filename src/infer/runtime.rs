@@ -21,6 +21,7 @@ pub struct Tensor {
 
 /// What a session is fed. Floats and integers are converted to the element type that the graph asks for.
 #[derive(Clone)]
+#[non_exhaustive]
 pub enum Input {
     /// Row-major floats.
     F32(Vec<usize>, Vec<f32>),

@@ -13,6 +13,7 @@ use crate::report::viewer::Names;
 use crate::scene::{Camera, LanguageField, Splats};
 
 /// Everything a finished run knows; [`crate::report`] turns it into run.json, report.html and the summary.
+#[non_exhaustive]
 pub struct Outcome {
     /// What was asked for.
     pub plan: RunPlan,

@@ -53,6 +53,7 @@ pub struct TrainPlan {
 }
 
 /// What a finished training tells.
+#[non_exhaustive]
 pub struct TrainOutcome {
     /// Content of run.json.
     pub record: RunRecord,

@@ -45,6 +45,7 @@ const SUPPORT_TAPS: i32 = 4;
 
 /// What another view says about a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum Verdict {
     /// Outside its image, or it knows nothing there.
     Unseen,
