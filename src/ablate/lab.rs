@@ -138,6 +138,7 @@ impl<'a> Lab<'a> {
             sam: SamOptions::default(),
             given_features: given(&setup.regions),
             preset: Preset::Draft,
+            seed: self.seed,
         };
         let posed = if setup.true_cameras {
             let named = |f: &Frame| Camera { name: f.stem.clone(), ..f.camera.clone() };

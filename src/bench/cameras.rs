@@ -147,7 +147,7 @@ fn placed(
     if reading.copies {
         photos.iter_mut().for_each(|p| p.fine = None);
     }
-    pose::place(photos, None, registry, progress)
+    pose::place(photos, None, registry, 0, progress)
 }
 
 fn figures(truth: &GroundTruth, frames: &[&Frame], placed: &Placed) -> Result<CameraFigures> {

@@ -150,8 +150,8 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         options = options.with_iterations(n);
     }
     let mut graph = Graph::default();
-    let placed = graph.add(stages::Cameras::new(photos, source)?, ());
-    let geometry = graph.add(stages::Depth { preset }, (placed,));
+    let placed = graph.add(stages::Cameras::new(photos, source, plan.seed)?, ());
+    let geometry = graph.add(stages::Depth { preset, seed: plan.seed }, (placed,));
     let trained = graph.add(stages::TrainColour { options }, (placed, geometry));
     let targets = [placed.target(), geometry.target(), trained.target()];
     let store = super::execute::store(plan.resume, plan.checkpoint_seconds);
