@@ -27,7 +27,7 @@ pub enum Error {
     },
     /// A place cannot take a file: the disk is full, or the folder or file system does not allow it. Nothing half-written
     /// stays there; the same work succeeds once there is space, or in another place.
-    #[error("{}: cannot be written: {source}{}", path.display(), advice(source))]
+    #[error("{}: cannot be written: {source}{}", path.display(), elsewhere(source))]
     Unwritable {
         /// The file or folder.
         path: PathBuf,
@@ -163,6 +163,15 @@ impl Error {
     }
 }
 
+/// What the user can do about a place that cannot be written.
+fn elsewhere(e: &std::io::Error) -> &'static str {
+    match (e.kind(), advice(e)) {
+        // It was to be made.
+        (std::io::ErrorKind::NotFound, _) | (_, "") => "; choose another folder",
+        (_, advice) => advice,
+    }
+}
+
 /// How to go on without the device.
 fn after_loss(resumable: bool) -> &'static str {
     match resumable {
@@ -179,9 +188,6 @@ fn advice(e: &std::io::Error) -> &'static str {
         K::FileTooLarge => "; the file size limit (ulimit -f) is too small for this file",
         K::PermissionDenied | K::ReadOnlyFilesystem => "; choose a folder that you may write to",
         K::NotFound => "; check the name",
-        K::NotADirectory | K::IsADirectory | K::AlreadyExists | K::InvalidFilename => {
-            "; choose another folder"
-        }
         _ => "",
     }
 }
