@@ -1,4 +1,5 @@
-//! A scene from a camera that circles what its first photo shows: `cargo run --release --example render -- out/kitchen orbit`.
+//! A scene from a camera that swings around what the photo in the middle shows:
+//! `cargo run --release --example render -- out/kitchen orbit`.
 use glam::{DMat3, DVec2};
 use splatvk::format::{picture, scene_dir};
 use splatvk::gpu::Device;
@@ -8,10 +9,10 @@ use splatvk::{Error, Result};
 use std::path::Path;
 use std::process::ExitCode;
 
-/// Pictures of a swing to one side and back.
+/// Pictures of a swing to either side and back.
 const FRAMES: usize = 8;
 /// To either side, radians.
-const SWING: f64 = 0.35;
+const SWING: f64 = 0.2;
 
 /// The camera turned by an angle around a vertical axis through the point at `depth` before it.
 fn orbit(camera: &Camera, depth: f64, angle: f64) -> Camera {
@@ -26,16 +27,17 @@ fn orbit(camera: &Camera, depth: f64, angle: f64) -> Camera {
 
 fn render(scene: &Path, out: &Path) -> Result<()> {
     let scene = scene_dir::load(scene)?;
-    let first = scene.cameras.first().ok_or_else(|| Error::input("the scene has no cameras"))?;
+    let middle = scene.cameras.get(scene.cameras.len() / 2);
+    let middle = middle.ok_or_else(|| Error::input("the scene has no cameras"))?;
     let mut renderer = Renderer::new(&Device::open(None)?, &scene.splats, &[], 0)?;
     std::fs::create_dir_all(out).map_err(Error::unwritable(out))?;
-    let seen = renderer.render(first)?;
+    let seen = renderer.render(middle)?;
     let mut depths: Vec<f32> = seen.depth.data.iter().copied().filter(|z| *z > 0.0).collect();
     depths.sort_by(f32::total_cmp);
     let depth = depths.get(depths.len() / 2).copied().unwrap_or(1.0);
     for k in 0..FRAMES {
         let angle = SWING * (std::f64::consts::TAU * k as f64 / FRAMES as f64).sin();
-        let frame = renderer.render(&orbit(first, f64::from(depth), angle))?;
+        let frame = renderer.render(&orbit(middle, f64::from(depth), angle))?;
         let path = out.join(format!("{k:02}.png"));
         picture::write_png(&path, &frame.rgb)?;
         println!("{}", path.display());
