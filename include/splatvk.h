@@ -48,15 +48,15 @@ enum SvkStatus
      */
     SVK_STATUS_INPUT = 1,
     /*
-     A file could not be read or written.
+     A file could not be read.
      */
     SVK_STATUS_IO = 2,
     /*
-     A model, library or driver is not installed.
+     A library or program is not installed.
      */
     SVK_STATUS_MISSING = 3,
     /*
-     The Vulkan device or driver refused something.
+     The Vulkan device or driver refused something, other than the codes from 9 on.
      */
     SVK_STATUS_GPU = 4,
     /*
@@ -75,6 +75,26 @@ enum SvkStatus
      A mistake in splatvk. The handle may be destroyed, and nothing else should be done with it.
      */
     SVK_STATUS_INTERNAL = 8,
+    /*
+     The Vulkan device was lost. Contexts and scenes on it can only be destroyed; a context on a new device may work.
+     */
+    SVK_STATUS_DEVICE_LOST = 9,
+    /*
+     The Vulkan device has no memory left: fewer splats, smaller photos or another device may help.
+     */
+    SVK_STATUS_OUT_OF_DEVICE_MEMORY = 10,
+    /*
+     No Vulkan loader, driver or device that can be used.
+     */
+    SVK_STATUS_NO_DEVICE = 11,
+    /*
+     A model, or a file of it, is missing or not what it is used for.
+     */
+    SVK_STATUS_MISSING_MODEL = 12,
+    /*
+     A file cannot be written: the disk is full, or the folder does not allow it. Nothing half-written stays.
+     */
+    SVK_STATUS_UNWRITABLE = 13,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L

@@ -26,6 +26,11 @@ impl Checkpoint {
         postcard::from_bytes(&bytes).ok()
     }
 
+    /// Whether there is a state on disk, of this process or an earlier one.
+    pub(crate) fn exists(&self) -> bool {
+        self.file.is_file()
+    }
+
     /// Whether it is time for the next.
     pub fn due(&self) -> bool {
         self.last.lock().unwrap_or_else(PoisonError::into_inner).elapsed() >= self.every

@@ -4,14 +4,20 @@ use std::path::{Path, PathBuf};
 /// The crate's result.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// Everything that can go wrong. [`Error::exit_code`] maps it to the process exit code.
+/// What stands behind an error, where there is something.
+pub type Cause = Box<dyn std::error::Error + Send + Sync + 'static>;
+
+/// Everything that can go wrong, by what a program may do about it. The message alone says everything; [`source`] is there
+/// for what the system or the driver said. [`Error::exit_code`] maps it to the process exit code.
+///
+/// [`source`]: std::error::Error::source
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// What the user typed or supplied cannot be used: the message names it and says what to do.
     #[error("{0}")]
     Input(String),
-    /// A file could not be read or written.
+    /// A file could not be read, or not written for a reason that only its cause can tell.
     #[error("{}: {source}{}", path.display(), advice(source))]
     Io {
         /// The file or folder.
@@ -19,12 +25,61 @@ pub enum Error {
         /// What the operating system said.
         source: std::io::Error,
     },
-    /// A model file, the inference library or another installable part is missing or corrupt.
+    /// A place cannot take a file: the disk is full, or the folder or file system does not allow it. Nothing half-written
+    /// stays there; the same work succeeds once there is space, or in another place.
+    #[error("{}: cannot be written: {source}{}", path.display(), elsewhere(source))]
+    Unwritable {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the operating system said; its [`kind`](std::io::Error::kind) tells a full disk from a missing permission.
+        source: std::io::Error,
+    },
+    /// The inference library, a program or another installable part is missing or cannot be used.
     #[error("{0}")]
     Missing(String),
-    /// The Vulkan loader, device or driver refused something.
-    #[error("Vulkan: {0}")]
-    Gpu(String),
+    /// A model, or a file of it, is missing, corrupt or not what it is used for.
+    #[error("{message}")]
+    MissingModel {
+        /// Its name in the model table, that of its folder, or the path of the file.
+        model: String,
+        /// What is wrong with it and how to get it.
+        message: String,
+    },
+    /// No Vulkan loader, driver or device that can be used.
+    #[error("{message}")]
+    NoDevice {
+        /// What is missing and how to get it.
+        message: String,
+        /// What the loader or the driver said, if it was asked.
+        source: Option<Cause>,
+    },
+    /// The Vulkan device was lost: reset by its driver, removed, or asleep. Everything on it is gone and nothing more can be
+    /// done with it; a new [`crate::gpu::Device`] may work.
+    #[error("Vulkan: {doing}: the device was lost ({source}); {}", after_loss(*resumable))]
+    DeviceLost {
+        /// What was being done.
+        doing: String,
+        /// Finished stages or a state of training are on disk, from which the same run with `resume` goes on.
+        resumable: bool,
+        /// What the driver said.
+        source: ash::vk::Result,
+    },
+    /// The Vulkan device or its driver has no memory left.
+    #[error("Vulkan: {doing}: {source}; use fewer splats, smaller photos or another device")]
+    OutOfDeviceMemory {
+        /// What was being done, with its size where one is known.
+        doing: String,
+        /// What the driver said.
+        source: ash::vk::Result,
+    },
+    /// The Vulkan driver refused something else, or the device cannot do it.
+    #[error("Vulkan: {message}")]
+    Gpu {
+        /// What was refused and why.
+        message: String,
+        /// What the driver said, if it was asked.
+        source: Option<ash::vk::Result>,
+    },
     /// Something failed while working on valid input.
     #[error("{0}")]
     Work(String),
@@ -46,24 +101,82 @@ impl Error {
     pub fn missing(message: impl Into<String>) -> Self {
         Error::Missing(message.into())
     }
-    /// Shorthand for [`Error::Gpu`].
-    pub fn gpu(message: impl Into<String>) -> Self {
-        Error::Gpu(message.into())
+    /// Shorthand for [`Error::MissingModel`].
+    pub fn missing_model(model: impl std::fmt::Display, message: impl Into<String>) -> Self {
+        Error::MissingModel { model: model.to_string(), message: message.into() }
     }
-    /// Attaches the path to an I/O error: `.map_err(Error::io(path))`.
+    /// Shorthand for [`Error::NoDevice`] without a cause.
+    pub fn no_device(message: impl Into<String>) -> Self {
+        Error::NoDevice { message: message.into(), source: None }
+    }
+    /// Shorthand for [`Error::Gpu`] without a cause.
+    pub fn gpu(message: impl Into<String>) -> Self {
+        Error::Gpu { message: message.into(), source: None }
+    }
+    /// What a Vulkan call returned, as the variant that a program reacts to; `doing` says what it was for.
+    pub fn vulkan(doing: impl Into<String>, source: ash::vk::Result) -> Self {
+        use ash::vk::Result as R;
+        let doing = doing.into();
+        match source {
+            R::ERROR_DEVICE_LOST => Error::DeviceLost { doing, resumable: false, source },
+            R::ERROR_OUT_OF_DEVICE_MEMORY | R::ERROR_OUT_OF_HOST_MEMORY => {
+                Error::OutOfDeviceMemory { doing, source }
+            }
+            _ => Error::Gpu { message: format!("{doing}: {source}"), source: Some(source) },
+        }
+    }
+    /// Attaches the path to an I/O error: `.map_err(Error::io(path))`. What only writing can meet becomes
+    /// [`Error::Unwritable`].
     pub fn io(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Error {
+        use std::io::ErrorKind as K;
         let path = path.as_ref().to_path_buf();
-        move |source| Error::Io { path, source }
+        move |source| match source.kind() {
+            K::StorageFull | K::QuotaExceeded | K::FileTooLarge | K::ReadOnlyFilesystem => {
+                Error::Unwritable { path, source }
+            }
+            _ => Error::Io { path, source },
+        }
+    }
+    /// Attaches the path to an I/O error of writing, whatever it was.
+    pub fn unwritable(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Error {
+        let path = path.as_ref().to_path_buf();
+        move |source| Error::Unwritable { path, source }
+    }
+    /// The same error, where finished stages or a state of training are on disk.
+    pub(crate) fn resumable(self) -> Self {
+        match self {
+            Error::DeviceLost { doing, source, .. } => Error::DeviceLost { doing, resumable: true, source },
+            e => e,
+        }
     }
     /// 2 for bad usage, bad input, a missing part or a place that cannot be written (also a full disk); 1 for a failure
     /// while working; 130 when stopped by the user.
     pub fn exit_code(&self) -> u8 {
         match self {
-            Error::Input(_) | Error::Missing(_) => 2,
+            Error::Input(_) | Error::Missing(_) | Error::MissingModel { .. } => 2,
+            Error::NoDevice { .. } | Error::Unwritable { .. } => 2,
             Error::Io { source, .. } if !advice(source).is_empty() => 2,
-            Error::Io { .. } | Error::Gpu(_) | Error::Work(_) => 1,
+            Error::Io { .. } | Error::Gpu { .. } | Error::Work(_) => 1,
+            Error::DeviceLost { .. } | Error::OutOfDeviceMemory { .. } => 1,
             Error::Cancelled => 130,
         }
+    }
+}
+
+/// What the user can do about a place that cannot be written.
+fn elsewhere(e: &std::io::Error) -> &'static str {
+    match (e.kind(), advice(e)) {
+        // It was to be made.
+        (std::io::ErrorKind::NotFound, _) | (_, "") => "; choose another folder",
+        (_, advice) => advice,
+    }
+}
+
+/// How to go on without the device.
+fn after_loss(resumable: bool) -> &'static str {
+    match resumable {
+        true => "the same command with --resume goes on from what was kept",
+        false => "try again; if it happens again, update the driver or choose another device with --device",
     }
 }
 
@@ -76,5 +189,39 @@ fn advice(e: &std::io::Error) -> &'static str {
         K::PermissionDenied | K::ReadOnlyFilesystem => "; choose a folder that you may write to",
         K::NotFound => "; check the name",
         _ => "",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ash::vk;
+    use std::error::Error as _;
+    use std::io::{Error as IoError, ErrorKind};
+
+    #[test]
+    fn a_program_can_tell_what_to_react_to_and_see_the_cause() {
+        let lost = Error::vulkan("step 7", vk::Result::ERROR_DEVICE_LOST);
+        assert!(matches!(&lost, Error::DeviceLost { doing, resumable: false, .. } if doing == "step 7"));
+        assert!(lost.source().is_some_and(|s| s.downcast_ref() == Some(&vk::Result::ERROR_DEVICE_LOST)));
+        assert!(!lost.to_string().contains("--resume"), "{lost}");
+        let lost = lost.resumable();
+        assert!(lost.to_string().contains("step 7") && lost.to_string().contains("--resume"), "{lost}");
+        let full = Error::vulkan("buffer", vk::Result::ERROR_OUT_OF_DEVICE_MEMORY);
+        assert!(matches!(full, Error::OutOfDeviceMemory { .. }) && full.source().is_some());
+        let other = Error::vulkan("fence", vk::Result::ERROR_INITIALIZATION_FAILED);
+        assert!(matches!(other, Error::Gpu { source: Some(_), .. }) && other.source().is_some());
+        assert_eq!([&lost, &full, &other].map(Error::exit_code), [1; 3]);
+
+        let disk = Error::io("a/b")(IoError::from(ErrorKind::StorageFull));
+        assert!(matches!(&disk, Error::Unwritable { path, .. } if path == Path::new("a/b")));
+        let cause = disk.source().and_then(|s| s.downcast_ref::<IoError>());
+        assert_eq!(cause.map(IoError::kind), Some(ErrorKind::StorageFull));
+        assert!(disk.exit_code() == 2 && disk.to_string().contains("free some space"), "{disk}");
+        let absent = Error::io("a/b")(IoError::from(ErrorKind::NotFound));
+        assert!(matches!(absent, Error::Io { .. }) && absent.exit_code() == 2);
+        let none = Error::NoDevice { message: "no loader".into(), source: Some("libvulkan.so.1".into()) };
+        assert!(none.exit_code() == 2 && none.source().is_some_and(|s| s.to_string() == "libvulkan.so.1"));
+        assert_eq!(Error::missing_model("text", "model text: is missing").exit_code(), 2);
     }
 }

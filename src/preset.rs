@@ -2,6 +2,7 @@
 
 /// How much time a run may take.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[non_exhaustive]
 pub enum Preset {
     /// A few hundred steps: minutes on a CPU device.
     Draft,

@@ -52,6 +52,7 @@ impl Progress for Silent {
 
 /// What one stage took.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
+#[non_exhaustive]
 pub struct StageRecord {
     /// Stage name.
     pub name: String,

@@ -152,8 +152,8 @@ fn output_that_cannot_be_written_is_found_before_the_work() {
     let file = folder.path().join("file");
     std::fs::write(&file, "x").unwrap();
     run(file.clone(), &["file is in the way"]);
-    run(file.join("scene"), &["cannot write"]);
-    run(PathBuf::from("/proc/splatvk-scene"), &["cannot write"]);
+    run(file.join("scene"), &["cannot be written"]);
+    run(PathBuf::from("/proc/splatvk-scene"), &["cannot be written"]);
     let precious = folder.path().join("precious");
     std::fs::create_dir(&precious).unwrap();
     std::fs::write(precious.join("letter.txt"), "x").unwrap();

@@ -101,8 +101,8 @@ fn done(lab: &mut Runner, mut row: TableRow, seen: &mut Vec<String>) -> Result<F
     match lab.outcome(setup) {
         Ok(outcome) => Ok(FinishedRow { bytes: Some(outcome.feature_bytes), outcome: Some(outcome), row }),
         // What a device cannot hold is a finding about it; the other rows still count.
-        Err(Error::Gpu(why)) => {
-            row.note = why;
+        Err(e @ (Error::Gpu { .. } | Error::OutOfDeviceMemory { .. })) => {
+            row.note = e.to_string();
             Ok(FinishedRow { bytes: None, outcome: None, row })
         }
         Err(e) => Err(e),

@@ -27,6 +27,7 @@ use std::sync::Arc;
 
 /// What came out of a setup.
 #[derive(Clone)]
+#[non_exhaustive]
 pub struct RowFigures {
     /// Figures of protocol `field`, and agreement of decoded embeddings with the true ones.
     pub scored: Arc<Scored>,
@@ -142,6 +143,7 @@ impl<'a> Runner<'a> {
             sam: SamOptions::default(),
             given_features: given(&setup.regions),
             preset: Preset::Draft,
+            seed: self.seed,
         };
         let posed = if setup.true_cameras {
             let named = |f: &TruthFrame| Camera { name: f.stem.clone(), ..f.camera.clone() };

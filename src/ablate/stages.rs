@@ -33,6 +33,7 @@ pub struct EmbeddingAgreement {
 
 /// The figures of a scene.
 #[derive(Clone, Debug, Default)]
+#[non_exhaustive]
 pub struct Scored {
     /// Of protocol `field`.
     pub report: EvalReport,

@@ -17,6 +17,7 @@ pub struct FinishedRow {
 }
 
 /// A table that ran.
+#[non_exhaustive]
 pub struct FinishedTable {
     /// Which.
     pub table: &'static Table,

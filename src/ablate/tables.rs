@@ -198,6 +198,7 @@ pub fn table(name: &str) -> Option<&'static Table> {
 /// Where masks and features come from.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Regions {
     /// Found in the photos, or read from a folder.
     Found {
@@ -271,6 +272,7 @@ pub struct Setup {
 
 /// What a row takes.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub enum RowWork {
     /// All of it, scored.
     Score(Setup),

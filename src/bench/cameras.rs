@@ -31,6 +31,7 @@ pub struct CameraRow {
 /// Figures or the reason why there are none.
 #[derive(Clone, Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum CameraOutcome {
     /// Cameras were found.
     Figures(Box<CameraFigures>),
@@ -67,6 +68,7 @@ pub struct CameraFigures {
 
 /// Data sets and their summary.
 #[derive(Clone, Debug, Serialize)]
+#[non_exhaustive]
 pub struct CameraReport {
     /// In the order given.
     pub rows: Vec<CameraRow>,
@@ -145,7 +147,7 @@ fn find_cameras(
     if input.copies {
         photos.iter_mut().for_each(|p| p.fine = None);
     }
-    pose::place(photos, None, registry, progress)
+    pose::place(photos, None, registry, 0, progress)
 }
 
 fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) -> Result<CameraFigures> {

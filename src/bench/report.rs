@@ -21,6 +21,7 @@ const FORWARD: [&str; 4] = ["projection", "depth sort", "binning", "raster forwa
 
 /// Everything one run of `splatvk bench` measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct BenchReport {
     /// `splatvk-bench 1`.
     pub format: String,
@@ -34,6 +35,7 @@ pub struct BenchReport {
 
 /// The device of a report.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct DeviceRecord {
     /// As the driver reports it.
     pub name: String,
@@ -85,6 +87,7 @@ pub struct PassRow {
 /// What a time is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum Clock {
     /// Difference of two timestamps on the device.
     #[default]

@@ -88,8 +88,13 @@ fn status(e: &Error) -> SvkStatus {
     match e {
         Error::Input(_) => SvkStatus::Input,
         Error::Io { .. } => SvkStatus::Io,
+        Error::Unwritable { .. } => SvkStatus::Unwritable,
         Error::Missing(_) => SvkStatus::Missing,
-        Error::Gpu(_) => SvkStatus::Gpu,
+        Error::MissingModel { .. } => SvkStatus::MissingModel,
+        Error::NoDevice { .. } => SvkStatus::NoDevice,
+        Error::DeviceLost { .. } => SvkStatus::DeviceLost,
+        Error::OutOfDeviceMemory { .. } => SvkStatus::OutOfDeviceMemory,
+        Error::Gpu { .. } => SvkStatus::Gpu,
         Error::Work(_) => SvkStatus::Work,
         Error::Cancelled => SvkStatus::Cancelled,
     }
@@ -278,6 +283,11 @@ mod tests {
         assert_eq!(guard(&store, || panic!("broken {}", 7)), SvkStatus::Internal);
         assert_eq!(text(), "internal error: broken 7");
         assert_eq!(guard(&store, || Err(Error::Cancelled.into())), SvkStatus::Cancelled);
+        let lost = || Err(Error::vulkan("a step", crate::gpu::vk::Result::ERROR_DEVICE_LOST).into());
+        assert_eq!(guard(&store, lost), SvkStatus::DeviceLost);
+        assert!(text().contains("a step: the device was lost"), "{}", text());
+        let full = || Err(Error::io("scene")(std::io::ErrorKind::StorageFull.into()).into());
+        assert_eq!(guard(&store, full), SvkStatus::Unwritable);
     }
 
     #[test]

@@ -9,11 +9,11 @@ pub enum SvkStatus {
     Ok = 0,
     /// What was given cannot be used; the text says what and why.
     Input = 1,
-    /// A file could not be read or written.
+    /// A file could not be read.
     Io = 2,
-    /// A model, library or driver is not installed.
+    /// A library or program is not installed.
     Missing = 3,
-    /// The Vulkan device or driver refused something.
+    /// The Vulkan device or driver refused something, other than the codes from 9 on.
     Gpu = 4,
     /// Something failed while working on valid input.
     Work = 5,
@@ -23,6 +23,16 @@ pub enum SvkStatus {
     Argument = 7,
     /// A mistake in splatvk. The handle may be destroyed, and nothing else should be done with it.
     Internal = 8,
+    /// The Vulkan device was lost. Contexts and scenes on it can only be destroyed; a context on a new device may work.
+    DeviceLost = 9,
+    /// The Vulkan device has no memory left: fewer splats, smaller photos or another device may help.
+    OutOfDeviceMemory = 10,
+    /// No Vulkan loader, driver or device that can be used.
+    NoDevice = 11,
+    /// A model, or a file of it, is missing or not what it is used for.
+    MissingModel = 12,
+    /// A file cannot be written: the disk is full, or the folder does not allow it. Nothing half-written stays.
+    Unwritable = 13,
 }
 
 /// Time against quality.

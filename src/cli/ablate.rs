@@ -51,8 +51,8 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
 
 fn write(out: &Path, finished: &FinishedTable, report: &Value) -> Result<()> {
     let file = |extension: &str| out.join(format!("{}.{extension}", finished.table.name));
-    std::fs::write(file("txt"), finished.text()).map_err(Error::io(file("txt")))?;
-    std::fs::write(file("svg"), finished.svg()).map_err(Error::io(file("svg")))?;
+    std::fs::write(file("txt"), finished.text()).map_err(Error::unwritable(file("txt")))?;
+    std::fs::write(file("svg"), finished.svg()).map_err(Error::unwritable(file("svg")))?;
     write_json(&out.join("ablate.json"), report)
 }
 

@@ -15,9 +15,7 @@ impl WrittenFiles {
     pub fn open(folder: &Path) -> Result<WrittenFiles> {
         let mut outputs =
             WrittenFiles { folder: folder.to_path_buf(), files: vec![], folders: vec![], kept: false };
-        outputs.make(folder).map_err(|e| {
-            Error::input(format!("{}: cannot write there ({e}); choose another --out", folder.display()))
-        })?;
+        outputs.make(folder).map_err(Error::unwritable(folder))?;
         Ok(outputs)
     }
 
@@ -33,7 +31,7 @@ impl WrittenFiles {
     pub fn file(&mut self, name: &str) -> Result<PathBuf> {
         let path = self.folder.join(name);
         if let Some(parent) = path.parent() {
-            self.make(parent).map_err(Error::io(parent))?;
+            self.make(parent).map_err(Error::unwritable(parent))?;
         }
         self.files.push(path.clone());
         Ok(path)

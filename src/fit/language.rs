@@ -25,6 +25,7 @@ const MIN_GAIN: f64 = 1e-3;
 
 /// One measurement during the language stage.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct LanguagePoint {
     /// 1-based step; 0 = after lifting.
     pub step: usize,
@@ -43,6 +44,7 @@ impl LanguagePoint {
 
 /// The result of the language stage.
 #[derive(Clone, Debug, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct TrainedLanguage {
     /// Splats of the shared model (or the given ones, with `per_level`).
     pub splats: Splats,

@@ -42,6 +42,7 @@ pub struct CurvePoint {
 
 /// What happened during a fit.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct FitStats {
     /// The loss over time.
     pub curve: Vec<CurvePoint>,
@@ -64,6 +65,7 @@ impl FitStats {
 
 /// The result of the RGB stage.
 #[derive(Clone, Debug, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct Trained {
     /// Fitted splats.
     pub splats: Splats,

@@ -264,7 +264,7 @@ fn write_text(
     lenses: Option<&[Lens]>,
     points: Option<&PointCloud>,
 ) -> Result<()> {
-    std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
+    std::fs::create_dir_all(folder).map_err(Error::unwritable(folder))?;
     let mut intrinsics = String::from("# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n");
     let mut images =
         String::from("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n");
@@ -294,14 +294,14 @@ fn write_text(
     }
     for (name, text) in [("cameras.txt", intrinsics), ("images.txt", images), ("points3D.txt", cloud)] {
         let path = folder.join(name);
-        std::fs::write(&path, text).map_err(Error::io(&path))?;
+        std::fs::write(&path, text).map_err(Error::unwritable(&path))?;
     }
     Ok(())
 }
 
 /// Writes a binary model with PINHOLE cameras, and all points: only text needs many bytes for them.
 pub fn write_binary(folder: &Path, cameras: &[Camera], points: Option<&PointCloud>) -> Result<()> {
-    std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
+    std::fs::create_dir_all(folder).map_err(Error::unwritable(folder))?;
     let count = |n: usize| (n as u64).to_le_bytes();
     let mut intrinsics = count(cameras.len()).to_vec();
     let mut images = intrinsics.clone();
@@ -329,7 +329,7 @@ pub fn write_binary(folder: &Path, cameras: &[Camera], points: Option<&PointClou
     }
     for (name, bytes) in [("cameras.bin", intrinsics), ("images.bin", images), ("points3D.bin", cloud)] {
         let path = folder.join(name);
-        std::fs::write(&path, bytes).map_err(Error::io(&path))?;
+        std::fs::write(&path, bytes).map_err(Error::unwritable(&path))?;
     }
     Ok(())
 }

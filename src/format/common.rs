@@ -25,12 +25,12 @@ pub fn to_byte(v: f32) -> u8 {
 pub fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<()> {
     let text =
         serde_json::to_string_pretty(value).map_err(|e| Error::work(format!("{}: {e}", path.display())))?;
-    std::fs::write(path, text + "\n").map_err(Error::io(path))
+    std::fs::write(path, text + "\n").map_err(Error::unwritable(path))
 }
 
 /// Creates a folder and its parents.
 pub fn create_folder(path: &Path) -> Result<()> {
-    std::fs::create_dir_all(path).map_err(Error::io(path))
+    std::fs::create_dir_all(path).map_err(Error::unwritable(path))
 }
 
 /// Writes a file beside its target and renames it: one that was there stays until the new one is whole.
@@ -38,7 +38,8 @@ pub fn write_whole_file(out: &Path, write: impl FnOnce(&Path) -> Result<()>) -> 
     let mut name = out.file_name().unwrap_or_default().to_os_string();
     name.push(format!(".partial-{}", std::process::id()));
     let partial = out.with_file_name(name);
-    let outcome = write(&partial).and_then(|()| std::fs::rename(&partial, out).map_err(Error::io(out)));
+    let outcome =
+        write(&partial).and_then(|()| std::fs::rename(&partial, out).map_err(Error::unwritable(out)));
     if outcome.is_err() {
         // The error is what matters; the partial file may not even exist.
         let _ = std::fs::remove_file(&partial);

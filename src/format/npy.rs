@@ -9,6 +9,7 @@ const MAGIC: &[u8] = b"\x93NUMPY";
 
 /// The values of an array in its stored type.
 #[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum NpyData {
     /// `<f2`
     F16(Vec<f16>),
@@ -140,7 +141,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<NpyArray> {
 pub fn write(path: impl AsRef<Path>, array: &NpyArray) -> Result<()> {
     let path = path.as_ref();
     let bytes = encode(array)?;
-    std::fs::write(path, bytes).map_err(Error::io(path))
+    std::fs::write(path, bytes).map_err(Error::unwritable(path))
 }
 
 /// Reads every `.npy` member of an `.npz` file, by name without the extension.
@@ -166,16 +167,18 @@ pub fn read_npz(path: impl AsRef<Path>) -> Result<BTreeMap<String, NpyArray>> {
 /// Writes an `.npz` file, stored without compression so that readers can map it.
 pub fn write_npz(path: impl AsRef<Path>, arrays: &[(&str, &NpyArray)]) -> Result<()> {
     let path = path.as_ref();
-    let bad =
-        |e: zip::result::ZipError| Error::work(format!("{}: cannot write the npz file: {e}", path.display()));
-    let file = std::fs::File::create(path).map_err(Error::io(path))?;
+    let bad = |e: zip::result::ZipError| match e {
+        zip::result::ZipError::Io(e) => Error::unwritable(path)(e),
+        e => Error::work(format!("{}: cannot write the npz file: {e}", path.display())),
+    };
+    let file = std::fs::File::create(path).map_err(Error::unwritable(path))?;
     let mut zip = zip::ZipWriter::new(std::io::BufWriter::new(file));
     let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
     for (name, array) in arrays {
         zip.start_file(format!("{name}.npy"), options).map_err(bad)?;
-        zip.write_all(&encode(array)?).map_err(Error::io(path))?;
+        zip.write_all(&encode(array)?).map_err(Error::unwritable(path))?;
     }
-    zip.finish().map_err(bad)?.flush().map_err(Error::io(path))
+    zip.finish().map_err(bad)?.flush().map_err(Error::unwritable(path))
 }
 
 /// Serialises an array as a `.npy` file image.

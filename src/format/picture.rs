@@ -9,12 +9,12 @@ use std::io::BufWriter;
 use std::path::Path;
 
 fn file(path: &Path) -> Result<BufWriter<std::fs::File>> {
-    Ok(BufWriter::new(std::fs::File::create(path).map_err(Error::io(path))?))
+    Ok(BufWriter::new(std::fs::File::create(path).map_err(Error::unwritable(path))?))
 }
 
 fn picture_error(path: &Path) -> impl FnOnce(image::ImageError) -> Error {
     move |e| match e {
-        image::ImageError::IoError(source) => Error::Io { path: path.to_path_buf(), source },
+        image::ImageError::IoError(source) => Error::unwritable(path)(source),
         other => Error::work(format!("{}: {other}", path.display())),
     }
 }
@@ -30,7 +30,7 @@ fn write_bytes(
     let mut out = file(path)?;
     let encoder = image::codecs::png::PngEncoder::new(&mut out);
     encoder.write_image(bytes, size.0 as u32, size.1 as u32, colour).map_err(picture_error(path))?;
-    out.flush().map_err(Error::io(path))
+    out.flush().map_err(Error::unwritable(path))
 }
 
 /// 8-bit RGB PNG.
@@ -111,7 +111,7 @@ pub fn write_exr(path: &Path, size: (usize, usize), planes: Planes) -> Result<()
         .write()
         .to_buffered(&mut bytes)
         .map_err(|e| Error::work(format!("{}: cannot encode the EXR file: {e}", path.display())))?;
-    std::fs::write(path, bytes.into_inner()).map_err(Error::io(path))
+    std::fs::write(path, bytes.into_inner()).map_err(Error::unwritable(path))
 }
 
 /// Reads every channel of the first layer of an OpenEXR file, by name; half floats and integers become floats.

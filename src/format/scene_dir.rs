@@ -20,6 +20,7 @@ pub const TEXT_EMBEDDINGS: &str = "language/text_embeddings.npz";
 
 /// A loaded scene.
 #[derive(Clone, Debug, Default)]
+#[non_exhaustive]
 pub struct Scene {
     /// Where it was read from.
     pub path: PathBuf,

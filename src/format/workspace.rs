@@ -48,11 +48,10 @@ impl Workspace {
             Some(p) if !p.as_os_str().is_empty() => p.to_path_buf(),
             _ => PathBuf::from("."),
         };
-        let unwritable = |e: std::io::Error| bad(&format!("cannot write there ({e}); choose another --out"));
-        std::fs::create_dir_all(&parent).map_err(unwritable)?;
+        std::fs::create_dir_all(&parent).map_err(Error::unwritable(out))?;
         sweep(&parent, &name);
         let partial = parent.join(format!(".{name}.partial-{}", std::process::id()));
-        std::fs::create_dir(&partial).map_err(unwritable)?;
+        std::fs::create_dir(&partial).map_err(Error::unwritable(out))?;
         UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).push(partial.clone());
         Ok(Workspace { partial, out: out.to_path_buf(), done: false })
     }
@@ -148,6 +147,47 @@ mod tests {
         w.commit().unwrap();
         assert_eq!(std::fs::read_to_string(out.join(MANIFEST)).unwrap(), "2");
         assert_eq!(names(&folder.path().join("deep")), ["scene"]);
+    }
+
+    /// Opening the file gives a device on which every write says that the disk is full.
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn a_full_disk_leaves_the_old_scene_as_it_was() {
+        use super::super::scene_dir::{self, Contents};
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("scene");
+        std::fs::create_dir(&out).unwrap();
+        std::fs::write(out.join(MANIFEST), "old").unwrap();
+        let (splats, camera) = crate::pass::seeded::small(40, 64, 48, 1, 3);
+        let contents = Contents {
+            splats: &splats,
+            cameras: std::slice::from_ref(&camera),
+            photos: &[],
+            points: None,
+            language: None,
+            text_embeddings: None,
+        };
+        for full in ["point_cloud.ply", "cameras/transforms.json", MANIFEST] {
+            let w = Workspace::create(&out, true).unwrap();
+            let place = w.path().join(full);
+            std::fs::create_dir_all(place.parent().unwrap()).unwrap();
+            std::os::unix::fs::symlink("/dev/full", &place).unwrap();
+            let e = scene_dir::write(w.path(), &contents).unwrap_err();
+            let Error::Unwritable { path, source } = &e else { panic!("{e:?}") };
+            assert_eq!((path, source.kind()), (&place, std::io::ErrorKind::StorageFull));
+            let text = e.to_string();
+            assert!(
+                e.exit_code() == 2 && text.lines().count() == 1 && text.contains("free some space"),
+                "{e}"
+            );
+            drop(w);
+            assert_eq!(names(folder.path()), ["scene"]);
+            assert_eq!(std::fs::read_to_string(out.join(MANIFEST)).unwrap(), "old");
+        }
+        let w = Workspace::create(&out, true).unwrap();
+        scene_dir::write(w.path(), &contents).unwrap();
+        w.commit().unwrap();
+        assert_eq!(scene_dir::load(&out).unwrap().splats.len(), 40);
     }
 
     #[test]

@@ -76,8 +76,8 @@ impl<T> Buffer<T> {
                 mib(limit)
             )));
         }
-        let fail = |e: String| Error::gpu(format!("buffer `{name}` of {:.1} MiB: {e}", mib(bytes)));
-        let block = device.0.heap.buffer(&device.0.device, name, padded(bytes), mapped).map_err(fail)?;
+        let what = format!("buffer `{name}` of {:.1} MiB", mib(bytes));
+        let block = device.0.heap.buffer(&device.0.device, name, padded(bytes), mapped, &what)?;
         let inner = Inner {
             device: device.clone(),
             name: name.to_owned(),

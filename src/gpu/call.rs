@@ -15,8 +15,9 @@ pub struct Call {
 }
 
 impl Call {
-    /// For generated code; use `shaders::NAME::call`.
-    #[doc(hidden)]
+    /// A call of a shader of one's own: one of the family's variants, a buffer per binding number, and the push constants as
+    /// the shader lays them out. The engine's own are called through `shaders::NAME::call`, which checks all of that when it
+    /// is compiled; here a buffer that is missing is an error when the recording is compiled.
     pub fn new(
         family: &'static Family,
         variant: Vec<u32>,

@@ -52,7 +52,8 @@ pub(super) struct Inner {
     submissions: AtomicU64,
     /// Locked while something is submitted, so that what waits in it keeps its place in the queue.
     pub staging: Mutex<Staging>,
-    pipelines: Mutex<HashMap<&'static str, Arc<Pipeline>>>,
+    /// By name and code: modules of a program may share a name with the engine's.
+    pipelines: Mutex<HashMap<(&'static str, usize), Arc<Pipeline>>>,
     pipeline_cache: vk::PipelineCache,
     store: Option<Store>,
     /// Set where synchronization2 comes from the extension instead of Vulkan 1.3.
@@ -172,11 +173,12 @@ impl Device {
     /// The pipeline of a module, made on first use (20–300 ms on lavapipe).
     pub(super) fn pipeline(&self, module: &'static Module) -> Result<Arc<Pipeline>> {
         let mut known = lock(&self.0.pipelines);
-        if let Some(pipeline) = known.get(module.name) {
+        let key = (module.name, module.spirv.as_ptr() as usize);
+        if let Some(pipeline) = known.get(&key) {
             return Ok(pipeline.clone());
         }
         let made = Arc::new(Pipeline::new(&self.0.device, self.info(), self.0.pipeline_cache, module)?);
-        known.insert(module.name, made.clone());
+        known.insert(key, made.clone());
         Ok(made)
     }
 

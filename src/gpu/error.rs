@@ -3,9 +3,9 @@ use crate::Error;
 use ash::vk;
 use std::sync::{Mutex, MutexGuard};
 
-/// Turns a Vulkan result into an error that says what was being done.
+/// Turns a Vulkan result into an error that says what was being done, of the kind that it is.
 pub(super) fn vk_error(what: impl std::fmt::Display) -> impl FnOnce(vk::Result) -> Error {
-    move |e| Error::gpu(format!("{what}: {e}"))
+    move |e| Error::vulkan(what.to_string(), e)
 }
 
 /// Locks, ignoring poison: the guarded values stay consistent, a panic elsewhere is reported by its own thread.

@@ -7,6 +7,7 @@ use ash::vk;
 
 /// Where a result goes.
 #[derive(Clone, Copy, Debug)]
+#[non_exhaustive]
 pub enum Target {
     /// A buffer of the host with `TRANSFER_DST` usage.
     Buffer {

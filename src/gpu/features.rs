@@ -66,7 +66,10 @@ pub(super) fn create(
 ) -> Result<(ash::Device, DeviceInfo)> {
     let offer = offer(instance, candidate);
     if !offer.synchronization2 {
-        return Err(Error::gpu(format!("{} lacks synchronization2: update the driver", candidate.name)));
+        return Err(Error::no_device(format!(
+            "{} lacks synchronization2: update the driver",
+            candidate.name
+        )));
     }
     let core13 = candidate.properties.api_version >= vk::API_VERSION_1_3;
     let atomics_on = offer.atomic_float_add && !options.no_float_atomics;

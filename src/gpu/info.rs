@@ -42,6 +42,7 @@ impl Options {
 
 /// What the device is and can do.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct DeviceInfo {
     /// As the driver reports it.
     pub name: String,

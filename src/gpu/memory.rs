@@ -1,16 +1,17 @@
 //! Device memory for buffers, and how much of it is in use.
-use super::error::lock;
+use super::error::{lock, vk_error};
 use crate::{Error, Result};
 use ash::vk;
-use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::{
     Allocation, AllocationCreateDesc, AllocationScheme, Allocator, AllocatorCreateDesc,
 };
+use gpu_allocator::{AllocationError, MemoryLocation};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Memory of the buffers of a device, staging included.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Memory {
     /// Bytes now.
     pub current: u64,
@@ -49,6 +50,14 @@ impl Block {
     }
 }
 
+/// What the allocator says, as the result that Vulkan gave it where it tells.
+fn refused(what: &str, e: &AllocationError) -> Error {
+    match e {
+        AllocationError::OutOfMemory => Error::vulkan(what, vk::Result::ERROR_OUT_OF_DEVICE_MEMORY),
+        e => Error::gpu(format!("{what}: {e}")),
+    }
+}
+
 impl Heap {
     pub fn new(instance: &ash::Instance, device: &ash::Device, physical: vk::PhysicalDevice) -> Result<Heap> {
         let allocator = Allocator::new(&AllocatorCreateDesc {
@@ -59,7 +68,7 @@ impl Heap {
             buffer_device_address: false,
             allocation_sizes: gpu_allocator::AllocationSizes::default(),
         })
-        .map_err(|e| Error::gpu(format!("memory allocator: {e}")))?;
+        .map_err(|e| refused("memory allocator", &e))?;
         Ok(Heap {
             allocator: Mutex::new(Some(allocator)),
             current: AtomicU64::new(0),
@@ -68,22 +77,24 @@ impl Heap {
         })
     }
 
-    /// A buffer for every use that passes and transfers have; `mapped` puts it where the host reads and writes it.
+    /// A buffer for every use that passes and transfers have; `mapped` puts it where the host reads and writes it. `what`
+    /// names it in errors, with its size.
     pub fn buffer(
         &self,
         device: &ash::Device,
         name: &str,
         size: u64,
         mapped: bool,
-    ) -> std::result::Result<Block, String> {
+        what: &str,
+    ) -> Result<Block> {
         let usage = vk::BufferUsageFlags::STORAGE_BUFFER
             | vk::BufferUsageFlags::TRANSFER_SRC
             | vk::BufferUsageFlags::TRANSFER_DST
             | vk::BufferUsageFlags::INDIRECT_BUFFER;
         let info = vk::BufferCreateInfo::default().size(size).usage(usage);
         // SAFETY: plain object creation on a live device.
-        let raw = unsafe { device.create_buffer(&info, None) }.map_err(|e| e.to_string())?;
-        match self.bind(device, name, raw, mapped) {
+        let raw = unsafe { device.create_buffer(&info, None) }.map_err(vk_error(what))?;
+        match self.bind(device, name, raw, mapped, what) {
             Ok(memory) => {
                 let now = self.current.fetch_add(memory.size(), Ordering::Relaxed) + memory.size();
                 self.peak.fetch_max(now, Ordering::Relaxed);
@@ -104,11 +115,12 @@ impl Heap {
         name: &str,
         raw: vk::Buffer,
         mapped: bool,
-    ) -> std::result::Result<Allocation, String> {
+        what: &str,
+    ) -> Result<Allocation> {
         // SAFETY: the buffer is alive and unbound.
         let requirements = unsafe { device.get_buffer_memory_requirements(raw) };
         let mut guard = lock(&self.allocator);
-        let allocator = guard.as_mut().ok_or("the device is closing")?;
+        let allocator = guard.as_mut().ok_or_else(|| Error::gpu("the device is closing"))?;
         // GpuToCpu is cached host memory: read-backs and CPU devices need it, uploads do not suffer.
         let location = if mapped { MemoryLocation::GpuToCpu } else { MemoryLocation::GpuOnly };
         let allocation = allocator
@@ -119,13 +131,13 @@ impl Heap {
                 linear: true,
                 allocation_scheme: AllocationScheme::GpuAllocatorManaged,
             })
-            .map_err(|e| e.to_string())?;
+            .map_err(|e| refused(what, &e))?;
         // SAFETY: memory and offset come from the allocator for these requirements.
         match unsafe { device.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) } {
             Ok(()) => Ok(allocation),
             Err(e) => {
                 let _ = allocator.free(allocation);
-                Err(e.to_string())
+                Err(vk_error(what)(e))
             }
         }
     }

@@ -26,6 +26,7 @@ pub struct Binding {
 /// What a module needs beyond Vulkan 1.2's minimum.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum Capability {
     Float16,
     Float64,

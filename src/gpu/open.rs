@@ -38,7 +38,7 @@ impl Device {
         let candidate = select::choose(select::candidates(instance)?, options.choice.as_deref())?;
         let physical = candidate.physical;
         let queue_family = select::queue_family(instance, physical)
-            .ok_or_else(|| Error::gpu(format!("{} has no compute queue", candidate.name)))?;
+            .ok_or_else(|| Error::no_device(format!("{} has no compute queue", candidate.name)))?;
         let (device, info) = features::create(instance, &candidate, queue_family, options)?;
         // SAFETY: the queue was requested in `create`.
         let queue = unsafe { device.get_device_queue(queue_family, 0) };

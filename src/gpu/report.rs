@@ -6,6 +6,7 @@ use ash::vk;
 
 /// How a line of the report turned out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Status {
     /// There and good.
     Ok,

@@ -1,5 +1,6 @@
 //! Vulkan loader, instance and the choice of a physical device.
 use super::validation;
+use crate::error::Cause;
 use crate::{Error, Result};
 use ash::vk;
 use std::ffi::CStr;
@@ -17,9 +18,13 @@ pub(super) struct Candidate {
     pub unusable: Option<String>,
 }
 
+fn no_device(message: String, cause: impl Into<Cause>) -> Error {
+    Error::NoDevice { message, source: Some(cause.into()) }
+}
+
 pub(super) fn load() -> Result<ash::Entry> {
     // SAFETY: the system's Vulkan loader is trusted to be a Vulkan loader.
-    unsafe { ash::Entry::load() }.map_err(|e| Error::missing(format!("no Vulkan loader ({e}); {INSTALL}")))
+    unsafe { ash::Entry::load() }.map_err(|e| no_device(format!("no Vulkan loader ({e}); {INSTALL}"), e))
 }
 
 /// An instance, with validation layer, synchronization validation and debug messenger when asked for.
@@ -28,7 +33,7 @@ pub(super) fn instance(entry: &ash::Entry, sink: Option<&validation::Sink>) -> R
     let version =
         unsafe { entry.try_enumerate_instance_version() }.ok().flatten().unwrap_or(vk::API_VERSION_1_0);
     if version < vk::API_VERSION_1_2 {
-        return Err(Error::missing(format!("the Vulkan loader is older than 1.2; {INSTALL}")));
+        return Err(Error::no_device(format!("the Vulkan loader is older than 1.2; {INSTALL}")));
     }
     let application = vk::ApplicationInfo::default()
         .application_name(c"splatvk")
@@ -52,14 +57,14 @@ pub(super) fn instance(entry: &ash::Entry, sink: Option<&validation::Sink>) -> R
     let info = info.enabled_layer_names(&layers).enabled_extension_names(&extensions);
     // SAFETY: all pointers in `info` outlive the call.
     unsafe { entry.create_instance(&info, None) }
-        .map_err(|e| Error::missing(format!("no Vulkan instance ({e}); {INSTALL}")))
+        .map_err(|e| no_device(format!("no Vulkan instance ({e}); {INSTALL}"), e))
 }
 
 /// All physical devices, best first: discrete, integrated, virtual, CPU.
 pub(super) fn candidates(instance: &ash::Instance) -> Result<Vec<Candidate>> {
     // SAFETY: the instance is alive.
     let devices = unsafe { instance.enumerate_physical_devices() }
-        .map_err(|e| Error::missing(format!("the Vulkan drivers list no device ({e}); {INSTALL}")))?;
+        .map_err(|e| no_device(format!("the Vulkan drivers list no device ({e}); {INSTALL}"), e))?;
     let mut all: Vec<Candidate> = devices.into_iter().map(|physical| candidate(instance, physical)).collect();
     all.sort_by_key(|c| match c.properties.device_type {
         vk::PhysicalDeviceType::DISCRETE_GPU => 0,
@@ -120,7 +125,7 @@ pub(super) fn choose(all: Vec<Candidate>, choice: Option<&str>) -> Result<Candid
     let names: Vec<String> = all.iter().enumerate().map(|(i, c)| format!("{i}: {}", c.name)).collect();
     let listed = names.join(", ");
     if all.is_empty() {
-        return Err(Error::missing(format!("no Vulkan device; {INSTALL}")));
+        return Err(Error::no_device(format!("no Vulkan device; {INSTALL}")));
     }
     let picked = match choice {
         None => all.into_iter().find(|c| c.unusable.is_none()),
@@ -135,13 +140,13 @@ pub(super) fn choose(all: Vec<Candidate>, choice: Option<&str>) -> Result<Candid
     };
     match (picked, choice) {
         (Some(Candidate { name, unusable: Some(reason), .. }), _) => {
-            Err(Error::missing(format!("Vulkan device {name} cannot be used: {reason}")))
+            Err(Error::no_device(format!("Vulkan device {name} cannot be used: {reason}")))
         }
         (Some(candidate), _) => Ok(candidate),
         (None, Some(text)) => {
             Err(Error::input(format!("no Vulkan device matches `{text}`; there are {listed}")))
         }
-        (None, None) => Err(Error::missing(format!(
+        (None, None) => Err(Error::no_device(format!(
             "no usable Vulkan device among {listed}: Vulkan 1.2 with VK_KHR_synchronization2 and a compute queue is needed; {INSTALL}"
         ))),
     }

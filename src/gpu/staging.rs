@@ -46,8 +46,8 @@ impl Frame {
             return Ok(());
         }
         let capacity = needed.next_power_of_two().max(LEAST);
-        let fail = |e| Error::gpu(format!("staging memory of {} KiB: {e}", capacity >> 10));
-        let mut block = heap.buffer(device, "staging", capacity, true).map_err(fail)?;
+        let what = format!("staging memory of {} KiB", capacity >> 10);
+        let mut block = heap.buffer(device, "staging", capacity, true, &what)?;
         if let Some(old) = self.block.take() {
             if let (Some(from), Some(to)) = (old.bytes(), block.bytes_mut()) {
                 let used = self.used as usize;

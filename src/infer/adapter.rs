@@ -68,6 +68,7 @@ pub enum Fit {
 /// How a photo is resampled; all widen when they shrink, as Pillow's do.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum Filter {
     /// Triangle.
     Bilinear,
@@ -81,6 +82,7 @@ pub enum Filter {
 /// What the program must still apply to an output.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Activation {
     /// 1 / (1 + e^−x): logits → probability.
     Sigmoid,

@@ -120,10 +120,13 @@ fn repeat(file: &GraphFile, reference: &Path) -> Result<f32> {
         worst = worst.max(apart / largest);
     }
     if worst > TOLERANCE {
-        return Err(Error::missing(format!(
-            "{}: differs from its reference by {worst:.1e} of the largest value (at most {TOLERANCE:.0e}); export it again",
-            file.path.display()
-        )));
+        return Err(Error::missing_model(
+            file.path.display(),
+            format!(
+                "{}: differs from its reference by {worst:.1e} of the largest value (at most {TOLERANCE:.0e}); export it again",
+                file.path.display()
+            ),
+        ));
     }
     Ok(worst)
 }

@@ -123,11 +123,14 @@ impl Clip {
         for (text, wanted) in GOLDEN {
             let ids = self.tokens(text)?;
             if ids.len() < 2 || ids[1..ids.len() - 1] != *wanted {
-                return Err(Error::missing(format!(
-                    "{}: the tokenizer beside it does not give CLIP's tokens for {text:?} ({ids:?}); take tokenizer.json from \
+                return Err(Error::missing_model(
+                    tower.path.display(),
+                    format!(
+                        "{}: the tokenizer beside it does not give CLIP's tokens for {text:?} ({ids:?}); take tokenizer.json from \
                      the model's own page or from tools/export/export_clip.py",
-                    tower.path.display()
-                )));
+                        tower.path.display()
+                    ),
+                ));
             }
         }
         Ok(())
@@ -282,11 +285,14 @@ impl RegionEncoder for Clip {
 }
 
 fn towers_differ(visual: &GraphFile, text: &GraphFile, why: &str) -> Error {
-    Error::missing(format!(
-        "{} and {} do not belong together ({why}); export both towers from one checkpoint",
+    Error::missing_model(
         visual.path.display(),
-        text.path.display()
-    ))
+        format!(
+            "{} and {} do not belong together ({why}); export both towers from one checkpoint",
+            visual.path.display(),
+            text.path.display()
+        ),
+    )
 }
 
 fn tokenizer(model: &Installed) -> Result<Tokenizer> {
@@ -294,12 +300,14 @@ fn tokenizer(model: &Installed) -> Result<Tokenizer> {
     let beside = text.path.with_file_name("tokenizer.json");
     let places: [PathBuf; 2] = [beside, model.folder.join("tokenizer.json")];
     let file = places.iter().find(|p| p.is_file()).ok_or_else(|| {
-        Error::missing(format!(
+        Error::missing_model(&model.name, format!(
             "{}: missing; tools/export/export_clip.py writes it, and Hugging Face has one beside every CLIP model",
             places[0].display()
         ))
     })?;
-    let failed = |e: tokenizers::Error| Error::missing(format!("{}: not a tokenizer: {e}", file.display()));
+    let failed = |e: tokenizers::Error| {
+        Error::missing_model(&model.name, format!("{}: not a tokenizer: {e}", file.display()))
+    };
     let mut tokenizer = Tokenizer::from_file(file).map_err(failed)?;
     tokenizer.with_padding(None);
     tokenizer.with_truncation(None).map_err(failed)?;

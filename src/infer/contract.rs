@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 /// What a graph does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Part {
     /// Image → one embedding (CLIP).
     ImageTower,

@@ -49,11 +49,14 @@ impl GraphFile {
         let adapter = Adapter::of_file(path)?;
         let binding = adapter.fit(path, &header)?;
         if let Some(absent) = header.external.iter().find(|p| !p.is_file()) {
-            return Err(Error::missing(format!(
-                "{}: its weights are in {}, which is missing; put that file beside it under the same name",
+            return Err(Error::missing_model(
                 path.display(),
-                absent.display()
-            )));
+                format!(
+                    "{}: its weights are in {}, which is missing; put that file beside it under the same name",
+                    path.display(),
+                    absent.display()
+                ),
+            ));
         }
         let pin = |p: &PathBuf| {
             let name = p.file_name()?.to_str()?;
@@ -109,14 +112,17 @@ impl GraphFile {
         for HashedFile { path: file, sha256: wanted } in &self.pinned {
             let found = fingerprint(file).map_err(Error::io(file))?;
             if found != *wanted {
-                return Err(Error::missing(format!(
-                    "{}: has sha256 {found}, its adapter pins {wanted}; copy or export it again",
-                    file.display()
-                )));
+                return Err(Error::missing_model(
+                    file.display(),
+                    format!(
+                        "{}: has sha256 {found}, its adapter pins {wanted}; copy or export it again",
+                        file.display()
+                    ),
+                ));
             }
         }
         let session = Session::load_sized(&self.path, self.bytes(), &self.compute).map_err(|e| match e {
-            Error::Missing(text) if text.contains("pset") => Error::missing(format!(
+            Error::MissingModel { model, message: text } if text.contains("pset") => Error::missing_model(model, format!(
                 "{text}; the file asks for operator set {}: export it with opset_version=17, or install a newer ONNX Runtime",
                 self.opset
             )),

@@ -19,6 +19,7 @@ use crate::{Error, Result};
 /// What a model does in a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Deserialize, Serialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum Task {
     /// Cameras, depth and points.
     Geometry,
@@ -114,7 +115,8 @@ impl Installed {
     /// The graph of a part.
     pub fn graph(&self, part: Part) -> Result<&GraphFile> {
         self.graphs.get(&part).ok_or_else(|| {
-            Error::missing(format!("{}: model {} has no {}", self.folder.display(), self.name, part.name()))
+            let (folder, name) = (self.folder.display(), &self.name);
+            Error::missing_model(name, format!("{folder}: model {name} has no {}", part.name()))
         })
     }
 
@@ -292,15 +294,16 @@ impl Registry {
             catalogue().iter().any(|k| k.family == name && text.contains(&k.id)) || text.contains(name)
         };
         if let Some(broken) = inventory.broken.iter().find(|b| about(&b.path)) {
-            return Err(Error::missing(broken.reason.clone()));
+            return Err(Error::missing_model(name, broken.reason.clone()));
         }
         let place = self.folders().first().map(|f| f.display().to_string()).unwrap_or_default();
         let how = catalogue().iter().find(|k| k.family == name && k.does(task));
         let how = how.map_or(String::new(), |k| format!(" (from {}, exported with {})", k.source, k.export));
-        Err(Error::missing(format!(
+        let message = format!(
             "no model \"{name}\" for {} in {place}; put its ONNX files{how} into {place}/{name}/, or see splatvk models list",
             task.name()
-        )))
+        );
+        Err(Error::missing_model(name, message))
     }
 }
 

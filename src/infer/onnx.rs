@@ -260,7 +260,7 @@ pub fn read(path: &Path) -> Result<Header> {
     let header = whole(&mut reader, path).filter(|h| !h.inputs.is_empty() && !h.outputs.is_empty());
     header.ok_or_else(|| {
         let at = reader.file.stream_position().unwrap_or_default();
-        Error::missing(format!(
+        Error::missing_model(path.display(), format!(
             "{}: not a complete ONNX file (unreadable at byte {at} of {size}): truncated or of another format; copy or \
              export it again",
             path.display()

@@ -209,7 +209,8 @@ fn unpack(values: &[f32], size: [&Prepared; 2]) -> Option<Decoded> {
 /// Refuses output that a trained network cannot give: an activation that the export left out, or outputs in the wrong order.
 fn plausible(model: &Installed, prepared: &[Prepared], pairs: &[PairPointmaps]) -> Result<()> {
     let wrong = |what: &str, mend: &str| {
-        Error::missing(format!("{}: model {}: {what}; {mend}", model.folder.display(), model.name))
+        let message = format!("{}: model {}: {what}; {mend}", model.folder.display(), model.name);
+        Error::missing_model(&model.name, message)
     };
     let raw = "either two outputs are swapped or the export left an activation to the program: say apply.points = \
                \"expm1-norm\" and apply.conf = \"one-plus-exp\" in its adapter (docs/models.md)";

@@ -301,7 +301,7 @@ fn multi_view_networks_that_say_the_truth_give_the_true_cameras() {
     for name in ["vggt", "da3"] {
         let model = Registry::of(&[dir.path()]).installed(Task::Geometry, name).unwrap();
         let (seen, maps) = pairs::pointmaps(&model, &photos, &Silent).unwrap();
-        let geometry = pointmap::reconstruct(&seen, &maps, &Silent).unwrap();
+        let geometry = pointmap::reconstruct(&seen, &maps, 0, &Silent).unwrap();
         for (k, (camera, v)) in geometry.cameras.iter().zip(&views).enumerate() {
             let truth = v.camera.pose.compose(&views[0].camera.pose.inverse());
             let turned = (camera.pose.rotation * truth.rotation.transpose()).transpose();

@@ -19,6 +19,7 @@ const FIX: &str = "run tools/setup (or tools/models/build) to get it";
 /// What a model file is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum PackFileKind {
     /// Keypoints and descriptors.
     Keypoints,
@@ -36,6 +37,7 @@ pub enum PackFileKind {
 
 /// One file of the pack as found on this machine.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct ModelStatus {
     /// What it is for.
     pub kind: PackFileKind,
@@ -169,7 +171,7 @@ impl Registry {
     pub fn path(&self, kind: PackFileKind) -> Result<PathBuf> {
         let found = self.pack.files.iter().find(|f| f.kind == kind).map(|f| self.inspect(f));
         match found {
-            Some(ModelStatus { fix: Some(fix), .. }) => Err(Error::missing(fix)),
+            Some(ModelStatus { name, fix: Some(fix), .. }) => Err(Error::missing_model(name, fix)),
             Some(status) => Ok(status.file),
             None => Err(Error::work(format!("no model for {kind:?} in the model table"))),
         }

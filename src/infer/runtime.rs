@@ -21,6 +21,7 @@ pub struct Tensor {
 
 /// Input of a session. Floats and integers are converted to the element type of the graph.
 #[derive(Clone)]
+#[non_exhaustive]
 pub enum Input {
     /// Row-major floats.
     F32(Vec<usize>, Vec<f32>),
@@ -127,7 +128,10 @@ impl Session {
             built => built,
         };
         let inner = built.map_err(|e| {
-            Error::missing(format!("{}: ONNX Runtime cannot load it: {}", file.display(), line(&e)))
+            Error::missing_model(
+                file.display(),
+                format!("{}: ONNX Runtime cannot load it: {}", file.display(), line(&e)),
+            )
         })?;
         if large {
             drop(HandBack);

@@ -133,8 +133,11 @@ impl Sam {
 }
 
 fn too_few(decoder: &GraphFile) -> Error {
-    Error::missing(format!(
-        "{}: gives fewer than three masks per point, but the three levels need them; export it without --return-single-mask",
-        decoder.path.display()
-    ))
+    Error::missing_model(
+        decoder.path.display(),
+        format!(
+            "{}: gives fewer than three masks per point, but the three levels need them; export it without --return-single-mask",
+            decoder.path.display()
+        ),
+    )
 }

@@ -20,7 +20,8 @@ impl TextEncoder {
     /// Loads both from the model pack.
     pub fn load(registry: &Registry) -> Result<Self> {
         let file = registry.path(PackFileKind::Tokenizer)?;
-        let failed = |e: tokenizers::Error| Error::missing(format!("{}: {e}", file.display()));
+        let failed =
+            |e: tokenizers::Error| Error::missing_model(file.display(), format!("{}: {e}", file.display()));
         let mut tokenizer = Tokenizer::from_file(&file).map_err(failed)?;
         // The file pads every text to 128 tokens; padding would only cost time here.
         tokenizer.with_padding(None);

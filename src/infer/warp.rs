@@ -80,11 +80,14 @@ fn by_descriptors(
     for pair in &pairs {
         progress.check()?;
         let Some([first, second, _, _]) = &pair.descriptors else {
-            return Err(Error::missing(format!(
-                "{}: model {} gives no descriptors, so it cannot match; choose another --matcher",
-                model.folder.display(),
-                model.name
-            )));
+            return Err(Error::missing_model(
+                &model.name,
+                format!(
+                    "{}: model {} gives no descriptors, so it cannot match; choose another --matcher",
+                    model.folder.display(),
+                    model.name
+                ),
+            ));
         };
         let (i, j) = (pair.first, pair.second);
         let there = Field::nearest((first, &prepared[i]), (second, &prepared[j]));
@@ -114,11 +117,14 @@ fn field_values(warp: Tensor, certainty: Tensor, file: &super::graph::GraphFile)
         return Err(Error::work(format!("{}: warp and certainty differ in size", file.path.display())));
     }
     if let Some(odd) = certainty.data.iter().find(|c| !(-1e-3..=1.001).contains(*c)) {
-        return Err(Error::missing(format!(
-            "{}: a certainty of {odd} is no probability; if the graph gives logits say apply.certainty = \"sigmoid\" in its \
+        return Err(Error::missing_model(
+            file.path.display(),
+            format!(
+                "{}: a certainty of {odd} is no probability; if the graph gives logits say apply.certainty = \"sigmoid\" in its \
              adapter (docs/models.md)",
-            file.path.display()
-        )));
+                file.path.display()
+            ),
+        ));
     }
     let mut all = vec![width as f32, height as f32];
     for (xy, c) in warp.data.chunks_exact(2).zip(&certainty.data) {

@@ -181,11 +181,10 @@ impl Vocabulary {
         let first = |line: &str| line.split(['\t', ',']).next().unwrap_or_default().to_string();
         let list: Vec<String> = table.lines().map(first).collect();
         if list.len() != CLASSES {
-            return Err(Error::missing(format!(
-                "{}: {} classes, expected {CLASSES}",
+            return Err(Error::missing_model(
                 file.display(),
-                list.len()
-            )));
+                format!("{}: {} classes, expected {CLASSES}", file.display(), list.len()),
+            ));
         }
         let mut encoder = TextEncoder::load(registry)?;
         // Naming a thousand classes takes seconds, which a single query should not pay.

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 /// How embeddings become the short codes that splats carry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum Reducer {
     /// One code per distinct embedding, bound to it (docs/method.md#codebook).
     Bijection,
@@ -53,6 +54,7 @@ impl Default for BuildOptions {
 
 /// What [`build`] produces.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct Language {
     /// Codebooks and training targets; splat features are empty until training fills them.
     pub field: LanguageField,

@@ -50,6 +50,7 @@ impl RgbImage {
 
 /// The shape of a resampling filter; its width grows with the reduction (as Pillow's `resize` does).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Kernel {
     /// Bilinear.
     Triangle,

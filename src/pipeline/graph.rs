@@ -119,11 +119,13 @@ impl<'g> Graph<'g> {
         });
         let state = shared.state.into_inner().unwrap_or_else(PoisonError::into_inner);
         if let Err(error) = both(device_lane, processor_lane) {
+            let of = |n: usize| store.checkpoint(self.nodes[n].name, &shared.keys[n]);
+            let begun = (0..self.nodes.len()).filter_map(of).any(|c| c.exists());
             if !state.kept.is_empty() {
                 let names = state.kept.join(", ");
                 progress.inform(&format!("kept: {names}; the same command with --resume goes on from there"));
             }
-            return Err(error);
+            return Err(if begun || !state.kept.is_empty() { error.resumable() } else { error });
         }
         Ok(Outputs { values: state.values, seconds: state.seconds })
     }

@@ -19,6 +19,7 @@ pub struct Context<'a> {
 
 /// What a stage keeps busy. One stage of each kind runs at a time: two on one device would only wait for each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Lane {
     /// The Vulkan device, and the processor where cameras are found: what everything else waits for.
     Device,

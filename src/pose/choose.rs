@@ -38,6 +38,7 @@ const BLURRED: f64 = 0.6;
 
 /// What was chosen and why, for messages and run.json.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
+#[non_exhaustive]
 pub struct Choice {
     /// Names of the photos used, in order.
     pub used: Vec<String>,
@@ -64,6 +65,7 @@ impl From<LeftOut> for (String, Reason) {
 /// Why a photo is not used.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum Reason {
     /// Less sharp than the others.
     Blurred,

@@ -33,6 +33,7 @@ pub struct SparsePoint {
 
 /// What the photos told of the optics of one of them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct Fitted {
     /// Its lens.
     pub lens: Lens,

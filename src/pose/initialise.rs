@@ -23,14 +23,15 @@ pub struct SolvedCameras {
     pub method: String,
 }
 
-/// Cameras of the photos, from the photos themselves (`cameras` = None) or as given.
+/// Cameras of the photos, from the photos themselves (`cameras` = None; `seed` draws the samples of RANSAC) or as given.
 pub fn place(
     photos: Vec<Photo>,
     cameras: Option<&[Camera]>,
     registry: &Registry,
+    seed: u64,
     progress: &dyn Progress,
 ) -> Result<SolvedCameras> {
-    let model = sparse(&photos, cameras, Some(registry), progress)?;
+    let model = sparse(&photos, cameras, Some(registry), seed, progress)?;
     if let Some(sigma) = model.focal_log_sigma.filter(|s| *s > UNSURE_FOCAL) {
         progress.warn(&format!(
             "the photos leave the focal length open by ±{:.0} %: depth may be stretched; photos from more different \
@@ -142,6 +143,7 @@ pub fn sparse(
     photos: &[Photo],
     cameras: Option<&[Camera]>,
     registry: Option<&Registry>,
+    seed: u64,
     progress: &dyn Progress,
 ) -> Result<SparseModel> {
     let features = match registry {
@@ -150,7 +152,7 @@ pub fn sparse(
     };
     match cameras {
         Some(c) => sfm::with_cameras(photos, &assigned(photos, c)?, &features, progress),
-        None => sfm::reconstruct(photos, &features, progress),
+        None => sfm::reconstruct(photos, &features, seed, progress),
     }
 }
 
@@ -228,7 +230,7 @@ mod tests {
         let dim = Light { gain: [0.7; 3], ..Light::NONE };
         photos[1].image = dim.applied(&photos[1].image);
         let before = psnr(&photos[1].image, &truth.photos[1].image);
-        let placed = place(photos, None, &registry, &Silent).unwrap();
+        let placed = place(photos, None, &registry, 0, &Silent).unwrap();
         // Against the photo without lens, in the light of the others: only a lens and a gain that are both taken out agree.
         for (photo, original) in placed.photos.iter().zip(&truth.photos) {
             let agreed = psnr(&photo.image, &original.image);

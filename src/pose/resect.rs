@@ -22,13 +22,14 @@ fn error2(pose: &Pose, focal: f64, world: DVec3, pixel: DVec2) -> f64 {
 }
 
 /// World points and the pixels (relative to the principal point) that show them → world → camera pose. `threshold` in
-/// pixels. `None` with fewer than four points or without a consistent pose.
+/// pixels; `seed` draws the samples. `None` with fewer than four points or without a consistent pose.
 pub(crate) fn resect(
     world: &[DVec3],
     pixels: &[DVec2],
     focal: f64,
     threshold: f64,
     iterations: usize,
+    seed: u64,
 ) -> Option<Resection> {
     let n = world.len();
     if n < 4 {
@@ -36,7 +37,7 @@ pub(crate) fn resect(
     }
     let t2 = threshold * threshold;
     let score = |p: &Pose| (0..n).map(|k| error2(p, focal, world[k], pixels[k]).min(t2)).sum::<f64>();
-    let mut rng = Random::new(0x5eed_0003);
+    let mut rng = Random::new(seed ^ 0x5eed_0003);
     let mut best: Option<(f64, Pose)> = None;
     for _ in 0..iterations {
         let s = rng.sample::<3>(n);
@@ -107,7 +108,7 @@ mod tests {
             world.push(p);
             pixels.push(u);
         }
-        let r = resect(&world, &pixels, 600.0, 3.0, 200).unwrap();
+        let r = resect(&world, &pixels, 600.0, 3.0, 200, 0).unwrap();
         assert!(rotation_angle(&(r.pose.rotation * truth.rotation.transpose())).to_degrees() < 0.1);
         assert!((r.pose.centre() - truth.centre()).length() < 0.01);
         assert!(r.inliers.len() >= 145);

@@ -158,8 +158,14 @@ impl Data<'_> {
 }
 
 /// Estimates the relation of two views from matches sorted best first. `x`, `y`: centred pixels over prior focal length;
-/// `threshold` in the same unit; `prior_sigma` is that of ln stretch.
-pub(crate) fn estimate(x: &[DVec2], y: &[DVec2], threshold: f64, prior_sigma: f64) -> Option<TwoView> {
+/// `threshold` in the same unit; `prior_sigma` is that of ln stretch. `seed` draws the samples.
+pub(crate) fn estimate(
+    x: &[DVec2],
+    y: &[DVec2],
+    threshold: f64,
+    prior_sigma: f64,
+    seed: u64,
+) -> Option<TwoView> {
     let n = x.len();
     if n < 8 {
         return None;
@@ -174,7 +180,7 @@ pub(crate) fn estimate(x: &[DVec2], y: &[DVec2], threshold: f64, prior_sigma: f6
     let mut best: Option<(f64, Pose, f64)> = None;
     for (k, m) in stretches.iter().enumerate() {
         let iterations = if k == 0 { 1500 } else { 300 };
-        let found = data.ransac(*m, iterations, prior_sigma, 0x5eed_0001 + k as u64);
+        let found = data.ransac(*m, iterations, prior_sigma, seed ^ (0x5eed_0001 + k as u64));
         if let Some(found) = found.filter(|f| best.as_ref().is_none_or(|b| f.0 < b.0)) {
             best = Some(found);
         }
@@ -256,7 +262,7 @@ mod tests {
         let pose =
             Pose { rotation: turn.rotation, translation: DVec3::new(0.3, 0.4, 2.5) - turn.rotation * c };
         let (x, y) = views(&pose, 660.0, 400, false);
-        let found = estimate(&x, &y, 3.0 / 576.0, 0.35).unwrap();
+        let found = estimate(&x, &y, 3.0 / 576.0, 0.35, 0).unwrap();
         let error = rotation_angle(&(found.pose.rotation * pose.rotation.transpose())).to_degrees();
         let direction = found.pose.translation.angle_between(pose.translation).to_degrees();
         assert!(error < 1.5 && direction < 3.0, "{error} {direction} {}", found.stretch);
@@ -268,7 +274,7 @@ mod tests {
     fn a_turning_camera_is_recognised() {
         let pose = Pose::exp(DVec3::ZERO, DVec3::new(0.02, 0.2, 0.01));
         let (x, y) = views(&pose, 660.0, 300, false);
-        let found = estimate(&x, &y, 3.0 / 576.0, 0.35).unwrap();
+        let found = estimate(&x, &y, 3.0 / 576.0, 0.35, 0).unwrap();
         assert!(found.rotation_residual * 576.0 < 3.0, "{}", found.rotation_residual * 576.0);
     }
 }

@@ -6,6 +6,7 @@ use crate::scene::{LEVEL_NAMES, LanguageField, Plane};
 /// What viewers draw for a query. The level and the codes are those that answered in the views where the text was
 /// found, so that a viewer lights up what the views' masks show.
 #[derive(Clone, Debug, Default, PartialEq)]
+#[non_exhaustive]
 pub struct Highlight {
     /// Chosen level, index as in [`LEVEL_NAMES`].
     pub level: usize,

@@ -62,6 +62,7 @@ pub const SLACK: Slack = Slack { margin: 0.02, share: 0.1 };
 
 /// How the mask follows from relevancy.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum MaskRule {
     /// Protocol `field`: the codes whose relevancy is at least this share of the way from 0.5 (as close as a canonical
     /// phrase) to the best code of the level; their pixels are the mask, without smoothing.
@@ -83,6 +84,7 @@ pub const CODE_SHARE: f32 = 0.8;
 
 /// The answer to one query in one frame.
 #[derive(Clone, Debug, Default)]
+#[non_exhaustive]
 pub struct QueryResult {
     /// Chosen level, index as in [`crate::scene::LEVEL_NAMES`].
     pub level: usize,

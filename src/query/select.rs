@@ -12,6 +12,7 @@ const MIN_LENGTH: f32 = 0.1;
 
 /// The splats that answer a query.
 #[derive(Clone, Debug, Default, PartialEq)]
+#[non_exhaustive]
 pub struct Selection {
     /// Level that answers, index as in [`crate::scene::LEVEL_NAMES`].
     pub level: usize,

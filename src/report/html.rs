@@ -16,7 +16,7 @@ const STYLE: &str = include_str!("report.css");
 /// Writes `report.html` into a scene folder.
 pub fn write_html(folder: &Path, report: &HtmlReport) -> Result<()> {
     let path = folder.join("report.html");
-    std::fs::write(&path, page(report)?).map_err(Error::io(&path))
+    std::fs::write(&path, page(report)?).map_err(Error::unwritable(&path))
 }
 
 fn figure(image: &RgbImage, caption: &str) -> Result<String> {

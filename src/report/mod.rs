@@ -23,7 +23,7 @@ pub fn write_previews(folder: &Path, report: &HtmlReport) -> Result<()> {
     create_folder(&folder)?;
     let save = |name: String, image: &RgbImage| {
         let path = folder.join(name);
-        std::fs::write(&path, picture::jpeg_bytes(image, 90)?).map_err(Error::io(&path))
+        std::fs::write(&path, picture::jpeg_bytes(image, 90)?).map_err(Error::unwritable(&path))
     };
     for v in &report.views {
         if let Some(render) = v.render {

@@ -91,6 +91,7 @@ impl QueryScene {
 
 /// The answers to one text, one per photo.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct Answers {
     /// The text of the query.
     pub text: String,

@@ -79,6 +79,7 @@ fn work(
         sam: plan.sam,
         given_features: plan.features.argument.is_some(),
         preset,
+        seed: plan.seed,
     };
     let scene = list::scene(&mut build, plan, device, photos)?;
     let mut made = build.graph.run(&scene.targets(), device, registry, store, progress)?;

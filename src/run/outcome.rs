@@ -13,6 +13,7 @@ use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, LanguageField, Splats};
 
 /// Everything that a run made; [`crate::report`] turns it into run.json, report.html and the summary.
+#[non_exhaustive]
 pub struct RunOutcome {
     /// The plan that was run.
     pub plan: RunPlan,

@@ -53,6 +53,7 @@ pub struct TrainPlan {
 }
 
 /// Figures of a finished training.
+#[non_exhaustive]
 pub struct TrainOutcome {
     /// Content of run.json.
     pub record: RunRecord,
@@ -149,8 +150,8 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         options = options.with_iterations(n);
     }
     let mut graph = Graph::default();
-    let placed = graph.add(stages::Cameras::new(photos, source)?, ());
-    let geometry = graph.add(stages::DenseDepth { preset }, (placed,));
+    let placed = graph.add(stages::Cameras::new(photos, source, plan.seed)?, ());
+    let geometry = graph.add(stages::DenseDepth { preset, seed: plan.seed }, (placed,));
     let trained = graph.add(stages::TrainColour { options }, (placed, geometry));
     let targets = [placed.target(), geometry.target(), trained.target()];
     let store = super::execute::store(plan.resume, plan.checkpoint_seconds);

@@ -10,6 +10,7 @@ use crate::scene::{Camera, LanguageField, Plane, Splats};
 
 /// A rendered frame and the code of every pixel per level (−1 = none).
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct DecodedFrame {
     /// Colour and depth; features only from [`Viewer::view_with_features`].
     pub rendered: Frame,

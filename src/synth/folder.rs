@@ -94,7 +94,7 @@ fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &RayCast, qual
     let place = if split == Split::Train { "images" } else { "held_out" };
     let (name, file) = (&camera.name, format!("{place}/{}.jpg", camera.name));
     let path = folder.join(&file);
-    std::fs::write(&path, picture::jpeg_bytes(&seen.image, quality)?).map_err(Error::io(&path))?;
+    std::fs::write(&path, picture::jpeg_bytes(&seen.image, quality)?).map_err(Error::unwritable(&path))?;
     let shape = vec![seen.depth.height, seen.depth.width];
     let depth = NpyData::F16(seen.depth.data.iter().map(|z| f16::from_f32(*z)).collect());
     let path = folder.join("depth").join(format!("{name}.npz"));

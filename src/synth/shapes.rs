@@ -3,6 +3,7 @@ use glam::{DVec2, DVec3};
 
 /// A solid, metres, +z up.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum Shape {
     /// Centre and radius.
     Ball(DVec3, f64),

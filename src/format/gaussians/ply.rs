@@ -91,10 +91,10 @@ pub fn write_splats(path: &Path, s: &Splats, options: PlyOptions) -> Result<()> 
     use std::io::Write as _;
     let levels = options.language.map(|l| named_levels(l, s.len())).transpose()?.unwrap_or_default();
     let rest = sh_coefficients(options.degree) - 1;
-    let file = std::fs::File::create(path).map_err(Error::io(path))?;
+    let file = std::fs::File::create(path).map_err(Error::unwritable(path))?;
     let mut out = std::io::BufWriter::new(file);
     let mut row: Vec<u8> = Vec::new();
-    let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(Error::io(path));
+    let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(Error::unwritable(path));
     write(splat_header(s.len(), rest, &levels).as_bytes())?;
     let have = s.sh_len();
     for i in 0..s.len() {
@@ -116,7 +116,7 @@ pub fn write_splats(path: &Path, s: &Splats, options: PlyOptions) -> Result<()> 
         }
         write(&row)?;
     }
-    out.flush().map_err(Error::io(path))
+    out.flush().map_err(Error::unwritable(path))
 }
 
 fn named_levels(field: &LanguageField, n: usize) -> Result<Vec<(&'static str, &LevelField)>> {
@@ -196,5 +196,5 @@ pub fn write_points(path: &Path, p: &PointCloud) -> Result<()> {
         }
         bytes.extend(colour.map(crate::format::to_byte));
     }
-    std::fs::write(path, bytes).map_err(Error::io(path))
+    std::fs::write(path, bytes).map_err(Error::unwritable(path))
 }

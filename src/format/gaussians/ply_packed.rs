@@ -188,7 +188,7 @@ pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
             );
         }
     }
-    std::fs::write(path, out).map_err(Error::io(path))?;
+    std::fs::write(path, out).map_err(Error::unwritable(path))?;
     Ok(order)
 }
 

@@ -60,6 +60,6 @@ pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
         let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
         bytes.extend(q.map(|v| (v / norm * 128.0 + 128.0).round().clamp(0.0, 255.0) as u8));
     }
-    std::fs::write(path, bytes).map_err(Error::io(path))?;
+    std::fs::write(path, bytes).map_err(Error::unwritable(path))?;
     Ok(order.into_iter().map(|(_, i)| i as u32).collect())
 }

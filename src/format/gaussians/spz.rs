@@ -241,7 +241,7 @@ pub fn write_splats(path: &Path, s: &Splats) -> Result<()> {
         out.extend((plain.len() as u64).to_le_bytes());
     }
     packed.iter().for_each(|p| out.extend_from_slice(p));
-    std::fs::write(path, out).map_err(Error::io(path))
+    std::fs::write(path, out).map_err(Error::unwritable(path))
 }
 
 /// The most fractional bits, up to 24, with which all positions fit.

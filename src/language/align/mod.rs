@@ -22,6 +22,7 @@ use serde::{Deserialize, Serialize};
 
 /// What alignment did on one level, for run.json.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct LevelReport {
     /// Accepted edges, best first.
     pub edges: Vec<Edge>,

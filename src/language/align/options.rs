@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 /// How the share of a target mask is measured (docs/method.md#pixel-matching).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum AreaScore {
     /// Share of the target's own pixels whose reverse match lands in the source: independent of image scale.
     Coverage,

@@ -149,7 +149,7 @@ fn a_photo_in_another_light_is_named() {
 fn real_points_tell_the_light_of_real_photos() {
     let truth = testing::train(&testing::folder());
     let cameras: Vec<Camera> = truth.cameras;
-    let model = sparse(&truth.photos, Some(&cameras), None, &Silent).unwrap();
+    let model = sparse(&truth.photos, Some(&cameras), None, 0, &Silent).unwrap();
     let none = estimate(&truth.photos, &model);
     eprintln!("steady: {:?} {:?}", none.lights, none.unexplained);
     assert!(none.lights.iter().all(Light::is_none), "{:?}", none.lights);

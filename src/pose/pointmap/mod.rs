@@ -18,10 +18,11 @@ use adjust::Adjustment;
 pub use matches::{PairMatches, PixelMatch, descriptor_matches, point_matches};
 use pairs::Edge;
 
-/// Steps A–G.
+/// Steps A–G; `seed` draws the samples of RANSAC.
 pub fn reconstruct(
     views: &[ModelView],
     pairs: &[PairPointmaps],
+    seed: u64,
     progress: &dyn Progress,
 ) -> Result<Geometry> {
     check(views, pairs)?;
@@ -30,7 +31,7 @@ pub fn reconstruct(
         progress.check()?;
         matches.push(matches::of_pair(&views[pair.first], &views[pair.second], pair));
     }
-    align(views, pairs, &matches, progress)
+    align(views, pairs, &matches, seed, progress)
 }
 
 /// Steps B–G for given matches, one list per pair.
@@ -38,6 +39,7 @@ pub fn align(
     views: &[ModelView],
     pairs: &[PairPointmaps],
     matches: &[PairMatches],
+    seed: u64,
     progress: &dyn Progress,
 ) -> Result<Geometry> {
     check(views, pairs)?;
@@ -46,7 +48,7 @@ pub fn align(
     let edges: Vec<Edge> = pairs
         .iter()
         .zip(matches)
-        .filter_map(|(pair, m)| pairs::edge(views, pair, &m.matches, &canonical, &focals))
+        .filter_map(|(pair, m)| pairs::edge(views, pair, &m.matches, &canonical, &focals, seed))
         .collect();
     let start = tree::place(views.len(), &edges).map_err(|left| not_connected(views, &edges, &left))?;
     progress.check()?;

@@ -78,7 +78,13 @@ struct Relative {
 const SAMPLES: usize = 4096;
 
 impl Direction<'_> {
-    fn solve(&self, views: &[ModelView], canonical: &[Canonical], focals: &Focals) -> Option<Relative> {
+    fn solve(
+        &self,
+        views: &[ModelView],
+        canonical: &[Canonical],
+        focals: &Focals,
+        seed: u64,
+    ) -> Option<Relative> {
         let view = &views[self.seen];
         let chosen = confident(self.cross, self.own);
         let world: Vec<DVec3> = chosen.iter().map(|&k| self.cross.point(k)).collect();
@@ -89,7 +95,7 @@ impl Direction<'_> {
             })
             .collect();
         let threshold = (0.005 * view.width as f64).max(2.0);
-        let found = resect(&world, &pixels, focals.of(self.seen), threshold, 512)?;
+        let found = resect(&world, &pixels, focals.of(self.seen), threshold, 512, seed)?;
         let rotation = self.procrustes(&chosen, &world)?;
         let inliers = found.inliers.len() as f64 / chosen.len() as f64;
         let apart = rotation_angle(&(rotation * found.pose.rotation.transpose())).to_degrees();
@@ -162,13 +168,14 @@ pub(super) fn edge(
     matches: &[PixelMatch],
     canonical: &[Canonical],
     focals: &Focals,
+    seed: u64,
 ) -> Option<Edge> {
     let (first, second) = (pair.first, pair.second);
     let forward = Direction { cross: &pair.x21, own: &pair.x22, base: &pair.x11, frame: first, seen: second }
-        .solve(views, canonical, focals);
+        .solve(views, canonical, focals, seed);
     let backward =
         Direction { cross: &pair.x12, own: &pair.x11, base: &pair.x22, frame: second, seen: first }
-            .solve(views, canonical, focals)
+            .solve(views, canonical, focals, seed)
             .map(|b| {
                 let mut pose = b.pose.inverse();
                 // Unit of the second view → unit of the first.

@@ -123,7 +123,7 @@ fn noisy_pointmaps_place_cameras_and_depth() {
     let case = case();
     let (pairs, matches) = case.input(FAULTS);
     let start = std::time::Instant::now();
-    let g = align(&case.views, &pairs, &matches, &Silent).unwrap();
+    let g = align(&case.views, &pairs, &matches, 0, &Silent).unwrap();
     let e = case.errors(&g);
     println!(
         "rotation {:.3?}° centre {:.3?} focal {:.4} ± {:.4}, {} points, {:.1} s",
@@ -174,14 +174,14 @@ fn order_of_views_and_scale_of_a_pair_do_not_matter() {
     // Three views keep the three solutions short.
     case.views.truncate(3);
     let (pairs, matches) = case.input(FAULTS);
-    let base = align(&case.views, &pairs, &matches, &Silent).unwrap();
+    let base = align(&case.views, &pairs, &matches, 0, &Silent).unwrap();
     let mut scaled = pairs.clone();
     // A power of two, so that f32 storage itself changes nothing.
     let pair = &mut scaled[1];
     for m in [&mut pair.x11, &mut pair.x21] {
         m.points.iter_mut().flatten().for_each(|v| *v *= 4.0);
     }
-    let g = align(&case.views, &scaled, &matches, &Silent).unwrap();
+    let g = align(&case.views, &scaled, &matches, 0, &Silent).unwrap();
     assert!(difference(&base.cameras, &g.cameras) < 1e-6, "{}", difference(&base.cameras, &g.cameras));
     // View k becomes view order[k].
     let order = [2usize, 0, 1];
@@ -193,7 +193,7 @@ fn order_of_views_and_scale_of_a_pair_do_not_matter() {
         .iter()
         .map(|p| PairPointmaps { first: order[p.first], second: order[p.second], ..p.clone() })
         .collect();
-    let g = align(&views, &renamed, &matches, &Silent).unwrap();
+    let g = align(&views, &renamed, &matches, 0, &Silent).unwrap();
     let back: Vec<Camera> = order.iter().map(|k| g.cameras[*k].clone()).collect();
     let d = difference(&base.cameras, &back);
     println!("permuted: {d:e}");
@@ -209,7 +209,7 @@ fn residual_gradients_agree_with_differences() {
     let edges: Vec<Edge> = pairs
         .iter()
         .zip(&matches)
-        .filter_map(|(p, m)| pairs::edge(&case.views, p, &m.matches, &canonical, &focals))
+        .filter_map(|(p, m)| pairs::edge(&case.views, p, &m.matches, &canonical, &focals, 0))
         .collect();
     assert_eq!(edges.len(), 6);
     let start = tree::place(4, &edges).unwrap();
@@ -246,19 +246,22 @@ fn views_without_geometry_are_refused_by_name() {
     let keep = [0usize, 5];
     let (p, m) =
         keep.iter().map(|k| (pairs[*k].clone(), matches[*k].clone())).unzip::<_, _, Vec<_>, Vec<_>>();
-    let error = align(&case.views, &p, &m, &Silent).unwrap_err();
+    let error = align(&case.views, &p, &m, 0, &Silent).unwrap_err();
     assert!(error.exit_code() == 2 && error.to_string().contains("train_00–train_02"), "{error}");
     // Identical photos: every map in the same frame.
     let mut rng = Random::new(5);
     let twin =
         Case { cameras: vec![case.cameras[0].clone(); 2], depths: vec![case.depths[0].clone(); 2], ..case };
     let (p, m) = twin.pair(0, 1, FAULTS, &mut rng);
-    let error = align(&twin.views[..2], &[p], &[m], &Silent).unwrap_err();
+    let error = align(&twin.views[..2], &[p], &[m], 0, &Silent).unwrap_err();
     assert!(error.exit_code() == 2 && error.to_string().contains("no parallax"), "{error}");
     // A map of the wrong size.
     let (mut p, m) = twin.pair(0, 1, FAULTS, &mut rng);
     p.x21.points.pop();
     assert!(
-        align(&twin.views[..2], &[p], &[m], &Silent).unwrap_err().to_string().contains("wrong model output")
+        align(&twin.views[..2], &[p], &[m], 0, &Silent)
+            .unwrap_err()
+            .to_string()
+            .contains("wrong model output")
     );
 }

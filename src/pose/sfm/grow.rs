@@ -99,7 +99,7 @@ fn resection(model: &Model, view: usize, threshold: f64) -> Option<Resection> {
     // A ratio of two focal lengths has √2 of the σ of one; two of it.
     let tried = STRETCHES.into_iter().filter(|s| s.ln().abs() <= 2.0 * 2f64.sqrt() * sigma);
     let place = |stretch: f64| {
-        let r = resect(&world, &pixels, model.focal(view) * stretch, 2.0 * threshold, 500)?;
+        let r = resect(&world, &pixels, model.focal(view) * stretch, 2.0 * threshold, 500, model.seed)?;
         Some(Resection { pose: r.pose, stretch, count: r.inliers.len() })
     };
     tried.filter_map(place).max_by_key(|p| p.count)

@@ -51,6 +51,8 @@ pub fn with_cameras(
         priors: vec![OpticsPrior::default(); cameras.len()],
         freedom: Freedom::Focal,
         tracks: Vec::new(),
+        // Nothing is drawn where cameras are known.
+        seed: 0,
     };
     let mut putative = putative_matches(&families, progress)?;
     for pair in &mut putative {

@@ -37,8 +37,13 @@ const LENS_SIGMA: f64 = 0.05;
 /// Principal point from the middle, as a share of the long side: stabilised sensors move by up to a hundredth.
 const SHIFT_SIGMA: f64 = 0.007;
 /// Cameras and sparse points from photos and their learned features (one per photo; may be empty, then only the
-/// built-in corner detector is used).
-pub fn reconstruct(photos: &[Photo], features: &[Keypoints], progress: &dyn Progress) -> Result<SparseModel> {
+/// built-in corner detector is used). `seed` draws the samples of RANSAC.
+pub fn reconstruct(
+    photos: &[Photo],
+    features: &[Keypoints],
+    seed: u64,
+    progress: &dyn Progress,
+) -> Result<SparseModel> {
     if photos.len() < 2 {
         return Err(Error::input("cameras need at least two photos; give two or more"));
     }
@@ -46,7 +51,7 @@ pub fn reconstruct(photos: &[Photo], features: &[Keypoints], progress: &dyn Prog
     progress.step(0, "corners");
     let families = corner_families(photos, features, progress)?;
     progress.step(1, "matches");
-    let empty = empty_model(photos);
+    let empty = empty_model(photos, seed);
     let putative = relate::putative_matches(&families, progress)?;
     let pairs = relate::pairs(photos, &putative, &empty, progress)?;
     progress.step(2, "poses");
@@ -71,7 +76,7 @@ fn separable(photos: &[Photo], group: &[usize]) -> Vec<usize> {
 }
 
 /// Groups and priors of the optics from the files.
-fn empty_model(photos: &[Photo]) -> Model {
+fn empty_model(photos: &[Photo], seed: u64) -> Model {
     let zoom: Vec<f64> = photos.iter().map(Photo::zoom).collect();
     let long = |v: usize| photos[v].original_size.0.max(photos[v].original_size.1);
     let group = crate::photo::cameras_by_file(photos);
@@ -115,6 +120,7 @@ fn empty_model(photos: &[Photo]) -> Model {
         priors,
         freedom: Freedom::Focal,
         tracks: Vec::new(),
+        seed,
     }
 }
 

@@ -95,6 +95,8 @@ pub(super) struct Model {
     /// What adjustments change; nothing where the prior's σ is 0.
     pub(super) freedom: Freedom,
     pub(super) tracks: Vec<Track>,
+    /// Of the samples that are drawn.
+    pub(super) seed: u64,
 }
 
 /// Least angle between two rays of a usable point: below it the depth is mostly noise.
@@ -172,6 +174,7 @@ impl Model {
             priors: self.priors.clone(),
             freedom: self.freedom,
             tracks: Vec::new(),
+            seed: self.seed,
         }
     }
 
@@ -433,6 +436,7 @@ mod tests {
                 priors: vec![prior],
                 freedom: Freedom::Full,
                 tracks: vec![track; tracks],
+                seed: 0,
             };
             let problem = model.problem(f64::INFINITY, Freedom::Full).0;
             assert_eq!(problem.observations.len(), 2 * tracks);

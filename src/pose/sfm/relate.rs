@@ -116,7 +116,9 @@ fn relate(photos: &[Photo], pair: &Matches, empty: &Model) -> Relation {
     let threshold = THRESHOLD * long / empty.focal(i);
     let sigma = |v: usize| empty.priors[empty.group[v]].log_focal.1;
     let sigma = sigma(i).max(sigma(j));
-    let Some(found) = two_view::estimate(&x, &y, threshold, sigma) else { return Relation::Apart };
+    let Some(found) = two_view::estimate(&x, &y, threshold, sigma, empty.seed) else {
+        return Relation::Apart;
+    };
     if found.inliers.len() < MIN_INLIERS {
         return Relation::Apart;
     }

@@ -16,7 +16,7 @@ fn check(name: &str, features: impl Fn(&[Photo]) -> Vec<Keypoints>, rotation: f6
     let start = std::time::Instant::now();
     let features = features(&truth.photos);
     let found = start.elapsed();
-    let model = reconstruct(&truth.photos, &features, &Silent).unwrap();
+    let model = reconstruct(&truth.photos, &features, 0, &Silent).unwrap();
     let e = pose_errors(&model.cameras, &truth.cameras, truth.mean_depth);
     println!(
         "{name}: rotation {:.3?}° centre {:.3?} % focal {:.2} % ± {:.2} %, {} points, {:.1} + {:.1} s",
@@ -89,7 +89,7 @@ fn turned(photo: &Photo, focal: f64, angle: f64) -> Photo {
 
 /// The error for photos that cannot be reconstructed: one line, exit code 2, naming the photos.
 fn refusal(photos: &[Photo]) -> String {
-    let error = reconstruct(photos, &[], &Silent).unwrap_err();
+    let error = reconstruct(photos, &[], 0, &Silent).unwrap_err();
     let text = error.to_string();
     assert!(error.exit_code() == 2 && !text.contains('\n') && text.contains(&photos[1].stem), "{text}");
     text
@@ -128,7 +128,7 @@ fn two_photos_of_different_size_and_known_focal_are_enough() {
     for (p, c) in truth.photos.iter_mut().zip(&truth.cameras) {
         p.exif_focal = Some(c.fx * 1.02);
     }
-    let model = reconstruct(&truth.photos, &[], &Silent).unwrap();
+    let model = reconstruct(&truth.photos, &[], 0, &Silent).unwrap();
     // Two views fix no scale, so compare the relative rotation and the direction of the baseline.
     let relative = |c: &[Camera]| c[1].pose.compose(&c[0].pose.inverse());
     let (found, want) = (relative(&model.cameras), relative(&truth.cameras));
@@ -145,12 +145,12 @@ fn two_photos_of_different_size_and_known_focal_are_enough() {
 fn a_lens_is_found_and_a_pinhole_stays_one() {
     let truth = testing::train(&testing::folder());
     let focal = truth.cameras[0].fx;
-    let model = reconstruct(&truth.photos, &[], &Silent).unwrap();
+    let model = reconstruct(&truth.photos, &[], 0, &Silent).unwrap();
     assert!(model.fitted.iter().all(|f| f.lens.is_none()), "{:?}", model.fitted);
     assert_eq!((model.cameras[0].cx, model.cameras[0].cy), (320.0, 240.0));
     let lens = Lens { k1: -0.12, k2: 0.03 };
     let photos: Vec<Photo> = truth.photos.iter().map(|p| lensed(p, focal, lens)).collect();
-    let model = reconstruct(&photos, &[], &Silent).unwrap();
+    let model = reconstruct(&photos, &[], 0, &Silent).unwrap();
     let e = pose_errors(&model.cameras, &truth.cameras, truth.mean_depth);
     let found = model.fitted[0];
     // Where both lenses image the corner of the undistorted picture.
@@ -168,7 +168,7 @@ fn a_lens_is_found_and_a_pinhole_stays_one() {
 fn a_view_in_the_wrong_place_is_the_only_one_that_disagrees() {
     let truth = testing::train(&testing::folder());
     let families = corner_families(&truth.photos, &[], &Silent).unwrap();
-    let mut model = empty_model(&truth.photos);
+    let mut model = empty_model(&truth.photos, 0);
     model.optics[0].focal = truth.cameras[0].fx;
     model.poses = truth.cameras.iter().map(|c| Some(c.pose)).collect();
     let putative = relate::putative_matches(&families, &Silent).unwrap();
@@ -199,7 +199,7 @@ fn cropped(photo: &Photo, zoom: f64) -> Photo {
 fn photos_that_only_look_like_one_camera_are_told_apart() {
     let truth = testing::train(&testing::folder());
     let focal = truth.cameras[0].fx;
-    let one = reconstruct(&truth.photos, &[], &Silent).unwrap();
+    let one = reconstruct(&truth.photos, &[], 0, &Silent).unwrap();
     assert!(one.fitted.iter().all(|f| f.camera == 0 && f.agreement > 0.9), "{:?}", one.fitted);
     let lens = Lens { k1: -0.12, k2: 0.03 };
     type Change<'a> = &'a dyn Fn(&Photo) -> Photo;
@@ -214,7 +214,7 @@ fn photos_that_only_look_like_one_camera_are_told_apart() {
             photos[v] = change(&photos[v]);
             (cameras[v].fx, cameras[v].fy) = (focal * zoom, focal * zoom);
         }
-        let model = reconstruct(&photos, &[], &Silent).unwrap();
+        let model = reconstruct(&photos, &[], 0, &Silent).unwrap();
         let e = pose_errors(&model.cameras, &cameras, truth.mean_depth);
         println!("{e:?} {:?}", model.fitted);
         let of: Vec<usize> = model.fitted.iter().map(|f| f.camera).collect();
@@ -242,7 +242,7 @@ fn a_moving_lens_does_not_make_another_camera() {
     let shifts = [[0, 0], [12, -6], [-10, 8], [6, 10]];
     let moved = |(p, s): (&Photo, [i32; 2])| moved(p, s);
     let photos: Vec<Photo> = truth.photos.iter().zip(shifts).map(moved).collect();
-    let model = reconstruct(&photos, &[], &Silent).unwrap();
+    let model = reconstruct(&photos, &[], 0, &Silent).unwrap();
     let of: Vec<usize> = model.fitted.iter().map(|f| f.camera).collect();
     let focal: Vec<f64> = model.cameras.iter().map(|c| c.fx / truth.cameras[0].fx - 1.0).collect();
     println!("{of:?} {focal:?} {:?}", model.fitted[0].sigmas);
@@ -254,7 +254,7 @@ fn a_moving_lens_does_not_make_another_camera() {
 #[test]
 fn photos_whose_files_name_camera_and_zoom_share_it() {
     let mut photos = testing::train(&testing::folder()).photos;
-    let separate = |photos: &[Photo]| empty_model(photos).with_separate_optics().map(|m| m.group);
+    let separate = |photos: &[Photo]| empty_model(photos, 0).with_separate_optics().map(|m| m.group);
     assert_eq!(separate(&photos), Some(vec![0, 1, 2, 3]));
     for p in &mut photos[..3] {
         (p.camera_model, p.exif_focal) = (Some("phone".into()), Some(600.0));
@@ -272,7 +272,7 @@ fn larger_images_make_cameras_better() {
     truth.photos = photos.iter().map(|p| crate::photo::load_at(&p.path, 320).unwrap()).collect();
     assert!(truth.photos.iter().all(|p| p.image.width == 320 && p.fine.as_ref().unwrap().width == 640));
     let errors = |photos: &[Photo]| {
-        let model = reconstruct(photos, &[], &Silent).unwrap();
+        let model = reconstruct(photos, &[], 0, &Silent).unwrap();
         pose_errors(&model.cameras, &truth.cameras, truth.mean_depth)
     };
     let fine = errors(&truth.photos);

@@ -45,6 +45,7 @@ const SUPPORT_TAPS: i32 = 4;
 
 /// Visibility of a point in another view.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum Visibility {
     /// Outside its image, or the other view has no depth there.
     Outside,

@@ -33,6 +33,7 @@ pub fn colour_fit(rendered: &RgbImage, photo: &RgbImage) -> RgbImage {
 
 /// Depth against the truth, where both are known.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct DepthScore {
     /// Median of |z − z_true| / z_true at the scale of the cameras.
     pub median_relative: f64,

@@ -66,6 +66,7 @@ pub struct Rendered {
 
 /// Pose errors of one train view.
 #[derive(Clone, Debug, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct PoseScore {
     /// Frame file stem.
     pub frame: String,
@@ -79,6 +80,7 @@ pub struct PoseScore {
 
 /// Image and depth scores of one frame.
 #[derive(Clone, Debug, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct ImageScore {
     /// Frame file stem.
     pub frame: String,
@@ -100,6 +102,7 @@ pub struct ImageScore {
 
 /// How one phrase did in one frame.
 #[derive(Clone, Debug, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct MaskScore {
     /// Frame file stem.
     pub frame: String,
@@ -146,6 +149,7 @@ pub struct SplitSummary {
 
 /// One pair of train views.
 #[derive(Clone, Debug, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct PairScore {
     /// Frame file stems.
     pub frames: [String; 2],
@@ -157,6 +161,7 @@ pub struct PairScore {
 
 /// Relative poses of the train views.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct RelativeScore {
     /// All pairs of train views that the scene has.
     pub pairs: Vec<PairScore>,
@@ -214,6 +219,7 @@ impl OpticsOffset {
 
 /// Held-out frames from refined cameras.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct RefinedScore {
     /// What moved.
     pub views: Vec<RefinedView>,
@@ -227,6 +233,7 @@ pub struct RefinedScore {
 
 /// Everything `splatvk eval` reports.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct EvalReport {
     /// What each figure is, one line each.
     pub definitions: Vec<String>,
@@ -492,5 +499,5 @@ fn write_files(out: &Path, stem: &str, shown: &RgbImage, answers: &[(u32, QueryR
 }
 
 fn make_parent(path: &Path) -> Result<()> {
-    path.parent().map_or(Ok(()), |p| std::fs::create_dir_all(p).map_err(Error::io(p)))
+    path.parent().map_or(Ok(()), |p| std::fs::create_dir_all(p).map_err(Error::unwritable(p)))
 }

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 /// Which frames the pipeline may have seen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum Split {
     /// Photos the scene was made from.
     Train,

@@ -13,6 +13,7 @@ use std::path::Path;
 /// Which published protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum ProtocolKind {
     /// LERF-OVS: one JSON of polygons and boxes per frame.
     Lerf,
@@ -36,6 +37,7 @@ pub struct LabelledView {
 
 /// One prompt in one frame under one rule.
 #[derive(Clone, Debug, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct Score {
     /// Frame file stem.
     pub frame: String,
@@ -67,6 +69,7 @@ pub struct ProtocolSummary {
 
 /// The figures and what they mean.
 #[derive(Clone, Debug, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct ProtocolReport {
     /// Name of the protocol.
     pub protocol: ProtocolKind,
@@ -94,6 +97,7 @@ pub trait Protocol {
 }
 
 /// Score of each code for each prompt.
+#[non_exhaustive]
 pub struct CodeScores {
     /// [prompt][level][K]
     relevancy: Vec<Vec<Vec<f32>>>,

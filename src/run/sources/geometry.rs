@@ -43,8 +43,8 @@ impl SourceKind for GeometrySources {
 impl GraphBuilder {
     /// Photos with cameras from anywhere, and depth by stereo where a network has not given it.
     pub fn posed(&mut self, photos: Vec<Photo>, source: CameraOrigin) -> Result<PosedPhotos> {
-        let placed = self.graph.add(Cameras::new(photos, source)?, ());
-        let geometry = self.graph.add(DenseDepth { preset: self.preset }, (placed,));
+        let placed = self.graph.add(Cameras::new(photos, source, self.seed)?, ());
+        let geometry = self.graph.add(DenseDepth { preset: self.preset, seed: self.seed }, (placed,));
         Ok(PosedPhotos { placed, geometry })
     }
 }

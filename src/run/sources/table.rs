@@ -109,6 +109,8 @@ pub struct GraphBuilder {
     pub given_features: bool,
     /// Time against quality.
     pub preset: Preset,
+    /// Of everything random in cameras and depth.
+    pub seed: u64,
 }
 
 /// Photos with their geometry, as stages of a graph.

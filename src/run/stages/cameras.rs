@@ -46,12 +46,13 @@ pub enum KnownGeometry {
 pub struct Cameras {
     photos: Vec<Photo>,
     source: CameraOrigin,
+    seed: u64,
     settings: String,
 }
 
 impl Cameras {
-    /// Of these photos.
-    pub fn new(photos: Vec<Photo>, source: CameraOrigin) -> Result<Cameras> {
+    /// Of these photos; `seed` draws the samples of RANSAC.
+    pub fn new(photos: Vec<Photo>, source: CameraOrigin, seed: u64) -> Result<Cameras> {
         let source_name = match &source {
             CameraOrigin::Sfm => "sfm".to_owned(),
             CameraOrigin::Known(cameras) => format!("{cameras:?}"),
@@ -59,8 +60,8 @@ impl Cameras {
             CameraOrigin::GivenGeometry(geometry) => format!("{geometry:?}"),
         };
         let photos_name: Vec<String> = photos.iter().map(identity).collect();
-        let settings = format!("{source_name} {photos_name:?}");
-        Ok(Cameras { photos, source, settings })
+        let settings = format!("{source_name} {photos_name:?} {seed}");
+        Ok(Cameras { photos, source, seed, settings })
     }
 }
 
@@ -98,7 +99,7 @@ impl Stage for Cameras {
         let known = match &self.source {
             CameraOrigin::Network(model) => {
                 let (views, maps) = pairs::pointmaps(model, &photos, progress)?;
-                match pointmap::reconstruct(&views, &maps, progress) {
+                match pointmap::reconstruct(&views, &maps, self.seed, progress) {
                     Ok(geometry) => {
                         let method = format!("{} pointmaps", model.name);
                         return Ok(PlacedPhotos {
@@ -122,7 +123,7 @@ impl Stage for Cameras {
             CameraOrigin::Known(cameras) => Some(cameras.as_slice()),
         };
         let pose::SolvedCameras { photos, model, method } =
-            pose::place(photos, known, context.registry, progress)?;
+            pose::place(photos, known, context.registry, self.seed, progress)?;
         Ok(PlacedPhotos { photos, known: KnownGeometry::Sparse(model, method) })
     }
 }
@@ -131,6 +132,8 @@ impl Stage for Cameras {
 pub struct DenseDepth {
     /// Time against quality.
     pub preset: Preset,
+    /// Of the planes that stereo tries.
+    pub seed: u64,
 }
 
 impl Stage for DenseDepth {
@@ -140,7 +143,7 @@ impl Stage for DenseDepth {
     type Output = Geometry;
 
     fn settings(&self) -> String {
-        format!("{:?}", StereoOptions::preset(self.preset))
+        format!("{:?}", StereoOptions::preset(self.preset).seeded(self.seed))
     }
 
     fn codec() -> Option<Codec<Geometry>> {
@@ -151,7 +154,7 @@ impl Stage for DenseDepth {
         match placed.known.clone() {
             KnownGeometry::Complete(geometry) => Ok(geometry),
             KnownGeometry::Sparse(model, method) => {
-                let options = StereoOptions::preset(self.preset);
+                let options = StereoOptions::preset(self.preset).seeded(self.seed);
                 pose::dense(context.device, &placed.photos, model, method, &options, context.progress)
             }
         }

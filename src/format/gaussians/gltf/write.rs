@@ -30,7 +30,7 @@ pub fn write_glb(path: &Path, splats: &Splats) -> Result<()> {
         out.extend(kind.to_le_bytes());
         out.extend(chunk);
     }
-    std::fs::write(path, out).map_err(Error::io(path))
+    std::fs::write(path, out).map_err(Error::unwritable(path))
 }
 
 /// Writes one text file with the numbers inside it, in the order of the scene.
@@ -38,7 +38,7 @@ pub fn write_gltf(path: &Path, splats: &Splats) -> Result<()> {
     let (mut root, data) = document(splats);
     let uri = format!("data:application/octet-stream;base64,{}", STANDARD.encode(&data));
     root["buffers"] = json!([{ "byteLength": data.len(), "uri": uri }]);
-    std::fs::write(path, root.to_string()).map_err(Error::io(path))
+    std::fs::write(path, root.to_string()).map_err(Error::unwritable(path))
 }
 
 /// The document without its buffer, and the buffer.
