@@ -4,6 +4,8 @@
 // Labels index rows of `codes`, all levels one after the other; -1 has no influence, not even on the gradient's bits.
 // mode 0: upstream = weight[level] * sign(F - code);  mode 1 (lifting): upstream = code, so that the backward pass
 // returns the blending-weighted sum of codes of every splat.
+#extension GL_GOOGLE_include_directive : require
+#include "shared/layout.glsl"
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Labels { int labels[]; };  // [levels, H*W]
 layout(std430, binding = 1) readonly buffer Codes { float codes[]; };  // [K, width]
@@ -22,7 +24,7 @@ void main() {
         float weight = weights[level];
         float sum = 0.0;
         for (uint k = 0u; k < width; k++) {
-            uint at = (4u + level * width + k) * pixels + pixel;
+            uint at = (BASE_CHANNELS + level * width + k) * pixels + pixel;
             float slope = 0.0;
             if (label >= 0) {
                 float code = codes[uint(label) * width + k];

@@ -14,13 +14,13 @@ layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; };
 layout(std430, binding = 3) writeonly buffer Counts { uvec2 counts[]; };        // [tiles, 64] (evaluated, blended), zero at first
 layout(push_constant) uniform Push { uint width; uint height; uint tiles_x; };
 
-#define CHANNELS 4
+#define CHANNELS BASE_CHANNELS
 #include "shared/raster.glsl"
 
 void main() {
     uint lane = gl_SubgroupInvocationID;
     uint tile = gl_WorkGroupID.y * tiles_x + gl_WorkGroupID.x;
-    uvec2 corner = gl_WorkGroupID.xy * 8 + uvec2(lane % LANES_X, lane / LANES_X);
+    uvec2 corner = gl_WorkGroupID.xy * TILE + uvec2(lane % LANES_X, lane / LANES_X);
     vec2 origin = vec2(corner);
     uint first = tile_ranges[tile], last = tile_ranges[tile + 1];
     uint evaluated = 0, blended = 0;
@@ -49,5 +49,5 @@ void main() {
         }
         if (all_stopped(T)) break;
     }
-    counts[tile * 64 + lane] = uvec2(evaluated, blended);
+    counts[tile * (TILE * TILE) + lane] = uvec2(evaluated, blended);
 }

@@ -17,6 +17,7 @@ layout(push_constant) uniform Push { uint count; uint sh_stride; };
 
 #include "shared/camera.glsl"
 #include "shared/cutoffs.glsl"
+#include "shared/layout.glsl"
 #include "shared/sh.glsl"
 #include "shared/splat.glsl"
 
@@ -43,8 +44,8 @@ void main() {
     vec2 centre = camera_focal() * g.t.xy / g.t.z + camera_centre() - 0.5;
     vec3 power = vec3(-0.5 * LOG2_E, -LOG2_E, -0.5 * LOG2_E) * g.conic;
     // A splat that is not visible must fail every comparison downstream: far below any opacity.
-    projected[3 * i] = vec4(centre, power.xy);
-    projected[3 * i + 1] = vec4(power.z, visible ? log2_opacity : -1e4, 0.25 * LOG2_E * LOG2_E * g.conic_det, 0.0);
-    projected[3 * i + 2] = vec4(colour, g.t.z);
+    projected[PROJECTED_VECTORS * i] = vec4(centre, power.xy);
+    projected[PROJECTED_VECTORS * i + 1] = vec4(power.z, visible ? log2_opacity : -1e4, 0.25 * LOG2_E * LOG2_E * g.conic_det, 0.0);
+    projected[PROJECTED_VECTORS * i + 2] = vec4(colour, g.t.z);
     depth_pairs[i] = uvec2(visible ? floatBitsToUint(g.t.z) : 0xffffffffu, i); // positive floats sort like integers
 }

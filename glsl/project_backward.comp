@@ -18,7 +18,7 @@ layout(std430, binding = 8) writeonly buffer LogScalesGrad { float log_scales_gr
 layout(std430, binding = 9) writeonly buffer QuatsGrad { vec4 quats_grad[]; };
 layout(std430, binding = 10) writeonly buffer OpacityLogitsGrad { float opacity_logits_grad[]; };
 layout(std430, binding = 11) writeonly buffer ShGrad { float sh_grad[]; };
-layout(std430, binding = 12) writeonly buffer CameraParts { float camera_parts[]; };    // [10, PARTS]
+layout(std430, binding = 12) writeonly buffer CameraParts { float camera_parts[]; };    // [CAMERA_GRADIENTS, PARTS]
 layout(push_constant) uniform Push { uint count; uint sh_stride; };
 
 // Each thread walks every THREADS-th splat, so that few parts of the camera gradient are left to sum: room for 16
@@ -26,6 +26,7 @@ layout(push_constant) uniform Push { uint count; uint sh_stride; };
 const uint THREADS = 4096, PARTS = THREADS / 64 * 16;
 
 #include "shared/camera.glsl"
+#include "shared/layout.glsl"
 #include "shared/sh.glsl"
 #include "shared/splat.glsl"
 
@@ -101,8 +102,8 @@ void main() {
         vec3 mean = vec3(means[3 * i], means[3 * i + 1], means[3 * i + 2]);
         vec3 log_scale = vec3(log_scales[3 * i], log_scales[3 * i + 1], log_scales[3 * i + 2]);
         Geometry g = geometry_of(mean, log_scale, quats[i]);
-        float up[10]; // a splat that no pixel saw has zeros here, and gets zero gradients below
-        [[unroll]] for (int k = 0; k < 10; k++) up[k] = projected_grad[3 * i + k / 4][k % 4];
+        float up[MOMENTS + BASE_CHANNELS]; // a splat that no pixel saw has zeros here, and gets zero gradients below
+        [[unroll]] for (int k = 0; k < MOMENTS + BASE_CHANNELS; k++) up[k] = projected_grad[GRADIENT_VECTORS * i + k / 4][k % 4];
 
         float opacity = 1.0 / (1.0 + exp(min(-opacity_logits[i], 80.0)));
         opacity_logits_grad[i] = up[0] * (1.0 - opacity);
@@ -111,7 +112,7 @@ void main() {
         covariance_backward(g, vec3(-0.5 * up[3], -up[4], -0.5 * up[5]), by_b0, by_b1);
         mat3 m = mat3(g.rotation[0] * g.scale.x, g.rotation[1] * g.scale.y, g.rotation[2] * g.scale.z);
         vec3 by_j0 = to_camera_axes(m * by_b0), by_j1 = to_camera_axes(m * by_b1);
-        vec3 by_t = vec3(0.0, 0.0, up[9]);
+        vec3 by_t = vec3(0.0, 0.0, up[MOMENTS + 3]);
         vec4 by_k = vec4(0.0);
         axis_backward(0, g, -(g.conic.x * up[1] + g.conic.y * up[2]), by_j0, by_t, by_k);
         axis_backward(1, g, -(g.conic.z * up[2] + g.conic.y * up[1]), by_j1, by_t, by_k);
@@ -124,7 +125,7 @@ void main() {
         log_scales_grad[3 * i + 2] = by_log_scale.z;
         quats_grad[i] = quat_backward(g, mat3(by_m[0] * g.scale.x, by_m[1] * g.scale.y, by_m[2] * g.scale.z));
 
-        vec3 by_mean_colour = colour_backward(i, mean, vec3(up[6], up[7], up[8]));
+        vec3 by_mean_colour = colour_backward(i, mean, vec3(up[MOMENTS], up[MOMENTS + 1], up[MOMENTS + 2]));
         vec3 by_mean = to_world_axes(by_t) + by_mean_colour;
         means_grad[3 * i] = by_mean.x;
         means_grad[3 * i + 1] = by_mean.y;
@@ -137,10 +138,10 @@ void main() {
             by_intrinsics += by_k;
         }
     }
-    float sums[10] = float[10](by_rho.x, by_rho.y, by_rho.z, by_theta.x, by_theta.y, by_theta.z,
+    float sums[CAMERA_GRADIENTS] = float[](by_rho.x, by_rho.y, by_rho.z, by_theta.x, by_theta.y, by_theta.z,
                                by_intrinsics.x, by_intrinsics.y, by_intrinsics.z, by_intrinsics.w);
     uint part = gl_WorkGroupID.x * 16 + gl_SubgroupID; // at most 16 subgroups of 4
-    [[unroll]] for (int k = 0; k < 10; k++) {
+    [[unroll]] for (int k = 0; k < CAMERA_GRADIENTS; k++) {
         float sum = subgroupAdd(sums[k]);
         if (gl_SubgroupInvocationID == 0) camera_parts[k * PARTS + part] = sum;
     }

@@ -7,12 +7,13 @@
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_vote : require
 #extension GL_KHR_shader_subgroup_shuffle : require
+#include "shared/layout.glsl"
 layout(local_size_x = SUBGROUP_SIZE) in;
 
 layout(std430, binding = 1) readonly buffer Projected { vec4 projected[]; };      // [N, 3], see project.comp
 layout(std430, binding = 2) readonly buffer TileRanges { uint tile_ranges[]; };   // [tiles + 1]
 layout(std430, binding = 3) readonly buffer TileSplats { uvec2 tile_splats[]; };  // [capacity] (splat, entry)
-#if CHANNELS != 4
+#if CHANNELS != BASE_CHANNELS
 layout(std430, binding = 4) readonly buffer Codes { vec4 codes[]; };              // [N, code_vectors]
 #endif
 layout(std430, binding = 5) writeonly buffer Planes { float planes[]; };          // [4 + d, H, W]
@@ -34,7 +35,7 @@ void main() {
     uint lane = gl_SubgroupInvocationID;
     uint tile_row = gl_WorkGroupID.y + first_row, bottom = top + rows;
     uint tile = (tile_row - list_row) * tiles_x + gl_WorkGroupID.x;
-    uvec2 corner = uvec2(gl_WorkGroupID.x, tile_row) * 8 + uvec2(lane % LANES_X, lane / LANES_X);
+    uvec2 corner = uvec2(gl_WorkGroupID.x, tile_row) * TILE + uvec2(lane % LANES_X, lane / LANES_X);
     vec2 origin = vec2(corner);
     uint first = tile_ranges[tile], last = tile_ranges[tile + 1];
 

@@ -160,9 +160,12 @@ fn constants_of_shaders_stand_in_one_place() {
 
 #[test]
 fn constants_are_what_the_sources_say() {
-    use shaders::shared::{cutoffs, plane_sweep, ssim, tiles};
-    assert_eq!((tiles::TILE, shaders::sort_sweep::TILE, shaders::decode::PIXELS), (8, 2048, 4));
+    use shaders::shared::{cutoffs, layout, plane_sweep, ssim};
+    assert_eq!((layout::TILE, shaders::sort_sweep::TILE, shaders::decode::PIXELS), (8, 2048, 4));
     assert_eq!(shaders::project_backward::PARTS, 1024);
+    assert_eq!((layout::BASE_CHANNELS, layout::PROJECTED_FLOATS, layout::CAMERA_GRADIENTS), (4, 12, 10));
+    // Moments and base channels fit their vectors, without one to spare.
+    assert_eq!((layout::MOMENTS + layout::BASE_CHANNELS + 3) / 4, layout::GRADIENT_VECTORS);
     assert_eq!(plane_sweep::VIEW_SHARES, [0.6, 0.3, 0.1, 0.0]);
     assert_eq!(ssim::WINDOW.len() as i32, 2 * ssim::HALF + 1);
     assert_eq!(cutoffs::ALPHA_MIN, 1.0 / 255.0);

@@ -3,9 +3,10 @@
 //
 // CHANNELS names a block of channels: 4 = RGB and depth, 7 / 12 / 20 = those and 3 / 8 / 16 features, 16 = sixteen
 // further features only. A block with room for more features than there are reads zeros for the rest.
+#include "shared/layout.glsl"
 #define BASE (CHANNELS != 16)
 #if BASE
-#define FEATURES (CHANNELS - 4)
+#define FEATURES (CHANNELS - BASE_CHANNELS)
 #else
 #define FEATURES CHANNELS
 #endif
@@ -13,10 +14,10 @@
 
 // Which pixels of the tile a lane owns: column lane % LANES_X (+ LANES_X per column step), row lane / LANES_X
 // (+ LANES_Y per row step).
-#define LANES_X (SUBGROUP_SIZE < 8 ? SUBGROUP_SIZE : 8)
+#define LANES_X (SUBGROUP_SIZE < TILE ? SUBGROUP_SIZE : TILE)
 #define LANES_Y (SUBGROUP_SIZE / LANES_X)
-#define COLUMNS (8 / LANES_X)
-#define ROWS (8 / LANES_Y)
+#define COLUMNS (TILE / LANES_X)
+#define ROWS (TILE / LANES_Y)
 #define PIXELS (COLUMNS * ROWS)
 
 #include "shared/cutoffs.glsl"
@@ -26,7 +27,7 @@ float own_u, own_v, own_a, own_b, own_c, own_log2_opacity;
 float own_value[CHANNELS];
 
 void load_splat(uint splat, bool valid) {
-    vec4 p = projected[3 * splat], q = projected[3 * splat + 1];
+    vec4 p = projected[PROJECTED_VECTORS * splat], q = projected[PROJECTED_VECTORS * splat + 1];
     own_u = p.x;
     own_v = p.y;
     own_a = p.z;
@@ -34,8 +35,8 @@ void load_splat(uint splat, bool valid) {
     own_c = q.x;
     own_log2_opacity = valid ? q.y : -1e4;
 #if BASE
-    vec4 r = projected[3 * splat + 2];
-    [[unroll]] for (int k = 0; k < 4; k++) own_value[k] = r[k];
+    vec4 r = projected[PROJECTED_VECTORS * splat + 2];
+    [[unroll]] for (int k = 0; k < BASE_CHANNELS; k++) own_value[k] = r[k];
 #endif
 #if FEATURES > 0
     [[unroll]] for (int k = 0; k < FEATURE_VECTORS; k++) {

@@ -3,12 +3,13 @@
 // alpha is linear in the channels. Equations and twin: pass::raster_backward.
 //
 // BY_ENTRY 0: one atomic addition per value, tile and splat. 1: stored per entry for gradient_sum.comp, same bits every run.
+#include "shared/layout.glsl"
 layout(local_size_x = SUBGROUP_SIZE) in;
 
 layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };      // [N, 3], see project.comp
 layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; };   // [tiles + 1]
 layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; };  // [capacity] (splat, entry)
-#if CHANNELS != 4
+#if CHANNELS != BASE_CHANNELS
 layout(std430, binding = 3) readonly buffer Codes { vec4 codes[]; };              // [N, code_vectors]
 #if BY_ENTRY
 layout(std430, binding = 4) writeonly buffer CodeEntries { vec4 code_entries[]; }; // [entries, FEATURE_VECTORS] of this block
@@ -24,7 +25,7 @@ layout(std430, binding = 7) readonly buffer Transmittance { float transmittances
 #if BY_ENTRY
 layout(std430, binding = 8) buffer SplatEntries { vec4 splat_entries[]; };            // [entries, 3] as projected_grad
 #else
-layout(std430, binding = 8) buffer ProjectedGrad { ATOMIC_FLOAT projected_grad[]; };  // [N, 12], added to
+layout(std430, binding = 8) buffer ProjectedGrad { ATOMIC_FLOAT projected_grad[]; };  // [N, GRADIENT_FLOATS], added to
 #endif
 // As in raster_forward.comp; coupling 0 keeps the features' part of the loss from moving the geometry, 1 lets it.
 layout(push_constant) uniform Push {
@@ -34,7 +35,7 @@ layout(push_constant) uniform Push {
 };
 
 #include "shared/raster.glsl"
-#define VALUES (6 + CHANNELS)
+#define VALUES (MOMENTS + CHANNELS)
 #define HALF (SUBGROUP_SIZE / 2)
 
 float T[PIXELS], behind[PIXELS], upstream[CHANNELS * PIXELS];
@@ -71,9 +72,9 @@ void evaluate(uint i, vec2 origin) {
             own[k] = fma(felt, upstream[channel * PIXELS + k], own[k]);
             sum = fma(weight[k], upstream[channel * PIXELS + k], sum);
         }
-        part[6 + channel] = sum;
+        part[MOMENTS + channel] = sum;
     }
-    [[unroll]] for (int k = 0; k < 6; k++) part[k] = 0.0;
+    [[unroll]] for (int k = 0; k < MOMENTS; k++) part[k] = 0.0;
     [[unroll]] for (int n = 0; n < COLUMNS; n++) {
         float dx = dx0 - float(n * LANES_X);
         float m0 = 0.0, m1 = 0.0, m2 = 0.0;
@@ -100,12 +101,12 @@ void evaluate(uint i, vec2 origin) {
 void store_gradients(uvec2 item, float sums[VALUES]) {
 #if BY_ENTRY
 #if BASE
-    splat_entries[3 * item.y] = vec4(sums[0], sums[1], sums[2], sums[3]);
-    splat_entries[3 * item.y + 1] = vec4(sums[4], sums[5], sums[6], sums[7]);
-    splat_entries[3 * item.y + 2] = vec4(sums[8], sums[9], 0.0, 0.0);
+    splat_entries[GRADIENT_VECTORS * item.y] = vec4(sums[0], sums[1], sums[2], sums[3]);
+    splat_entries[GRADIENT_VECTORS * item.y + 1] = vec4(sums[4], sums[5], sums[6], sums[7]);
+    splat_entries[GRADIENT_VECTORS * item.y + 2] = vec4(sums[8], sums[9], 0.0, 0.0);
 #else
-    splat_entries[3 * item.y] += vec4(sums[0], sums[1], sums[2], sums[3]);
-    splat_entries[3 * item.y + 1] += vec4(sums[4], sums[5], 0.0, 0.0);
+    splat_entries[GRADIENT_VECTORS * item.y] += vec4(sums[0], sums[1], sums[2], sums[3]);
+    splat_entries[GRADIENT_VECTORS * item.y + 1] += vec4(sums[4], sums[5], 0.0, 0.0);
 #endif
 #if FEATURES > 0
     [[unroll]] for (int k = 0; k < FEATURE_VECTORS; k++) {
@@ -116,7 +117,7 @@ void store_gradients(uvec2 item, float sums[VALUES]) {
     }
 #endif
 #else
-    [[unroll]] for (int n = 0; n < VALUES - FEATURES; n++) ATOMIC_ADD(projected_grad[12 * item.x + n], sums[n]);
+    [[unroll]] for (int n = 0; n < VALUES - FEATURES; n++) ATOMIC_ADD(projected_grad[GRADIENT_FLOATS * item.x + n], sums[n]);
 #if FEATURES > 0
     [[unroll]] for (int n = 0; n < FEATURES; n++) {
         float sum = n < features ? sums[VALUES - FEATURES + n] : 0.0;
@@ -130,7 +131,7 @@ void main() {
     uint lane = gl_SubgroupInvocationID;
     uint tile_row = gl_WorkGroupID.y + first_row, bottom = top + rows;
     uint tile = (tile_row - list_row) * tiles_x + gl_WorkGroupID.x;
-    uvec2 corner = uvec2(gl_WorkGroupID.x, tile_row) * 8 + uvec2(lane % LANES_X, lane / LANES_X);
+    uvec2 corner = uvec2(gl_WorkGroupID.x, tile_row) * TILE + uvec2(lane % LANES_X, lane / LANES_X);
     vec2 origin = vec2(corner);
     uint first = tile_ranges[tile], last = tile_ranges[tile + 1], pixels = width * rows;
 

@@ -2,7 +2,7 @@
 // log2(o e^p) reaches log2(1/255). The band of a row cuts a convex piece out of the ellipse, so the tiles of a row are an
 // interval, whose ends follow from two chords. `precise`: counting and writing must take exactly the same decisions.
 // Needs `projected`.
-const int TILE = 8;
+#include "shared/layout.glsl"
 #include "shared/cutoffs.glsl"
 // The raster pass evaluates the same power in another order; 1e-3 covers the difference of up to 1e4 in size.
 const float MARGIN = 1e-3;
@@ -17,7 +17,7 @@ struct Ellipse { // A' dx² + B' dx dy + C' dy² + k = 0, all coefficients but k
 
 // Only rows of tiles from `begin` up to `end` count.
 Ellipse ellipse_of(uint splat, uint begin, uint end) {
-    vec4 p = projected[3 * splat], q = projected[3 * splat + 1];
+    vec4 p = projected[PROJECTED_VECTORS * splat], q = projected[PROJECTED_VECTORS * splat + 1];
     precise float inv_a = 1.0 / p.z, det = q.z;
     precise float k = max(q.y - LOG2_ALPHA_MIN + MARGIN, 0.0) * p.z;
     precise float half_height = sqrt(max(-k / det, 0.0)), half_width = sqrt(max(-k * inv_a * q.x / det, 0.0));

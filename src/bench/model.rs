@@ -1,8 +1,10 @@
 //! How much work each pass has to do: bytes that must move at least once and arithmetic on pairs that are blended.
 //! What an implementation does beyond that (pairs evaluated in vain, lists read twice) is what the roofline shows up.
 //!
-//! Floats per splat: 11 of geometry and opacity, 3 per SH coefficient, d features; a projected splat has 12 floats.
+//! Floats per splat: 11 of geometry and opacity, 3 per SH coefficient, d features; of a projected splat PROJECTED_FLOATS.
 //! Operations are counted from the formulas of the passes, a fused multiply-add as two, an exponential as one.
+use crate::gpu::shaders;
+
 /// What the device can do at most.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Roofline {
@@ -39,7 +41,7 @@ pub struct PassWork {
 /// Geometry and opacity of a splat, bytes.
 const GEOMETRY: f64 = 44.0;
 /// A projected splat, bytes.
-const PROJECTED: f64 = 48.0;
+const PROJECTED: f64 = 4.0 * shaders::shared::layout::PROJECTED_FLOATS as f64;
 /// (key, value), bytes.
 const PAIR: f64 = 8.0;
 /// 32-bit keys, eight bits at a time.

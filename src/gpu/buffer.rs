@@ -14,7 +14,7 @@ use std::sync::{Arc, Mutex, OnceLock};
 ///
 /// The bindings of a shader ask for the element that its source declares: the scalar of scalars, vectors and arrays of
 /// them, so that a `vec4[]` and a `float[]` are both `Buffer<f32>` and their lengths count floats; the generated structure
-/// of structures. [`Buffer::cast`] is for memory that is declared in two ways.
+/// of structures. [`Buffer::cast`] is for memory that is declared in two ways. A plain `Buffer` is one of words, `u32`.
 ///
 /// On memory that is not mapped, what the host writes waits for the next submission and goes along with it, and what a
 /// recording has downloaded ([`super::Recorder::download`]) is read without one; other reads submit and wait. Do not write

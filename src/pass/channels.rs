@@ -1,7 +1,8 @@
 //! Blocks of channels: what one launch of the raster kernels blends.
+use crate::gpu::shaders;
 
 /// RGB and depth come before the d features in every stack of planes.
-pub const BASE_CHANNELS: usize = 4;
+pub const BASE_CHANNELS: usize = shaders::shared::layout::BASE_CHANNELS as usize;
 
 /// A block of channels that one launch of the raster kernels handles: their cost per pixel and splat has a fixed part,
 /// but their registers grow with the channels, so 48 features go in three launches of at most 16.
@@ -32,7 +33,7 @@ const BLOCK_FEATURES: u32 = 16;
 pub(super) fn blocks(dim: u32) -> Vec<Block> {
     let features = dim.min(BLOCK_FEATURES);
     let channels = match features {
-        0 => 4,
+        0 => BASE_CHANNELS as u32,
         1..=3 => 7,
         4..=8 => 12,
         _ => 20,
@@ -65,7 +66,7 @@ mod tests {
                 let base = if k == 0 { BASE_CHANNELS as u32 } else { 0 };
                 assert!(block.features + base <= block.channels);
                 assert_eq!(block.first_vector * 4, next);
-                assert_eq!(block.first_plane + base, 4 + next);
+                assert_eq!(block.first_plane + base, BASE_CHANNELS as u32 + next);
                 next += block.features;
             }
         }

@@ -3,7 +3,7 @@ use super::bands::Bands;
 use super::channels::{Block, blocks};
 use super::tile_lists::{TILE, TileLists};
 use crate::Result;
-use crate::gpu::{Buffer, Device};
+use crate::gpu::{Buffer, Device, shaders};
 use std::ops::Range;
 
 /// Buffers of one frame; pixel planes are planar [C, H, W], f32, with H the rows of one band where there are several.
@@ -65,7 +65,11 @@ impl FrameBuffers {
 }
 
 /// Floats per splat in the gradient buffer: moments, RGB and z in whole vectors.
-pub(super) const GRADIENT_FLOATS: usize = 12;
+pub(super) const GRADIENT_FLOATS: usize = shaders::shared::layout::GRADIENT_FLOATS as usize;
+/// Floats per splat on the screen.
+pub(super) const PROJECTED_FLOATS: usize = shaders::shared::layout::PROJECTED_FLOATS as usize;
+/// Gradient by the camera: twist (ρ, θ), fx, fy, cx, cy.
+pub(super) const CAMERA_GRADIENTS: usize = shaders::shared::layout::CAMERA_GRADIENTS as usize;
 
 /// Bytes per entry of the widest buffer that [`Summation::Entries`] needs: the features of one launch.
 pub(super) fn entry_bytes(feature_dim: usize) -> usize {

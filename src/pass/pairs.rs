@@ -1,5 +1,6 @@
 //! Pixel–splat pairs: how many the raster kernels evaluate, and how many of those change a pixel.
 use super::rasterizer::Rasterizer;
+use super::tile_lists::TILE;
 use crate::Result;
 use crate::gpu::{Device, Recorder, shaders};
 
@@ -7,7 +8,7 @@ use crate::gpu::{Device, Recorder, shaders};
 pub fn count(device: &Device, raster: &Rasterizer) -> Result<[f64; 2]> {
     let frame = raster.frame();
     let tiles = frame.tiles();
-    let counts = device.buffer::<u32>("pair counts", 2 * 64 * (tiles[0] * tiles[1]) as usize)?;
+    let counts = device.buffer::<u32>("pair counts", 2 * (TILE * TILE * tiles[0] * tiles[1]) as usize)?;
     let call = shaders::count_pairs::call(
         &shaders::count_pairs::Bindings {
             projected: &frame.projected,

@@ -15,7 +15,7 @@ use super::raster_forward::{Cutoffs, TwinScene, channels_of, push, walk};
 use crate::gpu::{Buffer, Recorder, shaders};
 
 /// Moments of one splat in the gradient buffer; RGB and z follow.
-pub const MOMENTS: usize = 6;
+pub const MOMENTS: usize = shaders::shared::layout::MOMENTS as usize;
 /// Clears the sums that [`record`] adds to.
 pub(super) fn record_clear(rec: &mut Recorder, frame: &FrameBuffers) {
     rec.fill(&frame.projected_grad, 0);

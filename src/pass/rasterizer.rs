@@ -35,7 +35,9 @@
 //! [`Rasterizer::record_band_backward`], and at the end [`Rasterizer::record_gradients`]. An image that fits is one band.
 use super::bands::{Band, Bands};
 use super::channels::BASE_CHANNELS;
-use super::frame::{GRADIENT_FLOATS, GradientEntries, Summation, Tiles, entry_bytes};
+use super::frame::{
+    CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, PROJECTED_FLOATS, Summation, Tiles, entry_bytes,
+};
 use super::sort::Sort;
 use super::tile_lists::{self, Grouping, TILE, TileLists};
 use super::view::View;
@@ -128,12 +130,14 @@ impl Rasterizer {
             planes: device.buffer::<f32>("planes", planes * pixels)?,
             transmittance: device.buffer::<f32>("transmittance", pixels)?,
             planes_grad: device.buffer::<f32>("planes_grad", (planes + 1) * pixels)?,
-            camera_grad: device.buffer::<f32>("camera_grad", 10)?,
+            camera_grad: device.buffer::<f32>("camera_grad", CAMERA_GRADIENTS)?,
             status: device.buffer::<u32>("status", 2)?,
-            projected: device.buffer::<f32>("projected", 12 * splats)?,
+            projected: device.buffer::<f32>("projected", PROJECTED_FLOATS * splats)?,
             projected_grad: device.buffer::<f32>("projected_grad", GRADIENT_FLOATS * splats)?,
-            camera_parts: device
-                .buffer::<f32>("camera_parts", 10 * shaders::project_backward::PARTS as usize)?,
+            camera_parts: device.buffer::<f32>(
+                "camera_parts",
+                CAMERA_GRADIENTS * shaders::project_backward::PARTS as usize,
+            )?,
             summation: ways.summation,
             gradient_entries: GradientEntries::default(),
             codes: device.buffer::<f32>("codes", (stride * splats).max(4))?,
