@@ -1,6 +1,6 @@
 #version 450
 // Code per pixel: k* = argmax_k F.c_k, ties to the lowest k. -1 where alpha < VOID_ALPHA,
-// and where |F| < SPOKEN_SHARE alpha: splats without features are what the pixel shows.
+// and where |F| < MIN_FEATURE_SHARE alpha: splats without features are what the pixel shows.
 // Twin: pass::decode::decode_pixels.
 // variants: DIM=4,8,16,32
 #extension GL_EXT_control_flow_attributes : require
@@ -10,7 +10,7 @@ const float VOID_ALPHA = 0.5;
 // Pixels whose feature is shorter than this share of their alpha have no code: surfaces continued beyond the photos carry no
 // features, and a blend of nothing has no code. Splat features are unit vectors, so |F| is the alpha they contribute, less
 // what differing codes cancel (sqrt(1/2) where two meet); a quarter separates that from stray contributions.
-const float SPOKEN_SHARE = 0.25;
+const float MIN_FEATURE_SHARE = 0.25;
 #define PIXELS 4u
 #define QUADS (DIM / 4)
 layout(local_size_x = 64) in;
@@ -65,7 +65,7 @@ void main() {
         float norm = sqrt(norm2);
         if (pixel < pixels) {
             float alpha = 1.0 - transmittance[pixel];
-            bool shown = alpha >= VOID_ALPHA && norm >= SPOKEN_SHARE * alpha;
+            bool shown = alpha >= VOID_ALPHA && norm >= MIN_FEATURE_SHARE * alpha;
             decoded[pixel] = shown ? chosen[j] : -1;
         }
     }

@@ -6,7 +6,7 @@ use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions};
 use splatvk::gpu::{Device, Options, Recorder, TestDevice, test_device};
 use splatvk::pass::Summation;
 use splatvk::pass::rasterizer::Rasterizer;
-use splatvk::pass::{Frame, Renderer, SplatBuffers, Ways, seeded};
+use splatvk::pass::{DeviceChoices, RenderedFrame, Renderer, SplatBuffers, seeded};
 use splatvk::progress::Silent;
 use splatvk::query::{QueryOptions, TextQuery, answer};
 use splatvk::run::view::Viewer;
@@ -29,7 +29,7 @@ fn in_bands(
 ) -> (Vec<f32>, GpuGradients, usize) {
     let params = SplatBuffers::upload(device, &scene.splats, &scene.features, scene.dim).unwrap();
     let [width, height] = scene.view.size;
-    let ways = Ways { summation, ..Ways::of(device) };
+    let ways = DeviceChoices { summation, ..DeviceChoices::of(device) };
     let mut raster = Rasterizer::with(device, scene.splats.len(), scene.dim, width, height, ways).unwrap();
     raster.set_view(&scene.view).unwrap();
     let pixels = scene.pixels();
@@ -129,7 +129,7 @@ fn an_image_too_large_for_the_device_is_rendered_in_bands() {
     // 700,000 pixels: two bands at 128 MiB.
     let (splats, camera) = seeded::benchmark(2000, 1000, 700, 0, 3);
     let features = seeded::features(2000, 48, 1);
-    let frame = |mib: u64| -> Frame {
+    let frame = |mib: u64| -> RenderedFrame {
         let device = limited(mib * MIB, false);
         Renderer::new(&device, &splats, &features, 48).unwrap().render(&camera).unwrap()
     };

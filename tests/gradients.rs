@@ -2,7 +2,7 @@
 mod support;
 use splatvk::gpu::{Options, TestDevice, test_device};
 use splatvk::pass::close::Tolerance;
-use splatvk::pass::{FeatureMode, Summation, Ways};
+use splatvk::pass::{DeviceChoices, FeatureMode, Summation};
 use support::{GpuGradients, Scene, assert_close};
 
 /// Relative 1e-3 by class in the L2 sense (docs/method.md#tolerances; measured 4e-7 to 4e-6). Single elements are sums
@@ -46,7 +46,7 @@ fn assert_gradients(scene: &Scene, actual: &GpuGradients, seed: u64) {
 #[test]
 fn random_scenes_match_the_twin() {
     let device = test_device();
-    let by = |summation| Ways { summation, ..Ways::of(&device) };
+    let by = |summation| DeviceChoices { summation, ..DeviceChoices::of(&device) };
     let (atomics, entries) = (by(Summation::Atomics), by(Summation::Entries));
     for (n, sh_degree, dim) in [(1, 3, 3), (10, 3, 0), (100, 2, 8), (500, 1, 16), (100, 0, 48)] {
         let scene = Scene::small(n, sh_degree, dim, 60 + n as u64);
@@ -136,7 +136,7 @@ fn without_float_atomics_the_gradients_are_the_same() {
     assert!(!device.info().float_atomics);
     let scene = Scene::small(100, 1, 3, 14);
     let upstream = scene.upstream(14);
-    let ways = Ways { summation: Summation::Atomics, ..Ways::of(&device) };
+    let ways = DeviceChoices { summation: Summation::Atomics, ..DeviceChoices::of(&device) };
     assert_gradients(&scene, &scene.gradients_by(&device, ways, &upstream), 14);
 }
 

@@ -5,7 +5,7 @@ use splatvk::gpu::{Recorder, test_device};
 use splatvk::pass::channels::BASE_CHANNELS;
 use splatvk::pass::seeded::{self, Random};
 use splatvk::pass::{
-    FeatureMode, Grouping, RasterOptions, Rasterizer, Renderer, SplatBuffers, View, Ways, bin,
+    DeviceChoices, FeatureMode, Grouping, RasterOptions, Rasterizer, Renderer, SplatBuffers, View, bin,
 };
 use splatvk::scene::{Pose, Splats};
 use support::{IMAGE, Scene, assert_close, assert_images, rendered};
@@ -161,7 +161,7 @@ fn tile_lists_contain_the_twins() {
     let forward = scene.twin();
     let expected = bin::twin(&forward.projected, &forward.order, scene.view.size);
     let lists = |grouping| {
-        let ways = Ways { grouping, ..Ways::of(&device) };
+        let ways = DeviceChoices { grouping, ..DeviceChoices::of(&device) };
         let params = SplatBuffers::upload(&device, &scene.splats, &[], 0).unwrap();
         let [width, height] = scene.view.size;
         let mut raster = Rasterizer::with(&device, 500, 0, width, height, ways).unwrap();

@@ -28,7 +28,7 @@ const float SMOOTH_LIMIT = 0.03;
 const int SMOOTH_NEIGHBOURS = 8;
 
 // One source view as seen from a reference view.
-struct Source {
+struct SourceView {
     vec4 forward[3]; // rows of K_s [R | t]: (ray, 1/z) of the reference -> homogeneous source pixel, scaled by the inverse depth
     vec4 back[3];    // rows of the inverse mapping: (ray, 1/z) of the source -> homogeneous reference pixel
     vec4 centre;     // source camera centre in the reference frame; w unused
@@ -55,7 +55,7 @@ layout(push_constant) uniform Push {
 
 // Per pixel the luma of the 2 x 2 pixels from it to the right and below, 16 bits each: one load per bilinear sample.
 layout(std430, set = 0, binding = 0) readonly buffer Quads { uvec2 quads[]; };
-layout(std430, set = 0, binding = 1) readonly buffer Sources { Source source_views[]; };
+layout(std430, set = 0, binding = 1) readonly buffer Sources { SourceView source_views[]; };
 // pi and cost per pixel of all views.
 layout(std430, set = 0, binding = 2) buffer Planes { vec4 planes[]; };
 

@@ -5,7 +5,7 @@ use super::types::*;
 use crate::gpu::Buffer;
 use crate::gpu::external::{Sync, Target};
 use crate::gpu::vk::{self, Handle};
-use crate::pass::pack::{self, Encoding, Source};
+use crate::pass::pack::{self, Encoding, FrameChannel};
 use crate::run::live::LiveScene;
 use crate::scene::Camera;
 
@@ -52,7 +52,7 @@ struct RenderRequest {
 }
 
 enum RenderContent {
-    Frame(Source),
+    Frame(FrameChannel),
     Relevancy(String),
 }
 
@@ -157,14 +157,14 @@ unsafe fn checked_request(
         other => return bad_argument(format!("output {i}: there is no encoding {other}")),
     };
     let what = match o.channel {
-        0 => RenderContent::Frame(Source::Colour),
-        1 => RenderContent::Frame(Source::Alpha),
-        2 => RenderContent::Frame(Source::Depth),
+        0 => RenderContent::Frame(FrameChannel::Colour),
+        1 => RenderContent::Frame(FrameChannel::Alpha),
+        2 => RenderContent::Frame(FrameChannel::Depth),
         3 => match live.features(o.level as usize) {
             (_, 0) => {
                 return bad_argument(format!("output {i}: the scene has no features at level {}", o.level));
             }
-            (first, count) => RenderContent::Frame(Source::Features(first, count)),
+            (first, count) => RenderContent::Frame(FrameChannel::Features(first, count)),
         },
         // SAFETY: per the header.
         4 => match unsafe { boundary::text(o.text, "SvkOutput.text") }? {

@@ -12,19 +12,19 @@ pub(crate) struct Photos<'a> {
 }
 
 /// The same at half the size.
-pub(super) struct Halved {
+pub(super) struct HalfSizePhotos {
     images: Vec<RgbImage>,
     cameras: Vec<Camera>,
     depths: Option<Vec<DepthMap>>,
 }
 
-impl Halved {
-    pub(super) fn of(photos: &Photos) -> Halved {
+impl HalfSizePhotos {
+    pub(super) fn of(photos: &Photos) -> HalfSizePhotos {
         let Photos { images, cameras, depths } = *photos;
         let image = |i: &RgbImage| i.resized_by_area(half(i.width), half(i.height));
         let camera = |c: &Camera| c.resized(half(c.width as usize) as u32, half(c.height as usize) as u32);
         let depth = |d: &DepthMap| DepthMap { depth: sampled(&d.depth), confidence: sampled(&d.confidence) };
-        Halved {
+        HalfSizePhotos {
             images: images.iter().map(image).collect(),
             cameras: cameras.iter().map(camera).collect(),
             depths: depths.map(|all| all.iter().map(depth).collect()),

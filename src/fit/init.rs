@@ -2,14 +2,11 @@
 //! (docs/method.md#splats-from-points).
 use super::options::InitOptions;
 use crate::math::Random;
-use crate::scene::{PointCloud, Splats, sh_coefficients};
+use crate::scene::{PointCloud, SH_C0, Splats, sh_coefficients};
 use crate::{Error, Result};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::collections::HashMap;
-
-/// SH basis constant of degree 0: `rgb = 0.5 + C0·dc`.
-pub const SH_C0: f32 = 0.282_094_8;
 
 /// Makes one isotropic splat per (kept) point, SH degree 0.
 pub fn splats_from_points(points: &PointCloud, options: &InitOptions, seed: u64) -> Result<Splats> {

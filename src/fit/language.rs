@@ -7,6 +7,7 @@ use super::scale::SceneScale;
 use super::training::{self, Review, Trainer, Training};
 use super::views::Views;
 use crate::gpu::{Buffer, Device, Recorder};
+use crate::pass::channels::BASE_CHANNELS;
 use crate::pass::options::{FeatureMode, RasterOptions};
 use crate::pass::{codes, codes::Mode, sum};
 use crate::progress::Progress;
@@ -193,7 +194,7 @@ impl<'a> Run<'a> {
                 for (l, level) in levels.iter().enumerate() {
                     let Some(labels) = level.targets.get(view) else { continue };
                     let labels = frame.bands.cut_inner(band, &labels.data, -1);
-                    let first = (4 + l * width) * pixels;
+                    let first = (BASE_CHANNELS + l * width) * pixels;
                     let block = frame.planes.read_range(first..first + width * pixels)?;
                     let [right, valid] = decoded_right(level, &labels, &block);
                     counts[l][0] += right;

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 /// The parameter classes, in the order of the schedule's rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum ParameterClass {
     Means,
     LogScales,
     Quats,
@@ -19,8 +19,13 @@ pub(super) enum Kind {
 }
 
 /// Everything but the features.
-pub(super) const GEOMETRY_AND_COLOUR: [Kind; 5] =
-    [Kind::Means, Kind::LogScales, Kind::Quats, Kind::Opacity, Kind::Sh];
+pub(super) const GEOMETRY_AND_COLOUR: [ParameterClass; 5] = [
+    ParameterClass::Means,
+    ParameterClass::LogScales,
+    ParameterClass::Quats,
+    ParameterClass::Opacity,
+    ParameterClass::Sh,
+];
 
 /// Row of the schedule that the features use.
 const FEATURE_ROW: usize = 5;
@@ -79,11 +84,11 @@ impl Model {
         let moments = |kind| Moments::new(device, n * width(&values, kind));
         Ok(Model {
             moments: [
-                moments(Kind::Means)?,
-                moments(Kind::LogScales)?,
-                moments(Kind::Quats)?,
-                moments(Kind::Opacity)?,
-                moments(Kind::Sh)?,
+                moments(ParameterClass::Means)?,
+                moments(ParameterClass::LogScales)?,
+                moments(ParameterClass::Quats)?,
+                moments(ParameterClass::Opacity)?,
+                moments(ParameterClass::Sh)?,
             ],
             feature_moments: Moments::new(device, n * feature_dim)?,
             schedule: Schedule::new(device, FEATURE_ROW + 1)?,
@@ -127,7 +132,7 @@ impl Model {
                 slot: kind as u32,
                 count: self.count() * w,
                 stride: w as u32,
-                head: if kind == Kind::Sh { 3 } else { w as u32 },
+                head: if kind == ParameterClass::Sh { 3 } else { w as u32 },
             };
             let (values, gradients) = (buffer(&self.values, kind), buffer(&self.gradients, kind));
             self.schedule.record(rec, class, values, gradients, &self.moments[kind as usize], guard);
@@ -196,31 +201,31 @@ impl Model {
 }
 
 /// Values per splat of a class.
-fn width(splats: &SplatBuffers, kind: Kind) -> usize {
+fn width(splats: &SplatBuffers, kind: ParameterClass) -> usize {
     match kind {
-        Kind::Means | Kind::LogScales => 3,
-        Kind::Quats => 4,
-        Kind::Opacity => 1,
-        Kind::Sh => 3 * splats.sh_len(),
+        ParameterClass::Means | ParameterClass::LogScales => 3,
+        ParameterClass::Quats => 4,
+        ParameterClass::Opacity => 1,
+        ParameterClass::Sh => 3 * splats.sh_len(),
     }
 }
 
-fn buffer(splats: &SplatBuffers, kind: Kind) -> &Buffer<f32> {
+fn buffer(splats: &SplatBuffers, kind: ParameterClass) -> &Buffer<f32> {
     match kind {
-        Kind::Means => &splats.means,
-        Kind::LogScales => &splats.log_scales,
-        Kind::Quats => &splats.quats,
-        Kind::Opacity => &splats.opacity_logits,
-        Kind::Sh => &splats.sh,
+        ParameterClass::Means => &splats.means,
+        ParameterClass::LogScales => &splats.log_scales,
+        ParameterClass::Quats => &splats.quats,
+        ParameterClass::Opacity => &splats.opacity_logits,
+        ParameterClass::Sh => &splats.sh,
     }
 }
 
-fn buffer_mut(splats: &mut SplatBuffers, kind: Kind) -> &mut Buffer<f32> {
+fn buffer_mut(splats: &mut SplatBuffers, kind: ParameterClass) -> &mut Buffer<f32> {
     match kind {
-        Kind::Means => &mut splats.means,
-        Kind::LogScales => &mut splats.log_scales,
-        Kind::Quats => &mut splats.quats,
-        Kind::Opacity => &mut splats.opacity_logits,
-        Kind::Sh => &mut splats.sh,
+        ParameterClass::Means => &mut splats.means,
+        ParameterClass::LogScales => &mut splats.log_scales,
+        ParameterClass::Quats => &mut splats.quats,
+        ParameterClass::Opacity => &mut splats.opacity_logits,
+        ParameterClass::Sh => &mut splats.sh,
     }
 }

@@ -1,5 +1,5 @@
 //! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (docs/method.md#splats).
-use super::coarse::{Halved, Photos};
+use super::coarse::{HalfSizePhotos, Photos};
 use super::init::splats_from_points;
 use super::model::Model;
 use super::options::RgbOptions;
@@ -135,7 +135,7 @@ pub(crate) struct Run<'a> {
     scale: SceneScale,
     photos: Photos<'a>,
     /// What the first steps see instead of the photos.
-    half: Option<Halved>,
+    half: Option<HalfSizePhotos>,
     poses: Vec<PoseAdam>,
     /// Losses since the last report.
     recent: Vec<ImageLoss>,
@@ -164,8 +164,8 @@ impl<'a> Run<'a> {
         scale: SceneScale,
         options: &'a RgbOptions,
     ) -> Result<Self> {
-        let half = (coarse_steps(options) > 0).then(|| Halved::of(&photos));
-        let seen = half.as_ref().map_or(photos, Halved::photos);
+        let half = (coarse_steps(options) > 0).then(|| HalfSizePhotos::of(&photos));
+        let seen = half.as_ref().map_or(photos, HalfSizePhotos::photos);
         let raster =
             RasterOptions { sh_degree: 0, feature_mode: FeatureMode::Linear, features_move_geometry: true };
         let depths = used(seen.depths, options);
@@ -222,7 +222,7 @@ impl<'a> Run<'a> {
             Some(shown) => shown,
             None => t.views.render(self.last, &t.cameras[self.last], &t.model, &t.raster)?,
         };
-        let seen = self.half.as_ref().map_or(self.photos, Halved::photos);
+        let seen = self.half.as_ref().map_or(self.photos, HalfSizePhotos::photos);
         self.psnr[self.last] = Some(psnr(&shown, &seen.images[self.last]).min(MOST_PSNR));
         let known: Vec<f64> = self.psnr.iter().flatten().copied().collect();
         let n = self.recent.len().max(1) as f64;

@@ -21,7 +21,7 @@ pub(super) struct TrainView {
 }
 
 /// What views of one size share.
-pub(super) struct Stage {
+pub(super) struct SizeBuffers {
     pub(super) raster: Rasterizer,
     pub(super) loss: SsimL1,
     /// Per band Σ|x−y|, ΣSSIM, language loss, unused: [`SUMS`] floats.
@@ -31,12 +31,12 @@ pub(super) struct Stage {
 /// Loss sums of a band.
 pub(super) const SUMS: usize = 4;
 
-impl Stage {
-    fn new(device: &Device, capacity: usize, feature_dim: usize, size: [u32; 2]) -> Result<Stage> {
+impl SizeBuffers {
+    fn new(device: &Device, capacity: usize, feature_dim: usize, size: [u32; 2]) -> Result<SizeBuffers> {
         let raster = Rasterizer::new(device, capacity, feature_dim, size[0], size[1])?;
         let loss = SsimL1::new(device, &raster.frame().bands)?;
         let sums = device.buffer::<f32>("loss sums", SUMS * raster.frame().bands.count())?;
-        Ok(Stage { raster, loss, sums })
+        Ok(SizeBuffers { raster, loss, sums })
     }
 
     /// Where the sums of a band begin.
@@ -54,7 +54,7 @@ impl Stage {
 /// All views.
 pub(super) struct Views {
     pub(super) list: Vec<TrainView>,
-    pub(super) stages: Vec<Stage>,
+    pub(super) stages: Vec<SizeBuffers>,
     near: f64,
 }
 
@@ -73,11 +73,11 @@ impl Views {
         let mut views = Views { list: Vec::new(), stages: Vec::new(), near };
         for (i, image) in images.iter().enumerate() {
             let size = [image.width as u32, image.height as u32];
-            let same = |s: &Stage| [s.raster.frame().width, s.raster.frame().height] == size;
+            let same = |s: &SizeBuffers| [s.raster.frame().width, s.raster.frame().height] == size;
             let stage = match views.stages.iter().position(same) {
                 Some(found) => found,
                 None => {
-                    views.stages.push(Stage::new(device, capacity, feature_dim, size)?);
+                    views.stages.push(SizeBuffers::new(device, capacity, feature_dim, size)?);
                     views.stages.len() - 1
                 }
             };
@@ -102,12 +102,12 @@ impl Views {
     }
 
     /// The stage of a view.
-    pub(super) fn stage(&self, view: usize) -> &Stage {
+    pub(super) fn stage(&self, view: usize) -> &SizeBuffers {
         &self.stages[self.list[view].stage]
     }
 
     /// The same, to change it.
-    pub(super) fn stage_mut(&mut self, view: usize) -> &mut Stage {
+    pub(super) fn stage_mut(&mut self, view: usize) -> &mut SizeBuffers {
         &mut self.stages[self.list[view].stage]
     }
 

@@ -2,9 +2,6 @@
 use crate::{Error, Result};
 use std::path::Path;
 
-/// Constant of the first spherical harmonic, `1 / (2 √π)`: colour = 0.5 + SH_C0 · f_dc.
-pub const SH_C0: f32 = 0.282_094_8;
-
 /// Opacity of a raw parameter.
 pub(crate) fn sigmoid(v: f32) -> f32 {
     1.0 / (1.0 + (-v).exp())

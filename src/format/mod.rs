@@ -11,7 +11,7 @@ mod transform;
 pub mod transforms;
 mod workspace;
 
-pub use common::{SH_C0, create_folder, to_byte, write_json, write_whole_file};
+pub use common::{create_folder, to_byte, write_json, write_whole_file};
 pub(crate) use common::{logit, sigmoid};
 pub use gaussians::{gltf, ply, ply_packed, splat, spz};
 pub use workspace::{Workspace, remove_unfinished};

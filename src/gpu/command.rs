@@ -1,7 +1,7 @@
 //! Commands as plain data.
 use super::buffer::Buffer;
 use super::call::Call;
-use super::hazard::{self, Stage, Touch};
+use super::hazard::{self, AccessStage, BufferAccess};
 use super::module::Module;
 use crate::{Error, Result};
 
@@ -27,23 +27,26 @@ pub(super) struct Command {
 
 impl Command {
     /// Declared accesses; for a dispatch they come from the compiled module.
-    pub fn touches(&self) -> Vec<Touch> {
-        let touch = |b: &Buffer, stage, read, write| Touch { buffer: b.id(), stage, read, write };
+    pub fn touches(&self) -> Vec<BufferAccess> {
+        let touch = |b: &Buffer, stage, read, write| BufferAccess { buffer: b.id(), stage, read, write };
         match &self.op {
-            Op::Fill { buffer, .. } => vec![touch(buffer, Stage::Transfer, false, true)],
+            Op::Fill { buffer, .. } => vec![touch(buffer, AccessStage::Transfer, false, true)],
             Op::Copy { from, to, .. } => {
-                vec![touch(from, Stage::Transfer, true, false), touch(to, Stage::Transfer, false, true)]
+                vec![
+                    touch(from, AccessStage::Transfer, true, false),
+                    touch(to, AccessStage::Transfer, false, true),
+                ]
             }
             Op::Dispatch { module, call, groups } => {
                 let mut touches = Vec::with_capacity(call.buffers.len() + 1);
                 if let Groups::Indirect { args, .. } = groups {
-                    touches.push(touch(args, Stage::Indirect, true, false));
+                    touches.push(touch(args, AccessStage::Indirect, true, false));
                 }
                 for binding in module.bindings.iter().filter(|b| b.access.read || b.access.write) {
                     if let Some((_, buffer)) = call.buffers.iter().find(|(n, _)| *n == binding.number) {
                         touches.push(touch(
                             buffer,
-                            Stage::Compute,
+                            AccessStage::Compute,
                             binding.access.read,
                             binding.access.write,
                         ));
@@ -69,7 +72,7 @@ impl Command {
 }
 
 /// Refuses a command that touches one buffer twice with a write: the shader would see itself.
-pub(super) fn check_aliases(label: &str, commands: &[Command], touches: &[Vec<Touch>]) -> Result<()> {
+pub(super) fn check_aliases(label: &str, commands: &[Command], touches: &[Vec<BufferAccess>]) -> Result<()> {
     for (command, touches) in commands.iter().zip(touches) {
         if let Some(id) = hazard::aliased(touches) {
             return Err(Error::gpu(format!(

@@ -10,7 +10,7 @@ use std::collections::BTreeSet;
 
 /// What a physical device offers, before anything is enabled.
 #[derive(Clone, Copy, Default)]
-struct Offer {
+struct AvailableFeatures {
     base: vk::PhysicalDeviceFeatures,
     storage8: bool,
     float16: bool,
@@ -22,7 +22,7 @@ struct Offer {
     full_subgroups: bool,
 }
 
-fn offer(instance: &ash::Instance, candidate: &Candidate) -> Offer {
+fn available(instance: &ash::Instance, candidate: &Candidate) -> AvailableFeatures {
     let list = select::extensions(instance, candidate.physical);
     let core13 = candidate.properties.api_version >= vk::API_VERSION_1_3;
     let mut v11 = vk::PhysicalDeviceVulkan11Features::default();
@@ -43,7 +43,7 @@ fn offer(instance: &ash::Instance, candidate: &Candidate) -> Offer {
     // SAFETY: the chain holds only structures whose version or extension the device has.
     unsafe { instance.get_physical_device_features2(candidate.physical, &mut features) };
     let base = features.features;
-    Offer {
+    AvailableFeatures {
         base,
         storage8: v12.storage_buffer8_bit_access == vk::TRUE,
         float16: v12.shader_float16 == vk::TRUE,
@@ -64,7 +64,7 @@ pub(super) fn create(
     queue_family: u32,
     options: &Options,
 ) -> Result<(ash::Device, DeviceInfo)> {
-    let offer = offer(instance, candidate);
+    let offer = available(instance, candidate);
     if !offer.synchronization2 {
         return Err(Error::no_device(format!(
             "{} lacks synchronization2: update the driver",
@@ -131,7 +131,7 @@ pub(super) fn adopted(
     queue_family: u32,
     options: &Options,
 ) -> DeviceInfo {
-    let offer = Offer {
+    let offer = AvailableFeatures {
         base: enabled.base,
         storage8: enabled.storage8,
         float16: enabled.float16,
@@ -150,7 +150,7 @@ pub(super) fn adopted(
 fn describe(
     instance: &ash::Instance,
     candidate: &Candidate,
-    offer: &Offer,
+    offer: &AvailableFeatures,
     queue_family: u32,
     options: &Options,
     float_atomics: bool,
@@ -217,7 +217,7 @@ fn describe(
 }
 
 fn capabilities(
-    offer: &Offer,
+    offer: &AvailableFeatures,
     v11: &vk::PhysicalDeviceVulkan11Properties<'_>,
     float_atomics: bool,
 ) -> BTreeSet<Capability> {
@@ -255,7 +255,7 @@ pub(super) fn survey(
     if let Some(reason) = &candidate.unusable {
         return Err(reason.clone());
     }
-    let offer = offer(instance, candidate);
+    let offer = available(instance, candidate);
     let family = select::queue_family(instance, candidate.physical).ok_or("it has no compute queue")?;
     Ok(describe(instance, candidate, &offer, family, &Options::default(), offer.atomic_float_add))
 }

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 
 /// Where in the pipeline a command touches memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Stage {
+pub(super) enum AccessStage {
     Compute = 1,
     Transfer = 2,
     Indirect = 4,
@@ -17,16 +17,16 @@ pub(super) enum Stage {
 
 /// One command's access to one buffer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Touch {
+pub(super) struct BufferAccess {
     pub buffer: u64,
-    pub stage: Stage,
+    pub stage: AccessStage,
     pub read: bool,
     pub write: bool,
 }
 
-/// Stages that read and stages that write, as sets of [`Stage`] bits.
+/// Stages that read and stages that write, as sets of [`AccessStage`] bits.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Scope {
+pub(super) struct StageMasks {
     pub reads: u8,
     pub writes: u8,
 }
@@ -35,8 +35,8 @@ pub(super) struct Scope {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Barrier {
     pub buffer: u64,
-    pub from: Scope,
-    pub to: Scope,
+    pub from: StageMasks,
+    pub to: StageMasks,
 }
 
 /// One entry of the final list.
@@ -49,8 +49,8 @@ pub(super) enum Step {
 
 /// What [`derive`] remembers of a buffer.
 #[derive(Clone, Copy, Default)]
-struct Summary {
-    /// Stage of the last write.
+struct BufferState {
+    /// AccessStage of the last write.
     writer: u8,
     /// Stages that can already see the last write.
     seen_by: u8,
@@ -59,8 +59,8 @@ struct Summary {
 }
 
 /// The commands in order, with the barriers they need in between.
-pub(super) fn derive(commands: &[Vec<Touch>]) -> Vec<Step> {
-    let mut state: BTreeMap<u64, Summary> = BTreeMap::new();
+pub(super) fn derive(commands: &[Vec<BufferAccess>]) -> Vec<Step> {
+    let mut state: BTreeMap<u64, BufferState> = BTreeMap::new();
     let mut steps = Vec::new();
     for (index, touches) in commands.iter().enumerate() {
         let mut barriers: Vec<Barrier> = Vec::new();
@@ -78,25 +78,25 @@ pub(super) fn derive(commands: &[Vec<Touch>]) -> Vec<Step> {
     steps
 }
 
-fn advance(summary: &mut Summary, touch: &Touch) -> Option<Barrier> {
+fn advance(summary: &mut BufferState, touch: &BufferAccess) -> Option<Barrier> {
     let stage = touch.stage as u8;
-    let barrier = |from: Scope, to: Scope| Some(Barrier { buffer: touch.buffer, from, to });
+    let barrier = |from: StageMasks, to: StageMasks| Some(Barrier { buffer: touch.buffer, from, to });
     if touch.write {
-        let from = Scope { reads: summary.readers, writes: summary.writer };
-        let to = Scope { reads: if touch.read { stage } else { 0 }, writes: stage };
-        *summary = Summary { writer: stage, seen_by: 0, readers: 0 };
-        return if from == Scope::default() { None } else { barrier(from, to) };
+        let from = StageMasks { reads: summary.readers, writes: summary.writer };
+        let to = StageMasks { reads: if touch.read { stage } else { 0 }, writes: stage };
+        *summary = BufferState { writer: stage, seen_by: 0, readers: 0 };
+        return if from == StageMasks::default() { None } else { barrier(from, to) };
     }
     summary.readers |= stage;
     if summary.writer == 0 || summary.seen_by & stage != 0 {
         return None;
     }
     summary.seen_by |= stage;
-    barrier(Scope { reads: 0, writes: summary.writer }, Scope { reads: stage, writes: 0 })
+    barrier(StageMasks { reads: 0, writes: summary.writer }, StageMasks { reads: stage, writes: 0 })
 }
 
 /// One past access and how far barriers have carried it.
-struct Past {
+struct PastAccess {
     command: usize,
     stage: u8,
     write: bool,
@@ -105,7 +105,7 @@ struct Past {
     /// For a write: some barrier made it available, so that later barriers of the chain can make it visible.
     available: bool,
     /// For a write: stages whose reads / writes see it.
-    visible: Scope,
+    visible: StageMasks,
 }
 
 /// A pair of commands that needs a barrier and has none.
@@ -118,8 +118,8 @@ pub(super) struct Hazard {
 }
 
 /// All hazards of a final list; every command must appear exactly once and in order.
-pub(super) fn check(commands: &[Vec<Touch>], steps: &[Step]) -> Vec<Hazard> {
-    let mut past: BTreeMap<u64, Vec<Past>> = BTreeMap::new();
+pub(super) fn check(commands: &[Vec<BufferAccess>], steps: &[Step]) -> Vec<Hazard> {
+    let mut past: BTreeMap<u64, Vec<PastAccess>> = BTreeMap::new();
     let mut hazards = Vec::new();
     for step in steps {
         match step {
@@ -141,13 +141,13 @@ pub(super) fn check(commands: &[Vec<Touch>], steps: &[Step]) -> Vec<Hazard> {
                         // been reported.
                         earlier.clear();
                     }
-                    earlier.push(Past {
+                    earlier.push(PastAccess {
                         command: *index,
                         stage: touch.stage as u8,
                         write: touch.write,
                         ordered: 0,
                         available: false,
-                        visible: Scope::default(),
+                        visible: StageMasks::default(),
                     });
                 }
             }
@@ -156,7 +156,7 @@ pub(super) fn check(commands: &[Vec<Touch>], steps: &[Step]) -> Vec<Hazard> {
     hazards
 }
 
-fn carry(past: &mut Past, barrier: &Barrier) {
+fn carry(past: &mut PastAccess, barrier: &Barrier) {
     let from_stages = barrier.from.reads | barrier.from.writes;
     let to_stages = barrier.to.reads | barrier.to.writes;
     let direct = past.stage & from_stages != 0;
@@ -174,7 +174,7 @@ fn carry(past: &mut Past, barrier: &Barrier) {
     }
 }
 
-fn hazard(past: &Past, touch: &Touch, later: usize) -> Option<Hazard> {
+fn hazard(past: &PastAccess, touch: &BufferAccess, later: usize) -> Option<Hazard> {
     let stage = touch.stage as u8;
     let found = |kind| Some(Hazard { buffer: touch.buffer, earlier: past.command, later, kind });
     if past.write {
@@ -191,7 +191,7 @@ fn hazard(past: &Past, touch: &Touch, later: usize) -> Option<Hazard> {
 }
 
 /// A buffer that one command touches twice, at least once writing: the order of the two is undefined.
-pub(super) fn aliased(touches: &[Touch]) -> Option<u64> {
+pub(super) fn aliased(touches: &[BufferAccess]) -> Option<u64> {
     touches.iter().enumerate().find_map(|(i, a)| {
         touches[..i].iter().find(|b| b.buffer == a.buffer && (a.write || b.write)).map(|b| b.buffer)
     })
@@ -205,13 +205,13 @@ mod tests {
     const WRITE: (bool, bool) = (false, true);
     const BOTH: (bool, bool) = (true, true);
 
-    fn touch(buffer: u64, stage: Stage, (read, write): (bool, bool)) -> Touch {
-        Touch { buffer, stage, read, write }
+    fn touch(buffer: u64, stage: AccessStage, (read, write): (bool, bool)) -> BufferAccess {
+        BufferAccess { buffer, stage, read, write }
     }
 
     /// A step with every kind of dependency: fill, read-modify-write chain, gather, indirect, copy.
-    fn program() -> Vec<Vec<Touch>> {
-        use Stage::*;
+    fn program() -> Vec<Vec<BufferAccess>> {
+        use AccessStage::*;
         vec![
             vec![touch(1, Transfer, WRITE)],
             vec![touch(0, Compute, READ), touch(1, Compute, BOTH)],
@@ -254,10 +254,10 @@ mod tests {
     #[test]
     fn hazards_are_named() {
         let commands = vec![
-            vec![touch(7, Stage::Compute, BOTH)],
-            vec![touch(7, Stage::Compute, BOTH)],
-            vec![touch(7, Stage::Transfer, READ)],
-            vec![touch(7, Stage::Compute, WRITE)],
+            vec![touch(7, AccessStage::Compute, BOTH)],
+            vec![touch(7, AccessStage::Compute, BOTH)],
+            vec![touch(7, AccessStage::Transfer, READ)],
+            vec![touch(7, AccessStage::Compute, WRITE)],
         ];
         let bare: Vec<Step> = (0..4).map(Step::Command).collect();
         let kinds: Vec<_> = check(&commands, &bare).iter().map(|h| (h.earlier, h.later, h.kind)).collect();
@@ -274,14 +274,15 @@ mod tests {
 
     #[test]
     fn a_barrier_for_the_wrong_stage_or_access_does_not_count() {
-        let commands = vec![vec![touch(0, Stage::Compute, WRITE)], vec![touch(0, Stage::Compute, READ)]];
+        let commands =
+            vec![vec![touch(0, AccessStage::Compute, WRITE)], vec![touch(0, AccessStage::Compute, READ)]];
         let with = |from, to| {
             vec![Step::Command(0), Step::Barriers(vec![Barrier { buffer: 0, from, to }]), Step::Command(1)]
         };
-        let compute = Stage::Compute as u8;
-        let transfer = Stage::Transfer as u8;
-        let writes = |s| Scope { reads: 0, writes: s };
-        let reads = |s| Scope { reads: s, writes: 0 };
+        let compute = AccessStage::Compute as u8;
+        let transfer = AccessStage::Transfer as u8;
+        let writes = |s| StageMasks { reads: 0, writes: s };
+        let reads = |s| StageMasks { reads: s, writes: 0 };
         assert!(check(&commands, &with(writes(compute), reads(compute))).is_empty());
         assert_eq!(check(&commands, &with(writes(transfer), reads(compute))).len(), 1, "wrong source stage");
         assert_eq!(check(&commands, &with(writes(compute), reads(transfer))).len(), 1, "wrong target stage");
@@ -302,12 +303,13 @@ mod tests {
             (seed >> 33) % n
         };
         for _ in 0..300 {
-            let commands: Vec<Vec<Touch>> = (0..12)
+            let commands: Vec<Vec<BufferAccess>> = (0..12)
                 .map(|_| {
                     let first = next(4);
                     (0..=next(3))
                         .map(|i| {
-                            let stage = [Stage::Compute, Stage::Compute, Stage::Transfer][next(3) as usize];
+                            let stage = [AccessStage::Compute, AccessStage::Compute, AccessStage::Transfer]
+                                [next(3) as usize];
                             touch(first + i, stage, [READ, WRITE, BOTH][next(3) as usize])
                         })
                         .collect()
@@ -316,9 +318,9 @@ mod tests {
             assert_eq!(check(&commands, &derive(&commands)), []);
         }
         let shared = vec![
-            vec![touch(0, Stage::Compute, WRITE)],
-            vec![touch(0, Stage::Compute, READ)],
-            vec![touch(0, Stage::Compute, READ)],
+            vec![touch(0, AccessStage::Compute, WRITE)],
+            vec![touch(0, AccessStage::Compute, READ)],
+            vec![touch(0, AccessStage::Compute, READ)],
         ];
         let barriers = derive(&shared).iter().filter(|s| matches!(s, Step::Barriers(_))).count();
         assert_eq!(barriers, 1);
@@ -326,8 +328,8 @@ mod tests {
 
     #[test]
     fn aliasing_with_a_write_is_found() {
-        let read = touch(3, Stage::Compute, READ);
+        let read = touch(3, AccessStage::Compute, READ);
         assert_eq!(aliased(&[read, read]), None);
-        assert_eq!(aliased(&[read, touch(3, Stage::Compute, WRITE)]), Some(3));
+        assert_eq!(aliased(&[read, touch(3, AccessStage::Compute, WRITE)]), Some(3));
     }
 }

@@ -7,12 +7,12 @@ use ash::vk;
 /// Most bytes that wait at once; larger transfers go in pieces. 16 MiB take over a millisecond on PCIe 4 ×16, against some
 /// 20 µs for a submission.
 pub(super) const MOST: u64 = 16 << 20;
-/// Bytes of a new frame; a training step sends a few hundred.
+/// Bytes of a new batch; a training step sends a few hundred.
 const LEAST: u64 = 64 << 10;
 
 /// What the next submission does before its own commands.
 pub(super) enum Pending {
-    /// Bytes of the frame go to a buffer.
+    /// Bytes of the batch go to a buffer.
     Write { target: vk::Buffer, at: u64, from: u64, bytes: u64 },
     /// A buffer becomes zero.
     Clear { target: vk::Buffer },
@@ -28,7 +28,7 @@ impl Pending {
 
 /// Mapped memory with the command buffer that copies from or to it. Used again once its submission is done.
 #[derive(Default)]
-pub(super) struct Frame {
+pub(super) struct Batch {
     block: Option<Block>,
     capacity: u64,
     used: u64,
@@ -38,7 +38,7 @@ pub(super) struct Frame {
     pub fence: vk::Fence,
 }
 
-impl Frame {
+impl Batch {
     /// Makes room for `bytes` more; what waits already stays.
     pub fn reserve(&mut self, device: &ash::Device, heap: &Heap, bytes: u64) -> Result<()> {
         let needed = self.used + bytes;
@@ -53,7 +53,7 @@ impl Frame {
                 let used = self.used as usize;
                 to[..used].copy_from_slice(&from[..used]);
             }
-            // SAFETY: a frame is filled between submissions, so nothing uses its memory.
+            // SAFETY: a batch is filled between submissions, so nothing uses its memory.
             unsafe { heap.release(device, old) };
         }
         (self.block, self.capacity) = (Some(block), capacity);
@@ -89,7 +89,7 @@ impl Frame {
     /// Begins the command buffer anew.
     pub fn begin(&mut self, device: &ash::Device, queue_family: u32) -> Result<()> {
         let error = || vk_error("transfers");
-        // SAFETY: objects of one live device; nothing of this frame is pending.
+        // SAFETY: objects of one live device; nothing of this batch is pending.
         unsafe {
             if self.pool == vk::CommandPool::null() {
                 let info = vk::CommandPoolCreateInfo::default().queue_family_index(queue_family);
@@ -128,7 +128,7 @@ fn not_mapped() -> Error {
     Error::gpu("staging memory is not mapped")
 }
 
-/// A submitted frame's buffers: they must outlive it.
+/// A submitted batch's buffers: they must outlive it.
 struct Flight {
     number: u64,
     targets: Vec<vk::Buffer>,
@@ -140,40 +140,40 @@ struct Flight {
 #[derive(Default)]
 pub(super) struct Staging {
     /// Collects what the next submission takes along.
-    pub current: Frame,
-    spare: Vec<Frame>,
+    pub current: Batch,
+    spare: Vec<Batch>,
     flights: Vec<Flight>,
     launched: u64,
 }
 
 impl Staging {
-    /// A frame to use for something else; give it back with [`Staging::give`].
-    pub fn take(&mut self) -> Frame {
+    /// A batch to use for something else; give it back with [`Staging::give`].
+    pub fn take(&mut self) -> Batch {
         let largest = (0..self.spare.len()).max_by_key(|&i| self.spare[i].capacity);
         largest.map(|i| self.spare.swap_remove(i)).unwrap_or_default()
     }
 
-    pub fn give(&mut self, mut frame: Frame) {
-        frame.clear();
-        self.spare.push(frame);
+    pub fn give(&mut self, mut batch: Batch) {
+        batch.clear();
+        self.spare.push(batch);
     }
 
-    /// Takes the current frame, if anything waits in it, and remembers its targets under a number until [`Staging::land`].
-    pub fn launch(&mut self) -> Option<(u64, Frame)> {
+    /// Takes the current batch, if anything waits in it, and remembers its targets under a number until [`Staging::land`].
+    pub fn launch(&mut self) -> Option<(u64, Batch)> {
         if self.current.pending.is_empty() {
             return None;
         }
         let next = self.take();
-        let frame = std::mem::replace(&mut self.current, next);
+        let batch = std::mem::replace(&mut self.current, next);
         self.launched += 1;
-        let targets = frame.pending.iter().map(Pending::target).collect();
+        let targets = batch.pending.iter().map(Pending::target).collect();
         self.flights.push(Flight { number: self.launched, targets, dead: Vec::new() });
-        Some((self.launched, frame))
+        Some((self.launched, batch))
     }
 
-    /// Takes a launched frame back when the device is done with it.
-    pub fn land(&mut self, device: &ash::Device, heap: &Heap, number: u64, frame: Frame) {
-        self.give(frame);
+    /// Takes a launched batch back when the device is done with it.
+    pub fn land(&mut self, device: &ash::Device, heap: &Heap, number: u64, batch: Batch) {
+        self.give(batch);
         if let Some(at) = self.flights.iter().position(|f| f.number == number) {
             for block in self.flights.swap_remove(at).dead {
                 // SAFETY: the submission is done, and so are those before it.
@@ -182,7 +182,7 @@ impl Staging {
         }
     }
 
-    /// Destroys a buffer that nobody holds any more, or has it done when the last frame that writes to it lands.
+    /// Destroys a buffer that nobody holds any more, or has it done when the last batch that writes to it lands.
     pub fn bury(&mut self, device: &ash::Device, heap: &Heap, block: Block) {
         self.current.pending.retain(|p| p.target() != block.raw);
         let last =
@@ -196,6 +196,6 @@ impl Staging {
 
     pub fn close(&mut self, device: &ash::Device, heap: &Heap) {
         self.current.destroy(device, heap);
-        self.spare.iter_mut().for_each(|frame| frame.destroy(device, heap));
+        self.spare.iter_mut().for_each(|batch| batch.destroy(device, heap));
     }
 }

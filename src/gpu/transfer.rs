@@ -2,8 +2,8 @@
 use super::barrier;
 use super::device::Device;
 use super::error::{lock, vk_error};
-use super::hazard::{self, Stage, Step, Touch};
-use super::staging::{Frame, MOST, Pending, Staging};
+use super::hazard::{self, AccessStage, BufferAccess, Step};
+use super::staging::{Batch, MOST, Pending, Staging};
 use crate::Result;
 use ash::vk::{self, Handle};
 use std::ops::Range;
@@ -13,13 +13,13 @@ impl Device {
     pub(super) fn submit(&self, commands: vk::CommandBuffer, fence: vk::Fence, what: &str) -> Result<()> {
         let mut staging = lock(&self.0.staging);
         let flight = self.launch(&mut staging)?;
-        let first = flight.iter().map(|(_, frame)| frame.commands);
+        let first = flight.iter().map(|(_, batch)| batch.commands);
         let all: Vec<_> = first.chain([commands]).collect();
         let sent = self.queue_submit(&[vk::SubmitInfo::default().command_buffers(&all)], fence);
         drop(staging);
         let done = sent.map_err(vk_error(what)).and_then(|()| self.finish(fence, what));
-        if let Some((number, frame)) = flight {
-            lock(&self.0.staging).land(&self.0.device, &self.0.heap, number, frame);
+        if let Some((number, batch)) = flight {
+            lock(&self.0.staging).land(&self.0.device, &self.0.heap, number, batch);
         }
         done
     }
@@ -31,12 +31,12 @@ impl Device {
     }
 
     fn flush_locked(&self, staging: &mut Staging) -> Result<()> {
-        let Some((number, frame)) = self.launch(staging)? else { return Ok(()) };
-        let commands = [frame.commands];
+        let Some((number, batch)) = self.launch(staging)? else { return Ok(()) };
+        let commands = [batch.commands];
         let submit = vk::SubmitInfo::default().command_buffers(&commands);
-        let sent = self.queue_submit(&[submit], frame.fence).map_err(vk_error("upload"));
-        let done = sent.and_then(|()| self.finish(frame.fence, "upload"));
-        staging.land(&self.0.device, &self.0.heap, number, frame);
+        let sent = self.queue_submit(&[submit], batch.fence).map_err(vk_error("upload"));
+        let done = sent.and_then(|()| self.finish(batch.fence, "upload"));
+        staging.land(&self.0.device, &self.0.heap, number, batch);
         done
     }
 
@@ -74,15 +74,15 @@ impl Device {
         range: Range<u64>,
         seen: &mut dyn FnMut(&[u8]),
     ) -> Result<()> {
-        let mut frame = lock(&self.0.staging).take();
-        let done = self.read_through(&mut frame, source, range, seen);
-        lock(&self.0.staging).give(frame);
+        let mut batch = lock(&self.0.staging).take();
+        let done = self.read_through(&mut batch, source, range, seen);
+        lock(&self.0.staging).give(batch);
         done
     }
 
     fn read_through(
         &self,
-        frame: &mut Frame,
+        batch: &mut Batch,
         source: vk::Buffer,
         range: Range<u64>,
         seen: &mut dyn FnMut(&[u8]),
@@ -90,44 +90,44 @@ impl Device {
         let device = &self.0.device;
         for start in range.clone().step_by(MOST as usize) {
             let bytes = (range.end - start).min(MOST);
-            frame.reserve(device, &self.0.heap, bytes)?;
-            frame.begin(device, self.0.queue_family)?;
-            self.cmd_edge_barrier(frame.commands);
+            batch.reserve(device, &self.0.heap, bytes)?;
+            batch.begin(device, self.0.queue_family)?;
+            self.cmd_edge_barrier(batch.commands);
             let region = [vk::BufferCopy::default().src_offset(start).size(bytes)];
             // SAFETY: recording; the caller holds the source and has checked the range.
-            unsafe { device.cmd_copy_buffer(frame.commands, source, frame.raw(), &region) };
-            self.cmd_edge_barrier(frame.commands);
+            unsafe { device.cmd_copy_buffer(batch.commands, source, batch.raw(), &region) };
+            self.cmd_edge_barrier(batch.commands);
             // SAFETY: recording.
-            unsafe { device.end_command_buffer(frame.commands) }.map_err(vk_error("read back"))?;
-            self.submit(frame.commands, frame.fence, "read back")?;
-            seen(&frame.bytes()?[..bytes as usize]);
+            unsafe { device.end_command_buffer(batch.commands) }.map_err(vk_error("read back"))?;
+            self.submit(batch.commands, batch.fence, "read back")?;
+            seen(&batch.bytes()?[..bytes as usize]);
         }
         Ok(())
     }
 
-    /// Takes the frame in which transfers wait, if any do, its commands encoded.
-    fn launch(&self, staging: &mut Staging) -> Result<Option<(u64, Frame)>> {
-        let Some((number, mut frame)) = staging.launch() else { return Ok(None) };
-        match self.encode_transfers(&mut frame) {
-            Ok(()) => Ok(Some((number, frame))),
+    /// Takes the batch in which transfers wait, if any do, its commands encoded.
+    fn launch(&self, staging: &mut Staging) -> Result<Option<(u64, Batch)>> {
+        let Some((number, mut batch)) = staging.launch() else { return Ok(None) };
+        match self.encode_transfers(&mut batch) {
+            Ok(()) => Ok(Some((number, batch))),
             Err(e) => {
-                staging.land(&self.0.device, &self.0.heap, number, frame);
+                staging.land(&self.0.device, &self.0.heap, number, batch);
                 Err(e)
             }
         }
     }
 
-    fn encode_transfers(&self, frame: &mut Frame) -> Result<()> {
+    fn encode_transfers(&self, batch: &mut Batch) -> Result<()> {
         let device = &self.0.device;
-        frame.begin(device, self.0.queue_family)?;
-        let (out, staged) = (frame.commands, frame.raw());
-        let touch = |p: &Pending| Touch {
+        batch.begin(device, self.0.queue_family)?;
+        let (out, staged) = (batch.commands, batch.raw());
+        let touch = |p: &Pending| BufferAccess {
             buffer: p.target().as_raw(),
-            stage: Stage::Transfer,
+            stage: AccessStage::Transfer,
             read: false,
             write: true,
         };
-        let touches: Vec<_> = frame.pending.iter().map(|p| vec![touch(p)]).collect();
+        let touches: Vec<_> = batch.pending.iter().map(|p| vec![touch(p)]).collect();
         self.cmd_edge_barrier(out);
         for step in hazard::derive(&touches) {
             match step {
@@ -138,7 +138,7 @@ impl Device {
                 }
                 // SAFETY: recording; ranges were checked when the bytes were taken, and a dropped buffer leaves the list.
                 Step::Command(index) => unsafe {
-                    match frame.pending[index] {
+                    match batch.pending[index] {
                         Pending::Write { target, at, from, bytes } => {
                             let region = [vk::BufferCopy { src_offset: from, dst_offset: at, size: bytes }];
                             device.cmd_copy_buffer(out, staged, target, &region);

@@ -1,5 +1,5 @@
 //! Rendered features to code indices: `k*(p) = argmax_k F(p)·c_k`, brute force over the codes of a level.
-use crate::gpu::shaders::decode::{PIXELS, SPOKEN_SHARE, VOID_ALPHA, WORKGROUP};
+use crate::gpu::shaders::decode::{MIN_FEATURE_SHARE, PIXELS, VOID_ALPHA, WORKGROUP};
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 use crate::{Error, Result};
 
@@ -76,7 +76,7 @@ pub fn decode_pixels(codes: &[f32], dim: usize, features: &[f32], alpha: &[f32])
                 second = score;
             }
         }
-        let shown = alpha[p] >= VOID_ALPHA as f32 && norm >= SPOKEN_SHARE * f64::from(alpha[p]);
+        let shown = alpha[p] >= VOID_ALPHA as f32 && norm >= MIN_FEATURE_SHARE * f64::from(alpha[p]);
         if !shown || chosen < 0 {
             (if shown { chosen } else { -1 }, 0.0)
         } else {

@@ -35,8 +35,8 @@ pub mod view;
 
 pub use frame::{FrameBuffers, Summation};
 pub use options::{FeatureMode, RasterOptions};
-pub use rasterizer::{Rasterizer, Ways};
-pub use renderer::{Frame, Renderer};
+pub use rasterizer::{DeviceChoices, Rasterizer};
+pub use renderer::{RenderedFrame, Renderer};
 pub use splat_buffers::SplatBuffers;
 pub use tile_lists::Grouping;
 pub use view::View;

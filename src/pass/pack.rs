@@ -7,7 +7,7 @@ use crate::{Error, Result};
 
 /// What to take from a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Source {
+pub enum FrameChannel {
     /// R, G, B on the background (not clamped where the encoding holds more than [0, 1]), and alpha.
     Colour,
     /// Accumulated opacity.
@@ -31,26 +31,26 @@ pub enum Encoding {
     Unorm8x4,
 }
 
-impl Source {
+impl FrameChannel {
     fn index(self) -> u32 {
         match self {
-            Source::Colour => 0,
-            Source::Alpha => 1,
-            Source::Depth => 2,
-            Source::Features(..) => 3,
+            FrameChannel::Colour => 0,
+            FrameChannel::Alpha => 1,
+            FrameChannel::Depth => 2,
+            FrameChannel::Features(..) => 3,
         }
     }
     /// Values per pixel.
     pub fn channels(self) -> usize {
         match self {
-            Source::Colour => 4,
-            Source::Alpha | Source::Depth => 1,
-            Source::Features(_, count) => count,
+            FrameChannel::Colour => 4,
+            FrameChannel::Alpha | FrameChannel::Depth => 1,
+            FrameChannel::Features(_, count) => count,
         }
     }
     fn first(self) -> usize {
         match self {
-            Source::Features(first, _) => BASE_CHANNELS + first,
+            FrameChannel::Features(first, _) => BASE_CHANNELS + first,
             _ => 0,
         }
     }
@@ -84,7 +84,12 @@ impl Encoding {
 }
 
 /// A buffer of exactly [`Encoding::bytes`] for a part of an image.
-pub fn texels(device: &Device, pixels: usize, source: Source, encoding: Encoding) -> Result<Buffer<u32>> {
+pub fn texels(
+    device: &Device,
+    pixels: usize,
+    source: FrameChannel,
+    encoding: Encoding,
+) -> Result<Buffer<u32>> {
     device.buffer::<u32>("texels", encoding.bytes(source.channels(), pixels) / 4)
 }
 
@@ -93,12 +98,12 @@ pub fn pack(
     device: &Device,
     frame: &FrameBuffers,
     band: &Band,
-    source: Source,
+    source: FrameChannel,
     encoding: Encoding,
     texels: &Buffer<u32>,
 ) -> Result<()> {
     let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
-    if let Source::Features(first, count) = source
+    if let FrameChannel::Features(first, count) = source
         && (count == 0 || first + count > frame.feature_dim)
     {
         return Err(Error::work(format!("the frame has no features {first} to {}", first + count)));
@@ -127,18 +132,18 @@ pub fn pack(
 }
 
 /// Twin of [`pack`]: bytes of the texels from `planes` [C, P] and `transmittance` [P].
-pub fn texels_of(planes: &[f32], transmittance: &[f32], source: Source, encoding: Encoding) -> Vec<u8> {
+pub fn texels_of(planes: &[f32], transmittance: &[f32], source: FrameChannel, encoding: Encoding) -> Vec<u8> {
     let pixels = transmittance.len();
     let channels = source.channels();
     let value = |p: usize, k: usize| match source {
         _ if k >= channels => 0.0,
-        Source::Alpha => 1.0 - transmittance[p],
-        Source::Colour if k == 3 => 1.0 - transmittance[p],
-        Source::Depth => {
+        FrameChannel::Alpha => 1.0 - transmittance[p],
+        FrameChannel::Colour if k == 3 => 1.0 - transmittance[p],
+        FrameChannel::Depth => {
             let alpha = 1.0 - transmittance[p];
             if alpha >= super::renderer::DEPTH_ALPHA_MIN { planes[3 * pixels + p] / alpha } else { 0.0 }
         }
-        Source::Colour | Source::Features(..) => planes[(source.first() + k) * pixels + p],
+        FrameChannel::Colour | FrameChannel::Features(..) => planes[(source.first() + k) * pixels + p],
     };
     let (group, _) = encoding.texel(channels);
     let mut out = Vec::with_capacity(encoding.bytes(channels, pixels));
@@ -175,14 +180,16 @@ mod tests {
         let band = raster.frame().bands.get(0);
         raster.frame().planes.write(&planes).unwrap();
         raster.frame().transmittance.write(&transmittance).unwrap();
-        for source in [Source::Colour, Source::Alpha, Source::Depth, Source::Features(1, 5)] {
+        for source in
+            [FrameChannel::Colour, FrameChannel::Alpha, FrameChannel::Depth, FrameChannel::Features(1, 5)]
+        {
             for encoding in [Encoding::F32, Encoding::F32x4, Encoding::F16x4, Encoding::Unorm8x4] {
                 let out = texels(&device, pixels, source, encoding).unwrap();
                 pack(&device, raster.frame(), &band, source, encoding, &out).unwrap();
                 let got = out.cast::<u8>().read().unwrap();
                 let expected = texels_of(&planes, &transmittance, source, encoding);
                 assert_eq!(got.len(), encoding.bytes(source.channels(), pixels), "{source:?} {encoding:?}");
-                if encoding == Encoding::F16x4 && source == Source::Depth {
+                if encoding == Encoding::F16x4 && source == FrameChannel::Depth {
                     // z / alpha is not exact in half precision; rounding directions may differ by one step.
                     for (a, b) in got.chunks(2).zip(expected.chunks(2)) {
                         let step = |v: &[u8]| i32::from(u16::from_le_bytes([v[0], v[1]]));
@@ -194,6 +201,8 @@ mod tests {
             }
         }
         let out = device.buffer::<u32>("texels", 5 * pixels).unwrap();
-        assert!(pack(&device, raster.frame(), &band, Source::Features(2, 5), Encoding::F32, &out).is_err());
+        assert!(
+            pack(&device, raster.frame(), &band, FrameChannel::Features(2, 5), Encoding::F32, &out).is_err()
+        );
     }
 }

@@ -2,7 +2,7 @@
 //! [`super::plane_sweep_cpu`].
 use crate::Result;
 use crate::gpu::shaders::shared::plane_sweep::VIEW_SHARES;
-pub use crate::gpu::shaders::structs::Source;
+pub use crate::gpu::shaders::structs::SourceView;
 use crate::gpu::shaders::{plane_sweep, plane_sweep_refine};
 use crate::gpu::{Buffer, Device, Recorder};
 use glam::Vec4;
@@ -12,7 +12,7 @@ pub const MAX_SOURCES: usize = VIEW_SHARES.len();
 
 /// The reference view and the search; the shader's push constants.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Reference {
+pub struct ReferenceView {
     /// fx, fy, cx, cy, pixels.
     pub intrinsics: [f32; 4],
     /// Smallest and largest inverse depth searched.
@@ -42,9 +42,9 @@ pub struct Reference {
 /// What the matching schedule needs of the device and of its twin.
 pub trait Matcher {
     /// Initial sweep over all pixels of one view.
-    fn sweep(&mut self, reference: &Reference) -> Result<()>;
+    fn sweep(&mut self, reference: &ReferenceView) -> Result<()>;
     /// One propagation step over one checkerboard colour of one view.
-    fn refine(&mut self, reference: &Reference) -> Result<()>;
+    fn refine(&mut self, reference: &ReferenceView) -> Result<()>;
     /// (π, cost) per pixel of all views.
     fn planes(&self) -> Result<Vec<Vec4>>;
 }
@@ -53,7 +53,7 @@ pub trait Matcher {
 /// and its sources are brought together for every pass.
 pub struct GpuMatcher {
     device: Device,
-    sources: Buffer<Source>,
+    sources: Buffer<SourceView>,
     /// What a pass binds: all views, or one group.
     quads: Buffer<u32>,
     planes: Buffer<f32>,
@@ -85,8 +85,8 @@ impl GpuMatcher {
     pub fn new(
         device: &Device,
         luma: &[f32],
-        references: &[Reference],
-        sources: &[Source],
+        references: &[ReferenceView],
+        sources: &[SourceView],
         planes: &[Vec4],
     ) -> Result<Self> {
         let planes: Vec<[f32; 4]> = planes.iter().map(Vec4::to_array).collect();
@@ -131,7 +131,7 @@ impl GpuMatcher {
     }
 
     /// The view of a reference, where views are grouped.
-    fn view_of(&self, r: &Reference) -> Option<&ViewBuffers> {
+    fn view_of(&self, r: &ReferenceView) -> Option<&ViewBuffers> {
         let mut first = 0;
         self.views.iter().find(|view| {
             let found = first == r.first as usize;
@@ -141,7 +141,7 @@ impl GpuMatcher {
     }
 
     /// Records one pass: `dispatch` gets where the reference's pixels begin in the buffers.
-    fn record(&self, rec: &mut Recorder, r: &Reference, dispatch: impl FnOnce(&mut Recorder, u32)) {
+    fn record(&self, rec: &mut Recorder, r: &ReferenceView, dispatch: impl FnOnce(&mut Recorder, u32)) {
         let Some(view) = self.view_of(r) else { return dispatch(rec, r.first) };
         let (mut quad, mut plane) = (0, 0);
         for member in view.group.iter().map(|&v| &self.views[v]) {
@@ -155,12 +155,12 @@ impl GpuMatcher {
     }
 }
 
-fn pixels_of(r: &Reference) -> usize {
+fn pixels_of(r: &ReferenceView) -> usize {
     r.width as usize * r.height as usize
 }
 
 /// Per pixel its own luma and that of the pixels to the right, below and diagonally below, 16 bits each.
-fn quads(luma: &[f32], references: &[Reference]) -> Vec<[u32; 2]> {
+fn quads(luma: &[f32], references: &[ReferenceView]) -> Vec<[u32; 2]> {
     let word = |a: f32, b: f32| ((b * 65535.0).round() as u32) << 16 | (a * 65535.0).round() as u32;
     let mut out = Vec::with_capacity(luma.len());
     for r in references {
@@ -200,7 +200,7 @@ macro_rules! push {
 }
 
 impl Matcher for GpuMatcher {
-    fn sweep(&mut self, r: &Reference) -> Result<()> {
+    fn sweep(&mut self, r: &ReferenceView) -> Result<()> {
         let bindings =
             plane_sweep::Bindings { quads: &self.quads, sources: &self.sources, planes: &self.planes };
         let mut rec = Recorder::new(&self.device, "plane sweep");
@@ -211,7 +211,7 @@ impl Matcher for GpuMatcher {
         rec.run()
     }
 
-    fn refine(&mut self, r: &Reference) -> Result<()> {
+    fn refine(&mut self, r: &ReferenceView) -> Result<()> {
         let bindings =
             plane_sweep_refine::Bindings { quads: &self.quads, sources: &self.sources, planes: &self.planes };
         let mut rec = Recorder::new(&self.device, "plane refinement");

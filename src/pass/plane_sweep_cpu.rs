@@ -4,7 +4,7 @@
 //! `1/z = π·ray` and the warp into a source view is the homography `K_s (R + t πᵀ)`. Matching cost: 1 − bilaterally
 //! weighted ZNCC (Schönberger et al. 2016, eq. 7–8), mixed over the best source views; propagation on a red-black
 //! checkerboard with adaptive candidate areas (Xu and Tao 2019, ACMM, section 3.1).
-use super::plane_sweep::{MAX_SOURCES, Matcher, Reference, Source};
+use super::plane_sweep::{MAX_SOURCES, Matcher, ReferenceView, SourceView};
 use crate::Result;
 use crate::gpu::shaders::shared::plane_sweep as shared;
 use glam::{Vec2, Vec3, Vec4};
@@ -59,10 +59,10 @@ pub struct Window {
 pub struct Inputs<'a> {
     /// Luma of all views, one after the other.
     pub luma: &'a [f32],
-    /// Source table.
-    pub sources: &'a [Source],
+    /// SourceView table.
+    pub sources: &'a [SourceView],
     /// The reference and the search.
-    pub reference: Reference,
+    pub reference: ReferenceView,
 }
 
 fn offset(tap: usize) -> i32 {
@@ -112,7 +112,7 @@ impl Inputs<'_> {
     }
 
     /// Bilinear luma of a source view at continuous pixel coordinates, clamped to the border.
-    fn sample(&self, source: &Source, u: f32, v: f32) -> f32 {
+    fn sample(&self, source: &SourceView, u: f32, v: f32) -> f32 {
         let [width, height, first, _] = source.size;
         let x = (u - 0.5).clamp(0.0, width as f32 - 1.001);
         let y = (v - 0.5).clamp(0.0, height as f32 - 1.001);
@@ -126,7 +126,7 @@ impl Inputs<'_> {
     }
 
     /// 1 − ZNCC of the window warped by `plane` into one source view, at most `COST_LIMIT`.
-    pub fn source_cost(&self, source: &Source, window: &Window, ray: Vec3, plane: Vec3) -> f32 {
+    pub fn source_cost(&self, source: &SourceView, window: &Window, ray: Vec3, plane: Vec3) -> f32 {
         let rows = source.forward.map(Vec4::from);
         let [fx, fy, ..] = self.reference.intrinsics;
         let apply = |v: Vec4| Vec3::new(rows[0].dot(v), rows[1].dot(v), rows[2].dot(v));
@@ -163,7 +163,7 @@ impl Inputs<'_> {
     fn geometric_error(
         &self,
         planes: &[Vec4],
-        source: &Source,
+        source: &SourceView,
         x: i32,
         y: i32,
         ray: Vec3,
@@ -359,19 +359,19 @@ impl Inputs<'_> {
 /// The twin of the whole GPU matcher: same calls, plain loops.
 pub struct CpuMatcher {
     luma: Vec<f32>,
-    sources: Vec<Source>,
+    sources: Vec<SourceView>,
     planes: Vec<Vec4>,
 }
 
 impl CpuMatcher {
     /// `luma` and `planes` (π, cost) hold all views one after the other.
-    pub fn new(luma: Vec<f32>, sources: Vec<Source>, planes: Vec<Vec4>) -> Self {
+    pub fn new(luma: Vec<f32>, sources: Vec<SourceView>, planes: Vec<Vec4>) -> Self {
         CpuMatcher { luma, sources, planes }
     }
 }
 
 impl Matcher for CpuMatcher {
-    fn sweep(&mut self, reference: &Reference) -> Result<()> {
+    fn sweep(&mut self, reference: &ReferenceView) -> Result<()> {
         let (width, first) = (reference.width as usize, reference.first as usize);
         let inputs = Inputs { luma: &self.luma, sources: &self.sources, reference: *reference };
         let pixels = width * reference.height as usize;
@@ -381,7 +381,7 @@ impl Matcher for CpuMatcher {
             .for_each(|(k, plane)| *plane = inputs.sweep((k % width) as i32, (k / width) as i32));
         Ok(())
     }
-    fn refine(&mut self, reference: &Reference) -> Result<()> {
+    fn refine(&mut self, reference: &ReferenceView) -> Result<()> {
         let (width, first) = (reference.width as usize, reference.first as usize);
         let inputs = Inputs { luma: &self.luma, sources: &self.sources, reference: *reference };
         let of_colour = |k: &usize| (k % width + k / width) % 2 == reference.parity as usize;

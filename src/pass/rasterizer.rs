@@ -53,17 +53,17 @@ pub use super::splat_buffers::SplatBuffers;
 
 /// Choices among passes that lead to the same result.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Ways {
+pub struct DeviceChoices {
     /// How tile lists are made.
     pub grouping: Grouping,
     /// How gradients of several tiles are added up.
     pub summation: Summation,
 }
 
-impl Ways {
+impl DeviceChoices {
     /// What suits the device.
-    pub fn of(device: &Device) -> Ways {
-        Ways { grouping: Grouping::of(device), summation: Summation::of(device) }
+    pub fn of(device: &Device) -> DeviceChoices {
+        DeviceChoices { grouping: Grouping::of(device), summation: Summation::of(device) }
     }
 }
 
@@ -99,7 +99,7 @@ impl Rasterizer {
         width: u32,
         height: u32,
     ) -> Result<Rasterizer> {
-        Rasterizer::with(device, capacity, feature_dim, width, height, Ways::of(device))
+        Rasterizer::with(device, capacity, feature_dim, width, height, DeviceChoices::of(device))
     }
 
     /// [`Rasterizer::new`] with ways that may not be the device's best: for tests and benchmarks.
@@ -109,7 +109,7 @@ impl Rasterizer {
         feature_dim: usize,
         width: u32,
         height: u32,
-        ways: Ways,
+        ways: DeviceChoices,
     ) -> Result<Rasterizer> {
         if width == 0 || height == 0 {
             return Err(Error::work("an image of zero size cannot be rendered"));

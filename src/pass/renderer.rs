@@ -17,7 +17,7 @@ pub const DEPTH_ALPHA_MIN: f32 = shaders::pack::DEPTH_ALPHA_MIN as f32;
 
 /// One rendered view.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Frame {
+pub struct RenderedFrame {
     /// [H, W] RGB on the background. Not clamped: values may pass 1.
     pub rgb: RgbImage,
     /// [H, W] in [0, 1).
@@ -85,8 +85,9 @@ impl Renderer {
     }
 
     /// Renders one view and copies it to the host.
-    pub fn render(&mut self, camera: &Camera) -> Result<Frame> {
-        let mut out = Frame::empty(camera.width as usize, camera.height as usize, self.splats.feature_dim);
+    pub fn render(&mut self, camera: &Camera) -> Result<RenderedFrame> {
+        let mut out =
+            RenderedFrame::empty(camera.width as usize, camera.height as usize, self.splats.feature_dim);
         self.draw_bands(camera, |frame, band| out.read_band(frame, band))?;
         Ok(out)
     }
@@ -145,10 +146,10 @@ impl Renderer {
     }
 }
 
-impl Frame {
+impl RenderedFrame {
     /// A frame that nothing was rendered into.
-    pub fn empty(width: usize, height: usize, feature_dim: usize) -> Frame {
-        Frame {
+    pub fn empty(width: usize, height: usize, feature_dim: usize) -> RenderedFrame {
+        RenderedFrame {
             rgb: RgbImage { width, height, data: vec![[0.0; 3]; width * height] },
             alpha: Plane::filled(width, height, 0.0),
             depth: Plane::filled(width, height, 0.0),

@@ -5,7 +5,7 @@ use crate::pass::bands::Band;
 use crate::pass::decode::Codes;
 use crate::pass::raster_forward::BASE_CHANNELS;
 use crate::pass::rasterizer::FrameBuffers;
-use crate::pass::renderer::{Frame, Renderer};
+use crate::pass::renderer::{RenderedFrame, Renderer};
 use crate::scene::{Camera, LanguageField, Plane, Splats};
 
 /// A rendered frame and the code of every pixel per level (−1 = none).
@@ -13,7 +13,7 @@ use crate::scene::{Camera, LanguageField, Plane, Splats};
 #[non_exhaustive]
 pub struct DecodedFrame {
     /// Colour and depth; features only from [`Viewer::view_with_features`].
-    pub rendered: Frame,
+    pub rendered: RenderedFrame,
     /// Per level, index as in [`crate::scene::LEVEL_NAMES`]; levels without codes are −1 everywhere.
     pub codes: Vec<Plane<i32>>,
 }
@@ -88,7 +88,7 @@ impl Viewer {
     fn seen(&mut self, camera: &Camera, features: bool) -> Result<DecodedFrame> {
         let mut codes = empty(self.levels.len(), camera);
         let dim = if features { self.renderer.feature_dim() } else { 0 };
-        let mut shown = Frame::empty(camera.width as usize, camera.height as usize, dim);
+        let mut shown = RenderedFrame::empty(camera.width as usize, camera.height as usize, dim);
         let (device, levels, output) = (&self.device, &self.levels, &mut self.output);
         self.renderer.draw_bands(camera, |frame, band| {
             decode(device, levels, output, frame, band, &mut codes)?;

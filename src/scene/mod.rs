@@ -23,6 +23,6 @@ pub use lens::Lens;
 pub use pointmap::{Descriptors, ModelView, PairPointmaps, Pointmap};
 pub use points::PointCloud;
 pub use similarity::Similarity;
-pub use splats::{Splats, sh_coefficients};
+pub use splats::{SH_C0, Splats, sh_coefficients};
 pub use transfer::{to_linear, to_srgb};
 pub use warp::DenseWarp;

@@ -1,6 +1,9 @@
 //! The Gaussians of a scene, as raw (pre-activation) parameters.
 use serde::{Deserialize, Serialize};
 
+/// Constant of the first spherical harmonic, `1 / (2 √π)`: colour = 0.5 + SH_C0 · f_dc.
+pub const SH_C0: f32 = 0.282_094_8;
+
 /// Number of spherical-harmonics coefficients per channel at a degree 0–3.
 pub const fn sh_coefficients(degree: u32) -> usize {
     ((degree + 1) * (degree + 1)) as usize

@@ -6,7 +6,7 @@ use splatvk::pass::params::{Gradients, Params};
 use splatvk::pass::raster_forward::Cutoffs;
 use splatvk::pass::seeded;
 use splatvk::pass::twin::{self, Forward};
-use splatvk::pass::{RasterOptions, Rasterizer, SplatBuffers, View, Ways};
+use splatvk::pass::{DeviceChoices, RasterOptions, Rasterizer, SplatBuffers, View};
 use splatvk::scene::{Camera, Splats};
 
 /// A scene with everything a render needs.
@@ -59,10 +59,10 @@ impl Scene {
     }
 
     pub fn upload(&self, device: &Device) -> (SplatBuffers, Rasterizer) {
-        self.upload_for(device, Ways::of(device))
+        self.upload_for(device, DeviceChoices::of(device))
     }
 
-    fn upload_for(&self, device: &Device, ways: Ways) -> (SplatBuffers, Rasterizer) {
+    fn upload_for(&self, device: &Device, ways: DeviceChoices) -> (SplatBuffers, Rasterizer) {
         let params = SplatBuffers::upload(device, &self.splats, &self.features, self.dim).unwrap();
         let [width, height] = self.view.size;
         let raster = Rasterizer::with(device, self.splats.len(), self.dim, width, height, ways).unwrap();
@@ -83,10 +83,10 @@ impl Scene {
     }
 
     pub fn gradients(&self, device: &Device, upstream: &[f32]) -> GpuGradients {
-        self.gradients_by(device, Ways::of(device), upstream)
+        self.gradients_by(device, DeviceChoices::of(device), upstream)
     }
 
-    pub fn gradients_by(&self, device: &Device, ways: Ways, upstream: &[f32]) -> GpuGradients {
+    pub fn gradients_by(&self, device: &Device, ways: DeviceChoices, upstream: &[f32]) -> GpuGradients {
         let (params, mut raster) = self.upload_for(device, ways);
         raster.forward(&params, &self.options).unwrap();
         raster.frame().planes_grad.write(upstream).unwrap();

@@ -6,9 +6,8 @@
 //! training view sees them, so they change no loss.
 mod anchor;
 
-use super::init::SH_C0;
 use crate::math::Random;
-use crate::scene::{Camera, DepthMap, RgbImage, Splats};
+use crate::scene::{Camera, DepthMap, RgbImage, SH_C0, Splats};
 use anchor::{Anchor, BEHIND, STEP, Shown};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
@@ -23,7 +22,7 @@ const OVERLAP: f64 = 0.7;
 const LOGIT: f32 = 4.0;
 
 /// One splat to be.
-struct Candidate {
+struct UnseenSplat {
     /// From where the surface ends, pixels.
     distance: f64,
     position: DVec3,
@@ -42,7 +41,7 @@ pub fn unseen_splats(
     min_confidence: f32,
     seed: u64,
 ) -> Splats {
-    let of_view = |view: usize| -> Vec<Candidate> {
+    let of_view = |view: usize| -> Vec<UnseenSplat> {
         let shown =
             Shown { image: &images[view], camera: &cameras[view], depth: &depths[view], min_confidence };
         let mut random = Random::new(seed ^ 0x3a61 ^ ((view as u64) << 32));
@@ -51,7 +50,7 @@ pub fn unseen_splats(
         own
     };
     let views = images.len().min(depths.len());
-    let mut all: Vec<Candidate> = (0..views).into_par_iter().flat_map_iter(of_view).collect();
+    let mut all: Vec<UnseenSplat> = (0..views).into_par_iter().flat_map_iter(of_view).collect();
     // Where several photos continue one surface, the nearest end knows best.
     all.sort_by(|a, b| a.distance.total_cmp(&b.distance));
     let mut taken = HashSet::new();
@@ -68,7 +67,7 @@ pub fn unseen_splats(
 }
 
 /// Splats around one photo and behind what it shows, up to `reach` pixels from where their surfaces end.
-fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<Candidate> {
+fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<UnseenSplat> {
     let size = shown.size();
     // What is hidden is seen through narrow cracks: twice as fine as beyond the borders.
     let (step, fine) = (STEP * shown.long(), 0.5 * STEP * shown.long());
@@ -101,7 +100,7 @@ fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<Candidate> 
 }
 
 /// True where a candidate would stand before, or on, what another photo shows (or should show).
-fn in_the_way(c: &Candidate, camera: &Camera, depth: &DepthMap) -> bool {
+fn in_the_way(c: &UnseenSplat, camera: &Camera, depth: &DepthMap) -> bool {
     let (pixel, z) = camera.project(c.position);
     let (w, h) = (f64::from(camera.width), f64::from(camera.height));
     if z <= 0.0 || pixel.x < 0.0 || pixel.y < 0.0 || pixel.x >= w || pixel.y >= h {
@@ -112,7 +111,13 @@ fn in_the_way(c: &Candidate, camera: &Camera, depth: &DepthMap) -> bool {
 }
 
 /// The splat that continues an anchor's plane at a pixel that does not show it; `None` near or past the horizon.
-fn candidate(camera: &Camera, anchor: &Anchor, pixel: DVec2, distance: f64, step: f64) -> Option<Candidate> {
+fn candidate(
+    camera: &Camera,
+    anchor: &Anchor,
+    pixel: DVec2,
+    distance: f64,
+    step: f64,
+) -> Option<UnseenSplat> {
     // Beyond three times the distance of its end, or nearer than half of it, a plane is a guess too far.
     let value = anchor.inverse(pixel);
     if value < anchor.w / 3.0 || value > anchor.w * 2.0 {
@@ -121,11 +126,11 @@ fn candidate(camera: &Camera, anchor: &Anchor, pixel: DVec2, distance: f64, step
     let world = |p: DVec2| camera.unproject(p, 1.0 / anchor.inverse(p).max(anchor.w / 4.0));
     let position = world(pixel);
     let steps = [DVec2::X, DVec2::Y].map(|e| world(pixel + 0.5 * step * e) - world(pixel - 0.5 * step * e));
-    Some(Candidate { distance, position, steps, colour: anchor.colour })
+    Some(UnseenSplat { distance, position, steps, colour: anchor.colour })
 }
 
 /// A flat splat that spans one grid cell of the plane.
-fn push(splats: &mut Splats, c: &Candidate) {
+fn push(splats: &mut Splats, c: &UnseenSplat) {
     let (long, short) = if c.steps[0].length() >= c.steps[1].length() {
         (c.steps[0], c.steps[1])
     } else {
@@ -292,7 +297,7 @@ mod tests {
             unseen_splats(&images, &[camera(), beside.clone()], &[depth.clone(), depth.clone()], 0.2, 0.5, 0);
         assert!(splats.len() > 1000);
         for p in &splats.means {
-            let c = Candidate {
+            let c = UnseenSplat {
                 distance: 0.0,
                 position: DVec3::from(p.map(f64::from)),
                 steps: [DVec3::X; 2],

@@ -62,7 +62,7 @@ pub fn read_points(path: &Path) -> Result<PointCloud> {
                     if matches!(t.columns[c].1, PropertyType::F32 | PropertyType::F64) { 1.0 } else { 255.0 };
                 (t.at(r, c) / full).clamp(0.0, 1.0)
             }),
-            (None, Some(c)) => c.map(|c| (0.5 + crate::format::SH_C0 * t.at(r, c)).clamp(0.0, 1.0)),
+            (None, Some(c)) => c.map(|c| (0.5 + crate::scene::SH_C0 * t.at(r, c)).clamp(0.0, 1.0)),
             (None, None) => [0.5; 3],
         });
     }

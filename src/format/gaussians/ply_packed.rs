@@ -78,7 +78,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Splats, String> {
         s.quats.push(unpack_rotation(rotation));
         let [r, g, b, a] = colour.to_be_bytes().map(|v| f32::from(v) / 255.0);
         let base = [span(12, r), span(13, g), span(14, b)];
-        s.sh.extend(base.map(|v| (v - 0.5) / crate::format::SH_C0));
+        s.sh.extend(base.map(|v| (v - 0.5) / crate::scene::SH_C0));
         s.opacity_logits.push(crate::format::logit(a).clamp(-LOGIT_MAX, LOGIT_MAX));
         if let Some(rows) = &sh {
             for k in 0..rest {
@@ -197,7 +197,7 @@ fn bounded(s: &Splats, i: usize) -> [f32; 9] {
     let ([x, y, z], [a, b, c]) =
         (s.means[i], s.log_scales[i].map(|v| v.clamp(-LOG_SCALE_MAX, LOG_SCALE_MAX)));
     let base = &s.sh[i * 3 * s.sh_len()..];
-    let [r, g, blue] = [0, 1, 2].map(|k| 0.5 + crate::format::SH_C0 * base[k]);
+    let [r, g, blue] = [0, 1, 2].map(|k| 0.5 + crate::scene::SH_C0 * base[k]);
     [x, y, z, a, b, c, r, g, blue]
 }
 

@@ -27,7 +27,7 @@ pub fn read_splats(path: &Path) -> Result<Splats> {
         s.means.push([0, 1, 2].map(float));
         // A flat Gaussian has a scale of 0, of which there is no logarithm.
         s.log_scales.push([3, 4, 5].map(|k| float(k).max(f32::MIN_POSITIVE).ln()));
-        s.sh.extend([0, 1, 2].map(|k| (share(k) - 0.5) / crate::format::SH_C0));
+        s.sh.extend([0, 1, 2].map(|k| (share(k) - 0.5) / crate::scene::SH_C0));
         s.opacity_logits.push(crate::format::logit(share(3)));
         s.quats.push([4, 5, 6, 7].map(|k| (f32::from(row[24 + k]) - 128.0) / 128.0));
     }
@@ -54,7 +54,7 @@ pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
         for v in s.means[i].into_iter().chain(s.log_scales[i].map(f32::exp)) {
             bytes.extend_from_slice(&v.to_le_bytes());
         }
-        bytes.extend([0, 1, 2].map(|k| crate::format::to_byte(0.5 + crate::format::SH_C0 * s.sh[base + k])));
+        bytes.extend([0, 1, 2].map(|k| crate::format::to_byte(0.5 + crate::scene::SH_C0 * s.sh[base + k])));
         bytes.push(crate::format::to_byte(alpha(i)));
         let q = s.quats[i];
         let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);

@@ -18,7 +18,7 @@ const FIXED_MAX: f32 = 8_388_607.0;
 /// Slope of the base colour: byte = (f_dc · 0.15 + 0.5) · 255.
 const COLOUR_SCALE: f32 = 0.15;
 /// Largest base colour that a byte holds: f_dc ends at 0.5 / 0.15.
-pub const BRIGHTEST: f32 = 0.5 + crate::format::SH_C0 * 0.5 / COLOUR_SCALE;
+pub const BRIGHTEST: f32 = 0.5 + crate::scene::SH_C0 * 0.5 / COLOUR_SCALE;
 /// Most Gaussians that are read, so that a damaged count does not take all memory: ten times the largest scenes shared.
 const MAX_GAUSSIANS: usize = 100_000_000;
 

@@ -16,7 +16,7 @@ pub use views::{Level, pyramid};
 
 use crate::Result;
 use crate::gpu::Device;
-use crate::pass::plane_sweep::{GpuMatcher, Matcher, Reference};
+use crate::pass::plane_sweep::{GpuMatcher, Matcher, ReferenceView};
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, Plane, PointCloud, RgbImage};
 use glam::{DVec3, Vec4};
@@ -72,7 +72,7 @@ pub fn run_schedule<M: Matcher>(
         let mut matcher = matcher(level, start)?;
         if index == 0 {
             for reference in &level.references {
-                matcher.sweep(&Reference { seed, planes: options.planes, ..*reference })?;
+                matcher.sweep(&ReferenceView { seed, planes: options.planes, ..*reference })?;
             }
         }
         let (photometric, geometric) = rounds_of(index);
@@ -83,7 +83,7 @@ pub fn run_schedule<M: Matcher>(
                     progress.check()?;
                     seed = seed.wrapping_add(1);
                     let smoothness = options.smoothness;
-                    matcher.refine(&Reference { parity, geometric, smoothness, seed, ..*reference })?;
+                    matcher.refine(&ReferenceView { parity, geometric, smoothness, seed, ..*reference })?;
                 }
             }
             done += level.pixels() as u64 / 1000;

@@ -154,7 +154,7 @@ fn device_and_twin_choose_the_same_planes() {
     };
     let (mut gpu, mut cpu) = make(&vec![Vec4::ZERO; level.pixels()]);
     for r in &level.references {
-        let r = Reference { seed: 5, planes: 24, ..*r };
+        let r = ReferenceView { seed: 5, planes: 24, ..*r };
         gpu.sweep(&r).unwrap();
         cpu.sweep(&r).unwrap();
     }
@@ -163,7 +163,7 @@ fn device_and_twin_choose_the_same_planes() {
     for (geometric, smoothness) in [(0.0, 0.0), (0.1, 0.0), (0.1, 0.1)] {
         for parity in 0..2 {
             let (mut gpu, mut cpu) = make(&swept);
-            let r = Reference { seed: 9, geometric, smoothness, parity, ..level.references[1] };
+            let r = ReferenceView { seed: 9, geometric, smoothness, parity, ..level.references[1] };
             gpu.refine(&r).unwrap();
             cpu.refine(&r).unwrap();
             let refined = cpu.planes().unwrap();

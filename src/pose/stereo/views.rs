@@ -1,6 +1,6 @@
 //! What the matcher reads: the image pyramid, the source views of every view, the inverse depth range.
 use super::StereoOptions;
-use crate::pass::plane_sweep::{MAX_SOURCES, Reference, Source, binding};
+use crate::pass::plane_sweep::{MAX_SOURCES, ReferenceView, SourceView, binding};
 use crate::scene::{Camera, RgbImage};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3, Vec4};
@@ -14,10 +14,10 @@ pub struct Level {
     pub guide: Vec<RgbImage>,
     /// Luma of all views, one after the other.
     pub luma: Vec<f32>,
-    /// Source views of all references.
-    pub sources: Vec<Source>,
+    /// SourceView views of all references.
+    pub sources: Vec<SourceView>,
     /// One per view; parity, seed and search parameters are set per pass.
-    pub references: Vec<Reference>,
+    pub references: Vec<ReferenceView>,
     /// Relative depth difference below which two depths of a view agree, one per view.
     pub tolerance: Vec<f32>,
 }
@@ -193,7 +193,7 @@ fn level(
     let mut sources = Vec::new();
     let mut references = Vec::new();
     for (view, camera) in cameras.iter().enumerate() {
-        references.push(Reference {
+        references.push(ReferenceView {
             intrinsics: [camera.fx, camera.fy, camera.cx, camera.cy].map(|v| v as f32),
             range: ranges[view].map(|v| v as f32),
             width: camera.width,
@@ -201,7 +201,7 @@ fn level(
             first: first[view],
             first_source: sources.len() as u32,
             sources: chosen[view].len() as u32,
-            ..Reference::default()
+            ..ReferenceView::default()
         });
         sources.extend(chosen[view].iter().map(|&other| source(camera, &cameras[other], first[other])));
     }
@@ -211,8 +211,8 @@ fn level(
     Level { cameras, guide: guide.to_vec(), luma, sources, references, tolerance: tolerance.to_vec() }
 }
 
-fn source(reference: &Camera, other: &Camera, first: u32) -> Source {
-    // Reference frame → source frame.
+fn source(reference: &Camera, other: &Camera, first: u32) -> SourceView {
+    // ReferenceView frame → source frame.
     let relative = other.pose.compose(&reference.pose.inverse());
     let rows = |camera: &Camera, rotation: DMat3, translation: DVec3| {
         let k = DMat3::from_cols(
@@ -224,7 +224,7 @@ fn source(reference: &Camera, other: &Camera, first: u32) -> Source {
         [0, 1, 2].map(|i| m.row(i).extend(t[i]).as_vec4().to_array())
     };
     let inverse = relative.inverse();
-    Source {
+    SourceView {
         forward: rows(other, relative.rotation, relative.translation),
         back: rows(reference, inverse.rotation, inverse.translation),
         centre: inverse.translation.extend(0.0).as_vec4().to_array(),

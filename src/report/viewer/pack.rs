@@ -18,7 +18,7 @@
 //! Planes of one quantity deflate better than records. A position is exact to 1/65535 of a block, which is a few
 //! neighbouring splats wide.
 use crate::query::select;
-use crate::scene::{LanguageField, LevelField, Splats};
+use crate::scene::{LanguageField, LevelField, SH_C0, Splats};
 use crate::{Error, Result};
 use std::io::Write;
 
@@ -26,8 +26,6 @@ use std::io::Write;
 const MAGIC: &[u8; 8] = b"SVKVIEW1";
 /// Splats that share a range.
 const BLOCK: usize = 256;
-/// Constant of the lowest spherical harmonic, ½ √(1/π).
-const SH0: f32 = 0.282_094_8;
 /// A fainter splat is never drawn (docs/method.md#forward-rasterisation).
 const MIN_ALPHA: f32 = 1.0 / 255.0;
 
@@ -103,7 +101,7 @@ fn bounds<const K: usize>(rows: impl Iterator<Item = [f32; K]>) -> ([f32; K], [f
 
 fn write(splats: &Splats, levels: &[&LevelField], order: &[usize]) -> Vec<u8> {
     let rest = splats.sh_len() - 1;
-    let colour = |i: usize| [0, 1, 2].map(|c| 0.5 + SH0 * splats.sh[3 * (rest + 1) * i + c]);
+    let colour = |i: usize| [0, 1, 2].map(|c| 0.5 + SH_C0 * splats.sh[3 * (rest + 1) * i + c]);
     let all = |i: usize| {
         let ([x, y, z], [a, b, c], [r, g, u]) = (splats.means[i], splats.log_scales[i], colour(i));
         [x, y, z, a, b, c, r, g, u]
@@ -300,7 +298,7 @@ mod tests {
         }
         for k in 0..3 {
             for (i, &s) in order.iter().enumerate() {
-                near(at(i, 4, r.u8() as f32 / 255.0), 0.5 + SH0 * splats.sh[27 * s + k], step(i, 4, 255.0));
+                near(at(i, 4, r.u8() as f32 / 255.0), 0.5 + SH_C0 * splats.sh[27 * s + k], step(i, 4, 255.0));
             }
         }
         for k in 0..8 {

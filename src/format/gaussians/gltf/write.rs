@@ -1,7 +1,7 @@
 //! Writing.
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
-use crate::format::{SH_C0, sigmoid, transform};
-use crate::scene::{Splats, to_linear};
+use crate::format::{sigmoid, transform};
+use crate::scene::{SH_C0, Splats, to_linear};
 use crate::{Error, Result};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
