@@ -1,4 +1,4 @@
-//! A run that is killed goes on with `--resume`, and ends with the same bits as one that was left alone.
+//! A run that is killed, or finds the disk full, goes on with `--resume`, and ends with the same bits as one that was left alone.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 use serde_json::Value;
@@ -116,6 +116,48 @@ fn killed_after(mut child: Child, time: Duration) -> bool {
     child.kill().unwrap();
     child.wait().unwrap();
     false
+}
+
+/// Size of the largest file below a folder, bytes.
+fn largest(folder: &Path) -> u64 {
+    let entries = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
+    entries.map(|p| if p.is_dir() { largest(&p) } else { p.metadata().unwrap().len() }).max().unwrap_or(0)
+}
+
+#[test]
+fn a_run_that_no_disk_takes_leaves_the_old_scene_and_goes_on_later() {
+    let scene = Scene::new();
+    scene.finished("home-a", "whole", 20, false);
+    let before = content(&scene.at("whole"));
+    let run_json = std::fs::read(scene.at("whole/run.json")).unwrap();
+
+    // The same run again, over its scene, where the largest file of the scene does not fit; the kernel counts in blocks of
+    // 512 bytes, and would end the process without the trap.
+    let blocks = largest(&scene.at("whole")).div_ceil(512) - 2;
+    let run = scene.run("home-b", "whole", 20, false);
+    let mut limited = Command::new("sh");
+    limited.arg("-c").arg(format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$0\" \"$@\""));
+    limited.arg(run.get_program()).args(run.get_args()).arg("--force");
+    limited.envs(run.get_envs().filter_map(|(name, value)| Some((name, value?))));
+    let output = limited.output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    let last: Value = serde_json::from_str(said.lines().last().unwrap()).unwrap();
+    let message = last["message"].as_str().unwrap();
+    assert!(last["event"] == "error" && message.contains("cannot be written"), "{said}");
+    assert!(message.contains("ulimit") && message.lines().count() == 1, "{message}");
+    assert!(content(&scene.at("whole")) == before, "the old scene is as it was");
+    assert!(std::fs::read(scene.at("whole/run.json")).unwrap() == run_json);
+    for entry in std::fs::read_dir(scene.folder.path()).unwrap() {
+        let name = entry.unwrap().file_name().to_string_lossy().into_owned();
+        assert!(!name.contains("partial") && !name.contains("old"), "left behind: {name}");
+    }
+
+    // There is space again.
+    let said = scene.finished("home-b", "resumed", 20, true);
+    let kept = said.lines().find(|l| l.contains("kept from an earlier run")).unwrap();
+    assert!(kept.contains("cameras") && kept.contains("splats") && kept.contains("language"), "{kept}");
+    assert!(content(&scene.at("resumed")) == before, "the same scene");
 }
 
 #[test]

@@ -2,8 +2,8 @@
 use super::print::listing;
 use super::progress;
 use crate::format::gaussians::{self, FORMATS, SplatFormat};
-use crate::format::{SH_C0, colmap, create_folder, ply, scene_dir, transforms, write_whole_file};
-use crate::scene::{Camera, Splats};
+use crate::format::{colmap, create_folder, ply, scene_dir, transforms, write_whole_file};
+use crate::scene::{Camera, SH_C0, Splats};
 use crate::{Error, Result};
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser};

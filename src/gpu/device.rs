@@ -50,6 +50,9 @@ pub(super) struct Inner {
     pub owned: bool,
     pub heap: Heap,
     submissions: AtomicU64,
+    /// The submission from which on the device is lost.
+    #[cfg(test)]
+    lost_from: AtomicU64,
     /// Locked while something is submitted, so that what waits in it keeps its place in the queue.
     pub staging: Mutex<Staging>,
     /// By name and code: modules of a program may share a name with the engine's.
@@ -119,6 +122,8 @@ impl Device {
             owned,
             heap,
             submissions: AtomicU64::new(0),
+            #[cfg(test)]
+            lost_from: AtomicU64::new(u64::MAX),
             staging: Mutex::default(),
             pipelines: Mutex::new(HashMap::new()),
             pipeline_cache,
@@ -144,6 +149,12 @@ impl Device {
     /// Submissions to the queue so far: a call of the driver each, and nearly always a wait.
     pub fn submissions(&self) -> u64 {
         self.0.submissions.load(Ordering::Relaxed)
+    }
+
+    /// Makes the driver say, after so many more submissions, that the device is lost.
+    #[cfg(test)]
+    pub(crate) fn lose_after(&self, submissions: u64) {
+        self.0.lost_from.store(self.submissions() + submissions, Ordering::Relaxed);
     }
 
     /// Starts measuring [`Memory::peak`] anew.
@@ -199,7 +210,11 @@ impl Device {
         infos: &[vk::SubmitInfo<'_>],
         fence: vk::Fence,
     ) -> std::result::Result<(), vk::Result> {
-        self.0.submissions.fetch_add(1, Ordering::Relaxed);
+        let _number = self.0.submissions.fetch_add(1, Ordering::Relaxed);
+        #[cfg(test)]
+        if _number >= self.0.lost_from.load(Ordering::Relaxed) {
+            return Err(vk::Result::ERROR_DEVICE_LOST);
+        }
         let queue = lock(&self.0.queue);
         let mut outcome = Ok(());
         // SAFETY: our threads are kept apart by the lock, the host's by `queue_lock` or its promise (see HostDevice).

@@ -106,6 +106,28 @@ fn finished_stages_are_not_run_again_and_their_warnings_stay() {
     assert!(list.len() == 3 && list.iter().all(|(_, bytes)| *bytes > 64), "{list:?}");
 }
 
+/// Opening a file at its place gives a device on which every write says that the disk is full.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_full_disk_costs_the_next_run_time_and_this_one_nothing() {
+    let (machine, folder) = (Machine::new(), tempfile::tempdir().unwrap());
+    let kept = || Store::at(folder.path(), true, PATIENCE);
+    assert_eq!(chain(&machine, &kept(), 2).0, [1, 1, 1]);
+    let files: Vec<_> = Store::list(folder.path()).into_iter().map(|f| f.0).collect();
+    for file in &files {
+        std::fs::remove_file(file).unwrap();
+        let partial = file.with_extension(format!("partial-{}", std::process::id()));
+        std::os::unix::fs::symlink("/dev/full", partial).unwrap();
+    }
+    let (runs, value, _) = chain(&machine, &kept(), 2);
+    assert_eq!((runs, value), ([1, 1, 1], 8));
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "nothing half-written stays");
+    // There is space again.
+    assert_eq!(chain(&machine, &kept(), 2).0, [1, 1, 1]);
+    assert_eq!(chain(&machine, &kept(), 2).0, [0, 0, 0]);
+    assert_eq!(Store::list(folder.path()).len(), files.len());
+}
+
 #[test]
 fn graphs_of_one_store_in_memory_share_their_stages() {
     let (machine, store) = (Machine::new(), Store::in_memory());

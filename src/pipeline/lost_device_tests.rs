@@ -1,0 +1,117 @@
+//! A device that is lost in the middle of training: what is said of it, and that the same work goes on with another.
+use super::{Graph, Store};
+use crate::Error;
+use crate::fit::{Preset, RgbOptions, Trained};
+use crate::gpu::{Device, Options, Recorder};
+use crate::infer::Registry;
+use crate::photo::{self, Photo};
+use crate::pose::Geometry;
+use crate::progress::{Progress, Recorded};
+use crate::run::stages::{CameraSource, Cameras, Depth, TrainColour};
+use crate::scene::PointCloud;
+use crate::synth::{self, Knobs};
+use glam::DVec2;
+use std::error::Error as _;
+use std::path::Path;
+use std::sync::Mutex;
+use std::time::Duration;
+
+const STEPS: usize = 60;
+
+fn device() -> Device {
+    Device::with(&Options { deterministic: true, ..Options::from_env(None) }).unwrap()
+}
+
+/// Three photos of a generated scene, and its exact cameras with a point for every fourth pixel.
+fn scene() -> (Vec<Photo>, Geometry) {
+    let knobs = Knobs { seed: 1000, views: 3, size: (96, 72), ..Knobs::default() };
+    let world = synth::world(&knobs).unwrap();
+    let (mut photos, mut points) = (Vec::new(), PointCloud::default());
+    for (view, camera) in world.train.iter().enumerate() {
+        let seen = synth::render(&world, camera, 0.0, 0);
+        for (x, y) in (0..72).step_by(2).flat_map(|y| (0..96).step_by(2).map(move |x| (x, y))) {
+            let z = seen.depth.data[y * 96 + x];
+            if z > 0.0 {
+                let pixel = DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
+                points.positions.push(camera.unproject(pixel, f64::from(z)).as_vec3().to_array());
+                points.colours.push(seen.image.data[y * 96 + x]);
+                points.confidence.push(1.0);
+                points.view.push(view as u8);
+                points.radius.push(z / camera.fx as f32);
+            }
+        }
+        let name = format!("{view}.png");
+        photos.push(photo::from_pixels(Path::new(&name), &seen.image, Some(camera.fx), 96).unwrap());
+    }
+    let geometry = Geometry { cameras: world.train.clone(), points, ..Geometry::default() };
+    (photos, geometry)
+}
+
+/// The steps after which figures were reported.
+#[derive(Default)]
+struct Steps(Mutex<Vec<u64>>);
+
+impl Progress for Steps {
+    fn begin(&self, _: &'static str, _: u64) {}
+    fn step(&self, _: u64, _: &str) {}
+    fn figures(&self, step: u64, _: &[(&str, f64)]) {
+        self.0.lock().unwrap().push(step);
+    }
+    fn end(&self) {}
+    fn warn(&self, _: &str) {}
+}
+
+/// Trains, and says which steps were reported.
+fn train(device: &Device, store: &Store) -> (crate::Result<Trained>, Vec<u64>) {
+    let (photos, geometry) = scene();
+    let mut graph = Graph::default();
+    let cameras = Cameras::new(photos, CameraSource::Complete(geometry), 0).unwrap();
+    let placed = graph.add(cameras, ());
+    let geometry = graph.add(Depth { preset: Preset::Draft, seed: 0 }, (placed,));
+    let options = RgbOptions::preset(Preset::Draft).with_iterations(STEPS);
+    let trained = graph.add(TrainColour { options }, (placed, geometry));
+    let (steps, registry) = (Steps::default(), Registry::open(None).unwrap());
+    let made = graph
+        .run(&[trained.target()], device, &registry, store, &Recorded::new(&steps))
+        .map(|mut made| made.take(trained).unwrap());
+    (made, steps.0.into_inner().unwrap())
+}
+
+#[test]
+fn a_lost_device_is_named_and_training_goes_on_elsewhere_with_the_same_bits() {
+    let whole_device = device();
+    let (whole, _) = train(&whole_device, &Store::none());
+    let (whole, submissions) = (whole.unwrap(), whole_device.submissions());
+
+    let folder = tempfile::tempdir().unwrap();
+    let kept = || Store::at(folder.path(), true, Duration::ZERO);
+    // Before anything is kept there is nothing to go on from.
+    let lost = device();
+    lost.lose_after(0);
+    let error = train(&lost, &Store::none()).0.unwrap_err();
+    assert!(matches!(error, Error::DeviceLost { resumable: false, .. }), "{error:?}");
+    // In the middle of training, twice.
+    let mut begun = 0;
+    for share in [3, 2] {
+        let lost = device();
+        lost.lose_after(submissions / share);
+        let (error, steps) = train(&lost, &kept());
+        let error = error.unwrap_err();
+        assert!(matches!(error, Error::DeviceLost { resumable: true, .. }), "{error:?}");
+        assert!(error.source().is_some() && error.exit_code() == 1);
+        let text = error.to_string();
+        assert!(text.contains("the device was lost") && text.contains("--resume"), "{text}");
+        assert!(!text.contains('\n') && steps.first().is_some_and(|s| *s >= begun), "{steps:?}");
+        begun = steps.last().copied().unwrap();
+        // Nothing works on it any more, and nothing hangs.
+        let buffer = lost.buffer::<u32>("after", 4).unwrap();
+        let mut after = Recorder::new(&lost, "after");
+        after.fill(&buffer, 1);
+        assert!(matches!(after.run(), Err(Error::DeviceLost { .. })));
+    }
+    assert!(begun > 0 && begun < STEPS as u64, "lost in the middle: step {begun}");
+    let (resumed, steps) = train(&device(), &kept());
+    let resumed = resumed.unwrap();
+    assert!(steps[0] >= begun, "it goes on where it was: {steps:?} after {begun}");
+    assert!(resumed.splats == whole.splats && resumed.cameras == whole.cameras, "the same bits");
+}
