@@ -5,12 +5,7 @@ use crate::scene::{LEVEL_NAMES, Plane, RgbImage};
 use crate::{Error, Result};
 use exr::prelude as ex;
 use std::collections::BTreeMap;
-use std::io::BufWriter;
 use std::path::Path;
-
-fn file(path: &Path) -> Result<BufWriter<std::fs::File>> {
-    Ok(BufWriter::new(std::fs::File::create(path).map_err(Error::unwritable(path))?))
-}
 
 fn picture_error(path: &Path) -> impl FnOnce(image::ImageError) -> Error {
     move |e| match e {
@@ -26,11 +21,11 @@ fn write_bytes(
     colour: image::ExtendedColorType,
 ) -> Result<()> {
     use image::ImageEncoder;
-    use std::io::Write;
-    let mut out = file(path)?;
+    // Through memory: the encoder keeps of an error of the disk only its text.
+    let mut out = Vec::new();
     let encoder = image::codecs::png::PngEncoder::new(&mut out);
     encoder.write_image(bytes, size.0 as u32, size.1 as u32, colour).map_err(picture_error(path))?;
-    out.flush().map_err(Error::unwritable(path))
+    std::fs::write(path, out).map_err(Error::unwritable(path))
 }
 
 /// 8-bit RGB PNG.
