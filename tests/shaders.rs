@@ -90,7 +90,7 @@ fn element_of(module: &naga::Module, block: naga::Handle<naga::Type>) -> String 
 fn elements_are_what_the_modules_read() {
     let structures = [
         ("CameraView", size_of::<shaders::structs::CameraView>()),
-        ("Source", size_of::<shaders::structs::Source>()),
+        ("SourceView", size_of::<shaders::structs::SourceView>()),
     ];
     let mut kinds = std::collections::BTreeSet::new();
     for module in modules() {

@@ -7,9 +7,9 @@ use crate::infer::Registry;
 use crate::photo::{self, Photo};
 use crate::pose::Geometry;
 use crate::progress::{Progress, Recorded};
-use crate::run::stages::{CameraSource, Cameras, Depth, TrainColour};
+use crate::run::stages::{CameraOrigin, Cameras, DenseDepth, TrainColour};
 use crate::scene::PointCloud;
-use crate::synth::{self, Knobs};
+use crate::synth::{self, SceneSpec};
 use glam::DVec2;
 use std::error::Error as _;
 use std::path::Path;
@@ -24,8 +24,8 @@ fn device() -> Device {
 
 /// Three photos of a generated scene, and its exact cameras with a point for every fourth pixel.
 fn scene() -> (Vec<Photo>, Geometry) {
-    let knobs = Knobs { seed: 1000, views: 3, size: (96, 72), ..Knobs::default() };
-    let world = synth::world(&knobs).unwrap();
+    let spec = SceneSpec { seed: 1000, views: 3, size: (96, 72), ..SceneSpec::default() };
+    let world = synth::build_scene(&spec).unwrap();
     let (mut photos, mut points) = (Vec::new(), PointCloud::default());
     for (view, camera) in world.train.iter().enumerate() {
         let seen = synth::render(&world, camera, 0.0, 0);
@@ -65,9 +65,9 @@ impl Progress for Steps {
 fn train(device: &Device, store: &Store) -> (crate::Result<Trained>, Vec<u64>) {
     let (photos, geometry) = scene();
     let mut graph = Graph::default();
-    let cameras = Cameras::new(photos, CameraSource::Complete(geometry), 0).unwrap();
+    let cameras = Cameras::new(photos, CameraOrigin::GivenGeometry(geometry), 0).unwrap();
     let placed = graph.add(cameras, ());
-    let geometry = graph.add(Depth { preset: Preset::Draft, seed: 0 }, (placed,));
+    let geometry = graph.add(DenseDepth { preset: Preset::Draft, seed: 0 }, (placed,));
     let options = RgbOptions::preset(Preset::Draft).with_iterations(STEPS);
     let trained = graph.add(TrainColour { options }, (placed, geometry));
     let (steps, registry) = (Steps::default(), Registry::open(None).unwrap());

@@ -111,7 +111,7 @@ fn finished_stages_are_not_run_again_and_their_warnings_stay() {
 #[test]
 fn a_full_disk_costs_the_next_run_time_and_this_one_nothing() {
     let (machine, folder) = (Machine::new(), tempfile::tempdir().unwrap());
-    let kept = || Store::at(folder.path(), true, PATIENCE);
+    let kept = || Store::at(folder.path(), true, TIMEOUT);
     assert_eq!(chain(&machine, &kept(), 2).0, [1, 1, 1]);
     let files: Vec<_> = Store::list(folder.path()).into_iter().map(|f| f.0).collect();
     for file in &files {
