@@ -108,7 +108,7 @@ fn elements_are_what_the_modules_read() {
             kinds.insert(binding.element);
         }
     }
-    assert_eq!(kinds.into_iter().collect::<Vec<_>>(), ["CameraView", "Source", "f32", "i32", "u32"]);
+    assert_eq!(kinds.into_iter().collect::<Vec<_>>(), ["CameraView", "SourceView", "f32", "i32", "u32"]);
 }
 
 /// Every `const NAME: TYPE = VALUE;` of the Rust sources.

@@ -47,8 +47,8 @@ pub struct Choice {
 }
 
 /// A photo that is not used. Stored as `[photo, reason]`.
-#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
-#[serde(into = "(String, Reason)")]
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(into = "(String, Reason)", from = "(String, Reason)")]
 pub struct LeftOut {
     /// Its name.
     pub photo: String,
@@ -62,8 +62,14 @@ impl From<LeftOut> for (String, Reason) {
     }
 }
 
+impl From<(String, Reason)> for LeftOut {
+    fn from((photo, reason): (String, Reason)) -> LeftOut {
+        LeftOut { photo, reason }
+    }
+}
+
 /// Why a photo is not used.
-#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Reason {
@@ -78,6 +84,8 @@ pub enum Reason {
     /// The photos used show most of what it shows.
     #[serde(rename = "adds_little")]
     LittleNewArea,
+    /// Its place among the others could not be found surely: so many percent of its matches agree with any cameras.
+    Doubtful(u8),
 }
 
 /// Finds the photos of files, folders and videos and chooses `views` of them (`None`: all, at most

@@ -1,4 +1,6 @@
 //! Photos to cameras, and from cameras to depth (docs/method.md#geometry).
+use super::choose::LeftOut;
+use super::leave_out::{self, DOUBTFUL, Placed};
 use super::stereo::{self, StereoOptions};
 use super::{Geometry, Keypoints, SparseModel, light, sfm};
 use crate::gpu::Device;
@@ -19,11 +21,14 @@ pub struct SolvedCameras {
     pub photos: Vec<Photo>,
     /// Their cameras and sparse points.
     pub model: SparseModel,
+    /// Photos whose place could not be found surely.
+    pub left_out: Vec<LeftOut>,
     /// Where the cameras come from, for run.json.
     pub method: String,
 }
 
-/// Cameras of the photos, from the photos themselves (`cameras` = None; `seed` draws the samples of RANSAC) or as given.
+/// Cameras of the photos, from the photos themselves (`cameras` = None; `seed` draws the samples of RANSAC) or as given. From
+/// the photos themselves only those get one whose place can be found surely.
 pub fn place(
     photos: Vec<Photo>,
     cameras: Option<&[Camera]>,
@@ -31,7 +36,14 @@ pub fn place(
     seed: u64,
     progress: &dyn Progress,
 ) -> Result<SolvedCameras> {
-    let model = sparse(&photos, cameras, Some(registry), seed, progress)?;
+    let features = learned_features(&photos, registry, progress)?;
+    let Placed { photos, model, left_out } = match cameras {
+        Some(known) => {
+            let model = sfm::with_cameras(&photos, &assigned(&photos, known)?, &features, progress)?;
+            Placed { photos, model, left_out: Vec::new() }
+        }
+        None => leave_out::place(photos, features, seed, progress)?,
+    };
     if let Some(sigma) = model.focal_log_sigma.filter(|s| *s > UNSURE_FOCAL) {
         progress.warn(&format!(
             "the photos leave the focal length open by ±{:.0} %: depth may be stretched; photos from more different \
@@ -49,7 +61,7 @@ pub fn place(
     photos.iter_mut().for_each(|p| p.fine = None);
     let photos = light::equalised(photos, &model, progress);
     let method = if cameras.is_some() { "cameras + stereo" } else { "sfm (corners + XFeat) + stereo" };
-    Ok(SolvedCameras { photos, model, method: method.into() })
+    Ok(SolvedCameras { photos, model, left_out, method: method.into() })
 }
 
 /// Depth maps and points of placed photos by stereo.
@@ -72,10 +84,6 @@ pub fn dense(
 const STRANGE: f64 = 4.0;
 /// … and by at least this share of the long side (half a pixel at 640) does not fit the model.
 const STRANGE_SHARE: f64 = 0.5 / 640.0;
-
-/// A photo of whose matches fewer agree with the cameras is in doubt: 0.93 and more where they are right on the tuning sets, 0.28
-/// to 0.8 where one is wrong.
-const DOUBTFUL: f64 = 0.85;
 
 /// Distance of the principal point from the middle, share of the long side, that no lens has: stabilised sensors move by a
 /// hundredth.
@@ -135,25 +143,6 @@ pub fn learned_features(
     }
     progress.end();
     Ok(out)
-}
-
-/// Cameras and sparse points by structure from motion (`cameras` = None) or for known cameras. Without a registry only
-/// the built-in corner detector is used.
-pub fn sparse(
-    photos: &[Photo],
-    cameras: Option<&[Camera]>,
-    registry: Option<&Registry>,
-    seed: u64,
-    progress: &dyn Progress,
-) -> Result<SparseModel> {
-    let features = match registry {
-        Some(r) => learned_features(photos, r, progress)?,
-        None => Vec::new(),
-    };
-    match cameras {
-        Some(c) => sfm::with_cameras(photos, &assigned(photos, c)?, &features, progress),
-        None => sfm::reconstruct(photos, &features, seed, progress),
-    }
 }
 
 /// One camera per photo, at working resolution, by file name without extension.

@@ -4,6 +4,7 @@ mod bundle;
 pub mod choose;
 mod geometry;
 mod initialise;
+mod leave_out;
 pub mod light;
 pub mod matching;
 mod minimal;
@@ -20,5 +21,5 @@ mod testing;
 mod two_view;
 
 pub use geometry::{Fitted, Geometry, SparseModel, SparsePoint};
-pub use initialise::{SolvedCameras, dense, learned_features, place, sparse};
+pub use initialise::{SolvedCameras, dense, learned_features, place};
 pub use matching::Keypoints;

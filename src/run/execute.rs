@@ -5,6 +5,7 @@ use super::outcome::RunOutcome;
 use super::plan::RunPlan;
 use super::record;
 use super::sources::{self, GraphBuilder};
+use super::stages::PlacedPhotos;
 use crate::Result;
 use crate::format::Workspace;
 use crate::format::scene_dir::{self, Contents};
@@ -85,12 +86,14 @@ fn work(
     let mut made = build.graph.run(&scene.targets(), device, registry, store, progress)?;
     registry.compute().report(progress)?;
     let (trained, language) = (made.take(scene.trained)?, made.take(scene.language)?);
+    let PlacedPhotos { photos, left_out, .. } = made.take(scene.placed)?;
     Ok(RunOutcome {
         plan: plan.clone(),
         preset,
         device: device.info().clone(),
         choice: None,
-        photos: made.take(scene.placed)?.photos,
+        photos,
+        left_out,
         geometry: made.take(scene.geometry)?,
         cameras: trained.cameras,
         splats: language.splats,

@@ -25,6 +25,8 @@ pub struct RunOutcome {
     pub choice: Option<pose::choose::Choice>,
     /// Photos at working resolution.
     pub photos: Vec<Photo>,
+    /// Photos whose place could not be found surely.
+    pub left_out: Vec<pose::choose::LeftOut>,
     /// Geometry before training.
     pub geometry: Geometry,
     /// Refined cameras.

@@ -50,6 +50,7 @@ fn statistics(o: &RunOutcome) -> serde_json::Value {
     json!({
         "photos": o.photos.iter().map(|p| p.path.display().to_string()).collect::<Vec<_>>(),
         "choice": o.choice,
+        "left_out": o.left_out,
         "working_sizes": working_sizes(&o.photos),
         "geometry": {
             "method": o.geometry.method, "points": o.geometry.points.len(),
@@ -168,9 +169,13 @@ fn answer_json(a: &Answers) -> serde_json::Value {
 fn figures(o: &RunOutcome) -> Vec<(String, String)> {
     let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
     // Which, and why, is said when they are chosen, and in run.json.
-    let chosen = o.choice.as_ref().map_or(String::new(), |c| {
+    let mut chosen = o.choice.as_ref().map_or(String::new(), |c| {
         format!("; {} chosen of {}", c.used.len(), c.used.len() + c.left_out.len())
     });
+    if !o.left_out.is_empty() {
+        let names: Vec<&str> = o.left_out.iter().map(|l| l.photo.as_str()).collect();
+        chosen += &format!("; left out: {}", names.join(", "));
+    }
     let mut list = vec![
         ("device".to_owned(), format!("{}{cpu}", o.device.name)),
         ("photos".to_owned(), sizes(&o.photos) + &chosen),

@@ -1,6 +1,6 @@
 use super::*;
 use crate::math::Random;
-use crate::pose::{SparsePoint, sparse, testing};
+use crate::pose::{SparsePoint, sfm, testing};
 use crate::progress::Silent;
 use crate::scene::{Camera, Pose, RgbImage, to_linear, to_srgb};
 use glam::DVec2;
@@ -149,7 +149,7 @@ fn a_photo_in_another_light_is_named() {
 fn real_points_tell_the_light_of_real_photos() {
     let truth = testing::train(&testing::folder());
     let cameras: Vec<Camera> = truth.cameras;
-    let model = sparse(&truth.photos, Some(&cameras), None, 0, &Silent).unwrap();
+    let model = sfm::with_cameras(&truth.photos, &cameras, &[], &Silent).unwrap();
     let none = estimate(&truth.photos, &model);
     eprintln!("steady: {:?} {:?}", none.lights, none.unexplained);
     assert!(none.lights.iter().all(Light::is_none), "{:?}", none.lights);

@@ -12,6 +12,7 @@ mod tracks;
 
 use super::SparseModel;
 use super::bundle::{Optics, OpticsPrior};
+use super::choose::Reason;
 use super::matching::Keypoints;
 use crate::photo::Photo;
 use crate::progress::Progress;
@@ -43,9 +44,9 @@ pub fn reconstruct(
     features: &[Keypoints],
     seed: u64,
     progress: &dyn Progress,
-) -> Result<SparseModel> {
+) -> Result<SparseModel, Unplaced> {
     if photos.len() < 2 {
-        return Err(Error::input("cameras need at least two photos; give two or more"));
+        return Err(Error::input("cameras need at least two photos; give two or more").into());
     }
     progress.begin("cameras", STEPS);
     progress.step(0, "corners");
@@ -62,6 +63,28 @@ pub fn reconstruct(
     progress.step(STEPS, &format!("{} points", model.points.len()));
     progress.end();
     Ok(model)
+}
+
+/// Why there are no cameras for all photos.
+#[derive(Debug)]
+pub struct Unplaced {
+    /// Photos without which the others may have cameras, ascending, each with what is wrong with it; empty if that is not
+    /// known.
+    pub views: Vec<(usize, Reason)>,
+    /// The same in words.
+    pub error: Error,
+}
+
+impl From<Error> for Unplaced {
+    fn from(error: Error) -> Unplaced {
+        Unplaced { views: Vec::new(), error }
+    }
+}
+
+impl From<Unplaced> for Error {
+    fn from(unplaced: Unplaced) -> Error {
+        unplaced.error
+    }
 }
 
 /// Steps of the progress bar: corners, matches, poses, refinement, extension.
@@ -134,7 +157,7 @@ fn assemble(
     mut empty: Model,
     pairs: &[Pair],
     progress: &dyn Progress,
-) -> Result<Model> {
+) -> Result<Model, Unplaced> {
     let mut links: Vec<KeypointMatch> =
         pairs.iter().flat_map(|p| p.matches.list.iter().map(|m| m.2)).collect();
     let tracks = tracks::join(&mut links, points);
@@ -166,7 +189,9 @@ fn assemble(
         let model = match grow(start, &tracks, pairs, seed, threshold) {
             Ok(model) => model,
             Err(s) => {
-                stuck = s.left;
+                if stuck.is_empty() || s.left.len() < stuck.len() {
+                    stuck = s.left;
+                }
                 continue;
             }
         };
@@ -181,10 +206,11 @@ fn assemble(
     }
     let names = || stuck.iter().map(|v| photos[*v].stem.as_str()).collect::<Vec<_>>().join(", ");
     best.map(|b| b.1).ok_or_else(|| {
-        Error::input(format!(
+        let error = Error::input(format!(
             "no camera position found for {}; these photos share too little with the others: replace them or add photos in between",
             names()
-        ))
+        ));
+        Unplaced { views: stuck.iter().map(|v| (*v, Reason::NoOverlap)).collect(), error }
     })
 }
 

@@ -1,7 +1,9 @@
 //! What pairs of photos have in common: matches by descriptors, and the geometry on which they agree.
+use super::Unplaced;
 use super::model::Model;
 use super::tracks::KeypointMatch;
 use crate::photo::Photo;
+use crate::pose::choose::Reason;
 use crate::pose::matching::{self, Keypoints, Match};
 use crate::pose::two_view::{self, TwoView};
 use crate::progress::Progress;
@@ -53,7 +55,7 @@ pub(super) fn pairs(
     putative: &[Matches],
     empty: &Model,
     progress: &dyn Progress,
-) -> Result<Vec<Pair>> {
+) -> Result<Vec<Pair>, Unplaced> {
     let related = |pair: &Matches| {
         let relation = match progress.cancelled() {
             true => Relation::Apart,
@@ -144,8 +146,8 @@ fn same_picture(a: &RgbImage, b: &RgbImage) -> bool {
     sum / (3.0 * a.data.len().max(1) as f64) < 0.004
 }
 
-/// A clear error unless the usable pairs connect all photos.
-fn check_overlap(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Result<()> {
+/// A clear error unless the usable pairs connect all photos; it names those outside the largest part that they connect.
+fn check_overlap(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Result<(), Unplaced> {
     let n = photos.len();
     let name = |i: &usize, j: &usize| format!("{}–{}", photos[*i].stem, photos[*j].stem);
     let list = |test: fn(&Relation) -> bool| {
@@ -153,28 +155,40 @@ fn check_overlap(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Re
     };
     let same = list(|r| matches!(r, Relation::Same));
     if !same.is_empty() {
-        return Err(Error::input(format!("identical photos: {same}; give photos from different positions")));
-    }
-    let mut reached = vec![false; n];
-    reached[0] = true;
-    for _ in 0..n {
-        for (i, j, r) in relations {
-            if matches!(r, Relation::Usable(..)) && (reached[*i] || reached[*j]) {
-                (reached[*i], reached[*j]) = (true, true);
+        // Pairs stand in the order of their first photo: that one stays.
+        let mut views: Vec<(usize, Reason)> = Vec::new();
+        for (i, j, _) in relations.iter().filter(|r| matches!(r.2, Relation::Same)) {
+            if views.iter().all(|v| v.0 != *j) {
+                views.push((*j, Reason::Duplicate(photos[*i].stem.clone())));
             }
         }
+        views.sort_by_key(|v| v.0);
+        let text = format!("identical photos: {same}; give photos from different positions");
+        return Err(Unplaced { views, error: Error::input(text) });
     }
-    if reached.iter().all(|r| *r) {
+    // The part that a photo belongs to, by its first photo.
+    let mut part: Vec<usize> = (0..n).collect();
+    for (i, j, _) in relations.iter().filter(|r| matches!(r.2, Relation::Usable(..))) {
+        let (a, b) = (part[*i].min(part[*j]), part[*i].max(part[*j]));
+        part.iter_mut().filter(|p| **p == b).for_each(|p| *p = a);
+    }
+    let size = |of: usize| part.iter().filter(|p| **p == of).count();
+    let largest = (0..n).max_by_key(|p| (size(*p), std::cmp::Reverse(*p))).unwrap_or(0);
+    let apart = (0..n).filter(|v| part[*v] != largest);
+    let views: Vec<_> = apart.map(|v| (v, Reason::NoOverlap)).collect();
+    if views.is_empty() {
         return Ok(());
     }
     let turned = list(|r| matches!(r, Relation::NoParallax));
-    if !turned.is_empty() {
-        return Err(Error::input(format!(
+    let text = if turned.is_empty() {
+        let apart = list(|r| matches!(r, Relation::Apart));
+        format!(
+            "photos do not overlap enough: {apart}; take photos that share at least half of what they show"
+        )
+    } else {
+        format!(
             "no parallax between {turned}: the camera only turned; take the photos from different positions"
-        )));
-    }
-    let apart = list(|r| matches!(r, Relation::Apart));
-    Err(Error::input(format!(
-        "photos do not overlap enough: {apart}; take photos that share at least half of what they show"
-    )))
+        )
+    };
+    Err(Unplaced { views, error: Error::input(text) })
 }

@@ -89,7 +89,7 @@ fn turned(photo: &Photo, focal: f64, angle: f64) -> Photo {
 
 /// The error for photos that cannot be reconstructed: one line, exit code 2, naming the photos.
 fn refusal(photos: &[Photo]) -> String {
-    let error = reconstruct(photos, &[], 0, &Silent).unwrap_err();
+    let error = reconstruct(photos, &[], 0, &Silent).unwrap_err().error;
     let text = error.to_string();
     assert!(error.exit_code() == 2 && !text.contains('\n') && text.contains(&photos[1].stem), "{text}");
     text

@@ -5,6 +5,7 @@ use crate::infer::installed::Installed;
 use crate::infer::pairs;
 use crate::photo::Photo;
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
+use crate::pose::choose::LeftOut;
 use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, SparseModel, pointmap};
 use crate::scene::Camera;
@@ -27,8 +28,10 @@ pub enum CameraOrigin {
 /// Photos as all later stages take them, without lens distortion and in one light, and what is known of their cameras.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct PlacedPhotos {
-    /// The photos.
+    /// The photos that have a camera.
     pub photos: Vec<Photo>,
+    /// Those whose place could not be found surely.
+    pub left_out: Vec<LeftOut>,
     /// How far geometry is known.
     pub known: KnownGeometry,
 }
@@ -104,6 +107,7 @@ impl Stage for Cameras {
                         let method = format!("{} pointmaps", model.name);
                         return Ok(PlacedPhotos {
                             photos,
+                            left_out: Vec::new(),
                             known: KnownGeometry::Complete(Geometry { method, ..geometry }),
                         });
                     }
@@ -117,14 +121,15 @@ impl Stage for Cameras {
                 None
             }
             CameraOrigin::GivenGeometry(geometry) => {
-                return Ok(PlacedPhotos { photos, known: KnownGeometry::Complete(geometry.clone()) });
+                let known = KnownGeometry::Complete(geometry.clone());
+                return Ok(PlacedPhotos { photos, left_out: Vec::new(), known });
             }
             CameraOrigin::Sfm => None,
             CameraOrigin::Known(cameras) => Some(cameras.as_slice()),
         };
-        let pose::SolvedCameras { photos, model, method } =
+        let pose::SolvedCameras { photos, model, left_out, method } =
             pose::place(photos, known, context.registry, self.seed, progress)?;
-        Ok(PlacedPhotos { photos, known: KnownGeometry::Sparse(model, method) })
+        Ok(PlacedPhotos { photos, left_out, known: KnownGeometry::Sparse(model, method) })
     }
 }
 

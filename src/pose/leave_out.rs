@@ -1,0 +1,120 @@
+//! Cameras of as many photos as hold together (docs/method.md#photos-left-out). A photo in a wrong place spoils the others: splats are
+//! trained to explain what it shows from there.
+use super::SparseModel;
+use super::choose::{LeftOut, Reason};
+use super::matching::Keypoints;
+use super::sfm::{self, Unplaced};
+use crate::Result;
+use crate::photo::Photo;
+use crate::progress::Progress;
+
+/// Share of a photo's matches with the others that agree with the cameras, below which its place is in doubt: 0.93 and more
+/// where all are right on the tuning sets, 0.28 to 0.8 where one is wrong.
+pub(super) const DOUBTFUL: f64 = 0.85;
+
+/// Photos that have cameras.
+pub(super) struct Placed {
+    pub(super) photos: Vec<Photo>,
+    pub(super) model: SparseModel,
+    /// The others, in the order in which they were left out.
+    pub(super) left_out: Vec<LeftOut>,
+}
+
+/// Structure from motion with all photos that it can place surely, as long as those are more than half of them; what fewer
+/// agree on says nothing about the others. `features` are one per photo.
+pub(super) fn place(
+    mut photos: Vec<Photo>,
+    mut features: Vec<Keypoints>,
+    seed: u64,
+    progress: &dyn Progress,
+) -> Result<Placed> {
+    let given = photos.len();
+    let mut left_out = Vec::new();
+    loop {
+        let found = sfm::reconstruct(&photos, &features, seed, progress);
+        let views: Vec<(usize, Reason)> = match &found {
+            Ok(model) => least_sure(model).into_iter().collect(),
+            Err(Unplaced { views, .. }) => views.clone(),
+        };
+        let rest = photos.len() - views.len();
+        if views.is_empty() || rest < 2 || 2 * rest <= given {
+            return Ok(Placed { photos, model: found?, left_out });
+        }
+        for (view, reason) in views.into_iter().rev() {
+            let photo = photos.remove(view);
+            if view < features.len() {
+                features.remove(view);
+            }
+            progress.warn(&message(&photo.stem, &reason));
+            left_out.push(LeftOut { photo: photo.stem, reason });
+        }
+    }
+}
+
+/// The photo whose place is most in doubt, if that of any is.
+fn least_sure(model: &SparseModel) -> Option<(usize, Reason)> {
+    let shares = model.fitted.iter().map(|f| f.agreement).enumerate();
+    let (view, share) = shares.filter(|s| s.1 < DOUBTFUL).min_by(|a, b| a.1.total_cmp(&b.1))?;
+    Some((view, Reason::Doubtful((100.0 * share).round() as u8)))
+}
+
+fn message(stem: &str, reason: &Reason) -> String {
+    const JOIN: &str = "a photo from between it and the others would join it to them";
+    match reason {
+        Reason::Duplicate(other) => format!("{stem} is left out: it is the same picture as {other}"),
+        Reason::Doubtful(percent) => format!(
+            "{stem} is left out: only {percent} % of its matches with the other photos agree with the place that was found \
+             for it; {JOIN}"
+        ),
+        _ => format!("{stem} is left out: it shares too little with the other photos; {JOIN}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pose::testing;
+    use crate::progress::{Recorded, Silent};
+
+    fn grey(photo: &Photo) -> Photo {
+        let mut sky = photo.clone();
+        sky.stem = "sky".into();
+        sky.image.data.iter_mut().enumerate().for_each(|(i, c)| *c = [0.4, 0.6, 0.5 + 1e-7 * i as f32]);
+        sky
+    }
+
+    #[test]
+    fn a_photo_of_something_else_is_left_out_by_name_and_the_others_stay_right() {
+        let truth = testing::train(&testing::folder());
+        let mut photos = truth.photos.clone();
+        photos.insert(1, grey(&photos[0]));
+        let recorded = Recorded::new(&Silent);
+        let placed = place(photos, Vec::new(), 0, &recorded).unwrap();
+        let names: Vec<&str> = placed.photos.iter().map(|p| p.stem.as_str()).collect();
+        assert_eq!(names, ["train_00", "train_01", "train_02", "train_03"]);
+        assert_eq!(placed.left_out, [LeftOut { photo: "sky".into(), reason: Reason::NoOverlap }]);
+        assert!(recorded.warnings()[0].starts_with("sky is left out: it shares too little"));
+        let e = crate::pose::align::pose_errors(&placed.model.cameras, &truth.cameras, truth.mean_depth);
+        assert!(e.rotation_degrees.iter().all(|v| *v < 0.05), "{e:?}");
+    }
+
+    #[test]
+    fn half_of_the_photos_are_not_left_out() {
+        let truth = testing::train(&testing::folder());
+        let mut sky = grey(&truth.photos[0]);
+        sky.stem = "sky".into();
+        let error = place(vec![truth.photos[0].clone(), sky], Vec::new(), 0, &Silent).err().unwrap();
+        assert!(error.to_string().contains("do not overlap") && error.exit_code() == 2, "{error}");
+    }
+
+    #[test]
+    fn the_photo_that_agrees_least_is_the_one_in_doubt() {
+        let fitted = |agreement| crate::pose::Fitted { agreement, ..Default::default() };
+        let model = |shares: &[f64]| SparseModel {
+            fitted: shares.iter().map(|s| fitted(*s)).collect(),
+            ..SparseModel::default()
+        };
+        assert_eq!(least_sure(&model(&[0.93, 0.98, 0.86])), None);
+        assert_eq!(least_sure(&model(&[0.8, 0.98, 0.3])), Some((2, Reason::Doubtful(30))));
+    }
+}
