@@ -9,6 +9,7 @@ mod patch;
 mod refine;
 mod relate;
 mod tracks;
+mod unplaced;
 
 use super::SparseModel;
 use super::bundle::{Optics, OpticsPrior};
@@ -26,6 +27,7 @@ pub use known::with_cameras;
 use model::{Freedom, Model, Sighting};
 use relate::{Pair, THRESHOLD};
 use tracks::KeypointMatch;
+pub use unplaced::Unplaced;
 
 /// ln f of a photo without EXIF: 0.9 × the long side covers phones (0.8) to normal lenses (1.2) within one σ.
 const FOCAL_GUESS: f64 = 0.9;
@@ -63,28 +65,6 @@ pub fn reconstruct(
     progress.step(STEPS, &format!("{} points", model.points.len()));
     progress.end();
     Ok(model)
-}
-
-/// Why there are no cameras for all photos.
-#[derive(Debug)]
-pub struct Unplaced {
-    /// Photos without which the others may have cameras, ascending, each with what is wrong with it; empty if that is not
-    /// known.
-    pub views: Vec<(usize, Reason)>,
-    /// The same in words.
-    pub error: Error,
-}
-
-impl From<Error> for Unplaced {
-    fn from(error: Error) -> Unplaced {
-        Unplaced { views: Vec::new(), error }
-    }
-}
-
-impl From<Unplaced> for Error {
-    fn from(unplaced: Unplaced) -> Error {
-        unplaced.error
-    }
 }
 
 /// Steps of the progress bar: corners, matches, poses, refinement, extension.

@@ -1,7 +1,7 @@
 //! What pairs of photos have in common: matches by descriptors, and the geometry on which they agree.
-use super::Unplaced;
 use super::model::Model;
 use super::tracks::KeypointMatch;
+use super::unplaced::Unplaced;
 use crate::photo::Photo;
 use crate::pose::choose::Reason;
 use crate::pose::matching::{self, Keypoints, Match};
