@@ -4,7 +4,7 @@ use crate::infer::Registry;
 use crate::photo;
 use crate::pose::align::pose_errors;
 use crate::pose::relative::{auc, pair_errors};
-use crate::pose::{self, SolvedCameras};
+use crate::pose::{self, Confidence, SolvedCameras};
 use crate::progress::Progress;
 use crate::query::eval::{GroundTruth, Split, TruthFrame};
 use crate::scene::Lens;
@@ -19,8 +19,8 @@ use std::time::Instant;
 pub struct CameraRow {
     /// Its folder.
     pub data: PathBuf,
-    /// Train frames.
-    pub photos: usize,
+    /// Photos used, by stem.
+    pub photos: Vec<String>,
     /// From files to cameras.
     pub seconds: f64,
     /// The figures, or why there are none.
@@ -60,6 +60,10 @@ pub struct CameraFigures {
     pub auc: [Option<f64>; 3],
     /// Worst offset of the principal point from the true one, over the width.
     pub principal_point: f64,
+    /// Worst stated standard deviation of a rotation against the first photo, degrees.
+    pub rotation_sigma_degrees: f64,
+    /// That of the least sure camera.
+    pub confidence: Option<Confidence>,
     /// The lens that was found, of the first photo.
     pub lens: Lens,
     /// The true lens, if the data state it.
@@ -84,6 +88,21 @@ pub struct CameraReport {
     pub median_centre_fraction: Option<f64>,
     /// Mean AUC up to 3, 5 and 30 degrees; a set without cameras counts 0.
     pub mean_auc: [Option<f64>; 3],
+    /// Sets by the confidence of their least sure camera, with their worst pair.
+    pub by_confidence: Vec<ConfidenceRow>,
+}
+
+/// What a level of confidence was worth.
+#[derive(Clone, Debug, Serialize)]
+pub struct ConfidenceRow {
+    /// The level.
+    pub confidence: Confidence,
+    /// Sets whose least sure camera has it.
+    pub sets: usize,
+    /// Those of them with every relative rotation within one degree.
+    pub within_one_degree: usize,
+    /// The worst angle between relative rotations in any, degrees.
+    pub worst_rotation_degrees: f64,
 }
 
 /// Which pixels of the photos are used.
@@ -93,6 +112,8 @@ pub struct PhotoInput {
     pub max_size: usize,
     /// Only the working image, as if the files were no larger.
     pub copies: bool,
+    /// Every two train frames by themselves instead of all together.
+    pub pairs: bool,
 }
 
 /// Degrees up to which recall is added up.
@@ -109,29 +130,36 @@ pub fn measure(
     let truths = sets.iter().map(|s| GroundTruth::read(s)).collect::<Result<Vec<_>>>()?;
     let mut rows = Vec::new();
     for truth in &truths {
-        let row = measure_set(truth, input, registry, progress)?;
-        done(&row)?;
-        rows.push(row);
+        let train: Vec<&TruthFrame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
+        let first = |i: usize| train[i + 1..].iter().map(move |b| (i, *b));
+        let pairs = (0..train.len()).flat_map(first).map(|(i, b)| vec![train[i], b]);
+        let used: Vec<Vec<&TruthFrame>> = if input.pairs { pairs.collect() } else { vec![train.clone()] };
+        for frames in &used {
+            let row = measure_set(truth, frames, input, registry, progress)?;
+            done(&row)?;
+            rows.push(row);
+        }
     }
     Ok(summarise(rows))
 }
 
 fn measure_set(
     truth: &GroundTruth,
+    frames: &[&TruthFrame],
     input: PhotoInput,
     registry: &Registry,
     progress: &dyn Progress,
 ) -> Result<CameraRow> {
-    let frames: Vec<&TruthFrame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
     let clock = Instant::now();
-    let found = find_cameras(&truth.folder, &frames, input, registry, progress);
+    let found = find_cameras(&truth.folder, frames, input, registry, progress);
     let seconds = clock.elapsed().as_secs_f64();
     let outcome = match found {
-        Ok(placed) => CameraOutcome::Figures(Box::new(figures(truth, &frames, &placed)?)),
+        Ok(placed) => CameraOutcome::Figures(Box::new(figures(truth, frames, &placed)?)),
         Err(Error::Cancelled) => return Err(Error::Cancelled),
         Err(e) => CameraOutcome::Failure(e.to_string()),
     };
-    Ok(CameraRow { data: truth.folder.clone(), photos: frames.len(), seconds, outcome })
+    let photos = frames.iter().map(|f| f.stem.clone()).collect();
+    Ok(CameraRow { data: truth.folder.clone(), photos, seconds, outcome })
 }
 
 /// What a run does before its first dense stage.
@@ -185,6 +213,10 @@ fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) 
         pair_direction_degrees: of_pairs(&|p| p.direction_degrees.unwrap_or(0.0)),
         auc: AUC_DEGREES.map(|d| auc(&pairs, asked - pairs.len().min(asked), d)),
         principal_point: offset.fold(0.0, f64::max),
+        rotation_sigma_degrees: worst(
+            &model.fitted.iter().map(|f| f.rotation_sigma.to_degrees()).collect::<Vec<_>>(),
+        ),
+        confidence: model.fitted.iter().map(pose::Fitted::confidence).min(),
         lens: model.fitted.first().map_or(Lens::NONE, |f| f.lens),
         true_lens: frames.first().and_then(|f| f.lens),
     })
@@ -210,7 +242,19 @@ fn summarise(rows: Vec<CameraRow>) -> CameraReport {
         let sum: f64 = good.iter().filter_map(|f| f.auc[k]).sum();
         (!rows.is_empty()).then(|| sum / rows.len() as f64)
     });
+    let of_level = |confidence: Confidence| {
+        let own = good.iter().filter(|f| f.confidence == Some(confidence)).map(|f| f.pair_rotation_degrees);
+        let errors: Vec<f64> = own.collect();
+        ConfidenceRow {
+            confidence,
+            sets: errors.len(),
+            within_one_degree: errors.iter().filter(|e| **e <= 1.0).count(),
+            worst_rotation_degrees: errors.iter().copied().fold(0.0, f64::max),
+        }
+    };
+    let levels = [Confidence::High, Confidence::Medium, Confidence::Low];
     CameraReport {
+        by_confidence: levels.map(of_level).into_iter().filter(|r| r.sets > 0).collect(),
         failures: rows.len() - good.len(),
         within_2_sigma: (!stated.is_empty()).then(|| within as f64 / stated.len() as f64),
         median_focal_error: median(&|f| f.focal_error.abs()),
@@ -224,7 +268,7 @@ fn summarise(rows: Vec<CameraRow>) -> CameraReport {
 /// Heads of the columns of [`CameraRow::text`].
 pub fn header() -> String {
     format!(
-        "{:<24}{:>9}{:>9}{:>6}{:>10}{:>9}{:>11}{:>11}{:>7}{:>7}{:>7}{:>8}\n",
+        "{:<32}{:>9}{:>9}{:>6}{:>10}{:>9}{:>11}{:>9}{:>11}{:>7}{:>7}{:>7}{:>8}\n",
         "data",
         "focal %",
         "sigma %",
@@ -232,6 +276,7 @@ pub fn header() -> String {
         "rotation",
         "centre %",
         "pair rot.",
+        "rot. s.",
         "pair dir.",
         "@3",
         "@5",
@@ -247,20 +292,25 @@ impl CameraRow {
             .data
             .file_name()
             .map_or_else(|| self.data.display().to_string(), |n| n.to_string_lossy().into());
+        let name = match self.photos.as_slice() {
+            [a, b] => format!("{name} {a} {b}"),
+            _ => name,
+        };
         let f = match &self.outcome {
-            CameraOutcome::Failure(why) => return format!("{name:<24}no cameras: {why}\n"),
+            CameraOutcome::Failure(why) => return format!("{name:<32}no cameras: {why}\n"),
             CameraOutcome::Figures(f) => f,
         };
         let number =
             |v: Option<f64>, digits: usize| v.map_or_else(|| "-".into(), |v| format!("{v:.digits$}"));
         format!(
-            "{name:<24}{:>9.2}{:>9}{:>6}{:>10.3}{:>9.2}{:>11.3}{:>11.3}{:>7}{:>7}{:>7}{:>8.1}\n",
+            "{name:<32}{:>9.2}{:>9}{:>6}{:>10.3}{:>9.2}{:>11.3}{:>9.3}{:>11.3}{:>7}{:>7}{:>7}{:>8.1}\n",
             100.0 * f.focal_error,
             number(f.focal_sigma.map(|s| 100.0 * s), 2),
             number(f.focal_sigmas, 1),
             f.rotation_degrees,
             100.0 * f.centre_fraction,
             f.pair_rotation_degrees,
+            f.rotation_sigma_degrees,
             f.pair_direction_degrees,
             number(f.auc[0], 3),
             number(f.auc[1], 3),
@@ -291,6 +341,16 @@ impl CameraReport {
             number(self.mean_auc[1], 3),
             number(self.mean_auc[2], 3),
         );
+        for r in &self.by_confidence {
+            let _ = writeln!(
+                out,
+                "{} confidence: {} sets, all rotations within 1 degree in {}, worst {:.2} degrees",
+                r.confidence.name(),
+                r.sets,
+                r.within_one_degree,
+                r.worst_rotation_degrees
+            );
+        }
         out
     }
 }
@@ -318,7 +378,7 @@ mod tests {
         }
         std::fs::write(dir.path().join("ground_truth.json"), truth.to_string()).unwrap();
         let mut seen = Vec::new();
-        let input = PhotoInput { max_size: crate::photo::MAX_SIZE_CPU, copies: false };
+        let input = PhotoInput { max_size: crate::photo::MAX_SIZE_CPU, copies: false, pairs: false };
         let report = measure(&[breakfast, dir.path().into()], input, &registry, &Silent, &mut |row| {
             seen.push(row.text());
             Ok(())

@@ -113,7 +113,8 @@ fn cameras(args: &BenchArgs) -> Result<()> {
     }
     writable(args.json.as_deref())?;
     let registry = args.registry()?;
-    let reading = bench::cameras::PhotoInput { max_size: args.max_size, copies: args.copies };
+    let reading =
+        bench::cameras::PhotoInput { max_size: args.max_size, copies: args.copies, pairs: args.pairs };
     let progress = progress::reporter();
     let mut header = Some(bench::cameras::header());
     let mut show =

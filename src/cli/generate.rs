@@ -58,6 +58,7 @@ fn spec(args: &GenerateArgs) -> Result<SceneSpec> {
         similar: args.similar,
         pose_noise: args.pose_noise,
         photo_noise: args.photo_noise.unwrap_or(usual),
+        outdoor: args.outdoor,
         effects,
     })
 }

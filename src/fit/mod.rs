@@ -1,4 +1,5 @@
 //! Training: losses, schedules, pruning, pose refinement.
+mod bounds;
 mod coarse;
 pub mod index_head;
 pub mod init;

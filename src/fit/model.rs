@@ -164,8 +164,11 @@ impl Model {
         }
     }
 
-    /// Keeps the given rows, optimiser state included. Features start anew.
-    pub(super) fn keep(&mut self, rows: &[u32]) -> Result<()> {
+    /// Keeps the given rows, optimiser state included; features start anew. Whether others went.
+    pub(super) fn keep(&mut self, rows: &[u32]) -> Result<bool> {
+        if rows.len() == self.count() {
+            return Ok(false);
+        }
         let (device, n) = (&self.device, rows.len());
         let index = device.buffer_from("kept rows", rows)?;
         let (degree, dim) = (self.values.sh_degree, self.values.feature_dim);
@@ -180,7 +183,7 @@ impl Model {
         self.feature_moments = Moments::new(device, n * dim)?;
         self.gradients = values.zeros_like(device)?;
         self.values = values;
-        Ok(())
+        Ok(true)
     }
 
     /// Reads the splats back; an error if any value is not finite.

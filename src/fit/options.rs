@@ -59,6 +59,9 @@ pub struct RgbOptions {
     pub min_confidence: f32,
     /// Weight of `mean max(0, s_max/s_min − 8)`, against needles; 0 = off.
     pub ratio_weight: f64,
+    /// No splat before everything that a photo shows, none larger than a share of its distance to the cameras: held at the
+    /// start, when pruning, and in the end.
+    pub bounded: bool,
     /// Drop splats with a lower opacity …
     pub prune_opacity: f32,
     /// … every so many steps (0 = never) …
@@ -132,6 +135,7 @@ impl RgbOptions {
             depth_weight: 0.02,
             min_confidence: 0.5,
             ratio_weight: 1e-3,
+            bounded: true,
             poses: Some(PoseOptions {
                 start: (iterations / 10).min(100),
                 rate: Exponential { start: 1e-4, end: 1e-6, steps: iterations },
@@ -165,6 +169,7 @@ impl RgbOptions {
             depth_weight: 0.0,
             min_confidence: 0.5,
             ratio_weight: 0.0,
+            bounded: false,
             prune_opacity: 0.005,
             prune_every: 100,
             prune_from: 200,

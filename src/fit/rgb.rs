@@ -1,4 +1,5 @@
 //! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (docs/method.md#splats).
+use super::bounds::Bounds;
 use super::coarse::{HalfSizePhotos, Photos};
 use super::init::splats_from_points;
 use super::model::Model;
@@ -91,6 +92,9 @@ pub fn train_rgb(
         let (reach, confidence) = (options.margin, options.min_confidence);
         start.append(unseen_splats(images, cameras, depths, reach, confidence, options.seed));
     }
+    if options.bounded {
+        start = Bounds::new(cameras, &points.positions).hold(start);
+    }
     super::init::raise_sh_degree(&mut start, options.sh_degree);
     let scale = SceneScale::of(cameras, points);
     fit_rgb(device, images, cameras, start, scale, depths, options, progress)
@@ -134,6 +138,7 @@ pub(crate) struct Run<'a> {
     options: &'a RgbOptions,
     scale: SceneScale,
     photos: Photos<'a>,
+    bounds: Option<Bounds>,
     /// What the first steps see instead of the photos.
     half: Option<HalfSizePhotos>,
     poses: Vec<PoseAdam>,
@@ -177,6 +182,7 @@ impl<'a> Run<'a> {
             options,
             scale,
             photos,
+            bounds: options.bounded.then(|| Bounds::new(photos.cameras, &start.means)),
             half,
             poses: vec![PoseAdam::default(); photos.cameras.len()],
             recent: Vec::new(),
@@ -239,6 +245,7 @@ impl<'a> Run<'a> {
         Ok(point)
     }
 
+    /// Drops what has faded away and holds the rest in its bounds.
     fn prune(&mut self, step: usize) -> Result<()> {
         let every = self.options.prune_every;
         if every == 0 || step < self.options.prune_from || !step.is_multiple_of(every) {
@@ -252,8 +259,17 @@ impl<'a> Run<'a> {
                 "every splat faded away by step {step}: cameras and photos do not fit together"
             )));
         }
-        if rows.len() < model.count() {
-            model.keep(&rows)?;
+        if model.keep(&rows)? {
+            self.trainer.forget_recordings();
+        }
+        self.hold()
+    }
+
+    /// Keeps splats from standing before a photo.
+    fn hold(&mut self) -> Result<()> {
+        if let Some(bounds) = &self.bounds
+            && bounds.hold_model(&mut self.trainer.model)?
+        {
             self.trainer.forget_recordings();
         }
         Ok(())
@@ -262,6 +278,7 @@ impl<'a> Run<'a> {
     /// Reads everything back and keeps the refined cameras only if they explain the photos better.
     fn finish(&mut self) -> Result<(Splats, Vec<Camera>, Vec<f64>, bool)> {
         self.leave_half_size()?;
+        self.hold()?;
         let (t, Photos { images, cameras: initial, .. }) = (&mut self.trainer, self.photos);
         let splats = t.model.splats()?;
         let mut score = |cameras: &[Camera]| -> Result<Vec<f64>> {

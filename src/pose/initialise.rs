@@ -1,6 +1,7 @@
 //! Photos to cameras, and from cameras to depth (docs/method.md#geometry).
 use super::choose::LeftOut;
-use super::leave_out::{self, DOUBTFUL, Placed};
+use super::confidence::{DOUBTFUL, DOUBTFUL_ROTATION, UNSURE_FOCAL};
+use super::leave_out::{self, Placed};
 use super::stereo::{self, StereoOptions};
 use super::{Geometry, Keypoints, SparseModel, light, sfm};
 use crate::gpu::Device;
@@ -11,9 +12,6 @@ use crate::progress::Progress;
 use crate::scene::Camera;
 use crate::{Error, Result};
 use glam::DVec2;
-
-/// Above this σ of ln f the depth of the scene is guessed more than measured: say so.
-const UNSURE_FOCAL: f64 = 0.05;
 
 /// Photos whose cameras are known, as every later stage sees them.
 pub struct SolvedCameras {
@@ -44,13 +42,7 @@ pub fn place(
         }
         None => leave_out::place(photos, features, seed, progress)?,
     };
-    if let Some(sigma) = model.focal_log_sigma.filter(|s| *s > UNSURE_FOCAL) {
-        progress.warn(&format!(
-            "the photos leave the focal length open by ±{:.0} %: depth may be stretched; photos from more different \
-             directions, or with EXIF focal length, would settle it",
-            100.0 * sigma
-        ));
-    }
+    warn_of_doubt(&photos, &model, progress);
     warn_of_misfits(&photos, &model, progress);
     progress.check()?;
     let mut photos = photos;
@@ -62,6 +54,30 @@ pub fn place(
     let photos = light::equalised(photos, &model, progress);
     let method = if cameras.is_some() { "cameras + stereo" } else { "sfm (corners + XFeat) + stereo" };
     Ok(SolvedCameras { photos, model, left_out, method: method.into() })
+}
+
+/// Says what the photos leave open of the focal length and of the angles between the cameras.
+fn warn_of_doubt(photos: &[Photo], model: &SparseModel, progress: &dyn Progress) {
+    let rotation = |f: &super::Fitted| f.rotation_sigma.to_degrees();
+    let doubtful = || photos.iter().zip(&model.fitted).filter(|(_, f)| rotation(f) > DOUBTFUL_ROTATION);
+    let worst = doubtful().map(|(_, f)| rotation(f)).fold(0.0, f64::max);
+    if let Some(sigma) = model.focal_log_sigma.filter(|s| *s > UNSURE_FOCAL) {
+        let angles = match worst > 0.0 {
+            true => format!(", and with it the angles between the cameras by up to ±{worst:.0}°"),
+            false => String::new(),
+        };
+        progress.warn(&format!(
+            "the photos leave the focal length open by ±{:.0} %{angles}: depth may be stretched; photos from more different \
+             directions, or with EXIF focal length, would settle it",
+            100.0 * sigma
+        ));
+    } else if worst > 0.0 {
+        let names: Vec<&str> = doubtful().map(|(p, _)| p.stem.as_str()).collect();
+        progress.warn(&format!(
+            "the photos leave the direction of {} open by up to ±{worst:.0}°: photos from between would settle it",
+            names.join(", ")
+        ));
+    }
 }
 
 /// Depth maps and points of placed photos by stereo.

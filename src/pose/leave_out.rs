@@ -2,15 +2,12 @@
 //! trained to explain what it shows from there.
 use super::SparseModel;
 use super::choose::{LeftOut, Reason};
+use super::confidence::DOUBTFUL;
 use super::matching::Keypoints;
 use super::sfm::{self, Unplaced};
 use crate::Result;
 use crate::photo::Photo;
 use crate::progress::Progress;
-
-/// Share of a photo's matches with the others that agree with the cameras, below which its place is in doubt: 0.93 and more
-/// where all are right on the tuning sets, 0.28 to 0.8 where one is wrong.
-pub(super) const DOUBTFUL: f64 = 0.85;
 
 /// Photos that have cameras.
 pub(super) struct Placed {

@@ -1,7 +1,9 @@
 //! Photos to cameras, depth and points.
+mod affine;
 pub mod align;
 mod bundle;
 pub mod choose;
+mod confidence;
 mod geometry;
 mod initialise;
 mod leave_out;
@@ -20,6 +22,7 @@ pub mod stereo;
 mod testing;
 mod two_view;
 
+pub use confidence::Confidence;
 pub use geometry::{Fitted, Geometry, SparseModel, SparsePoint};
 pub use initialise::{SolvedCameras, dense, learned_features, place};
 pub use matching::Keypoints;

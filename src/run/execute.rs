@@ -87,6 +87,9 @@ fn work(
     registry.compute().report(progress)?;
     let (trained, language) = (made.take(scene.trained)?, made.take(scene.language)?);
     let PlacedPhotos { photos, left_out, .. } = made.take(scene.placed)?;
+    if let Some(text) = super::fidelity::warning(&photos, &trained.stats) {
+        progress.warn(&text);
+    }
     Ok(RunOutcome {
         plan: plan.clone(),
         preset,

@@ -3,6 +3,7 @@ pub mod ask;
 pub mod budget;
 pub mod encoder;
 mod execute;
+mod fidelity;
 mod light;
 mod list;
 pub mod live;

@@ -4,7 +4,7 @@ use super::outcome::RunOutcome;
 use crate::Result;
 use crate::fit::{CurvePoint, FitStats, LanguagePoint};
 use crate::photo::Photo;
-use crate::pose::Fitted;
+use crate::pose::{Confidence, Fitted};
 use crate::report::viewer::Scene3d;
 use crate::report::{self, AnswerShown, Curve, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown};
 use crate::scene::{Camera, LEVEL_NAMES};
@@ -79,6 +79,7 @@ fn optics(o: &RunOutcome) -> Vec<serde_json::Value> {
             "sigma": { "log_focal": fitted.sigmas[0], "k1": fitted.sigmas[1], "k2": fitted.sigmas[2],
                 "cx": fitted.sigmas[3], "cy": fitted.sigmas[4] },
             "residual_px": fitted.residual, "agreement": fitted.agreement, "camera": fitted.camera,
+            "rotation_sigma_degrees": fitted.rotation_sigma.to_degrees(), "confidence": fitted.confidence(),
         })
     };
     o.photos.iter().zip(&o.cameras).zip(&o.geometry.fitted).map(one).collect()
@@ -104,6 +105,16 @@ fn focal_figure(photos: &[Photo], cameras: &[Camera], fitted: &[Fitted]) -> Opti
             Some(each.collect::<Vec<_>>().join("; "))
         }
     }
+}
+
+/// How far the cameras are to be trusted: that of the worst, and which are worse than the best.
+fn confidence_figure(photos: &[Photo], fitted: &[Fitted]) -> Option<String> {
+    let levels: Vec<Confidence> = fitted.iter().map(Fitted::confidence).collect();
+    let (worst, best) = (levels.iter().min()?, levels.iter().max()?);
+    let named = photos.iter().zip(&levels).filter(|(_, l)| *l < best).map(|(p, _)| p.stem.as_str());
+    let named: Vec<&str> = named.collect();
+    let which = if named.is_empty() { String::new() } else { format!(" ({})", named.join(", ")) };
+    Some(format!("{} confidence{which}", worst.name()))
 }
 
 /// What was assumed about the lens: the strongest distortion taken out, and how far the principal point is from the middle.
@@ -180,11 +191,12 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
         ("device".to_owned(), format!("{}{cpu}", o.device.name)),
         ("photos".to_owned(), sizes(&o.photos) + &chosen),
         ("splats".to_owned(), o.splats.len().to_string()),
-        ("train PSNR".to_owned(), format!("{:.2} dB", o.rgb.mean_psnr())),
+        super::fidelity::figure(&o.rgb),
     ];
     list.extend(
         focal_figure(&o.photos, &o.cameras, &o.geometry.fitted).map(|text| ("focal length".to_owned(), text)),
     );
+    list.extend(confidence_figure(&o.photos, &o.geometry.fitted).map(|text| ("cameras".to_owned(), text)));
     list.extend(lens_figure(o).map(|text| ("lens".to_owned(), text)));
     list.extend(super::light::figure(&o.photos));
     let codes = |k: usize| o.field.levels.get(k).map_or(0, |l| l.codebook.len());

@@ -158,6 +158,9 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let mut made = graph.run(&targets, &device, &registry, &store, progress)?;
     let (photos, geometry) = (made.take(placed)?.photos, made.take(geometry)?);
     let trained = made.take(trained)?;
+    if let Some(text) = super::fidelity::warning(&photos, &trained.stats) {
+        progress.warn(&text);
+    }
 
     progress.begin("write", 1);
     let nothing = LanguageField::default();
@@ -198,7 +201,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         ("device".to_owned(), device.info().name.clone()),
         ("photos".to_owned(), super::record::sizes(&photos)),
         ("splats".to_owned(), trained.splats.len().to_string()),
-        ("train PSNR".to_owned(), format!("{:.2} dB", trained.stats.mean_psnr())),
+        super::fidelity::figure(&trained.stats),
     ];
     figures.extend(super::light::figure(&photos));
     let views = photos.iter().zip(&frames).zip(&trained.stats.psnr);

@@ -1,4 +1,5 @@
 //! Synthetic scenes on disk, in the layout of a ground-truth folder.
+use super::outdoor::Sky;
 use super::regions::{self, InjectedErrors};
 use super::render::{self, RayCast};
 use super::scene::{SceneSpec, SyntheticScene, build_scene};
@@ -27,8 +28,10 @@ pub fn generate(
         create_folder(&folder.join(name))?;
     }
     let frames = write_views(folder, &scene, spec, progress)?;
+    let named = scene.objects.iter().map(|t| (t.label, t.phrase.as_str()));
+    let named = named.chain(scene.sky.iter().map(|s| (s.label, Sky::PHRASE)));
     let labels: serde_json::Map<String, serde_json::Value> =
-        scene.objects.iter().map(|t| (t.label.to_string(), json!(t.phrase))).collect();
+        named.map(|(label, phrase)| (label.to_string(), json!(phrase))).collect();
     let truth = json!({
         "width": spec.size.0, "height": spec.size.1, "labels": labels,
         "convention": "OpenCV world-to-camera, metres, pinhole", "frames": frames, "knobs": spec,

@@ -1,5 +1,6 @@
 //! Data with a known answer: scenes with exact cameras, depth, masks and phrases, and regions with injected errors.
 mod folder;
+mod outdoor;
 mod phone;
 pub mod regions;
 mod render;
@@ -7,7 +8,8 @@ mod scene;
 mod shapes;
 
 pub use folder::{generate, write_regions};
+pub use outdoor::Sky;
 pub use phone::{Effects, PhotoEffects, TrueLight, to_linear, to_srgb};
 pub use render::{RayCast, photo, render};
-pub use scene::{SceneObject, SceneSpec, SyntheticScene, build_scene};
-pub use shapes::{Hit, Paint, Shape};
+pub use scene::{SceneSpec, SyntheticScene, build_scene};
+pub use shapes::{Hit, Paint, SceneObject, Shape};

@@ -229,8 +229,8 @@ pub fn to_srgb(v: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::super::render::photo;
-    use super::super::scene::{SceneObject, SceneSpec, SyntheticScene, build_scene};
-    use super::super::shapes::{Paint, Shape};
+    use super::super::scene::{SceneSpec, SyntheticScene, build_scene};
+    use super::super::shapes::{Paint, SceneObject, Shape};
     use super::*;
     use glam::DVec3;
 
@@ -258,7 +258,14 @@ mod tests {
             places.push((at, rim.map(|d| at + (radius * d).extend(0.0)).collect()));
         }
         (
-            SyntheticScene { objects, train: vec![], photo_effects: vec![], test: vec![], noisy: vec![] },
+            SyntheticScene {
+                objects,
+                sky: None,
+                train: vec![],
+                photo_effects: vec![],
+                test: vec![],
+                noisy: vec![],
+            },
             places,
         )
     }

@@ -1,7 +1,7 @@
 //! Ray casting: photo, depth and mask of a synthetic scene.
 use super::phone::PhotoEffects;
-use super::scene::{SceneObject, SyntheticScene};
-use super::shapes::Hit;
+use super::scene::SyntheticScene;
+use super::shapes::{Hit, SceneObject};
 use crate::math::Random;
 use crate::scene::{Camera, Lens, Plane, RgbImage};
 use glam::{DVec2, DVec3};
@@ -19,7 +19,7 @@ const SAMPLES: usize = 2;
 pub struct RayCast {
     /// The photo.
     pub image: RgbImage,
-    /// Camera z, metres.
+    /// Camera z, metres; 0 where nothing is, or sky.
     pub depth: Plane<f32>,
     /// Label per pixel.
     pub objects: Plane<u32>,
@@ -30,7 +30,7 @@ fn first(scene: &SyntheticScene, from: DVec3, ray: DVec3) -> Option<(&SceneObjec
     hits.min_by(|a, b| a.1.t.total_cmp(&b.1.t))
 }
 
-/// Mean colour over the rays of a pixel, sRGB values; black where nothing is.
+/// Mean colour over the rays of a pixel, sRGB values; black where nothing is and no sky either.
 fn colour(scene: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, (x, y): (f64, f64)) -> [f64; 3] {
     let to_world = camera.pose.inverse();
     let mut sum = [0.0; 3];
@@ -38,11 +38,16 @@ fn colour(scene: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, (x, y): 
         let at = |i: usize| (i as f64 + 0.5) / SAMPLES as f64;
         let pixel = DVec2::new(x + at(k % SAMPLES), y + at(k / SAMPLES));
         let ray = lens.map_or_else(|| camera.ray(pixel), |l| l.ray(camera, pixel));
-        if let Some((object, hit)) = first(scene, to_world.translation, to_world.rotation * ray) {
-            let light = AMBIENT + (1.0 - AMBIENT) * hit.normal.dot(LIGHT).max(0.0);
-            let colour = object.paint.at(hit.place);
-            (0..3).for_each(|c| sum[c] += light * colour[c]);
-        }
+        let direction = to_world.rotation * ray;
+        let shown = match (first(scene, to_world.translation, direction), &scene.sky) {
+            (Some((object, hit)), _) => {
+                let light = AMBIENT + (1.0 - AMBIENT) * hit.normal.dot(LIGHT).max(0.0);
+                object.paint.at(hit.place).map(|c| light * c)
+            }
+            (None, Some(sky)) => sky.at(direction),
+            (None, None) => [0.0; 3],
+        };
+        (0..3).for_each(|c| sum[c] += shown[c]);
     }
     sum.map(|v| v / (SAMPLES * SAMPLES) as f64)
 }
@@ -63,11 +68,12 @@ fn picture(scene: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, noise: 
 pub fn render(scene: &SyntheticScene, camera: &Camera, noise: f64, seed: u64) -> RayCast {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let to_world = camera.pose.inverse();
+    let beyond = scene.sky.as_ref().map_or(0, |sky| sky.label);
     // The ray has camera z 1: its parameter is the depth.
     let cast = |p: usize| {
         let pixel = DVec2::new((p % width) as f64 + 0.5, (p / width) as f64 + 0.5);
         let hit = first(scene, to_world.translation, to_world.rotation * camera.ray(pixel));
-        hit.map_or((0.0, 0), |(t, h)| (h.t as f32, t.label))
+        hit.map_or((0.0, beyond), |(t, h)| (h.t as f32, t.label))
     };
     let pixels: Vec<(f32, u32)> = (0..width * height).into_par_iter().map(cast).collect();
     RayCast {
@@ -191,6 +197,28 @@ mod tests {
             SceneSpec { texture: 2.0, ..base.clone() },
         ] {
             assert_eq!(build_scene(&bad).unwrap_err().exit_code(), 2);
+        }
+    }
+
+    #[test]
+    fn out_of_doors_the_sky_has_no_depth_and_the_ground_begins_at_the_feet() {
+        let spec =
+            SceneSpec { seed: 1001, size: (160, 120), outdoor: true, held_out: 1, ..SceneSpec::default() };
+        let scene = build_scene(&spec).unwrap();
+        let sky = scene.sky.unwrap();
+        for camera in scene.train.iter().chain(&scene.test) {
+            let seen = render(&scene, camera, 0.0, 0);
+            let share = |label: u32| {
+                seen.objects.data.iter().filter(|o| **o == label).count() as f64 / (160.0 * 120.0)
+            };
+            assert!(share(sky.label) > 0.1 && share(1) > 0.2 && share(0) == 0.0, "{} {}", share(3), share(1));
+            for (depth, object) in seen.depth.data.iter().zip(&seen.objects.data) {
+                assert_eq!(*depth == 0.0, *object == sky.label);
+            }
+            let nearest = seen.depth.data.iter().filter(|z| **z > 0.0).fold(f32::INFINITY, |m, z| m.min(*z));
+            assert!(nearest > 1.0 && nearest < 6.0, "{nearest} m");
+            // Bluer above than at the horizon.
+            assert!(seen.image.at(80, 0)[0] < 0.75, "{:?}", seen.image.at(80, 0));
         }
     }
 }

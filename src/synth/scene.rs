@@ -1,6 +1,8 @@
-//! Small scenes with everything known: a table with objects before a wall, and the settings that make them hard.
+//! Small scenes with everything known: a table with objects before a wall, or a place out of doors, and the settings that make
+//! them hard.
+use super::outdoor::{self, Sky};
 use super::phone::{self, Effects, PhotoEffects};
-use super::shapes::{Paint, Shape};
+use super::shapes::{SceneObject, Shape, paint};
 use crate::math::Random;
 use crate::scene::{Camera, Pose};
 use crate::{Error, Result};
@@ -34,6 +36,8 @@ pub struct SceneSpec {
     pub pose_noise: f64,
     /// Standard deviation of the photos' noise, in units of full white.
     pub photo_noise: f64,
+    /// Out of doors, ten times as large: the ground begins at the feet, and behind a house stands the sky.
+    pub outdoor: bool,
     /// Effects of a phone camera on the photos; held-out views then are clean.
     pub effects: Effects,
 }
@@ -53,22 +57,10 @@ impl Default for SceneSpec {
             similar: 0,
             pose_noise: 0.1,
             photo_noise: 0.005,
+            outdoor: false,
             effects: Effects::default(),
         }
     }
-}
-
-/// An object with a name.
-#[derive(Clone, Debug, PartialEq)]
-pub struct SceneObject {
-    /// Index in the masks.
-    pub label: u32,
-    /// What it is called.
-    pub phrase: String,
-    /// Its solid.
-    pub shape: Shape,
-    /// Its surface.
-    pub paint: Paint,
 }
 
 /// A finished scene.
@@ -76,6 +68,8 @@ pub struct SceneObject {
 pub struct SyntheticScene {
     /// Background first.
     pub objects: Vec<SceneObject>,
+    /// Behind everything, if there is one.
+    pub sky: Option<Sky>,
     /// True cameras of the photos, without distortion.
     pub train: Vec<Camera>,
     /// What each photo goes through.
@@ -98,6 +92,11 @@ const COLOURS: [(&str, [f64; 3]); 6] = [
 const NOUNS: [&str; 6] = ["ball", "box", "can", "book", "brick", "drum"];
 
 impl SceneSpec {
+    /// Metres from the cameras to the middle of the scene, about.
+    fn unit(&self) -> f64 {
+        if self.outdoor { outdoor::SCALE } else { 1.0 }
+    }
+
     fn check(&self) -> Result<()> {
         let bad = |what: &str| Err(Error::input(format!("generate: {what}")));
         match self {
@@ -123,12 +122,15 @@ impl SceneSpec {
 pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
     spec.check()?;
     let mut random = Random::new(spec.seed ^ 0x5ce7e);
-    let mut objects = background(spec, &mut random);
+    let (mut objects, sky) = match spec.outdoor {
+        true => (outdoor::background(spec.texture, &mut random), Some(Sky::new(&mut random))),
+        false => (background(spec, &mut random), None),
+    };
     place_objects(spec, &mut random, &mut objects)?;
     let middle = (spec.views - 1) as f64 / 2.0;
     let train = (0..spec.views).map(|i| {
         let azimuth = (i as f64 - middle) * spec.baseline + 4.0 * (random.uniform() - 0.5);
-        camera(&format!("train_{i:02}"), azimuth, 32.0 + 8.0 * (random.uniform() - 0.5), spec.size)
+        camera(spec, &format!("train_{i:02}"), azimuth, 32.0 + 8.0 * (random.uniform() - 0.5))
     });
     let train: Vec<Camera> = train.collect();
     let photo_effects = phone::photo_effects(&train, &spec.effects, spec.seed)?;
@@ -136,25 +138,21 @@ pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
     let test = (0..spec.held_out).map(|i| {
         let azimuth = (random.uniform() - 0.5) * (2.0 * middle * spec.baseline + 6.0);
         let name = format!("test_{:02}", spec.views + i);
-        let made = camera(&name, azimuth, 25.0 + 18.0 * random.uniform(), spec.size);
+        let made = camera(spec, &name, azimuth, 25.0 + 18.0 * random.uniform());
         // The same phone, with its principal point in the middle.
         let (fx, fy) = train.first().map_or((made.fx, made.fy), |c| (c.fx, c.fy));
         Camera { fx, fy, ..made }
     });
     let test: Vec<Camera> = test.collect();
-    let sigma = spec.pose_noise.to_radians();
+    let (sigma, unit) = (spec.pose_noise.to_radians(), spec.unit());
     let noisy = train.iter().map(|c| {
         let mut draw = || DVec3::new(random.normal(), random.normal(), random.normal()) * sigma;
-        // The scene is about a metre away: an angle moves the picture as much as that length does.
-        let error = Pose::exp(draw(), draw());
+        // The scene is about one unit away: an angle moves the picture as much as that length does.
+        let error = Pose::exp(unit * draw(), draw());
         Camera { pose: error.compose(&c.pose), ..c.clone() }
     });
     let noisy = noisy.collect();
-    Ok(SyntheticScene { objects, train, photo_effects, test, noisy })
-}
-
-fn paint(colour: [f64; 3], contrast: f64, grain: f64, random: &mut Random) -> Paint {
-    Paint { colour, contrast, grain, seed: random.bits() }
+    Ok(SyntheticScene { objects, sky, train, photo_effects, test, noisy })
 }
 
 fn background(spec: &SceneSpec, random: &mut Random) -> Vec<SceneObject> {
@@ -178,7 +176,7 @@ fn place_objects(spec: &SceneSpec, random: &mut Random, objects: &mut Vec<SceneO
         (0..COLOURS.len()).flat_map(|c| (0..NOUNS.len()).map(move |n| (c, n))).collect();
     random.shuffle(&mut names);
     let kinds = spec.objects - spec.similar;
-    let reach = 0.42 - 0.16 * spec.occlusion;
+    let (unit, reach) = (spec.unit(), (0.42 - 0.16 * spec.occlusion) * spec.unit());
     let mut taken: Vec<(DVec2, f64)> = Vec::new();
     for (label, k) in (4..).zip(0..spec.objects + spec.thin) {
         let like = k.checked_sub(kinds).filter(|_| k < spec.objects);
@@ -191,8 +189,8 @@ fn place_objects(spec: &SceneSpec, random: &mut Random, objects: &mut Vec<SceneO
             let dim = if like.is_some() { 0.55 } else { 1.0 };
             (format!("{word}{} {n}", COLOURS[c].0), COLOURS[c].1.map(|v| v * dim), n)
         };
-        let (footprint, make) = solid(noun, random);
-        let gap = 0.05 * (1.0 - spec.occlusion) + 0.01;
+        let (footprint, make) = solid(noun, unit, random);
+        let gap = (0.05 * (1.0 - spec.occlusion) + 0.01) * unit;
         let at = (0..2000).find_map(|_| {
             let p = DVec2::new(random.uniform() - 0.5, random.uniform() - 0.5)
                 * 2.0
@@ -210,7 +208,7 @@ fn place_objects(spec: &SceneSpec, random: &mut Random, objects: &mut Vec<SceneO
             label,
             phrase,
             shape: make(at),
-            paint: paint(colour, contrast, 0.03, random),
+            paint: paint(colour, contrast, 0.03 * unit, random),
         });
     }
     Ok(())
@@ -221,8 +219,8 @@ fn number(k: usize) -> String {
 }
 
 /// Radius on the table, and the solid once its place is known.
-fn solid(noun: &str, random: &mut Random) -> (f64, Box<dyn Fn(DVec2) -> Shape>) {
-    let size = 0.85 + 0.3 * random.uniform();
+fn solid(noun: &str, unit: f64, random: &mut Random) -> (f64, Box<dyn Fn(DVec2) -> Shape>) {
+    let size = (0.85 + 0.3 * random.uniform()) * unit;
     let turn = random.uniform() * std::f64::consts::PI;
     let block = |x: f64, y: f64, z: f64| -> (f64, Box<dyn Fn(DVec2) -> Shape>) {
         let half = DVec3::new(x, y, z) * size;
@@ -239,15 +237,19 @@ fn solid(noun: &str, random: &mut Random) -> (f64, Box<dyn Fn(DVec2) -> Shape>) 
         "can" => (0.035 * size, Box::new(move |p| Shape::Can(p.extend(0.0), 0.035 * size, 0.12 * size))),
         "drum" => (0.065 * size, Box::new(move |p| Shape::Can(p.extend(0.0), 0.065 * size, 0.06 * size))),
         // a pole of 8 mm is 4 pixels wide at the usual size
-        _ => (0.02, Box::new(|p| Shape::Can(p.extend(0.0), 0.004, 0.24))),
+        _ => (0.02 * unit, Box::new(move |p| Shape::Can(p.extend(0.0), 0.004 * unit, 0.24 * unit))),
     }
 }
 
-/// A camera on a sphere around the table's middle, looking at it.
-fn camera(name: &str, azimuth: f64, elevation: f64, (width, height): (u32, u32)) -> Camera {
-    let (a, e) = (azimuth.to_radians(), elevation.to_radians());
-    let target = DVec3::new(0.0, 0.0, 0.04);
-    let centre = target + 0.95 * DVec3::new(a.sin() * e.cos(), -a.cos() * e.cos(), e.sin());
+/// A camera on a sphere around the middle of the scene, looking at it; `elevation` is that over a table.
+fn camera(spec: &SceneSpec, name: &str, azimuth: f64, elevation: f64) -> Camera {
+    let (width, height) = spec.size;
+    let (target, elevation) = match spec.outdoor {
+        true => (DVec3::new(0.0, 0.0, 0.12), outdoor::ELEVATION * elevation / 32.0),
+        false => (DVec3::new(0.0, 0.0, 0.04), elevation),
+    };
+    let (a, e, target) = (azimuth.to_radians(), elevation.to_radians(), target * spec.unit());
+    let centre = target + 0.95 * spec.unit() * DVec3::new(a.sin() * e.cos(), -a.cos() * e.cos(), e.sin());
     let z = (target - centre).normalize();
     let x = z.cross(DVec3::Z).normalize();
     let y = z.cross(x);

@@ -1,4 +1,5 @@
-//! Solids that a ray can hit, and their colours.
+//! Solids that a ray can hit, their colours and names.
+use crate::math::Random;
 use glam::{DVec2, DVec3};
 
 /// A solid, metres, +z up.
@@ -103,6 +104,24 @@ pub struct Paint {
     pub seed: u64,
 }
 
+/// An object with a name.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SceneObject {
+    /// Index in the masks.
+    pub label: u32,
+    /// What it is called.
+    pub phrase: String,
+    /// Its solid.
+    pub shape: Shape,
+    /// Its surface.
+    pub paint: Paint,
+}
+
+/// A surface with a pattern of its own.
+pub(super) fn paint(colour: [f64; 3], contrast: f64, grain: f64, random: &mut Random) -> Paint {
+    Paint { colour, contrast, grain, seed: random.bits() }
+}
+
 /// A number in [−1, 1] that belongs to a cell.
 fn cell(p: DVec3, seed: u64) -> f64 {
     let q = p.floor();
@@ -111,7 +130,23 @@ fn cell(p: DVec3, seed: u64) -> f64 {
         h = (h ^ (v as i64 as u64)).wrapping_mul(0xff51_afd7_ed55_8ccd);
         h ^= h >> 32;
     }
+    // The last product leaves neighbours with nearly equal upper bits; one more mixes them.
+    h = h.wrapping_mul(0xc4ce_b9fe_1a85_ec53);
+    h ^= h >> 32;
     (h >> 11) as f64 / (1u64 << 52) as f64 - 1.0
+}
+
+/// The numbers of the eight nearest cells, mixed without a step.
+fn between_cells(p: DVec3, seed: u64) -> f64 {
+    let low = p.floor();
+    let t = p - low;
+    let t = t * t * (3.0 - 2.0 * t);
+    let corner = |k: u32| {
+        let side = DVec3::new(f64::from(k & 1), f64::from(k >> 1 & 1), f64::from(k >> 2));
+        let share = side * t + (1.0 - side) * (1.0 - t);
+        share.x * share.y * share.z * cell(low + side, seed)
+    };
+    (0..8).map(corner).sum()
 }
 
 impl Paint {
@@ -119,11 +154,21 @@ impl Paint {
     pub fn at(&self, place: DVec3) -> [f64; 3] {
         // Off the faces of solids that lie on a cell border, where rounding would draw noise.
         let p = place + DVec3::new(0.000_31, 0.000_17, 0.000_23);
+        self.with_pattern(p, cell)
+    }
+
+    /// The same with soft edges, as clouds have.
+    pub fn smooth(&self, place: DVec3) -> [f64; 3] {
+        self.with_pattern(place, between_cells)
+    }
+
+    /// Colour times a pattern of three sizes.
+    fn with_pattern(&self, place: DVec3, pattern: impl Fn(DVec3, u64) -> f64) -> [f64; 3] {
         let sum: f64 = [(1.0, 0.5), (0.37, 0.3), (0.13, 0.2)]
             .into_iter()
             .enumerate()
             .map(|(k, (size, weight))| {
-                weight * cell(p / (self.grain * size), self.seed.wrapping_add(k as u64))
+                weight * pattern(place / (self.grain * size), self.seed.wrapping_add(k as u64))
             })
             .sum();
         self.colour.map(|c| (c * (1.0 + self.contrast * sum)).clamp(0.0, 1.0))
@@ -133,6 +178,17 @@ impl Paint {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn neighbouring_cells_differ_along_every_axis() {
+        // The mean difference of two independent numbers in [−1, 1] is 2/3.
+        for axis in [DVec3::X, DVec3::Y, DVec3::Z] {
+            let at = |i: i32| DVec3::new(f64::from(i % 9), f64::from(i / 9 % 9), f64::from(i / 81));
+            let differences = (0..729).map(|i| (cell(at(i), 1005) - cell(at(i) + axis, 1005)).abs());
+            let mean = differences.sum::<f64>() / 729.0;
+            assert!((mean - 2.0 / 3.0).abs() < 0.06, "{axis} {mean}");
+        }
+    }
 
     /// Inside or on the solid, by its definition.
     fn contains(shape: &Shape, p: DVec3) -> bool {
@@ -158,7 +214,7 @@ mod tests {
             Shape::Can(DVec3::new(0.05, -0.1, 0.0), 0.2, 0.4),
             Shape::Plane(DVec3::new(0.0, 0.6, 0.8), 0.1),
         ];
-        let mut random = crate::math::Random::new(1000);
+        let mut random = Random::new(1000);
         let mut hits = 0;
         for shape in &shapes {
             for _ in 0..300 {

@@ -69,6 +69,9 @@ pub struct BenchArgs {
     /// cameras: use copies of the photos of that size, not the photos themselves
     #[arg(long)]
     pub copies: bool,
+    /// cameras: every two photos of a folder by themselves
+    #[arg(long)]
+    pub pairs: bool,
     /// query, models, cameras: folder of the models
     #[arg(long, value_name = "DIR")]
     pub models: Option<PathBuf>,

@@ -86,6 +86,9 @@ pub struct GenerateArgs {
     /// Objects that look like another one
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub similar: usize,
+    /// Out of doors, ten times as large: the ground begins at the feet, behind a house stands the sky
+    #[arg(long)]
+    pub outdoor: bool,
     /// Error of the starting cameras in cameras_noisy.json, degrees
     #[arg(long, default_value_t = 0.1, value_name = "DEG")]
     pub pose_noise: f64,

@@ -70,11 +70,13 @@ impl Problem {
                 break;
             }
         }
-        Ok(Adjusted { cost, sigmas: self.sigmas(c) })
+        let (sigmas, rotation_sigmas) = self.sigmas(c);
+        Ok(Adjusted { cost, sigmas, rotation_sigmas })
     }
 
-    /// σ of the optics from the inverse of the reduced system, scaled by the observed residual variance.
-    fn sigmas(&self, c: f64) -> Vec<[f64; OPTICS]> {
+    /// σ of the optics per group and of the rotation per pose, from the inverse of the reduced system, scaled by the observed
+    /// residual variance.
+    fn sigmas(&self, c: f64) -> (Vec<[f64; OPTICS]>, Vec<f64>) {
         let normal = self.linearise(c);
         // Marginalise the points without damping; λ = 1e-9 only keeps numerical zeros positive.
         let (mut s, _, _) = Self::reduce(&normal, 1e-9);
@@ -106,7 +108,14 @@ impl Problem {
             let priors = p.deviations(o).map(|d| d.1);
             std::array::from_fn(|k| sigma(group, k, priors[k]))
         };
-        self.optics.iter().zip(&self.priors).enumerate().map(of).collect()
+        let optics = self.optics.iter().zip(&self.priors).enumerate().map(of).collect();
+        let rotation = |pose: usize| {
+            let Some(at) = pose.checked_sub(1).map(|k| 6 * k + 3) else { return 0.0 };
+            let seen = inverse.as_ref().map(|m| m.fixed_view::<3, 3>(at, at).symmetric_eigenvalues().max());
+            // Beyond half a turn nothing is known.
+            (seen.unwrap_or(f64::INFINITY) * variance).sqrt().min(std::f64::consts::PI)
+        };
+        (optics, (0..self.poses.len()).map(rotation).collect())
     }
 }
 

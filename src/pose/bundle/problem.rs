@@ -97,6 +97,8 @@ pub(crate) struct Adjusted {
     pub(crate) cost: f64,
     /// σ of ln f, k1, k2 and the shift per group, from the observations and the priors; 0 where held.
     pub(crate) sigmas: Vec<[f64; OPTICS]>,
+    /// σ of the rotation of every pose against the first, about its least certain axis, radians.
+    pub(crate) rotation_sigmas: Vec<f64>,
 }
 
 impl Problem {

@@ -3,7 +3,7 @@ use super::model::Sighting;
 use crate::Result;
 use crate::photo::Photo;
 use crate::pose::matching::{self, Keypoints};
-use crate::pose::sift;
+use crate::pose::{affine, sift};
 use crate::progress::Progress;
 use crate::scene::Plane;
 use rayon::prelude::*;
@@ -14,25 +14,45 @@ const MAX_CORNERS: usize = 4000;
 /// Pixels next to the image edge that hold no features: their neighbourhood is cut off.
 pub(super) const MARGIN: usize = 4;
 
-/// Keypoints per detector family (built-in corners first, then the learned ones if given) and photo.
+/// Strongest corners kept per compressed version of a photo: matching then takes seconds per pair.
+const MAX_AFFINE: usize = 700;
+
+/// What one detector found in all photos.
+pub(super) struct Family {
+    /// Matches are nearest neighbours whose distance is below this share of that to the second-best elsewhere.
+    pub(super) ratio: f32,
+    /// Per photo.
+    pub(super) keypoints: Vec<Keypoints>,
+}
+
+/// Built-in corners, then the learned ones if given.
 pub(super) fn corner_families(
     photos: &[Photo],
     features: &[Keypoints],
     progress: &dyn Progress,
-) -> Result<Vec<Vec<Keypoints>>> {
+) -> Result<Vec<Family>> {
     progress.check()?;
-    let own: Vec<Keypoints> = photos
-        .par_iter()
-        .map(|p| {
-            sift::detect(&p.image.luma(), &matching::valid_area(&p.image, p.border, MARGIN), MAX_CORNERS)
-        })
-        .collect();
+    let mut families = vec![Family { ratio: 0.85, keypoints: of_all(photos, MAX_CORNERS, sift::detect) }];
     progress.check()?;
-    let mut families = vec![own];
     if features.len() == photos.len() {
-        families.push(masked(photos, features));
+        // Learned descriptors are compared more leniently: their second-best is close by design of the training.
+        families.push(Family { ratio: 0.97, keypoints: masked(photos, features) });
     }
     Ok(families)
+}
+
+/// Corners of all photos as they look from the side.
+pub(super) fn affine_family(photos: &[Photo]) -> Family {
+    Family { ratio: 0.85, keypoints: of_all(photos, MAX_AFFINE, affine::detect) }
+}
+
+fn of_all(
+    photos: &[Photo],
+    limit: usize,
+    detect: impl Fn(&Plane<f32>, &Plane<bool>, usize) -> Keypoints + Sync,
+) -> Vec<Keypoints> {
+    let one = |p: &Photo| detect(&p.image.luma(), &matching::valid_area(&p.image, p.border, MARGIN), limit);
+    photos.par_iter().map(one).collect()
 }
 
 /// Keypoints on valid pixels.
@@ -58,7 +78,8 @@ pub(super) fn masked(photos: &[Photo], features: &[Keypoints]) -> Vec<Keypoints>
 }
 
 /// All keypoints of a view, numbered as the links number them.
-pub(super) fn keypoints(families: &[Vec<Keypoints>], view: usize) -> Vec<Sighting> {
-    let all = families.iter().enumerate().flat_map(|(k, f)| f[view].points.iter().map(move |p| (k, *p)));
+pub(super) fn keypoints(families: &[Family], view: usize) -> Vec<Sighting> {
+    let all =
+        families.iter().enumerate().flat_map(|(k, f)| f.keypoints[view].points.iter().map(move |p| (k, *p)));
     all.map(|(family, pixel)| Sighting { view, pixel, sigma: 1.0, family }).collect()
 }

@@ -233,11 +233,14 @@ fn sparse_model(
         Some(SparsePoint { position: t.position?, colour: photos[s.view].image.nearest(s.pixel), views })
     };
     let points = model.tracks.iter().filter_map(point).collect();
+    // Of the first photo's camera no more is known than of the angle to the next.
+    let others = outcome.rotation_sigmas.iter().skip(1).copied().fold(f64::INFINITY, f64::min);
     let fitted = |v: usize| Fitted {
         lens: model.lens(v),
         sigmas: outcome.sigmas[model.group[v]],
         residual: model.residual(v),
         agreement: agreement[v],
+        rotation_sigma: if v == 0 { others } else { outcome.rotation_sigmas[v] },
         camera: model.group[v],
     };
     Ok(SparseModel {

@@ -25,7 +25,7 @@ use glam::DVec2;
 use grow::grow;
 pub use known::with_cameras;
 use model::{Freedom, Model, Sighting};
-use relate::{Pair, THRESHOLD};
+use relate::{MIN_INLIERS, Pair, Related, THRESHOLD};
 use tracks::KeypointMatch;
 pub use unplaced::Unplaced;
 
@@ -52,19 +52,37 @@ pub fn reconstruct(
     }
     progress.begin("cameras", STEPS);
     progress.step(0, "corners");
-    let families = corner_families(photos, features, progress)?;
+    let mut families = corner_families(photos, features, progress)?;
     progress.step(1, "matches");
     let empty = empty_model(photos, seed);
-    let putative = relate::putative_matches(&families, progress)?;
-    let pairs = relate::pairs(photos, &putative, &empty, progress)?;
+    let Related { putative, pairs } = relate::related(photos, &mut families, &empty, progress)?;
     progress.step(2, "poses");
     let keypoints: Vec<Vec<Sighting>> = (0..photos.len()).map(|v| keypoints(&families, v)).collect();
     let model = assemble(photos, &keypoints, empty, &pairs, progress)?;
     progress.step(3, "refining");
     let model = finish(photos, model, &Evidence { putative, pairs, keypoints }, progress)?;
+    check_points(photos, &model)?;
     progress.step(STEPS, &format!("{} points", model.points.len()));
     progress.end();
     Ok(model)
+}
+
+/// An error that names the photos whose place rests on too few points.
+fn check_points(photos: &[Photo], model: &SparseModel) -> Result<(), Unplaced> {
+    let mut counts = vec![0; photos.len()];
+    model.points.iter().flat_map(|p| &p.views).for_each(|(view, _)| counts[*view] += 1);
+    let views: Vec<_> =
+        (0..photos.len()).filter(|v| counts[*v] < MIN_INLIERS).map(|v| (v, Reason::NoOverlap)).collect();
+    if views.is_empty() {
+        return Ok(());
+    }
+    let names: Vec<String> =
+        views.iter().map(|(v, _)| format!("{} ({})", photos[*v].stem, counts[*v])).collect();
+    let error = Error::input(format!(
+        "too few points that the photos agree on to place {}; replace them or add photos in between",
+        names.join(", ")
+    ));
+    Err(Unplaced { views, error })
 }
 
 /// Steps of the progress bar: corners, matches, poses, refinement, extension.

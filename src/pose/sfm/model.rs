@@ -10,11 +10,9 @@ use glam::{DMat3, DVec2, DVec3};
 /// pixels by 5 by 1.3 % and more; with 2000 the criterion asks for 0.8 %. The same number makes the stated σ of the focal
 /// length as large as its errors there.
 const MAX_INDEPENDENT: f64 = 2000.0;
-
-/// Independent observations that so many residual components count as.
-pub(super) fn effective_observations(observations: usize) -> f64 {
-    MAX_INDEPENDENT.min(observations as f64)
-}
+/// Pairs of photos that [`MAX_INDEPENDENT`] was found with. Each pair has its own share of it, since what its sightings have in
+/// common does not repeat in another: two photos alone say little of their optics.
+const PAIRS: f64 = 6.0;
 
 /// One sighting of a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -119,6 +117,13 @@ impl Model {
     /// Parameters of the optics that adjustments change.
     pub(super) fn parameters(&self) -> usize {
         self.priors.iter().map(|p| self.freedom.of(p).count()).sum()
+    }
+
+    /// Independent observations that so many residual components of the placed photos count as.
+    pub(super) fn independent(&self, observations: usize) -> f64 {
+        let views = self.poses.iter().flatten().count() as f64;
+        let pairs = (0.5 * views * (views - 1.0)).clamp(1.0, PAIRS);
+        (MAX_INDEPENDENT * pairs / PAIRS).min(observations as f64)
     }
 
     /// Residual components of the sightings.
@@ -337,7 +342,7 @@ impl Model {
         }
         // The sightings count as fewer independent ones ([`MAX_INDEPENDENT`]); priors are weighed against those.
         let observations = 2 * problem.observations.len();
-        let scale = (effective_observations(observations) / observations.max(1) as f64).sqrt();
+        let scale = (self.independent(observations) / observations.max(1) as f64).sqrt();
         problem.priors.iter_mut().for_each(|p| p.narrow(scale));
         (problem, views, used)
     }
@@ -442,8 +447,8 @@ mod tests {
             assert_eq!(problem.observations.len(), 2 * tracks);
             problem.priors[0].shift
         };
-        // Four residual components a track: up to 500 tracks each counts.
-        assert!((shift(100) - 4.0).abs() < 1e-12);
-        assert!((shift(2000) - 4.0 / 2.0).abs() < 1e-12);
+        // Four residual components a track; of two photos 333 count.
+        assert!((shift(80) - 4.0).abs() < 1e-12);
+        assert!((shift(2000) - 4.0 * (MAX_INDEPENDENT / PAIRS / 8000.0).sqrt()).abs() < 1e-12);
     }
 }

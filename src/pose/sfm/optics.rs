@@ -1,7 +1,7 @@
 //! What the sightings determine of the optics, and which of them share a camera.
-use super::model::{Freedom, Model, effective_observations};
+use super::model::{Freedom, Model};
 use crate::Result;
-use crate::pose::bundle::{Adjusted, OPTICS, OpticsPrior};
+use crate::pose::bundle::Adjusted;
 
 /// Steps that any start needs at most.
 const STEPS: usize = 60;
@@ -19,7 +19,7 @@ struct OpticsFit {
 fn fit_optics(model: &Model, freedom: Freedom, steps: usize) -> Result<OpticsFit> {
     let mut model = Model { freedom, ..model.clone() };
     let outcome = model.adjust(f64::INFINITY, 2.0, steps)?;
-    let n = effective_observations(model.observations());
+    let n = model.independent(model.observations());
     let value = n * outcome.cost.max(1e-9).ln() + model.parameters() as f64 * n.ln();
     Ok(OpticsFit { value, model, outcome })
 }
@@ -27,10 +27,12 @@ fn fit_optics(model: &Model, freedom: Freedom, steps: usize) -> Result<OpticsFit
 /// The best of `freedoms`, with the standard deviations of the last of them.
 fn best_of(model: &Model, freedoms: &[Freedom]) -> Result<OpticsFit> {
     let mut all = freedoms.iter().map(|f| fit_optics(model, *f, STEPS)).collect::<Result<Vec<_>>>()?;
-    let sigmas = all.last().map(|e| e.outcome.sigmas.clone()).unwrap_or_default();
+    let of_all = all.last().map(|e| e.outcome.clone());
     all.sort_by(|a, b| a.value.total_cmp(&b.value));
     let mut best = all.swap_remove(0);
-    best.outcome.sigmas = sigmas;
+    if let Some(Adjusted { sigmas, rotation_sigmas, .. }) = of_all {
+        best.outcome = Adjusted { sigmas, rotation_sigmas, ..best.outcome };
+    }
     Ok(best)
 }
 
@@ -73,7 +75,7 @@ pub(super) fn learn_optics(model: &mut Model) -> Result<Adjusted> {
             }
         }
     }
-    found.outcome.sigmas = found.sigmas();
+    found.widen();
     *model = found.model;
     Ok(found.outcome)
 }
@@ -93,19 +95,20 @@ fn shared_camera_criterion(shared: &OpticsFit) -> Result<f64> {
         prior.lens = [0.0; 2];
     }
     let moved = fit_optics(&model, Freedom::Full, STEPS)?;
-    let n = effective_observations(model.observations());
+    let n = model.independent(model.observations());
     Ok(moved.value + shared.model.parameters() as f64 * n.ln() + n * MAX_COST_SHARE.ln())
 }
 
 impl OpticsFit {
-    /// σ of the optics, with [`effective_observations`] taken for independent.
-    fn sigmas(&self) -> Vec<[f64; OPTICS]> {
+    /// Widens every σ to what it is with [`Model::independent`] observations taken for independent.
+    fn widen(&mut self) {
         let observations = self.model.observations();
-        let wider = (observations as f64 / effective_observations(observations)).sqrt();
-        let one = |(sigmas, prior): (&[f64; OPTICS], &OpticsPrior)| {
-            let most = prior.sigmas();
-            std::array::from_fn(|k| (sigmas[k] * wider).min(most[k]))
-        };
-        self.outcome.sigmas.iter().zip(&self.model.priors).map(one).collect()
+        let wider = (observations as f64 / self.model.independent(observations)).sqrt();
+        for (sigmas, prior) in self.outcome.sigmas.iter_mut().zip(&self.model.priors) {
+            for (sigma, most) in sigmas.iter_mut().zip(prior.sigmas()) {
+                *sigma = (*sigma * wider).min(most);
+            }
+        }
+        self.outcome.rotation_sigmas.iter_mut().for_each(|s| *s = (*s * wider).min(std::f64::consts::PI));
     }
 }

@@ -167,12 +167,11 @@ fn a_lens_is_found_and_a_pinhole_stays_one() {
 #[test]
 fn a_view_in_the_wrong_place_is_the_only_one_that_disagrees() {
     let truth = testing::train(&testing::folder());
-    let families = corner_families(&truth.photos, &[], &Silent).unwrap();
+    let mut families = corner_families(&truth.photos, &[], &Silent).unwrap();
     let mut model = empty_model(&truth.photos, 0);
     model.optics[0].focal = truth.cameras[0].fx;
     model.poses = truth.cameras.iter().map(|c| Some(c.pose)).collect();
-    let putative = relate::putative_matches(&families, &Silent).unwrap();
-    let pairs = relate::pairs(&truth.photos, &putative, &model, &Silent).unwrap();
+    let pairs = relate::related(&truth.photos, &mut families, &model, &Silent).unwrap().pairs;
     let right = agreement(&model, &pairs, 3.0);
     assert!(right.iter().all(|a| *a > AGREED), "{right:?}");
     let turn = crate::scene::Pose::exp(glam::DVec3::new(0.1, 0.0, 0.0), glam::DVec3::new(0.0, 0.05, 0.0));
@@ -181,6 +180,41 @@ fn a_view_in_the_wrong_place_is_the_only_one_that_disagrees() {
     println!("{right:?} {wrong:?}");
     // Its neighbours share half of their matches with it and are not blamed.
     assert!(wrong[2] < 0.5 && [0, 1, 3].iter().all(|v| wrong[*v] > AGREED), "{wrong:?}");
+}
+
+#[test]
+fn two_photos_75_degrees_apart_say_how_little_they_know() {
+    let truth = testing::train(&testing::folder());
+    let outer = [truth.photos[0].clone(), truth.photos[3].clone()];
+    let cameras = [truth.cameras[0].clone(), truth.cameras[3].clone()];
+    let model = reconstruct(&outer, &[], 0, &Silent).unwrap();
+    let error = crate::pose::relative::pair_errors(&model.cameras, &cameras)[0].rotation_degrees;
+    let sigma = model.fitted[1].rotation_sigma.to_degrees();
+    // Equal distances to what both axes meet leave the focal length open, and with it the angle.
+    println!("{error}° ± {sigma}°, {} points", model.points.len());
+    assert!(sigma > 2.0 && error < 4.0 * sigma, "{error} {sigma}");
+    assert!(model.fitted.iter().all(|f| f.confidence() == crate::pose::Confidence::Low));
+    let all = reconstruct(&truth.photos, &[], 0, &Silent).unwrap();
+    assert!(all.fitted.iter().all(|f| f.confidence() == crate::pose::Confidence::High), "{:?}", all.fitted);
+}
+
+#[test]
+fn corners_seen_from_the_side_join_photos_75_degrees_apart() {
+    let truth = testing::train(&testing::folder());
+    let outer = [truth.photos[0].clone(), truth.photos[3].clone()];
+    let mut model = empty_model(&outer, 0);
+    model.optics[0].focal = truth.cameras[0].fx;
+    model.poses = [0, 3].map(|v| Some(truth.cameras[v].pose)).to_vec();
+    let mut families = corner_families(&outer, &[], &Silent).unwrap();
+    let right = |families: &[families::Family]| {
+        let putative = relate::putative_matches(families, &Silent).unwrap();
+        (finish::inlier_matches(&model, &putative, 1.5).len(), putative[0].list.len())
+    };
+    let plain = right(&families);
+    families.push(families::affine_family(&outer));
+    let wide = right(&families);
+    println!("{plain:?} {wide:?}");
+    assert!(wide.0 > 3 * plain.0 && 2 * wide.0 > wide.1, "{plain:?} {wide:?}");
 }
 
 /// The middle of a photo at the size of the whole: the inner 1 / `zoom` of its width.

@@ -1,0 +1,58 @@
+//! How well a scene shows the photos that it was made from.
+use crate::fit::FitStats;
+use crate::photo::Photo;
+
+/// A photo this much below the best one, dB, is not shown as it should be: half the amplitude of the error is more than texture
+/// makes among photos of one place.
+const FAR_BELOW: f64 = 6.0;
+
+/// Mean over the photos and their range, for the closing table.
+pub(super) fn figure(stats: &FitStats) -> (String, String) {
+    let (low, high) = range(&stats.psnr);
+    let text = format!("{:.2} dB ({low:.1} to {high:.1})", stats.mean_psnr());
+    ("train PSNR".to_owned(), text)
+}
+
+/// Names the photos that the scene shows far worse than the best one.
+pub(super) fn warning(photos: &[Photo], stats: &FitStats) -> Option<String> {
+    warning_about(photos.iter().map(|p| p.stem.as_str()), &stats.psnr)
+}
+
+fn warning_about<'a>(names: impl Iterator<Item = &'a str>, psnr: &[f64]) -> Option<String> {
+    let (_, best) = range(psnr);
+    let poor: Vec<String> = names
+        .zip(psnr)
+        .filter(|(_, psnr)| **psnr < best - FAR_BELOW)
+        .map(|(name, psnr)| format!("{name} ({psnr:.1} dB)"))
+        .collect();
+    (!poor.is_empty()).then(|| {
+        format!(
+            "the scene shows {} far worse than the best photo ({best:.1} dB): something in it moved or hides the rest, or its \
+             camera is wrong; look at its preview, and leave it out if that is so",
+            poor.join(", ")
+        )
+    })
+}
+
+fn range(values: &[f64]) -> (f64, f64) {
+    values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |r, v| (r.0.min(*v), r.1.max(*v)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_hidden_photo_is_named_and_others_are_not() {
+        let warning = |psnr: [f64; 4]| warning_about(["a", "b", "c", "d"].into_iter(), &psnr);
+        assert_eq!(warning([32.0, 30.0, 26.1, 31.0]), None);
+        let text = warning([32.0, 13.3, 34.0, 31.0]).unwrap();
+        assert!(text.contains("shows b (13.3 dB) far worse than the best photo (34.0 dB)"), "{text}");
+    }
+
+    #[test]
+    fn the_figure_states_mean_and_range() {
+        let stats = FitStats { psnr: vec![32.0, 34.0], ..FitStats::default() };
+        assert_eq!(figure(&stats).1, "33.00 dB (32.0 to 34.0)");
+    }
+}
