@@ -81,31 +81,21 @@ pub(super) fn related(
     };
     let mut relations: Vec<Relation> = putative.par_iter().map(one).collect();
     progress.check()?;
-    let ends = |k: usize, putative: &[Matches]| (putative[k].first, putative[k].second);
-    let sure = (0..putative.len())
-        .filter(|k| relations[*k].is_sure(putative[*k].list.len()))
-        .map(|k| ends(k, &putative));
-    let part = parts(photos.len(), sure);
-    let between: Vec<usize> = (0..putative.len())
-        .filter(|k| {
-            let (i, j) = ends(*k, &putative);
-            part[i] != part[j] && !matches!(relations[*k], Relation::Same | Relation::NoParallax)
-        })
-        .collect();
-    if !between.is_empty() {
+    let unsure = unsure_pairs(photos.len(), &putative, &relations);
+    if !unsure.is_empty() {
         families.push(affine_family(photos));
+    }
+    for k in unsure {
         progress.check()?;
-        for k in between {
-            let (first, second) = ends(k, &putative);
-            let wide = Matches { first, second, list: distinct(self::putative(families, first, second)) };
-            let relation = one(&wide);
-            // So many more corners also agree by chance more often, as those of a mirrored photo.
-            if relation.is_sure(wide.list.len()) {
-                (putative[k], relations[k]) = (wide, relation);
-            }
-            progress.check()?;
+        let Matches { first, second, .. } = putative[k];
+        let wide = Matches { first, second, list: distinct(self::putative(families, first, second)) };
+        let relation = one(&wide);
+        // So many more corners also agree by chance more often, as those of a mirrored photo.
+        if relation.is_sure(wide.list.len()) {
+            (putative[k], relations[k]) = (wide, relation);
         }
     }
+    progress.check()?;
     let named = putative.iter().zip(relations).map(|(p, r)| (p.first, p.second, r)).collect::<Vec<_>>();
     check_overlap(photos, &named)?;
     let usable = |(_, _, relation)| match relation {
@@ -114,6 +104,17 @@ pub(super) fn related(
     };
     let pairs = named.into_iter().filter_map(usable).collect();
     Ok(Related { putative, pairs })
+}
+
+/// Pairs between parts of the photos that sure pairs connect, as far as more corners may make them sure.
+fn unsure_pairs(photos: usize, putative: &[Matches], relations: &[Relation]) -> Vec<usize> {
+    let pairs = || putative.iter().zip(relations);
+    let sure = pairs().filter(|(p, r)| r.is_sure(p.list.len())).map(|(p, _)| (p.first, p.second));
+    let part = parts(photos, sure);
+    let between = pairs().enumerate().filter(|(_, (p, r))| {
+        part[p.first] != part[p.second] && !matches!(r, Relation::Same | Relation::NoParallax)
+    });
+    between.map(|(k, _)| k).collect()
 }
 
 /// Matches by descriptor between all views.
