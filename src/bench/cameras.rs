@@ -5,7 +5,7 @@ use crate::photo;
 use crate::pose::align::pose_errors;
 use crate::pose::relative::{auc, pair_errors};
 use crate::pose::{self, Confidence, SolvedCameras};
-use crate::progress::Progress;
+use crate::progress::{Progress, Recorded};
 use crate::query::eval::{GroundTruth, Split, TruthFrame};
 use crate::scene::Lens;
 use crate::{Error, Result};
@@ -23,10 +23,19 @@ pub struct CameraRow {
     pub photos: Vec<String>,
     /// From files to cameras.
     pub seconds: f64,
+    /// What a run would warn of.
+    pub warnings: Vec<String>,
     /// The figures, or why there are none.
     #[serde(flatten)]
     pub outcome: CameraOutcome,
 }
+
+/// Worst relative rotation above which cameras are wrong, degrees: hidden surfaces come out elsewhere.
+const WRONG_ROTATION: f64 = 2.0;
+/// Error of the focal length above which they are, as a share: depth is stretched by as much.
+const WRONG_FOCAL: f64 = 0.1;
+/// Worst error of a centre above which they are, over the mean depth.
+const WRONG_CENTRE: f64 = 0.05;
 
 /// Figures or the reason why there are none.
 #[derive(Clone, Debug, Serialize)]
@@ -70,6 +79,15 @@ pub struct CameraFigures {
     pub true_lens: Option<Lens>,
 }
 
+impl CameraFigures {
+    /// Whether a scene on these cameras would mislead.
+    fn wrong(&self) -> bool {
+        self.pair_rotation_degrees > WRONG_ROTATION
+            || self.focal_error.abs() > WRONG_FOCAL
+            || self.centre_fraction > WRONG_CENTRE
+    }
+}
+
 /// Data sets and their summary.
 #[derive(Clone, Debug, Serialize)]
 #[non_exhaustive]
@@ -78,6 +96,11 @@ pub struct CameraReport {
     pub rows: Vec<CameraRow>,
     /// Data sets whose photos gave no cameras.
     pub failures: usize,
+    /// Data sets whose cameras are wrong: a relative rotation by more than 2 degrees, the focal length by more than 10 %, or a
+    /// centre by more than 5 % of the mean depth.
+    pub wrong: usize,
+    /// Those of them of which no warning was given.
+    pub wrong_without_warning: Vec<PathBuf>,
     /// Share of the sets with a stated focal length whose error is within 2 σ.
     pub within_2_sigma: Option<f64>,
     /// Median of |f / f_true − 1|.
@@ -151,7 +174,8 @@ fn measure_set(
     progress: &dyn Progress,
 ) -> Result<CameraRow> {
     let clock = Instant::now();
-    let found = find_cameras(&truth.folder, frames, input, registry, progress);
+    let recorded = Recorded::new(progress);
+    let found = find_cameras(&truth.folder, frames, input, registry, &recorded);
     let seconds = clock.elapsed().as_secs_f64();
     let outcome = match found {
         Ok(placed) => CameraOutcome::Figures(Box::new(figures(truth, frames, &placed)?)),
@@ -159,7 +183,7 @@ fn measure_set(
         Err(e) => CameraOutcome::Failure(e.to_string()),
     };
     let photos = frames.iter().map(|f| f.stem.clone()).collect();
-    Ok(CameraRow { data: truth.folder.clone(), photos, seconds, outcome })
+    Ok(CameraRow { data: truth.folder.clone(), photos, seconds, warnings: recorded.warnings(), outcome })
 }
 
 /// What a run does before its first dense stage.
@@ -252,10 +276,14 @@ fn summarise(rows: Vec<CameraRow>) -> CameraReport {
             worst_rotation_degrees: errors.iter().copied().fold(0.0, f64::max),
         }
     };
+    let wrong = || rows.iter().filter(|r| matches!(&r.outcome, CameraOutcome::Figures(f) if f.wrong()));
+    let silent = wrong().filter(|r| r.warnings.is_empty()).map(|r| r.data.clone()).collect();
     let levels = [Confidence::High, Confidence::Medium, Confidence::Low];
     CameraReport {
         by_confidence: levels.map(of_level).into_iter().filter(|r| r.sets > 0).collect(),
         failures: rows.len() - good.len(),
+        wrong: wrong().count(),
+        wrong_without_warning: silent,
         within_2_sigma: (!stated.is_empty()).then(|| within as f64 / stated.len() as f64),
         median_focal_error: median(&|f| f.focal_error.abs()),
         median_rotation_degrees: median(&|f| f.rotation_degrees),
@@ -340,6 +368,19 @@ impl CameraReport {
             number(self.mean_auc[0], 3),
             number(self.mean_auc[1], 3),
             number(self.mean_auc[2], 3),
+        );
+        let names: Vec<String> =
+            self.wrong_without_warning.iter().map(|p| format!(" {}", p.display())).collect();
+        let _ = writeln!(
+            out,
+            "wrong by more than {WRONG_ROTATION} degrees, {:.0} % of the focal length or {:.0} % of the depth: {}, without a \
+             warning {}{}{}",
+            100.0 * WRONG_FOCAL,
+            100.0 * WRONG_CENTRE,
+            self.wrong,
+            names.len(),
+            if names.is_empty() { "" } else { ":" },
+            names.concat()
         );
         for r in &self.by_confidence {
             let _ = writeln!(
