@@ -4,10 +4,13 @@
 //! Positions are continuous pixels of the network's input ("model pixels"); the centre of the first pixel is 0.5.
 mod adjust;
 mod canonical;
-mod cholesky;
 mod dense;
 mod matches;
+mod normal;
 mod pairs;
+mod problem;
+mod residual;
+mod solver;
 mod tree;
 
 use super::Geometry;
