@@ -270,6 +270,11 @@ enum SvkArray
      [N][(degree + 1)²][3] spherical-harmonics coefficients; colour = 0.5 + 0.2820948 · the first.
      */
     SVK_ARRAY_SH = 4,
+    /*
+     [N] pixels of all photos that show the Gaussian; below 0.05 no photo does and it is guessed. Empty (0 floats) where that
+     is not known: files of Gaussians, scenes of older versions.
+     */
+    SVK_ARRAY_SEEN = 5,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L

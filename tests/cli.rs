@@ -3,6 +3,8 @@
 mod fixture;
 
 use fixture::{data, scene, small_views, train_log};
+use splatvk::format::npy::{self, NpyArray};
+use splatvk::scene::Seen;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -300,16 +302,19 @@ fn scenes_render_export_and_answer_only_what_they_know() {
     let cameras = scene().join("cameras/transforms.json");
     let mut render = splatvk();
     render.arg("render").arg(scene()).arg("--cameras").arg(&cameras).arg("--out").arg(&out);
-    render.args(["--channels", "rgb,alpha,depth", "--format", "png,exr,npy", "--json"]);
+    render.args(["--channels", "rgb,alpha,depth,unseen", "--format", "png,exr,npy", "--json"]);
     let output = render.output().unwrap();
     assert!(output.status.success(), "{}", text(&output.stderr));
     let listed: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let files = listed["files"].as_array().unwrap();
-    // Three PNG, one EXR and three npy per view.
-    assert_eq!((files.len(), names(&out).len()), (2 * 7, 2 * 7));
-    let depth = splatvk::format::npy::read(out.join("train_00_depth.npy")).unwrap();
+    // Four PNG, one EXR and four npy per view.
+    assert_eq!((files.len(), names(&out).len()), (2 * 9, 2 * 9));
+    let depth = npy::read(out.join("train_00_depth.npy")).unwrap();
     assert_eq!(depth.shape, [120, 160]);
     assert!(depth.to_f32().iter().any(|z| *z > 0.3), "the table is about 0.7 m away");
+    let unseen = npy::read(out.join("train_00_unseen.npy")).unwrap().to_f32();
+    let mean = unseen.iter().sum::<f32>() / unseen.len() as f32;
+    assert!(mean < 1e-3, "a photo shows what its own view shows: {mean}");
     let picture = image::open(out.join("train_00.png")).unwrap().to_rgb8();
     assert!(picture.dimensions() == (160, 120) && picture.pixels().any(|p| p.0[0] > 60));
 
@@ -333,6 +338,26 @@ fn scenes_render_export_and_answer_only_what_they_know() {
         assert!(export.output().unwrap().status.success(), "{format}");
         assert!(folder.path().join(name).exists());
     }
+    // The same scene, as if no photo showed its first hundred splats.
+    let guessed = tempfile::tempdir().unwrap();
+    std::fs::create_dir(guessed.path().join("cameras")).unwrap();
+    for file in ["scene.json", "point_cloud.ply", "cameras/transforms.json"] {
+        std::fs::copy(scene().join(file), guessed.path().join(file)).unwrap();
+    }
+    let mut pixels = npy::read(scene().join("seen.npy")).unwrap().to_f32();
+    pixels[..100].fill(0.0);
+    let all = Seen { pixels };
+    npy::write(guessed.path().join("seen.npy"), &NpyArray::f32(&[all.pixels.len()], all.pixels.clone()))
+        .unwrap();
+    let mut seen = splatvk();
+    seen.arg("export").arg(guessed.path()).args(["--format", "ply", "--only-seen", "--out"]);
+    assert!(seen.arg(folder.path().join("a.ply")).output().unwrap().status.success());
+    let kept = splatvk::format::ply::read_splats(&folder.path().join("a.ply")).unwrap();
+    assert!((100..all.pixels.len() / 2).contains(&all.unseen()), "{}", all.unseen());
+    assert_eq!(kept.len(), all.pixels.len() - all.unseen());
+    let mut bare = splatvk();
+    bare.arg("export").arg(folder.path().join("a.ply")).args(["--format", "splat", "--only-seen", "--out"]);
+    refuses(bare.arg(folder.path().join("b.splat")), 2, &["not known", "--only-seen"]);
     assert_eq!(names(folder.path()), ["a.ply", "a.splat", "model", "renders", "t.json"]);
     let mut nothing = splatvk();
     nothing

@@ -1,11 +1,14 @@
 //! File formats: what is written reads back, foreign files are understood, damaged ones are refused in one line.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 use glam::{DQuat, DVec3};
+use splatvk::format::npy::{self, NpyArray};
 use splatvk::format::{
     cameras, colmap, gaussians, ply, ply_packed, scene_dir, side_file, splat, spz, transforms,
 };
 use splatvk::photo::{self, stem};
-use splatvk::scene::{Camera, Codebook, LanguageField, Lens, LevelField, MaskId, PointCloud, Pose, Splats};
+use splatvk::scene::{
+    Camera, Codebook, LanguageField, Lens, LevelField, MaskId, PointCloud, Pose, Seen, Splats,
+};
 use std::path::{Path, PathBuf};
 
 fn data(name: &str) -> PathBuf {
@@ -463,8 +466,10 @@ fn scene_directory_round_trip() {
     let three = [0, 1, 2].map(|i| data(&format!("breakfast/images/train_{i:02}.jpg")));
     let photos = photo::load_all(&three, &splatvk::progress::Silent).unwrap();
     let (s, cams, language) = (splats(5, 2), some_cameras(), field(5));
+    let seen = Seen { pixels: vec![0.0, 1.0, 2.5, 0.01, 7.0] };
     let contents = scene_dir::Contents {
         splats: &s,
+        seen: &seen,
         cameras: &cams,
         photos: &photos,
         points: None,
@@ -475,6 +480,7 @@ fn scene_directory_round_trip() {
     let scene = scene_dir::load(folder.path()).unwrap();
     assert_eq!(scene.splats, s, "with its own SH degree, though the PLY is padded to 3");
     assert_eq!(scene.language.as_ref(), Some(&language));
+    assert_eq!((&scene.seen, scene.seen.unseen()), (&seen, 2));
     let stems: Vec<_> = scene.cameras.iter().map(|c| stem(&c.name)).collect();
     assert_eq!(stems, photos.iter().map(|p| p.stem.clone()).collect::<Vec<_>>());
     assert!((scene.cameras[2].pose.centre() - cams[2].pose.centre()).length() < 1e-6);
@@ -484,6 +490,11 @@ fn scene_directory_round_trip() {
 
     let bare = scene_dir::load(&folder.path().join("point_cloud.ply")).unwrap();
     assert!(bare.language.is_none() && bare.cameras.is_empty() && bare.splats.len() == 5);
+    assert!(bare.seen.pixels.is_empty(), "what is not known is not guessed");
+    npy::write(folder.path().join("seen.npy"), &NpyArray::f32(&[2], vec![0.0; 2])).unwrap();
+    assert!(scene_dir::load(folder.path()).unwrap_err().to_string().contains("2] values for 5 splats"));
+    std::fs::remove_file(folder.path().join("seen.npy")).unwrap();
+    assert_eq!(scene_dir::load(folder.path()).unwrap().seen, Seen::default(), "scenes of earlier versions");
     let manifest = folder.path().join("scene.json");
     let text = std::fs::read_to_string(&manifest).unwrap();
     std::fs::write(&manifest, text.replace("\"version\": 1", "\"version\": 99")).unwrap();

@@ -3,6 +3,8 @@ mod support;
 use glam::DVec3;
 use splatvk::gpu::{Recorder, test_device};
 use splatvk::pass::channels::BASE_CHANNELS;
+use splatvk::pass::raster_backward;
+use splatvk::pass::raster_forward::{Cutoffs, TwinScene};
 use splatvk::pass::seeded::{self, Random};
 use splatvk::pass::{
     DeviceChoices, FeatureMode, Grouping, RasterOptions, Rasterizer, Renderer, SplatBuffers, View, bin,
@@ -245,6 +247,49 @@ fn renderer_returns_the_planes_as_maps() {
     }
     // Another size on the same renderer.
     assert_eq!(renderer.render(&camera.resized(40, 28)).unwrap().rgb.data.len(), 40 * 28);
+}
+
+/// What a splat shows of a view, with colours and features that must not matter, in one band and in strips of the image.
+#[test]
+fn weights_of_a_view_match_the_twin() {
+    let device = test_device();
+    for (n, dim) in [(300, 0), (120, 3)] {
+        let scene = Scene::small(n, 2, dim, 33);
+        let (_, camera) = seeded::small(n, 75, 53, 2, 33);
+        let forward = scene.twin();
+        let list = TwinScene {
+            projected: &forward.projected,
+            features: &forward.rendered_features,
+            feature_dim: dim,
+            order: &forward.order,
+            view: &scene.view,
+        };
+        let mut upstream = vec![0.0; (BASE_CHANNELS + dim + 1) * scene.pixels()];
+        upstream[..scene.pixels()].fill(1.0);
+        let twin = raster_backward::twin(&list, &Cutoffs::STANDARD, &upstream);
+        let expected: Vec<f64> = twin.geometry.iter().map(|g| g.channels[0]).collect();
+        let mut renderer =
+            Renderer::new(&device, &scene.splats, &scene.features, dim).unwrap().with_near(scene.view.near);
+        let weights = renderer.weights(&camera).unwrap();
+        let most = expected.iter().copied().fold(0.0, f64::max);
+        for (i, (got, want)) in weights.iter().zip(&expected).enumerate() {
+            // Where alpha is just at its bound, one pixel may count on one side only.
+            assert!((f64::from(*got) - want).abs() <= 1e-4 * most + 0.005, "splat {i}: {got} {want}");
+        }
+        let alpha: f64 = forward.image.transmittance.iter().map(|t| 1.0 - t).sum();
+        let sum: f64 = weights.iter().map(|w| f64::from(*w)).sum();
+        assert!((sum / alpha - 1.0).abs() < 1e-3, "all weights are all of what is opaque: {sum} {alpha}");
+        assert_eq!(renderer.weights(&camera).unwrap().len(), n, "a second time on the same buffers");
+    }
+    // A wall before a splat: nothing of it shows.
+    let mut splats = splat([0.0, 0.0, 2.0], 0.8, 9.0);
+    for k in 1..6 {
+        append(&mut splats, splat([0.0, 0.0, 2.0 + 0.01 * k as f32], 0.8, 9.0));
+    }
+    append(&mut splats, splat([0.0, 0.0, 4.0], 0.02, 9.0));
+    let camera = seeded::camera(40, 40, Pose::IDENTITY);
+    let weights = Renderer::new(&device, &splats, &[], 0).unwrap().weights(&camera).unwrap();
+    assert!(weights[0] > 100.0 && weights[6] < 1e-3, "{weights:?}");
 }
 
 #[test]

@@ -13,12 +13,12 @@ use splatvk::gpu::Device;
 use splatvk::pass::metrics::psnr;
 use splatvk::pass::seeded::Random;
 use splatvk::photo::{self, Photo};
-use splatvk::query::QueryOptions;
+use splatvk::query::{QueryOptions, select::splat_codes};
 use splatvk::report::viewer::Scene3d;
 use splatvk::run::ask::QueryScene;
 use splatvk::run::sources;
 use splatvk::run::view::Viewer;
-use splatvk::scene::{Codebook, LanguageField, LevelField, Plane, RgbImage, Splats};
+use splatvk::scene::{Codebook, LanguageField, LevelField, Plane, RgbImage, Seen, Splats};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
@@ -100,6 +100,7 @@ fn breakfast(folder: &Path) -> PathBuf {
     std::fs::create_dir(&scene).unwrap();
     let contents = Contents {
         splats: &splats,
+        seen: &Seen::default(),
         cameras: &cameras,
         photos: &photos,
         points: None,
@@ -409,9 +410,13 @@ fn a_static_page_answers_what_was_asked() {
     ready.set_views(&scene.cameras).unwrap();
     let answers = ["lemon", "loaf of bread"].map(|t| ready.ask(t, &QueryOptions::default()).unwrap());
     let names = ready.names().unwrap();
+    // As if no photo showed the loaf of bread, label 8.
+    let things = splat_codes(&scene.language.as_ref().unwrap().levels[2]);
+    let seen = Seen { pixels: things.iter().map(|k| f32::from(u8::from(*k != Some(7)))).collect() };
     let view = Scene3d {
         title: "static",
         splats: &scene.splats,
+        seen: &seen,
         cameras: &scene.cameras,
         photos: Vec::new(),
         language: scene.language.as_ref(),
@@ -433,6 +438,10 @@ fn a_static_page_answers_what_was_asked() {
     let overlap = iou(&coloured(&page.picture(0)), &is(&masks_of("train_00"), 8));
     println!("loaf of bread: IoU {overlap:.2}");
     assert!(overlap > 0.7, "{overlap}");
+    page.run("splatvk.show('unseen')");
+    let overlap = iou(&coloured(&page.picture(0)), &is(&masks_of("train_00"), 8));
+    println!("guessed: IoU {overlap:.2}");
+    assert!(overlap > 0.7, "what no photo shows is in magenta, the rest grey: {overlap}");
     page.run("splatvk.ask('plate')");
     assert!(
         page.run("document.querySelector('.v-status').textContent")

@@ -73,6 +73,8 @@ pub struct CameraFigures {
     pub rotation_sigma_degrees: f64,
     /// That of the least sure camera.
     pub confidence: Option<Confidence>,
+    /// Photos that got no camera, by stem; each was warned of.
+    pub left_out: Vec<String>,
     /// The lens that was found, of the first photo.
     pub lens: Lens,
     /// The true lens, if the data state it.
@@ -99,7 +101,7 @@ pub struct CameraReport {
     /// Data sets whose cameras are wrong: a relative rotation by more than 2 degrees, the focal length by more than 10 %, or a
     /// centre by more than 5 % of the mean depth.
     pub wrong: usize,
-    /// Those of them of which no warning was given.
+    /// Those of them of whose cameras no warning was given; that another photo is left out says nothing about them.
     pub wrong_without_warning: Vec<PathBuf>,
     /// Share of the sets with a stated focal length whose error is within 2 σ.
     pub within_2_sigma: Option<f64>,
@@ -241,6 +243,7 @@ fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) 
             &model.fitted.iter().map(|f| f.rotation_sigma.to_degrees()).collect::<Vec<_>>(),
         ),
         confidence: model.fitted.iter().map(pose::Fitted::confidence).min(),
+        left_out: placed.left_out.iter().map(|l| l.photo.clone()).collect(),
         lens: model.fitted.first().map_or(Lens::NONE, |f| f.lens),
         true_lens: frames.first().and_then(|f| f.lens),
     })
@@ -276,8 +279,9 @@ fn summarise(rows: Vec<CameraRow>) -> CameraReport {
             worst_rotation_degrees: errors.iter().copied().fold(0.0, f64::max),
         }
     };
-    let wrong = || rows.iter().filter(|r| matches!(&r.outcome, CameraOutcome::Figures(f) if f.wrong()));
-    let silent = wrong().filter(|r| r.warnings.is_empty()).map(|r| r.data.clone()).collect();
+    let wrong = || rows.iter().filter_map(CameraRow::wrong);
+    let silent = wrong().filter(|(r, f)| r.warnings.len() <= f.left_out.len()).map(|(r, _)| r.data.clone());
+    let silent = silent.collect();
     let levels = [Confidence::High, Confidence::Medium, Confidence::Low];
     CameraReport {
         by_confidence: levels.map(of_level).into_iter().filter(|r| r.sets > 0).collect(),
@@ -314,6 +318,14 @@ pub fn header() -> String {
 }
 
 impl CameraRow {
+    /// The row and its figures, if its cameras are wrong.
+    fn wrong(&self) -> Option<(&CameraRow, &CameraFigures)> {
+        match &self.outcome {
+            CameraOutcome::Figures(f) if f.wrong() => Some((self, f)),
+            _ => None,
+        }
+    }
+
     /// One line of the table.
     pub fn text(&self) -> String {
         let name = self

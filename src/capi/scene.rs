@@ -175,6 +175,7 @@ pub unsafe extern "C" fn svk_scene_read(
                 2 => s.quats.as_flattened(),
                 3 => &s.opacity_logits,
                 4 => &s.sh,
+                5 => &live.seen().pixels,
                 other => return bad_argument(format!("there is no array {other}")),
             };
             if values.is_null() || all.len() != count {

@@ -109,6 +109,9 @@ pub enum SvkArray {
     OpacityLogits = 3,
     /// [N][(degree + 1)²][3] spherical-harmonics coefficients; colour = 0.5 + 0.2820948 · the first.
     Sh = 4,
+    /// [N] pixels of all photos that show the Gaussian; below 0.05 no photo does and it is guessed. Empty (0 floats) where that
+    /// is not known: files of Gaussians, scenes of older versions.
+    Seen = 5,
 }
 
 /// How a context is made. All zero (but for `size`) is the default.

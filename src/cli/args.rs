@@ -140,6 +140,8 @@ pub enum Channel {
     Features,
     /// Index of the decoded code per level, −1 = none
     Codes,
+    /// Share of every pixel that is guessed: surfaces that no photo shows
+    Unseen,
 }
 
 /// How `render` writes it.

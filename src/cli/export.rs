@@ -26,6 +26,9 @@ pub struct ExportArgs {
     /// ply: add the language features and codes as extra columns
     #[arg(long)]
     pub with_features: bool,
+    /// Leave out splats that no photo shows: surfaces continued beyond the photos and behind what stands in front
+    #[arg(long)]
+    pub only_seen: bool,
     /// Print one JSON object on standard output
     #[arg(long)]
     pub json: bool,
@@ -42,7 +45,10 @@ fn formats() -> PossibleValuesParser {
 }
 
 pub fn export(args: &ExportArgs) -> Result<()> {
-    let scene = scene_dir::load(&args.scene)?;
+    let mut scene = scene_dir::load(&args.scene)?;
+    if args.only_seen {
+        keep_seen(&mut scene, args)?;
+    }
     if let Some(parent) = args.out.parent().filter(|p| !p.as_os_str().is_empty()) {
         create_folder(parent).map_err(|e| Error::input(format!("{e}; choose another --out")))?;
     }
@@ -79,6 +85,21 @@ pub fn export(args: &ExportArgs) -> Result<()> {
         }
     }
     listing(std::slice::from_ref(&args.out), args.json)
+}
+
+/// Drops what no photo shows.
+fn keep_seen(scene: &mut scene_dir::Scene, args: &ExportArgs) -> Result<()> {
+    if scene.seen.pixels.is_empty() {
+        return Err(Error::input(format!(
+            "{}: what the photos show of the scene is not known; leave --only-seen out, or make the scene again with this \
+             version",
+            args.scene.display()
+        )));
+    }
+    let rows = scene.seen.rows(&scene.splats);
+    scene.language = scene.language.take().map(|field| field.picked(&rows, scene.splats.len()));
+    scene.splats = scene.splats.picked(&rows);
+    Ok(())
 }
 
 /// Base colours of ordinary photos stay below this: of 145,000 splats of the breakfast scene one in 50,000 is above 1.1,

@@ -9,7 +9,7 @@ use crate::format::picture::{self, Planes};
 use crate::format::{cameras, scene_dir};
 use crate::gpu::Device;
 use crate::report::colour;
-use crate::run::view::{DecodedFrame, Viewer};
+use crate::run::view::{DecodedFrame, UnseenShare, Viewer};
 use crate::scene::{LEVEL_NAMES, LanguageField, Plane, RgbImage, to_linear};
 use crate::{Error, Result};
 
@@ -24,11 +24,21 @@ pub fn render(args: &RenderArgs) -> Result<()> {
             args.scene.display()
         )));
     }
+    let wants_unseen = args.channels.contains(&Channel::Unseen);
+    if wants_unseen && scene.seen.pixels.is_empty() {
+        return Err(Error::input(format!(
+            "{}: what the photos show of the scene is not known, so no unseen; leave it out of --channels, or make the scene \
+             again with this version",
+            args.scene.display()
+        )));
+    }
     let nothing = LanguageField::default();
     let field = if wants_language { scene.language.as_ref().unwrap_or(&nothing) } else { &nothing };
     let mut out = WrittenFiles::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
+    let mut unseen =
+        wants_unseen.then(|| UnseenShare::new(&device, &scene.splats, &scene.seen)).transpose()?;
     let progress = progress::reporter();
     progress.begin("render", cameras.len() as u64);
     for (i, (camera, stem)) in cameras.iter().zip(&stems).enumerate() {
@@ -38,17 +48,27 @@ pub fn render(args: &RenderArgs) -> Result<()> {
         } else {
             viewer.view(camera)?
         };
+        let unseen = unseen.as_mut().map(|u| u.view(camera)).transpose()?;
+        let view = View { decoded: &view, unseen: unseen.as_ref() };
         for format in &args.formats {
             match format {
-                ImageFormat::Png => png(&mut out, stem, &args.channels, &view, field)?,
-                ImageFormat::Exr => exr(&mut out, stem, &args.channels, &view)?,
-                ImageFormat::Npy => arrays(&mut out, stem, &args.channels, &view, field)?,
+                ImageFormat::Png => png(&mut out, stem, &args.channels, view, field)?,
+                ImageFormat::Exr => exr(&mut out, stem, &args.channels, view)?,
+                ImageFormat::Npy => arrays(&mut out, stem, &args.channels, view, field)?,
             }
         }
         progress.step(i as u64 + 1, "");
     }
     progress.end();
     listing(&out.keep(), args.device.json)
+}
+
+/// What is written of one camera.
+#[derive(Clone, Copy)]
+struct View<'a> {
+    decoded: &'a DecodedFrame,
+    /// [H, W] share that no photo shows, where it is asked for.
+    unseen: Option<&'a Plane<f32>>,
 }
 
 /// Levels of the field that have codes: (name, first feature channel, number of channels, index).
@@ -74,7 +94,7 @@ fn png(
     out: &mut WrittenFiles,
     stem: &str,
     channels: &[Channel],
-    view: &DecodedFrame,
+    View { decoded: view, unseen }: View,
     field: &LanguageField,
 ) -> Result<()> {
     let frame = &view.rendered;
@@ -94,6 +114,11 @@ fn png(
                 for (name, first, d, _) in levels(field) {
                     let image = false_colour(&part(view, first, d), d, &frame.alpha);
                     picture::write_png(&out.file(&format!("{stem}_features_{name}.png"))?, &image)?;
+                }
+            }
+            Channel::Unseen => {
+                if let Some(share) = unseen {
+                    picture::write_grey_png(&out.file(&format!("{stem}_unseen.png"))?, share)?;
                 }
             }
             Channel::Codes => {
@@ -120,7 +145,12 @@ fn false_colour(features: &[f32], d: usize, like: &Plane<f32>) -> RgbImage {
     }
 }
 
-fn exr(out: &mut WrittenFiles, stem: &str, channels: &[Channel], view: &DecodedFrame) -> Result<()> {
+fn exr(
+    out: &mut WrittenFiles,
+    stem: &str,
+    channels: &[Channel],
+    View { decoded: view, unseen }: View,
+) -> Result<()> {
     let frame = &view.rendered;
     let has = |c: Channel| channels.contains(&c);
     // OpenEXR holds linear light; what programs that read it expect.
@@ -130,6 +160,7 @@ fn exr(out: &mut WrittenFiles, stem: &str, channels: &[Channel], view: &DecodedF
         rgb: linear.as_ref(),
         alpha: has(Channel::Alpha).then_some(&frame.alpha),
         depth: has(Channel::Depth).then_some(&frame.depth),
+        unseen,
         features: has(Channel::Features).then_some((frame.feature_dim, frame.features.as_slice())),
         codes: if has(Channel::Codes) { &view.codes } else { &[] },
     };
@@ -140,7 +171,7 @@ fn arrays(
     out: &mut WrittenFiles,
     stem: &str,
     channels: &[Channel],
-    view: &DecodedFrame,
+    View { decoded: view, unseen }: View,
     field: &LanguageField,
 ) -> Result<()> {
     let frame = &view.rendered;
@@ -161,6 +192,11 @@ fn arrays(
                 for (name, first, d, _) in levels(field) {
                     let path = out.file(&format!("{stem}_features_{name}.npy"))?;
                     picture::write_npy(&path, size, Some(d), &part(view, first, d))?;
+                }
+            }
+            Channel::Unseen => {
+                if let Some(share) = unseen {
+                    picture::write_npy(&out.file(&format!("{stem}_unseen.npy"))?, size, None, &share.data)?;
                 }
             }
             Channel::Codes => {

@@ -42,7 +42,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     let names = ready.as_mut().map_or(Ok(CodeNames::new()), QueryScene::names)?;
     let content = Content {
         page: page(&scene, args, &names, no_questions.as_deref())?,
-        splats: viewer::pack(&scene.splats, scene.language.as_ref(), usize::MAX)?.bytes,
+        splats: viewer::pack(&scene.splats, &scene.seen, scene.language.as_ref(), usize::MAX)?.bytes,
         port: port_of(&server)?,
     };
     let address = format!("http://127.0.0.1:{}/", content.port);
@@ -95,6 +95,7 @@ fn page(scene: &Scene, args: &ViewArgs, names: &CodeNames, no_questions: Option<
     let view = Scene3d {
         title: &title,
         splats: &scene.splats,
+        seen: &scene.seen,
         cameras: &scene.cameras,
         photos: images.iter().collect(),
         language: scene.language.as_ref(),

@@ -70,6 +70,8 @@ pub struct Planes<'a> {
     pub alpha: Option<&'a Plane<f32>>,
     /// Z, scene units.
     pub depth: Option<&'a Plane<f32>>,
+    /// unseen: share of every pixel that no photo shows.
+    pub unseen: Option<&'a Plane<f32>>,
     /// feat.00 …: (d, [H, W, d] values).
     pub features: Option<(usize, &'a [f32])>,
     /// code.s, code.m, code.l: one map per level, −1 = none.
@@ -87,6 +89,7 @@ pub fn write_exr(path: &Path, size: (usize, usize), planes: Planes) -> Result<()
     }
     channels.extend(planes.alpha.map(|p| ("A".to_string(), p.data.clone())));
     channels.extend(planes.depth.map(|p| ("Z".to_string(), p.data.clone())));
+    channels.extend(planes.unseen.map(|p| ("unseen".to_string(), p.data.clone())));
     if let Some((d, values)) = planes.features {
         for k in 0..d {
             channels.push((format!("feat.{k:02}"), values.iter().skip(k).step_by(d).copied().collect()));
@@ -149,6 +152,7 @@ mod tests {
         let planes = Planes {
             rgb: Some(&rgb),
             depth: Some(&depth),
+            unseen: None,
             features: Some((d, &features)),
             codes: std::slice::from_ref(&codes),
             ..Planes::default()

@@ -3,7 +3,9 @@ use super::npy::{self, NpyArray};
 use super::workspace::MANIFEST;
 use super::{cameras, colmap, create_folder, gaussians, picture, ply, transforms};
 use crate::photo::Photo;
-use crate::scene::{Camera, Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId, PointCloud, Splats};
+use crate::scene::{
+    Camera, Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId, PointCloud, Seen, Splats,
+};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -18,6 +20,9 @@ const FORMAT: &str = "splatvk-scene";
 /// Text embeddings that came with precomputed features, kept so that the scene answers queries on its own.
 pub const TEXT_EMBEDDINGS: &str = "language/text_embeddings.npz";
 
+/// What the photos show of every splat, [N] f32 ([`Seen`]).
+const SEEN: &str = "seen.npy";
+
 /// A loaded scene.
 #[derive(Clone, Debug, Default)]
 #[non_exhaustive]
@@ -26,6 +31,8 @@ pub struct Scene {
     pub path: PathBuf,
     /// The Gaussians.
     pub splats: Splats,
+    /// What the photos show of them.
+    pub seen: Seen,
     /// Training cameras at working resolution; empty for a bare PLY.
     pub cameras: Vec<Camera>,
     /// Codebooks and features; `None` without language.
@@ -64,6 +71,8 @@ struct LevelManifest {
 pub struct Contents<'a> {
     /// The Gaussians.
     pub splats: &'a Splats,
+    /// What the photos show of them.
+    pub seen: &'a Seen,
     /// One per photo, at working resolution.
     pub cameras: &'a [Camera],
     /// Kept beside the cameras (undistorted, working resolution), for other tools; may be empty.
@@ -80,6 +89,9 @@ pub struct Contents<'a> {
 /// a folder without it is not a scene.
 pub fn write(folder: &Path, c: &Contents) -> Result<()> {
     ply::write_splats(&folder.join("point_cloud.ply"), c.splats, ply::PlyOptions::default())?;
+    if !c.seen.pixels.is_empty() {
+        npy::write(folder.join(SEEN), &NpyArray::f32(&[c.seen.pixels.len()], c.seen.pixels.clone()))?;
+    }
     let camera_folder = folder.join("cameras");
     create_folder(&camera_folder)?;
     let mut named = c.cameras.to_vec();
@@ -193,7 +205,25 @@ pub fn load(path: &Path) -> Result<Scene> {
     }
     let splats = cut_degree(splats, manifest.sh_degree);
     let language = manifest.language.map(|m| read_language(path, &m, splats.len())).transpose()?;
-    Ok(Scene { path: path.into(), splats, cameras, language })
+    let seen = read_seen(path, splats.len())?;
+    Ok(Scene { path: path.into(), splats, seen, cameras, language })
+}
+
+/// Scenes of earlier versions do not have the file.
+fn read_seen(folder: &Path, splats: usize) -> Result<Seen> {
+    let file = folder.join(SEEN);
+    if !file.is_file() {
+        return Ok(Seen::default());
+    }
+    let array = npy::read(&file)?;
+    if array.shape != [splats] {
+        return Err(Error::input(format!(
+            "{}: {:?} values for {splats} splats; the scene is damaged, run again",
+            file.display(),
+            array.shape
+        )));
+    }
+    Ok(Seen { pixels: array.to_f32() })
 }
 
 fn read_manifest(path: &Path) -> Result<Manifest> {

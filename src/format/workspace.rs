@@ -161,6 +161,7 @@ mod tests {
         let (splats, camera) = crate::pass::seeded::small(40, 64, 48, 1, 3);
         let contents = Contents {
             splats: &splats,
+            seen: &crate::scene::Seen::default(),
             cameras: std::slice::from_ref(&camera),
             photos: &[],
             points: None,

@@ -316,25 +316,35 @@ impl Rasterizer {
         options: &RasterOptions,
         mut seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
     ) -> Result<()> {
-        self.check(params)?;
         for index in 0..self.frame.bands.count() {
             let band = self.frame.bands.get(index);
-            loop {
-                let mut rec = Recorder::new(&self.device, "forward");
-                if index == 0 {
-                    self.record_projection(&mut rec, params, options);
-                }
-                self.record_band(&mut rec, params, &band);
-                rec.download(&self.frame.status);
-                rec.run()?;
-                match self.overflow()? {
-                    Some(needed) => self.grow(needed)?,
-                    None => break,
-                }
-            }
+            self.forward_band(params, options, &band)?;
             seen(&self.frame, &band)?;
         }
         Ok(())
+    }
+
+    /// Runs the forward pass of one band, after those above it.
+    pub(super) fn forward_band(
+        &mut self,
+        params: &SplatBuffers,
+        options: &RasterOptions,
+        band: &Band,
+    ) -> Result<()> {
+        self.check(params)?;
+        loop {
+            let mut rec = Recorder::new(&self.device, "forward");
+            if band.index == 0 {
+                self.record_projection(&mut rec, params, options);
+            }
+            self.record_band(&mut rec, params, band);
+            rec.download(&self.frame.status);
+            rec.run()?;
+            match self.overflow()? {
+                Some(needed) => self.grow(needed)?,
+                None => return Ok(()),
+            }
+        }
     }
 
     /// Entries that a frame needed since the last [`Rasterizer::grow`], if they did not fit; `None` when all was well.

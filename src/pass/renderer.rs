@@ -1,12 +1,13 @@
 //! Renders a scene that stays on the GPU to images on the host.
 use super::bands::Band;
 use super::channels::BASE_CHANNELS;
-use super::frame::FrameBuffers;
+use super::frame::{FrameBuffers, GRADIENT_FLOATS};
 use super::options::RasterOptions;
+use super::raster_backward::MOMENTS;
 use super::rasterizer::Rasterizer;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
-use crate::gpu::{Device, shaders};
+use crate::gpu::{Device, Recorder, shaders};
 use crate::math::median;
 use crate::scene::{Camera, Plane, RgbImage, Splats};
 use crate::{Error, Result};
@@ -109,6 +110,29 @@ impl Renderer {
         let options = self.options;
         let (rasterizer, splats) = self.ready(camera)?;
         rasterizer.forward_bands(splats, &options, seen)
+    }
+
+    /// [N] pixels of a view that each splat shows: its blending weight summed over them, 0 for what is hidden or outside.
+    ///
+    /// `∂/∂c_i Σ_px C(px) = Σ_px w_i(px)`: the way back of a loss that adds up one colour.
+    pub fn weights(&mut self, camera: &Camera) -> Result<Vec<f32>> {
+        let options = RasterOptions { sh_degree: 0, ..self.options };
+        let device = self.device.clone();
+        let (rasterizer, splats) = self.ready(camera)?;
+        let ones = vec![1f32; camera.width as usize * camera.height as usize];
+        for index in 0..rasterizer.frame().bands.count() {
+            let band = rasterizer.frame().bands.get(index);
+            rasterizer.forward_band(splats, &options, &band)?;
+            let upstream = rasterizer.frame().bands.cut_inner(&band, &ones, 0.0);
+            rasterizer.frame().planes_grad.write_at(0, &upstream)?;
+            let mut rec = Recorder::new(&device, "weights");
+            rasterizer.record_band_backward(&mut rec, splats, &options, &band);
+            rec.run()?;
+        }
+        let sums = rasterizer.frame().projected_grad.read_range(0..GRADIENT_FLOATS * splats.count)?;
+        // Nothing is to be left of it for a loss that uses other planes.
+        rasterizer.frame().planes_grad.write_at(0, &vec![0f32; rasterizer.frame().bands.pixels()])?;
+        Ok(sums.chunks_exact(GRADIENT_FLOATS).map(|g| g[MOMENTS]).collect())
     }
 
     /// A rasteriser that is set to the camera, and the splats.

@@ -90,6 +90,7 @@ fn work(
     if let Some(text) = super::fidelity::warning(&photos, &trained.stats) {
         progress.warn(&text);
     }
+    let seen = super::view::seen(device, &language.splats, &trained.cameras, progress)?;
     Ok(RunOutcome {
         plan: plan.clone(),
         preset,
@@ -100,6 +101,7 @@ fn work(
         geometry: made.take(scene.geometry)?,
         cameras: trained.cameras,
         splats: language.splats,
+        seen,
         rgb: trained.stats,
         field: language.field,
         alignment: made.take(scene.aligned)?.alignment,
@@ -132,6 +134,7 @@ fn write(workspace: Workspace, outcome: &RunOutcome, progress: &dyn Progress) ->
     let table = sources::text_table(&outcome.plan.features);
     let contents = Contents {
         splats: &outcome.splats,
+        seen: &outcome.seen,
         cameras: &outcome.cameras,
         photos: &outcome.photos,
         points: Some(&outcome.geometry.points),

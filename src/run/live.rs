@@ -12,7 +12,7 @@ use crate::pass::rasterizer::FrameBuffers;
 use crate::photo;
 use crate::progress::Silent;
 use crate::query::{self, CANONICAL_PHRASES, QueryOptions, QueryResult, TextQuery};
-use crate::scene::{Camera, LanguageField, Plane, Splats};
+use crate::scene::{Camera, LanguageField, Plane, Seen, Splats};
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -87,6 +87,13 @@ impl LiveScene {
         match &self.origin {
             SceneOrigin::Trained(o) => &o.splats,
             SceneOrigin::Loaded(s) => &s.splats,
+        }
+    }
+    /// What the photos show of them.
+    pub fn seen(&self) -> &Seen {
+        match &self.origin {
+            SceneOrigin::Trained(o) => &o.seen,
+            SceneOrigin::Loaded(s) => &s.seen,
         }
     }
     /// One per photo; none for a bare file.
@@ -201,6 +208,7 @@ fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
     let table = scene.path.join(scene_dir::TEXT_EMBEDDINGS);
     let contents = Contents {
         splats: &scene.splats,
+        seen: &scene.seen,
         cameras: &scene.cameras,
         photos: &photos,
         points: points.as_ref(),

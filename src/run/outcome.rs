@@ -10,7 +10,7 @@ use crate::preset::Preset;
 use crate::progress::StageRecord;
 use crate::report::ModelUsed;
 use crate::report::viewer::CodeNames;
-use crate::scene::{Camera, LanguageField, Splats};
+use crate::scene::{Camera, LanguageField, Seen, Splats};
 
 /// Everything that a run made; [`crate::report`] turns it into run.json, report.html and the summary.
 #[non_exhaustive]
@@ -33,6 +33,8 @@ pub struct RunOutcome {
     pub cameras: Vec<Camera>,
     /// The scene.
     pub splats: Splats,
+    /// What the photos show of it.
+    pub seen: Seen,
     /// Figures of the colour stage.
     pub rgb: fit::FitStats,
     /// The scene's language.

@@ -7,7 +7,7 @@ use crate::photo::Photo;
 use crate::pose::{Confidence, Fitted};
 use crate::report::viewer::Scene3d;
 use crate::report::{self, AnswerShown, Curve, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown};
-use crate::scene::{Camera, LEVEL_NAMES};
+use crate::scene::{Camera, LEVEL_NAMES, Seen, Splats};
 use serde_json::json;
 use std::path::Path;
 
@@ -59,7 +59,7 @@ fn statistics(o: &RunOutcome) -> serde_json::Value {
             "optics": optics(o),
         },
         "light": super::light::record(&o.photos),
-        "splats": { "start": o.rgb.splats[0], "end": o.splats.len() },
+        "splats": { "start": o.rgb.splats[0], "end": o.splats.len(), "unseen": o.seen.unseen() },
         "psnr_train": o.rgb.psnr, "poses_refined": o.rgb.poses_refined,
         "loss": o.rgb.curve.iter().map(|p| json!([p.step, p.loss])).collect::<Vec<_>>(),
         "curves": curves,
@@ -190,7 +190,7 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
     let mut list = vec![
         ("device".to_owned(), format!("{}{cpu}", o.device.name)),
         ("photos".to_owned(), sizes(&o.photos) + &chosen),
-        ("splats".to_owned(), o.splats.len().to_string()),
+        splats_figure(&o.splats, &o.seen),
         super::fidelity::figure(&o.rgb),
     ];
     list.extend(
@@ -205,6 +205,15 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
         list.push((format!("“{}”", a.text), format!("found in {} of {} photos", a.found(), a.views.len())));
     }
     list
+}
+
+/// How many splats there are, and how many of them are guessed.
+pub(super) fn splats_figure(splats: &Splats, seen: &Seen) -> (String, String) {
+    let guessed = match seen.unseen() {
+        0 => String::new(),
+        n => format!(", {n} of them where no photo looks"),
+    };
+    ("splats".to_owned(), format!("{}{guessed}", splats.len()))
 }
 
 /// Per photo its working and its original (width, height).
@@ -293,6 +302,7 @@ fn scene<'a>(title: &'a str, o: &'a RunOutcome) -> Scene3d<'a> {
     Scene3d {
         title,
         splats: &o.splats,
+        seen: &o.seen,
         cameras: &o.cameras,
         photos: o.photos.iter().map(|p| &p.image).collect(),
         language: Some(&o.field),

@@ -162,12 +162,14 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         progress.warn(&text);
     }
 
+    let seen = super::view::seen(&device, &trained.splats, &trained.cameras, progress)?;
     progress.begin("write", 1);
     let nothing = LanguageField::default();
     let mut viewer = Viewer::new(&device, &trained.splats, &nothing)?;
     let frames = trained.cameras.iter().map(|c| viewer.view(c)).collect::<Result<Vec<_>>>()?;
     let contents = Contents {
         splats: &trained.splats,
+        seen: &seen,
         cameras: &trained.cameras,
         photos: &photos,
         points: Some(&geometry.points),
@@ -191,7 +193,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
             "working_sizes": super::record::working_sizes(&photos),
             "geometry": { "method": geometry.method, "points": geometry.points.len() },
             "light": super::light::record(&photos),
-            "splats": { "start": trained.stats.splats[0], "end": trained.splats.len() },
+            "splats": { "start": trained.stats.splats[0], "end": trained.splats.len(), "unseen": seen.unseen() },
             "psnr_train": trained.stats.psnr, "poses_refined": trained.stats.poses_refined,
             "curves": curves,
         }),
@@ -200,7 +202,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let mut figures = vec![
         ("device".to_owned(), device.info().name.clone()),
         ("photos".to_owned(), super::record::sizes(&photos)),
-        ("splats".to_owned(), trained.splats.len().to_string()),
+        super::record::splats_figure(&trained.splats, &seen),
         super::fidelity::figure(&trained.stats),
     ];
     figures.extend(super::light::figure(&photos));
@@ -224,6 +226,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         scene: Some(report::viewer::Scene3d {
             title: &title,
             splats: &trained.splats,
+            seen: &seen,
             cameras: &trained.cameras,
             photos: photos.iter().map(|p| &p.image).collect(),
             language: None,

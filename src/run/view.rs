@@ -6,7 +6,8 @@ use crate::pass::decode::Codes;
 use crate::pass::raster_forward::BASE_CHANNELS;
 use crate::pass::rasterizer::FrameBuffers;
 use crate::pass::renderer::{RenderedFrame, Renderer};
-use crate::scene::{Camera, LanguageField, Plane, Splats};
+use crate::progress::Progress;
+use crate::scene::{Camera, LanguageField, Plane, SH_C0, Seen, Splats};
 
 /// A rendered frame and the code of every pixel per level (−1 = none).
 #[derive(Clone, Debug)]
@@ -129,6 +130,39 @@ fn decode(
     }
     *output = Some(decoded);
     Ok(())
+}
+
+/// How much of the photos, taken by these cameras, every splat shows.
+pub fn seen(device: &Device, splats: &Splats, cameras: &[Camera], progress: &dyn Progress) -> Result<Seen> {
+    progress.begin("seen", cameras.len() as u64);
+    let mut renderer = Renderer::new(device, splats, &[], 0)?;
+    let mut pixels = vec![0.0; splats.len()];
+    for (done, camera) in cameras.iter().enumerate() {
+        progress.check()?;
+        pixels.iter_mut().zip(renderer.weights(camera)?).for_each(|(sum, w)| *sum += w);
+        progress.step(done as u64 + 1, "");
+    }
+    progress.end();
+    Ok(Seen { pixels })
+}
+
+/// Share of every pixel that splats blend into it which no photo shows; alpha, without them, is what is known of it.
+pub struct UnseenShare(Renderer);
+
+impl UnseenShare {
+    /// Uploads the scene in two colours.
+    pub fn new(device: &Device, splats: &Splats, seen: &Seen) -> Result<UnseenShare> {
+        let dc = |i: usize| (f32::from(u8::from(seen.is_unseen(i))) - 0.5) / SH_C0;
+        let sh = (0..splats.len()).flat_map(|i| [dc(i); 3]).collect();
+        let two = Splats { sh, sh_degree: 0, ..splats.clone() };
+        Ok(UnseenShare(Renderer::new(device, &two, &[], 0)?))
+    }
+
+    /// [H, W] in [0, 1).
+    pub fn view(&mut self, camera: &Camera) -> Result<Plane<f32>> {
+        let rgb = self.0.render(camera)?.rgb;
+        Ok(Plane { width: rgb.width, height: rgb.height, data: rgb.data.iter().map(|c| c[0]).collect() })
+    }
 }
 
 /// The scene from every camera.

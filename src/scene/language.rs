@@ -95,3 +95,15 @@ pub struct LanguageField {
     /// Identifies the embedding space, for example `words/efficientnet-lite+minilm` or `dir:oracle`.
     pub space: String,
 }
+
+impl LanguageField {
+    /// The field of the given rows of a scene's `splats`, in their order.
+    pub fn picked(self, rows: &[usize], splats: usize) -> LanguageField {
+        let level = |l: LevelField| {
+            let width = l.features.len() / splats.max(1);
+            let row = |i: &usize| &l.features[i * width..(i + 1) * width];
+            LevelField { features: rows.iter().flat_map(row).copied().collect(), ..l }
+        };
+        LanguageField { levels: self.levels.into_iter().map(level).collect(), ..self }
+    }
+}

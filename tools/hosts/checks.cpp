@@ -2,6 +2,7 @@
 //   checks SCENE PHOTO PHOTO...
 #include "host.hpp"
 
+#include <algorithm>
 #include <atomic>
 #include <cmath>
 #include <cstring>
@@ -90,6 +91,9 @@ static void reading(SvkContext *context, const char *path) {
     std::vector<float> means(3 * info.splats);
     check(svk_scene_read(loaded, SVK_ARRAY_MEANS, means.data(), means.size()), loaded);
     EXPECT(svk_scene_read(loaded, SVK_ARRAY_MEANS, means.data(), means.size() - 1) == SVK_STATUS_ARGUMENT);
+    std::vector<float> seen(means.size() / 3);
+    check(svk_scene_read(loaded, SVK_ARRAY_SEEN, seen.data(), seen.size()), loaded);
+    EXPECT(*std::max_element(seen.begin(), seen.end()) > 0.05f);
     SvkCamera camera = scene_camera(loaded, 0);
     auto none = make<SvkCamera>();
     EXPECT(svk_scene_camera(loaded, 99, &none, nullptr, 0) == SVK_STATUS_ARGUMENT);

@@ -11,7 +11,7 @@ use super::colour;
 use crate::Result;
 use crate::format::picture;
 use crate::query::highlight::Highlight;
-use crate::scene::{Camera, LEVEL_NAMES, LanguageField, RgbImage, Splats};
+use crate::scene::{Camera, LEVEL_NAMES, LanguageField, RgbImage, Seen, Splats};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::{Value, json};
@@ -74,6 +74,8 @@ pub struct Scene3d<'a> {
     pub title: &'a str,
     /// The Gaussians.
     pub splats: &'a Splats,
+    /// What the photos show of them.
+    pub seen: &'a Seen,
     /// The photos' cameras.
     pub cameras: &'a [Camera],
     /// The photos, for thumbnails; as many as cameras, or none.
@@ -89,7 +91,7 @@ pub struct Scene3d<'a> {
 impl Scene3d<'_> {
     /// The section for a static page, splats included, and what to tell about it.
     pub fn embedded(&self) -> Result<(String, String)> {
-        let packed = pack(self.splats, self.language, REPORT_SPLATS)?;
+        let packed = pack(self.splats, self.seen, self.language, REPORT_SPLATS)?;
         let data = STANDARD.encode(&packed.bytes);
         let note = format!(
             "{} of {} splats, {:.1} MB in this page. splatvk view SCENE shows all of them and answers any question.",
@@ -125,6 +127,7 @@ impl Scene3d<'_> {
             "title": self.title, "live": false, "ask_note": ask_note,
             "names_note": if words { "" } else { "This text model brings no phrases of its own: ask, and they appear here." },
             "views": views.collect::<Result<Vec<_>>>()?,
+            "unseen": self.seen.unseen(),
             "levels": (0..LEVEL_NAMES.len()).map(|at| self.level(at)).collect::<Vec<_>>(),
             "answers": self.answers.iter().map(ShownAnswer::json).collect::<Vec<_>>(),
         }))
@@ -185,6 +188,7 @@ mod tests {
         let scene = Scene3d {
             title: "a<b",
             splats: &splats,
+            seen: &Seen::default(),
             cameras: std::slice::from_ref(&camera),
             photos: vec![&photo],
             language: None,

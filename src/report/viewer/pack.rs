@@ -4,7 +4,7 @@
 //!
 //! | what | type | meaning |
 //! |---|---|---|
-//! | head | `SVKVIEW1`, u32 × 4 | N, SH degree, L, 0 |
+//! | head | `SVKVIEW1`, u32 × 4 | N, SH degree, L, 1 if the last row is there |
 //! | SH scale | f32 × 3 | largest absolute coefficient of degrees 1, 2, 3 |
 //! | ranges | f32 × 10 per block | lowest and highest x, y, z; log scale; colour |
 //! | x, y, z | u16 × N each | position in the block's range |
@@ -14,11 +14,12 @@
 //! | red, green, blue | u8 × N each | 0.5 + SH₀ · DC in the block's range |
 //! | SH rest | i8 × N, 3 R times | coefficient by coefficient, RGB; 127 = the scale of its degree |
 //! | codes | u16 × N, L times | code + 1 per level, finest first; 0 = none |
+//! | unseen | u8 × N | 1 where no photo shows the splat |
 //!
 //! Planes of one quantity deflate better than records. A position is exact to 1/65535 of a block, which is a few
 //! neighbouring splats wide.
 use crate::query::select;
-use crate::scene::{LanguageField, LevelField, SH_C0, Splats};
+use crate::scene::{LanguageField, LevelField, SH_C0, Seen, Splats};
 use crate::{Error, Result};
 use std::io::Write;
 
@@ -40,10 +41,10 @@ pub struct Packed {
 }
 
 /// Packs at most `most` splats, those that cover the most.
-pub fn pack(splats: &Splats, language: Option<&LanguageField>, most: usize) -> Result<Packed> {
+pub fn pack(splats: &Splats, seen: &Seen, language: Option<&LanguageField>, most: usize) -> Result<Packed> {
     let order = in_space(splats, most_visible(splats, most));
     let levels: Vec<&LevelField> = language.map_or(Vec::new(), |f| f.levels.iter().collect());
-    let raw = write(splats, &levels, &order);
+    let raw = write(splats, seen, &levels, &order);
     // 6: a tenth larger than 9 and four times as fast.
     let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::new(6));
     gzip.write_all(&raw)
@@ -99,7 +100,7 @@ fn bounds<const K: usize>(rows: impl Iterator<Item = [f32; K]>) -> ([f32; K], [f
     })
 }
 
-fn write(splats: &Splats, levels: &[&LevelField], order: &[usize]) -> Vec<u8> {
+fn write(splats: &Splats, seen: &Seen, levels: &[&LevelField], order: &[usize]) -> Vec<u8> {
     let rest = splats.sh_len() - 1;
     let colour = |i: usize| [0, 1, 2].map(|c| 0.5 + SH_C0 * splats.sh[3 * (rest + 1) * i + c]);
     let all = |i: usize| {
@@ -123,7 +124,7 @@ fn write(splats: &Splats, levels: &[&LevelField], order: &[usize]) -> Vec<u8> {
     };
     let scales = sh_scales(splats, order, rest);
     let mut out = MAGIC.to_vec();
-    for v in [order.len() as u32, splats.sh_degree, levels.len() as u32, 0] {
+    for v in [order.len() as u32, splats.sh_degree, levels.len() as u32, u32::from(seen.unseen() > 0)] {
         out.extend(v.to_le_bytes());
     }
     scales.iter().chain(ranges.iter().flatten().flatten()).for_each(|v| out.extend(v.to_le_bytes()));
@@ -153,6 +154,9 @@ fn write(splats: &Splats, levels: &[&LevelField], order: &[usize]) -> Vec<u8> {
     }
     for level in levels {
         codes(level, order).iter().for_each(|code| out.extend(code.to_le_bytes()));
+    }
+    if seen.unseen() > 0 {
+        out.extend(order.iter().map(|i| u8::from(seen.is_unseen(*i))));
     }
     out
 }
@@ -247,14 +251,15 @@ mod tests {
         let level = LevelField { codebook, features, targets: Vec::new() };
         let field = LanguageField { levels: vec![level, LevelField::default()], space: String::new() };
         let order = in_space(&splats, most_visible(&splats, usize::MAX));
-        let packed = pack(&splats, Some(&field), usize::MAX).unwrap();
+        let seen = Seen { pixels: (0..700).map(|i| (i % 2) as f32).collect() };
+        let packed = pack(&splats, &seen, Some(&field), usize::MAX).unwrap();
         let n = order.len();
         assert_eq!((packed.shown, packed.total), (n, 700));
         let raw = unpacked(&packed);
         let mut r = Reader(&raw);
         assert_eq!(&r.take::<8>(), MAGIC);
         let head: [u32; 4] = std::array::from_fn(|_| u32::from_le_bytes(r.take()));
-        assert_eq!(head, [n as u32, 2, 2, 0]);
+        assert_eq!(head, [n as u32, 2, 2, 1]);
         let sh_scales: [f32; 3] = std::array::from_fn(|_| r.f32());
         let ranges: Vec<[f32; 10]> =
             (0..n.div_ceil(BLOCK)).map(|_| std::array::from_fn(|_| r.f32())).collect();
@@ -317,7 +322,12 @@ mod tests {
             assert_eq!(r.u16(), [1, 2, 0][s % 3], "code + 1, or none for a feature of length 0.05");
         }
         assert!(order.iter().all(|_| r.u16() == 0), "a level without codes");
+        for &s in &order {
+            assert_eq!(r.u8(), u8::from(s % 2 == 0), "even ones are in no photo");
+        }
         assert!(r.0.is_empty());
+        let unknown = unpacked(&pack(&splats, &Seen::default(), Some(&field), usize::MAX).unwrap());
+        assert_eq!((unknown[20], unknown.len()), (0, raw.len() - n), "no row where nothing is known");
     }
 
     #[test]

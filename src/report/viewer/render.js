@@ -2,11 +2,11 @@
 // glsl/raster_forward.comp), far to near into a half-float image; a second pass turns that image into colours.
 import { half } from "splatvk/splats";
 
-export const MODES = { colour: 0, depth: 1, level: 2, relevancy: 3 };
+export const MODES = { colour: 0, depth: 1, level: 2, relevancy: 3, unseen: 4 };
 
 const VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
-uniform usampler2D data;     // two texels per splat: position, (r, g); (b, opacity), (log scales), quaternion
+uniform usampler2D data;     // two texels per splat: position, (r, g); (b, opacity), (log scales and unseen), quaternion
 uniform usampler2D codes;    // code + 1 per level
 uniform sampler2D sh;        // (degree + 1)² − 1 texels per splat, -1..1 of shScale
 uniform sampler2D table;     // per level two rows: (label colour, selected), (relevancy, answers)
@@ -91,6 +91,7 @@ void main() {
   vec4 label = texelFetch(table, ivec2(k, 2 * level), 0), answer = texelFetch(table, ivec2(k, 2 * level + 1), 0);
   payload.a = opacity;
   if (mode == ${MODES.depth}) payload.rgb = vec3(t.z, 0.0, 0.0);
+  else if (mode == ${MODES.unseen}) payload.rgb = unpackHalf2x16(b.z).y > 0.5 ? vec3(0.9, 0.1, 0.6) : vec3(0.15 + 0.7 * luma);
   else if (mode == ${MODES.relevancy}) payload.rgb = vec3(luma, answer.xy);
   else {
     payload.rgb = mode == ${MODES.level} ? label.rgb : colour;
@@ -233,7 +234,7 @@ export class Renderer {
         out[8 * i + 3] = two(c[0], c[1]);
         out[8 * i + 4] = two(c[2], splats.opacity[i]);
         out[8 * i + 5] = two(s[0], s[1]);
-        out[8 * i + 6] = two(s[2], 0);
+        out[8 * i + 6] = two(s[2], splats.unseen ? splats.unseen[i] : 0);
         out[8 * i + 7] = splats.packedQuats[i];
       }
       return out;

@@ -232,6 +232,7 @@ const modes = [
   { name: "Depth", mode: "depth" },
   ...levels.flatMap((l, level) => (l.colours.length ? [{ name: l.title, mode: "level", level }] : [])),
   ...(levels.some((l) => l.colours.length) ? [{ name: "Relevancy", mode: "relevancy" }] : []),
+  ...(manifest.unseen ? [{ name: "Guessed", mode: "unseen", title: "What no photo shows, in magenta" }] : []),
 ];
 
 function show(mode, level = state.level) {
@@ -491,7 +492,7 @@ function nextMode() {
 }
 
 function controls() {
-  find(".v-modes").replaceChildren(...modes.map((m) => button(m.name, () => show(m.mode, m.level), { role: "radio", "aria-checked": String(m.mode === "colour") })));
+  find(".v-modes").replaceChildren(...modes.map((m) => button(m.name, () => show(m.mode, m.level), { role: "radio", title: m.title ?? "", "aria-checked": String(m.mode === "colour") })));
   find(".v-photos").replaceChildren(...views.map((v, i) => {
     const made = button(v.thumbnail ? "" : String(i + 1), () => goTo(i), { title: v.name, "aria-label": `photo ${v.name}` });
     if (v.thumbnail) made.style.backgroundImage = `url(${v.thumbnail})`;

@@ -1,0 +1,44 @@
+//! How much of the photos every splat shows. What no photo shows is a guess: a surface continued beyond the photos' borders and
+//! behind what stands in front, or the inside of a thing.
+use super::Splats;
+
+/// Splats that show less of the photos than this, in pixels, are unseen: they leave no trace in any photo. The bound below which
+/// a splat starts without a feature, too (docs/method.md#lifting).
+const LEAST: f32 = 0.05;
+
+/// What the photos show of every splat; nothing where that is not known, as of a bare file of Gaussians.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Seen {
+    /// [N] pixels: blending weights, summed over the pixels of all photos.
+    pub pixels: Vec<f32>,
+}
+
+impl Seen {
+    /// Whether no photo shows a splat; false where that is not known.
+    pub fn is_unseen(&self, splat: usize) -> bool {
+        self.pixels.get(splat).is_some_and(|p| *p < LEAST)
+    }
+
+    /// How many splats no photo shows.
+    pub fn unseen(&self) -> usize {
+        (0..self.pixels.len()).filter(|i| self.is_unseen(*i)).count()
+    }
+
+    /// Rows of the splats that some photo shows.
+    pub fn rows(&self, splats: &Splats) -> Vec<usize> {
+        (0..splats.len()).filter(|i| !self.is_unseen(*i)).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_known_is_not_called_unseen() {
+        let splats = Splats { means: vec![[0.0; 3]; 3], ..Splats::default() };
+        let seen = Seen { pixels: vec![3.0, 0.01, 0.0] };
+        assert_eq!((seen.unseen(), seen.rows(&splats)), (2, vec![0]));
+        assert_eq!((Seen::default().unseen(), Seen::default().rows(&splats)), (0, vec![0, 1, 2]));
+    }
+}
