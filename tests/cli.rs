@@ -4,7 +4,8 @@ mod fixture;
 
 use fixture::{data, scene, small_views, train_log};
 use splatvk::format::npy::{self, NpyArray};
-use splatvk::scene::Seen;
+use splatvk::format::scene_dir::{self, Contents};
+use splatvk::scene::{Camera, Pose, Seen, Splats, Up, World};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -293,6 +294,127 @@ fn the_scene_of_a_run_is_whole_and_can_be_replaced() {
         serde_json::from_slice(&std::fs::read(scene.join("run.json")).unwrap()).unwrap();
     assert!(run["stages"].as_array().unwrap().len() >= 2 && run["seed"] == 0 && run["device"].is_string());
     assert!(names(scene.parent().unwrap()).iter().all(|n| !n.contains("partial") && !n.contains("old")));
+}
+
+/// A scene of two splats and one camera, the first splat one unit straight above it.
+fn tilted_scene(folder: &Path) -> (PathBuf, Splats, Camera) {
+    let scene = folder.join("scene");
+    std::fs::create_dir(&scene).unwrap();
+    let direction = glam::DVec3::new(0.2, -0.9, 0.3).normalize();
+    let splats = Splats {
+        means: vec![direction.as_vec3().to_array(), [0.1, 0.2, 2.0]],
+        log_scales: vec![[-3.0, -4.0, -5.0]; 2],
+        quats: vec![[1.0, 0.0, 0.0, 0.0]; 2],
+        opacity_logits: vec![1.0; 2],
+        sh_degree: 0,
+        sh: vec![0.0; 6],
+    };
+    let camera = Camera {
+        name: "a".into(),
+        width: 64,
+        height: 48,
+        fx: 60.0,
+        fy: 60.0,
+        cx: 32.0,
+        cy: 24.0,
+        pose: Pose::exp(glam::DVec3::new(0.1, 0.0, 0.3), glam::DVec3::new(0.0, 0.2, 0.1)),
+    };
+    let up = Up { direction, sigma_degrees: 1.0, evidence: Vec::new() };
+    let contents = Contents {
+        splats: &splats,
+        seen: &Seen::default(),
+        cameras: std::slice::from_ref(&camera),
+        world: &World { up: Some(up), ..World::default() },
+        photos: &[],
+        points: None,
+        language: None,
+        text_embeddings: None,
+    };
+    scene_dir::write(&scene, &contents).unwrap();
+    (scene, splats, camera)
+}
+
+#[test]
+fn exports_turn_up_to_the_axis_that_is_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, splats, camera) = tilted_scene(folder.path());
+    let export = |scene: &Path, format: &str, axis: &str, name: &str| {
+        let mut export = splatvk();
+        export.arg("export").arg(scene).args(["--format", format, "--up", axis, "--out"]);
+        export.arg(folder.path().join(name));
+        export
+    };
+    let mean = |at: &[f32; 3]| glam::Vec3::from_array(*at).as_dvec3();
+    for (axis, to) in [("-y", glam::DVec3::NEG_Y), ("z", glam::DVec3::Z)] {
+        for (format, name) in [("ply", "a.ply"), ("transforms", "t.json")] {
+            let output = export(&scene, format, axis, name).output().unwrap();
+            assert!(output.status.success(), "{}", text(&output.stderr));
+        }
+        let turned = splatvk::format::ply::read_splats(&folder.path().join("a.ply")).unwrap();
+        assert!((mean(&turned.means[0]) - to).length() < 1e-6, "{axis}: {:?}", turned.means[0]);
+        let seen = splatvk::format::cameras::read(&folder.path().join("t.json")).unwrap();
+        let (before, after) =
+            (camera.project(mean(&splats.means[1])), seen[0].project(mean(&turned.means[1])));
+        assert!((before.0 - after.0).length() < 1e-3, "cameras and splats turn together");
+    }
+    // Read back, glTF is in the axes of scenes again: y up in the file.
+    assert!(export(&scene, "glb", "y", "a.glb").output().unwrap().status.success());
+    let turned = splatvk::format::gltf::read_splats(&folder.path().join("a.glb")).unwrap();
+    assert!((mean(&turned.means[0]) - glam::DVec3::NEG_Y).length() < 1e-6);
+    refuses(&mut export(&scene, "spz", "z", "b.spz"), 2, &["y up by definition", "--up y"]);
+    refuses(&mut export(&folder.path().join("a.ply"), "splat", "y", "b.splat"), 2, &["not known"]);
+    refuses(&mut export(&scene, "ply", "x", "b.ply"), 2, &["-y, y or z"]);
+    assert!(!folder.path().join("b.spz").exists());
+}
+
+#[test]
+fn a_known_length_gives_the_scene_its_scale() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, splats, _) = tilted_scene(folder.path());
+    let measure = |arguments: &[&str]| {
+        let mut measure = splatvk();
+        measure.arg("measure").arg(&scene).args(arguments);
+        measure
+    };
+    let json = |arguments: &[&str]| -> serde_json::Value {
+        let output = measure(arguments).arg("--json").output().unwrap();
+        assert!(output.status.success(), "{}", text(&output.stderr));
+        serde_json::from_slice(&output.stdout).unwrap()
+    };
+    let export = |name: &str| {
+        let mut export = splatvk();
+        export
+            .arg("export")
+            .arg(&scene)
+            .args(["--format", "ply", "--metres", "--out"])
+            .arg(folder.path().join(name));
+        export
+    };
+    refuses(&mut export("none.ply"), 2, &["scale is not known", "splatvk measure --scale"]);
+    let length = "0,0,1 - 0.3,-0.4,1";
+    let before = json(&[length]);
+    assert!(
+        (before["lengths"][0]["units"].as_f64().unwrap() - 0.5).abs() < 1e-12 && before["scale"].is_null()
+    );
+    let stated = json(&["--scale", "0,0,2 - -2,0,2 = 50cm", length]);
+    assert!((stated["scale"]["metres_per_unit"].as_f64().unwrap() - 0.25).abs() < 1e-12);
+    let kept = json(&[length]);
+    assert!((kept["lengths"][0]["metres"].as_f64().unwrap() - 0.125).abs() < 1e-12, "{kept}");
+    assert!(kept["lengths"][0]["sigma_metres"].as_f64().unwrap() > 0.0);
+    assert!(export("metres.ply").output().unwrap().status.success());
+    let scaled = splatvk::format::ply::read_splats(&folder.path().join("metres.ply")).unwrap();
+    for (own, metres) in splats.means.as_flattened().iter().zip(scaled.means.as_flattened()) {
+        assert!((0.25 * own - metres).abs() < 1e-6);
+    }
+    // The direction up and all else that the manifest says stays.
+    let loaded = scene_dir::load(&scene).unwrap();
+    assert!(loaded.world.up.is_some() && loaded.splats == splats && loaded.cameras.len() == 1);
+    refuses(&mut measure(&[]), 2, &["give a length"]);
+    refuses(&mut measure(&["--scale", length]), 2, &["METRES"]);
+    refuses(&mut measure(&["0,0,1 to 1,0,1"]), 2, &["A - B"]);
+    refuses(&mut measure(&["0,0,1 - 0,0,1"]), 2, &["one place"]);
+    refuses(&mut measure(&["b:1,1 - a:2,2"]), 2, &["no view of the scene", "it has a"]);
+    refuses(&mut measure(&["a:64,1 - a:2,2"]), 2, &["64 × 48 pixels"]);
 }
 
 #[test]

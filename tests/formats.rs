@@ -7,7 +7,8 @@ use splatvk::format::{
 };
 use splatvk::photo::{self, stem};
 use splatvk::scene::{
-    Camera, Codebook, LanguageField, Lens, LevelField, MaskId, PointCloud, Pose, Seen, Splats,
+    Camera, Codebook, LanguageField, Lens, LevelField, MaskId, PointCloud, Pose, Seen, Splats, Up,
+    UpEvidence, World,
 };
 use std::path::{Path, PathBuf};
 
@@ -467,10 +468,17 @@ fn scene_directory_round_trip() {
     let photos = photo::load_all(&three, &splatvk::progress::Silent).unwrap();
     let (s, cams, language) = (splats(5, 2), some_cameras(), field(5));
     let seen = Seen { pixels: vec![0.0, 1.0, 2.5, 0.01, 7.0] };
+    let up = Up {
+        direction: glam::DVec3::new(0.1, -0.9, 0.2).normalize(),
+        sigma_degrees: 0.7,
+        evidence: vec![UpEvidence::VerticalEdges],
+    };
+    let world = World { up: Some(up), scale: None };
     let contents = scene_dir::Contents {
         splats: &s,
         seen: &seen,
         cameras: &cams,
+        world: &world,
         photos: &photos,
         points: None,
         language: Some(&language),
@@ -481,6 +489,7 @@ fn scene_directory_round_trip() {
     assert_eq!(scene.splats, s, "with its own SH degree, though the PLY is padded to 3");
     assert_eq!(scene.language.as_ref(), Some(&language));
     assert_eq!((&scene.seen, scene.seen.unseen()), (&seen, 2));
+    assert_eq!(scene.world, world);
     let stems: Vec<_> = scene.cameras.iter().map(|c| stem(&c.name)).collect();
     assert_eq!(stems, photos.iter().map(|p| p.stem.clone()).collect::<Vec<_>>());
     assert!((scene.cameras[2].pose.centre() - cams[2].pose.centre()).length() < 1e-6);
@@ -489,6 +498,7 @@ fn scene_directory_round_trip() {
     assert_eq!(kept.image, photos[0].image, "8-bit photos survive unchanged");
 
     let bare = scene_dir::load(&folder.path().join("point_cloud.ply")).unwrap();
+    assert_eq!(bare.world, World::default());
     assert!(bare.language.is_none() && bare.cameras.is_empty() && bare.splats.len() == 5);
     assert!(bare.seen.pixels.is_empty(), "what is not known is not guessed");
     npy::write(folder.path().join("seen.npy"), &NpyArray::f32(&[2], vec![0.0; 2])).unwrap();

@@ -16,9 +16,10 @@ use splatvk::photo::{self, Photo};
 use splatvk::query::{QueryOptions, select::splat_codes};
 use splatvk::report::viewer::Scene3d;
 use splatvk::run::ask::QueryScene;
+use splatvk::run::metric::{self, Length};
 use splatvk::run::sources;
 use splatvk::run::view::Viewer;
-use splatvk::scene::{Codebook, LanguageField, LevelField, Plane, RgbImage, Seen, Splats};
+use splatvk::scene::{Codebook, LanguageField, LevelField, Plane, RgbImage, Seen, Splats, Up, World};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
@@ -37,6 +38,12 @@ fn masks_of(stem: &str) -> Plane<i32> {
     let mask = image::open(data(&format!("breakfast/masks/{stem}.png"))).unwrap().to_luma8();
     let (width, height) = (mask.width() as usize, mask.height() as usize);
     Plane { width, height, data: mask.into_raw().into_iter().map(i32::from).collect() }
+}
+
+/// The true direction up of breakfast.
+fn world() -> World {
+    let up = Up { direction: glam::DVec3::Z, sigma_degrees: 0.1, evidence: Vec::new() };
+    World { up: Some(up), ..World::default() }
 }
 
 /// Breakfast as splats, straight from the true depth, photos and masks of two views: every fourth pixel is one splat of
@@ -102,6 +109,7 @@ fn breakfast(folder: &Path) -> PathBuf {
         splats: &splats,
         seen: &Seen::default(),
         cameras: &cameras,
+        world: &world(),
         photos: &photos,
         points: None,
         language: Some(&field),
@@ -214,6 +222,7 @@ fn the_served_view_draws_selects_and_answers() {
     a_click_selects_the_object(&mut page);
     a_query_lights_it_up(&mut page);
     the_keyboard_does_it_all(&mut page);
+    a_tape_measures_between_two_clicks(&mut page, &scene);
     assert_eq!(page.complaints, Vec::<String>::new());
     let foreign: Vec<_> = page
         .requests
@@ -354,6 +363,8 @@ fn the_keyboard_does_it_all(page: &mut Page) {
     let first = eye(page);
     page.press("ArrowLeft");
     assert_ne!(eye(page), first);
+    let height = |eye: &Value| eye[2].as_f64().unwrap();
+    assert!((height(&eye(page)) - height(&first)).abs() < 1e-9, "it turns about the scene's up");
     page.press("1");
     page.run("splatvk.settled()");
     let back = eye(page);
@@ -371,6 +382,57 @@ fn the_keyboard_does_it_all(page: &mut Page) {
     assert_eq!(page.run("document.querySelector('.v-help').hidden"), false);
     page.press("Escape");
     assert_eq!(page.run("document.querySelector('.v-help').hidden"), true);
+}
+
+fn a_tape_measures_between_two_clicks(page: &mut Page, scene: &Path) {
+    page.run("splatvk.show('colour')");
+    page.run("splatvk.goTo(0)");
+    page.press("l");
+    let loaded = scene_dir::load(scene).unwrap();
+    let (camera, masks) = (&loaded.cameras[0], masks_of("train_00"));
+    let depth = npy::read_npz(data("breakfast/depth/train_00.npz")).unwrap()["depth"].to_f32();
+    // The middle of the box of cereal and of the blue mug.
+    let ends = [4, 9].map(|object| inside(&masks, object));
+    let places = ends.map(|(x, y)| {
+        let z = f64::from(depth[y as usize * 640 + x as usize]);
+        camera.unproject(glam::DVec2::new(x, y), z)
+    });
+    for end in ends {
+        let (x, y) = on_page(page, end);
+        page.click(x, y);
+    }
+    let units = page.run("splatvk.tape.units").as_f64().unwrap();
+    let truth = places[0].distance(places[1]);
+    println!("box to mug: {units:.4}, truly {truth:.4}");
+    // Splats of four pixels about the true surface.
+    assert!((units / truth - 1.0).abs() < 0.05, "{units} {truth}");
+    assert_eq!(page.run("splatvk.state.selected"), Value::Null, "a click measures, it does not select");
+    let shown = |page: &mut Page| {
+        let text = page.run("document.querySelector('.v-tape output').textContent");
+        text.as_str().unwrap().to_owned()
+    };
+    assert!(shown(page).ends_with(" units"), "{}", shown(page));
+    page.run("splatvk.settled()");
+    assert_eq!(page.run("document.querySelectorAll('.v-line line, .v-line circle').length"), 3);
+    keep(page, "measured.png");
+    page.run("document.querySelector('.v-tape input').focus()");
+    page.write("0.5");
+    let stated = page.run("splatvk.tape.stated()");
+    let stated = stated.as_str().unwrap();
+    assert!(stated.starts_with("--scale \"") && stated.ends_with(" = 0.5\""), "{stated}");
+    let length: Length = stated["--scale \"".len()..stated.len() - 1].parse().unwrap();
+    let measured = &metric::measure(&loaded, std::slice::from_ref(&length), None).unwrap()[0];
+    assert!((measured.units / units - 1.0).abs() < 1e-4);
+    assert_eq!(length.metres, Some(0.5));
+    // From now on the page tells lengths in metres.
+    page.run("document.querySelector('.viewer').focus()");
+    for end in ends {
+        let (x, y) = on_page(page, end);
+        page.click(x, y);
+    }
+    assert_eq!(shown(page), "50 cm");
+    page.press("Escape");
+    assert_eq!(page.run("document.querySelector('.v-tape').hidden"), true);
 }
 
 fn fits_a_phone(page: &mut Page) {
@@ -418,6 +480,7 @@ fn a_static_page_answers_what_was_asked() {
         splats: &scene.splats,
         seen: &seen,
         cameras: &scene.cameras,
+        world: &scene.world,
         photos: Vec::new(),
         language: scene.language.as_ref(),
         names: &names,

@@ -9,6 +9,7 @@ mod experiments;
 mod shared;
 
 pub use super::export::ExportArgs;
+pub use super::measure::MeasureArgs;
 pub use super::run::RunArgs;
 pub use bench::{BenchArgs, BenchPart};
 pub use experiments::{AblateArgs, GenerateArgs};
@@ -42,6 +43,8 @@ pub enum Command {
     Query(QueryArgs),
     /// Look at a scene in the browser, and ask it
     View(ViewArgs),
+    /// Lengths in a scene; one that is known gives the scene its scale
+    Measure(MeasureArgs),
     /// Scene against ground truth → figures
     Eval(EvalArgs),
     /// Data with ground truth → the tables of the paper's experiments
@@ -84,6 +87,7 @@ impl Command {
             Command::Render(_)
             | Command::Generate(_)
             | Command::Export(_)
+            | Command::Measure(_)
             | Command::Clean(_)
             | Command::Completions(_)
             | Command::Manuals(_) => return None,

@@ -52,7 +52,8 @@ fn ask(scene: &Scene, texts: &[String], args: &EvalArgs) -> Result<Vec<TextQuery
 
 fn field(scene: &Scene, args: &EvalArgs) -> Result<EvalReport> {
     let truth = GroundTruth::read(&args.ground_truth)?;
-    let evaluation = Evaluation::new(truth, &scene.cameras, args.out.as_deref())?;
+    let mut evaluation = Evaluation::new(truth, &scene.cameras, args.out.as_deref())?;
+    evaluation.add_world(&scene.world);
     let phrases: Vec<String> = evaluation.phrases().into_iter().map(|p| p.1).collect();
     let queries = ask(scene, &phrases, args)?;
     let device = Device::open(args.device.device.as_deref())?;

@@ -2,11 +2,14 @@
 use super::print::listing;
 use super::progress;
 use crate::format::gaussians::{self, FORMATS, SplatFormat};
+use crate::format::scene_dir::Scene;
+use crate::format::transform::transform_splats;
 use crate::format::{colmap, create_folder, ply, scene_dir, transforms, write_whole_file};
-use crate::scene::{Camera, SH_C0, Splats};
+use crate::scene::{Camera, PointCloud, SH_C0, Similarity, Splats, UpAxis};
 use crate::{Error, Result};
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser};
+use glam::{DMat3, DVec3, Vec3};
 use std::path::PathBuf;
 
 /// `splatvk export`
@@ -29,6 +32,13 @@ pub struct ExportArgs {
     /// Leave out splats that no photo shows: surfaces continued beyond the photos and behind what stands in front
     #[arg(long)]
     pub only_seen: bool,
+    /// Turn the scene so that up, where the scene states it, is this axis: -y (right, down, forward), y (right, up, back) or z
+    /// (right, forward, up); spz, glb and gltf know only y [default: the scene's own axes]
+    #[arg(long, value_parser = up_axis, allow_hyphen_values = true, value_name = "AXIS")]
+    pub up: Option<UpAxis>,
+    /// Scale the scene to metres, where its scale is known (splatvk measure --scale)
+    #[arg(long)]
+    pub metres: bool,
     /// Print one JSON object on standard output
     #[arg(long)]
     pub json: bool,
@@ -44,10 +54,77 @@ fn formats() -> PossibleValuesParser {
     PossibleValuesParser::new(splats.chain(cameras.map(|(name, about)| PossibleValue::new(name).help(about))))
 }
 
+fn up_axis(text: &str) -> Result<UpAxis, String> {
+    match text {
+        "-y" => Ok(UpAxis::MinusY),
+        "y" => Ok(UpAxis::PlusY),
+        "z" => Ok(UpAxis::PlusZ),
+        _ => Err("give -y, y or z".into()),
+    }
+}
+
+/// What `--up` and `--metres` ask for, from the scene's own coordinates.
+fn placement(scene: &Scene, args: &ExportArgs) -> Result<Option<Similarity>> {
+    let scale = match (args.metres, &scene.world.scale) {
+        (false, _) => 1.0,
+        (true, Some(scale)) => scale.metres_per_unit,
+        (true, None) => {
+            return Err(Error::input(format!(
+                "{}: its scale is not known; state a length with splatvk measure --scale, or leave --metres out",
+                args.scene.display()
+            )));
+        }
+    };
+    let rotation = rotation(scene, args)?;
+    let placed = args.metres || args.up.is_some();
+    Ok(placed.then_some(Similarity { scale, rotation, translation: DVec3::ZERO }))
+}
+
+fn rotation(scene: &Scene, args: &ExportArgs) -> Result<DMat3> {
+    let Some(axis) = args.up else { return Ok(DMat3::IDENTITY) };
+    let up = scene.world.up.as_ref().ok_or_else(|| {
+        Error::input(format!("{}: which way is up is not known; leave --up out", args.scene.display()))
+    })?;
+    let axis = match SplatFormat::named(&args.format) {
+        // Their writers turn right, down, forward to right, up, back.
+        Some(format) if format.y_up => match axis {
+            UpAxis::PlusY => UpAxis::MinusY,
+            _ => {
+                return Err(Error::input(format!(
+                    "--up: {} has y up by definition; give --up y",
+                    format.name
+                )));
+            }
+        },
+        _ => axis,
+    };
+    Ok(up.levelled(axis))
+}
+
+/// Moves everything that a scene has in space.
+fn place(scene: &mut Scene, points: &mut Option<PointCloud>, by: &Similarity) {
+    transform_splats(&mut scene.splats, by);
+    scene.cameras.iter_mut().for_each(|c| *c = by.camera(c));
+    if let Some(points) = points {
+        for p in &mut points.positions {
+            *p = by.transform(Vec3::from_array(*p).as_dvec3()).as_vec3().to_array();
+        }
+        points.radius.iter_mut().for_each(|r| *r *= by.scale as f32);
+    }
+}
+
 pub fn export(args: &ExportArgs) -> Result<()> {
     let mut scene = scene_dir::load(&args.scene)?;
     if args.only_seen {
         keep_seen(&mut scene, args)?;
+    }
+    let placement = placement(&scene, args)?;
+    let mut points = match args.format.starts_with("colmap") {
+        true => colmap::read_points(&args.scene.join("cameras/colmap")).ok(),
+        false => None,
+    };
+    if let Some(by) = placement {
+        place(&mut scene, &mut points, &by);
     }
     if let Some(parent) = args.out.parent().filter(|p| !p.as_os_str().is_empty()) {
         create_folder(parent).map_err(|e| Error::input(format!("{e}; choose another --out")))?;
@@ -71,7 +148,6 @@ pub fn export(args: &ExportArgs) -> Result<()> {
         }
         "colmap" | "colmap-bin" => {
             let cameras = cameras(&scene, args)?;
-            let points = colmap::read_points(&args.scene.join("cameras/colmap")).ok();
             let write = if args.format == "colmap" { colmap::write } else { colmap::write_binary };
             write(&args.out, cameras, points.as_ref())?;
         }
@@ -127,7 +203,7 @@ fn warn_of_range(splats: &Splats, brightest: f32) {
     }
 }
 
-fn cameras<'a>(scene: &'a scene_dir::Scene, args: &ExportArgs) -> Result<&'a [Camera]> {
+fn cameras<'a>(scene: &'a Scene, args: &ExportArgs) -> Result<&'a [Camera]> {
     if scene.cameras.is_empty() {
         return Err(Error::input(format!(
             "{}: a file of Gaussians has no cameras; give a scene directory",

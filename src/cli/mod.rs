@@ -7,6 +7,7 @@ mod doctor;
 mod eval;
 mod export;
 mod generate;
+mod measure;
 mod models;
 mod outputs;
 mod plan;
@@ -58,6 +59,7 @@ fn execute(command: Command) -> Result<()> {
         Command::Eval(args) => eval::eval(&args),
         Command::Ablate(args) => ablate::ablate(&args),
         Command::Generate(args) => generate::generate(&args),
+        Command::Measure(args) => measure::measure(&args),
         Command::Export(args) => export::export(&args),
         Command::Models(args) => models::models(&args),
         Command::Bench(args) => bench::bench(&args),

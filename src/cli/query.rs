@@ -11,8 +11,10 @@ use crate::query::{QueryOptions, QueryResult};
 use crate::report::{colour, file_name};
 use crate::run::ask::QueryScene;
 use crate::run::encoder;
-use crate::scene::{LEVEL_NAMES, RgbImage};
+use crate::run::view::DecodedFrame;
+use crate::scene::{Camera, LEVEL_NAMES, RgbImage, World};
 use crate::{Error, Result};
+use glam::DVec2;
 use serde_json::{Value, json};
 use std::fmt::Write;
 use std::time::Instant;
@@ -65,9 +67,16 @@ pub fn query(args: &QueryArgs) -> Result<()> {
             let clock = Instant::now();
             let answers = ready.ask(text, &QueryOptions::default())?;
             latency[q] += 1e3 * clock.elapsed().as_secs_f64();
-            for ((frame, stem), answer) in ready.frames().iter().zip(stems).zip(&answers.views) {
+            for (((frame, stem), camera), answer) in
+                ready.frames().iter().zip(stems).zip(cameras).zip(&answers.views)
+            {
                 write(&mut out, stem, &folders[q], &frame.rendered.rgb, answer)?;
-                views[q].push(to_json(stem, &folders[q], answer));
+                views[q].push(to_json(
+                    stem,
+                    &folders[q],
+                    answer,
+                    &place(frame, camera, answer, &scene.world),
+                ));
             }
         }
         progress.step((part * AT_ONCE + cameras.len()) as u64, "");
@@ -90,7 +99,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         }
         queries.push(entry);
     }
-    let report = json!({ "scene": args.scene, "out": args.out, "queries": queries });
+    let report = json!({ "scene": args.scene, "out": args.out, "world": scene.world, "queries": queries });
     write_json(&out.file("answers.json")?, &report)?;
     out.keep();
     if args.device.json { print_json(&report) } else { print(&table(&args.texts, &views, &latency, args)) }
@@ -111,8 +120,22 @@ fn write(
     picture::write_npy(&out.file(&name("relevancy.npy"))?, size, None, &a.relevancy.data)
 }
 
-fn to_json(stem: &str, folder: &str, a: &QueryResult) -> Value {
+/// Where the location is in space, and how far from the camera; null where the scene shows nothing.
+fn place(frame: &DecodedFrame, camera: &Camera, a: &QueryResult, world: &World) -> Value {
+    let (x, y) = a.location;
+    let depth = f64::from(frame.rendered.depth.at(x, y));
+    if depth <= 0.0 {
+        return Value::Null;
+    }
+    let at = camera.unproject(DVec2::new(x as f64 + 0.5, y as f64 + 0.5), depth);
+    let distance = at.distance(camera.pose.centre());
+    let metres = world.scale.as_ref().map(|s| distance * s.metres_per_unit);
+    json!({ "position": at.to_array(), "distance": distance, "distance_metres": metres })
+}
+
+fn to_json(stem: &str, folder: &str, a: &QueryResult, place: &Value) -> Value {
     json!({
+        "place": place,
         "view": stem, "found": a.found, "score": a.score, "level": LEVEL_NAMES[a.level],
         // Pixel position of the most relevant pixel's centre; the first pixel's is (0.5, 0.5).
         "location": [a.location.0 as f64 + 0.5, a.location.1 as f64 + 0.5],

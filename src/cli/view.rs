@@ -97,6 +97,7 @@ fn page(scene: &Scene, args: &ViewArgs, names: &CodeNames, no_questions: Option<
         splats: &scene.splats,
         seen: &scene.seen,
         cameras: &scene.cameras,
+        world: &scene.world,
         photos: images.iter().collect(),
         language: scene.language.as_ref(),
         names,

@@ -7,7 +7,7 @@ pub mod npy;
 pub mod picture;
 pub mod scene_dir;
 pub mod side_file;
-mod transform;
+pub mod transform;
 pub mod transforms;
 mod workspace;
 

@@ -4,7 +4,7 @@ use super::workspace::MANIFEST;
 use super::{cameras, colmap, create_folder, gaussians, picture, ply, transforms};
 use crate::photo::Photo;
 use crate::scene::{
-    Camera, Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId, PointCloud, Seen, Splats,
+    Camera, Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId, PointCloud, Seen, Splats, World,
 };
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -35,6 +35,8 @@ pub struct Scene {
     pub seen: Seen,
     /// Training cameras at working resolution; empty for a bare PLY.
     pub cameras: Vec<Camera>,
+    /// How it lies in the world, as far as that is known.
+    pub world: World,
     /// Codebooks and features; `None` without language.
     pub language: Option<LanguageField>,
 }
@@ -48,6 +50,8 @@ struct Manifest {
     splats: usize,
     sh_degree: u32,
     cameras: usize,
+    #[serde(default)]
+    world: World,
     #[serde(default)]
     language: Option<LanguageManifest>,
 }
@@ -75,6 +79,8 @@ pub struct Contents<'a> {
     pub seen: &'a Seen,
     /// One per photo, at working resolution.
     pub cameras: &'a [Camera],
+    /// How the scene lies in the world.
+    pub world: &'a World,
     /// Kept beside the cameras (undistorted, working resolution), for other tools; may be empty.
     pub photos: &'a [Photo],
     /// Points for the COLMAP model.
@@ -122,6 +128,7 @@ pub fn write(folder: &Path, c: &Contents) -> Result<()> {
         splats: c.splats.len(),
         sh_degree: c.splats.sh_degree,
         cameras: c.cameras.len(),
+        world: c.world.clone(),
         language,
     };
     super::write_json(&folder.join(MANIFEST), &manifest)
@@ -185,6 +192,12 @@ fn write_codebook(path: &Path, book: &Codebook, space: &str) -> Result<()> {
     )
 }
 
+/// Replaces what a scene directory states of the world.
+pub fn write_world(path: &Path, world: &World) -> Result<()> {
+    let manifest = Manifest { world: world.clone(), ..read_manifest(path)? };
+    super::write_whole_file(&path.join(MANIFEST), |file| super::write_json(file, &manifest))
+}
+
 /// Loads a scene directory, or a file of Gaussians ([`gaussians::read`]), which has no cameras.
 pub fn load(path: &Path) -> Result<Scene> {
     if path.is_file() {
@@ -206,7 +219,7 @@ pub fn load(path: &Path) -> Result<Scene> {
     let splats = cut_degree(splats, manifest.sh_degree);
     let language = manifest.language.map(|m| read_language(path, &m, splats.len())).transpose()?;
     let seen = read_seen(path, splats.len())?;
-    Ok(Scene { path: path.into(), splats, seen, cameras, language })
+    Ok(Scene { path: path.into(), splats, seen, cameras, world: manifest.world, language })
 }
 
 /// Scenes of earlier versions do not have the file.

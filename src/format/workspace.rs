@@ -163,6 +163,7 @@ mod tests {
             splats: &splats,
             seen: &crate::scene::Seen::default(),
             cameras: std::slice::from_ref(&camera),
+            world: &Default::default(),
             photos: &[],
             points: None,
             language: None,

@@ -193,6 +193,7 @@ fn pictures() -> Vec<Photo> {
             fine: None,
             straightened: None,
             camera_model: None,
+            gravity: None,
             light: crate::photo::Light::NONE,
             image,
         }

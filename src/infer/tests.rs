@@ -327,6 +327,7 @@ pub(super) fn photo(stem: &str, image: RgbImage) -> Photo {
         fine: None,
         straightened: None,
         camera_model: None,
+        gravity: None,
         light: crate::photo::Light::NONE,
         image,
     }

@@ -252,6 +252,7 @@ mod tests {
             fine: None,
             straightened: None,
             camera_model: None,
+            gravity: None,
             light: crate::photo::Light::NONE,
         }
     }

@@ -1,5 +1,6 @@
 //! Camera and lens in EXIF data.
 use exif::{Context, Field, In, Reader, Tag, Value};
+use glam::DVec3;
 
 /// Diagonal of the 36 × 24 mm frame that "35 mm equivalent" refers to (CIPA DCG-001: equal diagonal angle of view).
 const FULL_FRAME_DIAGONAL_MM: f64 = 43.266615305567875;
@@ -17,6 +18,8 @@ pub(super) struct Lens {
     pub camera_model: Option<String>,
     /// Name of the lens, if it states that it is a fisheye.
     pub fisheye: Option<String>,
+    /// Unit vector of gravity in camera axes of the upright photo, as the phone measured it.
+    pub gravity: Option<DVec3>,
 }
 
 /// Reads the lens facts out of a raw EXIF block; a damaged block yields what could be read. `size` is the size of the
@@ -57,7 +60,12 @@ impl TiffTags {
 type Fields<'a> = &'a dyn Fn(Tag) -> Option<&'a Field>;
 
 fn of(fields: Fields, size: (u32, u32)) -> Lens {
-    Lens { focal: focal(fields, size), camera_model: camera_model(fields), fisheye: fisheye(fields) }
+    Lens {
+        focal: focal(fields, size),
+        camera_model: camera_model(fields),
+        fisheye: fisheye(fields),
+        gravity: gravity(fields),
+    }
 }
 
 fn number(fields: Fields, tag: Tag) -> Option<f64> {
@@ -109,6 +117,49 @@ fn fisheye(fields: Fields) -> Option<String> {
     let name = ascii(fields, Tag::LensModel)?;
     let plain = name.to_lowercase().replace(['-', ' '], "");
     plain.contains("fisheye").then_some(name)
+}
+
+/// A phone that is held still measures 1 g; what a moving one measures is not gravity alone.
+const STILL: std::ops::Range<f64> = 0.93..1.07;
+
+/// From the acceleration that iPhones note: in g, in axes of the phone (right, towards its top, out of its screen). The stored
+/// pictures of its back camera lie on their side: x towards the phone's bottom, y towards its left.
+fn gravity(fields: Fields) -> Option<DVec3> {
+    let Value::Undefined(note, _) = &fields(Tag::MakerNote)?.value else { return None };
+    if ascii(fields, Tag::LensModel).is_some_and(|lens| lens.to_lowercase().contains("front")) {
+        return None;
+    }
+    let v = apple_acceleration(note).filter(|v| STILL.contains(&v.length()))?.normalize();
+    let stored = DVec3::new(-v.y, -v.x, -v.z);
+    match fields(Tag::Orientation).and_then(|f| f.value.get_uint(0)).unwrap_or(1) {
+        1 => Some(stored),
+        3 => Some(DVec3::new(-stored.x, -stored.y, stored.z)),
+        6 => Some(DVec3::new(-stored.y, stored.x, stored.z)),
+        8 => Some(DVec3::new(stored.y, -stored.x, stored.z)),
+        // Mirrored: not as a camera wrote it.
+        _ => None,
+    }
+}
+
+/// Tag 8 of Apple's maker note, three signed fractions; `None` where the note is another maker's or damaged.
+fn apple_acceleration(note: &[u8]) -> Option<DVec3> {
+    // After the name, a version and "MM" follows a TIFF directory whose offsets count from the name.
+    note.strip_prefix(b"Apple iOS\0").filter(|rest| rest.get(2..4) == Some(b"MM"))?;
+    let bytes = |at: usize| note.get(at..at.checked_add(4)?)?.try_into().ok();
+    let short = |at: usize| Some(u16::from_be_bytes(note.get(at..at.checked_add(2)?)?.try_into().ok()?));
+    let entries = (0..usize::from(short(14)?)).map(|k| 16 + 12 * k);
+    let entry = entries.into_iter().find(|at| short(*at) == Some(8))?;
+    // Type 10 is the signed fraction.
+    if (short(entry + 2)?, u32::from_be_bytes(bytes(entry + 4)?)) != (10, 3) {
+        return None;
+    }
+    let values = u32::from_be_bytes(bytes(entry + 8)?) as usize;
+    let value = |k: usize| {
+        let part = |at: usize| Some(f64::from(i32::from_be_bytes(bytes(at)?)));
+        let at = values.checked_add(8 * k)?;
+        Some(part(at)? / part(at + 4)?).filter(|v| v.is_finite())
+    };
+    Some(DVec3::new(value(0)?, value(1)?, value(2)?))
 }
 
 fn ascii(fields: Fields, tag: Tag) -> Option<String> {
@@ -192,6 +243,53 @@ pub(super) mod tests {
             Some("Samyang 8mm f/3.5 UMC Fish-Eye CS")
         );
         assert_eq!(named("iPhone 15 back camera 2.22mm f/2.2"), None);
+    }
+
+    /// A maker note of an iPhone with this acceleration, in thousandths of g.
+    fn note(acceleration: [i32; 3]) -> Vec<u8> {
+        let mut note = b"Apple iOS\0\0\x01MM".to_vec();
+        for half in [2u16, 1, 9, 0, 1, 0, 4] {
+            note.extend(half.to_be_bytes());
+        }
+        for half in [8u16, 10, 0, 3, 0, 44, 0, 0] {
+            note.extend(half.to_be_bytes());
+        }
+        assert_eq!(note.len(), 44);
+        for value in acceleration {
+            note.extend(value.to_be_bytes());
+            note.extend(1000i32.to_be_bytes());
+        }
+        note
+    }
+
+    #[test]
+    fn gravity_is_that_of_the_upright_photo() {
+        let of = |acceleration, orientation| {
+            let fields = [
+                (Tag::MakerNote, Value::Undefined(note(acceleration), 0)),
+                (Tag::Orientation, Value::Short(vec![orientation])),
+            ];
+            lens(block(&fields), (4000, 3000)).gravity
+        };
+        let near = |found: Option<DVec3>, x, y, z| {
+            let found = found.unwrap();
+            assert!((found - DVec3::new(x, y, z)).length() < 1e-9, "{found}");
+        };
+        // Upright, on its left and on its right side, upside down: always down in the photo.
+        near(of([0, -1000, 0], 6), 0.0, 1.0, 0.0);
+        near(of([-1000, 0, 0], 1), 0.0, 1.0, 0.0);
+        near(of([1000, 0, 0], 3), 0.0, 1.0, 0.0);
+        near(of([0, 1000, 0], 8), 0.0, 1.0, 0.0);
+        // Upright and leaning forward, so that the camera looks down: partly ahead.
+        near(of([0, -800, -600], 6), 0.0, 0.8, 0.6);
+        // Rolled to the right: its right side is lower.
+        near(of([600, -800, 0], 6), 0.6, 0.8, 0.0);
+        assert_eq!(of([0, -1500, 0], 6), None, "shaken");
+        assert_eq!(of([0, -1000, 0], 2), None, "mirrored");
+        for cut in 0..68 {
+            assert_eq!(apple_acceleration(&note([0, -1000, 0])[..cut]), None);
+        }
+        assert!(apple_acceleration(&note([0, -1000, 0])).is_some() && apple_acceleration(&[7; 90]).is_none());
     }
 
     #[test]

@@ -6,7 +6,7 @@ use super::straighten::Straightening;
 use super::{decode, resize};
 use crate::scene::{Affine, Camera, Lens, Plane, RgbImage};
 use crate::{Error, Result};
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -52,6 +52,8 @@ pub struct Photo {
     pub straightened: Option<Straightening>,
     /// Camera make and model from EXIF: photos that share it may share one focal length.
     pub camera_model: Option<String>,
+    /// Unit vector of gravity in camera axes (x right, y down, z forward), where the phone noted it.
+    pub gravity: Option<DVec3>,
     /// Exposure, white balance and vignetting that were taken out of `image`.
     pub light: Light,
 }
@@ -125,7 +127,8 @@ pub fn from_bytes(name: &Path, bytes: Vec<u8>, max_size: usize) -> Result<Photo>
     let photo = working(name, decoded.size, max_size, |x, y| decoded.at(x, y))?;
     // The two scales differ by the rounding of the size only.
     let exif_focal = decoded.lens.focal.map(|f| f * photo.to_working.scale[1]);
-    Ok(Photo { exif_focal, camera_model: decoded.lens.camera_model.clone(), ..photo })
+    let lens = &decoded.lens;
+    Ok(Photo { exif_focal, camera_model: lens.camera_model.clone(), gravity: lens.gravity, ..photo })
 }
 
 /// A photo from upright sRGB pixels in [0, 1]; `focal` is in their pixels, where it is known.
@@ -167,6 +170,7 @@ fn working(
         fine,
         straightened: None,
         camera_model: None,
+        gravity: None,
         light: Light::NONE,
     })
 }

@@ -21,6 +21,7 @@ pub mod stereo;
 #[cfg(test)]
 mod testing;
 mod two_view;
+pub mod upright;
 
 pub use confidence::Confidence;
 pub use geometry::{Fitted, Geometry, SparseModel, SparsePoint};

@@ -15,6 +15,7 @@ use crate::photo::{self, Photo};
 use crate::pipeline::{Graph, Store};
 use crate::pose;
 use crate::progress::{Progress, Recorded};
+use crate::scene::World;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -100,6 +101,7 @@ fn work(
         left_out,
         geometry: made.take(scene.geometry)?,
         cameras: trained.cameras,
+        world: World { up: made.take(scene.up)?, scale: None },
         splats: language.splats,
         seen,
         rgb: trained.stats,
@@ -136,6 +138,7 @@ fn write(workspace: Workspace, outcome: &RunOutcome, progress: &dyn Progress) ->
         splats: &outcome.splats,
         seen: &outcome.seen,
         cameras: &outcome.cameras,
+        world: &outcome.world,
         photos: &outcome.photos,
         points: Some(&outcome.geometry.points),
         language: Some(&outcome.field),

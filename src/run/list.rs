@@ -15,12 +15,14 @@ use crate::pipeline::Output;
 use crate::pose;
 use crate::report::viewer::CodeNames;
 use crate::run::view::DecodedFrame;
+use crate::scene::Up;
 
 /// Outputs of the stages of a run.
 pub(super) struct SceneOutputs {
     pub(super) placed: Output<PlacedPhotos>,
     pub(super) geometry: Output<pose::Geometry>,
     pub(super) trained: Output<Trained>,
+    pub(super) up: Output<Option<Up>>,
     pub(super) aligned: Output<Language>,
     pub(super) names: Output<CodeNames>,
     pub(super) language: Output<TrainedLanguage>,
@@ -30,11 +32,12 @@ pub(super) struct SceneOutputs {
 
 impl SceneOutputs {
     /// For [`Graph::run`].
-    pub(super) fn targets(&self) -> [usize; 8] {
+    pub(super) fn targets(&self) -> [usize; 9] {
         [
             self.placed.target(),
             self.geometry.target(),
             self.trained.target(),
+            self.up.target(),
             self.aligned.target(),
             self.names.target(),
             self.language.target(),
@@ -70,6 +73,7 @@ pub(super) fn scene(
     };
     let PosedPhotos { placed, geometry } = posed;
     let trained = build.graph.add(stages::TrainColour { options }, (placed, geometry));
+    let up = build.graph.add(stages::Upright, (placed, geometry, trained));
 
     // First what can be refused: a phrase that a table of embeddings does not hold.
     let embed = stages::EmbedQueries { encoder: encoder.clone(), texts: plan.queries.clone() };
@@ -86,5 +90,5 @@ pub(super) fn scene(
     let language = graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
     let frames = graph.add(stages::DecodeViews, (trained, language));
     let answers = graph.add(stages::AnswerQueries, (frames, language, queries));
-    Ok(SceneOutputs { placed, geometry, trained, aligned, names, language, frames, answers })
+    Ok(SceneOutputs { placed, geometry, trained, up, aligned, names, language, frames, answers })
 }

@@ -210,6 +210,7 @@ fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
         splats: &scene.splats,
         seen: &scene.seen,
         cameras: &scene.cameras,
+        world: &scene.world,
         photos: &photos,
         points: points.as_ref(),
         language: scene.language.as_ref(),

@@ -8,6 +8,7 @@ mod light;
 mod list;
 pub mod live;
 pub mod method;
+pub mod metric;
 mod networks;
 mod outcome;
 mod plan;

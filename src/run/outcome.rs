@@ -10,7 +10,7 @@ use crate::preset::Preset;
 use crate::progress::StageRecord;
 use crate::report::ModelUsed;
 use crate::report::viewer::CodeNames;
-use crate::scene::{Camera, LanguageField, Seen, Splats};
+use crate::scene::{Camera, LanguageField, Seen, Splats, World};
 
 /// Everything that a run made; [`crate::report`] turns it into run.json, report.html and the summary.
 #[non_exhaustive]
@@ -31,6 +31,8 @@ pub struct RunOutcome {
     pub geometry: Geometry,
     /// Refined cameras.
     pub cameras: Vec<Camera>,
+    /// Which way is up, as far as that was found.
+    pub world: World,
     /// The scene.
     pub splats: Splats,
     /// What the photos show of it.

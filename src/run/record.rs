@@ -7,7 +7,7 @@ use crate::photo::Photo;
 use crate::pose::{Confidence, Fitted};
 use crate::report::viewer::Scene3d;
 use crate::report::{self, AnswerShown, Curve, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown};
-use crate::scene::{Camera, LEVEL_NAMES, Seen, Splats};
+use crate::scene::{Camera, LEVEL_NAMES, Seen, Splats, World};
 use serde_json::json;
 use std::path::Path;
 
@@ -58,6 +58,7 @@ fn statistics(o: &RunOutcome) -> serde_json::Value {
             "focal_log_sigma": o.geometry.focal_log_sigma,
             "optics": optics(o),
         },
+        "world": o.world,
         "light": super::light::record(&o.photos),
         "splats": { "start": o.rgb.splats[0], "end": o.splats.len(), "unseen": o.seen.unseen() },
         "psnr_train": o.rgb.psnr, "poses_refined": o.rgb.poses_refined,
@@ -198,6 +199,7 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
     );
     list.extend(confidence_figure(&o.photos, &o.geometry.fitted).map(|text| ("cameras".to_owned(), text)));
     list.extend(lens_figure(o).map(|text| ("lens".to_owned(), text)));
+    list.push(up_figure(&o.world));
     list.extend(super::light::figure(&o.photos));
     let codes = |k: usize| o.field.levels.get(k).map_or(0, |l| l.codebook.len());
     list.push(("things s/m/l".to_owned(), format!("{} / {} / {}", codes(0), codes(1), codes(2))));
@@ -214,6 +216,18 @@ pub(super) fn splats_figure(splats: &Splats, seen: &Seen) -> (String, String) {
         n => format!(", {n} of them where no photo looks"),
     };
     ("splats".to_owned(), format!("{}{guessed}", splats.len()))
+}
+
+/// Which way is up, and what says so.
+pub(super) fn up_figure(world: &World) -> (String, String) {
+    let text = match &world.up {
+        Some(up) => {
+            let evidence: Vec<&str> = up.evidence.iter().map(|e| e.text()).collect();
+            format!("± {:.1}° ({})", up.sigma_degrees, evidence.join(", "))
+        }
+        None => "not known: too few edges and surfaces agree on one direction".to_owned(),
+    };
+    ("up".to_owned(), text)
 }
 
 /// Per photo its working and its original (width, height).
@@ -304,6 +318,7 @@ fn scene<'a>(title: &'a str, o: &'a RunOutcome) -> Scene3d<'a> {
         splats: &o.splats,
         seen: &o.seen,
         cameras: &o.cameras,
+        world: &o.world,
         photos: o.photos.iter().map(|p| &p.image).collect(),
         language: Some(&o.field),
         names: &o.names,

@@ -12,7 +12,7 @@ use crate::report::{self, HtmlReport, RunRecord, ViewShown};
 use crate::run::budget::{self, Limits, MemoryDemand};
 use crate::run::stages::{self, CameraOrigin};
 use crate::run::view::Viewer;
-use crate::scene::{Camera, LanguageField, PointCloud};
+use crate::scene::{Camera, LanguageField, PointCloud, World};
 use crate::{Error, Result};
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -153,11 +153,13 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let placed = graph.add(stages::Cameras::new(photos, source, plan.seed)?, ());
     let geometry = graph.add(stages::DenseDepth { preset, seed: plan.seed }, (placed,));
     let trained = graph.add(stages::TrainColour { options }, (placed, geometry));
-    let targets = [placed.target(), geometry.target(), trained.target()];
+    let up = graph.add(stages::Upright, (placed, geometry, trained));
+    let targets = [placed.target(), geometry.target(), trained.target(), up.target()];
     let store = super::execute::store(plan.resume, plan.checkpoint_seconds);
     let mut made = graph.run(&targets, &device, &registry, &store, progress)?;
     let (photos, geometry) = (made.take(placed)?.photos, made.take(geometry)?);
     let trained = made.take(trained)?;
+    let world = World { up: made.take(up)?, scale: None };
     if let Some(text) = super::fidelity::warning(&photos, &trained.stats) {
         progress.warn(&text);
     }
@@ -171,6 +173,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         splats: &trained.splats,
         seen: &seen,
         cameras: &trained.cameras,
+        world: &world,
         photos: &photos,
         points: Some(&geometry.points),
         language: None,
@@ -192,6 +195,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         statistics: json!({
             "working_sizes": super::record::working_sizes(&photos),
             "geometry": { "method": geometry.method, "points": geometry.points.len() },
+            "world": world,
             "light": super::light::record(&photos),
             "splats": { "start": trained.stats.splats[0], "end": trained.splats.len(), "unseen": seen.unseen() },
             "psnr_train": trained.stats.psnr, "poses_refined": trained.stats.poses_refined,
@@ -205,6 +209,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         super::record::splats_figure(&trained.splats, &seen),
         super::fidelity::figure(&trained.stats),
     ];
+    figures.push(super::record::up_figure(&world));
     figures.extend(super::light::figure(&photos));
     let views = photos.iter().zip(&frames).zip(&trained.stats.psnr);
     let views = views.map(|((p, f), psnr)| ViewShown {
@@ -228,6 +233,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
             splats: &trained.splats,
             seen: &seen,
             cameras: &trained.cameras,
+            world: &world,
             photos: photos.iter().map(|p| &p.image).collect(),
             language: None,
             names: &Vec::new(),

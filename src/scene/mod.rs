@@ -15,6 +15,7 @@ mod similarity;
 mod splats;
 mod transfer;
 mod warp;
+mod world;
 
 pub use affine::Affine;
 pub use camera::{Camera, Pose};
@@ -28,3 +29,4 @@ pub use similarity::Similarity;
 pub use splats::{SH_C0, Splats, sh_coefficients};
 pub use transfer::{to_linear, to_srgb};
 pub use warp::DenseWarp;
+pub use world::{Scale, Up, UpAxis, UpEvidence, World};

@@ -1,4 +1,5 @@
 //! Moving between world frames of different scale.
+use super::{Camera, Pose};
 use glam::{DMat3, DVec3};
 
 /// `x ↦ scale · rotation · x + translation`.
@@ -16,5 +17,38 @@ impl Similarity {
     /// The image of a point.
     pub fn transform(&self, p: DVec3) -> DVec3 {
         self.rotation * p * self.scale + self.translation
+    }
+
+    /// The camera that sees moved points where `camera` saw them.
+    pub fn camera(&self, camera: &Camera) -> Camera {
+        let rotation = camera.pose.rotation * self.rotation.transpose();
+        let translation = camera.pose.translation * self.scale - rotation * self.translation;
+        Camera { pose: Pose { rotation, translation }, ..camera.clone() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec2;
+
+    #[test]
+    fn a_moved_camera_sees_moved_points_where_they_were() {
+        let pose = Pose::exp(DVec3::new(0.3, 1.0, -2.0), DVec3::new(0.1, -0.8, 0.4));
+        let camera = Camera {
+            name: "a".into(),
+            width: 640,
+            height: 480,
+            fx: 600.0,
+            fy: 610.0,
+            cx: 321.0,
+            cy: 239.0,
+            pose,
+        };
+        let turn = Pose::exp(DVec3::ZERO, DVec3::new(-0.4, 1.2, 0.6)).rotation;
+        let by = Similarity { scale: 2.5, rotation: turn, translation: DVec3::new(1.0, -3.0, 0.5) };
+        let (pixel, depth) = (DVec2::new(12.0, 401.0), 3.5);
+        let (seen, z) = by.camera(&camera).project(by.transform(camera.unproject(pixel, depth)));
+        assert!((seen - pixel).length() < 1e-9 && (z - 2.5 * depth).abs() < 1e-9);
     }
 }

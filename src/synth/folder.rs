@@ -34,7 +34,7 @@ pub fn generate(
         named.map(|(label, phrase)| (label.to_string(), json!(phrase))).collect();
     let truth = json!({
         "width": spec.size.0, "height": spec.size.1, "labels": labels,
-        "convention": "OpenCV world-to-camera, metres, pinhole", "frames": frames, "knobs": spec,
+        "convention": "OpenCV world-to-camera, metres, pinhole", "up": [0.0, 0.0, 1.0], "frames": frames, "knobs": spec,
     });
     write_json(&folder.join("ground_truth.json"), &truth)?;
     cameras::write_json(&folder.join("cameras_noisy.json"), &scene.noisy)?;
@@ -134,6 +134,7 @@ mod tests {
         let truth = GroundTruth::read(dir.path()).unwrap();
         let made = build_scene(&spec).unwrap();
         assert_eq!((truth.frames.len(), truth.labels.len()), (5, made.objects.len()));
+        assert_eq!(truth.up, Some(glam::DVec3::Z));
         for (frame, camera) in truth.frames.iter().zip(made.train.iter().chain(&made.test)) {
             assert_eq!(frame.stem, camera.name);
             assert!((frame.camera.pose.centre() - camera.pose.centre()).length() < 1e-12);

@@ -4,6 +4,8 @@
 //! it, answers each label's phrase with [`super::answer`] and hands both to [`Evaluation::add_frame`]; the figures
 //! agree with an independent scorer that reads only the files written.
 mod figures;
+mod lengths;
+mod report;
 mod text;
 mod truth;
 
@@ -11,6 +13,11 @@ mod truth;
 mod tests;
 
 pub use figures::{DepthScore, colour_fit, depth_score, iou};
+pub use lengths::LengthScore;
+pub use report::{
+    EvalReport, ImageScore, MaskScore, PairScore, PoseScore, RefinedScore, RefinedView, RelativeScore,
+    SplitSummary,
+};
 pub use truth::{GroundTruth, Split, TruthFrame};
 
 use super::QueryResult;
@@ -19,10 +26,12 @@ use crate::pass::metrics;
 use crate::photo::stem;
 use crate::pose::align::{PoseErrors, pose_errors};
 use crate::pose::relative::{auc, pair_errors};
-use crate::scene::{Camera, Plane, Pose, RgbImage, Similarity};
+use crate::scene::{Camera, Plane, Pose, RgbImage, Similarity, Up, World};
 use crate::{Error, Result};
 use figures::quantised;
-use serde::Serialize;
+use glam::{DVec2, DVec3};
+use lengths::length_score;
+use report::DEFINITIONS;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -33,25 +42,10 @@ pub const BACKGROUND_LABELS: [&str; 6] =
 /// Views that show fewer pixels of an object do not count for it.
 pub const MIN_OBJECT_PIXELS: usize = 100;
 
-/// What the figures of the report are.
-const DEFINITIONS: [&str; 8] = [
-    "poses: after the similarity that maps the scene's cameras of the train frames onto the true ones",
-    "relative_poses: over all pairs of train frames, the angle between the relative rotations and between the directions of \
-     the baselines; auc_N: area under the share of pairs whose larger angle is below x, x from 0 to N degrees, exact",
-    "images: PSNR and SSIM of the 8-bit render; psnr_colour_fit: after the gain and offset per channel that bring the render \
-     closest to the photo (least squares per frame), for photos whose exposure and white balance differ",
-    "depth: median of |z - z_true| / z_true at the cameras' scale where both are known; AbsRel (mean of |s z - z_true| / \
-     z_true) and delta (share with a ratio below 1.25) with s = median z_true / median z per frame, as usual for depth \
-     without known scale",
-    "mask: the codes of the chosen level that are nearly as relevant as the best one in the frame, without smoothing; objects \
-     of at least 100 pixels, surfaces behind them left out",
-    "miou: plain mean of IoU over all (object, frame) pairs; localisation: share of pairs whose most relevant pixel lies on \
-     the object",
-    "train: photos that the scene was made from; test: held-out frames",
-    "refined: held-out frames again, each with the focal length and principal point that the scene found for its own photos \
-     (focal_relative and centre_shift against the truth's), from a camera moved until the frozen scene's render is closest to \
-     the photo; kept only where psnr_colour_fit rises. Everything outside `refined` is from the cameras as given",
-];
+/// Columns and rows of pixels whose distances are compared with the true ones.
+const LENGTH_GRID: [usize; 2] = [8, 6];
+/// Shortest of them, share of the mean depth: shorter ones would measure the noise of their ends.
+const LEAST_LENGTH: f64 = 0.1;
 
 /// One rendered frame.
 #[derive(Clone, Debug, Default)]
@@ -62,132 +56,6 @@ pub struct Rendered {
     pub alpha: Plane<f32>,
     /// Camera z in scene units, 0 where nothing is.
     pub depth: Plane<f32>,
-}
-
-/// Pose errors of one train view.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[non_exhaustive]
-pub struct PoseScore {
-    /// Frame file stem.
-    pub frame: String,
-    /// Degrees, after the similarity that best maps the scene onto the truth.
-    pub rotation_degrees: f64,
-    /// Distance of the centres over the mean depth.
-    pub centre_fraction: f64,
-    /// |f / f_true − 1|.
-    pub focal_relative: f64,
-}
-
-/// Image and depth scores of one frame.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[non_exhaustive]
-pub struct ImageScore {
-    /// Frame file stem.
-    pub frame: String,
-    /// `train` or `test`.
-    pub split: Split,
-    /// dB, of the 8-bit picture that is written, within a photo's plain frame if it has one.
-    pub psnr: f64,
-    /// Structural similarity, 11×11 Gaussian window.
-    pub ssim: f64,
-    /// dB, after a gain and an offset per channel.
-    pub psnr_colour_fit: f64,
-    /// Median of |z − z_true| / z_true where both are known.
-    pub depth_median_relative: Option<f64>,
-    /// Mean of |s z − z_true| / z_true, s from the medians.
-    pub depth_abs_rel: Option<f64>,
-    /// Share of pixels whose depth, so scaled, is off by less than 1.25.
-    pub depth_delta: Option<f64>,
-}
-
-/// How one phrase did in one frame.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[non_exhaustive]
-pub struct MaskScore {
-    /// Frame file stem.
-    pub frame: String,
-    /// `train` or `test`.
-    pub split: Split,
-    /// Object index in the ground truth.
-    pub label: u32,
-    /// Its phrase.
-    pub phrase: String,
-    /// Intersection over union of the predicted mask and the object.
-    pub iou: f64,
-    /// The most relevant pixel lies on the object.
-    pub localised: bool,
-    /// Level that answered, 0 = s.
-    pub level: usize,
-    /// Best relevancy in the frame.
-    pub score: f32,
-    /// Whether the query passed the absolute threshold.
-    pub found: bool,
-}
-
-/// Means over one split.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct SplitSummary {
-    /// Mean PSNR, dB.
-    pub psnr: Option<f64>,
-    /// Mean SSIM.
-    pub ssim: Option<f64>,
-    /// Mean PSNR after the colour fit, dB.
-    pub psnr_colour_fit: Option<f64>,
-    /// Mean over frames of the median relative depth error.
-    pub depth_median_relative: Option<f64>,
-    /// Mean over frames of AbsRel.
-    pub depth_abs_rel: Option<f64>,
-    /// Mean over frames of the share with a ratio below 1.25.
-    pub depth_delta: Option<f64>,
-    /// Plain mean over all (object, view) pairs.
-    pub miou: Option<f64>,
-    /// Share of (object, view) pairs whose most relevant pixel lies on the object.
-    pub localisation: Option<f64>,
-    /// Mean IoU per phrase.
-    pub iou: BTreeMap<String, f64>,
-}
-
-/// One pair of train views.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[non_exhaustive]
-pub struct PairScore {
-    /// Frame file stems.
-    pub frames: [String; 2],
-    /// Angle between the relative rotations, degrees.
-    pub rotation_degrees: f64,
-    /// Angle between the directions of the baselines, degrees.
-    pub direction_degrees: Option<f64>,
-}
-
-/// Relative poses of the train views.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-#[non_exhaustive]
-pub struct RelativeScore {
-    /// All pairs of train views that the scene has.
-    pub pairs: Vec<PairScore>,
-    /// Area under the recall curve up to 3 degrees; pairs with a frame that the scene lacks count as failures.
-    pub auc_3: Option<f64>,
-    /// Up to 5 degrees.
-    pub auc_5: Option<f64>,
-    /// Up to 30 degrees.
-    pub auc_30: Option<f64>,
-}
-
-/// How far a held-out camera was moved.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct RefinedView {
-    /// Frame file stem.
-    pub frame: String,
-    /// Whether the moved camera is used.
-    pub kept: bool,
-    /// Turn, degrees.
-    pub rotation_degrees: f64,
-    /// Shift of the centre over the scene's median depth.
-    pub centre_fraction: f64,
-    /// Focal length that it has over the true one, minus 1.
-    pub focal_relative: f64,
-    /// Principal point that it has minus the true one, pixels.
-    pub centre_shift: [f64; 2],
 }
 
 /// Focal ratio and offset of the principal point of the scene's cameras against the truth: medians over the train frames.
@@ -217,47 +85,16 @@ impl OpticsOffset {
     }
 }
 
-/// Held-out frames from refined cameras.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-#[non_exhaustive]
-pub struct RefinedScore {
-    /// What moved.
-    pub views: Vec<RefinedView>,
-    /// As in the report.
-    pub images: Vec<ImageScore>,
-    /// As in the report.
-    pub masks: Vec<MaskScore>,
-    /// Means.
-    pub summary: SplitSummary,
-}
-
-/// Everything `splatvk eval` reports.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-#[non_exhaustive]
-pub struct EvalReport {
-    /// What each figure is, one line each.
-    pub definitions: Vec<String>,
-    /// Per train view.
-    pub poses: Vec<PoseScore>,
-    /// Per pair of train views.
-    pub relative_poses: RelativeScore,
-    /// Per rendered frame.
-    pub images: Vec<ImageScore>,
-    /// Per object and frame; background labels are not listed.
-    pub masks: Vec<MaskScore>,
-    /// Means per split, `train` and `test`.
-    pub summary: BTreeMap<String, SplitSummary>,
-    /// Held-out frames from refined cameras, if asked for.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub refined: Option<RefinedScore>,
-}
-
 /// Collects scores frame by frame.
 pub struct Evaluation {
     truth: GroundTruth,
     similarity: Similarity,
     optics_offset: OpticsOffset,
     out: Option<PathBuf>,
+    /// Places on surfaces that train frames show: in the scene, and true.
+    surface: Vec<(DVec3, DVec3)>,
+    /// Mean true depth.
+    mean_depth: f64,
     report: EvalReport,
 }
 
@@ -285,10 +122,24 @@ impl Evaluation {
         let known: Vec<Camera> = frames.iter().map(|f| f.camera.clone()).collect();
         let errors = pose_errors(&estimated, &known, mean_depth);
         let relative_poses = relative(&frames, &estimated, &known, asked);
-        let report =
-            EvalReport { poses: pose_scores(&frames, &errors), relative_poses, ..EvalReport::default() };
+        let centres: Vec<_> =
+            estimated.iter().zip(&known).map(|(e, k)| (e.pose.centre(), k.pose.centre())).collect();
+        let report = EvalReport {
+            poses: pose_scores(&frames, &errors),
+            relative_poses,
+            camera_lengths: length_score(&centres, 0.0),
+            ..EvalReport::default()
+        };
         let (similarity, optics_offset) = (errors.similarity, OpticsOffset::of(&estimated, &known));
-        Ok(Evaluation { similarity, optics_offset, out: out.map(Path::to_path_buf), report, truth })
+        let out = out.map(Path::to_path_buf);
+        Ok(Evaluation { similarity, optics_offset, out, surface: Vec::new(), mean_depth, report, truth })
+    }
+
+    /// Scores the scene's direction up, as far as it is known.
+    pub fn add_world(&mut self, world: &World) {
+        let angle = |up: &Up, truth: DVec3| (self.similarity.rotation * up.direction).angle_between(truth);
+        let known = world.up.as_ref().zip(self.truth.up);
+        self.report.up_degrees = known.map(|(up, truth)| angle(up, truth).to_degrees());
     }
 
     /// The frames and, for each, the camera of the truth expressed in the scene's world, at the truth's size.
@@ -328,8 +179,28 @@ impl Evaluation {
         answers: &[(u32, QueryResult)],
     ) -> Result<()> {
         let (image, masks) = self.score(frame, rendered, answers, self.out.as_deref())?;
+        if frame.split == Split::Train {
+            self.add_surface(frame, rendered)?;
+        }
         self.report.images.push(image);
         self.report.masks.extend(masks);
+        Ok(())
+    }
+
+    /// Notes places of a train frame whose true depth is known.
+    fn add_surface(&mut self, frame: &TruthFrame, rendered: &Rendered) -> Result<()> {
+        let Some(truth) = self.truth.depth(frame)? else { return Ok(()) };
+        let camera = to_scene(&frame.camera, &self.similarity);
+        let [columns, rows] = LENGTH_GRID;
+        for k in 0..columns * rows {
+            let (x, y) = ((2 * (k % columns) + 1) * truth.width, (2 * (k / columns) + 1) * truth.height);
+            let (x, y) = (x / (2 * columns), y / (2 * rows));
+            let (z, z_true) = (f64::from(rendered.depth.at(x, y)), f64::from(truth.at(x, y)));
+            if z > 0.0 && z_true > 0.0 {
+                let pixel = DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
+                self.surface.push((camera.unproject(pixel, z), frame.camera.unproject(pixel, z_true)));
+            }
+        }
         Ok(())
     }
 
@@ -414,6 +285,7 @@ impl Evaluation {
 
     /// The report with its means.
     pub fn finish(mut self) -> EvalReport {
+        self.report.surface_lengths = length_score(&self.surface, LEAST_LENGTH * self.mean_depth);
         self.report.definitions = DEFINITIONS.map(String::from).to_vec();
         for split in [Split::Train, Split::Test] {
             let summary = summarise(&self.report.images, &self.report.masks, split);

@@ -18,6 +18,16 @@ impl EvalReport {
             percent(self.relative_poses.auc_5),
             percent(self.relative_poses.auc_30),
         );
+        for (name, lengths) in [("surface", self.surface_lengths), ("cameras", self.camera_lengths)] {
+            if let Some(l) = lengths {
+                let (median, p90) = (percent(Some(l.median)), percent(Some(l.p90)));
+                let _ =
+                    writeln!(out, "lengths  {name}: off by {median} at the median, 90 % by less than {p90}");
+            }
+        }
+        if let Some(degrees) = self.up_degrees {
+            let _ = writeln!(out, "up       {degrees:.2} degrees off");
+        }
         let _ = writeln!(
             out,
             "{:<9}{:>8}{:>10}{:>7}{:>11}{:>9}{:>9}{:>8}{:>11}",

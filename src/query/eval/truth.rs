@@ -51,6 +51,8 @@ pub struct GroundTruth {
     pub folder: PathBuf,
     /// Object index → phrase; empty when the set has no labels.
     pub labels: BTreeMap<u32, String>,
+    /// Unit vector against gravity, if the set states it.
+    pub up: Option<DVec3>,
     /// All views.
     pub frames: Vec<TruthFrame>,
 }
@@ -61,6 +63,8 @@ struct File {
     height: u32,
     #[serde(default)]
     labels: BTreeMap<u32, String>,
+    #[serde(default)]
+    up: Option<DVec3>,
     frames: Vec<FileFrame>,
 }
 
@@ -98,7 +102,8 @@ impl GroundTruth {
             TruthFrame { file: f.file, stem, split: f.split, camera, lens: f.lens }
         };
         let frames = file.frames.into_iter().map(frame).collect();
-        Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, frames })
+        let up = file.up.map(DVec3::normalize_or_zero);
+        Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, up, frames })
     }
 
     /// The photo of a frame.

@@ -11,7 +11,7 @@ use super::colour;
 use crate::Result;
 use crate::format::picture;
 use crate::query::highlight::Highlight;
-use crate::scene::{Camera, LEVEL_NAMES, LanguageField, RgbImage, Seen, Splats};
+use crate::scene::{Camera, LEVEL_NAMES, LanguageField, RgbImage, Seen, Splats, World};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::{Value, json};
@@ -26,8 +26,9 @@ const REPORT_SPLATS: usize = 300_000;
 const THUMBNAIL: usize = 104;
 
 /// Name under which the page imports a module, and its text.
-const MODULES: [(&str, &str); 6] = [
+const MODULES: [(&str, &str); 7] = [
     ("splatvk/camera", include_str!("camera.js")),
+    ("splatvk/measure", include_str!("measure.js")),
     ("splatvk/pick", include_str!("pick.js")),
     ("splatvk/render", include_str!("render.js")),
     ("splatvk/sort", include_str!("sort.js")),
@@ -78,6 +79,8 @@ pub struct Scene3d<'a> {
     pub seen: &'a Seen,
     /// The photos' cameras.
     pub cameras: &'a [Camera],
+    /// How the scene lies in the world.
+    pub world: &'a World,
     /// The photos, for thumbnails; as many as cameras, or none.
     pub photos: Vec<&'a RgbImage>,
     /// Codebooks and features, where the scene has language.
@@ -128,6 +131,8 @@ impl Scene3d<'_> {
             "names_note": if words { "" } else { "This text model brings no phrases of its own: ask, and they appear here." },
             "views": views.collect::<Result<Vec<_>>>()?,
             "unseen": self.seen.unseen(),
+            "metres": self.world.scale.as_ref().map(|s| s.metres_per_unit),
+            "up": self.world.up.as_ref().map(|u| u.direction.to_array()),
             "levels": (0..LEVEL_NAMES.len()).map(|at| self.level(at)).collect::<Vec<_>>(),
             "answers": self.answers.iter().map(ShownAnswer::json).collect::<Vec<_>>(),
         }))
@@ -190,6 +195,7 @@ mod tests {
             splats: &splats,
             seen: &Seen::default(),
             cameras: std::slice::from_ref(&camera),
+            world: &World::default(),
             photos: vec![&photo],
             language: None,
             names: &Vec::new(),

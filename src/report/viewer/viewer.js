@@ -1,6 +1,7 @@
 // The page: ties the canvas, the controls and the scene together. Everything it needs is in the page itself
 // (#v-manifest), or comes from the server that sent it.
 import { Camera, add, scale, upOf } from "splatvk/camera";
+import { Tape } from "splatvk/measure";
 import { pick } from "splatvk/pick";
 import { Renderer } from "splatvk/render";
 import { gunzip, unpack } from "splatvk/splats";
@@ -10,12 +11,13 @@ const root = document.querySelector(".viewer");
 const find = (selector) => root.querySelector(selector);
 const canvas = find("canvas");
 const { views, levels } = manifest;
-const up = upOf(views);
+const up = manifest.up || upOf(views);
 
 const state = { mode: "colour", level: levels.findLastIndex((l) => l.colours.length), selected: null, picked: null, query: null };
 let splats, renderer, camera, worker, near = 0.01;
 let request = 0, sortedFor = -1, waiting = false, drawn = true, flight = null, walking = new Set();
 const idle = [];
+const tape = new Tape(find(".v-tape"), find(".v-line"), manifest.metres, say);
 
 // --- the scene --------------------------------------------------------------------------------------------------
 
@@ -115,6 +117,7 @@ function changed() {
 }
 
 function draw() {
+  if (!capturing) tape.draw(camera, canvas.clientWidth, canvas.clientHeight, near);
   renderer.draw(camera, { mode: state.mode, level: state.level, selecting: state.selected !== null, near });
 }
 
@@ -295,6 +298,7 @@ function clear() {
   renderer.select(-1, []);
   find(".v-card").hidden = true;
   find(".v-help").hidden = true;
+  if (tape.active) measure(false);
   setQuery(null);
   if (state.mode === "relevancy") show("colour");
   changed();
@@ -380,12 +384,24 @@ function levelOf(codes) {
 function clickAt(x, y, centre = false) {
   const ratio = canvas.width / canvas.clientWidth;
   const hit = pick(splats, camera, x * ratio, y * ratio, canvas.width, canvas.height, near);
+  if (tape.active && !centre) return hit ? measureAt(x, y, hit.depth) : say("Nothing to measure to there.");
   if (!hit) return clear();
   if (centre) return turn(() => camera.aim(camera.unproject(x * ratio, y * ratio, hit.depth, canvas.width, canvas.height)));
   const level = state.mode === "level" && hit.codes[state.level] >= 0 ? state.level : levelOf(hit.codes);
   if (level < 0) return say("Nothing that the scene has words for.");
   setQuery(null);
   select(level, hit);
+}
+
+function measureAt(x, y, depth) {
+  tape.place(camera.unproject(x, y, depth, canvas.clientWidth, canvas.clientHeight));
+  changed();
+}
+
+function measure(on) {
+  tape.toggle(on);
+  find("[data-do=measure]").setAttribute("aria-pressed", String(tape.active));
+  changed();
 }
 
 function pointers() {
@@ -453,7 +469,7 @@ function full() {
   moved();
 }
 
-const actions = { play, save, full, help: () => { find(".v-help").hidden = !find(".v-help").hidden; } };
+const actions = { play, save, full, measure: () => measure(), help: () => { find(".v-help").hidden = !find(".v-help").hidden; } };
 
 function keys() {
   const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
@@ -473,6 +489,7 @@ function keys() {
     else if (key === "-") turn(() => camera.dolly(1 / 0.9));
     else if (key === " " && e.target === root) play();
     else if (key === "m") nextMode();
+    else if (key === "l") measure();
     else if (key === "p") save();
     else if (key === "f") full();
     else if (key === "?" || key === "h") actions.help();
@@ -517,6 +534,7 @@ window.splatvk = {
   ready: load().then(controls),
   state,
   camera: () => camera,
+  tape,
   goTo: (view) => (goTo(view, true), settled()),
   show: (mode, level) => (show(mode, level), settled()),
   ask: async (text) => (await ask(text), settled()),

@@ -1,14 +1,14 @@
 //! Photos → cameras → depth and points.
 use super::shared;
-use crate::fit::Preset;
+use crate::fit::{Preset, Trained};
 use crate::infer::installed::Installed;
 use crate::infer::pairs;
 use crate::photo::Photo;
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::choose::LeftOut;
 use crate::pose::stereo::StereoOptions;
-use crate::pose::{self, Geometry, SparseModel, pointmap};
-use crate::scene::Camera;
+use crate::pose::{self, Geometry, SparseModel, pointmap, upright};
+use crate::scene::{Camera, Up};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -76,10 +76,11 @@ fn identity(photo: &Photo) -> String {
         digest.update(bytemuck::cast_slice::<_, u8>(&fine.data));
     }
     let pixels = crate::files::hex(&digest.finalize());
-    let Photo { path, image, border, original_size, to_working, exif_focal, camera_model, .. } = photo;
+    let Photo { path, image, border, original_size, to_working, exif_focal, camera_model, gravity, .. } =
+        photo;
     let size = (image.width, image.height);
     format!(
-        "{path:?} {size:?} {border:?} {original_size:?} {to_working:?} {exif_focal:?} {camera_model:?} {pixels}"
+        "{path:?} {size:?} {border:?} {original_size:?} {to_working:?} {exif_focal:?} {camera_model:?} {gravity:?} {pixels}"
     )
 }
 
@@ -163,5 +164,29 @@ impl Stage for DenseDepth {
                 pose::dense(context.device, &placed.photos, model, method, &options, context.progress)
             }
         }
+    }
+}
+
+/// Which way is up.
+pub struct Upright;
+
+impl Stage for Upright {
+    const NAME: &'static str = "upright";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<PlacedPhotos>, Output<Geometry>, Output<Trained>);
+    type Output = Option<Up>;
+
+    fn settings(&self) -> String {
+        String::new()
+    }
+
+    fn run(
+        self,
+        (placed, geometry, trained): (&PlacedPhotos, &Geometry, &Trained),
+        _: &Context,
+    ) -> Result<Option<Up>> {
+        let images: Vec<_> = placed.photos.iter().map(|p| &p.image).collect();
+        let gravity: Vec<_> = placed.photos.iter().map(|p| p.gravity).collect();
+        Ok(upright::up(&images, &trained.cameras, &geometry.points, &gravity))
     }
 }

@@ -9,7 +9,7 @@ mod shared;
 mod splats;
 
 pub use answers::{AnswerQueries, DecodeViews};
-pub use cameras::{CameraOrigin, Cameras, DenseDepth, PlacedPhotos};
+pub use cameras::{CameraOrigin, Cameras, DenseDepth, PlacedPhotos, Upright};
 pub use language::{Align, EmbedQueries, NameCodes, SharedEncoder, TrainLanguage};
 pub use masks::{ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMasks, RegionFeatures};
 pub use matches::{DescriptorMatches, Descriptors, NetworkMatches};

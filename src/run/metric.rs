@@ -1,0 +1,225 @@
+//! Lengths in a scene, and the scale that a known one gives it (docs/metres.md).
+use super::view::Viewer;
+use crate::format::scene_dir::Scene;
+use crate::gpu::Device;
+use crate::photo::stem;
+use crate::scene::{Camera, LanguageField, Scale};
+use crate::{Error, Result};
+use glam::{DVec2, DVec3};
+use std::str::FromStr;
+
+/// An end of a length.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Place {
+    /// `x,y,z` in the scene's own coordinates.
+    Point(DVec3),
+    /// `VIEW:x,y`: what a view of the scene shows at a pixel position.
+    Pixel(String, DVec2),
+}
+
+impl Place {
+    fn parse(text: &str) -> Option<Place> {
+        let numbers = |text: &str| -> Option<Vec<f64>> {
+            text.split(',').map(|n| n.trim().parse().ok().filter(|v: &f64| v.is_finite())).collect()
+        };
+        match text.rsplit_once(':') {
+            Some((view, pixel)) => match numbers(pixel)?[..] {
+                [x, y] => Some(Place::Pixel(stem(view.trim()).to_owned(), DVec2::new(x, y))),
+                _ => None,
+            },
+            None => match numbers(text)?[..] {
+                [x, y, z] => Some(Place::Point(DVec3::new(x, y, z))),
+                _ => None,
+            },
+        }
+    }
+}
+
+/// `A - B`, or with its true length `A - B = 0.21`: metres, or a number with `m`, `cm` or `mm`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Length {
+    /// As it was written.
+    pub text: String,
+    /// Its ends.
+    pub ends: [Place; 2],
+    /// If it was stated.
+    pub metres: Option<f64>,
+}
+
+impl FromStr for Length {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Length, String> {
+        let (places, metres) = match text.split_once('=') {
+            Some((places, length)) => (places, Some(metres(length)?)),
+            None => (text, None),
+        };
+        // A minus may also be a sign, or part of a name: the first one that leaves two places counts.
+        let split =
+            |(at, _): (usize, &str)| Some([Place::parse(&places[..at])?, Place::parse(&places[at + 1..])?]);
+        let ends = places.match_indices('-').find_map(split).ok_or_else(|| {
+            format!("\"{text}\": give two places as A - B, each x,y,z of the scene or VIEW:x,y in pixels")
+        })?;
+        Ok(Length { text: text.trim().to_owned(), ends, metres })
+    }
+}
+
+fn metres(text: &str) -> Result<f64, String> {
+    let text = text.trim();
+    let units = [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0)];
+    let (number, unit) =
+        units.iter().find_map(|(name, unit)| Some((text.strip_suffix(name)?, *unit))).unwrap_or((text, 1.0));
+    let metres = number.trim().parse::<f64>().ok().map(|v| v * unit);
+    let metres = metres.filter(|v| v.is_finite() && *v > 0.0);
+    metres.ok_or_else(|| {
+        format!("\"{text}\": a length is a positive number of metres, or one with m, cm or mm")
+    })
+}
+
+/// What one photo can tell of a place: a click is right to a pixel …
+const CLICK_SIGMA: f64 = 1.0;
+/// … and depth to 0.3 % (`depth med` of `eval` is 0.1 to 0.6 % on the tuning sets).
+const DEPTH_SIGMA: f64 = 0.003;
+
+/// A length as the scene has it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Measured {
+    /// Its ends, scene coordinates.
+    pub ends: [DVec3; 2],
+    /// Scene units.
+    pub units: f64,
+    /// One standard deviation of `units`.
+    pub sigma: f64,
+}
+
+/// Measures lengths; a device is opened where one of them names pixels.
+pub fn measure(scene: &Scene, lengths: &[Length], device: Option<&str>) -> Result<Vec<Measured>> {
+    let places = || lengths.iter().flat_map(|l| &l.ends);
+    let mut depths: Vec<(&str, crate::scene::Plane<f32>)> = Vec::new();
+    if places().any(|p| matches!(p, Place::Pixel(..))) {
+        let device = Device::open(device)?;
+        let mut viewer = Viewer::new(&device, &scene.splats, &LanguageField::default())?;
+        for place in places() {
+            let Place::Pixel(view, _) = place else { continue };
+            if depths.iter().all(|d| d.0 != view) {
+                depths.push((view, viewer.view(camera(scene, view)?)?.rendered.depth));
+            }
+        }
+    }
+    let position = |place: &Place| match place {
+        Place::Point(p) => Ok(*p),
+        Place::Pixel(view, pixel) => {
+            let camera = camera(scene, view)?;
+            let (x, y) = (pixel.x.floor(), pixel.y.floor());
+            let inside = x >= 0.0 && y >= 0.0 && x < f64::from(camera.width) && y < f64::from(camera.height);
+            if !inside {
+                return Err(Error::input(format!(
+                    "{view}:{},{}: the view has {} × {} pixels",
+                    pixel.x, pixel.y, camera.width, camera.height
+                )));
+            }
+            let depth = depths.iter().find(|d| d.0 == view).map_or(0.0, |d| d.1.at(x as usize, y as usize));
+            match depth > 0.0 {
+                true => Ok(camera.unproject(*pixel, f64::from(depth))),
+                false => Err(Error::input(format!(
+                    "{view}:{},{}: the scene shows nothing there",
+                    pixel.x, pixel.y
+                ))),
+            }
+        }
+    };
+    let one = |length: &Length| {
+        let ends = [position(&length.ends[0])?, position(&length.ends[1])?];
+        let units = ends[0].distance(ends[1]);
+        if units <= 0.0 {
+            return Err(Error::input(format!("\"{}\": both ends are at one place", length.text)));
+        }
+        let along = (ends[1] - ends[0]) / units;
+        let sigma = sigma(scene, ends[0], along).hypot(sigma(scene, ends[1], along));
+        Ok(Measured { ends, units, sigma })
+    };
+    lengths.iter().map(one).collect()
+}
+
+fn camera<'a>(scene: &'a Scene, view: &str) -> Result<&'a Camera> {
+    scene.cameras.iter().find(|c| stem(&c.name) == view).ok_or_else(|| {
+        let names: Vec<&str> = scene.cameras.iter().map(|c| stem(&c.name)).collect();
+        Error::input(format!("{view}: no view of the scene; it has {}", names.join(", ")))
+    })
+}
+
+/// Standard deviation of a place along a direction, as the nearest camera in front of it sees it; 0 without cameras.
+fn sigma(scene: &Scene, place: DVec3, along: DVec3) -> f64 {
+    let seen = scene.cameras.iter().map(|c| (c, c.project(place).1)).filter(|s| s.1 > 0.0);
+    let Some((camera, depth)) = seen.min_by(|a, b| a.1.total_cmp(&b.1)) else { return 0.0 };
+    let ray = (place - camera.pose.centre()).normalize_or_zero();
+    let deep = ray.dot(along);
+    let across = (1.0 - deep * deep).max(0.0).sqrt();
+    (DEPTH_SIGMA * depth * deep).hypot(CLICK_SIGMA * depth / camera.fx * across)
+}
+
+/// The scale at which lengths are as stated: the mean of what each of them says, weighted by how surely it says it. Its
+/// deviation is at least that by which they disagree.
+pub fn scale(lengths: &[Length], measured: &[Measured]) -> Option<Scale> {
+    let stated = || lengths.iter().zip(measured).filter_map(|(l, m)| Some((l, m, l.metres?)));
+    let logs: Vec<(f64, f64)> = stated()
+        .map(|(_, m, metres)| ((metres / m.units).ln(), (m.sigma / m.units).max(1e-6).powi(-2)))
+        .collect();
+    let weight: f64 = logs.iter().map(|l| l.1).sum();
+    let mean = logs.iter().map(|(log, w)| log * w).sum::<f64>() / weight;
+    let misfit: f64 = logs.iter().map(|(log, w)| w * (log - mean).powi(2)).sum();
+    // Birge ratio: as much more than the stated deviations as the lengths differ by more than these.
+    let excess = (misfit / (logs.len().max(2) - 1) as f64).max(1.0);
+    (!logs.is_empty()).then(|| Scale {
+        metres_per_unit: mean.exp(),
+        log_sigma: (excess / weight).sqrt(),
+        stated: stated().map(|s| s.0.text.clone()).collect(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lengths_are_read_as_they_are_written() {
+        let point = |x, y, z| Place::Point(DVec3::new(x, y, z));
+        let read = |text: &str| text.parse::<Length>();
+        let plain = read("0.1,-0.2,1.3 - -0.4,0.5,1 = 0.21").unwrap();
+        assert_eq!((plain.ends, plain.metres), ([point(0.1, -0.2, 1.3), point(-0.4, 0.5, 1.0)], Some(0.21)));
+        assert_eq!(read("1e-2,0,1-0,0,1").unwrap().ends, [point(0.01, 0.0, 1.0), point(0.0, 0.0, 1.0)]);
+        let pixel = |view: &str, x, y| Place::Pixel(view.into(), DVec2::new(x, y));
+        let named = read("img-1.jpg:12,30.5-img-2:4,5=21 cm").unwrap();
+        assert_eq!(named.ends, [pixel("img-1", 12.0, 30.5), pixel("img-2", 4.0, 5.0)]);
+        assert!((named.metres.unwrap() - 0.21).abs() < 1e-12);
+        assert_eq!(read("0,0,1 - 1,0,1 = 5mm").unwrap().metres, Some(0.005));
+        for bad in [
+            "0,0,1",
+            "0,0 - 1,1",
+            "0,0,1 - 1,0,1 = ",
+            "0,0,1 - 1,0,1 = -2",
+            "a:1,2,3 - b:1,2",
+            "0,0,nan - 0,0,1",
+        ] {
+            assert!(read(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn the_surest_length_counts_most_and_disagreement_widens() {
+        let length = |metres| Length { metres: Some(metres), ..read("0,0,1 - 1,0,1") };
+        fn read(text: &str) -> Length {
+            text.parse().unwrap()
+        }
+        let measured = |units: f64, sigma| Measured { ends: [DVec3::ZERO; 2], units, sigma };
+        let one = scale(&[length(0.5)], &[measured(2.0, 0.02)]).unwrap();
+        assert!((one.metres_per_unit - 0.25).abs() < 1e-12 && (one.log_sigma - 0.01).abs() < 1e-12);
+        let two = [measured(2.0, 0.02), measured(1.0, 0.1)];
+        let agreeing = scale(&[length(0.5), length(0.25)], &two).unwrap();
+        assert!((agreeing.metres_per_unit - 0.25).abs() < 1e-12 && agreeing.log_sigma < 0.01);
+        // 40 % apart, where 10 % was to be expected.
+        let apart = scale(&[length(0.5), length(0.35)], &two).unwrap();
+        assert!((0.25..0.252).contains(&apart.metres_per_unit) && apart.log_sigma > 0.03, "{apart:?}");
+        assert_eq!(scale(&[read("0,0,1 - 1,0,1")], &two[..1]), None);
+    }
+}
