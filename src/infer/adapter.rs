@@ -158,6 +158,10 @@ struct GraphSpec {
     needs: Vec<String>,
     /// A mask decoder that adds the padding point to a prompt itself; most do not.
     pads: Option<bool>,
+    /// Least confidence of a usable point, on the scale of the network after `apply`.
+    confidence_floor: Option<f64>,
+    /// Where the first pixel's centre is in `intrinsics`: 0.5, or 0 where pixels are counted from their centres.
+    pixel_centre: Option<f64>,
     #[serde(skip)]
     family: String,
 }
@@ -299,6 +303,10 @@ pub struct Binding {
     pub apply: BTreeMap<String, Activation>,
     /// A mask decoder that adds the padding point to a prompt itself.
     pub pads: bool,
+    /// Least confidence of a usable point, if the adapter states it.
+    pub confidence_floor: Option<f64>,
+    /// Coordinate of the first pixel's centre in `intrinsics`.
+    pub pixel_centre: f64,
 }
 
 impl Binding {
@@ -324,6 +332,8 @@ impl GraphSpec {
         spec.apply.extend(self.apply.clone());
         spec.needs.extend(self.needs.clone());
         spec.pads = self.pads.or(spec.pads);
+        spec.confidence_floor = self.confidence_floor.or(spec.confidence_floor);
+        spec.pixel_centre = self.pixel_centre.or(spec.pixel_centre);
         spec.image = self.image.clone().or(spec.image);
         spec
     }
@@ -355,8 +365,16 @@ impl GraphSpec {
         if !complaints.is_empty() {
             return Err(Misfit { bound: ports.len(), complaints });
         }
-        let (image, apply, family) = (self.image.clone(), self.apply.clone(), self.family.clone());
-        Ok(Binding { part: self.part, family, ports, image, apply, pads: self.pads.unwrap_or_default() })
+        Ok(Binding {
+            part: self.part,
+            family: self.family.clone(),
+            ports,
+            image: self.image.clone(),
+            apply: self.apply.clone(),
+            pads: self.pads.unwrap_or_default(),
+            confidence_floor: self.confidence_floor,
+            pixel_centre: self.pixel_centre.unwrap_or(0.5),
+        })
     }
 
     fn bind<'s>(

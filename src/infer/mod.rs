@@ -3,6 +3,7 @@
 //! Networks that users bring are recognised by what goes in and comes out: [`onnx`] reads a file's header, [`contract`] states
 //! what splatvk requires of each part of a model, [`adapter`] maps a file's names to it, [`graph`] runs it by role.
 pub mod adapter;
+pub(crate) mod best_pairs;
 #[cfg(test)]
 pub(crate) mod breakfast;
 pub mod cache;

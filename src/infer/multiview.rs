@@ -2,20 +2,17 @@
 //! pointmaps of every pair follow.
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
+use super::best_pairs::BestPairs;
 use super::cache::OutputKey;
 use super::graph::{GraphFile, Outputs};
 use super::prepare::Prepared;
 use super::runtime::Input;
 use crate::photo::Photo;
 use crate::progress::Progress;
-use crate::scene::{Camera, ModelView, PairPointmaps, Pointmap, Pose};
+use crate::scene::{Camera, PairPointmaps, Pointmap, Pointmaps, Pose};
 use crate::{Error, Result};
 
-pub(super) fn pointmaps(
-    graph: &GraphFile,
-    photos: &[Photo],
-    progress: &dyn Progress,
-) -> Result<(Vec<ModelView>, Vec<PairPointmaps>)> {
+pub(super) fn pointmaps(graph: &GraphFile, photos: &[Photo], progress: &dyn Progress) -> Result<Pointmaps> {
     let count = photos.len();
     if let Some(n) = graph.fixed("images", "N").filter(|n| *n != count) {
         return Err(Error::input(format!(
@@ -42,7 +39,8 @@ pub(super) fn pointmaps(
         Ok(all)
     })?;
     let (cameras, maps) = values.split_at_checked(16 * count).unwrap_or_default();
-    let cameras: Vec<Camera> = cameras.chunks_exact(16).map(|c| camera(c, width, height)).collect();
+    let cameras: Vec<Camera> =
+        cameras.chunks_exact(16).zip(&views).map(|(c, v)| camera(c, &v.name, width, height)).collect();
     let (depth, confidence) = maps.split_at_checked(pixels * count).unwrap_or_default();
     if confidence.len() != pixels * count || cameras.len() != count {
         return Err(Error::work(format!(
@@ -61,23 +59,29 @@ pub(super) fn pointmaps(
             depth.iter().enumerate().map(at).collect()
         })
         .collect();
+    // The alignment counts from 1 = "no idea"; a scale that starts below is moved there.
+    let lift = 1.0 - confidence.iter().fold(1f32, |least, c| least.min(*c));
     let map = |seen: usize, by: usize| Pointmap {
         points: worlds[seen].iter().map(|x| cameras[by].pose.transform(*x).as_vec3().to_array()).collect(),
-        // The alignment counts from 1 = "no idea".
-        confidence: confidence[seen * pixels..(seen + 1) * pixels].iter().map(|c| c.max(1.0)).collect(),
+        confidence: confidence[seen * pixels..(seen + 1) * pixels].iter().map(|c| c + lift).collect(),
     };
-    let pairs = (0..count).flat_map(|i| (i + 1..count).map(move |j| (i, j))).map(|(i, j)| PairPointmaps {
-        first: i,
-        second: j,
-        x11: map(i, i),
-        x21: map(j, i),
-        x22: map(j, j),
-        x12: map(i, j),
-        descriptors: None,
-    });
-    let pairs = pairs.collect();
+    let mut pairs = BestPairs::new(&views);
+    for (i, j) in (0..count).flat_map(|i| (i + 1..count).map(move |j| (i, j))) {
+        progress.check()?;
+        pairs.add(PairPointmaps {
+            first: i,
+            second: j,
+            x11: map(i, i),
+            x21: map(j, i),
+            x22: map(j, j),
+            x12: map(i, j),
+            descriptors: None,
+        });
+    }
+    let pairs = pairs.finish();
     progress.end();
-    Ok((views, pairs))
+    let confidence_floor = graph.binding.confidence_floor.map(|c| c + f64::from(lift));
+    Ok(Pointmaps { views, pairs, cameras, confidence_floor })
 }
 
 /// All photos at the first one's input size, since they share a tensor.
@@ -117,7 +121,8 @@ fn cameras(outputs: &mut Outputs, graph: &GraphFile, count: usize, size: (usize,
         for (p, k) in pose.data.chunks_exact(stride.max(12)).zip(lens.data.chunks_exact(9)) {
             all.extend((0..3).flat_map(|r| p[4 * r..4 * r + 3].to_vec()));
             all.extend([p[3], p[7], p[11]]);
-            all.extend([k[0], k[4], k[2], k[5]]);
+            let shift = (0.5 - graph.binding.pixel_centre) as f32;
+            all.extend([k[0], k[4], k[2] + shift, k[5] + shift]);
         }
     }
     if all.len() != 16 * count || all.iter().any(|v| !v.is_finite()) {
@@ -126,7 +131,7 @@ fn cameras(outputs: &mut Outputs, graph: &GraphFile, count: usize, size: (usize,
     Ok(all)
 }
 
-fn camera(c: &[f32], width: usize, height: usize) -> Camera {
+fn camera(c: &[f32], name: &str, width: usize, height: usize) -> Camera {
     let v = |k: usize| f64::from(c[k]);
     let rows = DMat3::from_cols(
         DVec3::new(v(0), v(1), v(2)),
@@ -135,7 +140,7 @@ fn camera(c: &[f32], width: usize, height: usize) -> Camera {
     );
     let pose = Pose { rotation: rows.transpose(), translation: DVec3::new(v(9), v(10), v(11)) };
     Camera {
-        name: String::new(),
+        name: name.into(),
         width: width as u32,
         height: height as u32,
         fx: v(12),

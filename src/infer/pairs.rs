@@ -1,5 +1,6 @@
 //! Geometry networks: DUSt3R and MASt3R see two photos at a time, VGGT and its like all of them. Both give pointmaps of pairs
 //! ([`PairPointmaps`]), which [`crate::pose::pointmap`] brings to one scene.
+use super::best_pairs::BestPairs;
 use super::cache::OutputKey;
 use super::contract::Part;
 use super::graph::{Graph, GraphFile, Outputs};
@@ -9,40 +10,47 @@ use super::runtime::{Input, Tensor};
 use crate::math::median;
 use crate::photo::Photo;
 use crate::progress::Progress;
-use crate::scene::{Descriptors, ModelView, PairPointmaps, Pointmap};
+use crate::scene::{Descriptors, PairPointmaps, Pointmap, Pointmaps};
 use crate::{Error, Result};
 
-/// Pointmaps of all pairs of photos, for [`crate::pose::pointmap::reconstruct`].
-pub fn pointmaps(
-    model: &Installed,
-    photos: &[Photo],
-    progress: &dyn Progress,
-) -> Result<(Vec<ModelView>, Vec<PairPointmaps>)> {
+/// Pointmaps of pairs of photos, for [`crate::pose::pointmap::reconstruct`]: all pairs of up to four, the [`BestPairs`] of more.
+pub fn pointmaps(model: &Installed, photos: &[Photo], progress: &dyn Progress) -> Result<Pointmaps> {
     if let Ok(graph) = model.graph(Part::MultiView) {
         let _turn = graph.compute.turn();
         return super::multiview::pointmaps(graph, photos, progress);
     }
-    let (prepared, pairs) = decoded(model, photos, progress)?;
-    Ok((views(photos, &prepared, progress), pairs))
+    let prepared = inputs_of(model, photos)?;
+    let views = views(photos, &prepared, progress);
+    let mut pairs = BestPairs::new(&views);
+    decode_all(model, &prepared, progress, |pair| pairs.add(pair))?;
+    let pairs = pairs.finish();
+    let graph = model.graph(Part::Pair).or_else(|_| model.graph(Part::PairDecoder))?;
+    Ok(Pointmaps { views, pairs, cameras: Vec::new(), confidence_floor: graph.binding.confidence_floor })
 }
 
-/// The photos as inputs of a pair network, and its pointmaps of all pairs.
-pub(super) fn decoded(
+/// The photos as inputs of a pair network.
+pub(super) fn inputs_of(model: &Installed, photos: &[Photo]) -> Result<Vec<Prepared>> {
+    match model.graph(Part::Pair) {
+        Ok(graph) => inputs(graph, "image1", photos),
+        Err(_) => inputs(model.graph(Part::PairEncoder)?, "image", photos),
+    }
+}
+
+/// What a pair network says of every pair of photos, one after another.
+pub(super) fn decode_all(
     model: &Installed,
-    photos: &[Photo],
+    prepared: &[Prepared],
     progress: &dyn Progress,
-) -> Result<(Vec<Prepared>, Vec<PairPointmaps>)> {
+    mut take: impl FnMut(PairPointmaps),
+) -> Result<()> {
     let compute = model.compute();
     let _turn = compute.turn();
-    let prepared = match model.graph(Part::Pair) {
-        Ok(graph) => inputs(graph, "image1", photos)?,
-        Err(_) => inputs(model.graph(Part::PairEncoder)?, "image", photos)?,
-    };
-    let count = photos.len();
-    let mut network = Network::new(model, &prepared);
+    let count = prepared.len();
+    let mut network = Network::new(model, prepared);
+    let mut sense = Sense { model, judged: 0, crossed: 0 };
     let ordered = (count * count.saturating_sub(1)) as u64;
     progress.begin("pointmaps", ordered);
-    let (mut pairs, mut done) = (Vec::new(), 0);
+    let mut done = 0;
     for i in 0..count {
         for j in i + 1..count {
             let mut decode = |a: usize, b: usize| {
@@ -59,15 +67,15 @@ pub(super) fn decoded(
                 _ => None,
             };
             let ([x11, x21], [x22, x12]) = (one.maps, two.maps);
-            pairs.push(PairPointmaps { first: i, second: j, x11, x21, x22, x12, descriptors });
+            let pair = PairPointmaps { first: i, second: j, x11, x21, x22, x12, descriptors };
+            if !model.untrained() {
+                sense.see(&pair, [&prepared[i], &prepared[j]])?;
+            }
+            take(pair);
         }
     }
     progress.end();
-    if !model.untrained() {
-        plausible(model, &prepared, &pairs)?;
-    }
-    drop(network);
-    Ok((prepared, pairs))
+    sense.verdict()
 }
 
 /// One decoding: first and second view, both in the first camera.
@@ -207,43 +215,49 @@ fn unpack(values: &[f32], size: [&Prepared; 2]) -> Option<Decoded> {
 }
 
 /// Refuses output that a trained network cannot give: an activation that the export left out, or outputs in the wrong order.
-fn plausible(model: &Installed, prepared: &[Prepared], pairs: &[PairPointmaps]) -> Result<()> {
-    let wrong = |what: &str, mend: &str| {
-        let message = format!("{}: model {}: {what}; {mend}", model.folder.display(), model.name);
-        Error::missing_model(&model.name, message)
-    };
-    let raw = "either two outputs are swapped or the export left an activation to the program: say apply.points = \
-               \"expm1-norm\" and apply.conf = \"one-plus-exp\" in its adapter (docs/models.md)";
-    let (mut judged, mut crossed) = (0, 0);
-    for pair in pairs {
+struct Sense<'a> {
+    model: &'a Installed,
+    judged: usize,
+    crossed: usize,
+}
+
+impl Sense<'_> {
+    fn wrong(&self, what: &str, mend: &str) -> Error {
+        let message = format!("{}: model {}: {what}; {mend}", self.model.folder.display(), self.model.name);
+        Error::missing_model(&self.model.name, message)
+    }
+
+    fn see(&mut self, pair: &PairPointmaps, size: [&Prepared; 2]) -> Result<()> {
+        let raw = "either two outputs are swapped or the export left an activation to the program: say apply.points = \
+                   \"expm1-norm\" and apply.conf = \"one-plus-exp\" in its adapter (docs/models.md)";
         for map in [&pair.x11, &pair.x21, &pair.x22, &pair.x12] {
             // 1 + e^x rounds to 1 at least.
             if map.confidence.iter().any(|c| *c < 0.999) {
-                return Err(wrong("a confidence is below 1", raw));
+                return Err(self.wrong("a confidence is below 1", raw));
             }
         }
-        let (first, second) = (&prepared[pair.first], &prepared[pair.second]);
-        for (own, other, ready) in [(&pair.x11, &pair.x21, first), (&pair.x22, &pair.x12, second)] {
+        for (own, other, ready) in [(&pair.x11, &pair.x21, size[0]), (&pair.x22, &pair.x12, size[1])] {
             let ahead = own.points.iter().filter(|p| p[2] > 0.0).count();
             if 2 * ahead < own.points.len() {
-                return Err(wrong("most points lie behind the camera that sees them", raw));
+                return Err(self.wrong("most points lie behind the camera that sees them", raw));
             }
             if own.points.len() == other.points.len() {
                 // Seen from the first camera, only the first view's points lie on the rays of its pixels.
                 let [a, b] = [own, other].map(|m| off_the_rays(m, ready.width, ready.height));
-                judged += 1;
-                crossed += usize::from(b < 0.05 && a > 2.0 * b);
+                self.judged += 1;
+                self.crossed += usize::from(b < 0.05 && a > 2.0 * b);
             }
         }
+        Ok(())
     }
-    if 2 * crossed > judged {
+
+    fn verdict(&self) -> Result<()> {
+        if 2 * self.crossed <= self.judged {
+            return Ok(());
+        }
         let mend = "swap names.points1 with names.points2 in its adapter, and with them conf and desc (docs/models.md)";
-        return Err(wrong(
-            "the second view's points lie on the first view's rays, so the two are swapped",
-            mend,
-        ));
+        Err(self.wrong("the second view's points lie on the first view's rays, so the two are swapped", mend))
     }
-    Ok(())
 }
 
 /// How far points project from their own pixels with the focal length that suits them best: median, in widths of the picture.
@@ -280,7 +294,39 @@ mod tests {
     use crate::progress::Silent;
     use crate::scene::{Camera, Pose, RgbImage};
 
-    /// The true pointmaps of two breakfast views from one graph, which knows them by the brightness of its first input.
+    /// Pointmaps of 64 × 48 pixels from one graph, which knows the two views by the brightness of its first input: the points of
+    /// the dark and of the light view, in their own camera and in the other's, at the outputs `ports`.
+    fn graph(own: &[Vec<f32>; 2], other: &[Vec<f32>; 2], ports: [&str; 2]) -> Onnx {
+        let dims = [1, 48, 64, 3];
+        let mut graph = Onnx::new().input("img1", FLOAT, "1 3 48 64").input("img2", FLOAT, "1 3 48 64");
+        for (name, [dark, light]) in [("own", own), ("other", other)] {
+            let step: Vec<f32> = light.iter().zip(dark).map(|(b, a)| b - a).collect();
+            let (start, step_name) = (format!("{name}_0"), format!("{name}_step"));
+            graph = graph.weight(&start, &dims, dark).weight(&step_name, &dims, &step);
+        }
+        graph = graph.node("ReduceMean", "img1", "light", &[("keepdims", Attribute::Int(1))]);
+        for (name, port) in ["own", "other"].into_iter().zip(ports) {
+            graph = graph
+                .output(port, "1 48 64 3")
+                .node("Mul", &format!("{name}_step light"), &format!("{name}_more"), &[])
+                .node("Add", &format!("{name}_0 {name}_more"), port, &[]);
+        }
+        for k in ["conf_1", "conf_2"] {
+            graph = graph
+                .output(k, "1 48 64")
+                .weight(&format!("sure_{k}"), &[1, 48, 64], &[5.0; 48 * 64])
+                .node("Identity", &format!("sure_{k}"), k, &[]);
+        }
+        graph
+    }
+
+    /// Photos that are 0 and 1 after the network's normalisation to [−1, 1].
+    fn dark_and_light() -> [Photo; 2] {
+        let plain = |v: f32| RgbImage { width: 640, height: 480, data: vec![[v; 3]; 640 * 480] };
+        [photo("dark", plain(0.5)), photo("light", plain(1.0))]
+    }
+
+    /// The true pointmaps of two breakfast views.
     #[test]
     fn swapped_pointmaps_are_seen_by_the_rays_they_lie_on() {
         let views = breakfast::train_views();
@@ -296,44 +342,60 @@ mod tests {
             };
             (0..w * h).flat_map(at).collect()
         };
-        let dims = [1, h as u64, w as u64, 3];
         let [own, other] = [[points(0, 0), points(1, 1)], [points(1, 0), points(0, 1)]];
-        let graph = |first: &str, second: &str| {
-            let mut graph = Onnx::new().input("img1", FLOAT, "1 3 48 64").input("img2", FLOAT, "1 3 48 64");
-            for (name, [dark, light]) in [("own", &own), ("other", &other)] {
-                let step: Vec<f32> = light.iter().zip(dark).map(|(b, a)| b - a).collect();
-                graph = graph.weight(&format!("{name}_0"), &dims, dark).weight(
-                    &format!("{name}_step"),
-                    &dims,
-                    &step,
-                );
-            }
-            graph = graph.node("ReduceMean", "img1", "light", &[("keepdims", Attribute::Int(1))]);
-            for (name, port) in [("own", first), ("other", second)] {
-                graph = graph
-                    .output(port, "1 48 64 3")
-                    .node("Mul", &format!("{name}_step light"), &format!("{name}_more"), &[])
-                    .node("Add", &format!("{name}_0 {name}_more"), port, &[]);
-            }
-            for k in ["conf_1", "conf_2"] {
-                graph = graph
-                    .output(k, "1 48 64")
-                    .weight(&format!("sure_{k}"), &[1, h as u64, w as u64], &vec![2.0; w * h])
-                    .node("Identity", &format!("sure_{k}"), k, &[]);
-            }
-            graph
-        };
-        // 0 and 1 after the network's normalisation to [−1, 1].
-        let plain = |v: f32| RgbImage { width: 640, height: 480, data: vec![[v; 3]; 640 * 480] };
-        let photos = [photo("dark", plain(0.5)), photo("light", plain(1.0))];
         let dir = tempfile::tempdir().unwrap();
-        let ask = |first: &str, second: &str| {
-            graph(first, second).write(&dir.path().join("dust3r/model.onnx"));
+        let ask = |ports: [&str; 2]| {
+            graph(&own, &other, ports).write(&dir.path().join("dust3r/model.onnx"));
             let model = Registry::of(&[dir.path()]).installed(Task::Geometry, "dust3r").unwrap();
-            pointmaps(&model, &photos, &Silent).map(drop)
+            pointmaps(&model, &dark_and_light(), &Silent).map(drop)
         };
-        ask("pts3d_1", "pts3d_2").unwrap();
-        let error = ask("pts3d_2", "pts3d_1").unwrap_err().to_string();
+        ask(["pts3d_1", "pts3d_2"]).unwrap();
+        let error = ask(["pts3d_2", "pts3d_1"]).unwrap_err().to_string();
         assert!(error.contains("swap names.points1 with names.points2"), "{error}");
+    }
+
+    /// A tilted wall in front of two cameras, every point on the ray through the centre of its pixel: where the photo shows that
+    /// point is known, and half a pixel of the network would be five of the photo.
+    #[test]
+    fn points_of_a_pair_network_are_those_of_the_centres_of_its_pixels() {
+        let (w, h) = (64usize, 48);
+        let at = |centre: f64, angle: f64| {
+            let rotation = glam::DMat3::from_rotation_y(angle);
+            let pose = Pose { rotation, translation: -(rotation * glam::DVec3::X * centre) };
+            let name = String::new();
+            Camera { name, width: 640, height: 480, fx: 700.0, fy: 700.0, cx: 320.0, cy: 240.0, pose }
+        };
+        let cameras = [at(0.0, 0.0), at(0.6, 0.15)];
+        // World points of the plane z = 4 + 0.4 x that the centres of the network's pixels show.
+        let world = |k: usize, p: usize| {
+            let pixel = glam::DVec2::new((p % w) as f64 + 0.5, (p / w) as f64 + 0.5) * 10.0;
+            let (from, to) = (cameras[k].pose.centre(), cameras[k].unproject(pixel, 1.0));
+            let ray = to - from;
+            from + ray * ((4.0 + 0.4 * from.x - from.z) / (ray.z - 0.4 * ray.x))
+        };
+        let points = |k: usize, c: usize| -> Vec<f32> {
+            let seen = |p: usize| cameras[c].pose.transform(world(k, p)).as_vec3().to_array();
+            (0..w * h).flat_map(seen).collect()
+        };
+        let [own, other] = [[points(0, 0), points(1, 1)], [points(1, 0), points(0, 1)]];
+        let dir = tempfile::tempdir().unwrap();
+        graph(&own, &other, ["pts3d_1", "pts3d_2"]).write(&dir.path().join("dust3r/model.onnx"));
+        let model = Registry::of(&[dir.path()]).installed(Task::Geometry, "dust3r").unwrap();
+        let maps = pointmaps(&model, &dark_and_light(), &Silent).unwrap();
+        let pair = &maps.pairs[0];
+        for (map, of, by) in [(&pair.x11, 0, 0), (&pair.x21, 1, 0), (&pair.x22, 1, 1), (&pair.x12, 0, 1)] {
+            let photo = maps.views[of].from_working.inverse();
+            for p in (0..w * h).step_by(31) {
+                let x = cameras[by].pose.inverse().transform(map.point(p));
+                let centre = photo.apply([(p % w) as f64 + 0.5, (p / w) as f64 + 0.5]);
+                let shown = cameras[of].project(x).0 - glam::DVec2::from(centre);
+                assert!(shown.length() < 1e-2, "{of} {by} {p}: {shown}");
+            }
+        }
+        // The focal length that two views of 64 pixels give of a plane says nothing; its principal point is the photo's.
+        let found = crate::pose::pointmap::reconstruct(maps, 0, &Silent).unwrap().geometry;
+        for camera in &found.cameras {
+            assert!((camera.cx - 320.0).abs() < 1e-9 && (camera.cy - 240.0).abs() < 1e-9, "{camera:?}");
+        }
     }
 }

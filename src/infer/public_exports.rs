@@ -10,7 +10,7 @@ use super::tests::{clip_in, photo};
 use super::{RegionEncoder, Registry, pairs, warp};
 use crate::pose::pointmap;
 use crate::progress::Silent;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Camera, Plane, Pose, RgbImage};
 
 fn flat(width: usize, height: usize, colour: [f32; 3]) -> RgbImage {
     RgbImage { width, height, data: vec![colour; width * height] }
@@ -289,19 +289,39 @@ fn multi_view_networks_that_say_the_truth_give_the_true_cameras() {
     let graph = say(graph, "depth", &format!("1 {n} {h} {w} 1"), &depth);
     let graph = say(graph, "depth_conf", &format!("1 {n} {h} {w}"), &sure);
     say(graph, "pose_enc", &format!("1 {n} 9"), &narrow(&codes)).write(&dir.path().join("vggt/model.onnx"));
-    let graph = Onnx::new().input("image", FLOAT, &format!("1 {n} 3 {h} {w}"));
-    let graph = say(graph, "depth", &format!("1 {n} {h} {w}"), &depth);
-    let graph = say(graph, "depth_conf", &format!("1 {n} {h} {w}"), &sure);
-    let graph = say(graph, "extrinsics", &format!("1 {n} 3 4"), &narrow(&matrices));
-    let graph = say(graph, "intrinsics", &format!("1 {n} 3 3"), &narrow(&intrinsics));
-    graph.write(&dir.path().join("da3/model.onnx"));
+    let matrix_form = |folder: &str, intrinsics: &[f64]| {
+        let graph = Onnx::new().input("image", FLOAT, &format!("1 {n} 3 {h} {w}"));
+        let graph = say(graph, "depth", &format!("1 {n} {h} {w}"), &depth);
+        let graph = say(graph, "depth_conf", &format!("1 {n} {h} {w}"), &sure);
+        let graph = say(graph, "extrinsics", &format!("1 {n} 3 4"), &narrow(&matrices));
+        let graph = say(graph, "intrinsics", &format!("1 {n} 3 3"), &narrow(intrinsics));
+        graph.write(&dir.path().join(folder).join("model.onnx"));
+    };
+    matrix_form("da3", &intrinsics);
+    // The same cameras in pixels that are counted from their centres.
+    let shifted = |(k, v): (usize, &f64)| if [2, 5].contains(&(k % 9)) { v - 0.5 } else { *v };
+    matrix_form("da3_from_centres", &intrinsics.iter().enumerate().map(shifted).collect::<Vec<_>>());
+    let adapter = "family = \"da3\"\n[[graph]]\npart = \"multi-view\"\npixel_centre = 0.0\n";
+    std::fs::write(dir.path().join("da3_from_centres/adapter.toml"), adapter).unwrap();
 
     let photos: Vec<_> =
         views.iter().enumerate().map(|(k, v)| photo(&format!("view{k}"), v.image.clone())).collect();
-    for name in ["vggt", "da3"] {
+    for name in ["vggt", "da3", "da3_from_centres"] {
         let model = Registry::of(&[dir.path()]).installed(Task::Geometry, name).unwrap();
-        let (seen, maps) = pairs::pointmaps(&model, &photos, &Silent).unwrap();
-        let geometry = pointmap::reconstruct(&seen, &maps, 0, &Silent).unwrap();
+        let maps = pairs::pointmaps(&model, &photos, &Silent).unwrap();
+        assert_eq!(maps.confidence_floor, (name != "vggt").then_some(1.05));
+        for (pair, k) in maps.pairs.iter().flat_map(|p| [(&p.x11, p.first), (&p.x22, p.second)]) {
+            let camera = Camera { pose: Pose::IDENTITY, ..views[k].camera.resized(w as u32, h as u32) };
+            for (p, x) in pair.points.iter().enumerate().step_by(97) {
+                let centre = glam::DVec2::new((p % w) as f64 + 0.5, (p / w) as f64 + 0.5);
+                let truth = camera.unproject(centre, f64::from(depth[k * w * h + p]));
+                // Half a pixel would be 0.5 % of the depth.
+                let off = (glam::Vec3::from(*x).as_dvec3() - truth).length();
+                assert!(off < 1e-4 * truth.z.max(1.0), "{name} {k} {p}: {off}");
+            }
+        }
+        let geometry = pointmap::reconstruct(maps, 0, &Silent).unwrap().geometry;
+        assert_eq!(geometry.method, "pointmaps, started from the network's own cameras", "{name}");
         for (k, (camera, v)) in geometry.cameras.iter().zip(&views).enumerate() {
             let truth = v.camera.pose.compose(&views[0].camera.pose.inverse());
             let turned = (camera.pose.rotation * truth.rotation.transpose()).transpose();

@@ -361,15 +361,16 @@ fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_t
     let photos = [photo("dark", grey(0.5)), photo("light", grey(1.0))];
     let model = registry.installed(Task::Geometry, "dust3r").unwrap();
     // ln 3 = 1.1 is no confidence of 4, but it is at least 1: nothing to see here yet.
-    let (views, maps) = pairs::pointmaps(&model, &photos, &Silent).unwrap();
-    assert_eq!((views[0].width, views[0].height, maps.len()), (32, 16, 1));
-    assert!((maps[0].x11.points[0][2] - 3f32.ln()).abs() < 1e-6);
+    let maps = pairs::pointmaps(&model, &photos, &Silent).unwrap();
+    assert_eq!((maps.views[0].width, maps.views[0].height, maps.pairs.len()), (32, 16, 1));
+    assert!(maps.cameras.is_empty() && maps.confidence_floor == Some(3.0));
+    assert!((maps.pairs[0].x11.points[0][2] - 3f32.ln()).abs() < 1e-6);
 
     let adapter = "family = \"dust3r\"\n[[graph]]\npart = \"pair\"\napply.points = \"expm1-norm\"\napply.conf = \"one-plus-exp\"";
     std::fs::write(dir.path().join("dust3r/adapter.toml"), adapter).unwrap();
     let model = registry.installed(Task::Geometry, "dust3r").unwrap();
-    let (_, maps) = pairs::pointmaps(&model, &photos, &Silent).unwrap();
-    let pair = &maps[0];
+    let maps = pairs::pointmaps(&model, &photos, &Silent).unwrap();
+    let pair = &maps.pairs[0];
     assert!((pair.x21.points[7][2] - 2.0).abs() < 1e-5 && (pair.x12.points[7][2] - 2.0).abs() < 1e-5);
     assert!((pair.x11.confidence[0] - 4.0).abs() < 1e-5);
     // (1 − 0.5) / 0.5 = 1 for the light photo, 0 for the dark one.

@@ -74,7 +74,9 @@ fn by_descriptors(
     photos: &[Photo],
     progress: &dyn Progress,
 ) -> Result<Vec<(DenseWarp, DenseWarp)>> {
-    let (prepared, pairs) = super::pairs::decoded(model, photos, progress)?;
+    let prepared = super::pairs::inputs_of(model, photos)?;
+    let mut pairs = Vec::new();
+    super::pairs::decode_all(model, &prepared, progress, |pair| pairs.push(pair))?;
     progress.begin("match", pairs.len() as u64);
     let mut all = Vec::new();
     for pair in &pairs {

@@ -55,7 +55,8 @@ fn least_sure(model: &SparseModel) -> Option<(usize, Reason)> {
     Some((view, Reason::Doubtful((100.0 * share).round() as u8)))
 }
 
-fn message(stem: &str, reason: &Reason) -> String {
+/// What is said of a photo without a camera.
+pub(super) fn message(stem: &str, reason: &Reason) -> String {
     const JOIN: &str = "a photo from between it and the others would join it to them";
     match reason {
         Reason::Duplicate(other) => format!("{stem} is left out: it is the same picture as {other}"),

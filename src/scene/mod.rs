@@ -22,7 +22,7 @@ pub use camera::{Camera, Pose};
 pub use image::{DepthMap, Plane, RgbImage};
 pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId};
 pub use lens::Lens;
-pub use pointmap::{Descriptors, ModelView, PairPointmaps, Pointmap};
+pub use pointmap::{Descriptors, ModelView, PairPointmaps, Pointmap, Pointmaps};
 pub use points::PointCloud;
 pub use seen::Seen;
 pub use similarity::Similarity;

@@ -47,7 +47,7 @@ impl ModelView {
     }
 }
 
-/// A point and a confidence (≥ 1) per pixel.
+/// A point and a confidence per pixel. 1 is none at all; how far above it a good one is depends on the network.
 #[derive(Clone, Debug, Default)]
 pub struct Pointmap {
     /// [H, W] points; OpenCV axes of the camera that the pair names.
@@ -115,4 +115,18 @@ pub struct PairPointmaps {
     pub x12: Pointmap,
     /// Descriptors D11, D21 (first decoding) and D12, D22 (second decoding), if the network has them.
     pub descriptors: Option<[Descriptors; 4]>,
+}
+
+/// What a geometry network says of a set of photos.
+#[derive(Clone, Debug, Default)]
+pub struct Pointmaps {
+    /// The photos as it saw them.
+    pub views: Vec<ModelView>,
+    /// Pointmaps of pairs of them.
+    pub pairs: Vec<PairPointmaps>,
+    /// Cameras that it gave for all of them at once, one per view at the size of its input, in the unit of the pointmaps; empty
+    /// when it gives none.
+    pub cameras: Vec<Camera>,
+    /// Least confidence of a usable point on the network's own scale, if that is known.
+    pub confidence_floor: Option<f64>,
 }

@@ -1,15 +1,13 @@
 //! Step F: cameras, focal lengths, view scales and a smooth depth correction per view, adjusted together to the matches
 //! (Levenberg–Marquardt in f64).
-use super::canonical::{Canonical, Focals};
-use super::matches::PairMatches;
+use super::canonical::Focals;
 use super::normal::{Normal, Pattern};
-use super::problem::{Problem, State, Step};
+use super::problem::{PairLinks, Problem, State, Step};
 use super::solver::Factored;
 use super::tree::Placement;
 use crate::Result;
 use crate::math::median;
 use crate::progress::Progress;
-use crate::scene::{ModelView, PairPointmaps};
 use glam::DVec2;
 use nalgebra::DVector;
 
@@ -24,22 +22,16 @@ const SCALES: [(f64, usize, f64); 4] = [(8.0, 10, 1e-4), (4.0, 3, 1e-4), (2.0, 3
 pub(super) struct Adjustment {
     pub(super) state: State,
     pub(super) problem: Problem,
+    /// Matches of wrong pairs.
+    dropped: Vec<PairLinks>,
     pub(super) focal_log_sigma: f64,
 }
 
 impl Adjustment {
-    pub(super) fn new(
-        views: &[ModelView],
-        canonical: &[Canonical],
-        focals: &Focals,
-        start: &Placement,
-        pairs: &[PairPointmaps],
-        matches: &[PairMatches],
-    ) -> Adjustment {
-        let mut problem = Problem::new(views, canonical, focals, pairs, matches);
+    pub(super) fn new(mut problem: Problem, start: &Placement, focals: &Focals) -> Adjustment {
         let state = State::new(start, focals, &problem.lattices);
         problem.hold(&state);
-        Adjustment { state, problem, focal_log_sigma: 0.0 }
+        Adjustment { state, problem, dropped: Vec::new(), focal_log_sigma: 0.0 }
     }
 
     pub(super) fn focal(&self, view: usize) -> f64 {
@@ -98,19 +90,25 @@ impl Adjustment {
         Ok(())
     }
 
-    /// Leaves out pairs whose median reprojection error exceeds `fraction` of the long side; true if there were any.
+    /// Takes the matches from pairs whose median reprojection error exceeds `fraction` of the long side; true if there were any.
     pub(super) fn drop_wrong_pairs(&mut self, fraction: f64) -> bool {
         let (problem, state) = (&mut self.problem, &self.state);
         let most = fraction * problem.long;
         let wrong: Vec<bool> = (problem.pairs.iter())
             .map(|p| problem.median_error(state, p).is_some_and(|e| e > most))
             .collect();
-        if wrong.iter().all(|w| !w) || wrong.iter().filter(|w| !**w).count() + 1 < state.poses.len() {
-            return false;
+        for (pair, _) in problem.pairs.iter_mut().zip(&wrong).filter(|p| *p.1) {
+            self.dropped.push(PairLinks { views: pair.views, links: std::mem::take(&mut pair.links) });
         }
-        let mut keep = wrong.iter().map(|w| !w);
-        problem.pairs.retain(|_| keep.next().unwrap_or(true));
-        true
+        wrong.contains(&true)
+    }
+
+    /// How badly the matches are explained, those of wrong pairs too.
+    pub(super) fn disagreement(&self) -> f64 {
+        [&self.problem.pairs, &self.dropped]
+            .map(|pairs| self.problem.match_cost(pairs, &self.state, 1.0))
+            .iter()
+            .sum()
     }
 
     /// Unit of length: the median depth of the matched points becomes 1.

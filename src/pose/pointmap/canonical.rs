@@ -1,6 +1,6 @@
 //! Steps B and C: one depth map per view from all pairs that contain it, and the focal lengths.
 use crate::math::median;
-use crate::scene::{ModelView, PairPointmaps, Pointmap};
+use crate::scene::{Camera, ModelView, PairPointmaps, Pointmap};
 use glam::{DVec2, DVec3};
 
 /// Depth of one view from all its pairs, in the scale of its reference pair.
@@ -98,6 +98,16 @@ pub(super) struct Focals {
 }
 
 impl Focals {
+    /// With the focal lengths of a network's cameras to start from; the priors stay.
+    pub(super) fn started(&self, cameras: &[Camera]) -> Focals {
+        let of_group = |g: usize| {
+            let members = cameras.iter().zip(&self.group).filter(|(_, own)| **own == g);
+            median(&mut members.map(|(c, _)| (c.fx * c.fy).sqrt()).collect::<Vec<f64>>())
+        };
+        let values = self.values.iter().enumerate().map(|(g, f)| of_group(g).unwrap_or(*f)).collect();
+        Focals { values, ..self.clone() }
+    }
+
     pub(super) fn of(&self, view: usize) -> f64 {
         self.values[self.group[view]]
     }

@@ -3,7 +3,7 @@ use super::adjust::Adjustment;
 use super::canonical::Canonical;
 use crate::math::quantile;
 use crate::pose::Geometry;
-use crate::scene::{Camera, DepthMap, ModelView, Plane, PointCloud};
+use crate::scene::{Camera, DepthMap, ModelView, Plane, PointCloud, Pointmaps};
 use glam::DVec2;
 
 /// A less confident point this much in front of another view's surface is wrong (depth noise is about this large).
@@ -12,8 +12,8 @@ const CLEAN_TOLERANCE: f64 = 0.005;
 const EDGE_JUMP: f64 = 0.06;
 /// Points of two views closer than this in depth are the same point.
 const SAME_DEPTH: f64 = 0.01;
-/// Least canonical confidence of a point (MASt3R's default).
-const MIN_CONFIDENCE: f64 = 2.0;
+/// Share of the pixels that are no points whatever the scale of their confidence.
+const LEAST_CONFIDENT: f64 = 0.2;
 
 /// Depth and confidence of one view at model resolution.
 struct Layer {
@@ -22,12 +22,17 @@ struct Layer {
     confidence: Vec<f64>,
 }
 
-pub(super) fn output(views: &[ModelView], canonical: &[Canonical], a: &Adjustment) -> Geometry {
+pub(super) fn output(maps: &Pointmaps, canonical: &[Canonical], a: &Adjustment) -> Geometry {
+    let views = &maps.views;
     let mut layers: Vec<Layer> = (0..views.len()).map(|v| layer(&views[v], &canonical[v], a, v)).collect();
-    clean(&mut layers);
+    clean(&mut layers, &partners(maps));
     for l in &mut layers {
         mask_edges(l);
     }
+    // The canonical confidence counts from 0.
+    let least = least_confidence(&layers, maps.confidence_floor.map(|c| c - 1.0));
+    // From here on 1 is that of the least confident point, whatever the network's scale.
+    layers.iter_mut().flat_map(|l| &mut l.confidence).for_each(|c| *c /= least);
     let depths = views.iter().zip(&layers).map(|(v, l)| to_working(v, l)).collect();
     let cameras = (0..views.len()).map(|v| views[v].working_camera(a.focal(v), &a.state.poses[v])).collect();
     Geometry {
@@ -85,8 +90,18 @@ impl Layer {
     }
 }
 
-/// Removes points that float in front of a more confident surface of another view.
-fn clean(layers: &mut [Layer]) {
+/// The views with which each shares a pair: those that show much of the same.
+fn partners(maps: &Pointmaps) -> Vec<Vec<usize>> {
+    let mut all = vec![Vec::new(); maps.views.len()];
+    for pair in &maps.pairs {
+        all[pair.first].push(pair.second);
+        all[pair.second].push(pair.first);
+    }
+    all
+}
+
+/// Removes points that float in front of a more confident surface of a partner.
+fn clean(layers: &mut [Layer], partners: &[Vec<usize>]) {
     let removed: Vec<Vec<usize>> = (0..layers.len())
         .map(|i| {
             let l = &layers[i];
@@ -94,12 +109,11 @@ fn clean(layers: &mut [Layer]) {
                 .filter(|&k| l.depth[k] > 0.0)
                 .filter(|&k| {
                     let x = l.world(k);
-                    layers.iter().enumerate().any(|(j, other)| {
-                        j != i
-                            && other.hit(x).is_some_and(|(m, z)| {
-                                z < (1.0 - CLEAN_TOLERANCE) * other.depth[m]
-                                    && l.confidence[k] < other.confidence[m]
-                            })
+                    partners[i].iter().map(|j| &layers[*j]).any(|other| {
+                        other.hit(x).is_some_and(|(m, z)| {
+                            z < (1.0 - CLEAN_TOLERANCE) * other.depth[m]
+                                && l.confidence[k] < other.confidence[m]
+                        })
                     })
                 })
                 .collect()
@@ -161,11 +175,16 @@ fn to_working(view: &ModelView, l: &Layer) -> DepthMap {
     out
 }
 
-/// Points above the confidence threshold; a pixel that an already kept point of another view covers is left out.
-fn fuse(views: &[ModelView], layers: &[Layer]) -> PointCloud {
+/// Confidence of a usable point: the floor, if there is one, or what the least confident share stays below, if that is more.
+fn least_confidence(layers: &[Layer], floor: Option<f64>) -> f64 {
     let mut all: Vec<f64> =
         layers.iter().flat_map(|l| l.confidence.iter().copied()).filter(|c| *c > 0.0).collect();
-    let threshold = quantile(&mut all, 0.2).unwrap_or(0.0).max(MIN_CONFIDENCE);
+    let least = quantile(&mut all, LEAST_CONFIDENT).unwrap_or(1.0);
+    floor.map_or(least, |f| least.max(f))
+}
+
+/// Points of confidence 1 and more; a pixel that an already kept point of another view covers is left out.
+fn fuse(views: &[ModelView], layers: &[Layer]) -> PointCloud {
     let mean = |l: &Layer| l.confidence.iter().sum::<f64>() / l.confidence.len().max(1) as f64;
     let mut order: Vec<usize> = (0..layers.len()).collect();
     order.sort_by(|a, b| mean(&layers[*b]).total_cmp(&mean(&layers[*a])).then(a.cmp(b)));
@@ -175,7 +194,7 @@ fn fuse(views: &[ModelView], layers: &[Layer]) -> PointCloud {
         let (l, view) = (&layers[v], &views[v]);
         let back = view.from_working.inverse();
         for k in 0..l.depth.len() {
-            if l.confidence[k] <= threshold || l.depth[k] <= 0.0 || covered[v][k] {
+            if l.confidence[k] < 1.0 || l.depth[k] <= 0.0 || covered[v][k] {
                 continue;
             }
             let world = l.world(k);

@@ -2,7 +2,7 @@
 use super::canonical::{Canonical, Focals};
 use super::matches::PairMatches;
 use super::residual::{Direction, End, Lattice, PITCH};
-use super::tree::Placement;
+use super::tree::{Placement, largest_component};
 use crate::math::median;
 use crate::pose::numeric::cauchy;
 use crate::scene::{ModelView, PairPointmaps, Pose};
@@ -89,7 +89,18 @@ pub(super) struct PairLinks {
     pub(super) links: Vec<Link>,
 }
 
+/// A pair with fewer matches holds no views together; structure from motion rests cameras on no fewer points.
+const LEAST_MATCHES: usize = 20;
+
+impl PairLinks {
+    /// Whether the pair joins its views.
+    pub(super) fn joins(&self) -> bool {
+        self.links.len() >= LEAST_MATCHES
+    }
+}
+
 /// Measurements and priors.
+#[derive(Clone)]
 pub(super) struct Problem {
     pub(super) group: Vec<usize>,
     pub(super) lattices: Vec<Lattice>,
@@ -221,8 +232,8 @@ impl Problem {
         s.kappa.iter().sum::<f64>() - self.start_kappa
     }
 
-    /// Robust cost; `c` stretches the Cauchy scales.
-    pub(super) fn cost(&self, s: &State, c: f64) -> f64 {
+    /// Robust cost of matches; `c` stretches the Cauchy scales.
+    pub(super) fn match_cost(&self, pairs: &[PairLinks], s: &State, c: f64) -> f64 {
         let of_pair = |pair: &PairLinks| {
             let mut sum = 0.0;
             let directions = [0, 1].map(|side| self.direction(s, pair, side));
@@ -238,10 +249,21 @@ impl Problem {
             sum
         };
         // Collected first: a parallel sum would depend on who is free.
-        let costs: Vec<f64> = self.pairs.par_iter().map(of_pair).collect();
-        let mut sum: f64 = costs.iter().sum();
+        let costs: Vec<f64> = pairs.par_iter().map(of_pair).collect();
+        costs.iter().sum()
+    }
+
+    /// Robust cost of the matches, and that of the priors.
+    pub(super) fn cost(&self, s: &State, c: f64) -> f64 {
+        let mut sum = self.match_cost(&self.pairs, s, c);
         self.priors(s, |r, w| sum += w * r * r);
         sum
+    }
+
+    /// Whether pairs with matches hold all views together.
+    pub(super) fn joins_all_views(&self) -> bool {
+        let joined: Vec<[usize; 2]> = self.pairs.iter().filter(|p| p.joins()).map(|p| p.views).collect();
+        largest_component(self.lattices.len(), &joined).len() == self.lattices.len()
     }
 
     /// Median reprojection error of a pair, pixels.

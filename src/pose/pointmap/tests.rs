@@ -1,5 +1,6 @@
 mod equations;
 mod many;
+mod network;
 
 use super::*;
 use crate::math::Random;
@@ -16,9 +17,11 @@ struct Faults {
     depth: f64,
     pixels: f64,
     outliers: f64,
+    /// σ of ln scale of a decoding.
+    scale: f64,
 }
 
-const FAULTS: Faults = Faults { depth: 0.01, pixels: 1.0, outliers: 0.2 };
+const FAULTS: Faults = Faults { depth: 0.01, pixels: 1.0, outliers: 0.2, scale: 0.7 };
 
 struct Case {
     views: Vec<ModelView>,
@@ -75,7 +78,7 @@ impl Case {
     }
 
     fn pair(&self, i: usize, j: usize, f: Faults, rng: &mut Random) -> (PairPointmaps, PairMatches) {
-        let mut scale = || (0.7 * rng.normal()).exp();
+        let mut scale = || (f.scale * rng.normal()).exp();
         let (s, t) = (scale(), scale());
         let pair = PairPointmaps {
             first: i,
@@ -116,6 +119,18 @@ impl Case {
     }
 }
 
+/// What a pair network would say.
+fn said(views: &[ModelView], pairs: &[PairPointmaps]) -> Pointmaps {
+    Pointmaps { views: views.to_vec(), pairs: pairs.to_vec(), ..Pointmaps::default() }
+}
+
+/// Cameras for all views.
+fn aligned(views: &[ModelView], pairs: &[PairPointmaps], matches: &[PairMatches]) -> Geometry {
+    let found = align(said(views, pairs), matches.to_vec(), 0, &Silent).unwrap();
+    assert!(found.left_out.is_empty());
+    found.geometry
+}
+
 fn errors(g: &Geometry, truth: &Truth) -> PoseErrors {
     pose_errors(&g.cameras, &truth.cameras, truth.mean_depth)
 }
@@ -125,7 +140,7 @@ fn noisy_pointmaps_place_cameras_and_depth() {
     let (case, truth) = case();
     let (pairs, matches) = case.input(FAULTS);
     let start = std::time::Instant::now();
-    let g = align(&case.views, &pairs, &matches, 0, &Silent).unwrap();
+    let g = aligned(&case.views, &pairs, &matches);
     let e = errors(&g, &truth);
     println!(
         "rotation {:.3?}° centre {:.3?} focal {:.4} ± {:.4}, {} points, {:.1} s",
@@ -176,14 +191,14 @@ fn order_of_views_and_scale_of_a_pair_do_not_matter() {
     // Three views keep the three solutions short.
     case.views.truncate(3);
     let (pairs, matches) = case.input(FAULTS);
-    let base = align(&case.views, &pairs, &matches, 0, &Silent).unwrap();
+    let base = aligned(&case.views, &pairs, &matches);
     let mut scaled = pairs.clone();
     // A power of two, so that f32 storage itself changes nothing.
     let pair = &mut scaled[1];
     for m in [&mut pair.x11, &mut pair.x21] {
         m.points.iter_mut().flatten().for_each(|v| *v *= 4.0);
     }
-    let g = align(&case.views, &scaled, &matches, 0, &Silent).unwrap();
+    let g = aligned(&case.views, &scaled, &matches);
     assert!(difference(&base.cameras, &g.cameras) < 1e-6, "{}", difference(&base.cameras, &g.cameras));
     // View k becomes view order[k].
     let order = [2usize, 0, 1];
@@ -195,7 +210,7 @@ fn order_of_views_and_scale_of_a_pair_do_not_matter() {
         .iter()
         .map(|p| PairPointmaps { first: order[p.first], second: order[p.second], ..p.clone() })
         .collect();
-    let g = align(&views, &renamed, &matches, 0, &Silent).unwrap();
+    let g = aligned(&views, &renamed, &matches);
     let back: Vec<Camera> = order.iter().map(|k| g.cameras[*k].clone()).collect();
     let d = difference(&base.cameras, &back);
     println!("permuted: {d:e}");
@@ -206,7 +221,7 @@ fn order_of_views_and_scale_of_a_pair_do_not_matter() {
 fn matches_are_found_from_the_points_themselves() {
     let (case, _) = case();
     let mut rng = Random::new(3);
-    let exact = Faults { depth: 0.0, pixels: 0.0, outliers: 0.0 };
+    let exact = Faults { depth: 0.0, pixels: 0.0, outliers: 0.0, scale: 0.7 };
     let (pair, _) = case.pair(0, 1, exact, &mut rng);
     let found = matches::of_pair(&case.views[0], &case.views[1], &pair);
     assert!(found.matches.len() > 400, "{}", found.matches.len());
@@ -231,20 +246,20 @@ fn views_without_geometry_are_refused_by_name() {
     let keep = [0usize, 5];
     let (p, m) =
         keep.iter().map(|k| (pairs[*k].clone(), matches[*k].clone())).unzip::<_, _, Vec<_>, Vec<_>>();
-    let error = align(&case.views, &p, &m, 0, &Silent).unwrap_err();
+    let error = align(said(&case.views, &p), m, 0, &Silent).unwrap_err();
     assert!(error.exit_code() == 2 && error.to_string().contains("train_00–train_02"), "{error}");
     // Identical photos: every map in the same frame.
     let mut rng = Random::new(5);
     let twin =
         Case { cameras: vec![case.cameras[0].clone(); 2], depths: vec![case.depths[0].clone(); 2], ..case };
     let (p, m) = twin.pair(0, 1, FAULTS, &mut rng);
-    let error = align(&twin.views[..2], &[p], &[m], 0, &Silent).unwrap_err();
+    let error = align(said(&twin.views[..2], &[p]), vec![m], 0, &Silent).unwrap_err();
     assert!(error.exit_code() == 2 && error.to_string().contains("no parallax"), "{error}");
     // A map of the wrong size.
     let (mut p, m) = twin.pair(0, 1, FAULTS, &mut rng);
     p.x21.points.pop();
     assert!(
-        align(&twin.views[..2], &[p], &[m], 0, &Silent)
+        align(said(&twin.views[..2], &[p]), vec![m], 0, &Silent)
             .unwrap_err()
             .to_string()
             .contains("wrong model output")

@@ -54,6 +54,17 @@ pub(super) fn place(n: usize, edges: &[Edge]) -> Result<Placement, Vec<usize>> {
     Ok(out)
 }
 
+/// The views that the most pairs hold together, ascending; of equals the one with the first view.
+pub(super) fn largest_component(views: usize, pairs: &[[usize; 2]]) -> Vec<usize> {
+    let mut label: Vec<usize> = (0..views).collect();
+    for [a, b] in pairs {
+        let (keep, gone) = (label[*a].min(label[*b]), label[*a].max(label[*b]));
+        label.iter_mut().filter(|l| **l == gone).for_each(|l| *l = keep);
+    }
+    let of = |l: usize| (0..views).filter(|v| label[*v] == l).collect::<Vec<_>>();
+    (0..views).map(of).rev().max_by_key(Vec::len).unwrap_or_default()
+}
+
 /// Weight of an edge with residual length r in an L1 sense; the floor keeps exact edges finite.
 fn l1(weight: f64, r: f64) -> f64 {
     weight / r.max(1e-4)
@@ -197,5 +208,13 @@ mod tests {
             assert!((p.kappa[v] - (kappa[v] - kappa[0])).abs() < 1e-9);
         }
         assert_eq!(place(5, &edges[..1]).unwrap_err(), [2, 3, 4]);
+    }
+
+    #[test]
+    fn the_largest_component_is_found_whatever_the_order_of_the_pairs() {
+        assert_eq!(largest_component(6, &[[5, 2], [0, 1], [4, 5], [4, 2]]), [2, 4, 5]);
+        assert_eq!(largest_component(4, &[[3, 2], [1, 0]]), [0, 1]);
+        assert_eq!(largest_component(3, &[]), [0]);
+        assert_eq!(largest_component(3, &[[2, 1], [0, 2]]), [0, 1, 2]);
     }
 }

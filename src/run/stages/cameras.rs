@@ -5,7 +5,7 @@ use crate::infer::installed::Installed;
 use crate::infer::pairs;
 use crate::photo::Photo;
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
-use crate::pose::choose::LeftOut;
+use crate::pose::choose::{LeftOut, Reason};
 use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, SparseModel, pointmap, upright};
 use crate::scene::{Camera, Up};
@@ -102,16 +102,9 @@ impl Stage for Cameras {
         let (progress, photos) = (context.progress, self.photos);
         let known = match &self.source {
             CameraOrigin::Network(model) => {
-                let (views, maps) = pairs::pointmaps(model, &photos, progress)?;
-                match pointmap::reconstruct(&views, &maps, self.seed, progress) {
-                    Ok(geometry) => {
-                        let method = format!("{} pointmaps", model.name);
-                        return Ok(PlacedPhotos {
-                            photos,
-                            left_out: Vec::new(),
-                            known: KnownGeometry::Complete(Geometry { method, ..geometry }),
-                        });
-                    }
+                let maps = pairs::pointmaps(model, &photos, progress)?;
+                match pointmap::reconstruct(maps, self.seed, progress) {
+                    Ok(found) => return Ok(of_network(&model.name, photos, found)),
                     Err(Error::Cancelled) => return Err(Error::Cancelled),
                     Err(error) if model.untrained() => progress.warn(&format!(
                         "{}: no geometry in untrained pointmaps ({error}); cameras from sfm",
@@ -132,6 +125,22 @@ impl Stage for Cameras {
             pose::place(photos, known, context.registry, self.seed, progress)?;
         Ok(PlacedPhotos { photos, left_out, known: KnownGeometry::Sparse(model, method) })
     }
+}
+
+/// The photos that a network's geometry places.
+fn of_network(model: &str, photos: Vec<Photo>, found: pointmap::Reconstruction) -> PlacedPhotos {
+    let mut left_out = Vec::new();
+    let mut kept = Vec::new();
+    for (view, photo) in photos.into_iter().enumerate() {
+        if found.left_out.contains(&view) {
+            left_out.push(LeftOut { photo: photo.stem, reason: Reason::NoOverlap });
+        } else {
+            kept.push(photo);
+        }
+    }
+    let method = format!("{model} {}", found.geometry.method);
+    let known = KnownGeometry::Complete(Geometry { method, ..found.geometry });
+    PlacedPhotos { photos: kept, left_out, known }
 }
 
 /// Depth maps and points by stereo, where no network has given them.

@@ -21,7 +21,8 @@ fn started(views: usize) -> Adjustment {
         .collect();
     assert_eq!(edges.len(), pairs.len());
     let start = tree::place(views, &edges).unwrap();
-    let mut a = Adjustment::new(&case.views, &canonical, &focals, &start, &pairs, &matches);
+    let mut a =
+        Adjustment::new(Problem::new(&case.views, &canonical, &focals, &pairs, &matches), &start, &focals);
     let mut rng = Random::new(31);
     a.state.grid.iter_mut().flatten().for_each(|v| *v = 0.01 * rng.normal());
     a.state.log_focals.iter_mut().for_each(|f| *f += 0.01);
@@ -187,7 +188,7 @@ fn solved(views: &[ModelView], pairs: &[PairPointmaps], matches: &[PairMatches])
         .filter_map(|(p, m)| pairs::edge(views, p, &m.matches, &canonical, &focals, 0))
         .collect();
     let start = tree::place(views.len(), &edges).unwrap();
-    let mut a = Adjustment::new(views, &canonical, &focals, &start, pairs, matches);
+    let mut a = Adjustment::new(Problem::new(views, &canonical, &focals, pairs, matches), &start, &focals);
     a.solve(&Silent).unwrap();
     a
 }
