@@ -377,7 +377,7 @@ fn a_known_length_gives_the_scene_its_scale() {
         measure
     };
     let json = |arguments: &[&str]| -> serde_json::Value {
-        let output = measure(arguments).arg("--json").output().unwrap();
+        let output = measure(&[&["--json"], arguments].concat()).output().unwrap();
         assert!(output.status.success(), "{}", text(&output.stderr));
         serde_json::from_slice(&output.stdout).unwrap()
     };
@@ -409,6 +409,8 @@ fn a_known_length_gives_the_scene_its_scale() {
     // The direction up and all else that the manifest says stays.
     let loaded = scene_dir::load(&scene).unwrap();
     assert!(loaded.world.up.is_some() && loaded.splats == splats && loaded.cameras.len() == 1);
+    let behind = json(&["--", "-0.3,0,1 - 0,0,1"]);
+    assert!((behind["lengths"][0]["units"].as_f64().unwrap() - 0.3).abs() < 1e-12);
     refuses(&mut measure(&[]), 2, &["give a length"]);
     refuses(&mut measure(&["--scale", length]), 2, &["METRES"]);
     refuses(&mut measure(&["0,0,1 to 1,0,1"]), 2, &["A - B"]);
