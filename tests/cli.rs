@@ -288,7 +288,8 @@ fn a_full_disk_leaves_nothing() {
 #[test]
 fn the_scene_of_a_run_is_whole_and_can_be_replaced() {
     let scene = scene();
-    let expected = ["cameras", "point_cloud.ply", "previews", "report.html", "run.json", "scene.json"];
+    let expected =
+        ["cameras", "point_cloud.ply", "previews", "report.html", "run.json", "scene.json", "seen.npy"];
     assert_eq!(names(scene), expected);
     let run: serde_json::Value =
         serde_json::from_slice(&std::fs::read(scene.join("run.json")).unwrap()).unwrap();
