@@ -33,7 +33,10 @@ impl BestPairs {
         self.pairs.retain(|_| keep.next().unwrap_or(true));
     }
 
-    pub(crate) fn finish(self) -> Vec<PairPointmaps> {
+    pub(crate) fn finish(mut self) -> Vec<PairPointmaps> {
+        let scores: Vec<_> = self.pairs.iter().map(|(s, p)| ([p.first, p.second], *s)).collect();
+        let mut keep = enough(self.sizes.len(), &scores).into_iter();
+        self.pairs.retain(|_| keep.next().unwrap_or(true));
         self.pairs.into_iter().map(|p| p.1).collect()
     }
 }
@@ -41,17 +44,51 @@ impl BestPairs {
 /// Which pairs are among the best three of one of their views, or in the maximum spanning forest, which keeps together what
 /// holds together. A pair that fails this among some pairs fails it among more, so pairs may come one after another.
 fn best(views: usize, pairs: &[([usize; 2], f64)]) -> Vec<bool> {
-    let mut order: Vec<usize> = (0..pairs.len()).collect();
-    order.sort_by(|a, b| pairs[*b].1.total_cmp(&pairs[*a].1).then(pairs[*a].0.cmp(&pairs[*b].0)));
-    let (mut partners, mut tree) = (vec![0; views], (0..views).collect::<Vec<usize>>());
-    let mut keep = vec![false; pairs.len()];
+    let order = best_first(pairs);
+    let mut keep = forest(views, pairs, &order);
+    let mut partners = vec![0; views];
     for k in order {
         let [a, b] = pairs[k].0;
-        let (joined, gone) = (tree[a], tree[b]);
-        keep[k] = partners[a] < PARTNERS || partners[b] < PARTNERS || joined != gone;
-        tree.iter_mut().filter(|t| **t == gone).for_each(|t| *t = joined);
+        keep[k] |= partners[a] < PARTNERS || partners[b] < PARTNERS;
         partners[a] += 1;
         partners[b] += 1;
+    }
+    keep
+}
+
+/// Of the best pairs those without which a view would have fewer than three, or views would fall apart: a view that many others
+/// count among their best would have many more.
+fn enough(views: usize, pairs: &[([usize; 2], f64)]) -> Vec<bool> {
+    let mut keep = vec![true; pairs.len()];
+    let mut partners = vec![0; views];
+    pairs.iter().flat_map(|p| p.0).for_each(|v| partners[v] += 1);
+    let order = best_first(pairs);
+    let tree = forest(views, pairs, &order);
+    for k in order.into_iter().rev() {
+        let [a, b] = pairs[k].0;
+        if partners[a] > PARTNERS && partners[b] > PARTNERS && !tree[k] {
+            keep[k] = false;
+            partners[a] -= 1;
+            partners[b] -= 1;
+        }
+    }
+    keep
+}
+
+fn best_first(pairs: &[([usize; 2], f64)]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..pairs.len()).collect();
+    order.sort_by(|a, b| pairs[*b].1.total_cmp(&pairs[*a].1).then(pairs[*a].0.cmp(&pairs[*b].0)));
+    order
+}
+
+/// Which pairs are in the maximum spanning forest; `order` is best first.
+fn forest(views: usize, pairs: &[([usize; 2], f64)], order: &[usize]) -> Vec<bool> {
+    let mut tree: Vec<usize> = (0..views).collect();
+    let mut keep = vec![false; pairs.len()];
+    for &k in order {
+        let (joined, gone) = (tree[pairs[k].0[0]], tree[pairs[k].0[1]]);
+        keep[k] = joined != gone;
+        tree.iter_mut().filter(|t| **t == gone).for_each(|t| *t = joined);
     }
     keep
 }
@@ -131,6 +168,14 @@ mod tests {
             some.retain(|_| keep.next().unwrap());
         }
         assert_eq!(some, kept);
+        // In the end each view has three partners still, and no pair can go without that it would have fewer.
+        let left = enough(10, &kept);
+        let left: Vec<_> = kept.iter().zip(&left).filter(|p| *p.1).map(|p| p.0.0).collect();
+        let partners = |v: usize| left.iter().filter(|p| p.contains(&v)).count();
+        assert!((0..10).all(|v| partners(v) >= 3), "{left:?}");
+        assert!(left.iter().any(|[i, j]| (*i < 5) != (*j < 5)) && left.len() < kept.len(), "{left:?}");
+        let spare = left.iter().filter(|[i, j]| partners(*i) > 3 && partners(*j) > 3).count();
+        assert!(spare <= 9, "only the nine of the spanning tree may be spare: {spare}");
         assert_eq!(best(4, &[([0, 1], 0.0), ([0, 2], 0.0), ([0, 3], 0.0), ([1, 2], 0.0)]), [true; 4]);
     }
 
