@@ -13,7 +13,8 @@ use crate::progress::Progress;
 use crate::scene::{Descriptors, PairPointmaps, Pointmap, Pointmaps};
 use crate::{Error, Result};
 
-/// Pointmaps of pairs of photos, for [`crate::pose::pointmap::reconstruct`]: all pairs of up to four, the [`BestPairs`] of more.
+/// Pointmaps of pairs of photos, for [`crate::pose::pointmap::reconstruct`]: all pairs of up to four; of more, those that show most
+/// in common.
 pub fn pointmaps(model: &Installed, photos: &[Photo], progress: &dyn Progress) -> Result<Pointmaps> {
     if let Ok(graph) = model.graph(Part::MultiView) {
         let _turn = graph.compute.turn();
