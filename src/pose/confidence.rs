@@ -41,7 +41,7 @@ impl Fitted {
     /// What the stated deviations and the agreement of the matches come to.
     pub fn confidence(&self) -> Confidence {
         let rotation = self.rotation_sigma.to_degrees();
-        if self.agreement < DOUBTFUL || rotation > DOUBTFUL_ROTATION {
+        if self.agreement < DOUBTFUL || self.unconfirmed || rotation > DOUBTFUL_ROTATION {
             Confidence::Low
         } else if self.agreement < AGREED || rotation > UNSURE_ROTATION || self.sigmas[0] > UNSURE_FOCAL {
             Confidence::Medium
@@ -64,6 +64,7 @@ mod tests {
         assert_eq!(level(Fitted { rotation_sigma: 0.01, ..good }), Confidence::Medium);
         assert_eq!(level(Fitted { rotation_sigma: 0.04, ..good }), Confidence::Low);
         assert_eq!(level(Fitted { agreement: 0.8, ..good }), Confidence::Low);
+        assert_eq!(level(Fitted { unconfirmed: true, ..good }), Confidence::Low);
         assert!(Confidence::Low < Confidence::Medium && Confidence::Medium < Confidence::High);
     }
 }

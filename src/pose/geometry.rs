@@ -43,6 +43,9 @@ pub struct Fitted {
     pub residual: f64,
     /// Share of its matches that agree with the cameras, of those on which its pairs with other photos agree by themselves.
     pub agreement: f64,
+    /// Whether one pair of photos, whose matches are few or mostly contradict each other, is all that its place rests on.
+    #[serde(default)]
+    pub unconfirmed: bool,
     /// One standard deviation of the direction in which its camera looks, against that of the first photo, radians.
     pub rotation_sigma: f64,
     /// Photos of one number were explained with the same optics.

@@ -58,9 +58,20 @@ pub fn place(
 
 /// Says what the photos leave open of the focal length and of the angles between the cameras.
 fn warn_of_doubt(photos: &[Photo], model: &SparseModel, progress: &dyn Progress) {
+    let named = |test: &dyn Fn(&super::Fitted) -> bool| {
+        let all = photos.iter().zip(&model.fitted).filter(|(_, f)| test(f));
+        all.map(|(p, _)| p.stem.as_str()).collect::<Vec<_>>().join(", ")
+    };
+    let unconfirmed = named(&|f| f.unconfirmed);
+    if !unconfirmed.is_empty() {
+        progress.warn(&format!(
+            "the cameras of {unconfirmed} may be wrong: they rest on one pair of photos, whose matches are few or mostly \
+             contradict each other; photos from between would settle it"
+        ));
+    }
     let rotation = |f: &super::Fitted| f.rotation_sigma.to_degrees();
-    let doubtful = || photos.iter().zip(&model.fitted).filter(|(_, f)| rotation(f) > DOUBTFUL_ROTATION);
-    let worst = doubtful().map(|(_, f)| rotation(f)).fold(0.0, f64::max);
+    let doubtful = |f: &super::Fitted| rotation(f) > DOUBTFUL_ROTATION;
+    let worst = model.fitted.iter().filter(|f| doubtful(f)).map(rotation).fold(0.0, f64::max);
     if let Some(sigma) = model.focal_log_sigma.filter(|s| *s > UNSURE_FOCAL) {
         let angles = match worst > 0.0 {
             true => format!(", and with it the angles between the cameras by up to ±{worst:.0}°"),
@@ -72,10 +83,9 @@ fn warn_of_doubt(photos: &[Photo], model: &SparseModel, progress: &dyn Progress)
             100.0 * sigma
         ));
     } else if worst > 0.0 {
-        let names: Vec<&str> = doubtful().map(|(p, _)| p.stem.as_str()).collect();
         progress.warn(&format!(
             "the photos leave the direction of {} open by up to ±{worst:.0}°: photos from between would settle it",
-            names.join(", ")
+            named(&doubtful)
         ));
     }
 }

@@ -15,6 +15,7 @@ mod overlap;
 pub mod pointmap;
 pub mod relative;
 mod resect;
+mod segments;
 pub mod sfm;
 mod sift;
 pub mod stereo;
@@ -22,6 +23,7 @@ pub mod stereo;
 mod testing;
 mod two_view;
 pub mod upright;
+mod vanishing;
 
 pub use confidence::Confidence;
 pub use geometry::{Fitted, Geometry, SparseModel, SparsePoint};

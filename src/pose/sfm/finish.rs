@@ -2,9 +2,10 @@
 use super::families::MARGIN;
 use super::model::{Model, Sighting, Track};
 use super::optics::learn_optics;
+use super::pair::{self, Matches, Pair};
 use super::patch::Shades;
 use super::refine;
-use super::relate::{Matches, Pair, THRESHOLD};
+use super::relate::THRESHOLD;
 use super::tracks::{self, KeypointMatch};
 use crate::photo::{Photo, Straightening};
 use crate::pose::bundle::Adjusted;
@@ -78,8 +79,8 @@ pub(super) fn finish(
         outcome = learn_optics(&mut model)?;
     }
     model.normalise();
-    let agreement = agreement(&model, &evidence.pairs, threshold);
-    sparse_model(photos, &model, outcome, &agreement)
+    let trust = trust(&model, &evidence.pairs, threshold);
+    sparse_model(photos, &model, outcome, &trust)
 }
 
 /// Pixels of the working image within which the neighbours of a point lie on one plane with it.
@@ -175,6 +176,23 @@ pub(super) fn agreement(model: &Model, pairs: &[Pair], threshold: f64) -> Vec<f6
     shares.into_iter().flatten().collect()
 }
 
+/// What speaks for the places of the cameras, per view.
+struct Trust {
+    agreement: Vec<f64>,
+    unconfirmed: Vec<bool>,
+}
+
+fn trust(model: &Model, pairs: &[Pair], threshold: f64) -> Trust {
+    let agrees = |p: &Pair| {
+        inliers_of(model, &p.matches, threshold).len() as f64 >= AGREED * p.matches.list.len() as f64
+    };
+    let agrees: Vec<bool> = pairs.par_iter().map(agrees).collect();
+    Trust {
+        agreement: agreement(model, pairs, threshold),
+        unconfirmed: pair::unconfirmed(model.poses.len(), pairs, &agrees),
+    }
+}
+
 /// New tracks from all matches that agree with the cameras.
 fn rematch(model: &mut Model, evidence: &Evidence, threshold: f64) {
     let mut links = inlier_matches(model, &evidence.putative, threshold);
@@ -216,12 +234,7 @@ fn on_straight(model: &mut Model, step: impl FnOnce(&mut Model)) {
     }
 }
 
-fn sparse_model(
-    photos: &[Photo],
-    model: &Model,
-    outcome: Adjusted,
-    agreement: &[f64],
-) -> Result<SparseModel> {
+fn sparse_model(photos: &[Photo], model: &Model, outcome: Adjusted, trust: &Trust) -> Result<SparseModel> {
     let cameras = cameras_of(photos, model)?;
     let point = |t: &Track| {
         let views: Vec<(usize, DVec2)> = t
@@ -239,7 +252,8 @@ fn sparse_model(
         lens: model.lens(v),
         sigmas: outcome.sigmas[model.group[v]],
         residual: model.residual(v),
-        agreement: agreement[v],
+        agreement: trust.agreement[v],
+        unconfirmed: trust.unconfirmed[v],
         rotation_sigma: if v == 0 { others } else { outcome.rotation_sigmas[v] },
         camera: model.group[v],
     };

@@ -1,7 +1,7 @@
 //! From verified pairs to a reconstruction: the pair with most matches at good parallax first, the other views by
 //! resection, an adjustment after each.
 use super::model::{Model, Track};
-use super::relate::Pair;
+use super::pair::Pair;
 use super::tracks::Sightings;
 use crate::pose::resect::resect;
 use crate::scene::Pose;

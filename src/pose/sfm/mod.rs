@@ -5,6 +5,7 @@ mod grow;
 mod known;
 mod model;
 mod optics;
+mod pair;
 mod patch;
 mod refine;
 mod relate;
@@ -15,6 +16,7 @@ use super::SparseModel;
 use super::bundle::{Optics, OpticsPrior};
 use super::choose::Reason;
 use super::matching::Keypoints;
+use super::vanishing::{self, LogFocal};
 use crate::photo::Photo;
 use crate::progress::Progress;
 use crate::scene::Lens;
@@ -25,7 +27,8 @@ use glam::DVec2;
 use grow::grow;
 pub use known::with_cameras;
 use model::{Freedom, Model, Sighting};
-use relate::{MIN_INLIERS, Pair, Related, THRESHOLD};
+use pair::Pair;
+use relate::{MIN_INLIERS, Related, THRESHOLD};
 use tracks::KeypointMatch;
 pub use unplaced::Unplaced;
 
@@ -108,14 +111,19 @@ fn empty_model(photos: &[Photo], seed: u64) -> Model {
         .iter()
         .enumerate()
         .map(|(g, &v)| {
+            let members = || photos.iter().zip(&group).filter(|m| *m.1 == g).map(|m| m.0);
             let log_focal = match photos[v].original_focal() {
                 Some(f) => (f.ln(), EXIF_SIGMA),
-                None => ((FOCAL_GUESS * long(v) as f64).ln(), FOCAL_SIGMA),
+                None => {
+                    let guess = LogFocal { mean: FOCAL_GUESS.ln(), sigma: FOCAL_SIGMA };
+                    let LogFocal { mean, sigma } =
+                        vanishing::log_focal(members().map(|p| &p.image), guess).unwrap_or(guess);
+                    (mean + (long(v) as f64).ln(), sigma)
+                }
             };
             let short = photos[v].original_size.0.min(photos[v].original_size.1);
             let corner = 0.5 * f64::hypot(long(v) as f64, short as f64) / log_focal.0.exp();
             // Upright photos of a camera that was turned hold its principal point in other places.
-            let members = || photos.iter().zip(&group).filter(|m| *m.1 == g).map(|m| m.0);
             let one_way = members().all(|p| p.original_size == photos[v].original_size);
             OpticsPrior {
                 log_focal,

@@ -1,12 +1,13 @@
 //! What pairs of photos have in common: matches by descriptors, and the geometry on which they agree.
 use super::families::{Family, affine_family};
 use super::model::Model;
+use super::pair::{Matches, Pair, is_sure, parts};
 use super::tracks::KeypointMatch;
 use super::unplaced::Unplaced;
 use crate::photo::Photo;
 use crate::pose::choose::Reason;
 use crate::pose::matching::{self, Match};
-use crate::pose::two_view::{self, TwoView};
+use crate::pose::two_view;
 use crate::progress::Progress;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
@@ -15,21 +16,6 @@ use rayon::prelude::*;
 
 /// Agreement threshold as a fraction of the long side: 3 px at 640, three times the noise of learned keypoints.
 pub(super) const THRESHOLD: f64 = 3.0 / 640.0;
-
-/// Matches between two views.
-pub(super) struct Matches {
-    pub(super) first: usize,
-    pub(super) second: usize,
-    /// (pixel, pixel, link), best first.
-    pub(super) list: Vec<(DVec2, DVec2, KeypointMatch)>,
-}
-
-/// Two views whose matches agree on a geometry.
-pub(super) struct Pair {
-    /// Those that agree.
-    pub(super) matches: Matches,
-    pub(super) geometry: TwoView,
-}
 
 /// Fewest verified matches of a usable pair: five are fitted by anything, 20 agree by chance in few cases.
 pub(super) const MIN_INLIERS: usize = 20;
@@ -46,10 +32,8 @@ enum Relation {
 }
 
 impl Relation {
-    /// Whether so many matches of all leave no doubt.
-    fn is_sure(&self, all: usize) -> bool {
-        let agree = |pair: &Pair| pair.matches.list.len();
-        matches!(self, Relation::Usable(p) if agree(p) >= SURE.0 && agree(p) as f64 >= SURE.1 * all as f64)
+    fn is_sure(&self) -> bool {
+        matches!(self, Relation::Usable(pair) if pair.sure)
     }
 }
 
@@ -91,7 +75,7 @@ pub(super) fn related(
         let wide = Matches { first, second, list: distinct(self::putative(families, first, second)) };
         let relation = one(&wide);
         // So many more corners also agree by chance more often, as those of a mirrored photo.
-        if relation.is_sure(wide.list.len()) {
+        if relation.is_sure() {
             (putative[k], relations[k]) = (wide, relation);
         }
     }
@@ -109,7 +93,7 @@ pub(super) fn related(
 /// Pairs between parts of the photos that sure pairs connect, as far as more corners may make them sure.
 fn unsure_pairs(photos: usize, putative: &[Matches], relations: &[Relation]) -> Vec<usize> {
     let pairs = || putative.iter().zip(relations);
-    let sure = pairs().filter(|(p, r)| r.is_sure(p.list.len())).map(|(p, _)| (p.first, p.second));
+    let sure = pairs().filter(|(_, r)| r.is_sure()).map(|(p, _)| (p.first, p.second));
     let part = parts(photos, sure);
     let between = pairs().enumerate().filter(|(_, (p, r))| {
         part[p.first] != part[p.second] && !matches!(r, Relation::Same | Relation::NoParallax)
@@ -158,20 +142,6 @@ fn distinct(matches: Vec<(DVec2, DVec2, KeypointMatch)>) -> Vec<(DVec2, DVec2, K
     matches.into_iter().filter(|m| taken.insert((cell(m.0), cell(m.1)))).collect()
 }
 
-/// Agreeing matches, and their share of all, from which on a pair is taken for sure: on the tuning sets wrong geometries of
-/// two photos have up to 200 matches, but less than half of all.
-const SURE: (usize, f64) = (100, 0.5);
-
-/// Per photo the part that links connect it to, by the first photo of that part.
-fn parts(n: usize, linked: impl Iterator<Item = (usize, usize)>) -> Vec<usize> {
-    let mut part: Vec<usize> = (0..n).collect();
-    for (i, j) in linked {
-        let (a, b) = (part[i].min(part[j]), part[i].max(part[j]));
-        part.iter_mut().filter(|p| **p == b).for_each(|p| *p = a);
-    }
-    part
-}
-
 fn relate(photos: &[Photo], pair: &Matches, empty: &Model) -> Relation {
     let (i, j, all) = (pair.first, pair.second, &pair.list);
     if same_picture(&photos[i].image, &photos[j].image) {
@@ -195,7 +165,8 @@ fn relate(photos: &[Photo], pair: &Matches, empty: &Model) -> Relation {
         return Relation::NoParallax;
     }
     let list = found.inliers.iter().map(|k| all[*k]).collect();
-    Relation::Usable(Pair { matches: Matches { first: i, second: j, list }, geometry: found })
+    let sure = is_sure(found.inliers.len(), all.len());
+    Relation::Usable(Pair { matches: Matches { first: i, second: j, list }, geometry: found, sure })
 }
 
 /// True when two photos differ by less than re-compression does.

@@ -1,17 +1,11 @@
 //! Which way is up in a scene (docs/method.md#upright).
 mod clues;
 mod planes;
-mod segments;
 
+use super::segments::{self, END_SIGMA};
 use crate::scene::{Camera, PointCloud, RgbImage, Up, UpEvidence};
 use clues::{Agreement, Clues, EdgePlane, Refined};
 use glam::DVec3;
-
-/// Longest side of the pictures in which edges are looked for, pixels: more would only show shorter ones.
-const EDGE_SIZE: usize = 800;
-
-/// Standard deviation of the ends of an edge, pixels.
-const END_SIGMA: f64 = 0.7;
 
 /// Least agreement of a direction that counts as known: two fifths of what edges, surface and roll make together (2.5). The
 /// tuning sets have 1.4 and more, but for `room_a` with 0.85, 3° off, and four photos of a tree trunk with 1.2, 7° off.
@@ -55,12 +49,8 @@ fn decide(found: &[(Refined, Agreement)]) -> Option<Up> {
 fn clues(images: &[&RgbImage], cameras: &[Camera], points: &PointCloud, gravity: &[Option<DVec3>]) -> Clues {
     let mut clues = Clues::default();
     for (image, camera) in images.iter().zip(cameras) {
-        let (w, h) = (image.width, image.height);
-        let scale = (EDGE_SIZE as f64 / w.max(h) as f64).min(1.0);
-        let size = |s: usize| ((s as f64 * scale).round() as usize).max(1);
-        let small = image.resized_by_area(size(w), size(h));
-        let camera = camera.resized(small.width as u32, small.height as u32);
-        let found = segments::segments(&small.luma());
+        let segments::Found { segments: found, width, height } = segments::of(image);
+        let camera = camera.resized(width as u32, height as u32);
         let total: f64 = found.iter().map(|s| s.length()).sum();
         clues.edges.extend(found.iter().map(|s| EdgePlane {
             normal: camera.pose.rotation.transpose()

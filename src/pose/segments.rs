@@ -1,7 +1,13 @@
 //! Straight edges of a picture: neighbouring pixels whose gradients point the same way, as in LSD (Grompone von Gioi et al.
 //! 2010), with a bound on their width instead of its statistical test.
-use crate::scene::Plane;
+use crate::scene::{Plane, RgbImage};
 use glam::{DVec2, IVec2};
+
+/// Longest side of the pictures in which edges are looked for, pixels: more would only show shorter ones.
+const SIZE: usize = 800;
+
+/// Standard deviation of the ends of an edge, pixels.
+pub(super) const END_SIGMA: f64 = 0.7;
 
 /// A straight edge, pixel positions of its ends.
 #[derive(Clone, Copy, Debug)]
@@ -32,8 +38,23 @@ const MAX_SPREAD: f64 = 1.5;
 /// Least share of the length that pixels of the edge cover: scattered pixels are texture.
 const MIN_COVER: f64 = 0.8;
 
+/// Edges of a photo, in pixels of the reduced picture in which they were found.
+pub(super) struct Found {
+    pub segments: Vec<Segment>,
+    pub width: usize,
+    pub height: usize,
+}
+
+/// The edges of a photo.
+pub(super) fn of(image: &RgbImage) -> Found {
+    let scale = (SIZE as f64 / image.width.max(image.height) as f64).min(1.0);
+    let size = |s: usize| ((s as f64 * scale).round() as usize).max(1);
+    let small = image.resized_by_area(size(image.width), size(image.height));
+    Found { segments: segments(&small.luma()), width: small.width, height: small.height }
+}
+
 /// The edges of a picture in the order of their strongest pixel.
-pub(super) fn segments(luma: &Plane<f32>) -> Vec<Segment> {
+fn segments(luma: &Plane<f32>) -> Vec<Segment> {
     let (w, h) = (luma.width, luma.height);
     if w < 8 || h < 8 {
         return Vec::new();
