@@ -11,6 +11,7 @@ mod read;
 mod resize;
 mod sizes;
 mod straighten;
+mod superpixels;
 mod support;
 mod video;
 
@@ -26,6 +27,7 @@ pub use read::{
 pub use resize::Kernel;
 pub use sizes::sizes_of;
 pub use straighten::Straightening;
+pub use superpixels::superpixels;
 pub use support::Support;
 
 use crate::progress::Progress;

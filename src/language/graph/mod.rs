@@ -4,7 +4,6 @@ mod levels;
 mod options;
 mod pixels;
 mod plane;
-mod superpixels;
 mod tree;
 
 #[cfg(test)]
@@ -48,7 +47,7 @@ fn merge_tree<'a>(
         colour + edges.map_or(0.0, |e| 10.0 * e.data[p].max(e.data[q]))
     };
     let min_size = (options.min_superpixel * linear * linear).max(4.0) as u32;
-    let (labels, count) = superpixels::superpixels(width, height, options.scale * linear, min_size, weight);
+    let (labels, count) = crate::photo::superpixels(width, height, options.scale * linear, min_size, weight);
     let gradient = pixels::gradient(&lab, width, height);
     let cues =
         Cues { labels, count, lab, gradient, edges, depth: depth.map(|d| d.1), camera: depth.map(|d| d.0) };

@@ -21,7 +21,7 @@ const OWN: f32 = 0.1;
 /// Path cost of a pixel where the carried plane would block another view.
 const BLOCKING: f32 = 0.3;
 /// RGB distance (Euclidean) up to which two views show the same point: gloss and exposure change this much.
-const COLOUR_TOLERANCE: f32 = 0.2;
+pub const COLOUR_TOLERANCE: f32 = 0.2;
 /// Factor on a pixel's path cost where another view confirms the carried plane.
 const CONFIRMED: f32 = 0.3;
 /// Highest confidence of a filled pixel, below every matched one.

@@ -5,9 +5,11 @@ mod fill;
 mod fuse;
 mod options;
 mod planes;
+mod regions;
 mod surface;
 #[cfg(test)]
 mod tests;
+mod texture;
 mod views;
 mod void;
 
@@ -103,12 +105,14 @@ pub fn finish(
     options: &StereoOptions,
 ) -> (Vec<DepthMap>, PointCloud) {
     let void = void::white_border(level);
+    let weak = texture::weak(level);
     let links = surface::RelativePoses::new(level);
-    let consistent = surface::consistent_surface(level, &links, matched, &void);
+    let consistent = surface::consistent_surface(level, &links, matched, &void, &weak);
     let fitted = surface::smoothed(level, &consistent, FIT_RADIUS);
     let large = planes::large_planes(level, &fitted, options.seed);
     let opened = fill::open_rims(level, &fitted, rim_radius(level));
-    let complete = fill::fill(level, &links, &opened, &large, &void);
+    let inferred = regions::fill(level, &links, &opened, &void, &weak, options.seed);
+    let complete = fill::fill(level, &links, &inferred, &large, &void);
     let points = fuse::fuse(level, &links, &complete);
     let depths =
         images.iter().enumerate().map(|(view, image)| depth_map(level, &complete, view, image)).collect();

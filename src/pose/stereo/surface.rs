@@ -93,6 +93,12 @@ impl RelativePoses {
         inside.then_some((u, v, p.z))
     }
 
+    /// A plane `π·X = 1` of frame `a` in frame `b`; without meaning where it passes through the camera of `b`.
+    pub fn plane(&self, a: usize, b: usize, plane: Vec3) -> Vec3 {
+        let (r, t) = self.to[b * self.views + a];
+        (r.transpose() * plane) / (1.0 - plane.dot(t))
+    }
+
     /// Relative depth difference that a point of frame `a` must show before view `b` contradicts it: what moves its
     /// image by [`REPROJECTION_TOLERANCE`], at least [`DEPTH_TOLERANCE`].
     fn tolerance(&self, level: &Level, a: usize, b: usize, point: Vec3) -> f32 {
@@ -164,7 +170,13 @@ pub fn map_pixels<T: Send>(level: &Level, f: impl Fn(usize, usize, usize, usize)
 }
 
 /// Keeps what at least one other view confirms and none that confirmed itself contradicts more often.
-pub fn consistent_surface(level: &Level, links: &RelativePoses, matched: &[Vec4], void: &[bool]) -> Surface {
+pub fn consistent_surface(
+    level: &Level,
+    links: &RelativePoses,
+    matched: &[Vec4],
+    void: &[bool],
+    weak: &[bool],
+) -> Surface {
     let mut surface = Surface {
         planes: matched.iter().map(|p| p.truncate()).collect(),
         confidence: matched
@@ -197,25 +209,27 @@ pub fn consistent_surface(level: &Level, links: &RelativePoses, matched: &[Vec4]
             if agree == 0 || (round > 0 && against >= agree) { 0.0 } else { CONFIDENCE[agree.min(2)] }
         });
     }
-    let mut surface = with_plausible(level, links, &surface, matched, void);
+    let mut surface = with_plausible(level, links, &surface, matched, void, weak);
     remove_speckles(level, &mut surface);
     surface
 }
 
 /// Adds what no view confirms in views with little parallax, where confirmation is hard to get: pixels that match
 /// somewhere, lie on one surface with their surroundings and block no confirmed pixel. Where parallax is ample, a missing
-/// confirmation means occlusion or error, and nothing is added.
+/// confirmation means occlusion or error, and nothing is added; nor where texture is weak, since there the smoothness of the
+/// search makes surroundings agree on anything.
 fn with_plausible(
     level: &Level,
     links: &RelativePoses,
     confirmed: &Surface,
     matched: &[Vec4],
     void: &[bool],
+    weak: &[bool],
 ) -> Surface {
     let confidence = map_pixels(level, |view, x, y, k| {
         let plane = matched[k].truncate();
         let ample = level.tolerance[view] <= DEPTH_TOLERANCE;
-        if confirmed.confidence[k] > 0.0 || ample || void[k] || matched[k].w > PLAUSIBLE_COST {
+        if confirmed.confidence[k] > 0.0 || ample || void[k] || weak[k] || matched[k].w > PLAUSIBLE_COST {
             return confirmed.confidence[k];
         }
         let ray = ray(level, view, x, y);

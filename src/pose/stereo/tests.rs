@@ -8,11 +8,11 @@ use glam::{DMat3, DVec2};
 use std::path::Path;
 
 /// Photos with exact depth.
-struct Set {
-    images: Vec<RgbImage>,
-    cameras: Vec<Camera>,
-    depth: Vec<Plane<f32>>,
-    sparse: Vec<DVec3>,
+pub(super) struct Set {
+    pub(super) images: Vec<RgbImage>,
+    pub(super) cameras: Vec<Camera>,
+    pub(super) depth: Vec<Plane<f32>>,
+    pub(super) sparse: Vec<DVec3>,
 }
 
 /// Smooth noise over the plane, three octaves down to about four pixels: something to match everywhere.
@@ -35,7 +35,7 @@ fn texture(u: f64, v: f64) -> f32 {
 }
 
 /// A slanted square in front of a slanted wall, seen by three cameras about 12° apart.
-fn synthetic(width: u32, height: u32) -> Set {
+pub(super) fn synthetic(width: u32, height: u32) -> Set {
     synthetic_from(width, height, 0.8)
 }
 
@@ -178,7 +178,8 @@ fn two_slanted_planes_are_recovered_and_runs_repeat() {
     let device = test_device();
     let set = synthetic(160, 120);
     let run = || {
-        dense(&device, &set.images, &set.cameras, &set.sparse, &StereoOptions::default(), &Silent).unwrap()
+        dense(&device, &set.images, &set.cameras, &set.sparse, &StereoOptions::default(), &Silent)
+            .unwrap()
     };
     let (depths, points) = run();
     for (found, exact) in depths.iter().zip(&set.depth) {
@@ -212,7 +213,8 @@ fn noisy_photos_with_little_parallax_give_a_surface() {
         }
     }
     let (depths, _) =
-        dense(&device, &set.images, &set.cameras, &set.sparse, &StereoOptions::default(), &Silent).unwrap();
+        dense(&device, &set.images, &set.cameras, &set.sparse, &StereoOptions::default(), &Silent)
+            .unwrap();
     for (view, (found, exact)) in depths.iter().zip(&set.depth).enumerate() {
         let (e, complete) = errors(&found.depth, exact);
         println!("view {view}: median {:.4}, within 10 % {:.3}", e[e.len() / 2], within(&e, 0.1));
@@ -253,7 +255,8 @@ fn photos_of_different_sizes_are_matched() {
     set.cameras[0] = small.cameras[0].clone();
     set.depth[0] = small.depth[0].clone();
     let (depths, _) =
-        dense(&device, &set.images, &set.cameras, &set.sparse, &StereoOptions::default(), &Silent).unwrap();
+        dense(&device, &set.images, &set.cameras, &set.sparse, &StereoOptions::default(), &Silent)
+            .unwrap();
     for (found, exact) in depths.iter().zip(&set.depth) {
         assert_eq!((found.depth.width, found.depth.height), (exact.width, exact.height));
         let (e, _) = errors(&found.depth, exact);
@@ -323,7 +326,8 @@ fn breakfast_depth_at_a_quarter_of_the_resolution() {
     let device = test_device();
     let set = breakfast(4);
     let (depths, points) =
-        dense(&device, &set.images, &set.cameras, &set.sparse, &StereoOptions::default(), &Silent).unwrap();
+        dense(&device, &set.images, &set.cameras, &set.sparse, &StereoOptions::default(), &Silent)
+            .unwrap();
     for (view, (found, exact)) in depths.iter().zip(&set.depth).enumerate() {
         let (e, complete) = errors(&found.depth, exact);
         println!(

@@ -28,7 +28,7 @@ impl Forest {
 /// `scale / size`; regions below `min_size` then join their most similar neighbour. Returns compact labels.
 ///
 /// `weight(p, q)` is the dissimilarity of two neighbouring pixels (8-neighbourhood).
-pub(super) fn superpixels(
+pub fn superpixels(
     width: usize,
     height: usize,
     scale: f32,
