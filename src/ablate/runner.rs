@@ -16,7 +16,7 @@ use crate::query::TextQuery;
 use crate::query::eval::{BACKGROUND_LABELS, GroundTruth, Split, TruthFrame};
 use crate::run::ask;
 use crate::run::sources::{
-    self, FeatureSources, GeometrySources, GraphBuilder, MaskSources, MatchSources, PosedPhotos,
+    self, DepthSources, FeatureSources, GeometrySources, GraphBuilder, MaskSources, MatchSources, PosedPhotos,
 };
 use crate::run::stages::{self, CameraOrigin, PlacedPhotos};
 use crate::scene::Camera;
@@ -142,6 +142,7 @@ impl<'a> Runner<'a> {
             registry: registry.clone(),
             sam: SamOptions::default(),
             given_features: given(&setup.regions),
+            depth_prior: sources::default::<DepthSources>(),
             preset: Preset::Draft,
             seed: self.seed,
         };

@@ -7,7 +7,9 @@ use crate::infer::installed::{Inventory, inventory};
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;
 use crate::run::method::METHODS;
-use crate::run::sources::{self, FeatureSources, GeometrySources, MaskSources, MatchSources, choose};
+use crate::run::sources::{
+    self, DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, SourceKind, choose,
+};
 use crate::run::{Method, RunPlan};
 use crate::{Error, Result};
 use clap::Args;
@@ -32,6 +34,9 @@ pub struct RunArgs {
     /// Source of cameras, depth and points
     #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<GeometrySources>())]
     pub init: String,
+    /// Source of depth where photos cannot be matched
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<DepthSources>())]
+    pub depth_prior: String,
     /// Source of dense matches
     #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<MatchSources>())]
     pub matcher: String,
@@ -121,6 +126,13 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
     if let Some(blank) = args.queries.iter().find(|q| q.trim().is_empty()) {
         return Err(Error::input(format!("--query \"{blank}\": give a few words")));
     }
+    let init = choose::<GeometrySources>(&args.init, installed)?;
+    // A network that gives depth itself needs none suggested.
+    let measured = GeometrySources::SOURCES.iter().any(|s| s.name == init.name);
+    let depth_prior = match args.depth_prior.as_str() {
+        "auto" if !measured => sources::default::<DepthSources>(),
+        text => choose::<DepthSources>(text, installed)?,
+    };
     Ok(RunPlan {
         inputs: args.inputs.clone(),
         views: args.views,
@@ -129,7 +141,8 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         resume: args.making.resume,
         checkpoint_seconds: args.making.checkpoint_seconds,
         preset: args.making.preset.map(plan::preset),
-        init: choose::<GeometrySources>(&args.init, installed)?,
+        init,
+        depth_prior,
         matcher: choose::<MatchSources>(&args.matcher, installed)?,
         masks: choose::<MaskSources>(&args.masks, installed)?,
         sam: SamOptions { points: args.mask_points, crops: !args.no_mask_crops, ..SamOptions::default() },
@@ -210,6 +223,7 @@ mod tests {
             ("mine", Task::Features),
             ("da3", Task::Geometry),
             ("mast3r_512", Task::Geometry),
+            ("depth_anything_v2_small", Task::Depth),
         ];
         let installed = Inventory { models: models.map(|(n, d)| model(n, d)).into(), broken: Vec::new() };
         let plan = plan_with(&[], &installed).unwrap();
@@ -217,8 +231,11 @@ mod tests {
         assert_eq!(plan.features, named("mine"));
         assert_eq!(plan.init, named("mast3r_512"));
         assert_eq!(plan.matcher, named("xfeat"));
+        // Depth of a geometry network needs no suggestion, that of stereo takes what there is.
+        assert_eq!(plan.depth_prior, named("none"));
         let plan =
             plan_with(&["--masks", "graph", "--init", "sfm", "--features", "words"], &installed).unwrap();
+        assert_eq!(plan.depth_prior, named("depth_anything_v2_small"));
         assert_eq!((plan.init, plan.masks, plan.features), (named("sfm"), named("graph"), named("words")));
     }
 

@@ -11,7 +11,7 @@ use super::onnx::{Dim, ElementType, Header, Port, listed};
 use super::runtime::Tensor;
 use crate::{Error, Result};
 
-const BUILT_IN: [(&str, &str); 11] = [
+const BUILT_IN: [(&str, &str); 13] = [
     ("clip", include_str!("adapters/clip.toml")),
     ("lseg", include_str!("adapters/lseg.toml")),
     ("sam", include_str!("adapters/sam.toml")),
@@ -23,6 +23,8 @@ const BUILT_IN: [(&str, &str); 11] = [
     ("depth-anything-3", include_str!("adapters/depth-anything-3.toml")),
     ("roma", include_str!("adapters/roma.toml")),
     ("roma2", include_str!("adapters/roma2.toml")),
+    ("depth-anything", include_str!("adapters/depth-anything.toml")),
+    ("metric-depth", include_str!("adapters/metric-depth.toml")),
 ];
 
 /// How a photo becomes the network's input.

@@ -7,7 +7,7 @@ use super::graph::GraphFile;
 use super::installed::{Installed, Task};
 use super::runtime::Input;
 use super::sam::{BATCH, MASKS, Sam};
-use super::{RegionEncoder, pairs, warp};
+use super::{RegionEncoder, depth_prior, pairs, warp};
 use crate::format::npy::{self, NpyData};
 use crate::photo::{Photo, PlainBorder};
 use crate::progress::{Silent, peak_memory, reset_peak_memory};
@@ -70,8 +70,14 @@ pub fn check(model: &Installed) -> Result<Vec<Measured>> {
             }
             Task::Masks => masks(model, &photos[0].image, &mut steps)?,
             Task::Features => features(model, &photos[0].image, &mut steps)?,
-            // Runs with the features.
+            // Runs with the features, or is what the geometry says.
             Task::Text => {}
+            Task::Depth if model.tasks.contains(&Task::Geometry) => {}
+            Task::Depth => {
+                measured("depth of 2 photos".to_string(), &mut steps, || {
+                    depth_prior::of_network(model, &photos, &Silent)
+                })?;
+            }
         }
     }
     Ok(steps)

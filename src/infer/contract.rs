@@ -30,6 +30,8 @@ pub enum Part {
     MultiView,
     /// Two images → where each pixel of one is in the other (RoMa).
     Warp,
+    /// Image → depth of unknown scale and shift (Depth Anything, MiDaS).
+    Depth,
 }
 
 impl Part {
@@ -51,6 +53,7 @@ impl Part {
             Part::PairDecoder => &PAIR_DECODER,
             Part::MultiView => &MULTI_VIEW,
             Part::Warp => &WARP,
+            Part::Depth => &DEPTH,
         }
     }
 }
@@ -202,8 +205,18 @@ static WARP: Contract = Contract {
     ],
 };
 
+// Which of the two it gives, the adapter says: names do not (Depth Anything calls both "predicted_depth").
+static DEPTH: Contract = Contract {
+    name: "depth",
+    inputs: &[slot("image", "B 3 H W", &["B H W 3"])],
+    outputs: &[
+        maybe("inverse_depth", "B h w", &["B 1 h w", "B h w 1"]),
+        maybe("depth", "B h w", &["B 1 h w", "B h w 1"]),
+    ],
+};
+
 /// Every part.
-pub const PARTS: [Part; 10] = [
+pub const PARTS: [Part; 11] = [
     Part::ImageTower,
     Part::TextTower,
     Part::DenseFeatures,
@@ -214,6 +227,7 @@ pub const PARTS: [Part; 10] = [
     Part::PairDecoder,
     Part::MultiView,
     Part::Warp,
+    Part::Depth,
 ];
 
 /// The axes of a shape.

@@ -31,6 +31,8 @@ pub enum Task {
     Features,
     /// Embeddings of texts.
     Text,
+    /// Depth of each photo up to scale and shift.
+    Depth,
 }
 
 impl Task {
@@ -42,6 +44,7 @@ impl Task {
             Task::Masks => "masks",
             Task::Features => "features",
             Task::Text => "text",
+            Task::Depth => "depth",
         }
     }
 }
@@ -179,10 +182,11 @@ impl Inventory {
 }
 
 /// Sets of parts that make a model, and what it then does.
-const WHOLE: [(&[Part], &[Task]); 7] = [
-    (&[Part::Pair], &[Task::Geometry]),
-    (&[Part::PairEncoder, Part::PairDecoder], &[Task::Geometry]),
-    (&[Part::MultiView], &[Task::Geometry]),
+const WHOLE: [(&[Part], &[Task]); 8] = [
+    (&[Part::Pair], &[Task::Geometry, Task::Depth]),
+    (&[Part::PairEncoder, Part::PairDecoder], &[Task::Geometry, Task::Depth]),
+    (&[Part::MultiView], &[Task::Geometry, Task::Depth]),
+    (&[Part::Depth], &[Task::Depth]),
     (&[Part::Warp], &[Task::Matcher]),
     (&[Part::MaskEncoder, Part::MaskDecoder], &[Task::Masks]),
     (&[Part::ImageTower, Part::TextTower], &[Task::Features, Task::Text]),

@@ -13,6 +13,7 @@ pub mod clip;
 mod colour;
 mod compute;
 pub mod contract;
+pub mod depth_prior;
 pub mod graph;
 pub mod hed;
 pub mod installed;

@@ -7,7 +7,7 @@ use crate::infer::Registry;
 use crate::photo::{self, Photo};
 use crate::pose::Geometry;
 use crate::progress::{Progress, Recorded};
-use crate::run::stages::{CameraOrigin, Cameras, DenseDepth, TrainColour};
+use crate::run::stages::{CameraOrigin, Cameras, DenseDepth, DepthPriors, PriorOrigin, TrainColour};
 use crate::scene::PointCloud;
 use crate::synth::{self, SceneSpec};
 use glam::DVec2;
@@ -67,7 +67,8 @@ fn train(device: &Device, store: &Store) -> (crate::Result<Trained>, Vec<u64>) {
     let mut graph = Graph::default();
     let cameras = Cameras::new(photos, CameraOrigin::GivenGeometry(geometry), 0).unwrap();
     let placed = graph.add(cameras, ());
-    let geometry = graph.add(DenseDepth { preset: Preset::Draft, seed: 0 }, (placed,));
+    let priors = graph.add(DepthPriors::new(PriorOrigin::None).unwrap(), (placed,));
+    let geometry = graph.add(DenseDepth { preset: Preset::Draft, seed: 0 }, (placed, priors));
     let options = RgbOptions::preset(Preset::Draft).with_iterations(STEPS);
     let trained = graph.add(TrainColour { options }, (placed, geometry));
     let (steps, registry) = (Steps::default(), Registry::open(None).unwrap());

@@ -9,7 +9,7 @@ use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
 use crate::photo::{Photo, stem};
 use crate::progress::Progress;
-use crate::scene::Camera;
+use crate::scene::{Camera, DepthPrior};
 use crate::{Error, Result};
 use glam::DVec2;
 
@@ -90,10 +90,12 @@ fn warn_of_doubt(photos: &[Photo], model: &SparseModel, progress: &dyn Progress)
     }
 }
 
-/// Depth maps and points of placed photos by stereo.
+/// Depth maps and points of placed photos by stereo; `priors`, one or none per photo, or none at all, suggest depth where photos
+/// cannot be matched.
 pub fn dense(
     device: &Device,
     photos: &[Photo],
+    priors: &[Option<DepthPrior>],
     model: SparseModel,
     method: String,
     options: &StereoOptions,
@@ -101,7 +103,8 @@ pub fn dense(
 ) -> Result<Geometry> {
     let images: Vec<_> = photos.iter().map(|p| p.image.clone()).collect();
     let positions: Vec<_> = model.points.iter().map(|p| p.position).collect();
-    let (depths, points) = stereo::dense(device, &images, &model.cameras, &positions, options, progress)?;
+    let (depths, points) =
+        stereo::dense(device, &images, &model.cameras, &positions, priors, options, progress)?;
     let SparseModel { cameras, focal_log_sigma, fitted, .. } = model;
     Ok(Geometry { cameras, depths, points, focal_log_sigma, fitted, method })
 }

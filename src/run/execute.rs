@@ -80,6 +80,7 @@ fn work(
         registry: registry.clone(),
         sam: plan.sam,
         given_features: plan.features.argument.is_some(),
+        depth_prior: plan.depth_prior.clone(),
         preset,
         seed: plan.seed,
     };

@@ -2,7 +2,8 @@
 use super::ask::Answers;
 use super::plan::RunPlan;
 use super::sources::{
-    self, FeatureSources, GeometrySources, Given, GraphBuilder, MaskSources, MatchSources, PosedPhotos,
+    self, DepthSources, FeatureSources, GeometrySources, Given, GraphBuilder, MaskSources, MatchSources,
+    PosedPhotos,
 };
 use super::stages::{self, CameraOrigin, PlacedPhotos};
 use crate::Result;
@@ -51,6 +52,7 @@ impl SceneOutputs {
 pub(super) fn check(plan: &RunPlan, photos: &[Photo], registry: &Registry) -> Result<()> {
     let given = Given { photos, masks: &plan.masks, features: &plan.features };
     sources::check::<GeometrySources>(&plan.init, &given, registry)?;
+    sources::check::<DepthSources>(&plan.depth_prior, &given, registry)?;
     sources::check::<MatchSources>(&plan.matcher, &given, registry)?;
     sources::check::<FeatureSources>(&plan.features, &given, registry)?;
     sources::check::<MaskSources>(&plan.masks, &given, registry)

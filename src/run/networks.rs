@@ -1,6 +1,6 @@
 //! The networks that users bring, as a run uses them: found before any work, named in run.json.
 use super::plan::RunPlan;
-use super::sources::{FeatureSources, GeometrySources, MaskSources, MatchSources, installed};
+use super::sources::{DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, installed};
 use crate::Result;
 use crate::infer::Registry;
 use crate::infer::installed::{HashedFile, Installed};
@@ -15,6 +15,7 @@ impl Networks {
     pub(super) fn of(plan: &RunPlan, registry: &Registry) -> Result<Networks> {
         let found = [
             installed::<GeometrySources>(&plan.init, registry)?,
+            installed::<DepthSources>(&plan.depth_prior, registry)?,
             installed::<MatchSources>(&plan.matcher, registry)?,
             installed::<MaskSources>(&plan.masks, registry)?,
             installed::<FeatureSources>(&plan.features, registry)?,

@@ -32,6 +32,8 @@ pub struct RunPlan {
     pub preset: Option<Preset>,
     /// Cameras and points.
     pub init: SourceChoice,
+    /// Depth suggested where stereo finds none.
+    pub depth_prior: SourceChoice,
     /// Known cameras in memory, one per photo with its name, instead of those of `init`.
     #[serde(skip)]
     pub cameras: Vec<Camera>,
@@ -81,6 +83,7 @@ impl Default for RunPlan {
             checkpoint_seconds: CHECKPOINT_SECONDS,
             preset: None,
             init: sources::default::<sources::GeometrySources>(),
+            depth_prior: sources::default::<sources::DepthSources>(),
             cameras: Vec::new(),
             matcher: sources::default::<sources::MatchSources>(),
             masks: sources::default::<sources::MaskSources>(),

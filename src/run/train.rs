@@ -151,7 +151,8 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     }
     let mut graph = Graph::default();
     let placed = graph.add(stages::Cameras::new(photos, source, plan.seed)?, ());
-    let geometry = graph.add(stages::DenseDepth { preset, seed: plan.seed }, (placed,));
+    let priors = graph.add(stages::DepthPriors::new(stages::PriorOrigin::None)?, (placed,));
+    let geometry = graph.add(stages::DenseDepth { preset, seed: plan.seed }, (placed, priors));
     let trained = graph.add(stages::TrainColour { options }, (placed, geometry));
     let up = graph.add(stages::Upright, (placed, geometry, trained));
     let targets = [placed.target(), geometry.target(), trained.target(), up.target()];

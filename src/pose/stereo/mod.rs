@@ -5,6 +5,7 @@ mod fill;
 mod fuse;
 mod options;
 mod planes;
+mod prior;
 mod regions;
 mod surface;
 #[cfg(test)]
@@ -20,7 +21,7 @@ use crate::Result;
 use crate::gpu::Device;
 use crate::pass::plane_sweep::{GpuMatcher, Matcher, ReferenceView};
 use crate::progress::Progress;
-use crate::scene::{Camera, DepthMap, Plane, PointCloud, RgbImage};
+use crate::scene::{Camera, DepthMap, DepthPrior, Plane, PointCloud, RgbImage};
 use glam::{DVec3, Vec4};
 
 /// Depth of every photo (complete but for white borders; confidence tells matched from filled) and fused points, from
@@ -33,6 +34,7 @@ pub fn dense(
     images: &[RgbImage],
     cameras: &[Camera],
     sparse: &[DVec3],
+    priors: &[Option<DepthPrior>],
     options: &StereoOptions,
     progress: &dyn Progress,
 ) -> Result<(Vec<DepthMap>, PointCloud)> {
@@ -43,7 +45,7 @@ pub fn dense(
     })?;
     progress.check()?;
     let finest = &levels[levels.len() - 1];
-    Ok(finish(images, finest, &planes, options))
+    Ok(finish(images, finest, &planes, priors, options, progress))
 }
 
 /// Planes (π, cost) of all views at the finest resolution; `matcher` makes the device's or the twin's.
@@ -102,7 +104,9 @@ pub fn finish(
     images: &[RgbImage],
     level: &Level,
     matched: &[Vec4],
+    priors: &[Option<DepthPrior>],
     options: &StereoOptions,
+    progress: &dyn Progress,
 ) -> (Vec<DepthMap>, PointCloud) {
     let void = void::white_border(level);
     let weak = texture::weak(level);
@@ -112,7 +116,8 @@ pub fn finish(
     let large = planes::large_planes(level, &fitted, options.seed);
     let opened = fill::open_rims(level, &fitted, rim_radius(level));
     let inferred = regions::fill(level, &links, &opened, &void, &weak, options.seed);
-    let complete = fill::fill(level, &links, &inferred, &large, &void);
+    let joined = prior::join(level, &links, &inferred, priors, options.seed, progress);
+    let complete = fill::fill(level, &links, &joined, &large, &void);
     let points = fuse::fuse(level, &links, &complete);
     let depths =
         images.iter().enumerate().map(|(view, image)| depth_map(level, &complete, view, image)).collect();

@@ -1,5 +1,6 @@
 //! Cameras, depth and points.
-use super::table::{GraphBuilder, NO_CHECK, PosedPhotos, Source, SourceKind};
+use super::depth::DepthSources;
+use super::table::{self, GraphBuilder, NO_CHECK, PosedPhotos, Source, SourceKind};
 use crate::Result;
 use crate::format::cameras;
 use crate::infer::PackFileKind;
@@ -43,8 +44,13 @@ impl SourceKind for GeometrySources {
 impl GraphBuilder {
     /// Photos with cameras from anywhere, and depth by stereo where a network has not given it.
     pub fn posed(&mut self, photos: Vec<Photo>, source: CameraOrigin) -> Result<PosedPhotos> {
+        // A network that gives depth itself needs none suggested.
+        let none = table::default::<DepthSources>();
+        let choice = if matches!(source, CameraOrigin::Network(_)) { none } else { self.depth_prior.clone() };
         let placed = self.graph.add(Cameras::new(photos, source, self.seed)?, ());
-        let geometry = self.graph.add(DenseDepth { preset: self.preset, seed: self.seed }, (placed,));
+        let registry = self.registry.clone();
+        let priors = table::make::<DepthSources>(&choice, &registry, (self, placed))?;
+        let geometry = self.graph.add(DenseDepth { preset: self.preset, seed: self.seed }, (placed, priors));
         Ok(PosedPhotos { placed, geometry })
     }
 }

@@ -1,11 +1,13 @@
 //! Where cameras, matches, masks and features come from: a table per kind, an entry per source. The options of the command
 //! line with their help, the choices that errors name, `auto`, `splatvk doctor`, run.json and the C interface read them.
+mod depth;
 mod features;
 mod geometry;
 mod masks;
 mod matches;
 mod table;
 
+pub use depth::DepthSources;
 pub use features::{FeatureSources, encoder, table_encoder, text_table};
 pub use geometry::GeometrySources;
 pub use masks::MaskSources;
@@ -22,6 +24,7 @@ use table::listed;
 pub fn list(networks: &Inventory) -> Vec<(String, String)> {
     vec![
         listed::<GeometrySources>(networks),
+        listed::<DepthSources>(networks),
         listed::<MatchSources>(networks),
         listed::<MaskSources>(networks),
         listed::<FeatureSources>(networks),
@@ -55,6 +58,7 @@ mod tests {
             assert_eq!(names.len(), K::SOURCES.len(), "two sources of one name");
         }
         of::<GeometrySources>(&none);
+        of::<DepthSources>(&none);
         of::<MatchSources>(&none);
         of::<MaskSources>(&none);
         of::<FeatureSources>(&none);

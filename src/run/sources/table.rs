@@ -107,6 +107,8 @@ pub struct GraphBuilder {
     pub sam: SamOptions,
     /// Whether features are read with the masks.
     pub given_features: bool,
+    /// Depth priors, where stereo finds depth.
+    pub depth_prior: SourceChoice,
     /// Time against quality.
     pub preset: Preset,
     /// Of everything random in cameras and depth.

@@ -8,7 +8,7 @@ use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::choose::{LeftOut, Reason};
 use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, SparseModel, pointmap, upright};
-use crate::scene::{Camera, Up};
+use crate::scene::{Camera, DepthPrior, Up};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -154,7 +154,7 @@ pub struct DenseDepth {
 impl Stage for DenseDepth {
     const NAME: &'static str = "depth";
     const LANE: Lane = Lane::Device;
-    type Inputs = (Output<PlacedPhotos>,);
+    type Inputs = (Output<PlacedPhotos>, Output<Vec<Option<DepthPrior>>>);
     type Output = Geometry;
 
     fn settings(&self) -> String {
@@ -165,12 +165,16 @@ impl Stage for DenseDepth {
         kept()
     }
 
-    fn run(self, (placed,): (&PlacedPhotos,), context: &Context) -> Result<Geometry> {
+    fn run(
+        self,
+        (placed, priors): (&PlacedPhotos, &Vec<Option<DepthPrior>>),
+        context: &Context,
+    ) -> Result<Geometry> {
         match placed.known.clone() {
             KnownGeometry::Complete(geometry) => Ok(geometry),
             KnownGeometry::Sparse(model, method) => {
                 let options = StereoOptions::preset(self.preset).seeded(self.seed);
-                pose::dense(context.device, &placed.photos, model, method, &options, context.progress)
+                pose::dense(context.device, &placed.photos, priors, model, method, &options, context.progress)
             }
         }
     }

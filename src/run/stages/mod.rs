@@ -5,6 +5,7 @@ mod cameras;
 mod language;
 pub mod masks;
 mod matches;
+mod prior;
 mod shared;
 mod splats;
 
@@ -13,5 +14,6 @@ pub use cameras::{CameraOrigin, Cameras, DenseDepth, PlacedPhotos, Upright};
 pub use language::{Align, EmbedQueries, NameCodes, SharedEncoder, TrainLanguage};
 pub use masks::{ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMasks, RegionFeatures};
 pub use matches::{DescriptorMatches, Descriptors, NetworkMatches};
+pub use prior::{DepthPriors, PriorOrigin};
 pub use shared::identity;
 pub use splats::TrainColour;

@@ -1,0 +1,21 @@
+//! Depth that is suggested, not measured.
+use super::Plane;
+use serde::{Deserialize, Serialize};
+
+/// What the values of a depth prior are; scale and shift may be unknown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum PriorKind {
+    /// Camera z.
+    Depth,
+    /// 1 / z, as networks of relative depth give.
+    InverseDepth,
+}
+
+/// A depth map of unknown scale and shift, as a network sees one photo. It covers the whole photo, at any resolution.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct DepthPrior {
+    /// [H, W] values; 0 or less and what is not finite = unknown.
+    pub values: Plane<f32>,
+    /// What they are.
+    pub kind: PriorKind,
+}
