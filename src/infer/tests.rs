@@ -398,7 +398,7 @@ fn descriptors_of_a_pair_network_match_photos() {
     graph.write(&dir.path().join("mast3r/model.onnx"));
     let registry = Registry::of(&[dir.path()]);
     let model = registry.installed(Task::Matcher, "mast3r").unwrap();
-    assert_eq!(model.tasks, [Task::Geometry, Task::Matcher]);
+    assert_eq!(model.tasks, [Task::Geometry, Task::Depth, Task::Matcher]);
     // A direction on a cone per pixel: no two pixels share one, neighbours are near each other. The second photo is the first
     // moved by eight pixels.
     let colours = |shift: usize| {
