@@ -1,7 +1,7 @@
 //! Time against quality, for every stage that can trade them.
 
 /// How much time a run may take.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[non_exhaustive]
 pub enum Preset {
     /// A few hundred steps: minutes on a CPU device.

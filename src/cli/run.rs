@@ -6,9 +6,10 @@ use super::progress;
 use crate::infer::installed::{Inventory, inventory};
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;
+use crate::run::base::{Settings, next_to};
 use crate::run::method::METHODS;
 use crate::run::sources::{
-    self, DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, SourceKind, choose,
+    self, DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice, SourceKind, choose,
 };
 use crate::run::{Method, RunPlan};
 use crate::{Error, Result};
@@ -22,6 +23,10 @@ pub struct RunArgs {
     /// Photos, folders of photos (JPEG, PNG, HEIC, AVIF, WebP, TIFF, EXR, HDR), or a video
     #[arg(required = true, value_name = "INPUT")]
     pub inputs: Vec<PathBuf>,
+    /// Add the photos to this scene, made by run, instead of making one of their own; without --out, the larger scene stands beside it
+    /// under the next number, and the old one stays
+    #[arg(long, value_name = "SCENE", conflicts_with_all = ["views", "init", "depth_prior", "method", "feature_dim", "per_level"])]
+    pub add: Option<PathBuf>,
     /// How many photos to use: sharp ones that overlap, from different places [default: all, at most 4]
     #[arg(long, value_name = "N")]
     pub views: Option<usize>,
@@ -90,7 +95,10 @@ fn methods() -> PossibleValuesParser {
 
 pub fn run(args: &RunArgs) -> Result<()> {
     let installed = inventory(&args.device.registry()?);
-    let plan = plan(args, &installed)?;
+    let plan = match &args.add {
+        Some(scene) => joining(args, scene, &installed)?,
+        None => plan(args, &installed)?,
+    };
     let outcome = crate::run::run(&plan, progress::reporter().as_ref())?;
     if args.device.json {
         let record = serde_json::to_value(crate::run::run_record(&outcome));
@@ -135,6 +143,7 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
     };
     Ok(RunPlan {
         inputs: args.inputs.clone(),
+        add: None,
         views: args.views,
         out: args.out.clone().unwrap_or_else(|| default_out(&args.inputs)),
         force: args.making.force,
@@ -163,6 +172,31 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
     })
 }
 
+/// The plan for photos that join a scene: what the arguments leave open is as the scene was made.
+fn joining(args: &RunArgs, scene: &Path, installed: &Inventory) -> Result<RunPlan> {
+    let made = Settings::read(scene)?;
+    let plan = plan(args, installed)?;
+    Ok(RunPlan {
+        add: Some(scene.to_path_buf()),
+        out: args.out.clone().unwrap_or_else(|| next_to(scene)),
+        preset: plan.preset.or(made.preset()),
+        init: sources::default::<GeometrySources>(),
+        depth_prior: sources::default::<DepthSources>(),
+        matcher: as_made::<MatchSources>(&made, &args.matcher, installed)?,
+        masks: as_made::<MaskSources>(&made, &args.masks, installed)?,
+        features: as_made::<FeatureSources>(&made, &args.features, installed)?,
+        feature_dim: made.feature_dim().unwrap_or(plan.feature_dim),
+        queries: made.queries(&plan.queries),
+        ..plan
+    })
+}
+
+/// The source that is asked for; where that is left open, the one that the scene was made with.
+fn as_made<K: SourceKind>(made: &Settings, asked: &str, installed: &Inventory) -> Result<SourceChoice> {
+    let recorded = made.source(K::OPTION).filter(|_| asked == "auto");
+    choose::<K>(recorded.unwrap_or(asked), installed)
+}
+
 /// `out/<name>` beside where the command runs; a folder called `images` takes its parent's name.
 fn default_out(inputs: &[PathBuf]) -> PathBuf {
     let first = inputs.first().map(PathBuf::as_path).unwrap_or(Path::new("scene"));
@@ -178,7 +212,6 @@ mod tests {
     use super::*;
     use crate::cli::args::{Cli, Command};
     use crate::infer::installed::{Installed, Task};
-    use crate::run::sources::SourceChoice;
     use clap::Parser;
 
     fn named(name: &str) -> SourceChoice {

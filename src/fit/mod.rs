@@ -1,4 +1,5 @@
 //! Training: losses, schedules, pruning, pose refinement.
+mod added;
 mod bounds;
 mod coarse;
 pub mod index_head;
@@ -16,6 +17,7 @@ mod unseen;
 mod views;
 
 pub use crate::preset::Preset;
+pub use added::{new_surface, train_on};
 pub(crate) use coarse::Photos;
 pub(crate) use language::Run as LanguageRun;
 pub use language::{LanguagePoint, TrainedLanguage, train_language};

@@ -68,8 +68,11 @@ pub struct RgbOptions {
     pub prune_every: usize,
     /// … from this step on.
     pub prune_from: usize,
-    /// Camera refinement, if at all. Camera 0 never moves.
+    /// Camera refinement, if at all.
     pub poses: Option<PoseOptions>,
+    /// So many cameras, the first ones, never move: camera 0 holds the world frame, those of a scene that goes on also what was
+    /// measured in it.
+    pub held: usize,
     /// SH degree of the result, 0–3.
     pub sh_degree: u32,
     /// A point of the loss curve every so many steps.
@@ -105,6 +108,24 @@ impl RgbOptions {
             poses.rate.steps = iterations;
         }
         self
+    }
+
+    /// The same options for a scene of `known` photos that goes on with `new` more: its cameras are held, and each new photo may bring
+    /// as many splats as one of the scene's has on average, `splats` in all.
+    pub fn going_on(self, known: usize, new: usize, splats: usize) -> Self {
+        let env = |n: &str, d: f64| std::env::var(n).ok().and_then(|v| v.parse().ok()).unwrap_or(d);
+        let steps = (self.iterations as f64 * env("ADD_STEPS", 0.5)) as usize;
+        let mut options = self.with_iterations(steps);
+        options.held = known;
+        options.coarse = env("ADD_COARSE", 0.0);
+        let k = env("ADD_RATE", 1.0);
+        options.rates.means.start *= k;
+        options.rates.log_scales *= k;
+        options.rates.quats *= k;
+        options.rates.opacity *= k;
+        options.rates.sh_dc *= k;
+        options.init.max_points = options.init.max_points.min((splats * new).div_ceil(known.max(1)));
+        options
     }
 
     /// Most steps at half the photos' size. A thousand steps learn a few photos by heart: 0.9 dB more on them, 0.3 less on views
@@ -179,6 +200,7 @@ impl RgbOptions {
             prune_every: 100,
             prune_from: 200,
             poses: Some(PoseOptions { start: 0, rate: Exponential { start: 1e-4, end: 1e-6, steps: 1000 } }),
+            held: 1,
             sh_degree: 0,
             report_every: 10,
         }

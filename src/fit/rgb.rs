@@ -70,7 +70,7 @@ impl FitStats {
 pub struct Trained {
     /// Fitted splats.
     pub splats: Splats,
-    /// Refined cameras; camera 0 as given.
+    /// Refined cameras; the held ones as given.
     pub cameras: Vec<Camera>,
     /// How it went.
     pub stats: FitStats,
@@ -207,9 +207,10 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Pose refinement; camera 0 fixes the world frame.
+    /// Pose refinement; the held cameras fix the world frame.
     fn move_camera(&mut self, view: usize, iteration: usize) -> Result<()> {
-        let Some(poses) = self.options.poses.filter(|p| view > 0 && iteration >= p.start) else {
+        let Some(poses) = self.options.poses.filter(|p| view >= self.options.held && iteration >= p.start)
+        else {
             return Ok(());
         };
         let g = self.trainer.views.stage(view).raster.frame().camera_grad.read()?;

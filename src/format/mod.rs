@@ -6,6 +6,7 @@ pub mod gaussians;
 pub mod npy;
 pub mod picture;
 pub mod scene_dir;
+pub mod scene_photos;
 pub mod side_file;
 pub mod transform;
 pub mod transforms;

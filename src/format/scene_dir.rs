@@ -1,7 +1,7 @@
 //! The scene directory: what a run writes and every other command reads.
 use super::npy::{self, NpyArray};
 use super::workspace::MANIFEST;
-use super::{cameras, colmap, create_folder, gaussians, picture, ply, transforms};
+use super::{cameras, colmap, create_folder, gaussians, picture, ply, scene_photos, transforms};
 use crate::photo::Photo;
 use crate::scene::{
     Camera, Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId, PointCloud, Seen, Splats, World,
@@ -115,6 +115,7 @@ pub fn write(folder: &Path, c: &Contents) -> Result<()> {
     transforms::write(&camera_folder.join("transforms.json"), &named, Some("../point_cloud.ply"))?;
     if !c.photos.is_empty() {
         write_originals(&camera_folder.join("original"), c)?;
+        scene_photos::write(&camera_folder, c.photos)?;
     }
     let language = c.language.map(|l| write_language(folder, l, c.splats.len())).transpose()?;
     if let (Some(_), Some(table)) = (&language, c.text_embeddings) {

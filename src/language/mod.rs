@@ -8,9 +8,11 @@ mod build;
 pub mod codebook;
 pub mod dir;
 pub mod graph;
+mod join;
 mod masks;
 pub mod matcher;
 pub mod sam;
 
 pub use build::{BuildOptions, Language, Reducer, build};
+pub use join::{SceneView, join};
 pub use masks::{LevelMasks, ViewMasks};

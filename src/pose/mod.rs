@@ -1,4 +1,5 @@
 //! Photos to cameras, depth and points.
+mod added;
 mod affine;
 pub mod align;
 mod bundle;
@@ -25,6 +26,7 @@ mod two_view;
 pub mod upright;
 mod vanishing;
 
+pub use added::{KnownPhotos, add};
 pub use confidence::Confidence;
 pub use geometry::{Fitted, Geometry, SparseModel, SparsePoint};
 pub use initialise::{SolvedCameras, dense, learned_features, place};

@@ -1,4 +1,5 @@
 //! Running a plan: photos → cameras, depth and points → splats → language → scene directory.
+use super::base::BaseScene;
 use super::list;
 use super::networks::Networks;
 use super::outcome::RunOutcome;
@@ -6,22 +7,25 @@ use super::plan::RunPlan;
 use super::record;
 use super::sources::{self, GraphBuilder};
 use super::stages::PlacedPhotos;
-use crate::Result;
 use crate::format::Workspace;
 use crate::format::scene_dir::{self, Contents};
 use crate::gpu::{self, Device};
 use crate::infer::{Registry, home};
-use crate::photo::{self, Photo};
+use crate::photo::{self, Candidate, Photo};
 use crate::pipeline::{Graph, Store};
 use crate::pose;
 use crate::progress::{Progress, Recorded};
 use crate::scene::World;
+use crate::{Error, Result};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 /// Runs the plan and writes the scene directory, whole or not at all.
 pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     let progress = &Recorded::new(progress);
+    // Read whole before anything is written: the scene may be the one that is replaced.
+    let base = plan.add.as_deref().map(BaseScene::open).transpose()?.map(Arc::new);
     let workspace = Workspace::create(&plan.out, plan.force)?;
     // The device comes first: it says how large the photos may be.
     let device = Device::with(&gpu::Options {
@@ -29,12 +33,18 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
         ..gpu::Options::from_env(plan.device.as_deref())
     })?;
     let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
-    let (chosen, choice) = pose::choose::photos(&plan.inputs, plan.views, progress)?;
-    plan.check_budget(&device, &photo::sizes_of(&chosen), max_size)?;
-    let photos = photo::load_each(&chosen, max_size, progress)?;
+    let (photos, choice) = match &base {
+        Some(base) => (joining(plan, base, &device, max_size, progress)?, None),
+        None => {
+            let (chosen, choice) = pose::choose::photos(&plan.inputs, plan.views, progress)?;
+            plan.check_budget(&device, &photo::sizes_of(&chosen), max_size)?;
+            (photo::load_each(&chosen, max_size, progress)?, choice)
+        }
+    };
     let registry = plan.registry()?;
     let store = store(plan.resume, plan.checkpoint_seconds);
-    let outcome = RunOutcome { choice, ..work(plan, &device, &registry, photos, &store, progress)? };
+    let made = work(plan, &device, &registry, base.as_ref(), photos, &store, progress)?;
+    let outcome = RunOutcome { choice, ..made };
     write(workspace, &outcome, progress)?;
     Ok(outcome)
 }
@@ -51,7 +61,7 @@ pub fn reconstruct(
     photo::check_set(&photos)?;
     let sizes: Vec<_> = photos.iter().map(|p| (p.image.width, p.image.height)).collect();
     plan.check_budget(device, &sizes, usize::MAX)?;
-    work(plan, device, registry, photos, &Store::none(), &Recorded::new(progress))
+    work(plan, device, registry, None, photos, &Store::none(), &Recorded::new(progress))
 }
 
 /// Writes what [`reconstruct`] made as a scene directory, whole or not at all; `force` replaces a scene.
@@ -61,10 +71,45 @@ pub fn save(outcome: &mut RunOutcome, out: &Path, force: bool, progress: &dyn Pr
     write(workspace, outcome, progress)
 }
 
+/// The photos that join a scene, all that were named.
+fn joining(
+    plan: &RunPlan,
+    base: &BaseScene,
+    device: &Device,
+    max_size: usize,
+    progress: &dyn Progress,
+) -> Result<Vec<Photo>> {
+    let found = photo::find(&plan.inputs)?;
+    if let Some(video) = found.videos.first() {
+        return Err(Error::input(format!(
+            "{}: a video; --add takes photos, for a video make a scene of its own",
+            video.display()
+        )));
+    }
+    let files: Vec<Candidate> = found.photos.iter().map(|p| Candidate::file(p)).collect();
+    // As large as those of the scene, where nothing else is asked for: finer ones would be shown no better.
+    let sides = base.known.photos.iter().map(|p| p.image.width.max(p.image.height));
+    let max_size = plan.max_size.or(sides.max()).unwrap_or(max_size);
+    let sizes = base.known.photos.iter().map(|p| (p.image.width, p.image.height));
+    let sizes: Vec<_> = sizes.chain(photo::sizes_of(&files)).collect();
+    plan.check_budget(device, &sizes, max_size)?;
+    progress.begin("photos", files.len() as u64);
+    let mut photos = Vec::with_capacity(files.len());
+    for file in &files {
+        progress.check()?;
+        photos.push(file.load(max_size, progress)?);
+        progress.step(photos.len() as u64, "");
+    }
+    progress.end();
+    base.check(&photos)?;
+    Ok(photos)
+}
+
 fn work(
     plan: &RunPlan,
     device: &Device,
     registry: &Registry,
+    base: Option<&Arc<BaseScene>>,
     photos: Vec<Photo>,
     store: &Store,
     progress: &Recorded,
@@ -84,13 +129,21 @@ fn work(
         preset,
         seed: plan.seed,
     };
-    let scene = list::scene(&mut build, plan, device, photos)?;
+    let scene = match base {
+        Some(base) => list::added(&mut build, plan, device, base, photos)?,
+        None => list::scene(&mut build, plan, device, photos)?,
+    };
     let mut made = build.graph.run(&scene.targets(), device, registry, store, progress)?;
     registry.compute().report(progress)?;
     let (trained, language) = (made.take(scene.trained)?, made.take(scene.language)?);
     let PlacedPhotos { photos, left_out, .. } = made.take(scene.placed)?;
     if let Some(text) = super::fidelity::warning(&photos, &trained.stats) {
         progress.warn(&text);
+    }
+    let mut geometry = made.take(scene.geometry)?;
+    if let Some(base) = base {
+        let new = std::mem::replace(&mut geometry.points, base.points.clone());
+        geometry.points.append(new);
     }
     let seen = super::view::seen(device, &language.splats, &trained.cameras, progress)?;
     Ok(RunOutcome {
@@ -100,9 +153,10 @@ fn work(
         choice: None,
         photos,
         left_out,
-        geometry: made.take(scene.geometry)?,
+        geometry,
+        known: base.map_or(0, |b| b.known.photos.len()),
         cameras: trained.cameras,
-        world: World { up: made.take(scene.up)?, scale: None },
+        world: World { up: made.take(scene.up)?, scale: base.and_then(|b| b.world.scale.clone()) },
         splats: language.splats,
         seen,
         rgb: trained.stats,

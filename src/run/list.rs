@@ -1,12 +1,12 @@
 //! The stages of `splatvk run`.
 use super::ask::Answers;
+use super::base::BaseScene;
 use super::plan::RunPlan;
 use super::sources::{
     self, DepthSources, FeatureSources, GeometrySources, Given, GraphBuilder, MaskSources, MatchSources,
     PosedPhotos,
 };
 use super::stages::{self, CameraOrigin, PlacedPhotos};
-use crate::Result;
 use crate::fit::{Trained, TrainedLanguage};
 use crate::gpu::Device;
 use crate::infer::Registry;
@@ -17,6 +17,8 @@ use crate::pose;
 use crate::report::viewer::CodeNames;
 use crate::run::view::DecodedFrame;
 use crate::scene::Up;
+use crate::{Error, Result};
+use std::sync::Arc;
 
 /// Outputs of the stages of a run.
 pub(super) struct SceneOutputs {
@@ -88,6 +90,54 @@ pub(super) fn scene(
     let aligned = graph.add(stages::Align { recipe, space, seed }, (regions, matches, geometry));
     let names = graph.add(stages::NameCodes { encoder }, (aligned,));
 
+    let options = plan.language_options(preset);
+    let language = graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
+    let frames = graph.add(stages::DecodeViews, (trained, language));
+    let answers = graph.add(stages::AnswerQueries, (frames, language, queries));
+    Ok(SceneOutputs { placed, geometry, trained, up, aligned, names, language, frames, answers })
+}
+
+/// The same for photos that join a scene.
+pub(super) fn added(
+    build: &mut GraphBuilder,
+    plan: &RunPlan,
+    device: &Device,
+    base: &Arc<BaseScene>,
+    photos: Vec<Photo>,
+) -> Result<SceneOutputs> {
+    let (preset, seed, registry) = (build.preset, plan.seed, build.registry.clone());
+    let encoder = sources::make::<FeatureSources>(&plan.features, &registry, &registry)?;
+    if encoder.space() != base.field.space {
+        return Err(Error::input(format!(
+            "--features: the scene's features are {}, these would be {}; give the --features it was made with",
+            base.field.space,
+            encoder.space()
+        )));
+    }
+    let known = base.known.photos.len();
+    let options = plan.rgb_options(preset, device, known + photos.len());
+    let graph = &mut build.graph;
+    let placed = graph.add(stages::AddedCameras { base: base.clone(), photos, seed }, ());
+    let geometry = graph.add(stages::AddedDepth { base: base.clone(), preset, seed }, (placed,));
+    let trained = graph.add(stages::TrainOn { base: base.clone(), options }, (placed, geometry));
+    let up = match &base.world.up {
+        Some(up) => graph.add(stages::KnownUp(Some(up.clone())), ()),
+        None => graph.add(stages::Upright, (placed, geometry, trained)),
+    };
+    let embed = stages::EmbedQueries { encoder: encoder.clone(), texts: plan.queries.clone() };
+    let queries = graph.add(embed, ());
+    let new = PosedPhotos {
+        placed: graph.add(stages::OnlyAdded { known }, (placed,)),
+        geometry: graph.add(stages::OnlyAddedGeometry { known }, (geometry,)),
+    };
+    let masks = sources::make::<MaskSources>(&plan.masks, &registry, (build, new))?;
+    let graph = &mut build.graph;
+    let regions = graph.add(stages::RegionFeatures { encoder: encoder.clone() }, (new.placed, masks));
+    let recipe = plan.recipe();
+    let align = recipe.build(encoder.space(), seed);
+    let aligned =
+        graph.add(stages::AlignAdded { base: base.clone(), options: align }, (regions, geometry, trained));
+    let names = graph.add(stages::NameCodes { encoder }, (aligned,));
     let options = plan.language_options(preset);
     let language = graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
     let frames = graph.add(stages::DecodeViews, (trained, language));

@@ -1,5 +1,6 @@
 //! The commands that make scenes, as lists of stages, and what is done with a finished one.
 pub mod ask;
+pub mod base;
 pub mod budget;
 pub mod encoder;
 mod execute;

@@ -27,6 +27,8 @@ pub struct RunOutcome {
     pub photos: Vec<Photo>,
     /// Photos whose place could not be found surely.
     pub left_out: Vec<pose::choose::LeftOut>,
+    /// The first so many photos were in the scene already that the others were added to; 0 = no scene.
+    pub known: usize,
     /// Geometry before training.
     pub geometry: Geometry,
     /// Refined cameras.

@@ -18,6 +18,8 @@ pub const CHECKPOINT_SECONDS: u64 = 30;
 pub struct RunPlan {
     /// Photos or folders of photos.
     pub inputs: Vec<PathBuf>,
+    /// A scene directory that the photos join, instead of making a scene of their own.
+    pub add: Option<PathBuf>,
     /// How many to use; `None` = as many as there are, at most [`photo::DEFAULT_VIEWS`].
     pub views: Option<usize>,
     /// Scene directory.
@@ -76,6 +78,7 @@ impl Default for RunPlan {
     fn default() -> Self {
         RunPlan {
             inputs: Vec::new(),
+            add: None,
             views: None,
             out: PathBuf::new(),
             force: false,

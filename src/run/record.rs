@@ -51,6 +51,7 @@ fn statistics(o: &RunOutcome) -> serde_json::Value {
         "photos": o.photos.iter().map(|p| p.path.display().to_string()).collect::<Vec<_>>(),
         "choice": o.choice,
         "left_out": o.left_out,
+        "added": added(o),
         "working_sizes": working_sizes(&o.photos),
         "geometry": {
             "method": o.geometry.method, "points": o.geometry.points.len(),
@@ -68,6 +69,33 @@ fn statistics(o: &RunOutcome) -> serde_json::Value {
         "alignment": o.alignment.report,
         "queries": o.answers.iter().map(answer_json).collect::<Vec<_>>(),
     })
+}
+
+/// What is known of the photos that joined a scene; `None` where the scene is a new one.
+fn added(o: &RunOutcome) -> Option<serde_json::Value> {
+    let one = |v: usize| {
+        let fitted = &o.geometry.fitted[v];
+        json!({
+            "photo": o.photos[v].stem, "confidence": fitted.confidence(), "agreement": fitted.agreement,
+            "rotation_sigma_degrees": fitted.rotation_sigma.to_degrees(), "psnr": o.rgb.psnr.get(v),
+        })
+    };
+    let scene = o.plan.add.as_ref()?;
+    let photos: Vec<_> = (o.known..o.photos.len()).map(one).collect();
+    Some(json!({ "scene": scene.display().to_string(), "photos": photos }))
+}
+
+/// A line per photo that joined a scene.
+fn added_figures(o: &RunOutcome) -> Vec<(String, String)> {
+    if o.known == 0 {
+        return Vec::new();
+    }
+    let one = |v: usize| {
+        let confidence = o.geometry.fitted[v].confidence().name();
+        let psnr = o.rgb.psnr.get(v).copied().unwrap_or(0.0);
+        ("added".to_owned(), format!("{}: {confidence} confidence, {psnr:.2} dB", o.photos[v].stem))
+    };
+    (o.known..o.photos.len()).map(one).collect()
 }
 
 /// Per photo what was found of its lens, and the camera of its file.
@@ -194,6 +222,7 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
         splats_figure(&o.splats, &o.seen),
         super::fidelity::figure(&o.rgb),
     ];
+    list.extend(added_figures(o));
     list.extend(
         focal_figure(&o.photos, &o.cameras, &o.geometry.fitted).map(|text| ("focal length".to_owned(), text)),
     );

@@ -21,6 +21,27 @@ impl PointCloud {
     pub fn len(&self) -> usize {
         self.positions.len()
     }
+    /// The points of the given rows, in their order.
+    pub fn picked(&self, rows: &[usize]) -> PointCloud {
+        fn of<T: Copy>(all: &[T], rows: &[usize]) -> Vec<T> {
+            rows.iter().map(|i| all[*i]).collect()
+        }
+        PointCloud {
+            positions: of(&self.positions, rows),
+            colours: of(&self.colours, rows),
+            confidence: of(&self.confidence, rows),
+            view: of(&self.view, rows),
+            radius: of(&self.radius, rows),
+        }
+    }
+    /// Adds the points of another cloud behind these.
+    pub fn append(&mut self, mut other: PointCloud) {
+        self.positions.append(&mut other.positions);
+        self.colours.append(&mut other.colours);
+        self.confidence.append(&mut other.confidence);
+        self.view.append(&mut other.view);
+        self.radius.append(&mut other.radius);
+    }
     /// True without points.
     pub fn is_empty(&self) -> bool {
         self.positions.is_empty()

@@ -65,6 +65,13 @@ impl PairLinks {
     }
 }
 
+/// Correspondences of two views from one camera: the same pixel, where both show the same surface.
+pub fn links_from_overlay(i: usize, j: usize, same: &[bool]) -> PairLinks {
+    let target = same.iter().zip(0..).map(|(s, p)| if *s { p } else { NONE }).collect();
+    let links = Links { target, visible: same.to_vec() };
+    PairLinks { i, j, forward: links.clone(), backward: links }
+}
+
 /// Step 1: keeps matches that are certain, inside, and return to where they came from within
 /// `max(2, 0.004·width)` pixels.
 pub fn links_from_warps(i: usize, j: usize, forward: &DenseWarp, backward: &DenseWarp) -> PairLinks {

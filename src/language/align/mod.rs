@@ -13,7 +13,7 @@ mod score;
 mod tests;
 
 pub use components::Component;
-pub use links::{PairLinks, links_from_depth, links_from_warps};
+pub use links::{PairLinks, links_from_depth, links_from_overlay, links_from_warps};
 pub use options::{AlignOptions, AreaScore, Edge, Fusion};
 
 use super::ViewMasks;

@@ -1,9 +1,12 @@
 //! The bijection between embeddings and the short codes that splats carry (docs/method.md#codebook).
+mod append;
 pub(super) mod autoencoder;
 mod network;
 mod pca;
 pub(super) mod quantise;
 mod spread;
+
+pub use append::append;
 
 use crate::math::{Random, dot};
 use crate::scene::{Codebook, MaskId};

@@ -40,7 +40,45 @@ pub fn equalised(mut photos: Vec<Photo>, model: &SparseModel, progress: &dyn Pro
             photo.light = *light;
         },
     );
-    let odd = photos.iter().zip(&found.unexplained).filter(|(_, left)| **left > UNEXPLAINED);
+    warn_of_odd(&photos, &found.unexplained, progress);
+    photos
+}
+
+/// The photos behind the first `known` ones brought into the light that those have in common.
+pub fn in_light_of(
+    mut photos: Vec<Photo>,
+    known: usize,
+    model: &SparseModel,
+    progress: &dyn Progress,
+) -> Vec<Photo> {
+    // The vignetting of the known photos is taken out already, whichever camera they share with the new ones.
+    let mut fitted = model.fitted.clone();
+    let mut cameras: Vec<usize> = fitted.iter().skip(known).map(|f| f.camera).collect();
+    cameras.sort_unstable();
+    cameras.dedup();
+    for (view, own) in fitted.iter_mut().enumerate() {
+        own.camera = if view < known { 0 } else { 1 + cameras.partition_point(|c| *c < own.camera) };
+    }
+    let found = estimate(&photos, &SparseModel { fitted, ..model.clone() });
+    let log_gain = |channel: usize| {
+        let logs = found.lights[..known].iter().map(|l| l.gain[channel].ln());
+        logs.sum::<f64>() / known.max(1) as f64
+    };
+    let scene = [0, 1, 2].map(log_gain);
+    for (photo, light) in photos.iter_mut().zip(&found.lights).skip(known) {
+        let gain = [0, 1, 2].map(|c| light.gain[c] / scene[c].exp());
+        let light = Light { gain, ..*light };
+        if !light.is_none() {
+            photo.image = light.removed(&photo.image);
+            photo.light = light;
+        }
+    }
+    warn_of_odd(&photos[known..], &found.unexplained[known..], progress);
+    photos
+}
+
+fn warn_of_odd(photos: &[Photo], unexplained: &[f64], progress: &dyn Progress) {
+    let odd = photos.iter().zip(unexplained).filter(|(_, left)| **left > UNEXPLAINED);
     let odd: Vec<String> =
         odd.map(|(p, left)| format!("{} (±{:.0} %)", p.stem, 100.0 * left.exp_m1())).collect();
     if !odd.is_empty() {
@@ -50,7 +88,6 @@ pub fn equalised(mut photos: Vec<Photo>, model: &SparseModel, progress: &dyn Pro
             odd.join(", ")
         ));
     }
-    photos
 }
 
 /// Exposure, white balance and vignetting of placed photos.

@@ -14,7 +14,7 @@ pub(super) struct Stuck {
 }
 
 /// Fewest agreeing points for placing a view: six fix pose and focal length, twice that guards against chance.
-const MIN_RESECTION: usize = 12;
+pub(super) const MIN_RESECTION: usize = 12;
 
 /// Usefulness of a pair as the seed: matches, discounted below 10° of parallax.
 pub(super) fn seed_score(pair: &Pair) -> f64 {
@@ -72,19 +72,19 @@ fn adjust_and_triangulate(model: &mut Model, threshold: f64) {
 }
 
 /// Pose of a view from triangulated points that it shows.
-struct Resection {
-    pose: Pose,
+pub(super) struct Resection {
+    pub(super) pose: Pose,
     /// Focal length as a multiple of the one that the view came with.
-    stretch: f64,
+    pub(super) stretch: f64,
     /// Points that agree.
-    count: usize,
+    pub(super) count: usize,
 }
 
 /// Focal lengths tried for a view that shares its own with no placed view: resection bears half a step of 1.4.
 const STRETCHES: [f64; 5] = [1.0, 0.7, 1.4, 0.5, 2.0];
 
 /// Pose of a view from its sightings of triangulated points.
-fn resection(model: &Model, view: usize, threshold: f64) -> Option<Resection> {
+pub(super) fn resection(model: &Model, view: usize, threshold: f64) -> Option<Resection> {
     let (mut world, mut pixels) = (Vec::<DVec3>::new(), Vec::<DVec2>::new());
     for t in &model.tracks {
         let Some(x) = t.position else { continue };

@@ -58,14 +58,55 @@ pub(super) fn related(
     empty: &Model,
     progress: &dyn Progress,
 ) -> Result<Related, Unplaced> {
+    let (putative, named) = relations(photos, families, empty, 0, progress)?;
+    check_overlap(photos, &named)?;
+    Ok(Related { putative, pairs: usable(named) })
+}
+
+/// The same for photos that join the first `known` ones, whose cameras are known: of pairs of those only the matches. Nothing
+/// is said of a photo that no pair connects; one that is another once more is an error.
+pub(super) fn related_to(
+    photos: &[Photo],
+    families: &mut Vec<Family>,
+    model: &Model,
+    known: usize,
+    progress: &dyn Progress,
+) -> Result<Related, Unplaced> {
+    let (putative, named) = relations(photos, families, model, known, progress)?;
+    if let Some((i, j, _)) = named.iter().find(|r| matches!(r.2, Relation::Same)) {
+        let (old, new) = (&photos[*i].stem, &photos[*j].stem);
+        return Err(Unplaced {
+            views: vec![(*j, Reason::Duplicate(old.clone()))],
+            error: Error::input(format!("{new}: the same picture as {old}; give photos from other places")),
+        });
+    }
+    Ok(Related { putative, pairs: usable(named) })
+}
+
+fn usable(named: Vec<(usize, usize, Relation)>) -> Vec<Pair> {
+    let pair = |(_, _, relation)| match relation {
+        Relation::Usable(pair) => Some(pair),
+        _ => None,
+    };
+    named.into_iter().filter_map(pair).collect()
+}
+
+/// Matches of all pairs by descriptor, and what the pairs have in common, apart from those among the first `known` photos.
+fn relations(
+    photos: &[Photo],
+    families: &mut Vec<Family>,
+    empty: &Model,
+    known: usize,
+    progress: &dyn Progress,
+) -> Result<(Vec<Matches>, Vec<(usize, usize, Relation)>)> {
     let mut putative = putative_matches(families, progress)?;
-    let one = |pair: &Matches| match progress.cancelled() {
+    let one = |pair: &Matches| match progress.cancelled() || pair.second < known {
         true => Relation::Apart,
         false => relate(photos, pair, empty),
     };
     let mut relations: Vec<Relation> = putative.par_iter().map(one).collect();
     progress.check()?;
-    let unsure = unsure_pairs(photos.len(), &putative, &relations);
+    let unsure = unsure_pairs(photos.len(), &putative, &relations, known);
     if !unsure.is_empty() {
         families.push(affine_family(photos));
     }
@@ -80,20 +121,16 @@ pub(super) fn related(
         }
     }
     progress.check()?;
-    let named = putative.iter().zip(relations).map(|(p, r)| (p.first, p.second, r)).collect::<Vec<_>>();
-    check_overlap(photos, &named)?;
-    let usable = |(_, _, relation)| match relation {
-        Relation::Usable(pair) => Some(pair),
-        _ => None,
-    };
-    let pairs = named.into_iter().filter_map(usable).collect();
-    Ok(Related { putative, pairs })
+    let named = putative.iter().zip(relations).map(|(p, r)| (p.first, p.second, r)).collect();
+    Ok((putative, named))
 }
 
-/// Pairs between parts of the photos that sure pairs connect, as far as more corners may make them sure.
-fn unsure_pairs(photos: usize, putative: &[Matches], relations: &[Relation]) -> Vec<usize> {
+/// Pairs between parts of the photos that sure pairs connect, as far as more corners may make them sure; the first `known`
+/// photos are one part.
+fn unsure_pairs(photos: usize, putative: &[Matches], relations: &[Relation], known: usize) -> Vec<usize> {
     let pairs = || putative.iter().zip(relations);
-    let sure = pairs().filter(|(_, r)| r.is_sure()).map(|(p, _)| (p.first, p.second));
+    let sure = pairs().filter(|(p, r)| p.second < known || r.is_sure());
+    let sure = sure.map(|(p, _)| (p.first, p.second));
     let part = parts(photos, sure);
     let between = pairs().enumerate().filter(|(_, (p, r))| {
         part[p.first] != part[p.second] && !matches!(r, Relation::Same | Relation::NoParallax)

@@ -69,7 +69,7 @@ impl Cameras {
 }
 
 /// Everything of a photo that stages read.
-fn identity(photo: &Photo) -> String {
+pub(super) fn identity(photo: &Photo) -> String {
     let mut digest = Sha256::new();
     digest.update(bytemuck::cast_slice::<_, u8>(&photo.image.data));
     if let Some(fine) = &photo.fine {

@@ -1,5 +1,6 @@
 //! The stages of the commands, one kind of work per file. Each declares its inputs and its settings
 //! ([`crate::pipeline`]); the commands are lists of them.
+mod added;
 mod answers;
 mod cameras;
 mod language;
@@ -9,6 +10,7 @@ mod prior;
 mod shared;
 mod splats;
 
+pub use added::{AddedCameras, AddedDepth, AlignAdded, KnownUp, OnlyAdded, OnlyAddedGeometry, TrainOn};
 pub use answers::{AnswerQueries, DecodeViews};
 pub use cameras::{CameraOrigin, Cameras, DenseDepth, PlacedPhotos, Upright};
 pub use language::{Align, EmbedQueries, NameCodes, SharedEncoder, TrainLanguage};

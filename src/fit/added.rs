@@ -1,0 +1,110 @@
+//! A scene that goes on with more photos (docs/method.md#photos-added-later): its splats stay and train on, surfaces that it does not
+//! have yet become new ones.
+use super::bounds::Bounds;
+use super::init::{raise_sh_degree, splats_from_points};
+use super::options::RgbOptions;
+use super::rgb::{Trained, fit_rgb};
+use super::scale::SceneScale;
+use super::unseen::unseen_splats;
+use crate::Result;
+use crate::gpu::Device;
+use crate::progress::Progress;
+use crate::scene::{Camera, DepthMap, Plane, PointCloud, RgbImage, Splats};
+use glam::DVec3;
+
+/// Relative difference in depth from which on a point is on another surface than the one that is rendered: what occlusion tests
+/// between views allow (docs/method.md#reprojection).
+const SAME_SURFACE: f64 = 0.05;
+
+/// Fewest points that splats are made of.
+const MIN_POINTS: usize = 4;
+
+/// The points on surfaces that a scene does not have: those that a new view measures where the scene renders nothing, or something
+/// clearly nearer or farther. `views` are new cameras, each with the depth that was measured in it and what the scene renders there.
+pub fn new_surface(points: &PointCloud, views: &[(&Camera, &DepthMap, &Plane<f32>)]) -> PointCloud {
+    let is_new = |i: usize| {
+        let p = DVec3::from(points.positions[i].map(f64::from));
+        views.iter().any(|(camera, measured, rendered)| {
+            let (pixel, z) = camera.project(p);
+            let inside = |v: f64, size: u32| (0.0..f64::from(size)).contains(&v);
+            if z <= 0.0 || !inside(pixel.x, camera.width) || !inside(pixel.y, camera.height) {
+                return false;
+            }
+            let (x, y) = (pixel.x as usize, pixel.y as usize);
+            let same = |d: f64| (d / z - 1.0).abs() < SAME_SURFACE;
+            same(f64::from(measured.depth.at(x, y))) && !same(f64::from(rendered.at(x, y)))
+        })
+    };
+    let rows: Vec<usize> = (0..points.len()).filter(|i| is_new(*i)).collect();
+    points.picked(&rows)
+}
+
+/// Trains on: `scene` are the splats that photos show, `fresh` points of new surfaces, all other lists have one entry per photo,
+/// those of the scene first ([`RgbOptions::held`] of them).
+pub fn train_on(
+    device: &Device,
+    images: &[RgbImage],
+    cameras: &[Camera],
+    scene: Splats,
+    fresh: &PointCloud,
+    depths: &[DepthMap],
+    options: &RgbOptions,
+    progress: &dyn Progress,
+) -> Result<Trained> {
+    let mut start = scene;
+    raise_sh_degree(&mut start, options.sh_degree);
+    let join = |start: &mut Splats, mut more: Splats| {
+        raise_sh_degree(&mut more, start.sh_degree);
+        start.append(more);
+    };
+    if fresh.len() >= MIN_POINTS {
+        join(&mut start, splats_from_points(fresh, &options.init, options.seed)?);
+    }
+    let surfaces = start.means.clone();
+    if options.margin > 0.0 {
+        let (reach, confidence) = (options.margin, options.min_confidence);
+        join(&mut start, unseen_splats(images, cameras, depths, reach, confidence, options.seed));
+    }
+    if options.bounded {
+        start = Bounds::new(cameras, &surfaces).hold(start);
+    }
+    let scale = SceneScale::measure(cameras, &surfaces);
+    fit_rgb(device, images, cameras, start, scale, Some(depths), options, progress)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Pose;
+
+    #[test]
+    fn only_what_the_scene_does_not_have_is_new() {
+        let camera = Camera {
+            name: String::new(),
+            width: 4,
+            height: 1,
+            fx: 4.0,
+            fy: 4.0,
+            cx: 0.0,
+            cy: 0.5,
+            pose: Pose::IDENTITY,
+        };
+        // Pixel 0 is rendered where it was measured, 1 behind, 2 not at all; 3 was measured elsewhere.
+        let measured = DepthMap {
+            depth: Plane { width: 4, height: 1, data: vec![2.0, 2.0, 2.0, 1.0] },
+            confidence: Plane { width: 4, height: 1, data: vec![0.9; 4] },
+        };
+        let rendered = Plane { width: 4, height: 1, data: vec![2.05, 3.0, 0.0, 0.0] };
+        let mut points = PointCloud::default();
+        for x in 0..4 {
+            let p = camera.unproject(glam::DVec2::new(f64::from(x) + 0.5, 0.5), 2.0);
+            points.positions.push(p.as_vec3().to_array());
+            points.colours.push([0.5; 3]);
+            points.confidence.push(0.9);
+            points.view.push(0);
+            points.radius.push(0.5);
+        }
+        let found = new_surface(&points, &[(&camera, &measured, &rendered)]);
+        assert_eq!(found.positions, points.positions[1..3]);
+    }
+}

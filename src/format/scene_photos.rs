@@ -1,0 +1,49 @@
+//! The photos that a scene directory keeps: their working images, and what was read of their files and taken out of them.
+use crate::photo::{self, Photo};
+use crate::scene::RgbImage;
+use crate::{Error, Result};
+use std::path::Path;
+
+/// Everything of the photos but their pixels, which are in `images/` beside it.
+const PHOTOS: &str = "photos.json";
+
+/// Writes `photos.json` into the folder of cameras.
+pub(super) fn write(cameras: &Path, photos: &[Photo]) -> Result<()> {
+    let bare = |p: &Photo| {
+        let image = RgbImage { width: p.image.width, height: p.image.height, data: Vec::new() };
+        Photo { image, fine: None, ..p.clone() }
+    };
+    let all: Vec<Photo> = photos.iter().map(bare).collect();
+    super::write_json(&cameras.join(PHOTOS), &all)
+}
+
+/// The photos of a scene directory as they were trained on: without lens and in one light, in the order of its cameras.
+pub fn load(scene: &Path) -> Result<Vec<Photo>> {
+    let folder = scene.join("cameras");
+    let file = folder.join(PHOTOS);
+    let bytes = std::fs::read(&file).map_err(|e| {
+        Error::input(format!(
+            "{}: {e}; the scene does not say how its photos were made: make it again with splatvk run",
+            file.display()
+        ))
+    })?;
+    let mut photos: Vec<Photo> = serde_json::from_slice(&bytes)
+        .map_err(|e| Error::input(format!("{}: {e}; the scene is damaged, run again", file.display())))?;
+    for photo in &mut photos {
+        let path = folder.join("images").join(format!("{}.png", photo.stem));
+        // Larger than any image: it is to be read as it is.
+        let image = photo::load_at(&path, usize::MAX >> 16)?.image;
+        if (image.width, image.height) != (photo.image.width, photo.image.height) {
+            return Err(Error::input(format!(
+                "{}: {} × {} pixels, the scene's camera has {} × {}; the scene is damaged, run again",
+                path.display(),
+                image.width,
+                image.height,
+                photo.image.width,
+                photo.image.height
+            )));
+        }
+        photo.image = image;
+    }
+    Ok(photos)
+}

@@ -1,0 +1,207 @@
+//! A scene that more photos are added to: what it is, and what it was made with.
+use crate::files;
+use crate::fit::Preset;
+use crate::format::{colmap, scene_dir, scene_photos};
+use crate::photo::{self, Photo};
+use crate::pose::{Fitted, KnownPhotos};
+use crate::scene::{Camera, LanguageField, Lens, PointCloud, Seen, Splats, World};
+use crate::{Error, Result};
+use serde_json::Value;
+use std::path::Path;
+
+/// What a scene was made with, by its run.json.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    file: String,
+    record: Value,
+}
+
+impl Settings {
+    /// Reads run.json of a scene directory.
+    pub fn read(scene: &Path) -> Result<Settings> {
+        let path = scene.join("run.json");
+        let file = path.display().to_string();
+        let bad = |what: String| {
+            Error::input(format!("{file}: {what}; --add takes a scene that splatvk run wrote"))
+        };
+        let bytes = std::fs::read(&path).map_err(|e| bad(e.to_string()))?;
+        let record: Value = serde_json::from_slice(&bytes).map_err(|e| bad(e.to_string()))?;
+        let settings = Settings { file, record };
+        match settings.text("method") {
+            Some("sparselgs") => Ok(settings),
+            Some(method) => Err(Error::input(format!(
+                "{}: made with --method {method}; photos can be added to scenes of --method sparselgs",
+                settings.file
+            ))),
+            None => Err(Error::input(format!(
+                "{}: the scene has no language; --add takes a scene that splatvk run wrote, for splatvk train give all photos at once",
+                settings.file
+            ))),
+        }
+    }
+
+    fn plan(&self, name: &str) -> &Value {
+        &self.record["config"]["plan"][name]
+    }
+
+    fn text(&self, name: &str) -> Option<&str> {
+        self.plan(name).as_str()
+    }
+
+    /// The source that `--option` was resolved to.
+    pub fn source(&self, option: &str) -> Option<&str> {
+        self.text(option)
+    }
+
+    /// The preset that was used.
+    pub fn preset(&self) -> Option<Preset> {
+        serde_json::from_value(self.record["config"]["preset"].clone()).ok()
+    }
+
+    /// Length of the codes.
+    pub fn feature_dim(&self) -> Option<usize> {
+        usize::try_from(self.plan("feature_dim").as_u64()?).ok()
+    }
+
+    /// Queries that were asked, then `more` that are new.
+    pub fn queries(&self, more: &[String]) -> Vec<String> {
+        let old = self.plan("queries").as_array().into_iter().flatten();
+        let mut all: Vec<String> = old.filter_map(|q| Some(q.as_str()?.to_owned())).collect();
+        for query in more {
+            if !all.contains(query) {
+                all.push(query.clone());
+            }
+        }
+        all
+    }
+
+    /// How the camera of a photo was found; where that was not estimated, cameras were given and stand.
+    fn fitted(&self, stem: &str) -> Fitted {
+        let list = self.record["statistics"]["geometry"]["optics"].as_array();
+        let own = list.into_iter().flatten().find(|o| o["photo"].as_str() == Some(stem));
+        let Some(own) = own else { return Fitted { agreement: 1.0, ..Fitted::default() } };
+        let number = |value: &Value| value.as_f64().unwrap_or(0.0);
+        let sigma = |name: &str| number(&own["sigma"][name]);
+        Fitted {
+            lens: Lens { k1: number(&own["k1"]), k2: number(&own["k2"]) },
+            sigmas: ["log_focal", "k1", "k2", "cx", "cy"].map(sigma),
+            residual: number(&own["residual_px"]),
+            agreement: number(&own["agreement"]),
+            rotation_sigma: number(&own["rotation_sigma_degrees"]).to_radians(),
+            camera: own["camera"].as_u64().and_then(|c| usize::try_from(c).ok()).unwrap_or(0),
+        }
+    }
+}
+
+/// A scene that goes on.
+#[derive(Clone, Debug)]
+pub struct BaseScene {
+    /// Its photos with their cameras.
+    pub known: KnownPhotos,
+    /// Its splats, all of them.
+    pub splats: Splats,
+    /// What the photos show of them; nothing in scenes of earlier versions.
+    pub seen: Seen,
+    /// How it lies in the world.
+    pub world: World,
+    /// Codes and features.
+    pub field: LanguageField,
+    /// Points of its surfaces.
+    pub points: PointCloud,
+    /// A checksum of all this, for [`crate::pipeline::Stage::settings`].
+    pub identity: String,
+}
+
+impl BaseScene {
+    /// Reads a scene directory that `splatvk run` wrote.
+    pub fn open(path: &Path) -> Result<BaseScene> {
+        let settings = Settings::read(path)?;
+        let photos = scene_photos::load(path)?;
+        let scene = scene_dir::load(path)?;
+        let field = scene.language.ok_or_else(|| {
+            Error::input(format!("{}: the scene has no language; make it with splatvk run", path.display()))
+        })?;
+        if photos.len() != scene.cameras.len() {
+            return Err(Error::input(format!(
+                "{}: {} photos and {} cameras; the scene is damaged, run again",
+                path.display(),
+                photos.len(),
+                scene.cameras.len()
+            )));
+        }
+        let named = |(camera, photo): (Camera, &Photo)| {
+            let name =
+                photo.path.file_name().map_or_else(|| photo.stem.clone(), |n| n.to_string_lossy().into());
+            Camera { name, ..camera }
+        };
+        let cameras = scene.cameras.into_iter().zip(&photos).map(named).collect();
+        let fitted = photos.iter().map(|p| settings.fitted(&p.stem)).collect();
+        let points = colmap::read_points(&path.join("cameras/colmap"))?;
+        Ok(BaseScene {
+            identity: identity(path)?,
+            known: KnownPhotos { photos, cameras, fitted },
+            splats: scene.splats,
+            seen: scene.seen,
+            world: scene.world,
+            field,
+            points,
+        })
+    }
+
+    /// Refuses photos that cannot be added: too many, or under a name that the scene has.
+    pub fn check(&self, new: &[Photo]) -> Result<()> {
+        let all: Vec<Photo> = self.known.photos.iter().chain(new).cloned().collect();
+        if all.len() > photo::MAX_VIEWS {
+            return Err(Error::input(format!(
+                "{} photos in the scene and {} more; a scene has at most {}",
+                self.known.photos.len(),
+                new.len(),
+                photo::MAX_VIEWS
+            )));
+        }
+        photo::check_set(&all)
+    }
+}
+
+fn identity(path: &Path) -> Result<String> {
+    let mut sums = Vec::new();
+    for file in
+        ["point_cloud.ply", "run.json", "scene.json", "cameras/transforms.json", "language/features.npz"]
+    {
+        let file = path.join(file);
+        sums.push(files::content_hash(&file).map_err(Error::io(&file))?);
+    }
+    Ok(sums.join(" "))
+}
+
+/// A free folder beside a scene, for the scene with more photos: its name with the next number, `scene-2`, `scene-3`, ….
+pub fn next_to(scene: &Path) -> std::path::PathBuf {
+    let full = scene.canonicalize().unwrap_or_else(|_| scene.to_path_buf());
+    let name = full.file_name().map_or_else(|| "scene".to_owned(), |n| n.to_string_lossy().into_owned());
+    let numbered =
+        name.rsplit_once('-').and_then(|(stem, n)| Some((stem.to_owned(), n.parse::<u32>().ok()?)));
+    let (stem, first) = numbered.map_or((name, 2), |(stem, n)| (stem, n.saturating_add(1)));
+    // Of "." and "scene/.." only the full path has a parent.
+    let parent = if scene.file_name().is_some() { scene.parent() } else { full.parent() };
+    let parent = parent.unwrap_or(Path::new(""));
+    let free = |p: &std::path::PathBuf| p.symlink_metadata().is_err();
+    let all = (first..=u32::MAX).map(|n| parent.join(format!("{stem}-{n}")));
+    all.into_iter().find(free).unwrap_or_else(|| scene.with_extension("more"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_next_scene_gets_the_next_free_number() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        for name in ["cup", "cup-2", "cup-7"] {
+            std::fs::create_dir(at(name)).unwrap();
+        }
+        assert_eq!(next_to(&at("cup")), at("cup-3"));
+        assert_eq!(next_to(&at("cup-2")), at("cup-3"));
+        assert_eq!(next_to(&at("cup-7")), at("cup-8"));
+    }
+}

@@ -1,0 +1,312 @@
+//! Photos that join a finished scene: their cameras, the surfaces that they add, and their masks under the scene's codes.
+use super::cameras::{KnownGeometry, PlacedPhotos};
+use super::shared;
+use crate::fit::{self, Preset, RgbOptions, Trained};
+use crate::language::{self, BuildOptions, Language, SceneView, ViewMasks};
+use crate::pass::renderer::Renderer;
+use crate::photo::Photo;
+use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
+use crate::pose::stereo::StereoOptions;
+use crate::pose::{self, Geometry, SparseModel};
+use crate::run::base::BaseScene;
+use crate::run::refine::ViewRefiner;
+use crate::run::view::{self, Viewer};
+use crate::scene::{Camera, DepthMap, Plane, Splats, Up};
+use crate::{Error, Result};
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+/// Places new photos in a scene: by matches with its photos, then against its splats.
+pub struct AddedCameras {
+    /// The scene.
+    pub base: Arc<BaseScene>,
+    /// As they were read.
+    pub photos: Vec<Photo>,
+    /// Of the samples of RANSAC.
+    pub seed: u64,
+}
+
+impl Stage for AddedCameras {
+    const NAME: &'static str = "added-cameras";
+    const LANE: Lane = Lane::Device;
+    type Inputs = ();
+    type Output = PlacedPhotos;
+
+    fn settings(&self) -> String {
+        let names: Vec<String> = self.photos.iter().map(super::cameras::identity).collect();
+        format!("{} {names:?} {}", self.base.identity, self.seed)
+    }
+
+    fn codec() -> Option<Codec<PlacedPhotos>> {
+        kept()
+    }
+
+    fn run(self, (): (), context: &Context) -> Result<PlacedPhotos> {
+        let (progress, count) = (context.progress, self.base.known.photos.len());
+        let pose::SolvedCameras { photos, mut model, left_out, method } =
+            pose::add(&self.base.known, self.photos, context.registry, self.seed, progress)?;
+        progress.begin("refining", (photos.len() - count) as u64);
+        let refiner = ViewRefiner::new(context.device, &self.base.splats)?;
+        for (k, photo) in photos.iter().enumerate().skip(count) {
+            let refined = refiner.refine(&model.cameras[k], &photo.image, progress)?;
+            model.cameras[k] = refined.camera;
+            let text = format!(
+                "{}: turned by {:.2}°, moved by {:.2} % of the depth",
+                photo.stem,
+                refined.rotation_degrees,
+                100.0 * refined.centre_fraction
+            );
+            progress.step((k + 1 - count) as u64, &text);
+        }
+        progress.end();
+        Ok(PlacedPhotos { photos, left_out, known: KnownGeometry::Sparse(model, method) })
+    }
+}
+
+/// Depth of all photos and the points that the new ones add: stereo for the new photos and their neighbours, what the scene renders
+/// for the others.
+pub struct AddedDepth {
+    /// The scene.
+    pub base: Arc<BaseScene>,
+    /// Time against quality.
+    pub preset: Preset,
+    /// Of the planes that stereo tries.
+    pub seed: u64,
+}
+
+/// Photos of the scene that the depth of a new one is matched with: with itself four, the number that stereo was tuned on. Each
+/// takes as long as the new photo.
+const NEIGHBOURS: usize = 3;
+
+impl Stage for AddedDepth {
+    const NAME: &'static str = "added-depth";
+    const LANE: Lane = Lane::Device;
+    type Inputs = (Output<PlacedPhotos>,);
+    type Output = Geometry;
+
+    fn settings(&self) -> String {
+        format!("{:?}", StereoOptions::preset(self.preset).seeded(self.seed))
+    }
+
+    fn codec() -> Option<Codec<Geometry>> {
+        kept()
+    }
+
+    fn run(self, (placed,): (&PlacedPhotos,), context: &Context) -> Result<Geometry> {
+        let KnownGeometry::Sparse(model, method) = &placed.known else {
+            return Err(Error::work("added photos have cameras and sparse points"));
+        };
+        let (count, all) = (self.base.known.photos.len(), placed.photos.len());
+        let shown = shown_splats(&self.base, context)?;
+        let mut renderer = Renderer::new(context.device, &shown, &[], 0)?;
+        let rendered: Vec<Plane<f32>> =
+            model.cameras.iter().map(|c| Ok(renderer.render(c)?.depth)).collect::<Result<_>>()?;
+
+        let views = with_neighbours(model, count, all);
+        let pick = |v: &usize| (placed.photos[*v].clone(), model.cameras[*v].clone());
+        let (photos, cameras): (Vec<Photo>, Vec<Camera>) = views.iter().map(pick).unzip();
+        let sparse = SparseModel { cameras, points: model.points.clone(), ..SparseModel::default() };
+        let options = StereoOptions::preset(self.preset).seeded(self.seed);
+        let dense = pose::dense(context.device, &photos, sparse, String::new(), &options, context.progress)?;
+
+        let mut depths: Vec<DepthMap> = rendered.iter().map(trusted).collect();
+        for (view, depth) in views.iter().zip(dense.depths) {
+            depths[*view] = depth;
+        }
+        let new: Vec<_> = (count..all).map(|v| (&model.cameras[v], &depths[v], &rendered[v])).collect();
+        let mut points = fit::new_surface(&dense.points, &new);
+        points.view.iter_mut().for_each(|v| *v = views[usize::from(*v)] as u8);
+        Ok(Geometry {
+            cameras: model.cameras.clone(),
+            points,
+            depths,
+            focal_log_sigma: model.focal_log_sigma,
+            fitted: model.fitted.clone(),
+            method: method.clone(),
+        })
+    }
+}
+
+/// The splats of a scene that its photos show: what it guessed where none looks is guessed anew with the new ones.
+fn shown_splats(base: &BaseScene, context: &Context) -> Result<Splats> {
+    let rows = if base.seen.pixels.is_empty() {
+        view::seen(context.device, &base.splats, &base.known.cameras, context.progress)?.rows(&base.splats)
+    } else {
+        base.seen.rows(&base.splats)
+    };
+    Ok(base.splats.picked(&rows))
+}
+
+/// New views and, of the others, those that share most points with each of them; ascending.
+fn with_neighbours(model: &SparseModel, known: usize, all: usize) -> Vec<usize> {
+    let mut views: BTreeSet<usize> = (known..all).collect();
+    for new in known..all {
+        let mut shared = vec![0usize; known];
+        for point in model.points.iter().filter(|p| p.views.iter().any(|v| v.0 == new)) {
+            point.views.iter().filter(|v| v.0 < known).for_each(|v| shared[v.0] += 1);
+        }
+        let mut order: Vec<usize> = (0..known).collect();
+        order.sort_by_key(|v| (std::cmp::Reverse(shared[*v]), *v));
+        views.extend(order.into_iter().take(NEIGHBOURS));
+    }
+    views.into_iter().collect()
+}
+
+/// Depth as the scene renders it, as sure as where several photos agreed on it: they trained it.
+fn trusted(depth: &Plane<f32>) -> DepthMap {
+    let confidence = depth.data.iter().map(|z| if *z > 0.0 { 0.9 } else { 0.0 }).collect();
+    DepthMap {
+        confidence: Plane { width: depth.width, height: depth.height, data: confidence },
+        depth: depth.clone(),
+    }
+}
+
+/// Trains a scene on with all photos.
+pub struct TrainOn {
+    /// The scene.
+    pub base: Arc<BaseScene>,
+    /// How.
+    pub options: RgbOptions,
+}
+
+impl Stage for TrainOn {
+    const NAME: &'static str = "added-splats";
+    const LANE: Lane = Lane::Device;
+    type Inputs = (Output<PlacedPhotos>, Output<Geometry>);
+    type Output = Trained;
+
+    fn settings(&self) -> String {
+        format!("{} {:?}", self.base.identity, self.options)
+    }
+
+    fn codec() -> Option<Codec<Trained>> {
+        kept()
+    }
+
+    fn run(self, (placed, geometry): (&PlacedPhotos, &Geometry), context: &Context) -> Result<Trained> {
+        let scene = shown_splats(&self.base, context)?;
+        let (count, all) = (self.base.known.photos.len(), placed.photos.len());
+        let options = self.options.going_on(count, all - count, scene.len());
+        fit::train_on(
+            context.device,
+            &shared::images(&placed.photos),
+            &geometry.cameras,
+            scene,
+            &geometry.points,
+            &geometry.depths,
+            &options,
+            context.progress,
+        )
+    }
+}
+
+/// The new photos alone, for what the scene has of its own already.
+pub struct OnlyAdded {
+    /// Photos of the scene.
+    pub known: usize,
+}
+
+impl Stage for OnlyAdded {
+    const NAME: &'static str = "added-photos";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<PlacedPhotos>,);
+    type Output = PlacedPhotos;
+
+    fn settings(&self) -> String {
+        self.known.to_string()
+    }
+
+    fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<PlacedPhotos> {
+        Ok(PlacedPhotos { photos: placed.photos[self.known..].to_vec(), ..placed.clone() })
+    }
+}
+
+/// [`OnlyAdded`] for cameras and depth.
+pub struct OnlyAddedGeometry {
+    /// Photos of the scene.
+    pub known: usize,
+}
+
+impl Stage for OnlyAddedGeometry {
+    const NAME: &'static str = "added-geometry";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<Geometry>,);
+    type Output = Geometry;
+
+    fn settings(&self) -> String {
+        self.known.to_string()
+    }
+
+    fn run(self, (geometry,): (&Geometry,), _: &Context) -> Result<Geometry> {
+        Ok(Geometry {
+            cameras: geometry.cameras[self.known..].to_vec(),
+            depths: geometry.depths[self.known..].to_vec(),
+            ..geometry.clone()
+        })
+    }
+}
+
+/// Brings the masks of new photos under the codes of the scene; what matches none of its things gets a code of its own.
+pub struct AlignAdded {
+    /// The scene.
+    pub base: Arc<BaseScene>,
+    /// Thresholds of the alignment, length of the codes.
+    pub options: BuildOptions,
+}
+
+impl Stage for AlignAdded {
+    const NAME: &'static str = "added-alignment";
+    const LANE: Lane = Lane::Device;
+    type Inputs = (Output<Vec<ViewMasks>>, Output<Geometry>, Output<Trained>);
+    type Output = Language;
+
+    fn settings(&self) -> String {
+        format!("{} {:?}", self.base.identity, self.options)
+    }
+
+    fn codec() -> Option<Codec<Language>> {
+        kept()
+    }
+
+    fn run(
+        self,
+        (masks, geometry, trained): (&Vec<ViewMasks>, &Geometry, &Trained),
+        context: &Context,
+    ) -> Result<Language> {
+        let (base, count) = (&self.base, self.base.known.photos.len());
+        let mut viewer = Viewer::new(context.device, &base.splats, &base.field)?;
+        // What the scene says of its own photos is what they go on to teach.
+        let known = base.known.cameras.iter().map(|c| viewer.codes(c)).collect::<Result<Vec<_>>>()?;
+        let new = trained.cameras[count..].iter().zip(&geometry.depths[count..]);
+        let new = new
+            .map(|(camera, measured)| {
+                let frame = viewer.view(camera)?;
+                Ok(SceneView {
+                    camera: camera.clone(),
+                    codes: frame.codes,
+                    depth: frame.rendered.depth,
+                    measured,
+                })
+            })
+            .collect::<Result<Vec<_>>>()?;
+        language::join(&base.field, known, &new, masks, &self.options, context.progress)
+    }
+}
+
+/// The direction up that the scene states.
+pub struct KnownUp(pub Option<Up>);
+
+impl Stage for KnownUp {
+    const NAME: &'static str = "known-up";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = ();
+    type Output = Option<Up>;
+
+    fn settings(&self) -> String {
+        format!("{:?}", self.0)
+    }
+
+    fn run(self, (): (), _: &Context) -> Result<Option<Up>> {
+        Ok(self.0)
+    }
+}
