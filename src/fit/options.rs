@@ -113,17 +113,10 @@ impl RgbOptions {
     /// The same options for a scene of `known` photos that goes on with `new` more: its cameras are held, and each new photo may bring
     /// as many splats as one of the scene's has on average, `splats` in all.
     pub fn going_on(self, known: usize, new: usize, splats: usize) -> Self {
-        let env = |n: &str, d: f64| std::env::var(n).ok().and_then(|v| v.parse().ok()).unwrap_or(d);
-        let steps = (self.iterations as f64 * env("ADD_STEPS", 0.5)) as usize;
-        let mut options = self.with_iterations(steps);
+        let steps = self.iterations.div_ceil(2);
+        // Half-size photos would undo what the scene shows already.
+        let mut options = RgbOptions { coarse: 0.0, ..self.with_iterations(steps) };
         options.held = known;
-        options.coarse = env("ADD_COARSE", 0.0);
-        let k = env("ADD_RATE", 1.0);
-        options.rates.means.start *= k;
-        options.rates.log_scales *= k;
-        options.rates.quats *= k;
-        options.rates.opacity *= k;
-        options.rates.sh_dc *= k;
         options.init.max_points = options.init.max_points.min((splats * new).div_ceil(known.max(1)));
         options
     }

@@ -9,14 +9,13 @@ use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, SparseModel};
 use crate::run::base::BaseScene;
-use crate::run::refine::ViewRefiner;
 use crate::run::view::{self, Viewer};
 use crate::scene::{Camera, DepthMap, Plane, Splats, Up};
 use crate::{Error, Result};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Places new photos in a scene: by matches with its photos, then against its splats.
+/// Places new photos in a scene by matches with its photos; training moves their cameras on against its splats.
 pub struct AddedCameras {
     /// The scene.
     pub base: Arc<BaseScene>,
@@ -42,23 +41,8 @@ impl Stage for AddedCameras {
     }
 
     fn run(self, (): (), context: &Context) -> Result<PlacedPhotos> {
-        let (progress, count) = (context.progress, self.base.known.photos.len());
-        let pose::SolvedCameras { photos, mut model, left_out, method } =
-            pose::add(&self.base.known, self.photos, context.registry, self.seed, progress)?;
-        progress.begin("refining", (photos.len() - count) as u64);
-        let refiner = ViewRefiner::new(context.device, &self.base.splats)?;
-        for (k, photo) in photos.iter().enumerate().skip(count) {
-            let refined = refiner.refine(&model.cameras[k], &photo.image, progress)?;
-            model.cameras[k] = refined.camera;
-            let text = format!(
-                "{}: turned by {:.2}°, moved by {:.2} % of the depth",
-                photo.stem,
-                refined.rotation_degrees,
-                100.0 * refined.centre_fraction
-            );
-            progress.step((k + 1 - count) as u64, &text);
-        }
-        progress.end();
+        let pose::SolvedCameras { photos, model, left_out, method } =
+            pose::add(&self.base.known, self.photos, context.registry, self.seed, context.progress)?;
         Ok(PlacedPhotos { photos, left_out, known: KnownGeometry::Sparse(model, method) })
     }
 }
