@@ -87,6 +87,8 @@ impl Settings {
             sigmas: ["log_focal", "k1", "k2", "cx", "cy"].map(sigma),
             residual: number(&own["residual_px"]),
             agreement: number(&own["agreement"]),
+            // What else makes a place doubtful is not recorded by itself.
+            unconfirmed: own["confidence"] == "low",
             rotation_sigma: number(&own["rotation_sigma_degrees"]).to_radians(),
             camera: own["camera"].as_u64().and_then(|c| usize::try_from(c).ok()).unwrap_or(0),
         }

@@ -3,12 +3,12 @@ use super::families::{corner_families, keypoints};
 use super::finish::{agreement, inlier_matches};
 use super::grow::{MIN_RESECTION, Resection, resection};
 use super::model::{Freedom, Model, Sighting, Track};
-use super::prior::empty_model;
-use super::relate::{MIN_INLIERS, Matches, Pair, Related, THRESHOLD, related_to};
+use super::pair::{Matches, Pair};
+use super::relate::{MIN_INLIERS, Related, THRESHOLD, related_to};
 use super::tracks::{self, KeypointMatch};
 use super::unplaced::Unplaced;
 use crate::math::median;
-use crate::photo::Photo;
+use crate::photo::{Photo, cameras_by_file};
 use crate::pose::bundle::{Optics, OpticsPrior};
 use crate::pose::choose::Reason;
 use crate::pose::matching::Keypoints;
@@ -79,7 +79,7 @@ pub fn with_added(
     model.prune(threshold);
     let shares = agreement(&model, &pairs, threshold);
     check_sightings(&model, photos, count)?;
-    let out = sparse_model(&model, photos, known, &shares, &sigmas);
+    let out = sparse_model(&model, photos, known, &pairs, &shares, &sigmas);
     progress.step(3, &format!("{} points", out.points.len()));
     progress.end();
     Ok(out)
@@ -87,9 +87,9 @@ pub fn with_added(
 
 /// The known cameras, and for the other photos the optics of those; an error that names a photo of another camera.
 fn start_model(photos: &[Photo], cameras: &[Camera], seed: u64) -> Result<Model, Unplaced> {
-    let by_file = empty_model(photos, seed);
     let known = |v: usize| cameras.get(v);
     let views = || 0..photos.len();
+    let middle = |v: usize| DVec2::new(photos[v].image.width as f64, photos[v].image.height as f64) * 0.5;
     let by_view = views().map(|v| match known(v) {
         Some(c) => {
             let optics = Optics { focal: 0.5 * (c.fx + c.fy), lens: Lens::NONE, shift: DVec2::ZERO };
@@ -107,11 +107,11 @@ fn start_model(photos: &[Photo], cameras: &[Camera], seed: u64) -> Result<Model,
     let (optics, priors) = by_view.collect::<Result<Vec<_>, Unplaced>>()?.into_iter().unzip();
     Ok(Model {
         poses: views().map(|v| known(v).map(|c| c.pose)).collect(),
-        centres: views().map(|v| known(v).map_or(by_file.centres[v], |c| DVec2::new(c.cx, c.cy))).collect(),
+        centres: views().map(|v| known(v).map_or(middle(v), |c| DVec2::new(c.cx, c.cy))).collect(),
         group: views().collect(),
         alike: views().collect(),
         separable: views().collect(),
-        zoom: views().map(|v| if known(v).is_some() { 1.0 } else { by_file.zoom[v] }).collect(),
+        zoom: views().map(|v| if known(v).is_some() { 1.0 } else { photos[v].zoom() }).collect(),
         optics,
         priors,
         freedom: Freedom::Focal,
@@ -122,7 +122,7 @@ fn start_model(photos: &[Photo], cameras: &[Camera], seed: u64) -> Result<Model,
 
 /// The optics of a photo of the scene that was taken with the same camera as a new one by their files, and the σ of what may differ.
 fn shared_optics(photos: &[Photo], cameras: &[Camera], view: usize) -> Option<(Optics, OpticsPrior)> {
-    let by_file = empty_model(photos, 0).group;
+    let by_file = cameras_by_file(photos);
     let alike = (0..cameras.len()).find(|o| by_file[*o] == by_file[view])?;
     let (taken, photo) = (photos[alike].original_camera(&cameras[alike]), &photos[alike]);
     let middle = DVec2::new(f64::from(photo.original_size.0), f64::from(photo.original_size.1)) * 0.5;
@@ -258,12 +258,14 @@ fn sparse_model(
     model: &Model,
     photos: &[Photo],
     known: Known,
+    pairs: &[Pair],
     shares: &[f64],
     sigmas: &[Sigmas],
 ) -> SparseModel {
-    let by_file = empty_model(photos, 0).group;
+    let by_file = cameras_by_file(photos);
     let highest = known.fitted.iter().map(|f| f.camera + 1).max().unwrap_or(0);
     let count = known.cameras.len();
+    let own = |v: usize| pairs.iter().filter(move |p| [p.matches.first, p.matches.second].contains(&v));
     let camera = |v: usize| match known.cameras.get(v) {
         Some(c) => c.clone(),
         None => {
@@ -290,6 +292,8 @@ fn sparse_model(
                 sigmas: [sigmas[v].log_focal, 0.0, 0.0, 0.0, 0.0],
                 residual: model.residual(v),
                 agreement: shares[v],
+                // One pair whose matches are few or mostly contradict each other confirms nothing.
+                unconfirmed: own(v).count() < 2 && !own(v).any(|p| p.sure),
                 rotation_sigma: sigmas[v].rotation,
                 camera: alike.map_or(highest + by_file[v], |o| known.fitted[o].camera),
             }

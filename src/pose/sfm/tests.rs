@@ -2,8 +2,7 @@ use super::*;
 use crate::pose::align::pose_errors;
 use crate::pose::testing::{self, bilinear, lensed};
 use crate::progress::Silent;
-use crate::scene::{Camera, Lens, RgbImage};
-use glam::DVec2;
+use crate::scene::{Camera, RgbImage};
 
 /// Learned features when the model pack is installed.
 fn learned(photos: &[Photo]) -> Vec<Keypoints> {
