@@ -9,7 +9,8 @@ use crate::language::sam::SamOptions;
 use crate::run::base::{Settings, next_to};
 use crate::run::method::METHODS;
 use crate::run::sources::{
-    self, DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice, SourceKind, choose,
+    self, DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice, SourceKind,
+    choose,
 };
 use crate::run::{Method, RunPlan};
 use crate::{Error, Result};

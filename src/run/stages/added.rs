@@ -91,7 +91,9 @@ impl Stage for AddedDepth {
         let (photos, cameras): (Vec<Photo>, Vec<Camera>) = views.iter().map(pick).unzip();
         let sparse = SparseModel { cameras, points: model.points.clone(), ..SparseModel::default() };
         let options = StereoOptions::preset(self.preset).seeded(self.seed);
-        let dense = pose::dense(context.device, &photos, sparse, String::new(), &options, context.progress)?;
+        let priors: Vec<_> = photos.iter().map(|_| None).collect();
+        let dense =
+            pose::dense(context.device, &photos, &priors, sparse, String::new(), &options, context.progress)?;
 
         let mut depths: Vec<DepthMap> = rendered.iter().map(trusted).collect();
         for (view, depth) in views.iter().zip(dense.depths) {
