@@ -239,6 +239,21 @@ mod tests {
     }
 
     #[test]
+    fn cameras_that_rest_on_one_doubtful_pair_are_named() {
+        let truth = testing::train(&testing::folder());
+        let mut model = SparseModel { fitted: vec![Fitted::default(); 4], ..Default::default() };
+        let warned = |model: &SparseModel| {
+            let recorded = Recorded::new(&Silent);
+            warn_of_doubt(&truth.photos, model, &recorded);
+            recorded.warnings()
+        };
+        assert!(warned(&model).is_empty());
+        model.fitted[2].unconfirmed = true;
+        let all = warned(&model);
+        assert!(all.len() == 1 && all[0].starts_with("the cameras of train_02 may be wrong"), "{all:?}");
+    }
+
+    #[test]
     fn placed_photos_are_straight_and_in_one_light() {
         let truth = testing::train(&testing::folder());
         let registry = Registry::open(None).unwrap();

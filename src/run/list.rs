@@ -6,14 +6,15 @@ use super::sources::{
     self, DepthSources, FeatureSources, GeometrySources, Given, GraphBuilder, MaskSources, MatchSources,
     PosedPhotos,
 };
-use super::stages::{self, CameraOrigin, PlacedPhotos};
-use crate::fit::{Trained, TrainedLanguage};
+use super::stages::{self, CameraOrigin, PlacedPhotos, SharedEncoder};
+use crate::fit::{Preset, Trained, TrainedLanguage};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::language::Language;
 use crate::photo::Photo;
-use crate::pipeline::Output;
+use crate::pipeline::{Graph, Output};
 use crate::pose;
+use crate::query::TextQuery;
 use crate::report::viewer::CodeNames;
 use crate::run::view::DecodedFrame;
 use crate::scene::Up;
@@ -88,13 +89,8 @@ pub(super) fn scene(
     let regions = graph.add(stages::RegionFeatures { encoder: encoder.clone() }, (placed, masks));
     let (recipe, seed, space) = (plan.recipe(), plan.seed, encoder.space().to_owned());
     let aligned = graph.add(stages::Align { recipe, space, seed }, (regions, matches, geometry));
-    let names = graph.add(stages::NameCodes { encoder }, (aligned,));
-
-    let options = plan.language_options(preset);
-    let language = graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
-    let frames = graph.add(stages::DecodeViews, (trained, language));
-    let answers = graph.add(stages::AnswerQueries, (frames, language, queries));
-    Ok(SceneOutputs { placed, geometry, trained, up, aligned, names, language, frames, answers })
+    let aligned = Aligned { placed, geometry, trained, up, aligned, queries };
+    Ok(aligned.answered(graph, plan, preset, encoder))
 }
 
 /// The same for photos that join a scene.
@@ -137,10 +133,35 @@ pub(super) fn added(
     let align = recipe.build(encoder.space(), seed);
     let aligned =
         graph.add(stages::AlignAdded { base: base.clone(), options: align }, (regions, geometry, trained));
-    let names = graph.add(stages::NameCodes { encoder }, (aligned,));
-    let options = plan.language_options(preset);
-    let language = graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
-    let frames = graph.add(stages::DecodeViews, (trained, language));
-    let answers = graph.add(stages::AnswerQueries, (frames, language, queries));
-    Ok(SceneOutputs { placed, geometry, trained, up, aligned, names, language, frames, answers })
+    let aligned = Aligned { placed, geometry, trained, up, aligned, queries };
+    Ok(aligned.answered(graph, plan, preset, encoder))
+}
+
+/// What language training and answers start from.
+struct Aligned {
+    placed: Output<PlacedPhotos>,
+    geometry: Output<pose::Geometry>,
+    trained: Output<Trained>,
+    up: Output<Option<Up>>,
+    aligned: Output<Language>,
+    queries: Output<Vec<TextQuery>>,
+}
+
+impl Aligned {
+    /// Adds the stages that every list ends with.
+    fn answered(
+        self,
+        graph: &mut Graph<'static>,
+        plan: &RunPlan,
+        preset: Preset,
+        encoder: SharedEncoder,
+    ) -> SceneOutputs {
+        let Aligned { placed, geometry, trained, up, aligned, queries } = self;
+        let names = graph.add(stages::NameCodes { encoder }, (aligned,));
+        let (recipe, options) = (plan.recipe(), plan.language_options(preset));
+        let language = graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
+        let frames = graph.add(stages::DecodeViews, (trained, language));
+        let answers = graph.add(stages::AnswerQueries, (frames, language, queries));
+        SceneOutputs { placed, geometry, trained, up, aligned, names, language, frames, answers }
+    }
 }

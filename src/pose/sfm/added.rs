@@ -1,6 +1,6 @@
 //! Cameras of photos that join photos whose cameras are known (docs/method.md#photos-added-later).
 use super::families::{corner_families, keypoints};
-use super::finish::{agreement, inlier_matches};
+use super::finish::{agreement, inlier_matches, sparse_points};
 use super::grow::{MIN_RESECTION, Resection, resection};
 use super::model::{Freedom, Model, Sighting, Track};
 use super::pair::{Matches, Pair};
@@ -13,7 +13,7 @@ use crate::pose::bundle::{Optics, OpticsPrior};
 use crate::pose::choose::Reason;
 use crate::pose::matching::Keypoints;
 use crate::pose::numeric::{cauchy_weight, minimise_small};
-use crate::pose::{Fitted, SparseModel, SparsePoint};
+use crate::pose::{Fitted, SparseModel};
 use crate::progress::Progress;
 use crate::scene::{Camera, Lens, Pose};
 use crate::{Error, Result};
@@ -299,18 +299,9 @@ fn sparse_model(
             }
         }
     };
-    let point = |t: &Track| {
-        let views: Vec<(usize, DVec2)> = t
-            .sightings
-            .iter()
-            .map(|s| (s.view, model.straight(s.view, s.pixel) + model.principal_point(s.view)))
-            .collect();
-        let s = t.sightings.first()?;
-        Some(SparsePoint { position: t.position?, colour: photos[s.view].image.nearest(s.pixel), views })
-    };
     SparseModel {
         cameras: (0..photos.len()).map(camera).collect(),
-        points: model.tracks.iter().filter_map(point).collect(),
+        points: sparse_points(photos, model),
         focal_log_sigma: None,
         fitted: (0..photos.len()).map(fitted).collect(),
     }

@@ -234,8 +234,8 @@ fn on_straight(model: &mut Model, step: impl FnOnce(&mut Model)) {
     }
 }
 
-fn sparse_model(photos: &[Photo], model: &Model, outcome: Adjusted, trust: &Trust) -> Result<SparseModel> {
-    let cameras = cameras_of(photos, model)?;
+/// The triangulated tracks, with the colour that the first of their photos has there, as pinholes show them.
+pub(super) fn sparse_points(photos: &[Photo], model: &Model) -> Vec<SparsePoint> {
     let point = |t: &Track| {
         let views: Vec<(usize, DVec2)> = t
             .sightings
@@ -245,7 +245,12 @@ fn sparse_model(photos: &[Photo], model: &Model, outcome: Adjusted, trust: &Trus
         let s = t.sightings.first()?;
         Some(SparsePoint { position: t.position?, colour: photos[s.view].image.nearest(s.pixel), views })
     };
-    let points = model.tracks.iter().filter_map(point).collect();
+    model.tracks.iter().filter_map(point).collect()
+}
+
+fn sparse_model(photos: &[Photo], model: &Model, outcome: Adjusted, trust: &Trust) -> Result<SparseModel> {
+    let cameras = cameras_of(photos, model)?;
+    let points = sparse_points(photos, model);
     // Of the first photo's camera no more is known than of the angle to the next.
     let others = outcome.rotation_sigmas.iter().skip(1).copied().fold(f64::INFINITY, f64::min);
     let fitted = |v: usize| Fitted {
