@@ -138,6 +138,43 @@ typedef uint32_t SvkPreset;
 #endif // __cplusplus
 
 /*
+ Spherical-harmonics degree of colours: above 0 they depend on the direction.
+ */
+enum SvkShDegree
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : uint32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /*
+     What photos support that are left out for a test.
+     */
+    SVK_SH_DEGREE_AUTO = 0,
+    /*
+     The same from everywhere.
+     */
+    SVK_SH_DEGREE_ZERO = 1,
+    /*
+     4 numbers per colour channel.
+     */
+    SVK_SH_DEGREE_ONE = 2,
+    /*
+     9.
+     */
+    SVK_SH_DEGREE_TWO = 3,
+    /*
+     16.
+     */
+    SVK_SH_DEGREE_THREE = 4,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum SvkShDegree SvkShDegree;
+#else
+typedef uint32_t SvkShDegree;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/*
  What a call of the progress callback is about.
  */
 enum SvkProgressKind
@@ -605,6 +642,10 @@ typedef struct {
      How language gets onto the splats, as --method takes it. NULL = "sparselgs".
      */
     const char *method;
+    /*
+     SvkShDegree
+     */
+    uint64_t sh_degree;
 } SvkTrainOptions;
 
 /*

@@ -2,9 +2,10 @@
 #![allow(clippy::unwrap_used)] // helpers of tests
 use glam::DVec3;
 use splatvk::fit::schedule::Exponential;
-use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions};
+use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions, Trained, ViewDependentOptions};
 use splatvk::gpu::{Device, Options, TestDevice, test_device};
 use splatvk::math::Random;
+use splatvk::pass::metrics::psnr;
 use splatvk::pass::{FeatureMode, RasterOptions, Renderer};
 use splatvk::progress::Silent;
 use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, Plane, Pose, RgbImage, Splats};
@@ -77,9 +78,7 @@ fn a_perturbed_camera_is_recovered() {
     options.iterations = 900;
     // These splats stand still; at half the size they would need to look different.
     options.coarse = 0.0;
-    let still = Exponential::constant(0.0);
-    options.rates =
-        fit::Rates { means: still, log_scales: 0.0, quats: 0.0, opacity: 0.0, sh_dc: 0.0, sh_rest: 0.0 };
+    options.rates = fit::Rates::STILL;
     let rate = Exponential { start: 1e-3, end: 3e-5, steps: 900 };
     options.poses = Some(fit::pose::PoseOptions { start: 0, rate });
     let scale = fit::scale::SceneScale::measure(&truth, &splats.means);
@@ -135,6 +134,59 @@ fn faint_splats_are_pruned_and_broken_input_is_refused() {
     assert!(fit(start).unwrap_err().to_string().contains("faded"));
     let wrong = fit::fit_rgb(&device, &images[..1], &cameras, truth, scale, None, &options, &Silent);
     assert!(wrong.unwrap_err().to_string().contains("one camera per photo"));
+}
+
+/// Splats of SH degree 0 that are asked what they lack, with cameras that see `truth`.
+fn with_view_dependence(device: &Device, truth: &Splats, cameras: &[Camera], degree: Option<u32>) -> Trained {
+    let images = photos(device, truth, cameras);
+    let mut start = Splats { sh_degree: 0, ..truth.clone() };
+    start.sh = truth.sh.chunks_exact(3 * truth.sh_len()).flat_map(|row| row[..3].to_vec()).collect();
+    let options = RgbOptions {
+        iterations: 1,
+        rates: fit::Rates::STILL,
+        poses: None,
+        coarse: 0.0,
+        ..RgbOptions::preset(Preset::Draft)
+    };
+    let scale = fit::scale::SceneScale::measure(cameras, &start.means);
+    let trained = fit::fit_rgb(device, &images, cameras, start, scale, None, &options, &Silent).unwrap();
+    let before = (trained.splats.clone(), trained.cameras.clone());
+    let options = ViewDependentOptions::preset(Preset::Draft, degree, 0);
+    let found = fit::fit_view_dependent(device, &images, trained, &options, &Silent).unwrap();
+    assert_eq!(found.cameras, before.1);
+    let geometry = |s: &Splats| Splats { sh: Vec::new(), sh_degree: 0, ..s.clone() };
+    assert!(geometry(&found.splats) == geometry(&before.0), "only colours are fitted");
+    found
+}
+
+#[test]
+fn colours_depend_on_the_direction_where_photos_left_out_gain_by_it() {
+    let device = test_device();
+    let cameras = cameras(9);
+    let (held_out, seen) = cameras.split_at(1);
+    let matte = wall(500, 8);
+    // Brighter from the right: one slope for all, as a lamp far away makes it.
+    let mut glossy = Splats { sh_degree: 1, ..matte.clone() };
+    glossy.sh = matte.sh.chunks_exact(3).flat_map(|c| [c, &[0.0; 6], &[-0.5; 3]].concat()).collect();
+
+    let found = with_view_dependence(&device, &matte, seen, None);
+    assert_eq!((found.splats.sh_degree, found.stats.view_dependence.degree), (0, 0));
+    let trials = &found.stats.view_dependence.trials;
+    assert!(trials.len() == 3 && trials.iter().all(|t| !t.supported()), "{trials:?}");
+
+    let found = with_view_dependence(&device, &glossy, seen, None);
+    let trials = &found.stats.view_dependence.trials;
+    assert!(found.splats.sh_degree >= 1 && trials.last().unwrap().supported(), "{trials:?}");
+    let truth = &photos(&device, &glossy, held_out)[0];
+    let shown = |splats: &Splats| psnr(&photos(&device, splats, held_out)[0], truth);
+    let (before, after) = (shown(&matte), shown(&found.splats));
+    println!("{before:.1} dB without, {after:.1} dB with degree {}: {trials:.2?}", found.splats.sh_degree);
+    assert!(after > before + 1.0, "{before:.1} dB without, {after:.1} dB with");
+
+    let found = with_view_dependence(&device, &glossy, &seen[..3], None);
+    assert!(found.splats.sh_degree == 0 && found.stats.view_dependence.trials.is_empty(), "too few photos");
+    let found = with_view_dependence(&device, &glossy, &seen[..3], Some(2));
+    assert!(found.splats.sh_degree == 2 && found.stats.view_dependence.trials.is_empty(), "as asked");
 }
 
 /// Two objects, left and right of x = 0: labels where the pixel is opaque, from the true features.

@@ -6,7 +6,6 @@ use super::workload::Workload;
 use crate::Result;
 use crate::fit::options::Rates;
 use crate::fit::scale::SceneScale;
-use crate::fit::schedule::Exponential;
 use crate::fit::{LanguageOptions, LanguageRun, Photos, Preset, RgbOptions, RgbRun, Training};
 use crate::gpu::{Device, Recorder};
 use crate::pass::renderer::Renderer;
@@ -15,33 +14,16 @@ use crate::scene::{Codebook, LevelField, Plane, RgbImage};
 
 /// Codes per level of the synthetic feature targets; a scene of four photos has about as many.
 const CODES: usize = 32;
-/// Far behind the schedule's end: all SH bands are in use (one more every 1000 steps).
+/// Far behind the schedule's end.
 const ITERATION: usize = 1_000_000;
-
-/// No parameter moves, all arithmetic is done.
-fn still() -> Rates {
-    Rates {
-        means: Exponential::constant(0.0),
-        log_scales: 0.0,
-        quats: 0.0,
-        opacity: 0.0,
-        sh_dc: 0.0,
-        sh_rest: 0.0,
-    }
-}
 
 /// Forward, L1 + SSIM, regularisers, backward, Adam: the step of the colour stage.
 pub fn colour(device: &Device, workload: &Workload, limits: (&Budget, &Roofline)) -> Result<Section> {
     device.reset_peak_memory();
     let target = [workload.target(device)?];
     let cameras = [workload.camera.clone()];
-    let options = RgbOptions {
-        rates: still(),
-        sh_degree: workload.splats.sh_degree,
-        poses: None,
-        coarse: 0.0,
-        ..RgbOptions::preset(Preset::Default)
-    };
+    let options =
+        RgbOptions { rates: Rates::STILL, poses: None, coarse: 0.0, ..RgbOptions::preset(Preset::Default) };
     let scale = SceneScale::measure(&cameras, &workload.splats.means);
     let photos = Photos { images: &target, cameras: &cameras, depths: None };
     let mut run = RgbRun::new(device, photos, &workload.splats, scale, &options)?;
@@ -68,7 +50,7 @@ pub fn with_features(
         (0..levels).map(|l| level(&target[0], features / levels, l as u64)).collect();
     let fields: Vec<&LevelField> = fields.iter().collect();
     let options = LanguageOptions {
-        rates: still(),
+        rates: Rates::STILL,
         feature_rate: 0.0,
         lift: false,
         check_every: 0,

@@ -149,6 +149,13 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Cal
         3 => Some(Preset::Paper),
         other => return bad_argument(format!("SvkTrainOptions.preset is {other}")),
     };
+    let sh_degree = match o.sh_degree {
+        0 => None,
+        degree @ 1..=4 => Some(degree as u32 - 1),
+        other => {
+            return bad_argument(format!("SvkTrainOptions.sh_degree is {other}; an SvkShDegree, 0 to 4"));
+        }
+    };
     if ![0, 3, 8, 16].contains(&o.feature_dim) {
         return bad_argument(format!("SvkTrainOptions.feature_dim is {}; 3, 8 or 16", o.feature_dim));
     }
@@ -180,6 +187,7 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Cal
         seed: o.seed,
         iterations: count(o.iterations),
         language_iterations: count(o.language_iterations),
+        sh_degree,
         method,
         feature_dim: if o.feature_dim == 0 { method.recipe.feature_dim } else { o.feature_dim as usize },
         per_level: o.per_level != 0,

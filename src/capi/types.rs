@@ -49,6 +49,22 @@ pub enum SvkPreset {
     Paper = 3,
 }
 
+/// Spherical-harmonics degree of colours: above 0 they depend on the direction.
+#[repr(u32)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SvkShDegree {
+    /// What photos support that are left out for a test.
+    Auto = 0,
+    /// The same from everywhere.
+    Zero = 1,
+    /// 4 numbers per colour channel.
+    One = 2,
+    /// 9.
+    Two = 3,
+    /// 16.
+    Three = 4,
+}
+
 /// What a call of the progress callback is about.
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -292,6 +308,8 @@ pub struct SvkTrainOptions {
     pub feature_source: *const c_char,
     /// How language gets onto the splats, as --method takes it. NULL = "sparselgs".
     pub method: *const c_char,
+    /// SvkShDegree
+    pub sh_degree: u64,
 }
 
 /// What a scene holds.

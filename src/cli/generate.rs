@@ -53,6 +53,7 @@ fn spec(args: &GenerateArgs) -> Result<SceneSpec> {
         objects: args.objects,
         baseline: args.baseline,
         texture: args.texture,
+        gloss: args.gloss,
         thin: args.thin,
         occlusion: args.occlusion,
         similar: args.similar,

@@ -161,6 +161,7 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         seed: args.seed,
         iterations: args.iterations,
         language_iterations: args.language_iterations,
+        sh_degree: args.making.sh_degree,
         method,
         feature_dim,
         per_level: args.per_level,

@@ -18,6 +18,7 @@ pub fn train(args: &TrainArgs) -> Result<()> {
         checkpoint_seconds: args.making.checkpoint_seconds,
         preset: args.making.preset.map(plan::preset),
         iterations: args.iterations,
+        sh_degree: args.making.sh_degree,
         seed: args.seed,
         max_size: plan::max_size(args.max_size)?,
         device: args.device.device.clone(),

@@ -52,7 +52,6 @@ pub fn train_on(
     progress: &dyn Progress,
 ) -> Result<Trained> {
     let mut start = scene;
-    raise_sh_degree(&mut start, options.sh_degree);
     let join = |start: &mut Splats, mut more: Splats| {
         raise_sh_degree(&mut more, start.sh_degree);
         start.append(more);

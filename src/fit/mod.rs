@@ -12,8 +12,10 @@ pub mod pose;
 mod rgb;
 pub mod scale;
 pub mod schedule;
+mod sh_degree;
 mod training;
 mod unseen;
+mod view_dependent;
 mod views;
 
 pub use crate::preset::Preset;
@@ -24,4 +26,6 @@ pub use language::{LanguagePoint, TrainedLanguage, train_language};
 pub use options::{InitOptions, LanguageOptions, Rates, RgbOptions};
 pub(crate) use rgb::Run as RgbRun;
 pub use rgb::{CurvePoint, FitStats, Trained, fit_rgb, train_rgb};
+pub use sh_degree::{DegreeTrial, ViewDependence};
 pub(crate) use training::Training;
+pub use view_dependent::{ViewDependentOptions, fit_view_dependent};

@@ -33,6 +33,18 @@ pub struct Rates {
     pub sh_rest: f64,
 }
 
+impl Rates {
+    /// Nothing moves.
+    pub const STILL: Rates = Rates {
+        means: Exponential { start: 0.0, end: 0.0, steps: 1 },
+        log_scales: 0.0,
+        quats: 0.0,
+        opacity: 0.0,
+        sh_dc: 0.0,
+        sh_rest: 0.0,
+    };
+}
+
 /// Options of [`super::train_rgb`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct RgbOptions {
@@ -73,8 +85,6 @@ pub struct RgbOptions {
     /// So many cameras, the first ones, never move: camera 0 holds the world frame, those of a scene that goes on also what was
     /// measured in it.
     pub held: usize,
-    /// SH degree of the result, 0–3.
-    pub sh_degree: u32,
     /// A point of the loss curve every so many steps.
     pub report_every: usize,
 }
@@ -194,7 +204,6 @@ impl RgbOptions {
             prune_from: 200,
             poses: Some(PoseOptions { start: 0, rate: Exponential { start: 1e-4, end: 1e-6, steps: 1000 } }),
             held: 1,
-            sh_degree: 0,
             report_every: 10,
         }
     }

@@ -6,6 +6,7 @@ use super::model::Model;
 use super::options::RgbOptions;
 use super::pose::PoseAdam;
 use super::scale::SceneScale;
+use super::sh_degree::ViewDependence;
 use super::training::{self, Review, Trainer, Training};
 use super::unseen::unseen_splats;
 use super::views::Views;
@@ -53,6 +54,9 @@ pub struct FitStats {
     pub splats: [usize; 2],
     /// Whether the refined cameras were kept.
     pub poses_refined: bool,
+    /// What photos say of colours that depend on the direction; empty where nobody asked.
+    #[serde(default)]
+    pub view_dependence: ViewDependence,
     /// Wall-clock time, seconds.
     pub seconds: f64,
 }
@@ -95,12 +99,11 @@ pub fn train_rgb(
     if options.bounded {
         start = Bounds::new(cameras, &points.positions).hold(start);
     }
-    super::init::raise_sh_degree(&mut start, options.sh_degree);
     let scale = SceneScale::of(cameras, points);
     fit_rgb(device, images, cameras, start, scale, depths, options, progress)
 }
 
-/// [`train_rgb`] from given splats instead of points.
+/// [`train_rgb`] from given splats instead of points, with the SH degree that they have.
 pub fn fit_rgb(
     device: &Device,
     images: &[RgbImage],
@@ -122,6 +125,7 @@ pub fn fit_rgb(
         psnr,
         splats: [start.len(), splats.len()],
         poses_refined,
+        view_dependence: ViewDependence::default(),
         seconds: clock.elapsed().as_secs_f64(),
     };
     Ok(Trained { splats, cameras, stats })
@@ -171,8 +175,11 @@ impl<'a> Run<'a> {
     ) -> Result<Self> {
         let half = (coarse_steps(options) > 0).then(|| HalfSizePhotos::of(&photos));
         let seen = half.as_ref().map_or(photos, HalfSizePhotos::photos);
-        let raster =
-            RasterOptions { sh_degree: 0, feature_mode: FeatureMode::Linear, features_move_geometry: true };
+        let raster = RasterOptions {
+            sh_degree: start.sh_degree,
+            feature_mode: FeatureMode::Linear,
+            features_move_geometry: true,
+        };
         let depths = used(seen.depths, options);
         let views = Views::new(device, seen.images, seen.cameras, depths, start.len(), 0, scale.near())?;
         let model = Model::new(device, start, 0)?;
@@ -318,14 +325,7 @@ impl Training for Run<'_> {
         if iteration >= coarse_steps(self.options) {
             self.leave_half_size()?;
         }
-        // One more SH band per 1000 steps (Kerbl et al. 2023), so that the low bands settle first.
-        let degree = self.options.sh_degree.min((iteration / 1000) as u32);
-        let t = &mut self.trainer;
-        if degree != t.raster.sh_degree {
-            t.raster.sh_degree = degree;
-            t.forget_recordings();
-        }
-        t.model.set_rates(&self.options.rates, 0.0, self.scale.extent, iteration)
+        self.trainer.model.set_rates(&self.options.rates, 0.0, self.scale.extent, iteration)
     }
 
     fn record(&self, view: usize) -> Recorder {

@@ -15,6 +15,9 @@ pub struct Light {
     pub sigma_ev: f64,
     /// One standard deviation of the corner's brightness, as a share of it; 0 where nothing was estimated.
     pub sigma_corner: f64,
+    /// Difference to the other photos' brightness, ln, that all this leaves in the tenth of the photo's parts that fits worst; 0 where
+    /// nothing was estimated.
+    pub unexplained: f64,
 }
 
 impl Default for Light {
@@ -25,7 +28,15 @@ impl Default for Light {
 
 impl Light {
     /// The scene's own light: nothing to take out.
-    pub const NONE: Light = Light { gain: [1.0; 3], falloff: [0.0; 2], sigma_ev: 0.0, sigma_corner: 0.0 };
+    pub const NONE: Light =
+        Light { gain: [1.0; 3], falloff: [0.0; 2], sigma_ev: 0.0, sigma_corner: 0.0, unexplained: 0.0 };
+    /// What may be left unexplained before the user should know of it, ln: half an f-stop.
+    const UNEXPLAINED: f64 = 0.35;
+
+    /// False where parts of the photo are lit differently than in the others: highlights, flash, a moving shadow.
+    pub fn explains_the_photo(&self) -> bool {
+        self.unexplained <= Light::UNEXPLAINED
+    }
 
     /// True where the photo is left as it is.
     pub fn is_none(&self) -> bool {

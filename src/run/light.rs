@@ -5,11 +5,11 @@ use serde_json::{Value, json};
 /// Per photo, for run.json; `None` where every photo was left as it is.
 pub(super) fn record(photos: &[Photo]) -> Option<Value> {
     let one = |p: &Photo| {
-        let Light { gain, falloff, sigma_ev, sigma_corner } = p.light;
+        let Light { gain, falloff, sigma_ev, sigma_corner, unexplained } = p.light;
         json!({
             "photo": p.stem, "exposure_ev": p.light.exposure_ev(), "exposure_doubt_ev": sigma_ev,
             "red_to_green": gain[0] / gain[1], "blue_to_green": gain[2] / gain[1],
-            "corner": p.light.corner(), "corner_doubt": sigma_corner, "gain": gain, "falloff": falloff,
+            "corner": p.light.corner(), "corner_doubt": sigma_corner, "gain": gain, "falloff": falloff, "unexplained": unexplained,
         })
     };
     taken(photos).then(|| photos.iter().map(one).collect())
@@ -56,8 +56,13 @@ mod tests {
         };
         let mut photos = vec![photo("a.png"), photo("b.png")];
         assert!(record(&photos).is_none() && figure(&photos).is_none());
-        photos[1].light =
-            Light { gain: [2.2, 2.0, 2.0], falloff: [-0.2, 0.0], sigma_ev: 0.04, sigma_corner: 0.01 };
+        photos[1].light = Light {
+            gain: [2.2, 2.0, 2.0],
+            falloff: [-0.2, 0.0],
+            sigma_ev: 0.04,
+            sigma_corner: 0.01,
+            unexplained: 0.0,
+        };
         let json = record(&photos).unwrap();
         assert_eq!((&json[0]["exposure_ev"], &json[1]["photo"]), (&json!(0.0), &json!("b")));
         assert!((json[1]["corner"].as_f64().unwrap() - (-0.2f64).exp()).abs() < 1e-12);

@@ -78,6 +78,8 @@ pub(super) fn scene(
     };
     let PosedPhotos { placed, geometry } = posed;
     let trained = build.graph.add(stages::TrainColour { options }, (placed, geometry));
+    let options = plan.view_dependent_options(preset);
+    let trained = build.graph.add(stages::ViewDependence { options }, (placed, trained));
     let up = build.graph.add(stages::Upright, (placed, geometry, trained));
 
     // First what can be refused: a phrase that a table of embeddings does not hold.
@@ -116,6 +118,8 @@ pub(super) fn added(
     let placed = graph.add(stages::AddedCameras { base: base.clone(), photos, seed }, ());
     let geometry = graph.add(stages::AddedDepth { base: base.clone(), preset, seed }, (placed,));
     let trained = graph.add(stages::TrainOn { base: base.clone(), options }, (placed, geometry));
+    let options = plan.view_dependent_options(preset);
+    let trained = graph.add(stages::ViewDependence { options }, (placed, trained));
     let up = match &base.world.up {
         Some(up) => graph.add(stages::KnownUp(Some(up.clone())), ()),
         None => graph.add(stages::Upright, (placed, geometry, trained)),

@@ -3,7 +3,7 @@ use super::budget;
 use super::method::{self, FEATURE_DIM, Method, Recipe};
 use super::sources::{self, SourceChoice};
 use crate::Result;
-use crate::fit::{LanguageOptions, Preset, RgbOptions};
+use crate::fit::{LanguageOptions, Preset, RgbOptions, ViewDependentOptions};
 use crate::gpu::Device;
 use crate::infer::{Compute, Registry};
 use crate::language::sam::SamOptions;
@@ -55,6 +55,8 @@ pub struct RunPlan {
     pub iterations: Option<usize>,
     /// Steps of the language stage instead of the preset's.
     pub language_iterations: Option<usize>,
+    /// SH degree of the colours, 0–3; `None` = what the photos support, and 0 in the paper's preset.
+    pub sh_degree: Option<u32>,
     /// What gets language onto the splats: [`super::method::SPARSELGS`] unless a baseline is wanted.
     pub method: &'static Method,
     /// Length of the codes.
@@ -96,6 +98,7 @@ impl Default for RunPlan {
             seed: 0,
             iterations: None,
             language_iterations: None,
+            sh_degree: None,
             method: &method::SPARSELGS,
             feature_dim: FEATURE_DIM,
             per_level: false,
@@ -149,6 +152,13 @@ impl RunPlan {
             options = options.with_iterations(n);
         }
         self.recipe().rgb(options)
+    }
+
+    /// Colours that depend on the direction. A method that trains no colours has none.
+    pub(super) fn view_dependent_options(&self, preset: Preset) -> ViewDependentOptions {
+        let trains = self.recipe().rgb(RgbOptions::preset(preset)).iterations > 0;
+        let degree = if trains { self.sh_degree } else { Some(0) };
+        ViewDependentOptions::preset(preset, degree, self.seed)
     }
 
     /// The language stage.

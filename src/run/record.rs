@@ -2,7 +2,7 @@
 use super::ask::Answers;
 use super::outcome::RunOutcome;
 use crate::Result;
-use crate::fit::{CurvePoint, FitStats, LanguagePoint};
+use crate::fit::{CurvePoint, FitStats, LanguagePoint, ViewDependence};
 use crate::photo::Photo;
 use crate::pose::{Confidence, Fitted};
 use crate::report::viewer::Scene3d;
@@ -62,6 +62,7 @@ fn statistics(o: &RunOutcome) -> serde_json::Value {
         "world": o.world,
         "light": super::light::record(&o.photos),
         "splats": { "start": o.rgb.splats[0], "end": o.splats.len(), "unseen": o.seen.unseen() },
+        "view_dependence": o.rgb.view_dependence,
         "psnr_train": o.rgb.psnr, "poses_refined": o.rgb.poses_refined,
         "loss": o.rgb.curve.iter().map(|p| json!([p.step, p.loss])).collect::<Vec<_>>(),
         "curves": curves,
@@ -222,6 +223,7 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
         splats_figure(&o.splats, &o.seen),
         super::fidelity::figure(&o.rgb),
     ];
+    list.extend(view_dependence_figure(&o.rgb.view_dependence));
     list.extend(added_figures(o));
     list.extend(
         focal_figure(&o.photos, &o.cameras, &o.geometry.fitted).map(|text| ("focal length".to_owned(), text)),
@@ -245,6 +247,18 @@ pub(super) fn splats_figure(splats: &Splats, seen: &Seen) -> (String, String) {
         n => format!(", {n} of them where no photo looks"),
     };
     ("splats".to_owned(), format!("{}{guessed}", splats.len()))
+}
+
+/// The SH degree of the colours, if it is not 0, and what photos say of it.
+pub(super) fn view_dependence_figure(found: &ViewDependence) -> Option<(String, String)> {
+    let text = match (found.degree, found.trials.last()) {
+        (0, _) => return None,
+        (degree, Some(t)) if t.supported() => {
+            format!("SH degree {degree}: photos left out are shown {:.1} dB better by it", t.gain)
+        }
+        (degree, _) => format!("SH degree {degree}"),
+    };
+    Some(("colours".to_owned(), text))
 }
 
 /// Which way is up, and what says so.

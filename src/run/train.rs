@@ -1,5 +1,5 @@
 //! Posed photos → scene without language: `splatvk train`.
-use crate::fit::{Preset, RgbOptions};
+use crate::fit::{Preset, RgbOptions, ViewDependentOptions};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras, colmap, ply};
 use crate::gpu::{self, Device};
@@ -38,6 +38,8 @@ pub struct TrainPlan {
     pub preset: Option<Preset>,
     /// Steps instead of the preset's.
     pub iterations: Option<usize>,
+    /// SH degree of the colours, 0–3; `None` = what the photos support, and 0 in the paper's preset.
+    pub sh_degree: Option<u32>,
     /// Seed of everything random.
     pub seed: u64,
     /// Greatest side of the working images, pixels; `None` = [`photo::default_max_size`] of the device.
@@ -154,6 +156,8 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let priors = graph.add(stages::DepthPriors::new(stages::PriorOrigin::None)?, (placed,));
     let geometry = graph.add(stages::DenseDepth { preset, seed: plan.seed }, (placed, priors));
     let trained = graph.add(stages::TrainColour { options }, (placed, geometry));
+    let options = ViewDependentOptions::preset(preset, plan.sh_degree, plan.seed);
+    let trained = graph.add(stages::ViewDependence { options }, (placed, trained));
     let up = graph.add(stages::Upright, (placed, geometry, trained));
     let targets = [placed.target(), geometry.target(), trained.target(), up.target()];
     let store = super::execute::store(plan.resume, plan.checkpoint_seconds);
@@ -199,6 +203,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
             "world": world,
             "light": super::light::record(&photos),
             "splats": { "start": trained.stats.splats[0], "end": trained.splats.len(), "unseen": seen.unseen() },
+            "view_dependence": trained.stats.view_dependence,
             "psnr_train": trained.stats.psnr, "poses_refined": trained.stats.poses_refined,
             "curves": curves,
         }),
@@ -210,6 +215,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         super::record::splats_figure(&trained.splats, &seen),
         super::fidelity::figure(&trained.stats),
     ];
+    figures.extend(super::record::view_dependence_figure(&trained.stats.view_dependence));
     figures.push(super::record::up_figure(&world));
     figures.extend(super::light::figure(&photos));
     let views = photos.iter().zip(&frames).zip(&trained.stats.psnr);

@@ -259,6 +259,7 @@ mod tests {
         }
         (
             SyntheticScene {
+                gloss: 0.0,
                 objects,
                 sky: None,
                 train: vec![],

@@ -26,6 +26,8 @@ pub struct SceneSpec {
     pub baseline: f64,
     /// Contrast of patterns, 1 = plenty to match, 0 = bare surfaces.
     pub texture: f64,
+    /// Strength of highlights, of full white: they move over the surfaces with the camera.
+    pub gloss: f64,
     /// Thin poles that stand about.
     pub thin: usize,
     /// 0 = objects far apart, 1 = close together and behind each other.
@@ -52,6 +54,7 @@ impl Default for SceneSpec {
             objects: 8,
             baseline: 20.0,
             texture: 1.0,
+            gloss: 0.0,
             thin: 0,
             occlusion: 0.3,
             similar: 0,
@@ -68,6 +71,8 @@ impl Default for SceneSpec {
 pub struct SyntheticScene {
     /// Background first.
     pub objects: Vec<SceneObject>,
+    /// Strength of highlights, of full white.
+    pub gloss: f64,
     /// Behind everything, if there is one.
     pub sky: Option<Sky>,
     /// True cameras of the photos, without distortion.
@@ -107,8 +112,8 @@ impl SceneSpec {
                 bad("--size: 64 to 4096 pixels a side")
             }
             k if !(1.0..=80.0).contains(&k.baseline) => bad("--baseline: 1 to 80 degrees"),
-            k if !(0.0..=1.0).contains(&k.occlusion) || !(0.0..=1.0).contains(&k.texture) => {
-                bad("--occlusion and --texture: 0 to 1")
+            k if [k.occlusion, k.texture, k.gloss].iter().any(|v| !(0.0..=1.0).contains(v)) => {
+                bad("--occlusion, --texture and --gloss: 0 to 1")
             }
             k if k.pose_noise < 0.0 || !(0.0..=0.5).contains(&k.photo_noise) => {
                 bad("--pose-noise: 0 or more; --photo-noise: 0 to 0.5")
@@ -152,7 +157,7 @@ pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
         Camera { pose: error.compose(&c.pose), ..c.clone() }
     });
     let noisy = noisy.collect();
-    Ok(SyntheticScene { objects, sky, train, photo_effects, test, noisy })
+    Ok(SyntheticScene { objects, gloss: spec.gloss, sky, train, photo_effects, test, noisy })
 }
 
 fn background(spec: &SceneSpec, random: &mut Random) -> Vec<SceneObject> {
@@ -170,13 +175,19 @@ fn background(spec: &SceneSpec, random: &mut Random) -> Vec<SceneObject> {
     ]
 }
 
+/// Objects whose middle is so far from the table's, in units, still stand on it.
+const TABLE: f64 = 0.5;
+
 /// Names and solids, placed without overlap; look-alikes and poles last.
 fn place_objects(spec: &SceneSpec, random: &mut Random, objects: &mut Vec<SceneObject>) -> Result<()> {
     let mut names: Vec<(usize, usize)> =
         (0..COLOURS.len()).flat_map(|c| (0..NOUNS.len()).map(move |n| (c, n))).collect();
     random.shuffle(&mut names);
     let kinds = spec.objects - spec.similar;
-    let (unit, reach) = (spec.unit(), (0.42 - 0.16 * spec.occlusion) * spec.unit());
+    let unit = spec.unit();
+    // As close together as asked; where there is no room left, as near to that as they fit on the table.
+    let asked = 0.42 - 0.16 * spec.occlusion;
+    let reaches = || (0..).map(|i| asked + 0.04 * f64::from(i)).take_while(|r| *r <= TABLE).map(|r| r * unit);
     let mut taken: Vec<(DVec2, f64)> = Vec::new();
     for (label, k) in (4..).zip(0..spec.objects + spec.thin) {
         let like = k.checked_sub(kinds).filter(|_| k < spec.objects);
@@ -191,7 +202,7 @@ fn place_objects(spec: &SceneSpec, random: &mut Random, objects: &mut Vec<SceneO
         };
         let (footprint, make) = solid(noun, unit, random);
         let gap = (0.05 * (1.0 - spec.occlusion) + 0.01) * unit;
-        let at = (0..2000).find_map(|_| {
+        let at = reaches().flat_map(|reach| std::iter::repeat_n(reach, 2000)).find_map(|reach| {
             let p = DVec2::new(random.uniform() - 0.5, random.uniform() - 0.5)
                 * 2.0
                 * DVec2::new(reach, 0.85 * reach);

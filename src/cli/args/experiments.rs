@@ -77,6 +77,9 @@ pub struct GenerateArgs {
     /// Contrast of surfaces: 1 = plenty to match, 0 = bare
     #[arg(long, default_value_t = 1.0, value_name = "0-1")]
     pub texture: f64,
+    /// Highlights that move with the camera: 1 = up to full white, 0 = none
+    #[arg(long, default_value_t = 0.0, value_name = "0-1")]
+    pub gloss: f64,
     /// Thin poles
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub thin: usize,

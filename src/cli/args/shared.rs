@@ -39,6 +39,10 @@ pub struct MakingArgs {
     /// Time against quality [default: draft on a CPU device, default on a GPU]
     #[arg(long, value_enum)]
     pub preset: Option<PresetArg>,
+    /// Spherical-harmonics degree of the colours, which then depend on the direction [default: what photos support that are left out
+    /// for a test; 0 for fewer than four photos]
+    #[arg(long, value_name = "0-3", value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub sh_degree: Option<u32>,
 }
 
 /// Options that every command working on a device takes.

@@ -17,30 +17,19 @@ use rayon::prelude::*;
 use sample::pairs_of;
 use solve::{Solution, System, exposure};
 
-/// Difference in brightness left in parts of a photo, ln, that the user should know of: half an f-stop.
-const UNEXPLAINED: f64 = 0.35;
 /// Fewest points that separate light from content.
 const MIN_POINTS: usize = 50;
-
-/// Light of the photos and what it leaves unexplained.
-#[derive(Clone, Debug, Default)]
-pub struct LightEstimate {
-    /// One per photo; all [`Light::NONE`] when nothing is significant.
-    pub lights: Vec<Light>,
-    /// Per photo: ln difference to the other photos that is left in the tenth of its cells that fits worst.
-    pub unexplained: Vec<f64>,
-}
 
 /// The photos in one light, as far as exposure, white balance and vignetting explain the differences; warns of the rest.
 pub fn equalised(mut photos: Vec<Photo>, model: &SparseModel, progress: &dyn Progress) -> Vec<Photo> {
     let found = estimate(&photos, model);
-    photos.par_iter_mut().zip(&found.lights).filter(|(_, light)| !light.is_none()).for_each(
-        |(photo, light)| {
+    photos.par_iter_mut().zip(&found).for_each(|(photo, light)| {
+        if !light.is_none() {
             photo.image = light.removed(&photo.image);
-            photo.light = *light;
-        },
-    );
-    warn_of_odd(&photos, &found.unexplained, progress);
+        }
+        photo.light = *light;
+    });
+    warn_of_odd(&photos, progress);
     photos
 }
 
@@ -61,26 +50,26 @@ pub fn in_light_of(
     }
     let found = estimate(&photos, &SparseModel { fitted, ..model.clone() });
     let log_gain = |channel: usize| {
-        let logs = found.lights[..known].iter().map(|l| l.gain[channel].ln());
+        let logs = found[..known].iter().map(|l| l.gain[channel].ln());
         logs.sum::<f64>() / known.max(1) as f64
     };
     let scene = [0, 1, 2].map(log_gain);
-    for (photo, light) in photos.iter_mut().zip(&found.lights).skip(known) {
+    for (photo, light) in photos.iter_mut().zip(&found).skip(known) {
         let gain = [0, 1, 2].map(|c| light.gain[c] / scene[c].exp());
         let light = Light { gain, ..*light };
         if !light.is_none() {
             photo.image = light.removed(&photo.image);
-            photo.light = light;
         }
+        photo.light = light;
     }
-    warn_of_odd(&photos[known..], &found.unexplained[known..], progress);
+    warn_of_odd(&photos[known..], progress);
     photos
 }
 
-fn warn_of_odd(photos: &[Photo], unexplained: &[f64], progress: &dyn Progress) {
-    let odd = photos.iter().zip(unexplained).filter(|(_, left)| **left > UNEXPLAINED);
+fn warn_of_odd(photos: &[Photo], progress: &dyn Progress) {
+    let odd = photos.iter().filter(|p| !p.light.explains_the_photo());
     let odd: Vec<String> =
-        odd.map(|(p, left)| format!("{} (±{:.0} %)", p.stem, 100.0 * left.exp_m1())).collect();
+        odd.map(|p| format!("{} (±{:.0} %)", p.stem, 100.0 * p.light.unexplained.exp_m1())).collect();
     if !odd.is_empty() {
         progress.warn(&format!(
             "parts of these photos are lit differently than in the others, beyond exposure, white balance and vignetting \
@@ -90,13 +79,11 @@ fn warn_of_odd(photos: &[Photo], unexplained: &[f64], progress: &dyn Progress) {
     }
 }
 
-/// Exposure, white balance and vignetting of placed photos.
-pub fn estimate(photos: &[Photo], model: &SparseModel) -> LightEstimate {
-    let none =
-        LightEstimate { lights: vec![Light::NONE; photos.len()], unexplained: vec![0.0; photos.len()] };
+/// Exposure, white balance and vignetting of placed photos, one per photo; none are stated when none is significant.
+pub fn estimate(photos: &[Photo], model: &SparseModel) -> Vec<Light> {
     let pairs = pairs_of(photos, model);
     if photos.len() < 2 || pairs.iter().map(|p| p.share).sum::<f64>() < 0.5 * MIN_POINTS as f64 {
-        return none;
+        return vec![Light::NONE; photos.len()];
     }
     // Photos taken through the same lens share their vignetting.
     let lenses = match model.fitted.as_slice() {
@@ -107,6 +94,7 @@ pub fn estimate(photos: &[Photo], model: &SparseModel) -> LightEstimate {
     let exposure = exposure(&grey);
     let colour = [1, 2].map(|channel| System { channel, ..grey }.gains(exposure.reference));
     let coloured = colour.iter().any(Solution::gains_matter);
+    let unexplained = grey.unexplained(&exposure);
     let mut lights: Vec<Light> = (0..photos.len())
         .map(|v| {
             let [red, blue] = [0, 1].map(|k| if coloured { colour[k].gain[v] } else { 0.0 });
@@ -116,11 +104,12 @@ pub fn estimate(photos: &[Photo], model: &SparseModel) -> LightEstimate {
                 falloff: exposure.falloff[lenses[v]],
                 sigma_ev: exposure.sigma[v] / std::f64::consts::LN_2,
                 sigma_corner: exposure.corner_sigma[lenses[v]],
+                unexplained: unexplained[v],
             }
         })
         .collect();
     if lights.iter().all(Light::is_none) {
-        lights = none.lights;
+        lights = unexplained.iter().map(|u| Light { unexplained: *u, ..Light::NONE }).collect();
     }
-    LightEstimate { unexplained: grey.unexplained(&exposure), lights }
+    lights
 }

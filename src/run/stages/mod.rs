@@ -18,4 +18,4 @@ pub use masks::{ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMas
 pub use matches::{DescriptorMatches, Descriptors, NetworkMatches};
 pub use prior::{DepthPriors, PriorOrigin};
 pub use shared::identity;
-pub use splats::TrainColour;
+pub use splats::{TrainColour, ViewDependence};

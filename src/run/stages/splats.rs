@@ -2,7 +2,7 @@
 use super::cameras::PlacedPhotos;
 use super::shared;
 use crate::Result;
-use crate::fit::{self, RgbOptions, Trained};
+use crate::fit::{self, RgbOptions, Trained, ViewDependentOptions};
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::Geometry;
 
@@ -37,5 +37,35 @@ impl Stage for TrainColour {
             &self.options,
             context.progress,
         )
+    }
+}
+
+/// Colours that depend on the direction, where the photos support them.
+pub struct ViewDependence {
+    /// How.
+    pub options: ViewDependentOptions,
+}
+
+impl Stage for ViewDependence {
+    const NAME: &'static str = "view dependence";
+    const LANE: Lane = Lane::Device;
+    type Inputs = (Output<PlacedPhotos>, Output<Trained>);
+    type Output = Trained;
+
+    fn settings(&self) -> String {
+        format!("{:?}", self.options)
+    }
+
+    fn codec() -> Option<Codec<Trained>> {
+        kept()
+    }
+
+    fn run(self, (placed, trained): (&PlacedPhotos, &Trained), context: &Context) -> Result<Trained> {
+        let images = shared::images(&placed.photos);
+        // Where the same points look as bright from every photo there is nothing to try.
+        let matt = placed.photos.iter().all(|p| p.light.explains_the_photo());
+        let degree = self.options.degree.or(matt.then_some(0));
+        let options = ViewDependentOptions { degree, ..self.options };
+        fit::fit_view_dependent(context.device, &images, trained.clone(), &options, context.progress)
     }
 }
