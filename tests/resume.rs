@@ -158,7 +158,10 @@ fn a_run_that_no_disk_takes_leaves_the_old_scene_and_goes_on_later() {
     let said = scene.finished("home-b", "resumed", 20, true);
     let kept = said.lines().find(|l| l.contains("kept from an earlier run")).unwrap();
     // The trained language is larger than the limit, so it was not kept.
-    assert!(kept.contains("cameras") && kept.contains("splats") && kept.contains("alignment"), "{kept}");
+    assert!(
+        kept.contains("cameras") && kept.contains("view dependence") && kept.contains("alignment"),
+        "{kept}"
+    );
     assert!(content(&scene.at("resumed")) == before, "the same scene");
 }
 
@@ -196,12 +199,14 @@ fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
     // Everything is there: nothing but decoding runs again. Then another late option: what precedes it stays.
     let said = scene.finished("home-b", "again", 20, true);
     let kept = |said: &str| said.lines().find(|l| l.contains("kept from an earlier run")).unwrap().to_owned();
-    for stage in ["cameras", "depth", "splats", "alignment", "language"] {
+    // Splats are read as the stage after them left them.
+    for stage in ["cameras", "depth", "view dependence", "alignment", "language"] {
         assert!(kept(&said).contains(stage), "{stage}: {said}");
     }
     assert!(!said.contains("\"begin\",\"stage\":\"rgb"), "{said}");
     assert!(content(&scene.at("again")) == b, "the same scene");
     let said = scene.finished("home-b", "other", 10, true);
     let kept = kept(&said);
-    assert!(kept.contains("splats") && kept.contains("alignment") && !kept.contains("language"), "{kept}");
+    assert!(kept.contains("view dependence") && kept.contains("alignment"), "{kept}");
+    assert!(!kept.contains("language"), "{kept}");
 }

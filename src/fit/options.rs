@@ -123,8 +123,9 @@ impl RgbOptions {
     /// The same options for a scene of `known` photos that goes on with `new` more: its cameras are held, and each new photo may bring
     /// as many splats as one of the scene's has on average, `splats` in all.
     pub fn going_on(self, known: usize, new: usize, splats: usize) -> Self {
+        // Steps at half size, 0.6 of a run, would undo what the scene shows already: they are left out, and of the others there are a
+        // few more, since new splats have seen none of them.
         let steps = self.iterations.div_ceil(2);
-        // Half-size photos would undo what the scene shows already.
         let mut options = RgbOptions { coarse: 0.0, ..self.with_iterations(steps) };
         options.held = known;
         options.init.max_points = options.init.max_points.min((splats * new).div_ceil(known.max(1)));
