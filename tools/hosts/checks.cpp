@@ -57,6 +57,10 @@ static void training(SvkContext *context, int count, char **paths) {
     options.preset = 77;
     EXPECT(svk_train(context, photos.data(), photos.size(), &options, &scene) == SVK_STATUS_ARGUMENT);
     EXPECT(says(last_error(svk_context_error, context), "preset"));
+    options.preset = SVK_PRESET_AUTO;
+    options.sh_degree = 5;
+    EXPECT(svk_train(context, photos.data(), photos.size(), &options, &scene) == SVK_STATUS_ARGUMENT);
+    EXPECT(says(last_error(svk_context_error, context), "sh_degree"));
     photos[0].encoded = reinterpret_cast<const uint8_t *>("both");
     EXPECT(svk_train(context, photos.data(), photos.size(), nullptr, &scene) == SVK_STATUS_ARGUMENT);
     photos[0].path = nullptr;
@@ -183,9 +187,12 @@ static void pixels(SvkContext *context, const char *path) {
     options.preset = SVK_PRESET_DRAFT;
     options.iterations = 10;
     options.language_iterations = 1;
+    options.sh_degree = SVK_SH_DEGREE_ONE;
     SvkScene *trained = nullptr;
     check(svk_train(context, photos.data(), 2, &options, &trained), context);
     Scene again(trained);
+    auto info = make<SvkSceneInfo>();
+    EXPECT(svk_scene_info(trained, &info) == SVK_STATUS_OK && info.sh_degree == 1);
     const SvkCamera first = scene_camera(trained, 0);
     double worst = std::fabs(first.fx - cameras[0].fx) / cameras[0].fx;
     for (int r = 0; r < 3; r++)

@@ -2,7 +2,8 @@
 //!
 //! In linear light, a matt point p looks as bright from every side, and photo v shows it as
 //! `ln I = ln a_p + ln gain_v + falloff · (r², r⁴)`. Differences between two photos of a point leave out a_p; what is left
-//! is a small linear problem, solved robustly because highlights and wrong matches are no matt points. The mean of the
+//! is a small linear problem, solved robustly because highlights and wrong matches are no matt points: they may be most of
+//! the points, as long as they agree less on one difference than the matt ones do. The mean of the
 //! channels in log light gives exposure and vignetting, its differences to red and blue the white balance: these are
 //! separate problems, since texture that two views sample differently moves all channels together.
 mod sample;
@@ -14,7 +15,7 @@ use super::SparseModel;
 use crate::photo::{Light, Photo};
 use crate::progress::Progress;
 use rayon::prelude::*;
-use sample::pairs_of;
+use sample::{Pair, pairs_of};
 use solve::{Solution, System, exposure};
 
 /// Fewest points that separate light from content.
@@ -92,7 +93,14 @@ pub fn estimate(photos: &[Photo], model: &SparseModel) -> Vec<Light> {
     };
     let grey = System { pairs: &pairs, views: photos.len(), lenses: &lenses, channel: 0 };
     let exposure = exposure(&grey);
-    let colour = [1, 2].map(|channel| System { channel, ..grey }.gains(exposure.reference));
+    // What shows a highlight in one photo says nothing of its white balance either.
+    let matt: Vec<Pair> = pairs
+        .iter()
+        .zip(&exposure.agreement)
+        .filter(|(_, agreement)| **agreement > 0.0)
+        .map(|(p, agreement)| Pair { share: p.share * agreement, ..*p })
+        .collect();
+    let colour = [1, 2].map(|channel| System { channel, pairs: &matt, ..grey }.gains(exposure.reference));
     let coloured = colour.iter().any(Solution::gains_matter);
     let unexplained = grey.unexplained(&exposure);
     let mut lights: Vec<Light> = (0..photos.len())

@@ -37,6 +37,7 @@ struct Sample {
 }
 
 /// Two photos' sights of one point.
+#[derive(Clone, Copy)]
 pub(super) struct Pair {
     pub(super) views: [usize; 2],
     pub(super) difference: [f64; 3],

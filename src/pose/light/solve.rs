@@ -1,7 +1,6 @@
 //! Gains and vignetting from differences of brightness: robust linear least squares with standard deviations.
 use super::sample::Pair;
 use crate::math::{median, quantile};
-use crate::pose::numeric::cauchy_weight;
 use nalgebra::{DMatrix, DVector};
 use std::collections::BTreeMap;
 
@@ -9,10 +8,14 @@ use std::collections::BTreeMap;
 const GAIN_PRIOR: f64 = 1.0;
 /// Prior σ of the vignetting terms: open lenses lose about a third in the corners.
 const FALLOFF_PRIOR: [f64; 2] = [0.3, 0.15];
-/// Cauchy scale in standard deviations: 95 % efficiency on Gaussian noise (Holland & Welsch 1977).
-const CAUCHY: f64 = 2.385;
+/// Standard deviations beyond which a difference does not count (Tukey's biweight, 95 % efficient on Gaussian noise; Holland &
+/// Welsch 1977). Highlights are no noise around the matt points but a heap of their own, often the larger one, so a weight
+/// that never reaches zero lets them win.
+const TUKEY: f64 = 4.685;
 /// Rounds of re-weighting; the estimate moves by less than one standard deviation after five.
 const ROUNDS: usize = 12;
+/// Fewest common points that tell the difference of two photos by themselves.
+const MIN_COMMON: usize = 20;
 /// Standard deviations that an effect must exceed before it is taken out.
 const SIGNIFICANT: f64 = 4.0;
 /// Smallest exposure or colour difference worth touching photos for, ln.
@@ -49,6 +52,8 @@ pub(super) struct Solution {
     pub(super) falloff: Vec<[f64; 2]>,
     pub(super) corner_sigma: Vec<f64>,
     pub(super) reference: usize,
+    /// Per pair: 1 = it agrees, 0 = something else than light of the whole photo is at work.
+    pub(super) agreement: Vec<f64>,
 }
 
 impl Solution {
@@ -113,26 +118,38 @@ impl System<'_> {
     fn solve(&self, free: &Free, reference: usize) -> Solution {
         let columns = Columns::new(free, self.views, reference);
         let rows: Vec<_> = self.pairs.iter().map(|p| self.row(p, &columns)).collect();
-        let mut x = DVector::zeros(columns.prior.len());
+        let mut x = self.start(&columns);
         let (mut h, mut residuals) = (DMatrix::from_diagonal(&columns.prior), Vec::new());
-        let mut weights = vec![0.0; rows.len()];
+        let (mut weights, mut agreement) = (vec![0.0; rows.len()], vec![0.0; rows.len()]);
+        // Slope of the scores against their secant: what a redescending weight takes from the information.
+        let mut slope = 1.0;
         for _ in 0..ROUNDS {
             residuals = self.residuals(&rows, &x);
             let mut sizes: Vec<f64> =
                 self.pairs.iter().zip(&residuals).map(|(p, r)| r.abs() / self.variance(p).sqrt()).collect();
-            // 1.4826 median |u| is σ of Gaussian u; below a tenth of the expected noise the model is exact.
-            let scale = (1.4826 * median(&mut sizes).unwrap_or(1.0)).max(0.1);
+            // 1.4826 median |u| is σ of Gaussian u; below a tenth of the expected noise the model is exact, and above that noise
+            // something else than noise is at work.
+            let scale = (1.4826 * median(&mut sizes).unwrap_or(1.0)).clamp(0.1, 1.0);
             h = DMatrix::from_diagonal(&columns.prior);
             let mut g = DVector::zeros(x.len());
-            for (((pair, row), r), weight) in self.pairs.iter().zip(&rows).zip(&residuals).zip(&mut weights) {
+            let (mut tangents, mut secants) = (0.0, 0.0);
+            for (k, ((pair, row), r)) in self.pairs.iter().zip(&rows).zip(&residuals).enumerate() {
                 let variance = scale * scale * self.variance(pair);
-                *weight = pair.share * cauchy_weight(r * r / variance, CAUCHY) / variance;
+                let rest = (1.0 - r * r / (variance * TUKEY * TUKEY)).max(0.0);
+                agreement[k] = rest * rest;
+                let weight = pair.share * agreement[k] / variance;
+                weights[k] = weight;
+                secants += weight;
+                tangents += pair.share * rest * (5.0 * rest - 4.0) / variance;
                 for (a, ca) in row {
-                    g[*a] += *weight * ca * pair.difference[self.channel];
+                    g[*a] += weight * ca * pair.difference[self.channel];
                     for (b, cb) in row {
-                        h[(*a, *b)] += *weight * ca * cb;
+                        h[(*a, *b)] += weight * ca * cb;
                     }
                 }
+            }
+            if secants > 0.0 {
+                slope = (tangents / secants).clamp(0.1, 1.0);
             }
             let Some(factor) = h.clone().cholesky() else { break };
             x = factor.solve(&g);
@@ -146,8 +163,40 @@ impl System<'_> {
         let spread = scores.len() as f64 / (scores.len() as f64 - 1.0).max(1.0);
         let mut middle = DMatrix::from_diagonal(&columns.prior);
         scores.values().for_each(|v| middle += spread * v * v.transpose());
-        let covariance = h.try_inverse().map(|i| &i * middle * &i);
-        columns.solution(&x, covariance.as_ref(), reference)
+        let covariance = h.try_inverse().map(|i| &i * middle * &i / (slope * slope));
+        Solution { agreement, ..columns.solution(&x, covariance.as_ref(), reference) }
+    }
+
+    /// Gains from the photos two by two: what the closer half of the common points agrees on (least median of squares,
+    /// Rousseeuw 1984), joined with least absolute deviations, so that a pair whose highlights agree better is outvoted.
+    fn start(&self, columns: &Columns) -> DVector<f64> {
+        let mut common: BTreeMap<[usize; 2], Vec<f64>> = BTreeMap::new();
+        for pair in self.pairs {
+            let [a, b] = pair.views;
+            let d = pair.difference[self.channel];
+            common.entry([a.min(b), a.max(b)]).or_default().push(if a < b { d } else { -d });
+        }
+        common.retain(|_, d| d.len() >= MIN_COMMON);
+        let told: Vec<([usize; 2], f64)> = common.into_iter().map(|(v, mut d)| (v, shorth(&mut d))).collect();
+        let mut x = DVector::zeros(columns.prior.len());
+        for round in 0..ROUNDS {
+            let mut h = DMatrix::from_diagonal(&columns.prior);
+            let mut g = DVector::zeros(x.len());
+            for (views, difference) in &told {
+                let row = [(columns.gain[views[0]], 1.0), (columns.gain[views[1]], -1.0)];
+                let row = row.into_iter().filter_map(|(c, sign)| Some((c?, sign)));
+                let r = difference - row.clone().map(|(c, sign)| sign * x[c]).sum::<f64>();
+                // A thousandth is less than a grey level.
+                let weight = if round == 0 { 1.0 } else { 1.0 / r.abs().max(1e-3) };
+                for (a, ca) in row.clone() {
+                    g[a] += weight * ca * difference;
+                    row.clone().for_each(|(b, cb)| h[(a, b)] += weight * ca * cb);
+                }
+            }
+            let Some(factor) = h.cholesky() else { break };
+            x = factor.solve(&g);
+        }
+        x
     }
 
     fn residuals(&self, rows: &[Vec<(usize, f64)>], x: &DVector<f64>) -> Vec<f64> {
@@ -179,6 +228,14 @@ impl System<'_> {
         }
         per_view.iter_mut().map(|v| quantile(v, 0.9).unwrap_or(0.0)).collect()
     }
+}
+
+/// Middle of the shortest interval that holds half of the values.
+fn shorth(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    let half = values.len().div_ceil(2);
+    let shortest = values.windows(half).min_by(|a, b| (a[half - 1] - a[0]).total_cmp(&(b[half - 1] - b[0])));
+    shortest.map_or(0.0, |w| w[half / 2])
 }
 
 /// Where the unknowns stand.
@@ -218,6 +275,7 @@ impl Columns {
             falloff: self.falloff.iter().map(falloff).collect(),
             corner_sigma: self.falloff.iter().map(corner).collect(),
             reference,
+            agreement: Vec::new(),
         }
     }
 }

@@ -134,6 +134,33 @@ fn wrong_matches_and_clipped_spots_do_not_count() {
 }
 
 #[test]
+fn highlights_are_no_exposure() {
+    let truth = [light(-0.3, 0.0, 0.0), light(0.0, 0.0, 0.0), light(0.2, 0.03, 0.0), light(0.4, 0.0, 0.0)];
+    for seed in 0..3 {
+        let (mut photos, model) = spots(&truth, 0.03, seed);
+        // White light of every strength over seven of ten spots of the last photo, over two of ten of the others.
+        let mut rng = Random::new(100 + seed);
+        for point in &model.points {
+            for (v, pixel) in &point.views {
+                let white = rng.uniform() as f32;
+                if rng.uniform() < if *v == 3 { 0.7 } else { 0.2 } {
+                    let (x0, y0) = (pixel.x as usize - 4, pixel.y as usize - 4);
+                    for k in (y0..y0 + 8).flat_map(|y| (x0..x0 + 8).map(move |x| y * SIZE.0 + x)) {
+                        let c = &mut photos[*v].image.data[k];
+                        *c = c.map(|c| to_srgb(to_linear(c) + 0.3 * white));
+                    }
+                }
+            }
+        }
+        let [ev, sigmas, colour, corner] = errors(&estimate(&photos, &model), &truth);
+        assert!(
+            ev < 0.05 && sigmas < 4.0 && colour < 0.02 && corner < 0.08,
+            "{ev} {sigmas} {colour} {corner}"
+        );
+    }
+}
+
+#[test]
 fn a_photo_in_another_light_is_named() {
     let (mut photos, model) = spots(&[Light::NONE; 4], 0.05, 4);
     // A shadow over the left half of one photo: 40 % of the light.
