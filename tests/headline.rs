@@ -60,6 +60,11 @@ fn a_small_run_reaches_its_figures() {
     let [photos, truth, scene, out] = [&photos, &truth, &scene, &out].map(|p| p.to_str().unwrap());
     let short = ["--preset", "draft", "--iterations", "120", "--language-iterations", "30", "--seed", "1"];
     splatvk(&[&["run", photos, "--out", scene, "--query", "lemon", "--json"], &short[..]].concat());
+    let record = std::fs::read(Path::new(scene).join("run.json")).unwrap();
+    let record: Value = serde_json::from_slice(&record).unwrap();
+    // Four photos would do for trials, but they show the same points equally bright.
+    let trials = record["statistics"]["view_dependence"]["trials"].as_array().unwrap();
+    assert!(trials.is_empty(), "trials of SH degrees without highlights: {trials:?}");
     let report = splatvk(&["eval", scene, "--ground-truth", truth, "--out", out, "--json"]);
     let report: Value = serde_json::from_slice(&report).unwrap();
     let (train, test) = (&report["summary"]["train"], &report["summary"]["test"]);

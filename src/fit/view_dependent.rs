@@ -54,16 +54,23 @@ pub fn fit_view_dependent(
 ) -> Result<Trained> {
     let mut result = trained;
     let fit = Fit { device, options, progress };
-    let start = result.splats.sh_degree;
-    let most = options.degree.unwrap_or_else(|| highest(device, result.splats.len()));
+    let (start, splats) = (result.splats.sh_degree, result.splats.len());
+    let highest = highest(device.info().max_storage_range, splats);
+    let asked = options.degree.map(|d| d.min(highest));
+    if asked < options.degree {
+        progress.warn(&format!(
+            "{splats} splats of a higher SH degree than {highest} need larger buffers than the device binds; trained with {highest}"
+        ));
+    }
+    let most = asked.unwrap_or(highest);
     let mut trials = Vec::new();
-    if most > start && (options.degree.is_some() || images.len() >= FEWEST_PHOTOS) {
+    if most > start && (asked.is_some() || images.len() >= FEWEST_PHOTOS) {
         progress.begin("view dependence", 2 + u64::from(most - start));
-        if options.degree.is_none() {
+        if asked.is_none() {
             trials = fit.trials(images, &result.cameras, &result.splats, most)?;
         }
         let supported = trials.last().filter(|t: &&DegreeTrial| t.supported()).map(|t| t.degree);
-        if let Some(degree) = options.degree.or(supported) {
+        if let Some(degree) = asked.or(supported) {
             let with = fit.colours(images, &result.cameras, &result.splats, degree)?;
             (result.splats, result.stats.psnr) = (with.splats, with.stats.psnr);
         }
@@ -73,10 +80,10 @@ pub fn fit_view_dependent(
     Ok(result)
 }
 
-/// The highest degree whose coefficients the device binds: their two moments are the largest buffer.
-fn highest(device: &Device, splats: usize) -> u32 {
+/// The highest degree whose coefficients the device binds: their two moments are the largest buffer. `range` in bytes.
+fn highest(range: u64, splats: usize) -> u32 {
     let bytes = |degree: u32| (2 * 4 * 3 * sh_coefficients(degree) * splats) as u64;
-    (0..=HIGHEST).rev().find(|d| bytes(*d) <= device.info().max_storage_range).unwrap_or(0)
+    (0..=HIGHEST).rev().find(|d| bytes(*d) <= range).unwrap_or(0)
 }
 
 struct Fit<'a> {
@@ -173,5 +180,18 @@ impl Progress for Quiet<'_> {
     }
     fn cancelled(&self) -> bool {
         self.0.cancelled()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn more_splats_take_a_lower_degree() {
+        // The two moments of a splat of degree 3 take 2 · 4 · 3 · 16 = 384 bytes.
+        let range = 128 << 20;
+        let degrees = [100_000, 349_525, 349_526, 621_378, 621_379, 1_398_101, 5_000_000];
+        assert_eq!(degrees.map(|splats| highest(range, splats)), [3, 3, 2, 2, 1, 1, 0]);
     }
 }
