@@ -135,9 +135,12 @@ pub fn check_set(photos: &[Photo]) -> Result<()> {
         for i in 0..j {
             let (a, b) = (photos[i].path.display(), photos[j].path.display());
             if digests[i] == digests[j] && photos[i].image.width == photos[j].image.width {
-                return Err(Error::input(format!(
-                    "{a} and {b}: the same photo twice; each photo must be taken from another place"
-                )));
+                // A photo added to the scene that has it already has one path.
+                let named = match photos[i].path == photos[j].path {
+                    true => format!("{a}: this photo is there already"),
+                    false => format!("{a} and {b}: the same photo twice"),
+                };
+                return Err(Error::input(format!("{named}; each photo must be taken from another place")));
             }
             if photos[i].stem == photos[j].stem {
                 return Err(Error::input(format!(
@@ -153,6 +156,17 @@ pub fn check_set(photos: &[Photo]) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_same_photo_is_named_once_where_it_has_one_path() {
+        let photo = |path: &str| {
+            let image = RgbImage { width: 64, height: 48, data: vec![[0.3; 3]; 64 * 48] };
+            from_pixels(path.as_ref(), &image, None, MAX_SIZE).unwrap()
+        };
+        let refusal = |a: &str, b: &str| check_set(&[photo(a), photo(b)]).unwrap_err().to_string();
+        assert!(refusal("a.png", "b.png").starts_with("a.png and b.png: the same photo twice"));
+        assert!(refusal("a.png", "a.png").starts_with("a.png: this photo is there already"));
+    }
 
     #[test]
     fn files_in_another_unit_are_noticed() {
