@@ -179,8 +179,11 @@ impl System<'_> {
         common.retain(|_, d| d.len() >= MIN_COMMON);
         let told: Vec<([usize; 2], f64)> = common.into_iter().map(|(v, mut d)| (v, shorth(&mut d))).collect();
         let mut x = DVector::zeros(columns.prior.len());
+        // Only for photos that share too few points with any other: absolute deviations would not outweigh the prior itself
+        // where photos are more than its σ apart.
+        let prior = 1e-6 * &columns.prior;
         for round in 0..ROUNDS {
-            let mut h = DMatrix::from_diagonal(&columns.prior);
+            let mut h = DMatrix::from_diagonal(&prior);
             let mut g = DVector::zeros(x.len());
             for (views, difference) in &told {
                 let row = [(columns.gain[views[0]], 1.0), (columns.gain[views[1]], -1.0)];

@@ -105,6 +105,14 @@ fn known_light_is_recovered_within_its_sigma() {
 }
 
 #[test]
+fn photos_many_stops_apart_are_brought_together() {
+    let truth = [light(-1.8, 0.0, 0.0), light(0.0, 0.02, 0.0), light(1.8, 0.0, -0.02)];
+    let (photos, model) = spots(&truth, 0.03, 6);
+    let [ev, sigmas, colour, corner] = errors(&estimate(&photos, &model), &truth);
+    assert!(ev < 0.03 && sigmas < 4.0 && colour < 0.02 && corner < 0.04, "{ev} {sigmas} {colour} {corner}");
+}
+
+#[test]
 fn steady_light_is_left_alone() {
     for seed in 0..5 {
         let (photos, model) = spots(&[Light::NONE; 4], 0.1, seed);
