@@ -160,7 +160,7 @@ mod tests {
     #[test]
     fn the_same_photo_is_named_once_where_it_has_one_path() {
         let photo = |path: &str| {
-            let image = RgbImage { width: 64, height: 48, data: vec![[0.3; 3]; 64 * 48] };
+            let image = RgbImage { width: 64, height: 64, data: vec![[0.3; 3]; 64 * 64] };
             from_pixels(path.as_ref(), &image, None, MAX_SIZE).unwrap()
         };
         let refusal = |a: &str, b: &str| check_set(&[photo(a), photo(b)]).unwrap_err().to_string();
