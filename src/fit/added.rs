@@ -40,7 +40,7 @@ pub fn new_surface(points: &PointCloud, views: &[(&Camera, &DepthMap, &Plane<f32
 }
 
 /// Trains on: `scene` are the splats that photos show, `fresh` points of new surfaces, all other lists have one entry per photo,
-/// those of the scene first ([`RgbOptions::held`] of them).
+/// those of the scene first.
 pub fn train_on(
     device: &Device,
     images: &[RgbImage],

@@ -82,9 +82,6 @@ pub struct RgbOptions {
     pub prune_from: usize,
     /// Camera refinement, if at all.
     pub poses: Option<PoseOptions>,
-    /// So many cameras, the first ones, never move: camera 0 holds the world frame, those of a scene that goes on also what was
-    /// measured in it.
-    pub held: usize,
     /// A point of the loss curve every so many steps.
     pub report_every: usize,
 }
@@ -120,15 +117,13 @@ impl RgbOptions {
         self
     }
 
-    /// The same options for a scene of `known` photos that goes on with `new` more: its cameras are held, and each new photo may bring
-    /// as many splats as one of the scene's has on average, `splats` in all.
-    pub fn going_on(self, known: usize, new: usize, splats: usize) -> Self {
+    /// The same options for a scene of `known` photos that goes on with `new` more: each may bring its share of the splats.
+    pub fn going_on(self, known: usize, new: usize) -> Self {
         // Steps at half size, 0.6 of a run, would undo what the scene shows already: they are left out, and of the others there are a
         // few more, since new splats have seen none of them.
         let steps = self.iterations.div_ceil(2);
         let mut options = RgbOptions { coarse: 0.0, ..self.with_iterations(steps) };
-        options.held = known;
-        options.init.max_points = options.init.max_points.min((splats * new).div_ceil(known.max(1)));
+        options.init.max_points = (options.init.max_points * new).div_ceil((known + new).max(1));
         options
     }
 
@@ -204,7 +199,6 @@ impl RgbOptions {
             prune_every: 100,
             prune_from: 200,
             poses: Some(PoseOptions { start: 0, rate: Exponential { start: 1e-4, end: 1e-6, steps: 1000 } }),
-            held: 1,
             report_every: 10,
         }
     }

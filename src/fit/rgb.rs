@@ -74,7 +74,7 @@ impl FitStats {
 pub struct Trained {
     /// Fitted splats.
     pub splats: Splats,
-    /// Refined cameras; the held ones as given.
+    /// Refined cameras; the first as given.
     pub cameras: Vec<Camera>,
     /// How it went.
     pub stats: FitStats,
@@ -214,10 +214,9 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Pose refinement; the held cameras fix the world frame.
+    /// Pose refinement; camera 0 holds the world frame.
     fn move_camera(&mut self, view: usize, iteration: usize) -> Result<()> {
-        let Some(poses) = self.options.poses.filter(|p| view >= self.options.held && iteration >= p.start)
-        else {
+        let Some(poses) = self.options.poses.filter(|p| view > 0 && iteration >= p.start) else {
             return Ok(());
         };
         let g = self.trainer.views.stage(view).raster.frame().camera_grad.read()?;

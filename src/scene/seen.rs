@@ -28,6 +28,16 @@ impl Seen {
     pub fn rows(&self, splats: &Splats) -> Vec<usize> {
         (0..splats.len()).filter(|i| !self.is_unseen(*i)).collect()
     }
+
+    /// The same, of more than `most` those of which photos show most; ascending.
+    pub fn most_shown(&self, splats: &Splats, most: usize) -> Vec<usize> {
+        let mut rows = self.rows(splats);
+        let pixels = |i: usize| self.pixels.get(i).copied().unwrap_or(0.0);
+        rows.sort_by(|a, b| pixels(*b).total_cmp(&pixels(*a)));
+        rows.truncate(most);
+        rows.sort_unstable();
+        rows
+    }
 }
 
 #[cfg(test)]
@@ -40,5 +50,13 @@ mod tests {
         let seen = Seen { pixels: vec![3.0, 0.01, 0.0] };
         assert_eq!((seen.unseen(), seen.rows(&splats)), (2, vec![0]));
         assert_eq!((Seen::default().unseen(), Seen::default().rows(&splats)), (0, vec![0, 1, 2]));
+    }
+
+    #[test]
+    fn what_photos_show_least_goes_first() {
+        let splats = Splats { means: vec![[0.0; 3]; 4], ..Splats::default() };
+        let seen = Seen { pixels: vec![0.5, 3.0, 0.0, 1.0] };
+        assert_eq!(seen.most_shown(&splats, 2), [1, 3]);
+        assert_eq!(seen.most_shown(&splats, 9), [0, 1, 3]);
     }
 }

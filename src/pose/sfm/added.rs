@@ -5,6 +5,7 @@ use super::grow::{MIN_RESECTION, Resection, resection};
 use super::model::{Freedom, Model, Sighting, Track};
 use super::pair::{Matches, Pair};
 use super::relate::{MIN_INLIERS, Related, THRESHOLD, related_to};
+use super::together;
 use super::tracks::{self, KeypointMatch};
 use super::unplaced::Unplaced;
 use crate::math::median;
@@ -37,6 +38,9 @@ const MIN_FIXED: usize = 30;
 /// Rounds of refining the camera and triangulating the points anew: the second changes the pose by less than its σ.
 const ROUNDS: usize = 3;
 
+/// Standard deviations of a focal length from that of the same camera, up to which the two are taken for one.
+const AGREES: f64 = 3.0;
+
 /// Cameras and points for all `photos`, the first of which are `known`; the others need no cameras, `features` are one per photo.
 /// A photo that shares too little with the others is an error that names it.
 pub fn with_added(
@@ -47,10 +51,11 @@ pub fn with_added(
     progress: &dyn Progress,
 ) -> Result<SparseModel, Unplaced> {
     let count = known.cameras.len();
-    progress.begin("cameras", 3);
+    progress.begin("cameras", 4);
     progress.step(0, "matches");
     let mut families = corner_families(photos, features, progress)?;
     let mut model = start_model(photos, known.cameras, seed)?;
+    let focals: Vec<f64> = (0..photos.len()).map(|v| model.focal(v)).collect();
     let Related { putative, pairs } = related_to(photos, &mut families, &model, count, progress)?;
     progress.step(1, "poses");
     let long = photos[0].image.width.max(photos[0].image.height) as f64;
@@ -74,15 +79,44 @@ pub fn with_added(
         }
         model.triangulate_all(2.0 * threshold);
     }
-    progress.step(2, "points");
     model.triangulate_all(threshold);
     model.prune(threshold);
-    let shares = agreement(&model, &pairs, threshold);
     check_sightings(&model, photos, count)?;
-    let out = sparse_model(&model, photos, known, &pairs, &shares, &sigmas);
-    progress.step(3, &format!("{} points", out.points.len()));
+    let mut fitted = fitted(&model, photos, known, &pairs, &sigmas);
+    let shares = agreement(&model, &pairs, threshold);
+    fitted.iter_mut().zip(&shares).skip(count).for_each(|(f, share)| f.agreement = *share);
+    if known.fitted.iter().all(|f| f.sigmas[0] > 0.0) {
+        progress.step(2, "all cameras");
+        share_optics(&mut model, &mut fitted, &focals, count);
+        let camera: Vec<usize> = fitted.iter().map(|f| f.camera).collect();
+        let outcome = together::adjust(&mut model, photos, count, &camera, threshold, progress)?;
+        for (v, own) in fitted.iter_mut().enumerate() {
+            own.sigmas[0] = outcome.sigmas[model.group[v]][0];
+            own.residual = model.residual(v);
+            if v > 0 {
+                own.rotation_sigma = outcome.rotation_sigmas[v];
+            }
+        }
+    }
+    progress.step(3, "points");
+    let cameras = (0..photos.len()).map(|v| camera(&model, photos, known.cameras, v)).collect();
+    let out = SparseModel { cameras, points: sparse_points(photos, &model), focal_log_sigma: None, fitted };
+    progress.step(4, &format!("{} points", out.points.len()));
     progress.end();
     Ok(out)
+}
+
+/// A new photo that agrees with the focal length of its camera takes it over; others are told apart as cameras of their own. `focals`
+/// are what the files say, per view.
+fn share_optics(model: &mut Model, fitted: &mut [Fitted], focals: &[f64], known: usize) {
+    for view in known..fitted.len() {
+        let found = model.focal(view) / focals[view];
+        if found.ln().abs() < AGREES * fitted[view].sigmas[0] {
+            model.optics[view].focal /= found;
+        } else {
+            fitted[view].camera = fitted.iter().map(|f| f.camera + 1).max().unwrap_or(0);
+        }
+    }
 }
 
 /// The known cameras, and for the other photos the optics of those; an error that names a photo of another camera.
@@ -254,35 +288,38 @@ fn refine(model: &mut Model, view: usize, threshold: f64) -> Sigmas {
     }
 }
 
-fn sparse_model(
-    model: &Model,
-    photos: &[Photo],
-    known: Known,
-    pairs: &[Pair],
-    shares: &[f64],
-    sigmas: &[Sigmas],
-) -> SparseModel {
+/// A view's camera; what is known of it and no model says stays.
+fn camera(model: &Model, photos: &[Photo], known: &[Camera], v: usize) -> Camera {
+    let p = &photos[v];
+    let (focal, centre) = (model.focal(v), model.principal_point(v));
+    let (fx, fy, cx, cy) = (focal, focal, centre.x, centre.y);
+    // Registered: `register` gave every view a pose or failed.
+    let pose = model.poses[v].unwrap_or(Pose::IDENTITY);
+    match known.get(v) {
+        Some(camera) => {
+            // Where fx and fy differ they keep their ratio.
+            let ratio = focal / (0.5 * (camera.fx + camera.fy));
+            Camera { fx: camera.fx * ratio, fy: camera.fy * ratio, pose, ..camera.clone() }
+        }
+        None => Camera {
+            name: p.path.file_name().map_or_else(|| p.stem.clone(), |n| n.to_string_lossy().into()),
+            width: p.image.width as u32,
+            height: p.image.height as u32,
+            fx,
+            fy,
+            cx,
+            cy,
+            pose,
+        },
+    }
+}
+
+/// What is known of the photos of the scene, and what their own registration says of the others, all but their agreement.
+fn fitted(model: &Model, photos: &[Photo], known: Known, pairs: &[Pair], sigmas: &[Sigmas]) -> Vec<Fitted> {
     let by_file = cameras_by_file(photos);
     let highest = known.fitted.iter().map(|f| f.camera + 1).max().unwrap_or(0);
     let count = known.cameras.len();
     let own = |v: usize| pairs.iter().filter(move |p| [p.matches.first, p.matches.second].contains(&v));
-    let camera = |v: usize| match known.cameras.get(v) {
-        Some(c) => c.clone(),
-        None => {
-            let p = &photos[v];
-            Camera {
-                name: p.path.file_name().map_or_else(|| p.stem.clone(), |n| n.to_string_lossy().into()),
-                width: p.image.width as u32,
-                height: p.image.height as u32,
-                fx: model.focal(v),
-                fy: model.focal(v),
-                cx: model.principal_point(v).x,
-                cy: model.principal_point(v).y,
-                // Registered: `register` gave every view one or failed.
-                pose: model.poses[v].unwrap_or(Pose::IDENTITY),
-            }
-        }
-    };
     let fitted = |v: usize| match known.fitted.get(v) {
         Some(f) => *f,
         None => {
@@ -291,7 +328,7 @@ fn sparse_model(
                 lens: model.lens(v),
                 sigmas: [sigmas[v].log_focal, 0.0, 0.0, 0.0, 0.0],
                 residual: model.residual(v),
-                agreement: shares[v],
+                agreement: 0.0,
                 // One pair whose matches are few or mostly contradict each other confirms nothing.
                 unconfirmed: own(v).count() < 2 && !own(v).any(|p| p.sure),
                 rotation_sigma: sigmas[v].rotation,
@@ -299,12 +336,7 @@ fn sparse_model(
             }
         }
     };
-    SparseModel {
-        cameras: (0..photos.len()).map(camera).collect(),
-        points: sparse_points(photos, model),
-        focal_log_sigma: None,
-        fitted: (0..photos.len()).map(fitted).collect(),
-    }
+    (0..photos.len()).map(fitted).collect()
 }
 
 #[cfg(test)]
@@ -357,6 +389,35 @@ mod tests {
         let model = check(truth.photos[3].clone(), truth.cameras[3].fx);
         assert!(model.fitted[3].lens.is_none(), "the scene's lens is none");
         assert_eq!(model.fitted[3].camera, 0);
+    }
+
+    #[test]
+    fn a_new_photo_mends_the_cameras_that_were_estimated() {
+        let truth = testing::train(&testing::folder());
+        let mut known = truth.cameras[..3].to_vec();
+        for (camera, turn) in known.iter_mut().zip([0.0, 2e-3, -2e-3]) {
+            camera.pose = Pose::exp(DVec3::ZERO, DVec3::new(turn, 0.5 * turn, 0.0)).compose(&camera.pose);
+            (camera.fx, camera.fy) = (camera.fx * 1.003, camera.fy * 1.003);
+        }
+        let sigmas = [0.003, 0.0, 0.0, 0.0, 0.0];
+        let fitted = [Fitted { agreement: 1.0, sigmas, ..Fitted::default() }; 3];
+        let model =
+            with_added(&truth.photos, Known { cameras: &known, fitted: &fitted }, &[], 0, &Silent).unwrap();
+        let errors = |cameras: &[Camera]| pose_errors(cameras, &truth.cameras, truth.mean_depth);
+        let (was, is) = (errors(&known), errors(&model.cameras));
+        println!("rotation {:?}° of {:?}°", is.rotation_degrees, was.rotation_degrees);
+        println!("centre {:?} focal {:?}", is.centre, is.focal);
+        let worst = |v: &[f64]| v.iter().copied().fold(0.0, f64::max);
+        // Half of what a whole reconstruction is asked for.
+        assert!(worst(&is.rotation_degrees) < 0.1 && worst(&was.rotation_degrees) > 0.1, "{is:?} {was:?}");
+        assert!(worst(&is.centre) < 0.003 && worst(&is.focal) < 0.003, "{is:?}");
+        // The world frame stays.
+        assert_eq!(model.cameras[0].pose, known[0].pose);
+        let size = |cameras: &[Camera]| {
+            let from_first = |c: &Camera| (c.pose.centre() - cameras[0].pose.centre()).length();
+            cameras[..3].iter().map(from_first).sum::<f64>()
+        };
+        assert!((size(&model.cameras) / size(&known) - 1.0).abs() < 1e-3);
     }
 
     #[test]

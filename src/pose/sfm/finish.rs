@@ -54,22 +54,8 @@ pub(super) fn finish(
     progress.check()?;
     let straight: Vec<RgbImage> =
         (0..photos.len()).map(|v| straightened(&model, v, &photos[v].image)).collect();
-    let shades: Vec<Shades> = straight.par_iter().map(|image| Shades::new(&image.luma())).collect();
-    let valid: Vec<Plane<bool>> = photos
-        .iter()
-        .zip(&straight)
-        .map(|(p, image)| matching::valid_area(image, p.border, MARGIN))
-        .collect();
-    on_straight(&mut model, |m| refine::refine(m, &shades, refine::REFINED, REACH));
-    reweight_and_adjust(&mut model)?;
-    progress.check()?;
-    progress.step(4, "more points");
-    model.prune(0.5 * threshold);
-    on_straight(&mut model, |m| {
-        refine::extend(m, &shades, &valid);
-    });
-    model.prune(0.5 * threshold);
-    reweight_and_adjust(&mut model)?;
+    sub_pixel(&mut model, photos, &straight, threshold, progress)?;
+    progress.step(4, "optics");
     let mut outcome = learn_optics(&mut model)?;
     if sharpen(&mut model, photos) {
         progress.check()?;
@@ -85,6 +71,29 @@ pub(super) fn finish(
 
 /// Pixels of the working image within which the neighbours of a point lie on one plane with it.
 const REACH: f64 = 80.0;
+
+/// Refines all sightings to sub-pixel on the `straight` images, those of pinholes, and adds points that the geometry predicts.
+pub(super) fn sub_pixel(
+    model: &mut Model,
+    photos: &[Photo],
+    straight: &[RgbImage],
+    threshold: f64,
+    progress: &dyn Progress,
+) -> Result<()> {
+    let shades: Vec<Shades> = straight.par_iter().map(|image| Shades::new(&image.luma())).collect();
+    let valid: Vec<Plane<bool>> =
+        photos.iter().zip(straight).map(|(p, image)| matching::valid_area(image, p.border, MARGIN)).collect();
+    on_straight(model, |m| refine::refine(m, &shades, refine::REFINED, REACH));
+    reweight_and_adjust(model)?;
+    progress.check()?;
+    model.prune(0.5 * threshold);
+    on_straight(model, |m| {
+        refine::extend(m, &shades, &valid);
+    });
+    model.prune(0.5 * threshold);
+    reweight_and_adjust(model)?;
+    progress.check()
+}
 
 /// Refines all sightings on the larger images of the photos; false where no photo has one.
 fn sharpen(model: &mut Model, photos: &[Photo]) -> bool {
@@ -116,7 +125,7 @@ fn sharpen(model: &mut Model, photos: &[Photo]) -> bool {
 }
 
 /// Adjusts with weights from the residuals. Weights and geometry depend on each other; they converge to a percent in two rounds.
-fn reweight_and_adjust(model: &mut Model) -> Result<Adjusted> {
+pub(super) fn reweight_and_adjust(model: &mut Model) -> Result<Adjusted> {
     model.weigh();
     model.adjust(f64::INFINITY, 2.0, 60)?;
     model.weigh();
@@ -210,7 +219,7 @@ fn straightening(model: &Model, view: usize) -> Straightening {
 }
 
 /// A view's image as a pinhole would show it.
-fn straightened(model: &Model, view: usize, image: &RgbImage) -> RgbImage {
+pub(super) fn straightened(model: &Model, view: usize, image: &RgbImage) -> RgbImage {
     match model.lens(view) {
         lens if lens.is_none() => image.clone(),
         _ => straightening(model, view).image(image),

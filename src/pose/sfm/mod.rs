@@ -10,6 +10,7 @@ mod pair;
 mod patch;
 mod refine;
 mod relate;
+mod together;
 mod tracks;
 mod unplaced;
 

@@ -24,6 +24,14 @@ fn fit_optics(model: &Model, freedom: Freedom, steps: usize) -> Result<OpticsFit
     Ok(OpticsFit { value, model, outcome })
 }
 
+/// Adjusts with `freedom`; standard deviations as [`learn_optics`] states them.
+pub(super) fn adjust_optics(model: &mut Model, freedom: Freedom) -> Result<Adjusted> {
+    let mut found = fit_optics(model, freedom, STEPS)?;
+    found.widen();
+    *model = found.model;
+    Ok(found.outcome)
+}
+
 /// The best of `freedoms`, with the standard deviations of the last of them.
 fn best_of(model: &Model, freedoms: &[Freedom]) -> Result<OpticsFit> {
     let mut all = freedoms.iter().map(|f| fit_optics(model, *f, STEPS)).collect::<Result<Vec<_>>>()?;

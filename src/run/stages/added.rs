@@ -81,7 +81,7 @@ impl Stage for AddedDepth {
             return Err(Error::work("added photos have cameras and sparse points"));
         };
         let (count, all) = (self.base.known.photos.len(), placed.photos.len());
-        let shown = shown_splats(&self.base, context)?;
+        let shown = shown_splats(&self.base, usize::MAX, context)?;
         let mut renderer = Renderer::new(context.device, &shown, &[], 0)?;
         let rendered: Vec<Plane<f32>> =
             model.cameras.iter().map(|c| Ok(renderer.render(c)?.depth)).collect::<Result<_>>()?;
@@ -113,12 +113,14 @@ impl Stage for AddedDepth {
     }
 }
 
-/// The splats of a scene that its photos show: what it guessed where none looks is guessed anew with the new ones.
-fn shown_splats(base: &BaseScene, context: &Context) -> Result<Splats> {
+/// The splats of a scene that its photos show, no more than `most`: what it guessed where none looks is guessed anew with the new
+/// ones.
+fn shown_splats(base: &BaseScene, most: usize, context: &Context) -> Result<Splats> {
     let rows = if base.seen.pixels.is_empty() {
-        view::seen(context.device, &base.splats, &base.known.cameras, context.progress)?.rows(&base.splats)
+        let seen = view::seen(context.device, &base.splats, &base.known.cameras, context.progress)?;
+        seen.most_shown(&base.splats, most)
     } else {
-        base.seen.rows(&base.splats)
+        base.seen.most_shown(&base.splats, most)
     };
     Ok(base.splats.picked(&rows))
 }
@@ -170,9 +172,12 @@ impl Stage for TrainOn {
     }
 
     fn run(self, (placed, geometry): (&PlacedPhotos, &Geometry), context: &Context) -> Result<Trained> {
-        let scene = shown_splats(&self.base, context)?;
         let (count, all) = (self.base.known.photos.len(), placed.photos.len());
-        let options = self.options.going_on(count, all - count, scene.len());
+        let most = self.options.init.max_points;
+        let options = self.options.going_on(count, all - count);
+        // As many splats on surfaces in the end as a run with all photos has.
+        let fresh = geometry.points.len().min(options.init.max_points);
+        let scene = shown_splats(&self.base, most - fresh, context)?;
         fit::train_on(
             context.device,
             &shared::images(&placed.photos),
