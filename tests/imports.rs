@@ -27,7 +27,7 @@ const FOLDERS: &[(&str, &str)] = &[
     ("language", "error math progress scene photo format infer"),
     ("query", "error math scene pass photo format pose"),
     ("report", "error progress scene photo format query"),
-    ("synth", "error math progress scene photo format language query"),
+    ("synth", "error math progress scene photo format infer language query"),
     ("pipeline", "error files checkpoint progress gpu infer"),
     (
         "run",

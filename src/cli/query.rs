@@ -7,9 +7,10 @@ use super::views;
 use crate::format::ply::{self, PlyOptions};
 use crate::format::{cameras, picture, scene_dir, write_json};
 use crate::gpu::Device;
+use crate::query::presence::{Evidence, Presence};
 use crate::query::{QueryOptions, QueryResult};
 use crate::report::{colour, file_name};
-use crate::run::ask::QueryScene;
+use crate::run::ask::{self, QueryScene};
 use crate::run::encoder;
 use crate::run::view::DecodedFrame;
 use crate::scene::{Camera, LEVEL_NAMES, RgbImage, World};
@@ -60,6 +61,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     progress.begin("query", cameras.len() as u64);
     let mut views: Vec<Vec<Value>> = vec![Vec::new(); args.texts.len()];
     let mut latency = vec![0.0; args.texts.len()];
+    let mut evidence: Vec<Vec<Evidence>> = vec![Vec::new(); args.texts.len()];
     for (part, (cameras, stems)) in cameras.chunks(AT_ONCE).zip(stems.chunks(AT_ONCE)).enumerate() {
         progress.check()?;
         ready.set_views(cameras)?;
@@ -67,6 +69,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
             let clock = Instant::now();
             let answers = ready.ask(text, &QueryOptions::default())?;
             latency[q] += 1e3 * clock.elapsed().as_secs_f64();
+            evidence[q].extend(answers.evidence);
             for (((frame, stem), camera), answer) in
                 ready.frames().iter().zip(stems).zip(cameras).zip(&answers.views)
             {
@@ -82,9 +85,15 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         progress.step((part * AT_ONCE + cameras.len()) as u64, "");
     }
     progress.end();
-    let mut queries = Vec::new();
+    let (mut queries, mut verdicts) = (Vec::new(), Vec::new());
     for (q, text) in args.texts.iter().enumerate() {
-        let mut entry = json!({ "text": text, "milliseconds": latency[q], "views": views[q] });
+        // Of cameras that were answered apart, the part that shows most of it.
+        let best = evidence[q].iter().min_by(|a, b| a.p_value.total_cmp(&b.p_value));
+        let mut entry = json!({
+            "text": text, "presence": best.map(|e| e.presence), "p_value": best.map(|e| e.p_value),
+            "milliseconds": latency[q], "views": views[q],
+        });
+        verdicts.push(best.map(|e| e.presence));
         if args.splats {
             let chosen = ready.select(text, &QueryOptions::default())?;
             let name = format!("{}/splats.ply", folders[q]);
@@ -102,7 +111,11 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let report = json!({ "scene": args.scene, "out": args.out, "world": scene.world, "queries": queries });
     write_json(&out.file("answers.json")?, &report)?;
     out.keep();
-    if args.device.json { print_json(&report) } else { print(&table(&args.texts, &views, &latency, args)) }
+    if args.device.json {
+        print_json(&report)
+    } else {
+        print(&table(&args.texts, &views, &verdicts, &latency, args))
+    }
 }
 
 fn write(
@@ -145,13 +158,19 @@ fn to_json(stem: &str, folder: &str, a: &QueryResult, place: &Value) -> Value {
     })
 }
 
-fn table(texts: &[String], answers: &[Vec<Value>], latency: &[f64], args: &QueryArgs) -> String {
+fn table(
+    texts: &[String],
+    answers: &[Vec<Value>],
+    verdicts: &[Option<Presence>],
+    latency: &[f64],
+    args: &QueryArgs,
+) -> String {
     let mut text = String::new();
     // Writing to a String cannot fail.
-    for ((query, views), ms) in texts.iter().zip(answers).zip(latency) {
+    for (((query, views), ms), presence) in texts.iter().zip(answers).zip(latency).zip(verdicts) {
         let found = views.iter().filter(|v| v["found"] == true).count();
-        let _ =
-            writeln!(text, "“{query}”: found in {found} of {} views, answered in {ms:.0} ms", views.len());
+        let verdict = ask::verdict(*presence, found, views.len());
+        let _ = writeln!(text, "“{query}”: {verdict}, answered in {ms:.0} ms");
         for v in views {
             let verdict = if v["found"] == true { "" } else { "  not found" };
             let _ = writeln!(

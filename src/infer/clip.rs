@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use rayon::prelude::*;
 use tokenizers::Tokenizer;
 
-use super::RegionEncoder;
 use super::cache::OutputKey;
 use super::classify::{crop, extents};
 use super::contract::Part;
@@ -14,6 +13,7 @@ use super::installed::Installed;
 use super::prepare::prepare;
 use super::runtime::Input;
 use super::text::normalise;
+use super::{RegionEncoder, things};
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
 
@@ -281,6 +281,14 @@ impl RegionEncoder for Clip {
             all.extend(row);
         }
         Ok(all)
+    }
+
+    fn others(&mut self, form: &str) -> Result<Vec<f32>> {
+        let texts = things::of_form(form);
+        let graph = self.model.graph(Part::TextTower)?;
+        let key = OutputKey::new("other-things").model(graph)?.text(&texts.join("\n"));
+        let compute = graph.compute.clone();
+        compute.remember(key, || self.embed_texts(&texts.iter().map(String::as_str).collect::<Vec<_>>()))
     }
 }
 

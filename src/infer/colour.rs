@@ -67,6 +67,23 @@ pub fn terms_in(text: &str) -> Option<[f32; COUNT]> {
     (count > 0.0).then(|| said.map(|s| if s { 1.0 / count } else { 0.0 }))
 }
 
+/// The eleven terms.
+pub fn names() -> impl Iterator<Item = &'static str> {
+    TERMS.iter().map(|(names, _)| names[0])
+}
+
+/// The terms that do not mean the same as a colour word.
+pub fn names_besides(word: &str) -> impl Iterator<Item = &'static str> {
+    TERMS.iter().filter(move |(names, _)| !names.contains(&word)).map(|(names, _)| names[0])
+}
+
+/// The colour words of a text, as it says them.
+pub fn words_in(text: &str) -> Vec<String> {
+    let lower = text.to_lowercase();
+    let words = lower.split(|c: char| !c.is_alphanumeric());
+    words.filter(|w| TERMS.iter().any(|(names, _)| names.contains(w))).map(str::to_owned).collect()
+}
+
 /// The term that a direction of [`direction`]'s space is nearest to, and the cosine to it.
 pub fn nearest_term(towards: &[f32]) -> (&'static str, f32) {
     let cosine = |i: usize| {

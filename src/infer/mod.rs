@@ -33,6 +33,7 @@ pub(crate) mod testing;
 #[cfg(test)]
 mod tests;
 pub mod text;
+pub mod things;
 pub mod warp;
 pub mod words;
 pub mod xfeat;
@@ -71,6 +72,16 @@ pub trait RegionEncoder: Send {
     fn embed_regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>>;
     /// [texts.len(), D] row-major unit vectors.
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>>;
+    /// [N, D] unit rows of [`things::of_form`]; fewer, or none, from an encoder that knows only some texts.
+    fn others(&mut self, form: &str) -> Result<Vec<f32>> {
+        let list = things::of_form(form);
+        self.embed_texts(&list.iter().map(String::as_str).collect::<Vec<_>>())
+    }
+    /// [M, D] unit rows of [`things::recoloured`]; fewer, or none, from an encoder that knows only some texts.
+    fn recoloured(&mut self, text: &str) -> Result<Vec<f32>> {
+        let list = things::recoloured(text);
+        self.embed_texts(&list.iter().map(String::as_str).collect::<Vec<_>>())
+    }
     /// Per region embedding ([count, D] rows) the `best` phrases of the encoder's own vocabulary, with their cosine, best
     /// first. None from an encoder that has no list of phrases.
     fn names(&mut self, regions: &[f32], _best: usize) -> Result<Vec<Vec<(String, f32)>>> {

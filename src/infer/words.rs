@@ -21,7 +21,7 @@ use super::cache::OutputKey;
 use super::classify::{CLASSES, Classifier};
 use super::registry::{PackFileKind, Registry};
 use super::text::{self, TextEncoder, normalise};
-use super::{RegionEncoder, colour, nearest};
+use super::{RegionEncoder, colour, nearest, things};
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -119,13 +119,25 @@ impl RegionEncoder for RegionWords {
         let vocabulary = self.vocabulary()?;
         let mut all = vec![0f32; texts.len() * DIM];
         for (row, text) in all.chunks_exact_mut(DIM).zip(texts) {
-            let (meaning, classes) = vocabulary.place(text)?;
-            fill_text(row, &meaning, &classes);
-            if let Some(said) = colour::terms_in(text) {
-                fill(row, COLOUR_AT, SHARES[2], colour::direction(&said));
-            }
-            row[REST_AT] = (1.0 - row.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
+            let meaning = vocabulary.encoder.embed(text)?;
+            vocabulary.fill_phrase(row, text, meaning);
         }
+        Ok(all)
+    }
+
+    fn others(&mut self, form: &str) -> Result<Vec<f32>> {
+        let texts = things::of_form(form);
+        let registry = self.registry.clone();
+        let key = text_key("other-things", &registry).text(&texts.join("\n"));
+        let vocabulary = self.vocabulary()?;
+        let list: Vec<&str> = texts.iter().map(String::as_str).collect();
+        let meanings = registry.compute().remember(key, || vocabulary.encoder.embed_list(&list))?;
+        let mut all = vec![0f32; texts.len() * DIM];
+        let fixed = &*vocabulary;
+        all.par_chunks_exact_mut(DIM)
+            .zip(meanings.par_chunks_exact(text::DIM))
+            .zip(&texts)
+            .for_each(|((row, meaning), text)| fixed.fill_phrase(row, text, meaning.to_vec()));
         Ok(all)
     }
 
@@ -160,6 +172,12 @@ fn fill(row: &mut [f32], at: usize, share: f32, values: impl IntoIterator<Item =
     row[at..].iter_mut().zip(values).for_each(|(r, v)| *r = share.sqrt() * v);
 }
 
+/// What the models that understand texts are told apart by.
+fn text_key(what: &'static str, registry: &Registry) -> OutputKey {
+    let used = registry.status_of(&[PackFileKind::Text, PackFileKind::Tokenizer, PackFileKind::Classes]);
+    used.iter().fold(OutputKey::new(what), |key, file| key.text(&file.sha256))
+}
+
 /// Mean distribution over colour terms of each region's pixels; `None` for a region without pixels.
 fn region_colours(image: &RgbImage, labels: &Plane<i32>, count: usize) -> Vec<Option<[f32; colour::COUNT]>> {
     let mut sums = vec![([0f32; colour::COUNT], 0u32); count];
@@ -188,8 +206,7 @@ impl Vocabulary {
         }
         let mut encoder = TextEncoder::load(registry)?;
         // Naming a thousand classes takes seconds, which a single query should not pay.
-        let used = registry.status_of(&[PackFileKind::Text, PackFileKind::Tokenizer, PackFileKind::Classes]);
-        let key = used.iter().fold(OutputKey::new("class-names"), |key, file| key.text(&file.sha256));
+        let key = text_key("class-names", registry);
         let mut names = registry
             .compute()
             .remember(key, || encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>()))?;
@@ -204,16 +221,18 @@ impl Vocabulary {
         Ok(Vocabulary { encoder, mean, names, list })
     }
 
-    /// A text's centred unit embedding [384] and its weight on each class [1000], which sum to less than 1.
-    fn place(&mut self, text: &str) -> Result<(Vec<f32>, Vec<f32>)> {
-        let mut meaning = self.encoder.embed(text)?;
+    /// Writes the row of a text with its sentence embedding [384].
+    fn fill_phrase(&self, row: &mut [f32], text: &str, mut meaning: Vec<f32>) {
         meaning.iter_mut().zip(&self.mean).for_each(|(v, m)| *v -= m);
         normalise(&mut meaning);
-        let weights = self.weights(&meaning);
-        Ok((meaning, weights))
+        fill_text(row, &meaning, &self.weights(&meaning));
+        if let Some(said) = colour::terms_in(text) {
+            fill(row, COLOUR_AT, SHARES[2], colour::direction(&said));
+        }
+        row[REST_AT] = (1.0 - row.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
     }
 
-    /// The weight [1000] on each class of a centred unit embedding.
+    /// The weight [1000] on each class of a centred unit embedding; they sum to less than 1.
     fn weights(&self, meaning: &[f32]) -> Vec<f32> {
         let cosine = |name: &[f32]| name.iter().zip(meaning).map(|(a, b)| a * b).sum::<f32>();
         let scores: Vec<f32> = self.names.chunks_exact(text::DIM).map(cosine).collect();

@@ -66,8 +66,12 @@ mod tests {
         let fine = level(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
         let coarse = level(&[[0.9, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
         let field = LanguageField { levels: vec![fine, LevelField::default(), coarse], space: "t".into() };
-        let query =
-            TextQuery { text: "x".into(), embedding: vec![1.0, 0.0, 0.0], canonicals: vec![0.0, 0.0, 1.0] };
+        let query = TextQuery {
+            text: "x".into(),
+            embedding: vec![1.0, 0.0, 0.0],
+            canonicals: vec![0.0, 0.0, 1.0],
+            alternatives: Default::default(),
+        };
         let map = |data: &[i32]| Plane { width: data.len(), height: 1, data: data.to_vec() };
         let (first, second) = (
             vec![map(&[0, 1]), map(&[-1, -1]), map(&[0, 2])],

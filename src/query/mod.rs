@@ -6,14 +6,15 @@
 pub mod eval;
 pub mod filter;
 pub mod highlight;
+pub mod presence;
 pub mod protocol;
 pub mod select;
 
+use self::presence::Alternatives;
 use crate::math::dot;
 use crate::scene::{Codebook, LanguageField, Plane};
 use crate::{Error, Result};
 use rayon::prelude::*;
-
 /// The phrases that every query is compared against (LERF).
 pub const CANONICAL_PHRASES: [&str; 4] = ["object", "things", "stuff", "texture"];
 
@@ -29,6 +30,8 @@ pub struct TextQuery {
     pub embedding: Vec<f32>,
     /// [C, D] unit rows of the canonical phrases.
     pub canonicals: Vec<f32>,
+    /// What else it could have said; may be nothing.
+    pub alternatives: Alternatives,
 }
 
 /// How an answer is cut out of the relevancy map.

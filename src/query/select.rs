@@ -84,6 +84,7 @@ mod tests {
             text: "q".into(),
             embedding: v.to_vec(),
             canonicals: vec![0.0, 0.0, 0.0, 1.0],
+            alternatives: Default::default(),
         };
         let options = QueryOptions::default();
         let thing = select(&field, &query([1.0, 0.0, 0.0, 0.0]), &options).unwrap();

@@ -27,6 +27,7 @@ fn query(v: &[f32]) -> TextQuery {
         text: "q".into(),
         embedding: unit(v),
         canonicals: vec![0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.8],
+        alternatives: Default::default(),
     }
 }
 
@@ -199,7 +200,12 @@ fn perfect_masks_and_distinct_features_answer_every_phrase() {
     assert_eq!(codes_per_level, [11, 11, 11]);
     for (object, text) in &phrases {
         let embedding = vectors[*object as usize].clone();
-        let query = TextQuery { text: text.clone(), embedding, canonicals: vectors[12..].concat() };
+        let query = TextQuery {
+            text: text.clone(),
+            embedding,
+            canonicals: vectors[12..].concat(),
+            alternatives: Default::default(),
+        };
         for (t, view) in views.iter().enumerate() {
             let maps: Vec<Plane<i32>> = built.field.levels.iter().map(|l| l.targets[t].clone()).collect();
             let r = answer(&maps, &built.field, &query, &QueryOptions::default()).unwrap();

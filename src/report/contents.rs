@@ -91,6 +91,8 @@ pub struct AnswerShown<'a> {
 pub struct QueryShown<'a> {
     /// The text of the query.
     pub text: &'a str,
+    /// The answer in a few words.
+    pub verdict: String,
     /// One per view.
     pub answers: Vec<AnswerShown<'a>>,
 }

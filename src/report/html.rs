@@ -128,9 +128,9 @@ fn query_row(report: &HtmlReport, q: &QueryShown) -> Result<String> {
     let hits = q.answers.iter().filter(|a| a.found).count();
     let class = if hits > 0 { "yes" } else { "no" };
     let mut row = format!(
-        "<h3>“{}” <span class=\"{class}\">found in {hits} of {} views</span></h3><div class=\"row\">",
+        "<h3>“{}” <span class=\"{class}\">{}</span></h3><div class=\"row\">",
         escape(q.text),
-        q.answers.len()
+        q.verdict
     );
     for a in &q.answers {
         let Some(view) = report.views.get(a.view) else { continue };
@@ -236,7 +236,11 @@ mod tests {
         let report = HtmlReport {
             title: "a <b> & \"c\"",
             views: vec![view],
-            queries: vec![QueryShown { text: "<script>", answers: vec![answer] }],
+            queries: vec![QueryShown {
+                text: "<script>",
+                verdict: "found in 1 of 1 photos".into(),
+                answers: vec![answer],
+            }],
             curves: vec![
                 Curve { name: "PSNR", unit: "dB", points: vec![(1.0, 21.0), (100.0, 32.456)] },
                 Curve { name: "nothing", unit: "", points: vec![(1.0, 1.0)] },

@@ -1,13 +1,17 @@
 //! A loaded scene that is kept on the device for queries: what viewers, `splatvk query` and benchmarks call.
 use super::view::{DecodedFrame, Viewer};
 use crate::gpu::Device;
-use crate::infer::RegionEncoder;
+use crate::infer::{RegionEncoder, things};
 use crate::query::highlight::Highlight;
+use crate::query::presence::{Alternatives, Background, Evidence, Presence, ShownCodes};
 use crate::query::select::{Selection, select};
 use crate::query::{self, CANONICAL_PHRASES, QueryOptions, QueryResult, TextQuery};
 use crate::report::viewer::{CodeNames, ShownAnswer};
 use crate::scene::{Camera, LanguageField, Plane, Splats};
 use crate::{Error, Result};
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
+use std::sync::Arc;
 
 /// The scene on the device, its code maps in the set views, and the text encoder. A query costs the
 /// embedding of its text and a gather and five box filters per camera; nothing is rendered for it.
@@ -31,7 +35,32 @@ pub struct QueryScene {
     encoder: Box<dyn RegionEncoder>,
     /// [C, D] unit rows of the canonical phrases.
     canonicals: Vec<f32>,
+    others: Others,
+    /// How well other things fit what the frames show, by the words before them.
+    backgrounds: HashMap<String, Background>,
     frames: Vec<DecodedFrame>,
+}
+
+/// What texts could have said instead, [N, D], by the words before them.
+type Others = HashMap<String, Arc<Vec<f32>>>;
+
+/// One text as a query.
+fn as_query(
+    text: &str,
+    encoder: &mut dyn RegionEncoder,
+    canonicals: &[f32],
+    others: &mut Others,
+) -> Result<TextQuery> {
+    let embedding = encoder.embed_texts(&[text])?;
+    let things = match others.entry(things::form(text)) {
+        Entry::Occupied(known) => known.get().clone(),
+        Entry::Vacant(new) => {
+            let rows = encoder.others(new.key())?;
+            new.insert(Arc::new(rows)).clone()
+        }
+    };
+    let alternatives = Alternatives { things, colours: encoder.recoloured(text)? };
+    Ok(TextQuery { text: text.to_owned(), embedding, canonicals: canonicals.to_vec(), alternatives })
 }
 
 impl QueryScene {
@@ -47,12 +76,14 @@ impl QueryScene {
         }
         let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
         let viewer = Viewer::new(device, splats, &field)?;
-        Ok(QueryScene { viewer, field, encoder, canonicals, frames: Vec::new() })
+        let (others, backgrounds) = (Others::new(), HashMap::new());
+        Ok(QueryScene { viewer, field, encoder, canonicals, others, backgrounds, frames: Vec::new() })
     }
 
     /// Renders and decodes the cameras that later queries are answered for.
     pub fn set_views(&mut self, cameras: &[Camera]) -> Result<&[DecodedFrame]> {
         self.frames.clear();
+        self.backgrounds.clear();
         for camera in cameras {
             self.frames.push(self.viewer.view(camera)?);
         }
@@ -76,16 +107,15 @@ impl QueryScene {
 
     /// The splats that a text means, whatever the views.
     pub fn select(&mut self, text: &str, options: &QueryOptions) -> Result<Selection> {
-        let embedding = self.encoder.embed_texts(&[text])?;
-        let query = TextQuery { text: text.to_owned(), embedding, canonicals: self.canonicals.clone() };
+        let query = as_query(text, self.encoder.as_mut(), &self.canonicals, &mut self.others)?;
         select(&self.field, &query, options)
     }
 
     /// Answers a text in every frame.
     pub fn ask(&mut self, text: &str, options: &QueryOptions) -> Result<Answers> {
-        let embedding = self.encoder.embed_texts(&[text])?;
-        let query = TextQuery { text: text.to_owned(), embedding, canonicals: self.canonicals.clone() };
-        answers(&self.frames, &self.field, &query, options)
+        let query = as_query(text, self.encoder.as_mut(), &self.canonicals, &mut self.others)?;
+        let background = self.backgrounds.entry(things::form(text));
+        answers_with(&self.frames, &self.field, &query, options, background)
     }
 }
 
@@ -97,6 +127,8 @@ pub struct Answers {
     pub text: String,
     /// Per photo.
     pub views: Vec<QueryResult>,
+    /// Whether the scene shows what the text means; `None` where the text model knows too few texts to tell.
+    pub evidence: Option<Evidence>,
     /// For the scene as a whole.
     pub highlight: Highlight,
 }
@@ -108,6 +140,7 @@ impl Answers {
             text: &self.text,
             found: self.found(),
             views: self.views.len(),
+            presence: self.evidence.map(|e| e.presence),
             highlight: &self.highlight,
         }
     }
@@ -115,6 +148,20 @@ impl Answers {
     /// Photos in which the text was found.
     pub fn found(&self) -> usize {
         self.views.iter().filter(|v| v.found).count()
+    }
+
+    /// The answer in a few words.
+    pub fn verdict(&self) -> String {
+        verdict(self.evidence.map(|e| e.presence), self.found(), self.views.len())
+    }
+}
+
+/// An answer in a few words: "found in 3 of 4 photos".
+pub fn verdict(presence: Option<Presence>, found: usize, views: usize) -> String {
+    match presence {
+        Some(Presence::Absent) => "not in this scene".to_owned(),
+        Some(Presence::Unsure) => format!("unsure; if it is here, in {found} of {views} photos"),
+        Some(Presence::Found) | None => format!("found in {found} of {views} photos"),
     }
 }
 
@@ -147,10 +194,27 @@ pub fn answers(
     query: &TextQuery,
     options: &QueryOptions,
 ) -> Result<Answers> {
+    answers_with(frames, field, query, options, HashMap::new().entry(String::new()))
+}
+
+/// The same, with a place for how well other things fit these frames.
+fn answers_with(
+    frames: &[DecodedFrame],
+    field: &LanguageField,
+    query: &TextQuery,
+    options: &QueryOptions,
+    background: Entry<'_, String, Background>,
+) -> Result<Answers> {
     let codes: Vec<&[Plane<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
-    let views = query::answer_all(&codes, field, query, options)?;
+    let mut views = query::answer_all(&codes, field, query, options)?;
+    let shown = ShownCodes::new(&codes, field, &query.canonicals);
+    let background = background.or_insert_with(|| shown.background(&query.alternatives.things));
+    let evidence = shown.evidence(query, background);
+    if evidence.is_some_and(|e| e.presence == Presence::Absent) {
+        views.iter_mut().for_each(|v| v.found = false);
+    }
     let highlight = query::highlight::highlight(&codes, field, query, &views)?;
-    Ok(Answers { text: query.text.clone(), views, highlight })
+    Ok(Answers { text: query.text.clone(), views, evidence, highlight })
 }
 
 /// Embeds texts for [`crate::query::answer`].
@@ -159,12 +223,6 @@ pub fn embedded(texts: &[String], encoder: &mut dyn RegionEncoder) -> Result<Vec
         return Ok(Vec::new());
     }
     let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
-    let list: Vec<&str> = texts.iter().map(String::as_str).collect();
-    let rows = encoder.embed_texts(&list)?;
-    let query = |(text, row): (&String, &[f32])| TextQuery {
-        text: text.clone(),
-        embedding: row.to_vec(),
-        canonicals: canonicals.clone(),
-    };
-    Ok(texts.iter().zip(rows.chunks_exact(encoder.dim())).map(query).collect())
+    let mut others = Others::new();
+    texts.iter().map(|text| as_query(text, encoder, &canonicals, &mut others)).collect()
 }

@@ -161,6 +161,7 @@ impl LiveScene {
             text: text.to_owned(),
             embedding,
             canonicals: canonicals.clone(),
+            alternatives: Default::default(),
         });
         self.text_encoder = Some((encoder, canonicals));
         let query = query?;

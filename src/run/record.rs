@@ -203,7 +203,10 @@ fn answer_json(a: &Answers) -> serde_json::Value {
             })
         })
         .collect();
-    json!({ "text": a.text, "found": a.found(), "views": views })
+    json!({
+        "text": a.text, "found": a.found(), "presence": a.evidence.map(|e| e.presence),
+        "p_value": a.evidence.map(|e| e.p_value), "views": views,
+    })
 }
 
 /// Figures for the head of the report and the closing table: (label, value).
@@ -235,7 +238,7 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
     let codes = |k: usize| o.field.levels.get(k).map_or(0, |l| l.codebook.len());
     list.push(("things s/m/l".to_owned(), format!("{} / {} / {}", codes(0), codes(1), codes(2))));
     for a in &o.answers {
-        list.push((format!("“{}”", a.text), format!("found in {} of {} photos", a.found(), a.views.len())));
+        list.push((format!("“{}”", a.text), a.verdict()));
     }
     list
 }
@@ -383,7 +386,7 @@ fn shown(a: &Answers) -> QueryShown<'_> {
             level: LEVEL_NAMES[v.level],
         })
         .collect();
-    QueryShown { text: &a.text, answers }
+    QueryShown { text: &a.text, verdict: a.verdict(), answers }
 }
 
 #[cfg(test)]

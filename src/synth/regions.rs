@@ -6,6 +6,7 @@
 //! book"), and any phrase has an embedding.
 use crate::format::create_folder;
 use crate::format::npy::{self, NpyArray};
+use crate::infer::things;
 use crate::language::dir::normalise_rows;
 use crate::language::{LevelMasks, ViewMasks};
 use crate::math::Random;
@@ -15,7 +16,7 @@ use crate::query::{CANONICAL_PHRASES, TextQuery};
 use crate::scene::Plane;
 use crate::{Error, Result};
 use glam::{DVec2, DVec3};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// Length of an embedding, that of CLIP ViT-B/16.
@@ -100,6 +101,7 @@ pub fn query(text: &str) -> TextQuery {
         text: text.to_owned(),
         embedding: text_embedding(text),
         canonicals: CANONICAL_PHRASES.iter().flat_map(|c| text_embedding(c)).collect(),
+        alternatives: Default::default(),
     }
 }
 
@@ -331,7 +333,10 @@ fn compacted(masks: LevelMasks) -> LevelMasks {
     out
 }
 
-/// Writes regions as a `dir:` folder, with the embeddings of `phrases`.
+/// Of the other things that a query is weighed against every so many are in the table of texts: a megabyte of them.
+const OTHERS_EVERY: usize = 4;
+
+/// Writes regions as a `dir:` folder, with the embeddings of `phrases` and of other things to weigh them against.
 pub fn write(folder: &Path, frames: &[&TruthFrame], regions: &Regions, phrases: &[String]) -> Result<()> {
     create_folder(folder)?;
     for (frame, view) in frames.iter().zip(&regions.masks) {
@@ -347,7 +352,11 @@ pub fn write(folder: &Path, frames: &[&TruthFrame], regions: &Regions, phrases: 
         npy::write(folder.join(format!("{name}_s.npy")), &labels)?;
         npy::write(folder.join(format!("{name}_f.npy")), &NpyArray::f32(&[first as usize, DIM], features))?;
     }
-    let texts: Vec<&str> = phrases.iter().map(String::as_str).chain(CANONICAL_PHRASES).collect();
+    let of_forms = things::forms().flat_map(|form| things::of_form(form).into_iter().step_by(OTHERS_EVERY));
+    let recoloured = phrases.iter().flat_map(|p| things::recoloured(p));
+    let others: BTreeSet<String> = of_forms.chain(recoloured).collect();
+    let new = others.iter().filter(|o| !phrases.contains(o));
+    let texts: Vec<&str> = phrases.iter().chain(new).map(String::as_str).chain(CANONICAL_PHRASES).collect();
     let rows: Vec<NpyArray> = texts.iter().map(|t| NpyArray::f32(&[DIM], text_embedding(t))).collect();
     let table: Vec<(&str, &NpyArray)> = texts.iter().copied().zip(&rows).collect();
     npy::write_npz(folder.join("text_embeddings.npz"), &table)

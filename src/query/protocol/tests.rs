@@ -31,6 +31,7 @@ fn query(text: &str, random: &mut Random) -> TextQuery {
         text: text.into(),
         embedding: unit(random),
         canonicals: (0..4).flat_map(|_| unit(random)).collect(),
+        alternatives: Default::default(),
     }
 }
 
@@ -522,7 +523,12 @@ fn own_ground_truth_serves_lerf_and_ovs() {
     let ask = |phrase: &String| {
         let label = truth.labels.iter().find(|(_, p)| *p == phrase).unwrap().0;
         let axis = |k: u32| (0..13).map(|i| f32::from(u8::from(i == k))).collect::<Vec<f32>>();
-        TextQuery { text: phrase.clone(), embedding: axis(*label), canonicals: axis(12) }
+        TextQuery {
+            text: phrase.clone(),
+            embedding: axis(*label),
+            canonicals: axis(12),
+            alternatives: Default::default(),
+        }
     };
     for (kind, figure) in [(ProtocolKind::Lerf, "localisation"), (ProtocolKind::Ovs, "accuracy_argmax")] {
         let mut protocol = open(kind, folder, &scene, &[]).unwrap();

@@ -11,6 +11,7 @@ use super::colour;
 use crate::Result;
 use crate::format::picture;
 use crate::query::highlight::Highlight;
+use crate::query::presence::Presence;
 use crate::scene::{Camera, LEVEL_NAMES, LanguageField, RgbImage, Seen, Splats, World};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -50,6 +51,8 @@ pub struct ShownAnswer<'a> {
     pub found: usize,
     /// Views that were queried.
     pub views: usize,
+    /// Whether the scene shows it, where that can be told.
+    pub presence: Option<Presence>,
     /// What lights up.
     pub highlight: &'a Highlight,
 }
@@ -59,7 +62,7 @@ impl ShownAnswer<'_> {
     pub fn json(&self) -> Value {
         let h = self.highlight;
         json!({
-            "text": self.text, "found": self.found, "views": self.views,
+            "text": self.text, "found": self.found, "views": self.views, "presence": self.presence,
             "level": h.level, "codes": h.codes, "relevancy": h.relevancy,
         })
     }
@@ -189,7 +192,8 @@ mod tests {
         let photo = RgbImage { width: 64, height: 48, data: vec![[0.3; 3]; 64 * 48] };
         let highlight =
             Highlight { level: 2, codes: vec![1], relevancy: vec![vec![], vec![], vec![0.1, 0.9]] };
-        let answer = ShownAnswer { text: "</script><b>", found: 1, views: 1, highlight: &highlight };
+        let answer =
+            ShownAnswer { text: "</script><b>", found: 1, views: 1, presence: None, highlight: &highlight };
         let scene = Scene3d {
             title: "a<b",
             splats: &splats,

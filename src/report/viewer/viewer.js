@@ -340,7 +340,9 @@ function setQuery(answer) {
     find(".v-ask input").value = answer.text;
     const of = (k) => answer.relevancy[answer.level][k];
     const best = answer.codes.reduce((a, b) => (of(b) > of(a) ? b : a), answer.codes[0]);
-    const found = answer.found ? `In ${answer.found} of ${answer.views} photos` : "Not found; this is the nearest";
+    const where = `in ${answer.found} of ${answer.views} photos`;
+    const found = !answer.found ? "Not in this scene; this is the nearest"
+      : answer.presence === "unsure" ? `Unsure; if it is here, ${where}` : `Found ${where}`;
     const time = answer.milliseconds === undefined ? "" : `, ${answer.milliseconds.toFixed(0)} ms`;
     const names = best === undefined ? [] : namesOf(answer.level, best);
     card(answer.text, `${found}, as a ${levels[answer.level].one.toLowerCase()}${time}`, null, answer.level, names);

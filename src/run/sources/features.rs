@@ -4,7 +4,7 @@ use crate::files::content_hash;
 use crate::infer::clip::Clip;
 use crate::infer::installed::{Installed, Task};
 use crate::infer::words::RegionWords;
-use crate::infer::{PackFileKind, RegionEncoder, Registry, nearest};
+use crate::infer::{PackFileKind, RegionEncoder, Registry, nearest, things};
 use crate::language::dir::TextEmbeddings;
 use crate::query::CANONICAL_PHRASES;
 use crate::run::stages::{SharedEncoder, identity};
@@ -94,6 +94,13 @@ struct Table {
     space: String,
 }
 
+impl Table {
+    /// [N, D] rows of those texts that the table has.
+    fn known(&self, texts: &[String]) -> Vec<f32> {
+        texts.iter().filter_map(|text| self.texts.get(text)).flatten().copied().collect()
+    }
+}
+
 impl RegionEncoder for Table {
     fn space(&self) -> &str {
         &self.space
@@ -106,6 +113,12 @@ impl RegionEncoder for Table {
     }
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
         self.texts.embed(texts)
+    }
+    fn others(&mut self, form: &str) -> Result<Vec<f32>> {
+        Ok(self.known(&things::of_form(form)))
+    }
+    fn recoloured(&mut self, text: &str) -> Result<Vec<f32>> {
+        Ok(self.known(&things::recoloured(text)))
     }
     fn names(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
         let named: Vec<_> = self.texts.iter().filter(|(p, _)| !CANONICAL_PHRASES.contains(p)).collect();

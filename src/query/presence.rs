@@ -1,0 +1,190 @@
+//! Whether a scene shows what a text means (docs/method.md#presence): a text is weighed against other things that it could have
+//! said. One that fits the scene no better than they do is no evidence of anything.
+use super::TextQuery;
+use crate::scene::{LanguageField, Plane};
+use rayon::prelude::*;
+use serde::Serialize;
+use std::sync::Arc;
+
+/// Fewer other things tell nothing: the least share that they can state is above [`FOUND`].
+const MIN_OTHERS: usize = 20;
+
+/// Share of other things that fit at least as well, up to which a text is found. Of texts that are not in the scene no more than
+/// this share is called found, as far as they are like the other things: the level of a conformal test.
+const FOUND: f32 = 0.05;
+
+/// The same, from which on a text is not in the scene: three of four things that are hardly there fit better. Of what is in
+/// `breakfast` and five generated scenes (tuning; built-in words) one in sixteen is above, of what is not one in seven.
+const ABSENT: f32 = 0.75;
+
+/// Codes that show less than this share of all pixels are specks, which answer anything by chance.
+const LEAST_SHARE: f64 = 3e-4;
+
+/// What a text could have said instead.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Alternatives {
+    /// [N, D] unit rows of other things; the same for many texts.
+    pub things: Arc<Vec<f32>>,
+    /// [M, D] unit rows of the same thing in other colours.
+    pub colours: Vec<f32>,
+}
+
+/// Whether something is in a scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Presence {
+    /// It is.
+    Found,
+    /// What the features say does not decide.
+    Unsure,
+    /// It is not.
+    Absent,
+}
+
+/// What speaks for a text.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Evidence {
+    /// The verdict.
+    pub presence: Presence,
+    /// Share of other things that fit the scene at least as well, in (0, 1].
+    pub p_value: f32,
+}
+
+/// The codes that frames show, and what of their meaning the canonical phrases have.
+pub struct ShownCodes<'f> {
+    /// [D] embedding, and the largest cosine to a canonical phrase.
+    codes: Vec<(&'f [f32], f32)>,
+}
+
+impl<'f> ShownCodes<'f> {
+    /// `frames` hold one decoded map per level.
+    pub fn new(frames: &[&[Plane<i32>]], field: &'f LanguageField, canonicals: &[f32]) -> ShownCodes<'f> {
+        let mut codes = Vec::new();
+        for (index, level) in field.levels.iter().enumerate() {
+            let book = &level.codebook;
+            let mut shown = vec![0usize; book.len()];
+            let maps = || frames.iter().filter_map(|levels| levels.get(index));
+            for code in maps().flat_map(|m| &m.data) {
+                if let Some(n) = usize::try_from(*code).ok().and_then(|k| shown.get_mut(k)) {
+                    *n += 1;
+                }
+            }
+            let least = LEAST_SHARE * maps().map(|m| m.data.len()).sum::<usize>() as f64;
+            let rows = book.embeddings.chunks_exact(book.embedding_dim.max(1)).zip(&shown);
+            codes.extend(rows.filter(|(_, n)| **n > 0 && **n as f64 >= least).map(|(row, _)| {
+                let common = canonicals.chunks_exact(row.len()).map(|c| dot(row, c));
+                (row, common.fold(f32::NEG_INFINITY, f32::max))
+            }));
+        }
+        ShownCodes { codes }
+    }
+
+    /// The code that fits a text best, and by how much it is nearer to it than to every canonical phrase, as a difference of
+    /// cosines.
+    fn best(&self, text: &[f32]) -> Option<(&'f [f32], f32)> {
+        let fits = self.codes.iter().map(|(row, common)| (*row, dot(row, text) - common));
+        fits.max_by(|a, b| a.1.total_cmp(&b.1))
+    }
+
+    /// The scores of other things.
+    pub fn background(&self, others: &[f32]) -> Background {
+        let dim = self.codes.first().map_or(1, |c| c.0.len());
+        let scores = others.par_chunks_exact(dim).filter_map(|other| Some(self.best(other)?.1));
+        Background { scores: scores.collect() }
+    }
+
+    /// What speaks for a query against such scores; `None` where there are too few to say, or no code is shown.
+    pub fn evidence(&self, query: &TextQuery, background: &Background) -> Option<Evidence> {
+        if background.scores.len() < MIN_OTHERS {
+            return None;
+        }
+        let (code, own) = self.best(&query.embedding)?;
+        // "green mug": the code that fits it best is a blue mug.
+        let fit = dot(code, &query.embedding);
+        let other_colour = query.alternatives.colours.chunks_exact(code.len()).any(|c| dot(code, c) > fit);
+        let better = background.scores.iter().filter(|other| **other >= own).count();
+        let p_value = (1 + better) as f32 / (1 + background.scores.len()) as f32;
+        let presence = match p_value {
+            p if p <= FOUND && !other_colour => Presence::Found,
+            p if p < ABSENT => Presence::Unsure,
+            _ => Presence::Absent,
+        };
+        Some(Evidence { presence, p_value })
+    }
+}
+
+/// How well other things fit a scene.
+#[derive(Clone, Debug, Default)]
+pub struct Background {
+    scores: Vec<f32>,
+}
+
+fn dot(a: &[f32], b: &[f32]) -> f32 {
+    a.iter().zip(b).map(|(x, y)| x * y).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::infer::things;
+    use crate::scene::{Codebook, LevelField};
+    use crate::synth::regions;
+
+    /// A scene that shows some phrases, each as one code with the feature of its text, and a speck of another one.
+    fn field(phrases: &[&str], speck: &str) -> (LanguageField, Vec<Plane<i32>>) {
+        let dim = regions::DIM;
+        let embeddings: Vec<f32> =
+            phrases.iter().chain([&speck]).flat_map(|p| regions::text_embedding(p)).collect();
+        let count = phrases.len() + 1;
+        let codebook = Codebook {
+            embedding_dim: dim,
+            code_dim: 3,
+            embeddings,
+            codes: vec![0.0; 3 * count],
+            ..Codebook::default()
+        };
+        let mut map = Plane::filled(100, 100, 0);
+        map.data.iter_mut().enumerate().for_each(|(i, k)| *k = (i % phrases.len()) as i32);
+        map.data[0] = phrases.len() as i32;
+        let level = LevelField { codebook, ..LevelField::default() };
+        (LanguageField { levels: vec![level], ..LanguageField::default() }, vec![map])
+    }
+
+    #[test]
+    fn what_is_there_is_found_and_what_is_not_is_not() {
+        let present = ["red book", "blue mug", "lemon", "wooden table", "green can"];
+        let (field, maps) = field(&present, "trombone");
+        let ask = |text: &str, form: &str| {
+            let mut query = regions::query(text);
+            query.alternatives.colours =
+                things::recoloured(text).iter().flat_map(|t| regions::text_embedding(t)).collect();
+            let shown = ShownCodes::new(&[&maps], &field, &query.canonicals);
+            let rows: Vec<f32> =
+                things::of_form(form).iter().flat_map(|o| regions::text_embedding(o)).collect();
+            shown.evidence(&query, &shown.background(&rows)).unwrap()
+        };
+        for (text, form) in [("red book", "red"), ("blue mug", "blue"), ("lemon", ""), ("green can", "green")]
+        {
+            assert_eq!(ask(text, form).presence, Presence::Found, "{text}: {:?}", ask(text, form));
+        }
+        // A speck is nothing, although its code is the phrase itself.
+        let absent = ["trombone", "iguana", "sarcophagus", "zeppelin", "turnip", "bollard", "tuba", "pelmet"];
+        let found = absent.iter().filter(|t| ask(t, "").presence == Presence::Found).count();
+        assert!(found <= 1, "{:?}", absent.map(|t| (t, ask(t, "").p_value)));
+        // A thing that is there in another colour is not found.
+        assert_ne!(ask("green mug", "green").presence, Presence::Found, "{:?}", ask("green mug", "green"));
+        // Without the same form every red thing would be a red book.
+        let (same, plain) = (ask("red trombone", "red").p_value, ask("red trombone", "").p_value);
+        assert!(same > FOUND && plain <= FOUND, "{same} {plain}");
+    }
+
+    #[test]
+    fn nothing_is_said_without_other_things() {
+        let (field, maps) = field(&["lemon"], "speck");
+        let query = regions::query("lemon");
+        let shown = ShownCodes::new(&[&maps], &field, &query.canonicals);
+        assert_eq!(shown.evidence(&query, &Background::default()), None);
+        let empty = ShownCodes::new(&[], &field, &query.canonicals);
+        assert_eq!(empty.evidence(&query, &Background { scores: vec![0.0; 100] }), None);
+    }
+}
