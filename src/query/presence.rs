@@ -1,6 +1,5 @@
 //! Whether a scene shows what a text means (docs/method.md#presence): a text is weighed against other things that it could have
 //! said. One that fits the scene no better than they do is no evidence of anything.
-use super::TextQuery;
 use crate::scene::{LanguageField, Plane};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -93,15 +92,16 @@ impl<'f> ShownCodes<'f> {
         Background { scores: scores.collect() }
     }
 
-    /// What speaks for a query against such scores; `None` where there are too few to say, or no code is shown.
-    pub fn evidence(&self, query: &TextQuery, background: &Background) -> Option<Evidence> {
+    /// What speaks for a text against the scores of other things, and its embedding in other colours ([`Alternatives::colours`]);
+    /// `None` where there are too few other things to say, or no code is shown.
+    pub fn evidence(&self, text: &[f32], colours: &[f32], background: &Background) -> Option<Evidence> {
         if background.scores.len() < MIN_OTHERS {
             return None;
         }
-        let (code, own) = self.best(&query.embedding)?;
+        let (code, own) = self.best(text)?;
         // "green mug": the code that fits it best is a blue mug.
-        let fit = dot(code, &query.embedding);
-        let other_colour = query.alternatives.colours.chunks_exact(code.len()).any(|c| dot(code, c) > fit);
+        let fit = dot(code, text);
+        let other_colour = colours.chunks_exact(code.len()).any(|c| dot(code, c) > fit);
         let better = background.scores.iter().filter(|other| **other >= own).count();
         let p_value = (1 + better) as f32 / (1 + background.scores.len()) as f32;
         let presence = match p_value {
@@ -155,13 +155,13 @@ mod tests {
         let present = ["red book", "blue mug", "lemon", "wooden table", "green can"];
         let (field, maps) = field(&present, "trombone");
         let ask = |text: &str, form: &str| {
-            let mut query = regions::query(text);
-            query.alternatives.colours =
+            let query = regions::query(text);
+            let colours: Vec<f32> =
                 things::recoloured(text).iter().flat_map(|t| regions::text_embedding(t)).collect();
             let shown = ShownCodes::new(&[&maps], &field, &query.canonicals);
             let rows: Vec<f32> =
                 things::of_form(form).iter().flat_map(|o| regions::text_embedding(o)).collect();
-            shown.evidence(&query, &shown.background(&rows)).unwrap()
+            shown.evidence(&query.embedding, &colours, &shown.background(&rows)).unwrap()
         };
         for (text, form) in [("red book", "red"), ("blue mug", "blue"), ("lemon", ""), ("green can", "green")]
         {
@@ -183,8 +183,8 @@ mod tests {
         let (field, maps) = field(&["lemon"], "speck");
         let query = regions::query("lemon");
         let shown = ShownCodes::new(&[&maps], &field, &query.canonicals);
-        assert_eq!(shown.evidence(&query, &Background::default()), None);
+        assert_eq!(shown.evidence(&query.embedding, &[], &Background::default()), None);
         let empty = ShownCodes::new(&[], &field, &query.canonicals);
-        assert_eq!(empty.evidence(&query, &Background { scores: vec![0.0; 100] }), None);
+        assert_eq!(empty.evidence(&query.embedding, &[], &Background { scores: vec![0.0; 100] }), None);
     }
 }

@@ -209,7 +209,7 @@ fn answers_with(
     let mut views = query::answer_all(&codes, field, query, options)?;
     let shown = ShownCodes::new(&codes, field, &query.canonicals);
     let background = background.or_insert_with(|| shown.background(&query.alternatives.things));
-    let evidence = shown.evidence(query, background);
+    let evidence = shown.evidence(&query.embedding, &query.alternatives.colours, background);
     if evidence.is_some_and(|e| e.presence == Presence::Absent) {
         views.iter_mut().for_each(|v| v.found = false);
     }
