@@ -120,8 +120,8 @@ impl RgbOptions {
     /// The same options for a scene of `known` photos that goes on with `new` more: each may bring its share of the splats.
     pub fn going_on(self, known: usize, new: usize) -> Self {
         // Steps at half size, 0.6 of a run, would undo what the scene shows already: they are left out, and of the others there are a
-        // few more, since new splats have seen none of them.
-        let steps = self.iterations.div_ceil(2);
+        // few more, since new splats have seen none of them. Of many photos each is seen as often as in a run with sixteen.
+        let steps = self.iterations.div_ceil(2).max(self.iterations * (known + new) / 16);
         let mut options = RgbOptions { coarse: 0.0, ..self.with_iterations(steps) };
         options.init.max_points = (options.init.max_points * new).div_ceil((known + new).max(1));
         options
