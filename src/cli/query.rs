@@ -93,7 +93,8 @@ pub fn query(args: &QueryArgs) -> Result<()> {
             "text": text, "presence": best.map(|e| e.presence), "p_value": best.map(|e| e.p_value),
             "milliseconds": latency[q], "views": views[q],
         });
-        verdicts.push(best.map(|e| e.presence));
+        let presence = best.map(|e| e.presence);
+        verdicts.push(presence);
         if args.splats {
             let chosen = ready.select(text, &QueryOptions::default())?;
             let name = format!("{}/splats.ply", folders[q]);
@@ -103,7 +104,8 @@ pub fn query(args: &QueryArgs) -> Result<()> {
                 PlyOptions::default(),
             )?;
             entry["splats"] = json!({
-                "count": chosen.splats.len(), "level": LEVEL_NAMES[chosen.level], "found": chosen.found, "file": name,
+                "count": chosen.splats.len(), "level": LEVEL_NAMES[chosen.level],
+                "found": chosen.found && presence != Some(Presence::Absent), "file": name,
             });
         }
         queries.push(entry);

@@ -82,9 +82,8 @@ pub fn with_added(
     model.triangulate_all(threshold);
     model.prune(threshold);
     check_sightings(&model, photos, count)?;
-    let mut fitted = fitted(&model, photos, known, &pairs, &sigmas);
     let shares = agreement(&model, &pairs, threshold);
-    fitted.iter_mut().zip(&shares).skip(count).for_each(|(f, share)| f.agreement = *share);
+    let mut fitted = fitted(&model, photos, known, &pairs, &shares, &sigmas);
     if known.fitted.iter().all(|f| f.sigmas[0] > 0.0) {
         progress.step(2, "all cameras");
         share_optics(&mut model, &mut fitted, &focals, count);
@@ -292,7 +291,6 @@ fn refine(model: &mut Model, view: usize, threshold: f64) -> Sigmas {
 fn camera(model: &Model, photos: &[Photo], known: &[Camera], v: usize) -> Camera {
     let p = &photos[v];
     let (focal, centre) = (model.focal(v), model.principal_point(v));
-    let (fx, fy, cx, cy) = (focal, focal, centre.x, centre.y);
     // Registered: `register` gave every view a pose or failed.
     let pose = model.poses[v].unwrap_or(Pose::IDENTITY);
     match known.get(v) {
@@ -305,17 +303,24 @@ fn camera(model: &Model, photos: &[Photo], known: &[Camera], v: usize) -> Camera
             name: p.path.file_name().map_or_else(|| p.stem.clone(), |n| n.to_string_lossy().into()),
             width: p.image.width as u32,
             height: p.image.height as u32,
-            fx,
-            fy,
-            cx,
-            cy,
+            fx: focal,
+            fy: focal,
+            cx: centre.x,
+            cy: centre.y,
             pose,
         },
     }
 }
 
-/// What is known of the photos of the scene, and what their own registration says of the others, all but their agreement.
-fn fitted(model: &Model, photos: &[Photo], known: Known, pairs: &[Pair], sigmas: &[Sigmas]) -> Vec<Fitted> {
+/// What is known of the photos of the scene, and what their own registration says of the others.
+fn fitted(
+    model: &Model,
+    photos: &[Photo],
+    known: Known,
+    pairs: &[Pair],
+    shares: &[f64],
+    sigmas: &[Sigmas],
+) -> Vec<Fitted> {
     let by_file = cameras_by_file(photos);
     let highest = known.fitted.iter().map(|f| f.camera + 1).max().unwrap_or(0);
     let count = known.cameras.len();
@@ -328,7 +333,7 @@ fn fitted(model: &Model, photos: &[Photo], known: Known, pairs: &[Pair], sigmas:
                 lens: model.lens(v),
                 sigmas: [sigmas[v].log_focal, 0.0, 0.0, 0.0, 0.0],
                 residual: model.residual(v),
-                agreement: 0.0,
+                agreement: shares[v],
                 // One pair whose matches are few or mostly contradict each other confirms nothing.
                 unconfirmed: own(v).count() < 2 && !own(v).any(|p| p.sure),
                 rotation_sigma: sigmas[v].rotation,
