@@ -3,7 +3,8 @@
 // (docs/method.md#language-loss).
 // Labels index rows of `codes`, all levels one after the other; -1 has no influence, not even on the gradient's bits.
 // mode 0: upstream = weight[level] * sign(F - code);  mode 1 (lifting): upstream = code, so that the backward pass
-// returns the blending-weighted sum of codes of every splat.
+// returns the blending-weighted sum of codes of every splat, and 1 for colour number `level` where there is a label, which
+// returns the blending weight itself;  mode 2 (least squares): upstream = F - code.
 #extension GL_GOOGLE_include_directive : require
 #include "shared/layout.glsl"
 layout(local_size_x = 64) in;
@@ -14,6 +15,10 @@ layout(std430, binding = 3) readonly buffer Planes { float planes[]; };  // [4 +
 layout(std430, binding = 4) writeonly buffer Upstream { float upstream[]; };  // [4 + levels*width + 1, H*W]
 layout(std430, binding = 5) writeonly buffer Loss { float loss[]; };  // [H*W] weighted sum over levels
 layout(push_constant) uniform Push { uint pixels; uint levels; uint width; uint mode; };
+
+const uint LOSS = 0u;
+const uint LIFT = 1u;
+const uint COLOURS = 3u;
 
 void main() {
     uint pixel = gl_GlobalInvocationID.x;
@@ -30,10 +35,11 @@ void main() {
                 float code = codes[uint(label) * width + k];
                 float difference = planes[at] - code;
                 sum += abs(difference);
-                slope = mode == 0u ? weight * sign(difference) : code;
+                slope = mode == LOSS ? weight * sign(difference) : mode == LIFT ? code : difference;
             }
             upstream[at] = slope;
         }
+        if (mode == LIFT && level < COLOURS) upstream[level * pixels + pixel] = label >= 0 ? 1.0 : 0.0;
         total += weight * sum;
     }
     loss[pixel] = total;

@@ -203,8 +203,8 @@ fn field(images: &[RgbImage]) -> LanguageField {
                 members: vec![Vec::new(); 8],
                 min_chord: 0.5,
             },
-            features: Vec::new(),
             targets: images.iter().map(target).collect(),
+            ..LevelField::default()
         }
     };
     LanguageField { levels: (0..3).map(level).collect(), space: "test".into() }

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)] // helpers of tests
 use glam::DVec3;
 use splatvk::fit::schedule::Exponential;
-use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions, Trained, ViewDependentOptions};
+use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions, Start, Trained, ViewDependentOptions};
 use splatvk::gpu::{Device, Options, TestDevice, test_device};
 use splatvk::math::Random;
 use splatvk::pass::metrics::psnr;
@@ -216,8 +216,8 @@ fn two_objects(device: &Device, splats: &Splats, cameras: &[Camera]) -> Language
             members: vec![Vec::new(); 2],
             min_chord: 2f32.sqrt(),
         },
-        features: Vec::new(),
         targets: targets.collect(),
+        ..LevelField::default()
     };
     // Three levels with the same content; the middle one has no masks.
     LanguageField { levels: vec![level.clone(), LevelField::default(), level], space: "test".into() }
@@ -235,7 +235,7 @@ fn two_objects_are_told_apart_in_every_parameterisation() {
     let images = photos(&device, &splats, &cameras);
     let field = two_objects(&device, &splats, &cameras);
     let base = language_options();
-    let zero = LanguageOptions { lift: false, feature_rate: 7e-3, iterations: 120, ..base.clone() };
+    let zero = LanguageOptions { start: Start::Zero, feature_rate: 7e-3, iterations: 120, ..base.clone() };
     let cases = [
         ("lifted", base.clone()),
         ("from zero", zero),
@@ -268,7 +268,7 @@ fn only_the_ratio_of_rate_and_epsilon_matters_from_zero() {
         let options = LanguageOptions {
             epsilon,
             feature_rate,
-            lift: false,
+            start: Start::Zero,
             detach_geometry: true,
             iterations: 60,
             ..language_options()

@@ -143,9 +143,9 @@ fn field(n: usize) -> LanguageField {
     };
     let mut features = vec![0.0; n * 2];
     features[..4].copy_from_slice(&[3.0, 4.0, 2.0, 0.5]);
-    let s = LevelField { codebook: book.clone(), features: features.clone(), targets: vec![] };
+    let s = LevelField { codebook: book.clone(), features: features.clone(), ..LevelField::default() };
     features[2..4].fill(0.0);
-    let l = LevelField { codebook: book, features, targets: vec![] };
+    let l = LevelField { codebook: book, features, ..LevelField::default() };
     LanguageField { levels: vec![s, LevelField::default(), l], space: "test/space".into() }
 }
 

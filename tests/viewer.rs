@@ -91,7 +91,7 @@ fn breakfast(folder: &Path) -> PathBuf {
             min_chord: 1.4,
         };
         let feature = |l: &i32| if *l > 0 { unit(code(*l as usize - 1)) } else { unit(16) };
-        LevelField { codebook, features: labels.iter().flat_map(feature).collect(), targets: Vec::new() }
+        LevelField { codebook, features: labels.iter().flat_map(feature).collect(), ..LevelField::default() }
     };
     let levels = vec![level(&|o| LABELS - 1 - o), LevelField::default(), level(&|o| o)];
     let field = LanguageField { levels, space: "dir".into() };

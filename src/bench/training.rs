@@ -6,7 +6,7 @@ use super::workload::Workload;
 use crate::Result;
 use crate::fit::options::Rates;
 use crate::fit::scale::SceneScale;
-use crate::fit::{LanguageOptions, LanguageRun, Photos, Preset, RgbOptions, RgbRun, Training};
+use crate::fit::{LanguageOptions, LanguageRun, Photos, Preset, RgbOptions, RgbRun, Start, Training};
 use crate::gpu::{Device, Recorder};
 use crate::pass::renderer::Renderer;
 use crate::pass::{pairs, seeded};
@@ -52,7 +52,7 @@ pub fn with_features(
     let options = LanguageOptions {
         rates: Rates::STILL,
         feature_rate: 0.0,
-        lift: false,
+        start: Start::Zero,
         check_every: 0,
         ..LanguageOptions::preset(Preset::Default)
     };
@@ -80,8 +80,8 @@ fn level(image: &RgbImage, width: usize, seed: u64) -> LevelField {
             codes,
             ..Codebook::default()
         },
-        features: Vec::new(),
         targets: vec![Plane { width: image.width, height: image.height, data }],
+        ..LevelField::default()
     }
 }
 

@@ -1,8 +1,9 @@
 //! The language stage: features on the splats that render to each pixel's code (docs/method.md#language-training),
 //! `L = λ2·L_img + (1−λ2)·L_sem`, starting from lifted features.
-use super::lift::{CodeTargets, lift};
+use super::least_squares;
+use super::lift::{CodeTargets, Lifting};
 use super::model::Model;
-use super::options::LanguageOptions;
+use super::options::{LanguageOptions, Start};
 use super::scale::SceneScale;
 use super::training::{self, Review, Trainer, Training};
 use super::views::Views;
@@ -92,8 +93,10 @@ pub fn train_language(
         training::train(&mut run, g, options.iterations, progress)?;
         let (trained, features) = run.finish()?;
         out.curve.append(&mut run.curve);
-        for (&level, features) in group.iter().zip(features) {
-            out.field.levels[level].features = features;
+        let features = features.into_iter().zip(std::mem::take(&mut run.reliability));
+        for (&level, (features, reliability)) in group.iter().zip(features) {
+            out.field.levels[level].carry(features);
+            out.field.levels[level].reliability = reliability;
             if options.per_level {
                 out.level_splats[level] = trained.clone();
             }
@@ -118,6 +121,8 @@ pub(crate) struct Run<'a> {
     targets: CodeTargets,
     losses: Vec<Buffer<f32>>,
     partials: Buffer<f32>,
+    /// Per level, [N].
+    reliability: Vec<Vec<f32>>,
     /// Losses since the last measurement.
     recent: Vec<f64>,
     curve: Vec<LanguagePoint>,
@@ -150,9 +155,14 @@ impl<'a> Run<'a> {
             feature_mode: FeatureMode::Gauge { epsilon: options.epsilon, blocks: levels.len() },
             features_move_geometry: !options.detach_geometry,
         };
-        if options.lift {
-            let start = lift(device, &mut views, cameras, &model, &raster, &targets)?;
-            model.values.features.write(&start)?;
+        let mut lifting =
+            Lifting { device, views: &mut views, cameras, model: &model, raster, targets: &targets };
+        let lifted = lifting.sums()?;
+        let reliability = (0..levels.len()).map(|l| lifted.reliability(l, levels.len(), width)).collect();
+        match options.start {
+            Start::Zero => {}
+            Start::Lifted => model.values.features.write(&lifted.features(width))?,
+            Start::LeastSquares => least_squares::solve(&mut lifting, &lifted)?,
         }
         let losses = views
             .stages
@@ -169,6 +179,7 @@ impl<'a> Run<'a> {
             targets,
             losses,
             partials: device.buffer::<f32>("loss partials", sum::PARTIALS)?,
+            reliability,
             recent: Vec::new(),
             curve: Vec::new(),
         })

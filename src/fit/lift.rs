@@ -1,5 +1,5 @@
-//! Code targets in GPU memory, and lifting: features that start as the blending-weighted mean of the codes each splat
-//! is seen with (docs/method.md#lifting).
+//! Code targets in GPU memory, and lifting: the blending-weighted mean of the codes that each splat is seen with
+//! (docs/method.md#lifting).
 use super::model::Model;
 use super::views::Views;
 use crate::gpu::{Buffer, Device, Recorder};
@@ -11,7 +11,7 @@ use crate::{Error, Result};
 
 /// Splats that labelled pixels saw with less weight than this (in pixels) start without a feature: their direction
 /// would be noise (docs/method.md#lifting).
-const MIN_WEIGHT: f32 = 0.05;
+pub(super) const MIN_WEIGHT: f32 = 0.05;
 /// Length of a lifted raw feature: far above ε, so steps turn it without collapsing it.
 const LIFTED_LENGTH: f32 = 0.5;
 
@@ -66,6 +66,11 @@ impl CodeTargets {
         })
     }
 
+    /// d, the length of a code.
+    pub(super) fn width(&self) -> usize {
+        self.width as usize
+    }
+
     /// What the language loss of one band of a view reads.
     pub(super) fn of(&self, view: usize, band: &Band) -> Targets<'_> {
         Targets {
@@ -93,35 +98,65 @@ fn rows_of(level: &LevelField, view: usize, pixels: usize, first: i32) -> Result
     Ok(map.data.iter().map(|&l| if l < 0 { -1 } else { l + first }).collect())
 }
 
-/// Raw start features [N, levels·d].
+/// What splats are seen with.
+pub(super) struct Lifted {
+    /// [N, levels·d] blending-weighted sums of codes, `Σ_px w c`.
+    pub(super) sums: Vec<f32>,
+    /// [N, levels] blending weights of labelled pixels, `Σ_px w`, in pixels.
+    pub(super) weights: Vec<f32>,
+}
+
+/// Passes over all photos that lift, with the model's splats.
 ///
 /// The gradient of `Σ_px F(px)·c(px)` by a splat's feature is `Σ_px w(px) c(px)`, so one backward pass per view with the
-/// codes as upstream gives the weighted sums. Its length per level is at most the total weight (equal if all codes agree)
-/// and stands in for it in the threshold.
-pub(super) fn lift(
-    device: &Device,
-    views: &mut Views,
-    cameras: &[Camera],
-    model: &Model,
-    raster: &RasterOptions,
-    targets: &CodeTargets,
-) -> Result<Vec<f32>> {
-    let d = targets.width as usize;
-    let total = model.count() * d * targets.levels as usize;
-    let mut sums = vec![0.0f32; total];
-    // The sums are gradients by what is rendered, whatever is stored.
-    let raster = &RasterOptions { feature_mode: FeatureMode::Linear, ..*raster };
-    for (view, camera) in cameras.iter().enumerate() {
-        views.set_camera(view, camera)?;
-        let stage = views.stage_mut(view);
-        let scratch = device.buffer::<f32>("language loss", stage.raster.frame().bands.pixels())?;
+/// codes as upstream gives the weighted sums, and with ones as upstream of a colour the weights themselves.
+pub(super) struct Lifting<'a> {
+    pub(super) device: &'a Device,
+    pub(super) views: &'a mut Views,
+    pub(super) cameras: &'a [Camera],
+    pub(super) model: &'a Model,
+    pub(super) raster: RasterOptions,
+    pub(super) targets: &'a CodeTargets,
+}
+
+impl Lifting<'_> {
+    /// The sums and weights of all photos.
+    pub(super) fn sums(&mut self) -> Result<Lifted> {
+        let (splats, levels) = (self.model.count(), self.targets.levels as usize);
+        let mut lifted = Lifted {
+            sums: vec![0.0; splats * levels * self.targets.width as usize],
+            weights: vec![0.0; splats * levels],
+        };
+        for view in 0..self.cameras.len() {
+            self.back(view, Mode::Lift, &mut lifted.sums)?;
+            let frame = self.views.stage(view).raster.frame();
+            for (row, by_level) in
+                lifted.weights.chunks_exact_mut(levels).zip(frame.colour_gradients(splats)?)
+            {
+                row.iter_mut().zip(by_level).for_each(|(sum, w)| *sum += w);
+            }
+            // Nothing is to be left of it for a loss that writes no colours.
+            let colours = 3 * frame.bands.pixels();
+            frame.planes_grad.write_at(0, &vec![0f32; colours])?;
+        }
+        Ok(lifted)
+    }
+
+    /// Adds to `sums` what the backward pass of a view gives for an upstream.
+    pub(super) fn back(&mut self, view: usize, mode: Mode, sums: &mut [f32]) -> Result<()> {
+        self.views.set_camera(view, &self.cameras[view])?;
+        // The sums are gradients by what is rendered, whatever is stored.
+        let raster = &RasterOptions { feature_mode: FeatureMode::Linear, ..self.raster };
+        let (model, targets) = (self.model, self.targets);
+        let stage = self.views.stage_mut(view);
+        let scratch = self.device.buffer::<f32>("language loss", stage.raster.frame().bands.pixels())?;
         loop {
             let frame = stage.raster.frame();
-            let mut rec = Recorder::new(device, "lift");
+            let mut rec = Recorder::new(self.device, "lift");
             stage.raster.record_projection(&mut rec, &model.values, raster);
             for band in frame.bands.iter() {
                 stage.raster.record_band(&mut rec, &model.values, &band);
-                codes::record(&mut rec, &targets.of(view, &band), frame, &scratch, Mode::Lift);
+                codes::record(&mut rec, &targets.of(view, &band), frame, &scratch, mode);
                 stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
             }
             stage.raster.record_gradients(&mut rec, &model.values, raster, &model.gradients);
@@ -132,13 +167,44 @@ pub(super) fn lift(
                 None => break,
             }
         }
-        let seen = model.gradients.features.read_range(0..total)?;
+        let seen = model.gradients.features.read_range(0..sums.len())?;
         sums.iter_mut().zip(seen).for_each(|(s, v)| *s += v);
+        Ok(())
     }
-    for feature in sums.chunks_exact_mut(d) {
-        let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
-        let scale = if norm > MIN_WEIGHT { LIFTED_LENGTH / norm } else { 0.0 };
-        feature.iter_mut().for_each(|v| *v *= scale);
+}
+
+impl Lifted {
+    /// Raw start features [N, levels·d]: the directions of the sums.
+    pub(super) fn features(&self, width: usize) -> Vec<f32> {
+        let mut features = self.sums.clone();
+        // Its length is at most the weight, equal if all codes agree, and stands in for it.
+        features.chunks_exact_mut(width).filter(|f| length(f) <= MIN_WEIGHT).for_each(|f| f.fill(0.0));
+        unit_start(features, width)
     }
-    Ok(sums)
+
+    /// [N] of one of `levels`: the length of the mean of the unit codes that a splat is seen with (docs/method.md#reliability),
+    /// in steps of 1/255; 0 where it is not seen.
+    pub(super) fn reliability(&self, level: usize, levels: usize, width: usize) -> Vec<f32> {
+        let sums = self.sums.chunks_exact(width).skip(level).step_by(levels);
+        let weights = self.weights.iter().skip(level).step_by(levels);
+        let one = |(sum, &weight): (&[f32], &f32)| {
+            if weight > MIN_WEIGHT { (255.0 * (length(sum) / weight).min(1.0)).round() / 255.0 } else { 0.0 }
+        };
+        sums.zip(weights).map(one).collect()
+    }
+}
+
+/// Features of the length that training starts from; zeros stay.
+pub(super) fn unit_start(mut features: Vec<f32>, width: usize) -> Vec<f32> {
+    for feature in features.chunks_exact_mut(width) {
+        let norm = length(feature);
+        if norm > 0.0 {
+            feature.iter_mut().for_each(|v| *v *= LIFTED_LENGTH / norm);
+        }
+    }
+    features
+}
+
+fn length(v: &[f32]) -> f32 {
+    v.iter().map(|v| v * v).sum::<f32>().sqrt()
 }

@@ -204,6 +204,18 @@ impl RgbOptions {
     }
 }
 
+/// What features start from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Start {
+    /// Zero, as the paper.
+    Zero,
+    /// The mean of the codes that a splat is seen with, weighted by how much it is blended into their pixels.
+    Lifted,
+    /// The features whose blend is nearest to the codes of all labelled pixels, in the sense of least squares.
+    LeastSquares,
+}
+
 /// Options of [`super::train_language`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct LanguageOptions {
@@ -220,8 +232,8 @@ pub struct LanguageOptions {
     /// ε of `f̂ = f/(‖f‖+ε)` per level (docs/method.md#feature-gauge); only the ratio of ε and learning rate matters when
     /// features start at zero.
     pub epsilon: f32,
-    /// Start from the weighted mean of the codes each splat sees instead of from zero.
-    pub lift: bool,
+    /// What the features start from.
+    pub start: Start,
     /// Train every level on its own copy of the splats, as the paper; otherwise all levels share one geometry.
     pub per_level: bool,
     /// Keep geometry, opacity and colour fixed: only the features move.
@@ -256,7 +268,7 @@ impl LanguageOptions {
             // From zero: the paper's dynamics (7e-9 at ε = 1e-9) scaled to numbers f32 holds. After lifting: 2.5e-3.
             feature_rate: if paper { 7e-3 } else { 2.5e-3 },
             epsilon: 1e-3,
-            lift: !paper,
+            start: if paper { Start::Zero } else { Start::Lifted },
             per_level: paper,
             detach_geometry: false,
             // A measurement costs as much as three steps.

@@ -288,8 +288,8 @@ mod tests {
                 codes: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
                 ..Codebook::default()
             },
-            features: Vec::new(),
             targets: (0..2).map(|v| Plane { width: 75, height: 53, data: labels(v) }).collect(),
+            ..LevelField::default()
         };
         let options = LanguageOptions::preset(Preset::Draft);
         let mut run = LanguageRun::new(device, &images, &cameras, &splats, &[&level], &options).unwrap();

@@ -3,6 +3,7 @@ pub mod cameras;
 pub mod colmap;
 mod common;
 pub mod gaussians;
+mod level_arrays;
 pub mod npy;
 pub mod picture;
 pub mod scene_dir;

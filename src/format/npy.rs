@@ -166,14 +166,22 @@ pub fn read_npz(path: impl AsRef<Path>) -> Result<BTreeMap<String, NpyArray>> {
 
 /// Writes an `.npz` file, stored without compression so that readers can map it.
 pub fn write_npz(path: impl AsRef<Path>, arrays: &[(&str, &NpyArray)]) -> Result<()> {
-    let path = path.as_ref();
+    write_zip(path.as_ref(), arrays, zip::CompressionMethod::Stored)
+}
+
+/// The same, compressed (as `numpy.savez_compressed`).
+pub fn write_packed_npz(path: impl AsRef<Path>, arrays: &[(&str, &NpyArray)]) -> Result<()> {
+    write_zip(path.as_ref(), arrays, zip::CompressionMethod::Deflated)
+}
+
+fn write_zip(path: &Path, arrays: &[(&str, &NpyArray)], method: zip::CompressionMethod) -> Result<()> {
     let bad = |e: zip::result::ZipError| match e {
         zip::result::ZipError::Io(e) => Error::unwritable(path)(e),
         e => Error::work(format!("{}: cannot write the npz file: {e}", path.display())),
     };
     let file = std::fs::File::create(path).map_err(Error::unwritable(path))?;
     let mut zip = zip::ZipWriter::new(std::io::BufWriter::new(file));
-    let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+    let options = zip::write::SimpleFileOptions::default().compression_method(method);
     for (name, array) in arrays {
         zip.start_file(format!("{name}.npy"), options).map_err(bad)?;
         zip.write_all(&encode(array)?).map_err(Error::unwritable(path))?;

@@ -1,7 +1,9 @@
 //! The scene directory: what a run writes and every other command reads.
 use super::npy::{self, NpyArray};
 use super::workspace::MANIFEST;
-use super::{cameras, colmap, create_folder, gaussians, picture, ply, scene_photos, transforms};
+use super::{
+    cameras, colmap, create_folder, gaussians, level_arrays, picture, ply, scene_photos, transforms,
+};
 use crate::photo::Photo;
 use crate::scene::{
     Camera, Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId, PointCloud, Seen, Splats, World,
@@ -12,7 +14,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Version of the layout; readers refuse newer ones.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// Name in the manifest.
 const FORMAT: &str = "splatvk-scene";
@@ -148,14 +150,11 @@ fn write_language(folder: &Path, field: &LanguageField, splats: usize) -> Result
     let folder = folder.join("language");
     create_folder(&folder)?;
     let mut levels = Vec::new();
-    let mut features: Vec<(&str, NpyArray)> = Vec::new();
+    let mut features: Vec<(String, NpyArray)> = Vec::new();
     for (name, level) in LEVEL_NAMES.into_iter().zip(&field.levels).filter(|(_, l)| !l.codebook.is_empty()) {
         let book = &level.codebook;
-        if level.features.len() != splats * book.code_dim {
-            return Err(Error::work(format!("level {name} has features for another number of splats")));
-        }
+        level_arrays::append(&mut features, name, level, splats, &[])?;
         write_codebook(&folder.join(format!("codebook_{name}.npz")), book, &field.space)?;
-        features.push((name, NpyArray::f32(&[splats, book.code_dim], level.features.clone())));
         levels.push(LevelManifest {
             name: name.into(),
             codes: book.len(),
@@ -163,8 +162,8 @@ fn write_language(folder: &Path, field: &LanguageField, splats: usize) -> Result
             code_dim: book.code_dim,
         });
     }
-    let arrays: Vec<(&str, &NpyArray)> = features.iter().map(|(n, a)| (*n, a)).collect();
-    npy::write_npz(folder.join("features.npz"), &arrays)?;
+    let arrays: Vec<(&str, &NpyArray)> = features.iter().map(|(n, a)| (n.as_str(), a)).collect();
+    npy::write_packed_npz(folder.join("features.npz"), &arrays)?;
     Ok(LanguageManifest { space: field.space.clone(), levels })
 }
 
@@ -272,30 +271,25 @@ pub fn cut_degree(splats: Splats, degree: u32) -> Splats {
 fn read_language(path: &Path, manifest: &LanguageManifest, splats: usize) -> Result<LanguageField> {
     let folder = path.join("language");
     let file = folder.join("features.npz");
-    let mut features = npy::read_npz(&file)?;
+    let features = npy::read_npz(&file)?;
     let mut field = LanguageField {
         levels: vec![LevelField::default(); LEVEL_NAMES.len()],
         space: manifest.space.clone(),
     };
     for m in &manifest.levels {
-        let at = LEVEL_NAMES.iter().position(|n| *n == m.name);
-        let (Some(at), Some(array)) = (at, features.remove(&m.name)) else {
-            return Err(Error::input(format!(
-                "{}: no level {:?}; the scene is damaged",
-                file.display(),
-                m.name
-            )));
+        let damaged = |what: String| {
+            Error::input(format!("{}: {what}; the scene is damaged, run again", file.display()))
+        };
+        let Some(at) = LEVEL_NAMES.iter().position(|n| *n == m.name) else {
+            return Err(damaged(format!("no level is named {:?}", m.name)));
         };
         let codebook = read_codebook(&folder.join(format!("codebook_{}.npz", m.name)))?;
-        if array.shape != [splats, m.code_dim] || codebook.code_dim != m.code_dim || codebook.len() != m.codes
-        {
-            return Err(Error::input(format!(
-                "{}: level {} has the wrong shape; the scene is damaged",
-                file.display(),
-                m.name
-            )));
+        if codebook.code_dim != m.code_dim || codebook.len() != m.codes {
+            return Err(damaged(format!("the codebook of level {} is another one", m.name)));
         }
-        field.levels[at] = LevelField { codebook, features: array.to_f32(), targets: Vec::new() };
+        let level = &mut field.levels[at];
+        level.codebook = codebook;
+        level_arrays::read(&features, &m.name, splats, level).map_err(damaged)?;
     }
     Ok(field)
 }

@@ -1,12 +1,13 @@
 //! Language beside a file of Gaussians: `NAME.language.npz`, for formats that have no place for it. Described in
 //! docs/formats.md.
+use super::level_arrays;
 use super::npy::{self, NpyArray};
 use crate::scene::{Codebook, LEVEL_NAMES, LanguageField, LevelField};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Version of the layout; readers refuse newer ones.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// Where the language of a file is.
 pub fn path(splats: &Path) -> PathBuf {
@@ -24,17 +25,7 @@ pub fn write(path: &Path, field: &LanguageField, count: usize, order: &[u32]) ->
     ];
     for (name, level) in LEVEL_NAMES.iter().zip(&field.levels).filter(|(_, l)| !l.codebook.is_empty()) {
         let (book, d) = (&level.codebook, level.codebook.code_dim);
-        if level.features.len() != count * d {
-            return Err(Error::work(format!("level {name} has features for another number of splats")));
-        }
-        let features = match order {
-            [] => level.features.clone(),
-            order => {
-                let row = |i: &u32| level.features[*i as usize * d..(*i as usize + 1) * d].iter().copied();
-                order.iter().flat_map(row).collect()
-            }
-        };
-        arrays.push((format!("features_{name}"), NpyArray::f32(&[count, d], features)));
+        level_arrays::append(&mut arrays, name, level, count, order)?;
         arrays.push((format!("code_{name}"), NpyArray::f32(&[book.len(), d], book.codes.clone())));
         let clip = NpyArray::f32(&[book.len(), book.embedding_dim], book.embeddings.clone());
         arrays.push((format!("clip_{name}"), clip));
@@ -42,7 +33,7 @@ pub fn write(path: &Path, field: &LanguageField, count: usize, order: &[u32]) ->
         arrays.push((format!("delta_min_{name}"), NpyArray::f32(&[], vec![book.min_chord])));
     }
     let list: Vec<(&str, &NpyArray)> = arrays.iter().map(|(n, a)| (n.as_str(), a)).collect();
-    npy::write_npz(path, &list)
+    npy::write_packed_npz(path, &list)
 }
 
 /// Reads the language beside a file of `count` Gaussians; `None` where there is none.
@@ -64,29 +55,25 @@ pub fn read(splats: &Path, count: usize) -> Result<Option<LanguageField>> {
             let key = format!("{part}_{name}");
             arrays.get(&key).ok_or_else(|| bad(format!("no array {key:?}")))
         };
-        let Ok(features) = get("features") else { continue };
-        let (code, clip, weight) = (get("code")?, get("clip")?, get("weight")?);
+        let Ok(code) = get("code") else { continue };
+        let (clip, weight) = (get("clip")?, get("weight")?);
         let (&[k, code_dim], &[k2, embedding_dim]) = (&code.shape[..], &clip.shape[..]) else {
             return Err(bad(format!("the codes of level {name} have no two dimensions")));
         };
-        if k != k2 || weight.shape != [k] || features.shape != [count, code_dim] {
-            return Err(bad(format!(
-                "level {name} does not fit {count} Gaussians; it belongs to another file"
-            )));
+        if k != k2 || weight.shape != [k] {
+            return Err(bad(format!("the arrays of level {name} do not fit together")));
         }
-        *level = LevelField {
-            codebook: Codebook {
-                embedding_dim,
-                code_dim,
-                embeddings: clip.to_f32(),
-                codes: code.to_f32(),
-                weights: weight.to_f32(),
-                members: vec![Vec::new(); k],
-                min_chord: get("delta_min")?.to_f32().first().copied().unwrap_or(0.0),
-            },
-            features: features.to_f32(),
-            targets: Vec::new(),
+        level.codebook = Codebook {
+            embedding_dim,
+            code_dim,
+            embeddings: clip.to_f32(),
+            codes: code.to_f32(),
+            weights: weight.to_f32(),
+            members: vec![Vec::new(); k],
+            min_chord: get("delta_min")?.to_f32().first().copied().unwrap_or(0.0),
         };
+        level_arrays::read(&arrays, name, count, level)
+            .map_err(|e| bad(format!("{e}; it belongs to another file of {count} Gaussians")))?;
     }
     Ok(Some(field))
 }

@@ -150,7 +150,7 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
             Plane { width: labels.width, height: labels.height, data }
         });
         let targets = targets.collect();
-        field.levels.push(LevelField { codebook: built.codebook, features: Vec::new(), targets });
+        field.levels.push(LevelField { codebook: built.codebook, targets, ..LevelField::default() });
     }
     Ok(field)
 }

@@ -84,7 +84,7 @@ pub fn join(
         let (codebook, mut targets) = state.join(known.len(), options)?;
         let mut all: Vec<Plane<i32>> = known.iter().map(|codes| codes[level].clone()).collect();
         all.append(&mut targets);
-        out.levels.push(LevelField { codebook, features: Vec::new(), targets: all });
+        out.levels.push(LevelField { codebook, targets: all, ..LevelField::default() });
     }
     progress.end();
     Ok(Language { field: out, alignment })

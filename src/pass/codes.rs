@@ -22,8 +22,11 @@ pub struct Targets<'a> {
 pub enum Mode {
     /// The gradient of the loss.
     Loss,
-    /// The code itself: back-propagated, it gives `Σ w·c` per splat.
+    /// The code itself: back-propagated, it gives `Σ w·c` per splat; and 1 for colour number `level` of labelled pixels, which gives
+    /// `Σ w` ([`FrameBuffers::colour_gradients`]). The colours' planes of the upstream stay so until something else writes them.
     Lift,
+    /// `F − c`, the gradient of half the square: least squares.
+    Residual,
 }
 
 /// Records the loss of a frame, or of the band in its planes: writes the feature planes of `frame.planes_grad` and, per
@@ -52,12 +55,7 @@ fn record_planes(
             upstream,
             loss,
         },
-        &shaders::code_l1::Push {
-            pixels,
-            levels: targets.levels,
-            width: targets.width,
-            mode: u32::from(mode == Mode::Lift),
-        },
+        &shaders::code_l1::Push { pixels, levels: targets.levels, width: targets.width, mode: mode as u32 },
     );
     rec.dispatch_threads(call, [pixels, 1, 1]);
 }
@@ -150,6 +148,17 @@ mod tests {
             let label = labels[p];
             let code = |k: usize| if label < 0 { 0.0 } else { table[label as usize * width + k] };
             assert!((0..width).all(|k| lifted[(4 + k) * pixels + p] == code(k)));
+            for level in 0..levels {
+                let labelled = labels[level * pixels + p] >= 0;
+                assert_eq!(lifted[level * pixels + p], f32::from(u8::from(labelled)));
+            }
+        }
+        let (residual, _) = run(&planes, Mode::Residual);
+        for p in 0..pixels {
+            let code = |k: usize| table[labels[p] as usize * width + k];
+            let at = |k: usize| (4 + k) * pixels + p;
+            let wanted = |k: usize| if labels[p] < 0 { 0.0 } else { planes[at(k)] - code(k) };
+            assert!((0..width).all(|k| residual[at(k)] == wanted(k)));
         }
     }
 }

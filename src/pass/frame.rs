@@ -54,6 +54,14 @@ impl FrameBuffers {
         self.bands.pixels() as u32
     }
 
+    /// [N, 3] the last backward pass's gradient by the colour of every splat: `∂L/∂c_i = Σ_px w_i(px) ∂L/∂C(px)`, so that an
+    /// upstream of ones gives the blending weight of each.
+    pub fn colour_gradients(&self, splats: usize) -> Result<Vec<[f32; 3]>> {
+        const FIRST: usize = shaders::shared::layout::MOMENTS as usize;
+        let sums = self.projected_grad.read_range(0..GRADIENT_FLOATS * splats)?;
+        Ok(sums.chunks_exact(GRADIENT_FLOATS).map(|g| [g[FIRST], g[FIRST + 1], g[FIRST + 2]]).collect())
+    }
+
     /// Tiles along x and y.
     pub(super) fn tiles(&self) -> [u32; 2] {
         [self.width.div_ceil(TILE), self.height.div_ceil(TILE)]

@@ -1,9 +1,8 @@
 //! Renders a scene that stays on the GPU to images on the host.
 use super::bands::Band;
 use super::channels::BASE_CHANNELS;
-use super::frame::{FrameBuffers, GRADIENT_FLOATS};
+use super::frame::FrameBuffers;
 use super::options::RasterOptions;
-use super::raster_backward::MOMENTS;
 use super::rasterizer::Rasterizer;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
@@ -129,10 +128,10 @@ impl Renderer {
             rasterizer.record_band_backward(&mut rec, splats, &options, &band);
             rec.run()?;
         }
-        let sums = rasterizer.frame().projected_grad.read_range(0..GRADIENT_FLOATS * splats.count)?;
+        let sums = rasterizer.frame().colour_gradients(splats.count)?;
         // Nothing is to be left of it for a loss that uses other planes.
         rasterizer.frame().planes_grad.write_at(0, &vec![0f32; rasterizer.frame().bands.pixels()])?;
-        Ok(sums.chunks_exact(GRADIENT_FLOATS).map(|g| g[MOMENTS]).collect())
+        Ok(sums.iter().map(|g| g[0]).collect())
     }
 
     /// A rasteriser that is set to the camera, and the splats.

@@ -1,14 +1,12 @@
 //! Splats that a query selects in space, without any view (docs/method.md#selection-in-space).
 use super::{MaskRule, QueryOptions, TextQuery, field_relevancy, margin};
 use crate::Result;
+use crate::scene::code_mix::MIN_LENGTH;
 use crate::scene::{LanguageField, LevelField};
 use rayon::prelude::*;
 
 /// Codes that fewer splats carry are specks: at a pixel per splat, less than a mask may be.
 const MIN_SPLATS: usize = 32;
-
-/// Splats whose feature is shorter have none: lifting leaves exact zeros, training moves them by less than this.
-const MIN_LENGTH: f32 = 0.1;
 
 /// The splats that answer a query.
 #[derive(Clone, Debug, Default, PartialEq)]

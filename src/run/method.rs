@@ -2,7 +2,7 @@
 //! default, and changes only what its authors do differently to language.
 use super::view::Viewer;
 use crate::fit::scale::SceneScale;
-use crate::fit::{self, LanguageOptions, RgbOptions, TrainedLanguage, index_head};
+use crate::fit::{self, LanguageOptions, RgbOptions, Start, TrainedLanguage, index_head};
 use crate::gpu::Device;
 use crate::language::align::AlignOptions;
 use crate::language::{BuildOptions, Reducer};
@@ -53,11 +53,37 @@ pub static LEGAUSSIANS: Method = Method {
 pub static LSM: Method = Method {
     name: "lsm",
     about: "No alignment, features lifted onto the stereo points in one pass, nothing optimised",
-    recipe: Recipe { optimise: false, ..UNALIGNED },
+    recipe: Recipe { optimise: false, language: LanguageFit::Lift, ..UNALIGNED },
+};
+
+/// Closed form (Cheng et al. 2024 call it Occam's LGS): the mean of what every splat is seen with.
+pub static LIFT: Method = Method {
+    name: "lift",
+    about: "Alignment and codes as sparselgs; features are summed and normalised, not trained",
+    recipe: Recipe { language: LanguageFit::Lift, ..OURS },
+};
+
+/// Closed form: least squares with a prior at that mean.
+pub static LIFT_LEAST_SQUARES: Method = Method {
+    name: "lift-ls",
+    about: "Alignment and codes as sparselgs; features by regularised least squares over all pixels",
+    recipe: Recipe { language: LanguageFit::LeastSquares, ..OURS },
 };
 
 /// What `--method` takes, the default first.
-pub static METHODS: [&Method; 4] = [&SPARSELGS, &LANGSPLAT, &LEGAUSSIANS, &LSM];
+pub static METHODS: [&Method; 6] = [&SPARSELGS, &LIFT, &LIFT_LEAST_SQUARES, &LANGSPLAT, &LEGAUSSIANS, &LSM];
+
+/// How splats get their features.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LanguageFit {
+    /// Training, from where the preset starts.
+    Train,
+    /// One pass per photo, sum and normalise.
+    Lift,
+    /// The regularised least-squares solution.
+    LeastSquares,
+}
 
 const OURS: Recipe = Recipe {
     steps: [true; 3],
@@ -66,6 +92,7 @@ const OURS: Recipe = Recipe {
     image_weight: IMAGE_WEIGHT,
     features_only: false,
     optimise: true,
+    language: LanguageFit::Train,
     index_head: false,
 };
 
@@ -84,8 +111,10 @@ pub struct Recipe {
     pub image_weight: f64,
     /// Only features move in the language stage.
     pub features_only: bool,
-    /// Optimise the scene at all.
+    /// Train the colours.
     pub optimise: bool,
+    /// How splats get their features.
+    pub language: LanguageFit,
     /// Smooth features in space and train a head that reads the codebook index from them.
     pub index_head: bool,
 }
@@ -154,9 +183,10 @@ impl Recipe {
             // Decoding every training pixel against 2048 directions takes the processor longer than the training.
             options.check_every = 0;
         }
-        if !self.optimise {
-            // Lifting is the one pass.
-            (options.iterations, options.lift) = (0, true);
+        match self.language {
+            LanguageFit::Train => {}
+            LanguageFit::Lift => (options.iterations, options.start) = (0, Start::Lifted),
+            LanguageFit::LeastSquares => (options.iterations, options.start) = (0, Start::LeastSquares),
         }
         options
     }
@@ -217,7 +247,14 @@ mod tests {
         assert_eq!(ours.rgb(RgbOptions::preset(Preset::Draft)), RgbOptions::preset(Preset::Draft));
         let build = ours.build("x", 3);
         assert_eq!(build, BuildOptions { space: "x".into(), seed: 3, ..BuildOptions::default() });
-        for method in &METHODS[1..] {
+        for method in [&LIFT, &LIFT_LEAST_SQUARES] {
+            let recipe = Recipe { language: LanguageFit::Train, ..method.recipe };
+            assert_eq!(recipe, ours, "{}", method.name);
+            let start = method.recipe.language(preset.clone());
+            let expected = LanguageOptions { iterations: 0, start: start.start, ..preset.clone() };
+            assert_eq!(start, expected, "{}", method.name);
+        }
+        for method in [&LANGSPLAT, &LEGAUSSIANS, &LSM] {
             let recipe = method.recipe;
             let align = recipe.build("x", 0).align;
             assert!(!align.matching && !align.fusion && !align.reprojection, "{}", method.name);

@@ -1,5 +1,6 @@
 //! Language of a scene: features of the splats per level, and the codebooks that map them to embeddings.
 use super::Plane;
+use super::code_mix::{self, CodeMix};
 use serde::{Deserialize, Serialize};
 
 /// A mask of a view. Stored as the pair `[view, mask]`.
@@ -63,6 +64,10 @@ impl Codebook {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
+    /// Code number `k`, [d].
+    pub fn code(&self, k: usize) -> &[f32] {
+        &self.codes[k * self.code_dim..(k + 1) * self.code_dim]
+    }
     /// `argmax_k F·c_k` (docs/method.md#decoding-codes); ties take the lowest k; `None` without codes.
     pub fn decode(&self, feature: &[f32]) -> Option<usize> {
         let mut best: Option<(f32, usize)> = None;
@@ -81,10 +86,42 @@ impl Codebook {
 pub struct LevelField {
     /// The bijection.
     pub codebook: Codebook,
-    /// [N, d] raw splat features (the renderer's semantic channels), splat order of the scene.
+    /// [N, d] splat features as rendered (the renderer's semantic channels), splat order of the scene.
     pub features: Vec<f32>,
+    /// [N] what the features are made of, and stored as; empty where they are no mixes of codes.
+    pub mixes: Vec<CodeMix>,
+    /// [N] how far the photos agree on what a splat is, in 0..1 (docs/method.md#reliability); empty where that is not known.
+    pub reliability: Vec<f32>,
     /// Per training view: code index per pixel, −1 = none. Training targets; empty in a loaded scene.
     pub targets: Vec<Plane<i32>>,
+}
+
+impl LevelField {
+    /// Takes over features [N, d] of any length: as unit mixes of two codes, or as they are where a mix cannot name the codes.
+    pub fn carry(&mut self, features: Vec<f32>) {
+        self.carry_mixes(code_mix::mixes(&features, &self.codebook));
+        if self.mixes.is_empty() {
+            self.features = features;
+        }
+    }
+
+    /// Takes over mixes of its codes.
+    pub fn carry_mixes(&mut self, mixes: Vec<CodeMix>) {
+        self.features = code_mix::features(&mixes, &self.codebook);
+        self.mixes = mixes;
+    }
+
+    /// The rows of some of its splats.
+    fn picked(self, rows: &[usize], splats: usize) -> LevelField {
+        let width = self.features.len() / splats.max(1);
+        let row = |i: &usize| &self.features[i * width..(i + 1) * width];
+        LevelField {
+            features: rows.iter().flat_map(row).copied().collect(),
+            mixes: rows.iter().filter_map(|&i| self.mixes.get(i)).copied().collect(),
+            reliability: rows.iter().filter_map(|&i| self.reliability.get(i)).copied().collect(),
+            ..self
+        }
+    }
 }
 
 /// All levels (index as in [`LEVEL_NAMES`]); a level without masks has an empty codebook.
@@ -99,11 +136,6 @@ pub struct LanguageField {
 impl LanguageField {
     /// The field of the given rows of a scene's `splats`, in their order.
     pub fn picked(self, rows: &[usize], splats: usize) -> LanguageField {
-        let level = |l: LevelField| {
-            let width = l.features.len() / splats.max(1);
-            let row = |i: &usize| &l.features[i * width..(i + 1) * width];
-            LevelField { features: rows.iter().flat_map(row).copied().collect(), ..l }
-        };
-        LanguageField { levels: self.levels.into_iter().map(level).collect(), ..self }
+        LanguageField { levels: self.levels.into_iter().map(|l| l.picked(rows, splats)).collect(), ..self }
     }
 }

@@ -5,6 +5,7 @@
 //! row-major RGB in [0, 1] (sRGB values as they are).
 mod affine;
 mod camera;
+pub mod code_mix;
 mod image;
 mod language;
 mod lens;
@@ -20,6 +21,7 @@ mod world;
 
 pub use affine::Affine;
 pub use camera::{Camera, Pose};
+pub use code_mix::CodeMix;
 pub use image::{DepthMap, Plane, RgbImage};
 pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId};
 pub use lens::Lens;

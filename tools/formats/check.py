@@ -344,13 +344,17 @@ def language():
     features = np.load(SCENE / "language/features.npz")
     whole, packed = read_ply(SCENE / "point_cloud.ply"), of_gsply(gsply.plyread(str(out)))
     span = np.ptp(whole["means"], axis=0).max() / 2046
-    for level in features.files:
-        # A feature that only one splat has tells where that splat went; its position must have gone there, too.
-        unique, first, count = np.unique(features[level], axis=0, return_index=True, return_counts=True)
+    def carried(arrays, level):
+        return np.stack([arrays[f"{kind}_{level}"] for kind in ("first", "second", "share", "reliability")], axis=1)
+
+    for level in (name[-1] for name in features.files if name.startswith("first_")):
+        # What only one splat carries tells where that splat went; its position must have gone there, too.
+        ours = carried(features, level)
+        unique, first, count = np.unique(ours, axis=0, return_index=True, return_counts=True)
         where = {f.tobytes(): i for f, i, n in zip(unique, first, count) if n == 1}
         known = {f.tobytes() for f in unique}
-        rows = [f.tobytes() for f in side[f"features_{level}"]]
-        assert len(rows) == len(features[level]) and known.issuperset(rows), f"level {level}: not the scene's features"
+        rows = [f.tobytes() for f in carried(side, level)]
+        assert len(rows) == len(ours) and known.issuperset(rows), f"level {level}: not what the scene's splats carry"
         pairs = np.array([(r, where[f]) for r, f in enumerate(rows) if f in where])
         assert len(pairs) == len(where) > 100, f"level {level}: {len(pairs)} of {len(where)} splats found again"
         close(f"language level {level}", packed["means"][pairs[:, 0]], whole["means"][pairs[:, 1]], span)

@@ -248,7 +248,7 @@ mod tests {
             codes: vec![1.0, 0.0, 0.0, 1.0],
             ..Codebook::default()
         };
-        let level = LevelField { codebook, features, targets: Vec::new() };
+        let level = LevelField { codebook, features, ..LevelField::default() };
         let field = LanguageField { levels: vec![level, LevelField::default()], space: String::new() };
         let order = in_space(&splats, most_visible(&splats, usize::MAX));
         let seen = Seen { pixels: (0..700).map(|i| (i % 2) as f32).collect() };

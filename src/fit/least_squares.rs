@@ -1,0 +1,71 @@
+//! Features in closed form: those whose blend is nearest to the codes of all labelled pixels (docs/method.md#lifting).
+use super::lift::{Lifted, Lifting, MIN_WEIGHT, unit_start};
+use crate::Result;
+use crate::pass::codes::Mode;
+use rayon::prelude::*;
+
+/// Steps of conjugate gradients; a step costs a forward and a backward pass per photo. Preconditioned by the blending weights the
+/// residual falls to a tenth in this many, and mIoU no longer moves (docs/experiments.md#measured-lifting).
+const STEPS: usize = 8;
+
+/// λ: how much a splat's own mean counts beside what its pixels ask for, as a share of its blending weight
+/// (docs/experiments.md#measured-lifting).
+const PRIOR: f32 = 0.1;
+
+/// Sets the model's raw features to the solution of `min_f Σ_px |Σ_i w_i f_i − c|² + λ Σ_i W_i |f_i − m_i|²`, with W_i the blending
+/// weight of splat i over the labelled pixels and m_i the mean of the codes it is seen with, and with the length that training
+/// starts from.
+pub(super) fn solve(lifting: &mut Lifting, lifted: &Lifted) -> Result<()> {
+    let width = lifting.targets.width();
+    // W for every value; 0 keeps the values of splats that no labelled pixel shows at zero.
+    let known = |w: &f32| if *w > MIN_WEIGHT { *w } else { 0.0 };
+    let weights: Vec<f32> =
+        lifted.weights.iter().map(known).flat_map(|w| std::iter::repeat_n(w, width)).collect();
+    let over = |v: &f32, w: &f32| if *w > 0.0 { v / w } else { 0.0 };
+    let mean: Vec<f32> = lifted.sums.par_iter().zip(&weights).map(|(s, w)| over(s, w)).collect();
+    let mut x = mean;
+    // The right-hand side is Aᵀc + λWm = (1 + λ) Aᵀc where the splat is known.
+    let applied = apply(lifting, lifted, &weights, &x)?;
+    let right = |(s, w): (&f32, &f32)| if *w > 0.0 { (1.0 + PRIOR) * s } else { 0.0 };
+    let mut residual: Vec<f32> =
+        lifted.sums.par_iter().zip(&weights).map(right).zip(&applied).map(|(b, a)| b - a).collect();
+    let precondition = |r: &[f32]| -> Vec<f32> {
+        r.par_iter().zip(&weights).map(|(r, w)| over(r, &((1.0 + PRIOR) * w))).collect()
+    };
+    let mut z = precondition(&residual);
+    let mut direction = z.clone();
+    let mut energy = dot(&residual, &z);
+    for _ in 0..STEPS {
+        let applied = apply(lifting, lifted, &weights, &direction)?;
+        let curvature = dot(&direction, &applied);
+        // False for what is not a number, too: what was reached stays.
+        let descends = curvature > 0.0 && energy > 0.0;
+        if !descends {
+            break;
+        }
+        let step = (energy / curvature) as f32;
+        x.par_iter_mut().zip(&direction).for_each(|(x, d)| *x += step * d);
+        residual.par_iter_mut().zip(&applied).for_each(|(r, a)| *r -= step * a);
+        z = precondition(&residual);
+        let next = dot(&residual, &z);
+        let turn = (next / energy) as f32;
+        direction.par_iter_mut().zip(&z).for_each(|(d, z)| *d = z + turn * *d);
+        energy = next;
+    }
+    lifting.model.values.features.write(&unit_start(x, width))
+}
+
+/// `(AᵀA + λW) v`, with A the blending of all labelled pixels. Photos give `AᵀA v − Aᵀc`, and Aᵀc is what was lifted.
+fn apply(lifting: &mut Lifting, lifted: &Lifted, weights: &[f32], v: &[f32]) -> Result<Vec<f32>> {
+    lifting.model.values.features.write(v)?;
+    let mut sums = lifted.sums.clone();
+    for view in 0..lifting.cameras.len() {
+        lifting.back(view, Mode::Residual, &mut sums)?;
+    }
+    let one = |((s, w), v): ((&f32, &f32), &f32)| if *w > 0.0 { s + PRIOR * w * v } else { 0.0 };
+    Ok(sums.par_iter().zip(weights).zip(v).map(one).collect())
+}
+
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    a.par_iter().zip(b).map(|(x, y)| f64::from(*x) * f64::from(*y)).sum()
+}

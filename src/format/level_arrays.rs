@@ -1,0 +1,86 @@
+//! What the splats carry on each level, as named arrays: the same in a scene directory and beside a file of Gaussians
+//! (docs/formats.md#features-of-splats).
+use super::npy::{NpyArray, NpyData};
+use crate::scene::{CodeMix, LevelField};
+use crate::{Error, Result};
+use std::collections::BTreeMap;
+
+/// Adds the arrays of a level with codes. Row r is splat `order[r]`; an empty order is the scene's own.
+pub fn append(
+    arrays: &mut Vec<(String, NpyArray)>,
+    name: &str,
+    level: &LevelField,
+    splats: usize,
+    order: &[u32],
+) -> Result<()> {
+    let book = &level.codebook;
+    if level.features.len() != splats * book.code_dim {
+        return Err(Error::work(format!("level {name} has features for another number of splats")));
+    }
+    let rows: Vec<usize> = match order {
+        [] => (0..splats).collect(),
+        order => order.iter().map(|&i| i as usize).collect(),
+    };
+    let mut put = |kind: &str, array: NpyArray| arrays.push((format!("{kind}_{name}"), array));
+    if level.mixes.len() == splats {
+        let index = |of: fn(&CodeMix) -> u16| {
+            let values = rows.iter().map(|&i| of(&level.mixes[i]));
+            // The number of codes itself stands for no feature.
+            let data = match book.len() {
+                0..=255 => NpyData::U8(values.map(|v| v as u8).collect()),
+                _ => NpyData::I32(values.map(i32::from).collect()),
+            };
+            NpyArray { shape: vec![rows.len()], data }
+        };
+        put("first", index(|m| m.first));
+        put("second", index(|m| m.second));
+        put("share", NpyArray::u8(&[rows.len()], rows.iter().map(|&i| level.mixes[i].share).collect()));
+    } else {
+        let d = book.code_dim;
+        let features = rows.iter().flat_map(|&i| &level.features[i * d..(i + 1) * d]).copied().collect();
+        put("features", NpyArray::f32(&[rows.len(), d], features));
+    }
+    if level.reliability.len() == splats {
+        let bytes = rows.iter().map(|&i| (255.0 * level.reliability[i]).round() as u8).collect();
+        put("reliability", NpyArray::u8(&[rows.len()], bytes));
+    }
+    Ok(())
+}
+
+/// Reads what [`append`] wrote into a level whose codebook is there; `Err` says what does not fit.
+pub fn read(
+    arrays: &BTreeMap<String, NpyArray>,
+    name: &str,
+    splats: usize,
+    level: &mut LevelField,
+) -> std::result::Result<(), String> {
+    let get = |kind: &str| arrays.get(&format!("{kind}_{name}"));
+    let (d, codes) = (level.codebook.code_dim, level.codebook.len());
+    let column = |kind: &str| match get(kind) {
+        Some(a) if a.shape == [splats] => Ok(a.to_i32()),
+        Some(a) => Err(format!("array {kind}_{name} has the shape {:?} for {splats} splats", a.shape)),
+        None => Err(format!("no array {kind}_{name}")),
+    };
+    // Scenes of version 1 have the bare name of the level.
+    match get("features").or_else(|| arrays.get(name)) {
+        Some(a) if a.shape == [splats, d] => level.features = a.to_f32(),
+        Some(a) => return Err(format!("the features of level {name} have the shape {:?}", a.shape)),
+        None => {
+            let (first, second, share) = (column("first")?, column("second")?, column("share")?);
+            let known = |k: &i32| usize::try_from(*k).is_ok_and(|k| k <= codes);
+            if !first.iter().chain(&second).all(known) || share.iter().any(|s| *s > 255) {
+                return Err(format!("level {name} names codes that its codebook of {codes} lacks"));
+            }
+            let mix = |((a, b), s): ((&i32, &i32), &i32)| CodeMix {
+                first: *a as u16,
+                second: *b as u16,
+                share: *s as u8,
+            };
+            level.carry_mixes(first.iter().zip(&second).zip(&share).map(mix).collect());
+        }
+    }
+    if get("reliability").is_some() {
+        level.reliability = column("reliability")?.iter().map(|&r| r as f32 / 255.0).collect();
+    }
+    Ok(())
+}

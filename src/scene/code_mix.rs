@@ -1,0 +1,138 @@
+//! What a splat carries on a level, in five bytes: where it lies between two codes, and how sure that is.
+use super::Codebook;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// Steps of [`CodeMix::share`] in a whole. Of two codes the nearer one comes first, so that half of it is enough: a byte.
+const SHARE_STEPS: f32 = 510.0;
+
+/// Splats whose feature is shorter have none: lifting leaves exact zeros, training moves them by less than this.
+pub const MIN_LENGTH: f32 = 0.1;
+
+/// A unit feature as a mix of the two codes that it is nearest to. Blending and decoding read a feature only through its cosines
+/// to the codes, and a splat between two things mixes two of them; docs/method.md#feature-storage has what that costs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CodeMix {
+    /// The nearest code; the number of codes where the splat has no feature.
+    pub first: u16,
+    /// The second-nearest code.
+    pub second: u16,
+    /// Share of the second code, in 1/510.
+    pub share: u8,
+}
+
+impl CodeMix {
+    /// Of a feature [d] of any length among the codes of a level.
+    fn of(feature: &[f32], book: &Codebook) -> CodeMix {
+        let none = CodeMix { first: book.len() as u16, second: book.len() as u16, share: 0 };
+        let length = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
+        // False for what is not a number, too.
+        let carried = length >= MIN_LENGTH;
+        if !carried {
+            return none;
+        }
+        let mut best: [(f32, usize); 2] = [(f32::NEG_INFINITY, book.len()); 2];
+        for (k, code) in book.codes.chunks_exact(book.code_dim.max(1)).enumerate() {
+            let cosine = dot(feature, code) / length;
+            if cosine > best[0].0 {
+                best = [(cosine, k), best[0]];
+            } else if cosine > best[1].0 {
+                best[1] = (cosine, k);
+            }
+        }
+        let [(a, first), (b, second)] = best;
+        if second >= book.len() {
+            return CodeMix { first: first as u16, second: first as u16, share: 0 };
+        }
+        // The combination of the two that is nearest to the feature (least squares of unit vectors).
+        let ab = dot(book.code(first), book.code(second));
+        let (first_weight, second_weight) = (a - ab * b, (b - ab * a).max(0.0));
+        let share = second_weight / (first_weight + second_weight).max(f32::MIN_POSITIVE);
+        let share = (SHARE_STEPS * share).round().clamp(0.0, 255.0) as u8;
+        let second = if share == 0 { first } else { second };
+        CodeMix { first: first as u16, second: second as u16, share }
+    }
+
+    /// Writes the unit feature [d] that it stands for; zeros for none.
+    fn write(self, book: &Codebook, out: &mut [f32]) {
+        out.fill(0.0);
+        if usize::from(self.first) >= book.len() || usize::from(self.second) >= book.len() {
+            return;
+        }
+        let share = f32::from(self.share) / SHARE_STEPS;
+        let (first, second) = (book.code(self.first.into()), book.code(self.second.into()));
+        for ((value, a), b) in out.iter_mut().zip(first).zip(second) {
+            *value = (1.0 - share) * a + share * b;
+        }
+        let length = dot(out, out).sqrt();
+        if length > 0.0 {
+            out.iter_mut().for_each(|v| *v /= length);
+        }
+    }
+}
+
+/// The mixes nearest to features [N, d]; nothing where the codes are more than a mix can name.
+pub fn mixes(features: &[f32], book: &Codebook) -> Vec<CodeMix> {
+    if book.len() >= usize::from(u16::MAX) {
+        return Vec::new();
+    }
+    features.par_chunks_exact(book.code_dim.max(1)).map(|f| CodeMix::of(f, book)).collect()
+}
+
+/// The unit features [N, d] of mixes.
+pub fn features(mixes: &[CodeMix], book: &Codebook) -> Vec<f32> {
+    let mut out = vec![0.0; mixes.len() * book.code_dim];
+    out.par_chunks_exact_mut(book.code_dim.max(1)).zip(mixes).for_each(|(f, mix)| mix.write(book, f));
+    out
+}
+
+fn dot(a: &[f32], b: &[f32]) -> f32 {
+    a.iter().zip(b).map(|(x, y)| x * y).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::Random;
+
+    fn book(codes: &[[f32; 3]]) -> Codebook {
+        let count = codes.len();
+        Codebook {
+            embedding_dim: 1,
+            code_dim: 3,
+            embeddings: vec![1.0; count],
+            codes: codes.concat(),
+            ..Codebook::default()
+        }
+    }
+
+    #[test]
+    fn a_mix_of_two_codes_survives_and_no_feature_stays_none() {
+        let book = book(&[[1.0, 0.0, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]);
+        let mut random = Random::new(1000);
+        for _ in 0..200 {
+            let (t, length) = (0.5 * random.uniform() as f32, 0.2 + random.uniform() as f32);
+            let (a, b) = (random.below(3), random.below(3));
+            let mixed: Vec<f32> =
+                book.code(a).iter().zip(book.code(b)).map(|(x, y)| (1.0 - t) * x + t * y).collect();
+            let norm = dot(&mixed, &mixed).sqrt();
+            let feature: Vec<f32> = mixed.iter().map(|v| length * v / norm).collect();
+            let mix = mixes(&feature, &book);
+            let back = features(&mix, &book);
+            // Half a step of the share moves a unit vector by at most 1/510 of the codes' distance.
+            assert!(dot(&back, &feature) / length > 1.0 - 1e-5, "{a} {b} {t}: {back:?} of {feature:?}");
+            // Storing what was stored changes nothing.
+            assert_eq!(features(&mixes(&back, &book), &book), back);
+        }
+        let none = mixes(&[0.05, 0.0, 0.0, f32::NAN, 0.0, 0.0], &book);
+        assert_eq!(features(&none, &book), [0.0; 6]);
+    }
+
+    #[test]
+    fn a_single_code_and_opposite_codes_give_unit_features() {
+        let one = book(&[[0.0, 1.0, 0.0]]);
+        assert_eq!(features(&mixes(&[0.3, 0.4, 0.0], &one), &one), [0.0, 1.0, 0.0]);
+        let opposite = book(&[[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]);
+        assert_eq!(features(&mixes(&[0.5, 0.5, 0.0], &opposite), &opposite), [1.0, 0.0, 0.0]);
+    }
+}
