@@ -466,7 +466,12 @@ fn scene_directory_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     let three = [0, 1, 2].map(|i| data(&format!("breakfast/images/train_{i:02}.jpg")));
     let photos = photo::load_all(&three, &splatvk::progress::Silent).unwrap();
-    let (s, cams, language) = (splats(5, 2), some_cameras(), field(5));
+    let (s, cams, mut language) = (splats(5, 2), some_cameras(), field(5));
+    // One level as mixes of its codes, as training leaves it, and one as plain features.
+    let raw = std::mem::take(&mut language.levels[0].features);
+    language.levels[0].carry(raw);
+    language.levels[0].reliability = [0u8, 255, 128, 3, 77].map(|r| f32::from(r) / 255.0).to_vec();
+    assert_eq!(language.levels[0].mixes.len(), 5);
     let seen = Seen { pixels: vec![0.0, 1.0, 2.5, 0.01, 7.0] };
     let up = Up {
         // Halves and quarters survive JSON to the last bit.
@@ -498,6 +503,24 @@ fn scene_directory_round_trip() {
     let kept = photo::load(&folder.path().join("cameras/images/train_00.png")).unwrap();
     assert_eq!(kept.image, photos[0].image, "8-bit photos survive unchanged");
 
+    let features = folder.path().join("language/features.npz");
+    let arrays = npy::read_npz(&features).unwrap();
+    let with = |name: &str, array: &NpyArray| {
+        let own = arrays.iter().filter(|(n, _)| n.as_str() != name).map(|(n, a)| (n.as_str(), a));
+        npy::write_npz(&features, &own.chain([(name, array)]).collect::<Vec<_>>()).unwrap();
+        scene_dir::load(folder.path())
+    };
+    let e = with("first_s", &NpyArray::u8(&[5], vec![0, 1, 7, 0, 0])).unwrap_err().to_string();
+    assert!(e.contains("names codes that its codebook of 2 lacks"), "{e}");
+    let e = with("share_s", &NpyArray::u8(&[4], vec![0; 4])).unwrap_err().to_string();
+    assert!(e.contains("share_s has the shape [4] for 5 splats"), "{e}");
+    // Version 1: plain features under the name of the level.
+    let plain = |l: usize| NpyArray::f32(&[5, 2], language.levels[l].features.clone());
+    npy::write_npz(&features, &[("s", &plain(0)), ("l", &plain(2))]).unwrap();
+    let old = scene_dir::load(folder.path()).unwrap().language.unwrap();
+    assert_eq!(old.levels[0].features, language.levels[0].features);
+    assert!(old.levels[0].mixes.is_empty() && old.levels[0].reliability.is_empty());
+
     let bare = scene_dir::load(&folder.path().join("point_cloud.ply")).unwrap();
     assert_eq!(bare.world, World::default());
     assert!(bare.language.is_none() && bare.cameras.is_empty() && bare.splats.len() == 5);
@@ -508,7 +531,7 @@ fn scene_directory_round_trip() {
     assert_eq!(scene_dir::load(folder.path()).unwrap().seen, Seen::default(), "scenes of earlier versions");
     let manifest = folder.path().join("scene.json");
     let text = std::fs::read_to_string(&manifest).unwrap();
-    std::fs::write(&manifest, text.replace("\"version\": 1", "\"version\": 99")).unwrap();
+    std::fs::write(&manifest, text.replace("\"version\": 2", "\"version\": 99")).unwrap();
     assert!(scene_dir::load(folder.path()).unwrap_err().to_string().contains("update it"));
     std::fs::remove_file(&manifest).unwrap();
     assert!(scene_dir::load(folder.path()).unwrap_err().to_string().contains("not a scene directory"));
