@@ -59,6 +59,8 @@ pub mod bench;
 pub mod capi;
 pub mod checkpoint;
 pub mod error;
+#[cfg(feature = "cli")]
+pub mod fetch;
 mod files;
 pub mod fit;
 pub mod format;

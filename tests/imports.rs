@@ -22,6 +22,7 @@ const FOLDERS: &[(&str, &str)] = &[
     ("photo", "error progress scene"),
     ("format", "error scene pass photo"),
     ("infer", "error files math progress scene photo format"),
+    ("fetch", "error files progress infer"),
     ("pose", "error math preset progress scene gpu pass photo infer"),
     ("fit", "error math preset checkpoint progress scene gpu pass"),
     ("language", "error math progress scene photo format infer"),
@@ -38,7 +39,7 @@ const FOLDERS: &[(&str, &str)] = &[
     ("capi", "error preset progress scene gpu pass photo infer pose run"),
     (
         "cli",
-        "error preset progress scene gpu photo format infer language query report synth pipeline run ablate bench",
+        "error preset progress scene gpu photo format infer fetch language query report synth pipeline run ablate bench",
     ),
 ];
 

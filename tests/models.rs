@@ -63,7 +63,9 @@ fn a_network_that_is_not_there_or_broken_is_explained_before_the_work() {
         refusal(&args, &[])
     };
     let absent = run(&["--masks", "sam"]);
-    assert!(absent.contains("tools/export/export_sam.py") && absent.contains("segment-anything"), "{absent}");
+    for part in ["splatvk models fetch sam_vit_b", "tools/export/export_sam.py", "segment-anything"] {
+        assert!(absent.contains(part), "{part}: {absent}");
+    }
     std::fs::create_dir(folder.path().join("dust3r")).unwrap();
     std::fs::write(folder.path().join("dust3r/encoder.onnx"), b"\x08\x08cut off").unwrap();
     let broken = run(&["--init", "dust3r"]);

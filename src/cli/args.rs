@@ -81,6 +81,7 @@ impl Command {
                 ModelsAction::List(device) | ModelsAction::Check(device) | ModelsAction::Path(device) => {
                     device
                 }
+                ModelsAction::Fetch(args) => &mut args.device,
             },
             Command::Doctor(args) => &mut args.device,
             Command::Bench(args) => return Some(&mut args.provider),
@@ -274,8 +275,33 @@ pub enum ModelsAction {
     List(DeviceArgs),
     /// Verify the built-in files; run every installed network on a built-in input and hold it to its contract
     Check(DeviceArgs),
+    /// Download networks, hold them to their contract and install them
+    Fetch(FetchArgs),
     /// Where models are looked for
     Path(DeviceArgs),
+}
+
+/// `splatvk models fetch`
+#[derive(Debug, Args)]
+pub struct FetchArgs {
+    /// Packs (open, paper) and names of `splatvk models list`
+    #[arg(required = true, value_name = "NAME")]
+    pub names: Vec<String>,
+    /// Do not ask
+    #[arg(long)]
+    pub yes: bool,
+    /// Accept the licence of this model, which forbids commercial use; once for each
+    #[arg(long, value_name = "NAME")]
+    pub accept: Vec<String>,
+    /// Print every address, file and command, and do nothing
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Replace what is installed
+    #[arg(long)]
+    pub force: bool,
+    /// Where models are; they go into the first folder
+    #[command(flatten)]
+    pub device: DeviceArgs,
 }
 
 /// `splatvk doctor`
@@ -289,6 +315,9 @@ pub struct DoctorArgs {
 /// `splatvk clean`
 #[derive(Debug, Args)]
 pub struct CleanArgs {
+    /// Folder of the models
+    #[arg(long, value_name = "DIR")]
+    pub models: Option<PathBuf>,
     /// Delete it
     #[arg(long)]
     pub delete: bool,

@@ -1,38 +1,52 @@
 //! `splatvk clean`: what earlier runs left to be used again, and how to free it.
 use super::args::CleanArgs;
 use super::print::{print, print_json};
-use crate::infer::cache;
+use crate::fetch;
+use crate::infer::{Registry, cache};
 use crate::pipeline::Store;
 use crate::{Error, Result};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Kept things of one kind.
+/// Kept things of one kind, and how one of them goes.
 struct KeptRow {
     what: &'static str,
     folder: PathBuf,
-    files: Vec<(PathBuf, u64)>,
+    things: Vec<(PathBuf, u64)>,
+    remove: fn(&Path) -> Result<()>,
 }
 
 impl KeptRow {
     fn bytes(&self) -> u64 {
-        self.files.iter().map(|f| f.1).sum()
+        self.things.iter().map(|f| f.1).sum()
     }
 }
 
 pub fn clean(args: &CleanArgs) -> Result<()> {
     let stages = crate::run::stage_folder();
-    let rows = [
-        KeptRow { what: "stages of runs, for --resume", files: Store::list(&stages), folder: stages },
-        KeptRow { what: "answers of networks", files: cache::files(), folder: cache::folder() },
+    let (answers, folder) = (cache::files(), cache::folder());
+    let mut rows = vec![
+        KeptRow {
+            what: "stages of runs, for --resume",
+            things: Store::list(&stages),
+            folder: stages,
+            remove,
+        },
+        KeptRow { what: "answers of networks", things: answers, folder, remove },
     ];
+    rows.extend(Registry::places(args.models.as_deref()).into_iter().map(|folder| KeptRow {
+        what: "models that were fetched in part",
+        things: fetch::leftovers(&folder),
+        folder,
+        remove: fetch::sweep,
+    }));
     if args.delete {
-        for (file, _) in rows.iter().flat_map(|r| &r.files) {
-            remove(file)?;
+        for row in &rows {
+            row.things.iter().try_for_each(|(path, _)| (row.remove)(path))?;
         }
     }
     if args.json {
-        let one = |r: &KeptRow| json!({ "what": r.what, "folder": r.folder, "files": r.files.len(), "bytes": r.bytes() });
+        let one = |r: &KeptRow| json!({ "what": r.what, "folder": r.folder, "files": r.things.len(), "bytes": r.bytes() });
         return print_json(
             &json!({ "deleted": args.delete, "kept": rows.iter().map(one).collect::<Vec<_>>() }),
         );
@@ -43,13 +57,15 @@ pub fn clean(args: &CleanArgs) -> Result<()> {
         print(&format!(
             "{}: {verb} {size:.1} MiB in {} files ({})\n",
             r.what,
-            r.files.len(),
+            r.things.len(),
             r.folder.display()
         ))?;
     }
     match args.delete {
         true => Ok(()),
-        false => print("splatvk clean --delete frees it; runs then start from their photos\n"),
+        false => print(
+            "splatvk clean --delete frees it; runs then start from their photos, fetches from the first byte\n",
+        ),
     }
 }
 

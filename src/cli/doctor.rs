@@ -4,7 +4,7 @@ use super::models;
 use super::print::{print, print_json};
 use crate::gpu::report::{Line, Status, vulkan};
 use crate::infer;
-use crate::infer::installed::inventory;
+use crate::infer::installed::{Task, inventory};
 use crate::photo::{self, Support};
 use crate::run::sources;
 use crate::{Error, Result};
@@ -38,6 +38,16 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
     lines.extend(
         sources::list(&networks).into_iter().map(|(option, found)| line(&option, Status::Ok, found, None)),
     );
+    let lacking: Vec<&str> = [Task::Geometry, Task::Masks, Task::Features]
+        .into_iter()
+        .filter(|task| networks.best(*task).is_none())
+        .map(Task::name)
+        .collect();
+    if !lacking.is_empty() {
+        // The built-in ways do without.
+        let advice = "splatvk models fetch open gets those that are recommended".to_owned();
+        lines.push(line("networks", Status::Note, format!("none for {}", lacking.join(", ")), Some(advice)));
+    }
     // Photos of other kinds are read without it, so this is no fault of the machine.
     let Support { found, advice } = photo::heif_support();
     lines.push(line("HEIC, AVIF", if advice.is_some() { Status::Note } else { Status::Ok }, found, advice));

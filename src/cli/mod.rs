@@ -6,6 +6,7 @@ mod clean;
 mod doctor;
 mod eval;
 mod export;
+mod fetch;
 mod generate;
 mod measure;
 mod models;

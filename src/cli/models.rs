@@ -1,5 +1,6 @@
-//! `splatvk models list|check|path`
+//! `splatvk models list|check|path`; `fetch` has a file of its own.
 use super::args::{ModelsAction, ModelsArgs};
+use super::fetch::fetch;
 use super::print::{print, print_json};
 use crate::infer::check::{Measured, check};
 use crate::infer::installed::{CatalogueEntry, HashedFile, Installed, Inventory, catalogue, inventory};
@@ -18,6 +19,7 @@ pub fn models(args: &ModelsArgs) -> Result<()> {
             let registry = device.registry()?;
             check_all(&registry.uncached(), device.json)
         }
+        ModelsAction::Fetch(args) => fetch(args),
         ModelsAction::Path(device) => {
             let registry = device.registry()?;
             let paths: Vec<String> = registry.folders().iter().map(|f| f.display().to_string()).collect();
@@ -43,8 +45,8 @@ fn list(registry: &Registry, found: &Inventory, as_json: bool) -> Result<()> {
     let mut text = String::from("Built-in pack: what splatvk uses unless told otherwise\n");
     status.iter().for_each(|m| built_in(&mut text, m));
     let packs = [
-        ("paper", "Paper pack: the networks of the paper; bring their weights yourself"),
-        ("open", "Open pack: every licence permits commercial use; bring their weights yourself"),
+        ("paper", "Paper pack: the networks of the paper (splatvk models fetch paper)"),
+        ("open", "Open pack: every licence permits commercial use (splatvk models fetch open)"),
         ("", "Others that splatvk can use"),
     ];
     for (pack, title) in packs {
@@ -91,7 +93,11 @@ fn entry(text: &mut String, k: &CatalogueEntry, registry: &Registry, found: &Inv
     match model {
         Some(m) => installed(text, m),
         None => {
-            let _ = writeln!(text, "{:10} looked for in {}; written by {}", "", place(k, registry), k.export);
+            let how = match crate::fetch::sources(k).is_empty() {
+                true => k.export.clone(),
+                false => format!("splatvk models fetch {}, or {}", k.id, k.export),
+            };
+            let _ = writeln!(text, "{:10} looked for in {}; from {how}", "", place(k, registry));
         }
     }
 }
@@ -197,7 +203,8 @@ pub fn to_json(m: &ModelStatus) -> serde_json::Value {
 fn known_json(k: &CatalogueEntry, registry: &Registry, found: &Inventory) -> serde_json::Value {
     json!({
         "role": k.task, "id": k.id, "name": k.name, "family": k.family, "packs": k.packs, "licence": k.licence,
-        "megabytes": k.megabytes, "source": k.source, "export": k.export, "looked_for": place(k, registry),
+        "non_commercial": k.non_commercial, "megabytes": k.megabytes, "source": k.source, "export": k.export,
+        "fetchable": !crate::fetch::sources(k).is_empty(), "looked_for": place(k, registry),
         "installed": of_entry(k, found).is_some(),
     })
 }

@@ -183,6 +183,9 @@ pub struct Adapter {
     /// What the files beside it must hash to, by name; files without an entry may be anything.
     #[serde(default)]
     pub sha256: BTreeMap<String, String>,
+    /// Where the files were fetched from, by name.
+    #[serde(default)]
+    pub source: BTreeMap<String, String>,
     #[serde(default)]
     graph: Vec<GraphSpec>,
 }

@@ -4,98 +4,15 @@
 //! belong together when their names do (`sam_vit_b_encoder.onnx`, `sam_vit_b_decoder.onnx`).
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
-
-use serde::{Deserialize, Serialize};
 
 use super::cache::fingerprint;
+pub use super::catalogue::{CatalogueEntry, Task, catalogue};
 use super::compute::Compute;
 use super::contract::Part;
 use super::graph::GraphFile;
 pub use super::graph::HashedFile;
 use super::registry::Registry;
 use crate::{Error, Result};
-
-/// What a model does in a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Deserialize, Serialize)]
-#[serde(rename_all = "lowercase")]
-#[non_exhaustive]
-pub enum Task {
-    /// Cameras, depth and points.
-    Geometry,
-    /// Dense matches between photos.
-    Matcher,
-    /// Masks on three levels.
-    Masks,
-    /// Features of image regions.
-    Features,
-    /// Embeddings of texts.
-    Text,
-    /// Depth of each photo up to scale and shift.
-    Depth,
-}
-
-impl Task {
-    /// The name on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            Task::Geometry => "geometry",
-            Task::Matcher => "matcher",
-            Task::Masks => "masks",
-            Task::Features => "features",
-            Task::Text => "text",
-            Task::Depth => "depth",
-        }
-    }
-}
-
-/// A network that splatvk knows and does not ship.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct CatalogueEntry {
-    /// Folder or beginning of the file names under which it is looked for.
-    pub id: String,
-    /// What people call it.
-    pub name: String,
-    /// What it does.
-    #[serde(rename = "role")]
-    pub task: Task,
-    /// What it can do besides.
-    #[serde(default, rename = "also")]
-    pub other_tasks: Vec<Task>,
-    /// What `--init`, `--matcher`, `--masks` or `--features` call it.
-    pub family: String,
-    /// "paper", "open".
-    pub packs: Vec<String>,
-    /// Of code and weights.
-    pub licence: String,
-    /// Size of its float32 files.
-    pub megabytes: u32,
-    /// Where it is from.
-    pub source: String,
-    /// What writes its ONNX files.
-    pub export: String,
-}
-
-impl CatalogueEntry {
-    /// Whether it does this, mainly or besides.
-    pub fn does(&self, task: Task) -> bool {
-        self.task == task || self.other_tasks.contains(&task)
-    }
-}
-
-/// The known networks, in order of preference within a family.
-pub fn catalogue() -> &'static [CatalogueEntry] {
-    #[derive(Default, Deserialize)]
-    struct Catalogue {
-        model: Vec<CatalogueEntry>,
-    }
-    static KNOWN: OnceLock<Vec<CatalogueEntry>> = OnceLock::new();
-    KNOWN.get_or_init(|| {
-        // A test reads the same text; a mistake in it cannot reach users.
-        toml::from_str::<Catalogue>(include_str!("catalogue.toml")).unwrap_or_default().model
-    })
-}
 
 /// A network that is there, whole.
 #[derive(Clone, Debug)]
@@ -144,7 +61,8 @@ impl Installed {
 
     /// Place in the catalogue's order of preference; networks that it does not know come last.
     fn rank(&self) -> usize {
-        catalogue().iter().position(|k| self.name.starts_with(&k.id)).unwrap_or(usize::MAX)
+        let own = self.catalogue_entry().map(|k| &k.id);
+        catalogue().iter().position(|k| Some(&k.id) == own).unwrap_or(usize::MAX)
     }
 
     /// The catalogue entry with its name.
@@ -301,14 +219,28 @@ impl Registry {
             return Err(Error::missing_model(name, broken.reason.clone()));
         }
         let place = self.folders().first().map(|f| f.display().to_string()).unwrap_or_default();
-        let how = catalogue().iter().find(|k| k.family == name && k.does(task));
-        let how = how.map_or(String::new(), |k| format!(" (from {}, exported with {})", k.source, k.export));
-        let message = format!(
-            "no model \"{name}\" for {} in {place}; put its ONNX files{how} into {place}/{name}/, or see splatvk models list",
-            task.name()
-        );
+        let message =
+            format!("no model \"{name}\" for {} in {place}; {}", task.name(), how_to_get(name, task, &place));
         Err(Error::missing_model(name, message))
     }
+}
+
+/// What to do about a model that is not there: fetch it, or the one of its family that needs no export, or bring its files.
+fn how_to_get(name: &str, task: Task, place: &str) -> String {
+    let own = catalogue().iter().find(|k| k.id == name);
+    let family = || catalogue().iter().filter(|k| k.family == name && k.does(task));
+    let known = own.or_else(|| family().find(|k| !k.files.is_empty())).or_else(|| family().next());
+    let Some(k) = known else {
+        return format!("put its ONNX files into {place}/{name}/, or see splatvk models list");
+    };
+    let fetch = match k.files.is_empty() && k.recipe.is_none() {
+        true => String::new(),
+        false => format!("splatvk models fetch {} gets it ({}, from {}), or ", k.id, k.licence, k.source),
+    };
+    format!(
+        "{fetch}put its ONNX files into {place}/{name}/ ({} writes them); see splatvk models list",
+        k.export
+    )
 }
 
 fn onnx_files(folder: &Path) -> Vec<PathBuf> {

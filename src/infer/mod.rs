@@ -7,6 +7,7 @@ pub(crate) mod best_pairs;
 #[cfg(test)]
 pub(crate) mod breakfast;
 pub mod cache;
+pub mod catalogue;
 pub mod check;
 mod classify;
 pub mod clip;

@@ -1,10 +1,11 @@
 //! Networks that users bring, as tiny graphs with the same interfaces: what fits is used, what does not is named.
 use std::path::Path;
 
+use super::catalogue::{CatalogueEntry, catalogue, common_packages};
 use super::clip::Clip;
 use super::contract::Part;
 use super::graph::GraphFile;
-use super::installed::{Task, catalogue, inventory};
+use super::installed::{Task, inventory};
 use super::testing::{Attribute, FLOAT, INT64, Onnx};
 use super::{Input, RegionEncoder, Registry, pairs, warp};
 use crate::files::sha256;
@@ -271,22 +272,52 @@ fn the_catalogue_is_sound_and_a_missing_model_is_explained() {
         assert!(model.source.starts_with("https://") && !model.licence.is_empty(), "{}", model.id);
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join(&model.export);
         assert!(model.export.starts_with("https://") || script.is_file(), "{}: {}", model.id, model.export);
-        // The open pack is for commercial use.
-        assert!(!(model.packs.contains(&"open".into()) && model.licence.contains("NC")), "{}", model.id);
+        assert_eq!(model.non_commercial, model.licence.contains("NC"), "{}", model.id);
+        // The open pack is for commercial use, and needs no Python.
+        let open = model.packs.contains(&"open".into());
+        assert!(!open || !model.non_commercial && !model.files.is_empty(), "{}", model.id);
+        sources_are_sound(model);
     }
-    for pack in ["paper", "open"] {
-        for task in [Task::Geometry, Task::Matcher, Task::Masks, Task::Features] {
-            assert!(
-                catalogue().iter().any(|k| k.task == task && k.packs.contains(&pack.into())),
-                "{pack} {task:?}"
-            );
+    for (pack, tasks) in [
+        ("paper", &[Task::Geometry, Task::Matcher, Task::Masks, Task::Features][..]),
+        ("open", &[Task::Geometry, Task::Masks, Task::Features]),
+    ] {
+        for task in tasks {
+            let of_pack = |k: &&CatalogueEntry| k.task == *task && k.packs.contains(&pack.into());
+            assert_eq!(catalogue().iter().filter(of_pack).count(), 1, "{pack} {task:?}");
         }
     }
+    assert!(common_packages().iter().any(|p| p.starts_with("torch==")));
     let dir = tempfile::tempdir().unwrap();
     let error = Registry::of(&[dir.path()]).installed(Task::Geometry, "dust3r").unwrap_err();
     let text = error.to_string();
-    assert!(text.contains("tools/export/export_dust3r.py") && text.contains("naver/dust3r"), "{text}");
+    for part in ["splatvk models fetch dust3r", "NC", "tools/export/export_dust3r.py", "naver/dust3r"] {
+        assert!(text.contains(part), "{part}: {text}");
+    }
     assert_eq!(error.exit_code(), 2);
+    let text = Registry::of(&[dir.path()]).installed(Task::Masks, "sam").unwrap_err().to_string();
+    assert!(text.contains("models fetch sam_vit_b"), "of a family the one that needs no export: {text}");
+}
+
+/// Addresses are of https and lead to files; names are such that files cannot leave their folder.
+fn sources_are_sound(model: &CatalogueEntry) {
+    let weights = model.recipe.iter().flat_map(|r| &r.weights);
+    for source in model.files.iter().chain(weights) {
+        let name = Path::new(&source.name);
+        assert!(source.from.starts_with("https://") && !source.from.ends_with('/'), "{}", source.from);
+        assert_eq!(name.file_name(), Some(name.as_os_str()), "{}", source.name);
+        let hex = |s: &String| s.len() == 64 && s.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
+        assert!(source.sha256.as_ref().is_none_or(hex), "{}", source.from);
+        // Whoever can change a file behind an address without a revision cannot change its checksum.
+        let fixed =
+            source.from.split('/').any(|part| part.len() == 40) || !source.from.contains("huggingface");
+        assert!(fixed || source.sha256.is_none(), "{}", source.from);
+    }
+    if let Some(recipe) = &model.recipe {
+        assert!(model.export.ends_with(&recipe.script), "{}", model.id);
+        let mut given = recipe.weights.iter().map(|w| &w.name);
+        assert!(given.all(|w| recipe.arguments.contains(w)), "{}: a checkpoint nobody reads", model.id);
+    }
 }
 
 #[test]

@@ -106,11 +106,21 @@ def graph(args, name, module, inputs, outputs, dynamic=None, reference=None):
 
 
 def photo(size, count=2):
-    """`count` of [1, 3, H, W] in [0, 1]: real photos of the repository's test scene, at most 4, stretched to (width, height)."""
+    """`count` of [1, 3, H, W] in [0, 1]: real photos of the repository's test scene, at most 4, stretched to (width, height); where
+    the script stands alone, as `splatvk models fetch` runs it, waves of colour instead."""
     from PIL import Image
     folder = Path(__file__).resolve().parents[2] / "tests/data/breakfast/images"
+    if not folder.is_dir():
+        return [waves(size, 20.0 * k) for k in range(count)]
     return [torch.from_numpy(np.asarray(Image.open(p).convert("RGB").resize(size, Image.BICUBIC)).astype(np.float32) / 255)
             .permute(2, 0, 1)[None].contiguous() for p in sorted(folder.iterdir())[:count]]
+
+
+def waves(size, shift):
+    """The texture of src/infer/check.rs: smooth, and nowhere the same."""
+    x, y = np.meshgrid(np.arange(size[0]) + shift, np.arange(size[1]))
+    rows = [0.5 + 0.5 * np.sin(x * a + 1) * np.cos(y * b - 1) for a, b in [(0.11, 0.07), (0.05, 0.13), (0.23, 0.19)]]
+    return torch.from_numpy(np.stack(rows)[None].astype(np.float32))
 
 
 def normalise(image, mean, std):

@@ -1,0 +1,268 @@
+//! One file: what goes wrong on networks and disks.
+use super::server::{File, Request, Server, plain};
+use super::sha256;
+use splatvk::Error;
+use splatvk::fetch::{Client, Fetched, Limits};
+use splatvk::infer::catalogue::Source;
+use splatvk::progress::Silent;
+use std::io::Write;
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// Short enough for tests.
+const LIMITS: Limits = Limits {
+    connect: Duration::from_secs(5),
+    stall: Duration::from_millis(300),
+    tries: 3,
+    pause: Duration::from_millis(10),
+};
+
+/// Where the file of a test is, as the catalogue would say it; the server stands for the host.
+const FROM: &str = "https://models.example/some/file.bin";
+
+fn content(length: usize) -> Vec<u8> {
+    (0..length).map(|k| (k * k % 251) as u8).collect()
+}
+
+/// A folder, a server and the download of one file from it.
+struct Trial {
+    folder: tempfile::TempDir,
+    server: Server,
+    source: Source,
+}
+
+impl Trial {
+    fn new(answer: impl Fn(&Request, usize, &mut TcpStream) + Send + Sync + 'static) -> Trial {
+        let source = Source { from: FROM.into(), name: "file.bin".into(), bytes: None, sha256: None };
+        Trial { folder: tempfile::tempdir().unwrap(), server: Server::start(answer), source }
+    }
+
+    fn pinned(mut self, content: &[u8]) -> Trial {
+        (self.source.bytes, self.source.sha256) = (Some(content.len() as u64), Some(sha256(content)));
+        self
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn get(&self) -> Result<Fetched, Error> {
+        let client = Client::new(Some(&self.server.address), None, LIMITS).unwrap();
+        let to = self.path("whole.bin");
+        client.download(&self.source, 10_000_000, self.folder.path(), &to, &Silent)
+    }
+
+    /// The whole file is there, and nothing half.
+    fn got(&self, content: &[u8]) -> Fetched {
+        let done = self.get().unwrap();
+        assert!(std::fs::read(self.path("whole.bin")).unwrap() == content, "another content");
+        assert_eq!((done.bytes, &done.sha256), (content.len() as u64, &sha256(content)));
+        assert!(!self.path("file.bin.partial").exists());
+        done
+    }
+
+    /// The one line of a download that must fail.
+    fn fails(&self, words: &[&str]) -> String {
+        let text = self.get().unwrap_err().to_string();
+        assert!(words.iter().all(|w| text.contains(w)) && !text.contains('\n'), "{words:?}: {text}");
+        assert!(!self.path("whole.bin").exists());
+        text
+    }
+}
+
+#[test]
+fn redirects_are_followed_to_the_file_and_not_in_circles() {
+    let body = content(300_000);
+    let file = File::new(&body);
+    let trial = Trial::new(move |r, _, s| match r.path.as_str() {
+        "/some/file.bin" => plain(s, "302 Found", &["Location: /elsewhere?key=1"]),
+        "/elsewhere?key=1" => file.send(r, s),
+        _ => plain(s, "404 Not Found", &[]),
+    });
+    assert_eq!(trial.got(&body).downloaded, 300_000);
+
+    let circle = Trial::new(|_, _, s| plain(s, "302 Found", &["Location: /some/file.bin"]));
+    circle.fails(&["circle", "/some/file.bin"]);
+    assert!(circle.server.requests().len() < 15, "refused, not tried again");
+}
+
+#[test]
+fn what_is_gone_is_said_at_once_and_a_busy_server_is_asked_again() {
+    let gone = Trial::new(|_, _, s| plain(s, "404 Not Found", &[]));
+    gone.fails(&["HTTP 404", "no longer there", "models path"]);
+    assert_eq!(gone.server.requests().len(), 1);
+    let closed = Trial::new(|_, _, s| plain(s, "403 Forbidden", &[]));
+    closed.fails(&["HTTP 403", "login"]);
+
+    let body = content(1000);
+    let file = File::new(&body);
+    let busy = Trial::new(move |r, count, s| match count {
+        0 => plain(s, "503 Service Unavailable", &["Retry-After: 0"]),
+        1 => plain(s, "429 Too Many Requests", &[]),
+        _ => file.send(r, s),
+    });
+    busy.got(&body);
+    let never = Trial::new(|_, _, s| plain(s, "503 Service Unavailable", &[]));
+    never.fails(&["HTTP 503", "3 times"]);
+    // Nobody answers at all.
+    let mut nobody = Trial::new(|_, _, _| ());
+    nobody.server.address = "http://127.0.0.1:9".into();
+    nobody.fails(&["no answer", "3 times", "check the network"]);
+}
+
+#[test]
+fn a_download_that_breaks_off_goes_on_where_it_was() {
+    let body = content(900_000);
+    let file = File::new(&body);
+    // Five pieces, which is more tries than are allowed without progress.
+    let trial = Trial::new(move |r, _, s| file.clone().cut(200_000).send(r, s));
+    trial.got(&body);
+    let asked: Vec<_> = trial.server.requests().iter().map(Request::first).collect();
+    assert_eq!(asked, [None, Some(200_000), Some(400_000), Some(600_000), Some(800_000)]);
+
+    // Another process goes on as well, and proves that it is the same file.
+    let file = File::new(&body);
+    let trial = Trial::new(move |r, count, s| match count {
+        0..3 => file.clone().cut(if count == 0 { 500_000 } else { 0 }).send(r, s),
+        _ => file.send(r, s),
+    });
+    trial.fails(&["3 times", "0.5 MB that are here"]);
+    assert_eq!(std::fs::metadata(trial.path("file.bin.partial")).unwrap().len(), 500_000);
+    assert_eq!(trial.got(&body).downloaded, 400_000);
+    let last = trial.server.requests().pop().unwrap();
+    assert_eq!((last.first(), last.header("if-range")), (Some(500_000), Some("\"one\"")));
+}
+
+#[test]
+fn pieces_of_different_files_are_never_put_together() {
+    let (old, new) = (content(600_000), content(700_000).into_iter().rev().collect::<Vec<_>>());
+    // The file has changed in between, with an ETag that says so.
+    let (first, second) = (File::new(&old), File { etag: "\"two\"", ..File::new(&new) });
+    let changed = Trial::new(move |r, count, s| match count {
+        0 => first.clone().cut(300_000).send(r, s),
+        _ => second.send(r, s),
+    });
+    changed.got(&new);
+    assert_eq!(changed.server.requests()[1].first(), Some(300_000), "it was asked to go on");
+
+    // A server that knows no ranges sends all of it again.
+    let file = File { ranges: false, ..File::new(&old) };
+    let whole = Trial::new(move |r, count, s| match count {
+        0 => file.clone().cut(300_000).send(r, s),
+        _ => file.send(r, s),
+    });
+    whole.got(&old);
+
+    // One that answers with another part than the one asked for.
+    let file = File::new(&old);
+    let odd = Trial::new(move |r, count, s| match (count, r.first()) {
+        (0, _) => file.clone().cut(300_000).send(r, s),
+        (_, Some(_)) => plain(s, "206 Partial Content", &["Content-Range: bytes 7-9/600000"]),
+        _ => file.send(r, s),
+    });
+    odd.got(&old);
+
+    // One whose ETag lies: the checksum of the catalogue tells, and it starts from the first byte.
+    let file = File::new(&new);
+    let lying = Trial::new(move |r, _, s| file.send(r, s)).pinned(&new);
+    std::fs::write(lying.path("file.bin.partial"), [1; 1000]).unwrap();
+    let notes = format!(r#"{{"from": "{FROM}", "validator": "\"one\"", "total": 700000}}"#);
+    std::fs::write(lying.path("file.bin.json"), notes).unwrap();
+    lying.got(&new);
+    let asked: Vec<_> = lying.server.requests().iter().map(Request::first).collect();
+    assert_eq!(asked, [Some(1000), None]);
+}
+
+#[test]
+fn a_file_of_another_content_or_size_is_refused_and_not_kept() {
+    let (body, other) = (content(100_000), content(100_001));
+    let file = File::new(&other);
+    let larger = Trial::new(move |r, _, s| file.send(r, s)).pinned(&body);
+    larger.fails(&["has 100001 bytes", "says 100000"]);
+
+    let mut altered = body.clone();
+    altered[50_000] ^= 1;
+    let file = File::new(&altered);
+    let wrong = Trial::new(move |r, _, s| file.send(r, s)).pinned(&body);
+    wrong.fails(&[&sha256(&altered), &sha256(&body), "altered"]);
+    assert!(!wrong.path("file.bin.partial").exists());
+    assert_eq!(wrong.server.requests().len(), 1);
+
+    // A web page in its place.
+    let page = Trial::new(|_, _, s| {
+        let _ = s.write_all(b"HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: 6\r\n\r\nlog in");
+    });
+    page.fails(&["a web page came"]);
+    // Without a length: only the catalogue tells that it is not all.
+    let half = |_: &Request, _: usize, s: &mut TcpStream| {
+        let _ = s
+            .write_all(b"HTTP/1.1 200 OK\r\nConnection: close\r\n\r\n")
+            .and_then(|()| s.write_all(&[7; 1000]));
+    };
+    Trial::new(half).pinned(&body).fails(&["ended after 1000 bytes", "3 times"]);
+    // Without a length, and without an end.
+    let endless = |_: &Request, _: usize, s: &mut TcpStream| {
+        let _ = s.write_all(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n");
+        while write!(s, "10000\r\n")
+            .and_then(|()| s.write_all(&[7; 0x10000]))
+            .and_then(|()| s.write_all(b"\r\n"))
+            .is_ok()
+        {}
+    };
+    Trial::new(endless).pinned(&body).fails(&["longer than it can be (0.1 MB)"]);
+    let unknown = Trial::new(endless);
+    unknown.fails(&["longer than it can be (10.0 MB)"]);
+    assert!(!unknown.path("file.bin.partial").exists());
+    let huge = File::new(&content(10_000_001));
+    Trial::new(move |r, _, s| huge.send(r, s)).fails(&["longer than it can be"]);
+}
+
+#[test]
+fn a_silent_server_is_left_and_asked_again() {
+    let body = content(600_000);
+    let file = File::new(&body);
+    let trial = Trial::new(move |r, count, s| match count {
+        0 => std::thread::sleep(Duration::from_secs(3)),
+        1 => {
+            // A part of the body, then nothing.
+            let slow = File { pause: Duration::from_secs(3), ..file.clone() };
+            slow.send(r, s);
+        }
+        _ => file.send(r, s),
+    });
+    let began = std::time::Instant::now();
+    trial.got(&body);
+    assert!(began.elapsed() < Duration::from_secs(2), "waited for {:?}", began.elapsed());
+    assert_eq!(trial.server.requests()[2].first(), Some(1 << 18));
+    // Slow is not silent.
+    let file = File { pause: Duration::from_millis(150), ..File::new(&body) };
+    let slow = Trial::new(move |r, _, s| file.send(r, s));
+    slow.got(&body);
+    assert_eq!(slow.server.requests().len(), 1);
+}
+
+#[test]
+fn a_full_disk_is_named_and_a_file_that_is_there_is_not_downloaded_again() {
+    let body = content(500_000);
+    let file = File::new(&body);
+    let trial = Trial::new(move |r, _, s| file.send(r, s));
+    if Path::new("/dev/full").exists() {
+        std::os::unix::fs::symlink("/dev/full", trial.path("file.bin.partial")).unwrap();
+        let error = trial.get().unwrap_err();
+        let text = error.to_string();
+        assert!(error.exit_code() == 2 && text.contains("file.bin.partial"), "{text}");
+        assert!(text.contains("free some space"), "{text}");
+        std::fs::remove_file(trial.path("file.bin.partial")).unwrap();
+    }
+    trial.got(&body);
+    trial.server.requests();
+    assert_eq!(trial.got(&body).downloaded, 0);
+    // Killed between the last byte and the renaming.
+    std::fs::rename(trial.path("whole.bin"), trial.path("file.bin.partial")).unwrap();
+    assert_eq!(trial.got(&body).downloaded, 0);
+    assert!(trial.server.requests().is_empty());
+    // Somebody changed it meanwhile.
+    std::fs::write(trial.path("whole.bin"), b"something else").unwrap();
+    assert_eq!(trial.got(&body).downloaded, 500_000);
+}

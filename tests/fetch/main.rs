@@ -1,0 +1,16 @@
+//! `splatvk models fetch` against a server on this machine: what goes wrong on networks, disks and with processes, and that a
+//! model is there whole or not at all.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
+mod download;
+mod full_size;
+mod models;
+mod server;
+#[allow(dead_code)] // other tests use the rest
+#[path = "../../src/infer/testing.rs"]
+mod testing;
+
+use sha2::{Digest, Sha256};
+
+fn sha256(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
+}
