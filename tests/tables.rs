@@ -56,6 +56,65 @@ fn a_generated_scene_is_ablated() {
     }
 }
 
+/// Two scenes and one that cannot be read, with two seeds; what they share runs once, and the second call takes it all from the
+/// first.
+#[test]
+fn scenes_and_seeds_have_a_spread_and_a_failed_scene_is_a_note() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let small = ["--size", "160x120", "--views", "3", "--held-out", "2", "--objects", "4"];
+    for (name, seed) in [("a", "1000"), ("b", "1001"), ("broken", "1000")] {
+        let made = splatvk(&[&["generate", "--out", path(&at(name)), "--seed", seed], &small[..]].concat());
+        assert!(made.status.success());
+    }
+    std::fs::remove_dir_all(at("broken/images")).unwrap();
+    let (a, b, broken, out) = (at("a"), at("b"), at("broken"), at("out"));
+    let ablate = || {
+        let mut args =
+            vec!["--log", "json", "ablate", "alignment", "--data", path(&broken), path(&a), path(&b)];
+        args.extend([
+            "--seeds",
+            "0,1",
+            "--regions",
+            "exact",
+            "--true-cameras",
+            "--out",
+            path(&out),
+            "--resume",
+            "--json",
+        ]);
+        args.extend(["--iterations", "5", "--language-iterations", "1", "--max-points", "5000"]);
+        let output = splatvk(&args);
+        let log = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success(), "{log}");
+        let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let begun = move |stage: &str| {
+            let events = log.lines().filter_map(|l| serde_json::from_str::<serde_json::Value>(l).ok());
+            events.filter(|e| e["event"] == "begin" && e["stage"] == stage).count()
+        };
+        (report, begun)
+    };
+    let (report, begun) = ablate();
+    let row = &report["tables"][0]["rows"][0];
+    assert_eq!(
+        (row["spread"]["mIoU"]["n"].as_u64(), row["difference"]["scenes"].as_u64()),
+        (Some(4), Some(2))
+    );
+    assert!(
+        row["spread"]["mIoU"]["sd"].as_f64().unwrap() > 0.0 && row["difference"]["half"].is_f64(),
+        "{row}"
+    );
+    let note = row["note"].as_str().unwrap();
+    assert!(note.starts_with("2 of 6 failed, first broken with seed 0: "), "{note}");
+    // Cameras are given, so that no random number enters before stereo: once per scene, training once per scene and seed.
+    assert_eq!((begun("features"), begun("splats")), (2, 4));
+    let text = std::fs::read_to_string(out.join("alignment.txt")).unwrap();
+    assert!(text.contains(" ± ") && text.contains("Δ mIoU"), "{text}");
+    let (again, begun) = ablate();
+    assert_eq!((begun("features"), begun("splats")), (0, 0));
+    assert_eq!(report["tables"], again["tables"]);
+}
+
 /// Two photos whose axes meet at equal distances: matches leave their focal length open (without vanishing points it comes out
 /// 36 % short, and the rotation between them 17° wrong).
 #[test]
@@ -104,6 +163,10 @@ fn what_cannot_be_done_is_one_line_and_exit_code_two() {
         (vec!["ablate", "all", "--data", o, "--out", o], "ground_truth.json"),
         (vec!["ablate", "all", "--data", breakfast, "--out", o, "--regions", "clip"], "--regions clip"),
         (vec!["ablate", "all", "--data", breakfast, "--out", o, "--iterations", "0"], "--iterations 0"),
+        (vec!["ablate", "all", "--data", breakfast, breakfast, "--out", o], "the same folder twice"),
+        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--seeds", "1,1"], "the same seed twice"),
+        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--matcher", "sift"], "--matcher sift"),
+        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--layout", "lerf"], "lerf"),
     ] {
         let output = splatvk(&args);
         let text = String::from_utf8_lossy(&output.stderr).into_owned();

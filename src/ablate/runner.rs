@@ -1,12 +1,16 @@
 //! Runs setups as graphs of stages that share one store: setups that agree up to a stage share what that stage made.
+use super::data::{DataSet, Layout};
+use super::flat;
+use super::measure::Scope;
+use super::setup::{Available, Network, Regions, RowWork, Setup, TableRow};
 use super::stages::{
-    EncoderEmbeddings, MaskEmbeddings, ObjectEmbeddings, Score, Scored, SyntheticEmbeddings, SyntheticMasks,
+    EncoderEmbeddings, LabelEmbeddings, LabelledMasks, MaskEmbeddings, ObjectEmbeddings, Score,
+    ScorePublished, Scored, SyntheticEmbeddings, SyntheticMasks,
 };
-use super::tables::{Available, NetworkFamily, Regions, Setup};
 use crate::fit::{LanguageOptions, Preset, RgbOptions, Trained, TrainedLanguage};
 use crate::gpu::Device;
 use crate::infer::Registry;
-use crate::infer::installed::{Task, catalogue, inventory};
+use crate::infer::installed::{Installed, Task, catalogue, inventory};
 use crate::language::sam::SamOptions;
 use crate::language::{Language, ViewMasks};
 use crate::photo;
@@ -16,12 +20,14 @@ use crate::query::TextQuery;
 use crate::query::eval::{BACKGROUND_LABELS, GroundTruth, Split, TruthFrame};
 use crate::run::ask;
 use crate::run::sources::{
-    self, DepthSources, FeatureSources, GeometrySources, GraphBuilder, MaskSources, MatchSources, PosedPhotos,
+    self, DepthSources, FeatureSources, GeometrySources, GraphBuilder, MaskSources, MatchSources,
+    PosedPhotos, SourceChoice,
 };
-use crate::run::stages::{self, CameraOrigin, PlacedPhotos};
+use crate::run::stages::{self, CameraOrigin, PlacedPhotos, SharedEncoder};
 use crate::scene::Camera;
-use crate::synth::regions;
+use crate::synth::regions::{self, InjectedErrors};
 use crate::{Error, Result};
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -39,18 +45,35 @@ pub struct RowFigures {
     pub feature_bytes: u64,
     /// Seconds of alignment, language stage and scoring.
     pub seconds: f64,
+    /// Seconds of both training stages.
+    pub training_seconds: f64,
+    /// Seconds of all stages from photos to the finished scene, one after the other, shared ones included.
+    pub total_seconds: f64,
 }
 
-/// The machine, the data, and everything made so far.
+/// The machine, one data set, and what was made of it.
 pub struct Runner<'a> {
-    device: Device,
-    registry: Registry,
-    /// The data set.
-    pub truth: Arc<GroundTruth>,
+    device: &'a Device,
+    registry: &'a Registry,
+    data: Arc<DataSet>,
+    truth: Arc<GroundTruth>,
     seed: u64,
     progress: &'a dyn Progress,
     store: Store,
+    encoders: Vec<Encoder>,
+    /// Setups that ran with this seed.
+    done: Vec<(Setup, RowFigures)>,
 }
+
+/// An encoder with its answers to the evaluation's phrases.
+struct Encoder {
+    choice: SourceChoice,
+    encoder: SharedEncoder,
+    queries: Vec<TextQuery>,
+}
+
+/// Trained features are large, and rows of one setup share their figures.
+const PASSING: &[&str] = &["language"];
 
 /// The stages of a setup.
 struct Stages {
@@ -74,15 +97,30 @@ fn pixels(placed: &PlacedPhotos) -> usize {
 }
 
 impl<'a> Runner<'a> {
-    /// Opens the machine and the data.
+    /// Opens the data on a machine.
     pub fn open(
-        device: Device,
-        registry: Registry,
-        truth: GroundTruth,
-        seed: u64,
+        device: &'a Device,
+        registry: &'a Registry,
+        data: DataSet,
         progress: &'a dyn Progress,
     ) -> Self {
-        Runner { device, registry, truth: Arc::new(truth), seed, progress, store: Store::in_memory() }
+        let store = Store::in_memory_without(PASSING);
+        let (data, truth) = (Arc::new(data.clone()), Arc::new(data.truth));
+        let (encoders, done) = (Vec::new(), Vec::new());
+        Runner { device, registry, data, truth, seed: 0, progress, store, encoders, done }
+    }
+
+    /// Photos of the default row, where the user does not say.
+    pub fn default_views(&self) -> usize {
+        let train = self.truth.frames.iter().filter(|f| f.split == Split::Train).count();
+        train.min(self.data.layout.views())
+    }
+
+    /// The seed of what runs from now on. What the seed before the last one alone has made is dropped.
+    pub fn start_seed(&mut self, seed: u64) {
+        self.store.forget_unused();
+        self.done.clear();
+        self.seed = seed;
     }
 
     /// Frames whose photos a scene of so many views is made from: train frames spread over their order, and held-out ones
@@ -108,34 +146,65 @@ impl<'a> Runner<'a> {
         Ok(frames)
     }
 
+    /// What rows can be scored on: held-out frames that none of them has as a photo, or the photos that all of them have.
+    pub(super) fn scope<'r>(&self, rows: impl Iterator<Item = &'r TableRow>) -> Scope {
+        let headline = self.data.layout.headline();
+        let (mut seen, mut shared) = (BTreeSet::new(), None::<BTreeSet<String>>);
+        for row in rows {
+            let RowWork::Score(setup) = &row.runs else { continue };
+            // A row with too few frames says so when it runs.
+            let Ok(frames) = self.frames(setup.views) else { continue };
+            let stems: BTreeSet<String> = frames.into_iter().map(|f| f.stem).collect();
+            shared =
+                Some(shared.map_or_else(|| stems.clone(), |s| s.intersection(&stems).cloned().collect()));
+            seen.extend(stems);
+        }
+        let own = self.data.layout == Layout::Own;
+        let counts = |f: &&TruthFrame| match headline {
+            Split::Train => shared.as_ref().is_some_and(|s| s.contains(&f.stem)),
+            split => !seen.contains(&f.stem) && (!own || f.split == split),
+        };
+        let frames = self.truth.frames.iter().filter(counts).map(|f| f.stem.clone()).collect();
+        Scope { headline, frames }
+    }
+
     /// What there is to compare.
     pub fn available(&self) -> Available {
         let of = |split| self.truth.frames.iter().filter(|f| f.split == split).count();
-        let there = inventory(&self.registry);
-        let families = |task| {
-            let mut all: Vec<NetworkFamily> = Vec::new();
-            for model in catalogue().iter().filter(|k| k.task == task) {
-                let installed = there
-                    .models
-                    .iter()
-                    .any(|m| m.tasks.contains(&task) && m.family == model.family && !m.untrained());
-                if all.iter().all(|f| f.name != model.family) {
-                    all.push(NetworkFamily { name: model.family.clone(), installed });
+        let there = inventory(self.registry);
+        let network = |name: &str, family: &str, fetch: Option<&String>| Network {
+            name: name.to_owned(),
+            family: family.to_owned(),
+            fetch: fetch.cloned(),
+        };
+        let networks = |task| {
+            let trained = there.models.iter().filter(|m| m.tasks.contains(&task) && !m.untrained());
+            let installed: Vec<&Installed> = trained.collect();
+            let mut all: Vec<Network> = installed.iter().map(|m| network(&m.name, &m.family, None)).collect();
+            for known in catalogue().iter().filter(|k| k.does(task)) {
+                if all.iter().all(|n| n.family != known.family) {
+                    all.push(network(&known.family, &known.family, Some(&known.id)));
                 }
             }
             all
         };
-        // Half of the held-out frames must stay held out.
-        let views = of(Split::Train) + of(Split::Test) / 2;
-        Available { views, geometry: families(Task::Geometry), features: families(Task::Features) }
+        Available {
+            // Half of the held-out frames must stay held out.
+            views: of(Split::Train) + of(Split::Test) / 2,
+            cameras: self.data.layout == Layout::Own || !self.data.known.is_empty(),
+            geometry: networks(Task::Geometry),
+            matchers: networks(Task::Matcher),
+            masks: networks(Task::Masks),
+            features: networks(Task::Features),
+        }
     }
 
     /// The stages of a setup, up to its figures.
-    fn stages(&self, setup: &Setup) -> Result<Stages> {
+    fn stages(&mut self, setup: &Setup) -> Result<Stages> {
         let frames = self.frames(setup.views)?;
         let paths: Vec<PathBuf> = frames.iter().map(|f| self.truth.folder.join(&f.file)).collect();
         let photos = photo::load_all(&paths, self.progress)?;
-        let registry = &self.registry;
+        let registry = self.registry;
         let given = |r: &Regions| matches!(r, Regions::Found { features, .. } if features.argument.is_some());
         let mut build = GraphBuilder {
             graph: Graph::default(),
@@ -153,11 +222,7 @@ impl<'a> Runner<'a> {
             sources::make::<GeometrySources>(&setup.init, registry, (&mut build, photos))?
         };
         let PosedPhotos { placed, geometry } = posed;
-        let matches = sources::make::<MatchSources>(
-            &sources::default::<MatchSources>(),
-            registry,
-            (&mut build, posed),
-        )?;
+        let matches = sources::make::<MatchSources>(&setup.matcher, registry, (&mut build, posed))?;
         let options = self.rgb_options(setup);
         let trained = build.graph.add(stages::TrainColour { options }, (placed, geometry));
         let RegionData { masks, embeddings, queries, space } = self.described(setup, &mut build, posed)?;
@@ -171,8 +236,16 @@ impl<'a> Runner<'a> {
             ..LanguageOptions::preset(Preset::Draft)
         };
         let language = build.graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
-        let score = Score { truth: self.truth.clone(), queries: queries.clone() };
-        let scored = build.graph.add(score, (trained, language, embeddings));
+        let scene = (trained, language, embeddings);
+        let scored = match self.data.layout {
+            Layout::Own => {
+                build.graph.add(Score { truth: self.truth.clone(), queries: queries.clone() }, scene)
+            }
+            Layout::Published(kind) => {
+                let score = ScorePublished { data: self.data.clone(), kind, queries: queries.clone() };
+                build.graph.add(score, scene)
+            }
+        };
         Ok(Stages { build, placed, trained, aligned, language, scored, queries })
     }
 
@@ -184,27 +257,37 @@ impl<'a> Runner<'a> {
     }
 
     /// Masks with features, the true embedding of every object in the space of these features, and the questions.
-    fn described(&self, setup: &Setup, build: &mut GraphBuilder, posed: PosedPhotos) -> Result<RegionData> {
-        let (truth, placed) = (&self.truth, posed.placed);
+    fn described(
+        &mut self,
+        setup: &Setup,
+        build: &mut GraphBuilder,
+        posed: PosedPhotos,
+    ) -> Result<RegionData> {
+        let (truth, placed) = (self.truth.clone(), posed.placed);
         let (masks, features) = match &setup.regions {
-            Regions::Synthetic(flaws) => {
-                let (truth, flaws) = (truth.clone(), *flaws);
-                let queries = self.phrases().iter().map(|p| regions::query(p)).collect();
+            Regions::Found { masks, features } => (masks, features),
+            Regions::Exact => return Ok(self.synthetic(InjectedErrors::NONE, build, posed)),
+            Regions::Flawed => {
+                return Ok(self.synthetic(InjectedErrors::default_rates(self.seed), build, posed));
+            }
+            Regions::TrueSegmentation { features } => {
+                let Encoder { encoder, queries, .. } = self.encoder(features)?;
+                let (encoder, queries) = (encoder.clone(), queries.clone());
+                let masks = LabelledMasks { truth: truth.clone(), encoder: encoder.clone() };
+                let space = encoder.space().to_owned();
                 return Ok(RegionData {
-                    masks: build.graph.add(SyntheticMasks { truth: truth.clone(), flaws }, (placed,)),
-                    embeddings: build.graph.add(SyntheticEmbeddings { truth, flaws }, (placed,)),
+                    masks: build.graph.add(masks, (placed,)),
+                    embeddings: build.graph.add(LabelEmbeddings { truth, encoder }, ()),
                     queries,
-                    space: "synthetic".into(),
+                    space,
                 });
             }
-            Regions::Found { masks, features } => (masks, features),
         };
-        let encoder = sources::make::<FeatureSources>(features, &self.registry, &self.registry)?;
-        let found = sources::make::<MaskSources>(masks, &self.registry, (build, posed))?;
+        let registry = self.registry;
+        let Encoder { encoder, queries, .. } = self.encoder(features)?;
+        let (encoder, queries, space) = (encoder.clone(), queries.clone(), encoder.space().to_owned());
+        let found = sources::make::<MaskSources>(masks, registry, (build, posed))?;
         let masks = build.graph.add(stages::RegionFeatures { encoder: encoder.clone() }, (placed, found));
-        let queries = encoder.with(|e| ask::embedded(&self.phrases(), e))?;
-        let space = encoder.space().to_owned();
-        let truth = truth.clone();
         let embeddings = if features.argument.is_some() {
             build.graph.add(MaskEmbeddings { truth }, (placed, masks))
         } else {
@@ -213,29 +296,78 @@ impl<'a> Runner<'a> {
         Ok(RegionData { masks, embeddings, queries, space })
     }
 
-    /// Phrases that the evaluation asks for, in its order.
+    /// True masks with synthetic features.
+    fn synthetic(
+        &self,
+        flaws: InjectedErrors,
+        build: &mut GraphBuilder,
+        PosedPhotos { placed, .. }: PosedPhotos,
+    ) -> RegionData {
+        let truth = self.truth.clone();
+        RegionData {
+            masks: build.graph.add(SyntheticMasks { truth: truth.clone(), flaws }, (placed,)),
+            embeddings: build.graph.add(SyntheticEmbeddings { truth, flaws }, (placed,)),
+            queries: self.phrases().iter().map(|p| regions::query(p)).collect(),
+            space: "synthetic".into(),
+        }
+    }
+
+    /// An encoder, loaded once and asked once: the built-in one compares each phrase with a thousand others.
+    fn encoder(&mut self, choice: &SourceChoice) -> Result<&Encoder> {
+        let known = self.encoders.iter().position(|e| e.choice == *choice);
+        let at = match known {
+            Some(at) => at,
+            None => {
+                let encoder = sources::make::<FeatureSources>(choice, self.registry, self.registry)?;
+                let queries = encoder.with(|e| ask::embedded(&self.phrases(), e))?;
+                self.encoders.push(Encoder { choice: choice.clone(), encoder, queries });
+                self.encoders.len() - 1
+            }
+        };
+        Ok(&self.encoders[at])
+    }
+
+    /// Phrases that the evaluation may ask for, in its order.
     fn phrases(&self) -> Vec<String> {
-        let all = self.truth.labels.values();
-        all.filter(|p| !BACKGROUND_LABELS.contains(&p.as_str())).cloned().collect()
+        let own = self.data.layout == Layout::Own;
+        let asked = |p: &&String| !own || !BACKGROUND_LABELS.contains(&p.as_str());
+        self.truth.labels.values().filter(asked).cloned().collect()
+    }
+
+    /// The labelled photos themselves, without a scene: features of every few pixels, asked directly.
+    pub fn flat(&mut self, choice: &SourceChoice) -> Result<Scored> {
+        let (data, truth, progress) = (self.data.clone(), self.truth.clone(), self.progress);
+        let Encoder { encoder, queries, .. } = self.encoder(choice)?;
+        match data.layout {
+            Layout::Own => flat::field(&truth, encoder, queries, progress),
+            Layout::Published(kind) => flat::published(&data, kind, encoder, queries, progress),
+        }
     }
 
     /// Runs a setup, as far as it was not run before.
     pub fn outcome(&mut self, setup: &Setup) -> Result<RowFigures> {
+        if let Some((_, known)) = self.done.iter().find(|(s, _)| s == setup) {
+            return Ok(known.clone());
+        }
         let s = self.stages(setup)?;
         let targets = [s.placed.target(), s.aligned.target(), s.language.target(), s.scored.target()];
         let progress = Recorded::new(self.progress);
-        let made = s.build.graph.run(&targets, &self.device, &self.registry, &self.store, &progress)?;
+        let made = s.build.graph.run(&targets, self.device, self.registry, &self.store, &progress)?;
         let (placed, language, scored) = (made.get(s.placed)?, made.get(s.language)?, made.get(s.scored)?);
         let levels = &language.field.levels;
         let codes = levels.iter().map(|l| l.codebook.members.iter().filter(|m| !m.is_empty()).count());
         let channels: usize = levels.iter().map(|l| l.codebook.code_dim).sum();
-        Ok(RowFigures {
+        let figures = RowFigures {
             splats: language.splats.len(),
             codes: codes.collect(),
             feature_bytes: feature_bytes(language.splats.len(), channels, pixels(&placed)),
             seconds: made.seconds(s.aligned) + made.seconds(s.language) + made.seconds(s.scored),
+            training_seconds: made.seconds(s.trained) + made.seconds(s.language),
+            total_seconds: made.seconds_in_all(s.language),
             scored,
-        })
+        };
+        self.done.push((setup.clone(), figures.clone()));
+        Ok(figures)
     }
 
     /// Bytes of a setup's features in training if they were as long as the embeddings, on three levels.
@@ -243,7 +375,7 @@ impl<'a> Runner<'a> {
         let s = self.stages(setup)?;
         let targets = [s.placed.target(), s.trained.target()];
         let progress = Recorded::new(self.progress);
-        let made = s.build.graph.run(&targets, &self.device, &self.registry, &self.store, &progress)?;
+        let made = s.build.graph.run(&targets, self.device, self.registry, &self.store, &progress)?;
         let (placed, trained) = (made.get(s.placed)?, made.get(s.trained)?);
         let length = s.queries.first().map_or(0, |q| q.embedding.len());
         Ok(feature_bytes(trained.splats.len(), 3 * length, pixels(&placed)))

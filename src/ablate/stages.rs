@@ -1,13 +1,16 @@
 //! What only experiments do: masks and features from ground truth, the true embeddings of objects, and figures.
+use super::data::DataSet;
 use crate::fit::{Trained, TrainedLanguage};
-use crate::language::{ViewMasks, dir};
+use crate::language::{LevelMasks, ViewMasks, dir};
 use crate::photo::Photo;
 use crate::photo::stem;
 use crate::pipeline::{Context, Lane, Output, Stage};
 use crate::query::TextQuery;
 use crate::query::eval::{EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
+use crate::query::protocol::{self, CodeScores, DecodedView, ProtocolKind, ProtocolReport};
 use crate::run::score::score_field;
 use crate::run::stages::{PlacedPhotos, SharedEncoder};
+use crate::run::view::Viewer;
 use crate::scene::{Codebook, Plane};
 use crate::synth::regions::{self, InjectedErrors};
 use crate::{Error, Result};
@@ -37,6 +40,8 @@ pub struct EmbeddingAgreement {
 pub struct Scored {
     /// Of protocol `field`.
     pub report: EvalReport,
+    /// Of the published protocol instead, where the data set follows one.
+    pub published: Option<ProtocolReport>,
     /// Per frame.
     pub agreement: Vec<EmbeddingAgreement>,
 }
@@ -213,8 +218,134 @@ impl Stage for Score {
                 Ok(())
             },
         )?;
-        Ok(Scored { report, agreement: agreements })
+        Ok(Scored { report, agreement: agreements, published: None })
     }
+}
+
+/// The same by a published protocol.
+pub(super) struct ScorePublished {
+    pub(super) data: Arc<DataSet>,
+    pub(super) kind: ProtocolKind,
+    /// Of every phrase that the data set labels.
+    pub(super) queries: Vec<TextQuery>,
+}
+
+impl Stage for ScorePublished {
+    const NAME: &'static str = "score-published";
+    const LANE: Lane = Lane::Device;
+    type Inputs = (Output<Trained>, Output<TrainedLanguage>, Output<ObjectEmbeddings>);
+    type Output = Scored;
+
+    fn settings(&self) -> String {
+        format!("{:?}", self.data.truth.folder)
+    }
+
+    fn run(
+        self,
+        (trained, language, embeddings): (&Trained, &TrainedLanguage, &ObjectEmbeddings),
+        context: &Context,
+    ) -> Result<Scored> {
+        let truth = &self.data.truth;
+        let mut protocol = protocol::open(self.kind, &self.data.labels, &trained.cameras, &self.data.known)?;
+        let queries = asked(&protocol.prompts(), &self.queries);
+        let scores = CodeScores::new(&language.field, &queries)?;
+        let mut viewer = Viewer::new(context.device, &language.splats, &language.field)?;
+        let (levels, scale) = (&language.field.levels, Scale::of(embeddings));
+        let whole = levels.iter().rposition(|l| !l.codebook.is_empty());
+        let mut agreements = Vec::new();
+        let views = protocol.views().to_vec();
+        context.progress.begin("eval", views.len() as u64);
+        for (i, view) in views.iter().enumerate() {
+            context.progress.check()?;
+            let decoded = viewer.view(&view.camera)?;
+            protocol.add(i, &DecodedView { codes: &decoded.codes, scores: &scores })?;
+            let frame = truth.frames.iter().find(|f| f.stem == view.stem);
+            if let (Some(level), Some(frame)) = (whole, frame)
+                && let Some(objects) = truth.objects(frame)?
+            {
+                let (codes, book) = (&decoded.codes[level], &levels[level].codebook);
+                let found = agreement(frame, codes, book, &objects, embeddings, &scale);
+                agreements.extend(found.map(|a| EmbeddingAgreement { split: view.split, ..a }));
+            }
+            context.progress.step(i as u64 + 1, "");
+        }
+        context.progress.end();
+        let published = Some(protocol.finish());
+        Ok(Scored { published, agreement: agreements, ..Scored::default() })
+    }
+}
+
+/// The queries of these texts.
+pub(super) fn asked(texts: &[String], queries: &[TextQuery]) -> Vec<TextQuery> {
+    texts.iter().filter_map(|text| queries.iter().find(|q| q.text == *text)).cloned().collect()
+}
+
+/// True masks on every level, each with the embedding of its label's text.
+pub(super) struct LabelledMasks {
+    pub(super) truth: Arc<GroundTruth>,
+    pub(super) encoder: SharedEncoder,
+}
+
+impl Stage for LabelledMasks {
+    const NAME: &'static str = "labelled-masks";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<PlacedPhotos>,);
+    type Output = Vec<ViewMasks>;
+
+    fn settings(&self) -> String {
+        format!("{:?} {}", self.truth.folder, self.encoder.identity())
+    }
+
+    fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<Vec<ViewMasks>> {
+        let words = label_embeddings(&self.truth, &self.encoder)?;
+        let mut views = Vec::new();
+        for (frame, photo) in frames_of(&self.truth, &placed.photos)?.into_iter().zip(&placed.photos) {
+            let objects = self.truth.objects(frame)?.ok_or_else(|| {
+                Error::input(format!("{}: no true masks of {}", self.truth.folder.display(), frame.stem))
+            })?;
+            if (objects.width, objects.height) != (photo.image.width, photo.image.height) {
+                return Err(Error::input(format!("{}: masks and photo differ in size", frame.stem)));
+            }
+            let shown: Vec<u32> = words.keys().copied().filter(|k| objects.data.contains(k)).collect();
+            let index = |o: &u32| shown.iter().position(|k| k == o).map_or(-1, |k| k as i32);
+            let labels = objects.data.iter().map(index).collect();
+            let level = LevelMasks {
+                labels: Plane { width: objects.width, height: objects.height, data: labels },
+                quality: vec![1.0; shown.len()],
+                features: shown.iter().flat_map(|k| words[k].iter().copied()).collect(),
+            };
+            views.push(ViewMasks { levels: vec![level; 3] });
+        }
+        Ok(views)
+    }
+}
+
+/// What labels mean where [`LabelledMasks`] say so.
+pub(super) struct LabelEmbeddings {
+    pub(super) truth: Arc<GroundTruth>,
+    pub(super) encoder: SharedEncoder,
+}
+
+impl Stage for LabelEmbeddings {
+    const NAME: &'static str = "label-embeddings";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = ();
+    type Output = ObjectEmbeddings;
+
+    fn settings(&self) -> String {
+        format!("{:?} {}", self.truth.folder, self.encoder.identity())
+    }
+
+    fn run(self, (): (), _: &Context) -> Result<ObjectEmbeddings> {
+        label_embeddings(&self.truth, &self.encoder)
+    }
+}
+
+fn label_embeddings(truth: &GroundTruth, encoder: &SharedEncoder) -> Result<ObjectEmbeddings> {
+    let texts: Vec<&str> = truth.labels.values().map(String::as_str).collect();
+    let rows = encoder.with(|e| e.embed_texts(&texts).map(|rows| (e.dim(), rows)));
+    let (dim, rows) = rows?;
+    Ok(truth.labels.keys().copied().zip(rows.chunks_exact(dim.max(1)).map(<[f32]>::to_vec)).collect())
 }
 
 /// Weighted sums of vectors per object.
@@ -266,11 +397,14 @@ fn agreement(
     scale: &Scale,
 ) -> Option<EmbeddingAgreement> {
     let mut pairs: BTreeMap<(i32, u32), usize> = BTreeMap::new();
-    if codes.data.len() != objects.data.len() {
-        return None;
-    }
-    for (&k, &o) in codes.data.iter().zip(&objects.data).filter(|(k, _)| **k >= 0) {
-        *pairs.entry((k, o)).or_default() += 1;
+    // The decoded pixel under the centre of each labelled one, where sizes differ.
+    let at = |k: usize, from: usize, to: usize| ((2 * k + 1) * to / (2 * from)).min(to - 1);
+    for (p, &o) in objects.data.iter().enumerate() {
+        let (x, y) = (p % objects.width, p / objects.width);
+        let k = codes.at(at(x, objects.width, codes.width), at(y, objects.height, codes.height));
+        if k >= 0 {
+            *pairs.entry((k, o)).or_default() += 1;
+        }
     }
     let (mut cosine, mut square, mut total) = (0.0f64, 0.0f64, 0usize);
     for ((k, o), n) in pairs {

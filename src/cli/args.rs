@@ -12,7 +12,7 @@ pub use super::export::ExportArgs;
 pub use super::measure::MeasureArgs;
 pub use super::run::RunArgs;
 pub use bench::{BenchArgs, BenchPart};
-pub use experiments::{AblateArgs, GenerateArgs};
+pub use experiments::{AblateArgs, GenerateArgs, LayoutArg};
 pub use shared::{DeviceArgs, LogFormat, MakingArgs, PresetArg};
 
 /// Photos in, a 3D scene that answers text queries out.

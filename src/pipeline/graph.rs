@@ -37,6 +37,7 @@ pub struct Graph<'g> {
 pub struct Outputs {
     values: Vec<Option<Value>>,
     seconds: Vec<f64>,
+    needs: Vec<Vec<usize>>,
 }
 
 impl Outputs {
@@ -49,6 +50,16 @@ impl Outputs {
     /// Seconds that an output took to make, in this process; 0 for what was read from disk.
     pub fn seconds<T>(&self, output: Output<T>) -> f64 {
         self.seconds[output.node]
+    }
+
+    /// Seconds that an output and all that it depends on took to make, one stage after the other, in this process.
+    pub fn seconds_in_all<T>(&self, output: Output<T>) -> f64 {
+        let (mut total, mut asked) = (0.0, BTreeSet::from([output.node]));
+        while let Some(node) = asked.pop_last() {
+            total += self.seconds[node];
+            asked.extend(&self.needs[node]);
+        }
+        total
     }
 
     /// Takes out the output of a target that no store in memory holds too.
@@ -127,7 +138,8 @@ impl<'g> Graph<'g> {
             }
             return Err(if begun || !state.kept.is_empty() { error.resumable() } else { error });
         }
-        Ok(Outputs { values: state.values, seconds: state.seconds })
+        let needs = self.nodes.iter().map(|n| n.needs.clone()).collect();
+        Ok(Outputs { values: state.values, seconds: state.seconds, needs })
     }
 
     fn keys(&self, device: &Device, registry: &Registry) -> Vec<Key> {
@@ -150,7 +162,7 @@ impl<'g> Graph<'g> {
         let mut state = State {
             waiting: BTreeSet::new(),
             values: vec![None; n],
-            seconds: vec![0.0; n],
+            seconds: keys.iter().map(|key| store.seconds(key)).collect(),
             warnings: vec![Vec::new(); n],
             users: vec![0; n],
             kept: Vec::new(),
@@ -159,9 +171,9 @@ impl<'g> Graph<'g> {
         let mut asked: BTreeSet<usize> = targets.iter().copied().collect();
         // Inputs precede the stages that need them.
         while let Some(node) = asked.pop_last() {
-            if let Some((value, seconds)) = store.memory_get(&keys[node]) {
+            if let Some(value) = store.memory_get(&keys[node]) {
                 // Its warnings were given in this process.
-                (state.values[node], state.seconds[node]) = (Some(value), seconds);
+                state.values[node] = Some(value);
             } else if let Some((warnings, value)) = (self.nodes[node].load)(store, &keys[node]) {
                 (state.warnings[node], state.values[node]) = (warnings, Some(value));
                 state.kept.push(self.nodes[node].name);
@@ -202,7 +214,7 @@ struct State {
     /// Stages that must still start.
     waiting: BTreeSet<usize>,
     values: Vec<Option<Value>>,
-    /// That each took to make.
+    /// That each took to make, here or in an earlier graph of the store.
     seconds: Vec<f64>,
     /// What was warned of while each was made, and its inputs.
     warnings: Vec<Vec<String>>,
@@ -244,7 +256,7 @@ impl Shared<'_, '_> {
             // Those of its inputs as well: with its output kept they need not be read again.
             warnings.splice(0..0, at.needs.iter().flat_map(|n| self.lock().warnings[*n].clone()));
             let seconds = began.elapsed().as_secs_f64();
-            self.store.memory_put(&self.keys[node], &value, seconds);
+            self.store.memory_put(at.name, &self.keys[node], &value, seconds);
             let kept = (at.save)(self.store, &self.keys[node], &warnings, &value)?;
             recorder.checkpoint.iter().for_each(Checkpoint::remove);
             let mut state = self.lock();

@@ -59,7 +59,18 @@ pub struct Store {
     folder: Option<PathBuf>,
     resume: bool,
     every: Duration,
-    memory: Option<Mutex<BTreeMap<String, (Value, f64)>>>,
+    passing: &'static [&'static str],
+    memory: Option<Mutex<BTreeMap<String, Made>>>,
+}
+
+/// An output in memory.
+struct Made {
+    /// Gone once [`Store::forget_unused`] or the rules of the store say so.
+    value: Option<Value>,
+    /// That it took to make.
+    seconds: f64,
+    /// Since [`Store::forget_unused`] was last called.
+    used: bool,
 }
 
 impl Store {
@@ -68,29 +79,51 @@ impl Store {
         Store::default()
     }
 
-    /// Keeps every output of the graphs that run with it, as long as it lives.
+    /// Keeps every output of the graphs that run with it, as long as it lives or until [`Store::forget_unused`].
     pub fn in_memory() -> Store {
         Store { memory: Some(Mutex::default()), ..Store::default() }
     }
 
-    /// Keeps outputs in `folder`, and the state of training every so often; with `resume` what is there is used.
-    pub fn at(folder: impl Into<PathBuf>, resume: bool, every: Duration) -> Store {
-        Store { folder: Some(folder.into()), resume, every, memory: None }
+    /// The same without the outputs of these stages: large ones that no other graph needs.
+    pub fn in_memory_without(stages: &'static [&'static str]) -> Store {
+        Store { passing: stages, ..Store::in_memory() }
     }
 
-    /// What this process has made, and the seconds that it took.
-    pub(super) fn memory_get(&self, key: &Key) -> Option<(Value, f64)> {
-        let memory = self.memory.as_ref()?.lock().unwrap_or_else(PoisonError::into_inner);
-        memory.get(&key.0).cloned()
+    /// Drops from memory what no graph has used since this was last called.
+    pub fn forget_unused(&self) {
+        let Some(memory) = &self.memory else { return };
+        for made in memory.lock().unwrap_or_else(PoisonError::into_inner).values_mut() {
+            if !std::mem::take(&mut made.used) {
+                made.value = None;
+            }
+        }
+    }
+
+    /// Keeps outputs in `folder`, and the state of training every so often; with `resume` what is there is used.
+    pub fn at(folder: impl Into<PathBuf>, resume: bool, every: Duration) -> Store {
+        Store { folder: Some(folder.into()), resume, every, ..Store::default() }
+    }
+
+    /// What this process has made.
+    pub(super) fn memory_get(&self, key: &Key) -> Option<Value> {
+        let mut memory = self.memory.as_ref()?.lock().unwrap_or_else(PoisonError::into_inner);
+        let made = memory.get_mut(&key.0)?;
+        made.used = true;
+        made.value.clone()
+    }
+
+    /// Seconds that it took, if this process has made it in this store; 0 otherwise.
+    pub(super) fn seconds(&self, key: &Key) -> f64 {
+        let memory = self.memory.as_ref().map(|m| m.lock().unwrap_or_else(PoisonError::into_inner));
+        memory.and_then(|m| m.get(&key.0).map(|made| made.seconds)).unwrap_or(0.0)
     }
 
     /// Keeps it for [`Store::memory_get`], in a store that does.
-    pub(super) fn memory_put(&self, key: &Key, value: &Value, seconds: f64) {
+    pub(super) fn memory_put(&self, name: &str, key: &Key, value: &Value, seconds: f64) {
         if let Some(memory) = &self.memory {
-            memory
-                .lock()
-                .unwrap_or_else(PoisonError::into_inner)
-                .insert(key.0.clone(), (value.clone(), seconds));
+            let value = (!self.passing.contains(&name)).then(|| value.clone());
+            let made = Made { value, seconds, used: true };
+            memory.lock().unwrap_or_else(PoisonError::into_inner).insert(key.0.clone(), made);
         }
     }
 

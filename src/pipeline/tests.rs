@@ -141,6 +141,33 @@ fn graphs_of_one_store_in_memory_share_their_stages() {
     assert_eq!(chain(&machine, &Store::in_memory(), 3).0, [1, 1, 1]);
 }
 
+#[test]
+fn a_store_in_memory_forgets_what_a_round_has_not_used_and_what_only_passes() {
+    let (machine, store) = (Machine::new(), Store::in_memory());
+    assert_eq!(chain(&machine, &store, 2).0, [1, 1, 1]);
+    store.forget_unused();
+    // The last stage differs: number and its successor serve this round too, 5 + 1 + 2 does not.
+    assert_eq!(chain(&machine, &store, 3).0, [0, 0, 1]);
+    store.forget_unused();
+    assert_eq!(chain(&machine, &store, 3).0, [0, 0, 0]);
+    assert_eq!(chain(&machine, &store, 2).0, [0, 0, 1], "made again, from what both rounds have used");
+    let passing = Store::in_memory_without(&["number"]);
+    assert_eq!(chain(&machine, &passing, 2).0, [1, 1, 1]);
+    assert_eq!(chain(&machine, &passing, 2).0, [0, 0, 0]);
+    assert_eq!(chain(&machine, &passing, 3).0, [0, 0, 1], "the sum before it was kept");
+    // One "number" of a store that keeps nothing else of it runs for whoever asks for it.
+    let graph = |by| {
+        let runs = Arc::new(AtomicUsize::new(0));
+        let mut graph = Graph::default();
+        let number = graph.add(Number(5, runs.clone()), ());
+        let add = graph.add(Add { by, runs: Arc::default(), warning: None }, (number,));
+        let (made, _) = machine.run(&graph, &[number.target(), add.target()], &passing).unwrap();
+        assert!(made.seconds_in_all(add) >= made.seconds(add) + made.seconds(number));
+        runs.load(Ordering::SeqCst)
+    };
+    assert_eq!((graph(7), graph(8)), (1, 1));
+}
+
 /// Sends to the other stage, then waits for its message.
 struct Handshake {
     receive: Option<mpsc::Receiver<()>>,

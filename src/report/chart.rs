@@ -68,6 +68,8 @@ pub struct Bar {
     pub label: String,
     /// In [0, 1].
     pub value: f64,
+    /// Standard deviation, drawn to both sides of the end of the bar.
+    pub error: Option<f64>,
     /// A tick to compare with.
     pub reference: Option<f64>,
 }
@@ -105,9 +107,18 @@ pub fn bar_chart(bars: &[Bar], title: &str) -> String {
             y + 3.0,
             px(bar.value) - BAR_LEFT,
             ROW - 6.0,
-            px(bar.value) + 6.0,
+            px(bar.value + bar.error.unwrap_or(0.0)) + 6.0,
             bar.value
         );
+        if let Some(error) = bar.error {
+            let (low, high) = (px(bar.value - error), px(bar.value + error));
+            let _ = write!(
+                body,
+                "<path d=\"M{low:.1} {0:.1}H{high:.1}M{low:.1} {1:.1}v8M{high:.1} {1:.1}v8\" stroke=\"#222\"/>",
+                y + ROW / 2.0,
+                y + ROW / 2.0 - 4.0
+            );
+        }
         if let Some(r) = bar.reference {
             let _ = write!(
                 body,
@@ -156,9 +167,14 @@ mod tests {
 
     #[test]
     fn bars_are_as_long_as_their_values_and_text_is_escape() {
-        let bar =
-            |label: &str, value, reference| Bar { group: "g".into(), label: label.into(), value, reference };
-        let svg = bar_chart(&[bar("a<b", 0.5, None), bar("c", 1.0, Some(0.25))], "t");
+        let bar = |label: &str, value, error, reference| Bar {
+            group: "g".into(),
+            label: label.into(),
+            value,
+            error,
+            reference,
+        };
+        let svg = bar_chart(&[bar("a<b", 0.5, Some(0.25), None), bar("c", 1.0, None, Some(0.25))], "t");
         let widths: Vec<f64> = svg
             .split("width=\"")
             .filter(|s| s.contains("fill=\"#3b7dd8\""))
@@ -168,6 +184,11 @@ mod tests {
         assert!(
             (widths[1] / widths[0] - 2.0).abs() < 0.01 && svg.contains("a&lt;b") && svg.contains("stroke")
         );
+        // The whole width is that of a bar of 1; the line reaches as far beyond the end of its own as before it.
+        let line = svg.split("<path d=\"M").find(|p| p.contains("#222")).unwrap();
+        let ends: Vec<f64> = line.split(['M', 'H', ' ', 'v']).filter_map(|v| v.parse().ok()).collect();
+        assert!((ends[2] - ends[0] - 0.5 * widths[1]).abs() < 0.2, "{ends:?} {widths:?}");
+        assert_eq!(svg.matches("#222").count(), 1);
         assert_eq!(bar_chart(&[], "t"), "");
     }
 }

@@ -1,8 +1,9 @@
 //! `splatvk ablate` and `splatvk generate`: tables, and data with a known answer.
 use super::shared::DeviceArgs;
-use crate::ablate::TABLES;
-use clap::Args;
+use crate::ablate::{Layout, TABLES};
+use crate::query::protocol::ProtocolKind;
 use clap::builder::{PossibleValue, PossibleValuesParser};
+use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 
 fn tables() -> PossibleValuesParser {
@@ -11,16 +12,50 @@ fn tables() -> PossibleValuesParser {
     PossibleValuesParser::new(std::iter::once(all).chain(each))
 }
 
+/// Layouts of data sets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum LayoutArg {
+    /// As what lies in the folder
+    Auto,
+    /// ground_truth.json: protocol field on held-out views
+    Own,
+    /// LERF-OVS: images/ in the folder, labels in ../label/NAME
+    Lerf,
+    /// 3D-OVS: images/ and segmentations/classes.txt
+    #[value(name = "3dovs")]
+    Ovs,
+    /// ScanNet: color/, label-filt/, pose/, intrinsic/
+    Scannet,
+}
+
+impl LayoutArg {
+    /// What was asked for; none = look.
+    pub fn given(self) -> Option<Layout> {
+        match self {
+            LayoutArg::Auto => None,
+            LayoutArg::Own => Some(Layout::Own),
+            LayoutArg::Lerf => Some(Layout::Published(ProtocolKind::Lerf)),
+            LayoutArg::Ovs => Some(Layout::Published(ProtocolKind::Ovs)),
+            LayoutArg::Scannet => Some(Layout::Published(ProtocolKind::ScanNet)),
+        }
+    }
+}
+
 /// `splatvk ablate`
 #[derive(Debug, Args)]
 pub struct AblateArgs {
     /// Which tables
     #[arg(value_parser = tables(), required = true, value_name = "TABLE")]
     pub tables: Vec<String>,
-    /// Folder with ground_truth.json, photos and masks
-    #[arg(long, value_name = "DIR")]
-    pub data: PathBuf,
-    /// Folder for ablate.json and one text and one chart per table [default: out/ablate-NAME, after the data]
+    /// Folders with ground_truth.json, photos and masks, or scenes of LERF-OVS, 3D-OVS or ScanNet: figures are means over
+    /// them, with their spread
+    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
+    pub data: Vec<PathBuf>,
+    /// How the data lies, and by which protocol it is scored
+    #[arg(long, value_enum, default_value = "auto")]
+    pub layout: LayoutArg,
+    /// Folder for ablate.json and one text and one chart per table, renewed after every row [default: out/ablate-NAME, after
+    /// the data]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Masks and features for every row: built-in, flawed (true masks, errors injected), exact, or dir:DIR [default: those
@@ -33,9 +68,27 @@ pub struct AblateArgs {
     /// Take the true cameras in every row, for photos that alone would give none
     #[arg(long)]
     pub true_cameras: bool,
-    /// Seed of training and of injected errors
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
+    /// Most splats at the start, in rows that do not vary it [default: draft's]
+    #[arg(long, value_name = "N")]
+    pub max_points: Option<usize>,
+    /// Seeds of cameras, stereo, training and injected errors: a run for each
+    #[arg(long, visible_alias = "seed", value_delimiter = ',', default_value = "0", value_name = "N,...")]
+    pub seeds: Vec<u64>,
+    /// Take the rows that an earlier run has left in --out, measured the same way, and go on from there
+    #[arg(long)]
+    pub resume: bool,
+    /// Cameras and points of every row that does not vary them, as of run [default: sfm]
+    #[arg(long, value_name = "SOURCE")]
+    pub init: Option<String>,
+    /// The same for dense matches [default: xfeat]
+    #[arg(long, value_name = "SOURCE")]
+    pub matcher: Option<String>,
+    /// The same for masks [default: graph]
+    #[arg(long, value_name = "SOURCE")]
+    pub masks: Option<String>,
+    /// The same for features [default: words]
+    #[arg(long, value_name = "SOURCE")]
+    pub features: Option<String>,
     /// Optimisation steps of the colour stage, instead of draft's
     #[arg(long, value_name = "N")]
     pub iterations: Option<usize>,

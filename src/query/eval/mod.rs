@@ -18,7 +18,7 @@ pub use report::{
     EvalReport, ImageScore, MaskScore, PairScore, PoseScore, RefinedScore, RefinedView, RelativeScore,
     SplitSummary,
 };
-pub use truth::{GroundTruth, Split, TruthFrame};
+pub use truth::{GroundTruth, ObjectMaps, Split, TruthFrame};
 
 use super::QueryResult;
 use crate::format::picture;

@@ -7,6 +7,7 @@ use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Which frames the pipeline may have seen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -44,6 +45,12 @@ pub struct TruthFrame {
     pub lens: Option<Lens>,
 }
 
+/// Labels of frames in another layout than `masks/<stem>.png`.
+pub trait ObjectMaps: std::fmt::Debug + Send + Sync {
+    /// Object index per pixel of a frame, [H, W] of the label's own size; `None` where the frame has no labels.
+    fn objects(&self, stem: &str) -> Result<Option<Plane<u32>>>;
+}
+
 /// A ground-truth folder.
 #[derive(Clone, Debug)]
 pub struct GroundTruth {
@@ -55,6 +62,8 @@ pub struct GroundTruth {
     pub up: Option<DVec3>,
     /// All views.
     pub frames: Vec<TruthFrame>,
+    /// Where labels lie, if not in `masks/<stem>.png`.
+    pub maps: Option<Arc<dyn ObjectMaps>>,
 }
 
 #[derive(Deserialize)]
@@ -103,7 +112,7 @@ impl GroundTruth {
         };
         let frames = file.frames.into_iter().map(frame).collect();
         let up = file.up.map(DVec3::normalize_or_zero);
-        Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, up, frames })
+        Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, up, frames, maps: None })
     }
 
     /// The photo of a frame.
@@ -114,8 +123,12 @@ impl GroundTruth {
         Ok(RgbImage { width: image.width() as usize, height: image.height() as usize, data })
     }
 
-    /// Object index per pixel, if the set has masks.
+    /// Object index per pixel, if the set has masks: of the frame's size where another layout holds them.
     pub fn objects(&self, frame: &TruthFrame) -> Result<Option<Plane<u32>>> {
+        if let Some(maps) = &self.maps {
+            let (width, height) = (frame.camera.width as usize, frame.camera.height as usize);
+            return Ok(maps.objects(&frame.stem)?.map(|plane| resampled(&plane, width, height)));
+        }
         let path = self.folder.join("masks").join(format!("{}.png", frame.stem));
         if self.labels.is_empty() || !path.exists() {
             return Ok(None);
@@ -157,6 +170,16 @@ impl GroundTruth {
         let mean = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
         Ok(centres.iter().map(|c| (*c - mean).length()).fold(0.0, f64::max).max(f64::MIN_POSITIVE))
     }
+}
+
+/// The nearest pixel's value at another size.
+fn resampled(plane: &Plane<u32>, width: usize, height: usize) -> Plane<u32> {
+    if (plane.width, plane.height) == (width, height) || plane.data.is_empty() {
+        return plane.clone();
+    }
+    let at = |k: usize, to: usize, from: usize| ((2 * k + 1) * from / (2 * to)).min(from - 1);
+    let pixel = |p: usize| plane.at(at(p % width, width, plane.width), at(p / width, height, plane.height));
+    Plane { width, height, data: (0..width * height).map(pixel).collect() }
 }
 
 fn open(path: &Path) -> Result<image::DynamicImage> {

@@ -1,16 +1,18 @@
 //! LERF-OVS as LangSplat evaluates it (docs/method.md#lerf-ovs): polygons and boxes per labelled frame.
 use super::super::filter;
+use super::labels::{Labels, numbered, painted};
 use super::polygon;
 use super::score::{
     DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score, mask_iou,
     mean, place, summarise,
 };
-use crate::query::eval::MIN_OBJECT_PIXELS;
+use crate::query::eval::{MIN_OBJECT_PIXELS, ObjectMaps};
 use crate::scene::{Camera, Plane};
 use crate::{Error, Result};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Thresholds on the re-normalised map, the first one behind `miou`: the paper's, LangSplat's.
 const THRESHOLDS: [(f32, &str, &str); 2] = [(0.6, "thr0.6", "miou"), (0.4, "thr0.4", "miou_thr0.4")];
@@ -110,6 +112,35 @@ fn read_folder(folder: &Path) -> Result<BTreeMap<String, BTreeMap<String, Target
     Ok(labels)
 }
 
+/// Planes that are all in memory: a LERF scene has a handful of labelled frames.
+#[derive(Debug)]
+struct Painted(BTreeMap<String, Plane<u32>>);
+
+impl ObjectMaps for Painted {
+    fn objects(&self, stem: &str) -> Result<Option<Plane<u32>>> {
+        Ok(self.0.get(stem).cloned())
+    }
+}
+
+/// The labels as one plane per frame.
+pub(super) fn labels(folder: &Path) -> Result<Labels> {
+    let frames = read_folder(folder)?;
+    let mut names: Vec<String> = frames.values().flat_map(|f| f.keys().cloned()).collect();
+    names.sort();
+    names.dedup();
+    let phrases = numbered(names);
+    let stems: Vec<String> = frames.keys().cloned().collect();
+    let number = |name: &String| phrases.iter().find(|p| p.1 == name).map_or(0, |p| *p.0);
+    let plane = |targets: BTreeMap<String, Target>| {
+        painted(targets.into_iter().map(|(name, target)| (number(&name), target.mask)).collect())
+    };
+    let planes = frames.into_iter().filter_map(|(stem, targets)| Some((stem, plane(targets)?))).collect();
+    if phrases.is_empty() {
+        return Err(Error::input(format!("{}: no object in any label file", folder.display())));
+    }
+    Ok(Labels { stems, phrases, maps: Arc::new(Painted(planes)), cameras: Vec::new() })
+}
+
 /// The masks of a ground-truth folder, each object with the box around it.
 fn from_masks(own: OwnLabels) -> Result<(Vec<LabelledView>, Vec<BTreeMap<String, Target>>)> {
     let mut all = Vec::new();
@@ -207,6 +238,7 @@ impl Protocol for Lerf {
             .map(String::from)
             .to_vec(),
             summary: summarise(&self.scores, THRESHOLDS[0].1, figures),
+            main_rule: THRESHOLDS[0].1,
             scores: self.scores,
         }
     }

@@ -1,13 +1,15 @@
 //! 3D-OVS (docs/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and the data set's own argmax.
+use super::labels::{Labels, numbered, painted};
 use super::score::{
     DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score, mask_iou,
     mean, nearest, place, summarise,
 };
-use crate::query::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, Split};
+use crate::query::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, ObjectMaps, Split};
 use crate::scene::{Camera, Plane};
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// τ of the paper: relevancy above which a pixel belongs to the answer.
 const TAU: f32 = 0.8;
@@ -49,8 +51,7 @@ impl Ovs {
                 (own.views.clone(), classes, LabelSource::Own(own))
             }
             None => {
-                let inner = folder.join("segmentations");
-                let root = if inner.is_dir() { inner } else { folder.to_path_buf() };
+                let root = root(folder);
                 let classes = read_classes(&root)?;
                 (place(&frames(&root)?, scene, known)?, classes, LabelSource::Folder(root))
             }
@@ -78,6 +79,40 @@ impl Ovs {
                 Ok(own.truth.labels.keys().map(one).collect())
             }
         }
+    }
+}
+
+/// The folder of the labels in that of a scene.
+fn root(folder: &Path) -> PathBuf {
+    let inner = folder.join("segmentations");
+    if inner.is_dir() { inner } else { folder.to_path_buf() }
+}
+
+/// The labels as one plane per frame.
+pub(super) fn labels(folder: &Path) -> Result<Labels> {
+    let root = root(folder);
+    let classes = read_classes(&root)?;
+    let (stems, phrases) = (frames(&root)?, numbered(classes));
+    let maps = Arc::new(Maps { root, phrases: phrases.clone() });
+    Ok(Labels { stems, phrases, maps, cameras: Vec::new() })
+}
+
+#[derive(Debug)]
+struct Maps {
+    root: PathBuf,
+    phrases: BTreeMap<u32, String>,
+}
+
+impl ObjectMaps for Maps {
+    fn objects(&self, stem: &str) -> Result<Option<Plane<u32>>> {
+        let mut masks = Vec::new();
+        for (label, class) in &self.phrases {
+            let path = self.root.join(stem).join(format!("{class}.png"));
+            if path.is_file() {
+                masks.push((*label, read_mask(&path)?));
+            }
+        }
+        Ok(painted(masks))
     }
 }
 
@@ -250,6 +285,7 @@ impl Protocol for Ovs {
             .map(String::from)
             .to_vec(),
             summary: summarise(&self.scores, PAPER, figures),
+            main_rule: PAPER,
             scores: self.scores,
         }
     }

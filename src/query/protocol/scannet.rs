@@ -1,15 +1,17 @@
 //! ScanNet with the eight labels of LSM (paper, "Comparison with Feed-forward LSM").
+use super::labels::{Labels, numbered};
 use super::score::{
     DecodedView, LabelledView, Masks, Protocol, ProtocolKind, ProtocolReport, ProtocolSummary, Score,
     nearest, place,
 };
 use crate::photo::stem;
-use crate::query::eval::Split;
+use crate::query::eval::{ObjectMaps, Split};
 use crate::scene::{Camera, Plane, Pose};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// The label space; the prompts are these words.
 pub const LABELS: [&str; 8] = ["wall", "floor", "ceiling", "chair", "table", "sofa", "bed", "other"];
@@ -31,10 +33,8 @@ pub(super) fn from_nyu40(id: u32) -> Option<usize> {
 
 /// The labels and what was counted so far.
 pub(super) struct ScanNet {
-    folder: PathBuf,
+    files: LabelFiles,
     views: Vec<LabelledView>,
-    /// Raw id → NYU40 id; none: the files hold NYU40 ids.
-    table: Option<BTreeMap<u32, u32>>,
     /// Per split, [truth][predicted] pixels; the last column is "nothing there".
     confusion: BTreeMap<&'static str, [[u64; 9]; 8]>,
     scores: Vec<Score>,
@@ -42,6 +42,33 @@ pub(super) struct ScanNet {
 
 impl ScanNet {
     pub fn open(folder: &Path, scene: &[Camera], known: &[Camera]) -> Result<Self> {
+        let scan = Scan::open(folder)?;
+        let own = if known.is_empty() { cameras(folder, &scan.stems)? } else { known.to_vec() };
+        Ok(ScanNet {
+            views: place(&scan.stems, scene, &own)?,
+            files: scan.files,
+            confusion: BTreeMap::new(),
+            scores: Vec::new(),
+        })
+    }
+}
+
+/// The label files of a scan.
+#[derive(Debug)]
+struct LabelFiles {
+    folder: PathBuf,
+    /// Raw id → NYU40 id; none: the files hold NYU40 ids.
+    table: Option<BTreeMap<u32, u32>>,
+}
+
+struct Scan {
+    files: LabelFiles,
+    /// Labelled frames in the order of the scan.
+    stems: Vec<String>,
+}
+
+impl Scan {
+    fn open(folder: &Path) -> Result<Scan> {
         let place_of = ["label-filt", "label"].iter().map(|n| folder.join(n)).find(|p| p.is_dir());
         let labels = place_of.ok_or_else(|| {
             Error::input(format!(
@@ -58,19 +85,14 @@ impl ScanNet {
             }
         }
         stems.sort_by_key(|s| (s.len(), s.clone()));
-        let own = if known.is_empty() { cameras(folder, &stems)? } else { known.to_vec() };
-        Ok(ScanNet {
-            views: place(&stems, scene, &own)?,
-            folder: labels,
-            table: table(folder)?,
-            confusion: BTreeMap::new(),
-            scores: Vec::new(),
-        })
+        Ok(Scan { files: LabelFiles { folder: labels, table: table(folder)? }, stems })
     }
+}
 
+impl LabelFiles {
     /// Index in [`LABELS`] per pixel, −1 = unlabelled.
-    fn truth(&self, view: &LabelledView) -> Result<Plane<i32>> {
-        let path = self.folder.join(format!("{}.png", view.stem));
+    fn truth(&self, stem: &str) -> Result<Plane<i32>> {
+        let path = self.folder.join(format!("{stem}.png"));
         let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
         let image =
             image::open(&path).map_err(|e| bad(format!("cannot be read as an image: {e}")))?.to_luma16();
@@ -90,6 +112,20 @@ impl ScanNet {
         }
         Ok(out)
     }
+}
+
+impl ObjectMaps for LabelFiles {
+    fn objects(&self, stem: &str) -> Result<Option<Plane<u32>>> {
+        let Plane { width, height, data } = self.truth(stem)?;
+        Ok(Some(Plane { width, height, data: data.into_iter().map(|k| (k + 1) as u32).collect() }))
+    }
+}
+
+/// The labels as one plane per frame, and the scan's cameras.
+pub(super) fn labels(folder: &Path) -> Result<Labels> {
+    let Scan { files, stems } = Scan::open(folder)?;
+    let cameras = cameras(folder, &stems)?;
+    Ok(Labels { phrases: numbered(LABELS.map(String::from)), maps: Arc::new(files), cameras, stems })
 }
 
 /// `id` → `nyu40id` of `scannetv2-labels.combined.tsv` in the folder or one of the two above it.
@@ -153,7 +189,7 @@ impl Protocol for ScanNet {
 
     fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks> {
         let view = self.views[index].clone();
-        let (truth, best) = (self.truth(&view)?, seen.best_prompt()?);
+        let (truth, best) = (self.files.truth(&view.stem)?, seen.best_prompt()?);
         let mut counts = [[0u64; 9]; 8];
         for y in 0..truth.height {
             for x in 0..truth.width {
@@ -205,6 +241,7 @@ impl Protocol for ScanNet {
             ]
             .map(String::from)
             .to_vec(),
+            main_rule: ARGMAX,
             scores: self.scores,
             summary,
         }

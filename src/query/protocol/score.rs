@@ -75,6 +75,9 @@ pub struct ProtocolReport {
     pub protocol: ProtocolKind,
     /// What each figure is, one line each.
     pub definitions: Vec<String>,
+    /// The [`Score::rule`] behind `miou`.
+    #[serde(skip)]
+    pub main_rule: &'static str,
     /// Every single score.
     pub scores: Vec<Score>,
     /// Per split that has frames.

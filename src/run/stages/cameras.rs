@@ -63,7 +63,9 @@ impl Cameras {
             CameraOrigin::GivenGeometry(geometry) => format!("{geometry:?}"),
         };
         let photos_name: Vec<String> = photos.iter().map(identity).collect();
-        let settings = format!("{source_name} {photos_name:?} {seed}");
+        // Nothing is drawn where cameras are given: runs that differ in the seed alone share them.
+        let drawn = matches!(source, CameraOrigin::Sfm | CameraOrigin::Network(_)).then_some(seed);
+        let settings = format!("{source_name} {photos_name:?} {drawn:?}");
         Ok(Cameras { photos, source, seed, settings })
     }
 }

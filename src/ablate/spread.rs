@@ -1,0 +1,95 @@
+//! Means over scenes and seeds, and whether a difference between two rows is more than chance.
+use serde::Serialize;
+use std::collections::BTreeMap;
+
+/// A figure over scenes and seeds.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Spread {
+    /// Mean.
+    pub mean: f64,
+    /// Standard deviation over scenes and seeds; none of a single value.
+    pub sd: Option<f64>,
+    /// Values.
+    pub n: usize,
+}
+
+impl Spread {
+    /// Of values; `None` without any.
+    pub fn of(values: &[f64]) -> Option<Spread> {
+        let n = values.len();
+        let mean = values.iter().sum::<f64>() / n as f64;
+        let square = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>();
+        let sd = (n > 1).then(|| (square / (n - 1) as f64).sqrt());
+        (n > 0).then_some(Spread { mean, sd, n })
+    }
+}
+
+/// How a row differs from the row that it is compared with, on the same scenes and seeds.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Difference {
+    /// Mean over scenes of their mean over seeds.
+    pub mean: f64,
+    /// Half of the 95 % interval for scenes of this kind; none of a single scene, which says nothing of others.
+    pub half: Option<f64>,
+    /// Scenes.
+    pub scenes: usize,
+}
+
+impl Difference {
+    /// Of differences as (scene, value). Seeds of one scene are no independent scenes: they are averaged first.
+    pub fn of(values: &[(&str, f64)]) -> Option<Difference> {
+        let mut scenes: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+        values.iter().for_each(|(scene, v)| scenes.entry(scene).or_default().push(*v));
+        let means: Vec<f64> = scenes.values().filter_map(|v| Spread::of(v)).map(|s| s.mean).collect();
+        let Spread { mean, sd, n } = Spread::of(&means)?;
+        Some(Difference { mean, half: sd.map(|sd| student(n - 1) * sd / (n as f64).sqrt()), scenes: n })
+    }
+
+    /// Whether scenes of this kind differ for certain enough to say so.
+    pub fn is_decided(&self) -> bool {
+        self.half.is_some_and(|half| self.mean.abs() > half)
+    }
+}
+
+/// 97.5 % quantile of Student's t (Student 1908): exact to a hundredth for up to ten degrees of freedom, Fisher's expansion in
+/// their reciprocal above.
+fn student(freedom: usize) -> f64 {
+    const TABLE: [f64; 10] = [12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228];
+    let z = 1.959_964f64;
+    let expansion = |f: f64| {
+        z + (z.powi(3) + z) / (4.0 * f) + (5.0 * z.powi(5) + 16.0 * z.powi(3) + 3.0 * z) / (96.0 * f * f)
+    };
+    TABLE.get(freedom.wrapping_sub(1)).copied().unwrap_or_else(|| expansion(freedom as f64))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_spread_is_that_of_a_sample() {
+        let s = Spread::of(&[1.0, 2.0, 4.0]).unwrap();
+        assert!((s.mean - 7.0 / 3.0).abs() < 1e-12 && (s.sd.unwrap() - (7.0f64 / 3.0).sqrt()).abs() < 1e-12);
+        assert_eq!(Spread::of(&[5.0]).unwrap(), Spread { mean: 5.0, sd: None, n: 1 });
+        assert_eq!(Spread::of(&[]), None);
+    }
+
+    #[test]
+    fn seeds_of_one_scene_do_not_make_a_difference_more_certain() {
+        let scenes = [("a", 0.1), ("b", 0.2), ("c", 0.3)];
+        let once = Difference::of(&scenes).unwrap();
+        let thrice: Vec<(&str, f64)> = scenes.iter().flat_map(|s| [*s; 3]).collect();
+        let again = Difference::of(&thrice).unwrap();
+        assert!((once.half.unwrap() - again.half.unwrap()).abs() < 1e-12 && again.scenes == 3);
+        // 0.2 ± 4.303 · 0.1 / √3 does not exclude zero.
+        assert!((once.half.unwrap() - 0.2484).abs() < 1e-3 && !once.is_decided());
+        assert!(Difference::of(&[("a", 0.2), ("b", 0.2), ("c", 0.21)]).unwrap().is_decided());
+        assert!(!Difference::of(&[("a", 0.9), ("a", 0.9)]).unwrap().is_decided(), "one scene");
+    }
+
+    #[test]
+    fn student_s_quantiles_join() {
+        assert!((student(11) - 2.201).abs() < 2e-3 && (student(30) - 2.042).abs() < 1e-3);
+        assert!((student(1000) - 1.962).abs() < 1e-3);
+    }
+}
