@@ -35,7 +35,7 @@ const FOLDERS: &[(&str, &str)] = &[
     ),
     ("ablate", "error preset progress scene gpu photo infer fit language query report synth pipeline run"),
     ("bench", "error preset progress scene gpu pass photo format infer pose fit query run"),
-    ("capi", "error preset progress scene gpu pass photo infer pose run"),
+    ("capi", "error preset progress scene gpu pass photo infer pose query run"),
     (
         "cli",
         "error preset progress scene gpu photo format infer language query report synth pipeline run ablate bench",
