@@ -12,10 +12,11 @@ fn query(scene: &Path, text: &str, out: &Path) -> Result<()> {
     let mut scene = LiveScene::load(&Device::open(None)?, scene, &Registry::open(None)?)?;
     std::fs::create_dir_all(out).map_err(Error::unwritable(out))?;
     for camera in scene.cameras().to_vec() {
-        let answer = scene.ask(text, &camera)?;
+        let answers = scene.ask(text, &camera)?;
+        let answer = &answers.views[0];
         let name = Path::new(&camera.name).file_stem().unwrap_or_default().to_string_lossy().into_owned();
         if !answer.found {
-            println!("{name}: not found, best score {:.2}", answer.score);
+            println!("{name}: not found, best score {:.2}; {}", answer.score, answers.sentence());
             continue;
         }
         let (x, y) = answer.location;

@@ -225,7 +225,7 @@ fn language_is_trained_decoded_and_asked_in_bands_as_in_whole_images() {
         text: "third".into(),
         embedding: (0..8).map(|k| f32::from(u8::from(k == 3))).collect(),
         canonicals: (0..8).map(|k| f32::from(u8::from(k == 5))).collect(),
-        alternatives: Default::default(),
+        ..Default::default()
     };
     let seen = |device: &Device, field: &LanguageField, camera: &Camera| {
         let view = Viewer::new(device, &splats, field).unwrap().view_with_features(camera).unwrap();

@@ -39,7 +39,7 @@ const FOLDERS: &[(&str, &str)] = &[
         "error preset progress scene gpu photo format infer fit language query report synth pipeline run",
     ),
     ("bench", "error preset progress scene gpu pass photo format infer pose fit query run"),
-    ("capi", "error preset progress scene gpu pass photo infer pose run"),
+    ("capi", "error preset progress scene gpu pass photo infer pose query run"),
     (
         "cli",
         "error preset progress scene gpu photo format infer fetch language query report synth pipeline run ablate bench",

@@ -13,7 +13,7 @@ use splatvk::gpu::Device;
 use splatvk::pass::metrics::psnr;
 use splatvk::pass::seeded::Random;
 use splatvk::photo::{self, Photo};
-use splatvk::query::{QueryOptions, select::splat_codes};
+use splatvk::query::{QueryOptions, instances::splat_codes};
 use splatvk::report::viewer::Scene3d;
 use splatvk::run::ask::QueryScene;
 use splatvk::run::metric::{self, Length};
@@ -468,7 +468,7 @@ fn a_static_page_answers_what_was_asked() {
     let encoder = sources::table_encoder(&folder.path().join("texts.npz")).unwrap();
     let device = Device::open(None).unwrap();
     let field = scene.language.clone().unwrap();
-    let mut ready = QueryScene::open(&device, &scene.splats, field, encoder).unwrap();
+    let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder).unwrap();
     ready.set_views(&scene.cameras).unwrap();
     let answers = ["lemon", "loaf of bread"].map(|t| ready.ask(t, &QueryOptions::default()).unwrap());
     let names = ready.names().unwrap();

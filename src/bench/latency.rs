@@ -22,7 +22,7 @@ pub fn measure(
     let place = format!("“{text}” in {} views, {} × {}", cameras.len(), first.width, first.height);
     let mut section = Section::new("query", place);
     let encoding = budget.wall(|| encoder.embed_texts(&[text]).map(drop))?;
-    let mut scene = QueryScene::open(device, splats, field, encoder)?;
+    let mut scene = QueryScene::open(device, (splats, cameras), field, encoder)?;
     let rendering = budget.wall(|| scene.set_views(cameras).map(drop))?;
     section.time("render and decode all views", Clock::Wall, rendering);
     section.time("encode the text", Clock::Wall, encoding);

@@ -133,7 +133,8 @@ versioned!(
     SvkSceneInfo 48,
     SvkOutput 80,
     SvkSync 40,
-    SvkAnswer 48
+    SvkAnswer 48,
+    SvkInstance 224
 );
 
 /// The size that a structure states.
@@ -212,6 +213,25 @@ pub unsafe fn write<T: Versioned>(pointer: *mut T, value: &T) -> Result<(), Call
         std::ptr::copy_nonoverlapping(from, pointer.cast::<u8>().add(head), known - head);
     }
     Ok(())
+}
+
+/// Fills as many structures of an array of the caller as it has; they are as far apart as the first one says it is large.
+pub unsafe fn write_array<T: Versioned>(
+    pointer: *mut T,
+    count: usize,
+    values: &[T],
+) -> Result<(), CallError> {
+    if count == 0 || values.is_empty() {
+        return Ok(());
+    }
+    if pointer.is_null() {
+        return bad_argument(format!("the pointer to {} is null", T::NAME));
+    }
+    // SAFETY: not null, so the first of the caller's structures.
+    let stride = unsafe { stated_size(pointer) }?;
+    let places = values.iter().take(count).enumerate();
+    // SAFETY: the caller gives `count` structures of this size.
+    places.map(|(i, v)| unsafe { write(pointer.cast::<u8>().add(i * stride).cast::<T>(), v) }).collect()
 }
 
 /// A text of the caller; `None` for null.

@@ -1,6 +1,6 @@
 //! Rendering into memory, buffers and images of the host.
 use super::boundary::{self, CallError, bad_argument, guard};
-use super::scene::{SvkScene, camera_in, lock};
+use super::scene::{SvkScene, camera_in, lock, one_view};
 use super::types::*;
 use crate::gpu::Buffer;
 use crate::gpu::external::{Sync, Target};
@@ -113,7 +113,7 @@ fn pack_all(
         packed.push(match &w.what {
             RenderContent::Frame(_) => None,
             RenderContent::Relevancy(text) => {
-                let map = live.ask(text, camera)?.relevancy.data;
+                let map = one_view(live.ask(text, camera)?)?.relevancy.data;
                 Some(match w.encoding {
                     Encoding::F32x4 => {
                         let texels: Vec<[f32; 4]> = map.iter().map(|v| [*v, 0.0, 0.0, 0.0]).collect();

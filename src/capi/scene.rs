@@ -4,6 +4,10 @@ use super::context::SvkContext;
 use super::types::*;
 use crate::Error;
 use crate::gpu::external::Delivery;
+use crate::query::QueryResult;
+use crate::query::instances::Instance;
+use crate::query::presence::Presence;
+use crate::run::Answers;
 use crate::run::live::LiveScene;
 use crate::scene::{Camera, Pose};
 use glam::{DMat3, DVec3};
@@ -116,6 +120,7 @@ pub unsafe extern "C" fn svk_scene_info(scene: *const SvkScene, info: *mut SvkSc
                 cameras: live.cameras().len() as u32,
                 codes: [0, 1, 2].map(level),
                 feature_dim: [0, 1, 2].map(|k| live.features(k).1 as u32),
+                metres_per_unit: live.world().scale.as_ref().map_or(0.0, |s| s.metres_per_unit),
             };
             boundary::write(info, &value)
         })
@@ -205,13 +210,16 @@ pub unsafe extern "C" fn svk_scene_query(
     // SAFETY: per the header.
     unsafe {
         with(scene, |scene| {
-            let Some(text) = boundary::text(text, "text")? else { return bad_argument("the text is null") };
+            let text = text_in(text)?;
             let camera = camera_in(camera)?;
             let pixels = camera.width as usize * camera.height as usize;
             if !mask.is_null() && mask_bytes != pixels {
                 return bad_argument(format!("the mask has {mask_bytes} bytes, the view {pixels} pixels"));
             }
-            let found = lock(&scene.live).ask(&text, &camera)?;
+            let all = lock(&scene.live).ask(&text, &camera)?;
+            let (presence, p_value) = (presence(all.presence), f64::from(all.p_value.unwrap_or(0.0)));
+            let (instances, reliability) = (all.instances.len() as u32, all.reliability.unwrap_or(-1.0));
+            let found = one_view(all)?;
             let value = SvkAnswer {
                 size: 0,
                 found: u32::from(found.found),
@@ -220,6 +228,10 @@ pub unsafe extern "C" fn svk_scene_query(
                 x: found.location.0 as f64 + 0.5,
                 y: found.location.1 as f64 + 0.5,
                 mask_pixels: found.mask.data.iter().filter(|m| **m).count() as u64,
+                presence: presence as u32,
+                instances,
+                p_value,
+                reliability,
             };
             boundary::write(answer, &value)?;
             if !mask.is_null() {
@@ -228,6 +240,92 @@ pub unsafe extern "C" fn svk_scene_query(
             }
             Ok(())
         })
+    }
+}
+
+/// The things in space that a text means, largest first, with the pixels at which the view of a camera shows them. `instances`
+/// has room for `capacity` structures, each with its size set (0 and NULL to count only); `*count` gets the number of things,
+/// which may be more. Thread-safe; calls with one scene follow each other.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_instances(
+    scene: *mut SvkScene,
+    text: *const c_char,
+    camera: *const SvkCamera,
+    instances: *mut SvkInstance,
+    capacity: usize,
+    count: *mut usize,
+) -> SvkStatus {
+    // SAFETY: per the header.
+    unsafe {
+        with(scene, |scene| {
+            let (text, camera) = (text_in(text)?, camera_in(camera)?);
+            let Some(count) = count.as_mut() else { return bad_argument("the pointer to the count is null") };
+            let found = lock(&scene.live).ask(&text, &camera)?.instances;
+            let values: Vec<SvkInstance> = found.iter().map(instance).collect();
+            boundary::write_array(instances, capacity, &values)?;
+            *count = values.len();
+            Ok(())
+        })
+    }
+}
+
+/// What is not understood of a text, one line each, into `notes` (`bytes` long, always ended): "answers for “mug”; “without
+/// handle” is not understood". Empty where all of it is understood. Thread-safe.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn svk_scene_notes(
+    scene: *mut SvkScene,
+    text: *const c_char,
+    notes: *mut c_char,
+    bytes: usize,
+) -> SvkStatus {
+    // SAFETY: per the header.
+    unsafe {
+        with(scene, |scene| {
+            let reading = lock(&scene.live).reading(&text_in(text)?)?;
+            boundary::copy_text(&reading.notes().join("\n"), notes, bytes);
+            Ok(())
+        })
+    }
+}
+
+unsafe fn text_in(text: *const c_char) -> Result<String, CallError> {
+    // SAFETY: per the header.
+    match unsafe { boundary::text(text, "text") }? {
+        Some(text) => Ok(text),
+        None => bad_argument("the text is null"),
+    }
+}
+
+/// The view of an answer for one camera.
+pub(super) fn one_view(answers: Answers) -> Result<QueryResult, CallError> {
+    answers.views.into_iter().next().ok_or_else(|| Error::work("an answer without a view").into())
+}
+
+fn presence(of: Option<Presence>) -> SvkPresence {
+    match of {
+        None => SvkPresence::Unknown,
+        Some(Presence::Found) => SvkPresence::Found,
+        Some(Presence::Unsure) => SvkPresence::Unsure,
+        Some(Presence::Absent) => SvkPresence::Absent,
+    }
+}
+
+fn instance(of: &Instance) -> SvkInstance {
+    let pixel = of.pixels.first().copied().flatten();
+    let [x, y] = pixel.unwrap_or_default();
+    SvkInstance {
+        size: 0,
+        splats: of.splats.len() as u64,
+        share: of.share,
+        reliability: of.reliability.unwrap_or(-1.0),
+        centre: of.centre.to_array(),
+        box_min: of.bounds[0].to_array(),
+        box_max: of.bounds[1].to_array(),
+        axes: of.oriented.axes.map(|a| a.to_array()),
+        box_size: of.oriented.size.to_array(),
+        seen: u64::from(pixel.is_some()),
+        x,
+        y,
     }
 }
 

@@ -130,6 +130,20 @@ pub enum SvkArray {
     Seen = 5,
 }
 
+/// Whether the scene has what a text means.
+#[repr(u32)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SvkPresence {
+    /// The text model knows too few texts to tell.
+    Unknown = 0,
+    /// It has.
+    Found = 1,
+    /// What the scene's features say does not decide, or the text is not wholly understood (see svk_scene_notes).
+    Unsure = 2,
+    /// It has not.
+    Absent = 3,
+}
+
 /// How a context is made. All zero (but for `size`) is the default.
 #[repr(C)]
 #[derive(Clone, Copy)]
@@ -328,6 +342,8 @@ pub struct SvkSceneInfo {
     pub codes: [u32; 3],
     /// Feature values per level.
     pub feature_dim: [u32; 3],
+    /// Metres in a scene unit; 0 = unknown.
+    pub metres_per_unit: f64,
 }
 
 /// Where an image of the host is written: exactly one of `host`, `buffer` and `image` is set.
@@ -386,7 +402,7 @@ pub struct SvkSync {
 pub struct SvkAnswer {
     /// sizeof(SvkAnswer)
     pub size: usize,
-    /// 1 = the text was found in this view.
+    /// 1 = the text was found in this view; 0 where it is absent.
     pub found: u32,
     /// Level that answers: 0 = subparts, 1 = parts, 2 = wholes.
     pub level: u32,
@@ -396,6 +412,44 @@ pub struct SvkAnswer {
     pub x: f64,
     /// See `x`.
     pub y: f64,
-    /// Pixels in the mask.
+    /// Pixels in the mask; 0 where the text was not found.
     pub mask_pixels: u64,
+    /// SvkPresence: whether the scene has it, whatever this view shows.
+    pub presence: u32,
+    /// Things in space that the text means: those of svk_scene_instances.
+    pub instances: u32,
+    /// Share of other things that fit the scene at least as well: the p-value behind `presence`. 0 = unknown.
+    pub p_value: f64,
+    /// How far the photos agree on what answers, 0 to 1; below 0 = unknown.
+    pub reliability: f64,
+}
+
+/// One of the things that a text means. Lengths are in scene units.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct SvkInstance {
+    /// sizeof(SvkInstance)
+    pub size: usize,
+    /// Number of its Gaussians.
+    pub splats: u64,
+    /// Its share of all that answers the text, 0 to 1.
+    pub share: f64,
+    /// How far the photos agree on what it is, 0 to 1; below 0 = unknown.
+    pub reliability: f64,
+    /// Middle of the oriented box.
+    pub centre: [f64; 3],
+    /// Lowest corner of the box along the scene's axes.
+    pub box_min: [f64; 3],
+    /// Highest corner.
+    pub box_max: [f64; 3],
+    /// Unit vectors along the edges of the oriented box.
+    pub axes: [[f64; 3]; 3],
+    /// Lengths of its edges, longest first.
+    pub box_size: [f64; 3],
+    /// 1 = the view shows it, at (`x`, `y`).
+    pub seen: u64,
+    /// Pixel of its middle in the view; the first pixel's centre is (0.5, 0.5).
+    pub x: f64,
+    /// See `x`.
+    pub y: f64,
 }

@@ -7,10 +7,11 @@ use super::views;
 use crate::format::ply::{self, PlyOptions};
 use crate::format::{cameras, picture, scene_dir, write_json};
 use crate::gpu::Device;
-use crate::query::presence::{Evidence, Presence};
+use crate::query::instances::Instance;
 use crate::query::{QueryOptions, QueryResult};
 use crate::report::{colour, file_name};
-use crate::run::ask::{self, QueryScene};
+use crate::run::answer::{self, Answers};
+use crate::run::ask::QueryScene;
 use crate::run::encoder;
 use crate::run::view::DecodedFrame;
 use crate::scene::{Camera, LEVEL_NAMES, RgbImage, World};
@@ -56,56 +57,46 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let mut out = WrittenFiles::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
     let field = scene.language.take().ok_or_else(no_language)?;
-    let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
+    let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
     let progress = progress::reporter();
     progress.begin("query", cameras.len() as u64);
-    let mut views: Vec<Vec<Value>> = vec![Vec::new(); args.texts.len()];
-    let mut latency = vec![0.0; args.texts.len()];
-    let mut evidence: Vec<Vec<Evidence>> = vec![Vec::new(); args.texts.len()];
+    let mut asked: Vec<Asked> = args.texts.iter().map(|_| Asked::default()).collect();
     for (part, (cameras, stems)) in cameras.chunks(AT_ONCE).zip(stems.chunks(AT_ONCE)).enumerate() {
         progress.check()?;
         ready.set_views(cameras)?;
-        for (q, text) in args.texts.iter().enumerate() {
+        for ((text, folder), asked) in args.texts.iter().zip(&folders).zip(&mut asked) {
             let clock = Instant::now();
             let answers = ready.ask(text, &QueryOptions::default())?;
-            latency[q] += 1e3 * clock.elapsed().as_secs_f64();
-            evidence[q].extend(answers.evidence);
+            let before = asked.views.len();
+            asked.milliseconds += 1e3 * clock.elapsed().as_secs_f64();
             for (((frame, stem), camera), answer) in
                 ready.frames().iter().zip(stems).zip(cameras).zip(&answers.views)
             {
-                write(&mut out, stem, &folders[q], &frame.rendered.rgb, answer)?;
-                views[q].push(to_json(
-                    stem,
-                    &folders[q],
-                    answer,
-                    &place(frame, camera, answer, &scene.world),
-                ));
+                write(&mut out, stem, folder, &frame.rendered.rgb, answer)?;
+                let place = place(frame, camera, answer, &scene.world);
+                let mut view = to_json(stem, folder, answer, &place);
+                view["reliability"] = answers.view_reliability[asked.views.len() - before].into();
+                asked.views.push(view);
             }
+            asked.join(answers);
         }
         progress.step((part * AT_ONCE + cameras.len()) as u64, "");
     }
     progress.end();
-    let (mut queries, mut verdicts) = (Vec::new(), Vec::new());
-    for (q, text) in args.texts.iter().enumerate() {
-        // Of cameras that were answered apart, the part that shows most of it.
-        let best = evidence[q].iter().min_by(|a, b| a.p_value.total_cmp(&b.p_value));
-        let mut entry = json!({
-            "text": text, "presence": best.map(|e| e.presence), "p_value": best.map(|e| e.p_value),
-            "milliseconds": latency[q], "views": views[q],
-        });
-        let presence = best.map(|e| e.presence);
-        verdicts.push(presence);
+    let mut queries = Vec::new();
+    for (asked, folder) in asked.iter().zip(&folders) {
+        let Some(answers) = &asked.answers else { continue };
+        for note in answers.reading.notes() {
+            progress.warn(&format!("“{}”: {note}", answers.text));
+        }
+        let mut entry = answers.record(&stems, &scene.world);
+        (entry["milliseconds"], entry["views"]) = (asked.milliseconds.into(), asked.views.clone().into());
         if args.splats {
-            let chosen = ready.select(text, &QueryOptions::default())?;
-            let name = format!("{}/splats.ply", folders[q]);
-            ply::write_splats(
-                &out.file(&name)?,
-                &scene.splats.picked(&chosen.splats),
-                PlyOptions::default(),
-            )?;
+            let (chosen, name) = (&answers.selection, format!("{folder}/splats.ply"));
+            let splats = scene.splats.picked(&chosen.splats);
+            ply::write_splats(&out.file(&name)?, &splats, PlyOptions::default())?;
             entry["splats"] = json!({
-                "count": chosen.splats.len(), "level": LEVEL_NAMES[chosen.level],
-                "found": chosen.found && presence != Some(Presence::Absent), "file": name,
+                "count": chosen.splats.len(), "level": LEVEL_NAMES[chosen.level], "found": chosen.found, "file": name,
             });
         }
         queries.push(entry);
@@ -113,10 +104,29 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let report = json!({ "scene": args.scene, "out": args.out, "world": scene.world, "queries": queries });
     write_json(&out.file("answers.json")?, &report)?;
     out.keep();
-    if args.device.json {
-        print_json(&report)
-    } else {
-        print(&table(&args.texts, &views, &verdicts, &latency, args))
+    if args.device.json { print_json(&report) } else { print(&table(&asked, &stems, args)) }
+}
+
+/// One text, asked of all cameras part by part.
+#[derive(Default)]
+struct Asked {
+    /// Its views are in `views`.
+    answers: Option<Answers>,
+    views: Vec<Value>,
+    milliseconds: f64,
+}
+
+impl Asked {
+    /// Adds the answer for more cameras: only what views show differs.
+    fn join(&mut self, mut part: Answers) {
+        part.views.clear();
+        match &mut self.answers {
+            None => self.answers = Some(part),
+            Some(all) => {
+                let pairs = all.instances.iter_mut().zip(part.instances);
+                pairs.for_each(|(all, part)| all.pixels.extend(part.pixels));
+            }
+        }
     }
 }
 
@@ -160,20 +170,15 @@ fn to_json(stem: &str, folder: &str, a: &QueryResult, place: &Value) -> Value {
     })
 }
 
-fn table(
-    texts: &[String],
-    answers: &[Vec<Value>],
-    verdicts: &[Option<Presence>],
-    latency: &[f64],
-    args: &QueryArgs,
-) -> String {
+fn table(asked: &[Asked], stems: &[String], args: &QueryArgs) -> String {
     let mut text = String::new();
     // Writing to a String cannot fail.
-    for (((query, views), ms), presence) in texts.iter().zip(answers).zip(latency).zip(verdicts) {
-        let found = views.iter().filter(|v| v["found"] == true).count();
-        let verdict = ask::verdict(*presence, found, views.len());
-        let _ = writeln!(text, "“{query}”: {verdict}, answered in {ms:.0} ms");
-        for v in views {
+    for asked in asked {
+        let Some(answers) = &asked.answers else { continue };
+        let found = asked.views.iter().filter(|v| v["found"] == true).count();
+        let verdict = answer::verdict(answers.presence, found, asked.views.len());
+        let _ = writeln!(text, "“{}”: {verdict}, answered in {:.0} ms", answers.text, asked.milliseconds);
+        for v in &asked.views {
             let verdict = if v["found"] == true { "" } else { "  not found" };
             let _ = writeln!(
                 text,
@@ -185,7 +190,19 @@ fn table(
                 v["location"][1].as_f64().unwrap_or(0.0)
             );
         }
+        for (n, instance) in answers.instances.iter().enumerate() {
+            let _ = writeln!(text, "{}", instance_line(n + 1, instance, stems));
+        }
     }
     let _ = writeln!(text, "heat maps and masks are in {}", args.out.display());
     text
+}
+
+/// Where one of the things is: in space, and in the first view that shows it.
+fn instance_line(n: usize, instance: &Instance, stems: &[String]) -> String {
+    let ([x, y, z], [a, b, c]) = (instance.centre.to_array(), instance.oriented.size.to_array());
+    let seen = stems.iter().zip(&instance.pixels).find_map(|(stem, p)| Some((stem, (*p)?)));
+    let seen = seen.map_or(String::new(), |(stem, [x, y])| format!(", pixel {x:.0}, {y:.0} of {stem}"));
+    let splats = instance.splats.len();
+    format!("  {n}. at {x:.3}, {y:.3}, {z:.3}, size {a:.3} × {b:.3} × {c:.3}, {splats} splats{seen}")
 }

@@ -79,7 +79,7 @@ fn questions(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
     let field = scene.language.clone().ok_or_else(|| Error::input("this scene has no language"))?;
     let encoder = encoder::of_scene(scene, args.device.registry()?)?;
     let device = Device::open(args.device.device.as_deref())?;
-    let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
+    let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
     ready.set_views(&scene.cameras)?;
     Ok(ready)
 }

@@ -84,6 +84,13 @@ pub fn words_in(text: &str) -> Vec<String> {
     words.filter(|w| TERMS.iter().any(|(names, _)| names.contains(w))).map(str::to_owned).collect()
 }
 
+/// A text without its colour words; all of it where nothing else is left.
+pub fn without(text: &str) -> String {
+    let is_colour = |w: &&str| TERMS.iter().any(|(names, _)| names.contains(&w.to_lowercase().as_str()));
+    let rest: Vec<&str> = text.split_whitespace().filter(|w| !is_colour(w)).collect();
+    if rest.is_empty() { text.to_owned() } else { rest.join(" ") }
+}
+
 /// The term that a direction of [`direction`]'s space is nearest to, and the cosine to it.
 pub fn nearest_term(towards: &[f32]) -> (&'static str, f32) {
     let cosine = |i: usize| {
@@ -149,6 +156,7 @@ mod tests {
             assert!(exact.iter().zip(near).all(|(a, b)| (a - b).abs() < 0.1), "{exact:?} {near:?}");
         }
         assert!(terms_in("a reddish thing").is_none());
+        assert_eq!(["Blue mug", "orange", "redwood"].map(without), ["mug", "orange", "redwood"]);
         assert_eq!(terms_in("Gray-green stone").unwrap().iter().filter(|t| **t == 0.5).count(), 2);
         assert_eq!(direction(&[1.0 / COUNT as f32; COUNT]), [0.0; COUNT]);
     }

@@ -83,6 +83,15 @@ pub trait RegionEncoder: Send {
         let list = things::recoloured(text);
         self.embed_texts(&list.iter().map(String::as_str).collect::<Vec<_>>())
     }
+    /// Whether a text is one whole to the encoder, whatever its words say: an entry of a table.
+    fn holds(&self, _text: &str) -> bool {
+        false
+    }
+    /// Whether a text is among the words that the encoder knows, and which of them is nearest to it; `None` from an encoder that
+    /// is not bound to a list of words.
+    fn nearest_word(&mut self, _text: &str) -> Result<Option<(bool, String)>> {
+        Ok(None)
+    }
     /// Per region embedding ([count, D] rows) the `best` phrases of the encoder's own vocabulary, with their cosine, best
     /// first. None from an encoder that has no list of phrases.
     fn names(&mut self, regions: &[f32], _best: usize) -> Result<Vec<Vec<(String, f32)>>> {

@@ -45,7 +45,7 @@ fn inputs() -> Inputs {
     let canonicals = words.with(|e| e.embed_texts(&CANONICAL_PHRASES)).unwrap();
     let ask = |(k, text): (i32, String)| {
         let embedding = words.with(|e| e.embed_texts(&[&text])).unwrap();
-        (k, TextQuery { text, embedding, canonicals: canonicals.clone(), alternatives: Default::default() })
+        (k, TextQuery { text, embedding, canonicals: canonicals.clone(), ..Default::default() })
     };
     let queries = phrases().into_iter().filter(|(k, _)| *k > 3).map(ask).collect();
     Inputs { views, masks, depths, matched, queries }

@@ -70,7 +70,7 @@ mod tests {
             text: "x".into(),
             embedding: vec![1.0, 0.0, 0.0],
             canonicals: vec![0.0, 0.0, 1.0],
-            alternatives: Default::default(),
+            ..Default::default()
         };
         let map = |data: &[i32]| Plane { width: data.len(), height: 1, data: data.to_vec() };
         let (first, second) = (

@@ -6,13 +6,16 @@
 pub mod eval;
 pub mod filter;
 pub mod highlight;
+pub mod instances;
+pub mod phrasing;
 pub mod presence;
 pub mod protocol;
 pub mod select;
 
+use self::phrasing::Reading;
 use self::presence::Alternatives;
 use crate::math::dot;
-use crate::scene::{Codebook, LanguageField, Plane};
+use crate::scene::{Codebook, LanguageField, LevelField, Plane};
 use crate::{Error, Result};
 use rayon::prelude::*;
 /// The phrases that every query is compared against (LERF).
@@ -22,7 +25,7 @@ pub const CANONICAL_PHRASES: [&str; 4] = ["object", "things", "stuff", "texture"
 const LOGIT_SCALE: f64 = 10.0;
 
 /// A text query in the field's embedding space.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct TextQuery {
     /// The text of the query.
     pub text: String,
@@ -32,6 +35,8 @@ pub struct TextQuery {
     pub canonicals: Vec<f32>,
     /// What else it could have said; may be nothing.
     pub alternatives: Alternatives,
+    /// What is understood of it.
+    pub reading: Reading,
 }
 
 /// How an answer is cut out of the relevancy map.
@@ -103,6 +108,14 @@ pub struct QueryResult {
     pub found: bool,
 }
 
+impl QueryResult {
+    /// Without a mask, which would look like an answer; what is nearest stays to see in the relevancy.
+    pub fn take_back(&mut self) {
+        self.found = false;
+        self.mask.data.fill(false);
+    }
+}
+
 /// Relevancy of every code, [K]: `min_i σ(10 (φ·q − φ·n_i))` (docs/method.md#relevancy).
 pub fn code_relevancy(codebook: &Codebook, query: &TextQuery) -> Result<Vec<f32>> {
     let d = codebook.embedding_dim;
@@ -155,9 +168,29 @@ pub fn answer_all(
     frames.par_iter().map(|codes| answer_with(codes, &relevancy, options)).collect()
 }
 
-/// [`code_relevancy`] of every level.
+/// [`code_relevancy`] of every level, for codes of the colour that the query names.
 pub fn field_relevancy(field: &LanguageField, query: &TextQuery) -> Result<Vec<Vec<f32>>> {
-    field.levels.iter().map(|level| code_relevancy(&level.codebook, query)).collect()
+    let one = |level: &LevelField| {
+        let mut relevancy = code_relevancy(&level.codebook, query)?;
+        other_colours_out(&level.codebook, query, &mut relevancy);
+        Ok(relevancy)
+    };
+    field.levels.iter().map(one).collect()
+}
+
+/// Where the best code is of the colour that the query names, codes that fit another colour better are no answers: "yellow brick"
+/// means no green one, however alike bricks are. Where it is not, features say too little of colours to go by them.
+fn other_colours_out(book: &Codebook, query: &TextQuery, relevancy: &mut [f32]) {
+    let rows = || book.embeddings.chunks_exact(book.embedding_dim.max(1));
+    let of_colour = |row: &[f32]| {
+        let own = dot(row, &query.embedding);
+        query.alternatives.colours.chunks_exact(row.len()).all(|other| dot(row, other) <= own)
+    };
+    let best = rows().zip(relevancy.iter()).max_by(|a, b| a.1.total_cmp(b.1));
+    if best.is_some_and(|(row, _)| of_colour(row)) {
+        let others = rows().zip(relevancy).filter(|(row, _)| !of_colour(row));
+        others.for_each(|(_, r)| *r = r.min(0.5));
+    }
 }
 
 /// One level of a frame.

@@ -49,27 +49,65 @@ pub struct Evidence {
     pub p_value: f32,
 }
 
-/// The codes that frames show, and what of their meaning the canonical phrases have.
+impl Evidence {
+    /// The same, where the answer may be for something else than what was asked.
+    pub fn in_doubt(self) -> Evidence {
+        match self.presence {
+            Presence::Found => Evidence { presence: Presence::Unsure, ..self },
+            _ => self,
+        }
+    }
+}
+
+/// How much views show of every code.
+#[derive(Clone, Debug, Default)]
+pub struct ShownPixels {
+    /// Per level [K] pixels.
+    codes: Vec<Vec<usize>>,
+    /// Per level all pixels.
+    all: Vec<usize>,
+}
+
+impl ShownPixels {
+    /// Counts a view; `maps` holds its decoded map per level.
+    pub fn add(&mut self, field: &LanguageField, maps: &[Plane<i32>]) {
+        self.codes.resize(field.levels.len(), Vec::new());
+        self.all.resize(field.levels.len(), 0);
+        for (((counts, all), level), map) in
+            self.codes.iter_mut().zip(&mut self.all).zip(&field.levels).zip(maps)
+        {
+            counts.resize(level.codebook.len(), 0);
+            *all += map.data.len();
+            for code in &map.data {
+                if let Some(n) = usize::try_from(*code).ok().and_then(|k| counts.get_mut(k)) {
+                    *n += 1;
+                }
+            }
+        }
+    }
+
+    /// Of several views.
+    pub fn of(field: &LanguageField, views: &[&[Plane<i32>]]) -> ShownPixels {
+        let mut shown = ShownPixels::default();
+        views.iter().for_each(|maps| shown.add(field, maps));
+        shown
+    }
+}
+
+/// The codes that views show, and what of their meaning the canonical phrases have.
 pub struct ShownCodes<'f> {
     /// [D] embedding, and the largest cosine to a canonical phrase.
     codes: Vec<(&'f [f32], f32)>,
 }
 
 impl<'f> ShownCodes<'f> {
-    /// `frames` hold one decoded map per level.
-    pub fn new(frames: &[&[Plane<i32>]], field: &'f LanguageField, canonicals: &[f32]) -> ShownCodes<'f> {
+    /// Those of `field` that are no specks.
+    pub fn new(shown: &ShownPixels, field: &'f LanguageField, canonicals: &[f32]) -> ShownCodes<'f> {
         let mut codes = Vec::new();
-        for (index, level) in field.levels.iter().enumerate() {
+        for ((level, shown), all) in field.levels.iter().zip(&shown.codes).zip(&shown.all) {
             let book = &level.codebook;
-            let mut shown = vec![0usize; book.len()];
-            let maps = || frames.iter().filter_map(|levels| levels.get(index));
-            for code in maps().flat_map(|m| &m.data) {
-                if let Some(n) = usize::try_from(*code).ok().and_then(|k| shown.get_mut(k)) {
-                    *n += 1;
-                }
-            }
-            let least = LEAST_SHARE * maps().map(|m| m.data.len()).sum::<usize>() as f64;
-            let rows = book.embeddings.chunks_exact(book.embedding_dim.max(1)).zip(&shown);
+            let least = LEAST_SHARE * *all as f64;
+            let rows = book.embeddings.chunks_exact(book.embedding_dim.max(1)).zip(shown);
             codes.extend(rows.filter(|(_, n)| **n > 0 && **n as f64 >= least).map(|(row, _)| {
                 let common = canonicals.chunks_exact(row.len()).map(|c| dot(row, c));
                 (row, common.fold(f32::NEG_INFINITY, f32::max))
@@ -154,11 +192,12 @@ mod tests {
     fn what_is_there_is_found_and_what_is_not_is_not() {
         let present = ["red book", "blue mug", "lemon", "wooden table", "green can"];
         let (field, maps) = field(&present, "trombone");
+        let pixels = ShownPixels::of(&field, &[&maps]);
         let ask = |text: &str, form: &str| {
             let query = regions::query(text);
             let colours: Vec<f32> =
                 things::recoloured(text).iter().flat_map(|t| regions::text_embedding(t)).collect();
-            let shown = ShownCodes::new(&[&maps], &field, &query.canonicals);
+            let shown = ShownCodes::new(&pixels, &field, &query.canonicals);
             let rows: Vec<f32> =
                 things::of_form(form).iter().flat_map(|o| regions::text_embedding(o)).collect();
             shown.evidence(&query.embedding, &colours, &shown.background(&rows)).unwrap()
@@ -183,9 +222,11 @@ mod tests {
     fn nothing_is_said_without_other_things() {
         let (field, maps) = field(&["lemon"], "speck");
         let query = regions::query("lemon");
-        let shown = ShownCodes::new(&[&maps], &field, &query.canonicals);
+        let pixels = ShownPixels::of(&field, &[&maps]);
+        let shown = ShownCodes::new(&pixels, &field, &query.canonicals);
         assert_eq!(shown.evidence(&query.embedding, &[], &Background::default()), None);
-        let empty = ShownCodes::new(&[], &field, &query.canonicals);
+        let nothing = ShownPixels::default();
+        let empty = ShownCodes::new(&nothing, &field, &query.canonicals);
         assert_eq!(empty.evidence(&query.embedding, &[], &Background { scores: vec![0.0; 100] }), None);
     }
 }

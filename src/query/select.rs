@@ -1,9 +1,8 @@
 //! Splats that a query selects in space, without any view (docs/method.md#selection-in-space).
+use super::instances::Places;
 use super::{MaskRule, QueryOptions, TextQuery, field_relevancy, margin};
 use crate::Result;
-use crate::scene::code_mix::MIN_LENGTH;
-use crate::scene::{LanguageField, LevelField};
-use rayon::prelude::*;
+use crate::scene::LanguageField;
 
 /// Codes that fewer splats carry are specks: at a pixel per splat, less than a mask may be.
 const MIN_SPLATS: usize = 32;
@@ -22,23 +21,17 @@ pub struct Selection {
     pub found: bool,
 }
 
-/// Code of every splat, `argmax_k f·c_k`; none for splats without a feature.
-pub fn splat_codes(level: &LevelField) -> Vec<Option<usize>> {
-    let d = level.codebook.code_dim.max(1);
-    let one = |f: &[f32]| {
-        let length = f.iter().map(|v| v * v).sum::<f32>().sqrt();
-        if length < MIN_LENGTH { None } else { level.codebook.decode(f) }
-    };
-    level.features.par_chunks_exact(d).map(one).collect()
-}
-
 /// Selects by the rule of the `field` masks: the coarsest level that is nearly as good as the best one answers, and of its
 /// codes those nearly as relevant as the best.
-pub fn select(field: &LanguageField, query: &TextQuery, options: &QueryOptions) -> Result<Selection> {
+pub fn select(
+    field: &LanguageField,
+    places: &Places,
+    query: &TextQuery,
+    options: &QueryOptions,
+) -> Result<Selection> {
     let relevancy = field_relevancy(field, query)?;
-    let mut found: Vec<(usize, f32, Vec<Option<usize>>)> = Vec::new();
-    for (l, (level, values)) in field.levels.iter().zip(&relevancy).enumerate() {
-        let of = splat_codes(level);
+    let mut found: Vec<(usize, f32, &[Option<usize>])> = Vec::new();
+    for (l, (of, values)) in places.codes().iter().zip(&relevancy).enumerate() {
         let mut carried = vec![0usize; values.len()];
         of.iter().flatten().for_each(|&k| carried[k] += 1);
         let solid = values.iter().zip(&carried).filter(|(_, n)| **n >= MIN_SPLATS).map(|(v, _)| *v);
@@ -62,7 +55,7 @@ pub fn select(field: &LanguageField, query: &TextQuery, options: &QueryOptions) 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::Codebook;
+    use crate::scene::{Codebook, LevelField, Splats};
 
     #[test]
     fn splats_are_chosen_by_their_codes_on_the_coarsest_good_level() {
@@ -82,16 +75,17 @@ mod tests {
             text: "q".into(),
             embedding: v.to_vec(),
             canonicals: vec![0.0, 0.0, 0.0, 1.0],
-            alternatives: Default::default(),
+            ..Default::default()
         };
         let options = QueryOptions::default();
-        let thing = select(&field, &query([1.0, 0.0, 0.0, 0.0]), &options).unwrap();
+        let places = Places::of(&Splats::default(), &field);
+        let thing = select(&field, &places, &query([1.0, 0.0, 0.0, 0.0]), &options).unwrap();
         assert_eq!((thing.level, thing.found), (1, true));
         assert_eq!(thing.splats, (0..80).collect::<Vec<_>>());
-        let other = select(&field, &query([0.0, 1.0, 0.0, 0.0]), &options).unwrap();
+        let other = select(&field, &places, &query([0.0, 1.0, 0.0, 0.0]), &options).unwrap();
         assert_eq!(other.splats, (80..120).collect::<Vec<_>>());
         assert!(
-            select(&LanguageField::default(), &query([1.0, 0.0, 0.0, 0.0]), &options)
+            select(&LanguageField::default(), &Places::default(), &query([1.0, 0.0, 0.0, 0.0]), &options)
                 .unwrap()
                 .splats
                 .is_empty()

@@ -27,7 +27,7 @@ fn query(v: &[f32]) -> TextQuery {
         text: "q".into(),
         embedding: unit(v),
         canonicals: vec![0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.8],
-        alternatives: Default::default(),
+        ..Default::default()
     }
 }
 
@@ -204,7 +204,7 @@ fn perfect_masks_and_distinct_features_answer_every_phrase() {
             text: text.clone(),
             embedding,
             canonicals: vectors[12..].concat(),
-            alternatives: Default::default(),
+            ..Default::default()
         };
         for (t, view) in views.iter().enumerate() {
             let maps: Vec<Plane<i32>> = built.field.levels.iter().map(|l| l.targets[t].clone()).collect();

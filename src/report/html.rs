@@ -130,7 +130,7 @@ fn query_row(report: &HtmlReport, q: &QueryShown) -> Result<String> {
     let mut row = format!(
         "<h3>“{}” <span class=\"{class}\">{}</span></h3><div class=\"row\">",
         escape(q.text),
-        q.verdict
+        escape(&q.verdict)
     );
     for a in &q.answers {
         let Some(view) = report.views.get(a.view) else { continue };

@@ -1,17 +1,145 @@
-//! A loaded scene that is kept on the device for queries: what viewers, `splatvk query` and benchmarks call.
+//! Questions to a scene that is kept on the device: what viewers, `splatvk query`, the C interface and benchmarks call.
+use super::answer::{Answers, Prepared};
 use super::view::{DecodedFrame, Viewer};
 use crate::gpu::Device;
 use crate::infer::{RegionEncoder, things};
-use crate::query::highlight::Highlight;
-use crate::query::presence::{Alternatives, Background, Evidence, Presence, ShownCodes};
-use crate::query::select::{Selection, select};
-use crate::query::{self, CANONICAL_PHRASES, QueryOptions, QueryResult, TextQuery};
-use crate::report::viewer::{CodeNames, ShownAnswer};
-use crate::scene::{Camera, LanguageField, Plane, Splats};
+use crate::query::phrasing::{self, Reading, Vocabulary};
+use crate::query::presence::{Alternatives, Background, ShownPixels};
+use crate::query::{self, CANONICAL_PHRASES, QueryOptions, TextQuery};
+use crate::report::viewer::CodeNames;
+use crate::scene::{Camera, LanguageField, Splats};
 use crate::{Error, Result};
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use std::sync::Arc;
+
+/// What texts could have said instead, [N, D], by the words before them.
+type Others = HashMap<String, Arc<Vec<f32>>>;
+
+/// One text as a query. With `verbatim` all its words count, as published protocols have it.
+fn as_query(
+    text: &str,
+    encoder: &mut dyn RegionEncoder,
+    canonicals: &[f32],
+    others: &mut Others,
+    verbatim: bool,
+) -> Result<TextQuery> {
+    let phrasing = if verbatim || encoder.holds(text) { None } else { phrasing::read(text) };
+    let asked = phrasing.as_ref().map_or(text, |p| &p.answers_for).to_owned();
+    let embedding = encoder.embed_texts(&[&asked])?;
+    let things = match others.entry(things::form(&asked)) {
+        Entry::Occupied(known) => known.get().clone(),
+        Entry::Vacant(new) => {
+            let rows = encoder.others(new.key())?;
+            new.insert(Arc::new(rows)).clone()
+        }
+    };
+    let alternatives = Alternatives { things, colours: encoder.recoloured(&asked)? };
+    let vocabulary = encoder.nearest_word(&asked)?.map(|(known, nearest)| Vocabulary { known, nearest });
+    let reading = Reading { phrasing, vocabulary };
+    Ok(TextQuery { text: text.to_owned(), embedding, canonicals: canonicals.to_vec(), alternatives, reading })
+}
+
+/// Embeds texts for [`crate::query::answer`], all their words.
+pub fn embedded(texts: &[String], encoder: &mut dyn RegionEncoder) -> Result<Vec<TextQuery>> {
+    queries(texts, encoder, true)
+}
+
+/// Texts as queries: of phrasing that no embedding carries the rest is asked ([`phrasing`]), unless they are taken `verbatim`.
+pub fn queries(texts: &[String], encoder: &mut dyn RegionEncoder, verbatim: bool) -> Result<Vec<TextQuery>> {
+    if texts.is_empty() {
+        return Ok(Vec::new());
+    }
+    let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
+    let mut others = Others::new();
+    texts.iter().map(|text| as_query(text, encoder, &canonicals, &mut others, verbatim)).collect()
+}
+
+/// What turns texts into answers about one scene: its text encoder, what that has embedded so far, and the scene prepared.
+pub(super) struct Questions {
+    encoder: Box<dyn RegionEncoder>,
+    /// [C, D] unit rows of the canonical phrases.
+    canonicals: Vec<f32>,
+    others: Others,
+    /// How well other things fit what the scene shows, by the words before them.
+    backgrounds: HashMap<String, Background>,
+    prepared: Prepared,
+    /// Cameras whose views tell what the scene shows, until they have been looked at.
+    unseen: Option<Vec<Camera>>,
+}
+
+impl Questions {
+    /// About a scene; what its own `cameras` show tells whether something is in it.
+    pub(super) fn open(
+        mut encoder: Box<dyn RegionEncoder>,
+        splats: &Splats,
+        field: &LanguageField,
+        cameras: &[Camera],
+    ) -> Result<Questions> {
+        if field.levels.iter().all(|l| l.codebook.is_empty()) {
+            return Err(Error::input(
+                "the scene has no language; only scenes made from photos by splatvk run have it",
+            ));
+        }
+        let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
+        Ok(Questions {
+            encoder,
+            canonicals,
+            others: Others::new(),
+            backgrounds: HashMap::new(),
+            prepared: Prepared::new(splats, field, ShownPixels::default()),
+            unseen: Some(cameras.to_vec()),
+        })
+    }
+
+    /// Looks at the scene from its own cameras, or takes the frames where they are theirs.
+    fn look(
+        &mut self,
+        viewer: &mut Viewer,
+        field: &LanguageField,
+        (cameras, frames): (&[Camera], &[DecodedFrame]),
+    ) -> Result<()> {
+        let Some(own) = self.unseen.take() else { return Ok(()) };
+        let shown = &mut self.prepared.shown;
+        match own.is_empty() || own == cameras {
+            true => frames.iter().for_each(|f| shown.add(field, &f.codes)),
+            false => {
+                for camera in &own {
+                    shown.add(field, &viewer.codes(camera)?);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// What is understood of a text.
+    pub(super) fn reading(&mut self, text: &str) -> Result<Reading> {
+        Ok(self.query(text)?.reading)
+    }
+
+    fn query(&mut self, text: &str) -> Result<TextQuery> {
+        if text.trim().is_empty() {
+            return Err(Error::input("an empty query; give a few words"));
+        }
+        as_query(text, self.encoder.as_mut(), &self.canonicals, &mut self.others, false)
+    }
+
+    /// Answers a text in views.
+    pub(super) fn ask(
+        &mut self,
+        text: &str,
+        viewer: &mut Viewer,
+        field: &LanguageField,
+        views: (&[Camera], &[DecodedFrame]),
+        options: &QueryOptions,
+    ) -> Result<Answers> {
+        let query = self.query(text)?;
+        self.look(viewer, field, views)?;
+        let asked = query.reading.phrasing.as_ref().map_or(text, |p| &p.answers_for);
+        let background = self.backgrounds.entry(things::form(asked));
+        self.prepared.answer(field, views, &query, options, background)
+    }
+}
 
 /// The scene on the device, its code maps in the set views, and the text encoder. A query costs the
 /// embedding of its text and a gather and five box filters per camera; nothing is rendered for it.
@@ -22,77 +150,48 @@ use std::sync::Arc;
 /// let scene = scene_dir::load("out/breakfast".as_ref())?;
 /// let field = scene.language.ok_or_else(|| splatvk::Error::input("no language"))?;
 /// let encoder = Box::new(RegionWords::load(Registry::open(None)?)?);
-/// let mut ready = QueryScene::open(&Device::open(None)?, &scene.splats, field, encoder)?;
+/// let mut ready = QueryScene::open(&Device::open(None)?, (&scene.splats, &scene.cameras), field, encoder)?;
 /// ready.set_views(&scene.cameras)?;
 /// let answers = ready.ask("lemon", &Default::default())?;
-/// println!("found in {} of {} views", answers.found(), answers.views.len());
+/// println!("{}; {} of it", answers.verdict(), answers.instances.len());
 /// # Ok(())
 /// # }
 /// ```
 pub struct QueryScene {
     viewer: Viewer,
     field: LanguageField,
-    encoder: Box<dyn RegionEncoder>,
-    /// [C, D] unit rows of the canonical phrases.
-    canonicals: Vec<f32>,
-    others: Others,
-    /// How well other things fit what the frames show, by the words before them.
-    backgrounds: HashMap<String, Background>,
+    questions: Questions,
+    cameras: Vec<Camera>,
     frames: Vec<DecodedFrame>,
 }
 
-/// What texts could have said instead, [N, D], by the words before them.
-type Others = HashMap<String, Arc<Vec<f32>>>;
-
-/// One text as a query.
-fn as_query(
-    text: &str,
-    encoder: &mut dyn RegionEncoder,
-    canonicals: &[f32],
-    others: &mut Others,
-) -> Result<TextQuery> {
-    let embedding = encoder.embed_texts(&[text])?;
-    let things = match others.entry(things::form(text)) {
-        Entry::Occupied(known) => known.get().clone(),
-        Entry::Vacant(new) => {
-            let rows = encoder.others(new.key())?;
-            new.insert(Arc::new(rows)).clone()
-        }
-    };
-    let alternatives = Alternatives { things, colours: encoder.recoloured(text)? };
-    Ok(TextQuery { text: text.to_owned(), embedding, canonicals: canonicals.to_vec(), alternatives })
-}
-
 impl QueryScene {
-    /// Uploads the scene and loads the text encoder, which must be of the field's space.
+    /// Uploads the scene and loads the text encoder, which must be of the field's space. Whether something is in the scene is told
+    /// by what its own `cameras` show.
     pub fn open(
         device: &Device,
-        splats: &Splats,
+        (splats, cameras): (&Splats, &[Camera]),
         field: LanguageField,
-        mut encoder: Box<dyn RegionEncoder>,
+        encoder: Box<dyn RegionEncoder>,
     ) -> Result<Self> {
-        if field.levels.iter().all(|l| l.codebook.is_empty()) {
-            return Err(Error::input("the scene has no language; make one with splatvk run"));
-        }
-        let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
+        let questions = Questions::open(encoder, splats, &field, cameras)?;
         let viewer = Viewer::new(device, splats, &field)?;
-        let (others, backgrounds) = (Others::new(), HashMap::new());
-        Ok(QueryScene { viewer, field, encoder, canonicals, others, backgrounds, frames: Vec::new() })
+        Ok(QueryScene { viewer, field, questions, cameras: Vec::new(), frames: Vec::new() })
     }
 
     /// Renders and decodes the cameras that later queries are answered for.
     pub fn set_views(&mut self, cameras: &[Camera]) -> Result<&[DecodedFrame]> {
         self.frames.clear();
-        self.backgrounds.clear();
         for camera in cameras {
             self.frames.push(self.viewer.view(camera)?);
         }
+        self.cameras = cameras.to_vec();
         Ok(&self.frames)
     }
 
     /// The phrases of the text model that name each code best: see [`RegionEncoder::names`].
     pub fn names(&mut self) -> Result<CodeNames> {
-        names(self.encoder.as_mut(), &self.field, NAMES)
+        names(self.questions.encoder.as_mut(), &self.field, NAMES)
     }
 
     /// The scene's language.
@@ -100,68 +199,14 @@ impl QueryScene {
         &self.field
     }
 
-    /// The frames of the last [`QueryScene::look`].
+    /// The frames of the last [`QueryScene::set_views`].
     pub fn frames(&self) -> &[DecodedFrame] {
         &self.frames
     }
 
-    /// The splats that a text means, whatever the views.
-    pub fn select(&mut self, text: &str, options: &QueryOptions) -> Result<Selection> {
-        let query = as_query(text, self.encoder.as_mut(), &self.canonicals, &mut self.others)?;
-        select(&self.field, &query, options)
-    }
-
     /// Answers a text in every frame.
     pub fn ask(&mut self, text: &str, options: &QueryOptions) -> Result<Answers> {
-        let query = as_query(text, self.encoder.as_mut(), &self.canonicals, &mut self.others)?;
-        let background = self.backgrounds.entry(things::form(text));
-        answers_with(&self.frames, &self.field, &query, options, background)
-    }
-}
-
-/// The answers to one text, one per photo.
-#[derive(Clone, Debug)]
-#[non_exhaustive]
-pub struct Answers {
-    /// The text of the query.
-    pub text: String,
-    /// Per photo.
-    pub views: Vec<QueryResult>,
-    /// Whether the scene shows what the text means; `None` where the text model knows too few texts to tell.
-    pub evidence: Option<Evidence>,
-    /// For the scene as a whole.
-    pub highlight: Highlight,
-}
-
-impl Answers {
-    /// For the interactive view.
-    pub fn shown(&self) -> ShownAnswer<'_> {
-        ShownAnswer {
-            text: &self.text,
-            found: self.found(),
-            views: self.views.len(),
-            presence: self.evidence.map(|e| e.presence),
-            highlight: &self.highlight,
-        }
-    }
-
-    /// Photos in which the text was found.
-    pub fn found(&self) -> usize {
-        self.views.iter().filter(|v| v.found).count()
-    }
-
-    /// The answer in a few words.
-    pub fn verdict(&self) -> String {
-        verdict(self.evidence.map(|e| e.presence), self.found(), self.views.len())
-    }
-}
-
-/// An answer in a few words: "found in 3 of 4 photos".
-pub fn verdict(presence: Option<Presence>, found: usize, views: usize) -> String {
-    match presence {
-        Some(Presence::Absent) => "not in this scene".to_owned(),
-        Some(Presence::Unsure) => format!("unsure; if it is here, in {found} of {views} photos"),
-        Some(Presence::Found) | None => format!("found in {found} of {views} photos"),
+        self.questions.ask(text, &mut self.viewer, &self.field, (&self.cameras, &self.frames), options)
     }
 }
 
@@ -185,44 +230,4 @@ pub fn names(encoder: &mut dyn RegionEncoder, field: &LanguageField, best: usize
         levels.push(rows.zip(named).map(rate).collect());
     }
     Ok(levels)
-}
-
-/// The answers to one query in all frames.
-pub fn answers(
-    frames: &[DecodedFrame],
-    field: &LanguageField,
-    query: &TextQuery,
-    options: &QueryOptions,
-) -> Result<Answers> {
-    answers_with(frames, field, query, options, HashMap::new().entry(String::new()))
-}
-
-/// The same, with a place for how well other things fit these frames.
-fn answers_with(
-    frames: &[DecodedFrame],
-    field: &LanguageField,
-    query: &TextQuery,
-    options: &QueryOptions,
-    background: Entry<'_, String, Background>,
-) -> Result<Answers> {
-    let codes: Vec<&[Plane<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
-    let mut views = query::answer_all(&codes, field, query, options)?;
-    let shown = ShownCodes::new(&codes, field, &query.canonicals);
-    let background = background.or_insert_with(|| shown.background(&query.alternatives.things));
-    let evidence = shown.evidence(&query.embedding, &query.alternatives.colours, background);
-    if evidence.is_some_and(|e| e.presence == Presence::Absent) {
-        views.iter_mut().for_each(|v| v.found = false);
-    }
-    let highlight = query::highlight::highlight(&codes, field, query, &views)?;
-    Ok(Answers { text: query.text.clone(), views, evidence, highlight })
-}
-
-/// Embeds texts for [`crate::query::answer`].
-pub fn embedded(texts: &[String], encoder: &mut dyn RegionEncoder) -> Result<Vec<TextQuery>> {
-    if texts.is_empty() {
-        return Ok(Vec::new());
-    }
-    let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
-    let mut others = Others::new();
-    texts.iter().map(|text| as_query(text, encoder, &canonicals, &mut others)).collect()
 }

@@ -1,5 +1,5 @@
 //! The stages of `splatvk run`.
-use super::ask::Answers;
+use super::answer::Answers;
 use super::base::BaseScene;
 use super::plan::RunPlan;
 use super::sources::{
@@ -165,7 +165,7 @@ impl Aligned {
         let (recipe, options) = (plan.recipe(), plan.language_options(preset));
         let language = graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
         let frames = graph.add(stages::DecodeViews, (trained, language));
-        let answers = graph.add(stages::AnswerQueries, (frames, language, queries));
+        let answers = graph.add(stages::AnswerQueries, (trained, frames, language, queries));
         SceneOutputs { placed, geometry, trained, up, aligned, names, language, frames, answers }
     }
 }

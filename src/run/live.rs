@@ -1,18 +1,21 @@
 //! A scene that a program holds in memory: rendered, queried and saved on demand. What the C interface is made of.
+use super::answer::Answers;
+use super::ask::Questions;
 use super::execute::save;
 use super::outcome::RunOutcome;
-use super::view::Viewer;
+use super::view::{DecodedFrame, Viewer};
 use super::{encoder, sources};
 use crate::format::scene_dir::{self, Contents, Scene};
 use crate::format::{Workspace, colmap, gaussians};
 use crate::gpu::Device;
-use crate::infer::{RegionEncoder, Registry};
+use crate::infer::Registry;
 use crate::pass::bands::Band;
 use crate::pass::rasterizer::FrameBuffers;
 use crate::photo;
 use crate::progress::Silent;
-use crate::query::{self, CANONICAL_PHRASES, QueryOptions, QueryResult, TextQuery};
-use crate::scene::{Camera, LanguageField, Plane, Seen, Splats};
+use crate::query::QueryOptions;
+use crate::query::phrasing::Reading;
+use crate::scene::{Camera, LanguageField, Seen, Splats, World};
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -29,7 +32,7 @@ use std::path::Path;
 /// let mut scene = LiveScene::trained(&device, outcome, &models)?;
 /// let camera = scene.cameras()[0].clone();
 /// let answer = scene.ask("blue mug", &camera)?;
-/// println!("found: {}, at {:?}", answer.found, answer.location);
+/// println!("{}; in this view at {:?}", answer.verdict(), answer.views[0].location);
 /// scene.save("out/kitchen".as_ref(), false)?;
 /// # Ok(())
 /// # }
@@ -39,10 +42,10 @@ pub struct LiveScene {
     origin: SceneOrigin,
     registry: Registry,
     viewer: Viewer,
-    /// The text encoder and the [C, D] unit rows of the canonical phrases; loaded with the first question.
-    text_encoder: Option<(Box<dyn RegionEncoder>, Vec<f32>)>,
-    /// Decoded codes of the last query's camera.
-    seen: Option<(Camera, Vec<Plane<i32>>)>,
+    /// Opened with the first one.
+    questions: Option<Questions>,
+    /// The last query's camera and what it shows.
+    seen: Option<(Camera, DecodedFrame)>,
 }
 
 enum SceneOrigin {
@@ -73,7 +76,7 @@ impl LiveScene {
             origin,
             registry: registry.clone(),
             viewer,
-            text_encoder: None,
+            questions: None,
             seen: None,
         })
     }
@@ -110,6 +113,13 @@ impl LiveScene {
             SceneOrigin::Loaded(s) => s.language.as_ref(),
         }
     }
+    /// How the scene lies in the world.
+    pub fn world(&self) -> &World {
+        match &self.origin {
+            SceneOrigin::Trained(o) => &o.world,
+            SceneOrigin::Loaded(s) => &s.world,
+        }
+    }
     /// What the run was warned of; none for a loaded scene.
     pub fn warnings(&self) -> &[String] {
         match &self.origin {
@@ -141,46 +151,58 @@ impl LiveScene {
         self.viewer.draw(camera)
     }
 
-    /// Answers a text in the view of a camera.
-    pub fn ask(&mut self, text: &str, camera: &Camera) -> Result<QueryResult> {
+    /// Answers a text for the scene and in the view of a camera: the answer has one view.
+    pub fn ask(&mut self, text: &str, camera: &Camera) -> Result<Answers> {
         check(camera)?;
-        if text.trim().is_empty() {
-            return Err(Error::input("an empty query; give a few words"));
-        }
         if self.language().is_none_or(|f| f.levels.iter().all(|l| l.codebook.is_empty())) {
             return Err(Error::input(
                 "the scene has no language; only scenes made from photos by a run have it",
             ));
         }
-        let (mut encoder, canonicals) = match self.text_encoder.take() {
+        let mut questions = match self.questions.take() {
             Some(ready) => ready,
-            None => self.open_text_encoder()?,
+            None => self.open_questions()?,
         };
-        let embedding = encoder.embed_texts(&[text]);
-        let query = embedding.map(|embedding| TextQuery {
-            text: text.to_owned(),
-            embedding,
-            canonicals: canonicals.clone(),
-            alternatives: Default::default(),
-        });
-        self.text_encoder = Some((encoder, canonicals));
-        let query = query?;
-        if self.seen.as_ref().is_none_or(|(c, _)| c != camera) {
-            let codes = self.viewer.codes(camera)?;
-            self.seen = Some((camera.clone(), codes));
-        }
-        let codes = self.seen.as_ref().map_or(&[][..], |(_, codes)| codes);
-        let field = self.language().ok_or_else(|| Error::work("the scene has no language"))?;
-        query::answer(codes, field, &query, &QueryOptions::default())
+        let answers = self.answer(&mut questions, text, camera);
+        self.questions = Some(questions);
+        answers
     }
 
-    fn open_text_encoder(&self) -> Result<(Box<dyn RegionEncoder>, Vec<f32>)> {
-        let mut encoder = match &self.origin {
+    /// What is understood of a text.
+    pub fn reading(&mut self, text: &str) -> Result<Reading> {
+        let mut questions = match self.questions.take() {
+            Some(ready) => ready,
+            None => self.open_questions()?,
+        };
+        let reading = questions.reading(text);
+        self.questions = Some(questions);
+        reading
+    }
+
+    fn answer(&mut self, questions: &mut Questions, text: &str, camera: &Camera) -> Result<Answers> {
+        let (camera, frame) = match self.seen.take().filter(|(c, _)| c == camera) {
+            Some(same) => same,
+            None => (camera.clone(), self.viewer.view(camera)?),
+        };
+        // Taken apart, since the viewer is used while the field is read.
+        let field = match &self.origin {
+            SceneOrigin::Trained(o) => Some(&o.field),
+            SceneOrigin::Loaded(s) => s.language.as_ref(),
+        };
+        let field = field.ok_or_else(|| Error::work("the scene has no language"))?;
+        let views = (std::slice::from_ref(&camera), std::slice::from_ref(&frame));
+        let answers = questions.ask(text, &mut self.viewer, field, views, &QueryOptions::default());
+        self.seen = Some((camera, frame));
+        answers
+    }
+
+    fn open_questions(&self) -> Result<Questions> {
+        let encoder = match &self.origin {
             SceneOrigin::Trained(o) => sources::encoder(&o.plan.features, &self.registry)?,
             SceneOrigin::Loaded(s) => encoder::of_scene(s, self.registry.clone())?,
         };
-        let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
-        Ok((encoder, canonicals))
+        let field = self.language().ok_or_else(|| Error::work("the scene has no language"))?;
+        Questions::open(encoder, self.splats(), field, self.cameras())
     }
 
     /// Writes a file of the kind that its name asks for ([`gaussians::write`]), or else a scene directory, whole or not at

@@ -1,4 +1,5 @@
 //! The commands that make scenes, as lists of stages, and what is done with a finished one.
+pub mod answer;
 pub mod ask;
 pub mod base;
 pub mod budget;
@@ -21,7 +22,7 @@ pub(crate) mod stages;
 pub mod train;
 pub mod view;
 
-pub use ask::Answers;
+pub use answer::Answers;
 pub use execute::{reconstruct, run, save, stage_folder};
 pub use method::{FEATURE_DIM, Method, Recipe};
 pub use outcome::RunOutcome;

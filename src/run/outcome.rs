@@ -1,5 +1,5 @@
 //! The result of a run.
-use super::ask::Answers;
+use super::answer::Answers;
 use super::plan::RunPlan;
 use super::view::DecodedFrame;
 use crate::fit;

@@ -1,5 +1,5 @@
 //! Records of a finished run: `run.json`, the report and the closing table, made from [`RunOutcome`].
-use super::ask::Answers;
+use super::answer::Answers;
 use super::outcome::RunOutcome;
 use crate::Result;
 use crate::fit::{CurvePoint, FitStats, LanguagePoint, ViewDependence};
@@ -68,7 +68,7 @@ fn statistics(o: &RunOutcome) -> serde_json::Value {
         "curves": curves,
         "levels": levels,
         "alignment": o.alignment.report,
-        "queries": o.answers.iter().map(answer_json).collect::<Vec<_>>(),
+        "queries": o.answers.iter().map(|a| answer_json(a, o)).collect::<Vec<_>>(),
     })
 }
 
@@ -192,21 +192,22 @@ pub(super) fn curves(rgb: &FitStats, language: &[LanguagePoint]) -> Vec<Curve> {
     ]
 }
 
-fn answer_json(a: &Answers) -> serde_json::Value {
+fn answer_json(a: &Answers, o: &RunOutcome) -> serde_json::Value {
     let views: Vec<_> = a
         .views
         .iter()
-        .map(|v| {
+        .zip(&a.view_reliability)
+        .map(|(v, reliability)| {
             json!({
                 "found": v.found, "score": v.score, "level": LEVEL_NAMES[v.level],
-                "location": [v.location.0, v.location.1],
+                "location": [v.location.0, v.location.1], "reliability": reliability,
             })
         })
         .collect();
-    json!({
-        "text": a.text, "found": a.found(), "presence": a.evidence.map(|e| e.presence),
-        "p_value": a.evidence.map(|e| e.p_value), "views": views,
-    })
+    let stems: Vec<String> = o.photos.iter().map(|p| p.stem.clone()).collect();
+    let mut entry = a.record(&stems, &o.world);
+    (entry["found"], entry["views"]) = (a.found().into(), views.into());
+    entry
 }
 
 /// Figures for the head of the report and the closing table: (label, value).
@@ -386,7 +387,7 @@ fn shown(a: &Answers) -> QueryShown<'_> {
             level: LEVEL_NAMES[v.level],
         })
         .collect();
-    QueryShown { text: &a.text, verdict: a.verdict(), answers }
+    QueryShown { text: &a.text, verdict: a.sentence(), answers }
 }
 
 #[cfg(test)]

@@ -6,6 +6,8 @@ use crate::gpu::Device;
 use crate::pass::metrics;
 use crate::progress::Progress;
 use crate::query::eval::{EvalReport, Evaluation, RefinedView, Rendered, Split, TruthFrame, colour_fit};
+use crate::query::instances::Places;
+use crate::query::select::select;
 use crate::query::{QueryOptions, QueryResult, TextQuery, answer_with, field_relevancy};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
 
@@ -25,6 +27,12 @@ pub fn score_field(
     let labels: Vec<u32> = evaluation.phrases().into_iter().map(|p| p.0).collect();
     let options = QueryOptions::default();
     let relevancy = queries.iter().map(|q| field_relevancy(field, q)).collect::<Result<Vec<_>>>()?;
+    let places = Places::of(splats, field);
+    let things = |query: &TextQuery| -> Result<_> {
+        let chosen = select(field, &places, query, &options)?;
+        Ok(places.instances(&chosen.splats, chosen.level))
+    };
+    evaluation.add_instances(&queries.iter().map(things).collect::<Result<Vec<_>>>()?)?;
     let mut viewer = Viewer::new(device, splats, field)?;
     let refiner = if refine { Some(ViewRefiner::new(device, splats)?) } else { None };
     let frames = evaluation.cameras();

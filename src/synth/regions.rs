@@ -101,7 +101,7 @@ pub fn query(text: &str) -> TextQuery {
         text: text.to_owned(),
         embedding: text_embedding(text),
         canonicals: CANONICAL_PHRASES.iter().flat_map(|c| text_embedding(c)).collect(),
-        alternatives: Default::default(),
+        ..Default::default()
     }
 }
 

@@ -59,6 +59,14 @@ static int run(int argc, char **argv) {
     check(svk_scene_query(scene.get(), "lemon", &camera, &answer, mask.data(), mask.size()), scene.get());
     std::printf("lemon: %s, score %.2f at (%.1f, %.1f), %llu pixels\n", answer.found ? "found" : "not found", answer.score,
                 answer.x, answer.y, static_cast<unsigned long long>(answer.mask_pixels));
+    const char *presences[] = {"the text model cannot tell", "found", "unsure", "not in this scene"};
+    std::printf("in the scene: %s (p = %.3f), %u of it\n", presences[answer.presence], answer.p_value, answer.instances);
+    std::vector<SvkInstance> things(answer.instances, make<SvkInstance>());
+    size_t count = 0;
+    check(svk_scene_instances(scene.get(), "lemon", &camera, things.data(), things.size(), &count), scene.get());
+    for (const auto &thing : things)
+        std::printf("  at %.2f %.2f %.2f, %.2f long, %llu splats\n", thing.centre[0], thing.centre[1], thing.centre[2],
+                    thing.box_size[0], static_cast<unsigned long long>(thing.splats));
     // What was not asked for gets darker.
     for (size_t i = 0; i < pixels; i++)
         for (size_t k = 0; k < 3; k++)

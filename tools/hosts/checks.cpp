@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
+#include <cstddef>
 #include <cstring>
 #include <thread>
 
@@ -84,6 +85,42 @@ static std::vector<float> render(SvkScene *scene, const SvkCamera &camera, uint3
     return out;
 }
 
+// Presence, things in space, and what is not understood of a text.
+static void evidence(SvkScene *scene, const SvkCamera &camera) {
+    std::vector<uint8_t> mask(size_t(camera.width) * camera.height);
+    for (const char *text : {"lemon", "piano", "elephant", "iguana", "mug without handle"}) {
+        auto answer = make<SvkAnswer>();
+        check(svk_scene_query(scene, text, &camera, &answer, mask.data(), mask.size()), scene);
+        EXPECT(answer.presence >= SVK_PRESENCE_FOUND && answer.presence <= SVK_PRESENCE_ABSENT);
+        EXPECT(answer.p_value > 0 && answer.p_value <= 1);
+        EXPECT(answer.presence != SVK_PRESENCE_ABSENT || (!answer.found && !answer.instances));
+        const bool empty = std::all_of(mask.begin(), mask.end(), [](uint8_t m) { return m == 0; });
+        EXPECT(empty == !answer.found && empty == !answer.mask_pixels);
+        size_t count = 0;
+        check(svk_scene_instances(scene, text, &camera, nullptr, 0, &count), scene);
+        EXPECT(count == answer.instances);
+        std::vector<SvkInstance> things(count + 1, make<SvkInstance>());
+        check(svk_scene_instances(scene, text, &camera, things.data(), things.size(), &count), scene);
+        for (size_t i = 0; i < count; i++) {
+            EXPECT(things[i].splats > 0 && things[i].box_size[0] >= things[i].box_size[2]);
+            for (int k = 0; k < 3; k++) EXPECT(things[i].box_min[k] <= things[i].box_max[k]);
+        }
+        EXPECT(things[count].splats == 0);
+        EXPECT(svk_scene_instances(scene, text, &camera, things.data(), things.size(), nullptr) == SVK_STATUS_ARGUMENT);
+        char notes[256];
+        check(svk_scene_notes(scene, text, notes, sizeof notes), scene);
+        const bool cut = says(text, "without");
+        EXPECT(says(notes, "without handle") == cut && (!cut || answer.presence != SVK_PRESENCE_FOUND));
+        // A host of the first version knows only the fields up to the mask's pixels.
+        auto old = make<SvkAnswer>();
+        old.size = offsetof(SvkAnswer, presence);
+        old.presence = 77;
+        check(svk_scene_query(scene, text, &camera, &old, nullptr, 0), scene);
+        EXPECT(old.presence == 77 && old.score == answer.score);
+    }
+    EXPECT(svk_scene_notes(scene, nullptr, nullptr, 0) == SVK_STATUS_ARGUMENT);
+}
+
 static void reading(SvkContext *context, const char *path) {
     SvkScene *loaded = nullptr;
     EXPECT(svk_scene_load(context, "no/such/scene", &loaded) == SVK_STATUS_INPUT && !loaded);
@@ -139,6 +176,7 @@ static void reading(SvkContext *context, const char *path) {
     for (float r : relevancy) best = std::fmax(best, r);
     EXPECT(best > 0 && best <= answers[0].score + 1e-6);
     EXPECT(svk_scene_query(loaded, " ", &camera, &answers[0], nullptr, 0) == SVK_STATUS_INPUT);
+    evidence(loaded, camera);
 
     camera.world_to_camera[0][0] = NAN;
     EXPECT(svk_scene_query(loaded, "lemon", &camera, &answers[0], nullptr, 0) == SVK_STATUS_INPUT);

@@ -4,6 +4,7 @@
 //! it, answers each label's phrase with [`super::answer`] and hands both to [`Evaluation::add_frame`]; the figures
 //! agree with an independent scorer that reads only the files written.
 mod figures;
+mod instances;
 mod lengths;
 mod report;
 mod text;
@@ -13,6 +14,7 @@ mod truth;
 mod tests;
 
 pub use figures::{DepthScore, colour_fit, depth_score, iou};
+pub use instances::InstanceScore;
 pub use lengths::LengthScore;
 pub use report::{
     EvalReport, ImageScore, MaskScore, PairScore, PoseScore, RefinedScore, RefinedView, RelativeScore,
@@ -21,6 +23,7 @@ pub use report::{
 pub use truth::{GroundTruth, ObjectMaps, Split, TruthFrame};
 
 use super::QueryResult;
+use super::instances::Instance;
 use crate::format::picture;
 use crate::pass::metrics;
 use crate::photo::stem;
@@ -164,6 +167,17 @@ impl Evaluation {
     pub fn phrases(&self) -> Vec<(u32, String)> {
         let all = self.truth.labels.iter();
         all.filter(|(_, p)| !BACKGROUND_LABELS.contains(&p.as_str())).map(|(k, p)| (*k, p.clone())).collect()
+    }
+
+    /// Scores the things that answered each of [`Evaluation::phrases`], in their order.
+    pub fn add_instances(&mut self, found: &[Vec<Instance>]) -> Result<()> {
+        let phrases = self.phrases();
+        let middles = instances::middles(&self.truth, phrases.clone(), MIN_OBJECT_PIXELS)?;
+        let score = |(found, (_, phrase)): (&Vec<Instance>, &(u32, String))| {
+            instances::score(&middles, phrase, found, &self.similarity)
+        };
+        self.report.instances = found.iter().zip(&phrases).filter_map(score).collect();
+        Ok(())
     }
 
     /// The photo of a frame.

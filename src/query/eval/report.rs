@@ -1,10 +1,10 @@
 //! What `splatvk eval` reports.
-use super::{LengthScore, Split};
+use super::{InstanceScore, LengthScore, Split};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
 /// What the figures of the report are.
-pub(super) const DEFINITIONS: [&str; 10] = [
+pub(super) const DEFINITIONS: [&str; 11] = [
     "poses: after the similarity that maps the scene's cameras of the train frames onto the true ones",
     "relative_poses: over all pairs of train frames, the angle between the relative rotations and between the directions of \
      the baselines; auc_N: area under the share of pairs whose larger angle is below x, x from 0 to N degrees, exact",
@@ -21,6 +21,8 @@ pub(super) const DEFINITIONS: [&str; 10] = [
      of at least 100 pixels, surfaces behind them left out",
     "miou: plain mean of IoU over all (object, frame) pairs; localisation: share of pairs whose most relevant pixel lies on \
      the object",
+    "instances: things in space that answer a phrase, and the objects that it means; centre_distance: from the middle of what the \
+     train frames show of each to that of the nearest thing, in units of the truth",
     "train: photos that the scene was made from; test: held-out frames",
     "refined: held-out frames again, each with the focal length and principal point that the scene found for its own photos \
      (focal_relative and centre_shift against the truth's), from a camera moved until the frozen scene's render is closest to \
@@ -187,6 +189,8 @@ pub struct EvalReport {
     pub images: Vec<ImageScore>,
     /// Per object and frame; background labels are not listed.
     pub masks: Vec<MaskScore>,
+    /// Per phrase the things in space that answer it.
+    pub instances: Vec<InstanceScore>,
     /// Means per split, `train` and `test`.
     pub summary: BTreeMap<String, SplitSummary>,
     /// Held-out frames from refined cameras, if asked for.

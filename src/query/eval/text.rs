@@ -28,6 +28,13 @@ impl EvalReport {
         if let Some(degrees) = self.up_degrees {
             let _ = writeln!(out, "up       {degrees:.2} degrees off");
         }
+        if let Some((distance, right)) = super::instances::summary(&self.instances) {
+            let (phrases, right) = (self.instances.len(), percent(Some(right)));
+            let _ = writeln!(
+                out,
+                "things   right number for {right} of {phrases} phrases; middle off by {distance:.4} at the median"
+            );
+        }
         let _ = writeln!(
             out,
             "{:<9}{:>8}{:>10}{:>7}{:>11}{:>9}{:>9}{:>8}{:>11}",

@@ -31,7 +31,7 @@ fn query(text: &str, random: &mut Random) -> TextQuery {
         text: text.into(),
         embedding: unit(random),
         canonicals: (0..4).flat_map(|_| unit(random)).collect(),
-        alternatives: Default::default(),
+        ..Default::default()
     }
 }
 
@@ -527,7 +527,7 @@ fn own_ground_truth_serves_lerf_and_ovs() {
             text: phrase.clone(),
             embedding: axis(*label),
             canonicals: axis(12),
-            alternatives: Default::default(),
+            ..Default::default()
         }
     };
     for (kind, figure) in [(ProtocolKind::Lerf, "localisation"), (ProtocolKind::Ovs, "accuracy_argmax")] {

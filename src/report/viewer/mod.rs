@@ -43,7 +43,7 @@ const MARKUP: &str = include_str!("viewer.html");
 pub const STYLE: &str = include_str!("viewer.css");
 
 /// One answered query as the page shows it.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct ShownAnswer<'a> {
     /// The text of the query.
     pub text: &'a str,
@@ -53,6 +53,8 @@ pub struct ShownAnswer<'a> {
     pub views: usize,
     /// Whether the scene shows it, where that can be told.
     pub presence: Option<Presence>,
+    /// What is not understood of the text, for people.
+    pub notes: Vec<String>,
     /// What lights up.
     pub highlight: &'a Highlight,
 }
@@ -63,6 +65,7 @@ impl ShownAnswer<'_> {
         let h = self.highlight;
         json!({
             "text": self.text, "found": self.found, "views": self.views, "presence": self.presence,
+            "notes": self.notes,
             "level": h.level, "codes": h.codes, "relevancy": h.relevancy,
         })
     }
@@ -192,8 +195,14 @@ mod tests {
         let photo = RgbImage { width: 64, height: 48, data: vec![[0.3; 3]; 64 * 48] };
         let highlight =
             Highlight { level: 2, codes: vec![1], relevancy: vec![vec![], vec![], vec![0.1, 0.9]] };
-        let answer =
-            ShownAnswer { text: "</script><b>", found: 1, views: 1, presence: None, highlight: &highlight };
+        let answer = ShownAnswer {
+            text: "</script><b>",
+            found: 1,
+            views: 1,
+            presence: None,
+            notes: Vec::new(),
+            highlight: &highlight,
+        };
         let scene = Scene3d {
             title: "a<b",
             splats: &splats,

@@ -18,7 +18,7 @@
 //!
 //! Planes of one quantity deflate better than records. A position is exact to 1/65535 of a block, which is a few
 //! neighbouring splats wide.
-use crate::query::select;
+use crate::query::instances;
 use crate::scene::{LanguageField, LevelField, SH_C0, Seen, Splats};
 use crate::{Error, Result};
 use std::io::Write;
@@ -198,7 +198,7 @@ fn rotation(q: [f32; 4]) -> u32 {
 
 /// Code + 1 of every splat, 0 where its feature is about none.
 fn codes(level: &LevelField, order: &[usize]) -> Vec<u16> {
-    let of = select::splat_codes(level);
+    let of = instances::splat_codes(level);
     let code = |i: &usize| of.get(*i).copied().flatten().and_then(|k| u16::try_from(k + 1).ok());
     order.iter().map(|i| code(i).unwrap_or(0)).collect()
 }

@@ -341,11 +341,13 @@ function setQuery(answer) {
     const of = (k) => answer.relevancy[answer.level][k];
     const best = answer.codes.reduce((a, b) => (of(b) > of(a) ? b : a), answer.codes[0]);
     const where = `in ${answer.found} of ${answer.views} photos`;
-    const found = !answer.found ? "Not in this scene; this is the nearest"
-      : answer.presence === "unsure" ? `Unsure; if it is here, ${where}` : `Found ${where}`;
+    const as = `, as a ${levels[answer.level].one.toLowerCase()}`;
+    const found = !answer.found ? "Not in this scene; the heat shows what is nearest"
+      : (answer.presence === "unsure" ? `Unsure; if it is here, ${where}` : `Found ${where}`) + as;
+    const notes = (answer.notes ?? []).map((note) => `; ${note}`).join("");
     const time = answer.milliseconds === undefined ? "" : `, ${answer.milliseconds.toFixed(0)} ms`;
     const names = best === undefined ? [] : namesOf(answer.level, best);
-    card(answer.text, `${found}, as a ${levels[answer.level].one.toLowerCase()}${time}`, null, answer.level, names);
+    card(answer.text, `${found}${notes}${time}`, null, answer.level, names);
   }
   find(".v-chips").querySelectorAll("button").forEach((b) => b.setAttribute("aria-pressed", String(b.textContent === answer?.text)));
 }

@@ -114,6 +114,9 @@ impl RegionEncoder for Table {
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
         self.texts.embed(texts)
     }
+    fn holds(&self, text: &str) -> bool {
+        self.texts.get(text).is_some()
+    }
     fn others(&mut self, form: &str) -> Result<Vec<f32>> {
         Ok(self.known(&things::of_form(form)))
     }

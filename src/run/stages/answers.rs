@@ -3,8 +3,10 @@ use crate::Result;
 use crate::fit::{Trained, TrainedLanguage};
 use crate::pipeline::{Context, Lane, Output, Stage};
 use crate::query::{QueryOptions, TextQuery};
-use crate::run::ask::{self, Answers};
+use crate::run::answer::{Answers, Prepared};
 use crate::run::view::{self, DecodedFrame};
+use std::collections::HashMap;
+use std::sync::Arc;
 
 /// Renders and decodes every photo's view.
 pub struct DecodeViews;
@@ -34,7 +36,8 @@ pub struct AnswerQueries;
 impl Stage for AnswerQueries {
     const NAME: &'static str = "query";
     const LANE: Lane = Lane::Device;
-    type Inputs = (Output<Vec<DecodedFrame>>, Output<TrainedLanguage>, Output<Vec<TextQuery>>);
+    type Inputs =
+        (Output<Trained>, Output<Vec<DecodedFrame>>, Output<TrainedLanguage>, Output<Vec<TextQuery>>);
     type Output = Vec<Answers>;
 
     fn settings(&self) -> String {
@@ -43,12 +46,27 @@ impl Stage for AnswerQueries {
 
     fn run(
         self,
-        (frames, language, queries): (&Vec<DecodedFrame>, &TrainedLanguage, &Vec<TextQuery>),
+        (trained, frames, language, queries): (
+            &Trained,
+            &Vec<DecodedFrame>,
+            &TrainedLanguage,
+            &Vec<TextQuery>,
+        ),
         context: &Context,
     ) -> Result<Vec<Answers>> {
         context.progress.begin("query", queries.len() as u64);
-        let answer = |query| ask::answers(frames, &language.field, query, &QueryOptions::default());
-        let answers = queries.iter().map(answer).collect();
+        let prepared = Prepared::of_frames(&language.splats, &language.field, frames);
+        let mut backgrounds = HashMap::new();
+        let mut answer = |query: &TextQuery| {
+            for note in query.reading.notes() {
+                context.progress.warn(&format!("“{}”: {note}", query.text));
+            }
+            // Texts of one form share their other things.
+            let background = backgrounds.entry(Arc::as_ptr(&query.alternatives.things));
+            let options = QueryOptions::default();
+            prepared.answer(&language.field, (&trained.cameras, frames), query, &options, background)
+        };
+        let answers = queries.iter().map(&mut answer).collect();
         context.progress.end();
         answers
     }

@@ -74,7 +74,7 @@ impl Stage for EmbedQueries {
     }
 
     fn run(self, (): (), _: &Context) -> Result<Vec<TextQuery>> {
-        self.encoder.with(|e| ask::embedded(&self.texts, e))
+        self.encoder.with(|e| ask::queries(&self.texts, e, false))
     }
 }
 

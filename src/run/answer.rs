@@ -1,0 +1,384 @@
+//! The answer of a scene to one text: whether it is there, how many of it and where, and what every view shows of it.
+use super::view::DecodedFrame;
+use crate::Result;
+use crate::query::highlight::{Highlight, highlight};
+use crate::query::instances::{Instance, Places};
+use crate::query::phrasing::Reading;
+use crate::query::presence::{Background, Evidence, Presence, ShownCodes, ShownPixels};
+use crate::query::select::{Selection, select};
+use crate::query::{self, QueryOptions, QueryResult, TextQuery};
+use crate::report::viewer::ShownAnswer;
+use crate::scene::{Camera, LanguageField, Plane, Splats, World};
+use glam::DVec3;
+use serde_json::{Value, json};
+use std::collections::hash_map::Entry;
+
+/// What all answers of a scene need, prepared once.
+pub struct Prepared {
+    /// Of its splats.
+    places: Places,
+    /// What its own photos' cameras show.
+    pub(super) shown: ShownPixels,
+}
+
+/// The answers to one text, one per view.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct Answers {
+    /// The text of the query.
+    pub text: String,
+    /// What is understood of it.
+    pub reading: Reading,
+    /// Per view. Where it is not found, the mask is empty; relevancy and location are those of what is nearest.
+    pub views: Vec<QueryResult>,
+    /// Whether the scene has what the text means; `None` where the text model knows too few texts to tell.
+    pub presence: Option<Presence>,
+    /// Share of other things that fit the scene at least as well, in (0, 1]; `None` as before.
+    pub p_value: Option<f32>,
+    /// How far the photos agree on what answers, 0 to 1 (docs/method.md#reliability): of all of it, and per view of what it shows of
+    /// it. `None` where that is not known, or nothing answers.
+    pub reliability: Option<f64>,
+    /// See `reliability`.
+    pub view_reliability: Vec<Option<f64>>,
+    /// The splats that the text means, whatever the views; none where it is absent.
+    pub selection: Selection,
+    /// The things that the text means, largest first; none where it is absent.
+    pub instances: Vec<Instance>,
+    /// For the scene as a whole.
+    pub highlight: Highlight,
+}
+
+impl Answers {
+    /// For the interactive view.
+    pub fn shown(&self) -> ShownAnswer<'_> {
+        ShownAnswer {
+            text: &self.text,
+            found: self.found(),
+            views: self.views.len(),
+            presence: self.presence,
+            notes: self.reading.notes(),
+            highlight: &self.highlight,
+        }
+    }
+
+    /// Views in which the text was found.
+    pub fn found(&self) -> usize {
+        self.views.iter().filter(|v| v.found).count()
+    }
+
+    /// The answer in a few words.
+    pub fn verdict(&self) -> String {
+        verdict(self.presence, self.found(), self.views.len())
+    }
+
+    /// The same, with what is not understood of the text.
+    pub fn sentence(&self) -> String {
+        std::iter::once(self.verdict()).chain(self.reading.notes()).collect::<Vec<_>>().join("; ")
+    }
+
+    /// What is known of the text and of its instances, as `query --json` and run.json have it; `views` are names of the views.
+    pub fn record(&self, views: &[String], world: &World) -> Value {
+        let metres = world.scale.as_ref().map(|s| s.metres_per_unit);
+        let instances: Vec<Value> = self.instances.iter().map(|i| instance_json(i, views, metres)).collect();
+        json!({
+            "text": self.text, "presence": self.presence, "p_value": self.p_value, "reliability": self.reliability,
+            "phrasing": self.reading.phrasing, "vocabulary": self.reading.vocabulary, "instances": instances,
+        })
+    }
+}
+
+fn instance_json(i: &Instance, views: &[String], metres_per_unit: Option<f64>) -> Value {
+    let points = |list: &[DVec3], unit: f64| list.iter().map(|p| (*p * unit).to_array()).collect::<Vec<_>>();
+    let place = |unit: f64| {
+        let box_of = &i.oriented;
+        json!({
+            "centre": (i.centre * unit).to_array(),
+            "box": { "min": (i.bounds[0] * unit).to_array(), "max": (i.bounds[1] * unit).to_array() },
+            "oriented_box": {
+                "centre": (box_of.centre * unit).to_array(), "axes": points(&box_of.axes, 1.0), "size": (box_of.size * unit).to_array(),
+            },
+        })
+    };
+    let pixels: serde_json::Map<String, Value> =
+        views.iter().zip(&i.pixels).map(|(name, pixel)| (name.clone(), json!(pixel))).collect();
+    let mut entry = place(1.0);
+    entry["metres"] = metres_per_unit.map_or(Value::Null, place);
+    entry["splats"] = i.splats.len().into();
+    entry["share"] = i.share.into();
+    entry["reliability"] = json!(i.reliability);
+    entry["pixels"] = pixels.into();
+    entry
+}
+
+/// An answer in a few words: "found in 3 of 4 photos".
+pub fn verdict(presence: Option<Presence>, found: usize, views: usize) -> String {
+    match presence {
+        Some(Presence::Absent) => "not in this scene".to_owned(),
+        Some(Presence::Unsure) => format!("unsure; if it is here, in {found} of {views} photos"),
+        Some(Presence::Found) | None => format!("found in {found} of {views} photos"),
+    }
+}
+
+impl Prepared {
+    /// Of a scene and what its own cameras show.
+    pub fn new(splats: &Splats, field: &LanguageField, shown: ShownPixels) -> Prepared {
+        Prepared { places: Places::of(splats, field), shown }
+    }
+
+    /// Of a scene whose own views are these.
+    pub fn of_frames(splats: &Splats, field: &LanguageField, frames: &[DecodedFrame]) -> Prepared {
+        let codes: Vec<&[Plane<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
+        Prepared::new(splats, field, ShownPixels::of(field, &codes))
+    }
+
+    /// What speaks for a text; `background` is the place of how well the other things of its form fit this scene.
+    fn evidence<K>(
+        &self,
+        field: &LanguageField,
+        query: &TextQuery,
+        background: Entry<'_, K, Background>,
+    ) -> Option<Evidence> {
+        let shown = ShownCodes::new(&self.shown, field, &query.canonicals);
+        let background = background.or_insert_with(|| shown.background(&query.alternatives.things));
+        let evidence = shown.evidence(&query.embedding, &query.alternatives.colours, background);
+        evidence.map(|e| if query.reading.is_doubtful() { e.in_doubt() } else { e })
+    }
+
+    /// The splats that a text means; none where it is absent.
+    fn select(
+        &self,
+        field: &LanguageField,
+        query: &TextQuery,
+        presence: Option<Presence>,
+        options: &QueryOptions,
+    ) -> Result<Selection> {
+        let chosen = select(field, &self.places, query, options)?;
+        Ok(match presence {
+            Some(Presence::Absent) => Selection { splats: Vec::new(), found: false, ..chosen },
+            _ => chosen,
+        })
+    }
+
+    /// The answer in these views, which need not be the scene's own.
+    pub fn answer<K>(
+        &self,
+        field: &LanguageField,
+        (cameras, frames): (&[Camera], &[DecodedFrame]),
+        query: &TextQuery,
+        options: &QueryOptions,
+        background: Entry<'_, K, Background>,
+    ) -> Result<Answers> {
+        let evidence = self.evidence(field, query, background);
+        // A model that cannot tell what is there cannot tell that an unclear text is, either.
+        let doubt = query.reading.is_doubtful().then_some(Presence::Unsure);
+        let presence = evidence.map(|e| e.presence).or(doubt);
+        let codes: Vec<&[Plane<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
+        let mut views = query::answer_all(&codes, field, query, options)?;
+        for view in views.iter_mut().filter(|v| presence == Some(Presence::Absent) || !v.found) {
+            view.take_back();
+        }
+        let selection = self.select(field, query, presence, options)?;
+        let mut instances = match selection.found {
+            true => self.places.instances(&selection.splats, selection.level),
+            false => Vec::new(),
+        };
+        for instance in &mut instances {
+            let seen = cameras.iter().zip(frames);
+            let pixels = seen.map(|(c, f)| self.places.pixel(instance, c, &f.rendered.depth));
+            instance.pixels = pixels.collect();
+        }
+        let seen_in = |(camera, frame): (&Camera, &DecodedFrame)| {
+            let seen = self.places.seen_of(&selection.splats, camera, &frame.rendered.depth);
+            self.places.reliability(&seen, selection.level)
+        };
+        let view_reliability = cameras.iter().zip(frames).map(seen_in).collect();
+        let highlight = highlight(&codes, field, query, &views)?;
+        Ok(Answers {
+            text: query.text.clone(),
+            reading: query.reading.clone(),
+            views,
+            presence,
+            p_value: evidence.map(|e| e.p_value),
+            reliability: self.places.reliability(&selection.splats, selection.level),
+            view_reliability,
+            selection,
+            instances,
+            highlight,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::infer::things;
+    use crate::pass::RenderedFrame;
+    use crate::query::phrasing::{Phrasing, Vocabulary};
+    use crate::query::presence::Alternatives;
+    use crate::scene::{Codebook, LevelField, Pose, Scale};
+    use crate::synth::regions;
+    use std::collections::HashMap;
+    use std::sync::Arc;
+
+    /// Edge of the square pictures, pixels.
+    const SIZE: usize = 100;
+
+    /// A wall of splats one unit before the camera, as wide as its picture, with two balls and a lemon in it: pixel → phrase.
+    fn shown(x: usize, y: usize) -> usize {
+        let within = |cx: i32, cy: i32| (x as i32 - cx).abs() <= 8 && (y as i32 - cy).abs() <= 8;
+        match (within(20, 50) || within(80, 50), within(50, 80)) {
+            (true, _) => 1,
+            (_, true) => 2,
+            _ => 0,
+        }
+    }
+
+    struct Wall {
+        field: LanguageField,
+        prepared: Prepared,
+        cameras: Vec<Camera>,
+        frames: Vec<DecodedFrame>,
+        things: Arc<Vec<f32>>,
+    }
+
+    fn wall() -> Wall {
+        let phrases = ["plaster wall", "red ball", "lemon"];
+        let pixels = || (0..SIZE * SIZE).map(|p| (p % SIZE, p / SIZE));
+        let place = |(x, y): (usize, usize)| {
+            [(x as f32 + 0.5) / SIZE as f32 - 0.5, (y as f32 + 0.5) / SIZE as f32 - 0.5, 1.0]
+        };
+        let count = SIZE * SIZE;
+        let splats = Splats {
+            means: pixels().map(place).collect(),
+            log_scales: vec![[(0.5 / SIZE as f32).ln(); 3]; count],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; count],
+            opacity_logits: vec![4.0; count],
+            ..Splats::default()
+        };
+        let unit = |k: usize| (0..3).map(move |c| f32::from(u8::from(c == k)));
+        let codebook = Codebook {
+            embedding_dim: regions::DIM,
+            code_dim: 3,
+            embeddings: phrases.iter().flat_map(|p| regions::text_embedding(p)).collect(),
+            codes: (0..3).flat_map(unit).collect(),
+            ..Codebook::default()
+        };
+        let features = pixels().flat_map(|(x, y)| unit(shown(x, y))).collect();
+        let level = LevelField { codebook, features, ..LevelField::default() };
+        let field = LanguageField {
+            levels: vec![LevelField::default(), LevelField::default(), level],
+            space: "test".into(),
+        };
+        let codes =
+            Plane { width: SIZE, height: SIZE, data: pixels().map(|(x, y)| shown(x, y) as i32).collect() };
+        let none = Plane::filled(SIZE, SIZE, -1);
+        let mut rendered = RenderedFrame::empty(SIZE, SIZE, 0);
+        rendered.depth.data.fill(1.0);
+        let frames = vec![DecodedFrame { rendered, codes: vec![none.clone(), none, codes] }];
+        let (size, focal) = (SIZE as u32, SIZE as f64);
+        let cameras = vec![Camera {
+            name: "a".into(),
+            width: size,
+            height: size,
+            fx: focal,
+            fy: focal,
+            cx: 0.5 * focal,
+            cy: 0.5 * focal,
+            pose: Pose { rotation: glam::DMat3::IDENTITY, translation: DVec3::ZERO },
+        }];
+        let prepared = Prepared::of_frames(&splats, &field, &frames);
+        let things = things::of_form("").iter().flat_map(|t| regions::text_embedding(t)).collect();
+        Wall { field, prepared, cameras, frames, things: Arc::new(things) }
+    }
+
+    impl Wall {
+        fn ask(&self, text: &str, reading: Reading) -> Answers {
+            let alternatives = Alternatives { things: self.things.clone(), colours: Vec::new() };
+            let query = TextQuery { alternatives, reading, ..regions::query(text) };
+            let mut backgrounds = HashMap::new();
+            let views = (&self.cameras[..], &self.frames[..]);
+            self.prepared
+                .answer(&self.field, views, &query, &QueryOptions::default(), backgrounds.entry(0))
+                .unwrap()
+        }
+    }
+
+    #[test]
+    fn an_absent_text_is_taken_back_everywhere() {
+        let wall = wall();
+        let texts = ["iguana", "sarcophagus", "zeppelin", "turnip", "bollard", "tuba", "pelmet", "kayak"];
+        let answers = texts.map(|t| wall.ask(t, Reading::default()));
+        let absent: Vec<&Answers> = answers.iter().filter(|a| a.presence == Some(Presence::Absent)).collect();
+        // As some other things score above one half, they would be "found" by that alone.
+        assert!(!absent.is_empty() && absent.iter().any(|a| a.views[0].score > 0.5), "{answers:.2?}");
+        for a in absent {
+            let view = &a.views[0];
+            assert!(!view.found && !view.mask.data.contains(&true) && a.found() == 0);
+            assert!(view.relevancy.data.iter().any(|v| *v > 0.0), "the heat stays");
+            assert!(a.instances.is_empty() && a.selection.splats.is_empty() && !a.selection.found);
+            assert_eq!(a.verdict(), "not in this scene");
+            let record = a.record(&["a".into()], &World::default());
+            assert!(record["presence"] == "absent" && record["p_value"].as_f64().unwrap() >= 0.75);
+            assert_eq!(record["instances"], json!([]));
+            let page = a.shown().json();
+            assert!(
+                page["presence"] == "absent" && page["found"] == 0 && page["codes"] == json!([]),
+                "{page}"
+            );
+        }
+    }
+
+    #[test]
+    fn several_things_are_several_answers() {
+        let wall = wall();
+        let balls = wall.ask("red ball", Reading::default());
+        assert_eq!((balls.presence, balls.instances.len()), (Some(Presence::Found), 2));
+        let scale = Scale { metres_per_unit: 2.0, log_sigma: 0.1, stated: Vec::new() };
+        let world = World { scale: Some(scale), ..World::default() };
+        let record = balls.record(&["a".into()], &world);
+        let list = record["instances"].as_array().unwrap();
+        let number = |v: &Value| v.as_f64().unwrap();
+        for (i, found) in list.iter().enumerate() {
+            let x = number(&found["centre"][0]);
+            assert!((x.abs() - 0.295).abs() < 0.01 && number(&found["centre"][1]).abs() < 0.01, "{found}");
+            assert!((number(&found["metres"]["centre"][0]) - 2.0 * x).abs() < 1e-9);
+            let edge = number(&found["box"]["max"][0]) - number(&found["box"]["min"][0]);
+            // 17 pixels wide, of which 2 % lie outside on either side.
+            assert!((edge - 0.16).abs() < 0.011 && number(&found["splats"]) == 289.0, "{found}");
+            let sizes = [0, 1, 2].map(|k| number(&found["oriented_box"]["size"][k]));
+            assert!(sizes[0] > 0.14 && sizes[1] > 0.14 && sizes[2] < 1e-6, "{sizes:?}");
+            let pixel = balls.instances[i].pixels[0].unwrap();
+            assert!((pixel[0] - 50.0 - 100.0 * x).abs() < 1.5 && (pixel[1] - 50.5).abs() < 1.5, "{pixel:?}");
+            assert_eq!(found["pixels"]["a"], json!(pixel));
+        }
+        assert!(number(&list[0]["centre"][0]) * number(&list[1]["centre"][0]) < 0.0, "one left, one right");
+        assert_eq!(wall.ask("lemon", Reading::default()).instances.len(), 1);
+        // Where something stands before it, a thing is not seen.
+        let mut hidden = wall;
+        hidden.frames[0].rendered.depth.data.fill(0.5);
+        assert_eq!(hidden.ask("lemon", Reading::default()).instances[0].pixels, [None]);
+    }
+
+    #[test]
+    fn what_is_not_understood_is_unsure_at_most() {
+        let wall = wall();
+        assert_eq!(wall.ask("lemon", Reading::default()).presence, Some(Presence::Found));
+        let cut = Phrasing { answers_for: "lemon".into(), not_understood: "on the plate".into() };
+        let unknown = Vocabulary { known: false, nearest: "orange".into() };
+        for (reading, note) in [
+            (
+                Reading { phrasing: Some(cut), vocabulary: None },
+                "answers for “lemon”; “on the plate” is not understood",
+            ),
+            (Reading { phrasing: None, vocabulary: Some(unknown) }, "outside vocabulary; nearest: “orange”"),
+        ] {
+            let a = wall.ask("lemon", reading);
+            assert_eq!(a.presence, Some(Presence::Unsure));
+            assert!(a.found() == 1 && a.sentence() == format!("{}; {note}", a.verdict()), "{}", a.sentence());
+            assert_eq!(a.shown().json()["notes"], json!([note]));
+            let record = a.record(&["a".into()], &World::default());
+            let said = if a.reading.phrasing.is_some() { &record["phrasing"] } else { &record["vocabulary"] };
+            assert!(said["not_understood"] == "on the plate" || said["nearest"] == "orange", "{record}");
+        }
+    }
+}
