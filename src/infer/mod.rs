@@ -31,7 +31,7 @@ pub mod sam;
 #[cfg(test)]
 pub(crate) mod testing;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 pub mod text;
 pub mod things;
 pub mod warp;
@@ -81,6 +81,14 @@ pub trait RegionEncoder: Send {
     fn recoloured(&mut self, text: &str) -> Result<Vec<f32>> {
         let list = things::recoloured(text);
         self.embed_texts(&list.iter().map(String::as_str).collect::<Vec<_>>())
+    }
+    /// What gave a text its embedding, of an encoder that has several: a table or a network by name.
+    fn embedded_by(&self, _text: &str) -> Option<String> {
+        None
+    }
+    /// What is doubtful about the embeddings given so far.
+    fn doubt(&self) -> Option<String> {
+        None
     }
     /// Per region embedding ([count, D] rows) the `best` phrases of the encoder's own vocabulary, with their cosine, best
     /// first. None from an encoder that has no list of phrases.
