@@ -4,9 +4,9 @@ use crate::language::{ViewMasks, dir};
 use crate::photo::Photo;
 use crate::photo::stem;
 use crate::pipeline::{Context, Lane, Output, Stage};
-use crate::query::TextQuery;
 use crate::query::eval::{EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
-use crate::run::score::score_field;
+use crate::query::{QueryOptions, TextQuery};
+use crate::run::score::{Questions, score_field};
 use crate::run::stages::{PlacedPhotos, SharedEncoder};
 use crate::scene::{Codebook, Plane};
 use crate::synth::regions::{self, InjectedErrors};
@@ -195,7 +195,7 @@ impl Stage for Score {
             context.device,
             &language.splats,
             &language.field,
-            &self.queries,
+            Questions { queries: &self.queries, options: QueryOptions::default() },
             evaluation,
             false,
             context.progress,

@@ -1,6 +1,7 @@
 //! Command-line arguments.
 use crate::infer::provider;
-use clap::builder::PossibleValuesParser;
+use crate::run::compat::{COMPATS, NONE};
+use clap::builder::{PossibleValue, PossibleValuesParser};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -14,6 +15,13 @@ pub use super::run::RunArgs;
 pub use bench::{BenchArgs, BenchPart};
 pub use experiments::{AblateArgs, GenerateArgs};
 pub use shared::{DeviceArgs, LogFormat, MakingArgs, PresetArg};
+
+/// What `--compat` takes.
+pub fn compats() -> PossibleValuesParser {
+    let own = PossibleValue::new(NONE).help("this program's own way");
+    let all = COMPATS.iter().map(|c| PossibleValue::new(c.name).help(c.about));
+    PossibleValuesParser::new(all.chain([own]))
+}
 
 /// Photos in, a 3D scene that answers text queries out.
 #[derive(Debug, Parser)]
@@ -198,6 +206,9 @@ pub struct QueryArgs {
     /// Also write the splats that each text means, as TEXT/splats.ply
     #[arg(long)]
     pub splats: bool,
+    /// Choose level, mask and location as others do [default: as the scene was made]
+    #[arg(long, value_parser = compats(), value_name = "WHOSE")]
+    pub compat: Option<String>,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -251,6 +262,9 @@ pub struct EvalArgs {
     /// Score held-out frames a second time, from cameras moved until the frozen scene fits their photos best: `refined`
     #[arg(long)]
     pub refine_views: bool,
+    /// Choose level, mask and location as others do (--protocol field) [default: as the scene was made]
+    #[arg(long, value_parser = compats(), value_name = "WHOSE")]
+    pub compat: Option<String>,
     /// Print a short table instead of JSON; --out DIR keeps eval.json
     #[arg(long, conflicts_with = "json")]
     pub text: bool,

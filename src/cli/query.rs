@@ -7,9 +7,10 @@ use super::views;
 use crate::format::ply::{self, PlyOptions};
 use crate::format::{cameras, picture, scene_dir, write_json};
 use crate::gpu::Device;
+use crate::query::QueryResult;
 use crate::query::presence::{Evidence, Presence};
-use crate::query::{QueryOptions, QueryResult};
 use crate::report::{colour, file_name};
+use crate::run::Compat;
 use crate::run::ask::{self, QueryScene};
 use crate::run::encoder;
 use crate::run::view::DecodedFrame;
@@ -57,6 +58,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let device = Device::open(args.device.device.as_deref())?;
     let field = scene.language.take().ok_or_else(no_language)?;
     let mut ready = QueryScene::open(&device, &scene.splats, field, encoder)?;
+    let options = Compat::answers(args.compat.as_deref(), &args.scene)?;
     let progress = progress::reporter();
     progress.begin("query", cameras.len() as u64);
     let mut views: Vec<Vec<Value>> = vec![Vec::new(); args.texts.len()];
@@ -67,7 +69,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         ready.set_views(cameras)?;
         for (q, text) in args.texts.iter().enumerate() {
             let clock = Instant::now();
-            let answers = ready.ask(text, &QueryOptions::default())?;
+            let answers = ready.ask(text, &options)?;
             latency[q] += 1e3 * clock.elapsed().as_secs_f64();
             evidence[q].extend(answers.evidence);
             for (((frame, stem), camera), answer) in
@@ -91,16 +93,16 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         let best = evidence[q].iter().min_by(|a, b| a.p_value.total_cmp(&b.p_value));
         let mut entry = json!({
             "text": text, "presence": best.map(|e| e.presence), "p_value": best.map(|e| e.p_value),
-            "milliseconds": latency[q], "views": views[q],
+            "milliseconds": latency[q], "embedded_by": ready.encoder().embedded_by(text), "views": views[q],
         });
         let presence = best.map(|e| e.presence);
         verdicts.push(presence);
         if args.splats {
-            let chosen = ready.select(text, &QueryOptions::default())?;
+            let chosen = ready.select(text, &options)?;
             let name = format!("{}/splats.ply", folders[q]);
             ply::write_splats(
                 &out.file(&name)?,
-                &scene.splats.picked(&chosen.splats),
+                &ready.field().levels[chosen.level].carrier(&scene.splats).picked(&chosen.splats),
                 PlyOptions::default(),
             )?;
             entry["splats"] = json!({
@@ -110,6 +112,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         }
         queries.push(entry);
     }
+    ready.encoder().doubt().iter().for_each(|doubt| progress.warn(doubt));
     let report = json!({ "scene": args.scene, "out": args.out, "world": scene.world, "queries": queries });
     write_json(&out.file("answers.json")?, &report)?;
     out.keep();

@@ -95,6 +95,11 @@ impl QueryScene {
         names(self.encoder.as_mut(), &self.field, NAMES)
     }
 
+    /// What embeds texts.
+    pub fn encoder(&self) -> &dyn RegionEncoder {
+        self.encoder.as_ref()
+    }
+
     /// The scene's language.
     pub fn field(&self) -> &LanguageField {
         &self.field

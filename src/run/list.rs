@@ -1,6 +1,7 @@
 //! The stages of `splatvk run`.
 use super::ask::Answers;
 use super::base::BaseScene;
+use super::compat::query_options;
 use super::plan::RunPlan;
 use super::sources::{
     self, DepthSources, FeatureSources, GeometrySources, Given, GraphBuilder, MaskSources, MatchSources,
@@ -165,7 +166,8 @@ impl Aligned {
         let (recipe, options) = (plan.recipe(), plan.language_options(preset));
         let language = graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
         let frames = graph.add(stages::DecodeViews, (trained, language));
-        let answers = graph.add(stages::AnswerQueries, (frames, language, queries));
+        let answers = graph
+            .add(stages::AnswerQueries { options: query_options(plan.compat) }, (frames, language, queries));
         SceneOutputs { placed, geometry, trained, up, aligned, names, language, frames, answers }
     }
 }

@@ -29,7 +29,10 @@ impl Stage for DecodeViews {
 }
 
 /// Answers the queries.
-pub struct AnswerQueries;
+pub struct AnswerQueries {
+    /// How.
+    pub options: QueryOptions,
+}
 
 impl Stage for AnswerQueries {
     const NAME: &'static str = "query";
@@ -38,7 +41,7 @@ impl Stage for AnswerQueries {
     type Output = Vec<Answers>;
 
     fn settings(&self) -> String {
-        String::new()
+        format!("{:?}", self.options)
     }
 
     fn run(
@@ -47,7 +50,7 @@ impl Stage for AnswerQueries {
         context: &Context,
     ) -> Result<Vec<Answers>> {
         context.progress.begin("query", queries.len() as u64);
-        let answer = |query| ask::answers(frames, &language.field, query, &QueryOptions::default());
+        let answer = |query| ask::answers(frames, &language.field, query, &self.options);
         let answers = queries.iter().map(answer).collect();
         context.progress.end();
         answers
