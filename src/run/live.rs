@@ -1,7 +1,8 @@
 //! A scene that a program holds in memory: rendered, queried and saved on demand. What the C interface is made of.
+use super::compat::{Compat, query_options};
 use super::execute::save;
 use super::outcome::RunOutcome;
-use super::view::Viewer;
+use super::view::{FeatureChannels, Viewer};
 use super::{encoder, sources};
 use crate::format::scene_dir::{self, Contents, Scene};
 use crate::format::{Workspace, colmap, gaussians};
@@ -39,6 +40,7 @@ pub struct LiveScene {
     origin: SceneOrigin,
     registry: Registry,
     viewer: Viewer,
+    options: QueryOptions,
     /// The text encoder and the [C, D] unit rows of the canonical phrases; loaded with the first question.
     text_encoder: Option<(Box<dyn RegionEncoder>, Vec<f32>)>,
     /// Decoded codes of the last query's camera.
@@ -67,12 +69,17 @@ impl LiveScene {
             SceneOrigin::Trained(o) => (&o.splats, Some(&o.field)),
             SceneOrigin::Loaded(s) => (&s.splats, s.language.as_ref()),
         };
+        let compat = match &origin {
+            SceneOrigin::Trained(o) => o.plan.compat,
+            SceneOrigin::Loaded(s) => Compat::of_scene(&s.path),
+        };
         let viewer = Viewer::new(device, splats, field.unwrap_or(&LanguageField::default()))?;
         Ok(LiveScene {
             device: device.clone(),
             origin,
             registry: registry.clone(),
             viewer,
+            options: query_options(compat),
             text_encoder: None,
             seen: None,
         })
@@ -117,22 +124,20 @@ impl LiveScene {
             SceneOrigin::Loaded(_) => &[],
         }
     }
-    /// Feature channels of a level in what [`LiveScene::draw`] renders: (first, count); the count is 0 without codes.
-    pub fn features(&self, level: usize) -> (usize, usize) {
-        let n = self.splats().len().max(1);
-        let levels = self.language().map_or(&[][..], |l| &l.levels);
-        let widths: Vec<usize> = levels.iter().map(|l| l.features.len() / n).collect();
-        (widths.iter().take(level).sum(), widths.get(level).copied().unwrap_or(0))
+    /// Where [`LiveScene::draw_bands`] renders the features of a level; `None` without codes.
+    pub fn features(&self, level: usize) -> Option<FeatureChannels> {
+        self.viewer.features(level)
     }
 
-    /// Renders one camera band by band and shows every band while it is on the device.
+    /// Renders one camera band by band and shows every band while it is on the device: [`Viewer::draw_bands`].
     pub fn draw_bands(
         &mut self,
+        model: usize,
         camera: &Camera,
         seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
     ) -> Result<()> {
         check(camera)?;
-        self.viewer.draw_bands(camera, seen)
+        self.viewer.draw_bands(model, camera, seen)
     }
 
     /// Renders one camera that the device holds at once. The frame stays on the device, and valid until the next call.
@@ -171,7 +176,7 @@ impl LiveScene {
         }
         let codes = self.seen.as_ref().map_or(&[][..], |(_, codes)| codes);
         let field = self.language().ok_or_else(|| Error::work("the scene has no language"))?;
-        query::answer(codes, field, &query, &QueryOptions::default())
+        query::answer(codes, field, &query, &self.options)
     }
 
     fn open_text_encoder(&self) -> Result<(Box<dyn RegionEncoder>, Vec<f32>)> {

@@ -1,7 +1,9 @@
 //! The commands that make scenes, as lists of stages, and what is done with a finished one.
 pub mod ask;
 pub mod base;
+mod border;
 pub mod budget;
+pub mod compat;
 pub mod encoder;
 mod execute;
 mod fidelity;
@@ -22,6 +24,7 @@ pub mod train;
 pub mod view;
 
 pub use ask::Answers;
+pub use compat::Compat;
 pub use execute::{reconstruct, run, save, stage_folder};
 pub use method::{FEATURE_DIM, Method, Recipe};
 pub use outcome::RunOutcome;
