@@ -6,7 +6,6 @@ use super::scene::{SvkScene, camera_in};
 use super::types::*;
 use crate::fit::Preset;
 use crate::infer::installed::{Inventory, inventory};
-use crate::language::sam::SamOptions;
 use crate::photo::{self, Photo};
 use crate::pose::choose;
 use crate::progress::Progress;
@@ -197,11 +196,10 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Cal
         } else {
             o.feature_dim as usize
         },
-        per_level: o.per_level != 0 || compat.is_some_and(|c| c.per_level),
-        sam: SamOptions { paint_in_order: compat.is_some_and(|c| c.paint_in_order), ..SamOptions::default() },
-        compat,
+        per_level: o.per_level != 0,
         ..RunPlan::default()
-    })
+    }
+    .compatible(compat))
 }
 
 /// A source by its name, or by the file or folder that an older field holds, or the built-in one.

@@ -1,7 +1,6 @@
 //! Command-line arguments.
 use crate::infer::provider;
-use crate::run::compat::{COMPATS, NONE};
-use clap::builder::{PossibleValue, PossibleValuesParser};
+use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -14,14 +13,7 @@ pub use super::measure::MeasureArgs;
 pub use super::run::RunArgs;
 pub use bench::{BenchArgs, BenchPart};
 pub use experiments::{AblateArgs, GenerateArgs};
-pub use shared::{DeviceArgs, LogFormat, MakingArgs, PresetArg};
-
-/// What `--compat` takes.
-pub fn compats() -> PossibleValuesParser {
-    let own = PossibleValue::new(NONE).help("this program's own way");
-    let all = COMPATS.iter().map(|c| PossibleValue::new(c.name).help(c.about));
-    PossibleValuesParser::new(all.chain([own]))
-}
+pub use shared::{DeviceArgs, LogFormat, MakingArgs, PresetArg, compats};
 
 /// Photos in, a 3D scene that answers text queries out.
 #[derive(Debug, Parser)]

@@ -161,12 +161,7 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         depth_prior,
         matcher: choose::<MatchSources>(&args.matcher, installed)?,
         masks: choose::<MaskSources>(&args.masks, installed)?,
-        sam: SamOptions {
-            points: args.mask_points,
-            crops: !args.no_mask_crops,
-            paint_in_order: compat.is_some_and(|c| c.paint_in_order),
-            ..SamOptions::default()
-        },
+        sam: SamOptions { points: args.mask_points, crops: !args.no_mask_crops, ..SamOptions::default() },
         features: choose::<FeatureSources>(&args.features, installed)?,
         queries: args.queries.clone(),
         seed: args.seed,
@@ -175,15 +170,16 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         sh_degree: args.making.sh_degree,
         method,
         feature_dim,
-        per_level: args.per_level || compat.is_some_and(|c| c.per_level),
-        compat,
+        per_level: args.per_level,
+        compat: None,
         max_size: plan::max_size(args.max_size)?,
         device: args.device.device.clone(),
         deterministic: args.deterministic,
         cameras: Vec::new(),
         models: args.device.models.clone(),
         provider: args.device.provider.clone(),
-    })
+    }
+    .compatible(compat))
 }
 
 /// The plan for photos that join a scene: what the arguments leave open is as the scene was made.
@@ -202,11 +198,10 @@ fn joining(args: &RunArgs, scene: &Path, installed: &Inventory) -> Result<RunPla
         features: as_made::<FeatureSources>(&made, &args.features, installed)?,
         feature_dim: made.feature_dim().unwrap_or(plan.feature_dim),
         per_level: made.per_level(),
-        sam: SamOptions { paint_in_order: compat.is_some_and(|c| c.paint_in_order), ..plan.sam },
-        compat,
         queries: made.queries(&plan.queries),
         ..plan
-    })
+    }
+    .compatible(compat))
 }
 
 /// The source that is asked for; where that is left open, the one that the scene was made with.

@@ -55,6 +55,8 @@ fn range(values: &[f64]) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::pass::renderer::RenderedFrame;
+    use crate::scene::RgbImage;
 
     #[test]
     fn a_hidden_photo_is_named_and_others_are_not() {
@@ -63,6 +65,19 @@ mod tests {
         assert_eq!(warning([38.0, 30.1, 36.0, 37.0]), None);
         let text = warning([32.0, 13.3, 34.0, 31.0]).unwrap();
         assert!(text.contains("shows b (13.3 dB) far worse than the best photo (34.0 dB)"), "{text}");
+    }
+
+    #[test]
+    fn a_photo_is_compared_with_the_frame_of_the_finished_scene() {
+        let image = |v: f32| RgbImage { width: 64, height: 64, data: vec![[v; 3]; 4096] };
+        let frame = |v: f32| DecodedFrame {
+            rendered: RenderedFrame { rgb: image(v), ..RenderedFrame::default() },
+            codes: Vec::new(),
+        };
+        let photos =
+            ["a.png", "b.png"].map(|n| crate::photo::from_pixels(n.as_ref(), &image(0.5), None, 64).unwrap());
+        let found = psnr(&[frame(0.6), frame(0.5)], &photos);
+        assert!((found[0] - 20.0).abs() < 1e-3 && found[1] == MOST_PSNR, "{found:?}");
     }
 
     #[test]

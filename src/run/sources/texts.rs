@@ -4,7 +4,6 @@ use crate::infer::contract::Part;
 use crate::infer::installed::{Installed, Task, inventory};
 use crate::infer::{RegionEncoder, Registry, nearest, things};
 use crate::language::dir::TextEmbeddings;
-use crate::math::dot;
 use crate::query::CANONICAL_PHRASES;
 use crate::query::presence::MIN_OTHERS;
 use crate::scene::{Plane, RgbImage};
@@ -19,6 +18,10 @@ const PROBES: usize = 4;
 /// Least cosine between its embedding of a phrase and the table's. Tables may word a phrase as "a photo of …", which leaves
 /// it at 0.8 and more; directions of another space are at 0 ± 1/√D.
 const SAME_SPACE: f64 = 0.5;
+
+fn cosine(a: &[f32], b: &[f32]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| f64::from(a * b)).sum()
+}
 
 /// What embeds texts for the features of a `dir:` folder whose table is `path`, if it has one; `dim` is the length of the
 /// features, where that is known.
@@ -83,7 +86,7 @@ impl DirTexts {
             let probes: Vec<(&str, &[f32])> = self.texts.iter().take(PROBES).collect();
             let phrases: Vec<&str> = probes.iter().map(|p| p.0).collect();
             let rows = network.embed_texts(&phrases)?;
-            let alike = |(row, probe): (&[f32], &(&str, &[f32]))| dot(row, probe.1) >= SAME_SPACE;
+            let alike = |(row, probe): (&[f32], &(&str, &[f32]))| cosine(row, probe.1) >= SAME_SPACE;
             if rows.chunks_exact(self.texts.dim.max(1)).zip(&probes).all(alike) {
                 return Ok(Some(Tower { name, network, proven: !probes.is_empty() }));
             }
@@ -180,7 +183,7 @@ mod tests {
             (Some("text_embeddings.npz"), None)
         );
         let green = both.embed_texts(&["green"]).unwrap();
-        assert!(dot(&green, &blue) < 0.9 && (dot(&green, &green) - 1.0).abs() < 1e-5);
+        assert!(cosine(&green, &blue) < 0.9 && (cosine(&green, &green) - 1.0).abs() < 1e-5);
         assert_eq!(both.embedded_by("green").as_deref(), Some("clip_toy"));
         assert_eq!(both.doubt(), None, "the network says of \"blue\" what the table says");
 
