@@ -646,6 +646,10 @@ typedef struct {
      SvkShDegree
      */
     uint64_t sh_degree;
+    /*
+     What can be done in several ways, as others do it: as --compat takes it. NULL = as this library does it.
+     */
+    const char *compat;
 } SvkTrainOptions;
 
 /*

@@ -148,6 +148,7 @@ mod tests {
             embedding: embedding.into(),
             canonicals: vec![0.0, 1.0, 0.0],
             alternatives: Default::default(),
+            reading: Default::default(),
         };
         let encoder = SharedEncoder::new(Box::new(Colours), String::new());
         let miou = |red: [f32; 3]| {

@@ -5,10 +5,10 @@ use crate::language::{LevelMasks, ViewMasks, dir};
 use crate::photo::Photo;
 use crate::photo::stem;
 use crate::pipeline::{Context, Lane, Output, Stage};
-use crate::query::TextQuery;
 use crate::query::eval::{EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
 use crate::query::protocol::{self, CodeScores, DecodedView, ProtocolKind, ProtocolReport};
-use crate::run::score::score_field;
+use crate::query::{QueryOptions, TextQuery};
+use crate::run::score::{Questions, score_field};
 use crate::run::stages::{PlacedPhotos, SharedEncoder};
 use crate::run::view::Viewer;
 use crate::scene::{Codebook, Plane};
@@ -200,7 +200,7 @@ impl Stage for Score {
             context.device,
             &language.splats,
             &language.field,
-            &self.queries,
+            Questions { queries: &self.queries, options: QueryOptions::default() },
             evaluation,
             false,
             context.progress,
@@ -313,6 +313,7 @@ impl Stage for LabelledMasks {
                 labels: Plane { width: objects.width, height: objects.height, data: labels },
                 quality: vec![1.0; shown.len()],
                 features: shown.iter().flat_map(|k| words[k].iter().copied()).collect(),
+                whole: Vec::new(),
             };
             views.push(ViewMasks { levels: vec![level; 3] });
         }

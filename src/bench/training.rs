@@ -48,7 +48,7 @@ pub fn with_features(
     let levels = features.div_ceil(16);
     let fields: Vec<LevelField> =
         (0..levels).map(|l| level(&target[0], features / levels, l as u64)).collect();
-    let fields: Vec<&LevelField> = fields.iter().collect();
+    let fields: Vec<(usize, &LevelField)> = fields.iter().enumerate().collect();
     let options = LanguageOptions {
         rates: Rates::STILL,
         feature_rate: 0.0,

@@ -7,7 +7,9 @@ use crate::gpu::external::{Sync, Target};
 use crate::gpu::vk::{self, Handle};
 use crate::pass::pack::{self, Encoding, FrameChannel};
 use crate::run::live::LiveScene;
+use crate::run::view::{FeatureChannels, SCENE_MODEL};
 use crate::scene::Camera;
+use std::collections::BTreeSet;
 
 /// Renders the scene from a camera into all `outputs` at once. `sync` may be NULL: then targets are written at once, and
 /// the call returns when they are. With a signal semaphore the call returns earlier; memory of the host is always written
@@ -52,7 +54,8 @@ struct RenderRequest {
 }
 
 enum RenderContent {
-    Frame(FrameChannel),
+    /// Of one of the scene's models.
+    Frame(usize, FrameChannel),
     Relevancy(String),
 }
 
@@ -111,7 +114,7 @@ fn pack_all(
     let mut packed: Vec<Option<Buffer<u32>>> = Vec::with_capacity(wanted.len());
     for w in wanted {
         packed.push(match &w.what {
-            RenderContent::Frame(_) => None,
+            RenderContent::Frame(..) => None,
             RenderContent::Relevancy(text) => {
                 let map = one_view(live.ask(text, camera)?)?.relevancy.data;
                 Some(match w.encoding {
@@ -124,17 +127,22 @@ fn pack_all(
             }
         });
     }
-    if packed.iter().any(Option::is_none) {
-        let pixels = camera.width as usize * camera.height as usize;
-        for (slot, w) in packed.iter_mut().zip(wanted) {
-            if let RenderContent::Frame(source) = w.what {
-                *slot = Some(pack::texels(&device, pixels, source, w.encoding)?);
-            }
+    let pixels = camera.width as usize * camera.height as usize;
+    let mut models = BTreeSet::new();
+    for (slot, w) in packed.iter_mut().zip(wanted) {
+        if let RenderContent::Frame(model, source) = w.what {
+            *slot = Some(pack::texels(&device, pixels, source, w.encoding)?);
+            models.insert(model);
         }
-        live.draw_bands(camera, |frame, band| {
+    }
+    for model in models {
+        live.draw_bands(model, camera, |frame, band| {
             for (slot, w) in packed.iter().zip(wanted) {
-                if let (Some(texels), RenderContent::Frame(source)) = (slot, &w.what) {
-                    pack::pack(&device, frame, band, *source, w.encoding, texels)?;
+                match (slot, &w.what) {
+                    (Some(texels), RenderContent::Frame(of, source)) if *of == model => {
+                        pack::pack(&device, frame, band, *source, w.encoding, texels)?;
+                    }
+                    _ => {}
                 }
             }
             Ok(())
@@ -157,14 +165,16 @@ unsafe fn checked_request(
         other => return bad_argument(format!("output {i}: there is no encoding {other}")),
     };
     let what = match o.channel {
-        0 => RenderContent::Frame(FrameChannel::Colour),
-        1 => RenderContent::Frame(FrameChannel::Alpha),
-        2 => RenderContent::Frame(FrameChannel::Depth),
+        0 => RenderContent::Frame(SCENE_MODEL, FrameChannel::Colour),
+        1 => RenderContent::Frame(SCENE_MODEL, FrameChannel::Alpha),
+        2 => RenderContent::Frame(SCENE_MODEL, FrameChannel::Depth),
         3 => match live.features(o.level as usize) {
-            (_, 0) => {
+            None => {
                 return bad_argument(format!("output {i}: the scene has no features at level {}", o.level));
             }
-            (first, count) => RenderContent::Frame(FrameChannel::Features(first, count)),
+            Some(FeatureChannels { model, first, count }) => {
+                RenderContent::Frame(model, FrameChannel::Features(first, count))
+            }
         },
         // SAFETY: per the header.
         4 => match unsafe { boundary::text(o.text, "SvkOutput.text") }? {
@@ -179,7 +189,7 @@ unsafe fn checked_request(
         other => return bad_argument(format!("output {i}: there is no channel {other}")),
     };
     let channels = match &what {
-        RenderContent::Frame(source) => source.channels(),
+        RenderContent::Frame(_, source) => source.channels(),
         RenderContent::Relevancy(_) => 1,
     };
     let bytes = encoding.bytes(channels, camera.width as usize * camera.height as usize);

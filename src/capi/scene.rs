@@ -119,7 +119,7 @@ pub unsafe extern "C" fn svk_scene_info(scene: *const SvkScene, info: *mut SvkSc
                 sh_degree: live.splats().sh_degree,
                 cameras: live.cameras().len() as u32,
                 codes: [0, 1, 2].map(level),
-                feature_dim: [0, 1, 2].map(|k| live.features(k).1 as u32),
+                feature_dim: [0, 1, 2].map(|k| live.features(k).map_or(0, |f| f.count as u32)),
                 metres_per_unit: live.world().scale.as_ref().map_or(0.0, |s| s.metres_per_unit),
             };
             boundary::write(info, &value)

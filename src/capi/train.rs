@@ -9,6 +9,7 @@ use crate::infer::installed::{Inventory, inventory};
 use crate::photo::{self, Photo};
 use crate::pose::choose;
 use crate::progress::Progress;
+use crate::run::compat::{self, Compat};
 use crate::run::live::LiveScene;
 use crate::run::sources::{self, SourceChoice, SourceKind, choose};
 use crate::run::{self, Method, RunPlan};
@@ -166,6 +167,7 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Cal
     let count = |n: u64| usize::try_from(n).ok().filter(|n| *n > 0);
     let method = text(o.method, "method")?.map(|name| Method::named(&name)).transpose()?;
     let method = method.unwrap_or(RunPlan::default().method);
+    let compat = text(o.compat, "compat")?.map_or(Ok(None), |name| Compat::named(&name))?;
     Ok(RunPlan {
         preset,
         init: source::<sources::GeometrySources>(
@@ -189,10 +191,15 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Cal
         language_iterations: count(o.language_iterations),
         sh_degree,
         method,
-        feature_dim: if o.feature_dim == 0 { method.recipe.feature_dim } else { o.feature_dim as usize },
+        feature_dim: if o.feature_dim == 0 {
+            compat::feature_dim(compat, method)
+        } else {
+            o.feature_dim as usize
+        },
         per_level: o.per_level != 0,
         ..RunPlan::default()
-    })
+    }
+    .compatible(compat))
 }
 
 /// A source by its name, or by the file or folder that an older field holds, or the built-in one.

@@ -324,6 +324,8 @@ pub struct SvkTrainOptions {
     pub method: *const c_char,
     /// SvkShDegree
     pub sh_degree: u64,
+    /// What can be done in several ways, as others do it: as --compat takes it. NULL = as this library does it.
+    pub compat: *const c_char,
 }
 
 /// What a scene holds.

@@ -13,7 +13,7 @@ pub use super::measure::MeasureArgs;
 pub use super::run::RunArgs;
 pub use bench::{BenchArgs, BenchPart};
 pub use experiments::{AblateArgs, GenerateArgs, LayoutArg};
-pub use shared::{DeviceArgs, LogFormat, MakingArgs, PresetArg};
+pub use shared::{DeviceArgs, LogFormat, MakingArgs, PresetArg, compats};
 
 /// Photos in, a 3D scene that answers text queries out.
 #[derive(Debug, Parser)]
@@ -199,6 +199,9 @@ pub struct QueryArgs {
     /// Also write the splats that each text means, as TEXT/splats.ply
     #[arg(long)]
     pub splats: bool,
+    /// Choose level, mask and location as others do [default: as the scene was made]
+    #[arg(long, value_parser = compats(), value_name = "WHOSE")]
+    pub compat: Option<String>,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -252,6 +255,9 @@ pub struct EvalArgs {
     /// Score held-out frames a second time, from cameras moved until the frozen scene fits their photos best: `refined`
     #[arg(long)]
     pub refine_views: bool,
+    /// Choose level, mask and location as others do (--protocol field) [default: as the scene was made]
+    #[arg(long, value_parser = compats(), value_name = "WHOSE")]
+    pub compat: Option<String>,
     /// Print a short table instead of JSON; --out DIR keeps eval.json
     #[arg(long, conflicts_with = "json")]
     pub text: bool,

@@ -9,9 +9,10 @@ use crate::query::TextQuery;
 use crate::query::eval::{EvalReport, Evaluation, GroundTruth};
 use crate::query::protocol::{self, CodeScores, DecodedView, Masks, ProtocolKind};
 use crate::report::file_name;
+use crate::run::Compat;
 use crate::run::ask;
 use crate::run::encoder;
-use crate::run::score::score_field;
+use crate::run::score::{Questions, score_field};
 use crate::run::view::Viewer;
 use crate::scene::LanguageField;
 use crate::{Error, Result};
@@ -31,9 +32,9 @@ pub fn eval(args: &EvalArgs) -> Result<()> {
             let found = field(&scene, args)?;
             report(&found, args, Some(found.text()))
         }
-        _ if args.refine_views || args.text => {
-            Err(Error::input("--refine-views and --text belong to --protocol field; leave them out"))
-        }
+        _ if args.refine_views || args.text || args.compat.is_some() => Err(Error::input(
+            "--refine-views, --text and --compat belong to --protocol field; leave them out",
+        )),
         ProtocolArg::Lerf => report(&published(ProtocolKind::Lerf, &scene, args)?, args, None),
         ProtocolArg::Ovs => report(&published(ProtocolKind::Ovs, &scene, args)?, args, None),
         ProtocolArg::Scannet => report(&published(ProtocolKind::ScanNet, &scene, args)?, args, None),
@@ -47,7 +48,9 @@ fn ask(scene: &Scene, texts: &[String], args: &EvalArgs) -> Result<Vec<TextQuery
     }
     let registry = args.device.registry()?;
     let mut encoder = encoder::of_scene(scene, registry)?;
-    ask::embedded(texts, encoder.as_mut())
+    let queries = ask::embedded(texts, encoder.as_mut())?;
+    encoder.doubt().iter().for_each(|doubt| progress::reporter().warn(doubt));
+    Ok(queries)
 }
 
 fn field(scene: &Scene, args: &EvalArgs) -> Result<EvalReport> {
@@ -63,7 +66,7 @@ fn field(scene: &Scene, args: &EvalArgs) -> Result<EvalReport> {
         &device,
         &scene.splats,
         field,
-        &queries,
+        Questions { queries: &queries, options: Compat::answers(args.compat.as_deref(), &args.scene)? },
         evaluation,
         args.refine_views,
         progress::reporter().as_ref(),

@@ -103,7 +103,9 @@ fn rotation(scene: &Scene, args: &ExportArgs) -> Result<DMat3> {
 
 /// Moves everything that a scene has in space.
 fn place(scene: &mut Scene, points: &mut Option<PointCloud>, by: &Similarity) {
-    transform_splats(&mut scene.splats, by);
+    let levels = scene.language.iter_mut().flat_map(|field| &mut field.levels);
+    let own = levels.filter_map(|level| level.splats.as_mut());
+    own.chain([&mut scene.splats]).for_each(|splats| transform_splats(splats, by));
     scene.cameras.iter_mut().for_each(|c| *c = by.camera(c));
     if let Some(points) = points {
         for p in &mut points.positions {
@@ -139,6 +141,9 @@ pub fn export(args: &ExportArgs) -> Result<()> {
                     args.scene.display()
                 )));
             }
+            if args.with_features {
+                warn_of_models(&scene);
+            }
             let options = ply::PlyOptions { degree: args.ply_degree, language };
             write_whole_file(&args.out, |path| ply::write_splats(path, &scene.splats, options))?;
         }
@@ -157,10 +162,22 @@ pub fn export(args: &ExportArgs) -> Result<()> {
             if let Some(brightest) = format.brightest {
                 warn_of_range(&scene.splats, brightest);
             }
+            warn_of_models(&scene);
             gaussians::write_as(&args.out, &scene.splats, scene.language.as_ref(), format)?;
         }
     }
     listing(std::slice::from_ref(&args.out), args.json)
+}
+
+/// Warns where a file of one set of splats gets features that were trained on others.
+fn warn_of_models(scene: &Scene) {
+    let levels = scene.language.iter().flat_map(|field| &field.levels);
+    if levels.into_iter().any(|level| level.splats.is_some()) {
+        progress::reporter().warn(
+            "every level of this scene has splats of its own, a file has one set: features go with the shared splats, which \
+             they were not trained on; the scene directory keeps all",
+        );
+    }
 }
 
 /// Drops what no photo shows.

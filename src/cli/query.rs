@@ -7,9 +7,10 @@ use super::views;
 use crate::format::ply::{self, PlyOptions};
 use crate::format::{cameras, picture, scene_dir, write_json};
 use crate::gpu::Device;
+use crate::query::QueryResult;
 use crate::query::instances::Instance;
-use crate::query::{QueryOptions, QueryResult};
 use crate::report::{colour, file_name};
+use crate::run::Compat;
 use crate::run::answer::{self, Answers};
 use crate::run::ask::QueryScene;
 use crate::run::encoder;
@@ -58,6 +59,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let device = Device::open(args.device.device.as_deref())?;
     let field = scene.language.take().ok_or_else(no_language)?;
     let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
+    let options = Compat::answers(args.compat.as_deref(), &args.scene)?;
     let progress = progress::reporter();
     progress.begin("query", cameras.len() as u64);
     let mut asked: Vec<Asked> = args.texts.iter().map(|_| Asked::default()).collect();
@@ -66,7 +68,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         ready.set_views(cameras)?;
         for ((text, folder), asked) in args.texts.iter().zip(&folders).zip(&mut asked) {
             let clock = Instant::now();
-            let answers = ready.ask(text, &QueryOptions::default())?;
+            let answers = ready.ask(text, &options)?;
             let before = asked.views.len();
             asked.milliseconds += 1e3 * clock.elapsed().as_secs_f64();
             for (((frame, stem), camera), answer) in
@@ -91,9 +93,11 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         }
         let mut entry = answers.record(&stems, &scene.world);
         (entry["milliseconds"], entry["views"]) = (asked.milliseconds.into(), asked.views.clone().into());
+        entry["embedded_by"] = json!(ready.encoder().embedded_by(&answers.text));
         if args.splats {
             let (chosen, name) = (&answers.selection, format!("{folder}/splats.ply"));
-            let splats = scene.splats.picked(&chosen.splats);
+            let carrier = ready.field().levels[chosen.level].carrier(&scene.splats);
+            let splats = carrier.picked(&chosen.splats);
             ply::write_splats(&out.file(&name)?, &splats, PlyOptions::default())?;
             entry["splats"] = json!({
                 "count": chosen.splats.len(), "level": LEVEL_NAMES[chosen.level], "found": chosen.found, "file": name,
@@ -101,6 +105,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         }
         queries.push(entry);
     }
+    ready.encoder().doubt().iter().for_each(|doubt| progress.warn(doubt));
     let report = json!({ "scene": args.scene, "out": args.out, "world": scene.world, "queries": queries });
     write_json(&out.file("answers.json")?, &report)?;
     out.keep();

@@ -1,5 +1,5 @@
 //! `splatvk run`
-use super::args::{DeviceArgs, MakingArgs};
+use super::args::{DeviceArgs, MakingArgs, compats};
 use super::plan;
 use super::print::{print, print_json};
 use super::progress;
@@ -7,6 +7,7 @@ use crate::infer::installed::{Inventory, inventory};
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;
 use crate::run::base::{Settings, next_to};
+use crate::run::compat::{self, Compat};
 use crate::run::method::METHODS;
 use crate::run::sources::{
     self, DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice, SourceKind,
@@ -26,7 +27,7 @@ pub struct RunArgs {
     pub inputs: Vec<PathBuf>,
     /// Add the photos to this scene, made by run, instead of making one of their own; without --out, the larger scene stands beside it
     /// under the next number, and the old one stays
-    #[arg(long, value_name = "SCENE", conflicts_with_all = ["views", "init", "depth_prior", "method", "feature_dim", "per_level"])]
+    #[arg(long, value_name = "SCENE", conflicts_with_all = ["views", "init", "depth_prior", "method", "feature_dim", "per_level", "compat"])]
     pub add: Option<PathBuf>,
     /// How many photos to use: sharp ones that overlap, from different places [default: all, at most 4]
     #[arg(long, value_name = "N")]
@@ -73,7 +74,7 @@ pub struct RunArgs {
     /// Optimisation steps of the language stage, instead of the preset's
     #[arg(long, value_name = "N")]
     pub language_iterations: Option<usize>,
-    /// Length of the codes that splats carry: 3, 8 or 16 [default: 16; langsplat 3, legaussians 8]
+    /// Length of the codes that splats carry: 3, 8 or 16 [default: 16; --compat and langsplat 3, legaussians 8]
     #[arg(long, value_name = "D")]
     pub feature_dim: Option<usize>,
     /// How language gets onto the splats: this program's way, or a baseline on the same geometry to compare with
@@ -82,6 +83,10 @@ pub struct RunArgs {
     /// One model per level as in the paper, instead of one geometry for all three
     #[arg(long)]
     pub per_level: bool,
+    /// Do what can be done in several ways as the paper, its authors' code or LangSplat: area score and conditions of the alignment,
+    /// order of masks, one model per level, 3 numbers per code, level and mask of answers
+    #[arg(long, value_parser = compats(), value_name = "WHOSE")]
+    pub compat: Option<String>,
     /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged [default: 800 on a CPU device, 1600 on a GPU]
     #[arg(long, value_name = "N")]
     pub max_size: Option<usize>,
@@ -113,7 +118,8 @@ pub fn run(args: &RunArgs) -> Result<()> {
 fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
     let method = Method::named(&args.method)?;
     let recipe = method.recipe;
-    let feature_dim = args.feature_dim.unwrap_or(recipe.feature_dim);
+    let compat = args.compat.as_deref().map_or(Ok(None), Compat::named)?;
+    let feature_dim = args.feature_dim.unwrap_or_else(|| compat::feature_dim(compat, method));
     if ![3, 8, 16].contains(&feature_dim) {
         return Err(Error::input(format!("--feature-dim {feature_dim}: choose 3, 8 or 16")));
     }
@@ -165,19 +171,22 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         method,
         feature_dim,
         per_level: args.per_level,
+        compat: None,
         max_size: plan::max_size(args.max_size)?,
         device: args.device.device.clone(),
         deterministic: args.deterministic,
         cameras: Vec::new(),
         models: args.device.models.clone(),
         provider: args.device.provider.clone(),
-    })
+    }
+    .compatible(compat))
 }
 
 /// The plan for photos that join a scene: what the arguments leave open is as the scene was made.
 fn joining(args: &RunArgs, scene: &Path, installed: &Inventory) -> Result<RunPlan> {
     let made = Settings::read(scene)?;
     let plan = plan(args, installed)?;
+    let compat = made.compat().map_or(Ok(None), Compat::named)?;
     Ok(RunPlan {
         add: Some(scene.to_path_buf()),
         out: args.out.clone().unwrap_or_else(|| next_to(scene)),
@@ -188,9 +197,11 @@ fn joining(args: &RunArgs, scene: &Path, installed: &Inventory) -> Result<RunPla
         masks: as_made::<MaskSources>(&made, &args.masks, installed)?,
         features: as_made::<FeatureSources>(&made, &args.features, installed)?,
         feature_dim: made.feature_dim().unwrap_or(plan.feature_dim),
+        per_level: made.per_level(),
         queries: made.queries(&plan.queries),
         ..plan
-    })
+    }
+    .compatible(compat))
 }
 
 /// The source that is asked for; where that is left open, the one that the scene was made with.
@@ -214,6 +225,7 @@ mod tests {
     use super::*;
     use crate::cli::args::{Cli, Command};
     use crate::infer::installed::{Installed, Task};
+    use crate::language::align::{AlignOptions, AreaScore};
     use clap::Parser;
 
     fn named(name: &str) -> SourceChoice {
@@ -279,6 +291,21 @@ mod tests {
         for (name, dim) in [("sparselgs", 16), ("langsplat", 3), ("legaussians", 8), ("lsm", 16)] {
             assert_eq!(plan(&["--method", name]).unwrap().feature_dim, dim, "{name}");
         }
+    }
+
+    #[test]
+    fn what_others_do_is_resolved_in_the_plan() {
+        let ours = plan(&[]).unwrap();
+        assert_eq!(ours.recipe().align, AlignOptions::default());
+        let paper = plan(&["--compat", "paper"]).unwrap();
+        let area = paper.recipe().align.area;
+        assert_eq!((paper.feature_dim, paper.per_level, area), (3, true, AreaScore::Paper));
+        assert_eq!(serde_json::to_value(&paper).unwrap()["compat"], "paper");
+        let authors = plan(&["--compat", "authors", "--feature-dim", "8"]).unwrap();
+        assert_eq!((authors.feature_dim, authors.sam.paint_in_order), (8, true));
+        assert!(!authors.recipe().build("x", 0).align.fusion, "dead at its own thresholds");
+        let theirs = plan(&["--compat", "langsplat", "--method", "legaussians"]).unwrap();
+        assert_eq!((theirs.feature_dim, theirs.recipe().build("x", 0).align.matching), (8, false));
     }
 
     #[test]

@@ -7,6 +7,7 @@ use crate::gpu::Device;
 use crate::photo;
 use crate::query::QueryOptions;
 use crate::report::viewer::{self, CodeNames, SCENE_PATH, Scene3d};
+use crate::run::Compat;
 use crate::run::ask::QueryScene;
 use crate::run::encoder;
 use crate::scene::RgbImage;
@@ -41,6 +42,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     }
     let names = ready.as_mut().map_or(Ok(CodeNames::new()), QueryScene::names)?;
     let content = Content {
+        options: Compat::answers(None, &args.scene)?,
         page: page(&scene, args, &names, no_questions.as_deref())?,
         splats: viewer::pack(&scene.splats, &scene.seen, scene.language.as_ref(), usize::MAX)?.bytes,
         port: port_of(&server)?,
@@ -108,6 +110,7 @@ fn page(scene: &Scene, args: &ViewArgs, names: &CodeNames, no_questions: Option<
 
 /// What is sent.
 struct Content {
+    options: QueryOptions,
     page: String,
     splats: Vec<u8>,
     port: u16,
@@ -152,7 +155,7 @@ impl Content {
                 let ready = ready.ok_or_else(|| (404, "this scene answers no questions".to_owned()))?;
                 let text = question(request)
                     .ok_or_else(|| (400, "ask as {\"text\": \"a few words\"}".to_owned()))?;
-                let answer = reply(ready, &text)
+                let answer = reply(ready, &text, &self.options)
                     .map_err(|e| (if e.exit_code() == 2 { 422 } else { 500 }, e.to_string()))?;
                 Ok(("application/json", answer.to_string().into_bytes()))
             }
@@ -181,9 +184,9 @@ fn question(request: &mut Request) -> Option<String> {
     (!text.is_empty()).then(|| text.to_owned())
 }
 
-fn reply(ready: &mut QueryScene, text: &str) -> Result<Value> {
+fn reply(ready: &mut QueryScene, text: &str, options: &QueryOptions) -> Result<Value> {
     let clock = Instant::now();
-    let answers = ready.ask(text, &QueryOptions::default())?;
+    let answers = ready.ask(text, options)?;
     let mut reply = answers.shown().json();
     reply["milliseconds"] = (1e3 * clock.elapsed().as_secs_f64()).into();
     Ok(reply)

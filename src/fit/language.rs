@@ -33,28 +33,33 @@ pub struct LanguagePoint {
     pub step: usize,
     /// Mean L_sem since the last point.
     pub loss: f64,
-    /// Share of labelled training pixels that decode to their label, per trained level.
-    pub accuracy: Vec<f64>,
+    /// Share of labelled training pixels that decode to their label, index as in [`LEVEL_NAMES`]; `None` for levels that the
+    /// model does not carry.
+    pub accuracy: Vec<Option<f64>>,
 }
 
 impl LanguagePoint {
-    /// Mean accuracy of the trained levels.
+    /// Mean accuracy of the levels of the model.
     pub fn mean_accuracy(&self) -> f64 {
-        self.accuracy.iter().sum::<f64>() / self.accuracy.len().max(1) as f64
+        let (sum, n) = self.accuracy.iter().flatten().fold((0.0, 0usize), |(s, n), a| (s + a, n + 1));
+        sum / n.max(1) as f64
     }
+}
+
+/// What was measured last of a level's decode accuracy.
+pub fn decode_accuracy(curve: &[LanguagePoint], level: usize) -> Option<f64> {
+    curve.iter().rev().find_map(|p| *p.accuracy.get(level)?)
 }
 
 /// The result of the language stage.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct TrainedLanguage {
-    /// Splats of the shared model (or the given ones, with `per_level`).
+    /// Splats of the shared model; those given, where every level has its own ([`LevelField::splats`]).
     pub splats: Splats,
-    /// With `per_level`: the splats of each level's own model, index as in [`LEVEL_NAMES`], empty where not trained.
-    pub level_splats: Vec<Splats>,
     /// The field given, with features [N, d] as they are rendered (linear blending).
     pub field: LanguageField,
-    /// Measurements; with `per_level` those of all levels one after the other.
+    /// Measurements; with `per_level` those of all levels one after the other, steps counted on.
     pub curve: Vec<LanguagePoint>,
     /// Wall-clock time, seconds.
     pub seconds: f64,
@@ -80,29 +85,22 @@ pub fn train_language(
     let groups: Vec<Vec<usize>> =
         if options.per_level { active.iter().map(|&l| vec![l]).collect() } else { vec![active] };
     progress.begin("language", (options.iterations * groups.len()) as u64);
-    let mut out = TrainedLanguage {
-        splats: splats.clone(),
-        level_splats: vec![Splats::default(); if options.per_level { field.levels.len() } else { 0 }],
-        field,
-        curve: Vec::new(),
-        seconds: 0.0,
-    };
+    let mut out = TrainedLanguage { splats: splats.clone(), field, curve: Vec::new(), seconds: 0.0 };
     for (g, group) in groups.iter().enumerate() {
-        let levels: Vec<&LevelField> = group.iter().map(|&l| &out.field.levels[l]).collect();
+        let levels: Vec<(usize, &LevelField)> = group.iter().map(|&l| (l, &out.field.levels[l])).collect();
         let mut run = Run::new(device, images, cameras, splats, &levels, options)?;
         training::train(&mut run, g, options.iterations, progress)?;
         let (trained, features) = run.finish()?;
-        out.curve.append(&mut run.curve);
+        let before = g * options.iterations;
+        out.curve.extend(run.curve.drain(..).map(|p| LanguagePoint { step: before + p.step, ..p }));
         let features = features.into_iter().zip(std::mem::take(&mut run.reliability));
         for (&level, (features, reliability)) in group.iter().zip(features) {
             out.field.levels[level].carry(features);
             out.field.levels[level].reliability = reliability;
-            if options.per_level {
-                out.level_splats[level] = trained.clone();
-            }
         }
-        if !options.per_level {
-            out.splats = trained;
+        match group.as_slice() {
+            [level] if options.per_level => out.field.levels[*level].splats = Some(trained),
+            _ => out.splats = trained,
         }
     }
     progress.end();
@@ -114,8 +112,8 @@ pub fn train_language(
 pub(crate) struct Run<'a> {
     trainer: Trainer,
     options: &'a LanguageOptions,
-    levels: Vec<&'a LevelField>,
-    names: String,
+    /// With their index in the field.
+    levels: Vec<(usize, &'a LevelField)>,
     width: usize,
     extent: f64,
     targets: CodeTargets,
@@ -141,15 +139,16 @@ impl<'a> Run<'a> {
         images: &[RgbImage],
         cameras: &[Camera],
         splats: &Splats,
-        levels: &[&'a LevelField],
+        levels: &[(usize, &'a LevelField)],
         options: &'a LanguageOptions,
     ) -> Result<Self> {
-        let width = levels[0].codebook.code_dim;
+        let fields: Vec<&LevelField> = levels.iter().map(|l| l.1).collect();
+        let width = fields[0].codebook.code_dim;
         let channels = width * levels.len();
         let scale = SceneScale::measure(cameras, &splats.means);
         let model = Model::new(device, splats, channels)?;
         let mut views = Views::new(device, images, cameras, None, splats.len(), channels, scale.near())?;
-        let targets = CodeTargets::new(device, levels, images, &views, 1.0 - options.image_weight)?;
+        let targets = CodeTargets::new(device, &fields, images, &views, 1.0 - options.image_weight)?;
         let raster = RasterOptions {
             sh_degree: splats.sh_degree,
             feature_mode: FeatureMode::Gauge { epsilon: options.epsilon, blocks: levels.len() },
@@ -173,7 +172,6 @@ impl<'a> Run<'a> {
             trainer: Trainer::new(device, raster, model, views, cameras, options.seed),
             options,
             levels: levels.to_vec(),
-            names: level_names(levels.len()),
             width,
             extent: scale.extent,
             targets,
@@ -202,7 +200,7 @@ impl<'a> Run<'a> {
             let raster = &mut t.views.stage_mut(view).raster;
             raster.forward_bands(&t.model.values, &t.raster, |frame, band| {
                 let pixels = frame.bands.pixels();
-                for (l, level) in levels.iter().enumerate() {
+                for (l, (_, level)) in levels.iter().enumerate() {
                     let Some(labels) = level.targets.get(view) else { continue };
                     let labels = frame.bands.cut_inner(band, &labels.data, -1);
                     let first = (BASE_CHANNELS + l * width) * pixels;
@@ -214,7 +212,10 @@ impl<'a> Run<'a> {
                 Ok(())
             })?;
         }
-        let accuracy = counts.iter().map(|c| c[0] as f64 / c[1].max(1) as f64).collect();
+        let mut accuracy = vec![None; LEVEL_NAMES.len()];
+        for ((level, _), [right, valid]) in self.levels.iter().zip(counts) {
+            accuracy[*level] = Some(right as f64 / valid.max(1) as f64);
+        }
         let loss = self.recent.iter().sum::<f64>() / self.recent.len().max(1) as f64;
         self.recent.clear();
         Ok(LanguagePoint { step, loss, accuracy })
@@ -302,8 +303,9 @@ impl Training for Run<'_> {
         self.trainer.model.check(step)?;
         let point = self.measure(step)?;
         let figures = vec![("loss", point.loss), ("accuracy", point.mean_accuracy())];
-        let shares: Vec<String> = point.accuracy.iter().map(|a| format!("{:.1} %", 100.0 * a)).collect();
-        let note = Some(format!("{} decoded {}", self.names, shares.join(" ")));
+        let share = |(name, a): (&str, &Option<f64>)| a.map(|a| format!("{name} {:.1} %", 100.0 * a));
+        let shares: Vec<String> = LEVEL_NAMES.into_iter().zip(&point.accuracy).filter_map(share).collect();
+        let note = Some(format!("decoded: {}", shares.join(", ")));
         self.curve.push(point);
         Ok(Review { figures, note, finished: self.settled() })
     }
@@ -315,10 +317,6 @@ impl Training for Run<'_> {
     fn set_figures(&mut self, kept: Figures) {
         (self.recent, self.curve) = (kept.recent, kept.curve);
     }
-}
-
-fn level_names(levels: usize) -> String {
-    if levels == LEVEL_NAMES.len() { LEVEL_NAMES.join("/") } else { String::new() }
 }
 
 /// (pixels that decode to their label, labelled pixels) of planar features [d, H·W].

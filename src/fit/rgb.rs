@@ -22,7 +22,7 @@ use std::time::Instant;
 
 /// Photos of 8 bits cannot show more than their rounding noise, 10·log10(12·255²) = 58.9 dB: a render that happens to
 /// match exactly must not outweigh all other views.
-const MOST_PSNR: f64 = 60.0;
+pub(crate) const MOST_PSNR: f64 = 60.0;
 /// Scale ratios above this are penalised (docs/method.md#regularisers).
 const RATIO_LIMIT: f32 = 8.0;
 

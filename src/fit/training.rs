@@ -292,7 +292,7 @@ mod tests {
             ..LevelField::default()
         };
         let options = LanguageOptions::preset(Preset::Draft);
-        let mut run = LanguageRun::new(device, &images, &cameras, &splats, &[&level], &options).unwrap();
+        let mut run = LanguageRun::new(device, &images, &cameras, &splats, &[(0, &level)], &options).unwrap();
         measure(device, &mut run)
     }
 

@@ -70,6 +70,14 @@ struct LevelManifest {
     codes: usize,
     embedding_dim: usize,
     code_dim: usize,
+    /// Whether the level has splats of its own ([`own_splats`]).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    own_splats: bool,
+}
+
+/// Where the splats of a level with a model of its own are.
+fn own_splats(language: &Path, level: &str) -> PathBuf {
+    language.join(format!("splats_{level}.ply"))
 }
 
 /// What [`write()`] puts into a scene directory.
@@ -155,11 +163,17 @@ fn write_language(folder: &Path, field: &LanguageField, splats: usize) -> Result
         let book = &level.codebook;
         level_arrays::append(&mut features, name, level, splats, &[])?;
         write_codebook(&folder.join(format!("codebook_{name}.npz")), book, &field.space)?;
+        if let Some(own) = &level.splats {
+            // In the scene's own degree: no other program needs to open it.
+            let options = ply::PlyOptions { degree: own.sh_degree, language: None };
+            ply::write_splats(&own_splats(&folder, name), own, options)?;
+        }
         levels.push(LevelManifest {
             name: name.into(),
             codes: book.len(),
             embedding_dim: book.embedding_dim,
             code_dim: book.code_dim,
+            own_splats: level.splats.is_some(),
         });
     }
     let arrays: Vec<(&str, &NpyArray)> = features.iter().map(|(n, a)| (n.as_str(), a)).collect();
@@ -290,6 +304,17 @@ fn read_language(path: &Path, manifest: &LanguageManifest, splats: usize) -> Res
         let level = &mut field.levels[at];
         level.codebook = codebook;
         level_arrays::read(&features, &m.name, splats, level).map_err(damaged)?;
+        if m.own_splats {
+            let own = ply::read_splats(&own_splats(&folder, &m.name))?;
+            if own.len() != splats {
+                return Err(damaged(format!(
+                    "level {} has {} splats, the scene {splats}",
+                    m.name,
+                    own.len()
+                )));
+            }
+            level.splats = Some(own);
+        }
     }
     Ok(field)
 }

@@ -32,7 +32,7 @@ pub mod sam;
 #[cfg(test)]
 pub(crate) mod testing;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 pub mod text;
 pub mod things;
 pub mod warp;
@@ -91,6 +91,14 @@ pub trait RegionEncoder: Send {
     /// is not bound to a list of words.
     fn nearest_word(&mut self, _text: &str) -> Result<Option<(bool, String)>> {
         Ok(None)
+    }
+    /// What gave a text its embedding, of an encoder that has several: a table or a network by name.
+    fn embedded_by(&self, _text: &str) -> Option<String> {
+        None
+    }
+    /// What is doubtful about the embeddings given so far.
+    fn doubt(&self) -> Option<String> {
+        None
     }
     /// Per region embedding ([count, D] rows) the `best` phrases of the encoder's own vocabulary, with their cosine, best
     /// first. None from an encoder that has no list of phrases.

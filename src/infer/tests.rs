@@ -51,7 +51,7 @@ fn tokenizer() -> String {
     )
 }
 
-pub(super) fn clip_in(folder: &Path, order: [usize; 3]) {
+pub(crate) fn clip_in(folder: &Path, order: [usize; 3]) {
     image_tower().write(&folder.join("clip_toy/vision_model.onnx"));
     text_tower(order).write(&folder.join("clip_toy/text_model.onnx"));
     std::fs::write(folder.join("clip_toy/tokenizer.json"), tokenizer()).unwrap();

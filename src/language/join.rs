@@ -44,6 +44,7 @@ impl SceneView<'_> {
             labels: labels.clone(),
             quality: vec![1.0; level.codebook.len()],
             features: level.codebook.embeddings.clone(),
+            ..LevelMasks::default()
         };
         ViewMasks { levels: self.codes.iter().zip(&field.levels).map(level).collect() }
     }
@@ -265,6 +266,7 @@ mod tests {
             labels: plane(mask),
             quality: vec![1.0; 4],
             features: [axis(0), axis(1), axis(2), axis(3)].concat(),
+            ..LevelMasks::default()
         };
         let new = [SceneView { camera, codes: codes.clone(), depth, measured: &measured }];
         let masks = [ViewMasks { levels: vec![masks; 3] }];

@@ -11,6 +11,9 @@ pub struct LevelMasks {
     pub quality: Vec<f32>,
     /// [M, D] unit feature per mask, row-major; empty until region features ran.
     pub features: Vec<f32>,
+    /// Label maps with every mask as it was found, in one of them, so that masks which overlap are in different ones; empty
+    /// where `labels` has them whole, and once features are there.
+    pub whole: Vec<Plane<i32>>,
 }
 
 /// The masks of one view, index as in [`crate::scene::LEVEL_NAMES`].

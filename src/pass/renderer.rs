@@ -10,6 +10,7 @@ use crate::gpu::{Device, Recorder, shaders};
 use crate::math::median;
 use crate::scene::{Camera, Plane, RgbImage, Splats};
 use crate::{Error, Result};
+use std::ops::Range;
 
 /// Alpha from which a pixel has a depth: below, Σ w z says little about any surface
 /// (docs/method.md#forward-rasterisation).
@@ -77,6 +78,11 @@ impl Renderer {
     pub fn with_options(mut self, options: RasterOptions) -> Renderer {
         self.options = options;
         self
+    }
+
+    /// Replaces the raw features [N, d].
+    pub fn set_features(&mut self, features: &[f32]) -> Result<()> {
+        self.splats.features.write(features)
     }
 
     /// d.
@@ -183,6 +189,12 @@ impl RenderedFrame {
 
     /// Copies what a band answers for to the host; features only where this frame has them.
     pub fn read_band(&mut self, frame: &FrameBuffers, band: &Band) -> Result<()> {
+        self.read_surface(frame, band)?;
+        self.read_features(frame, band, 0, 0..self.feature_dim)
+    }
+
+    /// [`RenderedFrame::read_band`] without features.
+    pub fn read_surface(&mut self, frame: &FrameBuffers, band: &Band) -> Result<()> {
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
         let stride = frame.bands.pixels();
         let plane = |k: usize| frame.planes.read_range(k * stride + stored.start..k * stride + stored.end);
@@ -196,9 +208,23 @@ impl RenderedFrame {
             *alpha = 1.0 - t;
             *depth = if *alpha >= DEPTH_ALPHA_MIN { z / *alpha } else { 0.0 };
         }
-        for k in 0..self.feature_dim {
+        Ok(())
+    }
+
+    /// Copies feature channels of a band, from number `first` on, to the channels `into` of this frame.
+    pub fn read_features(
+        &mut self,
+        frame: &FrameBuffers,
+        band: &Band,
+        first: usize,
+        into: Range<usize>,
+    ) -> Result<()> {
+        let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
+        for (k, to) in into.enumerate() {
+            let at = (BASE_CHANNELS + first + k) * frame.bands.pixels();
+            let values = frame.planes.read_range(at + stored.start..at + stored.end)?;
             let pixels = self.features[inner.start * self.feature_dim..].chunks_exact_mut(self.feature_dim);
-            pixels.zip(plane(BASE_CHANNELS + k)?).for_each(|(out, v)| out[k] = v);
+            pixels.zip(values).for_each(|(out, v)| out[to] = v);
         }
         Ok(())
     }

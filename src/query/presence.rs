@@ -6,7 +6,7 @@ use serde::Serialize;
 use std::sync::Arc;
 
 /// Fewer other things tell nothing: the least share that they can state is above [`FOUND`].
-const MIN_OTHERS: usize = 20;
+pub(crate) const MIN_OTHERS: usize = 20;
 
 /// Share of other things that fit at least as well, up to which a text is found. Of texts that are not in the scene no more than
 /// this share is called found, as far as they are like the other things: the level of a conformal test.

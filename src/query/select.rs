@@ -40,7 +40,11 @@ pub fn select(
         }
     }
     let peaks: Vec<f32> = found.iter().map(|f| margin(f.1)).collect();
-    let Some(chosen) = super::coarsest_good(&peaks, options.slack) else { return Ok(Selection::default()) };
+    let chosen = match options.mask {
+        MaskRule::Codes(_) => super::coarsest_good(&peaks, options.slack),
+        MaskRule::Lerf(_) => super::first_best(&peaks),
+    };
+    let Some(chosen) = chosen else { return Ok(Selection::default()) };
     let (level, score, of) = &found[chosen];
     let share = match options.mask {
         MaskRule::Codes(share) => share,

@@ -178,7 +178,7 @@ fn perfect_masks_and_distinct_features_answer_every_phrase() {
         .map(|v| {
             let labels = Plane { data: v.masks.data.iter().map(|&k| k.max(0)).collect(), ..v.masks };
             let features = vectors[..12].concat();
-            let level = LevelMasks { labels, quality: vec![1.0; 12], features };
+            let level = LevelMasks { labels, quality: vec![1.0; 12], features, ..LevelMasks::default() };
             ViewMasks { levels: vec![level.clone(), level.clone(), level] }
         })
         .collect();

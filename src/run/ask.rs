@@ -194,6 +194,11 @@ impl QueryScene {
         names(self.questions.encoder.as_mut(), &self.field, NAMES)
     }
 
+    /// What embeds texts.
+    pub fn encoder(&self) -> &dyn RegionEncoder {
+        self.questions.encoder.as_ref()
+    }
+
     /// The scene's language.
     pub fn field(&self) -> &LanguageField {
         &self.field

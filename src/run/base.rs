@@ -63,6 +63,16 @@ impl Settings {
         usize::try_from(self.plan("feature_dim").as_u64()?).ok()
     }
 
+    /// Whether every level has a model of its own.
+    pub fn per_level(&self) -> bool {
+        self.plan("per_level").as_bool().unwrap_or(false)
+    }
+
+    /// `--compat` of the run.
+    pub fn compat(&self) -> Option<&str> {
+        self.text("compat")
+    }
+
     /// Queries that were asked, then `more` that are new.
     pub fn queries(&self, more: &[String]) -> Vec<String> {
         let old = self.plan("queries").as_array().into_iter().flatten();

@@ -4,13 +4,16 @@ use crate::format::scene_dir::{Scene, TEXT_EMBEDDINGS};
 use crate::infer::{RegionEncoder, Registry};
 use crate::{Error, Result};
 
-/// The table of text embeddings that the scene carries, or the built-in model when the scene was made with it.
+/// For precomputed features the table of text embeddings that the scene carries, and a network; else the model that the scene was
+/// made with.
 pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncoder>> {
     let table = scene.path.join(TEXT_EMBEDDINGS);
-    if table.is_file() {
-        return sources::table_encoder(&table);
-    }
+    let levels = scene.language.iter().flat_map(|l| &l.levels);
+    let dim = levels.map(|l| l.codebook.embedding_dim).find(|dim| *dim > 0);
     let space = scene.language.as_ref().map_or("", |l| l.space.as_str());
+    if table.is_file() || space == sources::DIR_SPACE {
+        return sources::dir_encoder(&table, dim, &registry);
+    }
     // "clip:0123456789abcdef" was made with a network of the family clip.
     let source = match space.split_once(':') {
         Some((family, _)) => SourceChoice::named(family),

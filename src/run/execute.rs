@@ -137,7 +137,9 @@ fn work(
     registry.compute().report(progress)?;
     let (trained, language) = (made.take(scene.trained)?, made.take(scene.language)?);
     let PlacedPhotos { photos, left_out, .. } = made.take(scene.placed)?;
-    if let Some(text) = super::fidelity::warning(&photos, &trained.stats) {
+    let frames = made.take(scene.frames)?;
+    let psnr = super::fidelity::psnr(&frames, &photos);
+    if let Some(text) = super::fidelity::warning(&photos, &psnr) {
         progress.warn(&text);
     }
     let mut geometry = made.take(scene.geometry)?;
@@ -160,10 +162,11 @@ fn work(
         splats: language.splats,
         seen,
         rgb: trained.stats,
+        psnr,
         field: language.field,
         alignment: made.take(scene.aligned)?.alignment,
         language_curve: language.curve,
-        frames: made.take(scene.frames)?,
+        frames,
         answers: made.take(scene.answers)?,
         names: made.take(scene.names)?,
         provider: registry.compute().name().ok(),

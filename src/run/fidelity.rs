@@ -1,6 +1,9 @@
 //! How well a scene shows the photos that it was made from.
-use crate::fit::FitStats;
+use super::view::DecodedFrame;
+use crate::fit::MOST_PSNR;
+use crate::pass::metrics;
 use crate::photo::Photo;
+use rayon::prelude::*;
 
 /// A photo this much below the best one, dB, is not shown as it should be: half the amplitude of the error is more than texture
 /// makes among photos of one place.
@@ -9,16 +12,24 @@ const FAR_BELOW: f64 = 6.0;
 /// have seen the fewest steps, and photos that something hides are at 13 to 25 dB.
 const GOOD: f64 = 30.0;
 
+/// How well the frames of a finished scene show its photos, dB: the language stage has moved its splats since the colours were
+/// trained.
+pub(super) fn psnr(frames: &[DecodedFrame], photos: &[Photo]) -> Vec<f64> {
+    let one = |(f, p): (&DecodedFrame, &Photo)| metrics::psnr(&f.rendered.rgb, &p.image).min(MOST_PSNR);
+    frames.par_iter().zip(photos).map(one).collect()
+}
+
 /// Mean over the photos and their range, for the closing table.
-pub(super) fn figure(stats: &FitStats) -> (String, String) {
-    let (low, high) = range(&stats.psnr);
-    let text = format!("{:.2} dB ({low:.1} to {high:.1})", stats.mean_psnr());
+pub(super) fn figure(psnr: &[f64]) -> (String, String) {
+    let (low, high) = range(psnr);
+    let mean = psnr.iter().sum::<f64>() / psnr.len().max(1) as f64;
+    let text = format!("{mean:.2} dB ({low:.1} to {high:.1})");
     ("train PSNR".to_owned(), text)
 }
 
 /// Names the photos that the scene shows far worse than the best one.
-pub(super) fn warning(photos: &[Photo], stats: &FitStats) -> Option<String> {
-    warning_about(photos.iter().map(|p| p.stem.as_str()), &stats.psnr)
+pub(super) fn warning(photos: &[Photo], psnr: &[f64]) -> Option<String> {
+    warning_about(photos.iter().map(|p| p.stem.as_str()), psnr)
 }
 
 fn warning_about<'a>(names: impl Iterator<Item = &'a str>, psnr: &[f64]) -> Option<String> {
@@ -44,6 +55,8 @@ fn range(values: &[f64]) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::pass::renderer::RenderedFrame;
+    use crate::scene::RgbImage;
 
     #[test]
     fn a_hidden_photo_is_named_and_others_are_not() {
@@ -55,8 +68,20 @@ mod tests {
     }
 
     #[test]
+    fn a_photo_is_compared_with_the_frame_of_the_finished_scene() {
+        let image = |v: f32| RgbImage { width: 64, height: 64, data: vec![[v; 3]; 4096] };
+        let frame = |v: f32| DecodedFrame {
+            rendered: RenderedFrame { rgb: image(v), ..RenderedFrame::default() },
+            codes: Vec::new(),
+        };
+        let photos =
+            ["a.png", "b.png"].map(|n| crate::photo::from_pixels(n.as_ref(), &image(0.5), None, 64).unwrap());
+        let found = psnr(&[frame(0.6), frame(0.5)], &photos);
+        assert!((found[0] - 20.0).abs() < 1e-3 && found[1] == MOST_PSNR, "{found:?}");
+    }
+
+    #[test]
     fn the_figure_states_mean_and_range() {
-        let stats = FitStats { psnr: vec![32.0, 34.0], ..FitStats::default() };
-        assert_eq!(figure(&stats).1, "33.00 dB (32.0 to 34.0)");
+        assert_eq!(figure(&[32.0, 34.0]).1, "33.00 dB (32.0 to 34.0)");
     }
 }

@@ -1,6 +1,7 @@
 //! The stages of `splatvk run`.
 use super::answer::Answers;
 use super::base::BaseScene;
+use super::compat::query_options;
 use super::plan::RunPlan;
 use super::sources::{
     self, DepthSources, FeatureSources, GeometrySources, Given, GraphBuilder, MaskSources, MatchSources,
@@ -165,7 +166,8 @@ impl Aligned {
         let (recipe, options) = (plan.recipe(), plan.language_options(preset));
         let language = graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
         let frames = graph.add(stages::DecodeViews, (trained, language));
-        let answers = graph.add(stages::AnswerQueries, (trained, frames, language, queries));
+        let options = query_options(plan.compat);
+        let answers = graph.add(stages::AnswerQueries { options }, (trained, frames, language, queries));
         SceneOutputs { placed, geometry, trained, up, aligned, names, language, frames, answers }
     }
 }

@@ -1,9 +1,10 @@
 //! A scene that a program holds in memory: rendered, queried and saved on demand. What the C interface is made of.
 use super::answer::Answers;
 use super::ask::Questions;
+use super::compat::{Compat, query_options};
 use super::execute::save;
 use super::outcome::RunOutcome;
-use super::view::{DecodedFrame, Viewer};
+use super::view::{DecodedFrame, FeatureChannels, Viewer};
 use super::{encoder, sources};
 use crate::format::scene_dir::{self, Contents, Scene};
 use crate::format::{Workspace, colmap, gaussians};
@@ -42,6 +43,7 @@ pub struct LiveScene {
     origin: SceneOrigin,
     registry: Registry,
     viewer: Viewer,
+    options: QueryOptions,
     /// Opened with the first one.
     questions: Option<Questions>,
     /// The last query's camera and what it shows.
@@ -70,12 +72,17 @@ impl LiveScene {
             SceneOrigin::Trained(o) => (&o.splats, Some(&o.field)),
             SceneOrigin::Loaded(s) => (&s.splats, s.language.as_ref()),
         };
+        let compat = match &origin {
+            SceneOrigin::Trained(o) => o.plan.compat,
+            SceneOrigin::Loaded(s) => Compat::of_scene(&s.path),
+        };
         let viewer = Viewer::new(device, splats, field.unwrap_or(&LanguageField::default()))?;
         Ok(LiveScene {
             device: device.clone(),
             origin,
             registry: registry.clone(),
             viewer,
+            options: query_options(compat),
             questions: None,
             seen: None,
         })
@@ -127,22 +134,20 @@ impl LiveScene {
             SceneOrigin::Loaded(_) => &[],
         }
     }
-    /// Feature channels of a level in what [`LiveScene::draw`] renders: (first, count); the count is 0 without codes.
-    pub fn features(&self, level: usize) -> (usize, usize) {
-        let n = self.splats().len().max(1);
-        let levels = self.language().map_or(&[][..], |l| &l.levels);
-        let widths: Vec<usize> = levels.iter().map(|l| l.features.len() / n).collect();
-        (widths.iter().take(level).sum(), widths.get(level).copied().unwrap_or(0))
+    /// Where [`LiveScene::draw_bands`] renders the features of a level; `None` without codes.
+    pub fn features(&self, level: usize) -> Option<FeatureChannels> {
+        self.viewer.features(level)
     }
 
-    /// Renders one camera band by band and shows every band while it is on the device.
+    /// Renders one camera band by band and shows every band while it is on the device: [`Viewer::draw_bands`].
     pub fn draw_bands(
         &mut self,
+        model: usize,
         camera: &Camera,
         seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
     ) -> Result<()> {
         check(camera)?;
-        self.viewer.draw_bands(camera, seen)
+        self.viewer.draw_bands(model, camera, seen)
     }
 
     /// Renders one camera that the device holds at once. The frame stays on the device, and valid until the next call.
@@ -191,7 +196,7 @@ impl LiveScene {
         };
         let field = field.ok_or_else(|| Error::work("the scene has no language"))?;
         let views = (std::slice::from_ref(&camera), std::slice::from_ref(&frame));
-        let answers = questions.ask(text, &mut self.viewer, field, views, &QueryOptions::default());
+        let answers = questions.ask(text, &mut self.viewer, field, views, &self.options);
         self.seen = Some((camera, frame));
         answers
     }

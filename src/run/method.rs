@@ -94,6 +94,7 @@ const OURS: Recipe = Recipe {
     optimise: true,
     language: LanguageFit::Train,
     index_head: false,
+    align: AlignOptions::DEFAULT,
 };
 
 const UNALIGNED: Recipe = Recipe { steps: [false; 3], image_weight: 0.0, features_only: true, ..OURS };
@@ -117,6 +118,8 @@ pub struct Recipe {
     pub language: LanguageFit,
     /// Smooth features in space and train a head that reads the codebook index from them.
     pub index_head: bool,
+    /// Thresholds and conditions of the alignment, of which `steps` leaves out what a method does not do.
+    pub align: AlignOptions,
 }
 
 impl Method {
@@ -143,7 +146,12 @@ impl Recipe {
     pub fn build(&self, space: &str, seed: u64) -> BuildOptions {
         let [matching, fusion, reprojection] = self.steps;
         BuildOptions {
-            align: AlignOptions { matching, fusion, reprojection, ..AlignOptions::default() },
+            align: AlignOptions {
+                matching: matching && self.align.matching,
+                fusion: fusion && self.align.fusion,
+                reprojection: reprojection && self.align.reprojection,
+                ..self.align
+            },
             reducer: self.reducer,
             feature_dim: self.feature_dim,
             space: space.to_owned(),
@@ -205,7 +213,8 @@ fn train_index_heads(
     let extent = SceneScale::measure(cameras, &trained.splats.means).extent;
     for level in &mut trained.field.levels {
         let d = level.features.len() / trained.splats.len().max(1);
-        index_head::smooth(&trained.splats, &mut level.features, d, extent);
+        let own = level.splats.as_ref().unwrap_or(&trained.splats);
+        index_head::smooth(own, &mut level.features, d, extent);
     }
     let mut viewer = Viewer::new(device, &trained.splats, &trained.field)?;
     let dims: Vec<usize> =

@@ -2,7 +2,9 @@
 pub mod answer;
 pub mod ask;
 pub mod base;
+mod border;
 pub mod budget;
+pub mod compat;
 pub mod encoder;
 mod execute;
 mod fidelity;
@@ -23,6 +25,7 @@ pub mod train;
 pub mod view;
 
 pub use answer::Answers;
+pub use compat::Compat;
 pub use execute::{reconstruct, run, save, stage_folder};
 pub use method::{FEATURE_DIM, Method, Recipe};
 pub use outcome::RunOutcome;

@@ -41,6 +41,8 @@ pub struct RunOutcome {
     pub seen: Seen,
     /// Figures of the colour stage.
     pub rgb: fit::FitStats,
+    /// PSNR of the finished scene against every photo, dB.
+    pub psnr: Vec<f64>,
     /// The scene's language.
     pub field: LanguageField,
     /// Masks, edges and components behind it.

@@ -1,5 +1,6 @@
 //! What to run, and what follows from it for the stages.
 use super::budget;
+use super::compat::Compat;
 use super::method::{self, FEATURE_DIM, Method, Recipe};
 use super::sources::{self, SourceChoice};
 use crate::Result;
@@ -63,6 +64,8 @@ pub struct RunPlan {
     pub feature_dim: usize,
     /// One model per level.
     pub per_level: bool,
+    /// What is done as others do it; masks, code length and models of it stand in their own fields.
+    pub compat: Option<&'static Compat>,
     /// Greatest side of the working images, pixels; `None` = [`photo::default_max_size`] of the device.
     pub max_size: Option<usize>,
     /// Vulkan device.
@@ -102,6 +105,7 @@ impl Default for RunPlan {
             method: &method::SPARSELGS,
             feature_dim: FEATURE_DIM,
             per_level: false,
+            compat: None,
             max_size: None,
             device: None,
             deterministic: false,
@@ -112,9 +116,21 @@ impl Default for RunPlan {
 }
 
 impl RunPlan {
+    /// The plan with what a `compat` decides beside the length of the codes ([`compat::feature_dim`]).
+    pub fn compatible(self, compat: Option<&'static Compat>) -> RunPlan {
+        RunPlan {
+            per_level: self.per_level || compat.is_some_and(|c| c.per_level),
+            sam: SamOptions { paint_in_order: compat.is_some_and(|c| c.paint_in_order), ..self.sam },
+            compat,
+            ..self
+        }
+    }
+
     /// What the method does, with the plan's code length.
     pub fn recipe(&self) -> Recipe {
-        Recipe { feature_dim: self.feature_dim, ..self.method.recipe }
+        let recipe = self.method.recipe;
+        let align = self.compat.map_or(recipe.align, |c| c.align);
+        Recipe { feature_dim: self.feature_dim, align, ..recipe }
     }
 
     /// The models that the plan names.

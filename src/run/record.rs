@@ -2,7 +2,7 @@
 use super::answer::Answers;
 use super::outcome::RunOutcome;
 use crate::Result;
-use crate::fit::{CurvePoint, FitStats, LanguagePoint, ViewDependence};
+use crate::fit::{self, CurvePoint, FitStats, LanguagePoint, ViewDependence};
 use crate::photo::Photo;
 use crate::pose::{Confidence, Fitted};
 use crate::report::viewer::Scene3d;
@@ -43,7 +43,7 @@ fn statistics(o: &RunOutcome) -> serde_json::Value {
         .map(|(at, (name, level))| {
             json!({
                 "level": name, "codes": level.codebook.len(), "min_chord": level.codebook.min_chord,
-                "decode_accuracy": o.language_curve.last().and_then(|p| p.accuracy.get(at)),
+                "decode_accuracy": fit::decode_accuracy(&o.language_curve, at),
             })
         })
         .collect();
@@ -63,7 +63,7 @@ fn statistics(o: &RunOutcome) -> serde_json::Value {
         "light": super::light::record(&o.photos),
         "splats": { "start": o.rgb.splats[0], "end": o.splats.len(), "unseen": o.seen.unseen() },
         "view_dependence": o.rgb.view_dependence,
-        "psnr_train": o.rgb.psnr, "poses_refined": o.rgb.poses_refined,
+        "psnr_train": o.psnr, "poses_refined": o.rgb.poses_refined,
         "loss": o.rgb.curve.iter().map(|p| json!([p.step, p.loss])).collect::<Vec<_>>(),
         "curves": curves,
         "levels": levels,
@@ -78,7 +78,7 @@ fn added(o: &RunOutcome) -> Option<serde_json::Value> {
         let fitted = &o.geometry.fitted[v];
         json!({
             "photo": o.photos[v].stem, "confidence": fitted.confidence(), "agreement": fitted.agreement,
-            "rotation_sigma_degrees": fitted.rotation_sigma.to_degrees(), "psnr": o.rgb.psnr.get(v),
+            "rotation_sigma_degrees": fitted.rotation_sigma.to_degrees(), "psnr": o.psnr.get(v),
         })
     };
     let scene = o.plan.add.as_ref()?;
@@ -93,7 +93,7 @@ fn added_figures(o: &RunOutcome) -> Vec<(String, String)> {
     }
     let one = |v: usize| {
         let confidence = o.geometry.fitted[v].confidence().name();
-        let psnr = o.rgb.psnr.get(v).copied().unwrap_or(0.0);
+        let psnr = o.psnr.get(v).copied().unwrap_or(0.0);
         ("added".to_owned(), format!("{}: {confidence} confidence, {psnr:.2} dB", o.photos[v].stem))
     };
     (o.known..o.photos.len()).map(one).collect()
@@ -177,8 +177,8 @@ pub(super) fn curves(rgb: &FitStats, language: &[LanguagePoint]) -> Vec<Curve> {
         unit,
         points: rgb.curve.iter().map(|p| (p.step as f64, get(p))).collect(),
     };
-    let words = |name, unit, skip, get: fn(&LanguagePoint) -> f64| {
-        let points = language.iter().skip(skip).map(|p| (p.step as f64, get(p)));
+    let words = |name, unit, get: fn(&LanguagePoint) -> Option<f64>| {
+        let points = language.iter().filter_map(|p| Some((p.step as f64, get(p)?)));
         Curve { name, unit, points: points.collect() }
     };
     vec![
@@ -186,9 +186,9 @@ pub(super) fn curves(rgb: &FitStats, language: &[LanguagePoint]) -> Vec<Curve> {
         colour("PSNR of render and photo", "dB", |p| p.psnr),
         colour("SSIM of render and photo", "", |p| p.ssim),
         colour("splats", "", |p| p.splats as f64),
-        // The first measurement comes before any step, and so before any loss.
-        words("language loss", "", 1, |p| p.loss),
-        words("pixels that decode to their label", "%", 0, |p| 100.0 * p.mean_accuracy()),
+        // The first measurement of a model comes before any step, and so before any loss.
+        words("language loss", "", |p| (p.loss > 0.0).then_some(p.loss)),
+        words("pixels that decode to their label", "%", |p| Some(100.0 * p.mean_accuracy())),
     ]
 }
 
@@ -225,7 +225,7 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
         ("device".to_owned(), format!("{}{cpu}", o.device.name)),
         ("photos".to_owned(), sizes(&o.photos) + &chosen),
         splats_figure(&o.splats, &o.seen),
-        super::fidelity::figure(&o.rgb),
+        super::fidelity::figure(&o.psnr),
     ];
     list.extend(view_dependence_figure(&o.rgb.view_dependence));
     list.extend(added_figures(o));
@@ -340,7 +340,7 @@ pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
             render: Some(&o.frames[i].rendered.rgb),
             depth: Some(&o.frames[i].rendered.depth),
             levels: &levels[i],
-            psnr: o.rgb.psnr.get(i).copied(),
+            psnr: o.psnr.get(i).copied(),
             light: p.light,
         })
         .collect();

@@ -11,21 +11,27 @@ use crate::query::select::select;
 use crate::query::{QueryOptions, QueryResult, TextQuery, answer_with, field_relevancy};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
 
-/// The figures of protocol `field`. `queries` are the evaluation's phrases in order, or empty for a scene without
-/// language. With `refine`, held-out frames are scored a second time from refined cameras. `look` sees every decoded
+/// What is asked of a scene.
+pub struct Questions<'a> {
+    /// The evaluation's phrases in order; none for a scene without language.
+    pub queries: &'a [TextQuery],
+    /// How answers are chosen.
+    pub options: QueryOptions,
+}
+
+/// The figures of protocol `field`. With `refine`, held-out frames are scored a second time from refined cameras. `look` sees every decoded
 /// frame.
 pub fn score_field(
     device: &Device,
     splats: &Splats,
     field: &LanguageField,
-    queries: &[TextQuery],
+    Questions { queries, options }: Questions,
     mut evaluation: Evaluation,
     refine: bool,
     progress: &dyn Progress,
     look: &mut dyn FnMut(&TruthFrame, &DecodedFrame) -> Result<()>,
 ) -> Result<EvalReport> {
     let labels: Vec<u32> = evaluation.phrases().into_iter().map(|p| p.0).collect();
-    let options = QueryOptions::default();
     let relevancy = queries.iter().map(|q| field_relevancy(field, q)).collect::<Result<Vec<_>>>()?;
     let places = Places::of(splats, field);
     let things = |query: &TextQuery| -> Result<_> {
@@ -127,8 +133,9 @@ mod tests {
         std::fs::write(folder.path().join("ground_truth.json"), text).unwrap();
         let evaluation = Evaluation::new(GroundTruth::read(folder.path()).unwrap(), &scene, None).unwrap();
         let field = LanguageField::default();
+        let nothing = Questions { queries: &[], options: QueryOptions::default() };
         let report =
-            score_field(&device, &splats, &field, &[], evaluation, true, &Silent, &mut |_, _| Ok(()))
+            score_field(&device, &splats, &field, nothing, evaluation, true, &Silent, &mut |_, _| Ok(()))
                 .unwrap();
         let given = report.images.iter().find(|i| i.split == Split::Test).unwrap().psnr_colour_fit;
         let refined = report.refined.unwrap();

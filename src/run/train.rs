@@ -165,7 +165,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let (photos, geometry) = (made.take(placed)?.photos, made.take(geometry)?);
     let trained = made.take(trained)?;
     let world = World { up: made.take(up)?, scale: None };
-    if let Some(text) = super::fidelity::warning(&photos, &trained.stats) {
+    if let Some(text) = super::fidelity::warning(&photos, &trained.stats.psnr) {
         progress.warn(&text);
     }
 
@@ -213,7 +213,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         ("device".to_owned(), device.info().name.clone()),
         ("photos".to_owned(), super::record::sizes(&photos)),
         super::record::splats_figure(&trained.splats, &seen),
-        super::fidelity::figure(&trained.stats),
+        super::fidelity::figure(&trained.stats.psnr),
     ];
     figures.extend(super::record::view_dependence_figure(&trained.stats.view_dependence));
     figures.push(super::record::up_figure(&world));

@@ -1,4 +1,5 @@
 //! A scene with language seen from cameras: rendered and decoded.
+use super::border::Border;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder};
 use crate::pass::bands::Band;
@@ -8,6 +9,7 @@ use crate::pass::rasterizer::FrameBuffers;
 use crate::pass::renderer::{RenderedFrame, Renderer};
 use crate::progress::Progress;
 use crate::scene::{Camera, LanguageField, Plane, SH_C0, Seen, Splats};
+use std::ops::Range;
 
 /// A rendered frame and the code of every pixel per level (−1 = none).
 #[derive(Clone, Debug)]
@@ -22,35 +24,90 @@ pub struct DecodedFrame {
 /// Renders and decodes one camera after the other, both on the device.
 pub struct Viewer {
     device: Device,
-    renderer: Renderer,
-    /// Per level its first feature channel and its codes; `None` for a level without codes.
-    levels: Vec<Option<(usize, Codes)>>,
+    /// First the scene's own splats, then those of the levels that have others.
+    models: Vec<Model>,
+    /// Of the field.
+    levels: usize,
     /// Decoded codes, of the size of the last view.
     output: Option<Buffer<i32>>,
 }
 
-impl Viewer {
-    /// Uploads the scene with the features of all its levels side by side.
-    pub fn new(device: &Device, splats: &Splats, field: &LanguageField) -> Result<Self> {
-        let dims: Vec<usize> = field.levels.iter().map(|l| l.features.len() / splats.len().max(1)).collect();
-        let total: usize = dims.iter().sum();
+/// Splats on the device, with the levels whose features they carry.
+struct Model {
+    renderer: Renderer,
+    levels: Vec<CarriedLevel>,
+}
+
+/// A level's codes, and where its features are among the channels of its model and of all models.
+struct CarriedLevel {
+    level: usize,
+    codes: Codes,
+    /// Of short codes, which of them a pixel may have.
+    border: Option<Border>,
+    channels: Range<usize>,
+    shown: Range<usize>,
+}
+
+/// Where the features of a level are rendered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FeatureChannels {
+    /// For [`Viewer::draw_bands`].
+    pub model: usize,
+    /// First of its feature channels.
+    pub first: usize,
+    /// How many.
+    pub count: usize,
+}
+
+/// The model of [`Viewer::draw_bands`] that shows the scene: its colours, its depth.
+pub const SCENE_MODEL: usize = 0;
+
+impl Model {
+    /// Uploads splats with the features of some levels side by side; `shown` has the channels of every level.
+    fn new(
+        device: &Device,
+        splats: &Splats,
+        field: &LanguageField,
+        carried: &[usize],
+        shown: &[Range<usize>],
+    ) -> Result<Model> {
+        let total = carried.iter().map(|&l| shown[l].len()).sum();
         let mut features = Vec::with_capacity(total * splats.len());
         for i in 0..splats.len() {
-            for (level, &d) in field.levels.iter().zip(&dims) {
-                features.extend_from_slice(&level.features[i * d..(i + 1) * d]);
+            for &l in carried {
+                let d = shown[l].len();
+                features.extend_from_slice(&field.levels[l].features[i * d..(i + 1) * d]);
             }
         }
-        let mut levels = Vec::with_capacity(dims.len());
-        let mut first = 0;
-        for (level, &d) in field.levels.iter().zip(&dims) {
-            levels.push(match d {
-                0 => None,
-                _ => Some((first, Codes::upload(device, &level.codebook.codes, d)?)),
-            });
-            first += d;
+        let mut levels: Vec<CarriedLevel> = Vec::with_capacity(carried.len());
+        for &level in carried {
+            let (first, d) = (levels.last().map_or(0, |l| l.channels.end), shown[level].len());
+            let codes = Codes::upload(device, &field.levels[level].codebook.codes, d)?;
+            let border = Border::new(device, splats, &field.levels[level])?;
+            let (channels, shown) = (first..first + d, shown[level].clone());
+            levels.push(CarriedLevel { level, codes, border, channels, shown });
         }
-        let renderer = Renderer::new(device, splats, &features, total)?;
-        Ok(Viewer { device: device.clone(), renderer, levels, output: None })
+        Ok(Model { renderer: Renderer::new(device, splats, &features, total)?, levels })
+    }
+}
+
+impl Viewer {
+    /// Uploads the scene, each level's features on the splats that carry them ([`LevelField::carrier`]).
+    pub fn new(device: &Device, splats: &Splats, field: &LanguageField) -> Result<Self> {
+        let mut shown: Vec<Range<usize>> = Vec::with_capacity(field.levels.len());
+        for level in &field.levels {
+            let first = shown.last().map_or(0, |r| r.end);
+            shown.push(first..first + level.features.len() / splats.len().max(1));
+        }
+        let (own, shared): (Vec<usize>, Vec<usize>) = (0..shown.len())
+            .filter(|&l| !shown[l].is_empty())
+            .partition(|&l| field.levels[l].splats.is_some());
+        let mut models = vec![Model::new(device, splats, field, &shared, &shown)?];
+        for level in own {
+            let carrier = field.levels[level].carrier(splats);
+            models.push(Model::new(device, carrier, field, &[level], &shown)?);
+        }
+        Ok(Viewer { device: device.clone(), models, levels: shown.len(), output: None })
     }
 
     /// The scene from one camera.
@@ -63,51 +120,85 @@ impl Viewer {
         self.seen(camera, true)
     }
 
-    /// Renders one camera that the device holds at once. The frame stays on the device, and valid until the next call.
-    pub fn draw(&mut self, camera: &Camera) -> Result<&FrameBuffers> {
-        Ok(self.renderer.draw(camera)?.frame())
+    /// Where [`Viewer::draw_bands`] renders the features of a level; `None` where it has none.
+    pub fn features(&self, level: usize) -> Option<FeatureChannels> {
+        self.models.iter().enumerate().find_map(|(model, m)| {
+            let channels = &m.levels.iter().find(|l| l.level == level)?.channels;
+            Some(FeatureChannels { model, first: channels.start, count: channels.len() })
+        })
     }
 
-    /// Renders one camera band by band and shows every band while it is on the device.
+    /// Renders one camera that the device holds at once, as the scene's own splats show it. The frame stays on the device,
+    /// and valid until the next call.
+    pub fn draw(&mut self, camera: &Camera) -> Result<&FrameBuffers> {
+        Ok(self.models[SCENE_MODEL].renderer.draw(camera)?.frame())
+    }
+
+    /// Renders one camera band by band and shows every band while it is on the device. `model` is [`SCENE_MODEL`] or that of
+    /// [`Viewer::features`].
     pub fn draw_bands(
         &mut self,
+        model: usize,
         camera: &Camera,
         seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
     ) -> Result<()> {
-        self.renderer.draw_bands(camera, seen)
+        self.models[model].renderer.draw_bands(camera, seen)
     }
 
     /// Only the codes of one camera, as [`DecodedFrame::codes`].
     pub fn codes(&mut self, camera: &Camera) -> Result<Vec<Plane<i32>>> {
-        let mut codes = empty(self.levels.len(), camera);
-        let (device, levels, output) = (&self.device, &self.levels, &mut self.output);
-        self.renderer
-            .draw_bands(camera, |frame, band| decode(device, levels, output, frame, band, &mut codes))?;
-        Ok(codes)
+        self.decoded(camera, None)
     }
 
     fn seen(&mut self, camera: &Camera, features: bool) -> Result<DecodedFrame> {
-        let mut codes = empty(self.levels.len(), camera);
-        let dim = if features { self.renderer.feature_dim() } else { 0 };
-        let mut shown = RenderedFrame::empty(camera.width as usize, camera.height as usize, dim);
-        let (device, levels, output) = (&self.device, &self.levels, &mut self.output);
-        self.renderer.draw_bands(camera, |frame, band| {
-            decode(device, levels, output, frame, band, &mut codes)?;
-            shown.read_band(frame, band)
-        })?;
-        Ok(DecodedFrame { rendered: shown, codes })
+        let width: usize = self.models.iter().map(|m| m.renderer.feature_dim()).sum();
+        let (w, h) = (camera.width as usize, camera.height as usize);
+        let mut rendered = RenderedFrame::empty(w, h, if features { width } else { 0 });
+        let codes = self.decoded(camera, Some(&mut rendered))?;
+        Ok(DecodedFrame { rendered, codes })
+    }
+
+    /// Renders every model that `shown` or the codes need, and reads what `shown` has room for.
+    fn decoded(&mut self, camera: &Camera, mut shown: Option<&mut RenderedFrame>) -> Result<Vec<Plane<i32>>> {
+        let (w, h) = (camera.width as usize, camera.height as usize);
+        let mut codes = vec![Plane::filled(w, h, -1); self.levels];
+        let (device, output) = (&self.device, &mut self.output);
+        for (m, Model { renderer, levels }) in self.models.iter_mut().enumerate() {
+            if levels.is_empty() && !(m == SCENE_MODEL && shown.is_some()) {
+                continue;
+            }
+            let short = |l: &CarriedLevel| if l.border.is_some() { l.channels.len() } else { 0 };
+            let mut kept: Vec<_> = levels.iter().map(|l| RenderedFrame::empty(w, h, short(l))).collect();
+            renderer.draw_bands(camera, |frame, band| {
+                decode(device, levels, output, frame, band, &mut codes)?;
+                if let Some(shown) = shown.as_deref_mut() {
+                    if m == SCENE_MODEL {
+                        shown.read_surface(frame, band)?;
+                    }
+                    let features = shown.feature_dim > 0;
+                    for level in levels.iter().filter(|_| features) {
+                        shown.read_features(frame, band, level.channels.start, level.shown.clone())?;
+                    }
+                }
+                for (level, kept) in levels.iter().zip(&mut kept) {
+                    kept.read_features(frame, band, level.channels.start, 0..kept.feature_dim)?;
+                }
+                Ok(())
+            })?;
+            for (level, kept) in levels.iter_mut().zip(kept) {
+                if let Some(border) = &mut level.border {
+                    border.settle(camera, &kept.features, &mut codes[level.level])?;
+                }
+            }
+        }
+        Ok(codes)
     }
 }
 
-/// Codes of no pixel yet.
-fn empty(levels: usize, camera: &Camera) -> Vec<Plane<i32>> {
-    vec![Plane::filled(camera.width as usize, camera.height as usize, -1); levels]
-}
-
-/// Decodes every level of a band into `codes`; `output` keeps the buffers for the next one of the same size.
+/// Decodes the levels of a band into `codes`; `output` keeps the buffers for the next one of the same size.
 fn decode(
     device: &Device,
-    levels: &[Option<(usize, Codes)>],
+    levels: &[CarriedLevel],
     output: &mut Option<Buffer<i32>>,
     frame: &FrameBuffers,
     band: &Band,
@@ -118,15 +209,14 @@ fn decode(
         Some(fits) => fits,
         None => device.buffer::<i32>("decoded", pixels as usize)?,
     };
-    for (plane, level) in codes.iter_mut().zip(levels) {
-        let Some((first, table)) = level else { continue };
+    for level in levels {
         let mut rec = Recorder::new(device, "decode");
-        let at = (BASE_CHANNELS + first) as u32;
+        let at = (BASE_CHANNELS + level.channels.start) as u32;
         let (planes, transmittance) = (&frame.planes, &frame.transmittance);
-        table.record(&mut rec, planes, at, transmittance, pixels, &decoded);
+        level.codes.record(&mut rec, planes, at, transmittance, pixels, &decoded);
         rec.run()?;
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
-        plane.data[inner].copy_from_slice(&decoded.read_range(stored)?);
+        codes[level.level].data[inner].copy_from_slice(&decoded.read_range(stored)?);
     }
     *output = Some(decoded);
     Ok(())

@@ -1,6 +1,6 @@
 //! Language of a scene: features of the splats per level, and the codebooks that map them to embeddings.
-use super::Plane;
 use super::code_mix::{self, CodeMix};
+use super::{Plane, Splats};
 use serde::{Deserialize, Serialize};
 
 /// A mask of a view. Stored as the pair `[view, mask]`.
@@ -94,9 +94,17 @@ pub struct LevelField {
     pub reliability: Vec<f32>,
     /// Per training view: code index per pixel, −1 = none. Training targets; empty in a loaded scene.
     pub targets: Vec<Plane<i32>>,
+    /// The splats that the features were trained on, where the level has a model of its own; `None` = those of the scene.
+    /// As many as the scene has, in its order.
+    pub splats: Option<Splats>,
 }
 
 impl LevelField {
+    /// The splats that carry the features, of a scene whose own are `shared`.
+    pub fn carrier<'a>(&'a self, shared: &'a Splats) -> &'a Splats {
+        self.splats.as_ref().unwrap_or(shared)
+    }
+
     /// Takes over features [N, d] of any length: as unit mixes of two codes, or as they are where a mix cannot name the codes.
     pub fn carry(&mut self, features: Vec<f32>) {
         self.carry_mixes(code_mix::mixes(&features, &self.codebook));
@@ -119,6 +127,7 @@ impl LevelField {
             features: rows.iter().flat_map(row).copied().collect(),
             mixes: rows.iter().filter_map(|&i| self.mixes.get(i)).copied().collect(),
             reliability: rows.iter().filter_map(|&i| self.reliability.get(i)).copied().collect(),
+            splats: self.splats.as_ref().map(|own| own.picked(rows)),
             ..self
         }
     }

@@ -1,8 +1,17 @@
 //! Options of several commands.
 use crate::Result;
 use crate::infer::{Compute, Registry};
+use crate::run::compat::{COMPATS, NONE};
+use clap::builder::{PossibleValue, PossibleValuesParser};
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
+
+/// What `--compat` takes.
+pub fn compats() -> PossibleValuesParser {
+    let own = PossibleValue::new(NONE).help("this program's own way");
+    let all = COMPATS.iter().map(|c| PossibleValue::new(c.name).help(c.about));
+    PossibleValuesParser::new(all.chain([own]))
+}
 
 /// What goes to standard error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

@@ -4,17 +4,20 @@ use serde::{Deserialize, Serialize};
 
 /// How the share of a target mask is measured (docs/method.md#pixel-matching).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum AreaScore {
     /// Share of the target's own pixels whose reverse match lands in the source: independent of image scale.
     Coverage,
     /// Matched source pixels over target pixels, at most 1: the paper's ratio.
     Paper,
+    /// Share of the target's pixels at whose place the source view has a match of any mask: what the authors' code scores step 1
+    /// by, as if nothing moved between the views. Step 3 has the paper's ratio.
+    SamePlace,
 }
 
 /// Thresholds of the alignment; the defaults are explained in docs/method.md#alignment.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct AlignOptions {
     /// Acceptance threshold of step 1.
     pub tau1: f64,
@@ -30,6 +33,8 @@ pub struct AlignOptions {
     pub veto: f64,
     /// Share of a mask's matches that must fall into the fusion target.
     pub containment: f64,
+    /// Share of the fusion target that the masks to be fused must cover together.
+    pub fusion_cover: f64,
     /// Masks above this share of the image are background and never a fusion target.
     pub background_share: f64,
     /// Run step 1 (dense matches).
@@ -38,27 +43,34 @@ pub struct AlignOptions {
     pub fusion: bool,
     /// Run step 3 (reprojection).
     pub reprojection: bool,
+    /// In step 3, masks must be each other's best partner.
+    pub mutual: bool,
 }
 
 impl Default for AlignOptions {
     fn default() -> Self {
-        AlignOptions {
-            tau1: 0.5,
-            tau2: 0.5,
-            lambda: 0.3,
-            area: AreaScore::Coverage,
-            min_match_share: 2.05e-4,
-            veto: 0.5,
-            containment: 0.6,
-            background_share: 0.6,
-            matching: true,
-            fusion: true,
-            reprojection: true,
-        }
+        AlignOptions::DEFAULT
     }
 }
 
 impl AlignOptions {
+    /// The default.
+    pub const DEFAULT: AlignOptions = AlignOptions {
+        tau1: 0.5,
+        tau2: 0.5,
+        lambda: 0.3,
+        area: AreaScore::Coverage,
+        min_match_share: 2.05e-4,
+        veto: 0.5,
+        containment: 0.6,
+        fusion_cover: 0.5,
+        background_share: 0.6,
+        matching: true,
+        fusion: true,
+        reprojection: true,
+        mutual: true,
+    };
+
     /// Matched pixels that make a pair of masks worth scoring: 150 at 0.73 megapixels, at least 32.
     pub fn min_matches(&self, pixels: usize) -> u32 {
         ((self.min_match_share * pixels as f64).round() as u32).max(32)

@@ -70,6 +70,16 @@ impl LevelState {
         }
         counts
     }
+    /// Pixels of each mask of `view` at whose place the view that `links` start from has a match.
+    fn matched_places(&self, view: usize, links: &Links) -> Vec<u32> {
+        let mut area = vec![0; self.quality[view].len()];
+        for (p, &b) in self.labels[view].data.iter().enumerate() {
+            if b >= 0 && links.target(p).is_some() {
+                area[b as usize] += 1;
+            }
+        }
+        area
+    }
     /// Pixels of each mask of `view` that the other view could see.
     fn visible_areas(&self, view: usize, links: &Links) -> Vec<u32> {
         let mut area = vec![0; self.quality[view].len()];
@@ -131,8 +141,12 @@ pub(super) fn match_proposals(
     step: u8,
 ) -> Table {
     let mut table = Table::new();
-    for (i, j, there, back) in pairs.iter().flat_map(directions) {
-        let (there, back) = (state.counts(i, j, there), state.counts(j, i, back));
+    for (i, j, links, back) in pairs.iter().flat_map(directions) {
+        let (there, back) = (state.counts(i, j, links), state.counts(j, i, back));
+        let same_place = match options.area {
+            AreaScore::SamePlace => state.matched_places(j, links),
+            _ => Vec::new(),
+        };
         let n_min = options.min_matches(state.labels[i].data.len());
         for a in 0..state.quality[i].len() {
             let source = MaskId::new(i, a);
@@ -144,6 +158,7 @@ pub(super) fn match_proposals(
             let area = match options.area {
                 AreaScore::Coverage => back.at(b, a) as f64 / size,
                 AreaScore::Paper => (there.at(a, b) as f64 / size).min(1.0),
+                AreaScore::SamePlace => same_place[b] as f64 / size,
             };
             let e = edge(state, step, source, MaskId::new(j, b), area, options);
             if e.score > options.tau1 {
@@ -180,6 +195,7 @@ pub(super) fn fuse(state: &mut LevelState, pairs: &[PairLinks], options: &AlignO
     });
     let mut parent: Vec<Vec<usize>> = state.quality.iter().map(|q| (0..q.len()).collect()).collect();
     let mut taken = BTreeSet::new();
+    let mut named = Vec::new();
     for set in &sets {
         // a mask joins at most one fusion set per target view
         let fresh = |m: &usize| !taken.contains(&(set.view, *m, set.target.view));
@@ -187,15 +203,17 @@ pub(super) fn fuse(state: &mut LevelState, pairs: &[PairLinks], options: &AlignO
         if members.len() < 2 {
             continue;
         }
-        let target = state.feature(set.target).to_vec();
         for &m in &members {
             taken.insert((set.view, m, set.target.view));
             join(&mut parent[set.view], members[0], m);
         }
-        let root = find(&parent[set.view], members[0]);
-        // the fused mask takes the feature of the mask that covers it whole (docs/method.md#mask-fusion)
-        let at = root * target.len();
-        state.features[set.view][at..at + target.len()].copy_from_slice(&target);
+        named.push((set.view, members[0], state.feature(set.target).to_vec()));
+    }
+    // The fused mask takes the feature of the mask that covers it whole (docs/method.md#mask-fusion): the strongest set that
+    // it is in writes last.
+    for (view, member, feature) in named.into_iter().rev() {
+        let at = find(&parent[view], member) * feature.len();
+        state.features[view][at..at + feature.len()].copy_from_slice(&feature);
     }
     let mut fused = Vec::new();
     for (view, parent) in parent.iter().enumerate() {
@@ -260,8 +278,9 @@ fn fusion_sets(state: &LevelState, pairs: &[PairLinks], options: &AlignOptions) 
                     .all(|&o| state.cosine(MaskId::new(i, a), MaskId::new(i, o)) >= options.veto)
             };
             let coverage = members.iter().map(|&a| back.at(b, a) as f64).sum::<f64>() / size;
-            // less than half of the target covered: the members need not be all of it
-            if coverage >= 0.5 && members.iter().all(contained) && members.iter().all(alike) {
+            // little of the target covered: the members need not be all of it
+            if coverage >= options.fusion_cover && members.iter().all(contained) && members.iter().all(alike)
+            {
                 sets.push(FusionSet { view: i, members, target, coverage });
             }
         }
@@ -288,11 +307,16 @@ pub(super) fn add_reprojections(
             for a in 0..state.quality[i].len() {
                 let source = MaskId::new(i, a);
                 let Some(b) = best_partner(state, there.row(a), source, j as u32) else { continue };
-                let mutual = best_partner(state, back.row(b), MaskId::new(j, b), i as u32) == Some(a);
-                if there.at(a, b) < n_min || !mutual {
+                let mutual = || best_partner(state, back.row(b), MaskId::new(j, b), i as u32) == Some(a);
+                if there.at(a, b) < n_min || (options.mutual && !mutual()) {
                     continue;
                 }
-                let area = back.at(b, a) as f64 / visible[b].max(1) as f64;
+                let area = match options.area {
+                    AreaScore::Coverage => back.at(b, a) as f64 / visible[b].max(1) as f64,
+                    AreaScore::Paper | AreaScore::SamePlace => {
+                        (there.at(a, b) as f64 / state.areas[j][b].max(1) as f64).min(1.0)
+                    }
+                };
                 let e = edge(state, 3, source, MaskId::new(j, b), area, options);
                 if e.score <= options.tau2 {
                     continue;

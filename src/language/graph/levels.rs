@@ -154,7 +154,7 @@ fn paint(tree: &Tree, cues: &Cues, chosen: &[usize]) -> LevelMasks {
     let value = |&l: &i32| if mask_of[l as usize] == NONE { -1 } else { mask_of[l as usize] as i32 };
     let (width, height) = (cues.labels.width, cues.labels.height);
     let labels = Plane { width, height, data: cues.labels.data.iter().map(value).collect() };
-    LevelMasks { labels, quality: vec![1.0; chosen.len()], features: Vec::new() }
+    LevelMasks { labels, quality: vec![1.0; chosen.len()], ..LevelMasks::default() }
 }
 
 /// Border length between superpixels.

@@ -40,6 +40,8 @@ pub struct SamOptions {
     pub mask_overlap: f32,
     /// Least predicted IoU · stability.
     pub min_score: f32,
+    /// Paint masks in the order in which they came, those that needed a clean-up last, as LangSplat does; else larger ones first.
+    pub paint_in_order: bool,
 }
 
 impl Default for SamOptions {
@@ -53,6 +55,7 @@ impl Default for SamOptions {
             min_region: 100,
             mask_overlap: 0.8,
             min_score: 0.7,
+            paint_in_order: false,
         }
     }
 }
@@ -196,7 +199,7 @@ fn choose(candidates: Vec<MaskProposal>, width: usize, height: usize, options: &
         kept.retain(|m| m.bits.count() > 0);
         kept = nms::boxes(kept, options.box_overlap, |m| if m.changed { 0.0 } else { 1.0 });
         kept = nms::masks(kept, options.mask_overlap, options.min_score);
-        paint::labels(&kept, width, height)
+        paint::labels(&kept, options.paint_in_order, width, height)
     };
     ViewMasks { levels: (0..MASKS).map(level).collect() }
 }

@@ -222,7 +222,7 @@ fn holes_are_filled_and_islands_removed() {
 #[test]
 fn every_painted_pixel_belongs_to_a_mask_that_covers_it_and_small_ones_lie_on_top() {
     let all = seeded();
-    let level = paint::labels(&all, 50, 40);
+    let level = paint::labels(&all, false, 50, 40);
     let scores: Vec<f32> = all.iter().map(Mask::score).collect();
     let mut sizes = vec![0; level.quality.len()];
     for (p, label) in level.labels.data.iter().enumerate() {
@@ -233,8 +233,19 @@ fn every_painted_pixel_belongs_to_a_mask_that_covers_it_and_small_ones_lie_on_to
     }
     assert!(sizes.iter().all(|s| *s >= 32), "{sizes:?}");
     assert!(level.quality.iter().all(|q| scores.contains(q)) && level.quality.len() > 3);
-    let nested = paint::labels(&[rectangle(10..20, 10..20, 0.9), rectangle(0..40, 0..40, 0.99)], 50, 40);
+    let nested =
+        paint::labels(&[rectangle(10..20, 10..20, 0.9), rectangle(0..40, 0..40, 0.99)], false, 50, 40);
     assert_eq!((nested.labels.at(15, 15), nested.labels.at(5, 5), nested.labels.at(45, 5)), (0, 1, -1));
-    let none = paint::labels(&[], 50, 40);
+    // What lies on a mask hides nothing of it from the encoder.
+    assert_eq!(nested.whole.len(), 2);
+    let pixels = |label: i32| nested.whole.iter().flat_map(|m| &m.data).filter(|l| **l == label).count();
+    assert_eq!((pixels(0), pixels(1)), (100, 1600));
+    let other = [rectangle(10..20, 10..20, 0.9), rectangle(0..40, 0..30, 0.99)];
+    let in_order = paint::labels(&other, true, 50, 40);
+    assert_eq!((in_order.labels.at(15, 15), in_order.quality.len()), (0, 1), "the last one covers the first");
+    let apart =
+        paint::labels(&[rectangle(10..20, 10..20, 0.9), rectangle(30..40, 0..40, 0.99)], false, 50, 40);
+    assert!(apart.whole.is_empty(), "its labels are enough");
+    let none = paint::labels(&[], false, 50, 40);
     assert!(none.quality.is_empty() && none.labels.data.iter().all(|l| *l == -1));
 }

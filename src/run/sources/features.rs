@@ -1,22 +1,18 @@
 //! Features of regions, and the embeddings of texts that they are compared with.
 use super::table::{NO_CHECK, Source, SourceChoice, SourceKind, make};
+use super::texts::dir_encoder;
 use crate::files::content_hash;
+use crate::format::npy;
 use crate::infer::clip::Clip;
 use crate::infer::installed::{Installed, Task};
 use crate::infer::words::RegionWords;
-use crate::infer::{PackFileKind, RegionEncoder, Registry, nearest, things};
-use crate::language::dir::TextEmbeddings;
-use crate::query::CANONICAL_PHRASES;
+use crate::infer::{PackFileKind, RegionEncoder, Registry};
 use crate::run::stages::{SharedEncoder, identity};
-use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// File of the text embeddings in a `dir:` folder.
 const TEXT_TABLE: &str = "text_embeddings.npz";
-
-/// Space name of precomputed features.
-const DIR_SPACE: &str = "dir";
 
 /// `--features`
 pub struct FeatureSources;
@@ -45,7 +41,7 @@ impl SourceKind for FeatureSources {
         Source {
             name: "dir",
             argument: Some("DIR"),
-            about: "STEM_f.npy, text_embeddings.npz",
+            about: "STEM_f.npy; texts by text_embeddings.npz, then by an installed text model",
             needs: &[],
             check: |dir, given| match given.masks {
                 SourceChoice { name, argument: Some(masks) } if name == "dir" && masks == dir => Ok(()),
@@ -57,10 +53,10 @@ impl SourceKind for FeatureSources {
                     dir.display()
                 ))),
             },
-            make: |dir, _| {
+            make: |dir, registry| {
                 let file = dir.join(TEXT_TABLE);
-                let sum = content_hash(&file).map_err(Error::io(&file))?;
-                Ok(SharedEncoder::new(table_encoder(&file)?, sum))
+                let encoder = dir_encoder(&file, feature_length(dir), registry)?;
+                Ok(SharedEncoder::new(encoder, content_hash(&file).unwrap_or_default()))
             },
         },
     ];
@@ -78,56 +74,14 @@ pub fn encoder(choice: &SourceChoice, registry: &Registry) -> Result<Box<dyn Reg
     make::<FeatureSources>(choice, registry, registry)?.into_inner()
 }
 
-/// The table of text embeddings of a choice that has one.
+/// The table of text embeddings of a choice, if it has one.
 pub fn text_table(choice: &SourceChoice) -> Option<PathBuf> {
-    choice.argument.as_ref().map(|dir| dir.join(TEXT_TABLE))
+    choice.argument.as_ref().map(|dir| dir.join(TEXT_TABLE)).filter(|file| file.is_file())
 }
 
-/// The encoder of a table of text embeddings.
-pub fn table_encoder(path: &Path) -> Result<Box<dyn RegionEncoder>> {
-    Ok(Box::new(Table { texts: TextEmbeddings::read(path)?, space: DIR_SPACE.to_owned() }))
-}
-
-/// Text embeddings of a `dir:` folder behind the encoder boundary; region features were read with the masks.
-struct Table {
-    texts: TextEmbeddings,
-    space: String,
-}
-
-impl Table {
-    /// [N, D] rows of those texts that the table has.
-    fn known(&self, texts: &[String]) -> Vec<f32> {
-        texts.iter().filter_map(|text| self.texts.get(text)).flatten().copied().collect()
-    }
-}
-
-impl RegionEncoder for Table {
-    fn space(&self) -> &str {
-        &self.space
-    }
-    fn dim(&self) -> usize {
-        self.texts.dim
-    }
-    fn embed_regions(&mut self, _: &RgbImage, _: &Plane<i32>, _: usize) -> Result<Vec<f32>> {
-        Err(Error::work("precomputed features cannot describe new regions; give --masks dir: with them"))
-    }
-    fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
-        self.texts.embed(texts)
-    }
-    fn holds(&self, text: &str) -> bool {
-        self.texts.get(text).is_some()
-    }
-    fn others(&mut self, form: &str) -> Result<Vec<f32>> {
-        Ok(self.known(&things::of_form(form)))
-    }
-    fn recoloured(&mut self, text: &str) -> Result<Vec<f32>> {
-        Ok(self.known(&things::recoloured(text)))
-    }
-    fn names(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
-        let named: Vec<_> = self.texts.iter().filter(|(p, _)| !CANONICAL_PHRASES.contains(p)).collect();
-        let rows: Vec<f32> = named.iter().flat_map(|(_, v)| v.iter().copied()).collect();
-        let found = nearest(regions, &rows, self.texts.dim, best);
-        let text = |(i, cosine): (usize, f32)| (named[i].0.to_owned(), cosine);
-        Ok(found.into_iter().map(|list| list.into_iter().map(text).collect()).collect())
-    }
+/// Length of the features in a `dir:` folder.
+fn feature_length(dir: &Path) -> Option<usize> {
+    let files = std::fs::read_dir(dir).ok()?.flatten().map(|e| e.path());
+    let mut features = files.filter(|f| f.to_string_lossy().ends_with("_f.npy"));
+    npy::read(features.next()?).ok()?.shape.get(1).copied()
 }

@@ -6,9 +6,10 @@ mod geometry;
 mod masks;
 mod matches;
 mod table;
+mod texts;
 
 pub use depth::DepthSources;
-pub use features::{FeatureSources, encoder, table_encoder, text_table};
+pub use features::{FeatureSources, encoder, text_table};
 pub use geometry::GeometrySources;
 pub use masks::MaskSources;
 pub use matches::MatchSources;
@@ -16,6 +17,7 @@ pub use table::{
     Given, GraphBuilder, PosedPhotos, Source, SourceChoice, SourceKind, check, choose, default, help,
     installed, make,
 };
+pub use texts::{DIR_SPACE, dir_encoder};
 
 use crate::infer::installed::Inventory;
 use table::listed;

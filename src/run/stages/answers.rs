@@ -31,7 +31,10 @@ impl Stage for DecodeViews {
 }
 
 /// Answers the queries.
-pub struct AnswerQueries;
+pub struct AnswerQueries {
+    /// How.
+    pub options: QueryOptions,
+}
 
 impl Stage for AnswerQueries {
     const NAME: &'static str = "query";
@@ -41,7 +44,7 @@ impl Stage for AnswerQueries {
     type Output = Vec<Answers>;
 
     fn settings(&self) -> String {
-        String::new()
+        format!("{:?}", self.options)
     }
 
     fn run(
@@ -63,8 +66,7 @@ impl Stage for AnswerQueries {
             }
             // Texts of one form share their other things.
             let background = backgrounds.entry(Arc::as_ptr(&query.alternatives.things));
-            let options = QueryOptions::default();
-            prepared.answer(&language.field, (&trained.cameras, frames), query, &options, background)
+            prepared.answer(&language.field, (&trained.cameras, frames), query, &self.options, background)
         };
         let answers = queries.iter().map(&mut answer).collect();
         context.progress.end();

@@ -73,8 +73,17 @@ impl Stage for EmbedQueries {
         format!("{} {:?}", self.encoder.identity(), self.texts)
     }
 
-    fn run(self, (): (), _: &Context) -> Result<Vec<TextQuery>> {
-        self.encoder.with(|e| ask::queries(&self.texts, e, false))
+    fn run(self, (): (), context: &Context) -> Result<Vec<TextQuery>> {
+        self.encoder.with(|e| {
+            let queries = ask::queries(&self.texts, e, false)?;
+            for text in &self.texts {
+                if let Some(name) = e.embedded_by(text) {
+                    context.progress.inform(&format!("“{text}” embedded by {name}"));
+                }
+            }
+            e.doubt().iter().for_each(|doubt| context.progress.warn(doubt));
+            Ok(queries)
+        })
     }
 }
 

@@ -226,8 +226,15 @@ pub fn describe<'i>(
         for level in &mut view.levels {
             progress.check()?;
             let count = level.quality.len();
+            let whole = std::mem::take(&mut level.whole);
             if level.features.is_empty() && count > 0 {
-                level.features = encoder.with(|e| e.embed_regions(image, &level.labels, count))?;
+                let maps = if whole.is_empty() { std::slice::from_ref(&level.labels) } else { &whole };
+                for map in maps {
+                    let rows = encoder.with(|e| e.embed_regions(image, map, count))?;
+                    // A mask is on one map; on the others its row is zero.
+                    level.features.resize(rows.len(), 0.0);
+                    level.features.iter_mut().zip(rows).for_each(|(sum, v)| *sum += v);
+                }
             }
             done += 1;
             progress.step(done, "");
@@ -235,4 +242,51 @@ pub fn describe<'i>(
     }
     progress.end();
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::infer::RegionEncoder;
+    use crate::language::LevelMasks;
+    use crate::progress::Silent;
+
+    /// What it says of a region is how many pixels it was shown of it.
+    struct Counter;
+
+    impl RegionEncoder for Counter {
+        fn space(&self) -> &str {
+            "count"
+        }
+        fn dim(&self) -> usize {
+            1
+        }
+        fn embed_regions(&mut self, _: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
+            let of = |k: usize| labels.data.iter().filter(|l| **l == k as i32).count() as f32;
+            Ok((0..count).map(of).collect())
+        }
+        fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
+            Ok(vec![1.0; texts.len()])
+        }
+    }
+
+    #[test]
+    fn an_encoder_sees_masks_whole_whatever_lies_on_them() {
+        let image = RgbImage { width: 4, height: 1, data: vec![[0.5; 3]; 4] };
+        let map = |data: [i32; 4]| Plane { width: 4, height: 1, data: data.to_vec() };
+        // Mask 0 is three pixels long, mask 1 lies on two of them.
+        let level = LevelMasks {
+            labels: map([0, 1, 1, -1]),
+            quality: vec![1.0; 2],
+            whole: vec![map([0, 0, 0, -1]), map([-1, 1, 1, -1])],
+            ..LevelMasks::default()
+        };
+        let plain = LevelMasks { whole: Vec::new(), ..level.clone() };
+        let mut masks = [ViewMasks { levels: vec![level, plain] }];
+        let encoder = SharedEncoder::new(Box::new(Counter), String::new());
+        describe(&mut masks, [&image].into_iter(), &encoder, &Silent).unwrap();
+        assert_eq!(masks[0].levels[0].features, [3.0, 2.0]);
+        assert_eq!(masks[0].levels[1].features, [1.0, 2.0]);
+        assert!(masks[0].levels[0].whole.is_empty(), "of no use any more");
+    }
 }

@@ -1,0 +1,155 @@
+//! `--compat`: what the paper, its authors' code and LangSplat do otherwise than this program by default
+//! (docs/method.md#differences-from-the-paper). Each switch is a field here, and a row of the table there.
+use super::method::Method;
+use crate::language::Reducer;
+use crate::language::align::{AlignOptions, AreaScore};
+use crate::query::{MaskRule, QueryOptions};
+use crate::{Error, Result};
+use serde::Serialize;
+use serde_json::Value;
+use std::path::Path;
+
+/// A set of switches.
+#[derive(Debug, PartialEq)]
+pub struct Compat {
+    /// As users write it.
+    pub name: &'static str,
+    /// Whose, in a line.
+    pub about: &'static str,
+    /// Scores, thresholds and conditions of the alignment.
+    pub align: AlignOptions,
+    /// Masks of a network are painted in the order in which it gave them, not larger ones first.
+    pub paint_in_order: bool,
+    /// Length of the codes.
+    pub feature_dim: usize,
+    /// One model per level.
+    pub per_level: bool,
+    /// Level, mask and location of answers.
+    pub mask: MaskRule,
+}
+
+impl Serialize for Compat {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name)
+    }
+}
+
+/// What the text states; where it states no condition, there is none.
+pub const PAPER: Compat = Compat {
+    name: "paper",
+    about: "as the paper states it",
+    align: AlignOptions {
+        tau1: 0.5,
+        tau2: 0.5,
+        lambda: 0.3,
+        area: AreaScore::Paper,
+        containment: 0.0,
+        fusion_cover: 0.0,
+        background_share: 1.0,
+        veto: -1.0,
+        ..AlignOptions::DEFAULT
+    },
+    paint_in_order: false,
+    feature_dim: 3,
+    per_level: true,
+    mask: MaskRule::Lerf(0.6),
+};
+
+/// What the code of the authors does with its own defaults. Its step 2 asks for a score above 2 τ₁ = 1, which none has.
+pub const AUTHORS: Compat = Compat {
+    name: "authors",
+    about: "as the code that the paper's authors published does it",
+    align: AlignOptions { area: AreaScore::SamePlace, fusion: false, mutual: false, ..PAPER.align },
+    paint_in_order: true,
+    ..PAPER
+};
+
+/// What LangSplat does with masks, codes and answers; it has no alignment, so that of this program stays.
+pub const LANGSPLAT: Compat = Compat {
+    name: "langsplat",
+    about: "masks, codes and answers as in LangSplat",
+    align: AlignOptions::DEFAULT,
+    paint_in_order: true,
+    mask: MaskRule::Lerf(0.4),
+    ..PAPER
+};
+
+/// What `--compat` takes.
+pub static COMPATS: [&Compat; 3] = [&PAPER, &AUTHORS, &LANGSPLAT];
+
+/// For `--compat` of a scene that was made with one: this program's own way after all.
+pub const NONE: &str = "none";
+
+impl Compat {
+    /// The one of a name; `None` for [`NONE`].
+    pub fn named(name: &str) -> Result<Option<&'static Compat>> {
+        if name == NONE {
+            return Ok(None);
+        }
+        COMPATS.iter().find(|c| c.name == name).map(|c| Some(*c)).ok_or_else(|| {
+            let names: Vec<&str> = COMPATS.iter().map(|c| c.name).collect();
+            Error::input(format!("--compat {name}: unknown; use one of: {}, {NONE}", names.join(", ")))
+        })
+    }
+
+    /// What a scene was made with; `None` also for files that no run made.
+    pub fn of_scene(scene: &Path) -> Option<&'static Compat> {
+        let record: Value = serde_json::from_slice(&std::fs::read(scene.join("run.json")).ok()?).ok()?;
+        Compat::named(record["config"]["plan"]["compat"].as_str()?).ok().flatten()
+    }
+
+    /// What decides answers: of `asked`, or else of what the scene was made with.
+    pub fn answers(asked: Option<&str>, scene: &Path) -> Result<QueryOptions> {
+        let compat = match asked {
+            Some(name) => Compat::named(name)?,
+            None => Compat::of_scene(scene),
+        };
+        Ok(query_options(compat))
+    }
+}
+
+/// Length of the codes. A baseline has that of its authors.
+pub fn feature_dim(compat: Option<&Compat>, method: &Method) -> usize {
+    let ours = compat.filter(|_| method.recipe.reducer == Reducer::Bijection);
+    ours.map_or(method.recipe.feature_dim, |c| c.feature_dim)
+}
+
+/// How answers are chosen.
+pub fn query_options(compat: Option<&Compat>) -> QueryOptions {
+    compat.map_or_else(QueryOptions::default, |c| QueryOptions { mask: c.mask, ..QueryOptions::default() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_understood_and_others_refused_with_the_choices() {
+        for compat in COMPATS {
+            assert_eq!(Compat::named(compat.name).unwrap(), Some(compat));
+        }
+        assert_eq!(Compat::named("none").unwrap(), None);
+        let error = Compat::named("lerf").unwrap_err();
+        assert!(
+            error.exit_code() == 2 && error.to_string().contains("paper, authors, langsplat, none"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn a_scene_answers_as_it_was_made_unless_something_else_is_asked_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let rule = |asked: Option<&str>| Compat::answers(asked, folder.path()).unwrap().mask;
+        let ours = QueryOptions::default().mask;
+        assert_eq!(rule(None), ours, "a folder without run.json");
+        let record = |compat: &str| {
+            let text = format!("{{\"config\": {{\"plan\": {{{compat}}}}}}}");
+            std::fs::write(folder.path().join("run.json"), text).unwrap();
+        };
+        record("");
+        assert_eq!(rule(None), ours, "a run of before");
+        record("\"compat\": \"langsplat\"");
+        assert_eq!(rule(None), MaskRule::Lerf(0.4));
+        assert_eq!((rule(Some("paper")), rule(Some("none"))), (MaskRule::Lerf(0.6), ours));
+    }
+}
