@@ -229,9 +229,9 @@ pub unsafe fn write_array<T: Versioned>(
     }
     // SAFETY: not null, so the first of the caller's structures.
     let stride = unsafe { stated_size(pointer) }?;
-    let places = values.iter().take(count).enumerate();
+    let mut places = values.iter().take(count).enumerate();
     // SAFETY: the caller gives `count` structures of this size.
-    places.map(|(i, v)| unsafe { write(pointer.cast::<u8>().add(i * stride).cast::<T>(), v) }).collect()
+    places.try_for_each(|(i, v)| unsafe { write(pointer.cast::<u8>().add(i * stride).cast::<T>(), v) })
 }
 
 /// A text of the caller; `None` for null.
