@@ -6,6 +6,7 @@ use crate::query::protocol::{self, ProtocolKind};
 use crate::scene::{Camera, Pose};
 use crate::{Error, Result};
 use serde::Serialize;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// How a data set lies on disk, and by which protocol it is scored.
@@ -76,6 +77,25 @@ pub struct DataSet {
     pub(super) known: Vec<Camera>,
 }
 
+/// The frames that the first columns of a table are means over: the same for all of its rows.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Scope {
+    /// The split of these frames, which a published report sums up.
+    pub(super) headline: Split,
+    /// Stems: held-out frames that no row has seen as photos, or photos that all rows have.
+    pub(super) frames: BTreeSet<String>,
+}
+
+impl Scope {
+    /// Name of the column for the other split.
+    pub(super) fn other(&self) -> &'static str {
+        match self.headline {
+            Split::Train => "mIoU held out",
+            _ => "mIoU photos",
+        }
+    }
+}
+
 /// Labels of a LERF-OVS scene: `lerf_ovs/label/SCENE` beside `lerf_ovs/SCENE`, or in the scene's own folder.
 fn lerf_labels(folder: &Path) -> Option<PathBuf> {
     let whole = folder.canonicalize().ok()?;
@@ -121,7 +141,12 @@ impl DataSet {
 
 fn published(name: String, folder: &Path, kind: ProtocolKind) -> Result<DataSet> {
     let labels = match kind {
-        ProtocolKind::Lerf => lerf_labels(folder).unwrap_or_else(|| folder.join("label")),
+        ProtocolKind::Lerf => lerf_labels(folder).ok_or_else(|| {
+            let place = folder.display();
+            Error::input(format!(
+                "{place}: no label files of LERF-OVS in ../label/NAME or label/; check --layout"
+            ))
+        })?,
         _ => folder.to_owned(),
     };
     let read = protocol::labels(kind, &labels)?;

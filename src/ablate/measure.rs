@@ -1,4 +1,5 @@
 //! What one row gave on one data set with one seed.
+use super::data::Scope;
 use super::runner::RowFigures;
 use super::setup::{RowWork, TableRow};
 use super::stages::Scored;
@@ -7,7 +8,7 @@ use crate::query::eval::Split;
 use crate::query::protocol::{ProtocolKind, ProtocolReport};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 /// One row on one data set with one seed: plain data, which a later process can read back.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -65,25 +66,6 @@ impl Measurement {
         let key =
             |m: &Measurement| (m.data.clone(), m.seed, m.table.clone(), m.group.clone(), m.label.clone());
         key(self) == key(other) && self.setup == other.setup
-    }
-}
-
-/// The frames that the first columns of a table are means over: the same for all of its rows.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct Scope {
-    /// The split of these frames, which a published report sums up.
-    pub(super) headline: Split,
-    /// Stems: held-out frames that no row has seen as photos, or photos that all rows have.
-    pub(super) frames: BTreeSet<String>,
-}
-
-impl Scope {
-    /// Name of the column for the other split.
-    fn other(&self) -> &'static str {
-        match self.headline {
-            Split::Train => "mIoU held out",
-            _ => "mIoU photos",
-        }
     }
 }
 

@@ -30,7 +30,7 @@ use crate::infer::Registry;
 use crate::progress::Progress;
 use crate::run::method::SPARSELGS;
 use crate::{Error, Result};
-use measure::Scope;
+use data::Scope;
 use setup::Group;
 
 /// What to run.
@@ -46,7 +46,7 @@ pub struct Plan {
     pub views: Option<usize>,
     /// Take the true cameras in every row, for photos that alone would give none.
     pub true_cameras: bool,
-    /// Most splats at the start of rows that do not vary it; none = the preset's.
+    /// Most stereo points that splats start from, in rows that do not vary it; none = the preset's.
     pub max_points: Option<usize>,
     /// Each a run of its own: of cameras, stereo, training and injected errors.
     pub seeds: Vec<u64>,

@@ -1,7 +1,6 @@
 //! Runs setups as graphs of stages that share one store: setups that agree up to a stage share what that stage made.
-use super::data::{DataSet, Layout};
+use super::data::{DataSet, Layout, Scope};
 use super::flat;
-use super::measure::Scope;
 use super::setup::{Available, Network, Regions, RowWork, Setup, TableRow};
 use super::stages::{
     EncoderEmbeddings, LabelEmbeddings, LabelledMasks, MaskEmbeddings, ObjectEmbeddings, Score,

@@ -95,7 +95,7 @@ pub struct Setup {
     pub true_cameras: bool,
     /// Dense matches for the alignment.
     pub matcher: SourceChoice,
-    /// Most splats at the start; none = the preset's.
+    /// Most stereo points that splats start from; none = the preset's.
     pub max_points: Option<usize>,
     /// Masks and features.
     pub regions: Regions,

@@ -56,9 +56,12 @@ impl Difference {
 fn student(freedom: usize) -> f64 {
     const TABLE: [f64; 10] = [12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228];
     let z = 1.959_964f64;
-    let expansion = |f: f64| {
-        z + (z.powi(3) + z) / (4.0 * f) + (5.0 * z.powi(5) + 16.0 * z.powi(3) + 3.0 * z) / (96.0 * f * f)
-    };
+    let terms = [
+        (z.powi(3) + z) / 4.0,
+        (5.0 * z.powi(5) + 16.0 * z.powi(3) + 3.0 * z) / 96.0,
+        (3.0 * z.powi(7) + 19.0 * z.powi(5) + 17.0 * z.powi(3) - 15.0 * z) / 384.0,
+    ];
+    let expansion = |f: f64| terms.iter().rev().fold(0.0, |sum, term| (sum + term) / f) + z;
     TABLE.get(freedom.wrapping_sub(1)).copied().unwrap_or_else(|| expansion(freedom as f64))
 }
 

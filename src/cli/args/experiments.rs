@@ -68,7 +68,7 @@ pub struct AblateArgs {
     /// Take the true cameras in every row, for photos that alone would give none
     #[arg(long)]
     pub true_cameras: bool,
-    /// Most splats at the start, in rows that do not vary it [default: draft's]
+    /// Most stereo points that splats start from, in rows that do not vary it [default: draft's]
     #[arg(long, value_name = "N")]
     pub max_points: Option<usize>,
     /// Seeds of cameras, stereo, training and injected errors: a run for each
