@@ -307,7 +307,11 @@ fn read_language(path: &Path, manifest: &LanguageManifest, splats: usize) -> Res
         if m.own_splats {
             let own = ply::read_splats(&own_splats(&folder, &m.name))?;
             if own.len() != splats {
-                return Err(damaged(format!("level {} has {} splats, the scene {splats}", m.name, own.len())));
+                return Err(damaged(format!(
+                    "level {} has {} splats, the scene {splats}",
+                    m.name,
+                    own.len()
+                )));
             }
             level.splats = Some(own);
         }
