@@ -465,8 +465,12 @@ fn a_static_page_answers_what_was_asked() {
     let Some(chromium) = browser::installed() else { return };
     let folder = tempfile::tempdir().unwrap();
     let scene = scene_dir::load(&breakfast(folder.path())).unwrap();
-    let encoder =
-        sources::dir_encoder(&folder.path().join("texts.npz"), None, &Registry::open(None).unwrap()).unwrap();
+    let encoder = sources::dir_encoder(
+        &folder.path().join("texts.npz"),
+        None,
+        &splatvk::infer::Registry::open(None).unwrap(),
+    )
+    .unwrap();
     let device = Device::open(None).unwrap();
     let field = scene.language.clone().unwrap();
     let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder).unwrap();

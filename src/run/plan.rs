@@ -116,7 +116,7 @@ impl Default for RunPlan {
 }
 
 impl RunPlan {
-    /// The plan with what a `compat` decides beside the length of the codes ([`compat::feature_dim`]).
+    /// The plan with what a `compat` decides beside the length of the codes ([`super::compat::feature_dim`]).
     pub fn compatible(self, compat: Option<&'static Compat>) -> RunPlan {
         RunPlan {
             per_level: self.per_level || compat.is_some_and(|c| c.per_level),
