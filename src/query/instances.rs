@@ -172,7 +172,15 @@ impl Places {
         let corner = |side: usize| DVec3::from_array(straight.map(|e| e[side]));
         let oriented = OrientedBox { centre, axes, size };
         let reliability = self.reliability(&splats, level);
-        Instance { splats, share, reliability, centre, bounds: [corner(0), corner(1)], oriented, pixels: Vec::new() }
+        Instance {
+            splats,
+            share,
+            reliability,
+            centre,
+            bounds: [corner(0), corner(1)],
+            oriented,
+            pixels: Vec::new(),
+        }
     }
 
     /// From where to where splats reach along an axis.
