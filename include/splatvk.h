@@ -680,6 +680,10 @@ typedef struct {
      Feature values per level.
      */
     uint32_t feature_dim[3];
+    /*
+     Metres in a scene unit; 0 = unknown.
+     */
+    double metres_per_unit;
 } SvkSceneInfo;
 
 /*
@@ -691,7 +695,7 @@ typedef struct {
      */
     size_t size;
     /*
-     1 = the text was found in this view.
+     1 = the text was found in this view; 0 where it is absent.
      */
     uint32_t found;
     /*
@@ -711,10 +715,80 @@ typedef struct {
      */
     double y;
     /*
-     Pixels in the mask.
+     Pixels in the mask; 0 where the text was not found.
      */
     uint64_t mask_pixels;
+    /*
+     SvkPresence: whether the scene has it, whatever this view shows.
+     */
+    uint32_t presence;
+    /*
+     Things in space that the text means: those of svk_scene_instances.
+     */
+    uint32_t instances;
+    /*
+     Share of other things that fit the scene at least as well: the p-value behind `presence`. 0 = unknown.
+     */
+    double p_value;
+    /*
+     How far the photos agree on what answers, 0 to 1; below 0 = unknown.
+     */
+    double reliability;
 } SvkAnswer;
+
+/*
+ One of the things that a text means. Lengths are in scene units.
+ */
+typedef struct {
+    /*
+     sizeof(SvkInstance)
+     */
+    size_t size;
+    /*
+     Number of its Gaussians.
+     */
+    uint64_t splats;
+    /*
+     Its share of all that answers the text, 0 to 1.
+     */
+    double share;
+    /*
+     How far the photos agree on what it is, 0 to 1; below 0 = unknown.
+     */
+    double reliability;
+    /*
+     Middle of the oriented box.
+     */
+    double centre[3];
+    /*
+     Lowest corner of the box along the scene's axes.
+     */
+    double box_min[3];
+    /*
+     Highest corner.
+     */
+    double box_max[3];
+    /*
+     Unit vectors along the edges of the oriented box.
+     */
+    double axes[3][3];
+    /*
+     Lengths of its edges, longest first.
+     */
+    double box_size[3];
+    /*
+     1 = the view shows it, at (`x`, `y`).
+     */
+    uint64_t seen;
+    /*
+     Pixel of its middle in the view; the first pixel's centre is (0.5, 0.5).
+     */
+    double x;
+    /*
+     See `x`.
+     */
+    double y;
+} SvkInstance;
 
 /*
  Where an image of the host is written: exactly one of `host`, `buffer` and `image` is set.
@@ -900,6 +974,27 @@ SvkStatus svk_scene_query(SvkScene *scene,
                           SvkAnswer *answer,
                           uint8_t *mask,
                           size_t mask_bytes);
+
+/*
+ The things in space that a text means, largest first, with the pixels at which the view of a camera shows them. `instances`
+ has room for `capacity` structures, each with its size set (0 and NULL to count only); `*count` gets the number of things,
+ which may be more. Thread-safe; calls with one scene follow each other.
+ */
+SvkStatus svk_scene_instances(SvkScene *scene,
+                              const char *text,
+                              const SvkCamera *camera,
+                              SvkInstance *instances,
+                              size_t capacity,
+                              size_t *count);
+
+/*
+ What is not understood of a text, one line each, into `notes` (`bytes` long, always ended): "answers for “mug”; “without
+ handle” is not understood". Empty where all of it is understood. Thread-safe.
+ */
+SvkStatus svk_scene_notes(SvkScene *scene,
+                          const char *text,
+                          char *notes,
+                          size_t bytes);
 
 /*
  Writes the scene: a file of Gaussians where the name ends like one (.ply, .compressed.ply, .splat, .spz; language goes

@@ -88,9 +88,6 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let mut queries = Vec::new();
     for (asked, folder) in asked.iter().zip(&folders) {
         let Some(answers) = &asked.answers else { continue };
-        for note in answers.reading.notes() {
-            progress.warn(&format!("“{}”: {note}", answers.text));
-        }
         let mut entry = answers.record(&stems, &scene.world);
         (entry["milliseconds"], entry["views"]) = (asked.milliseconds.into(), asked.views.clone().into());
         entry["embedded_by"] = json!(ready.encoder().embedded_by(&answers.text));
@@ -182,7 +179,9 @@ fn table(asked: &[Asked], stems: &[String], args: &QueryArgs) -> String {
         let Some(answers) = &asked.answers else { continue };
         let found = asked.views.iter().filter(|v| v["found"] == true).count();
         let verdict = answer::verdict(answers.presence, found, asked.views.len());
-        let _ = writeln!(text, "“{}”: {verdict}, answered in {:.0} ms", answers.text, asked.milliseconds);
+        let notes: String = answers.reading.notes().iter().map(|note| format!("; {note}")).collect();
+        let _ =
+            writeln!(text, "“{}”: {verdict}{notes}; answered in {:.0} ms", answers.text, asked.milliseconds);
         for v in &asked.views {
             let verdict = if v["found"] == true { "" } else { "  not found" };
             let _ = writeln!(

@@ -1,5 +1,4 @@
 use super::*;
-use crate::scene::LevelField;
 
 fn unit(v: &[f32]) -> Vec<f32> {
     let n = v.iter().map(|x| x * x).sum::<f32>().sqrt();
@@ -233,4 +232,31 @@ fn the_location_avoids_what_a_finer_level_tells_apart() {
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap();
     assert_eq!(r.level, 2);
     assert!((120..180).contains(&r.location.0) && (20..100).contains(&r.location.1), "{:?}", r.location);
+}
+
+#[test]
+fn a_named_colour_tells_alike_things_apart_where_features_know_it() {
+    use crate::infer::things;
+    use crate::synth::regions;
+    let phrases = ["yellow brick", "green brick", "lemon"];
+    let codebook = Codebook {
+        embedding_dim: regions::DIM,
+        embeddings: phrases.iter().flat_map(|p| regions::text_embedding(p)).collect(),
+        ..Codebook::default()
+    };
+    let level = LevelField { codebook, ..LevelField::default() };
+    let field = LanguageField { levels: vec![level], ..LanguageField::default() };
+    let ask = |text: &str| {
+        let colours = things::recoloured(text).iter().flat_map(|t| regions::text_embedding(t)).collect();
+        let alternatives = Alternatives { colours, ..Alternatives::default() };
+        let blind = regions::query(text);
+        let query = TextQuery { alternatives, ..blind.clone() };
+        [blind, query].map(|q| field_relevancy(&field, &q).unwrap().concat())
+    };
+    let [blind, seeing] = ask("yellow brick");
+    assert!(blind[1] > 0.7 && seeing[1] == 0.5, "{blind:?} {seeing:?}");
+    assert_eq!(blind[0], seeing[0]);
+    // There is no red one: what is alike stays the nearest.
+    let [blind, seeing] = ask("red brick");
+    assert_eq!(blind, seeing);
 }
