@@ -34,7 +34,7 @@ const FOLDERS: &[(&str, &str)] = &[
         "error files preset progress scene gpu pass photo format infer pose fit language query report pipeline",
     ),
     ("ablate", "error preset progress scene gpu photo infer fit language query report synth pipeline run"),
-    ("bench", "error preset progress scene gpu pass photo format infer pose fit query run"),
+    ("bench", "error preset progress scene gpu pass photo format infer pose fit language query run"),
     ("capi", "error preset progress scene gpu pass photo infer pose run"),
     (
         "cli",
