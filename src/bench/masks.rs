@@ -254,7 +254,12 @@ mod tests {
             }
         }
         truth.data[10..14].fill(9);
-        let level = crate::language::LevelMasks { labels, quality: vec![1.0; 2], features: Vec::new() };
+        let level = crate::language::LevelMasks {
+            labels,
+            quality: vec![1.0; 2],
+            features: Vec::new(),
+            whole: Vec::new(),
+        };
         let hole = crate::language::LevelMasks { labels: Plane::filled(10, 10, -1), ..Default::default() };
         let found = ious(&ViewMasks { levels: vec![level, hole] }, &truth);
         assert_eq!(found.keys().copied().collect::<Vec<_>>(), [0, 7]);
