@@ -83,7 +83,7 @@ pub struct Finished<'m> {
 
 /// Runs the tables on every data set with every seed, one data set after the other, and drops what was made of one before the
 /// next. `keep` is told after every row. Rows of `earlier` that were measured the same way are taken from there. A row that
-/// cannot be measured says why and the others go on; an error is what stopped every row, or the user.
+/// cannot be measured says why and the others go on; an error is what stopped every row, a lost device, or the user.
 pub fn run(
     plan: &Plan,
     sets: Vec<DataSet>,
@@ -194,7 +194,8 @@ impl Study<'_> {
             RowWork::Nothing => Ok(begun.clone()),
         };
         match outcome {
-            Err(Error::Cancelled) => Err(Error::Cancelled),
+            // Without its device no later row can be measured either.
+            Err(error @ (Error::Cancelled | Error::DeviceLost { .. })) => Err(error),
             Err(error) => {
                 let note = error.to_string();
                 self.first_error.get_or_insert(error);

@@ -45,7 +45,14 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
             _ => Ok(()),
         }
     };
-    let all = ablate::run(&plan, sets, (&device, &registry), &earlier, progress.as_ref(), &mut keep)?;
+    let all = ablate::run(&plan, sets, (&device, &registry), &earlier, progress.as_ref(), &mut keep);
+    if let Err(Error::Cancelled | Error::DeviceLost { .. }) = all {
+        let place = out.display();
+        progress.inform(&format!(
+            "finished rows are in {place}; the same command with --resume goes on from there"
+        ));
+    }
+    let all = all?;
     if args.device.json {
         return print_json(&Report { all: &all, plan: &plan, paper: &paper, head: head() }.json());
     }
