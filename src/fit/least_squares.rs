@@ -4,12 +4,12 @@ use crate::Result;
 use crate::pass::codes::Mode;
 use rayon::prelude::*;
 
-/// Steps of conjugate gradients; a step costs a forward and a backward pass per photo. Preconditioned by the blending weights the
-/// residual falls to a tenth in this many, and mIoU no longer moves (docs/experiments.md#measured-lifting).
+/// Steps of conjugate gradients; a step costs a forward and a backward pass per photo, so that these cost about as much as the draft
+/// preset's training. Not searched (docs/experiments.md#measured-lifting).
 const STEPS: usize = 8;
 
-/// λ: how much a splat's own mean counts beside what its pixels ask for, as a share of its blending weight
-/// (docs/experiments.md#measured-lifting).
+/// λ: how much a splat's own mean counts beside what its pixels ask for, as a share of its blending weight. A tenth leaves what pixels
+/// agree on to them and decides what they leave open. Not searched (docs/experiments.md#measured-lifting).
 const PRIOR: f32 = 0.1;
 
 /// Sets the model's raw features to the solution of `min_f Σ_px |Σ_i w_i f_i − c|² + λ Σ_i W_i |f_i − m_i|²`, with W_i the blending
