@@ -1,5 +1,4 @@
 //! What a splat carries on a level, in five bytes: where it lies between two codes, and how sure that is.
-use super::Codebook;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -22,17 +21,18 @@ pub struct CodeMix {
 }
 
 impl CodeMix {
-    /// Of a feature [d] of any length among the codes of a level.
-    fn of(feature: &[f32], book: &Codebook) -> CodeMix {
-        let none = CodeMix { first: book.len() as u16, second: book.len() as u16, share: 0 };
+    /// Of a feature [d] of any length among codes [K, d].
+    fn of(feature: &[f32], codes: &[f32]) -> CodeMix {
+        let count = codes.len() / feature.len();
+        let none = CodeMix { first: count as u16, second: count as u16, share: 0 };
         let length = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
         // False for what is not a number, too.
         let carried = length >= MIN_LENGTH;
         if !carried {
             return none;
         }
-        let mut best: [(f32, usize); 2] = [(f32::NEG_INFINITY, book.len()); 2];
-        for (k, code) in book.codes.chunks_exact(book.code_dim.max(1)).enumerate() {
+        let mut best: [(f32, usize); 2] = [(f32::NEG_INFINITY, count); 2];
+        for (k, code) in codes.chunks_exact(feature.len()).enumerate() {
             let cosine = dot(feature, code) / length;
             if cosine > best[0].0 {
                 best = [(cosine, k), best[0]];
@@ -41,11 +41,11 @@ impl CodeMix {
             }
         }
         let [(a, first), (b, second)] = best;
-        if second >= book.len() {
+        if second >= count {
             return CodeMix { first: first as u16, second: first as u16, share: 0 };
         }
         // The combination of the two that is nearest to the feature (least squares of unit vectors).
-        let ab = dot(book.code(first), book.code(second));
+        let ab = dot(row(codes, first, feature.len()), row(codes, second, feature.len()));
         let (first_weight, second_weight) = (a - ab * b, (b - ab * a).max(0.0));
         let share = second_weight / (first_weight + second_weight).max(f32::MIN_POSITIVE);
         let share = (SHARE_STEPS * share).round().clamp(0.0, 255.0) as u8;
@@ -54,13 +54,15 @@ impl CodeMix {
     }
 
     /// Writes the unit feature [d] that it stands for; zeros for none.
-    fn write(self, book: &Codebook, out: &mut [f32]) {
+    fn write(self, codes: &[f32], out: &mut [f32]) {
         out.fill(0.0);
-        if usize::from(self.first) >= book.len() || usize::from(self.second) >= book.len() {
+        let count = codes.len() / out.len();
+        if usize::from(self.first) >= count || usize::from(self.second) >= count {
             return;
         }
         let share = f32::from(self.share) / SHARE_STEPS;
-        let (first, second) = (book.code(self.first.into()), book.code(self.second.into()));
+        let (first, second) =
+            (row(codes, self.first.into(), out.len()), row(codes, self.second.into(), out.len()));
         for ((value, a), b) in out.iter_mut().zip(first).zip(second) {
             *value = (1.0 - share) * a + share * b;
         }
@@ -71,19 +73,25 @@ impl CodeMix {
     }
 }
 
-/// The mixes nearest to features [N, d]; nothing where the codes are more than a mix can name.
-pub fn mixes(features: &[f32], book: &Codebook) -> Vec<CodeMix> {
-    if book.len() >= usize::from(u16::MAX) {
+/// The mixes of codes [K, d] nearest to features [N, d]; nothing where the codes are more than a mix can name.
+pub fn mixes(features: &[f32], codes: &[f32], d: usize) -> Vec<CodeMix> {
+    if d == 0 || codes.len() / d >= usize::from(u16::MAX) {
         return Vec::new();
     }
-    features.par_chunks_exact(book.code_dim.max(1)).map(|f| CodeMix::of(f, book)).collect()
+    features.par_chunks_exact(d).map(|f| CodeMix::of(f, codes)).collect()
 }
 
-/// The unit features [N, d] of mixes.
-pub fn features(mixes: &[CodeMix], book: &Codebook) -> Vec<f32> {
-    let mut out = vec![0.0; mixes.len() * book.code_dim];
-    out.par_chunks_exact_mut(book.code_dim.max(1)).zip(mixes).for_each(|(f, mix)| mix.write(book, f));
+/// The unit features [N, d] of mixes of codes [K, d].
+pub fn features(mixes: &[CodeMix], codes: &[f32], d: usize) -> Vec<f32> {
+    let mut out = vec![0.0; mixes.len() * d];
+    if d > 0 {
+        out.par_chunks_exact_mut(d).zip(mixes).for_each(|(f, mix)| mix.write(codes, f));
+    }
     out
+}
+
+fn row(codes: &[f32], k: usize, d: usize) -> &[f32] {
+    &codes[k * d..(k + 1) * d]
 }
 
 fn dot(a: &[f32], b: &[f32]) -> f32 {
@@ -95,44 +103,32 @@ mod tests {
     use super::*;
     use crate::math::Random;
 
-    fn book(codes: &[[f32; 3]]) -> Codebook {
-        let count = codes.len();
-        Codebook {
-            embedding_dim: 1,
-            code_dim: 3,
-            embeddings: vec![1.0; count],
-            codes: codes.concat(),
-            ..Codebook::default()
-        }
-    }
-
     #[test]
     fn a_mix_of_two_codes_survives_and_no_feature_stays_none() {
-        let book = book(&[[1.0, 0.0, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]);
+        let codes = [1.0, 0.0, 0.0, 0.6, 0.8, 0.0, 0.0, 0.0, 1.0];
         let mut random = Random::new(1000);
         for _ in 0..200 {
             let (t, length) = (0.5 * random.uniform() as f32, 0.2 + random.uniform() as f32);
             let (a, b) = (random.below(3), random.below(3));
             let mixed: Vec<f32> =
-                book.code(a).iter().zip(book.code(b)).map(|(x, y)| (1.0 - t) * x + t * y).collect();
+                row(&codes, a, 3).iter().zip(row(&codes, b, 3)).map(|(x, y)| (1.0 - t) * x + t * y).collect();
             let norm = dot(&mixed, &mixed).sqrt();
             let feature: Vec<f32> = mixed.iter().map(|v| length * v / norm).collect();
-            let mix = mixes(&feature, &book);
-            let back = features(&mix, &book);
+            let mix = mixes(&feature, &codes, 3);
+            let back = features(&mix, &codes, 3);
             // Half a step of the share moves a unit vector by at most 1/510 of the codes' distance.
             assert!(dot(&back, &feature) / length > 1.0 - 1e-5, "{a} {b} {t}: {back:?} of {feature:?}");
             // Storing what was stored changes nothing.
-            assert_eq!(features(&mixes(&back, &book), &book), back);
+            assert_eq!(features(&mixes(&back, &codes, 3), &codes, 3), back);
         }
-        let none = mixes(&[0.05, 0.0, 0.0, f32::NAN, 0.0, 0.0], &book);
-        assert_eq!(features(&none, &book), [0.0; 6]);
+        let none = mixes(&[0.05, 0.0, 0.0, f32::NAN, 0.0, 0.0], &codes, 3);
+        assert_eq!(features(&none, &codes, 3), [0.0; 6]);
     }
 
     #[test]
     fn a_single_code_and_opposite_codes_give_unit_features() {
-        let one = book(&[[0.0, 1.0, 0.0]]);
-        assert_eq!(features(&mixes(&[0.3, 0.4, 0.0], &one), &one), [0.0, 1.0, 0.0]);
-        let opposite = book(&[[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]);
-        assert_eq!(features(&mixes(&[0.5, 0.5, 0.0], &opposite), &opposite), [1.0, 0.0, 0.0]);
+        let stored = |feature: &[f32], codes: &[f32]| features(&mixes(feature, codes, 3), codes, 3);
+        assert_eq!(stored(&[0.3, 0.4, 0.0], &[0.0, 1.0, 0.0]), [0.0, 1.0, 0.0]);
+        assert_eq!(stored(&[0.5, 0.5, 0.0], &[1.0, 0.0, 0.0, -1.0, 0.0, 0.0]), [1.0, 0.0, 0.0]);
     }
 }

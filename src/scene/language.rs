@@ -64,10 +64,6 @@ impl Codebook {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// Code number `k`, [d].
-    pub fn code(&self, k: usize) -> &[f32] {
-        &self.codes[k * self.code_dim..(k + 1) * self.code_dim]
-    }
     /// `argmax_k F·c_k` (docs/method.md#decoding-codes); ties take the lowest k; `None` without codes.
     pub fn decode(&self, feature: &[f32]) -> Option<usize> {
         let mut best: Option<(f32, usize)> = None;
@@ -107,7 +103,7 @@ impl LevelField {
 
     /// Takes over features [N, d] of any length: as unit mixes of two codes, or as they are where a mix cannot name the codes.
     pub fn carry(&mut self, features: Vec<f32>) {
-        self.carry_mixes(code_mix::mixes(&features, &self.codebook));
+        self.carry_mixes(code_mix::mixes(&features, &self.codebook.codes, self.codebook.code_dim));
         if self.mixes.is_empty() {
             self.features = features;
         }
@@ -115,7 +111,7 @@ impl LevelField {
 
     /// Takes over mixes of its codes.
     pub fn carry_mixes(&mut self, mixes: Vec<CodeMix>) {
-        self.features = code_mix::features(&mixes, &self.codebook);
+        self.features = code_mix::features(&mixes, &self.codebook.codes, self.codebook.code_dim);
         self.mixes = mixes;
     }
 
