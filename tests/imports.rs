@@ -38,7 +38,7 @@ const FOLDERS: &[(&str, &str)] = &[
         "ablate",
         "error preset progress scene gpu photo format infer fit language query report synth pipeline run",
     ),
-    ("bench", "error preset progress scene gpu pass photo format infer pose fit query run"),
+    ("bench", "error preset progress scene gpu pass photo format infer pose fit language query run"),
     ("capi", "error preset progress scene gpu pass photo infer pose query run"),
     (
         "cli",

@@ -7,6 +7,7 @@ pub mod cameras;
 pub mod compare;
 mod growth;
 mod latency;
+pub mod masks;
 pub mod measure;
 mod model;
 pub mod report;

@@ -27,6 +27,9 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     if has(BenchPart::Cameras) {
         return cameras(args);
     }
+    if has(BenchPart::Masks) {
+        return masks(args);
+    }
     if has(BenchPart::Models) {
         models(&args.registry()?.uncached())?;
         if args.parts == [BenchPart::Models] {
@@ -105,14 +108,7 @@ fn models(registry: &Registry) -> Result<()> {
 
 /// Photos → cameras on data with a known answer; needs no device.
 fn cameras(args: &BenchArgs) -> Result<()> {
-    if args.parts.len() > 1 {
-        return Err(Error::input("bench cameras: runs alone; leave the other parts out"));
-    }
-    if args.data.is_empty() {
-        return Err(Error::input("bench cameras: give folders with ground_truth.json with --data DIR..."));
-    }
-    writable(args.json.as_deref())?;
-    let registry = args.registry()?;
+    let registry = of_data(args, "cameras")?;
     let reading =
         bench::cameras::PhotoInput { max_size: args.max_size, copies: args.copies, pairs: args.pairs };
     let progress = progress::reporter();
@@ -120,11 +116,40 @@ fn cameras(args: &BenchArgs) -> Result<()> {
     let mut show =
         |row: &bench::cameras::CameraRow| print(&(header.take().unwrap_or_default() + &row.text()));
     let report = bench::cameras::measure(&args.data, reading, &registry, progress.as_ref(), &mut show)?;
-    if let Some(file) = &args.json {
-        let value = serde_json::to_value(&report).map_err(|e| Error::work(format!("bench report: {e}")))?;
-        write_json(file, &value)?;
-    }
+    keep(args, &report)?;
     print(&report.text())
+}
+
+/// Photos → masks on data with true masks; needs no device.
+fn masks(args: &BenchArgs) -> Result<()> {
+    let registry = of_data(args, "masks")?;
+    let progress = progress::reporter();
+    let mut header = Some(bench::masks::header());
+    let mut show = |row: &bench::masks::MaskRow| print(&(header.take().unwrap_or_default() + &row.text()));
+    let report = bench::masks::measure(&args.data, args.max_size, &registry, progress.as_ref(), &mut show)?;
+    keep(args, &report)?;
+    print(&report.text())
+}
+
+/// Checks the options of a part that reads folders with ground truth and runs by itself.
+fn of_data(args: &BenchArgs, part: &str) -> Result<Registry> {
+    if args.parts.len() > 1 {
+        return Err(Error::input(format!("bench {part}: runs alone; leave the other parts out")));
+    }
+    if args.data.is_empty() {
+        return Err(Error::input(format!(
+            "bench {part}: give folders with ground_truth.json with --data DIR..."
+        )));
+    }
+    writable(args.json.as_deref())?;
+    args.registry()
+}
+
+/// Writes the report where `--json` says.
+fn keep(args: &BenchArgs, report: &impl serde::Serialize) -> Result<()> {
+    let Some(file) = &args.json else { return Ok(()) };
+    let value = serde_json::to_value(report).map_err(|e| Error::work(format!("bench report: {e}")))?;
+    write_json(file, &value)
 }
 
 /// The scene and the text encoder of its space.

@@ -29,7 +29,7 @@ fn inputs() -> Inputs {
         let known = v.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect();
         let depth = DepthMap { depth: v.depth.clone(), confidence: Plane { data: known, ..v.depth } };
         let edges = hed.edges(&v.image).unwrap();
-        let m = segment(&v.image, Some(&edges), Some((&v.camera, &depth)), &GraphOptions::default()).unwrap();
+        let m = segment(&v.image, &edges, &GraphOptions::default()).unwrap();
         dense.push(net.dense(&v.image).unwrap());
         masks.push(m);
         depths.push(depth);

@@ -19,6 +19,8 @@ pub enum BenchPart {
     Roofline,
     /// Photos to cameras on every --data folder: errors, and whether the stated focal uncertainty is right
     Cameras,
+    /// Photos to masks on every --data folder with true masks, without cameras: IoU of the best mask with each object
+    Masks,
 }
 
 /// `splatvk bench`
@@ -60,10 +62,10 @@ pub struct BenchArgs {
     /// query: what to look for
     #[arg(long, default_value = "a cup", value_name = "TEXT")]
     pub query: String,
-    /// cameras: folders with ground_truth.json and photos
+    /// cameras, masks: folders with ground_truth.json and photos
     #[arg(long, num_args = 1.., value_name = "DIR")]
     pub data: Vec<PathBuf>,
-    /// cameras: longer side of the working image, pixels
+    /// cameras, masks: longer side of the working image, pixels
     #[arg(long, default_value_t = crate::photo::MAX_SIZE_CPU, value_name = "N")]
     pub max_size: usize,
     /// cameras: use copies of the photos of that size, not the photos themselves
@@ -72,7 +74,7 @@ pub struct BenchArgs {
     /// cameras: every two photos of a folder by themselves
     #[arg(long)]
     pub pairs: bool,
-    /// query, models, cameras: folder of the models
+    /// query, models, cameras, masks: folder of the models
     #[arg(long, value_name = "DIR")]
     pub models: Option<PathBuf>,
     /// Repeat each measurement for this long

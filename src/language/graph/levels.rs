@@ -1,9 +1,9 @@
-//! Three cuts of the merge tree: each takes, along every branch, the region that survives longest.
+//! Three cuts of the merge tree.
 //!
 //! A fixed threshold cuts plain and printed things at different depths. What people call a thing is instead a node
-//! that forms early and is absorbed late, so level l is the set of disjoint nodes with the largest total persistence
-//! (the excess-of-mass rule of HDBSCAN, Campello et al. 2013), m the best such set strictly inside l's nodes, s inside
-//! m's.
+//! with a clear outline, so a level is the set of disjoint nodes with the largest total score (the rule by which HDBSCAN
+//! chooses clusters, Campello et al. 2013). Each level is cut by itself, so that a thing that stands out stays
+//! on its level whatever the others hold: cut inside the next coarser level's masks, it is on another level in every photo.
 use super::options::{Cues, GraphOptions};
 use super::tree::Tree;
 use crate::language::{LevelMasks, ViewMasks};
@@ -16,21 +16,17 @@ const NONE: usize = usize::MAX;
 pub(super) fn cut(tree: &Tree, cues: &Cues, options: &GraphOptions) -> ViewMasks {
     let total = cues.labels.data.len() as f32;
     let roots: Vec<usize> = (0..tree.nodes.len()).filter(|&n| tree.nodes[n].parent == NONE).collect();
-    let mut levels = Vec::new();
-    // the whole image is no thing: level l starts inside it
-    let mut starts: Vec<usize> = roots.iter().flat_map(|&r| inside(tree, r)).collect();
-    for factor in [16.0, 4.0, 1.0] {
-        let min_area = options.min_mask * factor * total;
-        let mut chosen = most_persistent(tree, &starts, min_area, options);
+    // the whole image is no thing
+    let starts: Vec<usize> = roots.iter().flat_map(|&r| inside(tree, r)).collect();
+    let level = |(&power, &share): (&f32, &f32)| {
+        let mut chosen = clearest(tree, &starts, share * total, |n| score(tree, n, power, options));
         if chosen.is_empty() {
             // nothing stands out: the image is one thing
             chosen.clone_from(&roots);
         }
-        starts = chosen.iter().flat_map(|&n| parts(tree, n, min_area / 4.0)).collect();
-        levels.push(paint(tree, cues, &chosen));
-    }
-    levels.reverse();
-    ViewMasks { levels }
+        paint(tree, cues, &chosen)
+    };
+    ViewMasks { levels: options.area_powers.iter().zip(&options.min_masks).map(level).collect() }
 }
 
 /// The two halves of a node; none for a leaf.
@@ -38,68 +34,22 @@ fn inside(tree: &Tree, node: usize) -> Vec<usize> {
     tree.nodes[node].children.map_or(Vec::new(), |(a, b)| vec![a, b])
 }
 
-/// The branches that a finer level may show inside `node`: both sides of the first split, from the top, whose smaller
-/// side could be a mask itself. What is trimmed off above that split is not a part but a ragged edge.
-fn parts(tree: &Tree, node: usize, min_area: f32) -> Vec<usize> {
-    let mut n = node;
-    while let Some((a, b)) = tree.nodes[n].children {
-        let (large, small) =
-            if tree.nodes[a].region.area >= tree.nodes[b].region.area { (a, b) } else { (b, a) };
-        if tree.nodes[small].region.area >= min_area {
-            return vec![large, small];
-        }
-        n = large;
-    }
-    // a thing without parts is its own part
-    vec![node]
+/// How clear the outline of a node is, weighed by its size. The share of costs over which it stays as it is, as in HDBSCAN,
+/// adds nothing to that: see `docs/method.md#graph-masks`.
+fn score(tree: &Tree, node: usize, area_power: f32, options: &GraphOptions) -> f32 {
+    let r = &tree.nodes[node].region;
+    let contour = r.contour / (r.perimeter - r.frame).max(1.0);
+    contour.powf(options.contour_power) * r.area.powf(area_power)
 }
 
-/// Height at which the region was essentially complete: gaining or losing a share `same` of its area does not make it
-/// another region.
-fn birth(tree: &Tree, node: usize, same: f32) -> f32 {
-    let limit = (1.0 - same) * tree.nodes[node].region.area;
-    let mut n = node;
-    while let Some((a, b)) = tree.nodes[n].children {
-        let larger = if tree.nodes[a].region.area >= tree.nodes[b].region.area { a } else { b };
-        if tree.nodes[larger].region.area < limit {
-            break;
-        }
-        n = larger;
-    }
-    tree.nodes[n].height
-}
-
-/// Height at which the region became part of something else.
-fn death(tree: &Tree, node: usize, same: f32) -> f32 {
-    let limit = tree.nodes[node].region.area * (1.0 + same);
-    let mut n = node;
-    while tree.nodes[n].parent != NONE && tree.nodes[n].region.area <= limit {
-        n = tree.nodes[n].parent;
-    }
-    tree.nodes[n].height
-}
-
-/// Disjoint nodes at or below `starts` with the largest total score.
-fn most_persistent(tree: &Tree, starts: &[usize], min_area: f32, options: &GraphOptions) -> Vec<usize> {
-    let score = |n: usize| {
-        let node = &tree.nodes[n];
-        if node.region.area < min_area || node.parent == NONE {
-            return 0.0;
-        }
-        let birth = birth(tree, n, options.same).max(options.floor);
-        let death = death(tree, n, options.same).max(options.floor);
-        let r = &node.region;
-        let contour = r.contour / (r.perimeter - r.frame).max(1.0);
-        (death / birth).ln().powf(options.life_power)
-            * contour.powf(options.contour_power)
-            * node.region.area.powf(options.area_power)
-    };
+/// Disjoint nodes of at least `min_area` at or below `starts` with the largest total score.
+fn clearest(tree: &Tree, starts: &[usize], min_area: f32, score: impl Fn(usize) -> f32) -> Vec<usize> {
     // children precede parents: one pass from the leaves up
     let mut best = vec![0.0f32; tree.nodes.len()];
     let mut own = vec![false; tree.nodes.len()];
     for n in 0..tree.nodes.len() {
         let below = tree.nodes[n].children.map_or(0.0, |(a, b)| best[a] + best[b]);
-        let here = score(n);
+        let here = if tree.nodes[n].region.area >= min_area { score(n) } else { 0.0 };
         own[n] = here > 0.0 && here >= below;
         best[n] = here.max(below);
     }

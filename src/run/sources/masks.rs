@@ -18,7 +18,7 @@ impl SourceKind for MaskSources {
         Source {
             name: "graph",
             argument: None,
-            about: "segmentation by colour, learned edges and depth",
+            about: "segmentation by colour and learned edges",
             needs: &[PackFileKind::Edges],
             check: NO_CHECK,
             make: |_, (build, photos)| Ok(graph(build, photos)),
@@ -54,5 +54,5 @@ impl SourceKind for MaskSources {
 
 fn graph(build: &mut GraphBuilder, photos: PosedPhotos) -> Output<Vec<ViewMasks>> {
     let edges = build.graph.add(ContourMaps, (photos.placed,));
-    build.graph.add(GraphMasks, (photos.placed, edges, photos.geometry))
+    build.graph.add(GraphMasks, (photos.placed, edges))
 }

@@ -9,7 +9,6 @@ use crate::language::sam::{self, SamOptions};
 use crate::language::{ViewMasks, dir, graph};
 use crate::photo::Photo;
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
-use crate::pose::Geometry;
 use crate::progress::Progress;
 use crate::scene::{Plane, RgbImage};
 use rayon::prelude::*;
@@ -48,13 +47,13 @@ impl Stage for ContourMaps {
     }
 }
 
-/// The built-in masks, helped by learned edges and stereo depth.
+/// The built-in masks, helped by learned edges.
 pub struct GraphMasks;
 
 impl Stage for GraphMasks {
     const NAME: &'static str = "graph-masks";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<PlacedPhotos>, Output<Vec<Plane<f32>>>, Output<Geometry>);
+    type Inputs = (Output<PlacedPhotos>, Output<Vec<Plane<f32>>>);
     type Output = Vec<ViewMasks>;
 
     fn settings(&self) -> String {
@@ -63,21 +62,20 @@ impl Stage for GraphMasks {
 
     fn run(
         self,
-        (placed, edges, geometry): (&PlacedPhotos, &Vec<Plane<f32>>, &Geometry),
+        (placed, edges): (&PlacedPhotos, &Vec<Plane<f32>>),
         context: &Context,
     ) -> Result<Vec<ViewMasks>> {
         let progress = context.progress;
         progress.begin("masks", placed.photos.len() as u64);
         let done = AtomicU64::new(0);
         let options = graph::GraphOptions::default();
-        let one = |(i, photo): (usize, &Photo)| {
+        let one = |(photo, edges): (&Photo, &Plane<f32>)| {
             progress.check()?;
-            let depth = Some((&geometry.cameras[i], &geometry.depths[i]));
-            let masks = graph::segment(&photo.image, edges.get(i), depth, &options)?;
+            let masks = graph::segment(&photo.image, edges, &options)?;
             progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
             Ok(masks)
         };
-        let masks = placed.photos.par_iter().enumerate().map(one).collect::<Result<_>>()?;
+        let masks = placed.photos.par_iter().zip(edges).map(one).collect::<Result<_>>()?;
         progress.end();
         Ok(masks)
     }
