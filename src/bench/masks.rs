@@ -232,7 +232,7 @@ mod tests {
             (12, 96, 8),
             "table, wall and carpet are no objects"
         );
-        // docs/method.md#graph-masks states 0.XXX and 0.XXX
+        // the targets of the built-in masks on this set; docs/method.md#graph-masks states what they reach
         assert!(row.best > 0.9 && row.one_level > 0.88, "{seen}");
         assert!(row.one_level <= row.best && report.best == row.best);
         let mut sizes = row.masks.to_vec();
@@ -254,12 +254,7 @@ mod tests {
             }
         }
         truth.data[10..14].fill(9);
-        let level = crate::language::LevelMasks {
-            labels,
-            quality: vec![1.0; 2],
-            features: Vec::new(),
-            whole: Vec::new(),
-        };
+        let level = crate::language::LevelMasks { labels, quality: vec![1.0; 2], ..Default::default() };
         let hole = crate::language::LevelMasks { labels: Plane::filled(10, 10, -1), ..Default::default() };
         let found = ious(&ViewMasks { levels: vec![level, hole] }, &truth);
         assert_eq!(found.keys().copied().collect::<Vec<_>>(), [0, 7]);

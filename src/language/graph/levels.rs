@@ -2,8 +2,8 @@
 //!
 //! A fixed threshold cuts plain and printed things at different depths. What people call a thing is instead a node
 //! with a clear outline, so a level is the set of disjoint nodes with the largest total score (the rule by which HDBSCAN
-//! chooses clusters, Campello et al. 2013). Each level is cut by itself, so that a thing that stands out stays
-//! on its level whatever the others hold: cut inside the next coarser level's masks, it is on another level in every photo.
+//! chooses clusters, Campello et al. 2013). Each level is cut by itself, so that what it
+//! holds does not hang on what a coarser one took.
 use super::options::{Cues, GraphOptions};
 use super::tree::Tree;
 use crate::language::{LevelMasks, ViewMasks};
