@@ -8,13 +8,13 @@ const SHARE_STEPS: f32 = 510.0;
 /// Splats whose feature is shorter have none: lifting leaves exact zeros, training moves them by less than this.
 pub const MIN_LENGTH: f32 = 0.1;
 
-/// A unit feature as a mix of the two codes that it is nearest to. Blending and decoding read a feature only through its cosines
+/// A unit feature as the nearest mix of its nearest code with another. Blending and decoding read a feature only through its cosines
 /// to the codes, and a splat between two things mixes two of them; docs/method.md#feature-storage has what that costs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CodeMix {
     /// The nearest code; the number of codes where the splat has no feature.
     pub first: u16,
-    /// The second-nearest code.
+    /// The code that comes nearest to the feature together with the first.
     pub second: u16,
     /// Share of the second code, in 1/510.
     pub share: u8,
@@ -31,22 +31,20 @@ impl CodeMix {
         if !carried {
             return none;
         }
-        let mut best: [(f32, usize); 2] = [(f32::NEG_INFINITY, count); 2];
-        for (k, code) in codes.chunks_exact(feature.len()).enumerate() {
-            let cosine = dot(feature, code) / length;
-            if cosine > best[0].0 {
-                best = [(cosine, k), best[0]];
-            } else if cosine > best[1].0 {
-                best[1] = (cosine, k);
-            }
-        }
-        let [(a, first), (b, second)] = best;
-        if second >= count {
-            return CodeMix { first: first as u16, second: first as u16, share: 0 };
-        }
-        // The combination of the two that is nearest to the feature (least squares of unit vectors).
-        let ab = dot(row(codes, first, feature.len()), row(codes, second, feature.len()));
-        let (first_weight, second_weight) = (a - ab * b, (b - ab * a).max(0.0));
+        let d = feature.len();
+        let cosine = |k: usize| dot(feature, row(codes, k, d)) / length;
+        let Some((a, first)) = (0..count).map(|k| (cosine(k), k)).max_by(|x, y| x.0.total_cmp(&y.0)) else {
+            return none;
+        };
+        // Weights of the combination of the two that is nearest to the feature (least squares of unit vectors), and how much nearer
+        // it is than the first code alone.
+        let with = |k: usize| {
+            let (b, ab) = (cosine(k), dot(row(codes, first, d), row(codes, k, d)));
+            let weight = (b - ab * a).max(0.0);
+            (weight * weight / (1.0 - ab * ab).max(f32::EPSILON), k, a - ab * b, weight)
+        };
+        let best = (0..count).filter(|k| *k != first).map(with).max_by(|x, y| x.0.total_cmp(&y.0));
+        let (_, second, first_weight, second_weight) = best.unwrap_or((0.0, first, 1.0, 0.0));
         let share = second_weight / (first_weight + second_weight).max(f32::MIN_POSITIVE);
         let share = (SHARE_STEPS * share).round().clamp(0.0, 255.0) as u8;
         let second = if share == 0 { first } else { second };
