@@ -170,7 +170,7 @@ fn what_cannot_be_done_is_one_line_and_exit_code_two() {
         (vec!["ablate", "all", "--data", breakfast, breakfast, "--out", o], "the same folder twice"),
         (vec!["ablate", "all", "--data", breakfast, "--out", o, "--seeds", "1,1"], "the same seed twice"),
         (vec!["ablate", "all", "--data", breakfast, "--out", o, "--matcher", "sift"], "--matcher sift"),
-        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--layout", "lerf"], "lerf"),
+        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--layout", "lerf"], "LERF-OVS"),
     ] {
         let output = splatvk(&args);
         let text = String::from_utf8_lossy(&output.stderr).into_owned();

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 /// Steps of conjugate gradients; a step costs a forward and a backward pass per photo, so that these cost about as much as the draft
 /// preset's training. Not searched (docs/experiments.md#measured-lifting).
-const STEPS: usize = 8;
+const SOLVER_STEPS: usize = 8;
 
 /// λ: how much a splat's own mean counts beside what its pixels ask for, as a share of its blending weight. A tenth leaves what pixels
 /// agree on to them and decides what they leave open. Not searched (docs/experiments.md#measured-lifting).
@@ -35,7 +35,7 @@ pub(super) fn solve(lifting: &mut Lifting, lifted: &Lifted) -> Result<()> {
     let mut z = precondition(&residual);
     let mut direction = z.clone();
     let mut energy = dot(&residual, &z);
-    for _ in 0..STEPS {
+    for _ in 0..SOLVER_STEPS {
         let applied = apply(lifting, lifted, &weights, &direction)?;
         let curvature = dot(&direction, &applied);
         // False for what is not a number, too: what was reached stays.
