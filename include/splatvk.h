@@ -175,6 +175,39 @@ typedef uint32_t SvkShDegree;
 #endif // __cplusplus
 
 /*
+ Whether the scene has what a text means.
+ */
+enum SvkPresence
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : uint32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /*
+     The text model knows too few texts to tell.
+     */
+    SVK_PRESENCE_UNKNOWN = 0,
+    /*
+     It has.
+     */
+    SVK_PRESENCE_FOUND = 1,
+    /*
+     What the scene's features say does not decide, or the text is not wholly understood (see svk_scene_notes).
+     */
+    SVK_PRESENCE_UNSURE = 2,
+    /*
+     It has not.
+     */
+    SVK_PRESENCE_ABSENT = 3,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum SvkPresence SvkPresence;
+#else
+typedef uint32_t SvkPresence;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/*
  What a call of the progress callback is about.
  */
 enum SvkProgressKind
