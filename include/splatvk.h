@@ -672,7 +672,8 @@ typedef struct {
      */
     const char *feature_source;
     /*
-     How language gets onto the splats, as --method takes it. NULL = "sparselgs".
+     How language gets onto the splats, as --method takes it. NULL = "lift"; "sparselgs" with the preset of the paper,
+     `language_iterations`, `per_level` or `compat`.
      */
     const char *method;
     /*
@@ -683,6 +684,11 @@ typedef struct {
      What can be done in several ways, as others do it: as --compat takes it. NULL = as this library does it.
      */
     const char *compat;
+    /*
+     Depth suggested where photos cannot be matched, as --depth-prior takes it: "dir:FOLDER", the name of an installed
+     network, or "auto" for the best of them. NULL = none.
+     */
+    const char *depth_prior;
 } SvkTrainOptions;
 
 /*

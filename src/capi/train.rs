@@ -165,9 +165,13 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Cal
     // SAFETY: as above.
     let path = |pointer, field: &str| unsafe { boundary::path(pointer, &format!("SvkTrainOptions.{field}")) };
     let count = |n: u64| usize::try_from(n).ok().filter(|n| *n > 0);
-    let method = text(o.method, "method")?.map(|name| Method::named(&name)).transpose()?;
-    let method = method.unwrap_or(RunPlan::default().method);
     let compat = text(o.compat, "compat")?.map_or(Ok(None), |name| Compat::named(&name))?;
+    let language_iterations = count(o.language_iterations);
+    let per_level = o.per_level != 0 || compat.is_some_and(|c| c.per_level);
+    let method = match text(o.method, "method")? {
+        Some(name) => Method::named(&name)?,
+        None => Method::by_default(preset, language_iterations, per_level),
+    };
     Ok(RunPlan {
         preset,
         init: source::<sources::GeometrySources>(
@@ -175,6 +179,7 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Cal
             path(o.cameras, "cameras")?.map(|file| SourceChoice::with("cameras", file)),
             networks,
         )?,
+        depth_prior: source::<sources::DepthSources>(text(o.depth_prior, "depth_prior")?, None, networks)?,
         matcher: source::<sources::MatchSources>(text(o.matcher, "matcher")?, None, networks)?,
         masks: source::<sources::MaskSources>(
             text(o.mask_source, "mask_source")?,
@@ -188,7 +193,7 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Cal
         )?,
         seed: o.seed,
         iterations: count(o.iterations),
-        language_iterations: count(o.language_iterations),
+        language_iterations,
         sh_degree,
         method,
         feature_dim: if o.feature_dim == 0 {
@@ -196,7 +201,7 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Cal
         } else {
             o.feature_dim as usize
         },
-        per_level: o.per_level != 0,
+        per_level,
         ..RunPlan::default()
     }
     .compatible(compat))

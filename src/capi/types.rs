@@ -320,12 +320,16 @@ pub struct SvkTrainOptions {
     pub mask_source: *const c_char,
     /// Region features, as --features takes it. NULL = `features`, or else built-in.
     pub feature_source: *const c_char,
-    /// How language gets onto the splats, as --method takes it. NULL = "sparselgs".
+    /// How language gets onto the splats, as --method takes it. NULL = "lift"; "sparselgs" with the preset of the paper,
+    /// `language_iterations`, `per_level` or `compat`.
     pub method: *const c_char,
     /// SvkShDegree
     pub sh_degree: u64,
     /// What can be done in several ways, as others do it: as --compat takes it. NULL = as this library does it.
     pub compat: *const c_char,
+    /// Depth suggested where photos cannot be matched, as --depth-prior takes it: "dir:FOLDER", the name of an installed
+    /// network, or "auto" for the best of them. NULL = none.
+    pub depth_prior: *const c_char,
 }
 
 /// What a scene holds.

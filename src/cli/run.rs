@@ -8,7 +8,7 @@ use crate::language::Reducer;
 use crate::language::sam::SamOptions;
 use crate::run::base::{Settings, next_to};
 use crate::run::compat::{self, Compat};
-use crate::run::method::METHODS;
+use crate::run::method::{METHODS, SPARSELGS};
 use crate::run::sources::{
     self, DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice, SourceKind,
     choose,
@@ -77,9 +77,10 @@ pub struct RunArgs {
     /// Length of the codes that splats carry: 3, 8 or 16 [default: 16; --compat and langsplat 3, legaussians 8]
     #[arg(long, value_name = "D")]
     pub feature_dim: Option<usize>,
-    /// How language gets onto the splats: this program's way, or a baseline on the same geometry to compare with
-    #[arg(long, value_parser = methods(), default_value = METHODS[0].name, value_name = "METHOD")]
-    pub method: String,
+    /// How language gets onto the splats: this program's ways, or a baseline on the same geometry to compare with [default: lift;
+    /// sparselgs with --preset paper, --language-iterations, --per-level or --compat]
+    #[arg(long, value_parser = methods(), value_name = "METHOD")]
+    pub method: Option<String>,
     /// One model per level as in the paper, instead of one geometry for all three
     #[arg(long)]
     pub per_level: bool,
@@ -116,9 +117,14 @@ pub fn run(args: &RunArgs) -> Result<()> {
 /// What the arguments mean: defaults resolved, names understood, contradictions refused; `auto` is the best of `installed`, or
 /// what is built in. No work happens here.
 fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
-    let method = Method::named(&args.method)?;
-    let recipe = method.recipe;
     let compat = args.compat.as_deref().map_or(Ok(None), Compat::named)?;
+    let preset = args.making.preset.map(plan::preset);
+    let per_level = args.per_level || compat.is_some_and(|c| c.per_level);
+    let method = match &args.method {
+        Some(name) => Method::named(name)?,
+        None => Method::by_default(preset, args.language_iterations, per_level),
+    };
+    let recipe = method.recipe;
     let feature_dim = args.feature_dim.unwrap_or_else(|| compat::feature_dim(compat, method));
     if ![3, 8, 16].contains(&feature_dim) {
         return Err(Error::input(format!("--feature-dim {feature_dim}: choose 3, 8 or 16")));
@@ -156,7 +162,7 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         force: args.making.force,
         resume: args.making.resume,
         checkpoint_seconds: args.making.checkpoint_seconds,
-        preset: args.making.preset.map(plan::preset),
+        preset,
         init,
         depth_prior,
         matcher: choose::<MatchSources>(&args.matcher, installed)?,
@@ -170,7 +176,7 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         sh_degree: args.making.sh_degree,
         method,
         feature_dim,
-        per_level: args.per_level,
+        per_level,
         compat: None,
         max_size: plan::max_size(args.max_size)?,
         device: args.device.device.clone(),
@@ -198,6 +204,8 @@ fn joining(args: &RunArgs, scene: &Path, installed: &Inventory) -> Result<RunPla
         features: as_made::<FeatureSources>(&made, &args.features, installed)?,
         feature_dim: made.feature_dim().unwrap_or(plan.feature_dim),
         per_level: made.per_level(),
+        // Steps that are asked for are done.
+        method: if plan.method == &SPARSELGS { plan.method } else { made.method()? },
         queries: made.queries(&plan.queries),
         ..plan
     }
@@ -250,7 +258,7 @@ mod tests {
         assert_eq!(plan.out, Path::new("out/breakfast"));
         assert_eq!((plan.init, plan.masks), (named("sfm"), named("graph")));
         assert_eq!((plan.features, plan.feature_dim), (named("words"), 16));
-        assert_eq!(plan.method.name, "sparselgs");
+        assert_eq!(plan.method.name, "lift");
         assert_eq!((plan.matcher, plan.sam), (named("xfeat"), SamOptions::default()));
     }
 

@@ -294,10 +294,10 @@ impl Training for Run<'_> {
     }
 
     fn review(&mut self, step: usize) -> Result<Review> {
-        let every = self.options.check_every;
+        let LanguageOptions { check_every: every, iterations: last, .. } = *self.options;
         // A run that is measured once, at its end, needs no start to compare with.
-        let once = step == 0 && every >= self.options.iterations;
-        if every == 0 || !step.is_multiple_of(every) || once {
+        let due = step == last || (step.is_multiple_of(every) && every < last);
+        if every == 0 || !due {
             return Ok(Review::default());
         }
         self.trainer.model.check(step)?;

@@ -238,8 +238,8 @@ pub struct LanguageOptions {
     pub per_level: bool,
     /// Keep geometry, opacity and colour fixed: only the features move.
     pub detach_geometry: bool,
-    /// Measure the decode accuracy every so many steps (0 = never) and stop when it gains less than 0.1 % in two
-    /// measurements.
+    /// Measure the decode accuracy every so many steps and after the last one (0 = never), and stop when it gains less
+    /// than 0.1 % in two measurements.
     pub check_every: usize,
 }
 

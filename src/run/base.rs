@@ -1,4 +1,5 @@
 //! A scene that more photos are added to: what it is, and what it was made with.
+use super::method::Method;
 use crate::files;
 use crate::fit::Preset;
 use crate::format::{colmap, scene_dir, scene_photos};
@@ -28,9 +29,9 @@ impl Settings {
         let record: Value = serde_json::from_slice(&bytes).map_err(|e| bad(e.to_string()))?;
         let settings = Settings { file, record };
         match settings.text("method") {
-            Some("sparselgs") => Ok(settings),
+            Some("sparselgs" | "lift") => Ok(settings),
             Some(method) => Err(Error::input(format!(
-                "{}: made with --method {method}; photos can be added to scenes of --method sparselgs",
+                "{}: made with --method {method}; photos can be added to scenes of --method sparselgs or lift",
                 settings.file
             ))),
             None => Err(Error::input(format!(
@@ -51,6 +52,11 @@ impl Settings {
     /// The source that `--option` was resolved to.
     pub fn source(&self, option: &str) -> Option<&str> {
         self.text(option)
+    }
+
+    /// The method that the scene was made with.
+    pub fn method(&self) -> Result<&'static Method> {
+        Method::named(self.text("method").unwrap_or_default())
     }
 
     /// The preset that was used.

@@ -2,7 +2,7 @@
 //! default, and changes only what its authors do differently to language.
 use super::view::Viewer;
 use crate::fit::scale::SceneScale;
-use crate::fit::{self, LanguageOptions, RgbOptions, Start, TrainedLanguage, index_head};
+use crate::fit::{self, LanguageOptions, Preset, RgbOptions, Start, TrainedLanguage, index_head};
 use crate::gpu::Device;
 use crate::language::align::AlignOptions;
 use crate::language::{BuildOptions, Reducer};
@@ -70,7 +70,7 @@ pub static LIFT_LEAST_SQUARES: Method = Method {
     recipe: Recipe { language: LanguageFit::LeastSquares, ..OURS },
 };
 
-/// What `--method` takes, the default first.
+/// What `--method` takes. [`Method::by_default`] is one of the first two.
 pub static METHODS: [&Method; 6] = [&SPARSELGS, &LIFT, &LIFT_LEAST_SQUARES, &LANGSPLAT, &LEGAUSSIANS, &LSM];
 
 /// How splats get their features.
@@ -129,6 +129,14 @@ impl Method {
             let names: Vec<&str> = METHODS.iter().map(|m| m.name).collect();
             Error::input(format!("--method {name}: unknown; use one of: {}", names.join(", ")))
         })
+    }
+
+    /// What a run does that is asked for no method: training gains nothing over lifted features
+    /// (docs/experiments.md#measured-lifting), so it trains them only where it is asked for something of the training: the
+    /// paper's preset, a number of steps, models of their own per level.
+    pub fn by_default(preset: Option<Preset>, language_iterations: Option<usize>, per_level: bool) -> &'static Method {
+        let trains = preset == Some(Preset::Paper) || language_iterations.is_some() || per_level;
+        if trains { &SPARSELGS } else { &LIFT }
     }
 }
 
@@ -246,10 +254,19 @@ fn train_index_heads(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fit::Preset;
 
     #[test]
-    fn the_default_changes_nothing_and_each_baseline_what_it_should() {
+    fn features_are_trained_by_default_where_something_of_the_training_is_asked_for() {
+        let name = |preset, steps, per_level| Method::by_default(preset, steps, per_level).name;
+        assert_eq!(name(None, None, false), "lift");
+        assert_eq!(name(Some(Preset::Default), None, false), "lift");
+        assert_eq!(name(Some(Preset::Paper), None, false), "sparselgs");
+        assert_eq!(name(None, Some(30), false), "sparselgs");
+        assert_eq!(name(None, None, true), "sparselgs");
+    }
+
+    #[test]
+    fn sparselgs_changes_nothing_and_each_baseline_what_it_should() {
         let preset = LanguageOptions::preset(Preset::Draft);
         let ours = SPARSELGS.recipe;
         assert_eq!(ours.language(preset.clone()), preset);

@@ -1,7 +1,7 @@
 //! What to run, and what follows from it for the stages.
 use super::budget;
 use super::compat::Compat;
-use super::method::{self, FEATURE_DIM, Method, Recipe};
+use super::method::{FEATURE_DIM, Method, Recipe};
 use super::sources::{self, SourceChoice};
 use crate::Result;
 use crate::fit::{LanguageOptions, Preset, RgbOptions, ViewDependentOptions};
@@ -58,7 +58,7 @@ pub struct RunPlan {
     pub language_iterations: Option<usize>,
     /// SH degree of the colours, 0–3; `None` = what the photos support, and 0 in the paper's preset.
     pub sh_degree: Option<u32>,
-    /// What gets language onto the splats: [`super::method::SPARSELGS`] unless a baseline is wanted.
+    /// What gets language onto the splats; [`Method::by_default`] unless another is wanted.
     pub method: &'static Method,
     /// Length of the codes.
     pub feature_dim: usize,
@@ -102,7 +102,7 @@ impl Default for RunPlan {
             iterations: None,
             language_iterations: None,
             sh_degree: None,
-            method: &method::SPARSELGS,
+            method: Method::by_default(None, None, false),
             feature_dim: FEATURE_DIM,
             per_level: false,
             compat: None,
