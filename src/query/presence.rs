@@ -195,12 +195,10 @@ mod tests {
         let pixels = ShownPixels::of(&field, &[&maps]);
         let ask = |text: &str, form: &str| {
             let query = regions::query(text);
-            let colours: Vec<f32> =
-                things::recoloured(text).iter().flat_map(|t| regions::text_embedding(t)).collect();
             let shown = ShownCodes::new(&pixels, &field, &query.canonicals);
             let rows: Vec<f32> =
                 things::of_form(form).iter().flat_map(|o| regions::text_embedding(o)).collect();
-            shown.evidence(&query.embedding, &colours, &shown.background(&rows)).unwrap()
+            shown.evidence(&query.embedding, &query.alternatives.colours, &shown.background(&rows)).unwrap()
         };
         for (text, form) in [("red book", "red"), ("blue mug", "blue"), ("lemon", ""), ("green can", "green")]
         {

@@ -12,6 +12,7 @@ use crate::language::{LevelMasks, ViewMasks};
 use crate::math::Random;
 use crate::photo::stem;
 use crate::query::eval::{BACKGROUND_LABELS, GroundTruth, TruthFrame};
+use crate::query::presence::Alternatives;
 use crate::query::{CANONICAL_PHRASES, TextQuery};
 use crate::scene::Plane;
 use crate::{Error, Result};
@@ -95,12 +96,14 @@ pub fn text_embedding(phrase: &str) -> Vec<f32> {
     sum
 }
 
-/// A query in this space.
+/// A query in this space, with the same thing in other colours beside it as every encoder gives it.
 pub fn query(text: &str) -> TextQuery {
+    let colours = things::recoloured(text).iter().flat_map(|t| text_embedding(t)).collect();
     TextQuery {
         text: text.to_owned(),
         embedding: text_embedding(text),
         canonicals: CANONICAL_PHRASES.iter().flat_map(|c| text_embedding(c)).collect(),
+        alternatives: Alternatives { colours, ..Alternatives::default() },
         ..Default::default()
     }
 }
