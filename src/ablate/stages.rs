@@ -280,7 +280,10 @@ pub(super) fn asked(texts: &[String], queries: &[TextQuery]) -> Vec<TextQuery> {
     texts.iter().filter_map(|text| queries.iter().find(|q| q.text == *text)).cloned().collect()
 }
 
-/// True masks on every level, each with the embedding of its label's text.
+/// What pixels are that carry no label. As nobody's, they would take the codes of the things beside them.
+const UNLABELLED: &str = "background";
+
+/// True masks on every level, each with the embedding of its label's text; what has no label is one more mask.
 pub(super) struct LabelledMasks {
     pub(super) truth: Arc<GroundTruth>,
     pub(super) encoder: SharedEncoder,
@@ -298,6 +301,7 @@ impl Stage for LabelledMasks {
 
     fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<Vec<ViewMasks>> {
         let words = label_embeddings(&self.truth, &self.encoder)?;
+        let unlabelled = self.encoder.with(|e| e.embed_texts(&[UNLABELLED]))?;
         let mut views = Vec::new();
         for (frame, photo) in frames_of(&self.truth, &placed.photos)?.into_iter().zip(&placed.photos) {
             let objects = self.truth.objects(frame)?.ok_or_else(|| {
@@ -307,12 +311,14 @@ impl Stage for LabelledMasks {
                 return Err(Error::input(format!("{}: masks and photo differ in size", frame.stem)));
             }
             let shown: Vec<u32> = words.keys().copied().filter(|k| objects.data.contains(k)).collect();
-            let index = |o: &u32| shown.iter().position(|k| k == o).map_or(-1, |k| k as i32);
-            let labels = objects.data.iter().map(index).collect();
+            let index = |o: &u32| shown.iter().position(|k| k == o).unwrap_or(shown.len()) as i32;
+            let labels: Vec<i32> = objects.data.iter().map(index).collect();
+            let background = labels.contains(&(shown.len() as i32)).then_some(&unlabelled);
+            let features = shown.iter().map(|k| &words[k]).chain(background).flatten().copied();
             let level = LevelMasks {
                 labels: Plane { width: objects.width, height: objects.height, data: labels },
-                quality: vec![1.0; shown.len()],
-                features: shown.iter().flat_map(|k| words[k].iter().copied()).collect(),
+                quality: vec![1.0; shown.len() + usize::from(background.is_some())],
+                features: features.collect(),
                 whole: Vec::new(),
             };
             views.push(ViewMasks { levels: vec![level; 3] });
