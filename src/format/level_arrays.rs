@@ -1,7 +1,7 @@
 //! What the splats carry on each level, as named arrays: the same in a scene directory and beside a file of Gaussians
 //! (docs/formats.md#features-of-splats).
 use super::npy::{NpyArray, NpyData};
-use crate::scene::{CodeMix, LevelField};
+use crate::scene::{CodeMix, Codebook, LevelField};
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 
@@ -47,6 +47,44 @@ pub fn append(
     Ok(())
 }
 
+/// A codebook of the arrays clip [K, D], code [K, d], weight [K] and delta_min, without members; `Err` says what does not fit.
+pub fn codebook([clip, code, weight, delta_min]: [&NpyArray; 4]) -> std::result::Result<Codebook, String> {
+    let (&[k, embedding_dim], &[k2, code_dim]) = (&clip.shape[..], &code.shape[..]) else {
+        return Err("its codes have no two dimensions".to_owned());
+    };
+    if k != k2 || weight.shape != [k] || embedding_dim * code_dim == 0 {
+        return Err(format!(
+            "the arrays of its codes do not fit together ({:?}, {:?}, {:?})",
+            clip.shape, code.shape, weight.shape
+        ));
+    }
+    let book = Codebook {
+        embedding_dim,
+        code_dim,
+        embeddings: clip.to_f32(),
+        codes: code.to_f32(),
+        weights: weight.to_f32(),
+        members: vec![Vec::new(); k],
+        min_chord: delta_min.to_f32().first().copied().unwrap_or(0.0),
+    };
+    finite("its embeddings", &book.embeddings, embedding_dim)?;
+    finite("its codes", &book.codes, code_dim)?;
+    finite("its weights", &book.weights, 1)?;
+    finite("delta_min", &[book.min_chord], 1)?;
+    Ok(book)
+}
+
+/// Refuses numbers that are not finite, with their count and the first row of `width` that has one.
+fn finite(what: &str, values: &[f32], width: usize) -> std::result::Result<(), String> {
+    let mut bad = values.iter().enumerate().filter(|(_, v)| !v.is_finite()).map(|(i, _)| i / width);
+    match bad.next() {
+        Some(first) => {
+            Err(format!("{} numbers of {what} are not finite, the first in row {first}", 1 + bad.count()))
+        }
+        None => Ok(()),
+    }
+}
+
 /// Reads what [`append`] wrote into a level whose codebook is there; `Err` says what does not fit.
 pub fn read(
     arrays: &BTreeMap<String, NpyArray>,
@@ -63,7 +101,10 @@ pub fn read(
     };
     // Scenes of version 1 have the bare name of the level.
     match get("features").or_else(|| arrays.get(name)) {
-        Some(a) if a.shape == [splats, d] => level.features = a.to_f32(),
+        Some(a) if a.shape == [splats, d] => {
+            level.features = a.to_f32();
+            finite(&format!("the features of level {name}"), &level.features, d)?;
+        }
         Some(a) => return Err(format!("the features of level {name} have the shape {:?}", a.shape)),
         None => {
             let (first, second, share) = (column("first")?, column("second")?, column("share")?);
