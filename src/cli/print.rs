@@ -1,9 +1,11 @@
 //! What goes to standard output.
+use super::line::lines;
 use crate::{Error, Result};
 use std::io::Write;
 
-/// Prints to standard output. A reader that closed the pipe (`| head`) ends the process quietly.
+/// Prints text for people to standard output. A reader that closed the pipe (`| head`) ends the process quietly.
 pub(super) fn print(text: &str) -> Result<()> {
+    let text = lines(text);
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
         Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => std::process::exit(0),
