@@ -80,7 +80,7 @@ fn camera_files_are_checked_when_they_are_read() {
         (frame(&"x".repeat(300), 64.0), "too long"),
         (frame(&"x".repeat(5_000_000), 64.0), "too long"),
         (frame("a", 64.0).replace("50", "null"), "no focal length"),
-        ("{\"frames\": 3}".to_owned(), "not a transforms.json file"),
+        ("{\"frames\": 3}".to_owned(), "not a JSON camera file (transforms.json)"),
         ("hello".to_owned(), "not a JSON camera file"),
     ] {
         std::fs::write(at("c.json"), text).unwrap();

@@ -25,7 +25,7 @@ pub fn read(path: &Path) -> Result<Vec<Camera>> {
     let cameras = match text.trim_start().chars().next() {
         Some('[') => {
             let entries: Result<Vec<Entry>, _> = files::parse_json(text.as_bytes());
-            let entries = entries.map_err(|e| format!("not a cameras.json file: {e}; check the camera file"));
+            let entries = entries.map_err(|e| format!("not a JSON camera file (cameras.json): {e}; check it"));
             entries.and_then(|all| all.into_iter().map(Entry::camera).collect::<Result<Vec<_>, _>>())
         }
         Some('{') => transforms::parse(&text, path.parent().unwrap_or(Path::new("."))),

@@ -5,7 +5,7 @@ pub mod ply_packed;
 mod ply_table;
 pub mod splat;
 pub mod spz;
-pub(super) mod usable;
+pub(crate) mod usable;
 
 use super::{side_file, write_whole_file};
 use crate::scene::{LanguageField, Splats};

@@ -30,19 +30,18 @@ pub fn load(scene: &Path) -> Result<Vec<Photo>> {
     let mut photos: Vec<Photo> = files::read_json(&file, "the scene is damaged, run again")?;
     for photo in &mut photos {
         let path = folder.join("images").join(format!("{}.png", photo.stem));
-        // Larger than any image: it is to be read as it is.
-        let image = photo::load_at(&path, usize::MAX >> 16)?.image;
-        if (image.width, image.height) != (photo.image.width, photo.image.height) {
+        // Before it is decoded: the header may state any size.
+        let (width, height) = photo::dimensions(&path)?;
+        if (width as usize, height as usize) != (photo.image.width, photo.image.height) {
             return Err(Error::input(format!(
-                "{}: {} × {} pixels, the scene's camera has {} × {}; the scene is damaged, run again",
+                "{}: {width} × {height} pixels, the scene's camera has {} × {}; the scene is damaged, run again",
                 path.display(),
-                image.width,
-                image.height,
                 photo.image.width,
                 photo.image.height
             )));
         }
-        photo.image = image;
+        // Larger than any image: it is to be read as it is.
+        photo.image = photo::load_at(&path, usize::MAX >> 16)?.image;
     }
     Ok(photos)
 }

@@ -46,7 +46,7 @@ fn rows<'a, D: Deserializer<'a>>(from: D) -> Result<Option<[[f64; 4]; 3]>, D::Er
 /// Cameras of a file's text; `folder` is where its image paths start, for files that do not state the image size.
 pub(super) fn parse(text: &str, folder: &Path) -> Result<Vec<Camera>, String> {
     let file: Block = files::parse_json(text.as_bytes())
-        .map_err(|e| format!("not a transforms.json file: {e}; check the camera file"))?;
+        .map_err(|e| format!("not a JSON camera file (transforms.json): {e}; check it"))?;
     let Some(frames) = &file.frames else {
         return Err(
             "neither transforms.json (an object with \"frames\") nor cameras.json (a list)".to_string()

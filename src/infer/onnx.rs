@@ -6,7 +6,7 @@ use std::collections::HashSet;
 use std::fmt;
 use std::fs::File;
 use std::io::{BufReader, Read, Seek};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use crate::{Error, Result, files};
 
@@ -262,6 +262,21 @@ pub fn read(path: &Path) -> Result<Header> {
     let (file, size) = files::open(path)?;
     let mut reader = Reader { file: BufReader::new(file), at: 0, size };
     let header = whole(&mut reader, path).filter(|h| !h.inputs.is_empty() && !h.outputs.is_empty());
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let beside = |p: &&PathBuf| {
+        let inside = p.strip_prefix(folder);
+        inside.is_ok_and(|p| p.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir)))
+    };
+    if let Some(other) = header.iter().flat_map(|h| &h.external).find(|p| !beside(p)) {
+        return Err(Error::missing_model(
+            path.display(),
+            format!(
+                "{}: its weights are in {}, outside of its folder; export it again with the weights beside it",
+                path.display(),
+                other.display()
+            ),
+        ));
+    }
     header.ok_or_else(|| {
         let at = reader.file.stream_position().unwrap_or_default();
         Error::missing_model(path.display(), format!(

@@ -2,9 +2,8 @@
 use super::exif_tags::{Lens, lens};
 use super::heif;
 use super::kind::{FileKind, LARGEST_DECODED, READ, TOO_LARGE, check_pixels, kind};
-use super::read;
 use crate::scene::to_srgb;
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits};
 use std::io::Cursor;
@@ -118,7 +117,7 @@ pub(super) fn decode(bytes: Vec<u8>, path: &Path) -> Result<Decoded> {
 
 /// Stored pixels of an image file that holds no photo but labels: as they are, in the file's own orientation.
 pub fn stored_pixels(path: &Path) -> Result<DynamicImage> {
-    let bytes = read::read(path)?;
+    let bytes = files::read(path)?;
     let named = |what: &str| Error::input(format!("{}: {what}", path.display()));
     match kind(&bytes, path) {
         FileKind::Image(format) => coded(bytes, format).map(|d| d.pixels).map_err(|what| named(&what)),

@@ -2,6 +2,8 @@
 use super::readers::{Limits, within};
 use super::{ONE, seeds};
 use splatvk::format::{cameras, colmap, gaussians, npy};
+use splatvk::infer::onnx;
+use splatvk::query::protocol::{self, ProtocolKind};
 use splatvk::{Error, Result};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -13,7 +15,7 @@ fn refused<T>(name: &str, bytes: &[u8], words: &str, read: impl Fn(&Path) -> Res
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(name);
     std::fs::write(&path, bytes).unwrap();
-    let verdict = within(bytes.len(), Limits::ROOM, || match read(&path) {
+    let verdict = within(bytes.len(), (Limits::ROOM, Limits::TIME), || match read(&path) {
         Ok(_) => panic!("{name} is read"),
         Err(e) => {
             assert!(e.to_string().contains(words) && e.to_string().contains(name), "{e}");
@@ -150,6 +152,29 @@ fn a_text_model_without_lines_of_points_keeps_all_its_cameras() {
     assert_eq!(read(mixed).unwrap(), wanted);
     let e = read(image(1) + "1.5 2.5\n" + &image(2)).unwrap_err().to_string();
     assert!(e.contains("images.txt: line 2"), "{e}");
+}
+
+#[test]
+fn labels_of_any_size_are_read_in_time() {
+    let labels = |size: usize, corner: f64, objects: usize| {
+        let object = |k: usize| serde_json::json!({ "category": k.to_string(), "segmentation": [[0, 0], [corner, 1], [2, corner]] });
+        let objects: Vec<_> = (0..objects).map(object).collect();
+        serde_json::json!({ "info": { "width": size, "height": size }, "objects": objects }).to_string()
+    };
+    let read = |p: &Path| protocol::labels(ProtocolKind::Lerf, p.parent().unwrap()).map(drop);
+    // A line of that many pixels took 20 s, one of 1e19 never ended.
+    refused("a.json", labels(16, 1e9, 1).as_bytes(), "a corner is beyond 1000000 pixels", read);
+    refused("a.json", labels(14_000, 9.0, 2).as_bytes(), "2 objects of 14000", read);
+}
+
+#[test]
+fn weights_lie_beside_their_graph() {
+    for place in ["../ab", "/ab.b"] {
+        let whole = seeds::onnx();
+        let at = whole.windows(5).position(|w| w == b"w.bin").unwrap();
+        let bytes = [&whole[..at], place.as_bytes(), &whole[at + 5..]].concat();
+        refused("m.onnx", &bytes, "outside of its folder", onnx::read);
+    }
 }
 
 #[test]

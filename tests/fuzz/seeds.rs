@@ -267,7 +267,7 @@ pub fn checkpoint(name: &str) -> Seed {
 
 pub fn adapter() -> Seed {
     let text = "family = \"mine\"\n[[graph]]\npart = \"depth\"\nneeds = [\"inverse_depth\"]\n\
-                names.image = [\"pixels\", \"x\"]\nnames.inverse_depth = \"y\"\nlayouts.image = \"nchw\"\n\
+                names.image = [\"pixels\", \"x\"]\nnames.inverse_depth = \"y\"\nlayouts.image = \"B 3 H W\"\n\
                 apply.inverse_depth = \"exp\"\nimage = { mean = [0.5, 0.5, 0.5], std = [0.5, 0.5, 0.5], size = 518, \
                 multiple = 14, fit = \"resize\" }\n[sha256]\n\"m.onnx\" = \"00\"\n";
     file("adapter.toml", text.into())
@@ -354,12 +354,12 @@ pub fn ovs() -> Vec<Seed> {
 
 pub fn scannet() -> Vec<Seed> {
     let table = "id\traw_category\tnyu40id\n1\twall\t1\n2\tchair\t5\n".as_bytes().to_vec();
-    let matrix = |f: f64| format!("{f} 0 8 0\n0 {f} 8 0\n0 0 1 0\n0 0 0 1\n").into_bytes();
+    let matrix = |f: f64, c: f64| format!("{f} 0 {c} 0\n0 {f} {c} 0\n0 0 1 0\n0 0 0 1\n").into_bytes();
     vec![
         inside("label-filt/0.png", label_png(|x, _| u8::from(x > 3)), CHUNKS),
         file("scannetv2-labels.combined.tsv", table),
-        file("intrinsic/intrinsic_color.txt", matrix(70.0)),
-        file("pose/0.txt", matrix(1.0)),
+        file("intrinsic/intrinsic_color.txt", matrix(70.0, 8.0)),
+        file("pose/0.txt", matrix(1.0, 0.0)),
         kept("color/0.png", label_png(|x, _| x as u8)),
     ]
 }

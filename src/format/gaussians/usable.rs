@@ -57,7 +57,7 @@ pub(super) fn keep(
 }
 
 /// Refuses to read a scene of this program's with Gaussians that are not usable.
-pub(in crate::format) fn check_read(path: &Path, s: &Splats) -> Result<()> {
+pub(crate) fn check_read(path: &Path, s: &Splats) -> Result<()> {
     refuse(s)
         .map_err(|what| Error::input(format!("{}: {what}; the scene is damaged, run again", path.display())))
 }

@@ -61,10 +61,19 @@ pub(super) fn parse(text: &str, path: &Path) -> Result<BTreeMap<String, Target>>
     let file: File = files::parse_json(text.as_bytes())
         .map_err(|e| Error::input(format!("{}: not a LERF-OVS label file: {e}", path.display())))?;
     let (width, height) = (file.info.width, file.info.height);
-    if width.saturating_mul(height) as u64 > MAX_PIXELS {
-        return Err(Error::input(format!(
-            "{}: labels of {width} × {height} pixels are too large; check its \"info\"",
-            path.display()
+    let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
+    let mut names: Vec<&str> = file.objects.iter().map(|o| o.category.as_str()).collect();
+    names.sort_unstable();
+    names.dedup();
+    let numbers = file.objects.iter().flat_map(|o| o.segmentation.as_flattened().iter().chain(&o.bbox));
+    // NaN is in no range.
+    if !numbers.into_iter().all(|v| v.abs() <= polygon::FARTHEST) {
+        return Err(bad(format!("a corner is beyond {} pixels; check its objects", polygon::FARTHEST)));
+    }
+    if names.len().saturating_mul(width).saturating_mul(height) as u64 > MAX_PIXELS {
+        return Err(bad(format!(
+            "{} objects of {width} × {height} pixels are too many; check its \"info\"",
+            names.len()
         )));
     }
     let mut targets: BTreeMap<String, Target> = BTreeMap::new();
