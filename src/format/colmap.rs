@@ -116,7 +116,7 @@ fn text_cameras(bytes: &[u8]) -> Result<HashMap<u32, Intrinsics>, String> {
 /// Whether a line is the 2D points of the image before it, numbers in threes; an image has nine and a name.
 fn is_points(line: &str) -> bool {
     let words = line.split_whitespace();
-    words.clone().count() % 3 == 0 && words.into_iter().all(|w| w.parse::<f64>().is_ok())
+    words.clone().count().is_multiple_of(3) && words.into_iter().all(|w| w.parse::<f64>().is_ok())
 }
 
 fn text_images(bytes: &[u8]) -> Result<Vec<Shot>, String> {

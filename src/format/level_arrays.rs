@@ -17,6 +17,8 @@ pub fn append(
     if level.features.len() != splats * book.code_dim {
         return Err(Error::work(format!("level {name} has features for another number of splats")));
     }
+    let written = check(book).and_then(|()| finite("its features", &level.features, book.code_dim));
+    written.map_err(|what| Error::work(format!("level {name}: nothing is written: {what}")))?;
     let rows: Vec<usize> = match order {
         [] => (0..splats).collect(),
         order => order.iter().map(|&i| i as usize).collect(),
@@ -67,11 +69,16 @@ pub fn codebook([clip, code, weight, delta_min]: [&NpyArray; 4]) -> std::result:
         members: vec![Vec::new(); k],
         min_chord: delta_min.to_f32().first().copied().unwrap_or(0.0),
     };
-    finite("its embeddings", &book.embeddings, embedding_dim)?;
-    finite("its codes", &book.codes, code_dim)?;
-    finite("its weights", &book.weights, 1)?;
-    finite("delta_min", &[book.min_chord], 1)?;
+    check(&book)?;
     Ok(book)
+}
+
+/// Refuses a codebook with numbers that are not finite: what would be refused when it is read is not written either.
+pub fn check(book: &Codebook) -> std::result::Result<(), String> {
+    finite("its embeddings", &book.embeddings, book.embedding_dim)?;
+    finite("its codes", &book.codes, book.code_dim)?;
+    finite("its weights", &book.weights, 1)?;
+    finite("delta_min", &[book.min_chord], 1)
 }
 
 /// Refuses numbers that are not finite, with their count and the first row of `width` that has one.
