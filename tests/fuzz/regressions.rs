@@ -2,6 +2,7 @@
 use super::readers::{Limits, within};
 use super::{ONE, seeds};
 use splatvk::format::{cameras, colmap, gaussians, npy};
+use splatvk::infer::adapter::Adapter;
 use splatvk::infer::onnx;
 use splatvk::query::protocol::{self, ProtocolKind};
 use splatvk::{Error, Result};
@@ -165,6 +166,37 @@ fn labels_of_any_size_are_read_in_time() {
     // A line of that many pixels took 20 s, one of 1e19 never ended.
     refused("a.json", labels(16, 1e9, 1).as_bytes(), "a corner is beyond 1000000 pixels", read);
     refused("a.json", labels(14_000, 9.0, 2).as_bytes(), "2 objects of 14000", read);
+}
+
+#[test]
+fn an_adapter_states_what_images_can_be_prepared_by() {
+    let read = |p: &Path| Adapter::of_file(&p.with_file_name("m.onnx"));
+    for (field, words) in [
+        ("size = 518, multiple = 0", "between 1 and 16384"),
+        ("size = 1000000000000", "between 1 and 16384"),
+        ("size = 0", "between 1 and 16384"),
+    ] {
+        let image = format!("{{ mean = [0.5, 0.5, 0.5], std = [0.5, 0.5, 0.5], {field} }}");
+        let text = format!("[[graph]]\npart = \"depth\"\nimage = {image}\n");
+        refused("adapter.toml", text.as_bytes(), words, read);
+        let flat = text.replace("std = [0.5", "std = [0.0").replace(field, "size = 518");
+        refused("adapter.toml", flat.as_bytes(), "std positive", read);
+    }
+}
+
+#[test]
+fn sides_of_more_than_32_bits_are_not_cut() {
+    let folder = tempfile::tempdir().unwrap();
+    for seed in seeds::colmap(true) {
+        let mut bytes = seed.bytes;
+        if seed.name == "cameras.bin" {
+            // After the count, the number and the model: 64 + 2^32.
+            bytes[8 + 8 + 4] = 1;
+        }
+        std::fs::write(folder.path().join(&seed.name), bytes).unwrap();
+    }
+    let e = colmap::read(folder.path()).unwrap_err().to_string();
+    assert!(e.contains("cameras.bin: camera 1 has a side of 4294967360 pixels"), "{e}");
 }
 
 #[test]
