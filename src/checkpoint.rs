@@ -16,7 +16,7 @@ pub struct Checkpoint {
 
 impl Checkpoint {
     /// A state in `file`, renewed after `every`; an old one is used only with `resume`.
-    pub(crate) fn new(file: PathBuf, every: Duration, resume: bool) -> Checkpoint {
+    pub fn new(file: PathBuf, every: Duration, resume: bool) -> Checkpoint {
         Checkpoint { file, every, last: Mutex::new(Instant::now()), resume }
     }
 

@@ -165,9 +165,10 @@ impl Error {
 
 /// What the user can do about a place that cannot be written.
 fn elsewhere(e: &std::io::Error) -> &'static str {
+    use std::io::ErrorKind as K;
     match (e.kind(), advice(e)) {
         // It was to be made.
-        (std::io::ErrorKind::NotFound, _) | (_, "") => "; choose another folder",
+        (K::NotFound | K::NotADirectory | K::IsADirectory, _) | (_, "") => "; choose another folder",
         (_, advice) => advice,
     }
 }
@@ -187,7 +188,7 @@ fn advice(e: &std::io::Error) -> &'static str {
         K::StorageFull | K::QuotaExceeded => "; free some space there, or choose a folder on another disk",
         K::FileTooLarge => "; the file size limit (ulimit -f) is too small for this file",
         K::PermissionDenied | K::ReadOnlyFilesystem => "; choose a folder that you may write to",
-        K::NotFound => "; check the name",
+        K::NotFound | K::NotADirectory | K::IsADirectory => "; check the name",
         _ => "",
     }
 }
@@ -220,6 +221,11 @@ mod tests {
         assert!(disk.exit_code() == 2 && disk.to_string().contains("free some space"), "{disk}");
         let absent = Error::io("a/b")(IoError::from(ErrorKind::NotFound));
         assert!(matches!(absent, Error::Io { .. }) && absent.exit_code() == 2);
+        // A file in the place of a folder, and the other way round, are the user's to mend.
+        for kind in [ErrorKind::NotADirectory, ErrorKind::IsADirectory] {
+            let e = Error::io("a/b")(IoError::from(kind));
+            assert!(e.exit_code() == 2 && e.to_string().ends_with("; check the name"), "{e}");
+        }
         let none = Error::NoDevice { message: "no loader".into(), source: Some("libvulkan.so.1".into()) };
         assert!(none.exit_code() == 2 && none.source().is_some_and(|s| s.to_string() == "libvulkan.so.1"));
         assert_eq!(Error::missing_model("text", "model text: is missing").exit_code(), 2);

@@ -1,11 +1,112 @@
-//! Files that are whole or not there: a checksum in front, written beside their place and renamed into it.
+//! Files read within bounds, and files that are whole or not there: a checksum in front, written beside their place and
+//! renamed into it.
+use crate::{Error, Result};
+use serde::Deserialize;
 use sha2::{Digest, Sha256};
 use std::collections::HashMap;
 use std::fmt::Write as _;
+use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, OnceLock};
 use std::time::SystemTime;
+
+/// Beyond the bytes of a file a reader takes at most four times its content, and this much (docs/formats.md#limits).
+pub(crate) const ROOM: u64 = 64 << 20;
+
+/// Most bytes of a text or JSON file: ten times the cameras of 10,000 photos.
+const LONGEST_TEXT: u64 = 64 << 20;
+
+/// Most values and keys of a JSON file. A value takes 32 bytes of memory and as few as two in the file, so the bound on the
+/// bytes would not hold the memory; the cameras of 10,000 photos have 450,000.
+const MOST_VALUES: usize = 1 << 20;
+
+/// How many times its bytes the content of a compressed file may have: Gaussians and features reach 5.
+const EXPANSION: u64 = 16;
+
+/// Most bytes that a compressed file of `size` bytes may hold.
+pub(crate) fn most_content(size: usize) -> u64 {
+    (size as u64).saturating_mul(EXPANSION).saturating_add(ROOM)
+}
+
+/// Opens a file that is to be read, and its size in bytes. Devices, pipes and folders are refused: they have no end, or none
+/// that can be known.
+pub(crate) fn open(path: &Path) -> Result<(File, u64)> {
+    let unreadable = |e: std::io::Error| match e.kind() {
+        std::io::ErrorKind::NotFound => Error::io(path)(e),
+        _ => Error::input(format!("{}: {e}; check the name and that you may read it", path.display())),
+    };
+    let regular = |meta: &std::fs::Metadata| match meta.is_file() {
+        true => Ok(meta.len()),
+        false => {
+            let kind = if meta.is_dir() { "a folder" } else { "a device or pipe" };
+            Err(Error::input(format!("{}: is {kind}, not a file; give a file", path.display())))
+        }
+    };
+    // Asked before it is opened, too: opening a pipe waits for somebody to write to it.
+    regular(&std::fs::metadata(path).map_err(unreadable)?)?;
+    let file = File::open(path).map_err(unreadable)?;
+    let size = regular(&file.metadata().map_err(Error::io(path))?)?;
+    Ok((file, size))
+}
+
+/// Reads a whole file: as many bytes as it has when it is opened. Everything that is read whole is read here.
+pub(crate) fn read(path: &Path) -> Result<Vec<u8>> {
+    read_within(path, u64::MAX)
+}
+
+fn read_within(path: &Path, most: u64) -> Result<Vec<u8>> {
+    let (file, size) = open(path)?;
+    if size > most {
+        return Err(Error::input(format!(
+            "{}: {size} bytes are too many for a file of this kind (at most {most}); check that it is the right one",
+            path.display()
+        )));
+    }
+    let mut bytes = Vec::new();
+    let room = usize::try_from(size).ok().and_then(|n| bytes.try_reserve_exact(n.checked_add(1)?).ok());
+    room.ok_or_else(|| Error::work(format!("{}: no memory for its {size} bytes", path.display())))?;
+    // One more than announced: files of the system announce none and go on for ever.
+    file.take(size.saturating_add(1)).read_to_end(&mut bytes).map_err(Error::io(path))?;
+    if bytes.len() as u64 != size {
+        return Err(Error::input(format!(
+            "{}: has another length than it states ({size} bytes); try again once it is complete",
+            path.display()
+        )));
+    }
+    Ok(bytes)
+}
+
+/// Reads a text file.
+pub(crate) fn read_text(path: &Path) -> Result<String> {
+    String::from_utf8(read_within(path, LONGEST_TEXT)?).map_err(|_| {
+        Error::input(format!("{}: is not text (UTF-8); check that it is the right file", path.display()))
+    })
+}
+
+/// Reads a JSON file; `advice` says what to do where it is not what is looked for.
+pub(crate) fn read_json<T: serde::de::DeserializeOwned>(path: &Path, advice: &str) -> Result<T> {
+    let bytes = read_within(path, LONGEST_TEXT)?;
+    parse_json(&bytes).map_err(|e| Error::input(format!("{}: {e}; {advice}", path.display())))
+}
+
+/// Parses JSON of a bounded number of values.
+pub(crate) fn parse_json<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, String> {
+    let (mut values, mut quoted, mut escaped) = (1usize, false, false);
+    for byte in bytes {
+        match byte {
+            _ if escaped => escaped = false,
+            b'\\' if quoted => escaped = true,
+            b'"' => quoted = !quoted,
+            b',' | b':' | b'[' | b'{' if !quoted => values += 1,
+            _ => {}
+        }
+    }
+    if values > MOST_VALUES {
+        return Err(format!("holds {values} values, more than the {MOST_VALUES} that are read"));
+    }
+    serde_json::from_slice(bytes).map_err(|e| e.to_string())
+}
 
 /// The folder that set-up fills: `SPLATVK_HOME`, else `splatvk` in the user's data folder.
 pub fn home() -> PathBuf {
@@ -45,7 +146,7 @@ pub(crate) fn content_hash(path: &Path) -> std::io::Result<String> {
     {
         return Ok(hash.clone());
     }
-    let mut file = std::fs::File::open(path)?;
+    let mut file = File::open(path)?;
     let (mut digest, mut block) = (Sha256::new(), vec![0u8; 1 << 18]);
     loop {
         match file.read(&mut block)? {
@@ -64,7 +165,7 @@ pub(crate) fn content_hash(path: &Path) -> std::io::Result<String> {
 pub(crate) fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
     let partial = path.with_extension(format!("partial-{}", std::process::id()));
     let all = || -> std::io::Result<()> {
-        let mut file = std::fs::File::create(&partial)?;
+        let mut file = File::create(&partial)?;
         parts.iter().try_for_each(|part| std::io::Write::write_all(&mut file, part))
     };
     let kept = std::fs::create_dir_all(path.parent().unwrap_or(path))
@@ -82,7 +183,7 @@ pub(crate) fn write_with_checksum(path: &Path, body: &[u8]) -> std::io::Result<(
 
 /// What [`write_with_checksum`] wrote; `None` if it is not there or not what was written. Counts as a use for [`prune`].
 pub(crate) fn read_with_checksum(path: &Path) -> Option<Vec<u8>> {
-    let mut bytes = std::fs::read(path).ok()?;
+    let mut bytes = read(path).ok()?;
     let (sum, body) = bytes.split_at_checked(CHECKSUM_DIGITS)?;
     if *sum != *sha256(body).as_bytes() {
         return None;
@@ -129,6 +230,44 @@ pub(crate) fn prune(newest: &Path, extension: &str, capacity: u64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_regular_files_of_a_bounded_length_are_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let refused = |path: &Path, words: &str| {
+            let e = read(path).unwrap_err();
+            assert!(e.exit_code() == 2 && e.to_string().contains(words), "{e}");
+        };
+        std::fs::write(at("a"), b"abc").unwrap();
+        assert_eq!(read(&at("a")).unwrap(), b"abc");
+        std::fs::write(at("none"), b"").unwrap();
+        assert_eq!(read(&at("none")).unwrap(), b"");
+        refused(folder.path(), "is a folder");
+        refused(&at("b"), "check the name");
+        let e = read_within(&at("a"), 2).unwrap_err();
+        assert!(e.to_string().contains("3 bytes are too many"), "{e}");
+        std::fs::write(at("binary"), b"\xff\xfe").unwrap();
+        assert!(read_text(&at("binary")).unwrap_err().to_string().contains("not text"));
+        #[cfg(target_os = "linux")]
+        {
+            use std::os::unix::fs::symlink;
+            symlink("/dev/zero", at("zero")).unwrap();
+            refused(&at("zero"), "is a device or pipe");
+            symlink(at("loop"), at("loop")).unwrap();
+            refused(&at("loop"), "check the name and that you may read it");
+            // Announces no bytes and has some.
+            refused(Path::new("/proc/self/status"), "another length");
+        }
+    }
+
+    #[test]
+    fn json_of_many_values_is_refused_before_it_is_parsed() {
+        let many = format!("[0{}]", ",0".repeat(MOST_VALUES));
+        assert!(parse_json::<serde_json::Value>(many.as_bytes()).unwrap_err().contains("values"));
+        let text = format!("[\"{}\\\"{}\"]", ",".repeat(MOST_VALUES), "[".repeat(MOST_VALUES));
+        assert_eq!(parse_json::<Vec<String>>(text.as_bytes()).unwrap()[0].len(), 2 * MOST_VALUES + 1);
+    }
 
     #[test]
     fn what_is_damaged_or_half_written_is_not_there() {

@@ -11,7 +11,7 @@ use std::path::Path;
 /// Each folder, or file beside them, and those that it uses; all of them stand above it.
 const FOLDERS: &[(&str, &str)] = &[
     ("error", ""),
-    ("files", ""),
+    ("files", "error"),
     ("math", ""),
     ("preset", ""),
     ("checkpoint", "error files"),
@@ -19,14 +19,14 @@ const FOLDERS: &[(&str, &str)] = &[
     ("scene", ""),
     ("gpu", "error files"),
     ("pass", "error math scene gpu"),
-    ("photo", "error progress scene"),
-    ("format", "error scene pass photo"),
+    ("photo", "error files progress scene"),
+    ("format", "error files scene pass photo"),
     ("infer", "error files math progress scene photo format"),
     ("fetch", "error files progress infer"),
     ("pose", "error math preset progress scene gpu pass photo infer"),
     ("fit", "error math preset checkpoint progress scene gpu pass"),
     ("language", "error math progress scene photo format infer"),
-    ("query", "error math scene pass photo format pose"),
+    ("query", "error files math scene pass photo format pose"),
     ("report", "error progress scene photo format query"),
     ("synth", "error math progress scene photo format infer language query"),
     ("pipeline", "error files checkpoint progress gpu infer"),
@@ -38,11 +38,11 @@ const FOLDERS: &[(&str, &str)] = &[
         "ablate",
         "error preset progress scene gpu photo format infer fit language query report synth pipeline run",
     ),
-    ("bench", "error preset progress scene gpu pass photo format infer pose fit language query run"),
+    ("bench", "error files preset progress scene gpu pass photo format infer pose fit language query run"),
     ("capi", "error preset progress scene gpu pass photo infer pose query run"),
     (
         "cli",
-        "error preset progress scene gpu photo format infer fetch language query report synth pipeline run ablate bench",
+        "error files preset progress scene gpu photo format infer fetch language query report synth pipeline run ablate bench",
     ),
 ];
 

@@ -2,7 +2,7 @@
 use super::measure::{Budget, Quartiles, cores, processor_ms};
 use super::model::{PassWork, Roofline};
 use crate::gpu::{Device, Program, Recorder};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
 use std::path::Path;
@@ -137,10 +137,7 @@ impl BenchReport {
     /// Reads a report from its JSON file.
     pub fn read(path: &Path) -> Result<BenchReport> {
         let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
-        let text = std::fs::read_to_string(path)
-            .map_err(|e| bad(format!("{e}; give a file of splatvk bench --json")))?;
-        let report: BenchReport = serde_json::from_str(&text)
-            .map_err(|e| bad(format!("not a report of splatvk bench --json: {e}")))?;
+        let report: BenchReport = files::read_json(path, "give a file of splatvk bench --json")?;
         if report.format != FORMAT {
             return Err(bad(format!("layout {:?}; this program reads {FORMAT:?}", report.format)));
         }

@@ -3,7 +3,7 @@ use crate::format::{cameras, create_folder, picture, ply, scene_dir, write_json}
 use crate::gpu::Device;
 use crate::pass::{renderer::Renderer, seeded};
 use crate::scene::{Camera, Pose, RgbImage, Splats};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use glam::{DMat3, DVec3};
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -104,9 +104,7 @@ fn read_camera(path: &Path) -> Result<Camera> {
     let bad = |what: String| {
         Error::input(format!("{}: {what}; give the camera with --camera FILE", path.display()))
     };
-    let text = std::fs::read_to_string(path).map_err(|e| bad(e.to_string()))?;
-    let value: serde_json::Value =
-        serde_json::from_str(&text).map_err(|e| bad(format!("not a JSON camera file: {e}")))?;
+    let value: serde_json::Value = files::read_json(path, "give the camera with --camera FILE")?;
     if value.get("w2c").is_none() {
         return cameras::read(path)?.into_iter().next().ok_or_else(|| bad("no camera in it".into()));
     }

@@ -14,7 +14,7 @@ use crate::infer::installed::{Inventory, inventory};
 use crate::run::sources::{
     FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice, SourceKind, choose,
 };
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -100,11 +100,13 @@ impl Report<'_> {
 
 /// The measurements of a report that an earlier run left; none where there is no report.
 fn earlier(path: &Path) -> Result<Vec<Measurement>> {
-    let Ok(text) = std::fs::read_to_string(path) else { return Ok(Vec::new()) };
+    if !path.exists() {
+        return Ok(Vec::new());
+    }
     let bad = |e: serde_json::Error| {
         Error::input(format!("{}: not a report of ablate: {e}; leave out --resume", path.display()))
     };
-    let mut report: Value = serde_json::from_str(&text).map_err(bad)?;
+    let mut report: Value = files::read_json(path, "not a report of ablate, leave out --resume")?;
     serde_json::from_value(report["measurements"].take()).map_err(bad)
 }
 

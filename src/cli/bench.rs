@@ -3,6 +3,7 @@ use super::args::{BenchArgs, BenchPart};
 use super::models::checked;
 use super::print::print;
 use super::progress;
+use super::scene;
 use crate::bench::{self, Bench, BenchReport, Budget, Workload, compare};
 use crate::format::{scene_dir, write_json};
 use crate::gpu::Device;
@@ -157,7 +158,7 @@ fn scene_and_encoder(args: &BenchArgs) -> Result<(scene_dir::Scene, Box<dyn Regi
     let Some(path) = &args.scene else {
         return Err(Error::input("bench query: give a scene with language with --scene DIR"));
     };
-    let scene = scene_dir::load(path)?;
+    let scene = scene::load(path)?;
     if scene.language.is_none() {
         let path = path.display();
         return Err(Error::input(format!("{path}: the scene has no language; make one with splatvk run")));

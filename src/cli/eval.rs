@@ -2,8 +2,9 @@
 use super::args::{EvalArgs, ProtocolArg};
 use super::print::{print, print_json};
 use super::progress;
+use super::scene;
 use crate::format::scene_dir::Scene;
-use crate::format::{cameras, create_folder, picture, scene_dir, write_json};
+use crate::format::{cameras, create_folder, picture, write_json};
 use crate::gpu::Device;
 use crate::query::TextQuery;
 use crate::query::eval::{EvalReport, Evaluation, GroundTruth};
@@ -20,7 +21,7 @@ use serde::Serialize;
 use std::path::Path;
 
 pub fn eval(args: &EvalArgs) -> Result<()> {
-    let scene = scene_dir::load(&args.scene)?;
+    let scene = scene::load(&args.scene)?;
     if let Some(out) = &args.out {
         create_folder(out).map_err(|e| Error::input(format!("{e}; choose another --out")))?;
     }

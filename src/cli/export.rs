@@ -1,10 +1,11 @@
 //! `splatvk export`
 use super::print::listing;
 use super::progress;
+use super::scene;
 use crate::format::gaussians::{self, FORMATS, SplatFormat};
 use crate::format::scene_dir::Scene;
 use crate::format::transform::transform_splats;
-use crate::format::{colmap, create_folder, ply, scene_dir, transforms, write_whole_file};
+use crate::format::{colmap, create_folder, ply, transforms, write_whole_file};
 use crate::scene::{Camera, PointCloud, SH_C0, Similarity, Splats, UpAxis};
 use crate::{Error, Result};
 use clap::Args;
@@ -116,7 +117,7 @@ fn place(scene: &mut Scene, points: &mut Option<PointCloud>, by: &Similarity) {
 }
 
 pub fn export(args: &ExportArgs) -> Result<()> {
-    let mut scene = scene_dir::load(&args.scene)?;
+    let mut scene = scene::load(&args.scene)?;
     if args.only_seen {
         keep_seen(&mut scene, args)?;
     }
@@ -181,7 +182,7 @@ fn warn_of_models(scene: &Scene) {
 }
 
 /// Drops what no photo shows.
-fn keep_seen(scene: &mut scene_dir::Scene, args: &ExportArgs) -> Result<()> {
+fn keep_seen(scene: &mut Scene, args: &ExportArgs) -> Result<()> {
     if scene.seen.pixels.is_empty() {
         return Err(Error::input(format!(
             "{}: what the photos show of the scene is not known; leave --only-seen out, or make the scene again with this \

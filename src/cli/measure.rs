@@ -1,5 +1,6 @@
 //! `splatvk measure`: lengths in a scene, and its scale.
 use super::print::{print, print_json};
+use super::scene;
 use crate::format::scene_dir;
 use crate::run::metric::{self, Length, Measured};
 use crate::scene::{Scale, World};
@@ -36,7 +37,7 @@ pub fn measure(args: &MeasureArgs) -> Result<()> {
     if let Some(bare) = args.scale.iter().find(|l| l.metres.is_none()) {
         return Err(Error::input(format!("--scale \"{}\": give its length, \"A - B = METRES\"", bare.text)));
     }
-    let scene = scene_dir::load(&args.scene)?;
+    let scene = scene::load(&args.scene)?;
     if scene.cameras.is_empty() {
         return Err(Error::input(format!(
             "{}: a file of Gaussians has no place for a scale; give a scene directory",

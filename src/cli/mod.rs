@@ -8,6 +8,7 @@ mod eval;
 mod export;
 mod fetch;
 mod generate;
+mod line;
 mod measure;
 mod models;
 mod outputs;
@@ -17,6 +18,7 @@ mod progress;
 mod query;
 mod render;
 mod run;
+mod scene;
 mod shell;
 mod train;
 mod view;
@@ -26,6 +28,7 @@ use crate::Result;
 use args::{Cli, Command};
 use clap::Parser;
 use clap::error::ErrorKind;
+use line::one_line;
 use std::process::ExitCode;
 
 /// Runs the command line of this process: one error line at most, and an exit code that says what kind it was
@@ -44,7 +47,7 @@ pub fn main() -> ExitCode {
     match execute(command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            progress::print_error(&one_line(&error.to_string()), error.exit_code());
+            progress::print_error(&error.to_string(), error.exit_code());
             ExitCode::from(error.exit_code())
         }
     }
@@ -88,8 +91,4 @@ fn print_usage_error(error: &clap::Error) -> ExitCode {
     let message = text.split("\n\n").next().unwrap_or(&text);
     eprintln!("splatvk: {}; see splatvk --help", one_line(message.trim_start_matches("error: ")));
     ExitCode::from(2)
-}
-
-fn one_line(message: &str) -> String {
-    message.split_whitespace().collect::<Vec<_>>().join(" ")
 }

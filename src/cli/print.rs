@@ -1,9 +1,15 @@
 //! What goes to standard output.
+use super::line::lines;
 use crate::{Error, Result};
 use std::io::Write;
 
-/// Prints to standard output. A reader that closed the pipe (`| head`) ends the process quietly.
+/// Prints text for people to standard output, without control characters.
 pub(super) fn print(text: &str) -> Result<()> {
+    put(&lines(text))
+}
+
+/// Writes to standard output. A reader that closed the pipe (`| head`) ends the process quietly.
+fn put(text: &str) -> Result<()> {
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
         Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => std::process::exit(0),
@@ -13,7 +19,8 @@ pub(super) fn print(text: &str) -> Result<()> {
 
 /// Prints one JSON object on a line of its own.
 pub(super) fn print_json(value: &serde_json::Value) -> Result<()> {
-    print(&format!("{value}\n"))
+    // As it is: JSON escapes control characters itself, and names must stay what they are.
+    put(&format!("{value}\n"))
 }
 
 /// Names the files that a command wrote.

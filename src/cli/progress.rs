@@ -1,6 +1,7 @@
 //! Progress on standard error: a bar per stage with the time left on a terminal, one line per stage elsewhere, or one
 //! JSON object per line for machines.
 use super::args::LogFormat;
+use super::line::one_line;
 use crate::progress::Progress;
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
@@ -38,13 +39,15 @@ pub fn stopped() -> bool {
 
 /// The error that ends the process.
 pub fn print_error(message: &str, exit_code: u8) {
+    let message = one_line(message);
     match as_json() {
         true => write_event("error", json!({ "message": message, "exit_code": exit_code })),
         false => eprintln!("splatvk: {message}"),
     }
 }
 
-fn print_warning(message: &str) {
+pub fn print_warning(message: &str) {
+    let message = one_line(message);
     match as_json() {
         true => write_event("warning", json!({ "message": message })),
         false => eprintln!("warning: {message}"),
@@ -96,7 +99,7 @@ impl Progress for JsonLines {
         print_warning(message);
     }
     fn inform(&self, message: &str) {
-        write_event("message", json!({ "message": message }));
+        write_event("message", json!({ "message": one_line(message) }));
     }
     fn cancelled(&self) -> bool {
         stopped()
@@ -165,7 +168,7 @@ impl Progress for Terminal {
     fn step(&self, done: u64, note: &str) {
         if let Some((_, _, bar)) = lock(&self.current).as_ref() {
             bar.set_position(done);
-            bar.set_prefix(note.to_owned());
+            bar.set_prefix(one_line(note));
         }
     }
     fn end(&self) {
@@ -175,10 +178,10 @@ impl Progress for Terminal {
         self.print(&format!("{name:>12}  {:6.1} s  {note}", start.elapsed().as_secs_f64()));
     }
     fn warn(&self, message: &str) {
-        self.print(&format!("warning: {message}"));
+        self.print(&format!("warning: {}", one_line(message)));
     }
     fn inform(&self, message: &str) {
-        self.print(message);
+        self.print(&one_line(message));
     }
     fn cancelled(&self) -> bool {
         stopped()

@@ -3,9 +3,10 @@ use super::args::QueryArgs;
 use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
 use super::progress;
+use super::scene;
 use super::views;
 use crate::format::ply::{self, PlyOptions};
-use crate::format::{cameras, picture, scene_dir, write_json};
+use crate::format::{cameras, picture, write_json};
 use crate::gpu::Device;
 use crate::query::QueryResult;
 use crate::query::instances::Instance;
@@ -26,7 +27,7 @@ use std::time::Instant;
 const AT_ONCE: usize = 16;
 
 pub fn query(args: &QueryArgs) -> Result<()> {
-    let mut scene = scene_dir::load(&args.scene)?;
+    let mut scene = scene::load(&args.scene)?;
     let no_language = || {
         Error::input(format!(
             "{}: the scene has no language; make one with splatvk run",
@@ -40,6 +41,12 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         Some(file) => cameras::read(file)?,
         None => scene.cameras.clone(),
     };
+    if cameras.is_empty() {
+        return Err(Error::input(format!(
+            "{}: a file of Gaussians has no cameras, and answers are given in views; add --cameras FILE",
+            args.scene.display()
+        )));
+    }
     let stems = views::stems(&cameras)?;
     let folders: Vec<String> = args.texts.iter().map(|t| file_name(t)).collect();
     for (i, folder) in folders.iter().enumerate() {

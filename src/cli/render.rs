@@ -3,10 +3,11 @@ use super::args::{Channel, ImageFormat, RenderArgs};
 use super::outputs::WrittenFiles;
 use super::print::listing;
 use super::progress;
+use super::scene;
 use super::views;
+use crate::format::cameras;
 use crate::format::npy::{self, NpyArray};
 use crate::format::picture::{self, Planes};
-use crate::format::{cameras, scene_dir};
 use crate::gpu::Device;
 use crate::report::colour;
 use crate::run::view::{DecodedFrame, UnseenShare, Viewer};
@@ -14,7 +15,7 @@ use crate::scene::{LEVEL_NAMES, LanguageField, Plane, RgbImage, to_linear};
 use crate::{Error, Result};
 
 pub fn render(args: &RenderArgs) -> Result<()> {
-    let scene = scene_dir::load(&args.scene)?;
+    let scene = scene::load(&args.scene)?;
     let cameras = cameras::read(&args.cameras)?;
     let stems = views::stems(&cameras)?;
     let wants_language = args.channels.iter().any(|c| matches!(c, Channel::Features | Channel::Codes));

@@ -2,7 +2,8 @@
 use super::args::ViewArgs;
 use super::print::{print, print_json};
 use super::progress;
-use crate::format::scene_dir::{self, Scene};
+use super::scene;
+use crate::format::scene_dir::Scene;
 use crate::gpu::Device;
 use crate::photo;
 use crate::query::QueryOptions;
@@ -27,7 +28,7 @@ const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'unsafe-in
                       img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
 pub fn view(args: &ViewArgs) -> Result<()> {
-    let scene = scene_dir::load(&args.scene)?;
+    let scene = scene::load(&args.scene)?;
     if scene.splats.is_empty() {
         return Err(Error::input(format!("{}: no splats to show", args.scene.display())));
     }

@@ -185,7 +185,7 @@ impl Client {
 }
 
 fn roots(file: &Path) -> Result<RootCerts> {
-    let text = std::fs::read(file).map_err(Error::io(file))?;
+    let text = files::read(file)?;
     let found: Vec<_> = ureq::tls::parse_pem(&text)
         .filter_map(|item| match item {
             Ok(PemItem::Certificate(one)) => Some(one),
@@ -239,7 +239,7 @@ impl Download<'_> {
 
     /// What is on disk belongs to this address.
     fn begun(&self) -> Option<Begun> {
-        let begun: Begun = serde_json::from_slice(&std::fs::read(self.notes()).ok()?).ok()?;
+        let begun: Begun = files::read_json(&self.notes(), "").ok()?;
         (begun.from == self.source.from).then_some(begun)
     }
 

@@ -1,7 +1,7 @@
 //! Camera files: one reader for every kind, the project's own `cameras.json`.
 use super::{colmap, transforms};
 use crate::scene::{Camera, Pose};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -21,19 +21,17 @@ pub fn read(path: &Path) -> Result<Vec<Camera>> {
             )),
         };
     }
-    let text = std::fs::read_to_string(path).map_err(|e| bad(format!("{e}; check the camera file")))?;
-    let value: serde_json::Value =
-        serde_json::from_str(&text).map_err(|e| bad(format!("not a JSON camera file: {e}")))?;
-    let cameras = match &value {
-        serde_json::Value::Array(_) => {
-            let entries: Vec<Entry> =
-                serde_json::from_value(value).map_err(|e| bad(format!("not a cameras.json file: {e}")))?;
-            entries.into_iter().map(Entry::camera).collect::<Result<Vec<_>, _>>()
+    let text = files::read_text(path)?;
+    let cameras = match text.trim_start().chars().next() {
+        Some('[') => {
+            let entries: Result<Vec<Entry>, _> = files::parse_json(text.as_bytes());
+            let entries = entries.map_err(|e| format!("not a JSON camera file (cameras.json): {e}; check it"));
+            entries.and_then(|all| all.into_iter().map(Entry::camera).collect::<Result<Vec<_>, _>>())
         }
-        serde_json::Value::Object(o) if o.contains_key("frames") => {
-            transforms::parse(value, path.parent().unwrap_or(Path::new(".")))
-        }
-        _ => Err("neither transforms.json (an object with \"frames\") nor cameras.json (a list)".to_string()),
+        Some('{') => transforms::parse(&text, path.parent().unwrap_or(Path::new("."))),
+        _ => Err("not a JSON camera file: neither transforms.json (an object with \"frames\") nor cameras.json (a list); \
+                  check the camera file"
+            .to_string()),
     };
     let cameras = cameras.map_err(bad)?;
     if cameras.is_empty() {

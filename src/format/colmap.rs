@@ -1,6 +1,6 @@
 //! COLMAP models, text and binary. World → camera, OpenCV axes, first pixel centre at 0.5.
 use crate::scene::{Camera, Lens, PointCloud, Pose};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use glam::{DMat3, DQuat, DVec3};
 use std::collections::HashMap;
 use std::fmt::Write as _;
@@ -48,12 +48,11 @@ pub fn read(folder: &Path) -> Result<Vec<Camera>> {
     let text = folder.join("images.txt").is_file();
     let ext = if text { "txt" } else { "bin" };
     let (cameras, images) = (folder.join(format!("cameras.{ext}")), folder.join(format!("images.{ext}")));
-    let load = |p: &Path| std::fs::read(p).map_err(Error::io(p));
     let named = |p: &Path| {
         let p = p.display().to_string();
         move |e: String| Error::input(format!("{p}: {e}"))
     };
-    let (camera_bytes, image_bytes) = (load(&cameras)?, load(&images)?);
+    let (camera_bytes, image_bytes) = (files::read(&cameras)?, files::read(&images)?);
     let (intrinsics, mut shots) = if text {
         (
             text_cameras(&camera_bytes).map_err(named(&cameras))?,
@@ -114,13 +113,19 @@ fn text_cameras(bytes: &[u8]) -> Result<HashMap<u32, Intrinsics>, String> {
     Ok(out)
 }
 
+/// Whether a line is the 2D points of the image before it, numbers in threes; an image has nine and a name.
+fn is_points(line: &str) -> bool {
+    let words = line.split_whitespace();
+    words.clone().count().is_multiple_of(3) && words.into_iter().all(|w| w.parse::<f64>().is_ok())
+}
+
 fn text_images(bytes: &[u8]) -> Result<Vec<Shot>, String> {
     let text = String::from_utf8_lossy(bytes);
-    // Two lines an image; the second (2D points) may be empty, so empty lines count.
-    let mut lines = text.lines().enumerate().filter(|(_, l)| !l.starts_with('#'));
+    // Two lines an image; the second (2D points) is often empty, and some programs leave it out.
     let mut out = Vec::new();
-    while let Some((i, line)) = lines.next() {
-        if line.trim().is_empty() {
+    let mut points_may_follow = false;
+    for (i, line) in text.lines().enumerate().filter(|(_, l)| !l.starts_with('#')) {
+        if std::mem::take(&mut points_may_follow) && is_points(line) || line.trim().is_empty() {
             continue;
         }
         let mut words = line.splitn(10, ' ');
@@ -132,8 +137,11 @@ fn text_images(bytes: &[u8]) -> Result<Vec<Shot>, String> {
         let [qw, qx, qy, qz, x, y, z] = seven;
         let camera = number(words.next(), i + 1)?;
         let name = words.next().unwrap_or("").trim_end().to_string();
+        if name.is_empty() {
+            return Err(format!("line {}: the name of the image is missing", i + 1));
+        }
         out.push(Shot { id, q: [qw, qx, qy, qz], t: [x, y, z], camera, name });
-        lines.next();
+        points_may_follow = true;
     }
     Ok(out)
 }
@@ -181,7 +189,8 @@ fn binary_cameras(bytes: &[u8]) -> Result<HashMap<u32, Intrinsics>, String> {
     let mut out = HashMap::new();
     for _ in 0..b.u64()? {
         let (id, model) = (b.u32()?, b.u32()? as usize);
-        let size = (b.u64()? as u32, b.u64()? as u32);
+        let side = |n: u64| u32::try_from(n).map_err(|_| format!("camera {id} has a side of {n} pixels"));
+        let size = (side(b.u64()?)?, side(b.u64()?)?);
         let count = MODELS.get(model).ok_or_else(|| unknown_model(model))?.1;
         let p: Vec<f64> = (0..count).map(|_| b.f64s::<1>().map(|v| v[0])).collect::<Result<_, _>>()?;
         out.insert(id, intrinsics(model, size, &p)?);
@@ -205,7 +214,7 @@ fn binary_images(bytes: &[u8]) -> Result<Vec<Shot>, String> {
 pub fn read_points(folder: &Path) -> Result<PointCloud> {
     let (text, binary) = (folder.join("points3D.txt"), folder.join("points3D.bin"));
     let path = if text.is_file() { text.clone() } else { binary };
-    let bytes = std::fs::read(&path).map_err(Error::io(&path))?;
+    let bytes = files::read(&path)?;
     let points = if path == text { text_points(&bytes) } else { binary_points(&bytes) };
     let points = points.map_err(|e| Error::input(format!("{}: {e}", path.display())))?;
     let n = points.len();

@@ -5,6 +5,7 @@ pub mod ply_packed;
 mod ply_table;
 pub mod splat;
 pub mod spz;
+pub(crate) mod usable;
 
 use super::{side_file, write_whole_file};
 use crate::scene::{LanguageField, Splats};
@@ -111,11 +112,17 @@ fn format(path: &Path) -> Result<&'static SplatFormat> {
     })
 }
 
-/// Reads a file of Gaussians, and the language beside it, if any.
+/// Reads a file of Gaussians, and the language beside it, if any. Gaussians that cannot be computed with (numbers that are not
+/// finite or beyond 1e18, no rotation) are left out.
 pub fn read(path: &Path) -> Result<(Splats, Option<LanguageField>)> {
+    read_counted(path).map(|(splats, language, _)| (splats, language))
+}
+
+/// [`read`], and what was left out, one line.
+pub fn read_counted(path: &Path) -> Result<(Splats, Option<LanguageField>, Option<String>)> {
     let splats = (format(path)?.read)(path)?;
     let language = side_file::read(path, splats.len())?;
-    Ok((splats, language))
+    usable::keep(splats, language, path)
 }
 
 /// Writes a file of Gaussians, and beside it ([`side_file`]) their language, if they have any.

@@ -1,7 +1,7 @@
 //! What the splats carry on each level, as named arrays: the same in a scene directory and beside a file of Gaussians
 //! (docs/formats.md#features-of-splats).
 use super::npy::{NpyArray, NpyData};
-use crate::scene::{CodeMix, LevelField};
+use crate::scene::{CodeMix, Codebook, LevelField};
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 
@@ -17,6 +17,8 @@ pub fn append(
     if level.features.len() != splats * book.code_dim {
         return Err(Error::work(format!("level {name} has features for another number of splats")));
     }
+    let written = check(book).and_then(|()| finite("its features", &level.features, book.code_dim));
+    written.map_err(|what| Error::work(format!("level {name}: nothing is written: {what}")))?;
     let rows: Vec<usize> = match order {
         [] => (0..splats).collect(),
         order => order.iter().map(|&i| i as usize).collect(),
@@ -47,6 +49,49 @@ pub fn append(
     Ok(())
 }
 
+/// A codebook of the arrays clip [K, D], code [K, d], weight [K] and delta_min, without members; `Err` says what does not fit.
+pub fn codebook([clip, code, weight, delta_min]: [&NpyArray; 4]) -> std::result::Result<Codebook, String> {
+    let (&[k, embedding_dim], &[k2, code_dim]) = (&clip.shape[..], &code.shape[..]) else {
+        return Err("its codes have no two dimensions".to_owned());
+    };
+    if k != k2 || weight.shape != [k] || embedding_dim * code_dim == 0 {
+        return Err(format!(
+            "the arrays of its codes do not fit together ({:?}, {:?}, {:?})",
+            clip.shape, code.shape, weight.shape
+        ));
+    }
+    let book = Codebook {
+        embedding_dim,
+        code_dim,
+        embeddings: clip.to_f32(),
+        codes: code.to_f32(),
+        weights: weight.to_f32(),
+        members: vec![Vec::new(); k],
+        min_chord: delta_min.to_f32().first().copied().unwrap_or(0.0),
+    };
+    check(&book)?;
+    Ok(book)
+}
+
+/// Refuses a codebook with numbers that are not finite: what would be refused when it is read is not written either.
+pub fn check(book: &Codebook) -> std::result::Result<(), String> {
+    finite("its embeddings", &book.embeddings, book.embedding_dim)?;
+    finite("its codes", &book.codes, book.code_dim)?;
+    finite("its weights", &book.weights, 1)?;
+    finite("delta_min", &[book.min_chord], 1)
+}
+
+/// Refuses numbers that are not finite, with their count and the first row of `width` that has one.
+fn finite(what: &str, values: &[f32], width: usize) -> std::result::Result<(), String> {
+    let mut bad = values.iter().enumerate().filter(|(_, v)| !v.is_finite()).map(|(i, _)| i / width);
+    match bad.next() {
+        Some(first) => {
+            Err(format!("{} numbers of {what} are not finite, the first in row {first}", 1 + bad.count()))
+        }
+        None => Ok(()),
+    }
+}
+
 /// Reads what [`append`] wrote into a level whose codebook is there; `Err` says what does not fit.
 pub fn read(
     arrays: &BTreeMap<String, NpyArray>,
@@ -63,7 +108,10 @@ pub fn read(
     };
     // Scenes of version 1 have the bare name of the level.
     match get("features").or_else(|| arrays.get(name)) {
-        Some(a) if a.shape == [splats, d] => level.features = a.to_f32(),
+        Some(a) if a.shape == [splats, d] => {
+            level.features = a.to_f32();
+            finite(&format!("the features of level {name}"), &level.features, d)?;
+        }
         Some(a) => return Err(format!("the features of level {name} have the shape {:?}", a.shape)),
         None => {
             let (first, second, share) = (column("first")?, column("second")?, column("share")?);

@@ -1,11 +1,15 @@
 //! NumPy `.npy` (format versions 1–3) and `.npz` files: little-endian, C order.
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use half::f16;
+use std::cmp::Ordering;
 use std::collections::BTreeMap;
-use std::io::{Read, Write};
+use std::io::{Cursor, Read, Write};
 use std::path::Path;
 
 const MAGIC: &[u8] = b"\x93NUMPY";
+
+/// Most bytes of the header of an array in an archive: NumPy's own have 128, and it refuses headers beyond 10,000.
+const LONGEST_HEADER: u64 = 1 << 16;
 
 /// The values of an array in its stored type.
 #[derive(Clone, Debug, PartialEq)]
@@ -133,8 +137,7 @@ impl NpyArray {
 /// Reads one `.npy` file.
 pub fn read(path: impl AsRef<Path>) -> Result<NpyArray> {
     let path = path.as_ref();
-    let bytes = std::fs::read(path).map_err(Error::io(path))?;
-    decode(&bytes, &path.display().to_string())
+    decode(&files::read(path)?, &path.display().to_string())
 }
 
 /// Writes one `.npy` file (version 1.0, header padded to 64 bytes).
@@ -144,24 +147,58 @@ pub fn write(path: impl AsRef<Path>, array: &NpyArray) -> Result<()> {
     std::fs::write(path, bytes).map_err(Error::unwritable(path))
 }
 
-/// Reads every `.npy` member of an `.npz` file, by name without the extension.
+/// Reads every `.npy` member of an `.npz` file, by name without the extension. A file that holds more than 16 times its
+/// bytes and 64 MiB is refused.
 pub fn read_npz(path: impl AsRef<Path>) -> Result<BTreeMap<String, NpyArray>> {
-    let path = path.as_ref();
-    let bad = |e: zip::result::ZipError| {
-        Error::input(format!("{}: not a readable npz (zip) file: {e}", path.display()))
+    read_npz_of(path.as_ref(), 0)
+}
+
+/// [`read_npz`] of what `rows` splats carry, which may compress to almost nothing.
+pub(super) fn read_npz_of(path: &Path, rows: usize) -> Result<BTreeMap<String, NpyArray>> {
+    let bytes = files::read(path)?;
+    // Three levels with two codes of four bytes, a share and a reliability.
+    let mut left = files::most_content(bytes.len()).saturating_add(30 * rows as u64);
+    let bad = |what: String| {
+        Error::input(format!("{}: {what}; copy the file again or make it anew", path.display()))
     };
-    let file = std::fs::File::open(path).map_err(Error::io(path))?;
-    let mut archive = zip::ZipArchive::new(std::io::BufReader::new(file)).map_err(bad)?;
+    let damaged = |e: zip::result::ZipError| bad(format!("not a readable npz (zip) file ({e})"));
+    let mut archive = zip::ZipArchive::new(Cursor::new(bytes.as_slice())).map_err(damaged)?;
     let mut out = BTreeMap::new();
     for k in 0..archive.len() {
-        let mut member = archive.by_index(k).map_err(bad)?;
-        let name = member.name().map_err(bad)?.to_string();
+        let mut member = archive.by_index(k).map_err(damaged)?;
+        let name = member.name().map_err(damaged)?.to_string();
         let Some(key) = name.strip_suffix(".npy") else { continue };
-        let mut bytes = Vec::new();
-        member.read_to_end(&mut bytes).map_err(Error::io(path))?;
+        let bytes = read_member(&mut member, left).map_err(|what| bad(format!("array {key:?}: {what}")))?;
+        left = left.saturating_sub(bytes.len() as u64);
         out.insert(key.to_string(), decode(&bytes, &format!("{}[{key}]", path.display()))?);
     }
     Ok(out)
+}
+
+/// A whole member of at most `left` bytes: its header first, which tells how many bytes of values belong to it.
+fn read_member(member: &mut impl Read, left: u64) -> Result<Vec<u8>, String> {
+    let damaged = |e: std::io::Error| format!("damaged ({e})");
+    let mut bytes = Vec::new();
+    // Versions 2 and 3 have the longest preamble.
+    member.by_ref().take(12).read_to_end(&mut bytes).map_err(damaged)?;
+    let end = preamble(&bytes)?;
+    if end as u64 > left.min(LONGEST_HEADER) {
+        return Err("its npy header is too long".to_owned());
+    }
+    member
+        .by_ref()
+        .take((end as u64).saturating_sub(bytes.len() as u64))
+        .read_to_end(&mut bytes)
+        .map_err(damaged)?;
+    let size = Header::parse(&bytes)?.size()?;
+    let total = (end as u64).saturating_add(size);
+    if total > left {
+        return Err(format!("{size} bytes of values are far more than the file can hold"));
+    }
+    // One byte more shows that something follows, and lets the archive check the sum.
+    bytes.reserve_exact(size as usize + 1);
+    member.take(total - bytes.len() as u64 + 1).read_to_end(&mut bytes).map_err(damaged)?;
+    Ok(bytes)
 }
 
 /// Writes an `.npz` file, stored without compression so that readers can map it.
@@ -221,29 +258,84 @@ pub fn encode(array: &NpyArray) -> Result<Vec<u8>> {
 
 /// Parses a `.npy` file image; `origin` names it in errors.
 pub fn decode(bytes: &[u8], origin: &str) -> Result<NpyArray> {
-    let bad = |what: &str| Error::input(format!("{origin}: {what}"));
-    if bytes.len() < 10 || &bytes[..6] != MAGIC {
-        return Err(bad("not a NumPy array file (wrong magic bytes)"));
-    }
-    let (start, length): (usize, usize) = match bytes[6] {
-        1 => (10, u16::from_le_bytes([bytes[8], bytes[9]]) as usize),
-        2 | 3 if bytes.len() >= 12 => {
-            (12, u32::from_le_bytes([bytes[8], bytes[9], bytes[10], bytes[11]]) as usize)
+    let parse = || -> Result<NpyArray, String> {
+        let header = Header::parse(bytes)?;
+        let (size, found) = (header.size()?, &bytes[header.end..]);
+        match (found.len() as u64).cmp(&size) {
+            Ordering::Less => Err(format!(
+                "truncated, {size} bytes of values expected, {} found; copy it again",
+                found.len()
+            )),
+            Ordering::Greater => {
+                Err(format!("{size} bytes of values expected, more follow; copy it again or save it anew"))
+            }
+            Ordering::Equal => Ok(NpyArray { data: parse_values(header.descr, found), shape: header.shape }),
         }
-        v => return Err(bad(&format!("npy format version {v} is not supported (1 to 3 are)"))),
     };
-    let end = start.checked_add(length).filter(|&e| e <= bytes.len());
-    let end = end.ok_or_else(|| bad("truncated npy header"))?;
-    let header = std::str::from_utf8(&bytes[start..end]).map_err(|_| bad("npy header is not text"))?;
-    let descr = quoted(header, "descr").ok_or_else(|| bad("npy header has no plain 'descr'"))?;
-    if field(header, "fortran_order").is_some_and(|f| f.starts_with("True")) {
-        return Err(bad("Fortran order is not supported; save numpy.ascontiguousarray(x)"));
+    parse().map_err(|what| Error::input(format!("{origin}: {what}")))
+}
+
+/// Where the values begin, by the first bytes of a file.
+fn preamble(bytes: &[u8]) -> Result<usize, String> {
+    if bytes.len() < 10 || &bytes[..6] != MAGIC {
+        return Err("not a NumPy array file (wrong magic bytes); copy it again or save it anew".to_owned());
     }
-    let shape = parse_shape(header).ok_or_else(|| bad("npy header has no readable 'shape'"))?;
-    let count = shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
-    let count = count.ok_or_else(|| bad("npy shape is too large"))?;
-    let data = parse_values(descr, count, &bytes[end..], origin)?;
-    Ok(NpyArray { shape, data })
+    let length = match bytes[6] {
+        1 => return Ok(10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]))),
+        2 | 3 if bytes.len() >= 12 => u32::from_le_bytes([bytes[8], bytes[9], bytes[10], bytes[11]]),
+        v => return Err(format!("npy format version {v} is not supported (1 to 3 are); save it anew")),
+    };
+    (length as usize).checked_add(12).ok_or_else(|| "its npy header is too long".to_owned())
+}
+
+/// What a file states of its values.
+struct Header<'a> {
+    descr: &'a str,
+    shape: Vec<usize>,
+    /// Where the values begin.
+    end: usize,
+}
+
+impl Header<'_> {
+    fn parse(bytes: &[u8]) -> Result<Header<'_>, String> {
+        let end = preamble(bytes)?;
+        let start = if bytes[6] == 1 { 10 } else { 12 };
+        let header = bytes.get(start..end).ok_or("truncated npy header; copy it again")?;
+        let header = std::str::from_utf8(header).map_err(|_| "npy header is not text; save it anew")?;
+        let descr = quoted(header, "descr").ok_or("npy header has no plain 'descr'; save it anew")?;
+        if field(header, "fortran_order").is_some_and(|f| f.starts_with("True")) {
+            return Err("Fortran order is not supported; save numpy.ascontiguousarray(x)".to_owned());
+        }
+        let shape = parse_shape(header).ok_or("npy header has no readable 'shape'; save it anew")?;
+        Ok(Header { descr, shape, end })
+    }
+
+    /// Bytes of all values.
+    fn size(&self) -> Result<u64, String> {
+        let one = self.value_bytes()? as u64;
+        let total = self.shape.iter().try_fold(one, |n, d| n.checked_mul(*d as u64));
+        total.ok_or_else(|| "npy shape is too large; save it anew".to_owned())
+    }
+
+    fn value_bytes(&self) -> Result<usize, String> {
+        let bytes = match self.descr {
+            "|u1" | "|b1" | "|i1" => Some(1),
+            "<f2" | "<i2" => Some(2),
+            "<f4" | "<i4" => Some(4),
+            "<f8" | "<i8" => Some(8),
+            // A scalar string of UTF-32.
+            other if self.shape.iter().all(|d| *d == 1) => {
+                other.strip_prefix("<U").and_then(|n| n.parse::<usize>().ok()?.checked_mul(4))
+            }
+            _ => None,
+        };
+        bytes.ok_or_else(|| {
+            format!(
+                "element type '{}' is not supported (f2 f4 f8 u1 b1 i1 i2 i4 i8, little-endian)",
+                self.descr
+            )
+        })
+    }
 }
 
 /// The text after `'name':` in the header's Python dictionary.
@@ -261,44 +353,26 @@ fn parse_shape(header: &str) -> Option<Vec<usize>> {
     inside.split(',').map(str::trim).filter(|s| !s.is_empty()).map(|s| s.parse().ok()).collect()
 }
 
-fn parse_values(descr: &str, count: usize, bytes: &[u8], origin: &str) -> Result<NpyData> {
-    let take = |size: usize| -> Result<&[u8]> {
-        let need = count.saturating_mul(size);
-        bytes.get(..need).ok_or_else(|| {
-            Error::input(format!(
-                "{origin}: truncated, {need} bytes of values expected, {} found",
-                bytes.len()
-            ))
-        })
-    };
+/// The values of a type that [`Header::value_bytes`] knows; `bytes` are theirs, no more and no fewer.
+fn parse_values(descr: &str, bytes: &[u8]) -> NpyData {
     macro_rules! values {
-        ($variant:ident, $t:ty) => {{
-            const SIZE: usize = std::mem::size_of::<$t>();
-            let mut out: Vec<$t> = Vec::with_capacity(take(SIZE)?.len() / SIZE);
-            for chunk in take(SIZE)?.chunks_exact(SIZE) {
-                let mut word = [0; SIZE];
-                word.copy_from_slice(chunk);
-                out.push(<$t>::from_le_bytes(word));
-            }
-            Ok(NpyData::$variant(out))
-        }};
+        ($variant:ident, $t:ty) => {
+            NpyData::$variant(bytes.as_chunks().0.iter().map(|word| <$t>::from_le_bytes(*word)).collect())
+        };
     }
     match descr {
         "<f2" => values!(F16, f16),
         "<f4" => values!(F32, f32),
         "<f8" => values!(F64, f64),
-        "|u1" | "|b1" => Ok(NpyData::U8(take(1)?.to_vec())),
-        "|i1" => Ok(NpyData::I16(take(1)?.iter().map(|&b| b as i8 as i16).collect())),
+        "|i1" => NpyData::I16(bytes.iter().map(|&b| b as i8 as i16).collect()),
         "<i2" => values!(I16, i16),
         "<i4" => values!(I32, i32),
         "<i8" => values!(I64, i64),
-        text if text.starts_with("<U") && count == 1 => {
-            let chars = bytes.chunks_exact(4).map(|c| u32::from_le_bytes([c[0], c[1], c[2], c[3]]));
-            Ok(NpyData::Text(chars.take_while(|&c| c != 0).filter_map(char::from_u32).collect()))
+        text if text.starts_with("<U") => {
+            let chars = bytes.as_chunks().0.iter().map(|word| u32::from_le_bytes(*word));
+            NpyData::Text(chars.take_while(|&c| c != 0).filter_map(char::from_u32).collect())
         }
-        other => Err(Error::input(format!(
-            "{origin}: element type '{other}' is not supported (f2 f4 f8 u1 b1 i1 i2 i4 i8, little-endian)"
-        ))),
+        _ => NpyData::U8(bytes.to_vec()),
     }
 }
 
@@ -355,5 +429,45 @@ mod tests {
         let endian: Vec<u8> = good.iter().map(|&b| if b == b'<' { b'>' } else { b }).collect();
         assert!(decode(&endian, "x").unwrap_err().to_string().contains(">f4"));
         assert!(encode(&NpyArray::f32(&[2, 2], vec![0.0])).is_err());
+        let more = decode(&[&good[..], &[0]].concat(), "x").unwrap_err().to_string();
+        assert!(more.contains("more follow"), "{more}");
+    }
+
+    /// An archive of one member; `change` may damage its bytes.
+    fn archive(path: &Path, member: &[&[u8]], change: impl Fn(&mut Vec<u8>)) -> String {
+        let method = zip::CompressionMethod::Deflated;
+        let options = zip::write::SimpleFileOptions::default().compression_method(method);
+        let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
+        zip.start_file("a.npy", options).unwrap();
+        member.iter().for_each(|part| zip.write_all(part).unwrap());
+        let mut bytes = zip.finish().unwrap().into_inner();
+        change(&mut bytes);
+        std::fs::write(path, bytes).unwrap();
+        let e = read_npz(path).unwrap_err();
+        assert_eq!(e.exit_code(), 2);
+        e.to_string()
+    }
+
+    #[test]
+    fn an_archive_holds_no_more_than_its_size_allows_and_nothing_after_its_arrays() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.npz");
+        let array = encode(&NpyArray::u8(&[100], vec![7; 100])).unwrap();
+        let zeros = vec![0u8; 1 << 20];
+        let follows = archive(&path, &[&array, &zeros], |_| ());
+        assert!(follows.contains("more follow") && follows.contains("a.npz"), "{follows}");
+        // 100 MiB of zeros, as their header states, in 100 KB.
+        let header = std::str::from_utf8(&array[10..128]).unwrap().replace("(100,)", "(104857600,)");
+        let large = [&array[..10], &header.as_bytes()[..118]].concat();
+        let parts: Vec<&[u8]> =
+            std::iter::once(&large[..]).chain(std::iter::repeat_n(&zeros[..], 100)).collect();
+        let bomb = archive(&path, &parts, |_| ());
+        assert!(bomb.contains("104857600 bytes") && bomb.contains("far more"), "{bomb}");
+        // A wrong sum.
+        let damaged = archive(&path, &[&array], |bytes| {
+            let at = bytes.windows(4).position(|w| w == b"PK\x01\x02").unwrap();
+            bytes[at + 16] ^= 1;
+        });
+        assert!(damaged.contains("a.npz: ") && damaged.contains("copy the file again"), "{damaged}");
     }
 }

@@ -8,7 +8,7 @@ use crate::photo::Photo;
 use crate::scene::{
     Camera, Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId, PointCloud, Seen, Splats, World,
 };
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -41,6 +41,8 @@ pub struct Scene {
     pub world: World,
     /// Codebooks and features; `None` without language.
     pub language: Option<LanguageField>,
+    /// What was left out of a file of Gaussians, for the user; a scene directory is taken whole or not at all.
+    pub warnings: Vec<String>,
 }
 
 /// `scene.json`.
@@ -215,11 +217,12 @@ pub fn write_world(path: &Path, world: &World) -> Result<()> {
 /// Loads a scene directory, or a file of Gaussians ([`gaussians::read`]), which has no cameras.
 pub fn load(path: &Path) -> Result<Scene> {
     if path.is_file() {
-        let (splats, language) = gaussians::read(path)?;
-        return Ok(Scene { path: path.into(), splats, language, ..Scene::default() });
+        let (splats, language, note) = gaussians::read_counted(path)?;
+        let warnings = note.into_iter().collect();
+        return Ok(Scene { path: path.into(), splats, language, warnings, ..Scene::default() });
     }
     let manifest = read_manifest(path)?;
-    let splats = ply::read_splats(&path.join("point_cloud.ply"))?;
+    let splats = read_own(&path.join("point_cloud.ply"))?;
     let cameras = cameras::read(&path.join("cameras/transforms.json"))?;
     let damaged =
         |what: String| Error::input(format!("{}: {what}; the scene is damaged, run again", path.display()));
@@ -233,7 +236,15 @@ pub fn load(path: &Path) -> Result<Scene> {
     let splats = cut_degree(splats, manifest.sh_degree);
     let language = manifest.language.map(|m| read_language(path, &m, splats.len())).transpose()?;
     let seen = read_seen(path, splats.len())?;
-    Ok(Scene { path: path.into(), splats, seen, cameras, world: manifest.world, language })
+    let world = manifest.world;
+    Ok(Scene { path: path.into(), splats, seen, cameras, world, language, warnings: Vec::new() })
+}
+
+/// Gaussians that this program wrote: all of them or none.
+fn read_own(path: &Path) -> Result<Splats> {
+    let splats = ply::read_splats(path)?;
+    gaussians::usable::check_read(path, &splats)?;
+    Ok(splats)
 }
 
 /// Scenes of earlier versions do not have the file.
@@ -250,19 +261,25 @@ fn read_seen(folder: &Path, splats: usize) -> Result<Seen> {
             array.shape
         )));
     }
-    Ok(Seen { pixels: array.to_f32() })
+    let pixels = array.to_f32();
+    match pixels.iter().position(|v| !v.is_finite()) {
+        Some(first) => Err(Error::input(format!(
+            "{}: value {first} is not finite; the scene is damaged, run again",
+            file.display()
+        ))),
+        None => Ok(Seen { pixels }),
+    }
 }
 
 fn read_manifest(path: &Path) -> Result<Manifest> {
     let file = path.join(MANIFEST);
-    let text = std::fs::read_to_string(&file).map_err(|e| {
-        Error::input(format!(
-            "{}: not a scene directory ({MANIFEST}: {e}); give one that splatvk run wrote",
+    if !file.is_file() {
+        return Err(Error::input(format!(
+            "{}: not a scene directory (no {MANIFEST}); give one that splatvk run wrote",
             path.display()
-        ))
-    })?;
-    let manifest: Manifest = serde_json::from_str(&text)
-        .map_err(|e| Error::input(format!("{}: {e}; the scene is damaged, run again", file.display())))?;
+        )));
+    }
+    let manifest: Manifest = files::read_json(&file, "the scene is damaged, run again")?;
     if manifest.format != FORMAT || manifest.version > VERSION {
         return Err(Error::input(format!(
             "{}: format {} version {}; this program reads {FORMAT} up to version {VERSION}, update it",
@@ -285,7 +302,7 @@ pub fn cut_degree(splats: Splats, degree: u32) -> Splats {
 fn read_language(path: &Path, manifest: &LanguageManifest, splats: usize) -> Result<LanguageField> {
     let folder = path.join("language");
     let file = folder.join("features.npz");
-    let features = npy::read_npz(&file)?;
+    let features = npy::read_npz_of(&file, splats)?;
     let mut field = LanguageField {
         levels: vec![LevelField::default(); LEVEL_NAMES.len()],
         space: manifest.space.clone(),
@@ -305,7 +322,7 @@ fn read_language(path: &Path, manifest: &LanguageManifest, splats: usize) -> Res
         level.codebook = codebook;
         level_arrays::read(&features, &m.name, splats, level).map_err(damaged)?;
         if m.own_splats {
-            let own = ply::read_splats(&own_splats(&folder, &m.name))?;
+            let own = read_own(&own_splats(&folder, &m.name))?;
             if own.len() != splats {
                 return Err(damaged(format!(
                     "level {} has {} splats, the scene {splats}",
@@ -321,15 +338,11 @@ fn read_language(path: &Path, manifest: &LanguageManifest, splats: usize) -> Res
 
 fn read_codebook(path: &Path) -> Result<Codebook> {
     let arrays: BTreeMap<String, NpyArray> = npy::read_npz(path)?;
-    let get = |name: &str| {
-        arrays.get(name).ok_or_else(|| {
-            Error::input(format!("{}: no array {name:?}; the scene is damaged", path.display()))
-        })
-    };
-    let (clip, code) = (get("clip")?, get("code")?);
-    let (&[k, embedding_dim], &[k2, code_dim]) = (&clip.shape[..], &code.shape[..]) else {
-        return Err(Error::input(format!("{}: arrays have no two dimensions", path.display())));
-    };
+    let damaged =
+        |what: String| Error::input(format!("{}: {what}; the scene is damaged, run again", path.display()));
+    let get = |name: &str| arrays.get(name).ok_or_else(|| damaged(format!("no array {name:?}")));
+    let parts = [get("clip")?, get("code")?, get("weight")?, get("delta_min")?];
+    let book = level_arrays::codebook(parts).map_err(damaged)?;
     let (members, offsets) = (get("members")?.to_i32(), get("offsets")?.to_i32());
     let bounds = |w: &[i32]| members.get(w[0].max(0) as usize * 2..w[1].max(0) as usize * 2);
     let members: Option<Vec<Vec<MaskId>>> = offsets
@@ -340,17 +353,7 @@ fn read_codebook(path: &Path) -> Result<Codebook> {
             )
         })
         .collect();
-    let members = members.filter(|m| k == k2 && m.len() == k);
-    let members = members.ok_or_else(|| {
-        Error::input(format!("{}: arrays do not fit together; the scene is damaged", path.display()))
-    })?;
-    Ok(Codebook {
-        embedding_dim,
-        code_dim,
-        embeddings: clip.to_f32(),
-        codes: code.to_f32(),
-        weights: get("weight")?.to_f32(),
-        members,
-        min_chord: get("delta_min")?.to_f32().first().copied().unwrap_or(0.0),
-    })
+    let members = members.filter(|m| m.len() == book.len());
+    let members = members.ok_or_else(|| damaged("its members do not fit its codes".to_owned()))?;
+    Ok(Codebook { members, ..book })
 }

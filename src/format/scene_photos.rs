@@ -1,7 +1,7 @@
 //! The photos that a scene directory keeps: their working images, and what was read of their files and taken out of them.
 use crate::photo::{self, Photo};
 use crate::scene::RgbImage;
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use std::path::Path;
 
 /// Everything of the photos but their pixels, which are in `images/` beside it.
@@ -21,29 +21,27 @@ pub(super) fn write(cameras: &Path, photos: &[Photo]) -> Result<()> {
 pub fn load(scene: &Path) -> Result<Vec<Photo>> {
     let folder = scene.join("cameras");
     let file = folder.join(PHOTOS);
-    let bytes = std::fs::read(&file).map_err(|e| {
-        Error::input(format!(
-            "{}: {e}; the scene does not say how its photos were made: make it again with splatvk run",
+    if !file.is_file() {
+        return Err(Error::input(format!(
+            "{}: missing; the scene does not say how its photos were made: make it again with splatvk run",
             file.display()
-        ))
-    })?;
-    let mut photos: Vec<Photo> = serde_json::from_slice(&bytes)
-        .map_err(|e| Error::input(format!("{}: {e}; the scene is damaged, run again", file.display())))?;
+        )));
+    }
+    let mut photos: Vec<Photo> = files::read_json(&file, "the scene is damaged, run again")?;
     for photo in &mut photos {
         let path = folder.join("images").join(format!("{}.png", photo.stem));
-        // Larger than any image: it is to be read as it is.
-        let image = photo::load_at(&path, usize::MAX >> 16)?.image;
-        if (image.width, image.height) != (photo.image.width, photo.image.height) {
+        // Before it is decoded: the header may state any size.
+        let (width, height) = photo::dimensions(&path)?;
+        if (width as usize, height as usize) != (photo.image.width, photo.image.height) {
             return Err(Error::input(format!(
-                "{}: {} × {} pixels, the scene's camera has {} × {}; the scene is damaged, run again",
+                "{}: {width} × {height} pixels, the scene's camera has {} × {}; the scene is damaged, run again",
                 path.display(),
-                image.width,
-                image.height,
                 photo.image.width,
                 photo.image.height
             )));
         }
-        photo.image = image;
+        // Larger than any image: it is to be read as it is.
+        photo.image = photo::load_at(&path, usize::MAX >> 16)?.image;
     }
     Ok(photos)
 }

@@ -2,7 +2,7 @@
 //! docs/formats.md.
 use super::level_arrays;
 use super::npy::{self, NpyArray};
-use crate::scene::{Codebook, LEVEL_NAMES, LanguageField, LevelField};
+use crate::scene::{LEVEL_NAMES, LanguageField, LevelField};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
@@ -42,11 +42,11 @@ pub fn read(splats: &Path, count: usize) -> Result<Option<LanguageField>> {
     if !file.is_file() {
         return Ok(None);
     }
-    let arrays = npy::read_npz(&file)?;
+    let arrays = npy::read_npz_of(&file, count)?;
     let bad = |what: String| Error::input(format!("{}: {what}", file.display()));
     let version = arrays.get("version").and_then(|a| a.to_i32().first().copied()).unwrap_or(0);
     if version < 1 || version > VERSION as i32 {
-        return Err(bad(format!("version {version}; this program reads 1 to {VERSION}")));
+        return Err(bad(format!("version {version}; this program reads 1 to {VERSION}: export it again")));
     }
     let space = arrays.get("space").and_then(NpyArray::as_text).unwrap_or_default().to_owned();
     let mut field = LanguageField { levels: vec![LevelField::default(); LEVEL_NAMES.len()], space };
@@ -56,22 +56,8 @@ pub fn read(splats: &Path, count: usize) -> Result<Option<LanguageField>> {
             arrays.get(&key).ok_or_else(|| bad(format!("no array {key:?}")))
         };
         let Ok(code) = get("code") else { continue };
-        let (clip, weight) = (get("clip")?, get("weight")?);
-        let (&[k, code_dim], &[k2, embedding_dim]) = (&code.shape[..], &clip.shape[..]) else {
-            return Err(bad(format!("the codes of level {name} have no two dimensions")));
-        };
-        if k != k2 || weight.shape != [k] {
-            return Err(bad(format!("the arrays of level {name} do not fit together")));
-        }
-        level.codebook = Codebook {
-            embedding_dim,
-            code_dim,
-            embeddings: clip.to_f32(),
-            codes: code.to_f32(),
-            weights: weight.to_f32(),
-            members: vec![Vec::new(); k],
-            min_chord: get("delta_min")?.to_f32().first().copied().unwrap_or(0.0),
-        };
+        level.codebook = level_arrays::codebook([get("clip")?, code, get("weight")?, get("delta_min")?])
+            .map_err(|e| bad(format!("level {name}: {e}; export it again")))?;
         level_arrays::read(&arrays, name, count, level)
             .map_err(|e| bad(format!("{e}; it belongs to another file of {count} Gaussians")))?;
     }

@@ -1,15 +1,15 @@
 //! nerfstudio `transforms.json`: camera → world in OpenGL axes (x right, y up, z backward).
-use crate::Result;
 use crate::scene::{Camera, Lens, Pose};
+use crate::{Result, files, photo};
 use glam::{DMat3, DVec3};
-use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde::{Deserialize, Deserializer, Serialize};
 use std::path::Path;
 
-/// Intrinsics, at the top of the file or per frame; a frame's own win.
-#[derive(Debug, Default, Clone, Deserialize)]
+/// Intrinsics, at the top of the file or per frame; a frame's own win. The file itself and a frame are one type: flattened
+/// structures would hold all that a file has besides in memory first.
+#[derive(Debug, Default, Deserialize)]
 #[serde(default)]
-struct Intrinsics {
+struct Block {
     fl_x: Option<f64>,
     fl_y: Option<f64>,
     cx: Option<f64>,
@@ -25,38 +25,38 @@ struct Intrinsics {
     k4: f64,
     p1: f64,
     p2: f64,
-}
-
-#[derive(Debug, Deserialize)]
-struct TransformsFrame {
-    #[serde(default)]
+    /// Of a frame.
     file_path: String,
-    transform_matrix: Vec<Vec<f64>>,
-    #[serde(flatten)]
-    own: Intrinsics,
+    #[serde(deserialize_with = "rows")]
+    transform_matrix: Option<[[f64; 4]; 3]>,
+    /// Of the file.
+    frames: Option<Vec<Block>>,
 }
 
-#[derive(Debug, Deserialize)]
-struct File {
-    #[serde(flatten)]
-    shared: Intrinsics,
-    frames: Vec<TransformsFrame>,
+/// The first three rows of a matrix with three or four.
+fn rows<'a, D: Deserializer<'a>>(from: D) -> Result<Option<[[f64; 4]; 3]>, D::Error> {
+    let rows = Vec::<Vec<f64>>::deserialize(from)?;
+    let row = |k: usize| <[f64; 4]>::try_from(rows.get(k)?.as_slice()).ok();
+    let matrix = (|| Some([row(0)?, row(1)?, row(2)?]))();
+    let fits = rows.len() <= 4 && rows.iter().all(|r| r.len() == 4);
+    let matrix = matrix.filter(|_| fits);
+    matrix.map(Some).ok_or_else(|| serde::de::Error::custom("transform_matrix must be 4 × 4"))
 }
 
-/// Cameras of a parsed file; `folder` is where its image paths start, for files that do not state the image size.
-pub(super) fn parse(value: Value, folder: &Path) -> Result<Vec<Camera>, String> {
-    let file: File = serde_json::from_value(value).map_err(|e| format!("not a transforms.json file: {e}"))?;
-    file.frames.iter().enumerate().map(|(i, f)| camera(&file.shared, f, i, folder)).collect()
+/// Cameras of a file's text; `folder` is where its image paths start, for files that do not state the image size.
+pub(super) fn parse(text: &str, folder: &Path) -> Result<Vec<Camera>, String> {
+    let file: Block = files::parse_json(text.as_bytes())
+        .map_err(|e| format!("not a JSON camera file (transforms.json): {e}; check it"))?;
+    let Some(frames) = &file.frames else {
+        return Err(
+            "neither transforms.json (an object with \"frames\") nor cameras.json (a list)".to_string()
+        );
+    };
+    frames.iter().enumerate().map(|(i, f)| camera(&file, f, i, folder)).collect()
 }
 
-fn camera(
-    shared: &Intrinsics,
-    frame: &TransformsFrame,
-    index: usize,
-    folder: &Path,
-) -> Result<Camera, String> {
-    let name = if frame.file_path.is_empty() { format!("{index:05}") } else { frame.file_path.clone() };
-    let own = &frame.own;
+fn camera(shared: &Block, own: &Block, index: usize, folder: &Path) -> Result<Camera, String> {
+    let name = if own.file_path.is_empty() { format!("{index:05}") } else { own.file_path.clone() };
     let model = own.camera_model.as_ref().or(shared.camera_model.as_ref());
     if let Some(m) = model.filter(|m| m.contains("FISHEYE") || m.contains("EQUIRECT")) {
         return Err(format!("frame {name:?}: camera model {m} is not a pinhole; undistort the photos first"));
@@ -72,7 +72,7 @@ fn camera(
             ));
         }
     }
-    let pick = |get: fn(&Intrinsics) -> Option<f64>| get(own).or_else(|| get(shared));
+    let pick = |get: fn(&Block) -> Option<f64>| get(own).or_else(|| get(shared));
     let stated = pick(|i| i.w).zip(pick(|i| i.h));
     let (w, h) = stated.or_else(|| size_of_image(folder, &name)).ok_or_else(|| {
         format!("frame {name:?}: no image size; add \"w\" and \"h\" to the file or keep the images beside it")
@@ -86,8 +86,11 @@ fn camera(
         fy: pick(|i| i.fl_y).unwrap_or(fx),
         cx: pick(|i| i.cx).unwrap_or(w / 2.0),
         cy: pick(|i| i.cy).unwrap_or(h / 2.0),
-        pose: pose(&frame.transform_matrix)
-            .ok_or_else(|| format!("frame {name:?}: transform_matrix must be 4 × 4"))?,
+        pose: own
+            .transform_matrix
+            .as_ref()
+            .map(pose)
+            .ok_or_else(|| format!("frame {name:?}: transform_matrix is missing"))?,
         name,
     }
     .checked()
@@ -96,17 +99,14 @@ fn camera(
 fn size_of_image(folder: &Path, name: &str) -> Option<(f64, f64)> {
     let candidates =
         [folder.join(name), folder.join(format!("{name}.png")), folder.join(format!("{name}.jpg"))];
-    candidates.iter().find_map(|p| image::image_dimensions(p).ok()).map(|(w, h)| (w as f64, h as f64))
+    candidates.iter().find_map(|p| photo::dimensions(p).ok()).map(|(w, h)| (w as f64, h as f64))
 }
 
 /// `T_cw` of a camera → world matrix in OpenGL axes: `T_wc = T_gl · diag(1, −1, −1, 1)`.
-fn pose(rows: &[Vec<f64>]) -> Option<Pose> {
-    if rows.len() < 3 || rows.iter().any(|r| r.len() != 4) {
-        return None;
-    }
+fn pose(rows: &[[f64; 4]; 3]) -> Pose {
     let column = |k: usize| DVec3::new(rows[0][k], rows[1][k], rows[2][k]);
     let to_world = DMat3::from_cols(column(0), -column(1), -column(2));
-    Some(Pose { rotation: to_world, translation: column(3) }.inverse())
+    Pose { rotation: to_world, translation: column(3) }.inverse()
 }
 
 #[derive(Serialize)]

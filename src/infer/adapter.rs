@@ -9,7 +9,8 @@ use serde::Deserialize;
 use super::contract::{Contract, Part, Slot, unify};
 use super::onnx::{Dim, ElementType, Header, Port, listed};
 use super::runtime::Tensor;
-use crate::{Error, Result};
+use crate::scene::MAX_SIDE;
+use crate::{Error, Result, files};
 
 const BUILT_IN: [(&str, &str); 13] = [
     ("clip", include_str!("adapters/clip.toml")),
@@ -50,6 +51,21 @@ pub struct ImageSpec {
 
 fn one() -> usize {
     1
+}
+
+impl ImageSpec {
+    /// Refuses what no image can be prepared by.
+    fn check(&self) -> Result<(), String> {
+        let numbers = self.mean.iter().chain(&self.std).all(|v| v.is_finite());
+        if !numbers || self.std.iter().any(|v| *v <= 0.0) {
+            return Err("image.mean must be finite and image.std positive".to_owned());
+        }
+        let side = 1..=MAX_SIDE as usize;
+        if !side.contains(&self.size) || !side.contains(&self.multiple) {
+            return Err(format!("image.size and image.multiple must be between 1 and {MAX_SIDE} pixels"));
+        }
+        Ok(())
+    }
 }
 
 /// How a photo of another aspect is brought to the input size.
@@ -195,7 +211,7 @@ impl Adapter {
     pub fn of_file(model: &Path) -> Result<Adapter> {
         for path in [model.with_extension("toml"), model.with_file_name("adapter.toml")] {
             if path.is_file() {
-                let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
+                let text = files::read_text(&path)?;
                 return Adapter::parse(&text).map_err(|e| Error::input(format!("{}: {e}", path.display())));
             }
         }
@@ -207,6 +223,7 @@ impl Adapter {
         let mut adapter: Adapter = toml::from_str(text).map_err(one_line)?;
         for graph in &mut adapter.graph {
             graph.family.clone_from(&adapter.family);
+            graph.image.as_ref().map_or(Ok(()), ImageSpec::check)?;
             let contract = graph.part.contract();
             for role in graph.names.keys().chain(graph.layouts.keys()) {
                 contract.slot(role).ok_or_else(|| unknown_role(contract, role))?;

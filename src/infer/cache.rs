@@ -87,7 +87,7 @@ pub(super) fn fingerprint(path: &Path) -> std::io::Result<String> {
     let age = meta.modified()?.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     let stamp = format!("{}:{}:{}", path.canonicalize()?.display(), meta.len(), age.as_nanos());
     let note = folder().join("sums").join(&sha256(stamp.as_bytes())[..16]);
-    if let Ok(known) = std::fs::read_to_string(&note)
+    if let Ok(known) = files::read_text(&note)
         && known.len() == 64
     {
         return Ok(known);

@@ -6,9 +6,9 @@ use std::collections::HashSet;
 use std::fmt;
 use std::fs::File;
 use std::io::{BufReader, Read, Seek};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 
 /// Element type of a tensor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -80,6 +80,11 @@ pub struct Header {
     pub parameters: u64,
 }
 
+/// Most axes of a tensor and outputs of a graph: real ones have some tens. A few bytes in the file take fifty in memory.
+const MOST_PARTS: usize = 1 << 12;
+/// Most weights of a graph, which old files list among the inputs: the largest language models have some thousands.
+const MOST_WEIGHTS: usize = 1 << 17;
+
 /// A field of a protobuf message.
 enum Field {
     Number(u64),
@@ -142,7 +147,7 @@ impl Reader {
         length: u64,
         each: &mut dyn FnMut(&mut Reader, u64, Field) -> Option<()>,
     ) -> Option<()> {
-        let end = self.at + length;
+        let end = self.at.checked_add(length)?;
         while self.at < end {
             let (number, field) = self.field()?;
             let next = match field {
@@ -210,7 +215,7 @@ impl Reader {
                     }
                     Some(())
                 })?;
-                dims.push(dim);
+                (dims.len() < MOST_PARTS).then(|| dims.push(dim))?;
             }
             Some(())
         })?;
@@ -254,10 +259,24 @@ impl Reader {
 
 /// Reads the header of an ONNX file; the error names the file and says what is wrong with it.
 pub fn read(path: &Path) -> Result<Header> {
-    let file = File::open(path).map_err(Error::io(path))?;
-    let size = file.metadata().map_err(Error::io(path))?.len();
+    let (file, size) = files::open(path)?;
     let mut reader = Reader { file: BufReader::new(file), at: 0, size };
     let header = whole(&mut reader, path).filter(|h| !h.inputs.is_empty() && !h.outputs.is_empty());
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let beside = |p: &&PathBuf| {
+        let inside = p.strip_prefix(folder);
+        inside.is_ok_and(|p| p.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir)))
+    };
+    if let Some(other) = header.iter().flat_map(|h| &h.external).find(|p| !beside(p)) {
+        return Err(Error::missing_model(
+            path.display(),
+            format!(
+                "{}: its weights are in {}, outside of its folder; export it again with the weights beside it",
+                path.display(),
+                other.display()
+            ),
+        ));
+    }
     header.ok_or_else(|| {
         let at = reader.file.stream_position().unwrap_or_default();
         Error::missing_model(path.display(), format!(
@@ -278,12 +297,17 @@ fn whole(reader: &mut Reader, path: &Path) -> Option<Header> {
                 match (number, field) {
                     (5, Field::Bytes(n)) => {
                         let (name, values, place) = r.weight(n)?;
-                        header.parameters += values;
+                        header.parameters = header.parameters.saturating_add(values);
                         places.extend(place);
-                        weights.insert(name);
+                        (weights.len() < MOST_WEIGHTS).then(|| weights.insert(name))?;
                     }
-                    (11, Field::Bytes(n)) => header.inputs.push(r.port(n)?),
-                    (12, Field::Bytes(n)) => header.outputs.push(r.port(n)?),
+                    (11, Field::Bytes(n)) if header.inputs.len() < MOST_WEIGHTS => {
+                        header.inputs.push(r.port(n)?);
+                    }
+                    (12, Field::Bytes(n)) if header.outputs.len() < MOST_PARTS => {
+                        header.outputs.push(r.port(n)?);
+                    }
+                    (11 | 12, _) => return None,
                     _ => {}
                 }
                 Some(())

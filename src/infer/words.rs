@@ -23,7 +23,7 @@ use super::registry::{PackFileKind, Registry};
 use super::text::{self, TextEncoder, normalise};
 use super::{RegionEncoder, colour, nearest, things};
 use crate::scene::{Plane, RgbImage};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use rayon::prelude::*;
 
 const MEANING_AT: usize = 0;
@@ -207,7 +207,7 @@ fn region_colours(image: &RgbImage, labels: &Plane<i32>, count: usize) -> Vec<Op
 impl Vocabulary {
     fn load(registry: &Registry) -> Result<Self> {
         let file = registry.path(PackFileKind::Classes)?;
-        let table = std::fs::read_to_string(&file).map_err(Error::io(&file))?;
+        let table = files::read_text(&file)?;
         // The first of a class's names: "lemon"; the rest are synonyms and Latin.
         let first = |line: &str| line.split(['\t', ',']).next().unwrap_or_default().to_string();
         let list: Vec<String> = table.lines().map(first).collect();

@@ -46,6 +46,37 @@ pub fn read_view(dir: &Path, photo: &Photo, with_features: bool) -> Result<ViewM
     Ok(out)
 }
 
+/// Reads the photos of a folder one after the other: features of all have one length.
+pub struct DirMasks<'a> {
+    dir: &'a Path,
+    with_features: bool,
+    /// The first length and the photo that has it.
+    first: Option<(usize, String)>,
+}
+
+impl<'a> DirMasks<'a> {
+    /// Nothing is read yet.
+    pub fn new(dir: &'a Path, with_features: bool) -> Self {
+        DirMasks { dir, with_features, first: None }
+    }
+
+    /// [`read_view`] of the next photo; refuses features of another length than the others'.
+    pub fn read(&mut self, photo: &Photo) -> Result<ViewMasks> {
+        let view = read_view(self.dir, photo, self.with_features)?;
+        let found = view.levels.iter().find_map(|l| l.features.len().checked_div(l.quality.len()));
+        if let Some(dim) = found.filter(|_| self.with_features) {
+            let (first, stem) = self.first.get_or_insert_with(|| (dim, photo.stem.clone()));
+            if *first != dim {
+                return Err(Error::input(format!(
+                    "{}: features of length {dim}, those of {stem}_f.npy have {first}; make all with one network",
+                    self.dir.join(format!("{}_f.npy", photo.stem)).display()
+                )));
+            }
+        }
+        Ok(view)
+    }
+}
+
 /// The last three maps of the file as row indices: (levels, H, W).
 fn read_labels(path: &Path, photo: &Photo) -> Result<(Vec<Vec<i32>>, usize, usize)> {
     if !path.exists() {
@@ -197,6 +228,12 @@ impl TextEmbeddings {
                     out.dim
                 )));
             }
+            if vector.iter().any(|v| !v.is_finite()) {
+                return Err(Error::input(format!(
+                    "{}: '{phrase}' holds values that are not finite; make its embedding again",
+                    path.display()
+                )));
+            }
             normalise_rows(&mut vector, out.dim);
             out.entries.insert(key(&phrase), vector);
         }
@@ -304,6 +341,28 @@ mod tests {
         // masks made at the original size follow the photo's resize
         let half = read_view(dir.path(), &photo(12, 8, (16, 10)), false).unwrap();
         assert_eq!((half.levels[0].labels.at(5, 4), half.levels[0].labels.at(6, 4)), (0, 1));
+    }
+
+    #[test]
+    fn features_of_all_photos_have_one_length_and_finite_numbers() {
+        let dir = tempfile::tempdir().unwrap();
+        write_case(dir.path(), 16, 10);
+        for kind in ["s", "f"] {
+            std::fs::copy(dir.path().join(format!("a_{kind}.npy")), dir.path().join(format!("b_{kind}.npy")))
+                .unwrap();
+        }
+        let other = Photo { stem: "b".into(), ..photo(16, 10, (16, 10)) };
+        let both = || {
+            let mut masks = DirMasks::new(dir.path(), true);
+            masks.read(&photo(16, 10, (16, 10))).and_then(|_| masks.read(&other)).map_err(|e| e.to_string())
+        };
+        assert!(both().is_ok());
+        npy::write(dir.path().join("b_f.npy"), &NpyArray::f32(&[6, 4], vec![1.0; 24])).unwrap();
+        let e = both().unwrap_err();
+        assert!(e.contains("b_f.npy: features of length 4, those of a_f.npy have 3"), "{e}");
+        let table = dir.path().join("text_embeddings.npz");
+        npy::write_npz(&table, &[("mug", &NpyArray::f32(&[2], vec![1.0, f32::NAN]))]).unwrap();
+        assert!(TextEmbeddings::read(&table).unwrap_err().to_string().contains("'mug' holds values"));
     }
 
     #[test]

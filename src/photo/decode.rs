@@ -1,9 +1,9 @@
 //! Bytes of an image file to upright pixels.
 use super::exif_tags::{Lens, lens};
 use super::heif;
-use super::kind::{FileKind, LARGEST_DECODED, READ, TOO_LARGE, kind};
+use super::kind::{FileKind, LARGEST_DECODED, READ, TOO_LARGE, check_pixels, kind};
 use crate::scene::to_srgb;
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits};
 use std::io::Cursor;
@@ -115,6 +115,16 @@ pub(super) fn decode(bytes: Vec<u8>, path: &Path) -> Result<Decoded> {
     }
 }
 
+/// Stored pixels of an image file that holds no photo but labels: as they are, in the file's own orientation.
+pub fn stored_pixels(path: &Path) -> Result<DynamicImage> {
+    let bytes = files::read(path)?;
+    let named = |what: &str| Error::input(format!("{}: {what}", path.display()));
+    match kind(&bytes, path) {
+        FileKind::Image(format) => coded(bytes, format).map(|d| d.pixels).map_err(|what| named(&what)),
+        _ => Err(named("cannot be read as an image; give a PNG")),
+    }
+}
+
 /// A file that the `image` crate reads; the error is one line without the file's name.
 fn coded(bytes: Vec<u8>, format: ImageFormat) -> Result<Decoded, String> {
     if format == ImageFormat::Jpeg && !jpeg_is_complete(&bytes) {
@@ -128,6 +138,7 @@ fn coded(bytes: Vec<u8>, format: ImageFormat) -> Result<Decoded, String> {
     reader.limits(limits);
     let mut decoder = reader.into_decoder().map_err(reason)?;
     let size = decoder.dimensions();
+    check_pixels(size.0.into(), size.1.into())?;
     // Damaged metadata must not cost the photo: it only loses the focal length and the orientation.
     let lens = match (&tiff, decoder.exif_metadata()) {
         (Some(tags), _) => tags.lens(size),
@@ -246,6 +257,25 @@ mod tests {
         let alpha = image::RgbaImage::from_pixel(2, 2, image::Rgba([255, 51, 0, 51]));
         let c = decode(png(&alpha.into(), None), p).unwrap().at(0, 0);
         assert!((c[0] - 0.2).abs() < 1e-6 && (c[1] - 0.04).abs() < 1e-6 && c[2] == 0.0, "on black: {c:?}");
+    }
+
+    #[test]
+    fn the_size_is_checked_before_anything_is_decoded() {
+        let small = png(&image::GrayImage::new(2, 2).into(), None);
+        let with_size = |w: u32, h: u32| {
+            let mut bytes = small.clone();
+            bytes[16..20].copy_from_slice(&w.to_be_bytes());
+            bytes[20..24].copy_from_slice(&h.to_be_bytes());
+            let mut sum = flate2::Crc::new();
+            sum.update(&bytes[12..29]);
+            bytes[29..33].copy_from_slice(&sum.sum().to_be_bytes());
+            decode(bytes, Path::new("a.png")).err().unwrap().to_string()
+        };
+        let e = with_size(20_000, 20_000);
+        assert!(e.contains("a.png: 20000 × 20000 pixels are more than the 200 million"), "{e}");
+        // 108 megapixels are none too many: here only the pixels are missing.
+        let e = with_size(12_000, 9_000);
+        assert!(!e.contains("million"), "{e}");
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! HEIC, HEIF and AVIF through libheif's C interface, loaded at run time: its HEVC decoders are under the LGPL and
 //! patents, so splatvk runs without it and never links it. The signatures are those of libheif 1.12 (2021), unchanged since.
-use super::kind::{LARGEST_DECODED, TOO_LARGE};
+use super::kind::{LARGEST_DECODED, TOO_LARGE, check_pixels};
 use super::support::Support;
 use image::{DynamicImage, ImageBuffer};
 use libloading::Library;
@@ -238,6 +238,7 @@ impl HeifLayout {
             )
         };
         let shape = HeifLayout { deep: bits > 8, alpha };
+        check_pixels(w.max(0) as u64, h.max(0) as u64).map_err(Failure::Input)?;
         let bytes = w.max(0) as u64 * h.max(0) as u64 * (3 + u64::from(alpha)) * (1 + u64::from(shape.deep));
         match bytes {
             0 => Err(Failure::Input("the image is damaged (no pixels); copy the photo again".to_owned())),

@@ -1,4 +1,5 @@
 //! What kind of file it is, by its first bytes or its name, and what to do with the kinds that are not read.
+use crate::scene::MAX_PIXELS;
 use image::ImageFormat;
 use std::path::Path;
 
@@ -17,6 +18,17 @@ pub(super) const READ: &str = "JPEG, PNG, HEIC, AVIF, WebP or TIFF";
 /// Most memory a decoded file may take: four times the largest photo that phones write (200 megapixels, 8 bit).
 pub(super) const LARGEST_DECODED: u64 = 2 << 30;
 pub(super) const TOO_LARGE: &str = "the image needs more than 2 GiB of memory; make it smaller";
+
+/// Refuses images of more than [`MAX_PIXELS`]: a few bytes can state any size.
+pub(super) fn check_pixels(w: u64, h: u64) -> Result<(), String> {
+    match w.saturating_mul(h) <= MAX_PIXELS {
+        true => Ok(()),
+        false => Err(format!(
+            "{w} × {h} pixels are more than the {} million that are read; make it smaller",
+            MAX_PIXELS / 1_000_000
+        )),
+    }
+}
 
 const RAW_ADVICE: &str = "is a camera raw file; develop it to JPEG or 16-bit TIFF";
 const GIF: &str = "is a GIF; save its frames as PNG";

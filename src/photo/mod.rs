@@ -18,6 +18,7 @@ mod video;
 pub use border::PlainBorder;
 pub use candidate::{Candidate, gather};
 pub use choose::{DEFAULT_VIEWS, FoundFiles, MAX_VIEWS, find, photo_count, spread};
+pub use decode::stored_pixels;
 pub use kind::stem;
 pub use light::Light;
 pub use read::{
@@ -25,7 +26,7 @@ pub use read::{
     working_size,
 };
 pub use resize::Kernel;
-pub use sizes::sizes_of;
+pub use sizes::{dimensions, sizes_of};
 pub use straighten::Straightening;
 pub use superpixels::superpixels;
 pub use support::Support;

@@ -5,7 +5,7 @@ use super::light::Light;
 use super::straighten::Straightening;
 use super::{decode, resize};
 use crate::scene::{Affine, Camera, Lens, Plane, RgbImage};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -109,9 +109,7 @@ pub fn load_at(path: &Path, max_size: usize) -> Result<Photo> {
 }
 
 pub(super) fn read(path: &Path) -> Result<Vec<u8>> {
-    std::fs::read(path).map_err(|e| {
-        Error::input(format!("{}: {e}; check the name and that you may read it", path.display()))
-    })
+    files::read(path).map_err(|e| Error::input(e.to_string()))
 }
 
 /// [`load_at`] of an image file that is in memory already; `name` stands for its path.

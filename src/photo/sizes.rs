@@ -1,7 +1,9 @@
 //! Sizes of photos before they are decoded: what memory a run needs, and how many files may be decoded at once.
 use super::candidate::Candidate;
+use crate::{Error, Result, files};
 use image::metadata::Orientation;
 use image::{ImageDecoder, ImageReader};
+use std::io::BufReader;
 use std::ops::Range;
 use std::path::Path;
 
@@ -20,8 +22,16 @@ pub fn sizes_of(candidates: &[Candidate]) -> Vec<(usize, usize)> {
     candidates.iter().map(|c| size_of_file(&c.path).unwrap_or(ASSUMED)).collect()
 }
 
+/// Stored (width, height) of an image file, by its header; orientation is not applied.
+pub fn dimensions(path: &Path) -> Result<(u32, u32)> {
+    let read = ImageReader::new(BufReader::new(files::open(path)?.0)).with_guessed_format();
+    let size = read.map_err(image::ImageError::IoError).and_then(ImageReader::into_dimensions);
+    size.map_err(|e| Error::input(format!("{}: cannot be read as an image: {e}", path.display())))
+}
+
 fn size_of_file(path: &Path) -> Option<(usize, usize)> {
-    let mut decoder = ImageReader::open(path).ok()?.with_guessed_format().ok()?.into_decoder().ok()?;
+    let file = BufReader::new(files::open(path).ok()?.0);
+    let mut decoder = ImageReader::new(file).with_guessed_format().ok()?.into_decoder().ok()?;
     let (w, h) = decoder.dimensions();
     let sideways = matches!(
         decoder.orientation().unwrap_or(Orientation::NoTransforms),

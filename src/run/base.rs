@@ -25,8 +25,10 @@ impl Settings {
         let bad = |what: String| {
             Error::input(format!("{file}: {what}; --add takes a scene that splatvk run wrote"))
         };
-        let bytes = std::fs::read(&path).map_err(|e| bad(e.to_string()))?;
-        let record: Value = serde_json::from_slice(&bytes).map_err(|e| bad(e.to_string()))?;
+        if !path.is_file() {
+            return Err(bad("missing".to_owned()));
+        }
+        let record: Value = files::read_json(&path, "--add takes a scene that splatvk run wrote")?;
         let settings = Settings { file, record };
         match settings.text("method") {
             Some("sparselgs" | "lift") => Ok(settings),

@@ -4,7 +4,7 @@ use super::method::Method;
 use crate::language::Reducer;
 use crate::language::align::{AlignOptions, AreaScore};
 use crate::query::{MaskRule, QueryOptions};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use serde::Serialize;
 use serde_json::Value;
 use std::path::Path;
@@ -94,7 +94,7 @@ impl Compat {
 
     /// What a scene was made with; `None` also for files that no run made.
     pub fn of_scene(scene: &Path) -> Option<&'static Compat> {
-        let record: Value = serde_json::from_slice(&std::fs::read(scene.join("run.json")).ok()?).ok()?;
+        let record: Value = files::read_json(&scene.join("run.json"), "").ok()?;
         Compat::named(record["config"]["plan"]["compat"].as_str()?).ok().flatten()
     }
 

@@ -127,11 +127,11 @@ impl LiveScene {
             SceneOrigin::Loaded(s) => &s.world,
         }
     }
-    /// What the run was warned of; none for a loaded scene.
+    /// What the run was warned of, or what was left out of a file of Gaussians.
     pub fn warnings(&self) -> &[String] {
         match &self.origin {
             SceneOrigin::Trained(o) => &o.warnings,
-            SceneOrigin::Loaded(_) => &[],
+            SceneOrigin::Loaded(s) => &s.warnings,
         }
     }
     /// Where [`LiveScene::draw_bands`] renders the features of a level; `None` without codes.

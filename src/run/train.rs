@@ -109,7 +109,9 @@ fn with_footprints(mut cloud: PointCloud, list: &[Camera]) -> Result<PointCloud>
                 pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < c.width as f64 && pixel.y < c.height as f64;
             (z > 0.0 && inside).then_some((v, (z / c.fx) as f32))
         });
-        if let Some((view, radius)) = seen.min_by(|a, b| a.1.total_cmp(&b.1)) {
+        // Positions that are not finite are in no image; a colour that is not would spread in training.
+        let coloured = cloud.colours[i].iter().all(|c| c.is_finite());
+        if let Some((view, radius)) = seen.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|_| coloured) {
             keep.positions.push(cloud.positions[i]);
             keep.colours.push(cloud.colours[i]);
             keep.confidence.push(cloud.confidence[i]);
@@ -120,7 +122,7 @@ fn with_footprints(mut cloud: PointCloud, list: &[Camera]) -> Result<PointCloud>
     std::mem::swap(&mut cloud, &mut keep);
     if cloud.is_empty() {
         return Err(Error::input(
-            "--points: no point is seen by any camera; are both in the same coordinates?",
+            "--points: no point with a colour is seen by any camera; are both in the same coordinates?",
         ));
     }
     Ok(cloud)

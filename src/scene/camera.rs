@@ -66,6 +66,15 @@ fn skew(v: DVec3) -> DMat3 {
     DMat3::from_cols(DVec3::new(0.0, v.z, -v.y), DVec3::new(-v.z, 0.0, v.x), DVec3::new(v.y, -v.x, 0.0))
 }
 
+/// Longest side of a camera's image, pixels: photos of 200 megapixels have 16,320.
+pub const MAX_SIDE: u32 = 16_384;
+/// Most pixels of an image: the largest photos that phones take.
+pub const MAX_PIXELS: u64 = 200_000_000;
+/// Bytes of a camera's name after its folders: file systems take 255 with what is appended ("_relevancy.npy").
+const LONGEST_NAME: usize = 200;
+/// Bytes of a camera's name with its folders, as Linux takes them.
+const LONGEST_PATH: usize = 4096;
+
 /// A pinhole camera without distortion. Pixel units; the centre of the first pixel is (0.5, 0.5).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
@@ -88,9 +97,20 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// Refuses what no pinhole camera can be.
+    /// Refuses what no pinhole camera can be, and what nothing can be written for: images beyond [`MAX_SIDE`] and
+    /// [`MAX_PIXELS`], names that are no names of files.
     pub fn checked(self) -> Result<Camera, String> {
         let c = self;
+        c.check_name()?;
+        if c.width.max(c.height) > MAX_SIDE || u64::from(c.width) * u64::from(c.height) > MAX_PIXELS {
+            return Err(format!(
+                "camera {:?}: {} × {} pixels are too many; at most {MAX_SIDE} a side and {} million in all",
+                c.name,
+                c.width,
+                c.height,
+                MAX_PIXELS / 1_000_000
+            ));
+        }
         let finite =
             [c.fx, c.fy, c.cx, c.cy].iter().chain(&c.pose.rotation.to_cols_array()).all(|v| v.is_finite())
                 && c.pose.translation.is_finite();
@@ -109,6 +129,20 @@ impl Camera {
         }
         let pose = if off > 1e-12 { c.pose.orthonormalised() } else { c.pose };
         Ok(Camera { pose, ..c })
+    }
+    fn check_name(&self) -> Result<(), String> {
+        let file = self.name.rsplit(['/', '\\']).next().unwrap_or_default();
+        if file.len() > LONGEST_NAME || self.name.len() > LONGEST_PATH {
+            let start: String = self.name.chars().take(40).collect();
+            return Err(format!(
+                "camera {start:?}…: a name of {} bytes is too long ({LONGEST_NAME} at most); rename it",
+                file.len()
+            ));
+        }
+        match self.name.chars().any(char::is_control) {
+            true => Err(format!("camera {:?}: a control character is in its name; rename it", self.name)),
+            false => Ok(()),
+        }
     }
     /// Pixel position of a world point and its depth; the depth may be ≤ 0 (behind the camera).
     pub fn project(&self, world: DVec3) -> (DVec2, f64) {
@@ -154,6 +188,22 @@ mod tests {
             let twice = half.compose(&half);
             assert!((twice.translation - p.translation).length() < 1e-12 * (1.0 + scale));
         }
+    }
+
+    #[test]
+    fn what_nothing_can_be_written_for_is_refused() {
+        let camera = |name: &str, width, height| {
+            let pose = Pose::IDENTITY;
+            Camera { name: name.into(), width, height, fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, pose }.checked()
+        };
+        assert!(camera("a/b c.jpg", 16_320, 12_240).is_ok());
+        assert!(camera(&format!("{}/{}", "f".repeat(300), "x".repeat(200)), 9, 9).is_ok());
+        for name in ["a\0b", "a\nb", "\u{1b}[31m", &"x".repeat(201), &"f/".repeat(3000)] {
+            let e = camera(name, 9, 9).unwrap_err();
+            assert!(e.contains("rename it") && e.len() < 250, "{e}");
+        }
+        assert!(camera("a", 1_000_000, 4).unwrap_err().contains("too many"));
+        assert!(camera("a", 16_000, 16_000).unwrap_err().contains("200 million"));
     }
 
     #[test]

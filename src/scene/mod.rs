@@ -20,7 +20,7 @@ mod warp;
 mod world;
 
 pub use affine::Affine;
-pub use camera::{Camera, Pose};
+pub use camera::{Camera, MAX_PIXELS, MAX_SIDE, Pose};
 pub use code_mix::CodeMix;
 pub use image::{DepthMap, Plane, RgbImage};
 pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId};

@@ -27,6 +27,17 @@ pub struct Splats {
 }
 
 impl Splats {
+    /// No Gaussians of an SH degree, and room for `n`.
+    pub fn with_capacity(n: usize, sh_degree: u32) -> Splats {
+        Splats {
+            means: Vec::with_capacity(n),
+            log_scales: Vec::with_capacity(n),
+            quats: Vec::with_capacity(n),
+            opacity_logits: Vec::with_capacity(n),
+            sh_degree,
+            sh: Vec::with_capacity(3 * sh_coefficients(sh_degree) * n),
+        }
+    }
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.means.len()

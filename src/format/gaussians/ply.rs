@@ -2,22 +2,22 @@
 //! (docs/method.md#gaussian-ply).
 use super::ply_packed;
 use super::ply_table::{PropertyType, Table, header, open, table};
+use super::usable;
 use crate::scene::{LanguageField, LevelField, PointCloud, Splats, sh_coefficients};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use std::fmt::Write as _;
 use std::path::Path;
 
 /// Reads Gaussians in the INRIA layout, of any SH degree 0–3; unknown columns are skipped. ASCII or binary. Compressed
 /// files as SuperSplat writes them are understood, too.
 pub fn read_splats(path: &Path) -> Result<Splats> {
-    let bytes = std::fs::read(path).map_err(Error::io(path))?;
-    let parse = || {
+    let parse = |bytes: Vec<u8>| {
         if ply_packed::is_packed(&header(&bytes, "vertex")?.columns) {
             return ply_packed::parse(&bytes);
         }
-        gaussians(&table(&bytes)?)
+        gaussians(&table(bytes)?)
     };
-    parse().map_err(|what| Error::input(format!("{}: {what}", path.display())))
+    parse(files::read(path)?).map_err(|what| Error::input(format!("{}: {what}", path.display())))
 }
 
 fn gaussians(t: &Table) -> Result<Splats, String> {
@@ -32,7 +32,7 @@ fn gaussians(t: &Table) -> Result<Splats, String> {
         .find(|&d| 3 * (sh_coefficients(d) - 1) == rest.len())
         .ok_or_else(|| format!("{} f_rest columns fit no SH degree 0–3 (0, 9, 24 or 45)", rest.len()))?;
     let per_channel = rest.len() / 3;
-    let mut s = Splats { sh_degree, ..Splats::default() };
+    let mut s = Splats::with_capacity(t.rows, sh_degree);
     for r in 0..t.rows {
         s.means.push(position.map(|c| t.at(r, c)));
         s.log_scales.push(scale.map(|c| t.at(r, c)));
@@ -89,6 +89,7 @@ impl Default for PlyOptions<'_> {
 /// Writes Gaussians in the INRIA layout, binary little-endian.
 pub fn write_splats(path: &Path, s: &Splats, options: PlyOptions) -> Result<()> {
     use std::io::Write as _;
+    usable::check_written(s)?;
     let levels = options.language.map(|l| named_levels(l, s.len())).transpose()?.unwrap_or_default();
     let rest = sh_coefficients(options.degree) - 1;
     let file = std::fs::File::create(path).map_err(Error::unwritable(path))?;

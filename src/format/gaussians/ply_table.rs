@@ -1,5 +1,5 @@
 //! Elements of PLY files as tables.
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use std::path::Path;
 
 /// A column of a PLY element.
@@ -62,16 +62,34 @@ impl PropertyType {
 pub(super) struct Table {
     pub rows: usize,
     pub columns: Vec<(String, PropertyType)>,
-    /// [rows, columns]
-    values: Vec<f32>,
+    cells: Cells,
 }
+
+enum Cells {
+    /// [rows, columns], parsed from text.
+    Parsed(Vec<f32>),
+    /// The file, read value by value: columns of bytes would take four times as much as floats.
+    Stored { bytes: Vec<u8>, first: usize, offsets: Vec<usize>, width: usize, little: bool },
+}
+
+/// Most columns of an element. Names of 4,096 take no time to look through; Gaussians with features have some hundreds.
+const MOST_COLUMNS: usize = 4096;
+
+/// Most bytes before the values: those of 4,096 columns with long names.
+const LONGEST_HEADER: usize = 1 << 20;
 
 impl Table {
     fn column(&self, name: &str) -> Option<usize> {
         self.columns.iter().position(|c| c.0 == name)
     }
     pub fn at(&self, row: usize, column: usize) -> f32 {
-        self.values[row * self.columns.len() + column]
+        match &self.cells {
+            Cells::Parsed(values) => values[row * self.columns.len() + column],
+            Cells::Stored { bytes, first, offsets, width, little } => {
+                let (at, kind) = (first + row * width + offsets[column], self.columns[column].1);
+                kind.value(&bytes[at..at + kind.size()], *little) as f32
+            }
+        }
     }
     /// Column numbers of all the names, or the first name that is missing.
     pub fn all<const N: usize>(&self, names: [&str; N]) -> Result<[usize; N], String> {
@@ -104,7 +122,8 @@ pub(super) fn header(bytes: &[u8], wanted: &str) -> Result<Header, String> {
         return Err("not a PLY file (it does not start with \"ply\")".into());
     }
     let mark = b"end_header";
-    let end = bytes.windows(mark.len()).position(|w| w == mark).ok_or("the header has no end_header line")?;
+    let start = &bytes[..bytes.len().min(LONGEST_HEADER)];
+    let end = start.windows(mark.len()).position(|w| w == mark).ok_or("the header has no end_header line")?;
     let body =
         end + bytes[end..].iter().position(|&b| b == b'\n').ok_or("the file ends with its header")? + 1;
     let text = String::from_utf8_lossy(&bytes[..end]);
@@ -128,7 +147,8 @@ pub(super) fn header(bytes: &[u8], wanted: &str) -> Result<Header, String> {
                     (h.rows, h.columns, found) = (done.1, done.2, true);
                 } else if !found {
                     let width: usize = done.2.iter().map(|c: &(String, PropertyType)| c.1.size()).sum();
-                    h.skip += done.1.saturating_mul(if h.ascii { 1 } else { width });
+                    let own = done.1.saturating_mul(if h.ascii { 1 } else { width });
+                    h.skip = h.skip.saturating_add(own);
                 }
             }
             ["property", "list", ..] if !found && element.0 != "face" => {
@@ -137,6 +157,9 @@ pub(super) fn header(bytes: &[u8], wanted: &str) -> Result<Header, String> {
             ["property", kind, name] => {
                 let kind =
                     PropertyType::parse(kind).ok_or_else(|| format!("unknown property type {kind:?}"))?;
+                if element.2.len() == MOST_COLUMNS {
+                    return Err(format!("element {} has more than {MOST_COLUMNS} properties", element.0));
+                }
                 element.2.push((name.to_string(), kind));
             }
             _ => {}
@@ -191,56 +214,67 @@ pub(super) fn rows<'a>(bytes: &'a [u8], element: &str) -> Result<Rows<'a>, Strin
     if h.ascii {
         return Err("an ASCII file cannot hold packed columns".into());
     }
-    let mut width = 0;
-    let mut offsets = Vec::with_capacity(h.columns.len());
-    for (_, kind) in &h.columns {
-        offsets.push(width);
-        width += kind.size();
-    }
-    let end = h.rows.checked_mul(width).and_then(|n| n.checked_add(h.skip)).unwrap_or(usize::MAX);
-    let body = bytes.get(h.body..).unwrap_or_default();
-    let rows = body.get(h.skip..end).ok_or("the file ends early; copy it again")?;
-    Ok(Rows { columns: h.columns, offsets, width, little: h.little, bytes: rows })
+    let (offsets, width) = layout(&h.columns);
+    let (first, end) = place(&h, width, bytes.len())?;
+    Ok(Rows { columns: h.columns, offsets, width, little: h.little, bytes: &bytes[first..end] })
 }
 
-pub(super) fn table(bytes: &[u8]) -> Result<Table, String> {
-    let h = header(bytes, "vertex")?;
-    let (width, wide) = (h.columns.iter().map(|c| c.1.size()).sum::<usize>(), h.columns.len());
-    let body = bytes.get(h.body..).unwrap_or_default();
-    let mut values = Vec::new();
-    if h.ascii {
-        let text = std::str::from_utf8(body).map_err(|_| "the ASCII body is not text".to_string())?;
-        for line in text.lines().skip(h.skip).take(h.rows) {
-            let before = values.len();
-            for word in line.split_whitespace().take(wide) {
-                values.push(word.parse::<f32>().map_err(|_| format!("{word:?} is not a number"))?);
-            }
-            if values.len() - before != wide {
-                return Err(format!("row {} has fewer than {wide} values", before / wide.max(1)));
-            }
-        }
+/// Where the columns of a row begin, and its bytes.
+fn layout(columns: &[(String, PropertyType)]) -> (Vec<usize>, usize) {
+    let mut width = 0;
+    let mut next = |(_, kind): &(String, PropertyType)| {
+        width += kind.size();
+        width - kind.size()
+    };
+    let offsets = columns.iter().map(&mut next).collect();
+    (offsets, width)
+}
+
+/// First byte of the rows and the first after them. Checked before anything is allocated: the counts come from the file.
+fn place(h: &Header, width: usize, size: usize) -> Result<(usize, usize), String> {
+    let first = h.body.checked_add(h.skip);
+    let end = first.and_then(|first| h.rows.checked_mul(width)?.checked_add(first));
+    match (first, end) {
+        (Some(first), Some(end)) if end <= size => Ok((first, end)),
+        _ => Err(format!(
+            "{} rows of {width} bytes are announced but the file ends early; copy it again",
+            h.rows
+        )),
+    }
+}
+
+pub(super) fn table(bytes: Vec<u8>) -> Result<Table, String> {
+    let h = header(&bytes, "vertex")?;
+    let cells = if h.ascii {
+        Cells::Parsed(parsed(&h, bytes.get(h.body..).unwrap_or_default())?)
     } else {
-        // Sizes are checked before anything is allocated: the counts come from the file.
-        let end = h.rows.checked_mul(width).and_then(|n| n.checked_add(h.skip)).unwrap_or(usize::MAX);
-        let rows = body.get(h.skip..end).ok_or_else(|| {
-            format!("{} rows of {width} bytes are announced but the file ends early; copy it again", h.rows)
-        })?;
-        values.reserve_exact(h.rows * wide);
-        for row in rows.chunks_exact(width.max(1)) {
-            let mut at = 0;
-            for (_, kind) in &h.columns {
-                values.push(kind.value(&row[at..at + kind.size()], h.little) as f32);
-                at += kind.size();
-            }
+        let (offsets, width) = layout(&h.columns);
+        let (first, _) = place(&h, width, bytes.len())?;
+        Cells::Stored { bytes, first, offsets, width, little: h.little }
+    };
+    Ok(Table { rows: h.rows, columns: h.columns, cells })
+}
+
+/// The rows of a text file.
+fn parsed(h: &Header, body: &[u8]) -> Result<Vec<f32>, String> {
+    let wide = h.columns.len();
+    let text = std::str::from_utf8(body).map_err(|_| "the ASCII body is not text".to_string())?;
+    let early = || format!("{} rows are announced but the file ends early; copy it again", h.rows);
+    // A value takes two bytes at least, with the blank after it.
+    let count = h.rows.checked_mul(wide).filter(|n| *n <= body.len().div_ceil(2)).ok_or_else(early)?;
+    let mut values = Vec::with_capacity(count);
+    for (row, line) in text.lines().skip(h.skip).take(h.rows).enumerate() {
+        let before = values.len();
+        for word in line.split_whitespace().take(wide) {
+            values.push(word.parse::<f32>().map_err(|_| format!("{word:?} is not a number (row {row})"))?);
+        }
+        if values.len() - before != wide {
+            return Err(format!("row {row} has fewer than {wide} values"));
         }
     }
-    if values.len() != h.rows * wide {
-        return Err(format!("{} rows are announced but the file ends early; copy it again", h.rows));
-    }
-    Ok(Table { rows: h.rows, columns: h.columns, values })
+    if values.len() == count { Ok(values) } else { Err(early()) }
 }
 
 pub(super) fn open(path: &Path) -> Result<Table> {
-    let bytes = std::fs::read(path).map_err(Error::io(path))?;
-    table(&bytes).map_err(|e| Error::input(format!("{}: {e}", path.display())))
+    table(files::read(path)?).map_err(|e| Error::input(format!("{}: {e}", path.display())))
 }

@@ -1,6 +1,7 @@
 //! `.splat`: 32 bytes a Gaussian, for web viewers. Only the base colour survives.
+use super::usable;
 use crate::scene::Splats;
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use std::path::Path;
 
 /// Largest base colour that a byte holds.
@@ -11,7 +12,7 @@ const ROW: usize = 32;
 
 /// Reads a file: SH of degree 0, rotations as precise as a byte.
 pub fn read_splats(path: &Path) -> Result<Splats> {
-    let bytes = std::fs::read(path).map_err(Error::io(path))?;
+    let bytes = files::read(path)?;
     if !bytes.len().is_multiple_of(ROW) {
         return Err(Error::input(format!(
             "{}: {} bytes are no whole number of {ROW}-byte Gaussians; not a .splat file, or cut off",
@@ -19,23 +20,16 @@ pub fn read_splats(path: &Path) -> Result<Splats> {
             bytes.len()
         )));
     }
-    let mut s = Splats::default();
+    let mut s = Splats::with_capacity(bytes.len() / ROW, 0);
     for row in bytes.chunks_exact(ROW) {
         let float =
             |k: usize| f32::from_le_bytes([row[4 * k], row[4 * k + 1], row[4 * k + 2], row[4 * k + 3]]);
         let share = |k: usize| f32::from(row[24 + k]) / 255.0;
         s.means.push([0, 1, 2].map(float));
-        // A flat Gaussian has a scale of 0, of which there is no logarithm.
-        s.log_scales.push([3, 4, 5].map(|k| float(k).max(f32::MIN_POSITIVE).ln()));
+        s.log_scales.push([3, 4, 5].map(|k| float(k).ln()));
         s.sh.extend([0, 1, 2].map(|k| (share(k) - 0.5) / crate::scene::SH_C0));
         s.opacity_logits.push(crate::format::logit(share(3)));
         s.quats.push([4, 5, 6, 7].map(|k| (f32::from(row[24 + k]) - 128.0) / 128.0));
-    }
-    if s.means.iter().chain(&s.log_scales).flatten().any(|v| !v.is_finite()) {
-        return Err(Error::input(format!(
-            "{}: not a .splat file (it holds no finite numbers)",
-            path.display()
-        )));
     }
     Ok(s)
 }
@@ -44,6 +38,7 @@ pub fn read_splats(path: &Path) -> Result<Splats> {
 /// (w, x, y, z as `128 q + 128`), the most visible splats first, as progressive viewers expect: row r of the file is
 /// number `order[r]` of the scene.
 pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
+    usable::check_written(s)?;
     let alpha = |i: usize| crate::format::sigmoid(s.opacity_logits[i]);
     let volume = |i: usize| s.log_scales[i].iter().sum::<f32>().exp();
     let mut order: Vec<(f32, usize)> = (0..s.len()).map(|i| (alpha(i) * volume(i), i)).collect();

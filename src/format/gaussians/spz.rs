@@ -3,8 +3,9 @@
 //!
 //! The format's axes are right, up, back; files are turned by 180° about x on the way in and out. Positions are 24-bit
 //! fixed point with as many fractional bits as their extent leaves room for (the format's own tools take 12).
+use super::usable;
 use crate::scene::{Splats, sh_coefficients};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use std::io::Read;
 use std::path::Path;
 
@@ -67,9 +68,20 @@ impl Head {
     }
 }
 
+impl Head {
+    /// [`Head::sections`] where a file of `size` bytes may hold as much: the count comes from the file.
+    fn checked_sections(&self, size: usize) -> Result<[usize; 6], String> {
+        let sections = self.sections();
+        match sections.iter().sum::<usize>() as u64 <= files::most_content(size) {
+            true => Ok(sections),
+            false => Err(format!("{} Gaussians are far more than its {size} bytes can hold", self.count)),
+        }
+    }
+}
+
 /// Reads a file.
 pub fn read_splats(path: &Path) -> Result<Splats> {
-    let bytes = std::fs::read(path).map_err(Error::io(path))?;
+    let bytes = files::read(path)?;
     parse(&bytes).map_err(|e| Error::input(format!("{}: {e}", path.display())))
 }
 
@@ -79,7 +91,7 @@ fn parse(bytes: &[u8]) -> Result<Splats, String> {
         let mut gzip = flate2::read::GzDecoder::new(bytes);
         // The header first: it tells how much may follow.
         gzip.by_ref().take(HEADER as u64).read_to_end(&mut plain).map_err(broken)?;
-        let size: usize = Head::parse(&plain)?.sections().iter().sum();
+        let size = Head::parse(&plain)?.checked_sections(bytes.len())?.iter().sum::<usize>();
         gzip.by_ref().take(size as u64).read_to_end(&mut plain).map_err(broken)?;
         // The end of the stream checks the sum of what came before it.
         gzip.read(&mut [0]).map_err(broken)?;
@@ -117,7 +129,7 @@ fn unpack_4(bytes: &[u8]) -> Result<Splats, String> {
     let streams = usize::from(*bytes.get(15).ok_or_else(early)?);
     let table = (word(16)? & 0xffff_ffff) as usize;
     // Empty attributes have no stream.
-    let sizes = head.sections();
+    let sizes = head.checked_sections(bytes.len())?;
     let wanted = sizes.iter().filter(|s| **s > 0).count();
     if streams != wanted {
         return Err(format!("{streams} streams where {wanted} are needed; copy the file again"));
@@ -129,6 +141,7 @@ fn unpack_4(bytes: &[u8]) -> Result<Splats, String> {
         let length = usize::try_from(word(table + 16 * stream)?).map_err(|_| early())?;
         let end = at.checked_add(length).ok_or_else(early)?;
         let packed = bytes.get(at..end).ok_or_else(early)?;
+        part.reserve_exact(size);
         let mut decoder = ruzstd::decoding::StreamingDecoder::new(packed).map_err(broken)?;
         decoder.by_ref().take(size as u64).read_to_end(part).map_err(broken)?;
         if part.len() != size {
@@ -218,6 +231,7 @@ fn pack_rotation([w, x, y, z]: [f32; 4]) -> [u8; 4] {
 
 /// Writes version 4, in the order of the scene.
 pub fn write_splats(path: &Path, s: &Splats) -> Result<()> {
+    usable::check_written(s)?;
     let bad = |what: String| Error::work(format!("{}: {what}", path.display()));
     let bits = fraction_bits(s).ok_or_else(|| {
         bad("the scene reaches farther than the format's 24 bits; write a .ply instead".to_owned())

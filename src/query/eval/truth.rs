@@ -1,8 +1,8 @@
 //! Ground-truth folders: `ground_truth.json`, photos, `masks/<stem>.png`, `depth/<stem>.npz`.
 use crate::format::npy;
-use crate::photo::stem;
+use crate::photo::{self, stem};
 use crate::scene::{Camera, Lens, Plane, Pose, RgbImage};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -94,11 +94,7 @@ impl GroundTruth {
     /// Reads `ground_truth.json` of a folder.
     pub fn read(folder: &Path) -> Result<Self> {
         let path = folder.join("ground_truth.json");
-        let text = std::fs::read_to_string(&path).map_err(|e| {
-            Error::input(format!("{}: {e}; a folder with ground truth has that file", path.display()))
-        })?;
-        let file: File = serde_json::from_str(&text)
-            .map_err(|e| Error::input(format!("{}: not a ground truth file: {e}", path.display())))?;
+        let file: File = files::read_json(&path, "a folder with ground truth has that file")?;
         let (width, height) = (file.width, file.height);
         let frame = |f: FileFrame| {
             let m = f.world_to_camera;
@@ -108,9 +104,10 @@ impl GroundTruth {
             let pose = Pose { rotation, translation: column(3) };
             let camera =
                 Camera { name: f.file.clone(), width, height, fx: f.fx, fy: f.fy, cx: f.cx, cy: f.cy, pose };
-            TruthFrame { file: f.file, stem, split: f.split, camera, lens: f.lens }
+            let camera = camera.checked().map_err(|e| Error::input(format!("{}: {e}", path.display())))?;
+            Ok(TruthFrame { file: f.file, stem, split: f.split, camera, lens: f.lens })
         };
-        let frames = file.frames.into_iter().map(frame).collect();
+        let frames = file.frames.into_iter().map(frame).collect::<Result<_>>()?;
         let up = file.up.map(DVec3::normalize_or_zero);
         Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, up, frames, maps: None })
     }
@@ -183,6 +180,5 @@ fn resampled(plane: &Plane<u32>, width: usize, height: usize) -> Plane<u32> {
 }
 
 fn open(path: &Path) -> Result<image::DynamicImage> {
-    image::open(path)
-        .map_err(|e| Error::input(format!("{}: cannot be read as an image: {e}", path.display())))
+    photo::stored_pixels(path)
 }

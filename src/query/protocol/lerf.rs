@@ -7,8 +7,8 @@ use super::score::{
     mean, place, summarise,
 };
 use crate::query::eval::{MIN_OBJECT_PIXELS, ObjectMaps};
-use crate::scene::{Camera, Plane};
-use crate::{Error, Result};
+use crate::scene::{Camera, MAX_PIXELS, Plane};
+use crate::{Error, Result, files};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -58,12 +58,27 @@ struct Object {
 
 /// Objects of one category are one target: their masks joined, their boxes side by side.
 pub(super) fn parse(text: &str, path: &Path) -> Result<BTreeMap<String, Target>> {
-    let file: File = serde_json::from_str(text)
+    let file: File = files::parse_json(text.as_bytes())
         .map_err(|e| Error::input(format!("{}: not a LERF-OVS label file: {e}", path.display())))?;
+    let (width, height) = (file.info.width, file.info.height);
+    let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
+    let mut names: Vec<&str> = file.objects.iter().map(|o| o.category.as_str()).collect();
+    names.sort_unstable();
+    names.dedup();
+    let numbers = file.objects.iter().flat_map(|o| o.segmentation.as_flattened().iter().chain(&o.bbox));
+    // NaN is in no range.
+    if !numbers.into_iter().all(|v| v.abs() <= polygon::FARTHEST) {
+        return Err(bad(format!("a corner is beyond {} pixels; check its objects", polygon::FARTHEST)));
+    }
+    if names.len().saturating_mul(width).saturating_mul(height) as u64 > MAX_PIXELS {
+        return Err(bad(format!(
+            "{} objects of {width} × {height} pixels are too many; check its \"info\"",
+            names.len()
+        )));
+    }
     let mut targets: BTreeMap<String, Target> = BTreeMap::new();
     for object in file.objects {
-        let empty =
-            || Target { mask: Plane::filled(file.info.width, file.info.height, false), boxes: Vec::new() };
+        let empty = || Target { mask: Plane::filled(width, height, false), boxes: Vec::new() };
         let target = targets.entry(object.category).or_insert_with(empty);
         polygon::fill(&mut target.mask, &object.segmentation);
         if let [x1, y1, x2, y2] = object.bbox[..] {
@@ -98,7 +113,7 @@ fn read_folder(folder: &Path) -> Result<BTreeMap<String, BTreeMap<String, Target
     for entry in std::fs::read_dir(folder).map_err(Error::io(folder))? {
         let path = entry.map_err(Error::io(folder))?.path();
         if path.extension().is_some_and(|e| e == "json") {
-            let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
+            let text = files::read_text(&path)?;
             let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
             labels.insert(stem, parse(&text, &path)?);
         }

@@ -6,7 +6,7 @@ use super::score::{
 };
 use crate::query::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, ObjectMaps, Split};
 use crate::scene::{Camera, Plane};
-use crate::{Error, Result};
+use crate::{Error, Result, files, photo};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -118,11 +118,8 @@ impl ObjectMaps for Maps {
 
 fn read_classes(root: &Path) -> Result<Vec<String>> {
     let path = root.join("classes.txt");
-    let text = std::fs::read_to_string(&path).map_err(|e| {
-        Error::input(format!(
-            "{}: {e}; --protocol 3dovs wants a scene folder with segmentations/classes.txt",
-            path.display()
-        ))
+    let text = files::read_text(&path).map_err(|e| {
+        Error::input(format!("{e}; --protocol 3dovs wants a scene folder with segmentations/classes.txt"))
     })?;
     let classes: Vec<String> = text.lines().map(|l| l.trim().to_string()).filter(|l| !l.is_empty()).collect();
     if classes.is_empty() {
@@ -145,9 +142,7 @@ fn frames(root: &Path) -> Result<Vec<String>> {
 }
 
 fn read_mask(path: &Path) -> Result<Plane<bool>> {
-    let image = image::open(path)
-        .map_err(|e| Error::input(format!("{}: cannot be read as an image: {e}", path.display())))?
-        .to_luma8();
+    let image = photo::stored_pixels(path)?.to_luma8();
     let data = image.pixels().map(|p| p.0[0] > 127).collect();
     Ok(Plane { width: image.width() as usize, height: image.height() as usize, data })
 }

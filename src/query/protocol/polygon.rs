@@ -2,7 +2,10 @@
 //! outline included (what OpenCV's `fillPoly` draws).
 use crate::scene::Plane;
 
-/// Sets the pixels of a closed polygon. Vertices may lie outside.
+/// Farthest that a vertex may lie outside, pixels: beyond it products of coordinates leave 64 bits.
+pub const FARTHEST: f64 = 1e6;
+
+/// Sets the pixels of a closed polygon. Vertices may lie outside, up to [`FARTHEST`].
 pub fn fill(mask: &mut Plane<bool>, polygon: &[[f64; 2]]) {
     let points: Vec<[i64; 2]> = polygon.iter().map(|p| p.map(|v| v.trunc() as i64)).collect();
     let edges = || (0..points.len()).map(|i| (points[i], points[(i + 1) % points.len()]));
@@ -20,7 +23,8 @@ pub fn fill(mask: &mut Plane<bool>, polygon: &[[f64; 2]]) {
             .collect();
         crossings.sort_by(f64::total_cmp);
         for pair in crossings.chunks_exact(2) {
-            for x in pair[0].ceil() as i64..=pair[1].floor() as i64 {
+            let (first, last) = (pair[0].ceil().max(0.0), pair[1].floor().min(mask.width as f64 - 1.0));
+            for x in first as i64..=last as i64 {
                 set(mask, x, y);
             }
         }
@@ -37,7 +41,13 @@ fn set(mask: &mut Plane<bool>, x: i64, y: i64) {
 fn outline(mask: &mut Plane<bool>, a: [i64; 2], b: [i64; 2]) {
     let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
     let steps = dx.abs().max(dy.abs());
-    for k in 0..=steps {
+    // Along the longer axis every step is a pixel: those before and after the image are left out.
+    let (from, forward, size) = match dx.abs() >= dy.abs() {
+        true => (a[0], dx >= 0, mask.width as i64),
+        false => (a[1], dy >= 0, mask.height as i64),
+    };
+    let (first, last) = if forward { (-from, size - 1 - from) } else { (from - size + 1, from) };
+    for k in first.max(0)..=last.min(steps) {
         let at = |from: i64, d: i64| from + (2 * k * d + steps).div_euclid((2 * steps).max(1));
         set(mask, at(a[0], dx), at(a[1], dy));
     }

@@ -4,10 +4,10 @@ use super::score::{
     DecodedView, LabelledView, Masks, Protocol, ProtocolKind, ProtocolReport, ProtocolSummary, Score,
     nearest, place,
 };
-use crate::photo::stem;
+use crate::photo::{self, stem};
 use crate::query::eval::{ObjectMaps, Split};
 use crate::scene::{Camera, Plane, Pose};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use glam::{DMat3, DVec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -94,8 +94,7 @@ impl LabelFiles {
     fn truth(&self, stem: &str) -> Result<Plane<i32>> {
         let path = self.folder.join(format!("{stem}.png"));
         let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
-        let image =
-            image::open(&path).map_err(|e| bad(format!("cannot be read as an image: {e}")))?.to_luma16();
+        let image = photo::stored_pixels(&path)?.to_luma16();
         let mut out = Plane::filled(image.width() as usize, image.height() as usize, -1);
         for (slot, pixel) in out.data.iter_mut().zip(image.pixels()) {
             let id = u32::from(pixel.0[0]);
@@ -134,7 +133,7 @@ fn table(folder: &Path) -> Result<Option<BTreeMap<u32, u32>>> {
     let Some(path) = folder.ancestors().take(3).map(|p| p.join(name)).find(|p| p.is_file()) else {
         return Ok(None);
     };
-    let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
+    let text = files::read_text(&path)?;
     let mut lines = text.lines();
     let header: Vec<&str> = lines.next().unwrap_or("").split('\t').collect();
     let column = |name: &str| header.iter().position(|h| h.trim() == name);
@@ -151,7 +150,7 @@ fn matrix(path: &Path) -> Result<Option<[f64; 16]>> {
     if !path.is_file() {
         return Ok(None);
     }
-    let text = std::fs::read_to_string(path).map_err(Error::io(path))?;
+    let text = files::read_text(path)?;
     let values: Vec<f64> = text.split_whitespace().filter_map(|v| v.parse().ok()).collect();
     let values = <[f64; 16]>::try_from(values)
         .map_err(|_| Error::input(format!("{}: not a 4x4 matrix of numbers", path.display())))?;
@@ -166,14 +165,16 @@ fn cameras(folder: &Path, stems: &[String]) -> Result<Vec<Camera>> {
     for name in stems {
         let Some(m) = matrix(&folder.join("pose").join(format!("{name}.txt")))? else { continue };
         let photo = ["jpg", "png"].map(|e| folder.join("color").join(format!("{name}.{e}")));
-        let Some(photo) = photo.iter().find(|p| p.is_file()) else { continue };
-        let (width, height) = image::image_dimensions(photo)
-            .map_err(|e| Error::input(format!("{}: cannot be read as an image: {e}", photo.display())))?;
+        let Some(file) = photo.iter().find(|p| p.is_file()) else { continue };
+        let (width, height) = photo::dimensions(file)?;
         let column = |c: usize| DVec3::new(m[c], m[4 + c], m[8 + c]);
         let to_world =
             Pose { rotation: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) };
         let pose = to_world.inverse();
-        out.push(Camera { name: name.clone(), width, height, fx: k[0], fy: k[5], cx: k[2], cy: k[6], pose });
+        let camera =
+            Camera { name: name.clone(), width, height, fx: k[0], fy: k[5], cx: k[2], cy: k[6], pose };
+        let named = |e: String| Error::input(format!("{}: {e}", folder.join("pose").display()));
+        out.push(camera.checked().map_err(named)?);
     }
     Ok(out)
 }

@@ -30,7 +30,8 @@ impl SourceKind for MaskSources {
             needs: &[],
             check: |dir, given| {
                 let features = given.features.name == "dir";
-                given.photos.iter().try_for_each(|p| dir::read_view(dir, p, features).map(drop))
+                let mut masks = dir::DirMasks::new(dir, features);
+                given.photos.iter().try_for_each(|p| masks.read(p).map(drop))
             },
             make: |dir, (build, photos)| {
                 let features = build.given_features;

@@ -164,7 +164,8 @@ impl Stage for GivenMasks {
     }
 
     fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<Vec<ViewMasks>> {
-        placed.photos.iter().map(|p| dir::read_view(&self.dir, p, self.features)).collect()
+        let mut masks = dir::DirMasks::new(&self.dir, self.features);
+        placed.photos.iter().map(|p| masks.read(p)).collect()
     }
 }
 

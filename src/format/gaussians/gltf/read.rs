@@ -2,13 +2,13 @@
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
 use crate::format::{logit, transform};
 use crate::scene::{Similarity, Splats, sh_coefficients};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::Deserialize;
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Component as Step, Path};
 
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
@@ -41,10 +41,11 @@ struct Node {
     mesh: Option<usize>,
     #[serde(default)]
     children: Vec<usize>,
-    matrix: Option<[f64; 16]>,
-    translation: Option<[f64; 3]>,
-    rotation: Option<[f64; 4]>,
-    scale: Option<[f64; 3]>,
+    // Boxed: a node without them takes few bytes in the file.
+    matrix: Option<Box<[f64; 16]>>,
+    translation: Option<Box<[f64; 3]>>,
+    rotation: Option<Box<[f64; 4]>>,
+    scale: Option<Box<[f64; 3]>>,
 }
 
 #[derive(Deserialize)]
@@ -91,61 +92,36 @@ struct Buffer {
     uri: Option<String>,
 }
 
-/// Reads a `.glb` or `.gltf`: scene axes, SH of the highest degree that any part has.
+/// Most nodes: scenes of Gaussians have a handful, and a node takes 200 bytes while it is visited.
+const MOST_NODES: usize = 100_000;
+
+/// Reads a `.glb` or `.gltf`: scene axes, SH of the highest degree that any part has. Buffers outside of the file are read
+/// from its own folder only.
 pub fn read_splats(path: &Path) -> Result<Splats> {
-    let bytes = std::fs::read(path).map_err(Error::io(path))?;
-    let folder = path.parent().unwrap_or(Path::new(""));
+    let bytes = files::read(path)?;
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     parse(&bytes, folder).map_err(|e| Error::input(format!("{}: {e}", path.display())))
 }
 
 fn parse(bytes: &[u8], folder: &Path) -> Result<Splats, String> {
     let (text, bin) = chunks(bytes)?;
-    let root: Root = serde_json::from_slice(text).map_err(|e| format!("not a glTF document ({e})"))?;
+    let root: Root = files::parse_json(text).map_err(|e| format!("not a glTF document ({e})"))?;
     if let Some(other) = root.extensions_required.iter().find(|e| *e != EXTENSION) {
         return Err(format!("needs the extension {other}, which splatvk does not know; export it without"));
     }
-    let buffers = root.buffers.iter().map(|b| contents(b, bin, folder)).collect::<Result<Vec<_>, _>>()?;
-    let document = Document { root: &root, buffers };
-    let mut parts = Vec::new();
-    let top: Vec<usize> = match root.scenes.get(root.scene.unwrap_or(0)) {
-        Some(scene) => scene.nodes.clone(),
-        // Without scenes every node that no other has is one.
-        None => {
-            let below = |i: &usize| root.nodes.iter().any(|n| n.children.contains(i));
-            (0..root.nodes.len()).filter(|i| !below(i)).collect()
-        }
-    };
-    // Nodes to visit, each with the transformation above it; in a tree no node comes twice.
-    let mut open: Vec<(usize, DMat4)> = top.into_iter().rev().map(|n| (n, DMat4::IDENTITY)).collect();
-    let mut seen = vec![false; root.nodes.len()];
-    while let Some((index, above)) = open.pop() {
-        let node = root.nodes.get(index).ok_or_else(|| format!("there is no node {index}"))?;
-        if std::mem::replace(&mut seen[index], true) {
-            return Err(format!("node {index} is below two others; nodes must form a tree"));
-        }
-        let matrix = above * local(node);
-        for mut splats in document.gaussians(node)? {
-            transform::transform_splats(&mut splats, &similarity(matrix, index)?);
-            parts.push(splats);
-        }
-        open.extend(node.children.iter().rev().map(|child| (*child, matrix)));
-    }
-    let degree = parts
-        .iter()
-        .map(|p| p.sh_degree)
+    let document = Document { buffers: contents(&root.buffers, folder)?, root: &root, bin };
+    let placed = document.placed()?;
+    let degrees = placed.iter().map(|(p, _)| Document::sh_degree(p));
+    let sh_degree = degrees
         .max()
         .ok_or_else(|| format!("no part of it has the extension {EXTENSION}: not a file of Gaussians"))?;
-    let mut all = Splats { sh_degree: degree, ..Splats::default() };
-    for mut part in parts {
-        let (own, wanted) = (3 * part.sh_len(), 3 * all.sh_len());
-        if own < wanted {
-            let padded = |row: &[f32]| {
-                row.iter().copied().chain(std::iter::repeat_n(0.0, wanted - own)).collect::<Vec<_>>()
-            };
-            part.sh = part.sh.chunks_exact(own).flat_map(padded).collect();
-            part.sh_degree = degree;
-        }
-        all.append(part);
+    document.check_size(&placed, sh_degree, bytes.len())?;
+    let mut all = Splats { sh_degree, ..Splats::default() };
+    for (primitive, by) in placed {
+        let mut part = document.primitive(primitive, sh_degree)?;
+        transform::transform_splats(&mut part, &by);
+        // The first is most often the only one: not copied.
+        if all.is_empty() { all = part } else { all.append(part) }
     }
     transform::transform_splats(&mut all, &turned());
     Ok(all)
@@ -182,10 +158,18 @@ fn chunks(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), String> {
     Ok((text, bin))
 }
 
-fn contents(buffer: &Buffer, bin: Option<&[u8]>, folder: &Path) -> Result<Vec<u8>, String> {
-    let Some(uri) = &buffer.uri else {
-        return Ok(bin.ok_or("a buffer has no address and the file no binary chunk")?.to_vec());
-    };
+/// What the addresses of buffers lead to, each once.
+fn contents<'a>(buffers: &'a [Buffer], folder: &Path) -> Result<BTreeMap<&'a str, Vec<u8>>, String> {
+    let mut all = BTreeMap::new();
+    for uri in buffers.iter().filter_map(|b| b.uri.as_deref()) {
+        if !all.contains_key(uri) {
+            all.insert(uri, content(uri, folder)?);
+        }
+    }
+    Ok(all)
+}
+
+fn content(uri: &str, folder: &Path) -> Result<Vec<u8>, String> {
     if let Some(data) = uri.strip_prefix("data:") {
         let body = data.split_once(";base64,").ok_or("a buffer inside of the file is not base64")?.1;
         return STANDARD.decode(body).map_err(|e| format!("damaged base64 ({e}); copy the file again"));
@@ -193,25 +177,115 @@ fn contents(buffer: &Buffer, bin: Option<&[u8]>, folder: &Path) -> Result<Vec<u8
     if uri.contains("://") {
         return Err(format!("its buffer {uri} is not a local file; download it and give its name"));
     }
+    let outside = || format!("its buffer {uri} is outside of the file's folder; put it beside the file");
+    if uri.contains('\\') || Path::new(uri).components().any(|c| !matches!(c, Step::Normal(_) | Step::CurDir))
+    {
+        return Err(outside());
+    }
     let path = folder.join(uri);
-    std::fs::read(&path).map_err(|e| format!("its buffer {}: {e}", path.display()))
+    // Where links lead to; what is not there or leads in a circle is reported by the reader.
+    if let (Ok(real), Ok(home)) = (path.canonicalize(), folder.canonicalize())
+        && !real.starts_with(home)
+    {
+        return Err(outside());
+    }
+    files::read(&path).map_err(|e| format!("its buffer {e}"))
 }
 
 struct Document<'a> {
     root: &'a Root,
-    buffers: Vec<Vec<u8>>,
+    bin: Option<&'a [u8]>,
+    buffers: BTreeMap<&'a str, Vec<u8>>,
 }
 
-impl Document<'_> {
-    /// The Gaussians of a node, a set per primitive that has the extension, in the node's own axes.
-    fn gaussians(&self, node: &Node) -> Result<Vec<Splats>, String> {
-        let Some(mesh) = node.mesh else { return Ok(Vec::new()) };
-        let mesh = self.root.meshes.get(mesh).ok_or_else(|| format!("there is no mesh {mesh}"))?;
-        let ours = mesh.primitives.iter().filter(|p| p.extensions.contains_key(EXTENSION));
-        ours.map(|p| self.primitive(p)).collect()
+impl<'a> Document<'a> {
+    /// All primitives with the extension below the default scene, and where they are; one for every node that shows it.
+    fn placed(&self) -> Result<Vec<(&'a Primitive, Similarity)>, String> {
+        let root = self.root;
+        let many = |n: usize| format!("{n} nodes, more than the {MOST_NODES} that are read; merge some");
+        let top: Vec<usize> = match root.scenes.get(root.scene.unwrap_or(0)) {
+            Some(scene) => scene.nodes.clone(),
+            // Without scenes every node that no other has is one.
+            None => {
+                let mut below = vec![false; root.nodes.len()];
+                for child in root.nodes.iter().flat_map(|n| &n.children) {
+                    below.get_mut(*child).into_iter().for_each(|b| *b = true);
+                }
+                (0..root.nodes.len()).filter(|i| !below[*i]).collect()
+            }
+        };
+        if root.nodes.len().max(top.len()) > MOST_NODES {
+            return Err(many(root.nodes.len().max(top.len())));
+        }
+        let mut placed = Vec::new();
+        // Nodes to visit, each with the transformation above it; in a tree no node comes twice.
+        let mut open: Vec<(usize, DMat4)> = top.into_iter().rev().map(|n| (n, DMat4::IDENTITY)).collect();
+        let mut seen = vec![false; root.nodes.len()];
+        while let Some((index, above)) = open.pop() {
+            let node = root.nodes.get(index).ok_or_else(|| format!("there is no node {index}"))?;
+            if std::mem::replace(&mut seen[index], true) {
+                return Err(format!("node {index} is below two others; nodes must form a tree"));
+            }
+            let matrix = above * local(node);
+            for primitive in self.primitives(node)? {
+                placed.push((primitive, similarity(matrix, index)?));
+            }
+            if open.len() + node.children.len() > MOST_NODES || placed.len() > MOST_NODES {
+                return Err(many(open.len() + node.children.len().max(placed.len())));
+            }
+            open.extend(node.children.iter().rev().map(|child| (*child, matrix)));
+        }
+        Ok(placed)
     }
 
-    fn primitive(&self, primitive: &Primitive) -> Result<Splats, String> {
+    /// The primitives of a node that have the extension.
+    fn primitives(&self, node: &Node) -> Result<impl Iterator<Item = &'a Primitive>, String> {
+        let none = &[][..];
+        let all = match node.mesh {
+            None => none,
+            Some(mesh) => {
+                let mesh = self.root.meshes.get(mesh).ok_or_else(|| format!("there is no mesh {mesh}"))?;
+                &mesh.primitives
+            }
+        };
+        Ok(all.iter().filter(|p| p.extensions.contains_key(EXTENSION)))
+    }
+
+    /// Refuses what would take far more memory than the file has bytes: many nodes that show one mesh, attributes that share
+    /// their bytes. Counted before anything of that size is made.
+    fn check_size(
+        &self,
+        placed: &[(&Primitive, Similarity)],
+        sh_degree: u32,
+        text: usize,
+    ) -> Result<(), String> {
+        let bytes = text as u64 + self.buffers.values().map(|b| b.len() as u64).sum::<u64>();
+        let count = |(p, _): &(&Primitive, Similarity)| {
+            let accessor = p.attributes.get("POSITION").and_then(|a| self.root.accessors.get(*a));
+            accessor.map_or(0, |a| a.count as u64)
+        };
+        let total = placed.iter().map(count).fold(0u64, u64::saturating_add);
+        // Mean, scales, rotation, opacity, coefficients.
+        let row = 4 * (3 + 3 + 4 + 1 + 3 * sh_coefficients(sh_degree) as u64);
+        let most = (4 * bytes + files::ROOM) / row;
+        if total > most {
+            return Err(format!(
+                "its nodes show {total} Gaussians, and {most} are the most that are read of a file of {bytes} bytes; show \
+                 its meshes fewer times"
+            ));
+        }
+        Ok(())
+    }
+
+    fn sh_degree(primitive: &Primitive) -> u32 {
+        let has = |degree: &u32| {
+            (0..=2 * degree).any(|n| primitive.attributes.contains_key(&coefficient(*degree, n)))
+        };
+        (1..=3).rev().find(has).unwrap_or(0)
+    }
+
+    /// The Gaussians of a primitive in the axes of its node; coefficients up to `sh_degree` that it lacks are zero.
+    fn primitive(&self, primitive: &Primitive, sh_degree: u32) -> Result<Splats, String> {
         let extension = &primitive.extensions[EXTENSION];
         let property = |name: &str, known: &str| match extension.get(name).and_then(|v| v.as_str()) {
             Some(value) if value != known => Err(format!("{name} {value} is not supported, only {known}")),
@@ -223,49 +297,50 @@ impl Document<'_> {
         if primitive.mode != Some(0) {
             return Err("Gaussians must be points (mode 0)".to_owned());
         }
-        let means = self.vectors::<3>(primitive, "POSITION", "VEC3")?;
-        let rotations = self.vectors::<4>(primitive, &attribute("ROTATION"), "VEC4")?;
-        let scales = self.vectors::<3>(primitive, &attribute("SCALE"), "VEC3")?;
-        let opacities = self.vectors::<1>(primitive, &attribute("OPACITY"), "SCALAR")?;
-        let name = |degree: u32, n: u32| attribute(&format!("SH_DEGREE_{degree}_COEF_{n}"));
-        let has =
-            |degree: &u32| (0..=2 * degree).any(|n| primitive.attributes.contains_key(&name(*degree, n)));
-        let sh_degree = (1..=3).rev().find(has).unwrap_or(0);
-        let mut columns = Vec::with_capacity(sh_coefficients(sh_degree));
-        for degree in 0..=sh_degree {
-            for n in 0..=2 * degree {
-                columns.push(self.vectors::<3>(primitive, &name(degree, n), "VEC3")?);
-            }
-        }
-        let counts = [rotations.len(), scales.len(), opacities.len()];
-        if counts.into_iter().chain(columns.iter().map(Vec::len)).any(|n| n != means.len()) {
-            return Err("its attributes have different numbers of Gaussians".to_owned());
-        }
-        // A flat Gaussian has a scale of 0, of which there is no logarithm.
-        let log_scale = |v: f32| v.max(f32::MIN_POSITIVE).ln();
-        if scales.as_flattened().iter().any(|v| *v < 0.0) {
+        let means: Vec<[f32; 3]> = self.vectors(primitive, "POSITION", "VEC3")?.collect();
+        let mut s = Splats { sh_degree, means, ..Splats::default() };
+        let (n, width) = (s.len(), 3 * s.sh_len());
+        let counted = |found: usize| match found == n {
+            true => Ok(()),
+            false => Err("its attributes have different numbers of Gaussians".to_owned()),
+        };
+        let rotations = self.vectors(primitive, &attribute("ROTATION"), "VEC4")?;
+        s.quats = rotations.map(|q: [f32; 4]| [q[3], q[0], q[1], q[2]]).collect();
+        let scales = self.vectors(primitive, &attribute("SCALE"), "VEC3")?;
+        s.log_scales = scales.collect();
+        let opacities = self.vectors(primitive, &attribute("OPACITY"), "SCALAR")?;
+        s.opacity_logits = opacities.map(|[a]| logit(a)).collect();
+        [s.quats.len(), s.log_scales.len(), s.opacity_logits.len()].into_iter().try_for_each(counted)?;
+        if s.log_scales.as_flattened().iter().any(|v| *v < 0.0) {
             return Err(
                 "a scale is negative: drafts of the extension held logarithms; export the file again"
                     .to_owned(),
             );
         }
-        Ok(Splats {
-            log_scales: scales.iter().map(|s| s.map(log_scale)).collect(),
-            quats: rotations.iter().map(|q| [q[3], q[0], q[1], q[2]]).collect(),
-            opacity_logits: opacities.iter().map(|[a]| logit(*a)).collect(),
-            sh_degree,
-            sh: (0..means.len()).flat_map(|i| columns.iter().flat_map(move |c| c[i])).collect(),
-            means,
-        })
+        for v in s.log_scales.as_flattened_mut() {
+            *v = v.ln();
+        }
+        s.sh = vec![0.0; n * width];
+        for degree in 0..=Document::sh_degree(primitive) {
+            for k in 0..=2 * degree {
+                let column = self.vectors::<3>(primitive, &coefficient(degree, k), "VEC3")?;
+                counted(column.len())?;
+                let first = 3 * (degree * degree + k) as usize;
+                for (row, value) in s.sh.chunks_exact_mut(width).zip(column) {
+                    row[first..first + 3].copy_from_slice(&value);
+                }
+            }
+        }
+        Ok(s)
     }
 
     /// An attribute as floats, whatever the file stores it in.
-    fn vectors<const N: usize>(
-        &self,
+    fn vectors<'s, const N: usize>(
+        &'s self,
         primitive: &Primitive,
         name: &str,
         kind: &str,
-    ) -> Result<Vec<[f32; N]>, String> {
+    ) -> Result<impl ExactSizeIterator<Item = [f32; N]> + use<'s, 'a, N>, String> {
         let index =
             *primitive.attributes.get(name).ok_or_else(|| format!("the attribute {name} is missing"))?;
         let bad = |what: &str| format!("{name}: {what}");
@@ -278,7 +353,12 @@ impl Document<'_> {
         };
         let view = self.root.buffer_views.get(view).ok_or_else(|| bad("its buffer view is missing"))?;
         let early = || bad("the buffer ends early; copy the file again");
-        let buffer = self.buffers.get(view.buffer).ok_or_else(|| bad("its buffer is missing"))?;
+        let buffer = self.root.buffers.get(view.buffer).ok_or_else(|| bad("its buffer is missing"))?;
+        let buffer = match &buffer.uri {
+            Some(uri) => self.buffers.get(uri.as_str()).map(Vec::as_slice),
+            None => self.bin,
+        };
+        let buffer = buffer.ok_or("a buffer has no address and the file no binary chunk")?;
         let bytes =
             buffer.get(view.byte_offset..).and_then(|b| b.get(..view.byte_length)).ok_or_else(early)?;
         let bytes = bytes.get(accessor.byte_offset..).ok_or_else(early)?;
@@ -290,17 +370,16 @@ impl Document<'_> {
         if stride < row || needed.is_none_or(|n| n > bytes.len()) {
             return Err(early());
         }
-        let vector = |i: usize| {
+        let vector = move |i: usize| {
             let own = &bytes[i * stride..i * stride + row];
             std::array::from_fn(|k| (component.read)(&own[k * component.bytes..]) / component.one)
         };
-        let vectors: Vec<[f32; N]> = (0..accessor.count).map(vector).collect();
-        if vectors.as_flattened().iter().all(|v| v.is_finite()) {
-            Ok(vectors)
-        } else {
-            Err(bad("not all numbers are finite"))
-        }
+        Ok((0..accessor.count).map(vector))
     }
+}
+
+fn coefficient(degree: u32, n: u32) -> String {
+    attribute(&format!("SH_DEGREE_{degree}_COEF_{n}"))
 }
 
 /// How a number is stored; `one` is what stands for 1.
@@ -331,13 +410,14 @@ impl Component {
 }
 
 fn local(node: &Node) -> DMat4 {
-    if let Some(matrix) = node.matrix {
-        return DMat4::from_cols_array(&matrix);
+    if let Some(matrix) = &node.matrix {
+        return DMat4::from_cols_array(matrix);
     }
+    let vector = |v: &Option<Box<[f64; 3]>>, none: DVec3| v.as_ref().map_or(none, |v| DVec3::from_array(**v));
     DMat4::from_scale_rotation_translation(
-        node.scale.map_or(DVec3::ONE, DVec3::from_array),
-        node.rotation.map_or(DQuat::IDENTITY, |q| DQuat::from_array(q).normalize()),
-        node.translation.map_or(DVec3::ZERO, DVec3::from_array),
+        vector(&node.scale, DVec3::ONE),
+        node.rotation.as_ref().map_or(DQuat::IDENTITY, |q| DQuat::from_array(**q).normalize()),
+        vector(&node.translation, DVec3::ZERO),
     )
 }
 

@@ -1,5 +1,6 @@
 //! Writing.
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
+use crate::format::gaussians::usable;
 use crate::format::{sigmoid, transform};
 use crate::scene::{SH_C0, Splats, to_linear};
 use crate::{Error, Result};
@@ -10,6 +11,7 @@ use std::path::Path;
 
 /// Writes a binary file, in the order of the scene.
 pub fn write_glb(path: &Path, splats: &Splats) -> Result<()> {
+    usable::check_written(splats)?;
     let (mut root, data) = document(splats);
     root["buffers"] = json!([{ "byteLength": data.len() }]);
     let mut text = root.to_string().into_bytes();
@@ -35,6 +37,7 @@ pub fn write_glb(path: &Path, splats: &Splats) -> Result<()> {
 
 /// Writes one text file with the numbers inside it, in the order of the scene.
 pub fn write_gltf(path: &Path, splats: &Splats) -> Result<()> {
+    usable::check_written(splats)?;
     let (mut root, data) = document(splats);
     let uri = format!("data:application/octet-stream;base64,{}", STANDARD.encode(&data));
     root["buffers"] = json!([{ "byteLength": data.len(), "uri": uri }]);

@@ -1,0 +1,233 @@
+//! Files that somebody else made, as the program meets them: one clear line, exit code 2, nothing half-written.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
+use splatvk::format::{cameras, gaussians, npy, ply, scene_dir};
+use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, Pose, Seen, Splats, World};
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+fn splatvk(arguments: &[&str]) -> Output {
+    let mut c = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+    c.env_remove("SPLATVK_MODELS").stdin(Stdio::null()).args(arguments).output().unwrap()
+}
+
+/// Must end with `code` and one error line of bounded length without control characters, which contains the words.
+fn refuses(code: i32, arguments: &[&str], words: &[&str]) {
+    let output = splatvk(arguments);
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{arguments:?}\n{stderr}");
+    let line = stderr.strip_suffix('\n').unwrap();
+    assert!(line.starts_with("splatvk: ") && !line.contains(char::is_control), "{line:?}");
+    assert!(line.chars().count() <= 1100, "{} characters", line.chars().count());
+    for word in words {
+        assert!(line.contains(word), "{word:?} is not in: {line}");
+    }
+}
+
+fn splats(n: usize) -> Splats {
+    Splats {
+        means: (0..n).map(|i| [i as f32 * 0.1, 0.2, 3.0]).collect(),
+        log_scales: vec![[-3.0; 3]; n],
+        quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
+        opacity_logits: vec![1.0; n],
+        sh_degree: 0,
+        sh: vec![0.3; 3 * n],
+    }
+}
+
+fn field(n: usize) -> LanguageField {
+    let codebook = Codebook {
+        embedding_dim: 2,
+        code_dim: 1,
+        embeddings: vec![0.6, 0.8],
+        codes: vec![1.0],
+        weights: vec![9.0],
+        members: vec![Vec::new()],
+        min_chord: 2.0,
+    };
+    let level = LevelField { codebook, features: vec![1.0; n], ..LevelField::default() };
+    LanguageField { levels: vec![level, LevelField::default(), LevelField::default()], space: "x".into() }
+}
+
+/// Puts a number in the place of one of a binary PLY of degree 0.
+fn poison(path: &Path, row: usize, column: usize, value: f32) {
+    let mut bytes = std::fs::read(path).unwrap();
+    let body = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let width = (bytes.len() - body) / 50;
+    bytes[body + row * width + 4 * column..][..4].copy_from_slice(&value.to_le_bytes());
+    std::fs::write(path, bytes).unwrap();
+}
+
+#[test]
+fn camera_files_are_checked_when_they_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    gaussians::write(at("a.ply").as_ref(), &splats(3), None).unwrap();
+    let frame = |name: &str, w: f64| {
+        serde_json::json!({ "fl_x": 50, "w": w, "h": 48, "frames": [{
+            "file_path": name, "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        }] })
+        .to_string()
+    };
+    let (out, scene) = (at("out"), at("a.ply"));
+    let refused = |cameras: &str, words: &[&str]| {
+        refuses(2, &["render", &scene, "--cameras", cameras, "--out", &out], words);
+        assert!(!Path::new(&out).exists(), "{cameras} left something behind");
+    };
+    for (text, words) in [
+        (frame("a", 1e6), "1000000 × 48 pixels are too many"),
+        (frame("a\0b", 64.0), "a control character is in its name"),
+        (frame("\u{1b}[31mred\n\u{7}", 64.0), "a control character is in its name"),
+        (frame(&"x".repeat(300), 64.0), "too long"),
+        (frame(&"x".repeat(5_000_000), 64.0), "too long"),
+        (frame("a", 64.0).replace("50", "null"), "no focal length"),
+        ("{\"frames\": 3}".to_owned(), "not a JSON camera file (transforms.json)"),
+        ("hello".to_owned(), "not a JSON camera file"),
+    ] {
+        std::fs::write(at("c.json"), text).unwrap();
+        refused(&at("c.json"), &["c.json", words]);
+    }
+    std::fs::create_dir(at("folder.json")).unwrap();
+    refused(&at("folder.json"), &["no cameras here"]);
+    refused(&at("none.json"), &["none.json", "check the name"]);
+    #[cfg(target_os = "linux")]
+    {
+        use std::os::unix::fs::symlink;
+        symlink("/dev/zero", at("zero.json")).unwrap();
+        symlink(at("loop.json"), at("loop.json")).unwrap();
+        refused("/dev/zero", &["is a device or pipe"]);
+        refused(&at("zero.json"), &["zero.json", "is a device or pipe"]);
+        refused(&at("loop.json"), &["loop.json", "check the name"]);
+    }
+}
+
+#[test]
+fn gaussians_that_are_not_finite_are_left_out_and_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    for (k, (column, value)) in [(0, f32::INFINITY), (9, f32::NAN), (10, 100.0)].into_iter().enumerate() {
+        // Columns: x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0.
+        let path = at(&format!("a{k}.ply"));
+        let options = ply::PlyOptions { degree: 0, language: None };
+        ply::write_splats(path.as_ref(), &splats(50), options).unwrap();
+        poison(path.as_ref(), 7, column, value);
+        for format in ["glb", "gltf", "splat", "compressed-ply", "spz", "ply"] {
+            let ending = format.replace("compressed-ply", "compressed.ply");
+            let out = at(&format!("out{k}.{ending}"));
+            let output = splatvk(&["export", &path, "--format", format, "--out", &out]);
+            let stderr = String::from_utf8_lossy(&output.stderr);
+            assert!(output.status.success(), "{stderr}");
+            let words = "1 of 50 Gaussians are left out, the first is number 7";
+            assert!(stderr.starts_with("warning: ") && stderr.contains(words), "{stderr}");
+            let (back, _, note) = gaussians::read_counted(out.as_ref()).unwrap();
+            assert!(back.len() == 49 && note.is_none(), "{out}: {note:?}");
+        }
+    }
+}
+
+fn write_scene(folder: &Path, s: &Splats, field: Option<&LanguageField>) {
+    let pose = Pose::IDENTITY;
+    let (name, c) = ("a.png".to_owned(), 32.0);
+    let camera = Camera { name, width: 64, height: 64, fx: 60.0, fy: 60.0, cx: c, cy: c, pose };
+    let contents = scene_dir::Contents {
+        splats: s,
+        seen: &Seen::default(),
+        cameras: &[camera],
+        world: &World::default(),
+        photos: &[],
+        points: None,
+        language: field,
+        text_embeddings: None,
+    };
+    std::fs::create_dir_all(folder).unwrap();
+    scene_dir::write(folder, &contents).unwrap();
+}
+
+#[test]
+fn a_damaged_scene_directory_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("scene");
+    let (path, out) = (scene.to_string_lossy().into_owned(), folder.path().join("o.ply"));
+    let out = out.to_string_lossy().into_owned();
+    let refused = |words: &[&str]| {
+        refuses(2, &["export", &path, "--format", "ply", "--out", &out], words);
+        assert!(!Path::new(&out).exists());
+    };
+    write_scene(&scene, &splats(50), Some(&field(50)));
+    assert!(scene_dir::load(&scene).is_ok());
+    poison(&scene.join("point_cloud.ply"), 3, 0, f32::NAN);
+    refused(&["point_cloud.ply", "1 of 50 Gaussians, the first is number 3"]);
+
+    // 50 features of 1, as they are: no mixes of codes.
+    type Change = fn(&mut Vec<f32>);
+    let cases: [(&str, &str, Change, &str); 5] = [
+        (
+            "features",
+            "features_s",
+            |v| v[8] = f32::NAN,
+            "the features of level s are not finite, the first in row 8",
+        ),
+        ("codebook_s", "clip", |v| v[1] = f32::INFINITY, "its embeddings are not finite"),
+        ("codebook_s", "code", |v| v[0] = f32::NAN, "its codes are not finite"),
+        ("codebook_s", "weight", |v| v[0] = f32::NAN, "its weights are not finite"),
+        ("codebook_s", "weight", |v| v.push(1.0), "do not fit together"),
+    ];
+    for (file, name, change, words) in cases {
+        write_scene(&scene, &splats(50), Some(&field(50)));
+        let archive = scene.join(format!("language/{file}.npz"));
+        let mut arrays = npy::read_npz(&archive).unwrap();
+        let array = arrays.get_mut(name).unwrap();
+        let mut values = array.to_f32();
+        change(&mut values);
+        let shape =
+            if values.len() == array.to_f32().len() { array.shape.clone() } else { vec![values.len()] };
+        *array = npy::NpyArray::f32(&shape, values);
+        let list: Vec<(&str, &npy::NpyArray)> = arrays.iter().map(|(n, a)| (n.as_str(), a)).collect();
+        npy::write_npz(&archive, &list).unwrap();
+        refused(&[file, words]);
+    }
+    // Nor is it written.
+    let mut broken = field(50);
+    broken.levels[0].features[8] = f32::NAN;
+    let e = gaussians::write(folder.path().join("b.ply").as_ref(), &splats(50), Some(&broken)).unwrap_err();
+    assert!(e.to_string().contains("nothing is written") && !folder.path().join("b.ply").exists(), "{e}");
+
+    write_scene(&scene, &splats(50), Some(&field(50)));
+    let archive = scene.join("language/codebook_s.npz");
+    let whole = std::fs::read(&archive).unwrap();
+    let mut refusals = 0;
+    for k in (0..whole.len()).step_by(7) {
+        let mut bytes = whole.clone();
+        bytes[k] ^= 0x10;
+        std::fs::write(&archive, &bytes).unwrap();
+        if let Err(e) = npy::read_npz(&archive) {
+            assert!(e.exit_code() == 2 && e.to_string().contains("codebook_s.npz"), "{e}");
+            assert!(e.to_string().contains("copy") || e.to_string().contains("save"), "{e}");
+            refusals += 1;
+        }
+    }
+    assert!(refusals > 20, "{refusals}");
+    std::fs::write(&archive, &whole[..whole.len() / 2]).unwrap();
+    refused(&["codebook_s.npz", "copy the file again"]);
+    std::fs::remove_file(&archive).unwrap();
+    std::fs::create_dir(&archive).unwrap();
+    refused(&["codebook_s.npz", "is a folder"]);
+}
+
+#[test]
+fn questions_need_cameras_and_language() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    gaussians::write(at("plain.ply").as_ref(), &splats(5), None).unwrap();
+    gaussians::write(at("words.ply").as_ref(), &splats(5), Some(&field(5))).unwrap();
+    let out = at("out");
+    refuses(2, &["query", &at("plain.ply"), "lemon", "--out", &out], &["plain.ply", "no language"]);
+    refuses(
+        2,
+        &["query", &at("words.ply"), "lemon", "--out", &out],
+        &["words.ply", "no cameras", "--cameras"],
+    );
+    cameras::write_json(at("none.json").as_ref(), &[]).unwrap();
+    let none = at("none.json");
+    refuses(2, &["query", &at("words.ply"), "lemon", "--cameras", &none, "--out", &out], &["no cameras"]);
+    assert!(!Path::new(&out).exists());
+}
