@@ -242,6 +242,7 @@ fn two_objects_are_told_apart_in_every_parameterisation() {
     let zero = LanguageOptions { start: Start::Zero, feature_rate: 7e-3, iterations: 120, ..base.clone() };
     let cases = [
         ("lifted", base.clone()),
+        ("lifted and left", LanguageOptions { iterations: 0, ..base.clone() }),
         ("from zero", zero),
         ("per level", LanguageOptions { per_level: true, ..base.clone() }),
         ("detached", LanguageOptions { detach_geometry: true, ..base }),

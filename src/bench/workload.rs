@@ -104,6 +104,9 @@ fn read_camera(path: &Path) -> Result<Camera> {
     let bad = |what: String| {
         Error::input(format!("{}: {what}; give the camera with --camera FILE", path.display()))
     };
+    if !path.is_file() {
+        return Err(bad("there is no such file".into()));
+    }
     let value: serde_json::Value = files::read_json(path, "give the camera with --camera FILE")?;
     if value.get("w2c").is_none() {
         return cameras::read(path)?.into_iter().next().ok_or_else(|| bad("no camera in it".into()));

@@ -195,7 +195,7 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Cal
         iterations: count(o.iterations),
         language_iterations,
         sh_degree,
-        method,
+        method: Some(method),
         feature_dim: if o.feature_dim == 0 {
             compat::feature_dim(compat, method)
         } else {

@@ -174,7 +174,7 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         iterations: args.iterations,
         language_iterations: args.language_iterations,
         sh_degree: args.making.sh_degree,
-        method,
+        method: Some(method),
         feature_dim,
         per_level,
         compat: None,
@@ -205,7 +205,7 @@ fn joining(args: &RunArgs, scene: &Path, installed: &Inventory) -> Result<RunPla
         feature_dim: made.feature_dim().unwrap_or(plan.feature_dim),
         per_level: made.per_level(),
         // Steps that are asked for are done.
-        method: if plan.method == &SPARSELGS { plan.method } else { made.method()? },
+        method: Some(if plan.method() == &SPARSELGS { plan.method() } else { made.method()? }),
         queries: made.queries(&plan.queries),
         ..plan
     }
@@ -256,9 +256,9 @@ mod tests {
     fn defaults_are_the_built_in_models() {
         let plan = plan(&[]).unwrap();
         assert_eq!(plan.out, Path::new("out/breakfast"));
+        assert_eq!(plan.method().name, "lift");
         assert_eq!((plan.init, plan.masks), (named("sfm"), named("graph")));
         assert_eq!((plan.features, plan.feature_dim), (named("words"), 16));
-        assert_eq!(plan.method.name, "lift");
         assert_eq!((plan.matcher, plan.sam), (named("xfeat"), SamOptions::default()));
     }
 

@@ -258,6 +258,7 @@ fn train_index_heads(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::run::RunPlan;
 
     #[test]
     fn features_are_trained_by_default_where_something_of_the_training_is_asked_for() {
@@ -267,6 +268,12 @@ mod tests {
         assert_eq!(name(Some(Preset::Paper), None, false), "sparselgs");
         assert_eq!(name(None, Some(30), false), "sparselgs");
         assert_eq!(name(None, None, true), "sparselgs");
+        let plan = RunPlan { preset: Some(Preset::Paper), ..RunPlan::default() };
+        assert_eq!(
+            plan.recipe().language,
+            LanguageFit::Train,
+            "a plan that names no method follows its preset"
+        );
     }
 
     #[test]

@@ -58,8 +58,8 @@ pub struct RunPlan {
     pub language_iterations: Option<usize>,
     /// SH degree of the colours, 0–3; `None` = what the photos support, and 0 in the paper's preset.
     pub sh_degree: Option<u32>,
-    /// What gets language onto the splats; [`Method::by_default`] unless another is wanted.
-    pub method: &'static Method,
+    /// What gets language onto the splats; `None` = [`Method::by_default`].
+    pub method: Option<&'static Method>,
     /// Length of the codes.
     pub feature_dim: usize,
     /// One model per level.
@@ -102,7 +102,7 @@ impl Default for RunPlan {
             iterations: None,
             language_iterations: None,
             sh_degree: None,
-            method: Method::by_default(None, None, false),
+            method: None,
             feature_dim: FEATURE_DIM,
             per_level: false,
             compat: None,
@@ -126,9 +126,15 @@ impl RunPlan {
         }
     }
 
+    /// The method that is asked for, or else the one that suits the plan.
+    pub fn method(&self) -> &'static Method {
+        let suiting = || Method::by_default(self.preset, self.language_iterations, self.per_level);
+        self.method.unwrap_or_else(suiting)
+    }
+
     /// What the method does, with the plan's code length.
     pub fn recipe(&self) -> Recipe {
-        let recipe = self.method.recipe;
+        let recipe = self.method().recipe;
         let align = self.compat.map_or(recipe.align, |c| c.align);
         Recipe { feature_dim: self.feature_dim, align, ..recipe }
     }

@@ -1,6 +1,7 @@
 //! Records of a finished run: `run.json`, the report and the closing table, made from [`RunOutcome`].
 use super::answer::Answers;
 use super::outcome::RunOutcome;
+use super::plan::RunPlan;
 use crate::Result;
 use crate::fit::{self, CurvePoint, FitStats, LanguagePoint, ViewDependence};
 use crate::photo::Photo;
@@ -14,9 +15,10 @@ use std::path::Path;
 /// `run.json`.
 pub fn run_record(o: &RunOutcome) -> RunRecord {
     let used = |m: &&crate::infer::ModelStatus| m.installed;
+    let plan = RunPlan { method: Some(o.plan.method()), ..o.plan.clone() };
     RunRecord {
         program: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
-        config: json!({ "plan": o.plan, "preset": o.preset, "provider": o.provider }),
+        config: json!({ "plan": plan, "preset": o.preset, "provider": o.provider }),
         seed: o.plan.seed,
         device: o.device.name.clone(),
         device_is_cpu: o.device.is_cpu,

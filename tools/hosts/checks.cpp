@@ -62,6 +62,10 @@ static void training(SvkContext *context, int count, char **paths) {
     options.sh_degree = 5;
     EXPECT(svk_train(context, photos.data(), photos.size(), &options, &scene) == SVK_STATUS_ARGUMENT);
     EXPECT(says(last_error(svk_context_error, context), "sh_degree"));
+    options.sh_degree = SVK_SH_DEGREE_AUTO;
+    options.depth_prior = "no such network";
+    EXPECT(svk_train(context, photos.data(), photos.size(), &options, &scene) == SVK_STATUS_INPUT);
+    EXPECT(says(last_error(svk_context_error, context), "depth-prior"));
     photos[0].encoded = reinterpret_cast<const uint8_t *>("both");
     EXPECT(svk_train(context, photos.data(), photos.size(), nullptr, &scene) == SVK_STATUS_ARGUMENT);
     photos[0].path = nullptr;
