@@ -111,8 +111,14 @@ fn parse(bytes: &[u8], folder: &Path) -> Result<Splats, String> {
         Some(scene) => scene.nodes.clone(),
         // Without scenes every node that no other has is one.
         None => {
-            let below = |i: &usize| root.nodes.iter().any(|n| n.children.contains(i));
-            (0..root.nodes.len()).filter(|i| !below(i)).collect()
+            let mut below = vec![false; root.nodes.len()];
+            for child in root.nodes.iter().flat_map(|n| &n.children) {
+                // One that is not there is refused where its parent is visited.
+                if let Some(below) = below.get_mut(*child) {
+                    *below = true;
+                }
+            }
+            (0..root.nodes.len()).filter(|i| !below[*i]).collect()
         }
     };
     // Nodes to visit, each with the transformation above it; in a tree no node comes twice.
