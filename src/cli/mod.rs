@@ -17,6 +17,7 @@ mod progress;
 mod query;
 mod render;
 mod run;
+mod serve;
 mod shell;
 mod train;
 mod view;
