@@ -134,7 +134,11 @@ impl Method {
     /// What a run does that is asked for no method: training gains nothing over lifted features
     /// (docs/experiments.md#measured-lifting), so it trains them only where it is asked for something of the training: the
     /// paper's preset, a number of steps, models of their own per level.
-    pub fn by_default(preset: Option<Preset>, language_iterations: Option<usize>, per_level: bool) -> &'static Method {
+    pub fn by_default(
+        preset: Option<Preset>,
+        language_iterations: Option<usize>,
+        per_level: bool,
+    ) -> &'static Method {
         let trains = preset == Some(Preset::Paper) || language_iterations.is_some() || per_level;
         if trains { &SPARSELGS } else { &LIFT }
     }
