@@ -1,4 +1,11 @@
-//! Files that are whole or not there: a checksum in front, written beside their place and renamed into it.
+//! Files that are whole or not there: written beside their place and renamed into it, some with a checksum in front; and the rule
+//! for what may be written over.
+mod partial;
+mod place;
+
+pub(crate) use partial::{Partial, leftovers, remove_any, remove_unfinished};
+pub(crate) use place::{Kind, check_place};
+
 use sha2::{Digest, Sha256};
 use std::collections::HashMap;
 use std::fmt::Write as _;

@@ -11,7 +11,7 @@ use std::path::Path;
 /// Each folder, or file beside them, and those that it uses; all of them stand above it.
 const FOLDERS: &[(&str, &str)] = &[
     ("error", ""),
-    ("files", ""),
+    ("files", "error"),
     ("math", ""),
     ("preset", ""),
     ("checkpoint", "error files"),
@@ -20,7 +20,7 @@ const FOLDERS: &[(&str, &str)] = &[
     ("gpu", "error files"),
     ("pass", "error math scene gpu"),
     ("photo", "error progress scene"),
-    ("format", "error scene pass photo"),
+    ("format", "error files scene pass photo"),
     ("infer", "error files math progress scene photo format"),
     ("fetch", "error files progress infer"),
     ("pose", "error math preset progress scene gpu pass photo infer"),
@@ -42,7 +42,7 @@ const FOLDERS: &[(&str, &str)] = &[
     ("capi", "error preset progress scene gpu pass photo infer pose query run"),
     (
         "cli",
-        "error preset progress scene gpu photo format infer fetch language query report synth pipeline run ablate bench",
+        "error files preset progress scene gpu photo format infer fetch language query report synth pipeline run ablate bench",
     ),
 ];
 

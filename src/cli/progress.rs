@@ -110,7 +110,7 @@ impl Progress for JsonLines {
 pub fn stop_on_signal() {
     let outcome = ctrlc::set_handler(|| {
         if STOPPED.swap(true, Ordering::SeqCst) {
-            crate::format::remove_unfinished();
+            crate::files::remove_unfinished();
             std::process::exit(130);
         }
         if !as_json() {
