@@ -45,6 +45,20 @@ pub struct TruthFrame {
     pub lens: Option<Lens>,
 }
 
+impl TruthFrame {
+    /// Refuses a file of another size than the frame's.
+    fn fits(&self, path: &Path, (width, height): (usize, usize)) -> Result<()> {
+        let (w, h) = (self.camera.width as usize, self.camera.height as usize);
+        if (width, height) == (w, h) {
+            return Ok(());
+        }
+        Err(Error::input(format!(
+            "{}: {width} × {height} pixels, the frame has {w} × {h}; give one of its size, or correct ground_truth.json",
+            path.display()
+        )))
+    }
+}
+
 /// Labels of frames in another layout than `masks/<stem>.png`.
 pub trait ObjectMaps: std::fmt::Debug + Send + Sync {
     /// Object index per pixel of a frame, [H, W] of the label's own size; `None` where the frame has no labels.
@@ -108,11 +122,45 @@ impl GroundTruth {
             let pose = Pose { rotation, translation: column(3) };
             let camera =
                 Camera { name: f.file.clone(), width, height, fx: f.fx, fy: f.fy, cx: f.cx, cy: f.cy, pose };
-            TruthFrame { file: f.file, stem, split: f.split, camera, lens: f.lens }
+            // The matrix stays as it is written: scores are finer than its printed digits.
+            camera.clone().checked()?;
+            Ok(TruthFrame { file: f.file, stem, split: f.split, camera, lens: f.lens })
         };
-        let frames = file.frames.into_iter().map(frame).collect();
+        let frames = file.frames.into_iter().map(frame).collect::<Result<_, String>>();
+        let frames = frames.map_err(|e| Error::input(format!("{}: {e}; correct it", path.display())))?;
         let up = file.up.map(DVec3::normalize_or_zero);
         Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, up, frames, maps: None })
+    }
+
+    /// Refuses files that are missing or do not fit the frames, before any work is done with them: photos, masks and depth of
+    /// another size, and with `masks`, where the set has labels, masks that are not there.
+    pub fn check(&self, masks: bool) -> Result<()> {
+        let labelled = self.maps.is_none() && !self.labels.is_empty();
+        for frame in &self.frames {
+            let photo = self.folder.join(&frame.file);
+            frame.fits(&photo, size_of(&photo)?)?;
+            let mask = self.mask_path(frame);
+            if labelled && mask.exists() {
+                frame.fits(&mask, size_of(&mask)?)?;
+            } else if labelled && masks {
+                return Err(Error::input(format!(
+                    "{}: the mask is missing; restore it, or take the labels out of ground_truth.json to score without masks",
+                    mask.display()
+                )));
+            }
+            if let Some(depth) = self.depth(frame)? {
+                frame.fits(&self.depth_path(frame), (depth.width, depth.height))?;
+            }
+        }
+        Ok(())
+    }
+
+    fn mask_path(&self, frame: &TruthFrame) -> PathBuf {
+        self.folder.join("masks").join(format!("{}.png", frame.stem))
+    }
+
+    fn depth_path(&self, frame: &TruthFrame) -> PathBuf {
+        self.folder.join("depth").join(format!("{}.npz", frame.stem))
     }
 
     /// The photo of a frame.
@@ -129,7 +177,7 @@ impl GroundTruth {
             let (width, height) = (frame.camera.width as usize, frame.camera.height as usize);
             return Ok(maps.objects(&frame.stem)?.map(|plane| resampled(&plane, width, height)));
         }
-        let path = self.folder.join("masks").join(format!("{}.png", frame.stem));
+        let path = self.mask_path(frame);
         if self.labels.is_empty() || !path.exists() {
             return Ok(None);
         }
@@ -140,7 +188,7 @@ impl GroundTruth {
 
     /// Camera z per pixel, 0 = unknown, if the set has depth.
     pub fn depth(&self, frame: &TruthFrame) -> Result<Option<Plane<f32>>> {
-        let path = self.folder.join("depth").join(format!("{}.npz", frame.stem));
+        let path = self.depth_path(frame);
         if !path.exists() {
             return Ok(None);
         }
@@ -182,7 +230,15 @@ fn resampled(plane: &Plane<u32>, width: usize, height: usize) -> Plane<u32> {
     Plane { width, height, data: (0..width * height).map(pixel).collect() }
 }
 
+fn size_of(path: &Path) -> Result<(usize, usize)> {
+    let (width, height) = image::image_dimensions(path).map_err(unreadable(path))?;
+    Ok((width as usize, height as usize))
+}
+
+fn unreadable(path: &Path) -> impl Fn(image::ImageError) -> Error {
+    move |e| Error::input(format!("{}: cannot be read as an image: {e}", path.display()))
+}
+
 fn open(path: &Path) -> Result<image::DynamicImage> {
-    image::open(path)
-        .map_err(|e| Error::input(format!("{}: cannot be read as an image: {e}", path.display())))
+    image::open(path).map_err(unreadable(path))
 }
