@@ -43,7 +43,10 @@ pub fn main() -> ExitCode {
         *provider = cli.provider;
     }
     match execute(command) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(()) => {
+            progress::release();
+            ExitCode::SUCCESS
+        }
         Err(error) => {
             progress::print_error(&one_line(&error.to_string()), error.exit_code());
             ExitCode::from(error.exit_code())
