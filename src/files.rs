@@ -3,7 +3,9 @@
 mod partial;
 mod place;
 
-pub(crate) use partial::{Partial, leftovers, remove_any, remove_unfinished};
+pub(crate) use partial::Partial;
+#[cfg(feature = "cli")]
+pub(crate) use partial::{leftovers, remove_any, remove_unfinished};
 pub(crate) use place::{Kind, check_place};
 
 use sha2::{Digest, Sha256};

@@ -40,6 +40,7 @@ impl Partial {
     }
 
     /// A free name inside of `folder`, which is made where it is missing.
+    #[cfg(feature = "cli")]
     pub fn inside(folder: &Path) -> std::io::Result<Partial> {
         Partial::named(folder, OsString::new(), None)
     }
@@ -105,6 +106,7 @@ pub fn remove_any(path: &Path) -> std::io::Result<()> {
 
 /// Removes everything unfinished of this process, for exits that run no destructors; whether nothing that a user asked for had been
 /// finished before.
+#[cfg(feature = "cli")]
 pub fn remove_unfinished() -> bool {
     unfinished().drain(..).for_each(|entry| remove(&entry));
     !FINISHED.load(Ordering::SeqCst)

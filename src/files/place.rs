@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 /// What is to be written at a place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// One file.
+    /// One file. Only commands are told to write one: the library writes scenes.
+    #[cfg_attr(not(feature = "cli"), allow(dead_code))]
     File,
     /// A folder of files.
     Folder,
