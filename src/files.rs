@@ -1,5 +1,13 @@
-//! Files read within bounds, and files that are whole or not there: a checksum in front, written beside their place and
-//! renamed into it.
+//! Files read within bounds; files that are whole or not there: written beside their place and renamed into it, some with a
+//! checksum in front; and the rule for what may be written over.
+mod partial;
+mod place;
+
+pub(crate) use partial::Partial;
+#[cfg(feature = "cli")]
+pub(crate) use partial::{leftovers, remove_any, remove_unfinished};
+pub(crate) use place::{Kind, check_place};
+
 use crate::{Error, Result};
 use serde::Deserialize;
 use sha2::{Digest, Sha256};

@@ -139,7 +139,7 @@ fn what_cannot_be_measured_is_refused_at_once() {
     refuses(&["bench", "--scene", "no/such/scene"], "no/such/scene");
     refuses(&["bench", "--scene", "x", "--splats", "5"], "--splats");
     refuses(&["bench", "--compare", "missing.json", "missing.json"], "missing.json");
-    refuses(&["bench", "--json", "no/such/folder/x.json"], "--json");
+    refuses(&["bench", "--json", "Cargo.toml/x.json"], "cannot be written");
 }
 
 #[test]

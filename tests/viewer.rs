@@ -5,169 +5,21 @@ mod browser;
 mod fixture;
 
 use browser::Page;
-use fixture::{camera, data, truth};
+use fixture::view::{LABELS, Server, breakfast, masks_of};
+use fixture::{data, truth};
 use serde_json::{Value, json};
-use splatvk::format::npy::{self, NpyArray};
-use splatvk::format::scene_dir::{self, Contents};
+use splatvk::format::npy;
+use splatvk::format::scene_dir;
 use splatvk::gpu::Device;
 use splatvk::pass::metrics::psnr;
-use splatvk::pass::seeded::Random;
-use splatvk::photo::{self, Photo};
 use splatvk::query::{QueryOptions, instances::splat_codes};
 use splatvk::report::viewer::Scene3d;
 use splatvk::run::ask::QueryScene;
 use splatvk::run::metric::{self, Length};
 use splatvk::run::sources;
 use splatvk::run::view::Viewer;
-use splatvk::scene::{Codebook, LanguageField, LevelField, Plane, RgbImage, Seen, Splats, Up, World};
-use std::io::{BufRead, BufReader, Read, Write};
-use std::net::TcpStream;
+use splatvk::scene::{LanguageField, Plane, RgbImage, Seen};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
-
-/// Objects of breakfast.
-const LABELS: usize = 11;
-/// Width of the language's embeddings: one coordinate per object and one for the canonical phrases.
-const WIDTH: usize = LABELS + 1;
-
-fn photo_of(frame: &Value) -> Photo {
-    photo::load(&data("breakfast").join(frame["file"].as_str().unwrap())).unwrap()
-}
-
-fn masks_of(stem: &str) -> Plane<i32> {
-    let mask = image::open(data(&format!("breakfast/masks/{stem}.png"))).unwrap().to_luma8();
-    let (width, height) = (mask.width() as usize, mask.height() as usize);
-    Plane { width, height, data: mask.into_raw().into_iter().map(i32::from).collect() }
-}
-
-/// The true direction up of breakfast.
-fn world() -> World {
-    let up = Up { direction: glam::DVec3::Z, sigma_degrees: 0.1, evidence: Vec::new() };
-    World { up: Some(up), ..World::default() }
-}
-
-/// Breakfast as splats, straight from the true depth, photos and masks of two views: every fourth pixel is one splat of
-/// random shape whose colour changes a little with the direction, and whose code says which object it is.
-fn breakfast(folder: &Path) -> PathBuf {
-    let mut random = Random::new(7);
-    let (mut splats, mut labels) = (Splats { sh_degree: 3, ..Splats::default() }, Vec::new());
-    let (mut cameras, mut photos) = (Vec::new(), Vec::new());
-    for frame in truth()["frames"].as_array().unwrap().iter().step_by(2).take(2) {
-        let photo = photo_of(frame);
-        let camera = camera(frame, &photo.stem);
-        let depth =
-            npy::read_npz(data(&format!("breakfast/depth/{}.npz", photo.stem))).unwrap()["depth"].to_f32();
-        let mask = masks_of(&photo.stem);
-        for (x, y) in (2..480).step_by(4).flat_map(|y| (2..640).step_by(4).map(move |x| (x, y))) {
-            let z = f64::from(depth[y * 640 + x]);
-            if z <= 0.0 {
-                continue;
-            }
-            let at = camera.unproject(glam::DVec2::new(x as f64 + 0.5, y as f64 + 0.5), z);
-            splats.means.push(at.as_vec3().to_array());
-            let size = (2.4 * z / camera.fx).ln() as f32;
-            splats.log_scales.push([0, 1, 2].map(|_| size + 0.5 * random.normal(1.0) as f32));
-            splats.quats.push([0; 4].map(|_| random.normal(1.0) as f32));
-            splats.opacity_logits.push(1.0 + random.normal(1.0) as f32);
-            // DC of Kerbl et al. 2023, 0.5 + SH0 · dc = colour; the rest small.
-            splats.sh.extend(photo.image.at(x, y).map(|c| (c - 0.5) / 0.282_094_8));
-            splats.sh.extend((0..45).map(|_| 0.04 * random.normal(1.0) as f32));
-            labels.push(mask.at(x, y));
-        }
-        cameras.push(camera);
-        photos.push(photo);
-    }
-    let unit = |k: usize| (0..16).map(move |i| if i == k { 1.0f32 } else { 0.0 });
-    // The finer level counts the objects backwards, so that mixed-up levels show.
-    let level = |code: &dyn Fn(usize) -> usize| {
-        let object = |k: usize| (0..LABELS).find(|&o| code(o) == k).unwrap();
-        let codebook = Codebook {
-            embedding_dim: WIDTH,
-            code_dim: 16,
-            embeddings: (0..LABELS).flat_map(|k| unit(object(k)).take(WIDTH)).collect(),
-            codes: (0..LABELS).flat_map(unit).collect(),
-            weights: vec![1.0; LABELS],
-            members: vec![vec![]; LABELS],
-            min_chord: 1.4,
-        };
-        let feature = |l: &i32| if *l > 0 { unit(code(*l as usize - 1)) } else { unit(16) };
-        LevelField { codebook, features: labels.iter().flat_map(feature).collect(), ..LevelField::default() }
-    };
-    let levels = vec![level(&|o| LABELS - 1 - o), LevelField::default(), level(&|o| o)];
-    let field = LanguageField { levels, space: "dir".into() };
-    let table = folder.join("texts.npz");
-    let texts: Vec<(String, NpyArray)> = (0..LABELS)
-        .map(|o| (truth()["labels"][(o + 1).to_string()].as_str().unwrap().to_owned(), o))
-        .chain(splatvk::query::CANONICAL_PHRASES.map(|p| (p.to_owned(), LABELS)))
-        .map(|(text, k)| (text, NpyArray::f32(&[WIDTH], unit(k).take(WIDTH).collect())))
-        .collect();
-    let texts: Vec<(&str, &NpyArray)> = texts.iter().map(|(t, a)| (t.as_str(), a)).collect();
-    npy::write_npz(&table, &texts).unwrap();
-    let scene = folder.join("breakfast");
-    std::fs::create_dir(&scene).unwrap();
-    let contents = Contents {
-        splats: &splats,
-        seen: &Seen::default(),
-        cameras: &cameras,
-        world: &world(),
-        photos: &photos,
-        points: None,
-        language: Some(&field),
-        text_embeddings: Some(&table),
-    };
-    scene_dir::write(&scene, &contents).unwrap();
-    scene
-}
-
-/// `splatvk view` and where it is.
-struct Server {
-    child: Child,
-    address: String,
-}
-
-impl Server {
-    fn start(scene: &Path) -> Server {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_splatvk"))
-            .arg("view")
-            .arg(scene)
-            .arg("--json")
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        let told: Value = serde_json::from_str(&line).unwrap();
-        Server { child, address: told["address"].as_str().unwrap().to_owned() }
-    }
-
-    /// Status and body of a request with a header.
-    fn request(&self, method: &str, path: &str, header: &str, body: &str) -> (u16, String) {
-        let host = self.address.trim_start_matches("http://").trim_end_matches('/');
-        let host_line = if header.starts_with("Host") { String::new() } else { format!("Host: {host}\r\n") };
-        let mut stream = TcpStream::connect(host).unwrap();
-        let length = body.len();
-        write!(stream, "{method} {path} HTTP/1.1\r\n{host_line}{header}Content-Length: {length}\r\nConnection: close\r\n\r\n{body}")
-            .unwrap();
-        let mut reply = Vec::new();
-        stream.read_to_end(&mut reply).unwrap();
-        let reply = String::from_utf8_lossy(&reply);
-        let (head, body) = reply.split_once("\r\n\r\n").unwrap();
-        (head.split(' ').nth(1).unwrap().parse().unwrap(), body.to_owned())
-    }
-
-    /// Ctrl-C; the exit code.
-    fn stop(mut self) -> Option<i32> {
-        Command::new("kill").args(["-INT", &self.child.id().to_string()]).status().unwrap();
-        self.child.wait().unwrap().code()
-    }
-}
-
-impl Drop for Server {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
 
 fn to_float(picture: &image::RgbImage) -> RgbImage {
     let data = picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect();
@@ -213,9 +65,8 @@ fn is(mask: &Plane<i32>, object: i32) -> Vec<bool> {
 fn the_served_view_draws_selects_and_answers() {
     let folder = tempfile::tempdir().unwrap();
     let scene = breakfast(folder.path());
-    let server = Server::start(&scene);
-    only_its_own_page_is_answered(&server);
     let Some(chromium) = browser::installed() else { return };
+    let server = Server::start(&scene);
     let mut page = Page::open(&chromium, 960, 720, false);
     page.go(&server.address);
     draws_what_the_engine_draws(&mut page, &scene);
@@ -235,7 +86,8 @@ fn the_served_view_draws_selects_and_answers() {
     let mut phone = Page::open(&chromium, 390, 844, true);
     phone.go(&server.address);
     fits_a_phone(&mut phone);
-    assert_eq!(server.stop(), Some(0), "Ctrl-C is how it ends");
+    let (status, _) = server.stop("-INT");
+    assert_eq!(status.code(), Some(0), "Ctrl-C is how it ends");
 }
 
 /// Keeps a screenshot to look at where `SPLATVK_KEEP` names a folder.
@@ -243,22 +95,6 @@ fn keep(page: &mut Page, name: &str) {
     if let Ok(folder) = std::env::var("SPLATVK_KEEP") {
         std::fs::write(Path::new(&folder).join(name), page.screenshot()).unwrap();
     }
-}
-
-fn only_its_own_page_is_answered(server: &Server) {
-    let ask = |header: &str, text: &str| {
-        server.request("POST", "/query", header, &json!({ "text": text }).to_string())
-    };
-    assert_eq!(server.request("GET", "/", "Host: evil.example\r\n", "").0, 403);
-    assert_eq!(ask("Origin: http://evil.example\r\n", "lemon").0, 403);
-    assert_eq!(server.request("GET", "/../Cargo.toml", "", "").0, 404);
-    assert_eq!(server.request("POST", "/query", "", "lemon").0, 400);
-    let (status, body) = ask("", "unicorn");
-    assert!(status == 422 && body.contains("no text embedding for 'unicorn'"), "{status} {body}");
-    let (status, body) = ask("", "lemon");
-    assert_eq!(status, 200);
-    let answer: Value = serde_json::from_str(body.trim()).unwrap();
-    assert_eq!((&answer["level"], &answer["codes"], &answer["found"]), (&json!(2), &json!([6]), &json!(2)));
 }
 
 fn draws_what_the_engine_draws(page: &mut Page, scene: &Path) {
@@ -544,17 +380,6 @@ fn the_report_of_a_training_shows_its_scene() {
         0
     );
     keep(&mut page, "report.png");
-}
-
-#[test]
-fn a_port_that_is_taken_is_said() {
-    let folder = tempfile::tempdir().unwrap();
-    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-    let port = taken.local_addr().unwrap().port().to_string();
-    let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));
-    let output = command.arg("view").arg(breakfast(folder.path())).args(["--port", &port]).output().unwrap();
-    assert_eq!(output.status.code(), Some(2));
-    assert!(String::from_utf8_lossy(&output.stderr).contains("--port"));
 }
 
 /// The pictures of the README, from a real run: `SPLATVK_SCENE=out/breakfast cargo test --test viewer -- --ignored`.

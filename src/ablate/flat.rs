@@ -14,7 +14,11 @@ use crate::scene::{Camera, Codebook, LanguageField, LevelField, Plane, RgbImage}
 const CELL: usize = 4;
 
 /// One photo as a field of one level, and the code of each pixel.
-fn described(image: &RgbImage, encoder: &SharedEncoder) -> Result<(LanguageField, Vec<Plane<i32>>)> {
+fn described(
+    image: &RgbImage,
+    encoder: &SharedEncoder,
+    progress: &dyn Progress,
+) -> Result<(LanguageField, Vec<Plane<i32>>)> {
     let (columns, rows) = (image.width.div_ceil(CELL), image.height.div_ceil(CELL));
     let cell = |p: usize| (p / image.width / CELL * columns + p % image.width / CELL) as i32;
     let labels = Plane {
@@ -23,7 +27,7 @@ fn described(image: &RgbImage, encoder: &SharedEncoder) -> Result<(LanguageField
         data: (0..image.width * image.height).map(cell).collect(),
     };
     let (embedding_dim, embeddings) =
-        encoder.with(|e| e.embed_regions(image, &labels, columns * rows).map(|f| (e.dim(), f)))?;
+        encoder.with(|e| e.embed_regions(image, &labels, columns * rows, progress).map(|f| (e.dim(), f)))?;
     let codebook = Codebook { embedding_dim, embeddings, ..Codebook::default() };
     let level = LevelField { codebook, ..LevelField::default() };
     Ok((LanguageField { levels: vec![level], space: encoder.space().to_owned() }, vec![labels]))
@@ -44,7 +48,7 @@ pub(super) fn field(
     for (k, frame) in truth.frames.iter().enumerate() {
         progress.check()?;
         let rgb = truth.image(frame)?;
-        let (field, codes) = described(&rgb, encoder)?;
+        let (field, codes) = described(&rgb, encoder, progress)?;
         let mut answers = Vec::new();
         for (label, query) in labels.iter().zip(queries) {
             let relevancy = field_relevancy(&field, query)?;
@@ -79,7 +83,7 @@ pub(super) fn published(
     for (k, view) in views.iter().enumerate() {
         progress.check()?;
         let Some(frame) = data.truth.frames.iter().find(|f| f.stem == view.stem) else { continue };
-        let (field, codes) = described(&data.truth.image(frame)?, encoder)?;
+        let (field, codes) = described(&data.truth.image(frame)?, encoder, progress)?;
         let scores = CodeScores::new(&field, &asked)?;
         protocol.add(k, &DecodedView { codes: &codes, scores: &scores })?;
         progress.step(k as u64 + 1, "");
@@ -106,7 +110,13 @@ mod tests {
         fn dim(&self) -> usize {
             3
         }
-        fn embed_regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
+        fn embed_regions(
+            &mut self,
+            image: &RgbImage,
+            labels: &Plane<i32>,
+            count: usize,
+            _: &dyn Progress,
+        ) -> Result<Vec<f32>> {
             let mut rows = vec![0.0; 3 * count];
             for (pixel, label) in image.data.iter().zip(&labels.data) {
                 (0..3).for_each(|c| rows[3 * *label as usize + c] += pixel[c]);

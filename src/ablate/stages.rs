@@ -113,16 +113,16 @@ impl Stage for EncoderEmbeddings {
         format!("{:?} {}", self.truth.folder, self.encoder.identity())
     }
 
-    fn run(self, (placed,): (&PlacedPhotos,), _: &Context) -> Result<ObjectEmbeddings> {
+    fn run(self, (placed,): (&PlacedPhotos,), context: &Context) -> Result<ObjectEmbeddings> {
         let mut sums: Option<Sums> = None;
         for (frame, photo) in frames_of(&self.truth, &placed.photos)?.into_iter().zip(&placed.photos) {
             let Some(objects) = self.truth.objects(frame)? else { continue };
             let top = self.truth.labels.keys().max().map_or(0, |k| *k as usize);
             let data = objects.data.iter().map(|&o| o as i32).collect();
             let labels = Plane { width: objects.width, height: objects.height, data };
-            let (dim, rows) = self
-                .encoder
-                .with(|e| e.embed_regions(&photo.image, &labels, top + 1).map(|rows| (e.dim(), rows)))?;
+            let (dim, rows) = self.encoder.with(|e| {
+                e.embed_regions(&photo.image, &labels, top + 1, context.progress).map(|rows| (e.dim(), rows))
+            })?;
             let sums = sums.get_or_insert_with(|| Sums::new(dim));
             for (label, row) in rows.chunks_exact(dim).enumerate() {
                 sums.add(label as u32, row, 1.0);

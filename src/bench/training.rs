@@ -56,7 +56,15 @@ pub fn with_features(
         check_every: 0,
         ..LanguageOptions::preset(Preset::Default)
     };
-    let mut run = LanguageRun::new(device, &target, &cameras, &workload.splats, &fields, &options)?;
+    let mut run = LanguageRun::new(
+        device,
+        &target,
+        &cameras,
+        &workload.splats,
+        &fields,
+        &options,
+        &crate::progress::Silent,
+    )?;
     run.set_features(&seeded::features(workload.splats.len(), features, 0))?;
     let mut section = Section::new(format!("{COLOUR}, {features} features"), workload.describe(features));
     measure(device, &mut run, limits, &mut section)?;

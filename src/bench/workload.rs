@@ -76,7 +76,7 @@ impl Workload {
     /// For other programs: `scene.ply` (INRIA fields), `scene.json` (pinhole camera, world → camera rows) and
     /// `render.npy` ([H, W, 3] f32, on black), what they should see.
     pub fn write(&self, device: &Device, folder: &Path) -> Result<[PathBuf; 3]> {
-        create_folder(folder).map_err(|e| Error::input(format!("{e}; choose another --write-scene")))?;
+        create_folder(folder)?;
         let files = ["scene.ply", "scene.json", "render.npy"].map(|name| folder.join(name));
         ply::write_splats(&files[0], &self.splats, ply::PlyOptions::default())?;
         let (c, r) = (&self.camera, &self.camera.pose.rotation);

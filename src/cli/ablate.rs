@@ -1,5 +1,6 @@
 //! `splatvk ablate`
 use super::args::{AblateArgs, LayoutArg};
+use super::outputs::{check_file, write_file};
 use super::plan::existing;
 use super::print::{print, print_json};
 use super::progress;
@@ -7,7 +8,8 @@ use crate::ablate::{
     self, DataSet, Finished, FinishedTable, Layout, Measurement, PaperSet, Plan, Regions, Sources, TABLES,
     Table,
 };
-use crate::format::{create_folder, write_json, write_whole_file};
+use crate::files::{Kind, check_place};
+use crate::format::write_json;
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::installed::{Inventory, inventory};
@@ -26,7 +28,9 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
     let layout = one_layout(&sets)?;
     let paper = PaperSet::of(layout, sets.iter());
     let out = args.out.clone().unwrap_or_else(|| default_out(&sets));
-    create_folder(&out).map_err(|e| Error::input(format!("{e}; choose another --out")))?;
+    // What a report says of an earlier run is its own to go on with.
+    check_place(&out, Kind::Folder, args.force || (args.resume && out.join(REPORT).is_file()))?;
+    check_file(&out.join(REPORT), true)?;
     let earlier = if args.resume { earlier(&out.join(REPORT))? } else { Vec::new() };
     let device = Device::open(args.device.device.as_deref())?;
     let (clock, progress) = (Instant::now(), progress::reporter());
@@ -88,13 +92,15 @@ impl Report<'_> {
     }
 
     fn write(&self, out: &Path) -> Result<()> {
-        let text = |file: &Path, text: String| std::fs::write(file, text).map_err(Error::unwritable(file));
+        let text = |file: &Path, text: String| {
+            write_file(file, true, |partial| std::fs::write(partial, text).map_err(Error::unwritable(file)))
+        };
         for table in self.begun() {
             let file = |extension: &str| out.join(format!("{}.{extension}", table.table.name));
             text(&file("txt"), table.text())?;
             text(&file("svg"), table.svg())?;
         }
-        write_whole_file(&out.join(REPORT), |file| write_json(file, &self.json()))
+        write_file(&out.join(REPORT), true, |file| write_json(file, &self.json()))
     }
 }
 

@@ -174,6 +174,9 @@ pub struct RenderArgs {
     /// What to write
     #[arg(long, value_enum, value_delimiter = ',', default_value = "rgb")]
     pub channels: Vec<Channel>,
+    /// Write over what is there: ordinary files of the same names
+    #[arg(long)]
+    pub force: bool,
     /// How to write it
     #[arg(long = "format", value_enum, value_delimiter = ',', default_value = "png")]
     pub formats: Vec<ImageFormat>,
@@ -196,6 +199,9 @@ pub struct QueryArgs {
     /// Folder for heat maps and masks
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// Write over what is there: ordinary files of the same names
+    #[arg(long)]
+    pub force: bool,
     /// Also write the splats that each text means, as TEXT/splats.ply
     #[arg(long)]
     pub splats: bool,
@@ -249,6 +255,9 @@ pub struct EvalArgs {
     /// Write every rendered view and predicted mask here
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
+    /// Write over what is there: ordinary files of the same names
+    #[arg(long)]
+    pub force: bool,
     /// What is read and how it is scored
     #[arg(long, value_enum, default_value = "field")]
     pub protocol: ProtocolArg,
@@ -321,6 +330,10 @@ pub struct DoctorArgs {
 /// `splatvk clean`
 #[derive(Debug, Args)]
 pub struct CleanArgs {
+    /// Folders in which, and in whose folders, commands that were killed may have left files they did not finish; looked into
+    /// besides the current folder and out/
+    #[arg(value_name = "DIR")]
+    pub folders: Vec<PathBuf>,
     /// Folder of the models
     #[arg(long, value_name = "DIR")]
     pub models: Option<PathBuf>,
@@ -345,6 +358,9 @@ pub struct CompletionsArgs {
 pub struct ManualsArgs {
     /// Folder for splatvk.1, splatvk-run.1, ...
     pub out: PathBuf,
+    /// Write over what is there: ordinary files of the same names
+    #[arg(long)]
+    pub force: bool,
 }
 
 #[cfg(test)]

@@ -1,7 +1,8 @@
 //! `splatvk bench`
 use super::args::{BenchArgs, BenchPart};
 use super::models::checked;
-use super::print::print;
+use super::outputs::{WrittenFiles, check_file, write_file};
+use super::print::{listing, print};
 use super::progress;
 use super::scene;
 use crate::bench::{self, Bench, BenchReport, Budget, Workload, compare};
@@ -12,7 +13,6 @@ use crate::infer::installed::inventory;
 use crate::infer::{RegionEncoder, Registry};
 use crate::run::encoder;
 use crate::{Error, Result};
-use std::path::Path;
 
 pub fn bench(args: &BenchArgs) -> Result<()> {
     if let Some([a, b]) = args.compare.as_deref() {
@@ -21,8 +21,9 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     let budget = check(args)?;
     if let Some(folder) = &args.write_scene {
         let workload = workload(args)?;
-        let files = workload.write(&Device::open(args.device.as_deref())?, folder)?;
-        return print(&files.map(|f| format!("{}\n", f.display())).concat());
+        let out = WrittenFiles::open(folder, args.force)?;
+        workload.write(&Device::open(args.device.as_deref())?, out.folder())?;
+        return listing(&out.keep()?, false);
     }
     let has = |part| args.parts.contains(&part);
     if has(BenchPart::Cameras) {
@@ -41,7 +42,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     let workload =
         if has(BenchPart::Training) || !args.sweep.is_empty() { Some(workload(args)?) } else { None };
     let asked = if has(BenchPart::Query) { Some(scene_and_encoder(args)?) } else { None };
-    writable(args.json.as_deref())?;
+    writable(args)?;
     let device = Device::open(args.device.as_deref())?;
     let mut bench = Bench::new(&device, budget)?;
     if let Some(workload) = &workload {
@@ -59,9 +60,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         let field = scene.language.ok_or_else(|| Error::work("the scene lost its language"))?;
         bench.query((&scene.splats, field, &scene.cameras), encoder, &args.query)?;
     }
-    if let Some(file) = &args.json {
-        write_json(file, &bench.report)?;
-    }
+    keep(args, &bench.report)?;
     print(&bench.report.table())
 }
 
@@ -142,15 +141,14 @@ fn of_data(args: &BenchArgs, part: &str) -> Result<Registry> {
             "bench {part}: give folders with ground_truth.json with --data DIR..."
         )));
     }
-    writable(args.json.as_deref())?;
+    writable(args)?;
     args.registry()
 }
 
 /// Writes the report where `--json` says.
 fn keep(args: &BenchArgs, report: &impl serde::Serialize) -> Result<()> {
     let Some(file) = &args.json else { return Ok(()) };
-    let value = serde_json::to_value(report).map_err(|e| Error::work(format!("bench report: {e}")))?;
-    write_json(file, &value)
+    write_file(file, args.force, |partial| write_json(partial, report))
 }
 
 /// The scene and the text encoder of its space.
@@ -168,9 +166,6 @@ fn scene_and_encoder(args: &BenchArgs) -> Result<(scene_dir::Scene, Box<dyn Regi
 }
 
 /// Finds out before the measurements take their time whether the result can be kept.
-fn writable(file: Option<&Path>) -> Result<()> {
-    let Some(file) = file else { return Ok(()) };
-    std::fs::File::create(file).map(drop).map_err(|e| {
-        Error::input(format!("--json {}: cannot write there ({e}); choose another file", file.display()))
-    })
+fn writable(args: &BenchArgs) -> Result<()> {
+    args.json.as_deref().map_or(Ok(()), |file| check_file(file, args.force))
 }

@@ -1,10 +1,11 @@
 //! `splatvk eval`
 use super::args::{EvalArgs, ProtocolArg};
+use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
 use super::progress;
 use super::scene;
 use crate::format::scene_dir::Scene;
-use crate::format::{cameras, create_folder, picture, write_json};
+use crate::format::{cameras, picture, write_json};
 use crate::gpu::Device;
 use crate::query::TextQuery;
 use crate::query::eval::{EvalReport, Evaluation, GroundTruth};
@@ -18,27 +19,30 @@ use crate::run::view::Viewer;
 use crate::scene::LanguageField;
 use crate::{Error, Result};
 use serde::Serialize;
-use std::path::Path;
 
 pub fn eval(args: &EvalArgs) -> Result<()> {
+    let mut out = args.out.as_deref().map(|out| WrittenFiles::open(out, args.force)).transpose()?;
     let scene = scene::load(&args.scene)?;
-    if let Some(out) = &args.out {
-        create_folder(out).map_err(|e| Error::input(format!("{e}; choose another --out")))?;
-    }
     match args.protocol {
         ProtocolArg::Field if args.cameras.is_some() => Err(Error::input(
             "--cameras: with --protocol field the cameras stand in ground_truth.json; leave it out",
         )),
         ProtocolArg::Field => {
-            let found = field(&scene, args)?;
-            report(&found, args, Some(found.text()))
+            let found = field(&scene, args, out.as_ref())?;
+            report(&found, args, out, Some(found.text()))
         }
         _ if args.refine_views || args.text || args.compat.is_some() => Err(Error::input(
             "--refine-views, --text and --compat belong to --protocol field; leave them out",
         )),
-        ProtocolArg::Lerf => report(&published(ProtocolKind::Lerf, &scene, args)?, args, None),
-        ProtocolArg::Ovs => report(&published(ProtocolKind::Ovs, &scene, args)?, args, None),
-        ProtocolArg::Scannet => report(&published(ProtocolKind::ScanNet, &scene, args)?, args, None),
+        ProtocolArg::Lerf => {
+            report(&published(ProtocolKind::Lerf, &scene, args, out.as_mut())?, args, out, None)
+        }
+        ProtocolArg::Ovs => {
+            report(&published(ProtocolKind::Ovs, &scene, args, out.as_mut())?, args, out, None)
+        }
+        ProtocolArg::Scannet => {
+            report(&published(ProtocolKind::ScanNet, &scene, args, out.as_mut())?, args, out, None)
+        }
     }
 }
 
@@ -54,9 +58,12 @@ fn ask(scene: &Scene, texts: &[String], args: &EvalArgs) -> Result<Vec<TextQuery
     Ok(queries)
 }
 
-fn field(scene: &Scene, args: &EvalArgs) -> Result<EvalReport> {
+fn field(scene: &Scene, args: &EvalArgs, out: Option<&WrittenFiles>) -> Result<EvalReport> {
     let truth = GroundTruth::read(&args.ground_truth)?;
-    let mut evaluation = Evaluation::new(truth, &scene.cameras, args.out.as_deref())?;
+    if let Some(doubt) = truth.check(scene.language.is_some())? {
+        progress::print_warning(&doubt);
+    }
+    let mut evaluation = Evaluation::new(truth, &scene.cameras, out.map(WrittenFiles::folder))?;
     evaluation.add_world(&scene.world);
     let phrases: Vec<String> = evaluation.phrases().into_iter().map(|p| p.1).collect();
     let queries = ask(scene, &phrases, args)?;
@@ -75,7 +82,12 @@ fn field(scene: &Scene, args: &EvalArgs) -> Result<EvalReport> {
     )
 }
 
-fn published(kind: ProtocolKind, scene: &Scene, args: &EvalArgs) -> Result<protocol::ProtocolReport> {
+fn published(
+    kind: ProtocolKind,
+    scene: &Scene,
+    args: &EvalArgs,
+    mut out: Option<&mut WrittenFiles>,
+) -> Result<protocol::ProtocolReport> {
     let Some(field) = &scene.language else {
         return Err(Error::input(format!(
             "{}: the scene has no language; make one with splatvk run",
@@ -95,7 +107,7 @@ fn published(kind: ProtocolKind, scene: &Scene, args: &EvalArgs) -> Result<proto
         progress.check()?;
         let decoded = viewer.view(&view.camera)?;
         let masks = protocol.add(i, &DecodedView { codes: &decoded.codes, scores: &scores })?;
-        if let Some(out) = &args.out {
+        if let Some(out) = out.as_deref_mut() {
             write(out, &view.stem, &decoded.rendered.rgb, masks)?;
         }
         progress.step(i as u64 + 1, "");
@@ -104,23 +116,26 @@ fn published(kind: ProtocolKind, scene: &Scene, args: &EvalArgs) -> Result<proto
     Ok(protocol.finish())
 }
 
-fn write(out: &Path, stem: &str, rgb: &crate::scene::RgbImage, masks: Masks) -> Result<()> {
+fn write(out: &mut WrittenFiles, stem: &str, rgb: &crate::scene::RgbImage, masks: Masks) -> Result<()> {
     let name = format!("{stem}.png");
-    create_folder(&out.join("renders"))?;
-    picture::write_png(&out.join("renders").join(&name), rgb)?;
+    picture::write_png(&out.file(&format!("renders/{name}"))?, rgb)?;
     for (phrase, mask) in masks {
-        let folder = out.join("masks").join(file_name(&phrase));
-        create_folder(&folder)?;
-        picture::write_mask_png(&folder.join(&name), &mask)?;
+        picture::write_mask_png(&out.file(&format!("masks/{}/{name}", file_name(&phrase)))?, &mask)?;
     }
     Ok(())
 }
 
 /// The report is JSON unless `--text` is given; `--json` keeps it on one line.
-fn report(report: &impl Serialize, args: &EvalArgs, table: Option<String>) -> Result<()> {
+fn report(
+    report: &impl Serialize,
+    args: &EvalArgs,
+    out: Option<WrittenFiles>,
+    table: Option<String>,
+) -> Result<()> {
     let value = serde_json::to_value(report).map_err(|e| Error::work(format!("eval report: {e}")))?;
-    if let Some(out) = &args.out {
-        write_json(&out.join("eval.json"), &value)?;
+    if let Some(mut out) = out {
+        write_json(&out.file("eval.json")?, &value)?;
+        out.keep()?;
     }
     if let Some(table) = table.filter(|_| args.text) {
         return print(&table);

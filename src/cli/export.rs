@@ -1,17 +1,19 @@
 //! `splatvk export`
+use super::outputs::{WrittenFiles, check_file, write_file};
 use super::print::listing;
 use super::progress;
 use super::scene;
+use crate::files::{Kind, check_place};
 use crate::format::gaussians::{self, FORMATS, SplatFormat};
 use crate::format::scene_dir::Scene;
 use crate::format::transform::transform_splats;
-use crate::format::{colmap, create_folder, ply, transforms, write_whole_file};
+use crate::format::{colmap, ply, side_file, transforms};
 use crate::scene::{Camera, PointCloud, SH_C0, Similarity, Splats, UpAxis};
 use crate::{Error, Result};
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser};
 use glam::{DMat3, DVec3, Vec3};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// `splatvk export`
 #[derive(Debug, Args)]
@@ -24,6 +26,9 @@ pub struct ExportArgs {
     /// File, or folder (colmap, colmap-bin)
     #[arg(long, value_name = "PATH")]
     pub out: PathBuf,
+    /// Write over what is there: an ordinary file, or those of the same names in a folder
+    #[arg(long)]
+    pub force: bool,
     /// ply: spherical-harmonics degree of the file, padded with zeros; most viewers ask for 3
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(0..=3), value_name = "0-3")]
     pub ply_degree: u32,
@@ -117,6 +122,7 @@ fn place(scene: &mut Scene, points: &mut Option<PointCloud>, by: &Similarity) {
 }
 
 pub fn export(args: &ExportArgs) -> Result<()> {
+    let folder = reserved(args)?;
     let mut scene = scene::load(&args.scene)?;
     if args.only_seen {
         keep_seen(&mut scene, args)?;
@@ -129,9 +135,7 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     if let Some(by) = placement {
         place(&mut scene, &mut points, &by);
     }
-    if let Some(parent) = args.out.parent().filter(|p| !p.as_os_str().is_empty()) {
-        create_folder(parent).map_err(|e| Error::input(format!("{e}; choose another --out")))?;
-    }
+    progress::reporter().check()?;
     match args.format.as_str() {
         // Alone of all formats it can hold the language itself, and any degree.
         "ply" => {
@@ -146,16 +150,19 @@ pub fn export(args: &ExportArgs) -> Result<()> {
                 warn_of_models(&scene);
             }
             let options = ply::PlyOptions { degree: args.ply_degree, language };
-            write_whole_file(&args.out, |path| ply::write_splats(path, &scene.splats, options))?;
+            write_file(&args.out, args.force, |path| ply::write_splats(path, &scene.splats, options))?;
         }
         "transforms" => {
             let cameras = cameras(&scene, args)?;
-            write_whole_file(&args.out, |path| transforms::write(path, cameras, None))?;
+            write_file(&args.out, args.force, |path| transforms::write(path, cameras, None))?;
         }
         "colmap" | "colmap-bin" => {
             let cameras = cameras(&scene, args)?;
             let write = if args.format == "colmap" { colmap::write } else { colmap::write_binary };
-            write(&args.out, cameras, points.as_ref())?;
+            if let Some(folder) = folder {
+                write(folder.folder(), cameras, points.as_ref())?;
+                folder.keep()?;
+            }
         }
         name => {
             let format =
@@ -168,6 +175,31 @@ pub fn export(args: &ExportArgs) -> Result<()> {
         }
     }
     listing(std::slice::from_ref(&args.out), args.json)
+}
+
+/// Refuses a place that may not be written before the scene is read; the folder, where one is asked for.
+fn reserved(args: &ExportArgs) -> Result<Option<WrittenFiles>> {
+    let is_folder = args.format.starts_with("colmap");
+    // A link is said to be one wherever it leads.
+    check_place(&args.out, if is_folder { Kind::Folder } else { Kind::File }, true)?;
+    let whole = |p: &Path| p.canonicalize().ok();
+    if let (Some(out), Some(scene)) = (whole(&args.out), whole(&args.scene))
+        && scene.is_dir()
+        && out.starts_with(&scene)
+    {
+        return Err(Error::input(format!(
+            "{}: a part of the scene that is exported; choose another --out",
+            args.out.display()
+        )));
+    }
+    if is_folder {
+        return WrittenFiles::open(&args.out, args.force).map(Some);
+    }
+    check_file(&args.out, args.force)?;
+    if SplatFormat::named(&args.format).is_some_and(|format| format.name != "ply") {
+        check_place(&side_file::path(&args.out), Kind::File, args.force)?;
+    }
+    Ok(None)
 }
 
 /// Warns where a file of one set of splats gets features that were trained on others.

@@ -19,6 +19,7 @@ mod query;
 mod render;
 mod run;
 mod scene;
+mod serve;
 mod shell;
 mod train;
 mod view;
@@ -45,7 +46,10 @@ pub fn main() -> ExitCode {
         *provider = cli.provider;
     }
     match execute(command) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(()) => {
+            progress::release();
+            ExitCode::SUCCESS
+        }
         Err(error) => {
             progress::print_error(&error.to_string(), error.exit_code());
             ExitCode::from(error.exit_code())

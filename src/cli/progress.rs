@@ -2,13 +2,14 @@
 //! JSON object per line for machines.
 use super::args::LogFormat;
 use super::line::one_line;
+use crate::Error;
 use crate::progress::Progress;
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Set by the first Ctrl-C of the process; work notices it between steps.
 static STOPPED: AtomicBool = AtomicBool::new(false);
@@ -37,12 +38,21 @@ pub fn stopped() -> bool {
     STOPPED.load(Ordering::SeqCst)
 }
 
-/// The error that ends the process.
+/// The error that ends the process; of two threads that end it the first has its say. Input that cannot be used gets this one line:
+/// what was said in the first [`HELD_FOR`] is about work that nobody will see.
 pub fn print_error(message: &str, exit_code: u8) {
+    static SAID: AtomicBool = AtomicBool::new(false);
+    if SAID.swap(true, Ordering::SeqCst) {
+        return;
+    }
+    match exit_code {
+        2 => drop(lock(&HELD).take()),
+        _ => release(),
+    }
     let message = one_line(message);
     match as_json() {
         true => write_event("error", json!({ "message": message, "exit_code": exit_code })),
-        false => eprintln!("splatvk: {message}"),
+        false => write_line(&format!("splatvk: {message}")),
     }
 }
 
@@ -50,16 +60,44 @@ pub fn print_warning(message: &str) {
     let message = one_line(message);
     match as_json() {
         true => write_event("warning", json!({ "message": message })),
-        false => eprintln!("warning: {message}"),
+        false => write_line(&format!("warning: {message}")),
     }
+}
+
+/// How long after the start of the process lines wait for the end of the checks. Photos that do not overlap are refused last, after
+/// their features: within 4 s for two of 640 × 480 pixels on two cores.
+const HELD_FOR: Duration = Duration::from_secs(10);
+/// Lines that wait; `None` once they do not any more.
+static HELD: Mutex<Option<Vec<String>>> = Mutex::new(Some(Vec::new()));
+
+/// Prints a line, not before it is known that the input can be used.
+fn print_held(line: &str) {
+    let mut held = lock(&HELD);
+    let Some(lines) = held.as_mut() else { return write_line(line) };
+    if lines.is_empty() {
+        std::thread::spawn(|| {
+            std::thread::sleep(HELD_FOR.saturating_sub(BEGAN.elapsed()));
+            release();
+        });
+    }
+    lines.push(line.to_owned());
+}
+
+/// Prints what was held back; from now on nothing is.
+pub fn release() {
+    lock(&HELD).take().into_iter().flatten().for_each(|line| write_line(&line));
 }
 
 /// Writes `{"event", "time", …}` as one line; `time` is in seconds since the process began.
 fn write_event(event: &str, mut fields: Value) {
     fields["event"] = event.into();
     fields["time"] = ((BEGAN.elapsed().as_secs_f64() * 1e3).round() / 1e3).into();
-    // There is nothing to do when standard error is closed.
-    let _ = writeln!(std::io::stderr().lock(), "{fields}");
+    write_line(&fields.to_string());
+}
+
+/// There is nothing to do when standard error is closed, as it is once the terminal is.
+fn write_line(line: &str) {
+    let _ = writeln!(std::io::stderr().lock(), "{line}");
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -109,20 +147,44 @@ impl Progress for JsonLines {
     }
 }
 
-/// Makes Ctrl-C (and a termination signal) ask for a clean stop; a second one ends the process at once.
+/// How long after a request to stop the work may go on to its next check. Nothing that is asked of a network or a driver can be
+/// cut short, and some of it takes longer than anyone waits.
+const GRACE: Duration = Duration::from_millis(1500);
+
+/// Makes Ctrl-C, a termination signal and a closed terminal ask for a clean stop. A second one, and [`GRACE`], end the process at
+/// once; what is unfinished is removed in either case.
 pub fn stop_on_signal() {
     let outcome = ctrlc::set_handler(|| {
         if STOPPED.swap(true, Ordering::SeqCst) {
-            crate::format::remove_unfinished();
-            std::process::exit(130);
+            end();
         }
         if !as_json() {
-            eprintln!("stopping; press Ctrl-C again to end at once");
+            write_line("stopping; press Ctrl-C again to end at once");
         }
+        std::thread::spawn(|| {
+            std::thread::sleep(GRACE);
+            end();
+        });
     });
     if let Err(error) = outcome {
         print_warning(&format!("Ctrl-C cannot be caught: {error}"));
     }
+}
+
+/// Ends the process as [`Error::Cancelled`] does, whatever its threads are doing.
+fn end() -> ! {
+    let nothing = crate::files::remove_unfinished();
+    let kept = "stopped; what was finished is kept".to_owned();
+    let code = Error::Cancelled.exit_code();
+    print_error(&if nothing { Error::Cancelled.to_string() } else { kept }, code);
+    // Exit handlers would take apart the libraries that those threads are in.
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: ends the process; nothing of it is used afterwards.
+    unsafe {
+        libc::_exit(code.into())
+    }
+    #[cfg(not(all(target_os = "linux", target_env = "gnu")))]
+    std::process::exit(code.into())
 }
 
 type Stage = (&'static str, Instant, ProgressBar);
@@ -143,8 +205,8 @@ impl Terminal {
     /// Prints a line above the bars.
     fn print(&self, line: &str) {
         match &self.bars {
-            Some(bars) => bars.suspend(|| eprintln!("{line}")),
-            None => eprintln!("{line}"),
+            Some(bars) => bars.suspend(|| write_line(line)),
+            None => print_held(line),
         }
     }
 }

@@ -27,6 +27,7 @@ use std::time::Instant;
 const AT_ONCE: usize = 16;
 
 pub fn query(args: &QueryArgs) -> Result<()> {
+    let mut out = WrittenFiles::open(&args.out, args.force)?;
     let mut scene = scene::load(&args.scene)?;
     let no_language = || {
         Error::input(format!(
@@ -62,7 +63,6 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     }
     let registry = args.device.registry()?;
     let encoder = encoder::of_scene(&scene, registry)?;
-    let mut out = WrittenFiles::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
     let field = scene.language.take().ok_or_else(no_language)?;
     let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
@@ -112,7 +112,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     ready.encoder().doubt().iter().for_each(|doubt| progress.warn(doubt));
     let report = json!({ "scene": args.scene, "out": args.out, "world": scene.world, "queries": queries });
     write_json(&out.file("answers.json")?, &report)?;
-    out.keep();
+    out.keep()?;
     if args.device.json { print_json(&report) } else { print(&table(&asked, &stems, args)) }
 }
 

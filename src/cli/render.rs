@@ -15,6 +15,7 @@ use crate::scene::{LEVEL_NAMES, LanguageField, Plane, RgbImage, to_linear};
 use crate::{Error, Result};
 
 pub fn render(args: &RenderArgs) -> Result<()> {
+    let mut out = WrittenFiles::open(&args.out, args.force)?;
     let scene = scene::load(&args.scene)?;
     let cameras = cameras::read(&args.cameras)?;
     let stems = views::stems(&cameras)?;
@@ -35,7 +36,6 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     }
     let nothing = LanguageField::default();
     let field = if wants_language { scene.language.as_ref().unwrap_or(&nothing) } else { &nothing };
-    let mut out = WrittenFiles::open(&args.out)?;
     let device = Device::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
     let mut unseen =
@@ -61,7 +61,7 @@ pub fn render(args: &RenderArgs) -> Result<()> {
         progress.step(i as u64 + 1, "");
     }
     progress.end();
-    listing(&out.keep(), args.device.json)
+    listing(&out.keep()?, args.device.json)
 }
 
 /// What is written of one camera.

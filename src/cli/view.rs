@@ -3,6 +3,7 @@ use super::args::ViewArgs;
 use super::print::{print, print_json};
 use super::progress;
 use super::scene;
+use super::serve::{Answer, Place, Site, serve};
 use crate::format::scene_dir::Scene;
 use crate::gpu::Device;
 use crate::photo;
@@ -13,19 +14,12 @@ use crate::run::ask::QueryScene;
 use crate::run::encoder;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
-use serde_json::{Value, json};
-use std::io::Read;
-use std::net::{Ipv4Addr, SocketAddrV4};
+use serde_json::json;
+use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
-use tiny_http::{Header, Method, Request, Response, Server};
 
-/// How soon Ctrl-C is noticed between requests.
+/// How soon Ctrl-C is noticed between questions.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
-/// Longest request body: a question is a few words.
-const MAX_BYTES: u64 = 4096;
-/// What the page may do: run what it carries, ask its own server, and nothing else.
-const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'unsafe-inline' data:; worker-src data:; style-src 'unsafe-inline'; \
-                      img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
 pub fn view(args: &ViewArgs) -> Result<()> {
     let scene = scene::load(&args.scene)?;
@@ -33,7 +27,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         return Err(Error::input(format!("{}: no splats to show", args.scene.display())));
     }
     // Bound first: a port that is taken is said before the scene is prepared.
-    let server = listen(args.port)?;
+    let place = Place::take(args.port)?;
     let (mut ready, no_questions) = match questions(&scene, args) {
         Ok(ready) => (Some(ready), None),
         Err(error) => (None, Some(error.to_string())),
@@ -41,40 +35,36 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     if let Some(reason) = no_questions.as_deref().filter(|_| scene.language.is_some()) {
         progress::reporter().warn(&format!("no questions: {reason}"));
     }
+    let options = Compat::answers(None, &args.scene)?;
     let names = ready.as_mut().map_or(Ok(CodeNames::new()), QueryScene::names)?;
-    let content = Content {
-        options: Compat::answers(None, &args.scene)?,
+    let site = Site {
         page: page(&scene, args, &names, no_questions.as_deref())?,
-        splats: viewer::pack(&scene.splats, &scene.seen, scene.language.as_ref(), usize::MAX)?.bytes,
-        port: port_of(&server)?,
+        scene_path: SCENE_PATH,
+        scene: viewer::pack(&scene.splats, &scene.seen, scene.language.as_ref(), usize::MAX)?.bytes,
+        asks: ready.is_some(),
     };
-    let address = format!("http://127.0.0.1:{}/", content.port);
+    let address = place.address();
+    let asked = serve(place, site)?;
     if args.device.json {
         print_json(&json!({ "address": address, "scene": args.scene, "questions": ready.is_some() }))?;
     } else {
         print(&format!("{} is at {address}  (Ctrl-C ends)\n", args.scene.display()))?;
     }
-    while !progress::stopped() {
-        let request =
-            server.recv_timeout(POLL_INTERVAL).map_err(Error::io("the connection to the browser"))?;
-        if let Some(request) = request {
-            // A browser that closed the page does not wait for the answer.
-            let _ = content.serve(request, ready.as_mut());
+    let input = StandardInput::new();
+    while !progress::stopped() && !input.has_closed() {
+        match asked.recv_timeout(POLL_INTERVAL) {
+            // Nobody waits for the answer any more: the page was closed.
+            Ok(question) if question.reply.is_closed() => {}
+            Ok(question) => {
+                let answer = reply(ready.as_mut(), &question.text, &options);
+                let _ = question.reply.send(answer);
+            }
+            Err(RecvTimeoutError::Timeout) => {}
+            // Without questions nobody holds the other end.
+            Err(RecvTimeoutError::Disconnected) => std::thread::sleep(POLL_INTERVAL),
         }
     }
     Ok(())
-}
-
-/// Only this machine can connect.
-fn listen(port: u16) -> Result<Server> {
-    let refused =
-        |e| Error::input(format!("--port {port}: {e}; give another, or leave it out to take a free one"));
-    Server::http(SocketAddrV4::new(Ipv4Addr::LOCALHOST, port)).map_err(refused)
-}
-
-fn port_of(server: &Server) -> Result<u16> {
-    let address = server.server_addr().to_ip().map(|a| a.port());
-    address.ok_or_else(|| Error::work("the server has no port"))
 }
 
 /// The scene ready for questions, looked at from its own cameras.
@@ -109,86 +99,42 @@ fn page(scene: &Scene, args: &ViewArgs, names: &CodeNames, no_questions: Option<
     view.served(no_questions)
 }
 
-/// What is sent.
-struct Content {
-    options: QueryOptions,
-    page: String,
-    splats: Vec<u8>,
-    port: u16,
-}
-
-impl Content {
-    fn serve(&self, mut request: Request, ready: Option<&mut QueryScene>) -> std::io::Result<()> {
-        let (status, kind, body) = match self.answer(&mut request, ready) {
-            Ok((kind, body)) => (200, kind, body),
-            Err((status, message)) => {
-                (status, "application/json", json!({ "error": message }).to_string().into_bytes())
-            }
-        };
-        let mut response = Response::from_data(body).with_status_code(status);
-        for (name, value) in [
-            ("Content-Type", kind),
-            ("Cache-Control", "no-store"),
-            ("Content-Security-Policy", CONTENT_SECURITY_POLICY),
-            ("X-Content-Type-Options", "nosniff"),
-        ] {
-            if let Ok(header) = Header::from_bytes(name, value) {
-                response.add_header(header);
-            }
-        }
-        request.respond(response)
-    }
-
-    fn answer(
-        &self,
-        request: &mut Request,
-        ready: Option<&mut QueryScene>,
-    ) -> Result<(&'static str, Vec<u8>), (u16, String)> {
-        if !self.is_own(request) {
-            return Err((403, "this server answers only the page that it sent".into()));
-        }
-        match (request.method(), request.url()) {
-            (Method::Get, "/") => Ok(("text/html; charset=utf-8", self.page.clone().into_bytes())),
-            (Method::Get, url) if url.strip_prefix('/') == Some(SCENE_PATH) => {
-                Ok(("application/octet-stream", self.splats.clone()))
-            }
-            (Method::Post, "/query") => {
-                let ready = ready.ok_or_else(|| (404, "this scene answers no questions".to_owned()))?;
-                let text = question(request)
-                    .ok_or_else(|| (400, "ask as {\"text\": \"a few words\"}".to_owned()))?;
-                let answer = reply(ready, &text, &self.options)
-                    .map_err(|e| (if e.exit_code() == 2 { 422 } else { 500 }, e.to_string()))?;
-                Ok(("application/json", answer.to_string().into_bytes()))
-            }
-            _ => Err((404, "there is nothing here".into())),
-        }
-    }
-
-    /// Other pages in the same browser can reach this address too. A host name of theirs that resolves to it shows in
-    /// `Host`, and a request that their script makes in `Origin`.
-    fn is_own(&self, request: &Request) -> bool {
-        let header = |name: &'static str| {
-            request.headers().iter().find(|h| h.field.equiv(name)).map(|h| h.value.as_str().to_owned())
-        };
-        let ours = ["127.0.0.1", "localhost"].map(|name| format!("{name}:{}", self.port));
-        let host = header("Host").is_some_and(|h| ours.contains(&h));
-        let origin = header("Origin").is_none_or(|o| ours.iter().any(|a| o == format!("http://{a}")));
-        host && origin
-    }
-}
-
-fn question(request: &mut Request) -> Option<String> {
-    let mut body = String::new();
-    request.as_reader().take(MAX_BYTES).read_to_string(&mut body).ok()?;
-    let body: Value = serde_json::from_str(&body).ok()?;
-    let text = body["text"].as_str()?.trim();
-    (!text.is_empty()).then(|| text.to_owned())
-}
-
-fn reply(ready: &mut QueryScene, text: &str, options: &QueryOptions) -> Result<Value> {
+fn reply(ready: Option<&mut QueryScene>, text: &str, options: &QueryOptions) -> Answer {
+    let ready = ready.ok_or_else(|| (404, "this scene answers no questions".to_owned()))?;
     let clock = Instant::now();
-    let answers = ready.ask(text, options)?;
+    let answers =
+        ready.ask(text, options).map_err(|e| (if e.exit_code() == 2 { 422 } else { 500 }, e.to_string()))?;
     let mut reply = answers.shown().json();
     reply["milliseconds"] = (1e3 * clock.elapsed().as_secs_f64()).into();
-    Ok(reply)
+    Ok(reply.to_string())
+}
+
+/// Tells when whoever started this process has gone: the terminal was closed, or the other end of a pipe. Nothing is read.
+struct StandardInput {
+    /// Not where it was closed from the beginning: it then says nothing.
+    watched: bool,
+}
+
+impl StandardInput {
+    fn new() -> Self {
+        StandardInput { watched: !hung_up() }
+    }
+
+    fn has_closed(&self) -> bool {
+        self.watched && hung_up()
+    }
+}
+
+#[cfg(all(target_os = "linux", target_env = "gnu"))]
+fn hung_up() -> bool {
+    let mut input = libc::pollfd { fd: libc::STDIN_FILENO, events: 0, revents: 0 };
+    // SAFETY: `input` is one pollfd, which lives through the call; 0 ms makes it return at once.
+    let ready = unsafe { libc::poll(&raw mut input, 1, 0) };
+    ready == 1 && input.revents & libc::POLLHUP != 0
+}
+
+/// A terminal that closes also sends a signal.
+#[cfg(not(all(target_os = "linux", target_env = "gnu")))]
+fn hung_up() -> bool {
+    false
 }

@@ -88,7 +88,7 @@ pub fn train_language(
     let mut out = TrainedLanguage { splats: splats.clone(), field, curve: Vec::new(), seconds: 0.0 };
     for (g, group) in groups.iter().enumerate() {
         let levels: Vec<(usize, &LevelField)> = group.iter().map(|&l| (l, &out.field.levels[l])).collect();
-        let mut run = Run::new(device, images, cameras, splats, &levels, options)?;
+        let mut run = Run::new(device, images, cameras, splats, &levels, options, progress)?;
         training::train(&mut run, g, options.iterations, progress)?;
         let (trained, features) = run.finish()?;
         let before = g * options.iterations;
@@ -141,6 +141,7 @@ impl<'a> Run<'a> {
         splats: &Splats,
         levels: &[(usize, &'a LevelField)],
         options: &'a LanguageOptions,
+        progress: &dyn Progress,
     ) -> Result<Self> {
         let fields: Vec<&LevelField> = levels.iter().map(|l| l.1).collect();
         let width = fields[0].codebook.code_dim;
@@ -154,8 +155,15 @@ impl<'a> Run<'a> {
             feature_mode: FeatureMode::Gauge { epsilon: options.epsilon, blocks: levels.len() },
             features_move_geometry: !options.detach_geometry,
         };
-        let mut lifting =
-            Lifting { device, views: &mut views, cameras, model: &model, raster, targets: &targets };
+        let mut lifting = Lifting {
+            device,
+            views: &mut views,
+            cameras,
+            model: &model,
+            raster,
+            targets: &targets,
+            progress,
+        };
         let lifted = lifting.sums()?;
         let reliability = (0..levels.len()).map(|l| lifted.reliability(l, levels.len(), width)).collect();
         match options.start {

@@ -6,6 +6,7 @@ use crate::gpu::{Buffer, Device, Recorder};
 use crate::pass::bands::Band;
 use crate::pass::codes::{self, Mode, Targets};
 use crate::pass::options::{FeatureMode, RasterOptions};
+use crate::progress::Progress;
 use crate::scene::{Camera, LevelField, RgbImage};
 use crate::{Error, Result};
 
@@ -117,6 +118,8 @@ pub(super) struct Lifting<'a> {
     pub(super) model: &'a Model,
     pub(super) raster: RasterOptions,
     pub(super) targets: &'a CodeTargets,
+    /// Asked before every pass whether to stop.
+    pub(super) progress: &'a dyn Progress,
 }
 
 impl Lifting<'_> {
@@ -144,6 +147,7 @@ impl Lifting<'_> {
 
     /// Adds to `sums` what the backward pass of a view gives for an upstream.
     pub(super) fn back(&mut self, view: usize, mode: Mode, sums: &mut [f32]) -> Result<()> {
+        self.progress.check()?;
         self.views.set_camera(view, &self.cameras[view])?;
         // The sums are gradients by what is rendered, whatever is stored.
         let raster = &RasterOptions { feature_mode: FeatureMode::Linear, ..self.raster };

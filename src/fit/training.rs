@@ -292,7 +292,16 @@ mod tests {
             ..LevelField::default()
         };
         let options = LanguageOptions::preset(Preset::Draft);
-        let mut run = LanguageRun::new(device, &images, &cameras, &splats, &[(0, &level)], &options).unwrap();
+        let mut run = LanguageRun::new(
+            device,
+            &images,
+            &cameras,
+            &splats,
+            &[(0, &level)],
+            &options,
+            &crate::progress::Silent,
+        )
+        .unwrap();
         measure(device, &mut run)
     }
 

@@ -1,4 +1,5 @@
 //! What several formats need.
+use crate::files::Partial;
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -30,16 +31,9 @@ pub fn create_folder(path: &Path) -> Result<()> {
     std::fs::create_dir_all(path).map_err(Error::unwritable(path))
 }
 
-/// Writes a file beside its target and renames it: one that was there stays until the new one is whole.
+/// Writes a file beside its target and renames it: one that was there stays until the new one is whole. Makes its folder.
 pub fn write_whole_file(out: &Path, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
-    let mut name = out.file_name().unwrap_or_default().to_os_string();
-    name.push(format!(".partial-{}", std::process::id()));
-    let partial = out.with_file_name(name);
-    let outcome =
-        write(&partial).and_then(|()| std::fs::rename(&partial, out).map_err(Error::unwritable(out)));
-    if outcome.is_err() {
-        // The error is what matters; the partial file may not even exist.
-        let _ = std::fs::remove_file(&partial);
-    }
-    outcome
+    let partial = Partial::beside(out, false).map_err(Error::unwritable(out))?;
+    write(partial.path())?;
+    partial.finish(|path| std::fs::rename(path, out).map_err(Error::unwritable(out)))
 }

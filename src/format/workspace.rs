@@ -1,25 +1,13 @@
 //! A scene directory appears whole or not at all: work happens in a hidden folder beside it and is renamed in at the end.
+use crate::files::{Kind, Partial, check_place};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
 
-/// Folders of this process that are not finished.
-static UNFINISHED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
-
-/// Removes every unfinished folder of this process: for exits that run no destructors.
-pub fn remove_unfinished() {
-    for folder in UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).drain(..) {
-        // Nothing more can be done about a folder that cannot be removed while exiting.
-        let _ = std::fs::remove_dir_all(folder);
-    }
-}
-
-/// A folder being written. Dropped without [`Workspace::commit`], it vanishes.
+/// A folder being written. Dropped without [`Workspace::commit`], it vanishes, and so do the folders that were made for it.
 #[derive(Debug)]
 pub struct Workspace {
-    partial: PathBuf,
+    partial: Partial,
     out: PathBuf,
-    done: bool,
 }
 
 /// File that marks a folder as a scene, and so as ours to replace.
@@ -30,84 +18,52 @@ impl Workspace {
     /// before [`Workspace::commit`].
     pub fn create(out: &Path, force: bool) -> Result<Workspace> {
         let bad = |what: &str| Error::input(format!("{}: {what}", out.display()));
-        let name = out.file_name().map(|n| n.to_string_lossy().into_owned());
-        let name = name.ok_or_else(|| bad("not a folder name; choose one such as \"scene\""))?;
-        if out.join(MANIFEST).is_file() {
-            if !force {
-                return Err(bad("already holds a scene; choose another --out, or --force to replace it"));
-            }
-        } else if out.is_dir() {
-            let mut entries = std::fs::read_dir(out).map_err(Error::io(out))?;
-            if entries.next().is_some() {
-                return Err(bad("the folder is not empty and not a scene; choose another --out"));
-            }
-        } else if out.symlink_metadata().is_ok() {
-            return Err(bad("a file is in the way; choose another --out"));
+        if out.file_name().is_none() {
+            return Err(bad("not a folder name; choose one such as \"scene\""));
         }
-        let parent = match out.parent() {
-            Some(p) if !p.as_os_str().is_empty() => p.to_path_buf(),
-            _ => PathBuf::from("."),
-        };
-        std::fs::create_dir_all(&parent).map_err(Error::unwritable(out))?;
-        sweep(&parent, &name);
-        let partial = parent.join(format!(".{name}.partial-{}", std::process::id()));
-        std::fs::create_dir(&partial).map_err(Error::unwritable(out))?;
-        UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).push(partial.clone());
-        Ok(Workspace { partial, out: out.to_path_buf(), done: false })
+        // What is no folder is refused in any case.
+        check_place(out, Kind::Folder, true)?;
+        let is_scene = out.join(MANIFEST).is_file();
+        if is_scene && !force {
+            return Err(bad("already holds a scene; choose another --out, or --force to replace it"));
+        }
+        if !is_scene && check_place(out, Kind::Folder, false).is_err() {
+            return Err(bad("the folder is not empty and not a scene; choose another --out"));
+        }
+        let partial = Partial::beside(out, true).map_err(Error::unwritable(out))?;
+        std::fs::create_dir(partial.path()).map_err(Error::unwritable(out))?;
+        Ok(Workspace { partial, out: out.to_path_buf() })
     }
 
     /// Where to write.
     pub fn path(&self) -> &Path {
-        &self.partial
+        self.partial.path()
     }
 
     /// Moves the folder to its place; a scene that `force` allowed to replace is removed only after that.
-    pub fn commit(mut self) -> Result<PathBuf> {
-        let old = self.partial.with_extension(format!("old-{}", std::process::id()));
-        let replaces = self.out.join(MANIFEST).is_file();
-        if replaces {
-            std::fs::rename(&self.out, &old).map_err(Error::io(&self.out))?;
-        }
-        if let Err(e) = std::fs::rename(&self.partial, &self.out) {
-            if replaces {
-                std::fs::rename(&old, &self.out).map_err(Error::io(&old))?;
+    pub fn commit(self) -> Result<PathBuf> {
+        let Workspace { partial, out } = self;
+        let replaces = out.join(MANIFEST).is_file();
+        // What came there meanwhile is not ours.
+        check_place(&out, Kind::Folder, replaces)?;
+        let garbage = partial.path().to_path_buf();
+        partial.finish(|path| {
+            if !replaces {
+                return std::fs::rename(path, &out).map_err(Error::io(&out));
             }
-            return Err(Error::io(&self.out)(e));
-        }
-        self.done = true;
-        forget(&self.partial);
+            let old = path.with_extension(format!("old-{}", std::process::id()));
+            std::fs::rename(&out, &old).map_err(Error::io(&out))?;
+            if let Err(e) = std::fs::rename(path, &out) {
+                std::fs::rename(&old, &out).map_err(Error::io(&old))?;
+                return Err(Error::io(&out)(e));
+            }
+            // From here on it is a leftover, should the process end before it is removed.
+            std::fs::rename(&old, path).map_err(Error::io(&old))
+        })?;
         if replaces {
-            std::fs::remove_dir_all(&old).map_err(Error::io(&old))?;
+            std::fs::remove_dir_all(&garbage).map_err(Error::io(&garbage))?;
         }
-        Ok(self.out.clone())
-    }
-}
-
-impl Drop for Workspace {
-    fn drop(&mut self) {
-        if !self.done {
-            // Dropping happens on the way out of an error, which is the one to report.
-            let _ = std::fs::remove_dir_all(&self.partial);
-            forget(&self.partial);
-        }
-    }
-}
-
-fn forget(folder: &Path) {
-    UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).retain(|p| p != folder);
-}
-
-/// Removes what killed runs for the same output left behind: partial folders whose process is gone.
-fn sweep(parent: &Path, name: &str) {
-    let prefix = format!(".{name}.partial-");
-    let Ok(entries) = std::fs::read_dir(parent) else { return };
-    for entry in entries.flatten() {
-        let file = entry.file_name().to_string_lossy().into_owned();
-        let Some(pid) = file.strip_prefix(&prefix).and_then(|p| p.parse::<u32>().ok()) else { continue };
-        // Without /proc nobody can tell whether the other run still lives: leave it alone.
-        if Path::new("/proc/self").exists() && !Path::new(&format!("/proc/{pid}")).exists() {
-            let _ = std::fs::remove_dir_all(entry.path());
-        }
+        Ok(out)
     }
 }
 
@@ -132,7 +88,7 @@ mod tests {
         std::fs::write(w.path().join(MANIFEST), "1").unwrap();
         assert!(!out.exists());
         drop(w);
-        assert!(names(&folder.path().join("deep")).is_empty(), "a dropped workspace leaves nothing");
+        assert!(names(folder.path()).is_empty(), "a dropped workspace leaves nothing");
 
         let w = Workspace::create(&out, false).unwrap();
         std::fs::write(w.path().join(MANIFEST), "1").unwrap();

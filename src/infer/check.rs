@@ -165,7 +165,7 @@ fn features(model: &Installed, image: &RgbImage, steps: &mut Vec<Measured>) -> R
     let half = |p: usize| i32::from(p % image.width >= image.width / 2);
     let data = (0..image.width * image.height).map(half).collect();
     let labels = Plane { width: image.width, height: image.height, data };
-    let rows = measured("2 regions".to_string(), steps, || net.embed_regions(image, &labels, 2))?;
+    let rows = measured("2 regions".to_string(), steps, || net.embed_regions(image, &labels, 2, &Silent))?;
     let unit = |row: &[f32]| (row.iter().map(|v| v * v).sum::<f32>() - 1.0).abs() < 1e-3;
     if !rows.chunks_exact(net.dim()).all(unit) {
         return Err(Error::work(format!("model {}: a region without direction", model.name)));

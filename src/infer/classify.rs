@@ -3,6 +3,7 @@ use rayon::prelude::*;
 
 use super::registry::{PackFileKind, Registry};
 use super::runtime::{Input, Session};
+use crate::progress::Progress;
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
 
@@ -41,7 +42,13 @@ impl Classifier {
     /// (40 perfect masks, 840 Felzenszwalb segments, 416 masks of the graph segmentation) nothing else named more
     /// regions right: wider crops, blurred, white, black or dimmed surroundings, the mirrored crop, filled holes or a
     /// grown mask, averages of these, and the larger Lite1 and Lite2.
-    pub fn regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
+    pub fn regions(
+        &mut self,
+        image: &RgbImage,
+        labels: &Plane<i32>,
+        count: usize,
+        progress: &dyn Progress,
+    ) -> Result<Vec<f32>> {
         if (labels.width, labels.height) != (image.width, image.height) {
             return Err(Error::input(format!(
                 "label map is {}×{} but its image is {}×{}",
@@ -52,6 +59,7 @@ impl Classifier {
             extents(labels, count).into_iter().enumerate().filter_map(|(i, e)| Some((i, e?))).collect();
         let mut all = vec![0f32; count * CLASSES];
         for batch in present.chunks(BATCH) {
+            progress.check()?;
             let crops: Vec<f32> = batch
                 .par_iter()
                 .flat_map_iter(|(i, e)| crop(image, labels, *i as i32, *e, SIDE, GREY))

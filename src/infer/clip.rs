@@ -14,6 +14,7 @@ use super::prepare::prepare;
 use super::runtime::Input;
 use super::text::normalise;
 use super::{RegionEncoder, things};
+use crate::progress::{Progress, Silent};
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
 
@@ -102,7 +103,7 @@ impl Clip {
             let mut cosines = Vec::new();
             for (_, rgb) in COLOURS {
                 let image = RgbImage { width: 224, height: 224, data: vec![rgb; 224 * 224] };
-                let shown = self.embed_regions(&image, &Plane::filled(224, 224, 0), 1)?;
+                let shown = self.embed_regions(&image, &Plane::filled(224, 224, 0), 1, &Silent)?;
                 let to = |name: &[f32]| name.iter().zip(&shown).map(|(a, b)| a * b).sum::<f32>();
                 cosines.extend(names.chunks_exact(self.dim.max(1)).map(to));
             }
@@ -169,7 +170,13 @@ impl Clip {
     }
 
     /// Every region from a crop of its own, on black.
-    fn crop_features(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
+    fn crop_features(
+        &mut self,
+        image: &RgbImage,
+        labels: &Plane<i32>,
+        count: usize,
+        progress: &dyn Progress,
+    ) -> Result<Vec<f32>> {
         let dim = self.dim;
         let graph = self.visual()?;
         let Some(spec) = graph.file.binding.image.clone() else {
@@ -181,6 +188,7 @@ impl Clip {
             extents(labels, count).into_iter().enumerate().filter_map(|(i, e)| Some((i, e?))).collect();
         let mut all = vec![0f32; count * dim];
         for regions in present.chunks(batch) {
+            progress.check()?;
             let mut crops: Vec<f32> = regions
                 .par_iter()
                 .flat_map_iter(|(i, e)| {
@@ -242,7 +250,13 @@ impl RegionEncoder for Clip {
         self.dim
     }
 
-    fn embed_regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
+    fn embed_regions(
+        &mut self,
+        image: &RgbImage,
+        labels: &Plane<i32>,
+        count: usize,
+        progress: &dyn Progress,
+    ) -> Result<Vec<f32>> {
         let dense = self.model.graph(Part::ImageTower).is_err();
         let graph = self.model.graph(if dense { Part::DenseFeatures } else { Part::ImageTower })?;
         let key = OutputKey::new("features").model(graph)?.values(&image.data).values(&labels.data);
@@ -252,7 +266,7 @@ impl RegionEncoder for Clip {
             if dense {
                 self.pixel_features(image, labels, count)
             } else {
-                self.crop_features(image, labels, count)
+                self.crop_features(image, labels, count, progress)
             }
         })?;
         rows.chunks_exact_mut(self.dim.max(1)).for_each(normalise);

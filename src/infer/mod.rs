@@ -45,6 +45,7 @@ pub use registry::{ModelStatus, PackFileKind, Registry, home};
 pub use runtime::{Input, Session, Tensor};
 
 use crate::Result;
+use crate::progress::Progress;
 use crate::scene::{Plane, RgbImage};
 
 /// The `best` of the rows [P, D] for each of the regions [count, D], by cosine.
@@ -69,8 +70,15 @@ pub trait RegionEncoder: Send {
     /// D, the length of every embedding.
     fn dim(&self) -> usize;
     /// [count, D] row-major unit vectors, one per region `0..count` of `labels` (the same size as `image`; −1 and
-    /// values ≥ `count` belong to no region). A region without a pixel gets a zero row.
-    fn embed_regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>>;
+    /// values ≥ `count` belong to no region). A region without a pixel gets a zero row. Asks between what it gives the network
+    /// at once whether to stop.
+    fn embed_regions(
+        &mut self,
+        image: &RgbImage,
+        labels: &Plane<i32>,
+        count: usize,
+        progress: &dyn Progress,
+    ) -> Result<Vec<f32>>;
     /// [texts.len(), D] row-major unit vectors.
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>>;
     /// [N, D] unit rows of [`things::of_form`]; fewer, or none, from an encoder that knows only some texts.

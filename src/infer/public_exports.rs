@@ -208,7 +208,7 @@ fn dense_features_are_averaged_over_regions() {
             labels.data[32 * y + x] = 0;
         }
     }
-    let rows = lseg.embed_regions(&image, &labels, 2).unwrap();
+    let rows = lseg.embed_regions(&image, &labels, 2, &Silent).unwrap();
     let half = 0.5f32.sqrt();
     near(&rows, &[half, half, 0.0, 0.0, 0.0, 1.0]);
     let blue = lseg.embed_texts(&["blue"]).unwrap();

@@ -93,7 +93,7 @@ fn towers_are_recognised_by_their_tensors_and_proven_to_belong_together() {
         image.data.push(if right { [0.0, 0.1, 1.0] } else { [0.0, 1.0, 0.1] });
         labels.data[p] = i32::from(right);
     }
-    let regions = clip.embed_regions(&image, &labels, 3).unwrap();
+    let regions = clip.embed_regions(&image, &labels, 3, &crate::progress::Silent).unwrap();
     let texts = clip.embed_texts(&["green", "blue"]).unwrap();
     let dot = |r: usize, t: usize| (0..3).map(|k| regions[3 * r + k] * texts[3 * t + k]).sum::<f32>();
     assert!(dot(0, 0) > dot(0, 1) && dot(1, 1) > dot(1, 0), "{regions:?} {texts:?}");

@@ -3,6 +3,7 @@ use tokenizers::Tokenizer;
 
 use super::registry::{PackFileKind, Registry};
 use super::runtime::{Input, Session};
+use crate::progress::Progress;
 use crate::{Error, Result};
 
 /// Length of an embedding.
@@ -43,7 +44,7 @@ impl TextEncoder {
 
     /// Unit embeddings [N, 384]. The int8 network scales its activations over a whole batch, so an embedding differs
     /// in the third digit from what [`TextEncoder::embed`] gives: fine for a fixed list, wrong for a single query.
-    pub fn embed_list(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
+    pub fn embed_list(&mut self, texts: &[&str], progress: &dyn Progress) -> Result<Vec<f32>> {
         let tokens = texts.iter().map(|t| self.tokens(t)).collect::<Result<Vec<_>>>()?;
         let mut order: Vec<usize> = (0..texts.len()).collect();
         order.sort_by_key(|&i| tokens[i].len());
@@ -51,6 +52,7 @@ impl TextEncoder {
         // Only texts of one length share a batch: no padding, no mask.
         for group in order.chunk_by(|&a, &b| tokens[a].len() == tokens[b].len()) {
             for batch in group.chunks(BATCH) {
+                progress.check()?;
                 let rows: Vec<&Vec<i64>> = batch.iter().map(|&i| &tokens[i]).collect();
                 let embedded = self.forward(&rows)?;
                 for (&i, row) in batch.iter().zip(embedded.chunks_exact(DIM)) {
@@ -137,7 +139,7 @@ mod tests {
     fn a_list_embeds_almost_as_its_texts_do() {
         let mut net = encoder();
         let texts = ["lemon", "coffee mug", "box of cereal", "plate", "water jug"];
-        let list = net.embed_list(&texts).unwrap();
+        let list = net.embed_list(&texts, &crate::progress::Silent).unwrap();
         for (text, row) in texts.iter().zip(list.chunks_exact(DIM)) {
             let alone = net.embed(text).unwrap();
             assert!(cosine(row, &alone) > 0.99, "{text}: {}", cosine(row, &alone));

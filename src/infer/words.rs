@@ -22,6 +22,7 @@ use super::classify::{CLASSES, Classifier};
 use super::registry::{PackFileKind, Registry};
 use super::text::{self, TextEncoder, normalise};
 use super::{RegionEncoder, colour, nearest, things};
+use crate::progress::{Progress, Silent};
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result, files};
 use rayon::prelude::*;
@@ -76,10 +77,10 @@ impl RegionWords {
         Ok(RegionWords { registry, classifier: None, vocabulary: None })
     }
 
-    fn vocabulary(&mut self) -> Result<&mut Vocabulary> {
+    fn vocabulary(&mut self, progress: &dyn Progress) -> Result<&mut Vocabulary> {
         let loaded = match self.vocabulary.take() {
             Some(v) => v,
-            None => Vocabulary::load(&self.registry)?,
+            None => Vocabulary::load(&self.registry, progress)?,
         };
         Ok(self.vocabulary.insert(loaded))
     }
@@ -94,14 +95,20 @@ impl RegionEncoder for RegionWords {
         DIM
     }
 
-    fn embed_regions(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
+    fn embed_regions(
+        &mut self,
+        image: &RgbImage,
+        labels: &Plane<i32>,
+        count: usize,
+        progress: &dyn Progress,
+    ) -> Result<Vec<f32>> {
         let classifier = match self.classifier.take() {
             Some(c) => c,
             None => Classifier::load(&self.registry)?,
         };
-        let posteriors = self.classifier.insert(classifier).regions(image, labels, count)?;
+        let posteriors = self.classifier.insert(classifier).regions(image, labels, count, progress)?;
         let colours = region_colours(image, labels, count);
-        let names = &self.vocabulary()?.names;
+        let names = &self.vocabulary(progress)?.names;
         let mut all = vec![0f32; count * DIM];
         for ((row, posterior), shown) in
             all.chunks_exact_mut(DIM).zip(posteriors.chunks_exact(CLASSES)).zip(&colours)
@@ -121,7 +128,7 @@ impl RegionEncoder for RegionWords {
     }
 
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
-        let vocabulary = self.vocabulary()?;
+        let vocabulary = self.vocabulary(&Silent)?;
         let mut all = vec![0f32; texts.len() * DIM];
         for (row, text) in all.chunks_exact_mut(DIM).zip(texts) {
             let meaning = vocabulary.encoder.embed(text)?;
@@ -134,9 +141,9 @@ impl RegionEncoder for RegionWords {
         let texts = things::of_form(form);
         let registry = self.registry.clone();
         let key = text_key("other-things", &registry).text(&texts.join("\n"));
-        let vocabulary = self.vocabulary()?;
+        let vocabulary = self.vocabulary(&Silent)?;
         let list: Vec<&str> = texts.iter().map(String::as_str).collect();
-        let meanings = registry.compute().remember(key, || vocabulary.encoder.embed_list(&list))?;
+        let meanings = registry.compute().remember(key, || vocabulary.encoder.embed_list(&list, &Silent))?;
         let mut all = vec![0f32; texts.len() * DIM];
         let fixed = &*vocabulary;
         all.par_chunks_exact_mut(DIM)
@@ -147,7 +154,7 @@ impl RegionEncoder for RegionWords {
     }
 
     fn nearest_word(&mut self, text: &str) -> Result<Option<(bool, String)>> {
-        let vocabulary = self.vocabulary()?;
+        let vocabulary = self.vocabulary(&Silent)?;
         let meaning = vocabulary.encoder.embed(&colour::without(text))?;
         let meaning = vocabulary.centred(meaning);
         let nearest = nearest(&meaning, &vocabulary.names, text::DIM, 1).concat();
@@ -156,7 +163,7 @@ impl RegionEncoder for RegionWords {
 
     /// Class names, with the region's colour before them where that says more: "yellow lemon".
     fn names(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
-        let vocabulary = self.vocabulary()?;
+        let vocabulary = self.vocabulary(&Silent)?;
         let found = nearest(regions, &vocabulary.rows(), DIM, best);
         let with_colour = |(list, region): (Vec<(usize, f32)>, &[f32])| {
             let (term, cosine) = colour::nearest_term(&region[COLOUR_AT..REST_AT]);
@@ -205,7 +212,7 @@ fn region_colours(image: &RgbImage, labels: &Plane<i32>, count: usize) -> Vec<Op
 }
 
 impl Vocabulary {
-    fn load(registry: &Registry) -> Result<Self> {
+    fn load(registry: &Registry, progress: &dyn Progress) -> Result<Self> {
         let file = registry.path(PackFileKind::Classes)?;
         let table = files::read_text(&file)?;
         // The first of a class's names: "lemon"; the rest are synonyms and Latin.
@@ -220,9 +227,9 @@ impl Vocabulary {
         let mut encoder = TextEncoder::load(registry)?;
         // Naming a thousand classes takes seconds, which a single query should not pay.
         let key = text_key("class-names", registry);
-        let mut names = registry
-            .compute()
-            .remember(key, || encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>()))?;
+        let mut names = registry.compute().remember(key, || {
+            encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>(), progress)
+        })?;
         let mut mean = vec![0f32; text::DIM];
         for name in names.chunks_exact(text::DIM) {
             mean.iter_mut().zip(name).for_each(|(m, n)| *m += n / CLASSES as f32);
@@ -308,7 +315,7 @@ mod tests {
         let canonical = words.embed_texts(&["object", "things", "stuff", "texture"]).unwrap();
         let views = views(split);
         let regions: Vec<_> =
-            views.iter().map(|v| words.embed_regions(&v.image, &v.masks, 12).unwrap()).collect();
+            views.iter().map(|v| words.embed_regions(&v.image, &v.masks, 12, &Silent).unwrap()).collect();
         let (mut first, mut all) = (0, 0);
         for (object, phrase) in phrases() {
             let query = words.embed_texts(&[&phrase]).unwrap();
@@ -373,7 +380,7 @@ mod tests {
     fn regions_get_names() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
         let view = &views("train")[1];
-        let regions = words.embed_regions(&view.image, &view.masks, 12).unwrap();
+        let regions = words.embed_regions(&view.image, &view.masks, 12, &Silent).unwrap();
         let names = words.names(&regions, 5).unwrap();
         assert!(names.len() == 12 && names.iter().all(|list| list.len() == 5));
         let object = phrases().into_iter().find(|(_, p)| p == "lemon").map_or(0, |(o, _)| o as usize);
@@ -389,7 +396,7 @@ mod tests {
     fn views_of_one_thing_agree() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
         let views = views("train");
-        let mut of = |v: &TestView| words.embed_regions(&v.image, &v.masks, 12).unwrap();
+        let mut of = |v: &TestView| words.embed_regions(&v.image, &v.masks, 12, &Silent).unwrap();
         let (a, b) = (of(&views[1]), of(&views[2]));
         let row = |all: &[f32], i: usize| all[i * DIM..(i + 1) * DIM].to_vec();
         // The eight objects. Measured: the same one 0.8 to 0.98, another 0.38 in the middle and 0.76 at most.
@@ -405,7 +412,7 @@ mod tests {
     fn embeddings_are_unit_vectors_and_empty_regions_zero() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
         let view = &views("train")[0];
-        let regions = words.embed_regions(&view.image, &view.masks, 14).unwrap();
+        let regions = words.embed_regions(&view.image, &view.masks, 14, &Silent).unwrap();
         assert_eq!(regions.len(), 14 * DIM);
         for (i, row) in regions.chunks_exact(DIM).enumerate() {
             let present = view.masks.data.contains(&(i as i32));
@@ -415,6 +422,6 @@ mod tests {
         for row in texts.chunks_exact(DIM) {
             assert!((dot(row, row) - 1.0).abs() < 1e-4);
         }
-        assert!(words.embed_regions(&view.image, &Plane::filled(3, 3, 0), 1).is_err());
+        assert!(words.embed_regions(&view.image, &Plane::filled(3, 3, 0), 1, &Silent).is_err());
     }
 }

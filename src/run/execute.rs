@@ -26,6 +26,8 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     let progress = &Recorded::new(progress);
     // Read whole before anything is written: the scene may be the one that is replaced.
     let base = plan.add.as_deref().map(BaseScene::open).transpose()?.map(Arc::new);
+    let registry = plan.registry()?;
+    sources::check_texts(&plan.features, &plan.queries, &registry)?;
     let workspace = Workspace::create(&plan.out, plan.force)?;
     // The device comes first: it says how large the photos may be.
     let device = Device::with(&gpu::Options {
@@ -41,7 +43,6 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
             (photo::load_each(&chosen, max_size, progress)?, choice)
         }
     };
-    let registry = plan.registry()?;
     let store = store(plan.resume, plan.checkpoint_seconds);
     let made = work(plan, &device, &registry, base.as_ref(), photos, &store, progress)?;
     let outcome = RunOutcome { choice, ..made };

@@ -207,22 +207,22 @@ def splats():
         write_ply(source, s)
         exact = dict(means=0, scales=0, rotation=1e-6, opacity=1e-7, sh0=0, sh=0)
         out = WORK / "out.ply"
-        run("export", source, "--format", "ply", "--ply-degree", degree, "--out", out)
+        run("export", source, "--format", "ply", "--ply-degree", degree, "--force", "--out", out)
         compare(f"ply degree {degree}: plyfile", read_ply(out), s, **exact)
         compare(f"ply degree {degree}: gsply", of_gsply(gsply.plyread(str(out))), s, **exact)
 
         out = WORK / "out.compressed.ply"
-        run("export", source, "--format", "compressed-ply", "--out", out)
+        run("export", source, "--format", "compressed-ply", "--force", "--out", out)
         _, got = by_position(of_gsply(gsply.plyread(str(out))), s)
         compare(f"compressed ply degree {degree}: gsply", got, s, **packed_bounds(s))
 
         out = WORK / "out.spz"
-        run("export", source, "--format", "spz", "--out", out)
+        run("export", source, "--format", "spz", "--force", "--out", out)
         compare(f"spz 4 degree {degree}: gsply", turned(of_gsply(read_spz(str(out)))), s, **SPZ)
 
         for kind in ("glb", "gltf"):
             out = WORK / f"out.{kind}"
-            run("export", source, "--format", kind, "--out", out)
+            run("export", source, "--format", kind, "--force", "--out", out)
             compare(f"{kind} degree {degree}: pygltflib", read_gltf(out), s, means=0, scales=1e-6, rotation=1e-6,
                     opacity=1e-7, sh0=0, sh=1e-6)
         others(s, degree)
@@ -247,7 +247,7 @@ def others(s, degree):
     back = WORK / "back.ply"
 
     def through(name, **bounds):
-        run("export", WORK / name, "--format", "ply", "--ply-degree", degree, "--out", back)
+        run("export", WORK / name, "--format", "ply", "--ply-degree", degree, "--force", "--out", back)
         got = read_ply(back)
         if "compressed" in name:
             _, got = by_position(got, s)

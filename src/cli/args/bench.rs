@@ -86,6 +86,9 @@ pub struct BenchArgs {
     /// Also write the figures to this file
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
+    /// Write over what is there: an ordinary file, or those of the same names in a folder
+    #[arg(long)]
+    pub force: bool,
     /// Measure nothing: print the ratios B / A of two files of --json
     #[arg(long, num_args = 2, value_names = ["A", "B"], conflicts_with_all = ["scene", "json", "write_scene"])]
     pub compare: Option<Vec<PathBuf>>,

@@ -58,6 +58,9 @@ pub struct AblateArgs {
     /// the data]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
+    /// Write over what is there: ordinary files of the names of tables
+    #[arg(long)]
+    pub force: bool,
     /// Masks and features for every row: built-in, flawed (true masks, errors injected), exact, or dir:DIR [default: those
     /// that each table is about]
     #[arg(long, value_name = "SOURCE")]

@@ -45,6 +45,20 @@ pub struct TruthFrame {
     pub lens: Option<Lens>,
 }
 
+impl TruthFrame {
+    /// Refuses a file of another size than the frame's.
+    fn fits(&self, path: &Path, (width, height): (u32, u32)) -> Result<()> {
+        let (w, h) = (self.camera.width, self.camera.height);
+        if (width, height) == (w, h) {
+            return Ok(());
+        }
+        Err(Error::input(format!(
+            "{}: {width} × {height} pixels, the frame has {w} × {h}; give one of its size, or correct ground_truth.json",
+            path.display()
+        )))
+    }
+}
+
 /// Labels of frames in another layout than `masks/<stem>.png`.
 pub trait ObjectMaps: std::fmt::Debug + Send + Sync {
     /// Object index per pixel of a frame, [H, W] of the label's own size; `None` where the frame has no labels.
@@ -104,12 +118,55 @@ impl GroundTruth {
             let pose = Pose { rotation, translation: column(3) };
             let camera =
                 Camera { name: f.file.clone(), width, height, fx: f.fx, fy: f.fy, cx: f.cx, cy: f.cy, pose };
-            let camera = camera.checked().map_err(|e| Error::input(format!("{}: {e}", path.display())))?;
+            // The matrix stays as it is written: scores are finer than its printed digits.
+            camera.clone().checked()?;
             Ok(TruthFrame { file: f.file, stem, split: f.split, camera, lens: f.lens })
         };
-        let frames = file.frames.into_iter().map(frame).collect::<Result<_>>()?;
+        let frames = file.frames.into_iter().map(frame).collect::<Result<_, String>>();
+        let frames = frames.map_err(|e| Error::input(format!("{}: {e}; correct it", path.display())))?;
         let up = file.up.map(DVec3::normalize_or_zero);
         Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, up, frames, maps: None })
+    }
+
+    /// Refuses files that are missing or do not fit the frames, before any work is done with them: photos, masks and depth of
+    /// another size, and with `masks`, where the set has labels, masks of some frames only. Says what cannot be scored where
+    /// it has labels and no mask at all.
+    pub fn check(&self, masks: bool) -> Result<Option<String>> {
+        let labelled = self.maps.is_none() && !self.labels.is_empty();
+        let mut missing = Vec::new();
+        for frame in &self.frames {
+            let photo = self.folder.join(&frame.file);
+            frame.fits(&photo, photo::dimensions(&photo)?)?;
+            let mask = self.mask_path(frame);
+            if labelled && mask.exists() {
+                frame.fits(&mask, photo::dimensions(&mask)?)?;
+            } else if labelled {
+                missing.push(mask);
+            }
+            if let Some(depth) = self.depth(frame)? {
+                frame.fits(&self.depth_path(frame), (depth.width as u32, depth.height as u32))?;
+            }
+        }
+        match missing.first() {
+            Some(_) if masks && missing.len() == self.frames.len() => Ok(Some(format!(
+                "{}: {} labels and no masks; answers are not scored",
+                self.folder.display(),
+                self.labels.len()
+            ))),
+            Some(mask) if masks => Err(Error::input(format!(
+                "{}: the mask is missing; restore it, or take the labels out of ground_truth.json to score without masks",
+                mask.display()
+            ))),
+            _ => Ok(None),
+        }
+    }
+
+    fn mask_path(&self, frame: &TruthFrame) -> PathBuf {
+        self.folder.join("masks").join(format!("{}.png", frame.stem))
+    }
+
+    fn depth_path(&self, frame: &TruthFrame) -> PathBuf {
+        self.folder.join("depth").join(format!("{}.npz", frame.stem))
     }
 
     /// The photo of a frame.
@@ -126,7 +183,7 @@ impl GroundTruth {
             let (width, height) = (frame.camera.width as usize, frame.camera.height as usize);
             return Ok(maps.objects(&frame.stem)?.map(|plane| resampled(&plane, width, height)));
         }
-        let path = self.folder.join("masks").join(format!("{}.png", frame.stem));
+        let path = self.mask_path(frame);
         if self.labels.is_empty() || !path.exists() {
             return Ok(None);
         }
@@ -137,7 +194,7 @@ impl GroundTruth {
 
     /// Camera z per pixel, 0 = unknown, if the set has depth.
     pub fn depth(&self, frame: &TruthFrame) -> Result<Option<Plane<f32>>> {
-        let path = self.folder.join("depth").join(format!("{}.npz", frame.stem));
+        let path = self.depth_path(frame);
         if !path.exists() {
             return Ok(None);
         }

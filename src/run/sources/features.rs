@@ -7,6 +7,7 @@ use crate::infer::clip::Clip;
 use crate::infer::installed::{Installed, Task};
 use crate::infer::words::RegionWords;
 use crate::infer::{PackFileKind, RegionEncoder, Registry};
+use crate::query::CANONICAL_PHRASES;
 use crate::run::stages::{SharedEncoder, identity};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -72,6 +73,17 @@ impl SourceKind for FeatureSources {
 /// The encoder of a choice, for queries alone.
 pub fn encoder(choice: &SourceChoice, registry: &Registry) -> Result<Box<dyn RegionEncoder>> {
     make::<FeatureSources>(choice, registry, registry)?.into_inner()
+}
+
+/// Refuses texts that the scene could not be asked for, and a table without the canonical phrases that every answer is held
+/// against, while nothing is made of the photos yet.
+pub fn check_texts(choice: &SourceChoice, queries: &[String], registry: &Registry) -> Result<()> {
+    let has_table = text_table(choice).is_some();
+    if choice.name != "dir" || (!has_table && queries.is_empty()) {
+        return Ok(());
+    }
+    let texts: Vec<&str> = CANONICAL_PHRASES.into_iter().chain(queries.iter().map(String::as_str)).collect();
+    encoder(choice, registry)?.embed_texts(&texts).map(drop)
 }
 
 /// The table of text embeddings of a choice, if it has one.

@@ -9,7 +9,7 @@ mod table;
 mod texts;
 
 pub use depth::DepthSources;
-pub use features::{FeatureSources, encoder, text_table};
+pub use features::{FeatureSources, check_texts, encoder, text_table};
 pub use geometry::GeometrySources;
 pub use masks::MaskSources;
 pub use matches::MatchSources;

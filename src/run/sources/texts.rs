@@ -4,6 +4,7 @@ use crate::infer::contract::Part;
 use crate::infer::installed::{Installed, Task, inventory};
 use crate::infer::{RegionEncoder, Registry, nearest, things};
 use crate::language::dir::TextEmbeddings;
+use crate::progress::Progress;
 use crate::query::CANONICAL_PHRASES;
 use crate::query::presence::MIN_OTHERS;
 use crate::scene::{Plane, RgbImage};
@@ -102,7 +103,13 @@ impl RegionEncoder for DirTexts {
     fn dim(&self) -> usize {
         self.texts.dim
     }
-    fn embed_regions(&mut self, _: &RgbImage, _: &Plane<i32>, _: usize) -> Result<Vec<f32>> {
+    fn embed_regions(
+        &mut self,
+        _: &RgbImage,
+        _: &Plane<i32>,
+        _: usize,
+        _: &dyn Progress,
+    ) -> Result<Vec<f32>> {
         Err(Error::work("precomputed features cannot describe new regions; give --masks dir: with them"))
     }
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {

@@ -229,7 +229,7 @@ pub fn describe<'i>(
             if level.features.is_empty() && count > 0 {
                 let maps = if whole.is_empty() { std::slice::from_ref(&level.labels) } else { &whole };
                 for map in maps {
-                    let rows = encoder.with(|e| e.embed_regions(image, map, count))?;
+                    let rows = encoder.with(|e| e.embed_regions(image, map, count, progress))?;
                     // A mask is on one map; on the others its row is zero.
                     level.features.resize(rows.len(), 0.0);
                     level.features.iter_mut().zip(rows).for_each(|(sum, v)| *sum += v);
@@ -260,7 +260,14 @@ mod tests {
         fn dim(&self) -> usize {
             1
         }
-        fn embed_regions(&mut self, _: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
+        fn embed_regions(
+            &mut self,
+            _: &RgbImage,
+            labels: &Plane<i32>,
+            count: usize,
+            progress: &dyn Progress,
+        ) -> Result<Vec<f32>> {
+            progress.check()?;
             let of = |k: usize| labels.data.iter().filter(|l| **l == k as i32).count() as f32;
             Ok((0..count).map(of).collect())
         }

@@ -1,0 +1,244 @@
+//! The rule for everything that a command writes where a user says: never over what is there without --force, never over a
+//! symbolic link or a device, all of it or none.
+#![cfg(unix)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
+mod fixture;
+
+use fixture::{data, scene, small_views};
+use std::ffi::OsString;
+use std::os::unix::fs::{FileTypeExt, symlink};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+fn splatvk(args: &[OsString]) -> Output {
+    let mut c = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+    c.env_remove("SPLATVK_MODELS").stdin(Stdio::null()).args(args).output().unwrap()
+}
+
+/// The command must end with exit code 2 and one line on standard error that contains the words.
+fn refused(args: &[OsString], words: &str) {
+    let output = splatvk(args);
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{args:?}: {stderr}");
+    assert!(stderr.lines().count() == 1 && stderr.contains(words), "{args:?}: {words:?} is not in: {stderr}");
+}
+
+fn succeeds(args: &[OsString]) {
+    let output = splatvk(args);
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(folder).unwrap();
+    let mut names: Vec<String> =
+        entries.map(|e| e.unwrap().file_name().to_string_lossy().into_owned()).collect();
+    names.sort();
+    names
+}
+
+/// A command line that ends with the place to write to.
+fn line(words: &str, place: &Path) -> Vec<OsString> {
+    let path = |name: &str| match name {
+        "SCENE" => scene().into(),
+        "CAMERAS" => scene().join("cameras/transforms.json").into(),
+        "TRUTH" => data("breakfast").into(),
+        "PHOTOS" => data("breakfast/images").into(),
+        "IMAGES" => small_views().0.into(),
+        "KNOWN" => small_views().1.into(),
+        word => OsString::from(word),
+    };
+    words.split(' ').map(path).chain([place.into()]).collect()
+}
+
+fn forced(mut line: Vec<OsString>) -> Vec<OsString> {
+    line.push("--force".into());
+    line
+}
+
+/// Commands that write a file, and those that write a folder.
+const FILES: [&str; 4] = [
+    "export SCENE --format ply --out",
+    "export SCENE --format spz --out",
+    "export SCENE --format transforms --out",
+    "bench sort --keys 1000 --repeats 1 --json",
+];
+const FOLDERS: [&str; 7] = [
+    "export SCENE --format colmap --out",
+    "render SCENE --cameras CAMERAS --out",
+    "query SCENE lemon --out",
+    "eval SCENE --ground-truth TRUTH --out",
+    "ablate alignment --data TRUTH --out",
+    "bench --write-scene",
+    "manuals",
+];
+/// Those whose folder is replaced as a whole, where it is a scene.
+const SCENES: [&str; 2] = ["run PHOTOS --out", "train --images IMAGES --cameras KNOWN --out"];
+
+#[test]
+fn nothing_is_written_over_without_force() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("letter");
+    std::fs::write(&file, "precious").unwrap();
+    let full = folder.path().join("full");
+    std::fs::create_dir(&full).unwrap();
+    std::fs::write(full.join("letter"), "precious").unwrap();
+    for words in FILES {
+        refused(&line(words, &file), "--force");
+        refused(&forced(line(words, &full)), "a folder is in the way");
+    }
+    for words in FOLDERS {
+        refused(&line(words, &full), "--force");
+        refused(&forced(line(words, &file)), "a file is in the way");
+    }
+    for words in SCENES {
+        refused(&forced(line(words, &full)), "not a scene");
+        refused(&forced(line(words, &file)), "a file is in the way");
+        refused(&line(words, scene()), "--force");
+    }
+    refused(&line("generate --out", &full), "not empty");
+    assert_eq!(std::fs::read_to_string(&file).unwrap(), "precious");
+    assert_eq!(std::fs::read_to_string(full.join("letter")).unwrap(), "precious");
+    assert_eq!(
+        (names(folder.path()), names(&full)),
+        (vec!["full".into(), "letter".into()], vec!["letter".into()])
+    );
+}
+
+#[test]
+fn links_and_devices_are_never_written_over() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::write(at("letter"), "precious").unwrap();
+    std::fs::create_dir(at("empty")).unwrap();
+    for (link, target) in [("to-file", "letter"), ("to-folder", "empty"), ("to-nothing", "nothing")] {
+        symlink(at(target), at(link)).unwrap();
+    }
+    symlink(scene(), at("to-scene")).unwrap();
+    for words in FILES.into_iter().chain(FOLDERS).chain(SCENES) {
+        for link in ["to-file", "to-folder", "to-nothing", "to-scene"] {
+            refused(&forced(line(words, &at(link))), "symbolic link");
+        }
+        refused(&forced(line(words, Path::new("/dev/null"))), "device");
+    }
+    refused(&line("generate --out", &at("to-folder")), "symbolic link");
+    assert!(std::fs::symlink_metadata("/dev/null").unwrap().file_type().is_char_device());
+    assert_eq!(std::fs::read_to_string(at("letter")).unwrap(), "precious");
+    assert!(
+        names(&at("empty")).is_empty() && !at("nothing").exists() && scene().join("scene.json").is_file()
+    );
+    assert!(["to-file", "to-folder", "to-nothing", "to-scene"].iter().all(|l| at(l).is_symlink()));
+}
+
+#[test]
+fn with_force_files_of_the_same_names_are_replaced_and_others_stay() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    for (k, words) in FILES.into_iter().enumerate() {
+        let file = at(&format!("file-{k}"));
+        std::fs::write(&file, "old").unwrap();
+        succeeds(&forced(line(words, &file)));
+        assert!(std::fs::metadata(&file).unwrap().len() > 100, "{words}");
+    }
+    for (words, file) in [
+        ("export SCENE --format colmap --out", "cameras.txt"),
+        ("render SCENE --cameras CAMERAS --out", "train_00.png"),
+        ("manuals", "splatvk.1"),
+        ("bench --splats 100 --width 64 --height 48 --write-scene", "scene.json"),
+    ] {
+        let out = at("results").join(words.split(' ').next().unwrap());
+        std::fs::create_dir_all(&out).unwrap();
+        std::fs::write(out.join(file), "old").unwrap();
+        std::fs::write(out.join("letter"), "precious").unwrap();
+        succeeds(&forced(line(words, &out)));
+        assert!(std::fs::metadata(out.join(file)).unwrap().len() > 100, "{words}");
+        assert_eq!(std::fs::read_to_string(out.join("letter")).unwrap(), "precious");
+        assert!(names(&out).iter().all(|n| !n.contains("partial")));
+    }
+}
+
+#[test]
+fn a_scene_is_not_written_into_by_its_own_export() {
+    let before = std::fs::read(scene().join("point_cloud.ply")).unwrap();
+    for (format, place) in [("ply", "point_cloud.ply"), ("colmap", "cameras/colmap"), ("colmap", "cameras")] {
+        let words = format!("export SCENE --format {format} --out");
+        refused(&forced(line(&words, &scene().join(place))), "a part of the scene");
+    }
+    assert_eq!(std::fs::read(scene().join("point_cloud.ply")).unwrap(), before);
+}
+
+/// Runs through a shell that limits the size of every written file, as a full disk does; the limit is in 512-byte blocks.
+fn limited(blocks: u32, args: &[OsString]) -> Output {
+    let mut c = Command::new("sh");
+    // Without the trap the kernel ends the process instead of failing the write.
+    c.arg("-c").arg(format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$0\" \"$@\""));
+    c.arg(env!("CARGO_BIN_EXE_splatvk")).args(args).output().unwrap()
+}
+
+#[test]
+fn a_full_disk_leaves_no_half_of_a_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out/model");
+    for format in ["colmap", "colmap-bin"] {
+        // Cameras and images take less than a block of 512 bytes each, points more.
+        let words = format!("export SCENE --format {format} --out");
+        let output = limited(4, &line(&words, &out));
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{stderr}");
+        assert!(stderr.lines().count() == 1 && stderr.contains("limit"), "{stderr}");
+        assert!(names(folder.path()).is_empty(), "{:?}", names(folder.path()));
+    }
+    succeeds(&line("export SCENE --format colmap --out", &out));
+    let before: Vec<Vec<u8>> = names(&out).iter().map(|n| std::fs::read(out.join(n)).unwrap()).collect();
+    assert_eq!(limited(4, &forced(line("export SCENE --format colmap --out", &out))).status.code(), Some(2));
+    let after: Vec<Vec<u8>> = names(&out).iter().map(|n| std::fs::read(out.join(n)).unwrap()).collect();
+    assert!(before.len() == 3 && before == after, "the old model is whole");
+}
+
+/// No process has this number: the kernel's largest is 2²².
+const GONE: &str = "partial-4000000000";
+
+#[test]
+fn leftovers_of_killed_commands_go_with_the_next_and_with_clean() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let living = format!("a.ply.partial-{}", std::process::id());
+    let leave = || {
+        for name in [&format!("a.ply.{GONE}"), &format!("b.ply.{GONE}"), &living] {
+            std::fs::write(at(name), "half").unwrap();
+        }
+        std::fs::create_dir_all(at("answers").join(format!(".{GONE}/lemon"))).unwrap();
+        std::fs::create_dir_all(at(&format!(".scene.{GONE}/cameras"))).unwrap();
+    };
+    leave();
+    succeeds(&line("export SCENE --format ply --out", &at("a.ply")));
+    let kept =
+        [format!(".scene.{GONE}"), "a.ply".into(), living.clone(), "answers".into(), format!("b.ply.{GONE}")];
+    assert_eq!(names(folder.path()), kept, "only those of the same place");
+    // A folder with nothing but a leftover is empty.
+    succeeds(&line("export SCENE --format colmap --out", &at("answers")));
+    assert_eq!(names(&at("answers")), ["cameras.txt", "images.txt", "points3D.txt"]);
+    std::fs::remove_dir_all(at("answers")).unwrap();
+    leave();
+    let clean = |extra: &[&str]| -> serde_json::Value {
+        let mut clean = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+        clean
+            .env("SPLATVK_HOME", at("home"))
+            .current_dir(folder.path())
+            .args(["clean", "--json"])
+            .args(extra);
+        let output = clean.output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let told: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let rows = told["kept"].as_array().unwrap();
+        rows.iter().find(|r| r["what"].as_str().unwrap().contains("unfinished")).unwrap()["files"].clone()
+    };
+    assert_eq!(clean(&[]), 4);
+    assert!(at(&format!("b.ply.{GONE}")).exists(), "told, not deleted");
+    let elsewhere = tempfile::tempdir().unwrap();
+    std::fs::write(elsewhere.path().join(format!("c.ply.{GONE}")), "half").unwrap();
+    assert_eq!(clean(&["--delete", elsewhere.path().to_str().unwrap()]), 5);
+    assert_eq!(clean(&[]), 0);
+    let left: Vec<PathBuf> = ["a.ply", &living, "answers"].map(PathBuf::from).to_vec();
+    assert_eq!(names(folder.path()).iter().map(PathBuf::from).collect::<Vec<_>>(), left);
+    assert!(names(elsewhere.path()).is_empty());
+}

@@ -1,0 +1,231 @@
+//! The server of `splatvk view`, as what else runs on the machine meets it: other pages, other users, requests that never end.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
+mod fixture;
+
+use fixture::view::{Server, breakfast};
+use serde_json::{Value, json};
+use std::net::TcpStream;
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+/// One scene for all tests, in the target folder: nothing destroys statics.
+fn scene() -> &'static PathBuf {
+    static SCENE: OnceLock<PathBuf> = OnceLock::new();
+    SCENE.get_or_init(|| {
+        let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("view");
+        let _ = std::fs::remove_dir_all(&folder);
+        std::fs::create_dir_all(&folder).unwrap();
+        breakfast(&folder)
+    })
+}
+
+/// An ordinary request gets its answer, soon.
+fn answers(server: &Server) {
+    let clock = Instant::now();
+    let (status, body) = server.request("POST", "query", "", &json!({ "text": "lemon" }).to_string());
+    assert_eq!(status, 200, "{body}");
+    let took = clock.elapsed();
+    assert!(took < Duration::from_secs(3), "{took:?}");
+}
+
+#[test]
+fn only_its_own_page_is_answered() {
+    let server = Server::start(scene());
+    let port = server.host.split_once(':').unwrap().1;
+    for name in ["", "scene.bin", "query", "none"] {
+        for header in [
+            "Host: evil.example\r\n".to_owned(),
+            format!("Host: evil.example:{port}\r\n"),
+            "Host: 127.0.0.1:1\r\n".to_owned(),
+            "Origin: http://evil.example\r\n".to_owned(),
+            "Origin: null\r\n".to_owned(),
+            format!("Origin: https://{}\r\n", server.host),
+        ] {
+            for method in ["GET", "POST"] {
+                let (status, body) = server.request(method, name, &header, "");
+                assert_eq!(status, 403, "{method} {name} {header}: {body}");
+            }
+        }
+        let path = format!("{}{name}", server.base);
+        for head in [
+            format!("GET {path} HTTP/1.0\r\n\r\n"),
+            format!("GET {path} HTTP/1.1\r\nHost: {0}\r\nHost: evil.example\r\n\r\n", server.host),
+            format!("GET http://evil.example{path} HTTP/1.1\r\nHost: {}\r\n\r\n", server.host),
+        ] {
+            let reply = server.raw(head.as_bytes());
+            assert!(reply.contains(" 403 ") || reply.contains(" 400 "), "{head}: {reply}");
+        }
+    }
+    assert_eq!(server.request("GET", "", &format!("Host: localhost:{port}\r\n"), "").0, 200);
+    assert_eq!(server.request("GET", "../Cargo.toml", "", "").0, 404);
+    assert_eq!(server.request("DELETE", "", "", "").0, 404);
+    assert_eq!(server.request("POST", "query", "", "lemon").0, 400);
+    let (status, body) = server.request("POST", "query", "", "{\"text\": \"unicorn\"}");
+    assert!(status == 422 && body.contains("no text embedding for 'unicorn'"), "{status} {body}");
+    let (status, body) = server.request("POST", "query", "", "{\"text\": \"lemon\"}");
+    assert_eq!(status, 200);
+    let answer: Value = serde_json::from_str(body.trim()).unwrap();
+    assert_eq!((&answer["level"], &answer["codes"], &answer["found"]), (&json!(2), &json!([6]), &json!(2)));
+}
+
+/// Other users of the machine can connect; the address is what they do not know.
+#[test]
+fn without_the_secret_there_is_nothing() {
+    let (server, other) = (Server::start(scene()), Server::start(scene()));
+    let secret = server.base.trim_matches('/');
+    assert!(secret.len() == 32 && secret.bytes().all(|b| b.is_ascii_hexdigit()), "{secret}");
+    assert_ne!(server.base, other.base);
+    let ask = json!({ "text": "lemon" }).to_string();
+    for folder in ["/".to_owned(), "//".to_owned(), format!("/{}/", "0".repeat(32)), other.base.clone()] {
+        for name in ["", "scene.bin", "query"] {
+            assert_eq!(server.at("GET", &format!("{folder}{name}"), "", "").0, 404, "{folder}{name}");
+            assert_eq!(server.at("POST", &format!("{folder}{name}"), "", &ask).0, 404, "{folder}{name}");
+        }
+    }
+    for path in [format!("/{secret}"), format!("/{secret}0/"), format!("/{}/", &secret[..31])] {
+        assert_eq!(server.at("GET", &path, "", "").0, 404, "{path}");
+    }
+    let (status, page) = server.request("GET", "", "", "");
+    assert!(status == 200 && page.contains("v-manifest") && !page.contains(secret));
+    assert_eq!(server.request("GET", "scene.bin", "", "").0, 200);
+}
+
+/// What a page sends back must not become a page itself.
+#[test]
+fn answers_are_data_whatever_was_asked() {
+    let server = Server::start(scene());
+    let body = json!({ "text": "<script>alert(1)</script>" }).to_string();
+    let head = format!("POST {}query HTTP/1.1\r\nHost: {}\r\n", server.base, server.host);
+    let reply =
+        server.raw(format!("{head}Content-Length: {}\r\n\r\n{body}", body.len()).as_bytes()).to_lowercase();
+    assert!(reply.contains("content-type: application/json\r\n"), "{reply}");
+    assert!(reply.contains("x-content-type-options: nosniff\r\n"), "{reply}");
+    assert!(reply.contains("content-security-policy: default-src 'none'"), "{reply}");
+    let error: Value = serde_json::from_str(reply.split_once("\r\n\r\n").unwrap().1).unwrap();
+    assert!(error["error"].as_str().unwrap().contains("<script>alert(1)</script>"));
+}
+
+#[test]
+fn bodies_that_are_huge_or_never_end_stop_nobody() {
+    let server = Server::start(scene());
+    let head = format!("POST {}query HTTP/1.1\r\nHost: {}\r\n", server.base, server.host);
+    let too_long = |rest: String| {
+        let reply = server.raw(format!("{head}{rest}").as_bytes());
+        assert!(reply.starts_with("HTTP/1.1 413 "), "{reply}");
+    };
+    too_long("Content-Length: 99999999999999\r\n\r\n".into());
+    too_long(format!("Content-Length: 5000\r\n\r\n{}", "x".repeat(5000)));
+    too_long(format!("Transfer-Encoding: chunked\r\n\r\n1388\r\n{}\r\n0\r\n\r\n", "x".repeat(5000)));
+    // Not even for a path that has nothing to do with a body.
+    let reply = server.raw(
+        format!("POST / HTTP/1.1\r\nHost: {}\r\nContent-Length: 99999999999999\r\n\r\n", server.host)
+            .as_bytes(),
+    );
+    assert!(reply.starts_with("HTTP/1.1 404 "), "{reply}");
+    let begun = Instant::now();
+    let unfinished: Vec<TcpStream> = [
+        format!("{head}Content-Length: 2000\r\n\r\n{{"),
+        format!("{head}Transfer-Encoding: chunked\r\n\r\n1\r\n{{"),
+        head.clone(),
+        "PO".to_owned(),
+        String::new(),
+    ]
+    .iter()
+    .map(|bytes| server.open(bytes.as_bytes()))
+    .collect();
+    answers(&server);
+    for mut stream in unfinished {
+        // Ended by the server, with or without a word.
+        let _ = std::io::Read::read_to_end(&mut stream, &mut Vec::new());
+    }
+    let took = begun.elapsed();
+    assert!(took > Duration::from_secs(3) && took < Duration::from_secs(15), "{took:?}");
+    answers(&server);
+}
+
+#[test]
+fn malformed_requests_are_refused_and_leave_it_answering() {
+    let server = Server::start(scene());
+    let big = format!("GET / HTTP/1.1\r\nHost: {}\r\nX: {}\r\n\r\n", server.host, "x".repeat(100_000));
+    let many: String = (0..5000).map(|k| format!("X-{k}: 1\r\n")).collect();
+    for bytes in [
+        b"\0\xff\xfe\r\n\r\n".to_vec(),
+        b"GET\r\n\r\n".to_vec(),
+        b"GET / HTTP/9.9\r\n\r\n".to_vec(),
+        b"GET / HTTP/1.1\r\nContent-Length: -1\r\n\r\n".to_vec(),
+        b"POST / HTTP/1.1\r\nContent-Length: 1\r\nContent-Length: 2\r\n\r\nab".to_vec(),
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03".to_vec(),
+        big.into_bytes(),
+        format!("GET / HTTP/1.1\r\n{many}\r\n").into_bytes(),
+    ] {
+        let reply = server.raw(&bytes);
+        assert!(reply.is_empty() || reply.starts_with("HTTP/1.1 4"), "{reply}");
+    }
+    answers(&server);
+}
+
+/// More than the server keeps open: it must end those that say nothing, and go on.
+#[test]
+fn a_thousand_connections_leave_it_answering_and_ending() {
+    let server = Server::start(scene());
+    let half = format!("POST {}query HTTP/1.1\r\nHost: {}\r\n", server.base, server.host);
+    let body = format!("{half}Content-Length: 2000\r\n\r\n{{");
+    let kinds = [String::new(), half, body];
+    let open: Vec<TcpStream> = (0..1000).map(|k| server.open(kinds[k % 3].as_bytes())).collect();
+    answers(&server);
+    drop(open);
+    // And a thousand that are in order, eight at a time.
+    std::thread::scope(|scope| {
+        for _ in 0..8 {
+            scope.spawn(|| {
+                for _ in 0..125 {
+                    assert_eq!(server.request("GET", "none", "", "").0, 404);
+                }
+            });
+        }
+    });
+    let _open: Vec<TcpStream> = (0..100).map(|k| server.open(kinds[k % 3].as_bytes())).collect();
+    let (status, took) = server.stop("-TERM");
+    assert_eq!(status.code(), Some(0));
+    assert!(took < Duration::from_secs(2), "{took:?}");
+}
+
+#[test]
+fn it_ends_with_its_terminal_and_with_who_started_it() {
+    for signal in ["-HUP", "-INT", "-TERM"] {
+        let server = Server::start(scene());
+        let _open = server.open(b"POST / HT");
+        let (status, took) = server.stop(signal);
+        assert_eq!(status.code(), Some(0), "{signal}");
+        assert!(took < Duration::from_secs(2), "{signal}: {took:?}");
+    }
+    if !cfg!(target_os = "linux") {
+        return;
+    }
+    let mut server = Server::start_with(scene(), Stdio::piped());
+    answers(&server);
+    assert!(server.child.try_wait().unwrap().is_none());
+    drop(server.child.stdin.take());
+    let closed = Instant::now();
+    assert_eq!(server.child.wait().unwrap().code(), Some(0));
+    assert!(closed.elapsed() < Duration::from_secs(2));
+    // Nobody to watch: closed from the beginning.
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(writer);
+    let mut server = Server::start_with(scene(), reader.into());
+    std::thread::sleep(Duration::from_millis(500));
+    assert!(server.child.try_wait().unwrap().is_none());
+    answers(&server);
+}
+
+#[test]
+fn a_port_that_is_taken_is_said() {
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = taken.local_addr().unwrap().port().to_string();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+    let output = command.arg("view").arg(scene()).args(["--port", &port]).output().unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("--port"));
+}
