@@ -43,7 +43,8 @@ void main() {
     // digit: being last in order, it displaces nothing.
     uvec2 own[EACH];
     uint ranks[EACH];
-    uvec2 all = SUBGROUP_SIZE == 64 ? uvec2(~0u) : uvec2((1u << (SUBGROUP_SIZE % 32)) - 1u, 0u);
+    // A shift by 32 is undefined: whole words stand by themselves.
+    uvec2 all = uvec2(SUBGROUP_SIZE < 32 ? (1u << (SUBGROUP_SIZE % 32)) - 1u : ~0u, SUBGROUP_SIZE < 64 ? 0u : ~0u);
     uvec2 before = lane < 32u ? uvec2((1u << lane) - 1u, 0u) : uvec2(~0u, (1u << (lane - 32u)) - 1u);
     for (uint i = 0u; i < EACH; i++) {
         uint index = first + (subgroup * EACH + i) * SUBGROUP_SIZE + lane;

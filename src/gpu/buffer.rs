@@ -126,7 +126,8 @@ impl<T> Buffer<T> {
     }
 
     /// Identity: equal for clones of one buffer.
-    pub(super) fn id(&self) -> u64 {
+    #[doc(hidden)]
+    pub fn id(&self) -> u64 {
         Arc::as_ptr(&self.0) as u64
     }
 

@@ -27,6 +27,18 @@ impl Call {
         Call { family, variant, buffers, push }
     }
 
+    /// Its buffers by binding number.
+    #[doc(hidden)]
+    pub fn buffers(&self) -> &[(u32, Buffer)] {
+        &self.buffers
+    }
+
+    /// Its push constants, as the shader lays them out.
+    #[doc(hidden)]
+    pub fn push(&self) -> &[u8] {
+        &self.push
+    }
+
     /// The compiled variant that serves it on a device.
     pub(super) fn resolve(&self, info: &DeviceInfo) -> Result<&'static Module> {
         let family = self.family;

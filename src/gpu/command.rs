@@ -6,14 +6,18 @@ use super::module::Module;
 use crate::{Error, Result};
 
 /// What a command does.
-pub(super) enum Op {
+#[doc(hidden)]
+#[allow(missing_docs)] // named as the arguments of `Recorder`
+pub enum Op {
     Fill { buffer: Buffer, value: u32 },
     Copy { from: Buffer, to: Buffer, from_byte: u64, to_byte: u64, bytes: u64 },
     Dispatch { module: &'static Module, call: Call, groups: Groups },
 }
 
 /// How many workgroups run.
-pub(super) enum Groups {
+#[doc(hidden)]
+#[allow(missing_docs)]
+pub enum Groups {
     Direct([u32; 3]),
     Indirect { args: Buffer, byte: u64 },
 }

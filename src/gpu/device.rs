@@ -9,6 +9,7 @@ use super::staging::Staging;
 use super::validation::Sink;
 use crate::Result;
 use ash::vk;
+use std::any::Any;
 use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -50,6 +51,8 @@ pub(super) struct Inner {
     pub owned: bool,
     pub heap: Heap,
     submissions: AtomicU64,
+    /// What tests run programs on in the place of the queue: an `executor::Attached`.
+    pub stand_in: Option<Box<dyn Any + Send + Sync>>,
     /// The submission from which on the device is lost.
     #[cfg(test)]
     lost_from: AtomicU64,
@@ -122,6 +125,7 @@ impl Device {
             owned,
             heap,
             submissions: AtomicU64::new(0),
+            stand_in: None,
             #[cfg(test)]
             lost_from: AtomicU64::new(u64::MAX),
             staging: Mutex::default(),

@@ -85,6 +85,7 @@ mod command;
 mod device;
 mod enabled;
 mod error;
+mod executor;
 pub mod external;
 mod features;
 mod hazard;
@@ -108,8 +109,12 @@ pub use adopt::HostDevice;
 pub use ash::vk;
 pub use buffer::Buffer;
 pub use call::Call;
+#[doc(hidden)]
+pub use command::{Groups, Op};
 pub use device::{Device, QueueLock};
 pub use enabled::EnabledFeatures;
+#[doc(hidden)]
+pub use executor::Executor;
 pub use info::{DeviceInfo, Options};
 pub use memory::Memory;
 pub use module::{Access, Binding, Capability, Family, Module};

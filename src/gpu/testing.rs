@@ -1,9 +1,10 @@
 //! Devices for tests, with validation on.
 use super::device::Device;
+use super::executor::{Attached, Executor};
 use super::info::Options;
 use crate::Result;
 use std::ops::Deref;
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 /// The device that all tests of a process share, with validation on. Dropping the handle fails the test if the layer has
 /// said anything so far.
@@ -25,6 +26,26 @@ impl TestDevice {
     /// A device of its own for tests that need other options than the shared one.
     pub fn with(options: &Options) -> Result<TestDevice> {
         Device::with(&Options { validation: true, pipeline_cache: None, ..options.clone() }).map(TestDevice)
+    }
+
+    /// A device whose programs are run by an executor, with the shaders for one subgroup size and the choices for GPUs.
+    /// Buffers must be mapped.
+    pub fn executed_by(
+        executor: Box<dyn Executor>,
+        subgroup_size: u32,
+        float_atomics: bool,
+    ) -> Result<TestDevice> {
+        let mut device = TestDevice::with(&Options::from_env(None))?;
+        if let Some(inner) = Arc::get_mut(&mut device.0.0) {
+            inner.info.subgroup_size = subgroup_size;
+            inner.info.subgroup_sizes = (subgroup_size, subgroup_size);
+            inner.info.float_atomics = float_atomics;
+            inner.info.timestamp_period = 0.0;
+            inner.info.is_cpu = false;
+            let attached: Attached = executor;
+            inner.stand_in = Some(Box::new(attached));
+        }
+        Ok(device)
     }
 }
 

@@ -1,0 +1,147 @@
+//! Runs the programs of the engine on the interpreter: a device of any subgroup size.
+use super::code::Code;
+use super::dispatch::{self, Schedule};
+use super::faults::Faults;
+use super::lower::lower;
+use super::memory::Memory;
+use super::module::words_of;
+use splatvk::gpu::{Buffer, Executor, Groups, Module, Op, TestDevice};
+use std::collections::{BTreeSet, HashMap};
+use std::sync::{Arc, LazyLock, Mutex};
+
+/// Another module in the place of one that is shipped.
+pub type Change = Arc<dyn Fn(&Module) -> Option<Vec<u32>> + Send + Sync>;
+
+/// A device that is interpreted.
+#[derive(Clone)]
+pub struct Interpreted {
+    pub schedule: Schedule,
+    pub float_atomics: bool,
+    /// Buffers of these names hold nothing when a program begins: what it reads there it must have written.
+    pub scratch: &'static [&'static str],
+    pub change: Option<Change>,
+    /// Modules that have run.
+    pub ran: Arc<Mutex<BTreeSet<&'static str>>>,
+}
+
+impl Interpreted {
+    pub fn open(&self) -> TestDevice {
+        let size = self.schedule.subgroup_size as u32;
+        TestDevice::executed_by(Box::new(self.clone()), size, self.float_atomics).expect("a device")
+    }
+
+    fn code(&self, module: &Module) -> Arc<Code> {
+        static LOWERED: LazyLock<Mutex<HashMap<&str, Arc<Code>>>> = LazyLock::new(Mutex::default);
+        if let Some(words) = self.change.as_ref().and_then(|change| change(module)) {
+            return Arc::new(lower(&words));
+        }
+        if let Some(code) = LOWERED.lock().unwrap().get(module.name) {
+            return code.clone();
+        }
+        let code = Arc::new(lower(&words_of(module.spirv)));
+        LOWERED.lock().unwrap().insert(module.name, code.clone());
+        code
+    }
+}
+
+/// Buffers of a program, by identity.
+struct Buffers<'a> {
+    scratch: &'a [&'a str],
+    held: HashMap<u64, (Buffer, Memory)>,
+}
+
+impl Buffers<'_> {
+    /// The memory of a buffer. Behind its own bytes a binding goes on to a whole vector of four words, which hold nothing.
+    fn memory(&mut self, buffer: &Buffer) -> &mut Memory {
+        let entry = self.held.entry(buffer.id()).or_insert_with(|| {
+            let bytes = buffer.cast::<u8>().read().expect("a mapped buffer");
+            let mut words = words_of(&bytes);
+            let own = words.len();
+            words.resize(own.next_multiple_of(4).max(4), 0);
+            let mut memory = Memory::of(words);
+            memory.forget(if self.scratch.contains(&buffer.name()) { 0 } else { own });
+            (buffer.clone(), memory)
+        });
+        &mut entry.1
+    }
+
+    fn write_back(&self) {
+        for (buffer, memory) in self.held.values() {
+            let bytes: Vec<u8> = memory.words.iter().flat_map(|w| w.to_le_bytes()).collect();
+            let own = &bytes[..buffer.bytes() as usize];
+            buffer.cast::<u8>().write(own).expect("a mapped buffer");
+        }
+    }
+}
+
+impl Executor for Interpreted {
+    fn run(&self, commands: &[&Op]) -> Result<(), String> {
+        let mut buffers = Buffers { scratch: self.scratch, held: HashMap::new() };
+        for (k, op) in commands.iter().enumerate() {
+            match op {
+                Op::Fill { buffer, value } => {
+                    let memory = buffers.memory(buffer);
+                    let words = vec![*value; memory.words.len()];
+                    memory.set(0, &words);
+                }
+                Op::Copy { from, to, from_byte, to_byte, bytes } => {
+                    let (first, count) = ((from_byte / 4) as usize, (bytes / 4) as usize);
+                    let words = buffers.memory(from).words[first..first + count].to_vec();
+                    buffers.memory(to).set((to_byte / 4) as usize, &words);
+                }
+                Op::Dispatch { module, call, groups } => {
+                    let groups = match groups {
+                        Groups::Direct(groups) => *groups,
+                        Groups::Indirect { args, byte } => {
+                            let words = &buffers.memory(args).words[(byte / 4) as usize..];
+                            [words[0], words[1], words[2]]
+                        }
+                    };
+                    self.dispatch(module, call.buffers(), call.push(), groups, k as u64, &mut buffers)?;
+                }
+            }
+        }
+        buffers.write_back();
+        Ok(())
+    }
+}
+
+impl Interpreted {
+    fn dispatch(
+        &self,
+        module: &'static Module,
+        bound: &[(u32, Buffer)],
+        push: &[u8],
+        groups: [u32; 3],
+        number: u64,
+        buffers: &mut Buffers,
+    ) -> Result<(), String> {
+        self.ran.lock().unwrap().insert(module.name);
+        let code = self.code(module);
+        let used: Vec<&(u32, Buffer)> =
+            bound.iter().filter(|b| module.bindings.iter().any(|m| m.number == b.0)).collect();
+        let mut bindings: Vec<Option<Memory>> = Vec::new();
+        bindings.resize_with(32, || None);
+        let mut first: HashMap<u64, u32> = HashMap::new();
+        for (binding, buffer) in &used {
+            // Buffers that are only read may be bound twice: the second binding gets a copy.
+            let memory = match first.get(&buffer.id()) {
+                Some(&other) => Memory::of(bindings[other as usize].as_ref().unwrap().words.clone()),
+                None => std::mem::replace(buffers.memory(buffer), Memory::of(Vec::new())),
+            };
+            first.entry(buffer.id()).or_insert(*binding);
+            bindings[*binding as usize] = Some(memory);
+        }
+        let mut faults = Faults::default();
+        let schedule = Schedule { seed: self.schedule.seed ^ number << 8, ..self.schedule };
+        let outcome = dispatch::run(&code, &mut bindings, &words_of(push), groups, &schedule, &mut faults);
+        for (binding, buffer) in &used {
+            if first.get(&buffer.id()) == Some(binding)
+                && let Some(memory) = bindings[*binding as usize].take()
+            {
+                *buffers.memory(buffer) = memory;
+            }
+        }
+        outcome.and_then(|()| faults.report()).map_err(|e| format!("{}: {e}", module.name))
+    }
+}

@@ -1,0 +1,179 @@
+//! Memory that knows who touched which word: words that nobody wrote, and data races.
+//!
+//! Two accesses race if at least one writes, not both are atomic, they are of different invocations, and no barrier lies
+//! between them. Barriers order the invocations of a workgroup only, and only the memory that they name; nothing orders
+//! two workgroups of one dispatch.
+use super::code::{Atomic, GARBAGE};
+
+/// Who accesses: number within the dispatch, from 1, and how many barriers it has behind it.
+#[derive(Clone, Copy)]
+pub struct Who {
+    pub invocation: u32,
+    pub epoch: u32,
+}
+
+/// Accesses of one kind to one word, summed up such that the question whether any of them is not ordered before another
+/// access has an exact answer.
+#[derive(Clone, Copy, Default)]
+struct Seen {
+    /// The latest; invocation 0 = none.
+    invocation: u32,
+    epoch: u32,
+    /// Several invocations of the latest's workgroup, in the latest's epoch.
+    many: bool,
+    /// More than one workgroup.
+    groups: bool,
+}
+
+/// Plain reads, plain writes and atomic accesses of a word since the dispatch began.
+#[derive(Clone, Copy, Default)]
+struct Shadow {
+    read: Seen,
+    written: Seen,
+    atomic: Seen,
+}
+
+/// What is wrong with an access.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Fault {
+    Unwritten,
+    Race,
+}
+
+const PAGE: usize = 256;
+
+/// Words with their history.
+pub struct Memory {
+    pub words: Vec<u32>,
+    /// Which words hold something; `None` where all do.
+    written: Option<Vec<bool>>,
+    shadow: Vec<Option<Box<[Shadow; PAGE]>>>,
+    group_size: u32,
+}
+
+impl Memory {
+    /// Words that all hold something.
+    pub fn of(words: Vec<u32>) -> Memory {
+        let pages = words.len().div_ceil(PAGE);
+        Memory { words, written: None, shadow: vec![None; pages], group_size: 1 }
+    }
+
+    /// Words that hold nothing.
+    pub fn empty(words: usize) -> Memory {
+        let mut memory = Memory::of(vec![GARBAGE; words]);
+        memory.forget(0);
+        memory
+    }
+
+    /// From a word on, what is there counts as written by nobody.
+    pub fn forget(&mut self, from: usize) {
+        let count = self.words.len();
+        self.words[from..].fill(GARBAGE);
+        self.written.get_or_insert_with(|| vec![true; count])[from..].fill(false);
+    }
+
+    /// Writes from outside a dispatch.
+    pub fn set(&mut self, first: usize, words: &[u32]) {
+        self.words[first..first + words.len()].copy_from_slice(words);
+        if let Some(written) = &mut self.written {
+            written[first..first + words.len()].fill(true);
+        }
+    }
+
+    /// Another dispatch, which waits for all that was before.
+    pub fn start(&mut self, group_size: u32) {
+        self.group_size = group_size;
+        self.shadow.fill(None);
+    }
+
+    fn shadow(&mut self, word: usize) -> &mut Shadow {
+        let page = self.shadow[word / PAGE].get_or_insert_with(|| Box::new([Shadow::default(); PAGE]));
+        &mut page[word % PAGE]
+    }
+
+    pub fn load(&mut self, word: usize, who: Who) -> (u32, Option<Fault>) {
+        let size = self.group_size;
+        let shadow = self.shadow(word);
+        let race = shadow.written.unordered(who, size) || shadow.atomic.unordered(who, size);
+        shadow.read.note(who, size);
+        let unwritten = self.written.as_ref().is_some_and(|w| !w[word]);
+        let fault = if race { Some(Fault::Race) } else { unwritten.then_some(Fault::Unwritten) };
+        (self.words[word], fault)
+    }
+
+    pub fn store(&mut self, word: usize, value: u32, who: Who) -> Option<Fault> {
+        let size = self.group_size;
+        let shadow = self.shadow(word);
+        let race = [shadow.read, shadow.written, shadow.atomic].iter().any(|s| s.unordered(who, size));
+        shadow.written.note(who, size);
+        self.words[word] = value;
+        if let Some(written) = &mut self.written {
+            written[word] = true;
+        }
+        race.then_some(Fault::Race)
+    }
+
+    pub fn atomic(
+        &mut self,
+        op: Atomic,
+        word: usize,
+        (value, expected): (u32, u32),
+        who: Who,
+    ) -> (u32, Option<Fault>) {
+        let size = self.group_size;
+        let shadow = self.shadow(word);
+        let race =
+            shadow.read.unordered(who, size) && op != Atomic::Load || shadow.written.unordered(who, size);
+        shadow.atomic.note(who, size);
+        let mut unwritten = false;
+        if let Some(written) = &mut self.written {
+            unwritten = !written[word] && !matches!(op, Atomic::Store | Atomic::Exchange);
+            written[word] = true;
+        }
+        let before = self.words[word];
+        self.words[word] = changed(op, before, value, expected);
+        let fault = if race { Some(Fault::Race) } else { unwritten.then_some(Fault::Unwritten) };
+        (before, fault)
+    }
+}
+
+impl Seen {
+    fn unordered(&self, who: Who, group_size: u32) -> bool {
+        if self.invocation == 0 {
+            return false;
+        }
+        let other = self.invocation != who.invocation;
+        let same_group = !other || (self.invocation - 1) / group_size == (who.invocation - 1) / group_size;
+        self.groups || !same_group || self.epoch == who.epoch && (other || self.many)
+    }
+
+    fn note(&mut self, who: Who, group_size: u32) {
+        let other = self.invocation != 0 && self.invocation != who.invocation;
+        if other && (self.invocation - 1) / group_size != (who.invocation - 1) / group_size {
+            self.groups = true;
+        } else if self.epoch != who.epoch {
+            self.many = false;
+        } else if other {
+            self.many = true;
+        }
+        (self.invocation, self.epoch) = (who.invocation, who.epoch);
+    }
+}
+
+fn changed(op: Atomic, before: u32, value: u32, expected: u32) -> u32 {
+    match op {
+        Atomic::Load => before,
+        Atomic::Store | Atomic::Exchange => value,
+        Atomic::CompareExchange if before == expected => value,
+        Atomic::CompareExchange => before,
+        Atomic::IAdd => before.wrapping_add(value),
+        Atomic::And => before & value,
+        Atomic::Or => before | value,
+        Atomic::Xor => before ^ value,
+        Atomic::UMin => before.min(value),
+        Atomic::UMax => before.max(value),
+        Atomic::SMin => (before as i32).min(value as i32) as u32,
+        Atomic::SMax => (before as i32).max(value as i32) as u32,
+        Atomic::FAdd => (f32::from_bits(before) + f32::from_bits(value)).to_bits(),
+    }
+}

@@ -1,0 +1,138 @@
+//! The declarations of a module, and its instructions as a list.
+use super::types::{Type, Types};
+use spirv::{Decoration, ExecutionMode, Op, StorageClass};
+use std::collections::HashMap;
+
+/// One instruction: opcode, operands, and the word where it stands.
+#[derive(Clone)]
+pub struct Instruction {
+    pub op: Op,
+    pub words: Vec<u32>,
+    pub at: u32,
+}
+
+/// A module as a list of instructions, without its header.
+pub fn instructions(words: &[u32]) -> Vec<Instruction> {
+    let (mut out, mut at) = (Vec::new(), 5);
+    while at < words.len() {
+        let length = (words[at] >> 16) as usize;
+        let op = Op::from_u32(words[at] & 0xFFFF).expect("an opcode");
+        out.push(Instruction { op, words: words[at + 1..at + length].to_vec(), at: at as u32 });
+        at += length;
+    }
+    out
+}
+
+/// The words of a module of these instructions.
+#[allow(dead_code)]
+pub fn assemble(header: &[u32], list: &[Instruction]) -> Vec<u32> {
+    let mut out = header[..5].to_vec();
+    for i in list {
+        out.push((i.words.len() as u32 + 1) << 16 | i.op as u32);
+        out.extend(&i.words);
+    }
+    out
+}
+
+pub fn words_of(bytes: &[u8]) -> Vec<u32> {
+    bytes.chunks_exact(4).map(|c| u32::from_le_bytes([c[0], c[1], c[2], c[3]])).collect()
+}
+
+pub struct Variable {
+    pub id: u32,
+    pub class: StorageClass,
+    /// The type that it points to.
+    pub ty: u32,
+    pub initializer: Option<u32>,
+}
+
+/// A constant: its type and its words, with parts flattened; `None` = undefined.
+pub struct Constant {
+    pub ty: u32,
+    pub words: Option<Vec<u32>>,
+}
+
+#[derive(Default)]
+pub struct Module {
+    pub types: Types,
+    pub constants: HashMap<u32, Constant>,
+    pub variables: Vec<Variable>,
+    pub bindings: HashMap<u32, u32>,
+    pub built_ins: HashMap<u32, u32>,
+    pub workgroup: [u32; 3],
+    /// From the entry point's first label to its end.
+    pub body: Vec<Instruction>,
+}
+
+impl Module {
+    pub fn new(words: &[u32]) -> Module {
+        let mut module = Module { workgroup: [1; 3], ..Module::default() };
+        let mut list = instructions(words).into_iter();
+        for i in list.by_ref() {
+            if i.op == Op::Function {
+                break;
+            }
+            module.declare(&i);
+        }
+        // The optimiser leaves one function; a second one would be seen as its call.
+        module.body = list.take_while(|i| i.op != Op::FunctionEnd).collect();
+        module
+    }
+
+    fn declare(&mut self, i: &Instruction) {
+        let w = &i.words;
+        match i.op {
+            Op::Decorate | Op::MemberDecorate => {
+                self.types.decorate(i.op, w);
+                if i.op == Op::Decorate && w[1] == Decoration::Binding as u32 {
+                    self.bindings.insert(w[0], w[2]);
+                }
+                if i.op == Op::Decorate && w[1] == Decoration::BuiltIn as u32 {
+                    self.built_ins.insert(w[0], w[2]);
+                }
+            }
+            Op::ExecutionMode if w[1] == ExecutionMode::LocalSize as u32 => {
+                self.workgroup = [w[2], w[3], w[4]];
+            }
+            Op::ConstantTrue => self.constant(w, vec![1]),
+            Op::ConstantFalse => self.constant(w, vec![0]),
+            Op::Constant => self.constant(w, vec![w[2]]),
+            Op::ConstantNull => self.constant(w, vec![0; self.types.scalars(w[0])]),
+            Op::ConstantComposite => {
+                let parts = w[2..].iter().flat_map(|id| self.constants[id].words.clone().unwrap_or_default());
+                let parts = parts.collect();
+                self.constant(w, parts);
+            }
+            Op::Undef => {
+                self.constants.insert(w[1], Constant { ty: w[0], words: None });
+            }
+            Op::Variable => self.variable(w),
+            Op::TypeVoid
+            | Op::TypeBool
+            | Op::TypeInt
+            | Op::TypeFloat
+            | Op::TypeVector
+            | Op::TypeMatrix
+            | Op::TypeArray
+            | Op::TypeRuntimeArray
+            | Op::TypeStruct
+            | Op::TypePointer
+            | Op::TypeFunction => {
+                let constants = &self.constants;
+                let value = |id: u32| constants[&id].words.as_ref().expect("a length")[0];
+                self.types.declare(i.op, w, value);
+            }
+            _ => {}
+        }
+    }
+
+    fn constant(&mut self, w: &[u32], words: Vec<u32>) {
+        self.constants.insert(w[1], Constant { ty: w[0], words: Some(words) });
+    }
+
+    /// `OpVariable`, at module scope or in the function.
+    pub fn variable(&mut self, w: &[u32]) {
+        let Type::Pointer { class, to } = *self.types.get(w[0]) else { panic!("a variable is a pointer") };
+        self.variables.push(Variable { id: w[1], class, ty: to, initializer: w.get(3).copied() });
+    }
+}

@@ -1,0 +1,67 @@
+//! What the invocations of a subgroup compute together.
+use super::code::{GARBAGE, Reduction, Reg, Subgroup as Op};
+use super::faults::{Faults, Kind};
+use super::subgroup::Subgroup;
+
+fn reduced(op: Reduction, a: u32, b: u32) -> u32 {
+    match op {
+        Reduction::IAdd => a.wrapping_add(b),
+        Reduction::FAdd => (f32::from_bits(a) + f32::from_bits(b)).to_bits(),
+    }
+}
+
+impl Subgroup {
+    /// Demands that all invocations take part: where some have gone another way, Vulkan does not say that the others
+    /// have met again.
+    pub(super) fn together(&mut self, op: Op, to: Reg, (a, b): (Reg, Reg), at: u32, faults: &mut Faults) {
+        let lanes = self.locals.len();
+        if self.active.len() != lanes {
+            faults.note(at, Kind::NonUniform, || format!("{op:?} by {} of {lanes} lanes", self.active.len()));
+        }
+        let mut here = vec![false; self.size];
+        self.active.iter().for_each(|&l| here[l] = true);
+        let values: Vec<u32> = (0..lanes).map(|l| self.get(a, l)).collect();
+        // Sums go up the lanes in whichever order the rest does.
+        let mut ascending = self.active.clone();
+        ascending.sort_unstable();
+        let vote = |l: &usize| values[*l] != 0;
+        let fill = |s: &mut Subgroup, value: u32| ascending.iter().for_each(|&l| s.set(to, l, value));
+        match op {
+            Op::All => fill(self, ascending.iter().all(vote).into()),
+            Op::Any => fill(self, ascending.iter().any(vote).into()),
+            Op::Ballot(word) => {
+                let inside = |l: &&usize| **l / 32 == word as usize && vote(l);
+                let bits = ascending.iter().filter(inside).map(|l| 1 << (l % 32)).fold(0, |a, b: u32| a | b);
+                fill(self, bits);
+            }
+            Op::Shuffle | Op::ShuffleXor | Op::Broadcast => {
+                for &lane in &ascending {
+                    let other = self.get(b, lane) as usize;
+                    let from = if op == Op::ShuffleXor { lane ^ other } else { other };
+                    let value = match here.get(from) {
+                        Some(true) => values[from],
+                        _ => {
+                            faults
+                                .note(at, Kind::AbsentLane, || format!("{op:?} from lane {from} of {lanes}"));
+                            GARBAGE
+                        }
+                    };
+                    self.set(to, lane, value);
+                }
+            }
+            Op::Reduce(r) => {
+                let sum = ascending.iter().map(|l| values[*l]).reduce(|a, b| reduced(r, a, b));
+                fill(self, sum.unwrap_or(0));
+            }
+            // Zero is 0 for integers and for floats.
+            Op::Inclusive(r) | Op::Exclusive(r) => {
+                let mut sum = 0;
+                for &lane in &ascending {
+                    let next = reduced(r, sum, values[lane]);
+                    self.set(to, lane, if matches!(op, Op::Inclusive(_)) { next } else { sum });
+                    sum = next;
+                }
+            }
+        }
+    }
+}
