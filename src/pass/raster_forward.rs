@@ -97,7 +97,8 @@ pub struct Image {
 }
 
 /// One contribution to a pixel.
-pub(super) struct Contribution {
+pub struct Contribution {
+    /// Index of the splat.
     pub splat: usize,
     /// α after the clamp.
     pub alpha: f64,
@@ -110,7 +111,7 @@ pub(super) struct Contribution {
 }
 
 /// Contributions to pixel (x, y), front to back, and the final T.
-pub(super) fn walk(scene: &TwinScene, cutoffs: &Cutoffs, x: u32, y: u32) -> (Vec<Contribution>, f64) {
+pub fn walk(scene: &TwinScene, cutoffs: &Cutoffs, x: u32, y: u32) -> (Vec<Contribution>, f64) {
     let mut list = Vec::new();
     let mut transmittance = 1.0;
     for &i in scene.order {

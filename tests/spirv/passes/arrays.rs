@@ -1,6 +1,5 @@
 //! Passes over plain arrays: scan, gather, sum, sort.
-use super::require;
-use splatvk::gpu::{Device, Recorder};
+use splatvk::gpu::{Device, Recorder, shaders};
 use splatvk::pass::seeded::Random;
 use splatvk::pass::sort::{Shape, Sort, sort_pairs};
 use splatvk::pass::{compact, scan, sum};
@@ -10,7 +9,7 @@ fn words(n: usize, below: u64, seed: u64) -> Vec<u32> {
     (0..n).map(|_| (random.bits() % below) as u32).collect()
 }
 
-pub fn scan(device: &Device) -> Result<(), String> {
+pub fn scan(device: &Device) {
     for n in [0, 1, 700] {
         let values = words(n, 1000, 1001);
         let input = device.buffer_from("scan values", &values).unwrap();
@@ -20,27 +19,24 @@ pub fn scan(device: &Device) -> Result<(), String> {
         let pass = scan::Scan::new(device).unwrap();
         let mut rec = Recorder::new(device, "scan");
         pass.record(&mut rec, &input, &count, &starts, &total);
-        rec.run().map_err(|e| e.to_string())?;
+        rec.run().unwrap();
         let (expected, sum) = scan::exclusive_scan(&values);
-        require("starts", starts.read().unwrap() == expected)?;
-        require("total", total.read().unwrap() == [sum])?;
+        assert!(starts.read().unwrap() == expected, "starts");
+        assert_eq!(total.read().unwrap(), [sum]);
     }
-    Ok(())
 }
 
-pub fn gather(device: &Device) -> Result<(), String> {
+pub fn gather(device: &Device) {
     for (rows, stride) in [(1, 1), (100, 3), (33, 7)] {
         let (from, index) = (words(50 * stride, 1 << 32, 1002), words(rows, 50, 1003));
         let source = device.buffer_from("gather from", &from).unwrap();
         let at = device.buffer_from("gather index", &index).unwrap();
-        let out =
-            compact::gather(device, "gathered", &source, &at, rows, stride).map_err(|e| e.to_string())?;
-        require("rows", out.read().unwrap() == compact::gather_rows(&from, &index, stride))?;
+        let out = compact::gather(device, "gathered", &source, &at, rows, stride).unwrap();
+        assert!(out.read().unwrap() == compact::gather_rows(&from, &index, stride), "rows");
     }
-    Ok(())
 }
 
-pub fn sum(device: &Device) -> Result<(), String> {
+pub fn sum(device: &Device) {
     for n in [1, 300, 20_000] {
         let mut random = Random::new(1004);
         let values: Vec<f32> = (0..n).map(|_| random.uniform(0.0, 1.0) as f32).collect();
@@ -49,17 +45,16 @@ pub fn sum(device: &Device) -> Result<(), String> {
         let result = device.buffer::<f32>("sum result", 3).unwrap();
         let mut rec = Recorder::new(device, "sum");
         sum::record(&mut rec, &input, &partials, &result, 1);
-        rec.run().map_err(|e| e.to_string())?;
+        rec.run().unwrap();
         let expected: f64 = values.iter().map(|v| f64::from(*v)).sum();
         let got = result.read().unwrap();
         // Some 20 000 / 16 384 + 16 roundings of 6e-8 each.
-        require("sum", (f64::from(got[1]) - expected).abs() <= 2e-6 * expected)?;
-        require("other slots", got[0] == 0.0 && got[2] == 0.0)?;
+        assert!((f64::from(got[1]) - expected).abs() <= 2e-6 * expected, "{} {expected}", got[1]);
+        assert_eq!((got[0], got[2]), (0.0, 0.0), "other slots");
     }
-    Ok(())
 }
 
-fn sort(device: &Device, shape: Shape) -> Result<(), String> {
+fn sort(device: &Device, shape: Shape) {
     for (n, all, bits, range) in [
         (0, 5, 32, 9),
         (1, 1, 32, 9),
@@ -74,18 +69,36 @@ fn sort(device: &Device, shape: Shape) -> Result<(), String> {
         let pass = Sort::with(device, all, shape).unwrap();
         let mut rec = Recorder::new(device, "sort");
         pass.record(&mut rec, &buffer, &count, bits);
-        rec.run().map_err(|e| e.to_string())?;
+        rec.run().unwrap();
         let mut expected = pairs[..n].to_vec();
         sort_pairs(&mut expected, bits);
-        require("order", buffer.read().unwrap()[..2 * n] == *expected.as_flattened())?;
+        assert!(buffer.read().unwrap()[..2 * n] == *expected.as_flattened(), "order");
     }
-    Ok(())
 }
 
-pub fn sort_chunks(device: &Device) -> Result<(), String> {
-    sort(device, Shape::Chunks)
+pub fn sort_chunks(device: &Device) {
+    sort(device, Shape::Chunks);
 }
 
-pub fn sort_sweep(device: &Device) -> Result<(), String> {
-    sort(device, Shape::Sweep)
+pub fn sort_sweep(device: &Device) {
+    sort(device, Shape::Sweep);
+}
+
+/// The shaders of `splatvk bench`.
+pub fn bench(device: &Device) {
+    let n = 4 * 256 * shaders::bench_copy::STEPS as usize;
+    let data: Vec<f32> = (0..n).map(|k| k as f32).collect();
+    let source = device.buffer_from("copy source", &data).unwrap();
+    let target = device.buffer::<f32>("copy target", n).unwrap();
+    let values = device.buffer_from("fma values", &data[..128]).unwrap();
+    let mut rec = Recorder::new(device, "bench");
+    rec.dispatch(
+        shaders::bench_copy::call(&shaders::bench_copy::Bindings { source: &source, target: &target }),
+        [1, 1, 1],
+    );
+    rec.dispatch(shaders::bench_fma::call(&shaders::bench_fma::Bindings { values: &values }), [2, 1, 1]);
+    rec.run().unwrap();
+    assert!(target.read().unwrap() == data);
+    // x / 2 + 1 / 4 tends to 1 / 2, in each of 16 chains.
+    assert!(values.read().unwrap().iter().all(|v| (v - 8.0).abs() < 1e-4));
 }

@@ -1,20 +1,37 @@
-//! Small scenes for every pass, each compared with its twin.
+//! Small scenes for every pass, each compared with its twin. A scene panics where a pass fails or differs.
 mod arrays;
+mod frames;
+mod losses;
+mod stereo;
 
 use splatvk::gpu::Device;
 
-/// Runs one pass or a chain of them; `Err` says what is wrong.
-pub type Scene = fn(&Device) -> Result<(), String>;
+pub type Scene = fn(&Device);
 
-pub const ALL: &[(&str, Scene)] = &[
+/// Those in which nothing is added with float atomics.
+pub const PLAIN: &[(&str, Scene)] = &[
     ("scan", arrays::scan),
     ("gather", arrays::gather),
     ("sum", arrays::sum),
     ("sort in chunks", arrays::sort_chunks),
     ("sort in one sweep", arrays::sort_sweep),
+    ("bench", arrays::bench),
+    ("gradients by entry", frames::gradients_by_entry),
+    ("lists by counting", frames::lists_by_counting),
+    ("pairs", frames::pairs),
+    ("decode", frames::decode),
+    ("pack", frames::pack),
+    ("depth loss", losses::depth),
+    ("ratio penalty", losses::ratio),
+    ("adam", losses::adam),
+    ("code loss", losses::codes),
+    ("ssim and l1", losses::ssim_l1),
+    ("plane sweep", stereo::plane_sweep),
 ];
 
-/// An error that names what does not hold.
-fn require(what: &str, holds: bool) -> Result<(), String> {
-    if holds { Ok(()) } else { Err(format!("{what}: not what the twin computes")) }
-}
+/// Those with float atomics.
+pub const ADDING: &[(&str, Scene)] = &[
+    ("colours", frames::colours),
+    ("3 features", frames::few_features),
+    ("21 features", frames::many_features),
+];

@@ -1,0 +1,157 @@
+//! Rendering forward and backward, and what reads a rendered frame.
+use crate::support::{Scene, assert_close, assert_gradients, assert_images, rendered};
+use splatvk::gpu::{Device, Recorder};
+use splatvk::pass::pack::{Encoding, FrameChannel, texels, texels_of};
+use splatvk::pass::raster_forward::{Cutoffs, TwinScene, walk};
+use splatvk::pass::seeded::{self, Random};
+use splatvk::pass::{DeviceChoices, FeatureMode, Grouping, Rasterizer, Summation, bin};
+use splatvk::pass::{decode as decoding, pack as packing, pairs as counting};
+
+/// Splats over 27 × 19 pixels: 4 × 3 tiles, those on two borders partial.
+fn scene(n: usize, sh_degree: u32, dim: usize, seed: u64) -> Scene {
+    let (splats, camera) = seeded::small(n, 27, 19, sh_degree, seed);
+    Scene::new(splats, &camera, dim, seed)
+}
+
+fn there_and_back(device: &Device, scene: &Scene, ways: DeviceChoices) {
+    let (params, mut raster) = scene.upload_for(device, ways);
+    raster.forward(&params, &scene.options).unwrap();
+    assert_images(&rendered(&raster), &scene.twin());
+    let upstream = scene.upstream(7);
+    assert_gradients(scene, &scene.gradients_by(device, ways, &upstream), 7);
+}
+
+fn by_atomics(device: &Device) -> DeviceChoices {
+    DeviceChoices { summation: Summation::Atomics, ..DeviceChoices::of(device) }
+}
+
+pub fn colours(device: &Device) {
+    there_and_back(device, &scene(40, 3, 0, 1040), by_atomics(device));
+}
+
+pub fn few_features(device: &Device) {
+    there_and_back(device, &scene(30, 1, 3, 1041), by_atomics(device));
+}
+
+/// More than one launch per tile; features in the gauge of three levels.
+pub fn many_features(device: &Device) {
+    let mut scene = scene(25, 0, 21, 1042);
+    scene.options.feature_mode = FeatureMode::Gauge { epsilon: 1e-3, blocks: 3 };
+    there_and_back(device, &scene, by_atomics(device));
+}
+
+/// All widths of a launch that [`many_features`] leaves out, summed entry by entry.
+pub fn gradients_by_entry(device: &Device) {
+    let ways = DeviceChoices { summation: Summation::Entries, ..DeviceChoices::of(device) };
+    for (n, sh_degree, dim) in [(40, 2, 0), (20, 0, 3), (20, 0, 8), (15, 0, 16), (12, 0, 37)] {
+        let mut scene = scene(n, sh_degree, dim, 1043 + dim as u64);
+        scene.options.features_move_geometry = dim != 8;
+        if scene.options.features_move_geometry {
+            there_and_back(device, &scene, ways);
+        } else {
+            let (params, mut raster) = scene.upload_for(device, ways);
+            raster.forward(&params, &scene.options).unwrap();
+            assert_images(&rendered(&raster), &scene.twin());
+        }
+    }
+}
+
+/// Tile lists in both ways, against the twin's.
+pub fn lists_by_counting(device: &Device) {
+    let scene = scene(60, 0, 0, 1044);
+    let forward = scene.twin();
+    let expected = bin::twin(&forward.projected, &forward.order, scene.view.size);
+    let lists = |grouping| {
+        let (params, mut raster) =
+            scene.upload_for(device, DeviceChoices { grouping, ..DeviceChoices::of(device) });
+        raster.forward(&params, &scene.options).unwrap();
+        raster.tile_lists().unwrap()
+    };
+    let counted = lists(Grouping::Counting);
+    assert_eq!(counted, lists(Grouping::Sorting));
+    assert_eq!(counted.len(), expected.len());
+    let mut extra = 0;
+    for (list, expected) in counted.iter().zip(&expected) {
+        let mut rest = list.iter();
+        assert!(expected.iter().all(|i| rest.any(|j| i == j)), "{expected:?} is no subsequence of {list:?}");
+        extra += list.len() - expected.len();
+    }
+    let total: usize = expected.iter().map(Vec::len).sum();
+    assert!(total > 50 && extra * 20 < total, "{extra} of {total}");
+}
+
+pub fn pairs(device: &Device) {
+    let scene = scene(60, 0, 0, 1045);
+    let (params, mut raster) = scene.upload(device);
+    raster.forward(&params, &scene.options).unwrap();
+    let [evaluated, blended] = counting::count(device, &raster).unwrap();
+    let forward = scene.twin();
+    let twin = TwinScene {
+        projected: &forward.projected,
+        features: &[],
+        feature_dim: 0,
+        order: &forward.order,
+        view: &scene.view,
+    };
+    let pixels = (0..19).flat_map(|y| (0..27).map(move |x| (x, y)));
+    let expected: usize = pixels.map(|(x, y)| walk(&twin, &Cutoffs::STANDARD, x, y).0.len()).sum();
+    // f32 and f64 may disagree at the two thresholds for one pair.
+    assert!((blended - expected as f64).abs() <= 1.0, "{blended} of {expected}");
+    let listed: usize = raster.tile_lists().unwrap().iter().map(Vec::len).sum();
+    assert!(evaluated >= blended && evaluated <= 64.0 * listed as f64, "{evaluated} {listed}");
+}
+
+pub fn decode(device: &Device) {
+    for (dim, count, pixels) in [(3, 9, 70), (8, 20, 130), (16, 5, 64), (20, 7, 65)] {
+        let mut random = Random::new(1046);
+        let mut numbers = |n: usize| (0..n).map(|_| random.normal(1.0) as f32).collect::<Vec<f32>>();
+        let mut table = numbers(count * dim);
+        for row in table.chunks_exact_mut(dim) {
+            let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();
+            row.iter_mut().for_each(|x| *x /= norm);
+        }
+        let planes = numbers((dim + 2) * pixels);
+        let alpha: Vec<f32> = (0..pixels).map(|p| (p % 11) as f32 / 10.0).collect();
+        let see_through: Vec<f32> = alpha.iter().map(|a| 1.0 - a).collect();
+        let features = device.buffer_from("features", &planes).unwrap();
+        let transmittance = device.buffer_from("transmittance", &see_through).unwrap();
+        let decoded = device.buffer::<i32>("decoded", pixels).unwrap();
+        let codes = decoding::Codes::upload(device, &table, dim).unwrap();
+        let mut rec = Recorder::new(device, "decode");
+        codes.record(&mut rec, &features, 2, &transmittance, pixels as u32, &decoded);
+        rec.run().unwrap();
+        let (expected, margin) = decoding::decode_pixels(&table, dim, &planes[2 * pixels..], &alpha);
+        for (p, got) in decoded.read().unwrap().into_iter().enumerate() {
+            // As in src/pass/decode.rs.
+            assert!(got == expected[p] || margin[p] < 8e-6, "pixel {p}: {got} {}", expected[p]);
+        }
+        assert!(expected.contains(&-1) && expected.iter().any(|k| *k >= 0));
+    }
+}
+
+pub fn pack(device: &Device) {
+    let (width, height, dim) = (19u32, 7u32, 6usize);
+    let pixels = (width * height) as usize;
+    let raster = Rasterizer::new(device, 1, dim, width, height).unwrap();
+    // As in src/pass/pack.rs: exact in half precision, and off the halves of rounding.
+    let noise = |i: usize| ((i * 7919 + 13) % 97) as f32 / 64.0;
+    let planes: Vec<f32> = (0..(4 + dim) * pixels).map(noise).collect();
+    let transmittance: Vec<f32> = (0..pixels).map(|i| (i % 9) as f32 / 8.0).collect();
+    let band = raster.frame().bands.get(0);
+    raster.frame().planes.write(&planes).unwrap();
+    raster.frame().transmittance.write(&transmittance).unwrap();
+    for source in [FrameChannel::Colour, FrameChannel::Alpha, FrameChannel::Features(1, 5)] {
+        for encoding in [Encoding::F32, Encoding::F32x4, Encoding::F16x4, Encoding::Unorm8x4] {
+            let out = texels(device, pixels, source, encoding).unwrap();
+            packing::pack(device, raster.frame(), &band, source, encoding, &out).unwrap();
+            let expected = texels_of(&planes, &transmittance, source, encoding);
+            assert_eq!(out.cast::<u8>().read().unwrap(), expected, "{source:?} {encoding:?}");
+        }
+    }
+    let out = texels(device, pixels, FrameChannel::Depth, Encoding::F32).unwrap();
+    packing::pack(device, raster.frame(), &band, FrameChannel::Depth, Encoding::F32, &out).unwrap();
+    let expected = texels_of(&planes, &transmittance, FrameChannel::Depth, Encoding::F32);
+    let wide: Vec<f64> =
+        expected.chunks_exact(4).map(|b| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]]))).collect();
+    assert_close("depth", &out.cast::<f32>().read().unwrap(), &wide, &crate::support::IMAGE);
+}
