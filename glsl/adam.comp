@@ -7,7 +7,7 @@
 // The guard is the rasteriser's status: a frame whose tile lists overflowed has no gradients, and the step is repeated.
 // A parameter whose gradient is not finite is left alone and counted in `faults`: the host stops with a clear error.
 // Four parameters per thread: on a CPU device an access costs the same whatever its width, on a GPU it is coalesced
-// either way. Buffers are padded to whole vectors.
+// either way. Buffers are padded to whole vectors: the last thread may have one vector of moments instead of two.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 256) in;
 layout(std430, binding = 0) buffer Parameters { vec4 parameters[]; };
@@ -24,7 +24,9 @@ void main() {
     uint i = (gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x) * 256u + gl_LocalInvocationID.x;
     if (4u * i >= count || guard[1] != 0u) return;
     vec4 gradient = gradients[i], parameter = parameters[i];
-    vec4 pair[2] = vec4[2](moments[2u * i], moments[2u * i + 1u]);
+    bool two = 4u * i + 2u < count;
+    vec4 pair[2] = vec4[2](moments[2u * i], vec4(0.0));
+    if (two) pair[1] = moments[2u * i + 1u];
     vec4 step_rates = rates[slot];
     uint column = 4u * i % stride, bad = 0u;
     [[unroll]] for (uint k = 0u; k < 4u; k++) {
@@ -43,6 +45,6 @@ void main() {
     }
     parameters[i] = parameter;
     moments[2u * i] = pair[0];
-    moments[2u * i + 1u] = pair[1];
+    if (two) moments[2u * i + 1u] = pair[1];
     if (bad > 0u) atomicAdd(faults[0], bad);
 }

@@ -113,3 +113,17 @@ fn common_translation_is_a_gauge() {
     let moved = (scene.view.rotation * sum).as_vec3().to_array();
     assert_class("translation", &moved, &rho);
 }
+
+/// Widths that leave room in the last launch: in the sums by entry nothing may reach the next splat.
+#[test]
+fn feature_widths_that_fill_no_launch_match_the_twin() {
+    let device = test_device();
+    for dim in [4, 10, 24, 37] {
+        let scene = Scene::small(30, 0, dim, 90 + dim as u64);
+        let upstream = scene.upstream(9);
+        for summation in [Summation::Atomics, Summation::Entries] {
+            let ways = DeviceChoices { summation, ..DeviceChoices::of(&device) };
+            assert_gradients(&scene, &scene.gradients_by(&device, ways, &upstream), 9);
+        }
+    }
+}

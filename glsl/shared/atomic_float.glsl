@@ -17,10 +17,11 @@ float atomic_addend(float value) {
 #define ATOMIC_VALUE(memory) (memory)
 #else
 #define ATOMIC_FLOAT uint
+// The first exchange guesses zero: a plain read of what others add to would be a data race.
 #define ATOMIC_ADD(memory, value)                                                                  \
     do {                                                                                           \
         float atomic_addend = (value);                                                             \
-        uint atomic_seen = memory;                                                                 \
+        uint atomic_seen = 0u;                                                                     \
         uint atomic_expected;                                                                      \
         do {                                                                                       \
             atomic_expected = atomic_seen;                                                         \

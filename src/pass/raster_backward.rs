@@ -46,27 +46,25 @@ pub(super) fn record(
         }
         Summation::Entries => match frame.gradient_entries.buffers(rec.device(), frame) {
             Ok(entries) => {
-                let sum = |rec: &mut Recorder, from, to, vectors, stride, first_vector| {
-                    let columns = Columns { vectors, stride, first_vector };
+                let sum = |rec: &mut Recorder, from, to, columns| {
                     record_sum(rec, frame, count, from, to, columns, !all);
                 };
                 for block in blocks {
                     record_entries(rec, frame, tiles, &entries, block, coupling);
                     if block.features > 0 {
-                        // The block's own number of vectors, and no more than there are.
-                        let stride = frame.code_stride() / 4;
-                        sum(
-                            rec,
-                            &entries.codes,
-                            &frame.codes_grad,
-                            block.vectors(),
-                            stride,
-                            block.first_vector,
-                        );
+                        // No more vectors than there are: behind a splat's last one the next splat begins.
+                        let columns = Columns {
+                            width: block.vectors(),
+                            vectors: block.features.div_ceil(4),
+                            stride: frame.code_stride() / 4,
+                            first_vector: block.first_vector,
+                        };
+                        sum(rec, &entries.codes, &frame.codes_grad, columns);
                     }
                 }
                 let vectors = GRADIENT_FLOATS as u32 / 4;
-                sum(rec, &entries.splats, &frame.projected_grad, vectors, vectors, 0);
+                let columns = Columns { width: vectors, vectors, stride: vectors, first_vector: 0 };
+                sum(rec, &entries.splats, &frame.projected_grad, columns);
             }
             Err(e) => rec.fail(e),
         },
@@ -125,12 +123,15 @@ fn alpha_plane(frame: &FrameBuffers) -> u32 {
 
 /// Where the columns of [`record_sum`] go, in vectors of four.
 struct Columns {
+    /// Of an entry.
+    width: u32,
+    /// Of these, the first that are summed.
     vectors: u32,
     stride: u32,
     first_vector: u32,
 }
 
-/// The sums of `from` [entries, vectors] per splat, written or `add`ed to columns of `to` [N, stride].
+/// The sums of `from` [entries, width] per splat, written or `add`ed to columns of `to` [N, stride].
 fn record_sum(
     rec: &mut Recorder,
     frame: &FrameBuffers,
@@ -140,7 +141,7 @@ fn record_sum(
     columns: Columns,
     add: bool,
 ) {
-    let Columns { vectors, stride, first_vector } = columns;
+    let Columns { width, vectors, stride, first_vector } = columns;
     let call = shaders::gradient_sum::call(
         &shaders::gradient_sum::Bindings {
             depth_pairs: &frame.depth_pairs,
@@ -152,6 +153,7 @@ fn record_sum(
         },
         &shaders::gradient_sum::Push {
             count: count as u32,
+            width,
             vectors,
             stride,
             first_vector,

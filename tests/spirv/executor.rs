@@ -1,5 +1,5 @@
 //! Runs the programs of the engine on the interpreter: a device of any subgroup size.
-use super::code::Code;
+use super::code::{Code, GARBAGE};
 use super::dispatch::{self, Schedule};
 use super::faults::Faults;
 use super::lower::lower;
@@ -51,15 +51,18 @@ struct Buffers<'a> {
 }
 
 impl Buffers<'_> {
-    /// The memory of a buffer. Behind its own bytes a binding goes on to a whole vector of four words, which hold nothing.
+    /// The memory of a buffer. Behind its own bytes a binding goes on to a whole vector of four words, which may be read
+    /// together with the others but must not matter.
     fn memory(&mut self, buffer: &Buffer) -> &mut Memory {
         let entry = self.held.entry(buffer.id()).or_insert_with(|| {
             let bytes = buffer.cast::<u8>().read().expect("a mapped buffer");
             let mut words = words_of(&bytes);
             let own = words.len();
-            words.resize(own.next_multiple_of(4).max(4), 0);
+            words.resize(own.next_multiple_of(4).max(4), GARBAGE);
             let mut memory = Memory::of(words);
-            memory.forget(if self.scratch.contains(&buffer.name()) { 0 } else { own });
+            if self.scratch.contains(&buffer.name()) {
+                memory.forget(0);
+            }
             (buffer.clone(), memory)
         });
         &mut entry.1
