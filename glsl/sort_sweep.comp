@@ -32,7 +32,7 @@ shared uvec2 staged[TILE];
 void main() {
     uint thread = gl_LocalInvocationID.x;
     uint lane = gl_SubgroupInvocationID;
-    uint subgroup = thread / SUBGROUP_SIZE;
+    uint subgroup = gl_SubgroupID; // a device may deal threads to subgroups in any order
     if (thread == 0u) begun = atomicAdd(tiles[0], 1u);
     for (uint i = thread; i < SUBGROUPS * 256u; i += THREADS) counters[i] = 0u;
     barrier();

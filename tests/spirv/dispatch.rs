@@ -6,7 +6,6 @@ use super::subgroup::{Dispatch, Group, Stop, Subgroup};
 use spirv::MemorySemantics;
 
 /// In which order workgroups begin.
-#[allow(dead_code)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Order {
     Random,

@@ -10,6 +10,7 @@ mod lower;
 mod lower_alu;
 mod memory;
 mod module;
+mod mutations;
 mod passes;
 mod subgroup;
 #[path = "../support/mod.rs"]
@@ -19,11 +20,33 @@ mod types;
 
 use dispatch::{Order, Schedule};
 use executor::Interpreted;
+use splatvk::gpu::shaders;
+use std::collections::BTreeSet;
 use std::sync::Arc;
+
+/// What passes keep within one program: it must not matter what is there before.
+const SCRATCH: &[&str] = &[
+    "entries",
+    "entry splats",
+    "l1 sums",
+    "loss partials",
+    "scan sums",
+    "sort digits",
+    "sort histogram",
+    "sort scratch",
+    "sort tiles",
+    "ssim cross slopes",
+    "ssim means",
+    "ssim moments",
+    "ssim slopes",
+    "ssim sums",
+    "sum partials",
+    "tile counters",
+];
 
 fn interpreted(subgroup_size: usize, float_atomics: bool) -> Interpreted {
     let schedule = Schedule { subgroup_size, order: Order::Random, in_flight: 3, scattered: false, seed: 1 };
-    Interpreted { schedule, float_atomics, scratch: &[], change: None, ran: Arc::default() }
+    Interpreted { schedule, float_atomics, scratch: SCRATCH, change: None, ran: Arc::default() }
 }
 
 /// Runs a scene; what it says if it fails.
@@ -35,20 +58,84 @@ fn outcome(scene: passes::Scene, on: &Interpreted) -> Result<(), String> {
     })
 }
 
-#[test]
-fn all() {
-    for size in [4, 8, 16, 32, 64] {
-        for (name, scene) in passes::PLAIN {
-            let t = std::time::Instant::now();
-            let o = outcome(*scene, &interpreted(size, true));
-            println!("{size} {name}: {o:?} {:?}", t.elapsed());
-        }
-        for native in [true, false] {
-            for (name, scene) in passes::ADDING {
-                let t = std::time::Instant::now();
-                let o = outcome(*scene, &interpreted(size, native));
-                println!("{size} {native} {name}: {o:?} {:?}", t.elapsed());
+/// All scenes at a subgroup size, where something is added atomically with native float atomics and without; the modules
+/// that have run.
+fn run_all(schedule: Schedule) -> BTreeSet<&'static str> {
+    let mut failed = Vec::new();
+    let mut ran = BTreeSet::new();
+    for native in [true, false] {
+        let on = Interpreted { schedule, ..interpreted(schedule.subgroup_size, native) };
+        let plain = if native { passes::PLAIN } else { &[] };
+        for (name, scene) in plain.iter().chain(passes::ADDING) {
+            if let Err(e) = outcome(*scene, &on) {
+                failed.push(format!("{name}, {schedule:?}, native float atomics {native}: {e}"));
             }
         }
+        ran.extend(on.ran.lock().unwrap().iter());
     }
+    assert!(failed.is_empty(), "{}", failed.join("\n"));
+    ran
+}
+
+/// Every pass against its twin, and no shader file left out.
+fn every_pass_at(subgroup_size: usize) {
+    let ran = run_all(interpreted(subgroup_size, true).schedule);
+    let forgotten: Vec<&str> = shaders::FAMILIES
+        .iter()
+        .filter(|f| !f.modules.iter().any(|m| ran.contains(m.name)))
+        .map(|f| f.name)
+        .collect();
+    assert!(forgotten.is_empty(), "no scene of tests/spirv/passes runs {forgotten:?}");
+}
+
+#[test]
+fn every_pass_matches_its_twin_at_subgroups_of_4() {
+    every_pass_at(4);
+}
+
+#[test]
+fn every_pass_matches_its_twin_at_subgroups_of_8() {
+    every_pass_at(8);
+}
+
+#[test]
+fn every_pass_matches_its_twin_at_subgroups_of_16() {
+    every_pass_at(16);
+}
+
+#[test]
+fn every_pass_matches_its_twin_at_subgroups_of_32() {
+    every_pass_at(32);
+}
+
+#[test]
+fn every_pass_matches_its_twin_at_subgroups_of_64() {
+    every_pass_at(64);
+}
+
+/// Vulkan does not say which invocations form a subgroup.
+#[test]
+fn subgroups_may_hold_any_invocations() {
+    run_all(Schedule { scattered: true, seed: 6, ..interpreted(32, true).schedule });
+}
+
+/// Every module that is shipped, with and without native float atomics; workgroups one by one in either order and many at
+/// once; invocations dealt to subgroups in order and at random.
+#[test]
+#[ignore = "takes long: tools/test-long"]
+fn every_module_in_every_order() {
+    let mut ran = BTreeSet::new();
+    for subgroup_size in [4, 8, 16, 32, 64] {
+        for (seed, order, in_flight, scattered) in [
+            (2, Order::Rising, 1, false),
+            (3, Order::Falling, 1, false),
+            (4, Order::Random, 20, false),
+            (5, Order::Random, 5, true),
+        ] {
+            ran.extend(run_all(Schedule { subgroup_size, order, in_flight, scattered, seed }));
+        }
+    }
+    let modules = shaders::FAMILIES.iter().flat_map(|f| f.modules);
+    let forgotten: Vec<&str> = modules.map(|m| m.name).filter(|name| !ran.contains(name)).collect();
+    assert!(forgotten.is_empty(), "no scene of tests/spirv/passes runs {forgotten:?}");
 }

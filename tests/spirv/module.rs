@@ -24,7 +24,6 @@ pub fn instructions(words: &[u32]) -> Vec<Instruction> {
 }
 
 /// The words of a module of these instructions.
-#[allow(dead_code)]
 pub fn assemble(header: &[u32], list: &[Instruction]) -> Vec<u32> {
     let mut out = header[..5].to_vec();
     for i in list {

@@ -14,7 +14,7 @@ const DONE: u32 = u32::MAX;
 
 /// More blocks than any shader takes in a test, by a factor of ten: a subgroup that runs longer waits for something that
 /// does not come.
-const MOST_BLOCKS: u64 = 4_000_000;
+const MOST_BLOCKS: u64 = 1_000_000;
 
 /// What all workgroups of a dispatch see.
 pub struct Dispatch<'a> {

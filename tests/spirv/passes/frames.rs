@@ -1,5 +1,5 @@
 //! Rendering forward and backward, and what reads a rendered frame.
-use crate::support::{Scene, assert_close, assert_gradients, assert_images, rendered};
+use crate::support::{Scene, assert_class, assert_close, assert_gradients, assert_images, rendered};
 use splatvk::gpu::{Device, Recorder};
 use splatvk::pass::pack::{Encoding, FrameChannel, texels, texels_of};
 use splatvk::pass::raster_forward::{Cutoffs, TwinScene, walk};
@@ -33,6 +33,28 @@ pub fn few_features(device: &Device) {
     there_and_back(device, &scene(30, 1, 3, 1041), by_atomics(device));
 }
 
+/// Without coupling between features and geometry on the way back.
+pub fn eight_features(device: &Device) {
+    let mut scene = scene(20, 2, 8, 1047);
+    scene.options.features_move_geometry = false;
+    let ways = by_atomics(device);
+    let (params, mut raster) = scene.upload_for(device, ways);
+    raster.forward(&params, &scene.options).unwrap();
+    assert_images(&rendered(&raster), &scene.twin());
+    let upstream = scene.upstream(7);
+    let gradients = scene.gradients_by(device, ways, &upstream);
+    // The features' own gradients are those with coupling, and the geometry's those of the other planes.
+    scene.options.features_move_geometry = true;
+    let reference = scene.twin_gradients(&scene.twin(), &upstream);
+    assert_class("features", &gradients.features, &reference.params.features);
+    let mut without = upstream;
+    let pixels = scene.pixels();
+    without[4 * pixels..12 * pixels].fill(0.0);
+    let reference = scene.twin_gradients(&scene.twin(), &without);
+    let means: Vec<f64> = reference.params.means.iter().flat_map(|m| m.to_array()).collect();
+    assert_class("means", gradients.splats.means.as_flattened(), &means);
+}
+
 /// More than one launch per tile; features in the gauge of three levels.
 pub fn many_features(device: &Device) {
     let mut scene = scene(25, 0, 21, 1042);
@@ -44,15 +66,8 @@ pub fn many_features(device: &Device) {
 pub fn gradients_by_entry(device: &Device) {
     let ways = DeviceChoices { summation: Summation::Entries, ..DeviceChoices::of(device) };
     for (n, sh_degree, dim) in [(40, 2, 0), (20, 0, 3), (20, 0, 8), (15, 0, 16), (12, 0, 37)] {
-        let mut scene = scene(n, sh_degree, dim, 1043 + dim as u64);
-        scene.options.features_move_geometry = dim != 8;
-        if scene.options.features_move_geometry {
-            there_and_back(device, &scene, ways);
-        } else {
-            let (params, mut raster) = scene.upload_for(device, ways);
-            raster.forward(&params, &scene.options).unwrap();
-            assert_images(&rendered(&raster), &scene.twin());
-        }
+        let scene = scene(n, sh_degree, dim, 1043 + dim as u64);
+        there_and_back(device, &scene, ways);
     }
 }
 

@@ -33,5 +33,11 @@ pub const PLAIN: &[(&str, Scene)] = &[
 pub const ADDING: &[(&str, Scene)] = &[
     ("colours", frames::colours),
     ("3 features", frames::few_features),
+    ("8 features", frames::eight_features),
     ("21 features", frames::many_features),
 ];
+
+/// The scene of a name.
+pub fn named(name: &str) -> Scene {
+    PLAIN.iter().chain(ADDING).find(|s| s.0 == name).expect("a scene").1
+}

@@ -1,0 +1,212 @@
+//! Whether faults are found: modules that are shipped, with one thing broken.
+use crate::dispatch::Order;
+use crate::executor::{Change, Interpreted};
+use crate::module::{Instruction, assemble, instructions, words_of};
+use crate::passes::{self, Scene};
+use crate::{interpreted, outcome};
+use spirv::Op;
+use splatvk::gpu::{Module, shaders};
+use std::sync::Arc;
+
+/// A change of the instructions of one family's modules; it also gets the first id that is free.
+fn changing(family: &'static str, change: fn(&mut Vec<Instruction>, u32)) -> Change {
+    let modules = shaders::FAMILIES.iter().find(|f| f.name == family).expect("a family").modules;
+    Arc::new(move |module: &Module| {
+        let known = modules.iter().find(|m| m.name == module.name)?;
+        let words = words_of(known.spirv);
+        let mut list = instructions(&words);
+        change(&mut list, words[3]);
+        Some(assemble(&words, &list))
+    })
+}
+
+fn broken(scene: Scene, on: &Interpreted, change: Change) -> String {
+    outcome(scene, &Interpreted { change: Some(change), ..on.clone() }).expect_err("the fault is not found")
+}
+
+/// Every barrier of every module, taken out. `sizes` = those of the subgroups.
+pub fn without_barriers(sizes: &[usize]) -> usize {
+    let mut removed = 0;
+    for &size in sizes {
+        for family in shaders::FAMILIES {
+            let fits = |m: &&Module| m.subgroup_size.is_none_or(|s| s as usize == size);
+            for module in family.modules.iter().filter(fits) {
+                let words = words_of(module.spirv);
+                let list = instructions(&words);
+                let barriers = list.iter().filter(|i| i.op == Op::ControlBarrier).count();
+                for skipped in 0..barriers {
+                    let mut count = 0..;
+                    let mut list = list.clone();
+                    list.retain(|i| i.op != Op::ControlBarrier || count.next() != Some(skipped));
+                    let (name, changed) = (module.name, assemble(&words, &list));
+                    let change: Change =
+                        Arc::new(move |m: &Module| (m.name == name).then(|| changed.clone()));
+                    let said = broken(scene_of(family.name), &interpreted(size, true), change);
+                    assert!(said.contains("Race"), "{name}, barrier {skipped}: {said}");
+                    removed += 1;
+                }
+            }
+        }
+    }
+    removed
+}
+
+/// The scene that runs a family with barriers.
+fn scene_of(family: &str) -> Scene {
+    let name = match family {
+        "scan_lanes" => "scan",
+        "sum" => "sum",
+        "sort_offsets" => "sort in chunks",
+        "sort_bases" | "sort_digits" | "sort_sweep" => "sort in one sweep",
+        other => panic!("no scene is known to run the barriers of {other}"),
+    };
+    passes::named(name)
+}
+
+/// The first instruction with an opcode.
+fn first(list: &mut [Instruction], op: Op) -> &mut Instruction {
+    list.iter_mut().find(|i| i.op == op).expect("the instruction")
+}
+
+#[test]
+fn a_dropped_barrier_is_a_race() {
+    // 2 each of scan_lanes, sort_bases, sort_digits, sort_offsets and sum, 6 of sort_sweep.
+    assert_eq!(without_barriers(&[32]), 16);
+}
+
+/// As [`a_dropped_barrier_is_a_race`], at every subgroup size.
+#[test]
+#[ignore = "takes long: tools/test-long"]
+fn a_dropped_barrier_is_a_race_at_every_size() {
+    assert_eq!(without_barriers(&[4, 8, 16, 32, 64]), 5 * 16);
+}
+
+/// A barrier that orders other memory than the one in question.
+#[test]
+fn a_barrier_of_other_memory_is_a_race() {
+    let change = changing("sum", |list, _| {
+        let semantics = first(list, Op::ControlBarrier).words[2];
+        // AcquireRelease | UniformMemory in the place of AcquireRelease | WorkgroupMemory.
+        list.iter_mut()
+            .filter(|i| i.op == Op::Constant && i.words[1] == semantics)
+            .for_each(|i| i.words[2] = 0x48);
+    });
+    assert!(broken(passes::named("sum"), &interpreted(32, true), change).contains("Race"));
+}
+
+#[test]
+fn an_index_beyond_the_end_is_reported() {
+    // Σ of one value more than there are: `i <= count`.
+    let change = changing("sum", |list, _| first(list, Op::ULessThan).op = Op::ULessThanEqual);
+    assert!(broken(passes::named("sum"), &interpreted(32, true), change).contains("Outside"));
+}
+
+#[test]
+fn a_plain_addition_in_the_place_of_an_atomic_one_is_a_race() {
+    let change = changing("sort_digits", |list, free| {
+        let at = list.iter().position(|i| i.op == Op::AtomicIAdd).expect("an atomic addition");
+        let [ty, result, pointer, _, _, value] = list[at].words[..] else { panic!("six operands") };
+        let plain = [
+            instruction(Op::Load, &[ty, result, pointer]),
+            instruction(Op::IAdd, &[ty, free, result, value]),
+            instruction(Op::Store, &[pointer, free]),
+        ];
+        list.splice(at..=at, plain);
+    });
+    let said = broken(passes::named("sort in one sweep"), &interpreted(32, true), change);
+    assert!(said.contains("sort_digits") && said.contains("Race"), "{said}");
+}
+
+#[test]
+fn a_subgroup_operation_that_some_lanes_miss_is_reported() {
+    // Loops end where the counter reaches the lane.
+    let change = changing("raster_forward", |list, _| {
+        let built_in = spirv::BuiltIn::SubgroupLocalInvocationId as u32;
+        let decorates = |i: &&Instruction| i.op == Op::Decorate && i.words.get(2) == Some(&built_in);
+        let variable = list.iter().find(decorates).expect("the lane").words[0];
+        let lane =
+            list.iter().find(|i| i.op == Op::Load && i.words[2] == variable).expect("its load").words[1];
+        list.iter_mut().filter(|i| i.op == Op::ULessThan).for_each(|i| i.words[3] = lane);
+    });
+    let said = broken(passes::named("colours"), &interpreted(32, true), change);
+    assert!(said.contains("NonUniform"), "{said}");
+}
+
+#[test]
+fn shared_memory_that_nobody_wrote_is_reported() {
+    let change = changing("sort_digits", |list, _| {
+        // The counters' zeros are the first store.
+        let at = list.iter().position(|i| i.op == Op::Store).expect("a store");
+        list.remove(at);
+    });
+    let said = broken(passes::named("sort in one sweep"), &interpreted(32, true), change);
+    assert!(said.contains("Unwritten"), "{said}");
+}
+
+/// What a program reads of a buffer that it has not written is the last program's.
+#[test]
+fn scratch_that_nobody_wrote_is_reported() {
+    let on = Interpreted { scratch: &["scan values"], ..interpreted(32, true) };
+    assert!(outcome(passes::named("scan"), &on).expect_err("a fault").contains("Unwritten"));
+}
+
+#[test]
+fn a_variant_for_other_subgroups_is_reported() {
+    // Shuffles reach for lanes that are not there, and lanes of two tiles share a workgroup.
+    let module = |size| {
+        let family = shaders::FAMILIES.iter().find(|f| f.name == "raster_forward").expect("a family");
+        family.modules.iter().find(|m| m.variant == [4] && m.subgroup_size == Some(size)).expect("a module")
+    };
+    let (asked, other) = (module(16).name, words_of(module(32).spirv));
+    let change: Change = Arc::new(move |m: &Module| (m.name == asked).then(|| other.clone()));
+    let said = broken(passes::named("colours"), &interpreted(16, true), change);
+    assert!(said.contains("AbsentLane") || said.contains("Race"), "{said}");
+}
+
+/// A tile of the one-sweep sort waits for those before it. It takes its number when it starts, so that they have started
+/// too; with the number of the workgroup it waits for ever where those come later.
+#[test]
+fn reliance_on_the_order_of_workgroups_is_reported() {
+    let scene = passes::named("sort in one sweep");
+    let change = || changing("sort_sweep", number_by_workgroup);
+    let run = |order| {
+        let mut on = interpreted(32, true);
+        (on.schedule.order, on.schedule.in_flight) = (order, 1);
+        on
+    };
+    assert_eq!(outcome(scene, &run(Order::Falling)), Ok(()));
+    let rising = Interpreted { change: Some(change()), ..run(Order::Rising) };
+    assert_eq!(outcome(scene, &rising), Ok(()));
+    let said = broken(scene, &run(Order::Falling), change());
+    assert!(said.contains("waits for another workgroup"), "{said}");
+}
+
+/// `begun = gl_WorkGroupID.x` in the place of `begun = atomicAdd(tiles[0], 1)`.
+fn number_by_workgroup(list: &mut Vec<Instruction>, free: u32) {
+    let [variable, chain] = [free, free + 1];
+    let vector =
+        list.iter().find(|i| i.op == Op::TypeVector && i.words[2] == 3).expect("uvec3").words.clone();
+    let (vector, scalar) = (vector[0], vector[1]);
+    let input = spirv::StorageClass::Input as u32;
+    let pointer_to = |ty: u32| {
+        let fits = |i: &&Instruction| i.op == Op::TypePointer && i.words[1..] == [input, ty];
+        list.iter().find(fits).expect("a pointer").words[0]
+    };
+    let (to_vector, to_scalar) = (pointer_to(vector), pointer_to(scalar));
+    let is_zero = |i: &&Instruction| i.op == Op::Constant && i.words[0] == scalar && i.words[2] == 0;
+    let zero = list.iter().find(is_zero).expect("0").words[1];
+    let at = list.iter().position(|i| i.op == Op::AtomicIAdd).expect("the tile's number");
+    let number = [
+        instruction(Op::AccessChain, &[to_scalar, chain, variable, zero]),
+        instruction(Op::Load, &[scalar, list[at].words[1], chain]),
+    ];
+    list.splice(at..=at, number);
+    let function = list.iter().position(|i| i.op == Op::Function).expect("a function");
+    list.insert(function, instruction(Op::Variable, &[to_vector, variable, input]));
+    let built_in = [variable, spirv::Decoration::BuiltIn as u32, spirv::BuiltIn::WorkgroupId as u32];
+    list.insert(0, instruction(Op::Decorate, &built_in));
+}
+
+fn instruction(op: Op, words: &[u32]) -> Instruction {
+    Instruction { op, words: words.to_vec(), at: 0 }
+}
