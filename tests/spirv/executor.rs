@@ -20,7 +20,7 @@ pub struct Interpreted {
     /// Buffers of these names hold nothing when a program begins: what it reads there it must have written.
     pub scratch: &'static [&'static str],
     pub change: Option<Change>,
-    /// Modules that have run.
+    /// Modules that have run, and buffers that were scratch.
     pub ran: Arc<Mutex<BTreeSet<&'static str>>>,
 }
 
@@ -46,7 +46,7 @@ impl Interpreted {
 
 /// Buffers of a program, by identity.
 struct Buffers<'a> {
-    scratch: &'a [&'a str],
+    on: &'a Interpreted,
     held: HashMap<u64, (Buffer, Memory)>,
 }
 
@@ -60,7 +60,8 @@ impl Buffers<'_> {
             let own = words.len();
             words.resize(own.next_multiple_of(4).max(4), GARBAGE);
             let mut memory = Memory::of(words);
-            if self.scratch.contains(&buffer.name()) {
+            if let Some(name) = self.on.scratch.iter().find(|name| **name == buffer.name()) {
+                self.on.ran.lock().unwrap().insert(name);
                 memory.forget(0);
             }
             (buffer.clone(), memory)
@@ -79,7 +80,7 @@ impl Buffers<'_> {
 
 impl Executor for Interpreted {
     fn run(&self, commands: &[&Op]) -> Result<(), String> {
-        let mut buffers = Buffers { scratch: self.scratch, held: HashMap::new() };
+        let mut buffers = Buffers { on: self, held: HashMap::new() };
         for (k, op) in commands.iter().enumerate() {
             match op {
                 Op::Fill { buffer, value } => {

@@ -59,7 +59,7 @@ fn outcome(scene: passes::Scene, on: &Interpreted) -> Result<(), String> {
 }
 
 /// All scenes at a subgroup size, where something is added atomically with native float atomics and without; the modules
-/// that have run.
+/// and scratch buffers that they used.
 fn run_all(schedule: Schedule) -> BTreeSet<&'static str> {
     let mut failed = Vec::new();
     let mut ran = BTreeSet::new();
@@ -86,6 +86,8 @@ fn every_pass_at(subgroup_size: usize) {
         .map(|f| f.name)
         .collect();
     assert!(forgotten.is_empty(), "no scene of tests/spirv/passes runs {forgotten:?}");
+    let unknown: Vec<_> = SCRATCH.iter().filter(|name| !ran.contains(*name)).collect();
+    assert!(unknown.is_empty(), "no pass has buffers named {unknown:?}");
 }
 
 #[test]
@@ -117,6 +119,33 @@ fn every_pass_matches_its_twin_at_subgroups_of_64() {
 #[test]
 fn subgroups_may_hold_any_invocations() {
     run_all(Schedule { scattered: true, seed: 6, ..interpreted(32, true).schedule });
+}
+
+/// A frame is all that the program writes: nothing of the last frame is left, whatever splats and lists it had.
+#[test]
+fn a_frame_depends_on_nothing_that_was_there_before() {
+    let scratch = &[
+        "codes",
+        "depth_pairs",
+        "entries",
+        "entry splats",
+        "entry_count",
+        "planes",
+        "projected",
+        "scan sums",
+        "sort digits",
+        "sort scratch",
+        "sort tiles",
+        "tile_counts",
+        "tile_ranges",
+        "tile_splats",
+        "tile_starts",
+        "transmittance",
+    ];
+    let on = Interpreted { scratch, ..interpreted(32, true) };
+    assert_eq!(outcome(passes::image, &on), Ok(()));
+    let unknown: Vec<_> = scratch.iter().filter(|name| !on.ran.lock().unwrap().contains(*name)).collect();
+    assert!(unknown.is_empty(), "no pass has buffers named {unknown:?}");
 }
 
 /// Every module that is shipped, with and without native float atomics; workgroups one by one in either order and many at

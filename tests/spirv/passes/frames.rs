@@ -21,6 +21,12 @@ fn there_and_back(device: &Device, scene: &Scene, ways: DeviceChoices) {
     assert_gradients(scene, &scene.gradients_by(device, ways, &upstream), 7);
 }
 
+/// One program.
+pub fn image(device: &Device) {
+    let scene = scene(40, 1, 3, 1048);
+    assert_images(&scene.render(device), &scene.twin());
+}
+
 fn by_atomics(device: &Device) -> DeviceChoices {
     DeviceChoices { summation: Summation::Atomics, ..DeviceChoices::of(device) }
 }

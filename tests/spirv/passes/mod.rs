@@ -4,6 +4,7 @@ mod frames;
 mod losses;
 mod stereo;
 
+pub use frames::image;
 use splatvk::gpu::Device;
 
 pub type Scene = fn(&Device);
