@@ -11,56 +11,13 @@ use splatvk::progress::Silent;
 use splatvk::query::{QueryOptions, TextQuery, answer};
 use splatvk::run::view::Viewer;
 use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, Plane, Pose, RgbImage, Splats};
-use support::{GpuGradients, Scene};
+use support::{GpuGradients, Scene, in_bands};
 
 const MIB: u64 = 1 << 20;
 
 /// A device that binds no more than this.
 fn limited(bytes: u64, deterministic: bool) -> TestDevice {
     TestDevice::with(&Options { max_binding: Some(bytes), deterministic, ..Options::from_env(None) }).unwrap()
-}
-
-/// Frame and gradients band by band, and the number of bands.
-fn in_bands(
-    scene: &Scene,
-    device: &Device,
-    summation: Summation,
-    upstream: &[f32],
-) -> (Vec<f32>, GpuGradients, usize) {
-    let params = SplatBuffers::upload(device, &scene.splats, &scene.features, scene.dim).unwrap();
-    let [width, height] = scene.view.size;
-    let ways = DeviceChoices { summation, ..DeviceChoices::of(device) };
-    let mut raster = Rasterizer::with(device, scene.splats.len(), scene.dim, width, height, ways).unwrap();
-    raster.set_view(&scene.view).unwrap();
-    let pixels = scene.pixels();
-    let mut image = vec![f32::NAN; (4 + scene.dim) * pixels];
-    // Also grows the lists.
-    let seen = |frame: &splatvk::pass::FrameBuffers, band: &splatvk::pass::bands::Band| {
-        let planes = frame.planes.read()?;
-        let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
-        for (to, from) in image.chunks_exact_mut(pixels).zip(planes.chunks_exact(frame.bands.pixels())) {
-            to[inner.clone()].copy_from_slice(&from[stored.clone()]);
-        }
-        Ok(())
-    };
-    raster.forward_bands(&params, &scene.options, seen).unwrap();
-    let gradients = params.zeros_like(device).unwrap();
-    let bands = raster.frame().bands.clone();
-    let run = |record: &dyn Fn(&mut Recorder)| {
-        let mut rec = Recorder::new(device, "bands");
-        record(&mut rec);
-        rec.run().unwrap();
-    };
-    run(&|rec| raster.record_projection(rec, &params, &scene.options));
-    for band in bands.iter() {
-        run(&|rec| raster.record_band(rec, &params, &band));
-        raster.frame().planes_grad.write(&bands.cut_inner(&band, upstream, 0.0)).unwrap();
-        run(&|rec| raster.record_band_backward(rec, &params, &scene.options, &band));
-    }
-    run(&|rec| raster.record_gradients(rec, &params, &scene.options, &gradients));
-    let (splats, features) = gradients.download().unwrap();
-    let camera = raster.frame().camera_grad.read().unwrap();
-    (image, GpuGradients { splats, features, camera }, bands.count())
 }
 
 /// Largest difference, relative to the largest value.

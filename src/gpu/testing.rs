@@ -28,18 +28,18 @@ impl TestDevice {
         Device::with(&Options { validation: true, pipeline_cache: None, ..options.clone() }).map(TestDevice)
     }
 
-    /// A device whose programs are run by an executor, with the shaders for one subgroup size and the choices for GPUs.
-    /// Buffers must be mapped.
+    /// A device whose programs are run by an executor, with the shaders for one subgroup size, native float atomics unless
+    /// the options say no, and the choices for GPUs. Buffers must be mapped.
     pub fn executed_by(
         executor: Box<dyn Executor>,
         subgroup_size: u32,
-        float_atomics: bool,
+        options: &Options,
     ) -> Result<TestDevice> {
-        let mut device = TestDevice::with(&Options::from_env(None))?;
+        let mut device = TestDevice::with(options)?;
         if let Some(inner) = Arc::get_mut(&mut device.0.0) {
             inner.info.subgroup_size = subgroup_size;
             inner.info.subgroup_sizes = (subgroup_size, subgroup_size);
-            inner.info.float_atomics = float_atomics;
+            inner.info.float_atomics = !options.no_float_atomics;
             inner.info.timestamp_period = 0.0;
             inner.info.is_cpu = false;
             let attached: Attached = executor;

@@ -5,7 +5,7 @@ use super::faults::Faults;
 use super::lower::lower;
 use super::memory::Memory;
 use super::module::words_of;
-use splatvk::gpu::{Buffer, Executor, Groups, Module, Op, TestDevice};
+use splatvk::gpu::{Buffer, Executor, Groups, Module, Op, Options, TestDevice};
 use std::collections::{BTreeSet, HashMap};
 use std::sync::{Arc, LazyLock, Mutex};
 
@@ -17,6 +17,8 @@ pub type Change = Arc<dyn Fn(&Module) -> Option<Vec<u32>> + Send + Sync>;
 pub struct Interpreted {
     pub schedule: Schedule,
     pub float_atomics: bool,
+    /// No buffer larger than this, bytes.
+    pub max_binding: Option<u64>,
     /// Buffers of these names hold nothing when a program begins: what it reads there it must have written.
     pub scratch: &'static [&'static str],
     pub change: Option<Change>,
@@ -27,7 +29,12 @@ pub struct Interpreted {
 impl Interpreted {
     pub fn open(&self) -> TestDevice {
         let size = self.schedule.subgroup_size as u32;
-        TestDevice::executed_by(Box::new(self.clone()), size, self.float_atomics).expect("a device")
+        let options = Options {
+            no_float_atomics: !self.float_atomics,
+            max_binding: self.max_binding,
+            ..Options::from_env(None)
+        };
+        TestDevice::executed_by(Box::new(self.clone()), size, &options).expect("a device")
     }
 
     fn code(&self, module: &Module) -> Arc<Code> {

@@ -46,7 +46,8 @@ const SCRATCH: &[&str] = &[
 
 fn interpreted(subgroup_size: usize, float_atomics: bool) -> Interpreted {
     let schedule = Schedule { subgroup_size, order: Order::Random, in_flight: 3, scattered: false, seed: 1 };
-    Interpreted { schedule, float_atomics, scratch: SCRATCH, change: None, ran: Arc::default() }
+    let ran = Arc::default();
+    Interpreted { schedule, float_atomics, max_binding: None, scratch: SCRATCH, change: None, ran }
 }
 
 /// Runs a scene; what it says if it fails.
@@ -113,6 +114,13 @@ fn every_pass_matches_its_twin_at_subgroups_of_32() {
 #[test]
 fn every_pass_matches_its_twin_at_subgroups_of_64() {
     every_pass_at(64);
+}
+
+/// Where a device does not bind a whole image.
+#[test]
+fn bands_of_an_image_stay_within_their_buffers() {
+    let on = Interpreted { max_binding: Some(1 << 17), ..interpreted(32, true) };
+    assert_eq!(outcome(passes::bands, &on), Ok(()));
 }
 
 /// Vulkan does not say which invocations form a subgroup.

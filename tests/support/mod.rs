@@ -1,12 +1,13 @@
 //! Shared by the integration tests.
 #![allow(dead_code, clippy::unwrap_used, clippy::expect_used, clippy::panic)] // each test binary uses its own part
 use splatvk::gpu::{Device, Recorder};
+use splatvk::pass::bands::Band;
 use splatvk::pass::close::{Distance, Tolerance, compare};
 use splatvk::pass::params::{Gradients, Params};
 use splatvk::pass::raster_forward::Cutoffs;
 use splatvk::pass::seeded;
 use splatvk::pass::twin::{self, Forward};
-use splatvk::pass::{DeviceChoices, RasterOptions, Rasterizer, SplatBuffers, View};
+use splatvk::pass::{DeviceChoices, FrameBuffers, RasterOptions, Rasterizer, SplatBuffers, Summation, View};
 use splatvk::scene::{Camera, Splats};
 
 /// A scene with everything a render needs.
@@ -169,4 +170,47 @@ pub fn assert_gradients(scene: &Scene, actual: &GpuGradients, seed: u64) {
     assert_class("features", &actual.features, &p.features);
     assert_class("pose twist", &actual.camera[..6], &reference.twist);
     assert_class("intrinsics", &actual.camera[6..], &reference.intrinsics);
+}
+
+/// Frame and gradients band by band, and the number of bands.
+pub fn in_bands(
+    scene: &Scene,
+    device: &Device,
+    summation: Summation,
+    upstream: &[f32],
+) -> (Vec<f32>, GpuGradients, usize) {
+    let params = SplatBuffers::upload(device, &scene.splats, &scene.features, scene.dim).unwrap();
+    let [width, height] = scene.view.size;
+    let ways = DeviceChoices { summation, ..DeviceChoices::of(device) };
+    let mut raster = Rasterizer::with(device, scene.splats.len(), scene.dim, width, height, ways).unwrap();
+    raster.set_view(&scene.view).unwrap();
+    let pixels = scene.pixels();
+    let mut image = vec![f32::NAN; (4 + scene.dim) * pixels];
+    // Also grows the lists.
+    let seen = |frame: &FrameBuffers, band: &Band| {
+        let planes = frame.planes.read()?;
+        let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
+        for (to, from) in image.chunks_exact_mut(pixels).zip(planes.chunks_exact(frame.bands.pixels())) {
+            to[inner.clone()].copy_from_slice(&from[stored.clone()]);
+        }
+        Ok(())
+    };
+    raster.forward_bands(&params, &scene.options, seen).unwrap();
+    let gradients = params.zeros_like(device).unwrap();
+    let bands = raster.frame().bands.clone();
+    let run = |record: &dyn Fn(&mut Recorder)| {
+        let mut rec = Recorder::new(device, "bands");
+        record(&mut rec);
+        rec.run().unwrap();
+    };
+    run(&|rec| raster.record_projection(rec, &params, &scene.options));
+    for band in bands.iter() {
+        run(&|rec| raster.record_band(rec, &params, &band));
+        raster.frame().planes_grad.write(&bands.cut_inner(&band, upstream, 0.0)).unwrap();
+        run(&|rec| raster.record_band_backward(rec, &params, &scene.options, &band));
+    }
+    run(&|rec| raster.record_gradients(rec, &params, &scene.options, &gradients));
+    let (splats, features) = gradients.download().unwrap();
+    let camera = raster.frame().camera_grad.read().unwrap();
+    (image, GpuGradients { splats, features, camera }, bands.count())
 }

@@ -1,5 +1,7 @@
 //! Rendering forward and backward, and what reads a rendered frame.
-use crate::support::{Scene, assert_class, assert_close, assert_gradients, assert_images, rendered};
+use crate::support::{
+    IMAGE, Scene, assert_class, assert_close, assert_gradients, assert_images, in_bands, rendered,
+};
 use splatvk::gpu::{Device, Recorder};
 use splatvk::pass::pack::{Encoding, FrameChannel, texels, texels_of};
 use splatvk::pass::raster_forward::{Cutoffs, TwinScene, walk};
@@ -25,6 +27,35 @@ fn there_and_back(device: &Device, scene: &Scene, ways: DeviceChoices) {
 pub fn image(device: &Device) {
     let scene = scene(40, 1, 3, 1048);
     assert_images(&scene.render(device), &scene.twin());
+}
+
+/// No splat, one, none in view, fewer pixels than a tile, and lists that have to grow.
+pub fn edge_cases(device: &Device) {
+    for (n, width, height) in [(0, 9, 5), (1, 3, 2), (1, 17, 8)] {
+        let (splats, camera) = seeded::small(n, width, height, 0, 1049);
+        there_and_back(device, &Scene::new(splats, &camera, 0, 1049), DeviceChoices::of(device));
+    }
+    let mut behind = scene(3, 0, 3, 1050);
+    behind.splats.means.fill((-3.0 * behind.view.position().as_vec3()).to_array());
+    behind.view.translation = glam::DVec3::new(0.0, 0.0, -50.0);
+    there_and_back(device, &behind, DeviceChoices::of(device));
+    let mut large = scene(12, 0, 0, 1051);
+    large.splats.log_scales.fill([3.0, 2.5, 2.0]);
+    large.splats.opacity_logits.fill(-3.0);
+    there_and_back(device, &large, DeviceChoices::of(device));
+}
+
+/// Band by band, against the twin of the whole: 8 planes of 6000 pixels do not fit in 128 KiB.
+pub fn bands(device: &Device) {
+    let (splats, camera) = seeded::small(12, 40, 150, 0, 1052);
+    let scene = Scene::new(splats, &camera, 3, 1052);
+    let upstream = scene.upstream(7);
+    for summation in [Summation::Atomics, Summation::Entries] {
+        let (planes, gradients, count) = in_bands(&scene, device, summation, &upstream);
+        assert!(count > 1, "one band");
+        assert_close("planes", &planes, &scene.twin().image.planes, &IMAGE);
+        assert_gradients(&scene, &gradients, 7);
+    }
 }
 
 fn by_atomics(device: &Device) -> DeviceChoices {
@@ -174,5 +205,5 @@ pub fn pack(device: &Device) {
     let expected = texels_of(&planes, &transmittance, FrameChannel::Depth, Encoding::F32);
     let wide: Vec<f64> =
         expected.chunks_exact(4).map(|b| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]]))).collect();
-    assert_close("depth", &out.cast::<f32>().read().unwrap(), &wide, &crate::support::IMAGE);
+    assert_close("depth", &out.cast::<f32>().read().unwrap(), &wide, &IMAGE);
 }

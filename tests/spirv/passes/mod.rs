@@ -4,7 +4,7 @@ mod frames;
 mod losses;
 mod stereo;
 
-pub use frames::image;
+pub use frames::{bands, image};
 use splatvk::gpu::Device;
 
 pub type Scene = fn(&Device);
@@ -19,6 +19,7 @@ pub const PLAIN: &[(&str, Scene)] = &[
     ("bench", arrays::bench),
     ("gradients by entry", frames::gradients_by_entry),
     ("lists by counting", frames::lists_by_counting),
+    ("edge cases", frames::edge_cases),
     ("pairs", frames::pairs),
     ("decode", frames::decode),
     ("pack", frames::pack),
