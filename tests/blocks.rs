@@ -3,10 +3,9 @@
 mod support;
 use glam::DVec3;
 use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions};
-use splatvk::gpu::{Device, Options, Recorder, TestDevice, test_device};
+use splatvk::gpu::{Device, Options, TestDevice, test_device};
 use splatvk::pass::Summation;
-use splatvk::pass::rasterizer::Rasterizer;
-use splatvk::pass::{DeviceChoices, RenderedFrame, Renderer, SplatBuffers, seeded};
+use splatvk::pass::{RenderedFrame, Renderer, seeded};
 use splatvk::progress::Silent;
 use splatvk::query::{QueryOptions, TextQuery, answer};
 use splatvk::run::view::Viewer;
