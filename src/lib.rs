@@ -57,6 +57,7 @@ pub mod ablate;
 pub mod bench;
 #[cfg(feature = "capi")]
 pub mod capi;
+pub mod check;
 pub mod checkpoint;
 pub mod error;
 #[cfg(feature = "cli")]

@@ -95,6 +95,27 @@ fn heic_without_its_library_says_what_to_do() {
 }
 
 #[test]
+fn doctor_compares_every_pass_on_the_device() {
+    let home = tempfile::tempdir().unwrap();
+    let check = |arguments: &[&str]| {
+        let output =
+            splatvk().arg("doctor").arg("--check").args(arguments).env("SPLATVK_HOME", home.path()).output();
+        let output = output.unwrap();
+        assert!(output.status.success(), "{}", text(&output.stderr));
+        text(&output.stdout)
+    };
+    let table = check(&[]);
+    assert!(
+        table.lines().count() > 16 && table.lines().skip(1).all(|line| line.starts_with("ok ")),
+        "{table}"
+    );
+    let report: serde_json::Value = serde_json::from_str(&check(&["--json"])).unwrap();
+    assert_eq!(report["right"], true);
+    assert_eq!(report["switched_off"], serde_json::json!([]));
+    assert_eq!(report["passes"].as_array().unwrap().len(), table.lines().count() - 1);
+}
+
+#[test]
 fn photos_without_overlap_are_named() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::copy(data("breakfast/images/train_00.jpg"), folder.path().join("table.jpg")).unwrap();

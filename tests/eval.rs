@@ -65,7 +65,7 @@ fn ground_truth_that_does_not_fit_is_refused_before_anything_is_written() {
     refused(&["ground_truth.json", "train_00", "not a rotation"], |_, text| {
         text["frames"][0]["world_to_camera"] = json!(vec![[0.0; 4]; 4]);
     });
-    refused(&["ground_truth.json", "not a ground truth file"], |_, text| {
+    refused(&["ground_truth.json", "expected a sequence"], |_, text| {
         text["frames"] = json!("none");
     });
     refused(&["truth", "0 of its train frames"], |_, text| {

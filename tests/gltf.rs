@@ -117,9 +117,9 @@ fn unreadable_files_are_refused() {
     );
 }
 
-/// Without scenes, every node that no other has is one: looking for that of each in all others took half a minute.
+/// Of as many nodes as are read, without scenes, every node that no other has is one: looking for that of each in all others took half a minute.
 #[test]
-fn a_hundred_thousand_nodes_are_read_at_once() {
+fn many_nodes_are_read_at_once() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("many.gltf");
     gaussians::write(&path, &splats(3, 0), None).unwrap();
@@ -127,16 +127,16 @@ fn a_hundred_thousand_nodes_are_read_at_once() {
     root.as_object_mut().unwrap().retain(|key, _| key != "scene" && key != "scenes");
     let nodes = root["nodes"].as_array_mut().unwrap();
     let first = nodes.len();
-    nodes.extend((0..100_000).map(|_| json!({ "translation": [0, 0, 0] })));
+    nodes.extend((0..99_998).map(|_| json!({ "translation": [0, 0, 0] })));
     nodes.push(json!({ "children": [0, first, first + 1] }));
     std::fs::write(&path, root.to_string()).unwrap();
     let clock = std::time::Instant::now();
     assert_eq!(gaussians::read(&path).unwrap().0.len(), 3);
     let took = clock.elapsed();
     assert!(took < std::time::Duration::from_secs(5), "{took:?}");
-    root["nodes"][first + 100_000]["children"] = json!([first + 100_001]);
+    root["nodes"][first + 99_998]["children"] = json!([first + 99_999]);
     std::fs::write(&path, root.to_string()).unwrap();
-    assert!(gaussians::read(&path).unwrap_err().to_string().contains("no node 100002"));
+    assert!(gaussians::read(&path).unwrap_err().to_string().contains("no node 100000"));
 }
 
 #[test]

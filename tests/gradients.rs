@@ -1,6 +1,6 @@
 //! Gradients of the whole render on the GPU against the f64 twin, which is itself checked by central differences.
 mod support;
-use splatvk::gpu::{Options, TestDevice, test_device};
+use splatvk::gpu::{Options, TestDevice, Way, test_device};
 use splatvk::pass::{DeviceChoices, FeatureMode, Summation};
 use support::{Scene, assert_class, assert_gradients};
 
@@ -94,7 +94,9 @@ fn detached_features_do_not_move_the_geometry() {
 /// The compare-and-swap side of shared/atomic_float.glsl gives the same sums.
 #[test]
 fn without_float_atomics_the_gradients_are_the_same() {
-    let device = TestDevice::with(&Options { no_float_atomics: true, ..Options::from_env(None) }).unwrap();
+    let device =
+        TestDevice::with(&Options { without: [Way::FloatAtomics].into(), ..Options::from_env(None) })
+            .unwrap();
     assert!(!device.info().float_atomics);
     let scene = Scene::small(100, 1, 3, 14);
     let upstream = scene.upstream(14);

@@ -19,6 +19,7 @@ const FOLDERS: &[(&str, &str)] = &[
     ("scene", ""),
     ("gpu", "error files"),
     ("pass", "error math scene gpu"),
+    ("check", "error math scene gpu pass"),
     ("photo", "error files progress scene"),
     ("format", "error files scene pass photo"),
     ("infer", "error files math progress scene photo format"),
@@ -42,7 +43,7 @@ const FOLDERS: &[(&str, &str)] = &[
     ("capi", "error preset progress scene gpu pass photo infer pose query run"),
     (
         "cli",
-        "error files preset progress scene gpu photo format infer fetch language query report synth pipeline run ablate bench",
+        "error files preset progress scene gpu check photo format infer fetch language query report synth pipeline run ablate bench",
     ),
 ];
 

@@ -325,6 +325,10 @@ pub struct DoctorArgs {
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
+    /// Run every GPU pass on the device and compare it with the same computation on the CPU: a table for bug reports. What
+    /// gives wrong results there and can be replaced is not used on this device and driver from then on
+    #[arg(long)]
+    pub check: bool,
 }
 
 /// `splatvk clean`

@@ -2,7 +2,10 @@
 use super::args::DoctorArgs;
 use super::models;
 use super::print::{print, print_json};
+use super::progress;
+use crate::check::{self, Row};
 use crate::gpu::report::{Line, Status, vulkan};
+use crate::gpu::{Device, Options, Way};
 use crate::infer;
 use crate::infer::installed::{Task, inventory};
 use crate::photo::{self, Support};
@@ -12,6 +15,9 @@ use serde_json::json;
 use std::fmt::Write;
 
 pub fn doctor(args: &DoctorArgs) -> Result<()> {
+    if args.check {
+        return check_passes(args);
+    }
     let registry = args.device.registry()?;
     let mut lines = vulkan(args.device.device.as_deref());
     lines.push(match infer::runtime().and_then(|path| Ok((path, registry.compute().name()?))) {
@@ -70,6 +76,82 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
             "{n} required parts are missing; follow the advice above, tools/setup does it all"
         ))),
     }
+}
+
+/// Compares every pass with its CPU twin, and switches off what is wrong and can be replaced.
+fn check_passes(args: &DoctorArgs) -> Result<()> {
+    let options = Options::from_env(args.device.device.as_deref());
+    let device = Device::with(&Options { cache: None, ..options.clone() })?;
+    let info = device.info();
+    let (low, high) = info.subgroup_sizes;
+    let about = format!(
+        "splatvk {} · {} · {} · Vulkan {}.{}.{} · subgroups {} ({low} to {high}) · float atomics {}",
+        env!("CARGO_PKG_VERSION"),
+        info.name,
+        info.driver,
+        info.api_version.0,
+        info.api_version.1,
+        info.api_version.2,
+        info.subgroup_size,
+        if info.float_atomics { "native" } else { "emulated" },
+    );
+    let json = args.device.json;
+    if !json {
+        print(&format!("{about}\n"))?;
+    }
+    let mut unwritten = None;
+    let rows = check::run(&options, &mut |row| {
+        if !json && let Err(e) = print(&text(row)) {
+            unwritten.get_or_insert(e);
+        }
+        // Stopped: the next row is the last.
+        if let Err(e) = progress::reporter().check() {
+            unwritten.get_or_insert(e);
+        }
+    })?;
+    if let Some(e) = unwritten {
+        return Err(e);
+    }
+    let off = check::wrong_ways(&rows);
+    let names: Vec<&str> = off.iter().map(|w| w.name()).collect();
+    if let Some(folder) = &options.cache {
+        device.switch_off(folder, &off)?;
+    }
+    let fatal = rows.iter().filter(|r| check::is_fatal(r, &off)).count();
+    if json {
+        let rows: Vec<_> = rows.iter().map(to_json).collect();
+        print_json(&json!({ "device": about, "right": fatal == 0, "switched_off": names, "passes": rows }))?;
+    } else if !off.is_empty() {
+        print(&format!("switched off on this device and driver: {}\n", names.join(", ")))?;
+    }
+    match fatal {
+        0 => Ok(()),
+        n => Err(Error::gpu(format!(
+            "{n} of {} passes give wrong results on {}, and nothing replaces them: update the driver or use another --device, and \
+             please report the table above",
+            rows.len(),
+            info.name
+        ))),
+    }
+}
+
+fn text(row: &Row) -> String {
+    let (word, found) = match &row.outcome {
+        Ok(found) => ("ok", found),
+        Err(what) => ("WRONG", what),
+    };
+    let pass = row.way.map_or(row.pass.to_owned(), |way| format!("{}, {}", row.pass, way.name()));
+    format!("{word:<6} {pass:<52} {:>6} ms  {found}\n", row.time.as_millis())
+}
+
+fn to_json(row: &Row) -> serde_json::Value {
+    json!({
+        "pass": row.pass,
+        "way": row.way.map(Way::name),
+        "right": row.outcome.is_ok(),
+        "found": row.outcome.as_ref().unwrap_or_else(|what| what),
+        "seconds": row.time.as_secs_f64(),
+    })
 }
 
 fn line(topic: &str, status: Status, found: String, advice: Option<String>) -> Line {

@@ -32,7 +32,7 @@ pub struct HostDevice {
 
 impl Device {
     /// Works on the host's device; it is not destroyed with the [`Device`]. Of `options` only `staging`, `deterministic`
-    /// and `no_float_atomics` count.
+    /// and `without` count.
     ///
     /// # Safety
     /// The handles are valid, belong together, were made as `host` says, and outlive everything made from the result.
@@ -88,7 +88,7 @@ impl Device {
             timeline: host.features.timeline_semaphore,
             queue_lock: host.queue_lock,
             owned: false,
-            pipelines: None,
+            cache: None,
         };
         Device::assemble(entry, candidate.physical, None, setup)
     }

@@ -7,11 +7,12 @@ use super::pipeline::Pipeline;
 use super::pipeline_cache::Store;
 use super::staging::Staging;
 use super::validation::Sink;
+use super::ways::{self, Way};
 use crate::Result;
 use ash::vk;
 use std::any::Any;
-use std::collections::HashMap;
-use std::path::PathBuf;
+use std::collections::{BTreeSet, HashMap};
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
@@ -31,7 +32,7 @@ pub(super) struct Setup {
     pub queue_lock: Option<QueueLock>,
     pub owned: bool,
     /// Folder of the compiled pipelines.
-    pub pipelines: Option<PathBuf>,
+    pub cache: Option<PathBuf>,
 }
 
 /// A Vulkan device; clones share it.
@@ -61,6 +62,7 @@ pub(super) struct Inner {
     /// By name and code: modules of a program may share a name with the engine's.
     pipelines: Mutex<HashMap<(&'static str, usize), Arc<Pipeline>>>,
     pipeline_cache: vk::PipelineCache,
+    properties: vk::PhysicalDeviceProperties,
     store: Option<Store>,
     /// Set where synchronization2 comes from the extension instead of Vulkan 1.3.
     sync2: Option<ash::khr::synchronization2::Device>,
@@ -85,7 +87,7 @@ impl Device {
             setup.sync2_extension.then(|| ash::khr::synchronization2::Device::new(&instance, &device));
         // SAFETY: the physical device belongs to the instance.
         let properties = unsafe { instance.get_physical_device_properties(physical) };
-        let store = setup.pipelines.as_ref().map(|folder| Store::new(folder, &properties));
+        let store = setup.cache.as_ref().map(|folder| Store::new(folder, &properties));
         let finish = || -> Result<(vk::PipelineCache, Heap)> {
             let kept = store.as_ref().map(Store::read).unwrap_or_default();
             let create = |data: &[u8]| {
@@ -131,6 +133,7 @@ impl Device {
             staging: Mutex::default(),
             pipelines: Mutex::new(HashMap::new()),
             pipeline_cache,
+            properties,
             store,
             sync2,
             messenger,
@@ -138,6 +141,18 @@ impl Device {
             sink,
             _entry: entry,
         })))
+    }
+
+    /// Switches off these ways and no others, for every process that opens this device with its driver and keeps its cache in
+    /// the folder ([`super::Options::cache`]).
+    pub fn switch_off(&self, folder: &Path, ways: &BTreeSet<Way>) -> Result<()> {
+        ways::write(folder, &self.0.properties, ways)
+    }
+
+    /// Names of the shaders that were run so far.
+    #[cfg(test)]
+    pub(crate) fn shaders_run(&self) -> BTreeSet<&'static str> {
+        super::error::lock(&self.0.pipelines).keys().map(|key| key.0).collect()
     }
 
     /// What the device is and can do.

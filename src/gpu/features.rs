@@ -4,6 +4,7 @@ use super::error::vk_error;
 use super::info::{DeviceInfo, Options};
 use super::module::Capability;
 use super::select::{self, Candidate};
+use super::ways::Way;
 use crate::{Error, Result};
 use ash::vk;
 use std::collections::BTreeSet;
@@ -72,7 +73,7 @@ pub(super) fn create(
         )));
     }
     let core13 = candidate.properties.api_version >= vk::API_VERSION_1_3;
-    let atomics_on = offer.atomic_float_add && !options.no_float_atomics;
+    let atomics_on = offer.atomic_float_add && !options.without.contains(&Way::FloatAtomics);
     let mut extensions = Vec::new();
     if !core13 {
         extensions.push(ash::khr::synchronization2::NAME.as_ptr());
@@ -142,7 +143,7 @@ pub(super) fn adopted(
         subgroup_control: enabled.subgroup_control,
         full_subgroups: enabled.full_subgroups,
     };
-    let atomics = offer.atomic_float_add && !options.no_float_atomics;
+    let atomics = offer.atomic_float_add && !options.without.contains(&Way::FloatAtomics);
     describe(instance, candidate, &offer, queue_family, options, atomics)
 }
 
@@ -204,6 +205,7 @@ fn describe(
         subgroup_control: pins,
         float_atomics,
         deterministic: options.deterministic,
+        without: options.without.clone(),
         capabilities: capabilities(offer, &v11, float_atomics),
         max_storage_range: u64::from(limits.max_storage_buffer_range)
             .min(options.max_binding.unwrap_or(u64::MAX)),
@@ -257,5 +259,7 @@ pub(super) fn survey(
     }
     let offer = available(instance, candidate);
     let family = select::queue_family(instance, candidate.physical).ok_or("it has no compute queue")?;
-    Ok(describe(instance, candidate, &offer, family, &Options::default(), offer.atomic_float_add))
+    let options = Options::from_env(None).for_device(&candidate.properties);
+    let atomics = offer.atomic_float_add && !options.without.contains(&Way::FloatAtomics);
+    Ok(describe(instance, candidate, &offer, family, &options, atomics))
 }

@@ -1,5 +1,6 @@
 //! What a device is asked for and what it is.
 use super::module::Capability;
+use super::ways::Way;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
@@ -16,15 +17,16 @@ pub struct Options {
     pub deterministic: bool,
     /// No buffer larger than this, bytes, although the device would bind more: to test what is done in blocks.
     pub max_binding: Option<u64>,
-    /// Folder that keeps compiled pipelines from one process to the next; `None` keeps none. Not used on a host's device.
-    pub pipeline_cache: Option<PathBuf>,
-    /// Use the compare-and-swap loop although the device has float atomics (to test it).
-    pub no_float_atomics: bool,
+    /// Folder that keeps compiled pipelines, and what is switched off on a device, from one process to the next; `None`
+    /// keeps nothing and knows of nothing. Not used on a host's device.
+    pub cache: Option<PathBuf>,
+    /// Ways not to be used although the device has them.
+    pub without: BTreeSet<Way>,
 }
 
 impl Options {
     /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`, staging when `SPLATVK_STAGING` is;
-    /// `SPLATVK_MAX_BINDING` in MiB; pipelines in `SPLATVK_HOME`.
+    /// `SPLATVK_MAX_BINDING` in MiB; the cache in `SPLATVK_HOME`.
     pub fn from_env(choice: Option<&str>) -> Self {
         let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
         Options {
@@ -34,7 +36,7 @@ impl Options {
             max_binding: variable("SPLATVK_MAX_BINDING")
                 .and_then(|v| v.parse::<u64>().ok())
                 .map(|mib| mib.saturating_mul(1 << 20)),
-            pipeline_cache: Some(crate::files::home().join("cache")),
+            cache: Some(crate::files::home().join("cache")),
             ..Options::default()
         }
     }
@@ -62,8 +64,10 @@ pub struct DeviceInfo {
     pub subgroup_control: bool,
     /// Asked to give the same bits on every run ([`Options::deterministic`]).
     pub deterministic: bool,
-    /// `atomicAdd` on float in storage buffers is native.
+    /// `atomicAdd` on float in storage buffers is native, and used.
     pub float_atomics: bool,
+    /// Ways that are not used here ([`DeviceInfo::way`]).
+    pub without: BTreeSet<Way>,
     /// Capabilities that shaders may use here.
     pub capabilities: BTreeSet<Capability>,
     /// Largest buffer a shader can see, bytes.

@@ -39,7 +39,8 @@ impl Device {
         let physical = candidate.physical;
         let queue_family = select::queue_family(instance, physical)
             .ok_or_else(|| Error::no_device(format!("{} has no compute queue", candidate.name)))?;
-        let (device, info) = features::create(instance, &candidate, queue_family, options)?;
+        let options = options.for_device(&candidate.properties);
+        let (device, info) = features::create(instance, &candidate, queue_family, &options)?;
         // SAFETY: the queue was requested in `create`.
         let queue = unsafe { device.get_device_queue(queue_family, 0) };
         let setup = Setup {
@@ -52,7 +53,7 @@ impl Device {
             timeline: false,
             queue_lock: None,
             owned: true,
-            pipelines: options.pipeline_cache.clone(),
+            cache: options.cache,
         };
         Self::assemble(entry, physical, sink, setup)
     }

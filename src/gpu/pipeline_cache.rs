@@ -102,7 +102,7 @@ mod tests {
         let work = || {
             let options = Options {
                 validation: true,
-                pipeline_cache: Some(folder.path().to_path_buf()),
+                cache: Some(folder.path().to_path_buf()),
                 ..Options::from_env(None)
             };
             let device = Device::with(&options).unwrap();

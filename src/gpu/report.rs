@@ -132,6 +132,11 @@ fn chosen(info: &DeviceInfo, lines: &mut Vec<Line>) {
         let advice = "a compare-and-swap loop is used instead: same results, slower training";
         line("float atomics", Status::Note, "missing (optional)", Some(advice))
     });
+    if !info.without.is_empty() {
+        let names: Vec<&str> = info.without.iter().map(|w| w.name()).collect();
+        let advice = "doctor --check found wrong results; after an update of the driver it starts anew";
+        lines.push(line("switched off", Status::Note, names.join(", "), Some(advice)));
+    }
     let mib = |bytes: u64| bytes >> 20;
     // One feature plane set of 20 channels at 1 Mpixel in f32 takes 80 MB; Vulkan itself only promises 128 MiB.
     lines.push(line(

@@ -25,7 +25,7 @@ pub fn test_device() -> TestDevice {
 impl TestDevice {
     /// A device of its own for tests that need other options than the shared one.
     pub fn with(options: &Options) -> Result<TestDevice> {
-        Device::with(&Options { validation: true, pipeline_cache: None, ..options.clone() }).map(TestDevice)
+        Device::with(&Options { validation: true, cache: None, ..options.clone() }).map(TestDevice)
     }
 
     /// A device whose programs are run by an executor, with the shaders for one subgroup size, native float atomics unless

@@ -3,7 +3,7 @@ use super::bands::Bands;
 use super::channels::{Block, blocks};
 use super::tile_lists::{TILE, TileLists};
 use crate::Result;
-use crate::gpu::{Buffer, Device, shaders};
+use crate::gpu::{Buffer, Device, Way, shaders};
 use std::ops::Range;
 
 /// Buffers of one frame; pixel planes are planar [C, H, W], f32, with H the rows of one band where there are several.
@@ -112,9 +112,13 @@ pub(super) struct EntryBuffers {
 }
 
 impl Summation {
-    /// The faster way, unless the device was opened to be deterministic.
+    /// The faster way, unless the device was opened to be deterministic or gives wrong results by it.
     pub fn of(device: &Device) -> Summation {
-        if device.info().deterministic { Summation::Entries } else { Summation::Atomics }
+        let info = device.info();
+        match info.way(Way::AtomicGradients) {
+            Way::AtomicGradients if !info.deterministic => Summation::Atomics,
+            _ => Summation::Entries,
+        }
     }
 }
 

@@ -7,7 +7,7 @@
 //! begin from the tiles before them while those run. Both are correct on any device and any subgroup size.
 use super::adam::rows_of_groups;
 use crate::Result;
-use crate::gpu::{Buffer, Device, Recorder, shaders};
+use crate::gpu::{Buffer, Device, Recorder, Way, shaders};
 
 /// How the work is divided.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -19,9 +19,13 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// The faster one for a kind of device.
+    /// The faster one for a kind of device, unless it gives wrong results there.
     pub fn of(device: &Device) -> Shape {
-        if device.info().is_cpu { Shape::Chunks } else { Shape::Sweep }
+        let info = device.info();
+        match info.way(if info.is_cpu { Way::ChunkSort } else { Way::SweepSort }) {
+            Way::ChunkSort => Shape::Chunks,
+            _ => Shape::Sweep,
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 use super::scan::Scan;
 use super::sort::Sort;
 use crate::Result;
-use crate::gpu::{Buffer, Device, shaders};
+use crate::gpu::{Buffer, Device, Way, shaders};
 
 /// Tile edge, pixels. 8 evaluates 2.9 times the pairs it blends, 16 six times (measured on the seeded scene).
 pub const TILE: u32 = shaders::shared::layout::TILE as u32;
@@ -19,7 +19,11 @@ pub enum Grouping {
 impl Grouping {
     /// What suits the device.
     pub fn of(device: &Device) -> Grouping {
-        if device.info().is_cpu { Grouping::Counting } else { Grouping::Sorting }
+        let info = device.info();
+        match info.way(if info.is_cpu { Way::CountedLists } else { Way::SortedLists }) {
+            Way::CountedLists => Grouping::Counting,
+            _ => Grouping::Sorting,
+        }
     }
 }
 

@@ -1,0 +1,165 @@
+//! Rendering and its gradients.
+use super::{Found, close, worst};
+use crate::gpu::{Device, Recorder};
+use crate::pass::close::Tolerance;
+use crate::pass::params::Params;
+use crate::pass::raster_forward::Cutoffs;
+use crate::pass::seeded::{self, Random};
+use crate::pass::twin::{self, Forward};
+use crate::pass::{
+    DeviceChoices, FeatureMode, Grouping, RasterOptions, Rasterizer, SplatBuffers, Summation, View,
+    regularise,
+};
+use crate::scene::Splats;
+use glam::DVec3;
+
+/// The image is no multiple of the tiles.
+const SIZE: [u32; 2] = [75, 53];
+const FEATURES: usize = 6;
+const MODE: FeatureMode = FeatureMode::Gauge { epsilon: 1e-3, blocks: 2 };
+
+/// As tests/passes.rs demands (docs/method.md#tolerances).
+const IMAGE: Tolerance =
+    Tolerance { relative_l2: 1e-4, absolute: 1e-4, relative: 1e-5, outliers: 2e-4, outlier_factor: 200.0 };
+
+/// As tests/gradients.rs demands.
+fn tolerance(reference: &[f64]) -> Tolerance {
+    let rms = (reference.iter().map(|x| x * x).sum::<f64>() / reference.len().max(1) as f64).sqrt();
+    Tolerance {
+        relative_l2: 1e-3,
+        absolute: 2e-3 * rms + 1e-9,
+        relative: 2e-3,
+        outliers: 0.02,
+        outlier_factor: 50.0,
+    }
+}
+
+struct Scene {
+    splats: Splats,
+    features: Vec<f32>,
+    view: View,
+    options: RasterOptions,
+}
+
+impl Scene {
+    fn new() -> Scene {
+        let (splats, camera) = seeded::small(150, SIZE[0], SIZE[1], 3, 11);
+        let features = seeded::features(splats.len(), FEATURES, 11);
+        let view = View::new(&camera, 0.05).with_background([0.2, 0.4, 0.1]);
+        let options = RasterOptions { sh_degree: 3, feature_mode: MODE, ..RasterOptions::default() };
+        Scene { splats, features, view, options }
+    }
+
+    fn params(&self) -> Params {
+        Params::new(&self.splats, &self.features, FEATURES)
+    }
+
+    fn twin(&self) -> Forward {
+        twin::forward(&self.params(), &self.view, MODE, &Cutoffs::STANDARD)
+    }
+
+    fn rendered(&self, device: &Device, ways: DeviceChoices) -> crate::Result<(SplatBuffers, Rasterizer)> {
+        let params = SplatBuffers::upload(device, &self.splats, &self.features, FEATURES)?;
+        let mut raster = Rasterizer::with(device, self.splats.len(), FEATURES, SIZE[0], SIZE[1], ways)?;
+        raster.set_view(&self.view)?;
+        raster.forward(&params, &self.options)?;
+        Ok((params, raster))
+    }
+}
+
+pub(super) fn forward(device: &Device, grouping: Grouping) -> Found {
+    let scene = Scene::new();
+    let (_, raster) = scene.rendered(device, DeviceChoices { grouping, ..DeviceChoices::of(device) })?;
+    let twin = scene.twin();
+    let (planes, rest) = (raster.frame().planes.read()?, raster.frame().transmittance.read()?);
+    Ok(worst([
+        close("planes", &planes, &twin.image.planes, &IMAGE),
+        close("transmittance", &rest, &twin.image.transmittance, &IMAGE),
+    ]))
+}
+
+pub(super) fn backward(device: &Device, summation: Summation) -> Found {
+    let scene = Scene::new();
+    let (params, raster) =
+        scene.rendered(device, DeviceChoices { summation, ..DeviceChoices::of(device) })?;
+    let mut random = Random::new(12);
+    let values = (5 + FEATURES) * (SIZE[0] * SIZE[1]) as usize;
+    let upstream: Vec<f32> = (0..values).map(|_| random.normal(1.0) as f32).collect();
+    raster.frame().planes_grad.write(&upstream)?;
+    let gradients = params.zeros_like(device)?;
+    let mut rec = Recorder::new(device, "self-check of gradients");
+    raster.record_backward(&mut rec, &params, &scene.options, &gradients);
+    rec.run()?;
+    let (splats, features) = gradients.download()?;
+    let camera = raster.frame().camera_grad.read()?;
+
+    let upstream: Vec<f64> = upstream.iter().map(|&g| g.into()).collect();
+    let twin =
+        twin::backward(&scene.params(), &scene.view, MODE, &Cutoffs::STANDARD, &scene.twin(), &upstream);
+    let flat = |v: &[DVec3]| v.iter().flat_map(|x| x.to_array()).collect::<Vec<f64>>();
+    let quats: Vec<f64> = twin.params.quats.iter().flat_map(|q| q.to_array()).collect();
+    let class = |name: &str, actual: &[f32], twin: &[f64]| close(name, actual, twin, &tolerance(twin));
+    Ok(worst([
+        class("means", splats.means.as_flattened(), &flat(&twin.params.means)),
+        class("log scales", splats.log_scales.as_flattened(), &flat(&twin.params.log_scales)),
+        class("quaternions", splats.quats.as_flattened(), &quats),
+        class("opacity logits", &splats.opacity_logits, &twin.params.opacity_logits),
+        class("SH", &splats.sh, &flat(&twin.params.sh)),
+        class("features", &features, &twin.params.features),
+        class("pose", &camera[..6], &twin.twist),
+        class("intrinsics", &camera[6..], &twin.intrinsics),
+    ]))
+}
+
+pub(super) fn regularisers(device: &Device) -> Found {
+    let scene = Scene::new();
+    let (params, raster) = scene.rendered(device, DeviceChoices::of(device))?;
+    let frame = raster.frame();
+    let pixels = frame.pixels() as usize;
+    let mut random = Random::new(13);
+    // A third of the pixels has no reference.
+    let depth: Vec<f32> = (0..pixels).map(|_| random.uniform(-1.0, 2.0).max(0.0) as f32).collect();
+    let reference = device.buffer_from("reference depth", &depth)?;
+    let gradients = params.zeros_like(device)?;
+    let n = scene.splats.len();
+    let mut rec = Recorder::new(device, "self-check of the regularisers");
+    regularise::record_depth(&mut rec, frame, Some(&reference), 0.5);
+    regularise::record_ratio(&mut rec, &params.log_scales, &gradients.log_scales, n, 0.25, 2.0);
+    rec.run()?;
+
+    let wide = |v: &[f32]| v.iter().map(|&a| f64::from(a)).collect::<Vec<f64>>();
+    let rendered = frame.planes.read()?[3 * pixels..4 * pixels].to_vec();
+    let alpha: Vec<f32> = frame.transmittance.read()?.iter().map(|t| 1.0 - t).collect();
+    let (_, by_pixel) = regularise::depth_l1(&wide(&rendered), &wide(&alpha), &wide(&depth), 0.5);
+    let upstream = frame.planes_grad.read()?;
+    let by_depth: Vec<f64> = by_pixel.iter().map(|g| g[0]).collect();
+    let by_alpha: Vec<f64> = by_pixel.iter().map(|g| g[1]).collect();
+    let plane = |first: usize| &upstream[first * pixels..(first + 1) * pixels];
+    let by_scale: Vec<f64> = scene
+        .splats
+        .log_scales
+        .iter()
+        .flat_map(|s| regularise::ratio_penalty(s.map(f64::from), 0.25, 2.0).1)
+        .collect();
+    // Signs and quotients of single values; where the two depths agree to rounding, the sign may differ.
+    let tolerance = Tolerance {
+        relative_l2: 1e-4,
+        absolute: 1e-6,
+        relative: 1e-4,
+        outliers: 1e-3,
+        outlier_factor: f64::MAX,
+    };
+    let scales = gradients.log_scales.read()?;
+    let depth = close("by depth", plane(3), &by_depth, &tolerance);
+    let alpha = close("by alpha", plane(4 + FEATURES), &by_alpha, &tolerance);
+    let scale = close("by log scale", &scales, &by_scale, &tolerance);
+    // Without a reference both become zero.
+    let mut rec = Recorder::new(device, "self-check of the regularisers");
+    regularise::record_depth(&mut rec, frame, None, 0.5);
+    rec.run()?;
+    let upstream = frame.planes_grad.read()?;
+    let zero =
+        [3, 4 + FEATURES].iter().all(|k| upstream[k * pixels..(k + 1) * pixels].iter().all(|g| *g == 0.0));
+    let cleared = if zero { Ok(0.0) } else { Err("the depth gradient was not cleared".to_owned()) };
+    Ok(worst([depth, alpha, scale, cleared]))
+}
