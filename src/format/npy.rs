@@ -3,7 +3,7 @@ use crate::{Error, Result, files};
 use half::f16;
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
-use std::io::{Cursor, Read, Write};
+use std::io::{Cursor, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 const MAGIC: &[u8] = b"\x93NUMPY";
@@ -217,13 +217,38 @@ fn write_zip(path: &Path, arrays: &[(&str, &NpyArray)], method: zip::Compression
         e => Error::work(format!("{}: cannot write the npz file: {e}", path.display())),
     };
     let file = std::fs::File::create(path).map_err(Error::unwritable(path))?;
-    let mut zip = zip::ZipWriter::new(std::io::BufWriter::new(file));
+    let mut zip = zip::ZipWriter::new(std::io::BufWriter::new(UntilItFails { file, failed: false }));
     let options = zip::write::SimpleFileOptions::default().compression_method(method);
     for (name, array) in arrays {
         zip.start_file(format!("{name}.npy"), options).map_err(bad)?;
         zip.write_all(&encode(array)?).map_err(Error::unwritable(path))?;
     }
     zip.finish().map_err(bad)?.flush().map_err(Error::unwritable(path))
+}
+
+/// Takes everything after the first error, which was reported: a dropped `ZipWriter` goes on writing, and prints of its own accord
+/// what comes of that.
+struct UntilItFails {
+    file: std::fs::File,
+    failed: bool,
+}
+
+impl Write for UntilItFails {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        match self.failed {
+            true => Ok(bytes.len()),
+            false => self.file.write(bytes).inspect_err(|_| self.failed = true),
+        }
+    }
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.file.flush()
+    }
+}
+
+impl Seek for UntilItFails {
+    fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
+        self.file.seek(to)
+    }
 }
 
 /// Serialises an array as a `.npy` file image.
