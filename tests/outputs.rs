@@ -160,7 +160,7 @@ fn with_force_files_of_the_same_names_are_replaced_and_others_stay() {
 fn generated_data_is_replaced_as_a_whole_and_only_where_nothing_else_lies_in_it() {
     let folder = tempfile::tempdir().unwrap();
     let data = folder.path().join("data");
-    let words = |views: u32| format!("generate --seed 1000 --size 32x24 --views {views} --held-out 0 --out");
+    let words = |views: u32| format!("generate --seed 1000 --size 64x64 --views {views} --held-out 0 --out");
     succeeds(&line(&words(3), &data));
     refused(&line(&words(2), &data), "--force");
     let regions = format!("generate --from {} --out", data.display());
