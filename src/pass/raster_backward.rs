@@ -68,7 +68,7 @@ pub(super) fn record(
                 let vectors = GRADIENT_FLOATS as u32 / 4;
                 sum(rec, &entries.splats, &frame.projected_grad, vectors, vectors, 0);
             }
-            Err(e) => rec.fail(e),
+            Err(e) => rec.fail_with(e),
         },
     }
 }
