@@ -199,8 +199,7 @@ static int32_t progress(void *user, const SvkProgress *) {
     return ++countdown->calls == countdown->stop;
 }
 
-static void use(SvkScene *scene, bool ask) {
-    const SvkCamera camera = scene_camera(scene, 0);
+static void use(SvkScene *scene, const SvkCamera &camera, bool ask) {
     const size_t pixels = size_t(camera.width) * camera.height;
     std::vector<unsigned char> image(4 * pixels), mask(pixels);
     auto colour = make<SvkOutput>();
@@ -249,7 +248,8 @@ static void once(const Job &job, int number, std::mt19937 &random, long &longest
         longest = std::max(longest, countdown.calls);
         Scene scene(scene_made);
         trained++;
-        use(scene.get(), true);
+        const SvkCamera camera = scene_camera(scene.get(), 0);
+        use(scene.get(), camera, true);
         const std::string place = job.out + "/" + std::to_string(number);
         for (const char *ending : {"", ".ply", ".spz"}) {
             check(svk_scene_save(scene.get(), (place + ending).c_str(), 1), scene.get());
@@ -257,9 +257,9 @@ static void once(const Job &job, int number, std::mt19937 &random, long &longest
         }
         SvkScene *again = nullptr;
         check(svk_scene_load(context.get(), (place + ".ply").c_str(), &again), context.get());
-        use(Scene(again).get(), false);
+        use(Scene(again).get(), camera, false);
     }
-    if (job.shared) use(job.shared, true);
+    if (job.shared) use(job.shared, scene_camera(job.shared, 0), true);
 }
 
 static void thread(const Job &job, int number) {
@@ -315,7 +315,7 @@ static int run(int argc, char **argv) {
     SvkScene *loaded = nullptr;
     check(svk_scene_load(context.get(), (job.out + "/0").c_str(), &loaded), context.get());
     Scene shared(loaded);
-    use(shared.get(), true);
+    use(shared.get(), scene_camera(shared.get(), 0), true);
     job.shared = shared.get();
     const long files = entries("/proc/self/fd");
     const auto began = std::chrono::steady_clock::now();
