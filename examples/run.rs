@@ -28,7 +28,7 @@ impl Progress for Lines {
 /// Runs, and once more where a driver was reset and finished stages are kept.
 fn reconstruct(plan: &RunPlan) -> Result<RunOutcome> {
     match run::run(plan, &Lines) {
-        Err(error @ Error::DeviceLost { resumable: true, .. }) => {
+        Err(error @ Error::DeviceLost { kept: Some(_), .. }) => {
             eprintln!("{error}");
             run::run(&RunPlan { resume: true, ..plan.clone() }, &Lines)
         }

@@ -1037,10 +1037,12 @@ SvkStatus svk_scene_notes(SvkScene *scene,
 
 /*
  Writes the scene: a file of Gaussians where the name ends like one (.ply, .compressed.ply, .splat, .spz; language goes
- beside it, into NAME.language.npz), a scene directory otherwise. It
- appears whole or not at all; `replace` = 1 allows to replace a scene or file that is there. Thread-safe.
+ beside it, into NAME.language.npz), a scene directory where it has no ending, ends in a slash or is that of a folder; any other
+ ending is SVK_STATUS_INPUT. It appears whole or not at all; `replace` = 1 allows to replace a scene or file that is there. Thread-safe.
  */
-SvkStatus svk_scene_save(SvkScene *scene, const char *path, uint32_t replace);
+SvkStatus svk_scene_save(SvkScene *scene,
+                         const char *path,
+                         uint32_t replace);
 
 /*
  Renders the scene from a camera into all `outputs` at once. `sync` may be NULL: then targets are written at once, and

@@ -3,6 +3,7 @@ use crate::{Error, Result, files};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -12,12 +13,16 @@ pub struct Checkpoint {
     every: Duration,
     last: Mutex<Instant>,
     resume: bool,
+    /// The steps that the state on disk has behind it, as far as this process knows; [`UNKNOWN`] otherwise.
+    done: AtomicU64,
 }
+
+const UNKNOWN: u64 = u64::MAX;
 
 impl Checkpoint {
     /// A state in `file`, renewed after `every`; an old one is used only with `resume`.
     pub fn new(file: PathBuf, every: Duration, resume: bool) -> Checkpoint {
-        Checkpoint { file, every, last: Mutex::new(Instant::now()), resume }
+        Checkpoint { file, every, last: Mutex::new(Instant::now()), resume, done: AtomicU64::new(UNKNOWN) }
     }
 
     /// The state of an earlier process, if there is one.
@@ -26,9 +31,17 @@ impl Checkpoint {
         postcard::from_bytes(&bytes).ok()
     }
 
-    /// Whether there is a state on disk, of this process or an earlier one.
-    pub(crate) fn exists(&self) -> bool {
-        self.file.is_file()
+    /// What the state on disk, of this process or an earlier one, is a state of; `None` where there is none.
+    pub(crate) fn named(&self, stage: &str) -> Option<String> {
+        self.file.is_file().then(|| match self.done.load(Ordering::Relaxed) {
+            UNKNOWN => format!("the state of stage {stage}"),
+            done => format!("stage {stage} after step {done}"),
+        })
+    }
+
+    /// The state that was loaded has so many steps behind it.
+    pub fn went_on_from(&self, done: usize) {
+        self.done.store(done as u64, Ordering::Relaxed);
     }
 
     /// Whether it is time for the next.
@@ -36,10 +49,12 @@ impl Checkpoint {
         self.last.lock().unwrap_or_else(PoisonError::into_inner).elapsed() >= self.every
     }
 
-    /// Writes the state. A disk that is full costs the next process time, not this one its result.
-    pub fn save<T: Serialize>(&self, state: &T) -> Result<()> {
+    /// Writes the state after `done` steps. A disk that is full costs the next process time, not this one its result.
+    pub fn save<T: Serialize>(&self, done: usize, state: &T) -> Result<()> {
         let bytes = postcard::to_stdvec(state).map_err(|e| Error::work(format!("checkpoint: {e}")))?;
-        let _ = files::write_with_checksum(&self.file, &bytes);
+        if files::write_with_checksum(&self.file, &bytes).is_ok() {
+            self.done.store(done as u64, Ordering::Relaxed);
+        }
         *self.last.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
         Ok(())
     }

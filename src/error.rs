@@ -55,20 +55,25 @@ pub enum Error {
     },
     /// The Vulkan device was lost: reset by its driver, removed, or asleep. Everything on it is gone and nothing more can be
     /// done with it; a new [`crate::gpu::Device`] may work.
-    #[error("Vulkan: {doing}: the device was lost ({source}); {}", after_loss(*resumable))]
+    #[error("Vulkan: {doing}: the device was lost ({source}); {}", after_loss(kept))]
     DeviceLost {
         /// What was being done.
         doing: String,
-        /// Finished stages or a state of training are on disk, from which the same run with `resume` goes on.
-        resumable: bool,
+        /// The last thing that is on disk, from which the same run with `resume` goes on: "stage splats after step 120".
+        kept: Option<String>,
         /// What the driver said.
         source: ash::vk::Result,
     },
     /// The Vulkan device or its driver has no memory left.
-    #[error("Vulkan: {doing}: {source}; use fewer splats, smaller photos or another device")]
+    #[error(
+        "Vulkan: {doing}: {source}; use fewer splats, smaller photos or another device{}",
+        once_there_is_memory(kept)
+    )]
     OutOfDeviceMemory {
         /// What was being done, with its size where one is known.
         doing: String,
+        /// As that of [`Error::DeviceLost`].
+        kept: Option<String>,
         /// What the driver said.
         source: ash::vk::Result,
     },
@@ -118,9 +123,9 @@ impl Error {
         use ash::vk::Result as R;
         let doing = doing.into();
         match source {
-            R::ERROR_DEVICE_LOST => Error::DeviceLost { doing, resumable: false, source },
+            R::ERROR_DEVICE_LOST => Error::DeviceLost { doing, kept: None, source },
             R::ERROR_OUT_OF_DEVICE_MEMORY | R::ERROR_OUT_OF_HOST_MEMORY => {
-                Error::OutOfDeviceMemory { doing, source }
+                Error::OutOfDeviceMemory { doing, kept: None, source }
             }
             _ => Error::Gpu { message: format!("{doing}: {source}"), source: Some(source) },
         }
@@ -142,12 +147,14 @@ impl Error {
         let path = path.as_ref().to_path_buf();
         move |source| Error::Unwritable { path, source }
     }
-    /// The same error, where finished stages or a state of training are on disk.
-    pub(crate) fn resumable(self) -> Self {
-        match self {
-            Error::DeviceLost { doing, source, .. } => Error::DeviceLost { doing, resumable: true, source },
-            e => e,
+    /// The same error, where `last` is on disk; what was named before is the later one.
+    pub(crate) fn keeping(mut self, last: Option<String>) -> Self {
+        if let Error::DeviceLost { kept, .. } | Error::OutOfDeviceMemory { kept, .. } = &mut self
+            && kept.is_none()
+        {
+            *kept = last;
         }
+        self
     }
     /// 2 for bad usage, bad input, a missing part or a place that cannot be written (also a full disk); 1 for a failure
     /// while working; 130 when stopped by the user.
@@ -174,11 +181,19 @@ fn elsewhere(e: &std::io::Error) -> &'static str {
 }
 
 /// How to go on without the device.
-fn after_loss(resumable: bool) -> &'static str {
-    match resumable {
-        true => "the same command with --resume goes on from what was kept",
-        false => "try again; if it happens again, update the driver or choose another device with --device",
+fn after_loss(kept: &Option<String>) -> String {
+    match kept {
+        Some(last) => format!("the same command with --resume goes on from {last}"),
+        None => {
+            "try again; if it happens again, update the driver or choose another device with --device".into()
+        }
     }
+}
+
+/// How to go on once other programs have freed the device's memory.
+fn once_there_is_memory(kept: &Option<String>) -> String {
+    let resume = |last| format!("; once there is memory, the same command with --resume goes on from {last}");
+    kept.as_ref().map(resume).unwrap_or_default()
 }
 
 /// What the user can do about an I/O error; empty where only its cause can tell.
@@ -203,13 +218,20 @@ mod tests {
     #[test]
     fn a_program_can_tell_what_to_react_to_and_see_the_cause() {
         let lost = Error::vulkan("step 7", vk::Result::ERROR_DEVICE_LOST);
-        assert!(matches!(&lost, Error::DeviceLost { doing, resumable: false, .. } if doing == "step 7"));
+        assert!(matches!(&lost, Error::DeviceLost { doing, kept: None, .. } if doing == "step 7"));
         assert!(lost.source().is_some_and(|s| s.downcast_ref() == Some(&vk::Result::ERROR_DEVICE_LOST)));
         assert!(!lost.to_string().contains("--resume"), "{lost}");
-        let lost = lost.resumable();
-        assert!(lost.to_string().contains("step 7") && lost.to_string().contains("--resume"), "{lost}");
+        let lost = lost.keeping(Some("stage splats after step 6".into())).keeping(Some("cameras".into()));
+        let text = lost.to_string();
+        assert!(
+            text.contains("step 7") && text.ends_with("--resume goes on from stage splats after step 6"),
+            "{lost}"
+        );
         let full = Error::vulkan("buffer", vk::Result::ERROR_OUT_OF_DEVICE_MEMORY);
         assert!(matches!(full, Error::OutOfDeviceMemory { .. }) && full.source().is_some());
+        assert!(full.to_string().ends_with("or another device"), "{full}");
+        let full = full.keeping(Some("cameras".into()));
+        assert!(full.to_string().ends_with("--resume goes on from cameras"), "{full}");
         let other = Error::vulkan("fence", vk::Result::ERROR_INITIALIZATION_FAILED);
         assert!(matches!(other, Error::Gpu { source: Some(_), .. }) && other.source().is_some());
         assert_eq!([&lost, &full, &other].map(Error::exit_code), [1; 3]);

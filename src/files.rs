@@ -2,11 +2,13 @@
 //! checksum in front; and the rule for what may be written over.
 mod partial;
 mod place;
+mod replace;
 
 pub(crate) use partial::Partial;
 #[cfg(feature = "cli")]
 pub(crate) use partial::{leftovers, remove_any, remove_unfinished};
 pub(crate) use place::{Kind, check_place};
+pub(crate) use replace::{restore, swap};
 
 use crate::{Error, Result};
 use serde::Deserialize;
@@ -16,7 +18,7 @@ use std::fmt::Write as _;
 use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, OnceLock};
+use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::SystemTime;
 
 /// Beyond the bytes of a file a reader takes at most four times its content, and this much (docs/formats.md#limits).
@@ -169,9 +171,14 @@ pub(crate) fn content_hash(path: &Path) -> std::io::Result<String> {
     Ok(hash)
 }
 
-/// Writes `parts` one after the other to a file that appears whole or not at all; makes its folder.
+/// Writes `parts` one after the other to a file of the program's own that appears whole or not at all; makes its folder, and
+/// removes what killed processes have left there.
 pub(crate) fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
+    // One at a time: two threads that keep the same thing would write into one partial file.
+    static WRITING: Mutex<()> = Mutex::new(());
+    let _turn = WRITING.lock().unwrap_or_else(PoisonError::into_inner);
     let partial = path.with_extension(format!("partial-{}", std::process::id()));
+    partial::sweep(path.parent().unwrap_or(path), None);
     let all = || -> std::io::Result<()> {
         let mut file = File::create(&partial)?;
         parts.iter().try_for_each(|part| std::io::Write::write_all(&mut file, part))
@@ -290,6 +297,24 @@ mod tests {
         assert_eq!(read_with_checksum(&file), None);
         std::fs::write(&file, b"short").unwrap();
         assert_eq!(read_with_checksum(&file), None);
+    }
+
+    #[test]
+    fn what_a_killed_process_left_goes_with_the_next_file_and_threads_do_not_share_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let stale = folder.path().join("rgb-1.partial-4000000000");
+        std::fs::write(&stale, "half").unwrap();
+        let file = folder.path().join("a.kept");
+        std::thread::scope(|s| {
+            for k in 0..8u8 {
+                s.spawn({
+                    let file = &file;
+                    move || write_with_checksum(file, &vec![k; 1 << 16]).unwrap()
+                });
+            }
+        });
+        assert_eq!(read_with_checksum(&file).map(|body| body.len()), Some(1 << 16));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 
     #[test]

@@ -1,6 +1,11 @@
-//! The C header is what the code says.
-#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
+//! The C header is what the code says; what its functions make of names and settings. `tools/hosts` has the rest.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks)] // a panic is how a test fails
+mod fixture;
+
+use splatvk::capi::*;
+use std::ffi::{CString, c_char, c_void};
 use std::path::Path;
+use std::ptr::{null, null_mut};
 
 #[test]
 fn the_header_is_generated_from_the_code() {
@@ -19,4 +24,92 @@ fn the_header_is_generated_from_the_code() {
     }
     let kept = std::fs::read_to_string(&file).unwrap_or_default();
     assert!(kept == made, "include/splatvk.h is out of date: SPLATVK_BLESS=1 cargo test --test capi");
+}
+
+fn text(path: &Path) -> CString {
+    CString::new(path.to_str().unwrap()).unwrap()
+}
+
+/// The text of a failure, by the function that copies it.
+fn said(copy: impl Fn(*mut c_char, usize) -> usize) -> String {
+    let mut bytes = vec![0u8; copy(null_mut(), 0)];
+    copy(bytes.as_mut_ptr().cast(), bytes.len());
+    bytes.pop();
+    String::from_utf8(bytes).unwrap()
+}
+
+fn context(provider: Option<&CString>) -> *mut SvkContext {
+    // The zero bytes of an options structure are its defaults.
+    let mut options: SvkContextOptions = unsafe { std::mem::zeroed() };
+    options.size = size_of::<SvkContextOptions>();
+    options.provider = provider.map_or(null(), |p| p.as_ptr());
+    let mut context = null_mut();
+    assert_eq!(unsafe { svk_context_create(&options, &mut context) }, SvkStatus::Ok);
+    context
+}
+
+#[test]
+fn a_name_with_an_unknown_ending_is_refused_and_no_folder_of_it_is_made() {
+    let folder = tempfile::tempdir().unwrap();
+    let context = context(None);
+    let mut scene = null_mut();
+    assert_eq!(
+        unsafe { svk_scene_load(context, text(fixture::scene()).as_ptr(), &mut scene) },
+        SvkStatus::Ok
+    );
+    let save = |name: &str, replace: u32| unsafe {
+        svk_scene_save(scene, text(&folder.path().join(name)).as_ptr(), replace)
+    };
+    for name in ["scene.foo", "scene.PLYX", "scene.v2"] {
+        assert_eq!(save(name, 1), SvkStatus::Input);
+        let said = said(|out, bytes| unsafe { svk_scene_error(scene, out, bytes) });
+        assert!(said.contains(".compressed.ply, .ply") && said.contains("ends in a slash"), "{said}");
+    }
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    assert_eq!(
+        (save("scene.v2/", 0), save("scene.v2", 1), save("scene", 0)),
+        (SvkStatus::Ok, SvkStatus::Ok, SvkStatus::Ok)
+    );
+    assert_eq!(
+        (save("a.ply", 0), save("a.ply", 0), save("a.PLY", 0)),
+        (SvkStatus::Ok, SvkStatus::Input, SvkStatus::Ok)
+    );
+    assert!(["scene.v2", "scene"].iter().all(|n| folder.path().join(n).join("scene.json").is_file()));
+    unsafe {
+        svk_scene_destroy(scene);
+        svk_context_destroy(context);
+    }
+}
+
+unsafe extern "C" fn stop(_: *mut c_void, _: *const SvkProgress) -> i32 {
+    1
+}
+
+#[test]
+fn two_contexts_do_not_share_their_provider() {
+    // No build of ONNX Runtime has both of the absent ones; the first context is there while the others are asked.
+    let providers = ["cpu", "directml", "coreml"].map(|name| CString::new(name).unwrap());
+    let contexts = providers.each_ref().map(|provider| context(Some(provider)));
+    let files: Vec<CString> =
+        (0..2).map(|k| text(&fixture::data(&format!("breakfast/images/train_0{k}.jpg")))).collect();
+    let outcomes = [1, 0, 2].map(|k| {
+        let mut photos: [SvkPhoto; 2] = unsafe { std::mem::zeroed() };
+        for (photo, file) in photos.iter_mut().zip(&files) {
+            (photo.size, photo.path) = (size_of::<SvkPhoto>(), file.as_ptr());
+        }
+        let mut options: SvkTrainOptions = unsafe { std::mem::zeroed() };
+        options.size = size_of::<SvkTrainOptions>();
+        if k == 0 {
+            options.progress = Some(stop);
+        }
+        let mut scene = null_mut();
+        let status = unsafe { svk_train(contexts[k], photos.as_ptr(), 2, &options, &mut scene) };
+        assert!(scene.is_null());
+        (status, said(|out, bytes| unsafe { svk_context_error(contexts[k], out, bytes) }))
+    });
+    assert_eq!(outcomes[1].0, SvkStatus::Cancelled, "{}", outcomes[1].1);
+    for (k, provider) in [(0, "provider directml"), (2, "provider coreml")] {
+        assert!(outcomes[k].0 == SvkStatus::Missing && outcomes[k].1.contains(provider), "{:?}", outcomes[k]);
+    }
+    contexts.iter().for_each(|c| unsafe { svk_context_destroy(*c) });
 }

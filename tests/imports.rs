@@ -29,7 +29,7 @@ const FOLDERS: &[(&str, &str)] = &[
     ("language", "error math progress scene photo format infer"),
     ("query", "error files math scene pass photo format pose"),
     ("report", "error progress scene photo format query"),
-    ("synth", "error math progress scene photo format infer language query"),
+    ("synth", "error files math progress scene photo format infer language query"),
     ("pipeline", "error files checkpoint progress gpu infer"),
     (
         "run",

@@ -95,7 +95,7 @@ fn nothing_is_written_over_without_force() {
         refused(&forced(line(words, &file)), "a file is in the way");
         refused(&line(words, scene()), "--force");
     }
-    refused(&line("generate --out", &full), "not empty");
+    refused(&forced(line("generate --out", &full)), "not empty and not generated data");
     assert_eq!(std::fs::read_to_string(&file).unwrap(), "precious");
     assert_eq!(std::fs::read_to_string(full.join("letter")).unwrap(), "precious");
     assert_eq!(
@@ -157,6 +157,46 @@ fn with_force_files_of_the_same_names_are_replaced_and_others_stay() {
 }
 
 #[test]
+fn generated_data_is_replaced_as_a_whole_and_only_where_nothing_else_lies_in_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = folder.path().join("data");
+    let words = |views: u32| format!("generate --seed 1000 --size 64x64 --views {views} --held-out 0 --out");
+    succeeds(&line(&words(3), &data));
+    refused(&line(&words(2), &data), "--force");
+    let regions = format!("generate --from {} --out", data.display());
+    refused(&forced(line(&regions, &data)), "the data that is read lies there");
+    succeeds(&forced(line(&words(2), &data)));
+    assert_eq!(names(&data.join("images")), ["train_00.jpg", "train_01.jpg"], "no photo of the older data");
+    let regions = format!("generate --from {} --out", data.display());
+    let out = folder.path().join("regions");
+    succeeds(&line(&regions, &out));
+    succeeds(&forced(line(&regions, &out)));
+    std::fs::write(data.join("letter"), "precious").unwrap();
+    refused(&forced(line(&words(2), &data)), "not generated data");
+    assert_eq!(std::fs::read_to_string(data.join("letter")).unwrap(), "precious");
+    assert_eq!(names(folder.path()), ["data", "regions"]);
+}
+
+#[test]
+fn a_model_in_one_form_replaces_that_in_the_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let model = folder.path().join("model");
+    let forms = [("colmap", "txt"), ("colmap-bin", "bin"), ("colmap", "txt")];
+    for (k, (format, ending)) in forms.into_iter().enumerate() {
+        let line = line(&format!("export SCENE --format {format} --out"), &model);
+        succeeds(&if k == 0 { line } else { forced(line) });
+        std::fs::write(model.join("letter"), "precious").unwrap();
+        let mut all: Vec<String> = ["cameras", "images", "points3D"].map(|n| format!("{n}.{ending}")).into();
+        all.insert(2, "letter".into());
+        assert_eq!(names(&model), all);
+    }
+    // What may not be written over may not be removed either.
+    symlink(model.join("letter"), model.join("images.bin")).unwrap();
+    refused(&forced(line("export SCENE --format colmap --out", &model)), "symbolic link");
+    assert!(model.join("images.bin").is_symlink() && model.join("images.txt").is_file());
+}
+
+#[test]
 fn a_scene_is_not_written_into_by_its_own_export() {
     let before = std::fs::read(scene().join("point_cloud.ply")).unwrap();
     for (format, place) in [("ply", "point_cloud.ply"), ("colmap", "cameras/colmap"), ("colmap", "cameras")] {
@@ -186,6 +226,18 @@ fn a_full_disk_leaves_no_half_of_a_folder() {
         assert_eq!(output.status.code(), Some(2), "{stderr}");
         assert!(stderr.lines().count() == 1 && stderr.contains("limit"), "{stderr}");
         assert!(names(folder.path()).is_empty(), "{:?}", names(folder.path()));
+    }
+    // Two files, of which the second is a zip archive.
+    let file = folder.path().join("scene.splat");
+    for blocks in [4, 16, 64, 256] {
+        let output = limited(blocks, &line("export SCENE --format splat --out", &file));
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        let lines: Vec<&str> = stderr.lines().filter(|l| !l.starts_with("warning: ")).collect();
+        assert!(
+            output.status.code() == Some(2) && lines.len() == 1 && lines[0].starts_with("splatvk: "),
+            "{stderr}"
+        );
+        assert!(names(folder.path()).is_empty(), "{blocks}: {:?}", names(folder.path()));
     }
     succeeds(&line("export SCENE --format colmap --out", &out));
     let before: Vec<Vec<u8>> = names(&out).iter().map(|n| std::fs::read(out.join(n)).unwrap()).collect();

@@ -330,8 +330,8 @@ fn instance(of: &Instance) -> SvkInstance {
 }
 
 /// Writes the scene: a file of Gaussians where the name ends like one (.ply, .compressed.ply, .splat, .spz; language goes
-/// beside it, into NAME.language.npz), a scene directory otherwise. It
-/// appears whole or not at all; `replace` = 1 allows to replace a scene or file that is there. Thread-safe.
+/// beside it, into NAME.language.npz), a scene directory where it has no ending, ends in a slash or is that of a folder; any other
+/// ending is SVK_STATUS_INPUT. It appears whole or not at all; `replace` = 1 allows to replace a scene or file that is there. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_save(
     scene: *mut SvkScene,

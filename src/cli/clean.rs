@@ -30,11 +30,11 @@ pub fn clean(args: &CleanArgs) -> Result<()> {
     let mut rows = vec![
         KeptRow {
             what: "stages of runs, for --resume",
-            things: Store::list(&stages),
+            things: [Store::list(&stages), partial(&stages)].concat(),
             folder: stages,
             remove,
         },
-        KeptRow { what: "answers of networks", things: answers, folder, remove },
+        KeptRow { what: "answers of networks", things: [answers, partial(&folder)].concat(), folder, remove },
     ];
     rows.extend(Registry::places(args.models.as_deref()).into_iter().map(|folder| KeptRow {
         what: "models that were fetched in part",
@@ -75,6 +75,11 @@ pub fn clean(args: &CleanArgs) -> Result<()> {
             "splatvk clean --delete frees it; runs then start from their photos, fetches from the first byte\n",
         ),
     }
+}
+
+/// What processes that are gone have begun in a folder of the program's own.
+fn partial(folder: &Path) -> Vec<(PathBuf, u64)> {
+    leftovers(folder, None).into_iter().map(|path| (path.clone(), size(&path))).collect()
 }
 
 /// What processes that are gone have begun in the current folder, in out/ and in `folders`, and in the folders of each.

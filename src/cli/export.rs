@@ -158,9 +158,14 @@ pub fn export(args: &ExportArgs) -> Result<()> {
         }
         "colmap" | "colmap-bin" => {
             let cameras = cameras(&scene, args)?;
-            let write = if args.format == "colmap" { colmap::write } else { colmap::write_binary };
-            if let Some(folder) = folder {
+            let [text, binary] = colmap::FILES;
+            let (write, other): (fn(&_, &_, _) -> _, _) = match args.format.as_str() {
+                "colmap" => (colmap::write, binary),
+                _ => (colmap::write_binary, text),
+            };
+            if let Some(mut folder) = folder {
                 write(folder.folder(), cameras, points.as_ref())?;
+                folder.outdate(other.into_iter());
                 folder.keep()?;
             }
         }

@@ -2,14 +2,28 @@
 use super::args::GenerateArgs;
 use super::print::{print, print_json};
 use super::progress;
-use crate::format::Workspace;
+use crate::format::{Replaced, Workspace};
 use crate::synth::regions::InjectedErrors;
 use crate::synth::{self, Effects, SceneSpec};
 use crate::{Error, Result};
+use std::path::Path;
 
 pub fn generate(args: &GenerateArgs) -> Result<()> {
     let flaws = flaws(args)?;
-    let workspace = Workspace::create(&args.out, false)?;
+    let whole = |p: &Path| p.canonicalize().ok();
+    if let (Some(from), Some(out)) = (args.from.as_deref().and_then(whole), whole(&args.out))
+        && from.starts_with(&out)
+    {
+        return Err(Error::input(format!(
+            "{}: the data that is read lies there; choose another --out",
+            args.out.display()
+        )));
+    }
+    let workspace = Workspace::replacing(
+        &args.out,
+        args.force,
+        Replaced { name: "generated data", is: synth::is_generated },
+    )?;
     match &args.from {
         Some(data) => synth::write_regions(data, workspace.path(), &flaws)?,
         None => synth::generate(workspace.path(), &spec(args)?, &flaws, progress::reporter().as_ref())?,

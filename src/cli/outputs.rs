@@ -24,12 +24,14 @@ pub fn write_file(file: &Path, force: bool, write: impl FnOnce(&Path) -> Result<
     })
 }
 
-/// Files of a command that writes into a folder. They are written into a hidden folder in it; dropped without
-/// [`WrittenFiles::keep`], it vanishes with all that is in it.
+/// Files of a command that writes into a folder. They are written into a hidden folder, beside one that is to be made, else in it;
+/// dropped without [`WrittenFiles::keep`], it vanishes with all that is in it.
 pub struct WrittenFiles {
     folder: PathBuf,
     partial: Partial,
     names: Vec<PathBuf>,
+    /// Files of the folder that go once those are there.
+    outdated: Vec<PathBuf>,
 }
 
 impl WrittenFiles {
@@ -37,9 +39,15 @@ impl WrittenFiles {
     /// written is bad input.
     pub fn open(folder: &Path, force: bool) -> Result<WrittenFiles> {
         check_place(folder, Kind::Folder, force)?;
-        let partial = Partial::inside(folder).map_err(Error::unwritable(folder))?;
+        let partial = if folder.exists() { Partial::inside(folder) } else { Partial::beside(folder, true) };
+        let partial = partial.map_err(Error::unwritable(folder))?;
         std::fs::create_dir(partial.path()).map_err(Error::unwritable(folder))?;
-        Ok(WrittenFiles { folder: folder.to_path_buf(), partial, names: Vec::new() })
+        Ok(WrittenFiles { folder: folder.to_path_buf(), partial, names: Vec::new(), outdated: Vec::new() })
+    }
+
+    /// Files of these names say the same in another form: what the folder has of them would contradict what is written.
+    pub fn outdate<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
+        self.outdated.extend(names.map(PathBuf::from));
     }
 
     /// The hidden folder, for what writes several files itself: [`WrittenFiles::keep`] finds them.
@@ -60,7 +68,7 @@ impl WrittenFiles {
     /// Everything is written: moves the files to their places, over ordinary files of their names only, and returns them; those of
     /// [`WrittenFiles::file`] first, in their order.
     pub fn keep(self) -> Result<Vec<PathBuf>> {
-        let WrittenFiles { folder, partial, mut names } = self;
+        let WrittenFiles { folder, partial, mut names, outdated } = self;
         let mut found = Vec::new();
         list(partial.path(), Path::new(""), &mut found)?;
         found.retain(|name| !names.contains(name));
@@ -73,13 +81,21 @@ impl WrittenFiles {
             }
             check_place(&folder.join(name), Kind::File, true)?;
         }
+        let outdated: Vec<PathBuf> =
+            outdated.iter().map(|name| folder.join(name)).filter(|p| p.symlink_metadata().is_ok()).collect();
+        outdated.iter().try_for_each(|place| check_place(place, Kind::File, true))?;
         let places: Vec<PathBuf> = names.iter().map(|name| folder.join(name)).collect();
         partial.finish(|from| {
+            // In one step, so that a process that is killed here leaves all or nothing.
+            if !folder.exists() {
+                return std::fs::rename(from, &folder).map_err(Error::unwritable(&folder));
+            }
             for (name, place) in names.iter().zip(&places) {
                 let parent = place.parent().unwrap_or(&folder);
                 std::fs::create_dir_all(parent).map_err(Error::unwritable(parent))?;
                 std::fs::rename(from.join(name), place).map_err(Error::unwritable(place))?;
             }
+            outdated.iter().try_for_each(|p| std::fs::remove_file(p).map_err(Error::unwritable(p)))?;
             std::fs::remove_dir_all(from).map_err(Error::io(from))
         })?;
         Ok(places)

@@ -109,8 +109,8 @@ pub fn present(entry: &CatalogueEntry, folder: &Path) -> Result<Present> {
 pub fn tidy(folder: &Path, going_on: &[&str]) -> Result<()> {
     for (root, _) in leftovers(folder) {
         let name = staging::name(&root).unwrap_or_default();
-        let replaced = staging::old(&root).exists();
-        if !going_on.contains(&name.as_str()) && (replaced || folder.join(&name).exists()) {
+        files::restore(&folder.join(&name));
+        if !going_on.contains(&name.as_str()) && folder.join(&name).exists() {
             sweep(&root)?;
         }
     }

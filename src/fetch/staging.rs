@@ -3,6 +3,7 @@
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 
+use crate::files::{restore, swap};
 use crate::{Error, Result};
 
 /// What the names of such folders begin with.
@@ -25,7 +26,7 @@ impl Staging {
             Error::input(format!("{name}: another splatvk is fetching it into {}", folder.display()))
         })?;
         let staging = Staging { root, place: folder.join(name), name: name.to_owned(), _lock: lock };
-        recover(&staging.root, &staging.place)?;
+        restore(&staging.place);
         for part in [staging.model(), staging.work()] {
             std::fs::create_dir_all(&part).map_err(Error::unwritable(&part))?;
         }
@@ -63,15 +64,11 @@ impl Staging {
 
     /// Moves the model to its place. One that is there is only removed after that, and comes back if the move fails.
     pub fn install(self) -> Result<PathBuf> {
-        let old = old(&self.root);
-        let replaces = self.place.symlink_metadata().is_ok();
-        if replaces {
-            std::fs::rename(&self.place, &old).map_err(Error::io(&self.place))?;
-        }
-        if let Err(e) = std::fs::rename(self.model(), &self.place) {
-            recover(&self.root, &self.place)?;
-            return Err(Error::io(&self.place)(e));
-        }
+        let moved = match self.place.symlink_metadata() {
+            Ok(_) => swap(&self.model(), &self.place),
+            Err(_) => std::fs::rename(self.model(), &self.place),
+        };
+        moved.map_err(Error::io(&self.place))?;
         // The move must be on disk before what it replaces goes.
         if let Some(folder) = self.place.parent() {
             let _ = File::open(folder).and_then(|f| f.sync_all());
@@ -86,11 +83,6 @@ pub(super) fn root(folder: &Path, name: &str) -> PathBuf {
     folder.join(format!("{PREFIX}{name}"))
 }
 
-/// A model that is being replaced.
-pub(super) fn old(root: &Path) -> PathBuf {
-    root.join("old")
-}
-
 fn lock(root: &Path) -> Result<Option<File>> {
     let path = root.join("lock");
     let file = File::create(&path).map_err(Error::unwritable(&path))?;
@@ -98,15 +90,6 @@ fn lock(root: &Path) -> Result<Option<File>> {
         Ok(()) => Ok(Some(file)),
         Err(TryLockError::WouldBlock) => Ok(None),
         Err(TryLockError::Error(e)) => Err(Error::io(&path)(e)),
-    }
-}
-
-/// Puts a model back that a killed process had taken out to replace it.
-fn recover(root: &Path, place: &Path) -> Result<()> {
-    let old = old(root);
-    match old.exists() && !place.exists() {
-        true => std::fs::rename(&old, place).map_err(Error::io(place)),
-        false => Ok(()),
     }
 }
 
@@ -125,11 +108,11 @@ pub fn leftovers(folder: &Path) -> Vec<(PathBuf, u64)> {
         .collect()
 }
 
-/// Removes one of [`leftovers`]; a model that it holds the only copy of goes back to its place.
+/// Removes one of [`leftovers`]; a model that a killed process had taken out to replace it goes back to its place.
 pub fn sweep(root: &Path) -> Result<()> {
     let (Some(folder), Some(name)) = (root.parent(), name(root)) else { return Ok(()) };
     let Some(_held) = lock(root)? else { return Ok(()) };
-    recover(root, &folder.join(name))?;
+    restore(&folder.join(name));
     std::fs::remove_dir_all(root).map_err(Error::io(root))
 }
 

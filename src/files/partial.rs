@@ -45,13 +45,22 @@ impl Partial {
         Partial::named(folder, OsString::new(), None)
     }
 
-    fn named(parent: &Path, mut own: OsString, of: Option<&OsStr>) -> std::io::Result<Partial> {
-        own.push(format!("{MARK}{}", std::process::id()));
+    fn named(parent: &Path, own: OsString, of: Option<&OsStr>) -> std::io::Result<Partial> {
         let missing = parent.ancestors().take_while(|p| !p.as_os_str().is_empty() && !p.exists());
         let made: Vec<PathBuf> = missing.map(Path::to_path_buf).collect();
-        let path = parent.join(own);
         // Noted first: an exit between the two would leave the folders.
-        unfinished().push((path.clone(), made));
+        let mut list = unfinished();
+        let taken = |path: &PathBuf| list.iter().any(|(other, _)| other == path);
+        let numbered = |n: usize| {
+            let mut name = own.clone();
+            name.push(format!("{MARK}{}", std::process::id()));
+            // Other threads may write to the same place.
+            name.push(if n == 0 { String::new() } else { format!(".{n}") });
+            parent.join(name)
+        };
+        let path = (0..).map(numbered).find(|p| !taken(p)).unwrap_or_default();
+        list.push((path.clone(), made));
+        drop(list);
         let partial = Partial { path, done: false };
         std::fs::create_dir_all(parent)?;
         sweep(parent, of);
@@ -119,6 +128,7 @@ pub fn leftovers(folder: &Path, of: Option<&OsStr>) -> Vec<PathBuf> {
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let Some((stem, process)) = name.rsplit_once(MARK) else { return false };
         let stem = stem.strip_prefix('.').unwrap_or(stem);
+        let process = process.split_once('.').map_or(process, |(process, _)| process);
         of.as_deref().is_none_or(|of| stem == of) && process.parse().is_ok_and(is_gone)
     };
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
@@ -136,7 +146,7 @@ pub fn sweep(folder: &Path, of: Option<&OsStr>) {
 }
 
 /// Without /proc nobody can tell whether another process still lives: it may.
-fn is_gone(process: u32) -> bool {
+pub(super) fn is_gone(process: u32) -> bool {
     Path::new("/proc/self").exists() && !Path::new(&format!("/proc/{process}")).exists()
 }
 
@@ -161,6 +171,22 @@ mod tests {
         std::fs::write(base.path().join("x/letter"), "another's").unwrap();
         drop(partial);
         assert_eq!(std::fs::read_dir(base.path().join("x")).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn threads_that_write_to_one_place_do_not_share_what_is_unfinished() {
+        let base = tempfile::tempdir().unwrap();
+        let place = base.path().join("a.ply");
+        let two = [0; 2].map(|_| Partial::beside(&place, false).unwrap());
+        assert_ne!(two[0].path(), two[1].path());
+        for (partial, text) in two.into_iter().zip(["one", "two"]) {
+            std::fs::write(partial.path(), text).unwrap();
+            partial.finish(|path| std::fs::rename(path, &place)).unwrap();
+            assert_eq!(std::fs::read_to_string(&place).unwrap(), text);
+        }
+        std::fs::write(base.path().join("a.ply.partial-4000000000.3"), "half").unwrap();
+        sweep(base.path(), Some("a.ply".as_ref()));
+        assert_eq!(std::fs::read_dir(base.path()).unwrap().count(), 1);
     }
 
     #[test]

@@ -2,7 +2,7 @@
 //! `L = λ2·L_img + (1−λ2)·L_sem`, starting from lifted features.
 use super::least_squares;
 use super::lift::{CodeTargets, Lifting};
-use super::model::Model;
+use super::model::{Model, not_finite};
 use super::options::{LanguageOptions, Start};
 use super::scale::SceneScale;
 use super::training::{self, Review, Trainer, Training};
@@ -240,8 +240,12 @@ impl<'a> Run<'a> {
         let splats = model.splats()?;
         let (levels, d) = (self.levels.len(), self.width);
         let mut all = model.values.features.read_range(0..splats.len() * levels * d)?;
-        if !all.iter().all(|v| v.is_finite()) {
-            return Err(Error::work("the language stage produced features that are not finite"));
+        let bad = not_finite(&all);
+        if bad > 0 {
+            return Err(Error::work(format!(
+                "the language stage produced {bad} of {} features that are not finite; nothing was kept",
+                all.len()
+            )));
         }
         for feature in all.chunks_exact_mut(d) {
             let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();

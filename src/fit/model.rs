@@ -189,18 +189,31 @@ impl Model {
     /// Reads the splats back; an error if any value is not finite.
     pub(super) fn splats(&self) -> Result<Splats> {
         let (splats, _) = self.values.download()?;
-        let finite = |v: &[f32]| v.iter().all(|x| x.is_finite());
-        let all = finite(splats.means.as_flattened())
-            && finite(splats.log_scales.as_flattened())
-            && finite(splats.quats.as_flattened())
-            && finite(&splats.opacity_logits)
-            && finite(&splats.sh);
-        if all {
-            Ok(splats)
-        } else {
-            Err(Error::work("training produced splats that are not finite; nothing was kept"))
+        let bad = |(name, values): (&str, &[f32])| match not_finite(values) {
+            0 => None,
+            n => Some(format!("{n} {name}")),
+        };
+        let all: [(&str, &[f32]); 5] = [
+            ("means", splats.means.as_flattened()),
+            ("log-scales", splats.log_scales.as_flattened()),
+            ("quaternions", splats.quats.as_flattened()),
+            ("opacities", &splats.opacity_logits),
+            ("SH coefficients", &splats.sh),
+        ];
+        let bad: Vec<String> = all.into_iter().filter_map(bad).collect();
+        if bad.is_empty() {
+            return Ok(splats);
         }
+        Err(Error::work(format!(
+            "training produced numbers that are not finite ({}); nothing was kept: the cameras or points may be degenerate",
+            bad.join(", ")
+        )))
     }
+}
+
+/// How many values are not finite.
+pub(super) fn not_finite(values: &[f32]) -> usize {
+    values.iter().filter(|v| !v.is_finite()).count()
 }
 
 /// Values per splat of a class.

@@ -187,14 +187,9 @@ pub(super) fn train<T: Training>(
 fn save<T: Training>(run: &T, done: usize, progress: &dyn Progress) -> Result<()> {
     let Some(checkpoint) = progress.checkpoint() else { return Ok(()) };
     let Trainer { group, model, cameras, order, .. } = run.trainer();
-    checkpoint.save(&State {
-        group: *group,
-        done,
-        model: model.state()?,
-        cameras: cameras.clone(),
-        order: order.clone(),
-        figures: run.figures(),
-    })
+    let (model, figures) = (model.state()?, run.figures());
+    let state = State { group: *group, done, model, cameras: cameras.clone(), order: order.clone(), figures };
+    checkpoint.save(done, &state)
 }
 
 /// Takes over the state of an earlier process, and says how many steps it has done.
@@ -205,6 +200,7 @@ fn restore<T: Training>(run: &mut T, progress: &dyn Progress) -> Result<usize> {
     trainer.model = Model::restored(&trainer.device, &kept.model)?;
     (trainer.cameras, trainer.order) = (kept.cameras, kept.order);
     run.set_figures(kept.figures);
+    progress.checkpoint().iter().for_each(|c| c.went_on_from(kept.done));
     Ok(kept.done)
 }
 

@@ -13,6 +13,11 @@ pub fn is_model(folder: &Path) -> bool {
         .any(|e| ["cameras", "images"].iter().all(|n| folder.join(format!("{n}.{e}")).is_file()))
 }
 
+/// Files of a model as text and of one in binary, in the order in which those of the other form go: a model is read as text as
+/// long as its images are there as text.
+pub const FILES: [[&str; 3]; 2] =
+    [["images.txt", "cameras.txt", "points3D.txt"], ["images.bin", "cameras.bin", "points3D.bin"]];
+
 /// Model names in the order of COLMAP's numbers, with the number of parameters and how many of them are f, c.
 const MODELS: [(&str, usize); 5] =
     [("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)];

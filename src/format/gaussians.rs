@@ -7,7 +7,8 @@ pub mod splat;
 pub mod spz;
 pub(crate) mod usable;
 
-use super::{side_file, write_whole_file};
+use super::side_file;
+use crate::files::Partial;
 use crate::scene::{LanguageField, Splats};
 use crate::{Error, Result};
 use std::path::Path;
@@ -106,10 +107,14 @@ pub fn is_named(path: &Path) -> bool {
 
 fn format(path: &Path) -> Result<&'static SplatFormat> {
     find(path).ok_or_else(|| {
-        let endings = FORMATS.iter().map(|k| k.ending).collect::<Vec<_>>().join(", ");
-        let path = path.display();
+        let (path, endings) = (path.display(), endings());
         Error::input(format!("{path}: no known format of splats; the name must end in one of {endings}"))
     })
+}
+
+/// The endings of all formats, for messages.
+pub fn endings() -> String {
+    FORMATS.iter().map(|k| k.ending).collect::<Vec<_>>().join(", ")
 }
 
 /// Reads a file of Gaussians, and the language beside it, if any. Gaussians that cannot be computed with (numbers that are not
@@ -138,15 +143,25 @@ pub fn write_as(
     format: &SplatFormat,
 ) -> Result<()> {
     let with_codes = language.filter(|l| l.levels.iter().any(|l| !l.codebook.is_empty()));
-    write_whole_file(path, |partial| {
-        let order = (format.write)(partial, splats)?;
-        let side = side_file::path(path);
-        match with_codes {
-            // Language first: a file with the wrong language beside it would be worse than one that is missing.
-            Some(field) => write_whole_file(&side, |p| side_file::write(p, field, splats.len(), &order)),
-            // So would be that of an older file.
-            None if side.is_file() => std::fs::remove_file(&side).map_err(Error::io(&side)),
-            None => Ok(()),
+    let side = side_file::path(path);
+    let partial = |place: &Path| Partial::beside(place, false).map_err(Error::unwritable(place));
+    let splat_file = partial(path)?;
+    let order = (format.write)(splat_file.path(), splats)?;
+    let language_file = match with_codes {
+        Some(field) => {
+            let file = partial(&side)?;
+            side_file::write(file.path(), field, splats.len(), &order)?;
+            Some(file)
         }
-    })
+        None => None,
+    };
+    // Both are written. Wherever a kill comes between these moves, no file has the language of another one beside it.
+    if side.is_file() {
+        std::fs::remove_file(&side).map_err(Error::unwritable(&side))?;
+    }
+    let place = |file: Partial, place: &Path| {
+        file.finish(|from| std::fs::rename(from, place).map_err(Error::unwritable(place)))
+    };
+    place(splat_file, path)?;
+    language_file.map_or(Ok(()), |file| place(file, &side))
 }

@@ -16,4 +16,4 @@ mod workspace;
 pub use common::{create_folder, to_byte, write_json, write_whole_file};
 pub(crate) use common::{logit, sigmoid};
 pub use gaussians::{gltf, ply, ply_packed, splat, spz};
-pub use workspace::Workspace;
+pub use workspace::{Replaced, Workspace};

@@ -3,7 +3,7 @@ use crate::{Error, Result, files};
 use half::f16;
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
-use std::io::{Cursor, Read, Write};
+use std::io::{Cursor, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 const MAGIC: &[u8] = b"\x93NUMPY";
@@ -216,14 +216,69 @@ fn write_zip(path: &Path, arrays: &[(&str, &NpyArray)], method: zip::Compression
         zip::result::ZipError::Io(e) => Error::unwritable(path)(e),
         e => Error::work(format!("{}: cannot write the npz file: {e}", path.display())),
     };
+    let members: Vec<Vec<u8>> = arrays.iter().map(|(_, array)| encode(array)).collect::<Result<_>>()?;
+    let members = arrays.iter().map(|(name, _)| *name).zip(members.iter().map(Vec::as_slice));
     let file = std::fs::File::create(path).map_err(Error::unwritable(path))?;
-    let mut zip = zip::ZipWriter::new(std::io::BufWriter::new(file));
+    write_archive(file, members, method).map_err(bad)
+}
+
+fn write_archive<'a>(
+    out: impl Write + Seek,
+    members: impl Iterator<Item = (&'a str, &'a [u8])>,
+    method: zip::CompressionMethod,
+) -> zip::result::ZipResult<()> {
+    let mut zip = zip::ZipWriter::new(std::io::BufWriter::new(UntilItFails::new(out)));
     let options = zip::write::SimpleFileOptions::default().compression_method(method);
-    for (name, array) in arrays {
-        zip.start_file(format!("{name}.npy"), options).map_err(bad)?;
-        zip.write_all(&encode(array)?).map_err(Error::unwritable(path))?;
+    for (name, bytes) in members {
+        zip.start_file(format!("{name}.npy"), options)?;
+        zip.write_all(bytes)?;
     }
-    zip.finish().map_err(bad)?.flush().map_err(Error::unwritable(path))
+    Ok(zip.finish()?.flush()?)
+}
+
+/// Takes everything after the first error, which was reported, and keeps count of the place as if it had been written: a dropped
+/// `ZipWriter` goes on writing, prints of its own accord what comes of that, and panics where the place makes no sense.
+struct UntilItFails<W> {
+    out: W,
+    failed: bool,
+    at: u64,
+    end: u64,
+}
+
+impl<W> UntilItFails<W> {
+    fn new(out: W) -> Self {
+        UntilItFails { out, failed: false, at: 0, end: 0 }
+    }
+}
+
+impl<W: Write> Write for UntilItFails<W> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        let written = match self.failed {
+            true => bytes.len(),
+            false => self.out.write(bytes).inspect_err(|_| self.failed = true)?,
+        };
+        self.at += written as u64;
+        self.end = self.end.max(self.at);
+        Ok(written)
+    }
+    fn flush(&mut self) -> std::io::Result<()> {
+        if self.failed { Ok(()) } else { self.out.flush().inspect_err(|_| self.failed = true) }
+    }
+}
+
+impl<W: Seek> Seek for UntilItFails<W> {
+    fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
+        let place = match to {
+            SeekFrom::Start(place) => Some(place),
+            SeekFrom::Current(by) => self.at.checked_add_signed(by),
+            SeekFrom::End(by) => self.end.checked_add_signed(by),
+        };
+        self.at = place.ok_or(std::io::ErrorKind::InvalidInput)?;
+        if !self.failed {
+            self.out.seek(SeekFrom::Start(self.at)).inspect_err(|_| self.failed = true)?;
+        }
+        Ok(self.at)
+    }
 }
 
 /// Serialises an array as a `.npy` file image.
@@ -379,6 +434,51 @@ fn parse_values(descr: &str, bytes: &[u8]) -> NpyData {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Takes so many bytes, as a disk does that is nearly full.
+    struct Nearly {
+        room: usize,
+        bytes: Cursor<Vec<u8>>,
+    }
+
+    impl Write for Nearly {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            let n = bytes.len().min(self.room.saturating_sub(self.bytes.position() as usize));
+            if n == 0 && !bytes.is_empty() {
+                return Err(std::io::ErrorKind::StorageFull.into());
+            }
+            self.bytes.write(&bytes[..n])
+        }
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    impl Seek for Nearly {
+        fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
+            self.bytes.seek(to)
+        }
+    }
+
+    #[test]
+    fn a_disk_that_is_full_anywhere_in_an_archive_is_an_error_and_no_panic() {
+        let long: Vec<u8> = (0..30_000u32).map(|i| (i * i % 251) as u8).collect();
+        let members = [("a", long.as_slice()), ("b", &long[..100])];
+        for method in [zip::CompressionMethod::Stored, zip::CompressionMethod::Deflated] {
+            let written = |room: usize| {
+                write_archive(Nearly { room, bytes: Cursor::default() }, members.into_iter(), method)
+            };
+            written(1 << 20).unwrap();
+            let enough = (0..).step_by(97).find(|room| written(*room).is_ok()).unwrap();
+            for room in (enough - 400..enough - 97).chain(0..200) {
+                let error = written(room).unwrap_err();
+                assert!(
+                    matches!(&error, zip::result::ZipError::Io(e) if e.kind() == std::io::ErrorKind::StorageFull),
+                    "{error}"
+                );
+            }
+        }
+    }
 
     #[test]
     fn every_type_survives_a_round_trip() {

@@ -1,5 +1,5 @@
 //! A scene directory appears whole or not at all: work happens in a hidden folder beside it and is renamed in at the end.
-use crate::files::{Kind, Partial, check_place};
+use crate::files::{Kind, Partial, check_place, restore, swap};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
@@ -8,31 +8,51 @@ use std::path::{Path, PathBuf};
 pub struct Workspace {
     partial: Partial,
     out: PathBuf,
+    replaced: Replaced,
+}
+
+/// A kind of folder that is replaced as a whole.
+#[derive(Clone, Copy, Debug)]
+pub struct Replaced {
+    /// "a scene", for messages.
+    pub name: &'static str,
+    /// Whether a folder is one, and so ours to replace.
+    pub is: fn(&Path) -> bool,
 }
 
 /// File that marks a folder as a scene, and so as ours to replace.
 pub(super) const MANIFEST: &str = "scene.json";
 
+const SCENE: Replaced = Replaced { name: "a scene", is: |folder| folder.join(MANIFEST).is_file() };
+
 impl Workspace {
     /// Reserves `out`: it must not exist, be an empty folder, or, with `force`, hold a scene. Nothing at `out` changes
-    /// before [`Workspace::commit`].
+    /// before [`Workspace::commit`], except that a scene which a killed process was about to replace comes back.
     pub fn create(out: &Path, force: bool) -> Result<Workspace> {
+        Workspace::replacing(out, force, SCENE)
+    }
+
+    /// [`Workspace::create`] of another kind of folder.
+    pub fn replacing(out: &Path, force: bool, replaced: Replaced) -> Result<Workspace> {
         let bad = |what: &str| Error::input(format!("{}: {what}", out.display()));
         if out.file_name().is_none() {
             return Err(bad("not a folder name; choose one such as \"scene\""));
         }
         // What is no folder is refused in any case.
         check_place(out, Kind::Folder, true)?;
-        let is_scene = out.join(MANIFEST).is_file();
-        if is_scene && !force {
-            return Err(bad("already holds a scene; choose another --out, or --force to replace it"));
+        restore(out);
+        let (is_one, name) = ((replaced.is)(out), replaced.name);
+        if is_one && !force {
+            return Err(bad(&format!(
+                "already holds {name}; choose another --out, or --force to replace it"
+            )));
         }
-        if !is_scene && check_place(out, Kind::Folder, false).is_err() {
-            return Err(bad("the folder is not empty and not a scene; choose another --out"));
+        if !is_one && check_place(out, Kind::Folder, false).is_err() {
+            return Err(bad(&format!("the folder is not empty and not {name}; choose another --out")));
         }
         let partial = Partial::beside(out, true).map_err(Error::unwritable(out))?;
         std::fs::create_dir(partial.path()).map_err(Error::unwritable(out))?;
-        Ok(Workspace { partial, out: out.to_path_buf() })
+        Ok(Workspace { partial, out: out.to_path_buf(), replaced })
     }
 
     /// Where to write.
@@ -42,23 +62,15 @@ impl Workspace {
 
     /// Moves the folder to its place; a scene that `force` allowed to replace is removed only after that.
     pub fn commit(self) -> Result<PathBuf> {
-        let Workspace { partial, out } = self;
-        let replaces = out.join(MANIFEST).is_file();
+        let Workspace { partial, out, replaced } = self;
+        let replaces = (replaced.is)(&out);
         // What came there meanwhile is not ours.
         check_place(&out, Kind::Folder, replaces)?;
         let garbage = partial.path().to_path_buf();
         partial.finish(|path| {
-            if !replaces {
-                return std::fs::rename(path, &out).map_err(Error::io(&out));
-            }
-            let old = path.with_extension(format!("old-{}", std::process::id()));
-            std::fs::rename(&out, &old).map_err(Error::io(&out))?;
-            if let Err(e) = std::fs::rename(path, &out) {
-                std::fs::rename(&old, &out).map_err(Error::io(&old))?;
-                return Err(Error::io(&out)(e));
-            }
-            // From here on it is a leftover, should the process end before it is removed.
-            std::fs::rename(&old, path).map_err(Error::io(&old))
+            let moved = if replaces { swap(path, &out) } else { std::fs::rename(path, &out) };
+            // From here on the old one is a leftover, should the process end before it is removed.
+            moved.map_err(Error::io(&out))
         })?;
         if replaces {
             std::fs::remove_dir_all(&garbage).map_err(Error::io(&garbage))?;

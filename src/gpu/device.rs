@@ -176,6 +176,12 @@ impl Device {
         self.0.lost_from.store(self.submissions() + submissions, Ordering::Relaxed);
     }
 
+    /// Makes the driver say, after so many more buffers, that the device has no memory left.
+    #[cfg(test)]
+    pub(crate) fn exhaust_after(&self, buffers: u64) {
+        self.0.heap.exhaust_after(buffers);
+    }
+
     /// Starts measuring [`Memory::peak`] anew.
     pub fn reset_peak_memory(&self) {
         self.0.heap.reset_peak();

@@ -28,6 +28,9 @@ pub(super) struct Heap {
     current: AtomicU64,
     peak: AtomicU64,
     allocations: AtomicU64,
+    /// The driver says of this allocation and all later ones that there is no memory: see [`Heap::exhaust_after`].
+    #[cfg(test)]
+    exhausted_from: AtomicU64,
 }
 
 /// A Vulkan buffer and the memory it is bound to.
@@ -74,7 +77,15 @@ impl Heap {
             current: AtomicU64::new(0),
             peak: AtomicU64::new(0),
             allocations: AtomicU64::new(0),
+            #[cfg(test)]
+            exhausted_from: AtomicU64::new(u64::MAX),
         })
+    }
+
+    /// Makes the driver say, after so many more buffers, that the device has no memory left.
+    #[cfg(test)]
+    pub fn exhaust_after(&self, buffers: u64) {
+        self.exhausted_from.store(self.figures().allocations + buffers, Ordering::Relaxed);
     }
 
     /// A buffer for every use that passes and transfers have; `mapped` puts it where the host reads and writes it. `what`
@@ -92,6 +103,10 @@ impl Heap {
             | vk::BufferUsageFlags::TRANSFER_DST
             | vk::BufferUsageFlags::INDIRECT_BUFFER;
         let info = vk::BufferCreateInfo::default().size(size).usage(usage);
+        #[cfg(test)]
+        if self.figures().allocations >= self.exhausted_from.load(Ordering::Relaxed) {
+            return Err(refused(what, &AllocationError::OutOfMemory));
+        }
         // SAFETY: plain object creation on a live device.
         let raw = unsafe { device.create_buffer(&info, None) }.map_err(vk_error(what))?;
         match self.bind(device, name, raw, mapped, what) {

@@ -76,9 +76,7 @@ impl Recorder {
         }
         match buffer.host_copy() {
             Ok(copy) => self.copy(buffer, copy),
-            Err(e) => {
-                self.error.get_or_insert(e);
-            }
+            Err(e) => self.fail_with(e),
         }
     }
 
@@ -188,7 +186,7 @@ impl Recorder {
         match call.resolve(self.device.info()) {
             Ok(module) => Some(module),
             Err(e) => {
-                self.error.get_or_insert(e);
+                self.fail_with(e);
                 None
             }
         }
@@ -203,6 +201,11 @@ impl Recorder {
     /// Keeps a mistake for [`Recorder::compile`] to return, unless there is an earlier one.
     pub fn fail(&mut self, what: impl std::fmt::Display) {
         let message = format!("{}: {what}", self.label);
-        self.error.get_or_insert_with(|| Error::gpu(message));
+        self.fail_with(Error::gpu(message));
+    }
+
+    /// [`Recorder::fail`] with an error that a program may react to, such as a device without memory.
+    pub fn fail_with(&mut self, error: Error) {
+        self.error.get_or_insert(error);
     }
 }

@@ -122,7 +122,7 @@ pub(super) fn queue_family(instance: &ash::Instance, physical: vk::PhysicalDevic
 
 /// The first usable device, or the one whose index in this order, or part of whose name, is `choice`.
 pub(super) fn choose(all: Vec<Candidate>, choice: Option<&str>) -> Result<Candidate> {
-    let names: Vec<String> = all.iter().enumerate().map(|(i, c)| format!("{i}: {}", c.name)).collect();
+    let names: Vec<String> = all.iter().enumerate().map(|(i, c)| format!("{i} = {}", c.name)).collect();
     let listed = names.join(", ");
     if all.is_empty() {
         return Err(Error::no_device(format!("no Vulkan device; {INSTALL}")));
@@ -144,7 +144,10 @@ pub(super) fn choose(all: Vec<Candidate>, choice: Option<&str>) -> Result<Candid
         }
         (Some(candidate), _) => Ok(candidate),
         (None, Some(text)) => {
-            Err(Error::input(format!("no Vulkan device matches `{text}`; there are {listed}")))
+            // "There are 0: llvmpipe" would read as "no device".
+            Err(Error::input(format!(
+                "no Vulkan device matches `{text}`; give the number or a part of the name: {listed}"
+            )))
         }
         (None, None) => Err(Error::no_device(format!(
             "no usable Vulkan device among {listed}: Vulkan 1.2 with VK_KHR_synchronization2 and a compute queue is needed; {INSTALL}"

@@ -2,6 +2,7 @@
 use super::device::Device;
 use super::executor::{Attached, Executor};
 use super::info::Options;
+use super::ways::Way;
 use crate::Result;
 use std::ops::Deref;
 use std::sync::{Arc, OnceLock};
@@ -39,7 +40,7 @@ impl TestDevice {
         if let Some(inner) = Arc::get_mut(&mut device.0.0) {
             inner.info.subgroup_size = subgroup_size;
             inner.info.subgroup_sizes = (subgroup_size, subgroup_size);
-            inner.info.float_atomics = !options.no_float_atomics;
+            inner.info.float_atomics = !options.without.contains(&Way::FloatAtomics);
             inner.info.timestamp_period = 0.0;
             inner.info.is_cpu = false;
             let attached: Attached = executor;

@@ -130,7 +130,9 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
             let one = |e: &Vec<CodeEntry>| quantise::build(e, options.feature_dim, options.seed);
             entries.iter().map(one).collect()
         }
-        Reducer::Autoencoder { least_steps } => autoencoder::build(&entries, least_steps, options.seed)?.0,
+        Reducer::Autoencoder { least_steps } => {
+            autoencoder::build(&entries, least_steps, options.seed, progress)?.0
+        }
     };
     for (level, (components, built)) in alignment.components.iter().zip(built).enumerate() {
         if built.codebook.is_empty() {

@@ -66,7 +66,7 @@ pub(super) fn record(
                 let columns = Columns { width: vectors, vectors, stride: vectors, first_vector: 0 };
                 sum(rec, &entries.splats, &frame.projected_grad, columns);
             }
-            Err(e) => rec.fail(e),
+            Err(e) => rec.fail_with(e),
         },
     }
 }

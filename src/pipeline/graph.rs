@@ -130,13 +130,14 @@ impl<'g> Graph<'g> {
         });
         let state = shared.state.into_inner().unwrap_or_else(PoisonError::into_inner);
         if let Err(error) = both(device_lane, processor_lane) {
-            let of = |n: usize| store.checkpoint(self.nodes[n].name, &shared.keys[n]);
-            let begun = (0..self.nodes.len()).filter_map(of).any(|c| c.exists());
+            let state_of =
+                |n: usize| store.checkpoint(self.nodes[n].name, &shared.keys[n])?.named(self.nodes[n].name);
+            let begun = (0..self.nodes.len()).rev().find_map(state_of);
             if !state.kept.is_empty() {
                 let names = state.kept.join(", ");
                 progress.inform(&format!("kept: {names}; the same command with --resume goes on from there"));
             }
-            return Err(if begun || !state.kept.is_empty() { error.resumable() } else { error });
+            return Err(error.keeping(begun.or(state.kept.last().map(|stage| format!("stage {stage}")))));
         }
         let needs = self.nodes.iter().map(|n| n.needs.clone()).collect();
         Ok(Outputs { values: state.values, seconds: state.seconds, needs })
@@ -250,7 +251,9 @@ impl Shared<'_, '_> {
             let recorder =
                 WarningRecorder { inner: context.progress, warnings: Mutex::default(), checkpoint };
             let began = Instant::now();
-            let value = work(&inputs, &Context { progress: &recorder, ..*context })?;
+            let state = || recorder.checkpoint.as_ref().and_then(|c| c.named(at.name));
+            let value = work(&inputs, &Context { progress: &recorder, ..*context })
+                .map_err(|error| error.keeping(state()))?;
             drop(inputs);
             let mut warnings = recorder.warnings.lock().unwrap_or_else(PoisonError::into_inner).clone();
             // Those of its inputs as well: with its output kept they need not be read again.

@@ -1,4 +1,5 @@
-//! A device that is lost in the middle of training: what is said of it, and that the same work goes on with another.
+//! A device that is lost, or has no memory left, in the middle of training: what is said of it, and that the same work goes on with
+//! another.
 use super::{Graph, Store};
 use crate::Error;
 use crate::fit::{Preset, RgbOptions, Trained};
@@ -90,7 +91,7 @@ fn a_lost_device_is_named_and_training_goes_on_elsewhere_with_the_same_bits() {
     let lost = device();
     lost.lose_after(0);
     let error = train(&lost, &Store::none()).0.unwrap_err();
-    assert!(matches!(error, Error::DeviceLost { resumable: false, .. }), "{error:?}");
+    assert!(matches!(error, Error::DeviceLost { kept: None, .. }), "{error:?}");
     // In the middle of training, twice.
     let mut begun = 0;
     for share in [3, 2] {
@@ -98,12 +99,15 @@ fn a_lost_device_is_named_and_training_goes_on_elsewhere_with_the_same_bits() {
         lost.lose_after(submissions / share);
         let (error, steps) = train(&lost, &kept());
         let error = error.unwrap_err();
-        assert!(matches!(error, Error::DeviceLost { resumable: true, .. }), "{error:?}");
+        let Error::DeviceLost { kept: Some(kept), .. } = &error else { panic!("{error:?}") };
         assert!(error.source().is_some() && error.exit_code() == 1);
         let text = error.to_string();
         assert!(text.contains("the device was lost") && text.contains("--resume"), "{text}");
         assert!(!text.contains('\n') && steps.first().is_some_and(|s| *s >= begun), "{steps:?}");
         begun = steps.last().copied().unwrap();
+        // The state is kept after every step, figures come with some.
+        let named: u64 = kept.strip_prefix("stage splats after step ").unwrap().parse().unwrap();
+        assert!(text.ends_with(kept) && (begun..=STEPS as u64).contains(&named), "{text}");
         // Nothing works on it any more, and nothing hangs.
         let buffer = lost.buffer::<u32>("after", 4).unwrap();
         let mut after = Recorder::new(&lost, "after");
@@ -114,5 +118,35 @@ fn a_lost_device_is_named_and_training_goes_on_elsewhere_with_the_same_bits() {
     let (resumed, steps) = train(&device(), &kept());
     let resumed = resumed.unwrap();
     assert!(steps[0] >= begun, "it goes on where it was: {steps:?} after {begun}");
+    assert!(resumed.splats == whole.splats && resumed.cameras == whole.cameras, "the same bits");
+}
+
+#[test]
+fn a_device_without_memory_is_named_with_what_is_kept_and_the_work_goes_on_once_there_is_some() {
+    let whole_device = device();
+    let (whole, _) = train(&whole_device, &Store::none());
+    let (whole, buffers) = (whole.unwrap(), whole_device.memory().allocations);
+    let folder = tempfile::tempdir().unwrap();
+    let kept = || Store::at(folder.path(), true, Duration::ZERO);
+    let full = device();
+    full.exhaust_after(0);
+    let error = train(&full, &Store::none()).0.unwrap_err();
+    assert!(matches!(error, Error::OutOfDeviceMemory { kept: None, .. }), "{error:?}");
+    let mut stages = Vec::new();
+    for refused in [buffers / 3, buffers - 2] {
+        let full = device();
+        full.exhaust_after(refused);
+        let error = train(&full, &kept()).0.unwrap_err();
+        let Error::OutOfDeviceMemory { kept: Some(kept), doing, .. } = &error else { panic!("{error:?}") };
+        let text = error.to_string();
+        assert!(text.ends_with(kept) && text.contains("--resume") && text.contains("fewer splats"), "{text}");
+        assert!(doing.contains("buffer") && error.exit_code() == 1 && error.source().is_some(), "{text}");
+        stages.push(kept.clone());
+        // There is memory again: what was refused has broken nothing.
+        full.exhaust_after(u64::MAX / 2);
+        assert!(full.buffer::<u32>("after", 4).is_ok());
+    }
+    println!("{stages:?}");
+    let resumed = train(&device(), &kept()).0.unwrap();
     assert!(resumed.splats == whole.splats && resumed.cameras == whole.cameras, "the same bits");
 }

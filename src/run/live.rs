@@ -210,7 +210,8 @@ impl LiveScene {
         Questions::open(encoder, self.splats(), field, self.cameras())
     }
 
-    /// Writes a file of the kind that its name asks for ([`gaussians::write`]), or else a scene directory, whole or not at
+    /// Writes a file of the kind that its name asks for ([`gaussians::write`]), or a scene directory where the name has no
+    /// ending, ends in a slash or is that of a folder, whole or not at
     /// all; `replace` allows to replace a scene or file that is there.
     pub fn save(&mut self, path: &Path, replace: bool) -> Result<()> {
         if gaussians::is_named(path) {
@@ -218,6 +219,17 @@ impl LiveScene {
                 return Err(Error::input(format!("{}: is already there", path.display())));
             }
             return gaussians::write(path, self.splats(), self.language());
+        }
+        if let Some(ending) = path.extension()
+            && !path.is_dir()
+            && !path.as_os_str().as_encoded_bytes().ends_with(b"/")
+        {
+            return Err(Error::input(format!(
+                "{}: .{} is no format of splats (there are {}); a scene directory of this name ends in a slash",
+                path.display(),
+                ending.display(),
+                gaussians::endings()
+            )));
         }
         match &mut self.origin {
             SceneOrigin::Trained(outcome) => save(outcome, path, replace, &Silent),

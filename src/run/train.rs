@@ -99,8 +99,16 @@ fn points(path: &Path) -> Result<PointCloud> {
 }
 
 /// Gives points from a file the footprint that initialisation needs: `z / f` in the camera that sees them nearest.
-fn with_footprints(mut cloud: PointCloud, list: &[Camera]) -> Result<PointCloud> {
+fn with_footprints(mut cloud: PointCloud, list: &[Camera], progress: &dyn Progress) -> Result<PointCloud> {
     let mut keep = PointCloud::default();
+    let finite = |i: &usize| cloud.positions[*i].iter().chain(&cloud.colours[*i]).all(|v| v.is_finite());
+    let bad = cloud.len() - (0..cloud.len()).filter(finite).count();
+    if bad > 0 {
+        progress.warn(&format!(
+            "--points: {bad} of {} points are left out: they have numbers that are not finite",
+            cloud.len()
+        ));
+    }
     for i in 0..cloud.len() {
         let p = glam::Vec3::from_array(cloud.positions[i]).as_dvec3();
         let seen = list.iter().enumerate().filter_map(|(v, c)| {
@@ -144,7 +152,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let photos = matched(plan, &known, max_size, work, &device, progress)?;
     let registry = Registry::with(plan.models.as_deref(), Compute::by(plan.provider.as_deref()))?;
     let source = match given {
-        Some(cloud) => CameraOrigin::GivenGeometry(from_points(&photos, &known, cloud)?),
+        Some(cloud) => CameraOrigin::GivenGeometry(from_points(&photos, &known, cloud, progress)?),
         None => CameraOrigin::Known(known),
     };
     let mut options = RgbOptions::preset(preset);
@@ -264,9 +272,14 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     Ok(TrainOutcome { record, table })
 }
 
-fn from_points(photos: &[Photo], known: &[Camera], cloud: PointCloud) -> Result<Geometry> {
+fn from_points(
+    photos: &[Photo],
+    known: &[Camera],
+    cloud: PointCloud,
+    progress: &dyn Progress,
+) -> Result<Geometry> {
     let cameras = photos.iter().map(|p| camera_of(p, known)).collect::<Result<Vec<_>>>()?;
-    let points = with_footprints(cloud, &cameras)?;
+    let points = with_footprints(cloud, &cameras, progress)?;
     Ok(Geometry {
         points,
         cameras,

@@ -8,13 +8,39 @@ use crate::format::{cameras, create_folder, picture, write_json};
 use crate::progress::Progress;
 use crate::query::eval::{GroundTruth, Split, TruthFrame};
 use crate::scene::Camera;
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use half::f16;
 use serde_json::json;
 use std::path::Path;
 
+/// Folders of regions without and with flaws.
+const REGIONS: [&str; 2] = ["regions_exact", "regions_flawed"];
+
 /// JPEG quality of held-out views, and of photos unless asked otherwise: no visible artefacts.
 const QUALITY: u8 = 95;
+
+/// Whether a folder holds what [`generate`] or [`write_regions`] made, and nothing that anybody else put beside it.
+pub fn is_generated(folder: &Path) -> bool {
+    const NAMES: [&str; 8] = [
+        "images",
+        "held_out",
+        "depth",
+        "masks",
+        "ground_truth.json",
+        "cameras_noisy.json",
+        REGIONS[0],
+        REGIONS[1],
+    ];
+    let list = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let names: Vec<String> = list.map(|e| e.file_name().to_string_lossy().into_owned()).collect();
+    let truth = folder.join("ground_truth.json");
+    // Data sets of other makes may lie in the same layout; only ours state the knobs they were made with.
+    let stated =
+        || files::read_json::<serde_json::Value>(&truth, "").is_ok_and(|truth| !truth["knobs"].is_null());
+    names.iter().all(|n| NAMES.contains(&n.as_str()))
+        && REGIONS.iter().all(|r| names.iter().any(|n| n == r))
+        && (names.len() == REGIONS.len() || stated())
+}
 
 /// Makes a scene and writes it: photos, held-out views, depth, masks, cameras, and regions without and with flaws.
 pub fn generate(
@@ -87,7 +113,7 @@ pub fn write_regions(data: &Path, out: &Path, flaws: &InjectedErrors) -> Result<
     let truth = GroundTruth::read(data)?;
     let photos: Vec<&TruthFrame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
     let phrases: Vec<String> = truth.labels.values().cloned().collect();
-    for (name, flaws) in [("regions_exact", &InjectedErrors::NONE), ("regions_flawed", flaws)] {
+    for (name, flaws) in REGIONS.into_iter().zip([&InjectedErrors::NONE, flaws]) {
         regions::write(&out.join(name), &photos, &regions::regions(&truth, &photos, flaws)?, &phrases)?;
     }
     Ok(())
@@ -146,6 +172,10 @@ mod tests {
             let photo = truth.image(frame).unwrap();
             assert!(crate::pass::metrics::psnr(&photo, &seen.image) > 30.0);
         }
+        assert!(is_generated(dir.path()));
+        std::fs::write(dir.path().join("letter"), "precious").unwrap();
+        assert!(!is_generated(dir.path()), "somebody's own file is in it");
+        std::fs::remove_file(dir.path().join("letter")).unwrap();
         let noisy = cameras::read(&dir.path().join("cameras_noisy.json")).unwrap();
         assert_eq!(noisy.len(), 3);
         for name in ["regions_exact", "regions_flawed"] {

@@ -7,7 +7,7 @@ mod render;
 mod scene;
 mod shapes;
 
-pub use folder::{generate, write_regions};
+pub use folder::{generate, is_generated, write_regions};
 pub use outdoor::Sky;
 pub use phone::{Effects, PhotoEffects, TrueLight, to_linear, to_srgb};
 pub use render::{RayCast, photo, render};

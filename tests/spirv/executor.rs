@@ -5,7 +5,7 @@ use super::faults::Faults;
 use super::lower::lower;
 use super::memory::Memory;
 use super::module::words_of;
-use splatvk::gpu::{Buffer, Executor, Groups, Module, Op, Options, TestDevice};
+use splatvk::gpu::{Buffer, Executor, Groups, Module, Op, Options, TestDevice, Way};
 use std::collections::{BTreeSet, HashMap};
 use std::sync::{Arc, LazyLock, Mutex};
 
@@ -30,7 +30,7 @@ impl Interpreted {
     pub fn open(&self) -> TestDevice {
         let size = self.schedule.subgroup_size as u32;
         let options = Options {
-            no_float_atomics: !self.float_atomics,
+            without: if self.float_atomics { BTreeSet::new() } else { [Way::FloatAtomics].into() },
             max_binding: self.max_binding,
             ..Options::from_env(None)
         };

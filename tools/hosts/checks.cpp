@@ -191,6 +191,8 @@ static void reading(SvkContext *context, const char *path) {
     EXPECT(svk_scene_render(loaded, &camera, &buffer, 1, nullptr) == SVK_STATUS_INPUT);
     EXPECT(says(last_error(svk_scene_error, loaded), "own Vulkan device"));
     EXPECT(svk_scene_save(loaded, path, 0) == SVK_STATUS_INPUT);
+    EXPECT(svk_scene_save(loaded, "no-such-format.foo", 0) == SVK_STATUS_INPUT);
+    EXPECT(says(last_error(svk_scene_error, loaded), "no format of splats"));
 }
 
 // Pixels in memory with known cameras: what the scene shows at its own cameras makes a scene again, in the same axes.

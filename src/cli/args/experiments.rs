@@ -109,6 +109,9 @@ pub struct GenerateArgs {
     /// Folder to write: photos, held-out views, depth, masks, cameras, regions
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// Replace data that an earlier call made; a folder of anything else is never replaced
+    #[arg(long)]
+    pub force: bool,
     /// Make no scene: only regions_exact/ and regions_flawed/ for this data set with masks
     #[arg(long, value_name = "DIR")]
     pub from: Option<PathBuf>,

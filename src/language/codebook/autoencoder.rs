@@ -8,6 +8,7 @@
 use super::network::{Adam, Network, Step};
 use super::{CodeEntry, EncodedLevel, min_chord};
 use crate::math::Random;
+use crate::progress::Progress;
 use crate::scene::Codebook;
 use crate::{Error, Result};
 use nalgebra::DMatrix;
@@ -53,8 +54,14 @@ fn unit_backward(y: &DMatrix<f32>, norms: &[f32], g: &DMatrix<f32>) -> DMatrix<f
 }
 
 impl Autoencoder {
-    /// Trains on unit rows `[N, dim]` for the published epochs, but at least `least_steps`.
-    pub fn train(features: &[f32], dim: usize, least_steps: usize, seed: u64) -> Result<Self> {
+    /// Trains on unit rows `[N, dim]` for the published epochs, but at least `least_steps`: minutes on a CPU.
+    pub fn train(
+        features: &[f32],
+        dim: usize,
+        least_steps: usize,
+        seed: u64,
+        progress: &dyn Progress,
+    ) -> Result<Self> {
         let count = features.len() / dim.max(1);
         if count == 0 {
             return Err(Error::work("autoencoder: the scene has no region features"));
@@ -72,6 +79,7 @@ impl Autoencoder {
         let steps = (EPOCHS * count.div_ceil(batch)).max(least_steps);
         let (mut done, mut at) = (0, count);
         while done < steps {
+            progress.check()?;
             if at + batch > count {
                 random.shuffle(&mut order);
                 at = 0;
@@ -144,11 +152,12 @@ pub(in crate::language) fn build(
     levels: &[Vec<CodeEntry>],
     least_steps: usize,
     seed: u64,
+    progress: &dyn Progress,
 ) -> Result<(Vec<EncodedLevel>, f64)> {
     let first = levels.iter().flatten().next();
     let dim = first.map_or(0, |e| e.embedding.len());
     let all: Vec<f32> = levels.iter().flatten().flat_map(|e| e.embedding.iter().copied()).collect();
-    let model = Autoencoder::train(&all, dim, least_steps, seed)?;
+    let model = Autoencoder::train(&all, dim, least_steps, seed, progress)?;
     let codes = lattice();
     let embeddings = model.decode(&DMatrix::from_column_slice(3, LATTICE, &codes));
     let chord = min_chord(&codes, 3);
@@ -181,7 +190,9 @@ pub(in crate::language) fn build(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::progress::Silent;
     use crate::scene::MaskId;
+    use std::sync::atomic::{AtomicUsize, Ordering};
 
     fn unit_rows(count: usize, dim: usize, seed: u64) -> Vec<f32> {
         let mut random = Random::new(seed);
@@ -211,11 +222,33 @@ mod tests {
 
     #[test]
     fn few_features_are_restored_and_many_are_not() {
-        let few = Autoencoder::train(&unit_rows(4, 32, 1000), 32, 2000, 0).unwrap();
+        let few = Autoencoder::train(&unit_rows(4, 32, 1000), 32, 2000, 0, &Silent).unwrap();
         assert!(few.cosine > 0.95, "{}", few.cosine);
         // 300 unrelated directions do not fit on a sphere: that is what the bijection avoids
-        let many = Autoencoder::train(&unit_rows(300, 32, 1000), 32, 2000, 0).unwrap();
+        let many = Autoencoder::train(&unit_rows(300, 32, 1000), 32, 2000, 0, &Silent).unwrap();
         assert!(many.cosine < 0.8 && many.cosine > 0.2, "{}", many.cosine);
+    }
+
+    /// Asks to stop at the third question.
+    #[derive(Default)]
+    struct StopAtThree(AtomicUsize);
+
+    impl Progress for StopAtThree {
+        fn begin(&self, _: &'static str, _: u64) {}
+        fn step(&self, _: u64, _: &str) {}
+        fn end(&self) {}
+        fn warn(&self, _: &str) {}
+        fn cancelled(&self) -> bool {
+            self.0.fetch_add(1, Ordering::SeqCst) >= 2
+        }
+    }
+
+    #[test]
+    fn training_stops_between_two_steps() {
+        let progress = StopAtThree::default();
+        let stopped = Autoencoder::train(&unit_rows(4, 32, 1000), 32, 2000, 0, &progress);
+        assert!(matches!(stopped, Err(Error::Cancelled)));
+        assert_eq!(progress.0.into_inner(), 3, "it asks before every step");
     }
 
     #[test]
@@ -234,7 +267,7 @@ mod tests {
             members: vec![MaskId::new(0, 0)],
         };
         let entries: Vec<CodeEntry> = rows.chunks_exact(16).map(entry).collect();
-        let (built, cosine) = build(&[entries.clone(), Vec::new()], 2000, 0).unwrap();
+        let (built, cosine) = build(&[entries.clone(), Vec::new()], 2000, 0, &Silent).unwrap();
         assert!(built[1].codebook.is_empty() && built[0].code_of.len() == 5);
         let book = &built[0].codebook;
         let restored: f32 = entries
