@@ -1,5 +1,5 @@
 //! Passes over pixels.
-use super::{Found, close, equal, worst};
+use super::compared::{Found, close, equal, worst};
 use crate::gpu::{Device, Recorder};
 use crate::math::Random;
 use crate::pass::Rasterizer;

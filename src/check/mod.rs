@@ -1,14 +1,15 @@
 //! Every pass on a device against its CPU twin, in seconds: `splatvk doctor --check`. Which ways of computing gave wrong results is
 //! kept for the device and its driver, and they are not used there any more ([`crate::gpu::Way`]).
+mod compared;
 mod data;
 mod images;
 mod render;
 
 use crate::Result;
 use crate::gpu::{Device, Options, Way};
-use crate::pass::close::{Tolerance, compare};
 use crate::pass::sort::Shape;
 use crate::pass::{Grouping, Summation};
+use compared::Found;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
@@ -25,9 +26,6 @@ pub struct Row {
     /// What was compared and how close it is; or what is wrong.
     pub outcome: std::result::Result<String, String>,
 }
-
-/// What one comparison found: a mismatch is text, a device that fails is an [`crate::Error`]; both are wrong results.
-type Found = Result<std::result::Result<String, String>>;
 
 struct Case {
     pass: &'static str,
@@ -109,42 +107,6 @@ pub fn is_fatal(row: &Row, switched_off: &BTreeSet<Way>) -> bool {
         None => false,
     };
     row.outcome.is_err() && !replaced
-}
-
-/// Compares arrays; says how close they are, or which element is not.
-fn close(
-    what: &str,
-    actual: &[f32],
-    twin: &[f64],
-    tolerance: &Tolerance,
-) -> std::result::Result<f64, String> {
-    compare(actual, twin, tolerance).map(|d| d.relative_l2).map_err(|e| format!("{what}: {e}"))
-}
-
-/// Of several [`close`] the largest distance, as text.
-fn worst(
-    all: impl IntoIterator<Item = std::result::Result<f64, String>>,
-) -> std::result::Result<String, String> {
-    let mut worst = 0.0f64;
-    for distance in all {
-        worst = worst.max(distance?);
-    }
-    Ok(format!("relative L2 error {worst:.1e}"))
-}
-
-/// Equal to the last bit.
-fn equal<T: PartialEq + std::fmt::Debug>(
-    what: &str,
-    actual: &[T],
-    twin: &[T],
-) -> std::result::Result<String, String> {
-    if actual.len() != twin.len() {
-        return Err(format!("{what}: {} elements against {}", actual.len(), twin.len()));
-    }
-    match actual.iter().zip(twin).position(|(a, b)| a != b) {
-        None => Ok(format!("{} equal", actual.len())),
-        Some(i) => Err(format!("{what}: element {i} is {:?}, should be {:?}", actual[i], twin[i])),
-    }
 }
 
 #[cfg(test)]

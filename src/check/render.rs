@@ -1,5 +1,5 @@
 //! Rendering and its gradients.
-use super::{Found, close, worst};
+use super::compared::{Found, close, worst};
 use crate::gpu::{Device, Recorder};
 use crate::pass::close::Tolerance;
 use crate::pass::params::Params;

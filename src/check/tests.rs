@@ -1,5 +1,7 @@
+use super::compared::{close, equal, worst};
 use super::*;
 use crate::gpu::shaders;
+use crate::pass::close::Tolerance;
 
 fn wrong(pass: &'static str, way: Option<Way>) -> Row {
     Row { pass, way, time: Duration::ZERO, outcome: Err("wrong".to_owned()) }

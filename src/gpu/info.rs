@@ -1,6 +1,7 @@
 //! What a device is asked for and what it is.
 use super::module::Capability;
-use super::ways::Way;
+use super::ways::{self, Way};
+use ash::vk;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
@@ -84,4 +85,25 @@ pub struct DeviceInfo {
     pub max_bindings: u32,
     /// Nanoseconds per timestamp tick; 0 when the queue has no timestamps.
     pub timestamp_period: f64,
+}
+
+impl DeviceInfo {
+    /// The way that suits the device, or its replacement where that is switched off here.
+    pub fn way(&self, preferred: Way) -> Way {
+        match preferred.replacement() {
+            Some(other) if self.without.contains(&preferred) && !self.without.contains(&other) => other,
+            _ => preferred,
+        }
+    }
+}
+
+impl Options {
+    /// Also without what is switched off on a device, where a cache is kept.
+    pub(super) fn for_device(&self, properties: &vk::PhysicalDeviceProperties) -> Options {
+        let mut options = self.clone();
+        if let Some(folder) = &self.cache {
+            options.without.extend(ways::read(folder, properties));
+        }
+        options
+    }
 }

@@ -1,5 +1,4 @@
 //! Ways of computing that another way can replace, and the memory of those that gave wrong results on a device.
-use super::info::{DeviceInfo, Options};
 use crate::{Error, Result, files};
 use ash::vk;
 use std::collections::BTreeSet;
@@ -63,27 +62,6 @@ impl Way {
     }
 }
 
-impl DeviceInfo {
-    /// The way that suits the device, or its replacement where that is switched off here.
-    pub fn way(&self, preferred: Way) -> Way {
-        match preferred.replacement() {
-            Some(other) if self.without.contains(&preferred) && !self.without.contains(&other) => other,
-            _ => preferred,
-        }
-    }
-}
-
-impl Options {
-    /// Also without what is switched off on a device, where a cache is kept.
-    pub(super) fn for_device(&self, properties: &vk::PhysicalDeviceProperties) -> Options {
-        let mut options = self.clone();
-        if let Some(folder) = &self.cache {
-            options.without.extend(read(folder, properties));
-        }
-        options
-    }
-}
-
 /// The file that names what is switched off on a device with this driver: another driver starts anew.
 fn file(folder: &Path, properties: &vk::PhysicalDeviceProperties) -> PathBuf {
     let vk::PhysicalDeviceProperties { vendor_id, device_id, driver_version, pipeline_cache_uuid, .. } =
@@ -93,7 +71,7 @@ fn file(folder: &Path, properties: &vk::PhysicalDeviceProperties) -> PathBuf {
 }
 
 /// What is switched off. A file that is damaged says nothing.
-fn read(folder: &Path, properties: &vk::PhysicalDeviceProperties) -> BTreeSet<Way> {
+pub(super) fn read(folder: &Path, properties: &vk::PhysicalDeviceProperties) -> BTreeSet<Way> {
     let text = files::read_with_checksum(&file(folder, properties)).unwrap_or_default();
     let text = String::from_utf8_lossy(&text).into_owned();
     text.lines().filter_map(|line| Way::ALL.into_iter().find(|w| w.name() == line)).collect()

@@ -1,0 +1,34 @@
+//! What a comparison says.
+use crate::pass::close::{Tolerance, compare};
+
+/// What one comparison found: a mismatch is text, a device that fails is an [`crate::Error`]; both are wrong results.
+pub(super) type Found = crate::Result<Result<String, String>>;
+
+/// Compares arrays; says how close they are, or which element is not.
+pub(super) fn close(what: &str, actual: &[f32], twin: &[f64], tolerance: &Tolerance) -> Result<f64, String> {
+    compare(actual, twin, tolerance).map(|d| d.relative_l2).map_err(|e| format!("{what}: {e}"))
+}
+
+/// Of several [`close`] the largest distance, as text.
+pub(super) fn worst(all: impl IntoIterator<Item = Result<f64, String>>) -> Result<String, String> {
+    let mut worst = 0.0f64;
+    for distance in all {
+        worst = worst.max(distance?);
+    }
+    Ok(format!("relative L2 error {worst:.1e}"))
+}
+
+/// Equal to the last bit.
+pub(super) fn equal<T: PartialEq + std::fmt::Debug>(
+    what: &str,
+    actual: &[T],
+    twin: &[T],
+) -> Result<String, String> {
+    if actual.len() != twin.len() {
+        return Err(format!("{what}: {} elements against {}", actual.len(), twin.len()));
+    }
+    match actual.iter().zip(twin).position(|(a, b)| a != b) {
+        None => Ok(format!("{} equal", actual.len())),
+        Some(i) => Err(format!("{what}: element {i} is {:?}, should be {:?}", actual[i], twin[i])),
+    }
+}
