@@ -101,7 +101,7 @@ fn stopped_it_leaves_nothing_and_finished_it_leaves_all() {
         eval(&data("breakfast"), &out).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
     let begun = Instant::now();
     // The first picture is written.
-    let hidden = out.join(format!(".partial-{}/renders", child.id()));
+    let hidden = folder.path().join(format!("deep/.out.partial-{}/renders", child.id()));
     while !hidden.exists() {
         assert!(begun.elapsed() < Duration::from_secs(60) && child.try_wait().unwrap().is_none());
         std::thread::sleep(Duration::from_millis(2));

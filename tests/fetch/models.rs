@@ -256,9 +256,9 @@ fn what_is_no_model_is_not_installed_and_what_is_left_can_be_cleaned() {
     );
     clean(&["--delete"]);
     assert!(place.hidden().is_empty() && place.at(DEPTH).exists());
-    // A model that a killed process had taken out to replace it comes back.
+    // A model that a process, killed since, had moved aside to replace it comes back.
     std::fs::create_dir_all(place.at(".fetch-da3")).unwrap();
-    std::fs::rename(place.at(DEPTH), place.at(".fetch-da3/old")).unwrap();
+    std::fs::rename(place.at(DEPTH), place.at(".da3.old-4000000000")).unwrap();
     clean(&["--delete"]);
     assert!(place.hidden().is_empty() && place.at("da3/model.onnx").exists());
 }
