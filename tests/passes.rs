@@ -6,11 +6,9 @@ use splatvk::pass::channels::BASE_CHANNELS;
 use splatvk::pass::raster_backward;
 use splatvk::pass::raster_forward::{Cutoffs, TwinScene};
 use splatvk::pass::seeded::{self, Random};
-use splatvk::pass::{
-    DeviceChoices, FeatureMode, Grouping, RasterOptions, Rasterizer, Renderer, SplatBuffers, View, bin,
-};
+use splatvk::pass::{FeatureMode, RasterOptions, Rasterizer, Renderer, SplatBuffers, View};
 use splatvk::scene::{Pose, Splats};
-use support::{IMAGE, Scene, assert_close, assert_images, rendered};
+use support::{IMAGE, Scene, assert_close, assert_images, assert_lists, rendered};
 
 /// A splat in front of an unrotated camera, round, grey unless coloured.
 fn splat(mean: [f32; 3], scale: f32, opacity_logit: f32) -> Splats {
@@ -158,29 +156,8 @@ fn near_opaque_needle_huge_hidden_and_outside_splats_match_the_twin() {
 /// The lists hold what the twin's exact test finds, nearest first, plus at most the few that its margin lets in.
 #[test]
 fn tile_lists_contain_the_twins() {
-    let device = test_device();
     let scene = Scene::small(500, 0, 0, 77);
-    let forward = scene.twin();
-    let expected = bin::twin(&forward.projected, &forward.order, scene.view.size);
-    let lists = |grouping| {
-        let ways = DeviceChoices { grouping, ..DeviceChoices::of(&device) };
-        let params = SplatBuffers::upload(&device, &scene.splats, &[], 0).unwrap();
-        let [width, height] = scene.view.size;
-        let mut raster = Rasterizer::with(&device, 500, 0, width, height, ways).unwrap();
-        raster.set_view(&scene.view).unwrap();
-        raster.forward(&params, &scene.options).unwrap();
-        raster.tile_lists().unwrap()
-    };
-    let counted = lists(Grouping::Counting);
-    assert_eq!(counted, lists(Grouping::Sorting));
-    assert_eq!(counted.len(), expected.len());
-    let mut extra = 0;
-    for (list, expected) in counted.iter().zip(&expected) {
-        let mut rest = list.iter();
-        assert!(expected.iter().all(|i| rest.any(|j| i == j)), "{expected:?} is no subsequence of {list:?}");
-        extra += list.len() - expected.len();
-    }
-    let total: usize = expected.iter().map(Vec::len).sum();
+    let (total, extra) = assert_lists(&test_device(), &scene);
     assert!(total > 1000 && extra * 100 < total, "{extra} of {total}");
 }
 

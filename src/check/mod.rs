@@ -47,7 +47,6 @@ const CASES: &[Case] = &[
     case("Adam", None, data::adam),
     case("projection and rendering", Some(Way::CountedLists), |d| render::forward(d, Grouping::Counting)),
     case("projection and rendering", Some(Way::SortedLists), |d| render::forward(d, Grouping::Sorting)),
-    case("gradients", Some(Way::AtomicGradients), |d| render::backward(d, Summation::Atomics)),
     case("gradients", Some(Way::StoredGradients), |d| render::backward(d, Summation::Entries)),
     case("depth and needle losses", None, render::regularisers),
     case("SSIM and L1 loss", None, images::ssim_l1),
@@ -57,56 +56,51 @@ const CASES: &[Case] = &[
     case("plane sweep stereo", None, images::plane_sweep),
 ];
 
-/// Compares all passes, and tells of each as it is done. The device is opened without what is switched off on it.
-pub fn run(options: &Options, told: &mut dyn FnMut(&Row)) -> Result<Vec<Row>> {
-    let plain = Options { cache: None, ..options.clone() };
-    let device = Device::with(&plain)?;
-    let mut rows = Vec::new();
-    let mut tell = |row: Row| {
-        told(&row);
-        rows.push(row);
+/// Compares all passes, and tells of each as it is done, until that is an error. Of `device`, opened with `options`, nothing should
+/// be switched off; what is found wrong and can be replaced is, for the passes after it that build on it.
+pub fn run(device: &Device, options: &Options, told: &mut dyn FnMut(&Row) -> Result<()>) -> Result<Vec<Row>> {
+    let mut device = device.clone();
+    let mut rows: Vec<Row> = Vec::new();
+    let by_atomics = |way| case("gradients", Some(way), |d| render::backward(d, Summation::Atomics));
+    let last = match device.info().float_atomics {
+        true => by_atomics(Way::FloatAtomics),
+        false => by_atomics(Way::AtomicGradients),
     };
-    CASES.iter().for_each(|case| tell(row(&device, case.pass, case.way, case.check)));
-    if device.info().float_atomics {
-        // With and without, the same pass: what only one of them gets wrong is their fault.
-        tell(row(&device, "float atomics", Some(Way::FloatAtomics), |d| {
-            render::backward(d, Summation::Atomics)
-        }));
-        let emulated = Device::with(&Options { without: [Way::FloatAtomics].into(), ..plain })?;
-        tell(row(&emulated, "float atomics, emulated", None, |d| render::backward(d, Summation::Atomics)));
+    for case in CASES.iter().chain([&last]) {
+        rows.push(row(&device, case));
+        told(&rows[rows.len() - 1])?;
+        let without = wrong_ways(&rows);
+        if without != device.info().without {
+            device = Device::with(&Options { without, ..options.clone() })?;
+        }
+    }
+    if device.info().without.contains(&Way::FloatAtomics) {
+        // What the device is left with.
+        rows.push(row(&device, &by_atomics(Way::AtomicGradients)));
+        told(&rows[rows.len() - 1])?;
     }
     Ok(rows)
 }
 
-fn row(device: &Device, pass: &'static str, way: Option<Way>, check: fn(&Device) -> Found) -> Row {
+fn row(device: &Device, case: &Case) -> Row {
     let begun = Instant::now();
-    let outcome = check(device).unwrap_or_else(|e| Err(e.to_string()));
-    Row { pass, way, time: begun.elapsed(), outcome }
+    let outcome = (case.check)(device).unwrap_or_else(|e| Err(e.to_string()));
+    Row { pass: case.pass, way: case.way, time: begun.elapsed(), outcome }
 }
 
-/// The ways that gave wrong results where others did not: what to switch off. Native float atomics are blamed for wrong atomic
-/// gradients if these are right without them.
+/// The ways that gave wrong results where one that replaces them did not: what to switch off.
 pub fn wrong_ways(rows: &[Row]) -> BTreeSet<Way> {
-    let mut wrong: BTreeSet<Way> = rows.iter().filter(|r| r.outcome.is_err()).filter_map(|r| r.way).collect();
-    let emulated = rows.iter().any(|r| r.pass == "float atomics, emulated" && r.outcome.is_ok());
-    match wrong.contains(&Way::FloatAtomics) && emulated {
-        true => wrong.remove(&Way::AtomicGradients),
-        false => wrong.remove(&Way::FloatAtomics),
+    let wrong: BTreeSet<Way> = rows.iter().filter(|r| r.outcome.is_err()).filter_map(|r| r.way).collect();
+    let replaced = |way: &Way| {
+        let other = way.replacement();
+        !wrong.contains(&other) || !wrong.contains(&other.replacement())
     };
-    let without_other = |way: &Way| way.replacement().is_some_and(|other| wrong.contains(&other));
-    wrong.iter().filter(|way| !without_other(way)).copied().collect()
+    wrong.iter().filter(|way| replaced(way)).copied().collect()
 }
 
 /// Whether a row is wrong and nothing can be used in its place.
 pub fn is_fatal(row: &Row, switched_off: &BTreeSet<Way>) -> bool {
-    let replaced = match row.way {
-        Some(Way::AtomicGradients) => {
-            switched_off.contains(&Way::AtomicGradients) || switched_off.contains(&Way::FloatAtomics)
-        }
-        Some(way) => switched_off.contains(&way),
-        None => false,
-    };
-    row.outcome.is_err() && !replaced
+    row.outcome.is_err() && row.way.is_none_or(|way| !switched_off.contains(&way))
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! Rendering and its gradients.
 use super::compared::{Found, close, worst};
 use crate::gpu::{Device, Recorder};
-use crate::pass::close::Tolerance;
+use crate::pass::close::{IMAGE, Tolerance, gradient_tolerance};
 use crate::pass::params::Params;
 use crate::pass::raster_forward::Cutoffs;
 use crate::pass::seeded::{self, Random};
@@ -17,22 +17,6 @@ use glam::DVec3;
 const SIZE: [u32; 2] = [75, 53];
 const FEATURES: usize = 6;
 const MODE: FeatureMode = FeatureMode::Gauge { epsilon: 1e-3, blocks: 2 };
-
-/// As tests/passes.rs demands (docs/method.md#tolerances).
-const IMAGE: Tolerance =
-    Tolerance { relative_l2: 1e-4, absolute: 1e-4, relative: 1e-5, outliers: 2e-4, outlier_factor: 200.0 };
-
-/// As tests/gradients.rs demands.
-fn tolerance(reference: &[f64]) -> Tolerance {
-    let rms = (reference.iter().map(|x| x * x).sum::<f64>() / reference.len().max(1) as f64).sqrt();
-    Tolerance {
-        relative_l2: 1e-3,
-        absolute: 2e-3 * rms + 1e-9,
-        relative: 2e-3,
-        outliers: 0.02,
-        outlier_factor: 50.0,
-    }
-}
 
 struct Scene {
     splats: Splats,
@@ -98,7 +82,8 @@ pub(super) fn backward(device: &Device, summation: Summation) -> Found {
         twin::backward(&scene.params(), &scene.view, MODE, &Cutoffs::STANDARD, &scene.twin(), &upstream);
     let flat = |v: &[DVec3]| v.iter().flat_map(|x| x.to_array()).collect::<Vec<f64>>();
     let quats: Vec<f64> = twin.params.quats.iter().flat_map(|q| q.to_array()).collect();
-    let class = |name: &str, actual: &[f32], twin: &[f64]| close(name, actual, twin, &tolerance(twin));
+    let class =
+        |name: &str, actual: &[f32], twin: &[f64]| close(name, actual, twin, &gradient_tolerance(twin));
     Ok(worst([
         class("means", splats.means.as_flattened(), &flat(&twin.params.means)),
         class("log scales", splats.log_scales.as_flattened(), &flat(&twin.params.log_scales)),

@@ -10,17 +10,19 @@ fn wrong(pass: &'static str, way: Option<Way>) -> Row {
 /// Also: what it does not run is only what benchmarks run.
 #[test]
 fn every_pass_is_right_on_the_test_device() {
-    let device = Device::with(&Options { cache: None, ..Options::from_env(None) }).unwrap();
-    let mut run = BTreeSet::new();
-    for case in CASES {
-        let row = row(&device, case.pass, case.way, case.check);
+    let options = Options { cache: None, ..Options::from_env(None) };
+    let device = Device::with(&options).unwrap();
+    let mut told = |row: &Row| -> Result<()> {
         println!("{:<40} {:?} {:?}", row.pass, row.way, row.outcome);
         assert!(row.outcome.is_ok(), "{}: {:?}", row.pass, row.outcome);
-    }
-    run.extend(device.shaders_run().into_iter().map(|name| name.split(' ').next().unwrap_or(name)));
+        Ok(())
+    };
+    let rows = super::run(&device, &options, &mut told).unwrap();
+    assert_eq!(rows.len(), CASES.len() + 1);
+    let run = device.shaders_run();
     let missing: Vec<&str> = shaders::FAMILIES
         .iter()
-        .filter(|f| !f.modules.iter().any(|m| run.contains(m.name) || run.contains(f.name)))
+        .filter(|f| !f.modules.iter().any(|m| run.contains(m.name)))
         .map(|f| f.name)
         .collect();
     assert_eq!(missing, ["bench_copy", "bench_fma", "count_pairs"]);
@@ -38,17 +40,26 @@ fn a_way_is_switched_off_where_its_replacement_is_right() {
 }
 
 #[test]
-fn native_float_atomics_are_blamed_only_if_it_goes_without_them() {
-    let emulated = Row { outcome: Ok(String::new()), ..wrong("float atomics, emulated", None) };
-    let mut rows = vec![
-        wrong("gradients", Some(Way::AtomicGradients)),
-        wrong("float atomics", Some(Way::FloatAtomics)),
-        emulated,
-    ];
-    assert_eq!(wrong_ways(&rows), BTreeSet::from([Way::FloatAtomics]));
-    assert!(rows.iter().all(|r| !is_fatal(r, &wrong_ways(&rows))));
-    rows[2] = wrong("float atomics, emulated", None);
-    assert_eq!(wrong_ways(&rows), BTreeSet::from([Way::AtomicGradients]));
+fn native_float_atomics_are_switched_off_alone_if_it_goes_without_them() {
+    let native = wrong("gradients", Some(Way::FloatAtomics));
+    assert_eq!(wrong_ways(std::slice::from_ref(&native)), BTreeSet::from([Way::FloatAtomics]));
+    let mut rows = vec![native, wrong("gradients", Some(Way::AtomicGradients))];
+    assert_eq!(wrong_ways(&rows), BTreeSet::from([Way::FloatAtomics, Way::AtomicGradients]));
+    assert!(rows.iter().all(|r| !is_fatal(r, &wrong_ways(&rows))), "entries are stored");
+    rows.push(wrong("gradients", Some(Way::StoredGradients)));
+    assert!(wrong_ways(&rows).is_empty() && rows.iter().all(|r| is_fatal(r, &BTreeSet::new())));
+}
+
+#[test]
+fn it_ends_where_the_caller_says_so() {
+    let options = Options { cache: None, ..Options::from_env(None) };
+    let device = Device::with(&options).unwrap();
+    let mut told = 0;
+    let stopped = run(&device, &options, &mut |_| {
+        told += 1;
+        if told == 2 { Err(crate::Error::Cancelled) } else { Ok(()) }
+    });
+    assert!(matches!(stopped, Err(crate::Error::Cancelled)) && told == 2);
 }
 
 #[test]

@@ -80,8 +80,10 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
 
 /// Compares every pass with its CPU twin, and switches off what is wrong and can be replaced.
 fn check_passes(args: &DoctorArgs) -> Result<()> {
-    let options = Options::from_env(args.device.device.as_deref());
-    let device = Device::with(&Options { cache: None, ..options.clone() })?;
+    let chosen = Options::from_env(args.device.device.as_deref());
+    // Without the cache nothing is switched off, and the driver compiles everything.
+    let options = Options { cache: None, ..chosen.clone() };
+    let device = Device::with(&options)?;
     let info = device.info();
     let (low, high) = info.subgroup_sizes;
     let about = format!(
@@ -99,22 +101,13 @@ fn check_passes(args: &DoctorArgs) -> Result<()> {
     if !json {
         print(&format!("{about}\n"))?;
     }
-    let mut unwritten = None;
-    let rows = check::run(&options, &mut |row| {
-        if !json && let Err(e) = print(&text(row)) {
-            unwritten.get_or_insert(e);
-        }
-        // Stopped: the next row is the last.
-        if let Err(e) = progress::reporter().check() {
-            unwritten.get_or_insert(e);
-        }
+    let rows = check::run(&device, &options, &mut |row| {
+        progress::reporter().check()?;
+        if json { Ok(()) } else { print(&text(row)) }
     })?;
-    if let Some(e) = unwritten {
-        return Err(e);
-    }
     let off = check::wrong_ways(&rows);
     let names: Vec<&str> = off.iter().map(|w| w.name()).collect();
-    if let Some(folder) = &options.cache {
+    if let Some(folder) = &chosen.cache {
         device.switch_off(folder, &off)?;
     }
     let fatal = rows.iter().filter(|r| check::is_fatal(r, &off)).count();
@@ -122,7 +115,7 @@ fn check_passes(args: &DoctorArgs) -> Result<()> {
         let rows: Vec<_> = rows.iter().map(to_json).collect();
         print_json(&json!({ "device": about, "right": fatal == 0, "switched_off": names, "passes": rows }))?;
     } else if !off.is_empty() {
-        print(&format!("switched off on this device and driver: {}\n", names.join(", ")))?;
+        print(&format!("switched off on this device with this driver: {}\n", names.join(", ")))?;
     }
     match fatal {
         0 => Ok(()),

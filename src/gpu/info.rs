@@ -90,10 +90,8 @@ pub struct DeviceInfo {
 impl DeviceInfo {
     /// The way that suits the device, or its replacement where that is switched off here.
     pub fn way(&self, preferred: Way) -> Way {
-        match preferred.replacement() {
-            Some(other) if self.without.contains(&preferred) && !self.without.contains(&other) => other,
-            _ => preferred,
-        }
+        let other = preferred.replacement();
+        if self.without.contains(&preferred) && !self.without.contains(&other) { other } else { preferred }
     }
 }
 

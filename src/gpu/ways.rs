@@ -7,9 +7,10 @@ use std::path::{Path, PathBuf};
 /// One of two or more passes that compute the same.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Way {
-    /// `atomicAdd` on float, where the device has it; a compare-and-swap loop replaces it.
+    /// Gradients added up by `atomicAdd` on float, where the device has it.
     FloatAtomics,
-    /// Gradients of several tiles added up by atomics ([`crate::pass::Summation::Atomics`]).
+    /// Gradients of several tiles added up by atomics ([`crate::pass::Summation::Atomics`]), of which floats are emulated by a
+    /// compare-and-swap loop where there are none or they are switched off.
     AtomicGradients,
     /// Gradients stored per tile and summed in order ([`crate::pass::Summation::Entries`]).
     StoredGradients,
@@ -48,26 +49,29 @@ impl Way {
         }
     }
 
-    /// What is used where this one is switched off; `None` where that is not one of the ways.
-    pub fn replacement(self) -> Option<Way> {
+    /// What is used where this one is switched off.
+    pub fn replacement(self) -> Way {
         match self {
-            Way::FloatAtomics => None,
-            Way::AtomicGradients => Some(Way::StoredGradients),
-            Way::StoredGradients => Some(Way::AtomicGradients),
-            Way::ChunkSort => Some(Way::SweepSort),
-            Way::SweepSort => Some(Way::ChunkSort),
-            Way::CountedLists => Some(Way::SortedLists),
-            Way::SortedLists => Some(Way::CountedLists),
+            Way::FloatAtomics => Way::AtomicGradients,
+            Way::AtomicGradients => Way::StoredGradients,
+            Way::StoredGradients => Way::AtomicGradients,
+            Way::ChunkSort => Way::SweepSort,
+            Way::SweepSort => Way::ChunkSort,
+            Way::CountedLists => Way::SortedLists,
+            Way::SortedLists => Way::CountedLists,
         }
     }
 }
 
-/// The file that names what is switched off on a device with this driver: another driver starts anew.
+/// The file that names what is switched off on a device: another driver and another splatvk start anew.
 fn file(folder: &Path, properties: &vk::PhysicalDeviceProperties) -> PathBuf {
     let vk::PhysicalDeviceProperties { vendor_id, device_id, driver_version, pipeline_cache_uuid, .. } =
         *properties;
     let uuid = files::hex(&pipeline_cache_uuid);
-    folder.join(format!("{vendor_id:08x}-{device_id:08x}-{driver_version:08x}-{uuid}.switched-off"))
+    folder.join(format!(
+        "{vendor_id:08x}-{device_id:08x}-{driver_version:08x}-{uuid}-{}.switched-off",
+        env!("CARGO_PKG_VERSION")
+    ))
 }
 
 /// What is switched off. A file that is damaged says nothing.

@@ -101,6 +101,7 @@ fn points(path: &Path) -> Result<PointCloud> {
 /// Gives points from a file the footprint that initialisation needs: `z / f` in the camera that sees them nearest.
 fn with_footprints(mut cloud: PointCloud, list: &[Camera], progress: &dyn Progress) -> Result<PointCloud> {
     let mut keep = PointCloud::default();
+    // What is not finite would spread in training.
     let finite = |i: &usize| cloud.positions[*i].iter().chain(&cloud.colours[*i]).all(|v| v.is_finite());
     let bad = cloud.len() - (0..cloud.len()).filter(finite).count();
     if bad > 0 {
@@ -109,7 +110,7 @@ fn with_footprints(mut cloud: PointCloud, list: &[Camera], progress: &dyn Progre
             cloud.len()
         ));
     }
-    for i in 0..cloud.len() {
+    for i in (0..cloud.len()).filter(finite) {
         let p = glam::Vec3::from_array(cloud.positions[i]).as_dvec3();
         let seen = list.iter().enumerate().filter_map(|(v, c)| {
             let (pixel, z) = c.project(p);
@@ -117,9 +118,7 @@ fn with_footprints(mut cloud: PointCloud, list: &[Camera], progress: &dyn Progre
                 pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < c.width as f64 && pixel.y < c.height as f64;
             (z > 0.0 && inside).then_some((v, (z / c.fx) as f32))
         });
-        // Positions that are not finite are in no image; a colour that is not would spread in training.
-        let coloured = cloud.colours[i].iter().all(|c| c.is_finite());
-        if let Some((view, radius)) = seen.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|_| coloured) {
+        if let Some((view, radius)) = seen.min_by(|a, b| a.1.total_cmp(&b.1)) {
             keep.positions.push(cloud.positions[i]);
             keep.colours.push(cloud.colours[i]);
             keep.confidence.push(cloud.confidence[i]);

@@ -3,11 +3,14 @@
 use splatvk::gpu::{Device, Recorder};
 use splatvk::pass::bands::Band;
 use splatvk::pass::close::{Distance, Tolerance, compare};
+pub use splatvk::pass::close::{IMAGE, gradient_tolerance};
 use splatvk::pass::params::{Gradients, Params};
 use splatvk::pass::raster_forward::Cutoffs;
 use splatvk::pass::seeded;
 use splatvk::pass::twin::{self, Forward};
-use splatvk::pass::{DeviceChoices, FrameBuffers, RasterOptions, Rasterizer, SplatBuffers, Summation, View};
+use splatvk::pass::{
+    DeviceChoices, FrameBuffers, Grouping, RasterOptions, Rasterizer, SplatBuffers, Summation, View, bin,
+};
 use splatvk::scene::{Camera, Splats};
 
 /// A scene with everything a render needs.
@@ -113,11 +116,6 @@ pub fn rendered(raster: &Rasterizer) -> Rendered {
     }
 }
 
-/// Image bound of docs/method.md#tolerances. A contribution at the α threshold of 1/255 may be counted by one side and
-/// not by the other, which is worth up to 1/255 of a channel value; at most 2 pixels in 10 000 may show that.
-pub const IMAGE: Tolerance =
-    Tolerance { relative_l2: 1e-4, absolute: 1e-4, relative: 1e-5, outliers: 2e-4, outlier_factor: 200.0 };
-
 #[track_caller]
 pub fn assert_close(name: &str, actual: &[f32], reference: &[f64], tolerance: &Tolerance) -> Distance {
     match compare(actual, reference, tolerance) {
@@ -133,20 +131,6 @@ pub fn assert_close(name: &str, actual: &[f32], reference: &[f64], tolerance: &T
 pub fn assert_images(actual: &Rendered, reference: &Forward) {
     assert_close("planes", &actual.planes, &reference.image.planes, &IMAGE);
     assert_close("transmittance", &actual.transmittance, &reference.image.transmittance, &IMAGE);
-}
-
-/// Relative 1e-3 by class in the L2 sense (docs/method.md#tolerances; measured 4e-7 to 4e-6). Single elements are sums
-/// of many terms of both signs, so each is also allowed 2e-3 of the class's root mean square; a contribution at the α
-/// threshold that one side counts and the other does not may push 2 % of the elements of a small class beyond that.
-pub fn gradient_tolerance(reference: &[f64]) -> Tolerance {
-    let rms = (reference.iter().map(|x| x * x).sum::<f64>() / reference.len().max(1) as f64).sqrt();
-    Tolerance {
-        relative_l2: 1e-3,
-        absolute: 2e-3 * rms + 1e-9,
-        relative: 2e-3,
-        outliers: 0.02,
-        outlier_factor: 50.0,
-    }
 }
 
 #[track_caller]
@@ -213,4 +197,28 @@ pub fn in_bands(
     let (splats, features) = gradients.download().unwrap();
     let camera = raster.frame().camera_grad.read().unwrap();
     (image, GpuGradients { splats, features, camera }, bands.count())
+}
+
+/// The lists of both groupings are equal and hold those of the twin, nearest first; how many entries the twin has, and how many
+/// more there are.
+#[track_caller]
+pub fn assert_lists(device: &Device, scene: &Scene) -> (usize, usize) {
+    let forward = scene.twin();
+    let expected = bin::twin(&forward.projected, &forward.order, scene.view.size);
+    let lists = |grouping| {
+        let (params, mut raster) =
+            scene.upload_for(device, DeviceChoices { grouping, ..DeviceChoices::of(device) });
+        raster.forward(&params, &scene.options).unwrap();
+        raster.tile_lists().unwrap()
+    };
+    let counted = lists(Grouping::Counting);
+    assert_eq!(counted, lists(Grouping::Sorting));
+    assert_eq!(counted.len(), expected.len());
+    let mut extra = 0;
+    for (list, expected) in counted.iter().zip(&expected) {
+        let mut rest = list.iter();
+        assert!(expected.iter().all(|i| rest.any(|j| i == j)), "{expected:?} is no subsequence of {list:?}");
+        extra += list.len() - expected.len();
+    }
+    (expected.iter().map(Vec::len).sum(), extra)
 }

@@ -24,14 +24,8 @@ static int run(int argc, char **argv) {
 
     // The photos could as well come from a camera or a socket: they are bytes in memory.
     std::vector<std::vector<unsigned char>> files;
-    std::vector<SvkPhoto> photos;
     for (int i = 3; i < argc; i++) files.push_back(read_file(argv[i]));
-    for (const auto &file : files) {
-        auto photo = make<SvkPhoto>();
-        photo.encoded = file.data();
-        photo.encoded_bytes = file.size();
-        photos.push_back(photo);
-    }
+    const std::vector<SvkPhoto> photos = encoded_photos(files);
     auto options = make<SvkTrainOptions>();
     options.preset = SVK_PRESET_DRAFT;
     options.iterations = options.language_iterations = std::stoul(argv[2]);

@@ -46,6 +46,18 @@ inline std::vector<unsigned char> read_file(const std::string &path) {
     return {std::istreambuf_iterator<char>(file), std::istreambuf_iterator<char>()};
 }
 
+// Photos as files in memory, which must outlive them.
+inline std::vector<SvkPhoto> encoded_photos(const std::vector<std::vector<unsigned char>> &files) {
+    std::vector<SvkPhoto> photos;
+    for (const auto &file : files) {
+        auto photo = make<SvkPhoto>();
+        photo.encoded = file.data();
+        photo.encoded_bytes = file.size();
+        photos.push_back(photo);
+    }
+    return photos;
+}
+
 // Writes RGBA bytes as a binary PPM, which any image program opens; alpha is left out.
 inline void write_ppm(const std::string &path, unsigned width, unsigned height, const unsigned char *rgba) {
     std::ofstream file(path, std::ios::binary);

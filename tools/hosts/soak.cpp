@@ -226,13 +226,7 @@ static void once(const Job &job, int number, std::mt19937 &random, long &longest
         check(svk_context_create(nullptr, &made), made);
     }
     Context context(made);
-    std::vector<SvkPhoto> photos;
-    for (const auto &file : job.files) {
-        auto photo = make<SvkPhoto>();
-        photo.encoded = file.data();
-        photo.encoded_bytes = file.size();
-        photos.push_back(photo);
-    }
+    const std::vector<SvkPhoto> photos = encoded_photos(job.files);
     auto options = make<SvkTrainOptions>();
     options.preset = SVK_PRESET_DRAFT;
     options.seed = random();

@@ -1,12 +1,13 @@
 //! Rendering forward and backward, and what reads a rendered frame.
 use crate::support::{
-    IMAGE, Scene, assert_class, assert_close, assert_gradients, assert_images, in_bands, rendered,
+    IMAGE, Scene, assert_class, assert_close, assert_gradients, assert_images, assert_lists, in_bands,
+    rendered,
 };
 use splatvk::gpu::{Device, Recorder};
 use splatvk::pass::pack::{Encoding, FrameChannel, texels, texels_of};
 use splatvk::pass::raster_forward::{Cutoffs, TwinScene, walk};
 use splatvk::pass::seeded::{self, Random};
-use splatvk::pass::{DeviceChoices, FeatureMode, Grouping, Rasterizer, Summation, bin};
+use splatvk::pass::{DeviceChoices, FeatureMode, Rasterizer, Summation};
 use splatvk::pass::{decode as decoding, pack as packing, pairs as counting};
 
 /// Splats over 27 × 19 pixels: 4 × 3 tiles, those on two borders partial.
@@ -110,25 +111,7 @@ pub fn gradients_by_entry(device: &Device) {
 
 /// Tile lists in both ways, against the twin's.
 pub fn lists_by_counting(device: &Device) {
-    let scene = scene(60, 0, 0, 1044);
-    let forward = scene.twin();
-    let expected = bin::twin(&forward.projected, &forward.order, scene.view.size);
-    let lists = |grouping| {
-        let (params, mut raster) =
-            scene.upload_for(device, DeviceChoices { grouping, ..DeviceChoices::of(device) });
-        raster.forward(&params, &scene.options).unwrap();
-        raster.tile_lists().unwrap()
-    };
-    let counted = lists(Grouping::Counting);
-    assert_eq!(counted, lists(Grouping::Sorting));
-    assert_eq!(counted.len(), expected.len());
-    let mut extra = 0;
-    for (list, expected) in counted.iter().zip(&expected) {
-        let mut rest = list.iter();
-        assert!(expected.iter().all(|i| rest.any(|j| i == j)), "{expected:?} is no subsequence of {list:?}");
-        extra += list.len() - expected.len();
-    }
-    let total: usize = expected.iter().map(Vec::len).sum();
+    let (total, extra) = assert_lists(device, &scene(60, 0, 0, 1044));
     assert!(total > 50 && extra * 20 < total, "{extra} of {total}");
 }
 
