@@ -4,7 +4,7 @@ use super::print::{print, print_json};
 use super::progress;
 use crate::format::{Replaced, Workspace};
 use crate::synth::regions::InjectedErrors;
-use crate::synth::{self, Effects, SceneSpec};
+use crate::synth::{self, Effects, SceneSpec, Spoil};
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -75,19 +75,21 @@ fn spec(args: &GenerateArgs) -> Result<SceneSpec> {
         photo_noise: args.photo_noise.unwrap_or(usual),
         outdoor: args.outdoor,
         effects,
+        spoil: args.spoil,
     })
 }
 
 /// `--phone` turns everything on; the single flags say the rest.
 fn effects(args: &GenerateArgs) -> Effects {
     let phone = if args.phone { Effects::PHONE } else { Effects::default() };
+    let swapped = args.spoil == Some(Spoil::SwappedExif);
     Effects {
-        focal: args.focal || phone.focal,
+        focal: args.focal || phone.focal || swapped,
         lens: args.lens || phone.lens,
         centre: args.centre || phone.centre,
         light: args.light || phone.light,
         sensor_noise: args.sensor_noise || phone.sensor_noise,
         jpeg: args.jpeg.or(phone.jpeg),
-        two_cameras: args.two_cameras,
+        two_cameras: args.two_cameras || swapped,
     }
 }

@@ -51,13 +51,35 @@ pub fn write_mask_png(path: &Path, plane: &Plane<bool>) -> Result<()> {
     write_bytes(path, (plane.width, plane.height), &bytes, image::ExtendedColorType::L8)
 }
 
-/// JPEG or PNG bytes for embedding in a page.
-pub fn jpeg_bytes(image: &RgbImage, quality: u8) -> Result<Vec<u8>> {
+/// How a JPEG is written.
+#[derive(Clone, Debug)]
+pub struct Jpeg {
+    /// 1 to 100.
+    pub quality: u8,
+    /// A raw EXIF block.
+    pub exif: Option<Vec<u8>>,
+}
+
+impl From<u8> for Jpeg {
+    fn from(quality: u8) -> Jpeg {
+        Jpeg { quality, exif: None }
+    }
+}
+
+/// The bytes of a JPEG file; `jpeg` is its quality where nothing else is to be said.
+pub fn jpeg_bytes(image: &RgbImage, jpeg: impl Into<Jpeg>) -> Result<Vec<u8>> {
+    use image::ImageEncoder;
+    let Jpeg { quality, exif } = jpeg.into();
     let bytes: Vec<u8> = image.data.iter().flat_map(|c| c.map(to_byte)).collect();
+    let failed = |e: &dyn std::fmt::Display| Error::work(format!("cannot encode a JPEG: {e}"));
     let mut out = Vec::new();
-    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut out, quality)
+    let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut out, quality);
+    if let Some(exif) = exif {
+        encoder.set_exif_metadata(exif).map_err(|e| failed(&e))?;
+    }
+    encoder
         .encode(&bytes, image.width as u32, image.height as u32, image::ExtendedColorType::Rgb8)
-        .map_err(|e| Error::work(format!("cannot encode a JPEG: {e}")))?;
+        .map_err(|e| failed(&e))?;
     Ok(out)
 }
 

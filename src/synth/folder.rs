@@ -1,9 +1,11 @@
 //! Synthetic scenes on disk, in the layout of a ground-truth folder.
 use super::outdoor::Sky;
+use super::photos::{self, Photos};
 use super::regions::{self, InjectedErrors};
 use super::render::{self, RayCast};
-use super::scene::{SceneSpec, SyntheticScene, build_scene};
+use super::scene::{SceneSpec, SyntheticScene};
 use crate::format::npy::{self, NpyArray, NpyData};
+use crate::format::picture::Jpeg;
 use crate::format::{cameras, create_folder, picture, write_json};
 use crate::progress::Progress;
 use crate::query::eval::{GroundTruth, Split, TruthFrame};
@@ -49,7 +51,7 @@ pub fn generate(
     flaws: &InjectedErrors,
     progress: &dyn Progress,
 ) -> Result<()> {
-    let scene = build_scene(spec)?;
+    let scene = photos::build(spec)?;
     for name in ["images", "held_out", "depth", "masks"] {
         create_folder(&folder.join(name))?;
     }
@@ -78,14 +80,15 @@ fn write_views(
     // Held-out views show what is there, not what a phone would make of it.
     let held_out_noise = if spec.effects.any() { 0.0 } else { spec.photo_noise };
     progress.begin("render", (scene.photo_effects.len() + scene.test.len()) as u64);
+    let shown = Photos::new(scene, spec)?;
     let mut frames = Vec::new();
     for i in 0..scene.photo_effects.len() + scene.test.len() {
         progress.check()?;
         let seed = spec.seed.wrapping_add(i as u64);
         frames.push(match scene.photo_effects.get(i) {
             Some(effects) => {
-                let seen = render::photo(scene, effects, spec.photo_noise, seed);
-                let file = write_view(folder, &effects.camera, Split::Train, &seen, quality)?;
+                let jpeg = Jpeg { quality, exif: shown.exif(i)? };
+                let file = write_view(folder, &effects.camera, Split::Train, &shown.render(i, seed), jpeg)?;
                 let mut frame = frame_json(&effects.camera, Split::Train, &file);
                 if let Some(lens) = &effects.lens {
                     frame["lens"] = json!(lens);
@@ -98,7 +101,8 @@ fn write_views(
             None => {
                 let camera = &scene.test[i - scene.photo_effects.len()];
                 let seen = render::render(scene, camera, held_out_noise, seed);
-                let file = write_view(folder, camera, Split::Test, &seen, QUALITY)?;
+                let file =
+                    write_view(folder, camera, Split::Test, &seen, Jpeg { quality: QUALITY, exif: None })?;
                 frame_json(camera, Split::Test, &file)
             }
         });
@@ -119,11 +123,11 @@ pub fn write_regions(data: &Path, out: &Path, flaws: &InjectedErrors) -> Result<
     Ok(())
 }
 
-fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &RayCast, quality: u8) -> Result<String> {
+fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &RayCast, jpeg: Jpeg) -> Result<String> {
     let place = if split == Split::Train { "images" } else { "held_out" };
     let (name, file) = (&camera.name, format!("{place}/{}.jpg", camera.name));
     let path = folder.join(&file);
-    std::fs::write(&path, picture::jpeg_bytes(&seen.image, quality)?).map_err(Error::unwritable(&path))?;
+    std::fs::write(&path, picture::jpeg_bytes(&seen.image, jpeg)?).map_err(Error::unwritable(&path))?;
     let shape = vec![seen.depth.height, seen.depth.width];
     let depth = NpyData::F16(seen.depth.data.iter().map(|z| f16::from_f32(*z)).collect());
     let path = folder.join("depth").join(format!("{name}.npz"));
@@ -149,7 +153,7 @@ mod tests {
     use super::*;
     use crate::progress::Silent;
     use crate::scene::Lens;
-    use crate::synth::Effects;
+    use crate::synth::{Effects, build_scene};
     use glam::DVec2;
 
     #[test]

@@ -2,10 +2,12 @@
 mod folder;
 mod outdoor;
 mod phone;
+mod photos;
 pub mod regions;
 mod render;
 mod scene;
 mod shapes;
+mod spoil;
 
 pub use folder::{generate, is_generated, write_regions};
 pub use outdoor::Sky;
@@ -13,3 +15,4 @@ pub use phone::{Effects, PhotoEffects, TrueLight, to_linear, to_srgb};
 pub use render::{RayCast, photo, render};
 pub use scene::{SceneSpec, SyntheticScene, build_scene};
 pub use shapes::{Hit, Paint, SceneObject, Shape};
+pub use spoil::Spoil;

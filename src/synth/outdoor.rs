@@ -24,7 +24,10 @@ impl Sky {
 
     pub(super) fn new(random: &mut Random) -> Sky {
         // Clouds of 15° and less, too faint for most detectors of corners.
-        Sky { label: 3, clouds: Paint { colour: [1.0; 3], contrast: 0.08, grain: 0.26, seed: random.bits() } }
+        Sky {
+            label: 3,
+            clouds: Paint { colour: [1.0; 3], contrast: 0.08, grain: 0.26, seed: random.bits(), tile: None },
+        }
     }
 
     /// sRGB colour towards a direction: pale at the horizon, blue above.

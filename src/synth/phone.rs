@@ -247,7 +247,7 @@ mod tests {
             let pixel = DVec2::new(20.0 + 40.0 * f64::from(i), 20.0 + 40.0 * f64::from(j));
             let at = to_world.transform(lens.ray(camera, pixel));
             let radius = 10.0 / camera.fx;
-            let paint = Paint { colour: [1.0; 3], contrast: 0.0, grain: 1.0, seed: 0 };
+            let paint = Paint { colour: [1.0; 3], contrast: 0.0, grain: 1.0, seed: 0, tile: None };
             objects.push(SceneObject {
                 label: 1,
                 phrase: "disc".into(),

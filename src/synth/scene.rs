@@ -3,6 +3,7 @@
 use super::outdoor::{self, Sky};
 use super::phone::{self, Effects, PhotoEffects};
 use super::shapes::{SceneObject, Shape, paint};
+use super::spoil::Spoil;
 use crate::math::Random;
 use crate::scene::{Camera, Pose};
 use crate::{Error, Result};
@@ -42,6 +43,9 @@ pub struct SceneSpec {
     pub outdoor: bool,
     /// Effects of a phone camera on the photos; held-out views then are clean.
     pub effects: Effects,
+    /// What is wrong with the photos.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub spoil: Option<Spoil>,
 }
 
 impl Default for SceneSpec {
@@ -62,6 +66,7 @@ impl Default for SceneSpec {
             photo_noise: 0.005,
             outdoor: false,
             effects: Effects::default(),
+            spoil: None,
         }
     }
 }
@@ -98,7 +103,7 @@ const NOUNS: [&str; 6] = ["ball", "box", "can", "book", "brick", "drum"];
 
 impl SceneSpec {
     /// Metres from the cameras to the middle of the scene, about.
-    fn unit(&self) -> f64 {
+    pub(super) fn unit(&self) -> f64 {
         if self.outdoor { outdoor::SCALE } else { 1.0 }
     }
 

@@ -102,6 +102,8 @@ pub struct Paint {
     pub grain: f64,
     /// Distinguishes patterns.
     pub seed: u64,
+    /// Side of the tile after which the pattern begins anew, metres; `None`: it never does.
+    pub tile: Option<f64>,
 }
 
 /// An object with a name.
@@ -119,7 +121,7 @@ pub struct SceneObject {
 
 /// A surface with a pattern of its own.
 pub(super) fn paint(colour: [f64; 3], contrast: f64, grain: f64, random: &mut Random) -> Paint {
-    Paint { colour, contrast, grain, seed: random.bits() }
+    Paint { colour, contrast, grain, seed: random.bits(), tile: None }
 }
 
 /// A number in [−1, 1] that belongs to a cell.
@@ -154,6 +156,7 @@ impl Paint {
     pub fn at(&self, place: DVec3) -> [f64; 3] {
         // Off the faces of solids that lie on a cell border, where rounding would draw noise.
         let p = place + DVec3::new(0.000_31, 0.000_17, 0.000_23);
+        let p = self.tile.map_or(p, |side| p.map(|v| v.rem_euclid(side)));
         self.with_pattern(p, cell)
     }
 

@@ -2,7 +2,8 @@
 use super::shared::DeviceArgs;
 use crate::ablate::{Layout, TABLES};
 use crate::query::protocol::ProtocolKind;
-use clap::builder::{PossibleValue, PossibleValuesParser};
+use crate::synth::Spoil;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 
@@ -10,6 +11,14 @@ fn tables() -> PossibleValuesParser {
     let all = PossibleValue::new("all").help("Every table, shared stages once");
     let each = TABLES.iter().map(|t| PossibleValue::new(t.name).help(t.about));
     PossibleValuesParser::new(std::iter::once(all).chain(each))
+}
+
+fn spoils() -> impl TypedValueParser<Value = Spoil> {
+    let each = Spoil::ALL.iter().map(|(_, name, about)| PossibleValue::new(*name).help(*about));
+    PossibleValuesParser::new(each).try_map(|given| {
+        let known = Spoil::ALL.iter().find(|(_, name, _)| *name == given);
+        known.map(|(spoil, ..)| *spoil).ok_or("no such way")
+    })
 }
 
 /// Layouts of data sets.
@@ -183,6 +192,9 @@ pub struct GenerateArgs {
     /// ask for them
     #[arg(long)]
     pub two_cameras: bool,
+    /// Photos of which no right scene, or only part of one, can be made
+    #[arg(long, value_name = "WAY", value_parser = spoils())]
+    pub spoil: Option<Spoil>,
     /// regions_flawed/: rate of masks cut in two
     #[arg(long, default_value_t = 0.2, value_name = "RATE")]
     pub split: f64,
