@@ -226,3 +226,146 @@ fn bad_videos_are_one_line() {
     std::fs::write(folder.path().join("list.mp4"), list).unwrap();
     refuse(&folder.path().join("list.mp4"), &["list.mp4", "cannot be read"]);
 }
+
+/// Upper left, upper right, lower left, lower right of the pictures below.
+const QUADRANTS: [[u8; 3]; 4] = [[230, 40, 40], [40, 200, 60], [30, 60, 220], [240, 240, 240]];
+
+/// An upright picture of four colours, in its own kind of pixels.
+fn quadrants(kind: &str, (w, h): (u32, u32)) -> image::DynamicImage {
+    use image::{DynamicImage, RgbImage};
+    let at = |x: u32, y: u32| QUADRANTS[usize::from(2 * x >= w) + 2 * usize::from(2 * y >= h)];
+    if kind.contains("luma8") {
+        // Of a picture of 108 megapixels not three bytes per pixel.
+        let grey = |x, y| image::Luma([at(x, y)[0]]);
+        return image::GrayImage::from_fn(w, h, grey).into();
+    }
+    let rgb = DynamicImage::from(RgbImage::from_fn(w, h, |x, y| image::Rgb(at(x, y))));
+    match kind {
+        "rgba8" => rgb.to_rgba8().into(),
+        "rgb16" => rgb.to_rgb16().into(),
+        "rgba16" => rgb.to_rgba16().into(),
+        "lumaa8" => quadrants("luma8", (w, h)).to_luma_alpha8().into(),
+        "luma16" => quadrants("luma8", (w, h)).to_luma16().into(),
+        _ => rgb,
+    }
+}
+
+/// Writes a picture so that only its EXIF orientation makes it upright.
+fn write_turned(path: &Path, upright: &image::DynamicImage, orientation: u8) {
+    use exif::{Field, In, Tag, Value, experimental::Writer};
+    use image::ImageEncoder;
+    let mut writer = Writer::new();
+    let field = Field {
+        tag: Tag::Orientation,
+        ifd_num: In::PRIMARY,
+        value: Value::Short(vec![u16::from(orientation)]),
+    };
+    writer.push_field(&field);
+    let mut raw = std::io::Cursor::new(Vec::new());
+    writer.write(&mut raw, false).unwrap();
+    let mut stored = upright.clone();
+    let inverse = match orientation {
+        6 => 8,
+        8 => 6,
+        other => other,
+    };
+    stored.apply_orientation(image::metadata::Orientation::from_exif(inverse).unwrap());
+    let file = std::io::BufWriter::new(std::fs::File::create(path).unwrap());
+    let (bytes, w, h, colour) = (stored.as_bytes(), stored.width(), stored.height(), stored.color().into());
+    if path.extension().unwrap() == "png" {
+        let mut encoder = image::codecs::png::PngEncoder::new(file);
+        encoder.set_exif_metadata(raw.into_inner()).unwrap();
+        encoder.write_image(bytes, w, h, colour).unwrap();
+    } else {
+        let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(file, 95);
+        encoder.set_exif_metadata(raw.into_inner()).unwrap();
+        encoder.write_image(bytes, w, h, colour).unwrap();
+    }
+}
+
+/// Loads a picture of four colours, and holds it against what it is.
+fn check_quadrants(path: &Path, kind: &str, (w, h): (u32, u32)) {
+    let named = format!("{} {w} × {h}", path.display());
+    let photo = match photo::load(path) {
+        Ok(photo) => photo,
+        Err(error) => {
+            let text = error.to_string();
+            assert!(w.min(h) < photo::SMALLEST_SIDE as u32, "{named}: {text}");
+            assert!(
+                error.exit_code() == 2 && text.lines().count() == 1 && text.contains("too few"),
+                "{text}"
+            );
+            return;
+        }
+    };
+    assert!(w.min(h) >= photo::SMALLEST_SIDE as u32, "{named}");
+    assert_eq!(photo.original_size, (w, h), "{named}");
+    let (pw, ph) = (photo.image.width, photo.image.height);
+    // The longer side is capped, as far as the shorter one keeps what the networks need.
+    let fits = pw.max(ph) <= photo::MAX_SIZE || pw.min(ph) == photo::SMALLEST_SIDE;
+    assert!(fits && pw.min(ph) >= photo::SMALLEST_SIDE, "{named}: {pw} × {ph}");
+    for (k, colour) in QUADRANTS.into_iter().enumerate() {
+        let expected = if kind.contains("luma") { [colour[0]; 3] } else { colour };
+        let seen = photo.image.at(pw / 4 + k % 2 * (pw / 2), ph / 4 + k / 2 * (ph / 2)).map(|v| 255.0 * v);
+        let off = (0..3).map(|c| (seen[c] - f32::from(expected[c])).abs()).fold(0.0, f32::max);
+        assert!(off < 4.0, "{named}, quadrant {k}: {seen:?}, expected {expected:?}");
+    }
+}
+
+#[test]
+fn photos_of_every_size_kind_and_orientation_are_upright_or_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let sizes = [(1, 1), (1, 4000), (63, 64), (64, 64), (65, 4096), (4099, 67), (640, 481), (2001, 1203)];
+    let kinds = [
+        "rgb8.png",
+        "rgba8.png",
+        "rgb16.png",
+        "rgba16.png",
+        "luma8.png",
+        "lumaa8.png",
+        "luma16.png",
+        "rgb8.jpg",
+        "luma8.jpg",
+    ];
+    for (i, size) in sizes.into_iter().enumerate() {
+        for (j, file) in kinds.into_iter().enumerate() {
+            // Every size meets every kind; with nine kinds all eight orientations come to each size and to each kind.
+            let orientation = 1 + (i + j) as u8 % 8;
+            let (kind, _) = file.split_once('.').unwrap();
+            let path = folder.path().join(format!("{i}-{orientation}-{file}"));
+            write_turned(&path, &quadrants(kind, size), orientation);
+            check_quadrants(&path, kind, size);
+        }
+    }
+    // 108 megapixels, as the largest sensors of phones give them.
+    let path = folder.path().join("large-luma8.jpg");
+    write_turned(&path, &quadrants("luma8", (12_000, 9_000)), 6);
+    check_quadrants(&path, "luma8", (12_000, 9_000));
+}
+
+#[test]
+fn colours_are_those_of_the_files_profile() {
+    use image::ImageEncoder;
+    let folder = tempfile::tempdir().unwrap();
+    let icc = moxcms::ColorProfile::new_display_p3().encode().unwrap();
+    let picture = quadrants("rgb8", (128, 96));
+    let mut seen = Vec::new();
+    for (name, profile) in [("plain.jpg", None), ("p3.jpg", Some(&icc)), ("p3.png", Some(&icc))] {
+        let path = folder.path().join(name);
+        let file = std::fs::File::create(&path).unwrap();
+        let (bytes, colour) = (picture.as_bytes(), picture.color().into());
+        if name.ends_with("png") {
+            let mut encoder = image::codecs::png::PngEncoder::new(file);
+            profile.into_iter().for_each(|icc| encoder.set_icc_profile(icc.clone()).unwrap());
+            encoder.write_image(bytes, 128, 96, colour).unwrap();
+        } else {
+            let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(file, 95);
+            profile.into_iter().for_each(|icc| encoder.set_icc_profile(icc.clone()).unwrap());
+            encoder.write_image(bytes, 128, 96, colour).unwrap();
+        }
+        seen.push(photo::load(&path).unwrap().image.at(96, 24).map(|v| 255.0 * v));
+    }
+    // The green of Display P3 has less red in sRGB: none, since it lies outside.
+    assert!((seen[0][0] - 40.0).abs() < 4.0 && seen[1][0] < 4.0 && seen[2][0] < 1.0, "{seen:?}");
+    assert!((seen[1][1] - seen[2][1]).abs() < 4.0, "{seen:?}");
+}

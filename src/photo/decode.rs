@@ -2,6 +2,7 @@
 use super::exif_tags::{Lens, lens};
 use super::heif;
 use super::kind::{FileKind, LARGEST_DECODED, READ, TOO_LARGE, check_pixels, kind};
+use super::profile;
 use crate::scene::to_srgb;
 use crate::{Error, Result, files};
 use image::metadata::Orientation;
@@ -31,6 +32,14 @@ impl Decoded {
                 | Orientation::Rotate270FlipH
         );
         Decoded { pixels, orientation, premultiplied, size: if sideways { (h, w) } else { (w, h) }, lens }
+    }
+
+    /// The same with the colours that an ICC profile gives the stored numbers.
+    fn in_srgb(self, icc: Option<Vec<u8>>) -> Decoded {
+        match icc {
+            Some(icc) => Decoded { pixels: profile::to_srgb(self.pixels, &icc), ..self },
+            None => self,
+        }
     }
 
     /// Upright pixel as sRGB; alpha composited on black. 1 is the white of an 8- or 16-bit file; floating-point files
@@ -99,12 +108,15 @@ pub(super) fn decode(bytes: Vec<u8>, path: &Path) -> Result<Decoded> {
         return Err(fail("the file is empty (0 bytes); copy the photo again"));
     }
     match kind(&bytes, path) {
-        FileKind::Image(format) => coded(bytes, format).map_err(|what| fail(&what)),
+        FileKind::Image(format) => {
+            let (decoded, icc) = coded(bytes, format).map_err(|what| fail(&what))?;
+            Ok(decoded.in_srgb(icc))
+        }
         FileKind::Heif => match heif::decode(&bytes) {
-            Ok(heif::Image { pixels, exif }) => {
+            Ok(heif::Image { pixels, exif, icc }) => {
                 let size = (pixels.width(), pixels.height());
                 let lens = exif.map(|raw| lens(raw, size)).unwrap_or_default();
-                Ok(Decoded::new(pixels, Orientation::NoTransforms, false, lens))
+                Ok(Decoded::new(pixels, Orientation::NoTransforms, false, lens).in_srgb(icc))
             }
             Err(heif::Failure::Input(what)) => Err(fail(&what)),
             Err(heif::Failure::Missing(what)) => Err(Error::missing(named(&what))),
@@ -120,13 +132,13 @@ pub fn stored_pixels(path: &Path) -> Result<DynamicImage> {
     let bytes = files::read(path)?;
     let named = |what: &str| Error::input(format!("{}: {what}", path.display()));
     match kind(&bytes, path) {
-        FileKind::Image(format) => coded(bytes, format).map(|d| d.pixels).map_err(|what| named(&what)),
+        FileKind::Image(format) => coded(bytes, format).map(|(d, _)| d.pixels).map_err(|what| named(&what)),
         _ => Err(named("cannot be read as an image; give a PNG")),
     }
 }
 
-/// A file that the `image` crate reads; the error is one line without the file's name.
-fn coded(bytes: Vec<u8>, format: ImageFormat) -> Result<Decoded, String> {
+/// A file that the `image` crate reads and its ICC profile; the error is one line without the file's name.
+fn coded(bytes: Vec<u8>, format: ImageFormat) -> Result<(Decoded, Option<Vec<u8>>), String> {
     if format == ImageFormat::Jpeg && !jpeg_is_complete(&bytes) {
         return Err("the JPEG is cut off before its end; copy the photo again".to_owned());
     }
@@ -152,8 +164,9 @@ fn coded(bytes: Vec<u8>, format: ImageFormat) -> Result<Decoded, String> {
     if decoder.total_bytes() > LARGEST_DECODED {
         return Err(TOO_LARGE.to_owned());
     }
+    let icc = decoder.icc_profile().ok().flatten();
     let pixels = DynamicImage::from_decoder(decoder).map_err(reason)?;
-    Ok(Decoded::new(pixels, orientation, premultiplied, lens))
+    Ok((Decoded::new(pixels, orientation, premultiplied, lens), icc))
 }
 
 fn reason(e: ImageError) -> String {

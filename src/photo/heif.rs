@@ -90,6 +90,8 @@ functions! {
     heif_image_handle_get_list_of_metadata_block_IDs: fn(Pointer, *const c_char, *mut u32, c_int) -> c_int;
     heif_image_handle_get_metadata_size: fn(Pointer, u32) -> usize;
     heif_image_handle_get_metadata: fn(Pointer, u32, *mut c_void) -> Status;
+    heif_image_handle_get_raw_color_profile_size: fn(Pointer) -> usize;
+    heif_image_handle_get_raw_color_profile: fn(Pointer, *mut c_void) -> Status;
     heif_decode_image: fn(Pointer, *mut Pointer, c_int, c_int, *const c_void) -> Status;
     heif_image_release: fn(Pointer);
     heif_image_get_width: fn(Pointer, c_int) -> c_int;
@@ -148,6 +150,8 @@ pub(super) struct Image {
     pub pixels: DynamicImage,
     /// TIFF bytes of the EXIF block.
     pub exif: Option<Vec<u8>>,
+    /// The ICC profile.
+    pub icc: Option<Vec<u8>>,
 }
 
 /// Why there is no image: something to install, or something about the file. One line without the file's name.
@@ -177,7 +181,8 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Image, Failure> {
         let decode = api.heif_decode_image;
         check(api, decode(handle.pointer, &mut image, COLORSPACE_RGB, shape.chroma(), ptr::null()))?;
         let image = owned(image, api.heif_image_release);
-        Ok(Image { pixels: shape.copy(api, image.pointer)?, exif: exif(api, handle.pointer) })
+        let (exif, icc) = (exif(api, handle.pointer), icc(api, handle.pointer));
+        Ok(Image { pixels: shape.copy(api, image.pointer)?, exif, icc })
     }
 }
 
@@ -300,6 +305,22 @@ impl HeifLayout {
     }
 }
 
+/// Bytes of a block of metadata. In JPEG they have 64 KiB at most; more than this is damage.
+const LARGEST_BLOCK: usize = 16 << 20;
+
+unsafe fn icc(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
+    // SAFETY: the caller's valid handle; the profile's own size is allocated.
+    unsafe {
+        let size = (api.heif_image_handle_get_raw_color_profile_size)(handle);
+        if !(1..=LARGEST_BLOCK).contains(&size) {
+            return None;
+        }
+        let mut profile = vec![0u8; size];
+        let got = (api.heif_image_handle_get_raw_color_profile)(handle, profile.as_mut_ptr().cast());
+        (got.code == 0).then_some(profile)
+    }
+}
+
 /// The first EXIF block. It begins with the distance of the TIFF header from the end of these four bytes.
 unsafe fn exif(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
     let mut id = 0u32;
@@ -310,8 +331,7 @@ unsafe fn exif(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
             return None;
         }
         let size = (api.heif_image_handle_get_metadata_size)(handle, id);
-        // 16 MiB: EXIF in JPEG has 64 KiB at most; more is damage.
-        if size > 16 << 20 {
+        if size > LARGEST_BLOCK {
             return None;
         }
         let mut block = vec![0u8; size];

@@ -7,6 +7,7 @@ mod exif_tags;
 mod heif;
 mod kind;
 pub mod light;
+mod profile;
 mod read;
 mod resize;
 mod sizes;

@@ -2,7 +2,7 @@
 //! together show what all show.
 use super::matching::{Keypoints, mutual_matches, valid_area};
 use super::overlap::{self, SimilarityInliers};
-use super::sift;
+use super::{sharpness, sift};
 use crate::Result;
 use crate::photo::{self, Candidate, PlainBorder};
 use crate::progress::Progress;
@@ -10,8 +10,6 @@ use crate::scene::RgbImage;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Long side at which sharpness is judged: near the working resolution, so that what is blurred there is blurred here.
-const SHARPNESS_SIDE: usize = 1000;
 /// Long side at which corners are matched: enough to measure overlap, and cheap enough for a hundred photos.
 const FEATURE_SIDE: usize = 320;
 /// Corners per photo. Matching costs their square: 5 ms a pair.
@@ -32,9 +30,6 @@ const HALF_SEEN: f64 = 40.0;
 const SAME_PLACE: f64 = 0.006;
 /// Of the fewer corners of two, the share that must match for them to show nearly the same.
 const SAME_SHARE: f64 = 0.35;
-/// Sharpness below this share of the median is blur. A photo in focus keeps 0.68 under a Gaussian of 0.7 px at the scale
-/// judged, 0.53 under 1 px and 0.36 under 1.5 px; photos in focus of one place differ by up to 0.7 in what they show.
-const BLURRED: f64 = 0.6;
 
 /// What was chosen and why, for messages and run.json.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
@@ -158,7 +153,7 @@ struct CandidateFeatures {
 
 impl CandidateFeatures {
     fn of(image: &RgbImage) -> CandidateFeatures {
-        let sharpness = sharpness(image);
+        let sharpness = sharpness::of(image);
         let scale = (FEATURE_SIDE as f64 / image.width.max(image.height) as f64).min(1.0);
         let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
         let small = image.resized_by_area(to(image.width), to(image.height));
@@ -173,25 +168,6 @@ impl CandidateFeatures {
     }
 }
 
-/// How much fine detail there is for the coarse detail there is: the energy of the gradient that a slight blur takes away,
-/// over the energy that it leaves. A ratio within one photo, so contrast and exposure cancel.
-fn sharpness(image: &RgbImage) -> f64 {
-    let fine = image.luma();
-    // Two blurs three quarters of an octave apart; the first takes the noise of single pixels away.
-    let (a, b) = (sift::blurred(&fine, 0.7), sift::blurred(&fine, 1.4));
-    let energy = |p: &crate::scene::Plane<f32>| -> f64 {
-        (0..(p.height - 1) * p.width)
-            .filter(|i| i % p.width + 1 < p.width)
-            .map(|i| {
-                let (dx, dy) = (p.data[i + 1] - p.data[i], p.data[i + p.width] - p.data[i]);
-                (dx * dx + dy * dy) as f64
-            })
-            .sum()
-    };
-    let (before, after) = (energy(&a), energy(&b));
-    (before - after).max(0.0) / after.max(1e-12)
-}
-
 /// Indices of the chosen candidates in order, and the reasons. Deterministic.
 pub fn choose(
     candidates: &[Candidate],
@@ -202,7 +178,7 @@ pub fn choose(
     let done = AtomicU64::new(0);
     let look = |c: &Candidate| {
         progress.check()?;
-        let seen = c.thumbnail(SHARPNESS_SIDE, progress)?.map(|image| CandidateFeatures::of(&image));
+        let seen = c.thumbnail(sharpness::SIDE, progress)?.map(|image| CandidateFeatures::of(&image));
         progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
         Ok(seen)
     };
@@ -388,7 +364,7 @@ impl Graph {
     }
 
     fn reason(&self, i: usize, chosen: &[usize], names: &[String]) -> Reason {
-        if self.quality[i] < BLURRED {
+        if self.quality[i] < sharpness::BLURRED {
             return Reason::Blurred;
         }
         if let Some(&j) = chosen.iter().find(|&&j| self.same[i][j]) {

@@ -2,6 +2,7 @@
 use super::choose::LeftOut;
 use super::confidence::{DOUBTFUL, DOUBTFUL_ROTATION, UNSURE_FOCAL};
 use super::leave_out::{self, Placed};
+use super::sharpness::warn_of_blur;
 use super::stereo::{self, StereoOptions};
 use super::{Geometry, Keypoints, SparseModel, light, sfm};
 use crate::gpu::Device;
@@ -34,6 +35,7 @@ pub fn place(
     seed: u64,
     progress: &dyn Progress,
 ) -> Result<SolvedCameras> {
+    warn_of_blur(&photos, progress);
     let features = learned_features(&photos, registry, progress)?;
     let Placed { photos, model, left_out } = match cameras {
         Some(known) => {

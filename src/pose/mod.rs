@@ -18,6 +18,7 @@ pub mod relative;
 mod resect;
 mod segments;
 pub mod sfm;
+mod sharpness;
 mod sift;
 pub mod stereo;
 #[cfg(test)]

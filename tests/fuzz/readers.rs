@@ -221,13 +221,14 @@ pub fn all() -> Vec<Reader> {
         Reader::new("3dovs", seeds::ovs(), |f| labelled(ProtocolKind::Ovs, f)),
         Reader::new("scannet", seeds::scannet(), |f| labelled(ProtocolKind::ScanNet, f)),
     ];
-    let photos: [(&str, Vec<Seed>, fn(&Path) -> Result<()>); 6] = [
+    let photos: [(&str, Vec<Seed>, fn(&Path) -> Result<()>); 7] = [
         ("png", vec![seeds::picture("a.png")], |f| photo_of(f, "a.png")),
         ("jpeg", vec![seeds::picture("a.jpg")], |f| photo_of(f, "a.jpg")),
         ("webp", vec![seeds::picture("a.webp")], |f| photo_of(f, "a.webp")),
         ("tiff", vec![seeds::picture("a.tif")], |f| photo_of(f, "a.tif")),
         ("exr", vec![seeds::picture("a.exr")], |f| photo_of(f, "a.exr")),
         ("exif", vec![seeds::exif("a.png")], |f| photo_of(f, "a.png")),
+        ("icc", vec![seeds::icc("a.png")], |f| photo_of(f, "a.png")),
     ];
     let labels = ["ground-truth", "lerf", "3dovs", "scannet"];
     all.iter_mut().filter(|r| labels.contains(&r.name)).for_each(|r| r.room = Limits::LABELS_ROOM);

@@ -393,7 +393,7 @@ pub fn picture(name: &str) -> Seed {
     let mut out = Cursor::new(Vec::new());
     let image = DynamicImage::from(pixels());
     match name {
-        "a.png" => return inside(name, png_with(Some(exif_block())), CHUNKS),
+        "a.png" => return inside(name, png_with(Some(exif_block()), None), CHUNKS),
         "a.jpg" => {
             let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut out, 80);
             encoder.set_exif_metadata(exif_block()).unwrap();
@@ -406,11 +406,14 @@ pub fn picture(name: &str) -> Seed {
     file(name, out.into_inner())
 }
 
-fn png_with(exif: Option<Vec<u8>>) -> Vec<u8> {
+fn png_with(exif: Option<Vec<u8>>, icc: Option<Vec<u8>>) -> Vec<u8> {
     let mut out = Vec::new();
     let mut encoder = image::codecs::png::PngEncoder::new(&mut out);
     if let Some(block) = exif {
         encoder.set_exif_metadata(block).unwrap();
+    }
+    if let Some(profile) = icc {
+        encoder.set_icc_profile(profile).unwrap();
     }
     encoder.write_image(&pixels(), 64, 64, image::ExtendedColorType::Rgb8).unwrap();
     out
@@ -437,5 +440,16 @@ fn exif_block() -> Vec<u8> {
 
 /// The tags of a photo are damaged, the photo is not.
 pub fn exif(name: &str) -> Seed {
-    inside(name, png_with(Some(exif_block())), |_, change| png_with(Some(change(&exif_block()))))
+    inside(name, png_with(Some(exif_block()), None), |_, change| png_with(Some(change(&exif_block())), None))
+}
+
+fn icc_profile() -> Vec<u8> {
+    moxcms::ColorProfile::new_display_p3().encode().unwrap()
+}
+
+/// The same with an ICC profile.
+pub fn icc(name: &str) -> Seed {
+    inside(name, png_with(None, Some(icc_profile())), |_, change| {
+        png_with(None, Some(change(&icc_profile())))
+    })
 }
