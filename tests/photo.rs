@@ -369,3 +369,24 @@ fn colours_are_those_of_the_files_profile() {
     assert!((seen[0][0] - 40.0).abs() < 4.0 && seen[1][0] < 4.0 && seen[2][0] < 1.0, "{seen:?}");
     assert!((seen[1][1] - seen[2][1]).abs() < 4.0, "{seen:?}");
 }
+
+#[test]
+fn pixels_that_are_no_numbers_are_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let paths = ["a.exr", "b.exr"].map(|n| folder.path().join(n));
+    for (k, path) in paths.iter().enumerate() {
+        let mut picture = image::Rgb32FImage::from_fn(64, 64, |x, y| {
+            image::Rgb([x as f32 / 64.0, y as f32 / 64.0, k as f32 / 2.0])
+        });
+        if k == 1 {
+            picture.get_pixel_mut(3, 5).0[1] = f32::NAN;
+            picture.get_pixel_mut(4, 5).0 = [f32::INFINITY; 3];
+        }
+        image::DynamicImage::from(picture).save(path).unwrap();
+    }
+    let recorded = splatvk::progress::Recorded::new(&Silent);
+    let photos = photo::load_all(&paths, &recorded).unwrap();
+    let said = "b: 2 of its pixels are not finite numbers and are read as black";
+    assert_eq!(recorded.warnings(), [said]);
+    assert!(photos[1].image.at(3, 5)[1] == 0.0 && photos[1].image.at(4, 5) == [0.0; 3]);
+}

@@ -90,7 +90,8 @@ fn agreed(args: &FetchArgs, missing: &[&CatalogueEntry]) -> Result<()> {
         return Ok(());
     }
     let megabytes: f64 = missing.iter().map(|k| size(k)).sum();
-    let what = format!("{} models, {megabytes:.0} MB", missing.len());
+    let plural = if missing.len() == 1 { "" } else { "s" };
+    let what = format!("{} model{plural}, {megabytes:.0} MB", missing.len());
     if !std::io::stdin().is_terminal() || !std::io::stderr().is_terminal() {
         return Err(Error::input(format!(
             "models fetch: {what}: nobody can be asked; --yes agrees, --dry-run shows"

@@ -197,6 +197,7 @@ fn pictures() -> Vec<Photo> {
             border: PlainBorder::default(),
             exif_focal: None,
             fine: None,
+            lost_pixels: 0,
             straightened: None,
             camera_model: None,
             gravity: None,

@@ -356,6 +356,7 @@ pub(super) fn photo(stem: &str, image: RgbImage) -> Photo {
         border: PlainBorder::default(),
         exif_focal: None,
         fine: None,
+        lost_pixels: 0,
         straightened: None,
         camera_model: None,
         gravity: None,

@@ -287,6 +287,7 @@ mod tests {
             },
             exif_focal: None,
             fine: None,
+            lost_pixels: 0,
             straightened: None,
             camera_model: None,
             gravity: None,

@@ -7,6 +7,7 @@ use crate::scene::to_srgb;
 use crate::{Error, Result, files};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits};
+use rayon::prelude::*;
 use std::io::Cursor;
 use std::path::Path;
 
@@ -52,6 +53,18 @@ impl Decoded {
     /// Whether the file holds linear light in floating point, as all formats with floats do by convention.
     fn is_linear(&self) -> bool {
         matches!(self.pixels, DynamicImage::ImageRgb32F(_) | DynamicImage::ImageRgba32F(_))
+    }
+
+    /// Pixels with a value that is no finite number; only floating-point files have them.
+    pub fn not_finite(&self) -> usize {
+        let count = |samples: &[f32], channels: usize| {
+            samples.par_chunks(channels).filter(|p| p.iter().any(|v| !v.is_finite())).count()
+        };
+        match &self.pixels {
+            DynamicImage::ImageRgb32F(i) => count(i.as_raw(), 3),
+            DynamicImage::ImageRgba32F(i) => count(i.as_raw(), 4),
+            _ => 0,
+        }
     }
 
     /// Upright pixel as the file encodes it, times alpha.
@@ -327,6 +340,10 @@ mod tests {
         let right =
             (srgb[0] - 0.537_099).abs() < 1e-5 && (srgb[1] - 1.824_796).abs() < 1e-5 && srgb[2] == 0.0;
         assert!(right, "{srgb:?}");
+        assert_eq!(
+            (d.not_finite(), decode(png(&picture(), None), Path::new("a.png")).unwrap().not_finite()),
+            (4, 0)
+        );
         let mut hdr = Cursor::new(Vec::new());
         let bright = image::Rgb32FImage::from_pixel(16, 2, image::Rgb([8.0, 2.0, 0.5]));
         DynamicImage::ImageRgb32F(bright).write_to(&mut hdr, ImageFormat::Hdr).unwrap();

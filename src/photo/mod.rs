@@ -79,6 +79,12 @@ pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progr
     if !framed.is_empty() {
         progress.warn(&format!("plain frame around the picture left out: {}", framed.join(", ")));
     }
+    for photo in photos.iter().filter(|p| p.lost_pixels > 0) {
+        progress.warn(&format!(
+            "{}: {} of its pixels are not finite numbers and are read as black",
+            photo.stem, photo.lost_pixels
+        ));
+    }
     let bright: Vec<&str> =
         photos.iter().filter(|p| mostly_above_white(&p.image)).map(|p| p.stem.as_str()).collect();
     if !bright.is_empty() {

@@ -48,6 +48,8 @@ pub struct Photo {
     /// Luma of the photo at more pixels than the working image has, for measuring positions; where there are more.
     #[serde(skip)]
     pub fine: Option<Arc<Plane<f32>>>,
+    /// Pixels of the file whose values are not finite numbers, which are read as black.
+    pub lost_pixels: usize,
     /// The lens that was taken out of the image.
     pub straightened: Option<Straightening>,
     /// Camera make and model from EXIF: photos that share it may share one focal length.
@@ -126,7 +128,8 @@ pub fn from_bytes(name: &Path, bytes: Vec<u8>, max_size: usize) -> Result<Photo>
     // The two scales differ by the rounding of the size only.
     let exif_focal = decoded.lens.focal.map(|f| f * photo.to_working.scale[1]);
     let lens = &decoded.lens;
-    Ok(Photo { exif_focal, camera_model: lens.camera_model.clone(), gravity: lens.gravity, ..photo })
+    let (camera_model, gravity) = (lens.camera_model.clone(), lens.gravity);
+    Ok(Photo { exif_focal, camera_model, gravity, lost_pixels: decoded.not_finite(), ..photo })
 }
 
 /// A photo from upright sRGB pixels in [0, 1]; `focal` is in their pixels, where it is known.
@@ -166,6 +169,7 @@ fn working(
         to_working: Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32)),
         exif_focal: None,
         fine,
+        lost_pixels: 0,
         straightened: None,
         camera_model: None,
         gravity: None,
