@@ -11,6 +11,7 @@ mod lower_alu;
 mod memory;
 mod module;
 mod mutations;
+mod operations;
 mod passes;
 mod subgroup;
 #[path = "../support/mod.rs"]

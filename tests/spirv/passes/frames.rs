@@ -95,7 +95,7 @@ pub fn eight_features(device: &Device) {
 
 /// More than one launch per tile; features in the gauge of three levels.
 pub fn many_features(device: &Device) {
-    let mut scene = scene(25, 0, 21, 1042);
+    let mut scene = scene(25, 0, 33, 1042);
     scene.options.feature_mode = FeatureMode::Gauge { epsilon: 1e-3, blocks: 3 };
     there_and_back(device, &scene, by_atomics(device));
 }
@@ -137,7 +137,7 @@ pub fn pairs(device: &Device) {
 }
 
 pub fn decode(device: &Device) {
-    for (dim, count, pixels) in [(3, 9, 70), (8, 20, 130), (16, 5, 64), (20, 7, 65)] {
+    for (dim, count, pixels) in [(3, 9, 300), (8, 20, 257), (16, 12, 290), (20, 11, 512)] {
         let mut random = Random::new(1046);
         let mut numbers = |n: usize| (0..n).map(|_| random.normal(1.0) as f32).collect::<Vec<f32>>();
         let mut table = numbers(count * dim);
@@ -145,7 +145,12 @@ pub fn decode(device: &Device) {
             let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();
             row.iter_mut().for_each(|x| *x /= norm);
         }
-        let planes = numbers((dim + 2) * pixels);
+        let mut planes = numbers((dim + 2) * pixels);
+        // Every third pixel has a feature about as short as those that have no code.
+        let length = |p: usize| if p % 3 == 0 { 0.2 / (dim as f32).sqrt() } else { 1.0 };
+        planes.chunks_exact_mut(pixels).for_each(|plane| {
+            plane.iter_mut().enumerate().for_each(|(p, v)| *v *= length(p));
+        });
         let alpha: Vec<f32> = (0..pixels).map(|p| (p % 11) as f32 / 10.0).collect();
         let see_through: Vec<f32> = alpha.iter().map(|a| 1.0 - a).collect();
         let features = device.buffer_from("features", &planes).unwrap();
