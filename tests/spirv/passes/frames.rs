@@ -147,7 +147,7 @@ pub fn decode(device: &Device) {
         }
         let mut planes = numbers((dim + 2) * pixels);
         // Every third pixel has a feature about as short as those that have no code.
-        let length = |p: usize| if p % 3 == 0 { 0.2 / (dim as f32).sqrt() } else { 1.0 };
+        let length = |p: usize| if p.is_multiple_of(3) { 0.2 / (dim as f32).sqrt() } else { 1.0 };
         planes.chunks_exact_mut(pixels).for_each(|plane| {
             plane.iter_mut().enumerate().for_each(|(p, v)| *v *= length(p));
         });
