@@ -58,7 +58,7 @@ impl<'a> Photos<'a> {
     pub(super) fn new(scene: &'a SyntheticScene, spec: &'a SceneSpec) -> Result<Photos<'a>> {
         let other = match spec.spoil {
             Some(Spoil::TwoScenes) => {
-                Some(build_scene(&SceneSpec { seed: spec.seed + OTHER_SCENE, ..spec.clone() })?)
+                Some(build_scene(&SceneSpec { seed: spec.seed.wrapping_add(OTHER_SCENE), ..spec.clone() })?)
             }
             Some(Spoil::Moving) => Some(with_moved_object(scene, spec.unit())),
             _ => None,
