@@ -44,6 +44,10 @@ pub fn edge_cases(device: &Device) {
     large.splats.log_scales.fill([3.0, 2.5, 2.0]);
     large.splats.opacity_logits.fill(-3.0);
     there_and_back(device, &large, DeviceChoices::of(device));
+    // Some lie beyond where the Jacobian is clamped, on every side, and still reach into the image.
+    let mut beyond = scene(20, 0, 0, 1053);
+    beyond.view.focal = beyond.view.focal.map(|f| 1.6 * f);
+    there_and_back(device, &beyond, DeviceChoices::of(device));
 }
 
 /// Band by band, against the twin of the whole: 8 planes of 6000 pixels do not fit in 128 KiB.
