@@ -27,7 +27,7 @@ void main() {
     float T[PIXELS];
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
-        T[k] = x < width && y < height ? 1.0 : -1.0;
+        T[k] = select(both(x < width, y < height), 1.0, -1.0);
     }
     for (uint j = first; j < last; j += SUBGROUP_SIZE) {
         load_splat(tile_splats[min(j + lane, last - 1)].x, j + lane < last);
@@ -40,11 +40,11 @@ void main() {
             [[unroll]] for (int k = 0; k < PIXELS; k++) {
                 float dx = dx0 - float((k / ROWS) * LANES_X), dy = dy0 - float((k % ROWS) * LANES_Y);
                 float power = fma(fma(c, dy, b * dx), dy, fma(a * dx, dx, log2_opacity));
-                float alpha = power >= LOG2_ALPHA_MIN ? min(ALPHA_MAX, exp2(power)) : 0.0;
+                float alpha = select(power >= LOG2_ALPHA_MIN, min(ALPHA_MAX, exp2(power)), 0.0);
                 float next = T[k] - alpha * T[k];
                 bool stop = next < TRANSMITTANCE_MIN;
-                blended += alpha > 0.0 && T[k] > 0.0 && !stop ? 1 : 0;
-                T[k] = stop ? -abs(T[k]) : next;
+                blended += uint(all(bvec3(alpha > 0.0, T[k] > 0.0, !stop)));
+                T[k] = select(stop, -abs(T[k]), next);
             }
         }
         if (all_stopped(T)) break;

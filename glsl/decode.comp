@@ -11,6 +11,7 @@ const float VOID_ALPHA = 0.5;
 // features, and a blend of nothing has no code. Splat features are unit vectors, so |F| is the alpha they contribute, less
 // what differing codes cancel (sqrt(1/2) where two meet); a quarter separates that from stray contributions.
 const float MIN_FEATURE_SHARE = 0.25;
+#include "shared/select.glsl"
 #define PIXELS 4u
 #define QUADS (DIM / 4)
 layout(local_size_x = 64) in;
@@ -60,7 +61,7 @@ void main() {
         [[unroll]] for (uint q = 0u; q < QUADS; q++)
             [[unroll]] for (uint c = 0u; c < 4u; c++) {
                 float f = feature[j * QUADS + q][c];
-                norm2 += q * 4u + c < dim ? f * f : 0.0;
+                norm2 += select(q * 4u + c < dim, f * f, 0.0);
             }
         float norm = sqrt(norm2);
         if (pixel < pixels) {

@@ -43,7 +43,7 @@ void main() {
     float T[PIXELS], sum[CHANNELS * PIXELS];
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
-        T[k] = x < width && y < bottom ? 1.0 : -1.0;
+        T[k] = select(both(x < width, y < bottom), 1.0, -1.0);
     }
     [[unroll]] for (int k = 0; k < CHANNELS * PIXELS; k++) sum[k] = 0.0;
 
@@ -62,11 +62,11 @@ void main() {
                     const int k = n * ROWS + m;
                     float dy = dy0 - float(m * LANES_Y);
                     float power = fma(fma(c, dy, bx), dy, ax);
-                    float alpha = power >= LOG2_ALPHA_MIN ? min(ALPHA_MAX, exp2(power)) : 0.0;
+                    float alpha = select(power >= LOG2_ALPHA_MIN, min(ALPHA_MAX, exp2(power)), 0.0);
                     float w = alpha * T[k], next = T[k] - w;
                     bool stop = next < TRANSMITTANCE_MIN;
-                    weight[k] = stop ? 0.0 : w;
-                    T[k] = stop ? -abs(T[k]) : next;
+                    weight[k] = select(stop, 0.0, w);
+                    T[k] = select(stop, -abs(T[k]), next);
                 }
             }
             [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {

@@ -10,6 +10,7 @@ layout(std430, binding = 3) writeonly buffer Cross { float cross_slopes[]; };  /
 layout(std430, binding = 4) writeonly buffer Sums { float sums[]; };  // [C, H, strips] sum of S over each strip
 // Rows outside first .. end have their part in the derivatives of others, but are not summed.
 layout(push_constant) uniform Push { int width; int height; int strips; int first; int end; };
+#include "shared/select.glsl"
 #include "shared/ssim.glsl"
 
 void main() {
@@ -24,10 +25,10 @@ void main() {
     float sum = 0.0;
     [[unroll]] for (int i = 0; i < STRIP + 20; i++) {
         int x = x0 + i - 10;
-        bool inside = x >= 0 && x < width;
+        bool inside = both(x >= 0, x < width);
         int q = base + clamp(x, 0, width - 1);
-        vec2 mean = inside ? means[q] : vec2(0.0);
-        vec2 moment = inside ? moments[q] : vec2(0.0);
+        vec2 mean = select(inside, means[q], vec2(0.0));
+        vec2 moment = select(inside, moments[q], vec2(0.0));
         [[unroll]] for (int k = 0; k < STRIP + 10; k++) {
             if (i - k >= 0 && i - k < 2 * HALF + 1) {
                 float w = WINDOW[i - k];
@@ -37,26 +38,26 @@ void main() {
                 f[k] = fma(w, moment.y, f[k]);
             }
         }
-        // With tap i the window around column x0 + i - 15 is complete; columns outside the image have no SSIM.
-        if (i >= 10) {
-            int k = i - 10;
-            int centre = x0 + k - 5;
-            float mx = a[k], my = b[k];
-            float both = mx * my, squares = mx * mx + my * my;
-            float a1 = 2.0 * both + C1, a2 = 2.0 * (f[k] - both) + C2, b1 = squares + C1, b2 = (e[k] - squares) + C2;
-            float inverse = 1.0 / (b1 * b2);
-            float s = a1 * a2 * inverse;
-            vec3 d = vec3(2.0 * my * (a2 - a1) * inverse - 2.0 * mx * s / b1 + 2.0 * mx * s / b2, -s / b2, 2.0 * a1 * inverse);
-            bool real = centre >= 0 && centre < width;
-            if (!real) d = vec3(0.0);
-            if (k >= 5 && k < STRIP + 5 && real) sum += s;
-            [[unroll]] for (int o = 0; o < STRIP; o++) {
-                if (k - o >= 0 && k - o < 2 * HALF + 1) {
-                    float w = WINDOW[k - o];
-                    oa[o] = fma(w, d.x, oa[o]);
-                    ob[o] = fma(w, d.y, ob[o]);
-                    oc[o] = fma(w, d.z, oc[o]);
-                }
+        // With tap i the window around column x0 + i - 15 is complete; columns outside the image have no SSIM. No branch stands here
+        // before the first is complete: within one the compiler does not write the inner loop out.
+        int k = max(i - 10, 0);
+        int centre = x0 + i - 15;
+        float mx = a[k], my = b[k];
+        float product = mx * my, squares = mx * mx + my * my;
+        float a1 = 2.0 * product + C1, a2 = 2.0 * (f[k] - product) + C2, b1 = squares + C1, b2 = (e[k] - squares) + C2;
+        float inverse = 1.0 / (b1 * b2);
+        float s = a1 * a2 * inverse;
+        vec3 d = vec3(2.0 * my * (a2 - a1) * inverse - 2.0 * mx * s / b1 + 2.0 * mx * s / b2, -s / b2, 2.0 * a1 * inverse);
+        bool real = both(centre >= 0, centre < width);
+        d = select(real, d, vec3(0.0));
+        if (i >= 15 && i < STRIP + 15) sum += select(real, s, 0.0);
+        [[unroll]] for (int o = 0; o < STRIP; o++) {
+            int tap = i - 10 - o;
+            if (tap >= 0 && tap < 2 * HALF + 1) {
+                float w = WINDOW[tap];
+                oa[o] = fma(w, d.x, oa[o]);
+                ob[o] = fma(w, d.y, ob[o]);
+                oc[o] = fma(w, d.z, oc[o]);
             }
         }
     }

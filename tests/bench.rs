@@ -106,6 +106,11 @@ fn reports_are_read_back_and_compared() {
     assert!(!text.contains("another workload") && !text.contains("nothing"));
     let output = splatvk(&["bench", "--compare", file.to_str().unwrap(), other.to_str().unwrap()]);
     assert_eq!(String::from_utf8(output.stdout).unwrap(), text);
+    b.sections[0].workload = "another scene".to_owned();
+    assert!(compare::table(&a, &b).contains("B has another workload: another scene"));
+    b.format = "splatvk-bench 0".to_owned();
+    let other = write("b.json", &b);
+    refuses(&["bench", "--compare", file.to_str().unwrap(), other.to_str().unwrap()], "splatvk-bench 0");
     std::fs::write(&other, "{}").unwrap();
     refuses(&["bench", "--compare", file.to_str().unwrap(), other.to_str().unwrap()], "b.json");
 }

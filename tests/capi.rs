@@ -81,6 +81,39 @@ fn a_name_with_an_unknown_ending_is_refused_and_no_folder_of_it_is_made() {
     }
 }
 
+/// What is told of a camera goes back as it is, one camera after the other.
+#[test]
+fn a_text_is_answered_in_the_view_of_the_camera_that_is_given() {
+    let folder = tempfile::tempdir().unwrap();
+    let (context, lemon) = (context(None), CString::new("lemon").unwrap());
+    let path = text(&fixture::view::breakfast(folder.path()));
+    let mut scene = null_mut();
+    assert_eq!(unsafe { svk_scene_load(context, path.as_ptr(), &mut scene) }, SvkStatus::Ok);
+    // The lemon is elsewhere in each; its label is 7.
+    for (index, stem) in [(0, "train_00"), (1, "train_02")] {
+        let mut camera: SvkCamera = unsafe { std::mem::zeroed() };
+        let mut answer: SvkAnswer = unsafe { std::mem::zeroed() };
+        (camera.size, answer.size) = (size_of::<SvkCamera>(), size_of::<SvkAnswer>());
+        assert_eq!(unsafe { svk_scene_camera(scene, index, &mut camera, null_mut(), 0) }, SvkStatus::Ok);
+        let truth = fixture::view::masks_of(stem);
+        let mut mask = vec![0u8; truth.data.len()];
+        let status = unsafe {
+            svk_scene_query(scene, lemon.as_ptr(), &camera, &mut answer, mask.as_mut_ptr(), mask.len())
+        };
+        let said = said(|out, bytes| unsafe { svk_scene_error(scene, out, bytes) });
+        assert_eq!((status, answer.found), (SvkStatus::Ok, 1), "{said}");
+        let pixels = |counts: fn(bool, bool) -> bool| {
+            mask.iter().zip(&truth.data).filter(|(m, t)| counts(**m > 0, **t == 7)).count() as f64
+        };
+        let overlap = pixels(|a, b| a && b) / pixels(|a, b| a || b);
+        assert!(overlap > 0.5, "{stem}: {overlap}");
+    }
+    unsafe {
+        svk_scene_destroy(scene);
+        svk_context_destroy(context);
+    }
+}
+
 unsafe extern "C" fn stop(_: *mut c_void, _: *const SvkProgress) -> i32 {
     1
 }

@@ -5,7 +5,9 @@ mod fixture;
 use fixture::{data, scene, small_views, train_log};
 use splatvk::format::npy::{self, NpyArray};
 use splatvk::format::scene_dir::{self, Contents};
-use splatvk::scene::{Camera, Pose, Seen, Splats, Up, World};
+use splatvk::scene::{
+    Camera, Codebook, LanguageField, LevelField, PointCloud, Pose, Seen, Splats, Up, World,
+};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -338,7 +340,8 @@ fn the_scene_of_a_run_is_whole_and_can_be_replaced() {
     assert!(names(scene.parent().unwrap()).iter().all(|n| !n.contains("partial") && !n.contains("old")));
 }
 
-/// A scene of two splats and one camera, the first splat one unit straight above it.
+/// A scene of two splats and one camera, the first splat one unit straight above it and in no photo. Points are where splats
+/// are.
 fn tilted_scene(folder: &Path) -> (PathBuf, Splats, Camera) {
     let scene = folder.join("scene");
     std::fs::create_dir(&scene).unwrap();
@@ -362,14 +365,28 @@ fn tilted_scene(folder: &Path) -> (PathBuf, Splats, Camera) {
         pose: Pose::exp(glam::DVec3::new(0.1, 0.0, 0.3), glam::DVec3::new(0.0, 0.2, 0.1)),
     };
     let up = Up { direction, sigma_degrees: 1.0, evidence: Vec::new() };
+    let points =
+        PointCloud { positions: splats.means.clone(), colours: vec![[0.5; 3]; 2], ..PointCloud::default() };
+    let codebook = Codebook {
+        embedding_dim: 1,
+        code_dim: 1,
+        embeddings: vec![1.0],
+        codes: vec![1.0],
+        weights: vec![1.0],
+        members: vec![Vec::new()],
+        min_chord: 2.0,
+    };
+    let level = LevelField { codebook, features: vec![0.25, 0.5], ..LevelField::default() };
+    let levels = vec![LevelField::default(), LevelField::default(), level];
+    let field = LanguageField { levels, space: "dir".into() };
     let contents = Contents {
         splats: &splats,
-        seen: &Seen::default(),
+        seen: &Seen { pixels: vec![0.0, 3.0] },
         cameras: std::slice::from_ref(&camera),
         world: &World { up: Some(up), ..World::default() },
         photos: &[],
-        points: None,
-        language: None,
+        points: Some(&points),
+        language: Some(&field),
         text_embeddings: None,
     };
     scene_dir::write(&scene, &contents).unwrap();
@@ -388,7 +405,7 @@ fn exports_turn_up_to_the_axis_that_is_asked_for() {
     };
     let mean = |at: &[f32; 3]| glam::Vec3::from_array(*at).as_dvec3();
     for (axis, to) in [("-y", glam::DVec3::NEG_Y), ("z", glam::DVec3::Z)] {
-        for (format, name) in [("ply", "a.ply"), ("transforms", "t.json")] {
+        for (format, name) in [("ply", "a.ply"), ("transforms", "t.json"), ("colmap", "model")] {
             let output = export(&scene, format, axis, name).output().unwrap();
             assert!(output.status.success(), "{}", text(&output.stderr));
         }
@@ -398,6 +415,8 @@ fn exports_turn_up_to_the_axis_that_is_asked_for() {
         let (before, after) =
             (camera.project(mean(&splats.means[1])), seen[0].project(mean(&turned.means[1])));
         assert!((before.0 - after.0).length() < 1e-3, "cameras and splats turn together");
+        let points = splatvk::format::colmap::read_points(&folder.path().join("model")).unwrap().positions;
+        assert!((mean(&points[0]) - to).length() < 1e-6, "and points: {points:?}");
     }
     // Read back, glTF is in the axes of scenes again: y up in the file.
     assert!(export(&scene, "glb", "y", "a.glb").output().unwrap().status.success());
@@ -407,6 +426,18 @@ fn exports_turn_up_to_the_axis_that_is_asked_for() {
     refuses(&mut export(&folder.path().join("a.ply"), "splat", "y", "b.splat"), 2, &["not known"]);
     refuses(&mut export(&scene, "ply", "x", "b.ply"), 2, &["-y, y or z"]);
     assert!(!folder.path().join("b.spz").exists());
+}
+
+#[test]
+fn splats_that_no_photo_shows_are_left_out_with_their_language() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, out) = (tilted_scene(folder.path()).0, folder.path().join("seen.spz"));
+    let mut export = splatvk();
+    export.arg("export").arg(scene).args(["--format", "spz", "--only-seen", "--out"]).arg(&out);
+    let output = export.output().unwrap();
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let (kept, language) = splatvk::format::gaussians::read(&out).unwrap();
+    assert_eq!((kept.len(), language.unwrap().levels[2].features.as_slice()), (1, &[0.5][..]));
 }
 
 #[test]
@@ -483,6 +514,13 @@ fn scenes_render_export_and_answer_only_what_they_know() {
     assert!(mean < 1e-3, "a photo shows what its own view shows: {mean}");
     let picture = image::open(out.join("train_00.png")).unwrap().to_rgb8();
     assert!(picture.dimensions() == (160, 120) && picture.pixels().any(|p| p.0[0] > 60));
+    // EXR holds linear light (IEC 61966-2-1), npy the values of the picture.
+    let light = splatvk::format::picture::read_exr(&out.join("train_00.exr")).unwrap();
+    let shown = npy::read(out.join("train_00_rgb.npy")).unwrap().to_f32();
+    for (red, v) in light["R"].data.iter().zip(shown.iter().step_by(3)).filter(|(_, v)| **v > 0.05) {
+        let linear = ((*v + 0.055) / 1.055).powf(2.4);
+        assert!((*red - linear).abs() < 1e-4 * linear.max(1.0), "{red} for {v}");
+    }
 
     let mut features = splatvk();
     features

@@ -170,6 +170,13 @@ fn files_of_other_programs() {
         (p.positions.as_slice(), p.colours[0]),
         (&[[1.5, 2.0, 3.0], [-1.0, -2.0, -3.0]][..], [1.0, 0.0, 0.2])
     );
+    // The other order of bytes.
+    let header = "ply\nformat binary_big_endian 1.0\nelement vertex 1\nproperty double x\nproperty float y\n\
+                  property short z\nend_header\n";
+    let mut bytes = header.as_bytes().to_vec();
+    bytes.extend(1.5f64.to_be_bytes().into_iter().chain((-2f32).to_be_bytes()).chain(300i16.to_be_bytes()));
+    std::fs::write(&path, bytes).unwrap();
+    assert_eq!(ply::read_points(&path).unwrap().positions, [[1.5, -2.0, 300.0]]);
 }
 
 #[test]
@@ -379,13 +386,13 @@ fn cameras_round_trip() {
 #[test]
 fn transforms_are_camera_to_world_in_opengl_axes() {
     // A camera at (1, 2, 3) that looks along world +x with world −z up: OpenCV right = +y... worked out by hand.
-    let text = r#"{"fl_x": 500, "w": 640, "h": 480, "frames": [{"file_path": "a.png", "transform_matrix":
-        [[0, 0, -1, 1], [1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]]}]}"#;
+    let text = r#"{"fl_x": 400, "w": 640, "h": 480, "frames": [{"file_path": "a.png", "fl_x": 500,
+        "transform_matrix": [[0, 0, -1, 1], [1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]]}]}"#;
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("transforms.json");
     std::fs::write(&path, text).unwrap();
     let c = &cameras::read(&path).unwrap()[0];
-    assert_eq!((c.fy, c.cx, c.cy), (500.0, 320.0, 240.0));
+    assert_eq!((c.fy, c.cx, c.cy), (500.0, 320.0, 240.0), "what a frame says of itself wins");
     // OpenGL: right = world +y, up = world −z, forward = −z axis = world +x.
     let (pixel, depth) = c.project(DVec3::new(1.0 + 4.0, 2.0, 3.0));
     assert!(
@@ -396,6 +403,10 @@ fn transforms_are_camera_to_world_in_opengl_axes() {
     assert!((pixel.x - (320.0 + 125.0)).abs() < 1e-9, "right of the camera is world +y: {pixel}");
     let (pixel, _) = c.project(DVec3::new(5.0, 2.0, 2.0));
     assert!((pixel.y - (240.0 - 125.0)).abs() < 1e-9, "above the camera is world −z: {pixel}");
+    // Blender states the angle across the picture: at 90° the focal length is half of its width.
+    let angle = format!(r#""camera_angle_x": {}"#, std::f64::consts::FRAC_PI_2);
+    std::fs::write(&path, text.replace(r#""fl_x": 400"#, &angle).replace(r#" "fl_x": 500,"#, "")).unwrap();
+    assert!((cameras::read(&path).unwrap()[0].fx - 320.0).abs() < 1e-9);
 }
 
 #[test]
@@ -426,6 +437,21 @@ fn colmap_binary_model() {
     assert!(
         cameras::read(folder.path()).unwrap_err().to_string().contains("images.bin: the file ends early")
     );
+}
+
+#[test]
+fn colmap_cameras_of_one_focal_length() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut cameras, mut images) = (String::new(), String::new());
+    for (i, model) in ["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"].into_iter().enumerate() {
+        // f, the principal point, and as many terms of distortion as the model has.
+        cameras += &format!("{i} {model} 640 480 500 321 242{}\n", " 0".repeat(i));
+        images += &format!("{i} 1 0 0 0 0 0 0 {i} {i}.png\n\n");
+    }
+    std::fs::write(folder.path().join("cameras.txt"), cameras).unwrap();
+    std::fs::write(folder.path().join("images.txt"), images).unwrap();
+    let read = colmap::read(folder.path()).unwrap();
+    assert!(read.len() == 3 && read.iter().all(|c| [c.fx, c.fy, c.cx, c.cy] == [500.0, 500.0, 321.0, 242.0]));
 }
 
 #[test]

@@ -117,6 +117,26 @@ fn unreadable_files_are_refused() {
     );
 }
 
+/// Right, up and back in the file; right, down and forward in a scene.
+#[test]
+fn gaussians_are_in_the_axes_of_gltf_and_where_all_nodes_above_them_put_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("nodes.gltf");
+    let s = Splats { means: vec![[1.0, -2.0, -3.0]], ..splats(1, 0) };
+    gaussians::write(&path, &s, None).unwrap();
+    let mut root: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    assert_eq!(root["accessors"][0]["min"], json!([1.0, 2.0, 3.0]));
+    // (1, 2, 3) scaled is (2, 4, 6), half a turn about y makes it (−2, 4, −6), the node above (8, 4, −6).
+    root["nodes"] = json!([
+        { "children": [1], "translation": [10, 0, 0] },
+        { "mesh": 0, "rotation": [0, 1, 0, 0], "scale": [2, 2, 2] },
+    ]);
+    std::fs::write(&path, root.to_string()).unwrap();
+    let back = gaussians::read(&path).unwrap().0;
+    close(&back.means[0], &[8.0, -4.0, 6.0], 1e-5, "mean");
+    close(&back.log_scales[0], &s.log_scales[0].map(|v| v + 2f32.ln()), 1e-5, "log scales");
+}
+
 /// Of as many nodes as are read, without scenes, every node that no other has is one: looking for that of each in all others took half a minute.
 #[test]
 fn many_nodes_are_read_at_once() {

@@ -1,8 +1,8 @@
 //! Gradients of the whole render on the GPU against the f64 twin, which is itself checked by central differences.
 mod support;
-use splatvk::gpu::{Options, TestDevice, Way, test_device};
-use splatvk::pass::{DeviceChoices, FeatureMode, Summation};
-use support::{Scene, assert_class, assert_gradients};
+use splatvk::gpu::{Options, Recorder, TestDevice, Way, shaders, test_device};
+use splatvk::pass::{DeviceChoices, FeatureMode, Summation, seeded};
+use support::{GpuGradients, Scene, assert_class, assert_gradients};
 
 /// Added up by atomics and entry by entry; the latter gives the same bits every time.
 #[test]
@@ -19,6 +19,59 @@ fn random_scenes_match_the_twin() {
         assert_gradients(&scene, &gradients, 7);
         assert_eq!(gradients, scene.gradients_by(&device, entries, &upstream));
     }
+}
+
+/// More splats than the way back through the projection has threads.
+#[test]
+fn every_one_of_thousands_of_splats_gets_its_gradient() {
+    let device = test_device();
+    let n = shaders::project_backward::THREADS as usize + 900;
+    let (splats, camera) = seeded::benchmark(n, 40, 24, 0, 68);
+    let scene = Scene::new(splats, &camera, 0, 68);
+    assert_gradients(&scene, &scene.gradients(&device, &scene.upstream(11)), 11);
+}
+
+/// A step with short lists first, for which the buffers of its entries are made.
+#[test]
+fn gradients_by_entry_have_room_for_lists_that_have_grown() {
+    let device = test_device();
+    let ways = DeviceChoices { summation: Summation::Entries, ..DeviceChoices::of(&device) };
+    let mut scene = Scene::small(12, 0, 3, 67);
+    scene.splats.log_scales.fill([-6.0; 3]);
+    let upstream = scene.upstream(12);
+    let (small, mut raster) = scene.upload_for(&device, ways);
+    // Every splat in every tile.
+    scene.splats.log_scales.fill([3.0, 2.5, 2.0]);
+    scene.splats.opacity_logits.fill(-3.0);
+    let (large, _) = scene.upload_for(&device, ways);
+    let gradients = large.zeros_like(&device).unwrap();
+    for params in [&small, &large] {
+        raster.forward(params, &scene.options).unwrap();
+        raster.frame().planes_grad.write(&upstream).unwrap();
+        let mut rec = Recorder::new(&device, "backward");
+        raster.record_backward(&mut rec, params, &scene.options, &gradients);
+        rec.run().unwrap();
+    }
+    let (splats, features) = gradients.download().unwrap();
+    let grown = GpuGradients { splats, features, camera: raster.frame().camera_grad.read().unwrap() };
+    assert_eq!(grown, scene.gradients_by(&device, ways, &upstream));
+}
+
+/// With an upstream that is alike everywhere, means move mostly by the direction from which colours are seen.
+#[test]
+fn colours_that_change_with_the_direction_move_the_means_as_in_the_twin() {
+    let device = test_device();
+    let mut scene = Scene::small(15, 3, 0, 70);
+    scene.splats.sh.fill(0.3);
+    // Bright enough that no colour is clamped at 0.
+    scene.splats.sh.chunks_exact_mut(48).for_each(|c| c[..3].fill(6.0));
+    let pixels = scene.pixels();
+    let mut upstream = vec![0.0; 5 * pixels];
+    upstream[..3 * pixels].fill(1.0);
+    let reference = scene.twin_gradients(&scene.twin(), &upstream).params.means;
+    let reference: Vec<f64> = reference.iter().flat_map(|m| m.to_array()).collect();
+    let gradients = scene.gradients(&device, &upstream);
+    assert_class("means", gradients.splats.means.as_flattened(), &reference);
 }
 
 /// Edge cases of docs/method.md#tolerances: clamped α, clamped Jacobian, needle, behind, hidden, outside, a clamped

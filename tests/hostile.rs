@@ -124,6 +124,24 @@ fn gaussians_that_are_not_finite_are_left_out_and_counted() {
     }
 }
 
+/// The warning of a command that is over in no time comes at its end.
+#[test]
+fn colours_that_a_format_cuts_off_are_warned_of() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    // 0.5 + 0.28 · 6 is 2.2 times white.
+    let mut bright = splats(50);
+    bright.sh[30] = 6.0;
+    gaussians::write(at("bright.ply").as_ref(), &bright, None).unwrap();
+    for (format, warned) in [("splat", true), ("spz", true), ("glb", false)] {
+        let out = at(&format!("out.{format}"));
+        let output = splatvk(&["export", &at("bright.ply"), "--format", format, "--out", &out]);
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{stderr}");
+        assert_eq!(stderr.contains("1 splats are brighter"), warned, "{format}: {stderr}");
+    }
+}
+
 fn write_scene(folder: &Path, s: &Splats, field: Option<&LanguageField>) {
     let pose = Pose::IDENTITY;
     let (name, c) = ("a.png".to_owned(), 32.0);

@@ -101,6 +101,12 @@ fn an_onnx_runtime_that_is_missing_or_too_old_is_named() {
     assert!(!out.exists());
 }
 
+#[test]
+fn the_environment_chooses_what_computes_the_networks() {
+    let (code, said, _) = splatvk(&["doctor", "--json"], &[("SPLATVK_PROVIDER", "gpu")]);
+    assert!(code == 2 && said.contains("provider gpu: unknown; choose one of auto, cpu"), "{code}: {said}");
+}
+
 /// A library that says it is ONNX Runtime 1.10: the two functions that a program asks first.
 fn old_runtime(library: &Path) {
     let source = library.with_extension("c");

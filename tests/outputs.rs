@@ -9,6 +9,7 @@ use std::ffi::OsString;
 use std::os::unix::fs::{FileTypeExt, symlink};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
 
 fn splatvk(args: &[OsString]) -> Output {
     let mut c = Command::new(env!("CARGO_BIN_EXE_splatvk"));
@@ -293,4 +294,30 @@ fn leftovers_of_killed_commands_go_with_the_next_and_with_clean() {
     let left: Vec<PathBuf> = ["a.ply", &living, "answers"].map(PathBuf::from).to_vec();
     assert_eq!(names(folder.path()).iter().map(PathBuf::from).collect::<Vec<_>>(), left);
     assert!(names(elsewhere.path()).is_empty());
+}
+
+/// Commands that take longer than the test, each with what it has written when it is told to stop.
+#[test]
+fn told_to_stop_a_command_leaves_nothing() {
+    let lines = [
+        "generate --size 1600x1200 --views 40 --out",
+        "bench training --splats 2000 --seconds 600 --json",
+        "ablate alignment --data TRUTH --seeds 1,2,3,4,5,6,7,8 --out",
+    ];
+    for words in lines {
+        let folder = tempfile::tempdir().unwrap();
+        let place = folder.path().join("out");
+        let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+        command.env_remove("SPLATVK_MODELS").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
+        let child = command.args(line(words, &place)).spawn().unwrap();
+        std::thread::sleep(Duration::from_secs(2));
+        let told = Instant::now();
+        Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
+        let output = child.wait_with_output().unwrap();
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(130), "{words}: {stderr}");
+        // 2 s are promised (docs/trust.md#faults); other tests run beside this one.
+        assert!(told.elapsed() < Duration::from_secs(10), "{words}: {:?}", told.elapsed());
+        assert_eq!(names(folder.path()), Vec::<String>::new(), "{words}: {stderr}");
+    }
 }

@@ -6,7 +6,9 @@ use splatvk::pass::channels::BASE_CHANNELS;
 use splatvk::pass::raster_backward;
 use splatvk::pass::raster_forward::{Cutoffs, TwinScene};
 use splatvk::pass::seeded::{self, Random};
-use splatvk::pass::{FeatureMode, RasterOptions, Rasterizer, Renderer, SplatBuffers, View};
+use splatvk::pass::{
+    DeviceChoices, FeatureMode, Grouping, RasterOptions, Rasterizer, Renderer, SplatBuffers, View,
+};
 use splatvk::scene::{Pose, Splats};
 use support::{IMAGE, Scene, assert_close, assert_images, assert_lists, rendered};
 
@@ -161,6 +163,26 @@ fn tile_lists_contain_the_twins() {
     assert!(total > 1000 && extra * 100 < total, "{extra} of {total}");
 }
 
+#[test]
+fn the_lists_of_a_view_hold_nothing_of_the_view_before() {
+    let device = test_device();
+    let whole = front_scene(splat([0.0, 0.0, 5.0], 50.0, -3.0), 40, 40);
+    // Nothing in the first 24 of 25 tiles.
+    let corner = front_scene(splat([0.889, 0.889, 2.0], 0.02, 2.0), 40, 40);
+    for grouping in [Grouping::Counting, Grouping::Sorting] {
+        let ways = DeviceChoices { grouping, ..DeviceChoices::of(&device) };
+        let (params, mut raster) = whole.upload_for(&device, ways);
+        raster.forward(&params, &whole.options).unwrap();
+        assert_eq!(raster.tile_lists().unwrap(), vec![vec![0u32]; 25], "{grouping:?}");
+        let (params, _) = corner.upload(&device);
+        raster.forward(&params, &corner.options).unwrap();
+        let mut expected = vec![Vec::<u32>::new(); 25];
+        expected[24].push(0);
+        assert_eq!(raster.tile_lists().unwrap(), expected, "{grouping:?}");
+        assert_images(&rendered(&raster), &corner.twin());
+    }
+}
+
 /// 20 000 splats in one tile (10⁵ take the twin too long): nothing overflows, saturates or
 /// loses its order.
 #[test]
@@ -224,6 +246,21 @@ fn renderer_returns_the_planes_as_maps() {
     }
     // Another size on the same renderer.
     assert_eq!(renderer.render(&camera.resized(40, 28)).unwrap().rgb.data.len(), 40 * 28);
+}
+
+/// The near plane that nobody set is a hundredth of the median depth of what lies before the camera.
+#[test]
+fn splats_behind_the_camera_neither_show_nor_count_for_the_near_plane() {
+    let device = test_device();
+    let camera = seeded::camera(24, 16, Pose::IDENTITY);
+    let image = |splats: &Splats| Renderer::new(&device, splats, &[], 0).unwrap().render(&camera).unwrap();
+    let mut splats = splat([0.0, 0.0, 2.0], 0.3, 2.0);
+    let seen = image(&splats);
+    assert!(seen.alpha.at(12, 8) > 0.5);
+    for z in [-2.0, -400.0, -400.0, -400.0] {
+        append(&mut splats, splat([0.1, 0.0, z], 0.5, 3.0));
+    }
+    assert!(image(&splats) == seen);
 }
 
 /// What a splat shows of a view, with colours and features that must not matter, in one band and in strips of the image.

@@ -1,8 +1,11 @@
 //! Photo loading from real files: kinds of JPEG and PNG, EXIF, and sets that must be refused.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
+use exif::{Tag, Value};
+use image::ImageEncoder;
 use splatvk::photo::{self, Photo};
 use splatvk::pose::choose;
 use splatvk::progress::Silent;
+use splatvk::scene::RgbImage;
 use std::path::{Path, PathBuf};
 
 fn data(name: &str) -> PathBuf {
@@ -33,21 +36,24 @@ fn kinds_of_files_agree_with_another_reader() {
     assert_colours(&palette, [[13, 11, 247], [231, 41, 156], [104, 197, 165], [231, 230, 107]], 0.01);
 }
 
-#[test]
-fn a_tall_photo_is_scaled_with_its_focal_and_orientation() {
-    use exif::{Field, In, Tag, Value, experimental::Writer};
-    use image::ImageEncoder;
-    let folder = tempfile::tempdir().unwrap();
-    let fields = [
-        (Tag::Orientation, Value::Short(vec![6])),
-        (Tag::FocalLengthIn35mmFilm, Value::Short(vec![28])),
-        (Tag::Model, Value::Ascii(vec![b"Phone".to_vec()])),
-    ]
-    .map(|(tag, value)| Field { tag, ifd_num: In::PRIMARY, value });
-    let mut writer = Writer::new();
+/// An EXIF block.
+fn exif_of<const N: usize>(tags: [(Tag, Value); N]) -> Vec<u8> {
+    let fields = tags.map(|(tag, value)| exif::Field { tag, ifd_num: exif::In::PRIMARY, value });
+    let mut writer = exif::experimental::Writer::new();
     fields.iter().for_each(|f| writer.push_field(f));
     let mut raw = std::io::Cursor::new(Vec::new());
     writer.write(&mut raw, false).unwrap();
+    raw.into_inner()
+}
+
+#[test]
+fn a_tall_photo_is_scaled_with_its_focal_and_orientation() {
+    let folder = tempfile::tempdir().unwrap();
+    let raw = exif_of([
+        (Tag::Orientation, Value::Short(vec![6])),
+        (Tag::FocalLengthIn35mmFilm, Value::Short(vec![28])),
+        (Tag::Model, Value::Ascii(vec![b"Phone".to_vec()])),
+    ]);
     // Stored 2000 × 1200 lying on its side, left half red: upright 1200 × 2000 with the upper half red.
     let stored = image::RgbImage::from_fn(2000, 1200, |x, _| {
         image::Rgb(if x < 1000 { [220, 0, 0] } else { [0, 0, 220] })
@@ -55,7 +61,7 @@ fn a_tall_photo_is_scaled_with_its_focal_and_orientation() {
     let path = folder.path().join("tall.jpg");
     let mut encoder =
         image::codecs::jpeg::JpegEncoder::new_with_quality(std::fs::File::create(&path).unwrap(), 90);
-    encoder.set_exif_metadata(raw.into_inner()).unwrap();
+    encoder.set_exif_metadata(raw).unwrap();
     encoder.encode_image(&stored).unwrap();
 
     let photo = photo::load(&path).unwrap();
@@ -135,6 +141,8 @@ fn unusable_sets_are_refused_in_one_line() {
         assert_eq!((e.exit_code(), message.lines().count()), (2, 1), "{message}");
         assert!(words.iter().all(|w| message.contains(w)), "{message}");
     };
+    // As macOS leaves them beside every photo on a memory card.
+    std::fs::write(dir.join("._a.jpg"), b"\0\x05\x16\x07").unwrap();
     refuse(&[dir.to_path_buf()], None, &["no photos"]);
     refuse(&[dir.join("nothing")], None, &["nothing", "No such file"]);
     std::fs::write(dir.join("clip.mp4"), b"\0\0\0\x18ftypmp42").unwrap();
@@ -152,6 +160,13 @@ fn unusable_sets_are_refused_in_one_line() {
     refuse(&[dir.join("a.jpg"), dir.join("c/a.jpg")], None, &["two photos with the name \"a\""]);
     image::RgbImage::new(20, 300).save(dir.join("b.png")).unwrap();
     refuse(&[dir.join("a.jpg"), dir.join("b.png")], None, &["b.png", "20 × 300"]);
+    let mut encoder =
+        image::codecs::png::PngEncoder::new(std::fs::File::create(dir.join("round.png")).unwrap());
+    let lens = Value::Ascii(vec![b"Samyang 8mm f/2.8 Fisheye".to_vec()]);
+    encoder.set_exif_metadata(exif_of([(Tag::LensModel, lens)])).unwrap();
+    encoder.write_image(&[90; 100 * 80], 100, 80, image::ExtendedColorType::L8).unwrap();
+    let named = ["round.png", "fisheye lens (Samyang 8mm f/2.8 Fisheye)"];
+    refuse(&[dir.join("a.jpg"), dir.join("round.png")], None, &named);
     let whole = std::fs::read(source(2)).unwrap();
     std::fs::write(dir.join("b.jpg"), &whole[..whole.len() / 2]).unwrap();
     refuse(&[dir.join("a.jpg"), dir.join("b.jpg")], None, &["b.jpg", "cut off"]);
@@ -221,8 +236,8 @@ fn bad_videos_are_one_line() {
     refuse(&folder.path().join("cut.mp4"), &["cut.mp4", "cannot be read"]);
     std::fs::write(folder.path().join("text.mov"), b"no video at all").unwrap();
     refuse(&folder.path().join("text.mov"), &["text.mov", "cannot be read"]);
-    // A list of other addresses in the clothes of a video.
-    let list = "#EXTM3U\n#EXTINF:1,\nhttp://localhost/x.ts\n#EXT-X-ENDLIST\n";
+    // A list of other files in the clothes of a video, which ffmpeg by itself would play.
+    let list = "ffconcat version 1.0\nfile clip.mp4\nduration 2.4\n";
     std::fs::write(folder.path().join("list.mp4"), list).unwrap();
     refuse(&folder.path().join("list.mp4"), &["list.mp4", "cannot be read"]);
 }
@@ -252,17 +267,7 @@ fn quadrants(kind: &str, (w, h): (u32, u32)) -> image::DynamicImage {
 
 /// Writes a picture so that only its EXIF orientation makes it upright.
 fn write_turned(path: &Path, upright: &image::DynamicImage, orientation: u8) {
-    use exif::{Field, In, Tag, Value, experimental::Writer};
-    use image::ImageEncoder;
-    let mut writer = Writer::new();
-    let field = Field {
-        tag: Tag::Orientation,
-        ifd_num: In::PRIMARY,
-        value: Value::Short(vec![u16::from(orientation)]),
-    };
-    writer.push_field(&field);
-    let mut raw = std::io::Cursor::new(Vec::new());
-    writer.write(&mut raw, false).unwrap();
+    let raw = exif_of([(Tag::Orientation, Value::Short(vec![u16::from(orientation)]))]);
     let mut stored = upright.clone();
     let inverse = match orientation {
         6 => 8,
@@ -274,11 +279,11 @@ fn write_turned(path: &Path, upright: &image::DynamicImage, orientation: u8) {
     let (bytes, w, h, colour) = (stored.as_bytes(), stored.width(), stored.height(), stored.color().into());
     if path.extension().unwrap() == "png" {
         let mut encoder = image::codecs::png::PngEncoder::new(file);
-        encoder.set_exif_metadata(raw.into_inner()).unwrap();
+        encoder.set_exif_metadata(raw).unwrap();
         encoder.write_image(bytes, w, h, colour).unwrap();
     } else {
         let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(file, 95);
-        encoder.set_exif_metadata(raw.into_inner()).unwrap();
+        encoder.set_exif_metadata(raw).unwrap();
         encoder.write_image(bytes, w, h, colour).unwrap();
     }
 }
@@ -304,12 +309,46 @@ fn check_quadrants(path: &Path, kind: &str, (w, h): (u32, u32)) {
     // The longer side is capped, as far as the shorter one keeps what the networks need.
     let fits = pw.max(ph) <= photo::MAX_SIZE || pw.min(ph) == photo::SMALLEST_SIDE;
     assert!(fits && pw.min(ph) >= photo::SMALLEST_SIDE, "{named}: {pw} × {ph}");
+    assert_quadrants(&photo.image, kind, &named);
+}
+
+/// Asserts the colours in the middle of each quadrant.
+fn assert_quadrants(picture: &RgbImage, kind: &str, named: &str) {
+    let (w, h) = (picture.width, picture.height);
     for (k, colour) in QUADRANTS.into_iter().enumerate() {
         let expected = if kind.contains("luma") { [colour[0]; 3] } else { colour };
-        let seen = photo.image.at(pw / 4 + k % 2 * (pw / 2), ph / 4 + k / 2 * (ph / 2)).map(|v| 255.0 * v);
+        let seen = picture.at(w / 4 + k % 2 * (w / 2), h / 4 + k / 2 * (h / 2)).map(|v| 255.0 * v);
         let off = (0..3).map(|c| (seen[c] - f32::from(expected[c])).abs()).fold(0.0, f32::max);
         assert!(off < 4.0, "{named}, quadrant {k}: {seen:?}, expected {expected:?}");
     }
+}
+
+#[test]
+fn small_versions_show_the_whole_photo() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.png");
+    quadrants("rgb8", (640, 480)).save(&path).unwrap();
+    // At a tenth of the size not all pixels are looked at.
+    let small = photo::Candidate::file(&path).thumbnail(64, &Silent).unwrap().unwrap();
+    assert_eq!((small.width, small.height), (64, 48));
+    assert_quadrants(&small, "rgb8", "small version");
+}
+
+#[test]
+fn the_picture_goes_on_where_a_photo_has_a_plain_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("framed.png");
+    let mut framed = quadrants("rgb8", (128, 96)).to_rgb8();
+    for (x, y, pixel) in framed.enumerate_pixels_mut() {
+        if !(3..125).contains(&x) || !(3..93).contains(&y) {
+            *pixel = image::Rgb([255; 3]);
+        }
+    }
+    framed.save(&path).unwrap();
+    let photo = photo::load(&path).unwrap();
+    assert!(!photo.border.is_none());
+    let corners = [(0, 0), (127, 0), (0, 95), (127, 95)].map(|(x, y)| photo.image.at(x, y));
+    assert_eq!(corners, QUADRANTS.map(|c| c.map(|v| f32::from(v) / 255.0)));
 }
 
 #[test]
@@ -345,7 +384,6 @@ fn photos_of_every_size_kind_and_orientation_are_upright_or_refused() {
 
 #[test]
 fn colours_are_those_of_the_files_profile() {
-    use image::ImageEncoder;
     let folder = tempfile::tempdir().unwrap();
     let icc = moxcms::ColorProfile::new_display_p3().encode().unwrap();
     let picture = quadrants("rgb8", (128, 96));
@@ -368,6 +406,44 @@ fn colours_are_those_of_the_files_profile() {
     // The green of Display P3 has less red in sRGB: none, since it lies outside.
     assert!((seen[0][0] - 40.0).abs() < 4.0 && seen[1][0] < 4.0 && seen[2][0] < 1.0, "{seen:?}");
     assert!((seen[1][1] - seen[2][1]).abs() < 4.0, "{seen:?}");
+}
+
+/// `small.avif` with an ICC profile: a fifth property of its only item (ISO/IEC 23008-12).
+fn avif_with(icc: &[u8]) -> Vec<u8> {
+    let mut file = std::fs::read(data("photos/small.avif")).unwrap();
+    let at = |name: &[u8; 4]| file.windows(4).position(|w| w == name).unwrap() - 4;
+    let [meta, iloc, iprp, ipco, ipma] = [b"meta", b"iloc", b"iprp", b"ipco", b"ipma"].map(at);
+    let number = |file: &[u8], at: usize| u32::from_be_bytes(file[at..at + 4].try_into().unwrap());
+    let end = ipma + number(&file, ipma) as usize;
+    let colr = [&(icc.len() as u32 + 12).to_be_bytes()[..], b"colrprof", icc].concat();
+    let grown = colr.len() as u32;
+    // The sizes of the boxes, and in `iloc` where the pixels begin.
+    for (at, by) in [(meta, grown + 1), (iloc + 20, grown + 1), (iprp, grown + 1), (ipco, grown), (ipma, 1)] {
+        let value = number(&file, at) + by;
+        file[at..at + 4].copy_from_slice(&value.to_be_bytes());
+    }
+    // The item's list of properties, by their numbers.
+    file[ipma + 18] += 1;
+    file.insert(end, 5);
+    file.splice(ipma..ipma, colr);
+    file
+}
+
+#[test]
+fn an_avif_with_a_profile_looks_as_the_same_png_with_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let icc = moxcms::ColorProfile::new_display_p3().encode().unwrap();
+    let avif = photo::from_bytes(Path::new("p3.avif"), avif_with(&icc), photo::MAX_SIZE).unwrap();
+    let plain = heif("small.avif").image;
+    let (w, h) = (plain.width as u32, plain.height as u32);
+    let bytes: Vec<u8> = plain.data.as_flattened().iter().map(|v| (255.0 * v).round() as u8).collect();
+    let path = folder.path().join("p3.png");
+    let mut encoder = image::codecs::png::PngEncoder::new(std::fs::File::create(&path).unwrap());
+    encoder.set_icc_profile(icc).unwrap();
+    encoder.write_image(&bytes, w, h, image::ExtendedColorType::Rgb8).unwrap();
+    let png = photo::load(&path).unwrap();
+    assert!(avif.image == png.image, "other colours");
+    assert!(avif.image != plain, "the profile changes nothing here");
 }
 
 #[test]

@@ -25,6 +25,8 @@ impl Scene {
             let small = photo.resize_exact(240, 180, image::imageops::FilterType::Triangle);
             small.to_rgb8().save(photos.join(format!("{k}.png"))).unwrap();
         }
+        // Beside photos a film is not read, which every run warns of.
+        std::fs::write(photos.join("clip.mp4"), "film").unwrap();
         Scene { folder }
     }
 
@@ -195,6 +197,7 @@ fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
         assert!(a == b, "{} differs", name.display());
     }
     assert_eq!(statistics(&whole), statistics(&resumed));
+    assert!(statistics(&whole)[4].to_string().contains("clip.mp4"), "{}", statistics(&whole)[4]);
 
     // Everything is there: nothing but decoding runs again. Then another late option: what precedes it stays.
     let said = scene.finished("home-b", "again", 20, true);

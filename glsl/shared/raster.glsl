@@ -4,6 +4,7 @@
 // CHANNELS names a block of channels: 4 = RGB and depth, 7 / 12 / 20 = those and 3 / 8 / 16 features, 16 = sixteen
 // further features only. A block with room for more features than there are reads zeros for the rest.
 #include "shared/layout.glsl"
+#include "shared/select.glsl"
 #define BASE (CHANNELS != 16)
 #if BASE
 #define FEATURES (CHANNELS - BASE_CHANNELS)
@@ -33,7 +34,7 @@ void load_splat(uint splat, bool valid) {
     own_a = p.z;
     own_b = p.w;
     own_c = q.x;
-    own_log2_opacity = valid ? q.y : -1e4;
+    own_log2_opacity = select(valid, q.y, -1e4);
 #if BASE
     vec4 r = projected[PROJECTED_VECTORS * splat + 2];
     [[unroll]] for (int k = 0; k < BASE_CHANNELS; k++) own_value[k] = r[k];

@@ -55,18 +55,18 @@ void evaluate(uint i, vec2 origin) {
             float dy = dy0 - float(m * LANES_Y);
             float raw = exp2(fma(fma(c, dy, bx), dy, ax));
             // The comparison of raster_forward.comp, on the power: it must decide alike.
-            float alpha = fma(fma(c, dy, bx), dy, ax) >= LOG2_ALPHA_MIN ? min(ALPHA_MAX, raw) : 0.0;
+            float alpha = select(fma(fma(c, dy, bx), dy, ax) >= LOG2_ALPHA_MIN, min(ALPHA_MAX, raw), 0.0);
             float w = alpha * T[k], next = T[k] - w;
             bool stop = next < TRANSMITTANCE_MIN;
-            weight[k] = stop ? 0.0 : w;
-            ratio[k] = stop || raw > ALPHA_MAX ? 0.0 : alpha / (1.0 - alpha);
-            T[k] = stop ? -abs(T[k]) : next;
+            weight[k] = select(stop, 0.0, w);
+            ratio[k] = select(both(!stop, raw <= ALPHA_MAX), alpha / (1.0 - alpha), 0.0);
+            T[k] = select(stop, -abs(T[k]), next);
             own[k] = 0.0;
         }
     }
     [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {
         float value = subgroupShuffle(own_value[channel], i);
-        float felt = channel < CHANNELS - FEATURES ? value : value * coupling;
+        float felt = value * (channel < CHANNELS - FEATURES ? 1.0 : coupling);
         float sum = 0.0;
         [[unroll]] for (int k = 0; k < PIXELS; k++) {
             own[k] = fma(felt, upstream[channel * PIXELS + k], own[k]);
@@ -120,7 +120,7 @@ void store_gradients(uvec2 item, float sums[VALUES]) {
     [[unroll]] for (int n = 0; n < VALUES - FEATURES; n++) ATOMIC_ADD(projected_grad[GRADIENT_FLOATS * item.x + n], sums[n]);
 #if FEATURES > 0
     [[unroll]] for (int n = 0; n < FEATURES; n++) {
-        float sum = n < features ? sums[VALUES - FEATURES + n] : 0.0;
+        float sum = select(n < features, sums[VALUES - FEATURES + n], 0.0);
         ATOMIC_ADD(codes_grad[4 * (item.x * code_vectors + first_vector) + min(n, features - 1)], sum);
     }
 #endif
@@ -137,20 +137,20 @@ void main() {
 
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
-        bool inside = x < width && y < bottom;
-        uint pixel = inside ? (y - top) * width + x : 0;
-        T[k] = inside ? 1.0 : -1.0;
+        bool inside = both(x < width, y < bottom);
+        uint pixel = select(inside, (y - top) * width + x, 0u);
+        T[k] = select(inside, 1.0, -1.0);
         behind[k] = 0.0;
         [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {
-            bool used = inside && (channel < CHANNELS - FEATURES || channel - (CHANNELS - FEATURES) < features);
-            uint at = (first_plane + channel) * pixels + pixel;
-            float g = used ? planes_grad[used ? at : 0] : 0.0;
+            bool used = both(inside, channel < CHANNELS - FEATURES || channel - (CHANNELS - FEATURES) < features);
+            uint at = select(used, (first_plane + channel) * pixels + pixel, 0u);
+            float g = select(used, planes_grad[at], 0.0);
             upstream[channel * PIXELS + k] = g;
-            float felt = channel < CHANNELS - FEATURES ? g : g * coupling;
-            behind[k] = fma(felt, planes[used ? at : 0], behind[k]);
+            float felt = g * (channel < CHANNELS - FEATURES ? 1.0 : coupling);
+            behind[k] = fma(felt, planes[at], behind[k]);
         }
 #if BASE
-        if (inside) behind[k] -= planes_grad[alpha_plane * pixels + pixel] * transmittances[pixel];
+        behind[k] -= select(inside, planes_grad[alpha_plane * pixels + pixel] * transmittances[pixel], 0.0);
 #endif
     }
 
@@ -166,7 +166,7 @@ void main() {
         for (uint i = 0; i < batch; i++) {
             evaluate(i, origin);
             bool mine = (lane & (HALF - 1)) == (i & (HALF - 1));
-            bool keep_low = mine && i < HALF, keep_high = mine && i >= HALF;
+            bool keep_low = both(mine, i < HALF), keep_high = both(mine, i >= HALF);
             [[unroll]] for (int n = 0; n < VALUES; n++) {
                 float sum = part[n];
                 sum += subgroupShuffleXor(sum, 1);
@@ -182,14 +182,14 @@ void main() {
 #if HALF > 16
                 sum += subgroupShuffleXor(sum, 16);
 #endif
-                low[n] = keep_low ? sum : low[n];
-                high[n] = keep_high ? sum : high[n];
+                low[n] = select(keep_low, sum, low[n]);
+                high[n] = select(keep_high, sum, high[n]);
             }
         }
         bool in_low = lane < HALF;
         [[unroll]] for (int n = 0; n < VALUES; n++) {
-            float own = in_low ? low[n] : high[n];
-            high[n] = subgroupShuffleXor(in_low ? high[n] : low[n], HALF);
+            float own = select(in_low, low[n], high[n]);
+            high[n] = subgroupShuffleXor(select(in_low, high[n], low[n]), HALF);
             low[n] = own;
         }
         [[unroll]] for (int n = 0; n < VALUES; n++) low[n] += high[n];

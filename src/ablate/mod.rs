@@ -205,3 +205,36 @@ impl Study<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::progress::Silent;
+
+    #[test]
+    fn rows_that_failed_in_an_earlier_run_are_tried_again() {
+        let (device, registry) = (Device::open(None).unwrap(), Registry::open(None).unwrap());
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast");
+        // More photos than there are frames: every row fails before any work.
+        let plan = Plan {
+            tables: vec![table("alignment").unwrap()],
+            regions: Some(Regions::Exact),
+            views: Some(99),
+            ..Plan::default()
+        };
+        let rows = |earlier: &[Measurement]| {
+            let mut kept = Vec::new();
+            let data = DataSet::open("breakfast".into(), folder.as_ref(), None).unwrap();
+            run(&plan, vec![data], (&device, &registry), earlier, &Silent, &mut |f| {
+                kept = f.measurements.to_vec();
+                Ok(())
+            })
+            .unwrap_err();
+            kept
+        };
+        let first = rows(&[]);
+        assert!(first.len() == 5 && first.iter().all(|m| m.failed && m.note.contains("99 views")));
+        let noted = |m: &Measurement| Measurement { note: "earlier".into(), ..m.clone() };
+        assert_eq!(rows(&first.iter().map(noted).collect::<Vec<_>>()), first);
+    }
+}

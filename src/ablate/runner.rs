@@ -388,3 +388,40 @@ struct RegionData {
     queries: Vec<TextQuery>,
     space: String,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::setup::Sources;
+    use super::*;
+    use crate::progress::Silent;
+    use crate::run::method::SPARSELGS;
+
+    #[test]
+    fn held_out_views_that_one_row_has_as_photos_are_scored_in_none() {
+        let (device, registry) = (Device::open(None).unwrap(), Registry::open(None).unwrap());
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast");
+        let data = DataSet::open("breakfast".into(), folder.as_ref(), None).unwrap();
+        let runner = Runner::open(&device, &registry, data, &Silent);
+        let row = |views: usize| {
+            let Sources { init, matcher, .. } = Sources::default();
+            let setup = Setup {
+                views,
+                init,
+                true_cameras: true,
+                matcher,
+                max_points: None,
+                regions: Regions::Exact,
+                recipe: SPARSELGS.recipe,
+                iterations: 1,
+                language_iterations: 1,
+            };
+            let (label, group, note) = (views.to_string(), String::new(), String::new());
+            TableRow { label, group, runs: RowWork::Score(setup), note }
+        };
+        // Four photos and eight held-out views, of which the second row takes two.
+        let scope = runner.scope([row(4), row(6)].iter());
+        let photos = runner.frames(6).unwrap();
+        assert_eq!((photos.len(), scope.frames.len()), (6, 6));
+        assert!(photos.iter().all(|f| !scope.frames.contains(&f.stem)), "{scope:?}");
+    }
+}

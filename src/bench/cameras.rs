@@ -454,4 +454,42 @@ mod tests {
         assert!((report.mean_auc[0].unwrap() - f.auc[0].unwrap() / 2.0).abs() < 1e-12);
         assert!(report.text().contains("2 sets, 1 without cameras"));
     }
+
+    #[test]
+    fn wrong_cameras_without_a_warning_of_them_are_named() {
+        let row = |data: &str, degrees: f64, warnings: &[&str]| CameraRow {
+            data: data.into(),
+            photos: Vec::new(),
+            seconds: 1.0,
+            warnings: warnings.iter().map(|w| w.to_string()).collect(),
+            outcome: CameraOutcome::Figures(Box::new(CameraFigures {
+                focal_error: 0.0,
+                focal_sigma: None,
+                focal_sigmas: None,
+                rotation_degrees: degrees,
+                centre_fraction: 0.0,
+                pair_rotation_degrees: degrees,
+                pair_direction_degrees: 0.0,
+                auc: [None; 3],
+                principal_point: 0.0,
+                rotation_sigma_degrees: 0.0,
+                confidence: None,
+                left_out: vec!["b".into()],
+                lens: Lens::NONE,
+                true_lens: None,
+            })),
+        };
+        let left_out = "b is left out";
+        let rows = vec![
+            row("right", 0.1, &[left_out]),
+            row("warned", 5.0, &[left_out, "little parallax"]),
+            row("silent", 5.0, &[left_out]),
+        ];
+        let report = summarise(rows);
+        assert_eq!(
+            (report.wrong, report.wrong_without_warning.as_slice()),
+            (2, &[PathBuf::from("silent")][..])
+        );
+        assert!(report.text().contains("2, without a warning 1: silent"));
+    }
 }

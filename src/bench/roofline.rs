@@ -47,9 +47,13 @@ fn best(runs: &[Vec<(&str, f64)>]) -> f64 {
     runs.iter().flatten().map(|p| p.1).fold(f64::INFINITY, f64::min)
 }
 
+/// About 14 ms on lavapipe and 1 ms on a large GPU: long against launching it.
+fn fma_threads(device: &Device) -> usize {
+    if device.info().is_cpu { 1 << 17 } else { 1 << 22 }
+}
+
 fn arithmetic(device: &Device, budget: &Budget, section: &mut Section) -> Result<f64> {
-    // About 14 ms on lavapipe and 1 ms on a large GPU: long against launching it.
-    let threads: usize = if device.info().is_cpu { 1 << 17 } else { 1 << 22 };
+    let threads = fma_threads(device);
     let values = device.buffer::<f32>("fma values", threads)?;
     let record = || {
         let mut rec = Recorder::new(device, "arithmetic");
@@ -74,6 +78,10 @@ mod tests {
         assert!(roofline.bytes_per_second > 1e6 && roofline.bytes_per_second.is_finite(), "{roofline:?}");
         assert!(roofline.flops_per_second > 1e6 && roofline.flops_per_second.is_finite(), "{roofline:?}");
         assert_eq!(section.rows.len(), 3);
+        // A multiplication and an addition each, in the fastest run.
+        let operations = 2.0 * (fma_threads(&device) * FMA_PER_THREAD) as f64;
+        let seconds = section.row("fused multiply-adds").unwrap().ms.best / 1e3;
+        assert!((roofline.flops_per_second * seconds / operations - 1.0).abs() < 1e-9, "{roofline:?}");
         let r = Roofline { bytes_per_second: 1e9, flops_per_second: 1e10 };
         assert_eq!(r.floor_ms(1e6, 0.0), 1.0);
         assert_eq!(r.floor_ms(1e6, 5e7), 5.0);

@@ -346,3 +346,31 @@ pub unsafe extern "C" fn svk_scene_save(
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_camera_of_a_host_sees_by_the_rows_of_its_matrix() {
+        let given = SvkCamera {
+            size: size_of::<SvkCamera>(),
+            width: 80,
+            height: 60,
+            fx: 13.0,
+            fy: 26.0,
+            cx: 40.0,
+            cy: 30.0,
+            // A third of a turn: x, y and z of the camera are the world's y, z and x.
+            world_to_camera: [[0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 1.0, -2.0], [1.0, 0.0, 0.0, 3.0]],
+        };
+        // SAFETY: a whole structure.
+        let camera = unsafe { camera_in(&given) }.ok().unwrap();
+        // (20 + 1, 30 − 2, 10 + 3) before the camera.
+        let (pixel, depth) = camera.project(DVec3::new(10.0, 20.0, 30.0));
+        assert!(
+            (depth - 13.0).abs() < 1e-12 && (pixel - glam::DVec2::new(61.0, 86.0)).length() < 1e-9,
+            "{pixel}"
+        );
+    }
+}

@@ -221,3 +221,23 @@ fn source<K: SourceKind>(
         (None, given) => Ok(given.unwrap_or_else(sources::default::<K>)),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_lies_between_the_rows_of_a_photo_in_memory_is_skipped() {
+        // Two rows of two pixels, 8 bytes apart; the second one ends with its last pixel.
+        let bytes: [u8; 14] = [1, 2, 3, 4, 5, 6, 99, 99, 7, 8, 9, 10, 11, 12];
+        // SAFETY: zero is a value.
+        let none: SvkPhoto = unsafe { std::mem::zeroed() };
+        let given =
+            SvkPhoto { pixels: bytes.as_ptr(), pixel_bytes: 3, width: 2, height: 2, row_bytes: 8, ..none };
+        // SAFETY: the bytes live as long as the call.
+        let image = unsafe { pixels(&given, Path::new("a")) }.ok().unwrap();
+        let expected = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0], [10.0, 11.0, 12.0]];
+        assert_eq!((image.width, image.height), (2, 2));
+        assert_eq!(image.data, expected.map(|p| p.map(|v| v / 255.0f32)));
+    }
+}

@@ -207,7 +207,7 @@ pub(super) fn plane_sweep(device: &Device) -> Found {
 
 /// exp, sqrt and the order of sums round differently, so that nearly equal hypotheses may win either way; anything more is wrong
 /// (the bounds of the test of stereo).
-fn planes(actual: &[Vec4], twin: &[Vec4]) -> std::result::Result<String, String> {
+pub(super) fn planes(actual: &[Vec4], twin: &[Vec4]) -> std::result::Result<String, String> {
     let same = |a: &Vec4, b: &Vec4| (a.truncate() - b.truncate()).length() < 1e-4 * a.truncate().length();
     let agreeing: Vec<(&Vec4, &Vec4)> = actual.iter().zip(twin).filter(|(a, b)| same(a, b)).collect();
     let share = agreeing.len() as f64 / actual.len().max(1) as f64;

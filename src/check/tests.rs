@@ -1,7 +1,9 @@
 use super::compared::{close, equal, worst};
+use super::images::planes;
 use super::*;
-use crate::gpu::shaders;
+use crate::gpu::{Executor, Op, TestDevice, shaders};
 use crate::pass::close::Tolerance;
+use glam::Vec4;
 
 fn wrong(pass: &'static str, way: Option<Way>) -> Row {
     Row { pass, way, time: Duration::ZERO, outcome: Err("wrong".to_owned()) }
@@ -71,4 +73,42 @@ fn wrong_results_are_told_apart_from_right_ones() {
     assert!(equal("b", &[1, 2], &[1, 2]).is_ok());
     assert!(equal("b", &[1, 3], &[1, 2]).unwrap_err().contains("element 1 is 3, should be 2"));
     assert!(equal("b", &[1], &[1, 2]).is_err());
+}
+
+#[test]
+fn planes_may_differ_where_two_are_nearly_as_good_and_nowhere_else() {
+    let twin = [Vec4::new(0.1, 0.0, 0.5, 0.2); 1000];
+    let with = |count: usize, change: Vec4| {
+        let mut actual = twin;
+        actual[..count].iter_mut().for_each(|plane| *plane += change);
+        planes(&actual, &twin)
+    };
+    assert!(with(10, Vec4::X).is_ok());
+    assert!(with(20, Vec4::X).unwrap_err().contains("98.0 % are the twin's"));
+    assert!(with(1, 0.01 * Vec4::W).unwrap_err().contains("costs differ"));
+}
+
+/// A device that fails at everything.
+struct Broken;
+
+impl Executor for Broken {
+    fn run(&self, _: &[&Op]) -> std::result::Result<(), String> {
+        Err("broken".to_owned())
+    }
+}
+
+#[test]
+fn after_a_wrong_way_the_device_is_opened_anew_without_it() {
+    let options = Options { cache: None, staging: false, ..Options::from_env(None) };
+    let device = TestDevice::executed_by(Box::new(Broken), 32, &options).unwrap();
+    let mut seen = Vec::new();
+    let stopped = run(&device, &options, &mut |row| {
+        seen.push((row.way, row.outcome.is_ok()));
+        if seen.len() == 4 { Err(crate::Error::Cancelled) } else { Ok(()) }
+    });
+    assert!(matches!(stopped, Err(crate::Error::Cancelled)));
+    // Nothing replaces what came before the sorts; the one that is opened now is not broken.
+    let expected =
+        [(None, false), (None, false), (Some(Way::ChunkSort), false), (Some(Way::SweepSort), true)];
+    assert_eq!(seen, expected);
 }

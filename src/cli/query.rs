@@ -217,3 +217,26 @@ fn instance_line(n: usize, instance: &Instance, stems: &[String]) -> String {
     let splats = instance.splats.len();
     format!("  {n}. at {x:.3}, {y:.3}, {z:.3}, size {a:.3} × {b:.3} × {c:.3}, {splats} splats{seen}")
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pass::RenderedFrame;
+    use crate::scene::{Pose, Scale};
+
+    #[test]
+    fn the_distance_to_an_answer_is_told_in_units_and_in_metres() {
+        let mut rendered = RenderedFrame::empty(4, 4, 0);
+        rendered.depth.data.fill(4.0);
+        let frame = DecodedFrame { rendered, codes: Vec::new() };
+        let (pose, size) = (Pose::IDENTITY, 4);
+        let camera =
+            Camera { name: "a".into(), width: size, height: size, fx: 4.0, fy: 4.0, cx: 0.5, cy: 1.5, pose };
+        // The middle of pixel (3, 1) is 3 pixels right of the principal point: 3 units at a depth of 4.
+        let answer = QueryResult { location: (3, 1), ..QueryResult::default() };
+        let scale = Scale { metres_per_unit: 0.25, log_sigma: 0.1, stated: Vec::new() };
+        let told = place(&frame, &camera, &answer, &World { scale: Some(scale), ..World::default() });
+        assert_eq!((told["distance"].as_f64(), told["distance_metres"].as_f64()), (Some(5.0), Some(1.25)));
+        assert_eq!(place(&frame, &camera, &answer, &World::default())["distance_metres"], Value::Null);
+    }
+}

@@ -263,6 +263,33 @@ mod tests {
     }
 
     #[test]
+    fn presets_are_those_that_are_asked_for() {
+        use crate::fit::Preset;
+        for (name, preset) in
+            [("draft", Preset::Draft), ("default", Preset::Default), ("paper", Preset::Paper)]
+        {
+            assert_eq!(plan(&["--preset", name]).unwrap().preset, Some(preset));
+        }
+    }
+
+    #[test]
+    fn photos_that_join_a_scene_get_masks_and_features_from_where_it_has_its_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let made = serde_json::json!({ "method": "lift", "masks": "dir:src", "features": "dir:tests" });
+        let record = serde_json::json!({ "config": { "plan": made } });
+        std::fs::write(folder.path().join("run.json"), record.to_string()).unwrap();
+        let line = ["splatvk", "run", "new.jpg", "--features", "words"];
+        let Command::Run(args) = Cli::try_parse_from(line).unwrap().command else { unreachable!() };
+        let plan = super::joining(&args, folder.path(), &Inventory::default()).unwrap();
+        assert_eq!(plan.masks, SourceChoice::with("dir", "src"));
+        assert_eq!(
+            (plan.features, plan.matcher),
+            (named("words"), named("xfeat")),
+            "asked for, not recorded"
+        );
+    }
+
+    #[test]
     fn auto_takes_the_most_preferred_network_there_is() {
         let model = |name: &str, task| Installed {
             name: name.to_owned(),

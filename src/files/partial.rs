@@ -118,6 +118,12 @@ pub fn remove_any(path: &Path) -> std::io::Result<()> {
 #[cfg(feature = "cli")]
 pub fn remove_unfinished() -> bool {
     unfinished().drain(..).for_each(|entry| remove(&entry));
+    nothing_finished()
+}
+
+/// Whether this process has finished nothing that a user asked for.
+#[cfg(feature = "cli")]
+fn nothing_finished() -> bool {
     !FINISHED.load(Ordering::SeqCst)
 }
 
@@ -166,6 +172,8 @@ mod tests {
         std::fs::write(partial.path(), "whole").unwrap();
         partial.finish(|path| std::fs::rename(path, &place)).unwrap();
         assert_eq!(std::fs::read_to_string(&place).unwrap(), "whole");
+        #[cfg(feature = "cli")]
+        assert!(!nothing_finished(), "a command that is stopped from now on says that something is kept");
         let partial = Partial::beside(&base.path().join("x/y"), true).unwrap();
         std::fs::create_dir(partial.path()).unwrap();
         std::fs::write(base.path().join("x/letter"), "another's").unwrap();

@@ -69,3 +69,67 @@ fn apply(lifting: &mut Lifting, lifted: &Lifted, weights: &[f32], v: &[f32]) -> 
 fn dot(a: &[f32], b: &[f32]) -> f64 {
     a.par_iter().zip(b).map(|(x, y)| f64::from(*x) * f64::from(*y)).sum()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::PRIOR;
+    use crate::fit::{LanguageOptions, LanguageRun, Preset, Start, Training};
+    use crate::gpu::test_device;
+    use crate::pass::{FeatureMode, RasterOptions, Renderer, seeded};
+    use crate::progress::Silent;
+    use crate::scene::{Codebook, LevelField, Plane, Pose, RgbImage, Splats};
+    use glam::{DMat3, DVec3};
+
+    #[test]
+    fn features_solve_the_normal_equations() {
+        const SIZE: (usize, usize) = (48, 36);
+        let device = test_device();
+        // A small splat before a large one, and one beside them.
+        let splats = Splats {
+            means: vec![[0.0, 0.0, 2.0], [0.1, 0.0, 3.0], [-0.5, 0.1, 4.0]],
+            log_scales: [0.1f32, 0.4, 0.4].map(|s| [s.ln(); 3]).to_vec(),
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; 3],
+            opacity_logits: vec![1.0; 3],
+            sh_degree: 0,
+            sh: vec![0.0; 9],
+        };
+        let label = |p: usize| if p < 5 * SIZE.0 { -1 } else { i32::from(p % SIZE.0 > 26) };
+        let codebook = Codebook {
+            embedding_dim: 1,
+            code_dim: 3,
+            embeddings: vec![1.0; 2],
+            codes: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+            ..Codebook::default()
+        };
+        let data = (0..SIZE.0 * SIZE.1).map(label).collect();
+        let targets = vec![Plane { width: SIZE.0, height: SIZE.1, data }];
+        let level = LevelField { codebook, targets, ..LevelField::default() };
+        let images = [RgbImage { width: SIZE.0, height: SIZE.1, data: vec![[0.5; 3]; SIZE.0 * SIZE.1] }];
+        let cameras = [seeded::camera(SIZE.0 as u32, SIZE.1 as u32, Pose::IDENTITY)];
+        let options =
+            LanguageOptions { start: Start::LeastSquares, ..LanguageOptions::preset(Preset::Draft) };
+        let run =
+            LanguageRun::new(&device, &images, &cameras, &splats, &[(0, &level)], &options, &Silent).unwrap();
+        let (_, found) = run.trainer().parts().params.download().unwrap();
+
+        // How much every pixel shows of each splat.
+        let raster = RasterOptions { feature_mode: FeatureMode::Linear, ..RasterOptions::default() };
+        let one_each = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
+        let mut renderer = Renderer::new(&device, &splats, &one_each, 3).unwrap().with_options(raster);
+        let shown = renderer.render(&cameras[0]).unwrap().features;
+        // (AᵀA + λW) f = (1 + λ) Aᵀc; a column per channel.
+        let (mut left, mut right, prior) = (DMat3::ZERO, DMat3::ZERO, f64::from(PRIOR));
+        for (p, w) in shown.chunks_exact(3).enumerate().filter(|(p, _)| label(*p) >= 0) {
+            let w = DVec3::new(w[0].into(), w[1].into(), w[2].into());
+            left += DMat3::from_cols(w * w.x, w * w.y, w * w.z) + DMat3::from_diagonal(prior * w);
+            *right.col_mut(label(p) as usize) += (1.0 + prior) * w;
+        }
+        let solution = left.inverse() * right;
+        for (splat, f) in found.chunks_exact(3).enumerate() {
+            let own = DVec3::new(f[0].into(), f[1].into(), f[2].into()).normalize();
+            let off = own.distance(solution.row(splat).normalize());
+            // The sums are of f32; the means of the codes are 0.3 to 0.8 away.
+            assert!(off < 5e-3, "{splat}: {own}, {off} from {solution}");
+        }
+    }
+}

@@ -212,3 +212,18 @@ pub(super) fn unit_start(mut features: Vec<f32>, width: usize) -> Vec<f32> {
 fn length(v: &[f32]) -> f32 {
     v.iter().map(|v| v * v).sum::<f32>().sqrt()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reliability_is_how_far_the_codes_of_a_splat_agree() {
+        // Two levels of two numbers: one code throughout, two half and half; hardly seen, two opposite ones.
+        let sums = vec![3.0, 0.0, 1.0, 1.0, 0.01, 0.0, 0.0, 0.0];
+        let lifted = Lifted { sums, weights: vec![3.0, 2.0, 0.01, 4.0] };
+        assert_eq!(lifted.reliability(0, 2, 2), [1.0, 0.0]);
+        // √½ in steps of 1/255.
+        assert_eq!(lifted.reliability(1, 2, 2), [180.0 / 255.0, 0.0]);
+    }
+}

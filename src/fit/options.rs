@@ -276,3 +276,22 @@ impl LanguageOptions {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn with_another_number_of_steps_rates_fall_until_the_last_of_them() {
+        for steps in [30, 3000] {
+            let options = RgbOptions::preset(Preset::Draft).with_iterations(steps);
+            for rate in [Some(options.rates.means), options.poses.map(|p| p.rate)].into_iter().flatten() {
+                let share = |step: usize| rate.at(step) / rate.end;
+                assert!((share(steps) - 1.0).abs() < 1e-9 && share(steps - 1) > 1.0001, "{steps}: {rate:?}");
+            }
+        }
+        // That of the paper is longer than its runs (docs/method.md#schedules).
+        let paper = RgbOptions::preset(Preset::Paper);
+        assert_eq!(paper.clone().with_iterations(100).rates.means, paper.rates.means);
+    }
+}

@@ -403,3 +403,62 @@ impl Training for Run<'_> {
 fn coarse_steps(options: &RgbOptions) -> usize {
     (options.coarse * options.iterations as f64) as usize
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::pose::PoseOptions;
+    use crate::fit::schedule::Exponential;
+    use crate::gpu::test_device;
+    use crate::pass::{Renderer, seeded};
+    use crate::preset::Preset;
+    use crate::scene::Pose;
+    use glam::DVec3;
+
+    fn turned(camera: &Camera, by: DVec3) -> Camera {
+        Camera { pose: Pose::exp(DVec3::ZERO, by).compose(&camera.pose), ..camera.clone() }
+    }
+
+    /// Splats, and two cameras with photos of them.
+    fn scene(device: &Device) -> (Splats, Vec<Camera>, Vec<RgbImage>) {
+        let (splats, camera) = seeded::small(300, 75, 53, 0, 1003);
+        let cameras = vec![camera.clone(), turned(&camera, DVec3::X * 0.01)];
+        let mut renderer = Renderer::new(device, &splats, &[], 0).unwrap();
+        let images = cameras.iter().map(|c| renderer.render(c).unwrap().rgb).collect();
+        (splats, cameras, images)
+    }
+
+    #[test]
+    fn training_goes_on_at_the_full_size_with_the_poses_that_it_found_at_half_of_it() {
+        let device = test_device();
+        let (splats, cameras, images) = scene(&device);
+        let poses = Some(PoseOptions { start: 0, rate: Exponential::constant(1e-3) });
+        let options = RgbOptions { iterations: 10, coarse: 0.5, poses, ..RgbOptions::preset(Preset::Draft) };
+        let scale = SceneScale::measure(&cameras, &splats.means);
+        let photos = Photos { images: &images, cameras: &cameras, depths: None };
+        let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
+        let size = |run: &Run| {
+            let frame = run.trainer.parts().raster.frame();
+            [frame.width, frame.height, run.trainer.cameras[1].width]
+        };
+        (0..5).for_each(|iteration| run.step(iteration).unwrap());
+        let found = run.trainer.cameras[1].pose;
+        assert!(size(&run) == [38, 27, 38] && found != cameras[1].pose, "{:?} {found:?}", size(&run));
+        run.schedule(5).unwrap();
+        assert_eq!((size(&run), run.trainer.cameras[1].pose), ([75, 53, 75], found));
+    }
+
+    #[test]
+    fn refined_cameras_that_explain_the_photos_worse_are_not_kept() {
+        let device = test_device();
+        let (splats, cameras, images) = scene(&device);
+        let options = RgbOptions { coarse: 0.0, bounded: false, ..RgbOptions::preset(Preset::Draft) };
+        let scale = SceneScale::measure(&cameras, &splats.means);
+        let photos = Photos { images: &images, cameras: &cameras, depths: None };
+        let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
+        // As if training had led the second camera astray.
+        run.trainer.cameras[1] = turned(&cameras[1], DVec3::Y * 0.2);
+        let (_, kept, _, refined) = run.finish().unwrap();
+        assert!(!refined && kept == cameras);
+    }
+}

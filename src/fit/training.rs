@@ -215,6 +215,7 @@ mod tests {
     use crate::pass::seeded;
     use crate::scene::{Camera, Codebook, LevelField, Plane, Pose, RgbImage, Splats};
     use glam::DVec3;
+    use std::time::Duration;
 
     const COUNTED: usize = 8;
 
@@ -262,11 +263,14 @@ mod tests {
         Outcome { submissions, allocations, splats, features, camera }
     }
 
+    fn colour_options() -> RgbOptions {
+        let rate = Exponential { start: 1e-3, end: 1e-4, steps: 2 * COUNTED };
+        RgbOptions { poses: Some(PoseOptions { start: 0, rate }), ..RgbOptions::preset(Preset::Draft) }
+    }
+
     fn colour(device: &Device) -> Outcome {
         let (splats, cameras, images) = scene();
-        let mut options = RgbOptions::preset(Preset::Draft);
-        let rate = Exponential { start: 1e-3, end: 1e-4, steps: 2 * COUNTED };
-        options.poses = Some(PoseOptions { start: 0, rate });
+        let options = colour_options();
         let scale = SceneScale::measure(&cameras, &splats.means);
         let photos = Photos { images: &images, cameras: &cameras, depths: None };
         let mut run = RgbRun::new(device, photos, &splats, scale, &options).unwrap();
@@ -310,5 +314,38 @@ mod tests {
             assert_eq!((there.submissions, there.allocations), (1.0, 0.0));
             assert_eq!(here, there, "other bits without mapped memory");
         }
+    }
+
+    /// Only keeps a state.
+    struct Keeps(Checkpoint);
+
+    impl Progress for Keeps {
+        fn begin(&self, _: &'static str, _: u64) {}
+        fn step(&self, _: u64, _: &str) {}
+        fn end(&self) {}
+        fn warn(&self, _: &str) {}
+        fn checkpoint(&self) -> Option<&Checkpoint> {
+            Some(&self.0)
+        }
+    }
+
+    #[test]
+    fn what_goes_on_from_a_kept_state_ends_with_the_same_bits() {
+        let (device, options) = (device(false), colour_options());
+        let (splats, cameras, images) = scene();
+        let scale = SceneScale::measure(&cameras, &splats.means);
+        let photos = Photos { images: &images, cameras: &cameras, depths: None };
+        let new = || RgbRun::new(&device, photos, &splats, scale, &options).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let keeps = Keeps(Checkpoint::new(folder.path().join("state"), Duration::ZERO, true));
+        let (mut whole, mut resumed) = (new(), new());
+        (0..COUNTED).for_each(|iteration| whole.step(iteration).unwrap());
+        save(&whole, COUNTED, &keeps).unwrap();
+        assert_eq!(restore(&mut resumed, &keeps).unwrap(), COUNTED);
+        let [a, b] = [&mut whole, &mut resumed].map(|run| {
+            (COUNTED..2 * COUNTED).for_each(|iteration| run.step(iteration).unwrap());
+            (run.trainer().parts().params.download().unwrap(), run.trainer().cameras.clone())
+        });
+        assert!(a == b, "other bits");
     }
 }

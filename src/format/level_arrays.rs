@@ -132,3 +132,31 @@ pub fn read(
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_of_codes_beyond_a_byte_come_back() {
+        let codes = 300;
+        let codebook = Codebook {
+            embedding_dim: 1,
+            code_dim: 1,
+            embeddings: vec![1.0; codes],
+            codes: vec![1.0; codes],
+            weights: vec![1.0; codes],
+            ..Codebook::default()
+        };
+        let mut level = LevelField { codebook: codebook.clone(), ..LevelField::default() };
+        let mixes =
+            [(299, 43), (7, 256), (300, 300)].map(|(first, second)| CodeMix { first, second, share: 9 });
+        level.carry_mixes(mixes.to_vec());
+        let mut arrays = Vec::new();
+        append(&mut arrays, "s", &level, 3, &[]).unwrap();
+        let arrays: BTreeMap<String, NpyArray> = arrays.into_iter().collect();
+        let mut back = LevelField { codebook, ..LevelField::default() };
+        read(&arrays, "s", 3, &mut back).unwrap();
+        assert_eq!(back, level);
+    }
+}

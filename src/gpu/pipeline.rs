@@ -128,3 +128,25 @@ fn check(info: &DeviceInfo, module: &Module) -> Result<()> {
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::{shaders, test_device};
+
+    #[test]
+    fn a_shader_that_needs_what_the_device_lacks_is_refused_by_name() {
+        let whole = test_device().info().clone();
+        let fits = |m: &&Module| !m.capabilities.is_empty() && check(&whole, m).is_ok();
+        let module = shaders::FAMILIES.iter().flat_map(|f| f.modules).find(fits).unwrap();
+        let refused = |info: &DeviceInfo, what: &str| {
+            let said = check(info, module).unwrap_err().to_string();
+            assert!(said.contains(module.name) && said.contains(what), "{said}");
+        };
+        let mut info = whole.clone();
+        info.capabilities.remove(&module.capabilities[0]);
+        refused(&info, &format!("needs {:?}", module.capabilities[0]));
+        refused(&DeviceInfo { max_bindings: 0, ..whole.clone() }, "the device allows 0");
+        refused(&DeviceInfo { max_workgroup_threads: 1, ..whole.clone() }, "the device allows 1");
+    }
+}

@@ -66,6 +66,12 @@ pub(super) fn candidates(instance: &ash::Instance) -> Result<Vec<Candidate>> {
     let devices = unsafe { instance.enumerate_physical_devices() }
         .map_err(|e| no_device(format!("the Vulkan drivers list no device ({e}); {INSTALL}"), e))?;
     let mut all: Vec<Candidate> = devices.into_iter().map(|physical| candidate(instance, physical)).collect();
+    best_first(&mut all);
+    Ok(all)
+}
+
+/// Devices of one kind keep the driver's order.
+fn best_first(all: &mut [Candidate]) {
     all.sort_by_key(|c| match c.properties.device_type {
         vk::PhysicalDeviceType::DISCRETE_GPU => 0,
         vk::PhysicalDeviceType::INTEGRATED_GPU => 1,
@@ -73,7 +79,6 @@ pub(super) fn candidates(instance: &ash::Instance) -> Result<Vec<Candidate>> {
         vk::PhysicalDeviceType::CPU => 3,
         _ => 4,
     });
-    Ok(all)
 }
 
 pub(super) fn candidate(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Candidate {
@@ -152,5 +157,47 @@ pub(super) fn choose(all: Vec<Candidate>, choice: Option<&str>) -> Result<Candid
         (None, None) => Err(Error::no_device(format!(
             "no usable Vulkan device among {listed}: Vulkan 1.2 with VK_KHR_synchronization2 and a compute queue is needed; {INSTALL}"
         ))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ash::vk::PhysicalDeviceType as Kind;
+
+    fn made_up(name: &str, kind: Kind, unusable: Option<&str>) -> Candidate {
+        Candidate {
+            physical: vk::PhysicalDevice::null(),
+            properties: vk::PhysicalDeviceProperties { device_type: kind, ..Default::default() },
+            name: name.to_owned(),
+            unusable: unusable.map(str::to_owned),
+        }
+    }
+
+    #[test]
+    fn a_discrete_gpu_comes_first_and_the_cpu_last() {
+        let kinds = [
+            ("other", Kind::OTHER),
+            ("llvmpipe", Kind::CPU),
+            ("virtual", Kind::VIRTUAL_GPU),
+            ("integrated", Kind::INTEGRATED_GPU),
+            ("discrete", Kind::DISCRETE_GPU),
+            ("second", Kind::DISCRETE_GPU),
+        ];
+        let mut all: Vec<Candidate> = kinds.iter().map(|(name, kind)| made_up(name, *kind, None)).collect();
+        best_first(&mut all);
+        let names: Vec<&str> = all.iter().map(|c| c.name.as_str()).collect();
+        assert_eq!(names, ["discrete", "second", "integrated", "virtual", "llvmpipe", "other"]);
+    }
+
+    #[test]
+    fn what_is_unusable_is_passed_over_unless_it_is_asked_for() {
+        let old = || made_up("Old GPU", Kind::DISCRETE_GPU, Some("update the driver"));
+        let all = || vec![old(), made_up("New GPU", Kind::INTEGRATED_GPU, None)];
+        assert_eq!(choose(all(), None).unwrap().name, "New GPU");
+        assert_eq!(choose(all(), Some("new")).unwrap().name, "New GPU");
+        let said = |all, choice| choose(all, choice).err().unwrap().to_string();
+        assert!(said(all(), Some("0")).ends_with("Old GPU cannot be used: update the driver"));
+        assert!(said(vec![old()], None).contains("no usable Vulkan device among 0 = Old GPU"));
     }
 }

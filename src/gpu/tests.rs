@@ -244,3 +244,45 @@ fn synchronization_validation_is_on() {
     let messages = device.validation_messages();
     assert!(messages.iter().any(|m| m.contains("SYNC-HAZARD-READ-AFTER-WRITE")), "{messages:?}");
 }
+
+#[test]
+fn what_is_submitted_to_a_hosts_queue_is_submitted_under_its_lock() {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU64, Ordering};
+    let options = Options::from_env(None);
+    let entry = super::select::load().unwrap();
+    let instance = super::select::instance(&entry, None).unwrap();
+    let all = super::select::candidates(&instance).unwrap();
+    let candidate = super::select::choose(all, options.choice.as_deref()).unwrap();
+    let family = super::select::queue_family(&instance, candidate.physical).unwrap();
+    let (raw, _) = super::features::create(&instance, &candidate, family, &options).unwrap();
+    // SAFETY: the queue was requested in `create`.
+    let queue = unsafe { raw.get_device_queue(family, 0) };
+    let locked = Arc::new(AtomicU64::new(0));
+    let count = locked.clone();
+    let host = HostDevice {
+        get_instance_proc_addr: None,
+        instance: instance.handle(),
+        physical_device: candidate.physical,
+        device: raw.handle(),
+        queue,
+        queue_family: family,
+        extensions: vec![ash::khr::synchronization2::NAME.to_owned()],
+        features: EnabledFeatures { synchronization2: true, ..EnabledFeatures::default() },
+        queue_lock: Some(Box::new(move |submit: &mut dyn FnMut()| {
+            count.fetch_add(1, Ordering::Relaxed);
+            submit();
+        })),
+    };
+    // SAFETY: the handles belong together, nothing else uses them, and they are destroyed after the device.
+    let device = unsafe { Device::adopt(host, &options) }.unwrap();
+    assert_eq!(gathered(&device, &[10, 20, 30], &[0, 2, 2, 1]).unwrap(), [10, 30, 30, 20]);
+    assert!(device.submissions() > 0);
+    assert_eq!(locked.load(Ordering::Relaxed), device.submissions());
+    drop(device);
+    // SAFETY: nothing made from them is left.
+    unsafe {
+        raw.destroy_device(None);
+        instance.destroy_instance(None);
+    }
+}

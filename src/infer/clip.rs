@@ -349,3 +349,35 @@ fn cleaned(text: &str) -> String {
     let once = |text: String| entities.iter().fold(text, |t, (from, to)| t.replace(from, to));
     once(once(text.chars().map(quotes).collect())).trim().to_string()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::installed::Task;
+    use super::super::tests::clip_in;
+    use super::super::{Compute, Registry};
+    use super::*;
+
+    #[test]
+    fn features_that_are_kept_are_those_of_the_photos_masks() {
+        let dir = tempfile::tempdir().unwrap();
+        clip_in(dir.path(), [0, 1, 2]);
+        let registry = Registry::with(Some(dir.path()), Compute::by(Some("cpu"))).unwrap();
+        let mut clip = Clip::load(registry.installed(Task::Features, "clip").unwrap()).unwrap();
+        // Red above, blue below, and a mask of each half; then the two masks change places.
+        let data = (0..640).map(|p| if p < 320 { [1.0, 0.0, 0.0] } else { [0.0, 0.0, 1.0] }).collect();
+        let image = RgbImage { width: 32, height: 20, data };
+        let mut first_is_red = |labels: [i32; 2]| {
+            let data = (0..640).map(|p| labels[p / 320]).collect();
+            let labels = Plane { width: 32, height: 20, data };
+            let rows = clip.embed_regions(&image, &labels, 2, &Silent).unwrap();
+            rows[0] > rows[2]
+        };
+        assert_eq!((first_is_red([0, 1]), first_is_red([1, 0])), (true, false));
+    }
+
+    #[test]
+    fn quotes_are_straightened_and_entities_resolved_as_clip_does() {
+        let given = [" grandmother’s “vase” ", "&amp;amp; more", "a &lt;b&gt; c&#39;s"];
+        assert_eq!(given.map(cleaned), ["grandmother's \"vase\"", "& more", "a <b> c's"]);
+    }
+}

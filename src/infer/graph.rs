@@ -247,3 +247,27 @@ pub fn relayout(tensor: Tensor, from: &str, to: &str) -> Option<Tensor> {
     let (shape, data) = reorder(tensor.shape, tensor.data, from, to)?;
     Some(Tensor { shape, data })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{FLOAT, Onnx};
+    use super::*;
+
+    #[test]
+    fn what_is_kept_depends_on_the_adapter() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("graph.onnx");
+        Onnx::new()
+            .input("pixel_values", FLOAT, "batch 3 16 16")
+            .output("image_embeds", "batch 3")
+            .write(&path);
+        let key = || OutputKey::new("test").model(&GraphFile::recognise(&path).unwrap()).unwrap().short();
+        let plain = key();
+        assert_eq!(key(), plain);
+        // The same file, given its photos in another range.
+        let adapter = "family = \"clip\"\n[[graph]]\npart = \"image-tower\"\n\
+                       image = { mean = [0.5, 0.5, 0.5], std = [0.5, 0.5, 0.5], size = 16 }";
+        std::fs::write(path.with_extension("toml"), adapter).unwrap();
+        assert_ne!(key(), plain);
+    }
+}

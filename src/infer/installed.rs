@@ -277,3 +277,22 @@ fn shared_name(file: &Path) -> String {
     }
     name.trim_end_matches(['_', '-', '.']).to_string()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::clip_in;
+    use super::*;
+
+    #[test]
+    fn networks_that_were_never_trained_are_chosen_by_name_only() {
+        let dir = tempfile::tempdir().unwrap();
+        clip_in(dir.path(), [0, 1, 2]);
+        let registry = Registry::of(&[dir.path()]);
+        let chosen = || inventory(&registry).best(Task::Features).map(|m| m.name.clone());
+        assert_eq!(chosen().as_deref(), Some("clip_toy"));
+        let adapter = dir.path().join("clip_toy/adapter.toml");
+        std::fs::write(adapter, "family = \"clip\"\nuntrained = true\n").unwrap();
+        assert_eq!(chosen(), None);
+        assert!(registry.installed(Task::Features, "clip").unwrap().untrained());
+    }
+}

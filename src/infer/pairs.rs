@@ -296,8 +296,8 @@ mod tests {
     use crate::scene::{Camera, Pose, RgbImage};
 
     /// Pointmaps of 64 × 48 pixels from one graph, which knows the two views by the brightness of its first input: the points of
-    /// the dark and of the light view, in their own camera and in the other's, at the outputs `ports`.
-    fn graph(own: &[Vec<f32>; 2], other: &[Vec<f32>; 2], ports: [&str; 2]) -> Onnx {
+    /// the dark and of the light view, in their own camera and in the other's, at `ports`, all as sure.
+    fn graph(own: &[Vec<f32>; 2], other: &[Vec<f32>; 2], ports: [&str; 2], sure: f32) -> Onnx {
         let dims = [1, 48, 64, 3];
         let mut graph = Onnx::new().input("img1", FLOAT, "1 3 48 64").input("img2", FLOAT, "1 3 48 64");
         for (name, [dark, light]) in [("own", own), ("other", other)] {
@@ -315,7 +315,7 @@ mod tests {
         for k in ["conf_1", "conf_2"] {
             graph = graph
                 .output(k, "1 48 64")
-                .weight(&format!("sure_{k}"), &[1, 48, 64], &[5.0; 48 * 64])
+                .weight(&format!("sure_{k}"), &[1, 48, 64], &[sure; 48 * 64])
                 .node("Identity", &format!("sure_{k}"), k, &[]);
         }
         graph
@@ -346,13 +346,24 @@ mod tests {
         let [own, other] = [[points(0, 0), points(1, 1)], [points(1, 0), points(0, 1)]];
         let dir = tempfile::tempdir().unwrap();
         let ask = |ports: [&str; 2]| {
-            graph(&own, &other, ports).write(&dir.path().join("dust3r/model.onnx"));
+            graph(&own, &other, ports, 5.0).write(&dir.path().join("dust3r/model.onnx"));
             let model = Registry::of(&[dir.path()]).installed(Task::Geometry, "dust3r").unwrap();
             pointmaps(&model, &dark_and_light(), &Silent).map(drop)
         };
         ask(["pts3d_1", "pts3d_2"]).unwrap();
         let error = ask(["pts3d_2", "pts3d_1"]).unwrap_err().to_string();
         assert!(error.contains("swap names.points1 with names.points2"), "{error}");
+    }
+
+    #[test]
+    fn a_confidence_that_lacks_its_activation_is_refused_with_the_mend() {
+        let points = vec![1.0; 3 * 48 * 64];
+        let ahead = [points.clone(), points];
+        let dir = tempfile::tempdir().unwrap();
+        graph(&ahead, &ahead, ["pts3d_1", "pts3d_2"], 0.5).write(&dir.path().join("dust3r/model.onnx"));
+        let model = Registry::of(&[dir.path()]).installed(Task::Geometry, "dust3r").unwrap();
+        let error = pointmaps(&model, &dark_and_light(), &Silent).map(drop).unwrap_err().to_string();
+        assert!(error.contains("below 1") && error.contains("apply.conf = \"one-plus-exp\""), "{error}");
     }
 
     /// A tilted wall in front of two cameras, every point on the ray through the centre of its pixel: where the photo shows that
@@ -380,7 +391,7 @@ mod tests {
         };
         let [own, other] = [[points(0, 0), points(1, 1)], [points(1, 0), points(0, 1)]];
         let dir = tempfile::tempdir().unwrap();
-        graph(&own, &other, ["pts3d_1", "pts3d_2"]).write(&dir.path().join("dust3r/model.onnx"));
+        graph(&own, &other, ["pts3d_1", "pts3d_2"], 5.0).write(&dir.path().join("dust3r/model.onnx"));
         let model = Registry::of(&[dir.path()]).installed(Task::Geometry, "dust3r").unwrap();
         let maps = pointmaps(&model, &dark_and_light(), &Silent).unwrap();
         let pair = &maps.pairs[0];

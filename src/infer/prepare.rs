@@ -130,3 +130,20 @@ pub(super) fn views(photos: &[Photo], prepared: &[Prepared], progress: &dyn Prog
     }
     views
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::photo;
+    use super::*;
+    use crate::progress::Silent;
+
+    #[test]
+    fn a_focal_length_of_the_file_is_given_in_the_pixels_of_the_network() {
+        let image = RgbImage { width: 64, height: 32, data: vec![[0.5; 3]; 64 * 32] };
+        let photos = [Photo { exif_focal: Some(80.0), ..photo("a", image.clone()) }, photo("b", image)];
+        let from_photo = Affine { scale: [0.5; 2], offset: [0.0; 2] };
+        let ready = Prepared { width: 32, height: 16, filled: [32, 16], data: Vec::new(), from_photo };
+        let views = views(&photos, &[ready.clone(), ready], &Silent);
+        assert_eq!((views[0].exif_focal, views[1].exif_focal), (Some(40.0), None));
+    }
+}

@@ -295,14 +295,16 @@ mod tests {
         }
     }
 
-    /// Left half row 2, right half row 5 at every level of a 4-map file, plus one lone pixel of row 1.
+    /// Left half row 2, right half row 5 at every level of a 4-map file, plus one lone pixel of row 1;
+    /// nothing in its first map, which is no level.
     fn write_case(dir: &Path, width: usize, height: usize) {
         let mut labels = Vec::new();
-        for _ in 0..4 {
+        for map in 0..4 {
             for y in 0..height {
                 for x in 0..width {
                     let lone = x == 0 && y == 0;
-                    labels.push(if lone { 1.0 } else { [2.0, 5.0][usize::from(2 * x >= width)] });
+                    let label = if lone { 1.0 } else { [2.0, 5.0][usize::from(2 * x >= width)] };
+                    labels.push(if map == 0 { -1.0 } else { label });
                 }
             }
         }

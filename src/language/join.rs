@@ -229,9 +229,8 @@ mod tests {
         LanguageField { levels: vec![level; LEVEL_NAMES.len()], space: "test".into() }
     }
 
-    #[test]
-    fn known_things_keep_their_codes_and_only_new_ones_get_one() {
-        let camera = Camera {
+    fn camera() -> Camera {
+        Camera {
             name: String::new(),
             width: SIZE.0 as u32,
             height: SIZE.1 as u32,
@@ -240,7 +239,11 @@ mod tests {
             cx: 16.0,
             cy: 8.0,
             pose: Pose::IDENTITY,
-        };
+        }
+    }
+
+    #[test]
+    fn known_things_keep_their_codes_and_only_new_ones_get_one() {
         // The scene shows its two things up to column 24 and nothing beyond.
         let code = |x: usize| {
             if x < 12 {
@@ -268,7 +271,7 @@ mod tests {
             features: [axis(0), axis(1), axis(2), axis(3)].concat(),
             ..LevelMasks::default()
         };
-        let new = [SceneView { camera, codes: codes.clone(), depth, measured: &measured }];
+        let new = [SceneView { camera: camera(), codes: codes.clone(), depth, measured: &measured }];
         let masks = [ViewMasks { levels: vec![masks; 3] }];
         let options = BuildOptions { feature_dim: 4, ..BuildOptions::default() };
         let old = field();
@@ -285,6 +288,30 @@ mod tests {
             assert_eq!(level.targets[1], expected);
             assert_eq!(book.members[0], [MaskId::new(0, 0), MaskId::new(1, 0)]);
             assert_eq!(book.members[2], [MaskId::new(1, 2)]);
+        }
+    }
+
+    #[test]
+    fn things_that_a_scene_tells_apart_stay_apart_under_one_mask_of_the_photo() {
+        let mut old = field();
+        // Alike enough to be parts of one thing.
+        let alike = [0.8, 0.6, 0.0, 0.0];
+        old.levels.iter_mut().for_each(|l| l.codebook.embeddings[4..].copy_from_slice(&alike));
+        let code = |x: usize| i32::from(x >= 12);
+        let codes = vec![plane(|x, _| code(x)); 3];
+        let measured = DepthMap { depth: plane(|_, _| 2.0), confidence: plane(|_, _| 0.9) };
+        let depth = plane(|_, _| 2.0);
+        let new = [SceneView { camera: camera(), codes: codes.clone(), depth, measured: &measured }];
+        let labels = plane(|x, _| if (6..18).contains(&x) { 0 } else { -1 });
+        let features = axis(0).to_vec();
+        let masks = LevelMasks { labels, quality: vec![1.0], features, ..LevelMasks::default() };
+        let masks = [ViewMasks { levels: vec![masks; 3] }];
+        let options = BuildOptions { feature_dim: 4, ..BuildOptions::default() };
+        let joined = join(&old, vec![codes], &new, &masks, &options, &Silent).unwrap();
+        let expected = plane(|x, _| if (6..18).contains(&x) { code(x) } else { -1 });
+        // Masks of the finest level are never fused.
+        for level in &joined.field.levels[1..] {
+            assert_eq!((level.codebook.len(), &level.targets[1]), (2, &expected));
         }
     }
 }

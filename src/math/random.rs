@@ -82,4 +82,17 @@ mod tests {
             assert!(drawn.windows(2).all(|w| w[0] < w[1]) && drawn[4] < 6);
         }
     }
+
+    #[test]
+    fn shuffling_gives_every_order_equally_often() {
+        let mut random = Random::new(4);
+        let mut counts = std::collections::BTreeMap::new();
+        for _ in 0..6000 {
+            let mut items = [0, 1, 2];
+            random.shuffle(&mut items);
+            *counts.entry(items).or_insert(0) += 1;
+        }
+        // 4 standard errors of a count of 1000.
+        assert!(counts.len() == 6 && counts.values().all(|n| (884..=1116).contains(n)), "{counts:?}");
+    }
 }

@@ -63,6 +63,22 @@ mod tests {
         }
     }
 
+    /// Workgroups of 256 numbers stand in rows of 32768.
+    #[test]
+    fn more_numbers_than_a_row_of_workgroups_are_all_moved() {
+        let device = crate::gpu::test_device();
+        let (stride, index) = (1usize << 16, [0u32, 1].repeat(65));
+        assert!(rows_of_groups(index.len() * stride)[1] > 1);
+        let rows: Vec<u32> = (1..=2 * stride as u32).collect();
+        let from = device.buffer_from("rows", &rows).unwrap();
+        let index_buffer = device.buffer_from("index", &index).unwrap();
+        let to = gather(&device, "compacted", &from, &index_buffer, index.len(), stride).unwrap();
+        for (k, i) in index.iter().enumerate() {
+            let moved = to.read_range(k * stride..(k + 1) * stride).unwrap();
+            assert!(moved == rows[*i as usize * stride..][..stride], "row {k}");
+        }
+    }
+
     #[test]
     fn pruning_keeps_order_and_drops_what_is_faint_or_broken() {
         let logit = |o: f32| (o / (1.0 - o)).ln();

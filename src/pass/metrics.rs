@@ -42,5 +42,9 @@ mod tests {
         assert!((psnr(&rendered, &target) - 20.0).abs() < 1e-4);
         assert!(psnr(&target, &target).is_infinite());
         assert!((ssim(&target, &target) - 1.0).abs() < 1e-12);
+        // A viewer shows white and black.
+        let target = RgbImage { data: vec![[1.0, 0.0, 0.25]; 12], ..target };
+        let rendered = RgbImage { data: vec![[7.0, -3.0, 0.25]; 12], ..target.clone() };
+        assert!(psnr(&rendered, &target).is_infinite());
     }
 }

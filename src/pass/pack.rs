@@ -164,7 +164,7 @@ pub fn texels_of(planes: &[f32], transmittance: &[f32], source: FrameChannel, en
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::test_device;
+    use crate::gpu::{Options, TestDevice, test_device};
     use crate::pass::Rasterizer;
 
     #[test]
@@ -204,5 +204,31 @@ mod tests {
         assert!(
             pack(&device, raster.frame(), &band, FrameChannel::Features(2, 5), Encoding::F32, &out).is_err()
         );
+    }
+
+    #[test]
+    fn what_is_packed_band_by_band_makes_up_the_image() {
+        let options = Options { max_binding: Some(1 << 18), ..Options::from_env(None) };
+        let device = TestDevice::with(&options).unwrap();
+        let (width, height, dim) = (80u32, 150u32, 3usize);
+        let pixels = (width * height) as usize;
+        let raster = Rasterizer::new(&device, 1, dim, width, height).unwrap();
+        let bands = &raster.frame().bands;
+        assert_eq!(bands.count(), 2);
+        let noise = |i: usize| ((i * 7919 + 13) % 97) as f32 / 64.0;
+        let planes: Vec<f32> = (0..(BASE_CHANNELS + dim) * pixels).map(noise).collect();
+        let transmittance: Vec<f32> = (0..pixels).map(|i| (i % 9) as f32 / 8.0).collect();
+        for (source, encoding) in
+            [(FrameChannel::Colour, Encoding::F32), (FrameChannel::Features(1, 2), Encoding::F16x4)]
+        {
+            let out = texels(&device, pixels, source, encoding).unwrap();
+            for band in bands.iter() {
+                raster.frame().planes.write(&bands.cut(&band, &planes)).unwrap();
+                raster.frame().transmittance.write(&bands.cut(&band, &transmittance)).unwrap();
+                pack(&device, raster.frame(), &band, source, encoding, &out).unwrap();
+            }
+            let expected = texels_of(&planes, &transmittance, source, encoding);
+            assert!(out.cast::<u8>().read().unwrap() == expected, "{source:?} {encoding:?}");
+        }
     }
 }

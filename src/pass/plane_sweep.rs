@@ -232,3 +232,88 @@ impl Matcher for GpuMatcher {
         Ok(planes)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::test_device;
+
+    fn waves(width: u32, height: u32, shift: f32) -> Vec<f32> {
+        let shade = |x: f32, y: f32| 0.5 + 0.1 * (0.8 * x + 0.3 * y).sin() + 0.08 * (0.5 * x - 0.7 * y).cos();
+        let place = |k: u32| ((k % width) as f32 + shift, (k / width) as f32);
+        (0..width * height).map(place).map(|(x, y)| shade(x, y)).collect()
+    }
+
+    /// Two views of one size; the second is the source of the first.
+    fn references(width: u32, height: u32, focal: f32, range: [f32; 2]) -> [ReferenceView; 2] {
+        let intrinsics = [focal, focal, width as f32 / 2.0, height as f32 / 2.0];
+        let view =
+            ReferenceView { intrinsics, range, seed: 5, width, height, planes: 16, ..Default::default() };
+        [ReferenceView { sources: 1, ..view }, ReferenceView { first: width * height, ..view }]
+    }
+
+    /// The second view, at `centre` in the camera frame of the first, turned half about y or not at all.
+    fn source(reference: &ReferenceView, centre: [f32; 3], turned: bool) -> SourceView {
+        let [fx, fy, cx, cy] = reference.intrinsics;
+        let sign = if turned { -1.0 } else { 1.0 };
+        let [x, y, z] = [-sign * centre[0], -centre[1], -sign * centre[2]];
+        SourceView {
+            forward: [
+                [sign * fx, 0.0, sign * cx, fx * x + cx * z],
+                [0.0, fy, sign * cy, fy * y + cy * z],
+                [0.0, 0.0, sign, z],
+            ],
+            centre: [centre[0], centre[1], centre[2], 0.0],
+            intrinsics: reference.intrinsics,
+            size: [reference.width, reference.height, reference.width * reference.height, 0],
+            ..SourceView::default()
+        }
+    }
+
+    /// All planes lie at depths below 1.7, none so oblique that it passes behind a camera at a depth of 8.
+    #[test]
+    fn a_photo_that_sees_a_plane_from_behind_does_not_speak_for_it() {
+        let views = references(24, 16, 120.0, [0.6, 1.0]);
+        let luma = waves(24, 16, 0.0).repeat(2);
+        let costs = |source: SourceView| -> Vec<f32> {
+            let start = vec![Vec4::ZERO; luma.len()];
+            let mut gpu = GpuMatcher::new(&test_device(), &luma, &views, &[source], &start).unwrap();
+            gpu.sweep(&views[0]).unwrap();
+            gpu.planes().unwrap()[..24 * 16].iter().map(|p| p.w).collect()
+        };
+        // What the three sources that are not there cost is 0.4 of it.
+        let same = costs(source(&views[0], [0.0; 3], false));
+        assert!(same.iter().all(|w| *w < 0.6), "{same:?}");
+        let behind = costs(source(&views[0], [0.0, 0.0, 8.0], true));
+        assert!(behind.iter().all(|w| (w - 1.0).abs() < 1e-5), "{behind:?}");
+    }
+
+    /// A wall at the inverse depth 1.5, which every second pixel knows.
+    #[test]
+    fn a_neighbours_plane_is_taken_over_only_where_its_depth_is_searched() {
+        let (width, height) = (32, 16);
+        let taken = |nearest: f32| {
+            let views = references(width, height, 20.0, [0.2, nearest]);
+            let luma = [waves(width, height, 0.0), waves(width, height, 6.0)].concat();
+            let plane = |k: u32| match (k % width + k / width) % 2 {
+                0 => Vec4::new(0.0, 0.0, 0.5, 0.9),
+                _ => Vec4::new(0.0, 0.0, 1.5, 0.0),
+            };
+            let start: Vec<Vec4> = (0..2 * width * height).map(plane).collect();
+            let beside = source(&views[0], [0.2, 0.0, 0.0], false);
+            let mut gpu = GpuMatcher::new(&test_device(), &luma, &views, &[beside], &start).unwrap();
+            gpu.refine(&views[0]).unwrap();
+            let planes = gpu.planes().unwrap();
+            let inverse_depth = |k: u32| {
+                let x = ((k % width) as f32 + 0.5 - 16.0) / 20.0;
+                let y = ((k / width) as f32 + 0.5 - 8.0) / 20.0;
+                planes[k as usize].dot(Vec4::new(x, y, 1.0, 0.0))
+            };
+            let updated = (0..width * height).filter(|k| (k % width + k / width) % 2 == 0);
+            updated.filter(|k| inverse_depth(*k) > 1.001).count()
+        };
+        assert_eq!(taken(1.0), 0);
+        let all = taken(2.0);
+        assert!(all > 150, "{all} of 256");
+    }
+}

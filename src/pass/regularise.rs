@@ -110,6 +110,20 @@ mod tests {
     }
 
     #[test]
+    fn one_degenerate_splat_does_not_make_the_penalty_infinite() {
+        let device = crate::gpu::test_device();
+        // A ratio of e^90, more than f32 holds.
+        let log_scales = device.buffer_from("log scales", &[45.0f32, 0.0, -45.0]).unwrap();
+        let gradients = device.buffer::<f32>("gradients", 3).unwrap();
+        let mut rec = Recorder::new(&device, "degenerate");
+        record_ratio(&mut rec, &log_scales, &gradients, 1, 0.5, 8.0);
+        rec.run().unwrap();
+        let got = gradients.read().unwrap();
+        let capped = 0.5 * 10f32.exp();
+        assert!((got[0] / capped - 1.0).abs() < 1e-4 && got[1] == 0.0 && got[2] == -got[0], "{got:?}");
+    }
+
+    #[test]
     fn depth_gradient_matches_differences_and_the_gpu() {
         let device = crate::gpu::test_device();
         let mut random = Random::new(6);

@@ -24,3 +24,21 @@ pub fn record(
     );
     rec.dispatch(call, [1, 1, 1]);
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// More than the workgroups of all partial sums take at once.
+    #[test]
+    fn every_value_counts() {
+        let device = crate::gpu::test_device();
+        let values = device.buffer_from("values", &[1.0f32; 40_000]).unwrap();
+        let partials = device.buffer::<f32>("partials", PARTIALS).unwrap();
+        let result = device.buffer_from("result", &[7.0f32; 3]).unwrap();
+        let mut rec = Recorder::new(&device, "sum");
+        record(&mut rec, &values, &partials, &result, 1);
+        rec.run().unwrap();
+        assert_eq!(result.read().unwrap(), [7.0, 40_000.0, 7.0]);
+    }
+}

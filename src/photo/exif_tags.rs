@@ -228,6 +228,12 @@ pub(super) mod tests {
         let size = (3000, 2000);
         let alone = lens(block(&fields), size).focal.unwrap();
         assert!((alone - 50.0 / 36.0 * 3000.0).abs() < 0.1, "{alone}");
+        // The same sensor in pixels per centimetre.
+        let mut metric = fields.clone();
+        metric[1].1 = rational(6000 * 100, 36 * 10);
+        metric[2].1 = Value::Short(vec![3]);
+        let metric = lens(block(&metric), size).focal.unwrap();
+        assert!((metric - alone).abs() < 0.1, "{metric} {alone}");
         fields.push((Tag::FocalLengthIn35mmFilm, Value::Short(vec![85])));
         let contradicted = lens(block(&fields), size).focal.unwrap();
         assert!((contradicted - 85.0 / 43.2666 * 3000f64.hypot(2000.0)).abs() < 0.1);
@@ -286,6 +292,15 @@ pub(super) mod tests {
         near(of([600, -800, 0], 6), 0.6, 0.8, 0.0);
         assert_eq!(of([0, -1500, 0], 6), None, "shaken");
         assert_eq!(of([0, -1000, 0], 2), None, "mirrored");
+        let by = |lens_model: &str| {
+            let fields = [
+                (Tag::MakerNote, Value::Undefined(note([0, -1000, 0]), 0)),
+                (Tag::LensModel, Value::Ascii(vec![lens_model.into()])),
+            ];
+            lens(block(&fields), (4000, 3000)).gravity
+        };
+        assert!(by("iPhone 15 back camera 5.96mm f/1.6").is_some());
+        assert_eq!(by("iPhone 15 front camera 2.69mm f/1.9"), None, "it looks the other way");
         for cut in 0..68 {
             assert_eq!(apple_acceleration(&note([0, -1000, 0])[..cut]), None);
         }
@@ -295,10 +310,11 @@ pub(super) mod tests {
     #[test]
     fn nonsense_is_ignored() {
         assert_eq!(lens(b"Exif?".to_vec(), (100, 100)), Lens::default());
-        assert_eq!(
-            lens(block(&[(Tag::FocalLengthIn35mmFilm, Value::Short(vec![0]))]), (100, 100)).focal,
-            None
-        );
+        // No focal length, and such as no lens of a camera has.
+        for mm in [0, 1, 65_535] {
+            let fields = [(Tag::FocalLengthIn35mmFilm, Value::Short(vec![mm]))];
+            assert_eq!(lens(block(&fields), (100, 100)).focal, None, "{mm} mm");
+        }
         assert_eq!(lens(block(&[(Tag::FocalLength, rational(1, 0))]), (100, 100)).focal, None);
     }
 }

@@ -177,6 +177,15 @@ mod tests {
     }
 
     #[test]
+    fn photos_of_one_zoom_share_a_camera_and_those_of_another_do_not() {
+        let image = RgbImage { width: 64, height: 64, data: vec![[0.3; 3]; 64 * 64] };
+        let photo = |focal| from_pixels("a.png".as_ref(), &image, focal, MAX_SIZE).unwrap();
+        // Rounding of the tags is 2 %.
+        let photos = [Some(60.0), Some(61.0), Some(90.0), None, None].map(photo);
+        assert_eq!(cameras_by_file(&photos), [0, 0, 1, 2, 2]);
+    }
+
+    #[test]
     fn files_in_another_unit_are_noticed() {
         let image = |v: f32| RgbImage { width: 2, height: 2, data: vec![[v; 3], [v; 3], [v; 3], [0.1; 3]] };
         assert!(mostly_above_white(&image(3.0)) && !mostly_above_white(&image(1.0)));

@@ -68,7 +68,10 @@ fn grouped(bytes: &[u64]) -> Vec<Range<usize>> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::exif_tags::tests::block;
     use super::*;
+    use exif::{Tag, Value};
+    use image::ImageEncoder;
 
     #[test]
     fn small_photos_are_decoded_together_and_large_ones_alone() {
@@ -85,7 +88,12 @@ mod tests {
         let path = folder.path().join("wide.png");
         image::RgbImage::new(300, 40).save(&path).unwrap();
         std::fs::write(folder.path().join("none.png"), b"no image").unwrap();
-        let files = [Candidate::file(&path), Candidate::file(&folder.path().join("none.png"))];
-        assert_eq!(sizes_of(&files), [(300, 40), ASSUMED]);
+        // Stored lying on its side, as phones do.
+        let tall = folder.path().join("tall.png");
+        let mut encoder = image::codecs::png::PngEncoder::new(std::fs::File::create(&tall).unwrap());
+        encoder.set_exif_metadata(block(&[(Tag::Orientation, Value::Short(vec![6]))])).unwrap();
+        encoder.write_image(&[0; 300 * 40], 300, 40, image::ExtendedColorType::L8).unwrap();
+        let files = [path, tall, folder.path().join("none.png")].map(|p| Candidate::file(&p));
+        assert_eq!(sizes_of(&files), [(300, 40), (40, 300), ASSUMED]);
     }
 }

@@ -119,6 +119,9 @@ fn a_lost_device_is_named_and_training_goes_on_elsewhere_with_the_same_bits() {
     let resumed = resumed.unwrap();
     assert!(steps[0] >= begun, "it goes on where it was: {steps:?} after {begun}");
     assert!(resumed.splats == whole.splats && resumed.cameras == whole.cameras, "the same bits");
+    let left = Store::list(folder.path());
+    let states = left.iter().filter(|(file, _)| file.to_string_lossy().contains("-state-"));
+    assert_eq!(states.count(), 0, "states of stages that have ended: {left:?}");
 }
 
 #[test]

@@ -60,3 +60,19 @@ fn check(stem: &str, fitted: &Fitted) -> Result<()> {
         fitted.rotation_sigma.to_degrees()
     )))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_place_in_doubt_is_refused_by_name() {
+        let sure = Fitted { agreement: 0.97, rotation_sigma: 0.002, ..Fitted::default() };
+        assert!(check("late", &sure).is_ok());
+        let refusal = |fitted: Fitted| check("late", &fitted).unwrap_err().to_string();
+        let contradicted = refusal(Fitted { agreement: 0.6, ..sure });
+        assert!(contradicted.starts_with("late: only 60 % of its matches"), "{contradicted}");
+        let open = refusal(Fitted { rotation_sigma: 0.06, ..sure });
+        assert!(open.starts_with("late: ") && open.contains("its direction is open by ±3.4°"), "{open}");
+    }
+}

@@ -63,6 +63,7 @@ mod tests {
         assert_eq!(level(Fitted { sigmas: [0.06, 0.0, 0.0, 0.0, 0.0], ..good }), Confidence::Medium);
         assert_eq!(level(Fitted { rotation_sigma: 0.01, ..good }), Confidence::Medium);
         assert_eq!(level(Fitted { rotation_sigma: 0.04, ..good }), Confidence::Low);
+        assert_eq!(level(Fitted { agreement: 0.87, ..good }), Confidence::Medium);
         assert_eq!(level(Fitted { agreement: 0.8, ..good }), Confidence::Low);
         assert_eq!(level(Fitted { unconfirmed: true, ..good }), Confidence::Low);
         assert!(Confidence::Low < Confidence::Medium && Confidence::Medium < Confidence::High);

@@ -212,7 +212,7 @@ mod tests {
     use crate::photo::Light;
     use crate::pose::{Fitted, testing};
     use crate::progress::{Recorded, Silent};
-    use crate::scene::Lens;
+    use crate::scene::{Lens, Pose, RgbImage};
 
     #[test]
     fn photos_that_do_not_fit_are_named_with_what_does_not() {
@@ -253,6 +253,43 @@ mod tests {
         model.fitted[2].unconfirmed = true;
         let all = warned(&model);
         assert!(all.len() == 1 && all[0].starts_with("the cameras of train_02 may be wrong"), "{all:?}");
+    }
+
+    fn grey_photo() -> Photo {
+        let image = RgbImage { width: 80, height: 64, data: vec![[0.5; 3]; 80 * 64] };
+        crate::photo::from_pixels("a.png".as_ref(), &image, None, 80).unwrap()
+    }
+
+    #[test]
+    fn an_open_focal_length_is_said_with_the_angles_that_it_opens() {
+        let photos = [grey_photo(), grey_photo()];
+        let warned = |focal_log_sigma, rotation_sigma| {
+            let fitted = vec![Fitted { rotation_sigma, ..Fitted::default() }; 2];
+            let recorded = Recorded::new(&Silent);
+            let model = SparseModel { focal_log_sigma, fitted, ..Default::default() };
+            warn_of_doubt(&photos, &model, &recorded);
+            recorded.warnings()
+        };
+        assert!(warned(Some(0.03), 0.0).is_empty());
+        let all = warned(Some(0.12), 0.0);
+        let said = "the photos leave the focal length open by ±12 %: depth may be stretched";
+        assert!(all.len() == 1 && all[0].starts_with(said), "{all:?}");
+        let all = warned(Some(0.12), 0.06);
+        assert!(all.len() == 1 && all[0].contains("the angles between the cameras by up to ±3°"), "{all:?}");
+    }
+
+    #[test]
+    fn given_cameras_are_scaled_to_their_photos_and_never_stretched() {
+        let photos = [grey_photo()];
+        let of = |width: u32, height: u32| {
+            let (name, pose) = ("a.jpg".to_string(), Pose::IDENTITY);
+            let camera = Camera { name, width, height, fx: 100.0, fy: 100.0, cx: 60.0, cy: 50.0, pose };
+            assigned(&photos, &[camera])
+        };
+        let half = &of(160, 128).unwrap()[0];
+        assert_eq!((half.width, half.height, half.fx, half.cx, half.cy), (80, 64, 50.0, 30.0, 25.0));
+        let error = of(128, 128).unwrap_err();
+        assert!(error.exit_code() == 2 && error.to_string().contains("the aspects differ"), "{error}");
     }
 
     #[test]

@@ -38,14 +38,19 @@ pub(super) fn place(
             return Ok(Placed { photos, model: found?, left_out });
         }
         for (view, reason) in views.into_iter().rev() {
-            let photo = photos.remove(view);
-            if view < features.len() {
-                features.remove(view);
-            }
+            let photo = taken_out(&mut photos, &mut features, view);
             progress.warn(&message(&photo.stem, &reason));
             left_out.push(LeftOut { photo: photo.stem, reason });
         }
     }
+}
+
+/// Takes a photo out of the list, with its features where there are any.
+fn taken_out(photos: &mut Vec<Photo>, features: &mut Vec<Keypoints>, view: usize) -> Photo {
+    if view < features.len() {
+        features.remove(view);
+    }
+    photos.remove(view)
 }
 
 /// The photo whose place is most in doubt, if that of any is.
@@ -73,6 +78,7 @@ mod tests {
     use super::*;
     use crate::pose::testing;
     use crate::progress::{Recorded, Silent};
+    use crate::scene::RgbImage;
 
     fn grey(photo: &Photo) -> Photo {
         let mut sky = photo.clone();
@@ -99,10 +105,28 @@ mod tests {
     #[test]
     fn half_of_the_photos_are_not_left_out() {
         let truth = testing::train(&testing::folder());
-        let mut sky = grey(&truth.photos[0]);
-        sky.stem = "sky".into();
-        let error = place(vec![truth.photos[0].clone(), sky], Vec::new(), 0, &Silent).err().unwrap();
+        let small = |p: &Photo| Photo { fine: None, ..crate::photo::load_at(&p.path, 320).unwrap() };
+        // Two that go together, and two that show nothing of it.
+        let mut photos: Vec<Photo> = truth.photos[..2].iter().map(small).collect();
+        let sky = grey(&photos[0]);
+        let mut dusk = Photo { stem: "dusk".into(), ..sky.clone() };
+        dusk.image.data.iter_mut().for_each(|c| *c = c.map(|v| v - 0.3));
+        photos.extend([sky, dusk]);
+        let error = place(photos, Vec::new(), 0, &Silent).err().unwrap();
         assert!(error.to_string().contains("do not overlap") && error.exit_code() == 2, "{error}");
+    }
+
+    #[test]
+    fn the_photos_that_stay_keep_their_own_features() {
+        let photo = |stem: &str| {
+            let image = RgbImage { width: 64, height: 64, data: vec![[0.5; 3]; 64 * 64] };
+            crate::photo::from_pixels(stem.as_ref(), &image, None, 64).unwrap()
+        };
+        let mut photos = ["a", "b", "c"].map(photo).to_vec();
+        let mut features = [8, 16, 24].map(|dim| Keypoints { dim, ..Keypoints::default() }).to_vec();
+        assert_eq!(taken_out(&mut photos, &mut features, 1).stem, "b");
+        let left: Vec<_> = photos.iter().zip(&features).map(|(p, f)| (p.stem.as_str(), f.dim)).collect();
+        assert_eq!(left, [("a", 8), ("c", 24)]);
     }
 
     #[test]

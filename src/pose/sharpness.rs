@@ -64,6 +64,23 @@ mod tests {
     use crate::scene::Plane;
 
     #[test]
+    fn a_photo_with_more_pixels_is_judged_at_the_size_of_the_others() {
+        let mut random = crate::math::Random::new(1005);
+        let noise: Vec<[f32; 3]> = (0..1000 * 64).map(|_| [random.uniform() as f32; 3]).collect();
+        // Every pixel shown `times` × `times` times: pixel by pixel that has less fine detail.
+        let photo = |times: usize| {
+            let (width, height) = (1000 * times, 64 * times);
+            let from = |k: usize| k / width / times * 1000 + k % width / times;
+            let data = (0..width * height).map(|k| noise[from(k)]).collect();
+            let image = RgbImage { width, height, data };
+            crate::photo::from_pixels("a.png".as_ref(), &image, None, width).unwrap()
+        };
+        let recorded = Recorded::new(&Silent);
+        warn_of_blur(&[photo(1), photo(2)], &recorded);
+        assert!(recorded.warnings().is_empty(), "{:?}", recorded.warnings());
+    }
+
+    #[test]
     fn a_photo_out_of_focus_is_named_and_sharp_ones_are_not() {
         let mut photos = testing::train(&testing::folder()).photos;
         let warned = |photos: &[Photo]| {

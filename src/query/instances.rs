@@ -267,3 +267,26 @@ impl Union {
         self.0[a.max(b)] = a.min(b);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_floating_speck_is_no_thing() {
+        // Rows of splats, the second with half as many as the first, and one splat by itself.
+        let row = |x: f32, count: usize| (0..count).map(move |i| [x + 0.01 * i as f32, 0.0, 1.0]);
+        let means: Vec<[f32; 3]> = row(0.0, 20).chain(row(5.0, 10)).chain(row(9.0, 1)).collect();
+        let count = means.len();
+        let splats = Splats {
+            means,
+            log_scales: vec![[0.01f32.ln(); 3]; count],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; count],
+            opacity_logits: vec![2.0; count],
+            ..Splats::default()
+        };
+        let places = Places::of(&splats, &LanguageField::default());
+        let found = places.instances(&(0..count).collect::<Vec<_>>(), 0);
+        assert_eq!(found.iter().map(|i| i.splats.len()).collect::<Vec<_>>(), [20, 10]);
+    }
+}

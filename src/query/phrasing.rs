@@ -193,6 +193,8 @@ mod tests {
             ("the second cup on the table", "cup", "second on the table"),
             ("the left mug", "mug", "left"),
             ("largest book", "book", "largest"),
+            ("the second, blue cup", "blue cup", "second,"),
+            ("\"first\" mug", "mug", "\"first\""),
         ] {
             let read = read(text).unwrap_or_else(|| panic!("{text}: taken as understood"));
             assert_eq!(

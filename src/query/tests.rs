@@ -78,6 +78,11 @@ fn the_mask_follows_code_borders_exactly() {
     let strict = QueryOptions { mask: MaskRule::Codes(1.0), ..QueryOptions::default() };
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &strict).unwrap();
     assert!(maps[1].data.iter().zip(&r.mask.data).all(|(&k, &m)| m == (k == 0)));
+    // where the view does not show that code, its near-copy is the best
+    let mut maps = maps;
+    maps.iter_mut().flat_map(|m| &mut m.data).filter(|k| **k == 0).for_each(|k| *k = 1);
+    let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &strict).unwrap();
+    assert!(maps[1].data.iter().zip(&r.mask.data).all(|(&k, &m)| m == (k == 2)));
 }
 
 #[test]

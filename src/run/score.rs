@@ -145,4 +145,19 @@ mod tests {
         // Moving the camera alone cannot undo an eighth of magnification in a scene with depth.
         assert!(score > given + 10.0 && score > 35.0, "{given} {score}");
     }
+
+    #[test]
+    fn a_refined_camera_that_shows_the_photo_worse_than_the_given_one_is_not_taken() {
+        let device = Device::open(None).unwrap();
+        let (splats, camera) = seeded::small(400, 96, 72, 1, 5);
+        let mut viewer = Viewer::new(&device, &splats, &LanguageField::default()).unwrap();
+        let refiner = ViewRefiner::new(&device, &splats).unwrap();
+        let given = viewer.view(&camera).unwrap();
+        let photo = given.rendered.rgb.clone();
+        // 9 degrees off; all steps together turn a camera by 2 about each axis.
+        let turn = Pose::exp(DVec3::ZERO, DVec3::new(0.0, 0.15, 0.0));
+        let start = Camera { pose: turn.compose(&camera.pose), ..camera.clone() };
+        let (closer, moved) = refined(&refiner, &mut viewer, (&start, &given), &photo, &Silent).unwrap();
+        assert!(closer.is_none(), "{moved:?}");
+    }
 }

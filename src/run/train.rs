@@ -304,3 +304,25 @@ fn camera_of(photo: &Photo, known: &[Camera]) -> Result<Camera> {
     }
     Ok(camera.resized(photo.image.width as u32, photo.image.height as u32))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pass::seeded;
+    use crate::scene::RgbImage;
+
+    #[test]
+    fn a_camera_of_another_aspect_than_its_photo_is_refused() {
+        let data = (0..96 * 72).map(|i| [(i * 7919 % 251) as f32 / 251.0; 3]).collect();
+        let image = RgbImage { width: 96, height: 72, data };
+        let photo = photo::from_pixels("a.png".as_ref(), &image, None, 96).unwrap();
+        let any = seeded::small(1, 96, 72, 0, 1).1;
+        let of_size = |width, height| {
+            camera_of(&photo, &[Camera { name: "a.jpg".into(), width, height, ..any.clone() }])
+        };
+        // Cameras of larger photos: of the same aspect, and of one on its side.
+        assert_eq!(of_size(640, 480).unwrap().width, 96);
+        let e = of_size(480, 640).unwrap_err();
+        assert!(e.exit_code() == 2 && e.to_string().contains("480 × 640 pixels, another aspect"), "{e}");
+    }
+}

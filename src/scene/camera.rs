@@ -207,6 +207,18 @@ mod tests {
     }
 
     #[test]
+    fn a_mirrored_matrix_is_no_rotation() {
+        let camera = |diagonal: DVec3| {
+            let pose = Pose { rotation: DMat3::from_diagonal(diagonal), ..Pose::IDENTITY };
+            Camera { name: "a".into(), width: 9, height: 9, fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, pose }
+                .checked()
+        };
+        // A half turn has two axes the other way round, a mirror one.
+        assert!(camera(DVec3::new(-1.0, -1.0, 1.0)).is_ok());
+        assert!(camera(DVec3::new(-1.0, 1.0, 1.0)).unwrap_err().contains("not a rotation"));
+    }
+
+    #[test]
     fn project_inverts_unproject() {
         let camera = Camera {
             name: "a".into(),

@@ -189,6 +189,28 @@ mod tests {
         }
     }
 
+    #[test]
+    fn photos_have_the_jpeg_quality_that_is_asked_for_and_held_out_views_keep_theirs() {
+        let bytes = |jpeg: Option<u8>| {
+            let dir = tempfile::tempdir().unwrap();
+            let effects = Effects { jpeg, ..Effects::default() };
+            let spec = SceneSpec {
+                seed: 1000,
+                size: (160, 120),
+                views: 2,
+                held_out: 1,
+                photo_noise: 0.0,
+                effects,
+                ..SceneSpec::default()
+            };
+            generate(dir.path(), &spec, &InjectedErrors::NONE, &Silent).unwrap();
+            ["images/train_00.jpg", "held_out/test_02.jpg"]
+                .map(|f| dir.path().join(f).metadata().unwrap().len())
+        };
+        let (usual, coarse) = (bytes(None), bytes(Some(5)));
+        assert!(2 * coarse[0] < usual[0] && coarse[1] == usual[1], "{usual:?} {coarse:?}");
+    }
+
     /// Value of a picture between pixels, bilinear.
     fn between(image: &crate::scene::RgbImage, at: DVec2) -> Option<[f32; 3]> {
         let (x, y) = (at.x - 0.5, at.y - 0.5);

@@ -80,6 +80,7 @@ fn refuse(s: &Splats) -> Result<(), String> {
 mod tests {
     use super::*;
     use crate::format::gaussians::{FORMATS, read_counted};
+    use crate::scene::LevelField;
 
     fn four() -> Splats {
         Splats {
@@ -108,8 +109,11 @@ mod tests {
             change(&mut s);
             assert_eq!(unusable(&s), Some((1, 2)));
             assert!(check_written(&s).unwrap_err().to_string().contains("the first is number 2"));
-            let (kept, _, note) = keep(s, None, Path::new("a.ply")).unwrap();
+            let level = LevelField { features: vec![0.0, 1.0, 2.0, 3.0], ..LevelField::default() };
+            let field = LanguageField { levels: vec![level], ..LanguageField::default() };
+            let (kept, language, note) = keep(s, Some(field), Path::new("a.ply")).unwrap();
             assert_eq!(kept, four().picked(&[0, 1, 3]));
+            assert_eq!(language.unwrap().levels[0].features, [0.0, 1.0, 3.0]);
             assert!(note.unwrap().contains("a.ply: 1 of 4 Gaussians are left out, the first is number 2"));
         }
         let mut all = four();

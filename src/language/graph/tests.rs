@@ -55,6 +55,19 @@ fn what_a_thing_encloses_belongs_to_it() {
 }
 
 #[test]
+fn what_no_contour_divides_merges_first_even_where_colours_differ_more() {
+    // A dark stripe, a bright one, and behind the only contour one that is a little brighter still.
+    let (width, height) = (30, 10);
+    let stripe = |p: usize| p % width / 10;
+    let mut edges = Plane::filled(width, height, 0.0);
+    edges.data.iter_mut().skip(19).step_by(width).for_each(|e| *e = 1.0);
+    let labels = Plane { width, height, data: (0..width * height).map(|p| stripe(p) as i32).collect() };
+    let lab = (0..width * height).map(|p| [[30.0, 60.0, 65.0][stripe(p)], 0.0, 0.0]).collect();
+    let tree = tree::build(&Cues { labels, count: 3, lab, edges: &edges }, &GraphOptions::default());
+    assert_eq!(tree.nodes[3].children, Some((0, 1)));
+}
+
+#[test]
 fn a_flat_image_and_wrong_sizes() {
     let flat = RgbImage { width: 64, height: 64, data: vec![[0.3; 3]; 4096] };
     let masks = segment(&flat, &Plane::filled(64, 64, 0.0), &GraphOptions::default()).unwrap();

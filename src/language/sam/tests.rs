@@ -2,6 +2,7 @@
 use super::*;
 use crate::infer::Registry;
 use crate::infer::installed::Task;
+use crate::infer::sam::Proposals;
 use crate::infer::testing::{Attribute, FLOAT, Onnx};
 use crate::progress::Silent;
 use std::path::Path;
@@ -132,6 +133,19 @@ fn the_photo_and_its_quarters_as_the_reference_cuts_them() {
 
 const REFERENCE: [[usize; 4]; 5] =
     [[0, 0, 640, 480], [0, 0, 402, 322], [0, 159, 402, 480], [239, 0, 640, 322], [239, 159, 640, 480]];
+
+#[test]
+fn a_mask_seen_in_a_crop_lies_where_the_crop_does() {
+    // Logits of ten pixels each in a crop of 140 × 110; the mask is columns 5 to 8 and rows 4 to 7 of them.
+    let (width, height) = (14, 11);
+    let inside = |k: usize| (5..9).contains(&(k % width)) && (4..8).contains(&(k / width));
+    let logits = (0..MASKS * width * height).map(|k| if inside(k) { 10.0 } else { -10.0 }).collect();
+    let proposals = Proposals { logits, scores: vec![0.9, 0.0, 0.0], width, height, filled: [1.0; 2] };
+    let crop = Crop { x0: 60, y0: 50, x1: 200, y1: 160 };
+    let found = filter::candidates(&proposals, &[[0.0; 2]], crop, 4, (200, 160), (0.5, 0.5));
+    let mask = Bits::from_runs(200, 160, &found[0].runs);
+    assert_eq!((found.len(), mask.bounds), (1, (110..150, 90..130)));
+}
 
 fn rectangle(x: std::ops::Range<usize>, y: std::ops::Range<usize>, iou: f32) -> Mask {
     let bits = Bits::of(50, 40, |p| x.contains(&(p % 50)) && y.contains(&(p / 50)));

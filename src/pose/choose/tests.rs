@@ -127,3 +127,21 @@ fn photos_of_two_places_are_not_mixed() {
     let left = [0, 1, 2, 6, 7, 8].into_iter().find(|i| !chosen.contains(i)).unwrap();
     assert_eq!(graph.reason(left, &chosen, &names), Reason::LittleNewArea);
 }
+
+#[test]
+fn of_many_photos_those_of_like_colours_are_compared() {
+    // Photos that follow each other look different: for up to four steps the colours are 9 apart and more.
+    let colour = |k: usize| (37 * k % 60) as f32;
+    let seen = |k: usize| CandidateFeatures {
+        features: Keypoints::default(),
+        diagonal: 1.0,
+        sharpness: 1.0,
+        signature: vec![colour(k)],
+    };
+    let found = pairs(&(0..60).map(seen).collect::<Vec<_>>());
+    for (i, j) in (0..60).flat_map(|i| (i + 1..60).map(move |j| (i, j))) {
+        let alike = (colour(i) - colour(j)).abs() <= 6.0;
+        assert!(!alike || found.contains(&(i, j)), "{i} and {j}");
+    }
+    assert!(found.len() < 60 * 59 / 4, "{} pairs", found.len());
+}

@@ -215,3 +215,27 @@ fn fuse(views: &[ModelView], layers: &[Layer]) -> PointCloud {
     }
     cloud
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Pose;
+
+    #[test]
+    fn depth_that_floats_before_a_surer_surface_is_removed() {
+        let (name, pose) = (String::new(), Pose::IDENTITY);
+        let camera = Camera { name, width: 4, height: 3, fx: 4.0, fy: 4.0, cx: 2.0, cy: 1.5, pose };
+        let layer = |confidence: f64| Layer {
+            camera: camera.clone(),
+            depth: vec![4.0; 12],
+            confidence: vec![confidence; 12],
+        };
+        let mut layers = [layer(1.0), layer(5.0)];
+        // Before the other view's surface, within its noise, and behind it.
+        layers[0].depth[5..8].copy_from_slice(&[2.0, 3.99, 5.0]);
+        clean(&mut layers, &[vec![1], vec![0]]);
+        let removed: Vec<usize> = (0..12).filter(|k| layers[0].confidence[*k] == 0.0).collect();
+        assert_eq!(removed, [5]);
+        assert_eq!(layers[1].confidence, [5.0; 12], "it is before another surface itself, but surer");
+    }
+}

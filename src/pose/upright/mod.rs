@@ -180,4 +180,14 @@ mod tests {
         }
         assert!(decide(&candidates(&clues)).is_none());
     }
+
+    #[test]
+    fn of_two_directions_that_agree_nearly_as_well_neither_is_up() {
+        let one = |direction: DVec3, edges: f64| {
+            (Refined { direction, sigma: 0.01 }, Agreement { edges, roll: 1.0, ..Agreement::default() })
+        };
+        // Totals of 1.5 and 1.3, then of 1.5 and 0.7.
+        assert_eq!(decide(&[one(DVec3::Z, 1.0), one(DVec3::X, 0.8)]), None);
+        assert_eq!(decide(&[one(DVec3::Z, 1.0), one(DVec3::X, 0.2)]).unwrap().direction, DVec3::Z);
+    }
 }

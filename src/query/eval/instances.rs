@@ -81,3 +81,24 @@ pub(super) fn summary(scores: &[InstanceScore]) -> Option<(f64, f64)> {
     let mut distances: Vec<f64> = scores.iter().flat_map(|s| s.centre_distance.iter().copied()).collect();
     Some((median(&mut distances)?, right as f64 / scores.len() as f64))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DMat3;
+
+    #[test]
+    fn things_are_compared_in_the_world_of_the_truth() {
+        // (x, y) of the scene is (1 − 2y, 2x) there.
+        let rotation = DMat3::from_rotation_z(std::f64::consts::FRAC_PI_2);
+        let to_truth = Similarity { scale: 2.0, rotation, translation: DVec3::X };
+        let at = |x: f64, y: f64| Instance { centre: DVec3::new(x, y, 0.0), ..Instance::default() };
+        let middles = [("red ball", 1.0, 2.0), ("dark red ball", -3.0, 0.0), ("mug", 1.0, 1.0)]
+            .map(|(label, x, y)| (label.to_owned(), DVec3::new(x, y, 0.0)));
+        let found = [at(0.0, 2.0), at(1.0, 0.0)];
+        let balls = score(&middles, "red ball", &found, &to_truth).unwrap();
+        assert_eq!((balls.expected, balls.found, balls.centre_distance.len()), (2, 2, 2));
+        assert!(balls.centre_distance.iter().all(|d| *d < 1e-9), "{balls:?}");
+        assert_eq!(score(&middles, "lemon", &found, &to_truth), None);
+    }
+}

@@ -52,7 +52,11 @@ fn a_perfect_scene_scores_perfectly_and_its_files_say_so() {
             .collect();
         eval.add_frame(&frame, &Rendered { rgb, alpha, depth }, &answers).unwrap();
     }
+    let direction = similarity.rotation.transpose() * truth.up.unwrap();
+    let up = Some(Up { direction, sigma_degrees: 1.0, evidence: Vec::new() });
+    eval.add_world(&World { up, scale: None });
     let report = eval.finish();
+    assert!(report.up_degrees.unwrap() < 1e-2, "{:?}", report.up_degrees);
     assert_eq!(report.poses.len(), 4);
     for p in &report.poses {
         assert!(p.rotation_degrees < 1e-3 && p.centre_fraction < 1e-5 && p.focal_relative < 1e-12);

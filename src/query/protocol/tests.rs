@@ -446,6 +446,7 @@ fn scannet_counts_eight_labels_and_places_frames_by_their_poses() {
     assert_eq!(splits, [("0", Split::Train), ("10", Split::Train), ("20", Split::Test)]);
     let expected = turn * DVec3::new(2.0, 0.4, 0.0) * 0.5;
     assert!((views[2].camera.pose.centre() - expected).length() < 1e-9);
+    assert_eq!((views[2].camera.cx, views[2].camera.cy), (32.0, 25.0));
 
     let mut random = Random::new(1004);
     let (field, codes) = (field(&mut random), codes(W, H, &mut random));
@@ -536,8 +537,10 @@ fn own_ground_truth_serves_lerf_and_ovs() {
         let queries: Vec<TextQuery> = protocol.prompts().iter().map(ask).collect();
         let scores = CodeScores::new(&field, &queries).unwrap();
         protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
-        let figures = protocol.finish().summary["train"].figures.clone();
+        let ProtocolSummary { figures, iou } = protocol.finish().summary["train"].clone();
         assert_eq!(figures[figure], 1.0, "{kind:?}");
+        // The table is a label that competes, and no thing to find.
+        assert!(iou.contains_key("lemon") && !iou.contains_key("wooden table"), "{kind:?}: {iou:?}");
         match kind {
             // masks are cut from smoothed maps: edges and thin parts move
             ProtocolKind::Lerf => assert!(figures["miou"] > 0.6, "{figures:?}"),

@@ -188,6 +188,7 @@ fn section(manifest: &Value, data: &str) -> String {
 mod tests {
     use super::*;
     use crate::pass::seeded;
+    use crate::scene::Scale;
 
     #[test]
     fn the_section_is_whole_and_its_data_cannot_break_out() {
@@ -203,12 +204,13 @@ mod tests {
             notes: Vec::new(),
             highlight: &highlight,
         };
+        let scale = Scale { metres_per_unit: 0.25, log_sigma: 0.1, stated: Vec::new() };
         let scene = Scene3d {
             title: "a<b",
             splats: &splats,
             seen: &Seen::default(),
             cameras: std::slice::from_ref(&camera),
-            world: &World::default(),
+            world: &World { scale: Some(scale), ..World::default() },
             photos: vec![&photo],
             language: None,
             names: &Vec::new(),
@@ -221,6 +223,7 @@ mod tests {
         let manifest: Value = serde_json::from_str(manifest).unwrap();
         assert_eq!(manifest["answers"][0]["text"], "</script><b>");
         assert_eq!(manifest["live"], false);
+        assert_eq!(manifest["metres"], 0.25, "what the tape multiplies by");
         // Row 2 of the rotation is where the camera looks.
         let forward = camera.pose.rotation.row(2);
         assert_eq!(manifest["views"][0]["rotation"][8], forward.z);

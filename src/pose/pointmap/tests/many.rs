@@ -113,6 +113,17 @@ fn cost(count: usize, size: (usize, usize)) -> (f64, u64) {
     (seconds, peak_memory() - before)
 }
 
+#[test]
+fn exif_tells_the_focal_length_where_there_is_any_and_the_points_where_not() {
+    let mut case = wall(2, 64, 48, 1);
+    let canonical = canonical::all(&case.views, &case.maps(0.0));
+    let points = canonical::focals(&case.views, &canonical).of(0);
+    assert!((points / case.cameras[0].fx - 1.0).abs() < 0.01, "{points}");
+    case.views.iter_mut().for_each(|v| v.exif_focal = Some(80.0));
+    let exif = canonical::focals(&case.views, &canonical);
+    assert_eq!((exif.of(0), exif.of(1)), (80.0, 80.0));
+}
+
 /// Depth at working size belongs to the centres of the photo's pixels, four to one of the network's here: half a pixel of the
 /// network is seen.
 #[test]
