@@ -308,7 +308,11 @@ fn told_to_stop_a_command_leaves_nothing() {
         let folder = tempfile::tempdir().unwrap();
         let place = folder.path().join("out");
         let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));
-        command.env_remove("SPLATVK_MODELS").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
+        command
+            .env_remove("SPLATVK_MODELS")
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped());
         let child = command.args(line(words, &place)).spawn().unwrap();
         std::thread::sleep(Duration::from_secs(2));
         let told = Instant::now();
