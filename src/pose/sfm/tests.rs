@@ -357,7 +357,7 @@ fn walls_tell_the_focal_length_where_the_file_does_not() {
     };
     let (mean, sigma) = prior(None);
     println!("{:.3} ± {sigma:.3}", mean - focal.ln());
-    // The long side alone says 0.25 ± 0.35; a copy of the method elsewhere 0.007 ± 0.06.
+    // The long side alone says 0.25 ± 0.35; the walls 0.007 ± 0.060.
     assert!((mean - focal.ln()).abs() < 0.05 && sigma < 0.1, "{mean} {sigma}");
     assert_eq!(prior(Some(300.0)), (300f64.ln(), EXIF_SIGMA), "EXIF goes before");
 }
