@@ -9,7 +9,6 @@ layout(std430, binding = 1) readonly buffer Target { float target_image[]; };  /
 layout(std430, binding = 2) writeonly buffer Means { vec2 means[]; };  // [C, H, W] blurred (x, y)
 layout(std430, binding = 3) writeonly buffer Moments { vec2 moments[]; };  // [C, H, W] blurred (x²+y², xy)
 layout(push_constant) uniform Push { int width; int height; };
-#include "shared/select.glsl"
 #include "shared/ssim.glsl"
 
 void main() {
@@ -21,10 +20,10 @@ void main() {
     [[unroll]] for (int k = 0; k < STRIP; k++) { a[k] = 0.0; b[k] = 0.0; e[k] = 0.0; f[k] = 0.0; }
     [[unroll]] for (int i = 0; i < STRIP + 2 * HALF; i++) {
         int y = y0 + i - HALF;
-        bool inside = both(y >= 0, y < height);
+        bool inside = y >= 0 && y < height;
         int q = base + clamp(y, 0, height - 1) * width + x;
-        float u = select(inside, rendered[q], 0.0);
-        float v = select(inside, target_image[q], 0.0);
+        float u = inside ? rendered[q] : 0.0;
+        float v = inside ? target_image[q] : 0.0;
         float squares = u * u + v * v, product = u * v;
         [[unroll]] for (int k = 0; k < STRIP; k++) {
             if (i - k >= 0 && i - k < 2 * HALF + 1) {

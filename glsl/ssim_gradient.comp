@@ -12,7 +12,6 @@ layout(std430, binding = 4) writeonly buffer Gradient { float gradient[]; };  //
 layout(std430, binding = 5) writeonly buffer Sums { float sums[]; };  // [C, strips, W] sum of |x-y| over each strip
 // Rows outside first .. end belong to other bands of the image: no gradient, no loss.
 layout(push_constant) uniform Push { int width; int height; float l1_weight; float dssim_weight; int first; int end; };
-#include "shared/select.glsl"
 #include "shared/ssim.glsl"
 
 void main() {
@@ -25,10 +24,10 @@ void main() {
     [[unroll]] for (int k = 0; k < STRIP; k++) { a[k] = 0.0; b[k] = 0.0; c[k] = 0.0; }
     [[unroll]] for (int i = 0; i < STRIP + 2 * HALF; i++) {
         int y = y0 + i - HALF;
-        bool inside = both(y >= 0, y < height);
+        bool inside = y >= 0 && y < height;
         int q = base + clamp(y, 0, height - 1) * width + x;
-        vec2 slope = select(inside, slopes[q], vec2(0.0));
-        float cross_slope = select(inside, cross_slopes[q], 0.0);
+        vec2 slope = inside ? slopes[q] : vec2(0.0);
+        float cross_slope = inside ? cross_slopes[q] : 0.0;
         [[unroll]] for (int k = 0; k < STRIP; k++) {
             if (i - k >= 0 && i - k < 2 * HALF + 1) {
                 float w = WINDOW[i - k];

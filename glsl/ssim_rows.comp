@@ -19,52 +19,47 @@ void main() {
     int x0 = strip * STRIP;
     int base = int(gl_WorkGroupID.z) * width * height + y * width;
     if (y >= height || strip >= strips) return;
-    float a[STRIP + 10], b[STRIP + 10], e[STRIP + 10], f[STRIP + 10], oa[STRIP], ob[STRIP], oc[STRIP];
-    [[unroll]] for (int k = 0; k < STRIP + 10; k++) { a[k] = 0.0; b[k] = 0.0; e[k] = 0.0; f[k] = 0.0; }
-    [[unroll]] for (int k = 0; k < STRIP; k++) { oa[k] = 0.0; ob[k] = 0.0; oc[k] = 0.0; }
+    // The last 11 columns, and the derivatives of the last 11 windows.
+    vec2 mean[TAPS], moment[TAPS];
+    vec3 slope[TAPS];
+    [[unroll]] for (int k = 0; k < TAPS; k++) {
+        mean[k] = moment[k] = vec2(0.0);
+        slope[k] = vec3(0.0);
+    }
     float sum = 0.0;
-    [[unroll]] for (int i = 0; i < STRIP + 20; i++) {
+    for (int i = 0; i < STRIP + 20; i++) {
+        [[unroll]] for (int k = 0; k + 1 < TAPS; k++) {
+            mean[k] = mean[k + 1];
+            moment[k] = moment[k + 1];
+            slope[k] = slope[k + 1];
+        }
         int x = x0 + i - 10;
         bool inside = both(x >= 0, x < width);
         int q = base + clamp(x, 0, width - 1);
-        vec2 mean = select(inside, means[q], vec2(0.0));
-        vec2 moment = select(inside, moments[q], vec2(0.0));
-        [[unroll]] for (int k = 0; k < STRIP + 10; k++) {
-            if (i - k >= 0 && i - k < 2 * HALF + 1) {
-                float w = WINDOW[i - k];
-                a[k] = fma(w, mean.x, a[k]);
-                b[k] = fma(w, mean.y, b[k]);
-                e[k] = fma(w, moment.x, e[k]);
-                f[k] = fma(w, moment.y, f[k]);
-            }
+        mean[TAPS - 1] = select(inside, means[q], vec2(0.0));
+        moment[TAPS - 1] = select(inside, moments[q], vec2(0.0));
+        vec2 m = vec2(0.0), n = vec2(0.0);
+        [[unroll]] for (int k = 0; k < TAPS; k++) {
+            m = fma(vec2(WINDOW[k]), mean[k], m);
+            n = fma(vec2(WINDOW[k]), moment[k], n);
         }
-        // With tap i the window around column x0 + i - 15 is complete; columns outside the image have no SSIM. No branch stands here
-        // before the first is complete: within one the compiler does not write the inner loop out.
-        int k = max(i - 10, 0);
+        // The window around this column is whole from i = 10 on; columns outside the image have no SSIM.
         int centre = x0 + i - 15;
-        float mx = a[k], my = b[k];
-        float product = mx * my, squares = mx * mx + my * my;
-        float a1 = 2.0 * product + C1, a2 = 2.0 * (f[k] - product) + C2, b1 = squares + C1, b2 = (e[k] - squares) + C2;
+        float product = m.x * m.y, squares = m.x * m.x + m.y * m.y;
+        float a1 = 2.0 * product + C1, a2 = 2.0 * (n.y - product) + C2, b1 = squares + C1, b2 = (n.x - squares) + C2;
         float inverse = 1.0 / (b1 * b2);
         float s = a1 * a2 * inverse;
-        vec3 d = vec3(2.0 * my * (a2 - a1) * inverse - 2.0 * mx * s / b1 + 2.0 * mx * s / b2, -s / b2, 2.0 * a1 * inverse);
+        vec3 d = vec3(2.0 * m.y * (a2 - a1) * inverse - 2.0 * m.x * s / b1 + 2.0 * m.x * s / b2, -s / b2, 2.0 * a1 * inverse);
         bool real = both(centre >= 0, centre < width);
-        d = select(real, d, vec3(0.0));
-        if (i >= 15 && i < STRIP + 15) sum += select(real, s, 0.0);
-        [[unroll]] for (int o = 0; o < STRIP; o++) {
-            int tap = i - 10 - o;
-            if (tap >= 0 && tap < 2 * HALF + 1) {
-                float w = WINDOW[tap];
-                oa[o] = fma(w, d.x, oa[o]);
-                ob[o] = fma(w, d.y, ob[o]);
-                oc[o] = fma(w, d.z, oc[o]);
-            }
-        }
-    }
-    [[unroll]] for (int k = 0; k < STRIP; k++) {
-        if (x0 + k < width) {
-            slopes[base + x0 + k] = vec2(oa[k], ob[k]);
-            cross_slopes[base + x0 + k] = oc[k];
+        slope[TAPS - 1] = select(real, d, vec3(0.0));
+        sum += select(both(real, both(i >= 15, i < STRIP + 15)), s, 0.0);
+        // The derivatives of the windows around this column are there from i = 20 on.
+        int out_x = x0 + i - 20;
+        if (i >= 20 && out_x < width) {
+            vec3 blurred = vec3(0.0);
+            [[unroll]] for (int k = 0; k < TAPS; k++) blurred = fma(vec3(WINDOW[k]), slope[k], blurred);
+            slopes[base + out_x] = blurred.xy;
+            cross_slopes[base + out_x] = blurred.z;
         }
     }
     sums[(int(gl_WorkGroupID.z) * height + y) * strips + strip] = y >= first && y < end ? sum : 0.0;
