@@ -28,7 +28,7 @@ void main() {
     }
     float sum = 0.0;
     for (int i = 0; i < STRIP + 20; i++) {
-        [[unroll]] for (int k = 0; k + 1 < TAPS; k++) {
+        [[unroll]] for (int k = 0; k < TAPS - 1; k++) {
             mean[k] = mean[k + 1];
             moment[k] = moment[k + 1];
             slope[k] = slope[k + 1];
