@@ -2,42 +2,13 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
+use fixture::command::{refuses, splatvk, text};
 use fixture::{data, scene, small_views, train_log};
 use splatvk::format::npy::{self, NpyArray};
-use splatvk::format::scene_dir::{self, Contents};
-use splatvk::scene::{
-    Camera, Codebook, LanguageField, LevelField, PointCloud, Pose, Seen, Splats, Up, World,
-};
+use splatvk::scene::Seen;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
-
-fn splatvk() -> Command {
-    let mut c = Command::new(env!("CARGO_BIN_EXE_splatvk"));
-    // Paths of the developer's shell must not decide the outcome.
-    c.env_remove("SPLATVK_MODELS").stdin(Stdio::null());
-    c
-}
-
-fn text(bytes: &[u8]) -> String {
-    String::from_utf8_lossy(bytes).into_owned()
-}
-
-/// Runs a command that must fail with `code` and exactly one line on standard error, which contains all the words.
-fn refuses(command: &mut Command, code: i32, words: &[&str]) -> Output {
-    let begun = Instant::now();
-    let output = command.output().unwrap();
-    // On a busy machine a command may take the ten seconds after which it lists its stages.
-    let listed = begun.elapsed() > Duration::from_secs(10);
-    let stderr = text(&output.stderr);
-    assert_eq!(output.status.code(), Some(code), "{command:?}\n{stderr}");
-    let lines: Vec<&str> = stderr.lines().filter(|l| !(listed && l.starts_with(' '))).collect();
-    assert!(lines.len() == 1 && lines[0].starts_with("splatvk: "), "one line:\n{stderr}");
-    for w in words {
-        assert!(stderr.contains(w), "{w:?} is not in: {stderr}");
-    }
-    output
-}
 
 fn names(folder: &Path) -> Vec<String> {
     let entries = std::fs::read_dir(folder).unwrap();
@@ -342,158 +313,6 @@ fn the_scene_of_a_run_is_whole_and_can_be_replaced() {
         serde_json::from_slice(&std::fs::read(scene.join("run.json")).unwrap()).unwrap();
     assert!(run["stages"].as_array().unwrap().len() >= 2 && run["seed"] == 0 && run["device"].is_string());
     assert!(names(scene.parent().unwrap()).iter().all(|n| !n.contains("partial") && !n.contains("old")));
-}
-
-/// A scene of two splats and one camera, the first splat one unit straight above it and in no photo. Points are where splats
-/// are.
-fn tilted_scene(folder: &Path) -> (PathBuf, Splats, Camera) {
-    let scene = folder.join("scene");
-    std::fs::create_dir(&scene).unwrap();
-    let direction = glam::DVec3::new(0.2, -0.9, 0.3).normalize();
-    let splats = Splats {
-        means: vec![direction.as_vec3().to_array(), [0.1, 0.2, 2.0]],
-        log_scales: vec![[-3.0, -4.0, -5.0]; 2],
-        quats: vec![[1.0, 0.0, 0.0, 0.0]; 2],
-        opacity_logits: vec![1.0; 2],
-        sh_degree: 0,
-        sh: vec![0.0; 6],
-    };
-    let camera = Camera {
-        name: "a".into(),
-        width: 64,
-        height: 48,
-        fx: 60.0,
-        fy: 60.0,
-        cx: 32.0,
-        cy: 24.0,
-        pose: Pose::exp(glam::DVec3::new(0.1, 0.0, 0.3), glam::DVec3::new(0.0, 0.2, 0.1)),
-    };
-    let up = Up { direction, sigma_degrees: 1.0, evidence: Vec::new() };
-    let points =
-        PointCloud { positions: splats.means.clone(), colours: vec![[0.5; 3]; 2], ..PointCloud::default() };
-    let codebook = Codebook {
-        embedding_dim: 1,
-        code_dim: 1,
-        embeddings: vec![1.0],
-        codes: vec![1.0],
-        weights: vec![1.0],
-        members: vec![Vec::new()],
-        min_chord: 2.0,
-    };
-    let level = LevelField { codebook, features: vec![0.25, 0.5], ..LevelField::default() };
-    let levels = vec![LevelField::default(), LevelField::default(), level];
-    let field = LanguageField { levels, space: "dir".into() };
-    let contents = Contents {
-        splats: &splats,
-        seen: &Seen { pixels: vec![0.0, 3.0] },
-        cameras: std::slice::from_ref(&camera),
-        world: &World { up: Some(up), ..World::default() },
-        photos: &[],
-        points: Some(&points),
-        language: Some(&field),
-        text_embeddings: None,
-    };
-    scene_dir::write(&scene, &contents).unwrap();
-    (scene, splats, camera)
-}
-
-#[test]
-fn exports_turn_up_to_the_axis_that_is_asked_for() {
-    let folder = tempfile::tempdir().unwrap();
-    let (scene, splats, camera) = tilted_scene(folder.path());
-    let export = |scene: &Path, format: &str, axis: &str, name: &str| {
-        let mut export = splatvk();
-        export.arg("export").arg(scene).args(["--format", format, "--up", axis, "--force", "--out"]);
-        export.arg(folder.path().join(name));
-        export
-    };
-    let mean = |at: &[f32; 3]| glam::Vec3::from_array(*at).as_dvec3();
-    for (axis, to) in [("-y", glam::DVec3::NEG_Y), ("z", glam::DVec3::Z)] {
-        for (format, name) in [("ply", "a.ply"), ("transforms", "t.json"), ("colmap", "model")] {
-            let output = export(&scene, format, axis, name).output().unwrap();
-            assert!(output.status.success(), "{}", text(&output.stderr));
-        }
-        let turned = splatvk::format::ply::read_splats(&folder.path().join("a.ply")).unwrap();
-        assert!((mean(&turned.means[0]) - to).length() < 1e-6, "{axis}: {:?}", turned.means[0]);
-        let seen = splatvk::format::cameras::read(&folder.path().join("t.json")).unwrap();
-        let (before, after) =
-            (camera.project(mean(&splats.means[1])), seen[0].project(mean(&turned.means[1])));
-        assert!((before.0 - after.0).length() < 1e-3, "cameras and splats turn together");
-        let points = splatvk::format::colmap::read_points(&folder.path().join("model")).unwrap().positions;
-        assert!((mean(&points[0]) - to).length() < 1e-6, "and points: {points:?}");
-    }
-    // Read back, glTF is in the axes of scenes again: y up in the file.
-    assert!(export(&scene, "glb", "y", "a.glb").output().unwrap().status.success());
-    let turned = splatvk::format::gltf::read_splats(&folder.path().join("a.glb")).unwrap();
-    assert!((mean(&turned.means[0]) - glam::DVec3::NEG_Y).length() < 1e-6);
-    refuses(&mut export(&scene, "spz", "z", "b.spz"), 2, &["y up by definition", "--up y"]);
-    refuses(&mut export(&folder.path().join("a.ply"), "splat", "y", "b.splat"), 2, &["not known"]);
-    refuses(&mut export(&scene, "ply", "x", "b.ply"), 2, &["-y, y or z"]);
-    assert!(!folder.path().join("b.spz").exists());
-}
-
-#[test]
-fn splats_that_no_photo_shows_are_left_out_with_their_language() {
-    let folder = tempfile::tempdir().unwrap();
-    let (scene, out) = (tilted_scene(folder.path()).0, folder.path().join("seen.spz"));
-    let mut export = splatvk();
-    export.arg("export").arg(scene).args(["--format", "spz", "--only-seen", "--out"]).arg(&out);
-    let output = export.output().unwrap();
-    assert!(output.status.success(), "{}", text(&output.stderr));
-    let (kept, language) = splatvk::format::gaussians::read(&out).unwrap();
-    assert_eq!((kept.len(), language.unwrap().levels[2].features.as_slice()), (1, &[0.5][..]));
-}
-
-#[test]
-fn a_known_length_gives_the_scene_its_scale() {
-    let folder = tempfile::tempdir().unwrap();
-    let (scene, splats, _) = tilted_scene(folder.path());
-    let measure = |arguments: &[&str]| {
-        let mut measure = splatvk();
-        measure.arg("measure").arg(&scene).args(arguments);
-        measure
-    };
-    let json = |arguments: &[&str]| -> serde_json::Value {
-        let output = measure(&[&["--json"], arguments].concat()).output().unwrap();
-        assert!(output.status.success(), "{}", text(&output.stderr));
-        serde_json::from_slice(&output.stdout).unwrap()
-    };
-    let export = |name: &str| {
-        let mut export = splatvk();
-        export
-            .arg("export")
-            .arg(&scene)
-            .args(["--format", "ply", "--metres", "--out"])
-            .arg(folder.path().join(name));
-        export
-    };
-    refuses(&mut export("none.ply"), 2, &["scale is not known", "splatvk measure --scale"]);
-    let length = "0,0,1 - 0.3,-0.4,1";
-    let before = json(&[length]);
-    assert!(
-        (before["lengths"][0]["units"].as_f64().unwrap() - 0.5).abs() < 1e-12 && before["scale"].is_null()
-    );
-    let stated = json(&["--scale", "0,0,2 - -2,0,2 = 50cm", length]);
-    assert!((stated["scale"]["metres_per_unit"].as_f64().unwrap() - 0.25).abs() < 1e-12);
-    let kept = json(&[length]);
-    assert!((kept["lengths"][0]["metres"].as_f64().unwrap() - 0.125).abs() < 1e-12, "{kept}");
-    assert!(kept["lengths"][0]["sigma_metres"].as_f64().unwrap() > 0.0);
-    assert!(export("metres.ply").output().unwrap().status.success());
-    let scaled = splatvk::format::ply::read_splats(&folder.path().join("metres.ply")).unwrap();
-    for (own, metres) in splats.means.as_flattened().iter().zip(scaled.means.as_flattened()) {
-        assert!((0.25 * own - metres).abs() < 1e-6);
-    }
-    // The direction up and all else that the manifest says stays.
-    let loaded = scene_dir::load(&scene).unwrap();
-    assert!(loaded.world.up.is_some() && loaded.splats == splats && loaded.cameras.len() == 1);
-    let behind = json(&["--", "-0.3,0,1 - 0,0,1"]);
-    assert!((behind["lengths"][0]["units"].as_f64().unwrap() - 0.3).abs() < 1e-12);
-    refuses(&mut measure(&[]), 2, &["give a length"]);
-    refuses(&mut measure(&["--scale", length]), 2, &["METRES"]);
-    refuses(&mut measure(&["0,0,1 to 1,0,1"]), 2, &["A - B"]);
-    refuses(&mut measure(&["0,0,1 - 0,0,1"]), 2, &["one place"]);
-    refuses(&mut measure(&["b:1,1 - a:2,2"]), 2, &["no view of the scene", "it has a"]);
-    refuses(&mut measure(&["a:64,1 - a:2,2"]), 2, &["64 × 48 pixels"]);
 }
 
 #[test]
