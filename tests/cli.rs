@@ -312,6 +312,10 @@ fn the_scene_of_a_run_is_whole_and_can_be_replaced() {
     let run: serde_json::Value =
         serde_json::from_slice(&std::fs::read(scene.join("run.json")).unwrap()).unwrap();
     assert!(run["stages"].as_array().unwrap().len() >= 2 && run["seed"] == 0 && run["device"].is_string());
+    let said = events(&std::fs::read_to_string(train_log()).unwrap());
+    let warned: Vec<_> =
+        said.iter().filter(|e| e["event"] == "warning").map(|e| e["message"].clone()).collect();
+    assert!(!warned.is_empty() && run["warnings"] == serde_json::Value::from(warned), "{}", run["warnings"]);
     assert!(names(scene.parent().unwrap()).iter().all(|n| !n.contains("partial") && !n.contains("old")));
 }
 

@@ -25,7 +25,7 @@ mod train;
 mod view;
 mod views;
 
-use crate::Result;
+use crate::{Result, gpu};
 use args::{Cli, Command};
 use clap::Parser;
 use clap::error::ErrorKind;
@@ -41,6 +41,7 @@ pub fn main() -> ExitCode {
     };
     progress::set_format(cli.log);
     progress::stop_on_signal();
+    gpu::on_long_compilation(progress::tell_of_compilation);
     let mut command = cli.command;
     if let Some(provider) = command.provider() {
         *provider = cli.provider;

@@ -30,7 +30,7 @@ fn as_json() -> bool {
 
 /// Where the commands of this process report to.
 pub fn reporter() -> Box<dyn Progress> {
-    if as_json() { Box::new(JsonLines::default()) } else { Box::new(Terminal::new()) }
+    if as_json() { Box::new(JsonLines::default()) } else { Box::new(Terminal::default()) }
 }
 
 /// True once the user wants the process to stop.
@@ -86,6 +86,16 @@ fn print_held(line: &str) {
 /// Prints what was held back; from now on nothing is.
 pub fn release() {
     lock(&HELD).take().into_iter().flatten().for_each(|line| write_line(&line));
+}
+
+/// What to wait for while nothing moves.
+pub fn tell_of_compilation(device: &str) {
+    let message =
+        format!("the driver of {} compiles shaders; it takes long only in the first run", one_line(device));
+    match as_json() {
+        true => write_event("message", json!({ "message": message })),
+        false => print(&message),
+    }
 }
 
 /// Writes `{"event", "time", …}` as one line; `time` is in seconds since the process began.
@@ -190,32 +200,28 @@ fn end() -> ! {
 
 type Stage = (&'static str, Instant, ProgressBar);
 
-/// The command line's [`Progress`] for people.
-struct Terminal {
-    /// All bars, below each other; `None` where standard error is no terminal.
-    bars: Option<MultiProgress>,
-    current: Mutex<Option<Stage>>,
+/// All bars of the process, below each other; `None` where standard error is no terminal.
+static BARS: LazyLock<Option<MultiProgress>> =
+    LazyLock::new(|| std::io::stderr().is_terminal().then(MultiProgress::new));
+
+/// Prints a line above the bars.
+fn print(line: &str) {
+    match &*BARS {
+        Some(bars) => bars.suspend(|| write_line(line)),
+        None => print_held(line),
+    }
 }
 
-impl Terminal {
-    /// Bars when standard error is a terminal, lines otherwise.
-    fn new() -> Self {
-        let bars = std::io::stderr().is_terminal().then(MultiProgress::new);
-        Terminal { bars, current: Mutex::default() }
-    }
-    /// Prints a line above the bars.
-    fn print(&self, line: &str) {
-        match &self.bars {
-            Some(bars) => bars.suspend(|| write_line(line)),
-            None => print_held(line),
-        }
-    }
+/// The command line's [`Progress`] for people: bars when standard error is a terminal, lines otherwise.
+#[derive(Default)]
+struct Terminal {
+    current: Mutex<Option<Stage>>,
 }
 
 impl Progress for Terminal {
     fn begin(&self, stage: &'static str, steps: u64) {
         self.end();
-        let bar = match &self.bars {
+        let bar = match &*BARS {
             Some(bars) => bars.add(ProgressBar::new(steps)),
             None => ProgressBar::hidden(),
         };
@@ -238,18 +244,18 @@ impl Progress for Terminal {
         let Some((name, start, bar)) = lock(&self.current).take() else { return };
         let note = bar.prefix();
         bar.finish_and_clear();
-        self.print(&format!("{name:>12}  {:6.1} s  {note}", start.elapsed().as_secs_f64()));
+        print(&format!("{name:>12}  {:6.1} s  {note}", start.elapsed().as_secs_f64()));
     }
     fn warn(&self, message: &str) {
-        self.print(&format!("warning: {}", one_line(message)));
+        print(&format!("warning: {}", one_line(message)));
     }
     fn inform(&self, message: &str) {
-        self.print(&one_line(message));
+        print(&one_line(message));
     }
     fn cancelled(&self) -> bool {
         stopped()
     }
     fn second_lane(&self) -> Box<dyn Progress + '_> {
-        Box::new(Terminal { bars: self.bars.clone(), current: Mutex::default() })
+        Box::new(Terminal::default())
     }
 }

@@ -1,4 +1,5 @@
 //! The logical device and everything that lives as long as it.
+use super::compile_time::CompileTime;
 use super::error::{lock, vk_error};
 use super::info::DeviceInfo;
 use super::memory::{Heap, Memory};
@@ -61,6 +62,7 @@ pub(super) struct Inner {
     pub staging: Mutex<Staging>,
     /// By name and code: modules of a program may share a name with the engine's.
     pipelines: Mutex<HashMap<(&'static str, usize), Arc<Pipeline>>>,
+    compile_time: CompileTime,
     pipeline_cache: vk::PipelineCache,
     properties: vk::PhysicalDeviceProperties,
     store: Option<Store>,
@@ -132,6 +134,7 @@ impl Device {
             lost_from: AtomicU64::new(u64::MAX),
             staging: Mutex::default(),
             pipelines: Mutex::new(HashMap::new()),
+            compile_time: CompileTime::new(),
             pipeline_cache,
             properties,
             store,
@@ -213,7 +216,9 @@ impl Device {
         if let Some(pipeline) = known.get(&key) {
             return Ok(pipeline.clone());
         }
-        let made = Arc::new(Pipeline::new(&self.0.device, self.info(), self.0.pipeline_cache, module)?);
+        let info = self.info();
+        let make = || Pipeline::new(&self.0.device, info, self.0.pipeline_cache, module);
+        let made = Arc::new(self.0.compile_time.during(&info.name, make)?);
         known.insert(key, made.clone());
         Ok(made)
     }

@@ -82,6 +82,7 @@ mod barrier;
 mod buffer;
 mod call;
 mod command;
+mod compile_time;
 mod device;
 mod enabled;
 mod error;
@@ -112,6 +113,7 @@ pub use buffer::Buffer;
 pub use call::Call;
 #[doc(hidden)]
 pub use command::{Groups, Op};
+pub use compile_time::on_long_compilation;
 pub use device::{Device, QueueLock};
 pub use enabled::EnabledFeatures;
 #[doc(hidden)]

@@ -50,8 +50,9 @@ impl Parameter {
         let rate = (adam.rate * correct(b2).sqrt() / correct(b1)) as f32;
         // ε of the uncorrected form
         let epsilon = 1e-8 * correct(b2).sqrt() as f32;
-        let moments = self.first.iter_mut().zip(self.second.iter_mut());
-        for ((v, (m, s)), g) in self.value.iter_mut().zip(moments).zip(gradient.iter()) {
+        // Slices, not the iterators of matrices, become vector instructions.
+        let moments = self.first.as_mut_slice().iter_mut().zip(self.second.as_mut_slice());
+        for ((v, (m, s)), g) in self.value.as_mut_slice().iter_mut().zip(moments).zip(gradient.as_slice()) {
             *m = b1 * *m + (1.0 - b1) * g;
             *s = b2 * *s + (1.0 - b2) * g * g;
             *v -= rate * *m / (s.sqrt() + epsilon);
@@ -173,7 +174,8 @@ impl Layer {
     fn backward(&mut self, trace: &Trace, gradient: &DMatrix<f32>, adam: &Adam) -> DMatrix<f32> {
         let by_weight = gradient * trace.input.transpose();
         let by_bias = DMatrix::from_column_slice(gradient.nrows(), 1, gradient.column_sum().as_slice());
-        let mut by_input = self.weight.value.tr_mul(gradient);
+        // `tr_mul` would take one product of columns after the other; this one is blocked for the caches.
+        let mut by_input = self.weight.value.transpose() * gradient;
         self.weight.update(&by_weight, adam);
         self.bias.update(&by_bias, adam);
         if self.relu {
