@@ -147,7 +147,8 @@ impl Level<'_> {
                 let own = of_mask.get(&MaskId::new(n + k, *label as usize));
                 let (code, twin) = own.copied().unwrap_or((-1, None));
                 let shown = if self.same[k][p] { codes.data[p] } else { -1 };
-                // Several things of the scene that the photo shows as one stay several; what matched nothing stays what it was.
+                // Several things of the scene that the photo shows as one stay several where alignment has fused them, which it does
+                // not on the finest level; what matched nothing stays what it was.
                 let stays = shown >= 0 && (code < 0 || twin.is_some_and(|t| t as i32 == scene.data[p]));
                 *label = if stays { shown } else { code };
             }
