@@ -74,7 +74,9 @@ mod tests {
         let (time, told) = (CompileTime::new(), AtomicUsize::new(0));
         for _ in 0..3 {
             time.watched(
-                || drop(told.fetch_add(1, Ordering::SeqCst)),
+                || {
+                    told.fetch_add(1, Ordering::SeqCst);
+                },
                 || std::thread::sleep(Duration::from_millis(5)),
             );
         }

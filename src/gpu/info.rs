@@ -12,6 +12,8 @@ pub struct Options {
     pub choice: Option<String>,
     /// Khronos validation layer with synchronization validation.
     pub validation: bool,
+    /// With validation: shaders also check every access to a buffer. A test takes minutes instead of seconds.
+    pub gpu_assisted: bool,
     /// Keep buffers out of host-visible memory, as on a GPU, even on a CPU device (to test the staging path).
     pub staging: bool,
     /// Only passes that give the same bits on every run of this device, even where others are faster.
@@ -26,13 +28,16 @@ pub struct Options {
 }
 
 impl Options {
-    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`, staging when `SPLATVK_STAGING` is;
+    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`, of the accesses of shaders too when it is `gpu`; staging when `SPLATVK_STAGING` is;
     /// `SPLATVK_MAX_BINDING` in MiB; the cache in `SPLATVK_HOME`.
     pub fn from_env(choice: Option<&str>) -> Self {
         let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
+        let validation = variable("SPLATVK_VALIDATION");
+        let validation = validation.as_deref();
         Options {
             choice: choice.map(str::to_owned).or_else(|| variable("SPLATVK_DEVICE")),
-            validation: variable("SPLATVK_VALIDATION").is_some_and(|v| v == "1"),
+            validation: validation.is_some_and(|v| v == "1" || v == "gpu"),
+            gpu_assisted: validation.is_some_and(|v| v == "gpu"),
             staging: variable("SPLATVK_STAGING").is_some_and(|v| v == "1"),
             max_binding: variable("SPLATVK_MAX_BINDING")
                 .and_then(|v| v.parse::<u64>().ok())

@@ -8,7 +8,8 @@ use ash::vk;
 
 impl Device {
     /// Opens the preferred device (discrete, integrated, virtual, CPU), or the one whose index or name part is `choice`.
-    /// `SPLATVK_DEVICE` is used when `choice` is `None`; `SPLATVK_VALIDATION=1` turns the validation layer on.
+    /// `SPLATVK_DEVICE` is used when `choice` is `None`; `SPLATVK_VALIDATION` turns the validation layer on
+    /// ([`Options::from_env`]).
     pub fn open(choice: Option<&str>) -> Result<Device> {
         Self::with(&Options::from_env(choice))
     }
@@ -16,7 +17,7 @@ impl Device {
     /// Opens a device with all options spelled out.
     pub fn with(options: &Options) -> Result<Device> {
         let entry = select::load()?;
-        let sink = options.validation.then(Sink::default);
+        let sink = options.validation.then(|| Sink::new(options.gpu_assisted));
         let instance = select::instance(&entry, sink.as_ref())?;
         // A clone keeps the loader in memory: `build` drops its entry on failure, and the instance must be destroyed after.
         match Self::build(entry.clone(), &instance, sink, options) {

@@ -231,6 +231,27 @@ fn validation_messages_are_caught() {
 }
 
 #[test]
+fn gpu_assisted_validation_sees_a_shader_read_beyond_a_buffer() {
+    let options = Options { validation: true, gpu_assisted: true, cache: None, ..Options::from_env(None) };
+    let device = Device::with(&options).unwrap();
+    let values = device.buffer_from("values", &[1.0f32; 64]).unwrap();
+    let result = device.buffer::<f32>("sum", 1).unwrap();
+    let bindings = super::shaders::sum::Bindings { values: &values, result: &result };
+    let mut sum = |count| {
+        let mut rec = Recorder::new(&device, "sum");
+        rec.dispatch(
+            super::shaders::sum::call(&bindings, &super::shaders::sum::Push { count, slot: 0 }),
+            [1, 1, 1],
+        );
+        rec.run().unwrap();
+        device.validation_messages()
+    };
+    assert_eq!(sum(64), [""; 0]);
+    let messages = sum(65);
+    assert!(messages.iter().any(|m| m.contains("out of bounds")), "{messages:?}");
+}
+
+#[test]
 fn synchronization_validation_is_on() {
     let device = Device::with(&Options { validation: true, ..Options::from_env(None) }).unwrap();
     let a = device.buffer::<u32>("a", 4).unwrap();

@@ -17,13 +17,31 @@ impl Messages {
 }
 
 /// The message store in a box, so that the address the driver keeps stays valid when the owner moves.
-#[derive(Default)]
-pub(super) struct Sink(Box<Messages>);
+pub(super) struct Sink {
+    messages: Box<Messages>,
+    gpu_assisted: bool,
+}
 
 impl Sink {
+    pub fn new(gpu_assisted: bool) -> Sink {
+        Sink { messages: Box::default(), gpu_assisted }
+    }
+
+    /// What the layer checks beside the calls.
+    pub fn features(&self) -> &'static [vk::ValidationFeatureEnableEXT] {
+        use vk::ValidationFeatureEnableEXT as Enable;
+        const ALL: &[Enable] = &[
+            Enable::SYNCHRONIZATION_VALIDATION,
+            Enable::GPU_ASSISTED,
+            // The layer binds a set of its own.
+            Enable::GPU_ASSISTED_RESERVE_BINDING_SLOT,
+        ];
+        if self.gpu_assisted { ALL } else { &ALL[..1] }
+    }
+
     /// For instance creation and for the messenger itself. No message is filtered.
     pub fn messenger_info(&self) -> vk::DebugUtilsMessengerCreateInfoEXT<'static> {
-        let store: *const Messages = &*self.0;
+        let store: *const Messages = &*self.messages;
         vk::DebugUtilsMessengerCreateInfoEXT::default()
             .message_severity(
                 vk::DebugUtilsMessageSeverityFlagsEXT::ERROR | vk::DebugUtilsMessageSeverityFlagsEXT::WARNING,
@@ -38,7 +56,7 @@ impl Sink {
     }
 
     pub fn messages(&self) -> Vec<String> {
-        self.0.lock().clone()
+        self.messages.lock().clone()
     }
 }
 
