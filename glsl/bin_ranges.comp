@@ -11,9 +11,11 @@ layout(std430, binding = 4) writeonly buffer TileSplats { uvec2 tile_splats[]; }
 layout(push_constant) uniform Push { uint tiles; uint lanes; };
 
 void main() {
+    // Read before the loop: of a read in its condition GPU-assisted validation makes a loop that lavapipe refuses.
+    uint count = entry_count;
     // One more than there are entries: the end closes the list of the last tile and all empty ones after it.
-    for (uint i = gl_GlobalInvocationID.x; i <= entry_count; i += lanes) {
-        bool real = i < entry_count;
+    for (uint i = gl_GlobalInvocationID.x; i <= count; i += lanes) {
+        bool real = i < count;
         uvec2 entry = real ? entries[i] : uvec2(tiles, 0);
         uint next = i > 0 ? entries[i - 1].x + 1 : 0;
         for (uint tile = next; tile <= entry.x; tile++) tile_ranges[tile] = i;

@@ -28,8 +28,8 @@ pub struct Options {
 }
 
 impl Options {
-    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`, of the accesses of shaders too when it is `gpu`; staging when `SPLATVK_STAGING` is;
-    /// `SPLATVK_MAX_BINDING` in MiB; the cache in `SPLATVK_HOME`.
+    /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`, GPU-assisted when it is `gpu`; staging when
+    /// `SPLATVK_STAGING` is `1`; `SPLATVK_MAX_BINDING` in MiB; the cache in `SPLATVK_HOME`.
     pub fn from_env(choice: Option<&str>) -> Self {
         let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
         let validation = variable("SPLATVK_VALIDATION");
