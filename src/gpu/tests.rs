@@ -237,7 +237,7 @@ fn gpu_assisted_validation_sees_a_shader_read_beyond_a_buffer() {
     let values = device.buffer_from("values", &[1.0f32; 64]).unwrap();
     let result = device.buffer::<f32>("sum", 1).unwrap();
     let bindings = super::shaders::sum::Bindings { values: &values, result: &result };
-    let mut sum = |count| {
+    let sum = |count| {
         let mut rec = Recorder::new(&device, "sum");
         rec.dispatch(
             super::shaders::sum::call(&bindings, &super::shaders::sum::Push { count, slot: 0 }),
