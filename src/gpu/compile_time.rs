@@ -1,4 +1,5 @@
-//! Tells the host when a driver takes long to compile shaders, while it does: on a first run some take half a minute.
+//! Tells the host when a driver takes long to compile shaders, while it does: on a first run some take half a minute. Drivers that
+//! compile when a pipeline first runs, as lavapipe does, are not seen.
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
