@@ -62,7 +62,7 @@ pub(super) struct Inner {
     pub staging: Mutex<Staging>,
     /// By name and code: modules of a program may share a name with the engine's.
     pipelines: Mutex<HashMap<(&'static str, usize), Arc<Pipeline>>>,
-    compile_time: CompileTime,
+    pub compile_time: CompileTime,
     pipeline_cache: vk::PipelineCache,
     properties: vk::PhysicalDeviceProperties,
     store: Option<Store>,

@@ -1,5 +1,6 @@
 //! The engine on a real device, with validation on.
 use super::*;
+use std::sync::Mutex;
 
 fn gathered(device: &Device, from: &[u32], index: &[u32]) -> crate::Result<Vec<u32>> {
     let from_buffer = device.buffer_from("from", from)?;
@@ -236,19 +237,27 @@ fn gpu_assisted_validation_sees_a_shader_read_beyond_a_buffer() {
     let device = Device::with(&options).unwrap();
     let values = device.buffer_from("values", &[1.0f32; 64]).unwrap();
     let result = device.buffer::<f32>("sum", 1).unwrap();
-    let bindings = super::shaders::sum::Bindings { values: &values, result: &result };
+    let bindings = shaders::sum::Bindings { values: &values, result: &result };
     let sum = |count| {
         let mut rec = Recorder::new(&device, "sum");
-        rec.dispatch(
-            super::shaders::sum::call(&bindings, &super::shaders::sum::Push { count, slot: 0 }),
-            [1, 1, 1],
-        );
+        rec.dispatch(shaders::sum::call(&bindings, &shaders::sum::Push { count, slot: 0 }), [1, 1, 1]);
         rec.run().unwrap();
         device.validation_messages()
     };
     assert_eq!(sum(64), [""; 0]);
     let messages = sum(65);
     assert!(messages.iter().any(|m| m.contains("out of bounds")), "{messages:?}");
+}
+
+#[test]
+fn a_host_is_told_of_long_compilations() {
+    static TOLD: Mutex<Vec<String>> = Mutex::new(Vec::new());
+    on_long_compilation(|name| TOLD.lock().unwrap().push(name.to_owned()));
+    // Of its own, so that it has pipelines to make.
+    let device = TestDevice::with(&Options::from_env(None)).unwrap();
+    device.0.compile_time.use_up();
+    gathered(&device, &[1], &[0]).unwrap();
+    assert!(TOLD.lock().unwrap().contains(&device.info().name));
 }
 
 #[test]
