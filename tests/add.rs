@@ -1,5 +1,7 @@
 //! Photos that join a scene: `splatvk run --add`.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
+mod fixture;
+
 use glam::{DMat3, DVec3};
 use serde_json::Value;
 use splatvk::format::scene_dir;
@@ -13,10 +15,6 @@ const WIDTH: u32 = 320;
 
 struct Scene {
     folder: tempfile::TempDir,
-}
-
-fn data() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast")
 }
 
 impl Scene {
@@ -35,7 +33,7 @@ impl Scene {
     }
 
     fn photo(&self, name: &str, to: &Path) -> PathBuf {
-        let photo = image::open(data().join(format!("{name}.jpg"))).unwrap();
+        let photo = image::open(fixture::data(&format!("breakfast/{name}.jpg"))).unwrap();
         let small = photo.resize_exact(WIDTH, WIDTH * 3 / 4, image::imageops::FilterType::Triangle);
         let path = to.join(format!("{}.png", name.rsplit('/').next().unwrap()));
         small.to_rgb8().save(&path).unwrap();
@@ -66,8 +64,7 @@ impl Scene {
 
 /// True cameras of the photos of that name, at any resolution: their poses are compared.
 fn truth(names: &[&str]) -> Vec<Camera> {
-    let text = std::fs::read_to_string(data().join("ground_truth.json")).unwrap();
-    let json: Value = serde_json::from_str(&text).unwrap();
+    let json = fixture::truth();
     let one = |name: &&str| {
         let frames = json["frames"].as_array().unwrap();
         let frame = frames.iter().find(|f| f["file"].as_str().unwrap().contains(*name)).unwrap();
@@ -93,11 +90,11 @@ fn truth(names: &[&str]) -> Vec<Camera> {
 
 /// PSNR of a held-out view by `splatvk eval`, dB.
 fn held_out(scene: &Scene, name: &str, view: &str) -> f64 {
-    let truth = data();
+    let truth = scene.at("truth");
+    fixture::truth_of(&truth, |file| file.starts_with("images/") || file.contains(view));
     let report = scene.succeeds(&["eval", name, "--ground-truth", truth.to_str().unwrap(), "--json"]);
-    let views = &report["images"];
-    let find = |v: &&Value| v["frame"].as_str().is_some_and(|f| f.contains(view));
-    views.as_array().unwrap().iter().find(find).unwrap()["psnr"].as_f64().unwrap()
+    let views = report["images"].as_array().unwrap();
+    views.iter().find(|v| v["frame"].as_str().unwrap().contains(view)).unwrap()["psnr"].as_f64().unwrap()
 }
 
 fn found(record: &Value) -> u64 {

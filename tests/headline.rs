@@ -1,16 +1,14 @@
 //! The headline figures of one small run, from photos to scored answers through the command line: a stage that breaks
 //! shows here even if it still runs.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
+mod fixture;
+
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Held-out frames that are scored: one between the photos, one at the side.
 const HELD_OUT: [&str; 2] = ["test_05", "test_08"];
-
-fn data() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast")
-}
 
 fn splatvk(args: &[&str]) -> Vec<u8> {
     let output = Command::new(env!("CARGO_BIN_EXE_splatvk")).args(args).output().unwrap();
@@ -21,34 +19,17 @@ fn splatvk(args: &[&str]) -> Vec<u8> {
 /// The photos at half size, where the whole pipeline takes seconds, and the truth of the frames to score.
 fn prepare(folder: &Path) -> (PathBuf, PathBuf) {
     let (photos, truth) = (folder.join("photos"), folder.join("truth"));
-    let mut json: Value =
-        serde_json::from_str(&std::fs::read_to_string(data().join("ground_truth.json")).unwrap()).unwrap();
-    std::fs::create_dir(&photos).unwrap();
-    for name in ["images", "held_out", "masks", "depth"] {
-        std::fs::create_dir_all(truth.join(name)).unwrap();
-    }
-    let frames = json["frames"].as_array_mut().unwrap();
-    frames.retain(|f| {
-        f["split"] == "train" || HELD_OUT.iter().any(|h| f["file"].as_str().unwrap().contains(h))
+    fixture::truth_of(&truth, |file| {
+        file.starts_with("images/") || HELD_OUT.iter().any(|held_out| file.contains(held_out))
     });
-    assert_eq!(frames.len(), 6);
-    for frame in frames {
-        let file = Path::new(frame["file"].as_str().unwrap());
-        let stem = file.file_stem().unwrap().to_str().unwrap();
-        for part in [file.to_owned(), format!("masks/{stem}.png").into(), format!("depth/{stem}.npz").into()]
-        {
-            std::fs::copy(data().join(&part), truth.join(&part)).unwrap();
-        }
-        if frame["split"] == "train" {
-            let small = image::open(data().join(file)).unwrap().resize_exact(
-                320,
-                240,
-                image::imageops::FilterType::Triangle,
-            );
-            small.to_rgb8().save(photos.join(format!("{stem}.png"))).unwrap();
-        }
+    std::fs::create_dir(&photos).unwrap();
+    let names: Vec<_> = std::fs::read_dir(truth.join("images")).unwrap().map(|e| e.unwrap().path()).collect();
+    assert_eq!(names.len(), 4);
+    for file in names {
+        let small = image::open(&file).unwrap().resize_exact(320, 240, image::imageops::FilterType::Triangle);
+        let name = Path::new(file.file_name().unwrap()).with_extension("png");
+        small.to_rgb8().save(photos.join(name)).unwrap();
     }
-    std::fs::write(truth.join("ground_truth.json"), json.to_string()).unwrap();
     (photos, truth)
 }
 

@@ -1,7 +1,7 @@
 //! Keypoint features, their matches between two photos, and the parts of photos that cannot hold features.
 use crate::photo::PlainBorder;
 use crate::scene::{Plane, RgbImage};
-use glam::DVec2;
+use glam::{DVec2, Vec4};
 use rayon::prelude::*;
 
 /// Keypoints with unit descriptors of one photo.
@@ -33,34 +33,73 @@ pub(crate) struct Match {
     pub(crate) quality: f64,
 }
 
-/// Best and second-best similarity of each row of `a` among the rows of `b`.
-fn nearest(a: &Keypoints, b: &Keypoints) -> Vec<(usize, f32, f32)> {
-    let d = a.dim;
-    a.descriptors
-        .par_chunks(d.max(1))
-        .map(|row| {
-            let (mut index, mut best, mut second) = (0, f32::NEG_INFINITY, f32::NEG_INFINITY);
-            for (k, other) in b.descriptors.chunks_exact(d).enumerate() {
-                let mut lanes = [0f32; 8];
-                for (x, y) in row.chunks_exact(8).zip(other.chunks_exact(8)) {
-                    for l in 0..8 {
-                        lanes[l] += x[l] * y[l];
-                    }
-                }
-                let s: f32 = lanes.iter().sum();
-                if s > best {
-                    // The same corner may be listed twice (two orientations): it must not spoil its own ratio.
-                    if best > f32::NEG_INFINITY && (b.points[k] - b.points[index]).length() > 2.0 {
-                        second = best;
-                    }
-                    (index, best) = (k, s);
-                } else if s > second && (b.points[k] - b.points[index]).length() > 2.0 {
-                    second = s;
+/// The keypoint of the other photo that is most similar to one, and the second-best similarity elsewhere.
+#[derive(Clone, Copy)]
+struct Nearest {
+    index: usize,
+    best: f32,
+    second: f32,
+}
+
+impl Nearest {
+    const NONE: Nearest = Nearest { index: 0, best: f32::NEG_INFINITY, second: f32::NEG_INFINITY };
+
+    /// Candidate `k` of `points`, after all before it.
+    fn consider(&mut self, k: usize, similarity: f32, points: &[DVec2]) {
+        // The same corner may be listed twice (two orientations): it must not spoil its own ratio.
+        let elsewhere = |index: usize| (points[k] - points[index]).length() > 2.0;
+        if similarity > self.best {
+            if self.best > f32::NEG_INFINITY && elsewhere(self.index) {
+                self.second = self.best;
+            }
+            (self.index, self.best) = (k, similarity);
+        } else if similarity > self.second && elsewhere(self.index) {
+            self.second = similarity;
+        }
+    }
+}
+
+/// `a·b` of descriptors whose length is a multiple of 8, in eight sums.
+fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let (a, b) = (a.as_chunks::<8>().0, b.as_chunks::<8>().0);
+    // Vectors of glam and plain loops are fast in debug builds too, where these are most of what placing cameras takes.
+    let mut sums = [Vec4::ZERO; 2];
+    for i in 0..a.len() {
+        let ([a0, a1, a2, a3, a4, a5, a6, a7], [b0, b1, b2, b3, b4, b5, b6, b7]) = (a[i], b[i]);
+        sums[0] += Vec4::new(a0, a1, a2, a3) * Vec4::new(b0, b1, b2, b3);
+        sums[1] += Vec4::new(a4, a5, a6, a7) * Vec4::new(b4, b5, b6, b7);
+    }
+    sums.map(|s| s.to_array()).as_flattened().iter().sum()
+}
+
+/// For each keypoint of `a` the nearest of `b`, and the other way round. Similarities are computed once, for some rows of `a` at a time.
+fn nearest(a: &Keypoints, b: &Keypoints) -> (Vec<Nearest>, Vec<Nearest>) {
+    // With 8,000 keypoints in `b` the similarities of this many take 8 MB.
+    const ROWS: usize = 256;
+    // Enough for every core, and few enough of them stay in its first cache.
+    const COLUMNS: usize = 512;
+    let (dim, columns) = (a.dim, b.points.len());
+    let (mut forward, mut backward) = (vec![Nearest::NONE; a.points.len()], vec![Nearest::NONE; columns]);
+    let mut similarities = vec![0f32; ROWS.min(a.points.len()) * columns];
+    for (block, (found, rows)) in forward.chunks_mut(ROWS).zip(a.descriptors.chunks(ROWS * dim)).enumerate() {
+        let similarities = &mut similarities[..found.len() * columns];
+        let outputs = similarities.par_chunks_mut(columns).zip(found);
+        outputs.zip(rows.par_chunks(dim)).for_each(|((similarities, found), row)| {
+            for k in 0..columns {
+                similarities[k] = dot(row, &b.descriptors[k * dim..(k + 1) * dim]);
+                found.consider(k, similarities[k], &b.points);
+            }
+        });
+        backward.par_chunks_mut(COLUMNS).enumerate().for_each(|(part, found)| {
+            for (row, similarities) in similarities.chunks_exact(columns).enumerate() {
+                let similarities = &similarities[part * COLUMNS..];
+                for k in 0..found.len() {
+                    found[k].consider(block * ROWS + row, similarities[k], &a.points);
                 }
             }
-            (index, best, second)
-        })
-        .collect()
+        });
+    }
+    (forward, backward)
 }
 
 /// Mutual nearest neighbours whose distance is below `ratio` of the distance to the second-best elsewhere, best first.
@@ -69,18 +108,18 @@ pub(crate) fn mutual_matches(a: &Keypoints, b: &Keypoints, ratio: f32) -> Vec<Ma
     if a.dim != b.dim || !a.dim.is_multiple_of(8) || a.points.is_empty() || b.points.is_empty() {
         return Vec::new();
     }
-    let (forward, backward) = (nearest(a, b), nearest(b, a));
+    let (forward, backward) = nearest(a, b);
     let mut out: Vec<Match> = forward
         .iter()
         .enumerate()
-        .filter(|(i, m)| backward[m.0].0 == *i)
+        .filter(|(i, m)| backward[m.index].index == *i)
         .filter_map(|(i, m)| {
             // |a − b|² = 2 − 2 a·b for unit vectors.
             let distance = |s: f32| (2.0 - 2.0 * s.min(1.0)).max(0.0).sqrt();
-            let (d1, d2) = (distance(m.1), distance(m.2.max(backward[m.0].2).max(-1.0)));
+            let (d1, d2) = (distance(m.best), distance(m.second.max(backward[m.index].second).max(-1.0)));
             (d1 < ratio * d2).then(|| Match {
                 first: i,
-                second: m.0,
+                second: m.index,
                 quality: 1.0 - (d1 / d2.max(1e-6)) as f64,
             })
         })
@@ -176,6 +215,55 @@ fn dilated(p: &Plane<bool>, radius: usize) -> Plane<bool> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::math::Random;
+
+    /// Unit descriptors at random places, `n` of them and each third one twice at the same place.
+    fn random_keypoints(n: usize, seed: u64) -> Keypoints {
+        let (mut random, dim) = (Random::new(seed), 16);
+        let mut made = Keypoints { dim, ..Keypoints::default() };
+        for k in 0..n {
+            let place = DVec2::new(random.uniform(), random.uniform()) * 500.0;
+            made.points.push(if k % 3 == 2 { made.points[k - 1] } else { place });
+            let row: Vec<f32> = (0..dim).map(|_| random.uniform() as f32 - 0.5).collect();
+            let length = row.iter().map(|v| v * v).sum::<f32>().sqrt();
+            made.descriptors.extend(row.iter().map(|v| v / length));
+        }
+        made
+    }
+
+    #[test]
+    fn the_nearest_are_those_of_a_plain_search_both_ways() {
+        // More rows than are compared at a time, more columns than one part of them has.
+        let (a, b) = (random_keypoints(600, 1), random_keypoints(1100, 2));
+        let plain = |from: &Keypoints, to: &Keypoints| -> Vec<(usize, f32)> {
+            let rows = from.descriptors.chunks_exact(16);
+            rows.map(|row| {
+                let similarities: Vec<f32> =
+                    to.descriptors.chunks_exact(16).map(|o| row.iter().zip(o).map(|(x, y)| x * y).sum()).collect();
+                let best = (0..similarities.len()).max_by(|i, k| similarities[*i].total_cmp(&similarities[*k])).unwrap();
+                (best, similarities[best])
+            })
+            .collect()
+        };
+        let (forward, backward) = nearest(&a, &b);
+        for (found, wanted) in [(forward, plain(&a, &b)), (backward, plain(&b, &a))] {
+            assert_eq!(found.len(), wanted.len());
+            for (f, w) in found.iter().zip(&wanted) {
+                assert!(f.index == w.0 && (f.best - w.1).abs() < 1e-6, "{} {} {w:?}", f.index, f.best);
+                assert!(f.second <= f.best && f.second > 0.0);
+            }
+        }
+    }
+
+    #[test]
+    fn a_corner_that_is_listed_twice_does_not_spoil_its_own_ratio() {
+        let mut found = Nearest::NONE;
+        let points = [DVec2::ZERO, DVec2::new(50.0, 0.0), DVec2::new(50.5, 0.0)];
+        for (k, similarity) in [0.2, 0.9, 0.8].into_iter().enumerate() {
+            found.consider(k, similarity, &points);
+        }
+        assert_eq!((found.index, found.best, found.second), (1, 0.9, 0.2));
+    }
 
     #[test]
     fn a_white_frame_is_masked_and_a_bright_window_is_not() {
