@@ -31,7 +31,7 @@ fn photos(folder: &Path) -> Vec<PathBuf> {
             .unwrap();
         path
     };
-    (0..4).map(small).collect()
+    (0..3).map(small).collect()
 }
 
 /// The program with so many threads of its own and of lavapipe's.

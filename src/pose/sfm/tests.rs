@@ -5,10 +5,10 @@ use crate::progress::Silent;
 use crate::scene::{Camera, RgbImage};
 use glam::{DMat3, DVec3};
 
-/// Learned features when the model pack is installed.
+/// Features of XFeat, which is in the model pack.
 fn learned(photos: &[Photo]) -> Vec<Keypoints> {
-    let Ok(registry) = crate::infer::Registry::open(None) else { return Vec::new() };
-    let Ok(mut xfeat) = crate::infer::xfeat::XFeat::load(&registry) else { return Vec::new() };
+    let registry = crate::infer::Registry::open(None).unwrap();
+    let mut xfeat = crate::infer::xfeat::XFeat::load(&registry).unwrap();
     photos.iter().map(|p| Keypoints::from(xfeat.detect(&p.image, 4096).unwrap())).collect()
 }
 
