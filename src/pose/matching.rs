@@ -238,9 +238,14 @@ mod tests {
         let plain = |from: &Keypoints, to: &Keypoints| -> Vec<(usize, f32)> {
             let rows = from.descriptors.chunks_exact(16);
             rows.map(|row| {
-                let similarities: Vec<f32> =
-                    to.descriptors.chunks_exact(16).map(|o| row.iter().zip(o).map(|(x, y)| x * y).sum()).collect();
-                let best = (0..similarities.len()).max_by(|i, k| similarities[*i].total_cmp(&similarities[*k])).unwrap();
+                let similarities: Vec<f32> = to
+                    .descriptors
+                    .chunks_exact(16)
+                    .map(|o| row.iter().zip(o).map(|(x, y)| x * y).sum())
+                    .collect();
+                let best = (0..similarities.len())
+                    .max_by(|i, k| similarities[*i].total_cmp(&similarities[*k]))
+                    .unwrap();
                 (best, similarities[best])
             })
             .collect()

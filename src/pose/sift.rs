@@ -343,7 +343,8 @@ mod tests {
     fn a_blur_is_the_weighted_mean_of_what_is_around() {
         let (w, h, sigma) = (13, 7, 1.5);
         let mut random = crate::math::Random::new(3);
-        let plane = Plane { width: w, height: h, data: (0..w * h).map(|_| random.uniform() as f32).collect() };
+        let plane =
+            Plane { width: w, height: h, data: (0..w * h).map(|_| random.uniform() as f32).collect() };
         let blurred = blurred(&plane, sigma);
         for (x, y) in [(0, 0), (12, 3), (6, 6), (5, 2)] {
             let (mut sum, mut weights) = (0.0, 0.0);
