@@ -67,7 +67,7 @@ fn the_served_view_draws_selects_and_answers() {
     let scene = breakfast(folder.path());
     let Some(chromium) = browser::installed() else { return };
     let server = Server::start(&scene);
-    let mut page = Page::open(&chromium, 960, 720, false);
+    let mut page = Page::open(&chromium, 720, 540, false);
     page.go(&server.address);
     draws_what_the_engine_draws(&mut page, &scene);
     a_click_selects_the_object(&mut page);
