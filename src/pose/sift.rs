@@ -338,7 +338,6 @@ pub(crate) fn blurred(p: &Plane<f32>, sigma: f32) -> Plane<f32> {
 mod tests {
     use super::*;
 
-    /// A blob's keypoint must sit on the blob: this pins the half-pixel conventions of doubling and decimation.
     #[test]
     fn a_blur_is_the_weighted_mean_of_what_is_around() {
         let (w, h, sigma) = (13, 7, 1.5);
@@ -358,6 +357,7 @@ mod tests {
         }
     }
 
+    /// A blob's keypoint must sit on the blob: this pins the half-pixel conventions of doubling and decimation.
     #[test]
     fn blobs_are_found_where_they_are() {
         for sigma in [1.5f64, 3.0, 6.0, 12.0] {
