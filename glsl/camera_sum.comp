@@ -1,17 +1,21 @@
 #version 450
-// Sums of the parts of the camera gradient that project_backward.comp leaves, in a fixed order.
-#extension GL_GOOGLE_include_directive : require
-#include "shared/layout.glsl"
-layout(local_size_x = 16) in;
+// Sums of the parts of the camera gradient that project_backward.comp leaves, in a fixed order: a workgroup for each.
+layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer CameraParts { float camera_parts[]; };  // [CAMERA_GRADIENTS, parts]
 layout(std430, binding = 1) writeonly buffer CameraGrad { float camera_grad[]; };   // [CAMERA_GRADIENTS]
 layout(push_constant) uniform Push { uint parts; };
 
+shared float sums[64];
+
 void main() {
-    uint k = gl_LocalInvocationID.x;
-    if (k >= CAMERA_GRADIENTS) return;
+    uint thread = gl_LocalInvocationID.x, k = gl_WorkGroupID.x;
     float sum = 0.0;
-    for (uint part = 0; part < parts; part++) sum += camera_parts[k * parts + part];
-    camera_grad[k] = sum;
+    for (uint part = thread; part < parts; part += 64) sum += camera_parts[k * parts + part];
+    sums[thread] = sum;
+    for (uint half_way = 32; half_way > 0; half_way /= 2) {
+        barrier();
+        if (thread < half_way) sums[thread] += sums[thread + half_way];
+    }
+    if (thread == 0) camera_grad[k] = sums[0];
 }

@@ -18,17 +18,16 @@ layout(std430, binding = 8) writeonly buffer LogScalesGrad { float log_scales_gr
 layout(std430, binding = 9) writeonly buffer QuatsGrad { vec4 quats_grad[]; };
 layout(std430, binding = 10) writeonly buffer OpacityLogitsGrad { float opacity_logits_grad[]; };
 layout(std430, binding = 11) writeonly buffer ShGrad { float sh_grad[]; };
-layout(std430, binding = 12) writeonly buffer CameraParts { float camera_parts[]; };    // [CAMERA_GRADIENTS, PARTS]
+layout(std430, binding = 12) writeonly buffer CameraParts { float camera_parts[]; };    // [CAMERA_GRADIENTS, workgroups]
 layout(push_constant) uniform Push { uint count; uint sh_stride; };
-
-// Each thread walks every THREADS-th splat, so that few parts of the camera gradient are left to sum: room for 16
-// subgroups in each workgroup of 64, and zero where there are fewer.
-const uint THREADS = 4096, PARTS = THREADS / 64 * 16;
 
 #include "shared/camera.glsl"
 #include "shared/layout.glsl"
 #include "shared/sh.glsl"
 #include "shared/splat.glsl"
+
+// The camera gradient of each subgroup: at most 16, of 4 threads.
+shared float by_camera[CAMERA_GRADIENTS][16];
 
 // Through the conic: rows of ∂B = 2 G' B.
 void covariance_backward(Geometry g, vec3 by_conic, out vec3 by_b0, out vec3 by_b1) {
@@ -95,10 +94,12 @@ vec3 colour_backward(uint i, vec3 mean, vec3 by_colour) {
     return (by_direction - direction * dot(direction, by_direction)) / distance;
 }
 
+// Each thread walks the splats in steps of all threads, so that few parts of the camera gradient are left to sum.
 void main() {
+    uint threads = gl_NumWorkGroups.x * gl_WorkGroupSize.x;
     vec3 by_rho = vec3(0.0), by_theta = vec3(0.0);
     vec4 by_intrinsics = vec4(0.0);
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += THREADS) {
+    for (uint i = gl_GlobalInvocationID.x; i < count; i += threads) {
         vec3 mean = vec3(means[3 * i], means[3 * i + 1], means[3 * i + 2]);
         vec3 log_scale = vec3(log_scales[3 * i], log_scales[3 * i + 1], log_scales[3 * i + 2]);
         Geometry g = geometry_of(mean, log_scale, quats[i]);
@@ -140,9 +141,14 @@ void main() {
     }
     float sums[CAMERA_GRADIENTS] = float[](by_rho.x, by_rho.y, by_rho.z, by_theta.x, by_theta.y, by_theta.z,
                                by_intrinsics.x, by_intrinsics.y, by_intrinsics.z, by_intrinsics.w);
-    uint part = gl_WorkGroupID.x * 16 + gl_SubgroupID; // at most 16 subgroups of 4
     [[unroll]] for (int k = 0; k < CAMERA_GRADIENTS; k++) {
         float sum = subgroupAdd(sums[k]);
-        if (gl_SubgroupInvocationID == 0) camera_parts[k * PARTS + part] = sum;
+        if (gl_SubgroupInvocationID == 0) by_camera[k][gl_SubgroupID] = sum;
     }
+    barrier();
+    uint k = gl_LocalInvocationID.x;
+    if (k >= CAMERA_GRADIENTS) return;
+    float sum = 0.0;
+    for (uint subgroup = 0; subgroup < gl_NumSubgroups; subgroup++) sum += by_camera[k][subgroup];
+    camera_parts[k * gl_NumWorkGroups.x + gl_WorkGroupID.x] = sum;
 }

@@ -1,5 +1,5 @@
 #version 460
-// SSIM, pass 2 of 3: horizontal blur, SSIM and its derivatives by (E[x], E[x²], E[xy]), and at once the horizontal
+// SSIM, pass 2 of 3, for CPU devices (ssim_rows_shared.comp is for GPUs): horizontal blur, SSIM and its derivatives by (E[x], E[x²], E[xy]), and at once the horizontal
 // blur of those derivatives, which stays in the same registers. A strip needs halo 10: 5 for each blur.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 8, local_size_y = 8) in;
@@ -45,14 +45,10 @@ void main() {
         }
         // The window around this column is whole from i = 10 on; columns outside the image have no SSIM.
         int centre = x0 + i - 15;
-        float product = m.x * m.y, squares = m.x * m.x + m.y * m.y;
-        float a1 = 2.0 * product + C1, a2 = 2.0 * (n.y - product) + C2, b1 = squares + C1, b2 = (n.x - squares) + C2;
-        float inverse = 1.0 / (b1 * b2);
-        float s = a1 * a2 * inverse;
-        vec3 d = vec3(2.0 * m.y * (a2 - a1) * inverse - 2.0 * m.x * s / b1 + 2.0 * m.x * s / b2, -s / b2, 2.0 * a1 * inverse);
+        vec4 d = ssim_of(m, n);
         bool real = both(centre >= 0, centre < width);
-        slope[TAPS - 1] = select(real, d, vec3(0.0));
-        sum += select(both(real, both(i >= 15, i < STRIP + 15)), s, 0.0);
+        slope[TAPS - 1] = select(real, d.xyz, vec3(0.0));
+        sum += select(both(real, both(i >= 15, i < STRIP + 15)), d.w, 0.0);
         // The derivatives of the windows around this column are there from i = 20 on.
         int out_x = x0 + i - 20;
         if (i >= 20 && out_x < width) {

@@ -62,6 +62,22 @@ pub struct Section {
     pub rows: Vec<PassRow>,
     /// Counts and derived figures.
     pub figures: Vec<Figure>,
+    /// What the passes are made of, for those who make them faster; not in the plain table.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub commands: Vec<CommandRow>,
+}
+
+/// The commands of one name in a pass: a shader, a copy or a fill.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct CommandRow {
+    /// The pass that they belong to.
+    pub pass: String,
+    /// Shader, or what is filled or copied.
+    pub name: String,
+    /// How many.
+    pub count: usize,
+    /// Milliseconds of all of them, by timestamps on the device.
+    pub ms: Quartiles,
 }
 
 /// One timed thing.
@@ -175,6 +191,19 @@ impl BenchReport {
     }
 }
 
+/// The times of timed commands added up by the key of each, in the order of first commands: key, and milliseconds per run.
+fn sums_by<K: Copy + PartialEq>(keys: &[K], runs: &[Vec<(String, f64)>]) -> Vec<(K, Vec<f64>)> {
+    let mut sums: Vec<(K, Vec<f64>)> = Vec::new();
+    for (at, &key) in keys.iter().enumerate() {
+        let times = runs.iter().map(|run| run[at].1);
+        match sums.iter_mut().find(|s| s.0 == key) {
+            Some((_, sum)) => sum.iter_mut().zip(times).for_each(|(s, t)| *s += t),
+            None => sums.push((key, times.collect())),
+        }
+    }
+    sums
+}
+
 impl Section {
     /// An empty section.
     pub fn new(name: impl Into<String>, workload: impl Into<String>) -> Section {
@@ -203,19 +232,27 @@ impl Section {
         }
     }
 
-    /// Runs what `record` records again and again and adds a row per pass; the milliseconds of each run.
+    /// Runs what `record` records again and again and adds a row per pass; the milliseconds of each run, all passes.
     pub(super) fn passes(
         &mut self,
         device: &Device,
         record: &dyn Fn() -> Recorder,
         budget: &Budget,
-    ) -> Result<Vec<Vec<(&'static str, f64)>>> {
+    ) -> Result<Vec<f64>> {
         let program = record().compile()?;
-        let runs = budget.repeat(|| program.run_passes())?;
+        let timed = budget.repeat(|| program.run_timed())?;
+        let passes: Vec<&str> = program.passes().collect();
+        let names: Vec<&str> = timed.first().into_iter().flatten().map(|c| c.0.as_str()).collect();
+        let commands: Vec<(&str, &str)> = passes.iter().copied().zip(names).collect();
+        for ((pass, name), times) in sums_by(&commands, &timed) {
+            let count = commands.iter().filter(|c| **c == (pass, name)).count();
+            let (pass, name, ms) = (pass.to_owned(), name.to_owned(), Quartiles::of(&times));
+            self.commands.push(CommandRow { pass, name, count, ms });
+        }
         let first = self.rows.len();
-        for (at, (name, _)) in runs.first().into_iter().flatten().enumerate() {
-            let times: Vec<f64> = runs.iter().map(|r| r[at].1).collect();
-            self.time(*name, Clock::Device, Quartiles::of(&times));
+        let sums = sums_by(&passes, &timed);
+        for (name, times) in &sums {
+            self.time(*name, Clock::Device, Quartiles::of(times));
         }
         // Where the host is the device, the processor time of a pass tells what it takes when nothing else runs.
         if device.info().is_cpu {
@@ -235,7 +272,7 @@ impl Section {
                 row.ms.processor = Quartiles::of(&runs.iter().map(of_row).collect::<Vec<_>>()).median;
             }
         }
-        Ok(runs)
+        Ok((0..timed.len()).map(|run| sums.iter().map(|(_, times)| times[run]).sum()).collect())
     }
 
     /// Fills in bytes, operations and floors of the passes, and of the rows that are made of them.

@@ -102,8 +102,7 @@ fn measure(
     let (budget, roofline) = limits;
     // Also grows the tile lists to what the scene needs, before anything is recorded.
     run.step(ITERATION)?;
-    let runs = section.passes(device, &|| run.record(0), budget)?;
-    let sums: Vec<f64> = runs.iter().map(|r| r.iter().map(|p| p.1).sum()).collect();
+    let sums = section.passes(device, &|| run.record(0), budget)?;
     let processor = section.rows.iter().map(|r| r.ms.processor).sum();
     section.time(SUM, Clock::Device, Quartiles { processor, ..Quartiles::of(&sums) });
     let before = device.memory().allocations;

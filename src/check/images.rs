@@ -11,7 +11,7 @@ use crate::pass::decode::{Codes, decode_pixels};
 use crate::pass::pack::{self, Encoding, FrameChannel};
 use crate::pass::plane_sweep::{GpuMatcher, Matcher, ReferenceView, SourceView};
 use crate::pass::plane_sweep_cpu::CpuMatcher;
-use crate::pass::ssim_l1::{self, SsimL1};
+use crate::pass::ssim_l1::{self, Rows, SsimL1};
 use glam::Vec4;
 
 const SIZE: (usize, usize) = (75, 53);
@@ -26,11 +26,11 @@ fn wide(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&v| v.into()).collect()
 }
 
-pub(super) fn ssim_l1(device: &Device) -> Found {
+pub(super) fn ssim_l1(device: &Device, rows: Rows) -> Found {
     let x = noise(3 * PIXELS, 21);
     let y: Vec<f32> = noise(3 * PIXELS, 22).iter().zip(&x).map(|(n, x)| 0.7 * x + 0.3 * n).collect();
     let bands = Bands::whole(SIZE.0, SIZE.1);
-    let pass = SsimL1::new(device, &bands)?;
+    let pass = SsimL1::with(device, &bands, rows)?;
     let (rendered, target) = (device.buffer_from("rendered", &x)?, device.buffer_from("target", &y)?);
     let gradient = device.buffer::<f32>("gradient", 3 * PIXELS)?;
     let sums = device.buffer::<f32>("loss", 2)?;

@@ -7,7 +7,8 @@ mod render;
 
 use crate::Result;
 use crate::gpu::{Device, Options, Way};
-use crate::pass::sort::Shape;
+use crate::pass::sort::{Shape, Tile};
+use crate::pass::ssim_l1::Rows;
 use crate::pass::{Grouping, Summation};
 use compared::Found;
 use std::collections::BTreeSet;
@@ -41,15 +42,18 @@ const fn case(pass: &'static str, way: Option<Way>, check: fn(&Device) -> Found)
 const CASES: &[Case] = &[
     case("buffers: upload, copy, fill, download", None, data::buffers),
     case("prefix sum", None, data::scan),
-    case("radix sort", Some(Way::ChunkSort), |d| data::sort(d, Shape::Chunks)),
-    case("radix sort", Some(Way::SweepSort), |d| data::sort(d, Shape::Sweep)),
+    case("radix sort", Some(Way::ChunkSort), |d| data::sort(d, &[Shape::Chunks])),
+    case("radix sort", Some(Way::SweepSort), |d| {
+        data::sort(d, &[Tile::Small, Tile::Large].map(Shape::Sweep))
+    }),
     case("gather", None, data::gather),
     case("Adam", None, data::adam),
     case("projection and rendering", Some(Way::CountedLists), |d| render::forward(d, Grouping::Counting)),
     case("projection and rendering", Some(Way::SortedLists), |d| render::forward(d, Grouping::Sorting)),
     case("gradients", Some(Way::StoredGradients), |d| render::backward(d, Summation::Entries)),
     case("depth and needle losses", None, render::regularisers),
-    case("SSIM and L1 loss", None, images::ssim_l1),
+    case("SSIM and L1 loss", Some(Way::SsimStrips), |d| images::ssim_l1(d, Rows::Strips)),
+    case("SSIM and L1 loss", Some(Way::SsimShared), |d| images::ssim_l1(d, Rows::Shared)),
     case("code loss", None, images::codes),
     case("decoding of codes", None, images::decode),
     case("packing of images", None, images::pack),

@@ -193,7 +193,7 @@ impl<T: Pod> Buffer<T> {
 
     /// Elements of a range.
     pub fn read_range(&self, range: Range<usize>) -> Result<Vec<T>> {
-        let bytes = self.byte_range(range)?;
+        let bytes = self.byte_range(range.clone())?;
         let (start, end) = (bytes.start as usize, bytes.end as usize);
         if start == end {
             return Ok(Vec::new());
@@ -206,9 +206,13 @@ impl<T: Pod> Buffer<T> {
         {
             return Ok(bytemuck::pod_collect_to_vec(&memory[start..end]));
         }
-        let mut out = Vec::with_capacity(end - start);
-        self.0.device.staged_read(self.raw(), bytes, &mut |piece| out.extend_from_slice(piece))?;
-        Ok(bytemuck::pod_collect_to_vec(&out))
+        let mut out = vec![T::zeroed(); range.len()];
+        let (rest, mut at): (&mut [u8], usize) = (bytemuck::cast_slice_mut(&mut out), 0);
+        self.0.device.staged_read(self.raw(), bytes, &mut |piece| {
+            rest[at..at + piece.len()].copy_from_slice(piece);
+            at += piece.len();
+        })?;
+        Ok(out)
     }
 
     /// Replaces the first elements.

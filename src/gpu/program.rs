@@ -124,17 +124,9 @@ impl Program {
         Ok(self.commands.iter().zip(ticks.chunks_exact(2)).map(|(c, t)| (c.label.clone(), ms(t))).collect())
     }
 
-    /// Submits and waits; milliseconds per pass (see [`super::Recorder::pass`]), in the order of their first commands.
-    pub fn run_passes(&self) -> Result<Vec<(&'static str, f64)>> {
-        let times = self.run_timed()?;
-        let mut passes: Vec<(&'static str, f64)> = Vec::new();
-        for (command, (_, ms)) in self.commands.iter().zip(times) {
-            match passes.iter_mut().find(|p| p.0 == command.pass) {
-                Some(pass) => pass.1 += ms,
-                None => passes.push((command.pass, ms)),
-            }
-        }
-        Ok(passes)
+    /// The pass of each command (see [`super::Recorder::pass`]), in order.
+    pub fn passes(&self) -> impl Iterator<Item = &'static str> {
+        self.commands.iter().map(|c| c.pass)
     }
 
     /// Number of commands and of barriers between them, for tests and reports.

@@ -29,7 +29,7 @@ impl Recorder {
         }
     }
 
-    /// Names the pass that the commands from here on belong to: the rows of [`Program::run_passes`].
+    /// Names the pass that the commands from here on belong to: [`Program::passes`].
     pub fn pass(&mut self, name: &'static str) {
         self.pass = name;
     }

@@ -22,11 +22,15 @@ pub enum Way {
     CountedLists,
     /// Tile lists by a sort ([`crate::pass::Grouping::Sorting`]).
     SortedLists,
+    /// SSIM with a strip of a row per thread ([`crate::pass::ssim_l1::Rows::Strips`]).
+    SsimStrips,
+    /// SSIM with a span of a row per workgroup ([`crate::pass::ssim_l1::Rows::Shared`]).
+    SsimShared,
 }
 
 impl Way {
     /// All of them.
-    pub const ALL: [Way; 7] = [
+    pub const ALL: [Way; 9] = [
         Way::FloatAtomics,
         Way::AtomicGradients,
         Way::StoredGradients,
@@ -34,6 +38,8 @@ impl Way {
         Way::SweepSort,
         Way::CountedLists,
         Way::SortedLists,
+        Way::SsimStrips,
+        Way::SsimShared,
     ];
 
     /// As `splatvk doctor` prints it.
@@ -46,6 +52,8 @@ impl Way {
             Way::SweepSort => "sort in one sweep",
             Way::CountedLists => "tile lists by counters",
             Way::SortedLists => "tile lists by sorting",
+            Way::SsimStrips => "rows in strips",
+            Way::SsimShared => "rows in shared memory",
         }
     }
 
@@ -59,6 +67,8 @@ impl Way {
             Way::SweepSort => Way::ChunkSort,
             Way::CountedLists => Way::SortedLists,
             Way::SortedLists => Way::CountedLists,
+            Way::SsimStrips => Way::SsimShared,
+            Way::SsimShared => Way::SsimStrips,
         }
     }
 }
@@ -104,7 +114,8 @@ pub(super) fn write(
 mod tests {
     use super::*;
     use crate::gpu::{Device, Options, test_device};
-    use crate::pass::sort::Shape;
+    use crate::pass::sort::{Shape, Tile};
+    use crate::pass::ssim_l1::Rows;
     use crate::pass::{Grouping, Summation};
 
     #[test]
@@ -134,7 +145,9 @@ mod tests {
             .switch_off(folder.path(), &Way::ALL.into_iter().filter(|w| *w != Way::SweepSort).collect())
             .unwrap();
         let device = Device::with(&options).unwrap();
-        assert_eq!(Shape::of(&device), Shape::Sweep);
+        assert_eq!(Shape::of(&device, 1000), Shape::Sweep(Tile::Small));
+        assert_eq!(Shape::of(&device, 5_000_000), Shape::Sweep(Tile::Large));
+        assert_eq!(Rows::of(&device), Rows::of(&usual));
         assert!(!device.info().float_atomics);
         // Both ways are wrong: nothing else is known, `doctor --check` says so.
         assert_eq!(Summation::of(&device), Summation::of(&usual));

@@ -195,6 +195,12 @@ mod tests {
                         let step = |v: &[u8]| i32::from(u16::from_le_bytes([v[0], v[1]]));
                         assert!((step(a) - step(b)).abs() <= 1);
                     }
+                } else if source == FrameChannel::Depth && encoding != Encoding::Unorm8x4 {
+                    // Vulkan allows a quotient 2.5 units in the last place; an NVIDIA H200 makes use of it.
+                    for (a, b) in got.chunks(4).zip(expected.chunks(4)) {
+                        let unit = |v: &[u8]| i64::from(u32::from_le_bytes([v[0], v[1], v[2], v[3]]));
+                        assert!((unit(a) - unit(b)).abs() <= 3, "{encoding:?}");
+                    }
                 } else {
                     assert_eq!(got, expected, "{source:?} {encoding:?}");
                 }

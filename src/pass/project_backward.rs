@@ -5,7 +5,7 @@
 //! `∂J = ∂B Mᵀ Rᵀ`, `∂R_cov Rᵀ = Jᵀ ∂J`. From there means, log scales, raw quaternion (through its
 //! normalisation), opacity logit, SH coefficients, and the left pose twist ξ = (ρ, θ), T_cw ← exp(ξ) T_cw:
 //! `∂ρ = Σ ∂t + R g_sh`, `∂θ = Σ t × ∂t + vee(Jᵀ∂J)`.
-use super::frame::FrameBuffers;
+use super::frame::{CAMERA_GRADIENTS, FrameBuffers};
 use super::options::FeatureMode;
 use super::params::{Gradients, Params};
 use super::project::{Geometry, geometry, raw_colour};
@@ -13,10 +13,16 @@ use super::raster_backward::SplatGradient;
 use super::sh;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
-use crate::gpu::shaders::project_backward::{PARTS, THREADS};
 use crate::gpu::shaders::structs::CameraView;
-use crate::gpu::{Buffer, Recorder, shaders};
+use crate::gpu::{Buffer, Device, Recorder, shaders};
 use glam::{DMat3, DVec3, DVec4};
+
+/// Workgroups that share the splats, each of which leaves a part of the camera gradient: as many as fill a large GPU (a hundred
+/// thousand threads), or as a few cores begin quickly.
+pub(super) fn groups(device: &Device, splats: usize) -> u32 {
+    let most = if device.info().is_cpu { 64 } else { 2048 };
+    splats.div_ceil(shaders::project_backward::WORKGROUP[0] as usize).clamp(1, most) as u32
+}
 
 /// Records the gradients by all raw parameters (overwritten in `gradients`, zero where a splat was not seen) and by
 /// the camera (`camera_grad` [10]: ρ, θ, fx, fy, cx, cy).
@@ -49,12 +55,13 @@ pub fn record(
         },
         &shaders::project_backward::Push { count, sh_stride: splats.sh_len() as u32 },
     );
-    rec.dispatch_threads(call, [THREADS, 1, 1]);
+    let groups = groups(rec.device(), splats.count);
+    rec.dispatch(call, [groups, 1, 1]);
     let call = shaders::camera_sum::call(
         &shaders::camera_sum::Bindings { camera_parts: &frame.camera_parts, camera_grad },
-        &shaders::camera_sum::Push { parts: PARTS },
+        &shaders::camera_sum::Push { parts: groups },
     );
-    rec.dispatch(call, [1, 1, 1]);
+    rec.dispatch(call, [CAMERA_GRADIENTS as u32, 1, 1]);
 }
 
 /// Records the gradient by the stored features. Nothing without features.

@@ -43,7 +43,7 @@ use super::tile_lists::{self, Grouping, TILE, TileLists};
 use super::view::View;
 use super::{bin, project, project_backward, raster_backward, raster_forward};
 use crate::gpu::shaders::structs::CameraView;
-use crate::gpu::{Buffer, Device, Recorder, shaders};
+use crate::gpu::{Buffer, Device, Recorder};
 use crate::{Error, Result};
 use std::ops::Range;
 
@@ -136,7 +136,7 @@ impl Rasterizer {
             projected_grad: device.buffer::<f32>("projected_grad", GRADIENT_FLOATS * splats)?,
             camera_parts: device.buffer::<f32>(
                 "camera_parts",
-                CAMERA_GRADIENTS * shaders::project_backward::PARTS as usize,
+                CAMERA_GRADIENTS * project_backward::groups(device, splats) as usize,
             )?,
             summation: ways.summation,
             gradient_entries: GradientEntries::default(),

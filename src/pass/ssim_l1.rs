@@ -8,7 +8,7 @@ use super::bands::{Band, Bands};
 use super::sum;
 use crate::Result;
 use crate::gpu::shaders::shared::ssim::{self as shared, C1, C2};
-use crate::gpu::{Buffer, Device, Recorder, shaders};
+use crate::gpu::{Buffer, Device, Recorder, Way, shaders};
 use serde::{Deserialize, Serialize};
 
 /// Taps of the SSIM window.
@@ -120,9 +120,30 @@ const STRIP: usize = shared::STRIP as usize;
 /// Colour channels.
 const CHANNELS: usize = 3;
 
+/// How rows are blurred.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Rows {
+    /// A strip of a row per thread, in registers: CPU devices.
+    Strips,
+    /// A span of a row per workgroup, in shared memory: GPUs.
+    Shared,
+}
+
+impl Rows {
+    /// The faster one for a kind of device, unless it gives wrong results there.
+    pub fn of(device: &Device) -> Rows {
+        let info = device.info();
+        match info.way(if info.is_cpu { Way::SsimStrips } else { Way::SsimShared }) {
+            Way::SsimStrips => Rows::Strips,
+            _ => Rows::Shared,
+        }
+    }
+}
+
 /// The GPU pass for one image size: scratch memory, reused for every view of that size and all its bands.
 pub struct SsimL1 {
     bands: Bands,
+    rows: Rows,
     means: Buffer<f32>,
     moments: Buffer<f32>,
     slopes: Buffer<f32>,
@@ -133,13 +154,19 @@ pub struct SsimL1 {
 }
 
 impl SsimL1 {
-    /// Allocates for RGB images that are divided like this.
+    /// Allocates for RGB images that are divided like this, with the rows that suit the device.
     pub fn new(device: &Device, bands: &Bands) -> Result<Self> {
+        Self::with(device, bands, Rows::of(device))
+    }
+
+    /// [`SsimL1::new`] with given rows.
+    pub fn with(device: &Device, bands: &Bands, rows: Rows) -> Result<Self> {
         let (width, height) = (bands.width, bands.rows);
         let values = CHANNELS * width * height;
         let pairs = |name| device.buffer::<f32>(name, 2 * values);
         Ok(SsimL1 {
             bands: bands.clone(),
+            rows,
             means: pairs("ssim means")?,
             moments: pairs("ssim moments")?,
             slopes: pairs("ssim slopes")?,
@@ -174,17 +201,7 @@ impl SsimL1 {
             &shaders::ssim_columns::Push { width, height },
         );
         rec.dispatch(call, columns);
-        let call = shaders::ssim_rows::call(
-            &shaders::ssim_rows::Bindings {
-                means: &self.means,
-                moments: &self.moments,
-                slopes: &self.slopes,
-                cross: &self.cross,
-                sums: &self.ssim_sums,
-            },
-            &shaders::ssim_rows::Push { width, height, strips: strips(self.bands.width) as i32, first, end },
-        );
-        rec.dispatch_threads(call, [strips(self.bands.width), height as u32, CHANNELS as u32]);
+        self.record_rows(rec, first, end);
         let call = shaders::ssim_gradient::call(
             &shaders::ssim_gradient::Bindings {
                 rendered,
@@ -206,6 +223,32 @@ impl SsimL1 {
         rec.dispatch(call, columns);
         sum::record(rec, &self.l1_sums, &self.partials, loss.0, loss.1);
         sum::record(rec, &self.ssim_sums, &self.partials, loss.0, loss.1 + 1);
+    }
+
+    fn record_rows(&self, rec: &mut Recorder, first: i32, end: i32) {
+        let (width, height) = (self.bands.width as u32, self.bands.rows as u32);
+        let strips = width.div_ceil(STRIP as u32);
+        let (means, moments, slopes) = (&self.means, &self.moments, &self.slopes);
+        let (cross, sums) = (&self.cross, &self.ssim_sums);
+        let (w, h, n) = (width as i32, height as i32, strips as i32);
+        match self.rows {
+            Rows::Strips => {
+                use shaders::ssim_rows::{Bindings, Push, call};
+                let call = call(
+                    &Bindings { means, moments, slopes, cross, sums },
+                    &Push { width: w, height: h, strips: n, first, end },
+                );
+                rec.dispatch_threads(call, [strips, height, CHANNELS as u32]);
+            }
+            Rows::Shared => {
+                use shaders::ssim_rows_shared::{Bindings, Push, SPAN, call};
+                let call = call(
+                    &Bindings { means, moments, slopes, cross, sums },
+                    &Push { width: w, height: h, strips: n, first, end },
+                );
+                rec.dispatch(call, [width.div_ceil(SPAN as u32), height, CHANNELS as u32]);
+            }
+        }
     }
 
     /// The loss parts from the two sums that [`SsimL1::record`] leaves, added up over the bands.
@@ -271,14 +314,15 @@ mod tests {
     fn gpu_equals_the_twin_on_odd_sizes() {
         let device = crate::gpu::test_device();
         // Neither side is a multiple of a strip or workgroup; the second is smaller than one strip and window.
-        for (w, h) in [(75, 53), (13, 7), (130, 33)] {
+        let sizes = [(75, 53), (13, 7), (130, 33)];
+        for ((w, h), rows) in sizes.into_iter().flat_map(|s| [(s, Rows::Strips), (s, Rows::Shared)]) {
             let x: Vec<f32> = (0..3 * w * h).map(|i| noise(i) as f32).collect();
             let y: Vec<f32> =
                 (0..3 * w * h).map(|i| (0.7 * noise(i) + 0.3 * noise(i + 7777)) as f32).collect();
             let wide = |v: &[f32]| v.iter().map(|&a| f64::from(a)).collect::<Vec<_>>();
             let (expected, gradient) = ssim_l1(&wide(&x), &wide(&y), w, h, 0.8, 0.2);
             let bands = Bands::whole(w, h);
-            let pass = SsimL1::new(&device, &bands).unwrap();
+            let pass = SsimL1::with(&device, &bands, rows).unwrap();
             let rendered = device.buffer_from("x", &x).unwrap();
             let target = device.buffer_from("y", &y).unwrap();
             let out = device.buffer::<f32>("gradient", 3 * w * h).unwrap();
@@ -289,11 +333,14 @@ mod tests {
             let sums = sums.read().unwrap();
             let loss = pass.loss([sums[1], sums[2]].map(f64::from));
             // f32 sums of about 10⁴ values of order one: 1e-5.
-            assert!((loss.l1 - expected.l1).abs() < 1e-5 && (loss.ssim - expected.ssim).abs() < 1e-5);
+            assert!(
+                (loss.l1 - expected.l1).abs() < 1e-5 && (loss.ssim - expected.ssim).abs() < 1e-5,
+                "{rows:?}"
+            );
             let scale = gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
             for (g, e) in out.read().unwrap().into_iter().zip(gradient) {
                 // E[x²]−E[x]² cancels about three digits in f32, amplified by 1/C2 in flat regions.
-                assert!((f64::from(g) - e).abs() < 1e-3 * scale, "{w}x{h}: {g} {e}");
+                assert!((f64::from(g) - e).abs() < 1e-3 * scale, "{w}x{h} {rows:?}: {g} {e}");
             }
         }
     }

@@ -104,10 +104,10 @@ pub fn many_features(device: &Device) {
     there_and_back(device, &scene, by_atomics(device));
 }
 
-/// All widths of a launch that [`many_features`] leaves out, summed entry by entry.
+/// All widths of a launch that [`many_features`] leaves out, and all degrees, summed entry by entry.
 pub fn gradients_by_entry(device: &Device) {
     let ways = DeviceChoices { summation: Summation::Entries, ..DeviceChoices::of(device) };
-    for (n, sh_degree, dim) in [(40, 2, 0), (20, 0, 3), (20, 0, 8), (15, 0, 16), (12, 0, 37)] {
+    for (n, sh_degree, dim) in [(40, 2, 0), (20, 1, 3), (20, 3, 8), (15, 0, 16), (12, 0, 37)] {
         let scene = scene(n, sh_degree, dim, 1043 + dim as u64);
         there_and_back(device, &scene, ways);
     }

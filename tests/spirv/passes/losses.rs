@@ -1,11 +1,12 @@
 //! Losses, regularisers and the optimiser.
 use splatvk::gpu::{Device, Recorder};
+use splatvk::pass::Rasterizer;
 use splatvk::pass::adam::{self as optimiser, Class, Moments, Schedule};
 use splatvk::pass::bands::Bands;
 use splatvk::pass::codes::{self as language, Mode, Targets};
 use splatvk::pass::regularise::{depth_l1, ratio_penalty, record_depth, record_ratio};
 use splatvk::pass::seeded::Random;
-use splatvk::pass::{Rasterizer, ssim_l1 as image_loss};
+use splatvk::pass::ssim_l1::{self as image_loss, Rows};
 
 fn normal(n: usize, seed: u64) -> Vec<f32> {
     let mut random = Random::new(seed);
@@ -163,12 +164,13 @@ pub fn codes(device: &Device) {
 }
 
 pub fn ssim_l1(device: &Device) {
-    for (w, h) in [(13, 7), (70, 18)] {
+    let sizes = [(13, 7), (70, 18)];
+    for ((w, h), rows) in sizes.into_iter().flat_map(|s| [(s, Rows::Strips), (s, Rows::Shared)]) {
         let (x, noise) = (uniform(3 * w * h, 0.0, 1073), uniform(3 * w * h, 0.0, 1074));
         let y: Vec<f32> = x.iter().zip(&noise).map(|(x, n)| 0.7 * x + 0.3 * n).collect();
         let (expected, gradient) = image_loss::ssim_l1(&wide(&x), &wide(&y), w, h, 0.8, 0.2);
         let bands = Bands::whole(w, h);
-        let pass = image_loss::SsimL1::new(device, &bands).unwrap();
+        let pass = image_loss::SsimL1::with(device, &bands, rows).unwrap();
         let rendered = device.buffer_from("x", &x).unwrap();
         let target = device.buffer_from("y", &y).unwrap();
         let out = device.buffer::<f32>("gradient", 3 * w * h).unwrap();
