@@ -1,9 +1,9 @@
 //! Things in space: the selected splats as connected groups (docs/method.md#instances).
 use crate::scene::code_mix::MIN_LENGTH;
 use crate::scene::{Camera, LanguageField, LevelField, Plane, Splats};
+use ahash::{HashMap, HashMapExt}; // quicker than the standard library's: a query looks up cells some million times
 use glam::{DMat3, DQuat, DVec2, DVec3, IVec3};
 use rayon::prelude::*;
-use std::collections::HashMap;
 
 /// Side of a cell, in median radii of the selected splats: cells that touch are one thing. On the data of [`LEAST_SHARE`] 3 to 8 tell the
 /// same things apart; with 2 more pieces are loose.
@@ -112,8 +112,8 @@ impl Places {
             .collect();
         groups.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         let least = groups.first().map_or(0.0, |g| LEAST_SHARE * g.0);
-        let solid = groups.into_iter().take_while(|g| g.0 >= least && g.0 > 0.0);
-        solid.map(|(own, splats)| self.instance(splats, own / all, level)).collect()
+        let solid: Vec<_> = groups.into_iter().take_while(|g| g.0 >= least && g.0 > 0.0).collect();
+        solid.into_par_iter().map(|(own, splats)| self.instance(splats, own / all, level)).collect()
     }
 
     /// Splats whose cells are linked by cells that touch.
@@ -133,7 +133,8 @@ impl Places {
         }
         let mut union = Union::new(cells.len());
         for (at, &a) in &cells {
-            for step in 0..27 {
+            // The neighbours on one side: those on the other have this one among theirs.
+            for step in 14..27 {
                 let near = *at + IVec3::new(step % 3, step / 3 % 3, step / 9) - IVec3::ONE;
                 if let Some(&b) = cells.get(&near) {
                     union.join(a, b);
@@ -165,11 +166,12 @@ impl Places {
             let v = eigen.eigenvectors.column(k);
             DVec3::new(v[0], v[1], v[2])
         });
-        let along = axes.map(|axis| self.extent(&splats, axis));
+        let directions = [axes[0], axes[1], axes[2], DVec3::X, DVec3::Y, DVec3::Z];
+        let extents: Vec<[f64; 2]> = directions.par_iter().map(|axis| self.extent(&splats, *axis)).collect();
+        let (along, straight) = extents.split_at(3);
         let centre = (0..3).map(|k| axes[k] * 0.5 * (along[k][0] + along[k][1])).sum();
-        let size = DVec3::from_array(along.map(|[low, high]| high - low));
-        let straight = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| self.extent(&splats, axis));
-        let corner = |side: usize| DVec3::from_array(straight.map(|e| e[side]));
+        let size = DVec3::from_array([0, 1, 2].map(|k| along[k][1] - along[k][0]));
+        let corner = |side: usize| DVec3::from_array([0, 1, 2].map(|k| straight[k][side]));
         let oriented = OrientedBox { centre, axes, size };
         let reliability = self.reliability(&splats, level);
         Instance {
