@@ -1,10 +1,8 @@
 #version 450
-// variants: TILE=2048,8192
 // subgroups: 4,8,16,32,64
 // One-sweep radix sort, step 3 of 3, once per digit: ranks a tile of pairs, learns from the tiles before it where its
 // digits begin, and writes the pairs in order, so that neighbours write neighbours. Every pair is read once and written
 // once. Tiles are numbered in the order in which workgroups start: a tile waits only for tiles that are running or done.
-#extension GL_EXT_control_flow_attributes : require
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_ballot : require
 #extension GL_KHR_shader_subgroup_shuffle : require
@@ -19,15 +17,8 @@ layout(push_constant) uniform Push { uint pass; uint mask; uint stride; };
 
 const uint SUBGROUPS = 8;
 const uint THREADS = SUBGROUPS * SUBGROUP_SIZE;
+const uint TILE = 2048;
 const uint EACH = TILE / THREADS;
-// Pairs put in order at once: what the shared memory of small GPUs holds. A larger tile goes in rounds.
-const uint STAGE = 2048;
-// A GPU keeps arrays in registers only where loops over them are written out.
-#if SUBGROUP_SIZE >= 32
-#define UNROLL [[unroll]]
-#else
-#define UNROLL
-#endif
 // What a tile tells of a digit: its own count, or the count of all tiles up to and with it; 0 = nothing yet.
 const uint OWN = 1u << 30, UP_TO_HERE = 2u << 30, VALUE = OWN - 1u;
 
@@ -36,15 +27,14 @@ shared uint counters[SUBGROUPS * 256]; // per subgroup: counts, then where its p
 shared uint totals[256];               // of the tile
 shared uint sums[2][256];
 shared uint offsets[256];              // place in `sorted` less place in the tile
-shared uvec2 staged[STAGE];
+shared uvec2 staged[TILE];
 
 void main() {
     uint thread = gl_LocalInvocationID.x;
     uint lane = gl_SubgroupInvocationID;
     uint subgroup = gl_SubgroupID; // a device may deal threads to subgroups in any order
-    uint told_at = pass * stride; // of this pass
-    if (thread == 0u) begun = atomicAdd(tiles[told_at], 1u);
-    told_at += 1u;
+    uint told_at = pass * stride + 1u; // what the tiles of this pass tell
+    if (thread == 0u) begun = atomicAdd(tiles[told_at - 1u], 1u);
     for (uint i = thread; i < SUBGROUPS * 256u; i += THREADS) counters[i] = 0u;
     barrier();
     uint tile = begun;
@@ -57,7 +47,7 @@ void main() {
     // A shift by 32 is undefined: whole words stand by themselves.
     uvec2 all = uvec2(SUBGROUP_SIZE < 32 ? (1u << (SUBGROUP_SIZE % 32)) - 1u : ~0u, SUBGROUP_SIZE < 64 ? 0u : ~0u);
     uvec2 before = lane < 32u ? uvec2((1u << lane) - 1u, 0u) : uvec2(~0u, (1u << (lane - 32u)) - 1u);
-    UNROLL for (uint i = 0u; i < EACH; i++) {
+    for (uint i = 0u; i < EACH; i++) {
         uint index = first + (subgroup * EACH + i) * SUBGROUP_SIZE + lane;
         own[i] = index < count ? pairs[index] : uvec2(~0u);
         uint digit = index < count ? ((own[i].x & mask) >> (8u * pass)) & 255u : 255u;
@@ -119,25 +109,16 @@ void main() {
     }
     barrier();
 
-    UNROLL for (uint i = 0u; i < EACH; i++) {
+    for (uint i = 0u; i < EACH; i++) {
         uint index = first + (subgroup * EACH + i) * SUBGROUP_SIZE + lane;
         uint digit = index < count ? ((own[i].x & mask) >> (8u * pass)) & 255u : 255u;
-        ranks[i] += counters[subgroup * 256u + digit];
+        staged[counters[subgroup * 256u + digit] + ranks[i]] = own[i];
     }
-    for (uint from = 0u; from < TILE; from += STAGE) {
-        UNROLL for (uint i = 0u; i < EACH; i++) {
-            uint place = ranks[i] - from;
-            if (place < STAGE) staged[place] = own[i];
+    barrier();
+    for (uint place = thread; place < TILE; place += THREADS) {
+        if (first + place < count) {
+            uvec2 pair = staged[place];
+            sorted[offsets[((pair.x & mask) >> (8u * pass)) & 255u] + place] = pair;
         }
-        barrier();
-        for (uint place = thread; place < STAGE; place += THREADS) {
-            if (first + from + place < count) {
-                uvec2 pair = staged[place];
-                sorted[offsets[((pair.x & mask) >> (8u * pass)) & 255u] + from + place] = pair;
-            }
-        }
-#if TILE > 2048 // STAGE
-        barrier();
-#endif
     }
 }

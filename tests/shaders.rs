@@ -161,7 +161,7 @@ fn constants_of_shaders_stand_in_one_place() {
 #[test]
 fn constants_are_what_the_sources_say() {
     use shaders::shared::{cutoffs, layout, plane_sweep, ssim};
-    assert_eq!((layout::TILE, shaders::sort_sweep::STAGE, shaders::decode::PIXELS), (8, 2048, 4));
+    assert_eq!((layout::TILE, shaders::sort_sweep::TILE, shaders::decode::PIXELS), (8, 2048, 4));
     // A workgroup's part of a row is whole strips, each of which has a sum.
     assert_eq!(shaders::ssim_rows_shared::SPAN % ssim::STRIP, 0);
     assert_eq!((layout::BASE_CHANNELS, layout::PROJECTED_FLOATS, layout::CAMERA_GRADIENTS), (4, 12, 10));

@@ -7,7 +7,7 @@ mod render;
 
 use crate::Result;
 use crate::gpu::{Device, Options, Way};
-use crate::pass::sort::{Shape, Tile};
+use crate::pass::sort::Shape;
 use crate::pass::ssim_l1::Rows;
 use crate::pass::{Grouping, Summation};
 use compared::Found;
@@ -42,10 +42,8 @@ const fn case(pass: &'static str, way: Option<Way>, check: fn(&Device) -> Found)
 const CASES: &[Case] = &[
     case("buffers: upload, copy, fill, download", None, data::buffers),
     case("prefix sum", None, data::scan),
-    case("radix sort", Some(Way::ChunkSort), |d| data::sort(d, &[Shape::Chunks])),
-    case("radix sort", Some(Way::SweepSort), |d| {
-        data::sort(d, &[Tile::Small, Tile::Large].map(Shape::Sweep))
-    }),
+    case("radix sort", Some(Way::ChunkSort), |d| data::sort(d, Shape::Chunks)),
+    case("radix sort", Some(Way::SweepSort), |d| data::sort(d, Shape::Sweep)),
     case("gather", None, data::gather),
     case("Adam", None, data::adam),
     case("projection and rendering", Some(Way::CountedLists), |d| render::forward(d, Grouping::Counting)),

@@ -193,26 +193,32 @@ impl<T: Pod> Buffer<T> {
 
     /// Elements of a range.
     pub fn read_range(&self, range: Range<usize>) -> Result<Vec<T>> {
-        let bytes = self.byte_range(range.clone())?;
+        let mut out = Vec::with_capacity(range.len());
+        self.show(range, &mut |_, piece| out.extend_from_slice(piece))?;
+        Ok(out)
+    }
+
+    /// What [`Buffer::read_range`] copies, where the host reads it: piece by piece, each with its place in the range. `seen` must
+    /// not use the buffer.
+    pub fn show(&self, range: Range<usize>, seen: &mut dyn FnMut(usize, &[T])) -> Result<()> {
+        let bytes = self.byte_range(range)?;
         let (start, end) = (bytes.start as usize, bytes.end as usize);
         if start == end {
-            return Ok(Vec::new());
+            return Ok(());
         }
-        if let Some(memory) = lock(&self.0.block).as_ref().and_then(Block::bytes) {
-            return Ok(bytemuck::pod_collect_to_vec(&memory[start..end]));
+        let fetched = self.0.host.get().filter(|_| self.0.fetched.load(Ordering::Acquire));
+        for mapped in [Some(self.cast()), fetched.cloned()].into_iter().flatten() {
+            if let Some(memory) = lock(&mapped.0.block).as_ref().and_then(Block::bytes) {
+                seen(0, bytemuck::cast_slice(&memory[start..end]));
+                return Ok(());
+            }
         }
-        if let Some(copy) = self.0.host.get().filter(|_| self.0.fetched.load(Ordering::Acquire))
-            && let Some(memory) = lock(&copy.0.block).as_ref().and_then(Block::bytes)
-        {
-            return Ok(bytemuck::pod_collect_to_vec(&memory[start..end]));
-        }
-        let mut out = vec![T::zeroed(); range.len()];
-        let (rest, mut at): (&mut [u8], usize) = (bytemuck::cast_slice_mut(&mut out), 0);
+        let mut at = 0;
         self.0.device.staged_read(self.raw(), bytes, &mut |piece| {
-            rest[at..at + piece.len()].copy_from_slice(piece);
+            let piece: &[T] = bytemuck::cast_slice(piece);
+            seen(at, piece);
             at += piece.len();
-        })?;
-        Ok(out)
+        })
     }
 
     /// Replaces the first elements.

@@ -114,7 +114,7 @@ pub(super) fn write(
 mod tests {
     use super::*;
     use crate::gpu::{Device, Options, test_device};
-    use crate::pass::sort::{Shape, Tile};
+    use crate::pass::sort::Shape;
     use crate::pass::ssim_l1::Rows;
     use crate::pass::{Grouping, Summation};
 
@@ -145,8 +145,7 @@ mod tests {
             .switch_off(folder.path(), &Way::ALL.into_iter().filter(|w| *w != Way::SweepSort).collect())
             .unwrap();
         let device = Device::with(&options).unwrap();
-        assert_eq!(Shape::of(&device, 1000), Shape::Sweep(Tile::Small));
-        assert_eq!(Shape::of(&device, 5_000_000), Shape::Sweep(Tile::Large));
+        assert_eq!(Shape::of(&device), Shape::Sweep);
         assert_eq!(Rows::of(&device), Rows::of(&usual));
         assert!(!device.info().float_atomics);
         // Both ways are wrong: nothing else is known, `doctor --check` says so.

@@ -197,17 +197,24 @@ impl RenderedFrame {
     pub fn read_surface(&mut self, frame: &FrameBuffers, band: &Band) -> Result<()> {
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
         let stride = frame.bands.pixels();
-        let plane = |k: usize| frame.planes.read_range(k * stride + stored.start..k * stride + stored.end);
+        let plane = |k: usize| k * stride + stored.start..k * stride + stored.end;
         for channel in 0..3 {
-            let values = plane(channel)?;
-            self.rgb.data[inner.clone()].iter_mut().zip(values).for_each(|(out, v)| out[channel] = v);
+            let rgb = &mut self.rgb.data[inner.clone()];
+            frame.planes.show(plane(channel), &mut |at, values| {
+                rgb[at..].iter_mut().zip(values).for_each(|(out, v)| out[channel] = *v);
+            })?;
         }
-        let transmittance = frame.transmittance.read_range(stored.clone())?;
-        let outputs = self.alpha.data[inner.clone()].iter_mut().zip(&mut self.depth.data[inner.clone()]);
-        for ((alpha, depth), (t, z)) in outputs.zip(transmittance.into_iter().zip(plane(3)?)) {
-            *alpha = 1.0 - t;
-            *depth = if *alpha >= DEPTH_ALPHA_MIN { z / *alpha } else { 0.0 };
-        }
+        let alpha = &mut self.alpha.data[inner.clone()];
+        frame.transmittance.show(stored.clone(), &mut |at, values| {
+            alpha[at..].iter_mut().zip(values).for_each(|(alpha, t)| *alpha = 1.0 - t);
+        })?;
+        let depth = &mut self.depth.data[inner];
+        frame.planes.show(plane(3), &mut |at, values| {
+            let outputs = depth[at..].iter_mut().zip(&alpha[at..]);
+            for ((depth, alpha), z) in outputs.zip(values) {
+                *depth = if *alpha >= DEPTH_ALPHA_MIN { z / *alpha } else { 0.0 };
+            }
+        })?;
         Ok(())
     }
 
@@ -222,9 +229,11 @@ impl RenderedFrame {
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
         for (k, to) in into.enumerate() {
             let at = (BASE_CHANNELS + first + k) * frame.bands.pixels();
-            let values = frame.planes.read_range(at + stored.start..at + stored.end)?;
-            let pixels = self.features[inner.start * self.feature_dim..].chunks_exact_mut(self.feature_dim);
-            pixels.zip(values).for_each(|(out, v)| out[to] = v);
+            let (dim, features) = (self.feature_dim, &mut self.features[inner.start * self.feature_dim..]);
+            frame.planes.show(at + stored.start..at + stored.end, &mut |first, values| {
+                let pixels = features[first * dim..].chunks_exact_mut(dim);
+                pixels.zip(values).for_each(|(out, v)| out[to] = *v);
+            })?;
         }
         Ok(())
     }

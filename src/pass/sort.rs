@@ -15,32 +15,16 @@ pub enum Shape {
     /// A chunk of the pairs per lane: CPU devices.
     Chunks,
     /// Tiles in one sweep per digit: GPUs.
-    Sweep(Tile),
-}
-
-/// Pairs that a workgroup of [`Shape::Sweep`] puts in order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Tile {
-    /// 2048: few pairs make many workgroups.
-    Small = 2048,
-    /// 8192: pairs of one digit are four times as many neighbours when they are written.
-    Large = 8192,
-}
-
-impl Tile {
-    /// Large ones when the largest GPUs (a few hundred workgroups at once) have several each to do.
-    fn for_capacity(pairs: usize) -> Tile {
-        if pairs >= 1 << 21 { Tile::Large } else { Tile::Small }
-    }
+    Sweep,
 }
 
 impl Shape {
-    /// The faster one for a kind of device and up to so many pairs, unless it gives wrong results there.
-    pub fn of(device: &Device, capacity: usize) -> Shape {
+    /// The faster one for a kind of device, unless it gives wrong results there.
+    pub fn of(device: &Device) -> Shape {
         let info = device.info();
         match info.way(if info.is_cpu { Way::ChunkSort } else { Way::SweepSort }) {
             Way::ChunkSort => Shape::Chunks,
-            _ => Shape::Sweep(Tile::for_capacity(capacity)),
+            _ => Shape::Sweep,
         }
     }
 }
@@ -55,13 +39,15 @@ enum Work {
     /// [lanes, 256] digit counts.
     Chunks { histogram: Buffer<u32>, lanes: u32 },
     /// [4, 256] digit counts of the passes, and per pass what its tiles tell each other.
-    Sweep { tile: Tile, digits: Buffer<u32>, tiles: Buffer<u32> },
+    Sweep { digits: Buffer<u32>, tiles: Buffer<u32> },
 }
 
 /// Bits per pass: 256 counters for each of 8 lanes are 8 KiB of shared memory.
 const DIGIT_BITS: u32 = 8;
 /// Most passes: digits of a 32-bit key.
 const PASSES: usize = (u32::BITS / DIGIT_BITS) as usize;
+/// Pairs per tile in `glsl/sort_sweep.comp`.
+const TILE: usize = shaders::sort_sweep::TILE as usize;
 /// Pairs per thread in `glsl/sort_digits.comp`.
 const EACH: usize = shaders::sort_digits::EACH as usize;
 
@@ -75,7 +61,7 @@ struct Key {
 impl Sort {
     /// Allocates 8 bytes per pair and the counters, in the shape that suits the device.
     pub fn new(device: &Device, capacity: usize) -> Result<Sort> {
-        Self::with(device, capacity, Shape::of(device, capacity))
+        Self::with(device, capacity, Shape::of(device))
     }
 
     /// [`Sort::new`] in a given shape.
@@ -89,10 +75,9 @@ impl Sort {
                     lanes: lanes as u32,
                 }
             }
-            Shape::Sweep(tile) => Work::Sweep {
-                tile,
+            Shape::Sweep => Work::Sweep {
                 digits: device.buffer::<u32>("sort digits", PASSES * 256)?,
-                tiles: device.buffer::<u32>("sort tiles", PASSES * stride(capacity, tile))?,
+                tiles: device.buffer::<u32>("sort tiles", PASSES * (1 + 256 * capacity.div_ceil(TILE)))?,
             },
         };
         Ok(Sort { scratch: device.buffer::<u32>("sort scratch", 2 * capacity)?, work })
@@ -108,7 +93,7 @@ impl Sort {
         let bits = bits.min(32);
         let mask = if bits == 32 { u32::MAX } else { (1 << bits) - 1 };
         let key = Key { mask, passes: bits.div_ceil(DIGIT_BITS) };
-        if let Work::Sweep { digits, tiles, .. } = &self.work {
+        if let Work::Sweep { digits, tiles } = &self.work {
             rec.fill(tiles, 0);
             record_digits(rec, pairs, count, digits, key);
         }
@@ -118,8 +103,8 @@ impl Sort {
                 Work::Chunks { histogram, lanes } => {
                     record_chunks(rec, (from, to), count, (histogram, *lanes), (key, pass));
                 }
-                Work::Sweep { tile, digits, tiles } => {
-                    record_sweep(rec, (from, to), count, (*tile, digits, tiles), (key, pass));
+                Work::Sweep { digits, tiles } => {
+                    record_sweep(rec, (from, to), count, (digits, tiles), (key, pass));
                 }
             }
             (from, to) = (to, from);
@@ -184,23 +169,17 @@ fn record_sweep(
     rec: &mut Recorder,
     (from, to): (&Buffer<u32>, &Buffer<u32>),
     count: &Buffer<u32>,
-    (tile, digits, tiles): (Tile, &Buffer<u32>, &Buffer<u32>),
+    (digits, tiles): (&Buffer<u32>, &Buffer<u32>),
     (key, pass): (Key, u32),
 ) {
     let call = shaders::sort_sweep::call(
-        shaders::sort_sweep::Variant { tile: tile as u32 },
         &shaders::sort_sweep::Bindings { pairs: from, count, digits, tiles, sorted: to },
-        &shaders::sort_sweep::Push { pass, mask: key.mask, stride: tiles.len() as u32 / PASSES as u32 },
+        &shaders::sort_sweep::Push { pass, mask: key.mask, stride: (tiles.len() / PASSES) as u32 },
     );
     // Groups beyond the last tile find nothing to do; dimensions end at 65535.
-    let groups = capacity(from).div_ceil(tile as usize).max(1);
+    let groups = capacity(from).div_ceil(TILE).max(1);
     let row = groups.min(32768);
     rec.dispatch(call, [row as u32, groups.div_ceil(row) as u32, 1]);
-}
-
-/// Words in which the tiles of a pass tell each other what they have: how many have begun, and a word per digit of each.
-fn stride(capacity: usize, tile: Tile) -> usize {
-    1 + 256 * capacity.div_ceil(tile as usize)
 }
 
 /// Pairs in a buffer.
@@ -230,13 +209,12 @@ mod tests {
             .collect()
     }
 
-    /// In all shapes, which must agree.
+    /// In both shapes, which must agree.
     fn sorted_on_device(pairs: &[[u32; 2]], n: usize, bits: u32) -> Vec<[u32; 2]> {
         let device = test_device();
-        let [chunks, small, large] = [Shape::Chunks, Shape::Sweep(Tile::Small), Shape::Sweep(Tile::Large)]
-            .map(|shape| sorted_in(&device, pairs, n, bits, shape));
-        assert!(chunks[..n] == small[..n], "{n} pairs, {bits} bits: small tiles");
-        assert!(chunks[..n] == large[..n], "{n} pairs, {bits} bits: large tiles");
+        let [chunks, sweep] =
+            [Shape::Chunks, Shape::Sweep].map(|shape| sorted_in(&device, pairs, n, bits, shape));
+        assert!(chunks[..n] == sweep[..n], "{n} pairs, {bits} bits: the shapes disagree");
         chunks
     }
 

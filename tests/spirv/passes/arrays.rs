@@ -1,7 +1,7 @@
 //! Passes over plain arrays: scan, gather, sum, sort.
 use splatvk::gpu::{Device, Recorder, shaders};
 use splatvk::pass::seeded::Random;
-use splatvk::pass::sort::{Shape, Sort, Tile, sort_pairs};
+use splatvk::pass::sort::{Shape, Sort, sort_pairs};
 use splatvk::pass::{compact, scan, sum};
 
 fn words(n: usize, below: u64, seed: u64) -> Vec<u32> {
@@ -82,8 +82,7 @@ pub fn sort_chunks(device: &Device) {
 }
 
 pub fn sort_sweep(device: &Device) {
-    sort(device, Shape::Sweep(Tile::Small));
-    sort(device, Shape::Sweep(Tile::Large));
+    sort(device, Shape::Sweep);
 }
 
 /// The shaders of `splatvk bench`.
