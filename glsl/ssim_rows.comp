@@ -1,6 +1,7 @@
 #version 460
-// SSIM, pass 2 of 3, for CPU devices (ssim_rows_shared.comp is for GPUs): horizontal blur, SSIM and its derivatives by (E[x], E[x²], E[xy]), and at once the horizontal
-// blur of those derivatives, which stays in the same registers. A strip needs halo 10: 5 for each blur.
+// SSIM, pass 2 of 3, for CPU devices (for GPUs: ssim_rows_shared.comp): horizontal blur, SSIM and its derivatives by
+// (E[x], E[x²], E[xy]), and at once the horizontal blur of those derivatives, which stays in the same registers. A strip
+// needs halo 10: 5 for each blur.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(std430, binding = 0) readonly buffer Means { vec2 means[]; };  // [C, H, W]

@@ -106,6 +106,14 @@ fn large_transfers_go_in_pieces() {
     assert!(buffer.read().unwrap() == values);
     // Two full pieces on the way there; the rest of it goes with the first of three on the way back.
     assert_eq!(device.submissions(), 5);
+    let (first, mut shown) = (1 << 20, 0);
+    buffer
+        .show(first..count, &mut |at, piece| {
+            assert!(at == shown && *piece == values[first + at..][..piece.len()]);
+            shown += piece.len();
+        })
+        .unwrap();
+    assert_eq!(shown, count - first);
     let again = || {
         buffer.write(&values).unwrap();
         assert!(buffer.read().unwrap() == values);
