@@ -20,6 +20,12 @@ fn check_step(section: &Section, expected: &[&str]) {
     let names: Vec<&str> = passes.iter().map(|r| r.name.as_str()).collect();
     assert_eq!(names, expected);
     assert!(section.rows.iter().all(|r| is_ordered(&r.ms) && r.ms.runs == 3), "{section:?}");
+    // What a pass is made of takes together what the pass takes.
+    for pass in passes {
+        let own = section.commands.iter().filter(|c| c.pass == pass.name);
+        let best = own.map(|c| (c.count, c.ms.best)).fold((0, 0.0), |sum, c| (sum.0 + c.0, sum.1 + c.1));
+        assert!(best.0 > 0 && best.1 > 0.0 && best.1 <= pass.ms.best * (1.0 + 1e-9), "{pass:?}");
+    }
     let best: f64 = passes.iter().map(|r| r.ms.best).sum();
     // The best sum is one run's; each pass can only have been faster in another.
     assert!(sum.ms.best >= best - 1e-9, "{} < {best}", sum.ms.best);
