@@ -102,6 +102,7 @@ fn found(record: &Value) -> u64 {
 }
 
 #[test]
+#[ignore = "takes long: tools/test-long"]
 fn a_photo_joins_a_scene_that_stays_as_it_was() {
     let scene = Scene::new();
     let settings = ["--preset", "draft", "--iterations", "80", "--language-iterations", "4", "--json"];

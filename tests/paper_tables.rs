@@ -203,6 +203,7 @@ fn row<'r>(report: &'r Value, label: &str) -> &'r Value {
 
 /// True masks with the embeddings of their labels: whatever layout they lie in, they are found again.
 #[test]
+#[ignore = "takes long: tools/test-long"]
 fn true_segmentation_is_found_again_in_every_layout() {
     let scene = Scene::generate("1003");
     let root = tempfile::tempdir().unwrap();
@@ -241,6 +242,7 @@ fn true_segmentation_is_found_again_in_every_layout() {
 }
 
 #[test]
+#[ignore = "takes long: tools/test-long"]
 fn the_driver_runs_what_is_there_and_says_what_is_missing() {
     let root = tempfile::tempdir().unwrap();
     let (data, out) = (root.path().join("data"), root.path().join("out"));

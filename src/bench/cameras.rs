@@ -414,6 +414,7 @@ mod tests {
     use crate::progress::Silent;
 
     #[test]
+    #[ignore = "takes long: tools/test-long"]
     fn breakfast_is_measured_and_photos_without_parallax_are_counted_as_failures() {
         let registry = Registry::open(None).unwrap();
         let breakfast = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast");

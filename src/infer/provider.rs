@@ -118,7 +118,9 @@ pub(super) fn settings(
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let builder = ort::session::Session::builder(environment)?
         .with_optimization_level(GraphOptimizationLevel::Level3)?
-        .with_intra_threads(threads)?;
+        .with_intra_threads(threads)?
+        // Else threads that wait for the next operator keep all cores busy, which passes on the CPU and other sessions need.
+        .with_intra_op_spinning(false)?;
     let mut providers: Vec<_> = provider.iter().map(|p| p.registration()).collect();
     if large {
         // The arena doubles what it takes and keeps it until the session ends.

@@ -293,6 +293,7 @@ mod tests {
     }
 
     #[test]
+    #[ignore = "takes long: tools/test-long"]
     fn placed_photos_are_straight_and_in_one_light() {
         let truth = testing::train(&testing::folder());
         let registry = Registry::open(None).unwrap();

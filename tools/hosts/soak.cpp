@@ -355,12 +355,11 @@ static int run(int argc, char **argv) {
     if (failed) return 1;
     const long files_now = entries("/proc/self/fd"), left = objects();
     const Held first = held[ROUNDS / 3], last = held.back();
-    const double per_context = (last.given_out_kib - first.given_out_kib) / double(last.contexts - first.contexts);
+    const double per_context = (last.given_out_kib - first.given_out_kib) / double(std::max(1L, last.contexts - first.contexts));
     std::printf("from round %d to the last: %.1f KiB of malloc more per context (bound: %.0f), resident %.0f and %.0f MiB (bound: %.0f %% and %.0f MiB "
                 "more); open files %ld before, %ld after; %ld device objects left\n",
                 ROUNDS / 3 + 1, per_context, KIB_PER_CONTEXT, first.resident_mib, last.resident_mib, 100 * GROWTH, ROOM_MIB, files, files_now,
                 left);
-    // Not what one context keeps for the whole process: that is there after a third of the rounds.
     if (per_context > KIB_PER_CONTEXT || last.resident_mib > (1 + GROWTH) * first.resident_mib + ROOM_MIB) wrong("memory grows");
     if (files_now > files) wrong("open files grow");
     if (left) wrong("device objects are left");

@@ -221,6 +221,7 @@ mod tests {
     }
 
     #[test]
+    #[ignore = "takes long: tools/test-long"]
     fn few_features_are_restored_and_many_are_not() {
         let few = Autoencoder::train(&unit_rows(4, 32, 1000), 32, 2000, 0, &Silent).unwrap();
         assert!(few.cosine > 0.95, "{}", few.cosine);

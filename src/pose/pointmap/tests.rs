@@ -186,6 +186,7 @@ fn difference(a: &[Camera], b: &[Camera]) -> f64 {
 }
 
 #[test]
+#[ignore = "takes long: tools/test-long"]
 fn order_of_views_and_scale_of_a_pair_do_not_matter() {
     let (mut case, _) = case();
     // Three views keep the three solutions short.

@@ -231,6 +231,7 @@ fn cropped(photo: &Photo, zoom: f64) -> Photo {
 }
 
 #[test]
+#[ignore = "takes long: tools/test-long"]
 fn photos_that_only_look_like_one_camera_are_told_apart() {
     let truth = testing::train(&testing::folder());
     let focal = truth.cameras[0].fx;
