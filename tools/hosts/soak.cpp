@@ -21,7 +21,7 @@
 #endif
 
 static const int ROUNDS = 6;
-// From a third of the rounds to the last, per context: the driver and its loader keep 4 KiB of each (measured on lavapipe).
+// From a third of the rounds to the last, per context: 4 to 5 KiB stay (docs/trust.md#soak), a kept image or scene would be 75 KiB or more.
 static const double KIB_PER_CONTEXT = 32;
 // What is resident may be so much more then: less than two trainings that were kept.
 static const double GROWTH = 0.25;
