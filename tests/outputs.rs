@@ -207,12 +207,9 @@ fn a_scene_is_not_written_into_by_its_own_export() {
     assert_eq!(std::fs::read(scene().join("point_cloud.ply")).unwrap(), before);
 }
 
-/// Runs through a shell that limits the size of every written file, as a full disk does; the limit is in 512-byte blocks.
-fn limited(blocks: u32, args: &[OsString]) -> Output {
-    let mut c = Command::new("sh");
-    // Without the trap the kernel ends the process instead of failing the write.
-    c.arg("-c").arg(format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$0\" \"$@\""));
-    c.arg(env!("CARGO_BIN_EXE_splatvk")).args(args).output().unwrap()
+/// With files of at most so many blocks of 512 bytes.
+fn limited(blocks: u64, args: &[OsString]) -> Output {
+    fixture::command::limited(blocks, fixture::command::splatvk().args(args)).output().unwrap()
 }
 
 #[test]

@@ -1,6 +1,9 @@
 //! A run that is killed, or finds the disk full, goes on with `--resume`, and ends with the same bits as one that was left alone.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
+mod fixture;
+
+use fixture::command::{limited, memory_was_limited};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -137,12 +140,11 @@ fn a_run_that_no_disk_takes_leaves_the_old_scene_and_goes_on_later() {
     // The same run again, over its scene, where the largest file of the scene does not fit; the kernel counts in blocks of
     // 512 bytes, and would end the process without the trap.
     let blocks = largest(&scene.at("whole")).div_ceil(512) - 2;
-    let run = scene.run("home-b", "whole", 20, false);
-    let mut limited = Command::new("sh");
-    limited.arg("-c").arg(format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$0\" \"$@\""));
-    limited.arg(run.get_program()).args(run.get_args()).arg("--force");
-    limited.envs(run.get_envs().filter_map(|(name, value)| Some((name, value?))));
-    let output = limited.output().unwrap();
+    let mut run = scene.run("home-b", "whole", 20, false);
+    let output = limited(blocks, run.arg("--force")).output().unwrap();
+    if memory_was_limited(output.status) {
+        return;
+    }
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(2), "{said}");
     let last: Value = serde_json::from_str(said.lines().last().unwrap()).unwrap();

@@ -213,7 +213,7 @@ fn table(asked: &[Asked], stems: &[String], args: &QueryArgs) -> String {
 fn instance_line(n: usize, instance: &Instance, stems: &[String]) -> String {
     let ([x, y, z], [a, b, c]) = (instance.centre.to_array(), instance.oriented.size.to_array());
     let seen = stems.iter().zip(&instance.pixels).find_map(|(stem, p)| Some((stem, (*p)?)));
-    let seen = seen.map_or(String::new(), |(stem, [x, y])| format!(", pixel {x:.0}, {y:.0} of {stem}"));
+    let seen = seen.map_or(String::new(), |(stem, [x, y])| format!(", pixel {x:.0}, {y:.0} of view {stem}"));
     let splats = instance.splats.len();
     format!("  {n}. at {x:.3}, {y:.3}, {z:.3}, size {a:.3} × {b:.3} × {c:.3}, {splats} splats{seen}")
 }

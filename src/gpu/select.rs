@@ -50,7 +50,9 @@ pub(super) fn instance(entry: &ash::Entry, sink: Option<&validation::Sink>) -> R
         extensions.push(ash::ext::debug_utils::NAME.as_ptr());
         extensions.push(ash::ext::validation_features::NAME.as_ptr());
         messenger = sink.messenger_info();
-        features = vk::ValidationFeaturesEXT::default().enabled_validation_features(sink.features());
+        features = vk::ValidationFeaturesEXT::default()
+            .enabled_validation_features(sink.features())
+            .disabled_validation_features(sink.without());
         info = info.push_next(&mut messenger).push_next(&mut features);
     }
     let info = info.enabled_layer_names(&layers).enabled_extension_names(&extensions);

@@ -1,5 +1,5 @@
 // Photos in memory → scene → query → image: the whole of splatvk from a C++ program.
-//   breakfast OUT STEPS PHOTO...       OUT/scene, OUT/lemon.ppm; STEPS of training (0 = as many as the preset says)
+//   breakfast OUT STEPS SIDE PHOTO...  OUT/scene, OUT/lemon.ppm; STEPS of training, photos of at most SIDE pixels (0: as the preset says)
 #include "host.hpp"
 
 // Called for every step; anything but 0 would stop the training.
@@ -10,8 +10,8 @@ static int32_t progress(void *, const SvkProgress *p) {
 }
 
 static int run(int argc, char **argv) {
-    if (argc < 5) {
-        std::fprintf(stderr, "usage: breakfast OUT STEPS PHOTO PHOTO...\n");
+    if (argc < 6) {
+        std::fprintf(stderr, "usage: breakfast OUT STEPS SIDE PHOTO PHOTO...\n");
         return 2;
     }
     const std::string out = argv[1];
@@ -24,11 +24,12 @@ static int run(int argc, char **argv) {
 
     // The photos could as well come from a camera or a socket: they are bytes in memory.
     std::vector<std::vector<unsigned char>> files;
-    for (int i = 3; i < argc; i++) files.push_back(read_file(argv[i]));
+    for (int i = 4; i < argc; i++) files.push_back(read_file(argv[i]));
     const std::vector<SvkPhoto> photos = encoded_photos(files);
     auto options = make<SvkTrainOptions>();
     options.preset = SVK_PRESET_DRAFT;
     options.iterations = options.language_iterations = std::stoul(argv[2]);
+    options.max_size = std::stoul(argv[3]);
     options.progress = progress;
     SvkScene *trained = nullptr;
     check(svk_train(context.get(), photos.data(), photos.size(), &options, &trained), context.get());
