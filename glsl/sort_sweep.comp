@@ -2,7 +2,8 @@
 // subgroups: 4,8,16,32,64
 // One-sweep radix sort, step 3 of 3, once per digit: ranks a tile of pairs, learns from the tiles before it where its
 // digits begin, and writes the pairs in order, so that neighbours write neighbours. Every pair is read once and written
-// once. Tiles are numbered in the order in which workgroups start: a tile waits only for tiles that are running or done.
+// once. Tiles are numbered in the order in which workgroups start, so that those before a tile are running or done; it looks
+// for what they tell a while and then counts for itself, since Vulkan does not promise that they go on meanwhile.
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_ballot : require
 #extension GL_KHR_shader_subgroup_shuffle : require
@@ -22,12 +23,29 @@ const uint EACH = TILE / THREADS;
 // What a tile tells of a digit: its own count, or the count of all tiles up to and with it; 0 = nothing yet.
 const uint OWN = 1u << 30, UP_TO_HERE = 2u << 30, VALUE = OWN - 1u;
 
+// Looks in vain before a digit of a tile is counted here. A tile takes some microseconds and a look a fraction of one, so that no GPU
+// comes near; lavapipe leaves a shader's loops after 65535 rounds in all, which it did where the system had put the other tile's thread aside.
+const uint PATIENCE = 1000u;
+
 shared uint begun;
 shared uint counters[SUBGROUPS * 256]; // per subgroup: counts, then where its pairs of a digit begin among the tile's
 shared uint totals[256];               // of the tile
 shared uint sums[2][256];
 shared uint offsets[256];              // place in `sorted` less place in the tile
 shared uvec2 staged[TILE];
+
+// Pairs of a tile before this one, which is full, that have a digit.
+uint counted(uint tile, uint digit) {
+    uint n = 0u;
+    for (uint i = tile * TILE; i < (tile + 1u) * TILE; i += 8u) {
+        uvec4 a = uvec4(pairs[i].x, pairs[i + 1u].x, pairs[i + 2u].x, pairs[i + 3u].x);
+        uvec4 b = uvec4(pairs[i + 4u].x, pairs[i + 5u].x, pairs[i + 6u].x, pairs[i + 7u].x);
+        uvec4 same = uvec4(equal(((a & mask) >> (8u * pass)) & 255u, uvec4(digit)));
+        same += uvec4(equal(((b & mask) >> (8u * pass)) & 255u, uvec4(digit)));
+        n += same.x + same.y + same.z + same.w;
+    }
+    return n;
+}
 
 void main() {
     uint thread = gl_LocalInvocationID.x;
@@ -95,8 +113,10 @@ void main() {
         if (first < count && tile > 0u) {
             uint look = tile - 1u;
             uint told = 0u;
+            uint vain = 0u;
             while ((told & UP_TO_HERE) == 0u) {
                 told = atomicOr(tiles[told_at + look * 256u + digit], 0u);
+                if (told == 0u && ++vain > PATIENCE) told = counted(look, digit) | (look == 0u ? UP_TO_HERE : OWN);
                 if (told != 0u) {
                     earlier += told & VALUE;
                     look -= 1u;

@@ -166,22 +166,36 @@ fn a_variant_for_other_subgroups_is_reported() {
     assert!(said.contains("AbsentLane") || said.contains("Race"), "{said}");
 }
 
-/// A tile of the one-sweep sort waits for those before it. It takes its number when it starts, so that they have started
-/// too; with the number of the workgroup it waits for ever where those come later.
+/// A tile of the one-sweep sort looks for what those before it tell. It takes its number when it starts, so that they have started
+/// too; with the number of the workgroup they may come later, one at a time: it counts for itself then. With more patience it would
+/// wait for ever.
 #[test]
 fn reliance_on_the_order_of_workgroups_is_reported() {
     let scene = passes::named("sort in one sweep");
-    let change = || changing("sort_sweep", number_by_workgroup);
     let run = |order| {
         let mut on = interpreted(32, true);
         (on.schedule.order, on.schedule.in_flight) = (order, 1);
         on
     };
-    assert_eq!(outcome(scene, &run(Order::Falling)), Ok(()));
-    let rising = Interpreted { change: Some(change()), ..run(Order::Rising) };
-    assert_eq!(outcome(scene, &rising), Ok(()));
-    let said = broken(scene, &run(Order::Falling), change());
+    for order in [Order::Falling, Order::Rising] {
+        assert_eq!(outcome(scene, &run(order)), Ok(()));
+        let change = Some(changing("sort_sweep", number_by_workgroup));
+        assert_eq!(outcome(scene, &Interpreted { change, ..run(order) }), Ok(()));
+    }
+    let patient = changing("sort_sweep", |list, free| {
+        number_by_workgroup(list, free);
+        wait_for_ever(list);
+    });
+    let said = broken(scene, &run(Order::Falling), patient);
     assert!(said.contains("waits for another workgroup"), "{said}");
+}
+
+/// `PATIENCE` of the largest number.
+fn wait_for_ever(list: &mut [Instruction]) {
+    let patience = |i: &&mut Instruction| i.op == Op::Constant && i.words[2..] == [1000];
+    let found: Vec<&mut Instruction> = list.iter_mut().filter(patience).collect();
+    assert_eq!(found.len(), 1, "PATIENCE");
+    found.into_iter().for_each(|constant| constant.words[2] = u32::MAX);
 }
 
 /// `begun = gl_WorkGroupID.x` in the place of `begun = atomicAdd(tiles[0], 1)`.
