@@ -18,7 +18,7 @@ layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };         // [N, 3]
 layout(std430, binding = 1) readonly buffer DepthPairs { uvec2 depth_pairs[]; };     // [N] (key, splat), sorted
 layout(std430, binding = 2) readonly buffer Starts { uint starts[]; };               // [N] first entry, in depth order
-layout(std430, binding = 3) buffer Status { uint status[]; };                        // [2] see FrameBuffers
+layout(std430, binding = 3) buffer Status { uint status[]; };                        // [3] see FrameBuffers
 layout(std430, binding = 4) writeonly buffer EntryCount { uint entry_count; };       // entries, 0 if they do not fit
 layout(std430, binding = 5) writeonly buffer Entries { uvec2 entries[]; };           // [capacity]
 #if GROUPING == 0

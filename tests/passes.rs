@@ -183,6 +183,51 @@ fn the_lists_of_a_view_hold_nothing_of_the_view_before() {
     }
 }
 
+/// lavapipe leaves the loops of a shader after 65535 rounds: more lanes share the 4.7 million entries of these lists.
+#[test]
+fn long_lists_are_listed_whole() {
+    let device = test_device();
+    let mut splats = Splats::default();
+    for k in 0..300 {
+        append(&mut splats, splat([0.0, 0.0, 5.0 + 0.01 * k as f32], 50.0, 3.0));
+    }
+    let scene = front_scene(splats, 1000, 1000);
+    for grouping in [Grouping::Counting, Grouping::Sorting] {
+        let (params, mut raster) =
+            scene.upload_for(&device, DeviceChoices { grouping, ..DeviceChoices::of(&device) });
+        raster.forward(&params, &scene.options).unwrap();
+        let (lists, all) = (raster.tile_lists().unwrap(), Vec::from_iter(0..300u32));
+        assert_eq!(lists.len(), 125 * 125);
+        assert!(lists.iter().all(|list| *list == all), "{grouping:?}");
+    }
+}
+
+/// Many splats on one corner of a tile, and one behind them on another: it is shown, or the frame is refused.
+#[test]
+fn no_splat_of_a_long_list_is_left_out_without_an_error() {
+    let device = test_device();
+    for (count, refused) in [(39_000, false), (70_000, device.info().name.starts_with("llvmpipe"))] {
+        // The focal length is 7.2 pixels, the principal point (4, 4).
+        let at = |pixel: f32, z: f32| [(pixel - 4.0) * z / 7.2, (pixel - 4.0) * z / 7.2, z];
+        let mut splats = Splats { sh_degree: 0, ..Splats::default() };
+        for k in 0..count {
+            append(&mut splats, splat(at(0.5, 1.0 + 1e-5 * k as f32), 1e-4, 0.0));
+        }
+        append(&mut splats, splat(at(6.5, 3.0), 0.02, 5.0));
+        let scene = front_scene(splats, 8, 8);
+        let (params, mut raster) = scene.upload(&device);
+        let outcome = raster.forward(&params, &scene.options);
+        assert_eq!(outcome.is_err(), refused, "{count}");
+        match outcome {
+            Ok(()) => {
+                let far = rendered(&raster).transmittance[6 * 8 + 6];
+                assert!(far < 0.05, "{count}: {far}");
+            }
+            Err(e) => assert!(e.to_string().contains("70001 splats lie on 8 × 8 pixels"), "{e}"),
+        }
+    }
+}
+
 /// 20 000 splats in one tile (10⁵ take the twin too long): nothing overflows, saturates or
 /// loses its order.
 #[test]

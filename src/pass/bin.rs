@@ -70,12 +70,19 @@ pub(super) fn record(
     );
     rec.dispatch_threads(call, [lanes, 1, 1]);
     match &lists.group {
-        Group::Counting { counters, lanes } => group_by_counting(rec, lists, tiles, counters, *lanes),
+        Group::Counting { counters, lanes } => group_by_counting(rec, frame, tiles, counters, *lanes),
         Group::Sorting { entry_splats, sort } => group_by_sorting(rec, lists, tiles, entry_splats, sort),
     }
 }
 
-fn group_by_counting(rec: &mut Recorder, lists: &TileLists, tiles: u32, counters: &Buffer<u32>, lanes: u32) {
+fn group_by_counting(
+    rec: &mut Recorder,
+    frame: &FrameBuffers,
+    tiles: u32,
+    counters: &Buffer<u32>,
+    lanes: u32,
+) {
+    let (lists, status) = (&frame.lists, &frame.status);
     let tile_ranges = &lists.ranges;
     let call = shaders::bin_sum::call(
         &shaders::bin_sum::Bindings { counters, tile_ranges },
@@ -83,7 +90,7 @@ fn group_by_counting(rec: &mut Recorder, lists: &TileLists, tiles: u32, counters
     );
     rec.dispatch_threads(call, [tiles, 1, 1]);
     let call = shaders::bin_scan::call(
-        &shaders::bin_scan::Bindings { tile_ranges },
+        &shaders::bin_scan::Bindings { tile_ranges, status },
         &shaders::bin_scan::Push { tiles },
     );
     rec.dispatch(call, [1, 1, 1]);

@@ -25,7 +25,8 @@ pub struct FrameBuffers {
     pub planes_grad: Buffer<f32>,
     /// [10]: gradient by the left pose twist (ρ, θ) and by fx, fy, cx, cy. Written by the backward pass.
     pub camera_grad: Buffer<f32>,
-    /// [2] u32: tile-list entries of this frame; the number needed if a frame did not fit since the last `grow`, else 0.
+    /// [3] u32: tile-list entries of this frame; the number needed if a frame did not fit since the last `grow`, else 0; the
+    /// longest list of a tile so far, where lists are made by counting.
     pub status: Buffer<u32>,
     pub(super) projected: Buffer<f32>,
     pub(super) projected_grad: Buffer<f32>,

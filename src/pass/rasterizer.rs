@@ -39,7 +39,7 @@ use super::frame::{
     CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, PROJECTED_FLOATS, Summation, Tiles, entry_bytes,
 };
 use super::sort::Sort;
-use super::tile_lists::{self, Grouping, TILE, TileLists};
+use super::tile_lists::{self, Grouping, LONGEST_LIST, TILE, TileLists};
 use super::view::View;
 use super::{bin, project, project_backward, raster_backward, raster_forward};
 use crate::gpu::shaders::structs::CameraView;
@@ -67,13 +67,18 @@ impl DeviceChoices {
     }
 }
 
-/// Entries that the device binds, with the gradients that some ways of adding up keep for each.
-fn most_entries(device: &Device, summation: Summation, feature_dim: usize) -> usize {
+/// Entries that the device takes at once, with the gradients that some ways of adding up keep for each.
+fn most_entries(
+    device: &Device,
+    (grouping, tiles): (Grouping, usize),
+    summation: Summation,
+    feature_dim: usize,
+) -> usize {
     let gradients = match summation {
         Summation::Atomics => usize::MAX,
         Summation::Entries => device.info().max_storage_range as usize / entry_bytes(feature_dim),
     };
-    tile_lists::most_entries(device).min(gradients)
+    tile_lists::most_entries(device, grouping, tiles).min(gradients)
 }
 
 /// Renders up to N splats with d features at a fixed image size, and back.
@@ -121,7 +126,8 @@ impl Rasterizer {
         let splats = capacity.max(1);
         let stride = feature_dim.next_multiple_of(4);
         // About five entries per splat on the seeded scene; `forward` grows the list if that is too few.
-        let entries = (8 * splats + 4 * tiles).min(most_entries(device, ways.summation, feature_dim));
+        let most = most_entries(device, (ways.grouping, tiles), ways.summation, feature_dim);
+        let entries = (8 * splats + 4 * tiles).min(most);
         let frame = FrameBuffers {
             width,
             height,
@@ -131,7 +137,7 @@ impl Rasterizer {
             transmittance: device.buffer::<f32>("transmittance", pixels)?,
             planes_grad: device.buffer::<f32>("planes_grad", (planes + 1) * pixels)?,
             camera_grad: device.buffer::<f32>("camera_grad", CAMERA_GRADIENTS)?,
-            status: device.buffer::<u32>("status", 2)?,
+            status: device.buffer::<u32>("status", 3)?,
             projected: device.buffer::<f32>("projected", PROJECTED_FLOATS * splats)?,
             projected_grad: device.buffer::<f32>("projected_grad", GRADIENT_FLOATS * splats)?,
             camera_parts: device.buffer::<f32>(
@@ -348,15 +354,27 @@ impl Rasterizer {
     }
 
     /// Entries that a frame needed since the last [`Rasterizer::grow`], if they did not fit; `None` when all was well.
+    /// An error where a tile has more splats than the device goes through: it would leave out the farthest of them.
     pub fn overflow(&self) -> Result<Option<usize>> {
-        let needed = self.frame.status.read()?[1] as usize;
+        let status = self.frame.status.read()?;
+        let (needed, longest) = (status[1] as usize, status[2]);
+        if longest > LONGEST_LIST && self.device.info().name.starts_with("llvmpipe") {
+            self.frame.status.write(&[0; 3])?;
+            return Err(Error::gpu(format!(
+                "{longest} splats lie on {TILE} × {TILE} pixels, and {} goes through {LONGEST_LIST} at most: a larger image, \
+                 a nearer camera, fewer splats or another device",
+                self.device.info().name
+            )));
+        }
         Ok((needed > 0).then_some(needed))
     }
 
     /// Makes room for tile lists of `needed` entries and a quarter more, or lists fewer rows of tiles at once where the
     /// device binds no longer lists. Earlier recordings must not be run again.
     pub fn grow(&mut self, needed: usize) -> Result<()> {
-        let most = most_entries(&self.device, self.frame.summation, self.frame.feature_dim);
+        let tiles = self.frame.tiles()[0] as usize * (self.frame.bands.rows as u32).div_ceil(TILE) as usize;
+        let lists = (self.grouping, tiles);
+        let most = most_entries(&self.device, lists, self.frame.summation, self.frame.feature_dim);
         let wanted = needed + needed / 4;
         if needed > most {
             if self.strip <= 1 {
@@ -369,10 +387,9 @@ impl Rasterizer {
             self.strip = ((u64::from(self.strip) * most as u64 / wanted as u64) as u32).max(1);
         }
         let splats = self.capacity.max(1);
-        let tiles = self.frame.tiles()[0] as usize * (self.frame.bands.rows as u32).div_ceil(TILE) as usize;
         let capacity = wanted.min(most);
         self.frame.lists = TileLists::new(&self.device, self.grouping, splats, tiles, capacity)?;
-        self.frame.status.write(&[0, 0])
+        self.frame.status.write(&[0; 3])
     }
 
     /// The tile lists of the last forward pass, row by row of tiles, nearest splat first. For tests and statistics.

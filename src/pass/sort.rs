@@ -7,6 +7,7 @@
 //! begin from the tiles before them while those run, or count for themselves where those do not go on. Both are correct on any
 //! device and any subgroup size.
 use super::adam::rows_of_groups;
+use super::tile_lists::ROUNDS;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, Way, shaders};
 
@@ -70,7 +71,7 @@ impl Sort {
         let work = match shape {
             Shape::Chunks => {
                 // 256 measured best on lavapipe for 100k to 1M pairs.
-                let lanes = 256;
+                let lanes = capacity.div_ceil(ROUNDS).next_multiple_of(256).max(256);
                 Work::Chunks {
                     histogram: device.buffer::<u32>("sort histogram", 256 * lanes)?,
                     lanes: lanes as u32,

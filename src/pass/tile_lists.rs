@@ -53,6 +53,14 @@ pub(super) enum Group {
 /// Lanes that write entries before a sort, and that read them behind it: enough to fill any GPU.
 pub(super) const SORTING_LANES: u32 = 1 << 16;
 
+/// Entries that a lane goes through one by one: lavapipe (Mesa 22 to 25) leaves the loops of a shader after 65535 rounds in all,
+/// and says nothing. Half of it, since a lane that writes entries also passes rows and splats without any.
+pub(super) const ROUNDS: usize = 1 << 15;
+
+/// Longest list of a tile that lavapipe goes through: a round for each splat and, at subgroups of four, half as many for groups of
+/// them, and some more.
+pub(super) const LONGEST_LIST: u32 = 40_000;
+
 impl TileLists {
     /// Room for `capacity` entries of up to `splats` splats on `tiles` tiles.
     pub fn new(
@@ -64,7 +72,7 @@ impl TileLists {
     ) -> Result<TileLists> {
         let group = match grouping {
             Grouping::Counting => {
-                let lanes = counting_lanes(tiles, device.info().max_storage_range);
+                let lanes = counting_lanes(tiles, capacity, device.info().max_storage_range);
                 let counters = device.buffer::<u32>("tile counters", tiles * lanes as usize)?;
                 Group::Counting { counters, lanes }
             }
@@ -87,18 +95,26 @@ impl TileLists {
     }
 }
 
-/// Few lanes keep a CPU device busy, and more only add counters to clear and scan; their number is also bounded by
-/// memory: 16 M counters are 64 MiB, half of the smallest buffer limit that Vulkan allows.
-fn counting_lanes(tiles: usize, binding: u64) -> u32 {
+/// Few lanes keep a CPU device busy, and more only add counters to clear and scan, until each has [`ROUNDS`] entries.
+fn counting_lanes(tiles: usize, capacity: usize, binding: u64) -> u32 {
+    capacity.div_ceil(ROUNDS).max(64).min(most_lanes(tiles, binding)) as u32 / 8 * 8
+}
+
+/// The number of lanes is bounded by memory: 16 M counters are 64 MiB, half of the smallest buffer limit that Vulkan allows.
+fn most_lanes(tiles: usize, binding: u64) -> usize {
     let counters = (binding / 4).min(1 << 24) as usize;
-    let bound = (counters / tiles.max(1)).max(8) as u32;
-    64.min(bound) / 8 * 8
+    (counters / tiles.max(1)).max(8) / 8 * 8
 }
 
 /// Bytes per entry of the widest list.
 const ENTRY_BYTES: u64 = 8;
 
-/// Entries that the device binds.
-pub(super) fn most_entries(device: &Device) -> usize {
-    (device.info().max_storage_range / ENTRY_BYTES) as usize
+/// Entries that the device binds, and that the lanes of [`Grouping::Counting`] go through.
+pub(super) fn most_entries(device: &Device, grouping: Grouping, tiles: usize) -> usize {
+    let binding = device.info().max_storage_range;
+    let bound = (binding / ENTRY_BYTES) as usize;
+    match grouping {
+        Grouping::Counting => bound.min(most_lanes(tiles, binding) * ROUNDS),
+        Grouping::Sorting => bound,
+    }
 }
