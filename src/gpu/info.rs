@@ -48,6 +48,10 @@ impl Options {
     }
 }
 
+/// Rounds after which lavapipe leaves the loops of a shader, all of them together, and says nothing
+/// (`LP_MAX_TGSI_LOOP_ITERATIONS`, Mesa 22 to 25). Passes share work among lanes so that no lane comes near, on any device.
+pub const LOOP_ROUNDS: usize = 65_535;
+
 /// What the device is and can do.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
@@ -97,6 +101,11 @@ impl DeviceInfo {
     pub fn way(&self, preferred: Way) -> Way {
         let other = preferred.replacement();
         if self.without.contains(&preferred) && !self.without.contains(&other) { other } else { preferred }
+    }
+
+    /// The driver leaves loops after [`LOOP_ROUNDS`]: lavapipe, whose devices have this name.
+    pub fn leaves_long_loops(&self) -> bool {
+        self.name.starts_with("llvmpipe")
     }
 }
 

@@ -118,7 +118,7 @@ pub use device::{Device, QueueLock};
 pub use enabled::EnabledFeatures;
 #[doc(hidden)]
 pub use executor::Executor;
-pub use info::{DeviceInfo, Options};
+pub use info::{DeviceInfo, LOOP_ROUNDS, Options};
 pub use memory::Memory;
 pub use module::{Access, Binding, Capability, Family, Module};
 pub use program::Program;

@@ -358,7 +358,7 @@ impl Rasterizer {
     pub fn overflow(&self) -> Result<Option<usize>> {
         let status = self.frame.status.read()?;
         let (needed, longest) = (status[1] as usize, status[2]);
-        if longest > LONGEST_LIST && self.device.info().name.starts_with("llvmpipe") {
+        if longest > LONGEST_LIST && self.device.info().leaves_long_loops() {
             self.frame.status.write(&[0; 3])?;
             return Err(Error::gpu(format!(
                 "{longest} splats lie on {TILE} × {TILE} pixels, and {} goes through {LONGEST_LIST} at most: a larger image, \
@@ -379,7 +379,7 @@ impl Rasterizer {
         if needed > most {
             if self.strip <= 1 {
                 return Err(Error::gpu(format!(
-                    "{needed} entries of one row of tiles are more than {} binds ({most}): fewer splats or a smaller \
+                    "{needed} entries of one row of tiles are more than {} takes at once ({most}): fewer splats or a smaller \
                      --max-size",
                     self.device.info().name
                 )));

@@ -7,9 +7,8 @@
 //! begin from the tiles before them while those run, or count for themselves where those do not go on. Both are correct on any
 //! device and any subgroup size.
 use super::adam::rows_of_groups;
-use super::tile_lists::ROUNDS;
 use crate::Result;
-use crate::gpu::{Buffer, Device, Recorder, Way, shaders};
+use crate::gpu::{Buffer, Device, LOOP_ROUNDS, Recorder, Way, shaders};
 
 /// How the work is divided.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -70,8 +69,8 @@ impl Sort {
     pub fn with(device: &Device, capacity: usize, shape: Shape) -> Result<Sort> {
         let work = match shape {
             Shape::Chunks => {
-                // 256 measured best on lavapipe for 100k to 1M pairs.
-                let lanes = capacity.div_ceil(ROUNDS).next_multiple_of(256).max(256);
+                // 256 measured best on lavapipe for 100k to 1M pairs; the chunks of more would be too long for its loops.
+                let lanes = capacity.div_ceil(LOOP_ROUNDS / 2).next_multiple_of(256).max(256);
                 Work::Chunks {
                     histogram: device.buffer::<u32>("sort histogram", 256 * lanes)?,
                     lanes: lanes as u32,

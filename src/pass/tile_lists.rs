@@ -2,7 +2,7 @@
 use super::scan::Scan;
 use super::sort::Sort;
 use crate::Result;
-use crate::gpu::{Buffer, Device, Way, shaders};
+use crate::gpu::{Buffer, Device, LOOP_ROUNDS, Way, shaders};
 
 /// Tile edge, pixels. 8 evaluates 2.9 times the pairs it blends, 16 six times (measured on the seeded scene).
 pub const TILE: u32 = shaders::shared::layout::TILE as u32;
@@ -53,12 +53,11 @@ pub(super) enum Group {
 /// Lanes that write entries before a sort, and that read them behind it: enough to fill any GPU.
 pub(super) const SORTING_LANES: u32 = 1 << 16;
 
-/// Entries that a lane goes through one by one: lavapipe (Mesa 22 to 25) leaves the loops of a shader after 65535 rounds in all,
-/// and says nothing. Half of it, since a lane that writes entries also passes rows and splats without any.
-pub(super) const ROUNDS: usize = 1 << 15;
+/// Most entries of a lane of [`Grouping::Counting`]: one that writes entries also passes rows and splats without any.
+const SHARE: usize = LOOP_ROUNDS / 2;
 
-/// Longest list of a tile that lavapipe goes through: a round for each splat and, at subgroups of four, half as many for groups of
-/// them, and some more.
+/// Longest list of a tile that goes into [`LOOP_ROUNDS`]: a round for each splat and, at subgroups of four, up to half as many for
+/// groups of them.
 pub(super) const LONGEST_LIST: u32 = 40_000;
 
 impl TileLists {
@@ -95,9 +94,9 @@ impl TileLists {
     }
 }
 
-/// Few lanes keep a CPU device busy, and more only add counters to clear and scan, until each has [`ROUNDS`] entries.
+/// Few lanes keep a CPU device busy, and more only add counters to clear and scan, until each has its [`SHARE`].
 fn counting_lanes(tiles: usize, capacity: usize, binding: u64) -> u32 {
-    capacity.div_ceil(ROUNDS).max(64).min(most_lanes(tiles, binding)) as u32 / 8 * 8
+    capacity.div_ceil(SHARE).max(64).min(most_lanes(tiles, binding)) as u32 / 8 * 8
 }
 
 /// The number of lanes is bounded by memory: 16 M counters are 64 MiB, half of the smallest buffer limit that Vulkan allows.
@@ -114,7 +113,7 @@ pub(super) fn most_entries(device: &Device, grouping: Grouping, tiles: usize) ->
     let binding = device.info().max_storage_range;
     let bound = (binding / ENTRY_BYTES) as usize;
     match grouping {
-        Grouping::Counting => bound.min(most_lanes(tiles, binding) * ROUNDS),
+        Grouping::Counting => bound.min(most_lanes(tiles, binding) * SHARE),
         Grouping::Sorting => bound,
     }
 }
