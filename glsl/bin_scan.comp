@@ -18,8 +18,10 @@ void main() {
         uint before = subgroupExclusiveAdd(size);
         if (tile < tiles) tile_ranges[tile] = carry + before;
         carry += subgroupAdd(size);
-        longest = max(longest, size);
+        longest = max(longest, subgroupMax(size));
     }
-    atomicMax(status[2], longest);
-    if (lane == 0) tile_ranges[tiles] = carry;
+    if (lane == 0) {
+        tile_ranges[tiles] = carry;
+        status[2] = max(status[2], longest); // of all frames since it was read
+    }
 }
