@@ -6,6 +6,7 @@ use fixture::command::{limited, memory_was_limited, refuses, splatvk, text};
 use fixture::{data, scene, small_views, train_log};
 use splatvk::format::npy::{self, NpyArray};
 use splatvk::scene::Seen;
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -225,14 +226,15 @@ fn ctrl_c_stops_cleanly() {
     std::thread::sleep(Duration::from_millis(500));
     let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
     assert!(killed.success());
+    // To its last line, with which everything is done: a busy kernel was seen to take 5 s more to take the process apart.
     let sent = Instant::now();
-    let status = child.wait().unwrap();
-    let mut stderr = String::new();
-    std::io::Read::read_to_string(&mut child.stderr.take().unwrap(), &mut stderr).unwrap();
-    assert_eq!(status.code(), Some(130), "{stderr}");
-    assert!(stderr.lines().last().unwrap().contains("nothing was written"), "{stderr}");
+    let lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    let said: Vec<(Duration, String)> = lines.map(|line| (sent.elapsed(), line.unwrap())).collect();
+    assert_eq!(child.wait().unwrap().code(), Some(130), "{said:?}");
+    let (took, last) = said.last().unwrap();
+    assert!(last.contains("nothing was written"), "{said:?}");
     assert!(names(folder.path()).is_empty(), "left behind: {:?}", names(folder.path()));
-    assert!(sent.elapsed() < Duration::from_secs(2), "took {:?} to stop", sent.elapsed());
+    assert!(*took < Duration::from_secs(2), "took {took:?} to stop");
 }
 
 #[test]

@@ -158,8 +158,8 @@ impl Progress for JsonLines {
 }
 
 /// How long after a request to stop the work may go on to its next check. Nothing that is asked of a network or a driver can be
-/// cut short, and some of it takes longer than anyone waits. A process is to be gone after 2 s; on a busy machine the kernel was
-/// seen to take 1.3 s of them to free the memory of one.
+/// cut short, and some of it takes longer than anyone waits. A process is to be done after 2 s; its end takes the
+/// kernel of a busy machine some time, too.
 const GRACE: Duration = Duration::from_millis(1000);
 
 /// Makes Ctrl-C, a termination signal and a closed terminal ask for a clean stop. A second one, and [`GRACE`], end the process at
