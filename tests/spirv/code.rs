@@ -90,6 +90,7 @@ pub enum Binary {
 pub enum Reduction {
     IAdd,
     FAdd,
+    UMax,
 }
 
 /// What invocations of a subgroup do together.

@@ -314,6 +314,7 @@ impl Lowering {
         let reduction = match i.op {
             Op::GroupNonUniformIAdd => Some(Reduction::IAdd),
             Op::GroupNonUniformFAdd => Some(Reduction::FAdd),
+            Op::GroupNonUniformUMax => Some(Reduction::UMax),
             _ => None,
         };
         if let Some(reduction) = reduction {

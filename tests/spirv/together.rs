@@ -7,6 +7,7 @@ fn reduced(op: Reduction, a: u32, b: u32) -> u32 {
     match op {
         Reduction::IAdd => a.wrapping_add(b),
         Reduction::FAdd => (f32::from_bits(a) + f32::from_bits(b)).to_bits(),
+        Reduction::UMax => a.max(b),
     }
 }
 
@@ -53,7 +54,7 @@ impl Subgroup {
                 let sum = ascending.iter().map(|l| values[*l]).reduce(|a, b| reduced(r, a, b));
                 fill(self, sum.unwrap_or(0));
             }
-            // Zero is 0 for integers and for floats.
+            // 0 changes no sum, also of floats, and no largest unsigned number.
             Op::Inclusive(r) | Op::Exclusive(r) => {
                 let mut sum = 0;
                 for &lane in &ascending {
