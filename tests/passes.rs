@@ -202,25 +202,25 @@ fn long_lists_are_listed_whole() {
     }
 }
 
-/// Many splats on one corner of a tile, and one behind them on another: it is shown, or the frame is refused.
+/// Many splats within the middle one of three tiles, and one farther away in its corner: it is shown, or the frame is refused.
 #[test]
 fn no_splat_of_a_long_list_is_left_out_without_an_error() {
     let device = test_device();
     for (count, refused) in [(39_000, false), (70_000, device.info().leaves_long_loops())] {
-        // The focal length is 7.2 pixels, the principal point (4, 4).
-        let at = |pixel: f32, z: f32| [(pixel - 4.0) * z / 7.2, (pixel - 4.0) * z / 7.2, z];
+        // The focal length is 21.6 pixels, the principal point (12, 4).
+        let at = |pixel: f32, z: f32| [(pixel - 4.0) * z / 21.6, (pixel - 4.0) * z / 21.6, z];
         let mut splats = Splats { sh_degree: 0, ..Splats::default() };
         for k in 0..count {
-            append(&mut splats, splat(at(0.5, 1.0 + 1e-5 * k as f32), 1e-4, 0.0));
+            append(&mut splats, splat(at(2.5, 1.0 + 1e-5 * k as f32), 1e-4, 0.0));
         }
         append(&mut splats, splat(at(6.5, 3.0), 0.02, 5.0));
-        let scene = front_scene(splats, 8, 8);
+        let scene = front_scene(splats, 24, 8);
         let (params, mut raster) = scene.upload(&device);
         let outcome = raster.forward(&params, &scene.options);
         assert_eq!(outcome.is_err(), refused, "{count}");
         match outcome {
             Ok(()) => {
-                let far = rendered(&raster).transmittance[6 * 8 + 6];
+                let far = rendered(&raster).transmittance[6 * 24 + 14];
                 assert!(far < 0.05, "{count}: {far}");
             }
             Err(e) => assert!(e.to_string().contains("70001 splats lie on 8 × 8 pixels"), "{e}"),
