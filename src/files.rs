@@ -1,14 +1,21 @@
 //! Files read within bounds; files that are whole or not there: written beside their place and renamed into it, some with a
 //! checksum in front; and the rule for what may be written over.
+mod home;
+mod owner;
 mod partial;
 mod place;
 mod replace;
 
-pub(crate) use partial::Partial;
+pub use home::home;
 #[cfg(feature = "cli")]
-pub(crate) use partial::{leftovers, remove_any, remove_unfinished};
-pub(crate) use place::{Kind, check_place};
-pub(crate) use replace::{restore, swap};
+pub(crate) use owner::{Found, Held, look};
+#[cfg(feature = "cli")]
+pub(crate) use partial::{HIDDEN, leftovers, remove_leftover, remove_unfinished};
+pub(crate) use partial::{Partial, check_free, check_free_inside, is_leftover, restore, sweep};
+#[cfg(test)]
+pub(crate) use owner::tests::leave;
+pub(crate) use place::{Kind, check_place, check_spared, foreign, listed, next_free};
+pub(crate) use replace::swap;
 
 use crate::{Error, Result};
 use serde::Deserialize;
@@ -73,6 +80,10 @@ fn read_within(path: &Path, most: u64) -> Result<Vec<u8>> {
             path.display()
         )));
     }
+    read_open(file, size, path)
+}
+
+fn read_open(file: File, size: u64, path: &Path) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let room = usize::try_from(size).ok().and_then(|n| bytes.try_reserve_exact(n.checked_add(1)?).ok());
     room.ok_or_else(|| Error::work(format!("{}: no memory for its {size} bytes", path.display())))?;
@@ -116,14 +127,6 @@ pub(crate) fn parse_json<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, S
         return Err(format!("holds {values} values, more than the {MOST_VALUES} that are read"));
     }
     serde_json::from_slice(bytes).map_err(|e| e.to_string())
-}
-
-/// The folder that set-up fills: `SPLATVK_HOME`, else `splatvk` in the user's data folder.
-pub fn home() -> PathBuf {
-    let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
-    let data =
-        || set("XDG_DATA_HOME").unwrap_or_else(|| set("HOME").unwrap_or_default().join(".local/share"));
-    set("SPLATVK_HOME").unwrap_or_else(|| data().join("splatvk"))
 }
 
 /// Hexadecimal digits of the checksum.
@@ -171,24 +174,60 @@ pub(crate) fn content_hash(path: &Path) -> std::io::Result<String> {
     Ok(hash)
 }
 
-/// Writes `parts` one after the other to a file of the program's own that appears whole or not at all; makes its folder, and
-/// removes what killed processes have left there.
+/// Writes `parts` one after the other to a file of the program's own that appears whole or not at all, and that only its user can
+/// read; makes its folder, and removes what killed processes have left there.
 pub(crate) fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
-    // One at a time: two threads that keep the same thing would write into one partial file.
+    // One at a time: of two threads that keep the same thing the second would be refused.
     static WRITING: Mutex<()> = Mutex::new(());
     let _turn = WRITING.lock().unwrap_or_else(PoisonError::into_inner);
-    let partial = path.with_extension(format!("partial-{}", std::process::id()));
-    partial::sweep(path.parent().unwrap_or(path), None);
-    let all = || -> std::io::Result<()> {
-        let mut file = File::create(&partial)?;
-        parts.iter().try_for_each(|part| std::io::Write::write_all(&mut file, part))
-    };
-    let kept = std::fs::create_dir_all(path.parent().unwrap_or(path))
-        .and_then(|()| all())
-        .and_then(|()| std::fs::rename(&partial, path));
-    kept.inspect_err(|_| {
-        let _ = std::fs::remove_file(&partial);
-    })
+    let folder = path.parent().unwrap_or(path);
+    private_folder(folder)?;
+    sweep(folder);
+    let partial = Partial::beside(path).map_err(std::io::Error::other)?;
+    let mut file = private_file(partial.path())?;
+    parts.iter().try_for_each(|part| std::io::Write::write_all(&mut file, part))?;
+    drop(file);
+    partial.keep(|from| std::fs::rename(from, path))
+}
+
+/// Makes a folder that only its user can look into, with the folders that it is in; one that is there stays as it is.
+fn private_folder(folder: &Path) -> std::io::Result<()> {
+    let mut builder = std::fs::DirBuilder::new();
+    #[cfg(unix)]
+    std::os::unix::fs::DirBuilderExt::mode(&mut builder, 0o700);
+    builder.recursive(true).create(folder)
+}
+
+/// Makes a file that only its user can read and write.
+fn private_file(path: &Path) -> std::io::Result<File> {
+    let mut options = File::options();
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
+    options.write(true).create_new(true).open(path)
+}
+
+/// Whether nobody but the user can have written a file: it is the user's own or that of the system's owner, and no group or other
+/// users may write to it.
+#[cfg(unix)]
+fn is_own(meta: &std::fs::Metadata) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    meta.mode() & 0o022 == 0 && user().is_none_or(|user| [0, user].contains(&meta.uid()))
+}
+
+/// Files have no such modes.
+#[cfg(not(unix))]
+fn is_own(_: &std::fs::Metadata) -> bool {
+    true
+}
+
+/// The user as whom the process works; `None` where the system is not asked.
+#[cfg(unix)]
+fn user() -> Option<u32> {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: takes nothing and cannot fail.
+    return Some(unsafe { libc::geteuid() });
+    #[cfg(not(all(target_os = "linux", target_env = "gnu")))]
+    None
 }
 
 /// [`write`] with the checksum of `body` in front.
@@ -196,9 +235,14 @@ pub(crate) fn write_with_checksum(path: &Path, body: &[u8]) -> std::io::Result<(
     write(path, &[sha256(body).as_bytes(), body])
 }
 
-/// What [`write_with_checksum`] wrote; `None` if it is not there or not what was written. Counts as a use for [`prune`].
+/// What [`write_with_checksum`] wrote; `None` if it is not there, not what was written, or another user may have written it. Counts as
+/// a use for [`prune`].
 pub(crate) fn read_with_checksum(path: &Path) -> Option<Vec<u8>> {
-    let mut bytes = read(path).ok()?;
+    let (file, size) = open(path).ok()?;
+    if !is_own(&file.metadata().ok()?) {
+        return None;
+    }
+    let mut bytes = read_open(file, size, path).ok()?;
     let (sum, body) = bytes.split_at_checked(CHECKSUM_DIGITS)?;
     if *sum != *sha256(body).as_bytes() {
         return None;
@@ -299,11 +343,30 @@ mod tests {
         assert_eq!(read_with_checksum(&file), None);
     }
 
+    #[cfg(unix)]
+    #[test]
+    fn kept_files_are_private_and_own() {
+        use std::os::unix::fs::{MetadataExt, PermissionsExt};
+        let base = tempfile::tempdir().unwrap();
+        let file = base.path().join("stages/a.kept");
+        write_with_checksum(&file, b"body").unwrap();
+        let mode = |path: &Path| path.metadata().unwrap().mode() & 0o777;
+        assert_eq!((mode(&file), mode(file.parent().unwrap())), (0o600, 0o700));
+        for (mode, own) in [(0o600, true), (0o644, true), (0o620, false), (0o602, false), (0o666, false)] {
+            std::fs::set_permissions(&file, std::fs::Permissions::from_mode(mode)).unwrap();
+            assert_eq!(read_with_checksum(&file).is_some(), own, "{mode:o}");
+        }
+        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o600)).unwrap();
+        // Only the system's owner can give a file away.
+        if std::os::unix::fs::chown(&file, Some(65534), None).is_ok() {
+            assert_eq!(read_with_checksum(&file), None, "of another user");
+        }
+    }
+
     #[test]
     fn what_a_killed_process_left_goes_with_the_next_file_and_threads_do_not_share_one() {
         let folder = tempfile::tempdir().unwrap();
-        let stale = folder.path().join("rgb-1.partial-4000000000");
-        std::fs::write(&stale, "half").unwrap();
+        leave(&folder.path().join(".rgb-1.stage.partial-splatvk"));
         let file = folder.path().join("a.kept");
         std::thread::scope(|s| {
             for k in 0..8u8 {

@@ -4,10 +4,11 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
+use fixture::command::abandon;
 use fixture::{data, scene, small_views};
 use std::ffi::OsString;
 use std::os::unix::fs::{FileTypeExt, symlink};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
@@ -165,7 +166,7 @@ fn generated_data_is_replaced_as_a_whole_and_only_where_nothing_else_lies_in_it(
     succeeds(&line(&words(3), &data));
     refused(&line(&words(2), &data), "--force");
     let regions = format!("generate --from {} --out", data.display());
-    refused(&forced(line(&regions, &data)), "the data that is read lies there");
+    refused(&forced(line(&regions, &data)), "is read, and lies in");
     succeeds(&forced(line(&words(2), &data)));
     assert_eq!(names(&data.join("images")), ["train_00.jpg", "train_01.jpg"], "no photo of the older data");
     let regions = format!("generate --from {} --out", data.display());
@@ -173,7 +174,7 @@ fn generated_data_is_replaced_as_a_whole_and_only_where_nothing_else_lies_in_it(
     succeeds(&line(&regions, &out));
     succeeds(&forced(line(&regions, &out)));
     std::fs::write(data.join("letter"), "precious").unwrap();
-    refused(&forced(line(&words(2), &data)), "not generated data");
+    refused(&forced(line(&words(2), &data)), "did not write: letter;");
     assert_eq!(std::fs::read_to_string(data.join("letter")).unwrap(), "precious");
     assert_eq!(names(folder.path()), ["data", "regions"]);
 }
@@ -244,53 +245,173 @@ fn a_full_disk_leaves_no_half_of_a_folder() {
     assert!(before.len() == 3 && before == after, "the old model is whole");
 }
 
-/// No process has this number: the kernel's largest is 2²².
-const GONE: &str = "partial-4000000000";
+/// `clean` in a folder, with a home of its own: what it says of unfinished files.
+fn cleaned(folder: &Path, extra: &[&str]) -> serde_json::Value {
+    let mut clean = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+    clean.env("SPLATVK_HOME", folder.join("home")).current_dir(folder).args(["clean", "--json"]).args(extra);
+    let output = clean.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let told: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let rows = told["kept"].as_array().unwrap();
+    rows.iter().find(|r| r["what"].as_str().unwrap().contains("unfinished")).unwrap().clone()
+}
 
 #[test]
 fn leftovers_of_killed_commands_go_with_the_next_and_with_clean() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
-    let living = format!("a.ply.partial-{}", std::process::id());
     let leave = || {
-        for name in [&format!("a.ply.{GONE}"), &format!("b.ply.{GONE}"), &living] {
-            std::fs::write(at(name), "half").unwrap();
+        for place in ["a.ply", "b.ply", "scene"] {
+            abandon(&at(&format!(".{place}.partial-splatvk")), place);
         }
-        std::fs::create_dir_all(at("answers").join(format!(".{GONE}/lemon"))).unwrap();
-        std::fs::create_dir_all(at(&format!(".scene.{GONE}/cameras"))).unwrap();
+        abandon(&at("answers/.partial-splatvk"), "answers");
     };
     leave();
     succeeds(&line("export SCENE --format ply --out", &at("a.ply")));
-    let kept =
-        [format!(".scene.{GONE}"), "a.ply".into(), living.clone(), "answers".into(), format!("b.ply.{GONE}")];
+    let kept = [".b.ply.partial-splatvk", ".scene.partial-splatvk", "a.ply", "answers"];
     assert_eq!(names(folder.path()), kept, "only those of the same place");
     // A folder with nothing but a leftover is empty.
     succeeds(&line("export SCENE --format colmap --out", &at("answers")));
     assert_eq!(names(&at("answers")), ["cameras.txt", "images.txt", "points3D.txt"]);
     std::fs::remove_dir_all(at("answers")).unwrap();
+    for name in [".b.ply.partial-splatvk", ".scene.partial-splatvk"] {
+        std::fs::remove_dir_all(at(name)).unwrap();
+    }
     leave();
-    let clean = |extra: &[&str]| -> serde_json::Value {
-        let mut clean = Command::new(env!("CARGO_BIN_EXE_splatvk"));
-        clean
-            .env("SPLATVK_HOME", at("home"))
-            .current_dir(folder.path())
-            .args(["clean", "--json"])
-            .args(extra);
-        let output = clean.output().unwrap();
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        let told: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
-        let rows = told["kept"].as_array().unwrap();
-        rows.iter().find(|r| r["what"].as_str().unwrap().contains("unfinished")).unwrap()["files"].clone()
-    };
-    assert_eq!(clean(&[]), 4);
-    assert!(at(&format!("b.ply.{GONE}")).exists(), "told, not deleted");
+    let told = cleaned(folder.path(), &[]);
+    assert!(told["files"] == 4 && told["paths"].to_string().contains(".b.ply.partial-splatvk"), "{told}");
+    assert!(at(".b.ply.partial-splatvk").exists(), "told, not deleted");
     let elsewhere = tempfile::tempdir().unwrap();
-    std::fs::write(elsewhere.path().join(format!("c.ply.{GONE}")), "half").unwrap();
-    assert_eq!(clean(&["--delete", elsewhere.path().to_str().unwrap()]), 5);
-    assert_eq!(clean(&[]), 0);
-    let left: Vec<PathBuf> = ["a.ply", &living, "answers"].map(PathBuf::from).to_vec();
-    assert_eq!(names(folder.path()).iter().map(PathBuf::from).collect::<Vec<_>>(), left);
+    abandon(&elsewhere.path().join(".c.ply.partial-splatvk"), "c.ply");
+    let again = elsewhere.path().join("..").join(elsewhere.path().file_name().unwrap());
+    let named = [elsewhere.path(), &again].map(|p| p.to_str().unwrap());
+    assert_eq!(cleaned(folder.path(), &["--delete", named[0], named[1], "."])["files"], 5, "each once");
+    assert_eq!(cleaned(folder.path(), &[])["files"], 0);
+    assert_eq!(names(folder.path()), ["a.ply", "answers"]);
     assert!(names(elsewhere.path()).is_empty());
+}
+
+#[test]
+fn clean_deletes_nothing_without_an_owners_mark() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::create_dir_all(at("precious/sub")).unwrap();
+    std::fs::write(at("precious/sub/IMG.jpg"), "precious").unwrap();
+    abandon(&at("precious/.x.partial-splatvk"), "x");
+    std::fs::create_dir(at("work")).unwrap();
+    for link in ["link.partial-99999999", ".link.partial-splatvk", ".partial-splatvk"] {
+        symlink("../precious", at("work").join(link)).unwrap();
+    }
+    symlink("../precious/.x.partial-splatvk", at("work/.x.partial-splatvk")).unwrap();
+    std::fs::write(at("work/notes.partial-20240115.md"), "precious").unwrap();
+    std::fs::write(at("work/.a.partial-splatvk"), "precious").unwrap();
+    for shoot in [".shoot.partial-20250101", ".shoot.partial-splatvk"] {
+        std::fs::create_dir(at("work").join(shoot)).unwrap();
+        std::fs::write(at("work").join(shoot).join("IMG.jpg"), "precious").unwrap();
+    }
+    let before = names(&at("work"));
+    assert_eq!(cleaned(&at("work"), &["--delete"])["files"], 0);
+    // A refused command, too, leaves everything, and a leftover of our own.
+    abandon(&at("work/.mine.partial-splatvk"), "mine");
+    refused(&line("render SCENE --cameras CAMERAS --out", &at("work")), "not empty");
+    refused(&line("export SCENE --format ply --out", &at("work/.a.partial-splatvk")), "--force");
+    refused(&line("export SCENE --format ply --out", &at("work/shoot")), "bears no mark");
+    assert!(at("work/.mine.partial-splatvk/owner").exists());
+    std::fs::remove_dir_all(at("work/.mine.partial-splatvk")).unwrap();
+    assert_eq!(names(&at("work")), before);
+    for shoot in [".shoot.partial-20250101", ".shoot.partial-splatvk"] {
+        assert!(at("work").join(shoot).join("IMG.jpg").exists());
+    }
+    assert!(at("precious/sub/IMG.jpg").exists() && at("precious/.x.partial-splatvk/owner").exists());
+}
+
+#[test]
+fn foreign_files_and_inputs_are_never_replaced() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    // A project that has a scene.json of its own, with the photos in it.
+    std::fs::create_dir_all(at("project/photos")).unwrap();
+    std::fs::write(at("project/scene.json"), r#"{"three": true}"#).unwrap();
+    for words in SCENES {
+        refused(&forced(line(words, &at("project"))), "not a scene");
+    }
+    copy(scene(), &at("room"));
+    std::fs::write(at("room/.DS_Store"), "x").unwrap();
+    let train = |images: &Path, cameras: &Path| {
+        let line: [OsString; 9] = [
+            "train".into(),
+            "--images".into(),
+            images.into(),
+            "--cameras".into(),
+            cameras.into(),
+            "--iterations=1".into(),
+            "--max-size=64".into(),
+            "--sh-degree=0".into(),
+            "--out".into(),
+        ];
+        forced(line.into_iter().chain([at("room").into()]).collect())
+    };
+    let (images, cameras, points) = small_views();
+    // Photos and notes that somebody has put into a scene.
+    std::fs::create_dir(at("room/my-photos")).unwrap();
+    std::fs::write(at("room/NOTES.txt"), "precious").unwrap();
+    refused(&train(&images, &cameras), "did not write: NOTES.txt, my-photos;");
+    std::fs::remove_dir(at("room/my-photos")).unwrap();
+    std::fs::remove_file(at("room/NOTES.txt")).unwrap();
+    // What the scene itself has, as an input.
+    refused(&train(&images, &at("room/cameras/original/transforms.json")), "is read, and lies in");
+    refused(&train(&at("room/cameras/images"), &cameras), "is read, and lies in");
+    let mut with_points = train(&images, &cameras);
+    with_points.extend(["--points".into(), at("room/point_cloud.ply").into()]);
+    refused(&with_points, "is read, and lies in");
+    refused(&forced(line("export SCENE --format ply --out", &points)).into_iter().map(|w| if w == scene().as_os_str() { points.clone().into() } else { w }).collect::<Vec<_>>(), "is read");
+    let render = format!("render {0} --cameras {0}/cameras/transforms.json --out", at("room").display());
+    refused(&forced(line(&render, &at("room/cameras/images"))), "what this command reads");
+    assert!(at("room/scene.json").exists() && at("room/cameras/images").exists());
+    // A scene with nothing else in it is replaced.
+    let before = std::fs::read(at("room/run.json")).unwrap();
+    succeeds(&train(&images, &cameras));
+    assert!(std::fs::read(at("room/run.json")).unwrap() != before && !at("room/.DS_Store").exists());
+    assert_eq!(names(folder.path()), ["project", "room"]);
+}
+
+fn copy(from: &Path, to: &Path) {
+    std::fs::create_dir(to).unwrap();
+    for entry in std::fs::read_dir(from).unwrap().map(|e| e.unwrap()) {
+        let to = to.join(entry.file_name());
+        match entry.path().is_dir() {
+            true => copy(&entry.path(), &to),
+            false => drop(std::fs::copy(entry.path(), to).unwrap()),
+        }
+    }
+}
+
+#[test]
+fn second_command_for_one_place_is_refused() {
+    for (words, seconds) in [
+        ("generate --size 1600x1200 --views 40 --out", 1.0),
+        ("ablate alignment --data TRUTH --seeds 1,2,3,4,5,6,7,8 --out", 2.0),
+        ("bench training --splats 2000 --seconds 600 --json", 1.0),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let place = folder.path().join("out");
+        let mut first = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+        first.env_remove("SPLATVK_MODELS").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+        let mut first = first.args(line(words, &place)).spawn().unwrap();
+        std::thread::sleep(Duration::from_secs_f64(seconds));
+        let name = format!("process {}", first.id());
+        for again in [line(words, &place), forced(line(words, &place))] {
+            refused(&again, &name);
+        }
+        refused(&line("export SCENE --format ply --out", &place), if place.is_dir() { "folder" } else { &name });
+        // Killed, it is in nobody's way.
+        first.kill().unwrap();
+        first.wait().unwrap();
+        assert_eq!(cleaned(folder.path(), &["--delete"])["files"], 1, "{words}");
+        std::fs::remove_dir_all(folder.path().join("home")).ok();
+        let left: Vec<String> = names(folder.path()).into_iter().filter(|n| n != "out").collect();
+        assert!(left.is_empty() && (!place.is_dir() || names(&place).is_empty()), "{left:?}");
+    }
 }
 
 /// Commands that take longer than the test, each with what it has written when it is told to stop.

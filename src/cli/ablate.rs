@@ -1,6 +1,6 @@
 //! `splatvk ablate`
 use super::args::{AblateArgs, LayoutArg};
-use super::outputs::{check_file, write_file};
+use super::outputs::WrittenFile;
 use super::plan::existing;
 use super::print::{print, print_json};
 use super::progress;
@@ -8,7 +8,7 @@ use crate::ablate::{
     self, DataSet, Finished, FinishedTable, Layout, Measurement, PaperSet, Plan, Regions, Sources, TABLES,
     Table,
 };
-use crate::files::{Kind, check_place};
+use crate::files::{Kind, Partial, check_place};
 use crate::format::write_json;
 use crate::gpu::Device;
 use crate::infer::Registry;
@@ -30,7 +30,9 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
     let out = args.out.clone().unwrap_or_else(|| default_out(&sets));
     // What a report says of an earlier run is its own to go on with.
     check_place(&out, Kind::Folder, args.force || (args.resume && out.join(REPORT).is_file()))?;
-    check_file(&out.join(REPORT), true)?;
+    // As long as it works, no other command writes there.
+    let _reserved = Partial::inside(&out)?;
+    check_place(&out.join(REPORT), Kind::File, true)?;
     let earlier = if args.resume { earlier(&out.join(REPORT))? } else { Vec::new() };
     let device = Device::open(args.device.device.as_deref())?;
     let (clock, progress) = (Instant::now(), progress::reporter());
@@ -93,14 +95,15 @@ impl Report<'_> {
 
     fn write(&self, out: &Path) -> Result<()> {
         let text = |file: &Path, text: String| {
-            write_file(file, true, |partial| std::fs::write(partial, text).map_err(Error::unwritable(file)))
+            let write = |partial: &Path| std::fs::write(partial, text).map_err(Error::unwritable(file));
+            WrittenFile::open(file, true, &[])?.keep(write)
         };
         for table in self.begun() {
             let file = |extension: &str| out.join(format!("{}.{extension}", table.table.name));
             text(&file("txt"), table.text())?;
             text(&file("svg"), table.svg())?;
         }
-        write_file(&out.join(REPORT), true, |file| write_json(file, &self.json()))
+        WrittenFile::open(&out.join(REPORT), true, &[])?.keep(|file| write_json(file, &self.json()))
     }
 }
 

@@ -1,7 +1,7 @@
 //! `splatvk bench`
 use super::args::{BenchArgs, BenchPart};
 use super::models::checked;
-use super::outputs::{WrittenFiles, check_file, write_file};
+use super::outputs::{WrittenFile, WrittenFiles};
 use super::print::{listing, print};
 use super::progress;
 use super::scene;
@@ -13,6 +13,7 @@ use crate::infer::installed::inventory;
 use crate::infer::{RegionEncoder, Registry};
 use crate::run::encoder;
 use crate::{Error, Result};
+use std::path::Path;
 
 pub fn bench(args: &BenchArgs) -> Result<()> {
     if let Some([a, b]) = args.compare.as_deref() {
@@ -21,7 +22,9 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     let budget = check(args)?;
     if let Some(folder) = &args.write_scene {
         let workload = workload(args)?;
-        let out = WrittenFiles::open(folder, args.force)?;
+        let inputs = [args.scene.as_deref(), args.camera.as_deref()];
+        let inputs: Vec<&Path> = inputs.into_iter().flatten().collect();
+        let out = WrittenFiles::open(folder, args.force, &inputs)?;
         workload.write(&Device::open(args.device.as_deref())?, out.folder())?;
         return listing(&out.keep()?, false);
     }
@@ -42,7 +45,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     let workload =
         if has(BenchPart::Training) || !args.sweep.is_empty() { Some(workload(args)?) } else { None };
     let asked = if has(BenchPart::Query) { Some(scene_and_encoder(args)?) } else { None };
-    writable(args)?;
+    let out = writable(args)?;
     let device = Device::open(args.device.as_deref())?;
     let mut bench = Bench::new(&device, budget)?;
     if let Some(workload) = &workload {
@@ -60,7 +63,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         let field = scene.language.ok_or_else(|| Error::work("the scene lost its language"))?;
         bench.query((&scene.splats, field, &scene.cameras), encoder, &args.query)?;
     }
-    keep(args, &bench.report)?;
+    keep(out, &bench.report)?;
     print(&bench.report.table())
 }
 
@@ -108,7 +111,7 @@ fn models(registry: &Registry) -> Result<()> {
 
 /// Photos → cameras on data with a known answer; needs no device.
 fn cameras(args: &BenchArgs) -> Result<()> {
-    let registry = of_data(args, "cameras")?;
+    let (registry, out) = of_data(args, "cameras")?;
     let reading =
         bench::cameras::PhotoInput { max_size: args.max_size, copies: args.copies, pairs: args.pairs };
     let progress = progress::reporter();
@@ -116,23 +119,23 @@ fn cameras(args: &BenchArgs) -> Result<()> {
     let mut show =
         |row: &bench::cameras::CameraRow| print(&(header.take().unwrap_or_default() + &row.text()));
     let report = bench::cameras::measure(&args.data, reading, &registry, progress.as_ref(), &mut show)?;
-    keep(args, &report)?;
+    keep(out, &report)?;
     print(&report.text())
 }
 
 /// Photos → masks on data with true masks; needs no device.
 fn masks(args: &BenchArgs) -> Result<()> {
-    let registry = of_data(args, "masks")?;
+    let (registry, out) = of_data(args, "masks")?;
     let progress = progress::reporter();
     let mut header = Some(bench::masks::header());
     let mut show = |row: &bench::masks::MaskRow| print(&(header.take().unwrap_or_default() + &row.text()));
     let report = bench::masks::measure(&args.data, args.max_size, &registry, progress.as_ref(), &mut show)?;
-    keep(args, &report)?;
+    keep(out, &report)?;
     print(&report.text())
 }
 
 /// Checks the options of a part that reads folders with ground truth and runs by itself.
-fn of_data(args: &BenchArgs, part: &str) -> Result<Registry> {
+fn of_data(args: &BenchArgs, part: &str) -> Result<(Registry, Option<WrittenFile>)> {
     if args.parts.len() > 1 {
         return Err(Error::input(format!("bench {part}: runs alone; leave the other parts out")));
     }
@@ -141,14 +144,12 @@ fn of_data(args: &BenchArgs, part: &str) -> Result<Registry> {
             "bench {part}: give folders with ground_truth.json with --data DIR..."
         )));
     }
-    writable(args)?;
-    args.registry()
+    Ok((args.registry()?, writable(args)?))
 }
 
 /// Writes the report where `--json` says.
-fn keep(args: &BenchArgs, report: &impl serde::Serialize) -> Result<()> {
-    let Some(file) = &args.json else { return Ok(()) };
-    write_file(file, args.force, |partial| write_json(partial, report))
+fn keep(out: Option<WrittenFile>, report: &impl serde::Serialize) -> Result<()> {
+    out.map_or(Ok(()), |out| out.keep(|file| write_json(file, report)))
 }
 
 /// The scene and the text encoder of its space.
@@ -166,6 +167,7 @@ fn scene_and_encoder(args: &BenchArgs) -> Result<(scene_dir::Scene, Box<dyn Regi
 }
 
 /// Finds out before the measurements take their time whether the result can be kept.
-fn writable(args: &BenchArgs) -> Result<()> {
-    args.json.as_deref().map_or(Ok(()), |file| check_file(file, args.force))
+fn writable(args: &BenchArgs) -> Result<Option<WrittenFile>> {
+    let inputs: Vec<&Path> = [args.scene.as_deref(), args.camera.as_deref()].into_iter().flatten().collect();
+    args.json.as_deref().map(|file| WrittenFile::open(file, args.force, &inputs)).transpose()
 }

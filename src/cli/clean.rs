@@ -2,7 +2,7 @@
 use super::args::CleanArgs;
 use super::print::{print, print_json};
 use crate::fetch;
-use crate::files::{leftovers, remove_any};
+use crate::files::{leftovers, remove_leftover};
 use crate::infer::{Registry, cache};
 use crate::pipeline::Store;
 use crate::{Error, Result};
@@ -10,51 +10,66 @@ use serde_json::json;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Kept things of one kind, and how one of them goes.
+/// Most things of a kind that are listed.
+const LISTED: usize = 20;
+
+/// Kept things of one kind.
 struct KeptRow {
     what: &'static str,
     folder: PathBuf,
     things: Vec<(PathBuf, u64)>,
-    remove: fn(&Path) -> Result<()>,
 }
 
 impl KeptRow {
     fn bytes(&self) -> u64 {
         self.things.iter().map(|f| f.1).sum()
     }
+
+    /// A line for each thing, or for the first of many.
+    fn listed(&self) -> String {
+        let line = |(path, _): &(PathBuf, u64)| format!("  {}\n", path.display());
+        let more = match self.things.len().saturating_sub(LISTED) {
+            0 => String::new(),
+            more => format!("  and {more} more\n"),
+        };
+        self.things.iter().take(LISTED).map(line).collect::<String>() + &more
+    }
 }
 
 pub fn clean(args: &CleanArgs) -> Result<()> {
-    let stages = crate::run::stage_folder();
-    let (answers, folder) = (cache::files(), cache::folder());
+    let (stages, answers) = (crate::run::stage_folder()?, cache::folder()?);
     let mut rows = vec![
         KeptRow {
             what: "stages of runs, for --resume",
             things: [Store::list(&stages), partial(&stages)].concat(),
             folder: stages,
-            remove,
         },
-        KeptRow { what: "answers of networks", things: [answers, partial(&folder)].concat(), folder, remove },
+        KeptRow {
+            what: "answers of networks",
+            things: [cache::files(&answers), partial(&answers), partial(&answers.join("sums"))].concat(),
+            folder: answers,
+        },
     ];
-    rows.extend(Registry::places(args.models.as_deref()).into_iter().map(|folder| KeptRow {
+    rows.extend(Registry::places(args.models.as_deref())?.into_iter().map(|folder| KeptRow {
         what: "models that were fetched in part",
         things: fetch::leftovers(&folder),
         folder,
-        remove: fetch::sweep,
     }));
     rows.push(KeptRow {
         what: "unfinished files of commands that were killed",
         things: unfinished(&args.folders)?,
         folder: PathBuf::from("."),
-        remove: |path| gone(remove_any(path), path),
     });
     if args.delete {
         for row in &rows {
-            row.things.iter().try_for_each(|(path, _)| (row.remove)(path))?;
+            row.things.iter().try_for_each(|(path, _)| remove(path))?;
         }
     }
     if args.json {
-        let one = |r: &KeptRow| json!({ "what": r.what, "folder": r.folder, "files": r.things.len(), "bytes": r.bytes() });
+        let one = |r: &KeptRow| {
+            let paths: Vec<String> = r.things.iter().map(|(path, _)| path.display().to_string()).collect();
+            json!({ "what": r.what, "folder": r.folder, "files": r.things.len(), "bytes": r.bytes(), "paths": paths })
+        };
         return print_json(
             &json!({ "deleted": args.delete, "kept": rows.iter().map(one).collect::<Vec<_>>() }),
         );
@@ -68,6 +83,9 @@ pub fn clean(args: &CleanArgs) -> Result<()> {
             r.things.len(),
             r.folder.display()
         ))?;
+        if !args.delete {
+            print(&r.listed())?;
+        }
     }
     match args.delete {
         true => Ok(()),
@@ -79,7 +97,7 @@ pub fn clean(args: &CleanArgs) -> Result<()> {
 
 /// What processes that are gone have begun in a folder of the program's own.
 fn partial(folder: &Path) -> Vec<(PathBuf, u64)> {
-    leftovers(folder, None).into_iter().map(|path| (path.clone(), size(&path))).collect()
+    leftovers(folder).into_iter().map(|path| (path.clone(), size(&path))).collect()
 }
 
 /// What processes that are gone have begun in the current folder, in out/ and in `folders`, and in the folders of each.
@@ -93,11 +111,13 @@ fn unfinished(folders: &[PathBuf]) -> Result<Vec<(PathBuf, u64)>> {
         };
         // Links are not followed: what they lead to is not below.
         let below = entries.flatten().filter(|e| e.file_type().is_ok_and(|t| t.is_dir())).map(|e| e.path());
-        for path in below.chain([folder.to_path_buf()]).flat_map(|f| leftovers(&f, None)) {
-            found.insert(path.canonicalize().unwrap_or_else(|_| path.clone()), size(&path));
+        for folder in below.chain([folder.to_path_buf()]) {
+            // Each folder once, under whichever name.
+            let Ok(whole) = folder.canonicalize() else { continue };
+            found.entry(whole).or_insert_with(|| partial(&folder));
         }
     }
-    Ok(found.into_iter().collect())
+    Ok(found.into_values().flatten().collect())
 }
 
 /// Bytes of a file, or of all files in a folder.
@@ -111,13 +131,14 @@ fn size(path: &Path) -> u64 {
     }
 }
 
-fn remove(file: &Path) -> Result<()> {
-    gone(std::fs::remove_file(file), file)
-}
-
-/// What another process has removed meanwhile is no error.
-fn gone(outcome: std::io::Result<()>, path: &Path) -> Result<()> {
-    match outcome {
+/// Removes a file, or, by its mark, a folder of unfinished work. What another process has removed meanwhile is no error.
+fn remove(path: &Path) -> Result<()> {
+    let removed = match path.symlink_metadata() {
+        Ok(meta) if meta.is_dir() => remove_leftover(path),
+        Ok(_) => std::fs::remove_file(path),
+        Err(e) => Err(e),
+    };
+    match removed {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(path)(e)),
         _ => Ok(()),
     }

@@ -19,9 +19,13 @@ use crate::run::view::Viewer;
 use crate::scene::LanguageField;
 use crate::{Error, Result};
 use serde::Serialize;
+use std::path::{Path, PathBuf};
 
 pub fn eval(args: &EvalArgs) -> Result<()> {
-    let mut out = args.out.as_deref().map(|out| WrittenFiles::open(out, args.force)).transpose()?;
+    let inputs: Vec<&Path> =
+        [Some(&args.scene), Some(&args.ground_truth), args.cameras.as_ref()].into_iter().flatten().map(PathBuf::as_path).collect();
+    let open = |out| WrittenFiles::open(out, args.force, &inputs);
+    let mut out = args.out.as_deref().map(open).transpose()?;
     let scene = scene::load(&args.scene)?;
     match args.protocol {
         ProtocolArg::Field if args.cameras.is_some() => Err(Error::input(

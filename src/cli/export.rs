@@ -1,13 +1,13 @@
 //! `splatvk export`
-use super::outputs::{WrittenFiles, check_file, write_file};
+use super::outputs::{WrittenFile, WrittenFiles, check_file};
 use super::print::listing;
 use super::progress;
 use super::scene;
 use crate::files::{Kind, check_place};
-use crate::format::gaussians::{self, FORMATS, SplatFormat};
+use crate::format::gaussians::{FORMATS, Reserved, SplatFormat};
 use crate::format::scene_dir::Scene;
 use crate::format::transform::transform_splats;
-use crate::format::{colmap, ply, side_file, transforms};
+use crate::format::{colmap, ply, transforms};
 use crate::scene::{Camera, PointCloud, SH_C0, Similarity, Splats, UpAxis};
 use crate::{Error, Result};
 use clap::Args;
@@ -122,7 +122,7 @@ fn place(scene: &mut Scene, points: &mut Option<PointCloud>, by: &Similarity) {
 }
 
 pub fn export(args: &ExportArgs) -> Result<()> {
-    let folder = reserved(args)?;
+    let out = Out::reserve(args)?;
     let mut scene = scene::load(&args.scene)?;
     if args.only_seen {
         keep_seen(&mut scene, args)?;
@@ -136,9 +136,30 @@ pub fn export(args: &ExportArgs) -> Result<()> {
         place(&mut scene, &mut points, &by);
     }
     progress::reporter().check()?;
-    match args.format.as_str() {
-        // Alone of all formats it can hold the language itself, and any degree.
-        "ply" => {
+    match out {
+        Out::Folder(mut folder) => {
+            let cameras = cameras(&scene, args)?;
+            let [text, binary] = colmap::FILES;
+            let (write, other): (fn(&_, &_, _) -> _, _) = match args.format.as_str() {
+                "colmap" => (colmap::write, binary),
+                _ => (colmap::write_binary, text),
+            };
+            write(folder.folder(), cameras, points.as_ref())?;
+            folder.outdate(other.into_iter());
+            folder.keep()?;
+        }
+        Out::Splats(files, format) => {
+            if let Some(brightest) = format.brightest {
+                warn_of_range(&scene.splats, brightest);
+            }
+            warn_of_models(&scene);
+            files.write(&scene.splats, scene.language.as_ref(), format)?;
+        }
+        Out::File(file) if args.format == "transforms" => {
+            let cameras = cameras(&scene, args)?;
+            file.keep(|path| transforms::write(path, cameras, None))?;
+        }
+        Out::File(file) => {
             let language = if args.with_features { scene.language.as_ref() } else { None };
             if args.with_features && language.is_none() {
                 return Err(Error::input(format!(
@@ -150,61 +171,50 @@ pub fn export(args: &ExportArgs) -> Result<()> {
                 warn_of_models(&scene);
             }
             let options = ply::PlyOptions { degree: args.ply_degree, language };
-            write_file(&args.out, args.force, |path| ply::write_splats(path, &scene.splats, options))?;
-        }
-        "transforms" => {
-            let cameras = cameras(&scene, args)?;
-            write_file(&args.out, args.force, |path| transforms::write(path, cameras, None))?;
-        }
-        "colmap" | "colmap-bin" => {
-            let cameras = cameras(&scene, args)?;
-            let [text, binary] = colmap::FILES;
-            let (write, other): (fn(&_, &_, _) -> _, _) = match args.format.as_str() {
-                "colmap" => (colmap::write, binary),
-                _ => (colmap::write_binary, text),
-            };
-            if let Some(mut folder) = folder {
-                write(folder.folder(), cameras, points.as_ref())?;
-                folder.outdate(other.into_iter());
-                folder.keep()?;
-            }
-        }
-        name => {
-            let format =
-                SplatFormat::named(name).ok_or_else(|| Error::input(format!("--format {name}: unknown")))?;
-            if let Some(brightest) = format.brightest {
-                warn_of_range(&scene.splats, brightest);
-            }
-            warn_of_models(&scene);
-            gaussians::write_as(&args.out, &scene.splats, scene.language.as_ref(), format)?;
+            file.keep(|path| ply::write_splats(path, &scene.splats, options))?;
         }
     }
     listing(std::slice::from_ref(&args.out), args.json)
 }
 
-/// Refuses a place that may not be written before the scene is read; the folder, where one is asked for.
-fn reserved(args: &ExportArgs) -> Result<Option<WrittenFiles>> {
-    let is_folder = args.format.starts_with("colmap");
-    // A link is said to be one wherever it leads.
-    check_place(&args.out, if is_folder { Kind::Folder } else { Kind::File }, true)?;
-    let whole = |p: &Path| p.canonicalize().ok();
-    if let (Some(out), Some(scene)) = (whole(&args.out), whole(&args.scene))
-        && scene.is_dir()
-        && out.starts_with(&scene)
-    {
-        return Err(Error::input(format!(
-            "{}: a part of the scene that is exported; choose another --out",
-            args.out.display()
-        )));
+/// Where a format goes.
+enum Out {
+    /// The files of a COLMAP model.
+    Folder(WrittenFiles),
+    /// One file: cameras, or a PLY, which alone of all formats can hold the language itself, and any degree.
+    File(WrittenFile),
+    /// Splats, and the language beside them.
+    Splats(Reserved, &'static SplatFormat),
+}
+
+impl Out {
+    /// Refuses a place that may not be written before the scene is read.
+    fn reserve(args: &ExportArgs) -> Result<Out> {
+        let is_folder = args.format.starts_with("colmap");
+        // A link is said to be one wherever it leads.
+        check_place(&args.out, if is_folder { Kind::Folder } else { Kind::File }, true)?;
+        let whole = |p: &Path| p.canonicalize().ok();
+        if let (Some(out), Some(scene)) = (whole(&args.out), whole(&args.scene))
+            && scene.is_dir()
+            && out.starts_with(&scene)
+        {
+            return Err(Error::input(format!(
+                "{}: a part of the scene that is exported; choose another --out",
+                args.out.display()
+            )));
+        }
+        let inputs = [args.scene.as_path()];
+        if is_folder {
+            return WrittenFiles::open(&args.out, args.force, &inputs).map(Out::Folder);
+        }
+        match SplatFormat::named(&args.format).filter(|format| format.name != "ply") {
+            Some(format) => {
+                check_file(&args.out, args.force, &inputs)?;
+                Ok(Out::Splats(Reserved::open(&args.out, args.force)?, format))
+            }
+            None => WrittenFile::open(&args.out, args.force, &inputs).map(Out::File),
+        }
     }
-    if is_folder {
-        return WrittenFiles::open(&args.out, args.force).map(Some);
-    }
-    check_file(&args.out, args.force)?;
-    if SplatFormat::named(&args.format).is_some_and(|format| format.name != "ply") {
-        check_place(&side_file::path(&args.out), Kind::File, args.force)?;
-    }
-    Ok(None)
 }
 
 /// Warns where a file of one set of splats gets features that were trained on others.

@@ -22,7 +22,7 @@ struct Wanted {
 }
 
 pub fn fetch(args: &FetchArgs) -> Result<()> {
-    let places = Registry::places(args.device.models.as_deref());
+    let places = Registry::places(args.device.models.as_deref())?;
     let folder = places.first().ok_or_else(|| Error::input("--models: names no folder"))?;
     let client = Client::from_environment()?;
     let look = |entry| Ok(Wanted { entry, present: fetch::present(entry, folder)? });

@@ -10,20 +10,9 @@ use std::path::Path;
 
 pub fn generate(args: &GenerateArgs) -> Result<()> {
     let flaws = flaws(args)?;
-    let whole = |p: &Path| p.canonicalize().ok();
-    if let (Some(from), Some(out)) = (args.from.as_deref().and_then(whole), whole(&args.out))
-        && from.starts_with(&out)
-    {
-        return Err(Error::input(format!(
-            "{}: the data that is read lies there; choose another --out",
-            args.out.display()
-        )));
-    }
-    let workspace = Workspace::replacing(
-        &args.out,
-        args.force,
-        Replaced { name: "generated data", is: synth::is_generated },
-    )?;
+    let inputs: Vec<&Path> = args.from.as_deref().into_iter().collect();
+    let generated = Replaced { name: "generated data", foreign: synth::foreign };
+    let workspace = Workspace::replacing(&args.out, args.force, &inputs, generated)?;
     match &args.from {
         Some(data) => synth::write_regions(data, workspace.path(), &flaws)?,
         None => synth::generate(workspace.path(), &spec(args)?, &flaws, progress::reporter().as_ref())?,

@@ -1,48 +1,71 @@
 //! What a command writes where the user says: by the rule of [`check_place`], and all of it or none.
-use crate::files::{Kind, Partial, check_place};
-use crate::format::write_whole_file;
+use crate::files::{self, Kind, Partial, check_place, check_spared};
+use crate::format::scene_files;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// Refuses a file that may not be written, before any work.
-pub fn check_file(file: &Path, force: bool) -> Result<()> {
-    if file.file_name().is_none() {
-        return Err(Error::input(format!("{}: not a file name; choose one", file.display())));
-    }
-    check_place(file, Kind::File, force)?;
-    // Only writing tells whether a folder takes files; what is made for it goes again.
-    let partial = Partial::beside(file, false).map_err(Error::unwritable(file))?;
-    std::fs::File::create(partial.path()).map(drop).map_err(Error::unwritable(file))
+/// A file that a command will write, whole or not at all. As long as it is reserved, no other command writes there.
+pub struct WrittenFile {
+    place: PathBuf,
+    force: bool,
+    partial: Partial,
 }
 
-/// Writes a file that appears whole or not at all.
-pub fn write_file(file: &Path, force: bool, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
-    write_whole_file(file, |partial| {
-        write(partial)?;
+impl WrittenFile {
+    /// Reserves the place before any work. One that may not be written, or that is one of the `inputs`, is bad input.
+    pub fn open(place: &Path, force: bool, inputs: &[&Path]) -> Result<WrittenFile> {
+        check_file(place, force, inputs)?;
+        Ok(WrittenFile { place: place.to_path_buf(), force, partial: Partial::beside(place)? })
+    }
+
+    /// Writes the file.
+    pub fn keep(self, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+        let WrittenFile { place, force, partial } = self;
+        write(partial.path())?;
         // What came there while it was written is not ours.
-        check_place(file, Kind::File, force)
-    })
+        check_place(&place, Kind::File, force)?;
+        partial.finish(|path| std::fs::rename(path, &place).map_err(Error::unwritable(&place)))
+    }
+}
+
+/// Refuses a file that may not be written.
+pub fn check_file(place: &Path, force: bool, inputs: &[&Path]) -> Result<()> {
+    if place.file_name().is_none() {
+        return Err(Error::input(format!("{}: not a file name; choose one", place.display())));
+    }
+    check_place(place, Kind::File, force)?;
+    check_spared(place, inputs.iter().copied())
 }
 
 /// Files of a command that writes into a folder. They are written into a hidden folder, beside one that is to be made, else in it;
 /// dropped without [`WrittenFiles::keep`], it vanishes with all that is in it.
 pub struct WrittenFiles {
     folder: PathBuf,
+    force: bool,
     partial: Partial,
+    /// What the command reads, whole paths.
+    inputs: Vec<PathBuf>,
     names: Vec<PathBuf>,
     /// Files of the folder that go once those are there.
     outdated: Vec<PathBuf>,
 }
 
 impl WrittenFiles {
-    /// Opens a folder for writing, creating it where needed; with `force` it may have files already. A place that cannot be
-    /// written is bad input.
-    pub fn open(folder: &Path, force: bool) -> Result<WrittenFiles> {
+    /// Reserves a folder, creating it where needed; with `force` it may have files already, but of the `inputs` none is replaced. A
+    /// place that cannot be written, or that another command writes to, is bad input.
+    pub fn open(folder: &Path, force: bool, inputs: &[&Path]) -> Result<WrittenFiles> {
         check_place(folder, Kind::Folder, force)?;
-        let partial = if folder.exists() { Partial::inside(folder) } else { Partial::beside(folder, true) };
-        let partial = partial.map_err(Error::unwritable(folder))?;
+        let partial = if folder.exists() {
+            // It may be about to be replaced as a whole.
+            files::check_free(folder)?;
+            Partial::inside(folder)?
+        } else {
+            Partial::beside(folder)?
+        };
         std::fs::create_dir(partial.path()).map_err(Error::unwritable(folder))?;
-        Ok(WrittenFiles { folder: folder.to_path_buf(), partial, names: Vec::new(), outdated: Vec::new() })
+        let inputs = inputs.iter().filter_map(|input| input.canonicalize().ok()).collect();
+        let (names, outdated) = (Vec::new(), Vec::new());
+        Ok(WrittenFiles { folder: folder.to_path_buf(), force, partial, inputs, names, outdated })
     }
 
     /// Files of these names say the same in another form: what the folder has of them would contradict what is written.
@@ -68,18 +91,20 @@ impl WrittenFiles {
     /// Everything is written: moves the files to their places, over ordinary files of their names only, and returns them; those of
     /// [`WrittenFiles::file`] first, in their order.
     pub fn keep(self) -> Result<Vec<PathBuf>> {
-        let WrittenFiles { folder, partial, mut names, outdated } = self;
+        let WrittenFiles { folder, force, partial, inputs, mut names, outdated } = self;
         let mut found = Vec::new();
         list(partial.path(), Path::new(""), &mut found)?;
         found.retain(|name| !names.contains(name));
         found.sort();
         names.extend(found);
-        // Everything that may be refused comes before the first file is moved.
+        // Everything that may be refused comes before the first file is moved. What came there meanwhile is not ours.
+        check_ours(&folder, force)?;
         for name in &names {
             for part in name.ancestors().skip(1).filter(|p| !p.as_os_str().is_empty()) {
                 check_place(&folder.join(part), Kind::Folder, true)?;
             }
             check_place(&folder.join(name), Kind::File, true)?;
+            check_unread(&folder, &folder.join(name), &inputs)?;
         }
         let outdated: Vec<PathBuf> =
             outdated.iter().map(|name| folder.join(name)).filter(|p| p.symlink_metadata().is_ok()).collect();
@@ -95,10 +120,37 @@ impl WrittenFiles {
                 std::fs::create_dir_all(parent).map_err(Error::unwritable(parent))?;
                 std::fs::rename(from.join(name), place).map_err(Error::unwritable(place))?;
             }
-            outdated.iter().try_for_each(|p| std::fs::remove_file(p).map_err(Error::unwritable(p)))?;
-            std::fs::remove_dir_all(from).map_err(Error::io(from))
+            outdated.iter().try_for_each(|p| std::fs::remove_file(p).map_err(Error::unwritable(p)))
         })?;
+        files::sweep(&folder);
         Ok(places)
+    }
+}
+
+/// Refuses a folder that without `force` is to be empty but for what is being written.
+fn check_ours(folder: &Path, force: bool) -> Result<()> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path());
+    let hidden = |p: &PathBuf| p.as_os_str().as_encoded_bytes().ends_with(files::HIDDEN.as_bytes());
+    match entries.filter(|p| !hidden(p)).min() {
+        Some(other) if !force => Err(Error::input(format!(
+            "{}: came there while this command worked; choose another folder, or --force to replace files of the same names",
+            other.display()
+        ))),
+        _ => Ok(()),
+    }
+}
+
+/// Refuses to replace a file that is read: an input itself, one of a scene's own, or one of a folder of inputs into which the command
+/// writes.
+fn check_unread(folder: &Path, place: &Path, inputs: &[PathBuf]) -> Result<()> {
+    let (Ok(whole), Ok(folder)) = (place.canonicalize(), folder.canonicalize()) else { return Ok(()) };
+    let read = |input: &PathBuf| *input == whole || *input == folder || scene_files::is_own(input, &whole);
+    match inputs.iter().any(read) {
+        true => Err(Error::input(format!(
+            "{}: is there already, among what this command reads, and stays; choose another --out",
+            place.display()
+        ))),
+        false => Ok(()),
     }
 }
 
@@ -130,23 +182,23 @@ mod tests {
     fn all_or_nothing() {
         let base = tempfile::tempdir().unwrap();
         let out = base.path().join("a/b");
-        let mut o = WrittenFiles::open(&out, false).unwrap();
+        let mut o = WrittenFiles::open(&out, false, &[]).unwrap();
         std::fs::write(o.file("x/y.png").unwrap(), "1").unwrap();
         drop(o);
         assert!(!base.path().join("a").exists());
-        let mut o = WrittenFiles::open(&out, false).unwrap();
+        let mut o = WrittenFiles::open(&out, false, &[]).unwrap();
         std::fs::write(o.file("y.png").unwrap(), "1").unwrap();
         std::fs::write(o.folder().join("found.png"), "1").unwrap();
         assert!(!out.join("y.png").exists(), "not before all is written");
         assert_eq!(o.keep().unwrap(), [out.join("y.png"), out.join("found.png")]);
-        assert!(refused(WrittenFiles::open(&out, false)).contains("--force"));
-        let mut o = WrittenFiles::open(&out, true).unwrap();
+        assert!(refused(WrittenFiles::open(&out, false, &[])).contains("--force"));
+        let mut o = WrittenFiles::open(&out, true, &[]).unwrap();
         std::fs::write(o.file("y.png").unwrap(), "2").unwrap();
         std::fs::write(o.file("z.png").unwrap(), "2").unwrap();
         drop(o);
         assert_eq!(std::fs::read_to_string(out.join("y.png")).unwrap(), "1");
         assert_eq!(std::fs::read_dir(&out).unwrap().count(), 2);
-        refused(WrittenFiles::open(&out.join("y.png/deeper"), true));
+        refused(WrittenFiles::open(&out.join("y.png/deeper"), true, &[]));
     }
 
     #[cfg(unix)]
@@ -160,7 +212,7 @@ mod tests {
         std::os::unix::fs::symlink(&precious, out.join("lemon")).unwrap();
         std::os::unix::fs::symlink(precious.join("a.png"), out.join("a.png")).unwrap();
         for name in ["lemon/a.png", "a.png"] {
-            let mut o = WrittenFiles::open(&out, true).unwrap();
+            let mut o = WrittenFiles::open(&out, true, &[]).unwrap();
             std::fs::write(o.file("first.png").unwrap(), "1").unwrap();
             std::fs::write(o.file(name).unwrap(), "1").unwrap();
             assert!(refused(o.keep()).contains("symbolic link"), "{name}");
@@ -168,5 +220,34 @@ mod tests {
         }
         assert_eq!(std::fs::read_to_string(precious.join("a.png")).unwrap(), "precious");
         assert_eq!(std::fs::read_dir(&out).unwrap().count(), 2);
+    }
+
+    #[test]
+    fn second_writer_and_read_files_are_refused() {
+        let base = tempfile::tempdir().unwrap();
+        let at = |name: &str| base.path().join(name);
+        for out in [at("new"), base.path().to_path_buf()] {
+            let first = WrittenFiles::open(&out, true, &[]).unwrap();
+            assert!(refused(WrittenFiles::open(&out, true, &[])).contains("another splatvk is writing there"));
+            drop(first);
+        }
+        // Another program wrote there meanwhile.
+        let mut o = WrittenFiles::open(&at("new"), false, &[]).unwrap();
+        std::fs::write(o.file("a.png").unwrap(), "1").unwrap();
+        std::fs::create_dir(at("new")).unwrap();
+        std::fs::write(at("new/a.png"), "precious").unwrap();
+        assert!(refused(o.keep()).contains("while this command worked"));
+        for input in [at("new"), at("new/a.png")] {
+            let mut o = WrittenFiles::open(&at("new"), true, &[&input]).unwrap();
+            std::fs::write(o.file("a.png").unwrap(), "1").unwrap();
+            assert!(refused(o.keep()).contains("what this command reads"));
+        }
+        assert_eq!(std::fs::read_to_string(at("new/a.png")).unwrap(), "precious");
+        assert!(refused(WrittenFile::open(&at("new/a.png"), true, &[&at("new/a.png")])).contains("is read"));
+        let first = WrittenFile::open(&at("new/a.png"), true, &[]).unwrap();
+        assert!(refused(WrittenFile::open(&at("new/a.png"), true, &[])).contains("another splatvk"));
+        first.keep(|file| std::fs::write(file, "2").map_err(Error::io(file))).unwrap();
+        assert_eq!(std::fs::read_to_string(at("new/a.png")).unwrap(), "2");
+        assert_eq!(std::fs::read_dir(at("new")).unwrap().count(), 1);
     }
 }

@@ -27,7 +27,9 @@ use std::time::Instant;
 const AT_ONCE: usize = 16;
 
 pub fn query(args: &QueryArgs) -> Result<()> {
-    let mut out = WrittenFiles::open(&args.out, args.force)?;
+    let inputs = [Some(args.scene.as_path()), args.cameras.as_deref()];
+    let inputs: Vec<_> = inputs.into_iter().flatten().collect();
+    let mut out = WrittenFiles::open(&args.out, args.force, &inputs)?;
     let mut scene = scene::load(&args.scene)?;
     let no_language = || {
         Error::input(format!(

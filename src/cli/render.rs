@@ -15,7 +15,7 @@ use crate::scene::{LEVEL_NAMES, LanguageField, Plane, RgbImage, to_linear};
 use crate::{Error, Result};
 
 pub fn render(args: &RenderArgs) -> Result<()> {
-    let mut out = WrittenFiles::open(&args.out, args.force)?;
+    let mut out = WrittenFiles::open(&args.out, args.force, &[&args.scene, &args.cameras])?;
     let scene = scene::load(&args.scene)?;
     let cameras = cameras::read(&args.cameras)?;
     let stems = views::stems(&cameras)?;

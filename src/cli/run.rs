@@ -6,7 +6,7 @@ use super::progress;
 use crate::infer::installed::{Inventory, inventory};
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;
-use crate::run::base::{Settings, next_to};
+use crate::run::base::Settings;
 use crate::run::compat::{self, Compat};
 use crate::run::method::{METHODS, SPARSELGS};
 use crate::run::sources::{
@@ -14,7 +14,7 @@ use crate::run::sources::{
     choose,
 };
 use crate::run::{Method, RunPlan};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser};
 use std::path::{Path, PathBuf};
@@ -195,7 +195,7 @@ fn joining(args: &RunArgs, scene: &Path, installed: &Inventory) -> Result<RunPla
     let compat = made.compat().map_or(Ok(None), Compat::named)?;
     Ok(RunPlan {
         add: Some(scene.to_path_buf()),
-        out: args.out.clone().unwrap_or_else(|| next_to(scene)),
+        out: args.out.clone().unwrap_or_else(|| files::next_free(scene)),
         preset: plan.preset.or(made.preset()),
         init: sources::default::<GeometrySources>(),
         depth_prior: sources::default::<DepthSources>(),

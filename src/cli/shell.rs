@@ -12,7 +12,7 @@ pub fn completions(args: &CompletionsArgs) -> Result<()> {
 }
 
 pub fn manuals(args: &ManualsArgs) -> Result<()> {
-    let outputs = WrittenFiles::open(&args.out, args.force)?;
+    let outputs = WrittenFiles::open(&args.out, args.force, &[])?;
     clap_mangen::generate_to(Cli::command(), outputs.folder()).map_err(Error::unwritable(&args.out))?;
     outputs.keep().map(drop)
 }

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 pub use download::{Client, Fetched, Limits, MIRROR};
 pub use export::commands;
-pub use staging::{leftovers, sweep};
+pub use staging::leftovers;
 
 use crate::infer::Registry;
 use crate::infer::adapter::Adapter;
@@ -18,6 +18,7 @@ use crate::infer::catalogue::{CatalogueEntry, Recipe, Source, catalogue};
 use crate::infer::check::{Measured, check};
 use crate::infer::installed::inventory;
 use crate::progress::Progress;
+use crate::files::{Found, look, remove_leftover};
 use crate::{Error, Result, files};
 use staging::Staging;
 
@@ -109,9 +110,11 @@ pub fn present(entry: &CatalogueEntry, folder: &Path) -> Result<Present> {
 pub fn tidy(folder: &Path, going_on: &[&str]) -> Result<()> {
     for (root, _) in leftovers(folder) {
         let name = staging::name(&root).unwrap_or_default();
-        files::restore(&folder.join(&name));
+        if let Found::Left(held) = look(&root) {
+            held.put_back();
+        }
         if !going_on.contains(&name.as_str()) && folder.join(&name).exists() {
-            sweep(&root)?;
+            remove_leftover(&root).map_err(Error::io(&root))?;
         }
     }
     Ok(())

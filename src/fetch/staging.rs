@@ -1,9 +1,9 @@
 //! Where a model is put together: a hidden folder beside its place, which no search for models looks into. It outlives a killed
 //! process, so that the next fetch goes on from it; one process at a time holds it.
-use std::fs::{File, TryLockError};
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
-use crate::files::{restore, swap};
+use crate::files::{Found, Held, look, swap};
 use crate::{Error, Result};
 
 /// What the names of such folders begin with.
@@ -11,22 +11,19 @@ const PREFIX: &str = ".fetch-";
 
 /// The folder in which one model comes into being.
 pub(super) struct Staging {
-    root: PathBuf,
+    held: Held,
     place: PathBuf,
     name: String,
-    _lock: File,
 }
 
 impl Staging {
     /// That of model `name` in a model folder, as an earlier process left it.
     pub fn open(folder: &Path, name: &str) -> Result<Staging> {
         let root = root(folder, name);
-        std::fs::create_dir_all(&root).map_err(Error::unwritable(&root))?;
-        let lock = lock(&root)?.ok_or_else(|| {
-            Error::input(format!("{name}: another splatvk is fetching it into {}", folder.display()))
-        })?;
-        let staging = Staging { root, place: folder.join(name), name: name.to_owned(), _lock: lock };
-        restore(&staging.place);
+        std::fs::create_dir_all(folder).map_err(Error::unwritable(folder))?;
+        let place = folder.join(name);
+        let staging = Staging { held: Held::take(&root, &place, true)?, place, name: name.to_owned() };
+        staging.held.put_back();
         for part in [staging.model(), staging.work()] {
             std::fs::create_dir_all(&part).map_err(Error::unwritable(&part))?;
         }
@@ -35,17 +32,17 @@ impl Staging {
 
     /// The hidden folder.
     pub fn root(&self) -> &Path {
-        &self.root
+        self.held.folder()
     }
 
     /// The model's folder to be.
     pub fn model(&self) -> PathBuf {
-        self.root.join(&self.name)
+        self.root().join(&self.name)
     }
 
     /// For partial files, checkpoints and what exports need.
     pub fn work(&self) -> PathBuf {
-        self.root.join("work")
+        self.root().join("work")
     }
 
     /// Starts the model's folder afresh.
@@ -65,7 +62,7 @@ impl Staging {
     /// Moves the model to its place. One that is there is only removed after that, and comes back if the move fails.
     pub fn install(self) -> Result<PathBuf> {
         let moved = match self.place.symlink_metadata() {
-            Ok(_) => swap(&self.model(), &self.place),
+            Ok(_) => swap(&self.model(), &self.place, &self.held.aside()),
             Err(_) => std::fs::rename(self.model(), &self.place),
         };
         moved.map_err(Error::io(&self.place))?;
@@ -73,7 +70,8 @@ impl Staging {
         if let Some(folder) = self.place.parent() {
             let _ = File::open(folder).and_then(|f| f.sync_all());
         }
-        std::fs::remove_dir_all(&self.root).map_err(Error::io(&self.root))?;
+        let root = self.root().to_path_buf();
+        self.held.clear().map_err(Error::io(root))?;
         Ok(self.place)
     }
 }
@@ -83,37 +81,18 @@ pub(super) fn root(folder: &Path, name: &str) -> PathBuf {
     folder.join(format!("{PREFIX}{name}"))
 }
 
-fn lock(root: &Path) -> Result<Option<File>> {
-    let path = root.join("lock");
-    let file = File::create(&path).map_err(Error::unwritable(&path))?;
-    match file.try_lock() {
-        Ok(()) => Ok(Some(file)),
-        Err(TryLockError::WouldBlock) => Ok(None),
-        Err(TryLockError::Error(e)) => Err(Error::io(&path)(e)),
-    }
-}
-
-/// What interrupted fetches left in a model folder: each hidden folder that no process holds, with its bytes.
+/// What interrupted fetches left in a model folder: each hidden folder whose owner is gone, with its bytes.
 pub fn leftovers(folder: &Path) -> Vec<(PathBuf, u64)> {
     let list = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path());
-    let ours = |p: &PathBuf| p.is_dir() && name(p).is_some();
-    let mut all: Vec<PathBuf> = list.filter(ours).collect();
+    let left = |p: &PathBuf| name(p).is_some() && matches!(look(p), Found::Left(_) | Found::Blank(_));
+    let mut all: Vec<PathBuf> = list.filter(left).collect();
     all.sort();
-    all.retain(|root| matches!(lock(root), Ok(Some(_))));
     all.into_iter()
         .map(|root| {
             let size = bytes(&root);
             (root, size)
         })
         .collect()
-}
-
-/// Removes one of [`leftovers`]; a model that a killed process had taken out to replace it goes back to its place.
-pub fn sweep(root: &Path) -> Result<()> {
-    let (Some(folder), Some(name)) = (root.parent(), name(root)) else { return Ok(()) };
-    let Some(_held) = lock(root)? else { return Ok(()) };
-    restore(&folder.join(name));
-    std::fs::remove_dir_all(root).map_err(Error::io(root))
 }
 
 /// The model whose hidden folder this is.

@@ -42,9 +42,79 @@ pub fn check_place(place: &Path, kind: Kind, force: bool) -> Result<()> {
     }
 }
 
+/// Leftovers of killed processes do not count: they go once the place is used.
 fn is_empty(folder: &Path) -> Result<bool> {
-    super::partial::sweep(folder, None);
-    Ok(std::fs::read_dir(folder).map_err(Error::io(folder))?.next().is_none())
+    super::check_free_inside(folder)?;
+    let mut entries = std::fs::read_dir(folder).map_err(Error::io(folder))?;
+    Ok(entries.all(|e| e.is_ok_and(|e| super::is_leftover(&e.path()))))
+}
+
+/// Most names that a message lists.
+const LISTED: usize = 5;
+
+/// What is in `folder` and nobody knows, relative to it and with `/`: `own` gets such a name, and whether it is a folder; what is in a
+/// folder that it does not know is not looked at. Leftovers of killed processes do not count, nor what file managers write.
+pub fn foreign(folder: &Path, own: &dyn Fn(&str, bool) -> bool) -> Vec<String> {
+    const OF_FILE_MANAGERS: [&str; 3] = [".DS_Store", "Thumbs.db", "desktop.ini"];
+    let (mut found, mut open) = (Vec::new(), vec![String::new()]);
+    while let Some(below) = open.pop() {
+        let Ok(entries) = std::fs::read_dir(folder.join(&below)) else {
+            found.push(below);
+            continue;
+        };
+        for entry in entries.flatten() {
+            let (plain, kind) = (entry.file_name().to_string_lossy().into_owned(), entry.file_type());
+            let name = if below.is_empty() { plain.clone() } else { format!("{below}/{plain}") };
+            let is_folder = kind.as_ref().is_ok_and(|k| k.is_dir());
+            let is_link = kind.is_ok_and(|k| k.is_symlink());
+            if OF_FILE_MANAGERS.contains(&plain.as_str()) && !is_folder || super::is_leftover(&entry.path()) {
+                continue;
+            }
+            match !is_link && own(&name, is_folder) {
+                true if is_folder => open.push(name),
+                true => {}
+                false => found.push(name),
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+/// The names for a message: the first of them, and how many more there are.
+pub fn listed(names: &[String]) -> String {
+    let more = names.len().saturating_sub(LISTED);
+    let first = names.iter().take(LISTED).map(String::as_str).collect::<Vec<_>>().join(", ");
+    if more == 0 { first } else { format!("{first} and {more} more") }
+}
+
+/// Refuses what is read where it would be replaced.
+pub fn check_spared<'a>(place: &Path, inputs: impl IntoIterator<Item = &'a Path>) -> Result<()> {
+    let Ok(whole) = place.canonicalize() else { return Ok(()) };
+    let lies_there = |input: &&Path| input.canonicalize().is_ok_and(|input| input.starts_with(&whole));
+    match inputs.into_iter().find(lies_there) {
+        Some(input) => Err(Error::input(format!(
+            "{}: is read, and lies in what would be replaced ({}); choose another --out",
+            input.display(),
+            place.display()
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// A free place beside another one: its name with the next number, `scene-2`, `scene-3`, ….
+pub fn next_free(place: &Path) -> PathBuf {
+    let full = place.canonicalize().unwrap_or_else(|_| place.to_path_buf());
+    let name = full.file_name().map_or_else(|| "scene".to_owned(), |n| n.to_string_lossy().into_owned());
+    let numbered =
+        name.rsplit_once('-').and_then(|(stem, n)| Some((stem.to_owned(), n.parse::<u32>().ok()?)));
+    let (stem, first) = numbered.map_or((name, 2), |(stem, n)| (stem, n.saturating_add(1)));
+    // Of "." and "scene/.." only the full path has a parent.
+    let parent = if place.file_name().is_some() { place.parent() } else { full.parent() };
+    let parent = parent.unwrap_or(Path::new(""));
+    let free = |p: &PathBuf| p.symlink_metadata().is_err() && super::check_free(p).is_ok();
+    let mut all = (first..=u32::MAX).map(|n| parent.join(format!("{stem}-{n}")));
+    all.find(free).unwrap_or_else(|| place.with_extension("more"))
 }
 
 #[cfg(test)]
@@ -95,5 +165,37 @@ mod tests {
             assert!(said(Path::new("/dev/null"), kind, true).contains("device"));
         }
         check_place(&at("to-folder/new"), Kind::File, false).unwrap();
+    }
+
+    #[test]
+    fn the_next_place_gets_the_next_free_number() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        for name in ["cup", "cup-2", "cup-7"] {
+            std::fs::create_dir(at(name)).unwrap();
+        }
+        assert_eq!(next_free(&at("cup")), at("cup-3"));
+        assert_eq!(next_free(&at("cup-2")), at("cup-3"));
+        assert_eq!(next_free(&at("cup-7")), at("cup-8"));
+        let _writing = super::super::Partial::beside(&at("cup-3")).unwrap();
+        assert_eq!(next_free(&at("cup")), at("cup-4"), "another command is about to take the first");
+    }
+
+    #[test]
+    fn foreign_entries_are_found_at_any_depth() {
+        let base = tempfile::tempdir().unwrap();
+        let at = |name: &str| base.path().join(name);
+        std::fs::create_dir_all(at("a/b")).unwrap();
+        std::fs::create_dir_all(at("c/d")).unwrap();
+        for name in ["own", "a/own", "a/b/mine", "c/own", ".DS_Store"] {
+            std::fs::write(at(name), "x").unwrap();
+        }
+        let own = |name: &str, folder: bool| name.ends_with("own") || folder && name.starts_with('a');
+        assert_eq!(foreign(base.path(), &own), ["a/b/mine", "c"]);
+        let names: Vec<String> = (0..7).map(|k| k.to_string()).collect();
+        assert_eq!((listed(&names[..2]), listed(&names)), ("0, 1".into(), "0, 1, 2, 3, 4 and 2 more".into()));
+        check_spared(&at("a"), [at("own").as_path(), &at("nothing")]).unwrap();
+        let e = check_spared(&at("a"), [at("own").as_path(), &at("c/../a/own")]).unwrap_err();
+        assert!(e.exit_code() == 2 && e.to_string().contains("c/../a/own: is read"), "{e}");
     }
 }

@@ -33,7 +33,7 @@ pub fn create_folder(path: &Path) -> Result<()> {
 
 /// Writes a file beside its target and renames it: one that was there stays until the new one is whole. Makes its folder.
 pub fn write_whole_file(out: &Path, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
-    let partial = Partial::beside(out, false).map_err(Error::unwritable(out))?;
+    let partial = Partial::beside(out)?;
     write(partial.path())?;
     partial.finish(|path| std::fs::rename(path, out).map_err(Error::unwritable(out)))
 }

@@ -8,10 +8,10 @@ pub mod spz;
 pub(crate) mod usable;
 
 use super::side_file;
-use crate::files::Partial;
+use crate::files::{Kind, Partial, check_place};
 use crate::scene::{LanguageField, Splats};
 use crate::{Error, Result};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// A format of Gaussians.
 pub struct SplatFormat {
@@ -105,7 +105,8 @@ pub fn is_named(path: &Path) -> bool {
     find(path).is_some()
 }
 
-fn format(path: &Path) -> Result<&'static SplatFormat> {
+/// The format that the name of a file says.
+pub(crate) fn format(path: &Path) -> Result<&'static SplatFormat> {
     find(path).ok_or_else(|| {
         let (path, endings) = (path.display(), endings());
         Error::input(format!("{path}: no known format of splats; the name must end in one of {endings}"))
@@ -130,7 +131,8 @@ pub fn read_counted(path: &Path) -> Result<(Splats, Option<LanguageField>, Optio
     usable::keep(splats, language, path)
 }
 
-/// Writes a file of Gaussians, and beside it ([`side_file`]) their language, if they have any.
+/// Writes a file of Gaussians, and beside it ([`side_file`]) their language, if they have any; ordinary files that are there are
+/// replaced.
 pub fn write(path: &Path, splats: &Splats, language: Option<&LanguageField>) -> Result<()> {
     write_as(path, splats, language, format(path)?)
 }
@@ -142,26 +144,52 @@ pub fn write_as(
     language: Option<&LanguageField>,
     format: &SplatFormat,
 ) -> Result<()> {
-    let with_codes = language.filter(|l| l.levels.iter().any(|l| !l.codebook.is_empty()));
-    let side = side_file::path(path);
-    let partial = |place: &Path| Partial::beside(place, false).map_err(Error::unwritable(place));
-    let splat_file = partial(path)?;
-    let order = (format.write)(splat_file.path(), splats)?;
-    let language_file = match with_codes {
-        Some(field) => {
-            let file = partial(&side)?;
-            side_file::write(file.path(), field, splats.len(), &order)?;
-            Some(file)
-        }
-        None => None,
-    };
-    // Both are written. Wherever a kill comes between these moves, no file has the language of another one beside it.
-    if side.is_file() {
-        std::fs::remove_file(&side).map_err(Error::unwritable(&side))?;
+    Reserved::open(path, true)?.write(splats, language, format)
+}
+
+/// The places of a file of Gaussians and of the language beside it, to which nobody else writes as long as this lives.
+#[derive(Debug)]
+pub(crate) struct Reserved {
+    path: PathBuf,
+    side: PathBuf,
+    force: bool,
+    splat_file: Partial,
+    language_file: Partial,
+}
+
+impl Reserved {
+    /// Refuses places that may not be written over.
+    pub fn open(path: &Path, force: bool) -> Result<Reserved> {
+        let side = side_file::path(path);
+        check_place(path, Kind::File, force)?;
+        check_place(&side, Kind::File, force)?;
+        let (splat_file, language_file) = (Partial::beside(path)?, Partial::beside(&side)?);
+        Ok(Reserved { path: path.to_path_buf(), side, force, splat_file, language_file })
     }
-    let place = |file: Partial, place: &Path| {
-        file.finish(|from| std::fs::rename(from, place).map_err(Error::unwritable(place)))
-    };
-    place(splat_file, path)?;
-    language_file.map_or(Ok(()), |file| place(file, &side))
+
+    /// Writes both files, or the one where there is no language.
+    pub fn write(
+        self,
+        splats: &Splats,
+        language: Option<&LanguageField>,
+        format: &SplatFormat,
+    ) -> Result<()> {
+        let with_codes = language.filter(|l| l.levels.iter().any(|l| !l.codebook.is_empty()));
+        let order = (format.write)(self.splat_file.path(), splats)?;
+        if let Some(field) = with_codes {
+            side_file::write(self.language_file.path(), field, splats.len(), &order)?;
+        }
+        // Both are written. What came there meanwhile is not ours.
+        check_place(&self.path, Kind::File, self.force)?;
+        check_place(&self.side, Kind::File, self.force)?;
+        // Wherever a kill comes between these moves, no file has the language of another one beside it.
+        if self.side.is_file() {
+            std::fs::remove_file(&self.side).map_err(Error::unwritable(&self.side))?;
+        }
+        let place = |file: Partial, place: &Path| {
+            file.finish(|from| std::fs::rename(from, place).map_err(Error::unwritable(place)))
+        };
+        place(self.splat_file, &self.path)?;
+        with_codes.map_or(Ok(()), |_| place(self.language_file, &self.side))
+    }
 }

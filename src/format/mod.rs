@@ -7,6 +7,7 @@ mod level_arrays;
 pub mod npy;
 pub mod picture;
 pub mod scene_dir;
+pub mod scene_files;
 pub mod scene_photos;
 pub mod side_file;
 pub mod transform;

@@ -1,6 +1,5 @@
 //! The scene directory: what a run writes and every other command reads.
 use super::npy::{self, NpyArray};
-use super::workspace::MANIFEST;
 use super::{
     cameras, colmap, create_folder, gaussians, level_arrays, picture, ply, scene_photos, transforms,
 };
@@ -22,8 +21,14 @@ const FORMAT: &str = "splatvk-scene";
 /// Text embeddings that came with precomputed features, kept so that the scene answers queries on its own.
 pub const TEXT_EMBEDDINGS: &str = "language/text_embeddings.npz";
 
+/// The manifest.
+pub(super) const MANIFEST: &str = "scene.json";
+
+/// The Gaussians.
+pub(super) const SPLATS: &str = "point_cloud.ply";
+
 /// What the photos show of every splat, [N] f32 ([`Seen`]).
-const SEEN: &str = "seen.npy";
+pub(super) const SEEN: &str = "seen.npy";
 
 /// A loaded scene.
 #[derive(Clone, Debug, Default)]
@@ -106,7 +111,7 @@ pub struct Contents<'a> {
 /// Writes splats, cameras and language into `folder`, which exists (see [`super::Workspace`]). The manifest comes last:
 /// a folder without it is not a scene.
 pub fn write(folder: &Path, c: &Contents) -> Result<()> {
-    ply::write_splats(&folder.join("point_cloud.ply"), c.splats, ply::PlyOptions::default())?;
+    ply::write_splats(&folder.join(SPLATS), c.splats, ply::PlyOptions::default())?;
     if !c.seen.pixels.is_empty() {
         npy::write(folder.join(SEEN), &NpyArray::f32(&[c.seen.pixels.len()], c.seen.pixels.clone()))?;
     }
@@ -222,7 +227,7 @@ pub fn load(path: &Path) -> Result<Scene> {
         return Ok(Scene { path: path.into(), splats, language, warnings, ..Scene::default() });
     }
     let manifest = read_manifest(path)?;
-    let splats = read_own(&path.join("point_cloud.ply"))?;
+    let splats = read_own(&path.join(SPLATS))?;
     let cameras = cameras::read(&path.join("cameras/transforms.json"))?;
     let damaged =
         |what: String| Error::input(format!("{}: {what}; the scene is damaged, run again", path.display()));
@@ -269,6 +274,11 @@ fn read_seen(folder: &Path, splats: usize) -> Result<Seen> {
         ))),
         None => Ok(Seen { pixels }),
     }
+}
+
+/// Whether a folder is a scene directory: by the content of its manifest, as other programs use the name, too.
+pub fn is_scene(folder: &Path) -> bool {
+    read_manifest(folder).is_ok()
 }
 
 fn read_manifest(path: &Path) -> Result<Manifest> {

@@ -29,7 +29,7 @@ pub struct Options {
 
 impl Options {
     /// `choice` or else `SPLATVK_DEVICE`; validation when `SPLATVK_VALIDATION` is `1`, GPU-assisted when it is `gpu`; staging when
-    /// `SPLATVK_STAGING` is `1`; `SPLATVK_MAX_BINDING` in MiB; the cache in `SPLATVK_HOME`.
+    /// `SPLATVK_STAGING` is `1`; `SPLATVK_MAX_BINDING` in MiB; the cache in the program's own folder, where there is one.
     pub fn from_env(choice: Option<&str>) -> Self {
         let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
         let validation = variable("SPLATVK_VALIDATION");
@@ -42,7 +42,7 @@ impl Options {
             max_binding: variable("SPLATVK_MAX_BINDING")
                 .and_then(|v| v.parse::<u64>().ok())
                 .map(|mib| mib.saturating_mul(1 << 20)),
-            cache: Some(crate::files::home().join("cache")),
+            cache: crate::files::home().ok().map(|home| home.join("cache")),
             ..Options::default()
         }
     }

@@ -51,25 +51,26 @@ impl OutputKey {
         hash
     }
 
-    fn file(self) -> PathBuf {
+    fn file(self) -> Result<PathBuf> {
         let kind = self.kind;
-        folder().join(format!("{kind}-{}.{EXTENSION}", self.short()))
+        Ok(folder()?.join(format!("{kind}-{}.{EXTENSION}", self.short())))
     }
 }
 
 /// Where answers are kept.
-pub fn folder() -> PathBuf {
-    home().join("cache")
+pub fn folder() -> Result<PathBuf> {
+    Ok(home()?.join("cache"))
 }
 
-/// What is kept, with sizes in bytes.
-pub fn files() -> Vec<(PathBuf, u64)> {
-    files::in_folder(&folder(), EXTENSION)
+/// What is kept in that folder, with sizes in bytes.
+pub fn files(folder: &Path) -> Vec<(PathBuf, u64)> {
+    files::in_folder(folder, EXTENSION)
 }
 
 /// `compute`, or what it gave the last time with the same key.
 pub(super) fn remember(key: OutputKey, compute: impl FnOnce() -> Result<Vec<f32>>) -> Result<Vec<f32>> {
-    let file = key.file();
+    // Without a folder of its own the program keeps nothing.
+    let Ok(file) = key.file() else { return compute() };
     if let Some(body) = files::read_with_checksum(&file).filter(|b| b.len() % 4 == 0) {
         return Ok(bytemuck::pod_collect_to_vec(&body));
     }
@@ -86,14 +87,14 @@ pub(super) fn fingerprint(path: &Path) -> std::io::Result<String> {
     let meta = std::fs::metadata(path)?;
     let age = meta.modified()?.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     let stamp = format!("{}:{}:{}", path.canonicalize()?.display(), meta.len(), age.as_nanos());
-    let note = folder().join("sums").join(&sha256(stamp.as_bytes())[..16]);
-    if let Ok(known) = files::read_text(&note)
-        && known.len() == 64
-    {
+    let Ok(folder) = folder() else { return content_hash(path) };
+    let note = folder.join("sums").join(&sha256(stamp.as_bytes())[..16]);
+    let known = files::read_with_checksum(&note).and_then(|known| String::from_utf8(known).ok());
+    if let Some(known) = known {
         return Ok(known);
     }
     let hash = content_hash(path)?;
-    let _ = files::write(&note, &[hash.as_bytes()]);
+    let _ = files::write_with_checksum(&note, hash.as_bytes());
     Ok(hash)
 }
 
@@ -104,7 +105,7 @@ mod tests {
     #[test]
     fn a_damaged_file_is_computed_again() {
         let key = || OutputKey::new("test").text("damaged").values(&[std::process::id()]);
-        let file = key().file();
+        let file = key().file().unwrap();
         let count = std::cell::Cell::new(0);
         let ask = || {
             remember(key(), || {
@@ -122,8 +123,8 @@ mod tests {
         assert_eq!(count.get(), 2);
         std::fs::remove_file(&file).unwrap();
         assert_ne!(
-            OutputKey::new("test").text("a").text("b").file(),
-            OutputKey::new("test").text("ab").text("").file()
+            OutputKey::new("test").text("a").text("b").file().unwrap(),
+            OutputKey::new("test").text("ab").text("").file().unwrap()
         );
     }
 }

@@ -33,14 +33,18 @@ fn load() -> Result<(PathBuf, Environment), String> {
             |e| format!("ONNX Runtime: ORT_DYLIB_PATH={} cannot be loaded ({e}); {fix}", path.display());
         return try_load(&path).map(|e| (path.clone(), e)).map_err(failed);
     }
-    let own = home().join("lib").join(LIBRARY);
-    if own.exists() {
+    let own = home().map(|home| home.join("lib").join(LIBRARY));
+    if let Ok(own) = &own
+        && own.exists()
+    {
         let failed = |e| format!("ONNX Runtime: {} cannot be loaded ({e}); {fix}", own.display());
-        return try_load(&own).map(|e| (own.clone(), e)).map_err(failed);
+        return try_load(own).map(|e| (own.clone(), e)).map_err(failed);
     }
     let system = PathBuf::from(LIBRARY);
-    let failed =
-        |_| format!("ONNX Runtime: neither {} nor a system {LIBRARY} is there; {fix}", own.display());
+    let failed = |_| match &own {
+        Ok(own) => format!("ONNX Runtime: neither {} nor a system {LIBRARY} is there; {fix}", own.display()),
+        Err(e) => format!("ONNX Runtime: no system {LIBRARY} is there, and {e}"),
+    };
     try_load(&system).map(|e| (system.clone(), e)).map_err(failed)
 }
 

@@ -103,7 +103,7 @@ impl Registry {
     pub fn with(models_dir: Option<&Path>, compute: Compute) -> Result<Self> {
         let pack =
             serde_json::from_str(PACK).map_err(|e| Error::work(format!("built-in model table: {e}")))?;
-        let folders = Registry::places(models_dir);
+        let folders = Registry::places(models_dir)?;
         if let Some(absent) = models_dir.and_then(|_| folders.iter().find(|f| !f.is_dir())) {
             return Err(Error::input(format!("{}: no such model folder; {FIX}", absent.display())));
         }
@@ -111,14 +111,14 @@ impl Registry {
     }
 
     /// The folders that [`Registry::open`] would search, whether they exist or not.
-    pub fn places(models_dir: Option<&Path>) -> Vec<PathBuf> {
+    pub fn places(models_dir: Option<&Path>) -> Result<Vec<PathBuf>> {
         let set = || std::env::var_os("SPLATVK_MODELS").filter(|v| !v.is_empty());
         let list = |text: &std::ffi::OsStr| -> Vec<PathBuf> {
             std::env::split_paths(text).filter(|p| !p.as_os_str().is_empty()).collect()
         };
         match models_dir.map(|d| list(d.as_os_str())).or_else(|| set().map(|text| list(&text))) {
-            Some(folders) => folders,
-            None => vec![home().join("models")],
+            Some(folders) => Ok(folders),
+            None => Ok(vec![home()?.join("models")]),
         }
     }
 

@@ -193,35 +193,3 @@ fn identity(path: &Path) -> Result<String> {
     }
     Ok(sums.join(" "))
 }
-
-/// A free folder beside a scene, for the scene with more photos: its name with the next number, `scene-2`, `scene-3`, ….
-pub fn next_to(scene: &Path) -> std::path::PathBuf {
-    let full = scene.canonicalize().unwrap_or_else(|_| scene.to_path_buf());
-    let name = full.file_name().map_or_else(|| "scene".to_owned(), |n| n.to_string_lossy().into_owned());
-    let numbered =
-        name.rsplit_once('-').and_then(|(stem, n)| Some((stem.to_owned(), n.parse::<u32>().ok()?)));
-    let (stem, first) = numbered.map_or((name, 2), |(stem, n)| (stem, n.saturating_add(1)));
-    // Of "." and "scene/.." only the full path has a parent.
-    let parent = if scene.file_name().is_some() { scene.parent() } else { full.parent() };
-    let parent = parent.unwrap_or(Path::new(""));
-    let free = |p: &std::path::PathBuf| p.symlink_metadata().is_err();
-    let all = (first..=u32::MAX).map(|n| parent.join(format!("{stem}-{n}")));
-    all.into_iter().find(free).unwrap_or_else(|| scene.with_extension("more"))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_next_scene_gets_the_next_free_number() {
-        let folder = tempfile::tempdir().unwrap();
-        let at = |name: &str| folder.path().join(name);
-        for name in ["cup", "cup-2", "cup-7"] {
-            std::fs::create_dir(at(name)).unwrap();
-        }
-        assert_eq!(next_to(&at("cup")), at("cup-3"));
-        assert_eq!(next_to(&at("cup-2")), at("cup-3"));
-        assert_eq!(next_to(&at("cup-7")), at("cup-8"));
-    }
-}

@@ -24,11 +24,11 @@ use std::time::Duration;
 /// Runs the plan and writes the scene directory, whole or not at all.
 pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     let progress = &Recorded::new(progress);
-    // Read whole before anything is written: the scene may be the one that is replaced.
     let base = plan.add.as_deref().map(BaseScene::open).transpose()?.map(Arc::new);
     let registry = plan.registry()?;
     sources::check_texts(&plan.features, &plan.queries, &registry)?;
-    let workspace = Workspace::create(&plan.out, plan.force)?;
+    let inputs: Vec<&Path> = plan.read().collect();
+    let workspace = Workspace::create(&plan.out, plan.force, &inputs)?;
     // The device comes first: it says how large the photos may be.
     let device = Device::with(&gpu::Options {
         deterministic: plan.deterministic,
@@ -43,7 +43,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
             (photo::load_each(&chosen, max_size, progress)?, choice)
         }
     };
-    let store = store(plan.resume, plan.checkpoint_seconds);
+    let store = store(plan.resume, plan.checkpoint_seconds)?;
     let made = work(plan, &device, &registry, base.as_ref(), photos, &store, progress)?;
     let outcome = RunOutcome { choice, ..made };
     write(workspace, &outcome, progress)?;
@@ -67,7 +67,7 @@ pub fn reconstruct(
 
 /// Writes what [`reconstruct`] made as a scene directory, whole or not at all; `force` replaces a scene.
 pub fn save(outcome: &mut RunOutcome, out: &Path, force: bool, progress: &dyn Progress) -> Result<()> {
-    let workspace = Workspace::create(out, force)?;
+    let workspace = Workspace::create(out, force, &[])?;
     outcome.plan.out = out.to_path_buf();
     write(workspace, outcome, progress)
 }
@@ -180,13 +180,17 @@ fn work(
 }
 
 /// What stages made, on disk.
-pub(super) fn store(resume: bool, checkpoint_seconds: u64) -> Store {
-    Store::at(stage_folder(), resume, Duration::from_secs(checkpoint_seconds))
+pub(super) fn store(resume: bool, checkpoint_seconds: u64) -> Result<Store> {
+    match stage_folder() {
+        Ok(folder) => Ok(Store::at(folder, resume, Duration::from_secs(checkpoint_seconds))),
+        Err(e) if resume => Err(e),
+        Err(_) => Ok(Store::none()),
+    }
 }
 
 /// Where runs keep what their stages made.
-pub fn stage_folder() -> PathBuf {
-    home().join("stages")
+pub fn stage_folder() -> Result<PathBuf> {
+    Ok(home()?.join("stages"))
 }
 
 fn write(workspace: Workspace, outcome: &RunOutcome, progress: &dyn Progress) -> Result<()> {

@@ -7,6 +7,8 @@ use super::outcome::RunOutcome;
 use super::view::{DecodedFrame, FeatureChannels, Viewer};
 use super::{encoder, sources};
 use crate::format::scene_dir::{self, Contents, Scene};
+use crate::files::check_spared;
+use crate::format::gaussians::Reserved;
 use crate::format::{Workspace, colmap, gaussians};
 use crate::gpu::Device;
 use crate::infer::Registry;
@@ -215,10 +217,9 @@ impl LiveScene {
     /// all; `replace` allows to replace a scene or file that is there.
     pub fn save(&mut self, path: &Path, replace: bool) -> Result<()> {
         if gaussians::is_named(path) {
-            if path.exists() && !replace {
-                return Err(Error::input(format!("{}: is already there", path.display())));
-            }
-            return gaussians::write(path, self.splats(), self.language());
+            self.check_spared(path)?;
+            let format = gaussians::format(path)?;
+            return Reserved::open(path, replace)?.write(self.splats(), self.language(), format);
         }
         if let Some(ending) = path.extension()
             && !path.is_dir()
@@ -236,10 +237,18 @@ impl LiveScene {
             SceneOrigin::Loaded(scene) => save_loaded(scene, path, replace),
         }
     }
+
+    /// Refuses to replace the file that the scene was loaded from.
+    fn check_spared(&self, path: &Path) -> Result<()> {
+        match &self.origin {
+            SceneOrigin::Loaded(scene) => check_spared(path, [scene.path.as_path()]),
+            SceneOrigin::Trained(_) => Ok(()),
+        }
+    }
 }
 
 fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
-    let workspace = Workspace::create(path, replace)?;
+    let workspace = Workspace::create(path, replace, &[&scene.path])?;
     let folder = scene.path.join("cameras");
     // A scene without its photos is still whole.
     let photos = scene.cameras.iter().map(|c| photo::load_at(&folder.join(&c.name), usize::MAX));

@@ -9,7 +9,7 @@ use crate::gpu::Device;
 use crate::infer::{Compute, Registry};
 use crate::language::sam::SamOptions;
 use crate::scene::Camera;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Training states are some ten megabytes for scenes of a few photos: written in a fraction of a second.
 pub const CHECKPOINT_SECONDS: u64 = 30;
@@ -124,6 +124,14 @@ impl RunPlan {
             compat,
             ..self
         }
+    }
+
+    /// The files and folders that the run reads.
+    pub(super) fn read(&self) -> impl Iterator<Item = &Path> {
+        let sources = [&self.init, &self.depth_prior, &self.matcher, &self.masks, &self.features];
+        let arguments = sources.into_iter().filter_map(|s| s.argument.as_deref());
+        let folders = [self.add.as_deref(), self.models.as_deref()].into_iter().flatten();
+        self.inputs.iter().map(PathBuf::as_path).chain(arguments).chain(folders)
     }
 
     /// The method that is asked for, or else the one that suits the plan.

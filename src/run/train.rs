@@ -138,7 +138,9 @@ fn with_footprints(mut cloud: PointCloud, list: &[Camera], progress: &dyn Progre
 /// Runs the plan and writes the scene directory, whole or not at all.
 pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> {
     let progress = &Recorded::new(progress);
-    let workspace = Workspace::create(&plan.out, plan.force)?;
+    let inputs = [Some(&plan.cameras), plan.points.as_ref(), plan.models.as_ref()];
+    let inputs: Vec<&Path> = inputs.into_iter().flatten().chain([&plan.images]).map(PathBuf::as_path).collect();
+    let workspace = Workspace::create(&plan.out, plan.force, &inputs)?;
     let known = cameras::read(&plan.cameras)?;
     let given = plan.points.as_deref().map(points).transpose()?;
     let device = Device::with(&gpu::Options {
@@ -169,7 +171,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let trained = graph.add(stages::ViewDependence { options }, (placed, trained));
     let up = graph.add(stages::Upright, (placed, geometry, trained));
     let targets = [placed.target(), geometry.target(), trained.target(), up.target()];
-    let store = super::execute::store(plan.resume, plan.checkpoint_seconds);
+    let store = super::execute::store(plan.resume, plan.checkpoint_seconds)?;
     let mut made = graph.run(&targets, &device, &registry, &store, progress)?;
     let (photos, geometry) = (made.take(placed)?.photos, made.take(geometry)?);
     let trained = made.take(trained)?;

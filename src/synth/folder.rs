@@ -18,30 +18,50 @@ use std::path::Path;
 /// Folders of regions without and with flaws.
 const REGIONS: [&str; 2] = ["regions_exact", "regions_flawed"];
 
+/// The ground truth.
+const TRUTH: &str = "ground_truth.json";
+
+/// The embeddings of texts in a folder of regions.
+const TEXTS: &str = "text_embeddings.npz";
+
 /// JPEG quality of held-out views, and of photos unless asked otherwise: no visible artefacts.
 const QUALITY: u8 = 95;
 
-/// Whether a folder holds what [`generate`] or [`write_regions`] made, and nothing that anybody else put beside it.
-pub fn is_generated(folder: &Path) -> bool {
-    const NAMES: [&str; 8] = [
-        "images",
-        "held_out",
-        "depth",
-        "masks",
-        "ground_truth.json",
-        "cameras_noisy.json",
-        REGIONS[0],
-        REGIONS[1],
-    ];
-    let list = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    let names: Vec<String> = list.map(|e| e.file_name().to_string_lossy().into_owned()).collect();
-    let truth = folder.join("ground_truth.json");
+/// What is in a folder that [`generate`] or [`write_regions`] made and neither of them wrote, relative to it; `None` where the folder is
+/// no such one.
+pub fn foreign(folder: &Path) -> Option<Vec<String>> {
+    let truth: Option<serde_json::Value> = files::read_json(&folder.join(TRUTH), "").ok();
     // Data sets of other makes may lie in the same layout; only ours state the knobs they were made with.
-    let stated =
-        || files::read_json::<serde_json::Value>(&truth, "").is_ok_and(|truth| !truth["knobs"].is_null());
-    names.iter().all(|n| NAMES.contains(&n.as_str()))
-        && REGIONS.iter().all(|r| names.iter().any(|n| n == r))
-        && (names.len() == REGIONS.len() || stated())
+    let knobs = truth.as_ref().is_some_and(|truth| !truth["knobs"].is_null());
+    let regions = |name: &str| folder.join(name).join(TEXTS).is_file();
+    if !REGIONS.into_iter().all(regions) || truth.is_some() && !knobs {
+        return None;
+    }
+    let views = truth.as_ref().and_then(|truth| truth["frames"].as_array());
+    let views: Option<Vec<&str>> = views.map(|v| v.iter().filter_map(|f| f["file"].as_str()).collect());
+    Some(files::foreign(folder, &|name, is_folder| is_own(name, is_folder, views.as_deref())))
+}
+
+/// Whether a name is that of a file or folder of generated data with these views; `None` for regions alone, whose views are those of
+/// other data.
+fn is_own(name: &str, is_folder: bool, views: Option<&[&str]>) -> bool {
+    let Some((folder, file)) = name.rsplit_once('/') else {
+        let folders: &[&str] = if views.is_some() { &["images", "held_out", "depth", "masks"] } else { &[] };
+        return match is_folder {
+            true => REGIONS.contains(&name) || folders.contains(&name),
+            false => views.is_some() && [TRUTH, "cameras_noisy.json"].contains(&name),
+        };
+    };
+    let plain = |view: &str| view.rsplit('/').next().and_then(|v| v.strip_suffix(".jpg")).map(str::to_owned);
+    let is_view = |stem: &str| views.is_none_or(|all| all.iter().filter_map(|v| plain(v)).any(|v| v == stem));
+    let stem = |ending: &str| file.strip_suffix(ending).is_some_and(is_view);
+    !is_folder
+        && match folder {
+            "images" | "held_out" => views.is_some_and(|all| all.contains(&name)),
+            "depth" => stem(".npz"),
+            "masks" => stem(".png"),
+            _ => REGIONS.contains(&folder) && (file == TEXTS || stem("_s.npy") || stem("_f.npy")),
+        }
 }
 
 /// Makes a scene and writes it: photos, held-out views, depth, masks, cameras, and regions without and with flaws.
@@ -64,7 +84,7 @@ pub fn generate(
         "width": spec.size.0, "height": spec.size.1, "labels": labels,
         "convention": "OpenCV world-to-camera, metres, pinhole", "up": [0.0, 0.0, 1.0], "frames": frames, "knobs": spec,
     });
-    write_json(&folder.join("ground_truth.json"), &truth)?;
+    write_json(&folder.join(TRUTH), &truth)?;
     cameras::write_json(&folder.join("cameras_noisy.json"), &scene.noisy)?;
     write_regions(folder, folder, flaws)
 }
@@ -176,10 +196,16 @@ mod tests {
             let photo = truth.image(frame).unwrap();
             assert!(crate::pass::metrics::psnr(&photo, &seen.image) > 30.0);
         }
-        assert!(is_generated(dir.path()));
-        std::fs::write(dir.path().join("letter"), "precious").unwrap();
-        assert!(!is_generated(dir.path()), "somebody's own file is in it");
-        std::fs::remove_file(dir.path().join("letter")).unwrap();
+        assert_eq!(foreign(dir.path()), Some(Vec::new()));
+        for name in ["letter", "images/IMG_1.jpg", "images/train_00.txt", "regions_exact/mine_s.npy", "depth"] {
+            let path = dir.path().join(name);
+            let _ = std::fs::rename(&path, dir.path().join("aside"));
+            std::fs::write(&path, "precious").unwrap();
+            let found = foreign(dir.path()).unwrap();
+            assert!(found.iter().any(|f| f == name), "somebody's own file is in it: {found:?}");
+            std::fs::remove_file(&path).unwrap();
+            let _ = std::fs::rename(dir.path().join("aside"), &path);
+        }
         let noisy = cameras::read(&dir.path().join("cameras_noisy.json")).unwrap();
         assert_eq!(noisy.len(), 3);
         for name in ["regions_exact", "regions_flawed"] {

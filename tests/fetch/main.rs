@@ -6,6 +6,9 @@ mod full_size;
 mod models;
 mod server;
 #[allow(dead_code)] // other tests use the rest
+#[path = "../fixture/command.rs"]
+mod command;
+#[allow(dead_code)] // other tests use the rest
 #[path = "../../src/infer/testing.rs"]
 mod testing;
 

@@ -257,10 +257,18 @@ fn what_is_no_model_is_not_installed_and_what_is_left_can_be_cleaned() {
     clean(&["--delete"]);
     assert!(place.hidden().is_empty() && place.at(DEPTH).exists());
     // A model that a process, killed since, had moved aside to replace it comes back.
-    std::fs::create_dir_all(place.at(".fetch-da3")).unwrap();
-    std::fs::rename(place.at(DEPTH), place.at(".da3.old-4000000000")).unwrap();
+    super::command::abandon(&place.at(".fetch-da3"), "da3");
+    std::fs::rename(place.at(DEPTH), place.at(".fetch-da3/old")).unwrap();
     clean(&["--delete"]);
     assert!(place.hidden().is_empty() && place.at("da3/model.onnx").exists());
+    // A folder of such a name that bears no mark, and a link to one, are somebody's own.
+    std::fs::create_dir(place.at(".fetch-mine")).unwrap();
+    std::fs::write(place.at(".fetch-mine/letter"), "precious").unwrap();
+    #[cfg(unix)]
+    std::os::unix::fs::symlink(place.at("da3"), place.at(".fetch-linked")).unwrap();
+    clean(&["--delete"]);
+    assert!(place.at(".fetch-mine/letter").exists() && place.at("da3/model.onnx").exists());
+    assert_eq!(std::fs::read_dir(place.at("da3")).unwrap().count(), 1, "no lock is made there");
 }
 
 /// Fetches the towers of [`clip_graphs`] as one model `clip_toy` into `place`.
