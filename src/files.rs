@@ -7,13 +7,13 @@ mod place;
 mod replace;
 
 pub use home::home;
+#[cfg(test)]
+pub(crate) use owner::tests::leave;
 #[cfg(feature = "cli")]
 pub(crate) use owner::{Found, Held, look};
 #[cfg(feature = "cli")]
 pub(crate) use partial::{HIDDEN, leftovers, remove_leftover, remove_unfinished};
 pub(crate) use partial::{Partial, check_free, check_free_inside, is_leftover, restore, sweep};
-#[cfg(test)]
-pub(crate) use owner::tests::leave;
 pub(crate) use place::{Kind, check_place, check_spared, foreign, listed, next_free};
 pub(crate) use replace::swap;
 

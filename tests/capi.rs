@@ -75,6 +75,26 @@ fn a_name_with_an_unknown_ending_is_refused_and_no_folder_of_it_is_made() {
         (SvkStatus::Ok, SvkStatus::Input, SvkStatus::Ok)
     );
     assert!(["scene.v2", "scene"].iter().all(|n| folder.path().join(n).join("scene.json").is_file()));
+    #[cfg(unix)]
+    {
+        let at = |name: &str| folder.path().join(name);
+        for (link, target) in [("link.ply", "a.ply"), ("nowhere.ply", "nothing"), ("link", "scene")] {
+            std::os::unix::fs::symlink(at(target), at(link)).unwrap();
+            assert_eq!((save(link, 0), save(link, 1)), (SvkStatus::Input, SvkStatus::Input), "{link}");
+            let said = said(|out, bytes| unsafe { svk_scene_error(scene, out, bytes) });
+            assert!(said.contains("symbolic link") && at(link).is_symlink(), "{said}");
+        }
+    }
+    // A folder that is not there is not made on the way to another one.
+    assert_ne!(save("new/../b.ply", 0), SvkStatus::Ok);
+    assert!(!folder.path().join("new").exists() && !folder.path().join("b.ply").exists());
+    // Somebody's file in a scene, and the scene that was loaded, stay.
+    std::fs::write(folder.path().join("scene/user.txt"), "precious").unwrap();
+    assert_eq!(save("scene", 1), SvkStatus::Input);
+    assert!(folder.path().join("scene/user.txt").exists());
+    let loaded = fixture::scene().join("run.json");
+    let own = unsafe { svk_scene_save(scene, text(fixture::scene()).as_ptr(), 1) };
+    assert!(own == SvkStatus::Input && loaded.exists());
     unsafe {
         svk_scene_destroy(scene);
         svk_context_destroy(context);

@@ -1,5 +1,7 @@
 //! Files that somebody else made, as the program meets them: one clear line, exit code 2, nothing half-written.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
+mod fixture;
+
 use splatvk::format::{cameras, gaussians, npy, ply, scene_dir};
 use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, Pose, Seen, Splats, World};
 use std::path::Path;
@@ -248,4 +250,70 @@ fn questions_need_cameras_and_language() {
     let none = at("none.json");
     refuses(2, &["query", &at("words.ply"), "lemon", "--cameras", &none, "--out", &out], &["no cameras"]);
     assert!(!Path::new(&out).exists());
+}
+
+/// A folder of somebody else, in which the command is started.
+#[test]
+fn relative_home_is_never_the_current_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let models = folder.path().join(".local/share/splatvk/models/theirs");
+    std::fs::create_dir_all(&models).unwrap();
+    std::fs::write(models.join("model.onnx"), "theirs").unwrap();
+    let variables = ["HOME", "XDG_DATA_HOME", "SPLATVK_HOME", "SPLATVK_MODELS", "ORT_DYLIB_PATH"];
+    for (home, data) in [("", ""), (".", ""), ("here", ".local/share"), ("", "./.local/share")] {
+        for arguments in [&["models", "list"][..], &["clean", "--delete"]] {
+            let mut c = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+            variables.iter().for_each(|name| drop(c.env_remove(name)));
+            let c = c.env("HOME", home).env("XDG_DATA_HOME", data).current_dir(folder.path());
+            let output = c.args(arguments).output().unwrap();
+            let said = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert_eq!(output.status.code(), Some(2), "{said}");
+            assert!(said.lines().count() == 1 && said.contains("set HOME, or SPLATVK_HOME"), "{said}");
+        }
+    }
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+}
+
+/// A scene and its report are passed on, kept stages stay with the user.
+#[cfg(unix)]
+#[test]
+fn folders_as_typed_are_not_in_the_scene() {
+    use std::os::unix::fs::MetadataExt;
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (images, cameras, points) = fixture::small_views();
+    let home = at("alice/home");
+    std::fs::create_dir_all(at("alice/private")).unwrap();
+    std::fs::create_dir_all(&home).unwrap();
+    for part in ["lib", "models"] {
+        std::os::unix::fs::symlink(splatvk::infer::home().unwrap().join(part), home.join(part)).unwrap();
+    }
+    for (from, to) in [(cameras, "cameras.json"), (points, "points.ply")] {
+        std::fs::copy(from, at("alice/private").join(to)).unwrap();
+    }
+    std::fs::create_dir(at("alice/private/photos")).unwrap();
+    for entry in std::fs::read_dir(images).unwrap().map(|e| e.unwrap()) {
+        std::fs::copy(entry.path(), at("alice/private/photos").join(entry.file_name())).unwrap();
+    }
+    std::fs::write(at("alice/private/photos/notes.jpg"), "no photo").unwrap();
+    let train = |images: &Path, out: &Path| {
+        let mut c = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+        c.env("SPLATVK_HOME", &home).arg("train").arg("--images").arg(images);
+        c.arg("--cameras").arg(at("alice/private/cameras.json"));
+        c.arg("--points").arg(at("alice/private/points.ply"));
+        let output = c.args(["--iterations", "5", "--resume", "--out"]).arg(out).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    };
+    train(&at("alice/private/photos"), &at("alice/scene"));
+    for name in ["run.json", "report.html", "cameras/photos.json", "cameras/transforms.json", "scene.json"] {
+        let text = String::from_utf8(std::fs::read(at("alice/scene").join(name)).unwrap()).unwrap();
+        let folder = folder.path().to_str().unwrap();
+        assert!(!text.contains("alice") && !text.contains("private") && !text.contains(folder), "{name}");
+    }
+    let record = std::fs::read_to_string(at("alice/scene/run.json")).unwrap();
+    assert!(record.contains("\"images\": \"photos\""), "what it was made of: {record}");
+    let mode = |path: &Path| path.metadata().unwrap().mode() & 0o777;
+    let stages: Vec<_> = std::fs::read_dir(home.join("stages")).unwrap().map(|e| e.unwrap().path()).collect();
+    assert!(mode(&home.join("stages")) == 0o700 && !stages.is_empty());
+    assert!(stages.iter().all(|s| mode(s) == 0o600), "{stages:?}");
 }

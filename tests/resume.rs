@@ -43,7 +43,8 @@ impl Scene {
         if !home.exists() {
             std::fs::create_dir(&home).unwrap();
             for part in ["lib", "models"] {
-                std::os::unix::fs::symlink(splatvk::infer::home().unwrap().join(part), home.join(part)).unwrap();
+                std::os::unix::fs::symlink(splatvk::infer::home().unwrap().join(part), home.join(part))
+                    .unwrap();
             }
         }
         home

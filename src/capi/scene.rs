@@ -331,7 +331,9 @@ fn instance(of: &Instance) -> SvkInstance {
 
 /// Writes the scene: a file of Gaussians where the name ends like one (.ply, .compressed.ply, .splat, .spz; language goes
 /// beside it, into NAME.language.npz), a scene directory where it has no ending, ends in a slash or is that of a folder; any other
-/// ending is SVK_STATUS_INPUT. It appears whole or not at all; `replace` = 1 allows to replace a scene or file that is there. Thread-safe.
+/// ending is SVK_STATUS_INPUT. It appears whole or not at all; `replace` = 1 allows to replace a scene or file that is there, but
+/// never a symbolic link, what the scene was loaded from, a scene directory with files in it that splatvk did not write, or a place
+/// to which another process or thread writes. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_save(
     scene: *mut SvkScene,

@@ -22,8 +22,11 @@ use serde::Serialize;
 use std::path::{Path, PathBuf};
 
 pub fn eval(args: &EvalArgs) -> Result<()> {
-    let inputs: Vec<&Path> =
-        [Some(&args.scene), Some(&args.ground_truth), args.cameras.as_ref()].into_iter().flatten().map(PathBuf::as_path).collect();
+    let inputs: Vec<&Path> = [Some(&args.scene), Some(&args.ground_truth), args.cameras.as_ref()]
+        .into_iter()
+        .flatten()
+        .map(PathBuf::as_path)
+        .collect();
     let open = |out| WrittenFiles::open(out, args.force, &inputs);
     let mut out = args.out.as_deref().map(open).transpose()?;
     let scene = scene::load(&args.scene)?;

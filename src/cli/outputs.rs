@@ -228,7 +228,9 @@ mod tests {
         let at = |name: &str| base.path().join(name);
         for out in [at("new"), base.path().to_path_buf()] {
             let first = WrittenFiles::open(&out, true, &[]).unwrap();
-            assert!(refused(WrittenFiles::open(&out, true, &[])).contains("another splatvk is writing there"));
+            assert!(
+                refused(WrittenFiles::open(&out, true, &[])).contains("another splatvk is writing there")
+            );
             drop(first);
         }
         // Another program wrote there meanwhile.

@@ -214,8 +214,14 @@ fn joining(args: &RunArgs, scene: &Path, installed: &Inventory) -> Result<RunPla
 
 /// The source that is asked for; where that is left open, the one that the scene was made with.
 fn as_made<K: SourceKind>(made: &Settings, asked: &str, installed: &Inventory) -> Result<SourceChoice> {
-    let recorded = made.source(K::OPTION).filter(|_| asked == "auto");
-    choose::<K>(recorded.unwrap_or(asked), installed)
+    let Some(recorded) = made.source(K::OPTION).filter(|_| asked == "auto") else {
+        return choose::<K>(asked, installed);
+    };
+    // The scene knows no folders: it may have come from elsewhere.
+    choose::<K>(recorded, installed).map_err(|e| {
+        let option = K::OPTION;
+        Error::input(format!("{e} (the scene was made with --{option} {recorded}; give --{option} again)"))
+    })
 }
 
 /// `out/<name>` beside where the command runs; a folder called `images` takes its parent's name.

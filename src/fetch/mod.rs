@@ -12,13 +12,13 @@ pub use download::{Client, Fetched, Limits, MIRROR};
 pub use export::commands;
 pub use staging::leftovers;
 
+use crate::files::{Found, look, remove_leftover};
 use crate::infer::Registry;
 use crate::infer::adapter::Adapter;
 use crate::infer::catalogue::{CatalogueEntry, Recipe, Source, catalogue};
 use crate::infer::check::{Measured, check};
 use crate::infer::installed::inventory;
 use crate::progress::Progress;
-use crate::files::{Found, look, remove_leftover};
 use crate::{Error, Result, files};
 use staging::Staging;
 

@@ -9,6 +9,8 @@ use std::time::Duration;
 
 /// The file in a folder of unfinished work that names its owner.
 const MARK: &str = "owner";
+/// What is written lies here, or in the folder itself.
+pub(super) const NEW: &str = "new";
 /// Where a result lies aside while another one takes its place, on file systems that cannot exchange two folders.
 const OLD: &str = "old";
 /// Most bytes of a mark: ten times a long one.
@@ -73,8 +75,7 @@ impl Owner {
     fn is_gone(&self, locked: bool, folder: &Path) -> bool {
         match self.is_near() {
             // What this process works on, it holds.
-            true if self.process == std::process::id() => locked,
-            true => self.has_ended(),
+            true => self.has_ended() || self.process == std::process::id() && locked,
             false => locked && locks_reach_everybody(folder),
         }
     }
@@ -107,8 +108,18 @@ fn locks_reach_everybody(folder: &Path) -> bool {
     use std::os::unix::ffi::OsStrExt;
     // ext2 to 4, XFS, Btrfs, tmpfs, ramfs, F2FS, ZFS, bcachefs, overlay, FAT, exFAT and NTFS (linux/magic.h).
     const LOCAL: [u64; 12] = [
-        0xef53, 0x5846_5342, 0x9123_683e, 0x0102_1994, 0x8584_58f6, 0xf2f5_2010, 0x2fc1_2fc1, 0xca45_1a4e,
-        0x794c_7630, 0x4d44, 0x2011_bab0, 0x7366_746e,
+        0xef53,
+        0x5846_5342,
+        0x9123_683e,
+        0x0102_1994,
+        0x8584_58f6,
+        0xf2f5_2010,
+        0x2fc1_2fc1,
+        0xca45_1a4e,
+        0x794c_7630,
+        0x4d44,
+        0x2011_bab0,
+        0x7366_746e,
     ];
     let Ok(path) = std::ffi::CString::new(folder.as_os_str().as_bytes()) else { return false };
     let mut found = std::mem::MaybeUninit::<libc::statfs>::uninit();
@@ -167,7 +178,7 @@ pub(crate) fn look(folder: &Path) -> Found {
     }
     match read(&mut lock, folder) {
         Some(owner) if owner.is_gone(locked, folder) => {
-            Found::Left(Held { folder: folder.to_path_buf(), place: owner.place, _lock: lock })
+            Found::Left(Held { folder: folder.to_path_buf(), place: owner.place, lock })
         }
         Some(owner) => Found::Busy(Some(owner)),
         None if locked && lock.metadata().is_ok_and(|m| m.len() == 0) && only(1) => Found::Blank(Some(lock)),
@@ -179,7 +190,8 @@ pub(crate) fn look(folder: &Path) -> Found {
 fn read(mark: &mut File, folder: &Path) -> Option<Owner> {
     let mut text = String::new();
     mark.take(LONGEST_MARK).read_to_string(&mut text).ok()?;
-    let owner: Owner = serde_json::from_str(&text).ok()?;
+    // The first of two: whoever takes a folder over writes over the mark, and then cuts it off.
+    let owner: Owner = serde_json::Deserializer::from_str(&text).into_iter().next()?.ok()?;
     (owner.splatvk == UNFINISHED && owner.folder == name(folder)).then_some(owner)
 }
 
@@ -202,7 +214,8 @@ fn is_at(_: &File, _: &Path) -> bool {
 pub(crate) struct Held {
     folder: PathBuf,
     place: String,
-    _lock: File,
+    /// Held as long as this lives.
+    lock: File,
 }
 
 impl Held {
@@ -226,7 +239,9 @@ impl Held {
                 left @ (Found::Left(_) | Found::Blank(_)) => {
                     remove(folder, left).map_err(Error::unwritable(place))?;
                 }
-                Found::Busy(Some(owner)) if !owner.has_ended() => return Err(busy(place, folder, Some(&owner))),
+                Found::Busy(Some(owner)) if !owner.has_ended() => {
+                    return Err(busy(place, folder, Some(&owner)));
+                }
                 Found::Busy(_) => std::thread::sleep(PATIENCE.1),
                 Found::Foreign => return Err(foreign(folder)),
             }
@@ -252,14 +267,16 @@ impl Held {
         write(&mut lock, folder, place).inspect_err(|_| {
             let _ = clear(folder);
         })?;
-        Ok(Some(Held { folder: folder.to_path_buf(), place: name(place), _lock: lock }))
+        Ok(Some(Held { folder: folder.to_path_buf(), place: name(place), lock }))
     }
 
     /// The same folder under this process's name.
     fn renewed(mut self, place: &Path) -> std::io::Result<Held> {
-        self._lock.set_len(0)?;
-        std::io::Seek::rewind(&mut self._lock)?;
-        write(&mut self._lock, &self.folder, place)?;
+        std::io::Seek::rewind(&mut self.lock)?;
+        write(&mut self.lock, &self.folder, place)?;
+        let end = std::io::Seek::stream_position(&mut self.lock)?;
+        self.lock.set_len(end)?;
+        self.place = name(place);
         Ok(self)
     }
 
@@ -280,9 +297,11 @@ impl Held {
             return true;
         }
         let Some(place) = self.folder.parent().map(|parent| parent.join(&self.place)) else { return false };
-        // What cannot be named again stays: it may be all that is left of a scene.
+        // What cannot be named again stays, and so does what another one came in the place of before the new one was there: it may be
+        // all that is left of a scene.
         let named = !self.place.is_empty() && !self.place.contains(char::REPLACEMENT_CHARACTER);
-        named && (place.symlink_metadata().is_ok() || std::fs::rename(&old, place).is_ok())
+        let moved = || [NEW, ""].iter().all(|part| !self.folder.join(part).join(&self.place).exists());
+        named && if place.symlink_metadata().is_ok() { moved() } else { std::fs::rename(&old, place).is_ok() }
     }
 
     /// Removes the folder with all that is in it.
@@ -464,5 +483,28 @@ pub(crate) mod tests {
             assert_eq!(at("a.ply/scene.json").exists(), !there, "nothing is written over");
             std::fs::remove_dir_all(at("a.ply")).unwrap();
         }
+        // Something came there while neither was at the place: what was moved aside is the only one.
+        leave(&at("x"));
+        std::fs::create_dir_all(at("x").join(NEW).join("a.ply")).unwrap();
+        std::fs::create_dir(at("x").join(OLD)).unwrap();
+        std::fs::create_dir(at("a.ply")).unwrap();
+        remove(&at("x"), look(&at("x"))).unwrap();
+        assert!(at("x").join(OLD).exists());
+    }
+
+    #[test]
+    fn folder_taken_over_keeps_its_content() {
+        let base = tempfile::tempdir().unwrap();
+        let folder = base.path().join("x");
+        leave(&folder);
+        // Killed before it has cut off the rest of a longer mark.
+        let mark = std::fs::read_to_string(folder.join(MARK)).unwrap();
+        std::fs::write(folder.join(MARK), format!("{mark}}}\n")).unwrap();
+        let held = Held::take(&folder, &base.path().join("b"), true).unwrap();
+        assert!(folder.join("half").exists());
+        let text = std::fs::read_to_string(folder.join(MARK)).unwrap();
+        assert_eq!(serde_json::from_str::<Owner>(&text).unwrap().process, std::process::id());
+        assert!(Held::take(&folder, &base.path().join("b"), true).is_err());
+        held.clear().unwrap();
     }
 }

@@ -1,6 +1,6 @@
 //! What is being written, in a hidden folder that its owner has marked and locked: it goes when the work fails, when the process is
 //! stopped, and, where the process was killed, with the next one that writes to the place.
-use super::owner::{self, Found, Held};
+use super::owner::{self, Found, Held, NEW};
 use crate::{Error, Result};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -16,8 +16,6 @@ static FINISHED: AtomicBool = AtomicBool::new(false);
 pub const HIDDEN: &str = ".partial-splatvk";
 /// Longest name, in bytes, that is part of that of its hidden folder: file systems take 255.
 const LONGEST_NAME: usize = 200;
-/// What is written lies here, within the hidden folder.
-const NEW: &str = "new";
 
 fn unfinished() -> MutexGuard<'static, Vec<(PathBuf, Vec<PathBuf>)>> {
     // A panic while holding the lock leaves a list that is still right.
@@ -44,11 +42,9 @@ impl Partial {
         Ok(partial)
     }
 
-    /// For several files: inside of `folder`, which is made where it is missing; leftovers in it go.
+    /// For several files: inside of `folder`, which is made where it is missing.
     pub fn inside(folder: &Path) -> Result<Partial> {
-        let partial = Partial::reserve(folder, &folder.join(HIDDEN), folder)?;
-        sweep(folder);
-        Ok(partial)
+        Partial::reserve(folder, &folder.join(HIDDEN), folder)
     }
 
     fn reserve(parent: &Path, hidden: &Path, place: &Path) -> Result<Partial> {
@@ -216,9 +212,9 @@ pub fn remove_leftover(path: &Path) -> std::io::Result<()> {
     owner::remove(path, owner::look(path))
 }
 
-/// Removes [`leftovers`].
+/// Removes [`leftovers`] in a folder, and what was left beside it of a whole one in its place.
 pub fn sweep(folder: &Path) {
-    for path in leftovers(folder) {
+    for path in leftovers(folder).into_iter().chain([hidden_beside(folder)]) {
         // Another process may have swept it, or it is another user's.
         let _ = remove_leftover(&path);
     }

@@ -2,7 +2,7 @@
 use crate::photo::{self, Photo};
 use crate::scene::RgbImage;
 use crate::{Error, Result, files};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Everything of the photos but their pixels, which are in `images/` beside it.
 const PHOTOS: &str = "photos.json";
@@ -11,7 +11,9 @@ const PHOTOS: &str = "photos.json";
 pub(super) fn write(cameras: &Path, photos: &[Photo]) -> Result<()> {
     let bare = |p: &Photo| {
         let image = RgbImage { width: p.image.width, height: p.image.height, data: Vec::new() };
-        Photo { image, fine: None, ..p.clone() }
+        // Its folder is nobody's business who gets the scene.
+        let path = p.path.file_name().map_or_else(|| p.path.clone(), PathBuf::from);
+        Photo { image, path, fine: None, ..p.clone() }
     };
     let all: Vec<Photo> = photos.iter().map(bare).collect();
     super::write_json(&cameras.join(PHOTOS), &all)

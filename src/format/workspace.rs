@@ -58,7 +58,8 @@ impl Workspace {
     /// meanwhile that may not be replaced, the folder goes beside it, and the error says where.
     pub fn commit(self) -> Result<PathBuf> {
         let Workspace { partial, out, force, replaced } = self;
-        let replaces = match check_place(&out, Kind::Folder, true).and_then(|()| replaced.check(&out, force)) {
+        let replaces = match check_place(&out, Kind::Folder, true).and_then(|()| replaced.check(&out, force))
+        {
             Ok(replaces) => replaces,
             Err(e) => {
                 let beside = files::next_free(&out);
@@ -100,7 +101,9 @@ impl Replaced {
             None => {
                 files::check_free_inside(out)?;
                 check_place(out, Kind::Folder, false).map(|()| false).map_err(|_| {
-                    Error::input(format!("{place}: the folder is not empty and not {name}; choose another --out"))
+                    Error::input(format!(
+                        "{place}: the folder is not empty and not {name}; choose another --out"
+                    ))
                 })
             }
         }

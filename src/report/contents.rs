@@ -1,10 +1,12 @@
 //! Contents of run.json and the report.
+use super::bare::bare;
 use super::viewer;
 use crate::Result;
 use crate::photo::Light;
 use crate::progress::StageRecord;
 use crate::scene::{Plane, RgbImage};
 use serde::Serialize;
+use serde_json::Value;
 use std::path::Path;
 
 /// A model file that a run used.
@@ -24,7 +26,7 @@ pub struct RunRecord {
     /// "splatvk 0.1.0".
     pub program: String,
     /// Options after defaults were resolved.
-    pub config: serde_json::Value,
+    pub config: Value,
     /// Seed of everything random.
     pub seed: u64,
     /// Name of the Vulkan device.
@@ -38,12 +40,25 @@ pub struct RunRecord {
     /// Wall seconds of the run.
     pub seconds: f64,
     /// Splats, PSNR, match counts, codes per level: free-form.
-    pub statistics: serde_json::Value,
+    pub statistics: Value,
     /// What the user was warned about.
     pub warnings: Vec<String>,
 }
 
 impl RunRecord {
+    /// The same without the folders of the paths that the user typed: a scene and its report are passed on, and nobody there needs to
+    /// know where the photos lay.
+    pub fn without_folders<'a>(mut self, typed: impl IntoIterator<Item = &'a Path>) -> RunRecord {
+        let mut warnings = Value::from(std::mem::take(&mut self.warnings));
+        let typed: Vec<&Path> = typed.into_iter().collect();
+        for value in [&mut self.config, &mut self.statistics, &mut warnings] {
+            bare(value, typed.iter().copied());
+        }
+        let texts = warnings.as_array().into_iter().flatten();
+        self.warnings = texts.filter_map(|w| w.as_str().map(str::to_owned)).collect();
+        self
+    }
+
     /// Writes `run.json` into a scene folder.
     pub fn write(&self, folder: &Path) -> Result<()> {
         crate::format::write_json(&folder.join("run.json"), self)

@@ -1,4 +1,5 @@
 //! Records of a run: `run.json`, `report.html`, `previews/`, the closing table on the terminal.
+mod bare;
 pub mod chart;
 pub mod colour;
 mod contents;

@@ -127,7 +127,7 @@ impl RunPlan {
     }
 
     /// The files and folders that the run reads.
-    pub(super) fn read(&self) -> impl Iterator<Item = &Path> {
+    pub fn read(&self) -> impl Iterator<Item = &Path> {
         let sources = [&self.init, &self.depth_prior, &self.matcher, &self.masks, &self.features];
         let arguments = sources.into_iter().filter_map(|s| s.argument.as_deref());
         let folders = [self.add.as_deref(), self.models.as_deref()].into_iter().flatten();

@@ -12,7 +12,7 @@ use crate::scene::{Camera, LEVEL_NAMES, Seen, Splats, World};
 use serde_json::json;
 use std::path::Path;
 
-/// `run.json`.
+/// What `run.json` holds, with the paths as they were typed.
 pub fn run_record(o: &RunOutcome) -> RunRecord {
     let used = |m: &&crate::infer::ModelStatus| m.installed;
     let plan = RunPlan { method: Some(o.plan.method()), ..o.plan.clone() };
@@ -328,7 +328,7 @@ pub fn closing_table(o: &RunOutcome) -> String {
 
 /// Writes `run.json`, `report.html` and `previews/`.
 pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
-    let record = run_record(o);
+    let record = run_record(o).without_folders(o.plan.read().chain([o.plan.out.as_path()]));
     record.write(folder)?;
     let levels: Vec<Vec<_>> =
         o.frames.iter().map(|f| LEVEL_NAMES.into_iter().zip(f.codes.iter().cloned()).collect()).collect();

@@ -63,6 +63,14 @@ pub struct TrainOutcome {
     pub table: String,
 }
 
+impl TrainPlan {
+    /// The files and folders that the training reads.
+    fn read(&self) -> impl Iterator<Item = &Path> {
+        let given = [self.points.as_deref(), self.models.as_deref()].into_iter().flatten();
+        [self.images.as_path(), self.cameras.as_path()].into_iter().chain(given)
+    }
+}
+
 /// Photos that have a camera, in name order; photos without one are named in a warning.
 fn matched(
     plan: &TrainPlan,
@@ -139,7 +147,8 @@ fn with_footprints(mut cloud: PointCloud, list: &[Camera], progress: &dyn Progre
 pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> {
     let progress = &Recorded::new(progress);
     let inputs = [Some(&plan.cameras), plan.points.as_ref(), plan.models.as_ref()];
-    let inputs: Vec<&Path> = inputs.into_iter().flatten().chain([&plan.images]).map(PathBuf::as_path).collect();
+    let inputs: Vec<&Path> =
+        inputs.into_iter().flatten().chain([&plan.images]).map(PathBuf::as_path).collect();
     let workspace = Workspace::create(&plan.out, plan.force, &inputs)?;
     let known = cameras::read(&plan.cameras)?;
     let given = plan.points.as_deref().map(points).transpose()?;
@@ -240,6 +249,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         light: p.light,
     });
     let title = plan.out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let bare = record.clone().without_folders(plan.read().chain([plan.out.as_path()]));
     let shown = HtmlReport {
         title: &title,
         views: views.collect(),
@@ -258,9 +268,9 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
             answers: Vec::new(),
         }),
         figures: figures.clone(),
-        run: &record,
+        run: &bare,
     };
-    record.write(workspace.path())?;
+    bare.write(workspace.path())?;
     report::write_html(workspace.path(), &shown)?;
     report::write_previews(workspace.path(), &shown)?;
     progress.check()?;

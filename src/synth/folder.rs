@@ -197,7 +197,8 @@ mod tests {
             assert!(crate::pass::metrics::psnr(&photo, &seen.image) > 30.0);
         }
         assert_eq!(foreign(dir.path()), Some(Vec::new()));
-        for name in ["letter", "images/IMG_1.jpg", "images/train_00.txt", "regions_exact/mine_s.npy", "depth"] {
+        for name in ["letter", "images/IMG_1.jpg", "images/train_00.txt", "regions_exact/mine_s.npy", "depth"]
+        {
             let path = dir.path().join(name);
             let _ = std::fs::rename(&path, dir.path().join("aside"));
             std::fs::write(&path, "precious").unwrap();

@@ -9,7 +9,7 @@ mod scene;
 mod shapes;
 mod spoil;
 
-pub use folder::{generate, foreign, write_regions};
+pub use folder::{foreign, generate, write_regions};
 pub use outdoor::Sky;
 pub use phone::{Effects, PhotoEffects, TrueLight, to_linear, to_srgb};
 pub use render::{RayCast, photo, render};

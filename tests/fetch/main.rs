@@ -1,13 +1,13 @@
 //! `splatvk models fetch` against a server on this machine: what goes wrong on networks, disks and with processes, and that a
 //! model is there whole or not at all.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
+#[allow(dead_code)] // other tests use the rest
+#[path = "../fixture/command.rs"]
+mod command;
 mod download;
 mod full_size;
 mod models;
 mod server;
-#[allow(dead_code)] // other tests use the rest
-#[path = "../fixture/command.rs"]
-mod command;
 #[allow(dead_code)] // other tests use the rest
 #[path = "../../src/infer/testing.rs"]
 mod testing;
