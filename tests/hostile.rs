@@ -282,35 +282,38 @@ fn folders_as_typed_are_not_in_the_scene() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let (images, cameras, points) = fixture::small_views();
-    let home = at("alice/home");
-    std::fs::create_dir_all(at("alice/private")).unwrap();
+    let home = at("alice-t/home");
+    std::fs::create_dir_all(at("alice-t/secret-album")).unwrap();
     std::fs::create_dir_all(&home).unwrap();
     for part in ["lib", "models"] {
         std::os::unix::fs::symlink(splatvk::infer::home().unwrap().join(part), home.join(part)).unwrap();
     }
     for (from, to) in [(cameras, "cameras.json"), (points, "points.ply")] {
-        std::fs::copy(from, at("alice/private").join(to)).unwrap();
+        std::fs::copy(from, at("alice-t/secret-album").join(to)).unwrap();
     }
-    std::fs::create_dir(at("alice/private/photos")).unwrap();
+    std::fs::create_dir(at("alice-t/secret-album/photos")).unwrap();
     for entry in std::fs::read_dir(images).unwrap().map(|e| e.unwrap()) {
-        std::fs::copy(entry.path(), at("alice/private/photos").join(entry.file_name())).unwrap();
+        std::fs::copy(entry.path(), at("alice-t/secret-album/photos").join(entry.file_name())).unwrap();
     }
-    std::fs::write(at("alice/private/photos/notes.jpg"), "no photo").unwrap();
+    std::fs::write(at("alice-t/secret-album/photos/notes.jpg"), "no photo").unwrap();
     let train = |images: &Path, out: &Path| {
         let mut c = Command::new(env!("CARGO_BIN_EXE_splatvk"));
         c.env("SPLATVK_HOME", &home).arg("train").arg("--images").arg(images);
-        c.arg("--cameras").arg(at("alice/private/cameras.json"));
-        c.arg("--points").arg(at("alice/private/points.ply"));
+        c.arg("--cameras").arg(at("alice-t/secret-album/cameras.json"));
+        c.arg("--points").arg(at("alice-t/secret-album/points.ply"));
         let output = c.args(["--iterations", "5", "--resume", "--out"]).arg(out).output().unwrap();
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     };
-    train(&at("alice/private/photos"), &at("alice/scene"));
+    train(&at("alice-t/secret-album/photos"), &at("alice-t/scene"));
     for name in ["run.json", "report.html", "cameras/photos.json", "cameras/transforms.json", "scene.json"] {
-        let text = String::from_utf8(std::fs::read(at("alice/scene").join(name)).unwrap()).unwrap();
+        let text = String::from_utf8(std::fs::read(at("alice-t/scene").join(name)).unwrap()).unwrap();
         let folder = folder.path().to_str().unwrap();
-        assert!(!text.contains("alice") && !text.contains("private") && !text.contains(folder), "{name}");
+        assert!(
+            !text.contains("alice-t") && !text.contains("secret-album") && !text.contains(folder),
+            "{name}"
+        );
     }
-    let record = std::fs::read_to_string(at("alice/scene/run.json")).unwrap();
+    let record = std::fs::read_to_string(at("alice-t/scene/run.json")).unwrap();
     assert!(record.contains("\"images\": \"photos\""), "what it was made of: {record}");
     let mode = |path: &Path| path.metadata().unwrap().mode() & 0o777;
     let stages: Vec<_> = std::fs::read_dir(home.join("stages")).unwrap().map(|e| e.unwrap().path()).collect();

@@ -389,17 +389,23 @@ fn copy(from: &Path, to: &Path) {
 
 #[test]
 fn second_command_for_one_place_is_refused() {
-    for (words, seconds) in [
-        ("generate --size 1600x1200 --views 40 --out", 1.0),
-        ("ablate alignment --data TRUTH --seeds 1,2,3,4,5,6,7,8 --out", 2.0),
-        ("bench training --splats 2000 --seconds 600 --json", 1.0),
+    for words in [
+        "generate --size 1600x1200 --views 40 --out",
+        "ablate alignment --data TRUTH --seeds 1,2,3,4,5,6,7,8 --out",
+        "bench training --splats 2000 --seconds 600 --json",
     ] {
         let folder = tempfile::tempdir().unwrap();
         let place = folder.path().join("out");
         let mut first = Command::new(env!("CARGO_BIN_EXE_splatvk"));
         first.env_remove("SPLATVK_MODELS").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         let mut first = first.args(line(words, &place)).spawn().unwrap();
-        std::thread::sleep(Duration::from_secs_f64(seconds));
+        let marks =
+            [".out.partial-splatvk/owner", "out/.partial-splatvk/owner"].map(|m| folder.path().join(m));
+        let begun = Instant::now();
+        while !marks.iter().any(|m| m.metadata().is_ok_and(|m| m.len() > 0)) {
+            assert!(begun.elapsed() < Duration::from_secs(60), "{words}: nothing is reserved");
+            std::thread::sleep(Duration::from_millis(20));
+        }
         let name = format!("process {}", first.id());
         for again in [line(words, &place), forced(line(words, &place))] {
             refused(&again, &name);
