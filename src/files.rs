@@ -100,9 +100,25 @@ fn read_open(file: File, size: u64, path: &Path) -> Result<Vec<u8>> {
 
 /// Reads a text file.
 pub(crate) fn read_text(path: &Path) -> Result<String> {
-    String::from_utf8(read_within(path, LONGEST_TEXT)?).map_err(|_| {
-        Error::input(format!("{}: is not text (UTF-8); check that it is the right file", path.display()))
-    })
+    let bytes = read_within(path, LONGEST_TEXT)?;
+    let text = plain_text(&bytes).map_err(|e| Error::input(format!("{}: {e}", path.display())))?;
+    Ok(text.to_owned())
+}
+
+/// The text of a file's bytes, without the byte-order mark that editors of Windows put in front.
+pub(crate) fn plain_text(bytes: &[u8]) -> Result<&str, String> {
+    // JSON, TOML and tables of numbers begin with ASCII, whose other byte is zero in UTF-16.
+    let ascii = |byte: u8| byte.is_ascii_graphic() || byte.is_ascii_whitespace();
+    let utf16 = match bytes {
+        [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => true,
+        [a, 0, b, 0, ..] | [0, a, 0, b, ..] => ascii(*a) && ascii(*b),
+        _ => false,
+    };
+    if utf16 {
+        return Err("is UTF-16 text; save it as UTF-8".to_owned());
+    }
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    std::str::from_utf8(bytes).map_err(|_| "is not text (UTF-8); check that it is the right file".to_owned())
 }
 
 /// Reads a JSON file; `advice` says what to do where it is not what is looked for.
@@ -113,6 +129,8 @@ pub(crate) fn read_json<T: serde::de::DeserializeOwned>(path: &Path, advice: &st
 
 /// Parses JSON of a bounded number of values.
 pub(crate) fn parse_json<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, String> {
+    let text = plain_text(bytes)?;
+    let bytes = text.as_bytes();
     let (mut values, mut quoted, mut escaped) = (1usize, false, false);
     for byte in bytes {
         match byte {
@@ -126,7 +144,7 @@ pub(crate) fn parse_json<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, S
     if values > MOST_VALUES {
         return Err(format!("holds {values} values, more than the {MOST_VALUES} that are read"));
     }
-    serde_json::from_slice(bytes).map_err(|e| e.to_string())
+    serde_json::from_str(text).map_err(|e| e.to_string())
 }
 
 /// Hexadecimal digits of the checksum.
@@ -306,7 +324,7 @@ mod tests {
         refused(&at("b"), "check the name");
         let e = read_within(&at("a"), 2).unwrap_err();
         assert!(e.to_string().contains("3 bytes are too many"), "{e}");
-        std::fs::write(at("binary"), b"\xff\xfe").unwrap();
+        std::fs::write(at("binary"), b"\xff\xd8").unwrap();
         assert!(read_text(&at("binary")).unwrap_err().to_string().contains("not text"));
         #[cfg(target_os = "linux")]
         {
@@ -317,6 +335,30 @@ mod tests {
             refused(&at("loop"), "check the name and that you may read it");
             // Announces no bytes and has some.
             refused(Path::new("/proc/self/status"), "another length");
+        }
+    }
+
+    #[test]
+    fn text_is_read_as_editors_write_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("a.json");
+        std::fs::write(&file, b"\xef\xbb\xbf[1, 2]\r\n").unwrap();
+        assert_eq!(read_text(&file).unwrap(), "[1, 2]\r\n");
+        assert_eq!(read_json::<Vec<u8>>(&file, "").unwrap(), [1, 2]);
+        let utf16 = |order: fn(u16) -> [u8; 2], mark: bool| -> Vec<u8> {
+            let marks = if mark { "\u{feff}" } else { "" };
+            format!("{marks}[1]").encode_utf16().flat_map(order).collect()
+        };
+        for bytes in [
+            utf16(u16::to_le_bytes, true),
+            utf16(u16::to_be_bytes, true),
+            utf16(u16::to_le_bytes, false),
+            utf16(u16::to_be_bytes, false),
+        ] {
+            std::fs::write(&file, bytes).unwrap();
+            for e in [read_text(&file).unwrap_err(), read_json::<Vec<u8>>(&file, "").unwrap_err()] {
+                assert!(e.exit_code() == 2 && e.to_string().contains("save it as UTF-8"), "{e}");
+            }
         }
     }
 

@@ -451,7 +451,8 @@ fn colmap_cameras_of_one_focal_length() {
     std::fs::write(folder.path().join("cameras.txt"), cameras).unwrap();
     std::fs::write(folder.path().join("images.txt"), images).unwrap();
     let read = colmap::read(folder.path()).unwrap();
-    assert!(read.len() == 3 && read.iter().all(|c| [c.fx, c.fy, c.cx, c.cy] == [500.0, 500.0, 321.0, 242.0]));
+    let optics = |c: &Camera| [c.fx, c.fy, c.cx, c.cy];
+    assert!(read.len() == 3 && read.iter().all(|c| optics(&c.camera) == [500.0, 500.0, 321.0, 242.0]));
 }
 
 #[test]
@@ -469,7 +470,6 @@ fn what_no_pinhole_can_be_is_refused() {
         ("{}", "neither transforms.json"),
         (r#"{"frames": []}"#, "no cameras"),
         (&frame("", identity), "no focal length"),
-        (&frame(r#""fl_x": 50, "k1": 0.1,"#, identity), "k1 = 0.1"),
         (&frame(r#""fl_x": -50,"#, identity), "must be positive"),
         (&frame(r#""fl_x": 50,"#, "[[1,0,0,0]]"), "4 × 4"),
         (&frame(r#""fl_x": 50,"#, "[[2,0,0,0],[0,1,0,0],[0,0,1,0]]"), "not a rotation"),
@@ -566,8 +566,20 @@ fn scene_directory_round_trip() {
 #[test]
 fn cameras_of_photos_as_taken_carry_their_lens() {
     let dir = tempfile::tempdir().unwrap();
-    let list = some_cameras();
-    let lenses = [Lens { k1: -0.12, k2: 0.03 }, Lens { k1: 0.05, k2: 0.0 }, Lens::NONE];
+    let list: Vec<Camera> = some_cameras().into_iter().chain(some_cameras()).collect();
+    let list: Vec<Camera> = list
+        .into_iter()
+        .enumerate()
+        .map(|(k, c)| Camera { name: format!("{k}.jpg"), fy: 611.0, ..c })
+        .collect();
+    let lenses = [
+        Lens::radial(-0.12, 0.03),
+        Lens::radial(0.05, 0.0),
+        Lens::NONE,
+        Lens { p1: 0.001, p2: -0.002, ..Lens::radial(0.01, 0.0) },
+        Lens { k3: 0.002, k4: 0.01, k5: -0.003, k6: 0.0001, p1: 0.001, ..Lens::radial(0.01, 0.02) },
+        Lens { k3: 0.002, k4: -0.0001, fisheye: true, ..Lens::radial(0.01, 0.02) },
+    ];
     colmap::write_lensed(dir.path(), &list, &lenses).unwrap();
     let text = std::fs::read_to_string(dir.path().join("cameras.txt")).unwrap();
     let line = text.lines().find(|l| l.starts_with("1 ")).unwrap();
@@ -577,9 +589,147 @@ fn cameras_of_photos_as_taken_carry_their_lens() {
     let json: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     assert_eq!(json["camera_model"], "OPENCV");
     assert_eq!((&json["frames"][0]["k1"], &json["frames"][0]["k2"]), (&(-0.12).into(), &0.03.into()));
-    // A pinhole reader must not take them for pinholes.
-    for path in [dir.path(), file.as_path()] {
-        let e = cameras::read(path).unwrap_err();
-        assert!(e.exit_code() == 2 && e.to_string().contains("distortion"), "{e}");
+    for path in [dir.path(), file.as_path(), &dir.path().join("images.txt")] {
+        let read = cameras::read_file(path).unwrap();
+        assert_eq!(read.cameras.iter().map(|c| c.lens).collect::<Vec<_>>(), lenses);
+        assert_same_cameras(&read.cameras.iter().map(|c| c.camera.clone()).collect::<Vec<_>>(), &list);
+        // Views are rendered of the pinholes, which is said.
+        let (pinholes, warnings) = read.pinholes();
+        assert!(
+            pinholes.len() == 6 && warnings.len() == 1 && warnings[0].starts_with("5 of 6"),
+            "{warnings:?}"
+        );
     }
+}
+
+/// A `transforms.json` of one frame with more keys.
+fn one_frame(extra: &str) -> String {
+    format!(
+        r#"{{"w": 64, "h": 48, "fl_x": 50, {extra} "frames": [{{"file_path": "a.png", "transform_matrix":
+            [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}}]}}"#
+    )
+}
+
+#[test]
+fn camera_models_are_read_or_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("t.json");
+    let read = |extra: &str| {
+        std::fs::write(&path, one_frame(extra)).unwrap();
+        cameras::read_file(&path)
+    };
+    let lens = |extra: &str| read(extra).unwrap().cameras[0].lens;
+    assert_eq!(lens(r#""k1": null, "k2": 0, "is_fisheye": false, "camera_model": null,"#), Lens::NONE);
+    assert_eq!(lens(r#""k1": 1e-9,"#), Lens::radial(1e-9, 0.0));
+    let tangential = Lens { k3: 0.01, p1: 0.001, p2: 0.002, ..Lens::radial(0.1, 0.02) };
+    assert_eq!(
+        lens(r#""camera_model": "OPENCV", "k1": 0.1, "k2": 0.02, "k3": 0.01, "p1": 0.001, "p2": 0.002,"#),
+        tangential
+    );
+    let round = Lens { k3: 0.01, k4: 0.001, fisheye: true, ..Lens::radial(0.1, 0.02) };
+    for model in [r#""is_fisheye": true,"#, r#""camera_model": "OPENCV_FISHEYE","#] {
+        assert_eq!(lens(&format!(r#"{model} "k1": 0.1, "k2": 0.02, "k3": 0.01, "k4": 0.001,"#)), round);
+    }
+    for (extra, words) in [
+        (r#""k4": 0.1,"#, "FULL_OPENCV"),
+        (r#""camera_model": "ORTHOPHOTO","#, "ORTHOPHOTO is not read"),
+        (r#""camera_model": "EQUIRECTANGULAR","#, "EQUIRECTANGULAR is not read"),
+        (r#""camera_model": "FISHEYE624","#, "FISHEYE624 is not read"),
+        (r#""camera_model": "FOV","#, "FOV is not read"),
+        (r#""ftheta_p0": 0.0,"#, "ftheta_p0"),
+        (r#""latlong": true,"#, "latlong"),
+        (r#""is_fisheye": true, "p1": 0.1,"#, "p1 = 0.1"),
+        (r#""is_fisheye": false, "camera_model": "OPENCV_FISHEYE","#, "is_fisheye is false"),
+        // The corner of 64 × 48 at f = 50 is at r = 0.8, the fold of k1 = −0.8 at 0.65.
+        (r#""k1": -0.8,"#, "folds back"),
+        (r#""k1": 1e999,"#, "not a JSON camera file"),
+    ] {
+        let e = read(extra).unwrap_err();
+        assert!(e.exit_code() == 2 && e.to_string().contains(words), "{extra}: {e}");
+    }
+    // What a frame states counts before what the file states for all.
+    let own = one_frame(r#""k1": 0.1,"#)
+        .replace(r#""file_path""#, r#""k1": 0.05, "camera_model": "OPENCV", "file_path""#);
+    std::fs::write(&path, own).unwrap();
+    assert_eq!(cameras::read_file(&path).unwrap().cameras[0].lens, Lens::radial(0.05, 0.0));
+    assert_eq!(read(r#""rolling_shutter": [0, 0, 1, 0],"#).unwrap().warnings.len(), 1);
+}
+
+#[test]
+fn frames_without_matrix_are_skipped_and_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("t.json");
+    let more = |frame: &str| one_frame("").replace(r#""frames": ["#, &format!(r#""frames": [{frame}, "#));
+    for matrix in ["", r#", "transform_matrix": null"#] {
+        std::fs::write(&path, more(&format!(r#"{{"file_path": "b.png"{matrix}}}"#))).unwrap();
+        let read = cameras::read_file(&path).unwrap();
+        assert!(read.cameras.len() == 1 && read.warnings.len() == 1 && read.warnings[0].ends_with("b.png"));
+    }
+    std::fs::write(&path, r#"{"fl_x": 50, "frames": [{"file_path": "b.png"}]}"#).unwrap();
+    assert!(cameras::read_file(&path).unwrap_err().to_string().contains("b.png"));
+    // Twice the same name, spelt in two ways.
+    let again = one_frame("").replace(
+        "]]}",
+        r#"]]}, {"file_path": "./a.png", "transform_matrix":
+        [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#,
+    );
+    std::fs::write(&path, again).unwrap();
+    assert!(cameras::read_file(&path).unwrap_err().to_string().contains("two cameras have the name"));
+}
+
+/// A COLMAP model in text of two photos.
+fn model(folder: &Path, cameras: &str, images: &str) {
+    std::fs::create_dir_all(folder).unwrap();
+    std::fs::write(folder.join("cameras.txt"), cameras).unwrap();
+    std::fs::write(folder.join("images.txt"), images).unwrap();
+}
+
+#[test]
+fn colmap_text_is_read_as_people_write_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let cases = [
+        (
+            "\u{feff}# cameras\r\n1 PINHOLE 64 48 50 50 32 24\r\n",
+            "\u{feff}# images\r\n7 1 0 0 0 0 0 0 1 a b.jpg\r\n\r\n",
+        ),
+        ("1\tPINHOLE\t64\t48\t50\t50\t32\t24\n", "7\t1\t0\t0\t0\t0\t0\t0\t1\ta b.jpg\n1.5\t2.5\t-1\n"),
+        ("  1  PINHOLE 64  48 50 50 32 24 \n", " 7  1 0 0 0  0 0 0 1   a b.jpg \n\n"),
+        (
+            "  # c\n1 pinhole 64 48 50 50 32 24\n2 FOV 64 48 50 50 32 24 0.9\n",
+            "7 1 0 0 0 0 0 0 1 a b.jpg\n\n",
+        ),
+    ];
+    for (cameras, images) in cases {
+        model(folder.path(), cameras, images);
+        let read = colmap::read(folder.path()).unwrap();
+        assert!(read.len() == 1 && read[0].camera.name == "a b.jpg" && read[0].camera.cx == 32.0, "{read:?}");
+    }
+    model(folder.path(), "2 FOV 64 48 50 50 32 24 0.9\n", "7 1 0 0 0 0 0 0 2 a.jpg\n\n");
+    let e = colmap::read(folder.path()).unwrap_err().to_string();
+    assert!(e.contains("camera 2 is FOV") && e.contains("colmap image_undistorter --image_path"), "{e}");
+    model(folder.path(), "2 LOMO 64 48 1 2\n", "7 1 0 0 0 0 0 0 2 a.jpg\n\n");
+    assert!(colmap::read(folder.path()).unwrap_err().to_string().contains("\"LOMO\" is not known"));
+}
+
+#[test]
+fn models_are_found_in_data_sets() {
+    for below in
+        ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "dense/sparse", "dense/0/sparse", "colmap"]
+    {
+        let folder = tempfile::tempdir().unwrap();
+        let place = folder.path().join(below);
+        model(&place, "1 PINHOLE 64 48 50 50 32 24\n", "1 1 0 0 0 0 0 0 1 a.jpg\n\n");
+        std::fs::write(place.join("points3D.txt"), "1 1 2 3 255 0 0 0.5\n").unwrap();
+        assert_eq!(cameras::read_file(folder.path()).unwrap().cameras.len(), 1, "{below}");
+        assert_eq!(colmap::read_points(folder.path()).unwrap().positions, [[1.0, 2.0, 3.0]], "{below}");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    for number in ["0", "1"] {
+        let place = folder.path().join("sparse").join(number);
+        model(&place, "1 PINHOLE 64 48 50 50 32 24\n", "1 1 0 0 0 0 0 0 1 a.jpg\n\n");
+    }
+    let warnings = cameras::read_file(folder.path()).unwrap().warnings;
+    assert!(warnings.len() == 1 && warnings[0].contains("sparse/1"), "{warnings:?}");
+    let e = colmap::read_points(folder.path()).unwrap_err();
+    assert!(e.exit_code() == 2 && e.to_string().contains("no points3D"), "{e}");
 }

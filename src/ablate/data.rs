@@ -1,6 +1,6 @@
 //! Data sets in their own layouts, as the runner takes them: frames that may be photos, labels, and cameras where known.
 use crate::format::cameras;
-use crate::photo::{Candidate, MAX_SIZE, sizes_of, stem, working_size};
+use crate::photo::{Candidate, MAX_SIZE, join, sizes_of, working_size};
 use crate::query::eval::{GroundTruth, Split, TruthFrame};
 use crate::query::protocol::{self, ProtocolKind};
 use crate::scene::{Camera, Pose};
@@ -154,13 +154,15 @@ fn published(name: String, folder: &Path, kind: ProtocolKind) -> Result<DataSet>
         own if !own.is_empty() => own,
         _ => cameras_beside(folder)?,
     };
+    let names: Vec<&str> = known.iter().map(|c| c.name.as_str()).collect();
+    let joined = join(&read.stems, &names).map_err(|e| Error::input(format!("{}: {e}", folder.display())))?;
     let mut frames = Vec::new();
-    for name in read.stems {
+    for (name, own) in read.stems.into_iter().zip(joined) {
         let Some(file) = photo(folder, &name) else { continue };
         let (w, h) = sizes_of(&[Candidate::file(&folder.join(&file))])[0];
         let (width, height) = working_size(w, h, MAX_SIZE);
         let (width, height) = (width as u32, height as u32);
-        let own = known.iter().find(|c| stem(&c.name) == name);
+        let own = own.map(|k| &known[k]);
         // A frame without a camera of its own can be a photo, and is held out of nothing.
         let camera = own.map(|c| c.resized(width, height)).unwrap_or_else(|| unknown(&name, width, height));
         frames.push(TruthFrame { file, stem: name, split: Split::Train, camera, lens: None });

@@ -215,8 +215,8 @@ impl<'a> Runner<'a> {
             seed: self.seed,
         };
         let posed = if setup.true_cameras {
-            let named = |f: &TruthFrame| Camera { name: f.stem.clone(), ..f.camera.clone() };
-            build.posed(photos, CameraOrigin::Known(frames.iter().map(named).collect()))?
+            let named = |f: &TruthFrame| Camera { name: f.stem.clone(), ..f.camera.clone() }.into();
+            build.posed(photos, CameraOrigin::Known(frames.iter().map(named).collect::<Vec<_>>().into()))?
         } else {
             sources::make::<GeometrySources>(&setup.init, registry, (&mut build, photos))?
         };

@@ -13,7 +13,7 @@ use crate::run::compat::{self, Compat};
 use crate::run::live::LiveScene;
 use crate::run::sources::{self, SourceChoice, SourceKind, choose};
 use crate::run::{self, Method, RunPlan};
-use crate::scene::{Camera, RgbImage};
+use crate::scene::{Camera, GivenCamera, RgbImage};
 use std::path::{Path, PathBuf};
 
 /// Trains a scene from 2 to 16 photos. `options` may be NULL. On failure, and when the callback stops it, `*scene` is NULL
@@ -53,7 +53,7 @@ pub unsafe extern "C" fn svk_train(
                         "cameras are given with the photos and in the options; give one of them",
                     );
                 }
-                plan.cameras = cameras;
+                plan.cameras = cameras.into_iter().map(GivenCamera::from).collect();
             }
             let outcome = run::reconstruct(&plan, &context.device, &context.registry, photos, &progress)?;
             let live = LiveScene::trained(&context.device, outcome, &context.registry)?;

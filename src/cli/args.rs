@@ -103,10 +103,13 @@ pub struct TrainArgs {
     /// Folder of the photos
     #[arg(long, value_name = "DIR")]
     pub images: PathBuf,
-    /// Cameras: transforms.json, a COLMAP model folder, or cameras.json
+    /// Cameras: transforms.json, cameras.json, a COLMAP model, or the folder of a data set with one of them; their lenses are taken out of the photos
     #[arg(long, value_name = "FILE")]
     pub cameras: PathBuf,
-    /// Start from the points of this .ply instead of stereo
+    /// How many of the photos with a camera are used [default: all, at most 16]
+    #[arg(long, value_name = "N")]
+    pub views: Option<usize>,
+    /// Start from the points of this .ply or COLMAP model instead of stereo
     #[arg(long, value_name = "FILE")]
     pub points: Option<PathBuf>,
     /// Scene directory to write

@@ -4,8 +4,9 @@ use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
 use super::progress;
 use super::scene;
+use super::views;
 use crate::format::scene_dir::Scene;
-use crate::format::{cameras, picture, write_json};
+use crate::format::{picture, write_json};
 use crate::gpu::Device;
 use crate::query::TextQuery;
 use crate::query::eval::{EvalReport, Evaluation, GroundTruth};
@@ -101,7 +102,7 @@ fn published(
             args.scene.display()
         )));
     };
-    let known = args.cameras.as_deref().map(cameras::read).transpose()?.unwrap_or_default();
+    let known = args.cameras.as_deref().map(views::read).transpose()?.unwrap_or_default();
     let mut protocol = protocol::open(kind, &args.ground_truth, &scene.cameras, &known)?;
     let queries = ask(scene, &protocol.prompts(), args)?;
     let scores = CodeScores::new(field, &queries)?;

@@ -6,7 +6,7 @@ use super::progress;
 use super::scene;
 use super::views;
 use crate::format::ply::{self, PlyOptions};
-use crate::format::{cameras, picture, write_json};
+use crate::format::{picture, write_json};
 use crate::gpu::Device;
 use crate::query::QueryResult;
 use crate::query::instances::Instance;
@@ -41,7 +41,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         return Err(no_language());
     }
     let cameras = match &args.cameras {
-        Some(file) => cameras::read(file)?,
+        Some(file) => views::read(file)?,
         None => scene.cameras.clone(),
     };
     if cameras.is_empty() {

@@ -5,7 +5,6 @@ use super::print::listing;
 use super::progress;
 use super::scene;
 use super::views;
-use crate::format::cameras;
 use crate::format::npy::{self, NpyArray};
 use crate::format::picture::{self, Planes};
 use crate::gpu::Device;
@@ -17,7 +16,7 @@ use crate::{Error, Result};
 pub fn render(args: &RenderArgs) -> Result<()> {
     let mut out = WrittenFiles::open(&args.out, args.force, &[&args.scene, &args.cameras])?;
     let scene = scene::load(&args.scene)?;
-    let cameras = cameras::read(&args.cameras)?;
+    let cameras = views::read(&args.cameras)?;
     let stems = views::stems(&cameras)?;
     let wants_language = args.channels.iter().any(|c| matches!(c, Channel::Features | Channel::Codes));
     if wants_language && scene.language.is_none() {

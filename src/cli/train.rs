@@ -11,6 +11,7 @@ pub fn train(args: &TrainArgs) -> Result<()> {
     let plan = TrainPlan {
         images: args.images.clone(),
         cameras: args.cameras.clone(),
+        views: args.views,
         points: args.points.clone(),
         out: args.out.clone(),
         force: args.making.force,

@@ -1,50 +1,114 @@
 //! Camera files: one reader for every kind, the project's own `cameras.json`.
+use super::camera_file::CameraFile;
 use super::{colmap, transforms};
-use crate::scene::{Camera, Pose};
+use crate::photo;
+use crate::scene::{Camera, GivenCamera, Pose};
 use crate::{Error, Result, files};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
-use std::path::Path;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
 
-/// Reads cameras from nerfstudio `transforms.json`, `cameras.json`, or a COLMAP model folder (text or binary).
+/// Reads the cameras of a file that must be pinholes, see [`read_file`].
 pub fn read(path: &Path) -> Result<Vec<Camera>> {
-    let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
-    if path.is_dir() {
-        // A scene directory and common COLMAP layouts keep the model further down.
-        let nested = ["", "sparse/0", "sparse", "cameras/colmap", "colmap"].map(|n| path.join(n));
-        let model = nested.iter().find(|p| colmap::is_model(p));
-        return match model {
-            Some(folder) => colmap::read(folder),
-            None if path.join("transforms.json").is_file() => read(&path.join("transforms.json")),
-            None => Err(bad(
-                "no cameras here; give transforms.json, cameras.json or a COLMAP model folder".into()
-            )),
-        };
+    let cameras = read_file(path)?.cameras;
+    match cameras.iter().find(|c| !c.lens.is_none()) {
+        Some(c) => Err(Error::input(format!(
+            "{}: camera {:?} has a lens, and pinholes are needed here; undistort its photos first",
+            path.display(),
+            c.camera.name
+        ))),
+        None => Ok(cameras.into_iter().map(|c| c.camera).collect()),
     }
+}
+
+/// Reads cameras from nerfstudio `transforms.json`, `cameras.json`, a COLMAP model (text or binary), or the folder of a data set
+/// or scene that holds one of them.
+pub fn read_file(path: &Path) -> Result<CameraFile> {
+    if path.is_dir() {
+        return of_folder(path);
+    }
+    // A file of a model stands for the model.
+    let is_of_model =
+        |p: &Path| colmap::FILES.as_flattened().iter().any(|f| p.file_name().is_some_and(|n| n == *f));
+    if let Some(folder) = path.parent().filter(|folder| is_of_model(path) && colmap::is_model(folder)) {
+        return of_folder(folder);
+    }
+    let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
     let text = files::read_text(path)?;
-    let cameras = match text.trim_start().chars().next() {
+    let file = match text.trim_start().chars().next() {
         Some('[') => {
             let entries: Result<Vec<Entry>, _> = files::parse_json(text.as_bytes());
             let entries = entries.map_err(|e| format!("not a JSON camera file (cameras.json): {e}; check it"));
-            entries.and_then(|all| all.into_iter().map(Entry::camera).collect::<Result<Vec<_>, _>>())
+            let cameras =
+                entries.and_then(|all| all.into_iter().map(Entry::camera).collect::<Result<Vec<_>, _>>());
+            cameras.map(|cameras| CameraFile { cameras, warnings: Vec::new() })
         }
         Some('{') => transforms::parse(&text, path.parent().unwrap_or(Path::new("."))),
         _ => Err("not a JSON camera file: neither transforms.json (an object with \"frames\") nor cameras.json (a list); \
                   check the camera file"
             .to_string()),
     };
-    let cameras = cameras.map_err(bad)?;
-    if cameras.is_empty() {
-        return Err(bad("the file has no cameras".into()));
+    let file = file.map_err(bad)?;
+    if file.cameras.is_empty() {
+        let nothing = "the file has no cameras".to_owned();
+        return Err(bad(file.warnings.first().map_or(nothing, |w| format!("the file has no cameras: {w}"))));
     }
-    Ok(cameras)
+    check_names(&file.cameras).map_err(bad)?;
+    Ok(file)
+}
+
+fn of_folder(folder: &Path) -> Result<CameraFile> {
+    let Some(model) = colmap::find(folder) else {
+        // A scene directory keeps them below.
+        let files =
+            ["transforms.json", "cameras/transforms.json", "cameras.json"].map(|name| folder.join(name));
+        return match files.iter().find(|file| file.is_file()) {
+            Some(file) => read_file(file),
+            None => Err(Error::input(format!(
+                "{}: no cameras here; give transforms.json, cameras.json or a COLMAP model folder",
+                folder.display()
+            ))),
+        };
+    };
+    let cameras = colmap::read(&model)?;
+    check_names(&cameras).map_err(|e| Error::input(format!("{}: {e}", model.display())))?;
+    Ok(CameraFile { cameras, warnings: other_models(&model) })
+}
+
+/// COLMAP numbers the parts of a reconstruction that it could not join.
+fn other_models(model: &Path) -> Vec<String> {
+    let numbered = |p: &PathBuf| p.file_name().is_some_and(|n| n.to_string_lossy().parse::<u32>().is_ok());
+    let entries =
+        model.parent().filter(|_| numbered(&model.to_path_buf())).and_then(|p| std::fs::read_dir(p).ok());
+    let mut others: Vec<PathBuf> = entries.into_iter().flatten().flatten().map(|e| e.path()).collect();
+    others.retain(|p| numbered(p) && p.as_path() != model && colmap::is_model(p));
+    others.sort();
+    let Some(first) = others.first() else { return Vec::new() };
+    let more = if others.len() > 1 { format!(" and {} more", others.len() - 1) } else { String::new() };
+    vec![format!(
+        "{} is used, one of several models; give {}{more} for the others",
+        model.display(),
+        first.display()
+    )]
+}
+
+/// Refuses two cameras of one name: nothing could say which of them is that of a photo.
+fn check_names(cameras: &[GivenCamera]) -> Result<(), String> {
+    let mut seen: HashMap<String, &str> = HashMap::new();
+    for c in cameras {
+        if seen.insert(photo::plain_name(&c.camera.name), &c.camera.name).is_some() {
+            return Err(format!("two cameras have the name {:?}; rename or remove one", c.camera.name));
+        }
+    }
+    Ok(())
 }
 
 /// One camera of `cameras.json`: the layout 3DGS tools write, plus the principal point.
 #[derive(Debug, Serialize, Deserialize)]
 struct Entry {
     #[serde(default)]
-    id: u32,
+    id: Option<u32>,
     img_name: String,
     width: u32,
     height: u32,
@@ -61,11 +125,11 @@ struct Entry {
 }
 
 impl Entry {
-    fn camera(self) -> Result<Camera, String> {
+    fn camera(self) -> Result<GivenCamera, String> {
         // The rows of camera → world are the columns of world → camera.
         let rotation = DMat3::from_cols_array_2d(&self.rotation);
         let pose = Pose { rotation, translation: -(rotation * DVec3::from_array(self.position)) };
-        Camera {
+        let camera = Camera {
             name: self.img_name,
             width: self.width,
             height: self.height,
@@ -74,15 +138,15 @@ impl Entry {
             cx: self.cx.unwrap_or(self.width as f64 / 2.0),
             cy: self.cy.unwrap_or(self.height as f64 / 2.0),
             pose,
-        }
-        .checked()
+        };
+        GivenCamera::from(camera).checked()
     }
 }
 
 /// Writes `cameras.json`.
 pub fn write_json(path: &Path, cameras: &[Camera]) -> Result<()> {
     let entry = |(id, c): (usize, &Camera)| Entry {
-        id: id as u32,
+        id: Some(id as u32),
         img_name: c.name.clone(),
         width: c.width,
         height: c.height,

@@ -1,16 +1,38 @@
 //! COLMAP models, text and binary. World → camera, OpenCV axes, first pixel centre at 0.5.
-use crate::scene::{Camera, Lens, PointCloud, Pose};
+use super::lens_models::{self, LensModel, Optics};
+use crate::scene::{Camera, GivenCamera, Lens, PointCloud, Pose};
 use crate::{Error, Result, files};
 use glam::{DMat3, DQuat, DVec3};
 use std::collections::HashMap;
 use std::fmt::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-/// True for a folder that holds a text or binary model.
+/// Whether a folder holds a text or binary model.
 pub fn is_model(folder: &Path) -> bool {
     ["txt", "bin"]
         .iter()
         .any(|e| ["cameras", "images"].iter().all(|n| folder.join(format!("{n}.{e}")).is_file()))
+}
+
+/// Where programs keep a model below the folder of a data set or a scene.
+const BELOW: [&str; 12] = [
+    "",
+    "sparse/0",
+    "sparse",
+    "colmap/sparse/0",
+    "colmap/sparse",
+    "dense/sparse/0",
+    "dense/sparse",
+    "dense/0/sparse",
+    "cameras/colmap",
+    "colmap",
+    "0",
+    "undistorted/sparse",
+];
+
+/// The folder of the model of a data set: the folder itself or the first of those below it that [`is_model`].
+pub fn find(folder: &Path) -> Option<PathBuf> {
+    BELOW.iter().map(|below| folder.join(below)).find(|f| is_model(f))
 }
 
 /// Files of a model as text and of one in binary, in the order in which those of the other form go: a model is read as text as
@@ -18,38 +40,38 @@ pub fn is_model(folder: &Path) -> bool {
 pub const FILES: [[&str; 3]; 2] =
     [["images.txt", "cameras.txt", "points3D.txt"], ["images.bin", "cameras.bin", "points3D.bin"]];
 
-/// Model names in the order of COLMAP's numbers, with the number of parameters and how many of them are f, c.
-const MODELS: [(&str, usize); 5] =
-    [("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)];
-
-#[derive(Clone, Copy)]
 struct Intrinsics {
     size: (u32, u32),
-    f: [f64; 2],
-    c: [f64; 2],
+    optics: Optics,
 }
 
-fn intrinsics(model: usize, size: (u32, u32), p: &[f64]) -> Result<Intrinsics, String> {
-    let (name, _) = MODELS[model];
-    let (f, c, distortion) = match (model, p) {
-        (0 | 2 | 3, [f, cx, cy, rest @ ..]) => ([*f; 2], [*cx, *cy], rest),
-        (_, [fx, fy, cx, cy, rest @ ..]) => ([*fx, *fy], [*cx, *cy], rest),
-        _ => return Err(format!("camera model {name} with {} parameters", p.len())),
-    };
-    match distortion.iter().find(|k| **k != 0.0) {
-        Some(k) => Err(format!(
-            "{name} camera with lens distortion {k}: undistort the photos first (colmap image_undistorter)"
+/// Cameras by their number; of those whose lens is not read, why.
+type Intrinsic = HashMap<u32, Result<Intrinsics, String>>;
+
+fn intrinsics(
+    id: u32,
+    model: &LensModel,
+    size: (u32, u32),
+    p: &[f64],
+    folder: &Path,
+) -> Result<Intrinsics, String> {
+    match model.optics(p) {
+        Some(optics) => Ok(Intrinsics { size, optics }),
+        None if model.name == "EQUIRECTANGULAR" => Err(format!(
+            "camera {id} is {}, a panorama; cut it into pinhole views first (COLMAP's panorama_sfm.py)",
+            model.name
         )),
-        None => Ok(Intrinsics { size, f, c }),
+        None => Err(format!(
+            "camera {id} is {}, whose lens is not read; undistort the photos with colmap image_undistorter --image_path IMAGES \
+             --input_path {} --output_path NEW, then give NEW/sparse and NEW/images",
+            model.name,
+            folder.display()
+        )),
     }
 }
 
-fn unknown_model(model: impl std::fmt::Display) -> String {
-    format!("camera model {model} is not supported; undistort to PINHOLE (colmap image_undistorter)")
-}
-
-/// Reads the cameras of a model folder, in the order of its image numbers.
-pub fn read(folder: &Path) -> Result<Vec<Camera>> {
+/// Reads the cameras of a model folder with their lenses, in the order of its image numbers.
+pub fn read(folder: &Path) -> Result<Vec<GivenCamera>> {
     let text = folder.join("images.txt").is_file();
     let ext = if text { "txt" } else { "bin" };
     let (cameras, images) = (folder.join(format!("cameras.{ext}")), folder.join(format!("images.{ext}")));
@@ -60,30 +82,23 @@ pub fn read(folder: &Path) -> Result<Vec<Camera>> {
     let (camera_bytes, image_bytes) = (files::read(&cameras)?, files::read(&images)?);
     let (intrinsics, mut shots) = if text {
         (
-            text_cameras(&camera_bytes).map_err(named(&cameras))?,
+            text_cameras(&camera_bytes, folder).map_err(named(&cameras))?,
             text_images(&image_bytes).map_err(named(&images))?,
         )
     } else {
         (
-            binary_cameras(&camera_bytes).map_err(named(&cameras))?,
+            binary_cameras(&camera_bytes, folder).map_err(named(&cameras))?,
             binary_images(&image_bytes).map_err(named(&images))?,
         )
     };
     shots.sort_by_key(|s| s.id);
-    let out: Result<Vec<Camera>, String> = shots
-        .into_iter()
-        .map(|s| {
-            let k = intrinsics
-                .get(&s.camera)
-                .ok_or_else(|| format!("image {:?} names camera {}, which is missing", s.name, s.camera))?;
-            let rotation = DMat3::from_quat(DQuat::from_xyzw(s.q[1], s.q[2], s.q[3], s.q[0]).normalize());
-            let pose = Pose { rotation, translation: DVec3::from_array(s.t) };
-            let (width, height) = k.size;
-            Camera { name: s.name, width, height, fx: k.f[0], fy: k.f[1], cx: k.c[0], cy: k.c[1], pose }
-                .checked()
-        })
-        .collect();
-    let out = out.map_err(named(&images))?;
+    let mut out = Vec::with_capacity(shots.len());
+    for shot in shots {
+        let missing = || format!("image {:?} names camera {}, which is missing", shot.name, shot.camera);
+        let own = intrinsics.get(&shot.camera).ok_or_else(missing).map_err(named(&images))?;
+        let own = own.as_ref().map_err(|e| named(&cameras)(e.clone()))?;
+        out.push(shot.seen_by(own).checked().map_err(named(&images))?);
+    }
     if out.is_empty() { Err(named(&images)("the model has no images".into())) } else { Ok(out) }
 }
 
@@ -95,25 +110,54 @@ struct Shot {
     name: String,
 }
 
+impl Shot {
+    fn seen_by(self, own: &Intrinsics) -> GivenCamera {
+        let rotation =
+            DMat3::from_quat(DQuat::from_xyzw(self.q[1], self.q[2], self.q[3], self.q[0]).normalize());
+        let pose = Pose { rotation, translation: DVec3::from_array(self.t) };
+        let ((width, height), Optics { f, c, lens }) = (own.size, own.optics);
+        let camera = Camera { name: self.name, width, height, fx: f[0], fy: f[1], cx: c[0], cy: c[1], pose };
+        GivenCamera { camera, lens }
+    }
+}
+
 fn number<T: std::str::FromStr>(word: Option<&str>, line: usize) -> Result<T, String> {
     word.and_then(|w| w.parse().ok())
         .ok_or_else(|| format!("line {line}: {:?} is not a number", word.unwrap_or("")))
 }
 
-fn text_cameras(bytes: &[u8]) -> Result<HashMap<u32, Intrinsics>, String> {
-    let text = String::from_utf8_lossy(bytes);
+/// Lines that are no comments, with their numbers from 1.
+fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
+    text.lines().enumerate().map(|(i, line)| (i + 1, line.trim())).filter(|(_, line)| !line.starts_with('#'))
+}
+
+/// The next word and what follows it; words are apart by any number of blanks and tabs.
+fn split(line: &str) -> (Option<&str>, &str) {
+    let line = line.trim_start();
+    let end = line.find(char::is_whitespace).unwrap_or(line.len());
+    ((end > 0).then_some(&line[..end]), &line[end..])
+}
+
+fn text_cameras(bytes: &[u8], folder: &Path) -> Result<Intrinsic, String> {
     let mut out = HashMap::new();
-    for (i, line) in text.lines().enumerate().filter(|(_, l)| !l.starts_with('#') && !l.trim().is_empty()) {
+    for (i, line) in lines(files::plain_text(bytes)?).filter(|(_, l)| !l.is_empty()) {
         let mut words = line.split_whitespace();
-        let id = number(words.next(), i + 1)?;
-        let model = words.next().unwrap_or("");
-        let model = MODELS.iter().position(|m| m.0 == model).ok_or_else(|| unknown_model(model))?;
-        let size = (number(words.next(), i + 1)?, number(words.next(), i + 1)?);
-        let p: Vec<f64> = words.map(|w| number(Some(w), i + 1)).collect::<Result<_, _>>()?;
-        if p.len() != MODELS[model].1 {
-            return Err(format!("line {}: {} needs {} parameters", i + 1, MODELS[model].0, MODELS[model].1));
+        let id = number(words.next(), i)?;
+        let name = words.next().unwrap_or("");
+        let model = LensModel::named(name).ok_or_else(|| {
+            format!(
+                "line {i}: camera model {name:?} is not known; those that are read: {}",
+                lens_models::read_names()
+            )
+        })?;
+        let size = (number(words.next(), i)?, number(words.next(), i)?);
+        let p: Vec<f64> = words.map(|w| number(Some(w), i)).collect::<Result<_, _>>()?;
+        if p.len() != model.parameters() {
+            return Err(format!("line {i}: {} needs {} parameters", model.name, model.parameters()));
         }
-        out.insert(id, intrinsics(model, size, &p)?);
+        if out.insert(id, intrinsics(id, model, size, &p, folder)).is_some() {
+            return Err(format!("line {i}: a second camera {id}"));
+        }
     }
     Ok(out)
 }
@@ -125,25 +169,30 @@ fn is_points(line: &str) -> bool {
 }
 
 fn text_images(bytes: &[u8]) -> Result<Vec<Shot>, String> {
-    let text = String::from_utf8_lossy(bytes);
     // Two lines an image; the second (2D points) is often empty, and some programs leave it out.
     let mut out = Vec::new();
     let mut points_may_follow = false;
-    for (i, line) in text.lines().enumerate().filter(|(_, l)| !l.starts_with('#')) {
-        if std::mem::take(&mut points_may_follow) && is_points(line) || line.trim().is_empty() {
+    for (i, line) in lines(files::plain_text(bytes)?) {
+        if std::mem::take(&mut points_may_follow) && is_points(line) || line.is_empty() {
             continue;
         }
-        let mut words = line.splitn(10, ' ');
-        let id = number(words.next(), i + 1)?;
+        let mut rest = line;
+        let mut word = || {
+            let (word, after) = split(rest);
+            rest = after;
+            word
+        };
+        let id = number(word(), i)?;
         let mut seven = [0.0; 7];
         for v in &mut seven {
-            *v = number(words.next(), i + 1)?;
+            *v = number(word(), i)?;
         }
         let [qw, qx, qy, qz, x, y, z] = seven;
-        let camera = number(words.next(), i + 1)?;
-        let name = words.next().unwrap_or("").trim_end().to_string();
+        let camera = number(word(), i)?;
+        // The name is all that is left: it may have blanks.
+        let name = rest.trim().to_string();
         if name.is_empty() {
-            return Err(format!("line {}: the name of the image is missing", i + 1));
+            return Err(format!("line {i}: the name of the image is missing"));
         }
         out.push(Shot { id, q: [qw, qx, qy, qz], t: [x, y, z], camera, name });
         points_may_follow = true;
@@ -189,16 +238,19 @@ impl<'a> Bytes<'a> {
     }
 }
 
-fn binary_cameras(bytes: &[u8]) -> Result<HashMap<u32, Intrinsics>, String> {
+fn binary_cameras(bytes: &[u8], folder: &Path) -> Result<Intrinsic, String> {
     let mut b = Bytes(bytes);
     let mut out = HashMap::new();
     for _ in 0..b.u64()? {
         let (id, model) = (b.u32()?, b.u32()? as usize);
         let side = |n: u64| u32::try_from(n).map_err(|_| format!("camera {id} has a side of {n} pixels"));
         let size = (side(b.u64()?)?, side(b.u64()?)?);
-        let count = MODELS.get(model).ok_or_else(|| unknown_model(model))?.1;
-        let p: Vec<f64> = (0..count).map(|_| b.f64s::<1>().map(|v| v[0])).collect::<Result<_, _>>()?;
-        out.insert(id, intrinsics(model, size, &p)?);
+        let model = LensModel::numbered(model).ok_or_else(|| {
+            format!("camera {id} has the camera model of number {model}, which is not known; those that are read: {}", lens_models::read_names())
+        })?;
+        let p: Vec<f64> =
+            (0..model.parameters()).map(|_| b.f64s::<1>().map(|v| v[0])).collect::<Result<_, _>>()?;
+        out.insert(id, intrinsics(id, model, size, &p, folder));
     }
     Ok(out)
 }
@@ -215,12 +267,20 @@ fn binary_images(bytes: &[u8]) -> Result<Vec<Shot>, String> {
     Ok(out)
 }
 
-/// Reads `points3D.txt` or `points3D.bin` of a model folder; confidence 1, radius 0.
+/// Reads `points3D.txt` or `points3D.bin` of a model folder or of a data set that holds one; confidence 1, radius 0.
 pub fn read_points(folder: &Path) -> Result<PointCloud> {
-    let (text, binary) = (folder.join("points3D.txt"), folder.join("points3D.bin"));
-    let path = if text.is_file() { text.clone() } else { binary };
+    let files = BELOW
+        .iter()
+        .flat_map(|below| ["txt", "bin"].map(|e| folder.join(below).join(format!("points3D.{e}"))));
+    let Some(path) = files.into_iter().find(|p| p.is_file()) else {
+        return Err(Error::input(format!(
+            "{}: no points3D.bin or points3D.txt here or in its sparse folders; give the folder of a COLMAP model",
+            folder.display()
+        )));
+    };
     let bytes = files::read(&path)?;
-    let points = if path == text { text_points(&bytes) } else { binary_points(&bytes) };
+    let text = path.extension().is_some_and(|e| e == "txt");
+    let points = if text { text_points(&bytes) } else { binary_points(&bytes) };
     let points = points.map_err(|e| Error::input(format!("{}: {e}", path.display())))?;
     let n = points.len();
     let (positions, colours) = points.into_iter().unzip();
@@ -230,14 +290,14 @@ pub fn read_points(folder: &Path) -> Result<PointCloud> {
 type Point = ([f32; 3], [f32; 3]);
 
 fn text_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
-    let text = String::from_utf8_lossy(bytes);
-    let lines = text.lines().enumerate().filter(|(_, l)| !l.starts_with('#') && !l.trim().is_empty());
+    let text = files::plain_text(bytes)?;
+    let lines = lines(text).filter(|(_, l)| !l.is_empty());
     lines
         .map(|(i, line)| {
             let mut words = line.split_whitespace().skip(1);
             let mut six = [0.0f32; 6];
             for v in &mut six {
-                *v = number(words.next(), i + 1)?;
+                *v = number(words.next(), i)?;
             }
             Ok(([six[0], six[1], six[2]], [six[3], six[4], six[5]].map(|v| v / 255.0)))
         })
@@ -267,7 +327,7 @@ pub fn write(folder: &Path, cameras: &[Camera], points: Option<&PointCloud>) -> 
     write_text(folder, cameras, None, points)
 }
 
-/// Writes a text model of photos as they were taken, with OPENCV cameras: one lens per camera.
+/// Writes a text model of photos as they were taken: one lens per camera, as OPENCV, FULL_OPENCV or OPENCV_FISHEYE.
 pub fn write_lensed(folder: &Path, cameras: &[Camera], lenses: &[Lens]) -> Result<()> {
     write_text(folder, cameras, Some(lenses), None)
 }
@@ -285,11 +345,11 @@ fn write_text(
     for (i, c) in cameras.iter().enumerate() {
         let id = i + 1;
         // Writing to a String cannot fail.
+        let (model, distortion) =
+            lenses.and_then(|l| l.get(i)).map_or(("PINHOLE", Vec::new()), lens_models::of_lens);
+        let terms: String = distortion.iter().map(|v| format!(" {v}")).collect();
         let pinhole = format!("{} {} {} {} {} {}", c.width, c.height, c.fx, c.fy, c.cx, c.cy);
-        let _ = match lenses.and_then(|l| l.get(i)) {
-            Some(Lens { k1, k2 }) => writeln!(intrinsics, "{id} OPENCV {pinhole} {k1} {k2} 0 0"),
-            None => writeln!(intrinsics, "{id} PINHOLE {pinhole}"),
-        };
+        let _ = writeln!(intrinsics, "{id} {model} {pinhole}{terms}");
         let q = DQuat::from_mat3(&c.pose.rotation).normalize();
         let t = c.pose.translation;
         let _ = writeln!(

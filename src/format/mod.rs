@@ -1,8 +1,10 @@
 //! File formats and the scene directory.
+mod camera_file;
 pub mod cameras;
 pub mod colmap;
 mod common;
 pub mod gaussians;
+mod lens_models;
 mod level_arrays;
 pub mod npy;
 pub mod picture;
@@ -14,6 +16,7 @@ pub mod transform;
 pub mod transforms;
 mod workspace;
 
+pub use camera_file::CameraFile;
 pub use common::{create_folder, to_byte, write_json, write_whole_file};
 pub(crate) use common::{logit, sigmoid};
 pub use gaussians::{gltf, ply, ply_packed, splat, spz};

@@ -1,12 +1,15 @@
-//! nerfstudio `transforms.json`: camera → world in OpenGL axes (x right, y up, z backward).
-use crate::scene::{Camera, Lens, Pose};
+//! nerfstudio and instant-ngp `transforms.json`: camera → world in OpenGL axes (x right, y up, z backward).
+use super::camera_file::CameraFile;
+use super::lens_models::{self, LensModel};
+use crate::scene::{Camera, GivenCamera, Lens, Pose};
 use crate::{Result, files, photo};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Deserializer, Serialize};
+use serde_json::{Map, Value};
 use std::path::Path;
 
 /// Intrinsics, at the top of the file or per frame; a frame's own win. The file itself and a frame are one type: flattened
-/// structures would hold all that a file has besides in memory first.
+/// structures would hold all that a file has besides in memory first. `null` is as absent.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct Block {
@@ -17,16 +20,29 @@ struct Block {
     // Some writers store sizes as floats.
     w: Option<f64>,
     h: Option<f64>,
+    /// Angles of view: radians, and degrees.
     camera_angle_x: Option<f64>,
+    camera_angle_y: Option<f64>,
+    x_fov: Option<f64>,
+    y_fov: Option<f64>,
     camera_model: Option<String>,
-    k1: f64,
-    k2: f64,
-    k3: f64,
-    k4: f64,
-    p1: f64,
-    p2: f64,
+    is_fisheye: Option<bool>,
+    k1: Option<f64>,
+    k2: Option<f64>,
+    k3: Option<f64>,
+    k4: Option<f64>,
+    k5: Option<f64>,
+    k6: Option<f64>,
+    p1: Option<f64>,
+    p2: Option<f64>,
+    /// Other projections of instant-ngp, and how its camera moved while a picture was taken.
+    ftheta_p0: Option<Value>,
+    latlong: Option<Value>,
+    equirectangular: Option<Value>,
+    orthographic: Option<Value>,
+    rolling_shutter: Option<Value>,
     /// Of a frame.
-    file_path: String,
+    file_path: Option<String>,
     #[serde(deserialize_with = "rows")]
     transform_matrix: Option<[[f64; 4]; 3]>,
     /// Of the file.
@@ -35,7 +51,7 @@ struct Block {
 
 /// The first three rows of a matrix with three or four.
 fn rows<'a, D: Deserializer<'a>>(from: D) -> Result<Option<[[f64; 4]; 3]>, D::Error> {
-    let rows = Vec::<Vec<f64>>::deserialize(from)?;
+    let Some(rows) = Option::<Vec<Vec<f64>>>::deserialize(from)? else { return Ok(None) };
     let row = |k: usize| <[f64; 4]>::try_from(rows.get(k)?.as_slice()).ok();
     let matrix = (|| Some([row(0)?, row(1)?, row(2)?]))();
     let fits = rows.len() <= 4 && rows.iter().all(|r| r.len() == 4);
@@ -43,8 +59,17 @@ fn rows<'a, D: Deserializer<'a>>(from: D) -> Result<Option<[[f64; 4]; 3]>, D::Er
     matrix.map(Some).ok_or_else(|| serde::de::Error::custom("transform_matrix must be 4 × 4"))
 }
 
+/// Whether a value of any type says yes.
+fn is_set(value: Option<&Value>) -> bool {
+    match value {
+        None | Some(Value::Null | Value::Bool(false)) => false,
+        Some(Value::Array(list)) => list.iter().any(|v| v.as_f64() != Some(0.0)),
+        Some(_) => true,
+    }
+}
+
 /// Cameras of a file's text; `folder` is where its image paths start, for files that do not state the image size.
-pub(super) fn parse(text: &str, folder: &Path) -> Result<Vec<Camera>, String> {
+pub(super) fn parse(text: &str, folder: &Path) -> Result<CameraFile, String> {
     let file: Block = files::parse_json(text.as_bytes())
         .map_err(|e| format!("not a JSON camera file (transforms.json): {e}; check it"))?;
     let Some(frames) = &file.frames else {
@@ -52,48 +77,124 @@ pub(super) fn parse(text: &str, folder: &Path) -> Result<Vec<Camera>, String> {
             "neither transforms.json (an object with \"frames\") nor cameras.json (a list)".to_string()
         );
     };
-    frames.iter().enumerate().map(|(i, f)| camera(&file, f, i, folder)).collect()
-}
-
-fn camera(shared: &Block, own: &Block, index: usize, folder: &Path) -> Result<Camera, String> {
-    let name = if own.file_path.is_empty() { format!("{index:05}") } else { own.file_path.clone() };
-    let model = own.camera_model.as_ref().or(shared.camera_model.as_ref());
-    if let Some(m) = model.filter(|m| m.contains("FISHEYE") || m.contains("EQUIRECT")) {
-        return Err(format!("frame {name:?}: camera model {m} is not a pinhole; undistort the photos first"));
-    }
-    for (k, v) in [("k1", own.k1, shared.k1), ("k2", own.k2, shared.k2), ("k3", own.k3, shared.k3)]
-        .into_iter()
-        .chain([("k4", own.k4, shared.k4), ("p1", own.p1, shared.p1), ("p2", own.p2, shared.p2)])
-        .map(|(k, a, b)| (k, if a != 0.0 { a } else { b }))
-    {
-        if v != 0.0 {
-            return Err(format!(
-                "frame {name:?}: lens distortion {k} = {v} is not supported; undistort the photos first"
-            ));
+    let (mut cameras, mut without, mut moving) = (Vec::new(), Vec::new(), false);
+    for (i, frame) in frames.iter().enumerate() {
+        let both = Frame { shared: &file, own: frame, name: name(frame, i) };
+        moving |= is_set(both.pick(|b| b.rolling_shutter.as_ref()));
+        match &frame.transform_matrix {
+            Some(matrix) => cameras.push(both.camera(pose(matrix), folder)?),
+            // nerfstudio writes frames that it could not place without one.
+            None => without.push(both.name),
         }
     }
-    let pick = |get: fn(&Block) -> Option<f64>| get(own).or_else(|| get(shared));
-    let stated = pick(|i| i.w).zip(pick(|i| i.h));
-    let (w, h) = stated.or_else(|| size_of_image(folder, &name)).ok_or_else(|| {
-        format!("frame {name:?}: no image size; add \"w\" and \"h\" to the file or keep the images beside it")
-    })?;
-    let fx = pick(|i| i.fl_x).or_else(|| pick(|i| i.camera_angle_x).map(|a| 0.5 * w / (0.5 * a).tan()));
-    let fx = fx.ok_or_else(|| format!("frame {name:?}: no focal length (fl_x or camera_angle_x)"))?;
-    Camera {
-        width: w as u32,
-        height: h as u32,
-        fx,
-        fy: pick(|i| i.fl_y).unwrap_or(fx),
-        cx: pick(|i| i.cx).unwrap_or(w / 2.0),
-        cy: pick(|i| i.cy).unwrap_or(h / 2.0),
-        pose: own
-            .transform_matrix
-            .as_ref()
-            .map(pose)
-            .ok_or_else(|| format!("frame {name:?}: transform_matrix is missing"))?,
-        name,
+    let mut warnings = Vec::new();
+    if !without.is_empty() {
+        warnings.push(format!("frames without transform_matrix are skipped: {}", photo::listed(&without)));
     }
-    .checked()
+    if moving {
+        warnings.push("rolling_shutter is not used: every photo is taken to be from one place".to_owned());
+    }
+    Ok(CameraFile { cameras, warnings })
+}
+
+fn name(frame: &Block, index: usize) -> String {
+    frame.file_path.clone().filter(|p| !p.is_empty()).unwrap_or_else(|| format!("{index:05}"))
+}
+
+/// A frame with what the file states for all.
+struct Frame<'a> {
+    shared: &'a Block,
+    own: &'a Block,
+    name: String,
+}
+
+impl<'a> Frame<'a> {
+    fn pick<T>(&self, get: impl Fn(&'a Block) -> Option<T>) -> Option<T> {
+        get(self.own).or_else(|| get(self.shared))
+    }
+
+    fn camera(&self, pose: Pose, folder: &Path) -> Result<GivenCamera, String> {
+        let bad = |what: String| format!("frame {:?}: {what}", self.name);
+        let lens = self.lens().map_err(bad)?;
+        let stated = self.pick(|b| b.w).zip(self.pick(|b| b.h));
+        let (w, h) = stated.or_else(|| size_of_image(folder, &self.name)).ok_or_else(|| {
+            bad("no image size; add \"w\" and \"h\" to the file or keep the images beside it".to_owned())
+        })?;
+        let wide = |side: f64, angle: f64| 0.5 * side / (0.5 * angle).tan();
+        let along = |side: f64, focal: Option<f64>, radians: Option<f64>, degrees: Option<f64>| {
+            focal.or_else(|| radians.or(degrees.map(f64::to_radians)).map(|angle| wide(side, angle)))
+        };
+        let fx = along(w, self.pick(|b| b.fl_x), self.pick(|b| b.camera_angle_x), self.pick(|b| b.x_fov));
+        let fy = along(h, self.pick(|b| b.fl_y), self.pick(|b| b.camera_angle_y), self.pick(|b| b.y_fov));
+        let fx = fx.or(fy).ok_or_else(|| bad("no focal length (fl_x or camera_angle_x)".to_owned()))?;
+        let camera = Camera {
+            width: w as u32,
+            height: h as u32,
+            fx,
+            fy: fy.unwrap_or(fx),
+            cx: self.pick(|b| b.cx).unwrap_or(w / 2.0),
+            cy: self.pick(|b| b.cy).unwrap_or(h / 2.0),
+            pose,
+            name: self.name.clone(),
+        };
+        GivenCamera { camera, lens }.checked()
+    }
+
+    fn lens(&self) -> Result<Lens, String> {
+        let stated = self.pick(|b| b.camera_model.as_deref());
+        let model = stated.map(|m| LensModel::named(m).filter(|m| m.is_read()).ok_or(m)).transpose();
+        let model = model.map_err(|m| {
+            format!("camera model {m} is not read; those that are: {}", lens_models::read_names())
+        })?;
+        for (key, value) in [
+            ("ftheta_p0", self.pick(|b| b.ftheta_p0.as_ref())),
+            ("latlong", self.pick(|b| b.latlong.as_ref())),
+            ("equirectangular", self.pick(|b| b.equirectangular.as_ref())),
+            ("orthographic", self.pick(|b| b.orthographic.as_ref())),
+        ] {
+            if is_set(value) {
+                return Err(format!(
+                    "{key} states a projection that is not read; make the photos rectilinear first, and leave it out"
+                ));
+            }
+        }
+        let k = |get: fn(&Block) -> Option<f64>| self.pick(get).unwrap_or(0.0);
+        let lens = Lens {
+            k1: k(|b| b.k1),
+            k2: k(|b| b.k2),
+            k3: k(|b| b.k3),
+            k4: k(|b| b.k4),
+            k5: k(|b| b.k5),
+            k6: k(|b| b.k6),
+            p1: k(|b| b.p1),
+            p2: k(|b| b.p2),
+            fisheye: self.pick(|b| b.is_fisheye).unwrap_or(false) || model.is_some_and(LensModel::is_fisheye),
+        };
+        self.check(lens, model)
+    }
+
+    /// Refuses coefficients that programs do not agree upon.
+    fn check(&self, lens: Lens, model: Option<&LensModel>) -> Result<Lens, String> {
+        if lens.fisheye && self.pick(|b| b.is_fisheye) == Some(false) {
+            return Err("is_fisheye is false and camera_model a fisheye; remove one of them".to_owned());
+        }
+        let denominator = [("k4", lens.k4), ("k5", lens.k5), ("k6", lens.k6)];
+        let extra = match (lens.fisheye, model.map(|m| m.name)) {
+            (true, _) => vec![("p1", lens.p1), ("p2", lens.p2), ("k5", lens.k5), ("k6", lens.k6)],
+            (false, Some("FULL_OPENCV")) => Vec::new(),
+            (false, _) => denominator.to_vec(),
+        };
+        match extra.into_iter().find(|(_, value)| *value != 0.0) {
+            Some((key, value)) if lens.fisheye => {
+                Err(format!("{key} = {value}: OPENCV_FISHEYE has k1 to k4 alone; remove it"))
+            }
+            Some((key, value)) => Err(format!(
+                "{key} = {value}: programs differ in what it means (r⁸, or a term of the denominator); say \"camera_model\": \
+                 \"FULL_OPENCV\" for OpenCV's rational model, or undistort the photos first"
+            )),
+            None => Ok(lens),
+        }
+    }
 }
 
 fn size_of_image(folder: &Path, name: &str) -> Option<(f64, f64)> {
@@ -119,8 +220,29 @@ struct OutFrame<'a> {
     w: u32,
     h: u32,
     #[serde(flatten)]
-    lens: Option<Lens>,
+    lens: Option<OutLens>,
     transform_matrix: [[f64; 4]; 4],
+}
+
+/// The lens of a frame: its model, and the coefficients that the model has.
+#[derive(Serialize)]
+struct OutLens {
+    camera_model: &'static str,
+    #[serde(flatten)]
+    terms: Map<String, Value>,
+}
+
+impl OutLens {
+    fn new(lens: &Lens) -> OutLens {
+        let (camera_model, values) = lens_models::of_lens(lens);
+        let names: &[&str] = match camera_model {
+            "OPENCV_FISHEYE" => &["k1", "k2", "k3", "k4"],
+            _ => &["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"],
+        };
+        let terms =
+            names.iter().zip(values).map(|(name, value)| ((*name).to_owned(), value.into())).collect();
+        OutLens { camera_model, terms }
+    }
 }
 
 /// Writes `transforms.json`; every frame carries its own intrinsics. `ply_file_path`, relative to the file, names points
@@ -129,7 +251,7 @@ pub fn write(path: &Path, cameras: &[Camera], ply_file_path: Option<&str>) -> Re
     write_frames(path, cameras, None, ply_file_path)
 }
 
-/// Writes `transforms.json` of photos as they were taken: every frame with its `k1` and `k2`.
+/// Writes `transforms.json` of photos as they were taken: every frame with its lens.
 pub fn write_lensed(path: &Path, cameras: &[Camera], lenses: &[Lens]) -> Result<()> {
     write_frames(path, cameras, Some(lenses), None)
 }
@@ -155,7 +277,7 @@ fn write_frames(
                 cy: c.cy,
                 w: c.width,
                 h: c.height,
-                lens: lenses.and_then(|l| l.get(i)).copied(),
+                lens: lenses.and_then(|l| l.get(i)).map(OutLens::new),
                 transform_matrix: [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
             }
         })

@@ -199,6 +199,7 @@ fn pictures() -> Vec<Photo> {
             fine: None,
             lost_pixels: 0,
             straightened: None,
+            turn: Default::default(),
             camera_model: None,
             gravity: None,
             light: crate::photo::Light::NONE,

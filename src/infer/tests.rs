@@ -358,6 +358,7 @@ pub(super) fn photo(stem: &str, image: RgbImage) -> Photo {
         fine: None,
         lost_pixels: 0,
         straightened: None,
+        turn: Default::default(),
         camera_model: None,
         gravity: None,
         light: crate::photo::Light::NONE,

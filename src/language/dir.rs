@@ -289,6 +289,7 @@ mod tests {
             fine: None,
             lost_pixels: 0,
             straightened: None,
+            turn: Default::default(),
             camera_model: None,
             gravity: None,
             light: crate::photo::Light::NONE,
@@ -318,9 +319,13 @@ mod tests {
     #[test]
     fn labels_follow_a_lens_that_was_taken_out() {
         let mut seen = photo(200, 100, (200, 100));
-        let lens = crate::scene::Lens { k1: -0.3, k2: 0.0 };
-        seen.straightened =
-            Some(crate::photo::Straightening { lens, focal: 150.0, centre: DVec2::new(100.0, 50.0) });
+        let lens = crate::scene::Lens::radial(-0.3, 0.0);
+        seen.straightened = Some(crate::photo::Straightening {
+            lens,
+            focal: 150.0,
+            aspect: 1.0,
+            centre: DVec2::new(100.0, 50.0),
+        });
         let columns = (0..200 * 100).map(|k| k % 200).collect();
         let labels = to_working(Plane { width: 200, height: 100, data: columns }, &seen);
         // r = 0.6 is imaged at 0.6 (1 − 0.3 · 0.36) = 0.5352, 80.28 pixels from the middle instead of 90.

@@ -1,5 +1,6 @@
 //! Candidates for the photos of a run: files and frames of videos.
 use super::choose::{FoundFiles, find};
+use super::kind::check_name;
 use super::read::{self, Photo, from_bytes, load_at};
 use super::video::Video;
 use super::{decode, resize};
@@ -22,12 +23,19 @@ pub struct Candidate {
     /// The file; for a frame the video's path with the frame's name behind it.
     pub path: PathBuf,
     source: CandidateOrigin,
+    /// Instead of the stem of the path, where two photos have that one.
+    stem: Option<String>,
 }
 
 impl Candidate {
     /// A photo file.
     pub fn file(path: &Path) -> Candidate {
-        Candidate { path: path.to_path_buf(), source: CandidateOrigin::File }
+        Candidate { path: path.to_path_buf(), source: CandidateOrigin::File, stem: None }
+    }
+
+    /// A photo file that goes by another name than that of the file.
+    pub fn named(path: &Path, stem: &str) -> Candidate {
+        Candidate { stem: Some(stem.to_owned()), ..Candidate::file(path) }
     }
 
     /// File name without folder.
@@ -37,12 +45,14 @@ impl Candidate {
 
     /// At working resolution, see [`super::load_at`].
     pub fn load(&self, max_size: usize, progress: &dyn Progress) -> Result<Photo> {
-        match &self.source {
+        let photo = match &self.source {
             CandidateOrigin::File => load_at(&self.path, max_size),
             CandidateOrigin::Frame(video, at) => {
                 from_bytes(&self.path, video.frame(*at, None, progress)?, max_size)
             }
-        }
+        }?;
+        let stem = self.stem.clone().unwrap_or_else(|| photo.stem.clone());
+        Ok(Photo { stem, ..photo })
     }
 
     /// Upright pixels, at most `side` on the longer side; `None` past the end of a video that is shorter than it says.
@@ -70,30 +80,30 @@ impl Candidate {
 /// The candidates behind files, folders and videos, in the order of their names; frames in the order of time. Warns of what
 /// folders hold besides.
 pub fn gather(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Candidate>> {
-    let FoundFiles { photos, videos, ignored } = find(inputs)?;
-    if let Some(first) = ignored.first() {
-        let more = ignored.len() - 1;
-        let others = if more > 0 { format!(" and {more} more") } else { String::new() };
-        progress.warn(&format!("not a photo that can be read, ignored: {}{others}", first.display()));
-    }
+    let found = find(inputs)?;
+    let warnings = found.warnings();
+    warnings.iter().for_each(|w| progress.warn(w));
+    let FoundFiles { photos, videos, .. } = found;
     let mut all: Vec<Candidate> = photos.iter().map(|p| Candidate::file(p)).collect();
     for path in videos {
         let video = Arc::new(Video::open(&path, progress)?);
-        let frame =
-            |at| Candidate { path: video.frame_name(at), source: CandidateOrigin::Frame(video.clone(), at) };
+        let frame = |at| Candidate {
+            source: CandidateOrigin::Frame(video.clone(), at),
+            ..Candidate::file(&video.frame_name(at))
+        };
         all.extend(video.times().into_iter().map(frame));
     }
-    check_count(&all)?;
+    all.iter().try_for_each(|c| check_name(&c.path))?;
+    check_count(&all, &warnings)?;
     Ok(all)
 }
 
-/// Refuses a single photo.
-fn check_count(candidates: &[Candidate]) -> Result<()> {
-    match candidates {
-        [one] => Err(Error::input(format!(
-            "{}: only one photo; at least 2 are needed, 3 or 4 work best",
-            one.path.display()
-        ))),
-        _ => Ok(()),
-    }
+/// Refuses a single photo; what was left out may be the others.
+fn check_count(candidates: &[Candidate], left_out: &[String]) -> Result<()> {
+    let [one] = candidates else { return Ok(()) };
+    let besides: String = left_out.iter().map(|w| format!(" ({w})")).collect();
+    Err(Error::input(format!(
+        "{}: only one photo{besides}; at least 2 are needed, 3 or 4 work best",
+        one.path.display()
+    )))
 }

@@ -1,7 +1,9 @@
 //! Which files are the photos, and how many of them the run uses.
-use super::kind::{READ, is_foreign_name, is_photo_name, is_video_name};
+use super::join::listed;
+use super::kind::{READ, begins_as_photo, is_foreign_name, is_photo_name, is_raw_name, is_video_name};
+use super::twins;
 use crate::{Error, Result};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 /// Largest number of views: the pair count grows with its square, and the method is made for a few photos.
 pub const MAX_VIEWS: usize = 16;
@@ -18,10 +20,15 @@ pub struct FoundFiles {
     pub videos: Vec<PathBuf>,
     /// Videos beside photos and images of other kinds in the folders, which nothing reads.
     pub ignored: Vec<PathBuf>,
+    /// Files that hold the same photo as another one, which is used: (used, left out).
+    pub twins: Vec<(PathBuf, PathBuf)>,
+    /// `images` folders of data sets, whose photos are taken where the folder itself has none.
+    pub inside: Vec<PathBuf>,
 }
 
-/// Lists the photos of files and folders (not their subfolders), sorted by file name. A file that is named must exist; its
-/// content is judged when it is read.
+/// Lists the photos of files and folders (not their subfolders, but for `images` of a folder without photos of its own), sorted by
+/// file name, one of each where a camera wrote it in two formats. A file that is named must exist; its content is judged when it
+/// is read.
 pub fn find(inputs: &[PathBuf]) -> Result<FoundFiles> {
     let mut found = FoundFiles::default();
     for input in inputs {
@@ -29,7 +36,7 @@ pub fn find(inputs: &[PathBuf]) -> Result<FoundFiles> {
             Error::input(format!("{}: {e}; give photo files or a folder of photos", input.display()))
         })?;
         if kind.is_dir() {
-            list(input, &mut found)?;
+            list_or_below(input, &mut found)?;
         } else if is_video_name(input) {
             found.videos.push(input.clone());
         } else {
@@ -44,29 +51,154 @@ pub fn find(inputs: &[PathBuf]) -> Result<FoundFiles> {
         list.sort_by_key(key);
         list.dedup();
     }
+    found.twins = twins::leave_out(&mut found.photos);
+    if found.photos.is_empty() && found.videos.is_empty() { Err(nothing(inputs, &found)) } else { Ok(found) }
+}
+
+/// The photos of a folder and of those folders below it (and below its `images`) in which names of cameras lie.
+pub fn find_named(root: &Path, names: &[&str]) -> Result<FoundFiles> {
+    let mut folders: Vec<PathBuf> = names.iter().filter_map(|name| folder_of(name)).collect();
+    folders.sort();
+    folders.dedup();
+    let below = folders.iter().flat_map(|f| [root.join(f), root.join("images").join(f)]);
+    let mut all = vec![root.to_path_buf()];
+    all.extend(below.filter(|folder| folder.is_dir()));
+    let has_photos = |folder: &PathBuf| {
+        let mut found = FoundFiles::default();
+        list(folder, &mut found).is_ok() && !found.photos.is_empty()
+    };
+    all.retain(has_photos);
+    if all.is_empty() { find(&[root.to_path_buf()]) } else { find(&all) }
+}
+
+/// The folders of a name, relative and downwards only.
+fn folder_of(name: &str) -> Option<PathBuf> {
+    let name = name.replace('\\', "/");
+    let folder = Path::new(&name).parent()?;
+    let inside = |part: Component| matches!(part, Component::Normal(_) | Component::CurDir);
+    (!folder.as_os_str().is_empty() && folder.components().all(inside)).then(|| folder.to_path_buf())
+}
+
+impl FoundFiles {
+    /// What of the folders is not used, a line each.
+    pub fn warnings(&self) -> Vec<String> {
+        let show =
+            |list: &[&PathBuf]| listed(&list.iter().map(|p| p.display().to_string()).collect::<Vec<_>>());
+        let developed = |raw: &&PathBuf| {
+            self.photos.iter().any(|p| p.parent() == raw.parent() && p.file_stem() == raw.file_stem())
+        };
+        let (raw, other): (Vec<&PathBuf>, Vec<&PathBuf>) = self.ignored.iter().partition(|p| is_raw_name(p));
+        let (beside, raw): (Vec<&PathBuf>, Vec<&PathBuf>) = raw.into_iter().partition(developed);
+        let mut all = Vec::new();
+        if !self.inside.is_empty() {
+            all.push(format!("the photos are those in {}", show(&self.inside.iter().collect::<Vec<_>>())));
+        }
+        if !raw.is_empty() {
+            all.push(format!(
+                "camera raw files are not read: {}; develop them to JPEG or 16-bit TIFF",
+                show(&raw)
+            ));
+        }
+        if !beside.is_empty() {
+            all.push(format!("camera raw files are not read, the photos beside them are: {}", show(&beside)));
+        }
+        if !other.is_empty() {
+            all.push(format!("not a photo that can be read, ignored: {}", show(&other)));
+        }
+        if !self.twins.is_empty() {
+            let name = |p: &Path| p.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let pairs: Vec<String> =
+                self.twins.iter().map(|(a, b)| format!("{} for {}", name(a), name(b))).collect();
+            all.push(format!(
+                "photos in two formats are used once, the file with more pixels, else the JPEG: {}",
+                listed(&pairs)
+            ));
+        }
+        all
+    }
+}
+
+/// Why there is nothing.
+fn nothing(inputs: &[PathBuf], found: &FoundFiles) -> Error {
     let place = inputs.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ");
-    match (found.photos.is_empty() && found.videos.is_empty(), found.ignored.first()) {
-        (true, None) => Err(Error::input(format!(
-            "{place}: no photos; give a folder with 2 to {MAX_VIEWS} photos ({READ}), or a video"
-        ))),
-        (true, Some(other)) => Err(Error::input(format!(
+    let below: Vec<String> = inputs
+        .iter()
+        .flat_map(|input| folders_with_photos(input))
+        .map(|(folder, count)| format!("{} ({count})", folder.display()))
+        .collect();
+    Error::input(match found.ignored.first() {
+        _ if !below.is_empty() => {
+            format!(
+                "{place}: no photos in the folder itself; they are in {}: give one of these",
+                listed(&below)
+            )
+        }
+        None => {
+            format!("{place}: no photos; give a folder with 2 to {MAX_VIEWS} photos ({READ}), or a video")
+        }
+        Some(raw) if is_raw_name(raw) => {
+            format!(
+                "{}: a camera raw file, and there are no photos beside it; develop it to JPEG or 16-bit TIFF",
+                raw.display()
+            )
+        }
+        Some(other) => format!(
             "{}: this kind of image is not read and there are no photos beside it; save the photos as JPEG or PNG",
             other.display()
-        ))),
-        _ => Ok(found),
+        ),
+    })
+}
+
+fn list_or_below(folder: &Path, found: &mut FoundFiles) -> Result<()> {
+    let mut own = FoundFiles::default();
+    list(folder, &mut own)?;
+    let images = folder.join("images");
+    if own.photos.is_empty() && !own.ignored.iter().any(|p| is_video_name(p)) && images.is_dir() {
+        let mut below = FoundFiles::default();
+        list(&images, &mut below)?;
+        if !below.photos.is_empty() {
+            below.ignored.append(&mut own.ignored);
+            own = FoundFiles { inside: vec![images], ..below };
+        }
     }
+    found.photos.append(&mut own.photos);
+    found.ignored.append(&mut own.ignored);
+    found.inside.append(&mut own.inside);
+    Ok(())
+}
+
+fn subfolders(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path());
+    let mut all: Vec<PathBuf> = entries.filter(|p| !is_hidden(p) && p.is_dir()).collect();
+    all.sort();
+    all
+}
+
+/// Folders within two levels below one that hold photos, with their number.
+fn folders_with_photos(folder: &Path) -> Vec<(PathBuf, usize)> {
+    let first = subfolders(folder);
+    let all = first.iter().flat_map(|sub| [vec![sub.clone()], subfolders(sub)].concat());
+    let count = |sub: PathBuf| {
+        let mut found = FoundFiles::default();
+        list(&sub, &mut found).ok()?;
+        (!found.photos.is_empty()).then_some((sub, found.photos.len()))
+    };
+    all.filter_map(count).collect()
+}
+
+fn is_hidden(path: &Path) -> bool {
+    path.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'))
 }
 
 fn list(folder: &Path, found: &mut FoundFiles) -> Result<()> {
     for entry in std::fs::read_dir(folder).map_err(Error::io(folder))? {
         let path = entry.map_err(Error::io(folder))?.path();
-        let hidden = path.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
-        if hidden || path.is_dir() {
+        if is_hidden(&path) || path.is_dir() {
             continue;
         }
         if is_photo_name(&path) {
             found.photos.push(path);
-        } else if is_video_name(&path) || is_foreign_name(&path) {
+        } else if is_video_name(&path) || is_foreign_name(&path) || begins_as_photo(&path) {
             found.ignored.push(path);
         }
     }

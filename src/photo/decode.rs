@@ -14,7 +14,8 @@ use std::path::Path;
 /// A decoded file: stored pixels, read through [`Decoded::at`] as the upright image.
 pub(super) struct Decoded {
     pixels: DynamicImage,
-    orientation: Orientation,
+    /// Of the stored pixels, by EXIF.
+    pub orientation: Orientation,
     /// Colours are multiplied by alpha already (OpenEXR, TIFF with associated alpha).
     premultiplied: bool,
     /// Upright (width, height).

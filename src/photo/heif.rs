@@ -164,8 +164,39 @@ pub(super) enum Failure {
 /// alpha, which is the same as compositing on black.
 pub(super) fn decode(bytes: &[u8]) -> Result<Image, Failure> {
     let api = api().map_err(|what| Failure::Missing(format!("is a HEIC/AVIF photo and {what}")))?;
-    let owned = |pointer, free| Owned { pointer, free };
     // SAFETY: `bytes` outlives the context, every pointer is freed once, and after what was made from it.
+    unsafe {
+        let (_context, handle) = primary(api, bytes)?;
+        let shape = HeifLayout::of(api, handle.pointer)?;
+        let mut image = ptr::null_mut();
+        let decode = api.heif_decode_image;
+        check(api, decode(handle.pointer, &mut image, COLORSPACE_RGB, shape.chroma(), ptr::null()))?;
+        let image = Owned { pointer: image, free: api.heif_image_release };
+        let (exif, icc) = (exif(api, handle.pointer), icc(api, handle.pointer));
+        Ok(Image { pixels: shape.copy(api, image.pointer)?, exif, icc })
+    }
+}
+
+/// Pixels of the primary image, without decoding it; 0 where it cannot be read.
+pub(super) fn pixels(bytes: &[u8]) -> u64 {
+    let Ok(api) = api() else { return 0 };
+    let side = |n: c_int| u64::try_from(n).unwrap_or(0);
+    // SAFETY: as in `decode`.
+    unsafe {
+        primary(api, bytes).map_or(0, |(_context, handle)| {
+            side((api.heif_image_handle_get_width)(handle.pointer))
+                * side((api.heif_image_handle_get_height)(handle.pointer))
+        })
+    }
+}
+
+/// The context of a file and the handle of its primary image, which lives as long as the context; drop the handle first.
+///
+/// # Safety
+/// `bytes` must outlive the context.
+unsafe fn primary(api: &Api, bytes: &[u8]) -> Result<(Owned, Owned), Failure> {
+    let owned = |pointer, free| Owned { pointer, free };
+    // SAFETY: pointers that the library has made, each freed once.
     unsafe {
         let context = owned((api.heif_context_alloc)(), api.heif_context_free);
         if context.pointer.is_null() {
@@ -175,14 +206,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Image, Failure> {
         check(api, read(context.pointer, bytes.as_ptr().cast(), bytes.len(), ptr::null()))?;
         let mut handle = ptr::null_mut();
         check(api, (api.heif_context_get_primary_image_handle)(context.pointer, &mut handle))?;
-        let handle = owned(handle, api.heif_image_handle_release);
-        let shape = HeifLayout::of(api, handle.pointer)?;
-        let mut image = ptr::null_mut();
-        let decode = api.heif_decode_image;
-        check(api, decode(handle.pointer, &mut image, COLORSPACE_RGB, shape.chroma(), ptr::null()))?;
-        let image = owned(image, api.heif_image_release);
-        let (exif, icc) = (exif(api, handle.pointer), icc(api, handle.pointer));
-        Ok(Image { pixels: shape.copy(api, image.pointer)?, exif, icc })
+        Ok((context, owned(handle, api.heif_image_handle_release)))
     }
 }
 

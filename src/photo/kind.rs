@@ -1,5 +1,6 @@
 //! What kind of file it is, by its first bytes or its name, and what to do with the kinds that are not read.
 use crate::scene::MAX_PIXELS;
+use crate::{Error, Result};
 use image::ImageFormat;
 use std::path::Path;
 
@@ -8,9 +9,14 @@ const PHOTO: [&str; 14] =
     ["jpg", "jpeg", "jpe", "jfif", "png", "webp", "tif", "tiff", "heic", "heif", "hif", "avif", "exr", "hdr"];
 const VIDEO: [&str; 14] =
     ["mp4", "m4v", "mov", "qt", "avi", "mkv", "webm", "mpg", "mpeg", "wmv", "3gp", "3g2", "mts", "m2ts"];
-const RAW: [&str; 14] =
-    ["dng", "cr2", "cr3", "crw", "nef", "nrw", "arw", "srf", "sr2", "orf", "raf", "rw2", "pef", "srw"];
-const OTHER_IMAGE: [&str; 8] = ["bmp", "gif", "jxl", "jp2", "psd", "tga", "svg", "pdf"];
+/// Of Canon, Nikon, Sony, Olympus, Fujifilm, Panasonic, Leica, Pentax, Samsung, Hasselblad, Phase One, Mamiya, Minolta, Kodak, Epson,
+/// Sigma, GoPro and Apple's and Adobe's DNG.
+const RAW: [&str; 28] = [
+    "dng", "cr2", "cr3", "crw", "nef", "nrw", "arw", "srf", "sr2", "orf", "raf", "rw2", "raw", "rwl", "pef",
+    "srw", "3fr", "fff", "iiq", "mef", "mos", "mrw", "dcr", "kdc", "k25", "erf", "x3f", "gpr",
+];
+const OTHER_IMAGE: [&str; 12] =
+    ["bmp", "gif", "jxl", "jp2", "j2k", "psd", "tga", "svg", "pdf", "ppm", "pgm", "insp"];
 
 /// The kinds that are read, for messages.
 pub(super) const READ: &str = "JPEG, PNG, HEIC, AVIF, WebP or TIFF";
@@ -63,7 +69,58 @@ pub(super) fn is_video_name(path: &Path) -> bool {
 
 /// Images that nothing here reads: worth a word when a folder holds them.
 pub(super) fn is_foreign_name(path: &Path) -> bool {
-    has_extension(path, &RAW) || has_extension(path, &OTHER_IMAGE)
+    is_raw_name(path) || has_extension(path, &OTHER_IMAGE)
+}
+
+/// Camera raw files.
+pub(super) fn is_raw_name(path: &Path) -> bool {
+    has_extension(path, &RAW)
+}
+
+/// Names of files in which one photo may lie beside others of the same stem: what phones and cameras write two of. PNG is not
+/// among them: it holds masks and cut-outs.
+pub(super) fn is_camera_format(path: &Path) -> bool {
+    is_photo_name(path) && !has_extension(path, &["png", "exr", "hdr", "webp"])
+}
+
+/// JPEG by its name.
+pub(super) fn is_jpeg_name(path: &Path) -> bool {
+    has_extension(path, &["jpg", "jpeg", "jpe", "jfif"])
+}
+
+/// Whether a file whose name is not that of a photo begins as one.
+pub(super) fn begins_as_photo(path: &Path) -> bool {
+    use std::io::Read as _;
+    let mut start = Vec::new();
+    let read = crate::files::open(path).map(|(file, _)| file.take(16).read_to_end(&mut start).is_ok());
+    matches!(read, Ok(true))
+        && (start.starts_with(b"\xff\xd8\xff")
+            || start.starts_with(b"\x89PNG\r\n\x1a\n")
+            || brand(&start) == Some(FileKind::Heif))
+}
+
+/// Bytes of the longest stem: the scene's files are named after it, and cameras take names of 200 bytes.
+const LONGEST_STEM: usize = 196;
+
+/// Refuses names of photos that files of a scene cannot be named after: that are no Unicode, have control characters, or are too
+/// long.
+pub fn check_name(path: &Path) -> Result<()> {
+    let shown = path.to_string_lossy();
+    let bad = |what: String| {
+        let start: String = shown.chars().rev().take(60).collect::<Vec<_>>().into_iter().rev().collect();
+        let cut = if start.len() < shown.len() { "…" } else { "" };
+        Err(Error::input(format!("{cut}{start}: {what}; rename the photo")))
+    };
+    let name = stem(&shown);
+    if path.to_str().is_none() {
+        bad("its path is not Unicode (UTF-8), so that no file of the scene can name it".to_owned())
+    } else if name.chars().any(char::is_control) {
+        bad("a control character is in its name".to_owned())
+    } else if name.len() > LONGEST_STEM {
+        bad(format!("a name of {} bytes is too long, {LONGEST_STEM} are the most", name.len()))
+    } else {
+        Ok(())
+    }
 }
 
 /// What reads a file, or why nothing does.
@@ -198,6 +255,30 @@ mod tests {
         ];
         for (name, expected) in cases {
             assert_eq!((stem(name), stem(stem(name))), (expected, expected));
+        }
+    }
+
+    #[test]
+    fn names_that_no_scene_can_hold_are_refused() {
+        let refused = |name: &str| check_name(Path::new(name)).err().map(|e| e.to_string());
+        assert_eq!(refused(&format!("f/{}.jpg", "x".repeat(196))), None);
+        assert_eq!(refused(&format!("f/{}.jpg", "写".repeat(65))), None);
+        for name in [
+            "a\nb.jpg",
+            "\u{1b}[31m.jpg",
+            "f/\u{7f}.png",
+            &format!("{}.jpg", "x".repeat(197)),
+            &"写".repeat(66),
+        ] {
+            let e = refused(name).unwrap();
+            assert!(e.contains("rename the photo") && e.len() < 400, "{e}");
+        }
+        #[cfg(unix)]
+        {
+            use std::os::unix::ffi::OsStrExt;
+            let name = std::ffi::OsStr::from_bytes(b"caf\xe9.jpg");
+            let e = check_name(Path::new(name)).unwrap_err();
+            assert!(e.exit_code() == 2 && e.to_string().contains("not Unicode"), "{e}");
         }
     }
 

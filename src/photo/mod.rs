@@ -4,7 +4,9 @@ mod candidate;
 mod choose;
 mod decode;
 mod exif_tags;
+mod header;
 mod heif;
+mod join;
 mod kind;
 pub mod light;
 mod profile;
@@ -14,23 +16,28 @@ mod sizes;
 mod straighten;
 mod superpixels;
 mod support;
+mod turn;
+mod twins;
 mod video;
 
 pub use border::PlainBorder;
 pub use candidate::{Candidate, gather};
-pub use choose::{DEFAULT_VIEWS, FoundFiles, MAX_VIEWS, find, photo_count, spread};
+pub use choose::{DEFAULT_VIEWS, FoundFiles, MAX_VIEWS, find, find_named, photo_count, spread};
 pub use decode::stored_pixels;
-pub use kind::stem;
+pub use header::dimensions;
+pub use join::{join, listed, plain_name, stems_apart};
+pub use kind::{check_name, stem};
 pub use light::Light;
 pub use read::{
     MAX_SIZE, MAX_SIZE_CPU, Photo, SMALLEST_SIDE, default_max_size, from_bytes, from_pixels, load, load_at,
     working_size,
 };
 pub use resize::Kernel;
-pub use sizes::{dimensions, sizes_of};
+pub use sizes::sizes_of;
 pub use straighten::Straightening;
 pub use superpixels::superpixels;
 pub use support::Support;
+pub use turn::Turn;
 
 use crate::progress::Progress;
 use crate::scene::RgbImage;
@@ -60,6 +67,7 @@ pub fn load_all(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Photo
 /// Reads the photos of a run, each scaled down to `max_size` where it is larger; refuses sets that cannot give geometry (the
 /// same photo twice) or that would mix up files (the same name twice).
 pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progress) -> Result<Vec<Photo>> {
+    candidates.iter().try_for_each(|c| check_name(&c.path))?;
     progress.begin("photos", candidates.len() as u64);
     let done = AtomicU64::new(0);
     let one = |candidate: &Candidate| {
@@ -135,8 +143,20 @@ pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
 /// twice). [`load_all`] has done it; for photos from memory.
 pub fn check_set(photos: &[Photo]) -> Result<()> {
     if !(2..=MAX_VIEWS).contains(&photos.len()) {
-        return Err(Error::input(format!("{} photos; give 2 to {MAX_VIEWS}", photos.len())));
+        return Err(match photos {
+            [] => Error::input("no photos; at least 2 are needed, 3 or 4 work best"),
+            [one] => Error::input(format!(
+                "{}: only one photo; at least 2 are needed, 3 or 4 work best",
+                one.path.display()
+            )),
+            all => Error::input(format!(
+                "{} photos are more than a scene takes; give at most {MAX_VIEWS}, or --views {MAX_VIEWS} to have them chosen",
+                all.len()
+            )),
+        });
     }
+    // The name that a photo goes by may have folders in front of that of its file.
+    photos.iter().try_for_each(|p| check_name(&p.path).and_then(|()| check_name(p.stem.as_ref())))?;
     let digests: Vec<_> =
         photos.iter().map(|p| Sha256::digest(bytemuck::cast_slice(&p.image.data))).collect();
     for j in 1..photos.len() {

@@ -3,6 +3,7 @@ use super::border::PlainBorder;
 use super::kind::stem;
 use super::light::Light;
 use super::straighten::Straightening;
+use super::turn::Turn;
 use super::{decode, resize};
 use crate::scene::{Affine, Camera, Lens, Plane, RgbImage};
 use crate::{Error, Result, files};
@@ -41,6 +42,9 @@ pub struct Photo {
     pub border: PlainBorder,
     /// Upright size of the file, pixels.
     pub original_size: (u32, u32),
+    /// How the stored pixels of the file were turned to be upright.
+    #[serde(default)]
+    pub turn: Turn,
     /// Original (upright) pixels → working pixels.
     pub to_working: Affine,
     /// Focal length from EXIF in working pixels, if the file states it.
@@ -61,14 +65,29 @@ pub struct Photo {
 }
 
 impl Photo {
-    /// Takes the lens out of the working image; `camera` is the pinhole that remains, at the working resolution.
+    /// Takes the lens out of the working image and the fine one; `camera` is the pinhole that remains, at the working resolution.
     pub fn straighten(&mut self, lens: Lens, camera: &Camera) {
         if !lens.is_none() {
-            let (focal, centre) = (0.5 * (camera.fx + camera.fy), DVec2::new(camera.cx, camera.cy));
-            let how = Straightening { lens, focal, centre };
+            let how = Straightening::new(lens, camera);
             self.image = how.image(&self.image);
+            self.fine = self.fine.take().map(|fine| Arc::new(how.larger(&fine, self.image.width)));
             self.straightened = Some(how);
         }
+    }
+
+    /// Mirrors the photo as if the file's orientation were without it: its stored pixels turned.
+    pub fn unmirror(&mut self) {
+        fn flipped<T: Copy>(data: &mut [T], width: usize) {
+            data.chunks_exact_mut(width.max(1)).for_each(<[T]>::reverse);
+        }
+        flipped(&mut self.image.data, self.image.width);
+        if let Some(fine) = &mut self.fine {
+            let width = fine.width;
+            flipped(&mut Arc::make_mut(fine).data, width);
+        }
+        let PlainBorder { left, right, .. } = self.border;
+        self.border = PlainBorder { left: right, right: left, ..self.border };
+        self.turn.mirrored = false;
     }
 
     /// Working pixels per original pixel.
@@ -129,7 +148,8 @@ pub fn from_bytes(name: &Path, bytes: Vec<u8>, max_size: usize) -> Result<Photo>
     let exif_focal = decoded.lens.focal.map(|f| f * photo.to_working.scale[1]);
     let lens = &decoded.lens;
     let (camera_model, gravity) = (lens.camera_model.clone(), lens.gravity);
-    Ok(Photo { exif_focal, camera_model, gravity, lost_pixels: decoded.not_finite(), ..photo })
+    let (turn, lost_pixels) = (Turn::from(decoded.orientation), decoded.not_finite());
+    Ok(Photo { exif_focal, camera_model, gravity, lost_pixels, turn, ..photo })
 }
 
 /// A photo from upright sRGB pixels in [0, 1]; `focal` is in their pixels, where it is known.
@@ -166,6 +186,7 @@ fn working(
         image,
         border,
         original_size: (w as u32, h as u32),
+        turn: Turn::default(),
         to_working: Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32)),
         exif_focal: None,
         fine,

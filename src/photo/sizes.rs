@@ -1,11 +1,7 @@
 //! Sizes of photos before they are decoded: what memory a run needs, and how many files may be decoded at once.
 use super::candidate::Candidate;
-use crate::{Error, Result, files};
-use image::metadata::Orientation;
-use image::{ImageDecoder, ImageReader};
-use std::io::BufReader;
+use super::header;
 use std::ops::Range;
-use std::path::Path;
 
 /// Decoded bytes that may be held at once. A photo of 12 megapixels is 36 MB, one of 100 megapixels 300 MB, and two cores are
 /// busy with two of either.
@@ -19,29 +15,7 @@ const ASSUMED: (usize, usize) = (8064, 6048);
 
 /// Upright (width, height) of photos that have not been read yet.
 pub fn sizes_of(candidates: &[Candidate]) -> Vec<(usize, usize)> {
-    candidates.iter().map(|c| size_of_file(&c.path).unwrap_or(ASSUMED)).collect()
-}
-
-/// Stored (width, height) of an image file, by its header; orientation is not applied.
-pub fn dimensions(path: &Path) -> Result<(u32, u32)> {
-    let read = ImageReader::new(BufReader::new(files::open(path)?.0)).with_guessed_format();
-    let size = read.map_err(image::ImageError::IoError).and_then(ImageReader::into_dimensions);
-    size.map_err(|e| Error::input(format!("{}: cannot be read as an image: {e}", path.display())))
-}
-
-fn size_of_file(path: &Path) -> Option<(usize, usize)> {
-    let file = BufReader::new(files::open(path).ok()?.0);
-    let mut decoder = ImageReader::new(file).with_guessed_format().ok()?.into_decoder().ok()?;
-    let (w, h) = decoder.dimensions();
-    let sideways = matches!(
-        decoder.orientation().unwrap_or(Orientation::NoTransforms),
-        Orientation::Rotate90
-            | Orientation::Rotate270
-            | Orientation::Rotate90FlipH
-            | Orientation::Rotate270FlipH
-    );
-    let (w, h) = (w as usize, h as usize);
-    Some(if sideways { (h, w) } else { (w, h) })
+    candidates.iter().map(|c| header::upright_size(&c.path).unwrap_or(ASSUMED)).collect()
 }
 
 /// Consecutive photos that may be decoded side by side.

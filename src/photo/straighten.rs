@@ -1,5 +1,5 @@
 //! Photos resampled to a pinhole without distortion.
-use crate::scene::{Lens, Plane, RgbImage};
+use crate::scene::{Camera, Lens, Plane, RgbImage};
 use glam::DVec2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -9,16 +9,36 @@ use serde::{Deserialize, Serialize};
 pub struct Straightening {
     /// What is taken out.
     pub lens: Lens,
-    /// Focal length, pixels.
+    /// Focal length along x, pixels.
     pub focal: f64,
+    /// Focal length along y over that along x.
+    #[serde(default = "square")]
+    pub aspect: f64,
     /// Principal point, pixels.
     pub centre: DVec2,
 }
 
+/// Scenes of earlier versions do not state it.
+fn square() -> f64 {
+    1.0
+}
+
 impl Straightening {
+    /// Of a picture whose pinhole is `camera`.
+    pub fn new(lens: Lens, camera: &Camera) -> Straightening {
+        let centre = DVec2::new(camera.cx, camera.cy);
+        Straightening { lens, focal: camera.fx, aspect: camera.fy / camera.fx, centre }
+    }
+
     /// Where the lens imaged what the pinhole shows at `p`, pixels.
     pub fn source(&self, p: DVec2) -> DVec2 {
-        self.lens.distort((p - self.centre) / self.focal) * self.focal + self.centre
+        let focal = DVec2::new(self.focal, self.focal * self.aspect);
+        self.lens.distort((p - self.centre) / focal) * focal + self.centre
+    }
+
+    /// The same for the picture in another size.
+    fn resized(&self, scale: f64) -> Straightening {
+        Straightening { focal: self.focal * scale, centre: self.centre * scale, ..*self }
     }
 
     /// The picture without the lens, by cubic interpolation (Catmull–Rom); what the lens did not see continues the nearest
@@ -34,6 +54,11 @@ impl Straightening {
         let size = (plane.width, plane.height);
         let data = resampled(size, |x, y| [plane.at(x, y)], |p| self.source(p));
         Plane { width: size.0, height: size.1, data: data.into_iter().map(|[v]| v).collect() }
+    }
+
+    /// [`Straightening::plane`] of a picture that is larger than the one that is meant, which is `width` pixels wide.
+    pub(super) fn larger(&self, plane: &Plane<f32>, width: usize) -> Plane<f32> {
+        self.resized(plane.width as f64 / width as f64).plane(plane)
     }
 }
 
@@ -96,7 +121,7 @@ mod tests {
 
     #[test]
     fn a_pattern_seen_through_a_lens_comes_out_straight() {
-        let (w, h, focal, lens) = (160, 120, 140.0, Lens { k1: -0.12, k2: 0.03 });
+        let (w, h, focal, lens) = (160, 120, 140.0, Lens::radial(-0.12, 0.03));
         let centre = DVec2::new(81.0, 58.5);
         // A smooth pattern of ideal positions, and the photo that the lens makes of it.
         let pattern = |x: DVec2| {
@@ -107,7 +132,7 @@ mod tests {
         let position = |k: usize| (DVec2::new((k % w) as f64 + 0.5, (k / w) as f64 + 0.5) - centre) / focal;
         let data = (0..w * h).map(|k| pattern(lens.undistort(position(k)))).collect();
         let photo = RgbImage { width: w, height: h, data };
-        let out = Straightening { lens, focal, centre }.image(&photo);
+        let out = Straightening { lens, focal, aspect: 1.0, centre }.image(&photo);
         let mut worst = 0f32;
         for y in 2..h - 2 {
             for x in 2..w - 2 {

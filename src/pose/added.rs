@@ -36,8 +36,9 @@ pub fn add(
         check(&photo.stem, fitted)?;
     }
     for ((photo, fitted), camera) in photos.iter_mut().zip(&model.fitted).zip(&model.cameras).skip(count) {
-        photo.straighten(fitted.lens, camera);
+        // Only the cameras were measured on it.
         photo.fine = None;
+        photo.straighten(fitted.lens, camera);
     }
     let photos = light::in_light_of(photos, count, &model, progress);
     Ok(SolvedCameras {

@@ -4,14 +4,14 @@ use super::confidence::{DOUBTFUL, DOUBTFUL_ROTATION, UNSURE_FOCAL};
 use super::leave_out::{self, Placed};
 use super::sharpness::warn_of_blur;
 use super::stereo::{self, StereoOptions};
-use super::{Geometry, Keypoints, SparseModel, light, sfm};
+use super::{Geometry, Keypoints, SparseModel, given, light, sfm};
+use crate::Result;
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::xfeat::XFeat;
-use crate::photo::{Photo, stem};
+use crate::photo::Photo;
 use crate::progress::Progress;
-use crate::scene::{Camera, DepthPrior};
-use crate::{Error, Result};
+use crate::scene::{DepthPrior, GivenCamera};
 use glam::DVec2;
 
 /// Photos whose cameras are known, as every later stage sees them.
@@ -29,17 +29,18 @@ pub struct SolvedCameras {
 /// Cameras of the photos, from the photos themselves (`cameras` = None; `seed` draws the samples of RANSAC) or as given. From
 /// the photos themselves only those get one whose place can be found surely.
 pub fn place(
-    photos: Vec<Photo>,
-    cameras: Option<&[Camera]>,
+    mut photos: Vec<Photo>,
+    cameras: Option<&[GivenCamera]>,
     registry: &Registry,
     seed: u64,
     progress: &dyn Progress,
 ) -> Result<SolvedCameras> {
+    let known = cameras.map(|given| given::assign(&mut photos, given, progress)).transpose()?;
     warn_of_blur(&photos, progress);
     let features = learned_features(&photos, registry, progress)?;
-    let Placed { photos, model, left_out } = match cameras {
+    let Placed { photos, model, left_out } = match known {
         Some(known) => {
-            let model = sfm::with_cameras(&photos, &assigned(&photos, known)?, &features, progress)?;
+            let model = sfm::with_cameras(&photos, &known, &features, progress)?;
             Placed { photos, model, left_out: Vec::new() }
         }
         None => leave_out::place(photos, features, seed, progress)?,
@@ -48,11 +49,11 @@ pub fn place(
     warn_of_misfits(&photos, &model, progress);
     progress.check()?;
     let mut photos = photos;
+    // Only the cameras were measured on them.
+    photos.iter_mut().for_each(|p| p.fine = None);
     for ((photo, fitted), camera) in photos.iter_mut().zip(&model.fitted).zip(&model.cameras) {
         photo.straighten(fitted.lens, camera);
     }
-    // Only the cameras were measured on them.
-    photos.iter_mut().for_each(|p| p.fine = None);
     let photos = light::equalised(photos, &model, progress);
     let method = if cameras.is_some() { "cameras + stereo" } else { "sfm (corners + XFeat) + stereo" };
     Ok(SolvedCameras { photos, model, left_out, method: method.into() })
@@ -176,35 +177,6 @@ pub fn learned_features(
     Ok(out)
 }
 
-/// One camera per photo, at working resolution, by file name without extension.
-fn assigned(photos: &[Photo], cameras: &[Camera]) -> Result<Vec<Camera>> {
-    photos
-        .iter()
-        .map(|p| {
-            let camera = cameras.iter().find(|c| stem(&c.name) == p.stem).ok_or_else(|| {
-                Error::input(format!(
-                    "the camera file has no camera named {}; it names {}",
-                    p.stem,
-                    cameras.iter().map(|c| stem(&c.name)).collect::<Vec<_>>().join(", ")
-                ))
-            })?;
-            let size = (p.image.width as u32, p.image.height as u32);
-            if (camera.width, camera.height) == p.original_size {
-                return Ok(p.to_working.camera(camera, size));
-            }
-            let (a, b) = (camera.width as f64 * size.1 as f64, camera.height as f64 * size.0 as f64);
-            // One pixel of rounding on the short side of a small image.
-            if (a / b - 1.0).abs() > 0.01 {
-                return Err(Error::input(format!(
-                    "camera {} is for {}×{} pixels, the photo is {}×{}: the aspects differ",
-                    camera.name, camera.width, camera.height, p.original_size.0, p.original_size.1
-                )));
-            }
-            Ok(camera.resized(size.0, size.1))
-        })
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -212,7 +184,7 @@ mod tests {
     use crate::photo::Light;
     use crate::pose::{Fitted, testing};
     use crate::progress::{Recorded, Silent};
-    use crate::scene::{Lens, Pose, RgbImage};
+    use crate::scene::{Lens, RgbImage};
 
     #[test]
     fn photos_that_do_not_fit_are_named_with_what_does_not() {
@@ -279,25 +251,11 @@ mod tests {
     }
 
     #[test]
-    fn given_cameras_are_scaled_to_their_photos_and_never_stretched() {
-        let photos = [grey_photo()];
-        let of = |width: u32, height: u32| {
-            let (name, pose) = ("a.jpg".to_string(), Pose::IDENTITY);
-            let camera = Camera { name, width, height, fx: 100.0, fy: 100.0, cx: 60.0, cy: 50.0, pose };
-            assigned(&photos, &[camera])
-        };
-        let half = &of(160, 128).unwrap()[0];
-        assert_eq!((half.width, half.height, half.fx, half.cx, half.cy), (80, 64, 50.0, 30.0, 25.0));
-        let error = of(128, 128).unwrap_err();
-        assert!(error.exit_code() == 2 && error.to_string().contains("the aspects differ"), "{error}");
-    }
-
-    #[test]
     #[ignore = "takes long: tools/test-long"]
     fn placed_photos_are_straight_and_in_one_light() {
         let truth = testing::train(&testing::folder());
         let registry = Registry::open(None).unwrap();
-        let lens = Lens { k1: -0.12, k2: 0.03 };
+        let lens = Lens::radial(-0.12, 0.03);
         let mut photos: Vec<Photo> =
             truth.photos.iter().map(|p| testing::lensed(p, truth.cameras[0].fx, lens)).collect();
         let dim = Light { gain: [0.7; 3], ..Light::NONE };

@@ -87,6 +87,8 @@ fn joining(
             video.display()
         )));
     }
+    found.warnings().iter().for_each(|w| progress.warn(w));
+    found.photos.iter().try_for_each(|p| photo::check_name(p))?;
     let files: Vec<Candidate> = found.photos.iter().map(|p| Candidate::file(p)).collect();
     // As large as those of the scene, where nothing else is asked for: finer ones would be shown no better.
     let sides = base.known.photos.iter().map(|p| p.image.width.max(p.image.height));
@@ -102,6 +104,7 @@ fn joining(
         progress.step(photos.len() as u64, "");
     }
     progress.end();
+    let photos = base.without_its_own(photos, progress)?;
     base.check(&photos)?;
     Ok(photos)
 }

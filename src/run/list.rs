@@ -75,7 +75,7 @@ pub(super) fn scene(
     let posed = if plan.cameras.is_empty() {
         sources::make::<GeometrySources>(&plan.init, &registry, (build, photos))?
     } else {
-        build.posed(photos, CameraOrigin::Known(plan.cameras.clone()))?
+        build.posed(photos, CameraOrigin::Known(plan.cameras.clone().into()))?
     };
     let PosedPhotos { placed, geometry } = posed;
     let trained = build.graph.add(stages::TrainColour { options }, (placed, geometry));

@@ -8,7 +8,7 @@ use crate::fit::{LanguageOptions, Preset, RgbOptions, ViewDependentOptions};
 use crate::gpu::Device;
 use crate::infer::{Compute, Registry};
 use crate::language::sam::SamOptions;
-use crate::scene::Camera;
+use crate::scene::GivenCamera;
 use std::path::{Path, PathBuf};
 
 /// Training states are some ten megabytes for scenes of a few photos: written in a fraction of a second.
@@ -39,7 +39,7 @@ pub struct RunPlan {
     pub depth_prior: SourceChoice,
     /// Known cameras in memory, one per photo with its name, instead of those of `init`.
     #[serde(skip)]
-    pub cameras: Vec<Camera>,
+    pub cameras: Vec<GivenCamera>,
     /// Dense matches.
     pub matcher: SourceChoice,
     /// Masks.

@@ -4,15 +4,15 @@ use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras, colmap, ply};
 use crate::gpu::{self, Device};
 use crate::infer::{Compute, Registry};
-use crate::photo::{self, Candidate, Photo, stem};
+use crate::photo::{self, Candidate, Photo};
 use crate::pipeline::Graph;
-use crate::pose::Geometry;
+use crate::pose::{self, Geometry};
 use crate::progress::{Progress, Recorded};
 use crate::report::{self, HtmlReport, RunRecord, ViewShown};
 use crate::run::budget::{self, Limits, MemoryDemand};
 use crate::run::stages::{self, CameraOrigin};
 use crate::run::view::Viewer;
-use crate::scene::{Camera, LanguageField, PointCloud, World};
+use crate::scene::{Camera, GivenCamera, LanguageField, PointCloud, World};
 use crate::{Error, Result};
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -24,7 +24,9 @@ pub struct TrainPlan {
     pub images: PathBuf,
     /// Camera file or COLMAP model folder.
     pub cameras: PathBuf,
-    /// Points to start from (`.ply` or a COLMAP model folder) instead of stereo.
+    /// How many photos with a camera are used; `None`: all, at most [`photo::MAX_VIEWS`].
+    pub views: Option<usize>,
+    /// Points to start from (`.ply`, a COLMAP model folder or a data set that holds one) instead of stereo.
     pub points: Option<PathBuf>,
     /// Scene directory.
     pub out: PathBuf,
@@ -71,35 +73,66 @@ impl TrainPlan {
     }
 }
 
-/// Photos that have a camera, in name order; photos without one are named in a warning.
+/// Photos that have a camera, in name order, at most as many as are wanted; what is left out is named in warnings.
 fn matched(
     plan: &TrainPlan,
-    known: &[Camera],
+    known: &[GivenCamera],
     max_size: usize,
     work: impl Fn(usize) -> MemoryDemand,
     device: &Device,
     progress: &dyn Progress,
 ) -> Result<Vec<Photo>> {
-    let found = photo::find(std::slice::from_ref(&plan.images))?;
-    let has = |p: &&PathBuf| known.iter().any(|c| stem(&c.name) == stem(&p.to_string_lossy()));
-    let paths: Vec<PathBuf> = found.photos.iter().filter(has).cloned().collect();
-    if paths.len() < 2 {
-        return Err(Error::input(format!(
-            "{}: {} of {} photos have a camera in {}, at least 2 are needed; names must match without extension",
-            plan.images.display(),
-            paths.len(),
-            found.photos.len(),
-            plan.cameras.display()
-        )));
-    }
-    if paths.len() < found.photos.len() {
-        progress
-            .warn(&format!("{} photos have no camera and are left out", found.photos.len() - paths.len()));
-    }
-    let files: Vec<Candidate> = paths.iter().map(|p| Candidate::file(p)).collect();
+    let files = with_cameras(plan, known, progress)?;
+    let views = plan.views.unwrap_or(files.len().min(photo::MAX_VIEWS));
+    let wanted = photo::photo_count(files.len(), Some(views))?;
+    let files = match wanted == files.len() {
+        true => files,
+        false => {
+            let (chosen, choice) = pose::choose::choose(&files, wanted, progress)?;
+            progress.warn(&choice.message());
+            chosen.into_iter().map(|i| files[i].clone()).collect()
+        }
+    };
     let limits = Limits::now(device.info());
     budget::check(&limits, &photo::sizes_of(&files), max_size, &work(files.len()))?;
     photo::load_each(&files, max_size, progress)
+}
+
+/// The photos of the folder, and of the folders below it that names of cameras lie in, that have a camera.
+fn with_cameras(plan: &TrainPlan, known: &[GivenCamera], progress: &dyn Progress) -> Result<Vec<Candidate>> {
+    let names: Vec<&str> = known.iter().map(|c| c.camera.name.as_str()).collect();
+    let found = photo::find_named(&plan.images, &names)?;
+    found.warnings().iter().for_each(|w| progress.warn(w));
+    let paths: Vec<String> = found.photos.iter().map(|p| p.to_string_lossy().into_owned()).collect();
+    let place = |e: String| Error::input(format!("{}: {e}", plan.cameras.display()));
+    let own = photo::join(&paths, &names).map_err(place)?;
+    let (with, without): (Vec<_>, Vec<_>) = found.photos.iter().zip(own).partition(|(_, own)| own.is_some());
+    let shown = |list: &[(&PathBuf, Option<usize>)]| {
+        let names = list.iter().map(|(p, _)| p.strip_prefix(&plan.images).unwrap_or(p).display().to_string());
+        photo::listed(&names.collect::<Vec<_>>())
+    };
+    if with.len() < 2 {
+        return Err(Error::input(format!(
+            "{}: {} of {} photos have a camera in {}, at least 2 are needed; the photos are {}, the cameras {}",
+            plan.images.display(),
+            with.len(),
+            found.photos.len(),
+            plan.cameras.display(),
+            shown(&found.photos.iter().map(|p| (p, None)).collect::<Vec<_>>()),
+            photo::listed(&names)
+        )));
+    }
+    if !without.is_empty() {
+        progress.warn(&format!(
+            "{} photos have no camera and are left out: {}",
+            without.len(),
+            shown(&without)
+        ));
+    }
+    let paths: Vec<String> = with.iter().map(|(p, _)| p.to_string_lossy().into_owned()).collect();
+    let stems = photo::stems_apart(&paths);
+    let files = with.iter().zip(&stems).map(|((path, _), stem)| Candidate::named(path, stem));
+    Ok(files.collect())
 }
 
 fn points(path: &Path) -> Result<PointCloud> {
@@ -150,7 +183,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let inputs: Vec<&Path> =
         inputs.into_iter().flatten().chain([&plan.images]).map(PathBuf::as_path).collect();
     let workspace = Workspace::create(&plan.out, plan.force, &inputs)?;
-    let known = cameras::read(&plan.cameras)?;
+    let known = cameras::read_file(&plan.cameras)?;
     let given = plan.points.as_deref().map(points).transpose()?;
     let device = Device::with(&gpu::Options {
         deterministic: plan.deterministic,
@@ -159,10 +192,14 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });
     let work = |photos| MemoryDemand::colour(preset, photos);
-    let photos = matched(plan, &known, max_size, work, &device, progress)?;
+    let mut photos = matched(plan, &known.cameras, max_size, work, &device, progress)?;
     let registry = Registry::with(plan.models.as_deref(), Compute::by(plan.provider.as_deref()))?;
     let source = match given {
-        Some(cloud) => CameraOrigin::GivenGeometry(from_points(&photos, &known, cloud, progress)?),
+        Some(cloud) => {
+            known.warnings.iter().for_each(|w| progress.warn(w));
+            let geometry = from_points(&mut photos, &known.cameras, cloud, progress)?;
+            CameraOrigin::GivenGeometry(geometry)
+        }
         None => CameraOrigin::Known(known),
     };
     let mut options = RgbOptions::preset(preset);
@@ -283,13 +320,15 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     Ok(TrainOutcome { record, table })
 }
 
+/// Geometry of given cameras and points; the lenses are taken out of the photos.
 fn from_points(
-    photos: &[Photo],
-    known: &[Camera],
+    photos: &mut [Photo],
+    known: &[GivenCamera],
     cloud: PointCloud,
     progress: &dyn Progress,
 ) -> Result<Geometry> {
-    let cameras = photos.iter().map(|p| camera_of(p, known)).collect::<Result<Vec<_>>>()?;
+    let cameras = pose::assign(photos, known, progress)?;
+    photos.iter_mut().for_each(|p| p.fine = None);
     let points = with_footprints(cloud, &cameras, progress)?;
     Ok(Geometry {
         points,
@@ -299,42 +338,4 @@ fn from_points(
         fitted: Vec::new(),
         method: "cameras+points".into(),
     })
-}
-
-/// The photo's camera at its working resolution; sizes may differ, the aspect may not.
-fn camera_of(photo: &Photo, known: &[Camera]) -> Result<Camera> {
-    let bad = |what: &str| Error::input(format!("{}: {what}", photo.path.display()));
-    let camera = known.iter().find(|c| stem(&c.name) == photo.stem);
-    let camera = camera.ok_or_else(|| bad("no camera with this name"))?;
-    let (w, h) = (photo.image.width as f64, photo.image.height as f64);
-    // 1 %: sizes are whole numbers, and working sizes are truncated.
-    if (camera.width as f64 / camera.height as f64 / (w / h) - 1.0).abs() > 0.01 {
-        return Err(bad(&format!(
-            "its camera is for {} × {} pixels, another aspect",
-            camera.width, camera.height
-        )));
-    }
-    Ok(camera.resized(photo.image.width as u32, photo.image.height as u32))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::pass::seeded;
-    use crate::scene::RgbImage;
-
-    #[test]
-    fn a_camera_of_another_aspect_than_its_photo_is_refused() {
-        let data = (0..96 * 72).map(|i| [(i * 7919 % 251) as f32 / 251.0; 3]).collect();
-        let image = RgbImage { width: 96, height: 72, data };
-        let photo = photo::from_pixels("a.png".as_ref(), &image, None, 96).unwrap();
-        let any = seeded::small(1, 96, 72, 0, 1).1;
-        let of_size = |width, height| {
-            camera_of(&photo, &[Camera { name: "a.jpg".into(), width, height, ..any.clone() }])
-        };
-        // Cameras of larger photos: of the same aspect, and of one on its side.
-        assert_eq!(of_size(640, 480).unwrap().width, 96);
-        let e = of_size(480, 640).unwrap_err();
-        assert!(e.exit_code() == 2 && e.to_string().contains("480 × 640 pixels, another aspect"), "{e}");
-    }
 }

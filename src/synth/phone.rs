@@ -137,7 +137,7 @@ fn optics(widest: &Camera, effects: &Effects, seed: u64) -> Result<Optics> {
         let camera = refocused(widest, focal, offset, effects);
         let drawn = (0..1000).find_map(|_| {
             let k1 = between(&mut optics, -K1, K1);
-            let lens = Lens { k1, k2: k1 * between(&mut optics, -K2_SHARE, K2_SHARE) };
+            let lens = Lens::radial(k1, k1 * between(&mut optics, -K2_SHARE, K2_SHARE));
             fits(&lens, &camera).then_some(lens)
         });
         lens = Some(drawn.ok_or_else(|| Error::work("generate: no lens covers the picture"))?);

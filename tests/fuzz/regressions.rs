@@ -142,7 +142,7 @@ fn a_text_model_without_lines_of_points_keeps_all_its_cameras() {
     let read = |images: String| {
         std::fs::write(folder.path().join("cameras.txt"), "1 PINHOLE 64 48 70 70 32 24\n").unwrap();
         std::fs::write(folder.path().join("images.txt"), images).unwrap();
-        colmap::read(folder.path()).map(|c| c.iter().map(|c| c.name.clone()).collect::<Vec<_>>())
+        colmap::read(folder.path()).map(|c| c.iter().map(|c| c.camera.name.clone()).collect::<Vec<_>>())
     };
     let wanted: Vec<String> = (1..=5).map(|k| format!("photo {k}.jpg")).collect();
     for between in ["", "\n", "1.5 2.5 -1 3 4 17\n", "# remark\n\n"] {

@@ -72,7 +72,7 @@ fn focal_sigma_predicts_the_scatter_of_the_estimate() {
 #[test]
 fn lens_and_principal_point_are_recovered_where_they_are_free() {
     let (mut p, _) = scene(0.0);
-    let truth = Optics { focal: 600.0, lens: Lens { k1: -0.12, k2: 0.03 }, shift: DVec2::new(4.0, -3.0) };
+    let truth = Optics { focal: 600.0, lens: Lens::radial(-0.12, 0.03), shift: DVec2::new(4.0, -3.0) };
     let (mut wide, _) = scene(0.0);
     wide.optics[0] = truth;
     // The rig of `scene` before it was disturbed, seen through that lens.
@@ -125,7 +125,7 @@ fn two_cameras() -> Problem {
     let (mut p, _) = scene(1.0);
     let free = OpticsPrior { log_focal: (576f64.ln(), 0.35), lens: [0.1; 2], shift: 5.0 };
     p.priors = vec![free, OpticsPrior { lens: [0.2; 2], ..free }];
-    let optics = |focal, k1| Optics { focal, lens: Lens { k1, k2: -0.04 }, shift: DVec2::new(2.0, 1.0) };
+    let optics = |focal, k1| Optics { focal, lens: Lens::radial(k1, -0.04), shift: DVec2::new(2.0, 1.0) };
     p.optics = vec![optics(620.0, 0.05), optics(590.0, -0.1)];
     p.group = vec![0, 1, 0, 1];
     p

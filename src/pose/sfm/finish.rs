@@ -215,7 +215,7 @@ fn rematch(model: &mut Model, evidence: &Evidence, threshold: f64) {
 
 fn straightening(model: &Model, view: usize) -> Straightening {
     let (focal, centre) = (model.focal(view), model.principal_point(view));
-    Straightening { lens: model.lens(view), focal, centre }
+    Straightening { lens: model.lens(view), focal, aspect: 1.0, centre }
 }
 
 /// A view's image as a pinhole would show it.

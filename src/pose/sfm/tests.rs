@@ -149,7 +149,7 @@ fn a_lens_is_found_and_a_pinhole_stays_one() {
     let model = reconstruct(&truth.photos, &[], 0, &Silent).unwrap();
     assert!(model.fitted.iter().all(|f| f.lens.is_none()), "{:?}", model.fitted);
     assert_eq!((model.cameras[0].cx, model.cameras[0].cy), (320.0, 240.0));
-    let lens = Lens { k1: -0.12, k2: 0.03 };
+    let lens = Lens::radial(-0.12, 0.03);
     let photos: Vec<Photo> = truth.photos.iter().map(|p| lensed(p, focal, lens)).collect();
     let model = reconstruct(&photos, &[], 0, &Silent).unwrap();
     let e = pose_errors(&model.cameras, &truth.cameras, truth.mean_depth);
@@ -237,7 +237,7 @@ fn photos_that_only_look_like_one_camera_are_told_apart() {
     let focal = truth.cameras[0].fx;
     let one = reconstruct(&truth.photos, &[], 0, &Silent).unwrap();
     assert!(one.fitted.iter().all(|f| f.camera == 0 && f.agreement > 0.9), "{:?}", one.fitted);
-    let lens = Lens { k1: -0.12, k2: 0.03 };
+    let lens = Lens::radial(-0.12, 0.03);
     type Change<'a> = &'a dyn Fn(&Photo) -> Photo;
     // No file says that two of the photos came through a lens, or were cut out of larger ones. Change, zoom, limits of rotation
     // in degrees and of the centre: a cut enlarged twice shows half the detail.

@@ -1,5 +1,5 @@
 //! What the protocols share: frames, scores, and the decoded views of a scene.
-use crate::photo::stem;
+use crate::photo::{join, stem};
 use crate::pose::align::pose_errors;
 use crate::query::eval::{Evaluation, GroundTruth, Split, to_scene};
 use crate::query::{TextQuery, field_relevancy, relevancy_map};
@@ -201,19 +201,28 @@ pub(super) fn mask_iou(predicted: &Plane<bool>, truth: &Plane<bool>) -> Result<f
 /// the similarity that the shared photos give.
 pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Result<Vec<LabelledView>> {
     let own = |s: &str| scene.iter().find(|c| stem(&c.name) == s);
+    let names: Vec<&str> = known.iter().map(|c| c.name.as_str()).collect();
+    let joined = |list: &[&str]| join(list, &names).map_err(|e| Error::input(format!("--cameras: {e}")));
+    let of_scene = joined(&scene.iter().map(|c| c.name.as_str()).collect::<Vec<_>>())?;
+    let of_labels = joined(&stems.iter().map(String::as_str).collect::<Vec<_>>())?;
+    let pairs = scene.iter().zip(of_scene);
     let shared: Vec<(Camera, Camera)> =
-        known.iter().filter_map(|k| own(stem(&k.name)).map(|c| (c.clone(), k.clone()))).collect();
+        pairs.filter_map(|(c, k)| Some((c.clone(), known[k?].clone()))).collect();
     // One shared photo leaves the scale open.
     let similarity = (shared.len() >= 2).then(|| {
         let (estimated, truth): (Vec<_>, Vec<_>) = shared.into_iter().unzip();
         pose_errors(&estimated, &truth, 1.0).similarity
     });
     let mut views = Vec::new();
-    for name in stems {
+    for (name, known_as) in stems.iter().zip(of_labels) {
         if let Some(camera) = own(name) {
             views.push(LabelledView { stem: name.clone(), split: Split::Train, camera: camera.clone() });
-        } else if let (Some(s), Some(camera)) = (&similarity, known.iter().find(|k| stem(&k.name) == *name)) {
-            views.push(LabelledView { stem: name.clone(), split: Split::Test, camera: to_scene(camera, s) });
+        } else if let (Some(s), Some(k)) = (&similarity, known_as) {
+            views.push(LabelledView {
+                stem: name.clone(),
+                split: Split::Test,
+                camera: to_scene(&known[k], s),
+            });
         }
     }
     if views.is_empty() {

@@ -30,7 +30,7 @@ impl SourceKind for GeometrySources {
             about: "transforms.json, COLMAP folder, cameras.json",
             needs: &[PackFileKind::Keypoints],
             check: NO_CHECK,
-            make: |file, (build, photos)| build.posed(photos, CameraOrigin::Known(cameras::read(file)?)),
+            make: |file, (build, photos)| build.posed(photos, CameraOrigin::Known(cameras::read_file(file)?)),
         },
     ];
     type Input<'i> = (&'i mut GraphBuilder, Vec<Photo>);

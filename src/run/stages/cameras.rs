@@ -1,6 +1,7 @@
 //! Photos → cameras → depth and points.
 use super::shared;
 use crate::fit::{Preset, Trained};
+use crate::format::CameraFile;
 use crate::infer::installed::Installed;
 use crate::infer::pairs;
 use crate::photo::Photo;
@@ -8,7 +9,7 @@ use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::choose::{LeftOut, Reason};
 use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, SparseModel, pointmap, upright};
-use crate::scene::{Camera, DepthPrior, Up};
+use crate::scene::{DepthPrior, Up};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -18,7 +19,7 @@ pub enum CameraOrigin {
     /// Structure from motion.
     Sfm,
     /// Known ones, joined to the photos by name.
-    Known(Vec<Camera>),
+    Known(CameraFile),
     /// Pointmaps of a network, with depth; structure from motion where an untrained one gives no geometry.
     Network(Installed),
     /// Cameras and points that were given.
@@ -58,7 +59,7 @@ impl Cameras {
     pub fn new(photos: Vec<Photo>, source: CameraOrigin, seed: u64) -> Result<Cameras> {
         let source_name = match &source {
             CameraOrigin::Sfm => "sfm".to_owned(),
-            CameraOrigin::Known(cameras) => format!("{cameras:?}"),
+            CameraOrigin::Known(file) => format!("{file:?}"),
             CameraOrigin::Network(model) => shared::identity(model)?,
             CameraOrigin::GivenGeometry(geometry) => format!("{geometry:?}"),
         };
@@ -78,11 +79,12 @@ pub(super) fn identity(photo: &Photo) -> String {
         digest.update(bytemuck::cast_slice::<_, u8>(&fine.data));
     }
     let pixels = crate::files::hex(&digest.finalize());
-    let Photo { path, image, border, original_size, to_working, exif_focal, camera_model, gravity, .. } =
-        photo;
+    let Photo {
+        path, image, border, original_size, turn, to_working, exif_focal, camera_model, gravity, ..
+    } = photo;
     let size = (image.width, image.height);
     format!(
-        "{path:?} {size:?} {border:?} {original_size:?} {to_working:?} {exif_focal:?} {camera_model:?} {gravity:?} {pixels}"
+        "{path:?} {size:?} {border:?} {original_size:?} {turn:?} {to_working:?} {exif_focal:?} {camera_model:?} {gravity:?} {pixels}"
     )
 }
 
@@ -121,7 +123,10 @@ impl Stage for Cameras {
                 return Ok(PlacedPhotos { photos, left_out: Vec::new(), known });
             }
             CameraOrigin::Sfm => None,
-            CameraOrigin::Known(cameras) => Some(cameras.as_slice()),
+            CameraOrigin::Known(file) => {
+                file.warnings.iter().for_each(|w| progress.warn(w));
+                Some(file.cameras.as_slice())
+            }
         };
         let pose::SolvedCameras { photos, model, left_out, method } =
             pose::place(photos, known, context.registry, self.seed, progress)?;

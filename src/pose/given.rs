@@ -1,0 +1,370 @@
+//! Given cameras brought to their photos: joined by name, turned as the photos were, at working size, their lens taken out.
+use super::matching::{Keypoints, Match, mutual_matches, valid_area};
+use super::minimal::{essential, triangulate_two};
+use super::sift;
+use super::two_view::sampson;
+use crate::photo::{Photo, join, listed};
+use crate::progress::Progress;
+use crate::scene::{Camera, GivenCamera, Lens};
+use crate::{Error, Result};
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+
+/// Which pixels of a photo whose EXIF states an orientation a camera belongs to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Pixels {
+    /// Those of the file. COLMAP does not apply the orientation (colmap#1456), nor do most programs that build on it.
+    Stored,
+    /// Those that a viewer shows.
+    Upright,
+}
+
+/// Cameras of photos (pinholes at working resolution). Where a camera is of the stored pixels it is turned as the photo was, and a
+/// photo that is mirrored by its orientation is mirrored back; then the lens is taken out of the photo.
+pub fn assign(photos: &mut [Photo], given: &[GivenCamera], progress: &dyn Progress) -> Result<Vec<Camera>> {
+    let own = joined(photos, given)?;
+    let pixels = pixels(photos, &own, progress)?;
+    let turned =
+        photos.iter().zip(&pixels).filter(|(p, pixels)| !p.turn.is_none() && **pixels == Pixels::Stored);
+    let turned: Vec<&str> = turned.map(|(p, _)| p.stem.as_str()).collect();
+    if !turned.is_empty() {
+        progress.inform(&format!(
+            "the cameras are those of the stored pixels, without the EXIF orientation; they are turned with the photos: {}",
+            listed(&turned)
+        ));
+    }
+    let mut cameras = Vec::with_capacity(photos.len());
+    let mut strongest = 0.0f64;
+    for ((photo, own), pixels) in photos.iter_mut().zip(own).zip(pixels) {
+        let GivenCamera { camera, lens } = at_working_size(photo, own, pixels);
+        if pixels == Pixels::Stored && photo.turn.mirrored {
+            photo.unmirror();
+        }
+        photo.straighten(lens, &camera);
+        let share = bend(&lens, &camera);
+        strongest = if share.abs() > strongest.abs() { share } else { strongest };
+        cameras.push(camera);
+    }
+    if strongest != 0.0 {
+        progress.inform(&format!(
+            "lenses of the camera file are taken out of the photos: up to {:+.1} % of the radius at the corner",
+            100.0 * strongest
+        ));
+    }
+    Ok(cameras)
+}
+
+/// How much farther from the principal point the lens images the first corner, share of the distance.
+fn bend(lens: &Lens, camera: &Camera) -> f64 {
+    let corner = camera.ray(DVec2::ZERO).truncate();
+    lens.distort(corner).length() / corner.length() - 1.0
+}
+
+/// The camera of each photo.
+fn joined<'a>(photos: &[Photo], given: &'a [GivenCamera]) -> Result<Vec<&'a GivenCamera>> {
+    let names: Vec<&str> = given.iter().map(|c| c.camera.name.as_str()).collect();
+    let paths: Vec<String> = photos.iter().map(|p| p.path.to_string_lossy().into_owned()).collect();
+    let found = join(&paths, &names).map_err(Error::input)?;
+    let one = |(photo, found): (&Photo, Option<usize>)| {
+        found.map(|k| &given[k]).ok_or_else(|| {
+            Error::input(format!(
+                "{}: the camera file has no camera of this name; it names {}",
+                photo.path.display(),
+                listed(&names)
+            ))
+        })
+    };
+    photos.iter().zip(found).map(one).collect()
+}
+
+/// Sides that differ by rounding: working sizes are whole numbers, and so are those of reduced copies.
+const SAME_ASPECT: f64 = 0.01;
+
+/// For every photo the pixels that its camera belongs to: by the size, then as that of the other photos says, then by matches.
+fn pixels(photos: &[Photo], own: &[&GivenCamera], progress: &dyn Progress) -> Result<Vec<Pixels>> {
+    let told = photos.iter().zip(own).map(|(p, c)| by_size(p, &c.camera)).collect::<Result<Vec<_>>>()?;
+    let open: Vec<usize> = (0..photos.len()).filter(|v| told[*v].is_none()).collect();
+    if open.is_empty() {
+        return Ok(told.into_iter().flatten().collect());
+    }
+    // One program made the file: it did the same with all photos. Photos without orientation say nothing.
+    let says = |pixels| told.iter().zip(photos).any(|(t, p)| *t == Some(pixels) && !p.turn.is_none());
+    let all = match (says(Pixels::Stored), says(Pixels::Upright)) {
+        (true, false) => Pixels::Stored,
+        (false, true) => Pixels::Upright,
+        _ => by_matches(photos, own, &told).unwrap_or_else(|| {
+            let names: Vec<&str> = open.iter().map(|v| photos[*v].stem.as_str()).collect();
+            progress.warn(&format!(
+                "neither sizes nor matches show whether the cameras of {} belong to the stored pixels or to the upright ones (EXIF \
+                 orientation); taken as stored, as COLMAP does: if the scene is wrong, save the photos without EXIF",
+                listed(&names)
+            ));
+            Pixels::Stored
+        }),
+    };
+    Ok(told.into_iter().map(|t| t.unwrap_or(all)).collect())
+}
+
+/// By the size of a camera's picture; `None` where both may be meant.
+fn by_size(photo: &Photo, camera: &Camera) -> Result<Option<Pixels>> {
+    if photo.turn.is_none() && fits(camera, photo.original_size) {
+        return Ok(Some(Pixels::Upright));
+    }
+    let (upright, size) = (photo.original_size, (camera.width, camera.height));
+    let stored = photo.turn.stored(upright);
+    if stored != upright && (size == stored || size == upright) {
+        return Ok(Some(if size == stored { Pixels::Stored } else { Pixels::Upright }));
+    }
+    match (fits(camera, stored), fits(camera, upright)) {
+        (true, true) => Ok(None),
+        (true, false) => Ok(Some(Pixels::Stored)),
+        (false, true) => Ok(Some(Pixels::Upright)),
+        (false, false) => {
+            let turn = match photo.turn.is_none() {
+                true => String::new(),
+                false => {
+                    format!(" ({}×{} as stored, EXIF orientation {})", stored.0, stored.1, photo.turn.exif())
+                }
+            };
+            Err(Error::input(format!(
+                "{}: camera {} is for {}×{} pixels, the photo is {}×{}{turn}: the aspects differ; give the photos that the \
+                 cameras were made of",
+                photo.path.display(),
+                camera.name,
+                camera.width,
+                camera.height,
+                upright.0,
+                upright.1
+            )))
+        }
+    }
+}
+
+fn fits(camera: &Camera, (w, h): (u32, u32)) -> bool {
+    let (a, b) = (f64::from(camera.width) * f64::from(h), f64::from(camera.height) * f64::from(w));
+    (a / b - 1.0).abs() <= SAME_ASPECT
+}
+
+/// The camera of a photo in the frame of its upright picture, at working resolution.
+fn at_working_size(photo: &Photo, own: &GivenCamera, pixels: Pixels) -> GivenCamera {
+    let quarters = if pixels == Pixels::Stored { photo.turn.quarters } else { 0 };
+    let GivenCamera { camera, lens } = own.turned(quarters);
+    let size = (photo.image.width as u32, photo.image.height as u32);
+    let camera = match (camera.width, camera.height) == photo.original_size {
+        true => photo.to_working.camera(&camera, size),
+        false => camera.resized(size.0, size.1),
+    };
+    GivenCamera { camera, lens }
+}
+
+/// Photos that are matched to tell the pixels; every two of them.
+const MATCHED: usize = 6;
+/// Long side at which they are matched, and corners of each.
+const SIDE: usize = 480;
+const CORNERS: usize = 500;
+/// Lowe's ratio.
+const RATIO: f32 = 0.85;
+/// Distance from the epipolar line, share of the long side (2 pixels of 480).
+const NEAR: f64 = 2.0 / 480.0;
+/// Fewest agreeing matches that decide …
+const ENOUGH: usize = 30;
+/// … and how many times as many as under the other assumption.
+const CLEARLY: f64 = 1.5;
+
+/// Under which assumption more matches obey the cameras: near their epipolar lines, and in front of both cameras.
+fn by_matches(photos: &[Photo], own: &[&GivenCamera], told: &[Option<Pixels>]) -> Option<Pixels> {
+    let mut views: Vec<usize> = (0..photos.len()).collect();
+    views.sort_by_key(|v| told[*v].is_some());
+    views.truncate(MATCHED);
+    let corners: Vec<Keypoints> = views.par_iter().map(|v| detect(&photos[*v])).collect();
+    let pairs: Vec<(usize, usize)> =
+        (0..views.len()).flat_map(|i| (i + 1..views.len()).map(move |j| (i, j))).collect();
+    let agreeing = |(i, j): &(usize, usize)| -> [usize; 2] {
+        let (a, b) = (views[*i], views[*j]);
+        if told[a].is_some() && told[b].is_some() {
+            return [0, 0];
+        }
+        let matches = mutual_matches(&corners[*i], &corners[*j], RATIO);
+        [Pixels::Stored, Pixels::Upright].map(|pixels| {
+            let of = |v: usize| told[v].unwrap_or(pixels);
+            let (one, other) = (seen_by(&photos[a], own[a], of(a)), seen_by(&photos[b], own[b], of(b)));
+            obeying(&matches, (&corners[*i], &one), (&corners[*j], &other))
+        })
+    };
+    let counts: Vec<[usize; 2]> = pairs.par_iter().map(agreeing).collect();
+    let [stored, upright] = [0, 1].map(|k| counts.iter().map(|c| c[k]).sum::<usize>());
+    let wins = |a: usize, b: usize| a >= ENOUGH && a as f64 > CLEARLY * b as f64;
+    match (wins(stored, upright), wins(upright, stored)) {
+        (true, _) => Some(Pixels::Stored),
+        (_, true) => Some(Pixels::Upright),
+        _ => None,
+    }
+}
+
+fn detect(photo: &Photo) -> Keypoints {
+    let image = &photo.image;
+    let share = (SIDE as f64 / image.width.max(image.height) as f64).min(1.0);
+    let to = |n: usize| ((n as f64 * share).round() as usize).max(1);
+    let small = image.resized_by_area(to(image.width), to(image.height));
+    let mut found = sift::detect(&small.luma(), &valid_area(&small, Default::default(), 4), CORNERS);
+    let back = DVec2::new(image.width as f64 / small.width as f64, image.height as f64 / small.height as f64);
+    found.points.iter_mut().for_each(|p| *p *= back);
+    found
+}
+
+/// A camera and whether the picture that it sees is the mirrored one of the photo.
+struct Seen {
+    given: GivenCamera,
+    mirrored: bool,
+}
+
+fn seen_by(photo: &Photo, own: &GivenCamera, pixels: Pixels) -> Seen {
+    Seen {
+        given: at_working_size(photo, own, pixels),
+        mirrored: pixels == Pixels::Stored && photo.turn.mirrored,
+    }
+}
+
+impl Seen {
+    fn ray(&self, p: DVec2) -> DVec3 {
+        let GivenCamera { camera, lens } = &self.given;
+        let x = if self.mirrored { f64::from(camera.width) - p.x } else { p.x };
+        lens.ray(camera, DVec2::new(x, p.y))
+    }
+}
+
+fn obeying(matches: &[Match], (a, one): (&Keypoints, &Seen), (b, other): (&Keypoints, &Seen)) -> usize {
+    let (first, second) = (&one.given.camera, &other.given.camera);
+    let pose = second.pose.compose(&first.pose.inverse());
+    let between = essential(&pose);
+    let near = NEAR * f64::from(first.width.max(first.height)) / first.fx;
+    let obeys = |m: &&Match| {
+        let (x, y) = (one.ray(a.points[m.first]), other.ray(b.points[m.second]));
+        let seen = triangulate_two(&pose, x, y).is_some_and(|p| p.z > 0.0 && pose.transform(p).z > 0.0);
+        seen && sampson(&between, x.truncate(), y.truncate()) < near * near
+    };
+    matches.iter().filter(obeys).count()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing;
+    use super::*;
+    use crate::photo::{Turn, from_pixels};
+    use crate::progress::{Recorded, Silent};
+    use crate::scene::{Pose, RgbImage};
+
+    fn photo(width: usize, height: usize, quarters: u8) -> Photo {
+        let image = RgbImage { width, height, data: vec![[0.5; 3]; width * height] };
+        let photo = from_pixels("a.png".as_ref(), &image, None, width.max(height)).unwrap();
+        Photo { turn: Turn { quarters, mirrored: false }, ..photo }
+    }
+
+    fn camera(width: u32, height: u32) -> GivenCamera {
+        let (name, pose) = ("a.jpg".to_string(), Pose::IDENTITY);
+        Camera { name, width, height, fx: 100.0, fy: 110.0, cx: 60.0, cy: 50.0, pose }.into()
+    }
+
+    #[test]
+    fn given_cameras_are_scaled_to_their_photos_and_never_stretched() {
+        let of = |w, h| assign(&mut [photo(80, 64, 0)], &[camera(w, h)], &Silent);
+        let half = &of(160, 128).unwrap()[0];
+        assert_eq!((half.width, half.height, half.fx, half.cx, half.cy), (80, 64, 50.0, 30.0, 25.0));
+        let error = of(128, 128).unwrap_err();
+        assert!(error.exit_code() == 2 && error.to_string().contains("the aspects differ"), "{error}");
+    }
+
+    #[test]
+    fn cameras_of_stored_pixels_are_told_by_size() {
+        // Upright 64 × 80, stored 80 × 64: the camera of the stored pixels and a half-size copy of it are turned.
+        for (w, h, fx) in [(80, 64, 110.0), (160, 128, 55.0)] {
+            let turned = &assign(&mut [photo(64, 80, 1)], &[camera(w, h)], &Silent).unwrap()[0];
+            assert_eq!((turned.width, turned.height, turned.fx), (64, 80, fx));
+        }
+        let upright = &assign(&mut [photo(64, 80, 1)], &[camera(64, 80)], &Silent).unwrap()[0];
+        assert_eq!((upright.fx, upright.cx), (100.0, 60.0));
+        let e = assign(&mut [photo(64, 80, 1)], &[camera(90, 90)], &Silent).unwrap_err().to_string();
+        assert!(e.contains("80×64 as stored, EXIF orientation 6"), "{e}");
+    }
+
+    #[test]
+    fn what_size_cannot_tell_matches_do() {
+        let truth = testing::train(&testing::folder());
+        let size = (truth.photos[0].image.width as f64, truth.photos[0].image.height as f64);
+        for mirrored in [false, true] {
+            // The files hold the photos upside down or mirrored, with the EXIF tag that makes them right again.
+            let turn = if mirrored { Turn { quarters: 0, mirrored } } else { Turn { quarters: 2, mirrored } };
+            let photos: Vec<Photo> = truth.photos.iter().map(|p| Photo { turn, ..p.clone() }).collect();
+            let upright: Vec<GivenCamera> = truth.cameras.iter().cloned().map(GivenCamera::from).collect();
+            // A camera of the stored pixels: a half turn of the upright one, or the world in a mirror.
+            let stored: Vec<GivenCamera> = match mirrored {
+                false => upright.iter().map(|c| c.turned(2)).collect(),
+                true => truth.cameras.iter().map(|c| in_a_mirror(c, size.0).into()).collect(),
+            };
+            let choice = |given: &[GivenCamera]| {
+                let recorded = Recorded::new(&Silent);
+                let own: Vec<&GivenCamera> = given.iter().collect();
+                let found = pixels(&photos, &own, &recorded).unwrap();
+                assert!(recorded.warnings().is_empty());
+                found
+            };
+            assert_eq!(choice(&stored), [Pixels::Stored; 4], "{mirrored}");
+            assert_eq!(choice(&upright), [Pixels::Upright; 4], "{mirrored}");
+            let mut placed = photos.clone();
+            let cameras = assign(&mut placed, &stored, &Silent).unwrap();
+            let off = (cameras[1].pose.centre() - stored[1].camera.pose.centre()).length();
+            assert!(off < 1e-12 && !placed[0].turn.mirrored);
+            let row = &photos[0].image.data[..photos[0].image.width];
+            let first = if mirrored { row[row.len() - 1] } else { row[0] };
+            assert_eq!(placed[0].image.data[0], first);
+        }
+    }
+
+    /// The camera that sees the mirrored picture of what `camera` sees, in the mirrored world.
+    fn in_a_mirror(camera: &Camera, width: f64) -> Camera {
+        let mirror = glam::DMat3::from_diagonal(DVec3::new(-1.0, 1.0, 1.0));
+        let pose = Pose {
+            rotation: mirror * camera.pose.rotation * mirror,
+            translation: mirror * camera.pose.translation,
+        };
+        Camera { cx: width - camera.cx, pose, ..camera.clone() }
+    }
+
+    #[test]
+    fn blank_photos_leave_the_orientation_open() {
+        let photos = [photo(80, 64, 2), Photo { path: "b.png".into(), stem: "b".into(), ..photo(80, 64, 2) }];
+        let mut other = camera(80, 64);
+        other.camera.name = "b.jpg".into();
+        let recorded = Recorded::new(&Silent);
+        assign(&mut photos.clone(), &[camera(80, 64), other], &recorded).unwrap();
+        let warnings = recorded.warnings();
+        assert!(warnings.len() == 1 && warnings[0].contains("stored pixels"), "{warnings:?}");
+    }
+
+    #[test]
+    fn a_given_lens_is_taken_out_of_the_photo() {
+        let truth = testing::train(&testing::folder());
+        let camera = &truth.cameras[0];
+        for lens in [
+            Lens { p1: 0.002, p2: -0.001, ..Lens::radial(-0.1, 0.02) },
+            Lens { k3: 0.001, fisheye: true, ..Lens::radial(0.01, 0.0) },
+        ] {
+            let mut seen = [testing::lensed(&truth.photos[0], camera.fx, lens)];
+            let given =
+                GivenCamera { camera: Camera { name: "train_00.jpg".into(), ..camera.clone() }, lens };
+            assign(&mut seen, &[given], &Silent).unwrap();
+            let (w, h) = (camera.width as usize, camera.height as usize);
+            let mut squares = 0.0;
+            for y in h / 8..7 * h / 8 {
+                for x in w / 8..7 * w / 8 {
+                    let (a, b) = (seen[0].image.at(x, y), truth.photos[0].image.at(x, y));
+                    squares += (0..3).map(|k| f64::from(a[k] - b[k]).powi(2)).sum::<f64>();
+                }
+            }
+            let psnr = -10.0 * (squares / (3.0 * 0.75 * 0.75 * (w * h) as f64)).log10();
+            // Interpolating twice costs the rest.
+            assert!(psnr > 35.0, "{lens:?}: {psnr:.1} dB");
+            assert_eq!(seen[0].lens(), lens);
+        }
+    }
+}
