@@ -251,6 +251,54 @@ mod tests {
     }
 
     #[test]
+    fn photos_below_a_folder_are_found_or_named() {
+        let root = tempfile::tempdir().unwrap();
+        let at = |name: &str| root.path().join(name);
+        let put = |name: &str| {
+            std::fs::create_dir_all(at(name).parent().unwrap()).unwrap();
+            std::fs::write(at(name), b"photo").unwrap();
+        };
+        let inputs = [root.path().to_path_buf()];
+        put("shoot/cam1/1.jpg");
+        put("shoot/cam2/1.jpg");
+        put("shoot/cam2/2.jpg");
+        let e = find(&inputs).unwrap_err().to_string();
+        assert!(e.contains("cam1 (1)") && e.contains("cam2 (2)") && e.contains("give one of these"), "{e}");
+        // The cameras name two of the folders below, one of which is not there.
+        let names = ["cam2/1.jpg", "cam9/1.jpg", "../outside/1.jpg", "/etc/1.jpg"];
+        let found = find_named(&at("shoot"), &names).unwrap();
+        assert_eq!(found.photos, [at("shoot/cam2/1.jpg"), at("shoot/cam2/2.jpg")]);
+        // A data set: copies of another size and masks lie beside the photos.
+        for folder in ["images", "images_2", "masks"] {
+            put(&format!("{folder}/1.jpg"));
+        }
+        let found = find(&inputs).unwrap();
+        assert_eq!((found.photos, found.inside), (vec![at("images/1.jpg")], vec![at("images")]));
+        assert_eq!(find_named(root.path(), &["1.jpg"]).unwrap().photos, [at("images/1.jpg")]);
+        put("own.jpg");
+        assert_eq!(find(&inputs).unwrap().photos, [at("own.jpg")]);
+    }
+
+    #[test]
+    fn what_looks_like_a_photo_is_named() {
+        let root = tempfile::tempdir().unwrap();
+        let at = |name: &str| root.path().join(name);
+        let inputs = [root.path().to_path_buf()];
+        std::fs::write(at("notes.txt"), b"words").unwrap();
+        std::fs::write(at("a.3FR"), b"raw").unwrap();
+        let e = find(&inputs).unwrap_err().to_string();
+        assert!(e.contains("a.3FR: a camera raw file") && e.contains("develop it"), "{e}");
+        std::fs::write(at("b.jpg"), b"photo").unwrap();
+        std::fs::write(at("IMG_1"), b"\xff\xd8\xff\xe0\0\x10JFIF\0\x01\x01\0\0").unwrap();
+        let warnings = find(&inputs).unwrap().warnings();
+        assert!(warnings.len() == 2 && warnings[0].contains("a.3FR; develop"), "{warnings:?}");
+        assert!(warnings[1].contains("IMG_1"), "{warnings:?}");
+        // The one line of the refusal has it, too.
+        let e = super::super::gather(&inputs, &crate::progress::Silent).unwrap_err().to_string();
+        assert!(e.contains("only one photo") && e.contains("a.3FR"), "{e}");
+    }
+
+    #[test]
     fn view_counts_are_checked() {
         assert_eq!(photo_count(20, None).unwrap(), DEFAULT_VIEWS);
         assert_eq!(photo_count(3, None).unwrap(), 3);

@@ -171,7 +171,7 @@ impl BaseScene {
 
     /// The photos that are not in the scene yet; those that are go with a warning.
     pub fn without_its_own(&self, new: Vec<Photo>, progress: &dyn Progress) -> Result<Vec<Photo>> {
-        let known = |p: &Photo| self.known.photos.iter().any(|k| k.stem == p.stem && show_the_same(k, p));
+        let known = |p: &Photo| self.known.photos.iter().any(|k| k.stem == p.stem && likeness(k, p) > SAME);
         let (there, new): (Vec<Photo>, Vec<Photo>) = new.into_iter().partition(known);
         let names: Vec<&str> = there.iter().map(|p| p.stem.as_str()).collect();
         let words = if names.len() == 1 { "is" } else { "are" };
@@ -207,7 +207,7 @@ const COMPARED: usize = 24;
 /// a lens and a gain 0.99, neighbours 0.8.
 const SAME: f64 = 0.95;
 
-fn show_the_same(a: &Photo, b: &Photo) -> bool {
+fn likeness(a: &Photo, b: &Photo) -> f64 {
     let small = |p: &Photo| p.image.resized_by_area(COMPARED, COMPARED).luma().data;
     let (a, b) = (small(a), small(b));
     let mean = |v: &[f32]| v.iter().copied().map(f64::from).sum::<f64>() / v.len() as f64;
@@ -217,7 +217,7 @@ fn show_the_same(a: &Photo, b: &Photo) -> bool {
         let (x, y) = (f64::from(*x) - ma, f64::from(*y) - mb);
         (ab, aa, bb) = (ab + x * y, aa + x * x, bb + y * y);
     }
-    ab > SAME * (aa * bb).sqrt()
+    ab / (aa * bb).sqrt().max(f64::MIN_POSITIVE)
 }
 
 fn identity(path: &Path) -> Result<String> {
@@ -229,4 +229,39 @@ fn identity(path: &Path) -> Result<String> {
         sums.push(files::content_hash(&file).map_err(Error::io(&file))?);
     }
     Ok(sums.join(" "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn photos_of_the_scene_are_known_again() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast/images");
+        let read = |k: usize| photo::load(&folder.join(format!("train_0{k}.jpg"))).unwrap();
+        let photos = [0, 1, 2, 3].map(read);
+        let camera = Camera {
+            name: "a".into(),
+            width: 640,
+            height: 480,
+            fx: 656.0,
+            fy: 656.0,
+            cx: 320.0,
+            cy: 240.0,
+            pose: crate::scene::Pose::IDENTITY,
+        };
+        // As a scene keeps it: without lens, darker and with another white.
+        let kept = |p: &Photo| {
+            let mut p = p.clone();
+            p.straighten(Lens::radial(-0.12, 0.03), &camera);
+            p.image.data.iter_mut().for_each(|c| *c = [0.6 * c[0], 0.7 * c[1], 0.75 * c[2]]);
+            p
+        };
+        for (i, a) in photos.iter().enumerate() {
+            for (j, b) in photos.iter().enumerate() {
+                println!("{i} {j} {:.3}", likeness(&kept(a), b));
+                assert_eq!(likeness(&kept(a), b) > SAME, i == j, "{i} {j}");
+            }
+        }
+    }
 }
