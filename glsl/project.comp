@@ -13,7 +13,7 @@ layout(std430, binding = 5) readonly buffer Sh { float sh[]; };                 
 // [N, 3]: (u, v, A', B'), (C', log2 o, A'C' − B'²/4, 0), (r, g, b, z), log2(o e^p) = A' dx² + B' dx dy + C' dy² + log2 o
 layout(std430, binding = 6) writeonly buffer Projected { vec4 projected[]; };
 layout(std430, binding = 7) writeonly buffer DepthPairs { uvec2 depth_pairs[]; };        // [N] (sort key, splat)
-layout(push_constant) uniform Push { uint count; uint sh_stride; };
+layout(push_constant) uniform Push { uint count; uint sh_stride; uint antialiased; };
 
 #include "shared/camera.glsl"
 #include "shared/cutoffs.glsl"
@@ -30,6 +30,8 @@ void main() {
     Geometry g = geometry_of(mean, vec3(log_scales[3 * i], log_scales[3 * i + 1], log_scales[3 * i + 2]), quats[i]);
     // exp(80) is still finite, so an extreme logit gives a tiny opacity and not a NaN.
     float log2_opacity = -log2(1.0 + exp(min(-opacity_logits[i], 80.0)));
+
+    if (antialiased != 0) log2_opacity += 0.5 * log2(max(dot(g.area, g.area), SMALLEST_AREA) * g.conic_det);
 
     float basis[SH_COUNT];
     sh_basis(normalize(mean - camera_position()), basis);

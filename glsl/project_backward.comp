@@ -19,7 +19,7 @@ layout(std430, binding = 9) writeonly buffer QuatsGrad { vec4 quats_grad[]; };
 layout(std430, binding = 10) writeonly buffer OpacityLogitsGrad { float opacity_logits_grad[]; };
 layout(std430, binding = 11) writeonly buffer ShGrad { float sh_grad[]; };
 layout(std430, binding = 12) writeonly buffer CameraParts { float camera_parts[]; };    // [CAMERA_GRADIENTS, workgroups]
-layout(push_constant) uniform Push { uint count; uint sh_stride; };
+layout(push_constant) uniform Push { uint count; uint sh_stride; uint antialiased; };
 
 #include "shared/camera.glsl"
 #include "shared/layout.glsl"
@@ -35,6 +35,14 @@ void covariance_backward(Geometry g, vec3 by_conic, out vec3 by_b0, out vec3 by_
     mat2 by_sigma = -(q * mat2(by_conic.x, 0.5 * by_conic.y, 0.5 * by_conic.y, by_conic.z) * q);
     by_b0 = 2.0 * (g.b0 * by_sigma[0][0] + g.b1 * by_sigma[1][0]);
     by_b1 = 2.0 * (g.b0 * by_sigma[0][1] + g.b1 * by_sigma[1][1]);
+}
+
+// Through the opacity of antialiased splats, by its logarithm: ∂ ln √(det BBᵀ / det Σ') = (BBᵀ)⁻¹ B − Σ'⁻¹ B.
+void filter_backward(Geometry g, float by_log_opacity, inout vec3 by_b0, inout vec3 by_b1) {
+    float inv = 1.0 / max(dot(g.area, g.area), SMALLEST_AREA), xy = dot(g.b0, g.b1);
+    vec3 own = vec3(dot(g.b1, g.b1) * inv, -xy * inv, dot(g.b0, g.b0) * inv) - g.conic;
+    by_b0 += by_log_opacity * (own.x * g.b0 + own.y * g.b1);
+    by_b1 += by_log_opacity * (own.y * g.b0 + own.z * g.b1);
 }
 
 // Through one coordinate of the centre and one row of the Jacobian; adds to ∂t and to the intrinsics.
@@ -111,6 +119,7 @@ void main() {
 
         vec3 by_b0, by_b1;
         covariance_backward(g, vec3(-0.5 * up[3], -up[4], -0.5 * up[5]), by_b0, by_b1);
+        if (antialiased != 0) filter_backward(g, up[0], by_b0, by_b1);
         mat3 m = mat3(g.rotation[0] * g.scale.x, g.rotation[1] * g.scale.y, g.rotation[2] * g.scale.z);
         vec3 by_j0 = to_camera_axes(m * by_b0), by_j1 = to_camera_axes(m * by_b1);
         vec3 by_t = vec3(0.0, 0.0, up[MOMENTS + 3]);

@@ -23,6 +23,7 @@
 //!     opacity_logits: vec![4.0],
 //!     sh_degree: 0,
 //!     sh: vec![1.7, -1.7, -1.7],
+//!     antialiased: false,
 //! };
 //! let camera = Camera {
 //!     name: "front".into(),

@@ -31,6 +31,7 @@ fn load(name: &str) -> (Scene, Vec<f32>) {
         opacity_logits: floats(&file, "opacities"),
         sh_degree: 3,
         sh: floats(&file, "coeffs"),
+        antialiased: false,
     };
     let shape = file.tensor("out_img").unwrap().shape().to_vec();
     let (height, width) = (shape[0] as u32, shape[1] as u32);

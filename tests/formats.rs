@@ -2,9 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 use glam::{DQuat, DVec3};
 use splatvk::format::npy::{self, NpyArray};
-use splatvk::format::{
-    cameras, colmap, gaussians, ply, ply_packed, scene_dir, side_file, splat, spz, transforms,
-};
+use splatvk::format::{cameras, colmap, gaussians, ply, ply_packed, scene_dir, side_file, splat, transforms};
 use splatvk::photo::{self, stem};
 use splatvk::scene::{
     Camera, Codebook, LanguageField, Lens, LevelField, MaskId, PointCloud, Pose, Seen, Splats, Up,
@@ -152,7 +150,7 @@ fn field(n: usize) -> LanguageField {
 #[test]
 fn files_of_other_programs() {
     // Written by trimesh, kept in the brush repository: 100 coloured points, no Gaussians.
-    let points = ply::read_points(&data("formats/brush_init.ply")).unwrap();
+    let points = ply::read_points(&data("formats/brush_init.ply")).unwrap().0;
     assert!(
         points.len() == 100 && points.positions.iter().flatten().all(|v| v.is_finite() && v.abs() < 10.0)
     );
@@ -165,7 +163,8 @@ fn files_of_other_programs() {
                 property uchar green\nproperty uchar blue\nproperty double x\nproperty float y\nproperty float z\nelement face 0\n\
                 property list uchar int vertex_indices\nend_header\n9\n255 0 51 1.5 2 3\n0 0 0 -1 -2 -3\n";
     std::fs::write(&path, text).unwrap();
-    let p = ply::read_points(&path).unwrap();
+    let (p, notes) = ply::read_points(&path).unwrap();
+    assert!(notes.len() == 1 && notes[0].contains("elements camera"), "{notes:?}");
     assert_eq!(
         (p.positions.as_slice(), p.colours[0]),
         (&[[1.5, 2.0, 3.0], [-1.0, -2.0, -3.0]][..], [1.0, 0.0, 0.2])
@@ -176,7 +175,7 @@ fn files_of_other_programs() {
     let mut bytes = header.as_bytes().to_vec();
     bytes.extend(1.5f64.to_be_bytes().into_iter().chain((-2f32).to_be_bytes()).chain(300i16.to_be_bytes()));
     std::fs::write(&path, bytes).unwrap();
-    assert_eq!(ply::read_points(&path).unwrap().positions, [[1.5, -2.0, 300.0]]);
+    assert_eq!(ply::read_points(&path).unwrap().0.positions, [[1.5, -2.0, 300.0]]);
 }
 
 #[test]
@@ -274,6 +273,7 @@ fn packed_formats_round_trip_within_their_precision() {
                 opacity_logits: pick(&back.opacity_logits, 1),
                 sh: pick(&back.sh, 3 * back.sh_len()),
                 sh_degree: back.sh_degree,
+                antialiased: false,
             };
             for (k, (got, bound)) in differences(&back, &s).iter().zip(bounds).enumerate() {
                 assert!(got <= &bound, "{name} degree {degree}, quantity {k}: {got} > {bound}");
@@ -291,7 +291,7 @@ fn splat_files_written_by_splat_transform() {
     assert_eq!(plain.means, corners);
     assert!(plain.log_scales.as_flattened().iter().all(|s| (s - 0.1f32.ln()).abs() < 1e-6));
     for version in ["raw", "v2", "v3", "v4"] {
-        let s = spz::read_splats(&data(&format!("formats/minimal-{version}.spz"))).unwrap();
+        let s = gaussians::read(&data(&format!("formats/minimal-{version}.spz"))).unwrap().0;
         assert_eq!((s.len(), s.sh_degree), (4, 0), "{version}");
         let by_hand = matches!(version, "raw" | "v2");
         let turn = if by_hand { -1.0 } else { 1.0 };

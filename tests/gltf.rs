@@ -91,7 +91,32 @@ fn unreadable_files_are_refused() {
         },
         "SH_DEGREE_1_COEF_0 is missing",
     );
-    said(|r| r["extensionsRequired"] = json!(["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression");
+    for name in
+        ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_gaussian_splatting_compression_spz_2"]
+    {
+        let text = refused(folder.path(), |r| r["extensionsRequired"] = json!([name]));
+        assert!(text.contains(name) && text.contains("without compression"), "{text}");
+    }
+    said(
+        |r| r["extensionsRequired"] = json!(["EXT_unheard_of"]),
+        "EXT_unheard_of, which splatvk does not know",
+    );
+    said(|r| r["nodes"][0]["extensions"] = json!({ "EXT_mesh_gpu_instancing": {} }), "as a node of its own");
+    said(
+        |r| r["bufferViews"][0]["extensions"] = json!({ "KHR_meshopt_compression": {} }),
+        "KHR_meshopt_compression",
+    );
+    said(
+        |r| {
+            r["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["extensions"] =
+                json!({ "KHR_gaussian_splatting_compression_spz_2": {} });
+        },
+        "KHR_gaussian_splatting_compression_spz_2",
+    );
+    said(
+        |r| r["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["kernel"] = json!(7),
+        "kernel 7 is not supported",
+    );
     said(|r| r["nodes"][0]["scale"] = json!([1, 2, 1]), "stretches or mirrors");
     said(|r| r["nodes"][0]["scale"] = json!([1, 1, -1]), "stretches or mirrors");
     said(|r| r["nodes"][0]["children"] = json!([0]), "form a tree");
@@ -115,6 +140,37 @@ fn unreadable_files_are_refused() {
         },
         "a scale is negative",
     );
+}
+
+#[test]
+fn extensions_that_change_nothing_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.gltf");
+    let s = splats(3, 1);
+    gaussians::write(&path, &s, None).unwrap();
+    let mut root: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    let names = [
+        "KHR_gaussian_splatting",
+        "KHR_mesh_quantization",
+        "KHR_materials_unlit",
+        "KHR_xmp_json_ld",
+        "KHR_xmp",
+    ];
+    root["extensionsRequired"] = json!(names);
+    root["extensionsUsed"] = json!(["KHR_materials_unlit", "EXT_unheard_of"]);
+    let splatting = &mut root["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"];
+    splatting["sortingMethod"] = json!("zDepth");
+    splatting["weight"] = json!(3);
+    let attributes = root["meshes"][0]["primitives"][0]["attributes"].as_object_mut().unwrap();
+    attributes.insert("KHR_gaussian_splatting:SH_DEGREE_4_COEF_0".into(), json!(0));
+    attributes.insert("KHR_gaussian_splatting:VELOCITY".into(), json!(0));
+    std::fs::write(&path, root.to_string()).unwrap();
+    let (back, _, notes) = gaussians::read_noted(&path).unwrap();
+    assert_eq!(back.means, s.means);
+    for words in ["EXT_unheard_of", "sortingMethod \"zDepth\"", "weight of KHR", "band 4", "VELOCITY"] {
+        assert_eq!(notes.iter().filter(|n| n.contains(words)).count(), 1, "{words}: {notes:?}");
+    }
+    assert_eq!(notes.len(), 5, "{notes:?}");
 }
 
 /// Right, up and back in the file; right, down and forward in a scene.

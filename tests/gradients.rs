@@ -21,6 +21,24 @@ fn random_scenes_match_the_twin() {
     }
 }
 
+/// Opacities that fall where the projection dilates a splat, and those that no longer reach a pixel.
+#[test]
+fn antialiased_scenes_match_the_twin() {
+    let device = test_device();
+    for (n, seed) in [(1, 81), (100, 82)] {
+        let mut scene = Scene::small(n, 1, 3, seed);
+        let upstream = scene.upstream(7);
+        let plain = scene.gradients(&device, &upstream);
+        scene.splats.antialiased = true;
+        // A needle of a thousandth of a pixel, and a splat of no extent along the third axis.
+        scene.splats.log_scales[0] = [-1.0, -9.0, -9.0];
+        scene.splats.log_scales[n / 2][2] = f32::MIN_POSITIVE.ln();
+        let gradients = scene.gradients(&device, &upstream);
+        assert_ne!(gradients, plain);
+        assert_gradients(&scene, &gradients, 7);
+    }
+}
+
 /// More splats than the way back through the projection has threads on a CPU device.
 #[test]
 fn every_one_of_thousands_of_splats_gets_its_gradient() {

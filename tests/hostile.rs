@@ -33,6 +33,7 @@ fn splats(n: usize) -> Splats {
         opacity_logits: vec![1.0; n],
         sh_degree: 0,
         sh: vec![0.3; 3 * n],
+        antialiased: false,
     }
 }
 
@@ -120,9 +121,84 @@ fn gaussians_that_are_not_finite_are_left_out_and_counted() {
             assert!(output.status.success(), "{stderr}");
             let words = "1 of 50 Gaussians are left out, the first is number 7";
             assert!(stderr.starts_with("warning: ") && stderr.contains(words), "{stderr}");
-            let (back, _, note) = gaussians::read_counted(out.as_ref()).unwrap();
-            assert!(back.len() == 49 && note.is_none(), "{out}: {note:?}");
+            let (back, _, notes) = gaussians::read_noted(out.as_ref()).unwrap();
+            assert!(back.len() == 49 && notes.is_empty(), "{out}: {notes:?}");
         }
+    }
+}
+
+#[test]
+fn names_of_another_format_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    gaussians::write(at("a.ply").as_ref(), &splats(3), None).unwrap();
+    for (format, out, words) in [
+        ("spz", "tree.ply", ["--format spz", "tree.spz", "--format ply"]),
+        ("ply", "tree.compressed.ply", ["tree.ply", "--format compressed-ply", ".compressed.ply"]),
+        ("splat", "Tree.SPZ", ["Tree.splat", "--format spz", "end in .spz"]),
+        ("gltf", "tree.glb", ["tree.gltf", "--format glb", "end in .glb"]),
+        ("ply", "tree.json", ["tree.ply", "--format transforms", ".json"]),
+        ("spz", "..ply", ["..spz", "--format ply", ".ply"]),
+    ] {
+        refuses(2, &["export", &at("a.ply"), "--format", format, "--out", &at(out)], &words);
+        assert!(!folder.path().join(out).exists());
+    }
+    // A name of no format is written, with a warning; those of COLMAP are folders.
+    for (format, out, warned) in [
+        ("ply", "tree", true),
+        ("spz", "tree.xyz", true),
+        ("compressed-ply", "b.ply", false),
+        ("spz", "t.v2.spz", false),
+    ] {
+        let output = splatvk(&["export", &at("a.ply"), "--format", format, "--out", &at(out)]);
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && folder.path().join(out).is_file(), "{stderr}");
+        assert_eq!(
+            stderr.contains("warning: --out") && stderr.contains("by names that end in"),
+            warned,
+            "{stderr}"
+        );
+    }
+}
+
+#[test]
+fn scenes_beyond_spz_are_refused_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    let mut far = splats(3);
+    far.means[1][2] = 2e7;
+    gaussians::write(at("a.ply").as_ref(), &far, None).unwrap();
+    let words = ["b.spz: the scene reaches 2.0e7", "--only-seen", "--format ply"];
+    let line = ["export", &at("a.ply"), "--format", "spz", "--out", &at("b.spz")];
+    refuses(2, &line, &words);
+    let stderr = splatvk(&line).stderr;
+    assert!(!String::from_utf8_lossy(&stderr).contains("partial"), "{stderr:?}");
+    refuses(
+        2,
+        &["export", &at("a.ply"), "--format", "ply", "--spz-version", "2", "--out", &at("c.ply")],
+        &["--spz-version"],
+    );
+}
+
+#[test]
+fn antialiased_scenes_stay_so_or_are_warned_of() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    let thin = Splats { antialiased: true, ..splats(50) };
+    gaussians::write(at("a.ply").as_ref(), &thin, None).unwrap();
+    for (format, ending, kept) in [
+        ("ply", "ply", true),
+        ("compressed-ply", "compressed.ply", true),
+        ("spz", "spz", true),
+        ("splat", "splat", false),
+        ("glb", "glb", false),
+    ] {
+        let out = at(&format!("out.{ending}"));
+        let output = splatvk(&["export", &at("a.ply"), "--format", format, "--out", &out]);
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{stderr}");
+        assert_eq!(gaussians::read(out.as_ref()).unwrap().0.antialiased, kept, "{format}");
+        assert_eq!(stderr.contains("the scene is antialiased"), !kept, "{format}: {stderr}");
     }
 }
 

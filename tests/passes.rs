@@ -21,6 +21,7 @@ fn splat(mean: [f32; 3], scale: f32, opacity_logit: f32) -> Splats {
         opacity_logits: vec![opacity_logit],
         sh_degree: 0,
         sh: vec![0.0; 3],
+        antialiased: false,
     }
 }
 
@@ -110,6 +111,7 @@ fn order_of_splats_does_not_matter() {
         opacity_logits: order.iter().map(|&i| s.opacity_logits[i]).collect(),
         sh_degree: 2,
         sh: order.iter().flat_map(|&i| s.sh[i * width..(i + 1) * width].to_vec()).collect(),
+        antialiased: false,
     };
     let other = Scene { splats: shuffled, features: Vec::new(), ..Scene::small(1, 0, 0, 0) };
     let other = Scene { view: scene.view.clone(), options: scene.options, ..other };
@@ -376,4 +378,22 @@ fn no_splats_give_the_background() {
     let far = DVec3::new(0.0, 0.0, -9.0);
     let behind = front_scene(splat([0.0, 0.0, far.z as f32], 0.5, 2.0), 16, 9).render(&device);
     assert_eq!(behind.planes, out.planes);
+}
+
+/// gsplat's `rasterize_mode="antialiased"`: the opacity of a splat of variance v px² is multiplied by v / (v + 0.3).
+#[test]
+fn antialiased_opacity_falls_with_the_dilation() {
+    let device = test_device();
+    let alpha = |antialiased: bool| {
+        // At depth 2: 0.5 px wide.
+        let mut scene = front_scene(splat([0.0, 0.0, 2.0], 1.0, 0.0), 33, 33);
+        let sigma = 0.5f32;
+        scene.splats.log_scales = vec![[(sigma * 2.0 / scene.view.focal[0] as f32).ln(); 3]];
+        scene.splats.antialiased = antialiased;
+        let rendered = scene.render(&device);
+        assert_images(&rendered, &scene.twin());
+        rendered.transmittance.iter().map(|t| 1.0 - t).fold(0.0, f32::max)
+    };
+    let ratio = alpha(true) / alpha(false);
+    assert!((ratio - 0.25 / 0.55).abs() < 1e-3, "{ratio}");
 }

@@ -22,6 +22,7 @@ fn tilted_scene(folder: &Path) -> (PathBuf, Splats, Camera) {
         opacity_logits: vec![1.0; 2],
         sh_degree: 0,
         sh: vec![0.0; 6],
+        antialiased: false,
     };
     let camera = Camera {
         name: "a".into(),

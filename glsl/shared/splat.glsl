@@ -1,6 +1,7 @@
 // Screen-space geometry of one splat, shared by projection and its backward pass. Equations: pass::project.
 // Needs shared/camera.glsl.
 const float DILATION = 0.3; // a splat never gets thinner than about a pixel (INRIA's value)
+const float SMALLEST_AREA = 1e-12; // squared, px⁴: below it an opacity is invisible and its logarithm would not be finite
 
 struct Geometry {
     bool visible;       // beyond the near plane; the other fields are meaningless otherwise
@@ -16,6 +17,7 @@ struct Geometry {
     vec3 b0, b1;        // J R M
     vec3 conic;         // (A, B, C)
     float conic_det;    // AC − B²
+    vec3 area;          // b0 × b1; its square is the determinant without the dilation
 };
 
 mat3 rotation_of(vec4 q) {
@@ -52,6 +54,7 @@ Geometry geometry_of(vec3 mean, vec3 log_scale, vec4 raw_quat) {
     float xx = dot(g.b0, g.b0), yy = dot(g.b1, g.b1), xy = dot(g.b0, g.b1);
     float inv_det = 1.0 / (dot(area, area) + DILATION * (xx + yy) + DILATION * DILATION);
     g.conic_det = inv_det;
+    g.area = area;
     g.conic = vec3(yy + DILATION, -xy, xx + DILATION) * inv_det;
     return g;
 }

@@ -4,10 +4,10 @@ use super::print::listing;
 use super::progress;
 use super::scene;
 use crate::files::{Kind, check_place};
-use crate::format::gaussians::{FORMATS, Reserved, SplatFormat};
+use crate::format::gaussians::{FORMATS, Reserved, SplatFormat, WriteOptions};
 use crate::format::scene_dir::Scene;
 use crate::format::transform::transform_splats;
-use crate::format::{colmap, ply, transforms};
+use crate::format::{colmap, ply, spz, transforms};
 use crate::scene::{Camera, PointCloud, SH_C0, Similarity, Splats, UpAxis};
 use crate::{Error, Result};
 use clap::Args;
@@ -32,6 +32,9 @@ pub struct ExportArgs {
     /// ply: spherical-harmonics degree of the file, padded with zeros; most viewers ask for 3
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(0..=3), value_name = "0-3")]
     pub ply_degree: u32,
+    /// spz: version of the file; 3 is read by most programs, 4 by the newest ones only
+    #[arg(long, value_parser = clap::value_parser!(u32).range(2..=4), value_name = "2-4")]
+    pub spz_version: Option<u32>,
     /// ply: add the language features and codes as extra columns
     #[arg(long)]
     pub with_features: bool,
@@ -152,8 +155,16 @@ pub fn export(args: &ExportArgs) -> Result<()> {
             if let Some(brightest) = format.brightest {
                 warn_of_range(&scene.splats, brightest);
             }
+            if scene.splats.antialiased && !format.states_filter {
+                progress::reporter().warn(&format!(
+                    "the scene is antialiased and {} cannot say so: programs draw its thin splats too heavy; ply, \
+                     compressed-ply and spz keep it",
+                    format.name
+                ));
+            }
             warn_of_models(&scene);
-            files.write(&scene.splats, scene.language.as_ref(), format)?;
+            let options = WriteOptions { spz_version: args.spz_version.unwrap_or(spz::DEFAULT_VERSION) };
+            files.write(&scene.splats, scene.language.as_ref(), format, options)?;
         }
         Out::File(file) if args.format == "transforms" => {
             let cameras = cameras(&scene, args)?;
@@ -174,6 +185,9 @@ pub fn export(args: &ExportArgs) -> Result<()> {
             file.keep(|path| ply::write_splats(path, &scene.splats, options))?;
         }
     }
+    if let Some(warning) = check_ending(args)? {
+        progress::reporter().warn(&warning);
+    }
     listing(std::slice::from_ref(&args.out), args.json)
 }
 
@@ -191,6 +205,10 @@ impl Out {
     /// Refuses a place that may not be written before the scene is read.
     fn reserve(args: &ExportArgs) -> Result<Out> {
         let is_folder = args.format.starts_with("colmap");
+        if args.spz_version.is_some() && args.format != "spz" {
+            return Err(Error::input("--spz-version: only --format spz has versions; leave it out"));
+        }
+        check_ending(args)?;
         // A link is said to be one wherever it leads.
         check_place(&args.out, if is_folder { Kind::Folder } else { Kind::File }, true)?;
         let whole = |p: &Path| p.canonicalize().ok();
@@ -214,6 +232,28 @@ impl Out {
             }
             None => WrittenFile::open(&args.out, args.force, &inputs).map(Out::File),
         }
+    }
+}
+
+/// Refuses a name that is of another format, by which programs would take the file for it; returns a warning for one of none.
+fn check_ending(args: &ExportArgs) -> Result<Option<String>> {
+    let endings = || FORMATS.iter().map(|f| (f.name, f.ending)).chain([("transforms", ".json")]);
+    let (format, out) = (&args.format, args.out.display());
+    let Some((_, own)) = endings().find(|(name, _)| name == format) else { return Ok(None) };
+    let file = args.out.to_string_lossy();
+    let lower = file.to_lowercase();
+    match endings().find(|(_, ending)| lower.ends_with(ending)) {
+        Some((name, _)) if name == format => Ok(None),
+        // Programs tell a compressed .ply by its content.
+        Some(("ply", _)) if format == "compressed-ply" => Ok(None),
+        Some((name, ending)) => {
+            let stem = file.get(..file.len() - ending.len()).unwrap_or_default();
+            Err(Error::input(format!(
+                "--out {out}: names that end in {ending} are of --format {name}, not {format}; give --out {stem}{own}, or \
+                 --format {name}"
+            )))
+        }
+        None => Ok(Some(format!("--out {out}: programs know --format {format} by names that end in {own}"))),
     }
 }
 

@@ -122,6 +122,7 @@ mod tests {
             opacity_logits: vec![0.0; n],
             sh: vec![0.0; 3 * n],
             sh_degree: 0,
+            antialiased: false,
         }
     }
 

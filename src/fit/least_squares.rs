@@ -92,6 +92,7 @@ mod tests {
             opacity_logits: vec![1.0; 3],
             sh_degree: 0,
             sh: vec![0.0; 9],
+            antialiased: false,
         };
         let label = |p: usize| if p < 5 * SIZE.0 { -1 } else { i32::from(p % SIZE.0 > 26) };
         let codebook = Codebook {

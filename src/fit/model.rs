@@ -173,6 +173,7 @@ impl Model {
         let index = device.buffer_from("kept rows", rows)?;
         let (degree, dim) = (self.values.sh_degree, self.values.feature_dim);
         let mut values = SplatBuffers::zeros(device, "splats", n, degree, dim)?;
+        values.antialiased = self.values.antialiased;
         for kind in GEOMETRY_AND_COLOUR {
             let w = width(&self.values, kind);
             *buffer_mut(&mut values, kind) =

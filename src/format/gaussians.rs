@@ -1,10 +1,15 @@
 //! Files of Gaussians: one reader and one writer for every format, chosen by the end of the file's name or by the format's.
 pub mod gltf;
+mod other;
 pub mod ply;
+mod ply_comments;
+mod ply_header;
 pub mod ply_packed;
+mod ply_points;
 mod ply_table;
 pub mod splat;
 pub mod spz;
+mod spz_extensions;
 pub(crate) mod usable;
 
 use super::side_file;
@@ -25,9 +30,25 @@ pub struct SplatFormat {
     pub brightest: Option<f32>,
     /// Its axes are right, up, back by definition; the others hold whatever axes a scene has.
     pub y_up: bool,
-    read: fn(&Path) -> Result<Splats>,
+    /// Whether it states that Gaussians are antialiased ([`Splats::antialiased`]).
+    pub states_filter: bool,
+    /// Adds a line to the notes for what is not read.
+    read: fn(&Path, &mut Vec<String>) -> Result<Splats>,
     /// Returns the order of the rows; empty = the scene's own.
-    write: fn(&Path, &Splats) -> Result<Vec<u32>>,
+    write: fn(&Path, &Splats, WriteOptions) -> Result<Vec<u32>>,
+}
+
+/// What a format leaves open.
+#[derive(Clone, Copy, Debug)]
+pub struct WriteOptions {
+    /// Version of `.spz`, one of [`spz::VERSIONS`].
+    pub spz_version: u32,
+}
+
+impl Default for WriteOptions {
+    fn default() -> Self {
+        WriteOptions { spz_version: spz::DEFAULT_VERSION }
+    }
 }
 
 /// All formats; an ending comes before those that it ends with.
@@ -38,8 +59,9 @@ pub static FORMATS: [SplatFormat; 6] = [
         ending: ".compressed.ply",
         brightest: None,
         y_up: false,
-        read: ply::read_splats,
-        write: ply_packed::write_splats,
+        states_filter: true,
+        read: ply::read_noted,
+        write: |path, s, _| ply_packed::write_splats(path, s),
     },
     SplatFormat {
         name: "ply",
@@ -47,8 +69,9 @@ pub static FORMATS: [SplatFormat; 6] = [
         ending: ".ply",
         brightest: None,
         y_up: false,
-        read: ply::read_splats,
-        write: |path, s| ply::write_splats(path, s, ply::PlyOptions::default()).map(|()| Vec::new()),
+        states_filter: true,
+        read: ply::read_noted,
+        write: |path, s, _| ply::write_splats(path, s, ply::PlyOptions::default()).map(|()| Vec::new()),
     },
     SplatFormat {
         name: "splat",
@@ -56,17 +79,19 @@ pub static FORMATS: [SplatFormat; 6] = [
         ending: ".splat",
         brightest: Some(splat::BRIGHTEST),
         y_up: false,
-        read: splat::read_splats,
-        write: splat::write_splats,
+        states_filter: false,
+        read: splat::read_noted,
+        write: |path, s, _| splat::write_splats(path, s),
     },
     SplatFormat {
         name: "spz",
-        about: ".spz version 4",
+        about: ".spz of Niantic, as --spz-version says",
         ending: ".spz",
         brightest: Some(spz::BRIGHTEST),
         y_up: true,
-        read: spz::read_splats,
-        write: |path, s| spz::write_splats(path, s).map(|()| Vec::new()),
+        states_filter: true,
+        read: spz::read_noted,
+        write: |path, s, options| spz::write_splats(path, s, options.spz_version).map(|()| Vec::new()),
     },
     SplatFormat {
         name: "glb",
@@ -74,8 +99,9 @@ pub static FORMATS: [SplatFormat; 6] = [
         ending: ".glb",
         brightest: None,
         y_up: true,
-        read: gltf::read_splats,
-        write: |path, s| gltf::write_glb(path, s).map(|()| Vec::new()),
+        states_filter: false,
+        read: gltf::read_noted,
+        write: |path, s, _| gltf::write_glb(path, s).map(|()| Vec::new()),
     },
     SplatFormat {
         name: "gltf",
@@ -83,8 +109,9 @@ pub static FORMATS: [SplatFormat; 6] = [
         ending: ".gltf",
         brightest: None,
         y_up: true,
-        read: gltf::read_splats,
-        write: |path, s| gltf::write_gltf(path, s).map(|()| Vec::new()),
+        states_filter: false,
+        read: gltf::read_noted,
+        write: |path, s, _| gltf::write_gltf(path, s).map(|()| Vec::new()),
     },
 ];
 
@@ -108,8 +135,9 @@ pub fn is_named(path: &Path) -> bool {
 /// The format that the name of a file says.
 pub(crate) fn format(path: &Path) -> Result<&'static SplatFormat> {
     find(path).ok_or_else(|| {
-        let (path, endings) = (path.display(), endings());
-        Error::input(format!("{path}: no known format of splats; the name must end in one of {endings}"))
+        let (place, endings) = (path.display(), endings());
+        let advice = other::named(path).unwrap_or("give a file in one of these formats");
+        Error::input(format!("{place}: splats are read from names that end in {endings}; {advice}"))
     })
 }
 
@@ -121,20 +149,27 @@ pub fn endings() -> String {
 /// Reads a file of Gaussians, and the language beside it, if any. Gaussians that cannot be computed with (numbers that are not
 /// finite or beyond 1e18, no rotation) are left out.
 pub fn read(path: &Path) -> Result<(Splats, Option<LanguageField>)> {
-    read_counted(path).map(|(splats, language, _)| (splats, language))
+    read_noted(path).map(|(splats, language, _)| (splats, language))
 }
 
-/// [`read`], and what was left out, one line.
-pub fn read_counted(path: &Path) -> Result<(Splats, Option<LanguageField>, Option<String>)> {
-    let splats = (format(path)?.read)(path)?;
+/// [`read`], and what was left out of the file or not applied, a line each.
+pub fn read_noted(path: &Path) -> Result<(Splats, Option<LanguageField>, Vec<String>)> {
+    let format = format(path)?;
+    if let Some(e) = other::misnamed(path, format) {
+        return Err(e);
+    }
+    let mut notes = Vec::new();
+    let splats = (format.read)(path, &mut notes)?;
     let language = side_file::read(path, splats.len())?;
-    usable::keep(splats, language, path)
+    let (splats, language) = usable::keep(splats, language, path, &mut notes)?;
+    notes.extend(usable::precision(&splats.means));
+    Ok((splats, language, usable::finished(notes, path)))
 }
 
 /// Writes a file of Gaussians, and beside it ([`side_file`]) their language, if they have any; ordinary files that are there are
 /// replaced.
 pub fn write(path: &Path, splats: &Splats, language: Option<&LanguageField>) -> Result<()> {
-    write_as(path, splats, language, format(path)?)
+    write_as(path, splats, language, format(path)?, WriteOptions::default())
 }
 
 /// [`write()`] in a format, whatever the file is called.
@@ -143,8 +178,9 @@ pub fn write_as(
     splats: &Splats,
     language: Option<&LanguageField>,
     format: &SplatFormat,
+    options: WriteOptions,
 ) -> Result<()> {
-    Reserved::open(path, true)?.write(splats, language, format)
+    Reserved::open(path, true)?.write(splats, language, format, options)
 }
 
 /// The places of a file of Gaussians and of the language beside it, to which nobody else writes as long as this lives.
@@ -173,9 +209,14 @@ impl Reserved {
         splats: &Splats,
         language: Option<&LanguageField>,
         format: &SplatFormat,
+        options: WriteOptions,
     ) -> Result<()> {
         let with_codes = language.filter(|l| l.levels.iter().any(|l| !l.codebook.is_empty()));
-        let order = (format.write)(self.splat_file.path(), splats)?;
+        // What a format cannot hold is said of the place that was asked for, not of the file beside it.
+        let order = (format.write)(self.splat_file.path(), splats, options).map_err(|e| match e {
+            Error::Input(what) => Error::input(format!("{}: {what}", self.path.display())),
+            other => other,
+        })?;
         if let Some(field) = with_codes {
             side_file::write(self.language_file.path(), field, splats.len(), &order)?;
         }

@@ -222,8 +222,7 @@ pub fn write_world(path: &Path, world: &World) -> Result<()> {
 /// Loads a scene directory, or a file of Gaussians ([`gaussians::read`]), which has no cameras.
 pub fn load(path: &Path) -> Result<Scene> {
     if path.is_file() {
-        let (splats, language, note) = gaussians::read_counted(path)?;
-        let warnings = note.into_iter().collect();
+        let (splats, language, warnings) = gaussians::read_noted(path)?;
         return Ok(Scene { path: path.into(), splats, language, warnings, ..Scene::default() });
     }
     let manifest = read_manifest(path)?;

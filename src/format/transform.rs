@@ -37,6 +37,24 @@ pub fn transform_splats(splats: &mut Splats, by: &Similarity) {
     }
 }
 
+/// Mirrors the Gaussians at the plane z = 0: what a splat showed in a direction, it shows in the mirrored one.
+pub(crate) fn mirror_z(splats: &mut Splats) {
+    splats.means.iter_mut().for_each(|m| m[2] = -m[2]);
+    // A rotation about an axis becomes the opposite one about the mirrored axis.
+    splats.quats.iter_mut().for_each(|q| (q[1], q[2]) = (-q[1], -q[2]));
+    let width = 3 * splats.sh_len();
+    for row in splats.sh.chunks_exact_mut(width) {
+        for (k, coefficient) in row.chunks_exact_mut(3).enumerate() {
+            let degree = k.isqrt();
+            // Y_lm has the parity l + |m| in z.
+            let order = (k - degree * degree).abs_diff(degree);
+            if (degree + order) % 2 == 1 {
+                coefficient.iter_mut().for_each(|v| *v = -*v);
+            }
+        }
+    }
+}
+
 /// How the 2l + 1 coefficients of degree l change when what they describe is turned: the functions of one degree span a
 /// space that rotations do not leave, so the least squares over some directions are exact.
 fn turned_basis(rotation: &DMat3, degree: u32) -> DMatrix<f64> {
@@ -76,6 +94,7 @@ mod tests {
             opacity_logits: vec![0.3],
             sh_degree: 3,
             sh: sh.clone(),
+            antialiased: false,
         };
         let rotation = DMat3::from_quat(DQuat::from_xyzw(0.3, -0.5, 0.2, 0.7).normalize());
         let by = Similarity { scale: 2.5, rotation, translation: DVec3::new(0.5, 1.0, -4.0) };
@@ -103,5 +122,34 @@ mod tests {
         assert!(covariance(s.quats[0], s.log_scales[0]).abs_diff_eq(expected, 1e-5));
         let mean = 2.5 * (rotation * DVec3::new(1.0, -2.0, 3.0)) + by.translation;
         assert!((Vec3::from_array(s.means[0]).as_dvec3() - mean).length() < 1e-5);
+    }
+
+    #[test]
+    fn a_mirrored_splat_shows_its_colours_in_mirrored_directions() {
+        let sh: Vec<f32> = (0..48).map(|i| (i as f32 * 1.7).sin()).collect();
+        let quat = [0.5, 0.1, -0.7, 0.3];
+        let mut s = Splats {
+            means: vec![[1.0, -2.0, 3.0]],
+            quats: vec![quat],
+            sh_degree: 3,
+            sh: sh.clone(),
+            ..Splats::default()
+        };
+        mirror_z(&mut s);
+        assert_eq!(s.means[0], [1.0, -2.0, -3.0]);
+        let mirror = DMat3::from_diagonal(DVec3::new(1.0, 1.0, -1.0));
+        for k in 0..DIRECTIONS {
+            let d = DMat3::from_rotation_y(0.4) * spiral_direction(k);
+            let colour =
+                |sh: &[f32], d| (0..16).map(|k| sh::basis(d, 3)[k] * f64::from(sh[3 * k])).sum::<f64>();
+            assert!((colour(&sh, d) - colour(&s.sh, mirror * d)).abs() < 1e-6, "direction {k}");
+        }
+        let covariance = |q: [f32; 4]| {
+            let [w, x, y, z] = q.map(f64::from);
+            let m = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())
+                * DMat3::from_diagonal(DVec3::new(1.0, 2.0, 3.0));
+            m * m.transpose()
+        };
+        assert!(covariance(s.quats[0]).abs_diff_eq(mirror * covariance(quat) * mirror, 1e-6));
     }
 }

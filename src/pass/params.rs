@@ -21,6 +21,8 @@ pub struct Params {
     pub feature_dim: usize,
     /// [N, d] raw features.
     pub features: Vec<f64>,
+    /// As [`Splats::antialiased`].
+    pub antialiased: bool,
 }
 
 impl Params {
@@ -40,6 +42,7 @@ impl Params {
                 .collect(),
             feature_dim,
             features: features.iter().map(|&f| f.into()).collect(),
+            antialiased: splats.antialiased,
         }
     }
 
@@ -55,6 +58,7 @@ impl Params {
             sh: vec![DVec3::ZERO; self.sh.len()],
             feature_dim: self.feature_dim,
             features: vec![0.0; self.features.len()],
+            antialiased: self.antialiased,
         }
     }
 

@@ -2,7 +2,8 @@
 //!
 //! Per splat, with R_q of the unit quaternion, s = exp(log scale):
 //! `t = R μ + τ`, `M = R_q diag(s)`, `B = J R M` (2×3), `Σ' = B Bᵀ + 0.3 I`, `(A, B, C) = Σ'⁻¹`,
-//! `u = fx t_x/t_z + cx − ½`, colour = max(0, Σ_k B_k(dir) sh_k + ½), opacity = σ(logit).
+//! `u = fx t_x/t_z + cx − ½`, colour = max(0, Σ_k B_k(dir) sh_k + ½), opacity = σ(logit); that of antialiased splats is
+//! multiplied by √(det B Bᵀ / det Σ') (Yu et al. 2024, the 2-D Mip filter).
 //! J is evaluated at t_x/t_z clamped to the image border plus 30 % of the half width, so that splats far outside do not explode.
 use super::frame::FrameBuffers;
 use super::options::FeatureMode;
@@ -10,7 +11,7 @@ use super::params::Params;
 use super::sh;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
-use crate::gpu::shaders::shared::splat::DILATION;
+use crate::gpu::shaders::shared::splat::{DILATION, SMALLEST_AREA};
 use crate::gpu::shaders::structs::CameraView;
 use crate::gpu::{Buffer, Recorder, shaders};
 use glam::{DMat3, DVec3, DVec4};
@@ -37,7 +38,11 @@ pub fn record(
             projected: &frame.projected,
             depth_pairs: &frame.depth_pairs,
         },
-        &shaders::project::Push { count, sh_stride: splats.sh_len() as u32 },
+        &shaders::project::Push {
+            count,
+            sh_stride: splats.sh_len() as u32,
+            antialiased: splats.antialiased.into(),
+        },
     );
     rec.dispatch_threads(call, [count, 1, 1]);
 }
@@ -95,6 +100,11 @@ pub(super) struct Geometry {
     /// Rows of B = T M.
     pub b: [DVec3; 2],
     pub conic: [f64; 3],
+    /// B Bᵀ as (xx, xy, yy), and its determinant.
+    pub undilated: [f64; 3],
+    pub undilated_det: f64,
+    /// √(det B Bᵀ / det Σ').
+    pub compensation: f64,
 }
 
 /// R_q of a unit quaternion (w, x, y, z).
@@ -129,20 +139,36 @@ pub(super) fn geometry(params: &Params, i: usize, view: &View) -> Option<Geometr
     ];
     let to_screen = jacobian.map(|row| view.rotation.transpose() * row);
     let b = to_screen.map(|row| (rotation.transpose() * row) * scale);
-    let (xx, xy, yy) = (b[0].dot(b[0]) + DILATION, b[0].dot(b[1]), b[1].dot(b[1]) + DILATION);
+    let (xx, xy, yy) = (b[0].dot(b[0]), b[0].dot(b[1]), b[1].dot(b[1]));
     // det(BBᵀ + cI) by Lagrange's identity: no cancellation for needles, where xx·yy − xy² loses every digit.
-    let det = b[0].cross(b[1]).length_squared()
-        + DILATION * (b[0].dot(b[0]) + b[1].dot(b[1]))
-        + DILATION * DILATION;
-    let conic = [yy / det, -xy / det, xx / det];
-    Some(Geometry { t, quat, quat_length, rotation, scale, clamped, inside, jacobian, to_screen, b, conic })
+    let area = b[0].cross(b[1]).length_squared();
+    let det = area + DILATION * (xx + yy) + DILATION * DILATION;
+    let conic = [(yy + DILATION) / det, -xy / det, (xx + DILATION) / det];
+    let undilated_det = area.max(SMALLEST_AREA);
+    Some(Geometry {
+        t,
+        quat,
+        quat_length,
+        rotation,
+        scale,
+        clamped,
+        inside,
+        jacobian,
+        to_screen,
+        b,
+        conic,
+        undilated: [xx, xy, yy],
+        undilated_det,
+        compensation: (undilated_det / det).sqrt(),
+    })
 }
 
 /// Projects splat `i`; `None` when it is behind the near plane or its opacity is below `alpha_min`, where it can
 /// change no pixel.
 pub fn twin(params: &Params, i: usize, view: &View, alpha_min: f64) -> Option<Projected> {
     let g = geometry(params, i, view)?;
-    let opacity = 1.0 / (1.0 + (-params.opacity_logits[i]).exp());
+    let own = 1.0 / (1.0 + (-params.opacity_logits[i]).exp());
+    let opacity = if params.antialiased { own * g.compensation } else { own };
     if opacity < alpha_min {
         return None;
     }

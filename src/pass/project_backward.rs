@@ -53,7 +53,11 @@ pub fn record(
             sh_grad: &gradients.sh,
             camera_parts: &frame.camera_parts,
         },
-        &shaders::project_backward::Push { count, sh_stride: splats.sh_len() as u32 },
+        &shaders::project_backward::Push {
+            count,
+            sh_stride: splats.sh_len() as u32,
+            antialiased: splats.antialiased.into(),
+        },
     );
     let groups = groups(rec.device(), splats.count);
     rec.dispatch(call, [groups, 1, 1]);
@@ -102,7 +106,14 @@ pub fn twin(params: &Params, i: usize, view: &View, upstream: &SplatGradient, ou
 
     let [a, b, c] = g.conic;
     let by_centre = [-(a * m1 + b * m2), -(c * m2 + b * m1)];
-    let by_b = covariance_backward(&g, [-0.5 * m3, -m4, -0.5 * m5]);
+    let mut by_b = covariance_backward(&g, [-0.5 * m3, -m4, -0.5 * m5]);
+    if params.antialiased {
+        // ∂ ln √(det B Bᵀ / det Σ') = (B Bᵀ)⁻¹ B − Σ'⁻¹ B.
+        let [xx, xy, yy] = g.undilated.map(|v| v / g.undilated_det);
+        let [own_a, own_b, own_c] = [yy - a, -xy - b, xx - c];
+        by_b[0] += m0 * (own_a * g.b[0] + own_b * g.b[1]);
+        by_b[1] += m0 * (own_b * g.b[0] + own_c * g.b[1]);
+    }
     let m = DMat3::from_cols(
         g.rotation.x_axis * g.scale.x,
         g.rotation.y_axis * g.scale.y,

@@ -12,6 +12,8 @@ pub struct SplatBuffers {
     pub sh_degree: u32,
     /// d.
     pub feature_dim: usize,
+    /// As [`Splats::antialiased`].
+    pub antialiased: bool,
     /// [N, 3] f32, world units.
     pub means: Buffer<f32>,
     /// [N, 3] f32, natural logs.
@@ -43,7 +45,8 @@ impl SplatBuffers {
             let given = features.len();
             return Err(Error::work(format!("{given} feature values do not make {n} × {feature_dim}")));
         }
-        let out = SplatBuffers::zeros(device, "splats", n, splats.sh_degree, feature_dim)?;
+        let mut out = SplatBuffers::zeros(device, "splats", n, splats.sh_degree, feature_dim)?;
+        out.antialiased = splats.antialiased;
         if n > 0 {
             out.means.write(splats.means.as_flattened())?;
             out.log_scales.write(splats.log_scales.as_flattened())?;
@@ -71,6 +74,7 @@ impl SplatBuffers {
             count,
             sh_degree,
             feature_dim,
+            antialiased: false,
             means: make("means", 3 * count)?,
             log_scales: make("log_scales", 3 * count)?,
             quats: make("quats", 4 * count)?,
@@ -101,6 +105,7 @@ impl SplatBuffers {
             opacity_logits: floats(&self.opacity_logits, n)?,
             sh_degree: self.sh_degree,
             sh: floats(&self.sh, 3 * n * self.sh_len())?,
+            antialiased: self.antialiased,
         };
         Ok((splats, floats(&self.features, n * self.feature_dim)?))
     }

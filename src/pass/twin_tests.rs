@@ -126,6 +126,15 @@ fn five_hundred_splats() {
 }
 
 #[test]
+fn antialiased_splats() {
+    let mut s = scene(60, 1, 0, 12);
+    s.params.antialiased = true;
+    // Thin enough that the dilation takes most of their opacity.
+    s.params.log_scales.iter_mut().take(20).for_each(|v| v.x -= 2.0);
+    check(s, FeatureMode::Linear, 30);
+}
+
+#[test]
 fn clamped_jacobian_and_clamped_alpha() {
     let mut s = scene(10, 1, 0, 9);
     let camera_point = |view: &View, p: DVec3| view.rotation.transpose() * (p - view.translation);

@@ -7,7 +7,7 @@ use super::outcome::RunOutcome;
 use super::view::{DecodedFrame, FeatureChannels, Viewer};
 use super::{encoder, sources};
 use crate::files::check_spared;
-use crate::format::gaussians::Reserved;
+use crate::format::gaussians::{Reserved, WriteOptions};
 use crate::format::scene_dir::{self, Contents, Scene};
 use crate::format::{Workspace, colmap, gaussians};
 use crate::gpu::Device;
@@ -219,7 +219,12 @@ impl LiveScene {
         if gaussians::is_named(path) {
             self.check_spared(path)?;
             let format = gaussians::format(path)?;
-            return Reserved::open(path, replace)?.write(self.splats(), self.language(), format);
+            return Reserved::open(path, replace)?.write(
+                self.splats(),
+                self.language(),
+                format,
+                WriteOptions::default(),
+            );
         }
         if let Some(ending) = path.extension()
             && !path.is_dir()

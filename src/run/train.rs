@@ -135,8 +135,13 @@ fn with_cameras(plan: &TrainPlan, known: &[GivenCamera], progress: &dyn Progress
     Ok(files.collect())
 }
 
-fn points(path: &Path) -> Result<PointCloud> {
-    if path.is_dir() { colmap::read_points(path) } else { ply::read_points(path) }
+fn points(path: &Path, progress: &dyn Progress) -> Result<PointCloud> {
+    if path.is_dir() {
+        return colmap::read_points(path);
+    }
+    let (points, notes) = ply::read_points(path)?;
+    notes.iter().for_each(|note| progress.warn(note));
+    Ok(points)
 }
 
 /// Gives points from a file the footprint that initialisation needs: `z / f` in the camera that sees them nearest.
@@ -184,7 +189,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
         inputs.into_iter().flatten().chain([&plan.images]).map(PathBuf::as_path).collect();
     let workspace = Workspace::create(&plan.out, plan.force, &inputs)?;
     let known = cameras::read_file(&plan.cameras)?;
-    let given = plan.points.as_deref().map(points).transpose()?;
+    let given = plan.points.as_deref().map(|path| points(path, progress)).transpose()?;
     let device = Device::with(&gpu::Options {
         deterministic: plan.deterministic,
         ..gpu::Options::from_env(plan.device.as_deref())

@@ -24,6 +24,9 @@ pub struct Splats {
     pub sh_degree: u32,
     /// [N, (degree+1)², 3] coefficients, DC first, RGB interleaved.
     pub sh: Vec<f32>,
+    /// Whether opacities are meant with the 2-D Mip filter (Yu et al. 2024, Mip-Splatting): where the projection dilates a splat,
+    /// its opacity falls by the square root of the ratio of the determinants, so that thin splats do not grow heavier.
+    pub antialiased: bool,
 }
 
 impl Splats {
@@ -36,6 +39,7 @@ impl Splats {
             opacity_logits: Vec::with_capacity(n),
             sh_degree,
             sh: Vec::with_capacity(3 * sh_coefficients(sh_degree) * n),
+            antialiased: false,
         }
     }
     /// Number of Gaussians.
@@ -46,9 +50,9 @@ impl Splats {
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
     }
-    /// Adds the rows of `other`, which must have the same SH degree.
+    /// Adds the rows of `other`, which must have the same SH degree and the same filter.
     pub fn append(&mut self, mut other: Splats) {
-        debug_assert_eq!(self.sh_degree, other.sh_degree);
+        debug_assert_eq!((self.sh_degree, self.antialiased), (other.sh_degree, other.antialiased));
         self.means.append(&mut other.means);
         self.log_scales.append(&mut other.log_scales);
         self.quats.append(&mut other.quats);
@@ -65,6 +69,7 @@ impl Splats {
             opacity_logits: rows.iter().map(|&i| self.opacity_logits[i]).collect(),
             sh_degree: self.sh_degree,
             sh: rows.iter().flat_map(|&i| &self.sh[i * width..(i + 1) * width]).copied().collect(),
+            antialiased: self.antialiased,
         }
     }
     /// Coefficients per channel.

@@ -217,8 +217,9 @@ def splats():
         compare(f"compressed ply degree {degree}: gsply", got, s, **packed_bounds(s))
 
         out = WORK / "out.spz"
-        run("export", source, "--format", "spz", "--force", "--out", out)
-        compare(f"spz 4 degree {degree}: gsply", turned(of_gsply(read_spz(str(out)))), s, **SPZ)
+        for version in (3, 4):
+            run("export", source, "--format", "spz", "--spz-version", version, "--force", "--out", out)
+            compare(f"spz {version} degree {degree}: gsply", turned(of_gsply(read_spz(str(out)))), s, **SPZ)
 
         for kind in ("glb", "gltf"):
             out = WORK / f"out.{kind}"

@@ -1,74 +1,136 @@
 //! PLY files: the Gaussian layout that 3DGS viewers expect
 //! (docs/method.md#gaussian-ply).
-use super::ply_packed;
-use super::ply_table::{PropertyType, Table, header, open, table};
+use super::ply_header::header;
+use super::ply_points::Colours;
+pub use super::ply_points::{read_points, write_points};
+use super::ply_table::{Table, listed, table};
 use super::usable;
-use crate::scene::{LanguageField, LevelField, PointCloud, Splats, sh_coefficients};
+use super::{ply_comments, ply_packed};
+use crate::scene::{LanguageField, LevelField, SH_C0, Splats, sh_coefficients};
 use crate::{Error, Result, files};
 use std::fmt::Write as _;
 use std::path::Path;
 
-/// Reads Gaussians in the INRIA layout, of any SH degree 0–3; unknown columns are skipped. ASCII or binary. Compressed
-/// files as SuperSplat writes them are understood, too.
-pub fn read_splats(path: &Path) -> Result<Splats> {
-    let parse = |bytes: Vec<u8>| {
+/// Reads Gaussians in the INRIA layout, of any SH degree 0–3 (of degree 4 without band 4), and of other programs what is close to
+/// it; notes name what is not read, a line each. ASCII or binary. Compressed files as SuperSplat writes them are understood, too.
+pub fn read_noted(path: &Path, notes: &mut Vec<String>) -> Result<Splats> {
+    let mut parse = |bytes: Vec<u8>| {
         if ply_packed::is_packed(&header(&bytes, "vertex")?.columns) {
-            return ply_packed::parse(&bytes);
+            return ply_packed::parse(&bytes, notes);
         }
-        gaussians(&table(bytes)?)
+        gaussians(&table(bytes)?, notes)
     };
     parse(files::read(path)?).map_err(|what| Error::input(format!("{}: {what}", path.display())))
 }
 
-fn gaussians(t: &Table) -> Result<Splats, String> {
-    let need = |missing: String| format!("no column {missing}: this is not a Gaussian splat file");
+/// [`read_noted`] of a file that this program wrote.
+pub fn read_splats(path: &Path) -> Result<Splats> {
+    read_noted(path, &mut Vec::new())
+}
+
+/// SH degree of so many `f_rest` columns, and how many coefficients a channel has in the file; a note where not all are read.
+pub(super) fn sh_degree(columns: usize, notes: &mut Vec<String>) -> Result<(u32, usize), String> {
+    let degree = (0..=4).find(|&d| 3 * (sh_coefficients(d) - 1) == columns).ok_or_else(|| {
+        format!("its {columns} f_rest columns fit no SH degree (0, 9, 24, 45 or 72 do); export it with one of them")
+    })?;
+    notes.extend((degree > MOST_DEGREE).then(|| beyond_degree(degree)));
+    Ok((degree.min(MOST_DEGREE), columns / 3))
+}
+
+/// Greatest SH degree that is drawn.
+pub(super) const MOST_DEGREE: u32 = 3;
+
+/// What is said of coefficients beyond it.
+pub(super) fn beyond_degree(degree: u32) -> String {
+    format!("its SH degree is {degree}: band {degree} is left out, {MOST_DEGREE} bands are read")
+}
+
+fn gaussians(t: &Table, notes: &mut Vec<String>) -> Result<Splats, String> {
+    let need = |missing: String| {
+        let has = listed(&t.names());
+        format!("no column {missing}: this is not a Gaussian splat file of the INRIA layout; it has {has}")
+    };
     let position = t.all(["x", "y", "z"]).map_err(need)?;
-    let scale = t.all(["scale_0", "scale_1", "scale_2"]).map_err(need)?;
-    let rotation = t.all(["rot_0", "rot_1", "rot_2", "rot_3"]).map_err(need)?;
     let [opacity] = t.all(["opacity"]).map_err(need)?;
-    let dc = t.all(["f_dc_0", "f_dc_1", "f_dc_2"]).map_err(need)?;
-    let rest = t.series("f_rest_");
-    let sh_degree = (0..=3)
-        .find(|&d| 3 * (sh_coefficients(d) - 1) == rest.len())
-        .ok_or_else(|| format!("{} f_rest columns fit no SH degree 0–3 (0, 9, 24 or 45)", rest.len()))?;
-    let per_channel = rest.len() / 3;
-    let mut s = Splats::with_capacity(t.rows, sh_degree);
+    let scale = scales(t, notes).map_err(need)?;
+    let rotation = t.all(["rot_0", "rot_1", "rot_2", "rot_3"]).map_err(need)?;
+    let dc = t.all(["f_dc_0", "f_dc_1", "f_dc_2"]);
+    // nerfstudio writes colours in the place of the coefficients where it is asked to.
+    let colours = if dc.is_err() { Colours::of(t, notes)? } else { None };
+    if let (Err(missing), None) = (&dc, &colours) {
+        return Err(need(missing.clone()));
+    }
+    let rest = t.series("f_rest_")?;
+    let (degree, stored) = sh_degree(rest.len(), notes)?;
+    let filter = t.column(FILTER);
+    if filter.is_some() && scale.len() < 3 {
+        return Err(format!(
+            "a column {FILTER} and no scale_2: no program is known that writes both; remove one"
+        ));
+    }
+    let mut s = Splats::with_capacity(t.rows, degree);
     for r in 0..t.rows {
         s.means.push(position.map(|c| t.at(r, c)));
-        s.log_scales.push(scale.map(|c| t.at(r, c)));
+        s.log_scales.push([0, 1, 2].map(|k| scale.get(k).map_or(f32::NEG_INFINITY, |c| t.at(r, *c))));
         s.quats.push(rotation.map(|c| t.at(r, c)));
         s.opacity_logits.push(t.at(r, opacity));
-        s.sh.extend(dc.map(|c| t.at(r, c)));
-        for k in 0..per_channel {
-            s.sh.extend([0, 1, 2].map(|channel| t.at(r, rest[channel * per_channel + k])));
+        match (&dc, &colours) {
+            (Err(_), Some(c)) => s.sh.extend(c.at(t, r).map(|v| (v - 0.5) / SH_C0)),
+            _ => s.sh.extend(dc.iter().flatten().map(|c| t.at(r, *c))),
+        }
+        for k in 0..s.sh_len() - 1 {
+            s.sh.extend([0, 1, 2].map(|channel| t.at(r, rest[channel * stored + k])));
+        }
+        if let Some(filter) = filter {
+            fold(&mut s.log_scales[r], &mut s.opacity_logits[r], t.at(r, filter));
         }
     }
+    notes.extend(ply_comments::places(&t.comments));
+    s.antialiased = ply_comments::antialiased(&t.comments, notes)?;
+    if filter.is_some() {
+        // Mip-Splatting draws with both of its filters.
+        s.antialiased = true;
+        notes.push(format!(
+            "the 3-D filter of Mip-Splatting ({FILTER}) is worked into scales and opacities; its screen filter of 0.1 px² is \
+             drawn as one of 0.3 px²"
+        ));
+    }
+    let rest = rest.iter().map(|c| t.columns[*c].0.as_str());
+    let base = colours.map_or(["f_dc_0", "f_dc_1", "f_dc_2"], |c| c.names(t));
+    notes.extend(t.unread(&COLUMNS.into_iter().chain(base).chain(rest).collect::<Vec<_>>()));
     Ok(s)
 }
 
-/// Reads positions and colours (`red green blue` of any type, or `f_dc`); confidence 1, radius 0.
-pub fn read_points(path: &Path) -> Result<PointCloud> {
-    let t = open(path)?;
-    let missing = |c| Error::input(format!("{}: no column {c}: this is not a point cloud", path.display()));
-    let position = t.all(["x", "y", "z"]).map_err(missing)?;
-    let colours = t.all(["red", "green", "blue"]).ok();
-    let dc = t.all(["f_dc_0", "f_dc_1", "f_dc_2"]).ok();
-    let mut p = PointCloud::default();
-    for r in 0..t.rows {
-        p.positions.push(position.map(|c| t.at(r, c)));
-        p.colours.push(match (colours, dc) {
-            (Some(c), _) => c.map(|c| {
-                let full =
-                    if matches!(t.columns[c].1, PropertyType::F32 | PropertyType::F64) { 1.0 } else { 255.0 };
-                (t.at(r, c) / full).clamp(0.0, 1.0)
-            }),
-            (None, Some(c)) => c.map(|c| (0.5 + crate::scene::SH_C0 * t.at(r, c)).clamp(0.0, 1.0)),
-            (None, None) => [0.5; 3],
-        });
+/// Columns that are read, but for those of the colours.
+const COLUMNS: [&str; 12] =
+    ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", FILTER];
+
+/// The columns of the scales: three, or two of 2-D Gaussians (Huang et al. 2024), whose third is 0.
+fn scales(t: &Table, notes: &mut Vec<String>) -> Result<Vec<usize>, String> {
+    if let ([_, _], None) = (t.all(["scale_0", "scale_1"])?, t.column("scale_2")) {
+        notes.push(
+            "no column scale_2: read as flat Gaussians (2DGS), of standard deviation 0 along the third axis"
+                .into(),
+        );
+        return t.all(["scale_0", "scale_1"]).map(Vec::from);
     }
-    let n = p.positions.len();
-    (p.confidence, p.view, p.radius) = (vec![1.0; n], vec![0; n], vec![0.0; n]);
-    Ok(p)
+    t.all(["scale_0", "scale_1", "scale_2"]).map(Vec::from)
+}
+
+/// Column of the 3-D smoothing filter of Mip-Splatting: a standard deviation per Gaussian.
+const FILTER: &str = "filter_3D";
+
+/// Works a 3-D filter of standard deviation f into a Gaussian (Yu et al. 2024, eq. 9): s' = √(s² + f²), o' = o ∏ s / s'.
+fn fold(log_scales: &mut [f32; 3], logit: &mut f32, filter: f32) {
+    let (mut log_ratio, variance) = (0.0, f64::from(filter).powi(2));
+    for log_scale in log_scales {
+        let s = f64::from(*log_scale).exp();
+        let widened = 0.5 * (s * s + variance).ln();
+        log_ratio += f64::from(*log_scale) - widened;
+        *log_scale = widened as f32;
+    }
+    let opacity = log_ratio.exp() / (1.0 + (-f64::from(*logit)).exp());
+    *logit = crate::format::logit(opacity as f32);
 }
 
 /// How [`write_splats`] writes.
@@ -96,7 +158,7 @@ pub fn write_splats(path: &Path, s: &Splats, options: PlyOptions) -> Result<()> 
     let mut out = std::io::BufWriter::new(file);
     let mut row: Vec<u8> = Vec::new();
     let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(Error::unwritable(path));
-    write(splat_header(s.len(), rest, &levels).as_bytes())?;
+    write(splat_header(s, rest, &levels).as_bytes())?;
     let have = s.sh_len();
     for i in 0..s.len() {
         row.clear();
@@ -134,8 +196,11 @@ fn named_levels(field: &LanguageField, n: usize) -> Result<Vec<(&'static str, &L
     }
 }
 
-fn splat_header(n: usize, rest: usize, levels: &[(&str, &LevelField)]) -> String {
+fn splat_header(s: &Splats, rest: usize, levels: &[(&str, &LevelField)]) -> String {
     let mut h = String::from("ply\nformat binary_little_endian 1.0\n");
+    if s.antialiased {
+        h.push_str(ply_comments::MIP);
+    }
     if let Some((_, first)) = levels.first() {
         let names = levels.iter().map(|l| l.0).collect::<Vec<_>>().join(",");
         let d = first.codebook.code_dim;
@@ -145,7 +210,7 @@ fn splat_header(n: usize, rest: usize, levels: &[(&str, &LevelField)]) -> String
             "comment splatvk features d={d} levels={names} codebook=language/codebook_<level>.npz"
         );
     }
-    let _ = writeln!(h, "element vertex {n}");
+    let _ = writeln!(h, "element vertex {}", s.len());
     let names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].map(String::from).into_iter();
     let names = names
         .chain((0..3 * rest).map(|k| format!("f_rest_{k}")))
@@ -183,19 +248,88 @@ fn nearest_code(level: &LevelField, i: usize) -> i32 {
     level.codebook.decode(&feature).map_or(-1, |k| k as i32)
 }
 
-/// Writes a coloured point cloud as other tools expect it: `x y z nx ny nz` float, `red green blue` uchar.
-pub fn write_points(path: &Path, p: &PointCloud) -> Result<()> {
-    let mut bytes = String::from("ply\nformat binary_little_endian 1.0\n").into_bytes();
-    let mut header = format!("element vertex {}\n", p.len());
-    ["x", "y", "z", "nx", "ny", "nz"].iter().for_each(|n| header.push_str(&format!("property float {n}\n")));
-    ["red", "green", "blue"].iter().for_each(|n| header.push_str(&format!("property uchar {n}\n")));
-    bytes.extend_from_slice(header.as_bytes());
-    bytes.extend_from_slice(b"end_header\n");
-    for (position, colour) in p.positions.iter().zip(&p.colours) {
-        for v in position.iter().chain(&[0.0; 3]) {
-            bytes.extend_from_slice(&v.to_le_bytes());
-        }
-        bytes.extend(colour.map(crate::format::to_byte));
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A text file of one Gaussian with these columns, all 0.5 but the last one, which is `last`.
+    fn read(comments: &str, columns: &str, last: f32) -> Result<(Splats, Vec<String>)> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.ply");
+        let names: Vec<&str> = columns.split(' ').collect();
+        let properties: String = names.iter().map(|n| format!("property float {n}\n")).collect();
+        let values = "0.5 ".repeat(names.len() - 1);
+        let text = format!(
+            "ply\nformat ascii 1.0\n{comments}element vertex 1\n{properties}end_header\n{values}{last}\n"
+        );
+        std::fs::write(&path, text).unwrap();
+        let mut notes = Vec::new();
+        read_noted(&path, &mut notes).map(|s| (s, notes))
     }
-    std::fs::write(path, bytes).map_err(Error::unwritable(path))
+
+    const FLAT: &str = "x y z f_dc_0 f_dc_1 f_dc_2 opacity rot_0 rot_1 rot_2 rot_3 scale_0 scale_1";
+
+    fn with(columns: &str) -> String {
+        format!("{FLAT} scale_2 {columns}").trim_end().to_owned()
+    }
+
+    #[test]
+    fn flat_gaussians_are_read_with_note() {
+        let (s, notes) = read("", FLAT, 0.25).unwrap();
+        assert_eq!(s.log_scales[0], [0.5, 0.25, f32::NEG_INFINITY]);
+        assert!(notes.len() == 1 && notes[0].contains("standard deviation 0"), "{notes:?}");
+        let (s, notes) = read("comment SplatRenderMode: default\n", &with(""), 0.25).unwrap();
+        assert!(s.log_scales[0] == [0.5, 0.5, 0.25] && !s.antialiased && notes.is_empty(), "{notes:?}");
+    }
+
+    #[test]
+    fn antialiased_comment_survives_reading_and_writing() {
+        let (s, notes) = read("comment antialiased 1\n", &with(""), 0.25).unwrap();
+        assert!(s.antialiased && notes.is_empty());
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["a.ply", "b.compressed.ply", "c.spz"] {
+            let path = folder.path().join(name);
+            crate::format::gaussians::write(&path, &s, None).unwrap();
+            let (back, _, notes) = crate::format::gaussians::read_noted(&path).unwrap();
+            assert!(back.antialiased && notes.is_empty(), "{name}: {notes:?}");
+        }
+    }
+
+    /// Yu et al. 2024, equation 9, by hand: s² = e, f² = 3.
+    #[test]
+    fn mip_splatting_filter_is_worked_in() {
+        let (s, notes) = read("", &with("filter_3D"), 3f32.sqrt()).unwrap();
+        let widened = 0.5 * (1f32.exp() + 3.0).ln();
+        assert!((s.log_scales[0][0] - widened).abs() < 1e-6, "{:?}", s.log_scales);
+        let ratio = (3.0 * (0.5 - widened)).exp();
+        let opacity = 1.0 / (1.0 + (-s.opacity_logits[0]).exp());
+        assert!((opacity - ratio / (1.0 + (-0.5f32).exp())).abs() < 1e-6);
+        assert!(s.antialiased && notes.iter().any(|n| n.contains("0.1 px²")), "{notes:?}");
+    }
+
+    #[test]
+    fn other_sh_degrees_are_named() {
+        let rest = |n: usize| (0..n).map(|k| format!("f_rest_{k}")).collect::<Vec<_>>().join(" ");
+        let (s, notes) = read("", &with(&rest(72)), 9.0).unwrap();
+        assert_eq!((s.sh_degree, s.sh.len(), s.sh.contains(&9.0)), (3, 48, false));
+        assert!(notes.len() == 1 && notes[0].contains("band 4"), "{notes:?}");
+        for (columns, words) in [(rest(10), "10 f_rest columns"), (rest(9) + " f_rest_10", "gap at f_rest_9")]
+        {
+            let e = read("", &with(&columns), 1.0).unwrap_err().to_string();
+            assert!(e.contains(words), "{e}");
+        }
+    }
+
+    #[test]
+    fn columns_that_are_not_read_are_named() {
+        let (_, notes) = read("comment Vertical Axis: z\n", &with("nx semantic_0 label"), 1.0).unwrap();
+        assert!(notes.iter().any(|n| n.ends_with("not read: columns semantic_0, label")), "{notes:?}");
+        assert!(notes.iter().any(|n| n.contains("Vertical Axis: z")) && notes.len() == 2, "{notes:?}");
+        let renamed = FLAT.replace("opacity", "opacities");
+        let e = read("", &renamed, 1.0).unwrap_err().to_string();
+        assert!(e.contains("no column opacity") && e.contains("opacities"), "{e}");
+        let coloured = with("").replace("f_dc_0 f_dc_1 f_dc_2", "red green blue");
+        let (s, _) = read("", &coloured, 1.0).unwrap();
+        assert_eq!(s.sh, [0.0; 3]);
+    }
 }

@@ -10,8 +10,8 @@ pub const BRIGHTEST: f32 = 1.0;
 /// Bytes of a Gaussian.
 const ROW: usize = 32;
 
-/// Reads a file: SH of degree 0, rotations as precise as a byte.
-pub fn read_splats(path: &Path) -> Result<Splats> {
+/// Reads a file: SH of degree 0, rotations as precise as a byte. It has nothing beside Gaussians.
+pub fn read_noted(path: &Path, _notes: &mut Vec<String>) -> Result<Splats> {
     let bytes = files::read(path)?;
     if !bytes.len().is_multiple_of(ROW) {
         return Err(Error::input(format!(

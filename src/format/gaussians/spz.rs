@@ -1,12 +1,13 @@
 //! `.spz`, Niantic's compressed splats: versions 2 and 3 (one gzip stream, or bare) and 4 (one Zstandard stream per
-//! attribute) are read, 4 is written. About a tenth of the size of a PLY.
+//! attribute) are read and written. About a tenth of the size of a PLY.
 //!
-//! The format's axes are right, up, back; files are turned by 180° about x on the way in and out. Positions are 24-bit
-//! fixed point with as many fractional bits as their extent leaves room for (the format's own tools take 12).
-use super::usable;
+//! The format's axes are right, up, back unless a file states others; files are turned by 180° about x on the way in and out.
+//! Positions are 24-bit fixed point with as many fractional bits as their extent leaves room for (the format's own tools take
+//! 12).
+use super::{ply, spz_extensions, usable};
 use crate::scene::{Splats, sh_coefficients};
 use crate::{Error, Result, files};
-use std::io::Read;
+use std::io::{Read, Write as _};
 use std::path::Path;
 
 const MAGIC: u32 = 0x5053_474e; // "NGSP"
@@ -23,9 +24,23 @@ pub const BRIGHTEST: f32 = 0.5 + crate::scene::SH_C0 * 0.5 / COLOUR_SCALE;
 /// Most Gaussians that are read, so that a damaged count does not take all memory: ten times the largest scenes shared.
 const MAX_GAUSSIANS: usize = 100_000_000;
 
+/// Most bytes of extension records: those that are known have some dozens.
+const MOST_BEHIND: u64 = 1 << 20;
+
 /// Signs of the SH coefficients when y and z turn round: the parity of each basis function in (y, z) together.
 const SH_SIGNS: [f32; 16] =
     [1.0, -1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
+
+/// Versions that are written.
+pub const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
+/// The newest version that most programs read: of the loaders of Niantic, SuperSplat and Spark (2.2) all know 3, Spark's not 4.
+pub const DEFAULT_VERSION: u32 = 3;
+
+/// Bits of the header's flags.
+const ANTIALIASED: u8 = 0x01;
+const EXTENSIONS: u8 = 0x02;
+/// Spark's: a tree of levels of detail, its opacities halved.
+const LEVELS_OF_DETAIL: u8 = 0x80;
 
 /// How a file stores what: the fields of its header.
 struct Head {
@@ -33,6 +48,7 @@ struct Head {
     count: usize,
     degree: u32,
     fraction_bits: u32,
+    flags: u8,
 }
 
 impl Head {
@@ -47,15 +63,37 @@ impl Head {
             count: word(8) as usize,
             degree: u32::from(b[12]),
             fraction_bits: u32::from(b[13]),
+            flags: b[14],
         };
-        if !(2..=4).contains(&head.version) {
-            return Err(format!("spz version {} is not supported (2 to 4 are)", head.version));
-        }
-        if head.degree > 3 || head.fraction_bits > 24 || head.count > MAX_GAUSSIANS {
+        if !VERSIONS.contains(&head.version) {
             return Err(format!(
-                "{} Gaussians of SH degree {} with {} fractional bits: not a readable .spz file",
-                head.count, head.degree, head.fraction_bits
+                "spz version {} is not known (2 to 4 are); write it as one of these",
+                head.version
             ));
+        }
+        if head.degree > 4 {
+            return Err(format!(
+                "SH degree {} is not known (0 to 4 are); export it with a lower one",
+                head.degree
+            ));
+        }
+        if head.fraction_bits > 24 {
+            return Err(format!(
+                "{} fractional bits of 24; the file is damaged, copy it again",
+                head.fraction_bits
+            ));
+        }
+        if head.count > MAX_GAUSSIANS {
+            return Err(format!("{} Gaussians, more than the {MAX_GAUSSIANS} that are read", head.count));
+        }
+        if head.flags & LEVELS_OF_DETAIL != 0 {
+            return Err(
+                "all levels of detail of Spark at once (header flag 0x80); export it without LoD".into()
+            );
+        }
+        let unknown = head.flags & !(ANTIALIASED | EXTENSIONS);
+        if unknown != 0 {
+            return Err(format!("header flags {unknown:#04x} of unknown meaning; write it again as .ply"));
         }
         Ok(head)
     }
@@ -79,25 +117,33 @@ impl Head {
     }
 }
 
-/// Reads a file.
-pub fn read_splats(path: &Path) -> Result<Splats> {
+/// Reads a file; notes name what is not read, a line each.
+pub fn read_noted(path: &Path, notes: &mut Vec<String>) -> Result<Splats> {
     let bytes = files::read(path)?;
-    parse(&bytes).map_err(|e| Error::input(format!("{}: {e}", path.display())))
+    parse(&bytes, notes).map_err(|e| Error::input(format!("{}: {e}", path.display())))
 }
 
-fn parse(bytes: &[u8]) -> Result<Splats, String> {
+fn parse(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, String> {
     if bytes.starts_with(&[0x1f, 0x8b]) {
-        let mut plain = Vec::new();
-        let mut gzip = flate2::read::GzDecoder::new(bytes);
-        // The header first: it tells how much may follow.
-        gzip.by_ref().take(HEADER as u64).read_to_end(&mut plain).map_err(broken)?;
-        let size = Head::parse(&plain)?.checked_sections(bytes.len())?.iter().sum::<usize>();
-        gzip.by_ref().take(size as u64).read_to_end(&mut plain).map_err(broken)?;
-        // The end of the stream checks the sum of what came before it.
-        gzip.read(&mut [0]).map_err(broken)?;
-        return unpack(&plain);
+        return unpack(&inflated(bytes)?, notes);
     }
-    if Head::parse(bytes)?.version >= 4 { unpack_4(bytes) } else { unpack(bytes) }
+    if Head::parse(bytes)?.version >= 4 { unpack_4(bytes, notes) } else { unpack(bytes, notes) }
+}
+
+/// The content of a gzip stream: the Gaussians, and what stands behind them within its limit.
+fn inflated(bytes: &[u8]) -> Result<Vec<u8>, String> {
+    let mut plain = Vec::new();
+    let mut gzip = flate2::read::GzDecoder::new(bytes);
+    // The header first: it tells how much may follow.
+    gzip.by_ref().take(HEADER as u64).read_to_end(&mut plain).map_err(broken)?;
+    let size = Head::parse(&plain)?.checked_sections(bytes.len())?.iter().sum::<usize>();
+    gzip.by_ref().take(size as u64).read_to_end(&mut plain).map_err(broken)?;
+    // The end of the stream checks the sum of what came before it.
+    gzip.by_ref().take(MOST_BEHIND).read_to_end(&mut plain).map_err(broken)?;
+    match gzip.read(&mut [0]).map_err(broken)? {
+        0 => Ok(plain),
+        _ => Err(format!("holds more than {MOST_BEHIND} bytes behind its Gaussians; write it again")),
+    }
 }
 
 fn broken(e: impl std::fmt::Display) -> String {
@@ -105,7 +151,7 @@ fn broken(e: impl std::fmt::Display) -> String {
 }
 
 /// Versions 2 and 3 after decompression.
-fn unpack(bytes: &[u8]) -> Result<Splats, String> {
+fn unpack(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, String> {
     let head = Head::parse(bytes)?;
     if head.version >= 4 {
         return Err("version 4 inside of gzip is not valid".into());
@@ -116,10 +162,20 @@ fn unpack(bytes: &[u8]) -> Result<Splats, String> {
         *part = rest.get(..size).ok_or("the file ends early; copy it again")?;
         rest = &rest[size..];
     }
-    Ok(splats(&head, parts))
+    placed(&head, splats(&head, parts, notes), rest, notes)
 }
 
-fn unpack_4(bytes: &[u8]) -> Result<Splats, String> {
+/// Gaussians in the axes of the scene, by the extensions of their file.
+fn placed(head: &Head, mut s: Splats, extensions: &[u8], notes: &mut Vec<String>) -> Result<Splats, String> {
+    match (head.flags & EXTENSIONS != 0, extensions.len()) {
+        (true, _) => spz_extensions::apply(&mut s, extensions, notes)?,
+        (false, 0) => {}
+        (false, more) => notes.push(format!("{more} bytes beside its Gaussians are not read")),
+    }
+    Ok(s)
+}
+
+fn unpack_4(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, String> {
     let head = Head::parse(bytes)?;
     let early = || "the file ends early; copy it again".to_string();
     let word = |at: usize| -> Result<u64, String> {
@@ -128,6 +184,8 @@ fn unpack_4(bytes: &[u8]) -> Result<Splats, String> {
     };
     let streams = usize::from(*bytes.get(15).ok_or_else(early)?);
     let table = (word(16)? & 0xffff_ffff) as usize;
+    let extensions =
+        bytes.get(HEADER_4..table).ok_or("its table begins inside of its header; copy it again")?;
     // Empty attributes have no stream.
     let sizes = head.checked_sections(bytes.len())?;
     let wanted = sizes.iter().filter(|s| **s > 0).count();
@@ -147,21 +205,29 @@ fn unpack_4(bytes: &[u8]) -> Result<Splats, String> {
         if part.len() != size {
             return Err(early());
         }
+        if decoder.read(&mut [0]).map_err(broken)? != 0 {
+            return Err("a stream holds more than its Gaussians; copy the file again".into());
+        }
         (at, stream) = (end, stream + 1);
     }
-    Ok(splats(&head, [0, 1, 2, 3, 4, 5].map(|k| parts[k].as_slice())))
+    let s = splats(&head, [0, 1, 2, 3, 4, 5].map(|k| parts[k].as_slice()), notes);
+    placed(&head, s, extensions, notes)
 }
 
-fn splats(head: &Head, [positions, alphas, colours, scales, rotations, sh]: [&[u8]; 6]) -> Splats {
+fn splats(head: &Head, parts: [&[u8]; 6], notes: &mut Vec<String>) -> Splats {
+    let [positions, alphas, colours, scales, rotations, sh] = parts;
     let unit = 1.0 / (1u32 << head.fraction_bits) as f32;
     // The upper bytes of an i32, shifted down with the sign.
     let fixed = |b: &[u8]| (i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) as f32 * unit;
     let mean = |b: &[u8]| [fixed(&b[..3]), -fixed(&b[3..6]), -fixed(&b[6..9])];
-    let rest = sh_coefficients(head.degree) - 1;
+    let degree = head.degree.min(ply::MOST_DEGREE);
+    notes.extend((degree < head.degree).then(|| ply::beyond_degree(head.degree)));
+    // Bands follow each other, so the first coefficients are those of the lower degree.
+    let (stored, rest) = (sh_coefficients(head.degree) - 1, sh_coefficients(degree) - 1);
     let mut all = Vec::with_capacity(head.count * 3 * (rest + 1));
     for (i, c) in colours.chunks_exact(3).enumerate() {
         all.extend(c.iter().map(|v| (f32::from(*v) / 255.0 - 0.5) / COLOUR_SCALE));
-        let own = &sh[i * 3 * rest..(i + 1) * 3 * rest];
+        let own = &sh[i * 3 * stored..][..3 * rest];
         all.extend(
             own.iter().enumerate().map(|(k, v)| SH_SIGNS[1 + k / 3] * (f32::from(*v) - 128.0) / 128.0),
         );
@@ -176,8 +242,9 @@ fn splats(head: &Head, [positions, alphas, colours, scales, rotations, sh]: [&[u
             .collect(),
         quats: rotations.chunks_exact(width).map(|b| turned(rotation(b))).collect(),
         opacity_logits: alphas.iter().map(|a| crate::format::logit(f32::from(*a) / 255.0)).collect(),
-        sh_degree: head.degree,
+        sh_degree: degree,
         sh: all,
+        antialiased: head.flags & ANTIALIASED != 0,
     }
 }
 
@@ -190,6 +257,13 @@ fn turned([w, x, y, z]: [f32; 4]) -> [f32; 4] {
 fn first_three(b: &[u8]) -> [f32; 4] {
     let [x, y, z] = [0, 1, 2].map(|k| f32::from(b[k]) / 127.5 - 1.0);
     [(1.0 - x * x - y * y - z * z).max(0.0).sqrt(), x, y, z]
+}
+
+fn pack_three(q: [f32; 4]) -> [u8; 3] {
+    let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+    // q and −q are one rotation; w is read as positive.
+    let sign = q[0].signum() / norm;
+    [1, 2, 3].map(|k| byte((q[k] * sign + 1.0) * 127.5))
 }
 
 /// Largest magnitude of a component that is not the largest one.
@@ -229,38 +303,65 @@ fn pack_rotation([w, x, y, z]: [f32; 4]) -> [u8; 4] {
     bits.to_le_bytes()
 }
 
-/// Writes version 4, in the order of the scene.
-pub fn write_splats(path: &Path, s: &Splats) -> Result<()> {
+/// Writes one of [`VERSIONS`], in the order of the scene.
+pub fn write_splats(path: &Path, s: &Splats, version: u32) -> Result<()> {
     usable::check_written(s)?;
-    let bad = |what: String| Error::work(format!("{}: {what}", path.display()));
+    if !VERSIONS.contains(&version) {
+        return Err(Error::input(format!("spz version {version} is not known; give 2, 3 or 4")));
+    }
     let bits = fraction_bits(s).ok_or_else(|| {
-        bad("the scene reaches farther than the format's 24 bits; write a .ply instead".to_owned())
+        Error::input(format!(
+            "the scene reaches {:.1e} units from its origin and .spz ends at {FIXED_MAX:.1e}; leave out what no photo shows \
+             (--only-seen) or write another format (--format ply)",
+            widest(s)
+        ))
     })?;
-    let head = Head { version: 4, count: s.len(), degree: s.sh_degree, fraction_bits: bits };
-    let sections: Vec<Vec<u8>> = pack(s, bits).into_iter().filter(|p| !p.is_empty()).collect();
-    let count = u32::try_from(head.count).map_err(|_| bad("too many Gaussians for the format".to_owned()))?;
+    let count = u32::try_from(s.len())
+        .map_err(|_| Error::input("too many Gaussians for .spz; write another format (--format ply)"))?;
+    let sections: Vec<Vec<u8>> = pack(s, bits, version).into_iter().filter(|p| !p.is_empty()).collect();
     let mut out = Vec::new();
-    for word in [MAGIC, head.version, count] {
+    for word in [MAGIC, version, count] {
         out.extend(word.to_le_bytes());
     }
-    // SH degree, fractional bits, no flags, number of streams.
-    out.extend([head.degree as u8, bits as u8, 0, sections.len() as u8]);
+    let flags = if s.antialiased { ANTIALIASED } else { 0 };
+    // Only version 4 has streams to count.
+    let streams = if version >= 4 { sections.len() as u8 } else { 0 };
+    out.extend([s.sh_degree as u8, bits as u8, flags, streams]);
+    let out = if version >= 4 { streams_of(out, &sections) } else { gzip_of(out, &sections) };
+    std::fs::write(path, out.map_err(Error::unwritable(path))?).map_err(Error::unwritable(path))
+}
+
+/// Versions 2 and 3: everything in one stream.
+fn gzip_of(mut plain: Vec<u8>, sections: &[Vec<u8>]) -> std::io::Result<Vec<u8>> {
+    sections.iter().for_each(|p| plain.extend_from_slice(p));
+    let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::default());
+    gzip.write_all(&plain)?;
+    gzip.finish()
+}
+
+/// Version 4: a table of streams, then one per attribute.
+fn streams_of(mut out: Vec<u8>, sections: &[Vec<u8>]) -> std::io::Result<Vec<u8>> {
     out.extend((HEADER_4 as u32).to_le_bytes());
     out.resize(HEADER_4, 0);
     let level = ruzstd::encoding::CompressionLevel::Fastest;
     let packed: Vec<Vec<u8>> =
         sections.iter().map(|p| ruzstd::encoding::compress_to_vec(p.as_slice(), level)).collect();
-    for (packed, plain) in packed.iter().zip(&sections) {
+    for (packed, plain) in packed.iter().zip(sections) {
         out.extend((packed.len() as u64).to_le_bytes());
         out.extend((plain.len() as u64).to_le_bytes());
     }
     packed.iter().for_each(|p| out.extend_from_slice(p));
-    std::fs::write(path, out).map_err(Error::unwritable(path))
+    Ok(out)
+}
+
+/// Largest coordinate.
+fn widest(s: &Splats) -> f32 {
+    s.means.as_flattened().iter().fold(0.0f32, |m, v| m.max(v.abs()))
 }
 
 /// The most fractional bits, up to 24, with which all positions fit.
 fn fraction_bits(s: &Splats) -> Option<u32> {
-    let widest = s.means.as_flattened().iter().fold(0.0f32, |m, v| m.max(v.abs()));
+    let widest = widest(s);
     (0..=24).rev().find(|b| widest * (1u32 << b) as f32 <= FIXED_MAX)
 }
 
@@ -268,7 +369,7 @@ fn byte(v: f32) -> u8 {
     v.round().clamp(0.0, 255.0) as u8
 }
 
-fn pack(s: &Splats, bits: u32) -> [Vec<u8>; 6] {
+fn pack(s: &Splats, bits: u32, version: u32) -> [Vec<u8>; 6] {
     let mut parts: [Vec<u8>; 6] = Default::default();
     let scale = (1u32 << bits) as f32;
     let width = 3 * s.sh_len();
@@ -282,9 +383,100 @@ fn pack(s: &Splats, bits: u32) -> [Vec<u8>; 6] {
         let sh = &s.sh[i * width..(i + 1) * width];
         parts[2].extend(sh[..3].iter().map(|v| byte((v * COLOUR_SCALE + 0.5) * 255.0)));
         parts[3].extend(s.log_scales[i].map(|v| byte((v + 10.0) * 16.0)));
-        parts[4].extend(pack_rotation(turned(s.quats[i])));
+        let rotation = turned(s.quats[i]);
+        match version {
+            2 => parts[4].extend(pack_three(rotation)),
+            _ => parts[4].extend(pack_rotation(rotation)),
+        }
         let rest = sh[3..].iter().enumerate();
         parts[5].extend(rest.map(|(k, v)| byte(SH_SIGNS[1 + k / 3] * v * 128.0 + 128.0)));
     }
     parts
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pass::seeded;
+
+    /// A bare file of version 3 with a header that `change` changes, and what follows its Gaussians.
+    fn read(change: impl FnOnce(&mut Vec<u8>), behind: &[u8]) -> Result<(Splats, Vec<String>), String> {
+        let s = seeded::small(5, 32, 24, 3, 1002).0;
+        let mut bytes = Vec::new();
+        for word in [MAGIC, 3, 5] {
+            bytes.extend(word.to_le_bytes());
+        }
+        bytes.extend([3, 12, 0, 0]);
+        pack(&s, 12, 3).iter().for_each(|part| bytes.extend(part));
+        change(&mut bytes);
+        bytes.extend(behind);
+        let mut notes = Vec::new();
+        parse(&bytes, &mut notes).map(|s| (s, notes))
+    }
+
+    #[test]
+    fn header_flags_are_used_or_refused() {
+        let (plain, notes) = read(|_| {}, &[]).unwrap();
+        assert!(!plain.antialiased && notes.is_empty());
+        let (s, notes) = read(|b| b[14] = 1, &[]).unwrap();
+        assert!(s == Splats { antialiased: true, ..plain } && notes.is_empty());
+        for (flags, words) in [(0x80, "LoD"), (0x81, "LoD"), (0x04, "flags 0x04"), (0x43, "flags 0x40")] {
+            let e = read(|b| b[14] = flags, &[]).unwrap_err();
+            assert!(e.contains(words), "{flags:#x}: {e}");
+        }
+        assert!(read(|b| b[12] = 5, &[]).unwrap_err().contains("SH degree 5"));
+        assert!(read(|b| b[13] = 30, &[]).unwrap_err().contains("30 fractional bits"));
+        assert!(read(|b| b[4] = 7, &[]).unwrap_err().contains("version 7"));
+    }
+
+    #[test]
+    fn fourth_sh_band_is_left_out_with_note() {
+        let (plain, _) = read(|_| {}, &[]).unwrap();
+        // Each Gaussian's 15 coefficients, then the nine of band 4.
+        let (s, notes) = read(
+            |b| {
+                let first = b.len() - 5 * 45;
+                let sh = b.split_off(first);
+                b[12] = 4;
+                sh.chunks(45).for_each(|own| b.extend(own.iter().chain(&[200; 27])));
+            },
+            &[],
+        )
+        .unwrap();
+        assert_eq!(s, plain);
+        assert!(notes.len() == 1 && notes[0].contains("band 4"), "{notes:?}");
+    }
+
+    #[test]
+    fn what_stands_behind_gaussians_is_bounded() {
+        let (_, notes) = read(|_| {}, &[7; 9]).unwrap();
+        assert!(notes[0].contains("9 bytes"), "{notes:?}");
+        let mut bytes = Vec::new();
+        assert!(read(|b| bytes = b.clone(), &[]).is_ok());
+        let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        gzip.write_all(&bytes).unwrap();
+        (0..80).for_each(|_| gzip.write_all(&[0; 1 << 20]).unwrap());
+        let e = parse(&gzip.finish().unwrap(), &mut Vec::new()).unwrap_err();
+        assert!(e.contains("bytes behind its Gaussians"), "{e}");
+    }
+
+    #[test]
+    fn every_version_is_read_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.spz");
+        let s = Splats { antialiased: true, ..seeded::small(50, 32, 24, 2, 1003).0 };
+        for version in VERSIONS {
+            write_splats(&path, &s, version).unwrap();
+            let mut notes = Vec::new();
+            let back = read_noted(&path, &mut notes).unwrap();
+            assert!(back.antialiased && back.len() == 50 && notes.is_empty(), "{version}: {notes:?}");
+            for (a, b) in s.quats.iter().zip(&back.quats) {
+                let norm = a.iter().map(|v| v * v).sum::<f32>().sqrt();
+                let dot = a.iter().zip(b).map(|(x, y)| x * y).sum::<f32>() / norm;
+                // In version 2 w is what the others leave, so half a step of theirs moves a w near 0 by a tenth.
+                assert!(dot.abs() > if version == 2 { 0.99 } else { 0.99999 }, "{version}: {dot}");
+            }
+        }
+        assert!(write_splats(&path, &s, 5).unwrap_err().to_string().contains("version 5"));
+    }
 }

@@ -1,4 +1,4 @@
-//! Which Gaussians are read and written: those that can be computed with.
+//! Which Gaussians are read and written: those that can be computed with; and how notes on a file are shown.
 use crate::scene::{LanguageField, Splats};
 use crate::{Error, Result};
 use std::path::Path;
@@ -33,7 +33,8 @@ pub(super) fn keep(
     mut s: Splats,
     language: Option<LanguageField>,
     path: &Path,
-) -> Result<(Splats, Option<LanguageField>, Option<String>)> {
+    notes: &mut Vec<String>,
+) -> Result<(Splats, Option<LanguageField>)> {
     let smallest = f32::MIN_POSITIVE.ln();
     s.log_scales
         .as_flattened_mut()
@@ -42,18 +43,53 @@ pub(super) fn keep(
         .for_each(|v| *v = smallest);
     let (clear, solid) = (crate::format::logit(0.0), crate::format::logit(1.0));
     s.opacity_logits.iter_mut().filter(|v| v.is_infinite()).for_each(|v| *v = v.clamp(clear, solid));
-    let Some((count, first)) = unusable(&s) else { return Ok((s, language, None)) };
-    let (path, all) = (path.display(), s.len());
+    let Some((count, first)) = unusable(&s) else { return Ok((s, language)) };
+    let all = s.len();
     if count == all {
         return Err(Error::input(format!(
-            "{path}: all its {all} Gaussians have {WHY}; it is damaged or of another format"
+            "{}: all its {all} Gaussians have {WHY}; it is damaged or of another format",
+            path.display()
         )));
     }
     let rows: Vec<usize> = (0..all).filter(|i| is_usable(&s, *i)).collect();
-    let note = format!(
-        "{path}: {count} of {all} Gaussians are left out, the first is number {first}: they have {WHY}"
-    );
-    Ok((s.picked(&rows), language.map(|l| l.picked(&rows, all)), Some(note)))
+    notes.push(format!(
+        "{count} of {all} Gaussians are left out, the first is number {first}: they have {WHY}"
+    ));
+    Ok((s.picked(&rows), language.map(|l| l.picked(&rows, all))))
+}
+
+/// Most notes on one file.
+const MOST_NOTES: usize = 20;
+
+/// Notes on a file as they are shown: with its name, and not without end.
+pub(super) fn finished(mut notes: Vec<String>, path: &Path) -> Vec<String> {
+    let more = notes.len().saturating_sub(MOST_NOTES);
+    notes.truncate(MOST_NOTES);
+    notes.extend((more > 0).then(|| format!("and {more} more such notes")));
+    notes.into_iter().map(|note| format!("{}: {note}", path.display())).collect()
+}
+
+/// Share of the extent below which the step between two coordinates may be: a pixel of a picture of the whole scene is a
+/// thousand times as large.
+const FINEST_STEP: f32 = 1e-6;
+
+/// A note where coordinates are so large against their extent that single precision is too coarse for them, as those of maps are.
+pub(super) fn precision(positions: &[[f32; 3]]) -> Option<String> {
+    let finite = || positions.iter().filter(|p| p.iter().all(|v| v.abs() <= GREATEST));
+    let mut bounds = [[f32::INFINITY, f32::NEG_INFINITY]; 3];
+    for position in finite() {
+        for (bound, v) in bounds.iter_mut().zip(position) {
+            *bound = [bound[0].min(*v), bound[1].max(*v)];
+        }
+    }
+    let extent = bounds.iter().fold(0f32, |m, [low, high]| m.max(high - low));
+    let greatest = bounds.iter().flatten().filter(|v| v.is_finite()).fold(0f32, |m, v| m.max(v.abs()));
+    let step = greatest * f32::EPSILON;
+    (extent > 0.0 && step > FINEST_STEP * extent).then(|| {
+        format!(
+            "coordinates of up to {greatest} over an extent of {extent} are held to {step:.1e} only: subtract an offset before"
+        )
+    })
 }
 
 /// Refuses to read a scene of this program's with Gaussians that are not usable.
@@ -79,7 +115,7 @@ fn refuse(s: &Splats) -> Result<(), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::format::gaussians::{FORMATS, read_counted};
+    use crate::format::gaussians::{FORMATS, read_noted};
     use crate::scene::LevelField;
 
     fn four() -> Splats {
@@ -90,6 +126,7 @@ mod tests {
             opacity_logits: vec![0.5; 4],
             sh_degree: 0,
             sh: vec![0.1; 12],
+            antialiased: false,
         }
     }
 
@@ -111,22 +148,24 @@ mod tests {
             assert!(check_written(&s).unwrap_err().to_string().contains("the first is number 2"));
             let level = LevelField { features: vec![0.0, 1.0, 2.0, 3.0], ..LevelField::default() };
             let field = LanguageField { levels: vec![level], ..LanguageField::default() };
-            let (kept, language, note) = keep(s, Some(field), Path::new("a.ply")).unwrap();
+            let mut notes = Vec::new();
+            let (kept, language) = keep(s, Some(field), Path::new("a.ply"), &mut notes).unwrap();
             assert_eq!(kept, four().picked(&[0, 1, 3]));
             assert_eq!(language.unwrap().levels[0].features, [0.0, 1.0, 3.0]);
-            assert!(note.unwrap().contains("a.ply: 1 of 4 Gaussians are left out, the first is number 2"));
+            assert!(notes[0].contains("1 of 4 Gaussians are left out, the first is number 2"));
         }
         let mut all = four();
         all.means.iter_mut().for_each(|m| m[0] = f32::NAN);
-        assert_eq!(keep(all, None, Path::new("a.ply")).unwrap_err().exit_code(), 2);
+        assert_eq!(keep(all, None, Path::new("a.ply"), &mut Vec::new()).unwrap_err().exit_code(), 2);
     }
 
     #[test]
     fn flat_and_solid_ones_are_kept() {
         let mut s = four();
         (s.log_scales[0][2], s.opacity_logits[1]) = (f32::NEG_INFINITY, f32::INFINITY);
-        let (kept, _, note) = keep(s, None, Path::new("a.ply")).unwrap();
-        assert!(note.is_none() && unusable(&kept).is_none() && kept.len() == 4);
+        let mut notes = Vec::new();
+        let (kept, _) = keep(s, None, Path::new("a.ply"), &mut notes).unwrap();
+        assert!(notes.is_empty() && unusable(&kept).is_none() && kept.len() == 4);
         assert!(kept.opacity_logits[1] > 10.0 && kept.log_scales[0][2] < -80.0);
     }
 
@@ -142,8 +181,8 @@ mod tests {
                 s.means[0] = [8e6, -8e6, 3.0];
             }
             super::super::write(&path, &s, None).unwrap();
-            let (back, _, note) = read_counted(&path).unwrap();
-            assert!(back.len() == 4 && note.is_none(), "{}: {note:?}", format.name);
+            let (back, _, notes) = read_noted(&path).unwrap();
+            assert!(back.len() == 4 && notes.is_empty(), "{}: {notes:?}", format.name);
             s.means[3][1] = f32::NAN;
             std::fs::remove_file(&path).unwrap();
             let e = super::super::write(&path, &s, None).unwrap_err().to_string();

@@ -4,7 +4,7 @@
 //!
 //! | what | type | meaning |
 //! |---|---|---|
-//! | head | `SVKVIEW1`, u32 × 4 | N, SH degree, L, 1 if the last row is there |
+//! | head | `SVKVIEW1`, u32 × 4 | N, SH degree, L, flags: 1 if the last row is there, 2 if the splats are antialiased |
 //! | SH scale | f32 × 3 | largest absolute coefficient of degrees 1, 2, 3 |
 //! | ranges | f32 × 10 per block | lowest and highest x, y, z; log scale; colour |
 //! | x, y, z | u16 × N each | position in the block's range |
@@ -124,7 +124,8 @@ fn write(splats: &Splats, seen: &Seen, levels: &[&LevelField], order: &[usize]) 
     };
     let scales = sh_scales(splats, order, rest);
     let mut out = MAGIC.to_vec();
-    for v in [order.len() as u32, splats.sh_degree, levels.len() as u32, u32::from(seen.unseen() > 0)] {
+    let flags = u32::from(seen.unseen() > 0) | u32::from(splats.antialiased) << 1;
+    for v in [order.len() as u32, splats.sh_degree, levels.len() as u32, flags] {
         out.extend(v.to_le_bytes());
     }
     scales.iter().chain(ranges.iter().flatten().flatten()).for_each(|v| out.extend(v.to_le_bytes()));

@@ -7,7 +7,7 @@ const DILATION = 0.3, ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.99, VOID_ALPHA = 0.5;
 export function pick(splats, camera, x, y, width, height, near) {
   const [fx, fy, cx, cy] = camera.intrinsics(width, height);
   const r = camera.rotation, t = camera.translation;
-  const { positions, logScales, quats, opacity } = splats;
+  const { positions, logScales, quats, opacity, antialiased } = splats;
   const hits = [];
   // As in projection: the Jacobian is taken at most 15 % of the image beyond its border.
   const limits = [[-(cx + 0.15 * width) / fx, (1.15 * width - cx) / fx], [-(cy + 0.15 * height) / fy, (1.15 * height - cy) / fy]];
@@ -23,7 +23,7 @@ export function pick(splats, camera, x, y, width, height, near) {
     const s = Math.exp(Math.max(logScales[3 * i], logScales[3 * i + 1], logScales[3 * i + 2]));
     const reach = 3.4 * Math.sqrt((Math.max(fx, fy) * s / z) ** 2 * (1 + lu * lu + lv * lv) + DILATION);
     if (dx * dx + dy * dy > reach * reach) continue;
-    const alpha = alphaAt(i, dx, dy, lu, lv, z, fx, fy, r, logScales, quats, opacity);
+    const alpha = alphaAt(i, dx, dy, lu, lv, z, fx, fy, r, logScales, quats, opacity, antialiased);
     if (alpha >= ALPHA_MIN) hits.push([z, alpha, i]);
   }
   hits.sort((a, b) => a[0] - b[0]);
@@ -41,7 +41,7 @@ export function pick(splats, camera, x, y, width, height, near) {
   return { depth: depth / (1 - light), codes: votes.map(best) };
 }
 
-function alphaAt(i, dx, dy, u, v, z, fx, fy, r, logScales, quats, opacity) {
+function alphaAt(i, dx, dy, u, v, z, fx, fy, r, logScales, quats, opacity, antialiased) {
   const [w, a, b, c] = quats.subarray(4 * i, 4 * i + 4);
   // Columns of the splat's axes in the world, scaled.
   const axes = [
@@ -59,6 +59,8 @@ function alphaAt(i, dx, dy, u, v, z, fx, fy, r, logScales, quats, opacity) {
     yy += jy * jy;
   }
   const det = xx * yy - xy * xy;
+  const undilated = (xx - DILATION) * (yy - DILATION) - xy * xy;
+  const own = antialiased ? opacity[i] * Math.sqrt(Math.max(undilated, 0) / det) : opacity[i];
   const power = -0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / det;
-  return Math.min(ALPHA_MAX, opacity[i] * Math.exp(power));
+  return Math.min(ALPHA_MAX, own * Math.exp(power));
 }

@@ -11,7 +11,7 @@ uniform usampler2D codes;    // code + 1 per level
 uniform sampler2D sh;        // (degree + 1)² − 1 texels per splat, -1..1 of shScale
 uniform sampler2D table;     // per level two rows: (label colour, selected), (relevancy, answers)
 uniform vec3 shScale;
-uniform int shCount, mode, level, selecting;
+uniform int shCount, mode, level, selecting, antialiased;
 uniform mat3 rotation;       // world to camera
 uniform vec3 translation, position;
 uniform vec4 intrinsics;     // fx, fy, cx, cy in pixels
@@ -72,7 +72,13 @@ void main() {
   vec3 row2 = vec3(m[0].z, m[1].z, m[2].z);
   vec3 b0 = focal.x / t.z * (vec3(m[0].x, m[1].x, m[2].x) - limited.x * row2);
   vec3 b1 = focal.y / t.z * (vec3(m[0].y, m[1].y, m[2].y) - limited.y * row2);
+  vec3 area = cross(b0, b1);
   float xx = dot(b0, b0) + DILATION, yy = dot(b1, b1) + DILATION, xy = dot(b0, b1);
+  if (antialiased == 1) {
+    float undilated = dot(area, area);
+    opacity *= sqrt(undilated / (undilated + DILATION * (xx + yy - DILATION)));
+    if (opacity < ALPHA_MIN) return;
+  }
   float middle = 0.5 * (xx + yy), spread = length(vec2(0.5 * (xx - yy), xy));
   float major = middle + spread, minor = max(middle - spread, 1e-6);
   vec2 along = abs(xy) > 1e-6 * major ? normalize(vec2(xy, major - xx)) : xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
@@ -245,6 +251,7 @@ export class Renderer {
       return out;
     }, gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT);
     this.shScale = splats.shScale;
+    this.antialiased = splats.antialiased;
     this.shCount = splats.sh ? (splats.degree + 1) ** 2 - 1 : 0;
     const sh = this.filled(n * this.shCount, (texels) => {
       const out = new Int8Array(4 * texels);
@@ -311,6 +318,7 @@ export class Renderer {
     });
     gl.uniform3fv(at.shScale, this.shScale);
     gl.uniform1i(at.shCount, this.shCount);
+    gl.uniform1i(at.antialiased, this.antialiased ? 1 : 0);
     gl.uniform1i(at.mode, MODES[mode]);
     gl.uniform1i(at.level, level);
     gl.uniform1i(at.selecting, selecting ? 1 : 0);

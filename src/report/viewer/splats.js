@@ -21,11 +21,12 @@ export function half(value) {
 
 /// {count, degree, positions [N, 3], logScales [N, 3], quats [N, 4], packedQuats [N] as in the file, opacity [N],
 /// colours [N, 3], shScale [3],
-/// sh: Int8Array [N, R, 3] or null, codes: [L] x Uint16Array [N], unseen: Uint8Array [N] or null}
+/// sh: Int8Array [N, R, 3] or null, codes: [L] x Uint16Array [N], unseen: Uint8Array [N] or null,
+/// antialiased: whether opacities are meant with the 2-D Mip filter}
 export function unpack(buffer) {
   const view = new DataView(buffer), bytes = new Uint8Array(buffer);
   if (new TextDecoder().decode(bytes.subarray(0, 8)) !== "SVKVIEW1") throw new Error("the scene data is damaged");
-  const [n, degree, levels, flagged] = [8, 12, 16, 20].map((at) => view.getUint32(at, true));
+  const [n, degree, levels, flags] = [8, 12, 16, 20].map((at) => view.getUint32(at, true));
   const shScale = [24, 28, 32].map((at) => view.getFloat32(at, true));
   const blocks = Math.ceil(n / BLOCK);
   const ranges = new Float32Array(buffer, 36, blocks * 10);
@@ -75,6 +76,7 @@ export function unpack(buffer) {
   }
   const codes = [];
   for (let l = 0; l < levels; l++, at += 2 * n) codes.push(new Uint16Array(buffer.slice(at, at + 2 * n)));
-  const unseen = flagged ? bytes.subarray(at, at + n) : null;
-  return { count: n, degree, positions, logScales, quats, packedQuats, opacity, colours, shScale, sh, codes, unseen };
+  const unseen = flags & 1 ? bytes.subarray(at, at + n) : null;
+  const antialiased = (flags & 2) !== 0;
+  return { count: n, degree, positions, logScales, quats, packedQuats, opacity, colours, shScale, sh, codes, unseen, antialiased };
 }

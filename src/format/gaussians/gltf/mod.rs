@@ -10,9 +10,11 @@
 //! | `COLOR_0` | VEC4 | for programs without the extension: linear base colour, opacity |
 //!
 //! glTF's axes are right, up, back; files are turned by 180° about x on the way in and out.
+mod buffers;
+mod extensions;
 mod layout;
 mod read;
 mod write;
 
-pub use read::read_splats;
+pub use read::read_noted;
 pub use write::{write_glb, write_gltf};

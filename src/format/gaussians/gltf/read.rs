@@ -1,14 +1,15 @@
 //! Reading: every primitive of the default scene that has the extension, moved by the nodes above it.
+use super::buffers::contents;
+use super::extensions::{self, Refused};
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
+use crate::format::gaussians::ply;
 use crate::format::{logit, transform};
 use crate::scene::{Similarity, Splats, sh_coefficients};
 use crate::{Error, Result, files};
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::Deserialize;
-use std::collections::BTreeMap;
-use std::path::{Component as Step, Path};
+use std::collections::{BTreeMap, HashSet};
+use std::path::Path;
 
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
@@ -28,6 +29,8 @@ struct Root {
     buffers: Vec<Buffer>,
     #[serde(default)]
     extensions_required: Vec<String>,
+    #[serde(default)]
+    extensions_used: Vec<String>,
 }
 
 #[derive(Deserialize)]
@@ -46,6 +49,8 @@ struct Node {
     translation: Option<Box<[f64; 3]>>,
     rotation: Option<Box<[f64; 4]>>,
     scale: Option<Box<[f64; 3]>>,
+    #[serde(default)]
+    extensions: Refused,
 }
 
 #[derive(Deserialize)]
@@ -85,30 +90,31 @@ struct BufferView {
     byte_offset: usize,
     byte_length: usize,
     byte_stride: Option<usize>,
+    #[serde(default)]
+    extensions: Refused,
 }
 
 #[derive(Deserialize)]
-struct Buffer {
-    uri: Option<String>,
+pub(super) struct Buffer {
+    pub uri: Option<String>,
 }
 
 /// Most nodes: scenes of Gaussians have a handful, and a node takes 200 bytes while it is visited.
 const MOST_NODES: usize = 100_000;
 
 /// Reads a `.glb` or `.gltf`: scene axes, SH of the highest degree that any part has. Buffers outside of the file are read
-/// from its own folder only.
-pub fn read_splats(path: &Path) -> Result<Splats> {
+/// from its own folder only. Notes name what is not read, a line each.
+pub fn read_noted(path: &Path, notes: &mut Vec<String>) -> Result<Splats> {
     let bytes = files::read(path)?;
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    parse(&bytes, folder).map_err(|e| Error::input(format!("{}: {e}", path.display())))
+    parse(&bytes, folder, notes).map_err(|e| Error::input(format!("{}: {e}", path.display())))
 }
 
-fn parse(bytes: &[u8], folder: &Path) -> Result<Splats, String> {
+fn parse(bytes: &[u8], folder: &Path, notes: &mut Vec<String>) -> Result<Splats, String> {
     let (text, bin) = chunks(bytes)?;
     let root: Root = files::parse_json(text).map_err(|e| format!("not a glTF document ({e})"))?;
-    if let Some(other) = root.extensions_required.iter().find(|e| *e != EXTENSION) {
-        return Err(format!("needs the extension {other}, which splatvk does not know; export it without"));
-    }
+    root.extensions_required.iter().try_for_each(|name| extensions::required(name))?;
+    notes.extend(root.extensions_used.iter().filter_map(|name| extensions::note(name)));
     let document = Document { buffers: contents(&root.buffers, folder)?, root: &root, bin };
     let placed = document.placed()?;
     let degrees = placed.iter().map(|(p, _)| Document::sh_degree(p));
@@ -116,6 +122,17 @@ fn parse(bytes: &[u8], folder: &Path) -> Result<Splats, String> {
         .max()
         .ok_or_else(|| format!("no part of it has the extension {EXTENSION}: not a file of Gaussians"))?;
     document.check_size(&placed, sh_degree, bytes.len())?;
+    let mut seen = HashSet::new();
+    // Nodes may show a primitive several times.
+    for (primitive, _) in placed.iter().filter(|(p, _)| seen.insert(std::ptr::from_ref(*p))) {
+        extensions::check(&primitive.extensions[EXTENSION], notes)?;
+        notes.extend(unread(primitive));
+    }
+    let others = root.meshes.iter().flat_map(|m| &m.primitives);
+    let others = others.filter(|p| !p.extensions.contains_key(EXTENSION)).count();
+    if others > 0 {
+        notes.push(format!("{others} meshes without Gaussians are not read"));
+    }
     let mut all = Splats { sh_degree, ..Splats::default() };
     for (primitive, by) in placed {
         let mut part = document.primitive(primitive, sh_degree)?;
@@ -156,40 +173,6 @@ fn chunks(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), String> {
     let next = 20 + text.len();
     let bin = if next < bytes.len() { Some(chunk(next, BIN_CHUNK)?) } else { None };
     Ok((text, bin))
-}
-
-/// What the addresses of buffers lead to, each once.
-fn contents<'a>(buffers: &'a [Buffer], folder: &Path) -> Result<BTreeMap<&'a str, Vec<u8>>, String> {
-    let mut all = BTreeMap::new();
-    for uri in buffers.iter().filter_map(|b| b.uri.as_deref()) {
-        if !all.contains_key(uri) {
-            all.insert(uri, content(uri, folder)?);
-        }
-    }
-    Ok(all)
-}
-
-fn content(uri: &str, folder: &Path) -> Result<Vec<u8>, String> {
-    if let Some(data) = uri.strip_prefix("data:") {
-        let body = data.split_once(";base64,").ok_or("a buffer inside of the file is not base64")?.1;
-        return STANDARD.decode(body).map_err(|e| format!("damaged base64 ({e}); copy the file again"));
-    }
-    if uri.contains("://") {
-        return Err(format!("its buffer {uri} is not a local file; download it and give its name"));
-    }
-    let outside = || format!("its buffer {uri} is outside of the file's folder; put it beside the file");
-    if uri.contains('\\') || Path::new(uri).components().any(|c| !matches!(c, Step::Normal(_) | Step::CurDir))
-    {
-        return Err(outside());
-    }
-    let path = folder.join(uri);
-    // Where links lead to; what is not there or leads in a circle is reported by the reader.
-    if let (Ok(real), Ok(home)) = (path.canonicalize(), folder.canonicalize())
-        && !real.starts_with(home)
-    {
-        return Err(outside());
-    }
-    files::read(&path).map_err(|e| format!("its buffer {e}"))
 }
 
 struct Document<'a> {
@@ -248,7 +231,11 @@ impl<'a> Document<'a> {
                 &mesh.primitives
             }
         };
-        Ok(all.iter().filter(|p| p.extensions.contains_key(EXTENSION)))
+        let shown = all.iter().filter(|p| p.extensions.contains_key(EXTENSION));
+        if shown.clone().next().is_some() {
+            node.extensions.check()?;
+        }
+        Ok(shown)
     }
 
     /// Refuses what would take far more memory than the file has bytes: many nodes that show one mesh, attributes that share
@@ -286,14 +273,6 @@ impl<'a> Document<'a> {
 
     /// The Gaussians of a primitive in the axes of its node; coefficients up to `sh_degree` that it lacks are zero.
     fn primitive(&self, primitive: &Primitive, sh_degree: u32) -> Result<Splats, String> {
-        let extension = &primitive.extensions[EXTENSION];
-        let property = |name: &str, known: &str| match extension.get(name).and_then(|v| v.as_str()) {
-            Some(value) if value != known => Err(format!("{name} {value} is not supported, only {known}")),
-            _ => Ok(()),
-        };
-        property("kernel", "ellipse")?;
-        property("colorSpace", "srgb_rec709_display")?;
-        property("projection", "perspective")?;
         if primitive.mode != Some(0) {
             return Err("Gaussians must be points (mode 0)".to_owned());
         }
@@ -353,6 +332,7 @@ impl<'a> Document<'a> {
         };
         let view = self.root.buffer_views.get(view).ok_or_else(|| bad("its buffer view is missing"))?;
         let early = || bad("the buffer ends early; copy the file again");
+        view.extensions.check()?;
         let buffer = self.root.buffers.get(view.buffer).ok_or_else(|| bad("its buffer is missing"))?;
         let buffer = match &buffer.uri {
             Some(uri) => self.buffers.get(uri.as_str()).map(Vec::as_slice),
@@ -376,6 +356,21 @@ impl<'a> Document<'a> {
         };
         Ok((0..accessor.count).map(vector))
     }
+}
+
+/// Notes on attributes of the extension that are not read, those of higher SH degrees among them.
+fn unread(primitive: &Primitive) -> Vec<String> {
+    let degrees = (0..=ply::MOST_DEGREE).flat_map(|l| (0..=2 * l).map(move |n| coefficient(l, n)));
+    let read: Vec<String> =
+        ["ROTATION", "SCALE", "OPACITY"].iter().map(|n| attribute(n)).chain(degrees).collect();
+    let own = attribute("");
+    let beyond =
+        (ply::MOST_DEGREE + 1..=4).filter(|l| primitive.attributes.contains_key(&coefficient(*l, 0)));
+    let notes = beyond.map(ply::beyond_degree);
+    let others = primitive.attributes.keys().filter(|n| n.starts_with(&own) && !read.contains(n));
+    let others =
+        others.filter(|n| !n.contains("SH_DEGREE_4_")).map(|n| format!("its attribute {n} is not read"));
+    notes.chain(others).collect()
 }
 
 fn coefficient(degree: u32, n: u32) -> String {

@@ -1,0 +1,107 @@
+//! What the addresses of buffers lead to: data inside of the file, or files in its own folder and below.
+use super::read::Buffer;
+use crate::files;
+use base64::Engine;
+use base64::alphabet::STANDARD;
+use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
+use percent_encoding::percent_decode_str;
+use std::collections::BTreeMap;
+use std::path::{Component as Step, Path};
+
+/// With and without the signs at the end that fill the last block.
+const BASE64: GeneralPurpose = GeneralPurpose::new(
+    &STANDARD,
+    GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
+);
+
+/// The content of every address, each once.
+pub(super) fn contents<'a>(
+    buffers: &'a [Buffer],
+    folder: &Path,
+) -> Result<BTreeMap<&'a str, Vec<u8>>, String> {
+    let mut all = BTreeMap::new();
+    for uri in buffers.iter().filter_map(|b| b.uri.as_deref()) {
+        if !all.contains_key(uri) {
+            all.insert(uri, content(uri, folder)?);
+        }
+    }
+    Ok(all)
+}
+
+/// Addresses are percent-encoded (RFC 3986); some programs write names as they are.
+fn content(uri: &str, folder: &Path) -> Result<Vec<u8>, String> {
+    if uri.get(..5).is_some_and(|start| start.eq_ignore_ascii_case("data:")) {
+        let (kind, body) = uri[5..].split_once(',').ok_or("a buffer inside of the file has no comma")?;
+        let bytes: Vec<u8> = percent_decode_str(body).collect();
+        let base64 = kind.rsplit(';').next().is_some_and(|word| word.trim().eq_ignore_ascii_case("base64"));
+        return match base64 {
+            true => BASE64.decode(bytes).map_err(|e| format!("damaged base64 ({e}); copy the file again")),
+            false => Ok(bytes),
+        };
+    }
+    if uri.contains("://") {
+        return Err(format!("its buffer {uri} is not a local file; download it and give its name"));
+    }
+    let decoded = percent_decode_str(uri).decode_utf8_lossy();
+    let names = [decoded.as_ref(), uri];
+    if !names.iter().all(|name| is_inside(name, folder)) {
+        return Err(format!("its buffer {uri} is outside of the file's folder; put it beside the file"));
+    }
+    let name = names.into_iter().find(|name| folder.join(name).is_file()).unwrap_or(&decoded);
+    files::read(&folder.join(name)).map_err(|e| format!("its buffer {e}"))
+}
+
+fn is_inside(name: &str, folder: &Path) -> bool {
+    let plain = |step| matches!(step, Step::Normal(_) | Step::CurDir);
+    if name.contains('\\') || !Path::new(name).components().all(plain) {
+        return false;
+    }
+    // Where links lead to; what is not there or leads in a circle is reported by the reader.
+    match (folder.join(name).canonicalize(), folder.canonicalize()) {
+        (Ok(real), Ok(home)) => real.starts_with(home),
+        _ => true,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_are_decoded() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("ä b")).unwrap();
+        for name in ["my scene.bin", "ä b/1#.bin", "100%.bin", "as%20it is.bin"] {
+            std::fs::write(folder.path().join(name), name).unwrap();
+        }
+        for (uri, name) in [
+            ("my%20scene.bin", "my scene.bin"),
+            ("my scene.bin", "my scene.bin"),
+            ("./%C3%A4%20b/1%23.bin", "ä b/1#.bin"),
+            ("100%.bin", "100%.bin"),
+            ("as%20it is.bin", "as%20it is.bin"),
+        ] {
+            assert_eq!(content(uri, folder.path()), Ok(name.as_bytes().to_vec()), "{uri}");
+        }
+        for uri in ["%2e%2e/a.bin", "..%2Fa.bin", "%2Fetc%2Fpasswd", "a%5Cb.bin", "../a.bin", "a/../../b"] {
+            assert!(content(uri, folder.path()).unwrap_err().contains("outside"), "{uri}");
+        }
+        assert!(content("a%00.bin", folder.path()).is_err());
+    }
+
+    #[test]
+    fn data_inside_of_the_file_is_decoded() {
+        for uri in [
+            "data:application/octet-stream;base64,AQL/",
+            "DATA:application/gltf-buffer;Base64,AQL%2F",
+            "data:,%01%02%FF",
+            "data:application/octet-stream,%01%02%ff",
+        ] {
+            assert_eq!(content(uri, Path::new(".")), Ok(vec![1, 2, 255]), "{uri}");
+        }
+        assert_eq!(content("data:;base64,AQI", Path::new(".")), Ok(vec![1, 2]));
+        for uri in ["data:AQL", "data:;base64,!"] {
+            assert!(content(uri, Path::new(".")).is_err(), "{uri}");
+        }
+    }
+}
