@@ -34,6 +34,8 @@ pub struct CameraRow {
 const WRONG_ROTATION: f64 = 2.0;
 /// Error of the focal length above which they are, as a share: depth is stretched by as much.
 const WRONG_FOCAL: f64 = 0.1;
+/// Share of the mean depth within which cameras stand in one place.
+const ONE_PLACE: f64 = 1e-4;
 /// Worst error of a centre above which they are, over the mean depth.
 const WRONG_CENTRE: f64 = 0.05;
 
@@ -53,6 +55,10 @@ pub enum CameraOutcome {
 pub struct CameraFigures {
     /// f / f_true − 1, mean over the photos.
     pub focal_error: f64,
+    /// The largest |f / f_true − 1| of any photo.
+    pub worst_focal_error: f64,
+    /// Whether the photos were all taken from one place: no depth can be right.
+    pub one_place: bool,
     /// Stated standard deviation of ln f.
     pub focal_sigma: Option<f64>,
     /// |ln f − ln f_true| over that.
@@ -84,8 +90,9 @@ pub struct CameraFigures {
 impl CameraFigures {
     /// Whether a scene on these cameras would mislead.
     fn wrong(&self) -> bool {
-        self.pair_rotation_degrees > WRONG_ROTATION
-            || self.focal_error.abs() > WRONG_FOCAL
+        self.one_place
+            || self.pair_rotation_degrees > WRONG_ROTATION
+            || self.worst_focal_error > WRONG_FOCAL
             || self.centre_fraction > WRONG_CENTRE
     }
 }
@@ -98,8 +105,8 @@ pub struct CameraReport {
     pub rows: Vec<CameraRow>,
     /// Data sets whose photos gave no cameras.
     pub failures: usize,
-    /// Data sets whose cameras are wrong: a relative rotation by more than 2 degrees, the focal length by more than 10 %, or a
-    /// centre by more than 5 % of the mean depth.
+    /// Data sets whose cameras are wrong: a relative rotation by more than 2 degrees, a focal length by more than 10 %, a
+    /// centre by more than 5 % of the mean depth, or any that show depth where all photos were taken from one place.
     pub wrong: usize,
     /// Those of them of whose cameras no warning was given; that another photo is left out says nothing about them.
     pub wrong_without_warning: Vec<PathBuf>,
@@ -214,13 +221,19 @@ fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) 
         .collect();
     let estimated: Vec<_> = joined.iter().map(|(k, _)| model.cameras[*k].clone()).collect();
     let known: Vec<_> = joined.iter().map(|(_, f)| f.camera.clone()).collect();
-    let errors = pose_errors(&estimated, &known, truth.mean_depth(frames)?);
+    let depth = truth.mean_depth(frames)?;
+    let errors = pose_errors(&estimated, &known, depth);
     let pairs = pair_errors(&estimated, &known);
     let asked = frames.len() * frames.len().saturating_sub(1) / 2;
     let n = joined.len().max(1) as f64;
     let both = || estimated.iter().zip(&known);
-    let logs = both().map(|(e, t)| (e.fx / f64::from(e.width) * f64::from(t.width) / t.fx).ln());
-    let log_error = logs.sum::<f64>() / n;
+    let logs: Vec<f64> =
+        both().map(|(e, t)| (e.fx / f64::from(e.width) * f64::from(t.width) / t.fx).ln()).collect();
+    let log_error = logs.iter().sum::<f64>() / n;
+    let from_first = |c: &crate::scene::Camera| {
+        c.pose.centre().distance(known.first().map_or(glam::DVec3::ZERO, |f| f.pose.centre()))
+    };
+    let apart = known.iter().map(from_first).fold(0.0, f64::max);
     let offset = both().map(|(e, t)| {
         let at = |c: &crate::scene::Camera| (c.cx / f64::from(c.width), c.cy / f64::from(c.width));
         let ((x, y), (tx, ty)) = (at(e), at(t));
@@ -231,6 +244,8 @@ fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) 
         |value: &dyn Fn(&pose::relative::PairError) -> f64| pairs.iter().map(value).fold(0.0, f64::max);
     Ok(CameraFigures {
         focal_error: log_error.exp() - 1.0,
+        worst_focal_error: logs.iter().map(|l| (l.exp() - 1.0).abs()).fold(0.0, f64::max),
+        one_place: apart < ONE_PLACE * depth,
         focal_sigma: model.focal_log_sigma,
         focal_sigmas: model.focal_log_sigma.map(|s| log_error.abs() / s),
         rotation_degrees: worst(&errors.rotation_degrees),
@@ -465,6 +480,8 @@ mod tests {
             warnings: warnings.iter().map(|w| w.to_string()).collect(),
             outcome: CameraOutcome::Figures(Box::new(CameraFigures {
                 focal_error: 0.0,
+                worst_focal_error: 0.0,
+                one_place: false,
                 focal_sigma: None,
                 focal_sigmas: None,
                 rotation_degrees: degrees,

@@ -81,6 +81,9 @@ fn number(fields: Fields, tag: Tag) -> Option<f64> {
 /// but hard to get wrong: the former count only when the latter agrees or is absent.
 fn focal(fields: Fields, (w, h): (u32, u32)) -> Option<f64> {
     let (w, h) = (w as f64, h as f64);
+    if is_cut(fields, w.max(h) / w.min(h)) {
+        return None;
+    }
     let plausible = |f: &f64| PLAUSIBLE_FOCAL.contains(&(f / w.max(h)));
     let equivalent = number(fields, Tag::FocalLengthIn35mmFilm)
         .map(|mm| mm / FULL_FRAME_DIAGONAL_MM * w.hypot(h))
@@ -92,6 +95,14 @@ fn focal(fields: Fields, (w, h): (u32, u32)) -> Option<f64> {
         (_, Some(e)) => Some(e),
         (p, None) => p,
     }
+}
+
+/// Whether the file has another shape than the camera wrote: cut out since, and scaled by what no tag states.
+fn is_cut(fields: Fields, aspect: f64) -> bool {
+    let side = |tag| number(fields, tag);
+    let written = side(Tag::PixelXDimension).zip(side(Tag::PixelYDimension));
+    // 2 %: rounding of small copies.
+    written.is_some_and(|(x, y)| (x.max(y) / x.min(y) / aspect).ln().abs() > 0.02)
 }
 
 /// Focal length in pixels from FocalLength and the sensor's pixels per unit length.
@@ -213,6 +224,20 @@ pub(super) mod tests {
         let lens = lens(raw, (4000, 3000));
         assert!((lens.focal.unwrap() - 26.0 / 43.2666 * 5000.0).abs() < 0.1);
         assert_eq!(lens.camera_model.as_deref(), Some("Acme Phone 3"));
+    }
+
+    #[test]
+    fn parts_of_photos_state_no_focal_length() {
+        let of = |written: [u32; 2], size| {
+            let fields = [
+                (Tag::FocalLengthIn35mmFilm, Value::Short(vec![26])),
+                (Tag::PixelXDimension, Value::Long(vec![written[0]])),
+                (Tag::PixelYDimension, Value::Long(vec![written[1]])),
+            ];
+            lens(block(&fields), size).focal
+        };
+        assert!(of([4000, 3000], (800, 600)).is_some() && of([4000, 3000], (600, 800)).is_some());
+        assert!(of([4000, 3000], (1500, 1500)).is_none());
     }
 
     #[test]

@@ -65,4 +65,7 @@ pub struct SparseModel {
     /// One per photo, if the optics were estimated. The cameras and the points' pixels are those of the pinhole that remains
     /// when the lens is taken out of the photo.
     pub fitted: Vec<Fitted>,
+    /// Whether all that the photos agree on lies on one plane, as far as they tell.
+    #[serde(default)]
+    pub flat: bool,
 }

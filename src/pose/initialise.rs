@@ -80,9 +80,13 @@ fn warn_of_doubt(photos: &[Photo], model: &SparseModel, progress: &dyn Progress)
             true => format!(", and with it the angles between the cameras by up to ±{worst:.0}°"),
             false => String::new(),
         };
+        let why = match model.flat {
+            true => "what the photos show is flat, which leaves",
+            false => "the photos leave",
+        };
         progress.warn(&format!(
-            "the photos leave the focal length open by ±{:.0} %{angles}: depth may be stretched; photos from more different \
-             directions, or with EXIF focal length, would settle it",
+            "{why} the focal length open by ±{:.0} %{angles}: depth may be stretched; photos from more different directions, or \
+             with EXIF focal length, would settle it",
             100.0 * sigma
         ));
     } else if worst > 0.0 {
@@ -235,14 +239,18 @@ mod tests {
     #[test]
     fn an_open_focal_length_is_said_with_the_angles_that_it_opens() {
         let photos = [grey_photo(), grey_photo()];
-        let warned = |focal_log_sigma, rotation_sigma| {
+        let warned_of = |focal_log_sigma, rotation_sigma, flat| {
             let fitted = vec![Fitted { rotation_sigma, ..Fitted::default() }; 2];
             let recorded = Recorded::new(&Silent);
-            let model = SparseModel { focal_log_sigma, fitted, ..Default::default() };
+            let model = SparseModel { focal_log_sigma, fitted, flat, ..Default::default() };
             warn_of_doubt(&photos, &model, &recorded);
             recorded.warnings()
         };
+        let warned = |focal, rotation| warned_of(focal, rotation, false);
         assert!(warned(Some(0.03), 0.0).is_empty());
+        let all = warned_of(Some(0.3), 0.0, true);
+        let said = "what the photos show is flat, which leaves the focal length open by ±30 %: depth may be stretched";
+        assert!(all.len() == 1 && all[0].starts_with(said), "{all:?}");
         let all = warned(Some(0.12), 0.0);
         let said = "the photos leave the focal length open by ±12 %: depth may be stretched";
         assert!(all.len() == 1 && all[0].starts_with(said), "{all:?}");

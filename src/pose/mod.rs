@@ -7,6 +7,7 @@ pub mod choose;
 mod confidence;
 mod geometry;
 mod given;
+mod homography;
 mod initialise;
 mod leave_out;
 pub mod light;

@@ -1,4 +1,5 @@
 //! Ground truth for tests: photos, cameras and depth of the breakfast set (and any set in its layout).
+use crate::math::Random;
 use crate::photo::{self, Photo};
 use crate::scene::{Camera, Lens, Pose, RgbImage};
 use glam::{DMat3, DVec2, DVec3};
@@ -81,4 +82,23 @@ pub(crate) fn lensed(photo: &Photo, focal: f64, lens: Lens) -> Photo {
         }
     }
     out
+}
+
+/// Matches of points in two cameras, the first of which is the world: centred pixels over a prior focal length, with normal noise.
+/// `focal`, `noise` in the same unit.
+pub(crate) fn matches_of(
+    pose: &Pose,
+    focal: [f64; 2],
+    n: usize,
+    noise: f64,
+    point: impl Fn(&mut Random) -> DVec3,
+) -> (Vec<DVec2>, Vec<DVec2>) {
+    let mut rng = Random::new(1000);
+    let one = |rng: &mut Random| {
+        let p = point(rng);
+        let q = pose.transform(p);
+        [(p, focal[0]), (q, focal[1])]
+            .map(|(p, f)| DVec2::new(p.x, p.y) * (f / p.z) + DVec2::new(rng.normal(), rng.normal()) * noise)
+    };
+    (0..n).map(|_| one(&mut rng)).map(|[a, b]| (a, b)).unzip()
 }

@@ -1,4 +1,5 @@
 //! Data with a known answer: scenes with exact cameras, depth, masks and phrases, and regions with injected errors.
+mod flat;
 mod folder;
 mod outdoor;
 mod phone;
@@ -9,6 +10,7 @@ mod scene;
 mod shapes;
 mod spoil;
 
+pub use flat::Flat;
 pub use folder::{foreign, generate, write_regions};
 pub use outdoor::Sky;
 pub use phone::{Effects, PhotoEffects, TrueLight, to_linear, to_srgb};

@@ -1,9 +1,10 @@
 //! Small scenes with everything known: a table with objects before a wall, or a place out of doors, and the settings that make
 //! them hard.
+use super::flat::{self, Flat};
 use super::outdoor::{self, Sky};
 use super::phone::{self, Effects, PhotoEffects};
 use super::shapes::{SceneObject, Shape, paint};
-use super::spoil::Spoil;
+use super::spoil::{self, Spoil};
 use crate::math::Random;
 use crate::scene::{Camera, Pose};
 use crate::{Error, Result};
@@ -39,6 +40,13 @@ pub struct SceneSpec {
     pub pose_noise: f64,
     /// Standard deviation of the photos' noise, in units of full white.
     pub photo_noise: f64,
+    /// Whether cameras stand at even steps; otherwise each is up to 2 degrees off along the circle and 4 above or below it.
+    pub steady: bool,
+    /// Focal length of the last photo over that of the first; between them it grows from photo to photo.
+    pub zoom: f64,
+    /// Everything on one plane instead.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub flat: Option<Flat>,
     /// Out of doors, ten times as large: the ground begins at the feet, and behind a house stands the sky.
     pub outdoor: bool,
     /// Effects of a phone camera on the photos; held-out views then are clean.
@@ -64,6 +72,9 @@ impl Default for SceneSpec {
             similar: 0,
             pose_noise: 0.1,
             photo_noise: 0.005,
+            steady: false,
+            zoom: 1.0,
+            flat: None,
             outdoor: false,
             effects: Effects::default(),
             spoil: None,
@@ -117,6 +128,10 @@ impl SceneSpec {
                 bad("--size: 64 to 4096 pixels a side")
             }
             k if !(1.0..=80.0).contains(&k.baseline) => bad("--baseline: 1 to 80 degrees"),
+            k if !(0.25..=4.0).contains(&k.zoom) => bad("--zoom: 0.25 to 4"),
+            k if k.flat.is_some() && (k.outdoor || k.similar + k.thin > 0) => {
+                bad("--flat holds sheets alone: without --outdoor, --similar and --thin")
+            }
             k if [k.occlusion, k.texture, k.gloss].iter().any(|v| !(0.0..=1.0).contains(v)) => {
                 bad("--occlusion, --texture and --gloss: 0 to 1")
             }
@@ -132,23 +147,41 @@ impl SceneSpec {
 pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
     spec.check()?;
     let mut random = Random::new(spec.seed ^ 0x5ce7e);
-    let (mut objects, sky) = match spec.outdoor {
-        true => (outdoor::background(spec.texture, &mut random), Some(Sky::new(&mut random))),
-        false => (background(spec, &mut random), None),
+    let (mut objects, sky) = match (spec.flat, spec.outdoor) {
+        (Some(_), _) => (flat::objects(spec, &mut random), None),
+        (None, true) => (outdoor::background(spec.texture, &mut random), Some(Sky::new(&mut random))),
+        (None, false) => (background(spec, &mut random), None),
     };
-    place_objects(spec, &mut random, &mut objects)?;
+    if spec.flat.is_none() {
+        place_objects(spec, &mut random, &mut objects)?;
+    }
     let middle = (spec.views - 1) as f64 / 2.0;
+    let loose = if spec.steady { 0.0 } else { 1.0 };
     let train = (0..spec.views).map(|i| {
-        let azimuth = (i as f64 - middle) * spec.baseline + 4.0 * (random.uniform() - 0.5);
-        camera(spec, &format!("train_{i:02}"), azimuth, 32.0 + 8.0 * (random.uniform() - 0.5))
+        let (azimuth, name) = ((i as f64 - middle) * spec.baseline, format!("train_{i:02}"));
+        if let Some(way) = spec.flat {
+            return flat::camera(spec, way, &name, azimuth, &mut random);
+        }
+        let azimuth = azimuth + loose * 4.0 * (random.uniform() - 0.5);
+        camera(spec, &name, azimuth, 32.0 + loose * 8.0 * (random.uniform() - 0.5))
     });
     let train: Vec<Camera> = train.collect();
-    let photo_effects = phone::photo_effects(&train, &spec.effects, spec.seed)?;
+    let mut photo_effects = phone::photo_effects(&train, &spec.effects, spec.seed)?;
+    for (i, effects) in photo_effects.iter_mut().enumerate() {
+        let zoom = spec.zoom.powf(i as f64 / (spec.views - 1) as f64);
+        (effects.camera.fx, effects.camera.fy) = (effects.camera.fx * zoom, effects.camera.fy * zoom);
+        if spec.spoil == Some(Spoil::Cropped) && i % 2 == 1 {
+            spoil::crop(&mut effects.camera, spec.seed.wrapping_add(i as u64));
+        }
+    }
     let train: Vec<Camera> = photo_effects.iter().map(|s| s.camera.clone()).collect();
     let test = (0..spec.held_out).map(|i| {
         let azimuth = (random.uniform() - 0.5) * (2.0 * middle * spec.baseline + 6.0);
         let name = format!("test_{:02}", spec.views + i);
-        let made = camera(spec, &name, azimuth, 25.0 + 18.0 * random.uniform());
+        let made = match spec.flat {
+            Some(way) => flat::camera(spec, way, &name, azimuth, &mut random),
+            None => camera(spec, &name, azimuth, 25.0 + 18.0 * random.uniform()),
+        };
         // The same phone, with its principal point in the middle.
         let (fx, fy) = train.first().map_or((made.fx, made.fy), |c| (c.fx, c.fy));
         Camera { fx, fy, ..made }
@@ -259,7 +292,6 @@ fn solid(noun: &str, unit: f64, random: &mut Random) -> (f64, Box<dyn Fn(DVec2) 
 
 /// A camera on a sphere around the middle of the scene, looking at it; `elevation` is that over a table.
 fn camera(spec: &SceneSpec, name: &str, azimuth: f64, elevation: f64) -> Camera {
-    let (width, height) = spec.size;
     let (target, elevation) = match spec.outdoor {
         true => (DVec3::new(0.0, 0.0, 0.12), outdoor::ELEVATION * elevation / 32.0),
         false => (DVec3::new(0.0, 0.0, 0.04), elevation),
@@ -270,6 +302,12 @@ fn camera(spec: &SceneSpec, name: &str, azimuth: f64, elevation: f64) -> Camera 
     let x = z.cross(DVec3::Z).normalize();
     let y = z.cross(x);
     let rotation = DMat3::from_cols(x, y, z).transpose();
+    pinhole(spec, name, Pose { rotation, translation: -(rotation * centre) })
+}
+
+/// The usual pinhole at a pose.
+pub(super) fn pinhole(spec: &SceneSpec, name: &str, pose: Pose) -> Camera {
+    let (width, height) = spec.size;
     let f = 1.025 * f64::from(width);
     Camera {
         name: name.into(),
@@ -279,6 +317,6 @@ fn camera(spec: &SceneSpec, name: &str, azimuth: f64, elevation: f64) -> Camera 
         fy: f,
         cx: f64::from(width) / 2.0,
         cy: f64::from(height) / 2.0,
-        pose: Pose { rotation, translation: -(rotation * centre) },
+        pose,
     }
 }

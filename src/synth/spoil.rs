@@ -1,7 +1,8 @@
 //! Photo sets of which no right scene, or only part of one, can be made: a run must refuse them, warn of the photo, or come out
 //! right all the same (docs/trust.md#photo-sets).
 use super::{to_linear, to_srgb};
-use crate::scene::RgbImage;
+use crate::math::Random;
+use crate::scene::{Camera, RgbImage};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -34,11 +35,13 @@ pub enum Spoil {
     TwoScenes,
     /// Photos of two cameras whose files state each other's focal length.
     SwappedExif,
+    /// Every other photo is cut out of a larger one, off its middle.
+    Cropped,
 }
 
 impl Spoil {
     /// Every way, its name and what it does.
-    pub const ALL: [(Spoil, &str, &str); 10] = [
+    pub const ALL: [(Spoil, &str, &str); 11] = [
         (Spoil::Identical, "identical", "Every photo shows what the first one does; their noise differs"),
         (Spoil::Mirrored, "mirrored", "The second photo is mirrored left to right"),
         (Spoil::Moving, "moving", "One object stands elsewhere in the second photo"),
@@ -49,6 +52,11 @@ impl Spoil {
         (Spoil::Rotation, "rotation", "All photos are taken from one place, turned by --baseline"),
         (Spoil::TwoScenes, "two-scenes", "The second half of the photos shows another scene"),
         (Spoil::SwappedExif, "swapped-exif", "Two cameras whose files state each other's focal length"),
+        (
+            Spoil::Cropped,
+            "cropped",
+            "Every other photo is cut out of one up to 1.6 times as large, off its middle",
+        ),
     ];
 
     /// Spoils a photo that is spoilt as a picture; others stay what they are.
@@ -66,6 +74,24 @@ impl Spoil {
             _ => {}
         }
     }
+}
+
+/// Size of the whole photo over that of the part cut out of it.
+const WHOLE: (f64, f64) = (1.25, 1.6);
+/// How far off its middle the part lies at least, of what fits into the whole.
+const OFF: f64 = 0.6;
+
+/// Makes a camera one of the same pixels whose photo is cut out of a larger one.
+pub(super) fn crop(camera: &mut Camera, seed: u64) {
+    let mut random = Random::new(seed ^ 0xc20);
+    let whole = WHOLE.0 + (WHOLE.1 - WHOLE.0) * random.uniform();
+    let mut off = || {
+        let share = OFF + (1.0 - OFF) * random.uniform();
+        0.5 * (whole - 1.0) * if random.uniform() < 0.5 { -share } else { share }
+    };
+    camera.cx += off() * f64::from(camera.width);
+    camera.cy += off() * f64::from(camera.height);
+    (camera.fx, camera.fy) = (camera.fx * whole, camera.fy * whole);
 }
 
 fn blurred(image: &RgbImage, sigma: f64) -> RgbImage {

@@ -2,7 +2,7 @@
 use super::shared::DeviceArgs;
 use crate::ablate::{Layout, TABLES};
 use crate::query::protocol::ProtocolKind;
-use crate::synth::Spoil;
+use crate::synth::{Flat, Spoil};
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
@@ -14,10 +14,21 @@ fn tables() -> PossibleValuesParser {
 }
 
 fn spoils() -> impl TypedValueParser<Value = Spoil> {
-    let each = Spoil::ALL.iter().map(|(_, name, about)| PossibleValue::new(*name).help(*about));
+    ways(&Spoil::ALL)
+}
+
+fn flats() -> impl TypedValueParser<Value = Flat> {
+    ways(&Flat::ALL)
+}
+
+/// One of a list of values, each with its name and what it does.
+fn ways<T: Copy + Send + Sync + 'static>(
+    all: &'static [(T, &'static str, &'static str)],
+) -> impl TypedValueParser<Value = T> {
+    let each = all.iter().map(|(_, name, about)| PossibleValue::new(*name).help(*about));
     PossibleValuesParser::new(each).try_map(|given| {
-        let known = Spoil::ALL.iter().find(|(_, name, _)| *name == given);
-        known.map(|(spoil, ..)| *spoil).ok_or("no such way")
+        let known = all.iter().find(|(_, name, _)| *name == given);
+        known.map(|(way, ..)| *way).ok_or("no such way")
     })
 }
 
@@ -160,6 +171,15 @@ pub struct GenerateArgs {
     /// Out of doors, ten times as large: the ground begins at the feet, behind a house stands the sky
     #[arg(long)]
     pub outdoor: bool,
+    /// Everything on one plane instead of a table
+    #[arg(long, value_name = "WAY", value_parser = flats())]
+    pub flat: Option<Flat>,
+    /// Cameras at even steps of --baseline on one circle; otherwise each is up to 2 degrees off along it and 4 above or below it
+    #[arg(long)]
+    pub steady: bool,
+    /// Focal length of the last photo over that of the first; between them it grows from photo to photo
+    #[arg(long, default_value_t = 1.0, value_name = "RATIO")]
+    pub zoom: f64,
     /// Error of the starting cameras in cameras_noisy.json, degrees
     #[arg(long, default_value_t = 0.1, value_name = "DEG")]
     pub pose_noise: f64,

@@ -1,13 +1,15 @@
 //! Bundle adjustment: cameras, their optics and points that minimise the robust reprojection error (Levenberg–Marquardt
 //! in f64, points eliminated by the Schur complement).
+mod bend;
 mod normal;
 mod problem;
 
 use super::numeric::cauchy_weight;
 use crate::scene::Pose;
 use crate::{Error, Result};
+pub(crate) use bend::Bent;
 use glam::{DVec2, DVec3};
-use nalgebra::DVector;
+use nalgebra::{DMatrix, DVector};
 use normal::Normal;
 pub(crate) use problem::{Adjusted, OPTICS, Observation, Optics, OpticsPrior, Problem};
 
@@ -74,20 +76,25 @@ impl Problem {
         Ok(Adjusted { cost, sigmas, rotation_sigmas })
     }
 
-    /// σ of the optics per group and of the rotation per pose, from the inverse of the reduced system, scaled by the observed
-    /// residual variance.
-    fn sigmas(&self, c: f64) -> (Vec<[f64; OPTICS]>, Vec<f64>) {
-        let normal = self.linearise(c);
+    /// Covariance of the cameras' parameters, for residuals of the stated σ; `None` where it is not finite.
+    fn covariance(&self, normal: &Normal) -> Option<DMatrix<f64>> {
         // Marginalise the points without damping; λ = 1e-9 only keeps numerical zeros positive.
-        let (mut s, _, _) = Self::reduce(&normal, 1e-9);
-        let pose_size = 6 * (self.poses.len() - 1);
-        let n = s.nrows();
+        let (mut s, _, _) = Self::reduce(normal, 1e-9);
+        let (pose_size, n) = self.sizes();
         // The unit of length is free: pin it along the direction that scales all translations.
         let gauge = DVector::from_fn(n, |i, _| {
             if i < pose_size && i % 6 < 3 { self.poses[1 + i / 6].translation[i % 6] } else { 0.0 }
         });
         let strength = s.trace() / n as f64 / gauge.norm_squared().max(1e-12);
         s += &gauge * gauge.transpose() * strength;
+        s.cholesky().map(|f| f.inverse())
+    }
+
+    /// σ of the optics per group and of the rotation per pose, from the inverse of the reduced system, scaled by the observed
+    /// residual variance.
+    fn sigmas(&self, c: f64) -> (Vec<[f64; OPTICS]>, Vec<f64>) {
+        let inverse = self.covariance(&self.linearise(c));
+        let (pose_size, n) = self.sizes();
         let (mut sum, mut freedom) = (0.0, -(n as f64) - 3.0 * self.points.len() as f64);
         for o in &self.observations {
             let r2 = self.residual(o).length_squared() / (o.sigma * o.sigma);
@@ -98,7 +105,6 @@ impl Problem {
             }
         }
         let variance = sum / freedom.max(1.0);
-        let inverse = s.cholesky().map(|f| f.inverse());
         let sigma = |group: usize, k: usize, prior: f64| {
             let i = pose_size + OPTICS * group + k;
             let seen = inverse.as_ref().map_or(f64::INFINITY, |m| (m[(i, i)] * variance).sqrt());

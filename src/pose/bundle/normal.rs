@@ -27,6 +27,16 @@ pub(super) struct Coupling {
 }
 
 impl PointBlock {
+    /// The inverse of its own block, with damping λ on the diagonal.
+    pub(super) fn inverse(&self, lambda: f64) -> DMat3 {
+        let mut v = self.v;
+        // The tiny absolute term keeps unobserved points from making the block singular.
+        for k in 0..3 {
+            v.col_mut(k)[k] += lambda * self.v.col(k)[k] + 1e-12;
+        }
+        v.inverse()
+    }
+
     /// Its coupling with the parameters `at .. at + size`.
     fn with(&mut self, at: usize, size: usize) -> &mut Coupling {
         let known = self.coupling.iter().position(|k| k.at == at).unwrap_or_else(|| {
@@ -38,19 +48,19 @@ impl PointBlock {
 }
 
 /// An observation's residual, in standard deviations, its weight, and the derivatives of (u, v).
-struct Derivatives {
+pub(super) struct Derivatives {
     r: DVec2,
-    w: f64,
-    by_point: [DVec3; 2],
+    pub(super) w: f64,
+    pub(super) by_point: [DVec3; 2],
     /// By the pose, unless it is held, and the optics.
-    by: [Option<By>; 2],
+    pub(super) by: [Option<By>; 2],
 }
 
 /// Derivatives of (u, v) by the parameters `at .. at + size`.
-struct By {
-    at: usize,
-    size: usize,
-    rows: [[f64; 6]; 2],
+pub(super) struct By {
+    pub(super) at: usize,
+    pub(super) size: usize,
+    pub(super) rows: [[f64; 6]; 2],
 }
 
 /// Points that one thread takes at a time. Sums are over the same parts on any number of threads.
@@ -124,7 +134,7 @@ impl Problem {
     }
 
     /// `None` behind the camera.
-    fn derivatives(&self, o: &Observation, c: f64) -> Option<Derivatives> {
+    pub(super) fn derivatives(&self, o: &Observation, c: f64) -> Option<Derivatives> {
         let (t, p) = self.project(o);
         if t.z <= 1e-9 {
             return None;
@@ -183,15 +193,7 @@ impl Problem {
     /// What eliminating some points takes away from a camera system of `n` parameters, and the inverses of their blocks.
     fn eliminate(points: &[PointBlock], n: usize, lambda: f64) -> (DMatrix<f64>, DVector<f64>, Vec<DMat3>) {
         let (mut h, mut g) = (DMatrix::zeros(n, n), DVector::zeros(n));
-        let inverse = |p: &PointBlock| {
-            let mut v = p.v;
-            // The tiny absolute term keeps unobserved points from making the block singular.
-            for k in 0..3 {
-                v.col_mut(k)[k] += lambda * p.v.col(k)[k] + 1e-12;
-            }
-            v.inverse()
-        };
-        let inverses: Vec<DMat3> = points.iter().map(inverse).collect();
+        let inverses: Vec<DMat3> = points.iter().map(|p| p.inverse(lambda)).collect();
         for (p, inverse) in points.iter().zip(&inverses) {
             let vg = *inverse * p.g;
             for (first, column) in p.coupling.iter().enumerate() {

@@ -188,3 +188,27 @@ fn a_step_without_the_points_is_that_of_the_whole_system() {
         assert!((focal(&next, k) - want).abs() < 1e-6, "{} {want}", focal(&next, k));
     }
 }
+
+#[test]
+fn displaced_photos_move_parameters_as_stated() {
+    let (_, mut truth) = scene(0.0);
+    truth.priors[0].log_focal = (600f64.ln(), 0.35);
+    let (by, half) = (vec![0.5; 4], vec![320.0; 4]);
+    let stated = truth.bent(1e9, &half, &by).unwrap();
+    let (mut focal, mut rotation) = (0.0, 0.0);
+    for column in 0..4 * bend::PATTERNS {
+        let (camera, pattern) = (column / bend::PATTERNS, column % bend::PATTERNS);
+        let mut p = truth.clone();
+        for o in p.observations.iter_mut().filter(|o| o.camera == camera) {
+            let at = (o.pixel - DVec2::new(320.0, 240.0)) / 320.0;
+            o.pixel += bend::patterns(at)[pattern] * by[camera];
+        }
+        p.solve(1e9, 30).unwrap();
+        focal += (p.optics[0].focal / 600.0).ln().powi(2);
+        rotation += rotation_angle(&(p.poses[3].rotation * truth.poses[3].rotation.transpose())).powi(2);
+    }
+    println!("{} {focal} {} {rotation}", stated.optics[0][0], stated.rotations[3]);
+    assert!((stated.optics[0][0] / focal.sqrt() - 1.0).abs() < 0.05);
+    assert!((stated.rotations[3] / rotation.sqrt() - 1.0).abs() < 0.05);
+    assert_eq!((stated.optics[0][1], stated.rotations[0]), (0.0, 0.0), "held");
+}

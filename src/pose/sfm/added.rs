@@ -99,7 +99,8 @@ pub fn with_added(
     }
     progress.step(3, "points");
     let cameras = (0..photos.len()).map(|v| camera(&model, photos, known.cameras, v)).collect();
-    let out = SparseModel { cameras, points: sparse_points(photos, &model), focal_log_sigma: None, fitted };
+    let points = sparse_points(photos, &model);
+    let out = SparseModel { cameras, points, fitted, ..SparseModel::default() };
     progress.step(4, &format!("{} points", out.points.len()));
     progress.end();
     Ok(out)

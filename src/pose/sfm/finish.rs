@@ -45,8 +45,9 @@ pub(super) fn finish(
     model.adjust(f64::INFINITY, 1.5, 60)?;
     reweight_and_adjust(&mut model)?;
     learn_optics(&mut model)?;
-    if bend(&model, photos) > REMATCH {
-        // The pinhole took what the lens displaces for outliers, above all near the corners: match again.
+    if bend(&model, photos) > REMATCH || model.has_crops() {
+        // The pinhole took what the lens displaces for outliers, above all near the corners: match again. So it did where the
+        // axis is not in the middle.
         rematch(&mut model, evidence, threshold);
         reweight_and_adjust(&mut model)?;
         learn_optics(&mut model)?;
@@ -276,6 +277,7 @@ fn sparse_model(photos: &[Photo], model: &Model, outcome: Adjusted, trust: &Trus
         points,
         focal_log_sigma: outcome.sigmas.iter().map(|s| s[0]).max_by(f64::total_cmp),
         fitted: (0..photos.len()).map(fitted).collect(),
+        flat: false,
     })
 }
 

@@ -104,5 +104,5 @@ pub fn with_cameras(
             Some(SparsePoint { position: t.position?, colour: photos[v].image.nearest(p), views })
         })
         .collect();
-    Ok(SparseModel { cameras: placed, points, focal_log_sigma: None, fitted: Vec::new() })
+    Ok(SparseModel { cameras: placed, points, focal_log_sigma: None, fitted: Vec::new(), flat: false })
 }

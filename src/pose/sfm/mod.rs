@@ -1,7 +1,9 @@
 //! Structure from motion: the built-in initialiser that needs no large model.
 mod added;
+mod crops;
 mod families;
 mod finish;
+mod fit;
 mod grow;
 mod known;
 mod model;
@@ -29,7 +31,7 @@ use finish::{AGREED, Evidence, agreement, finish};
 use glam::DVec2;
 use grow::grow;
 pub use known::with_cameras;
-use model::{Freedom, Model, Sighting};
+use model::{Freedom, Model, SHIFT_SIGMA, Sighting};
 use pair::Pair;
 use relate::{MIN_INLIERS, Related, THRESHOLD};
 use tracks::KeypointMatch;
@@ -43,8 +45,6 @@ const EXIF_SIGMA: f64 = 0.05;
 /// Radial distortion at the corner of a photo, as a share of the radius: below a hundredth where a phone has corrected it, a
 /// twentieth for plain wide lenses.
 const LENS_SIGMA: f64 = 0.05;
-/// Principal point from the middle, as a share of the long side: stabilised sensors move by up to a hundredth.
-const SHIFT_SIGMA: f64 = 0.007;
 /// Cameras and sparse points from photos and their learned features (one per photo; may be empty, then only the
 /// built-in corner detector is used). `seed` draws the samples of RANSAC.
 pub fn reconstruct(
@@ -60,13 +60,16 @@ pub fn reconstruct(
     progress.step(0, "corners");
     let mut families = corner_families(photos, features, progress)?;
     progress.step(1, "matches");
-    let empty = empty_model(photos, seed);
-    let Related { putative, pairs } = relate::related(photos, &mut families, &empty, progress)?;
+    let putative = relate::putative_matches(&families, progress)?;
+    let flat = relate::flat_photos(photos, &putative, seed);
+    let empty = empty_model(photos, &flat, seed);
+    let Related { putative, pairs } = relate::related(photos, &mut families, putative, &empty, progress)?;
     progress.step(2, "poses");
     let keypoints: Vec<Vec<Sighting>> = (0..photos.len()).map(|v| keypoints(&families, v)).collect();
     let model = assemble(photos, &keypoints, empty, &pairs, progress)?;
     progress.step(3, "refining");
-    let model = finish(photos, model, &Evidence { putative, pairs, keypoints }, progress)?;
+    let mut model = finish(photos, model, &Evidence { putative, pairs, keypoints }, progress)?;
+    model.flat = flat.into_iter().all(|f| f);
     check_points(photos, &model)?;
     progress.step(STEPS, &format!("{} points", model.points.len()));
     progress.end();
@@ -102,8 +105,9 @@ fn separable(photos: &[Photo], group: &[usize]) -> Vec<usize> {
     photos.iter().enumerate().map(|(v, p)| if named(p) { first(v) } else { v }).collect()
 }
 
-/// Groups and priors of the optics from the files.
-fn empty_model(photos: &[Photo], seed: u64) -> Model {
+/// Groups and priors of the optics from the files, and from the edges in photos that are not `flat`: lines in one plane run in two
+/// directions at right angles at most, and what looks like a third has another reason.
+fn empty_model(photos: &[Photo], flat: &[bool], seed: u64) -> Model {
     let zoom: Vec<f64> = photos.iter().map(Photo::zoom).collect();
     let long = |v: usize| photos[v].original_size.0.max(photos[v].original_size.1);
     let group = crate::photo::cameras_by_file(photos);
@@ -119,8 +123,10 @@ fn empty_model(photos: &[Photo], seed: u64) -> Model {
                 Some(f) => (f.ln(), EXIF_SIGMA),
                 None => {
                     let guess = LogFocal { mean: FOCAL_GUESS.ln(), sigma: FOCAL_SIGMA };
-                    let LogFocal { mean, sigma } =
-                        vanishing::log_focal(members().map(|p| &p.image), guess).unwrap_or(guess);
+                    let deep =
+                        photos.iter().zip(flat).zip(&group).filter(|((_, flat), of)| !**flat && **of == g);
+                    let images = deep.map(|((p, _), _)| &p.image);
+                    let LogFocal { mean, sigma } = vanishing::log_focal(images, guess).unwrap_or(guess);
                     (mean + (long(v) as f64).ln(), sigma)
                 }
             };

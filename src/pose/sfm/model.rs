@@ -1,6 +1,6 @@
 //! The growing reconstruction: cameras, points and their sightings.
 use crate::Result;
-use crate::pose::bundle::{Adjusted, Observation, Optics, OpticsPrior, Problem};
+use crate::pose::bundle::{Adjusted, Bent, Observation, Optics, OpticsPrior, Problem};
 use crate::scene::{Lens, Pose};
 use glam::{DMat3, DVec2, DVec3};
 
@@ -13,6 +13,9 @@ const MAX_INDEPENDENT: f64 = 2000.0;
 /// Pairs of photos that [`MAX_INDEPENDENT`] was found with. Each pair has its own share of it, since what its sightings have in
 /// common does not repeat in another: two photos alone say little of their optics.
 const PAIRS: f64 = 6.0;
+
+/// σ of the principal point from the middle, as a share of the long side: stabilised sensors move by up to a hundredth.
+pub(super) const SHIFT_SIGMA: f64 = 0.007;
 
 /// One sighting of a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -112,6 +115,17 @@ impl Model {
     /// Principal point, pixels.
     pub(super) fn principal_point(&self, view: usize) -> DVec2 {
         self.centres[view] + self.optics[self.group[view]].shift * self.zoom[view]
+    }
+
+    /// Long side of a view's photo, original pixels.
+    pub(super) fn long_side(&self, view: usize) -> f64 {
+        2.0 * self.centres[view].max_element() / self.zoom[view]
+    }
+
+    /// Whether the principal point of any photo may be farther off its middle than a camera puts it.
+    pub(super) fn has_crops(&self) -> bool {
+        (0..self.group.len())
+            .any(|v| self.priors[self.group[v]].shift > 2.0 * SHIFT_SIGMA * self.long_side(v))
     }
 
     /// Parameters of the optics that adjustments change.
@@ -360,6 +374,15 @@ impl Model {
             self.tracks[k].position = Some(x);
         }
         Ok(outcome)
+    }
+
+    /// What displacements of the sightings by `share` of the long side at the border of the photos do to the parameters of all optics
+    /// and the rotations.
+    pub(super) fn bent(&self, share: f64) -> Option<Bent> {
+        let (problem, views, _) = self.problem(f64::INFINITY, Freedom::Full);
+        let half_long: Vec<f64> = views.iter().map(|v| self.centres[*v].max_element()).collect();
+        let scale: Vec<f64> = half_long.iter().map(|h| 2.0 * share * h).collect();
+        problem.bent(2.0, &half_long, &scale)
     }
 
     /// Drops sightings farther than `gate` from their point, then points with fewer than two left or too little parallax.

@@ -1,28 +1,12 @@
 //! What the sightings determine of the optics, and which of them share a camera.
+use super::crops;
+use super::fit::{MAX_COST_SHARE, OpticsFit, STEPS, fit_optics};
 use super::model::{Freedom, Model};
 use crate::Result;
 use crate::pose::bundle::Adjusted;
 
-/// Steps that any start needs at most.
-const STEPS: usize = 60;
 /// Steps from an optimum of the same sightings with one camera more: what is left of the cost after them decides nothing.
 const STEPS_JOINED: usize = 12;
-
-/// Optics fitted with a choice of free parameters and groups of photos.
-struct OpticsFit {
-    /// Bayesian information criterion with unknown noise: less is better.
-    value: f64,
-    model: Model,
-    outcome: Adjusted,
-}
-
-fn fit_optics(model: &Model, freedom: Freedom, steps: usize) -> Result<OpticsFit> {
-    let mut model = Model { freedom, ..model.clone() };
-    let outcome = model.adjust(f64::INFINITY, 2.0, steps)?;
-    let n = model.independent(model.observations());
-    let value = n * outcome.cost.max(1e-9).ln() + model.parameters() as f64 * n.ln();
-    Ok(OpticsFit { value, model, outcome })
-}
 
 /// Adjusts with `freedom`; standard deviations as [`learn_optics`] states them.
 pub(super) fn adjust_optics(model: &mut Model, freedom: Freedom) -> Result<Adjusted> {
@@ -83,15 +67,11 @@ pub(super) fn learn_optics(model: &mut Model) -> Result<Adjusted> {
             }
         }
     }
+    found = crops::explained(found)?;
     found.widen();
     *model = found.model;
     Ok(found.outcome)
 }
-
-/// Share of the cost that optics of their own may leave, of that with a principal point of its own for every photo. What is
-/// not modelled, as a rolling shutter, and what the held focal length and lens cost, gave 0.98 on photos of one iPhone; two
-/// generated cameras, 0.5 % apart in focal length and 2 % in k1, 0.92.
-const MAX_COST_SHARE: f64 = 0.95;
 
 /// What the criterion must be below for several cameras: its value if one camera took the photos that look alike and only
 /// its principal point moved from photo to photo, as image stabilisation moves it, times [`MAX_COST_SHARE`] in cost. Optics
@@ -105,18 +85,4 @@ fn shared_camera_criterion(shared: &OpticsFit) -> Result<f64> {
     let moved = fit_optics(&model, Freedom::Full, STEPS)?;
     let n = model.independent(model.observations());
     Ok(moved.value + shared.model.parameters() as f64 * n.ln() + n * MAX_COST_SHARE.ln())
-}
-
-impl OpticsFit {
-    /// Widens every σ to what it is with [`Model::independent`] observations taken for independent.
-    fn widen(&mut self) {
-        let observations = self.model.observations();
-        let wider = (observations as f64 / self.model.independent(observations)).sqrt();
-        for (sigmas, prior) in self.outcome.sigmas.iter_mut().zip(&self.model.priors) {
-            for (sigma, most) in sigmas.iter_mut().zip(prior.sigmas()) {
-                *sigma = (*sigma * wider).min(most);
-            }
-        }
-        self.outcome.rotation_sigmas.iter_mut().for_each(|s| *s = (*s * wider).min(std::f64::consts::PI));
-    }
 }

@@ -6,6 +6,7 @@ use super::tracks::KeypointMatch;
 use super::unplaced::Unplaced;
 use crate::photo::Photo;
 use crate::pose::choose::Reason;
+use crate::pose::homography::{self, FocalRange};
 use crate::pose::matching::{self, Match};
 use crate::pose::two_view;
 use crate::progress::Progress;
@@ -20,12 +21,19 @@ pub(super) const THRESHOLD: f64 = 3.0 / 640.0;
 /// Fewest verified matches of a usable pair: five are fitted by anything, 20 agree by chance in few cases.
 pub(super) const MIN_INLIERS: usize = 20;
 
+/// Largest zoom between two photos of one place that is looked for: that of usual lenses.
+const LARGEST_ZOOM: f64 = 4.0;
+/// The same for photos whose files state their focal lengths, which are rounded and change with focus.
+const SAME_ZOOM: f64 = 1.1;
+/// Least zoom that is told from a camera that moved: one that comes nearer by a twentieth without showing parallax shows no depth.
+const ZOOMED: f64 = 1.05;
+
 /// What two photos have in common.
 enum Relation {
     Usable(Pair),
     /// Too few matches agree on any geometry.
     Apart,
-    /// The camera only turned, or did not move.
+    /// The camera only turned or zoomed, or did not move.
     NoParallax,
     /// The same picture twice.
     Same,
@@ -50,15 +58,16 @@ pub(super) struct Related {
     pub(super) pairs: Vec<Pair>,
 }
 
-/// Matches of all photos, and the pairs that agree on a geometry; an error that names the others unless those connect all
+/// Of the matches of all photos the pairs that agree on a geometry; an error that names the others unless those connect all
 /// photos. Where photos are not connected surely, corners of [`affine_family`] join `families`.
 pub(super) fn related(
     photos: &[Photo],
     families: &mut Vec<Family>,
+    putative: Vec<Matches>,
     empty: &Model,
     progress: &dyn Progress,
 ) -> Result<Related, Unplaced> {
-    let (putative, named) = relations(photos, families, empty, 0, progress)?;
+    let (putative, named) = relations(photos, families, putative, empty, 0, progress)?;
     check_overlap(photos, &named)?;
     Ok(Related { putative, pairs: usable(named) })
 }
@@ -72,7 +81,8 @@ pub(super) fn related_to(
     known: usize,
     progress: &dyn Progress,
 ) -> Result<Related, Unplaced> {
-    let (putative, named) = relations(photos, families, model, known, progress)?;
+    let putative = putative_matches(families, progress)?;
+    let (putative, named) = relations(photos, families, putative, model, known, progress)?;
     if let Some((i, j, _)) = named.iter().find(|r| matches!(r.2, Relation::Same)) {
         let (old, new) = (&photos[*i].stem, &photos[*j].stem);
         return Err(Unplaced {
@@ -91,15 +101,15 @@ fn usable(named: Vec<(usize, usize, Relation)>) -> Vec<Pair> {
     named.into_iter().filter_map(pair).collect()
 }
 
-/// Matches of all pairs by descriptor, and what the pairs have in common, apart from those among the first `known` photos.
+/// Matches of all pairs, and what the pairs have in common, apart from those among the first `known` photos.
 fn relations(
     photos: &[Photo],
     families: &mut Vec<Family>,
+    mut putative: Vec<Matches>,
     empty: &Model,
     known: usize,
     progress: &dyn Progress,
 ) -> Result<(Vec<Matches>, Vec<(usize, usize, Relation)>)> {
-    let mut putative = putative_matches(families, progress)?;
     let one = |pair: &Matches| match progress.cancelled() || pair.second < known {
         true => Relation::Apart,
         false => relate(photos, pair, empty),
@@ -191,19 +201,60 @@ fn relate(photos: &[Photo], pair: &Matches, empty: &Model) -> Relation {
     let threshold = THRESHOLD * long / empty.focal(i);
     let sigma = |v: usize| empty.priors[empty.group[v]].log_focal.1;
     let sigma = sigma(i).max(sigma(j));
-    let Some(found) = two_view::estimate(&x, &y, threshold, sigma, empty.seed) else {
-        return Relation::Apart;
+    let turned = homography::homography(&x, &y, threshold, empty.seed).map(|h| {
+        let known = |v: usize| photos[v].exif_focal.is_some();
+        let zoom = if known(i) && known(j) { SAME_ZOOM } else { LARGEST_ZOOM };
+        homography::turn(&h, &x, &y, threshold, FocalRange { each: 2.0 * sigma, zoom: zoom.ln() })
+    });
+    let found = two_view::estimate(&x, &y, threshold, sigma, empty.seed);
+    let Some(found) = found.filter(|f| f.inliers.len() >= MIN_INLIERS) else {
+        // A turn so wide that no move explains it as well.
+        let agree = turned.map_or(0.0, |t| t.share(&x, &y, threshold) * x.len() as f64);
+        return if is_sure(agree as usize, x.len()) { Relation::NoParallax } else { Relation::Apart };
     };
-    if found.inliers.len() < MIN_INLIERS {
-        return Relation::Apart;
-    }
     // Without translation nothing but noise remains after the rotation: 0.6 of the threshold is about two σ.
-    if found.rotation_residual < 0.6 * threshold {
+    let noise = 0.6 * threshold;
+    let zoomed = turned.filter(|t| t.zoom.ln().abs() > ZOOMED.ln()).is_some_and(|t| {
+        let of = |p: &[DVec2]| -> Vec<DVec2> { found.inliers.iter().map(|k| p[*k]).collect() };
+        t.residual(&of(&x), &of(&y)) < noise
+    });
+    if found.rotation_residual < noise || zoomed {
         return Relation::NoParallax;
     }
     let list = found.inliers.iter().map(|k| all[*k]).collect();
     let sure = is_sure(found.inliers.len(), all.len());
     Relation::Usable(Pair { matches: Matches { first: i, second: j, list }, geometry: found, sure })
+}
+
+/// Share of matches off the plane that most of them lie on, below which a photo shows nothing but that plane.
+const FLAT: f64 = 0.1;
+/// Change of scale along the picture up to which two photos see a plane straight on: that of one tilted by 10° to 15° more than the other.
+const STRAIGHT_ON: f64 = 0.1;
+
+/// Per photo whether the matches show it to be of one plane seen straight on, or taken from the same place as the others: one homography
+/// explains all that agree on anything with every other photo, with one at least beyond doubt, and hardly has perspective. From the far
+/// side of a table its top may be all that is matched, while the photo shows more.
+pub(super) fn flat_photos(photos: &[Photo], putative: &[Matches], seed: u64) -> Vec<bool> {
+    let half = |v: usize| DVec2::new(photos[v].image.width as f64, photos[v].image.height as f64) * 0.5;
+    let one = |pair: &Matches| {
+        let middle = [half(pair.first), half(pair.second)];
+        let centred = pair.list.iter().map(|m| (m.0 - middle[0], m.1 - middle[1]));
+        let (x, y): (Vec<DVec2>, Vec<DVec2>) = centred.unzip();
+        let threshold = 2.0 * THRESHOLD * middle[0].max_element();
+        let h = homography::homography(&x, &y, threshold, seed)?;
+        let (on, off) = homography::on_and_off_plane(&h, &x, &y, threshold, seed);
+        let flat = (off as f64) < FLAT * (on + off) as f64;
+        let sure = is_sure(on, x.len());
+        let oblique = sure && homography::perspective(&h, middle[0]) > STRAIGHT_ON;
+        (on + off >= MIN_INLIERS).then_some((flat && !oblique, sure))
+    };
+    let found: Vec<Option<(bool, bool)>> = putative.par_iter().map(one).collect();
+    let flat = |view: usize| {
+        let own = putative.iter().zip(&found).filter(|(p, _)| [p.first, p.second].contains(&view));
+        let own: Vec<(bool, bool)> = own.filter_map(|(_, found)| *found).collect();
+        own.iter().all(|(flat, _)| *flat) && own.iter().any(|(_, sure)| *sure)
+    };
+    (0..photos.len()).map(flat).collect()
 }
 
 /// True when two photos differ by less than re-compression does.
@@ -257,7 +308,7 @@ fn check_overlap(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Re
         )
     } else {
         format!(
-            "no parallax between {turned}: the camera only turned; take the photos from different positions"
+            "no parallax between {turned}: the camera only turned or zoomed; take the photos from different positions"
         )
     };
     Err(Unplaced { views, error: Error::input(text) })

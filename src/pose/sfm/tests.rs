@@ -1,8 +1,9 @@
 use super::*;
+use crate::math::Random;
 use crate::pose::align::pose_errors;
 use crate::pose::testing::{self, bilinear, lensed};
 use crate::progress::Silent;
-use crate::scene::{Camera, RgbImage};
+use crate::scene::{Camera, Pose, RgbImage};
 use glam::{DMat3, DVec3};
 
 /// Features of XFeat, which is in the model pack.
@@ -104,6 +105,8 @@ fn photos_without_geometry_are_refused_by_name() {
     assert!(refusal(&twice).contains("identical photos: train_00–copy"));
     let turn = [a.clone(), turned(a, truth.cameras[0].fx, 0.15)];
     assert!(refusal(&turn).contains("no parallax"));
+    let zoom = [a.clone(), Photo { stem: "zoomed".into(), ..cropped(a, 1.5, DVec2::ZERO) }];
+    assert!(refusal(&zoom).contains("no parallax between train_00–zoomed: the camera only turned or zoomed"));
     let mut sky = a.clone();
     sky.stem = "sky".into();
     sky.image.data.iter_mut().enumerate().for_each(|(i, c)| *c = [0.4, 0.6, 0.5 + 1e-6 * i as f32]);
@@ -169,10 +172,11 @@ fn a_lens_is_found_and_a_pinhole_stays_one() {
 fn a_view_in_the_wrong_place_is_the_only_one_that_disagrees() {
     let truth = testing::train(&testing::folder());
     let mut families = corner_families(&truth.photos, &[], &Silent).unwrap();
-    let mut model = empty_model(&truth.photos, 0);
+    let mut model = empty_model(&truth.photos, &[false; 4], 0);
     model.optics[0].focal = truth.cameras[0].fx;
     model.poses = truth.cameras.iter().map(|c| Some(c.pose)).collect();
-    let pairs = relate::related(&truth.photos, &mut families, &model, &Silent).unwrap().pairs;
+    let putative = relate::putative_matches(&families, &Silent).unwrap();
+    let pairs = relate::related(&truth.photos, &mut families, putative, &model, &Silent).unwrap().pairs;
     let right = agreement(&model, &pairs, 3.0);
     assert!(right.iter().all(|a| *a > AGREED), "{right:?}");
     let turn = crate::scene::Pose::exp(glam::DVec3::new(0.1, 0.0, 0.0), glam::DVec3::new(0.0, 0.05, 0.0));
@@ -203,7 +207,7 @@ fn two_photos_75_degrees_apart_say_how_little_they_know() {
 fn corners_seen_from_the_side_join_photos_75_degrees_apart() {
     let truth = testing::train(&testing::folder());
     let outer = [truth.photos[0].clone(), truth.photos[3].clone()];
-    let mut model = empty_model(&outer, 0);
+    let mut model = empty_model(&outer, &[false; 2], 0);
     model.optics[0].focal = truth.cameras[0].fx;
     model.poses = [0, 3].map(|v| Some(truth.cameras[v].pose)).to_vec();
     let mut families = corner_families(&outer, &[], &Silent).unwrap();
@@ -218,14 +222,15 @@ fn corners_seen_from_the_side_join_photos_75_degrees_apart() {
     assert!(wide.0 > 3 * plain.0 && 2 * wide.0 > wide.1, "{plain:?} {wide:?}");
 }
 
-/// The middle of a photo at the size of the whole: the inner 1 / `zoom` of its width.
-fn cropped(photo: &Photo, zoom: f64) -> Photo {
+/// A part of a photo at the size of the whole: 1 / `zoom` of its width, `off` its middle by so many pixels of the whole.
+fn cropped(photo: &Photo, zoom: f64, off: DVec2) -> Photo {
     let mut out = photo.clone();
     let (w, h) = (photo.image.width, photo.image.height);
-    let from =
-        |at: usize, size: usize| (at as f64 + 0.5 - 0.5 * size as f64) / zoom + 0.5 * size as f64 - 0.5;
+    let from = |at: usize, size: usize, off: f64| {
+        (at as f64 + 0.5 - 0.5 * size as f64) / zoom + 0.5 * size as f64 - 0.5 + off
+    };
     for (i, pixel) in out.image.data.iter_mut().enumerate() {
-        *pixel = bilinear(&photo.image, from(i % w, w), from(i / w, h));
+        *pixel = bilinear(&photo.image, from(i % w, w, off.x), from(i / w, h, off.y));
     }
     out
 }
@@ -241,8 +246,10 @@ fn photos_that_only_look_like_one_camera_are_told_apart() {
     type Change<'a> = &'a dyn Fn(&Photo) -> Photo;
     // No file says that two of the photos came through a lens, or were cut out of larger ones. Change, zoom, limits of rotation
     // in degrees and of the centre: a cut enlarged twice shows half the detail.
-    let sets: [(Change, f64, [f64; 2]); 2] =
-        [(&|p| lensed(p, focal, lens), 1.0, [0.05, 0.001]), (&|p| cropped(p, 2.0), 2.0, [0.1, 0.002])];
+    let sets: [(Change, f64, [f64; 2]); 2] = [
+        (&|p| lensed(p, focal, lens), 1.0, [0.05, 0.001]),
+        (&|p| cropped(p, 2.0, DVec2::ZERO), 2.0, [0.1, 0.002]),
+    ];
     for (change, zoom, [rotation, centre]) in sets {
         let mut photos = truth.photos.clone();
         let mut cameras = truth.cameras.clone();
@@ -261,6 +268,53 @@ fn photos_that_only_look_like_one_camera_are_told_apart() {
         assert!(e.centre.iter().all(|v| *v < centre), "{e:?}");
         assert!(e.focal.iter().zip(&model.fitted).all(|(v, f)| *v < 2.0 * f.sigmas[0]), "{e:?}");
     }
+}
+
+#[test]
+fn photos_cut_off_centre_are_found() {
+    let truth = testing::train(&testing::folder());
+    let mut photos = truth.photos.clone();
+    let offs = [(1, DVec2::new(70.0, -50.0)), (3, DVec2::new(-60.0, 45.0))];
+    for (v, off) in offs {
+        photos[v] = cropped(&photos[v], 1.4, off);
+    }
+    let model = reconstruct(&photos, &[], 0, &Silent).unwrap();
+    println!("{:?}", model.cameras);
+    for (v, camera) in model.cameras.iter().enumerate() {
+        let (off, zoom) = offs.iter().find(|o| o.0 == v).map_or((DVec2::ZERO, 1.0), |o| (o.1 * 1.4, 1.4));
+        let middle = DVec2::new(320.0, 240.0) - off;
+        // A hundredth of the width; held in the middle where the photo is whole.
+        assert!(DVec2::new(camera.cx, camera.cy).distance(middle) < 6.4, "{v}: {camera:?}");
+        assert!((camera.fx / (zoom * truth.cameras[v].fx) - 1.0).abs() < 0.02, "{v}: {camera:?}");
+    }
+}
+
+#[test]
+fn planes_seen_straight_on_are_flat() {
+    let image = RgbImage { width: 640, height: 480, data: vec![[0.5; 3]; 640 * 480] };
+    let photos = ["a", "b"].map(|name| crate::photo::from_pixels(name.as_ref(), &image, None, 640).unwrap());
+    let flat = |pose: Pose, depth: f64| {
+        let point = |rng: &mut Random| {
+            let z = 4.0 + depth * (rng.uniform() - 0.5);
+            DVec3::new(rng.uniform() - 0.5, 0.75 * (rng.uniform() - 0.5), 1.0) * z
+        };
+        let (x, y) = testing::matches_of(&pose, [600.0; 2], 300, 0.5, point);
+        let one = |(k, (x, y)): (usize, (&DVec2, &DVec2))| {
+            let middle = DVec2::new(320.0, 240.0);
+            (*x + middle, *y + middle, KeypointMatch { first: (0, k), second: (1, k), quality: 1.0 })
+        };
+        let list = x.iter().zip(&y).enumerate().map(one).collect();
+        relate::flat_photos(&photos, &[pair::Matches { first: 0, second: 1, list }], 0)
+    };
+    let aside = Pose::exp(DVec3::new(-0.8, 0.2, 0.1), DVec3::ZERO);
+    let leaning = Pose::exp(DVec3::new(-0.8, 0.2, 0.1), DVec3::X * 0.4);
+    assert_eq!(flat(aside, 0.0), [true; 2]);
+    assert_eq!(
+        flat(leaning, 0.0),
+        [false; 2],
+        "one sees it at an angle, where its edges tell the focal length"
+    );
+    assert_eq!(flat(aside, 2.0), [false; 2]);
 }
 
 /// The part of a photo that a lens moved by image stabilisation would show: 600 × 440 pixels, off the middle by `shift`.
@@ -290,7 +344,8 @@ fn a_moving_lens_does_not_make_another_camera() {
 #[test]
 fn photos_whose_files_name_camera_and_zoom_share_it() {
     let mut photos = testing::train(&testing::folder()).photos;
-    let separate = |photos: &[Photo]| empty_model(photos, 0).with_separate_optics().map(|m| m.group);
+    let separate =
+        |photos: &[Photo]| empty_model(photos, &[false; 4], 0).with_separate_optics().map(|m| m.group);
     assert_eq!(separate(&photos), Some(vec![0, 1, 2, 3]));
     for p in &mut photos[..3] {
         (p.camera_model, p.exif_focal) = (Some("phone".into()), Some(600.0));
@@ -352,13 +407,14 @@ fn corner_of_a_room(focal: f64) -> RgbImage {
 fn walls_tell_the_focal_length_where_the_file_does_not() {
     let focal: f64 = 224.0;
     let room = corner_of_a_room(focal);
-    let prior = |exif: Option<f64>| {
+    let prior = |exif: Option<f64>, flat: bool| {
         let photo = crate::photo::from_pixels("room.png".as_ref(), &room, exif, 320).unwrap();
-        empty_model(&[photo], 0).priors[0].log_focal
+        empty_model(&[photo], &[flat], 0).priors[0].log_focal
     };
-    let (mean, sigma) = prior(None);
+    let (mean, sigma) = prior(None, false);
     println!("{:.3} ± {sigma:.3}", mean - focal.ln());
     // The long side alone says 0.25 ± 0.35; the walls 0.007 ± 0.060.
     assert!((mean - focal.ln()).abs() < 0.05 && sigma < 0.1, "{mean} {sigma}");
-    assert_eq!(prior(Some(300.0)), (300f64.ln(), EXIF_SIGMA), "EXIF goes before");
+    assert_eq!(prior(Some(300.0), false), (300f64.ln(), EXIF_SIGMA), "EXIF goes before");
+    assert_eq!(prior(None, true).1, FOCAL_SIGMA, "a picture of a room on a wall tells nothing");
 }
