@@ -152,16 +152,7 @@ pub fn export(args: &ExportArgs) -> Result<()> {
             folder.keep()?;
         }
         Out::Splats(files, format) => {
-            if let Some(brightest) = format.brightest {
-                warn_of_range(&scene.splats, brightest);
-            }
-            if scene.splats.antialiased && !format.states_filter {
-                progress::reporter().warn(&format!(
-                    "the scene is antialiased and {} cannot say so: programs draw its thin splats too heavy; ply, \
-                     compressed-ply and spz keep it",
-                    format.name
-                ));
-            }
+            warn_of_losses(&scene.splats, format);
             warn_of_models(&scene);
             let options = WriteOptions { spz_version: args.spz_version.unwrap_or(spz::DEFAULT_VERSION) };
             files.write(&scene.splats, scene.language.as_ref(), format, options)?;
@@ -288,6 +279,20 @@ fn keep_seen(scene: &mut Scene, args: &ExportArgs) -> Result<()> {
 const ORDINARY: f32 = 1.25;
 /// Share of the solid splats that may be cut off unnoticed.
 const UNNOTICED: f64 = 5e-4;
+
+/// Warns of what a format cannot hold.
+fn warn_of_losses(splats: &Splats, format: &SplatFormat) {
+    if let Some(brightest) = format.brightest {
+        warn_of_range(splats, brightest);
+    }
+    if splats.antialiased && !format.states_filter {
+        progress::reporter().warn(&format!(
+            "the scene is antialiased and {} cannot say so: programs draw its thin splats too heavy; ply, compressed-ply and \
+             spz keep it",
+            format.name
+        ));
+    }
+}
 
 /// Warns where a format of bytes cuts off what solid splats have beyond its `brightest` base colour.
 fn warn_of_range(splats: &Splats, brightest: f32) {

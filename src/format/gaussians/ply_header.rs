@@ -143,15 +143,8 @@ pub(super) fn header(bytes: &[u8], wanted: &str) -> Result<Header, String> {
                 }
                 elements.push(Element { name: (*name).into(), rows, ..Element::default() });
             }
-            ["property", "list", ..] => elements.last_mut().into_iter().for_each(|e| e.has_list = true),
-            ["property", kind, name] => {
-                let kind =
-                    PropertyType::parse(kind).ok_or_else(|| format!("unknown property type {kind:?}"))?;
-                let Some(element) = elements.last_mut() else { continue };
-                if element.columns.len() == MOST_COLUMNS {
-                    return Err(format!("element {} has more than {MOST_COLUMNS} properties", element.name));
-                }
-                element.columns.push(((*name).to_owned(), kind));
+            ["property", property @ ..] => {
+                elements.last_mut().map_or(Ok(()), |element| element.add(property))?;
             }
             _ => {}
         }
@@ -186,6 +179,40 @@ struct Element {
 }
 
 impl Element {
+    /// Takes the words after "property".
+    fn add(&mut self, property: &[&str]) -> Result<(), String> {
+        match property {
+            ["list", ..] => self.has_list = true,
+            [kind, name] => {
+                let kind =
+                    PropertyType::parse(kind).ok_or_else(|| format!("unknown property type {kind:?}"))?;
+                if self.columns.len() == MOST_COLUMNS {
+                    return Err(format!("element {} has more than {MOST_COLUMNS} properties", self.name));
+                }
+                self.columns.push(((*name).to_owned(), kind));
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Refuses rows that are not of one length, and columns that cannot be told apart.
+    fn check(&self) -> Result<(), String> {
+        let name = &self.name;
+        if self.has_list {
+            return Err(format!(
+                "element {name} has a list property, which is not supported; write it without"
+            ));
+        }
+        let mut seen = HashSet::new();
+        match self.columns.iter().find(|c| !seen.insert(c.0.as_str())) {
+            Some((twice, _)) => {
+                Err(format!("element {name} has the property {twice} twice; remove one of them"))
+            }
+            None => Ok(()),
+        }
+    }
+
     /// Bytes (binary) or lines (ASCII).
     fn length(&self, ascii: bool) -> Result<usize, String> {
         if ascii || self.rows == 0 {
