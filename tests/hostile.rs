@@ -339,7 +339,9 @@ fn relative_home_is_never_the_current_folder() {
     for (home, data) in [("", ""), (".", ""), ("here", ".local/share"), ("", "./.local/share")] {
         for arguments in [&["models", "list"][..], &["clean", "--delete"]] {
             let mut c = Command::new(env!("CARGO_BIN_EXE_splatvk"));
-            variables.iter().for_each(|name| drop(c.env_remove(name)));
+            for name in variables {
+                c.env_remove(name);
+            }
             let c = c.env("HOME", home).env("XDG_DATA_HOME", data).current_dir(folder.path());
             let output = c.args(arguments).output().unwrap();
             let said = String::from_utf8_lossy(&output.stderr).into_owned();
