@@ -5,10 +5,10 @@
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Rendered { float rendered[]; };  // [C, H, W]
-layout(std430, binding = 1) readonly buffer Target { float target_image[]; };  // [C, H, W]
+layout(std430, binding = 1) readonly buffer Target { float target_image[]; };  // [C, H, W], and [H, W] weights where there are some
 layout(std430, binding = 2) writeonly buffer Means { vec2 means[]; };  // [C, H, W] blurred (x, y)
 layout(std430, binding = 3) writeonly buffer Moments { vec2 moments[]; };  // [C, H, W] blurred (x²+y², xy)
-layout(push_constant) uniform Push { int width; int height; };
+layout(push_constant) uniform Push { int width; int height; int weighted; };
 #include "shared/ssim.glsl"
 
 void main() {
@@ -24,6 +24,8 @@ void main() {
         int q = base + clamp(y, 0, height - 1) * width + x;
         float u = inside ? rendered[q] : 0.0;
         float v = inside ? target_image[q] : 0.0;
+        // What does not count looks as it should.
+        if (weighted != 0) u = fma(target_image[3 * width * height + (q - base)], u - v, v);
         float squares = u * u + v * v, product = u * v;
         [[unroll]] for (int k = 0; k < STRIP; k++) {
             if (i - k >= 0 && i - k < 2 * HALF + 1) {

@@ -1,11 +1,15 @@
 //! Files read within bounds; files that are whole or not there: written beside their place and renamed into it, some with a
 //! checksum in front; and the rule for what may be written over.
+mod guard;
 mod home;
 mod owner;
 mod partial;
 mod place;
 mod replace;
 
+pub(crate) use guard::guarded;
+#[cfg(feature = "capi")]
+pub(crate) use guard::panic_text;
 pub use home::home;
 #[cfg(test)]
 pub(crate) use owner::tests::leave;

@@ -156,7 +156,7 @@ fn with_view_dependence(device: &Device, truth: &Splats, cameras: &[Camera], deg
     let trained = fit::fit_rgb(device, &images, cameras, start, scale, None, &options, &Silent).unwrap();
     let before = (trained.splats.clone(), trained.cameras.clone());
     let options = ViewDependentOptions::preset(Preset::Draft, degree, 0);
-    let found = fit::fit_view_dependent(device, &images, trained, &options, &Silent).unwrap();
+    let found = fit::fit_view_dependent(device, &images, &[], trained, &options, &Silent).unwrap();
     assert_eq!(found.cameras, before.1);
     let geometry = |s: &Splats| Splats { sh: Vec::new(), sh_degree: 0, ..s.clone() };
     assert!(geometry(&found.splats) == geometry(&before.0), "only colours are fitted");

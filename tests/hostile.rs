@@ -398,3 +398,34 @@ fn folders_as_typed_are_not_in_the_scene() {
     assert!(mode(&home.join("stages")) == 0o700 && !stages.is_empty());
     assert!(stages.iter().all(|s| mode(s) == 0o600), "{stages:?}");
 }
+
+/// A chunk of a PNG with its sum.
+fn chunk(kind: &[u8; 4], data: &[u8]) -> Vec<u8> {
+    let mut sum = flate2::Crc::new();
+    sum.update(kind);
+    sum.update(data);
+    [&(data.len() as u32).to_be_bytes()[..], kind, data, &sum.sum().to_be_bytes()].concat()
+}
+
+#[test]
+fn panic_of_photo_decoder_is_line() {
+    use std::io::Write;
+    let folder = tempfile::tempdir().unwrap();
+    let mut rows = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::fast());
+    rows.write_all(&[1; 65 * 64]).unwrap();
+    // A palette of one colour and a third.
+    let png = [
+        b"\x89PNG\r\n\x1a\n".to_vec(),
+        chunk(b"IHDR", &[0, 0, 0, 64, 0, 0, 0, 64, 8, 3, 0, 0, 0]),
+        chunk(b"PLTE", &[1, 2, 3, 4]),
+        chunk(b"IDAT", &rows.finish().unwrap()),
+        chunk(b"IEND", &[]),
+    ];
+    std::fs::write(folder.path().join("a.png"), png.concat()).unwrap();
+    let photo = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast/images/train_00.jpg");
+    std::fs::copy(photo, folder.path().join("b.jpg")).unwrap();
+    let (photos, out) =
+        (folder.path().display().to_string(), folder.path().join("out").display().to_string());
+    refuses(2, &["run", &photos, "--out", &out], &["a.png: the image is damaged (", "copy the photo again"]);
+    assert!(!Path::new(&out).exists());
+}

@@ -40,7 +40,7 @@ const FOLDERS: &[(&str, &str)] = &[
         "error preset progress scene gpu photo format infer fit language query report synth pipeline run",
     ),
     ("bench", "error files preset progress scene gpu pass photo format infer pose fit language query run"),
-    ("capi", "error preset progress scene gpu pass photo infer pose query run"),
+    ("capi", "error files preset progress scene gpu pass photo infer pose query run"),
     (
         "cli",
         "error files preset progress scene gpu check photo format infer fetch language query report synth pipeline run ablate bench",

@@ -447,6 +447,81 @@ fn an_avif_with_a_profile_looks_as_the_same_png_with_it() {
 }
 
 #[test]
+fn code_points_of_avif_are_used() {
+    let mut file = std::fs::read(data("photos/small.avif")).unwrap();
+    let at = file.windows(8).position(|w| w == b"colrnclx").unwrap() + 8;
+    let plain = heif("small.avif").image;
+    let bytes: Vec<u8> = plain.data.as_flattened().iter().map(|v| (255.0 * v).round() as u8).collect();
+    // BT.2020 with PQ, Display P3, and as it is.
+    for [primaries, transfer] in [[9u8, 16], [12, 13], [2, 2]] {
+        (file[at + 1], file[at + 3]) = (primaries, transfer);
+        let avif = photo::from_bytes(Path::new("a.avif"), file.clone(), photo::MAX_SIZE).unwrap();
+        let mut png = Vec::new();
+        let encoder = image::codecs::png::PngEncoder::new(&mut png);
+        let (w, h) = (plain.width as u32, plain.height as u32);
+        encoder.write_image(&bytes, w, h, image::ExtendedColorType::Rgb8).unwrap();
+        let mut chunk = [b"cICP", &[primaries, transfer, 0, 1][..]].concat();
+        let mut sum = flate2::Crc::new();
+        sum.update(&chunk);
+        chunk.splice(0..0, 4u32.to_be_bytes());
+        chunk.extend(sum.sum().to_be_bytes());
+        png.splice(33..33, chunk);
+        let png = photo::from_bytes(Path::new("a.png"), png, photo::MAX_SIZE).unwrap();
+        assert!(avif.image == png.image, "primaries {primaries}, transfer {transfer}: other colours");
+        assert_eq!(avif.image == plain, transfer == 2);
+    }
+}
+
+/// Mean difference between the largest and the smallest channel, in steps of 8 bits.
+fn saturation(image: &RgbImage) -> f32 {
+    let clipped = |c: &[f32; 3]| c.map(|v| 255.0 * v.clamp(0.0, 1.0));
+    let spread = |c: [f32; 3]| c[0].max(c[1]).max(c[2]) - c[0].min(c[1]).min(c[2]);
+    image.data.iter().map(|c| spread(clipped(c))).sum::<f32>() / image.data.len() as f32
+}
+
+#[test]
+fn hdr_video_has_colours_of_its_photos() {
+    let folder = tempfile::tempdir().unwrap();
+    let original = photo::load(&data("breakfast/images/train_00.jpg")).unwrap().image;
+    let to_2020 = [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.088, 0.8956f32]];
+    let hlg = |l: f32| {
+        // Diffuse white at 0.75 of the signal: ITU-R BT.2408.
+        let e = l * 0.265;
+        if e <= 1.0 / 12.0 {
+            (3.0 * e).sqrt()
+        } else {
+            0.178_832_77 * (12.0 * e - 0.284_668_92).ln() + 0.559_910_7
+        }
+    };
+    let pixels = original.data.iter().flat_map(|c| {
+        let light = c.map(splatvk::scene::to_linear);
+        to_2020.map(|r| (65535.0 * hlg((0..3).map(|k| r[k] * light[k]).sum::<f32>().max(0.0))) as u16)
+    });
+    let (w, h) = (original.width as u32, original.height as u32);
+    let frame =
+        image::ImageBuffer::<image::Rgb<u16>, _>::from_raw(w, h, pixels.collect::<Vec<u16>>()).unwrap();
+    for k in 0..2 {
+        image::DynamicImage::from(frame.clone()).save(folder.path().join(format!("{k}.png"))).unwrap();
+    }
+    let path = folder.path().join("hlg.mkv");
+    let Some(mut ffmpeg) = program("ffmpeg") else { return };
+    ffmpeg
+        .args(["-loglevel", "error", "-nostdin", "-framerate", "2", "-i"])
+        .arg(folder.path().join("%d.png"));
+    ffmpeg.args(["-vf", "scale=out_color_matrix=bt2020:out_range=tv,format=yuv420p10le", "-c:v", "ffv1"]);
+    ffmpeg.args(["-color_trc", "arib-std-b67", "-color_primaries", "bt2020", "-colorspace", "bt2020nc"]);
+    assert!(ffmpeg.args(["-color_range", "tv"]).arg(&path).status().unwrap().success());
+    let candidates = photo::gather(&[path], &Silent).unwrap();
+    let seen = candidates[0].load(photo::MAX_SIZE, &Silent).unwrap().image;
+    let (found, right) = (saturation(&seen), saturation(&original));
+    assert!((found / right - 1.0).abs() < 0.03, "saturation {found}, that of the photo is {right}");
+    let off: f32 =
+        seen.data.as_flattened().iter().zip(original.data.as_flattened()).map(|(a, b)| (a - b).abs()).sum();
+    let off = off / (3 * w * h) as f32;
+    assert!(off < 0.02, "colours differ by {off} on average");
+}
+
+#[test]
 fn pixels_that_are_no_numbers_are_counted() {
     let folder = tempfile::tempdir().unwrap();
     let paths = ["a.exr", "b.exr"].map(|n| folder.path().join(n));

@@ -25,7 +25,7 @@ pub fn colour(device: &Device, workload: &Workload, limits: (&Budget, &Roofline)
     let options =
         RgbOptions { rates: Rates::STILL, poses: None, coarse: 0.0, ..RgbOptions::preset(Preset::Default) };
     let scale = SceneScale::measure(&cameras, &workload.splats.means);
-    let photos = Photos { images: &target, cameras: &cameras, depths: None };
+    let photos = Photos { images: &target, cameras: &cameras, depths: None, coverage: &[] };
     let mut run = RgbRun::new(device, photos, &workload.splats, scale, &options)?;
     let mut section = Section::new(COLOUR, workload.describe(0));
     measure(device, &mut run, limits, &mut section)?;
@@ -58,8 +58,7 @@ pub fn with_features(
     };
     let mut run = LanguageRun::new(
         device,
-        &target,
-        &cameras,
+        Photos { images: &target, cameras: &cameras, depths: None, coverage: &[] },
         &workload.splats,
         &fields,
         &options,

@@ -1,7 +1,7 @@
 //! Between C and Rust: panics, errors, pointers, texts and structures of other versions.
 use super::types::*;
+use crate::files::panic_text;
 use crate::{Error, Result};
-use std::any::Any;
 use std::cell::RefCell;
 use std::ffi::{CStr, c_char};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -77,11 +77,6 @@ fn caught(store: impl FnOnce(String), body: impl FnOnce() -> Result<(), CallErro
     };
     store(text);
     status
-}
-
-fn panic_text(panic: &(dyn Any + Send)) -> &str {
-    let text = panic.downcast_ref::<String>().map(String::as_str);
-    text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")
 }
 
 fn status(e: &Error) -> SvkStatus {

@@ -6,7 +6,7 @@ use super::scene::{SvkScene, camera_in};
 use super::types::*;
 use crate::fit::Preset;
 use crate::infer::installed::{Inventory, inventory};
-use crate::photo::{self, Photo};
+use crate::photo::{self, MaskChoice, Photo};
 use crate::pose::choose;
 use crate::progress::Progress;
 use crate::run::compat::{self, Compat};
@@ -77,14 +77,18 @@ unsafe fn gather(
     let photos = if !in_memory && paths.iter().all(Option::is_some) {
         let paths: Vec<PathBuf> = paths.into_iter().flatten().collect();
         let all = if views > 0 || paths.iter().any(|p| p.is_dir()) { None } else { Some(paths.len()) };
-        let (chosen, _) = choose::photos(&paths, if views > 0 { Some(views) } else { all }, progress)?;
+        let (mut chosen, _) = choose::photos(&paths, if views > 0 { Some(views) } else { all }, progress)?;
+        photo::assign_masks(&mut chosen, &MaskChoice::default(), progress)?;
         photo::load_each(&chosen, max_size, progress)?
     } else {
         // SAFETY: photos of the host, as the header describes them.
         let one = |(i, (photo, path)): (usize, (&SvkPhoto, Option<PathBuf>))| unsafe {
             single(photo, path, i, max_size)
         };
-        given.iter().zip(paths).enumerate().map(one).collect::<Result<Vec<_>, CallError>>()?
+        let mut photos =
+            given.iter().zip(paths).enumerate().map(one).collect::<Result<Vec<_>, CallError>>()?;
+        photo::settle(&mut photos, &[], progress);
+        photos
     };
     let mut cameras = Vec::new();
     for (photo, given) in photos.iter().zip(given).filter(|(_, g)| !g.camera.is_null()) {

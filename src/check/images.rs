@@ -35,10 +35,10 @@ pub(super) fn ssim_l1(device: &Device, rows: Rows) -> Found {
     let gradient = device.buffer::<f32>("gradient", 3 * PIXELS)?;
     let sums = device.buffer::<f32>("loss", 2)?;
     let mut rec = Recorder::new(device, "self-check of the image loss");
-    pass.record(&mut rec, &bands.get(0), &rendered, &target, &gradient, [0.8, 0.2], (&sums, 0));
+    pass.record(&mut rec, &bands.get(0), &rendered, &target, &gradient, None, [0.8, 0.2], (&sums, 0));
     rec.run()?;
     let sums = sums.read()?;
-    let loss = pass.loss([sums[0], sums[1]].map(f64::from));
+    let loss = pass.loss([sums[0], sums[1]].map(f64::from), None);
     let (twin, by_pixel) = ssim_l1::ssim_l1(&wide(&x), &wide(&y), SIZE.0, SIZE.1, 0.8, 0.2);
     let largest = by_pixel.iter().fold(0.0f64, |m, g| m.max(g.abs()));
     // E[x²] − E[x]² cancels about three digits in f32, and 1/C2 amplifies what is left in flat regions.

@@ -160,6 +160,7 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         views: args.views,
         out: args.out.clone().unwrap_or_else(|| default_out(&args.inputs)),
         force: args.making.force,
+        photo_masks: args.making.photo_masks.clone(),
         resume: args.making.resume,
         checkpoint_seconds: args.making.checkpoint_seconds,
         preset,

@@ -15,6 +15,7 @@ pub fn train(args: &TrainArgs) -> Result<()> {
         points: args.points.clone(),
         out: args.out.clone(),
         force: args.making.force,
+        photo_masks: args.making.photo_masks.clone(),
         resume: args.making.resume,
         checkpoint_seconds: args.making.checkpoint_seconds,
         preset: args.making.preset.map(plan::preset),

@@ -1,15 +1,16 @@
 //! A scene that goes on with more photos (docs/method.md#photos-added-later): its splats stay and train on, surfaces that it does not
 //! have yet become new ones.
 use super::bounds::Bounds;
+use super::coarse::Photos;
 use super::init::{raise_sh_degree, splats_from_points};
 use super::options::RgbOptions;
-use super::rgb::{Trained, fit_rgb};
+use super::rgb::{Trained, fit_photos};
 use super::scale::SceneScale;
 use super::unseen::unseen_splats;
 use crate::Result;
 use crate::gpu::Device;
 use crate::progress::Progress;
-use crate::scene::{Camera, DepthMap, Plane, PointCloud, RgbImage, Splats};
+use crate::scene::{Camera, DepthMap, Plane, PointCloud, Splats};
 use glam::DVec3;
 
 /// Relative difference in depth from which on a point is on another surface than the one that is rendered: what occlusion tests
@@ -39,15 +40,12 @@ pub fn new_surface(points: &PointCloud, views: &[(&Camera, &DepthMap, &Plane<f32
     points.picked(&rows)
 }
 
-/// Trains on: `scene` are the splats that photos show, `fresh` points of new surfaces, all other lists have one entry per photo,
-/// those of the scene first.
-pub fn train_on(
+/// Trains on: `scene` are the splats that photos show, `fresh` points of new surfaces; `photos` are those of the scene first.
+pub(crate) fn train_on(
     device: &Device,
-    images: &[RgbImage],
-    cameras: &[Camera],
+    photos: Photos,
     scene: Splats,
     fresh: &PointCloud,
-    depths: &[DepthMap],
     options: &RgbOptions,
     progress: &dyn Progress,
 ) -> Result<Trained> {
@@ -60,7 +58,8 @@ pub fn train_on(
         join(&mut start, splats_from_points(fresh, &options.init, options.seed)?);
     }
     let surfaces = start.means.clone();
-    if options.margin > 0.0 {
+    let Photos { images, cameras, depths, .. } = photos;
+    if let Some(depths) = depths.filter(|_| options.margin > 0.0 && !photos.show_emptiness()) {
         let (reach, confidence) = (options.margin, options.min_confidence);
         join(&mut start, unseen_splats(images, cameras, depths, reach, confidence, options.seed));
     }
@@ -68,7 +67,7 @@ pub fn train_on(
         start = Bounds::new(cameras, &surfaces).hold(start);
     }
     let scale = SceneScale::measure(cameras, &surfaces);
-    fit_rgb(device, images, cameras, start, scale, Some(depths), options, progress)
+    fit_photos(device, photos, start, scale, options, progress)
 }
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
 //! Training first at half the photos' size: there a step costs less than half, and what it fits is what matters early on.
-use crate::scene::{Camera, DepthMap, Plane, RgbImage};
+use crate::scene::{Camera, Coverage, DepthMap, Plane, RgbImage};
 
 /// What training compares with.
 #[derive(Clone, Copy)]
@@ -9,6 +9,8 @@ pub(crate) struct Photos<'a> {
     pub(crate) cameras: &'a [Camera],
     /// One per photo, if any.
     pub(crate) depths: Option<&'a [DepthMap]>,
+    /// Which pixels of each photo count; empty where all of all do.
+    pub(crate) coverage: &'a [Option<Coverage>],
 }
 
 /// The same at half the size.
@@ -16,23 +18,30 @@ pub(super) struct HalfSizePhotos {
     images: Vec<RgbImage>,
     cameras: Vec<Camera>,
     depths: Option<Vec<DepthMap>>,
+    coverage: Vec<Option<Coverage>>,
 }
 
 impl HalfSizePhotos {
     pub(super) fn of(photos: &Photos) -> HalfSizePhotos {
-        let Photos { images, cameras, depths } = *photos;
+        let Photos { images, cameras, depths, coverage } = *photos;
         let image = |i: &RgbImage| i.resized_by_area(half(i.width), half(i.height));
         let camera = |c: &Camera| c.resized(half(c.width as usize) as u32, half(c.height as usize) as u32);
+        let covered = |c: &Coverage| Coverage {
+            share: c.share.resized_by_area(half(c.share.width), half(c.share.height)),
+            ..c.clone()
+        };
         let depth = |d: &DepthMap| DepthMap { depth: sampled(&d.depth), confidence: sampled(&d.confidence) };
         HalfSizePhotos {
             images: images.iter().map(image).collect(),
             cameras: cameras.iter().map(camera).collect(),
             depths: depths.map(|all| all.iter().map(depth).collect()),
+            coverage: coverage.iter().map(|c| c.as_ref().map(covered)).collect(),
         }
     }
 
     pub(super) fn photos(&self) -> Photos<'_> {
-        Photos { images: &self.images, cameras: &self.cameras, depths: self.depths.as_deref() }
+        let (images, cameras, coverage) = (&self.images, &self.cameras, &self.coverage);
+        Photos { images, cameras, depths: self.depths.as_deref(), coverage }
     }
 }
 

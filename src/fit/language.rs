@@ -1,5 +1,6 @@
 //! The language stage: features on the splats that render to each pixel's code (docs/method.md#language-training),
 //! `L = λ2·L_img + (1−λ2)·L_sem`, starting from lifted features.
+use super::coarse::Photos;
 use super::least_squares;
 use super::lift::{CodeTargets, Lifting};
 use super::model::{Model, not_finite};
@@ -10,7 +11,7 @@ use super::views::Views;
 use crate::gpu::{Buffer, Device, Recorder};
 use crate::pass::channels::BASE_CHANNELS;
 use crate::pass::options::{FeatureMode, RasterOptions};
-use crate::pass::{codes, codes::Mode, sum};
+use crate::pass::{codes, codes::Mode, regularise, sum};
 use crate::progress::Progress;
 use crate::scene::{Camera, LEVEL_NAMES, LanguageField, LevelField, RgbImage, Splats};
 use crate::{Error, Result};
@@ -75,6 +76,19 @@ pub fn train_language(
     options: &LanguageOptions,
     progress: &dyn Progress,
 ) -> Result<TrainedLanguage> {
+    let photos = Photos { images, cameras, depths: None, coverage: &[] };
+    train_language_of(device, photos, splats, field, options, progress)
+}
+
+/// [`train_language`] of photos of which not all pixels may count.
+pub(crate) fn train_language_of(
+    device: &Device,
+    photos: Photos,
+    splats: &Splats,
+    field: LanguageField,
+    options: &LanguageOptions,
+    progress: &dyn Progress,
+) -> Result<TrainedLanguage> {
     let clock = Instant::now();
     let active: Vec<usize> = (0..field.levels.len())
         .filter(|&l| !field.levels[l].codebook.is_empty() && !field.levels[l].targets.is_empty())
@@ -88,7 +102,7 @@ pub fn train_language(
     let mut out = TrainedLanguage { splats: splats.clone(), field, curve: Vec::new(), seconds: 0.0 };
     for (g, group) in groups.iter().enumerate() {
         let levels: Vec<(usize, &LevelField)> = group.iter().map(|&l| (l, &out.field.levels[l])).collect();
-        let mut run = Run::new(device, images, cameras, splats, &levels, options, progress)?;
+        let mut run = Run::new(device, photos, splats, &levels, options, progress)?;
         training::train(&mut run, g, options.iterations, progress)?;
         let (trained, features) = run.finish()?;
         let before = g * options.iterations;
@@ -136,8 +150,7 @@ pub(crate) struct Figures {
 impl<'a> Run<'a> {
     pub(crate) fn new(
         device: &Device,
-        images: &[RgbImage],
-        cameras: &[Camera],
+        Photos { images, cameras, coverage, .. }: Photos,
         splats: &Splats,
         levels: &[(usize, &'a LevelField)],
         options: &'a LanguageOptions,
@@ -148,7 +161,8 @@ impl<'a> Run<'a> {
         let channels = width * levels.len();
         let scale = SceneScale::measure(cameras, &splats.means);
         let model = Model::new(device, splats, channels)?;
-        let mut views = Views::new(device, images, cameras, None, splats.len(), channels, scale.near())?;
+        let (capacity, near) = (splats.len(), scale.near());
+        let mut views = Views::new(device, images, cameras, None, coverage, capacity, channels, near)?;
         let targets = CodeTargets::new(device, &fields, images, &views, 1.0 - options.image_weight)?;
         let raster = RasterOptions {
             sh_degree: splats.sh_degree,
@@ -284,7 +298,22 @@ impl Training for Run<'_> {
             stage.raster.record_band(&mut rec, &model.values, &band);
             if !self.options.detach_geometry {
                 let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(&band)));
-                stage.loss.record(&mut rec, &band, &frame.planes, target, &frame.planes_grad, weights, sums);
+                let gradient = &frame.planes_grad;
+                stage.loss.record(
+                    &mut rec,
+                    &band,
+                    &frame.planes,
+                    target,
+                    gradient,
+                    item.covered,
+                    weights,
+                    sums,
+                );
+                if let Some(alpha) = &item.alpha {
+                    let weight = weights[0] / f64::from(frame.width * frame.height);
+                    regularise::record_depth(&mut rec, frame, None, 0.0);
+                    regularise::record_alpha(&mut rec, frame, &alpha[band.index], weight);
+                }
             }
             codes::record(&mut rec, &self.targets.of(view, &band), frame, loss, Mode::Loss);
             sum::record(&mut rec, loss, &self.partials, &stage.sums, stage.slot(&band) + LANGUAGE_SUM);

@@ -73,7 +73,7 @@ fn dot(a: &[f32], b: &[f32]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::PRIOR;
-    use crate::fit::{LanguageOptions, LanguageRun, Preset, Start, Training};
+    use crate::fit::{LanguageOptions, LanguageRun, Photos, Preset, Start, Training};
     use crate::gpu::test_device;
     use crate::pass::{FeatureMode, RasterOptions, Renderer, seeded};
     use crate::progress::Silent;
@@ -109,8 +109,8 @@ mod tests {
         let cameras = [seeded::camera(SIZE.0 as u32, SIZE.1 as u32, Pose::IDENTITY)];
         let options =
             LanguageOptions { start: Start::LeastSquares, ..LanguageOptions::preset(Preset::Draft) };
-        let run =
-            LanguageRun::new(&device, &images, &cameras, &splats, &[(0, &level)], &options, &Silent).unwrap();
+        let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
+        let run = LanguageRun::new(&device, photos, &splats, &[(0, &level)], &options, &Silent).unwrap();
         let (_, found) = run.trainer().parts().params.download().unwrap();
 
         // How much every pixel shows of each splat.

@@ -20,14 +20,16 @@ mod view_dependent;
 mod views;
 
 pub use crate::preset::Preset;
-pub use added::{new_surface, train_on};
+pub use added::new_surface;
+pub(crate) use added::train_on;
 pub(crate) use coarse::Photos;
 pub(crate) use language::Run as LanguageRun;
+pub(crate) use language::train_language_of;
 pub use language::{LanguagePoint, TrainedLanguage, decode_accuracy, train_language};
 pub use options::{InitOptions, LanguageOptions, Rates, RgbOptions, Start};
-pub(crate) use rgb::MOST_PSNR;
 pub(crate) use rgb::Run as RgbRun;
 pub use rgb::{CurvePoint, FitStats, Trained, fit_rgb, train_rgb};
+pub(crate) use rgb::{MOST_PSNR, train_photos};
 pub use sh_degree::{DegreeTrial, ViewDependence};
 pub(crate) use training::Training;
 pub use view_dependent::{ViewDependentOptions, fit_view_dependent};

@@ -11,14 +11,17 @@ use super::training::{self, Review, Trainer, Training};
 use super::unseen::unseen_splats;
 use super::views::Views;
 use crate::gpu::{Device, Recorder};
-use crate::pass::metrics::psnr;
+use crate::pass::metrics::psnr_masked;
 use crate::pass::options::{FeatureMode, RasterOptions};
 use crate::pass::{compact, regularise, ssim_l1::ImageLoss};
 use crate::progress::Progress;
-use crate::scene::{Camera, DepthMap, PointCloud, RgbImage, Splats};
+use crate::scene::{Camera, Coverage, DepthMap, Outside, PointCloud, RgbImage, Splats};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
+
+#[cfg(test)]
+mod tests;
 
 /// Photos of 8 bits cannot show more than their rounding noise, 10·log10(12·255²) = 58.9 dB: a render that happens to
 /// match exactly must not outweigh all other views.
@@ -91,8 +94,21 @@ pub fn train_rgb(
     options: &RgbOptions,
     progress: &dyn Progress,
 ) -> Result<Trained> {
+    train_photos(device, Photos { images, cameras, depths, coverage: &[] }, points, options, progress)
+}
+
+/// [`train_rgb`] of photos of which not all pixels may count.
+pub(crate) fn train_photos(
+    device: &Device,
+    photos: Photos,
+    points: &PointCloud,
+    options: &RgbOptions,
+    progress: &dyn Progress,
+) -> Result<Trained> {
+    let Photos { images, cameras, depths, .. } = photos;
     let mut start = splats_from_points(points, &options.init, options.seed)?;
-    if let Some(depths) = depths.filter(|_| options.margin > 0.0) {
+    // Where a background is empty, surfaces end at the silhouette.
+    if let Some(depths) = depths.filter(|_| options.margin > 0.0 && !photos.show_emptiness()) {
         let (reach, confidence) = (options.margin, options.min_confidence);
         start.append(unseen_splats(images, cameras, depths, reach, confidence, options.seed));
     }
@@ -100,7 +116,7 @@ pub fn train_rgb(
         start = Bounds::new(cameras, &points.positions).hold(start);
     }
     let scale = SceneScale::of(cameras, points);
-    fit_rgb(device, images, cameras, start, scale, depths, options, progress)
+    fit_photos(device, photos, start, scale, options, progress)
 }
 
 /// [`train_rgb`] from given splats instead of points, with the SH degree that they have.
@@ -114,9 +130,22 @@ pub fn fit_rgb(
     options: &RgbOptions,
     progress: &dyn Progress,
 ) -> Result<Trained> {
+    let photos = Photos { images, cameras, depths, coverage: &[] };
+    fit_photos(device, photos, start, scale, options, progress)
+}
+
+/// [`fit_rgb`] of photos of which not all pixels may count.
+pub(crate) fn fit_photos(
+    device: &Device,
+    photos: Photos,
+    start: Splats,
+    scale: SceneScale,
+    options: &RgbOptions,
+    progress: &dyn Progress,
+) -> Result<Trained> {
     let clock = Instant::now();
     progress.begin("splats", options.iterations as u64);
-    let mut run = Run::new(device, Photos { images, cameras, depths }, &start, scale, options)?;
+    let mut run = Run::new(device, photos, &start, scale, options)?;
     training::train(&mut run, 0, options.iterations, progress)?;
     let (splats, cameras, psnr, poses_refined) = run.finish()?;
     progress.end();
@@ -129,6 +158,20 @@ pub fn fit_rgb(
         seconds: clock.elapsed().as_secs_f64(),
     };
     Ok(Trained { splats, cameras, stats })
+}
+
+impl Photos<'_> {
+    /// Whether a background that is empty is shown.
+    pub(super) fn show_emptiness(&self) -> bool {
+        self.coverage.iter().flatten().any(|c| c.outside == Outside::Empty)
+    }
+
+    /// PSNR of a render of a photo over the pixels that count, dB.
+    pub(super) fn psnr(&self, photo: usize, rendered: &RgbImage) -> f64 {
+        let weights = self.coverage.get(photo).and_then(Option::as_ref).map(Coverage::weights);
+        let counts = |i: usize| weights.as_ref().is_none_or(|w| w.data[i] > 0.0);
+        psnr_masked(rendered, &self.images[photo], counts).min(MOST_PSNR)
+    }
 }
 
 /// Depth and the confidence it needs, if it counts at all.
@@ -181,7 +224,8 @@ impl<'a> Run<'a> {
             features_move_geometry: true,
         };
         let depths = used(seen.depths, options);
-        let views = Views::new(device, seen.images, seen.cameras, depths, start.len(), 0, scale.near())?;
+        let Photos { images, cameras, coverage, .. } = seen;
+        let views = Views::new(device, images, cameras, depths, coverage, start.len(), 0, scale.near())?;
         let model = Model::new(device, start, 0)?;
         let trainer = Trainer::new(device, raster, model, views, seen.cameras, options.seed);
         Ok(Run {
@@ -204,9 +248,9 @@ impl<'a> Run<'a> {
         if self.half.take().is_none() {
             return Ok(());
         }
-        let (t, Photos { images, cameras, depths }) = (&mut self.trainer, self.photos);
+        let (t, Photos { images, cameras, depths, coverage }) = (&mut self.trainer, self.photos);
         let (depths, near) = (used(depths, self.options), self.scale.near());
-        t.views = Views::new(&t.device, images, cameras, depths, t.model.count(), 0, near)?;
+        t.views = Views::new(&t.device, images, cameras, depths, coverage, t.model.count(), 0, near)?;
         for (own, camera) in t.cameras.iter_mut().zip(cameras) {
             *own = Camera { pose: own.pose, ..camera.clone() };
         }
@@ -236,7 +280,7 @@ impl<'a> Run<'a> {
             None => t.views.render(self.last, &t.cameras[self.last], &t.model, &t.raster)?,
         };
         let seen = self.half.as_ref().map_or(self.photos, HalfSizePhotos::photos);
-        self.psnr[self.last] = Some(psnr(&shown, &seen.images[self.last]).min(MOST_PSNR));
+        self.psnr[self.last] = Some(seen.psnr(self.last, &shown));
         let known: Vec<f64> = self.psnr.iter().flatten().copied().collect();
         let n = self.recent.len().max(1) as f64;
         let total = |l: &ImageLoss| l.total(self.options.l1_weight, self.options.dssim_weight);
@@ -286,15 +330,15 @@ impl<'a> Run<'a> {
     fn finish(&mut self) -> Result<(Splats, Vec<Camera>, Vec<f64>, bool)> {
         self.leave_half_size()?;
         self.hold()?;
-        let (t, Photos { images, cameras: initial, .. }) = (&mut self.trainer, self.photos);
+        let (t, photos) = (&mut self.trainer, self.photos);
+        let initial = photos.cameras;
         let splats = t.model.splats()?;
         let mut score = |cameras: &[Camera]| -> Result<Vec<f64>> {
-            (0..images.len())
-                .map(|i| {
-                    let rendered = t.views.render(i, &cameras[i], &t.model, &t.raster)?;
-                    Ok(psnr(&rendered, &images[i]).min(MOST_PSNR))
-                })
-                .collect()
+            let one = |i: usize| {
+                let rendered = t.views.render(i, &cameras[i], &t.model, &t.raster)?;
+                Ok(photos.psnr(i, &rendered))
+            };
+            (0..photos.images.len()).map(one).collect()
         };
         let refined = score(&t.cameras)?;
         if self.options.poses.is_none() {
@@ -337,13 +381,19 @@ impl Training for Run<'_> {
         for band in frame.bands.iter() {
             stage.raster.record_band(&mut rec, &model.values, &band);
             let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(&band)));
-            stage.loss.record(&mut rec, &band, &frame.planes, target, &frame.planes_grad, weights, sums);
+            let gradient = &frame.planes_grad;
+            stage.loss.record(&mut rec, &band, &frame.planes, target, gradient, item.covered, weights, sums);
             // Without depth of its own, a view clears what another of its size may have left.
             let (reference, pixels) = match &item.depth {
                 Some((references, count)) => (Some(&references[band.index]), *count as f64),
                 None => (None, 1.0),
             };
             regularise::record_depth(&mut rec, frame, reference, self.options.depth_weight / pixels);
+            if let Some(alpha) = &item.alpha {
+                // As one more channel of the L1 loss.
+                let weight = self.options.l1_weight / f64::from(frame.width * frame.height);
+                regularise::record_alpha(&mut rec, frame, &alpha[band.index], weight);
+            }
             stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
         }
         stage.raster.record_gradients(&mut rec, &model.values, raster, &model.gradients);
@@ -366,7 +416,7 @@ impl Training for Run<'_> {
         self.last = view;
         let stage = self.trainer.views.stage(view);
         let [l1, ssim, ..] = stage.total()?;
-        self.recent.push(stage.loss.loss([l1, ssim]));
+        self.recent.push(stage.loss.loss([l1, ssim], self.trainer.views.list[view].covered));
         self.move_camera(view, iteration)
     }
 
@@ -402,63 +452,4 @@ impl Training for Run<'_> {
 /// Steps at half the photos' size, at the beginning.
 fn coarse_steps(options: &RgbOptions) -> usize {
     (options.coarse * options.iterations as f64) as usize
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::fit::pose::PoseOptions;
-    use crate::fit::schedule::Exponential;
-    use crate::gpu::test_device;
-    use crate::pass::{Renderer, seeded};
-    use crate::preset::Preset;
-    use crate::scene::Pose;
-    use glam::DVec3;
-
-    fn turned(camera: &Camera, by: DVec3) -> Camera {
-        Camera { pose: Pose::exp(DVec3::ZERO, by).compose(&camera.pose), ..camera.clone() }
-    }
-
-    /// Splats, and two cameras with photos of them.
-    fn scene(device: &Device) -> (Splats, Vec<Camera>, Vec<RgbImage>) {
-        let (splats, camera) = seeded::small(300, 75, 53, 0, 1003);
-        let cameras = vec![camera.clone(), turned(&camera, DVec3::X * 0.01)];
-        let mut renderer = Renderer::new(device, &splats, &[], 0).unwrap();
-        let images = cameras.iter().map(|c| renderer.render(c).unwrap().rgb).collect();
-        (splats, cameras, images)
-    }
-
-    #[test]
-    fn training_goes_on_at_the_full_size_with_the_poses_that_it_found_at_half_of_it() {
-        let device = test_device();
-        let (splats, cameras, images) = scene(&device);
-        let poses = Some(PoseOptions { start: 0, rate: Exponential::constant(1e-3) });
-        let options = RgbOptions { iterations: 10, coarse: 0.5, poses, ..RgbOptions::preset(Preset::Draft) };
-        let scale = SceneScale::measure(&cameras, &splats.means);
-        let photos = Photos { images: &images, cameras: &cameras, depths: None };
-        let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
-        let size = |run: &Run| {
-            let frame = run.trainer.parts().raster.frame();
-            [frame.width, frame.height, run.trainer.cameras[1].width]
-        };
-        (0..5).for_each(|iteration| run.step(iteration).unwrap());
-        let found = run.trainer.cameras[1].pose;
-        assert!(size(&run) == [38, 27, 38] && found != cameras[1].pose, "{:?} {found:?}", size(&run));
-        run.schedule(5).unwrap();
-        assert_eq!((size(&run), run.trainer.cameras[1].pose), ([75, 53, 75], found));
-    }
-
-    #[test]
-    fn refined_cameras_that_explain_the_photos_worse_are_not_kept() {
-        let device = test_device();
-        let (splats, cameras, images) = scene(&device);
-        let options = RgbOptions { coarse: 0.0, bounded: false, ..RgbOptions::preset(Preset::Draft) };
-        let scale = SceneScale::measure(&cameras, &splats.means);
-        let photos = Photos { images: &images, cameras: &cameras, depths: None };
-        let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
-        // As if training had led the second camera astray.
-        run.trainer.cameras[1] = turned(&cameras[1], DVec3::Y * 0.2);
-        let (_, kept, _, refined) = run.finish().unwrap();
-        assert!(!refined && kept == cameras);
-    }
 }

@@ -272,7 +272,7 @@ mod tests {
         let (splats, cameras, images) = scene();
         let options = colour_options();
         let scale = SceneScale::measure(&cameras, &splats.means);
-        let photos = Photos { images: &images, cameras: &cameras, depths: None };
+        let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
         let mut run = RgbRun::new(device, photos, &splats, scale, &options).unwrap();
         measure(device, &mut run)
     }
@@ -294,8 +294,7 @@ mod tests {
         let options = LanguageOptions::preset(Preset::Draft);
         let mut run = LanguageRun::new(
             device,
-            &images,
-            &cameras,
+            Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] },
             &splats,
             &[(0, &level)],
             &options,
@@ -334,7 +333,7 @@ mod tests {
         let (device, options) = (device(false), colour_options());
         let (splats, cameras, images) = scene();
         let scale = SceneScale::measure(&cameras, &splats.means);
-        let photos = Photos { images: &images, cameras: &cameras, depths: None };
+        let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
         let new = || RgbRun::new(&device, photos, &splats, scale, &options).unwrap();
         let folder = tempfile::tempdir().unwrap();
         let keeps = Keeps(Checkpoint::new(folder.path().join("state"), Duration::ZERO, true));

@@ -1,17 +1,17 @@
 //! Colours that depend on the direction they are seen from (docs/method.md#view-dependent-colour): spherical harmonics on a
 //! trained geometry, of the degree that photos left out support.
+use super::coarse::Photos;
 use super::init::raise_sh_degree;
 use super::options::{Rates, RgbOptions};
-use super::rgb::{Trained, fit_rgb};
+use super::rgb::{Trained, fit_photos};
 use super::scale::SceneScale;
 use super::sh_degree::{DegreeTrial, ViewDependence};
 use crate::Result;
 use crate::gpu::Device;
-use crate::pass::metrics::psnr;
 use crate::pass::renderer::Renderer;
 use crate::preset::Preset;
 use crate::progress::Progress;
-use crate::scene::{Camera, RgbImage, Splats, sh_coefficients};
+use crate::scene::{Camera, Coverage, RgbImage, Splats, sh_coefficients};
 
 /// The highest degree that files, viewers and passes know.
 const HIGHEST: u32 = 3;
@@ -48,12 +48,13 @@ impl ViewDependentOptions {
 pub fn fit_view_dependent(
     device: &Device,
     images: &[RgbImage],
+    coverage: &[Option<Coverage>],
     trained: Trained,
     options: &ViewDependentOptions,
     progress: &dyn Progress,
 ) -> Result<Trained> {
     let mut result = trained;
-    let fit = Fit { device, options, progress };
+    let fit = Fit { device, coverage, options, progress };
     let (start, splats) = (result.splats.sh_degree, result.splats.len());
     let highest = highest(device.info().max_storage_range, splats);
     let asked = options.degree.map(|d| d.min(highest));
@@ -71,7 +72,7 @@ pub fn fit_view_dependent(
         }
         let supported = trials.last().filter(|t: &&DegreeTrial| t.supported()).map(|t| t.degree);
         if let Some(degree) = asked.or(supported) {
-            let with = fit.colours(images, &result.cameras, &result.splats, degree)?;
+            let with = fit.colours(images, &result.cameras, coverage, &result.splats, degree)?;
             (result.splats, result.stats.psnr) = (with.splats, with.stats.psnr);
         }
         progress.end();
@@ -88,6 +89,8 @@ fn highest(range: u64, splats: usize) -> u32 {
 
 struct Fit<'a> {
     device: &'a Device,
+    /// Of all photos.
+    coverage: &'a [Option<Coverage>],
     options: &'a ViewDependentOptions,
     progress: &'a dyn Progress,
 }
@@ -98,6 +101,7 @@ impl Fit<'_> {
         &self,
         images: &[RgbImage],
         cameras: &[Camera],
+        coverage: &[Option<Coverage>],
         splats: &Splats,
         degree: u32,
     ) -> Result<Trained> {
@@ -119,7 +123,8 @@ impl Fit<'_> {
         };
         let scale = SceneScale::measure(cameras, &start.means);
         let quiet = Quiet(self.progress);
-        fit_rgb(self.device, images, cameras, start, scale, None, &options, &quiet)
+        let photos = Photos { images, cameras, depths: None, coverage };
+        fit_photos(self.device, photos, start, scale, &options, &quiet)
     }
 
     /// Degrees from the highest down until photos left out gain by one. A degree is compared with the colours of the splats fitted as
@@ -157,11 +162,14 @@ impl Fit<'_> {
             let (out, kept): (Vec<usize>, Vec<usize>) = (0..images.len()).partition(|i| i % PARTS == part);
             let pick = |i: &usize| (images[*i].clone(), cameras[*i].clone());
             let (images_kept, cameras_kept): (Vec<_>, Vec<_>) = kept.iter().map(pick).unzip();
-            let with = self.colours(&images_kept, &cameras_kept, splats, degree)?.splats;
+            let coverage_kept: Vec<_> =
+                kept.iter().map(|i| self.coverage.get(*i).cloned().flatten()).collect();
+            let with = self.colours(&images_kept, &cameras_kept, &coverage_kept, splats, degree)?.splats;
             let near = SceneScale::measure(cameras, &with.means).near();
             let mut renderer = Renderer::new(self.device, &with, &[], 0)?.with_near(near);
+            let photos = Photos { images, cameras, depths: None, coverage: self.coverage };
             for i in out {
-                all[i] = psnr(&renderer.render(&cameras[i])?.rgb, &images[i]);
+                all[i] = photos.psnr(i, &renderer.render(&cameras[i])?.rgb);
             }
         }
         Ok(all)

@@ -5,7 +5,7 @@ use crate::pass::metrics::planar;
 use crate::pass::ssim_l1::SsimL1;
 use crate::pass::view::View;
 use crate::pass::{FrameBuffers, RasterOptions, Rasterizer};
-use crate::scene::{Camera, DepthMap, RgbImage};
+use crate::scene::{Camera, Coverage, DepthMap, Outside, RgbImage};
 use crate::{Error, Result};
 
 use super::model::Model;
@@ -14,8 +14,12 @@ use super::model::Model;
 pub(super) struct TrainView {
     /// Index into [`Views::stages`].
     pub(super) stage: usize,
-    /// Per band [3, rows, W] of the photo.
+    /// Per band [3, rows, W] of the photo, [4, rows, W] with the weights of the pixels where some do not count.
     pub(super) target: Vec<Buffer<f32>>,
+    /// The sum of the weights, where some do not count.
+    pub(super) covered: Option<f64>,
+    /// Per band [rows, W] the alpha that renders should have, −1 where another band answers; where emptiness is shown.
+    pub(super) alpha: Option<Vec<Buffer<f32>>>,
     /// Per band [rows, W] depth where it is trusted and the band's own, else 0; and the number of trusted pixels.
     pub(super) depth: Option<(Vec<Buffer<f32>>, usize)>,
 }
@@ -65,6 +69,7 @@ impl Views {
         images: &[RgbImage],
         cameras: &[Camera],
         depths: Option<(&[DepthMap], f32)>,
+        coverage: &[Option<Coverage>],
         capacity: usize,
         feature_dim: usize,
         near: f64,
@@ -93,10 +98,28 @@ impl Views {
                 }
                 None => None,
             };
-            let photo = planar(image);
+            let coverage = coverage.get(i).and_then(Option::as_ref);
+            let mut photo = planar(image);
+            let covered = match coverage {
+                Some(c) if c.outside == Outside::Unknown => {
+                    let weights = c.weights().data;
+                    photo.extend(&weights);
+                    // A photo without any counts for nothing, whatever it is divided by.
+                    Some(weights.iter().map(|w| f64::from(*w)).sum::<f64>().max(1.0))
+                }
+                _ => None,
+            };
             let target = bands.iter().map(|b| device.buffer_from("photo", &bands.cut(&b, &photo)));
             let target = target.collect::<Result<_>>()?;
-            views.list.push(TrainView { stage, target, depth });
+            let alpha = match coverage {
+                Some(c) if c.outside == Outside::Empty => {
+                    let band =
+                        |b| device.buffer_from("wanted alpha", &bands.cut_inner(&b, &c.share.data, -1.0));
+                    Some(bands.iter().map(band).collect::<Result<_>>()?)
+                }
+                _ => None,
+            };
+            views.list.push(TrainView { stage, target, covered, alpha, depth });
         }
         Ok(views)
     }

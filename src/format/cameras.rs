@@ -1,13 +1,13 @@
 //! Camera files: one reader for every kind, the project's own `cameras.json`.
 use super::camera_file::CameraFile;
 use super::{colmap, transforms};
-use crate::photo;
+use crate::photo::{self, MaskChoice};
 use crate::scene::{Camera, GivenCamera, Pose};
 use crate::{Error, Result, files};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 /// Reads the cameras of a file that must be pinholes, see [`read_file`].
 pub fn read(path: &Path) -> Result<Vec<Camera>> {
@@ -102,6 +102,40 @@ fn check_names(cameras: &[GivenCamera]) -> Result<(), String> {
         }
     }
     Ok(())
+}
+
+/// Where the masks of photos come from: a folder, and what a camera file names (`mask_path` of transforms.json).
+pub fn masks(folder: Option<&Path>, cameras: Option<&Path>) -> Result<MaskChoice> {
+    let mut choice = MaskChoice { folder: folder.map(Path::to_path_buf), named: Vec::new() };
+    let inside = cameras.map(|c| c.join("transforms.json")).filter(|file| file.is_file());
+    let Some(file) = inside.or(cameras.filter(|c| c.is_file()).map(Path::to_path_buf)) else {
+        return Ok(choice);
+    };
+    let text = files::read_text(&file)?;
+    if !text.trim_start().starts_with('{') {
+        return Ok(choice);
+    }
+    let bad = |what: String| Error::input(format!("{}: {what}", file.display()));
+    let beside = file.parent().unwrap_or(Path::new("."));
+    for (photo, mask) in transforms::masks(&text).map_err(bad)? {
+        let path = Path::new(&mask);
+        // Other files are read only from the folder of the one that names them.
+        if !path.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir)) {
+            return Err(bad(format!(
+                "frame {photo:?}: mask_path {mask:?} leads out of the file's folder; put the mask beside the file, or give \
+                 --photo-masks"
+            )));
+        }
+        let path = beside.join(path);
+        if !path.is_file() {
+            return Err(bad(format!(
+                "frame {photo:?}: its mask {} is not there; put it there, or take mask_path out of the file",
+                path.display()
+            )));
+        }
+        choice.named.push((photo, path));
+    }
+    Ok(choice)
 }
 
 /// One camera of `cameras.json`: the layout 3DGS tools write, plus the principal point.

@@ -162,17 +162,21 @@ pub(super) fn read_npz_of(path: &Path, rows: usize) -> Result<BTreeMap<String, N
         Error::input(format!("{}: {what}; copy the file again or make it anew", path.display()))
     };
     let damaged = |e: zip::result::ZipError| bad(format!("not a readable npz (zip) file ({e})"));
-    let mut archive = zip::ZipArchive::new(Cursor::new(bytes.as_slice())).map_err(damaged)?;
-    let mut out = BTreeMap::new();
-    for k in 0..archive.len() {
-        let mut member = archive.by_index(k).map_err(damaged)?;
-        let name = member.name().map_err(damaged)?.to_string();
-        let Some(key) = name.strip_suffix(".npy") else { continue };
-        let bytes = read_member(&mut member, left).map_err(|what| bad(format!("array {key:?}: {what}")))?;
-        left = left.saturating_sub(bytes.len() as u64);
-        out.insert(key.to_string(), decode(&bytes, &format!("{}[{key}]", path.display()))?);
-    }
-    Ok(out)
+    let unpacked = || -> Result<BTreeMap<String, NpyArray>> {
+        let mut archive = zip::ZipArchive::new(Cursor::new(bytes.as_slice())).map_err(damaged)?;
+        let mut out = BTreeMap::new();
+        for k in 0..archive.len() {
+            let mut member = archive.by_index(k).map_err(damaged)?;
+            let name = member.name().map_err(damaged)?.to_string();
+            let Some(key) = name.strip_suffix(".npy") else { continue };
+            let bytes =
+                read_member(&mut member, left).map_err(|what| bad(format!("array {key:?}: {what}")))?;
+            left = left.saturating_sub(bytes.len() as u64);
+            out.insert(key.to_string(), decode(&bytes, &format!("{}[{key}]", path.display()))?);
+        }
+        Ok(out)
+    };
+    files::guarded(unpacked).unwrap_or_else(|panic| Err(bad(format!("damaged ({panic})"))))
 }
 
 /// A whole member of at most `left` bytes: its header first, which tells how many bytes of values belong to it.

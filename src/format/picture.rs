@@ -1,7 +1,8 @@
 //! Images and maps on disk: PNG, OpenEXR, npy.
 use super::npy::{self, NpyArray};
 use super::to_byte;
-use crate::scene::{LEVEL_NAMES, Plane, RgbImage};
+use crate::photo::Photo;
+use crate::scene::{Coverage, LEVEL_NAMES, Outside, Plane, RgbImage};
 use crate::{Error, Result};
 use exr::prelude as ex;
 use std::collections::BTreeMap;
@@ -32,6 +33,26 @@ fn write_bytes(
 pub fn write_png(path: &Path, image: &RgbImage) -> Result<()> {
     let bytes: Vec<u8> = image.data.iter().flat_map(|c| c.map(to_byte)).collect();
     write_bytes(path, (image.width, image.height), &bytes, image::ExtendedColorType::Rgb8)
+}
+
+/// The working image of a photo in `images` of a folder: with alpha where its background is empty, and with a grey mask in `masks`, as
+/// nerfstudio has them, where pixels are not used.
+pub(super) fn write_photo(folder: &Path, name: &str, photo: &Photo) -> Result<()> {
+    let path = folder.join("images").join(name);
+    match &photo.coverage {
+        Some(Coverage { share, outside: Outside::Empty }) => {
+            let pixels = photo.image.data.iter().zip(&share.data);
+            let bytes: Vec<u8> = pixels.flat_map(|([r, g, b], a)| [*r, *g, *b, *a].map(to_byte)).collect();
+            write_bytes(&path, (share.width, share.height), &bytes, image::ExtendedColorType::Rgba8)
+        }
+        Some(Coverage { share, outside: Outside::Unknown }) => {
+            let masks = folder.join("masks");
+            std::fs::create_dir_all(&masks).map_err(Error::unwritable(&masks))?;
+            write_grey_png(&masks.join(name), share)?;
+            write_png(&path, &photo.image)
+        }
+        None => write_png(&path, &photo.image),
+    }
 }
 
 /// 8-bit grey PNG of values in [0, 1].

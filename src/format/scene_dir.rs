@@ -122,7 +122,7 @@ pub fn write(folder: &Path, c: &Contents) -> Result<()> {
         create_folder(&camera_folder.join("images"))?;
         for (camera, photo) in named.iter_mut().zip(c.photos) {
             camera.name = format!("{}.png", photo.stem);
-            picture::write_png(&camera_folder.join("images").join(&camera.name), &photo.image)?;
+            picture::write_photo(&camera_folder, &camera.name, photo)?;
         }
     }
     colmap::write(&camera_folder.join("colmap"), &named, c.points)?;

@@ -36,10 +36,11 @@ impl Names {
     }
 
     fn has(&self, name: &str, is_folder: bool) -> bool {
-        const FOLDERS: [&str; 7] = [
+        const FOLDERS: [&str; 8] = [
             "cameras",
             "cameras/colmap",
             "cameras/images",
+            "cameras/masks",
             "cameras/original",
             "cameras/original/colmap",
             "language",
@@ -68,7 +69,9 @@ impl Names {
                 Some(("language", file)) => LEVEL_NAMES
                     .iter()
                     .any(|l| file == format!("codebook_{l}.npz") || file == format!("splats_{l}.ply")),
-                Some(("cameras/images", file)) => self.stems.iter().any(|s| file == format!("{s}.png")),
+                Some(("cameras/images" | "cameras/masks", file)) => {
+                    self.stems.iter().any(|s| file == format!("{s}.png"))
+                }
                 Some(("previews", file)) => self.stems.iter().any(|s| is_preview(file, s)),
                 _ => false,
             }

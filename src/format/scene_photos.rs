@@ -1,6 +1,6 @@
 //! The photos that a scene directory keeps: their working images, and what was read of their files and taken out of them.
 use crate::photo::{self, Photo};
-use crate::scene::RgbImage;
+use crate::scene::{Coverage, Outside, Plane, RgbImage};
 use crate::{Error, Result, files};
 use std::path::{Path, PathBuf};
 
@@ -13,7 +13,9 @@ pub(super) fn write(cameras: &Path, photos: &[Photo]) -> Result<()> {
         let image = RgbImage { width: p.image.width, height: p.image.height, data: Vec::new() };
         // Its folder is nobody's business who gets the scene.
         let path = p.path.file_name().map_or_else(|| p.path.clone(), PathBuf::from);
-        Photo { image, path, fine: None, ..p.clone() }
+        let none = Plane { width: p.image.width, height: p.image.height, data: Vec::new() };
+        let coverage = p.coverage.as_ref().map(|c| Coverage { share: none, ..c.clone() });
+        Photo { image, path, coverage, fine: None, ..p.clone() }
     };
     let all: Vec<Photo> = photos.iter().map(bare).collect();
     super::write_json(&cameras.join(PHOTOS), &all)
@@ -32,18 +34,38 @@ pub fn load(scene: &Path) -> Result<Vec<Photo>> {
     let mut photos: Vec<Photo> = files::read_json(&file, "the scene is damaged, run again")?;
     for photo in &mut photos {
         let path = folder.join("images").join(format!("{}.png", photo.stem));
-        // Before it is decoded: the header may state any size.
-        let (width, height) = photo::dimensions(&path)?;
-        if (width as usize, height as usize) != (photo.image.width, photo.image.height) {
-            return Err(Error::input(format!(
-                "{}: {width} × {height} pixels, the scene's camera has {} × {}; the scene is damaged, run again",
-                path.display(),
-                photo.image.width,
-                photo.image.height
-            )));
-        }
+        check_size(&path, photo)?;
         // Larger than any image: it is to be read as it is.
-        photo.image = photo::load_at(&path, usize::MAX >> 16)?.image;
+        let read = photo::load_at(&path, usize::MAX >> 16)?;
+        photo.image = read.image;
+        photo.coverage = match photo.coverage.as_ref().map(|c| c.outside) {
+            Some(outside @ Outside::Empty) => read.coverage.map(|c| Coverage { outside, ..c }),
+            Some(outside @ Outside::Unknown) => Some(Coverage { share: mask(&folder, photo)?, outside }),
+            None => None,
+        };
     }
     Ok(photos)
+}
+
+/// Refuses a picture of another size than its photo before it is decoded: the header may state any.
+fn check_size(path: &Path, photo: &Photo) -> Result<()> {
+    let (width, height) = photo::dimensions(path)?;
+    if (width as usize, height as usize) == (photo.image.width, photo.image.height) {
+        return Ok(());
+    }
+    Err(Error::input(format!(
+        "{}: {width} × {height} pixels, the scene's camera has {} × {}; the scene is damaged, run again",
+        path.display(),
+        photo.image.width,
+        photo.image.height
+    )))
+}
+
+/// The share of every pixel that is used.
+fn mask(cameras: &Path, photo: &Photo) -> Result<Plane<f32>> {
+    let path = cameras.join("masks").join(format!("{}.png", photo.stem));
+    check_size(&path, photo)?;
+    let data =
+        photo::stored_pixels(&path)?.to_luma8().as_raw().iter().map(|v| f32::from(*v) / 255.0).collect();
+    Ok(Plane { width: photo.image.width, height: photo.image.height, data })
 }

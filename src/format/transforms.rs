@@ -43,6 +43,8 @@ struct Block {
     rolling_shutter: Option<Value>,
     /// Of a frame.
     file_path: Option<String>,
+    /// Black where the photo is not to be used; beside the file.
+    mask_path: Option<String>,
     #[serde(deserialize_with = "rows")]
     transform_matrix: Option<[[f64; 4]; 3]>,
     /// Of the file.
@@ -95,6 +97,13 @@ pub(super) fn parse(text: &str, folder: &Path) -> Result<CameraFile, String> {
         warnings.push("rolling_shutter is not used: every photo is taken to be from one place".to_owned());
     }
     Ok(CameraFile { cameras, warnings })
+}
+
+/// Frames with a mask, by the name of the photo.
+pub(super) fn masks(text: &str) -> Result<Vec<(String, String)>, String> {
+    let file: Block = files::parse_json(text.as_bytes())?;
+    let named = |f: Block| Some((f.file_path?, f.mask_path.filter(|mask| !mask.is_empty())?));
+    Ok(file.frames.unwrap_or_default().into_iter().filter_map(named).collect())
 }
 
 fn name(frame: &Block, index: usize) -> String {

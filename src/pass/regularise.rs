@@ -42,6 +42,30 @@ pub fn depth_l1(depth: &[f64], alpha: &[f64], reference: &[f64], weight: f64) ->
     (loss, gradient)
 }
 
+/// Adds the gradient of `weight · Σ |A − a|` by A, over pixels with a wanted alpha a ≥ 0, to what [`record_depth`] left.
+pub fn record_alpha(rec: &mut Recorder, frame: &FrameBuffers, wanted: &Buffer<f32>, weight: f64) {
+    rec.pass("regularisers");
+    let pixels = frame.pixels();
+    let alpha_plane = 4 + frame.feature_dim as u32;
+    let call = shaders::alpha_l1::call(
+        &shaders::alpha_l1::Bindings {
+            wanted,
+            transmittance: &frame.transmittance,
+            upstream: &frame.planes_grad,
+        },
+        &shaders::alpha_l1::Push { pixels, alpha_plane, weight: weight as f32 },
+    );
+    rec.dispatch_threads(call, [pixels, 1, 1]);
+}
+
+/// The CPU twin: (loss, gradient by A).
+pub fn alpha_l1(alpha: &[f64], wanted: &[f64], weight: f64) -> (f64, Vec<f64>) {
+    let pairs = || alpha.iter().zip(wanted);
+    let loss = pairs().filter(|(_, w)| **w >= 0.0).map(|(a, w)| weight * (a - w).abs()).sum();
+    let slope = |(a, w): (&f64, &f64)| if *w < 0.0 || a == w { 0.0 } else { weight * (a - w).signum() };
+    (loss, pairs().map(slope).collect())
+}
+
 /// Records `gradients += ∂/∂log_scales (weight · Σ max(0, s_max/s_min − limit))`, both [N, 3].
 pub fn record_ratio(
     rec: &mut Recorder,
@@ -158,5 +182,36 @@ mod tests {
         record_depth(&mut rec, frame, None, 0.0);
         rec.run().unwrap();
         assert!(frame.planes_grad.read().unwrap().iter().all(|&g| g == 0.0));
+    }
+
+    #[test]
+    fn alpha_gradient_matches_differences_and_gpu() {
+        let device = crate::gpu::test_device();
+        let mut random = Random::new(7);
+        let (width, height) = (13u32, 9u32);
+        let pixels = (width * height) as usize;
+        let raster = crate::pass::Rasterizer::new(&device, 1, 0, width, height).unwrap();
+        let frame = raster.frame();
+        let mut numbers = || (0..pixels).map(|_| random.uniform()).collect::<Vec<f64>>();
+        let (alpha, mut wanted) = (numbers(), numbers());
+        (wanted[3], wanted[40]) = (-1.0, 0.0);
+        let narrow = |v: &[f64]| v.iter().map(|&a| a as f32).collect::<Vec<f32>>();
+        let see_through: Vec<f64> = alpha.iter().map(|a| 1.0 - a).collect();
+        frame.transmittance.write(&narrow(&see_through)).unwrap();
+        let buffer = device.buffer_from("wanted", &narrow(&wanted)).unwrap();
+        let mut rec = Recorder::new(&device, "alpha");
+        record_depth(&mut rec, frame, None, 0.0);
+        record_alpha(&mut rec, frame, &buffer, 0.25);
+        record_alpha(&mut rec, frame, &buffer, 0.5);
+        rec.run().unwrap();
+        let upstream = frame.planes_grad.read().unwrap();
+        let (_, gradient) = alpha_l1(&alpha, &wanted, 0.75);
+        for i in 0..pixels {
+            let loss = |a: f64| alpha_l1(&[a], &[wanted[i]], 0.75).0;
+            let difference = (loss(alpha[i] + 1e-7) - loss(alpha[i] - 1e-7)) / 2e-7;
+            assert!((difference - gradient[i]).abs() < 1e-6, "pixel {i}");
+            assert!((f64::from(upstream[4 * pixels + i]) - gradient[i]).abs() < 1e-6, "pixel {i}");
+        }
+        assert!(upstream[..4 * pixels].iter().all(|g| *g == 0.0) && gradient[3] == 0.0);
     }
 }

@@ -2,6 +2,8 @@
 //!
 //! SSIM as 3D Gaussian splatting uses it (Wang et al. 2004; Kerbl et al. 2023): 11×11 Gaussian window, σ = 1.5,
 //! normalised, zero padding, per channel, C1 = 1e-4, C2 = 9e-4, mean over all pixels and channels.
+//! Where pixels have weights w, x is replaced by `y + w·(x − y)`: a pixel that does not count looks as it should in the windows of its
+//! neighbours, and the means are over the weights.
 //! With ∗ the (symmetric) window and S = A1·A2/(B1·B2), the derivative is three more blurs:
 //! `∂/∂x = ∗(∂S/∂μx) + 2x·∗(∂S/∂E[x²]) + y·∗(∂S/∂E[xy])`.
 use super::bands::{Band, Bands};
@@ -73,18 +75,34 @@ pub fn ssim_l1(
     l1_weight: f64,
     dssim_weight: f64,
 ) -> (ImageLoss, Vec<f64>) {
-    let count = rendered.len() as f64;
-    let mut loss = ImageLoss::default();
+    let weights = vec![1.0; width * height];
+    ssim_l1_weighted(rendered, target, &weights, width, height, l1_weight, dssim_weight)
+}
+
+/// [`ssim_l1`] with `[H, W]` weights of the pixels.
+pub fn ssim_l1_weighted(
+    rendered: &[f64],
+    target: &[f64],
+    weights: &[f64],
+    width: usize,
+    height: usize,
+    l1_weight: f64,
+    dssim_weight: f64,
+) -> (ImageLoss, Vec<f64>) {
+    let planes = rendered.len() / (width * height);
+    let count = weights.iter().sum::<f64>() * planes as f64;
+    let mut loss = ImageLoss { l1: 0.0, ssim: 1.0 };
     let mut gradient = Vec::with_capacity(rendered.len());
     for (x, y) in rendered.chunks(width * height).zip(target.chunks(width * height)) {
-        let (ssim, d) = ssim_plane(x, y, width, height);
-        loss.ssim += ssim / count;
+        let x: Vec<f64> = (0..x.len()).map(|i| y[i] + weights[i] * (x[i] - y[i])).collect();
+        let (ssim, d) = ssim_plane(&x, y, width, height);
+        loss.ssim -= (x.len() as f64 - ssim) / count;
         for i in 0..x.len() {
             let difference = x[i] - y[i];
             loss.l1 += difference.abs() / count;
             // f64::signum(0) is 1; the subgradient there must be 0 or identical images would move.
             let sign = if difference == 0.0 { 0.0 } else { difference.signum() };
-            gradient.push((l1_weight * sign - dssim_weight * d[i]) / count);
+            gradient.push(weights[i] * (l1_weight * sign - dssim_weight * d[i]) / count);
         }
     }
     (loss, gradient)
@@ -178,7 +196,8 @@ impl SsimL1 {
     }
 
     /// Records the pass for a band. `rendered` and `gradient` are planar `[≥3, rows, W]` stacks whose first three planes
-    /// count, `target` `[3, rows, W]`. Afterwards `loss[slot]` is Σ|x−y| and `loss[slot+1]` ΣSSIM of the band: see
+    /// count, `target` `[3, rows, W]`; with `covered`, the sum of the weights of the whole image, `[4, rows, W]`, the last the weights
+    /// of the pixels. Afterwards `loss[slot]` is Σ|x−y| and `loss[slot+1]` ΣSSIM of the band: see
     /// [`SsimL1::loss`].
     pub fn record(
         &self,
@@ -187,18 +206,19 @@ impl SsimL1 {
         rendered: &Buffer<f32>,
         target: &Buffer<f32>,
         gradient: &Buffer<f32>,
+        covered: Option<f64>,
         weights: [f64; 2],
         loss: (&Buffer<f32>, u32),
     ) {
         rec.pass("SSIM + L1");
         let (width, height) = (self.bands.width as i32, self.bands.rows as i32);
         let (first, end) = ((band.inner.start - band.top) as i32, (band.inner.end - band.top) as i32);
-        let count = self.values();
+        let (count, weighted) = (self.values(covered), i32::from(covered.is_some()));
         let strips = |n: usize| n.div_ceil(STRIP) as u32;
         let columns = [(width as u32).div_ceil(64), strips(self.bands.rows), CHANNELS as u32];
         let call = shaders::ssim_columns::call(
             &shaders::ssim_columns::Bindings { rendered, target, means: &self.means, moments: &self.moments },
-            &shaders::ssim_columns::Push { width, height },
+            &shaders::ssim_columns::Push { width, height, weighted },
         );
         rec.dispatch(call, columns);
         self.record_rows(rec, first, end);
@@ -218,6 +238,7 @@ impl SsimL1 {
                 dssim_weight: (weights[1] / count) as f32,
                 first,
                 end,
+                weighted,
             },
         );
         rec.dispatch(call, columns);
@@ -252,13 +273,15 @@ impl SsimL1 {
     }
 
     /// The loss parts from the two sums that [`SsimL1::record`] leaves, added up over the bands.
-    pub fn loss(&self, sums: [f64; 2]) -> ImageLoss {
-        let count = self.values();
-        ImageLoss { l1: sums[0] / count, ssim: sums[1] / count }
+    pub fn loss(&self, sums: [f64; 2], covered: Option<f64>) -> ImageLoss {
+        let (all, count) = (self.values(None), self.values(covered));
+        ImageLoss { l1: sums[0] / count, ssim: 1.0 - (all - sums[1]) / count }
     }
 
-    fn values(&self) -> f64 {
-        (CHANNELS * self.bands.width * self.bands.height) as f64
+    /// What means are over.
+    fn values(&self, covered: Option<f64>) -> f64 {
+        let pixels = covered.unwrap_or((self.bands.width * self.bands.height) as f64);
+        CHANNELS as f64 * pixels
     }
 }
 
@@ -311,27 +334,60 @@ mod tests {
     }
 
     #[test]
+    fn weighted_gradient_matches_central_differences() {
+        let (w, h) = (23, 19);
+        let mut x: Vec<f64> = (0..3 * w * h).map(noise).collect();
+        let y: Vec<f64> = (0..3 * w * h).map(|i| noise(i + 7777)).collect();
+        let weights: Vec<f64> = (0..w * h).map(|i| [0.0, 1.0, 0.4][(i % w / 5 + i / w / 4) % 3]).collect();
+        let loss = |x: &[f64]| ssim_l1_weighted(x, &y, &weights, w, h, 0.8, 0.2);
+        let (_, gradient) = loss(&x);
+        let scale = gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
+        for i in (0..x.len()).step_by(37) {
+            let (keep, step) = (x[i], 1e-6);
+            let mut at = |v: f64| {
+                x[i] = v;
+                loss(&x).0.total(0.8, 0.2)
+            };
+            let difference = (at(keep + step) - at(keep - step)) / (2.0 * step);
+            x[i] = keep;
+            assert!((difference - gradient[i]).abs() < 1e-6 * scale, "{i}: {difference} {}", gradient[i]);
+            assert!(weights[i % (w * h)] > 0.0 || gradient[i] == 0.0, "a pixel without weight moves");
+        }
+        // Whatever is rendered where the weight is 0 changes nothing.
+        let before = loss(&x);
+        (0..x.len()).filter(|i| weights[i % (w * h)] == 0.0).for_each(|i| x[i] = 9.0);
+        assert_eq!(loss(&x), before);
+    }
+
+    #[test]
     fn gpu_equals_the_twin_on_odd_sizes() {
         let device = crate::gpu::test_device();
         // Neither side is a multiple of a strip or workgroup; the second is smaller than one strip and window.
         let sizes = [(75, 53), (13, 7), (130, 33)];
-        for ((w, h), rows) in sizes.into_iter().flat_map(|s| [(s, Rows::Strips), (s, Rows::Shared)]) {
+        let cases = sizes.into_iter().flat_map(|s| [(s, Rows::Strips), (s, Rows::Shared)]);
+        for ((w, h), rows, weighted) in cases.flat_map(|(s, r)| [(s, r, false), (s, r, true)]) {
             let x: Vec<f32> = (0..3 * w * h).map(|i| noise(i) as f32).collect();
             let y: Vec<f32> =
                 (0..3 * w * h).map(|i| (0.7 * noise(i) + 0.3 * noise(i + 7777)) as f32).collect();
             let wide = |v: &[f32]| v.iter().map(|&a| f64::from(a)).collect::<Vec<_>>();
-            let (expected, gradient) = ssim_l1(&wide(&x), &wide(&y), w, h, 0.8, 0.2);
+            let weight =
+                |i: usize| if weighted { [0.0f32, 1.0, 0.25][(i % w / 4 + i / w / 3) % 3] } else { 1.0 };
+            let weights: Vec<f32> = (0..w * h).map(weight).collect();
+            let (expected, gradient) =
+                ssim_l1_weighted(&wide(&x), &wide(&y), &wide(&weights), w, h, 0.8, 0.2);
+            let covered = weighted.then(|| wide(&weights).iter().sum::<f64>());
             let bands = Bands::whole(w, h);
             let pass = SsimL1::with(&device, &bands, rows).unwrap();
             let rendered = device.buffer_from("x", &x).unwrap();
-            let target = device.buffer_from("y", &y).unwrap();
+            let stack = if weighted { [&y[..], &weights].concat() } else { y.clone() };
+            let target = device.buffer_from("y", &stack).unwrap();
             let out = device.buffer::<f32>("gradient", 3 * w * h).unwrap();
             let sums = device.buffer::<f32>("loss", 4).unwrap();
             let mut rec = Recorder::new(&device, "ssim");
-            pass.record(&mut rec, &bands.get(0), &rendered, &target, &out, [0.8, 0.2], (&sums, 1));
+            pass.record(&mut rec, &bands.get(0), &rendered, &target, &out, covered, [0.8, 0.2], (&sums, 1));
             rec.run().unwrap();
             let sums = sums.read().unwrap();
-            let loss = pass.loss([sums[1], sums[2]].map(f64::from));
+            let loss = pass.loss([sums[1], sums[2]].map(f64::from), covered);
             // f32 sums of about 10⁴ values of order one: 1e-5.
             assert!(
                 (loss.l1 - expected.l1).abs() < 1e-5 && (loss.ssim - expected.ssim).abs() < 1e-5,

@@ -1,7 +1,8 @@
 //! Candidates for the photos of a run: files and frames of videos.
 use super::choose::{FoundFiles, find};
 use super::kind::check_name;
-use super::read::{self, Photo, from_bytes, load_at};
+use super::mask::Mask;
+use super::read::{self, Photo};
 use super::video::Video;
 use super::{decode, resize};
 use crate::progress::Progress;
@@ -25,12 +26,14 @@ pub struct Candidate {
     source: CandidateOrigin,
     /// Instead of the stem of the path, where two photos have that one.
     stem: Option<String>,
+    /// Where it has a mask of the pixels that are used.
+    pub(super) mask: Option<PathBuf>,
 }
 
 impl Candidate {
     /// A photo file.
     pub fn file(path: &Path) -> Candidate {
-        Candidate { path: path.to_path_buf(), source: CandidateOrigin::File, stem: None }
+        Candidate { path: path.to_path_buf(), source: CandidateOrigin::File, stem: None, mask: None }
     }
 
     /// A photo file that goes by another name than that of the file.
@@ -45,34 +48,41 @@ impl Candidate {
 
     /// At working resolution, see [`super::load_at`].
     pub fn load(&self, max_size: usize, progress: &dyn Progress) -> Result<Photo> {
-        let photo = match &self.source {
-            CandidateOrigin::File => load_at(&self.path, max_size),
+        let decoded = match &self.source {
+            CandidateOrigin::File => decode::decode(read::read(&self.path)?, &self.path, None)?,
             CandidateOrigin::Frame(video, at) => {
-                from_bytes(&self.path, video.frame(*at, None, progress)?, max_size)
+                decode::decode(video.frame(*at, None, progress)?, &self.path, Some(video.code_points))?
             }
-        }?;
+        };
+        let mask = self.mask.as_deref().map(Mask::read).transpose()?;
+        let photo = read::of_decoded(&self.path, decoded, mask.as_ref(), max_size)?;
         let stem = self.stem.clone().unwrap_or_else(|| photo.stem.clone());
         Ok(Photo { stem, ..photo })
+    }
+
+    /// Whether it is a file of its own.
+    pub(super) fn is_file(&self) -> bool {
+        matches!(self.source, CandidateOrigin::File)
     }
 
     /// Upright pixels, at most `side` on the longer side; `None` past the end of a video that is shorter than it says.
     /// Only one decoded file is held while it is made.
     pub fn thumbnail(&self, side: usize, progress: &dyn Progress) -> Result<Option<RgbImage>> {
-        let bytes = match &self.source {
-            CandidateOrigin::File => read::read(&self.path)?,
+        let (bytes, code) = match &self.source {
+            CandidateOrigin::File => (read::read(&self.path)?, None),
             CandidateOrigin::Frame(video, at) => match video.frame(*at, Some(side), progress)? {
                 bytes if bytes.is_empty() => return Ok(None),
-                bytes => bytes,
+                bytes => (bytes, Some(video.code_points)),
             },
         };
-        let decoded = decode::decode(bytes, &self.path)?;
+        let decoded = decode::decode(bytes, &self.path, code)?;
         read::check_size(&self.path, decoded.size)?;
         let (w, h) = decoded.size;
         let scale = (side as f64 / w.max(h) as f64).min(1.0);
         let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
         // Two samples a side for every pixel of the thumbnail; all sixteen of a large photo would take as long as decoding.
         let step = ((0.5 / scale) as usize).max(1);
-        let pixel = |x: usize, y: usize| decoded.at(x * step, y * step);
+        let pixel = |x: usize, y: usize| decoded.at(x * step, y * step).0;
         Ok(Some(resize::area_average((w / step, h / step), (to(w), to(h)), pixel)))
     }
 }

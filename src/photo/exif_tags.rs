@@ -1,5 +1,6 @@
 //! Camera and lens in EXIF data.
-use exif::{Context, Field, In, Reader, Tag, Value};
+use super::tiff::Directories;
+use exif::{Field, In, Reader, Tag, Value};
 use glam::DVec3;
 
 /// Diagonal of the 36 × 24 mm frame that "35 mm equivalent" refers to (CIPA DCG-001: equal diagonal angle of view).
@@ -20,39 +21,18 @@ pub(super) struct Lens {
     pub fisheye: Option<String>,
     /// Unit vector of gravity in camera axes of the upright photo, as the phone measured it.
     pub gravity: Option<DVec3>,
+    /// What says that the picture is a stitched panorama.
+    pub panorama: Option<String>,
 }
 
 /// Reads the lens facts out of a raw EXIF block; a damaged block yields what could be read. `size` is the size of the
 /// image in pixels, in either orientation.
-pub(super) fn lens(raw: Vec<u8>, size: (u32, u32)) -> Lens {
-    let read = Reader::new().continue_on_error(true).read_raw(raw);
+pub(super) fn lens(raw: &[u8], size: (u32, u32)) -> Lens {
+    let Some(tags) = Directories::of(raw) else { return Lens::default() };
+    let read = Reader::new().continue_on_error(true).read_raw(tags.digest());
     match read.or_else(|e| e.distill_partial_result(|_| ())) {
         Ok(exif) => of(&|tag| exif.get_field(tag, In::PRIMARY), size),
         Err(_) => Lens::default(),
-    }
-}
-
-/// The tags of the first image of a TIFF file.
-pub(super) struct TiffTags(Vec<Field>);
-
-/// Reads them without copying the pixels; `None` where they are damaged.
-pub(super) fn of_tiff(bytes: &[u8]) -> Option<TiffTags> {
-    Some(TiffTags(exif::parse_exif(bytes).ok()?.0))
-}
-
-impl TiffTags {
-    fn field(&self, tag: Tag) -> Option<&Field> {
-        self.0.iter().find(|f| f.tag == tag && f.ifd_num == In::PRIMARY)
-    }
-
-    pub fn lens(&self, size: (u32, u32)) -> Lens {
-        of(&|tag| self.field(tag), size)
-    }
-
-    /// ExtraSamples 1: colours are stored multiplied by alpha (TIFF 6.0, section 18).
-    pub fn has_associated_alpha(&self) -> bool {
-        let extra = self.field(Tag(Context::Tiff, 338));
-        extra.and_then(|f| f.value.get_uint(0)) == Some(1)
     }
 }
 
@@ -65,6 +45,7 @@ fn of(fields: Fields, size: (u32, u32)) -> Lens {
         camera_model: camera_model(fields),
         fisheye: fisheye(fields),
         gravity: gravity(fields),
+        panorama: panorama(fields),
     }
 }
 
@@ -128,6 +109,13 @@ fn fisheye(fields: Fields) -> Option<String> {
     let name = ascii(fields, Tag::LensModel)?;
     let plain = name.to_lowercase().replace(['-', ' '], "");
     plain.contains("fisheye").then_some(name)
+}
+
+/// Apple writes 6 for its panoramas, a number that EXIF does not define.
+fn panorama(fields: Fields) -> Option<String> {
+    let processing = fields(Tag::CustomRendered).and_then(|f| f.value.get_uint(0));
+    let by_apple = ascii(fields, Tag::Make).is_some_and(|make| make.starts_with("Apple"));
+    (by_apple && processing == Some(6)).then(|| "EXIF CustomRendered=6".to_owned())
 }
 
 /// A phone that is held still measures 1 g; what a moving one measures is not gravity alone.
@@ -221,7 +209,7 @@ pub(super) mod tests {
             (Tag::Make, Value::Ascii(vec![b"Acme".to_vec()])),
             (Tag::Model, Value::Ascii(vec![b"Phone 3".to_vec()])),
         ]);
-        let lens = lens(raw, (4000, 3000));
+        let lens = lens(&raw, (4000, 3000));
         assert!((lens.focal.unwrap() - 26.0 / 43.2666 * 5000.0).abs() < 0.1);
         assert_eq!(lens.camera_model.as_deref(), Some("Acme Phone 3"));
     }
@@ -234,7 +222,7 @@ pub(super) mod tests {
                 (Tag::PixelXDimension, Value::Long(vec![written[0]])),
                 (Tag::PixelYDimension, Value::Long(vec![written[1]])),
             ];
-            lens(block(&fields), size).focal
+            lens(&block(&fields), size).focal
         };
         assert!(of([4000, 3000], (800, 600)).is_some() && of([4000, 3000], (600, 800)).is_some());
         assert!(of([4000, 3000], (1500, 1500)).is_none());
@@ -251,23 +239,23 @@ pub(super) mod tests {
             (Tag::PixelYDimension, Value::Long(vec![4000])),
         ];
         let size = (3000, 2000);
-        let alone = lens(block(&fields), size).focal.unwrap();
+        let alone = lens(&block(&fields), size).focal.unwrap();
         assert!((alone - 50.0 / 36.0 * 3000.0).abs() < 0.1, "{alone}");
         // The same sensor in pixels per centimetre.
         let mut metric = fields.clone();
         metric[1].1 = rational(6000 * 100, 36 * 10);
         metric[2].1 = Value::Short(vec![3]);
-        let metric = lens(block(&metric), size).focal.unwrap();
+        let metric = lens(&block(&metric), size).focal.unwrap();
         assert!((metric - alone).abs() < 0.1, "{metric} {alone}");
         fields.push((Tag::FocalLengthIn35mmFilm, Value::Short(vec![85])));
-        let contradicted = lens(block(&fields), size).focal.unwrap();
+        let contradicted = lens(&block(&fields), size).focal.unwrap();
         assert!((contradicted - 85.0 / 43.2666 * 3000f64.hypot(2000.0)).abs() < 0.1);
     }
 
     #[test]
     fn a_fisheye_is_told_by_its_name() {
         let named = |name: &str| {
-            lens(block(&[(Tag::LensModel, Value::Ascii(vec![name.into()]))]), (4000, 3000)).fisheye
+            lens(&block(&[(Tag::LensModel, Value::Ascii(vec![name.into()]))]), (4000, 3000)).fisheye
         };
         assert_eq!(
             named("Samyang 8mm f/3.5 UMC Fish-Eye CS").as_deref(),
@@ -300,7 +288,7 @@ pub(super) mod tests {
                 (Tag::MakerNote, Value::Undefined(note(acceleration), 0)),
                 (Tag::Orientation, Value::Short(vec![orientation])),
             ];
-            lens(block(&fields), (4000, 3000)).gravity
+            lens(&block(&fields), (4000, 3000)).gravity
         };
         let near = |found: Option<DVec3>, x, y, z| {
             let found = found.unwrap();
@@ -322,7 +310,7 @@ pub(super) mod tests {
                 (Tag::MakerNote, Value::Undefined(note([0, -1000, 0]), 0)),
                 (Tag::LensModel, Value::Ascii(vec![lens_model.into()])),
             ];
-            lens(block(&fields), (4000, 3000)).gravity
+            lens(&block(&fields), (4000, 3000)).gravity
         };
         assert!(by("iPhone 15 back camera 5.96mm f/1.6").is_some());
         assert_eq!(by("iPhone 15 front camera 2.69mm f/1.9"), None, "it looks the other way");
@@ -334,12 +322,12 @@ pub(super) mod tests {
 
     #[test]
     fn nonsense_is_ignored() {
-        assert_eq!(lens(b"Exif?".to_vec(), (100, 100)), Lens::default());
+        assert_eq!(lens(b"Exif?", (100, 100)), Lens::default());
         // No focal length, and such as no lens of a camera has.
         for mm in [0, 1, 65_535] {
             let fields = [(Tag::FocalLengthIn35mmFilm, Value::Short(vec![mm]))];
-            assert_eq!(lens(block(&fields), (100, 100)).focal, None, "{mm} mm");
+            assert_eq!(lens(&block(&fields), (100, 100)).focal, None, "{mm} mm");
         }
-        assert_eq!(lens(block(&[(Tag::FocalLength, rational(1, 0))]), (100, 100)).focal, None);
+        assert_eq!(lens(&block(&[(Tag::FocalLength, rational(1, 0))]), (100, 100)).focal, None);
     }
 }

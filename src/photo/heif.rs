@@ -1,6 +1,7 @@
 //! HEIC, HEIF and AVIF through libheif's C interface, loaded at run time: its HEVC decoders are under the LGPL and
 //! patents, so splatvk runs without it and never links it. The signatures are those of libheif 1.12 (2021), unchanged since.
 use super::kind::{LARGEST_DECODED, TOO_LARGE, check_pixels};
+use super::metadata::Metadata;
 use super::support::Support;
 use image::{DynamicImage, ImageBuffer};
 use libloading::Library;
@@ -32,6 +33,16 @@ struct Status {
     code: c_int,
     subcode: c_int,
     message: *const c_char,
+}
+
+/// The beginning of `struct heif_color_profile_nclx`, all versions of it.
+#[repr(C)]
+struct Nclx {
+    version: u8,
+    primaries: c_int,
+    transfer: c_int,
+    matrix: c_int,
+    full_range: u8,
 }
 
 // Values of the header's enums.
@@ -89,6 +100,9 @@ functions! {
     heif_image_handle_get_luma_bits_per_pixel: fn(Pointer) -> c_int;
     heif_image_handle_get_list_of_metadata_block_IDs: fn(Pointer, *const c_char, *mut u32, c_int) -> c_int;
     heif_image_handle_get_metadata_size: fn(Pointer, u32) -> usize;
+    heif_image_handle_get_metadata_content_type: fn(Pointer, u32) -> *const c_char;
+    heif_image_handle_get_nclx_color_profile: fn(Pointer, *mut *mut Nclx) -> Status;
+    heif_nclx_color_profile_free: fn(*mut Nclx);
     heif_image_handle_get_metadata: fn(Pointer, u32, *mut c_void) -> Status;
     heif_image_handle_get_raw_color_profile_size: fn(Pointer) -> usize;
     heif_image_handle_get_raw_color_profile: fn(Pointer, *mut c_void) -> Status;
@@ -148,10 +162,7 @@ pub(super) fn status() -> Support {
 /// count, not the orientation in EXIF (ISO/IEC 23008-12).
 pub(super) struct Image {
     pub pixels: DynamicImage,
-    /// TIFF bytes of the EXIF block.
-    pub exif: Option<Vec<u8>>,
-    /// The ICC profile.
-    pub icc: Option<Vec<u8>>,
+    pub metadata: Metadata,
 }
 
 /// Why there is no image: something to install, or something about the file. One line without the file's name.
@@ -172,8 +183,14 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Image, Failure> {
         let decode = api.heif_decode_image;
         check(api, decode(handle.pointer, &mut image, COLORSPACE_RGB, shape.chroma(), ptr::null()))?;
         let image = Owned { pointer: image, free: api.heif_image_release };
-        let (exif, icc) = (exif(api, handle.pointer), icc(api, handle.pointer));
-        Ok(Image { pixels: shape.copy(api, image.pointer)?, exif, icc })
+        let metadata = Metadata {
+            exif: exif(api, handle.pointer),
+            icc: icc(api, handle.pointer),
+            xmp: xmp(api, handle.pointer),
+            code_points: code_points(api, handle.pointer),
+            ..Metadata::default()
+        };
+        Ok(Image { pixels: shape.copy(api, image.pointer)?, metadata: metadata.bounded() })
     }
 }
 
@@ -345,22 +362,62 @@ unsafe fn icc(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
     }
 }
 
-/// The first EXIF block. It begins with the distance of the TIFF header from the end of these four bytes.
-unsafe fn exif(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
-    let mut id = 0u32;
-    // SAFETY: the caller's valid handle; one id is asked for, and the block's own size is allocated.
-    let block = unsafe {
-        let list = api.heif_image_handle_get_list_of_metadata_block_IDs;
-        if list(handle, c"Exif".as_ptr(), &mut id, 1) < 1 {
+/// The numbers of ITU-T H.273 in the container or the stream.
+unsafe fn code_points(api: &Api, handle: Pointer) -> Option<[u16; 4]> {
+    let mut found = ptr::null_mut();
+    // SAFETY: the caller's valid handle; the structure is read before it is freed.
+    unsafe {
+        let got = (api.heif_image_handle_get_nclx_color_profile)(handle, &mut found);
+        if got.code != 0 || found.is_null() {
             return None;
         }
+        let Nclx { primaries, transfer, matrix, full_range, .. } = *found;
+        (api.heif_nclx_color_profile_free)(found);
+        let number = |v: c_int| u16::try_from(v).unwrap_or(u16::MAX);
+        Some([number(primaries), number(transfer), number(matrix), u16::from(full_range)])
+    }
+}
+
+/// The XMP packet: a block of the type that MIME has for RDF.
+unsafe fn xmp(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
+    let mut ids = [0u32; 8];
+    // SAFETY: the caller's valid handle; at most as many ids as there is room for; the type is a string of the library or null.
+    unsafe {
+        let list = api.heif_image_handle_get_list_of_metadata_block_IDs;
+        let count = list(handle, c"mime".as_ptr(), ids.as_mut_ptr(), ids.len() as c_int);
+        let is_rdf = |id: &u32| {
+            let name = (api.heif_image_handle_get_metadata_content_type)(handle, *id);
+            !name.is_null() && CStr::from_ptr(name) == c"application/rdf+xml"
+        };
+        let id = *ids.iter().take(count.max(0) as usize).find(|id| is_rdf(id))?;
+        block(api, handle, id)
+    }
+}
+
+/// A block of metadata.
+unsafe fn block(api: &Api, handle: Pointer, id: u32) -> Option<Vec<u8>> {
+    // SAFETY: the caller's valid handle and id; the block's own size is allocated.
+    unsafe {
         let size = (api.heif_image_handle_get_metadata_size)(handle, id);
         if size > LARGEST_BLOCK {
             return None;
         }
         let mut block = vec![0u8; size];
         let got = (api.heif_image_handle_get_metadata)(handle, id, block.as_mut_ptr().cast());
-        (got.code == 0).then_some(block)?
+        (got.code == 0).then_some(block)
+    }
+}
+
+/// The first EXIF block. It begins with the distance of the TIFF header from the end of these four bytes.
+unsafe fn exif(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
+    let mut id = 0u32;
+    // SAFETY: the caller's valid handle; one id is asked for.
+    let block = unsafe {
+        let list = api.heif_image_handle_get_list_of_metadata_block_IDs;
+        if list(handle, c"Exif".as_ptr(), &mut id, 1) < 1 {
+            return None;
+        }
+        block(api, handle, id)?
     };
     let (skip, rest) = block.split_first_chunk::<4>()?;
     rest.get(u32::from_be_bytes(*skip) as usize..).map(<[u8]>::to_vec)

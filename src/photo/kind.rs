@@ -1,4 +1,5 @@
 //! What kind of file it is, by its first bytes or its name, and what to do with the kinds that are not read.
+use super::tiff::Directories;
 use crate::scene::MAX_PIXELS;
 use crate::{Error, Result};
 use image::ImageFormat;
@@ -201,7 +202,8 @@ fn is_raw(bytes: &[u8]) -> bool {
     if bytes.get(8..10) == Some(b"CR") {
         return true;
     }
-    let Ok((fields, _)) = exif::parse_exif(bytes) else { return false };
+    let Some(digest) = Directories::of(bytes).map(|tags| tags.digest()) else { return false };
+    let Ok((fields, _)) = exif::parse_exif(&digest) else { return false };
     let first =
         |tag: u16| fields.iter().find(|f| f.ifd_num == In::PRIMARY && f.tag == Tag(Context::Tiff, tag));
     // DNGVersion; a first image that is declared a reduced copy, with the real one in SubIFDs; a colour filter array.

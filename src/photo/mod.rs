@@ -2,13 +2,19 @@
 mod border;
 mod candidate;
 mod choose;
+mod code_points;
 mod decode;
 mod exif_tags;
 mod header;
 mod heif;
 mod join;
+mod jpeg;
 mod kind;
 pub mod light;
+mod mask;
+mod masks;
+mod metadata;
+mod png;
 mod profile;
 mod read;
 mod resize;
@@ -16,9 +22,11 @@ mod sizes;
 mod straighten;
 mod superpixels;
 mod support;
+mod tiff;
 mod turn;
 mod twins;
 mod video;
+mod xmp;
 
 pub use border::PlainBorder;
 pub use candidate::{Candidate, gather};
@@ -28,6 +36,7 @@ pub use header::dimensions;
 pub use join::{join, listed, plain_name, stems_apart};
 pub use kind::{check_name, stem};
 pub use light::Light;
+pub use masks::{MaskChoice, assign as assign_masks};
 pub use read::{
     MAX_SIZE, MAX_SIZE_CPU, Photo, SMALLEST_SIDE, default_max_size, from_bytes, from_pixels, load, load_at,
     working_size,
@@ -40,7 +49,7 @@ pub use support::Support;
 pub use turn::Turn;
 
 use crate::progress::Progress;
-use crate::scene::RgbImage;
+use crate::scene::{Outside, RgbImage};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
@@ -81,8 +90,49 @@ pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progr
     for wave in sizes::waves(candidates) {
         all.par_extend(candidates[wave].par_iter().map(one));
     }
-    let photos = all.into_iter().collect::<Result<Vec<_>>>()?;
+    let mut photos = all.into_iter().collect::<Result<Vec<_>>>()?;
     progress.end();
+    settle(&mut photos, &[], progress);
+    check_set(&photos)?;
+    Ok(photos)
+}
+
+/// What is decided and said of photos once all of a set are read; `known` are those of a scene that they join.
+pub fn settle(photos: &mut [Photo], known: &[Photo], progress: &dyn Progress) {
+    warn_of_files(photos, progress);
+    settle_transparency(photos, known, progress);
+}
+
+/// Decides what transparent pixels of a set stand for: nothing, where every photo has some and none a mask, as in photos of things
+/// whose background was removed; else they are only not used.
+fn settle_transparency(photos: &mut [Photo], known: &[Photo], progress: &dyn Progress) {
+    let named = |wanted: &dyn Fn(&Photo) -> bool, photos: &[Photo]| {
+        photos.iter().filter(|p| wanted(p)).map(|p| p.stem.as_str()).collect::<Vec<_>>().join(", ")
+    };
+    let transparent = named(&|p| p.coverage.is_some() && !p.masked, photos);
+    if transparent.is_empty() {
+        return;
+    }
+    let empty = photos.iter().all(|p| p.coverage.is_some() && !p.masked)
+        && known.iter().all(|p| p.coverage.as_ref().is_some_and(|c| c.outside == Outside::Empty));
+    if !empty {
+        progress.warn(&format!(
+            "transparent parts are not used, since other photos have none or have masks: {transparent}"
+        ));
+        return;
+    }
+    progress.warn(
+        "all photos have a transparent background: it is taken for emptiness, and the scene has nothing there; for a background that \
+         is there but not to be used, give masks (--photo-masks) and opaque photos",
+    );
+    photos.iter_mut().flat_map(|p| &mut p.coverage).for_each(|c| c.outside = Outside::Empty);
+}
+
+/// Says what of the files is not used or looks odd.
+fn warn_of_files(photos: &[Photo], progress: &dyn Progress) {
+    for photo in photos {
+        photo.notes.iter().for_each(|note| progress.warn(&format!("{}: {note}", photo.stem)));
+    }
     let framed: Vec<&str> = photos.iter().filter(|p| !p.border.is_none()).map(|p| p.stem.as_str()).collect();
     if !framed.is_empty() {
         progress.warn(&format!("plain frame around the picture left out: {}", framed.join(", ")));
@@ -102,8 +152,6 @@ pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progr
             bright.join(", ")
         ));
     }
-    check_set(&photos)?;
-    Ok(photos)
 }
 
 /// Files of high dynamic range in another unit: matching and training expect diffuse surfaces below 1.

@@ -1,7 +1,11 @@
 //! Colours as the ICC profile of a file means them, to sRGB: phones write Display P3, cameras Adobe RGB, and photos of both may make
 //! one scene. Colours outside sRGB come to lie on its border.
+use crate::files::guarded;
 use image::{DynamicImage, ImageBuffer, Pixel};
-use moxcms::{ColorProfile, DataColorSpace, Layout, TransformExecutor, TransformOptions};
+use moxcms::{
+    Chromaticity, ColorPrimaries, ColorProfile, DataColorSpace, Layout, ToneReprCurve, TransformExecutor,
+    TransformOptions, XyY,
+};
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -13,20 +17,76 @@ const PROBES: [u8; 6] = [0, 51, 102, 153, 204, 255];
 const CHUNK: usize = 1 << 16;
 
 /// The same image in sRGB. A profile that is damaged, or is not one of the image's own channels (JPEGs with CMYK are RGB by now),
-/// leaves it as it is: metadata must not cost the photo.
-pub(super) fn to_srgb(image: DynamicImage, icc: &[u8]) -> DynamicImage {
-    let Ok(profile) = ColorProfile::new_from_slice(icc) else { return image };
-    let grey = matches!(image, DynamicImage::ImageLuma8(_) | DynamicImage::ImageLuma16(_))
-        || matches!(image, DynamicImage::ImageLumaA8(_) | DynamicImage::ImageLumaA16(_));
-    let fits = match profile.color_space {
-        DataColorSpace::Rgb => !grey,
-        DataColorSpace::Gray => grey,
-        _ => false,
+/// leaves it as it is, with a note: metadata must not cost the photo.
+pub(super) fn to_srgb(image: DynamicImage, icc: &[u8], notes: &mut Vec<String>) -> DynamicImage {
+    let Ok(profile) = ColorProfile::new_from_slice(icc) else {
+        notes.push("its ICC profile is damaged and not used".to_owned());
+        return image;
     };
-    if !fits || is_srgb(&profile) {
+    if fits(&image, &profile) {
+        return by_profile(image, &profile);
+    }
+    notes.push(format!(
+        "its ICC profile ({:?}) does not describe its pixels and is not used",
+        profile.color_space
+    ));
+    image
+}
+
+fn fits(image: &DynamicImage, profile: &ColorProfile) -> bool {
+    match profile.color_space {
+        DataColorSpace::Rgb => !is_grey(image),
+        DataColorSpace::Gray => is_grey(image),
+        _ => false,
+    }
+}
+
+fn is_grey(image: &DynamicImage) -> bool {
+    !image.color().has_color()
+}
+
+/// The same image in sRGB by a profile of its channels. Grey of a profile for colours is left as it is.
+pub(super) fn by_profile(image: DynamicImage, profile: &ColorProfile) -> DynamicImage {
+    if !fits(&image, profile) || is_srgb(profile) {
         return image;
     }
-    converted(&image, &profile).unwrap_or(image)
+    converted(&image, profile).unwrap_or(image)
+}
+
+/// Exponents of PNG that mean the curve of sRGB or of television, which FFmpeg writes as 1 / 1.961.
+const SRGB_GAMMA: std::ops::Range<f64> = 0.42..0.53;
+
+/// The image in sRGB by an exponent from light to stored numbers, and x and y of white, red, green and blue, as PNG states them.
+pub(super) fn by_numbers(
+    image: DynamicImage,
+    gamma: Option<f64>,
+    chromaticities: Option<[f64; 8]>,
+) -> DynamicImage {
+    let mut profile = ColorProfile::new_srgb();
+    if let Some([wx, wy, rx, ry, gx, gy, bx, by]) = chromaticities {
+        let point = |x: f64, y: f64| Chromaticity { x: x as f32, y: y as f32 };
+        let primaries = ColorPrimaries { red: point(rx, ry), green: point(gx, gy), blue: point(bx, by) };
+        let curves = (profile.red_trc.clone(), profile.green_trc.clone(), profile.blue_trc.clone());
+        profile.update_rgb_colorimetry(XyY { x: wx, y: wy, yb: 1.0 }, primaries);
+        (profile.red_trc, profile.green_trc, profile.blue_trc) = curves;
+        if !profile.transform_matrix(&ColorProfile::new_srgb()).v.as_flattened().iter().all(|v| v.is_finite())
+        {
+            return image;
+        }
+    }
+    match gamma.filter(|g| !SRGB_GAMMA.contains(g)) {
+        Some(g) if is_grey(&image) => by_profile(image, &ColorProfile::new_gray_with_gamma((1.0 / g) as f32)),
+        Some(g) => by_profile(image, &with_gamma(profile, (1.0 / g) as f32)),
+        None => by_profile(image, &profile),
+    }
+}
+
+/// The same with the curve of a power.
+pub(super) fn with_gamma(mut profile: ColorProfile, gamma: f32) -> ColorProfile {
+    let curve = Some(ToneReprCurve::Parametric(vec![gamma]));
+    (profile.red_trc, profile.green_trc, profile.blue_trc) = (curve.clone(), curve.clone(), curve);
+    profile.cicp = None;
+    profile
 }
 
 fn converted(image: &DynamicImage, profile: &ColorProfile) -> Option<DynamicImage> {
@@ -62,7 +122,8 @@ where
     let (from, to) = (usize::from(P::CHANNEL_COUNT), usize::from(Q::CHANNEL_COUNT));
     let mut data = vec![T::default(); image.as_raw().len() / from * to];
     let chunks = image.as_raw().par_chunks(CHUNK * from).zip(data.par_chunks_mut(CHUNK * to));
-    chunks.map(|(from, to)| transform.transform(from, to).ok()).collect::<Option<()>>()?;
+    // Each on a thread of its own, so each behind the boundary.
+    chunks.map(|(from, to)| guarded(|| transform.transform(from, to).ok()).ok()?).collect::<Option<()>>()?;
     ImageBuffer::from_raw(image.width(), image.height(), data)
 }
 
@@ -101,7 +162,7 @@ pub(super) mod tests {
     }
 
     fn one(image: DynamicImage, icc: &[u8]) -> [u8; 3] {
-        to_srgb(image, icc).to_rgb8().get_pixel(0, 0).0
+        to_srgb(image, icc, &mut Vec::new()).to_rgb8().get_pixel(0, 0).0
     }
 
     fn rgb(c: [u8; 3]) -> DynamicImage {
@@ -121,7 +182,7 @@ pub(super) mod tests {
         assert!(made[0] < 75 && made[1].abs_diff(151) <= 2, "less red: {made:?}");
         let deep =
             image::ImageBuffer::<image::Rgb<u16>, _>::from_pixel(2, 2, image::Rgb([32896, 16448, 49087]));
-        let made = to_srgb(deep.into(), &display_p3()).to_rgb8().get_pixel(0, 0).0;
+        let made = to_srgb(deep.into(), &display_p3(), &mut Vec::new()).to_rgb8().get_pixel(0, 0).0;
         assert!(near(made, expected_p3([128, 64, 191])), "{made:?}");
     }
 
@@ -150,11 +211,11 @@ pub(super) mod tests {
             p
         };
         for icc in [ColorProfile::new_srgb().encode().unwrap(), Vec::new(), b"no profile".to_vec(), cmyk] {
-            assert_eq!(to_srgb(picture.clone(), &icc), picture);
+            assert_eq!(to_srgb(picture.clone(), &icc, &mut Vec::new()), picture);
         }
         let whole = display_p3();
         for cut in 0..whole.len() {
-            let _ = to_srgb(rgb([128, 64, 191]), &whole[..cut]);
+            let _ = to_srgb(rgb([128, 64, 191]), &whole[..cut], &mut Vec::new());
         }
     }
 
@@ -166,7 +227,7 @@ pub(super) mod tests {
         let made = one(grey.into(), &dark);
         assert!(made.iter().all(|v| v.abs_diff(147) <= 1), "{made:?}");
         let with_alpha = ImageBuffer::<LumaA<u8>, _>::from_pixel(2, 2, LumaA([128, 51]));
-        let made = to_srgb(with_alpha.into(), &dark).to_rgba8().get_pixel(1, 1).0;
+        let made = to_srgb(with_alpha.into(), &dark, &mut Vec::new()).to_rgba8().get_pixel(1, 1).0;
         assert!(made[0].abs_diff(147) <= 1 && made[3] == 51, "{made:?}");
         assert_eq!(one(rgb([128; 3]), &dark), [128; 3], "a profile of grey says nothing of colours");
     }

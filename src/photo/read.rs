@@ -1,11 +1,13 @@
 //! One photo from its file.
 use super::border::PlainBorder;
+use super::decode::{self, Decoded};
 use super::kind::stem;
 use super::light::Light;
+use super::mask::Mask;
+use super::resize;
 use super::straighten::Straightening;
 use super::turn::Turn;
-use super::{decode, resize};
-use crate::scene::{Affine, Camera, Lens, Plane, RgbImage};
+use crate::scene::{Affine, Camera, Coverage, Lens, Outside, Plane, RgbImage};
 use crate::{Error, Result, files};
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -54,6 +56,15 @@ pub struct Photo {
     pub fine: Option<Arc<Plane<f32>>>,
     /// Pixels of the file whose values are not finite numbers, which are read as black.
     pub lost_pixels: usize,
+    /// Which pixels are used; `None` = all. Those that are not continue the others smoothly in `image`.
+    #[serde(default)]
+    pub coverage: Option<Coverage>,
+    /// Whether a mask has a part in `coverage`.
+    #[serde(skip)]
+    pub masked: bool,
+    /// What of the file is not used, and why: sentences for warnings.
+    #[serde(skip)]
+    pub notes: Vec<String>,
     /// The lens that was taken out of the image.
     pub straightened: Option<Straightening>,
     /// Camera make and model from EXIF: photos that share it may share one focal length.
@@ -71,6 +82,9 @@ impl Photo {
             let how = Straightening::new(lens, camera);
             self.image = how.image(&self.image);
             self.fine = self.fine.take().map(|fine| Arc::new(how.larger(&fine, self.image.width)));
+            if let Some(coverage) = &mut self.coverage {
+                coverage.share = how.plane(&coverage.share);
+            }
             self.straightened = Some(how);
         }
     }
@@ -85,9 +99,22 @@ impl Photo {
             let width = fine.width;
             flipped(&mut Arc::make_mut(fine).data, width);
         }
+        if let Some(Coverage { share, .. }) = &mut self.coverage {
+            flipped(&mut share.data, share.width);
+        }
         let PlainBorder { left, right, .. } = self.border;
         self.border = PlainBorder { left: right, right: left, ..self.border };
         self.turn.mirrored = false;
+    }
+
+    /// What renders are compared with.
+    pub fn target(&self) -> RgbImage {
+        self.coverage.as_ref().map_or_else(|| self.image.clone(), |c| c.target(&self.image))
+    }
+
+    /// Whether a working pixel is used.
+    pub fn uses(&self, index: usize) -> bool {
+        self.coverage.as_ref().is_none_or(|c| c.uses(index))
     }
 
     /// Working pixels per original pixel.
@@ -123,7 +150,7 @@ pub fn load(path: &Path) -> Result<Photo> {
     load_at(path, MAX_SIZE)
 }
 
-/// Reads one photo: EXIF orientation applied, alpha composited on black, scaled down to `max_size` pixels along its longer
+/// Reads one photo: EXIF orientation applied, transparency as [`Photo::coverage`], scaled down to `max_size` pixels along its longer
 /// side if it is larger.
 pub fn load_at(path: &Path, max_size: usize) -> Result<Photo> {
     from_bytes(path, read(path)?, max_size)
@@ -135,7 +162,16 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>> {
 
 /// [`load_at`] of an image file that is in memory already; `name` stands for its path.
 pub fn from_bytes(name: &Path, bytes: Vec<u8>, max_size: usize) -> Result<Photo> {
-    let decoded = decode::decode(bytes, name)?;
+    of_decoded(name, decode::decode(bytes, name, None)?, None, max_size)
+}
+
+/// A photo of decoded pixels, of which those count that a mask leaves.
+pub(super) fn of_decoded(
+    name: &Path,
+    mut decoded: Decoded,
+    mask: Option<&Mask>,
+    max_size: usize,
+) -> Result<Photo> {
     if let Some(lens) = &decoded.lens.fisheye {
         return Err(Error::input(format!(
             "{}: taken with a fisheye lens ({lens}), which radial distortion does not describe; make it rectilinear first, \
@@ -143,13 +179,23 @@ pub fn from_bytes(name: &Path, bytes: Vec<u8>, max_size: usize) -> Result<Photo>
             name.display()
         )));
     }
-    let photo = working(name, decoded.size, max_size, |x, y| decoded.at(x, y))?;
+    let mask = mask.map(|mask| mask.on(name, &decoded)).transpose()?;
+    let masked = |x: usize, y: usize| mask.as_ref().is_none_or(|m| m(x, y));
+    let photo = if mask.is_none() && !decoded.is_transparent() {
+        working(name, decoded.size, max_size, |x, y| decoded.at(x, y).0)?
+    } else {
+        partly_used(name, decoded.size, max_size, mask.is_some(), |x, y| {
+            let (colour, alpha) = decoded.at(x, y);
+            (colour, if masked(x, y) { alpha } else { 0.0 })
+        })?
+    };
     // The two scales differ by the rounding of the size only.
     let exif_focal = decoded.lens.focal.map(|f| f * photo.to_working.scale[1]);
+    let notes = std::mem::take(&mut decoded.notes);
     let lens = &decoded.lens;
     let (camera_model, gravity) = (lens.camera_model.clone(), lens.gravity);
     let (turn, lost_pixels) = (Turn::from(decoded.orientation), decoded.not_finite());
-    Ok(Photo { exif_focal, camera_model, gravity, lost_pixels, turn, ..photo })
+    Ok(Photo { exif_focal, camera_model, gravity, lost_pixels, turn, notes, ..photo })
 }
 
 /// A photo from upright sRGB pixels in [0, 1]; `focal` is in their pixels, where it is known.
@@ -170,32 +216,67 @@ pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>, max_size: 
 /// Upright pixels at working resolution, nothing known about the lens.
 fn working(
     name: &Path,
-    (w, h): (usize, usize),
+    size: (usize, usize),
     max_size: usize,
     at: impl Fn(usize, usize) -> [f32; 3] + Sync,
 ) -> Result<Photo> {
-    check_size(name, (w, h))?;
-    let (working_w, working_h) = working_size(w, h, max_size);
-    let mut image = resize::area_average((w, h), (working_w, working_h), &at);
-    let fine = fine((w, h), (working_w, working_h), &at);
+    check_size(name, size)?;
+    let working = working_size(size.0, size.1, max_size);
+    let mut image = resize::area_average(size, working, &at);
+    let fine = fine_size(size, working).map(|fine| Arc::new(resize::area_average(size, fine, &at).luma()));
     let border = PlainBorder::of(&image);
     border.continue_picture(&mut image);
-    Ok(Photo {
+    Ok(Photo { border, fine, ..bare(name, size, image) })
+}
+
+/// [`working`] of pixels with the share of each that is used: unused ones have no part in the average of their neighbours.
+fn partly_used(
+    name: &Path,
+    size: (usize, usize),
+    max_size: usize,
+    masked: bool,
+    at: impl Fn(usize, usize) -> ([f32; 3], f32) + Sync,
+) -> Result<Photo> {
+    check_size(name, size)?;
+    let (image, share) = resize::area_average_of_used(size, working_size(size.0, size.1, max_size), &at);
+    let used = share.data.iter().filter(|s| **s > 0.0).count();
+    if used < SMALLEST_SIDE * SMALLEST_SIDE / 4 {
+        let what = if masked { "its mask leaves" } else { "its transparency leaves" };
+        return Err(Error::input(format!(
+            "{}: {what} {used} of {} pixels; white parts of a mask are used, black ones are not: invert it, or leave it out",
+            name.display(),
+            share.data.len()
+        )));
+    }
+    let fine = fine_size(size, (image.width, image.height));
+    let fine = fine.map(|fine| Arc::new(resize::area_average_of_used(size, fine, &at).0.luma()));
+    // Transparent pixels of one photo are unknown until all photos of the set have some.
+    let coverage = Some(Coverage { share, outside: Outside::Unknown });
+    Ok(Photo { coverage, masked, fine, ..bare(name, size, image) })
+}
+
+/// A photo of a working image, with nothing known about its file.
+fn bare(name: &Path, (w, h): (usize, usize), image: RgbImage) -> Photo {
+    let working = (image.width as u32, image.height as u32);
+    Photo {
         path: name.to_path_buf(),
         stem: stem(&name.to_string_lossy()).to_string(),
         image,
-        border,
+        border: PlainBorder::default(),
         original_size: (w as u32, h as u32),
         turn: Turn::default(),
-        to_working: Affine::resize((w as u32, h as u32), (working_w as u32, working_h as u32)),
+        to_working: Affine::resize((w as u32, h as u32), working),
         exif_focal: None,
-        fine,
+        fine: None,
         lost_pixels: 0,
+        coverage: None,
+        masked: false,
+        notes: Vec::new(),
         straightened: None,
         camera_model: None,
         gravity: None,
         light: Light::NONE,
-    })
+    }
 }
 
 pub(super) fn check_size(name: &Path, (w, h): (usize, usize)) -> Result<()> {
@@ -213,15 +294,10 @@ const FINE: usize = 3072;
 /// Fewer more pixels than this show nothing new.
 const MIN_GAIN: f64 = 1.25;
 
-fn fine(
-    (w, h): (usize, usize),
-    working: (usize, usize),
-    at: &(impl Fn(usize, usize) -> [f32; 3] + Sync),
-) -> Option<Arc<Plane<f32>>> {
+fn fine_size((w, h): (usize, usize), working: (usize, usize)) -> Option<(usize, usize)> {
     let share = (FINE as f64 / w.max(h) as f64).min(1.0);
     let size = ((w as f64 * share).round() as usize, (h as f64 * share).round() as usize);
-    (size.0 as f64 > MIN_GAIN * working.0 as f64)
-        .then(|| Arc::new(resize::area_average((w, h), size, at).luma()))
+    (size.0 as f64 > MIN_GAIN * working.0 as f64).then_some(size)
 }
 
 /// Working (width, height) of a photo of that size: the longer side is capped, the other one rounded. Never larger than

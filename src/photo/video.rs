@@ -1,5 +1,6 @@
 //! Frames of a video through `ffprobe` and `ffmpeg`, as child processes: without a shell, reading local files only, within
 //! bounded time and memory.
+use super::code_points::{self, CodePoints};
 use super::support::Support;
 use crate::progress::Progress;
 use crate::{Error, Result};
@@ -33,6 +34,8 @@ pub(super) struct Video {
     duration: f64,
     /// As many as the file states, or as its rate suggests.
     frames: u64,
+    /// How its numbers become colours.
+    pub code_points: CodePoints,
 }
 
 /// "ffmpeg 5.1.9", or what is missing and what to do: `(found, advice)`.
@@ -52,11 +55,12 @@ pub(super) fn status() -> Support {
 impl Video {
     /// Reads length and size.
     pub fn open(path: &Path, progress: &dyn Progress) -> Result<Video> {
-        let entries = "stream=width,height,avg_frame_rate,nb_frames,duration:format=duration";
+        let entries = "stream=width,height,avg_frame_rate,nb_frames,duration,color_transfer,color_primaries:\
+            stream_side_data=side_data_type,projection:format=duration";
         let mut command = reader("ffprobe");
         command.args(["-select_streams", "v:0", "-show_entries", entries, "-of", "json"]);
         command.arg("-i").arg(file(path));
-        // 1 MiB: one stream of six figures.
+        // 1 MiB: one stream of a few figures.
         let text = output(command, path, 1 << 20, progress)?;
         let bad = |what: &str| Error::input(format!("{}: {what}", path.display()));
         let found: serde_json::Value =
@@ -70,6 +74,15 @@ impl Video {
         if w.saturating_mul(h) > MAX_PIXELS {
             return Err(bad(&format!("{w} × {h} pixels are too many for a video; scale it down")));
         }
+        let sphere =
+            stream["side_data_list"].as_array().into_iter().flatten().find_map(|d| d["projection"].as_str());
+        if let Some(projection) = sphere.filter(|p| *p != "rectilinear") {
+            return Err(bad(&format!(
+                "is a 360° video (projection {projection}), which no pinhole camera shows; cut one view out of it: ffmpeg -i IN.mp4 -vf \
+                 v360=e:flat:h_fov=90:v_fov=90:yaw=0:pitch=0:w=1200:h=1200 OUT.mp4"
+            )));
+        }
+        let code_points = code_points(stream, path, progress);
         let duration = number(&stream["duration"]).or_else(|| number(&found["format"]["duration"]));
         let duration = duration.filter(|d| d.is_finite() && *d > 0.0);
         let duration =
@@ -82,7 +95,7 @@ impl Video {
         if frames < 2 {
             return Err(bad("one frame is no video; at least 2 are needed"));
         }
-        Ok(Video { path: path.to_path_buf(), duration, frames })
+        Ok(Video { path: path.to_path_buf(), duration, frames, code_points })
     }
 
     /// When the candidate frames are, seconds: evenly from the first frame on.
@@ -108,10 +121,29 @@ impl Video {
             let fit = format!("scale='min({side},iw)':'min({side},ih)':flags=area");
             command.args(["-vf", &format!("{fit}:force_original_aspect_ratio=decrease")]);
         }
-        command.args(["-c:v", "png", "-pix_fmt", "rgb24", "-f", "image2pipe", "pipe:1"]);
+        // 8 bits of a high dynamic range would show steps.
+        let (format, bytes) =
+            if code_points::is_hdr(self.code_points) { ("rgb48be", 6) } else { ("rgb24", 3) };
+        command.args(["-c:v", "png", "-pix_fmt", format, "-f", "image2pipe", "pipe:1"]);
         // Uncompressed, plus the PNG's own framing.
-        output(command, &self.path, 3 * MAX_PIXELS + (1 << 20), progress)
+        output(command, &self.path, bytes * MAX_PIXELS + (1 << 20), progress)
     }
+}
+
+/// The numbers of ITU-T H.273 for what ffprobe calls primaries and transfer; a name that is not known is said.
+fn code_points(stream: &serde_json::Value, path: &Path, progress: &dyn Progress) -> CodePoints {
+    let number = |key: &str, of: fn(&str) -> Option<u16>, what: &str| {
+        let name = stream[key].as_str().unwrap_or("");
+        of(name).unwrap_or_else(|| {
+            progress.warn(&format!(
+                "{}: states the {what} {name}, which is not known; read as that of sRGB",
+                path.display()
+            ));
+            2
+        })
+    };
+    let transfer = number("color_transfer", code_points::transfer_of_name, "transfer");
+    [number("color_primaries", code_points::primaries_of_name, "primaries"), transfer, 0, 1]
 }
 
 /// The options that both programs share. Options of the input come before it.

@@ -158,7 +158,7 @@ impl CandidateFeatures {
         let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
         let small = image.resized_by_area(to(image.width), to(image.height));
         // Margin 4: the descriptor's window at the finest scale.
-        let valid = valid_area(&small, PlainBorder::default(), 4);
+        let valid = valid_area(&small, PlainBorder::default(), None, 4);
         CandidateFeatures {
             features: sift::detect(&small.luma(), &valid, FEATURES),
             diagonal: (small.width as f64).hypot(small.height as f64),

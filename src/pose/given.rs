@@ -206,7 +206,7 @@ fn detect(photo: &Photo) -> Keypoints {
     let share = (SIDE as f64 / image.width.max(image.height) as f64).min(1.0);
     let to = |n: usize| ((n as f64 * share).round() as usize).max(1);
     let small = image.resized_by_area(to(image.width), to(image.height));
-    let mut found = sift::detect(&small.luma(), &valid_area(&small, Default::default(), 4), CORNERS);
+    let mut found = sift::detect(&small.luma(), &valid_area(&small, Default::default(), None, 4), CORNERS);
     let back = DVec2::new(image.width as f64 / small.width as f64, image.height as f64 / small.height as f64);
     found.points.iter_mut().for_each(|p| *p *= back);
     found

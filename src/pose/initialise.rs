@@ -109,9 +109,10 @@ pub fn dense(
     progress: &dyn Progress,
 ) -> Result<Geometry> {
     let images: Vec<_> = photos.iter().map(|p| p.image.clone()).collect();
+    let coverage: Vec<_> = photos.iter().map(|p| p.coverage.clone()).collect();
     let positions: Vec<_> = model.points.iter().map(|p| p.position).collect();
     let (depths, points) =
-        stereo::dense(device, &images, &model.cameras, &positions, priors, options, progress)?;
+        stereo::dense(device, &images, &coverage, &model.cameras, &positions, priors, options, progress)?;
     let SparseModel { cameras, focal_log_sigma, fitted, .. } = model;
     Ok(Geometry { cameras, depths, points, focal_log_sigma, fitted, method })
 }

@@ -1,6 +1,6 @@
 //! Keypoint features, their matches between two photos, and the parts of photos that cannot hold features.
 use crate::photo::PlainBorder;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Coverage, Plane, RgbImage};
 use glam::{DVec2, Vec4};
 use rayon::prelude::*;
 
@@ -128,12 +128,19 @@ pub(crate) fn mutual_matches(a: &Keypoints, b: &Keypoints, ratio: f32) -> Vec<Ma
     out
 }
 
-/// True where features may lie: away from the image edge, from a border that was found on loading and from uniform
+/// True where features may lie: away from the image edge, from pixels that are not used, from a border that was found on loading and from uniform
 /// saturated margins (undistorted or scanned photos have white or black borders; their outline does not move with the
 /// scene and would pass for a match).
-pub(crate) fn valid_area(image: &RgbImage, border: PlainBorder, margin: usize) -> Plane<bool> {
+pub(crate) fn valid_area(
+    image: &RgbImage,
+    border: PlainBorder,
+    coverage: Option<&Coverage>,
+    margin: usize,
+) -> Plane<bool> {
     let (w, h) = (image.width, image.height);
-    let mut excluded: Vec<bool> = (0..w * h).map(|i| border.covers(i % w, i / w, w, h)).collect();
+    let unused = |i: usize| coverage.is_some_and(|c| !c.uses(i));
+    let mut excluded: Vec<bool> =
+        (0..w * h).map(|i| unused(i) || border.covers(i % w, i / w, w, h)).collect();
     for white in [true, false] {
         let saturated = |i: usize| {
             let c = image.data[i];
@@ -278,7 +285,7 @@ mod tests {
                 image.data[y * 100 + x] = [1.0; 3];
             }
         }
-        let open = valid_area(&image, PlainBorder::default(), 2);
+        let open = valid_area(&image, PlainBorder::default(), None, 2);
         assert!(open.at(12, 35) && !open.at(1, 35) && open.at(3, 60));
         for y in 0..80 {
             for x in 0..100 {
@@ -287,7 +294,7 @@ mod tests {
                 }
             }
         }
-        let framed = valid_area(&image, PlainBorder::default(), 2);
+        let framed = valid_area(&image, PlainBorder::default(), None, 2);
         assert!(!framed.at(9, 50) && framed.at(12, 50) && framed.at(50, 40) && !framed.at(50, 3));
     }
 
@@ -305,5 +312,17 @@ mod tests {
             Keypoints { points: at(4), dim: 8, descriptors: [unit(2), unit(1), unit(1), unit(0)].concat() };
         let m: Vec<_> = mutual_matches(&a, &b, 0.9).iter().map(|m| (m.first, m.second)).collect();
         assert_eq!(m, [(0, 3), (2, 0)]);
+    }
+
+    #[test]
+    fn features_keep_away_from_unused_pixels() {
+        use crate::scene::Outside;
+        let data = (0..60 * 40).map(|i| [0.3 + 0.4 * (i % 7) as f32 / 7.0; 3]).collect();
+        let image = RgbImage { width: 60, height: 40, data };
+        let share = (0..60 * 40).map(|i| if i % 60 < 30 { 1.0 } else { 0.0 }).collect();
+        let coverage =
+            Coverage { share: Plane { width: 60, height: 40, data: share }, outside: Outside::Unknown };
+        let open = valid_area(&image, PlainBorder::default(), Some(&coverage), 2);
+        assert_eq!([25, 26, 29, 35].map(|x| open.at(x, 20)), [true, false, false, false]);
     }
 }

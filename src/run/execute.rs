@@ -7,11 +7,11 @@ use super::plan::RunPlan;
 use super::record;
 use super::sources::{self, GraphBuilder};
 use super::stages::PlacedPhotos;
-use crate::format::Workspace;
 use crate::format::scene_dir::{self, Contents};
+use crate::format::{Workspace, cameras};
 use crate::gpu::{self, Device};
 use crate::infer::{Registry, home};
-use crate::photo::{self, Candidate, Photo};
+use crate::photo::{self, Candidate, MaskChoice, Photo};
 use crate::pipeline::{Graph, Store};
 use crate::pose;
 use crate::progress::{Progress, Recorded};
@@ -38,7 +38,8 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     let (photos, choice) = match &base {
         Some(base) => (joining(plan, base, &device, max_size, progress)?, None),
         None => {
-            let (chosen, choice) = pose::choose::photos(&plan.inputs, plan.views, progress)?;
+            let (mut chosen, choice) = pose::choose::photos(&plan.inputs, plan.views, progress)?;
+            photo::assign_masks(&mut chosen, &masks(plan)?, progress)?;
             plan.check_budget(&device, &photo::sizes_of(&chosen), max_size)?;
             (photo::load_each(&chosen, max_size, progress)?, choice)
         }
@@ -72,6 +73,12 @@ pub fn save(outcome: &mut RunOutcome, out: &Path, force: bool, progress: &dyn Pr
     write(workspace, outcome, progress)
 }
 
+/// Where the masks of the photos come from.
+fn masks(plan: &RunPlan) -> Result<MaskChoice> {
+    let cameras = plan.init.argument.as_deref().filter(|_| plan.init.name == "cameras");
+    cameras::masks(plan.photo_masks.as_deref(), cameras.map(Path::new))
+}
+
 /// The photos that join a scene, all that were named.
 fn joining(
     plan: &RunPlan,
@@ -89,7 +96,8 @@ fn joining(
     }
     found.warnings().iter().for_each(|w| progress.warn(w));
     found.photos.iter().try_for_each(|p| photo::check_name(p))?;
-    let files: Vec<Candidate> = found.photos.iter().map(|p| Candidate::file(p)).collect();
+    let mut files: Vec<Candidate> = found.photos.iter().map(|p| Candidate::file(p)).collect();
+    photo::assign_masks(&mut files, &masks(plan)?, progress)?;
     // As large as those of the scene, where nothing else is asked for: finer ones would be shown no better.
     let sides = base.known.photos.iter().map(|p| p.image.width.max(p.image.height));
     let max_size = plan.max_size.or(sides.max()).unwrap_or(max_size);
@@ -104,7 +112,8 @@ fn joining(
         progress.step(photos.len() as u64, "");
     }
     progress.end();
-    let photos = base.without_its_own(photos, progress)?;
+    let mut photos = base.without_its_own(photos, progress)?;
+    photo::settle(&mut photos, &base.known.photos, progress);
     base.check(&photos)?;
     Ok(photos)
 }

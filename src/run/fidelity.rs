@@ -3,6 +3,7 @@ use super::view::DecodedFrame;
 use crate::fit::MOST_PSNR;
 use crate::pass::metrics;
 use crate::photo::Photo;
+use crate::scene::Coverage;
 use rayon::prelude::*;
 
 /// A photo this much below the best one, dB, is not shown as it should be: half the amplitude of the error is more than texture
@@ -15,7 +16,11 @@ const GOOD: f64 = 30.0;
 /// How well the frames of a finished scene show its photos, dB: the language stage has moved its splats since the colours were
 /// trained.
 pub(super) fn psnr(frames: &[DecodedFrame], photos: &[Photo]) -> Vec<f64> {
-    let one = |(f, p): (&DecodedFrame, &Photo)| metrics::psnr(&f.rendered.rgb, &p.image).min(MOST_PSNR);
+    let one = |(f, p): (&DecodedFrame, &Photo)| {
+        let weights = p.coverage.as_ref().map(Coverage::weights);
+        let counts = |i: usize| weights.as_ref().is_none_or(|w| w.data[i] > 0.0);
+        metrics::psnr_masked(&f.rendered.rgb, &p.target(), counts).min(MOST_PSNR)
+    };
     frames.par_iter().zip(photos).map(one).collect()
 }
 

@@ -9,7 +9,7 @@ use super::{encoder, sources};
 use crate::files::check_spared;
 use crate::format::gaussians::{Reserved, WriteOptions};
 use crate::format::scene_dir::{self, Contents, Scene};
-use crate::format::{Workspace, colmap, gaussians};
+use crate::format::{Workspace, colmap, gaussians, scene_photos};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::pass::bands::Band;
@@ -256,8 +256,8 @@ fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
     let workspace = Workspace::create(path, replace, &[&scene.path])?;
     let folder = scene.path.join("cameras");
     // A scene without its photos is still whole.
-    let photos = scene.cameras.iter().map(|c| photo::load_at(&folder.join(&c.name), usize::MAX));
-    let photos = photos.collect::<Result<Vec<_>>>().unwrap_or_default();
+    let plain = || scene.cameras.iter().map(|c| photo::load_at(&folder.join(&c.name), usize::MAX)).collect();
+    let photos = scene_photos::load(&scene.path).or_else(|_| plain()).unwrap_or_default();
     let points = colmap::read_points(&folder.join("colmap")).ok();
     let table = scene.path.join(scene_dir::TEXT_EMBEDDINGS);
     let contents = Contents {

@@ -2,12 +2,12 @@
 //! default, and changes only what its authors do differently to language.
 use super::view::Viewer;
 use crate::fit::scale::SceneScale;
-use crate::fit::{self, LanguageOptions, Preset, RgbOptions, Start, TrainedLanguage, index_head};
+use crate::fit::{self, LanguageOptions, Photos, Preset, RgbOptions, Start, TrainedLanguage, index_head};
 use crate::gpu::Device;
 use crate::language::align::AlignOptions;
 use crate::language::{BuildOptions, Reducer};
 use crate::progress::Progress;
-use crate::scene::{Camera, LanguageField, RgbImage, Splats};
+use crate::scene::{Camera, LanguageField, Splats};
 use crate::{Error, Result};
 use serde::Serialize;
 
@@ -177,20 +177,19 @@ impl Recipe {
     }
 
     /// The language stage of this recipe, from codes and targets to features.
-    pub fn train_language(
+    pub(crate) fn train_language(
         &self,
         device: &Device,
-        images: &[RgbImage],
-        cameras: &[Camera],
+        photos: Photos,
         splats: &Splats,
         field: LanguageField,
         options: LanguageOptions,
         progress: &dyn Progress,
     ) -> Result<TrainedLanguage> {
         let (options, seed) = (self.language(options.clone()), options.seed);
-        let mut trained = fit::train_language(device, images, cameras, splats, field, &options, progress)?;
+        let mut trained = fit::train_language_of(device, photos, splats, field, &options, progress)?;
         if self.index_head {
-            train_index_heads(device, cameras, &mut trained, seed)?;
+            train_index_heads(device, photos.cameras, &mut trained, seed)?;
         }
         Ok(trained)
     }

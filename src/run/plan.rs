@@ -25,6 +25,8 @@ pub struct RunPlan {
     pub views: Option<usize>,
     /// Scene directory.
     pub out: PathBuf,
+    /// Folder of a mask per photo; `None` = one beside the photos, where there is any.
+    pub photo_masks: Option<PathBuf>,
     /// Replace an existing scene.
     pub force: bool,
     /// Use the stages that an earlier run with the same photos and settings has finished.
@@ -86,6 +88,7 @@ impl Default for RunPlan {
             add: None,
             views: None,
             out: PathBuf::new(),
+            photo_masks: None,
             force: false,
             resume: false,
             checkpoint_seconds: CHECKPOINT_SECONDS,
@@ -130,8 +133,8 @@ impl RunPlan {
     pub fn read(&self) -> impl Iterator<Item = &Path> {
         let sources = [&self.init, &self.depth_prior, &self.matcher, &self.masks, &self.features];
         let arguments = sources.into_iter().filter_map(|s| s.argument.as_deref());
-        let folders = [self.add.as_deref(), self.models.as_deref()].into_iter().flatten();
-        self.inputs.iter().map(PathBuf::as_path).chain(arguments).chain(folders)
+        let folders = [&self.add, &self.models, &self.photo_masks].into_iter().flatten();
+        self.inputs.iter().map(PathBuf::as_path).chain(arguments).chain(folders.map(PathBuf::as_path))
     }
 
     /// The method that is asked for, or else the one that suits the plan.

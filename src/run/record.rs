@@ -8,7 +8,7 @@ use crate::photo::Photo;
 use crate::pose::{Confidence, Fitted};
 use crate::report::viewer::Scene3d;
 use crate::report::{self, AnswerShown, Curve, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown};
-use crate::scene::{Camera, LEVEL_NAMES, Seen, Splats, World};
+use crate::scene::{Camera, LEVEL_NAMES, RgbImage, Seen, Splats, World};
 use serde_json::json;
 use std::path::Path;
 
@@ -332,13 +332,15 @@ pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
     record.write(folder)?;
     let levels: Vec<Vec<_>> =
         o.frames.iter().map(|f| LEVEL_NAMES.into_iter().zip(f.codes.iter().cloned()).collect()).collect();
+    // What renders are compared with.
+    let targets: Vec<RgbImage> = o.photos.iter().map(Photo::target).collect();
     let views = o
         .photos
         .iter()
         .enumerate()
         .map(|(i, p)| ViewShown {
             name: &p.stem,
-            photo: &p.image,
+            photo: &targets[i],
             render: Some(&o.frames[i].rendered.rgb),
             depth: Some(&o.frames[i].rendered.depth),
             levels: &levels[i],
@@ -353,7 +355,7 @@ pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
         queries: o.answers.iter().map(shown).collect(),
         curves: curves(&o.rgb, &o.language_curve),
         space: Some(&o.field.space),
-        scene: Some(scene(&title, o)),
+        scene: Some(scene(&title, &targets, o)),
         figures: figures(o),
         run: &record,
     };
@@ -361,14 +363,14 @@ pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
     report::write_previews(folder, &report)
 }
 
-fn scene<'a>(title: &'a str, o: &'a RunOutcome) -> Scene3d<'a> {
+fn scene<'a>(title: &'a str, photos: &'a [RgbImage], o: &'a RunOutcome) -> Scene3d<'a> {
     Scene3d {
         title,
         splats: &o.splats,
         seen: &o.seen,
         cameras: &o.cameras,
         world: &o.world,
-        photos: o.photos.iter().map(|p| &p.image).collect(),
+        photos: photos.iter().collect(),
         language: Some(&o.field),
         names: &o.names,
         answers: o.answers.iter().map(Answers::shown).collect(),

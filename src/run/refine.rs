@@ -123,7 +123,7 @@ impl ViewRefiner {
                 break;
             }
             let s = sums.read()?;
-            let total = loss.loss([s[0], s[1]].map(f64::from)).total(WEIGHTS[0], WEIGHTS[1]);
+            let total = loss.loss([s[0], s[1]].map(f64::from), None).total(WEIGHTS[0], WEIGHTS[1]);
             if total < best.0 {
                 best = (total, pose);
             }
@@ -147,7 +147,7 @@ impl ViewRefiner {
         let mut rec = Recorder::new(&self.device, "refine view");
         raster.record_forward(&mut rec, &self.params, &self.options);
         let whole = frame.bands.get(0);
-        loss.record(&mut rec, &whole, &frame.planes, target, &frame.planes_grad, WEIGHTS, (sums, 0));
+        loss.record(&mut rec, &whole, &frame.planes, target, &frame.planes_grad, None, WEIGHTS, (sums, 0));
         raster.record_backward(&mut rec, &self.params, &self.options, &self.gradients);
         rec
     }

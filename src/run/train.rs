@@ -12,7 +12,7 @@ use crate::report::{self, HtmlReport, RunRecord, ViewShown};
 use crate::run::budget::{self, Limits, MemoryDemand};
 use crate::run::stages::{self, CameraOrigin};
 use crate::run::view::Viewer;
-use crate::scene::{Camera, GivenCamera, LanguageField, PointCloud, World};
+use crate::scene::{Camera, GivenCamera, LanguageField, PointCloud, RgbImage, World};
 use crate::{Error, Result};
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -30,6 +30,8 @@ pub struct TrainPlan {
     pub points: Option<PathBuf>,
     /// Scene directory.
     pub out: PathBuf,
+    /// Folder of a mask per photo; `None` = one beside the photos, where there is any.
+    pub photo_masks: Option<PathBuf>,
     /// Replace an existing scene.
     pub force: bool,
     /// Use the stages that an earlier training with the same photos and settings has finished.
@@ -68,8 +70,8 @@ pub struct TrainOutcome {
 impl TrainPlan {
     /// The files and folders that the training reads.
     fn read(&self) -> impl Iterator<Item = &Path> {
-        let given = [self.points.as_deref(), self.models.as_deref()].into_iter().flatten();
-        [self.images.as_path(), self.cameras.as_path()].into_iter().chain(given)
+        let given = [&self.points, &self.models, &self.photo_masks].into_iter().flatten();
+        [self.images.as_path(), self.cameras.as_path()].into_iter().chain(given.map(PathBuf::as_path))
     }
 }
 
@@ -82,7 +84,9 @@ fn matched(
     device: &Device,
     progress: &dyn Progress,
 ) -> Result<Vec<Photo>> {
-    let files = with_cameras(plan, known, progress)?;
+    let mut files = with_cameras(plan, known, progress)?;
+    let masks = cameras::masks(plan.photo_masks.as_deref(), Some(&plan.cameras))?;
+    photo::assign_masks(&mut files, &masks, progress)?;
     let views = plan.views.unwrap_or(files.len().min(photo::MAX_VIEWS));
     let wanted = photo::photo_count(files.len(), Some(views))?;
     let files = match wanted == files.len() {
@@ -280,10 +284,12 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     figures.extend(super::record::view_dependence_figure(&trained.stats.view_dependence));
     figures.push(super::record::up_figure(&world));
     figures.extend(super::light::figure(&photos));
-    let views = photos.iter().zip(&frames).zip(&trained.stats.psnr);
-    let views = views.map(|((p, f), psnr)| ViewShown {
+    // What renders are compared with.
+    let targets: Vec<RgbImage> = photos.iter().map(Photo::target).collect();
+    let views = photos.iter().zip(&targets).zip(&frames).zip(&trained.stats.psnr);
+    let views = views.map(|(((p, target), f), psnr)| ViewShown {
         name: &p.stem,
-        photo: &p.image,
+        photo: target,
         render: Some(&f.rendered.rgb),
         depth: Some(&f.rendered.depth),
         levels: &[],
@@ -304,7 +310,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
             seen: &seen,
             cameras: &trained.cameras,
             world: &world,
-            photos: photos.iter().map(|p| &p.image).collect(),
+            photos: targets.iter().collect(),
             language: None,
             names: &Vec::new(),
             answers: Vec::new(),

@@ -62,3 +62,12 @@ pub struct DepthMap {
     /// [H, W] confidence ≥ 0; 0 where depth is unknown.
     pub confidence: Plane<f32>,
 }
+
+impl DepthMap {
+    /// Makes depth unknown where `keep(index)` does not hold.
+    pub fn keep(&mut self, keep: impl Fn(usize) -> bool) {
+        for i in (0..self.depth.data.len()).filter(|i| !keep(*i)) {
+            (self.depth.data[i], self.confidence.data[i]) = (0.0, 0.0);
+        }
+    }
+}

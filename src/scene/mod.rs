@@ -6,6 +6,7 @@
 mod affine;
 mod camera;
 pub mod code_mix;
+mod coverage;
 mod given;
 mod image;
 mod language;
@@ -23,6 +24,7 @@ mod world;
 pub use affine::Affine;
 pub use camera::{Camera, MAX_PIXELS, MAX_SIDE, Pose};
 pub use code_mix::CodeMix;
+pub use coverage::{Coverage, Outside};
 pub use given::GivenCamera;
 pub use image::{DepthMap, Plane, RgbImage};
 pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId};

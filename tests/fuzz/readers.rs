@@ -240,8 +240,10 @@ pub fn all() -> Vec<Reader> {
         Reader::new("3dovs", seeds::ovs(), |f| labelled(ProtocolKind::Ovs, f)),
         Reader::new("scannet", seeds::scannet(), |f| labelled(ProtocolKind::ScanNet, f)),
     ];
-    let photos: [(&str, Vec<Seed>, fn(&Path) -> Result<()>); 7] = [
+    let photos: [(&str, Vec<Seed>, fn(&Path) -> Result<()>); 9] = [
         ("png", vec![seeds::picture("a.png")], |f| photo_of(f, "a.png")),
+        ("png-indexed", vec![seeds::indexed("a.png")], |f| photo_of(f, "a.png")),
+        ("radiance", vec![seeds::picture("a.hdr")], |f| photo_of(f, "a.hdr")),
         ("jpeg", vec![seeds::picture("a.jpg")], |f| photo_of(f, "a.jpg")),
         ("webp", vec![seeds::picture("a.webp")], |f| photo_of(f, "a.webp")),
         ("tiff", vec![seeds::picture("a.tif")], |f| photo_of(f, "a.tif")),

@@ -364,29 +364,87 @@ pub fn scannet() -> Vec<Seed> {
     ]
 }
 
-/// One chunk after the other of a PNG, with right sums.
-const CHUNKS: Container = |bytes, change| {
-    static TURN: AtomicUsize = AtomicUsize::new(0);
-    let (mut at, mut chunks) = (8, Vec::new());
+/// Kind and content of the chunks of a PNG.
+fn chunks(bytes: &[u8]) -> Vec<([u8; 4], Vec<u8>)> {
+    let (mut at, mut all) = (8, Vec::new());
     while let Some(length) = bytes.get(at..at + 4) {
         let length = u32::from_be_bytes(length.try_into().unwrap()) as usize;
-        chunks.push(&bytes[at + 4..at + 8 + length]);
+        all.push((bytes[at + 4..at + 8].try_into().unwrap(), bytes[at + 8..at + 8 + length].to_vec()));
         at += 12 + length;
     }
-    let turn = TURN.fetch_add(1, Relaxed) % chunks.len();
-    let mut out = bytes[..8].to_vec();
-    for (k, chunk) in chunks.iter().enumerate() {
-        let content = if k == turn { change(&chunk[4..]) } else { chunk[4..].to_vec() };
+    all
+}
+
+/// A PNG of chunks, with right lengths and sums.
+fn png_of(chunks: &[([u8; 4], Vec<u8>)]) -> Vec<u8> {
+    let mut out = b"\x89PNG\r\n\x1a\n".to_vec();
+    for (kind, content) in chunks {
         let mut sum = flate2::Crc::new();
-        sum.update(&chunk[..4]);
-        sum.update(&content);
+        sum.update(kind);
+        sum.update(content);
         out.extend((content.len() as u32).to_be_bytes());
-        out.extend(&chunk[..4]);
+        out.extend(kind);
         out.extend(content);
         out.extend(sum.sum().to_be_bytes());
     }
     out
+}
+
+/// One chunk after the other of a PNG, with right sums.
+const CHUNKS: Container = |bytes, change| {
+    static TURN: AtomicUsize = AtomicUsize::new(0);
+    let mut all = chunks(bytes);
+    let turn = TURN.fetch_add(1, Relaxed) % all.len();
+    all[turn].1 = change(&all[turn].1);
+    png_of(&all)
 };
+
+/// The same, and chunks that are missing, twice there, of every length, or at another place.
+const ORDER: Container = |bytes, change| {
+    static TURN: AtomicUsize = AtomicUsize::new(0);
+    let mut all = chunks(bytes);
+    let (turn, n) = (TURN.fetch_add(1, Relaxed), all.len());
+    let (k, place) = (turn % n, turn / n % n);
+    match turn / (n * n) % 6 {
+        0 => drop(all.remove(k)),
+        1 => all.insert(place, all[k].clone()),
+        2 => all.swap(k, place),
+        3 => all[k].1.resize(turn / n % 800, 7),
+        _ => all[k].1 = change(&all[k].1),
+    }
+    png_of(&all)
+};
+
+fn deflated(bytes: &[u8]) -> Vec<u8> {
+    let mut out = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::fast());
+    out.write_all(bytes).unwrap();
+    out.finish().unwrap()
+}
+
+/// A PNG with a palette and a chunk of every kind that is read.
+pub fn indexed(name: &str) -> Seed {
+    let packet =
+        b"<x xmlns:G=\"http://ns.google.com/photos/1.0/panorama/\" G:ProjectionType=\"rectilinear\"/>";
+    let rows: Vec<u8> =
+        (0..64u8).flat_map(|y| std::iter::once(0).chain((0..64).map(move |x| x * 3 ^ y))).collect();
+    let numbers = |v: &[u32]| v.iter().flat_map(|v| v.to_be_bytes()).collect::<Vec<u8>>();
+    let chunk = |kind: &[u8; 4], content: Vec<u8>| (*kind, content);
+    let all = [
+        chunk(b"IHDR", [numbers(&[64, 64]), vec![8, 3, 0, 0, 0]].concat()),
+        chunk(b"cICP", vec![12, 13, 0, 1]),
+        chunk(b"iCCP", [&b"p3\0\0"[..], &deflated(&icc_profile())].concat()),
+        chunk(b"gAMA", numbers(&[45_455])),
+        chunk(b"cHRM", numbers(&[31_270, 32_900, 64_000, 33_000, 30_000, 60_000, 15_000, 6_000])),
+        chunk(b"PLTE", (0..768).map(|k| (k * 7 % 256) as u8).collect()),
+        chunk(b"tRNS", (0..=255).map(|k| 255 - k / 4).collect()),
+        chunk(b"eXIf", exif_block()),
+        chunk(b"iTXt", [&b"XML:com.adobe.xmp\0\x01\0\0\0"[..], &deflated(packet)].concat()),
+        chunk(b"zTXt", [&b"a\0\0"[..], &deflated(b"text")].concat()),
+        chunk(b"IDAT", deflated(&rows)),
+        chunk(b"IEND", Vec::new()),
+    ];
+    inside(name, png_of(&all), ORDER)
+}
 
 /// A photo in the format of its name.
 pub fn picture(name: &str) -> Seed {
@@ -400,6 +458,7 @@ pub fn picture(name: &str) -> Seed {
             encoder.encode_image(&image).unwrap();
         }
         "a.exr" => image.to_rgba32f().write_to(&mut out, ImageFormat::OpenExr).unwrap(),
+        "a.hdr" => DynamicImage::from(image.to_rgb32f()).write_to(&mut out, ImageFormat::Hdr).unwrap(),
         "a.webp" => image.write_to(&mut out, ImageFormat::WebP).unwrap(),
         _ => image.write_to(&mut out, ImageFormat::Tiff).unwrap(),
     }

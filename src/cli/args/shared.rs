@@ -42,6 +42,9 @@ pub struct MakingArgs {
     /// Go on where an earlier command ended, or change a late option: stages with the same photos and settings are not run again
     #[arg(long)]
     pub resume: bool,
+    /// Folder of a mask per photo, x.png or x.jpg.png for x.jpg: black is not used [default: masks beside images]
+    #[arg(long, value_name = "DIR")]
+    pub photo_masks: Option<PathBuf>,
     /// How often training keeps its state for --resume, seconds
     #[arg(long, default_value_t = crate::run::CHECKPOINT_SECONDS, value_name = "N")]
     pub checkpoint_seconds: u64,

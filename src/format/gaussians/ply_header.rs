@@ -157,15 +157,7 @@ pub(super) fn header(bytes: &[u8], wanted: &str) -> Result<Header, String> {
     }
     h.elements = elements.iter().filter(|e| e.rows > 0).map(|e| e.name.clone()).collect();
     let element = elements.swap_remove(at);
-    if element.has_list {
-        return Err(format!(
-            "element {wanted} has a list property, which is not supported; write it without"
-        ));
-    }
-    let mut seen = HashSet::new();
-    if let Some((twice, _)) = element.columns.iter().find(|c| !seen.insert(c.0.as_str())) {
-        return Err(format!("element {wanted} has the property {twice} twice; remove one of them"));
-    }
+    element.check()?;
     (h.rows, h.columns) = (element.rows, element.columns);
     Ok(h)
 }

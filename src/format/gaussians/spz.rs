@@ -120,7 +120,8 @@ impl Head {
 /// Reads a file; notes name what is not read, a line each.
 pub fn read_noted(path: &Path, notes: &mut Vec<String>) -> Result<Splats> {
     let bytes = files::read(path)?;
-    parse(&bytes, notes).map_err(|e| Error::input(format!("{}: {e}", path.display())))
+    let parsed = files::guarded(|| parse(&bytes, notes)).unwrap_or_else(|panic| Err(broken(panic)));
+    parsed.map_err(|e| Error::input(format!("{}: {e}", path.display())))
 }
 
 fn parse(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, String> {

@@ -51,8 +51,13 @@ fn of_all(
     limit: usize,
     detect: impl Fn(&Plane<f32>, &Plane<bool>, usize) -> Keypoints + Sync,
 ) -> Vec<Keypoints> {
-    let one = |p: &Photo| detect(&p.image.luma(), &matching::valid_area(&p.image, p.border, MARGIN), limit);
+    let one = |p: &Photo| detect(&p.image.luma(), &valid(p), limit);
     photos.par_iter().map(one).collect()
+}
+
+/// Where features of a photo may lie.
+fn valid(photo: &Photo) -> Plane<bool> {
+    matching::valid_area(&photo.image, photo.border, photo.coverage.as_ref(), MARGIN)
 }
 
 /// Keypoints on valid pixels.
@@ -70,11 +75,7 @@ fn within(f: &Keypoints, valid: &Plane<bool>) -> Keypoints {
 
 /// Masked features of all detectors, per family and photo.
 pub(super) fn masked(photos: &[Photo], features: &[Keypoints]) -> Vec<Keypoints> {
-    photos
-        .iter()
-        .zip(features)
-        .map(|(p, f)| within(f, &matching::valid_area(&p.image, p.border, MARGIN)))
-        .collect()
+    photos.iter().zip(features).map(|(p, f)| within(f, &valid(p))).collect()
 }
 
 /// All keypoints of a view, numbered as the links number them.

@@ -82,8 +82,8 @@ pub(super) fn sub_pixel(
     progress: &dyn Progress,
 ) -> Result<()> {
     let shades: Vec<Shades> = straight.par_iter().map(|image| Shades::new(&image.luma())).collect();
-    let valid: Vec<Plane<bool>> =
-        photos.iter().zip(straight).map(|(p, image)| matching::valid_area(image, p.border, MARGIN)).collect();
+    let valid = |p: &Photo, image| matching::valid_area(image, p.border, p.coverage.as_ref(), MARGIN);
+    let valid: Vec<Plane<bool>> = photos.iter().zip(straight).map(|(p, image)| valid(p, image)).collect();
     on_straight(model, |m| refine::refine(m, &shades, refine::REFINED, REACH));
     reweight_and_adjust(model)?;
     progress.check()?;

@@ -21,10 +21,10 @@ use crate::Result;
 use crate::gpu::Device;
 use crate::pass::plane_sweep::{GpuMatcher, Matcher, ReferenceView};
 use crate::progress::Progress;
-use crate::scene::{Camera, DepthMap, DepthPrior, Plane, PointCloud, RgbImage};
+use crate::scene::{Camera, Coverage, DepthMap, DepthPrior, Plane, PointCloud, RgbImage};
 use glam::{DVec3, Vec4};
 
-/// Depth of every photo (complete but for white borders; confidence tells matched from filled) and fused points, from
+/// Depth of every photo (complete but for white borders and what the photos do not use; confidence tells matched from filled) and fused points, from
 /// cameras at the photos' working resolutions. `sparse` are points of the scene in world coordinates: they set the
 /// searched depths and choose which views are matched. Deterministic for a given device, seed and input.
 ///
@@ -32,6 +32,7 @@ use glam::{DVec3, Vec4};
 pub fn dense(
     device: &Device,
     images: &[RgbImage],
+    coverage: &[Option<Coverage>],
     cameras: &[Camera],
     sparse: &[DVec3],
     priors: &[Option<DepthPrior>],
@@ -45,7 +46,7 @@ pub fn dense(
     })?;
     progress.check()?;
     let finest = &levels[levels.len() - 1];
-    Ok(finish(images, finest, &planes, priors, options, progress))
+    Ok(finish(images, coverage, finest, &planes, priors, options, progress))
 }
 
 /// Planes (π, cost) of all views at the finest resolution; `matcher` makes the device's or the twin's.
@@ -102,13 +103,14 @@ pub fn run_schedule<M: Matcher>(
 /// Depth maps and points from matched planes.
 pub fn finish(
     images: &[RgbImage],
+    coverage: &[Option<Coverage>],
     level: &Level,
     matched: &[Vec4],
     priors: &[Option<DepthPrior>],
     options: &StereoOptions,
     progress: &dyn Progress,
 ) -> (Vec<DepthMap>, PointCloud) {
-    let void = void::white_border(level);
+    let void = void::unused(level, coverage);
     let weak = texture::weak(level);
     let links = surface::RelativePoses::new(level);
     let consistent = surface::consistent_surface(level, &links, matched, &void, &weak);
@@ -119,8 +121,11 @@ pub fn finish(
     let joined = prior::join(level, &links, &inferred, priors, options.seed, progress);
     let complete = fill::fill(level, &links, &joined, &large, &void);
     let points = fuse::fuse(level, &links, &complete);
-    let depths =
+    let mut depths: Vec<DepthMap> =
         images.iter().enumerate().map(|(view, image)| depth_map(level, &complete, view, image)).collect();
+    for (depth, coverage) in depths.iter_mut().zip(coverage) {
+        coverage.iter().for_each(|c| depth.keep(|i| c.uses(i)));
+    }
     (depths, points)
 }
 

@@ -248,7 +248,7 @@ fn two_slanted_planes_are_recovered_and_runs_repeat() {
     let device = test_device();
     let set = synthetic(160, 120);
     let run = || {
-        dense(&device, &set.images, &set.cameras, &set.sparse, &[], &StereoOptions::default(), &Silent)
+        dense(&device, &set.images, &[], &set.cameras, &set.sparse, &[], &StereoOptions::default(), &Silent)
             .unwrap()
     };
     let (depths, points) = run();
@@ -283,7 +283,7 @@ fn noisy_photos_with_little_parallax_give_a_surface() {
         }
     }
     let (depths, _) =
-        dense(&device, &set.images, &set.cameras, &set.sparse, &[], &StereoOptions::default(), &Silent)
+        dense(&device, &set.images, &[], &set.cameras, &set.sparse, &[], &StereoOptions::default(), &Silent)
             .unwrap();
     for (view, (found, exact)) in depths.iter().zip(&set.depth).enumerate() {
         let (e, complete) = errors(&found.depth, exact);
@@ -306,7 +306,8 @@ fn white_frames_get_no_depth() {
         }
     }
     let options = StereoOptions { planes: 16, coarse_rounds: 2, rounds: vec![2], ..StereoOptions::default() };
-    let (depths, _) = dense(&device, &set.images, &set.cameras, &set.sparse, &[], &options, &Silent).unwrap();
+    let (depths, _) =
+        dense(&device, &set.images, &[], &set.cameras, &set.sparse, &[], &options, &Silent).unwrap();
     for map in depths {
         for k in 0..map.depth.data.len() {
             let frame = k % 120 < 4 || k / 120 >= 97;
@@ -325,7 +326,7 @@ fn photos_of_different_sizes_are_matched() {
     set.cameras[0] = small.cameras[0].clone();
     set.depth[0] = small.depth[0].clone();
     let (depths, _) =
-        dense(&device, &set.images, &set.cameras, &set.sparse, &[], &StereoOptions::default(), &Silent)
+        dense(&device, &set.images, &[], &set.cameras, &set.sparse, &[], &StereoOptions::default(), &Silent)
             .unwrap();
     for (found, exact) in depths.iter().zip(&set.depth) {
         assert_eq!((found.depth.width, found.depth.height), (exact.width, exact.height));
@@ -396,7 +397,7 @@ fn breakfast_depth_at_a_quarter_of_the_resolution() {
     let device = test_device();
     let set = breakfast(4);
     let (depths, points) =
-        dense(&device, &set.images, &set.cameras, &set.sparse, &[], &StereoOptions::default(), &Silent)
+        dense(&device, &set.images, &[], &set.cameras, &set.sparse, &[], &StereoOptions::default(), &Silent)
             .unwrap();
     for (view, (found, exact)) in depths.iter().zip(&set.depth).enumerate() {
         let (e, complete) = errors(&found.depth, exact);

@@ -178,13 +178,12 @@ impl Stage for TrainOn {
         // As many splats on surfaces in the end as a run with all photos has.
         let fresh = geometry.points.len().min(options.init.max_points);
         let scene = shown_splats(&self.base, most - fresh, context)?;
+        let (targets, coverage) = shared::targets(&placed.photos);
         fit::train_on(
             context.device,
-            &shared::images(&placed.photos),
-            &geometry.cameras,
+            shared::posed(&targets, &geometry.cameras, Some(&geometry.depths), &coverage),
             scene,
             &geometry.points,
-            &geometry.depths,
             &options,
             context.progress,
         )

@@ -78,13 +78,17 @@ pub(super) fn identity(photo: &Photo) -> String {
     if let Some(fine) = &photo.fine {
         digest.update(bytemuck::cast_slice::<_, u8>(&fine.data));
     }
+    let outside = photo.coverage.as_ref().map(|coverage| {
+        digest.update(bytemuck::cast_slice::<_, u8>(&coverage.share.data));
+        coverage.outside
+    });
     let pixels = crate::files::hex(&digest.finalize());
     let Photo {
         path, image, border, original_size, turn, to_working, exif_focal, camera_model, gravity, ..
     } = photo;
     let size = (image.width, image.height);
     format!(
-        "{path:?} {size:?} {border:?} {original_size:?} {turn:?} {to_working:?} {exif_focal:?} {camera_model:?} {gravity:?} {pixels}"
+        "{path:?} {size:?} {border:?} {original_size:?} {turn:?} {to_working:?} {exif_focal:?} {camera_model:?} {gravity:?} {outside:?} {pixels}"
     )
 }
 
@@ -146,8 +150,28 @@ fn of_network(model: &str, photos: Vec<Photo>, found: pointmap::Reconstruction) 
         }
     }
     let method = format!("{model} {}", found.geometry.method);
-    let known = KnownGeometry::Complete(Geometry { method, ..found.geometry });
+    let geometry = without_unused(found.geometry, &kept);
+    let known = KnownGeometry::Complete(Geometry { method, ..geometry });
     PlacedPhotos { photos: kept, left_out, known }
+}
+
+/// Depth and points on the pixels that the photos use.
+fn without_unused(mut geometry: Geometry, photos: &[Photo]) -> Geometry {
+    for (depth, photo) in geometry.depths.iter_mut().zip(photos).filter(|(_, p)| p.coverage.is_some()) {
+        depth.keep(|i| photo.uses(i));
+    }
+    let points = &geometry.points;
+    let is_used = |i: &usize| {
+        let view = usize::from(points.view[*i]);
+        let (Some(photo), Some(camera)) = (photos.get(view), geometry.cameras.get(view)) else { return true };
+        let (pixel, _) = camera.project(glam::DVec3::from(points.positions[*i].map(f64::from)));
+        let (w, h) = (photo.image.width, photo.image.height);
+        let inside = |v: f64, size: usize| (v.max(0.0) as usize).min(size - 1);
+        photo.uses(inside(pixel.y, h) * w + inside(pixel.x, w))
+    };
+    let rows: Vec<usize> = (0..points.len()).filter(is_used).collect();
+    geometry.points = points.picked(&rows);
+    geometry
 }
 
 /// Depth maps and points by stereo, where no network has given them.

@@ -170,10 +170,10 @@ impl Stage for TrainLanguage {
         (placed, trained, language): (&PlacedPhotos, &Trained, &Language),
         context: &Context,
     ) -> Result<TrainedLanguage> {
+        let (targets, coverage) = shared::targets(&placed.photos);
         self.recipe.train_language(
             context.device,
-            &shared::images(&placed.photos),
-            &trained.cameras,
+            shared::posed(&targets, &trained.cameras, None, &coverage),
             &trained.splats,
             language.field.clone(),
             self.options,

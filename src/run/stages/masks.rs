@@ -207,6 +207,9 @@ impl Stage for RegionFeatures {
         context: &Context,
     ) -> Result<Vec<ViewMasks>> {
         let (mut masks, images) = (masks.clone(), placed.photos.iter().map(|p| &p.image));
+        for (view, photo) in masks.iter_mut().zip(&placed.photos).filter(|(_, p)| p.coverage.is_some()) {
+            view.levels.iter_mut().for_each(|level| level.keep(|i| photo.uses(i)));
+        }
         describe(&mut masks, images, &self.encoder, context.progress)?;
         Ok(masks)
     }

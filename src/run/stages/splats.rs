@@ -28,15 +28,9 @@ impl Stage for TrainColour {
 
     fn run(self, (placed, geometry): (&PlacedPhotos, &Geometry), context: &Context) -> Result<Trained> {
         let depths = (!geometry.depths.is_empty()).then_some(geometry.depths.as_slice());
-        fit::train_rgb(
-            context.device,
-            &shared::images(&placed.photos),
-            &geometry.cameras,
-            &geometry.points,
-            depths,
-            &self.options,
-            context.progress,
-        )
+        let (targets, coverage) = shared::targets(&placed.photos);
+        let photos = shared::posed(&targets, &geometry.cameras, depths, &coverage);
+        fit::train_photos(context.device, photos, &geometry.points, &self.options, context.progress)
     }
 }
 
@@ -61,11 +55,12 @@ impl Stage for ViewDependence {
     }
 
     fn run(self, (placed, trained): (&PlacedPhotos, &Trained), context: &Context) -> Result<Trained> {
-        let images = shared::images(&placed.photos);
+        let (images, coverage) = shared::targets(&placed.photos);
         // Where the same points look as bright from every photo there is nothing to try.
         let matt = placed.photos.iter().all(|p| p.light.explains_the_photo());
         let degree = self.options.degree.or(matt.then_some(0));
         let options = ViewDependentOptions { degree, ..self.options };
-        fit::fit_view_dependent(context.device, &images, trained.clone(), &options, context.progress)
+        let trained = trained.clone();
+        fit::fit_view_dependent(context.device, &images, &coverage, trained, &options, context.progress)
     }
 }

@@ -4,7 +4,9 @@ use splatvk::pass::Rasterizer;
 use splatvk::pass::adam::{self as optimiser, Class, Moments, Schedule};
 use splatvk::pass::bands::Bands;
 use splatvk::pass::codes::{self as language, Mode, Targets};
-use splatvk::pass::regularise::{depth_l1, ratio_penalty, record_depth, record_ratio};
+use splatvk::pass::regularise::{
+    alpha_l1, depth_l1, ratio_penalty, record_alpha, record_depth, record_ratio,
+};
 use splatvk::pass::seeded::Random;
 use splatvk::pass::ssim_l1::{self as image_loss, Rows};
 
@@ -49,6 +51,15 @@ pub fn depth(device: &Device) {
         }
     }
     assert!(record(None, 0.0).iter().all(|&g| g == 0.0));
+    let mut wanted = uniform(pixels, 0.0, 1064);
+    wanted[5] = -1.0;
+    let buffer = device.buffer_from("wanted", &wanted).unwrap();
+    let mut rec = Recorder::new(device, "alpha");
+    record_alpha(&mut rec, frame, &buffer, 0.25);
+    rec.run().unwrap();
+    let upstream = frame.planes_grad.read().unwrap();
+    let (_, gradient) = alpha_l1(&alpha, &wide(&wanted), 0.25);
+    assert_eq!(wide(&upstream[4 * pixels..]), gradient);
 }
 
 pub fn ratio(device: &Device) {
@@ -165,21 +176,27 @@ pub fn codes(device: &Device) {
 
 pub fn ssim_l1(device: &Device) {
     let sizes = [(13, 7), (70, 18)];
-    for ((w, h), rows) in sizes.into_iter().flat_map(|s| [(s, Rows::Strips), (s, Rows::Shared)]) {
+    let cases = sizes.into_iter().flat_map(|s| [(s, Rows::Strips), (s, Rows::Shared)]);
+    for ((w, h), rows, weighted) in cases.flat_map(|(s, r)| [(s, r, false), (s, r, true)]) {
+        let weight = |i: usize| if weighted { [0.0f32, 1.0, 0.25][(i % w / 4 + i / w / 3) % 3] } else { 1.0 };
+        let weights: Vec<f32> = (0..w * h).map(weight).collect();
+        let covered = weighted.then(|| wide(&weights).iter().sum::<f64>());
         let (x, noise) = (uniform(3 * w * h, 0.0, 1073), uniform(3 * w * h, 0.0, 1074));
         let y: Vec<f32> = x.iter().zip(&noise).map(|(x, n)| 0.7 * x + 0.3 * n).collect();
-        let (expected, gradient) = image_loss::ssim_l1(&wide(&x), &wide(&y), w, h, 0.8, 0.2);
+        let (expected, gradient) =
+            image_loss::ssim_l1_weighted(&wide(&x), &wide(&y), &wide(&weights), w, h, 0.8, 0.2);
         let bands = Bands::whole(w, h);
         let pass = image_loss::SsimL1::with(device, &bands, rows).unwrap();
         let rendered = device.buffer_from("x", &x).unwrap();
-        let target = device.buffer_from("y", &y).unwrap();
+        let stack = if weighted { [&y[..], &weights].concat() } else { y.clone() };
+        let target = device.buffer_from("y", &stack).unwrap();
         let out = device.buffer::<f32>("gradient", 3 * w * h).unwrap();
         let sums = device.buffer::<f32>("loss", 4).unwrap();
         let mut rec = Recorder::new(device, "ssim");
-        pass.record(&mut rec, &bands.get(0), &rendered, &target, &out, [0.8, 0.2], (&sums, 1));
+        pass.record(&mut rec, &bands.get(0), &rendered, &target, &out, covered, [0.8, 0.2], (&sums, 1));
         rec.run().unwrap();
         let sums = sums.read().unwrap();
-        let loss = pass.loss([sums[1], sums[2]].map(f64::from));
+        let loss = pass.loss([sums[1], sums[2]].map(f64::from), covered);
         // Tolerances of src/pass/ssim_l1.rs.
         assert!((loss.l1 - expected.l1).abs() < 1e-5 && (loss.ssim - expected.ssim).abs() < 1e-5);
         let scale = gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));

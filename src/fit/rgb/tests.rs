@@ -1,0 +1,137 @@
+//! Tests of [`super`].
+use super::*;
+use crate::fit::pose::PoseOptions;
+use crate::fit::schedule::Exponential;
+use crate::gpu::test_device;
+use crate::pass::{Renderer, seeded};
+use crate::preset::Preset;
+use crate::scene::{Plane, Pose};
+use glam::DVec3;
+
+fn turned(camera: &Camera, by: DVec3) -> Camera {
+    Camera { pose: Pose::exp(DVec3::ZERO, by).compose(&camera.pose), ..camera.clone() }
+}
+
+/// Splats, and two cameras with photos of them.
+fn scene(device: &Device) -> (Splats, Vec<Camera>, Vec<RgbImage>) {
+    let (splats, camera) = seeded::small(300, 75, 53, 0, 1003);
+    let cameras = vec![camera.clone(), turned(&camera, DVec3::X * 0.01)];
+    let mut renderer = Renderer::new(device, &splats, &[], 0).unwrap();
+    let images = cameras.iter().map(|c| renderer.render(c).unwrap().rgb).collect();
+    (splats, cameras, images)
+}
+
+#[test]
+fn training_goes_on_at_the_full_size_with_the_poses_that_it_found_at_half_of_it() {
+    let device = test_device();
+    let (splats, cameras, images) = scene(&device);
+    let poses = Some(PoseOptions { start: 0, rate: Exponential::constant(1e-3) });
+    let options = RgbOptions { iterations: 10, coarse: 0.5, poses, ..RgbOptions::preset(Preset::Draft) };
+    let scale = SceneScale::measure(&cameras, &splats.means);
+    let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
+    let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
+    let size = |run: &Run| {
+        let frame = run.trainer.parts().raster.frame();
+        [frame.width, frame.height, run.trainer.cameras[1].width]
+    };
+    (0..5).for_each(|iteration| run.step(iteration).unwrap());
+    let found = run.trainer.cameras[1].pose;
+    assert!(size(&run) == [38, 27, 38] && found != cameras[1].pose, "{:?} {found:?}", size(&run));
+    run.schedule(5).unwrap();
+    assert_eq!((size(&run), run.trainer.cameras[1].pose), ([75, 53, 75], found));
+}
+
+#[test]
+fn refined_cameras_that_explain_the_photos_worse_are_not_kept() {
+    let device = test_device();
+    let (splats, cameras, images) = scene(&device);
+    let options = RgbOptions { coarse: 0.0, bounded: false, ..RgbOptions::preset(Preset::Draft) };
+    let scale = SceneScale::measure(&cameras, &splats.means);
+    let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
+    let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
+    // As if training had led the second camera astray.
+    run.trainer.cameras[1] = turned(&cameras[1], DVec3::Y * 0.2);
+    let (_, kept, _, refined) = run.finish().unwrap();
+    assert!(!refined && kept == cameras);
+}
+
+/// The right half of a photo is not used.
+fn left_half(width: usize, height: usize, outside: Outside) -> Coverage {
+    let share = (0..width * height).map(|i| if i % width < width / 2 { 1.0 } else { 0.0 }).collect();
+    Coverage { share: Plane { width, height, data: share }, outside }
+}
+
+#[test]
+fn unused_pixels_have_no_part_in_training() {
+    let device = test_device();
+    let (truth, cameras, images) = scene(&device);
+    let mut start = truth.clone();
+    start.sh.iter_mut().for_each(|v| *v *= 0.5);
+    let coverage: Vec<_> = cameras.iter().map(|_| Some(left_half(75, 53, Outside::Unknown))).collect();
+    let options = RgbOptions {
+        iterations: 12,
+        coarse: 0.5,
+        poses: None,
+        bounded: false,
+        prune_every: 0,
+        ..RgbOptions::preset(Preset::Draft)
+    };
+    let scale = SceneScale::measure(&cameras, &truth.means);
+    let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &coverage };
+    let trained =
+        fit_photos(&device, photos, start.clone(), scale, &options, &crate::progress::Silent).unwrap();
+    // Splats cover a few pixels: far from the middle they are on one side only.
+    let moved = |columns: std::ops::Range<f64>| {
+        let inside = |i: &usize| {
+            let (pixel, z) = cameras[0].project(DVec3::from(truth.means[*i].map(f64::from)));
+            z > 0.0 && columns.contains(&pixel.x) && (0.0..53.0).contains(&pixel.y)
+        };
+        let all: Vec<usize> = (0..start.len()).filter(inside).collect();
+        let changed = |i: &&usize| trained.splats.sh[3 * **i..3 * **i + 3] != start.sh[3 * **i..3 * **i + 3];
+        (all.iter().filter(changed).count(), all.len())
+    };
+    let (left, right) = (moved(0.0..25.0), moved(68.0..75.0));
+    assert!(
+        2 * left.0 > left.1 && right.0 == 0 && right.1 > 5,
+        "moved: {left:?} on the left, {right:?} on the right"
+    );
+    // The figure is that of the pixels that count: it is the same whatever is rendered elsewhere.
+    let half = |c: usize| RgbImage {
+        data: (0..75 * 53).map(|i| if i % 75 < 37 { images[0].data[i] } else { [c as f32; 3] }).collect(),
+        ..images[0].clone()
+    };
+    assert_eq!([photos.psnr(0, &half(0)), photos.psnr(0, &half(1))], [MOST_PSNR; 2]);
+}
+
+#[test]
+fn empty_background_becomes_transparent() {
+    let device = test_device();
+    let (truth, cameras, images) = scene(&device);
+    // Black splats where nothing is: on a black background no colour tells them from nothing.
+    let mut start = truth.clone();
+    let right = |mean: &[f32; 3], camera: &Camera| {
+        let (pixel, _) = camera.project(DVec3::from(mean.map(f64::from)));
+        pixel.x > 0.5 * f64::from(camera.width)
+    };
+    for i in (0..start.len()).filter(|i| right(&truth.means[*i], &cameras[0])) {
+        start.sh[3 * i..3 * i + 3].fill(-0.5 / crate::scene::SH_C0);
+        start.opacity_logits[i] = 2.0;
+    }
+    let coverage: Vec<_> = cameras.iter().map(|_| Some(left_half(75, 53, Outside::Empty))).collect();
+    let images: Vec<RgbImage> =
+        images.iter().zip(&coverage).map(|(i, c)| c.as_ref().unwrap().target(i)).collect();
+    let options = RgbOptions { iterations: 150, poses: None, ..RgbOptions::preset(Preset::Draft) };
+    let scale = SceneScale::measure(&cameras, &truth.means);
+    let alpha_right = |coverage: &[Option<Coverage>]| {
+        let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage };
+        let trained =
+            fit_photos(&device, photos, start.clone(), scale, &options, &crate::progress::Silent).unwrap();
+        let alpha =
+            Renderer::new(&device, &trained.splats, &[], 0).unwrap().render(&cameras[0]).unwrap().alpha;
+        // Away from the border, which splats of the left half reach across.
+        let far: Vec<f32> = (0..75 * 53).filter(|i| i % 75 > 48).map(|i| alpha.data[i]).collect();
+        far.iter().sum::<f32>() / far.len() as f32
+    };
+    let (with, without) = (alpha_right(&coverage), alpha_right(&[]));
+    assert!(with < 0.15 && without > 0.4, "{with} with an empty background, {without} on plain black");
+}

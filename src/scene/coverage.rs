@@ -1,0 +1,135 @@
+//! Which pixels of a photo are used.
+use super::image::{Plane, RgbImage};
+use serde::{Deserialize, Serialize};
+
+/// What the pixels of a photo stand for that are not used.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outside {
+    /// Nobody says what is there: masks. No loss counts them.
+    Unknown,
+    /// Nothing is there: a transparent background. Renders become transparent there.
+    Empty,
+}
+
+/// Which pixels of a photo are used, and what the others are.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Coverage {
+    /// [H, W] share of every working pixel that is used, in [0, 1].
+    pub share: Plane<f32>,
+    /// What the rest is.
+    pub outside: Outside,
+}
+
+impl Coverage {
+    /// A pixel counts for matches, depth and masks where at least half of it is used.
+    pub fn uses(&self, index: usize) -> bool {
+        self.share.data[index] >= 0.5
+    }
+
+    /// [H, W] weight of every pixel in losses: 0 or 1. Emptiness is shown as well as things are; of what is not known even a part
+    /// would count.
+    pub fn weights(&self) -> Plane<f32> {
+        let weight = |share: &f32| match self.outside {
+            Outside::Empty => 1.0,
+            // Averaging leaves a little less than 1 where everything is used.
+            Outside::Unknown => f32::from(u8::from(*share > 0.999)),
+        };
+        Plane { data: self.share.data.iter().map(weight).collect(), ..self.share.clone() }
+    }
+
+    /// What a render is compared with: on black, where nothing is there.
+    pub fn target(&self, image: &RgbImage) -> RgbImage {
+        match self.outside {
+            Outside::Unknown => image.clone(),
+            Outside::Empty => {
+                let data = image.data.iter().zip(&self.share.data).map(|(c, a)| c.map(|v| v * a)).collect();
+                RgbImage { data, ..image.clone() }
+            }
+        }
+    }
+}
+
+impl RgbImage {
+    /// Gives pixels that are not used colours that go on smoothly from the used ones, so that neither filters nor features see an edge:
+    /// means over larger and larger blocks (pull-push, Gortler et al. 1996). Without any used pixel nothing changes.
+    pub fn fill_from_used(&mut self, used: impl Fn(usize) -> bool) {
+        let weights: Vec<bool> = (0..self.width * self.height).map(used).collect();
+        if weights.contains(&true) {
+            fill(self, &weights);
+        }
+    }
+}
+
+fn fill(image: &mut RgbImage, known: &[bool]) {
+    if !known.contains(&false) {
+        return;
+    }
+    let (w, h) = (image.width.div_ceil(2), image.height.div_ceil(2));
+    let mut half = RgbImage { width: w, height: h, data: vec![[0.0; 3]; w * h] };
+    let mut counts = vec![0u32; w * h];
+    for i in (0..image.data.len()).filter(|i| known[*i]) {
+        let block = i / image.width / 2 * w + i % image.width / 2;
+        counts[block] += 1;
+        (0..3).for_each(|c| half.data[block][c] += image.data[i][c]);
+    }
+    for (colour, count) in half.data.iter_mut().zip(&counts) {
+        *colour = colour.map(|v| v / (*count).max(1) as f32);
+    }
+    fill(&mut half, &counts.iter().map(|c| *c > 0).collect::<Vec<_>>());
+    for i in (0..image.data.len()).filter(|i| !known[*i]) {
+        let position = |v: usize| 0.5 * v as f32 - 0.25;
+        image.data[i] = half.bilinear(position(i % image.width), position(i / image.width));
+    }
+}
+
+impl RgbImage {
+    /// Colour between the centres of pixels, whole numbers at the centres.
+    fn bilinear(&self, x: f32, y: f32) -> [f32; 3] {
+        let split = |v: f32, size: usize| {
+            let v = v.clamp(0.0, (size - 1) as f32);
+            (v as usize, (v as usize + 1).min(size - 1), v.fract())
+        };
+        let ((x0, x1, u), (y0, y1, v)) = (split(x, self.width), split(y, self.height));
+        let mix = |a: [f32; 3], b: [f32; 3], t: f32| [0, 1, 2].map(|c| a[c] + t * (b[c] - a[c]));
+        mix(mix(self.at(x0, y0), self.at(x1, y0), u), mix(self.at(x0, y1), self.at(x1, y1), u), v)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn coverage(outside: Outside) -> Coverage {
+        Coverage { share: Plane { width: 3, height: 1, data: vec![0.0, 0.5, 1.0] }, outside }
+    }
+
+    #[test]
+    fn emptiness_counts_and_unknown_does_not() {
+        let image = RgbImage { width: 3, height: 1, data: vec![[0.8; 3]; 3] };
+        let (unknown, empty) = (coverage(Outside::Unknown), coverage(Outside::Empty));
+        assert_eq!((unknown.weights().data, unknown.target(&image)), (vec![0.0, 0.0, 1.0], image.clone()));
+        assert_eq!(empty.weights().data, [1.0; 3]);
+        assert_eq!(empty.target(&image).data, [[0.0; 3], [0.4; 3], [0.8; 3]]);
+        assert_eq!([0, 1, 2].map(|i| empty.uses(i)), [false, true, true]);
+    }
+
+    #[test]
+    fn unused_pixels_go_on_smoothly() {
+        let (w, h) = (40, 30);
+        let data = (0..w * h).map(|i| [if i % w < 20 { 0.2 } else { 0.8 }; 3]).collect();
+        let before = RgbImage { width: w, height: h, data };
+        let mut image = before.clone();
+        // Known on the left and on the right.
+        let used = |i: usize| !(8..32).contains(&(i % w));
+        image.data.iter_mut().enumerate().filter(|(i, _)| !used(*i)).for_each(|(_, c)| *c = [9.0; 3]);
+        image.fill_from_used(used);
+        let row: Vec<f32> = (0..w).map(|x| image.at(x, 15)[0]).collect();
+        assert!((0..w).filter(|x| used(*x)).all(|x| row[x] == before.at(x, 15)[0]));
+        assert!((row[9] - 0.2).abs() < 0.06 && (row[30] - 0.8).abs() < 0.06, "{row:?}");
+        assert!(row.windows(2).all(|p| p[1] >= p[0] - 1e-6 && p[1] - p[0] < 0.16), "no edge: {row:?}");
+        let untouched = image.clone();
+        image.fill_from_used(|_| false);
+        assert_eq!(image, untouched);
+    }
+}
