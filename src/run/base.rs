@@ -203,8 +203,8 @@ impl BaseScene {
 
 /// Side of the pictures that are compared: lens and light, which were taken out of one of them, change little at this size.
 const COMPARED: usize = 24;
-/// Correlation of their brightness from which two photos of one name are one photo. Measured on `breakfast`: the same photo through
-/// a lens and a gain 0.99, neighbours 0.8.
+/// Correlation of their brightness from which two photos of one name are one photo. On `breakfast` a photo and itself through a lens
+/// (k1 −0.12, k2 0.03) and gains of 0.6 to 0.75 reach 0.994, different photos at most 0.51.
 const SAME: f64 = 0.95;
 
 fn likeness(a: &Photo, b: &Photo) -> f64 {
