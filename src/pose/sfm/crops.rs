@@ -10,6 +10,9 @@ const CROP_SIGMA: f64 = 0.2;
 /// σ of its ln f: what the file states is of the whole photo, which may be twice as large.
 const FOCAL_SIGMA: f64 = 0.35;
 
+/// Least offset of the axis of such a photo, as a share of its long side: image stabilisation moves it by up to 0.02.
+const OFF_CENTRE: f64 = 0.05;
+
 /// Which photos are taken for whole.
 #[derive(Clone)]
 struct Guess {
@@ -83,7 +86,9 @@ pub(super) fn explained(best: OpticsFit) -> Result<OpticsFit> {
             }
         }
     }
-    if found.value >= bound || !found.model.has_crops() {
+    let off = |v: usize| found.model.optics[found.model.group[v]].shift.length() / found.model.long_side(v);
+    let cut = (0..views).filter(|v| !guess.whole[*v]);
+    if found.value >= bound || guess.whole.iter().all(|w| *w) || cut.map(off).any(|o| o < OFF_CENTRE) {
         return Ok(best);
     }
     let of_all = fit_optics(&found.model, Freedom::Full, STEPS)?.outcome;

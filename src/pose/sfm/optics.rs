@@ -55,7 +55,8 @@ fn joined(mut best: OpticsFit) -> Result<OpticsFit> {
 pub(super) fn learn_optics(model: &mut Model) -> Result<Adjusted> {
     let apart = model.with_separate_optics();
     // Which of the photos that look alike share a camera is decided once.
-    let decided = model.group != model.alike && apart.as_ref().is_some_and(|a| a.group != model.group);
+    let regrouped = model.group != model.alike && apart.as_ref().is_some_and(|a| a.group != model.group);
+    let decided = model.has_crops() || regrouped;
     let start = if decided { model.clone() } else { model.regrouped(&model.alike) };
     let mut found = best_of(&start, &Freedom::ALL)?;
     if let Some(apart) = apart.filter(|_| !decided) {
