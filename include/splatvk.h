@@ -12,6 +12,8 @@
  * - Texts are UTF-8 and end with a zero byte. Pointers that you give are used during the call only.
  * - Every function may be called from any thread; where it says so, calls with one handle wait for each other. A handle
  *   must not be destroyed while another call with it runs.
+ * - A child process after fork() has none of the threads and no device: there, call nothing but exec functions and _exit.
+ * - Texts that you ask have at most 300 characters and 40 words; other texts and paths have at most 65,536 bytes.
  * - Nothing is thrown or unwound into your code, and nothing may be thrown out of your callbacks.
  * - Vulkan handles are given as void * (VkInstance, VkPhysicalDevice, VkDevice, VkQueue) and uint64_t (VkBuffer, VkImage,
  *   VkSemaphore), so that this header needs no other one.

@@ -1,5 +1,10 @@
 //! The one error type. Every message is a single line that says what is wrong, where, and what to do next.
+mod system;
+
+pub(crate) use system::words;
+
 use std::path::{Path, PathBuf};
+use system::advice;
 
 /// The crate's result.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
@@ -18,7 +23,7 @@ pub enum Error {
     #[error("{0}")]
     Input(String),
     /// A file could not be read, or not written for a reason that only its cause can tell.
-    #[error("{}: {source}{}", path.display(), advice(source))]
+    #[error("{}: {}{}", path.display(), words(source), advice(source))]
     Io {
         /// The file or folder.
         path: PathBuf,
@@ -27,7 +32,7 @@ pub enum Error {
     },
     /// A place cannot take a file: the disk is full, or the folder or file system does not allow it. Nothing half-written
     /// stays there; the same work succeeds once there is space, or in another place.
-    #[error("{}: cannot be written: {source}{}", path.display(), elsewhere(source))]
+    #[error("{}: cannot be written: {}{}", path.display(), words(source), elsewhere(source))]
     Unwritable {
         /// The file or folder.
         path: PathBuf,
@@ -194,18 +199,6 @@ fn after_loss(kept: &Option<String>) -> String {
 fn once_there_is_memory(kept: &Option<String>) -> String {
     let resume = |last| format!("; once there is memory, the same command with --resume goes on from {last}");
     kept.as_ref().map(resume).unwrap_or_default()
-}
-
-/// What the user can do about an I/O error; empty where only its cause can tell.
-fn advice(e: &std::io::Error) -> &'static str {
-    use std::io::ErrorKind as K;
-    match e.kind() {
-        K::StorageFull | K::QuotaExceeded => "; free some space there, or choose a folder on another disk",
-        K::FileTooLarge => "; the file size limit (ulimit -f) is too small for this file",
-        K::PermissionDenied | K::ReadOnlyFilesystem => "; choose a folder that you may write to",
-        K::NotFound | K::NotADirectory | K::IsADirectory => "; check the name",
-        _ => "",
-    }
 }
 
 #[cfg(test)]

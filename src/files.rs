@@ -6,6 +6,7 @@ mod owner;
 mod partial;
 mod place;
 mod replace;
+mod within;
 
 pub(crate) use guard::guarded;
 #[cfg(feature = "capi")]
@@ -20,7 +21,9 @@ pub(crate) use partial::{HIDDEN, leftovers, remove_leftover, remove_unfinished};
 pub(crate) use partial::{Partial, check_free, check_free_inside, is_leftover, restore, sweep};
 pub(crate) use place::{Kind, check_place, check_spared, foreign, listed, next_free};
 pub(crate) use replace::swap;
+pub(crate) use within::within;
 
+use crate::error::words;
 use crate::{Error, Result};
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
@@ -55,7 +58,11 @@ pub(crate) fn most_content(size: usize) -> u64 {
 pub(crate) fn open(path: &Path) -> Result<(File, u64)> {
     let unreadable = |e: std::io::Error| match e.kind() {
         std::io::ErrorKind::NotFound => Error::io(path)(e),
-        _ => Error::input(format!("{}: {e}; check the name and that you may read it", path.display())),
+        _ => Error::input(format!(
+            "{}: {}; check the name and that you may read it",
+            path.display(),
+            words(&e)
+        )),
     };
     let regular = |meta: &std::fs::Metadata| match meta.is_file() {
         true => Ok(meta.len()),

@@ -122,8 +122,9 @@ fn a_size_that_cannot_be_done_is_refused_with_one_that_can() {
 fn views_must_fit_the_photos() {
     let photos = data("breakfast/images");
     run_refuses(&[&photos], &["--views", "5"], &["--views 5", "only 4"]);
-    run_refuses(&[&photos], &["--views", "1"], &["--views 1", "at least 2"]);
-    run_refuses(&[&photos], &["--views", "0"], &["--views 0"]);
+    for views in ["0", "1", "17", "-3", "abc"] {
+        run_refuses(&[&photos], &["--views", views], &[&format!("--views {views}: "), "give 2 to 16"]);
+    }
 }
 
 #[test]
@@ -135,6 +136,82 @@ fn bad_usage_is_exit_code_two() {
     }
     let help = splatvk().arg("--help").output().unwrap();
     assert!(help.status.success() && text(&help.stdout).contains("doctor"));
+}
+
+#[test]
+fn what_was_meant_is_said_in_one_line() {
+    for (args, words) in [
+        (&["rnu"][..], "there is no command rnu; did you mean run?"),
+        (&["run", "x", "--quary", "lemon"], "there is no option --quary; did you mean --query?"),
+        (&["run", "x", "--preset", "drat"], "did you mean draft?"),
+    ] {
+        refuses(splatvk().args(args), 2, &[words, "--help"]);
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn errors_of_the_system_are_words() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::write(at("file"), "x").unwrap();
+    std::os::unix::fs::symlink(at("loop"), at("loop")).unwrap();
+    let long = "n".repeat(300);
+    for (name, words) in [
+        ("none", &["none: ", "does not exist"][..]),
+        ("file/a.ply", &["a.ply: ", "is a file, not a folder"]),
+        ("loop", &["loop: ", "lead in a circle"]),
+        (&long, &["the name is too long"]),
+    ] {
+        let words: Vec<&str> = words.iter().copied().chain(["; "]).collect();
+        for line in [
+            refuses(splatvk().arg("view").arg(at(name)), 2, &[]),
+            refuses(splatvk().arg("run").arg(at(name)).arg("--out").arg(at("o")), 2, &words),
+        ] {
+            let said = text(&line.stderr);
+            assert!(!said.contains("os error"), "{said}");
+        }
+    }
+}
+
+/// Without --out nothing is written: a row per text, or the same answers as JSON.
+#[test]
+fn a_question_without_a_folder_is_answered() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = fixture::view::breakfast(folder.path());
+    let empty = tempfile::tempdir().unwrap();
+    let ask = |more: &[&str]| {
+        let output =
+            splatvk().arg("query").arg(&scene).args(["lemon"]).args(more).current_dir(empty.path()).output();
+        let output = output.unwrap();
+        assert!(output.status.success(), "{}", text(&output.stderr));
+        text(&output.stdout)
+    };
+    let table = ask(&[]);
+    let lines: Vec<&str> = table.lines().collect();
+    assert!(lines.len() == 2 && lines[0].starts_with("text ") && lines[0].ends_with("best view"), "{table}");
+    assert!(lines[1].starts_with("“lemon”  found ") && lines[1].contains("train_0"), "{table}");
+    let report: serde_json::Value = serde_json::from_str(&ask(&["--json"])).unwrap();
+    let view = &report["queries"][0]["views"][0];
+    assert!(report["out"].is_null() && view["found"] == true && view.get("heat").is_none(), "{report}");
+    assert_eq!(names(empty.path()), [""; 0]);
+    let mut force = splatvk();
+    refuses(force.arg("query").arg(&scene).args(["lemon", "--splats"]), 2, &["--out"]);
+    let long = "red ".repeat(50);
+    let mut question = splatvk();
+    refuses(question.arg("query").arg(&scene).arg(&long), 2, &["50 words", "at most 300 characters"]);
+    // Another record of the run would change how it answers: it is not taken for none.
+    std::fs::write(scene.join("run.json"), "{\"config\"").unwrap();
+    let mut damaged = splatvk();
+    refuses(damaged.arg("query").arg(&scene).arg("lemon"), 2, &["run.json", "restore it"]);
+    let mut chosen = splatvk();
+    let chosen = chosen.arg("query").arg(&scene).args(["lemon", "--compat", "none"]).output().unwrap();
+    assert!(chosen.status.success(), "{}", text(&chosen.stderr));
+    std::fs::remove_file(scene.join("run.json")).unwrap();
+    std::fs::remove_file(scene.join("seen.npy")).unwrap_or_default();
+    std::fs::create_dir(scene.join("seen.npy")).unwrap();
+    let mut seen = splatvk();
+    refuses(seen.arg("query").arg(&scene).arg("lemon"), 2, &["seen.npy", "a folder, not a file"]);
 }
 
 #[test]

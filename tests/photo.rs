@@ -144,7 +144,7 @@ fn unusable_sets_are_refused_in_one_line() {
     // As macOS leaves them beside every photo on a memory card.
     std::fs::write(dir.join("._a.jpg"), b"\0\x05\x16\x07").unwrap();
     refuse(&[dir.to_path_buf()], None, &["no photos"]);
-    refuse(&[dir.join("nothing")], None, &["nothing", "No such file"]);
+    refuse(&[dir.join("nothing")], None, &["nothing", "does not exist"]);
     std::fs::write(dir.join("clip.mp4"), b"\0\0\0\x18ftypmp42").unwrap();
     refuse(&[dir.to_path_buf()], None, &["clip.mp4", "video"]);
     refuse(&[dir.join("clip.mp4")], None, &["clip.mp4", "video"]);

@@ -61,6 +61,17 @@ fn only_its_own_page_is_answered() {
     assert_eq!(server.request("GET", "", &format!("Host: localhost:{port}\r\n"), "").0, 200);
     assert_eq!(server.request("GET", "../Cargo.toml", "", "").0, 404);
     assert_eq!(server.request("DELETE", "", "", "").0, 404);
+    // HEAD says what GET would, without the body.
+    for name in ["", "scene.bin", "none"] {
+        let (status, body) = server.request("GET", name, "", "");
+        let reply = server
+            .raw(format!("HEAD {}{name} HTTP/1.1\r\nHost: {}\r\n\r\n", server.base, server.host).as_bytes());
+        let (head, nothing) = reply.split_once("\r\n\r\n").unwrap();
+        assert!(head.starts_with(&format!("HTTP/1.1 {status} ")) && nothing.is_empty(), "{reply}");
+        let length = head.to_lowercase();
+        // Of the scene the body is no text, and its length here is not that of its bytes.
+        assert!(name == "scene.bin" || length.contains(&format!("content-length: {}", body.len())), "{head}");
+    }
     assert_eq!(server.request("POST", "query", "", "lemon").0, 400);
     let (status, body) = server.request("POST", "query", "", "{\"text\": \"unicorn\"}");
     assert!(status == 422 && body.contains("no text embedding for 'unicorn'"), "{status} {body}");
@@ -190,6 +201,40 @@ fn a_thousand_connections_leave_it_answering_and_ending() {
     let (status, took) = server.stop("-TERM");
     assert_eq!(status.code(), Some(0));
     assert!(took < Duration::from_secs(2), "{took:?}");
+}
+
+/// Names in a scene lead to pictures of the scene, and nowhere else.
+#[test]
+fn pictures_outside_of_the_scene_are_not_shown() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = breakfast(folder.path());
+    let shows = || Server::start(&scene).request("GET", "", "", "").1.contains("data:image/jpeg");
+    assert!(shows());
+    let file = scene.join("cameras/transforms.json");
+    let text = std::fs::read_to_string(&file).unwrap();
+    let secret = folder.path().join("secret.png");
+    std::fs::copy(scene.join("cameras/images/train_00.png"), &secret).unwrap();
+    for name in [secret.to_str().unwrap(), "../../secret.png"] {
+        std::fs::write(&file, text.replace("images/train_00.png", name)).unwrap();
+        assert!(!shows(), "{name}");
+    }
+    #[cfg(unix)]
+    {
+        std::os::unix::fs::symlink(&secret, scene.join("cameras/images/link.png")).unwrap();
+        std::fs::write(&file, text.replace("images/train_00.png", "images/link.png")).unwrap();
+        assert!(!shows(), "through a link");
+    }
+}
+
+#[test]
+fn stopping_twice_is_no_failure_either() {
+    let server = Server::start(scene());
+    let id = server.child.id().to_string();
+    let mut server = server;
+    assert!(Command::new("kill").args(["-INT", &id]).status().unwrap().success());
+    // It may have ended by then.
+    let _ = Command::new("kill").args(["-INT", &id]).stderr(Stdio::null()).status();
+    assert_eq!(server.child.wait().unwrap().code(), Some(0));
 }
 
 #[test]

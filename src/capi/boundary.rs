@@ -3,10 +3,15 @@ use super::types::*;
 use crate::files::panic_text;
 use crate::{Error, Result};
 use std::cell::RefCell;
-use std::ffi::{CStr, c_char};
+use std::ffi::c_char;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
+
+/// Most bytes of a text: longer than any path that a system takes. Questions have a limit of their own.
+const MOST_TEXT: usize = 1 << 16;
+/// Most structures of an array: photos, outputs, instances.
+const MOST_STRUCTURES: usize = 1 << 20;
 
 /// What goes wrong in a call.
 pub enum CallError {
@@ -185,6 +190,9 @@ pub unsafe fn read_array<T: Versioned>(pointer: *const T, count: usize) -> Resul
     if count == 0 {
         return Ok(Vec::new());
     }
+    if count > MOST_STRUCTURES {
+        return bad_argument(format!("{count} of {} are too many; at most {MOST_STRUCTURES}", T::NAME));
+    }
     if pointer.is_null() {
         return bad_argument(format!("the pointer to {} is null", T::NAME));
     }
@@ -234,8 +242,13 @@ pub unsafe fn text(pointer: *const c_char, what: &str) -> Result<Option<String>,
     if pointer.is_null() {
         return Ok(None);
     }
-    // SAFETY: a null-terminated text, per the header.
-    match unsafe { CStr::from_ptr(pointer) }.to_str() {
+    // SAFETY: a null-terminated text, per the header: nothing is read behind its end.
+    let Some(length) = (0..=MOST_TEXT).find(|k| unsafe { pointer.add(*k).read() } == 0) else {
+        return bad_argument(format!("{what} has more than {MOST_TEXT} bytes, or no zero byte at its end"));
+    };
+    // SAFETY: so many bytes were read before the zero.
+    let bytes = unsafe { std::slice::from_raw_parts(pointer.cast::<u8>(), length) };
+    match std::str::from_utf8(bytes) {
         Ok(text) => Ok(Some(text.to_owned())),
         Err(_) => bad_argument(format!("{what} is not UTF-8")),
     }
@@ -335,12 +348,32 @@ mod tests {
     }
 
     #[test]
+    fn texts_and_arrays_have_a_bound() {
+        let long = std::ffi::CString::new("a".repeat(MOST_TEXT + 1)).unwrap();
+        let read = |text: &std::ffi::CStr| {
+            // SAFETY: a null-terminated text.
+            unsafe { super::text(text.as_ptr(), "text") }
+        };
+        assert!(matches!(read(&long), Err(CallError::Argument(e)) if e.contains("more than 65536 bytes")));
+        let longest = std::ffi::CString::new("a".repeat(MOST_TEXT)).unwrap();
+        assert_eq!(read(&longest).ok().flatten().map(|t| t.len()), Some(MOST_TEXT));
+        let sync = SvkSync { size: size_of::<SvkSync>(), ..unsafe_zero() };
+        // SAFETY: refused before the array is read.
+        assert!(unsafe { read_array(&raw const sync, usize::MAX) }.is_err());
+    }
+
+    fn unsafe_zero() -> SvkSync {
+        // SAFETY: zero is a value.
+        unsafe { std::mem::zeroed() }
+    }
+
+    #[test]
     fn texts_are_cut_between_characters_and_always_end() {
         let mut room = [1 as c_char; 6];
         // SAFETY: six bytes.
         let needed = unsafe { copy_text("aé€b", room.as_mut_ptr(), 6) };
         // SAFETY: ended by copy_text.
-        let text = unsafe { CStr::from_ptr(room.as_ptr()) }.to_str().unwrap();
+        let text = unsafe { std::ffi::CStr::from_ptr(room.as_ptr()) }.to_str().unwrap();
         assert_eq!((needed, text), (8, "aé"));
     }
 }

@@ -91,9 +91,18 @@ unsafe fn boxed(device: Device, options: &SvkContextOptions) -> Result<*mut SvkC
     Ok(Box::into_raw(Box::new(SvkContext { device, registry, error: LastError::default() })))
 }
 
+/// Drivers know some three hundred extensions.
+const MOST_EXTENSIONS: u32 = 4096;
+
 unsafe fn host_device(given: &SvkVulkanDevice) -> Result<HostDevice, CallError> {
     let mut extensions = Vec::new();
     if given.extension_count > 0 {
+        if given.extension_count > MOST_EXTENSIONS {
+            return bad_argument(format!(
+                "SvkVulkanDevice.extension_count is {}; at most {MOST_EXTENSIONS}",
+                given.extension_count
+            ));
+        }
         if given.extensions.is_null() {
             return bad_argument("SvkVulkanDevice.extensions is null but extension_count is not 0");
         }

@@ -13,8 +13,13 @@ use crate::run::compat::{self, Compat};
 use crate::run::live::LiveScene;
 use crate::run::sources::{self, SourceChoice, SourceKind, choose};
 use crate::run::{self, Method, RunPlan};
-use crate::scene::{Camera, GivenCamera, RgbImage};
+use crate::scene::{Camera, GivenCamera, MAX_PIXELS, RgbImage};
 use std::path::{Path, PathBuf};
+
+/// Most bytes from one row of a photo in memory to the next: a part of an image as wide as any may be given.
+const MOST_ROW_BYTES: u64 = 1 << 32;
+/// Most bytes of a photo's file: an uncompressed one of the most pixels, in 32-bit floats.
+const MOST_ENCODED_BYTES: u64 = 16 * MAX_PIXELS;
 
 /// Trains a scene from 2 to 16 photos. `options` may be NULL. On failure, and when the callback stops it, `*scene` is NULL
 /// and the text is the context's. Thread-safe; several trainings may run on one context, sharing its device.
@@ -119,6 +124,13 @@ unsafe fn single(
         return Ok(photo::load_at(&path, max_size)?);
     }
     if !given.encoded.is_null() {
+        if given.encoded_bytes as u64 > MOST_ENCODED_BYTES {
+            return bad_argument(format!(
+                "{}: a file of {} bytes is too large for a photo; at most {MOST_ENCODED_BYTES}",
+                name.display(),
+                given.encoded_bytes
+            ));
+        }
         // SAFETY: the caller's file of that length.
         let bytes = unsafe { std::slice::from_raw_parts(given.encoded, given.encoded_bytes) };
         return Ok(photo::from_bytes(&name, bytes.to_vec(), max_size)?);
@@ -131,18 +143,28 @@ unsafe fn single(
 
 unsafe fn pixels(given: &SvkPhoto, name: &Path) -> Result<RgbImage, CallError> {
     let (width, height, bytes) = (given.width as usize, given.height as usize, given.pixel_bytes as usize);
-    let row = if given.row_bytes == 0 { width * bytes } else { given.row_bytes };
-    if !(3..=4).contains(&bytes) || width == 0 || height == 0 || row < width * bytes {
-        return bad_argument(format!(
-            "{}: {width} × {height} pixels of {bytes} bytes in rows of {row} bytes make no image",
-            name.display()
+    let named = |what: String| bad_argument(format!("{}: {what}", name.display()));
+    if u64::from(given.width) * u64::from(given.height) > MAX_PIXELS {
+        let most = MAX_PIXELS / 1_000_000;
+        return named(format!("{width} × {height} pixels are too many; at most {most} million"));
+    }
+    let packed = width.saturating_mul(bytes);
+    let row = if given.row_bytes == 0 { packed } else { given.row_bytes };
+    let whole = (3..=4).contains(&bytes) && width > 0 && height > 0;
+    if !whole || row < packed || row as u64 > MOST_ROW_BYTES {
+        return named(format!(
+            "{width} × {height} pixels of {bytes} bytes in rows of {row} bytes make no image"
         ));
     }
+    let length = row.checked_mul(height - 1).and_then(|rows| rows.checked_add(packed));
+    let Some(length) = length.filter(|n| isize::try_from(*n).is_ok()) else {
+        return named(format!("{height} rows of {row} bytes do not fit into memory"));
+    };
     // SAFETY: the last row need not reach to the next one.
-    let all = unsafe { std::slice::from_raw_parts(given.pixels, row * (height - 1) + width * bytes) };
+    let all = unsafe { std::slice::from_raw_parts(given.pixels, length) };
     let level = |v: u8| f32::from(v) / 255.0;
     let pixel = |p: &[u8]| [level(p[0]), level(p[1]), level(p[2])];
-    let data = all.chunks(row).flat_map(|r| r[..width * bytes].chunks_exact(bytes).map(pixel)).collect();
+    let data = all.chunks(row).flat_map(|r| r[..packed].chunks_exact(bytes).map(pixel)).collect();
     Ok(RgbImage { width, height, data })
 }
 
@@ -243,5 +265,32 @@ mod tests {
         let expected = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0], [10.0, 11.0, 12.0]];
         assert_eq!((image.width, image.height), (2, 2));
         assert_eq!(image.data, expected.map(|p| p.map(|v| v / 255.0f32)));
+    }
+
+    #[test]
+    fn sizes_that_are_none_are_refused_unread() {
+        // SAFETY: zero is a value.
+        let none: SvkPhoto = unsafe { std::mem::zeroed() };
+        let byte = 0u8;
+        for (width, height, row_bytes, says) in [
+            (30_000, 30_000, 0, "too many; at most"),
+            (u32::MAX, u32::MAX, 0, "too many; at most"),
+            (u32::MAX, 0, 0, "make no image"),
+            (2, 2, 1 << 62, "make no image"),
+            (2, 2, usize::MAX, "make no image"),
+            (2, 2, 5, "make no image"),
+            (0, 2, 0, "make no image"),
+        ] {
+            let given = SvkPhoto { pixels: &byte, pixel_bytes: 4, width, height, row_bytes, ..none };
+            // SAFETY: refused before the pixels are read.
+            let said = match unsafe { pixels(&given, Path::new("a")) } {
+                Err(CallError::Argument(text)) => text,
+                _ => panic!("{width} {height} {row_bytes}"),
+            };
+            assert!(said.starts_with("a: ") && said.contains(says), "{said}");
+        }
+        let given = SvkPhoto { encoded: &byte, encoded_bytes: usize::MAX, ..none };
+        // SAFETY: as above.
+        assert!(matches!(unsafe { single(&given, None, 0, 64) }, Err(CallError::Argument(_))));
     }
 }

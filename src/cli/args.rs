@@ -6,6 +6,7 @@ use std::path::PathBuf;
 
 mod bench;
 mod experiments;
+mod number;
 mod shared;
 
 pub use super::export::ExportArgs;
@@ -13,7 +14,8 @@ pub use super::measure::MeasureArgs;
 pub use super::run::RunArgs;
 pub use bench::{BenchArgs, BenchPart};
 pub use experiments::{AblateArgs, GenerateArgs, LayoutArg};
-pub use shared::{DeviceArgs, LogFormat, MakingArgs, PresetArg, compats};
+pub use number::whole;
+pub use shared::{DeviceArgs, EXPERTS, LogFormat, MACHINE, MakingArgs, PresetArg, compats};
 
 /// Photos in, a 3D scene that answers text queries out.
 #[derive(Debug, Parser)]
@@ -26,7 +28,7 @@ pub struct Cli {
     #[arg(long, global = true, value_enum, default_value = "text", value_name = "FORMAT")]
     pub log: LogFormat,
     /// What computes the networks, as far as the ONNX Runtime library can; auto: a GPU that answers, or else the CPU
-    #[arg(long, global = true, value_parser = PossibleValuesParser::new(provider::NAMES), value_name = "NAME")]
+    #[arg(long, global = true, value_parser = PossibleValuesParser::new(provider::NAMES), value_name = "NAME", help_heading = MACHINE)]
     pub provider: Option<String>,
 }
 
@@ -118,18 +120,6 @@ pub struct TrainArgs {
     /// How the scene is made
     #[command(flatten)]
     pub making: MakingArgs,
-    /// Optimisation steps, instead of the preset's
-    #[arg(long, value_name = "N")]
-    pub iterations: Option<usize>,
-    /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged [default: 800 on a CPU device, 1600 on a GPU]
-    #[arg(long, value_name = "N")]
-    pub max_size: Option<usize>,
-    /// Seed of everything random
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
-    /// Same bits on every run on one machine: training adds up gradients in a fixed order, about a tenth slower
-    #[arg(long)]
-    pub deterministic: bool,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -196,20 +186,20 @@ pub struct QueryArgs {
     /// What to look for
     #[arg(required = true, value_name = "TEXT")]
     pub texts: Vec<String>,
+    /// Folder for heat maps, masks and answers.json [default: only answers, nothing is written]
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
     /// Views to answer in [default: the scene's own]
     #[arg(long, value_name = "FILE")]
     pub cameras: Option<PathBuf>,
-    /// Folder for heat maps and masks
-    #[arg(long, value_name = "DIR")]
-    pub out: PathBuf,
     /// Write over what is there: ordinary files of the same names
-    #[arg(long)]
+    #[arg(long, requires = "out")]
     pub force: bool,
     /// Also write the splats that each text means, as TEXT/splats.ply
-    #[arg(long)]
+    #[arg(long, requires = "out")]
     pub splats: bool,
     /// Choose level, mask and location as others do [default: as the scene was made]
-    #[arg(long, value_parser = compats(), value_name = "WHOSE")]
+    #[arg(long, value_parser = compats(), value_name = "WHOSE", help_heading = EXPERTS)]
     pub compat: Option<String>,
     /// Device and models
     #[command(flatten)]
@@ -222,7 +212,7 @@ pub struct ViewArgs {
     /// Scene directory, or a file of Gaussians (.ply, .splat, .spz, .glb, .gltf)
     pub scene: PathBuf,
     /// Port on 127.0.0.1; 0 takes a free one
-    #[arg(long, default_value_t = 0, value_name = "N")]
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u16>(0..=65_535))]
     pub port: u16,
     /// Device and models
     #[command(flatten)]
@@ -368,15 +358,4 @@ pub struct ManualsArgs {
     /// Write over what is there: ordinary files of the same names
     #[arg(long)]
     pub force: bool,
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use clap::CommandFactory;
-
-    #[test]
-    fn the_definitions_are_consistent() {
-        Cli::command().debug_assert();
-    }
 }

@@ -30,7 +30,7 @@ pub struct ExportArgs {
     #[arg(long)]
     pub force: bool,
     /// ply: spherical-harmonics degree of the file, padded with zeros; most viewers ask for 3
-    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(0..=3), value_name = "0-3")]
+    #[arg(long, default_value_t = 3, value_parser = super::args::whole::<u32>(0..=3), value_name = "0-3")]
     pub ply_degree: u32,
     /// spz: version of the file; 3 is read by most programs, 4 by the newest ones only
     #[arg(long, value_parser = clap::value_parser!(u32).range(2..=4), value_name = "2-4")]

@@ -1,27 +1,7 @@
 //! Text as it may go to a terminal.
+pub(super) use crate::report::one_line;
+use crate::report::visible;
 use std::borrow::Cow;
-
-/// Most characters of an error, warning or message. Longer ones keep their beginning and their end, where the advice is.
-const LONGEST: usize = 1000;
-/// Characters that a longer one keeps of its end.
-const END: usize = 300;
-
-/// One line of bounded length without control characters: messages quote names and texts of files, which may hold anything.
-pub(super) fn one_line(message: &str) -> String {
-    let mut line = String::with_capacity(message.len().min(4 * LONGEST));
-    let mut count = 0;
-    for word in message.split_whitespace() {
-        for c in (count > 0).then_some(' ').into_iter().chain(word.chars()) {
-            count += 1;
-            line.push(visible(c));
-        }
-    }
-    if count <= LONGEST {
-        return line;
-    }
-    let at = |n: usize| line.char_indices().nth(n).map_or(line.len(), |(at, _)| at);
-    format!("{}…{}", &line[..at(LONGEST - END - 1)], &line[at(count - END)..])
-}
 
 /// Text of several lines without control characters.
 pub(super) fn lines(text: &str) -> Cow<'_, str> {
@@ -31,27 +11,12 @@ pub(super) fn lines(text: &str) -> Cow<'_, str> {
     }
 }
 
-/// The character, or a sign in its place: terminals obey control characters, and marks of direction turn text round.
-fn visible(c: char) -> char {
-    let turns = matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
-    if c.is_control() || turns { '\u{fffd}' } else { c }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn a_line_is_short_and_has_no_control_characters() {
-        assert_eq!(one_line("a  b\n c"), "a b c");
-        assert_eq!(
-            one_line("\u{1b}[31mred\u{7}\u{9b}2J \u{202e}x"),
-            "\u{fffd}[31mred\u{fffd}\u{fffd}2J \u{fffd}x"
-        );
-        let long = one_line(&format!("{}: start {} what to do", "ä".repeat(5_000_000), "x".repeat(9)));
-        assert_eq!(long.chars().count(), LONGEST);
-        assert!(long.starts_with("ää") && long.contains('…') && long.ends_with("what to do"), "{long}");
-        assert_eq!(one_line(&"y".repeat(LONGEST)).len(), LONGEST);
+    fn lines_have_no_control_characters() {
         assert_eq!(lines("a\nb"), "a\nb");
         assert_eq!(lines("a\n\u{1b}b"), "a\n\u{fffd}b");
     }

@@ -8,6 +8,7 @@ mod eval;
 mod export;
 mod fetch;
 mod generate;
+mod kept;
 mod line;
 mod measure;
 mod models;
@@ -22,22 +23,20 @@ mod scene;
 mod serve;
 mod shell;
 mod train;
+mod usage;
 mod view;
 mod views;
 
 use crate::{Result, gpu};
-use args::{Cli, Command};
-use clap::Parser;
-use clap::error::ErrorKind;
-use line::one_line;
+use args::Command;
 use std::process::ExitCode;
 
 /// Runs the command line of this process: one error line at most, and an exit code that says what kind it was
 /// ([`Error::exit_code`]).
 pub fn main() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let cli = match usage::parse() {
         Ok(cli) => cli,
-        Err(error) => return print_usage_error(&error),
+        Err(code) => return code,
     };
     progress::set_format(cli.log);
     progress::stop_on_signal();
@@ -77,23 +76,4 @@ fn execute(command: Command) -> Result<()> {
         Command::Completions(args) => shell::completions(&args),
         Command::Manuals(args) => shell::manuals(&args),
     }
-}
-
-/// Help and version go to standard output; what cannot be parsed is one line like every other error, exit code 2.
-fn print_usage_error(error: &clap::Error) -> ExitCode {
-    let help = matches!(
-        error.kind(),
-        ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand | ErrorKind::MissingSubcommand
-    );
-    let asked = matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
-    if asked || help {
-        // A closed pipe while printing help is the reader's choice, not a failure.
-        let _ = error.print();
-        return if asked { ExitCode::SUCCESS } else { ExitCode::from(2) };
-    }
-    // The message may go on over several lines, to list what is missing, before the usage.
-    let text = error.to_string();
-    let message = text.split("\n\n").next().unwrap_or(&text);
-    eprintln!("splatvk: {}; see splatvk --help", one_line(message.trim_start_matches("error: ")));
-    ExitCode::from(2)
 }

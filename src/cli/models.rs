@@ -3,7 +3,7 @@ use super::args::{ModelsAction, ModelsArgs};
 use super::fetch::fetch;
 use super::print::{print, print_json};
 use crate::infer::check::{Measured, check};
-use crate::infer::installed::{CatalogueEntry, HashedFile, Installed, Inventory, catalogue, inventory};
+use crate::infer::installed::{CatalogueEntry, Installed, Inventory, catalogue, inventory};
 use crate::infer::{ModelStatus, Registry};
 use crate::{Error, Result};
 use serde_json::json;
@@ -68,6 +68,7 @@ fn list(registry: &Registry, found: &Inventory, as_json: bool) -> Result<()> {
             let _ = writeln!(text, "  → {why}");
         });
     }
+    text.push_str("\nsplatvk models list --json also has the checksums\n");
     print(&text)
 }
 
@@ -78,7 +79,6 @@ fn built_in(text: &mut String, m: &ModelStatus) {
     // Writing to a String cannot fail.
     let _ =
         writeln!(text, "{kind:<10} {:<40} {state:<9} {size:7.1} MB  {:<28} {}", m.name, m.licence, m.source);
-    let _ = writeln!(text, "{:10} sha256 {}", "", m.sha256);
     if let Some(fix) = &m.fix {
         let _ = writeln!(text, "{:10} → {fix}", "");
     }
@@ -115,10 +115,6 @@ fn installed(text: &mut String, m: &Installed) {
             "",
             graph.path.display()
         );
-        for HashedFile { path: file, sha256: pinned } in &graph.pinned {
-            let name = file.file_name().unwrap_or_default().to_string_lossy();
-            let _ = writeln!(text, "{:10}   sha256 {pinned} pinned for {name}", "");
-        }
     }
     unused(text, m);
 }

@@ -2,6 +2,7 @@
 use super::line::lines;
 use crate::{Error, Result};
 use std::io::Write;
+use std::path::Path;
 
 /// Prints text for people to standard output, without control characters.
 pub(super) fn print(text: &str) -> Result<()> {
@@ -23,10 +24,37 @@ pub(super) fn print_json(value: &serde_json::Value) -> Result<()> {
     put(&format!("{value}\n"))
 }
 
+/// The lines that one copies after a scene was made: where its report is, and the command that shows it.
+pub(super) fn ending(scene: &Path) -> String {
+    let report = scene.join("report.html");
+    format!("report: {}\nlook at it: splatvk view {}\n", report.display(), quoted(scene))
+}
+
+/// A path as a shell takes it.
+fn quoted(path: &Path) -> String {
+    let text = path.display().to_string();
+    let plain = |c: char| c.is_alphanumeric() || "/._-+,:@%".contains(c);
+    if text.chars().all(plain) { text } else { format!("'{}'", text.replace('\'', "'\\''")) }
+}
+
 /// Names the files that a command wrote.
 pub(super) fn listing(files: &[std::path::PathBuf], as_json: bool) -> Result<()> {
     if as_json {
         return print_json(&serde_json::json!({ "files": files }));
     }
     print(&files.iter().map(|f| format!("{}\n", f.display())).collect::<String>())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_copied_suits_a_shell() {
+        assert_eq!(
+            ending(Path::new("out/tree")),
+            "report: out/tree/report.html\nlook at it: splatvk view out/tree\n"
+        );
+        assert!(ending(Path::new("it's a tree")).ends_with("view 'it'\\''s a tree'\n"));
+    }
 }

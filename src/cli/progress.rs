@@ -4,7 +4,7 @@ use super::args::LogFormat;
 use super::line::one_line;
 use crate::Error;
 use crate::progress::Progress;
-use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use indicatif::{HumanDuration, MultiProgress, ProgressBar, ProgressState, ProgressStyle};
 use serde_json::{Value, json};
 use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -182,12 +182,23 @@ pub fn stop_on_signal() {
     }
 }
 
+/// Whether the process does what only ends by being stopped.
+static SERVES: AtomicBool = AtomicBool::new(false);
+
+/// From now on a stop ends the process with 0 and without a word.
+pub fn stopping_is_no_failure() {
+    SERVES.store(true, Ordering::SeqCst);
+}
+
 /// Ends the process as [`Error::Cancelled`] does, whatever its threads are doing.
 fn end() -> ! {
     let nothing = crate::files::remove_unfinished();
     let kept = "stopped; what was finished is kept".to_owned();
-    let code = Error::Cancelled.exit_code();
-    print_error(&if nothing { Error::Cancelled.to_string() } else { kept }, code);
+    let serves = SERVES.load(Ordering::SeqCst);
+    let code = if serves { 0 } else { Error::Cancelled.exit_code() };
+    if !serves {
+        print_error(&if nothing { Error::Cancelled.to_string() } else { kept }, code);
+    }
     // Exit handlers would take apart the libraries that those threads are in.
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     // SAFETY: ends the process; nothing of it is used afterwards.
@@ -212,6 +223,13 @@ fn print(line: &str) {
     }
 }
 
+/// The time left, once a step says how long one takes: before, the bar knows none.
+fn time_left(state: &ProgressState, text: &mut dyn std::fmt::Write) {
+    if state.pos() > 0 {
+        let _ = write!(text, "{:#} left", HumanDuration(state.eta()));
+    }
+}
+
 /// The command line's [`Progress`] for people: bars when standard error is a terminal, lines otherwise.
 #[derive(Default)]
 struct Terminal {
@@ -225,10 +243,8 @@ impl Progress for Terminal {
             Some(bars) => bars.add(ProgressBar::new(steps)),
             None => ProgressBar::hidden(),
         };
-        if let Ok(style) =
-            ProgressStyle::with_template("{msg:>12} {wide_bar} {pos}/{len} {prefix} {eta} left")
-        {
-            bar.set_style(style);
+        if let Ok(style) = ProgressStyle::with_template("{msg:>12} {wide_bar} {pos}/{len} {prefix} {left}") {
+            bar.set_style(style.with_key("left", time_left));
         }
         bar.set_message(stage);
         bar.tick();

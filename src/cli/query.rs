@@ -1,5 +1,6 @@
 //! `splatvk query`
 use super::args::QueryArgs;
+use super::line::one_line;
 use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
 use super::progress;
@@ -10,6 +11,8 @@ use crate::format::{picture, write_json};
 use crate::gpu::Device;
 use crate::query::QueryResult;
 use crate::query::instances::Instance;
+use crate::query::phrasing;
+use crate::query::presence::Presence;
 use crate::report::{colour, file_name};
 use crate::run::Compat;
 use crate::run::answer::{self, Answers};
@@ -21,6 +24,7 @@ use crate::{Error, Result};
 use glam::DVec2;
 use serde_json::{Value, json};
 use std::fmt::Write;
+use std::path::Path;
 use std::time::Instant;
 
 /// Cameras whose frames are kept at a time.
@@ -29,7 +33,8 @@ const AT_ONCE: usize = 16;
 pub fn query(args: &QueryArgs) -> Result<()> {
     let inputs = [Some(args.scene.as_path()), args.cameras.as_deref()];
     let inputs: Vec<_> = inputs.into_iter().flatten().collect();
-    let mut out = WrittenFiles::open(&args.out, args.force, &inputs)?;
+    let open = |folder| WrittenFiles::open(folder, args.force, &inputs);
+    let mut out = args.out.as_deref().map(open).transpose()?;
     let mut scene = scene::load(&args.scene)?;
     let no_language = || {
         Error::input(format!(
@@ -53,10 +58,8 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let stems = views::stems(&cameras)?;
     let folders: Vec<String> = args.texts.iter().map(|t| file_name(t)).collect();
     for (i, folder) in folders.iter().enumerate() {
-        if args.texts[i].trim().is_empty() {
-            return Err(Error::input("an empty query; give a few words"));
-        }
-        if folders[..i].contains(folder) {
+        phrasing::check(&args.texts[i])?;
+        if args.out.is_some() && folders[..i].contains(folder) {
             return Err(Error::input(format!(
                 "\"{}\" is asked twice (its files would be the same); ask once",
                 args.texts[i]
@@ -83,9 +86,11 @@ pub fn query(args: &QueryArgs) -> Result<()> {
             for (((frame, stem), camera), answer) in
                 ready.frames().iter().zip(stems).zip(cameras).zip(&answers.views)
             {
-                write(&mut out, stem, folder, &frame.rendered.rgb, answer)?;
                 let place = place(frame, camera, answer, &scene.world);
-                let mut view = to_json(stem, folder, answer, &place);
+                let mut view = to_json(stem, answer, &place);
+                if let Some(out) = &mut out {
+                    write(out, stem, folder, &frame.rendered.rgb, answer, &mut view)?;
+                }
                 view["reliability"] = answers.view_reliability[asked.views.len() - before].into();
                 asked.views.push(view);
             }
@@ -100,7 +105,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         let mut entry = answers.record(&stems, &scene.world);
         (entry["milliseconds"], entry["views"]) = (asked.milliseconds.into(), asked.views.clone().into());
         entry["embedded_by"] = json!(ready.encoder().embedded_by(&answers.text));
-        if args.splats {
+        if let Some(out) = out.as_mut().filter(|_| args.splats) {
             let (chosen, name) = (&answers.selection, format!("{folder}/splats.ply"));
             let carrier = ready.field().levels[chosen.level].carrier(&scene.splats);
             let splats = carrier.picked(&chosen.splats);
@@ -113,9 +118,15 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     }
     ready.encoder().doubt().iter().for_each(|doubt| progress.warn(doubt));
     let report = json!({ "scene": args.scene, "out": args.out, "world": scene.world, "queries": queries });
-    write_json(&out.file("answers.json")?, &report)?;
-    out.keep()?;
-    if args.device.json { print_json(&report) } else { print(&table(&asked, &stems, args)) }
+    if let Some(mut out) = out {
+        write_json(&out.file("answers.json")?, &report)?;
+        out.keep()?;
+    }
+    match (args.device.json, &args.out) {
+        (true, _) => print_json(&report),
+        (false, Some(folder)) => print(&table(&asked, &stems, folder)),
+        (false, None) => print(&short_table(&asked)),
+    }
 }
 
 /// One text, asked of all cameras part by part.
@@ -141,14 +152,19 @@ impl Asked {
     }
 }
 
+/// Writes the files of an answer in a view, and names them in its record.
 fn write(
     out: &mut WrittenFiles,
     stem: &str,
     folder: &str,
     picture: &RgbImage,
     a: &QueryResult,
+    view: &mut Value,
 ) -> Result<()> {
     let name = |kind: &str| format!("{folder}/{stem}_{kind}");
+    for (key, kind) in [("heat", "heat.png"), ("mask", "mask.png"), ("relevancy", "relevancy.npy")] {
+        view[key] = name(kind).into();
+    }
     let heat = colour::heat_image(picture, &a.relevancy, Some(&a.mask));
     picture::write_png(&out.file(&name("heat.png"))?, &heat)?;
     picture::write_mask_png(&out.file(&name("mask.png"))?, &a.mask)?;
@@ -169,19 +185,61 @@ fn place(frame: &DecodedFrame, camera: &Camera, a: &QueryResult, world: &World) 
     json!({ "position": at.to_array(), "distance": distance, "distance_metres": metres })
 }
 
-fn to_json(stem: &str, folder: &str, a: &QueryResult, place: &Value) -> Value {
+fn to_json(stem: &str, a: &QueryResult, place: &Value) -> Value {
     json!({
         "place": place,
         "view": stem, "found": a.found, "score": a.score, "level": LEVEL_NAMES[a.level],
         // Pixel position of the most relevant pixel's centre; the first pixel's is (0.5, 0.5).
         "location": [a.location.0 as f64 + 0.5, a.location.1 as f64 + 0.5],
         "mask_pixels": a.mask.data.iter().filter(|m| **m).count(),
-        "heat": format!("{folder}/{stem}_heat.png"), "mask": format!("{folder}/{stem}_mask.png"),
-        "relevancy": format!("{folder}/{stem}_relevancy.npy"),
     })
 }
 
-fn table(asked: &[Asked], stems: &[String], args: &QueryArgs) -> String {
+/// A row per text: whether it is there, how sure that is, where, and the view that shows it best.
+fn short_table(asked: &[Asked]) -> String {
+    let mut rows = vec![["text", "answer", "p", "place (x, y, z)", "best view"].map(str::to_owned)];
+    let mut notes = Vec::new();
+    for asked in asked {
+        let Some(answers) = &asked.answers else { continue };
+        let text = format!("“{}”", one_line(&answers.text));
+        notes.extend(answers.reading.notes().iter().map(|note| format!("{text}: {}\n", one_line(note))));
+        let place = answers.instances.first().map(|i| i.centre.to_array().map(|v| format!("{v:.3}")));
+        let absent = answers.presence == Some(Presence::Absent);
+        let score = |v: &&Value| v["score"].as_f64().unwrap_or(0.0);
+        let best = asked.views.iter().filter(|v| v["found"] == true);
+        let best = best.max_by(|a, b| score(a).total_cmp(&score(b))).filter(|_| !absent);
+        rows.push([
+            text,
+            match answers.presence {
+                Some(Presence::Absent) => "not in this scene".to_owned(),
+                Some(Presence::Unsure) => "unsure".to_owned(),
+                Some(Presence::Found) | None if best.is_none() => "not found".to_owned(),
+                Some(Presence::Found) | None => "found".to_owned(),
+            },
+            answers.p_value.map_or("-".to_owned(), |p| format!("{p:.3}")),
+            place.map_or("-".to_owned(), |p| p.join(", ")),
+            best.map_or("-".to_owned(), |v| {
+                format!("{} ({:.2})", v["view"].as_str().unwrap_or(""), score(&v))
+            }),
+        ]);
+    }
+    columns(&rows) + &notes.concat()
+}
+
+/// Rows with their cells below each other.
+fn columns(rows: &[[String; 5]]) -> String {
+    let wide = |column: usize| rows.iter().map(|r| r[column].chars().count()).max().unwrap_or(0);
+    let mut text = String::new();
+    for row in rows {
+        let cells = row.iter().enumerate().map(|(k, cell)| format!("{cell:<wide$}", wide = wide(k)));
+        text += cells.collect::<Vec<_>>().join("  ").trim_end();
+        text.push('\n');
+    }
+    text
+}
+
+/// What stands in the folder of the answers.
+fn table(asked: &[Asked], stems: &[String], folder: &Path) -> String {
     let mut text = String::new();
     // Writing to a String cannot fail.
     for asked in asked {
@@ -189,8 +247,8 @@ fn table(asked: &[Asked], stems: &[String], args: &QueryArgs) -> String {
         let found = asked.views.iter().filter(|v| v["found"] == true).count();
         let verdict = answer::verdict(answers.presence, found, asked.views.len());
         let notes: String = answers.reading.notes().iter().map(|note| format!("; {note}")).collect();
-        let _ =
-            writeln!(text, "“{}”: {verdict}{notes}; answered in {:.0} ms", answers.text, asked.milliseconds);
+        let asked_for = one_line(&format!("“{}”: {verdict}{notes}", answers.text));
+        let _ = writeln!(text, "{asked_for}; answered in {:.0} ms", asked.milliseconds);
         for v in &asked.views {
             let verdict = if v["found"] == true { "" } else { "  not found" };
             let _ = writeln!(
@@ -207,7 +265,7 @@ fn table(asked: &[Asked], stems: &[String], args: &QueryArgs) -> String {
             let _ = writeln!(text, "{}", instance_line(n + 1, instance, stems));
         }
     }
-    let _ = writeln!(text, "heat maps and masks are in {}", args.out.display());
+    let _ = writeln!(text, "heat maps and masks are in {}", folder.display());
     text
 }
 

@@ -1,11 +1,14 @@
 //! `splatvk run`
-use super::args::{DeviceArgs, MakingArgs, compats};
+use super::args::{DeviceArgs, EXPERTS, MakingArgs, compats, whole};
+use super::kept::tell_of_kept_stages;
 use super::plan;
-use super::print::{print, print_json};
+use super::print::{ending, print, print_json};
 use super::progress;
 use crate::infer::installed::{Inventory, inventory};
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;
+use crate::photo::MAX_VIEWS;
+use crate::query::phrasing;
 use crate::run::base::Settings;
 use crate::run::compat::{self, Compat};
 use crate::run::method::{METHODS, SPARSELGS};
@@ -25,75 +28,70 @@ pub struct RunArgs {
     /// Photos, folders of photos (JPEG, PNG, HEIC, AVIF, WebP, TIFF, EXR, HDR), or a video
     #[arg(required = true, value_name = "INPUT")]
     pub inputs: Vec<PathBuf>,
+    /// Scene directory to write [default: out/NAME, after the input]
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Ask the finished scene; may be repeated
+    #[arg(long = "query", value_name = "TEXT")]
+    pub queries: Vec<String>,
+    /// How many photos to use: sharp ones that overlap, from different places [default: all, at most 4]
+    #[arg(long, value_name = "N", value_parser = views())]
+    pub views: Option<usize>,
     /// Add the photos to this scene, made by run, instead of making one of their own; without --out, the larger scene stands beside it
     /// under the next number, and the old one stays
     #[arg(long, value_name = "SCENE", conflicts_with_all = ["views", "init", "depth_prior", "method", "feature_dim", "per_level", "compat"])]
     pub add: Option<PathBuf>,
-    /// How many photos to use: sharp ones that overlap, from different places [default: all, at most 4]
-    #[arg(long, value_name = "N")]
-    pub views: Option<usize>,
-    /// Scene directory to write [default: out/NAME, after the input]
-    #[arg(long, value_name = "DIR")]
-    pub out: Option<PathBuf>,
     /// How the scene is made
     #[command(flatten)]
     pub making: MakingArgs,
     /// Source of cameras, depth and points
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<GeometrySources>())]
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<GeometrySources>(), help_heading = SOURCES)]
     pub init: String,
     /// Source of depth where photos cannot be matched
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<DepthSources>())]
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<DepthSources>(), help_heading = SOURCES)]
     pub depth_prior: String,
     /// Source of dense matches
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<MatchSources>())]
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<MatchSources>(), help_heading = SOURCES)]
     pub matcher: String,
     /// Source of masks
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<MaskSources>())]
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<MaskSources>(), help_heading = SOURCES)]
     pub masks: String,
+    /// Source of features
+    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<FeatureSources>(), help_heading = SOURCES)]
+    pub features: String,
     /// Points along each side of a photo at which a mask network is asked
-    #[arg(long, default_value_t = 32, value_name = "N")]
+    #[arg(long, default_value_t = 32, value_name = "N", value_parser = whole::<usize>(1..=128), help_heading = SOURCES)]
     pub mask_points: usize,
     /// Do not ask the mask network about four overlapping crops as well: five times faster, misses small things
-    #[arg(long)]
+    #[arg(long, help_heading = SOURCES)]
     pub no_mask_crops: bool,
-    /// Source of features
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<FeatureSources>())]
-    pub features: String,
-    /// Ask the finished scene; may be repeated
-    #[arg(long = "query", value_name = "TEXT")]
-    pub queries: Vec<String>,
-    /// Seed of everything random
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
-    /// Same bits on every run on one machine: training adds up gradients in a fixed order, about a tenth slower
-    #[arg(long)]
-    pub deterministic: bool,
-    /// Optimisation steps of the colour stage, instead of the preset's
-    #[arg(long, value_name = "N")]
-    pub iterations: Option<usize>,
     /// Optimisation steps of the language stage, instead of the preset's
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..), help_heading = EXPERTS)]
     pub language_iterations: Option<usize>,
     /// Length of the codes that splats carry: 3, 8 or 16 [default: 16; --compat and langsplat 3, legaussians 8]
-    #[arg(long, value_name = "D")]
+    #[arg(long, value_name = "D", value_parser = whole::<usize>(3..=16), help_heading = EXPERTS)]
     pub feature_dim: Option<usize>,
     /// How language gets onto the splats: this program's ways, or a baseline on the same geometry to compare with [default: lift;
     /// sparselgs with --preset paper, --language-iterations, --per-level or --compat]
-    #[arg(long, value_parser = methods(), value_name = "METHOD")]
+    #[arg(long, value_parser = methods(), value_name = "METHOD", help_heading = EXPERTS)]
     pub method: Option<String>,
     /// One model per level as in the paper, instead of one geometry for all three
-    #[arg(long)]
+    #[arg(long, help_heading = EXPERTS)]
     pub per_level: bool,
     /// Do what can be done in several ways as the paper, its authors' code or LangSplat: area score and conditions of the alignment,
     /// order of masks, one model per level, 3 numbers per code, level and mask of answers
-    #[arg(long, value_parser = compats(), value_name = "WHOSE")]
+    #[arg(long, value_parser = compats(), value_name = "WHOSE", help_heading = EXPERTS)]
     pub compat: Option<String>,
-    /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged [default: 800 on a CPU device, 1600 on a GPU]
-    #[arg(long, value_name = "N")]
-    pub max_size: Option<usize>,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
+}
+
+/// Heading of the options that say where the parts of a scene come from.
+const SOURCES: &str = "Sources and networks";
+
+fn views() -> impl Fn(&str) -> std::result::Result<usize, String> + Clone + Send + Sync {
+    whole(2..=MAX_VIEWS as u64)
 }
 
 fn methods() -> PossibleValuesParser {
@@ -106,12 +104,16 @@ pub fn run(args: &RunArgs) -> Result<()> {
         Some(scene) => joining(args, scene, &installed)?,
         None => plan(args, &installed)?,
     };
-    let outcome = crate::run::run(&plan, progress::reporter().as_ref())?;
+    let progress = progress::reporter();
+    let outcome = crate::run::run(&plan, progress.as_ref())?;
     if args.device.json {
         let record = serde_json::to_value(crate::run::run_record(&outcome));
-        return print_json(&record.map_err(|e| Error::work(format!("run record: {e}")))?);
+        print_json(&record.map_err(|e| Error::work(format!("run record: {e}")))?)?;
+    } else {
+        print(&(crate::run::closing_table(&outcome) + &ending(&outcome.plan.out)))?;
     }
-    print(&crate::run::closing_table(&outcome))
+    tell_of_kept_stages(progress.as_ref());
+    Ok(())
 }
 
 /// What the arguments mean: defaults resolved, names understood, contradictions refused; `auto` is the best of `installed`, or
@@ -134,18 +136,8 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
             "--feature-dim {feature_dim}: the autoencoder of --method langsplat has 3 dimensions; leave it out"
         )));
     }
-    for (flag, value) in
-        [("--iterations", args.iterations), ("--language-iterations", args.language_iterations)]
-    {
-        if value == Some(0) {
-            return Err(Error::input(format!("{flag} 0: give at least 1, or leave it out")));
-        }
-    }
-    if args.mask_points == 0 || args.mask_points > 128 {
-        return Err(Error::input(format!("--mask-points {}: give 1 to 128", args.mask_points)));
-    }
-    if let Some(blank) = args.queries.iter().find(|q| q.trim().is_empty()) {
-        return Err(Error::input(format!("--query \"{blank}\": give a few words")));
+    for text in &args.queries {
+        phrasing::check(text).map_err(|e| Error::input(format!("--query: {e}")))?;
     }
     let init = choose::<GeometrySources>(&args.init, installed)?;
     // A network that gives depth itself needs none suggested.
@@ -171,17 +163,17 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         sam: SamOptions { points: args.mask_points, crops: !args.no_mask_crops, ..SamOptions::default() },
         features: choose::<FeatureSources>(&args.features, installed)?,
         queries: args.queries.clone(),
-        seed: args.seed,
-        iterations: args.iterations,
+        seed: args.making.seed,
+        iterations: args.making.iterations,
         language_iterations: args.language_iterations,
         sh_degree: args.making.sh_degree,
         method: Some(method),
         feature_dim,
         per_level,
         compat: None,
-        max_size: plan::max_size(args.max_size)?,
+        max_size: args.making.max_size,
         device: args.device.device.clone(),
-        deterministic: args.deterministic,
+        deterministic: args.making.deterministic,
         cameras: Vec::new(),
         models: args.device.models.clone(),
         provider: args.device.provider.clone(),
@@ -366,8 +358,6 @@ mod tests {
         for (extra, says) in [
             (["--init", "colmap"], "auto, sfm, cameras:FILE, mast3r, dust3r"),
             (["--masks", "clip"], "auto, graph, dir:DIR, sam"),
-            (["--mask-points", "0"], "1 to 128"),
-            (["--max-size", "63"], "at least 64 pixels"),
             (["--masks", "dir:nowhere"], "does not exist"),
             (["--features", "sam"], "auto, words, dir:DIR, clip"),
             (["--matcher", "sift"], "auto, xfeat, mast3r, roma"),

@@ -2,6 +2,7 @@
 //!
 //! It takes what any process of this machine may send: other pages of the same browser, other users, requests that never end.
 //! All connections share one thread that waits for none of them, so that no one holds up another.
+use crate::error::words;
 use crate::{Error, Result};
 use http_body_util::{BodyExt, Full, LengthLimitError, Limited};
 use hyper::body::{Body, Bytes, Incoming};
@@ -76,7 +77,8 @@ impl Place {
     /// Takes a port of 127.0.0.1, which no other machine can reach; 0 = a free one.
     pub fn take(port: u16) -> Result<Place> {
         let refused = |e: std::io::Error| {
-            Error::input(format!("--port {port}: {e}; give another, or leave it out to take a free one"))
+            let why = words(&e);
+            Error::input(format!("--port {port}: {why}; give another, or leave it out to take a free one"))
         };
         let listener = TcpListener::bind(SocketAddrV4::new(Ipv4Addr::LOCALHOST, port)).map_err(refused)?;
         listener.set_nonblocking(true).map_err(refused)?;
@@ -95,7 +97,7 @@ impl Place {
 /// Serves in a thread of its own until the process ends; questions come out of what is returned, one after the other.
 pub fn serve(place: Place, site: Site) -> Result<Receiver<Question>> {
     let (questions, asked) = sync_channel(MAX_WAITING);
-    let failed = |e: std::io::Error| Error::work(format!("the server cannot start: {e}"));
+    let failed = |e: std::io::Error| Error::work(format!("the server cannot start: {}", words(&e)));
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(failed)?;
     let Place { listener, port, secret } = place;
     let shared = Arc::new(Shared {
@@ -103,7 +105,7 @@ pub fn serve(place: Place, site: Site) -> Result<Receiver<Question>> {
         scene_path: site.scene_path,
         scene: site.scene.into(),
         questions: site.asks.then_some(questions),
-        hosts: ["127.0.0.1", "localhost"].map(|name| format!("{name}:{port}")),
+        hosts: hosts(port),
         secret,
     });
     let listener = {
@@ -165,8 +167,15 @@ struct Shared {
     scene: Bytes,
     questions: Option<SyncSender<Question>>,
     /// As `Host` may name this server.
-    hosts: [String; 2],
+    hosts: Vec<String>,
     secret: String,
+}
+
+/// As `Host` names a server at a port: browsers leave out that of http, 80.
+fn hosts(port: u16) -> Vec<String> {
+    let names = ["127.0.0.1", "localhost"];
+    let bare = names.iter().filter(|_| port == 80).map(|name| (*name).to_owned());
+    names.iter().map(|name| format!("{name}:{port}")).chain(bare).collect()
 }
 
 type Refused = (StatusCode, String);
@@ -179,6 +188,7 @@ impl Shared {
                 (status, "application/json", Bytes::from(json!({ "error": message }).to_string()))
             }
         };
+        // The server leaves the body of an answer to HEAD out, and says how long it would be.
         let mut response = Response::new(Full::new(body));
         *response.status_mut() = status;
         for (name, value) in [
@@ -205,8 +215,8 @@ impl Shared {
         let nothing = || (StatusCode::NOT_FOUND, "there is nothing here".to_owned());
         let name = self.name(request.uri().path()).ok_or_else(nothing)?.to_owned();
         match (request.method(), name.as_str()) {
-            (&Method::GET, "") => Ok(("text/html; charset=utf-8", self.page.clone())),
-            (&Method::GET, name) if name == self.scene_path => {
+            (&Method::GET | &Method::HEAD, "") => Ok(("text/html; charset=utf-8", self.page.clone())),
+            (&Method::GET | &Method::HEAD, name) if name == self.scene_path => {
                 Ok(("application/octet-stream", self.scene.clone()))
             }
             (&Method::POST, "query") => {
@@ -277,4 +287,15 @@ async fn question(request: Request<Incoming>) -> Result<String, Refused> {
     let value: Value = serde_json::from_slice(&whole.to_bytes()).map_err(|_| malformed())?;
     let text = value["text"].as_str().unwrap_or_default().trim();
     if text.is_empty() { Err(malformed()) } else { Ok(text.to_owned()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_port_of_http_may_be_left_out() {
+        assert_eq!(hosts(8080), ["127.0.0.1:8080", "localhost:8080"]);
+        assert_eq!(hosts(80), ["127.0.0.1:80", "localhost:80", "127.0.0.1", "localhost"]);
+    }
 }

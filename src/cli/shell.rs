@@ -1,18 +1,18 @@
 //! `splatvk completions`, `splatvk manuals`: what tools/install puts beside the program.
-use super::args::{Cli, CompletionsArgs, ManualsArgs};
+use super::args::{CompletionsArgs, ManualsArgs};
 use super::outputs::WrittenFiles;
 use super::print::print;
+use super::usage;
 use crate::{Error, Result};
-use clap::CommandFactory;
 
 pub fn completions(args: &CompletionsArgs) -> Result<()> {
     let mut script = Vec::new();
-    clap_complete::generate(args.shell, &mut Cli::command(), "splatvk", &mut script);
+    clap_complete::generate(args.shell, &mut usage::command(), "splatvk", &mut script);
     print(&String::from_utf8_lossy(&script))
 }
 
 pub fn manuals(args: &ManualsArgs) -> Result<()> {
     let outputs = WrittenFiles::open(&args.out, args.force, &[])?;
-    clap_mangen::generate_to(Cli::command(), outputs.folder()).map_err(Error::unwritable(&args.out))?;
+    clap_mangen::generate_to(usage::manual(), outputs.folder()).map_err(Error::unwritable(&args.out))?;
     outputs.keep().map(drop)
 }

@@ -1,7 +1,8 @@
 //! `splatvk train`
 use super::args::TrainArgs;
+use super::kept::tell_of_kept_stages;
 use super::plan;
-use super::print::{print, print_json};
+use super::print::{ending, print, print_json};
 use super::progress;
 use crate::Result;
 use crate::run::train::{TrainPlan, train as run};
@@ -19,18 +20,21 @@ pub fn train(args: &TrainArgs) -> Result<()> {
         resume: args.making.resume,
         checkpoint_seconds: args.making.checkpoint_seconds,
         preset: args.making.preset.map(plan::preset),
-        iterations: args.iterations,
+        iterations: args.making.iterations,
         sh_degree: args.making.sh_degree,
-        seed: args.seed,
-        max_size: plan::max_size(args.max_size)?,
+        seed: args.making.seed,
+        max_size: args.making.max_size,
         device: args.device.device.clone(),
-        deterministic: args.deterministic,
+        deterministic: args.making.deterministic,
         models: args.device.models.clone(),
         provider: args.device.provider.clone(),
     };
-    let trained = run(&plan, progress::reporter().as_ref())?;
-    if args.device.json {
-        return print_json(&json!({ "out": plan.out, "run": trained.record }));
+    let progress = progress::reporter();
+    let trained = run(&plan, progress.as_ref())?;
+    match args.device.json {
+        true => print_json(&json!({ "out": plan.out, "run": trained.record }))?,
+        false => print(&(trained.table + &ending(&plan.out)))?,
     }
-    print(&trained.table)
+    tell_of_kept_stages(progress.as_ref());
+    Ok(())
 }

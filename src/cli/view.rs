@@ -5,6 +5,7 @@ use super::progress;
 use super::scene;
 use super::serve::{Answer, Place, Site, serve};
 use crate::format::scene_dir::Scene;
+use crate::format::scene_photos;
 use crate::gpu::Device;
 use crate::photo;
 use crate::query::QueryOptions;
@@ -12,7 +13,7 @@ use crate::report::viewer::{self, CodeNames, SCENE_PATH, Scene3d};
 use crate::run::Compat;
 use crate::run::ask::QueryScene;
 use crate::run::encoder;
-use crate::scene::RgbImage;
+use crate::scene::{Camera, RgbImage};
 use crate::{Error, Result};
 use serde_json::json;
 use std::sync::mpsc::RecvTimeoutError;
@@ -50,6 +51,8 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     } else {
         print(&format!("{} is at {address}  (Ctrl-C ends)\n", args.scene.display()))?;
     }
+    // From here on there is nothing that stopping could leave undone, also while a question is answered.
+    progress::stopping_is_no_failure();
     let input = StandardInput::new();
     while !progress::stopped() && !input.has_closed() {
         match asked.recv_timeout(POLL_INTERVAL) {
@@ -78,9 +81,8 @@ fn questions(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
 }
 
 fn page(scene: &Scene, args: &ViewArgs, names: &CodeNames, no_questions: Option<&str>) -> Result<String> {
-    // Photos are decoration here: a scene whose pictures were deleted still shows.
-    let load =
-        |c: &crate::scene::Camera| photo::load_at(&scene.path.join("cameras").join(&c.name), usize::MAX).ok();
+    // Photos are decoration here: a scene whose pictures were deleted still shows, and one that names pictures elsewhere.
+    let load = |c: &Camera| photo::load_at(&scene_photos::picture(&scene.path, c)?, usize::MAX).ok();
     let photos: Option<Vec<_>> = scene.cameras.iter().map(load).collect();
     let images: Vec<RgbImage> = photos.unwrap_or_default().into_iter().map(|p| p.image).collect();
     let path = args.scene.canonicalize().unwrap_or_else(|_| args.scene.clone());

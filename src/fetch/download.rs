@@ -10,6 +10,7 @@ use ureq::http::{Response, StatusCode};
 use ureq::tls::{PemItem, RootCerts, TlsConfig};
 
 use super::meter::Meter;
+use crate::error::words;
 use crate::files::{self, hex};
 use crate::infer::catalogue::Source;
 use crate::progress::Progress;
@@ -482,7 +483,7 @@ fn validator<B>(response: &Response<B>) -> Option<String> {
 }
 
 fn cut(e: &std::io::Error) -> String {
-    format!("the connection broke ({})", one_line(e))
+    format!("the connection broke ({})", words(e))
 }
 
 fn one_line(e: &dyn std::fmt::Display) -> String {
@@ -499,6 +500,7 @@ fn trouble(address: &str, e: &ureq::Error) -> Trouble {
         ureq::Error::Tls(_) | ureq::Error::Rustls(_) | ureq::Error::Pem(_) => refused(CERTIFICATES),
         ureq::Error::Io(io) if io.kind() == K::InvalidData => refused(CERTIFICATES),
         ureq::Error::BadUri(_) | ureq::Error::InvalidProxyUrl | ureq::Error::Http(_) => refused(""),
+        ureq::Error::Io(io) => Trouble::Passing(format!("no answer ({})", words(io)), None),
         _ => Trouble::Passing(format!("no answer ({})", one_line(e)), None),
     }
 }

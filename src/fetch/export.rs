@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use super::download::{Client, Fetched};
 use super::staging::Staging;
+use crate::error::words;
 use crate::infer::catalogue::{CatalogueEntry, Recipe, common_packages};
 use crate::progress::Progress;
 use crate::{Error, Result};
@@ -158,7 +159,8 @@ fn run(step: &Step, at: &Places, progress: &dyn Progress) -> Result<()> {
         .spawn()
         .map_err(|e| {
             Error::missing(format!(
-                "{program}: cannot be started ({e}); an export needs Python 3.9 or newer with venv, and git"
+                "{program}: cannot be started ({}); an export needs Python 3.9 or newer with venv, and git",
+                words(&e)
             ))
         })?;
     // Read on a thread of its own, or a full pipe would stop the child.

@@ -254,7 +254,8 @@ fn read_own(path: &Path) -> Result<Splats> {
 /// Scenes of earlier versions do not have the file.
 fn read_seen(folder: &Path, splats: usize) -> Result<Seen> {
     let file = folder.join(SEEN);
-    if !file.is_file() {
+    // A folder or a pipe in its place is not taken for "not there".
+    if file.symlink_metadata().is_err_and(|e| e.kind() == std::io::ErrorKind::NotFound) {
         return Ok(Seen::default());
     }
     let array = npy::read(&file)?;

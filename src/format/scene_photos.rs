@@ -1,6 +1,6 @@
 //! The photos that a scene directory keeps: their working images, and what was read of their files and taken out of them.
 use crate::photo::{self, Photo};
-use crate::scene::{Coverage, Outside, Plane, RgbImage};
+use crate::scene::{Camera, Coverage, Outside, Plane, RgbImage};
 use crate::{Error, Result, files};
 use std::path::{Path, PathBuf};
 
@@ -21,6 +21,11 @@ pub(super) fn write(cameras: &Path, photos: &[Photo]) -> Result<()> {
     super::write_json(&cameras.join(PHOTOS), &all)
 }
 
+/// The picture of a camera of a scene directory; `None` where its name leads out of the scene.
+pub fn picture(scene: &Path, camera: &Camera) -> Option<PathBuf> {
+    files::within(&scene.join("cameras"), &camera.name)
+}
+
 /// The photos of a scene directory as they were trained on: without lens and in one light, in the order of its cameras.
 pub fn load(scene: &Path) -> Result<Vec<Photo>> {
     let folder = scene.join("cameras");
@@ -33,7 +38,14 @@ pub fn load(scene: &Path) -> Result<Vec<Photo>> {
     }
     let mut photos: Vec<Photo> = files::read_json(&file, "the scene is damaged, run again")?;
     for photo in &mut photos {
-        let path = folder.join("images").join(format!("{}.png", photo.stem));
+        let path =
+            files::within(&folder.join("images"), &format!("{}.png", photo.stem)).ok_or_else(|| {
+                Error::input(format!(
+                    "{}: {:?} names a file outside of the scene; the scene is damaged, run again",
+                    file.display(),
+                    photo.stem
+                ))
+            })?;
         check_size(&path, photo)?;
         // Larger than any image: it is to be read as it is.
         let read = photo::load_at(&path, usize::MAX >> 16)?;

@@ -8,6 +8,7 @@ use serde::Deserialize;
 
 use super::compute::Compute;
 use super::runtime::Session;
+use crate::error::words;
 use crate::files::content_hash;
 pub use crate::files::home;
 use crate::{Error, Result};
@@ -195,7 +196,7 @@ impl Registry {
                 (Some(hash), Some(problem))
             }
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => (None, Some("is missing".to_string())),
-            Err(e) => (None, Some(format!("cannot be read ({e})"))),
+            Err(e) => (None, Some(format!("cannot be read ({})", words(&e)))),
         };
         let package = self.pack.packages.get(&entry.package);
         let fix = problem.map(|p| {

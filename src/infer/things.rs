@@ -7,10 +7,24 @@ const THINGS: &str = include_str!("things.txt");
 /// With words before them so many fewer are asked for: each form is a list of its own, which takes a text model seconds.
 const FORMED_EVERY: usize = 4;
 
-/// The words that a text must have in common with what else it could have said: its colours. Anything red is a little of a "red
-/// book".
+/// Most colours of a form. A list is made for each form that is asked for, so that their number bounds the work and the memory.
+const MOST_COLOURS: usize = 3;
+
+/// The words that a text must have in common with what else it could have said: its first colours, each once. Anything red is a
+/// little of a "red book".
 pub fn form(text: &str) -> String {
-    colour::words_in(text).join(" ")
+    let mut words: Vec<String> = Vec::new();
+    for word in colour::words_in(text) {
+        if words.len() < MOST_COLOURS && !words.contains(&word) {
+            words.push(word);
+        }
+    }
+    words.join(" ")
+}
+
+/// Whether many texts have a form, so that it is worth keeping what belongs to it: one colour at most.
+pub fn is_common(form: &str) -> bool {
+    forms().any(|known| known == form)
 }
 
 /// A text that names one colour with each of the other ten; nothing for other texts.
@@ -59,6 +73,8 @@ mod tests {
         assert_eq!(form("Red soda can"), "red");
         assert_eq!(form("a blue and white mug"), "blue white");
         assert_eq!(form("redwood"), "");
+        assert_eq!(form(&"red blue red green grey pink ".repeat(100)), "red blue green");
+        assert!(is_common("") && is_common("pink") && !is_common("blue white"));
         assert_eq!(forms().count(), 12);
         let mugs = recoloured("Gray mug");
         assert!(mugs.len() == 10 && mugs.contains(&"red mug".to_owned()), "{mugs:?}");

@@ -143,7 +143,12 @@ impl RegionEncoder for RegionWords {
         let key = text_key("other-things", &registry).text(&texts.join("\n"));
         let vocabulary = self.vocabulary(&Silent)?;
         let list: Vec<&str> = texts.iter().map(String::as_str).collect();
-        let meanings = registry.compute().remember(key, || vocabulary.encoder.embed_list(&list, &Silent))?;
+        let mut embed = || vocabulary.encoder.embed_list(&list, &Silent);
+        // Whoever asks may put any colours into any order, and fill the folder with that.
+        let meanings = match things::is_common(form) {
+            true => registry.compute().remember(key, embed)?,
+            false => embed()?,
+        };
         let mut all = vec![0f32; texts.len() * DIM];
         let fixed = &*vocabulary;
         all.par_chunks_exact_mut(DIM)

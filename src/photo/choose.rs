@@ -2,6 +2,7 @@
 use super::join::listed;
 use super::kind::{READ, begins_as_photo, is_foreign_name, is_photo_name, is_raw_name, is_video_name};
 use super::twins;
+use crate::error::words;
 use crate::{Error, Result};
 use std::path::{Component, Path, PathBuf};
 
@@ -33,7 +34,11 @@ pub fn find(inputs: &[PathBuf]) -> Result<FoundFiles> {
     let mut found = FoundFiles::default();
     for input in inputs {
         let kind = std::fs::metadata(input).map_err(|e| {
-            Error::input(format!("{}: {e}; give photo files or a folder of photos", input.display()))
+            Error::input(format!(
+                "{}: {}; give photo files or a folder of photos",
+                input.display(),
+                words(&e)
+            ))
         })?;
         if kind.is_dir() {
             list_or_below(input, &mut found)?;

@@ -2,6 +2,7 @@
 //! bounded time and memory.
 use super::code_points::{self, CodePoints};
 use super::support::Support;
+use crate::error::words;
 use crate::progress::Progress;
 use crate::{Error, Result};
 use std::ffi::OsString;
@@ -181,7 +182,7 @@ fn output(mut command: Command, path: &Path, most: u64, progress: &dyn Progress)
         std::io::ErrorKind::NotFound => {
             Error::missing(named(format!("is a video, and {program} is not there; {INSTALL}")))
         }
-        _ => Error::work(named(format!("{program} does not start ({e})"))),
+        _ => Error::work(named(format!("{program} does not start ({})", words(&e)))),
     })?;
     let mut child = Running(child);
     let collect = |pipe: Option<Box<dyn Read + Send>>, most: u64| {
@@ -206,7 +207,7 @@ fn output(mut command: Command, path: &Path, most: u64, progress: &dyn Progress)
                 ))));
             }
             Ok(None) => progress.check()?,
-            Err(e) => return Err(Error::work(named(format!("{program}: {e}")))),
+            Err(e) => return Err(Error::work(named(format!("{program}: {}", words(&e))))),
         }
         // Short against the tens of milliseconds that starting the program takes.
         std::thread::sleep(Duration::from_millis(5));

@@ -14,7 +14,8 @@ use std::time::Instant;
 
 type Work<'g> = Box<dyn FnOnce(&[Value], &Context) -> Result<Value> + Send + 'g>;
 type Load<'g> = Box<dyn Fn(&Store, &Key) -> Option<(Vec<String>, Value)> + Send + Sync + 'g>;
-type Save<'g> = Box<dyn Fn(&Store, &Key, &[String], &Value) -> Result<bool> + Send + Sync + 'g>;
+type Save<'g> =
+    Box<dyn Fn(&Store, &Key, &[String], &Value, &dyn Fn(&str)) -> Result<bool> + Send + Sync + 'g>;
 
 struct Node<'g> {
     name: &'static str,
@@ -83,11 +84,11 @@ impl<'g> Graph<'g> {
             let found = S::codec().and_then(|c: Codec<S::Output>| store.load(S::NAME, key, &c));
             found.map(|(warnings, value)| (warnings, Arc::new(value) as Value))
         };
-        let save = |store: &Store, key: &Key, warnings: &[String], value: &Value| match (
+        let save = |store: &Store, key: &Key, warnings: &[String], value: &Value, warn: &dyn Fn(&str)| match (
             S::codec(),
             value.downcast_ref(),
         ) {
-            (Some(codec), Some(value)) => store.save(S::NAME, key, &codec, warnings, value),
+            (Some(codec), Some(value)) => store.save(S::NAME, key, &codec, warnings, value, warn),
             _ => Ok(false),
         };
         self.nodes.push(Node {
@@ -260,7 +261,8 @@ impl Shared<'_, '_> {
             warnings.splice(0..0, at.needs.iter().flat_map(|n| self.lock().warnings[*n].clone()));
             let seconds = began.elapsed().as_secs_f64();
             self.store.memory_put(at.name, &self.keys[node], &value, seconds);
-            let kept = (at.save)(self.store, &self.keys[node], &warnings, &value)?;
+            let warn = |text: &str| context.progress.warn(text);
+            let kept = (at.save)(self.store, &self.keys[node], &warnings, &value, &warn)?;
             recorder.checkpoint.iter().for_each(Checkpoint::remove);
             let mut state = self.lock();
             state.kept.extend(kept.then_some(at.name));

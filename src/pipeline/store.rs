@@ -1,6 +1,7 @@
 //! Outputs of stages on disk, by everything that they depend on.
 use super::output::Value;
 use crate::checkpoint::Checkpoint;
+use crate::error::words;
 use crate::files;
 use crate::{Error, Result};
 use serde::Serialize;
@@ -8,6 +9,7 @@ use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
@@ -61,6 +63,8 @@ pub struct Store {
     every: Duration,
     passing: &'static [&'static str],
     memory: Option<Mutex<BTreeMap<String, Made>>>,
+    /// Whether it was said that outputs are not kept.
+    told: AtomicBool,
 }
 
 /// An output in memory.
@@ -145,7 +149,8 @@ impl Store {
         Some((warnings, (codec.read)(body)?))
     }
 
-    /// Whether it is there now: a disk that is full costs the next run time, not this one its result.
+    /// Whether it is there now: a disk that is full costs the next run time, not this one its result. `warn` gets the first reason
+    /// why one is not.
     pub(super) fn save<T>(
         &self,
         name: &str,
@@ -153,16 +158,23 @@ impl Store {
         codec: &Codec<T>,
         warnings: &[String],
         value: &T,
+        warn: &dyn Fn(&str),
     ) -> Result<bool> {
         let Some(folder) = &self.folder else { return Ok(false) };
         let file = Store::file(folder, name, key);
         let warnings = postcard::to_stdvec(warnings).map_err(unwritable)?;
         let body = [warnings, (codec.write)(value)?].concat();
-        let written = files::write_with_checksum(&file, &body).is_ok();
-        if written {
-            files::prune(&file, EXTENSION, CAPACITY);
+        let written = files::write_with_checksum(&file, &body);
+        match &written {
+            Ok(()) => files::prune(&file, EXTENSION, CAPACITY),
+            Err(_) if self.told.swap(true, Ordering::Relaxed) => {}
+            Err(e) => warn(&format!(
+                "stages are not kept, so that --resume will find nothing: {}: {}",
+                folder.display(),
+                words(e)
+            )),
         }
-        Ok(written)
+        Ok(written.is_ok())
     }
 
     /// What is kept in a folder, with sizes in bytes.

@@ -1,6 +1,28 @@
 //! Words of a text that no embedding of a few words carries: negations, places, and choices among several. A text that has them is
 //! answered for the rest of it, and says so (docs/method.md#phrasing).
+use crate::{Error, Result};
 use serde::Serialize;
+
+/// Most characters of a question. A thing is named in a few words; text models read about 77 or 128 parts of words.
+pub const MOST_CHARACTERS: usize = 300;
+/// Most words of a question.
+pub const MOST_WORDS: usize = 40;
+
+/// Refuses a question that is empty or too long.
+pub fn check(text: &str) -> Result<()> {
+    if text.trim().is_empty() {
+        return Err(Error::input("an empty query; give a few words"));
+    }
+    let (characters, words) = (text.chars().count(), text.split_whitespace().count());
+    if characters <= MOST_CHARACTERS && words <= MOST_WORDS {
+        return Ok(());
+    }
+    let start: String = text.chars().take(30).collect();
+    Err(Error::input(format!(
+        "“{start}…”: a question of {characters} characters and {words} words is too long; ask in at most \
+         {MOST_CHARACTERS} characters and {MOST_WORDS} words"
+    )))
+}
 
 /// From one of these on a text says what is not meant.
 const NEGATIONS: &str =
@@ -203,6 +225,19 @@ mod tests {
                 "{text}"
             );
         }
+    }
+
+    #[test]
+    fn questions_beyond_the_limit_are_refused() {
+        for text in ["lemon", &"ab ".repeat(MOST_WORDS), &"ä".repeat(MOST_CHARACTERS)] {
+            check(text).unwrap();
+        }
+        for text in ["", " \n", &"a ".repeat(MOST_WORDS + 1), &"ä".repeat(MOST_CHARACTERS + 1)] {
+            let error = check(text).unwrap_err();
+            assert!(error.exit_code() == 2 && error.to_string().len() < 300, "{error}");
+        }
+        let error = check(&"red ".repeat(2_500_000)).unwrap_err().to_string();
+        assert!(error.contains("2500000 words") && error.contains("at most 300 characters"), "{error}");
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! `report.html`: one self-contained file, readable on a phone.
 use super::chart::escape;
-use super::{Curve, HtmlReport, QueryShown, ViewShown, chart, colour, duration, viewer};
+use super::{Curve, HtmlReport, QueryShown, ViewShown, chart, colour, duration, one_line, viewer};
 use crate::format::picture;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
@@ -129,7 +129,7 @@ fn query_row(report: &HtmlReport, q: &QueryShown) -> Result<String> {
     let class = if hits > 0 { "yes" } else { "no" };
     let mut row = format!(
         "<h3>“{}” <span class=\"{class}\">{}</span></h3><div class=\"row\">",
-        escape(q.text),
+        escape(&one_line(q.text)),
         escape(&q.verdict)
     );
     for a in &q.answers {

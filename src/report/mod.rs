@@ -4,11 +4,13 @@ pub mod chart;
 pub mod colour;
 mod contents;
 mod html;
+mod line;
 mod summary;
 pub mod viewer;
 
 pub use contents::{AnswerShown, Curve, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown};
 pub use html::write_html;
+pub use line::{one_line, visible};
 pub use summary::{duration, table};
 
 pub use crate::progress::StageRecord;
@@ -50,7 +52,13 @@ pub fn write_previews(folder: &Path, report: &HtmlReport) -> Result<()> {
 
 /// A text as part of a file name: letters and digits stay, everything else becomes `_`.
 pub fn file_name(text: &str) -> String {
-    let safe: String =
-        text.trim().chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).take(60).collect();
+    let mut safe = String::new();
+    for c in text.trim().chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).take(60) {
+        // Names of files have at most 255 bytes, and those of views stand in them, too.
+        if safe.len() + c.len_utf8() > 120 {
+            break;
+        }
+        safe.push(c);
+    }
     if safe.is_empty() { "_".into() } else { safe }
 }

@@ -11,7 +11,6 @@ use crate::report::viewer::ShownAnswer;
 use crate::scene::{Camera, LanguageField, Plane, Splats, World};
 use glam::DVec3;
 use serde_json::{Value, json};
-use std::collections::hash_map::Entry;
 
 /// What all answers of a scene need, prepared once.
 pub struct Prepared {
@@ -132,14 +131,14 @@ impl Prepared {
     }
 
     /// What speaks for a text; `background` is the place of how well the other things of its form fit this scene.
-    fn evidence<K>(
+    fn evidence(
         &self,
         field: &LanguageField,
         query: &TextQuery,
-        background: Entry<'_, K, Background>,
+        background: &mut Option<Background>,
     ) -> Option<Evidence> {
         let shown = ShownCodes::new(&self.shown, field, &query.canonicals);
-        let background = background.or_insert_with(|| shown.background(&query.alternatives.things));
+        let background = background.get_or_insert_with(|| shown.background(&query.alternatives.things));
         let evidence = shown.evidence(&query.embedding, &query.alternatives.colours, background);
         evidence.map(|e| if query.reading.is_doubtful() { e.in_doubt() } else { e })
     }
@@ -160,13 +159,13 @@ impl Prepared {
     }
 
     /// The answer in these views, which need not be the scene's own.
-    pub fn answer<K>(
+    pub fn answer(
         &self,
         field: &LanguageField,
         (cameras, frames): (&[Camera], &[DecodedFrame]),
         query: &TextQuery,
         options: &QueryOptions,
-        background: Entry<'_, K, Background>,
+        background: &mut Option<Background>,
     ) -> Result<Answers> {
         let evidence = self.evidence(field, query, background);
         // A model that cannot tell what is there cannot tell that an unclear text is, either.
@@ -217,7 +216,6 @@ mod tests {
     use crate::query::presence::Alternatives;
     use crate::scene::{Codebook, LevelField, Pose, Scale};
     use crate::synth::regions;
-    use std::collections::HashMap;
     use std::sync::Arc;
 
     /// Edge of the square pictures, pixels.
@@ -296,11 +294,8 @@ mod tests {
         fn ask(&self, text: &str, reading: Reading) -> Answers {
             let alternatives = Alternatives { things: self.things.clone(), colours: Vec::new() };
             let query = TextQuery { alternatives, reading, ..regions::query(text) };
-            let mut backgrounds = HashMap::new();
             let views = (&self.cameras[..], &self.frames[..]);
-            self.prepared
-                .answer(&self.field, views, &query, &QueryOptions::default(), backgrounds.entry(0))
-                .unwrap()
+            self.prepared.answer(&self.field, views, &query, &QueryOptions::default(), &mut None).unwrap()
         }
     }
 

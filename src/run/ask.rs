@@ -1,39 +1,29 @@
 //! Questions to a scene that is kept on the device: what viewers, `splatvk query`, the C interface and benchmarks call.
 use super::answer::{Answers, Prepared};
+use super::recent::RecentOthers;
 use super::view::{DecodedFrame, Viewer};
 use crate::gpu::Device;
 use crate::infer::{RegionEncoder, things};
 use crate::query::phrasing::{self, Reading, Vocabulary};
-use crate::query::presence::{Alternatives, Background, ShownPixels};
+use crate::query::presence::{Alternatives, ShownPixels};
 use crate::query::{self, CANONICAL_PHRASES, QueryOptions, TextQuery};
 use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, LanguageField, Splats};
 use crate::{Error, Result};
-use std::collections::HashMap;
-use std::collections::hash_map::Entry;
-use std::sync::Arc;
-
-/// What texts could have said instead, [N, D], by the words before them.
-type Others = HashMap<String, Arc<Vec<f32>>>;
 
 /// One text as a query. With `verbatim` all its words count, as published protocols have it.
 fn as_query(
     text: &str,
     encoder: &mut dyn RegionEncoder,
     canonicals: &[f32],
-    others: &mut Others,
+    others: &mut RecentOthers,
     verbatim: bool,
 ) -> Result<TextQuery> {
+    phrasing::check(text)?;
     let phrasing = if verbatim || encoder.holds(text) { None } else { phrasing::read(text) };
     let asked = phrasing.as_ref().map_or(text, |p| &p.answers_for).to_owned();
     let embedding = encoder.embed_texts(&[&asked])?;
-    let things = match others.entry(things::form(&asked)) {
-        Entry::Occupied(known) => known.get().clone(),
-        Entry::Vacant(new) => {
-            let rows = encoder.others(new.key())?;
-            new.insert(Arc::new(rows)).clone()
-        }
-    };
+    let things = others.of(&things::form(&asked), |form| encoder.others(form))?.things.clone();
     let alternatives = Alternatives { things, colours: encoder.recoloured(&asked)? };
     let vocabulary = encoder.nearest_word(&asked)?.map(|(known, nearest)| Vocabulary { known, nearest });
     let reading = Reading { phrasing, vocabulary };
@@ -51,7 +41,7 @@ pub fn queries(texts: &[String], encoder: &mut dyn RegionEncoder, verbatim: bool
         return Ok(Vec::new());
     }
     let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
-    let mut others = Others::new();
+    let mut others = RecentOthers::default();
     texts.iter().map(|text| as_query(text, encoder, &canonicals, &mut others, verbatim)).collect()
 }
 
@@ -60,9 +50,7 @@ pub(super) struct Questions {
     encoder: Box<dyn RegionEncoder>,
     /// [C, D] unit rows of the canonical phrases.
     canonicals: Vec<f32>,
-    others: Others,
-    /// How well other things fit what the scene shows, by the words before them.
-    backgrounds: HashMap<String, Background>,
+    others: RecentOthers,
     prepared: Prepared,
     /// Cameras whose views tell what the scene shows, until they have been looked at.
     unseen: Option<Vec<Camera>>,
@@ -85,8 +73,7 @@ impl Questions {
         Ok(Questions {
             encoder,
             canonicals,
-            others: Others::new(),
-            backgrounds: HashMap::new(),
+            others: RecentOthers::default(),
             prepared: Prepared::new(splats, field, ShownPixels::default()),
             unseen: Some(cameras.to_vec()),
         })
@@ -118,9 +105,6 @@ impl Questions {
     }
 
     fn query(&mut self, text: &str) -> Result<TextQuery> {
-        if text.trim().is_empty() {
-            return Err(Error::input("an empty query; give a few words"));
-        }
         as_query(text, self.encoder.as_mut(), &self.canonicals, &mut self.others, false)
     }
 
@@ -136,8 +120,8 @@ impl Questions {
         let query = self.query(text)?;
         self.look(viewer, field, views)?;
         let asked = query.reading.phrasing.as_ref().map_or(text, |p| &p.answers_for);
-        let background = self.backgrounds.entry(things::form(asked));
-        self.prepared.answer(field, views, &query, options, background)
+        let shared = self.others.of(&things::form(asked), |form| self.encoder.others(form))?;
+        self.prepared.answer(field, views, &query, options, &mut shared.background)
     }
 }
 

@@ -197,6 +197,15 @@ impl BaseScene {
                 photo::MAX_VIEWS
             )));
         }
+        // Those of the scene have lost their lens and their light: what tells that a photo is the same is its name.
+        let known = |p: &Photo| self.known.photos.iter().any(|k| k.stem == p.stem);
+        if let Some(again) = new.iter().find(|p| known(p)) {
+            return Err(Error::input(format!(
+                "{}: a photo of the name \"{}\" is in the scene already; leave it out, or rename it if it is another one",
+                again.path.display(),
+                again.stem
+            )));
+        }
         photo::check_set(&all)
     }
 }

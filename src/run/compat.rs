@@ -7,6 +7,7 @@ use crate::query::{MaskRule, QueryOptions};
 use crate::{Error, Result, files};
 use serde::Serialize;
 use serde_json::Value;
+use std::io::ErrorKind;
 use std::path::Path;
 
 /// A set of switches.
@@ -92,17 +93,32 @@ impl Compat {
         })
     }
 
-    /// What a scene was made with; `None` also for files that no run made.
-    pub fn of_scene(scene: &Path) -> Option<&'static Compat> {
-        let record: Value = files::read_json(&scene.join("run.json"), "").ok()?;
-        Compat::named(record["config"]["plan"]["compat"].as_str()?).ok().flatten()
+    /// What a scene was made with; `None` also for files that no run made. A record that cannot be read is an error: the scene
+    /// would answer in another way than it was made for.
+    pub fn of_scene(scene: &Path) -> Result<Option<&'static Compat>> {
+        let file = scene.join("run.json");
+        let absent = |e: std::io::Error| matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory);
+        if file.symlink_metadata().is_err_and(absent) {
+            return Ok(None);
+        }
+        let remedy = "it says how the scene answers: restore it, or delete it to have answers in this program's own way";
+        let damaged = |what: &str| Error::input(format!("{}: {what}; {remedy}", file.display()));
+        let record: Value = files::read_json(&file, remedy)?;
+        match record.get("config").map(|config| &config["plan"]["compat"]) {
+            None => Err(damaged("no record of a run")),
+            Some(Value::Null) => Ok(None),
+            Some(Value::String(name)) => {
+                Compat::named(name).map_err(|_| damaged(&format!("made with the unknown --compat {name:?}")))
+            }
+            Some(_) => Err(damaged("its \"compat\" is no text")),
+        }
     }
 
     /// What decides answers: of `asked`, or else of what the scene was made with.
     pub fn answers(asked: Option<&str>, scene: &Path) -> Result<QueryOptions> {
         let compat = match asked {
             Some(name) => Compat::named(name)?,
-            None => Compat::of_scene(scene),
+            None => Compat::of_scene(scene)?,
         };
         Ok(query_options(compat))
     }
@@ -151,5 +167,17 @@ mod tests {
         record("\"compat\": \"langsplat\"");
         assert_eq!(rule(None), MaskRule::Lerf(0.4));
         assert_eq!((rule(Some("paper")), rule(Some("none"))), (MaskRule::Lerf(0.6), ours));
+        for damaged in ["", "{\"config\"", "[]", "{}", "{\"config\":{\"plan\":{\"compat\":3}}}"] {
+            std::fs::write(folder.path().join("run.json"), damaged).unwrap();
+            let error = Compat::answers(None, folder.path()).unwrap_err();
+            assert!(error.exit_code() == 2 && error.to_string().contains("run.json: "), "{error}");
+            assert_eq!(rule(Some("paper")), MaskRule::Lerf(0.6), "it is not asked");
+        }
+        record("\"compat\": \"mine\"");
+        let error = Compat::answers(None, folder.path()).unwrap_err().to_string();
+        assert!(error.contains("unknown --compat \"mine\"; it says how"), "{error}");
+        std::fs::remove_file(folder.path().join("run.json")).unwrap();
+        std::fs::create_dir(folder.path().join("run.json")).unwrap();
+        assert!(Compat::answers(None, folder.path()).unwrap_err().to_string().contains("is a folder"));
     }
 }

@@ -11,7 +11,7 @@ pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncod
     let levels = scene.language.iter().flat_map(|l| &l.levels);
     let dim = levels.map(|l| l.codebook.embedding_dim).find(|dim| *dim > 0);
     let space = scene.language.as_ref().map_or("", |l| l.space.as_str());
-    if table.is_file() || space == sources::DIR_SPACE {
+    if table.symlink_metadata().is_ok() || space == sources::DIR_SPACE {
         return sources::dir_encoder(&table, dim, &registry);
     }
     // "clip:0123456789abcdef" was made with a network of the family clip.

@@ -76,7 +76,8 @@ impl LiveScene {
         };
         let compat = match &origin {
             SceneOrigin::Trained(o) => o.plan.compat,
-            SceneOrigin::Loaded(s) => Compat::of_scene(&s.path),
+            SceneOrigin::Loaded(s) if s.language.is_some() => Compat::of_scene(&s.path)?,
+            SceneOrigin::Loaded(_) => None,
         };
         let viewer = Viewer::new(device, splats, field.unwrap_or(&LanguageField::default()))?;
         Ok(LiveScene {
@@ -256,8 +257,9 @@ fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
     let workspace = Workspace::create(path, replace, &[&scene.path])?;
     let folder = scene.path.join("cameras");
     // A scene without its photos is still whole.
-    let plain = || scene.cameras.iter().map(|c| photo::load_at(&folder.join(&c.name), usize::MAX)).collect();
-    let photos = scene_photos::load(&scene.path).or_else(|_| plain()).unwrap_or_default();
+    let plain = |c: &Camera| photo::load_at(&scene_photos::picture(&scene.path, c)?, usize::MAX).ok();
+    let photos = scene_photos::load(&scene.path).ok();
+    let photos = photos.or_else(|| scene.cameras.iter().map(plain).collect()).unwrap_or_default();
     let points = colmap::read_points(&folder.join("colmap")).ok();
     let table = scene.path.join(scene_dir::TEXT_EMBEDDINGS);
     let contents = Contents {

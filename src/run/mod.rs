@@ -16,6 +16,7 @@ pub mod metric;
 mod networks;
 mod outcome;
 mod plan;
+mod recent;
 mod record;
 pub mod refine;
 pub mod score;

@@ -241,7 +241,7 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
     let codes = |k: usize| o.field.levels.get(k).map_or(0, |l| l.codebook.len());
     list.push(("things s/m/l".to_owned(), format!("{} / {} / {}", codes(0), codes(1), codes(2))));
     for a in &o.answers {
-        list.push((format!("“{}”", a.text), a.verdict()));
+        list.push((format!("“{}”", report::one_line(&a.text)), a.verdict()));
     }
     list
 }
@@ -315,15 +315,9 @@ pub(super) fn sizes(photos: &[Photo]) -> String {
     format!("{} at {}{more}{hint}", photos.len(), shown.join(", "))
 }
 
-/// The table that ends `splatvk run`; warnings stand first.
+/// The table that ends `splatvk run`.
 pub fn closing_table(o: &RunOutcome) -> String {
-    let warnings: String = o.warnings.iter().map(|w| format!("  warning: {w}\n")).collect();
-    format!(
-        "{warnings}{}  {:<12}  {}\n",
-        report::table(&o.stages, o.seconds, &figures(o)),
-        "scene",
-        o.plan.out.display()
-    )
+    report::table(&o.stages, o.seconds, &figures(o))
 }
 
 /// Writes `run.json`, `report.html` and `previews/`.

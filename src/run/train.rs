@@ -323,11 +323,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     report::write_previews(workspace.path(), &shown)?;
     progress.check()?;
     workspace.commit()?;
-    let table = format!(
-        "{}scene is in {}\n",
-        report::table(&record.stages, record.seconds, &figures),
-        plan.out.display()
-    );
+    let table = report::table(&record.stages, record.seconds, &figures);
     Ok(TrainOutcome { record, table })
 }
 

@@ -1,6 +1,8 @@
 //! `splatvk bench`: what to measure, and on what.
+use super::number::whole;
 use crate::Result;
 use crate::infer::{Compute, Registry};
+use crate::photo::SMALLEST_SIDE;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 
@@ -36,28 +38,28 @@ pub struct BenchArgs {
     #[arg(long, value_name = "FILE", requires = "scene")]
     pub camera: Option<PathBuf>,
     /// Splats of the seeded scene
-    #[arg(long, default_value_t = 100_000, value_name = "N", conflicts_with = "scene")]
+    #[arg(long, default_value_t = 100_000, value_name = "N", value_parser = whole::<usize>(1..), conflicts_with = "scene")]
     pub splats: usize,
     /// Image width of the seeded scene, pixels
-    #[arg(long, default_value_t = 640, value_name = "PIXELS", conflicts_with = "scene")]
+    #[arg(long, default_value_t = 640, value_name = "PIXELS", value_parser = whole::<u32>(1..=u32::MAX as u64), conflicts_with = "scene")]
     pub width: u32,
     /// Image height of the seeded scene, pixels
-    #[arg(long, default_value_t = 480, value_name = "PIXELS", conflicts_with = "scene")]
+    #[arg(long, default_value_t = 480, value_name = "PIXELS", value_parser = whole::<u32>(1..=u32::MAX as u64), conflicts_with = "scene")]
     pub height: u32,
     /// Seed of the seeded scene
-    #[arg(long, default_value_t = 0, value_name = "N", conflicts_with = "scene")]
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u64>(0..), conflicts_with = "scene")]
     pub seed: u64,
     /// Spherical-harmonics degree [default: 0, or the scene's own]
-    #[arg(long, value_parser = clap::value_parser!(u32).range(0..=3), value_name = "0-3")]
+    #[arg(long, value_parser = whole::<u32>(0..=3), value_name = "0-3")]
     pub sh_degree: Option<u32>,
     /// Feature channels of the second step: 0 = leave it out, 1 to 16, 32, 48
-    #[arg(long, default_value_t = 16, value_name = "D")]
+    #[arg(long, default_value_t = 16, value_name = "D", value_parser = whole::<usize>(0..=48))]
     pub features: usize,
     /// Then the training step of seeded scenes with so many splats each
-    #[arg(long, value_delimiter = ',', value_name = "N,N,...")]
+    #[arg(long, value_delimiter = ',', value_name = "N,N,...", value_parser = whole::<usize>(1..))]
     pub sweep: Vec<usize>,
     /// sort: how many keys
-    #[arg(long, default_value_t = 10_000_000, value_name = "N")]
+    #[arg(long, default_value_t = 10_000_000, value_name = "N", value_parser = whole::<usize>(1..))]
     pub keys: usize,
     /// query: what to look for
     #[arg(long, default_value = "a cup", value_name = "TEXT")]
@@ -66,7 +68,7 @@ pub struct BenchArgs {
     #[arg(long, num_args = 1.., value_name = "DIR")]
     pub data: Vec<PathBuf>,
     /// cameras, masks: longer side of the working image, pixels
-    #[arg(long, default_value_t = crate::photo::MAX_SIZE_CPU, value_name = "N")]
+    #[arg(long, default_value_t = crate::photo::MAX_SIZE_CPU, value_name = "N", value_parser = whole::<usize>(SMALLEST_SIDE as u64..))]
     pub max_size: usize,
     /// cameras: use copies of the photos of that size, not the photos themselves
     #[arg(long)]
@@ -81,7 +83,7 @@ pub struct BenchArgs {
     #[arg(long, default_value_t = 2.0, value_name = "S")]
     pub seconds: f64,
     /// Repeat each measurement so often instead
-    #[arg(long, value_name = "N", conflicts_with = "seconds")]
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..), conflicts_with = "seconds")]
     pub repeats: Option<usize>,
     /// Also write the figures to this file
     #[arg(long, value_name = "FILE")]

@@ -1,4 +1,5 @@
 //! `splatvk ablate` and `splatvk generate`: tables, and data with a known answer.
+use super::number::whole;
 use super::shared::DeviceArgs;
 use crate::ablate::{Layout, TABLES};
 use crate::query::protocol::ProtocolKind;
@@ -86,16 +87,16 @@ pub struct AblateArgs {
     #[arg(long, value_name = "SOURCE")]
     pub regions: Option<String>,
     /// Photos of the default row [default: all train frames, at most 4]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
     pub views: Option<usize>,
     /// Take the true cameras in every row, for photos that alone would give none
     #[arg(long)]
     pub true_cameras: bool,
     /// Most stereo points that splats start from, in rows that do not vary it [default: draft's]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
     pub max_points: Option<usize>,
     /// Seeds of cameras, stereo, training and injected errors: a run for each
-    #[arg(long, visible_alias = "seed", value_delimiter = ',', default_value = "0", value_name = "N,...")]
+    #[arg(long, visible_alias = "seed", value_delimiter = ',', default_value = "0", value_name = "N,...", value_parser = whole::<u64>(0..))]
     pub seeds: Vec<u64>,
     /// Take the rows that an earlier run has left in --out, measured the same way, and go on from there
     #[arg(long)]
@@ -113,10 +114,10 @@ pub struct AblateArgs {
     #[arg(long, value_name = "SOURCE")]
     pub features: Option<String>,
     /// Optimisation steps of the colour stage, instead of draft's
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
     pub iterations: Option<usize>,
     /// Optimisation steps of the language stage [default: 30]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
     pub language_iterations: Option<usize>,
     /// Device and models
     #[command(flatten)]
@@ -136,19 +137,19 @@ pub struct GenerateArgs {
     #[arg(long, value_name = "DIR")]
     pub from: Option<PathBuf>,
     /// Everything random
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u64>(0..))]
     pub seed: u64,
     /// Photos
-    #[arg(long, default_value_t = 4, value_name = "N")]
+    #[arg(long, default_value_t = 4, value_name = "N", value_parser = whole::<usize>(0..))]
     pub views: usize,
     /// Held-out views
-    #[arg(long, default_value_t = 6, value_name = "N")]
+    #[arg(long, default_value_t = 6, value_name = "N", value_parser = whole::<usize>(0..))]
     pub held_out: usize,
     /// Picture size, pixels
     #[arg(long, default_value = "640x480", value_name = "WxH")]
     pub size: String,
     /// Objects on the table, 1 to 12
-    #[arg(long, default_value_t = 8, value_name = "N")]
+    #[arg(long, default_value_t = 8, value_name = "N", value_parser = whole::<usize>(0..=12))]
     pub objects: usize,
     /// Angle between neighbouring photos, degrees
     #[arg(long, default_value_t = 20.0, value_name = "DEG")]
@@ -160,13 +161,13 @@ pub struct GenerateArgs {
     #[arg(long, default_value_t = 0.0, value_name = "0-1")]
     pub gloss: f64,
     /// Thin poles
-    #[arg(long, default_value_t = 0, value_name = "N")]
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<usize>(0..))]
     pub thin: usize,
     /// Objects close together and behind each other
     #[arg(long, default_value_t = 0.3, value_name = "0-1")]
     pub occlusion: f64,
     /// Objects that look like another one
-    #[arg(long, default_value_t = 0, value_name = "N")]
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<usize>(0..))]
     pub similar: usize,
     /// Out of doors, ten times as large: the ground begins at the feet, behind a house stands the sky
     #[arg(long)]
@@ -206,7 +207,7 @@ pub struct GenerateArgs {
     #[arg(long)]
     pub sensor_noise: bool,
     /// JPEG quality of the photos [default: 95; 82 with --phone]
-    #[arg(long, value_name = "1-100", value_parser = clap::value_parser!(u8).range(1..=100))]
+    #[arg(long, value_name = "1-100", value_parser = whole::<u8>(1..=100))]
     pub jpeg: Option<u8>,
     /// Every other photo by a second camera: focal length, lens, principal point and vignetting of its own, where the other options
     /// ask for them

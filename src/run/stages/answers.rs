@@ -65,7 +65,7 @@ impl Stage for AnswerQueries {
                 context.progress.warn(&format!("“{}”: {note}", query.text));
             }
             // Texts of one form share their other things.
-            let background = backgrounds.entry(Arc::as_ptr(&query.alternatives.things));
+            let background = backgrounds.entry(Arc::as_ptr(&query.alternatives.things)).or_insert(None);
             prepared.answer(&language.field, (&trained.cameras, frames), query, &self.options, background)
         };
         let answers = queries.iter().map(&mut answer).collect();

@@ -6,7 +6,7 @@ use base64::alphabet::STANDARD;
 use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
 use percent_encoding::percent_decode_str;
 use std::collections::BTreeMap;
-use std::path::{Component as Step, Path};
+use std::path::Path;
 
 /// With and without the signs at the end that fill the last block.
 const BASE64: GeneralPurpose = GeneralPurpose::new(
@@ -43,24 +43,12 @@ fn content(uri: &str, folder: &Path) -> Result<Vec<u8>, String> {
         return Err(format!("its buffer {uri} is not a local file; download it and give its name"));
     }
     let decoded = percent_decode_str(uri).decode_utf8_lossy();
-    let names = [decoded.as_ref(), uri];
-    if !names.iter().all(|name| is_inside(name, folder)) {
+    let paths = [decoded.as_ref(), uri].map(|name| files::within(folder, name));
+    let [Some(decoded), Some(plain)] = paths else {
         return Err(format!("its buffer {uri} is outside of the file's folder; put it beside the file"));
-    }
-    let name = names.into_iter().find(|name| folder.join(name).is_file()).unwrap_or(&decoded);
-    files::read(&folder.join(name)).map_err(|e| format!("its buffer {e}"))
-}
-
-fn is_inside(name: &str, folder: &Path) -> bool {
-    let plain = |step| matches!(step, Step::Normal(_) | Step::CurDir);
-    if name.contains('\\') || !Path::new(name).components().all(plain) {
-        return false;
-    }
-    // Where links lead to; what is not there or leads in a circle is reported by the reader.
-    match (folder.join(name).canonicalize(), folder.canonicalize()) {
-        (Ok(real), Ok(home)) => real.starts_with(home),
-        _ => true,
-    }
+    };
+    let path = if !decoded.is_file() && plain.is_file() { plain } else { decoded };
+    files::read(&path).map_err(|e| format!("its buffer {e}"))
 }
 
 #[cfg(test)]

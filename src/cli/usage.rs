@@ -1,0 +1,238 @@
+//! What was typed: the definition of the command line, and its mistakes in one line each, with what may have been meant.
+use super::args::Cli;
+use super::line::one_line;
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::{Command, CommandFactory, FromArgMatches};
+use std::error::Error as _;
+use std::num::{ParseFloatError, ParseIntError};
+use std::process::ExitCode;
+
+/// Options that a command takes, because all or its neighbours do, and has no use for: its help does not show them.
+const UNUSED: [(&str, &[&str]); 9] = [
+    ("render", &["provider"]),
+    ("measure", &["provider", "log"]),
+    ("generate", &["provider", "log"]),
+    ("export", &["provider", "log"]),
+    ("clean", &["provider", "log"]),
+    ("completions", &["provider", "log"]),
+    ("manuals", &["provider", "log"]),
+    ("models list", &["provider", "log", "device"]),
+    ("models path", &["provider", "log", "device"]),
+];
+
+/// The command line: what is parsed, and what completions are made of.
+pub fn command() -> Command {
+    built(Cli::command())
+}
+
+/// The same for man pages: `splatvk help` has none.
+pub fn manual() -> Command {
+    built(Cli::command().disable_help_subcommand(true))
+}
+
+fn built(all: Command) -> Command {
+    let mut all = all.mut_subcommands(numbers_may_be_negative);
+    // Options of all commands get into each of them here.
+    all.build();
+    UNUSED.iter().fold(all, |all, (path, options)| hide(all, path, options))
+}
+
+/// "--views -3" is a number that is refused, not an option "-3".
+fn numbers_may_be_negative(command: Command) -> Command {
+    let option = |a: &clap::Arg| a.get_action().takes_values() && !a.is_positional();
+    let command = command.mut_args(|a| if option(&a) { a.allow_negative_numbers(true) } else { a });
+    command.mut_subcommands(numbers_may_be_negative)
+}
+
+fn hide(command: Command, path: &str, options: &[&str]) -> Command {
+    match path.split_once(' ') {
+        Some((first, rest)) => command.mut_subcommand(first, |c| hide(c, rest, options)),
+        None => command.mut_subcommand(path, |c| {
+            c.mut_args(|a| if options.contains(&a.get_id().as_str()) { a.hide(true) } else { a })
+        }),
+    }
+}
+
+/// What this process was asked for, or how it ends.
+pub fn parse() -> Result<Cli, ExitCode> {
+    let parsed = command().try_get_matches().and_then(|found| Cli::from_arg_matches(&found));
+    parsed.map_err(|error| print_usage_error(&error))
+}
+
+/// Help and version go to standard output; what cannot be parsed is one line like every other error, exit code 2.
+fn print_usage_error(error: &clap::Error) -> ExitCode {
+    let help = matches!(
+        error.kind(),
+        ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand | ErrorKind::MissingSubcommand
+    );
+    let asked = matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
+    if asked || help {
+        // A closed pipe while printing help is the reader's choice, not a failure.
+        let _ = error.print();
+        return if asked { ExitCode::SUCCESS } else { ExitCode::from(2) };
+    }
+    eprintln!("splatvk: {}", one_line(&message(error)));
+    ExitCode::from(2)
+}
+
+/// What is wrong, what may have been meant, and which help shows the rest.
+fn message(error: &clap::Error) -> String {
+    let text = |kind| texts(error, kind).into_iter().next().unwrap_or_default();
+    // "--views <N>": its name is enough.
+    let option = || text(ContextKind::InvalidArg).split(' ').next().unwrap_or_default().to_owned();
+    let meant = |kind| match texts(error, kind).first() {
+        Some(near) => format!("; did you mean {near}?"),
+        None => String::new(),
+    };
+    let value = text(ContextKind::InvalidValue);
+    let wrong = match error.kind() {
+        ErrorKind::InvalidSubcommand => {
+            let name = text(ContextKind::InvalidSubcommand);
+            format!("there is no command {name}{}", meant(ContextKind::SuggestedSubcommand))
+        }
+        ErrorKind::UnknownArgument if option().starts_with('-') => {
+            format!("there is no option {}{}", option(), meant(ContextKind::SuggestedArg))
+        }
+        ErrorKind::UnknownArgument => {
+            format!("{}: nothing more is expected here; put texts of several words in quotes", option())
+        }
+        ErrorKind::InvalidValue if value.is_empty() => format!("{}: its value is missing", option()),
+        ErrorKind::InvalidValue => {
+            let (near, all) = (meant(ContextKind::SuggestedValue), texts(error, ContextKind::ValidValue));
+            format!("{} {value}: unknown{near}; give {}", option(), choices(&all))
+        }
+        ErrorKind::ValueValidation => format!("{} {value}: {}", option(), reason(error)),
+        ErrorKind::ArgumentConflict if !text(ContextKind::PriorArg).is_empty() => {
+            let other = texts(error, ContextKind::PriorArg).join(", ");
+            format!("{} cannot be used together with {other}; leave one of them out", option())
+        }
+        ErrorKind::MissingRequiredArgument => {
+            format!("{} missing", texts(error, ContextKind::InvalidArg).join(", "))
+        }
+        // The message may go on over several lines before the usage.
+        _ => {
+            let all = error.to_string();
+            all.split("\n\n").next().unwrap_or(&all).trim_start_matches("error: ").to_owned()
+        }
+    };
+    format!("{wrong}; {} --help shows what there is", asked_command(error))
+}
+
+/// Why a value is none: the reason of its parser, in words.
+fn reason(error: &clap::Error) -> String {
+    let Some(source) = error.source() else { return "cannot be used".to_owned() };
+    if source.is::<ParseFloatError>() {
+        return "not a number; give one such as 0.5".to_owned();
+    }
+    if source.is::<ParseIntError>() {
+        return "not a whole number".to_owned();
+    }
+    source.to_string()
+}
+
+fn texts(error: &clap::Error, kind: ContextKind) -> Vec<String> {
+    match error.get(kind) {
+        Some(ContextValue::String(one)) => vec![one.clone()],
+        Some(ContextValue::Strings(all)) => all.clone(),
+        _ => Vec::new(),
+    }
+}
+
+/// "draft, default or paper".
+fn choices(all: &[String]) -> String {
+    match all {
+        [most @ .., last] if !most.is_empty() => format!("{} or {last}", most.join(", ")),
+        all => all.join(", "),
+    }
+}
+
+/// The command up to its first argument: "splatvk models list".
+fn asked_command(error: &clap::Error) -> String {
+    let usage = match error.get(ContextKind::Usage) {
+        Some(ContextValue::StyledStr(usage)) => usage.to_string(),
+        _ => String::new(),
+    };
+    let words = usage.trim_start_matches("Usage:").split_whitespace();
+    let words: Vec<&str> = words.take_while(|w| w.starts_with(char::is_alphanumeric)).collect();
+    if words.is_empty() { "splatvk".to_owned() } else { words.join(" ") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn said(line: &[&str]) -> String {
+        let error = command().try_get_matches_from(["splatvk"].iter().chain(line)).unwrap_err();
+        one_line(&message(&error))
+    }
+
+    #[test]
+    fn the_definitions_are_consistent() {
+        command().debug_assert();
+    }
+
+    #[test]
+    fn mistakes_are_named_with_what_was_meant() {
+        for (line, expected) in [
+            (&["rnu"][..], "there is no command rnu; did you mean run?; splatvk --help"),
+            (&["models", "lsit"], "there is no command lsit; did you mean list?; splatvk models --help"),
+            (&["run", "x", "--quary", "lemon"], "there is no option --quary; did you mean --query?"),
+            (&["run", "x", "--view", "4"], "there is no option --view; did you mean --views?; splatvk run"),
+            (
+                &["run", "x", "--preset", "drat"],
+                "--preset drat: unknown; did you mean draft?; give draft, default or paper",
+            ),
+            (&["run", "x", "--log", "jsn"], "--log jsn: unknown; did you mean json?; give text or json"),
+            (&["run", "x", "--compat", "none", "--methd"], "no option --methd; did you mean --method?"),
+            (&["render", "x", "y"], "y: nothing more is expected here"),
+            (&["render", "x", "--out", "y"], "--cameras <FILE> missing; splatvk render --help"),
+            (&["run", "x", "--views"], "--views: its value is missing"),
+            (&["run", "x", "--add", "s", "--views", "3"], "cannot be used together with"),
+            (&["export", "x", "--format", "plz", "--out", "y"], "--format plz: unknown; did you mean ply?"),
+        ] {
+            let text = said(line);
+            assert!(text.contains(expected), "{line:?}: {text}");
+        }
+    }
+
+    #[test]
+    fn numbers_are_refused_with_their_range() {
+        for (line, expected) in [
+            (&["run", "x", "--views", "abc"][..], "--views abc: not a whole number; give 2 to 16"),
+            (&["run", "x", "--views", "4.0"], "--views 4.0: not a whole number; give 2 to 16"),
+            (&["run", "x", "--views", "-3"], "--views -3: give 2 to 16"),
+            (&["run", "x", "--views", "17"], "--views 17: give 2 to 16"),
+            (&["run", "x", "--sh-degree", "4"], "--sh-degree 4: give 0 to 3"),
+            (&["run", "x", "--iterations", "0"], "--iterations 0: give 1 or more"),
+            (
+                &["run", "x", "--seed", "99999999999999999999"],
+                "--seed 99999999999999999999: too large; give 0",
+            ),
+            (&["run", "x", "--max-size", "1e3"], "--max-size 1e3: not a whole number; give 64 or more"),
+            (&["view", "x", "--port", "70000"], "--port 70000: give 0 to 65535"),
+            (&["generate", "--out", "x", "--texture", "much"], "--texture much: not a number; give one"),
+            (&["bench", "--sweep", "1,x"], "--sweep x: not a whole number; give 1 or more"),
+        ] {
+            let text = said(line);
+            assert!(text.contains(expected), "{line:?}: {text}");
+        }
+    }
+
+    #[test]
+    fn a_help_shows_what_its_command_uses() {
+        let help = |path: &str| {
+            let found = path.split(' ').fold(command(), |c, name| c.find_subcommand(name).unwrap().clone());
+            { found }.render_help().to_string()
+        };
+        for path in ["clean", "models list", "export"] {
+            let text = help(path);
+            assert!(!text.contains("--provider") && !text.contains("--log"), "{path}: {text}");
+        }
+        let text = help("run");
+        let at =
+            |option: &str| text.find(&format!("{option} ")).unwrap_or_else(|| panic!("{option}: {text}"));
+        assert!(at("--query") < at("--views") && at("--max-size") < at("--compat"), "{text}");
+        let headings: Vec<&str> = text.lines().filter(|l| l.ends_with(':') && !l.starts_with(' ')).collect();
+        assert!(headings.len() >= 5, "{headings:?}");
+    }
+}
