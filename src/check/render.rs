@@ -105,10 +105,14 @@ pub(super) fn regularisers(device: &Device) -> Found {
     // A third of the pixels has no reference.
     let depth: Vec<f32> = (0..pixels).map(|_| random.uniform(-1.0, 2.0).max(0.0) as f32).collect();
     let reference = device.buffer_from("reference depth", &depth)?;
+    // A third of the pixels may have any alpha.
+    let wanted: Vec<f32> = (0..pixels).map(|_| random.uniform(-0.5, 1.0) as f32).collect();
+    let wanted_alpha = device.buffer_from("wanted alpha", &wanted)?;
     let gradients = params.zeros_like(device)?;
     let n = scene.splats.len();
     let mut rec = Recorder::new(device, "self-check of the regularisers");
     regularise::record_depth(&mut rec, frame, Some(&reference), 0.5);
+    regularise::record_alpha(&mut rec, frame, &wanted_alpha, 0.5);
     regularise::record_ratio(&mut rec, &params.log_scales, &gradients.log_scales, n, 0.25, 2.0);
     rec.run()?;
 
@@ -118,7 +122,8 @@ pub(super) fn regularisers(device: &Device) -> Found {
     let (_, by_pixel) = regularise::depth_l1(&wide(&rendered), &wide(&alpha), &wide(&depth), 0.5);
     let upstream = frame.planes_grad.read()?;
     let by_depth: Vec<f64> = by_pixel.iter().map(|g| g[0]).collect();
-    let by_alpha: Vec<f64> = by_pixel.iter().map(|g| g[1]).collect();
+    let (_, by_wanted) = regularise::alpha_l1(&wide(&alpha), &wide(&wanted), 0.5);
+    let by_alpha: Vec<f64> = by_pixel.iter().zip(by_wanted).map(|(g, w)| g[1] + w).collect();
     let plane = |first: usize| &upstream[first * pixels..(first + 1) * pixels];
     let by_scale: Vec<f64> = scene
         .splats

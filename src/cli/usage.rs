@@ -88,7 +88,11 @@ fn message(error: &clap::Error) -> String {
     let wrong = match error.kind() {
         ErrorKind::InvalidSubcommand => {
             let name = text(ContextKind::InvalidSubcommand);
-            format!("there is no command {name}{}", meant(ContextKind::SuggestedSubcommand))
+            let near = match meant(ContextKind::SuggestedSubcommand) {
+                none if none.is_empty() => swapped(error, &name),
+                near => near,
+            };
+            format!("there is no command {name}{near}")
         }
         ErrorKind::UnknownArgument if option().starts_with('-') => {
             format!("there is no option {}{}", option(), meant(ContextKind::SuggestedArg))
@@ -116,6 +120,20 @@ fn message(error: &clap::Error) -> String {
         }
     };
     format!("{wrong}; {} --help shows what there is", asked_command(error))
+}
+
+/// Clap compares places and finds nothing near to "rnu": a command with the same letters in another order may be meant.
+fn swapped(error: &clap::Error, name: &str) -> String {
+    let sorted = |word: &str| {
+        let mut letters: Vec<char> = word.chars().collect();
+        letters.sort_unstable();
+        letters
+    };
+    let asked = asked_command(error);
+    let all = command();
+    let of = asked.split(' ').skip(1).try_fold(&all, |c, word| c.find_subcommand(word));
+    let same = of.and_then(|c| c.get_subcommands().find(|c| sorted(c.get_name()) == sorted(name)));
+    same.map_or(String::new(), |c| format!("; did you mean {}?", c.get_name()))
 }
 
 /// Why a value is none: the reason of its parser, in words.

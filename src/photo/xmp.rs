@@ -65,11 +65,14 @@ mod tests {
             format!("<x:xmpmeta><rdf:Description xmlns:{prefix}=\"{NAMESPACE}\" {inside}</x:xmpmeta>")
                 .into_bytes()
         };
-        let sphere = Some("GPano:ProjectionType=equirectangular".to_owned());
-        assert_eq!(panorama(&packet("GPano", "GPano:ProjectionType=\"equirectangular\"/>")), sphere);
-        assert_eq!(panorama(&packet("p", "p:ProjectionType = 'Equirectangular'/>")), sphere);
+        let sphere = "GPano:ProjectionType=equirectangular".to_owned();
+        assert_eq!(
+            panorama(&packet("GPano", "GPano:ProjectionType=\"equirectangular\"/>")).as_ref(),
+            Some(&sphere)
+        );
+        assert_eq!(panorama(&packet("p", "p:ProjectionType = 'Equirectangular'/>")).as_ref(), Some(&sphere));
         let element = ">\n<GPano:ProjectionType>\n equirectangular </GPano:ProjectionType>";
-        assert_eq!(panorama(&packet("GPano", element)), sphere);
+        assert_eq!(panorama(&packet("GPano", element)).as_ref(), Some(&sphere));
         let wide = panorama(&packet("GPano", "GPano:ProjectionType=\"cylindrical\"/>")).unwrap();
         assert!(
             refusal(&wide, Path::new("a.jpg"))
@@ -83,6 +86,6 @@ mod tests {
         for cut in 0..whole.len() {
             panorama(&whole[..cut]);
         }
-        assert!(refusal(&sphere.unwrap(), Path::new("x/a b.jpg")).contains("-i 'a b.jpg' -vf"));
+        assert!(refusal(&sphere, Path::new("x/a b.jpg")).contains("-i 'a b.jpg' -vf"));
     }
 }

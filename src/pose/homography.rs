@@ -291,7 +291,8 @@ mod tests {
             let mut rng = Random::new(7);
             for _ in 0..200 {
                 let mut wrong = || DVec2::new(rng.uniform() - 0.5, 0.75 * (rng.uniform() - 0.5));
-                (x.push(wrong()), y.push(wrong()));
+                x.push(wrong());
+                y.push(wrong());
             }
             let h = homography(&x, &y, 3.0 * PIXEL, 0).unwrap();
             let (on, off) = on_and_off_plane(&h, &x, &y, 3.0 * PIXEL, 0);

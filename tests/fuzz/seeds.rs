@@ -426,7 +426,7 @@ pub fn indexed(name: &str) -> Seed {
     let packet =
         b"<x xmlns:G=\"http://ns.google.com/photos/1.0/panorama/\" G:ProjectionType=\"rectilinear\"/>";
     let rows: Vec<u8> =
-        (0..64u8).flat_map(|y| std::iter::once(0).chain((0..64).map(move |x| x * 3 ^ y))).collect();
+        (0..64u8).flat_map(|y| std::iter::once(0).chain((0..64).map(move |x| (x * 3) ^ y))).collect();
     let numbers = |v: &[u32]| v.iter().flat_map(|v| v.to_be_bytes()).collect::<Vec<u8>>();
     let chunk = |kind: &[u8; 4], content: Vec<u8>| (*kind, content);
     let all = [
