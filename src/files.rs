@@ -1,6 +1,7 @@
 //! Files read within bounds; files that are whole or not there: written beside their place and renamed into it, some with a
 //! checksum in front; and the rule for what may be written over.
 mod guard;
+mod hash;
 mod home;
 mod owner;
 mod partial;
@@ -11,6 +12,7 @@ mod within;
 pub(crate) use guard::guarded;
 #[cfg(feature = "capi")]
 pub(crate) use guard::panic_text;
+pub(crate) use hash::{hex, sha256};
 pub use home::home;
 #[cfg(test)]
 pub(crate) use owner::tests::leave;
@@ -28,7 +30,6 @@ use crate::{Error, Result};
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 use std::collections::HashMap;
-use std::fmt::Write as _;
 use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
@@ -160,20 +161,6 @@ pub(crate) fn parse_json<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, S
 
 /// Hexadecimal digits of the checksum.
 const CHECKSUM_DIGITS: usize = 64;
-
-/// Lower-case hexadecimal digits.
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, b| {
-        // Writing to a string cannot fail.
-        let _ = write!(text, "{b:02x}");
-        text
-    })
-}
-
-/// sha256 in lower-case hex.
-pub(crate) fn sha256(bytes: &[u8]) -> String {
-    hex(&Sha256::digest(bytes))
-}
 
 /// sha256 of a file in lower-case hex; remembered per path, size and modification time.
 pub(crate) fn content_hash(path: &Path) -> std::io::Result<String> {

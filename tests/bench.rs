@@ -143,7 +143,7 @@ fn what_cannot_be_measured_is_refused_at_once() {
     refuses(&["bench", "--features", "17"], "--features 17");
     refuses(&["bench", "--seconds", "0"], "--seconds 0");
     refuses(&["bench", "--repeats", "0"], "--repeats 0");
-    refuses(&["bench", "--splats", "0"], "at least one splat");
+    refuses(&["bench", "--splats", "0"], "--splats 0");
     refuses(&["bench", "--sweep", "10,0"], "--sweep 0");
     refuses(&["bench", "sort", "--keys", "0"], "--keys 0");
     refuses(&["bench", "query"], "--scene");

@@ -371,7 +371,9 @@ fn foreign_files_and_inputs_are_never_replaced() {
     assert!(at("room/scene.json").exists() && at("room/cameras/images").exists());
     // A scene with nothing else in it is replaced.
     let before = std::fs::read(at("room/run.json")).unwrap();
-    succeeds(&train(&images, &cameras));
+    let mut whole = train(&images, &cameras);
+    whole.extend(["--points".into(), points.into()]);
+    succeeds(&whole);
     assert!(std::fs::read(at("room/run.json")).unwrap() != before && !at("room/.DS_Store").exists());
     assert_eq!(names(folder.path()), ["project", "room"]);
 }

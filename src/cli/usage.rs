@@ -105,7 +105,8 @@ fn message(error: &clap::Error) -> String {
             let (near, all) = (meant(ContextKind::SuggestedValue), texts(error, ContextKind::ValidValue));
             format!("{} {value}: unknown{near}; give {}", option(), choices(&all))
         }
-        ErrorKind::ValueValidation => format!("{} {value}: {}", option(), reason(error)),
+        // The reason states the range.
+        ErrorKind::ValueValidation => return format!("{} {value}: {}", option(), reason(error)),
         ErrorKind::ArgumentConflict if !text(ContextKind::PriorArg).is_empty() => {
             let other = texts(error, ContextKind::PriorArg).join(", ");
             format!("{} cannot be used together with {other}; leave one of them out", option())

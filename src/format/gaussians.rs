@@ -155,7 +155,7 @@ pub fn read(path: &Path) -> Result<(Splats, Option<LanguageField>)> {
 /// [`read`], and what was left out of the file or not applied, a line each.
 pub fn read_noted(path: &Path) -> Result<(Splats, Option<LanguageField>, Vec<String>)> {
     let format = format(path)?;
-    if let Some(e) = other::misnamed(path, format) {
+    if let Some(e) = other::misnamed(path, format.name, format.ending) {
         return Err(e);
     }
     let mut notes = Vec::new();

@@ -1,5 +1,4 @@
 //! Files that are of another format than their names say, or of one that is not read: what they are, and the way out.
-use super::SplatFormat;
 use crate::{Error, files};
 use std::io::Read as _;
 use std::path::Path;
@@ -48,11 +47,11 @@ fn content(path: &Path) -> Option<&'static str> {
     Some(name)
 }
 
-/// The error of a file that is of another format than its name says.
-pub(super) fn misnamed(path: &Path, format: &SplatFormat) -> Option<Error> {
+/// The error of a file that is of another format than its name says: `format` with `ending`.
+pub(super) fn misnamed(path: &Path, format: &str, ending: &str) -> Option<Error> {
     let name = content(path)?;
     // A .glb may be named .gltf, and a compressed .ply as a plain one: their readers are the same.
-    if format.ending.ends_with(&format!(".{name}")) || (name, format.name) == ("glb", "gltf") {
+    if ending.ends_with(&format!(".{name}")) || (name, format) == ("glb", "gltf") {
         return None;
     }
     let path = path.display();

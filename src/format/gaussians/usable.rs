@@ -69,9 +69,8 @@ pub(super) fn finished(mut notes: Vec<String>, path: &Path) -> Vec<String> {
     notes.into_iter().map(|note| format!("{}: {note}", path.display())).collect()
 }
 
-/// Share of the extent below which the step between two coordinates may be: a pixel of a picture of the whole scene is a
-/// thousand times as large.
-const FINEST_STEP: f32 = 1e-6;
+/// Largest step between two coordinates, as a share of the extent: a tenth of a pixel in a picture of the whole scene.
+const FINEST_STEP: f32 = 1e-4;
 
 /// A note where coordinates are so large against their extent that single precision is too coarse for them, as those of maps are.
 pub(super) fn precision(positions: &[[f32; 3]]) -> Option<String> {

@@ -1,12 +1,17 @@
 //! What the addresses of buffers lead to: data inside of the file, or files in its own folder and below.
-use super::read::Buffer;
 use crate::files;
 use base64::Engine;
 use base64::alphabet::STANDARD;
 use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
 use percent_encoding::percent_decode_str;
+use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::Path;
+
+#[derive(Deserialize)]
+pub(super) struct Buffer {
+    pub uri: Option<String>,
+}
 
 /// With and without the signs at the end that fill the last block.
 const BASE64: GeneralPurpose = GeneralPurpose::new(

@@ -1,5 +1,5 @@
 //! Reading: every primitive of the default scene that has the extension, moved by the nodes above it.
-use super::buffers::contents;
+use super::buffers::{Buffer, contents};
 use super::extensions::{self, Refused};
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
 use crate::format::gaussians::ply;
@@ -92,11 +92,6 @@ struct BufferView {
     byte_stride: Option<usize>,
     #[serde(default)]
     extensions: Refused,
-}
-
-#[derive(Deserialize)]
-pub(super) struct Buffer {
-    pub uri: Option<String>,
 }
 
 /// Most nodes: scenes of Gaussians have a handful, and a node takes 200 bytes while it is visited.
