@@ -1,4 +1,5 @@
 //! Files of Gaussians: one reader and one writer for every format, chosen by the end of the file's name or by the format's.
+mod degree;
 pub mod gltf;
 mod other;
 pub mod ply;

@@ -1,9 +1,8 @@
 //! Everything on one plane: sheets of colour on the ground seen straight down, as from a drone, or a poster seen from before it. The
 //! focal length of photos straight down is open: a longer one from higher up shows the same.
-use super::scene::SceneSpec;
 use super::shapes::{SceneObject, Shape, paint};
 use crate::math::Random;
-use crate::scene::{Camera, Pose};
+use crate::scene::Pose;
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 
@@ -36,16 +35,16 @@ const HEIGHT: f64 = 0.03;
 /// Half the thickness of a sheet, metres: a tenth of a pixel from the usual distance would be 0.15 mm.
 const THIN: f64 = 5e-5;
 
-/// The ground and `spec.objects` sheets on it, at any angles.
-pub(super) fn objects(spec: &SceneSpec, random: &mut Random) -> Vec<SceneObject> {
-    let ground = paint([0.36, 0.42, 0.3], 0.8 * spec.texture, 0.08, random);
+/// The ground and some sheets on it, at any angles.
+pub(super) fn objects(sheets: usize, texture: f64, random: &mut Random) -> Vec<SceneObject> {
+    let ground = paint([0.36, 0.42, 0.3], 0.8 * texture, 0.08, random);
     let mut out = vec![SceneObject {
         label: 1,
         phrase: "flat ground".into(),
         shape: Shape::Plane(DVec3::Z, 0.0),
         paint: ground,
     }];
-    for (label, k) in (4..).zip(0..spec.objects) {
+    for (label, k) in (4..).zip(0..sheets) {
         let mut within = |reach: f64| reach * (2.0 * random.uniform() - 1.0);
         let at = DVec3::new(within(0.7), within(0.45), THIN * (1 + k) as f64);
         let half = DVec3::new(0.11 + within(0.05), 0.08 + within(0.04), THIN);
@@ -55,14 +54,14 @@ pub(super) fn objects(spec: &SceneSpec, random: &mut Random) -> Vec<SceneObject>
             label,
             phrase: format!("sheet {}", k + 1),
             shape: Shape::Block(at, half, turn),
-            paint: paint(colour, 0.7 * spec.texture, 0.03, random),
+            paint: paint(colour, 0.7 * texture, 0.03, random),
         });
     }
     out
 }
 
-/// A camera of the plane, `angle` degrees from the middle of the set.
-pub(super) fn camera(spec: &SceneSpec, way: Flat, name: &str, angle: f64, random: &mut Random) -> Camera {
+/// Where a camera of the plane stands, `angle` degrees from the middle of the set.
+pub(super) fn pose(way: Flat, angle: f64, random: &mut Random) -> Pose {
     let mut within = |reach: f64| reach * (2.0 * random.uniform() - 1.0);
     // Looking down the normal, the picture's y against the plane's.
     let down = DMat3::from_cols(DVec3::X, DVec3::NEG_Y, DVec3::NEG_Z);
@@ -82,8 +81,7 @@ pub(super) fn camera(spec: &SceneSpec, way: Flat, name: &str, angle: f64, random
             (DMat3::from_cols(x, z.cross(x), z).transpose(), centre)
         }
     };
-    let pose = Pose { rotation, translation: -(rotation * centre) };
-    super::scene::pinhole(spec, name, pose)
+    Pose { rotation, translation: -(rotation * centre) }
 }
 
 #[cfg(test)]

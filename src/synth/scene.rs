@@ -148,7 +148,7 @@ pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
     spec.check()?;
     let mut random = Random::new(spec.seed ^ 0x5ce7e);
     let (mut objects, sky) = match (spec.flat, spec.outdoor) {
-        (Some(_), _) => (flat::objects(spec, &mut random), None),
+        (Some(_), _) => (flat::objects(spec.objects, spec.texture, &mut random), None),
         (None, true) => (outdoor::background(spec.texture, &mut random), Some(Sky::new(&mut random))),
         (None, false) => (background(spec, &mut random), None),
     };
@@ -160,7 +160,7 @@ pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
     let train = (0..spec.views).map(|i| {
         let (azimuth, name) = ((i as f64 - middle) * spec.baseline, format!("train_{i:02}"));
         if let Some(way) = spec.flat {
-            return flat::camera(spec, way, &name, azimuth, &mut random);
+            return pinhole(spec, &name, flat::pose(way, azimuth, &mut random));
         }
         let azimuth = azimuth + loose * 4.0 * (random.uniform() - 0.5);
         camera(spec, &name, azimuth, 32.0 + loose * 8.0 * (random.uniform() - 0.5))
@@ -179,7 +179,7 @@ pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
         let azimuth = (random.uniform() - 0.5) * (2.0 * middle * spec.baseline + 6.0);
         let name = format!("test_{:02}", spec.views + i);
         let made = match spec.flat {
-            Some(way) => flat::camera(spec, way, &name, azimuth, &mut random),
+            Some(way) => pinhole(spec, &name, flat::pose(way, azimuth, &mut random)),
             None => camera(spec, &name, azimuth, 25.0 + 18.0 * random.uniform()),
         };
         // The same phone, with its principal point in the middle.
@@ -306,7 +306,7 @@ fn camera(spec: &SceneSpec, name: &str, azimuth: f64, elevation: f64) -> Camera 
 }
 
 /// The usual pinhole at a pose.
-pub(super) fn pinhole(spec: &SceneSpec, name: &str, pose: Pose) -> Camera {
+fn pinhole(spec: &SceneSpec, name: &str, pose: Pose) -> Camera {
     let (width, height) = spec.size;
     let f = 1.025 * f64::from(width);
     Camera {

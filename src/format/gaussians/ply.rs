@@ -1,5 +1,6 @@
 //! PLY files: the Gaussian layout that 3DGS viewers expect
 //! (docs/method.md#gaussian-ply).
+use super::degree::sh_degree;
 use super::ply_header::header;
 use super::ply_points::Colours;
 pub use super::ply_points::{read_points, write_points};
@@ -26,23 +27,6 @@ pub fn read_noted(path: &Path, notes: &mut Vec<String>) -> Result<Splats> {
 /// [`read_noted`] of a file that this program wrote.
 pub fn read_splats(path: &Path) -> Result<Splats> {
     read_noted(path, &mut Vec::new())
-}
-
-/// SH degree of so many `f_rest` columns, and how many coefficients a channel has in the file; a note where not all are read.
-pub(super) fn sh_degree(columns: usize, notes: &mut Vec<String>) -> Result<(u32, usize), String> {
-    let degree = (0..=4).find(|&d| 3 * (sh_coefficients(d) - 1) == columns).ok_or_else(|| {
-        format!("its {columns} f_rest columns fit no SH degree (0, 9, 24, 45 or 72 do); export it with one of them")
-    })?;
-    notes.extend((degree > MOST_DEGREE).then(|| beyond_degree(degree)));
-    Ok((degree.min(MOST_DEGREE), columns / 3))
-}
-
-/// Greatest SH degree that is drawn.
-pub(super) const MOST_DEGREE: u32 = 3;
-
-/// What is said of coefficients beyond it.
-pub(super) fn beyond_degree(degree: u32) -> String {
-    format!("its SH degree is {degree}: band {degree} is left out, {MOST_DEGREE} bands are read")
 }
 
 fn gaussians(t: &Table, notes: &mut Vec<String>) -> Result<Splats, String> {

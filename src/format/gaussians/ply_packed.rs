@@ -2,7 +2,7 @@
 //! SH in bytes. About a quarter of the size of a plain PLY without SH.
 use super::ply_header::PropertyType;
 use super::ply_table as table;
-use super::{ply, ply_comments, usable};
+use super::{degree, ply_comments, usable};
 use crate::scene::Splats;
 use crate::{Error, Result};
 use std::path::Path;
@@ -61,7 +61,7 @@ pub(super) fn parse(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, Str
     if sh.as_ref().is_some_and(|s| s.len() != vertices.len()) {
         return Err("the sh element has another number of rows".into());
     }
-    let (sh_degree, rest) = ply::sh_degree(columns.len(), notes)?;
+    let (sh_degree, rest) = degree::sh_degree(columns.len(), notes)?;
     let mut s = Splats::with_capacity(vertices.len(), sh_degree);
     for i in 0..vertices.len() {
         let bound = |k: usize| bounds[k].map(|c| chunks.value(i / CHUNK, c) as f32);

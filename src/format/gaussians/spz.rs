@@ -4,7 +4,7 @@
 //! The format's axes are right, up, back unless a file states others; files are turned by 180° about x on the way in and out.
 //! Positions are 24-bit fixed point with as many fractional bits as their extent leaves room for (the format's own tools take
 //! 12).
-use super::{ply, spz_extensions, usable};
+use super::{degree, spz_extensions, usable};
 use crate::scene::{Splats, sh_coefficients};
 use crate::{Error, Result, files};
 use std::io::{Read, Write as _};
@@ -221,8 +221,8 @@ fn splats(head: &Head, parts: [&[u8]; 6], notes: &mut Vec<String>) -> Splats {
     // The upper bytes of an i32, shifted down with the sign.
     let fixed = |b: &[u8]| (i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) as f32 * unit;
     let mean = |b: &[u8]| [fixed(&b[..3]), -fixed(&b[3..6]), -fixed(&b[6..9])];
-    let degree = head.degree.min(ply::MOST_DEGREE);
-    notes.extend((degree < head.degree).then(|| ply::beyond_degree(head.degree)));
+    let degree = head.degree.min(degree::MOST_DEGREE);
+    notes.extend((degree < head.degree).then(|| degree::beyond_degree(head.degree)));
     // Bands follow each other, so the first coefficients are those of the lower degree.
     let (stored, rest) = (sh_coefficients(head.degree) - 1, sh_coefficients(degree) - 1);
     let mut all = Vec::with_capacity(head.count * 3 * (rest + 1));

@@ -2,7 +2,7 @@
 use super::buffers::{Buffer, contents};
 use super::extensions::{self, Refused};
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
-use crate::format::gaussians::ply;
+use crate::format::gaussians::degree;
 use crate::format::{logit, transform};
 use crate::scene::{Similarity, Splats, sh_coefficients};
 use crate::{Error, Result, files};
@@ -355,13 +355,13 @@ impl<'a> Document<'a> {
 
 /// Notes on attributes of the extension that are not read, those of higher SH degrees among them.
 fn unread(primitive: &Primitive) -> Vec<String> {
-    let degrees = (0..=ply::MOST_DEGREE).flat_map(|l| (0..=2 * l).map(move |n| coefficient(l, n)));
+    let degrees = (0..=degree::MOST_DEGREE).flat_map(|l| (0..=2 * l).map(move |n| coefficient(l, n)));
     let read: Vec<String> =
         ["ROTATION", "SCALE", "OPACITY"].iter().map(|n| attribute(n)).chain(degrees).collect();
     let own = attribute("");
     let beyond =
-        (ply::MOST_DEGREE + 1..=4).filter(|l| primitive.attributes.contains_key(&coefficient(*l, 0)));
-    let notes = beyond.map(ply::beyond_degree);
+        (degree::MOST_DEGREE + 1..=4).filter(|l| primitive.attributes.contains_key(&coefficient(*l, 0)));
+    let notes = beyond.map(degree::beyond_degree);
     let others = primitive.attributes.keys().filter(|n| n.starts_with(&own) && !read.contains(n));
     let others =
         others.filter(|n| !n.contains("SH_DEGREE_4_")).map(|n| format!("its attribute {n} is not read"));
