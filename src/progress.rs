@@ -109,6 +109,11 @@ impl<'a> Recorded<'a> {
     pub fn warnings(&self) -> Vec<String> {
         lock(&self.warnings).clone()
     }
+    /// Warns of what matters more than all that was said before: it stands first among the warnings.
+    pub fn warn_first(&self, message: &str) {
+        lock(&self.warnings).insert(0, message.to_owned());
+        self.inner.warn(message);
+    }
     /// Makes all work that reports here stop, because a part of it has failed.
     pub fn stop(&self) {
         self.stopped.store(true, Ordering::SeqCst);
@@ -227,6 +232,8 @@ mod tests {
         let names: Vec<_> = stages.iter().map(|s| s.name.as_str()).collect();
         assert_eq!(names, ["train", "align", "write"]);
         assert_eq!(recorded.warnings(), ["few matches"]);
+        recorded.warn_first("a bad scene");
+        assert_eq!(recorded.warnings(), ["a bad scene", "few matches"]);
         for pair in stages.windows(2) {
             assert!(pair[0].start + pair[0].seconds <= pair[1].start, "one after the other");
         }

@@ -380,9 +380,15 @@ fn the_scene_of_a_run_is_whole_and_can_be_replaced() {
         serde_json::from_slice(&std::fs::read(scene.join("run.json")).unwrap()).unwrap();
     assert!(run["stages"].as_array().unwrap().len() >= 2 && run["seed"] == 0 && run["device"].is_string());
     let said = events(&std::fs::read_to_string(train_log()).unwrap());
-    let warned: Vec<_> =
-        said.iter().filter(|e| e["event"] == "warning").map(|e| e["message"].clone()).collect();
-    assert!(!warned.is_empty() && run["warnings"] == serde_json::Value::from(warned), "{}", run["warnings"]);
+    let mut warned: Vec<_> =
+        said.iter().filter(|e| e["event"] == "warning").filter_map(|e| e["message"].as_str()).collect();
+    let mut recorded: Vec<_> =
+        run["warnings"].as_array().unwrap().iter().filter_map(|w| w.as_str()).collect();
+    // Two iterations show no photo well: the record says that before all else, though it is known last.
+    assert!(recorded[0].starts_with("photos are reproduced at"), "{recorded:?}");
+    warned.sort_unstable();
+    recorded.sort_unstable();
+    assert_eq!(recorded, warned);
     assert!(names(scene.parent().unwrap()).iter().all(|n| !n.contains("partial") && !n.contains("old")));
 }
 

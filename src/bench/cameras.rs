@@ -208,6 +208,7 @@ fn find_cameras(
     if input.copies {
         photos.iter_mut().for_each(|p| p.fine = None);
     }
+    photo::cut_bars(&mut photos, progress);
     pose::place(photos, None, registry, 0, progress)
 }
 
@@ -219,7 +220,9 @@ fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) 
         .enumerate()
         .filter_map(|(k, p)| Some((k, *frames.iter().find(|f| f.stem == p.stem)?)))
         .collect();
-    let estimated: Vec<_> = joined.iter().map(|(k, _)| model.cameras[*k].clone()).collect();
+    // Of the whole files, as those of the truth are.
+    let estimated: Vec<_> =
+        joined.iter().map(|(k, _)| placed.photos[*k].original_camera(&model.cameras[*k])).collect();
     let known: Vec<_> = joined.iter().map(|(_, f)| f.camera.clone()).collect();
     let depth = truth.mean_depth(frames)?;
     let errors = pose_errors(&estimated, &known, depth);

@@ -199,6 +199,7 @@ fn pictures() -> Vec<Photo> {
             fine: None,
             lost_pixels: 0,
             coverage: None,
+            overlay: None,
             masked: false,
             notes: Vec::new(),
             straightened: None,

@@ -358,6 +358,7 @@ pub(super) fn photo(stem: &str, image: RgbImage) -> Photo {
         fine: None,
         lost_pixels: 0,
         coverage: None,
+        overlay: None,
         masked: false,
         notes: Vec::new(),
         straightened: None,

@@ -289,6 +289,7 @@ mod tests {
             fine: None,
             lost_pixels: 0,
             coverage: None,
+            overlay: None,
             masked: false,
             notes: Vec::new(),
             straightened: None,

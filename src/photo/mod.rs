@@ -1,4 +1,5 @@
 //! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (docs/method.md#photos).
+mod bars;
 mod border;
 mod candidate;
 mod choose;
@@ -14,6 +15,7 @@ pub mod light;
 mod mask;
 mod masks;
 mod metadata;
+mod overlay;
 mod png;
 mod profile;
 mod read;
@@ -37,6 +39,7 @@ pub use join::{join, listed, plain_name, stems_apart};
 pub use kind::{check_name, stem};
 pub use light::Light;
 pub use masks::{MaskChoice, assign as assign_masks};
+pub use overlay::Overlay;
 pub use read::{
     MAX_SIZE, MAX_SIZE_CPU, Photo, SMALLEST_SIDE, default_max_size, from_bytes, from_pixels, load, load_at,
     working_size,
@@ -91,7 +94,17 @@ pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progr
         all.par_extend(candidates[wave].par_iter().map(one));
     }
     let mut photos = all.into_iter().collect::<Result<Vec<_>>>()?;
+    for bars in bars::find(&photos) {
+        // The picture gets the pixels that the whole file would have had.
+        let photo = &photos[bars.photo];
+        let (w, h) = (photo.image.width, photo.image.height);
+        let gain = w.max(h) as f64 / bars.picture_long_side(photo);
+        if (w as u32, h as u32) != photo.original_size {
+            photos[bars.photo] = candidates[bars.photo].load((max_size as f64 * gain) as usize, progress)?;
+        }
+    }
     progress.end();
+    cut_bars(&mut photos, progress);
     settle(&mut photos, &[], progress);
     check_set(&photos)?;
     Ok(photos)
@@ -154,6 +167,15 @@ fn warn_of_files(photos: &[Photo], progress: &dyn Progress) {
     }
 }
 
+/// Cuts off the bars beside the pictures: letterboxes, frames and captions. Says so.
+pub fn cut_bars(photos: &mut [Photo], progress: &dyn Progress) {
+    let found = bars::find(photos);
+    if let Some(text) = bars::message(photos, &found) {
+        progress.warn(&text);
+    }
+    found.iter().for_each(|bars| photos[bars.photo].cut(bars.depth));
+}
+
 /// Files of high dynamic range in another unit: matching and training expect diffuse surfaces below 1.
 fn mostly_above_white(image: &RgbImage) -> bool {
     let above = image.data.iter().filter(|c| c.iter().any(|v| *v > 1.0)).count();
@@ -163,6 +185,9 @@ fn mostly_above_white(image: &RgbImage) -> bool {
 /// EXIF focal lengths of one camera that differ more come from different zoom settings.
 const SAME_ZOOM: f64 = 0.03;
 
+/// Sides of pictures between bars that differ by less are the same.
+const SAME_PICTURE: f64 = 0.02;
+
 /// Number of the camera of every photo, as far as the files state it: photos of one size, camera model and zoom have one, photos
 /// without EXIF share by size. Portrait and landscape of one camera share too.
 pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
@@ -170,12 +195,19 @@ pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
         let (w, h) = p.original_size;
         (w.max(h), w.min(h))
     };
+    // The edge of a bar is found to a pixel or two of the working image; uncut photos of one size have one picture.
+    let picture = |a: &Photo, b: &Photo| {
+        let sides = a.picture_size().into_iter().zip(b.picture_size());
+        let turned = a.picture_size().into_iter().rev().zip(b.picture_size());
+        let near = |(a, b): (f64, f64)| (a / b - 1.0).abs() < SAME_PICTURE;
+        sides.into_iter().all(near) || turned.into_iter().all(near)
+    };
     let alike = |a: &Photo, b: &Photo| {
         let one_zoom = match (a.original_focal(), b.original_focal()) {
             (Some(f), Some(g)) => (f / g - 1.0).abs() <= SAME_ZOOM,
             (f, g) => f.is_none() && g.is_none(),
         };
-        size(a) == size(b) && a.camera_model == b.camera_model && one_zoom
+        size(a) == size(b) && picture(a, b) && a.camera_model == b.camera_model && one_zoom
     };
     let mut firsts: Vec<&Photo> = Vec::new();
     let mut number = |photo| {

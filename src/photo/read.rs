@@ -4,6 +4,7 @@ use super::decode::{self, Decoded};
 use super::kind::stem;
 use super::light::Light;
 use super::mask::Mask;
+use super::overlay::Overlay;
 use super::resize;
 use super::straighten::Straightening;
 use super::turn::Turn;
@@ -56,7 +57,8 @@ pub struct Photo {
     pub fine: Option<Arc<Plane<f32>>>,
     /// Pixels of the file whose values are not finite numbers, which are read as black.
     pub lost_pixels: usize,
-    /// Which pixels are used; `None` = all. Those that are not continue the others smoothly in `image`.
+    /// Which pixels are used; `None` = all. Those that are not continue the others smoothly in `image`, apart
+    /// from what hides the scene in every photo.
     #[serde(default)]
     pub coverage: Option<Coverage>,
     /// Whether a mask has a part in `coverage`.
@@ -73,6 +75,9 @@ pub struct Photo {
     pub gravity: Option<DVec3>,
     /// Exposure, white balance and vignetting that were taken out of `image`.
     pub light: Light,
+    /// Part of what `coverage` leaves out, while cameras are looked for.
+    #[serde(skip)]
+    pub overlay: Option<Overlay>,
 }
 
 impl Photo {
@@ -104,7 +109,18 @@ impl Photo {
         }
         let PlainBorder { left, right, .. } = self.border;
         self.border = PlainBorder { left: right, right: left, ..self.border };
+        self.to_working = self.mirrored_to_working();
         self.turn.mirrored = false;
+    }
+
+    /// [`Photo::to_working`] of the mirrored photo: bars that were cut off are on the other side.
+    pub fn mirrored_to_working(&self) -> Affine {
+        let mut map = self.to_working;
+        if self.is_cut() {
+            let whole = map.scale[0] * f64::from(self.original_size.0);
+            map.offset[0] = self.image.width as f64 - whole - map.offset[0];
+        }
+        map
     }
 
     /// What renders are compared with.
@@ -115,6 +131,72 @@ impl Photo {
     /// Whether a working pixel is used.
     pub fn uses(&self, index: usize) -> bool {
         self.coverage.as_ref().is_none_or(|c| c.uses(index))
+    }
+
+    /// Leaves `hidden` out of [`Photo::coverage`], instead of the overlay that was left out so far.
+    pub fn set_overlay(&mut self, hidden: Option<Plane<bool>>) {
+        let before = match self.overlay.take() {
+            Some(overlay) => overlay.before,
+            None => self.coverage.take(),
+        };
+        match hidden {
+            None => self.coverage = before,
+            Some(hidden) => {
+                self.coverage = Some(Coverage::without(before.as_ref(), &hidden));
+                self.overlay = Some(Overlay { hidden, before });
+            }
+        }
+    }
+
+    /// Cuts off what lies beside the picture, `bars` working pixels on each side.
+    pub fn cut(&mut self, bars: PlainBorder) {
+        let (w, h) = (self.image.width, self.image.height);
+        self.image = bars.crop(&self.image);
+        if let Some(coverage) = &mut self.coverage {
+            let (width, height) = (self.image.width, self.image.height);
+            coverage.share = coverage.share.cropped((bars.left, bars.top), (width, height));
+        }
+        self.fine = self.fine.take().map(|fine| {
+            let to = |n: usize, side: usize, of: usize| (n * side + of / 2) / of;
+            let (x, y) = (to(bars.left, fine.width, w), to(bars.top, fine.height, h));
+            let width = to(self.image.width, fine.width, w).min(fine.width - x);
+            let height = to(self.image.height, fine.height, h).min(fine.height - y);
+            Arc::new(fine.cropped((x, y), (width, height)))
+        });
+        let less = |border: usize, bar: usize| border.saturating_sub(bar);
+        self.border = PlainBorder {
+            left: less(self.border.left, bars.left),
+            top: less(self.border.top, bars.top),
+            right: less(self.border.right, bars.right),
+            bottom: less(self.border.bottom, bars.bottom),
+        };
+        self.to_working = self.to_working.then(&Affine::crop(bars.left as f64, bars.top as f64));
+    }
+
+    /// Whether bars were cut off.
+    pub fn is_cut(&self) -> bool {
+        self.picture_size() != [self.original_size.0, self.original_size.1].map(f64::from)
+    }
+
+    /// Width and height of the picture without its bars, pixels of the file.
+    pub fn picture_size(&self) -> [f64; 2] {
+        let whole = [self.original_size.0, self.original_size.1].map(f64::from);
+        let shown = [self.image.width, self.image.height].map(|n| n as f64);
+        let full = [0, 1].map(|k| (whole[k] * self.to_working.scale[k]).round());
+        if shown == full { whole } else { [0, 1].map(|k| shown[k] / self.to_working.scale[k]) }
+    }
+
+    /// How far the middle of the picture is from that of the file, pixels of the file. Bars may be drawn over a photo, or frame a
+    /// whole one: the optical axis is near one of the two.
+    pub fn off_middle(&self) -> f64 {
+        let middle = [self.image.width, self.image.height].map(|n| 0.5 * n as f64);
+        let [x, y] = self.to_working.inverse().apply(middle);
+        match self.is_cut() {
+            true => {
+                (x - 0.5 * f64::from(self.original_size.0)).hypot(y - 0.5 * f64::from(self.original_size.1))
+            }
+            false => 0.0,
+        }
     }
 
     /// Working pixels per original pixel.
@@ -276,6 +358,7 @@ fn bare(name: &Path, (w, h): (usize, usize), image: RgbImage) -> Photo {
         camera_model: None,
         gravity: None,
         light: Light::NONE,
+        overlay: None,
     }
 }
 
@@ -311,4 +394,36 @@ pub fn working_size(w: usize, h: usize, max_size: usize) -> (usize, usize) {
     }
     let scaled = |side: usize| ((side * target + long / 2) / long).max(1);
     (scaled(w), scaled(h))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cleared_overlays_leave_the_mask() {
+        let (width, height) = (64, 64);
+        let image = RgbImage { width, height, data: vec![[0.5; 3]; width * height] };
+        let mut photo = from_pixels("a.png".as_ref(), &image, None, 64).unwrap();
+        let plane = |of: &dyn Fn(usize) -> bool| Plane {
+            width,
+            height,
+            data: (0..width * height).map(|i| of(i % width)).collect::<Vec<bool>>(),
+        };
+        let used = |photo: &Photo| [2, 12, 40].map(|i| photo.uses(i));
+        photo.set_overlay(Some(plane(&|x| x < 10)));
+        assert_eq!(used(&photo), [false, true, true]);
+        photo.set_overlay(None);
+        assert_eq!((photo.coverage.clone(), used(&photo)), (None, [true; 3]));
+        // With a mask whose left part the overlay covers.
+        let mask = Coverage::without(None, &plane(&|x| (5..20).contains(&x)));
+        photo.coverage = Some(mask.clone());
+        photo.set_overlay(Some(plane(&|x| x < 10)));
+        assert_eq!(used(&photo), [false, false, true]);
+        assert!(photo.coverage.as_ref().is_some_and(|c| c.outside == Outside::Unknown));
+        photo.set_overlay(Some(plane(&|x| x == 40)));
+        assert_eq!(used(&photo), [true, false, false]);
+        photo.set_overlay(None);
+        assert_eq!(photo.coverage, Some(mask));
+    }
 }

@@ -2,11 +2,11 @@
 //! together show what all show.
 use super::matching::{Keypoints, mutual_matches, valid_area};
 use super::overlap::{self, SimilarityInliers};
-use super::{sharpness, sift};
+use super::{sharpness, sift, still};
 use crate::Result;
 use crate::photo::{self, Candidate, PlainBorder};
 use crate::progress::Progress;
-use crate::scene::RgbImage;
+use crate::scene::{Coverage, Plane, RgbImage};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -151,21 +151,39 @@ struct CandidateFeatures {
     signature: Vec<f32>,
 }
 
-impl CandidateFeatures {
-    fn of(image: &RgbImage) -> CandidateFeatures {
-        let sharpness = sharpness::of(image);
+/// A candidate at the size at which it is compared.
+struct Look {
+    small: RgbImage,
+    sharpness: f64,
+}
+
+impl Look {
+    fn of(image: &RgbImage) -> Look {
         let scale = (FEATURE_SIDE as f64 / image.width.max(image.height) as f64).min(1.0);
         let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
         let small = image.resized_by_area(to(image.width), to(image.height));
+        Look { small, sharpness: sharpness::of(image) }
+    }
+
+    /// Features of the scene: `overlay` is what stands still in the frame.
+    fn features(&self, overlay: Option<&Plane<bool>>) -> CandidateFeatures {
+        let small = &self.small;
         // Margin 4: the descriptor's window at the finest scale.
-        let valid = valid_area(&small, PlainBorder::default(), None, 4);
+        let coverage = overlay.map(|hidden| Coverage::without(None, hidden));
+        let valid = valid_area(small, PlainBorder::default(), coverage.as_ref(), 4);
         CandidateFeatures {
             features: sift::detect(&small.luma(), &valid, FEATURES),
             diagonal: (small.width as f64).hypot(small.height as f64),
-            sharpness,
+            sharpness: self.sharpness,
             signature: small.resized_by_area(8, 8).data.into_iter().flatten().collect(),
         }
     }
+}
+
+/// Features of all candidates, without what stands still in all photos of one size.
+fn features(looks: &[Look]) -> Vec<CandidateFeatures> {
+    let overlays = still::overlays(looks.iter().map(|l| &l.small));
+    looks.par_iter().zip(&overlays).map(|(look, overlay)| look.features(overlay.as_ref())).collect()
 }
 
 /// Indices of the chosen candidates in order, and the reasons. Deterministic.
@@ -178,14 +196,15 @@ pub fn choose(
     let done = AtomicU64::new(0);
     let look = |c: &Candidate| {
         progress.check()?;
-        let seen = c.thumbnail(sharpness::SIDE, progress)?.map(|image| CandidateFeatures::of(&image));
+        let seen = c.thumbnail(sharpness::SIDE, progress)?.map(|image| Look::of(&image));
         progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
         Ok(seen)
     };
-    let looks: Vec<Result<Option<CandidateFeatures>>> = candidates.par_iter().map(look).collect();
+    let looks: Vec<Result<Option<Look>>> = candidates.par_iter().map(look).collect();
     let looks = looks.into_iter().collect::<Result<Vec<_>>>()?;
     let there: Vec<usize> = (0..looks.len()).filter(|i| looks[*i].is_some()).collect();
-    let seen: Vec<CandidateFeatures> = looks.into_iter().flatten().collect();
+    let looks: Vec<Look> = looks.into_iter().flatten().collect();
+    let seen = features(&looks);
     progress.end();
     photo::photo_count(seen.len(), Some(wanted))?;
     let links = links(&seen, progress)?;

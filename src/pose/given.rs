@@ -150,9 +150,14 @@ fn at_working_size(photo: &Photo, own: &GivenCamera, pixels: Pixels) -> GivenCam
     let quarters = if pixels == Pixels::Stored { photo.turn.quarters } else { 0 };
     let GivenCamera { camera, lens } = own.turned(quarters);
     let size = (photo.image.width as u32, photo.image.height as u32);
-    let camera = match (camera.width, camera.height) == photo.original_size {
-        true => photo.to_working.camera(&camera, size),
-        false => camera.resized(size.0, size.1),
+    let to_working = match pixels == Pixels::Stored && photo.turn.mirrored {
+        true => photo.mirrored_to_working(),
+        false => photo.to_working,
+    };
+    let whole = photo.original_size;
+    let camera = match (camera.width, camera.height) == whole {
+        true => to_working.camera(&camera, size),
+        false => to_working.camera(&camera.resized(whole.0, whole.1), size),
     };
     GivenCamera { camera, lens }
 }
@@ -250,7 +255,7 @@ fn obeying(matches: &[Match], (a, one): (&Keypoints, &Seen), (b, other): (&Keypo
 mod tests {
     use super::super::testing;
     use super::*;
-    use crate::photo::{Turn, from_pixels};
+    use crate::photo::{PlainBorder, Turn, from_pixels};
     use crate::progress::{Recorded, Silent};
     use crate::scene::{Pose, RgbImage};
 
@@ -272,6 +277,19 @@ mod tests {
         assert_eq!((half.width, half.height, half.fx, half.cx, half.cy), (80, 64, 50.0, 30.0, 25.0));
         let error = of(128, 128).unwrap_err();
         assert!(error.exit_code() == 2 && error.to_string().contains("the aspects differ"), "{error}");
+    }
+
+    #[test]
+    fn cameras_of_cut_photos_are_of_whole_files() {
+        let cut = |mirrored| {
+            let mut photo = Photo { turn: Turn { quarters: 0, mirrored }, ..photo(160, 128, 0) };
+            photo.cut(PlainBorder { left: 20, top: 8, right: 0, bottom: 0 });
+            let camera = assign(&mut [photo], &[camera(80, 64)], &Silent).unwrap().remove(0);
+            (camera.width, camera.height, camera.fx, camera.cx, camera.cy)
+        };
+        assert_eq!(cut(false), (140, 120, 200.0, 100.0, 92.0));
+        // The bar on the left is on the right of the stored pixels, which the camera is of.
+        assert_eq!(cut(true), (140, 120, 200.0, 120.0, 92.0));
     }
 
     #[test]

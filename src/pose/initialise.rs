@@ -4,7 +4,7 @@ use super::confidence::{DOUBTFUL, DOUBTFUL_ROTATION, UNSURE_FOCAL};
 use super::leave_out::{self, Placed};
 use super::sharpness::warn_of_blur;
 use super::stereo::{self, StereoOptions};
-use super::{Geometry, Keypoints, SparseModel, given, light, sfm};
+use super::{Geometry, Keypoints, SparseModel, given, light, sfm, still};
 use crate::Result;
 use crate::gpu::Device;
 use crate::infer::Registry;
@@ -37,20 +37,28 @@ pub fn place(
 ) -> Result<SolvedCameras> {
     let known = cameras.map(|given| given::assign(&mut photos, given, progress)).transpose()?;
     warn_of_blur(&photos, progress);
+    still::mark(&mut photos);
     let features = learned_features(&photos, registry, progress)?;
     let Placed { photos, model, left_out } = match known {
         Some(known) => {
+            still::clear_scene(&mut photos, &known);
             let model = sfm::with_cameras(&photos, &known, &features, progress)?;
             Placed { photos, model, left_out: Vec::new() }
         }
         None => leave_out::place(photos, features, seed, progress)?,
     };
+    if let Some(overlay) = still::description(&photos) {
+        progress.warn(&format!(
+            "something stands still in every photo while the scene moves ({overlay}): it is left out of the scene; photos without it \
+             serve better"
+        ));
+    }
     warn_of_doubt(&photos, &model, progress);
     warn_of_misfits(&photos, &model, progress);
     progress.check()?;
     let mut photos = photos;
-    // Only the cameras were measured on them.
-    photos.iter_mut().for_each(|p| p.fine = None);
+    // Only the cameras were measured on the fine images, and only they decide what of the overlays is scene.
+    photos.iter_mut().for_each(|p| (p.fine, p.overlay) = (None, None));
     for ((photo, fitted), camera) in photos.iter_mut().zip(&model.fitted).zip(&model.cameras) {
         photo.straighten(fitted.lens, camera);
     }

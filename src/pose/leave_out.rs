@@ -5,9 +5,10 @@ use super::choose::{LeftOut, Reason};
 use super::confidence::DOUBTFUL;
 use super::matching::Keypoints;
 use super::sfm::{self, Unplaced};
-use crate::Result;
+use super::still;
 use crate::photo::Photo;
 use crate::progress::Progress;
+use crate::{Error, Result};
 
 /// Photos that have cameras.
 pub(super) struct Placed {
@@ -29,19 +30,35 @@ pub(super) fn place(
     let mut left_out = Vec::new();
     loop {
         let found = sfm::reconstruct(&photos, &features, seed, progress);
+        if let Ok(model) = &found
+            && still::clear_scene(&mut photos, &model.cameras)
+        {
+            continue;
+        }
         let views: Vec<(usize, Reason)> = match &found {
             Ok(model) => least_sure(model).into_iter().collect(),
             Err(Unplaced { views, .. }) => views.clone(),
         };
         let rest = photos.len() - views.len();
         if views.is_empty() || rest < 2 || 2 * rest <= given {
-            return Ok(Placed { photos, model: found?, left_out });
+            let model = found.map_err(|unplaced| with_overlay(unplaced.error, &photos))?;
+            return Ok(Placed { photos, model, left_out });
         }
         for (view, reason) in views.into_iter().rev() {
             let photo = taken_out(&mut photos, &mut features, view);
             progress.warn(&message(&photo.stem, &reason));
             left_out.push(LeftOut { photo: photo.stem, reason });
         }
+    }
+}
+
+/// Names what stands still in the frame where it may be why the rest was not enough.
+fn with_overlay(error: Error, photos: &[Photo]) -> Error {
+    match (still::description(photos), error) {
+        (Some(overlay), Error::Input(text)) => Error::input(format!(
+            "{text}; something stands still in every photo and does not count ({overlay}): give the photos without it"
+        )),
+        (_, error) => error,
     }
 }
 
@@ -100,6 +117,44 @@ mod tests {
         assert!(recorded.warnings()[0].starts_with("sky is left out: it shares too little"));
         let e = crate::pose::align::pose_errors(&placed.model.cameras, &truth.cameras, truth.mean_depth);
         assert!(e.rotation_degrees.iter().all(|v| *v < 0.05), "{e:?}");
+    }
+
+    #[test]
+    fn a_watermark_does_not_hold_the_cameras() {
+        let mut truth = testing::train(&testing::folder());
+        for photo in &mut truth.photos {
+            crate::synth::Spoil::Watermark.draw_over(&mut photo.image);
+        }
+        let errors = |photos: Vec<Photo>| {
+            let placed = place(photos, Vec::new(), 0, &Silent).unwrap();
+            assert_eq!(placed.photos.len(), 4);
+            crate::pose::align::pose_errors(&placed.model.cameras, &truth.cameras, truth.mean_depth)
+                .rotation_degrees
+        };
+        let mut marked = truth.photos.clone();
+        still::mark(&mut marked);
+        let found = errors(marked);
+        println!("{found:?}");
+        assert!(found.iter().all(|v| *v < 0.1), "{found:?}");
+    }
+
+    #[test]
+    fn an_overlay_that_leaves_too_little_is_named() {
+        let truth = testing::train(&testing::folder());
+        let small = |p: &Photo| Photo { fine: None, ..crate::photo::load_at(&p.path, 320).unwrap() };
+        let mut photos: Vec<Photo> = truth.photos[..2].iter().map(small).collect();
+        for photo in &mut photos {
+            // All but a strip of it.
+            let (width, height) = (photo.image.width, photo.image.height);
+            let data = (0..width * height).map(|i| i / width > 20).collect();
+            photo.set_overlay(Some(crate::scene::Plane { width, height, data }));
+        }
+        let error = place(photos, Vec::new(), 0, &Silent).err().unwrap();
+        assert!(error.exit_code() == 2, "{error}");
+        assert!(
+            error.to_string().contains("something stands still in every photo and does not count"),
+            "{error}"
+        );
     }
 
     #[test]

@@ -23,6 +23,7 @@ pub mod sfm;
 mod sharpness;
 mod sift;
 pub mod stereo;
+mod still;
 #[cfg(test)]
 mod testing;
 mod two_view;

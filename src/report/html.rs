@@ -34,20 +34,20 @@ fn figure(image: &RgbImage, caption: &str) -> Result<String> {
 fn page(report: &HtmlReport) -> Result<String> {
     let title = escape(report.title);
     let mut body = format!("<header><h1>{title}</h1><p>{}</p></header>", escape(&report.run.program));
+    if !report.run.warnings.is_empty() {
+        let items: String = report.run.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
+        // Writing to a String cannot fail.
+        let _ = write!(body, "<section class=\"note\"><h2>Warnings</h2><ul>{items}</ul></section>");
+    }
     body.push_str("<section class=\"figures\">");
     // The device stands with the times below and the answers have their own section: cards are for short figures.
     for (label, value) in report.figures.iter().filter(|(l, _)| l != "device" && !l.starts_with('“')) {
-        // Writing to a String cannot fail.
         let _ = write!(body, "<div><b>{}</b><span>{}</span></div>", escape(value), escape(label));
     }
     body.push_str("</section>");
     if let Some(scene) = &report.scene {
         let (section, note) = scene.embedded()?;
         let _ = write!(body, "{section}<p class=\"small\">{}</p>", escape(&note));
-    }
-    if !report.run.warnings.is_empty() {
-        let items: String = report.run.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
-        let _ = write!(body, "<section class=\"note\"><h2>Warnings</h2><ul>{items}</ul></section>");
     }
     body.push_str(&queries(report)?);
     body.push_str("<section><h2>Views</h2>");

@@ -57,13 +57,15 @@ pub fn reconstruct(
     plan: &RunPlan,
     device: &Device,
     registry: &Registry,
-    photos: Vec<Photo>,
+    mut photos: Vec<Photo>,
     progress: &dyn Progress,
 ) -> Result<RunOutcome> {
     photo::check_set(&photos)?;
+    let progress = &Recorded::new(progress);
+    photo::cut_bars(&mut photos, progress);
     let sizes: Vec<_> = photos.iter().map(|p| (p.image.width, p.image.height)).collect();
     plan.check_budget(device, &sizes, usize::MAX)?;
-    work(plan, device, registry, None, photos, &Store::none(), &Recorded::new(progress))
+    work(plan, device, registry, None, photos, &Store::none(), progress)
 }
 
 /// Writes what [`reconstruct`] made as a scene directory, whole or not at all; `force` replaces a scene.
@@ -112,6 +114,7 @@ fn joining(
         progress.step(photos.len() as u64, "");
     }
     progress.end();
+    photo::cut_bars(&mut photos, progress);
     let mut photos = base.without_its_own(photos, progress)?;
     photo::settle(&mut photos, &base.known.photos, progress);
     base.check(&photos)?;
@@ -152,9 +155,7 @@ fn work(
     let PlacedPhotos { photos, left_out, .. } = made.take(scene.placed)?;
     let frames = made.take(scene.frames)?;
     let psnr = super::fidelity::psnr(&frames, &photos);
-    if let Some(text) = super::fidelity::warning(&photos, &psnr) {
-        progress.warn(&text);
-    }
+    super::fidelity::warn(&photos, &psnr, progress);
     let mut geometry = made.take(scene.geometry)?;
     if let Some(base) = base {
         let new = std::mem::replace(&mut geometry.points, base.points.clone());

@@ -3,6 +3,8 @@ use super::view::DecodedFrame;
 use crate::fit::MOST_PSNR;
 use crate::pass::metrics;
 use crate::photo::Photo;
+use crate::pose::Confidence;
+use crate::progress::{Progress, Recorded};
 use crate::scene::Coverage;
 use rayon::prelude::*;
 
@@ -12,6 +14,10 @@ const FAR_BELOW: f64 = 6.0;
 /// A photo that is shown this well, dB, is not said to be shown badly, however much better others are: photos that were added last
 /// have seen the fewest steps, and photos that something hides are at 13 to 25 dB.
 const GOOD: f64 = 30.0;
+/// Photos that come out below this on average, dB, are not what the scene shows: …
+const POOR: f64 = 22.0;
+/// … and below this the scene is of no use, and its cameras are as doubtful.
+const BAD: f64 = 18.0;
 
 /// How well the frames of a finished scene show its photos, dB: the language stage has moved its splats since the colours were
 /// trained.
@@ -27,16 +33,47 @@ pub(super) fn psnr(frames: &[DecodedFrame], photos: &[Photo]) -> Vec<f64> {
 /// Mean over the photos and their range, for the closing table.
 pub(super) fn figure(psnr: &[f64]) -> (String, String) {
     let (low, high) = range(psnr);
-    let mean = psnr.iter().sum::<f64>() / psnr.len().max(1) as f64;
-    let text = format!("{mean:.2} dB ({low:.1} to {high:.1})");
+    let text = format!("{:.2} dB ({low:.1} to {high:.1})", mean(psnr));
     ("train PSNR".to_owned(), text)
 }
 
-/// Names the photos that the scene shows far worse than the best one.
-pub(super) fn warning(photos: &[Photo], psnr: &[f64]) -> Option<String> {
-    warning_about(photos.iter().map(|p| p.stem.as_str()), psnr)
+/// Warns where the scene shows its photos badly: first of all if that is true of all of them, then by name.
+pub(super) fn warn(photos: &[Photo], psnr: &[f64], progress: &Recorded) {
+    if let Some(text) = warning_about(photos.iter().map(|p| p.stem.as_str()), psnr) {
+        progress.warn(&text);
+    }
+    if let Some(text) = overall_warning(psnr) {
+        progress.warn_first(&text);
+    }
 }
 
+/// The line that a summary begins with where the scene shows all of its photos badly.
+pub(super) fn heading(psnr: &[f64]) -> String {
+    overall_warning(psnr).map_or_else(String::new, |text| format!("  warning: {text}\n"))
+}
+
+/// Says that the scene shows all of its photos badly, which a comparison among them cannot tell.
+fn overall_warning(psnr: &[f64]) -> Option<String> {
+    (ceiling(psnr) < Confidence::High).then(|| {
+        format!(
+            "photos are reproduced at {:.1} dB only ({GOOD:.0} or more is usual): the cameras may be wrong, or much of what the \
+             photos show moved, hides the scene or stands still in the frame; compare the previews with the photos",
+            mean(psnr)
+        )
+    })
+}
+
+/// The most confidence in the cameras of a scene that shows its photos so: cameras that are right show them well.
+pub(super) fn ceiling(psnr: &[f64]) -> Confidence {
+    match mean(psnr) {
+        _ if psnr.is_empty() => Confidence::High,
+        mean if mean < BAD => Confidence::Low,
+        mean if mean < POOR => Confidence::Medium,
+        _ => Confidence::High,
+    }
+}
+
+/// Names the photos that the scene shows far worse than the best one.
 fn warning_about<'a>(names: impl Iterator<Item = &'a str>, psnr: &[f64]) -> Option<String> {
     let (_, best) = range(psnr);
     let poor: Vec<String> = names
@@ -51,6 +88,10 @@ fn warning_about<'a>(names: impl Iterator<Item = &'a str>, psnr: &[f64]) -> Opti
             poor.join(", ")
         )
     })
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len().max(1) as f64
 }
 
 fn range(values: &[f64]) -> (f64, f64) {
@@ -70,6 +111,16 @@ mod tests {
         assert_eq!(warning([38.0, 30.1, 36.0, 37.0]), None);
         let text = warning([32.0, 13.3, 34.0, 31.0]).unwrap();
         assert!(text.contains("shows b (13.3 dB) far worse than the best photo (34.0 dB)"), "{text}");
+    }
+
+    #[test]
+    fn photos_all_shown_badly_are_said_so() {
+        assert_eq!(overall_warning(&[25.0, 27.0, 24.0]), None);
+        assert_eq!(ceiling(&[25.0, 27.0, 24.0]), Confidence::High);
+        let text = overall_warning(&[9.4, 9.6]).unwrap();
+        assert!(text.starts_with("photos are reproduced at 9.5 dB only (30 or more is usual)"), "{text}");
+        assert_eq!((ceiling(&[9.4, 9.6]), ceiling(&[20.0, 21.0])), (Confidence::Low, Confidence::Medium));
+        assert_eq!(ceiling(&[]), Confidence::High);
     }
 
     #[test]

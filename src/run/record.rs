@@ -79,7 +79,7 @@ fn added(o: &RunOutcome) -> Option<serde_json::Value> {
     let one = |v: usize| {
         let fitted = &o.geometry.fitted[v];
         json!({
-            "photo": o.photos[v].stem, "confidence": fitted.confidence(), "agreement": fitted.agreement,
+            "photo": o.photos[v].stem, "confidence": confidence(fitted, &o.psnr), "agreement": fitted.agreement,
             "rotation_sigma_degrees": fitted.rotation_sigma.to_degrees(), "psnr": o.psnr.get(v),
         })
     };
@@ -94,7 +94,7 @@ fn added_figures(o: &RunOutcome) -> Vec<(String, String)> {
         return Vec::new();
     }
     let one = |v: usize| {
-        let confidence = o.geometry.fitted[v].confidence().name();
+        let confidence = confidence(&o.geometry.fitted[v], &o.psnr).name();
         let psnr = o.psnr.get(v).copied().unwrap_or(0.0);
         ("added".to_owned(), format!("{}: {confidence} confidence, {psnr:.2} dB", o.photos[v].stem))
     };
@@ -111,7 +111,8 @@ fn optics(o: &RunOutcome) -> Vec<serde_json::Value> {
             "sigma": { "log_focal": fitted.sigmas[0], "k1": fitted.sigmas[1], "k2": fitted.sigmas[2],
                 "cx": fitted.sigmas[3], "cy": fitted.sigmas[4] },
             "residual_px": fitted.residual, "agreement": fitted.agreement, "camera": fitted.camera,
-            "rotation_sigma_degrees": fitted.rotation_sigma.to_degrees(), "confidence": fitted.confidence(),
+            "rotation_sigma_degrees": fitted.rotation_sigma.to_degrees(),
+            "confidence": confidence(fitted, &o.psnr),
         })
     };
     o.photos.iter().zip(&o.cameras).zip(&o.geometry.fitted).map(one).collect()
@@ -139,9 +140,14 @@ fn focal_figure(photos: &[Photo], cameras: &[Camera], fitted: &[Fitted]) -> Opti
     }
 }
 
+/// Trust in the camera of a photo: what the cameras say of themselves, and no more than how well the scene shows the photos.
+fn confidence(fitted: &Fitted, psnr: &[f64]) -> Confidence {
+    fitted.confidence().min(super::fidelity::ceiling(psnr))
+}
+
 /// How far the cameras are to be trusted: that of the worst, and which are worse than the best.
-fn confidence_figure(photos: &[Photo], fitted: &[Fitted]) -> Option<String> {
-    let levels: Vec<Confidence> = fitted.iter().map(Fitted::confidence).collect();
+fn confidence_figure(photos: &[Photo], fitted: &[Fitted], psnr: &[f64]) -> Option<String> {
+    let levels: Vec<Confidence> = fitted.iter().map(|f| confidence(f, psnr)).collect();
     let (worst, best) = (levels.iter().min()?, levels.iter().max()?);
     let named = photos.iter().zip(&levels).filter(|(_, l)| *l < best).map(|(p, _)| p.stem.as_str());
     let named: Vec<&str> = named.collect();
@@ -234,7 +240,9 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
     list.extend(
         focal_figure(&o.photos, &o.cameras, &o.geometry.fitted).map(|text| ("focal length".to_owned(), text)),
     );
-    list.extend(confidence_figure(&o.photos, &o.geometry.fitted).map(|text| ("cameras".to_owned(), text)));
+    list.extend(
+        confidence_figure(&o.photos, &o.geometry.fitted, &o.psnr).map(|text| ("cameras".to_owned(), text)),
+    );
     list.extend(lens_figure(o).map(|text| ("lens".to_owned(), text)));
     list.push(up_figure(&o.world));
     list.extend(super::light::figure(&o.photos));
@@ -311,13 +319,13 @@ pub(super) fn sizes(photos: &[Photo]) -> String {
     // More than a few sizes would not fit a line; run.json has them all.
     let shown: Vec<String> = pairs.iter().take(3).map(one).collect();
     let more = if pairs.len() > 3 { ", …" } else { "" };
-    let hint = if pairs.iter().any(scaled) { " (--max-size changes it)" } else { "" };
+    let hint = if photos.iter().any(|p| p.zoom() < 1.0) { " (--max-size changes it)" } else { "" };
     format!("{} at {}{more}{hint}", photos.len(), shown.join(", "))
 }
 
-/// The table that ends `splatvk run`.
+/// The table that ends `splatvk run`; where the scene is of doubtful quality that stands first.
 pub fn closing_table(o: &RunOutcome) -> String {
-    report::table(&o.stages, o.seconds, &figures(o))
+    super::fidelity::heading(&o.psnr) + &report::table(&o.stages, o.seconds, &figures(o))
 }
 
 /// Writes `run.json`, `report.html` and `previews/`.

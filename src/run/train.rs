@@ -231,9 +231,7 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let (photos, geometry) = (made.take(placed)?.photos, made.take(geometry)?);
     let trained = made.take(trained)?;
     let world = World { up: made.take(up)?, scale: None };
-    if let Some(text) = super::fidelity::warning(&photos, &trained.stats.psnr) {
-        progress.warn(&text);
-    }
+    super::fidelity::warn(&photos, &trained.stats.psnr, progress);
 
     let seen = super::view::seen(&device, &trained.splats, &trained.cameras, progress)?;
     progress.begin("write", 1);
@@ -323,7 +321,8 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     report::write_previews(workspace.path(), &shown)?;
     progress.check()?;
     workspace.commit()?;
-    let table = report::table(&record.stages, record.seconds, &figures);
+    let table = super::fidelity::heading(&trained.stats.psnr)
+        + &report::table(&record.stages, record.seconds, &figures);
     Ok(TrainOutcome { record, table })
 }
 

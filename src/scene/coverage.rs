@@ -38,6 +38,18 @@ impl Coverage {
         Plane { data: self.share.data.iter().map(weight).collect(), ..self.share.clone() }
     }
 
+    /// What is left of a coverage, or of everything, where something hides the scene; nothing is known of what it hides.
+    pub fn without(before: Option<&Coverage>, hidden: &Plane<bool>) -> Coverage {
+        let left = |(i, hidden): (usize, &bool)| match before {
+            _ if *hidden => 0.0,
+            Some(before) => before.share.data[i],
+            None => 1.0,
+        };
+        let data = hidden.data.iter().enumerate().map(left).collect();
+        let share = Plane { width: hidden.width, height: hidden.height, data };
+        Coverage { share, outside: Outside::Unknown }
+    }
+
     /// What a render is compared with: on black, where nothing is there.
     pub fn target(&self, image: &RgbImage) -> RgbImage {
         match self.outside {

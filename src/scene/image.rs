@@ -25,6 +25,12 @@ impl<T: Copy> Plane<T> {
     pub fn at(&self, x: usize, y: usize) -> T {
         self.data[y * self.width + x]
     }
+
+    /// The part of a size (width, height) whose first pixel is at column x, row y.
+    pub fn cropped(&self, (x, y): (usize, usize), (width, height): (usize, usize)) -> Plane<T> {
+        let row = |r: usize| self.data[(y + r) * self.width + x..][..width].iter().copied();
+        Plane { width, height, data: (0..height).flat_map(row).collect() }
+    }
 }
 
 /// An RGB image: `[H, W, 3]` in [0, 1].

@@ -2,6 +2,7 @@
 mod flat;
 mod folder;
 mod outdoor;
+mod overlay;
 mod phone;
 mod photos;
 pub mod regions;

@@ -75,8 +75,11 @@ impl<'a> Photos<'a> {
         };
         let scene = self.other.as_ref().filter(|_| elsewhere).unwrap_or(self.scene);
         let mut seen = render::photo(scene, &self.scene.photo_effects[i], self.spec.photo_noise, seed);
-        if alone && let Some(spoil) = self.spec.spoil {
-            spoil.picture(&mut seen.image);
+        if let Some(spoil) = self.spec.spoil {
+            spoil.draw_over(&mut seen.image);
+            if alone {
+                spoil.picture(&mut seen.image);
+            }
         }
         seen
     }

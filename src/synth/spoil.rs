@@ -37,11 +37,25 @@ pub enum Spoil {
     SwappedExif,
     /// Every other photo is cut out of a larger one, off its middle.
     Cropped,
+    /// A half-transparent text is tiled over every photo.
+    Watermark,
+    /// Bars with text at the top and bottom of every photo.
+    Caption,
+    /// A banner over the lower 15 % of every photo.
+    Banner,
+    /// Black bars at the top and bottom of every photo.
+    Letterbox,
+    /// A white frame over the borders of every photo.
+    Frame,
+    /// The surface of a phone above and below every photo.
+    Screenshot,
+    /// The bonnet of a car in the lower part of every photo.
+    Bonnet,
 }
 
 impl Spoil {
     /// Every way, its name and what it does.
-    pub const ALL: [(Spoil, &str, &str); 11] = [
+    pub const ALL: [(Spoil, &str, &str); 18] = [
         (Spoil::Identical, "identical", "Every photo shows what the first one does; their noise differs"),
         (Spoil::Mirrored, "mirrored", "The second photo is mirrored left to right"),
         (Spoil::Moving, "moving", "One object stands elsewhere in the second photo"),
@@ -57,6 +71,17 @@ impl Spoil {
             "cropped",
             "Every other photo is cut out of one up to 1.6 times as large, off its middle",
         ),
+        (Spoil::Watermark, "watermark", "A half-transparent text is tiled over every photo"),
+        (Spoil::Caption, "caption", "Bars with text at the top and bottom of every photo"),
+        (Spoil::Banner, "banner", "A banner over the lower 15 % of every photo"),
+        (Spoil::Letterbox, "letterbox", "Black bars over an eighth of every photo at the top and bottom"),
+        (Spoil::Frame, "frame", "A white frame over the borders of every photo"),
+        (
+            Spoil::Screenshot,
+            "screenshot",
+            "The surface of a phone over a quarter of every photo above and below",
+        ),
+        (Spoil::Bonnet, "bonnet", "The bonnet of a car in the lower part of every photo"),
     ];
 
     /// Spoils a photo that is spoilt as a picture; others stay what they are.

@@ -54,7 +54,7 @@ pub fn with_cameras(
         // Nothing is drawn where cameras are known.
         seed: 0,
     };
-    let mut putative = putative_matches(&families, progress)?;
+    let mut putative = putative_matches(photos, &families, progress)?;
     for pair in &mut putative {
         let (a, b) = (&cameras[pair.first], &cameras[pair.second]);
         pair.list.iter_mut().for_each(|m| (m.0, m.1) = (flat(a, m.0), flat(b, m.1)));

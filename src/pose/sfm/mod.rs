@@ -60,7 +60,7 @@ pub fn reconstruct(
     progress.step(0, "corners");
     let mut families = corner_families(photos, features, progress)?;
     progress.step(1, "matches");
-    let putative = relate::putative_matches(&families, progress)?;
+    let putative = relate::putative_matches(photos, &families, progress)?;
     let flat = relate::flat_photos(photos, &putative, seed);
     let empty = empty_model(photos, &flat, seed);
     let Related { putative, pairs } = relate::related(photos, &mut families, putative, &empty, progress)?;
@@ -109,7 +109,8 @@ fn separable(photos: &[Photo], group: &[usize]) -> Vec<usize> {
 /// directions at right angles at most, and what looks like a third has another reason.
 fn empty_model(photos: &[Photo], flat: &[bool], seed: u64) -> Model {
     let zoom: Vec<f64> = photos.iter().map(Photo::zoom).collect();
-    let long = |v: usize| photos[v].original_size.0.max(photos[v].original_size.1);
+    let sides = |v: usize| photos[v].picture_size();
+    let long = |v: usize| f64::max(sides(v)[0], sides(v)[1]);
     let group = crate::photo::cameras_by_file(photos);
     // The first photo of each group stands for it.
     let cameras = group.iter().max().map_or(0, |g| g + 1);
@@ -127,17 +128,16 @@ fn empty_model(photos: &[Photo], flat: &[bool], seed: u64) -> Model {
                         photos.iter().zip(flat).zip(&group).filter(|((_, flat), of)| !**flat && **of == g);
                     let images = deep.map(|((p, _), _)| &p.image);
                     let LogFocal { mean, sigma } = vanishing::log_focal(images, guess).unwrap_or(guess);
-                    (mean + (long(v) as f64).ln(), sigma)
+                    (mean + long(v).ln(), sigma)
                 }
             };
-            let short = photos[v].original_size.0.min(photos[v].original_size.1);
-            let corner = 0.5 * f64::hypot(long(v) as f64, short as f64) / log_focal.0.exp();
+            let corner = 0.5 * f64::hypot(sides(v)[0], sides(v)[1]) / log_focal.0.exp();
             // Upright photos of a camera that was turned hold its principal point in other places.
             let one_way = members().all(|p| p.original_size == photos[v].original_size);
             OpticsPrior {
                 log_focal,
                 lens: [LENS_SIGMA / corner.powi(2), 0.5 * LENS_SIGMA / corner.powi(4)],
-                shift: if one_way { SHIFT_SIGMA * long(v) as f64 } else { 0.0 },
+                shift: if one_way { (SHIFT_SIGMA * long(v)).max(photos[v].off_middle()) } else { 0.0 },
             }
         })
         .collect();

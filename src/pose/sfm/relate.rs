@@ -81,7 +81,7 @@ pub(super) fn related_to(
     known: usize,
     progress: &dyn Progress,
 ) -> Result<Related, Unplaced> {
-    let putative = putative_matches(families, progress)?;
+    let putative = putative_matches(photos, families, progress)?;
     let (putative, named) = relations(photos, families, putative, model, known, progress)?;
     if let Some((i, j, _)) = named.iter().find(|r| matches!(r.2, Relation::Same)) {
         let (old, new) = (&photos[*i].stem, &photos[*j].stem);
@@ -123,7 +123,8 @@ fn relations(
     for k in unsure {
         progress.check()?;
         let Matches { first, second, .. } = putative[k];
-        let wide = Matches { first, second, list: distinct(self::putative(families, first, second)) };
+        let mut wide = Matches { first, second, list: distinct(self::putative(families, first, second)) };
+        drop_still(photos, &mut wide);
         let relation = one(&wide);
         // So many more corners also agree by chance more often, as those of a mirrored photo.
         if relation.is_sure() {
@@ -149,10 +150,16 @@ fn unsure_pairs(photos: usize, putative: &[Matches], relations: &[Relation], kno
 }
 
 /// Matches by descriptor between all views.
-pub(super) fn putative_matches(families: &[Family], progress: &dyn Progress) -> Result<Vec<Matches>> {
+pub(super) fn putative_matches(
+    photos: &[Photo],
+    families: &[Family],
+    progress: &dyn Progress,
+) -> Result<Vec<Matches>> {
     let pair = |(first, second)| {
         let list = if progress.cancelled() { Vec::new() } else { putative(families, first, second) };
-        Matches { first, second, list }
+        let mut pair = Matches { first, second, list };
+        drop_still(photos, &mut pair);
+        pair
     };
     let views = families.first().map_or(0, |f| f.keypoints.len());
     let out = pairs_of(views).into_par_iter().map(pair).collect();
@@ -177,6 +184,18 @@ fn putative(families: &[Family], i: usize, j: usize) -> Vec<(DVec2, DVec2, Keypo
     }
     all.sort_by(|a, b| b.2.quality.total_cmp(&a.2.quality).then(a.2.first.cmp(&b.2.first)));
     all
+}
+
+/// Drops matches that stand still where something in the frame of both photos does: beside what was found of it there is more.
+fn drop_still(photos: &[Photo], pair: &mut Matches) {
+    let (a, b) = (&photos[pair.first], &photos[pair.second]);
+    if a.overlay.is_some()
+        && b.overlay.is_some()
+        && (a.image.width, a.image.height) == (b.image.width, b.image.height)
+    {
+        let still = 0.5 * THRESHOLD * a.image.width.max(a.image.height) as f64;
+        pair.list.retain(|m| (m.0 - m.1).length() > still);
+    }
 }
 
 /// Pixels within which two matches of the same two places are one.

@@ -175,7 +175,7 @@ fn a_view_in_the_wrong_place_is_the_only_one_that_disagrees() {
     let mut model = empty_model(&truth.photos, &[false; 4], 0);
     model.optics[0].focal = truth.cameras[0].fx;
     model.poses = truth.cameras.iter().map(|c| Some(c.pose)).collect();
-    let putative = relate::putative_matches(&families, &Silent).unwrap();
+    let putative = relate::putative_matches(&truth.photos, &families, &Silent).unwrap();
     let pairs = relate::related(&truth.photos, &mut families, putative, &model, &Silent).unwrap().pairs;
     let right = agreement(&model, &pairs, 3.0);
     assert!(right.iter().all(|a| *a > AGREED), "{right:?}");
@@ -212,7 +212,7 @@ fn corners_seen_from_the_side_join_photos_75_degrees_apart() {
     model.poses = [0, 3].map(|v| Some(truth.cameras[v].pose)).to_vec();
     let mut families = corner_families(&outer, &[], &Silent).unwrap();
     let right = |families: &[families::Family]| {
-        let putative = relate::putative_matches(families, &Silent).unwrap();
+        let putative = relate::putative_matches(&outer, families, &Silent).unwrap();
         (finish::inlier_matches(&model, &putative, 1.5).len(), putative[0].list.len())
     };
     let plain = right(&families);

@@ -3,16 +3,24 @@ use crate::Result;
 use crate::fit::Photos;
 use crate::infer::installed::Installed;
 use crate::photo::Photo;
-use crate::scene::{Camera, Coverage, DepthMap, RgbImage};
+use crate::scene::{Camera, Coverage, DepthMap, Outside, RgbImage};
 
 /// The working images of photos.
 pub(super) fn images(photos: &[Photo]) -> Vec<RgbImage> {
     photos.iter().map(|p| p.image.clone()).collect()
 }
 
-/// What renders of photos are compared with, and which pixels of it count.
+/// What renders of photos are compared with, and which pixels of it count; the others continue them, so that no colour of what
+/// hides the scene gets into it.
 pub(super) fn targets(photos: &[Photo]) -> (Vec<RgbImage>, Vec<Option<Coverage>>) {
-    photos.iter().map(|p| (p.target(), p.coverage.clone())).unzip()
+    let target = |p: &Photo| {
+        let mut image = p.target();
+        if p.coverage.as_ref().is_some_and(|c| c.outside == Outside::Unknown) {
+            image.fill_from_used(|i| p.uses(i));
+        }
+        (image, p.coverage.clone())
+    };
+    photos.iter().map(target).unzip()
 }
 
 /// What training compares with.
