@@ -50,7 +50,7 @@ fn is_empty(folder: &Path) -> Result<bool> {
 }
 
 /// Most names that a message lists.
-const LISTED: usize = 5;
+const LISTED: usize = 8;
 
 /// What is in `folder` and nobody knows, relative to it and with `/`: `own` gets such a name, and whether it is a folder; what is in a
 /// folder that it does not know is not looked at. Leftovers of killed processes do not count, nor what file managers write.
@@ -82,9 +82,9 @@ pub fn foreign(folder: &Path, own: &dyn Fn(&str, bool) -> bool) -> Vec<String> {
 }
 
 /// The names for a message: the first of them, and how many more there are.
-pub fn listed(names: &[String]) -> String {
+pub fn listed(names: &[impl AsRef<str>]) -> String {
     let more = names.len().saturating_sub(LISTED);
-    let first = names.iter().take(LISTED).map(String::as_str).collect::<Vec<_>>().join(", ");
+    let first = names.iter().take(LISTED).map(AsRef::as_ref).collect::<Vec<_>>().join(", ");
     if more == 0 { first } else { format!("{first} and {more} more") }
 }
 
@@ -192,8 +192,11 @@ mod tests {
         }
         let own = |name: &str, folder: bool| name.ends_with("own") || folder && name.starts_with('a');
         assert_eq!(foreign(base.path(), &own), ["a/b/mine", "c"]);
-        let names: Vec<String> = (0..7).map(|k| k.to_string()).collect();
-        assert_eq!((listed(&names[..2]), listed(&names)), ("0, 1".into(), "0, 1, 2, 3, 4 and 2 more".into()));
+        let names: Vec<String> = (0..10).map(|k| k.to_string()).collect();
+        assert_eq!(
+            (listed(&names[..2]), listed(&names)),
+            ("0, 1".into(), "0, 1, 2, 3, 4, 5, 6, 7 and 2 more".into())
+        );
         check_spared(&at("a"), [at("own").as_path(), &at("nothing")]).unwrap();
         let e = check_spared(&at("a"), [at("own").as_path(), &at("c/../a/own")]).unwrap_err();
         assert!(e.exit_code() == 2 && e.to_string().contains("c/../a/own: is read"), "{e}");

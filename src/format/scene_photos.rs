@@ -38,14 +38,7 @@ pub fn load(scene: &Path) -> Result<Vec<Photo>> {
     }
     let mut photos: Vec<Photo> = files::read_json(&file, "the scene is damaged, run again")?;
     for photo in &mut photos {
-        let path =
-            files::within(&folder.join("images"), &format!("{}.png", photo.stem)).ok_or_else(|| {
-                Error::input(format!(
-                    "{}: {:?} names a file outside of the scene; the scene is damaged, run again",
-                    file.display(),
-                    photo.stem
-                ))
-            })?;
+        let path = own_file(&folder, "images", photo)?;
         check_size(&path, photo)?;
         // Larger than any image: it is to be read as it is.
         let read = photo::load_at(&path, usize::MAX >> 16)?;
@@ -57,6 +50,17 @@ pub fn load(scene: &Path) -> Result<Vec<Photo>> {
         };
     }
     Ok(photos)
+}
+
+/// The PNG file of a photo in a folder of the scene's cameras.
+fn own_file(cameras: &Path, folder: &str, photo: &Photo) -> Result<PathBuf> {
+    files::within(&cameras.join(folder), &format!("{}.png", photo.stem)).ok_or_else(|| {
+        Error::input(format!(
+            "{}: {:?} names a file outside of the scene; the scene is damaged, run again",
+            cameras.join(PHOTOS).display(),
+            photo.stem
+        ))
+    })
 }
 
 /// Refuses a picture of another size than its photo before it is decoded: the header may state any.
@@ -75,7 +79,7 @@ fn check_size(path: &Path, photo: &Photo) -> Result<()> {
 
 /// The share of every pixel that is used.
 fn mask(cameras: &Path, photo: &Photo) -> Result<Plane<f32>> {
-    let path = cameras.join("masks").join(format!("{}.png", photo.stem));
+    let path = own_file(cameras, "masks", photo)?;
     check_size(&path, photo)?;
     let data =
         photo::stored_pixels(&path)?.to_luma8().as_raw().iter().map(|v| f32::from(*v) / 255.0).collect();

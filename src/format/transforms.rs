@@ -91,7 +91,7 @@ pub(super) fn parse(text: &str, folder: &Path) -> Result<CameraFile, String> {
     }
     let mut warnings = Vec::new();
     if !without.is_empty() {
-        warnings.push(format!("frames without transform_matrix are skipped: {}", photo::listed(&without)));
+        warnings.push(format!("frames without transform_matrix are skipped: {}", files::listed(&without)));
     }
     if moving {
         warnings.push("rolling_shutter is not used: every photo is taken to be from one place".to_owned());

@@ -1,9 +1,8 @@
 //! Which files are the photos, and how many of them the run uses.
-use super::join::listed;
 use super::kind::{READ, begins_as_photo, is_foreign_name, is_photo_name, is_raw_name, is_video_name};
 use super::twins;
 use crate::error::words;
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use std::path::{Component, Path, PathBuf};
 
 /// Largest number of views: the pair count grows with its square, and the method is made for a few photos.
@@ -87,8 +86,9 @@ fn folder_of(name: &str) -> Option<PathBuf> {
 impl FoundFiles {
     /// What of the folders is not used, a line each.
     pub fn warnings(&self) -> Vec<String> {
-        let show =
-            |list: &[&PathBuf]| listed(&list.iter().map(|p| p.display().to_string()).collect::<Vec<_>>());
+        let show = |list: &[&PathBuf]| {
+            files::listed(&list.iter().map(|p| p.display().to_string()).collect::<Vec<_>>())
+        };
         let developed = |raw: &&PathBuf| {
             self.photos.iter().any(|p| p.parent() == raw.parent() && p.file_stem() == raw.file_stem())
         };
@@ -116,7 +116,7 @@ impl FoundFiles {
                 self.twins.iter().map(|(a, b)| format!("{} for {}", name(a), name(b))).collect();
             all.push(format!(
                 "photos in two formats are used once, the file with more pixels, else the JPEG: {}",
-                listed(&pairs)
+                files::listed(&pairs)
             ));
         }
         all
@@ -135,7 +135,7 @@ fn nothing(inputs: &[PathBuf], found: &FoundFiles) -> Error {
         _ if !below.is_empty() => {
             format!(
                 "{place}: no photos in the folder itself; they are in {}: give one of these",
-                listed(&below)
+                files::listed(&below)
             )
         }
         None => {

@@ -11,14 +11,6 @@ pub fn plain_name(name: &str) -> String {
     parts.collect::<Vec<_>>().join("/")
 }
 
-/// The names of a list for a message, at most five of them.
-pub fn listed(names: &[impl AsRef<str>]) -> String {
-    const NAMED: usize = 5;
-    let shown: Vec<&str> = names.iter().take(NAMED).map(AsRef::as_ref).collect();
-    let more = if names.len() > NAMED { format!(" and {} more", names.len() - NAMED) } else { String::new() };
-    format!("{}{more}", shown.join(", "))
-}
-
 struct Name {
     folders: Vec<String>,
     file: String,

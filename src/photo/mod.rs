@@ -35,7 +35,7 @@ pub use candidate::{Candidate, gather};
 pub use choose::{DEFAULT_VIEWS, FoundFiles, MAX_VIEWS, find, find_named, photo_count, spread};
 pub use decode::stored_pixels;
 pub use header::dimensions;
-pub use join::{join, listed, plain_name, stems_apart};
+pub use join::{join, plain_name, stems_apart};
 pub use kind::{check_name, stem};
 pub use light::Light;
 pub use masks::{MaskChoice, assign as assign_masks};

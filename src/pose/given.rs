@@ -3,10 +3,10 @@ use super::matching::{Keypoints, Match, mutual_matches, valid_area};
 use super::minimal::{essential, triangulate_two};
 use super::sift;
 use super::two_view::sampson;
-use crate::photo::{Photo, join, listed};
+use crate::photo::{Photo, join};
 use crate::progress::Progress;
 use crate::scene::{Camera, GivenCamera, Lens};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
@@ -30,7 +30,7 @@ pub fn assign(photos: &mut [Photo], given: &[GivenCamera], progress: &dyn Progre
     if !turned.is_empty() {
         progress.inform(&format!(
             "the cameras are those of the stored pixels, without the EXIF orientation; they are turned with the photos: {}",
-            listed(&turned)
+            files::listed(&turned)
         ));
     }
     let mut cameras = Vec::with_capacity(photos.len());
@@ -70,7 +70,7 @@ fn joined<'a>(photos: &[Photo], given: &'a [GivenCamera]) -> Result<Vec<&'a Give
             Error::input(format!(
                 "{}: the camera file has no camera of this name; it names {}",
                 photo.path.display(),
-                listed(&names)
+                files::listed(&names)
             ))
         })
     };
@@ -97,7 +97,7 @@ fn pixels(photos: &[Photo], own: &[&GivenCamera], progress: &dyn Progress) -> Re
             progress.warn(&format!(
                 "neither sizes nor matches show whether the cameras of {} belong to the stored pixels or to the upright ones (EXIF \
                  orientation); taken as stored, as COLMAP does: if the scene is wrong, save the photos without EXIF",
-                listed(&names)
+                files::listed(&names)
             ));
             Pixels::Stored
         }),

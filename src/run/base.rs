@@ -175,7 +175,7 @@ impl BaseScene {
         let (there, new): (Vec<Photo>, Vec<Photo>) = new.into_iter().partition(known);
         let names: Vec<&str> = there.iter().map(|p| p.stem.as_str()).collect();
         let words = if names.len() == 1 { "is" } else { "are" };
-        let said = format!("{} {words} in the scene already", photo::listed(&names));
+        let said = format!("{} {words} in the scene already", files::listed(&names));
         match (there.is_empty(), new.is_empty()) {
             (true, _) => Ok(new),
             (false, true) => Err(Error::input(format!("{said}; give photos that are not"))),

@@ -13,7 +13,7 @@ use crate::run::budget::{self, Limits, MemoryDemand};
 use crate::run::stages::{self, CameraOrigin};
 use crate::run::view::Viewer;
 use crate::scene::{Camera, GivenCamera, LanguageField, PointCloud, RgbImage, World};
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -113,7 +113,7 @@ fn with_cameras(plan: &TrainPlan, known: &[GivenCamera], progress: &dyn Progress
     let (with, without): (Vec<_>, Vec<_>) = found.photos.iter().zip(own).partition(|(_, own)| own.is_some());
     let shown = |list: &[(&PathBuf, Option<usize>)]| {
         let names = list.iter().map(|(p, _)| p.strip_prefix(&plan.images).unwrap_or(p).display().to_string());
-        photo::listed(&names.collect::<Vec<_>>())
+        files::listed(&names.collect::<Vec<_>>())
     };
     if with.len() < 2 {
         return Err(Error::input(format!(
@@ -123,7 +123,7 @@ fn with_cameras(plan: &TrainPlan, known: &[GivenCamera], progress: &dyn Progress
             found.photos.len(),
             plan.cameras.display(),
             shown(&found.photos.iter().map(|p| (p, None)).collect::<Vec<_>>()),
-            photo::listed(&names)
+            files::listed(&names)
         )));
     }
     if !without.is_empty() {

@@ -4,7 +4,7 @@ use super::degree::sh_degree;
 use super::ply_header::header;
 use super::ply_points::Colours;
 pub use super::ply_points::{read_points, write_points};
-use super::ply_table::{Table, listed, table};
+use super::ply_table::{Table, table};
 use super::usable;
 use super::{ply_comments, ply_packed};
 use crate::scene::{LanguageField, LevelField, SH_C0, Splats, sh_coefficients};
@@ -31,7 +31,7 @@ pub fn read_splats(path: &Path) -> Result<Splats> {
 
 fn gaussians(t: &Table, notes: &mut Vec<String>) -> Result<Splats, String> {
     let need = |missing: String| {
-        let has = listed(&t.names());
+        let has = files::listed(&t.names());
         format!("no column {missing}: this is not a Gaussian splat file of the INRIA layout; it has {has}")
     };
     let position = t.all(["x", "y", "z"]).map_err(need)?;

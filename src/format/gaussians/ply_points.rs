@@ -1,6 +1,6 @@
 //! Coloured points of PLY files.
 use super::ply_header::PropertyType;
-use super::ply_table::{Table, listed, table};
+use super::ply_table::{Table, table};
 use super::{ply_comments, usable};
 use crate::scene::{PointCloud, SH_C0};
 use crate::{Error, Result, files};
@@ -85,7 +85,7 @@ pub fn read_points(path: &Path) -> Result<(PointCloud, Vec<String>)> {
 
 fn points(t: &Table, notes: &mut Vec<String>) -> Result<PointCloud, String> {
     let missing =
-        |c: String| format!("no column {c}: this is not a point cloud; it has {}", listed(&t.names()));
+        |c: String| format!("no column {c}: this is not a point cloud; it has {}", files::listed(&t.names()));
     let position = t.all(["x", "y", "z"]).map_err(missing)?;
     let colours = Colours::of(t, notes)?;
     let dc = t.all(["f_dc_0", "f_dc_1", "f_dc_2"]).ok().filter(|_| colours.is_none());

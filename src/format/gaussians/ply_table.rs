@@ -1,5 +1,6 @@
 //! Elements of PLY files as tables.
 use super::ply_header::{Header, PropertyType, header};
+use crate::files;
 
 /// The `vertex` element of a PLY file.
 pub(super) struct Table {
@@ -82,16 +83,9 @@ fn unread(
     let parts: Vec<String> = [("columns", columns), ("elements", elements)]
         .into_iter()
         .filter(|(_, names)| !names.is_empty())
-        .map(|(what, names)| format!("{what} {}", listed(&names)))
+        .map(|(what, names)| format!("{what} {}", files::listed(&names)))
         .collect();
     (!parts.is_empty()).then(|| format!("not read: {}", parts.join("; ")))
-}
-
-/// Names for a message: a few, and how many more there are.
-pub(super) fn listed(names: &[&str]) -> String {
-    const SHOWN: usize = 12;
-    let shown = names.iter().take(SHOWN).copied().collect::<Vec<_>>().join(", ");
-    if names.len() > SHOWN { format!("{shown} and {} more", names.len() - SHOWN) } else { shown }
 }
 
 /// The rows of one element of a binary file, with every digit of their values.
