@@ -159,6 +159,13 @@ fn names_of_another_format_are_refused() {
             "{stderr}"
         );
     }
+    // Without a format, the ending of the file decides.
+    for out in ["c.compressed.ply", "c.spz", "c.GLB"] {
+        let output = splatvk(&["export", &at("a.ply"), "--out", &at(out)]);
+        assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
+        assert_eq!(gaussians::read(at(out).as_ref()).unwrap().0.len(), 3);
+    }
+    refuses(2, &["export", &at("a.ply"), "--out", &at("c.obj")], &["no format", "--format", ".spz", ".json"]);
 }
 
 #[test]

@@ -20,9 +20,10 @@ use std::path::{Path, PathBuf};
 pub struct ExportArgs {
     /// Scene directory, or a file of Gaussians: .ply (compressed, too), .splat, .spz, .glb, .gltf
     pub scene: PathBuf,
-    /// What to write; language goes beside the files of Gaussians, into OUT.language.npz (ply: --with-features)
+    /// What to write; language goes beside the files of Gaussians, into OUT.language.npz (ply: --with-features) [default: by the
+    /// ending of --out]
     #[arg(long, value_parser = formats(), value_name = "FORMAT")]
-    pub format: String,
+    pub format: Option<String>,
     /// File, or folder (colmap, colmap-bin)
     #[arg(long, value_name = "PATH")]
     pub out: PathBuf,
@@ -73,7 +74,7 @@ fn up_axis(text: &str) -> Result<UpAxis, String> {
 }
 
 /// What `--up` and `--metres` ask for, from the scene's own coordinates.
-fn placement(scene: &Scene, args: &ExportArgs) -> Result<Option<Similarity>> {
+fn placement(scene: &Scene, args: &ExportArgs, format: &str) -> Result<Option<Similarity>> {
     let scale = match (args.metres, &scene.world.scale) {
         (false, _) => 1.0,
         (true, Some(scale)) => scale.metres_per_unit,
@@ -84,17 +85,17 @@ fn placement(scene: &Scene, args: &ExportArgs) -> Result<Option<Similarity>> {
             )));
         }
     };
-    let rotation = rotation(scene, args)?;
+    let rotation = rotation(scene, args, format)?;
     let placed = args.metres || args.up.is_some();
     Ok(placed.then_some(Similarity { scale, rotation, translation: DVec3::ZERO }))
 }
 
-fn rotation(scene: &Scene, args: &ExportArgs) -> Result<DMat3> {
+fn rotation(scene: &Scene, args: &ExportArgs, format: &str) -> Result<DMat3> {
     let Some(axis) = args.up else { return Ok(DMat3::IDENTITY) };
     let up = scene.world.up.as_ref().ok_or_else(|| {
         Error::input(format!("{}: which way is up is not known; leave --up out", args.scene.display()))
     })?;
-    let axis = match SplatFormat::named(&args.format) {
+    let axis = match SplatFormat::named(format) {
         // Their writers turn right, down, forward to right, up, back.
         Some(format) if format.y_up => match axis {
             UpAxis::PlusY => UpAxis::MinusY,
@@ -125,13 +126,14 @@ fn place(scene: &mut Scene, points: &mut Option<PointCloud>, by: &Similarity) {
 }
 
 pub fn export(args: &ExportArgs) -> Result<()> {
-    let out = Out::reserve(args)?;
+    let format = format(args)?;
+    let out = Out::reserve(args, format)?;
     let mut scene = scene::load(&args.scene)?;
     if args.only_seen {
         keep_seen(&mut scene, args)?;
     }
-    let placement = placement(&scene, args)?;
-    let mut points = match args.format.starts_with("colmap") {
+    let placement = placement(&scene, args, format)?;
+    let mut points = match format.starts_with("colmap") {
         true => colmap::read_points(&args.scene.join("cameras/colmap")).ok(),
         false => None,
     };
@@ -143,7 +145,7 @@ pub fn export(args: &ExportArgs) -> Result<()> {
         Out::Folder(mut folder) => {
             let cameras = cameras(&scene, args)?;
             let [text, binary] = colmap::FILES;
-            let (write, other): (fn(&_, &_, _) -> _, _) = match args.format.as_str() {
+            let (write, other): (fn(&_, &_, _) -> _, _) = match format {
                 "colmap" => (colmap::write, binary),
                 _ => (colmap::write_binary, text),
             };
@@ -151,13 +153,13 @@ pub fn export(args: &ExportArgs) -> Result<()> {
             folder.outdate(other.into_iter());
             folder.keep()?;
         }
-        Out::Splats(files, format) => {
-            warn_of_losses(&scene.splats, format);
+        Out::Splats(files, of_splats) => {
+            warn_of_losses(&scene.splats, of_splats);
             warn_of_models(&scene);
             let options = WriteOptions { spz_version: args.spz_version.unwrap_or(spz::DEFAULT_VERSION) };
-            files.write(&scene.splats, scene.language.as_ref(), format, options)?;
+            files.write(&scene.splats, scene.language.as_ref(), of_splats, options)?;
         }
-        Out::File(file) if args.format == "transforms" => {
+        Out::File(file) if format == "transforms" => {
             let cameras = cameras(&scene, args)?;
             file.keep(|path| transforms::write(path, cameras, None))?;
         }
@@ -176,7 +178,7 @@ pub fn export(args: &ExportArgs) -> Result<()> {
             file.keep(|path| ply::write_splats(path, &scene.splats, options))?;
         }
     }
-    if let Some(warning) = check_ending(args)? {
+    if let Some(warning) = check_ending(&args.out, format)? {
         progress::reporter().warn(&warning);
     }
     listing(std::slice::from_ref(&args.out), args.json)
@@ -194,12 +196,12 @@ enum Out {
 
 impl Out {
     /// Refuses a place that may not be written before the scene is read.
-    fn reserve(args: &ExportArgs) -> Result<Out> {
-        let is_folder = args.format.starts_with("colmap");
-        if args.spz_version.is_some() && args.format != "spz" {
+    fn reserve(args: &ExportArgs, format: &str) -> Result<Out> {
+        let is_folder = format.starts_with("colmap");
+        if args.spz_version.is_some() && format != "spz" {
             return Err(Error::input("--spz-version: only --format spz has versions; leave it out"));
         }
-        check_ending(args)?;
+        check_ending(&args.out, format)?;
         // A link is said to be one wherever it leads.
         check_place(&args.out, if is_folder { Kind::Folder } else { Kind::File }, true)?;
         let whole = |p: &Path| p.canonicalize().ok();
@@ -216,7 +218,7 @@ impl Out {
         if is_folder {
             return WrittenFiles::open(&args.out, args.force, &inputs).map(Out::Folder);
         }
-        match SplatFormat::named(&args.format).filter(|format| format.name != "ply") {
+        match SplatFormat::named(format).filter(|format| format.name != "ply") {
             Some(format) => {
                 check_file(&args.out, args.force, &inputs)?;
                 Ok(Out::Splats(Reserved::open(&args.out, args.force)?, format))
@@ -226,12 +228,31 @@ impl Out {
     }
 }
 
+/// Names of the formats whose files have an ending, and the endings.
+fn endings() -> impl Iterator<Item = (&'static str, &'static str)> {
+    FORMATS.iter().map(|f| (f.name, f.ending)).chain([("transforms", ".json")])
+}
+
+/// The format that is asked for, else that of the ending of `--out`.
+fn format(args: &ExportArgs) -> Result<&str> {
+    if let Some(format) = &args.format {
+        return Ok(format);
+    }
+    let lower = args.out.to_string_lossy().to_lowercase();
+    match endings().find(|(_, ending)| lower.ends_with(ending)) {
+        Some((name, _)) => Ok(name),
+        None => Err(Error::input(format!(
+            "--out {}: its ending states no format; give --format, or one of the endings {}",
+            args.out.display(),
+            endings().map(|(_, ending)| ending).collect::<Vec<_>>().join(", ")
+        ))),
+    }
+}
+
 /// Refuses a name that is of another format, by which programs would take the file for it; returns a warning for one of none.
-fn check_ending(args: &ExportArgs) -> Result<Option<String>> {
-    let endings = || FORMATS.iter().map(|f| (f.name, f.ending)).chain([("transforms", ".json")]);
-    let (format, out) = (&args.format, args.out.display());
-    let Some((_, own)) = endings().find(|(name, _)| name == format) else { return Ok(None) };
-    let file = args.out.to_string_lossy();
+fn check_ending(path: &Path, format: &str) -> Result<Option<String>> {
+    let Some((_, own)) = endings().find(|(name, _)| *name == format) else { return Ok(None) };
+    let (out, file) = (path.display(), path.to_string_lossy());
     let lower = file.to_lowercase();
     match endings().find(|(_, ending)| lower.ends_with(ending)) {
         Some((name, _)) if name == format => Ok(None),

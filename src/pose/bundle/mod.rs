@@ -29,8 +29,9 @@ impl Problem {
         let pose_size = 6 * (self.poses.len() - 1);
         for (k, optics) in next.optics.iter_mut().enumerate() {
             let step = |j: usize| -d[pose_size + OPTICS * k + j];
-            // Steps beyond e^0.5 in focal length or 0.1 in the lens are outside the linear range.
-            optics.focal *= step(0).clamp(-0.5, 0.5).exp();
+            // Steps beyond half the focal length or 0.1 in the lens are outside the linear range. Where focal length and distance
+            // grow by one factor, photos of a flat scene hardly change: such a step is exact in f, not in ln f.
+            optics.focal *= 1.0 + step(0).clamp(-0.4, 0.6);
             optics.lens.k1 += step(1).clamp(-0.1, 0.1);
             optics.lens.k2 += step(2).clamp(-0.1, 0.1);
             optics.shift += DVec2::new(step(3), step(4));
@@ -90,12 +91,9 @@ impl Problem {
         s.cholesky().map(|f| f.inverse())
     }
 
-    /// σ of the optics per group and of the rotation per pose, from the inverse of the reduced system, scaled by the observed
-    /// residual variance.
-    fn sigmas(&self, c: f64) -> (Vec<[f64; OPTICS]>, Vec<f64>) {
-        let inverse = self.covariance(&self.linearise(c));
-        let (pose_size, n) = self.sizes();
-        let (mut sum, mut freedom) = (0.0, -(n as f64) - 3.0 * self.points.len() as f64);
+    /// Mean square of the residuals, in units of their σ and for one degree of freedom; outlying ones count little.
+    pub(crate) fn variance(&self, c: f64) -> f64 {
+        let (mut sum, mut freedom) = (0.0, -(self.sizes().1 as f64) - 3.0 * self.points.len() as f64);
         for o in &self.observations {
             let r2 = self.residual(o).length_squared() / (o.sigma * o.sigma);
             if r2.is_finite() {
@@ -104,7 +102,15 @@ impl Problem {
                 freedom += 2.0 * w;
             }
         }
-        let variance = sum / freedom.max(1.0);
+        sum / freedom.max(1.0)
+    }
+
+    /// σ of the optics per group and of the rotation per pose, from the inverse of the reduced system, scaled by the observed
+    /// residual variance.
+    fn sigmas(&self, c: f64) -> (Vec<[f64; OPTICS]>, Vec<f64>) {
+        let inverse = self.covariance(&self.linearise(c));
+        let (pose_size, _) = self.sizes();
+        let variance = self.variance(c);
         let sigma = |group: usize, k: usize, prior: f64| {
             let i = pose_size + OPTICS * group + k;
             let seen = inverse.as_ref().map_or(f64::INFINITY, |m| (m[(i, i)] * variance).sqrt());

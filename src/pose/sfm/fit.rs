@@ -27,8 +27,10 @@ pub(super) fn fit_optics(model: &Model, freedom: Freedom, steps: usize) -> Resul
     Ok(OpticsFit { value, model, outcome })
 }
 
-/// Displacement of sightings at the border of a photo that no parameter describes, as a share of its long side.
-const BEND: f64 = 0.03 / 640.0;
+/// Displacement of sightings at the border of a photo that no parameter describes, pixels of a working image of [`LONG`] and less …
+const BEND: f64 = 0.03;
+/// … and in proportion of a larger one, pixels of the long side: a lens bends all sizes alike, and corners are found on working images.
+const LONG: f64 = 640.0;
 
 impl OpticsFit {
     /// Widens every σ to what it is with [`Model::independent`] observations taken for independent, and by what displacements of
@@ -36,7 +38,7 @@ impl OpticsFit {
     pub(super) fn widen(&mut self) {
         let observations = self.model.observations();
         let wider = (observations as f64 / self.model.independent(observations)).sqrt();
-        let bent = self.model.bent(BEND);
+        let bent = self.model.bent(|long| BEND * (long / LONG).max(1.0));
         let outcome = &mut self.outcome;
         for (group, prior) in self.model.priors.iter().enumerate() {
             let bent = bent.as_ref().map_or(prior.sigmas(), |b| b.optics[group]);

@@ -354,9 +354,11 @@ impl Model {
                 sigma: s.sigma,
             }));
         }
-        // The sightings count as fewer independent ones ([`MAX_INDEPENDENT`]); priors are weighed against those.
+        // The sightings count as fewer independent ones ([`MAX_INDEPENDENT`]); priors are weighed against those, by the residuals
+        // where these are below the least σ.
         let observations = 2 * problem.observations.len();
-        let scale = (self.independent(observations) / observations.max(1) as f64).sqrt();
+        let share = self.independent(observations) / observations.max(1) as f64;
+        let scale = (share / problem.variance(2.0).clamp(1e-3, 1.0)).sqrt();
         problem.priors.iter_mut().for_each(|p| p.narrow(scale));
         (problem, views, used)
     }
@@ -376,13 +378,13 @@ impl Model {
         Ok(outcome)
     }
 
-    /// What displacements of the sightings by `share` of the long side at the border of the photos do to the parameters of all optics
-    /// and the rotations.
-    pub(super) fn bent(&self, share: f64) -> Option<Bent> {
+    /// What displacements of the sightings at the border of the photos, `by` pixels for the long side in pixels, do to the parameters of
+    /// all optics and the rotations.
+    pub(super) fn bent(&self, by: impl Fn(f64) -> f64) -> Option<Bent> {
         let (problem, views, _) = self.problem(f64::INFINITY, Freedom::Full);
         let half_long: Vec<f64> = views.iter().map(|v| self.centres[*v].max_element()).collect();
-        let scale: Vec<f64> = half_long.iter().map(|h| 2.0 * share * h).collect();
-        problem.bent(2.0, &half_long, &scale)
+        let displaced: Vec<f64> = half_long.iter().map(|h| by(2.0 * h)).collect();
+        problem.bent(2.0, &half_long, &displaced)
     }
 
     /// Drops sightings farther than `gate` from their point, then points with fewer than two left or too little parallax.
