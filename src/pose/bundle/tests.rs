@@ -70,6 +70,13 @@ fn focal_sigma_predicts_the_scatter_of_the_estimate() {
 }
 
 #[test]
+fn variance_is_that_of_the_noise() {
+    let (mut p, _) = scene(0.2);
+    p.solve(1e3, 60).unwrap();
+    assert!((p.variance(1e3) / 0.04 - 1.0).abs() < 0.1, "{}", p.variance(1e3));
+}
+
+#[test]
 fn lens_and_principal_point_are_recovered_where_they_are_free() {
     let (mut p, _) = scene(0.0);
     let truth = Optics { focal: 600.0, lens: Lens::radial(-0.12, 0.03), shift: DVec2::new(4.0, -3.0) };

@@ -295,6 +295,37 @@ fn planes_seen_straight_on_are_flat() {
     assert_eq!(flat(aside, 2.0), [false; 2]);
 }
 
+/// Focal length, relative to the true one, of a plane seen nearly straight on by positions of that noise, pixels of σ 0.05 at least.
+fn focal_of_plane(noise: f64, tilt: f64) -> f64 {
+    let truth = testing::train(&testing::folder());
+    let mut rng = Random::new(4);
+    let focal = 800.0;
+    let mut model = empty_model(&truth.photos, &[true; 4], 0);
+    model.optics[0].focal = focal;
+    let places = [[0.0, 0.0], [0.6, 0.0], [0.0, 0.5], [0.5, 0.6]];
+    let lean = |[x, y]: [f64; 2]| Pose::exp(DVec3::new(-x, -y, 0.0), tilt * DVec3::new(y, -x, 0.3));
+    model.poses = places.map(|place| Some(lean(place))).to_vec();
+    for _ in 0..1000 {
+        let x = DVec3::new(2.0 * rng.uniform() - 0.7, 1.6 * rng.uniform() - 0.5, 4.0);
+        let seen = (0..4).map(|view| {
+            let pixel = model.project(view, x).unwrap().0 + DVec2::new(rng.normal(), rng.normal()) * noise;
+            Sighting { view, pixel, sigma: noise.max(0.05), family: 0 }
+        });
+        let sightings = seen.collect();
+        model.tracks.push(model::Track { position: Some(x), sightings });
+    }
+    model.adjust(f64::INFINITY, 2.0, 60).unwrap();
+    model.optics[0].focal / focal
+}
+
+#[test]
+fn priors_count_against_residuals_not_against_the_least_sigma() {
+    let off = [0.002, 0.3].map(|noise| (focal_of_plane(noise, 0.03) - 1.0).abs());
+    println!("{off:?}");
+    // The prior is 22 % below: exact positions leave it no say, those of phones do.
+    assert!(off[0] < 0.005 && off[1] > 0.05, "{off:?}");
+}
+
 /// The part of a photo that a lens moved by image stabilisation would show: 600 × 440 pixels, off the middle by `shift`.
 fn moved(photo: &Photo, shift: [i32; 2]) -> Photo {
     let (width, height) = (600, 440);
