@@ -326,6 +326,43 @@ fn priors_count_against_residuals_not_against_the_least_sigma() {
     assert!(off[0] < 0.005 && off[1] > 0.05, "{off:?}");
 }
 
+#[test]
+fn parts_of_photos_are_told_by_their_axes() {
+    let truth = testing::train(&testing::folder());
+    let (mut rng, cuts) =
+        (Random::new(6), [DVec2::ZERO, DVec2::new(90.0, -50.0), DVec2::ZERO, DVec2::new(-60.0, 70.0)]);
+    let whole = empty_model(&truth.photos, &[true; 4], 0);
+    let mut seen = whole.regrouped(&[0, 1, 2, 3]);
+    seen.poses = truth.cameras.iter().map(|c| Some(c.pose)).collect();
+    for (v, optics) in seen.optics.iter_mut().enumerate() {
+        optics.focal = truth.cameras[v].fx;
+        if v % 2 == 1 {
+            (optics.focal, optics.shift) = (1.4 * optics.focal, cuts[v]);
+        }
+    }
+    let mut model = model::Model { poses: seen.poses.clone(), ..whole };
+    for _ in 0..800 {
+        let pixel = DVec2::new(640.0 * rng.uniform(), 480.0 * rng.uniform());
+        let x = truth.cameras[0].unproject(pixel, truth.mean_depth * (0.7 + 0.6 * rng.uniform()));
+        let seen = (0..4).filter_map(|view| {
+            let pixel = seen.project(view, x)?.0 + DVec2::new(rng.normal(), rng.normal()) * 0.1;
+            Some(Sighting { view, pixel, sigma: 0.1, family: 0 })
+        });
+        let sightings = seen.collect();
+        model.tracks.push(model::Track { position: Some(x), sightings });
+    }
+    let one_camera = fit::fit_optics(&model, Freedom::Focal, 60).unwrap();
+    let model = crops::explained(one_camera).unwrap().model;
+    let of = |v: usize| model.optics[model.group[v]];
+    for v in 0..4 {
+        let focal = if v % 2 == 1 { 1.4 } else { 1.0 };
+        let found = of(v);
+        assert!((found.shift - cuts[v]).length() < 8.0, "{v}: {found:?}");
+        assert!((found.focal / (focal * truth.cameras[0].fx) - 1.0).abs() < 0.03, "{v}: {found:?}");
+    }
+    assert!(model.group[0] == model.group[2] && model.has_crops());
+}
+
 /// The part of a photo that a lens moved by image stabilisation would show: 600 × 440 pixels, off the middle by `shift`.
 fn moved(photo: &Photo, shift: [i32; 2]) -> Photo {
     let (width, height) = (600, 440);
