@@ -1,10 +1,11 @@
 //! The state of work under way on disk, so that it goes on where it was killed.
+use crate::sync::lock;
 use crate::{Error, Result, files};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::path::PathBuf;
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 /// A place for one state, which the next replaces; reached through [`crate::progress::Progress::checkpoint`].
@@ -46,7 +47,7 @@ impl Checkpoint {
 
     /// Whether it is time for the next.
     pub fn due(&self) -> bool {
-        self.last.lock().unwrap_or_else(PoisonError::into_inner).elapsed() >= self.every
+        lock(&self.last).elapsed() >= self.every
     }
 
     /// Writes the state after `done` steps. A disk that is full costs the next process time, not this one its result.
@@ -55,7 +56,7 @@ impl Checkpoint {
         if files::write_with_checksum(&self.file, &bytes).is_ok() {
             self.done.store(done as u64, Ordering::Relaxed);
         }
-        *self.last.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
+        *lock(&self.last) = Instant::now();
         Ok(())
     }
 

@@ -26,6 +26,7 @@ pub(crate) use replace::swap;
 pub(crate) use within::within;
 
 use crate::error::words;
+use crate::sync::lock;
 use crate::{Error, Result};
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
@@ -33,7 +34,7 @@ use std::collections::HashMap;
 use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{Mutex, OnceLock};
 use std::time::SystemTime;
 
 /// Beyond the bytes of a file a reader takes at most four times its content, and this much (docs/formats.md#limits).
@@ -195,7 +196,7 @@ pub(crate) fn content_hash(path: &Path) -> std::io::Result<String> {
 pub(crate) fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
     // One at a time: of two threads that keep the same thing the second would be refused.
     static WRITING: Mutex<()> = Mutex::new(());
-    let _turn = WRITING.lock().unwrap_or_else(PoisonError::into_inner);
+    let _turn = lock(&WRITING);
     let folder = path.parent().unwrap_or(path);
     private_folder(folder)?;
     sweep(folder);

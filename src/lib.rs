@@ -80,6 +80,7 @@ pub mod query;
 pub mod report;
 pub mod run;
 pub mod scene;
+mod sync;
 pub mod synth;
 
 #[cfg(feature = "cli")]

@@ -1,8 +1,9 @@
 //! Progress of long work, and the request that it should stop.
 use crate::checkpoint::Checkpoint;
+use crate::sync::lock;
 use crate::{Error, Result};
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 /// Receives progress from any thread. The command line draws bars, hosts may forward it, tests use [`Silent`].
@@ -77,11 +78,6 @@ pub struct Recorded<'a> {
 /// The stage that one lane of work is in.
 #[derive(Default)]
 struct Current(Mutex<Option<(&'static str, Instant)>>);
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // A panic while holding the lock leaves plain data behind, which stays usable.
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
 
 impl<'a> Recorded<'a> {
     /// Records on the way to `inner`; the run begins now.

@@ -1,12 +1,13 @@
 //! Between C and Rust: panics, errors, pointers, texts and structures of other versions.
 use super::types::*;
 use crate::files::panic_text;
+use crate::sync::lock;
 use crate::{Error, Result};
 use std::cell::RefCell;
 use std::ffi::c_char;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
 /// Most bytes of a text: longer than any path that a system takes. Questions have a limit of their own.
 const MOST_TEXT: usize = 1 << 16;
@@ -38,12 +39,12 @@ pub struct LastError(Mutex<String>);
 
 impl LastError {
     fn set(&self, text: String) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = text;
+        *lock(&self.0) = text;
     }
     /// Copies the text out as a C string: see [`copy_text`].
     pub unsafe fn copy(&self, out: *mut c_char, bytes: usize) -> usize {
         // SAFETY: passed on.
-        unsafe { copy_text(&self.0.lock().unwrap_or_else(PoisonError::into_inner), out, bytes) }
+        unsafe { copy_text(&lock(&self.0), out, bytes) }
     }
 }
 

@@ -1,9 +1,10 @@
 //! The host's progress callback behind [`Progress`].
 use super::types::*;
 use crate::progress::Progress;
+use crate::sync::lock;
 use std::ffi::{CString, c_void};
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, PoisonError};
 
 pub struct Callback {
     call: SvkProgressFunction,
@@ -38,7 +39,7 @@ impl Callback {
 
     fn report(&self, kind: SvkProgressKind, done: u64, note: &str, begin: Option<(&str, u64)>) {
         let Some(call) = self.call else { return };
-        let mut stage = self.stage.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut stage = lock(&self.stage);
         if let Some((name, total)) = begin {
             *stage = StageProgress { name: c_text(name), total };
         }

@@ -1,6 +1,6 @@
 //! Rendering into memory, buffers and images of the host.
 use super::boundary::{self, CallError, bad_argument, guard};
-use super::scene::{SvkScene, camera_in, lock, one_view};
+use super::scene::{SvkScene, camera_in, one_view};
 use super::types::*;
 use crate::gpu::Buffer;
 use crate::gpu::external::{Sync, Target};
@@ -9,6 +9,7 @@ use crate::pass::pack::{self, Encoding, FrameChannel};
 use crate::run::live::LiveScene;
 use crate::run::view::{FeatureChannels, SCENE_MODEL};
 use crate::scene::Camera;
+use crate::sync::lock;
 use std::collections::BTreeSet;
 
 /// Renders the scene from a camera into all `outputs` at once. `sync` may be NULL: then targets are written at once, and

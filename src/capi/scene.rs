@@ -10,9 +10,10 @@ use crate::query::presence::Presence;
 use crate::run::Answers;
 use crate::run::live::LiveScene;
 use crate::scene::{Camera, Pose};
+use crate::sync::lock;
 use glam::{DMat3, DVec3};
 use std::ffi::c_char;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 
 /// A trained or loaded scene.
 pub struct SvkScene {
@@ -20,11 +21,6 @@ pub struct SvkScene {
     /// Copies to targets of the host that may still be under way.
     pub(super) deliveries: Mutex<Vec<Delivery>>,
     pub(super) error: LastError,
-}
-
-/// Locks, ignoring poison: a panic was reported by its own call, and every call sets up what it needs.
-pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl SvkScene {

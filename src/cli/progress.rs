@@ -4,11 +4,12 @@ use super::args::LogFormat;
 use super::line::one_line;
 use crate::Error;
 use crate::progress::Progress;
+use crate::sync::lock;
 use indicatif::{HumanDuration, MultiProgress, ProgressBar, ProgressState, ProgressStyle};
 use serde_json::{Value, json};
 use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
+use std::sync::{LazyLock, Mutex};
 use std::time::{Duration, Instant};
 
 /// Set by the first Ctrl-C of the process; work notices it between steps.
@@ -108,11 +109,6 @@ fn write_event(event: &str, mut fields: Value) {
 /// There is nothing to do when standard error is closed, as it is once the terminal is.
 fn write_line(line: &str) {
     let _ = writeln!(std::io::stderr().lock(), "{line}");
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // A panic while holding the lock leaves plain data behind, which stays usable.
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// One JSON object per line.

@@ -1,11 +1,12 @@
 //! What is being written, in a hidden folder that its owner has marked and locked: it goes when the work fails, when the process is
 //! stopped, and, where the process was killed, with the next one that writes to the place.
 use super::owner::{self, Found, Held, NEW};
+use crate::sync::lock;
 use crate::{Error, Result};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 
 /// What this process has begun: the hidden folder, and the folders that were made for it, deepest first.
 static UNFINISHED: Mutex<Vec<(PathBuf, Vec<PathBuf>)>> = Mutex::new(Vec::new());
@@ -19,7 +20,7 @@ const LONGEST_NAME: usize = 200;
 
 fn unfinished() -> MutexGuard<'static, Vec<(PathBuf, Vec<PathBuf>)>> {
     // A panic while holding the lock leaves a list that is still right.
-    UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner)
+    lock(&UNFINISHED)
 }
 
 /// A file or folder that is being written. Dropped without [`Partial::finish`], it vanishes, and with it the folders that were made

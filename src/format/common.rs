@@ -3,11 +3,6 @@ use crate::files::Partial;
 use crate::{Error, Result};
 use std::path::Path;
 
-/// Opacity of a raw parameter.
-pub(crate) fn sigmoid(v: f32) -> f32 {
-    1.0 / (1.0 + (-v).exp())
-}
-
 /// The raw parameter of an opacity; 0 and 1 give the largest ones that f32 tells from them.
 pub(crate) fn logit(a: f32) -> f32 {
     let a = a.clamp(1e-7, 1.0 - 1e-7);

@@ -17,7 +17,7 @@ pub mod transforms;
 mod workspace;
 
 pub use camera_file::CameraFile;
+pub(crate) use common::logit;
 pub use common::{create_folder, to_byte, write_json, write_whole_file};
-pub(crate) use common::{logit, sigmoid};
 pub use gaussians::{gltf, ply, ply_packed, splat, spz};
 pub use workspace::{Replaced, Workspace};

@@ -1,5 +1,5 @@
 //! Gaussians in other axes.
-use crate::pass::sh;
+use crate::scene::sh;
 use crate::scene::{Similarity, Splats};
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use nalgebra::DMatrix;

@@ -1,7 +1,7 @@
 //! Storage buffers.
 use super::device::Device;
-use super::error::lock;
 use super::memory::Block;
+use crate::sync::lock;
 use crate::{Error, Result};
 use ash::vk;
 use bytemuck::Pod;

@@ -1,7 +1,8 @@
 //! Tells the host when a driver takes long to compile shaders, while it does: on a first run some take half a minute. Drivers that
 //! compile when a pipeline first runs, as lavapipe does, are not seen.
+use crate::sync::lock;
 use std::sync::mpsc::{RecvTimeoutError, channel};
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 /// Called with the name of the device.
@@ -29,7 +30,7 @@ impl CompileTime {
     /// As if two seconds had gone by.
     #[cfg(test)]
     pub fn use_up(&self) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(Duration::ZERO);
+        *lock(&self.0) = Some(Duration::ZERO);
     }
 
     /// Runs `compile` for the device of this name.
@@ -41,7 +42,7 @@ impl CompileTime {
     }
 
     fn watched<T>(&self, say: impl FnOnce() + Send, compile: impl FnOnce() -> T) -> T {
-        let mut left = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut left = lock(&self.0);
         let Some(patience) = *left else { return compile() };
         if patience.is_zero() {
             say();

@@ -1,6 +1,6 @@
 //! The logical device and everything that lives as long as it.
 use super::compile_time::CompileTime;
-use super::error::{lock, vk_error};
+use super::error::vk_error;
 use super::info::DeviceInfo;
 use super::memory::{Heap, Memory};
 use super::module::Module;
@@ -10,6 +10,7 @@ use super::staging::Staging;
 use super::validation::Sink;
 use super::ways::{self, Way};
 use crate::Result;
+use crate::sync::lock;
 use ash::vk;
 use std::any::Any;
 use std::collections::{BTreeSet, HashMap};
@@ -155,7 +156,7 @@ impl Device {
     /// Names of the shaders that were run so far.
     #[cfg(test)]
     pub(crate) fn shaders_run(&self) -> BTreeSet<&'static str> {
-        super::error::lock(&self.0.pipelines).keys().map(|key| key.0).collect()
+        lock(&self.0.pipelines).keys().map(|key| key.0).collect()
     }
 
     /// What the device is and can do.

@@ -1,5 +1,6 @@
 //! Device memory for buffers, and how much of it is in use.
-use super::error::{lock, vk_error};
+use super::error::vk_error;
+use crate::sync::lock;
 use crate::{Error, Result};
 use ash::vk;
 use gpu_allocator::vulkan::{

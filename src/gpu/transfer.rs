@@ -1,10 +1,11 @@
 //! Submissions, and the transfers that go along with them on memory that is not mapped.
 use super::barrier;
 use super::device::Device;
-use super::error::{lock, vk_error};
+use super::error::vk_error;
 use super::hazard::{self, AccessStage, BufferAccess, Step};
 use super::staging::{Batch, MOST, Pending, Staging};
 use crate::Result;
+use crate::sync::lock;
 use ash::vk::{self, Handle};
 use std::ops::Range;
 

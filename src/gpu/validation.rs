@@ -1,4 +1,5 @@
 //! The Khronos validation layer with synchronization validation, its messages collected so that tests can fail on them.
+use crate::sync::lock;
 use crate::{Error, Result};
 use ash::vk;
 use std::ffi::{CStr, c_void};
@@ -12,7 +13,7 @@ pub(super) struct Messages(Mutex<Vec<String>>);
 
 impl Messages {
     fn lock(&self) -> MutexGuard<'_, Vec<String>> {
-        self.0.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
+        lock(&self.0)
     }
 }
 

@@ -7,8 +7,8 @@ use std::time::SystemTime;
 
 use sha2::{Digest, Sha256};
 
-use super::registry::home;
 use crate::Result;
+use crate::files::home;
 use crate::files::{self, content_hash, sha256};
 
 /// Bytes that the folder may hold: the pointmaps and descriptors of a dozen scenes, or the masks of hundreds.

@@ -2,9 +2,10 @@
 use super::cache::{self, OutputKey};
 use super::provider::{Provider, find};
 use crate::progress::Progress;
+use crate::sync::lock;
 use crate::{Error, Result};
 use std::fmt;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
 /// How networks are computed: by which provider, and whether their answers are kept. Clones share it; several in one process may
 /// differ, except that they share the one loaded library.
@@ -61,7 +62,7 @@ impl Compute {
     /// Held while a large network is loaded: stages that run beside each other take turns, so that a run needs the memory of
     /// one network and every network has all cores.
     pub(crate) fn turn(&self) -> MutexGuard<'_, ()> {
-        self.0.turn.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0.turn)
     }
 
     /// The provider of new sessions, `None` for the CPU: found by computing a graph of one node on it. Asked for by name, one
@@ -82,13 +83,13 @@ impl Compute {
     }
 
     pub(super) fn note(&self, text: String) {
-        self.0.notes.lock().unwrap_or_else(PoisonError::into_inner).push(text);
+        lock(&self.0.notes).push(text);
     }
 
     /// Finds the provider, and returns what did not work since the last call, a sentence each.
     pub fn notes(&self) -> Result<Vec<String>> {
         self.selected()?;
-        Ok(std::mem::take(&mut *self.0.notes.lock().unwrap_or_else(PoisonError::into_inner)))
+        Ok(std::mem::take(&mut *lock(&self.0.notes)))
     }
 
     /// Warns of [`Compute::notes`].

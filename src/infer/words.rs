@@ -288,10 +288,7 @@ impl Vocabulary {
 mod tests {
     use super::*;
     use crate::infer::breakfast::{TestView, phrases, views};
-
-    fn dot(a: &[f32], b: &[f32]) -> f32 {
-        a.iter().zip(b).map(|(p, q)| p * q).sum()
-    }
+    use crate::math::dot_f32 as dot;
 
     /// Relevancy as LERF defines it (Kerr et al. 2023).
     fn relevancy(region: &[f32], query: &[f32], canonical: &[f32]) -> f32 {

@@ -5,6 +5,7 @@
 //! where neighbours agree, and spread over their cells by a local affine fit. Both directions come from one set of
 //! matches, so they are each other's inverse.
 use crate::infer::xfeat::DenseFeatures;
+use crate::math::dot_f32 as dot;
 use crate::scene::{Camera, DenseWarp, DepthMap, Plane};
 use glam::{DMat2, DMat3, DVec2, DVec3};
 use rayon::prelude::*;
@@ -118,10 +119,6 @@ fn centre(f: &DenseFeatures, cell: usize) -> DVec2 {
 
 fn descriptor(f: &DenseFeatures, cell: usize) -> &[f32] {
     &f.descriptors[cell * DIM..(cell + 1) * DIM]
-}
-
-fn dot(a: &[f32], b: &[f32]) -> f32 {
-    a.iter().zip(b).map(|(x, y)| x * y).sum()
 }
 
 /// Most similar cell of `b` near the epipolar line of each cell of `a`.

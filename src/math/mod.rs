@@ -5,6 +5,21 @@ mod statistics;
 pub use random::Random;
 pub use statistics::{median, quantile};
 
+/// `a·b` in f32, for comparing many features.
+pub fn dot_f32(a: &[f32], b: &[f32]) -> f32 {
+    a.iter().zip(b).map(|(x, y)| x * y).sum()
+}
+
+/// Length of a raw quaternion, above 0.
+pub fn quaternion_norm(q: &[f32; 4]) -> f32 {
+    q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE)
+}
+
+/// Logistic function: the opacity of a raw parameter.
+pub fn sigmoid(v: f32) -> f32 {
+    1.0 / (1.0 + (-v).exp())
+}
+
 /// `a·b`, summed in f64.
 pub fn dot(a: &[f32], b: &[f32]) -> f64 {
     a.iter().zip(b).map(|(x, y)| f64::from(*x) * f64::from(*y)).sum()

@@ -4,6 +4,7 @@ use super::channels::{Block, blocks};
 use super::tile_lists::{TILE, TileLists};
 use crate::Result;
 use crate::gpu::{Buffer, Device, Way, shaders};
+use crate::sync::lock;
 use std::ops::Range;
 
 /// Buffers of one frame; pixel planes are planar [C, H, W], f32, with H the rows of one band where there are several.
@@ -125,7 +126,7 @@ impl Summation {
 
 impl GradientEntries {
     pub fn buffers(&self, device: &Device, frame: &FrameBuffers) -> Result<EntryBuffers> {
-        let mut made = self.0.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let mut made = lock(&self.0);
         let capacity = frame.lists.capacity;
         if let Some(buffers) = made.as_ref().filter(|b| b.capacity == capacity) {
             return Ok(buffers.clone());

@@ -24,7 +24,6 @@ pub mod regularise;
 pub mod renderer;
 pub mod scan;
 pub mod seeded;
-pub mod sh;
 pub mod sort;
 pub mod splat_buffers;
 pub mod ssim_l1;

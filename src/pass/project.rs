@@ -8,12 +8,12 @@
 use super::frame::FrameBuffers;
 use super::options::FeatureMode;
 use super::params::Params;
-use super::sh;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::shaders::shared::splat::{DILATION, SMALLEST_AREA};
 use crate::gpu::shaders::structs::CameraView;
 use crate::gpu::{Buffer, Recorder, shaders};
+use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 
 /// Records the projection of all splats, with the first (sh_degree + 1)² coefficients, to `frame.projected`

@@ -10,11 +10,11 @@ use super::options::FeatureMode;
 use super::params::{Gradients, Params};
 use super::project::{Geometry, geometry, raw_colour};
 use super::raster_backward::SplatGradient;
-use super::sh;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::shaders::structs::CameraView;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
+use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 
 /// Workgroups that share the splats, each of which leaves a part of the camera gradient: as many as fill a large GPU (a hundred

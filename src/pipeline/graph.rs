@@ -6,6 +6,7 @@ use crate::checkpoint::Checkpoint;
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::progress::{Progress, Recorded};
+use crate::sync::lock;
 use crate::{Error, Result};
 use std::collections::BTreeSet;
 use std::marker::PhantomData;
@@ -237,7 +238,7 @@ struct Shared<'s, 'g> {
 
 impl Shared<'_, '_> {
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     /// Runs the stages of a lane until none is left or one has failed anywhere.
@@ -246,7 +247,7 @@ impl Shared<'_, '_> {
         let guard = StopOnDrop { shared: self, progress };
         while let Some((node, inputs)) = self.next(lane) {
             let at = &self.graph.nodes[node];
-            let work = at.work.lock().unwrap_or_else(PoisonError::into_inner).take();
+            let work = lock(&at.work).take();
             let work = work.ok_or_else(|| Error::work("pipeline: a graph runs once"))?;
             let checkpoint = self.store.checkpoint(at.name, &self.keys[node]);
             let recorder =
@@ -256,7 +257,7 @@ impl Shared<'_, '_> {
             let value = work(&inputs, &Context { progress: &recorder, ..*context })
                 .map_err(|error| error.keeping(state()))?;
             drop(inputs);
-            let mut warnings = recorder.warnings.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            let mut warnings = lock(&recorder.warnings).clone();
             // Those of its inputs as well: with its output kept they need not be read again.
             warnings.splice(0..0, at.needs.iter().flat_map(|n| self.lock().warnings[*n].clone()));
             let seconds = began.elapsed().as_secs_f64();
@@ -323,7 +324,7 @@ impl Progress for WarningRecorder<'_> {
         self.inner.end();
     }
     fn warn(&self, message: &str) {
-        self.warnings.lock().unwrap_or_else(PoisonError::into_inner).push(message.to_owned());
+        lock(&self.warnings).push(message.to_owned());
         self.inner.warn(message);
     }
     fn inform(&self, message: &str) {

@@ -3,14 +3,15 @@ use super::output::Value;
 use crate::checkpoint::Checkpoint;
 use crate::error::words;
 use crate::files;
+use crate::sync::lock;
 use crate::{Error, Result};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 /// Bytes that the folder may hold: the stages of some twenty scenes of four photos.
@@ -96,7 +97,7 @@ impl Store {
     /// Drops from memory what no graph has used since this was last called.
     pub fn forget_unused(&self) {
         let Some(memory) = &self.memory else { return };
-        for made in memory.lock().unwrap_or_else(PoisonError::into_inner).values_mut() {
+        for made in lock(&memory).values_mut() {
             if !std::mem::take(&mut made.used) {
                 made.value = None;
             }
@@ -110,7 +111,7 @@ impl Store {
 
     /// What this process has made.
     pub(super) fn memory_get(&self, key: &Key) -> Option<Value> {
-        let mut memory = self.memory.as_ref()?.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut memory = lock(self.memory.as_ref()?);
         let made = memory.get_mut(&key.0)?;
         made.used = true;
         made.value.clone()
@@ -118,7 +119,7 @@ impl Store {
 
     /// Seconds that it took, if this process has made it in this store; 0 otherwise.
     pub(super) fn seconds(&self, key: &Key) -> f64 {
-        let memory = self.memory.as_ref().map(|m| m.lock().unwrap_or_else(PoisonError::into_inner));
+        let memory = self.memory.as_ref().map(|m| lock(&m));
         memory.and_then(|m| m.get(&key.0).map(|made| made.seconds)).unwrap_or(0.0)
     }
 
@@ -127,7 +128,7 @@ impl Store {
         if let Some(memory) = &self.memory {
             let value = (!self.passing.contains(&name)).then(|| value.clone());
             let made = Made { value, seconds, used: true };
-            memory.lock().unwrap_or_else(PoisonError::into_inner).insert(key.0.clone(), made);
+            lock(&memory).insert(key.0.clone(), made);
         }
     }
 

@@ -1,5 +1,6 @@
 //! Whether a scene shows what a text means (docs/method.md#presence): a text is weighed against other things that it could have
 //! said. One that fits the scene no better than they do is no evidence of anything.
+use crate::math::dot_f32 as dot;
 use crate::scene::{LanguageField, Plane};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -155,10 +156,6 @@ impl<'f> ShownCodes<'f> {
 #[derive(Clone, Debug, Default)]
 pub struct Background {
     scores: Vec<f32>,
-}
-
-fn dot(a: &[f32], b: &[f32]) -> f32 {
-    a.iter().zip(b).map(|(x, y)| x * y).sum()
 }
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
 //! What a splat carries on a level, in five bytes: where it lies between two codes, and how sure that is.
+use crate::math::dot_f32 as dot;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -90,10 +91,6 @@ pub fn features(mixes: &[CodeMix], codes: &[f32], d: usize) -> Vec<f32> {
 
 fn row(codes: &[f32], k: usize, d: usize) -> &[f32] {
     &codes[k * d..(k + 1) * d]
-}
-
-fn dot(a: &[f32], b: &[f32]) -> f32 {
-    a.iter().zip(b).map(|(x, y)| x * y).sum()
 }
 
 #[cfg(test)]

@@ -15,6 +15,7 @@ mod pointmap;
 mod points;
 mod prior;
 mod seen;
+pub mod sh;
 mod similarity;
 mod splats;
 mod transfer;

@@ -368,11 +368,8 @@ pub fn write(folder: &Path, frames: &[&TruthFrame], regions: &Regions, phrases: 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::math::dot_f32 as dot;
     use crate::query::eval::Split;
-
-    fn dot(a: &[f32], b: &[f32]) -> f32 {
-        a.iter().zip(b).map(|(x, y)| x * y).sum()
-    }
 
     fn breakfast() -> GroundTruth {
         GroundTruth::read(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast"))).unwrap()

@@ -3,6 +3,7 @@
 use super::ply_header::PropertyType;
 use super::ply_table as table;
 use super::{degree, ply_comments, usable};
+use crate::math::quaternion_norm;
 use crate::scene::Splats;
 use crate::{Error, Result};
 use std::path::Path;
@@ -127,7 +128,7 @@ fn unpack_rotation(word: u32) -> [f32; 4] {
 }
 
 fn pack_rotation(q: [f32; 4]) -> u32 {
-    let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+    let norm = quaternion_norm(&q);
     let largest = (0..4).max_by(|a, b| q[*a].abs().total_cmp(&q[*b].abs())).unwrap_or(0);
     let sign = q[largest].signum() / norm;
     (0..4).filter(|k| *k != largest).fold(largest as u32, |word, k| {
@@ -171,7 +172,7 @@ pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
                 let span = most[k] - least[k];
                 if span > 0.0 { (v[k] - least[k]) / span } else { 0.0 }
             };
-            let opacity = crate::format::to_byte(crate::format::sigmoid(s.opacity_logits[*i as usize]));
+            let opacity = crate::format::to_byte(crate::math::sigmoid(s.opacity_logits[*i as usize]));
             let [r, g, b] = [6, 7, 8].map(|k| crate::format::to_byte(share(k)));
             for word in [
                 pack_thirds([share(0), share(1), share(2)]),

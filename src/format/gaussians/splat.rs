@@ -1,5 +1,6 @@
 //! `.splat`: 32 bytes a Gaussian, for web viewers. Only the base colour survives.
 use super::usable;
+use crate::math::quaternion_norm;
 use crate::scene::Splats;
 use crate::{Error, Result, files};
 use std::path::Path;
@@ -39,7 +40,7 @@ pub fn read_noted(path: &Path, _notes: &mut Vec<String>) -> Result<Splats> {
 /// number `order[r]` of the scene.
 pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
     usable::check_written(s)?;
-    let alpha = |i: usize| crate::format::sigmoid(s.opacity_logits[i]);
+    let alpha = |i: usize| crate::math::sigmoid(s.opacity_logits[i]);
     let volume = |i: usize| s.log_scales[i].iter().sum::<f32>().exp();
     let mut order: Vec<(f32, usize)> = (0..s.len()).map(|i| (alpha(i) * volume(i), i)).collect();
     order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
@@ -52,7 +53,7 @@ pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
         bytes.extend([0, 1, 2].map(|k| crate::format::to_byte(0.5 + crate::scene::SH_C0 * s.sh[base + k])));
         bytes.push(crate::format::to_byte(alpha(i)));
         let q = s.quats[i];
-        let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+        let norm = quaternion_norm(&q);
         bytes.extend(q.map(|v| (v / norm * 128.0 + 128.0).round().clamp(0.0, 255.0) as u8));
     }
     std::fs::write(path, bytes).map_err(Error::unwritable(path))?;

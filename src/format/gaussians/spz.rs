@@ -5,6 +5,7 @@
 //! Positions are 24-bit fixed point with as many fractional bits as their extent leaves room for (the format's own tools take
 //! 12).
 use super::{degree, spz_extensions, usable};
+use crate::math::quaternion_norm;
 use crate::scene::{Splats, sh_coefficients};
 use crate::{Error, Result, files};
 use std::io::{Read, Write as _};
@@ -261,7 +262,7 @@ fn first_three(b: &[u8]) -> [f32; 4] {
 }
 
 fn pack_three(q: [f32; 4]) -> [u8; 3] {
-    let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+    let norm = quaternion_norm(&q);
     // q and −q are one rotation; w is read as positive.
     let sign = q[0].signum() / norm;
     [1, 2, 3].map(|k| byte((q[k] * sign + 1.0) * 127.5))
@@ -291,7 +292,7 @@ fn smallest_three(b: &[u8]) -> [f32; 4] {
 
 fn pack_rotation([w, x, y, z]: [f32; 4]) -> [u8; 4] {
     let q = [x, y, z, w];
-    let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+    let norm = quaternion_norm(&q);
     let largest = (0..4).max_by(|a, b| q[*a].abs().total_cmp(&q[*b].abs())).unwrap_or(3);
     // q and −q are one rotation: the largest component is stored positive, and so not at all.
     let sign = q[largest].signum() / norm;
@@ -380,7 +381,7 @@ fn pack(s: &Splats, bits: u32, version: u32) -> [Vec<u8>; 6] {
             let fixed = (v * scale).round().clamp(-FIXED_MAX, FIXED_MAX) as i32;
             parts[0].extend_from_slice(&fixed.to_le_bytes()[..3]);
         }
-        parts[1].push(byte(255.0 * crate::format::sigmoid(s.opacity_logits[i])));
+        parts[1].push(byte(255.0 * crate::math::sigmoid(s.opacity_logits[i])));
         let sh = &s.sh[i * width..(i + 1) * width];
         parts[2].extend(sh[..3].iter().map(|v| byte((v * COLOUR_SCALE + 0.5) * 255.0)));
         parts[3].extend(s.log_scales[i].map(|v| byte((v + 10.0) * 16.0)));

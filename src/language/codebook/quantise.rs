@@ -3,16 +3,13 @@
 use super::{CodeEntry, EncodedLevel, min_chord};
 use crate::language::dir::normalise_rows;
 use crate::math::Random;
+use crate::math::dot_f32 as dot;
 use crate::scene::Codebook;
 
 /// Entries of the published codebook.
 const ENTRIES: usize = 128;
 /// Rounds of k-means; assignments of a few hundred features settle within ten.
 const ROUNDS: usize = 20;
-
-fn dot(a: &[f32], b: &[f32]) -> f32 {
-    a.iter().zip(b).map(|(x, y)| x * y).sum()
-}
 
 /// Spherical k-means with weights: (unit centres, centre of each entry). Starts from entries far from each other.
 fn cluster(entries: &[CodeEntry], count: usize) -> (Vec<Vec<f32>>, Vec<usize>) {

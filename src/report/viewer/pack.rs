@@ -18,6 +18,7 @@
 //!
 //! Planes of one quantity deflate better than records. A position is exact to 1/65535 of a block, which is a few
 //! neighbouring splats wide.
+use crate::math::{quaternion_norm, sigmoid};
 use crate::query::instances;
 use crate::scene::{LanguageField, LevelField, SH_C0, Seen, Splats};
 use crate::{Error, Result};
@@ -55,7 +56,7 @@ pub fn pack(splats: &Splats, seen: &Seen, language: Option<&LanguageField>, most
 }
 
 fn alpha(splats: &Splats, i: usize) -> f32 {
-    1.0 / (1.0 + (-splats.opacity_logits[i]).exp())
+    sigmoid(splats.opacity_logits[i])
 }
 
 /// Splats that can be seen; when there are more than `most`, those with the largest opacity times area.
@@ -186,7 +187,7 @@ fn sh_scales(splats: &Splats, order: &[usize], rest: usize) -> [f32; 3] {
 /// Smallest three: the largest component follows from the unit length; its sign is made positive (q and −q are one
 /// rotation). The others lie within ±√½.
 fn rotation(q: [f32; 4]) -> u32 {
-    let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+    let norm = quaternion_norm(&q);
     let largest = (0..4).max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs())).unwrap_or(0);
     let sign = if q[largest] < 0.0 { -1.0 } else { 1.0 };
     let mut packed = (largest as u32) << 30;

@@ -11,6 +11,7 @@ use crate::query::TextQuery;
 use crate::report::viewer::CodeNames;
 use crate::run::ask;
 use crate::run::method::Recipe;
+use crate::sync::lock;
 use crate::{Error, Result};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -51,7 +52,7 @@ impl SharedEncoder {
 
     /// Asks it.
     pub fn with<T>(&self, ask: impl FnOnce(&mut dyn RegionEncoder) -> T) -> T {
-        ask(self.encoder.lock().unwrap_or_else(PoisonError::into_inner).as_mut())
+        ask(lock(&self.encoder).as_mut())
     }
 }
 

@@ -1,7 +1,9 @@
 //! Writing.
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
 use crate::format::gaussians::usable;
-use crate::format::{sigmoid, transform};
+use crate::format::transform;
+use crate::math::quaternion_norm;
+use crate::math::sigmoid;
 use crate::scene::{SH_C0, Splats, to_linear};
 use crate::{Error, Result};
 use base64::Engine;
@@ -62,7 +64,7 @@ fn document(splats: &Splats) -> (Value, Vec<u8>) {
         .quats
         .iter()
         .flat_map(|q| {
-            let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+            let norm = quaternion_norm(q);
             [1, 2, 3, 0].map(|k| q[k] / norm)
         })
         .collect();
