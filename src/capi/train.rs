@@ -13,7 +13,7 @@ use crate::run::compat::{self, Compat};
 use crate::run::live::LiveScene;
 use crate::run::sources::{self, SourceChoice, SourceKind, choose};
 use crate::run::{self, Method, RunPlan};
-use crate::scene::{Camera, GivenCamera, MAX_PIXELS, RgbImage};
+use crate::scene::{Camera, GivenCamera, MAX_PIXELS, Plane, RgbImage};
 use std::path::{Path, PathBuf};
 
 /// Most bytes from one row of a photo in memory to the next: a part of an image as wide as any may be given.
@@ -78,6 +78,11 @@ unsafe fn gather(
     // SAFETY: per the header.
     let paths = given.iter().map(|p| unsafe { boundary::path(p.path, "SvkPhoto.path") });
     let paths = paths.collect::<Result<Vec<Option<PathBuf>>, _>>()?;
+    if given.iter().any(|p| !p.mask.is_null() && p.pixels.is_null()) {
+        return bad_argument(
+            "SvkPhoto.mask: belongs to pixels; photos from files have a folder of masks beside theirs",
+        );
+    }
     let in_memory = given.iter().any(|p| !p.encoded.is_null() || !p.pixels.is_null());
     let photos = if !in_memory && paths.iter().all(Option::is_some) {
         let paths: Vec<PathBuf> = paths.into_iter().flatten().collect();
@@ -138,7 +143,14 @@ unsafe fn single(
     // SAFETY: per the header.
     let image = unsafe { pixels(given, &name) }?;
     let focal = (given.focal > 0.0).then_some(given.focal);
-    Ok(photo::from_pixels(&name, &image, focal, max_size)?)
+    if given.mask.is_null() {
+        return Ok(photo::from_pixels(&name, &image, focal, max_size)?);
+    }
+    // SAFETY: a byte for each of the pixels, whose number has been checked.
+    let mask = unsafe { std::slice::from_raw_parts(given.mask, image.data.len()) };
+    let used = mask.iter().map(|v| *v > 0).collect();
+    let used = Plane { width: image.width, height: image.height, data: used };
+    Ok(photo::from_used_pixels(&name, &image, &used, focal, max_size)?)
 }
 
 unsafe fn pixels(given: &SvkPhoto, name: &Path) -> Result<RgbImage, CallError> {
@@ -251,6 +263,7 @@ fn source<K: SourceKind>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::progress::Silent;
 
     #[test]
     fn what_lies_between_the_rows_of_a_photo_in_memory_is_skipped() {
@@ -265,6 +278,22 @@ mod tests {
         let expected = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0], [10.0, 11.0, 12.0]];
         assert_eq!((image.width, image.height), (2, 2));
         assert_eq!(image.data, expected.map(|p| p.map(|v| v / 255.0f32)));
+    }
+
+    #[test]
+    fn mask_of_pixels_leaves_the_others() {
+        let (grey, mut mask) = (vec![90u8; 3 * 64 * 64], vec![255u8; 64 * 64]);
+        mask[..64 * 10].fill(0);
+        // SAFETY: zero is a value.
+        let none: SvkPhoto = unsafe { std::mem::zeroed() };
+        let size = SvkPhoto { pixel_bytes: 3, width: 64, height: 64, mask: mask.as_ptr(), ..none };
+        let given = SvkPhoto { pixels: grey.as_ptr(), ..size };
+        // SAFETY: pixels and mask live as long as the call.
+        let photo = unsafe { single(&given, None, 0, 64) }.ok().unwrap();
+        assert!(!photo.uses(9 * 64 + 63) && photo.uses(10 * 64));
+        let encoded = SvkPhoto { encoded: grey.as_ptr(), encoded_bytes: 9, ..size };
+        // SAFETY: refused before anything is read.
+        assert!(matches!(unsafe { gather(&[encoded], 0, 64, &Silent) }, Err(CallError::Argument(_))));
     }
 
     #[test]

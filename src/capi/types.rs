@@ -253,6 +253,9 @@ pub struct SvkPhoto {
     pub focal: f64,
     /// The photo's camera, where it is known; for all photos or for none.
     pub camera: *const SvkCamera,
+    /// For `pixels`: a byte for each, 0 where the pixel is not used (a person, a bonnet), rows packed; NULL = all are used. Files have
+    /// masks in a folder "masks" beside theirs.
+    pub mask: *const u8,
 }
 
 /// What the progress callback is told. Texts are valid during the call only.

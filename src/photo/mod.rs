@@ -41,8 +41,8 @@ pub use light::Light;
 pub use masks::{MaskChoice, assign as assign_masks};
 pub use overlay::Overlay;
 pub use read::{
-    MAX_SIZE, MAX_SIZE_CPU, Photo, SMALLEST_SIDE, default_max_size, from_bytes, from_pixels, load, load_at,
-    working_size,
+    MAX_SIZE, MAX_SIZE_CPU, Photo, SMALLEST_SIDE, default_max_size, from_bytes, from_pixels,
+    from_used_pixels, load, load_at, working_size,
 };
 pub use resize::Kernel;
 pub use sizes::sizes_of;

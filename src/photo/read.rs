@@ -295,6 +295,25 @@ pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>, max_size: 
     Ok(Photo { exif_focal: focal.map(|f| f * photo.to_working.scale[1]), ..photo })
 }
 
+/// [`from_pixels`] of which only those are used where `used`, [H, W], is true.
+pub fn from_used_pixels(
+    name: &Path,
+    image: &RgbImage,
+    used: &Plane<bool>,
+    focal: Option<f64>,
+    max_size: usize,
+) -> Result<Photo> {
+    let size = (image.width, image.height);
+    if image.data.len() != size.0 * size.1
+        || (used.width, used.height, used.data.len()) != (size.0, size.1, image.data.len())
+    {
+        return Err(Error::input(format!("{}: pixels and mask are of two sizes", name.display())));
+    }
+    let at = |x: usize, y: usize| (image.at(x, y), if used.at(x, y) { 1.0 } else { 0.0 });
+    let photo = partly_used(name, size, max_size, true, at)?;
+    Ok(Photo { exif_focal: focal.map(|f| f * photo.to_working.scale[1]), ..photo })
+}
+
 /// Upright pixels at working resolution, nothing known about the lens.
 fn working(
     name: &Path,

@@ -97,7 +97,7 @@ impl Store {
     /// Drops from memory what no graph has used since this was last called.
     pub fn forget_unused(&self) {
         let Some(memory) = &self.memory else { return };
-        for made in lock(&memory).values_mut() {
+        for made in lock(memory).values_mut() {
             if !std::mem::take(&mut made.used) {
                 made.value = None;
             }
@@ -119,7 +119,7 @@ impl Store {
 
     /// Seconds that it took, if this process has made it in this store; 0 otherwise.
     pub(super) fn seconds(&self, key: &Key) -> f64 {
-        let memory = self.memory.as_ref().map(|m| lock(&m));
+        let memory = self.memory.as_ref().map(|m| lock(m));
         memory.and_then(|m| m.get(&key.0).map(|made| made.seconds)).unwrap_or(0.0)
     }
 
@@ -128,7 +128,7 @@ impl Store {
         if let Some(memory) = &self.memory {
             let value = (!self.passing.contains(&name)).then(|| value.clone());
             let made = Made { value, seconds, used: true };
-            lock(&memory).insert(key.0.clone(), made);
+            lock(memory).insert(key.0.clone(), made);
         }
     }
 

@@ -134,6 +134,16 @@ const STRANGE_SHARE: f64 = 0.5 / 640.0;
 /// hundredth.
 const OFF_CENTRE: f64 = 0.03;
 
+/// Distance of a principal point from the middle of the photo, working pixels. Bars that were cut off may lie over a photo or frame a
+/// whole one: the middle is anywhere between that of the picture and that of the file.
+fn off_middle(photo: &Photo, principal_point: DVec2) -> f64 {
+    let picture = DVec2::new(photo.image.width as f64, photo.image.height as f64) * 0.5;
+    let (w, h) = photo.original_size;
+    let to_file = DVec2::from(photo.to_working.apply([0.5 * f64::from(w), 0.5 * f64::from(h)])) - picture;
+    let way = to_file.dot(principal_point - picture) / to_file.length_squared().max(1e-9);
+    (principal_point - picture - way.clamp(0.0, 1.0) * to_file).length()
+}
+
 /// Names photos whose content, lens or file does not fit the cameras that explain the others.
 fn warn_of_misfits(photos: &[Photo], model: &SparseModel, progress: &dyn Progress) {
     for (v, ((photo, own), camera)) in photos.iter().zip(&model.fitted).zip(&model.cameras).enumerate() {
@@ -145,8 +155,7 @@ fn warn_of_misfits(photos: &[Photo], model: &SparseModel, progress: &dyn Progres
                 100.0 * own.agreement
             ));
         }
-        let half = DVec2::new(photo.image.width as f64, photo.image.height as f64) * 0.5;
-        let off = (DVec2::new(camera.cx, camera.cy) - half).length() / long;
+        let off = off_middle(photo, DVec2::new(camera.cx, camera.cy)) / long;
         if off > OFF_CENTRE {
             progress.warn(&format!(
                 "{stem}: its optical axis was found {:.0} % of the photo away from the middle; either it is cut out of a larger \
@@ -194,10 +203,22 @@ pub fn learned_features(
 mod tests {
     use super::*;
     use crate::pass::metrics::psnr;
-    use crate::photo::Light;
+    use crate::photo::{Light, PlainBorder};
     use crate::pose::{Fitted, testing};
     use crate::progress::{Recorded, Silent};
     use crate::scene::{Lens, RgbImage};
+
+    #[test]
+    fn middle_of_cut_photo_lies_between_picture_and_file() {
+        let image = RgbImage { width: 640, height: 480, data: vec![[0.5; 3]; 640 * 480] };
+        let mut photo = crate::photo::from_pixels("a.png".as_ref(), &image, None, 640).unwrap();
+        assert!((off_middle(&photo, DVec2::new(330.0, 240.0)) - 10.0).abs() < 1e-9);
+        photo.cut(PlainBorder { bottom: 80, ..PlainBorder::default() });
+        // The picture has its middle at 200, the file at 240.
+        for (y, off) in [(190.0, 10.0), (200.0, 0.0), (225.0, 0.0), (240.0, 0.0), (252.0, 12.0)] {
+            assert!((off_middle(&photo, DVec2::new(320.0, y)) - off).abs() < 1e-9, "{y}");
+        }
+    }
 
     #[test]
     fn photos_that_do_not_fit_are_named_with_what_does_not() {
