@@ -557,6 +557,11 @@ typedef struct {
      The photo's camera, where it is known; for all photos or for none.
      */
     const SvkCamera *camera;
+    /*
+     For `pixels`: a byte for each, 0 where the pixel is not used (a person, a bonnet), rows packed; NULL = all are used. Files have
+     masks in a folder "masks" beside theirs.
+     */
+    const uint8_t *mask;
 } SvkPhoto;
 
 /*
