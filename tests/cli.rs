@@ -118,6 +118,28 @@ fn a_size_that_cannot_be_done_is_refused_with_one_that_can() {
     assert!(names(folder.path()).is_empty(), "left behind: {:?}", names(folder.path()));
 }
 
+/// A data set has more photos with cameras than are trained on.
+#[test]
+fn train_chooses_views_and_names_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let (set, out) = (folder.path().join("set"), folder.path().join("scene"));
+    let size = ["--views", "5", "--held-out", "1", "--size", "160x120", "--objects", "2"];
+    assert!(splatvk().arg("generate").arg("--out").arg(&set).args(size).output().unwrap().status.success());
+    let mut train = splatvk();
+    train
+        .arg("train")
+        .arg("--images")
+        .arg(set.join("images"))
+        .arg("--cameras")
+        .arg(set.join("cameras_noisy.json"));
+    let output = train.args(["--views", "2", "--iterations", "1", "--out"]).arg(&out).output().unwrap();
+    assert!(
+        output.status.success() && text(&output.stderr).contains("using 2 of 5 photos: train_0"),
+        "{output:?}"
+    );
+    assert_eq!(names(&out.join("cameras/images")).len(), 2);
+}
+
 #[test]
 fn views_must_fit_the_photos() {
     let photos = data("breakfast/images");
