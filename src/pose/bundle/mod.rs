@@ -91,8 +91,8 @@ impl Problem {
         s.cholesky().map(|f| f.inverse())
     }
 
-    /// Mean square of the residuals, in units of their σ and for one degree of freedom; outlying ones count little.
-    pub(crate) fn variance(&self, c: f64) -> f64 {
+    /// Sum of the squared residuals, in units of their σ, and degrees of freedom; outlying ones count little in both.
+    pub(crate) fn squares(&self, c: f64) -> (f64, f64) {
         let (mut sum, mut freedom) = (0.0, -(self.sizes().1 as f64) - 3.0 * self.points.len() as f64);
         for o in &self.observations {
             let r2 = self.residual(o).length_squared() / (o.sigma * o.sigma);
@@ -102,6 +102,12 @@ impl Problem {
                 freedom += 2.0 * w;
             }
         }
+        (sum, freedom)
+    }
+
+    /// Variance of the residuals, in units of their σ².
+    fn variance(&self, c: f64) -> f64 {
+        let (sum, freedom) = self.squares(c);
         sum / freedom.max(1.0)
     }
 

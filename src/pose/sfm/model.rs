@@ -14,6 +14,20 @@ const MAX_INDEPENDENT: f64 = 2000.0;
 /// common does not repeat in another: two photos alone say little of their optics.
 const PAIRS: f64 = 6.0;
 
+/// Degrees of freedom in which residuals are assumed to have their σ, so that few sightings, which a model fits too well, do not
+/// state a smaller one.
+const ASSUMED: f64 = 20.0;
+
+/// Variance of the residuals where it is below what their σ states. Of two photos every point leaves one component, and errors along
+/// the epipolar lines leave none: their residuals are small whatever the errors.
+fn variance(problem: &Problem) -> f64 {
+    if problem.poses.len() < 3 {
+        return 1.0;
+    }
+    let (sum, freedom) = problem.squares(2.0);
+    ((sum + ASSUMED) / (freedom.max(0.0) + ASSUMED)).min(1.0)
+}
+
 /// σ of the principal point from the middle, as a share of the long side: stabilised sensors move by up to a hundredth.
 pub(super) const SHIFT_SIGMA: f64 = 0.007;
 
@@ -358,7 +372,7 @@ impl Model {
         // where these are below the least σ.
         let observations = 2 * problem.observations.len();
         let share = self.independent(observations) / observations.max(1) as f64;
-        let scale = (share / problem.variance(2.0).clamp(1e-3, 1.0)).sqrt();
+        let scale = (share / variance(&problem)).sqrt();
         problem.priors.iter_mut().for_each(|p| p.narrow(scale));
         (problem, views, used)
     }
@@ -452,16 +466,17 @@ mod tests {
     #[test]
     fn priors_are_weighed_against_what_the_sightings_are_worth() {
         let prior = OpticsPrior { log_focal: (6.0, 0.35), lens: [0.05, 0.02], shift: 4.0 };
-        let shift = |tracks: usize| {
-            let sighting = |view| Sighting { view, pixel: DVec2::splat(50.0), sigma: 1.0, family: 0 };
-            let track = Track { position: Some(DVec3::Z), sightings: vec![sighting(0), sighting(1)] };
+        let shift = |tracks: usize, views: usize, off: f64| {
+            let pixel = DVec2::new(50.0 + off, 50.0);
+            let sighting = |view| Sighting { view, pixel, sigma: 1.0, family: 0 };
+            let track = Track { position: Some(DVec3::Z), sightings: (0..views).map(sighting).collect() };
             let model = Model {
-                poses: vec![Some(Pose::IDENTITY); 2],
-                centres: vec![DVec2::splat(50.0); 2],
-                group: vec![0; 2],
-                alike: vec![0; 2],
-                separable: vec![0; 2],
-                zoom: vec![1.0; 2],
+                poses: vec![Some(Pose::IDENTITY); views],
+                centres: vec![DVec2::splat(50.0); views],
+                group: vec![0; views],
+                alike: vec![0; views],
+                separable: vec![0; views],
+                zoom: vec![1.0; views],
                 optics: vec![Optics { focal: 100.0, lens: Lens::NONE, shift: DVec2::ZERO }],
                 priors: vec![prior],
                 freedom: Freedom::Full,
@@ -469,11 +484,18 @@ mod tests {
                 seed: 0,
             };
             let problem = model.problem(f64::INFINITY, Freedom::Full).0;
-            assert_eq!(problem.observations.len(), 2 * tracks);
+            assert_eq!(problem.observations.len(), views * tracks);
             problem.priors[0].shift
         };
         // Four residual components a track; of two photos 333 count.
-        assert!((shift(80) - 4.0).abs() < 1e-12);
-        assert!((shift(2000) - 4.0 * (MAX_INDEPENDENT / PAIRS / 8000.0).sqrt()).abs() < 1e-12);
+        assert!((shift(80, 2, 0.0) - 4.0).abs() < 1e-12);
+        let share = MAX_INDEPENDENT / PAIRS / 8000.0;
+        assert!((shift(2000, 2, 0.0) - 4.0 * share.sqrt()).abs() < 1e-12);
+        // Three photos count as three pairs. Without residuals: 12,000 components, 6000 coordinates of points, 12 parameters of
+        // poses and 5 of the optics.
+        let share = 3.0 * MAX_INDEPENDENT / PAIRS / 12e3;
+        assert!((shift(2000, 3, 2.0) - 4.0 * share.sqrt()).abs() < 1e-12);
+        let variance = ASSUMED / (12e3 - 6e3 - 17.0 + ASSUMED);
+        assert!((shift(2000, 3, 0.0) - 4.0 * (share / variance).sqrt()).abs() < 1e-9);
     }
 }
