@@ -34,7 +34,8 @@
 #define SVK_ABI_VERSION 65536
 
 /*
- What a function returns. Anything but `SVK_STATUS_OK` leaves a text behind: svk_context_error, svk_scene_error.
+ What a function returns. Anything but `SVK_STATUS_OK` leaves a text behind: svk_context_error,
+ svk_scene_error.
  */
 enum SvkStatus
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
@@ -78,11 +79,13 @@ enum SvkStatus
      */
     SVK_STATUS_INTERNAL = 8,
     /*
-     The Vulkan device was lost. Contexts and scenes on it can only be destroyed; a context on a new device may work.
+     The Vulkan device was lost. Contexts and scenes on it can only be destroyed; a context on a
+     new device may work.
      */
     SVK_STATUS_DEVICE_LOST = 9,
     /*
-     The Vulkan device has no memory left: fewer splats, smaller photos or another device may help.
+     The Vulkan device has no memory left: fewer splats, smaller photos or another device may
+     help.
      */
     SVK_STATUS_OUT_OF_DEVICE_MEMORY = 10,
     /*
@@ -94,7 +97,8 @@ enum SvkStatus
      */
     SVK_STATUS_MISSING_MODEL = 12,
     /*
-     A file cannot be written: the disk is full, or the folder does not allow it. Nothing half-written stays.
+     A file cannot be written: the disk is full, or the folder does not allow it. Nothing
+     half-written stays.
      */
     SVK_STATUS_UNWRITABLE = 13,
 };
@@ -193,7 +197,8 @@ enum SvkPresence
      */
     SVK_PRESENCE_FOUND = 1,
     /*
-     What the scene's features say does not decide, or the text is not wholly understood (see svk_scene_notes).
+     What the scene's features say does not decide, or the text is not wholly understood (see
+     svk_scene_notes).
      */
     SVK_PRESENCE_UNSURE = 2,
     /*
@@ -251,7 +256,8 @@ enum SvkChannel
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
     /*
-     4 values: red, green, blue on black (display-referred sRGB values, not clamped in floats), and alpha.
+     4 values: red, green, blue on black (display-referred sRGB values, not clamped in floats),
+     and alpha.
      */
     SVK_CHANNEL_COLOUR = 0,
     /*
@@ -267,7 +273,8 @@ enum SvkChannel
      */
     SVK_CHANNEL_FEATURES = 3,
     /*
-     1 value: how well the pixel answers `text`, 0 to 1, smoothed; 0 where the scene says nothing.
+     1 value: how well the pixel answers `text`, 0 to 1, smoothed; 0 where the scene says
+     nothing.
      */
     SVK_CHANNEL_RELEVANCY = 4,
 };
@@ -288,13 +295,13 @@ enum SvkEncoding
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
     /*
-     32-bit floats [height][width][values]. As an image: VK_FORMAT_R32_SFLOAT for 1 value, VK_FORMAT_R32G32B32A32_SFLOAT
-     for 4; other counts are for memory and buffers only.
+     32-bit floats [height][width][values]. As an image: VK_FORMAT_R32_SFLOAT for 1 value,
+     VK_FORMAT_R32G32B32A32_SFLOAT for 4; other counts are for memory and buffers only.
      */
     SVK_ENCODING_F32 = 0,
     /*
-     32-bit floats [ceil(values / 4)][height][width][4], filled up with zeros. As an image: VK_FORMAT_R32G32B32A32_SFLOAT
-     with one array layer for every 4 values.
+     32-bit floats [ceil(values / 4)][height][width][4], filled up with zeros. As an image:
+     VK_FORMAT_R32G32B32A32_SFLOAT with one array layer for every 4 values.
      */
     SVK_ENCODING_F32X4 = 1,
     /*
@@ -323,7 +330,8 @@ enum SvkArray
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
     /*
-     [N][3] centres, scene units; axes as the cameras' (x right, y down, z forward in a camera without rotation).
+     [N][3] centres, scene units; axes as the cameras' (x right, y down, z forward in a camera
+     without rotation).
      */
     SVK_ARRAY_MEANS = 0,
     /*
@@ -339,12 +347,13 @@ enum SvkArray
      */
     SVK_ARRAY_OPACITY_LOGITS = 3,
     /*
-     [N][(degree + 1)²][3] spherical-harmonics coefficients; colour = 0.5 + 0.2820948 · the first.
+     [N][(degree + 1)²][3] spherical-harmonics coefficients; colour = 0.5 + 0.2820948 · the
+     first.
      */
     SVK_ARRAY_SH = 4,
     /*
-     [N] pixels of all photos that show the Gaussian; below 0.05 no photo does and it is guessed. Empty (0 floats) where that
-     is not known: files of Gaussians, scenes of older versions.
+     [N] pixels of all photos that show the Gaussian; below 0.05 no photo does and it is guessed.
+     Empty (0 floats) where that is not known: files of Gaussians, scenes of older versions.
      */
     SVK_ARRAY_SEEN = 5,
 };
@@ -375,7 +384,8 @@ typedef struct {
      */
     size_t size;
     /*
-     Part of a Vulkan device's name, or its number as a text; NULL = the best one. Not for svk_context_adopt.
+     Part of a Vulkan device's name, or its number as a text; NULL = the best one. Not for
+     svk_context_adopt.
      */
     const char *device;
     /*
@@ -391,7 +401,8 @@ typedef struct {
      */
     uint32_t validation;
     /*
-     What computes the networks, as --provider takes it; NULL = the environment variable SPLATVK_PROVIDER, or else "auto".
+     What computes the networks, as --provider takes it; NULL = the environment variable
+     SPLATVK_PROVIDER, or else "auto".
      */
     const char *provider;
 } SvkContextOptions;
@@ -407,7 +418,8 @@ typedef void (*SvkVoidFunction)(void);
 typedef void (*SvkQueueFunction)(void *user);
 
 /*
- A Vulkan device of the host, for svk_context_adopt. It must outlive the context and all scenes made from it.
+ A Vulkan device of the host, for svk_context_adopt. It must outlive the context and all scenes
+ made from it.
  */
 typedef struct {
     /*
@@ -443,9 +455,10 @@ typedef struct {
      */
     const char *const *extensions;
     /*
-     The VkPhysicalDeviceFeatures2 chain that the device was made with. Each feature of this list that is on makes some
-     work faster: shaderInt64, storageBuffer16BitAccess, subgroupSizeControl, computeFullSubgroups,
-     shaderBufferFloat32AtomicAdd. timelineSemaphore is needed for SvkSync. Read during the call only.
+     The VkPhysicalDeviceFeatures2 chain that the device was made with. Each feature of this list
+     that is on makes some work faster: shaderInt64, storageBuffer16BitAccess,
+     subgroupSizeControl, computeFullSubgroups, shaderBufferFloat32AtomicAdd. timelineSemaphore
+     is needed for SvkSync. Read during the call only.
      */
     const void *features;
     /*
@@ -453,8 +466,8 @@ typedef struct {
      */
     SvkVoidFunction get_instance_proc_addr;
     /*
-     Called around every use of the queue. NULL = the host leaves the queue alone while a call with this context or one
-     of its scenes runs.
+     Called around every use of the queue. NULL = the host leaves the queue alone while a call
+     with this context or one of its scenes runs.
      */
     SvkQueueFunction lock_queue;
     /*
@@ -468,7 +481,8 @@ typedef struct {
 } SvkVulkanDevice;
 
 /*
- A pinhole camera. Axes: x right, y down, z forward. The centre of the first pixel is at (0.5, 0.5).
+ A pinhole camera. Axes: x right, y down, z forward. The centre of the first pixel is at (0.5,
+ 0.5).
  */
 typedef struct {
     /*
@@ -514,11 +528,13 @@ typedef struct {
      */
     size_t size;
     /*
-     File name for messages, masks and cameras; NULL = that of `path`, or "photo_00", "photo_01", ...
+     File name for messages, masks and cameras; NULL = that of `path`, or "photo_00", "photo_01",
+     ...
      */
     const char *name;
     /*
-     Image file (JPEG, PNG, HEIC, AVIF, WebP, TIFF); with SvkTrainOptions.views a folder of them, too.
+     Image file (JPEG, PNG, HEIC, AVIF, WebP, TIFF); with SvkTrainOptions.views a folder of them,
+     too.
      */
     const char *path;
     /*
@@ -550,7 +566,8 @@ typedef struct {
      */
     size_t row_bytes;
     /*
-     Focal length in these pixels, where it is known; 0 = unknown. For `pixels`; files tell it themselves.
+     Focal length in these pixels, where it is known; 0 = unknown. For `pixels`; files tell it
+     themselves.
      */
     double focal;
     /*
@@ -558,8 +575,8 @@ typedef struct {
      */
     const SvkCamera *camera;
     /*
-     For `pixels`: a byte for each, 0 where the pixel is not used (a person, a bonnet), rows packed; NULL = all are used. Files have
-     masks in a folder "masks" beside theirs.
+     For `pixels`: a byte for each, 0 where the pixel is not used (a person, a bonnet), rows
+     packed; NULL = all are used. Files have masks in a folder "masks" beside theirs.
      */
     const uint8_t *mask;
 } SvkPhoto;
@@ -595,13 +612,15 @@ typedef struct {
 } SvkProgress;
 
 /*
- Called from any thread, never by two at a time, and never after svk_train has returned. Anything but 0 asks it to stop.
- No exception may leave it, and it may not call into the context that trains.
+ Called from any thread, never by two at a time, and never after svk_train has returned. Anything
+ but 0 asks it to stop. No exception may leave it, and it may not call into the context that
+ trains.
  */
 typedef int32_t (*SvkProgressFunction)(void *user, const SvkProgress *progress);
 
 /*
- How a scene is trained. All zero (but for `size`) is the default: built-in models, preset by device.
+ How a scene is trained. All zero (but for `size`) is the default: built-in models, preset by
+ device.
  */
 typedef struct {
     /*
@@ -637,7 +656,8 @@ typedef struct {
      */
     uint32_t per_level;
     /*
-     Known cameras: transforms.json, a COLMAP model folder or cameras.json; NULL = found from the photos.
+     Known cameras: transforms.json, a COLMAP model folder or cameras.json; NULL = found from the
+     photos.
      */
     const char *cameras;
     /*
@@ -645,7 +665,8 @@ typedef struct {
      */
     const char *masks;
     /*
-     Folder of precomputed features (STEM_f.npy, text_embeddings.npz), the same as `masks`; NULL = built-in.
+     Folder of precomputed features (STEM_f.npy, text_embeddings.npz), the same as `masks`; NULL
+     = built-in.
      */
     const char *features;
     /*
@@ -657,13 +678,13 @@ typedef struct {
      */
     void *user;
     /*
-     Longer side of the working images, pixels: larger photos are scaled down, none is enlarged. 0 = 800 on a CPU device,
-     1600 on a GPU.
+     Longer side of the working images, pixels: larger photos are scaled down, none is enlarged.
+     0 = 800 on a CPU device, 1600 on a GPU.
      */
     uint64_t max_size;
     /*
-     Cameras and points, as `splatvk run --init` takes it: "sfm", "cameras:FILE", the name of an installed network, or "auto"
-     for the best of them. NULL = `cameras`, or else "sfm".
+     Cameras and points, as `splatvk run --init` takes it: "sfm", "cameras:FILE", the name of an
+     installed network, or "auto" for the best of them. NULL = `cameras`, or else "sfm".
      */
     const char *init;
     /*
@@ -679,8 +700,8 @@ typedef struct {
      */
     const char *feature_source;
     /*
-     How language gets onto the splats, as --method takes it. NULL = "lift"; "sparselgs" with the preset of the paper,
-     `language_iterations`, `per_level` or `compat`.
+     How language gets onto the splats, as --method takes it. NULL = "lift"; "sparselgs" with the
+     preset of the paper, `language_iterations`, `per_level` or `compat`.
      */
     const char *method;
     /*
@@ -688,12 +709,13 @@ typedef struct {
      */
     uint64_t sh_degree;
     /*
-     What can be done in several ways, as others do it: as --compat takes it. NULL = as this library does it.
+     What can be done in several ways, as others do it: as --compat takes it. NULL = as this
+     library does it.
      */
     const char *compat;
     /*
-     Depth suggested where photos cannot be matched, as --depth-prior takes it: "dir:FOLDER", the name of an installed
-     network, or "auto" for the best of them. NULL = none.
+     Depth suggested where photos cannot be matched, as --depth-prior takes it: "dir:FOLDER", the
+     name of an installed network, or "auto" for the best of them. NULL = none.
      */
     const char *depth_prior;
 } SvkTrainOptions;
@@ -773,7 +795,8 @@ typedef struct {
      */
     uint32_t instances;
     /*
-     Share of other things that fit the scene at least as well: the p-value behind `presence`. 0 = unknown.
+     Share of other things that fit the scene at least as well: the p-value behind `presence`. 0
+     = unknown.
      */
     double p_value;
     /*
@@ -869,7 +892,8 @@ typedef struct {
      */
     void *host;
     /*
-     Size of `host`, or of the space in `buffer` from `offset` on. Must hold what the encoding needs.
+     Size of `host`, or of the space in `buffer` from `offset` on. Must hold what the encoding
+     needs.
      */
     size_t bytes;
     /*
@@ -881,8 +905,8 @@ typedef struct {
      */
     uint64_t offset;
     /*
-     VkImage with VK_IMAGE_USAGE_TRANSFER_DST_BIT, on the host's device: 2D, of the camera's size, one sample, in the
-     format that the encoding names. Mip level 0 is written.
+     VkImage with VK_IMAGE_USAGE_TRANSFER_DST_BIT, on the host's device: 2D, of the camera's
+     size, one sample, in the format that the encoding names. Mip level 0 is written.
      */
     uint64_t image;
     /*
@@ -896,8 +920,9 @@ typedef struct {
 } SvkOutput;
 
 /*
- Timeline semaphores of the host around writing to its buffers and images. Both belong to the context's queue family
- (or are shared concurrently) when the wait is over, and still do when the signal comes.
+ Timeline semaphores of the host around writing to its buffers and images. Both belong to the
+ context's queue family (or are shared concurrently) when the wait is over, and still do when the
+ signal comes.
  */
 typedef struct {
     /*
@@ -905,7 +930,8 @@ typedef struct {
      */
     size_t size;
     /*
-     VkSemaphore of type timeline: targets may be written once it reaches `wait_value`; 0 = at once.
+     VkSemaphore of type timeline: targets may be written once it reaches `wait_value`; 0 = at
+     once.
      */
     uint64_t wait_semaphore;
     /*
@@ -913,7 +939,8 @@ typedef struct {
      */
     uint64_t wait_value;
     /*
-     VkSemaphore of type timeline: reaches `signal_value` when all targets are written. 0 = the call waits for that.
+     VkSemaphore of type timeline: reaches `signal_value` when all targets are written. 0 = the
+     call waits for that.
      */
     uint64_t signal_semaphore;
     /*

@@ -6,11 +6,13 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// Receives progress from any thread. The command line draws bars, hosts may forward it, tests use [`Silent`].
+/// Receives progress from any thread. The command line draws bars, hosts may forward it, tests use
+/// [`Silent`].
 pub trait Progress: Send + Sync {
     /// A stage starts; `steps` is its length in whatever unit it counts.
     fn begin(&self, stage: &'static str, steps: u64);
-    /// `done` of the current stage's steps are finished; `note` is a short live figure ("PSNR 28.1").
+    /// `done` of the current stage's steps are finished; `note` is a short live figure ("PSNR
+    /// 28.1").
     fn step(&self, done: u64, note: &str);
     /// Measurements of the current stage at a step, by name: loss, PSNR in dB, counts.
     fn figures(&self, _step: u64, _figures: &[(&str, f64)]) {}
@@ -18,7 +20,8 @@ pub trait Progress: Send + Sync {
     fn end(&self);
     /// Something the user should know, one line.
     fn warn(&self, message: &str);
-    /// What was decided for the user and is as it should be, one line. Hosts that keep this default get it as a warning.
+    /// What was decided for the user and is as it should be, one line. Hosts that keep this default
+    /// get it as a warning.
     fn inform(&self, message: &str) {
         self.warn(message);
     }
@@ -34,8 +37,9 @@ pub trait Progress: Send + Sync {
     fn checkpoint(&self) -> Option<&Checkpoint> {
         None
     }
-    /// Progress of work that goes on in parallel to this one: stages of the two lanes do not end each other. Hosts that
-    /// show one stage at a time keep this default, which ignores the second lane.
+    /// Progress of work that goes on in parallel to this one: stages of the two lanes do not end
+    /// each other. Hosts that show one stage at a time keep this default, which ignores the second
+    /// lane.
     fn second_lane(&self) -> Box<dyn Progress + '_> {
         Box::new(Silent)
     }
@@ -61,11 +65,13 @@ pub struct StageRecord {
     pub start: f64,
     /// Wall seconds.
     pub seconds: f64,
-    /// Peak resident memory of the process up to the end of the stage, bytes; 0 where the system does not tell.
+    /// Peak resident memory of the process up to the end of the stage, bytes; 0 where the system
+    /// does not tell.
     pub peak_memory: u64,
 }
 
-/// Passes everything on and keeps what run.json reports: times and memory per stage, and the warnings.
+/// Passes everything on and keeps what run.json reports: times and memory per stage, and the
+/// warnings.
 pub struct Recorded<'a> {
     inner: &'a dyn Progress,
     began: Instant,
@@ -105,7 +111,8 @@ impl<'a> Recorded<'a> {
     pub fn warnings(&self) -> Vec<String> {
         lock(&self.warnings).clone()
     }
-    /// Warns of what matters more than all that was said before: it stands first among the warnings.
+    /// Warns of what matters more than all that was said before: it stands first among the
+    /// warnings.
     pub fn warn_first(&self, message: &str) {
         lock(&self.warnings).insert(0, message.to_owned());
         self.inner.warn(message);

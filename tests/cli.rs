@@ -1,4 +1,5 @@
-//! The program as a user runs it: what it refuses, how it says so, and that it leaves nothing half-written.
+//! The program as a user runs it: what it refuses, how it says so, and that it leaves nothing
+//! half-written.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
@@ -97,7 +98,8 @@ fn doctor_compares_every_pass_on_the_device() {
 fn photos_without_overlap_are_named() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::copy(data("breakfast/images/train_00.jpg"), folder.path().join("table.jpg")).unwrap();
-    // A few blocks of random colour: corners, none of them on the table, and few enough to be refused fast.
+    // A few blocks of random colour: corners, none of them on the table, and few enough to be
+    // refused fast.
     let blob = |x: u32, y: u32, k: u32| ((x / 64 * 7919 + y / 48 * 104_729 + k * 31) % 251) as u8;
     let noise =
         image::RgbImage::from_fn(640, 480, |x, y| image::Rgb([blob(x, y, 0), blob(x, y, 1), blob(x, y, 5)]));
@@ -325,7 +327,8 @@ fn ctrl_c_stops_cleanly() {
     std::thread::sleep(Duration::from_millis(500));
     let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
     assert!(killed.success());
-    // To its last line, with which everything is done: a busy kernel was seen to take 5 s more to take the process apart.
+    // To its last line, with which everything is done: a busy kernel was seen to take 5 s more to
+    // take the process apart.
     let sent = Instant::now();
     let lines = BufReader::new(child.stderr.take().unwrap()).lines();
     let said: Vec<(Duration, String)> = lines.map(|line| (sent.elapsed(), line.unwrap())).collect();
@@ -366,7 +369,8 @@ fn a_full_disk_leaves_nothing() {
     assert!(names(folder.path()).is_empty(), "{:?}", names(folder.path()));
 }
 
-/// Every answer is held against the canonical phrases: without them, and without a network for them, nothing can be asked.
+/// Every answer is held against the canonical phrases: without them, and without a network for
+/// them, nothing can be asked.
 #[test]
 fn text_embeddings_without_what_is_asked_are_refused_before_any_work() {
     let folder = tempfile::tempdir().unwrap();
@@ -406,7 +410,8 @@ fn the_scene_of_a_run_is_whole_and_can_be_replaced() {
         said.iter().filter(|e| e["event"] == "warning").filter_map(|e| e["message"].as_str()).collect();
     let mut recorded: Vec<_> =
         run["warnings"].as_array().unwrap().iter().filter_map(|w| w.as_str()).collect();
-    // Two iterations show no photo well: the record says that before all else, though it is known last.
+    // Two iterations show no photo well: the record says that before all else, though it is known
+    // last.
     assert!(recorded[0].starts_with("photos are reproduced at"), "{recorded:?}");
     warned.sort_unstable();
     recorded.sort_unstable();

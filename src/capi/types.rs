@@ -1,7 +1,8 @@
 //! Numbers and structures that cross the boundary.
 use std::ffi::{c_char, c_void};
 
-/// What a function returns. Anything but `SVK_STATUS_OK` leaves a text behind: svk_context_error, svk_scene_error.
+/// What a function returns. Anything but `SVK_STATUS_OK` leaves a text behind: svk_context_error,
+/// svk_scene_error.
 #[repr(i32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkStatus {
@@ -23,15 +24,18 @@ pub enum SvkStatus {
     Argument = 7,
     /// A mistake in splatvk. The handle may be destroyed, and nothing else should be done with it.
     Internal = 8,
-    /// The Vulkan device was lost. Contexts and scenes on it can only be destroyed; a context on a new device may work.
+    /// The Vulkan device was lost. Contexts and scenes on it can only be destroyed; a context on a
+    /// new device may work.
     DeviceLost = 9,
-    /// The Vulkan device has no memory left: fewer splats, smaller photos or another device may help.
+    /// The Vulkan device has no memory left: fewer splats, smaller photos or another device may
+    /// help.
     OutOfDeviceMemory = 10,
     /// No Vulkan loader, driver or device that can be used.
     NoDevice = 11,
     /// A model, or a file of it, is missing or not what it is used for.
     MissingModel = 12,
-    /// A file cannot be written: the disk is full, or the folder does not allow it. Nothing half-written stays.
+    /// A file cannot be written: the disk is full, or the folder does not allow it. Nothing
+    /// half-written stays.
     Unwritable = 13,
 }
 
@@ -83,7 +87,8 @@ pub enum SvkProgressKind {
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkChannel {
-    /// 4 values: red, green, blue on black (display-referred sRGB values, not clamped in floats), and alpha.
+    /// 4 values: red, green, blue on black (display-referred sRGB values, not clamped in floats),
+    /// and alpha.
     Colour = 0,
     /// 1 value: accumulated opacity, 0 to 1.
     Alpha = 1,
@@ -91,7 +96,8 @@ pub enum SvkChannel {
     Depth = 2,
     /// The blended features of one level: as many values as SvkSceneInfo.feature_dim says for it.
     Features = 3,
-    /// 1 value: how well the pixel answers `text`, 0 to 1, smoothed; 0 where the scene says nothing.
+    /// 1 value: how well the pixel answers `text`, 0 to 1, smoothed; 0 where the scene says
+    /// nothing.
     Relevancy = 4,
 }
 
@@ -99,11 +105,11 @@ pub enum SvkChannel {
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkEncoding {
-    /// 32-bit floats [height][width][values]. As an image: VK_FORMAT_R32_SFLOAT for 1 value, VK_FORMAT_R32G32B32A32_SFLOAT
-    /// for 4; other counts are for memory and buffers only.
+    /// 32-bit floats [height][width][values]. As an image: VK_FORMAT_R32_SFLOAT for 1 value,
+    /// VK_FORMAT_R32G32B32A32_SFLOAT for 4; other counts are for memory and buffers only.
     F32 = 0,
-    /// 32-bit floats [ceil(values / 4)][height][width][4], filled up with zeros. As an image: VK_FORMAT_R32G32B32A32_SFLOAT
-    /// with one array layer for every 4 values.
+    /// 32-bit floats [ceil(values / 4)][height][width][4], filled up with zeros. As an image:
+    /// VK_FORMAT_R32G32B32A32_SFLOAT with one array layer for every 4 values.
     F32X4 = 1,
     /// The same in 16-bit floats: VK_FORMAT_R16G16B16A16_SFLOAT. Not for relevancy.
     F16X4 = 2,
@@ -115,7 +121,8 @@ pub enum SvkEncoding {
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkArray {
-    /// [N][3] centres, scene units; axes as the cameras' (x right, y down, z forward in a camera without rotation).
+    /// [N][3] centres, scene units; axes as the cameras' (x right, y down, z forward in a camera
+    /// without rotation).
     Means = 0,
     /// [N][3] natural logarithms of the standard deviations along the local axes.
     LogScales = 1,
@@ -123,10 +130,11 @@ pub enum SvkArray {
     Quats = 2,
     /// [N] opacities before the sigmoid.
     OpacityLogits = 3,
-    /// [N][(degree + 1)²][3] spherical-harmonics coefficients; colour = 0.5 + 0.2820948 · the first.
+    /// [N][(degree + 1)²][3] spherical-harmonics coefficients; colour = 0.5 + 0.2820948 · the
+    /// first.
     Sh = 4,
-    /// [N] pixels of all photos that show the Gaussian; below 0.05 no photo does and it is guessed. Empty (0 floats) where that
-    /// is not known: files of Gaussians, scenes of older versions.
+    /// [N] pixels of all photos that show the Gaussian; below 0.05 no photo does and it is guessed.
+    /// Empty (0 floats) where that is not known: files of Gaussians, scenes of older versions.
     Seen = 5,
 }
 
@@ -138,7 +146,8 @@ pub enum SvkPresence {
     Unknown = 0,
     /// It has.
     Found = 1,
-    /// What the scene's features say does not decide, or the text is not wholly understood (see svk_scene_notes).
+    /// What the scene's features say does not decide, or the text is not wholly understood (see
+    /// svk_scene_notes).
     Unsure = 2,
     /// It has not.
     Absent = 3,
@@ -150,7 +159,8 @@ pub enum SvkPresence {
 pub struct SvkContextOptions {
     /// sizeof(SvkContextOptions)
     pub size: usize,
-    /// Part of a Vulkan device's name, or its number as a text; NULL = the best one. Not for svk_context_adopt.
+    /// Part of a Vulkan device's name, or its number as a text; NULL = the best one. Not for
+    /// svk_context_adopt.
     pub device: *const c_char,
     /// Folder of the models; NULL = the installed ones.
     pub models: *const c_char,
@@ -158,7 +168,8 @@ pub struct SvkContextOptions {
     pub deterministic: u32,
     /// 1 = with the Khronos validation layer. Not for svk_context_adopt.
     pub validation: u32,
-    /// What computes the networks, as --provider takes it; NULL = the environment variable SPLATVK_PROVIDER, or else "auto".
+    /// What computes the networks, as --provider takes it; NULL = the environment variable
+    /// SPLATVK_PROVIDER, or else "auto".
     pub provider: *const c_char,
 }
 
@@ -168,7 +179,8 @@ pub type SvkVoidFunction = Option<unsafe extern "C" fn()>;
 /// Takes or releases the host's own lock of a queue; `user` is the structure's.
 pub type SvkQueueFunction = Option<unsafe extern "C" fn(user: *mut c_void)>;
 
-/// A Vulkan device of the host, for svk_context_adopt. It must outlive the context and all scenes made from it.
+/// A Vulkan device of the host, for svk_context_adopt. It must outlive the context and all scenes
+/// made from it.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkVulkanDevice {
@@ -188,14 +200,15 @@ pub struct SvkVulkanDevice {
     pub extension_count: u32,
     /// Names of the device extensions that were enabled.
     pub extensions: *const *const c_char,
-    /// The VkPhysicalDeviceFeatures2 chain that the device was made with. Each feature of this list that is on makes some
-    /// work faster: shaderInt64, storageBuffer16BitAccess, subgroupSizeControl, computeFullSubgroups,
-    /// shaderBufferFloat32AtomicAdd. timelineSemaphore is needed for SvkSync. Read during the call only.
+    /// The VkPhysicalDeviceFeatures2 chain that the device was made with. Each feature of this list
+    /// that is on makes some work faster: shaderInt64, storageBuffer16BitAccess,
+    /// subgroupSizeControl, computeFullSubgroups, shaderBufferFloat32AtomicAdd. timelineSemaphore
+    /// is needed for SvkSync. Read during the call only.
     pub features: *const c_void,
     /// vkGetInstanceProcAddr of the host; NULL = that of the system's loader.
     pub get_instance_proc_addr: SvkVoidFunction,
-    /// Called around every use of the queue. NULL = the host leaves the queue alone while a call with this context or one
-    /// of its scenes runs.
+    /// Called around every use of the queue. NULL = the host leaves the queue alone while a call
+    /// with this context or one of its scenes runs.
     pub lock_queue: SvkQueueFunction,
     /// The end of `lock_queue`.
     pub unlock_queue: SvkQueueFunction,
@@ -203,7 +216,8 @@ pub struct SvkVulkanDevice {
     pub user: *mut c_void,
 }
 
-/// A pinhole camera. Axes: x right, y down, z forward. The centre of the first pixel is at (0.5, 0.5).
+/// A pinhole camera. Axes: x right, y down, z forward. The centre of the first pixel is at (0.5,
+/// 0.5).
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkCamera {
@@ -231,9 +245,11 @@ pub struct SvkCamera {
 pub struct SvkPhoto {
     /// sizeof(SvkPhoto)
     pub size: usize,
-    /// File name for messages, masks and cameras; NULL = that of `path`, or "photo_00", "photo_01", ...
+    /// File name for messages, masks and cameras; NULL = that of `path`, or "photo_00", "photo_01",
+    /// ...
     pub name: *const c_char,
-    /// Image file (JPEG, PNG, HEIC, AVIF, WebP, TIFF); with SvkTrainOptions.views a folder of them, too.
+    /// Image file (JPEG, PNG, HEIC, AVIF, WebP, TIFF); with SvkTrainOptions.views a folder of them,
+    /// too.
     pub path: *const c_char,
     /// Such an image file in memory.
     pub encoded: *const u8,
@@ -249,12 +265,13 @@ pub struct SvkPhoto {
     pub height: u32,
     /// From one row to the next, bytes; 0 = width * pixel_bytes.
     pub row_bytes: usize,
-    /// Focal length in these pixels, where it is known; 0 = unknown. For `pixels`; files tell it themselves.
+    /// Focal length in these pixels, where it is known; 0 = unknown. For `pixels`; files tell it
+    /// themselves.
     pub focal: f64,
     /// The photo's camera, where it is known; for all photos or for none.
     pub camera: *const SvkCamera,
-    /// For `pixels`: a byte for each, 0 where the pixel is not used (a person, a bonnet), rows packed; NULL = all are used. Files have
-    /// masks in a folder "masks" beside theirs.
+    /// For `pixels`: a byte for each, 0 where the pixel is not used (a person, a bonnet), rows
+    /// packed; NULL = all are used. Files have masks in a folder "masks" beside theirs.
     pub mask: *const u8,
 }
 
@@ -276,12 +293,14 @@ pub struct SvkProgress {
     pub note: *const c_char,
 }
 
-/// Called from any thread, never by two at a time, and never after svk_train has returned. Anything but 0 asks it to stop.
-/// No exception may leave it, and it may not call into the context that trains.
+/// Called from any thread, never by two at a time, and never after svk_train has returned. Anything
+/// but 0 asks it to stop. No exception may leave it, and it may not call into the context that
+/// trains.
 pub type SvkProgressFunction =
     Option<unsafe extern "C" fn(user: *mut c_void, progress: *const SvkProgress) -> i32>;
 
-/// How a scene is trained. All zero (but for `size`) is the default: built-in models, preset by device.
+/// How a scene is trained. All zero (but for `size`) is the default: built-in models, preset by
+/// device.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkTrainOptions {
@@ -301,21 +320,23 @@ pub struct SvkTrainOptions {
     pub feature_dim: u32,
     /// 1 = one model per level, as in the paper.
     pub per_level: u32,
-    /// Known cameras: transforms.json, a COLMAP model folder or cameras.json; NULL = found from the photos.
+    /// Known cameras: transforms.json, a COLMAP model folder or cameras.json; NULL = found from the
+    /// photos.
     pub cameras: *const c_char,
     /// Folder of precomputed masks (STEM_s.npy); NULL = built-in.
     pub masks: *const c_char,
-    /// Folder of precomputed features (STEM_f.npy, text_embeddings.npz), the same as `masks`; NULL = built-in.
+    /// Folder of precomputed features (STEM_f.npy, text_embeddings.npz), the same as `masks`; NULL
+    /// = built-in.
     pub features: *const c_char,
     /// Called with the progress; a result other than 0 stops the run; may be NULL.
     pub progress: SvkProgressFunction,
     /// Given to `progress`.
     pub user: *mut c_void,
-    /// Longer side of the working images, pixels: larger photos are scaled down, none is enlarged. 0 = 800 on a CPU device,
-    /// 1600 on a GPU.
+    /// Longer side of the working images, pixels: larger photos are scaled down, none is enlarged.
+    /// 0 = 800 on a CPU device, 1600 on a GPU.
     pub max_size: u64,
-    /// Cameras and points, as `splatvk run --init` takes it: "sfm", "cameras:FILE", the name of an installed network, or "auto"
-    /// for the best of them. NULL = `cameras`, or else "sfm".
+    /// Cameras and points, as `splatvk run --init` takes it: "sfm", "cameras:FILE", the name of an
+    /// installed network, or "auto" for the best of them. NULL = `cameras`, or else "sfm".
     pub init: *const c_char,
     /// Dense matches, as --matcher takes it. NULL = built-in.
     pub matcher: *const c_char,
@@ -323,15 +344,16 @@ pub struct SvkTrainOptions {
     pub mask_source: *const c_char,
     /// Region features, as --features takes it. NULL = `features`, or else built-in.
     pub feature_source: *const c_char,
-    /// How language gets onto the splats, as --method takes it. NULL = "lift"; "sparselgs" with the preset of the paper,
-    /// `language_iterations`, `per_level` or `compat`.
+    /// How language gets onto the splats, as --method takes it. NULL = "lift"; "sparselgs" with the
+    /// preset of the paper, `language_iterations`, `per_level` or `compat`.
     pub method: *const c_char,
     /// SvkShDegree
     pub sh_degree: u64,
-    /// What can be done in several ways, as others do it: as --compat takes it. NULL = as this library does it.
+    /// What can be done in several ways, as others do it: as --compat takes it. NULL = as this
+    /// library does it.
     pub compat: *const c_char,
-    /// Depth suggested where photos cannot be matched, as --depth-prior takes it: "dir:FOLDER", the name of an installed
-    /// network, or "auto" for the best of them. NULL = none.
+    /// Depth suggested where photos cannot be matched, as --depth-prior takes it: "dir:FOLDER", the
+    /// name of an installed network, or "auto" for the best of them. NULL = none.
     pub depth_prior: *const c_char,
 }
 
@@ -373,14 +395,15 @@ pub struct SvkOutput {
     pub text: *const c_char,
     /// Memory of the host.
     pub host: *mut c_void,
-    /// Size of `host`, or of the space in `buffer` from `offset` on. Must hold what the encoding needs.
+    /// Size of `host`, or of the space in `buffer` from `offset` on. Must hold what the encoding
+    /// needs.
     pub bytes: usize,
     /// VkBuffer with VK_BUFFER_USAGE_TRANSFER_DST_BIT, on the host's device.
     pub buffer: u64,
     /// First byte of `buffer`; a multiple of 4.
     pub offset: u64,
-    /// VkImage with VK_IMAGE_USAGE_TRANSFER_DST_BIT, on the host's device: 2D, of the camera's size, one sample, in the
-    /// format that the encoding names. Mip level 0 is written.
+    /// VkImage with VK_IMAGE_USAGE_TRANSFER_DST_BIT, on the host's device: 2D, of the camera's
+    /// size, one sample, in the format that the encoding names. Mip level 0 is written.
     pub image: u64,
     /// VkImageLayout that the image has; VK_IMAGE_LAYOUT_UNDEFINED where its content may be lost.
     pub old_layout: u32,
@@ -388,18 +411,21 @@ pub struct SvkOutput {
     pub new_layout: u32,
 }
 
-/// Timeline semaphores of the host around writing to its buffers and images. Both belong to the context's queue family
-/// (or are shared concurrently) when the wait is over, and still do when the signal comes.
+/// Timeline semaphores of the host around writing to its buffers and images. Both belong to the
+/// context's queue family (or are shared concurrently) when the wait is over, and still do when the
+/// signal comes.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkSync {
     /// sizeof(SvkSync)
     pub size: usize,
-    /// VkSemaphore of type timeline: targets may be written once it reaches `wait_value`; 0 = at once.
+    /// VkSemaphore of type timeline: targets may be written once it reaches `wait_value`; 0 = at
+    /// once.
     pub wait_semaphore: u64,
     /// See `wait_semaphore`.
     pub wait_value: u64,
-    /// VkSemaphore of type timeline: reaches `signal_value` when all targets are written. 0 = the call waits for that.
+    /// VkSemaphore of type timeline: reaches `signal_value` when all targets are written. 0 = the
+    /// call waits for that.
     pub signal_semaphore: u64,
     /// See `signal_semaphore`.
     pub signal_value: u64,
@@ -427,7 +453,8 @@ pub struct SvkAnswer {
     pub presence: u32,
     /// Things in space that the text means: those of svk_scene_instances.
     pub instances: u32,
-    /// Share of other things that fit the scene at least as well: the p-value behind `presence`. 0 = unknown.
+    /// Share of other things that fit the scene at least as well: the p-value behind `presence`. 0
+    /// = unknown.
     pub p_value: f64,
     /// How far the photos agree on what answers, 0 to 1; below 0 = unknown.
     pub reliability: f64,

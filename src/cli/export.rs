@@ -20,8 +20,8 @@ use std::path::{Path, PathBuf};
 pub struct ExportArgs {
     /// Scene directory, or a file of Gaussians: .ply (compressed, too), .splat, .spz, .glb, .gltf
     pub scene: PathBuf,
-    /// What to write; language goes beside the files of Gaussians, into OUT.language.npz (ply: --with-features) [default: by the
-    /// ending of --out]
+    /// Format of the file; language goes beside the files of Gaussians, into OUT.language.npz (ply:
+    /// --with-features) [default: by the ending of --out]
     #[arg(long, value_parser = formats(), value_name = "FORMAT")]
     pub format: Option<String>,
     /// File, or folder (colmap, colmap-bin)
@@ -39,11 +39,13 @@ pub struct ExportArgs {
     /// ply: add the language features and codes as extra columns
     #[arg(long)]
     pub with_features: bool,
-    /// Leave out splats that no photo shows: surfaces continued beyond the photos and behind what stands in front
+    /// Leave out splats that no photo shows: surfaces continued beyond the photos and behind what
+    /// stands in front
     #[arg(long)]
     pub only_seen: bool,
-    /// Turn the scene so that up, where the scene states it, is this axis: -y (right, down, forward), y (right, up, back) or z
-    /// (right, forward, up); spz, glb and gltf know only y [default: the scene's own axes]
+    /// Turn the scene so that up, where the scene states it, is this axis: -y (right, down,
+    /// forward), y (right, up, back) or z (right, forward, up); spz, glb and gltf know only y
+    /// [default: the scene's own axes]
     #[arg(long, value_parser = up_axis, allow_hyphen_values = true, value_name = "AXIS")]
     pub up: Option<UpAxis>,
     /// Scale the scene to metres, where its scale is known (splatvk measure --scale)
@@ -188,7 +190,8 @@ pub fn export(args: &ExportArgs) -> Result<()> {
 enum Out {
     /// The files of a COLMAP model.
     Folder(WrittenFiles),
-    /// One file: cameras, or a PLY, which alone of all formats can hold the language itself, and any degree.
+    /// One file: cameras, or a PLY, which alone of all formats can hold the language itself, and
+    /// any degree.
     File(WrittenFile),
     /// Splats, and the language beside them.
     Splats(Reserved, &'static SplatFormat),
@@ -249,7 +252,8 @@ fn format(args: &ExportArgs) -> Result<&str> {
     }
 }
 
-/// Refuses a name that is of another format, by which programs would take the file for it; returns a warning for one of none.
+/// Refuses a name that is of another format, by which programs would take the file for it; returns
+/// a warning for one of none.
 fn check_ending(path: &Path, format: &str) -> Result<Option<String>> {
     let Some((_, own)) = endings().find(|(name, _)| *name == format) else { return Ok(None) };
     let (out, file) = (path.display(), path.to_string_lossy());
@@ -295,8 +299,8 @@ fn keep_seen(scene: &mut Scene, args: &ExportArgs) -> Result<()> {
     Ok(())
 }
 
-/// Base colours of ordinary photos stay below this: of 145,000 splats of the breakfast scene one in 50,000 is above 1.1,
-/// none above 1.25.
+/// Base colours of ordinary photos stay below this: of 145,000 splats of the breakfast scene one in
+/// 50,000 is above 1.1, none above 1.25.
 const ORDINARY: f32 = 1.25;
 /// Share of the solid splats that may be cut off unnoticed.
 const UNNOTICED: f64 = 5e-4;
@@ -315,7 +319,8 @@ fn warn_of_losses(splats: &Splats, format: &SplatFormat) {
     }
 }
 
-/// Warns where a format of bytes cuts off what solid splats have beyond its `brightest` base colour.
+/// Warns where a format of bytes cuts off what solid splats have beyond its `brightest` base
+/// colour.
 fn warn_of_range(splats: &Splats, brightest: f32) {
     let row = splats.sh.len() / splats.len().max(1);
     let limit = brightest.max(ORDINARY);

@@ -1,5 +1,6 @@
-//! Bars beside the picture that photos have in common: letterboxes, frames of instant photos, the surface of a phone around a photo,
-//! captions and banners. They stand still in the frame, so they are cut off; what is left is the photo.
+//! Bars beside the picture that photos have in common: letterboxes, frames of instant photos, the
+//! surface of a phone around a photo, captions and banners. They stand still in the frame, so they
+//! are cut off; what is left is the photo.
 //!
 //! Thin plain borders of a single photo, as of scans, are those of [`super::border`].
 use super::border::PlainBorder;
@@ -8,14 +9,16 @@ use crate::scene::RgbImage;
 use rayon::prelude::*;
 use std::collections::HashMap;
 
-/// Largest difference of a colour among the photos within a bar, and within a plain bar of one photo: of compression.
+/// Largest difference of a colour among the photos within a bar, and within a plain bar of one
+/// photo: of compression.
 const SAME: f32 = 0.05;
 /// Share of the pixels of a line of a bar that are so.
 const BAR: f64 = 0.95;
-/// Share below which a line belongs to the picture: its first lines are full of the scene, where a wall or sky that looks the same in
-/// all photos ends at things of the scene, one after the other.
+/// Share below which a line belongs to the picture: its first lines are full of the scene, where a
+/// wall or sky that looks the same in all photos ends at things of the scene, one after the other.
 const PICTURE: f64 = 0.3;
-/// Lines, share of the shorter side, in which the bar ends: compression smears its edge over a block.
+/// Lines, share of the shorter side, in which the bar ends: compression smears its edge over a
+/// block.
 const EDGE: f64 = 0.02;
 /// A bar that is thinner, share of the shorter side, is an uneven border at most.
 const THINNEST: f64 = 0.015;
@@ -38,7 +41,8 @@ impl Bars {
     }
 }
 
-/// The bars of every photo that has some: those that stand still in all photos of one size, else those of plain colour.
+/// The bars of every photo that has some: those that stand still in all photos of one size, else
+/// those of plain colour.
 pub(super) fn find(photos: &[Photo]) -> Vec<Bars> {
     let size = |p: &Photo| (p.image.width, p.image.height);
     let mut of_size: HashMap<(usize, usize), PlainBorder> = HashMap::new();
@@ -56,8 +60,8 @@ pub(super) fn find(photos: &[Photo]) -> Vec<Bars> {
     found
 }
 
-/// Bars that all photos, of one size, have in common; none of a single one. Pixels that a mask or transparency leaves out are none of
-/// theirs: they have been dealt with.
+/// Bars that all photos, of one size, have in common; none of a single one. Pixels that a mask or
+/// transparency leaves out are none of theirs: they have been dealt with.
 fn common(photos: &[&Photo]) -> PlainBorder {
     let [first, _, ..] = photos else { return PlainBorder::default() };
     let (w, h) = (first.image.width, first.image.height);
@@ -86,15 +90,16 @@ fn common(photos: &[&Photo]) -> PlainBorder {
     enough(bars, (w, h))
 }
 
-/// Whether the line behind a bar differs from those of the bar in this photo, too: what is the same in all photos only as far as the
-/// shallowest of several skies is no bar.
+/// Whether the line behind a bar differs from those of the bar in this photo, too: what is the same
+/// in all photos only as far as the shallowest of several skies is no bar.
 fn ends_at(depth: usize, across: usize, at: &dyn Fn(usize, usize) -> [f32; 3]) -> bool {
     let alike =
         |i: &usize| at(3 * depth / 4, *i).iter().zip(at(depth, *i)).all(|(a, b)| (a - b).abs() <= SAME);
     ((0..across).filter(alike).count() as f64) < BAR * across as f64
 }
 
-/// Bars of one colour on two opposite sides of one photo. One side alone may be a sky that is burnt out.
+/// Bars of one colour on two opposite sides of one photo. One side alone may be a sky that is burnt
+/// out.
 fn plain(photo: &Photo) -> PlainBorder {
     let image = &photo.image;
     let (w, h) = (image.width, image.height);
@@ -146,7 +151,8 @@ fn around((w, h): (usize, usize), of_bar: &dyn Fn(usize, usize) -> bool) -> Plai
     bars
 }
 
-/// Lines of a bar from one side, by the share of each that is of it; 0 where it does not end at a straight edge.
+/// Lines of a bar from one side, by the share of each that is of it; 0 where it does not end at a
+/// straight edge.
 fn depth(lines: usize, shorter: f64, share: &dyn Fn(usize) -> f64) -> usize {
     let Some(end) = (0..lines).find(|d| share(*d) < BAR) else { return 0 };
     let edge = (EDGE * shorter).ceil() as usize;
@@ -157,7 +163,7 @@ fn depth(lines: usize, shorter: f64, share: &dyn Fn(usize) -> f64) -> usize {
     }
 }
 
-/// What is said of bars that were cut off.
+/// Warning about bars that were cut off.
 pub(super) fn message(photos: &[Photo], bars: &[Bars]) -> Option<String> {
     let share = |b: &Bars| {
         let image = &photos[b.photo].image;
@@ -255,7 +261,8 @@ mod tests {
 
     #[test]
     fn skies_and_plain_walls_are_no_bars() {
-        // Burnt out above roofs; a wall that objects of several heights stand before; the same picture twice.
+        // Burnt out above roofs; a wall that objects of several heights stand before; the same
+        // picture twice.
         let sky = |seed: usize| photo(seed, move |x, y| (y < 40 + 10 * (x / 40) + seed).then_some([1.0; 3]));
         let wall = |seed| photo(seed, |x, y| (y < 30 + (x * 7 % 53)).then_some([0.6, 0.6, 0.5]));
         let one_side = |seed| photo(seed, move |_, y| (y < 20 + 9 * seed).then_some([1.0; 3]));

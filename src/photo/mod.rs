@@ -69,15 +69,16 @@ pub fn video_support() -> Support {
     video::status()
 }
 
-/// Finds and reads all photos of files and folders at [`MAX_SIZE`]; [`crate::pose::choose::photos`] chooses among too many.
+/// Finds and reads all photos of files and folders at [`MAX_SIZE`]; [`crate::pose::choose::photos`]
+/// chooses among too many.
 pub fn load_all(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Photo>> {
     let found = gather(inputs, progress)?;
     photo_count(found.len(), Some(found.len()))?;
     load_each(&found, MAX_SIZE, progress)
 }
 
-/// Reads the photos of a run, each scaled down to `max_size` where it is larger; refuses sets that cannot give geometry (the
-/// same photo twice) or that would mix up files (the same name twice).
+/// Reads the photos of a run, each scaled down to `max_size` where it is larger; refuses sets that
+/// cannot give geometry (the same photo twice) or that would mix up files (the same name twice).
 pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progress) -> Result<Vec<Photo>> {
     candidates.iter().try_for_each(|c| check_name(&c.path))?;
     progress.begin("photos", candidates.len() as u64);
@@ -88,7 +89,8 @@ pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progr
         progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
         Ok(photo)
     };
-    // Collected before errors are looked at: the first in the order of the photos is reported, whichever came first.
+    // Collected before errors are looked at: the first in the order of the photos is reported,
+    // whichever came first.
     let mut all: Vec<Result<Photo>> = Vec::with_capacity(candidates.len());
     for wave in sizes::waves(candidates) {
         all.par_extend(candidates[wave].par_iter().map(one));
@@ -110,14 +112,15 @@ pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progr
     Ok(photos)
 }
 
-/// What is decided and said of photos once all of a set are read; `known` are those of a scene that they join.
+/// What is decided and said of photos once all of a set are read; `known` are those of a scene that
+/// they join.
 pub fn settle(photos: &mut [Photo], known: &[Photo], progress: &dyn Progress) {
     warn_of_files(photos, progress);
     settle_transparency(photos, known, progress);
 }
 
-/// Decides what transparent pixels of a set stand for: nothing, where every photo has some and none a mask, as in photos of things
-/// whose background was removed; else they are only not used.
+/// Decides what transparent pixels of a set stand for: nothing, where every photo has some and none
+/// a mask, as in photos of things whose background was removed; else they are only not used.
 fn settle_transparency(photos: &mut [Photo], known: &[Photo], progress: &dyn Progress) {
     let named = |wanted: &dyn Fn(&Photo) -> bool, photos: &[Photo]| {
         photos.iter().filter(|p| wanted(p)).map(|p| p.stem.as_str()).collect::<Vec<_>>().join(", ")
@@ -176,7 +179,8 @@ pub fn cut_bars(photos: &mut [Photo], progress: &dyn Progress) {
     found.iter().for_each(|bars| photos[bars.photo].cut(bars.depth));
 }
 
-/// Files of high dynamic range in another unit: matching and training expect diffuse surfaces below 1.
+/// Files of high dynamic range in another unit: matching and training expect diffuse surfaces below
+/// 1.
 fn mostly_above_white(image: &RgbImage) -> bool {
     let above = image.data.iter().filter(|c| c.iter().any(|v| *v > 1.0)).count();
     2 * above > image.data.len()
@@ -188,14 +192,16 @@ const SAME_ZOOM: f64 = 0.03;
 /// Sides of pictures between bars that differ by less are the same.
 const SAME_PICTURE: f64 = 0.02;
 
-/// Number of the camera of every photo, as far as the files state it: photos of one size, camera model and zoom have one, photos
-/// without EXIF share by size. Portrait and landscape of one camera share too.
+/// Number of the camera of every photo, as far as the files state it: photos of one size, camera
+/// model and zoom have one, photos without EXIF share by size. Portrait and landscape of one camera
+/// share too.
 pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
     let size = |p: &Photo| {
         let (w, h) = p.original_size;
         (w.max(h), w.min(h))
     };
-    // The edge of a bar is found to a pixel or two of the working image; uncut photos of one size have one picture.
+    // The edge of a bar is found to a pixel or two of the working image; uncut photos of one size
+    // have one picture.
     let picture = |a: &Photo, b: &Photo| {
         let sides = a.picture_size().into_iter().zip(b.picture_size());
         let turned = a.picture_size().into_iter().rev().zip(b.picture_size());
@@ -219,8 +225,8 @@ pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
     photos.iter().map(&mut number).collect()
 }
 
-/// Refuses sets that cannot give geometry (one photo, or the same photo twice) or that would mix up files (the same name
-/// twice). [`load_all`] has done it; for photos from memory.
+/// Refuses sets that cannot give geometry (one photo, or the same photo twice) or that would mix up
+/// files (the same name twice). [`load_all`] has done it; for photos from memory.
 pub fn check_set(photos: &[Photo]) -> Result<()> {
     if !(2..=MAX_VIEWS).contains(&photos.len()) {
         return Err(match photos {

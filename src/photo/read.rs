@@ -15,12 +15,13 @@ use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Greatest side of a working image on a GPU, pixels: where the reference implementation of Gaussian splatting stops (Kerbl
-/// et al. 2023 scale wider photos down to it). A portrait keeps as many pixels as the same photo lying on its side.
+/// Greatest side of a working image on a GPU, pixels: where the reference implementation of
+/// Gaussian splatting stops (Kerbl et al. 2023 scale wider photos down to it). A portrait keeps as
+/// many pixels as the same photo lying on its side.
 pub const MAX_SIZE: usize = 1600;
 
-/// Greatest side of a working image on a CPU device, pixels: photos of 4:3 then have 1.56 times the pixels of 640 × 480,
-/// which keeps a run within twice its time (docs/performance.md).
+/// Greatest side of a working image on a CPU device, pixels: photos of 4:3 then have 1.56 times the
+/// pixels of 640 × 480, which keeps a run within twice its time (docs/performance.md).
 pub const MAX_SIZE_CPU: usize = 800;
 
 /// The greatest side that suits the device.
@@ -28,8 +29,8 @@ pub fn default_max_size(is_cpu: bool) -> usize {
     if is_cpu { MAX_SIZE_CPU } else { MAX_SIZE }
 }
 
-/// Smallest side of a usable photo, pixels: feature networks work at 1/8 resolution, below 8 × 8 cells nothing is left
-/// to match.
+/// Smallest side of a usable photo, pixels: feature networks work at 1/8 resolution, below 8 × 8
+/// cells nothing is left to match.
 pub const SMALLEST_SIDE: usize = 64;
 
 /// One decoded photo at working resolution, upright.
@@ -52,13 +53,14 @@ pub struct Photo {
     pub to_working: Affine,
     /// Focal length from EXIF in working pixels, if the file states it.
     pub exif_focal: Option<f64>,
-    /// Luma of the photo at more pixels than the working image has, for measuring positions; where there are more.
+    /// Luma of the photo at more pixels than the working image has, for measuring positions; where
+    /// there are more.
     #[serde(skip)]
     pub fine: Option<Arc<Plane<f32>>>,
     /// Pixels of the file whose values are not finite numbers, which are read as black.
     pub lost_pixels: usize,
-    /// Which pixels are used; `None` = all. Those that are not continue the others smoothly in `image`, apart
-    /// from what hides the scene in every photo.
+    /// Which pixels are used; `None` = all. Those that are not continue the others smoothly in
+    /// `image`, apart from what hides the scene in every photo.
     #[serde(default)]
     pub coverage: Option<Coverage>,
     /// Whether a mask has a part in `coverage`.
@@ -71,7 +73,8 @@ pub struct Photo {
     pub straightened: Option<Straightening>,
     /// Camera make and model from EXIF: photos that share it may share one focal length.
     pub camera_model: Option<String>,
-    /// Unit vector of gravity in camera axes (x right, y down, z forward), where the phone noted it.
+    /// Unit vector of gravity in camera axes (x right, y down, z forward), where the phone noted
+    /// it.
     pub gravity: Option<DVec3>,
     /// Exposure, white balance and vignetting that were taken out of `image`.
     pub light: Light,
@@ -81,7 +84,8 @@ pub struct Photo {
 }
 
 impl Photo {
-    /// Takes the lens out of the working image and the fine one; `camera` is the pinhole that remains, at the working resolution.
+    /// Takes the lens out of the working image and the fine one; `camera` is the pinhole that
+    /// remains, at the working resolution.
     pub fn straighten(&mut self, lens: Lens, camera: &Camera) {
         if !lens.is_none() {
             let how = Straightening::new(lens, camera);
@@ -186,8 +190,8 @@ impl Photo {
         if shown == full { whole } else { [0, 1].map(|k| shown[k] / self.to_working.scale[k]) }
     }
 
-    /// How far the middle of the picture is from that of the file, pixels of the file. Bars may be drawn over a photo, or frame a
-    /// whole one: the optical axis is near one of the two.
+    /// How far the middle of the picture is from that of the file, pixels of the file. Bars may be
+    /// drawn over a photo, or frame a whole one: the optical axis is near one of the two.
     pub fn off_middle(&self) -> f64 {
         let middle = [self.image.width, self.image.height].map(|n| 0.5 * n as f64);
         let [x, y] = self.to_working.inverse().apply(middle);
@@ -219,8 +223,8 @@ impl Photo {
         self.straightened.map_or(p, |s| s.source(p))
     }
 
-    /// The camera of the working image as one of the photo's file: its size, its pixels, its name. [`Photo::lens`] belongs
-    /// to it.
+    /// The camera of the working image as one of the photo's file: its size, its pixels, its name.
+    /// [`Photo::lens`] belongs to it.
     pub fn original_camera(&self, camera: &Camera) -> Camera {
         let name = self.path.file_name().map_or_else(|| self.stem.clone(), |n| n.to_string_lossy().into());
         Camera { name, ..self.to_working.inverse().camera(camera, self.original_size) }
@@ -232,8 +236,8 @@ pub fn load(path: &Path) -> Result<Photo> {
     load_at(path, MAX_SIZE)
 }
 
-/// Reads one photo: EXIF orientation applied, transparency as [`Photo::coverage`], scaled down to `max_size` pixels along its longer
-/// side if it is larger.
+/// Reads one photo: EXIF orientation applied, transparency as [`Photo::coverage`], scaled down to
+/// `max_size` pixels along its longer side if it is larger.
 pub fn load_at(path: &Path, max_size: usize) -> Result<Photo> {
     from_bytes(path, read(path)?, max_size)
 }
@@ -330,7 +334,8 @@ fn working(
     Ok(Photo { border, fine, ..bare(name, size, image) })
 }
 
-/// [`working`] of pixels with the share of each that is used: unused ones have no part in the average of their neighbours.
+/// [`working`] of pixels with the share of each that is used: unused ones have no part in the
+/// average of their neighbours.
 fn partly_used(
     name: &Path,
     size: (usize, usize),
@@ -402,8 +407,9 @@ fn fine_size((w, h): (usize, usize), working: (usize, usize)) -> Option<(usize, 
     (size.0 as f64 > MIN_GAIN * working.0 as f64).then_some(size)
 }
 
-/// Working (width, height) of a photo of that size: the longer side is capped, the other one rounded. Never larger than
-/// the photo, and its shorter side never below [`SMALLEST_SIDE`]: a panorama keeps what the networks need.
+/// Working (width, height) of a photo of that size: the longer side is capped, the other one
+/// rounded. Never larger than the photo, and its shorter side never below [`SMALLEST_SIDE`]: a
+/// panorama keeps what the networks need.
 pub fn working_size(w: usize, h: usize, max_size: usize) -> (usize, usize) {
     let (long, short) = (w.max(h), w.min(h));
     let floor = (SMALLEST_SIDE * long).div_ceil(short.max(1));

@@ -26,8 +26,9 @@ pub struct SolvedCameras {
     pub method: String,
 }
 
-/// Cameras of the photos, from the photos themselves (`cameras` = None; `seed` draws the samples of RANSAC) or as given. From
-/// the photos themselves only those get one whose place can be found surely.
+/// Cameras of the photos, from the photos themselves (`cameras` = None; `seed` draws the samples of
+/// RANSAC) or as given. From the photos themselves only those get one whose place can be found
+/// surely.
 pub fn place(
     mut photos: Vec<Photo>,
     cameras: Option<&[GivenCamera]>,
@@ -57,7 +58,8 @@ pub fn place(
     warn_of_misfits(&photos, &model, progress);
     progress.check()?;
     let mut photos = photos;
-    // Only the cameras were measured on the fine images, and only they decide what of the overlays is scene.
+    // Only the cameras were measured on the fine images, and only they decide what of the overlays
+    // is scene.
     photos.iter_mut().for_each(|p| (p.fine, p.overlay) = (None, None));
     for ((photo, fitted), camera) in photos.iter_mut().zip(&model.fitted).zip(&model.cameras) {
         photo.straighten(fitted.lens, camera);
@@ -105,8 +107,8 @@ fn warn_of_doubt(photos: &[Photo], model: &SparseModel, progress: &dyn Progress)
     }
 }
 
-/// Depth maps and points of placed photos by stereo; `priors`, one or none per photo, or none at all, suggest depth where photos
-/// cannot be matched.
+/// Depth maps and points of placed photos by stereo; `priors`, one or none per photo, or none at
+/// all, suggest depth where photos cannot be matched.
 pub fn dense(
     device: &Device,
     photos: &[Photo],
@@ -130,12 +132,13 @@ const STRANGE: f64 = 4.0;
 /// … and by at least this share of the long side (half a pixel at 640) does not fit the model.
 const STRANGE_SHARE: f64 = 0.5 / 640.0;
 
-/// Distance of the principal point from the middle, share of the long side, that no lens has: stabilised sensors move by a
-/// hundredth.
+/// Distance of the principal point from the middle, share of the long side, that no lens has:
+/// stabilised sensors move by a hundredth.
 const OFF_CENTRE: f64 = 0.03;
 
-/// Distance of a principal point from the middle of the photo, working pixels. Bars that were cut off may lie over a photo or frame a
-/// whole one: the middle is anywhere between that of the picture and that of the file.
+/// Distance of a principal point from the middle of the photo, working pixels. Bars that were cut
+/// off may lie over a photo or frame a whole one: the middle is anywhere between that of the
+/// picture and that of the file.
 fn off_middle(photo: &Photo, principal_point: DVec2) -> f64 {
     let picture = DVec2::new(photo.image.width as f64, photo.image.height as f64) * 0.5;
     let (w, h) = photo.original_size;
@@ -300,7 +303,8 @@ mod tests {
         photos[1].image = dim.applied(&photos[1].image);
         let before = psnr(&photos[1].image, &truth.photos[1].image);
         let placed = place(photos, None, &registry, 0, &Silent).unwrap();
-        // Against the photo without lens, in the light of the others: only a lens and a gain that are both taken out agree.
+        // Against the photo without lens, in the light of the others: only a lens and a gain that
+        // are both taken out agree.
         for (photo, original) in placed.photos.iter().zip(&truth.photos) {
             let agreed = psnr(&photo.image, &original.image);
             println!("{}: {agreed:.1} dB, before {before:.1}", photo.stem);

@@ -1,8 +1,9 @@
-//! What stands still in the frame while the scene moves through it: watermarks, captions, logos, a bonnet. It is no part of the
-//! scene, and its corners match perfectly in every photo, as if no camera had moved (colmap#2539).
+//! Overlays stand still in the frame while the scene moves through it: watermarks, captions, logos,
+//! a bonnet. It is no part of the scene, and its corners match perfectly in every photo, as if no
+//! camera had moved (colmap#2539).
 //!
-//! Gradients of an overlay are the same in all photos, also of a half-transparent one (Dekel et al. 2017, "On the effectiveness of
-//! visible watermarks"); those of the scene are elsewhere in each.
+//! Gradients of an overlay are the same in all photos, also of a half-transparent one (Dekel et al.
+//! 2017, "On the effectiveness of visible watermarks"); those of the scene are elsewhere in each.
 use super::sift::blurred;
 use super::two_view::{fundamental, sampson};
 use crate::photo::Photo;
@@ -17,26 +18,32 @@ const SIDE: usize = 640;
 const SMOOTH: f32 = 1.0;
 /// Standard deviation of the window in which gradients are compared: about a letter of a caption.
 const WINDOW: f32 = 4.0;
-/// Root mean square gradient, full white per pixel, below which a window is plain in a photo: noise has half of it.
+/// Root mean square gradient, full white per pixel, below which a window is plain in a photo: noise
+/// has half of it.
 const TEXTURE: f32 = 0.004;
-/// Correlation of the gradients in every two photos compared that makes an overlay. On unspoilt tuning sets no region of
-/// [`LEAST_AREA`] reaches it together with [`PEAK`], photos 3° apart included.
+/// Correlation of the gradients in every two photos compared that makes an overlay. On unspoilt
+/// tuning sets no region of [`LEAST_AREA`] reaches it together with [`PEAK`], photos 3° apart
+/// included.
 const ALIKE: f32 = 0.7;
 /// Correlation that joins what is around it: strokes before a busy scene.
 const JOINED: f32 = 0.5;
-/// How much more the gradients correlate than when one photo is moved by [`ASIDE`] in any direction: a straight edge that lies along
-/// the motion of the camera stays where it is, too, but looks the same all along.
+/// How much more the gradients correlate than when one photo is moved by [`ASIDE`] in any
+/// direction: a straight edge that lies along the motion of the camera stays where it is, too, but
+/// looks the same all along.
 const PEAK: f32 = 0.2;
 /// Pixels.
 const ASIDE: f64 = 4.0;
-/// Smallest area of an overlay, share of the picture: a date of ten small digits has five times that.
+/// Smallest area of an overlay, share of the picture: a date of ten small digits has five times
+/// that.
 const LEAST_AREA: f64 = 0.0005;
-/// Of all windows with texture, the share above which it is the photos that are alike, as from a tripod.
+/// Of all windows with texture, the share above which it is the photos that are alike, as from a
+/// tripod.
 const SAME_PHOTOS: f64 = 0.85;
 /// Largest difference of colours that are the same in all photos: of compression.
 const SAME_COLOUR: f32 = 0.05;
 
-/// Leaves out of every photo what stands still in all photos of its size. Photos without background show nothing but the scene.
+/// Leaves out of every photo what stands still in all photos of its size. Photos without background
+/// show nothing but the scene.
 pub(super) fn mark(photos: &mut [Photo]) {
     let empty = |p: &Photo| p.coverage.as_ref().is_some_and(|c| c.outside == Outside::Empty);
     if photos.iter().any(empty) {
@@ -61,13 +68,15 @@ pub(super) fn overlays<'a>(images: impl Iterator<Item = &'a RgbImage>) -> Vec<Op
     images.iter().map(|image| of(image)).collect()
 }
 
-/// Distance from an epipolar line, share of the long side, within which a place that stands still agrees with the cameras.
+/// Distance from an epipolar line, share of the long side, within which a place that stands still
+/// agrees with the cameras.
 const EXPLAINED: f64 = 3.0 / 640.0;
 /// Pixels of a region that are tried.
 const TRIED: usize = 200;
 
-/// Takes out of the overlays what the cameras explain: the point that all cameras look at, and what is far away while the camera
-/// does not turn, stand still as well and are scene. Whether there was any.
+/// Takes out of the overlays what the cameras explain: the point that all cameras look at, and what
+/// is far away while the camera does not turn, stand still as well and are scene. Whether there was
+/// any.
 pub(super) fn clear_scene(photos: &mut [Photo], cameras: &[Camera]) -> bool {
     let mut cleared = false;
     for first in 0..photos.len() {
@@ -106,7 +115,7 @@ fn explained(cameras: &[Camera], group: &[usize], pixel: DVec2) -> bool {
         })
 }
 
-/// What stands still, in words: how much of the frame and where; `None` where nothing does.
+/// The overlay in words: its share of the frame and its place; `None` without one.
 pub(super) fn description(photos: &[Photo]) -> Option<String> {
     let mask = &photos.iter().find_map(|p| p.overlay.as_ref())?.hidden;
     let (w, h) = (mask.width, mask.height);
@@ -136,8 +145,8 @@ pub(super) fn description(photos: &[Photo]) -> Option<String> {
     ))
 }
 
-/// Which pixels belong to an overlay that all `images` have, which are of one size; `None` where there is none. At the size of the
-/// images.
+/// Which pixels belong to an overlay that all `images` have, which are of one size; `None` where
+/// there is none. At the size of the images.
 fn overlay(images: &[&RgbImage]) -> Option<Plane<bool>> {
     let first = images.first().filter(|_| images.len() > 1)?;
     let (w, h) = (first.width, first.height);
@@ -192,7 +201,8 @@ impl Gradients {
         Gradients { x, y, energy }
     }
 
-    /// Correlation with the gradients of another photo that is moved by whole pixels; `None` where one of the two is plain.
+    /// Correlation with the gradients of another photo that is moved by whole pixels; `None` where
+    /// one of the two is plain.
     fn correlation(&self, other: &Gradients, (dx, dy): (i64, i64)) -> Vec<Option<f32>> {
         let (w, h) = (self.x.width as i64, self.x.height as i64);
         let moved = |i: usize| {
@@ -219,8 +229,8 @@ fn neighbours(count: usize) -> impl Iterator<Item = (usize, usize)> {
     (1..count).map(|i| (i - 1, i)).chain(last)
 }
 
-/// Least correlation of the gradients at one place, over the photos that are compared; `None` where one is plain, or nothing is
-/// alike anywhere.
+/// Least correlation of the gradients at one place, over the photos that are compared; `None` where
+/// one is plain, or nothing is alike anywhere.
 fn agreement(photos: &[Gradients]) -> Option<Vec<Option<f32>>> {
     let mut least: Option<Vec<Option<f32>>> = None;
     for (i, j) in neighbours(photos.len()) {
@@ -241,7 +251,8 @@ fn agreement(photos: &[Gradients]) -> Option<Vec<Option<f32>>> {
     least
 }
 
-/// Where gradients are alike at the same place and nowhere around it, in all photos that are compared.
+/// Where gradients are alike at the same place and nowhere around it, in all photos that are
+/// compared.
 fn peaks(photos: &[Gradients], alike: &[Option<f32>]) -> Vec<bool> {
     let mut sure: Vec<bool> = alike.iter().map(|c| c.is_some_and(|c| c > ALIKE)).collect();
     for (i, j) in neighbours(photos.len()) {
@@ -262,7 +273,8 @@ fn peaks(photos: &[Gradients], alike: &[Option<f32>]) -> Vec<bool> {
     sure
 }
 
-/// Number per pixel of the connected set pixels that it belongs to (0 where none is set), and how many numbers there are.
+/// Number per pixel of the connected set pixels that it belongs to (0 where none is set), and how
+/// many numbers there are.
 fn components(set: &[bool], width: usize) -> (Vec<usize>, usize) {
     let (mut labels, mut count, mut stack) = (vec![0; set.len()], 1, Vec::new());
     for start in 0..set.len() {
@@ -296,7 +308,8 @@ fn around(i: usize, width: usize, pixels: usize) -> impl Iterator<Item = usize> 
     sides.into_iter().flatten()
 }
 
-/// Adds what has one colour in all photos and is enclosed by the overlay: the ground of a sign between its letters.
+/// Adds what has one colour in all photos and is enclosed by the overlay: the ground of a sign
+/// between its letters.
 fn fill(mask: &mut [bool], images: &[RgbImage], width: usize) {
     let same = |i: usize| {
         (0..3).all(|c| {
@@ -321,7 +334,8 @@ fn fill(mask: &mut [bool], images: &[RgbImage], width: usize) {
     }
 }
 
-/// So many times more of the outline of a plain region touches the overlay than anything else where it is a part of it.
+/// So many times more of the outline of a plain region touches the overlay than anything else where
+/// it is a part of it.
 const ENCLOSED: usize = 9;
 
 #[cfg(test)]

@@ -8,19 +8,20 @@ use crate::progress::{Progress, Recorded};
 use crate::scene::Coverage;
 use rayon::prelude::*;
 
-/// A photo this much below the best one, dB, is not shown as it should be: half the amplitude of the error is more than texture
-/// makes among photos of one place.
+/// A photo this much below the best one, dB, is not shown as it should be: half the amplitude of
+/// the error is more than texture makes among photos of one place.
 const FAR_BELOW: f64 = 6.0;
-/// A photo that is shown this well, dB, is not said to be shown badly, however much better others are: photos that were added last
-/// have seen the fewest steps, and photos that something hides are at 13 to 25 dB.
+/// A photo that is shown this well, dB, is not said to be shown badly, however much better others
+/// are: photos that were added last have seen the fewest steps, and photos that something hides are
+/// at 13 to 25 dB.
 const GOOD: f64 = 30.0;
 /// Photos that come out below this on average, dB, are not what the scene shows: …
 const POOR: f64 = 22.0;
 /// … and below this the scene is of no use, and its cameras are as doubtful.
 const BAD: f64 = 18.0;
 
-/// How well the frames of a finished scene show its photos, dB: the language stage has moved its splats since the colours were
-/// trained.
+/// How well the frames of a finished scene show its photos, dB: the language stage has moved its
+/// splats since the colours were trained.
 pub(super) fn psnr(frames: &[DecodedFrame], photos: &[Photo]) -> Vec<f64> {
     let one = |(f, p): (&DecodedFrame, &Photo)| {
         let weights = p.coverage.as_ref().map(Coverage::weights);
@@ -37,7 +38,8 @@ pub(super) fn figure(psnr: &[f64]) -> (String, String) {
     ("train PSNR".to_owned(), text)
 }
 
-/// Warns where the scene shows its photos badly: first of all if that is true of all of them, then by name.
+/// Warns where the scene shows its photos badly: first of all if that is true of all of them, then
+/// by name.
 pub(super) fn warn(photos: &[Photo], psnr: &[f64], progress: &Recorded) {
     if let Some(text) = warning_about(photos.iter().map(|p| p.stem.as_str()), psnr) {
         progress.warn(&text);
@@ -63,7 +65,8 @@ fn overall_warning(psnr: &[f64]) -> Option<String> {
     })
 }
 
-/// The most confidence in the cameras of a scene that shows its photos so: cameras that are right show them well.
+/// The most confidence in the cameras of a scene that shows its photos so: cameras that are right
+/// show them well.
 pub(super) fn ceiling(psnr: &[f64]) -> Confidence {
     match mean(psnr) {
         _ if psnr.is_empty() => Confidence::High,

@@ -1,4 +1,5 @@
-//! Records of a finished run: `run.json`, the report and the closing table, made from [`RunOutcome`].
+//! Records of a finished run: `run.json`, the report and the closing table, made from
+//! [`RunOutcome`].
 use super::answer::Answers;
 use super::outcome::RunOutcome;
 use super::plan::RunPlan;
@@ -140,7 +141,8 @@ fn focal_figure(photos: &[Photo], cameras: &[Camera], fitted: &[Fitted]) -> Opti
     }
 }
 
-/// Trust in the camera of a photo: what the cameras say of themselves, and no more than how well the scene shows the photos.
+/// Trust in the camera of a photo: what the cameras say of themselves, and no more than how well
+/// the scene shows the photos.
 fn confidence(fitted: &Fitted, psnr: &[f64]) -> Confidence {
     fitted.confidence().min(super::fidelity::ceiling(psnr))
 }
@@ -155,7 +157,8 @@ fn confidence_figure(photos: &[Photo], fitted: &[Fitted], psnr: &[f64]) -> Optio
     Some(format!("{} confidence{which}", worst.name()))
 }
 
-/// What was assumed about the lens: the strongest distortion taken out, and how far the principal point is from the middle.
+/// What was assumed about the lens: the strongest distortion taken out, and how far the principal
+/// point is from the middle.
 fn lens_figure(o: &RunOutcome) -> Option<String> {
     let corner = |(photo, camera): (&Photo, &Camera)| {
         let half = glam::DVec2::new(0.5 * camera.width as f64, 0.5 * camera.height as f64) / camera.fx;

@@ -27,8 +27,8 @@ impl Coverage {
         self.share.data[index] >= 0.5
     }
 
-    /// [H, W] weight of every pixel in losses: 0 or 1. Emptiness is shown as well as things are; of what is not known even a part
-    /// would count.
+    /// [H, W] weight of every pixel in losses: 0 or 1. Emptiness is shown as well as things are; of
+    /// what is not known even a part would count.
     pub fn weights(&self) -> Plane<f32> {
         let weight = |share: &f32| match self.outside {
             Outside::Empty => 1.0,
@@ -38,7 +38,8 @@ impl Coverage {
         Plane { data: self.share.data.iter().map(weight).collect(), ..self.share.clone() }
     }
 
-    /// What is left of a coverage, or of everything, where something hides the scene; nothing is known of what it hides.
+    /// A coverage, or all pixels, without those where something hides the scene; the scene behind
+    /// them is unknown.
     pub fn without(before: Option<&Coverage>, hidden: &Plane<bool>) -> Coverage {
         let left = |(i, hidden): (usize, &bool)| match before {
             _ if *hidden => 0.0,
@@ -63,8 +64,9 @@ impl Coverage {
 }
 
 impl RgbImage {
-    /// Gives pixels that are not used colours that go on smoothly from the used ones, so that neither filters nor features see an edge:
-    /// means over larger and larger blocks (pull-push, Gortler et al. 1996). Without any used pixel nothing changes.
+    /// Gives pixels that are not used colours that go on smoothly from the used ones, so that
+    /// neither filters nor features see an edge: means over larger and larger blocks (pull-push,
+    /// Gortler et al. 1996). Without any used pixel nothing changes.
     pub fn fill_from_used(&mut self, used: impl Fn(usize) -> bool) {
         let weights: Vec<bool> = (0..self.width * self.height).map(used).collect();
         if weights.contains(&true) {

@@ -1,4 +1,5 @@
-//! What is drawn over every photo of a set at the same place: watermarks, captions, frames, a bonnet.
+//! Overlays drawn over every photo of a set at the same place: watermarks, captions, frames, a
+//! bonnet.
 use super::spoil::Spoil;
 use crate::scene::RgbImage;
 use rayon::prelude::*;
@@ -55,7 +56,8 @@ fn ink(spoil: Spoil, [x, y]: [f64; 2], width: f64) -> Option<([f32; 3], f32)> {
     }
 }
 
-/// Whether a stroke of made-up letters is at a place in units of their height, the first letter's corner at the origin.
+/// Whether a stroke of made-up letters is at a place in units of their height, the first letter's
+/// corner at the origin.
 fn written([u, v]: [f64; 2], letters: f64) -> bool {
     let (rows, columns) = LETTER;
     let size = columns as f64 + 1.0;

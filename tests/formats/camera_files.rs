@@ -1,4 +1,5 @@
-//! Camera files: what is written reads back, files of other programs are understood, and lenses are kept or named.
+//! Camera files: what is written reads back, files of other programs are understood, and lenses are
+//! kept or named.
 use super::some_cameras;
 use glam::{DQuat, DVec3};
 use splatvk::format::{cameras, colmap, transforms};
@@ -6,8 +7,8 @@ use splatvk::photo::stem;
 use splatvk::scene::{Camera, Lens, PointCloud};
 use std::path::Path;
 
-/// Camera centres and rotations must survive text files (docs/method.md#camera-files: 1e-9); centres relative to their
-/// size.
+/// Camera centres and rotations must survive text files (docs/method.md#camera-files: 1e-9);
+/// centres relative to their size.
 fn assert_same_cameras(a: &[Camera], b: &[Camera]) {
     assert_eq!(a.len(), b.len());
     for (a, b) in a.iter().zip(b) {
@@ -53,7 +54,8 @@ fn cameras_round_trip() {
 
 #[test]
 fn transforms_are_camera_to_world_in_opengl_axes() {
-    // A camera at (1, 2, 3) that looks along world +x with world −z up: OpenCV right = +y... worked out by hand.
+    // A camera at (1, 2, 3) that looks along world +x with world −z up: OpenCV right = +y... worked
+    // out by hand.
     let text = r#"{"fl_x": 400, "w": 640, "h": 480, "frames": [{"file_path": "a.png", "fl_x": 500,
         "transform_matrix": [[0, 0, -1, 1], [1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]]}]}"#;
     let folder = tempfile::tempdir().unwrap();
@@ -239,7 +241,7 @@ fn camera_models_are_read_or_named() {
         let e = read(extra).unwrap_err();
         assert!(e.exit_code() == 2 && e.to_string().contains(words), "{extra}: {e}");
     }
-    // What a frame states counts before what the file states for all.
+    // Values of a frame count before those that the file states for all.
     let own = one_frame(r#""k1": 0.1,"#)
         .replace(r#""file_path""#, r#""k1": 0.05, "camera_model": "OPENCV", "file_path""#);
     std::fs::write(&path, own).unwrap();

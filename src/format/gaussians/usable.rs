@@ -1,4 +1,5 @@
-//! Which Gaussians are read and written: those that can be computed with; and how notes on a file are shown.
+//! Which Gaussians are read and written: those that can be computed with; and how notes on a file
+//! are shown.
 use crate::scene::{LanguageField, Splats};
 use crate::{Error, Result};
 use std::path::Path;
@@ -6,8 +7,8 @@ use std::path::Path;
 /// Greatest magnitude of a number of a Gaussian: squares beyond 1.8e19 are not finite in f32.
 const GREATEST: f32 = 1e18;
 
-/// A Gaussian whose numbers, standard deviations and squared quaternion are finite and at most [`GREATEST`], and whose
-/// quaternion has a direction.
+/// A Gaussian whose numbers, standard deviations and squared quaternion are finite and at most
+/// [`GREATEST`], and whose quaternion has a direction.
 fn is_usable(s: &Splats, i: usize) -> bool {
     let width = 3 * s.sh_len();
     let plain = [&s.means[i][..], &s.log_scales[i], &s.quats[i], &s.sh[i * width..(i + 1) * width]];
@@ -27,8 +28,9 @@ fn unusable(s: &Splats) -> Option<(usize, usize)> {
 
 const WHY: &str = "numbers that are not finite, are beyond 1e18 or give no rotation";
 
-/// Takes Gaussians of another program's file: drops those that are not usable, with their language, and says how many. Scales
-/// of 0 and opacities of 0 and 1, whose parameters are infinite, are kept as the nearest that f32 holds.
+/// Takes Gaussians of another program's file: drops those that are not usable, with their language,
+/// and says how many. Scales of 0 and opacities of 0 and 1, whose parameters are infinite, are kept
+/// as the nearest that f32 holds.
 pub(super) fn keep(
     mut s: Splats,
     language: Option<LanguageField>,
@@ -69,10 +71,12 @@ pub(super) fn finished(mut notes: Vec<String>, path: &Path) -> Vec<String> {
     notes.into_iter().map(|note| format!("{}: {note}", path.display())).collect()
 }
 
-/// Largest step between two coordinates, as a share of the extent: a tenth of a pixel in a picture of the whole scene.
+/// Largest step between two coordinates, as a share of the extent: a tenth of a pixel in a picture
+/// of the whole scene.
 const FINEST_STEP: f32 = 1e-4;
 
-/// A note where coordinates are so large against their extent that single precision is too coarse for them, as those of maps are.
+/// A note where coordinates are so large against their extent that single precision is too coarse
+/// for them, as those of maps are.
 pub(super) fn precision(positions: &[[f32; 3]]) -> Option<String> {
     let finite = || positions.iter().filter(|p| p.iter().all(|v| v.abs() <= GREATEST));
     let mut bounds = [[f32::INFINITY, f32::NEG_INFINITY]; 3];

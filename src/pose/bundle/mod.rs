@@ -1,5 +1,5 @@
-//! Bundle adjustment: cameras, their optics and points that minimise the robust reprojection error (Levenberg–Marquardt
-//! in f64, points eliminated by the Schur complement).
+//! Bundle adjustment: cameras, their optics and points that minimise the robust reprojection error
+//! (Levenberg–Marquardt in f64, points eliminated by the Schur complement).
 mod bend;
 mod normal;
 mod problem;
@@ -29,8 +29,9 @@ impl Problem {
         let pose_size = 6 * (self.poses.len() - 1);
         for (k, optics) in next.optics.iter_mut().enumerate() {
             let step = |j: usize| -d[pose_size + OPTICS * k + j];
-            // Steps beyond half the focal length or 0.1 in the lens are outside the linear range. Where focal length and distance
-            // grow by one factor, photos of a flat scene hardly change: such a step is exact in f, not in ln f.
+            // Steps beyond half the focal length or 0.1 in the lens are outside the linear range.
+            // Where focal length and distance grow by one factor, photos of a flat scene hardly
+            // change: such a step is exact in f, not in ln f.
             optics.focal *= 1.0 + step(0).clamp(-0.4, 0.6);
             optics.lens.k1 += step(1).clamp(-0.1, 0.1);
             optics.lens.k2 += step(2).clamp(-0.1, 0.1);
@@ -77,7 +78,8 @@ impl Problem {
         Ok(Adjusted { cost, sigmas, rotation_sigmas })
     }
 
-    /// Covariance of the cameras' parameters, for residuals of the stated σ; `None` where it is not finite.
+    /// Covariance of the cameras' parameters, for residuals of the stated σ; `None` where it is not
+    /// finite.
     fn covariance(&self, normal: &Normal) -> Option<DMatrix<f64>> {
         // Marginalise the points without damping; λ = 1e-9 only keeps numerical zeros positive.
         let (mut s, _, _) = Self::reduce(normal, 1e-9);
@@ -91,7 +93,8 @@ impl Problem {
         s.cholesky().map(|f| f.inverse())
     }
 
-    /// Sum of the squared residuals, in units of their σ, and degrees of freedom; outlying ones count little in both.
+    /// Sum of the squared residuals, in units of their σ, and degrees of freedom; outlying ones
+    /// count little in both.
     pub(crate) fn squares(&self, c: f64) -> (f64, f64) {
         let (mut sum, mut freedom) = (0.0, -(self.sizes().1 as f64) - 3.0 * self.points.len() as f64);
         for o in &self.observations {
@@ -111,8 +114,8 @@ impl Problem {
         sum / freedom.max(1.0)
     }
 
-    /// σ of the optics per group and of the rotation per pose, from the inverse of the reduced system, scaled by the observed
-    /// residual variance.
+    /// σ of the optics per group and of the rotation per pose, from the inverse of the reduced
+    /// system, scaled by the observed residual variance.
     fn sigmas(&self, c: f64) -> (Vec<[f64; OPTICS]>, Vec<f64>) {
         let inverse = self.covariance(&self.linearise(c));
         let (pose_size, _) = self.sizes();

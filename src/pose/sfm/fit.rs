@@ -6,9 +6,10 @@ use crate::pose::bundle::Adjusted;
 /// Steps that any start needs at most.
 pub(super) const STEPS: usize = 60;
 
-/// Share of the cost that optics of their own may leave, of that with a principal point of its own for every photo. What is
-/// not modelled, as a rolling shutter, and what the held focal length and lens cost, gave 0.98 on photos of one iPhone; two
-/// generated cameras, 0.5 % apart in focal length and 2 % in k1, 0.92.
+/// Share of the cost that optics of their own may leave, of that with a principal point of its own
+/// for every photo. What is not modelled, as a rolling shutter, and what the held focal length and
+/// lens cost, gave 0.98 on photos of one iPhone; two generated cameras, 0.5 % apart in focal length
+/// and 2 % in k1, 0.92.
 pub(super) const MAX_COST_SHARE: f64 = 0.95;
 
 /// Optics fitted with a choice of free parameters and groups of photos.
@@ -27,14 +28,16 @@ pub(super) fn fit_optics(model: &Model, freedom: Freedom, steps: usize) -> Resul
     Ok(OpticsFit { value, model, outcome })
 }
 
-/// Displacement of sightings at the border of a photo that no parameter describes, pixels of a working image of [`LONG`] and less …
+/// Displacement of sightings at the border of a photo that no parameter describes, pixels of a
+/// working image of [`LONG`] and less …
 const BEND: f64 = 0.03;
-/// … and in proportion of a larger one, pixels of the long side: a lens bends all sizes alike, and corners are found on working images.
+/// … and in proportion of a larger one, pixels of the long side: a lens bends all sizes alike, and
+/// corners are found on working images.
 const LONG: f64 = 640.0;
 
 impl OpticsFit {
-    /// Widens every σ to what it is with [`Model::independent`] observations taken for independent, and by what displacements of
-    /// [`BEND`] bring.
+    /// Widens every σ to what it is with [`Model::independent`] observations taken for independent,
+    /// and by what displacements of [`BEND`] bring.
     pub(super) fn widen(&mut self) {
         let observations = self.model.observations();
         let wider = (observations as f64 / self.model.independent(observations)).sqrt();

@@ -4,22 +4,25 @@ use crate::pose::bundle::{Adjusted, Bent, Observation, Optics, OpticsPrior, Prob
 use crate::scene::{Lens, Pose};
 use glam::{DMat3, DVec2, DVec3};
 
-/// Most independent observations that the sightings of a set count as. Neighbours err alike: what shifts one (a bent
-/// surface taken for flat, JPEG, a moved shadow) shifts those around it, so that thousands of sightings more say little more of
-/// the optics. On the tuning sets a principal point or lens that is not there lowers the cost by up to 0.3 %, one that moves
-/// pixels by 5 by 1.3 % and more; with 2000 the criterion asks for 0.8 %. The same number makes the stated σ of the focal
-/// length as large as its errors there.
+/// Most independent observations that the sightings of a set count as. Neighbours err alike: what
+/// shifts one (a bent surface taken for flat, JPEG, a moved shadow) shifts those around it, so that
+/// thousands of sightings more say little more of the optics. On the tuning sets a principal point
+/// or lens that is not there lowers the cost by up to 0.3 %, one that moves pixels by 5 by 1.3 %
+/// and more; with 2000 the criterion asks for 0.8 %. The same number makes the stated σ of the
+/// focal length as large as its errors there.
 const MAX_INDEPENDENT: f64 = 2000.0;
-/// Pairs of photos that [`MAX_INDEPENDENT`] was found with. Each pair has its own share of it, since what its sightings have in
-/// common does not repeat in another: two photos alone say little of their optics.
+/// Pairs of photos that [`MAX_INDEPENDENT`] was found with. Each pair has its own share of it,
+/// since what its sightings have in common does not repeat in another: two photos alone say little
+/// of their optics.
 const PAIRS: f64 = 6.0;
 
-/// Degrees of freedom in which residuals are assumed to have their σ, so that few sightings, which a model fits too well, do not
-/// state a smaller one.
+/// Degrees of freedom in which residuals are assumed to have their σ, so that few sightings, which
+/// a model fits too well, do not state a smaller one.
 const ASSUMED: f64 = 20.0;
 
-/// Variance of the residuals where it is below what their σ states. Of two photos every point leaves one component, and errors along
-/// the epipolar lines leave none: their residuals are small whatever the errors.
+/// Variance of the residuals where it is below what their σ states. Of two photos every point
+/// leaves one component, and errors along the epipolar lines leave none: their residuals are small
+/// whatever the errors.
 fn variance(problem: &Problem) -> f64 {
     if problem.poses.len() < 3 {
         return 1.0;
@@ -28,7 +31,8 @@ fn variance(problem: &Problem) -> f64 {
     ((sum + ASSUMED) / (freedom.max(0.0) + ASSUMED)).min(1.0)
 }
 
-/// σ of the principal point from the middle, as a share of the long side: stabilised sensors move by up to a hundredth.
+/// σ of the principal point from the middle, as a share of the long side: stabilised sensors move
+/// by up to a hundredth.
 pub(super) const SHIFT_SIGMA: f64 = 0.007;
 
 /// One sighting of a point.
@@ -136,7 +140,8 @@ impl Model {
         2.0 * self.centres[view].max_element() / self.zoom[view]
     }
 
-    /// Whether the principal point of any photo may be farther off its middle than a camera puts it.
+    /// Whether the principal point of any photo may be farther off its middle than a camera puts
+    /// it.
     pub(super) fn has_crops(&self) -> bool {
         (0..self.group.len())
             .any(|v| self.priors[self.group[v]].shift > 2.0 * SHIFT_SIGMA * self.long_side(v))
@@ -159,8 +164,8 @@ impl Model {
         self.tracks.iter().map(|t| 2 * t.sightings.len()).sum()
     }
 
-    /// The same model with other photos sharing optics, each group with those of its first view. `group` numbers them in any
-    /// way; views of one group must have the same prior.
+    /// The same model with other photos sharing optics, each group with those of its first view.
+    /// `group` numbers them in any way; views of one group must have the same prior.
     pub(super) fn regrouped(&self, group: &[usize]) -> Model {
         let mut out = Model { group: Vec::new(), optics: Vec::new(), priors: Vec::new(), ..self.clone() };
         let mut names = Vec::new();
@@ -176,7 +181,8 @@ impl Model {
         out
     }
 
-    /// The same model with optics of its own for every view that may have some; `None` where all that look alike must share.
+    /// The same model with optics of its own for every view that may have some; `None` where all
+    /// that look alike must share.
     pub(super) fn with_separate_optics(&self) -> Option<Model> {
         let separate = self.regrouped(&self.separable);
         (separate.group != self.alike).then_some(separate)
@@ -216,7 +222,8 @@ impl Model {
         self.lens(view).undistort((pixel - self.principal_point(view)) / self.focal(view)).extend(1.0)
     }
 
-    /// Where a pinhole of the same focal length around the principal point would show the pixel, relative to that point.
+    /// Where a pinhole of the same focal length around the principal point would show the pixel,
+    /// relative to that point.
     pub(super) fn straight(&self, view: usize, pixel: DVec2) -> DVec2 {
         self.ray(view, pixel).truncate() * self.focal(view)
     }
@@ -243,8 +250,9 @@ impl Model {
         crate::math::median(&mut all).unwrap_or(0.0)
     }
 
-    /// Position from the registered sightings: least squares on ray distances, then Gauss–Newton on pixels. `None` when
-    /// the rays do not meet within `threshold` pixels in front of every camera, or are nearly parallel.
+    /// Position from the registered sightings: least squares on ray distances, then Gauss–Newton on
+    /// pixels. `None` when the rays do not meet within `threshold` pixels in front of every camera,
+    /// or are nearly parallel.
     pub(super) fn triangulate(&self, sightings: &[Sighting], threshold: f64) -> Option<DVec3> {
         let seen: Vec<(&Sighting, Pose)> =
             sightings.iter().filter_map(|s| Some((s, self.poses[s.view]?))).collect();
@@ -304,8 +312,8 @@ impl Model {
         best.to_degrees()
     }
 
-    /// Triangulates every track anew; outlying sightings are dropped when the rest agrees. Tracks that do not triangulate
-    /// keep their sightings and have no position.
+    /// Triangulates every track anew; outlying sightings are dropped when the rest agrees. Tracks
+    /// that do not triangulate keep their sightings and have no position.
     pub(super) fn triangulate_all(&mut self, threshold: f64) {
         let positions: Vec<Option<DVec3>> = self
             .tracks
@@ -334,8 +342,8 @@ impl Model {
         }
     }
 
-    /// The registered views and triangulated points as an adjustment problem, over the sightings within `gate` pixels; and
-    /// which views and tracks stand behind its cameras and points.
+    /// The registered views and triangulated points as an adjustment problem, over the sightings
+    /// within `gate` pixels; and which views and tracks stand behind its cameras and points.
     fn problem(&self, gate: f64, freedom: Freedom) -> (Problem, Vec<usize>, Vec<usize>) {
         let views: Vec<usize> = (0..self.poses.len()).filter(|v| self.poses[*v].is_some()).collect();
         let mut local = vec![usize::MAX; self.poses.len()];
@@ -368,8 +376,8 @@ impl Model {
                 sigma: s.sigma,
             }));
         }
-        // The sightings count as fewer independent ones ([`MAX_INDEPENDENT`]); priors are weighed against those, by the residuals
-        // where these are below the least σ.
+        // The sightings count as fewer independent ones ([`MAX_INDEPENDENT`]); priors are weighed
+        // against those, by the residuals where these are below the least σ.
         let observations = 2 * problem.observations.len();
         let share = self.independent(observations) / observations.max(1) as f64;
         let scale = (share / variance(&problem)).sqrt();
@@ -377,8 +385,8 @@ impl Model {
         (problem, views, used)
     }
 
-    /// Adjusts cameras and points over the sightings within `gate` pixels; `c` is the Cauchy scale in standard
-    /// deviations. The first registered view stays where it is.
+    /// Adjusts cameras and points over the sightings within `gate` pixels; `c` is the Cauchy scale
+    /// in standard deviations. The first registered view stays where it is.
     pub(super) fn adjust(&mut self, gate: f64, c: f64, steps: usize) -> Result<Adjusted> {
         let (mut problem, views, used) = self.problem(gate, self.freedom);
         let outcome = problem.solve(c, steps)?;
@@ -392,8 +400,8 @@ impl Model {
         Ok(outcome)
     }
 
-    /// What displacements of the sightings at the border of the photos, `by` pixels for the long side in pixels, do to the parameters of
-    /// all optics and the rotations.
+    /// Changes of the parameters by displaced sightings, `by(long side)` pixels at the border of
+    /// the photos, of all optics and the rotations.
     pub(super) fn bent(&self, by: impl Fn(f64) -> f64) -> Option<Bent> {
         let (problem, views, _) = self.problem(f64::INFINITY, Freedom::Full);
         let half_long: Vec<f64> = views.iter().map(|v| self.centres[*v].max_element()).collect();
@@ -401,7 +409,8 @@ impl Model {
         problem.bent(2.0, &half_long, &displaced)
     }
 
-    /// Drops sightings farther than `gate` from their point, then points with fewer than two left or too little parallax.
+    /// Drops sightings farther than `gate` from their point, then points with fewer than two left
+    /// or too little parallax.
     pub(super) fn prune(&mut self, gate: f64) {
         let mut tracks = std::mem::take(&mut self.tracks);
         tracks.retain_mut(|t| {
@@ -427,7 +436,8 @@ impl Model {
             }
             // The median of the squared length of a 2-D normal deviate is 2 ln 2 σ².
             let Some(middle) = crate::math::median(&mut squares) else { continue };
-            // Below 0.05 px the lens, not the detector, limits; a smaller σ would only freeze the solution.
+            // Below 0.05 px the lens, not the detector, limits; a smaller σ would only freeze the
+            // solution.
             let sigma = (middle / (2.0 * std::f64::consts::LN_2)).sqrt().max(0.05);
             for s in self.tracks.iter_mut().flat_map(|t| &mut t.sightings).filter(|s| s.family == family) {
                 s.sigma = sigma;
@@ -435,7 +445,8 @@ impl Model {
         }
     }
 
-    /// Moves the world so that view 0 is the identity and the median depth of the points over their sightings is 1.
+    /// Moves the world so that view 0 is the identity and the median depth of the points over their
+    /// sightings is 1.
     pub(super) fn normalise(&mut self) {
         let Some(first) = self.poses[0] else { return };
         let model = &*self;
@@ -491,8 +502,8 @@ mod tests {
         assert!((shift(80, 2, 0.0) - 4.0).abs() < 1e-12);
         let share = MAX_INDEPENDENT / PAIRS / 8000.0;
         assert!((shift(2000, 2, 0.0) - 4.0 * share.sqrt()).abs() < 1e-12);
-        // Three photos count as three pairs. Without residuals: 12,000 components, 6000 coordinates of points, 12 parameters of
-        // poses and 5 of the optics.
+        // Three photos count as three pairs. Without residuals: 12,000 components, 6000 coordinates
+        // of points, 12 parameters of poses and 5 of the optics.
         let share = 3.0 * MAX_INDEPENDENT / PAIRS / 12e3;
         assert!((shift(2000, 3, 2.0) - 4.0 * share.sqrt()).abs() < 1e-12);
         let variance = ASSUMED / (12e3 - 6e3 - 17.0 + ASSUMED);

@@ -1,4 +1,5 @@
-//! What pairs of photos have in common: matches by descriptors, and the geometry on which they agree.
+//! What pairs of photos have in common: matches by descriptors, and the geometry on which they
+//! agree.
 use super::families::{Family, affine_family};
 use super::model::Model;
 use super::pair::{Matches, Pair, is_sure, parts};
@@ -15,17 +16,21 @@ use crate::{Error, Result};
 use glam::DVec2;
 use rayon::prelude::*;
 
-/// Agreement threshold as a fraction of the long side: 3 px at 640, three times the noise of learned keypoints.
+/// Agreement threshold as a fraction of the long side: 3 px at 640, three times the noise of
+/// learned keypoints.
 pub(super) const THRESHOLD: f64 = 3.0 / 640.0;
 
-/// Fewest verified matches of a usable pair: five are fitted by anything, 20 agree by chance in few cases.
+/// Fewest verified matches of a usable pair: five are fitted by anything, 20 agree by chance in few
+/// cases.
 pub(super) const MIN_INLIERS: usize = 20;
 
 /// Largest zoom between two photos of one place that is looked for: that of usual lenses.
 const LARGEST_ZOOM: f64 = 4.0;
-/// The same for photos whose files state their focal lengths, which are rounded and change with focus.
+/// The same for photos whose files state their focal lengths, which are rounded and change with
+/// focus.
 const SAME_ZOOM: f64 = 1.1;
-/// Least zoom that is told from a camera that moved: one that comes nearer by a twentieth without showing parallax shows no depth.
+/// Least zoom that is told from a camera that moved: one that comes nearer by a twentieth without
+/// showing parallax shows no depth.
 const ZOOMED: f64 = 1.05;
 
 /// What two photos have in common.
@@ -58,8 +63,9 @@ pub(super) struct Related {
     pub(super) pairs: Vec<Pair>,
 }
 
-/// Of the matches of all photos the pairs that agree on a geometry; an error that names the others unless those connect all
-/// photos. Where photos are not connected surely, corners of [`affine_family`] join `families`.
+/// Of the matches of all photos the pairs that agree on a geometry; an error that names the others
+/// unless those connect all photos. Where photos are not connected surely, corners of
+/// [`affine_family`] join `families`.
 pub(super) fn related(
     photos: &[Photo],
     families: &mut Vec<Family>,
@@ -72,8 +78,9 @@ pub(super) fn related(
     Ok(Related { putative, pairs: usable(named) })
 }
 
-/// The same for photos that join the first `known` ones, whose cameras are known: of pairs of those only the matches. Nothing
-/// is said of a photo that no pair connects; one that is another once more is an error.
+/// The same for photos that join the first `known` ones, whose cameras are known: of pairs of those
+/// only the matches. Nothing is said of a photo that no pair connects; one that is another once
+/// more is an error.
 pub(super) fn related_to(
     photos: &[Photo],
     families: &mut Vec<Family>,
@@ -101,7 +108,8 @@ fn usable(named: Vec<(usize, usize, Relation)>) -> Vec<Pair> {
     named.into_iter().filter_map(pair).collect()
 }
 
-/// Matches of all pairs, and what the pairs have in common, apart from those among the first `known` photos.
+/// Matches of all pairs, and what the pairs have in common, apart from those among the first
+/// `known` photos.
 fn relations(
     photos: &[Photo],
     families: &mut Vec<Family>,
@@ -136,8 +144,8 @@ fn relations(
     Ok((putative, named))
 }
 
-/// Pairs between parts of the photos that sure pairs connect, as far as more corners may make them sure; the first `known`
-/// photos are one part.
+/// Pairs between parts of the photos that sure pairs connect, as far as more corners may make them
+/// sure; the first `known` photos are one part.
 fn unsure_pairs(photos: usize, putative: &[Matches], relations: &[Relation], known: usize) -> Vec<usize> {
     let pairs = || putative.iter().zip(relations);
     let sure = pairs().filter(|(p, r)| p.second < known || r.is_sure());
@@ -186,7 +194,8 @@ fn putative(families: &[Family], i: usize, j: usize) -> Vec<(DVec2, DVec2, Keypo
     all
 }
 
-/// Drops matches that stand still where something in the frame of both photos does: beside what was found of it there is more.
+/// Drops matches that stand still where something in the frame of both photos does: beside what was
+/// found of it there is more.
 fn drop_still(photos: &[Photo], pair: &mut Matches) {
     let (a, b) = (&photos[pair.first], &photos[pair.second]);
     if a.overlay.is_some()
@@ -201,7 +210,8 @@ fn drop_still(photos: &[Photo], pair: &mut Matches) {
 /// Pixels within which two matches of the same two places are one.
 const SAME_PLACE: f64 = 2.0;
 
-/// Without the repetitions of better matches: what is seen in several compressed versions of a photo is still one corner.
+/// Without the repetitions of better matches: what is seen in several compressed versions of a
+/// photo is still one corner.
 fn distinct(matches: Vec<(DVec2, DVec2, KeypointMatch)>) -> Vec<(DVec2, DVec2, KeypointMatch)> {
     let mut taken = std::collections::HashSet::new();
     let cell = |p: DVec2| (p / SAME_PLACE).round().as_i64vec2();
@@ -231,7 +241,8 @@ fn relate(photos: &[Photo], pair: &Matches, empty: &Model) -> Relation {
         let agree = turned.map_or(0.0, |t| t.share(&x, &y, threshold) * x.len() as f64);
         return if is_sure(agree as usize, x.len()) { Relation::NoParallax } else { Relation::Apart };
     };
-    // Without translation nothing but noise remains after the rotation: 0.6 of the threshold is about two σ.
+    // Without translation nothing but noise remains after the rotation: 0.6 of the threshold is
+    // about two σ.
     let noise = 0.6 * threshold;
     let zoomed = turned.filter(|t| t.zoom.ln().abs() > ZOOMED.ln()).is_some_and(|t| {
         let of = |p: &[DVec2]| -> Vec<DVec2> { found.inliers.iter().map(|k| p[*k]).collect() };
@@ -245,14 +256,17 @@ fn relate(photos: &[Photo], pair: &Matches, empty: &Model) -> Relation {
     Relation::Usable(Pair { matches: Matches { first: i, second: j, list }, geometry: found, sure })
 }
 
-/// Share of matches off the plane that most of them lie on, below which a photo shows nothing but that plane.
+/// Share of matches off the plane that most of them lie on, below which a photo shows nothing but
+/// that plane.
 const FLAT: f64 = 0.1;
-/// Change of scale along the picture up to which two photos see a plane straight on: that of one tilted by 10° to 15° more than the other.
+/// Change of scale along the picture up to which two photos see a plane straight on: that of one
+/// tilted by 10° to 15° more than the other.
 const STRAIGHT_ON: f64 = 0.1;
 
-/// Per photo whether the matches show it to be of one plane seen straight on, or taken from the same place as the others: one homography
-/// explains all that agree on anything with every other photo, with one at least beyond doubt, and hardly has perspective. From the far
-/// side of a table its top may be all that is matched, while the photo shows more.
+/// Per photo whether the matches show it to be of one plane seen straight on, or taken from the
+/// same place as the others: one homography explains all that agree on anything with every other
+/// photo, with one at least beyond doubt, and hardly has perspective. From the far side of a table
+/// its top may be all that is matched, while the photo shows more.
 pub(super) fn flat_photos(photos: &[Photo], putative: &[Matches], seed: u64) -> Vec<bool> {
     let half = |v: usize| DVec2::new(photos[v].image.width as f64, photos[v].image.height as f64) * 0.5;
     let one = |pair: &Matches| {
@@ -290,7 +304,8 @@ fn same_picture(a: &RgbImage, b: &RgbImage) -> bool {
     sum / (3.0 * a.data.len().max(1) as f64) < 0.004
 }
 
-/// A clear error unless the usable pairs connect all photos; it names those outside the largest part that they connect.
+/// A clear error unless the usable pairs connect all photos; it names those outside the largest
+/// part that they connect.
 fn check_overlap(photos: &[Photo], relations: &[(usize, usize, Relation)]) -> Result<(), Unplaced> {
     let n = photos.len();
     let name = |i: &usize, j: &usize| format!("{}–{}", photos[*i].stem, photos[*j].stem);

@@ -37,7 +37,8 @@ fn check(name: &str, features: impl Fn(&[Photo]) -> Vec<Keypoints>, rotation: f6
 
 #[test]
 fn corners_alone_place_the_breakfast_cameras() {
-    // A tenth of what is asked of the whole (0.2°, 0.3 %, 1 %): ten times what it measures, so a slip shows.
+    // A tenth of what is asked of the whole (0.2°, 0.3 %, 1 %): ten times what it measures, so a
+    // slip shows.
     check("corners", |_| Vec::new(), 0.03, 0.0005, 0.002);
 }
 
@@ -125,7 +126,8 @@ fn two_photos_of_different_size_and_known_focal_are_enough() {
     let mut truth = testing::train(&testing::folder());
     truth.photos.truncate(2);
     truth.cameras.truncate(2);
-    // The second photo comes from a file of 1.6 times its size, as another working resolution of the same camera.
+    // The second photo comes from a file of 1.6 times its size, as another working resolution of
+    // the same camera.
     let half = &mut truth.photos[1];
     half.original_size = (1024, 768);
     half.to_working = crate::scene::Affine::resize(half.original_size, (640, 480));
@@ -140,7 +142,8 @@ fn two_photos_of_different_size_and_known_focal_are_enough() {
         crate::pose::numeric::rotation_angle(&(found.rotation * want.rotation.transpose())).to_degrees();
     let aim = found.translation.angle_between(want.translation).to_degrees();
     println!("two views: {turn:.3}° {aim:.3}°, σ ln f {:?}", model.focal_log_sigma);
-    // An orbit of two views hardly sees the focal length: 2 % of it turn the views by up to half a degree.
+    // An orbit of two views hardly sees the focal length: 2 % of it turn the views by up to half a
+    // degree.
     assert!(turn < 0.8 && aim < 0.8, "{turn} {aim}");
     assert!(model.focal_log_sigma.unwrap() > 0.002);
 }
@@ -243,8 +246,9 @@ fn photos_that_only_look_like_one_camera_are_told_apart() {
     assert!(one.fitted.iter().all(|f| f.camera == 0 && f.agreement > 0.9), "{:?}", one.fitted);
     let lens = Lens::radial(-0.12, 0.03);
     type Change<'a> = &'a dyn Fn(&Photo) -> Photo;
-    // No file says that two of the photos came through a lens, or were cut out of larger ones. Change, zoom, limits of rotation
-    // in degrees and of the centre: a cut enlarged twice shows half the detail.
+    // No file says that two of the photos came through a lens, or were cut out of larger ones.
+    // Change, zoom, limits of rotation in degrees and of the centre: a cut enlarged twice shows
+    // half the detail.
     let sets: [(Change, f64, [f64; 2]); 2] =
         [(&|p| lensed(p, focal, lens), 1.0, [0.05, 0.001]), (&|p| cropped(p, 2.0), 2.0, [0.1, 0.002])];
     for (change, zoom, [rotation, centre]) in sets {
@@ -295,7 +299,8 @@ fn planes_seen_straight_on_are_flat() {
     assert_eq!(flat(aside, 2.0), [false; 2]);
 }
 
-/// Focal length, relative to the true one, of a plane seen nearly straight on by positions of that noise, pixels of σ 0.05 at least.
+/// Focal length, relative to the true one, of a plane seen nearly straight on by positions of that
+/// noise, pixels of σ 0.05 at least.
 fn focal_of_plane(noise: f64, tilt: f64) -> f64 {
     let truth = testing::train(&testing::folder());
     let mut rng = Random::new(4);
@@ -363,7 +368,8 @@ fn parts_of_photos_are_told_by_their_axes() {
     assert!(model.group[0] == model.group[2] && model.has_crops());
 }
 
-/// The part of a photo that a lens moved by image stabilisation would show: 600 × 440 pixels, off the middle by `shift`.
+/// The part of a photo that a lens moved by image stabilisation would show: 600 × 440 pixels, off
+/// the middle by `shift`.
 fn moved(photo: &Photo, shift: [i32; 2]) -> Photo {
     let (width, height) = (600, 440);
     let at = |x: i32, y: i32| photo.image.at((x + 20 + shift[0]) as usize, (y + 20 + shift[1]) as usize);
@@ -383,7 +389,8 @@ fn a_moving_lens_does_not_make_another_camera() {
     let focal: Vec<f64> = model.cameras.iter().map(|c| c.fx / truth.cameras[0].fx - 1.0).collect();
     println!("{of:?} {focal:?} {:?}", model.fitted[0].sigmas);
     assert_eq!(of, [0; 4]);
-    // A principal point for all is an approximation where it moves by 2 % of the width: measured 0.038.
+    // A principal point for all is an approximation where it moves by 2 % of the width: measured
+    // 0.038.
     assert!(focal.iter().all(|f| f.abs() < 0.05), "{focal:?}");
 }
 
@@ -426,7 +433,8 @@ fn larger_images_make_cameras_better() {
     );
 }
 
-/// A view into the corner of a room, each wall striped along another of its three edges; `focal` in pixels.
+/// A view into the corner of a room, each wall striped along another of its three edges; `focal` in
+/// pixels.
 fn corner_of_a_room(focal: f64) -> RgbImage {
     let (width, height) = (320, 240);
     let to_world = (DMat3::from_rotation_x(-0.6) * DMat3::from_rotation_y(2.356)).transpose();

@@ -10,8 +10,8 @@ pub(super) fn images(photos: &[Photo]) -> Vec<RgbImage> {
     photos.iter().map(|p| p.image.clone()).collect()
 }
 
-/// What renders of photos are compared with, and which pixels of it count; the others continue them, so that no colour of what
-/// hides the scene gets into it.
+/// Targets of renders, and their pixels that count; the others continue them, so that no colour of
+/// what hides the scene gets into it.
 pub(super) fn targets(photos: &[Photo]) -> (Vec<RgbImage>, Vec<Option<Coverage>>) {
     let target = |p: &Photo| {
         let mut image = p.target();
