@@ -1,6 +1,6 @@
 //! Where a scene shows what a text means: `cargo run --release --example query -- out/kitchen "blue mug" masks`.
 use splatvk::format::picture;
-use splatvk::gpu::Device;
+use splatvk::gpu;
 use splatvk::infer::Registry;
 use splatvk::run::live::LiveScene;
 use splatvk::scene::LEVEL_NAMES;
@@ -9,7 +9,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 fn query(scene: &Path, text: &str, out: &Path) -> Result<()> {
-    let mut scene = LiveScene::load(&Device::open(None)?, scene, &Registry::open(None)?)?;
+    let mut scene = LiveScene::load(&gpu::open(None)?, scene, &Registry::open(None)?)?;
     std::fs::create_dir_all(out).map_err(Error::unwritable(out))?;
     for camera in scene.cameras().to_vec() {
         let answers = scene.ask(text, &camera)?;

@@ -2,7 +2,7 @@
 //! `cargo run --release --example render -- out/kitchen orbit`.
 use glam::{DMat3, DVec2};
 use splatvk::format::{picture, scene_dir};
-use splatvk::gpu::Device;
+use splatvk::gpu;
 use splatvk::pass::Renderer;
 use splatvk::scene::{Camera, Pose};
 use splatvk::{Error, Result};
@@ -29,7 +29,7 @@ fn render(scene: &Path, out: &Path) -> Result<()> {
     let scene = scene_dir::load(scene)?;
     let middle = scene.cameras.get(scene.cameras.len() / 2);
     let middle = middle.ok_or_else(|| Error::input("the scene has no cameras"))?;
-    let mut renderer = Renderer::new(&Device::open(None)?, &scene.splats, &[], 0)?;
+    let mut renderer = Renderer::new(&gpu::open(None)?, &scene.splats, &[], 0)?;
     std::fs::create_dir_all(out).map_err(Error::unwritable(out))?;
     let seen = renderer.render(middle)?;
     let mut depths: Vec<f32> = seen.depth.data.iter().copied().filter(|z| *z > 0.0).collect();

@@ -7,6 +7,6 @@
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_vote : require
 #extension GL_KHR_shader_subgroup_shuffle : require
-#include "shared/atomic_float.glsl"
+#include "gpu/atomic_float.glsl"
 #define BY_ENTRY 0
 #include "shared/raster_backward.glsl"

@@ -3,6 +3,7 @@ mod system;
 
 pub(crate) use system::words;
 
+use splatvk_gpu::VulkanError;
 use std::path::{Path, PathBuf};
 use system::advice;
 
@@ -67,7 +68,7 @@ pub enum Error {
         /// The last thing that is on disk, from which the same run with `resume` goes on: "stage splats after step 120".
         kept: Option<String>,
         /// What the driver said.
-        source: ash::vk::Result,
+        source: VulkanError,
     },
     /// The Vulkan device or its driver has no memory left.
     #[error(
@@ -80,7 +81,7 @@ pub enum Error {
         /// As that of [`Error::DeviceLost`].
         kept: Option<String>,
         /// What the driver said.
-        source: ash::vk::Result,
+        source: VulkanError,
     },
     /// The Vulkan driver refused something else, or the device cannot do it.
     #[error("Vulkan: {message}")]
@@ -88,7 +89,7 @@ pub enum Error {
         /// What was refused and why.
         message: String,
         /// What the driver said, if it was asked.
-        source: Option<ash::vk::Result>,
+        source: Option<VulkanError>,
     },
     /// Something failed while working on valid input.
     #[error("{0}")]
@@ -122,18 +123,6 @@ impl Error {
     /// Shorthand for [`Error::Gpu`] without a cause.
     pub fn gpu(message: impl Into<String>) -> Self {
         Error::Gpu { message: message.into(), source: None }
-    }
-    /// What a Vulkan call returned, as the variant that a program reacts to; `doing` says what it was for.
-    pub fn vulkan(doing: impl Into<String>, source: ash::vk::Result) -> Self {
-        use ash::vk::Result as R;
-        let doing = doing.into();
-        match source {
-            R::ERROR_DEVICE_LOST => Error::DeviceLost { doing, kept: None, source },
-            R::ERROR_OUT_OF_DEVICE_MEMORY | R::ERROR_OUT_OF_HOST_MEMORY => {
-                Error::OutOfDeviceMemory { doing, kept: None, source }
-            }
-            _ => Error::Gpu { message: format!("{doing}: {source}"), source: Some(source) },
-        }
     }
     /// Attaches the path to an I/O error: `.map_err(Error::io(path))`. What only writing can meet becomes
     /// [`Error::Unwritable`].
@@ -175,6 +164,21 @@ impl Error {
     }
 }
 
+impl From<splatvk_gpu::Error> for Error {
+    fn from(error: splatvk_gpu::Error) -> Self {
+        use splatvk_gpu::Error as Gpu;
+        match error {
+            Gpu::NoDevice { message, source } => Error::NoDevice { message, source },
+            Gpu::Choice(message) | Gpu::Host(message) => Error::Input(message),
+            Gpu::NoValidationLayer(message) => Error::Missing(message),
+            Gpu::DeviceLost { doing, source } => Error::DeviceLost { doing, kept: None, source },
+            Gpu::OutOfMemory { doing, source } => Error::OutOfDeviceMemory { doing, kept: None, source },
+            Gpu::Refused { message, source } => Error::Gpu { message, source },
+            other => Error::Gpu { message: other.to_string(), source: None },
+        }
+    }
+}
+
 /// What the user can do about a place that cannot be written.
 fn elsewhere(e: &std::io::Error) -> &'static str {
     use std::io::ErrorKind as K;
@@ -204,15 +208,18 @@ fn once_there_is_memory(kept: &Option<String>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ash::vk;
+    use crate::gpu::vk;
     use std::error::Error as _;
     use std::io::{Error as IoError, ErrorKind};
 
     #[test]
     fn a_program_can_tell_what_to_react_to_and_see_the_cause() {
-        let lost = Error::vulkan("step 7", vk::Result::ERROR_DEVICE_LOST);
+        let of = |doing: &str, result: vk::Result| -> Error {
+            splatvk_gpu::Error::vulkan(doing, VulkanError::from_code(result.as_raw())).into()
+        };
+        let lost = of("step 7", vk::Result::ERROR_DEVICE_LOST);
         assert!(matches!(&lost, Error::DeviceLost { doing, kept: None, .. } if doing == "step 7"));
-        assert!(lost.source().is_some_and(|s| s.downcast_ref() == Some(&vk::Result::ERROR_DEVICE_LOST)));
+        assert!(lost.source().is_some_and(|s| s.downcast_ref() == Some(&VulkanError::from_code(-4))));
         assert!(!lost.to_string().contains("--resume"), "{lost}");
         let lost = lost.keeping(Some("stage splats after step 6".into())).keeping(Some("cameras".into()));
         let text = lost.to_string();
@@ -220,12 +227,12 @@ mod tests {
             text.contains("step 7") && text.ends_with("--resume goes on from stage splats after step 6"),
             "{lost}"
         );
-        let full = Error::vulkan("buffer", vk::Result::ERROR_OUT_OF_DEVICE_MEMORY);
+        let full = of("buffer", vk::Result::ERROR_OUT_OF_DEVICE_MEMORY);
         assert!(matches!(full, Error::OutOfDeviceMemory { .. }) && full.source().is_some());
         assert!(full.to_string().ends_with("or another device"), "{full}");
         let full = full.keeping(Some("cameras".into()));
         assert!(full.to_string().ends_with("--resume goes on from cameras"), "{full}");
-        let other = Error::vulkan("fence", vk::Result::ERROR_INITIALIZATION_FAILED);
+        let other = of("fence", vk::Result::ERROR_INITIALIZATION_FAILED);
         assert!(matches!(other, Error::Gpu { source: Some(_), .. }) && other.source().is_some());
         assert_eq!([&lost, &full, &other].map(Error::exit_code), [1; 3]);
 

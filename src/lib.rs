@@ -35,7 +35,7 @@
 //!     cy: 24.0,
 //!     pose: Pose::IDENTITY,
 //! };
-//! let frame = Renderer::new(&Device::open(None)?, &splats, &[], 0)?.render(&camera)?;
+//! let frame = Renderer::new(&gpu::open(None)?, &splats, &[], 0)?.render(&camera)?;
 //! let [r, g, b] = frame.rgb.at(32, 24);
 //! assert!(r > 0.9 && g < 0.1 && b < 0.1);
 //! assert!((frame.depth.at(32, 24) - 4.0).abs() < 1e-3);

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 use splatvk::bench::report::{Clock, SUM};
 use splatvk::bench::{Bench, BenchReport, Budget, Quartiles, Section, Workload, compare};
-use splatvk::gpu::{Options, TestDevice, test_device};
+use splatvk::gpu::{self, TestDevice, test_device};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -46,7 +46,7 @@ fn check_step(section: &Section, expected: &[&str]) {
 #[test]
 fn a_training_step_adds_up() {
     // A device of its own: it counts the buffers of everything that runs on it.
-    let device = TestDevice::with(&Options::from_env(None)).unwrap();
+    let device = TestDevice::open(&gpu::options(None)).unwrap();
     let mut bench = Bench::new(&device, ONCE).unwrap();
     let workload = Workload::seeded(400, 75, 53, 1, 0).unwrap();
     bench.training(&workload, 5).unwrap();

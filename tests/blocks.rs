@@ -3,7 +3,7 @@
 mod support;
 use glam::DVec3;
 use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions};
-use splatvk::gpu::{Device, Options, TestDevice, test_device};
+use splatvk::gpu::{self, Device, Options, TestDevice, test_device};
 use splatvk::pass::Summation;
 use splatvk::pass::{RenderedFrame, Renderer, seeded};
 use splatvk::progress::Silent;
@@ -16,7 +16,7 @@ const MIB: u64 = 1 << 20;
 
 /// A device that binds no more than this.
 fn limited(bytes: u64, deterministic: bool) -> TestDevice {
-    TestDevice::with(&Options { max_binding: Some(bytes), deterministic, ..Options::from_env(None) }).unwrap()
+    TestDevice::open(&Options { max_binding: Some(bytes), deterministic, ..gpu::options(None) }).unwrap()
 }
 
 /// Largest difference, relative to the largest value.

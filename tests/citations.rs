@@ -6,8 +6,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// What is read, relative to the repository.
-const PLACES: [&str; 11] = [
+const PLACES: [&str; 13] = [
     "src",
+    "crates",
+    "examples",
     "glsl",
     "tests",
     "tools",

@@ -3,7 +3,7 @@
 use glam::{DMat3, DVec2, DVec3};
 use splatvk::fit::{self, Preset, RgbOptions};
 use splatvk::format::{npy, ply};
-use splatvk::gpu::Device;
+use splatvk::gpu;
 use splatvk::pass::Renderer;
 use splatvk::pass::metrics::{psnr, psnr_masked, ssim};
 use splatvk::progress::Progress;
@@ -121,7 +121,7 @@ fn knob(name: &str, default: f64) -> f64 {
 fn breakfast_with_exact_geometry() {
     let shrink = knob("SHRINK", 1.0) as usize;
     let (train, test) = (load("train", shrink), load("test", shrink));
-    let device = Device::open(None).unwrap();
+    let device = gpu::open(None).unwrap();
     let images: Vec<RgbImage> = train.iter().map(|v| v.image.clone()).collect();
     let cameras: Vec<Camera> = train.iter().map(|v| v.camera.clone()).collect();
     let depths: Vec<DepthMap> = train
@@ -197,7 +197,7 @@ fn light_above_one_is_learnt_and_rendered() {
     for view in &mut train {
         view.image.data.iter_mut().flatten().for_each(|v| *v = to_srgb(6.0 * to_linear(*v)));
     }
-    let device = Device::open(None).unwrap();
+    let device = gpu::open(None).unwrap();
     let images: Vec<RgbImage> = train.iter().map(|v| v.image.clone()).collect();
     let cameras: Vec<Camera> = train.iter().map(|v| v.camera.clone()).collect();
     let options = RgbOptions { poses: None, ..RgbOptions::preset(Preset::Draft).with_iterations(120) };

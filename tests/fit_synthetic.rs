@@ -4,7 +4,7 @@ use glam::DVec3;
 use splatvk::fit::schedule::Exponential;
 use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions, Start, Trained, ViewDependentOptions};
 use splatvk::format::scene_dir::{self, Contents};
-use splatvk::gpu::{Device, Options, TestDevice, test_device};
+use splatvk::gpu::{self, Device, Options, TestDevice, test_device};
 use splatvk::math::Random;
 use splatvk::pass::metrics::psnr;
 use splatvk::pass::{FeatureMode, RasterOptions, Renderer};
@@ -99,7 +99,7 @@ fn a_perturbed_camera_is_recovered() {
 
 #[test]
 fn colours_and_shapes_are_fitted_and_a_seed_repeats() {
-    let device = TestDevice::with(&Options { deterministic: true, ..Options::from_env(None) }).unwrap();
+    let device = TestDevice::open(&Options { deterministic: true, ..gpu::options(None) }).unwrap();
     let truth = wall(500, 8);
     let cameras = cameras(3);
     let images = photos(&device, &truth, &cameras);

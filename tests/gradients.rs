@@ -1,6 +1,6 @@
 //! Gradients of the whole render on the GPU against the f64 twin, which is itself checked by central differences.
 mod support;
-use splatvk::gpu::{Options, Recorder, TestDevice, Way, test_device};
+use splatvk::gpu::{self, NATIVE_FLOAT_ATOMICS, Options, Recorder, TestDevice, test_device};
 use splatvk::pass::{DeviceChoices, FeatureMode, Summation, seeded};
 use support::{GpuGradients, Scene, assert_class, assert_gradients};
 
@@ -162,12 +162,14 @@ fn detached_features_do_not_move_the_geometry() {
     }
 }
 
-/// The compare-and-swap side of shared/atomic_float.glsl gives the same sums.
+/// The compare-and-swap side of gpu/atomic_float.glsl gives the same sums.
 #[test]
 fn without_float_atomics_the_gradients_are_the_same() {
-    let device =
-        TestDevice::with(&Options { without: [Way::FloatAtomics].into(), ..Options::from_env(None) })
-            .unwrap();
+    let device = TestDevice::open(&Options {
+        disabled: [NATIVE_FLOAT_ATOMICS.to_owned()].into(),
+        ..gpu::options(None)
+    })
+    .unwrap();
     assert!(!device.info().float_atomics);
     let scene = Scene::small(100, 1, 3, 14);
     let upstream = scene.upstream(14);

@@ -18,7 +18,7 @@ const FOLDERS: &[(&str, &str)] = &[
     ("checkpoint", "error sync files"),
     ("progress", "error sync checkpoint"),
     ("scene", "math"),
-    ("gpu", "error sync files"),
+    ("gpu", "error files"),
     ("pass", "error sync math scene gpu"),
     ("check", "error math scene gpu pass"),
     ("photo", "error files progress scene"),

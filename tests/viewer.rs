@@ -10,7 +10,7 @@ use fixture::{data, truth};
 use serde_json::{Value, json};
 use splatvk::format::npy;
 use splatvk::format::scene_dir;
-use splatvk::gpu::Device;
+use splatvk::gpu;
 use splatvk::pass::metrics::psnr;
 use splatvk::query::{QueryOptions, instances::splat_codes};
 use splatvk::report::viewer::Scene3d;
@@ -99,7 +99,7 @@ fn keep(page: &mut Page, name: &str) {
 
 fn draws_what_the_engine_draws(page: &mut Page, scene: &Path) {
     let loaded = scene_dir::load(scene).unwrap();
-    let device = Device::open(None).unwrap();
+    let device = gpu::open(None).unwrap();
     let mut viewer = Viewer::new(&device, &loaded.splats, &LanguageField::default()).unwrap();
     for (i, camera) in loaded.cameras.iter().enumerate() {
         let engine = viewer.view(camera).unwrap().rendered;
@@ -307,7 +307,7 @@ fn a_static_page_answers_what_was_asked() {
         &splatvk::infer::Registry::open(None).unwrap(),
     )
     .unwrap();
-    let device = Device::open(None).unwrap();
+    let device = gpu::open(None).unwrap();
     let field = scene.language.clone().unwrap();
     let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder).unwrap();
     ready.set_views(&scene.cameras).unwrap();
@@ -392,7 +392,7 @@ fn pictures_of_a_real_scene() {
     let mut page = Page::open(&chromium, 1120, 760, false);
     page.go(&server.address);
     let loaded = scene_dir::load(&scene).unwrap();
-    let device = Device::open(None).unwrap();
+    let device = gpu::open(None).unwrap();
     let mut viewer = Viewer::new(&device, &loaded.splats, &LanguageField::default()).unwrap();
     let engine = viewer.view(&loaded.cameras[0]).unwrap().rendered.rgb;
     let likeness = psnr(&to_float(&page.picture(0)), &engine);

@@ -213,7 +213,7 @@ mod tests {
 
     #[test]
     fn rows_that_failed_in_an_earlier_run_are_tried_again() {
-        let (device, registry) = (Device::open(None).unwrap(), Registry::open(None).unwrap());
+        let (device, registry) = (crate::gpu::open(None).unwrap(), Registry::open(None).unwrap());
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast");
         // More photos than there are frames: every row fails before any work.
         let plan = Plan {

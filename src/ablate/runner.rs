@@ -398,7 +398,7 @@ mod tests {
 
     #[test]
     fn held_out_views_that_one_row_has_as_photos_are_scored_in_none() {
-        let (device, registry) = (Device::open(None).unwrap(), Registry::open(None).unwrap());
+        let (device, registry) = (crate::gpu::open(None).unwrap(), Registry::open(None).unwrap());
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast");
         let data = DataSet::open("breakfast".into(), folder.as_ref(), None).unwrap();
         let runner = Runner::open(&device, &registry, data, &Silent);

@@ -240,7 +240,7 @@ impl Section {
         budget: &Budget,
     ) -> Result<Vec<f64>> {
         let program = record().compile()?;
-        let timed = budget.repeat(|| program.run_timed())?;
+        let timed = budget.repeat(|| Ok(program.run_timed()?))?;
         let passes: Vec<&str> = program.passes().collect();
         let names: Vec<&str> = timed.first().into_iter().flatten().map(|c| c.0.as_str()).collect();
         let commands: Vec<(&str, &str)> = passes.iter().copied().zip(names).collect();

@@ -128,7 +128,7 @@ fn parts(device: &Device, run: &impl Training, budget: &Budget, section: &mut Se
             p.raster.record_backward(&mut rec, p.params, p.options, p.gradients);
         }
         let program = rec.compile()?;
-        section.time(name, Clock::Wall, budget.wall(|| program.run())?);
+        section.time(name, Clock::Wall, budget.wall(|| Ok(program.run()?))?);
     }
     Ok(())
 }

@@ -22,6 +22,12 @@ pub enum CallError {
     Argument(String),
 }
 
+impl From<crate::gpu::Error> for CallError {
+    fn from(error: crate::gpu::Error) -> Self {
+        Error::from(error).into()
+    }
+}
+
 impl From<Error> for CallError {
     fn from(e: Error) -> Self {
         CallError::Error(e)
@@ -301,6 +307,7 @@ pub unsafe fn slot<'a, T>(pointer: *mut *mut T) -> Result<&'a mut *mut T, CallEr
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu;
 
     #[test]
     fn panics_and_errors_become_codes_with_a_text() {
@@ -312,7 +319,7 @@ mod tests {
         assert_eq!(guard(&store, || panic!("broken {}", 7)), SvkStatus::Internal);
         assert_eq!(text(), "internal error: broken 7");
         assert_eq!(guard(&store, || Err(Error::Cancelled.into())), SvkStatus::Cancelled);
-        let lost = || Err(Error::vulkan("a step", crate::gpu::vk::Result::ERROR_DEVICE_LOST).into());
+        let lost = || Err(gpu::Error::vulkan("a step", gpu::VulkanError::from_code(-4)).into());
         assert_eq!(guard(&store, lost), SvkStatus::DeviceLost);
         assert!(text().contains("a step: the device was lost"), "{}", text());
         let full = || Err(Error::io("scene")(std::io::ErrorKind::StorageFull.into()).into());

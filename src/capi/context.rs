@@ -2,7 +2,7 @@
 use super::boundary::{self, CallError, LastError, bad_argument, guard_creation, guard_number};
 use super::types::*;
 use crate::gpu::vk::{self, Handle};
-use crate::gpu::{Device, EnabledFeatures, HostDevice, Options, QueueLock};
+use crate::gpu::{self, Device, EnabledFeatures, HostDevice, Options, QueueLock};
 use crate::infer::provider::NAMES;
 use crate::infer::{Compute, Registry};
 use std::ffi::{CStr, c_char, c_void};
@@ -47,10 +47,10 @@ pub unsafe extern "C" fn svk_context_create(
             let slot = boundary::slot(context)?;
             let options = boundary::read_or_default(options)?;
             let device = boundary::text(options.device, "SvkContextOptions.device")?;
-            let mut chosen = Options::from_env(device.as_deref());
+            let mut chosen = gpu::options(device.as_deref());
             chosen.validation |= options.validation != 0;
             chosen.deterministic = options.deterministic != 0;
-            *slot = boxed(Device::with(&chosen)?, &options)?;
+            *slot = boxed(Device::open(&chosen)?, &options)?;
         }
         Ok(())
     })

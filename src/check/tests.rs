@@ -5,17 +5,17 @@ use crate::gpu::{Executor, Op, TestDevice, shaders};
 use crate::pass::close::Tolerance;
 use glam::Vec4;
 
-fn wrong(pass: &'static str, way: Option<Way>) -> Row {
-    Row { pass, way, time: Duration::ZERO, outcome: Err("wrong".to_owned()) }
+fn wrong(pass: &'static str, variant: Option<KernelVariant>) -> Row {
+    Row { pass, variant, time: Duration::ZERO, outcome: Err("wrong".to_owned()) }
 }
 
 /// Also: what it does not run is only what benchmarks run.
 #[test]
 fn every_pass_is_right_on_the_test_device() {
-    let options = Options { cache: None, ..Options::from_env(None) };
-    let device = Device::with(&options).unwrap();
+    let options = Options { cache: None, ..crate::gpu::options(None) };
+    let device = Device::open(&options).unwrap();
     let mut told = |row: &Row| -> Result<()> {
-        println!("{:<40} {:?} {:?}", row.pass, row.way, row.outcome);
+        println!("{:<40} {:?} {:?}", row.pass, row.variant, row.outcome);
         assert!(row.outcome.is_ok(), "{}: {:?}", row.pass, row.outcome);
         Ok(())
     };
@@ -32,30 +32,36 @@ fn every_pass_is_right_on_the_test_device() {
 
 #[test]
 fn a_way_is_switched_off_where_its_replacement_is_right() {
-    let sweep = [wrong("radix sort", Some(Way::SweepSort))];
-    assert_eq!(wrong_ways(&sweep), BTreeSet::from([Way::SweepSort]));
-    assert!(!is_fatal(&sweep[0], &wrong_ways(&sweep)));
-    let both = [wrong("radix sort", Some(Way::SweepSort)), wrong("radix sort", Some(Way::ChunkSort))];
-    assert!(wrong_ways(&both).is_empty() && is_fatal(&both[0], &wrong_ways(&both)));
+    let sweep = [wrong("radix sort", Some(KernelVariant::SweepSort))];
+    assert_eq!(wrong_variants(&sweep), BTreeSet::from([KernelVariant::SweepSort]));
+    assert!(!is_fatal(&sweep[0], &wrong_variants(&sweep)));
+    let both = [
+        wrong("radix sort", Some(KernelVariant::SweepSort)),
+        wrong("radix sort", Some(KernelVariant::ChunkSort)),
+    ];
+    assert!(wrong_variants(&both).is_empty() && is_fatal(&both[0], &wrong_variants(&both)));
     let other = [wrong("Adam", None)];
-    assert!(wrong_ways(&other).is_empty() && is_fatal(&other[0], &wrong_ways(&other)));
+    assert!(wrong_variants(&other).is_empty() && is_fatal(&other[0], &wrong_variants(&other)));
 }
 
 #[test]
 fn native_float_atomics_are_switched_off_alone_if_it_goes_without_them() {
-    let native = wrong("gradients", Some(Way::FloatAtomics));
-    assert_eq!(wrong_ways(std::slice::from_ref(&native)), BTreeSet::from([Way::FloatAtomics]));
-    let mut rows = vec![native, wrong("gradients", Some(Way::AtomicGradients))];
-    assert_eq!(wrong_ways(&rows), BTreeSet::from([Way::FloatAtomics, Way::AtomicGradients]));
-    assert!(rows.iter().all(|r| !is_fatal(r, &wrong_ways(&rows))), "entries are stored");
-    rows.push(wrong("gradients", Some(Way::StoredGradients)));
-    assert!(wrong_ways(&rows).is_empty() && rows.iter().all(|r| is_fatal(r, &BTreeSet::new())));
+    let native = wrong("gradients", Some(KernelVariant::FloatAtomics));
+    assert_eq!(wrong_variants(std::slice::from_ref(&native)), BTreeSet::from([KernelVariant::FloatAtomics]));
+    let mut rows = vec![native, wrong("gradients", Some(KernelVariant::AtomicGradients))];
+    assert_eq!(
+        wrong_variants(&rows),
+        BTreeSet::from([KernelVariant::FloatAtomics, KernelVariant::AtomicGradients])
+    );
+    assert!(rows.iter().all(|r| !is_fatal(r, &wrong_variants(&rows))), "entries are stored");
+    rows.push(wrong("gradients", Some(KernelVariant::StoredGradients)));
+    assert!(wrong_variants(&rows).is_empty() && rows.iter().all(|r| is_fatal(r, &BTreeSet::new())));
 }
 
 #[test]
 fn it_ends_where_the_caller_says_so() {
-    let options = Options { cache: None, ..Options::from_env(None) };
-    let device = Device::with(&options).unwrap();
+    let options = Options { cache: None, ..crate::gpu::options(None) };
+    let device = Device::open(&options).unwrap();
     let mut told = 0;
     let stopped = run(&device, &options, &mut |_| {
         told += 1;
@@ -99,16 +105,20 @@ impl Executor for Broken {
 
 #[test]
 fn after_a_wrong_way_the_device_is_opened_anew_without_it() {
-    let options = Options { cache: None, staging: false, ..Options::from_env(None) };
+    let options = Options { cache: None, staging: false, ..crate::gpu::options(None) };
     let device = TestDevice::executed_by(Box::new(Broken), 32, &options).unwrap();
     let mut seen = Vec::new();
     let stopped = run(&device, &options, &mut |row| {
-        seen.push((row.way, row.outcome.is_ok()));
+        seen.push((row.variant, row.outcome.is_ok()));
         if seen.len() == 4 { Err(crate::Error::Cancelled) } else { Ok(()) }
     });
     assert!(matches!(stopped, Err(crate::Error::Cancelled)));
     // Nothing replaces what came before the sorts; the one that is opened now is not broken.
-    let expected =
-        [(None, false), (None, false), (Some(Way::ChunkSort), false), (Some(Way::SweepSort), true)];
+    let expected = [
+        (None, false),
+        (None, false),
+        (Some(KernelVariant::ChunkSort), false),
+        (Some(KernelVariant::SweepSort), true),
+    ];
     assert_eq!(seen, expected);
 }

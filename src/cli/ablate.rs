@@ -10,7 +10,7 @@ use crate::ablate::{
 };
 use crate::files::{Kind, Partial, check_place};
 use crate::format::write_json;
-use crate::gpu::Device;
+use crate::gpu;
 use crate::infer::Registry;
 use crate::infer::installed::{Inventory, inventory};
 use crate::run::sources::{
@@ -34,7 +34,7 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
     let _reserved = Partial::inside(&out)?;
     check_place(&out.join(REPORT), Kind::File, true)?;
     let earlier = if args.resume { earlier(&out.join(REPORT))? } else { Vec::new() };
-    let device = Device::open(args.device.device.as_deref())?;
+    let device = gpu::open(args.device.device.as_deref())?;
     let (clock, progress) = (Instant::now(), progress::reporter());
     let head = || {
         json!({

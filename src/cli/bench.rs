@@ -7,7 +7,7 @@ use super::progress;
 use super::scene;
 use crate::bench::{self, Bench, BenchReport, Budget, Workload, compare};
 use crate::format::{scene_dir, write_json};
-use crate::gpu::Device;
+use crate::gpu;
 use crate::infer::check::check as check_model;
 use crate::infer::installed::inventory;
 use crate::infer::{RegionEncoder, Registry};
@@ -25,7 +25,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         let inputs = [args.scene.as_deref(), args.camera.as_deref()];
         let inputs: Vec<&Path> = inputs.into_iter().flatten().collect();
         let out = WrittenFiles::open(folder, args.force, &inputs)?;
-        workload.write(&Device::open(args.device.as_deref())?, out.folder())?;
+        workload.write(&gpu::open(args.device.as_deref())?, out.folder())?;
         return listing(&out.keep()?, false);
     }
     let has = |part| args.parts.contains(&part);
@@ -46,7 +46,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         if has(BenchPart::Training) || !args.sweep.is_empty() { Some(workload(args)?) } else { None };
     let asked = if has(BenchPart::Query) { Some(scene_and_encoder(args)?) } else { None };
     let out = writable(args)?;
-    let device = Device::open(args.device.as_deref())?;
+    let device = gpu::open(args.device.as_deref())?;
     let mut bench = Bench::new(&device, budget)?;
     if let Some(workload) = &workload {
         if has(BenchPart::Training) {

@@ -5,7 +5,7 @@ use super::print::{print, print_json};
 use super::progress;
 use crate::check::{self, Row};
 use crate::gpu::report::{Line, Status, vulkan};
-use crate::gpu::{Device, Options, Way};
+use crate::gpu::{self, Device, FolderCache, Options};
 use crate::infer;
 use crate::infer::installed::{Task, inventory};
 use crate::photo::{self, Support};
@@ -80,10 +80,9 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
 
 /// Compares every pass with its CPU twin, and switches off what is wrong and can be replaced.
 fn check_passes(args: &DoctorArgs) -> Result<()> {
-    let chosen = Options::from_env(args.device.device.as_deref());
-    // Without the cache nothing is switched off, and the driver compiles everything.
-    let options = Options { cache: None, ..chosen.clone() };
-    let device = Device::with(&options)?;
+    // Without the cache nothing is disabled, and the driver compiles everything.
+    let options = Options { cache: None, ..gpu::options(args.device.device.as_deref()) };
+    let device = Device::open(&options)?;
     let info = device.info();
     let (low, high) = info.subgroup_sizes;
     let about = format!(
@@ -105,10 +104,10 @@ fn check_passes(args: &DoctorArgs) -> Result<()> {
         progress::reporter().check()?;
         if json { Ok(()) } else { print(&text(row)) }
     })?;
-    let off = check::wrong_ways(&rows);
-    let names: Vec<&str> = off.iter().map(|w| w.name()).collect();
-    if let Some(folder) = &chosen.cache {
-        device.switch_off(folder, &off)?;
+    let off = check::wrong_variants(&rows);
+    let names: Vec<&str> = off.iter().map(|v| v.name()).collect();
+    if let Some(cache) = FolderCache::own() {
+        device.disable(&cache, &check::names(&off)).map_err(Error::io(cache.path()))?;
     }
     let fatal = rows.iter().filter(|r| check::is_fatal(r, &off)).count();
     if json {
@@ -133,14 +132,14 @@ fn text(row: &Row) -> String {
         Ok(found) => ("ok", found),
         Err(what) => ("WRONG", what),
     };
-    let pass = row.way.map_or(row.pass.to_owned(), |way| format!("{}, {}", row.pass, way.name()));
+    let pass = row.variant.map_or(row.pass.to_owned(), |variant| format!("{}, {}", row.pass, variant.name()));
     format!("{word:<6} {pass:<52} {:>6} ms  {found}\n", row.time.as_millis())
 }
 
 fn to_json(row: &Row) -> serde_json::Value {
     json!({
         "pass": row.pass,
-        "way": row.way.map(Way::name),
+        "way": row.variant.map(|v| v.name()),
         "right": row.outcome.is_ok(),
         "found": row.outcome.as_ref().unwrap_or_else(|what| what),
         "seconds": row.time.as_secs_f64(),

@@ -7,7 +7,7 @@ use super::scene;
 use super::views;
 use crate::format::scene_dir::Scene;
 use crate::format::{picture, write_json};
-use crate::gpu::Device;
+use crate::gpu;
 use crate::query::TextQuery;
 use crate::query::eval::{EvalReport, Evaluation, GroundTruth};
 use crate::query::protocol::{self, CodeScores, DecodedView, Masks, ProtocolKind};
@@ -75,7 +75,7 @@ fn field(scene: &Scene, args: &EvalArgs, out: Option<&WrittenFiles>) -> Result<E
     evaluation.add_world(&scene.world);
     let phrases: Vec<String> = evaluation.phrases().into_iter().map(|p| p.1).collect();
     let queries = ask(scene, &phrases, args)?;
-    let device = Device::open(args.device.device.as_deref())?;
+    let device = gpu::open(args.device.device.as_deref())?;
     let nothing = LanguageField::default();
     let field = scene.language.as_ref().unwrap_or(&nothing);
     score_field(
@@ -106,7 +106,7 @@ fn published(
     let mut protocol = protocol::open(kind, &args.ground_truth, &scene.cameras, &known)?;
     let queries = ask(scene, &protocol.prompts(), args)?;
     let scores = CodeScores::new(field, &queries)?;
-    let device = Device::open(args.device.device.as_deref())?;
+    let device = gpu::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
     let progress = progress::reporter();
     let views = protocol.views().to_vec();

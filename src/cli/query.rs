@@ -8,7 +8,7 @@ use super::scene;
 use super::views;
 use crate::format::ply::{self, PlyOptions};
 use crate::format::{picture, write_json};
-use crate::gpu::Device;
+use crate::gpu;
 use crate::query::QueryResult;
 use crate::query::instances::Instance;
 use crate::query::phrasing;
@@ -68,7 +68,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     }
     let registry = args.device.registry()?;
     let encoder = encoder::of_scene(&scene, registry)?;
-    let device = Device::open(args.device.device.as_deref())?;
+    let device = gpu::open(args.device.device.as_deref())?;
     let field = scene.language.take().ok_or_else(no_language)?;
     let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
     let options = Compat::answers(args.compat.as_deref(), &args.scene)?;

@@ -7,7 +7,7 @@ use super::scene;
 use super::views;
 use crate::format::npy::{self, NpyArray};
 use crate::format::picture::{self, Planes};
-use crate::gpu::Device;
+use crate::gpu;
 use crate::report::colour;
 use crate::run::view::{DecodedFrame, UnseenShare, Viewer};
 use crate::scene::{LEVEL_NAMES, LanguageField, Plane, RgbImage, to_linear};
@@ -35,7 +35,7 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     }
     let nothing = LanguageField::default();
     let field = if wants_language { scene.language.as_ref().unwrap_or(&nothing) } else { &nothing };
-    let device = Device::open(args.device.device.as_deref())?;
+    let device = gpu::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
     let mut unseen =
         wants_unseen.then(|| UnseenShare::new(&device, &scene.splats, &scene.seen)).transpose()?;

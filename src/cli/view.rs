@@ -6,7 +6,7 @@ use super::scene;
 use super::serve::{Answer, Place, Site, serve};
 use crate::format::scene_dir::Scene;
 use crate::format::scene_photos;
-use crate::gpu::Device;
+use crate::gpu;
 use crate::photo;
 use crate::query::QueryOptions;
 use crate::report::viewer::{self, CodeNames, SCENE_PATH, Scene3d};
@@ -74,7 +74,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
 fn questions(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
     let field = scene.language.clone().ok_or_else(|| Error::input("this scene has no language"))?;
     let encoder = encoder::of_scene(scene, args.device.registry()?)?;
-    let device = Device::open(args.device.device.as_deref())?;
+    let device = gpu::open(args.device.device.as_deref())?;
     let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
     ready.set_views(&scene.cameras)?;
     Ok(ready)

@@ -8,7 +8,7 @@ use super::options::{LanguageOptions, Start};
 use super::scale::SceneScale;
 use super::training::{self, Review, Trainer, Training};
 use super::views::Views;
-use crate::gpu::{Buffer, Device, Recorder};
+use crate::gpu::{self, Buffer, Device, Recorder};
 use crate::pass::channels::BASE_CHANNELS;
 use crate::pass::options::{FeatureMode, RasterOptions};
 use crate::pass::{codes, codes::Mode, regularise, sum};
@@ -189,7 +189,7 @@ impl<'a> Run<'a> {
             .stages
             .iter()
             .map(|s| device.buffer::<f32>("language loss", s.raster.frame().bands.pixels()))
-            .collect::<Result<_>>()?;
+            .collect::<gpu::Result<_>>()?;
         Ok(Run {
             trainer: Trainer::new(device, raster, model, views, cameras, options.seed),
             options,
@@ -245,7 +245,7 @@ impl<'a> Run<'a> {
 
     /// Replaces the raw features [N, levels·d].
     pub(crate) fn set_features(&self, features: &[f32]) -> Result<()> {
-        self.trainer.model.values.features.write(features)
+        Ok(self.trainer.model.values.features.write(features)?)
     }
 
     /// Splats and, per level, features [N, d] as rendered.

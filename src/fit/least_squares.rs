@@ -52,7 +52,7 @@ pub(super) fn solve(lifting: &mut Lifting, lifted: &Lifted) -> Result<()> {
         direction.par_iter_mut().zip(&z).for_each(|(d, z)| *d = z + turn * *d);
         energy = next;
     }
-    lifting.model.values.features.write(&unit_start(x, width))
+    Ok(lifting.model.values.features.write(&unit_start(x, width))?)
 }
 
 /// `(AᵀA + λW) v`, with A the blending of all labelled pixels. Photos give `AᵀA v − Aᵀc`, and Aᵀc is what was lifted.

@@ -2,7 +2,7 @@
 //! (docs/method.md#lifting).
 use super::model::Model;
 use super::views::Views;
-use crate::gpu::{Buffer, Device, Recorder};
+use crate::gpu::{self, Buffer, Device, Recorder};
 use crate::pass::bands::Band;
 use crate::pass::codes::{self, Mode, Targets};
 use crate::pass::options::{FeatureMode, RasterOptions};
@@ -55,7 +55,7 @@ impl CodeTargets {
             }
             let bands = &views.stage(view).raster.frame().bands;
             let band = |b| device.buffer_from("code labels", &bands.cut_inner(&b, &rows, -1));
-            labels.push(bands.iter().map(band).collect::<Result<_>>()?);
+            labels.push(bands.iter().map(band).collect::<gpu::Result<_>>()?);
             weights.push(device.buffer_from("code weights", &scale)?);
         }
         Ok(CodeTargets {

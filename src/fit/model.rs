@@ -1,6 +1,6 @@
 //! Splat parameters in GPU memory with their gradients and optimiser state, moved together when splats come and go.
 use super::options::Rates;
-use crate::gpu::{Buffer, Device, Recorder};
+use crate::gpu::{self, Buffer, Device, Recorder};
 use crate::pass::adam::{Class, Moments, Schedule};
 use crate::pass::compact;
 use crate::pass::rasterizer::SplatBuffers;
@@ -60,7 +60,7 @@ impl Model {
     pub(super) fn state(&self) -> Result<State> {
         let (splats, features) = self.values.download()?;
         let all = self.moments.iter().chain([&self.feature_moments]);
-        let moments = all.map(|m| m.buffer.read()).collect::<Result<_>>()?;
+        let moments = all.map(|m| m.buffer.read()).collect::<gpu::Result<_>>()?;
         Ok(State { splats, features, feature_dim: self.values.feature_dim, moments, step: self.step })
     }
 

@@ -230,7 +230,7 @@ mod tests {
     }
 
     fn device(staging: bool) -> TestDevice {
-        TestDevice::with(&Options { staging, deterministic: true, ..Options::from_env(None) }).unwrap()
+        TestDevice::open(&Options { staging, deterministic: true, ..crate::gpu::options(None) }).unwrap()
     }
 
     fn scene() -> (Splats, Vec<Camera>, Vec<RgbImage>) {

@@ -1,5 +1,5 @@
 //! The training views in GPU memory, in the bands that the device binds, and one rasteriser per image size.
-use crate::gpu::{Buffer, Device};
+use crate::gpu::{self, Buffer, Device};
 use crate::pass::bands::Band;
 use crate::pass::metrics::planar;
 use crate::pass::ssim_l1::SsimL1;
@@ -94,7 +94,7 @@ impl Views {
             let depth = match depth {
                 Some((map, count)) => {
                     let band = |b| device.buffer_from("stereo depth", &bands.cut_inner(&b, &map, 0.0));
-                    Some((bands.iter().map(band).collect::<Result<_>>()?, count))
+                    Some((bands.iter().map(band).collect::<gpu::Result<_>>()?, count))
                 }
                 None => None,
             };
@@ -110,12 +110,12 @@ impl Views {
                 _ => None,
             };
             let target = bands.iter().map(|b| device.buffer_from("photo", &bands.cut(&b, &photo)));
-            let target = target.collect::<Result<_>>()?;
+            let target = target.collect::<gpu::Result<_>>()?;
             let alpha = match coverage {
                 Some(c) if c.outside == Outside::Empty => {
                     let band =
                         |b| device.buffer_from("wanted alpha", &bands.cut_inner(&b, &c.share.data, -1.0));
-                    Some(bands.iter().map(band).collect::<Result<_>>()?)
+                    Some(bands.iter().map(band).collect::<gpu::Result<_>>()?)
                 }
                 _ => None,
             };

@@ -1,8 +1,6 @@
-//! What `splatvk doctor` says about Vulkan.
-use super::info::DeviceInfo;
-use super::{features, select};
-use crate::Error;
-use ash::vk;
+//! The lines of `splatvk doctor` about Vulkan.
+use super::options::options;
+use splatvk_gpu::{DeviceInfo, Error, INSTALL, Survey, Surveyed, survey};
 
 /// How a line of the report turned out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -16,7 +14,7 @@ pub enum Status {
     Missing,
 }
 
-/// One line: what was looked at, what was found, and what to do if that is not enough.
+/// One line: a topic, the finding, and advice if that is not enough.
 #[derive(Clone, Debug)]
 pub struct Line {
     /// E.g. `loader`, `device 0`, `float atomics`.
@@ -34,74 +32,43 @@ fn line(topic: &str, status: Status, found: impl Into<String>, advice: Option<&s
 }
 
 /// Looks at loader, devices and the features of the device that would be used (`choice` as in
-/// [`super::Device::open`]). Never fails: what is missing is a line.
+/// [`super::open`]). Never fails: a missing part is a line.
 pub fn vulkan(choice: Option<&str>) -> Vec<Line> {
-    let entry = match select::load() {
-        Ok(entry) => entry,
-        Err(e) => return vec![line("Vulkan loader", Status::Missing, e.to_string(), Some(select::INSTALL))],
+    let missing = |topic: &str, found: String| line(topic, Status::Missing, found, Some(INSTALL));
+    let Survey { loader: (major, minor, patch), devices, chosen } = match survey(&options(choice)) {
+        Ok(survey) => survey,
+        Err(e) => return vec![missing("Vulkan", e.to_string())],
     };
-    // SAFETY: a plain query.
-    let version =
-        unsafe { entry.try_enumerate_instance_version() }.ok().flatten().unwrap_or(vk::API_VERSION_1_0);
-    let (major, minor, patch) =
-        (vk::api_version_major(version), vk::api_version_minor(version), vk::api_version_patch(version));
     let mut lines = vec![line("Vulkan loader", Status::Ok, format!("Vulkan {major}.{minor}.{patch}"), None)];
-    let instance = match select::instance(&entry, None) {
-        Ok(instance) => instance,
-        Err(e) => {
-            lines.push(line("Vulkan instance", Status::Missing, e.to_string(), Some(select::INSTALL)));
-            return lines;
-        }
-    };
-    devices(&instance, choice, &mut lines);
-    // SAFETY: nothing made from the instance is left.
-    unsafe { instance.destroy_instance(None) };
-    lines
-}
-
-fn devices(instance: &ash::Instance, choice: Option<&str>, lines: &mut Vec<Line>) {
-    let all = match select::candidates(instance) {
-        Ok(all) => all,
-        Err(e) => {
-            lines.push(line("Vulkan device", Status::Missing, e.to_string(), Some(select::INSTALL)));
-            return;
-        }
-    };
-    for (index, candidate) in all.iter().enumerate() {
+    for (index, Surveyed { name, info }) in devices.into_iter().enumerate() {
         let topic = format!("Vulkan device {index}");
-        lines.push(match features::survey(instance, candidate) {
+        lines.push(match info {
             Ok(info) => {
                 let (major, minor, patch) = info.api_version;
                 let kind = if info.is_cpu { ", runs on the CPU" } else { "" };
-                let found = format!("{} (Vulkan {major}.{minor}.{patch}, {}{kind})", info.name, info.driver);
+                let found = format!("{name} (Vulkan {major}.{minor}.{patch}, {}{kind})", info.driver);
                 line(&topic, Status::Ok, found, None)
             }
             Err(reason) => {
-                let found = format!("{}: {reason}", candidate.name);
-                line(&topic, Status::Note, found, Some("update its driver, or use another device"))
+                let advice = "update its driver, or use another device";
+                line(&topic, Status::Note, format!("{name}: {reason}"), Some(advice))
             }
         });
     }
-    match select::choose(all, choice) {
-        Ok(candidate) => match features::survey(instance, &candidate) {
-            Ok(info) => chosen(&info, lines),
-            Err(reason) => lines.push(line("Vulkan device", Status::Missing, reason, Some(select::INSTALL))),
-        },
-        Err(Error::Input(e)) => {
-            lines.push(line(
-                "Vulkan device",
-                Status::Missing,
-                e,
-                Some("name one of these, or leave --device out"),
-            ));
+    match chosen {
+        Ok(info) => describe(&info, &mut lines),
+        Err(Error::Choice(e)) => {
+            let advice = "name one of these, or leave --device out";
+            lines.push(line("Vulkan device", Status::Missing, e, Some(advice)));
         }
-        Err(e) => lines.push(line("Vulkan device", Status::Missing, e.to_string(), Some(select::INSTALL))),
+        Err(e) => lines.push(missing("Vulkan device", e.to_string())),
     }
+    lines
 }
 
 /// Required and optional features and the limits that matter.
-fn chosen(info: &DeviceInfo, lines: &mut Vec<Line>) {
-    use super::Capability::*;
+fn describe(info: &DeviceInfo, lines: &mut Vec<Line>) {
+    use splatvk_gpu::Capability::*;
     if info.is_cpu {
         let advice = "a GPU with a Vulkan 1.2 driver is much faster; nothing else changes";
         lines.push(line(
@@ -132,8 +99,8 @@ fn chosen(info: &DeviceInfo, lines: &mut Vec<Line>) {
         let advice = "a compare-and-swap loop is used instead: same results, slower training";
         line("float atomics", Status::Note, "missing (optional)", Some(advice))
     });
-    if !info.without.is_empty() {
-        let names: Vec<&str> = info.without.iter().map(|w| w.name()).collect();
+    if !info.disabled.is_empty() {
+        let names: Vec<&str> = info.disabled.iter().map(String::as_str).collect();
         let advice = "doctor --check found wrong results; after an update of the driver it starts anew";
         lines.push(line("switched off", Status::Note, names.join(", "), Some(advice)));
     }

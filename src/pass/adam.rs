@@ -66,7 +66,7 @@ impl Schedule {
         for (row, rate) in self.rows.iter_mut().zip(rates) {
             *row = row_of(step, *rate);
         }
-        self.rates.write(self.rows.as_flattened())
+        Ok(self.rates.write(self.rows.as_flattened())?)
     }
 
     /// How many non-finite gradients the steps so far have met (and skipped).

@@ -3,7 +3,8 @@ use super::bands::Bands;
 use super::channels::{Block, blocks};
 use super::tile_lists::{TILE, TileLists};
 use crate::Result;
-use crate::gpu::{Buffer, Device, Way, shaders};
+use crate::gpu::{self, Buffer, Device, shaders};
+use crate::pass::KernelVariant;
 use crate::sync::lock;
 use std::ops::Range;
 
@@ -117,15 +118,15 @@ impl Summation {
     /// The faster way, unless the device was opened to be deterministic or gives wrong results by it.
     pub fn of(device: &Device) -> Summation {
         let info = device.info();
-        match info.way(Way::AtomicGradients) {
-            Way::AtomicGradients if !info.deterministic => Summation::Atomics,
+        match KernelVariant::AtomicGradients.or_replacement(info) {
+            KernelVariant::AtomicGradients if !info.deterministic => Summation::Atomics,
             _ => Summation::Entries,
         }
     }
 }
 
 impl GradientEntries {
-    pub fn buffers(&self, device: &Device, frame: &FrameBuffers) -> Result<EntryBuffers> {
+    pub fn buffers(&self, device: &Device, frame: &FrameBuffers) -> gpu::Result<EntryBuffers> {
         let mut made = lock(&self.0);
         let capacity = frame.lists.capacity;
         if let Some(buffers) = made.as_ref().filter(|b| b.capacity == capacity) {

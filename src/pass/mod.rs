@@ -30,6 +30,7 @@ pub mod ssim_l1;
 pub mod sum;
 pub mod tile_lists;
 pub mod twin;
+pub mod variants;
 pub mod view;
 
 pub use frame::{FrameBuffers, Summation};
@@ -38,6 +39,7 @@ pub use rasterizer::{DeviceChoices, Rasterizer};
 pub use renderer::{RenderedFrame, Renderer};
 pub use splat_buffers::SplatBuffers;
 pub use tile_lists::Grouping;
+pub use variants::KernelVariant;
 pub use view::View;
 
 #[cfg(test)]

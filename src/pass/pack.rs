@@ -90,7 +90,7 @@ pub fn texels(
     source: FrameChannel,
     encoding: Encoding,
 ) -> Result<Buffer<u32>> {
-    device.buffer::<u32>("texels", encoding.bytes(source.channels(), pixels) / 4)
+    Ok(device.buffer::<u32>("texels", encoding.bytes(source.channels(), pixels) / 4)?)
 }
 
 /// Packs what a band of a rendered frame answers for into the [`texels`] of the image. Twin: [`texels_of`].
@@ -128,7 +128,7 @@ pub fn pack(
         ),
         [inner.len() as u32, 1, 1],
     );
-    rec.run()
+    Ok(rec.run()?)
 }
 
 /// Twin of [`pack`]: bytes of the texels from `planes` [C, P] and `transmittance` [P].
@@ -214,8 +214,8 @@ mod tests {
 
     #[test]
     fn what_is_packed_band_by_band_makes_up_the_image() {
-        let options = Options { max_binding: Some(1 << 18), ..Options::from_env(None) };
-        let device = TestDevice::with(&options).unwrap();
+        let options = Options { max_binding: Some(1 << 18), ..crate::gpu::options(None) };
+        let device = TestDevice::open(&options).unwrap();
         let (width, height, dim) = (80u32, 150u32, 3usize);
         let pixels = (width * height) as usize;
         let raster = Rasterizer::new(&device, 1, dim, width, height).unwrap();

@@ -208,7 +208,7 @@ impl Matcher for GpuMatcher {
             let call = plane_sweep::call(&bindings, &push!(plane_sweep, r, first));
             rec.dispatch_threads(call, [r.width, r.height, 1]);
         });
-        rec.run()
+        Ok(rec.run()?)
     }
 
     fn refine(&mut self, r: &ReferenceView) -> Result<()> {
@@ -219,7 +219,7 @@ impl Matcher for GpuMatcher {
             let call = plane_sweep_refine::call(&bindings, &push!(plane_sweep_refine, r, first));
             rec.dispatch_threads(call, [r.width.div_ceil(2), r.height, 1]);
         });
-        rec.run()
+        Ok(rec.run()?)
     }
 
     fn planes(&self) -> Result<Vec<Vec4>> {

@@ -3,7 +3,7 @@
 //! ```no_run
 //! # use splatvk::{gpu::{Device, Recorder}, pass::rasterizer::*, pass::view::View, scene::{Camera, Splats}};
 //! # fn step(splats: &Splats, camera: &Camera) -> splatvk::Result<()> {
-//! let device = Device::open(None)?;
+//! let device = gpu::open(None)?;
 //! let params = SplatBuffers::upload(&device, splats, &[], 0)?;
 //! let grads = params.zeros_like(&device)?;
 //! let mut raster = Rasterizer::new(&device, params.count, params.feature_dim, camera.width, camera.height)?;
@@ -184,7 +184,7 @@ impl Rasterizer {
                 view.size[0], view.size[1], self.frame.width, self.frame.height
             )));
         }
-        self.camera.write(&[view.to_gpu()])
+        Ok(self.camera.write(&[view.to_gpu()])?)
     }
 
     /// Records projection, depth sort, binning and blending of an image that is one band.
@@ -389,7 +389,7 @@ impl Rasterizer {
         let splats = self.capacity.max(1);
         let capacity = wanted.min(most);
         self.frame.lists = TileLists::new(&self.device, self.grouping, splats, tiles, capacity)?;
-        self.frame.status.write(&[0; 3])
+        Ok(self.frame.status.write(&[0; 3])?)
     }
 
     /// The tile lists of the last forward pass, row by row of tiles, nearest splat first. For tests and statistics.

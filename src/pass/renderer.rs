@@ -82,7 +82,7 @@ impl Renderer {
 
     /// Replaces the raw features [N, d].
     pub fn set_features(&mut self, features: &[f32]) -> Result<()> {
-        self.splats.features.write(features)
+        Ok(self.splats.features.write(features)?)
     }
 
     /// d.

@@ -8,7 +8,8 @@
 //! device and any subgroup size.
 use super::adam::rows_of_groups;
 use crate::Result;
-use crate::gpu::{Buffer, Device, LOOP_ROUNDS, Recorder, Way, shaders};
+use crate::gpu::{Buffer, Device, LOOP_ROUNDS, Recorder, shaders};
+use crate::pass::KernelVariant;
 
 /// How the work is divided.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -23,8 +24,10 @@ impl Shape {
     /// The faster one for a kind of device, unless it gives wrong results there.
     pub fn of(device: &Device) -> Shape {
         let info = device.info();
-        match info.way(if info.is_cpu { Way::ChunkSort } else { Way::SweepSort }) {
-            Way::ChunkSort => Shape::Chunks,
+        match (if info.is_cpu { KernelVariant::ChunkSort } else { KernelVariant::SweepSort })
+            .or_replacement(info)
+        {
+            KernelVariant::ChunkSort => Shape::Chunks,
             _ => Shape::Sweep,
         }
     }

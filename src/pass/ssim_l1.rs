@@ -10,7 +10,8 @@ use super::bands::{Band, Bands};
 use super::sum;
 use crate::Result;
 use crate::gpu::shaders::shared::ssim::{self as shared, C1, C2};
-use crate::gpu::{Buffer, Device, Recorder, Way, shaders};
+use crate::gpu::{Buffer, Device, Recorder, shaders};
+use crate::pass::KernelVariant;
 use serde::{Deserialize, Serialize};
 
 /// Taps of the SSIM window.
@@ -151,8 +152,10 @@ impl Rows {
     /// The faster one for a kind of device, unless it gives wrong results there.
     pub fn of(device: &Device) -> Rows {
         let info = device.info();
-        match info.way(if info.is_cpu { Way::SsimStrips } else { Way::SsimShared }) {
-            Way::SsimStrips => Rows::Strips,
+        match (if info.is_cpu { KernelVariant::SsimStrips } else { KernelVariant::SsimShared })
+            .or_replacement(info)
+        {
+            KernelVariant::SsimStrips => Rows::Strips,
             _ => Rows::Shared,
         }
     }

@@ -2,7 +2,8 @@
 use super::scan::Scan;
 use super::sort::Sort;
 use crate::Result;
-use crate::gpu::{Buffer, Device, LOOP_ROUNDS, Way, shaders};
+use crate::gpu::{Buffer, Device, LOOP_ROUNDS, shaders};
+use crate::pass::KernelVariant;
 
 /// Tile edge, pixels. 8 evaluates 2.9 times the pairs it blends, 16 six times (measured on the seeded scene).
 pub const TILE: u32 = shaders::shared::layout::TILE as u32;
@@ -20,8 +21,10 @@ impl Grouping {
     /// What suits the device.
     pub fn of(device: &Device) -> Grouping {
         let info = device.info();
-        match info.way(if info.is_cpu { Way::CountedLists } else { Way::SortedLists }) {
-            Way::CountedLists => Grouping::Counting,
+        match (if info.is_cpu { KernelVariant::CountedLists } else { KernelVariant::SortedLists })
+            .or_replacement(info)
+        {
+            KernelVariant::CountedLists => Grouping::Counting,
             _ => Grouping::Sorting,
         }
     }

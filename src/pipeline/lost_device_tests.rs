@@ -20,7 +20,7 @@ use std::time::Duration;
 const STEPS: usize = 60;
 
 fn device() -> Device {
-    Device::with(&Options { deterministic: true, ..Options::from_env(None) }).unwrap()
+    Device::open(&Options { deterministic: true, ..crate::gpu::options(None) }).unwrap()
 }
 
 /// Three photos of a generated scene, and its exact cameras with a point for every fourth pixel.
@@ -112,7 +112,7 @@ fn a_lost_device_is_named_and_training_goes_on_elsewhere_with_the_same_bits() {
         let buffer = lost.buffer::<u32>("after", 4).unwrap();
         let mut after = Recorder::new(&lost, "after");
         after.fill(&buffer, 1);
-        assert!(matches!(after.run(), Err(Error::DeviceLost { .. })));
+        assert!(matches!(after.run(), Err(crate::gpu::Error::DeviceLost { .. })));
     }
     assert!(begun > 0 && begun < STEPS as u64, "lost in the middle: step {begun}");
     let (resumed, steps) = train(&device(), &kept());

@@ -59,7 +59,7 @@ struct Machine {
 
 impl Machine {
     fn new() -> Machine {
-        Machine { device: Device::open(None).unwrap(), registry: Registry::open(None).unwrap() }
+        Machine { device: crate::gpu::open(None).unwrap(), registry: Registry::open(None).unwrap() }
     }
 
     fn run(&self, graph: &Graph, targets: &[usize], store: &Store) -> Result<(Outputs, Vec<String>)> {

@@ -134,7 +134,7 @@ impl Questions {
 /// let scene = scene_dir::load("out/breakfast".as_ref())?;
 /// let field = scene.language.ok_or_else(|| splatvk::Error::input("no language"))?;
 /// let encoder = Box::new(RegionWords::load(Registry::open(None)?)?);
-/// let mut ready = QueryScene::open(&Device::open(None)?, (&scene.splats, &scene.cameras), field, encoder)?;
+/// let mut ready = QueryScene::open(&gpu::open(None)?, (&scene.splats, &scene.cameras), field, encoder)?;
 /// ready.set_views(&scene.cameras)?;
 /// let answers = ready.ask("lemon", &Default::default())?;
 /// println!("{}; {} of it", answers.verdict(), answers.instances.len());

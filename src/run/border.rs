@@ -90,7 +90,7 @@ mod tests {
 
     #[test]
     fn a_border_of_two_things_shows_no_third() {
-        let device = Device::open(None).unwrap();
+        let device = crate::gpu::open(None).unwrap();
         let (mut splats, camera) = seeded::small(600, 96, 72, 0, 1003);
         splats.opacity_logits.fill(1.0);
         // The third code lies between the others, and no splat carries it.

@@ -30,9 +30,9 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     let inputs: Vec<&Path> = plan.read().collect();
     let workspace = Workspace::create(&plan.out, plan.force, &inputs)?;
     // The device comes first: it says how large the photos may be.
-    let device = Device::with(&gpu::Options {
+    let device = Device::open(&gpu::Options {
         deterministic: plan.deterministic,
-        ..gpu::Options::from_env(plan.device.as_deref())
+        ..gpu::options(plan.device.as_deref())
     })?;
     let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let (photos, choice) = match &base {

@@ -1,7 +1,7 @@
 //! Lengths in a scene, and the scale that a known one gives it (docs/metres.md).
 use super::view::Viewer;
 use crate::format::scene_dir::Scene;
-use crate::gpu::Device;
+use crate::gpu;
 use crate::photo::stem;
 use crate::scene::{Camera, LanguageField, Scale};
 use crate::{Error, Result};
@@ -98,7 +98,7 @@ pub fn measure(scene: &Scene, lengths: &[Length], device: Option<&str>) -> Resul
     let places = || lengths.iter().flat_map(|l| &l.ends);
     let mut depths: Vec<(&str, crate::scene::Plane<f32>)> = Vec::new();
     if places().any(|p| matches!(p, Place::Pixel(..))) {
-        let device = Device::open(device)?;
+        let device = gpu::open(device)?;
         let mut viewer = Viewer::new(&device, &scene.splats, &LanguageField::default())?;
         for place in places() {
             let Place::Pixel(view, _) = place else { continue };

@@ -190,7 +190,7 @@ mod tests {
 
     /// Splats with edges to hold on to, and what a camera sees of them.
     fn scene() -> (Device, Splats, Camera, RgbImage) {
-        let device = Device::open(None).unwrap();
+        let device = crate::gpu::open(None).unwrap();
         let (splats, camera) = seeded::small(400, 96, 72, 1, 5);
         let mut photo = Renderer::new(&device, &splats, &[], 0).unwrap().render(&camera).unwrap().rgb;
         photo.data.iter_mut().flatten().for_each(|v| *v = v.clamp(0.0, 1.0));

@@ -109,7 +109,7 @@ mod tests {
 
     #[test]
     fn a_truth_of_another_focal_length_is_met_with_the_scene_s_own() {
-        let device = Device::open(None).unwrap();
+        let device = crate::gpu::open(None).unwrap();
         let (splats, camera) = seeded::small(400, 96, 72, 1, 5);
         let mut renderer = Renderer::new(&device, &splats, &[], 0).unwrap();
         let folder = tempfile::tempdir().unwrap();
@@ -148,7 +148,7 @@ mod tests {
 
     #[test]
     fn a_refined_camera_that_shows_the_photo_worse_than_the_given_one_is_not_taken() {
-        let device = Device::open(None).unwrap();
+        let device = crate::gpu::open(None).unwrap();
         let (splats, camera) = seeded::small(400, 96, 72, 1, 5);
         let mut viewer = Viewer::new(&device, &splats, &LanguageField::default()).unwrap();
         let refiner = ViewRefiner::new(&device, &splats).unwrap();

@@ -194,9 +194,9 @@ pub fn train(plan: &TrainPlan, progress: &dyn Progress) -> Result<TrainOutcome> 
     let workspace = Workspace::create(&plan.out, plan.force, &inputs)?;
     let known = cameras::read_file(&plan.cameras)?;
     let given = plan.points.as_deref().map(|path| points(path, progress)).transpose()?;
-    let device = Device::with(&gpu::Options {
+    let device = Device::open(&gpu::Options {
         deterministic: plan.deterministic,
-        ..gpu::Options::from_env(plan.device.as_deref())
+        ..gpu::options(plan.device.as_deref())
     })?;
     let max_size = plan.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let preset = plan.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default });

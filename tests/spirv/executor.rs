@@ -5,7 +5,7 @@ use super::faults::Faults;
 use super::lower::lower;
 use super::memory::Memory;
 use super::module::words_of;
-use splatvk::gpu::{Buffer, Executor, Groups, Module, Op, Options, TestDevice, Way};
+use splatvk::gpu::{Buffer, Executor, Groups, Module, NATIVE_FLOAT_ATOMICS, Op, Options, TestDevice};
 use std::collections::{BTreeSet, HashMap};
 use std::sync::{Arc, LazyLock, Mutex};
 
@@ -30,9 +30,13 @@ impl Interpreted {
     pub fn open(&self) -> TestDevice {
         let size = self.schedule.subgroup_size as u32;
         let options = Options {
-            without: if self.float_atomics { BTreeSet::new() } else { [Way::FloatAtomics].into() },
+            disabled: if self.float_atomics {
+                BTreeSet::new()
+            } else {
+                [NATIVE_FLOAT_ATOMICS.to_owned()].into()
+            },
             max_binding: self.max_binding,
-            ..Options::from_env(None)
+            ..splatvk::gpu::options(None)
         };
         TestDevice::executed_by(Box::new(self.clone()), size, &options).expect("a device")
     }

@@ -116,9 +116,8 @@ fn within(errors: &[f32], limit: f32) -> f32 {
 fn views_are_matched_in_groups_as_all_together() {
     let set = synthetic(96, 72);
     let run = |binding: u64| {
-        let options =
-            crate::gpu::Options { max_binding: Some(binding), ..crate::gpu::Options::from_env(None) };
-        let device = crate::gpu::TestDevice::with(&options).unwrap();
+        let options = crate::gpu::Options { max_binding: Some(binding), ..crate::gpu::options(None) };
+        let device = crate::gpu::TestDevice::open(&options).unwrap();
         let options = StereoOptions { sources: 1, binding, ..StereoOptions::default() };
         let levels = pyramid(&set.images, &set.cameras, &set.sparse, &options).unwrap();
         run_schedule(&levels, &options, &Silent, |level, start| {

@@ -1,0 +1,5 @@
+//! Compiles `shaders/*.comp`.
+
+fn main() {
+    splatvk_gpu_build::compile("shaders");
+}

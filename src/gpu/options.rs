@@ -1,0 +1,34 @@
+//! Options of a device from the environment.
+use super::folder::FolderCache;
+use splatvk_gpu::{Cache, Device, Options};
+use std::sync::Arc;
+
+/// Opens the preferred device, or the one whose index or part of whose name is `choice`, with
+/// [`options`].
+///
+/// # Errors
+/// Those of [`Device::open`].
+pub fn open(choice: Option<&str>) -> crate::Result<Device> {
+    Ok(Device::open(&options(choice))?)
+}
+
+/// Options from the environment. The device is `choice`, or else `SPLATVK_DEVICE`.
+/// `SPLATVK_VALIDATION=1` turns the validation layer on, `gpu` its GPU-assisted checks, too.
+/// `SPLATVK_STAGING=1` keeps buffers out of host-visible memory. `SPLATVK_MAX_BINDING` limits the
+/// size of a buffer, MiB. The cache is a folder of the program, where it has one.
+pub fn options(choice: Option<&str>) -> Options {
+    let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
+    let validation = variable("SPLATVK_VALIDATION");
+    let validation = validation.as_deref();
+    Options {
+        choice: choice.map(str::to_owned).or_else(|| variable("SPLATVK_DEVICE")),
+        validation: validation.is_some_and(|v| v == "1" || v == "gpu"),
+        gpu_assisted: validation.is_some_and(|v| v == "gpu"),
+        staging: variable("SPLATVK_STAGING").is_some_and(|v| v == "1"),
+        max_binding: variable("SPLATVK_MAX_BINDING")
+            .and_then(|v| v.parse::<u64>().ok())
+            .map(|mib| mib.saturating_mul(1 << 20)),
+        cache: FolderCache::own().map(|cache| Arc::new(cache) as Arc<dyn Cache>),
+        ..Options::default()
+    }
+}

@@ -1,0 +1,109 @@
+//! Kernel variants that compute the same. One replaces another that gave wrong results on a device.
+use crate::gpu::{DeviceInfo, NATIVE_FLOAT_ATOMICS};
+
+/// One of two or more implementations of a pass.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum KernelVariant {
+    /// Gradients added up by `atomicAdd` on float, where the device has it.
+    FloatAtomics,
+    /// Gradients of several tiles added up by atomics ([`crate::pass::Summation::Atomics`]), of which floats are emulated by a
+    /// compare-and-swap loop where there are none or they are switched off.
+    AtomicGradients,
+    /// Gradients stored per tile and summed in order ([`crate::pass::Summation::Entries`]).
+    StoredGradients,
+    /// Radix sort with a chunk per lane ([`crate::pass::sort::Shape::Chunks`]).
+    ChunkSort,
+    /// Radix sort in one sweep per digit ([`crate::pass::sort::Shape::Sweep`]).
+    SweepSort,
+    /// Tile lists by counters ([`crate::pass::Grouping::Counting`]).
+    CountedLists,
+    /// Tile lists by a sort ([`crate::pass::Grouping::Sorting`]).
+    SortedLists,
+    /// SSIM with a strip of a row per thread ([`crate::pass::ssim_l1::Rows::Strips`]).
+    SsimStrips,
+    /// SSIM with a span of a row per workgroup ([`crate::pass::ssim_l1::Rows::Shared`]).
+    SsimShared,
+}
+
+impl KernelVariant {
+    /// All of them.
+    pub const ALL: [KernelVariant; 9] = [
+        KernelVariant::FloatAtomics,
+        KernelVariant::AtomicGradients,
+        KernelVariant::StoredGradients,
+        KernelVariant::ChunkSort,
+        KernelVariant::SweepSort,
+        KernelVariant::CountedLists,
+        KernelVariant::SortedLists,
+        KernelVariant::SsimStrips,
+        KernelVariant::SsimShared,
+    ];
+
+    /// The name that `splatvk doctor` prints and [`crate::gpu::Options::disabled`] takes.
+    pub fn name(self) -> &'static str {
+        match self {
+            KernelVariant::FloatAtomics => NATIVE_FLOAT_ATOMICS,
+            KernelVariant::AtomicGradients => "gradients by atomics",
+            KernelVariant::StoredGradients => "gradients by stored entries",
+            KernelVariant::ChunkSort => "sort in chunks",
+            KernelVariant::SweepSort => "sort in one sweep",
+            KernelVariant::CountedLists => "tile lists by counters",
+            KernelVariant::SortedLists => "tile lists by sorting",
+            KernelVariant::SsimStrips => "rows in strips",
+            KernelVariant::SsimShared => "rows in shared memory",
+        }
+    }
+
+    /// The variant that takes its place where it is disabled.
+    pub fn replacement(self) -> KernelVariant {
+        match self {
+            KernelVariant::FloatAtomics => KernelVariant::AtomicGradients,
+            KernelVariant::AtomicGradients => KernelVariant::StoredGradients,
+            KernelVariant::StoredGradients => KernelVariant::AtomicGradients,
+            KernelVariant::ChunkSort => KernelVariant::SweepSort,
+            KernelVariant::SweepSort => KernelVariant::ChunkSort,
+            KernelVariant::CountedLists => KernelVariant::SortedLists,
+            KernelVariant::SortedLists => KernelVariant::CountedLists,
+            KernelVariant::SsimStrips => KernelVariant::SsimShared,
+            KernelVariant::SsimShared => KernelVariant::SsimStrips,
+        }
+    }
+
+    /// This variant, or its replacement where it alone is disabled.
+    pub fn or_replacement(self, info: &DeviceInfo) -> KernelVariant {
+        let other = self.replacement();
+        let disabled = |variant: KernelVariant| info.disabled.contains(variant.name());
+        if disabled(self) && !disabled(other) { other } else { self }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::{Options, TestDevice, options, test_device};
+    use crate::pass::sort::Shape;
+    use crate::pass::ssim_l1::Rows;
+    use crate::pass::{Grouping, Summation};
+
+    #[test]
+    fn disabled_variants_are_replaced() {
+        let usual = test_device();
+        let without = |disabled: &[KernelVariant]| {
+            let disabled = disabled.iter().map(|v| v.name().to_owned()).collect();
+            TestDevice::open(&Options { disabled, ..options(None) }).unwrap()
+        };
+        let most: Vec<_> =
+            KernelVariant::ALL.into_iter().filter(|v| *v != KernelVariant::SweepSort).collect();
+        let device = without(&most);
+        assert_eq!(Shape::of(&device), Shape::Sweep);
+        assert_eq!(Rows::of(&device), Rows::of(&usual));
+        assert!(!device.info().float_atomics);
+        // Both variants are wrong: nothing else is known, `doctor --check` says so.
+        assert_eq!(Summation::of(&device), Summation::of(&usual));
+        assert_eq!(Grouping::of(&device), Grouping::of(&usual));
+        let device = without(&[KernelVariant::AtomicGradients, KernelVariant::CountedLists]);
+        assert_eq!(Summation::of(&device), Summation::Entries);
+        assert_eq!(Grouping::of(&device), Grouping::Sorting);
+        assert_eq!(device.info().float_atomics, usual.info().float_atomics);
+    }
+}
