@@ -11,7 +11,7 @@
 //!
 //! ```
 //! # fn main() -> splatvk::Result<()> {
-//! use splatvk::gpu::Device;
+//! use splatvk::gpu;
 //! use splatvk::pass::Renderer;
 //! use splatvk::scene::{Camera, Pose, Splats};
 //!
@@ -59,32 +59,24 @@ pub mod bench;
 #[cfg(feature = "capi")]
 pub mod capi;
 pub mod check;
-pub mod checkpoint;
-pub mod error;
 #[cfg(feature = "cli")]
 pub mod fetch;
-mod files;
 pub mod fit;
-pub mod format;
 pub mod gpu;
 pub mod infer;
 pub mod language;
-pub mod math;
 pub mod pass;
-pub mod photo;
 pub mod pipeline;
 pub mod pose;
-pub mod preset;
-pub mod progress;
 pub mod query;
 pub mod report;
 pub mod run;
-pub mod scene;
-mod sync;
 pub mod synth;
 
 #[cfg(feature = "cli")]
 #[doc(hidden)]
 pub mod cli;
 
-pub use error::{Error, Result};
+pub use splatvk_io::{format, photo};
+pub use splatvk_types::{Error, Result, checkpoint, error, math, preset, progress, scene};
+pub(crate) use splatvk_types::{files, sync};

@@ -5,10 +5,11 @@ use glam::DVec3;
 use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions};
 use splatvk::gpu::{self, Device, Options, TestDevice, test_device};
 use splatvk::pass::Summation;
-use splatvk::pass::{RenderedFrame, Renderer, seeded};
+use splatvk::pass::{RenderedFrame, Renderer};
 use splatvk::progress::Silent;
 use splatvk::query::{QueryOptions, TextQuery, answer};
 use splatvk::run::view::Viewer;
+use splatvk::scene::seeded;
 use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, Plane, Pose, RgbImage, Splats};
 use support::{GpuGradients, Scene, in_bands};
 

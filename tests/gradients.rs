@@ -1,7 +1,8 @@
 //! Gradients of the whole render on the GPU against the f64 twin, which is itself checked by central differences.
 mod support;
 use splatvk::gpu::{self, NATIVE_FLOAT_ATOMICS, Options, Recorder, TestDevice, test_device};
-use splatvk::pass::{DeviceChoices, FeatureMode, Summation, seeded};
+use splatvk::pass::{DeviceChoices, FeatureMode, Summation};
+use splatvk::scene::seeded;
 use support::{GpuGradients, Scene, assert_class, assert_gradients};
 
 /// Added up by atomics and entry by entry; the latter gives the same bits every time.

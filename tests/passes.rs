@@ -2,13 +2,14 @@
 mod support;
 use glam::DVec3;
 use splatvk::gpu::{Recorder, test_device};
+use splatvk::math::Random;
 use splatvk::pass::channels::BASE_CHANNELS;
 use splatvk::pass::raster_backward;
 use splatvk::pass::raster_forward::{Cutoffs, TwinScene};
-use splatvk::pass::seeded::{self, Random};
 use splatvk::pass::{
     DeviceChoices, FeatureMode, Grouping, RasterOptions, Rasterizer, Renderer, SplatBuffers, View,
 };
+use splatvk::scene::seeded;
 use splatvk::scene::{Pose, Splats};
 use support::{IMAGE, Scene, assert_close, assert_images, assert_lists, rendered};
 
@@ -238,11 +239,11 @@ fn crowded_tile_matches_the_twin() {
     let mut random = Random::new(4);
     let mut splats = Splats::default();
     for _ in 0..20_000 {
-        let (x, y) = (random.normal(0.02) as f32, random.normal(0.02) as f32);
+        let (x, y) = (random.scaled_normal(0.02) as f32, random.scaled_normal(0.02) as f32);
         // α of about 0.005: the pixel is still open after hundreds of them.
-        append(&mut splats, splat([x, y, random.uniform(2.0, 6.0) as f32], 0.05, -5.2));
+        append(&mut splats, splat([x, y, random.between(2.0, 6.0) as f32], 0.05, -5.2));
         let at = splats.sh.len() - 3;
-        splats.sh[at] = random.normal(0.5) as f32;
+        splats.sh[at] = random.scaled_normal(0.5) as f32;
     }
     let scene = front_scene(splats, 8, 8);
     assert_images(&scene.render(&device), &scene.twin());

@@ -139,7 +139,7 @@ fn literals(value: &str) -> Vec<f64> {
 #[test]
 fn constants_of_shaders_stand_in_one_place() {
     let (mut rust, mut repeated) = (Vec::new(), Vec::new());
-    rust_constants(std::path::Path::new("src"), &mut rust);
+    ["src", "crates"].iter().for_each(|folder| rust_constants(std::path::Path::new(folder), &mut rust));
     assert!(rust.len() > 100 && shaders::CONSTANTS.len() > 20);
     for (file, name, values) in shaders::CONSTANTS {
         let same = |v: &[f64]| {

@@ -3,7 +3,7 @@ use super::measure::Budget;
 use super::model::Roofline;
 use super::report::Section;
 use crate::gpu::{Device, Recorder};
-use crate::pass::seeded::Random;
+use crate::math::Random;
 use crate::pass::sort::Sort;
 use crate::{Error, Result};
 

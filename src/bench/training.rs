@@ -8,8 +8,9 @@ use crate::fit::options::Rates;
 use crate::fit::scale::SceneScale;
 use crate::fit::{LanguageOptions, LanguageRun, Photos, Preset, RgbOptions, RgbRun, Start, Training};
 use crate::gpu::{Device, Recorder};
+use crate::pass::pairs;
 use crate::pass::renderer::Renderer;
-use crate::pass::{pairs, seeded};
+use crate::scene::seeded;
 use crate::scene::{Codebook, LevelField, Plane, RgbImage};
 
 /// Codes per level of the synthetic feature targets; a scene of four photos has about as many.

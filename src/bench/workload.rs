@@ -1,7 +1,8 @@
 //! What is measured: splats and a camera.
 use crate::format::{cameras, create_folder, picture, ply, scene_dir, write_json};
 use crate::gpu::Device;
-use crate::pass::{renderer::Renderer, seeded};
+use crate::pass::renderer::Renderer;
+use crate::scene::seeded;
 use crate::scene::{Camera, Pose, RgbImage, Splats};
 use crate::{Error, Result, files};
 use glam::{DMat3, DVec3};

@@ -104,6 +104,7 @@ fn status(e: &Error) -> SvkStatus {
         Error::Gpu { .. } => SvkStatus::Gpu,
         Error::Work(_) => SvkStatus::Work,
         Error::Cancelled => SvkStatus::Cancelled,
+        _ => SvkStatus::Internal,
     }
 }
 

@@ -1,16 +1,17 @@
 //! Rendering and its gradients.
 use super::compared::{Found, close, worst};
 use crate::gpu::{Device, Recorder};
+use crate::math::Random;
 use crate::pass::close::{IMAGE, Tolerance, gradient_tolerance};
 use crate::pass::params::Params;
 use crate::pass::raster_forward::Cutoffs;
-use crate::pass::seeded::{self, Random};
 use crate::pass::twin::{self, Forward};
 use crate::pass::{
     DeviceChoices, FeatureMode, Grouping, RasterOptions, Rasterizer, SplatBuffers, Summation, View,
     regularise,
 };
 use crate::scene::Splats;
+use crate::scene::seeded;
 use glam::DVec3;
 
 /// The image is no multiple of the tiles.
@@ -68,7 +69,7 @@ pub(super) fn backward(device: &Device, summation: Summation) -> Found {
         scene.rendered(device, DeviceChoices { summation, ..DeviceChoices::of(device) })?;
     let mut random = Random::new(12);
     let values = (5 + FEATURES) * (SIZE[0] * SIZE[1]) as usize;
-    let upstream: Vec<f32> = (0..values).map(|_| random.normal(1.0) as f32).collect();
+    let upstream: Vec<f32> = (0..values).map(|_| random.scaled_normal(1.0) as f32).collect();
     raster.frame().planes_grad.write(&upstream)?;
     let gradients = params.zeros_like(device)?;
     let mut rec = Recorder::new(device, "self-check of gradients");
@@ -103,10 +104,10 @@ pub(super) fn regularisers(device: &Device) -> Found {
     let pixels = frame.pixels() as usize;
     let mut random = Random::new(13);
     // A third of the pixels has no reference.
-    let depth: Vec<f32> = (0..pixels).map(|_| random.uniform(-1.0, 2.0).max(0.0) as f32).collect();
+    let depth: Vec<f32> = (0..pixels).map(|_| random.between(-1.0, 2.0).max(0.0) as f32).collect();
     let reference = device.buffer_from("reference depth", &depth)?;
     // A third of the pixels may have any alpha.
-    let wanted: Vec<f32> = (0..pixels).map(|_| random.uniform(-0.5, 1.0) as f32).collect();
+    let wanted: Vec<f32> = (0..pixels).map(|_| random.between(-0.5, 1.0) as f32).collect();
     let wanted_alpha = device.buffer_from("wanted alpha", &wanted)?;
     let gradients = params.zeros_like(device)?;
     let n = scene.splats.len();

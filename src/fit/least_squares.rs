@@ -75,8 +75,9 @@ mod tests {
     use super::PRIOR;
     use crate::fit::{LanguageOptions, LanguageRun, Photos, Preset, Start, Training};
     use crate::gpu::test_device;
-    use crate::pass::{FeatureMode, RasterOptions, Renderer, seeded};
+    use crate::pass::{FeatureMode, RasterOptions, Renderer};
     use crate::progress::Silent;
+    use crate::scene::seeded;
     use crate::scene::{Codebook, LevelField, Plane, Pose, RgbImage, Splats};
     use glam::{DMat3, DVec3};
 

@@ -212,7 +212,7 @@ mod tests {
         scale::SceneScale, schedule::Exponential,
     };
     use crate::gpu::{Device, Options, TestDevice};
-    use crate::pass::seeded;
+    use crate::scene::seeded;
     use crate::scene::{Camera, Codebook, LevelField, Plane, Pose, RgbImage, Splats};
     use glam::DVec3;
     use std::time::Duration;

@@ -1,7 +1,7 @@
 //! HED edge detection (Xie & Tu, ICCV 2015; BSDS500 weights).
 use super::registry::{PackFileKind, Registry};
 use super::runtime::{Input, Session};
-use crate::photo::Kernel;
+use crate::scene::resize::Kernel;
 use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
 

@@ -2,8 +2,9 @@
 use super::adapter::{Filter, Fit, ImageSpec};
 use super::graph::GraphFile;
 use super::runtime::Input;
-use crate::photo::{Kernel, Photo};
+use crate::photo::Photo;
 use crate::progress::Progress;
+use crate::scene::resize::Kernel;
 use crate::scene::{Affine, ModelView, RgbImage};
 use crate::{Error, Result};
 

@@ -23,7 +23,6 @@ pub mod rasterizer;
 pub mod regularise;
 pub mod renderer;
 pub mod scan;
-pub mod seeded;
 pub mod sort;
 pub mod splat_buffers;
 pub mod ssim_l1;

@@ -28,11 +28,12 @@ pub fn count(device: &Device, raster: &Rasterizer) -> Result<[f64; 2]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::pass::View;
     use crate::pass::params::Params;
     use crate::pass::raster_forward::{Cutoffs, TwinScene, walk};
     use crate::pass::twin;
     use crate::pass::{FeatureMode, RasterOptions, SplatBuffers};
-    use crate::pass::{View, seeded};
+    use crate::scene::seeded;
 
     #[test]
     fn counts_equal_the_twins() {

@@ -1,7 +1,7 @@
 //! The training-facing render: parameters and gradients in GPU buffers, forward and backward as recorded commands.
 //!
 //! ```no_run
-//! # use splatvk::{gpu::{Device, Recorder}, pass::rasterizer::*, pass::view::View, scene::{Camera, Splats}};
+//! # use splatvk::{gpu::{self, Recorder}, pass::rasterizer::*, pass::view::View, scene::{Camera, Splats}};
 //! # fn step(splats: &Splats, camera: &Camera) -> splatvk::Result<()> {
 //! let device = gpu::open(None)?;
 //! let params = SplatBuffers::upload(&device, splats, &[], 0)?;

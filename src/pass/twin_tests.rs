@@ -2,10 +2,11 @@
 use super::options::FeatureMode;
 use super::params::Params;
 use super::raster_forward::Cutoffs;
-use super::seeded::{self, Random};
 use super::twin::{backward, forward, forward_in_order};
 use super::view::View;
+use crate::math::Random;
 use crate::scene::Pose;
+use crate::scene::seeded;
 use glam::DVec3;
 
 /// Σ over all planes of plane · upstream, with alpha = 1 − T last.
@@ -26,7 +27,7 @@ fn scene(n: usize, sh_degree: u32, dim: usize, seed: u64) -> Scene {
     let params = Params::new(&splats, &seeded::features(n, dim, seed), dim);
     let view = View::new(&camera, 0.05).with_background([0.2, 0.4, 0.1]);
     let mut random = Random::new(seed + 1);
-    let upstream = (0..(5 + dim) * 20 * 14).map(|_| random.normal(1.0)).collect();
+    let upstream = (0..(5 + dim) * 20 * 14).map(|_| random.scaled_normal(1.0)).collect();
     Scene { params, view, upstream }
 }
 

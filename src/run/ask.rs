@@ -130,7 +130,7 @@ impl Questions {
 ///
 /// ```no_run
 /// # fn main() -> splatvk::Result<()> {
-/// # use splatvk::{format::scene_dir, gpu::Device, infer::{Registry, words::RegionWords}, run::ask::QueryScene};
+/// # use splatvk::{format::scene_dir, gpu, infer::{Registry, words::RegionWords}, run::ask::QueryScene};
 /// let scene = scene_dir::load("out/breakfast".as_ref())?;
 /// let field = scene.language.ok_or_else(|| splatvk::Error::input("no language"))?;
 /// let encoder = Box::new(RegionWords::load(Registry::open(None)?)?);

@@ -85,7 +85,7 @@ impl Border {
 mod tests {
     use super::super::view::Viewer;
     use super::*;
-    use crate::pass::seeded;
+    use crate::scene::seeded;
     use crate::scene::{Codebook, LanguageField};
 
     #[test]

@@ -26,7 +26,7 @@ use std::path::Path;
 ///
 /// ```no_run
 /// # fn main() -> splatvk::Result<()> {
-/// use splatvk::{gpu::Device, infer::Registry, photo, pose::choose, progress::Silent, run::{self, RunPlan, live::LiveScene}};
+/// use splatvk::{gpu, infer::Registry, photo, pose::choose, progress::Silent, run::{self, RunPlan, live::LiveScene}};
 /// let device = gpu::open(None)?;
 /// let (chosen, _) = choose::photos(&["my-photos".into()], Some(4), &Silent)?;
 /// let photos = photo::load_each(&chosen, photo::MAX_SIZE, &Silent)?;

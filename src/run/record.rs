@@ -402,8 +402,8 @@ fn shown(a: &Answers) -> QueryShown<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pass::seeded;
     use crate::scene::RgbImage;
+    use crate::scene::seeded;
 
     #[test]
     fn the_focal_length_is_told_per_camera() {

@@ -184,8 +184,8 @@ fn target(photo: &RgbImage, raster: &Rasterizer) -> Result<RgbImage> {
 mod tests {
     use super::*;
     use crate::pass::renderer::Renderer;
-    use crate::pass::seeded;
     use crate::progress::Silent;
+    use crate::scene::seeded;
     use glam::DVec3;
 
     /// Splats with edges to hold on to, and what a camera sees of them.

@@ -100,10 +100,11 @@ fn refined(
 mod tests {
     use super::*;
     use crate::format::picture::write_png;
-    use crate::pass::{Renderer, seeded};
+    use crate::pass::Renderer;
     use crate::progress::Silent;
     use crate::query::eval::GroundTruth;
     use crate::scene::Pose;
+    use crate::scene::seeded;
     use glam::DVec3;
     use serde_json::json;
 

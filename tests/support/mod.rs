@@ -6,11 +6,11 @@ use splatvk::pass::close::{Distance, Tolerance, compare};
 pub use splatvk::pass::close::{IMAGE, gradient_tolerance};
 use splatvk::pass::params::{Gradients, Params};
 use splatvk::pass::raster_forward::Cutoffs;
-use splatvk::pass::seeded;
 use splatvk::pass::twin::{self, Forward};
 use splatvk::pass::{
     DeviceChoices, FrameBuffers, Grouping, RasterOptions, Rasterizer, SplatBuffers, Summation, View, bin,
 };
+use splatvk::scene::seeded;
 use splatvk::scene::{Camera, Splats};
 
 /// A scene with everything a render needs.
@@ -82,8 +82,8 @@ impl Scene {
 
     /// Random upstream gradients for all planes, alpha last.
     pub fn upstream(&self, seed: u64) -> Vec<f32> {
-        let mut random = seeded::Random::new(seed ^ 0xB0);
-        (0..(5 + self.dim) * self.pixels()).map(|_| random.normal(1.0) as f32).collect()
+        let mut random = splatvk::math::Random::new(seed ^ 0xB0);
+        (0..(5 + self.dim) * self.pixels()).map(|_| random.scaled_normal(1.0) as f32).collect()
     }
 
     pub fn gradients(&self, device: &Device, upstream: &[f32]) -> GpuGradients {

@@ -3,8 +3,9 @@ use super::*;
 use crate::fit::pose::PoseOptions;
 use crate::fit::schedule::Exponential;
 use crate::gpu::test_device;
-use crate::pass::{Renderer, seeded};
+use crate::pass::Renderer;
 use crate::preset::Preset;
+use crate::scene::seeded;
 use crate::scene::{Plane, Pose};
 use glam::DVec3;
 

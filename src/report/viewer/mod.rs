@@ -187,8 +187,8 @@ fn section(manifest: &Value, data: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pass::seeded;
     use crate::scene::Scale;
+    use crate::scene::seeded;
 
     #[test]
     fn the_section_is_whole_and_its_data_cannot_break_out() {

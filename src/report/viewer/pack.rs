@@ -208,8 +208,8 @@ fn codes(level: &LevelField, order: &[usize]) -> Vec<u16> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pass::seeded;
     use crate::scene::Codebook;
+    use crate::scene::seeded;
     use std::io::Read;
 
     fn unpacked(packed: &Packed) -> Vec<u8> {

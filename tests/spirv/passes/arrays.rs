@@ -1,6 +1,6 @@
 //! Passes over plain arrays: scan, gather, sum, sort.
 use splatvk::gpu::{Device, Recorder, shaders};
-use splatvk::pass::seeded::Random;
+use splatvk::math::Random;
 use splatvk::pass::sort::{Shape, Sort, sort_pairs};
 use splatvk::pass::{compact, scan, sum};
 
@@ -40,7 +40,7 @@ pub fn gather(device: &Device) {
 pub fn sum(device: &Device) {
     for n in [1, 300, 20_000] {
         let mut random = Random::new(1004);
-        let values: Vec<f32> = (0..n).map(|_| random.uniform(0.0, 1.0) as f32).collect();
+        let values: Vec<f32> = (0..n).map(|_| random.between(0.0, 1.0) as f32).collect();
         let input = device.buffer_from("sum values", &values).unwrap();
         let partials = device.buffer::<f32>("sum partials", sum::PARTIALS).unwrap();
         let result = device.buffer::<f32>("sum result", 3).unwrap();

@@ -4,11 +4,12 @@ use crate::support::{
     rendered,
 };
 use splatvk::gpu::{Device, Recorder};
+use splatvk::math::Random;
 use splatvk::pass::pack::{Encoding, FrameChannel, texels, texels_of};
 use splatvk::pass::raster_forward::{Cutoffs, TwinScene, walk};
-use splatvk::pass::seeded::{self, Random};
 use splatvk::pass::{DeviceChoices, FeatureMode, Rasterizer, Summation};
 use splatvk::pass::{decode as decoding, pack as packing, pairs as counting};
+use splatvk::scene::seeded;
 
 /// Splats over 27 × 19 pixels: 4 × 3 tiles, those on two borders partial.
 fn scene(n: usize, sh_degree: u32, dim: usize, seed: u64) -> Scene {
@@ -143,7 +144,7 @@ pub fn pairs(device: &Device) {
 pub fn decode(device: &Device) {
     for (dim, count, pixels) in [(3, 9, 300), (8, 20, 257), (16, 12, 290), (20, 11, 512)] {
         let mut random = Random::new(1046);
-        let mut numbers = |n: usize| (0..n).map(|_| random.normal(1.0) as f32).collect::<Vec<f32>>();
+        let mut numbers = |n: usize| (0..n).map(|_| random.scaled_normal(1.0) as f32).collect::<Vec<f32>>();
         let mut table = numbers(count * dim);
         for row in table.chunks_exact_mut(dim) {
             let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();

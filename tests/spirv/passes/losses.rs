@@ -1,5 +1,6 @@
 //! Losses, regularisers and the optimiser.
 use splatvk::gpu::{Device, Recorder};
+use splatvk::math::Random;
 use splatvk::pass::Rasterizer;
 use splatvk::pass::adam::{self as optimiser, Class, Moments, Schedule};
 use splatvk::pass::bands::Bands;
@@ -7,17 +8,16 @@ use splatvk::pass::codes::{self as language, Mode, Targets};
 use splatvk::pass::regularise::{
     alpha_l1, depth_l1, ratio_penalty, record_alpha, record_depth, record_ratio,
 };
-use splatvk::pass::seeded::Random;
 use splatvk::pass::ssim_l1::{self as image_loss, Rows};
 
 fn normal(n: usize, seed: u64) -> Vec<f32> {
     let mut random = Random::new(seed);
-    (0..n).map(|_| random.normal(1.0) as f32).collect()
+    (0..n).map(|_| random.scaled_normal(1.0) as f32).collect()
 }
 
 fn uniform(n: usize, low: f64, seed: u64) -> Vec<f32> {
     let mut random = Random::new(seed);
-    (0..n).map(|_| random.uniform(low, low + 1.0) as f32).collect()
+    (0..n).map(|_| random.between(low, low + 1.0) as f32).collect()
 }
 
 fn wide(v: &[f32]) -> Vec<f64> {

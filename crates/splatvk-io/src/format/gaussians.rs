@@ -1,0 +1,237 @@
+//! Files of Gaussians: one reader and one writer for every format, chosen by the end of the file's name or by the format's.
+mod degree;
+pub mod gltf;
+mod other;
+pub mod ply;
+mod ply_comments;
+mod ply_header;
+pub mod ply_packed;
+mod ply_points;
+mod ply_table;
+pub mod splat;
+pub mod spz;
+mod spz_extensions;
+pub mod usable;
+
+use super::side_file;
+use crate::files::{Kind, Partial, check_place};
+use crate::scene::{LanguageField, Splats};
+use crate::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// A format of Gaussians.
+pub struct SplatFormat {
+    /// As `splatvk export --format` takes it.
+    pub name: &'static str,
+    /// What it is.
+    pub about: &'static str,
+    /// End of the files' names.
+    pub ending: &'static str,
+    /// Brightest base colour that it holds; `None` = any.
+    pub brightest: Option<f32>,
+    /// Its axes are right, up, back by definition; the others hold whatever axes a scene has.
+    pub y_up: bool,
+    /// Whether it states that Gaussians are antialiased ([`Splats::antialiased`]).
+    pub states_filter: bool,
+    /// Adds a line to the notes for what is not read.
+    read: fn(&Path, &mut Vec<String>) -> Result<Splats>,
+    /// Returns the order of the rows; empty = the scene's own.
+    write: fn(&Path, &Splats, WriteOptions) -> Result<Vec<u32>>,
+}
+
+/// What a format leaves open.
+#[derive(Clone, Copy, Debug)]
+pub struct WriteOptions {
+    /// Version of `.spz`, one of [`spz::VERSIONS`].
+    pub spz_version: u32,
+}
+
+impl Default for WriteOptions {
+    fn default() -> Self {
+        WriteOptions { spz_version: spz::DEFAULT_VERSION }
+    }
+}
+
+/// All formats; an ending comes before those that it ends with.
+pub static FORMATS: [SplatFormat; 6] = [
+    SplatFormat {
+        name: "compressed-ply",
+        about: "compressed .ply, as SuperSplat writes it",
+        ending: ".compressed.ply",
+        brightest: None,
+        y_up: false,
+        states_filter: true,
+        read: ply::read_noted,
+        write: |path, s, _| ply_packed::write_splats(path, s),
+    },
+    SplatFormat {
+        name: "ply",
+        about: "INRIA .ply",
+        ending: ".ply",
+        brightest: None,
+        y_up: false,
+        states_filter: true,
+        read: ply::read_noted,
+        write: |path, s, _| ply::write_splats(path, s, ply::PlyOptions::default()).map(|()| Vec::new()),
+    },
+    SplatFormat {
+        name: "splat",
+        about: ".splat",
+        ending: ".splat",
+        brightest: Some(splat::BRIGHTEST),
+        y_up: false,
+        states_filter: false,
+        read: splat::read_noted,
+        write: |path, s, _| splat::write_splats(path, s),
+    },
+    SplatFormat {
+        name: "spz",
+        about: ".spz of Niantic, as --spz-version says",
+        ending: ".spz",
+        brightest: Some(spz::BRIGHTEST),
+        y_up: true,
+        states_filter: true,
+        read: spz::read_noted,
+        write: |path, s, options| spz::write_splats(path, s, options.spz_version).map(|()| Vec::new()),
+    },
+    SplatFormat {
+        name: "glb",
+        about: "glTF with KHR_gaussian_splatting, binary",
+        ending: ".glb",
+        brightest: None,
+        y_up: true,
+        states_filter: false,
+        read: gltf::read_noted,
+        write: |path, s, _| gltf::write_glb(path, s).map(|()| Vec::new()),
+    },
+    SplatFormat {
+        name: "gltf",
+        about: "the same as text",
+        ending: ".gltf",
+        brightest: None,
+        y_up: true,
+        states_filter: false,
+        read: gltf::read_noted,
+        write: |path, s, _| gltf::write_gltf(path, s).map(|()| Vec::new()),
+    },
+];
+
+impl SplatFormat {
+    /// The one of a name.
+    pub fn named(name: &str) -> Option<&'static SplatFormat> {
+        FORMATS.iter().find(|f| f.name == name)
+    }
+}
+
+fn find(path: &Path) -> Option<&'static SplatFormat> {
+    let name = path.file_name()?.to_string_lossy().to_lowercase();
+    FORMATS.iter().find(|k| name.ends_with(k.ending))
+}
+
+/// Whether the name is one of a file of Gaussians.
+pub fn is_named(path: &Path) -> bool {
+    find(path).is_some()
+}
+
+/// The format that the name of a file says.
+pub fn format(path: &Path) -> Result<&'static SplatFormat> {
+    find(path).ok_or_else(|| {
+        let (place, endings) = (path.display(), endings());
+        let advice = other::named(path).unwrap_or("give a file in one of these formats");
+        Error::input(format!("{place}: splats are read from names that end in {endings}; {advice}"))
+    })
+}
+
+/// The endings of all formats, for messages.
+pub fn endings() -> String {
+    FORMATS.iter().map(|k| k.ending).collect::<Vec<_>>().join(", ")
+}
+
+/// Reads a file of Gaussians, and the language beside it, if any. Gaussians that cannot be computed with (numbers that are not
+/// finite or beyond 1e18, no rotation) are left out.
+pub fn read(path: &Path) -> Result<(Splats, Option<LanguageField>)> {
+    read_noted(path).map(|(splats, language, _)| (splats, language))
+}
+
+/// [`read`], and what was left out of the file or not applied, a line each.
+pub fn read_noted(path: &Path) -> Result<(Splats, Option<LanguageField>, Vec<String>)> {
+    let format = format(path)?;
+    if let Some(e) = other::misnamed(path, format.name, format.ending) {
+        return Err(e);
+    }
+    let mut notes = Vec::new();
+    let splats = (format.read)(path, &mut notes)?;
+    let language = side_file::read(path, splats.len())?;
+    let (splats, language) = usable::keep(splats, language, path, &mut notes)?;
+    notes.extend(usable::precision(&splats.means));
+    Ok((splats, language, usable::finished(notes, path)))
+}
+
+/// Writes a file of Gaussians, and beside it ([`side_file`]) their language, if they have any; ordinary files that are there are
+/// replaced.
+pub fn write(path: &Path, splats: &Splats, language: Option<&LanguageField>) -> Result<()> {
+    write_as(path, splats, language, format(path)?, WriteOptions::default())
+}
+
+/// [`write()`] in a format, whatever the file is called.
+pub fn write_as(
+    path: &Path,
+    splats: &Splats,
+    language: Option<&LanguageField>,
+    format: &SplatFormat,
+    options: WriteOptions,
+) -> Result<()> {
+    Reserved::open(path, true)?.write(splats, language, format, options)
+}
+
+/// The places of a file of Gaussians and of the language beside it, to which nobody else writes as long as this lives.
+#[derive(Debug)]
+pub struct Reserved {
+    path: PathBuf,
+    side: PathBuf,
+    force: bool,
+    splat_file: Partial,
+    language_file: Partial,
+}
+
+impl Reserved {
+    /// Refuses places that may not be written over.
+    pub fn open(path: &Path, force: bool) -> Result<Reserved> {
+        let side = side_file::path(path);
+        check_place(path, Kind::File, force)?;
+        check_place(&side, Kind::File, force)?;
+        let (splat_file, language_file) = (Partial::beside(path)?, Partial::beside(&side)?);
+        Ok(Reserved { path: path.to_path_buf(), side, force, splat_file, language_file })
+    }
+
+    /// Writes both files, or the one where there is no language.
+    pub fn write(
+        self,
+        splats: &Splats,
+        language: Option<&LanguageField>,
+        format: &SplatFormat,
+        options: WriteOptions,
+    ) -> Result<()> {
+        let with_codes = language.filter(|l| l.levels.iter().any(|l| !l.codebook.is_empty()));
+        // What a format cannot hold is said of the place that was asked for, not of the file beside it.
+        let order = (format.write)(self.splat_file.path(), splats, options).map_err(|e| match e {
+            Error::Input(what) => Error::input(format!("{}: {what}", self.path.display())),
+            other => other,
+        })?;
+        if let Some(field) = with_codes {
+            side_file::write(self.language_file.path(), field, splats.len(), &order)?;
+        }
+        // Both are written. What came there meanwhile is not ours.
+        check_place(&self.path, Kind::File, self.force)?;
+        check_place(&self.side, Kind::File, self.force)?;
+        // Wherever a kill comes between these moves, no file has the language of another one beside it.
+        if self.side.is_file() {
+            std::fs::remove_file(&self.side).map_err(Error::unwritable(&self.side))?;
+        }
+        let place = |file: Partial, place: &Path| {
+            file.finish(|from| std::fs::rename(from, place).map_err(Error::unwritable(place)))
+        };
+        place(self.splat_file, &self.path)?;
+        with_codes.map_or(Ok(()), |_| place(self.language_file, &self.side))
+    }
+}

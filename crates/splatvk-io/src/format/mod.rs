@@ -1,0 +1,23 @@
+//! File formats and the scene directory.
+mod camera_file;
+pub mod cameras;
+pub mod colmap;
+mod common;
+pub mod gaussians;
+mod lens_models;
+mod level_arrays;
+pub mod npy;
+pub mod picture;
+pub mod scene_dir;
+pub mod scene_files;
+pub mod scene_photos;
+pub mod side_file;
+pub mod transform;
+pub mod transforms;
+mod workspace;
+
+pub use camera_file::CameraFile;
+pub use common::logit;
+pub use common::{create_folder, to_byte, write_json, write_whole_file};
+pub use gaussians::{gltf, ply, ply_packed, splat, spz};
+pub use workspace::{Replaced, Workspace};

@@ -1,0 +1,269 @@
+//! The one error type. Every message is a single line that says what is wrong, where, and what to do next.
+mod system;
+
+pub use system::words;
+
+use std::path::{Path, PathBuf};
+use system::advice;
+
+/// The crate's result.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// What stands behind an error, where there is something.
+pub type Cause = Box<dyn std::error::Error + Send + Sync + 'static>;
+
+/// Everything that can go wrong, by what a program may do about it. The message alone says everything; [`source`] is there
+/// for what the system or the driver said. [`Error::exit_code`] maps it to the process exit code.
+///
+/// [`source`]: std::error::Error::source
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// What the user typed or supplied cannot be used: the message names it and says what to do.
+    #[error("{0}")]
+    Input(String),
+    /// A file could not be read, or not written for a reason that only its cause can tell.
+    #[error("{}: {}{}", path.display(), words(source), advice(source))]
+    Io {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
+    /// A place cannot take a file: the disk is full, or the folder or file system does not allow it. Nothing half-written
+    /// stays there; the same work succeeds once there is space, or in another place.
+    #[error("{}: cannot be written: {}{}", path.display(), words(source), elsewhere(source))]
+    Unwritable {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the operating system said; its [`kind`](std::io::Error::kind) tells a full disk from a missing permission.
+        source: std::io::Error,
+    },
+    /// The inference library, a program or another installable part is missing or cannot be used.
+    #[error("{0}")]
+    Missing(String),
+    /// A model, or a file of it, is missing, corrupt or not what it is used for.
+    #[error("{message}")]
+    MissingModel {
+        /// Its name in the model table, that of its folder, or the path of the file.
+        model: String,
+        /// What is wrong with it and how to get it.
+        message: String,
+    },
+    /// No Vulkan loader, driver or device that can be used.
+    #[error("{message}")]
+    NoDevice {
+        /// What is missing and how to get it.
+        message: String,
+        /// What the loader or the driver said, if it was asked.
+        source: Option<Cause>,
+    },
+    /// The Vulkan device was lost: reset by its driver, removed, or asleep. Everything on it is gone and nothing more can be
+    /// done with it; a new [`crate::gpu::Device`] may work.
+    #[error("Vulkan: {doing}: the device was lost ({source}); {}", after_loss(kept))]
+    DeviceLost {
+        /// What was being done.
+        doing: String,
+        /// The last thing that is on disk, from which the same run with `resume` goes on: "stage splats after step 120".
+        kept: Option<String>,
+        /// What the driver said.
+        source: Cause,
+    },
+    /// The Vulkan device or its driver has no memory left.
+    #[error(
+        "Vulkan: {doing}: {source}; use fewer splats, smaller photos or another device{}",
+        once_there_is_memory(kept)
+    )]
+    OutOfDeviceMemory {
+        /// What was being done, with its size where one is known.
+        doing: String,
+        /// As that of [`Error::DeviceLost`].
+        kept: Option<String>,
+        /// What the driver said.
+        source: Cause,
+    },
+    /// The Vulkan driver refused something else, or the device cannot do it.
+    #[error("Vulkan: {message}")]
+    Gpu {
+        /// What was refused and why.
+        message: String,
+        /// What the driver said, if it was asked.
+        source: Option<Cause>,
+    },
+    /// Something failed while working on valid input.
+    #[error("{0}")]
+    Work(String),
+    /// The user stopped the run.
+    #[error("stopped; nothing was written")]
+    Cancelled,
+}
+
+impl Error {
+    /// Shorthand for [`Error::Input`].
+    pub fn input(message: impl Into<String>) -> Self {
+        Error::Input(message.into())
+    }
+    /// Shorthand for [`Error::Work`].
+    pub fn work(message: impl Into<String>) -> Self {
+        Error::Work(message.into())
+    }
+    /// Shorthand for [`Error::Missing`].
+    pub fn missing(message: impl Into<String>) -> Self {
+        Error::Missing(message.into())
+    }
+    /// Shorthand for [`Error::MissingModel`].
+    pub fn missing_model(model: impl std::fmt::Display, message: impl Into<String>) -> Self {
+        Error::MissingModel { model: model.to_string(), message: message.into() }
+    }
+    /// Shorthand for [`Error::NoDevice`] without a cause.
+    pub fn no_device(message: impl Into<String>) -> Self {
+        Error::NoDevice { message: message.into(), source: None }
+    }
+    /// Shorthand for [`Error::Gpu`] without a cause.
+    pub fn gpu(message: impl Into<String>) -> Self {
+        Error::Gpu { message: message.into(), source: None }
+    }
+    /// Attaches the path to an I/O error: `.map_err(Error::io(path))`. What only writing can meet becomes
+    /// [`Error::Unwritable`].
+    pub fn io(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Error {
+        use std::io::ErrorKind as K;
+        let path = path.as_ref().to_path_buf();
+        move |source| match source.kind() {
+            K::StorageFull | K::QuotaExceeded | K::FileTooLarge | K::ReadOnlyFilesystem => {
+                Error::Unwritable { path, source }
+            }
+            _ => Error::Io { path, source },
+        }
+    }
+    /// Attaches the path to an I/O error of writing, whatever it was.
+    pub fn unwritable(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Error {
+        let path = path.as_ref().to_path_buf();
+        move |source| Error::Unwritable { path, source }
+    }
+    /// The same error, where `last` is on disk; what was named before is the later one.
+    pub fn keeping(mut self, last: Option<String>) -> Self {
+        if let Error::DeviceLost { kept, .. } | Error::OutOfDeviceMemory { kept, .. } = &mut self
+            && kept.is_none()
+        {
+            *kept = last;
+        }
+        self
+    }
+    /// 2 for bad usage, bad input, a missing part or a place that cannot be written (also a full disk); 1 for a failure
+    /// while working; 130 when stopped by the user.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Error::Input(_) | Error::Missing(_) | Error::MissingModel { .. } => 2,
+            Error::NoDevice { .. } | Error::Unwritable { .. } => 2,
+            Error::Io { source, .. } if !advice(source).is_empty() => 2,
+            Error::Io { .. } | Error::Gpu { .. } | Error::Work(_) => 1,
+            Error::DeviceLost { .. } | Error::OutOfDeviceMemory { .. } => 1,
+            Error::Cancelled => 130,
+        }
+    }
+}
+
+#[cfg(feature = "gpu")]
+impl From<splatvk_gpu::Error> for Error {
+    fn from(error: splatvk_gpu::Error) -> Self {
+        use splatvk_gpu::Error as Gpu;
+        match error {
+            Gpu::NoDevice { message, source } => Error::NoDevice { message, source },
+            Gpu::Choice(message) | Gpu::Host(message) => Error::Input(message),
+            Gpu::NoValidationLayer(message) => Error::Missing(message),
+            Gpu::DeviceLost { doing, source } => {
+                Error::DeviceLost { doing, kept: None, source: Box::new(source) }
+            }
+            Gpu::OutOfMemory { doing, source } => {
+                Error::OutOfDeviceMemory { doing, kept: None, source: Box::new(source) }
+            }
+            Gpu::Refused { message, source } => {
+                Error::Gpu { message, source: source.map(|s| Box::new(s) as Cause) }
+            }
+            other => Error::Gpu { message: other.to_string(), source: None },
+        }
+    }
+}
+
+/// What the user can do about a place that cannot be written.
+fn elsewhere(e: &std::io::Error) -> &'static str {
+    use std::io::ErrorKind as K;
+    match (e.kind(), advice(e)) {
+        // It was to be made.
+        (K::NotFound | K::NotADirectory | K::IsADirectory, _) | (_, "") => "; choose another folder",
+        (_, advice) => advice,
+    }
+}
+
+/// How to go on without the device.
+fn after_loss(kept: &Option<String>) -> String {
+    match kept {
+        Some(last) => format!("the same command with --resume goes on from {last}"),
+        None => {
+            "try again; if it happens again, update the driver or choose another device with --device".into()
+        }
+    }
+}
+
+/// How to go on once other programs have freed the device's memory.
+fn once_there_is_memory(kept: &Option<String>) -> String {
+    let resume = |last| format!("; once there is memory, the same command with --resume goes on from {last}");
+    kept.as_ref().map(resume).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::error::Error as _;
+    use std::io::{Error as IoError, ErrorKind};
+
+    #[test]
+    fn a_program_can_tell_what_to_react_to_and_see_the_cause() {
+        let lost = Error::DeviceLost { doing: "step 7".into(), kept: None, source: "lost".into() };
+        assert!(lost.source().is_some_and(|s| s.to_string() == "lost"));
+        assert!(!lost.to_string().contains("--resume"), "{lost}");
+        let lost = lost.keeping(Some("stage splats after step 6".into())).keeping(Some("cameras".into()));
+        let text = lost.to_string();
+        assert!(
+            text.contains("step 7") && text.ends_with("--resume goes on from stage splats after step 6"),
+            "{lost}"
+        );
+        let full = Error::OutOfDeviceMemory { doing: "buffer".into(), kept: None, source: "full".into() };
+        assert!(full.to_string().ends_with("or another device"), "{full}");
+        let full = full.keeping(Some("cameras".into()));
+        assert!(full.to_string().ends_with("--resume goes on from cameras"), "{full}");
+        let other = Error::gpu("fence");
+        assert_eq!([&lost, &full, &other].map(Error::exit_code), [1; 3]);
+
+        let disk = Error::io("a/b")(IoError::from(ErrorKind::StorageFull));
+        assert!(matches!(&disk, Error::Unwritable { path, .. } if path == Path::new("a/b")));
+        let cause = disk.source().and_then(|s| s.downcast_ref::<IoError>());
+        assert_eq!(cause.map(IoError::kind), Some(ErrorKind::StorageFull));
+        assert!(disk.exit_code() == 2 && disk.to_string().contains("free some space"), "{disk}");
+        let absent = Error::io("a/b")(IoError::from(ErrorKind::NotFound));
+        assert!(matches!(absent, Error::Io { .. }) && absent.exit_code() == 2);
+        // A file in the place of a folder, and the other way round, are the user's to mend.
+        for kind in [ErrorKind::NotADirectory, ErrorKind::IsADirectory] {
+            let e = Error::io("a/b")(IoError::from(kind));
+            assert!(e.exit_code() == 2 && e.to_string().ends_with("; check the name"), "{e}");
+        }
+        let none = Error::NoDevice { message: "no loader".into(), source: Some("libvulkan.so.1".into()) };
+        assert!(none.exit_code() == 2 && none.source().is_some_and(|s| s.to_string() == "libvulkan.so.1"));
+        assert_eq!(Error::missing_model("text", "model text: is missing").exit_code(), 2);
+    }
+
+    #[cfg(feature = "gpu")]
+    #[test]
+    fn errors_of_the_gpu_keep_their_kind_and_cause() {
+        use splatvk_gpu::VulkanError;
+        let of = |code| Error::from(splatvk_gpu::Error::vulkan("step 7", VulkanError::from_code(code)));
+        let lost = of(-4);
+        assert!(matches!(&lost, Error::DeviceLost { doing, kept: None, .. } if doing == "step 7"));
+        let cause = lost.source().and_then(|s| s.downcast_ref::<VulkanError>());
+        assert_eq!(cause, Some(&VulkanError::from_code(-4)));
+        assert!(matches!(of(-2), Error::OutOfDeviceMemory { .. }));
+        assert!(matches!(of(-3), Error::Gpu { source: Some(_), .. }));
+        let unknown = Error::from(splatvk_gpu::Error::Choice("no such device".into()));
+        assert_eq!(unknown.exit_code(), 2);
+    }
+}

@@ -1,0 +1,73 @@
+//! Decoders of other crates over bytes from outside. A file must not end the program, so that a panic of a decoder counts as damage
+//! of the file, and says nothing on stderr.
+use std::any::Any;
+use std::cell::Cell;
+use std::panic::{AssertUnwindSafe, catch_unwind, set_hook, take_hook};
+use std::sync::Once;
+
+thread_local! {
+    /// Whether this thread is inside of [`guarded`].
+    static QUIET: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Sets [`QUIET`] and puts it back, also while a panic unwinds.
+struct Quiet(bool);
+
+impl Quiet {
+    fn begin() -> Quiet {
+        Quiet(QUIET.replace(true))
+    }
+}
+
+impl Drop for Quiet {
+    fn drop(&mut self) {
+        QUIET.set(self.0);
+    }
+}
+
+/// Longest text of a panic in a message, characters.
+const LONGEST: usize = 120;
+
+/// Runs a decoder on this thread; `Err` holds the text of its panic, one line. What it leaves half-done must not be used again.
+pub fn guarded<T>(decode: impl FnOnce() -> T) -> Result<T, String> {
+    static HOOK: Once = Once::new();
+    HOOK.call_once(|| {
+        let before = take_hook();
+        // A thread that ends has no flag any more.
+        set_hook(Box::new(move |panic| match QUIET.try_with(Cell::get) {
+            Ok(true) => {}
+            _ => before(panic),
+        }));
+    });
+    let quiet = Quiet::begin();
+    let outcome = catch_unwind(AssertUnwindSafe(decode));
+    drop(quiet);
+    outcome.map_err(|panic| one_line(panic_text(panic.as_ref())))
+}
+
+/// What a panic says.
+pub fn panic_text(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")
+}
+
+fn one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ").chars().take(LONGEST).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn panic_of_decoder_becomes_line() {
+        assert_eq!(guarded(|| 7), Ok(7));
+        let nested = guarded(|| {
+            let inner = guarded(|| -> u8 { panic!("slice of {}\n bytes", 4) });
+            assert!(QUIET.get(), "the outer call is still guarded");
+            inner
+        });
+        assert_eq!(nested, Ok(Err("slice of 4 bytes".to_owned())));
+        assert!(!QUIET.get());
+    }
+}

@@ -1,0 +1,283 @@
+//! What is being written, in a hidden folder that its owner has marked and locked: it goes when the work fails, when the process is
+//! stopped, and, where the process was killed, with the next one that writes to the place.
+use super::owner::{self, Found, Held, NEW};
+use crate::sync::lock;
+use crate::{Error, Result};
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard};
+
+/// What this process has begun: the hidden folder, and the folders that were made for it, deepest first.
+static UNFINISHED: Mutex<Vec<(PathBuf, Vec<PathBuf>)>> = Mutex::new(Vec::new());
+/// Whether this process has finished anything that a user asked for.
+static FINISHED: AtomicBool = AtomicBool::new(false);
+
+/// How the names of hidden folders end. A place has one such name, so that one process at a time writes to it.
+pub const HIDDEN: &str = ".partial-splatvk";
+/// Longest name, in bytes, that is part of that of its hidden folder: file systems take 255.
+const LONGEST_NAME: usize = 200;
+
+fn unfinished() -> MutexGuard<'static, Vec<(PathBuf, Vec<PathBuf>)>> {
+    // A panic while holding the lock leaves a list that is still right.
+    lock(&UNFINISHED)
+}
+
+/// A file or folder that is being written. Dropped without [`Partial::finish`], it vanishes, and with it the folders that were made
+/// for it. While it lives, no other process and no other thread writes to its place.
+#[derive(Debug)]
+pub struct Partial {
+    path: PathBuf,
+    /// `None` once it is taken apart.
+    held: Option<Held>,
+}
+
+impl Partial {
+    /// For one file or folder: beside `place`, whose folders are made where they are missing. A place that another process writes
+    /// to is bad input.
+    pub fn beside(place: &Path) -> Result<Partial> {
+        let mut partial = Partial::reserve(parent(place), &hidden_beside(place), place)?;
+        // Under its own name, of which writers take the ending.
+        std::fs::create_dir(&partial.path).map_err(Error::unwritable(place))?;
+        partial.path.push(place.file_name().unwrap_or_default());
+        Ok(partial)
+    }
+
+    /// For several files: inside of `folder`, which is made where it is missing.
+    pub fn inside(folder: &Path) -> Result<Partial> {
+        Partial::reserve(folder, &folder.join(HIDDEN), folder)
+    }
+
+    fn reserve(parent: &Path, hidden: &Path, place: &Path) -> Result<Partial> {
+        // An exit waits for it: between the two it would leave the folders.
+        let mut list = unfinished();
+        let made = make(parent).map_err(Error::unwritable(place))?;
+        match Held::take(hidden, place, false) {
+            Ok(held) => {
+                list.push((hidden.to_path_buf(), made));
+                Ok(Partial { path: hidden.join(NEW), held: Some(held) })
+            }
+            Err(e) => {
+                remove_empty(&made);
+                Err(e)
+            }
+        }
+    }
+
+    /// Where to write: nothing is there, in a folder that is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Where what is replaced may lie for the moment between two moves.
+    pub fn aside(&self) -> PathBuf {
+        self.held.as_ref().map(Held::aside).unwrap_or_default()
+    }
+
+    /// Moves what was written to its place, by `rename`; what is at [`Partial::path`] and [`Partial::aside`] after that, goes. An exit
+    /// waits for the move.
+    pub fn finish<E>(self, rename: impl FnOnce(&Path) -> Result<(), E>) -> Result<(), E> {
+        self.keep(|path| {
+            rename(path)?;
+            FINISHED.store(true, Ordering::SeqCst);
+            Ok(())
+        })
+    }
+
+    /// [`Partial::finish`] of what no user has asked for.
+    pub fn keep<E>(mut self, rename: impl FnOnce(&Path) -> Result<(), E>) -> Result<(), E> {
+        let list = unfinished();
+        rename(&self.path)?;
+        drop(list);
+        self.take_apart();
+        Ok(())
+    }
+
+    fn take_apart(&mut self) {
+        let Some(held) = self.held.take() else { return };
+        let hidden = held.folder().to_path_buf();
+        let at = |list: &[(PathBuf, Vec<PathBuf>)]| list.iter().position(|(path, _)| *path == hidden);
+        if at(&unfinished()).is_none() {
+            // Removed on the way to an exit.
+            return;
+        }
+        // The error on the way out is the one to report, and a result that is at its place is whole; the next process sweeps the rest.
+        let _ = held.clear();
+        let mut list = unfinished();
+        if let Some(at) = at(&list) {
+            remove_empty(&list.swap_remove(at).1);
+        }
+    }
+}
+
+impl Drop for Partial {
+    fn drop(&mut self) {
+        self.take_apart();
+    }
+}
+
+/// The folder that a place is in.
+fn parent(place: &Path) -> &Path {
+    match place.parent() {
+        Some(p) if !p.as_os_str().is_empty() => p,
+        _ => Path::new("."),
+    }
+}
+
+/// The hidden folder of a file or folder that is written as a whole.
+fn hidden_beside(place: &Path) -> PathBuf {
+    let mut own = OsString::from(".");
+    match place.file_name().unwrap_or_default() {
+        name if name.len() <= LONGEST_NAME => own.push(name),
+        name => own.push(&super::sha256(name.as_encoded_bytes())[..32]),
+    }
+    own.push(HIDDEN);
+    parent(place).join(own)
+}
+
+/// Makes the folders of a path that are missing; those that were made, deepest first. A `..` behind a missing one leads nowhere.
+fn make(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
+    let missing = folder.ancestors().take_while(|p| !p.as_os_str().is_empty() && !p.exists());
+    let missing: Vec<PathBuf> = missing.map(Path::to_path_buf).collect();
+    if missing.iter().any(|p| p.ends_with("..")) {
+        return Err(std::io::ErrorKind::NotFound.into());
+    }
+    std::fs::create_dir_all(folder).inspect_err(|_| remove_empty(&missing))?;
+    Ok(missing)
+}
+
+/// A folder that others wrote into stays, as it is not empty.
+fn remove_empty(folders: &[PathBuf]) {
+    for folder in folders {
+        let _ = std::fs::remove_dir(folder);
+    }
+}
+
+/// Refuses a place, to be written as a whole, that another process writes to.
+pub fn check_free(place: &Path) -> Result<()> {
+    check_hidden(place, &hidden_beside(place))
+}
+
+/// Refuses a folder into which another process writes.
+pub fn check_free_inside(folder: &Path) -> Result<()> {
+    check_hidden(folder, &folder.join(HIDDEN))
+}
+
+fn check_hidden(place: &Path, hidden: &Path) -> Result<()> {
+    match owner::look(hidden) {
+        Found::Busy(owner) => Err(owner::busy(place, hidden, owner.as_ref())),
+        _ => Ok(()),
+    }
+}
+
+/// Brings back what a process that was killed between two moves had moved aside from `place`.
+pub fn restore(place: &Path) {
+    if let Found::Left(held) = owner::look(&hidden_beside(place)) {
+        held.put_back();
+    }
+}
+
+/// Removes everything unfinished of this process, for exits that run no destructors; whether nothing that a user asked for had been
+/// finished before.
+pub fn remove_unfinished() -> bool {
+    for (hidden, made) in unfinished().drain(..) {
+        let _ = owner::clear(&hidden);
+        remove_empty(&made);
+    }
+    nothing_finished()
+}
+
+/// Whether this process has finished nothing that a user asked for.
+fn nothing_finished() -> bool {
+    !FINISHED.load(Ordering::SeqCst)
+}
+
+/// Whether a path has the name of a hidden folder, its owner's mark, and no owner any more.
+pub fn is_leftover(path: &Path) -> bool {
+    let named = path.file_name().is_some_and(|n| n.as_encoded_bytes().ends_with(HIDDEN.as_bytes()));
+    named && matches!(owner::look(path), Found::Left(_) | Found::Blank(_))
+}
+
+/// What processes that are gone have left in a folder.
+pub fn leftovers(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut found: Vec<PathBuf> = entries.map(|e| e.path()).filter(|p| is_leftover(p)).collect();
+    found.sort();
+    found
+}
+
+/// Removes one of [`leftovers`], unless somebody has begun to work in it; what was moved aside goes back to its place.
+pub fn remove_leftover(path: &Path) -> std::io::Result<()> {
+    owner::remove(path, owner::look(path))
+}
+
+/// Removes [`leftovers`] in a folder, and what was left beside it of a whole one in its place.
+pub fn sweep(folder: &Path) {
+    for path in leftovers(folder).into_iter().chain([hidden_beside(folder)]) {
+        // Another process may have swept it, or it is another user's.
+        let _ = remove_leftover(&path);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unfinished_work_goes_with_the_folders_made_for_it() {
+        let base = tempfile::tempdir().unwrap();
+        let place = base.path().join("a/b/c.ply");
+        let partial = Partial::beside(&place).unwrap();
+        std::fs::write(partial.path(), "half").unwrap();
+        drop(partial);
+        assert!(!base.path().join("a").exists());
+        let partial = Partial::beside(&place).unwrap();
+        std::fs::write(partial.path(), "whole").unwrap();
+        partial.finish(|path| std::fs::rename(path, &place)).unwrap();
+        assert_eq!(std::fs::read_to_string(&place).unwrap(), "whole");
+        assert_eq!(std::fs::read_dir(base.path().join("a/b")).unwrap().count(), 1);
+        assert!(!nothing_finished(), "a command that is stopped from now on says that something is kept");
+        let partial = Partial::beside(&base.path().join("x/y")).unwrap();
+        std::fs::create_dir(partial.path()).unwrap();
+        std::fs::write(base.path().join("x/letter"), "another's").unwrap();
+        drop(partial);
+        assert_eq!(std::fs::read_dir(base.path().join("x")).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn second_writer_of_one_place_is_refused() {
+        let base = tempfile::tempdir().unwrap();
+        let place = base.path().join("a.ply");
+        let first = Partial::beside(&place).unwrap();
+        let said = Partial::beside(&place).unwrap_err();
+        let me = format!("process {}", std::process::id());
+        assert!(said.exit_code() == 2 && said.to_string().contains(&me), "{said}");
+        assert!(check_free(&place).is_err() && check_free(&base.path().join("b.ply")).is_ok());
+        // The other is as it was.
+        std::fs::write(first.path(), "one").unwrap();
+        first.finish(|path| std::fs::rename(path, &place)).unwrap();
+        drop(Partial::beside(&place).unwrap());
+        let inside = Partial::inside(base.path()).unwrap();
+        assert!(Partial::inside(base.path()).is_err() && check_free_inside(base.path()).is_err());
+        drop(inside);
+        assert_eq!(std::fs::read_dir(base.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn dot_dot_behind_missing_folder_makes_nothing() {
+        let base = tempfile::tempdir().unwrap();
+        let e = Partial::beside(&base.path().join("a/../b.ply")).unwrap_err();
+        assert_eq!(e.exit_code(), 2, "{e}");
+        assert_eq!(std::fs::read_dir(base.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn longest_names_are_written() {
+        let base = tempfile::tempdir().unwrap();
+        let place = base.path().join("n".repeat(255));
+        let partial = Partial::beside(&place).unwrap();
+        std::fs::write(partial.path(), "x").unwrap();
+        partial.finish(|path| std::fs::rename(path, &place)).unwrap();
+        assert!(place.is_file());
+    }
+}
