@@ -1,10 +1,5 @@
 //! Runs the programs of the engine on the interpreter: a device of any subgroup size.
-use super::code::{Code, GARBAGE};
-use super::dispatch::{self, Schedule};
-use super::faults::Faults;
-use super::lower::lower;
-use super::memory::Memory;
-use super::module::words_of;
+use spirv_interpreter::{GARBAGE, Memory, Schedule, Shader, words};
 use splatvk::gpu::{Buffer, Executor, Groups, Module, NATIVE_FLOAT_ATOMICS, Op, Options, TestDevice};
 use std::collections::{BTreeSet, HashMap};
 use std::sync::{Arc, LazyLock, Mutex};
@@ -41,15 +36,15 @@ impl Interpreted {
         TestDevice::executed_by(Box::new(self.clone()), size, &options).expect("a device")
     }
 
-    fn code(&self, module: &Module) -> Arc<Code> {
-        static LOWERED: LazyLock<Mutex<HashMap<&str, Arc<Code>>>> = LazyLock::new(Mutex::default);
+    fn code(&self, module: &Module) -> Arc<Shader> {
+        static LOWERED: LazyLock<Mutex<HashMap<&str, Arc<Shader>>>> = LazyLock::new(Mutex::default);
         if let Some(words) = self.change.as_ref().and_then(|change| change(module)) {
-            return Arc::new(lower(&words));
+            return Arc::new(Shader::new(&words));
         }
         if let Some(code) = LOWERED.lock().unwrap().get(module.name) {
             return code.clone();
         }
-        let code = Arc::new(lower(&words_of(module.spirv)));
+        let code = Arc::new(Shader::new(&words(module.spirv)));
         LOWERED.lock().unwrap().insert(module.name, code.clone());
         code
     }
@@ -67,7 +62,7 @@ impl Buffers<'_> {
     fn memory(&mut self, buffer: &Buffer) -> &mut Memory {
         let entry = self.held.entry(buffer.id()).or_insert_with(|| {
             let bytes = buffer.cast::<u8>().read().expect("a mapped buffer");
-            let mut words = words_of(&bytes);
+            let mut words = spirv_interpreter::words(&bytes);
             let own = words.len();
             words.resize(own.next_multiple_of(4).max(4), GARBAGE);
             let mut memory = Memory::of(words);
@@ -147,9 +142,8 @@ impl Interpreted {
             first.entry(buffer.id()).or_insert(*binding);
             bindings[*binding as usize] = Some(memory);
         }
-        let mut faults = Faults::default();
         let schedule = Schedule { seed: self.schedule.seed ^ number << 8, ..self.schedule };
-        let outcome = dispatch::run(&code, &mut bindings, &words_of(push), groups, &schedule, &mut faults);
+        let outcome = code.dispatch(&mut bindings, &words(push), groups, &schedule);
         for (binding, buffer) in &used {
             if first.get(&buffer.id()) == Some(binding)
                 && let Some(memory) = bindings[*binding as usize].take()
@@ -157,6 +151,6 @@ impl Interpreted {
                 *buffers.memory(buffer) = memory;
             }
         }
-        outcome.and_then(|()| faults.report()).map_err(|e| format!("{}: {e}", module.name))
+        outcome.map_err(|e| format!("{}: {e}", module.name))
     }
 }

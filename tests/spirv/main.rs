@@ -1,26 +1,15 @@
-//! The shipped SPIR-V, interpreted: every pass against its CPU twin at subgroup sizes that no device at hand has, with
-//! what no driver reports. See docs/trust.md#shaders-without-a-device.
+//! The shipped SPIR-V in the interpreter: every pass against its CPU twin at subgroup sizes that no
+//! device at hand has, with faults that no driver reports. See docs/trust.md#shaders-without-a-device.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
-mod alu;
-mod code;
-mod dispatch;
 mod executor;
-mod faults;
-mod lower;
-mod lower_alu;
-mod memory;
-mod module;
 mod mutations;
 mod operations;
 mod passes;
-mod subgroup;
 #[path = "../support/mod.rs"]
 mod support;
-mod together;
-mod types;
 
-use dispatch::{Order, Schedule};
 use executor::Interpreted;
+use spirv_interpreter::{Order, Schedule};
 use splatvk::gpu::shaders;
 use std::collections::BTreeSet;
 use std::sync::Arc;

@@ -1,10 +1,10 @@
 //! Whether faults are found: modules that are shipped, with one thing broken.
-use crate::dispatch::Order;
 use crate::executor::{Change, Interpreted};
-use crate::module::{Instruction, assemble, instructions, words_of};
 use crate::passes::{self, Scene};
 use crate::{interpreted, outcome};
 use spirv::Op;
+use spirv_interpreter::module::{Instruction, assemble, instructions};
+use spirv_interpreter::{Order, words as words_of};
 use splatvk::gpu::{Module, shaders};
 use std::sync::Arc;
 

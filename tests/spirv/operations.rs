@@ -1,11 +1,11 @@
 //! Whether the comparisons with the CPU twins notice a wrong operation: modules that are shipped, with one operation in the place of
 //! another, as a slip of the hand would have it.
-use crate::dispatch::Random;
 use crate::executor::{Change, Interpreted};
-use crate::module::{Instruction, assemble, instructions, words_of};
 use crate::passes::{self, Scene};
 use crate::{interpreted, outcome};
 use spirv::Op;
+use spirv_interpreter::module::{Instruction, assemble, instructions};
+use spirv_interpreter::{Random, words as words_of};
 use splatvk::gpu::{Module, shaders};
 use std::sync::Arc;
 

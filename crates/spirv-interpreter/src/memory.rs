@@ -1,19 +1,19 @@
-//! Memory that knows who touched which word: words that nobody wrote, and data races.
+//! Memory that records the accesses of each word, to find unwritten reads and data races.
 //!
-//! Two accesses race if at least one writes, not both are atomic, they are of different invocations, and no barrier lies
-//! between them. Barriers order the invocations of a workgroup only, and only the memory that they name; nothing orders
-//! two workgroups of one dispatch.
-use super::code::{Atomic, GARBAGE};
+//! Two accesses race if at least one writes, not both are atomic, they are of different invocations,
+//! and no barrier lies between them. Barriers order the invocations of a workgroup only, and only the
+//! memory that they name. Nothing orders two workgroups of one dispatch.
+use crate::code::{Atomic, GARBAGE};
 
-/// Who accesses: number within the dispatch, from 1, and how many barriers it has behind it.
+/// An invocation: its number within the dispatch, from 1, and the barriers that it has passed.
 #[derive(Clone, Copy)]
-pub struct Who {
+pub(crate) struct Who {
     pub invocation: u32,
     pub epoch: u32,
 }
 
-/// Accesses of one kind to one word, summed up such that the question whether any of them is not ordered before another
-/// access has an exact answer.
+/// A summary of the accesses of one kind to one word. It decides exactly whether any of them is
+/// unordered with a later access.
 #[derive(Clone, Copy, Default)]
 struct Seen {
     /// The latest; invocation 0 = none.
@@ -33,17 +33,18 @@ struct Shadow {
     atomic: Seen,
 }
 
-/// What is wrong with an access.
+/// A fault of an access.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Fault {
+pub(crate) enum AccessFault {
     Unwritten,
     Race,
 }
 
 const PAGE: usize = 256;
 
-/// Words with their history.
+/// The words of a buffer, with their history in the current dispatch.
 pub struct Memory {
+    /// The content.
     pub words: Vec<u32>,
     /// Which words hold something; `None` where all do.
     written: Option<Vec<bool>>,
@@ -52,27 +53,27 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// Words that all hold something.
+    /// Memory in which all words count as written.
     pub fn of(words: Vec<u32>) -> Memory {
         let pages = words.len().div_ceil(PAGE);
         Memory { words, written: None, shadow: vec![None; pages], group_size: 1 }
     }
 
-    /// Words that hold nothing.
+    /// Memory in which no word counts as written.
     pub fn empty(words: usize) -> Memory {
         let mut memory = Memory::of(vec![GARBAGE; words]);
         memory.forget(0);
         memory
     }
 
-    /// From a word on, what is there counts as written by nobody.
+    /// Marks the words from one on as unwritten.
     pub fn forget(&mut self, from: usize) {
         let count = self.words.len();
         self.words[from..].fill(GARBAGE);
         self.written.get_or_insert_with(|| vec![true; count])[from..].fill(false);
     }
 
-    /// Writes from outside a dispatch.
+    /// Writes words from outside of a dispatch.
     pub fn set(&mut self, first: usize, words: &[u32]) {
         self.words[first..first + words.len()].copy_from_slice(words);
         if let Some(written) = &mut self.written {
@@ -80,8 +81,8 @@ impl Memory {
         }
     }
 
-    /// Another dispatch, which waits for all that was before.
-    pub fn start(&mut self, group_size: u32) {
+    /// Begins a dispatch, ordered after all earlier ones.
+    pub(crate) fn start(&mut self, group_size: u32) {
         self.group_size = group_size;
         self.shadow.fill(None);
     }
@@ -91,17 +92,17 @@ impl Memory {
         &mut page[word % PAGE]
     }
 
-    pub fn load(&mut self, word: usize, who: Who) -> (u32, Option<Fault>) {
+    pub(crate) fn load(&mut self, word: usize, who: Who) -> (u32, Option<AccessFault>) {
         let size = self.group_size;
         let shadow = self.shadow(word);
         let race = shadow.written.unordered(who, size) || shadow.atomic.unordered(who, size);
         shadow.read.note(who, size);
         let unwritten = self.written.as_ref().is_some_and(|w| !w[word]);
-        let fault = if race { Some(Fault::Race) } else { unwritten.then_some(Fault::Unwritten) };
+        let fault = if race { Some(AccessFault::Race) } else { unwritten.then_some(AccessFault::Unwritten) };
         (self.words[word], fault)
     }
 
-    pub fn store(&mut self, word: usize, value: u32, who: Who) -> Option<Fault> {
+    pub(crate) fn store(&mut self, word: usize, value: u32, who: Who) -> Option<AccessFault> {
         let size = self.group_size;
         let shadow = self.shadow(word);
         let race = [shadow.read, shadow.written, shadow.atomic].iter().any(|s| s.unordered(who, size));
@@ -110,16 +111,16 @@ impl Memory {
         if let Some(written) = &mut self.written {
             written[word] = true;
         }
-        race.then_some(Fault::Race)
+        race.then_some(AccessFault::Race)
     }
 
-    pub fn atomic(
+    pub(crate) fn atomic(
         &mut self,
         op: Atomic,
         word: usize,
         (value, expected): (u32, u32),
         who: Who,
-    ) -> (u32, Option<Fault>) {
+    ) -> (u32, Option<AccessFault>) {
         let size = self.group_size;
         let shadow = self.shadow(word);
         let race =
@@ -132,7 +133,7 @@ impl Memory {
         }
         let before = self.words[word];
         self.words[word] = changed(op, before, value, expected);
-        let fault = if race { Some(Fault::Race) } else { unwritten.then_some(Fault::Unwritten) };
+        let fault = if race { Some(AccessFault::Race) } else { unwritten.then_some(AccessFault::Unwritten) };
         (before, fault)
     }
 }

@@ -1,7 +1,7 @@
 //! Arithmetic to scalar operations; taking composites apart costs nothing.
-use super::code::{Binary, GARBAGE, Inst, Reg, Unary};
-use super::lower::Lowering;
-use super::module::Instruction;
+use crate::code::{Binary, GARBAGE, Inst, Reg, Unary};
+use crate::lower::Lowering;
+use crate::module::Instruction;
 use spirv::{GlslStd450Op as GLOp, Op};
 
 impl Lowering {

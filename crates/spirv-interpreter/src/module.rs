@@ -1,17 +1,23 @@
-//! The declarations of a module, and its instructions as a list.
-use super::types::{Type, Types};
+//! A module as a list of instructions, to be changed and put together again.
+use crate::types::{Type, Types};
 use spirv::{Decoration, ExecutionMode, Op, StorageClass};
 use std::collections::HashMap;
 
-/// One instruction: opcode, operands, and the word where it stands.
-#[derive(Clone)]
+/// One instruction.
+#[derive(Clone, Debug)]
 pub struct Instruction {
+    /// Its opcode.
     pub op: Op,
+    /// Its operands.
     pub words: Vec<u32>,
+    /// The word of the module at which it begins.
     pub at: u32,
 }
 
-/// A module as a list of instructions, without its header.
+/// The instructions of a module, without its header.
+///
+/// # Panics
+/// If an opcode is unknown.
 pub fn instructions(words: &[u32]) -> Vec<Instruction> {
     let (mut out, mut at) = (Vec::new(), 5);
     while at < words.len() {
@@ -23,7 +29,7 @@ pub fn instructions(words: &[u32]) -> Vec<Instruction> {
     out
 }
 
-/// The words of a module of these instructions.
+/// The words of a module: the header of another one, and these instructions.
 pub fn assemble(header: &[u32], list: &[Instruction]) -> Vec<u32> {
     let mut out = header[..5].to_vec();
     for i in list {
@@ -33,11 +39,7 @@ pub fn assemble(header: &[u32], list: &[Instruction]) -> Vec<u32> {
     out
 }
 
-pub fn words_of(bytes: &[u8]) -> Vec<u32> {
-    bytes.chunks_exact(4).map(|c| u32::from_le_bytes([c[0], c[1], c[2], c[3]])).collect()
-}
-
-pub struct Variable {
+pub(crate) struct Variable {
     pub id: u32,
     pub class: StorageClass,
     /// The type that it points to.
@@ -46,13 +48,13 @@ pub struct Variable {
 }
 
 /// A constant: its type and its words, with parts flattened; `None` = undefined.
-pub struct Constant {
+pub(crate) struct Constant {
     pub ty: u32,
     pub words: Option<Vec<u32>>,
 }
 
 #[derive(Default)]
-pub struct Module {
+pub(crate) struct Module {
     pub types: Types,
     pub constants: HashMap<u32, Constant>,
     pub variables: Vec<Variable>,

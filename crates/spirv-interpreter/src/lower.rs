@@ -1,9 +1,9 @@
 //! The body of a module to [`Code`]: blocks, memory, atomics, what subgroups do. Arithmetic is in `lower_alu.rs`.
-use super::code::{
+use crate::code::{
     Atomic, Block, Code, Edge, End, GARBAGE, Inst, Place, Reduction, Reg, Root, Step, Subgroup,
 };
-use super::module::{Instruction, Module};
-use super::types::Type;
+use crate::module::{Instruction, Module};
+use crate::types::Type;
 use spirv::{BuiltIn, GroupOperation, Op, StorageClass};
 use std::collections::{HashMap, HashSet};
 

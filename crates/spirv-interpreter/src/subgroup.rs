@@ -1,9 +1,9 @@
 //! The invocations of a subgroup in lockstep. Those that went different ways meet again where the construct merges: the
 //! block that stands first in the structured order runs first, with all invocations that are there.
-use super::alu;
-use super::code::{Code, Edge, End, GARBAGE, Inst, Place, Reg, Root, Step};
-use super::faults::{Faults, Kind};
-use super::memory::{Memory, Who};
+use crate::alu;
+use crate::code::{Code, Edge, End, GARBAGE, Inst, Place, Reg, Root, Step};
+use crate::faults::{Fault, Faults};
+use crate::memory::{Memory, Who};
 use spirv::BuiltIn;
 
 /// Marks the word of a pointer that leads out of its array; the rest is the index.
@@ -49,14 +49,14 @@ pub struct Subgroup {
     pub number: u32,
     pub subgroups: u32,
     /// Lanes that a subgroup of this device has; the last one of a workgroup may be short.
-    pub(super) size: usize,
-    pub(super) regs: Vec<u32>,
+    pub(crate) size: usize,
+    pub(crate) regs: Vec<u32>,
     private: Vec<u32>,
     written: Vec<bool>,
     block: Vec<u32>,
     /// Instruction of the current block, after a barrier.
     pc: usize,
-    pub(super) active: Vec<usize>,
+    pub(crate) active: Vec<usize>,
     blocks: u64,
     moved: Vec<u32>,
 }
@@ -202,7 +202,7 @@ impl Subgroup {
                         Some(&reg) => self.get(reg, lane),
                         None => {
                             d.faults
-                                .note(at, Kind::Outside, || format!("component {index} of {}", from.len()));
+                                .note(at, Fault::Outside, || format!("component {index} of {}", from.len()));
                             GARBAGE
                         }
                     };
@@ -218,11 +218,11 @@ impl Subgroup {
         }
     }
 
-    pub(super) fn get(&self, reg: Reg, lane: usize) -> u32 {
+    pub(crate) fn get(&self, reg: Reg, lane: usize) -> u32 {
         self.regs[reg as usize * self.size + lane]
     }
 
-    pub(super) fn set(&mut self, reg: Reg, lane: usize, value: u32) {
+    pub(crate) fn set(&mut self, reg: Reg, lane: usize, value: u32) {
         self.regs[reg as usize * self.size + lane] = value;
     }
 
@@ -265,7 +265,7 @@ impl Subgroup {
         if word & OUTSIDE == 0 {
             return Some(word);
         }
-        faults.note(at, Kind::Outside, || format!("{:?}, index {}", place.root, word as i32 & i32::MAX));
+        faults.note(at, Fault::Outside, || format!("{:?}, index {}", place.root, word as i32 & i32::MAX));
         None
     }
 
@@ -284,19 +284,19 @@ impl Subgroup {
                     Root::Input(built_in) => (self.input(built_in, word, lane, group, d), None),
                     Root::Private(base) => {
                         let slot = (base as usize + word) * self.size + lane;
-                        let fault = (!self.written[slot]).then_some(Kind::Unwritten);
+                        let fault = (!self.written[slot]).then_some(Fault::Unwritten);
                         (self.private[slot], fault)
                     }
                     Root::Shared(base) => {
                         let (value, fault) = group.shared.load(base as usize + word, who);
-                        (value, fault.map(Kind::from))
+                        (value, fault.map(Fault::from))
                     }
                     Root::Buffer(binding) => match buffer(d.buffers, binding, word) {
                         Some(memory) => {
                             let (value, fault) = memory.load(word, who);
-                            (value, fault.map(Kind::from))
+                            (value, fault.map(Fault::from))
                         }
-                        None => (GARBAGE, Some(Kind::Outside)),
+                        None => (GARBAGE, Some(Fault::Outside)),
                     },
                 };
                 if let Some(kind) = fault {
@@ -329,13 +329,13 @@ impl Subgroup {
                         None
                     }
                     Root::Shared(base) => {
-                        group.shared.store(base as usize + word, value, who).map(Kind::from)
+                        group.shared.store(base as usize + word, value, who).map(Fault::from)
                     }
                     Root::Buffer(binding) => match buffer(d.buffers, binding, word) {
-                        Some(memory) => memory.store(word, value, who).map(Kind::from),
-                        None => Some(Kind::Outside),
+                        Some(memory) => memory.store(word, value, who).map(Fault::from),
+                        None => Some(Fault::Outside),
                     },
-                    Root::Push | Root::Input(_) => Some(Kind::Outside),
+                    Root::Push | Root::Input(_) => Some(Fault::Outside),
                 };
                 if let Some(kind) = fault {
                     d.faults.note(at, kind, || describe("store", place.root, word, who));
@@ -357,16 +357,16 @@ impl Subgroup {
             let (before, fault) = match place.root {
                 Root::Shared(base) => {
                     let (before, fault) = group.shared.atomic(*op, base as usize + word, operands, who);
-                    (before, fault.map(Kind::from))
+                    (before, fault.map(Fault::from))
                 }
                 Root::Buffer(binding) => match buffer(d.buffers, binding, word) {
                     Some(memory) => {
                         let (before, fault) = memory.atomic(*op, word, operands, who);
-                        (before, fault.map(Kind::from))
+                        (before, fault.map(Fault::from))
                     }
-                    None => (GARBAGE, Some(Kind::Outside)),
+                    None => (GARBAGE, Some(Fault::Outside)),
                 },
-                _ => (GARBAGE, Some(Kind::Outside)),
+                _ => (GARBAGE, Some(Fault::Outside)),
             };
             if let Some(kind) = fault {
                 d.faults.note(at, kind, || describe("atomic", place.root, word, who));

@@ -1,5 +1,5 @@
 //! What scalar operations compute. Results that the specification leaves undefined are [`GARBAGE`].
-use super::code::{Binary, GARBAGE, Unary};
+use crate::code::{Binary, GARBAGE, Unary};
 
 fn f(word: u32) -> f32 {
     f32::from_bits(word)

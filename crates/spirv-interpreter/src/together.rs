@@ -1,7 +1,7 @@
 //! What the invocations of a subgroup compute together.
-use super::code::{GARBAGE, Reduction, Reg, Subgroup as Op};
-use super::faults::{Faults, Kind};
-use super::subgroup::Subgroup;
+use crate::code::{GARBAGE, Reduction, Reg, Subgroup as Op};
+use crate::faults::{Fault, Faults};
+use crate::subgroup::Subgroup;
 
 fn reduced(op: Reduction, a: u32, b: u32) -> u32 {
     match op {
@@ -14,10 +14,11 @@ fn reduced(op: Reduction, a: u32, b: u32) -> u32 {
 impl Subgroup {
     /// Demands that all invocations take part: where some have gone another way, Vulkan does not say that the others
     /// have met again.
-    pub(super) fn together(&mut self, op: Op, to: Reg, (a, b): (Reg, Reg), at: u32, faults: &mut Faults) {
+    pub(crate) fn together(&mut self, op: Op, to: Reg, (a, b): (Reg, Reg), at: u32, faults: &mut Faults) {
         let lanes = self.locals.len();
         if self.active.len() != lanes {
-            faults.note(at, Kind::NonUniform, || format!("{op:?} by {} of {lanes} lanes", self.active.len()));
+            faults
+                .note(at, Fault::NonUniform, || format!("{op:?} by {} of {lanes} lanes", self.active.len()));
         }
         let mut here = vec![false; self.size];
         self.active.iter().for_each(|&l| here[l] = true);
@@ -42,8 +43,9 @@ impl Subgroup {
                     let value = match here.get(from) {
                         Some(true) => values[from],
                         _ => {
-                            faults
-                                .note(at, Kind::AbsentLane, || format!("{op:?} from lane {from} of {lanes}"));
+                            faults.note(at, Fault::AbsentLane, || {
+                                format!("{op:?} from lane {from} of {lanes}")
+                            });
                             GARBAGE
                         }
                     };

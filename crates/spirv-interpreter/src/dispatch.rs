@@ -1,34 +1,41 @@
-//! The workgroups of a dispatch: some at a time, in any order, each a slice of its blocks now and then.
-use super::code::Code;
-use super::faults::Faults;
-use super::memory::Memory;
-use super::subgroup::{Dispatch, Group, Stop, Subgroup};
+//! Scheduling of a dispatch: some workgroups at a time, in any order, each for a slice of its blocks.
+use crate::code::Code;
+use crate::faults::Faults;
+use crate::memory::Memory;
+use crate::subgroup::{Dispatch, Group, Stop, Subgroup};
 use spirv::MemorySemantics;
 
-/// In which order workgroups begin.
+/// The order in which workgroups begin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Order {
+    /// At random.
     Random,
+    /// By number.
     Rising,
+    /// By number, the last first.
     Falling,
 }
 
-/// How a device might run a dispatch.
+/// A way in which a device might run a dispatch.
 #[derive(Clone, Copy, Debug)]
 pub struct Schedule {
+    /// Invocations per subgroup.
     pub subgroup_size: usize,
+    /// The order in which workgroups begin.
     pub order: Order,
     /// Workgroups that have begun and not ended, at most.
     pub in_flight: usize,
     /// Invocations are dealt to subgroups at random, which Vulkan allows.
     pub scattered: bool,
+    /// Seed of all random choices.
     pub seed: u64,
 }
 
+/// A random generator (SplitMix64) with its state.
 pub struct Random(pub u64);
 
 impl Random {
-    /// Below `n`; splitmix64.
+    /// A number below `n`.
     pub fn below(&mut self, n: usize) -> usize {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut z = self.0;
@@ -53,7 +60,7 @@ struct Running {
 }
 
 /// Runs all workgroups; `Err` if something cannot go on.
-pub fn run(
+pub(crate) fn run(
     code: &Code,
     buffers: &mut [Option<Memory>],
     push: &[u32],

@@ -1,0 +1,100 @@
+//! Interprets SPIR-V compute shaders, for tests.
+//!
+//! A device has one subgroup size and one scheduler. This interpreter takes any subgroup size and any
+//! order of workgroups, and reports faults that no driver reports:
+//!
+//! - **data races**, between invocations and between workgroups, by the memory model of Vulkan;
+//! - **reads of unwritten words**, in buffers that start empty, in workgroup and private memory;
+//! - **accesses out of bounds** of buffers, arrays and vectors;
+//! - **subgroup operations** in which not all invocations take part, and shuffles from absent lanes;
+//! - **barriers** that some invocations never reach, and waits that never end.
+//!
+//! ```no_run
+//! use spirv_interpreter::{Memory, Order, Schedule, Shader, words};
+//!
+//! # fn main() -> Result<(), spirv_interpreter::Error> {
+//! # let spirv = std::fs::read("double.spv").unwrap_or_default();
+//! let shader = Shader::new(&words(&spirv));
+//! // Binding 0 holds two floats.
+//! let mut buffers = vec![Some(Memory::of(vec![1f32.to_bits(), 2f32.to_bits()]))];
+//! let schedule = Schedule {
+//!     subgroup_size: 16,
+//!     order: Order::Random,
+//!     in_flight: 3,
+//!     scattered: false,
+//!     seed: 1,
+//! };
+//! shader.dispatch(&mut buffers, &[2], [1, 1, 1], &schedule)?;
+//! let doubled = buffers[0].as_ref().map(|b| f32::from_bits(b.words[1]));
+//! assert_eq!(doubled, Some(4.0));
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! # Scope
+//! Compute shaders for Vulkan with logical addressing and 32-bit numbers: storage buffers of
+//! descriptor set 0, push constants, workgroup and private memory, atomics, subgroup vote, ballot,
+//! shuffle and arithmetic, most of GLSL.std.450. No images, no other number widths, no functions that
+//! the compiler has not inlined. A module that uses something else makes [`Shader::new`] panic with
+//! its name: this is a test tool, and a panic fails a test.
+//!
+//! [`module`] takes modules apart and puts them together again, to break one instruction and see
+//! whether tests notice.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
+
+mod alu;
+mod code;
+mod dispatch;
+mod faults;
+mod lower;
+mod lower_alu;
+mod memory;
+pub mod module;
+mod subgroup;
+mod together;
+mod types;
+
+pub use code::GARBAGE;
+pub use dispatch::{Order, Random, Schedule};
+pub use faults::{Error, Fault, Found};
+pub use memory::Memory;
+
+/// The little-endian words of a SPIR-V file or a buffer.
+pub fn words(bytes: &[u8]) -> Vec<u32> {
+    bytes.chunks_exact(4).map(|c| u32::from_le_bytes([c[0], c[1], c[2], c[3]])).collect()
+}
+
+/// A shader, ready to run.
+pub struct Shader(code::Code);
+
+impl Shader {
+    /// Reads a module with one entry point.
+    ///
+    /// # Panics
+    /// If the module is invalid or uses something that is not supported; the message names it.
+    pub fn new(spirv: &[u32]) -> Shader {
+        Shader(lower::lower(spirv))
+    }
+
+    /// Invocations per workgroup: `local_size`.
+    pub fn workgroup(&self) -> [u32; 3] {
+        self.0.workgroup
+    }
+
+    /// Runs all workgroups. `buffers` by binding number, `push` the words of the push constants.
+    ///
+    /// # Errors
+    /// [`Error::Stuck`] if a barrier is not reached by all or a loop never ends, [`Error::Faulty`]
+    /// with each kind of fault once per instruction.
+    pub fn dispatch(
+        &self,
+        buffers: &mut [Option<Memory>],
+        push: &[u32],
+        groups: [u32; 3],
+        schedule: &Schedule,
+    ) -> Result<(), Error> {
+        let mut faults = faults::Faults::default();
+        dispatch::run(&self.0, buffers, push, groups, schedule, &mut faults).map_err(Error::Stuck)?;
+        faults.report()
+    }
+}
