@@ -1,6 +1,6 @@
 #version 460
 // The language loss of one view: L1 between rendered features and the target code where there is a label
-// (docs/method.md#language-loss).
+// (docs/internals/method.md#language-loss).
 // Labels index rows of `codes`, all levels one after the other; -1 has no influence, not even on the gradient's bits.
 // mode 0: upstream = weight[level] * sign(F - code);  mode 1 (lifting): upstream = code, so that the backward pass
 // returns the blending-weighted sum of codes of every splat, and 1 for colour number `level` where there is a label, which

@@ -1,6 +1,6 @@
 #version 450
 // Stored features to rendered ones, per block of `width` numbers: f / (|f| + epsilon), or f where epsilon < 0
-// (docs/method.md#feature-gauge).
+// (docs/internals/method.md#feature-gauge).
 // Twin: pass::project::features_twin.
 layout(local_size_x = 64) in;
 

@@ -12,7 +12,7 @@ layout(push_constant) uniform Push {
     uint pixels; uint source; uint first; uint channels; uint group; uint encoding; uint stride; uint from; uint to; uint count;
 };
 
-// Below, the sum of w z says little about any surface (docs/method.md#forward-rasterisation).
+// Below, the sum of w z says little about any surface (docs/internals/method.md#forward-rasterisation).
 const float DEPTH_ALPHA_MIN = 0.5;
 
 float value(uint pixel, uint k) {

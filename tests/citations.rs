@@ -1,4 +1,4 @@
-//! Citations of the documents: every `docs/<name>.md#<anchor>` in sources and documents, and every relative link of a
+//! Citations of the documents: every `docs/<folder>/<name>.md#<anchor>` in sources and documents, and every relative link of a
 //! Markdown file, leads to a file and a heading that exist. No compiler reads comments, so nothing else would notice a
 //! section that was renamed.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
@@ -52,9 +52,9 @@ fn place(path: &Path, line: usize) -> String {
     format!("{}:{line}", path.strip_prefix(root()).unwrap_or(path).display())
 }
 
-/// The letters, digits, `-` and `_` that a text starts with.
-fn word(text: &str) -> &str {
-    let end = text.find(|c: char| !(c.is_alphanumeric() || c == '-' || c == '_'));
+/// The letters, digits, `-`, `_` and characters of `more` that a text starts with.
+fn word<'a>(text: &'a str, more: &str) -> &'a str {
+    let end = text.find(|c: char| !(c.is_alphanumeric() || c == '-' || c == '_' || more.contains(c)));
     &text[..end.unwrap_or(text.len())]
 }
 
@@ -63,9 +63,9 @@ fn citations(line: &str) -> Vec<(String, &str)> {
     let mut all = Vec::new();
     for (at, start) in line.match_indices("docs/") {
         let rest = &line[at + start.len()..];
-        let name = word(rest);
+        let name = word(rest, "/");
         if let Some(anchor) = rest[name.len()..].strip_prefix(".md#").filter(|_| !name.is_empty()) {
-            all.push((format!("docs/{name}.md"), word(anchor)));
+            all.push((format!("docs/{name}.md"), word(anchor, "")));
         }
     }
     all
@@ -155,7 +155,7 @@ fn relative_links_lead_somewhere() {
     assert!(faults.is_empty(), "{}", faults.join("\n"));
 }
 
-/// Nobody else can look into the document that comments cited before docs/method.md was there.
+/// Nobody else can look into the document that comments cited before docs/internals/method.md was there.
 #[test]
 fn nothing_outside_the_repository_is_cited() {
     let word = ["ALGO", "RITHMS"].concat();
@@ -179,7 +179,30 @@ fn headings_become_the_anchors_that_github_makes() {
 #[test]
 fn citations_and_links_are_recognised() {
     // In two pieces, or this line would be a citation itself.
-    let line = ["as docs/", "method.md#code-length, step 1; docs/", "data.md has no anchor"].concat();
-    assert_eq!(citations(&line), [("docs/method.md".to_owned(), "code-length")]);
+    let line =
+        ["as docs/", "internals/method.md#code-length, step 1; docs/", "data.md has no anchor"].concat();
+    assert_eq!(citations(&line), [("docs/internals/method.md".to_owned(), "code-length")]);
     assert_eq!(links("a [b](c.md#d), [e](#f) and [g] (h)"), ["c.md#d", "#f"]);
+}
+
+/// Headings of the troubleshooting page are pieces of sentences that the program prints.
+#[test]
+fn troubleshooting_has_sentences_of_the_program() {
+    let page = std::fs::read_to_string(root().join("docs/use/troubleshooting.md")).unwrap();
+    let sentences: Vec<&str> =
+        page.lines().filter_map(|l| l.strip_prefix("### `")?.strip_suffix('`')).collect();
+    assert!(sentences.len() > 20);
+    let mut sources = String::new();
+    for (path, text) in texts().iter().filter(|(p, _)| p.extension().is_some_and(|e| e == "rs")) {
+        let in_tests = path.strip_prefix(root()).is_ok_and(|p| p.starts_with("tests"));
+        if !in_tests {
+            sources.push_str(text);
+        }
+    }
+    // A literal may go on in the next line.
+    let sources = sources.replace("\\\n", "");
+    let words: Vec<&str> = sources.split_whitespace().collect();
+    let sources = words.join(" ");
+    let gone: Vec<&&str> = sentences.iter().filter(|s| !sources.contains(**s)).collect();
+    assert!(gone.is_empty(), "the program prints none of these: {gone:#?}");
 }

@@ -71,7 +71,7 @@ fn a_perturbed_camera_is_recovered() {
     let truth = cameras(3);
     let images = photos(&device, &splats, &truth);
     let mut start = truth.clone();
-    // 0.5° and 1 % of the depth (docs/method.md#tolerances).
+    // 0.5° and 1 % of the depth (docs/internals/method.md#tolerances).
     let turn = DVec3::new(0.5, -0.7, 0.4).normalize() * 0.5f64.to_radians();
     let shift = DVec3::new(0.6, 0.5, -0.6).normalize() * 0.04;
     start[2].pose = Pose::exp(shift, turn).compose(&truth[2].pose);

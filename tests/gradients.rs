@@ -93,7 +93,7 @@ fn colours_that_change_with_the_direction_move_the_means_as_in_the_twin() {
     assert_class("means", gradients.splats.means.as_flattened(), &reference);
 }
 
-/// Edge cases of docs/method.md#tolerances: clamped α, clamped Jacobian, needle, behind, hidden, outside, a clamped
+/// Edge cases of docs/internals/method.md#tolerances: clamped α, clamped Jacobian, needle, behind, hidden, outside, a clamped
 /// colour.
 #[test]
 fn edge_cases_match_the_twin() {

@@ -450,7 +450,7 @@ fn told_to_stop_a_command_leaves_nothing() {
         let output = child.wait_with_output().unwrap();
         let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(130), "{words}: {stderr}");
-        // 2 s are promised (docs/trust.md#faults); other tests run beside this one.
+        // 2 s are promised (docs/internals/trust.md#faults); other tests run beside this one.
         assert!(told.elapsed() < Duration::from_secs(10), "{words}: {:?}", told.elapsed());
         assert_eq!(names(folder.path()), Vec::<String>::new(), "{words}: {stderr}");
     }

@@ -113,7 +113,7 @@ impl DataSet {
         let layout = layout.or_else(|| Layout::of(folder)).ok_or_else(|| {
             Error::input(format!(
                 "{}: no ground_truth.json, no segmentations/classes.txt (3D-OVS), no label-filt/ (ScanNet) and no \
-                 ../label/NAME/*.json (LERF-OVS); what docs/data.md describes is needed",
+                 ../label/NAME/*.json (LERF-OVS); what docs/internals/data.md describes is needed",
                 folder.display()
             ))
         })?;

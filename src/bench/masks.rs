@@ -232,7 +232,7 @@ mod tests {
             (12, 96, 8),
             "table, wall and carpet are no objects"
         );
-        // the targets of the built-in masks on this set; docs/method.md#graph-masks states what they reach
+        // the targets of the built-in masks on this set; docs/internals/method.md#graph-masks states what they reach
         assert!(row.best > 0.9 && row.one_level > 0.88, "{seen}");
         assert!(row.one_level <= row.best && report.best == row.best);
         let mut sizes = row.masks.to_vec();

@@ -1,5 +1,5 @@
 //! Gets networks: public ONNX files over HTTP, or the export of a checkpoint, into a hidden folder; there they are held to their
-//! contract and to a numeric self-check, and appear whole in their place or not at all. See docs/models.md#fetching.
+//! contract and to a numeric self-check, and appear whole in their place or not at all. See docs/use/models.md#fetching.
 mod download;
 mod export;
 mod meter;

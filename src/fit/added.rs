@@ -1,4 +1,4 @@
-//! A scene that goes on with more photos (docs/method.md#photos-added-later): its splats stay and train on, surfaces that it does not
+//! A scene that goes on with more photos (docs/internals/method.md#photos-added-later): its splats stay and train on, surfaces that it does not
 //! have yet become new ones.
 use super::bounds::Bounds;
 use super::coarse::Photos;
@@ -14,7 +14,7 @@ use crate::scene::{Camera, DepthMap, Plane, PointCloud, Splats};
 use glam::DVec3;
 
 /// Relative difference in depth from which on a point is on another surface than the one that is rendered: what occlusion tests
-/// between views allow (docs/method.md#reprojection).
+/// between views allow (docs/internals/method.md#reprojection).
 const SAME_SURFACE: f64 = 0.05;
 
 /// Fewest points that splats are made of.

@@ -1,4 +1,4 @@
-//! Where splats may be and how large (docs/method.md#bounds): a splat at a camera hides its whole photo, and once it is opaque
+//! Where splats may be and how large (docs/internals/method.md#bounds): a splat at a camera hides its whole photo, and once it is opaque
 //! no gradient reaches what it hides.
 use super::model::Model;
 use crate::Result;

@@ -1,5 +1,5 @@
 //! Splats from points: size from the pixel footprint and the nearest neighbours, colour from the photos
-//! (docs/method.md#splats-from-points).
+//! (docs/internals/method.md#splats-from-points).
 use super::options::InitOptions;
 use crate::math::Random;
 use crate::scene::{PointCloud, SH_C0, Splats, sh_coefficients};

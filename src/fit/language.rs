@@ -1,4 +1,4 @@
-//! The language stage: features on the splats that render to each pixel's code (docs/method.md#language-training),
+//! The language stage: features on the splats that render to each pixel's code (docs/internals/method.md#language-training),
 //! `L = λ2·L_img + (1−λ2)·L_sem`, starting from lifted features.
 use super::coarse::Photos;
 use super::least_squares;
@@ -23,7 +23,7 @@ use std::time::Instant;
 const IMAGE_WEIGHTS: [f64; 2] = [0.8, 0.2];
 /// Slots of the loss sums: Σ|x−y|, ΣSSIM, language loss.
 const LANGUAGE_SUM: u32 = 2;
-/// Two measurements that gain less than this share of the pixels end the training (docs/method.md#stopping).
+/// Two measurements that gain less than this share of the pixels end the training (docs/internals/method.md#stopping).
 const MIN_GAIN: f64 = 1e-3;
 
 /// One measurement during the language stage.

@@ -1,15 +1,15 @@
-//! Features in closed form: those whose blend is nearest to the codes of all labelled pixels (docs/method.md#lifting).
+//! Features in closed form: those whose blend is nearest to the codes of all labelled pixels (docs/internals/method.md#lifting).
 use super::lift::{Lifted, Lifting, MIN_WEIGHT, unit_start};
 use crate::Result;
 use crate::pass::codes::Mode;
 use rayon::prelude::*;
 
 /// Steps of conjugate gradients; a step costs a forward and a backward pass per photo, so that these cost about as much as the draft
-/// preset's training. Not searched (docs/experiments.md#measured-lifting).
+/// preset's training. Not searched (docs/internals/experiments.md#measured-lifting).
 const SOLVER_STEPS: usize = 8;
 
 /// λ: how much a splat's own mean counts beside what its pixels ask for, as a share of its blending weight. A tenth leaves what pixels
-/// agree on to them and decides what they leave open. Not searched (docs/experiments.md#measured-lifting).
+/// agree on to them and decides what they leave open. Not searched (docs/internals/experiments.md#measured-lifting).
 const PRIOR: f32 = 0.1;
 
 /// Sets the model's raw features to the solution of `min_f Σ_px |Σ_i w_i f_i − c|² + λ Σ_i W_i |f_i − m_i|²`, with W_i the blending

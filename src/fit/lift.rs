@@ -1,5 +1,5 @@
 //! Code targets in GPU memory, and lifting: the blending-weighted mean of the codes that each splat is seen with
-//! (docs/method.md#lifting).
+//! (docs/internals/method.md#lifting).
 use super::model::Model;
 use super::views::Views;
 use crate::gpu::{self, Buffer, Device, Recorder};
@@ -11,7 +11,7 @@ use crate::scene::{Camera, LevelField, RgbImage};
 use crate::{Error, Result};
 
 /// Splats that labelled pixels saw with less weight than this (in pixels) start without a feature: their direction
-/// would be noise (docs/method.md#lifting).
+/// would be noise (docs/internals/method.md#lifting).
 pub(super) const MIN_WEIGHT: f32 = 0.05;
 /// Length of a lifted raw feature: far above ε, so steps turn it without collapsing it.
 const LIFTED_LENGTH: f32 = 0.5;
@@ -186,7 +186,7 @@ impl Lifted {
         unit_start(features, width)
     }
 
-    /// [N] of one of `levels`: the length of the mean of the unit codes that a splat is seen with (docs/method.md#reliability),
+    /// [N] of one of `levels`: the length of the mean of the unit codes that a splat is seen with (docs/internals/method.md#reliability),
     /// in steps of 1/255; 0 where it is not seen.
     pub(super) fn reliability(&self, level: usize, levels: usize, width: usize) -> Vec<f32> {
         let sums = self.sums.chunks_exact(width).skip(level).step_by(levels);

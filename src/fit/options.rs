@@ -3,7 +3,7 @@ use super::pose::PoseOptions;
 use super::schedule::Exponential;
 use crate::preset::Preset;
 
-/// How splats start (docs/method.md#splats-from-points).
+/// How splats start (docs/internals/method.md#splats-from-points).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct InitOptions {
     /// At most this many splats; more points are thinned to an even density by voxels.
@@ -128,7 +128,7 @@ impl RgbOptions {
     }
 
     /// Most steps at half the photos' size. A thousand steps learn a few photos by heart: 0.9 dB more on them, 0.3 less on views
-    /// between them (docs/experiments.md#how-long-to-train).
+    /// between them (docs/internals/experiments.md#how-long-to-train).
     fn short() -> Self {
         RgbOptions { coarse: 0.6, ..Self::scaled(300, 2.0) }
     }
@@ -225,11 +225,11 @@ pub struct LanguageOptions {
     pub seed: u64,
     /// λ2 of `L = λ2·L_img + (1−λ2)·L_sem`.
     pub image_weight: f64,
-    /// Learning rates of everything but the features (reduced, docs/method.md#language-rates).
+    /// Learning rates of everything but the features (reduced, docs/internals/method.md#language-rates).
     pub rates: Rates,
     /// Learning rate of the features.
     pub feature_rate: f64,
-    /// ε of `f̂ = f/(‖f‖+ε)` per level (docs/method.md#feature-gauge); only the ratio of ε and learning rate matters when
+    /// ε of `f̂ = f/(‖f‖+ε)` per level (docs/internals/method.md#feature-gauge); only the ratio of ε and learning rate matters when
     /// features start at zero.
     pub epsilon: f32,
     /// What the features start from.
@@ -290,7 +290,7 @@ mod tests {
                 assert!((share(steps) - 1.0).abs() < 1e-9 && share(steps - 1) > 1.0001, "{steps}: {rate:?}");
             }
         }
-        // That of the paper is longer than its runs (docs/method.md#schedules).
+        // That of the paper is longer than its runs (docs/internals/method.md#schedules).
         let paper = RgbOptions::preset(Preset::Paper);
         assert_eq!(paper.clone().with_iterations(100).rates.means, paper.rates.means);
     }

@@ -1,4 +1,4 @@
-//! Camera pose refinement by Adam on left twists, `T ← exp(−lr·m̂/(√v̂+ε))·T` (docs/method.md#pose-refinement).
+//! Camera pose refinement by Adam on left twists, `T ← exp(−lr·m̂/(√v̂+ε))·T` (docs/internals/method.md#pose-refinement).
 use super::schedule::Exponential;
 use crate::scene::Pose;
 use glam::DVec3;

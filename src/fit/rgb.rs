@@ -1,4 +1,4 @@
-//! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (docs/method.md#splats).
+//! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (docs/internals/method.md#splats).
 use super::bounds::Bounds;
 use super::coarse::{HalfSizePhotos, Photos};
 use super::init::splats_from_points;
@@ -26,7 +26,7 @@ mod tests;
 /// Photos of 8 bits cannot show more than their rounding noise, 10·log10(12·255²) = 58.9 dB: a render that happens to
 /// match exactly must not outweigh all other views.
 pub(crate) const MOST_PSNR: f64 = 60.0;
-/// Scale ratios above this are penalised (docs/method.md#regularisers).
+/// Scale ratios above this are penalised (docs/internals/method.md#regularisers).
 const RATIO_LIMIT: f32 = 8.0;
 
 /// One point of the training curve.

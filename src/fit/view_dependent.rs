@@ -1,4 +1,4 @@
-//! Colours that depend on the direction they are seen from (docs/method.md#view-dependent-colour): spherical harmonics on a
+//! Colours that depend on the direction they are seen from (docs/internals/method.md#view-dependent-colour): spherical harmonics on a
 //! trained geometry, of the degree that photos left out support.
 use super::coarse::Photos;
 use super::init::raise_sh_degree;

@@ -283,7 +283,7 @@ impl Adapter {
         }
         best.ok_or_else(|| {
             Error::input(format!(
-                "{}: fits no known model: inputs {}; outputs {}; nearest is {}; if a name differs, say so in {} (docs/models.md)",
+                "{}: fits no known model: inputs {}; outputs {}; nearest is {}; if a name differs, say so in {} (docs/use/models.md)",
                 model.display(),
                 listed(&header.inputs),
                 listed(&header.outputs),

@@ -230,7 +230,7 @@ impl Sense<'_> {
 
     fn see(&mut self, pair: &PairPointmaps, size: [&Prepared; 2]) -> Result<()> {
         let raw = "either two outputs are swapped or the export left an activation to the program: say apply.points = \
-                   \"expm1-norm\" and apply.conf = \"one-plus-exp\" in its adapter (docs/models.md)";
+                   \"expm1-norm\" and apply.conf = \"one-plus-exp\" in its adapter (docs/use/models.md)";
         for map in [&pair.x11, &pair.x21, &pair.x22, &pair.x12] {
             // 1 + e^x rounds to 1 at least.
             if map.confidence.iter().any(|c| *c < 0.999) {
@@ -256,7 +256,7 @@ impl Sense<'_> {
         if 2 * self.crossed <= self.judged {
             return Ok(());
         }
-        let mend = "swap names.points1 with names.points2 in its adapter, and with them conf and desc (docs/models.md)";
+        let mend = "swap names.points1 with names.points2 in its adapter, and with them conf and desc (docs/use/models.md)";
         Err(self.wrong("the second view's points lie on the first view's rays, so the two are swapped", mend))
     }
 }

@@ -123,7 +123,7 @@ fn field_values(warp: Tensor, certainty: Tensor, file: &super::graph::GraphFile)
             file.path.display(),
             format!(
                 "{}: a certainty of {odd} is no probability; if the graph gives logits say apply.certainty = \"sigmoid\" in its \
-             adapter (docs/models.md)",
+             adapter (docs/use/models.md)",
                 file.path.display()
             ),
         ));

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum Reducer {
-    /// One code per distinct embedding, bound to it (docs/method.md#codebook).
+    /// One code per distinct embedding, bound to it (docs/internals/method.md#codebook).
     Bijection,
     /// A scene autoencoder to three dimensions and back, as LangSplat; `feature_dim` is then 3.
     Autoencoder {
@@ -41,7 +41,7 @@ pub struct BuildOptions {
 impl Default for BuildOptions {
     fn default() -> Self {
         // 16: codes of up to 200 things stay ghost-free at borders, where 3 gives 95 % ghosts
-        // (docs/method.md#code-length)
+        // (docs/internals/method.md#code-length)
         BuildOptions {
             align: AlignOptions::default(),
             reducer: Reducer::Bijection,

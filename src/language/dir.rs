@@ -12,10 +12,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Masks below this many pixels are dropped: LangSplat's own clean-up leaves none smaller, and fewer pixels carry no
-/// reliable feature (docs/method.md#label-maps).
+/// reliable feature (docs/internals/method.md#label-maps).
 pub const MIN_MASK_PIXELS: usize = 32;
 
-/// Vectors shorter than this have no direction (docs/method.md#region-features).
+/// Vectors shorter than this have no direction (docs/internals/method.md#region-features).
 const MIN_NORM: f32 = 1e-6;
 
 /// Reads the masks of one photo, at its working resolution; with their features when `with_features`.

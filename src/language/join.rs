@@ -1,4 +1,4 @@
-//! Masks of photos that join a scene, under the codes that it has (docs/method.md#photos-added-later).
+//! Masks of photos that join a scene, under the codes that it has (docs/internals/method.md#photos-added-later).
 //!
 //! A scene seen from the camera of a new photo shows its things where the photo shows them: the same alignment that joins masks of two
 //! photos joins the photo's masks with the codes that are rendered there.
@@ -12,7 +12,7 @@ use crate::{Error, Result};
 use std::collections::BTreeMap;
 
 /// Relative difference in depth that two views of one surface may have, as in the other alignment steps
-/// (docs/method.md#reprojection).
+/// (docs/internals/method.md#reprojection).
 const SAME_SURFACE: f32 = 0.05;
 
 /// Share of a mask that stands on surfaces the scene does not have, from which on a mask that is none of its things is a new one. Below,

@@ -1,5 +1,5 @@
-//! The language loss: L1 between rendered features and the code of each labelled pixel (docs/method.md#language-loss),
-//! and the upstream that lifts codes onto splats (docs/method.md#lifting).
+//! The language loss: L1 between rendered features and the code of each labelled pixel (docs/internals/method.md#language-loss),
+//! and the upstream that lifts codes onto splats (docs/internals/method.md#lifting).
 use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 

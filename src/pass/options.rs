@@ -1,6 +1,6 @@
 //! How to render.
 
-/// How stored features become rendered ones (docs/method.md#feature-gauge).
+/// How stored features become rendered ones (docs/internals/method.md#feature-gauge).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FeatureMode {
     /// f̂ = f / (‖f‖ + ε), the parameterisation of the paper, for each of several blocks of equal length (one per level).
@@ -45,7 +45,7 @@ pub struct RasterOptions {
 }
 
 impl Default for RasterOptions {
-    /// Degree 0; ε = 1e-3 as in docs/method.md#feature-gauge.
+    /// Degree 0; ε = 1e-3 as in docs/internals/method.md#feature-gauge.
     fn default() -> Self {
         RasterOptions {
             sh_degree: 0,

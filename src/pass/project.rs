@@ -1,4 +1,4 @@
-//! Projection of splats to the screen (EWA, Zwicker et al. 2002; Kerbl et al. 2023, docs/method.md#projection).
+//! Projection of splats to the screen (EWA, Zwicker et al. 2002; Kerbl et al. 2023, docs/internals/method.md#projection).
 //!
 //! Per splat, with R_q of the unit quaternion, s = exp(log scale):
 //! `t = R μ + τ`, `M = R_q diag(s)`, `B = J R M` (2×3), `Σ' = B Bᵀ + 0.3 I`, `(A, B, C) = Σ'⁻¹`,
@@ -190,7 +190,7 @@ pub(super) fn raw_colour(params: &Params, i: usize, view: &View) -> DVec3 {
     params.sh_of(i).iter().zip(basis).map(|(&c, b)| c * b).sum()
 }
 
-/// Raw features [N, d] → rendered ones (docs/method.md#feature-gauge).
+/// Raw features [N, d] → rendered ones (docs/internals/method.md#feature-gauge).
 pub fn features_twin(features: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
     match mode {
         FeatureMode::Linear => features.to_vec(),

@@ -1,5 +1,5 @@
 //! Gradients of the raw parameters and of the camera from those of the screen-space splats
-//! (docs/method.md#backward-rasterisation).
+//! (docs/internals/method.md#backward-rasterisation).
 //!
 //! With Q the conic matrix and G_M = [[∂A, ½∂B], [½∂B, ∂C]]: `G' = −Q G_M Q`, `∂B = 2 G' B` (2×3), `∂M = Tᵀ ∂B`,
 //! `∂J = ∂B Mᵀ Rᵀ`, `∂R_cov Rᵀ = Jᵀ ∂J`. From there means, log scales, raw quaternion (through its
@@ -251,7 +251,7 @@ fn outer(a: DVec3, b: DVec3) -> DMat3 {
     DMat3::from_cols(a * b.x, a * b.y, a * b.z)
 }
 
-/// ∂(rendered features) → ∂(raw features), both [N, d] (docs/method.md#feature-gauge):
+/// ∂(rendered features) → ∂(raw features), both [N, d] (docs/internals/method.md#feature-gauge):
 /// `∂f = (∂f̂ − f̂'(f̂'·∂f̂)·‖f‖/(‖f‖+ε)) / (‖f‖+ε)` with f̂' = f/‖f‖.
 pub fn features_twin(features: &[f64], upstream: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
     let FeatureMode::Gauge { epsilon, .. } = mode else { return upstream.to_vec() };

@@ -1,4 +1,4 @@
-//! Gradients of the blended image by every screen-space splat (docs/method.md#backward-rasterisation).
+//! Gradients of the blended image by every screen-space splat (docs/internals/method.md#backward-rasterisation).
 //!
 //! Upstream planes [(4 + d) + 1, H, W]: ∂L/∂(RGB on background), ∂L/∂Σwz, ∂L/∂features, ∂L/∂alpha (alpha = 1 − T_f).
 //! For a contributor with w = αT, own = c·g: `∂c += w g`, `∂α = T own − (S − g_A T_f)/(1 − α)` with S the

@@ -1,4 +1,4 @@
-//! Alpha blending of depth-sorted splats (docs/method.md#forward-rasterisation).
+//! Alpha blending of depth-sorted splats (docs/internals/method.md#forward-rasterisation).
 //!
 //! Per pixel, front to back, with d = centre − pixel: `p = −½(A dx² + C dy²) − B dx dy`, `α = min(0.99, o eᵖ)`; a
 //! splat with α < 1/255 is skipped; the pixel stops before the splat that would bring T below 1e-4; every channel

@@ -1,4 +1,4 @@
-//! Regularisers of the RGB stage (docs/method.md#regularisers): depth near the stereo depth, and no needles.
+//! Regularisers of the RGB stage (docs/internals/method.md#regularisers): depth near the stereo depth, and no needles.
 use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 

@@ -13,7 +13,7 @@ use crate::{Error, Result};
 use std::ops::Range;
 
 /// Alpha from which a pixel has a depth: below, Σ w z says little about any surface
-/// (docs/method.md#forward-rasterisation).
+/// (docs/internals/method.md#forward-rasterisation).
 pub const DEPTH_ALPHA_MIN: f32 = shaders::pack::DEPTH_ALPHA_MIN as f32;
 
 /// One rendered view.

@@ -17,7 +17,7 @@ pub struct View {
     /// Width and height, pixels.
     pub size: [u32; 2],
     /// Splats with camera z ≤ near are dropped. World units; 0.01 × the scene's median depth is a good value
-    /// (docs/method.md#projection), because scenes are not metric and may have close points.
+    /// (docs/internals/method.md#projection), because scenes are not metric and may have close points.
     pub near: f64,
     /// RGB behind everything.
     pub background: [f64; 3],

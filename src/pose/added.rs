@@ -1,4 +1,4 @@
-//! Photos that join those of a scene (docs/method.md#photos-added-later).
+//! Photos that join those of a scene (docs/internals/method.md#photos-added-later).
 use super::sfm::{self, Known};
 use super::{Confidence, Fitted, SolvedCameras, learned_features, light};
 use crate::infer::Registry;

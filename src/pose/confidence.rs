@@ -1,4 +1,4 @@
-//! How far the place of a photo's camera is to be trusted (docs/method.md#confidence).
+//! How far the place of a photo's camera is to be trusted (docs/internals/method.md#confidence).
 use super::Fitted;
 use serde::Serialize;
 
@@ -14,7 +14,7 @@ pub(super) const DOUBTFUL_ROTATION: f64 = 2.0;
 /// σ of ln f above which depth is not sure.
 pub(super) const UNSURE_FOCAL: f64 = 0.05;
 
-/// Trust in the place of a camera. What each level was worth on generated photos is in docs/photos.md.
+/// Trust in the place of a camera. What each level was worth on generated photos is in docs/use/photos.md.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Confidence {

@@ -3,7 +3,7 @@ use crate::scene::{Camera, DepthMap, Lens, PointCloud};
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// What every geometry initialiser returns (docs/method.md#geometry). World frame: camera 0 of the run, OpenCV axes.
+/// What every geometry initialiser returns (docs/internals/method.md#geometry). World frame: camera 0 of the run, OpenCV axes.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Geometry {
     /// One per photo, at the photo's working resolution.

@@ -1,4 +1,4 @@
-//! Photos to cameras, and from cameras to depth (docs/method.md#geometry).
+//! Photos to cameras, and from cameras to depth (docs/internals/method.md#geometry).
 use super::choose::LeftOut;
 use super::confidence::{DOUBTFUL, DOUBTFUL_ROTATION, UNSURE_FOCAL};
 use super::leave_out::{self, Placed};

@@ -1,4 +1,4 @@
-//! Cameras of as many photos as hold together (docs/method.md#photos-left-out). A photo in a wrong place spoils the others: splats are
+//! Cameras of as many photos as hold together (docs/internals/method.md#photos-left-out). A photo in a wrong place spoils the others: splats are
 //! trained to explain what it shows from there.
 use super::SparseModel;
 use super::choose::{LeftOut, Reason};

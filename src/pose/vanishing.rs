@@ -1,5 +1,5 @@
 //! Focal length from vanishing points: edges of most things that people build run in three directions at right angles, and only
-//! the right focal length makes the directions that a photo shows so (docs/method.md#vanishing-points).
+//! the right focal length makes the directions that a photo shows so (docs/internals/method.md#vanishing-points).
 use super::segments::{self, END_SIGMA};
 use crate::math::Random;
 use crate::scene::RgbImage;

@@ -1,4 +1,4 @@
-//! Smoothing and the LERF mask (docs/method.md#smoothing, docs/method.md#lerf-ovs).
+//! Smoothing and the LERF mask (docs/internals/method.md#smoothing, docs/internals/method.md#lerf-ovs).
 use crate::scene::Plane;
 use rayon::prelude::*;
 

@@ -1,4 +1,4 @@
-//! Things in space: the selected splats as connected groups (docs/method.md#instances).
+//! Things in space: the selected splats as connected groups (docs/internals/method.md#instances).
 use crate::scene::code_mix::MIN_LENGTH;
 use crate::scene::{Camera, LanguageField, LevelField, Plane, Splats};
 use ahash::{HashMap, HashMapExt}; // quicker than the standard library's: a query looks up cells some million times
@@ -63,7 +63,7 @@ pub struct Instance {
     pub splats: Vec<usize>,
     /// Share of the weight of the selected splats that is its own.
     pub share: f64,
-    /// How far the photos agree on what it is, 0 to 1 (docs/method.md#reliability); `None` where that is not known.
+    /// How far the photos agree on what it is, 0 to 1 (docs/internals/method.md#reliability); `None` where that is not known.
     pub reliability: Option<f64>,
     /// Middle of the oriented box, world units.
     pub centre: DVec3,

@@ -1,7 +1,7 @@
 //! Text queries and evaluation.
 //!
 //! A query is a unit vector and the canonical vectors of the same space. Its relevancy is computed once per code and
-//! gathered through the decoded code maps of a frame (docs/method.md#queries). Level and location are chosen on the
+//! gathered through the decoded code maps of a frame (docs/internals/method.md#queries). Level and location are chosen on the
 //! smoothed map; the mask of the `field` protocol is chosen on codes, so smoothing never moves its edges.
 pub mod eval;
 pub mod filter;
@@ -45,7 +45,7 @@ pub struct QueryOptions {
     /// Mask rule.
     pub mask: MaskRule,
     /// A query whose best relevancy stays below this is "not found". 0.5 means: no closer than the nearest canonical
-    /// phrase (docs/method.md#level-and-mask).
+    /// phrase (docs/internals/method.md#level-and-mask).
     pub abs_threshold: f32,
     /// For [`MaskRule::Codes`]: a part of a thing often matches a phrase a little better than the thing; the phrase still
     /// means the thing. The coarsest level answers whose margin (see [`Slack`]) the best level's does not clearly exceed.
@@ -75,7 +75,7 @@ pub enum MaskRule {
     /// Protocol `field`: the codes whose relevancy is at least this share of the way from 0.5 (as close as a canonical
     /// phrase) to the best code of the level; their pixels are the mask, without smoothing.
     Codes(f32),
-    /// Protocol `lerf` (docs/method.md#lerf-ovs): threshold on the min–max-normalised smoothed map, then a 7×7 majority
+    /// Protocol `lerf` (docs/internals/method.md#lerf-ovs): threshold on the min–max-normalised smoothed map, then a 7×7 majority
     /// filter.
     Lerf(f32),
 }
@@ -96,7 +96,7 @@ pub const CODE_SHARE: f32 = 0.8;
 pub struct QueryResult {
     /// Chosen level, index as in [`crate::scene::LEVEL_NAMES`].
     pub level: usize,
-    /// [H, W] blended relevancy of the chosen level (docs/method.md#smoothing), 0 where nothing is.
+    /// [H, W] blended relevancy of the chosen level (docs/internals/method.md#smoothing), 0 where nothing is.
     pub relevancy: Plane<f32>,
     /// [H, W] the mask.
     pub mask: Plane<bool>,
@@ -116,7 +116,7 @@ impl QueryResult {
     }
 }
 
-/// Relevancy of every code, [K]: `min_i σ(10 (φ·q − φ·n_i))` (docs/method.md#relevancy).
+/// Relevancy of every code, [K]: `min_i σ(10 (φ·q − φ·n_i))` (docs/internals/method.md#relevancy).
 pub fn code_relevancy(codebook: &Codebook, query: &TextQuery) -> Result<Vec<f32>> {
     let d = codebook.embedding_dim;
     if codebook.is_empty() {
@@ -218,7 +218,7 @@ pub fn answer_with(
     let chosen = choose_level(&candidates, options)
         .ok_or_else(|| Error::work("the scene has no language level to query"))?;
     // With masks of codes the other levels count for the location: the whole "plate" may hold a lemon, which finer
-    // levels tell apart. The published protocols use the chosen level alone (docs/method.md#lerf-ovs).
+    // levels tell apart. The published protocols use the chosen level alone (docs/internals/method.md#lerf-ovs).
     let all = matches!(options.mask, MaskRule::Codes(_)).then(|| filter::box30(&sum(&candidates)));
     let best = candidates.swap_remove(chosen);
     let boxed = filter::box30(&best.raw);
@@ -242,7 +242,7 @@ fn highest(map: &Plane<f32>) -> f32 {
     map.data.iter().copied().fold(f32::NEG_INFINITY, f32::max)
 }
 
-/// The published protocols take the peak of the blended map (docs/method.md#lerf-ovs). For masks of codes it is the
+/// The published protocols take the peak of the blended map (docs/internals/method.md#lerf-ovs). For masks of codes it is the
 /// margin whose relevancy is the peak of the blended *excess* over a canonical phrase, `max(0, 2·rel − 1)`: smoothing
 /// then counts against specks, which the usual 0.5 of their surroundings would hide.
 fn level_peak(raw: &Plane<f32>, rule: MaskRule) -> f32 {

@@ -1,5 +1,5 @@
 //! Words of a text that no embedding of a few words carries: negations, places, and choices among several. A text that has them is
-//! answered for the rest of it, and says so (docs/method.md#phrasing).
+//! answered for the rest of it, and says so (docs/internals/method.md#phrasing).
 use crate::{Error, Result};
 use serde::Serialize;
 

@@ -1,4 +1,4 @@
-//! Whether a scene shows what a text means (docs/method.md#presence): a text is weighed against other things that it could have
+//! Whether a scene shows what a text means (docs/internals/method.md#presence): a text is weighed against other things that it could have
 //! said. One that fits the scene no better than they do is no evidence of anything.
 use crate::math::dot_f32 as dot;
 use crate::scene::{LanguageField, Plane};

@@ -1,4 +1,4 @@
-//! Splats that a query selects in space, without any view (docs/method.md#selection-in-space).
+//! Splats that a query selects in space, without any view (docs/internals/method.md#selection-in-space).
 use super::instances::Places;
 use super::{MaskRule, QueryOptions, TextQuery, field_relevancy, margin};
 use crate::Result;

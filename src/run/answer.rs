@@ -34,7 +34,7 @@ pub struct Answers {
     pub presence: Option<Presence>,
     /// Share of other things that fit the scene at least as well, in (0, 1]; `None` as before.
     pub p_value: Option<f32>,
-    /// How far the photos agree on what answers, 0 to 1 (docs/method.md#reliability): of all of it, and per view of what it shows of
+    /// How far the photos agree on what answers, 0 to 1 (docs/internals/method.md#reliability): of all of it, and per view of what it shows of
     /// it. `None` where that is not known, or nothing answers.
     pub reliability: Option<f64>,
     /// See `reliability`.

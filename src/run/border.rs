@@ -1,4 +1,4 @@
-//! Which codes a pixel may decode to, where codes are short (docs/method.md#short-codes-at-borders).
+//! Which codes a pixel may decode to, where codes are short (docs/internals/method.md#short-codes-at-borders).
 use crate::gpu::Device;
 use crate::pass::renderer::Renderer;
 use crate::query::instances::splat_codes;
@@ -7,7 +7,7 @@ use crate::{Error, Result};
 use rayon::prelude::*;
 
 /// Codes of so many numbers need the rule: with 3 a mix of two codes is nearest to a third at almost every border, with 8
-/// hardly ever (docs/method.md#code-length).
+/// hardly ever (docs/internals/method.md#code-length).
 const SHORT: usize = 4;
 /// Books with more codes are no things of a scene but a table of directions (an autoencoder's), whose neighbours mean the same.
 const MOST_CODES: usize = 512;

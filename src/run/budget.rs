@@ -2,7 +2,7 @@
 //! what the device binds and holds and what the host has left.
 //!
 //! The figures per pixel and splat are those of the buffers that the stages make (`fit::views`, `fit::model`,
-//! `pass::rasterizer`, `pass::ssim_l1`, `pose::stereo`); those of the host are measured (docs/performance.md).
+//! `pass::rasterizer`, `pass::ssim_l1`, `pose::stereo`); those of the host are measured (docs/internals/performance.md).
 use crate::fit::{Preset, RgbOptions};
 use crate::gpu::DeviceInfo;
 use crate::pass::bands::{Bands, widest};

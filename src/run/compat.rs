@@ -1,5 +1,5 @@
 //! `--compat`: what the paper, its authors' code and LangSplat do otherwise than this program by default
-//! (docs/method.md#differences-from-the-paper). Each switch is a field here, and a row of the table there.
+//! (docs/internals/method.md#differences-from-the-paper). Each switch is a field here, and a row of the table there.
 use super::method::Method;
 use crate::language::Reducer;
 use crate::language::align::{AlignOptions, AreaScore};

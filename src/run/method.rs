@@ -132,7 +132,7 @@ impl Method {
     }
 
     /// What a run does that is asked for no method: training gains nothing over lifted features
-    /// (docs/experiments.md#measured-lifting), so it trains them only where it is asked for something of the training: the
+    /// (docs/internals/experiments.md#measured-lifting), so it trains them only where it is asked for something of the training: the
     /// paper's preset, a number of steps, models of their own per level.
     pub fn by_default(
         preset: Option<Preset>,
@@ -144,7 +144,7 @@ impl Method {
     }
 }
 
-/// Codes of up to 200 things stay apart at borders; with 3 numbers they do not (docs/method.md#code-length).
+/// Codes of up to 200 things stay apart at borders; with 3 numbers they do not (docs/internals/method.md#code-length).
 pub const FEATURE_DIM: usize = 16;
 
 /// LangSplat trains on the masks of hundreds of photos; 100 epochs of those of a few photos would leave it half trained.

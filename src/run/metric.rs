@@ -1,4 +1,4 @@
-//! Lengths in a scene, and the scale that a known one gives it (docs/metres.md).
+//! Lengths in a scene, and the scale that a known one gives it (docs/use/metres.md).
 use super::view::Viewer;
 use crate::format::scene_dir::Scene;
 use crate::gpu;

@@ -1,4 +1,4 @@
-//! Effects of a phone camera: lens, light, sensor noise. The distributions are stated in docs/data.md.
+//! Effects of a phone camera: lens, light, sensor noise. The distributions are stated in docs/internals/data.md.
 use crate::math::Random;
 use crate::scene::{Camera, Lens, RgbImage};
 use crate::{Error, Result};

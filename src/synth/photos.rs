@@ -10,7 +10,7 @@ use glam::{DMat3, DVec3};
 /// The photo that is spoilt where one alone is: neither the first nor the last.
 const SPOILT_PHOTO: usize = 1;
 
-/// Seed of the other scene: outside every range of seeds in docs/data.md.
+/// Seed of the other scene: outside every range of seeds in docs/internals/data.md.
 const OTHER_SCENE: u64 = 5000;
 /// Side of the tile that repeats, in units of the scene: about a tenth of the picture.
 const TILE: f64 = 0.1;

@@ -112,7 +112,7 @@ fn as_served(entry: &CatalogueEntry) -> CatalogueEntry {
 }
 
 #[test]
-#[ignore = "1.1 GB; prints the figures of docs/models.md"]
+#[ignore = "1.1 GB; prints the figures of docs/use/models.md"]
 fn the_open_pack_at_full_size() {
     let bodies: HashMap<String, File> =
         bodies().into_iter().map(|(from, body)| (from, File::new(&body))).collect();

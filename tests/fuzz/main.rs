@@ -1,5 +1,5 @@
 //! Every reader of outside bytes against damaged files: no panic, an answer within a second, memory in proportion to the file
-//! (docs/formats.md#limits), and errors that are the user's to mend.
+//! (docs/use/formats.md#limits), and errors that are the user's to mend.
 //!
 //! Coverage-guided fuzzers need a nightly compiler, and on stable Rust their front ends only make random bytes; so valid files
 //! are damaged here ([`mutate`]), those inside of containers with sums and lengths that are right again ([`readers`]).

@@ -1,5 +1,5 @@
 //! The shipped SPIR-V in the interpreter: every pass against its CPU twin at subgroup sizes that no
-//! device at hand has, with faults that no driver reports. See docs/trust.md#shaders-without-a-device.
+//! device at hand has, with faults that no driver reports. See docs/internals/trust.md#shaders-without-a-device.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod executor;
 mod mutations;

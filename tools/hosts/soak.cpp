@@ -20,7 +20,7 @@
 #endif
 
 static const int ROUNDS = 6;
-// From a third of the rounds to the last, per context: 3 to 12 KiB stay (docs/trust.md#soak), a kept image or scene would be 75 KiB or more.
+// From a third of the rounds to the last, per context: 3 to 12 KiB stay (docs/internals/trust.md#soak), a kept image or scene would be 75 KiB or more.
 static const double KIB_PER_CONTEXT = 32;
 // What is resident may be so much more then: it moves by a MiB where nothing is kept.
 static const double ROOM_MIB = 8;

@@ -34,7 +34,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, OnceLock};
 use std::time::SystemTime;
 
-/// Beyond the bytes of a file a reader takes at most four times its content, and this much (docs/formats.md#limits).
+/// Beyond the bytes of a file a reader takes at most four times its content, and this much (docs/use/formats.md#limits).
 pub const ROOM: u64 = 64 << 20;
 
 /// Most bytes of a text or JSON file: ten times the cameras of 10,000 photos.

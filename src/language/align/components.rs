@@ -1,4 +1,4 @@
-//! Accepted edges → things (docs/method.md#components).
+//! Accepted edges → things (docs/internals/method.md#components).
 use super::Edge;
 use super::score::LevelState;
 use crate::scene::MaskId;

@@ -1,5 +1,5 @@
-//! Pixel correspondences between two views: from dense matches (docs/method.md#pixel-matching) and from depth and poses
-//! (docs/method.md#reprojection).
+//! Pixel correspondences between two views: from dense matches (docs/internals/method.md#pixel-matching) and from depth and poses
+//! (docs/internals/method.md#reprojection).
 use crate::scene::{Camera, DenseWarp, DepthMap, Plane};
 use glam::DVec2;
 use rayon::prelude::*;
@@ -8,14 +8,14 @@ use serde::{Deserialize, Serialize};
 /// No correspondence.
 const NONE: u32 = u32::MAX;
 
-/// RoMa's probability above which a match counts (docs/method.md#pixel-matching).
+/// RoMa's probability above which a match counts (docs/internals/method.md#pixel-matching).
 const MIN_CERTAINTY: f32 = 0.35;
 
-/// Relative depth difference that occlusion tests and the round trip allow (docs/method.md#reprojection).
+/// Relative depth difference that occlusion tests and the round trip allow (docs/internals/method.md#reprojection).
 const DEPTH_TOLERANCE: f64 = 0.05;
 
 /// Bilinear depth is used only where its four neighbours lie on one surface: max/min below this
-/// (docs/method.md#reprojection).
+/// (docs/internals/method.md#reprojection).
 const SAME_SURFACE: f32 = 1.06;
 
 /// Where each pixel of one view lands in the other.

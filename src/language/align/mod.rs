@@ -1,4 +1,4 @@
-//! Three-step semantic alignment (docs/method.md#alignment): which masks of different views are the same thing.
+//! Three-step semantic alignment (docs/internals/method.md#alignment): which masks of different views are the same thing.
 //!
 //! Step 1 scores mask pairs by dense matches, step 2 fuses masks that one view splits and another keeps whole,
 //! step 3 re-scores by reprojection through depth and poses. Accepted pairs are undirected edges; connected

@@ -2,7 +2,7 @@
 use crate::scene::MaskId;
 use serde::{Deserialize, Serialize};
 
-/// How the share of a target mask is measured (docs/method.md#pixel-matching).
+/// How the share of a target mask is measured (docs/internals/method.md#pixel-matching).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
@@ -16,7 +16,7 @@ pub enum AreaScore {
     SamePlace,
 }
 
-/// Thresholds of the alignment; the defaults are explained in docs/method.md#alignment.
+/// Thresholds of the alignment; the defaults are explained in docs/internals/method.md#alignment.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct AlignOptions {
     /// Acceptance threshold of step 1.

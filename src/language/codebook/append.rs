@@ -1,4 +1,4 @@
-//! Codes for things that come later: those there are stay as they are (docs/method.md#photos-added-later).
+//! Codes for things that come later: those there are stay as they are (docs/internals/method.md#photos-added-later).
 use super::{CodeEntry, EncodedLevel, SAME_EMBEDDING, assert_bijection, build, min_chord, spread};
 use crate::Result;
 use crate::math::{Random, dot};

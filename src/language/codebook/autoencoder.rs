@@ -1,4 +1,4 @@
-//! The scene autoencoder of LangSplat (Qin et al. 2024, docs/method.md#other-codebooks) as another way to make a
+//! The scene autoencoder of LangSplat (Qin et al. 2024, docs/internals/method.md#other-codebooks) as another way to make a
 //! codebook, so that a comparison with the bijection changes nothing else.
 //!
 //! An encoder D → 3 and a decoder 3 → D are trained on the scene's features. Splats carry points of the unit sphere, and a

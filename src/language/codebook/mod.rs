@@ -1,4 +1,4 @@
-//! The bijection between embeddings and the short codes that splats carry (docs/method.md#codebook).
+//! The bijection between embeddings and the short codes that splats carry (docs/internals/method.md#codebook).
 mod append;
 pub(super) mod autoencoder;
 mod network;
@@ -14,10 +14,10 @@ use crate::{Error, Result};
 use rayon::prelude::*;
 
 /// Embeddings with a larger cosine cannot be told apart by any text query and share a code
-/// (docs/method.md#code-construction, step 1).
+/// (docs/internals/method.md#code-construction, step 1).
 const SAME_EMBEDDING: f64 = 0.9995;
 
-/// Smallest distance between two codes that the construction accepts (docs/method.md#code-construction, step 5).
+/// Smallest distance between two codes that the construction accepts (docs/internals/method.md#code-construction, step 5).
 const MIN_CHORD: f32 = 0.02;
 
 /// One distinct embedding and the masks that have it.

@@ -1,4 +1,4 @@
-//! Weighted PCA with whitening, the start of the code layout (docs/method.md#code-construction, step 3).
+//! Weighted PCA with whitening, the start of the code layout (docs/internals/method.md#code-construction, step 3).
 use crate::{Error, Result};
 use nalgebra::{DMatrix, SymmetricEigen};
 

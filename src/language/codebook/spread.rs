@@ -1,4 +1,4 @@
-//! Spreads codes over the sphere so that they stay apart (docs/method.md#code-construction, step 4).
+//! Spreads codes over the sphere so that they stay apart (docs/internals/method.md#code-construction, step 4).
 use crate::math::{Random, dot};
 use rayon::prelude::*;
 

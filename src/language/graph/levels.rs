@@ -35,7 +35,7 @@ fn inside(tree: &Tree, node: usize) -> Vec<usize> {
 }
 
 /// How clear the outline of a node is, weighed by its size. The share of costs over which it stays as it is, as in HDBSCAN,
-/// adds nothing to that: see `docs/method.md#graph-masks`.
+/// adds nothing to that: see `docs/internals/method.md#graph-masks`.
 fn score(tree: &Tree, node: usize, area_power: f32, options: &GraphOptions) -> f32 {
     let r = &tree.nodes[node].region;
     let contour = r.contour / (r.perimeter - r.frame).max(1.0);

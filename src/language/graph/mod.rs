@@ -1,5 +1,5 @@
 //! Built-in masks without a large model: hierarchical merging of superpixels by colour and a learned boundary map; three
-//! cuts of the tree are the three levels. Method: `docs/method.md#graph-masks`.
+//! cuts of the tree are the three levels. Method: `docs/internals/method.md#graph-masks`.
 mod levels;
 mod options;
 mod pixels;

@@ -1,6 +1,6 @@
 //! What the masks depend on. Each constant states what the mean of four figures becomes with it changed, from 0.948: the
 //! best-of-three IoU and that with one level per object (`splatvk bench masks`), each on breakfast and on generated scenes
-//! (tuning sets, `docs/method.md#graph-masks`). Differences below 0.005 are noise.
+//! (tuning sets, `docs/internals/method.md#graph-masks`). Differences below 0.005 are noise.
 use crate::scene::Plane;
 
 /// Blur before anything is compared, pixels. 0.940 with 0.8, Felzenszwalb and Huttenlocher's own.

@@ -2,7 +2,7 @@
 use crate::infer::sam::{MASKS, Proposals};
 use rayon::prelude::*;
 
-/// Boxes nearer than this to a crop's border are cut off there, pixels (docs/method.md#masks-from-points).
+/// Boxes nearer than this to a crop's border are cut off there, pixels (docs/internals/method.md#masks-from-points).
 pub(super) const BORDER: i32 = 20;
 
 /// A rectangle of the photo, pixels, ends excluded.
@@ -25,7 +25,7 @@ pub(super) struct MaskProposal {
     pub runs: Vec<u32>,
 }
 
-/// Logit offset of the stability test (docs/method.md#masks-from-points).
+/// Logit offset of the stability test (docs/internals/method.md#masks-from-points).
 const OFFSET: f32 = 1.0;
 
 /// One axis of the enlargement: first source index and the weight of the next one, per target pixel.

@@ -1,4 +1,4 @@
-//! Masks from a network that is prompted with points (docs/method.md#masks-from-points): a grid of points over the photo and
+//! Masks from a network that is prompted with points (docs/internals/method.md#masks-from-points): a grid of points over the photo and
 //! over four overlapping crops, three masks each, one list per level; poor, unstable and doubled ones are dropped and
 //! the rest painted into label maps.
 mod bits;
@@ -63,7 +63,7 @@ impl Default for SamOptions {
 /// Proposals below these are not kept, so that thresholds can be lowered to them without asking the network again.
 const KEPT: (f32, f32) = (0.5, 0.5);
 
-/// The photo and, if asked for, the four overlapping quarters of layer 1 (docs/method.md#masks-from-points).
+/// The photo and, if asked for, the four overlapping quarters of layer 1 (docs/internals/method.md#masks-from-points).
 fn crops(width: usize, height: usize, quarters: bool) -> Vec<Crop> {
     let mut all = vec![Crop { x0: 0, y0: 0, x1: width, y1: height }];
     if quarters {

@@ -21,7 +21,7 @@ impl Mask {
 }
 
 /// Largest share of the inner mask that may be seen as lying inside another, and the other's share below which it is the
-/// larger one (docs/method.md#masks-from-points).
+/// larger one (docs/internals/method.md#masks-from-points).
 const INSIDE: (f32, f32) = (0.85, 0.5);
 
 /// Intersection over union of boxes.

@@ -15,7 +15,7 @@ use nalgebra::DVector;
 const STEP_TOLERANCE: f64 = 1e-6;
 /// Cauchy scales, wide ones first so that a start far off is not held by its outliers: by how much they are stretched, steps at
 /// most, and the relative gain at which they are narrowed. Only the last end matters: the invariances of
-/// docs/method.md#pointmap-adjustment (10⁻⁶) need a tighter one than a picture would.
+/// docs/internals/method.md#pointmap-adjustment (10⁻⁶) need a tighter one than a picture would.
 const SCALES: [(f64, usize, f64); 4] = [(8.0, 10, 1e-4), (4.0, 3, 1e-4), (2.0, 3, 1e-4), (1.0, 44, 1e-11)];
 
 /// The problem and its current solution.

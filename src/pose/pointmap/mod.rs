@@ -1,4 +1,4 @@
-//! Pairwise pointmaps to cameras and dense points (docs/method.md#pointmaps): what networks such as MASt3R, DUSt3R and
+//! Pairwise pointmaps to cameras and dense points (docs/internals/method.md#pointmaps): what networks such as MASt3R, DUSt3R and
 //! VGGT predict for pairs of photos is brought to one scale, one set of cameras and one set of depth maps.
 //!
 //! Positions are continuous pixels of the network's input ("model pixels"); the centre of the first pixel is 0.5.

@@ -99,7 +99,7 @@ impl Direction<'_> {
         let rotation = self.procrustes(&chosen, &world)?;
         let inliers = found.inliers.len() as f64 / chosen.len() as f64;
         let apart = rotation_angle(&(rotation * found.pose.rotation.transpose())).to_degrees();
-        // Too few agree, or the two estimates contradict each other (docs/method.md#pair-poses).
+        // Too few agree, or the two estimates contradict each other (docs/internals/method.md#pair-poses).
         if inliers < 0.15 || apart > 15.0 {
             return None;
         }

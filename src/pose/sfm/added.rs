@@ -1,4 +1,4 @@
-//! Cameras of photos that join photos whose cameras are known (docs/method.md#photos-added-later).
+//! Cameras of photos that join photos whose cameras are known (docs/internals/method.md#photos-added-later).
 use super::families::{corner_families, keypoints};
 use super::finish::{agreement, inlier_matches, sparse_points};
 use super::grow::{MIN_RESECTION, Resection, resection};

@@ -1,4 +1,4 @@
-//! The cameras of a scene and of photos that join it, adjusted together (docs/method.md#photos-added-later).
+//! The cameras of a scene and of photos that join it, adjusted together (docs/internals/method.md#photos-added-later).
 use super::finish::{reweight_and_adjust, straightened, sub_pixel};
 use super::model::{Freedom, Model};
 use super::optics::adjust_optics;

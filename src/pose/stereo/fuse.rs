@@ -1,10 +1,10 @@
-//! Depth maps of all views to one set of points (docs/method.md#fusion).
+//! Depth maps of all views to one set of points (docs/internals/method.md#fusion).
 use super::Level;
 use super::surface::{RelativePoses, Surface, neighbours, ray};
 use crate::scene::PointCloud;
 use glam::Vec3;
 
-/// Relative depth step to a neighbour above which a pixel may float between two surfaces (docs/method.md#fusion).
+/// Relative depth step to a neighbour above which a pixel may float between two surfaces (docs/internals/method.md#fusion).
 const FLYING: f32 = 0.06;
 /// Confidence from which a pixel counts as matched rather than filled.
 pub const MATCHED: f32 = 0.5;

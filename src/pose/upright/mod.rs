@@ -1,4 +1,4 @@
-//! Which way is up in a scene (docs/method.md#upright).
+//! Which way is up in a scene (docs/internals/method.md#upright).
 mod clues;
 mod planes;
 

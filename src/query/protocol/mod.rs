@@ -1,4 +1,4 @@
-//! The published evaluation protocols, from their public file layouts (docs/method.md#protocols).
+//! The published evaluation protocols, from their public file layouts (docs/internals/method.md#protocols).
 //!
 //! [`open`] reads a data set's labels and lists the cameras to render and the texts to query; the caller renders and
 //! decodes each frame and hands it to [`Protocol::add`]; [`Protocol::finish`] gives the figures with the definitions they

@@ -1,4 +1,4 @@
-//! 3D-OVS (docs/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and the data set's own argmax.
+//! 3D-OVS (docs/internals/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and the data set's own argmax.
 use super::labels::{Labels, numbered, painted};
 use super::score::{
     DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score, mask_iou,

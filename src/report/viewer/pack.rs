@@ -28,7 +28,7 @@ use std::io::Write;
 const MAGIC: &[u8; 8] = b"SVKVIEW1";
 /// Splats that share a range.
 const BLOCK: usize = 256;
-/// A fainter splat is never drawn (docs/method.md#forward-rasterisation).
+/// A fainter splat is never drawn (docs/internals/method.md#forward-rasterisation).
 const MIN_ALPHA: f32 = 1.0 / 255.0;
 
 /// A packed scene.

@@ -1,5 +1,5 @@
 //! What the splats carry on each level, as named arrays: the same in a scene directory and beside a file of Gaussians
-//! (docs/formats.md#features-of-splats).
+//! (docs/use/formats.md#features-of-splats).
 use super::npy::{NpyArray, NpyData};
 use crate::scene::{CodeMix, Codebook, LevelField};
 use crate::{Error, Result};

@@ -188,7 +188,7 @@ fn write_language(folder: &Path, field: &LanguageField, splats: usize) -> Result
     Ok(LanguageManifest { space: field.space.clone(), levels })
 }
 
-/// One level's bijection (docs/method.md#codebook-file).
+/// One level's bijection (docs/internals/method.md#codebook-file).
 fn write_codebook(path: &Path, book: &Codebook, space: &str) -> Result<()> {
     let k = book.len();
     let mut offsets = vec![0i32];

@@ -1,5 +1,5 @@
 //! Language beside a file of Gaussians: `NAME.language.npz`, for formats that have no place for it. Described in
-//! docs/formats.md.
+//! docs/use/formats.md.
 use super::level_arrays;
 use super::npy::{self, NpyArray};
 use crate::scene::{LEVEL_NAMES, LanguageField, LevelField};

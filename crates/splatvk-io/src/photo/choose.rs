@@ -8,7 +8,7 @@ use std::path::{Component, Path, PathBuf};
 /// Largest number of views: the pair count grows with its square, and the method is made for a few photos.
 pub const MAX_VIEWS: usize = 16;
 
-/// Views used when more photos are given and `--views` is not (docs/method.md#choice-of-photos).
+/// Views used when more photos are given and `--views` is not (docs/internals/method.md#choice-of-photos).
 pub const DEFAULT_VIEWS: usize = 4;
 
 /// The photos behind the inputs and what was left out of the folders.
@@ -211,7 +211,7 @@ fn list(folder: &Path, found: &mut FoundFiles) -> Result<()> {
 }
 
 /// Indices of `views` of `count` frames: `linspace(0, count − 1, views)` truncated to whole numbers
-/// (docs/method.md#choice-of-photos).
+/// (docs/internals/method.md#choice-of-photos).
 pub fn spread(count: usize, views: usize) -> Vec<usize> {
     (0..views).map(|i| if views > 1 { i * (count - 1) / (views - 1) } else { 0 }).collect()
 }

@@ -1,4 +1,4 @@
-//! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (docs/method.md#photos).
+//! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (docs/internals/method.md#photos).
 mod bars;
 mod border;
 mod candidate;

@@ -21,7 +21,7 @@ use std::sync::Arc;
 pub const MAX_SIZE: usize = 1600;
 
 /// Greatest side of a working image on a CPU device, pixels: photos of 4:3 then have 1.56 times the
-/// pixels of 640 × 480, which keeps a run within twice its time (docs/performance.md).
+/// pixels of 640 × 480, which keeps a run within twice its time (docs/internals/performance.md).
 pub const MAX_SIZE_CPU: usize = 800;
 
 /// The greatest side that suits the device.

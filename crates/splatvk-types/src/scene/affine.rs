@@ -2,7 +2,7 @@
 use super::Camera;
 use serde::{Deserialize, Serialize};
 
-/// Axis-aligned affine map of pixel positions, `u' = s·u + o` per axis (docs/method.md#pixel-maps).
+/// Axis-aligned affine map of pixel positions, `u' = s·u + o` per axis (docs/internals/method.md#pixel-maps).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Affine {
     /// Scale along x and y.

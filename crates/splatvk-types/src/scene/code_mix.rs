@@ -10,7 +10,7 @@ const SHARE_STEPS: f32 = 510.0;
 pub const MIN_LENGTH: f32 = 0.1;
 
 /// A unit feature as the nearest mix of its nearest code with another. Blending and decoding read a feature only through its cosines
-/// to the codes, and a splat between two things mixes two of them; docs/method.md#feature-storage has what that costs.
+/// to the codes, and a splat between two things mixes two of them; docs/internals/method.md#feature-storage has what that costs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CodeMix {
     /// The nearest code; the number of codes where the splat has no feature.

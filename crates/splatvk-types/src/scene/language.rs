@@ -36,7 +36,7 @@ impl From<MaskId> for (u32, u32) {
 pub const LEVEL_NAMES: [&str; 3] = ["s", "m", "l"];
 
 /// The bijection of one level: K distinct unit vectors of the text/image space and their unit codes
-/// (docs/method.md#codebook).
+/// (docs/internals/method.md#codebook).
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct Codebook {
     /// Width D of the embedding space (512 for CLIP B/16).
@@ -64,7 +64,7 @@ impl Codebook {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// `argmax_k F·c_k` (docs/method.md#decoding-codes); ties take the lowest k; `None` without codes.
+    /// `argmax_k F·c_k` (docs/internals/method.md#decoding-codes); ties take the lowest k; `None` without codes.
     pub fn decode(&self, feature: &[f32]) -> Option<usize> {
         let mut best: Option<(f32, usize)> = None;
         for (k, code) in self.codes.chunks_exact(self.code_dim.max(1)).enumerate() {
@@ -86,7 +86,7 @@ pub struct LevelField {
     pub features: Vec<f32>,
     /// [N] what the features are made of, and stored as; empty where they are no mixes of codes.
     pub mixes: Vec<CodeMix>,
-    /// [N] how far the photos agree on what a splat is, in 0..1 (docs/method.md#reliability); empty where that is not known.
+    /// [N] how far the photos agree on what a splat is, in 0..1 (docs/internals/method.md#reliability); empty where that is not known.
     pub reliability: Vec<f32>,
     /// Per training view: code index per pixel, −1 = none. Training targets; empty in a loaded scene.
     pub targets: Vec<Plane<i32>>,

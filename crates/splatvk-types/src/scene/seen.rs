@@ -3,7 +3,7 @@
 use super::Splats;
 
 /// Splats that show less of the photos than this, in pixels, are unseen: they leave no trace in any photo. The bound below which
-/// a splat starts without a feature, too (docs/method.md#lifting).
+/// a splat starts without a feature, too (docs/internals/method.md#lifting).
 const LEAST: f32 = 0.05;
 
 /// What the photos show of every splat; nothing where that is not known, as of a bare file of Gaussians.

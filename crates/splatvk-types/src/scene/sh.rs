@@ -1,5 +1,5 @@
 //! Real spherical harmonics up to degree 3, in the order and with the signs that all 3DGS files use
-//! (docs/method.md#splat-parameters; twin of `glsl/shared/sh.glsl`).
+//! (docs/internals/method.md#splat-parameters; twin of `glsl/shared/sh.glsl`).
 use glam::DVec3;
 
 /// Degree 0.

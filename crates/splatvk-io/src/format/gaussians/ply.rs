@@ -1,5 +1,5 @@
 //! PLY files: the Gaussian layout that 3DGS viewers expect
-//! (docs/method.md#gaussian-ply).
+//! (docs/internals/method.md#gaussian-ply).
 use super::degree::sh_degree;
 use super::ply_header::header;
 use super::ply_points::Colours;
