@@ -59,16 +59,14 @@ pub mod bench;
 #[cfg(feature = "capi")]
 pub mod capi;
 pub mod check;
+pub mod eval;
 #[cfg(feature = "cli")]
 pub mod fetch;
 pub mod fit;
 pub mod gpu;
-pub mod infer;
-pub mod language;
 pub mod pass;
 pub mod pipeline;
 pub mod pose;
-pub mod query;
 pub mod report;
 pub mod run;
 pub mod synth;
@@ -77,6 +75,9 @@ pub mod synth;
 #[doc(hidden)]
 pub mod cli;
 
+pub use splatvk_infer as infer;
 pub use splatvk_io::{format, photo};
+pub use splatvk_language as language;
+pub use splatvk_language::query;
 pub use splatvk_types::{Error, Result, checkpoint, error, math, preset, progress, scene};
 pub(crate) use splatvk_types::{files, sync};

@@ -4,8 +4,8 @@ mod fixture;
 
 use fixture::{data, scene, truth};
 use serde_json::{Value, json};
+use splatvk::eval::GroundTruth;
 use splatvk::format::npy::{self, NpyArray};
-use splatvk::query::eval::GroundTruth;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};

@@ -1,8 +1,8 @@
 //! Data sets in their own layouts, as the runner takes them: frames that may be photos, labels, and cameras where known.
+use crate::eval::protocol::{self, ProtocolKind};
+use crate::eval::{GroundTruth, Split, TruthFrame};
 use crate::format::cameras;
 use crate::photo::{Candidate, MAX_SIZE, join, sizes_of, working_size};
-use crate::query::eval::{GroundTruth, Split, TruthFrame};
-use crate::query::protocol::{self, ProtocolKind};
 use crate::scene::{Camera, Pose};
 use crate::{Error, Result};
 use serde::Serialize;

@@ -3,9 +3,9 @@
 use super::data::DataSet;
 use super::stages::{Scored, asked};
 use crate::Result;
+use crate::eval::protocol::{self, CodeScores, DecodedView, ProtocolKind};
+use crate::eval::{EvalReport, Evaluation, GroundTruth, Rendered, Split};
 use crate::progress::Progress;
-use crate::query::eval::{EvalReport, Evaluation, GroundTruth, Rendered, Split};
-use crate::query::protocol::{self, CodeScores, DecodedView, ProtocolKind};
 use crate::query::{QueryOptions, TextQuery, answer_with, field_relevancy};
 use crate::run::stages::SharedEncoder;
 use crate::scene::{Camera, Codebook, LanguageField, LevelField, Plane, RgbImage};

@@ -4,8 +4,8 @@ use super::runner::RowFigures;
 use super::setup::{RowWork, TableRow};
 use super::stages::Scored;
 use super::tables::Table;
-use crate::query::eval::Split;
-use crate::query::protocol::{ProtocolKind, ProtocolReport};
+use crate::eval::Split;
+use crate::eval::protocol::{ProtocolKind, ProtocolReport};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -158,7 +158,7 @@ pub(super) fn iou(scored: &Scored, scope: &Scope) -> Figures {
 mod tests {
     use super::*;
     use crate::ablate::stages::{EmbeddingAgreement, Scored};
-    use crate::query::eval::{EvalReport, MaskScore};
+    use crate::eval::{EvalReport, MaskScore};
 
     fn mask(frame: &str, split: Split, iou: f64, localised: bool) -> MaskScore {
         MaskScore {

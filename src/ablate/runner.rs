@@ -6,6 +6,7 @@ use super::stages::{
     EncoderEmbeddings, LabelEmbeddings, LabelledMasks, MaskEmbeddings, ObjectEmbeddings, Score,
     ScorePublished, Scored, SyntheticEmbeddings, SyntheticMasks,
 };
+use crate::eval::{BACKGROUND_LABELS, GroundTruth, Split, TruthFrame};
 use crate::fit::{LanguageOptions, Preset, RgbOptions, Trained, TrainedLanguage};
 use crate::gpu::Device;
 use crate::infer::Registry;
@@ -16,7 +17,6 @@ use crate::photo;
 use crate::pipeline::{Graph, Output, Store};
 use crate::progress::{Progress, Recorded};
 use crate::query::TextQuery;
-use crate::query::eval::{BACKGROUND_LABELS, GroundTruth, Split, TruthFrame};
 use crate::run::ask;
 use crate::run::sources::{
     self, DepthSources, FeatureSources, GeometrySources, GraphBuilder, MaskSources, MatchSources,

@@ -1,12 +1,12 @@
 //! What only experiments do: masks and features from ground truth, the true embeddings of objects, and figures.
 use super::data::DataSet;
+use crate::eval::protocol::{self, CodeScores, DecodedView, ProtocolKind, ProtocolReport};
+use crate::eval::{EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
 use crate::fit::{Trained, TrainedLanguage};
 use crate::language::{LevelMasks, ViewMasks, dir};
 use crate::photo::Photo;
 use crate::photo::stem;
 use crate::pipeline::{Context, Lane, Output, Stage};
-use crate::query::eval::{EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
-use crate::query::protocol::{self, CodeScores, DecodedView, ProtocolKind, ProtocolReport};
 use crate::query::{QueryOptions, TextQuery};
 use crate::run::score::{Questions, score_field};
 use crate::run::stages::{PlacedPhotos, SharedEncoder};

@@ -298,7 +298,7 @@ fn aligned(cells: &[Vec<String>]) -> String {
 mod tests {
     use super::*;
     use crate::ablate::tables::table;
-    use crate::query::protocol::ProtocolKind;
+    use crate::eval::protocol::ProtocolKind;
 
     fn measured(data: &str, seed: u64, label: &str, miou: Option<f64>) -> Measurement {
         Measurement {

@@ -1,12 +1,12 @@
 //! Photos → cameras on data with a known answer, without training: how far off they are, and whether the stated
 //! uncertainty of the focal length is right.
+use crate::eval::{GroundTruth, Split, TruthFrame};
 use crate::infer::Registry;
 use crate::photo;
 use crate::pose::align::pose_errors;
 use crate::pose::relative::{auc, pair_errors};
 use crate::pose::{self, Confidence, SolvedCameras};
 use crate::progress::{Progress, Recorded};
-use crate::query::eval::{GroundTruth, Split, TruthFrame};
 use crate::scene::Lens;
 use crate::{Error, Result};
 use serde::Serialize;

@@ -1,12 +1,12 @@
 //! Photos → edges → masks on data with true masks, without cameras and without training: how well the best mask of any
 //! level fits each object, and whether one level has it in all photos.
+use crate::eval::{BACKGROUND_LABELS, GroundTruth, MIN_OBJECT_PIXELS};
 use crate::infer::Registry;
 use crate::infer::hed::Hed;
-use crate::language::{ViewMasks, graph};
+use crate::language::graph;
 use crate::photo;
 use crate::progress::Progress;
-use crate::query::eval::{BACKGROUND_LABELS, GroundTruth, MIN_OBJECT_PIXELS};
-use crate::scene::{LEVEL_NAMES, Plane};
+use crate::scene::LEVEL_NAMES;
 use crate::{Error, Result};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -109,7 +109,7 @@ fn measure_set(
         for (sum, level) in masks.iter_mut().zip(&found.levels) {
             *sum += level.quality.len() as f64;
         }
-        for (label, levels) in ious(&found, &shown) {
+        for (label, levels) in found.best_ious(&shown, MIN_OBJECT_PIXELS) {
             let Some(phrase) = truth.labels.get(&label) else { continue };
             if !BACKGROUND_LABELS.contains(&phrase.as_str()) {
                 let fit = objects.entry(phrase.clone()).or_default();
@@ -144,33 +144,6 @@ fn measure_set(
         mask_seconds: per_photo(mask_seconds),
         objects,
     })
-}
-
-/// Label in `truth` → IoU of its best mask per level; labels of fewer than [`MIN_OBJECT_PIXELS`] are left out. The two may
-/// differ in size.
-pub(crate) fn ious(masks: &ViewMasks, truth: &Plane<u32>) -> BTreeMap<u32, [f64; 3]> {
-    let mut sizes: BTreeMap<u32, usize> = BTreeMap::new();
-    truth.data.iter().for_each(|&t| *sizes.entry(t).or_default() += 1);
-    sizes.retain(|_, n| *n >= MIN_OBJECT_PIXELS);
-    let mut best: BTreeMap<u32, [f64; 3]> = sizes.keys().map(|&t| (t, [0.0; 3])).collect();
-    for (k, level) in masks.levels.iter().enumerate().take(3) {
-        let mut areas = vec![0usize; level.quality.len()];
-        let mut shared: BTreeMap<(usize, u32), usize> = BTreeMap::new();
-        for (p, &t) in truth.data.iter().enumerate() {
-            let x = p % truth.width * level.labels.width / truth.width;
-            let y = p / truth.width * level.labels.height / truth.height;
-            if let Ok(mask) = usize::try_from(level.labels.data[y * level.labels.width + x]) {
-                areas[mask] += 1;
-                *shared.entry((mask, t)).or_default() += 1;
-            }
-        }
-        for (&(mask, t), &both) in &shared {
-            if let (Some(best), Some(size)) = (best.get_mut(&t), sizes.get(&t)) {
-                best[k] = best[k].max(both as f64 / (areas[mask] + size - both) as f64);
-            }
-        }
-    }
-    best
 }
 
 /// Heads of the columns of [`MaskRow::text`].
@@ -238,26 +211,5 @@ mod tests {
         let mut sizes = row.masks.to_vec();
         sizes.sort_by(|a, b| b.total_cmp(a));
         assert_eq!(sizes, row.masks, "finer levels have more masks");
-    }
-
-    #[test]
-    fn iou_is_that_of_the_best_mask_at_any_size_and_specks_do_not_count() {
-        // 20 x 20 truth: label 7 on the left 8 columns, label 9 on 4 pixels; masks at half the size, left 5 columns and rest
-        let mut truth = Plane::filled(20, 20, 0u32);
-        let mut labels = Plane::filled(10, 10, 1i32);
-        for y in 0..20 {
-            for x in 0..8 {
-                truth.data[y * 20 + x] = 7;
-            }
-            for x in 0..10 {
-                labels.data[y / 2 * 10 + x / 2] = 0;
-            }
-        }
-        truth.data[10..14].fill(9);
-        let level = crate::language::LevelMasks { labels, quality: vec![1.0; 2], ..Default::default() };
-        let hole = crate::language::LevelMasks { labels: Plane::filled(10, 10, -1), ..Default::default() };
-        let found = ious(&ViewMasks { levels: vec![level, hole] }, &truth);
-        assert_eq!(found.keys().copied().collect::<Vec<_>>(), [0, 7]);
-        assert_eq!(found[&7], [160.0 / 200.0, 0.0, 0.0]);
     }
 }

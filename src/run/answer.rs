@@ -151,11 +151,12 @@ impl Prepared {
         presence: Option<Presence>,
         options: &QueryOptions,
     ) -> Result<Selection> {
-        let chosen = select(field, &self.places, query, options)?;
-        Ok(match presence {
-            Some(Presence::Absent) => Selection { splats: Vec::new(), found: false, ..chosen },
-            _ => chosen,
-        })
+        let mut chosen = select(field, &self.places, query, options)?;
+        if presence == Some(Presence::Absent) {
+            chosen.splats.clear();
+            chosen.found = false;
+        }
+        Ok(chosen)
     }
 
     /// The answer in these views, which need not be the scene's own.

@@ -32,3 +32,6 @@ pub use method::{FEATURE_DIM, Method, Recipe};
 pub use outcome::RunOutcome;
 pub use plan::{CHECKPOINT_SECONDS, RunPlan};
 pub use record::{closing_table, run_record};
+
+#[cfg(test)]
+mod defaults_tests;

@@ -2,10 +2,10 @@
 use super::refine::{RefinedCamera, ViewRefiner};
 use super::view::{DecodedFrame, Viewer};
 use crate::Result;
+use crate::eval::{EvalReport, Evaluation, RefinedView, Rendered, Split, TruthFrame, colour_fit};
 use crate::gpu::Device;
 use crate::pass::metrics;
 use crate::progress::Progress;
-use crate::query::eval::{EvalReport, Evaluation, RefinedView, Rendered, Split, TruthFrame, colour_fit};
 use crate::query::instances::Places;
 use crate::query::select::select;
 use crate::query::{QueryOptions, QueryResult, TextQuery, answer_with, field_relevancy};
@@ -99,10 +99,10 @@ fn refined(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::eval::GroundTruth;
     use crate::format::picture::write_png;
     use crate::pass::Renderer;
     use crate::progress::Silent;
-    use crate::query::eval::GroundTruth;
     use crate::scene::Pose;
     use crate::scene::seeded;
     use glam::DVec3;

@@ -19,3 +19,6 @@ pub use render::{RayCast, photo, render};
 pub use scene::{SceneSpec, SyntheticScene, build_scene};
 pub use shapes::{Hit, Paint, SceneObject, Shape};
 pub use spoil::Spoil;
+
+#[cfg(test)]
+mod query_tests;

@@ -4,6 +4,7 @@
 //! different objects still have a cosine near 0.65 and the same object from another side near 0.9, while an image and its
 //! phrase reach only about 0.25. Words have fixed directions, so phrases that share a word are alike ("red can", "red
 //! book"), and any phrase has an embedding.
+use crate::eval::{BACKGROUND_LABELS, GroundTruth, TruthFrame};
 use crate::format::create_folder;
 use crate::format::npy::{self, NpyArray};
 use crate::infer::things;
@@ -11,7 +12,6 @@ use crate::language::dir::normalise_rows;
 use crate::language::{LevelMasks, ViewMasks};
 use crate::math::Random;
 use crate::photo::stem;
-use crate::query::eval::{BACKGROUND_LABELS, GroundTruth, TruthFrame};
 use crate::query::presence::Alternatives;
 use crate::query::{CANONICAL_PHRASES, TextQuery};
 use crate::scene::Plane;
@@ -368,8 +368,8 @@ pub fn write(folder: &Path, frames: &[&TruthFrame], regions: &Regions, phrases: 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::eval::Split;
     use crate::math::dot_f32 as dot;
-    use crate::query::eval::Split;
 
     fn breakfast() -> GroundTruth {
         GroundTruth::read(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast"))).unwrap()

@@ -1,12 +1,12 @@
 //! The open pack at its real sizes: graphs with the interfaces of the public files, filled up with weights that nothing reads.
 use super::models::clip_graphs;
 use super::server::{File, Server, plain};
-use super::testing::{Attribute, FLOAT, Onnx};
 use splatvk::fetch::{Client, Limits, fetch};
 use splatvk::infer::Registry;
 use splatvk::infer::catalogue::{CatalogueEntry, Source, catalogue};
 use splatvk::infer::installed::{Task, inventory};
 use splatvk::progress::Silent;
+use splatvk_test_support::onnx::{Attribute, FLOAT, Onnx};
 use std::collections::HashMap;
 
 /// Bytes of the two files without a size in the catalogue: 393.0 MiB of weights, the tokenizer of CLIP.

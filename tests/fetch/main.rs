@@ -8,9 +8,6 @@ mod download;
 mod full_size;
 mod models;
 mod server;
-#[allow(dead_code)] // other tests use the rest
-#[path = "../../src/infer/testing.rs"]
-mod testing;
 
 use sha2::{Digest, Sha256};
 

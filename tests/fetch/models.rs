@@ -1,11 +1,11 @@
 //! Whole models: asked for, downloaded or exported, checked, installed, replaced, killed.
 use super::server::{File, Server, plain};
 use super::sha256;
-use super::testing::{Attribute, FLOAT, INT64, Onnx};
 use splatvk::fetch::{self, Client, Limits};
 use splatvk::infer::Registry;
 use splatvk::infer::catalogue::{CatalogueEntry, catalogue};
 use splatvk::progress::Silent;
+use splatvk_test_support::onnx::{Attribute, FLOAT, INT64, Onnx};
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::{Path, PathBuf};

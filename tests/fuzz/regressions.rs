@@ -1,10 +1,10 @@
 //! What was found once, small enough to be made here: each within the limits of its reader.
 use super::readers::{Limits, within};
 use super::{ONE, seeds};
+use splatvk::eval::protocol::{self, ProtocolKind};
 use splatvk::format::{cameras, colmap, gaussians, npy};
 use splatvk::infer::adapter::Adapter;
 use splatvk::infer::onnx;
-use splatvk::query::protocol::{self, ProtocolKind};
 use splatvk::{Error, Result};
 use std::io::Write;
 use std::path::{Path, PathBuf};

@@ -117,7 +117,7 @@ def photo(size, count=2):
 
 
 def waves(size, shift):
-    """The texture of src/infer/check.rs: smooth, and nowhere the same."""
+    """The texture of crates/splatvk-infer/src/check.rs: smooth, and nowhere the same."""
     x, y = np.meshgrid(np.arange(size[0]) + shift, np.arange(size[1]))
     rows = [0.5 + 0.5 * np.sin(x * a + 1) * np.cos(y * b - 1) for a, b in [(0.11, 0.07), (0.05, 0.13), (0.23, 0.19)]]
     return torch.from_numpy(np.stack(rows)[None].astype(np.float32))

@@ -2,7 +2,7 @@
 use super::number::whole;
 use super::shared::DeviceArgs;
 use crate::ablate::{Layout, TABLES};
-use crate::query::protocol::ProtocolKind;
+use crate::eval::protocol::ProtocolKind;
 use crate::synth::{Flat, Spoil};
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};

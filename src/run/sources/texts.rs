@@ -165,7 +165,7 @@ impl RegionEncoder for DirTexts {
 mod tests {
     use super::*;
     use crate::format::npy::{NpyArray, write_npz};
-    use crate::infer::tests::clip_in;
+    use splatvk_test_support::toys::clip_in;
 
     fn encoder(folder: &Path, dim: Option<usize>) -> Box<dyn RegionEncoder> {
         dir_encoder(&folder.join("text_embeddings.npz"), dim, &Registry::of(&[folder])).unwrap()

@@ -1,0 +1,383 @@
+//! CLIP (Radford et al. 2021; OpenCLIP): image regions and texts in one space, any embedding width. A model is an image tower
+//! or a network with a feature per pixel (LSeg), a text tower, and `tokenizer.json` beside it.
+use std::path::PathBuf;
+
+use rayon::prelude::*;
+use tokenizers::Tokenizer;
+
+use super::cache::OutputKey;
+use super::classify::{crop, extents};
+use super::contract::Part;
+use super::graph::{Graph, GraphFile};
+use super::installed::Installed;
+use super::prepare::prepare;
+use super::runtime::Input;
+use super::text::normalise;
+use super::{RegionEncoder, things};
+use crate::progress::{Progress, Silent};
+use crate::scene::{Plane, RgbImage};
+use crate::{Error, Result};
+
+/// Crops per forward pass: ViT-B/16 takes 0.2 GB for eight, and more are no faster on a CPU.
+const BATCH: usize = 8;
+/// Tokens of a text where the graph leaves the number open: CLIP's context.
+const CONTEXT: usize = 77;
+
+/// CLIP's vocabulary, and what its own tokenizer makes of some texts (open_clip 3.3, less the start and end marks).
+const VOCABULARY: usize = 49408;
+const GOLDEN: [(&str, &[i64]); 12] = [
+    ("lemon", &[7184]),
+    ("a photo of a cat.", &[320, 1125, 539, 320, 2368, 269]),
+    ("Blue MUG", &[1746, 9722]),
+    ("café!", &[15304, 256]),
+    ("it's 3 o'clock", &[585, 568, 274, 334, 262, 6716]),
+    ("日本語", &[39121, 44353, 34002, 508]),
+    ("naïve — “quoted”", &[1097, 35689, 563, 2005, 257, 27706, 257]),
+    ("x²+y²=z²", &[343, 41175, 266, 344, 41175, 284, 345, 41175]),
+    ("🙂 smile", &[14860, 3490]),
+    ("&amp;amp; more", &[261, 750]),
+    ("hello   world\n\tfoo", &[3306, 1002, 23435]),
+    ("grandmother's vase, 1950s", &[17469, 568, 20431, 267, 272, 280, 276, 271, 338]),
+];
+
+/// The pair of towers. Each is loaded when first needed.
+pub struct Clip {
+    model: Installed,
+    space: String,
+    tokenizer: Tokenizer,
+    image: Option<Graph>,
+    text: Option<Graph>,
+    dim: usize,
+}
+
+impl Clip {
+    /// Checks that the towers belong together; after that they are loaded when first used.
+    pub fn load(mut model: Installed) -> Result<Clip> {
+        let text = model.graph(Part::TextTower)?.clone();
+        if let (Some(dense), Some(dim)) =
+            (model.graphs.get_mut(&Part::DenseFeatures), text.fixed("embedding", "D"))
+        {
+            // A picture of fixed size is as long as it is wide or high: only the texts tell which axis holds the features.
+            dense.fix_axis("features", "D", dim);
+        }
+        let (visual, axis) = match model.graph(Part::ImageTower) {
+            Ok(tower) => (tower.clone(), "embedding"),
+            Err(_) => (model.graph(Part::DenseFeatures)?.clone(), "features"),
+        };
+        let widths = (visual.fixed(axis, "D"), text.fixed("embedding", "D"));
+        if let (Some(a), Some(b)) = widths
+            && a != b
+        {
+            return Err(towers_differ(&visual, &text, &format!("embeddings of {a} and {b} values")));
+        }
+        let tokenizer = tokenizer(&model)?;
+        // The space is the weights: features may be compared with texts only when both came from them.
+        let space =
+            format!("{}:{}", model.family, OutputKey::new("space").model(&visual)?.model(&text)?.short());
+        let mut clip = Clip { model, space, tokenizer, image: None, text: None, dim: 0 };
+        clip.tokens_are_right(&text)?;
+        clip.dim = match widths.0.or(widths.1) {
+            Some(dim) => dim,
+            None => clip.embed_texts(&["a"])?.len(),
+        };
+        if !clip.model.untrained() {
+            clip.check_towers_match(&visual, &text)?;
+        }
+        Ok(clip)
+    }
+
+    /// Refuses towers of different checkpoints: plain red, green and blue squares must each be nearest to their own name.
+    /// Chance passes one pair of unrelated towers in 512.
+    fn check_towers_match(&mut self, visual: &GraphFile, text: &GraphFile) -> Result<()> {
+        const COLOURS: [(&str, [f32; 3]); 3] = [
+            ("a red square", [0.9, 0.05, 0.05]),
+            ("a green square", [0.05, 0.7, 0.1]),
+            ("a blue square", [0.05, 0.1, 0.9]),
+        ];
+        const OTHERS: [&str; 5] =
+            ["a dog", "a city street at night", "a page of text", "a person on a bicycle", "a plate of food"];
+        let key = OutputKey::new("towers").model(visual)?.model(text)?;
+        let seen = visual.compute.remember(key, || {
+            let texts: Vec<&str> = COLOURS.iter().map(|c| c.0).chain(OTHERS).collect();
+            let names = self.embed_texts(&texts)?;
+            let mut cosines = Vec::new();
+            for (_, rgb) in COLOURS {
+                let image = RgbImage { width: 224, height: 224, data: vec![rgb; 224 * 224] };
+                let shown = self.embed_regions(&image, &Plane::filled(224, 224, 0), 1, &Silent)?;
+                let to = |name: &[f32]| name.iter().zip(&shown).map(|(a, b)| a * b).sum::<f32>();
+                cosines.extend(names.chunks_exact(self.dim.max(1)).map(to));
+            }
+            Ok(cosines)
+        })?;
+        let own = |(k, row): (usize, &[f32])| (0..row.len()).all(|j| j == k || row[j] < row[k]);
+        if seen.len() == 24 && seen.chunks_exact(8).enumerate().all(own) {
+            return Ok(());
+        }
+        Err(towers_differ(visual, text, "a red, a green and a blue square are not nearest to their names"))
+    }
+
+    /// A tokenizer with CLIP's vocabulary must give CLIP's ids; another vocabulary is its model's own affair.
+    fn tokens_are_right(&self, tower: &GraphFile) -> Result<()> {
+        if self.tokenizer.get_vocab_size(true) != VOCABULARY {
+            return Ok(());
+        }
+        for (text, wanted) in GOLDEN {
+            let ids = self.tokens(text)?;
+            if ids.len() < 2 || ids[1..ids.len() - 1] != *wanted {
+                return Err(Error::missing_model(
+                    tower.path.display(),
+                    format!(
+                        "{}: the tokenizer beside it does not give CLIP's tokens for {text:?} ({ids:?}); take tokenizer.json from \
+                     the model's own page or from tools/export/export_clip.py",
+                        tower.path.display()
+                    ),
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    fn visual(&mut self) -> Result<&mut Graph> {
+        let graph = match self.image.take() {
+            Some(graph) => graph,
+            None => match self.model.graph(Part::ImageTower) {
+                Ok(tower) => tower.load()?,
+                Err(_) => self.model.graph(Part::DenseFeatures)?.load()?,
+            },
+        };
+        Ok(self.image.insert(graph))
+    }
+
+    /// Token ids of a text with its start and end marks, cut to the context with the end mark last.
+    pub fn tokens(&self, text: &str) -> Result<Vec<i64>> {
+        let encoded = self
+            .tokenizer
+            .encode(cleaned(text), true)
+            .map_err(|e| Error::input(format!("text {text:?}: {e}")))?;
+        let mut ids: Vec<i64> = encoded.get_ids().iter().map(|id| i64::from(*id)).collect();
+        let context = self.context();
+        if ids.len() > context {
+            let end = ids.last().copied().unwrap_or_default();
+            ids.truncate(context);
+            ids[context - 1] = end;
+        }
+        Ok(ids)
+    }
+
+    fn context(&self) -> usize {
+        let fixed = self.model.graph(Part::TextTower).ok().and_then(|g| g.fixed("tokens", "L"));
+        fixed.unwrap_or(CONTEXT).max(2)
+    }
+
+    /// Every region from a crop of its own, on black.
+    fn crop_features(
+        &mut self,
+        image: &RgbImage,
+        labels: &Plane<i32>,
+        count: usize,
+        progress: &dyn Progress,
+    ) -> Result<Vec<f32>> {
+        let dim = self.dim;
+        let graph = self.visual()?;
+        let Some(spec) = graph.file.binding.image.clone() else {
+            return Err(Error::work(format!("{}: no image range in its adapter", graph.file.path.display())));
+        };
+        let side = graph.file.fixed("image", "W").unwrap_or(spec.size);
+        let batch = graph.file.fixed("image", "B").unwrap_or(BATCH);
+        let present: Vec<_> =
+            extents(labels, count).into_iter().enumerate().filter_map(|(i, e)| Some((i, e?))).collect();
+        let mut all = vec![0f32; count * dim];
+        for regions in present.chunks(batch) {
+            progress.check()?;
+            let mut crops: Vec<f32> = regions
+                .par_iter()
+                .flat_map_iter(|(i, e)| {
+                    let mut planes = crop(image, labels, *i as i32, *e, side, 0.0);
+                    for (c, plane) in planes.chunks_exact_mut(side * side).enumerate() {
+                        plane.iter_mut().for_each(|v| *v = (*v - spec.mean[c]) / spec.std[c]);
+                    }
+                    planes
+                })
+                .collect();
+            // A graph of a fixed batch gets zeros for what is missing.
+            let rows = if graph.file.fixed("image", "B").is_some() { batch } else { regions.len() };
+            crops.resize(rows * 3 * side * side, 0.0);
+            let embedding = graph
+                .run(vec![("image", Input::F32(vec![rows, 3, side, side], crops))])?
+                .take("embedding")?;
+            for ((i, _), row) in regions.iter().zip(embedding.data.chunks_exact(dim)) {
+                all[i * dim..(i + 1) * dim].copy_from_slice(row);
+            }
+        }
+        Ok(all)
+    }
+
+    /// Every region as the mean of its pixels' features.
+    fn pixel_features(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
+        let dim = self.dim;
+        let graph = self.visual()?;
+        let Some(spec) = graph.file.binding.image.clone() else {
+            return Err(Error::work(format!("{}: no image range in its adapter", graph.file.path.display())));
+        };
+        let ready = prepare(image, &graph.file, &spec, "image");
+        let features = graph.run(vec![("image", ready.input())])?.take("features")?;
+        let [_, rows, columns, _] = features.shape[..] else { return Ok(vec![0.0; count * dim]) };
+        let mut all = vec![0f32; count * dim];
+        for (p, label) in labels.data.iter().enumerate() {
+            let Some(sum) = usize::try_from(*label).ok().and_then(|l| all.chunks_exact_mut(dim).nth(l))
+            else {
+                continue;
+            };
+            let at = [(p % labels.width) as f64 + 0.5, (p / labels.width) as f64 + 0.5];
+            let [u, v] = ready.from_photo.apply(at);
+            let cell = |u: f64, cells: usize, pixels: usize| {
+                ((u * cells as f64 / pixels as f64) as usize).min(cells - 1)
+            };
+            let (x, y) = (cell(u, columns, ready.width), cell(v, rows, ready.height));
+            let from = (y * columns + x) * dim;
+            sum.iter_mut().zip(&features.data[from..]).for_each(|(s, f)| *s += f);
+        }
+        Ok(all)
+    }
+}
+
+impl RegionEncoder for Clip {
+    fn space(&self) -> &str {
+        &self.space
+    }
+
+    fn dim(&self) -> usize {
+        self.dim
+    }
+
+    fn embed_regions(
+        &mut self,
+        image: &RgbImage,
+        labels: &Plane<i32>,
+        count: usize,
+        progress: &dyn Progress,
+    ) -> Result<Vec<f32>> {
+        let dense = self.model.graph(Part::ImageTower).is_err();
+        let graph = self.model.graph(if dense { Part::DenseFeatures } else { Part::ImageTower })?;
+        let key = OutputKey::new("features").model(graph)?.values(&image.data).values(&labels.data);
+        let key = key.values(&[image.width as u64, count as u64]);
+        let compute = graph.compute.clone();
+        let mut rows = compute.remember(key, || {
+            if dense {
+                self.pixel_features(image, labels, count)
+            } else {
+                self.crop_features(image, labels, count, progress)
+            }
+        })?;
+        rows.chunks_exact_mut(self.dim.max(1)).for_each(normalise);
+        Ok(rows)
+    }
+
+    fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
+        let context = self.context();
+        let tokens = texts.iter().map(|t| self.tokens(t)).collect::<Result<Vec<_>>>()?;
+        let file = self.model.graph(Part::TextTower)?.clone();
+        let graph = match self.text.take() {
+            Some(graph) => graph,
+            None => file.load()?,
+        };
+        let graph = self.text.insert(graph);
+        let mut all = Vec::new();
+        // One at a time: a text's embedding must not depend on its neighbours, and some exports fix the batch at 1.
+        for ids in tokens {
+            let mask = (0..context).map(|k| i64::from(k < ids.len())).collect();
+            let mut ids = ids;
+            ids.resize(context, 0);
+            let shape = || vec![1, context];
+            let inputs = vec![("tokens", Input::I64(shape(), ids)), ("mask", Input::I64(shape(), mask))];
+            let mut row = graph.run(inputs)?.take("embedding")?.data;
+            normalise(&mut row);
+            all.extend(row);
+        }
+        Ok(all)
+    }
+
+    fn others(&mut self, form: &str) -> Result<Vec<f32>> {
+        let texts = things::of_form(form);
+        let graph = self.model.graph(Part::TextTower)?;
+        let key = OutputKey::new("other-things").model(graph)?.text(&texts.join("\n"));
+        let compute = graph.compute.clone();
+        compute.remember(key, || self.embed_texts(&texts.iter().map(String::as_str).collect::<Vec<_>>()))
+    }
+}
+
+fn towers_differ(visual: &GraphFile, text: &GraphFile, why: &str) -> Error {
+    Error::missing_model(
+        visual.path.display(),
+        format!(
+            "{} and {} do not belong together ({why}); export both towers from one checkpoint",
+            visual.path.display(),
+            text.path.display()
+        ),
+    )
+}
+
+fn tokenizer(model: &Installed) -> Result<Tokenizer> {
+    let text = model.graph(Part::TextTower)?;
+    let beside = text.path.with_file_name("tokenizer.json");
+    let places: [PathBuf; 2] = [beside, model.folder.join("tokenizer.json")];
+    let file = places.iter().find(|p| p.is_file()).ok_or_else(|| {
+        Error::missing_model(&model.name, format!(
+            "{}: missing; tools/export/export_clip.py writes it, and Hugging Face has one beside every CLIP model",
+            places[0].display()
+        ))
+    })?;
+    let failed = |e: tokenizers::Error| {
+        Error::missing_model(&model.name, format!("{}: not a tokenizer: {e}", file.display()))
+    };
+    let mut tokenizer = Tokenizer::from_file(file).map_err(failed)?;
+    tokenizer.with_padding(None);
+    tokenizer.with_truncation(None).map_err(failed)?;
+    Ok(tokenizer)
+}
+
+/// What CLIP's own tokenizer does before it splits words: typographic quotes straightened (as ftfy does) and HTML entities
+/// resolved twice. Case and white space are the tokenizer file's affair.
+fn cleaned(text: &str) -> String {
+    let entities =
+        [("&lt;", "<"), ("&gt;", ">"), ("&quot;", "\""), ("&#39;", "'"), ("&nbsp;", " "), ("&amp;", "&")];
+    let quotes = |c: char| match c {
+        '‘' | '’' | '‚' | '‛' => '\'',
+        '“' | '”' | '„' | '‟' => '"',
+        c => c,
+    };
+    let once = |text: String| entities.iter().fold(text, |t, (from, to)| t.replace(from, to));
+    once(once(text.chars().map(quotes).collect())).trim().to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::installed::Task;
+    use super::super::{Compute, Registry};
+    use super::*;
+    use splatvk_test_support::toys::clip_in;
+
+    #[test]
+    fn features_that_are_kept_are_those_of_the_photos_masks() {
+        let dir = tempfile::tempdir().unwrap();
+        clip_in(dir.path(), [0, 1, 2]);
+        let registry = Registry::with(Some(dir.path()), Compute::by(Some("cpu"))).unwrap();
+        let mut clip = Clip::load(registry.installed(Task::Features, "clip").unwrap()).unwrap();
+        // Red above, blue below, and a mask of each half; then the two masks change places.
+        let data = (0..640).map(|p| if p < 320 { [1.0, 0.0, 0.0] } else { [0.0, 0.0, 1.0] }).collect();
+        let image = RgbImage { width: 32, height: 20, data };
+        let mut first_is_red = |labels: [i32; 2]| {
+            let data = (0..640).map(|p| labels[p / 320]).collect();
+            let labels = Plane { width: 32, height: 20, data };
+            let rows = clip.embed_regions(&image, &labels, 2, &Silent).unwrap();
+            rows[0] > rows[2]
+        };
+        assert_eq!((first_is_red([0, 1]), first_is_red([1, 0])), (true, false));
+    }
+
+    #[test]
+    fn quotes_are_straightened_and_entities_resolved_as_clip_does() {
+        let given = [" grandmother’s “vase” ", "&amp;amp; more", "a &lt;b&gt; c&#39;s"];
+        assert_eq!(given.map(cleaned), ["grandmother's \"vase\"", "& more", "a <b> c's"]);
+    }
+}

@@ -1,0 +1,115 @@
+//! ONNX inference: sessions, model registry, one file per model family.
+//!
+//! Networks that users bring are recognised by what goes in and comes out: [`onnx`] reads a file's header, [`contract`] states
+//! what splatvk requires of each part of a model, [`adapter`] maps a file's names to it, [`graph`] runs it by role.
+// [N, 3] in the docs states a shape; rustdoc takes it for a link.
+#![allow(rustdoc::broken_intra_doc_links)]
+
+pub mod adapter;
+pub mod best_pairs;
+pub mod cache;
+pub mod catalogue;
+pub mod check;
+mod classify;
+pub mod clip;
+mod colour;
+mod compute;
+pub mod contract;
+pub mod depth_prior;
+pub mod graph;
+pub mod hed;
+pub mod installed;
+mod library;
+mod multiview;
+pub mod onnx;
+pub mod pairs;
+pub mod prepare;
+pub mod provider;
+mod registry;
+mod runtime;
+pub mod sam;
+#[cfg(test)]
+mod tests;
+pub mod text;
+pub mod things;
+pub mod warp;
+pub mod words;
+pub mod xfeat;
+
+pub use compute::Compute;
+pub use library::runtime;
+pub use registry::{ModelStatus, PackFileKind, Registry, home};
+pub use runtime::{Input, Session, Tensor};
+
+pub(crate) use splatvk_io::{format, photo};
+pub(crate) use splatvk_types::{Error, Result, error, files, math, progress, scene, sync};
+
+use crate::progress::Progress;
+use crate::scene::{Plane, RgbImage};
+
+/// The `best` of the rows [P, D] for each of the regions [count, D], by cosine.
+pub fn nearest(regions: &[f32], rows: &[f32], dim: usize, best: usize) -> Vec<Vec<(usize, f32)>> {
+    use rayon::prelude::*;
+    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f32>();
+    let of = |region: &[f32]| {
+        let mut list: Vec<(usize, f32)> =
+            rows.chunks_exact(dim).map(|row| dot(row, region)).enumerate().collect();
+        list.sort_by(|a, b| b.1.total_cmp(&a.1));
+        list.truncate(best);
+        list
+    };
+    regions.par_chunks_exact(dim).map(of).collect()
+}
+
+/// Puts image regions and texts into one space of unit vectors, so that a cosine measures how well a phrase names a
+/// region. Implemented by `words` (the built-in default) and by user-supplied CLIP-like pairs of towers.
+pub trait RegionEncoder: Send {
+    /// Name of the space; features and texts may be compared only when this agrees.
+    fn space(&self) -> &str;
+    /// D, the length of every embedding.
+    fn dim(&self) -> usize;
+    /// [count, D] row-major unit vectors, one per region `0..count` of `labels` (the same size as `image`; −1 and
+    /// values ≥ `count` belong to no region). A region without a pixel gets a zero row. Asks between what it gives the network
+    /// at once whether to stop.
+    fn embed_regions(
+        &mut self,
+        image: &RgbImage,
+        labels: &Plane<i32>,
+        count: usize,
+        progress: &dyn Progress,
+    ) -> Result<Vec<f32>>;
+    /// [texts.len(), D] row-major unit vectors.
+    fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>>;
+    /// [N, D] unit rows of [`things::of_form`]; fewer, or none, from an encoder that knows only some texts.
+    fn others(&mut self, form: &str) -> Result<Vec<f32>> {
+        let list = things::of_form(form);
+        self.embed_texts(&list.iter().map(String::as_str).collect::<Vec<_>>())
+    }
+    /// [M, D] unit rows of [`things::recoloured`]; fewer, or none, from an encoder that knows only some texts.
+    fn recoloured(&mut self, text: &str) -> Result<Vec<f32>> {
+        let list = things::recoloured(text);
+        self.embed_texts(&list.iter().map(String::as_str).collect::<Vec<_>>())
+    }
+    /// Whether a text is one whole to the encoder, whatever its words say: an entry of a table.
+    fn holds(&self, _text: &str) -> bool {
+        false
+    }
+    /// Whether a text is among the words that the encoder knows, and which of them is nearest to it; `None` from an encoder that
+    /// is not bound to a list of words.
+    fn nearest_word(&mut self, _text: &str) -> Result<Option<(bool, String)>> {
+        Ok(None)
+    }
+    /// What gave a text its embedding, of an encoder that has several: a table or a network by name.
+    fn embedded_by(&self, _text: &str) -> Option<String> {
+        None
+    }
+    /// What is doubtful about the embeddings given so far.
+    fn doubt(&self) -> Option<String> {
+        None
+    }
+    /// Per region embedding ([count, D] rows) the `best` phrases of the encoder's own vocabulary, with their cosine, best
+    /// first. None from an encoder that has no list of phrases.
+    fn names(&mut self, regions: &[f32], _best: usize) -> Result<Vec<Vec<(String, f32)>>> {
+        Ok(vec![Vec::new(); regions.len() / self.dim().max(1)])
+    }
+}

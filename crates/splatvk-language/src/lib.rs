@@ -1,0 +1,24 @@
+//! Masks, region features, alignment, codebook.
+//!
+//! [`dir`] or [`graph`] give masks, a [`splatvk_infer::RegionEncoder`] or `dir` their features, [`matcher`] the dense
+//! matches between views; [`build()`] aligns everything and turns it into codebooks and training targets.
+
+// [N, 3] in the docs states a shape; rustdoc takes it for a link.
+#![allow(rustdoc::broken_intra_doc_links)]
+
+pub mod align;
+mod build;
+pub mod codebook;
+pub mod dir;
+pub mod graph;
+mod join;
+mod masks;
+pub mod matcher;
+pub mod query;
+pub mod sam;
+
+pub use build::{BuildOptions, Language, Reducer, build};
+pub use join::{SceneView, join};
+pub use masks::{LevelMasks, ViewMasks};
+pub(crate) use splatvk_io::{format, photo};
+pub(crate) use splatvk_types::{Error, Result, math, progress, scene};

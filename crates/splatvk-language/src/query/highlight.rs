@@ -1,0 +1,97 @@
+//! The answer to a query for the scene as a whole: which codes are highlighted, in any view.
+use super::{QueryResult, TextQuery, field_relevancy};
+use crate::Result;
+use crate::scene::{LEVEL_NAMES, LanguageField, Plane};
+
+/// What viewers draw for a query. The level and the codes are those that answered in the views where the text was
+/// found, so that a viewer lights up what the views' masks show.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Highlight {
+    /// Chosen level, index as in [`LEVEL_NAMES`].
+    pub level: usize,
+    /// Codes of that level that answer, ascending.
+    pub codes: Vec<usize>,
+    /// Relevancy of every code, per level.
+    pub relevancy: Vec<Vec<f32>>,
+}
+
+/// Sums up the answers to `query` in the frames whose decoded maps are `codes`. Views vote for a level with their score;
+/// where no view found anything, all of them vote.
+pub fn highlight(
+    codes: &[&[Plane<i32>]],
+    field: &LanguageField,
+    query: &TextQuery,
+    answers: &[QueryResult],
+) -> Result<Highlight> {
+    let relevancy = field_relevancy(field, query)?;
+    let any = answers.iter().any(|a| a.found);
+    let counts = |a: &&QueryResult| a.found || !any;
+    let mut votes = [0.0; LEVEL_NAMES.len()];
+    answers.iter().filter(counts).for_each(|a| votes[a.level] += a.score);
+    // Of equal votes the coarser level's: max_by keeps the last.
+    let level = (0..votes.len()).max_by(|&a, &b| votes[a].total_cmp(&votes[b])).unwrap_or(0);
+    let mut chosen = vec![false; relevancy.get(level).map_or(0, Vec::len)];
+    for (frame, answer) in codes.iter().zip(answers).filter(|(_, a)| counts(a) && a.level == level) {
+        for (&code, _) in frame[level].data.iter().zip(&answer.mask.data).filter(|(_, m)| **m) {
+            if let Some(c) = usize::try_from(code).ok().and_then(|k| chosen.get_mut(k)) {
+                *c = true;
+            }
+        }
+    }
+    let codes = chosen.iter().enumerate().filter(|(_, c)| **c).map(|(k, _)| k).collect();
+    Ok(Highlight { level, codes, relevancy })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Codebook, LevelField};
+
+    /// A level whose codes are unit vectors of the text space itself.
+    fn level(rows: &[[f32; 3]]) -> LevelField {
+        let flat: Vec<f32> = rows.iter().flatten().copied().collect();
+        let codebook = Codebook {
+            embedding_dim: 3,
+            code_dim: 3,
+            embeddings: flat.clone(),
+            codes: flat,
+            ..Codebook::default()
+        };
+        LevelField { codebook, ..LevelField::default() }
+    }
+
+    #[test]
+    fn codes_of_the_views_that_found_it_light_up() {
+        let fine = level(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
+        let coarse = level(&[[0.9, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
+        let field = LanguageField { levels: vec![fine, LevelField::default(), coarse], space: "t".into() };
+        let query = TextQuery {
+            text: "x".into(),
+            embedding: vec![1.0, 0.0, 0.0],
+            canonicals: vec![0.0, 0.0, 1.0],
+            ..Default::default()
+        };
+        let map = |data: &[i32]| Plane { width: data.len(), height: 1, data: data.to_vec() };
+        let (first, second) = (
+            vec![map(&[0, 1]), map(&[-1, -1]), map(&[0, 2])],
+            vec![map(&[1, 1]), map(&[-1, -1]), map(&[1, 1])],
+        );
+        let frames: Vec<&[Plane<i32>]> = vec![&first, &second];
+        let answer = |level, found, score, mask: [bool; 2]| QueryResult {
+            level,
+            found,
+            score,
+            mask: Plane { width: 2, height: 1, data: mask.to_vec() },
+            ..QueryResult::default()
+        };
+        let seen = [answer(2, true, 0.9, [true, false]), answer(0, false, 0.95, [true, true])];
+        let lit = highlight(&frames, &field, &query, &seen).unwrap();
+        assert_eq!((lit.level, &lit.codes[..]), (2, &[0][..]));
+        assert_eq!(lit.relevancy.iter().map(Vec::len).collect::<Vec<_>>(), [2, 0, 3]);
+        assert!(lit.relevancy[2][0] > 0.99 && lit.relevancy[2][2] < 0.01, "σ(±10·0.9)");
+        // Found nowhere: the better guess.
+        let unseen = [answer(2, false, 0.3, [true, false]), answer(0, false, 0.4, [true, true])];
+        let lit = highlight(&frames, &field, &query, &unseen).unwrap();
+        assert_eq!((lit.level, &lit.codes[..]), (0, &[1][..]));
+    }
+}

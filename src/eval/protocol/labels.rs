@@ -1,0 +1,53 @@
+//! The labels of the published layouts as one object index per pixel, as ground truth for masks and features.
+use crate::eval::ObjectMaps;
+use crate::scene::{Camera, Plane};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// What a folder of a published layout labels.
+#[derive(Clone, Debug)]
+pub struct Labels {
+    /// Labelled frames in order, by file stem.
+    pub stems: Vec<String>,
+    /// Object index, from 1, → phrase; 0 is no object.
+    pub phrases: BTreeMap<u32, String>,
+    /// Object index per pixel of each frame.
+    pub maps: Arc<dyn ObjectMaps>,
+    /// Cameras that the layout itself states.
+    pub cameras: Vec<Camera>,
+}
+
+/// Numbered from 1 in their order.
+pub(super) fn numbered(phrases: impl IntoIterator<Item = String>) -> BTreeMap<u32, String> {
+    (1..).zip(phrases).collect()
+}
+
+/// Masks of one frame as one plane: where objects overlap, the smaller one is seen in front of the larger.
+pub(super) fn painted(mut masks: Vec<(u32, Plane<bool>)>) -> Option<Plane<u32>> {
+    masks.sort_by_key(|(_, m)| std::cmp::Reverse(m.data.iter().filter(|&&in_it| in_it).count()));
+    let (_, first) = masks.first()?;
+    let mut out = Plane::filled(first.width, first.height, 0u32);
+    let pixels = out.data.len();
+    for (label, mask) in masks.iter().filter(|(_, m)| m.data.len() == pixels) {
+        let inside = out.data.iter_mut().zip(&mask.data).filter(|(_, in_it)| **in_it);
+        inside.for_each(|(slot, _)| *slot = *label);
+    }
+    Some(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_overlapping_masks_the_smaller_one_is_in_front() {
+        let mask = |from: usize, to: usize| Plane {
+            width: 6,
+            height: 1,
+            data: (0..6).map(|x| (from..to).contains(&x)).collect(),
+        };
+        let plane = painted(vec![(7, mask(2, 4)), (3, mask(0, 5))]).unwrap();
+        assert_eq!(plane.data, [3, 3, 7, 7, 3, 0]);
+        assert!(painted(Vec::new()).is_none());
+    }
+}

@@ -1,0 +1,48 @@
+//! The published evaluation protocols, from their public file layouts (docs/internals/method.md#protocols).
+//!
+//! [`open`] reads a data set's labels and lists the cameras to render and the texts to query; the caller renders and
+//! decodes each frame and hands it to [`Protocol::add`]; [`Protocol::finish`] gives the figures with the definitions they
+//! follow. The project's own protocol, `field`, is [`crate::eval`].
+mod labels;
+mod lerf;
+mod ovs;
+mod polygon;
+mod scannet;
+mod score;
+
+#[cfg(test)]
+mod tests;
+
+pub use labels::Labels;
+pub use score::{
+    CodeScores, DecodedView, LabelledView, Masks, Protocol, ProtocolKind, ProtocolReport, ProtocolSummary,
+    Score,
+};
+
+use crate::Result;
+use crate::scene::Camera;
+use std::path::Path;
+
+/// What `folder` labels, frame by frame.
+pub fn labels(kind: ProtocolKind, folder: &Path) -> Result<Labels> {
+    match kind {
+        ProtocolKind::Lerf => lerf::labels(folder),
+        ProtocolKind::Ovs => ovs::labels(folder),
+        ProtocolKind::ScanNet => scannet::labels(folder),
+    }
+}
+
+/// Reads the labels of `folder`. `scene` are the scene's cameras; `known` the data set's own cameras, which place the
+/// frames that the scene was not made from (without them only the scene's own photos are scored).
+pub fn open(
+    kind: ProtocolKind,
+    folder: &Path,
+    scene: &[Camera],
+    known: &[Camera],
+) -> Result<Box<dyn Protocol>> {
+    Ok(match kind {
+        ProtocolKind::Lerf => Box::new(lerf::Lerf::open(folder, scene, known)?),
+        ProtocolKind::Ovs => Box::new(ovs::Ovs::open(folder, scene, known)?),
+        ProtocolKind::ScanNet => Box::new(scannet::ScanNet::open(folder, scene, known)?),
+    })
+}

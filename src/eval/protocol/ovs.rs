@@ -1,0 +1,306 @@
+//! 3D-OVS (docs/internals/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and the data set's own argmax.
+use super::labels::{Labels, numbered, painted};
+use super::score::{
+    DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score, mask_iou,
+    mean, nearest, place, summarise,
+};
+use crate::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, ObjectMaps, Split};
+use crate::scene::{Camera, Plane};
+use crate::{Error, Result, files, photo};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// τ of the paper: relevancy above which a pixel belongs to the answer.
+const TAU: f32 = 0.8;
+/// Smallest mask of a level that may answer, pixels (paper).
+const AREA: usize = 2000;
+/// Where no level passes: share of the best level's maximum that cuts the mask instead.
+const SUBSTITUTE: f32 = 0.95;
+/// Share of the maximal cosine that cuts the mask in the authors' script (its default; per scene .75 to .95).
+const BAR: f32 = 0.85;
+/// Smallest mask there, pixels.
+const AUTHORS_AREA: usize = 3000;
+
+const PAPER: &str = "paper";
+const AUTHORS: &str = "authors";
+const ARGMAX: &str = "argmax";
+
+/// The labels and what was scored so far.
+pub(super) struct Ovs {
+    views: Vec<LabelledView>,
+    source: LabelSource,
+    classes: Vec<String>,
+    scores: Vec<Score>,
+    /// Per split: labelled pixels, those whose class was found.
+    pixels: BTreeMap<&'static str, [u64; 2]>,
+}
+
+enum LabelSource {
+    /// `segmentations/`
+    Folder(PathBuf),
+    Own(OwnLabels),
+}
+
+impl Ovs {
+    pub fn open(folder: &Path, scene: &[Camera], known: &[Camera]) -> Result<Self> {
+        let (views, classes, source) = match OwnLabels::open(folder, scene)? {
+            Some(own) => {
+                // The argmax needs every label to compete, also those of the background.
+                let classes = own.truth.labels.values().cloned().collect();
+                (own.views.clone(), classes, LabelSource::Own(own))
+            }
+            None => {
+                let root = root(folder);
+                let classes = read_classes(&root)?;
+                (place(&frames(&root)?, scene, known)?, classes, LabelSource::Folder(root))
+            }
+        };
+        Ok(Ovs { views, source, classes, scores: Vec::new(), pixels: BTreeMap::new() })
+    }
+
+    /// Mask per class of a frame; `None` where the frame does not label it.
+    fn truth(&self, view: &LabelledView) -> Result<Vec<Option<Plane<bool>>>> {
+        match &self.source {
+            LabelSource::Folder(root) => {
+                let one = |class: &String| {
+                    let path = root.join(&view.stem).join(format!("{class}.png"));
+                    path.is_file().then(|| read_mask(&path)).transpose()
+                };
+                self.classes.iter().map(one).collect()
+            }
+            LabelSource::Own(own) => {
+                let Some(objects) = own.objects(view)? else { return Ok(vec![None; self.classes.len()]) };
+                let one = |label: &u32| {
+                    let data: Vec<bool> = objects.data.iter().map(|o| o == label).collect();
+                    let enough = data.iter().filter(|&&m| m).count() >= MIN_OBJECT_PIXELS;
+                    enough.then_some(Plane { width: objects.width, height: objects.height, data })
+                };
+                Ok(own.truth.labels.keys().map(one).collect())
+            }
+        }
+    }
+}
+
+/// The folder of the labels in that of a scene.
+fn root(folder: &Path) -> PathBuf {
+    let inner = folder.join("segmentations");
+    if inner.is_dir() { inner } else { folder.to_path_buf() }
+}
+
+/// The labels as one plane per frame.
+pub(super) fn labels(folder: &Path) -> Result<Labels> {
+    let root = root(folder);
+    let classes = read_classes(&root)?;
+    let (stems, phrases) = (frames(&root)?, numbered(classes));
+    let maps = Arc::new(Maps { root, phrases: phrases.clone() });
+    Ok(Labels { stems, phrases, maps, cameras: Vec::new() })
+}
+
+#[derive(Debug)]
+struct Maps {
+    root: PathBuf,
+    phrases: BTreeMap<u32, String>,
+}
+
+impl ObjectMaps for Maps {
+    fn objects(&self, stem: &str) -> Result<Option<Plane<u32>>> {
+        let mut masks = Vec::new();
+        for (label, class) in &self.phrases {
+            let path = self.root.join(stem).join(format!("{class}.png"));
+            if path.is_file() {
+                masks.push((*label, read_mask(&path)?));
+            }
+        }
+        Ok(painted(masks))
+    }
+}
+
+fn read_classes(root: &Path) -> Result<Vec<String>> {
+    let path = root.join("classes.txt");
+    let text = files::read_text(&path).map_err(|e| {
+        Error::input(format!("{e}; --protocol 3dovs wants a scene folder with segmentations/classes.txt"))
+    })?;
+    let classes: Vec<String> = text.lines().map(|l| l.trim().to_string()).filter(|l| !l.is_empty()).collect();
+    if classes.is_empty() {
+        Err(Error::input(format!("{}: no class in it", path.display())))
+    } else {
+        Ok(classes)
+    }
+}
+
+fn frames(root: &Path) -> Result<Vec<String>> {
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(root).map_err(Error::io(root))? {
+        let path = entry.map_err(Error::io(root))?.path();
+        if path.is_dir() {
+            names.extend(path.file_name().map(|n| n.to_string_lossy().into_owned()));
+        }
+    }
+    names.sort();
+    Ok(names)
+}
+
+fn read_mask(path: &Path) -> Result<Plane<bool>> {
+    let image = photo::stored_pixels(path)?.to_luma8();
+    let data = image.pixels().map(|p| p.0[0] > 127).collect();
+    Ok(Plane { width: image.width() as usize, height: image.height() as usize, data })
+}
+
+/// An answer: mask, level, whether the substitute was needed.
+pub(super) type Answer = (Plane<bool>, usize, bool);
+
+fn cut(map: &Plane<f32>, above: f32) -> Plane<bool> {
+    Plane { width: map.width, height: map.height, data: map.data.iter().map(|&v| v > above).collect() }
+}
+
+fn area(mask: &Plane<bool>) -> usize {
+    mask.data.iter().filter(|&&m| m).count()
+}
+
+fn top(map: &Plane<f32>) -> f32 {
+    map.data.iter().copied().fold(f32::NEG_INFINITY, f32::max)
+}
+
+/// The paper: relevancy above τ per level; of the levels with more than 2000 such pixels, the one with the highest mean.
+pub(super) fn paper_rule(levels: &[(usize, Plane<f32>)]) -> Option<Answer> {
+    let mut best: Option<(f64, Answer)> = None;
+    for (level, map) in levels {
+        let mask = cut(map, TAU);
+        let pixels = area(&mask);
+        if pixels <= AREA {
+            continue;
+        }
+        let inside = map.data.iter().zip(&mask.data).filter(|(_, m)| **m);
+        let score = inside.map(|(v, _)| f64::from(*v)).sum::<f64>() / pixels as f64;
+        if best.as_ref().is_none_or(|(s, _)| score > *s) {
+            best = Some((score, (mask, *level, false)));
+        }
+    }
+    if let Some((_, answer)) = best {
+        return Some(answer);
+    }
+    let peak = levels.iter().map(|(_, m)| top(m)).fold(f32::NEG_INFINITY, f32::max);
+    let (level, map) = levels.iter().find(|(_, m)| top(m) >= peak)?;
+    Some((cut(map, SUBSTITUTE * peak), *level, true))
+}
+
+/// The authors' script: cosine above 0.85 of its maximum on the levels m and l; the level with the largest mask.
+pub(super) fn authors_rule(levels: &[(usize, Plane<f32>)]) -> Option<Answer> {
+    let coarse: Vec<&(usize, Plane<f32>)> = levels.iter().filter(|(l, _)| *l > 0).collect();
+    let coarse = if coarse.is_empty() { levels.iter().collect() } else { coarse };
+    let mut best: Option<(usize, Answer)> = None;
+    for (level, map) in coarse {
+        let mask = cut(map, BAR * top(map));
+        let pixels = area(&mask);
+        if best.as_ref().is_none_or(|(n, _)| pixels > *n) {
+            best = Some((pixels, (mask, *level, pixels <= AUTHORS_AREA)));
+        }
+    }
+    best.map(|(_, answer)| answer)
+}
+
+impl Protocol for Ovs {
+    fn views(&self) -> &[LabelledView] {
+        &self.views
+    }
+
+    fn prompts(&self) -> Vec<String> {
+        self.classes.clone()
+    }
+
+    fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks> {
+        let view = self.views[index].clone();
+        let truth = self.truth(&view)?;
+        let (mut masks, classes) = (Masks::new(), self.classes.clone());
+        let best = seen.best_prompt()?;
+        let mut push = |class: usize, rule, iou, level, substituted| {
+            self.scores.push(Score {
+                frame: view.stem.clone(),
+                split: view.split,
+                phrase: classes[class].clone(),
+                rule,
+                iou,
+                level,
+                localised: None,
+                substituted,
+            });
+        };
+        for (class, target) in truth.iter().enumerate() {
+            let Some(target) = target else { continue };
+            let claimed = best.data.iter().map(|&k| k == class as i32).collect();
+            let claimed = Plane { width: best.width, height: best.height, data: claimed };
+            push(class, ARGMAX, mask_iou(&claimed, target)?, None, false);
+            if BACKGROUND_LABELS.contains(&classes[class].as_str()) {
+                continue;
+            }
+            if let Some((mask, level, substituted)) = paper_rule(&seen.relevancy(class)) {
+                push(class, PAPER, mask_iou(&mask, target)?, Some(level), substituted);
+                masks.push((classes[class].clone(), mask));
+            }
+            if let Some((mask, level, substituted)) = authors_rule(&seen.cosine(class)) {
+                push(class, AUTHORS, mask_iou(&mask, target)?, Some(level), substituted);
+            }
+        }
+        let counted = accuracy(&best, &truth);
+        let slot = self.pixels.entry(view.split.name()).or_default();
+        *slot = [slot[0] + counted[0], slot[1] + counted[1]];
+        Ok(masks)
+    }
+
+    fn finish(self: Box<Self>) -> ProtocolReport {
+        let figures = |of: &[&Score]| {
+            let mut out = BTreeMap::new();
+            for (rule, name) in [(PAPER, "miou"), (AUTHORS, "miou_authors"), (ARGMAX, "miou_argmax")] {
+                out.extend(
+                    mean(of.iter().filter(|s| s.rule == rule).map(|s| s.iou)).map(|m| (name.to_string(), m)),
+                );
+            }
+            let split = of.first().map_or(Split::Train, |s| s.split);
+            if let Some([all, right]) = self.pixels.get(split.name()).filter(|p| p[0] > 0) {
+                out.insert("accuracy_argmax".into(), *right as f64 / *all as f64);
+            }
+            out.insert("pairs".into(), of.iter().filter(|s| s.rule == PAPER).count() as f64);
+            let substituted = of.iter().filter(|s| s.rule == PAPER && s.substituted).count();
+            out.insert("substituted".into(), substituted as f64);
+            out
+        };
+        ProtocolReport {
+            protocol: ProtocolKind::Ovs,
+            definitions: [
+                "miou (the paper's text): per level relevancy > 0.8; of the levels with more than 2000 such pixels the one \
+                 with the highest mean answers; where none has, relevancy > 0.95 of the best level's maximum (counted in \
+                 `substituted`)",
+                "miou_authors (the authors' script): cosine > 0.85 of its maximum on levels m and l, the larger mask",
+                "miou_argmax, accuracy_argmax (3D-OVS): every pixel goes to the class with the highest cosine at any level; \
+                 accuracy over pixels that the truth labels",
+                "each mIoU: plain mean over (frame, class) pairs that the truth labels; predictions resampled to the size \
+                 of the truth",
+            ]
+            .map(String::from)
+            .to_vec(),
+            summary: summarise(&self.scores, PAPER, figures),
+            main_rule: PAPER,
+            scores: self.scores,
+        }
+    }
+}
+
+/// (labelled pixels, those whose class was found). A pixel of several classes is right with any of them.
+fn accuracy(best: &Plane<i32>, truth: &[Option<Plane<bool>>]) -> [u64; 2] {
+    let Some(size) = truth.iter().flatten().next() else { return [0, 0] };
+    let (mut all, mut right) = (0, 0);
+    for y in 0..size.height {
+        for x in 0..size.width {
+            let at = |m: &Plane<bool>| nearest(m, (x, y), (size.width, size.height));
+            if !truth.iter().flatten().any(at) {
+                continue;
+            }
+            all += 1;
+            let k = nearest(best, (x, y), (size.width, size.height));
+            let hit = usize::try_from(k).ok().and_then(|k| truth.get(k)?.as_ref()).is_some_and(at);
+            right += u64::from(hit);
+        }
+    }
+    [all, right]
+}
