@@ -209,7 +209,7 @@ fn find_cameras(
         photos.iter_mut().for_each(|p| p.fine = None);
     }
     photo::cut_bars(&mut photos, progress);
-    pose::place(photos, None, registry, 0, progress)
+    pose::place(photos, None, &mut crate::run::stages::keypoints(registry)?, 0, progress)
 }
 
 fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) -> Result<CameraFigures> {

@@ -42,4 +42,6 @@ pub use variants::KernelVariant;
 pub use view::View;
 
 #[cfg(test)]
+mod stereo_tests;
+#[cfg(test)]
 mod twin_tests;

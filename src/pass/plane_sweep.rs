@@ -2,58 +2,52 @@
 //! [`super::plane_sweep_cpu`].
 use crate::Result;
 use crate::gpu::shaders::shared::plane_sweep::VIEW_SHARES;
-pub use crate::gpu::shaders::structs::SourceView;
-use crate::gpu::shaders::{plane_sweep, plane_sweep_refine};
+use crate::gpu::shaders::{plane_sweep, plane_sweep_refine, structs};
 use crate::gpu::{Buffer, Device, Recorder};
 use glam::Vec4;
+use splatvk_sfm::stereo::PLANE_BYTES;
+pub use splatvk_sfm::stereo::{MAX_SOURCES, Matcher, PlaneSweep, ReferenceView, SourceView, binding};
 
-/// Most source views that one reference view is matched against: a fifth adds cost, hardly accuracy.
-pub const MAX_SOURCES: usize = VIEW_SHARES.len();
+/// The shader mixes as many sources.
+const _: () = assert!(MAX_SOURCES == VIEW_SHARES.len());
 
-/// The reference view and the search; the shader's push constants.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct ReferenceView {
-    /// fx, fy, cx, cy, pixels.
-    pub intrinsics: [f32; 4],
-    /// Smallest and largest inverse depth searched.
-    pub range: [f32; 2],
-    /// Weight of the geometric term per pixel of reprojection error; 0 = photometric only.
-    pub geometric: f32,
-    /// Seed of the hash that replaces a random-number generator.
-    pub seed: u32,
-    /// Pixels.
-    pub width: u32,
-    /// Pixels.
-    pub height: u32,
-    /// Index of the view's first pixel in the shared buffers.
-    pub first: u32,
-    /// Index of the view's first entry in the `sources` buffer.
-    pub first_source: u32,
-    /// Number of source views, at most [`MAX_SOURCES`].
-    pub sources: u32,
-    /// 0 or 1: the checkerboard colour to update.
-    pub parity: u32,
-    /// Hypotheses of the initial sweep.
-    pub planes: u32,
-    /// Weight of the disagreement with the neighbours' surfaces.
-    pub smoothness: f32,
+/// The plane sweep of stereo on a device.
+pub struct DevicePlaneSweep(Device);
+
+impl DevicePlaneSweep {
+    /// On this device.
+    pub fn new(device: &Device) -> Self {
+        DevicePlaneSweep(device.clone())
+    }
 }
 
-/// What the matching schedule needs of the device and of its twin.
-pub trait Matcher {
-    /// Initial sweep over all pixels of one view.
-    fn sweep(&mut self, reference: &ReferenceView) -> Result<()>;
-    /// One propagation step over one checkerboard colour of one view.
-    fn refine(&mut self, reference: &ReferenceView) -> Result<()>;
-    /// (π, cost) per pixel of all views.
-    fn planes(&self) -> Result<Vec<Vec4>>;
+impl PlaneSweep for DevicePlaneSweep {
+    fn binding(&self) -> u64 {
+        self.0.info().max_storage_range
+    }
+
+    fn matcher(
+        &self,
+        luma: &[f32],
+        references: &[ReferenceView],
+        sources: &[SourceView],
+        planes: &[Vec4],
+    ) -> Result<Box<dyn Matcher>> {
+        Ok(Box::new(GpuMatcher::new(&self.0, luma, references, sources, planes)?))
+    }
+}
+
+/// A source view as the shader has it.
+fn to_gpu(view: &SourceView) -> structs::SourceView {
+    let SourceView { forward, back, centre, intrinsics, size } = *view;
+    structs::SourceView { forward, back, centre, intrinsics, size }
 }
 
 /// Matching at one resolution on the device. Where it does not bind the planes of all views at once, those of a reference
 /// and its sources are brought together for every pass.
 pub struct GpuMatcher {
     device: Device,
-    sources: Buffer<SourceView>,
+    sources: Buffer<structs::SourceView>,
     /// What a pass binds: all views, or one group.
     quads: Buffer<u32>,
     planes: Buffer<f32>,
@@ -71,15 +65,6 @@ struct ViewBuffers {
     group: Vec<usize>,
 }
 
-/// Bytes of a plane.
-const PLANE_BYTES: usize = size_of::<[f32; 4]>();
-
-/// Bytes of the largest buffer that matching needs for these views: `groups` are the pixels of each reference and its
-/// sources together, `all` those of all views.
-pub fn binding(all: usize, groups: impl Iterator<Item = usize>) -> usize {
-    PLANE_BYTES * groups.max().unwrap_or(0).min(all)
-}
-
 impl GpuMatcher {
     /// `luma` and `planes` (π, cost) hold all views one after the other, as the references say.
     pub fn new(
@@ -90,19 +75,20 @@ impl GpuMatcher {
         planes: &[Vec4],
     ) -> Result<Self> {
         let planes: Vec<[f32; 4]> = planes.iter().map(Vec4::to_array).collect();
+        let sources: Vec<structs::SourceView> = sources.iter().map(to_gpu).collect();
         let quads = quads(luma, references);
         let (device, pixels) = (device.clone(), luma.len());
         if (PLANE_BYTES * pixels) as u64 <= device.info().max_storage_range {
             return Ok(GpuMatcher {
                 quads: device.buffer_from("stereo quads", quads.as_flattened())?,
-                sources: device.buffer_from("stereo sources", sources)?,
+                sources: device.buffer_from("stereo sources", &sources)?,
                 planes: device.buffer_from("stereo planes", planes.as_flattened())?,
                 views: Vec::new(),
                 device,
                 pixels,
             });
         }
-        let (mut views, mut grouped, mut largest) = (Vec::new(), sources.to_vec(), 0);
+        let (mut views, mut grouped, mut largest) = (Vec::new(), sources, 0);
         for (view, r) in references.iter().enumerate() {
             let (mut group, mut held) = (vec![view], pixels_of(r));
             for source in &mut grouped[r.first_source as usize..(r.first_source + r.sources) as usize] {

@@ -7,6 +7,7 @@
 use super::plane_sweep::{MAX_SOURCES, Matcher, ReferenceView, SourceView};
 use crate::Result;
 use crate::gpu::shaders::shared::plane_sweep as shared;
+use crate::math::hash;
 use glam::{Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 
@@ -19,13 +20,6 @@ const SIGMA_COLOUR: f32 = shared::SIGMA_COLOUR as f32;
 const SIGMA_SPACE: f32 = shared::SIGMA_SPACE as f32;
 const SMOOTH_LIMIT: f32 = shared::SMOOTH_LIMIT as f32;
 const GEOMETRIC_LIMIT: f32 = shared::GEOMETRIC_LIMIT as f32;
-
-/// PCG-like integer hash (Jarzynski and Olano 2020): deterministic, the same in GLSL.
-pub fn hash(mut v: u32) -> u32 {
-    v = v.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
-    let word = ((v >> ((v >> 28) + 4)) ^ v).wrapping_mul(277_803_737);
-    (word >> 22) ^ word
-}
 
 /// A stream of hashed numbers.
 pub struct Random(pub u32);

@@ -21,4 +21,6 @@ pub use shapes::{Hit, Paint, SceneObject, Shape};
 pub use spoil::Spoil;
 
 #[cfg(test)]
+mod overlay_tests;
+#[cfg(test)]
 mod query_tests;

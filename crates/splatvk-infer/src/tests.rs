@@ -227,7 +227,7 @@ fn the_catalogue_is_sound_and_a_missing_model_is_explained() {
     assert!(catalogue().len() >= 12);
     for model in catalogue() {
         assert!(model.source.starts_with("https://") && !model.licence.is_empty(), "{}", model.id);
-        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join(&model.export);
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(&model.export);
         assert!(model.export.starts_with("https://") || script.is_file(), "{}: {}", model.id, model.export);
         assert_eq!(model.non_commercial, model.licence.contains("NC"), "{}", model.id);
         // The open pack is for commercial use, and needs no Python.

@@ -14,7 +14,8 @@ pub struct TestView {
     pub camera: Camera,
 }
 
-fn folder() -> PathBuf {
+/// The folder of the set.
+pub fn folder() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/breakfast")
 }
 

@@ -1,8 +1,10 @@
 //! Photos that join a finished scene: their cameras, the surfaces that they add, and their masks under the scene's codes.
 use super::cameras::{KnownGeometry, PlacedPhotos};
 use super::shared;
+use super::shared::keypoints;
 use crate::fit::{self, Preset, RgbOptions, Trained};
 use crate::language::{self, BuildOptions, Language, SceneView, ViewMasks};
+use crate::pass::plane_sweep::DevicePlaneSweep;
 use crate::pass::renderer::Renderer;
 use crate::photo::Photo;
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
@@ -41,8 +43,13 @@ impl Stage for AddedCameras {
     }
 
     fn run(self, (): (), context: &Context) -> Result<PlacedPhotos> {
-        let pose::SolvedCameras { photos, model, left_out, method } =
-            pose::add(&self.base.known, self.photos, context.registry, self.seed, context.progress)?;
+        let pose::SolvedCameras { photos, model, left_out, method } = pose::add(
+            &self.base.known,
+            self.photos,
+            &mut keypoints(context.registry)?,
+            self.seed,
+            context.progress,
+        )?;
         Ok(PlacedPhotos { photos, left_out, known: KnownGeometry::Sparse(model, method) })
     }
 }
@@ -92,8 +99,15 @@ impl Stage for AddedDepth {
         let sparse = SparseModel { cameras, points: model.points.clone(), ..SparseModel::default() };
         let options = StereoOptions::preset(self.preset).seeded(self.seed);
         let priors: Vec<_> = photos.iter().map(|_| None).collect();
-        let dense =
-            pose::dense(context.device, &photos, &priors, sparse, String::new(), &options, context.progress)?;
+        let dense = pose::dense(
+            &DevicePlaneSweep::new(context.device),
+            &photos,
+            &priors,
+            sparse,
+            String::new(),
+            &options,
+            context.progress,
+        )?;
 
         let mut depths: Vec<DepthMap> = rendered.iter().map(trusted).collect();
         for (view, depth) in views.iter().zip(dense.depths) {

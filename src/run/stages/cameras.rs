@@ -1,9 +1,11 @@
 //! Photos → cameras → depth and points.
 use super::shared;
+use super::shared::keypoints;
 use crate::fit::{Preset, Trained};
 use crate::format::CameraFile;
 use crate::infer::installed::Installed;
 use crate::infer::pairs;
+use crate::pass::plane_sweep::DevicePlaneSweep;
 use crate::photo::Photo;
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::choose::{LeftOut, Reason};
@@ -133,7 +135,7 @@ impl Stage for Cameras {
             }
         };
         let pose::SolvedCameras { photos, model, left_out, method } =
-            pose::place(photos, known, context.registry, self.seed, progress)?;
+            pose::place(photos, known, &mut keypoints(context.registry)?, self.seed, progress)?;
         Ok(PlacedPhotos { photos, left_out, known: KnownGeometry::Sparse(model, method) })
     }
 }
@@ -205,7 +207,8 @@ impl Stage for DenseDepth {
             KnownGeometry::Complete(geometry) => Ok(geometry),
             KnownGeometry::Sparse(model, method) => {
                 let options = StereoOptions::preset(self.preset).seeded(self.seed);
-                pose::dense(context.device, &placed.photos, priors, model, method, &options, context.progress)
+                let sweep = DevicePlaneSweep::new(context.device);
+                pose::dense(&sweep, &placed.photos, priors, model, method, &options, context.progress)
             }
         }
     }

@@ -17,5 +17,5 @@ pub use language::{Align, EmbedQueries, NameCodes, SharedEncoder, TrainLanguage}
 pub use masks::{ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMasks, RegionFeatures};
 pub use matches::{DescriptorMatches, Descriptors, NetworkMatches};
 pub use prior::{DepthPriors, PriorOrigin};
-pub use shared::identity;
+pub use shared::{identity, keypoints};
 pub use splats::{TrainColour, ViewDependence};

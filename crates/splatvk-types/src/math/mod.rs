@@ -2,7 +2,7 @@
 mod random;
 mod statistics;
 
-pub use random::Random;
+pub use random::{Random, hash};
 pub use statistics::{median, quantile};
 
 /// `a·b` in f32, for comparing many features.

@@ -68,6 +68,13 @@ impl Random {
     }
 }
 
+/// PCG-like integer hash (Jarzynski and Olano 2020): deterministic, the same in GLSL.
+pub fn hash(mut v: u32) -> u32 {
+    v = v.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+    let word = ((v >> ((v >> 28) + 4)) ^ v).wrapping_mul(277_803_737);
+    (word >> 22) ^ word
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,0 +1,374 @@
+//! Photometric alignment of small planar patches between views with known cameras.
+use super::model::Model;
+use crate::scene::Plane;
+use crate::sift::blurred;
+use glam::{DMat3, DVec2, DVec3};
+use nalgebra::{DMatrix, DVector};
+
+/// Half the side of a patch: 13 × 13 pixels hold enough texture at corners and stay planar.
+pub(super) const RADIUS: i32 = 6;
+/// Gaussian window, pixels: the point itself matters most.
+const WINDOW: f64 = 4.0;
+/// Blur before sampling: hides the pixel grid from the bilinear interpolation.
+const BLUR: f32 = 0.8;
+/// Standard deviation below which a patch has no texture (1 in 255, twice JPEG noise after the blur).
+const MIN_CONTRAST: f64 = 0.008;
+/// Typical relative change of inverse depth per pixel of a surface seen at 45°, f = 650: 1/650. The slant prior is twice
+/// that.
+const SLANT_SIGMA: f64 = 0.003;
+
+/// Blurred luma with its gradients.
+pub(super) struct Shades {
+    value: Plane<f32>,
+    dx: Vec<f32>,
+    dy: Vec<f32>,
+}
+
+impl Shades {
+    pub(super) fn new(luma: &Plane<f32>) -> Shades {
+        let value = blurred(luma, BLUR);
+        let (w, h) = (value.width, value.height);
+        let at = |x: usize, y: usize| value.data[y * w + x];
+        let (mut dx, mut dy) = (vec![0f32; w * h], vec![0f32; w * h]);
+        for y in 1..h.saturating_sub(1) {
+            for x in 1..w.saturating_sub(1) {
+                dx[y * w + x] = 0.5 * (at(x + 1, y) - at(x - 1, y));
+                dy[y * w + x] = 0.5 * (at(x, y + 1) - at(x, y - 1));
+            }
+        }
+        Shades { value, dx, dy }
+    }
+
+    pub(super) fn size(&self) -> (usize, usize) {
+        (self.value.width, self.value.height)
+    }
+
+    /// Smaller eigenvalue of the gradient covariance over a 7 × 7 window (Shi & Tomasi 1994).
+    pub(super) fn cornerness(&self, x: usize, y: usize) -> f32 {
+        let w = self.value.width;
+        let (mut xx, mut xy, mut yy) = (0f32, 0f32, 0f32);
+        for r in y - 3..=y + 3 {
+            for k in r * w + x - 3..=r * w + x + 3 {
+                xx += self.dx[k] * self.dx[k];
+                xy += self.dx[k] * self.dy[k];
+                yy += self.dy[k] * self.dy[k];
+            }
+        }
+        let (half, difference) = (0.5 * (xx + yy), 0.5 * (xx - yy));
+        half - (difference * difference + xy * xy).sqrt()
+    }
+
+    /// Index of the upper left sample around a position and the bilinear fractions; `None` outside.
+    fn cell(&self, p: DVec2) -> Option<(usize, f32, f32)> {
+        let (u, v) = (p.x - 0.5, p.y - 0.5);
+        let (w, h) = self.size();
+        if !(u >= 1.0 && v >= 1.0 && u < (w - 2) as f64 && v < (h - 2) as f64) {
+            return None;
+        }
+        let (i, j) = (u as usize, v as usize);
+        Some((j * w + i, (u - i as f64) as f32, (v - j as f64) as f32))
+    }
+
+    fn value_at(&self, p: DVec2) -> Option<f64> {
+        let (k, fx, fy) = self.cell(p)?;
+        let (w, d) = (self.value.width, &self.value.data);
+        let top = d[k] + (d[k + 1] - d[k]) * fx;
+        let low = d[k + w] + (d[k + w + 1] - d[k + w]) * fx;
+        Some((top + (low - top) * fy) as f64)
+    }
+
+    /// (value, gradient) at a position; `None` outside.
+    fn sample(&self, p: DVec2) -> Option<(f64, DVec2)> {
+        let (k, fx, fy) = self.cell(p)?;
+        let w = self.value.width;
+        let mix = |d: &[f32]| {
+            let top = d[k] + (d[k + 1] - d[k]) * fx;
+            let low = d[k + w] + (d[k + w + 1] - d[k + w]) * fx;
+            (top + (low - top) * fy) as f64
+        };
+        Some((mix(&self.value.data), DVec2::new(mix(&self.dx), mix(&self.dy))))
+    }
+}
+
+/// Window weights and offsets, row-major.
+fn window() -> Vec<(DVec2, f64)> {
+    let mut out = Vec::new();
+    for y in -RADIUS..=RADIUS {
+        for x in -RADIUS..=RADIUS {
+            let d = DVec2::new(x as f64, y as f64);
+            out.push((d, (-d.length_squared() / (2.0 * WINDOW * WINDOW)).exp()));
+        }
+    }
+    let sum: f64 = out.iter().map(|o| o.1).sum();
+    out.iter_mut().for_each(|o| o.1 /= sum);
+    out
+}
+
+/// Zero-mean, unit-variance values under the window; `None` without texture.
+fn standardised(values: &[f64], offsets: &[(DVec2, f64)]) -> Option<(Vec<f64>, f64)> {
+    let mean: f64 = values.iter().zip(offsets).map(|(v, o)| v * o.1).sum();
+    let variance: f64 = values.iter().zip(offsets).map(|(v, o)| (v - mean).powi(2) * o.1).sum();
+    let sigma = variance.sqrt();
+    (sigma > MIN_CONTRAST).then(|| (values.iter().map(|v| (v - mean) / sigma).collect(), sigma))
+}
+
+/// Maps a patch of the reference view into another view through a plane of inverse depth `a (1 + b·d)`.
+struct Warp {
+    m: DMat3,
+    shift: DVec3,
+    f: f64,
+    centre: DVec2,
+}
+
+impl Warp {
+    fn new(model: &Model, reference: usize, other: usize) -> Option<Warp> {
+        let (r, o) = (model.poses[reference]?, model.poses[other]?);
+        let relative = o.compose(&r.inverse());
+        Some(Warp {
+            m: relative.rotation,
+            shift: relative.translation,
+            f: model.focal(other),
+            centre: model.principal_point(other),
+        })
+    }
+    fn position(&self, ray: DVec3, a: f64, slant: DVec2, d: DVec2) -> Option<DVec2> {
+        let h = self.m * ray + self.shift * (a * (1.0 + slant.dot(d)));
+        (h.z > 1e-6).then(|| DVec2::new(h.x, h.y) * (self.f / h.z) + self.centre)
+    }
+    /// Position and its derivatives by the two slants.
+    fn apply(&self, ray: DVec3, a: f64, slant: DVec2, d: DVec2) -> Option<(DVec2, [DVec2; 2])> {
+        let h = self.m * ray + self.shift * (a * (1.0 + slant.dot(d)));
+        if h.z <= 1e-6 {
+            return None;
+        }
+        let u = DVec2::new(h.x, h.y) / h.z;
+        let by = |amount: f64| {
+            let dh = self.shift * amount;
+            (DVec2::new(dh.x, dh.y) - u * dh.z) * (self.f / h.z)
+        };
+        Some((u * self.f + self.centre, [by(a * d.x), by(a * d.y)]))
+    }
+}
+
+/// One aligned view.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Aligned {
+    pub(super) view: usize,
+    /// Where the view shows the centre of the reference patch.
+    pub(super) pixel: DVec2,
+    /// Normalised cross-correlation.
+    pub(super) ncc: f64,
+}
+
+/// What alignment needs, prepared once.
+pub(super) struct Aligner<'a> {
+    pub(super) model: &'a Model,
+    pub(super) shades: &'a [Shades],
+    offsets: Vec<(DVec2, f64)>,
+}
+
+/// A patch of the reference view: centre and local plane.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Facet {
+    pub(super) view: usize,
+    pub(super) pixel: DVec2,
+    /// Inverse depth at the centre.
+    pub(super) inverse_depth: f64,
+    /// Relative change of inverse depth per pixel.
+    pub(super) slant: DVec2,
+}
+
+impl<'a> Aligner<'a> {
+    pub(super) fn new(model: &'a Model, shades: &'a [Shades]) -> Aligner<'a> {
+        Aligner { model, shades, offsets: window() }
+    }
+
+    /// The facet's own patch, standardised; `None` at the image edge or without texture.
+    pub(super) fn template(&self, f: &Facet) -> Option<Vec<f64>> {
+        let values: Option<Vec<f64>> =
+            self.offsets.iter().map(|o| self.shades[f.view].value_at(f.pixel + o.0)).collect();
+        Some(standardised(&values?, &self.offsets)?.0)
+    }
+
+    /// Normalised cross-correlation of a facet's template with another view at a shift.
+    pub(super) fn ncc(&self, template: &[f64], f: &Facet, other: usize, shift: DVec2) -> Option<f64> {
+        let warp = Warp::new(self.model, f.view, other)?;
+        let values: Option<Vec<f64>> = self
+            .offsets
+            .iter()
+            .map(|(d, _)| {
+                let p = warp.position(self.model.ray(f.view, f.pixel + *d), f.inverse_depth, f.slant, *d)?;
+                self.shades[other].value_at(p + shift)
+            })
+            .collect();
+        let (seen, _) = standardised(&values?, &self.offsets)?;
+        Some(seen.iter().zip(template).zip(&self.offsets).map(|((a, b), o)| a * b * o.1).sum())
+    }
+
+    /// Values, gradients and slant derivatives of the warped patch.
+    #[expect(clippy::type_complexity, reason = "three parallel arrays used once")]
+    fn look(&self, f: &Facet, other: usize, shift: DVec2) -> Option<(Vec<f64>, Vec<DVec2>, Vec<[DVec2; 2]>)> {
+        let warp = Warp::new(self.model, f.view, other)?;
+        let n = self.offsets.len();
+        let (mut values, mut gradients, mut moves) =
+            (Vec::with_capacity(n), Vec::with_capacity(n), Vec::with_capacity(n));
+        for (d, _) in &self.offsets {
+            let ray = self.model.ray(f.view, f.pixel + *d);
+            let (p, by) = warp.apply(ray, f.inverse_depth, f.slant, *d)?;
+            let (value, gradient) = self.shades[other].sample(p + shift)?;
+            values.push(value);
+            gradients.push(gradient);
+            moves.push(by);
+        }
+        Some((values, gradients, moves))
+    }
+
+    /// Where the facet's centre projects without shift.
+    pub(super) fn expected(&self, f: &Facet, other: usize) -> Option<DVec2> {
+        let warp = Warp::new(self.model, f.view, other)?;
+        let ray = self.model.ray(f.view, f.pixel);
+        warp.apply(ray, f.inverse_depth, f.slant, DVec2::ZERO).map(|w| w.0)
+    }
+
+    /// Gauss–Newton over the slant (shared by all views) and one shift per view, with gain and bias removed. `shifts`
+    /// start as given; views whose correlation stays below `least` are left out. Returns the improved facet.
+    pub(super) fn align(
+        &self,
+        facet: &Facet,
+        starts: &[(usize, DVec2)],
+        least: f64,
+    ) -> Option<(Facet, Vec<Aligned>)> {
+        let template = self.template(facet)?;
+        let (mut f, mut active) = (*facet, starts.to_vec());
+        let first = facet.slant;
+        let mut scores = Vec::new();
+        for round in 0..12 {
+            let n = 2 + 2 * active.len();
+            let (mut h, mut g) = (DMatrix::<f64>::zeros(n, n), DVector::<f64>::zeros(n));
+            scores.clear();
+            for (k, (view, shift)) in active.iter().enumerate() {
+                let step = self.look(&f, *view, *shift).and_then(|l| {
+                    let (seen, sigma) = standardised(&l.0, &self.offsets)?;
+                    Some((seen, sigma, l.1, l.2))
+                });
+                let Some((seen, sigma, gradients, moves)) = step else {
+                    scores.push(-1.0);
+                    h[(2 + 2 * k, 2 + 2 * k)] += 1.0;
+                    h[(3 + 2 * k, 3 + 2 * k)] += 1.0;
+                    continue;
+                };
+                scores.push(self.accumulate(&template, &seen, sigma, &gradients, &moves, k, &mut h, &mut g));
+            }
+            // Slant prior against the starting plane, in units of the patch residual (about 0.3 at NCC 0.95).
+            for k in 0..2 {
+                let w = (0.3 / SLANT_SIGMA).powi(2) * 0.05;
+                h[(k, k)] += w;
+                g[k] += w * (f.slant[k] - first[k]);
+            }
+            for i in 0..n {
+                h[(i, i)] = h[(i, i)] * 1.001 + 1e-9;
+            }
+            let d = h.cholesky()?.solve(&g);
+            // Beyond a pixel per step the linearisation is void.
+            f.slant -= DVec2::new(d[0], d[1]).clamp_length_max(SLANT_SIGMA);
+            let mut largest: f64 = 0.0;
+            for (k, a) in active.iter_mut().enumerate() {
+                let step = DVec2::new(d[2 + 2 * k], d[3 + 2 * k]).clamp_length_max(1.0);
+                a.1 -= step;
+                largest = largest.max(step.length());
+            }
+            if round >= 3 {
+                // Occluded or wrong views would bend the plane of the others.
+                let keep: Vec<bool> = scores.iter().map(|s| *s > 0.5).collect();
+                let mut k = keep.iter();
+                active.retain(|_| *k.next().unwrap_or(&false));
+            }
+            if active.is_empty() {
+                return None;
+            }
+            // A hundredth of a pixel is below what JPEG leaves.
+            if round >= 3 && largest < 0.01 {
+                break;
+            }
+        }
+        let aligned: Vec<Aligned> = active
+            .iter()
+            .filter_map(|(view, shift)| {
+                let ncc = self.ncc(&template, &f, *view, *shift)?;
+                let pixel = self.expected(&f, *view)? + *shift;
+                (ncc >= least).then_some(Aligned { view: *view, pixel, ncc })
+            })
+            .collect();
+        (!aligned.is_empty()).then_some((f, aligned))
+    }
+
+    /// Adds one view to the normal equations; returns its correlation.
+    fn accumulate(
+        &self,
+        template: &[f64],
+        seen: &[f64],
+        sigma: f64,
+        gradients: &[DVec2],
+        moves: &[[DVec2; 2]],
+        k: usize,
+        h: &mut DMatrix<f64>,
+        g: &mut DVector<f64>,
+    ) -> f64 {
+        let rows: Vec<[f64; 4]> = gradients
+            .iter()
+            .zip(moves)
+            .map(|(q, m)| [q.dot(m[0]), q.dot(m[1]), q.x, q.y].map(|v| v / sigma))
+            .collect();
+        // Standardising removes the mean and the component along the patch itself from every derivative.
+        let (mut mean, mut along) = ([0.0; 4], [0.0; 4]);
+        for ((row, s), o) in rows.iter().zip(seen).zip(&self.offsets) {
+            for c in 0..4 {
+                mean[c] += o.1 * row[c];
+                along[c] += o.1 * row[c] * s;
+            }
+        }
+        let at = [0, 1, 2 + 2 * k, 3 + 2 * k];
+        let mut correlation = 0.0;
+        for (((row, s), t), o) in rows.iter().zip(seen).zip(template).zip(&self.offsets) {
+            let j: [f64; 4] = std::array::from_fn(|c| row[c] - mean[c] - along[c] * s);
+            correlation += o.1 * s * t;
+            for a in 0..4 {
+                g[at[a]] += o.1 * j[a] * (s - t);
+                for b in 0..4 {
+                    h[(at[a], at[b])] += o.1 * j[a] * j[b];
+                }
+            }
+        }
+        correlation
+    }
+
+    /// Aligns back: the patch around `pixel` of `other`, seen through the same plane, must return to the facet's centre.
+    /// The distance it misses by, pixels.
+    pub(super) fn round_trip(&self, f: &Facet, other: usize, pixel: DVec2) -> Option<f64> {
+        let back = self.transferred(f, other, pixel)?;
+        let start = f.pixel - self.expected(&back, f.view)?;
+        let (_, found) = self.align(&back, &[(f.view, start)], 0.5)?;
+        Some((found[0].pixel - f.pixel).length())
+    }
+
+    /// The facet's plane as seen from another view, centred at `pixel`.
+    fn transferred(&self, f: &Facet, other: usize, pixel: DVec2) -> Option<Facet> {
+        let warp = Warp::new(self.model, f.view, other)?;
+        // Inverse depth in the other view at three points of the patch.
+        let at = |d: DVec2| -> Option<(DVec2, f64)> {
+            let ray = self.model.ray(f.view, f.pixel + d);
+            let rho = f.inverse_depth * (1.0 + f.slant.dot(d));
+            let h = warp.m * ray + warp.shift * rho;
+            (h.z > 1e-6 && rho > 0.0)
+                .then(|| (DVec2::new(h.x, h.y) * (warp.f / h.z) + warp.centre, rho / h.z))
+        };
+        let (c, x, y) = (at(DVec2::ZERO)?, at(DVec2::X * 4.0)?, at(DVec2::Y * 4.0)?);
+        let m = glam::DMat2::from_cols(x.0 - c.0, y.0 - c.0);
+        if m.determinant().abs() < 1e-3 {
+            return None;
+        }
+        // Relative changes along the two image directions of the other view.
+        let slant = m.transpose().inverse() * DVec2::new(x.1 / c.1 - 1.0, y.1 / c.1 - 1.0);
+        Some(Facet { view: other, pixel, inverse_depth: c.1, slant })
+    }
+}

@@ -1,0 +1,81 @@
+//! White borders around photos (rectified or cropped images) and pixels that are not used: nothing to match, nothing to fill.
+use super::Level;
+use super::surface::neighbours;
+use crate::scene::Coverage;
+
+/// A channel at least this bright is saturated; JPEG leaves a few grey levels of ringing.
+const WHITE: f32 = 0.95;
+/// Frames are thin; a white wall that reaches further in is scene.
+const DEEPEST_SHARE: f32 = 0.05;
+
+/// [`white_border`] and what photos do not use, one coverage or none per view, or none at all.
+pub fn unused(level: &Level, coverage: &[Option<Coverage>]) -> Vec<bool> {
+    let mut out = white_border(level);
+    for (view, coverage) in coverage.iter().enumerate() {
+        let (Some(coverage), Some(r)) = (coverage, level.references.get(view)) else { continue };
+        let (width, height) = (r.width as usize, r.height as usize);
+        // As depth_map has it: the level may be of half the size, or less.
+        let scale = (coverage.share.width / width).max(1);
+        for k in 0..width * height {
+            let (x, y) = (k % width * scale + scale / 2, k / width * scale + scale / 2);
+            let (x, y) = (x.min(coverage.share.width - 1), y.min(coverage.share.height - 1));
+            out[r.first as usize + k] |= !coverage.uses(y * coverage.share.width + x);
+        }
+    }
+    out
+}
+
+/// Per pixel of all views: true for white that is connected to the image border within its outer 5 %.
+pub fn white_border(level: &Level) -> Vec<bool> {
+    let mut out = Vec::with_capacity(level.pixels());
+    for guide in &level.guide {
+        let (width, height) = (guide.width, guide.height);
+        let deepest = (DEEPEST_SHARE * width.min(height) as f32).ceil() as usize;
+        let rim =
+            |k: usize| (k % width).min(width - 1 - k % width).min(k / width).min(height - 1 - k / width);
+        let white = |k: usize| guide.data[k].iter().all(|&c| c >= WHITE);
+        let mut void = vec![false; width * height];
+        let mut stack: Vec<usize> = (0..width * height).filter(|&k| rim(k) == 0 && white(k)).collect();
+        for &k in &stack {
+            void[k] = true;
+        }
+        while let Some(k) = stack.pop() {
+            for n in neighbours(k, width, height) {
+                if !void[n] && white(n) && rim(n) < deepest {
+                    void[n] = true;
+                    stack.push(n);
+                }
+            }
+        }
+        out.extend(void);
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Outside, Plane, RgbImage};
+    use crate::stereo::ReferenceView;
+
+    #[test]
+    fn unused_pixels_are_void() {
+        // Two views of 6 × 4 pixels, the second from a photo of twice the size whose left third is not used.
+        let view = |first| ReferenceView { first, width: 6, height: 4, ..ReferenceView::default() };
+        let grey = RgbImage { width: 6, height: 4, data: vec![[0.5; 3]; 24] };
+        let level = Level {
+            references: vec![view(0), view(24)],
+            guide: vec![grey.clone(), grey],
+            cameras: Vec::new(),
+            luma: Vec::new(),
+            sources: Vec::new(),
+            tolerance: Vec::new(),
+        };
+        let share = (0..12 * 8).map(|i| if i % 12 < 4 { 0.0 } else { 1.0 }).collect();
+        let coverage =
+            Coverage { share: Plane { width: 12, height: 8, data: share }, outside: Outside::Empty };
+        let void = unused(&level, &[None, Some(coverage)]);
+        let expected: Vec<bool> = (0..48).map(|k| k >= 24 && k % 6 < 2).collect();
+        assert_eq!(void, expected);
+    }
+}
