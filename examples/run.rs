@@ -1,4 +1,5 @@
-//! Photos to a scene directory: `cargo run --release --example run -- out/kitchen my-photos [TEXT...]`.
+//! Photos to a scene directory: `cargo run --release --example run -- out/kitchen my-photos
+//! [TEXT...]`.
 use splatvk::progress::Progress;
 use splatvk::run::{self, RunOutcome, RunPlan};
 use splatvk::{Error, Result};

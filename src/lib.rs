@@ -1,13 +1,15 @@
-//! splatvk turns a few ordinary photos, without camera poses, into a Gaussian-splat scene that answers text
-//! queries, on any Vulkan device. The folders follow the data, left to right: photo → infer → pose → fit and language →
-//! query → report → run → cli and capi. They use what stands left of them, never what stands right; below all of them lie
-//! `scene` (plain data), `math`, `gpu`, `pass` and `format`. `tests/imports.rs` has the whole order and holds the code to it.
+//! splatvk turns a few ordinary photos, without camera poses, into a Gaussian-splat scene that
+//! answers text queries, on any Vulkan device. The folders follow the data, left to right: photo →
+//! infer → pose → fit and language → query → report → run → cli and capi. They use what stands left
+//! of them, never what stands right; below all of them lie `scene` (plain data), `math`, `gpu`,
+//! `pass` and `format`. `tests/imports.rs` has the whole order and holds the code to it.
 //!
 //! # From a program
-//! Everything the command line does is here: [`run::run`] writes a scene directory, [`run::reconstruct`] keeps the scene in
-//! memory, [`run::live::LiveScene`] draws, answers and saves it, [`progress::Progress`] reports and stops,
-//! [`gpu::Device::adopt`] works on the program's own Vulkan device, [`format`] holds the files. The C interface
-//! ([`capi`], `include/splatvk.h`) is a thin layer over the same.
+//! Everything the command line does is here: [`run::run`] writes a scene directory,
+//! [`run::reconstruct`] keeps the scene in memory, [`run::live::LiveScene`] draws, answers and
+//! saves it, [`progress::Progress`] reports and stops, [`gpu::Device::adopt`] works on the
+//! program's own Vulkan device, [`format`] holds the files. The C interface ([`capi`],
+//! `include/splatvk.h`) is a thin layer over the same.
 //!
 //! ```
 //! # fn main() -> splatvk::Result<()> {

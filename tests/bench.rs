@@ -1,4 +1,5 @@
-//! `splatvk bench` on small scenes: its figures fit together, its files are read back, and it refuses what it cannot use.
+//! `splatvk bench` on small scenes: its figures fit together, its files are read back, and it
+//! refuses what it cannot use.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 use splatvk::bench::report::{Clock, SUM};
 use splatvk::bench::{Bench, BenchReport, Budget, Quartiles, Section, Workload, compare};

@@ -42,14 +42,15 @@ fn assert_alike(a: &GpuGradients, b: &GpuGradients, what: &str) {
     pairs.push((a.features.clone(), b.features.clone()));
     pairs.push((a.camera.clone(), b.camera.clone()));
     for (k, (x, y)) in pairs.iter().enumerate() {
-        // The same numbers added up in another order: about 1e-6 for sums of a thousand values of both signs.
+        // The same numbers added up in another order: about 1e-6 for sums of a thousand values of
+        // both signs.
         let off = difference(x, y);
         assert!(off < 2e-5, "{what}, class {k}: {off}");
     }
 }
 
-/// 800 × 600 with 52 channels is 97 MiB of gradients: whole, in two bands and in twelve. The lists of 16 MiB are too short
-/// for all entries at once where gradients are kept per entry.
+/// 800 × 600 with 52 channels is 97 MiB of gradients: whole, in two bands and in twelve. The lists
+/// of 16 MiB are too short for all entries at once where gradients are kept per entry.
 #[test]
 fn frames_and_gradients_are_those_of_the_whole() {
     let (splats, camera) = seeded::benchmark(4000, 800, 600, 1, 3);
@@ -69,7 +70,8 @@ fn frames_and_gradients_are_those_of_the_whole() {
     }
 }
 
-/// Code gradients of all features at once would be 205.7 MiB for so many splats, whatever the image.
+/// Code gradients of all features at once would be 205.7 MiB for so many splats, whatever the
+/// image.
 #[test]
 fn gradients_by_entry_fit_for_many_splats() {
     let (splats, camera) = seeded::benchmark(130_000, 320, 240, 0, 4);

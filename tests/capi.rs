@@ -1,4 +1,5 @@
-//! The C header is what the code says; what its functions make of names and settings. `tools/hosts` has the rest.
+//! The C header is what the code says; what its functions make of names and settings. `tools/hosts`
+//! has the rest.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks)] // a panic is how a test fails
 mod fixture;
 
@@ -140,7 +141,8 @@ unsafe extern "C" fn stop(_: *mut c_void, _: *const SvkProgress) -> i32 {
 
 #[test]
 fn two_contexts_do_not_share_their_provider() {
-    // No build of ONNX Runtime has both of the absent ones; the first context is there while the others are asked.
+    // No build of ONNX Runtime has both of the absent ones; the first context is there while the
+    // others are asked.
     let providers = ["cpu", "directml", "coreml"].map(|name| CString::new(name).unwrap());
     let contexts = providers.each_ref().map(|provider| context(Some(provider)));
     let files: Vec<CString> =

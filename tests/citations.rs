@@ -1,6 +1,6 @@
-//! Citations of the documents: every `docs/<folder>/<name>.md#<anchor>` in sources and documents, and every relative link of a
-//! Markdown file, leads to a file and a heading that exist. No compiler reads comments, so nothing else would notice a
-//! section that was renamed.
+//! Citations of the documents: every `docs/<folder>/<name>.md#<anchor>` in sources and documents,
+//! and every relative link of a Markdown file, leads to a file and a heading that exist. No
+//! compiler reads comments, so nothing else would notice a section that was renamed.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -155,7 +155,8 @@ fn relative_links_lead_somewhere() {
     assert!(faults.is_empty(), "{}", faults.join("\n"));
 }
 
-/// Nobody else can look into the document that comments cited before docs/internals/method.md was there.
+/// Nobody else can look into the document that comments cited before docs/internals/method.md was
+/// there.
 #[test]
 fn nothing_outside_the_repository_is_cited() {
     let word = ["ALGO", "RITHMS"].concat();

@@ -1,5 +1,6 @@
-//! `--deterministic`: the command line, the Rust interface and the C interface, with different numbers of host threads, make the
-//! same bits of the same photos, and the same renders and answers of them.
+//! `--deterministic`: the command line, the Rust interface and the C interface, with different
+//! numbers of host threads, make the same bits of the same photos, and the same renders and answers
+//! of them.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks)] // a panic is how a test fails
 mod fixture;
 
@@ -122,7 +123,8 @@ fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     found
 }
 
-/// Whether two folders hold the same bytes; `without` names folders that the second one need not have.
+/// Whether two folders hold the same bytes; `without` names folders that the second one need not
+/// have.
 fn assert_same(a: &Path, b: &Path, without: &[&str]) {
     let (mut a, b) = (files(a), files(b));
     a.retain(|name, _| !without.iter().any(|w| name.starts_with(w)));

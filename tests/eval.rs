@@ -1,4 +1,5 @@
-//! `splatvk eval` on ground truth that is not what it should be, and stopped on the way: one line, and nothing written.
+//! `splatvk eval` on ground truth that is not what it should be, and stopped on the way: one line,
+//! and nothing written.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 

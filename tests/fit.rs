@@ -189,8 +189,8 @@ fn breakfast_with_exact_geometry() {
     );
 }
 
-/// Six times the light of the 8-bit photos: what shows nearly white there is far above 1 here. It must come back from the
-/// trained scene, through a file as well.
+/// Six times the light of the 8-bit photos: what shows nearly white there is far above 1 here. It
+/// must come back from the trained scene, through a file as well.
 #[test]
 fn light_above_one_is_learnt_and_rendered() {
     let mut train = load("train", 8);

@@ -78,7 +78,8 @@ fn a_perturbed_camera_is_recovered() {
     assert!(angle(&start[2].pose, &truth[2].pose) > 0.49);
 
     let mut options = RgbOptions::preset(Preset::Draft);
-    // 300 updates of the camera: turning and shifting look alike, so the last tenths of a degree come slowly.
+    // 300 updates of the camera: turning and shifting look alike, so the last tenths of a degree
+    // come slowly.
     options.iterations = 900;
     // These splats stand still; at half the size they would need to look different.
     options.coarse = 0.0;
@@ -286,7 +287,8 @@ fn a_scene_with_a_model_per_level_decodes_as_it_was_trained() {
     let images = photos(&device, &splats, &cameras);
     let field = two_objects(&device, &splats, &cameras);
     let seen = Seen::default();
-    // Fast enough that the levels' splats are clearly others in the end, and on their way in another order.
+    // Fast enough that the levels' splats are clearly others in the end, and on their way in
+    // another order.
     let rate = Exponential { start: 0.03, end: 0.03, steps: 40 };
     let rates = fit::Rates { means: rate, ..language_options().rates };
     let options = LanguageOptions { per_level: true, rates, image_weight: 0.0, ..language_options() };
@@ -325,7 +327,8 @@ fn a_scene_with_a_model_per_level_decodes_as_it_was_trained() {
             .filter(|(f, code)| **code < 0 || codes.decode(&f[first..first + 3]) == Some(**code as usize));
         assert_eq!(alike.count(), frame.rendered.alpha.data.len(), "level {level}");
     }
-    // Mirrored splats of one level show its objects the other way round; the other level and the colours stay.
+    // Mirrored splats of one level show its objects the other way round; the other level and the
+    // colours stay.
     let mut mirrored = trained.field.clone();
     mirrored.levels[0].splats.as_mut().unwrap().means.iter_mut().for_each(|p| p[0] = -p[0]);
     let folder = tempfile::tempdir().unwrap();
@@ -357,7 +360,8 @@ fn only_the_ratio_of_rate_and_epsilon_matters_from_zero() {
     let decode = |f: &[f32]| f[0] > f[1];
     let pairs = a.field.levels[0].features.chunks_exact(3).zip(b.field.levels[0].features.chunks_exact(3));
     let differing = pairs.filter(|(x, y)| decode(x) != decode(y)).count();
-    // Splats that no labelled pixel saw stay at rounding noise; of the others only near ties may differ.
+    // Splats that no labelled pixel saw stay at rounding noise; of the others only near ties may
+    // differ.
     assert!(differing <= splats.len() / 100, "{differing} of {} decode differently", splats.len());
 }
 
@@ -372,8 +376,8 @@ fn without_weight_the_language_loss_changes_nothing() {
         let options = LanguageOptions { image_weight: 1.0, iterations, check_every: 0, ..language_options() };
         fit::train_language(&device, &images, &cameras, &splats, field.clone(), &options, &Silent).unwrap()
     };
-    // Two runs lift with atomic sums in another order, hence the last digits; an Adam step would move a
-    // feature by about its rate, more than 1e-3.
+    // Two runs lift with atomic sums in another order, hence the last digits; an Adam step would
+    // move a feature by about its rate, more than 1e-3.
     let (lifted, trained) = (run(0), run(9));
     let pairs = lifted.field.levels[0].features.iter().zip(&trained.field.levels[0].features);
     let moved = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

@@ -1,4 +1,5 @@
-//! glTF files: what is written reads back, and what is not a readable file of Gaussians is refused in one line.
+//! glTF files: what is written reads back, and what is not a readable file of Gaussians is refused
+//! in one line.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::indexing_slicing)] // a panic is how a test fails
 use serde_json::{Value, json};
 use splatvk::format::gaussians;
@@ -132,7 +133,8 @@ fn unreadable_files_are_refused() {
     said(|r| r["buffers"][0]["uri"] = json!("missing.bin"), "missing.bin");
     said(|r| r["buffers"][0]["uri"] = json!("https://example.org/a.bin"), "not a local file");
     said(|r| r["buffers"][0]["uri"] = json!("data:;base64,!"), "base64");
-    // Scales of the drafts were logarithms: here the accessor of SCALE is that of the means, some of them negative.
+    // Scales of the drafts were logarithms: here the accessor of SCALE is that of the means, some
+    // of them negative.
     said(
         |r| {
             let attributes = r["meshes"][0]["primitives"][0]["attributes"].as_object_mut().unwrap();
@@ -182,7 +184,8 @@ fn gaussians_are_in_the_axes_of_gltf_and_where_all_nodes_above_them_put_them() {
     gaussians::write(&path, &s, None).unwrap();
     let mut root: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
     assert_eq!(root["accessors"][0]["min"], json!([1.0, 2.0, 3.0]));
-    // (1, 2, 3) scaled is (2, 4, 6), half a turn about y makes it (−2, 4, −6), the node above (8, 4, −6).
+    // (1, 2, 3) scaled is (2, 4, 6), half a turn about y makes it (−2, 4, −6), the node above (8,
+    // 4, −6).
     root["nodes"] = json!([
         { "children": [1], "translation": [10, 0, 0] },
         { "mesh": 0, "rotation": [0, 1, 0, 0], "scale": [2, 2, 2] },
@@ -193,7 +196,8 @@ fn gaussians_are_in_the_axes_of_gltf_and_where_all_nodes_above_them_put_them() {
     close(&back.log_scales[0], &s.log_scales[0].map(|v| v + 2f32.ln()), 1e-5, "log scales");
 }
 
-/// Of as many nodes as are read, without scenes, every node that no other has is one: looking for that of each in all others took half a minute.
+/// Of as many nodes as are read, without scenes, every node that no other has is one: looking for
+/// that of each in all others took half a minute.
 #[test]
 fn many_nodes_are_read_at_once() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,4 +1,5 @@
-//! Gradients of the whole render on the GPU against the f64 twin, which is itself checked by central differences.
+//! Gradients of the whole render on the GPU against the f64 twin, which is itself checked by
+//! central differences.
 mod support;
 use splatvk::gpu::{self, NATIVE_FLOAT_ATOMICS, Options, Recorder, TestDevice, test_device};
 use splatvk::pass::{DeviceChoices, FeatureMode, Summation};
@@ -22,7 +23,8 @@ fn random_scenes_match_the_twin() {
     }
 }
 
-/// Opacities that fall where the projection dilates a splat, and those that no longer reach a pixel.
+/// Opacities that fall where the projection dilates a splat, and those that no longer reach a
+/// pixel.
 #[test]
 fn antialiased_scenes_match_the_twin() {
     let device = test_device();
@@ -76,7 +78,8 @@ fn gradients_by_entry_have_room_for_lists_that_have_grown() {
     assert_eq!(grown, scene.gradients_by(&device, ways, &upstream));
 }
 
-/// With an upstream that is alike everywhere, means move mostly by the direction from which colours are seen.
+/// With an upstream that is alike everywhere, means move mostly by the direction from which colours
+/// are seen.
 #[test]
 fn colours_that_change_with_the_direction_move_the_means_as_in_the_twin() {
     let device = test_device();
@@ -93,8 +96,8 @@ fn colours_that_change_with_the_direction_move_the_means_as_in_the_twin() {
     assert_class("means", gradients.splats.means.as_flattened(), &reference);
 }
 
-/// Edge cases of docs/internals/method.md#tolerances: clamped α, clamped Jacobian, needle, behind, hidden, outside, a clamped
-/// colour.
+/// Edge cases of docs/internals/method.md#tolerances: clamped α, clamped Jacobian, needle, behind,
+/// hidden, outside, a clamped colour.
 #[test]
 fn edge_cases_match_the_twin() {
     let device = test_device();
@@ -123,7 +126,8 @@ fn edge_cases_match_the_twin() {
     assert_eq!(gradients.splats.sh[7 * 48], 0.0);
 }
 
-/// Linear features, and features at exactly zero in the gauge, where the Jacobian is 1/ε; one gauge, and one per level.
+/// Linear features, and features at exactly zero in the gauge, where the Jacobian is 1/ε; one
+/// gauge, and one per level.
 #[test]
 fn both_feature_modes_match_the_twin() {
     let device = test_device();
@@ -190,7 +194,8 @@ fn common_translation_is_a_gauge() {
     assert_class("translation", &moved, &rho);
 }
 
-/// Widths that leave room in the last launch: in the sums by entry nothing may reach the next splat.
+/// Widths that leave room in the last launch: in the sums by entry nothing may reach the next
+/// splat.
 #[test]
 fn feature_widths_that_fill_no_launch_match_the_twin() {
     let device = test_device();

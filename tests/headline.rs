@@ -1,5 +1,5 @@
-//! The headline figures of one small run, from photos to scored answers through the command line: a stage that breaks
-//! shows here even if it still runs.
+//! The headline figures of one small run, from photos to scored answers through the command line: a
+//! stage that breaks shows here even if it still runs.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
 mod fixture;
 
@@ -16,7 +16,8 @@ fn splatvk(args: &[&str]) -> Vec<u8> {
     output.stdout
 }
 
-/// The photos at half size, where the whole pipeline takes seconds, and the truth of the frames to score.
+/// The photos at half size, where the whole pipeline takes seconds, and the truth of the frames to
+/// score.
 fn prepare(folder: &Path) -> (PathBuf, PathBuf) {
     let (photos, truth) = (folder.join("photos"), folder.join("truth"));
     fixture::truth_of(&truth, |file| {
@@ -70,9 +71,9 @@ fn a_small_run_reaches_its_figures() {
         lemon("train"),
         lemon("test"),
     );
-    // Measured: 0.061 degrees, 0.054 %, 0.08 %, 0.968; depth 0.48 % and 0.47 %; 30.3 and 28.3 dB; localised 0.97, mIoU 0.63.
-    // Float atomics, drivers and seeds move these by a few percent, mIoU from 0.62 to 0.77 (seeds 0 to 2), and may cost one
-    // answer; a broken stage costs far more.
+    // Measured: 0.061 degrees, 0.054 %, 0.08 %, 0.968; depth 0.48 % and 0.47 %; 30.3 and 28.3 dB;
+    // localised 0.97, mIoU 0.63. Float atomics, drivers and seeds move these by a few percent, mIoU
+    // from 0.62 to 0.77 (seeds 0 to 2), and may cost one answer; a broken stage costs far more.
     assert!(worst("rotation_degrees") < 0.15, "rotation");
     assert!(worst("centre_fraction") < 0.0015, "centre");
     assert!(worst("focal_relative") < 0.004, "focal");

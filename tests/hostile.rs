@@ -1,4 +1,5 @@
-//! Files that somebody else made, as the program meets them: one clear line, exit code 2, nothing half-written.
+//! Files that somebody else made, as the program meets them: one clear line, exit code 2, nothing
+//! half-written.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
@@ -12,7 +13,8 @@ fn splatvk(arguments: &[&str]) -> Output {
     c.env_remove("SPLATVK_MODELS").stdin(Stdio::null()).args(arguments).output().unwrap()
 }
 
-/// Must end with `code` and one error line of bounded length without control characters, which contains the words.
+/// Must end with `code` and one error line of bounded length without control characters, which
+/// contains the words.
 fn refuses(code: i32, arguments: &[&str], words: &[&str]) {
     let output = splatvk(arguments);
     let stderr = String::from_utf8_lossy(&output.stderr);

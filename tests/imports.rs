@@ -1,4 +1,5 @@
-//! Who may use whom: the folders in one direction, the files without circles. Tests may use what they like.
+//! Who may use whom: the folders in one direction, the files without circles. Tests may use what
+//! they like.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 
 #[path = "support/sources.rs"]

@@ -1,4 +1,5 @@
-//! Networks and ONNX Runtime as a user meets them on the command line: listed, explained, refused in one line.
+//! Networks and ONNX Runtime as a user meets them on the command line: listed, explained, refused
+//! in one line.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
 use std::path::Path;
 use std::process::{Command, Stdio};

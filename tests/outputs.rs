@@ -1,5 +1,5 @@
-//! The rule for everything that a command writes where a user says: never over what is there without --force, never over a
-//! symbolic link or a device, all of it or none.
+//! The rule for everything that a command writes where a user says: never over what is there
+//! without --force, never over a symbolic link or a device, all of it or none.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;

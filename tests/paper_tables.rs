@@ -1,4 +1,5 @@
-//! The tables on data sets in the published layouts, and the driver of all of them, on small fakes made from generated scenes.
+//! The tables on data sets in the published layouts, and the driver of all of them, on small fakes
+//! made from generated scenes.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
 use image::GenericImageView;
 use serde_json::{Value, json};
@@ -201,7 +202,8 @@ fn row<'r>(report: &'r Value, label: &str) -> &'r Value {
     rows.iter().find(|r| r["label"] == label).expect(label)
 }
 
-/// True masks with the embeddings of their labels: whatever layout they lie in, they are found again.
+/// True masks with the embeddings of their labels: whatever layout they lie in, they are found
+/// again.
 #[test]
 #[ignore = "takes long: tools/test-long"]
 fn true_segmentation_is_found_again_in_every_layout() {
@@ -211,9 +213,11 @@ fn true_segmentation_is_found_again_in_every_layout() {
     as_ovs(&scene, &root.path().join("3d_ovs"), "bed");
     as_scannet(&scene, &root.path().join("scannet"), "scene0000_00");
     for (layout, data, paper, least) in [
-        // LERF's masks are cut from smoothed maps: at this size edges move by a good part of an object.
+        // LERF's masks are cut from smoothed maps: at this size edges move by a good part of an
+        // object.
         ("lerf", "lerf_ovs/teatime", 0.7125, 0.6),
-        // Nothing has the 2000 pixels that a mask of the paper's rule needs: every answer is the substitute's.
+        // Nothing has the 2000 pixels that a mask of the paper's rule needs: every answer is the
+        // substitute's.
         ("3dovs", "3d_ovs/bed", f64::NAN, 0.55),
         ("scannet", "scannet/scene0000_00", 0.4709, 0.8),
     ] {

@@ -81,7 +81,8 @@ fn single_gaussian_has_its_analytic_image() {
     assert_close("transmittance", &out.transmittance, &expected, &IMAGE);
 }
 
-/// With one colour everywhere and a black background the image is colour · A, whatever the splats are.
+/// With one colour everywhere and a black background the image is colour · A, whatever the splats
+/// are.
 #[test]
 fn constant_colour_gives_colour_times_alpha() {
     let device = test_device();
@@ -158,7 +159,8 @@ fn near_opaque_needle_huge_hidden_and_outside_splats_match_the_twin() {
     assert_images(&scene.render(&device), &twin);
 }
 
-/// The lists hold what the twin's exact test finds, nearest first, plus at most the few that its margin lets in.
+/// The lists hold what the twin's exact test finds, nearest first, plus at most the few that its
+/// margin lets in.
 #[test]
 fn tile_lists_contain_the_twins() {
     let scene = Scene::small(500, 0, 0, 77);
@@ -186,7 +188,8 @@ fn the_lists_of_a_view_hold_nothing_of_the_view_before() {
     }
 }
 
-/// lavapipe leaves the loops of a shader after 65535 rounds: more lanes share the 4.7 million entries of these lists.
+/// lavapipe leaves the loops of a shader after 65535 rounds: more lanes share the 4.7 million
+/// entries of these lists.
 #[test]
 fn long_lists_are_listed_whole() {
     let device = test_device();
@@ -205,7 +208,8 @@ fn long_lists_are_listed_whole() {
     }
 }
 
-/// Many splats within the middle one of three tiles, and one farther away in its corner: it is shown, or the frame is refused.
+/// Many splats within the middle one of three tiles, and one farther away in its corner: it is
+/// shown, or the frame is refused.
 #[test]
 fn no_splat_of_a_long_list_is_left_out_without_an_error() {
     let device = test_device();
@@ -296,7 +300,8 @@ fn renderer_returns_the_planes_as_maps() {
     assert_eq!(renderer.render(&camera.resized(40, 28)).unwrap().rgb.data.len(), 40 * 28);
 }
 
-/// The near plane that nobody set is a hundredth of the median depth of what lies before the camera.
+/// The near plane that nobody set is a hundredth of the median depth of what lies before the
+/// camera.
 #[test]
 fn splats_behind_the_camera_neither_show_nor_count_for_the_near_plane() {
     let device = test_device();
@@ -311,7 +316,8 @@ fn splats_behind_the_camera_neither_show_nor_count_for_the_near_plane() {
     assert!(image(&splats) == seen);
 }
 
-/// What a splat shows of a view, with colours and features that must not matter, in one band and in strips of the image.
+/// What a splat shows of a view, with colours and features that must not matter, in one band and in
+/// strips of the image.
 #[test]
 fn weights_of_a_view_match_the_twin() {
     let device = test_device();
@@ -381,7 +387,8 @@ fn no_splats_give_the_background() {
     assert_eq!(behind.planes, out.planes);
 }
 
-/// gsplat's `rasterize_mode="antialiased"`: the opacity of a splat of variance v px² is multiplied by v / (v + 0.3).
+/// gsplat's `rasterize_mode="antialiased"`: the opacity of a splat of variance v px² is multiplied
+/// by v / (v + 0.3).
 #[test]
 fn antialiased_opacity_falls_with_the_dilation() {
     let device = test_device();

@@ -12,7 +12,8 @@ fn data(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
 }
 
-/// Asserts 8-bit colours at four positions. The expected values come from Pillow 13 reading the same files.
+/// Asserts 8-bit colours at four positions. The expected values come from Pillow 13 reading the
+/// same files.
 fn assert_colours(photo: &Photo, expected: [[u8; 3]; 4], tolerance: f32) {
     for ((x, y), e) in [(5, 5), (90, 10), (40, 50), (90, 60)].into_iter().zip(expected) {
         let c = photo.image.at(x, y).map(|v| v * 255.0);
@@ -27,7 +28,8 @@ fn read(inputs: &[PathBuf], views: Option<usize>) -> splatvk::Result<Vec<photo::
 
 #[test]
 fn kinds_of_files_agree_with_another_reader() {
-    // JPEG decoders may differ by rounding of the inverse DCT and of the chroma interpolation: 3 of 255.
+    // JPEG decoders may differ by rounding of the inverse DCT and of the chroma interpolation: 3 of
+    // 255.
     let cmyk = photo::load(&data("photos/cmyk.jpg")).unwrap();
     assert_colours(&cmyk, [[237, 231, 211], [17, 174, 173], [124, 49, 177], [15, 15, 153]], 3.0);
     let progressive = photo::load(&data("photos/progressive.jpg")).unwrap();
@@ -54,7 +56,8 @@ fn a_tall_photo_is_scaled_with_its_focal_and_orientation() {
         (Tag::FocalLengthIn35mmFilm, Value::Short(vec![28])),
         (Tag::Model, Value::Ascii(vec![b"Phone".to_vec()])),
     ]);
-    // Stored 2000 × 1200 lying on its side, left half red: upright 1200 × 2000 with the upper half red.
+    // Stored 2000 × 1200 lying on its side, left half red: upright 1200 × 2000 with the upper half
+    // red.
     let stored = image::RgbImage::from_fn(2000, 1200, |x, _| {
         image::Rgb(if x < 1000 { [220, 0, 0] } else { [0, 0, 220] })
     });
@@ -181,11 +184,13 @@ fn program(name: &str) -> Option<std::process::Command> {
     there.then(|| std::process::Command::new(name))
 }
 
-/// The four photos as a video of twelve frames, two of them blurred; `options` go before the output.
+/// The four photos as a video of twelve frames, two of them blurred; `options` go before the
+/// output.
 fn clip(folder: &Path, name: &str, options: &[&str]) -> Option<PathBuf> {
     let frames = folder.join("frames");
     std::fs::create_dir_all(&frames).unwrap();
-    // Each photo three times, as a camera that stands still: repeated frames must not be chosen together.
+    // Each photo three times, as a camera that stands still: repeated frames must not be chosen
+    // together.
     for i in 0..12 {
         let photo = data(&format!("breakfast/images/train_{:02}.jpg", i / 3));
         std::fs::copy(photo, frames.join(format!("{i:02}.jpg"))).unwrap();
@@ -368,7 +373,8 @@ fn photos_of_every_size_kind_and_orientation_are_upright_or_refused() {
     ];
     for (i, size) in sizes.into_iter().enumerate() {
         for (j, file) in kinds.into_iter().enumerate() {
-            // Every size meets every kind; with nine kinds all eight orientations come to each size and to each kind.
+            // Every size meets every kind; with nine kinds all eight orientations come to each size
+            // and to each kind.
             let orientation = 1 + (i + j) as u8 % 8;
             let (kind, _) = file.split_once('.').unwrap();
             let path = folder.path().join(format!("{i}-{orientation}-{file}"));

@@ -1,5 +1,5 @@
-//! The built-in adapters against graphs with the interfaces of public exports: each is run through the whole path of its
-//! role, and answers with something that shows what it was given.
+//! The built-in adapters against graphs with the interfaces of public exports: each is run through
+//! the whole path of its role, and answers with something that shows what it was given.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 use std::path::Path;
 
@@ -29,8 +29,9 @@ fn pool(side: i64) -> [(&'static str, Attribute<'static>); 2] {
     [("kernel_shape", Attribute::Ints(by)), ("strides", Attribute::Ints(by))]
 }
 
-/// Output `masks`: x of each prompt, plus the one number in `also`, plus 0, 100, 200… for the masks of a prompt. `shape` is that of
-/// one prompt's masks, 8 × 8 each; x is the first entry of the prompts' last axis.
+/// Output `masks`: x of each prompt, plus the one number in `also`, plus 0, 100, 200… for the masks
+/// of a prompt. `shape` is that of one prompt's masks, 8 × 8 each; x is the first entry of the
+/// prompts' last axis.
 fn marked(graph: Onnx, points: &str, axis: i64, shape: &[u64], also: &str, masks: &str) -> Onnx {
     let count = shape[shape.len() - 3];
     let place: Vec<f32> = (0..64 * count).map(|k| 100.0 * (k / 64) as f32).collect();
@@ -59,7 +60,8 @@ fn scored(graph: Onnx, shape: &[u64], row: &[i64], values: &[f32], scores: &str)
         .node("Add", "nothing values", scores, &[])
 }
 
-/// Asks a model about two pixels of a photo of 32 × 16: the first logit of each of their masks, and the scores.
+/// Asks a model about two pixels of a photo of 32 × 16: the first logit of each of their masks, and
+/// the scores.
 fn asked(folder: &Path, name: &str) -> (Vec<f32>, Vec<f32>) {
     let model = Registry::of(&[folder]).installed(Task::Masks, name).unwrap();
     let mut sam = Sam::load(&model).unwrap();
@@ -103,7 +105,8 @@ fn sam_2_hands_its_fine_features_to_the_decoder_and_fills_the_square() {
     scored(decoder, &[1, 4], &[-1, 1], &[0.1, 0.2, 0.3, 0.4], "iou_predictions")
         .write(&dir.path().join("sam2/decoder.onnx"));
     let (logits, scores) = asked(dir.path(), "sam2");
-    // Columns 8 and 24 of 32 are 16 and 48 of 64; a photo of the mean colour leaves 7 in the fine features.
+    // Columns 8 and 24 of 32 are 16 and 48 of 64; a photo of the mean colour leaves 7 in the fine
+    // features.
     near(&logits, &[123.0, 223.0, 323.0, 155.0, 255.0, 355.0]);
     near(&scores, &[0.2, 0.3, 0.4, 0.2, 0.3, 0.4]);
 
@@ -254,7 +257,8 @@ fn roma_2_answers_both_directions_at_once_with_probabilities() {
     near(&[there.certainty.data[10 * 80 + 30], back.certainty.data[50 * 160 + 120]], &[0.75, 0.25]);
 }
 
-/// The breakfast views with a graph that returns their true depth and cameras, as VGGT says them and as Depth Anything 3 does.
+/// The breakfast views with a graph that returns their true depth and cameras, as VGGT says them
+/// and as Depth Anything 3 does.
 #[test]
 fn multi_view_networks_that_say_the_truth_give_the_true_cameras() {
     let views = breakfast::train_views();
@@ -329,7 +333,8 @@ fn multi_view_networks_that_say_the_truth_give_the_true_cameras() {
             let turned = (camera.pose.rotation * truth.rotation.transpose()).transpose();
             let angle =
                 ((turned.x_axis.x + turned.y_axis.y + turned.z_axis.z - 1.0) / 2.0).clamp(-1.0, 1.0).acos();
-            // Depth is taken at one of 33 pixels and the nearest at that: measured below 0.1° and 0.3 %.
+            // Depth is taken at one of 33 pixels and the nearest at that: measured below 0.1° and
+            // 0.3 %.
             assert!(angle.to_degrees() < 0.3, "{name} {k}: {}°", angle.to_degrees());
             assert!(
                 (camera.fx / v.camera.fx - 1.0).abs() < 0.01,

@@ -1,4 +1,5 @@
-//! A run that is killed, or finds the disk full, goes on with `--resume`, and ends with the same bits as one that was left alone.
+//! A run that is killed, or finds the disk full, goes on with `--resume`, and ends with the same
+//! bits as one that was left alone.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 mod fixture;
@@ -50,7 +51,8 @@ impl Scene {
         home
     }
 
-    /// `splatvk run` with `language` steps of semantic training, and with stages kept in the folder `home`.
+    /// `splatvk run` with `language` steps of semantic training, and with stages kept in the folder
+    /// `home`.
     fn run(&self, home: &str, out: &str, language: u32, resume: bool) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));
         command
@@ -138,8 +140,8 @@ fn a_run_that_no_disk_takes_leaves_the_old_scene_and_goes_on_later() {
     let before = content(&scene.at("whole"));
     let run_json = std::fs::read(scene.at("whole/run.json")).unwrap();
 
-    // The same run again, over its scene, where the largest file of the scene does not fit; the kernel counts in blocks of
-    // 512 bytes, and would end the process without the trap.
+    // The same run again, over its scene, where the largest file of the scene does not fit; the
+    // kernel counts in blocks of 512 bytes, and would end the process without the trap.
     let blocks = largest(&scene.at("whole")).div_ceil(512) - 2;
     let mut run = scene.run("home-b", "whole", 20, false);
     let output = limited(blocks, run.arg("--force")).output().unwrap();
@@ -203,7 +205,8 @@ fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
     assert_eq!(statistics(&whole), statistics(&resumed));
     assert!(statistics(&whole)[4].to_string().contains("clip.mp4"), "{}", statistics(&whole)[4]);
 
-    // Everything is there: nothing but decoding runs again. Then another late option: what precedes it stays.
+    // Everything is there: nothing but decoding runs again. Then another late option: what precedes
+    // it stays.
     let said = scene.finished("home-b", "again", 20, true);
     let kept = |said: &str| said.lines().find(|l| l.contains("kept from an earlier run")).unwrap().to_owned();
     // Splats are read as the stage after them left them.

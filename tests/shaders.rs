@@ -1,4 +1,5 @@
-//! Every shipped shader module, in all variants: naga parses and validates it, and the reflection agrees with itself.
+//! Every shipped shader module, in all variants: naga parses and validates it, and the reflection
+//! agrees with itself.
 #![allow(clippy::unwrap_used)] // helpers of tests
 use naga::front::spv;
 use naga::valid::{Capabilities, ValidationFlags, Validator};
@@ -85,7 +86,8 @@ fn element_of(module: &naga::Module, block: naga::Handle<naga::Type>) -> String 
     }
 }
 
-/// `Binding::element` and the type of the field in `Bindings` are written by build.rs from one value.
+/// `Binding::element` and the type of the field in `Bindings` are written by build.rs from one
+/// value.
 #[test]
 fn elements_are_what_the_modules_read() {
     let structures = [

@@ -45,7 +45,8 @@ fn a_generated_scene_is_ablated() {
     let rows = report["tables"][0]["rows"].as_array().unwrap();
     assert_eq!(rows.len(), 5);
     let figure = |row: usize, name: &str| rows[row]["figures"][name].as_f64();
-    // the bijection keeps every meaning, whatever the dimension; one photo in four objects' size is coarse, though
+    // the bijection keeps every meaning, whatever the dimension; one photo in four objects' size is
+    // coarse, though
     assert!(
         figure(0, "SIM").unwrap() > figure(2, "SIM").unwrap() && figure(0, "mIoU").unwrap() > 0.3,
         "{rows:?}"
@@ -56,8 +57,8 @@ fn a_generated_scene_is_ablated() {
     }
 }
 
-/// Two scenes and one that cannot be read, with two seeds; what they share runs once, and the second call takes it all from the
-/// first.
+/// Two scenes and one that cannot be read, with two seeds; what they share runs once, and the
+/// second call takes it all from the first.
 #[test]
 #[ignore = "takes long: tools/test-long"]
 fn scenes_and_seeds_have_a_spread_and_a_failed_scene_is_a_note() {
@@ -107,7 +108,8 @@ fn scenes_and_seeds_have_a_spread_and_a_failed_scene_is_a_note() {
     );
     let note = row["note"].as_str().unwrap();
     assert!(note.starts_with("2 of 6 failed, first broken with seed 0: "), "{note}");
-    // Cameras are given, so that no random number enters before stereo: once per scene, training once per scene and seed.
+    // Cameras are given, so that no random number enters before stereo: once per scene, training
+    // once per scene and seed.
     assert_eq!((begun("features"), begun("splats")), (2, 4));
     let text = std::fs::read_to_string(out.join("alignment.txt")).unwrap();
     assert!(text.contains(" ± ") && text.contains("Δ mIoU"), "{text}");
@@ -120,8 +122,8 @@ fn scenes_and_seeds_have_a_spread_and_a_failed_scene_is_a_note() {
     assert_eq!((row["spread"]["mIoU"]["n"].as_u64(), row["note"].as_str()), (Some(4), Some(note)));
 }
 
-/// Two photos whose axes meet at equal distances: matches leave their focal length open (without vanishing points it comes out
-/// 36 % short, and the rotation between them 17° wrong).
+/// Two photos whose axes meet at equal distances: matches leave their focal length open (without
+/// vanishing points it comes out 36 % short, and the rotation between them 17° wrong).
 #[test]
 fn edges_at_right_angles_tell_two_photos_their_focal_length() {
     let folder = tempfile::tempdir().unwrap();

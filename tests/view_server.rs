@@ -1,4 +1,5 @@
-//! The server of `splatvk view`, as what else runs on the machine meets it: other pages, other users, requests that never end.
+//! The server of `splatvk view`, as what else runs on the machine meets it: other pages, other
+//! users, requests that never end.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 

@@ -1,5 +1,5 @@
-//! The interactive view in a real browser: it draws what the engine draws, selects what is clicked, lights up what is
-//! asked for, and asks nobody but its own server.
+//! The interactive view in a real browser: it draws what the engine draws, selects what is clicked,
+//! lights up what is asked for, and asks nobody but its own server.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod browser;
 mod fixture;
@@ -112,7 +112,8 @@ fn draws_what_the_engine_draws(page: &mut Page, scene: &Path) {
     let depth = to_float(&page.picture(0));
     let engine =
         splatvk::report::colour::depth_image(&viewer.view(&loaded.cameras[0]).unwrap().rendered.depth);
-    // The page takes the range of depth from the splats, the engine from the pixels: the same picture, not the same shades.
+    // The page takes the range of depth from the splats, the engine from the pixels: the same
+    // picture, not the same shades.
     assert!(psnr(&depth, &engine) > 15.0, "{}", psnr(&depth, &engine));
     page.run("splatvk.show('colour')");
 }
@@ -382,7 +383,8 @@ fn the_report_of_a_training_shows_its_scene() {
     keep(&mut page, "report.png");
 }
 
-/// The pictures of the README, from a real run: `SPLATVK_SCENE=out/breakfast cargo test --test viewer -- --ignored`.
+/// The pictures of the README, from a real run: `SPLATVK_SCENE=out/breakfast cargo test --test
+/// viewer -- --ignored`.
 #[test]
 #[ignore = "needs a scene of splatvk run on breakfast in SPLATVK_SCENE"]
 fn pictures_of_a_real_scene() {

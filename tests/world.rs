@@ -1,4 +1,5 @@
-//! What the program does with what a scene knows of the world: which way is up, how long things are, what the photos show.
+//! What the program does with what a scene knows of the world: which way is up, how long things
+//! are, what the photos show.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
@@ -9,8 +10,8 @@ use splatvk::scene::{
 };
 use std::path::{Path, PathBuf};
 
-/// A scene of two splats and one camera, the first splat one unit straight above it and in no photo. Points are where splats
-/// are.
+/// A scene of two splats and one camera, the first splat one unit straight above it and in no
+/// photo. Points are where splats are.
 fn tilted_scene(folder: &Path) -> (PathBuf, Splats, Camera) {
     let scene = folder.join("scene");
     std::fs::create_dir(&scene).unwrap();

@@ -1,4 +1,5 @@
-//! Data sets in their own layouts, as the runner takes them: frames that may be photos, labels, and cameras where known.
+//! Data sets in their own layouts, as the runner takes them: frames that may be photos, labels, and
+//! cameras where known.
 use crate::eval::protocol::{self, ProtocolKind};
 use crate::eval::{GroundTruth, Split, TruthFrame};
 use crate::format::cameras;
@@ -44,7 +45,8 @@ impl Layout {
         }
     }
 
-    /// The frames of the first column: the authors' script scores labelled photos, and everything else held-out views.
+    /// The frames of the first column: the authors' script scores labelled photos, and everything
+    /// else held-out views.
     pub(super) fn headline(self) -> Split {
         match self {
             Layout::Published(ProtocolKind::Lerf | ProtocolKind::Ovs) => Split::Train,
@@ -68,8 +70,8 @@ pub struct DataSet {
     pub name: String,
     /// How it lies on disk.
     pub layout: Layout,
-    /// Frames and labels. Of a published layout every labelled frame with a photo, all of them in the split `train`: which are
-    /// photos of a scene is the row's choice.
+    /// Frames and labels. Of a published layout every labelled frame with a photo, all of them in
+    /// the split `train`: which are photos of a scene is the row's choice.
     pub truth: GroundTruth,
     /// Where its protocol reads labels.
     pub(super) labels: PathBuf,
@@ -96,7 +98,8 @@ impl Scope {
     }
 }
 
-/// Labels of a LERF-OVS scene: `lerf_ovs/label/SCENE` beside `lerf_ovs/SCENE`, or in the scene's own folder.
+/// Labels of a LERF-OVS scene: `lerf_ovs/label/SCENE` beside `lerf_ovs/SCENE`, or in the scene's
+/// own folder.
 fn lerf_labels(folder: &Path) -> Option<PathBuf> {
     let whole = folder.canonicalize().ok()?;
     let beside = whole.parent().zip(whole.file_name()).map(|(up, name)| up.join("label").join(name));
@@ -108,7 +111,8 @@ fn lerf_labels(folder: &Path) -> Option<PathBuf> {
 }
 
 impl DataSet {
-    /// Opens a folder, in the given layout or in that of what lies there; refuses what no row could be scored on.
+    /// Opens a folder, in the given layout or in that of what lies there; refuses what no row could
+    /// be scored on.
     pub fn open(name: String, folder: &Path, layout: Option<Layout>) -> Result<DataSet> {
         let layout = layout.or_else(|| Layout::of(folder)).ok_or_else(|| {
             Error::input(format!(

@@ -1,5 +1,6 @@
-//! Features in 2D: what an encoder says of a photo's own pixels, without a scene (the row "LSeg" of the paper's comparison with
-//! LSM). Every cell of a few pixels is a code of its own, so that the rules of the protocols apply unchanged.
+//! Features in 2D: what an encoder says of a photo's own pixels, without a scene (the row "LSeg" of
+//! the paper's comparison with LSM). Every cell of a few pixels is a code of its own, so that the
+//! rules of the protocols apply unchanged.
 use super::data::DataSet;
 use super::stages::{Scored, asked};
 use crate::Result;
@@ -10,7 +11,8 @@ use crate::query::{QueryOptions, TextQuery, answer_with, field_relevancy};
 use crate::run::stages::SharedEncoder;
 use crate::scene::{Camera, Codebook, LanguageField, LevelField, Plane, RgbImage};
 
-/// Pixels along a cell. LSeg's features come at half the size of its input, which is about half that of a LERF photo.
+/// Pixels along a cell. LSeg's features come at half the size of its input, which is about half
+/// that of a LERF photo.
 const CELL: usize = 4;
 
 /// One photo as a field of one level, and the code of each pixel.
@@ -136,7 +138,8 @@ mod tests {
         std::fs::create_dir_all(at("images")).unwrap();
         let side = 120;
         for stem in ["0", "1"] {
-            // Red left of the middle, blue right of it: 7200 pixels each, and no cell across the border.
+            // Red left of the middle, blue right of it: 7200 pixels each, and no cell across the
+            // border.
             let red = |x: u32| x < side / 2;
             let photo = image::RgbImage::from_fn(side, side, |x, _| {
                 image::Rgb(if red(x) { [250, 0, 0] } else { [0, 0, 250] })

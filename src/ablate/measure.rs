@@ -104,7 +104,8 @@ fn field(scored: &Scored, scope: &Scope) -> Figures {
     out
 }
 
-/// Means over (frame, phrase) pairs where the protocol has them, else its own summary: ScanNet counts pixels of all frames.
+/// Means over (frame, phrase) pairs where the protocol has them, else its own summary: ScanNet
+/// counts pixels of all frames.
 fn published(report: &ProtocolReport, scope: &Scope) -> Figures {
     let mut out = Figures::new();
     let of_split = |split: Split| report.summary.get(split.name());

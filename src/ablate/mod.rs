@@ -1,9 +1,11 @@
 //! `splatvk ablate`: the tables of the paper's experiments on data sets with ground truth.
 //!
-//! A table is a list of setups ([`Setup`]) that differ in one thing. A [`Runner`] runs each on one data set as a graph of
-//! stages over one store in memory: cameras, points and splats are made once for most tables, and what no random number enters
-//! once for all seeds. What a row gave is a [`Measurement`]; a [`FinishedTable`] is the means of all of them. Figures are those
-//! of protocol `field` on held-out frames, or of the published protocol whose layout a data set has ([`Layout`]).
+//! A table is a list of setups ([`Setup`]) that differ in one thing. A [`Runner`] runs each on one
+//! data set as a graph of stages over one store in memory: cameras, points and splats are made once
+//! for most tables, and what no random number enters once for all seeds. What a row gave is a
+//! [`Measurement`]; a [`FinishedTable`] is the means of all of them. Figures are those of protocol
+//! `field` on held-out frames, or of the published protocol whose layout a data set has
+//! ([`Layout`]).
 mod data;
 mod flat;
 mod measure;
@@ -67,13 +69,15 @@ impl Default for Plan {
             max_points: None,
             seeds: vec![0],
             iterations: RgbOptions::preset(Preset::Draft).iterations,
-            // Three times draft's, whose features hardly leave their lifted start: methods differ in where training takes them.
+            // Three times draft's, whose features hardly leave their lifted start: methods differ
+            // in where training takes them.
             language_iterations: 3 * LanguageOptions::preset(Preset::Draft).iterations,
         }
     }
 }
 
-/// What a run has got to: the measurements so far, and the table that is finished with the last of them.
+/// What a run has got to: the measurements so far, and the table that is finished with the last of
+/// them.
 pub struct Finished<'m> {
     /// In the order in which they were made.
     pub measurements: &'m [Measurement],
@@ -81,9 +85,10 @@ pub struct Finished<'m> {
     pub table: Option<&'static Table>,
 }
 
-/// Runs the tables on every data set with every seed, one data set after the other, and drops what was made of one before the
-/// next. `keep` is told after every row. Rows of `earlier` that were measured the same way are taken from there. A row that
-/// cannot be measured says why and the others go on; an error is what stopped every row, a lost device, or the user.
+/// Runs the tables on every data set with every seed, one data set after the other, and drops what
+/// was made of one before the next. `keep` is told after every row. Rows of `earlier` that were
+/// measured the same way are taken from there. A row that cannot be measured says why and the
+/// others go on; an error is what stopped every row, a lost device, or the user.
 pub fn run(
     plan: &Plan,
     sets: Vec<DataSet>,

@@ -1,6 +1,8 @@
-//! The paper's own figures for the rows of the tables (SparseLGS, its sections "Experiments" and "Ablation studies").
+//! The paper's own figures for the rows of the tables (SparseLGS, its sections "Experiments" and
+//! "Ablation studies").
 
-/// Figures of one table on one data set: columns, then rows with a value per column; NaN where the paper has none.
+/// Figures of one table on one data set: columns, then rows with a value per column; NaN where the
+/// paper has none.
 struct Block {
     table: &'static str,
     /// Data set, or scene of one as `SET/SCENE`.
@@ -19,8 +21,8 @@ const TIMED: &[&str] = &["mIoU", "mAcc", "Tr.T", "T.T"];
 const SCORES: &[&str] = &["mIoU", "mAcc"];
 const IOU: &[&str] = &["mIoU"];
 
-/// The paper's mean accuracy on LERF is 0.770 in its tables of methods and 0.786 in those of ablations; the four scenes' own
-/// figures average 0.795.
+/// The paper's mean accuracy on LERF is 0.770 in its tables of methods and 0.786 in those of
+/// ablations; the four scenes' own figures average 0.795.
 static BLOCKS: &[Block] = &[
     Block {
         table: "methods",
@@ -169,7 +171,8 @@ static BLOCKS: &[Block] = &[
     },
 ];
 
-/// The paper's figures for a row, by column: those of the first of the data sets that has any for the row.
+/// The paper's figures for a row, by column: those of the first of the data sets that has any for
+/// the row.
 pub(super) fn figures(table: &str, row: &str, data: &[String]) -> Vec<(&'static str, f64)> {
     let of = |set: &String| {
         let mut blocks = BLOCKS.iter().filter(|b| b.table == table && b.data == set);

@@ -1,4 +1,5 @@
-//! Runs setups as graphs of stages that share one store: setups that agree up to a stage share what that stage made.
+//! Runs setups as graphs of stages that share one store: setups that agree up to a stage share what
+//! that stage made.
 use super::data::{DataSet, Layout, Scope};
 use super::flat;
 use super::setup::{Available, Network, Regions, RowWork, Setup, TableRow};
@@ -46,7 +47,8 @@ pub struct RowFigures {
     pub seconds: f64,
     /// Seconds of both training stages.
     pub training_seconds: f64,
-    /// Seconds of all stages from photos to the finished scene, one after the other, shared ones included.
+    /// Seconds of all stages from photos to the finished scene, one after the other, shared ones
+    /// included.
     pub total_seconds: f64,
 }
 
@@ -85,8 +87,9 @@ struct Stages {
     queries: Vec<TextQuery>,
 }
 
-/// Bytes that `channels` features of `splats` splats take while they are trained in views of `pixels` pixels: value, raw
-/// value, gradient and two moments each, and a plane with its gradient per channel.
+/// Bytes that `channels` features of `splats` splats take while they are trained in views of
+/// `pixels` pixels: value, raw value, gradient and two moments each, and a plane with its gradient
+/// per channel.
 pub fn feature_bytes(splats: usize, channels: usize, pixels: usize) -> u64 {
     4 * channels as u64 * (5 * splats as u64 + 2 * pixels as u64)
 }
@@ -115,15 +118,16 @@ impl<'a> Runner<'a> {
         train.min(self.data.layout.views())
     }
 
-    /// The seed of what runs from now on. What the seed before the last one alone has made is dropped.
+    /// The seed of what runs from now on. What the seed before the last one alone has made is
+    /// dropped.
     pub fn start_seed(&mut self, seed: u64) {
         self.store.forget_unused();
         self.done.clear();
         self.seed = seed;
     }
 
-    /// Frames whose photos a scene of so many views is made from: train frames spread over their order, and held-out ones
-    /// when they do not suffice.
+    /// Frames whose photos a scene of so many views is made from: train frames spread over their
+    /// order, and held-out ones when they do not suffice.
     pub fn frames(&self, views: usize) -> Result<Vec<TruthFrame>> {
         let of =
             |split| -> Vec<&TruthFrame> { self.truth.frames.iter().filter(|f| f.split == split).collect() };
@@ -145,7 +149,8 @@ impl<'a> Runner<'a> {
         Ok(frames)
     }
 
-    /// What rows can be scored on: held-out frames that none of them has as a photo, or the photos that all of them have.
+    /// What rows can be scored on: held-out frames that none of them has as a photo, or the photos
+    /// that all of them have.
     pub(super) fn scope<'r>(&self, rows: impl Iterator<Item = &'r TableRow>) -> Scope {
         let headline = self.data.layout.headline();
         let (mut seen, mut shared) = (BTreeSet::new(), None::<BTreeSet<String>>);
@@ -255,7 +260,8 @@ impl<'a> Runner<'a> {
         setup.recipe.rgb(options)
     }
 
-    /// Masks with features, the true embedding of every object in the space of these features, and the questions.
+    /// Masks with features, the true embedding of every object in the space of these features, and
+    /// the questions.
     fn described(
         &mut self,
         setup: &Setup,
@@ -311,7 +317,8 @@ impl<'a> Runner<'a> {
         }
     }
 
-    /// An encoder, loaded once and asked once: the built-in one compares each phrase with a thousand others.
+    /// An encoder, loaded once and asked once: the built-in one compares each phrase with a
+    /// thousand others.
     fn encoder(&mut self, choice: &SourceChoice) -> Result<&Encoder> {
         let known = self.encoders.iter().position(|e| e.choice == *choice);
         let at = match known {
@@ -333,7 +340,8 @@ impl<'a> Runner<'a> {
         self.truth.labels.values().filter(asked).cloned().collect()
     }
 
-    /// The labelled photos themselves, without a scene: features of every few pixels, asked directly.
+    /// The labelled photos themselves, without a scene: features of every few pixels, asked
+    /// directly.
     pub fn flat(&mut self, choice: &SourceChoice) -> Result<Scored> {
         let (data, truth, progress) = (self.data.clone(), self.truth.clone(), self.progress);
         let Encoder { encoder, queries, .. } = self.encoder(choice)?;
@@ -369,7 +377,8 @@ impl<'a> Runner<'a> {
         Ok(figures)
     }
 
-    /// Bytes of a setup's features in training if they were as long as the embeddings, on three levels.
+    /// Bytes of a setup's features in training if they were as long as the embeddings, on three
+    /// levels.
     pub fn unreduced_bytes(&mut self, setup: &Setup) -> Result<u64> {
         let s = self.stages(setup)?;
         let targets = [s.placed.target(), s.trained.target()];

@@ -115,7 +115,8 @@ pub enum RowWork {
     Score(Setup),
     /// Nothing is trained: the bytes that features of full length would take are stated.
     MemoryOnly(Setup),
-    /// No scene: every few pixels of the scored photos are described by these features and asked directly.
+    /// No scene: every few pixels of the scored photos are described by these features and asked
+    /// directly.
     Flat(SourceChoice),
     /// Nothing; the note says why.
     Nothing,
@@ -184,8 +185,8 @@ impl Group<'_> {
         self.row(label, Setup { recipe, ..self.base.clone() })
     }
 
-    /// A row for the source that needs no network, one for every network that is installed, and one that says how to get
-    /// it for every other.
+    /// A row for the source that needs no network, one for every network that is installed, and one
+    /// that says how to get it for every other.
     pub(super) fn each<K: SourceKind>(
         &self,
         networks: &[Network],

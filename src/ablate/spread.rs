@@ -29,14 +29,16 @@ impl Spread {
 pub struct Difference {
     /// Mean over scenes of their mean over seeds.
     pub mean: f64,
-    /// Half of the 95 % interval for scenes of this kind; none of a single scene, which says nothing of others.
+    /// Half of the 95 % interval for scenes of this kind; none of a single scene, which says
+    /// nothing of others.
     pub half: Option<f64>,
     /// Scenes.
     pub scenes: usize,
 }
 
 impl Difference {
-    /// Of differences as (scene, value). Seeds of one scene are no independent scenes: they are averaged first.
+    /// Of differences as (scene, value). Seeds of one scene are no independent scenes: they are
+    /// averaged first.
     pub fn of(values: &[(&str, f64)]) -> Option<Difference> {
         let mut scenes: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
         values.iter().for_each(|(scene, v)| scenes.entry(scene).or_default().push(*v));
@@ -51,8 +53,8 @@ impl Difference {
     }
 }
 
-/// 97.5 % quantile of Student's t (Student 1908): exact to a hundredth for up to ten degrees of freedom, Fisher's expansion in
-/// their reciprocal above.
+/// 97.5 % quantile of Student's t (Student 1908): exact to a hundredth for up to ten degrees of
+/// freedom, Fisher's expansion in their reciprocal above.
 fn student(freedom: usize) -> f64 {
     const TABLE: [f64; 10] = [12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228];
     let z = 1.959_964f64;

@@ -1,4 +1,5 @@
-//! What only experiments do: masks and features from ground truth, the true embeddings of objects, and figures.
+//! What only experiments do: masks and features from ground truth, the true embeddings of objects,
+//! and figures.
 use super::data::DataSet;
 use crate::eval::protocol::{self, CodeScores, DecodedView, ProtocolKind, ProtocolReport};
 use crate::eval::{EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
@@ -280,10 +281,12 @@ pub(super) fn asked(texts: &[String], queries: &[TextQuery]) -> Vec<TextQuery> {
     texts.iter().filter_map(|text| queries.iter().find(|q| q.text == *text)).cloned().collect()
 }
 
-/// What pixels are that carry no label. As nobody's, they would take the codes of the things beside them.
+/// What pixels are that carry no label. As nobody's, they would take the codes of the things beside
+/// them.
 const UNLABELLED: &str = "background";
 
-/// True masks on every level, each with the embedding of its label's text; what has no label is one more mask.
+/// True masks on every level, each with the embedding of its label's text; what has no label is one
+/// more mask.
 pub(super) struct LabelledMasks {
     pub(super) truth: Arc<GroundTruth>,
     pub(super) encoder: SharedEncoder,
@@ -393,8 +396,8 @@ impl Scale {
     }
 }
 
-/// How well a decoded level agrees with the true embedding of each pixel's object; pixels without code or truth are left
-/// out.
+/// How well a decoded level agrees with the true embedding of each pixel's object; pixels without
+/// code or truth are left out.
 fn agreement(
     frame: &TruthFrame,
     codes: &Plane<i32>,

@@ -69,7 +69,8 @@ impl PaperSet {
         format!("{set}/{}", name.rsplit('/').next().unwrap_or(name))
     }
 
-    /// A row's figures: of the scene, where there is one, of the whole data set, or of the one scene that the paper shows.
+    /// A row's figures: of the scene, where there is one, of the whole data set, or of the one
+    /// scene that the paper shows.
     fn figures(&self, table: &str, row: &str) -> Vec<(&'static str, f64)> {
         let set = self.layout.paper();
         let mut places = vec![set.to_owned(), format!("{set}/teatime")];

@@ -1,5 +1,5 @@
-//! The tables of the paper's experiments, as data: each is a list of setups that differ in one thing. The paper's own figures
-//! are in [`super::paper`].
+//! The tables of the paper's experiments, as data: each is a list of setups that differ in one
+//! thing. The paper's own figures are in [`super::paper`].
 use super::setup::{Available, Group, Regions, RowWork, Setup, Sources, TableRow};
 use crate::language::Reducer;
 use crate::run::method::{AUTOENCODER, LSM, METHODS, Recipe, SPARSELGS};
@@ -29,9 +29,11 @@ impl Serialize for Table {
     }
 }
 
-/// Regions of a table that is about errors of masks and features; the built-in models make few on an easy scene.
+/// Regions of a table that is about errors of masks and features; the built-in models make few on
+/// an easy scene.
 const WITH_ERRORS: fn(&Sources, &Available) -> Vec<Regions> = |own, _| vec![own.regions(), Regions::Flawed];
-/// Regions of a table that is about something else: perfect ones leave that as the only cause of a difference.
+/// Regions of a table that is about something else: perfect ones leave that as the only cause of a
+/// difference.
 const PERFECT: fn(&Sources, &Available) -> Vec<Regions> = |_, _| vec![Regions::Exact];
 /// Regions of a table about what finds them.
 const OWN: fn(&Sources, &Available) -> Vec<Regions> = |own, _| vec![own.regions()];
@@ -103,8 +105,8 @@ pub static TABLES: [Table; 13] = [
         columns: &[("PSNR", 2), ("SIM", 3)],
         regions: PERFECT,
         rows: |group| {
-            // Longer than the other tables: geometry moves slowly at the rates of this stage, and it is geometry that the
-            // image loss protects.
+            // Longer than the other tables: geometry moves slowly at the rates of this stage, and
+            // it is geometry that the image loss protects.
             let long =
                 Setup { language_iterations: 3 * group.base.language_iterations, ..group.base.clone() };
             let without = Recipe { image_weight: 0.0, ..long.recipe };
@@ -168,7 +170,8 @@ pub static TABLES: [Table; 13] = [
         columns: &[("PSNR", 2), ("splats", 0)],
         regions: PERFECT,
         rows: |group| {
-            // Short codes: those of 16 numbers for a million splats are more than lavapipe binds to a shader.
+            // Short codes: those of 16 numbers for a million splats are more than lavapipe binds to
+            // a shader.
             let recipe = Recipe { feature_dim: 3, ..group.base.recipe };
             let row = |(label, most): (&str, usize)| {
                 group.row(label, Setup { max_points: Some(most), recipe, ..group.base.clone() })

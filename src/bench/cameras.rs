@@ -1,5 +1,5 @@
-//! Photos → cameras on data with a known answer, without training: how far off they are, and whether the stated
-//! uncertainty of the focal length is right.
+//! Photos → cameras on data with a known answer, without training: how far off they are, and
+//! whether the stated uncertainty of the focal length is right.
 use crate::eval::{GroundTruth, Split, TruthFrame};
 use crate::infer::Registry;
 use crate::photo;
@@ -30,7 +30,8 @@ pub struct CameraRow {
     pub outcome: CameraOutcome,
 }
 
-/// Worst relative rotation above which cameras are wrong, degrees: hidden surfaces come out elsewhere.
+/// Worst relative rotation above which cameras are wrong, degrees: hidden surfaces come out
+/// elsewhere.
 const WRONG_ROTATION: f64 = 2.0;
 /// Error of the focal length above which they are, as a share: depth is stretched by as much.
 const WRONG_FOCAL: f64 = 0.1;
@@ -105,10 +106,12 @@ pub struct CameraReport {
     pub rows: Vec<CameraRow>,
     /// Data sets whose photos gave no cameras.
     pub failures: usize,
-    /// Data sets whose cameras are wrong: a relative rotation by more than 2 degrees, a focal length by more than 10 %, a
-    /// centre by more than 5 % of the mean depth, or any that show depth where all photos were taken from one place.
+    /// Data sets whose cameras are wrong: a relative rotation by more than 2 degrees, a focal
+    /// length by more than 10 %, a centre by more than 5 % of the mean depth, or any that show
+    /// depth where all photos were taken from one place.
     pub wrong: usize,
-    /// Those of them of whose cameras no warning was given; that another photo is left out says nothing about them.
+    /// Those of them of whose cameras no warning was given; that another photo is left out says
+    /// nothing about them.
     pub wrong_without_warning: Vec<PathBuf>,
     /// Share of the sets with a stated focal length whose error is within 2 σ.
     pub within_2_sigma: Option<f64>,

@@ -7,7 +7,8 @@ use super::workload::Workload;
 use crate::Result;
 use crate::gpu::Device;
 
-/// Training steps on seeded scenes of these sizes, which differ from `like` only in the number of splats.
+/// Training steps on seeded scenes of these sizes, which differ from `like` only in the number of
+/// splats.
 pub fn measure(
     device: &Device,
     sizes: &[usize],

@@ -1,5 +1,5 @@
-//! Photos → edges → masks on data with true masks, without cameras and without training: how well the best mask of any
-//! level fits each object, and whether one level has it in all photos.
+//! Photos → edges → masks on data with true masks, without cameras and without training: how well
+//! the best mask of any level fits each object, and whether one level has it in all photos.
 use crate::eval::{BACKGROUND_LABELS, GroundTruth, MIN_OBJECT_PIXELS};
 use crate::infer::Registry;
 use crate::infer::hed::Hed;
@@ -24,7 +24,8 @@ pub struct MaskRow {
     pub shown: usize,
     /// IoU of an object with the best mask of any level, mean over these.
     pub best: f64,
-    /// The same with the one level per object that has it best over all photos, mean over the objects.
+    /// The same with the one level per object that has it best over all photos, mean over the
+    /// objects.
     pub one_level: f64,
     /// Masks per photo on levels s, m, l.
     pub masks: [f64; 3],
@@ -205,7 +206,8 @@ mod tests {
             (12, 96, 8),
             "table, wall and carpet are no objects"
         );
-        // the targets of the built-in masks on this set; docs/internals/method.md#graph-masks states what they reach
+        // the targets of the built-in masks on this set; docs/internals/method.md#graph-masks
+        // states what they reach
         assert!(row.best > 0.9 && row.one_level > 0.88, "{seen}");
         assert!(row.one_level <= row.best && report.best == row.best);
         let mut sizes = row.masks.to_vec();

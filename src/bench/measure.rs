@@ -14,7 +14,8 @@ pub struct Budget {
 
 /// Fewer runs have no quartiles.
 pub const MIN_RUNS: usize = 5;
-/// Runs that are not counted: the driver compiles shaders at the first, caches and clocks settle at the second …
+/// Runs that are not counted: the driver compiles shaders at the first, caches and clocks settle at
+/// the second …
 const WARM_UP: usize = 2;
 /// … and, when a time is given, for this share of it.
 const WARM_UP_SHARE: f64 = 0.1;
@@ -92,8 +93,8 @@ pub struct Quartiles {
     pub best: f64,
     /// How many runs.
     pub runs: usize,
-    /// Median of the processor time of this process, all threads, divided by the cores: on a CPU device about what a run
-    /// would take if nothing else ran. 0 where it was not taken.
+    /// Median of the processor time of this process, all threads, divided by the cores: on a CPU
+    /// device about what a run would take if nothing else ran. 0 where it was not taken.
     #[serde(default)]
     pub processor: f64,
 }

@@ -1,8 +1,9 @@
-//! `splatvk bench`: reproducible workloads, per-pass and whole-step times with their spread, and the device's own limits
-//! measured in the same run.
+//! `splatvk bench`: reproducible workloads, per-pass and whole-step times with their spread, and
+//! the device's own limits measured in the same run.
 //!
-//! The steps are those of [`crate::fit`], recorded by the code that trains; learning rates are zero, so that every
-//! repetition does the same work on the same scene. The photo to fit is the scene's own render, a little paler.
+//! The steps are those of [`crate::fit`], recorded by the code that trains; learning rates are
+//! zero, so that every repetition does the same work on the same scene. The photo to fit is the
+//! scene's own render, a little paler.
 pub mod cameras;
 pub mod compare;
 mod growth;

@@ -1,8 +1,10 @@
-//! How much work each pass has to do: bytes that must move at least once and arithmetic on pairs that are blended.
-//! What an implementation does beyond that (pairs evaluated in vain, lists read twice) is what the roofline shows up.
+//! How much work each pass has to do: bytes that must move at least once and arithmetic on pairs
+//! that are blended. What an implementation does beyond that (pairs evaluated in vain, lists read
+//! twice) is what the roofline shows up.
 //!
-//! Floats per splat: 11 of geometry and opacity, 3 per SH coefficient, d features; of a projected splat PROJECTED_FLOATS.
-//! Operations are counted from the formulas of the passes, a fused multiply-add as two, an exponential as one.
+//! Floats per splat: 11 of geometry and opacity, 3 per SH coefficient, d features; of a projected
+//! splat PROJECTED_FLOATS. Operations are counted from the formulas of the passes, a fused
+//! multiply-add as two, an exponential as one.
 use crate::gpu::shaders;
 
 /// What the device can do at most.
@@ -64,7 +66,8 @@ impl PassWork {
             "raster forward" => {
                 (listed + 4.0 * pixels * (channels + 1.0), blended * (WEIGH + 2.0 * channels))
             }
-            // Seven separable blurs of 11 taps per value and 40 operations for SSIM and its derivatives.
+            // Seven separable blurs of 11 taps per value and 40 operations for SSIM and its
+            // derivatives.
             "SSIM + L1" => (3.0 * pixels * 12.0, 3.0 * pixels * (7.0 * 44.0 + 40.0)),
             "feature loss" => (pixels * (8.0 * d + 8.0), 3.0 * pixels * d),
             "regularisers" => (8.0 * pixels + 36.0 * n, 10.0 * n),

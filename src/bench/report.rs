@@ -191,7 +191,8 @@ impl BenchReport {
     }
 }
 
-/// The times of timed commands added up by the key of each, in the order of first commands: key, and milliseconds per run.
+/// The times of timed commands added up by the key of each, in the order of first commands: key,
+/// and milliseconds per run.
 fn sums_by<K: Copy + PartialEq>(keys: &[K], runs: &[Vec<(String, f64)>]) -> Vec<(K, Vec<f64>)> {
     let mut sums: Vec<(K, Vec<f64>)> = Vec::new();
     for (at, &key) in keys.iter().enumerate() {
@@ -232,7 +233,8 @@ impl Section {
         }
     }
 
-    /// Runs what `record` records again and again and adds a row per pass; the milliseconds of each run, all passes.
+    /// Runs what `record` records again and again and adds a row per pass; the milliseconds of each
+    /// run, all passes.
     pub(super) fn passes(
         &mut self,
         device: &Device,
@@ -254,7 +256,8 @@ impl Section {
         for (name, times) in &sums {
             self.time(*name, Clock::Device, Quartiles::of(times));
         }
-        // Where the host is the device, the processor time of a pass tells what it takes when nothing else runs.
+        // Where the host is the device, the processor time of a pass tells what it takes when
+        // nothing else runs.
         if device.info().is_cpu {
             let programs = record().compile_passes()?;
             let runs = budget.repeat(|| {

@@ -11,7 +11,8 @@ const COPY_STEPS: usize = shaders::bench_copy::STEPS as usize;
 /// Fused multiply-adds per thread in `glsl/bench_fma.comp`.
 const FMA_PER_THREAD: usize = (shaders::bench_fma::CHAINS * shaders::bench_fma::STEPS) as usize;
 
-/// Measures both limits. The best run counts: a limit is what the device can do, not what it usually does.
+/// Measures both limits. The best run counts: a limit is what the device can do, not what it
+/// usually does.
 pub fn measure(device: &Device, budget: &Budget) -> Result<(Roofline, Section)> {
     let mut section = Section::new("roofline", "copies and fused multiply-adds");
     let bytes_per_second = copy(device, budget, &mut section)?;

@@ -11,7 +11,8 @@ use crate::{Error, Result};
 const BITS: u32 = 32;
 /// Digits of eight bits: the passes over the data.
 const PASSES: f64 = 4.0;
-/// A key and a value are read and written in each pass. Counting the digits reads keys again; that is overhead here.
+/// A key and a value are read and written in each pass. Counting the digits reads keys again; that
+/// is overhead here.
 const BYTES_PER_PASS: f64 = 16.0;
 
 /// Sorts `keys` random 32-bit keys with values.

@@ -36,7 +36,8 @@ pub fn colour(device: &Device, workload: &Workload, limits: (&Budget, &Roofline)
     Ok(section)
 }
 
-/// The step of the language stage with `features` channels: the same image loss, and L1 to the codes of labelled pixels.
+/// The step of the language stage with `features` channels: the same image loss, and L1 to the
+/// codes of labelled pixels.
 pub fn with_features(
     device: &Device,
     workload: &Workload,

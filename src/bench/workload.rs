@@ -21,7 +21,8 @@ pub struct Workload {
 }
 
 impl Workload {
-    /// The seeded scene: `splats` splats spread evenly over a `width × height` image (see [`seeded::benchmark`]).
+    /// The seeded scene: `splats` splats spread evenly over a `width × height` image (see
+    /// [`seeded::benchmark`]).
     pub fn seeded(splats: usize, width: u32, height: u32, sh_degree: u32, seed: u64) -> Result<Workload> {
         if splats == 0 || width == 0 || height == 0 {
             return Err(Error::input("a benchmark scene needs at least one splat and one pixel"));
@@ -30,8 +31,8 @@ impl Workload {
         Ok(Workload { name: "seeded scene".into(), splats, camera })
     }
 
-    /// A Gaussian .ply with the camera file beside it, or a scene directory with its first camera, or either with
-    /// another camera file. `sh_degree` cuts the coefficients.
+    /// A Gaussian .ply with the camera file beside it, or a scene directory with its first camera,
+    /// or either with another camera file. `sh_degree` cuts the coefficients.
     pub fn load(scene: &Path, camera: Option<&Path>, sh_degree: Option<u32>) -> Result<Workload> {
         let loaded = scene_dir::load(scene)?;
         let beside: Option<PathBuf> = scene.is_file().then(|| scene.with_extension("json"));
@@ -67,15 +68,16 @@ impl Workload {
         Ok(Renderer::new(device, &self.splats, &[], 0)?.render(&self.camera)?.rgb)
     }
 
-    /// The photo to fit: the scene's own render, paler, so that there is a gradient everywhere but nothing unlike it.
+    /// The photo to fit: the scene's own render, paler, so that there is a gradient everywhere but
+    /// nothing unlike it.
     pub fn target(&self, device: &Device) -> Result<RgbImage> {
         let mut image = self.render(device)?;
         image.data.iter_mut().flatten().for_each(|v| *v = pale(*v));
         Ok(image)
     }
 
-    /// For other programs: `scene.ply` (INRIA fields), `scene.json` (pinhole camera, world → camera rows) and
-    /// `render.npy` ([H, W, 3] f32, on black), what they should see.
+    /// For other programs: `scene.ply` (INRIA fields), `scene.json` (pinhole camera, world → camera
+    /// rows) and `render.npy` ([H, W, 3] f32, on black), what they should see.
     pub fn write(&self, device: &Device, folder: &Path) -> Result<[PathBuf; 3]> {
         create_folder(folder)?;
         let files = ["scene.ply", "scene.json", "render.npy"].map(|name| folder.join(name));
@@ -146,7 +148,8 @@ mod tests {
         let w = Workload::seeded(20_000, 480, 360, 1, 0).unwrap();
         let n = w.splats.len() as f64;
         let mean = |f: &dyn Fn(usize) -> f64| (0..w.splats.len()).map(f).sum::<f64>() / n;
-        // Standard errors at 20 000 draws stay below 0.01 for every statistic here; five of them are allowed.
+        // Standard errors at 20 000 draws stay below 0.01 for every statistic here; five of them
+        // are allowed.
         let near = |value: f64, expected: f64, what: &str| {
             assert!((value - expected).abs() < 0.05, "{what}: {value} instead of {expected}");
         };

@@ -1,7 +1,8 @@
 //! What a comparison says.
 use crate::pass::close::{Tolerance, compare};
 
-/// What one comparison found: a mismatch is text, a device that fails is an [`crate::Error`]; both are wrong results.
+/// What one comparison found: a mismatch is text, a device that fails is an [`crate::Error`]; both
+/// are wrong results.
 pub(super) type Found = crate::Result<Result<String, String>>;
 
 /// Compares arrays; says how close they are, or which element is not.

@@ -41,7 +41,8 @@ pub(super) fn ssim_l1(device: &Device, rows: Rows) -> Found {
     let loss = pass.loss([sums[0], sums[1]].map(f64::from), None);
     let (twin, by_pixel) = ssim_l1::ssim_l1(&wide(&x), &wide(&y), SIZE.0, SIZE.1, 0.8, 0.2);
     let largest = by_pixel.iter().fold(0.0f64, |m, g| m.max(g.abs()));
-    // E[x²] − E[x]² cancels about three digits in f32, and 1/C2 amplifies what is left in flat regions.
+    // E[x²] − E[x]² cancels about three digits in f32, and 1/C2 amplifies what is left in flat
+    // regions.
     let tolerance = Tolerance {
         relative_l2: 1e-3,
         absolute: 1e-3 * largest,
@@ -205,8 +206,8 @@ pub(super) fn plane_sweep(device: &Device) -> Found {
     Ok(swept.and(planes(&gpu.planes()?, &cpu.planes()?)))
 }
 
-/// exp, sqrt and the order of sums round differently, so that nearly equal hypotheses may win either way; anything more is wrong
-/// (the bounds of the test of stereo).
+/// exp, sqrt and the order of sums round differently, so that nearly equal hypotheses may win
+/// either way; anything more is wrong (the bounds of the test of stereo).
 pub(super) fn planes(actual: &[Vec4], twin: &[Vec4]) -> std::result::Result<String, String> {
     let same = |a: &Vec4, b: &Vec4| (a.truncate() - b.truncate()).length() < 1e-4 * a.truncate().length();
     let agreeing: Vec<(&Vec4, &Vec4)> = actual.iter().zip(twin).filter(|(a, b)| same(a, b)).collect();

@@ -1,5 +1,5 @@
-//! Compares every pass on a device with its CPU twin, in seconds: `splatvk doctor --check`. Variants
-//! that gave wrong results are disabled for this device and driver ([`KernelVariant`]).
+//! Compares every pass on a device with its CPU twin, in seconds: `splatvk doctor --check`.
+//! Variants that gave wrong results are disabled for this device and driver ([`KernelVariant`]).
 mod compared;
 mod data;
 mod images;

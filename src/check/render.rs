@@ -132,7 +132,8 @@ pub(super) fn regularisers(device: &Device) -> Found {
         .iter()
         .flat_map(|s| regularise::ratio_penalty(s.map(f64::from), 0.25, 2.0).1)
         .collect();
-    // Signs and quotients of single values; where the two depths agree to rounding, the sign may differ.
+    // Signs and quotients of single values; where the two depths agree to rounding, the sign may
+    // differ.
     let tolerance = Tolerance {
         relative_l2: 1e-4,
         absolute: 1e-6,

@@ -119,7 +119,8 @@ fn earlier(path: &Path) -> Result<Vec<Measurement>> {
     serde_json::from_value(report["measurements"].take()).map_err(bad)
 }
 
-/// Data sets under the names of their folders, with as many of the folders above as tell them apart.
+/// Data sets under the names of their folders, with as many of the folders above as tell them
+/// apart.
 fn data_sets(folders: &[PathBuf], layout: LayoutArg) -> Result<Vec<DataSet>> {
     let whole = |f: &PathBuf| f.canonicalize().unwrap_or_else(|_| f.clone());
     let parts: Vec<Vec<String>> = folders
@@ -191,7 +192,8 @@ fn plan(args: &AblateArgs, registry: &Registry) -> Result<Plan> {
     })
 }
 
-/// The sources of every row; the built-in ones where nothing is said, so that tables of different machines compare.
+/// The sources of every row; the built-in ones where nothing is said, so that tables of different
+/// machines compare.
 fn sources(args: &AblateArgs, registry: &Registry) -> Result<Sources> {
     let (networks, own) = (inventory(registry), Sources::default());
     fn of<K: SourceKind>(

@@ -27,7 +27,8 @@ pub struct Cli {
     /// Progress and messages on standard error: for people, or one JSON object per line
     #[arg(long, global = true, value_enum, default_value = "text", value_name = "FORMAT")]
     pub log: LogFormat,
-    /// What computes the networks, as far as the ONNX Runtime library can; auto: a GPU that answers, or else the CPU
+    /// What computes the networks, as far as the ONNX Runtime library can; auto: a GPU that
+    /// answers, or else the CPU
     #[arg(long, global = true, value_parser = PossibleValuesParser::new(provider::NAMES), value_name = "NAME", help_heading = MACHINE)]
     pub provider: Option<String>,
 }
@@ -105,7 +106,8 @@ pub struct TrainArgs {
     /// Folder of the photos
     #[arg(long, value_name = "DIR")]
     pub images: PathBuf,
-    /// Cameras: transforms.json, cameras.json, a COLMAP model, or the folder of a data set with one of them; their lenses are taken out of the photos
+    /// Cameras: transforms.json, cameras.json, a COLMAP model, or the folder of a data set with one
+    /// of them; their lenses are taken out of the photos
     #[arg(long, value_name = "FILE")]
     pub cameras: PathBuf,
     /// How many of the photos with a camera are used [default: all, at most 16]
@@ -241,8 +243,8 @@ pub struct EvalArgs {
     /// Folder of the labels, in the layout of the protocol
     #[arg(long, value_name = "DIR")]
     pub ground_truth: PathBuf,
-    /// Cameras of the data set, to score labelled frames that the scene was not made from: transforms.json, a COLMAP model
-    /// folder, or cameras.json
+    /// Cameras of the data set, to score labelled frames that the scene was not made from:
+    /// transforms.json, a COLMAP model folder, or cameras.json
     #[arg(long, value_name = "FILE")]
     pub cameras: Option<PathBuf>,
     /// Write every rendered view and predicted mask here
@@ -254,10 +256,12 @@ pub struct EvalArgs {
     /// What is read and how it is scored
     #[arg(long, value_enum, default_value = "field")]
     pub protocol: ProtocolArg,
-    /// Score held-out frames a second time, from cameras moved until the frozen scene fits their photos best: `refined`
+    /// Score held-out frames a second time, from cameras moved until the frozen scene fits their
+    /// photos best: `refined`
     #[arg(long)]
     pub refine_views: bool,
-    /// Choose level, mask and location as others do (--protocol field) [default: as the scene was made]
+    /// Choose level, mask and location as others do (--protocol field) [default: as the scene was
+    /// made]
     #[arg(long, value_parser = compats(), value_name = "WHOSE")]
     pub compat: Option<String>,
     /// Print a short table instead of JSON; --out DIR keeps eval.json
@@ -281,7 +285,8 @@ pub struct ModelsArgs {
 pub enum ModelsAction {
     /// Every known model: role, licence, size, source, installed or not
     List(DeviceArgs),
-    /// Verify the built-in files; run every installed network on a built-in input and hold it to its contract
+    /// Verify the built-in files; run every installed network on a built-in input and hold it to
+    /// its contract
     Check(DeviceArgs),
     /// Download networks, hold them to their contract and install them
     Fetch(FetchArgs),
@@ -318,8 +323,9 @@ pub struct DoctorArgs {
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
-    /// Run every GPU pass on the device and compare it with the same computation on the CPU: a table for bug reports. What
-    /// gives wrong results there and can be replaced is not used on this device and driver from then on
+    /// Run every GPU pass on the device and compare it with the same computation on the CPU: a
+    /// table for bug reports. What gives wrong results there and can be replaced is not used on
+    /// this device and driver from then on
     #[arg(long)]
     pub check: bool,
 }
@@ -327,8 +333,8 @@ pub struct DoctorArgs {
 /// `splatvk clean`
 #[derive(Debug, Args)]
 pub struct CleanArgs {
-    /// Folders in which, and in whose folders, commands that were killed may have left files they did not finish; looked into
-    /// besides the current folder and out/
+    /// Folders in which, and in whose folders, commands that were killed may have left files they
+    /// did not finish; looked into besides the current folder and out/
     #[arg(value_name = "DIR")]
     pub folders: Vec<PathBuf>,
     /// Folder of the models

@@ -100,7 +100,8 @@ fn partial(folder: &Path) -> Vec<(PathBuf, u64)> {
     leftovers(folder).into_iter().map(|path| (path.clone(), size(&path))).collect()
 }
 
-/// What processes that are gone have begun in the current folder, in out/ and in `folders`, and in the folders of each.
+/// What processes that are gone have begun in the current folder, in out/ and in `folders`, and in
+/// the folders of each.
 fn unfinished(folders: &[PathBuf]) -> Result<Vec<(PathBuf, u64)>> {
     let mut found = BTreeMap::new();
     for folder in [Path::new("."), Path::new("out")].into_iter().chain(folders.iter().map(PathBuf::as_path)) {
@@ -131,7 +132,8 @@ fn size(path: &Path) -> u64 {
     }
 }
 
-/// Removes a file, or, by its mark, a folder of unfinished work. What another process has removed meanwhile is no error.
+/// Removes a file, or, by its mark, a folder of unfinished work. What another process has removed
+/// meanwhile is no error.
 fn remove(path: &Path) -> Result<()> {
     let removed = match path.symlink_metadata() {
         Ok(meta) if meta.is_dir() => remove_leftover(path),

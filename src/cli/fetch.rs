@@ -1,4 +1,5 @@
-//! `splatvk models fetch`: what comes from where under which licence, one question, then the work of [`crate::fetch`].
+//! `splatvk models fetch`: what comes from where under which licence, one question, then the work
+//! of [`crate::fetch`].
 use std::fmt::Write;
 use std::io::IsTerminal;
 use std::path::Path;

@@ -6,7 +6,8 @@ use crate::run::stage_folder;
 /// Bytes of stages from which on a run names them: some five scenes of four photos.
 const WORTH_TELLING: u64 = 1 << 30;
 
-/// Says how much the stages of this and earlier runs hold, and how to free it; nothing where that is little.
+/// Says how much the stages of this and earlier runs hold, and how to free it; nothing where that
+/// is little.
 pub(super) fn tell_of_kept_stages(progress: &dyn Progress) {
     let Ok(folder) = stage_folder() else { return };
     if let Some(text) = told(Store::list(&folder).iter().map(|f| f.1).sum()) {

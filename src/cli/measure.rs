@@ -15,11 +15,12 @@ use std::path::PathBuf;
 pub struct MeasureArgs {
     /// Scene directory
     pub scene: PathBuf,
-    /// Lengths to measure, "A - B": A and B are x,y,z of the scene, or VIEW:x,y in pixels of cameras/images; one that begins
-    /// with a minus goes behind --
+    /// Lengths to measure, "A - B": A and B are x,y,z of the scene, or VIEW:x,y in pixels of
+    /// cameras/images; one that begins with a minus goes behind --
     #[arg(value_name = "LENGTH")]
     pub lengths: Vec<Length>,
-    /// Give the scene its scale by a length that is known, in metres (or with cm, mm); more than one may be given
+    /// Give the scene its scale by a length that is known, in metres (or with cm, mm); more than
+    /// one may be given
     #[arg(long, value_name = "A-B=0.21", allow_hyphen_values = true)]
     pub scale: Vec<Length>,
     /// Device, for places given in pixels

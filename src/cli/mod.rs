@@ -31,8 +31,8 @@ use crate::{Result, gpu};
 use args::Command;
 use std::process::ExitCode;
 
-/// Runs the command line of this process: one error line at most, and an exit code that says what kind it was
-/// ([`Error::exit_code`]).
+/// Runs the command line of this process: one error line at most, and an exit code that says what
+/// kind it was ([`Error::exit_code`]).
 pub fn main() -> ExitCode {
     let cli = match usage::parse() {
         Ok(cli) => cli,

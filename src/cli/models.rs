@@ -119,7 +119,8 @@ fn installed(text: &mut String, m: &Installed) {
     unused(text, m);
 }
 
-/// Graphs beside a whole model, such as CLIP's two towers in one file, do no harm but may be what somebody meant.
+/// Graphs beside a whole model, such as CLIP's two towers in one file, do no harm but may be what
+/// somebody meant.
 fn unused(text: &mut String, m: &Installed) {
     for why in &m.unused {
         let _ = writeln!(text, "{:10}   not used: {why}", "");
@@ -187,7 +188,8 @@ pub fn checked(model: &Installed, steps: Option<&[Measured]>) -> String {
     text
 }
 
-/// The JSON of one built-in model, as `models list --json`, `doctor --json` and `run.json` print it.
+/// The JSON of one built-in model, as `models list --json`, `doctor --json` and `run.json` print
+/// it.
 pub fn to_json(m: &ModelStatus) -> serde_json::Value {
     json!({
         "role": format!("{:?}", m.kind).to_lowercase(), "name": m.name, "file": m.file, "installed": m.installed,

@@ -1,10 +1,12 @@
-//! What a command writes where the user says: by the rule of [`check_place`], and all of it or none.
+//! What a command writes where the user says: by the rule of [`check_place`], and all of it or
+//! none.
 use crate::files::{self, Kind, Partial, check_place, check_spared};
 use crate::format::scene_files;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// A file that a command will write, whole or not at all. As long as it is reserved, no other command writes there.
+/// A file that a command will write, whole or not at all. As long as it is reserved, no other
+/// command writes there.
 pub struct WrittenFile {
     place: PathBuf,
     force: bool,
@@ -12,7 +14,8 @@ pub struct WrittenFile {
 }
 
 impl WrittenFile {
-    /// Reserves the place before any work. One that may not be written, or that is one of the `inputs`, is bad input.
+    /// Reserves the place before any work. One that may not be written, or that is one of the
+    /// `inputs`, is bad input.
     pub fn open(place: &Path, force: bool, inputs: &[&Path]) -> Result<WrittenFile> {
         check_file(place, force, inputs)?;
         Ok(WrittenFile { place: place.to_path_buf(), force, partial: Partial::beside(place)? })
@@ -37,8 +40,9 @@ pub fn check_file(place: &Path, force: bool, inputs: &[&Path]) -> Result<()> {
     check_spared(place, inputs.iter().copied())
 }
 
-/// Files of a command that writes into a folder. They are written into a hidden folder, beside one that is to be made, else in it;
-/// dropped without [`WrittenFiles::keep`], it vanishes with all that is in it.
+/// Files of a command that writes into a folder. They are written into a hidden folder, beside one
+/// that is to be made, else in it; dropped without [`WrittenFiles::keep`], it vanishes with all
+/// that is in it.
 pub struct WrittenFiles {
     folder: PathBuf,
     force: bool,
@@ -51,8 +55,9 @@ pub struct WrittenFiles {
 }
 
 impl WrittenFiles {
-    /// Reserves a folder, creating it where needed; with `force` it may have files already, but of the `inputs` none is replaced. A
-    /// place that cannot be written, or that another command writes to, is bad input.
+    /// Reserves a folder, creating it where needed; with `force` it may have files already, but of
+    /// the `inputs` none is replaced. A place that cannot be written, or that another command
+    /// writes to, is bad input.
     pub fn open(folder: &Path, force: bool, inputs: &[&Path]) -> Result<WrittenFiles> {
         check_place(folder, Kind::Folder, force)?;
         let partial = if folder.exists() {
@@ -68,7 +73,8 @@ impl WrittenFiles {
         Ok(WrittenFiles { folder: folder.to_path_buf(), force, partial, inputs, names, outdated })
     }
 
-    /// Files of these names say the same in another form: what the folder has of them would contradict what is written.
+    /// Files of these names say the same in another form: what the folder has of them would
+    /// contradict what is written.
     pub fn outdate<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
         self.outdated.extend(names.map(PathBuf::from));
     }
@@ -88,8 +94,8 @@ impl WrittenFiles {
         Ok(path)
     }
 
-    /// Everything is written: moves the files to their places, over ordinary files of their names only, and returns them; those of
-    /// [`WrittenFiles::file`] first, in their order.
+    /// Everything is written: moves the files to their places, over ordinary files of their names
+    /// only, and returns them; those of [`WrittenFiles::file`] first, in their order.
     pub fn keep(self) -> Result<Vec<PathBuf>> {
         let WrittenFiles { folder, force, partial, inputs, mut names, outdated } = self;
         let mut found = Vec::new();
@@ -97,7 +103,8 @@ impl WrittenFiles {
         found.retain(|name| !names.contains(name));
         found.sort();
         names.extend(found);
-        // Everything that may be refused comes before the first file is moved. What came there meanwhile is not ours.
+        // Everything that may be refused comes before the first file is moved. What came there
+        // meanwhile is not ours.
         check_ours(&folder, force)?;
         for name in &names {
             for part in name.ancestors().skip(1).filter(|p| !p.as_os_str().is_empty()) {
@@ -140,8 +147,8 @@ fn check_ours(folder: &Path, force: bool) -> Result<()> {
     }
 }
 
-/// Refuses to replace a file that is read: an input itself, one of a scene's own, or one of a folder of inputs into which the command
-/// writes.
+/// Refuses to replace a file that is read: an input itself, one of a scene's own, or one of a
+/// folder of inputs into which the command writes.
 fn check_unread(folder: &Path, place: &Path, inputs: &[PathBuf]) -> Result<()> {
     let (Ok(whole), Ok(folder)) = (place.canonicalize(), folder.canonicalize()) else { return Ok(()) };
     let read = |input: &PathBuf| *input == whole || *input == folder || scene_files::is_own(input, &whole);

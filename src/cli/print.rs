@@ -24,7 +24,8 @@ pub(super) fn print_json(value: &serde_json::Value) -> Result<()> {
     put(&format!("{value}\n"))
 }
 
-/// The lines that one copies after a scene was made: where its report is, and the command that shows it.
+/// The lines that one copies after a scene was made: where its report is, and the command that
+/// shows it.
 pub(super) fn ending(scene: &Path) -> String {
     let report = scene.join("report.html");
     format!("report: {}\nlook at it: splatvk view {}\n", report.display(), quoted(scene))

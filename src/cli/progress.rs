@@ -1,5 +1,5 @@
-//! Progress on standard error: a bar per stage with the time left on a terminal, one line per stage elsewhere, or one
-//! JSON object per line for machines.
+//! Progress on standard error: a bar per stage with the time left on a terminal, one line per stage
+//! elsewhere, or one JSON object per line for machines.
 use super::args::LogFormat;
 use super::line::one_line;
 use crate::Error;
@@ -39,8 +39,9 @@ pub fn stopped() -> bool {
     STOPPED.load(Ordering::SeqCst)
 }
 
-/// The error that ends the process; of two threads that end it the first has its say. Input that cannot be used gets this one line:
-/// what was said in the first [`HELD_FOR`] is about work that nobody will see.
+/// The error that ends the process; of two threads that end it the first has its say. Input that
+/// cannot be used gets this one line: what was said in the first [`HELD_FOR`] is about work that
+/// nobody will see.
 pub fn print_error(message: &str, exit_code: u8) {
     static SAID: AtomicBool = AtomicBool::new(false);
     if SAID.swap(true, Ordering::SeqCst) {
@@ -65,8 +66,9 @@ pub fn print_warning(message: &str) {
     }
 }
 
-/// How long after the start of the process lines wait for the end of the checks. Photos that do not overlap are refused last, after
-/// their features: within 4 s for two of 640 × 480 pixels on two cores.
+/// How long after the start of the process lines wait for the end of the checks. Photos that do not
+/// overlap are refused last, after their features: within 4 s for two of 640 × 480 pixels on two
+/// cores.
 const HELD_FOR: Duration = Duration::from_secs(10);
 /// Lines that wait; `None` once they do not any more.
 static HELD: Mutex<Option<Vec<String>>> = Mutex::new(Some(Vec::new()));
@@ -153,13 +155,13 @@ impl Progress for JsonLines {
     }
 }
 
-/// How long after a request to stop the work may go on to its next check. Nothing that is asked of a network or a driver can be
-/// cut short, and some of it takes longer than anyone waits. A process is to be done after 2 s; its end takes the
-/// kernel of a busy machine some time, too.
+/// How long after a request to stop the work may go on to its next check. Nothing that is asked of
+/// a network or a driver can be cut short, and some of it takes longer than anyone waits. A process
+/// is to be done after 2 s; its end takes the kernel of a busy machine some time, too.
 const GRACE: Duration = Duration::from_millis(1000);
 
-/// Makes Ctrl-C, a termination signal and a closed terminal ask for a clean stop. A second one, and [`GRACE`], end the process at
-/// once; what is unfinished is removed in either case.
+/// Makes Ctrl-C, a termination signal and a closed terminal ask for a clean stop. A second one, and
+/// [`GRACE`], end the process at once; what is unfinished is removed in either case.
 pub fn stop_on_signal() {
     let outcome = ctrlc::set_handler(|| {
         if STOPPED.swap(true, Ordering::SeqCst) {
@@ -226,7 +228,8 @@ fn time_left(state: &ProgressState, text: &mut dyn std::fmt::Write) {
     }
 }
 
-/// The command line's [`Progress`] for people: bars when standard error is a terminal, lines otherwise.
+/// The command line's [`Progress`] for people: bars when standard error is a terminal, lines
+/// otherwise.
 #[derive(Default)]
 struct Terminal {
     current: Mutex<Option<Stage>>,

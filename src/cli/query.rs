@@ -292,7 +292,8 @@ mod tests {
         let (pose, size) = (Pose::IDENTITY, 4);
         let camera =
             Camera { name: "a".into(), width: size, height: size, fx: 4.0, fy: 4.0, cx: 0.5, cy: 1.5, pose };
-        // The middle of pixel (3, 1) is 3 pixels right of the principal point: 3 units at a depth of 4.
+        // The middle of pixel (3, 1) is 3 pixels right of the principal point: 3 units at a depth
+        // of 4.
         let answer = QueryResult { location: (3, 1), ..QueryResult::default() };
         let scale = Scale { metres_per_unit: 0.25, log_sigma: 0.1, stated: Vec::new() };
         let told = place(&frame, &camera, &answer, &World { scale: Some(scale), ..World::default() });

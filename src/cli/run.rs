@@ -34,11 +34,12 @@ pub struct RunArgs {
     /// Ask the finished scene; may be repeated
     #[arg(long = "query", value_name = "TEXT")]
     pub queries: Vec<String>,
-    /// How many photos to use: sharp ones that overlap, from different places [default: all, at most 4]
+    /// How many photos to use: sharp ones that overlap, from different places [default: all, at
+    /// most 4]
     #[arg(long, value_name = "N", value_parser = views())]
     pub views: Option<usize>,
-    /// Add the photos to this scene, made by run, instead of making one of their own; without --out, the larger scene stands beside it
-    /// under the next number, and the old one stays
+    /// Add the photos to this scene, made by run, instead of making one of their own; without
+    /// --out, the larger scene stands beside it under the next number, and the old one stays
     #[arg(long, value_name = "SCENE", conflicts_with_all = ["views", "init", "depth_prior", "method", "feature_dim", "per_level", "compat"])]
     pub add: Option<PathBuf>,
     /// How the scene is made
@@ -62,24 +63,28 @@ pub struct RunArgs {
     /// Points along each side of a photo at which a mask network is asked
     #[arg(long, default_value_t = 32, value_name = "N", value_parser = whole::<usize>(1..=128), help_heading = SOURCES)]
     pub mask_points: usize,
-    /// Do not ask the mask network about four overlapping crops as well: five times faster, misses small things
+    /// Do not ask the mask network about four overlapping crops as well: five times faster, misses
+    /// small things
     #[arg(long, help_heading = SOURCES)]
     pub no_mask_crops: bool,
     /// Optimisation steps of the language stage, instead of the preset's
     #[arg(long, value_name = "N", value_parser = whole::<usize>(1..), help_heading = EXPERTS)]
     pub language_iterations: Option<usize>,
-    /// Length of the codes that splats carry: 3, 8 or 16 [default: 16; --compat and langsplat 3, legaussians 8]
+    /// Length of the codes that splats carry: 3, 8 or 16 [default: 16; --compat and langsplat 3,
+    /// legaussians 8]
     #[arg(long, value_name = "D", value_parser = whole::<usize>(3..=16), help_heading = EXPERTS)]
     pub feature_dim: Option<usize>,
-    /// How language gets onto the splats: this program's ways, or a baseline on the same geometry to compare with [default: lift;
-    /// sparselgs with --preset paper, --language-iterations, --per-level or --compat]
+    /// How language gets onto the splats: this program's ways, or a baseline on the same geometry
+    /// to compare with [default: lift; sparselgs with --preset paper, --language-iterations,
+    /// --per-level or --compat]
     #[arg(long, value_parser = methods(), value_name = "METHOD", help_heading = EXPERTS)]
     pub method: Option<String>,
     /// One model per level as in the paper, instead of one geometry for all three
     #[arg(long, help_heading = EXPERTS)]
     pub per_level: bool,
-    /// Do what can be done in several ways as the paper, its authors' code or LangSplat: area score and conditions of the alignment,
-    /// order of masks, one model per level, 3 numbers per code, level and mask of answers
+    /// Do what can be done in several ways as the paper, its authors' code or LangSplat: area score
+    /// and conditions of the alignment, order of masks, one model per level, 3 numbers per code,
+    /// level and mask of answers
     #[arg(long, value_parser = compats(), value_name = "WHOSE", help_heading = EXPERTS)]
     pub compat: Option<String>,
     /// Device and models
@@ -116,8 +121,8 @@ pub fn run(args: &RunArgs) -> Result<()> {
     Ok(())
 }
 
-/// What the arguments mean: defaults resolved, names understood, contradictions refused; `auto` is the best of `installed`, or
-/// what is built in. No work happens here.
+/// What the arguments mean: defaults resolved, names understood, contradictions refused; `auto` is
+/// the best of `installed`, or what is built in. No work happens here.
 fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
     let compat = args.compat.as_deref().map_or(Ok(None), Compat::named)?;
     let preset = args.making.preset.map(plan::preset);

@@ -1,7 +1,9 @@
-//! The HTTP server of `splatvk view`: one page with its data, and questions, for the browser of the user who started it.
+//! The HTTP server of `splatvk view`: one page with its data, and questions, for the browser of the
+//! user who started it.
 //!
-//! It takes what any process of this machine may send: other pages of the same browser, other users, requests that never end.
-//! All connections share one thread that waits for none of them, so that no one holds up another.
+//! It takes what any process of this machine may send: other pages of the same browser, other
+//! users, requests that never end. All connections share one thread that waits for none of them, so
+//! that no one holds up another.
 use crate::error::words;
 use crate::{Error, Result};
 use http_body_util::{BodyExt, Full, LengthLimitError, Limited};
@@ -94,7 +96,8 @@ impl Place {
     }
 }
 
-/// Serves in a thread of its own until the process ends; questions come out of what is returned, one after the other.
+/// Serves in a thread of its own until the process ends; questions come out of what is returned,
+/// one after the other.
 pub fn serve(place: Place, site: Site) -> Result<Receiver<Question>> {
     let (questions, asked) = sync_channel(MAX_WAITING);
     let failed = |e: std::io::Error| Error::work(format!("the server cannot start: {}", words(&e)));
@@ -230,15 +233,16 @@ impl Shared {
         }
     }
 
-    /// What stands behind the secret. All of it is compared whatever differs, so that the time tells nothing.
+    /// What stands behind the secret. All of it is compared whatever differs, so that the time
+    /// tells nothing.
     fn name<'p>(&self, path: &'p str) -> Option<&'p str> {
         let (first, name) = path.strip_prefix('/')?.split_once('/')?;
         let differs = first.bytes().zip(self.secret.bytes()).fold(0, |all, (a, b)| all | (a ^ b));
         (first.len() == self.secret.len() && differs == 0).then_some(name)
     }
 
-    /// Other pages in the same browser can reach this address too. A host name of theirs that resolves to it shows in
-    /// `Host`, and a request that their script makes in `Origin`.
+    /// Other pages in the same browser can reach this address too. A host name of theirs that
+    /// resolves to it shows in `Host`, and a request that their script makes in `Origin`.
     fn is_own(&self, request: &Request<Incoming>) -> bool {
         let ours = |host: &str| self.hosts.iter().any(|own| own == host);
         let host = only(request.headers(), &header::HOST).is_some_and(|h| h.is_some_and(ours));
@@ -264,7 +268,8 @@ impl Shared {
     }
 }
 
-/// The one value of a header: `None` where it is not there, `Some(None)` where it is there twice or no text.
+/// The one value of a header: `None` where it is not there, `Some(None)` where it is there twice or
+/// no text.
 fn only<'h>(headers: &'h HeaderMap, name: &HeaderName) -> Option<Option<&'h str>> {
     let mut all = headers.get_all(name).iter();
     let first = all.next()?;

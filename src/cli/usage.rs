@@ -1,4 +1,5 @@
-//! What was typed: the definition of the command line, and its mistakes in one line each, with what may have been meant.
+//! What was typed: the definition of the command line, and its mistakes in one line each, with what
+//! may have been meant.
 use super::args::Cli;
 use super::line::one_line;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
@@ -7,7 +8,8 @@ use std::error::Error as _;
 use std::num::{ParseFloatError, ParseIntError};
 use std::process::ExitCode;
 
-/// Options that a command takes, because all or its neighbours do, and has no use for: its help does not show them.
+/// Options that a command takes, because all or its neighbours do, and has no use for: its help
+/// does not show them.
 const UNUSED: [(&str, &[&str]); 9] = [
     ("render", &["provider"]),
     ("measure", &["provider", "log"]),
@@ -59,7 +61,8 @@ pub fn parse() -> Result<Cli, ExitCode> {
     parsed.map_err(|error| print_usage_error(&error))
 }
 
-/// Help and version go to standard output; what cannot be parsed is one line like every other error, exit code 2.
+/// Help and version go to standard output; what cannot be parsed is one line like every other
+/// error, exit code 2.
 fn print_usage_error(error: &clap::Error) -> ExitCode {
     let help = matches!(
         error.kind(),
@@ -123,7 +126,8 @@ fn message(error: &clap::Error) -> String {
     format!("{wrong}; {} --help shows what there is", asked_command(error))
 }
 
-/// Clap compares places and finds nothing near to "rnu": a command with the same letters in another order may be meant.
+/// Clap compares places and finds nothing near to "rnu": a command with the same letters in another
+/// order may be meant.
 fn swapped(error: &clap::Error, name: &str) -> String {
     let sorted = |word: &str| {
         let mut letters: Vec<char> = word.chars().collect();

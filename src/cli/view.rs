@@ -51,7 +51,8 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     } else {
         print(&format!("{} is at {address}  (Ctrl-C ends)\n", args.scene.display()))?;
     }
-    // From here on there is nothing that stopping could leave undone, also while a question is answered.
+    // From here on there is nothing that stopping could leave undone, also while a question is
+    // answered.
     progress::stopping_is_no_failure();
     let input = StandardInput::new();
     while !progress::stopped() && !input.has_closed() {
@@ -81,7 +82,8 @@ fn questions(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
 }
 
 fn page(scene: &Scene, args: &ViewArgs, names: &CodeNames, no_questions: Option<&str>) -> Result<String> {
-    // Photos are decoration here: a scene whose pictures were deleted still shows, and one that names pictures elsewhere.
+    // Photos are decoration here: a scene whose pictures were deleted still shows, and one that
+    // names pictures elsewhere.
     let load = |c: &Camera| photo::load_at(&scene_photos::picture(&scene.path, c)?, usize::MAX).ok();
     let photos: Option<Vec<_>> = scene.cameras.iter().map(load).collect();
     let images: Vec<RgbImage> = photos.unwrap_or_default().into_iter().map(|p| p.image).collect();
@@ -111,7 +113,8 @@ fn reply(ready: Option<&mut QueryScene>, text: &str, options: &QueryOptions) -> 
     Ok(reply.to_string())
 }
 
-/// Tells when whoever started this process has gone: the terminal was closed, or the other end of a pipe. Nothing is read.
+/// Tells when whoever started this process has gone: the terminal was closed, or the other end of a
+/// pipe. Nothing is read.
 struct StandardInput {
     /// Not where it was closed from the beginning: it then says nothing.
     watched: bool,

@@ -13,8 +13,8 @@ pub fn read(path: &Path) -> Result<Vec<Camera>> {
     Ok(cameras)
 }
 
-/// One stem per camera, with folders of its name where that of the file is not its own; two of one name would overwrite each
-/// other's files.
+/// One stem per camera, with folders of its name where that of the file is not its own; two of one
+/// name would overwrite each other's files.
 pub fn stems(list: &[Camera]) -> Result<Vec<String>> {
     let stems = stems_apart(&list.iter().map(|c| c.name.as_str()).collect::<Vec<_>>());
     for (i, stem) in stems.iter().enumerate() {

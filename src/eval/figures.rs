@@ -43,7 +43,8 @@ pub struct DepthScore {
     pub delta: f64,
 }
 
-/// Depth of solid pixels; `scale` is that of the cameras, scene → truth. `None` without common pixels.
+/// Depth of solid pixels; `scale` is that of the cameras, scene → truth. `None` without common
+/// pixels.
 pub fn depth_score(
     depth: &Plane<f32>,
     alpha: &Plane<f32>,
@@ -64,8 +65,8 @@ pub fn depth_score(
     })
 }
 
-/// Intersection over union of a mask (resampled to the truth's size by nearest pixel) and one object; 0 when both are
-/// empty.
+/// Intersection over union of a mask (resampled to the truth's size by nearest pixel) and one
+/// object; 0 when both are empty.
 pub fn iou(mask: &Plane<bool>, objects: &Plane<u32>, label: u32) -> Result<f64> {
     if mask.data.len() != mask.width * mask.height || mask.data.is_empty() {
         return Err(Error::work("eval: a mask without pixels"));

@@ -21,11 +21,13 @@ pub struct InstanceScore {
     pub expected: usize,
     /// Things found.
     pub found: usize,
-    /// Per expected object the distance from the middle of what the photos show of it to that of the nearest thing, true units.
+    /// Per expected object the distance from the middle of what the photos show of it to that of
+    /// the nearest thing, true units.
     pub centre_distance: Vec<f64>,
 }
 
-/// Label → phrase and middle of what the train frames show of it, true world; those of which they show `least` pixels.
+/// Label → phrase and middle of what the train frames show of it, true world; those of which they
+/// show `least` pixels.
 pub(super) fn middles(
     truth: &GroundTruth,
     phrases: Vec<(u32, String)>,

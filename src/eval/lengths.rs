@@ -1,4 +1,5 @@
-//! Lengths in the scene against the true ones: what a tape measure is worth once one length is known.
+//! Lengths in the scene against the true ones: what a tape measure is worth once one length is
+//! known.
 use crate::math::{Random, quantile};
 use glam::DVec3;
 use serde::Serialize;
@@ -18,8 +19,8 @@ pub struct LengthScore {
 /// Pairs of lengths drawn: quantiles over them are right to a few hundredths of themselves.
 const DRAWN: usize = 20_000;
 
-/// Over the distances of all pairs of places, (scene, truth), that are truly at least `least` apart; the true places of a pair
-/// differ. `None` with fewer than two lengths.
+/// Over the distances of all pairs of places, (scene, truth), that are truly at least `least`
+/// apart; the true places of a pair differ. `None` with fewer than two lengths.
 pub(super) fn length_score(places: &[(DVec3, DVec3)], least: f64) -> Option<LengthScore> {
     let pairs = (0..places.len()).flat_map(|j| (0..j).map(move |i| (i, j)));
     let ratio = |(i, j): (usize, usize)| {

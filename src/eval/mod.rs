@@ -1,8 +1,10 @@
-//! Scoring a scene against known cameras, depth and object masks: the building blocks of `splatvk eval`.
+//! Scoring a scene against known cameras, depth and object masks: the building blocks of `splatvk
+//! eval`.
 //!
-//! A caller opens [`GroundTruth`], asks [`Evaluation::cameras`] for every frame's camera in the scene's world, renders
-//! it, answers each label's phrase with [`crate::query::answer`] and hands both to [`Evaluation::add_frame`]; the figures
-//! agree with an independent scorer that reads only the files written.
+//! A caller opens [`GroundTruth`], asks [`Evaluation::cameras`] for every frame's camera in the
+//! scene's world, renders it, answers each label's phrase with [`crate::query::answer`] and hands
+//! both to [`Evaluation::add_frame`]; the figures agree with an independent scorer that reads only
+//! the files written.
 mod figures;
 mod instances;
 mod lengths;
@@ -62,7 +64,8 @@ pub struct Rendered {
     pub depth: Plane<f32>,
 }
 
-/// Focal ratio and offset of the principal point of the scene's cameras against the truth: medians over the train frames.
+/// Focal ratio and offset of the principal point of the scene's cameras against the truth: medians
+/// over the train frames.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct OpticsOffset {
     /// Focal length over the true one.
@@ -103,8 +106,8 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
-    /// Matches the scene's cameras (by file stem) with the train frames and finds the similarity scene → truth from
-    /// them alone. With `out`, renders and masks are written there.
+    /// Matches the scene's cameras (by file stem) with the train frames and finds the similarity
+    /// scene → truth from them alone. With `out`, renders and masks are written there.
     pub fn new(truth: GroundTruth, scene: &[Camera], out: Option<&Path>) -> Result<Self> {
         let mut pairs: Vec<(Camera, &TruthFrame)> = Vec::new();
         let asked = truth.frames.iter().filter(|f| f.split == Split::Train).count();
@@ -146,13 +149,14 @@ impl Evaluation {
         self.report.up_degrees = known.map(|(up, truth)| angle(up, truth).to_degrees());
     }
 
-    /// The frames and, for each, the camera of the truth expressed in the scene's world, at the truth's size.
+    /// The frames and, for each, the camera of the truth expressed in the scene's world, at the
+    /// truth's size.
     pub fn cameras(&self) -> Vec<(TruthFrame, Camera)> {
         self.truth.frames.iter().map(|f| (f.clone(), to_scene(&f.camera, &self.similarity))).collect()
     }
 
-    /// A camera of the truth with the optics that the scene found for its own photos: what a photo taken with the same
-    /// camera shows of the scene if the scene is right about itself.
+    /// A camera of the truth with the optics that the scene found for its own photos: what a photo
+    /// taken with the same camera shows of the scene if the scene is right about itself.
     pub fn with_scene_optics(&self, camera: &Camera) -> Camera {
         let OpticsOffset { focal, centre: [x, y] } = self.optics_offset;
         Camera {

@@ -130,7 +130,8 @@ pub struct PairScore {
 pub struct RelativeScore {
     /// All pairs of train views that the scene has.
     pub pairs: Vec<PairScore>,
-    /// Area under the recall curve up to 3 degrees; pairs with a frame that the scene lacks count as failures.
+    /// Area under the recall curve up to 3 degrees; pairs with a frame that the scene lacks count
+    /// as failures.
     pub auc_3: Option<f64>,
     /// Up to 5 degrees.
     pub auc_5: Option<f64>,

@@ -105,7 +105,8 @@ fn another_scenes_truth_is_refused() {
 fn held_out_frames_take_the_optics_that_the_scene_found() {
     let (truth, mut scene, _) = moved();
     for c in &mut scene {
-        // As a scene at half the size that takes the focal length for a tenth shorter and the centre for 2 % off.
+        // As a scene at half the size that takes the focal length for a tenth shorter and the
+        // centre for 2 % off.
         *c = c.resized(320, 240);
         (c.fx, c.fy, c.cx) = (0.9 * c.fx, 0.9 * c.fy, c.cx + 0.02 * 320.0);
     }

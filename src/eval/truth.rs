@@ -61,7 +61,8 @@ impl TruthFrame {
 
 /// Labels of frames in another layout than `masks/<stem>.png`.
 pub trait ObjectMaps: std::fmt::Debug + Send + Sync {
-    /// Object index per pixel of a frame, [H, W] of the label's own size; `None` where the frame has no labels.
+    /// Object index per pixel of a frame, [H, W] of the label's own size; `None` where the frame
+    /// has no labels.
     fn objects(&self, stem: &str) -> Result<Option<Plane<u32>>>;
 }
 
@@ -128,9 +129,9 @@ impl GroundTruth {
         Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, up, frames, maps: None })
     }
 
-    /// Refuses files that are missing or do not fit the frames, before any work is done with them: photos, masks and depth of
-    /// another size, and with `masks`, where the set has labels, masks of some frames only. Says what cannot be scored where
-    /// it has labels and no mask at all.
+    /// Refuses files that are missing or do not fit the frames, before any work is done with them:
+    /// photos, masks and depth of another size, and with `masks`, where the set has labels, masks
+    /// of some frames only. Says what cannot be scored where it has labels and no mask at all.
     pub fn check(&self, masks: bool) -> Result<Option<String>> {
         let labelled = self.maps.is_none() && !self.labels.is_empty();
         let mut missing = Vec::new();
@@ -177,7 +178,8 @@ impl GroundTruth {
         Ok(RgbImage { width: image.width() as usize, height: image.height() as usize, data })
     }
 
-    /// Object index per pixel, if the set has masks: of the frame's size where another layout holds them.
+    /// Object index per pixel, if the set has masks: of the frame's size where another layout holds
+    /// them.
     pub fn objects(&self, frame: &TruthFrame) -> Result<Option<Plane<u32>>> {
         if let Some(maps) = &self.maps {
             let (width, height) = (frame.camera.width as usize, frame.camera.height as usize);
@@ -207,7 +209,8 @@ impl GroundTruth {
         }
     }
 
-    /// Mean over frames of their mean known depth; the largest camera distance from their mean where no depth exists.
+    /// Mean over frames of their mean known depth; the largest camera distance from their mean
+    /// where no depth exists.
     pub fn mean_depth(&self, frames: &[&TruthFrame]) -> Result<f64> {
         let mut means = Vec::new();
         for frame in frames {

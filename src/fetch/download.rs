@@ -1,4 +1,5 @@
-//! One file over HTTP: resumed where it was cut off, tried again where that can help, held to its size and checksum on the way.
+//! One file over HTTP: resumed where it was cut off, tried again where that can help, held to its
+//! size and checksum on the way.
 use std::fs::File;
 use std::io::{Read, Seek, Write};
 use std::path::{Path, PathBuf};
@@ -34,8 +35,9 @@ pub struct Limits {
 
 impl Default for Limits {
     fn default() -> Self {
-        // A line that is silent for half a minute is dead, as browsers and curl's own advice have it; five tries with pauses of 1, 2, 4
-        // and 8 s bridge a router that restarts its line, and keep somebody without a network for a quarter of a minute only.
+        // A line that is silent for half a minute is dead, as browsers and curl's own advice have
+        // it; five tries with pauses of 1, 2, 4 and 8 s bridge a router that restarts its line, and
+        // keep somebody without a network for a quarter of a minute only.
         let seconds = Duration::from_secs;
         Limits { connect: seconds(15), stall: seconds(30), tries: 5, pause: seconds(1) }
     }
@@ -70,7 +72,8 @@ pub struct Fetched {
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, Serialize)]
 struct Begun {
     from: String,
-    /// Proves that the rest belongs to what is there: a strong ETag, else the time of the last change.
+    /// Proves that the rest belongs to what is there: a strong ETag, else the time of the last
+    /// change.
     validator: Option<String>,
     total: Option<u64>,
     /// Once it is whole.
@@ -91,8 +94,8 @@ impl From<Error> for Trouble {
 }
 
 impl Client {
-    /// With [`MIRROR`] and, where `SSL_CERT_FILE` is set, its root certificates in the place of Mozilla's. Proxies are those of
-    /// `ALL_PROXY`, `HTTPS_PROXY`, `HTTP_PROXY` and `NO_PROXY`.
+    /// With [`MIRROR`] and, where `SSL_CERT_FILE` is set, its root certificates in the place of
+    /// Mozilla's. Proxies are those of `ALL_PROXY`, `HTTPS_PROXY`, `HTTP_PROXY` and `NO_PROXY`.
     pub fn from_environment() -> Result<Client> {
         let set = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
         Client::new(
@@ -138,7 +141,8 @@ impl Client {
         self.mirror.as_ref().map_or(source.from.clone(), |m| format!("{m}{}", path(&source.from)))
     }
 
-    /// Makes `to`, through a partial file in `work` that a later call goes on with. `ceiling` bounds a file of unknown size, bytes.
+    /// Makes `to`, through a partial file in `work` that a later call goes on with. `ceiling`
+    /// bounds a file of unknown size, bytes.
     pub fn download(
         &self,
         source: &Source,
@@ -301,7 +305,8 @@ impl Download<'_> {
         }
         let response = request.call().map_err(|e| trouble(&address, &e))?;
         let status = response.status();
-        // No file of a model is one; a network that wants a login first sends one in the place of everything.
+        // No file of a model is one; a network that wants a login first sends one in the place of
+        // everything.
         if status.is_success()
             && header(&response, "content-type").is_some_and(|t| t.starts_with("text/html"))
         {

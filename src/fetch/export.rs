@@ -1,5 +1,5 @@
-//! Networks that no public ONNX file holds: their checkpoint is exported by a script of `tools/export`, which this program carries,
-//! in a Python environment that exists only meanwhile.
+//! Networks that no public ONNX file holds: their checkpoint is exported by a script of
+//! `tools/export`, which this program carries, in a Python environment that exists only meanwhile.
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};

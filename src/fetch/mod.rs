@@ -1,5 +1,6 @@
-//! Gets networks: public ONNX files over HTTP, or the export of a checkpoint, into a hidden folder; there they are held to their
-//! contract and to a numeric self-check, and appear whole in their place or not at all. See docs/use/models.md#fetching.
+//! Gets networks: public ONNX files over HTTP, or the export of a checkpoint, into a hidden folder;
+//! there they are held to their contract and to a numeric self-check, and appear whole in their
+//! place or not at all. See docs/use/models.md#fetching.
 mod download;
 mod export;
 mod meter;
@@ -105,8 +106,8 @@ pub fn present(entry: &CatalogueEntry, folder: &Path) -> Result<Present> {
     Ok(Present::Sound)
 }
 
-/// Removes what interrupted fetches left of models that are installed by now, and puts back a model that one had taken out to
-/// replace it; not of those in `going_on`, which are fetched next.
+/// Removes what interrupted fetches left of models that are installed by now, and puts back a model
+/// that one had taken out to replace it; not of those in `going_on`, which are fetched next.
 pub fn tidy(folder: &Path, going_on: &[&str]) -> Result<()> {
     for (root, _) in leftovers(folder) {
         let name = staging::name(&root).unwrap_or_default();
@@ -138,7 +139,8 @@ pub fn fetch(
         None => download_files(entry, &staging, folder, client, progress)?,
     };
     progress.begin("check", 1);
-    // What only this download says that it is right, and is not, must not be taken for it the next time.
+    // What only this download says that it is right, and is not, must not be taken for it the next
+    // time.
     let steps = verify(entry, registry, &staging).inspect_err(|_| staging.discard(unpinned(entry)))?;
     progress.step(1, "");
     progress.end();
@@ -169,8 +171,8 @@ fn unpinned(entry: &CatalogueEntry) -> impl Iterator<Item = &str> {
     entry.files.iter().filter(|s| s.sha256.is_none()).map(|s| s.name.as_str())
 }
 
-/// The first download of a file whose content the catalogue does not know decides what it is: another one from the same address
-/// is refused.
+/// The first download of a file whose content the catalogue does not know decides what it is:
+/// another one from the same address is refused.
 fn same_as_before(files: &[Fetched], place: &Path) -> Result<()> {
     let Adapter { sha256, source, .. } = pinned(place)?;
     for file in files.iter().filter(|f| source.get(&f.name) == Some(&f.from)) {
@@ -203,7 +205,8 @@ fn adapter(entry: &CatalogueEntry, files: &[Fetched]) -> String {
     )
 }
 
-/// Holds what came to the contract of its kind and repeats references and the built-in pictures with it.
+/// Holds what came to the contract of its kind and repeats references and the built-in pictures
+/// with it.
 fn verify(entry: &CatalogueEntry, registry: &Registry, staging: &Staging) -> Result<Vec<Measured>> {
     let useless = |why: &str| {
         Error::missing_model(

@@ -1,5 +1,6 @@
-//! Where a model is put together: a hidden folder beside its place, which no search for models looks into. It outlives a killed
-//! process, so that the next fetch goes on from it; one process at a time holds it.
+//! Where a model is put together: a hidden folder beside its place, which no search for models
+//! looks into. It outlives a killed process, so that the next fetch goes on from it; one process at
+//! a time holds it.
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -59,7 +60,8 @@ impl Staging {
         files.for_each(|name| drop(std::fs::remove_file(self.model().join(name))));
     }
 
-    /// Moves the model to its place. One that is there is only removed after that, and comes back if the move fails.
+    /// Moves the model to its place. One that is there is only removed after that, and comes back
+    /// if the move fails.
     pub fn install(self) -> Result<PathBuf> {
         let moved = match self.place.symlink_metadata() {
             Ok(_) => swap(&self.model(), &self.place, &self.held.aside()),
@@ -81,7 +83,8 @@ pub(super) fn root(folder: &Path, name: &str) -> PathBuf {
     folder.join(format!("{PREFIX}{name}"))
 }
 
-/// What interrupted fetches left in a model folder: each hidden folder whose owner is gone, with its bytes.
+/// What interrupted fetches left in a model folder: each hidden folder whose owner is gone, with
+/// its bytes.
 pub fn leftovers(folder: &Path) -> Vec<(PathBuf, u64)> {
     let list = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path());
     let left = |p: &PathBuf| name(p).is_some() && matches!(look(p), Found::Left(_) | Found::Blank(_));

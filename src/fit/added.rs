@@ -1,5 +1,5 @@
-//! A scene that goes on with more photos (docs/internals/method.md#photos-added-later): its splats stay and train on, surfaces that it does not
-//! have yet become new ones.
+//! A scene that goes on with more photos (docs/internals/method.md#photos-added-later): its splats
+//! stay and train on, surfaces that it does not have yet become new ones.
 use super::bounds::Bounds;
 use super::coarse::Photos;
 use super::init::{raise_sh_degree, splats_from_points};
@@ -13,15 +13,16 @@ use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, Plane, PointCloud, Splats};
 use glam::DVec3;
 
-/// Relative difference in depth from which on a point is on another surface than the one that is rendered: what occlusion tests
-/// between views allow (docs/internals/method.md#reprojection).
+/// Relative difference in depth from which on a point is on another surface than the one that is
+/// rendered: what occlusion tests between views allow (docs/internals/method.md#reprojection).
 const SAME_SURFACE: f64 = 0.05;
 
 /// Fewest points that splats are made of.
 const MIN_POINTS: usize = 4;
 
-/// The points on surfaces that a scene does not have: those that a new view measures where the scene renders nothing, or something
-/// clearly nearer or farther. `views` are new cameras, each with the depth that was measured in it and what the scene renders there.
+/// The points on surfaces that a scene does not have: those that a new view measures where the
+/// scene renders nothing, or something clearly nearer or farther. `views` are new cameras, each
+/// with the depth that was measured in it and what the scene renders there.
 pub fn new_surface(points: &PointCloud, views: &[(&Camera, &DepthMap, &Plane<f32>)]) -> PointCloud {
     let is_new = |i: usize| {
         let p = DVec3::from(points.positions[i].map(f64::from));
@@ -40,7 +41,8 @@ pub fn new_surface(points: &PointCloud, views: &[(&Camera, &DepthMap, &Plane<f32
     points.picked(&rows)
 }
 
-/// Trains on: `scene` are the splats that photos show, `fresh` points of new surfaces; `photos` are those of the scene first.
+/// Trains on: `scene` are the splats that photos show, `fresh` points of new surfaces; `photos` are
+/// those of the scene first.
 pub(crate) fn train_on(
     device: &Device,
     photos: Photos,
@@ -87,7 +89,8 @@ mod tests {
             cy: 0.5,
             pose: Pose::IDENTITY,
         };
-        // Pixel 0 is rendered where it was measured, 1 behind, 2 not at all; 3 was measured elsewhere.
+        // Pixel 0 is rendered where it was measured, 1 behind, 2 not at all; 3 was measured
+        // elsewhere.
         let measured = DepthMap {
             depth: Plane { width: 4, height: 1, data: vec![2.0, 2.0, 2.0, 1.0] },
             confidence: Plane { width: 4, height: 1, data: vec![0.9; 4] },

@@ -1,15 +1,17 @@
-//! Where splats may be and how large (docs/internals/method.md#bounds): a splat at a camera hides its whole photo, and once it is opaque
-//! no gradient reaches what it hides.
+//! Where splats may be and how large (docs/internals/method.md#bounds): a splat at a camera hides
+//! its whole photo, and once it is opaque no gradient reaches what it hides.
 use super::model::Model;
 use crate::Result;
 use crate::math::quantile;
 use crate::scene::{Camera, Splats};
 use glam::DVec3;
 
-/// Largest standard deviation of a splat over its distance to the nearest camera. Three of them are then less than half of
-/// that distance: as far as the projection of splats, which is affine about their middle, is to be trusted.
+/// Largest standard deviation of a splat over its distance to the nearest camera. Three of them are
+/// then less than half of that distance: as far as the projection of splats, which is affine about
+/// their middle, is to be trusted.
 const LARGEST: f64 = 0.15;
-/// Nothing stands nearer to a camera than this share of the depth that all but one in a thousand of the points it shows have.
+/// Nothing stands nearer to a camera than this share of the depth that all but one in a thousand of
+/// the points it shows have.
 const NEAREST: f64 = 0.5;
 /// Points per view that the nearest are sought among.
 const SAMPLES: usize = 20_000;
@@ -66,7 +68,8 @@ impl Bounds {
         splats
     }
 
-    /// The same for splats in training. Whether splats went: recordings of steps then are out of date.
+    /// The same for splats in training. Whether splats went: recordings of steps then are out of
+    /// date.
     pub(super) fn hold_model(&self, model: &mut Model) -> Result<bool> {
         let means = model.values.means.read()?;
         let mut scales = model.values.log_scales.read()?;

@@ -1,4 +1,5 @@
-//! Training first at half the photos' size: there a step costs less than half, and what it fits is what matters early on.
+//! Training first at half the photos' size: there a step costs less than half, and what it fits is
+//! what matters early on.
 use crate::scene::{Camera, Coverage, DepthMap, Plane, RgbImage};
 
 /// What training compares with.

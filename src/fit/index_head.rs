@@ -1,5 +1,5 @@
-//! What LEGaussians does to features after they are splatted: smoothing in space, and a head that reads the index of a
-//! codebook entry from a rendered feature (Shi et al. 2024).
+//! What LEGaussians does to features after they are splatted: smoothing in space, and a head that
+//! reads the index of a codebook entry from a rendered feature (Shi et al. 2024).
 use crate::math::Random;
 use crate::scene::{Codebook, Splats};
 use rayon::prelude::*;
@@ -7,16 +7,18 @@ use std::collections::HashMap;
 
 /// Least weight of the neighbourhood in a smoothed feature (λ_min of the paper).
 const LEAST_SMOOTHING: f32 = 0.1;
-/// Side of a neighbourhood in units of the scene extent: a few times the distance between splats of a draft scene.
+/// Side of a neighbourhood in units of the scene extent: a few times the distance between splats of
+/// a draft scene.
 const NEIGHBOURHOOD: f64 = 0.01;
-/// Gradient steps of the head and their rate; the loss of a few thousand samples is flat after that.
+/// Gradient steps of the head and their rate; the loss of a few thousand samples is flat after
+/// that.
 const STEPS: usize = 150;
 const RATE: f32 = 0.05;
 /// Samples per step.
 const BATCH: usize = 1024;
 
-/// Moves every splat's feature `[N, d]` towards the mean of its neighbourhood, by as much as it disagrees with it and at
-/// least by a tenth; lengths stay.
+/// Moves every splat's feature `[N, d]` towards the mean of its neighbourhood, by as much as it
+/// disagrees with it and at least by a tenth; lengths stay.
 pub fn smooth(splats: &Splats, features: &mut [f32], d: usize, extent: f64) {
     let side = (NEIGHBOURHOOD * extent) as f32;
     if d == 0 || side <= 0.0 {
@@ -43,8 +45,9 @@ pub fn smooth(splats: &Splats, features: &mut [f32], d: usize, extent: f64) {
     });
 }
 
-/// Trains the rows of a linear softmax head, [K, d], on rendered features and the entries they should name; the rows take
-/// the place of the codes, so that the most probable entry is the decoded one.
+/// Trains the rows of a linear softmax head, [K, d], on rendered features and the entries they
+/// should name; the rows take the place of the codes, so that the most probable entry is the
+/// decoded one.
 pub fn train_head(book: &mut Codebook, features: &[f32], labels: &[u32], seed: u64) {
     let (d, k) = (book.code_dim, book.len());
     if labels.is_empty() || k == 0 {

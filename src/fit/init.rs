@@ -1,5 +1,5 @@
-//! Splats from points: size from the pixel footprint and the nearest neighbours, colour from the photos
-//! (docs/internals/method.md#splats-from-points).
+//! Splats from points: size from the pixel footprint and the nearest neighbours, colour from the
+//! photos (docs/internals/method.md#splats-from-points).
 use super::options::InitOptions;
 use crate::math::Random;
 use crate::scene::{PointCloud, SH_C0, Splats, sh_coefficients};
@@ -23,7 +23,8 @@ pub fn splats_from_points(points: &PointCloud, options: &InitOptions, seed: u64)
     let positions: Vec<Vec3> = keep.iter().map(|&i| Vec3::from(points.positions[i])).collect();
     let spacing = neighbour_distances(&positions);
     let logit = (options.opacity / (1.0 - options.opacity)).ln();
-    // Thinning spreads the same surface over fewer splats: each must cover proportionally more of it.
+    // Thinning spreads the same surface over fewer splats: each must cover proportionally more of
+    // it.
     let grow = (points.len() as f32 / keep.len() as f32).sqrt();
     let mut splats = Splats { sh_degree: 0, ..Splats::default() };
     for (n, &i) in keep.iter().enumerate() {
@@ -56,15 +57,16 @@ pub fn raise_sh_degree(splats: &mut Splats, degree: u32) {
     }
 }
 
-/// Reduces `candidates` to at most `max` points: the most confident point of every voxel, in voxels just large enough,
-/// then random ones up to the cap. Thin and far regions stay covered.
+/// Reduces `candidates` to at most `max` points: the most confident point of every voxel, in voxels
+/// just large enough, then random ones up to the cap. Thin and far regions stay covered.
 fn thin(points: &PointCloud, mut candidates: Vec<usize>, max: usize, seed: u64) -> Vec<usize> {
     if candidates.len() <= max {
         return candidates;
     }
     Random::new(seed).shuffle(&mut candidates);
-    // The voxel edge is in pixel footprints: on a surface with one point per footprint, a voxel of edge √ratio holds
-    // `ratio` points. Overlapping views hold more, so start there and grow until the voxels fit under the cap.
+    // The voxel edge is in pixel footprints: on a surface with one point per footprint, a voxel of
+    // edge √ratio holds `ratio` points. Overlapping views hold more, so start there and grow until
+    // the voxels fit under the cap.
     let mut edge = (candidates.len() as f32 / max as f32).sqrt() * 0.7;
     let mut best = occupied(points, &candidates, edge);
     while best.len() > max {
@@ -111,7 +113,8 @@ pub fn neighbour_distances(positions: &[Vec3]) -> Vec<f32> {
         .collect()
 }
 
-/// A balanced k-d tree over point indices: the median of each range splits it along its widest axis.
+/// A balanced k-d tree over point indices: the median of each range splits it along its widest
+/// axis.
 struct KdTree<'a> {
     positions: &'a [Vec3],
     order: Vec<u32>,
@@ -155,7 +158,8 @@ impl<'a> KdTree<'a> {
         }
     }
 
-    /// Squared distances to the three nearest points other than `skip`, infinite when there are fewer.
+    /// Squared distances to the three nearest points other than `skip`, infinite when there are
+    /// fewer.
     fn nearest(&self, query: Vec3, skip: usize) -> [f32; 3] {
         let mut best = [f32::INFINITY; 3];
         self.search(query, skip as u32, 0, self.order.len(), &mut best);

@@ -1,5 +1,6 @@
-//! The language stage: features on the splats that render to each pixel's code (docs/internals/method.md#language-training),
-//! `L = λ2·L_img + (1−λ2)·L_sem`, starting from lifted features.
+//! The language stage: features on the splats that render to each pixel's code
+//! (docs/internals/method.md#language-training), `L = λ2·L_img + (1−λ2)·L_sem`, starting from
+//! lifted features.
 use super::coarse::Photos;
 use super::least_squares;
 use super::lift::{CodeTargets, Lifting};
@@ -23,7 +24,8 @@ use std::time::Instant;
 const IMAGE_WEIGHTS: [f64; 2] = [0.8, 0.2];
 /// Slots of the loss sums: Σ|x−y|, ΣSSIM, language loss.
 const LANGUAGE_SUM: u32 = 2;
-/// Two measurements that gain less than this share of the pixels end the training (docs/internals/method.md#stopping).
+/// Two measurements that gain less than this share of the pixels end the training
+/// (docs/internals/method.md#stopping).
 const MIN_GAIN: f64 = 1e-3;
 
 /// One measurement during the language stage.
@@ -34,8 +36,8 @@ pub struct LanguagePoint {
     pub step: usize,
     /// Mean L_sem since the last point.
     pub loss: f64,
-    /// Share of labelled training pixels that decode to their label, index as in [`LEVEL_NAMES`]; `None` for levels that the
-    /// model does not carry.
+    /// Share of labelled training pixels that decode to their label, index as in [`LEVEL_NAMES`];
+    /// `None` for levels that the model does not carry.
     pub accuracy: Vec<Option<f64>>,
 }
 
@@ -56,7 +58,8 @@ pub fn decode_accuracy(curve: &[LanguagePoint], level: usize) -> Option<f64> {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct TrainedLanguage {
-    /// Splats of the shared model; those given, where every level has its own ([`LevelField::splats`]).
+    /// Splats of the shared model; those given, where every level has its own
+    /// ([`LevelField::splats`]).
     pub splats: Splats,
     /// The field given, with features [N, d] as they are rendered (linear blending).
     pub field: LanguageField,

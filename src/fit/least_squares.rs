@@ -1,20 +1,23 @@
-//! Features in closed form: those whose blend is nearest to the codes of all labelled pixels (docs/internals/method.md#lifting).
+//! Features in closed form: those whose blend is nearest to the codes of all labelled pixels
+//! (docs/internals/method.md#lifting).
 use super::lift::{Lifted, Lifting, MIN_WEIGHT, unit_start};
 use crate::Result;
 use crate::pass::codes::Mode;
 use rayon::prelude::*;
 
-/// Steps of conjugate gradients; a step costs a forward and a backward pass per photo, so that these cost about as much as the draft
-/// preset's training. Not searched (docs/internals/experiments.md#measured-lifting).
+/// Steps of conjugate gradients; a step costs a forward and a backward pass per photo, so that
+/// these cost about as much as the draft preset's training. Not searched
+/// (docs/internals/experiments.md#measured-lifting).
 const SOLVER_STEPS: usize = 8;
 
-/// λ: how much a splat's own mean counts beside what its pixels ask for, as a share of its blending weight. A tenth leaves what pixels
-/// agree on to them and decides what they leave open. Not searched (docs/internals/experiments.md#measured-lifting).
+/// λ: how much a splat's own mean counts beside what its pixels ask for, as a share of its blending
+/// weight. A tenth leaves what pixels agree on to them and decides what they leave open. Not
+/// searched (docs/internals/experiments.md#measured-lifting).
 const PRIOR: f32 = 0.1;
 
-/// Sets the model's raw features to the solution of `min_f Σ_px |Σ_i w_i f_i − c|² + λ Σ_i W_i |f_i − m_i|²`, with W_i the blending
-/// weight of splat i over the labelled pixels and m_i the mean of the codes it is seen with, and with the length that training
-/// starts from.
+/// Sets the model's raw features to the solution of `min_f Σ_px |Σ_i w_i f_i − c|² + λ Σ_i W_i |f_i
+/// − m_i|²`, with W_i the blending weight of splat i over the labelled pixels and m_i the mean of
+/// the codes it is seen with, and with the length that training starts from.
 pub(super) fn solve(lifting: &mut Lifting, lifted: &Lifted) -> Result<()> {
     let width = lifting.targets.width();
     // W for every value; 0 keeps the values of splats that no labelled pixel shows at zero.
@@ -55,7 +58,8 @@ pub(super) fn solve(lifting: &mut Lifting, lifted: &Lifted) -> Result<()> {
     Ok(lifting.model.values.features.write(&unit_start(x, width))?)
 }
 
-/// `(AᵀA + λW) v`, with A the blending of all labelled pixels. Photos give `AᵀA v − Aᵀc`, and Aᵀc is what was lifted.
+/// `(AᵀA + λW) v`, with A the blending of all labelled pixels. Photos give `AᵀA v − Aᵀc`, and Aᵀc
+/// is what was lifted.
 fn apply(lifting: &mut Lifting, lifted: &Lifted, weights: &[f32], v: &[f32]) -> Result<Vec<f32>> {
     lifting.model.values.features.write(v)?;
     let mut sums = lifted.sums.clone();

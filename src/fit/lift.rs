@@ -1,5 +1,5 @@
-//! Code targets in GPU memory, and lifting: the blending-weighted mean of the codes that each splat is seen with
-//! (docs/internals/method.md#lifting).
+//! Code targets in GPU memory, and lifting: the blending-weighted mean of the codes that each splat
+//! is seen with (docs/internals/method.md#lifting).
 use super::model::Model;
 use super::views::Views;
 use crate::gpu::{self, Buffer, Device, Recorder};
@@ -10,8 +10,8 @@ use crate::progress::Progress;
 use crate::scene::{Camera, LevelField, RgbImage};
 use crate::{Error, Result};
 
-/// Splats that labelled pixels saw with less weight than this (in pixels) start without a feature: their direction
-/// would be noise (docs/internals/method.md#lifting).
+/// Splats that labelled pixels saw with less weight than this (in pixels) start without a feature:
+/// their direction would be noise (docs/internals/method.md#lifting).
 pub(super) const MIN_WEIGHT: f32 = 0.05;
 /// Length of a lifted raw feature: far above ε, so steps turn it without collapsing it.
 const LIFTED_LENGTH: f32 = 0.5;
@@ -29,8 +29,8 @@ pub(super) struct CodeTargets {
 }
 
 impl CodeTargets {
-    /// Checks and uploads the targets. `weight` is that of L_sem, the mean over levels of the mean absolute difference
-    /// over labelled pixels and channels.
+    /// Checks and uploads the targets. `weight` is that of L_sem, the mean over levels of the mean
+    /// absolute difference over labelled pixels and channels.
     pub(super) fn new(
         device: &Device,
         levels: &[&LevelField],
@@ -84,7 +84,8 @@ impl CodeTargets {
     }
 }
 
-/// The labels of one level and view as rows of the common code table, whose first row for this level is `first`.
+/// The labels of one level and view as rows of the common code table, whose first row for this
+/// level is `first`.
 fn rows_of(level: &LevelField, view: usize, pixels: usize, first: i32) -> Result<Vec<i32>> {
     let Some(map) = level.targets.get(view) else {
         return Ok(vec![-1; pixels]);
@@ -109,8 +110,9 @@ pub(super) struct Lifted {
 
 /// Passes over all photos that lift, with the model's splats.
 ///
-/// The gradient of `Σ_px F(px)·c(px)` by a splat's feature is `Σ_px w(px) c(px)`, so one backward pass per view with the
-/// codes as upstream gives the weighted sums, and with ones as upstream of a colour the weights themselves.
+/// The gradient of `Σ_px F(px)·c(px)` by a splat's feature is `Σ_px w(px) c(px)`, so one backward
+/// pass per view with the codes as upstream gives the weighted sums, and with ones as upstream of a
+/// colour the weights themselves.
 pub(super) struct Lifting<'a> {
     pub(super) device: &'a Device,
     pub(super) views: &'a mut Views,
@@ -186,8 +188,8 @@ impl Lifted {
         unit_start(features, width)
     }
 
-    /// [N] of one of `levels`: the length of the mean of the unit codes that a splat is seen with (docs/internals/method.md#reliability),
-    /// in steps of 1/255; 0 where it is not seen.
+    /// [N] of one of `levels`: the length of the mean of the unit codes that a splat is seen with
+    /// (docs/internals/method.md#reliability), in steps of 1/255; 0 where it is not seen.
     pub(super) fn reliability(&self, level: usize, levels: usize, width: usize) -> Vec<f32> {
         let sums = self.sums.chunks_exact(width).skip(level).step_by(levels);
         let weights = self.weights.iter().skip(level).step_by(levels);
@@ -219,7 +221,8 @@ mod tests {
 
     #[test]
     fn reliability_is_how_far_the_codes_of_a_splat_agree() {
-        // Two levels of two numbers: one code throughout, two half and half; hardly seen, two opposite ones.
+        // Two levels of two numbers: one code throughout, two half and half; hardly seen, two
+        // opposite ones.
         let sums = vec![3.0, 0.0, 1.0, 1.0, 0.01, 0.0, 0.0, 0.0];
         let lifted = Lifted { sums, weights: vec![3.0, 2.0, 0.01, 4.0] };
         assert_eq!(lifted.reliability(0, 2, 2), [1.0, 0.0]);

@@ -1,4 +1,5 @@
-//! Splat parameters in GPU memory with their gradients and optimiser state, moved together when splats come and go.
+//! Splat parameters in GPU memory with their gradients and optimiser state, moved together when
+//! splats come and go.
 use super::options::Rates;
 use crate::gpu::{self, Buffer, Device, Recorder};
 use crate::pass::adam::{Class, Moments, Schedule};
@@ -30,7 +31,8 @@ pub(super) const GEOMETRY_AND_COLOUR: [ParameterClass; 5] = [
 /// Row of the schedule that the features use.
 const FEATURE_ROW: usize = 5;
 
-/// All parameters of the splats, with room for nothing more: recordings are made again when splats come or go.
+/// All parameters of the splats, with room for nothing more: recordings are made again when splats
+/// come or go.
 pub(super) struct Model {
     device: Device,
     /// What the rasteriser reads.
@@ -124,7 +126,8 @@ impl Model {
         self.schedule.set(self.step, &rows)
     }
 
-    /// Records the Adam step of geometry, opacity and colour; void where the frame's `guard` says so.
+    /// Records the Adam step of geometry, opacity and colour; void where the frame's `guard` says
+    /// so.
     pub(super) fn record_step(&self, rec: &mut Recorder, guard: &Buffer<u32>) {
         for kind in GEOMETRY_AND_COLOUR {
             let w = width(&self.values, kind);

@@ -12,7 +12,8 @@ pub struct InitOptions {
     pub opacity: f32,
     /// Standard deviation of a new splat in units of its pixel footprint (`PointCloud::radius`).
     pub footprint: f32,
-    /// Upper bound of the standard deviation in units of the mean distance to the three nearest points.
+    /// Upper bound of the standard deviation in units of the mean distance to the three nearest
+    /// points.
     pub neighbours: f32,
 }
 
@@ -54,8 +55,8 @@ pub struct RgbOptions {
     pub seed: u64,
     /// Start of the splats.
     pub init: InitOptions,
-    /// How far surfaces are continued beyond the photo borders, in units of the longer image side (needs depth maps); 0 =
-    /// nothing is continued, behind depth edges neither.
+    /// How far surfaces are continued beyond the photo borders, in units of the longer image side
+    /// (needs depth maps); 0 = nothing is continued, behind depth edges neither.
     pub margin: f64,
     /// Learning rates.
     pub rates: Rates,
@@ -65,14 +66,15 @@ pub struct RgbOptions {
     pub l1_weight: f64,
     /// Weight of 1 − SSIM.
     pub dssim_weight: f64,
-    /// Weight of the relative depth difference to the stereo depth where that is confident; 0 = off.
+    /// Weight of the relative depth difference to the stereo depth where that is confident; 0 =
+    /// off.
     pub depth_weight: f64,
     /// Stereo depth counts only where its confidence is at least this.
     pub min_confidence: f32,
     /// Weight of `mean max(0, s_max/s_min − 8)`, against needles; 0 = off.
     pub ratio_weight: f64,
-    /// No splat before everything that a photo shows, none larger than a share of its distance to the cameras: held at the
-    /// start, when pruning, and in the end.
+    /// No splat before everything that a photo shows, none larger than a share of its distance to
+    /// the cameras: held at the start, when pruning, and in the end.
     pub bounded: bool,
     /// Drop splats with a lower opacity …
     pub prune_opacity: f32,
@@ -91,14 +93,16 @@ impl RgbOptions {
     pub fn preset(preset: Preset) -> Self {
         match preset {
             Preset::Paper => Self::paper(),
-            // Fewer steps take proportionally longer ones: with Adam the distance a parameter can travel is about
-            // rate × steps. Rates stay below the point where the loss oscillates (means: a tenth of a pixel a step).
+            // Fewer steps take proportionally longer ones: with Adam the distance a parameter can
+            // travel is about rate × steps. Rates stay below the point where the loss oscillates
+            // (means: a tenth of a pixel a step).
             Preset::Draft => Self::draft(),
             Preset::Default => Self::short(),
         }
     }
 
-    /// No more than `most` splats in the end; `planned` is how many there would be with those beyond the photos' borders.
+    /// No more than `most` splats in the end; `planned` is how many there would be with those
+    /// beyond the photos' borders.
     pub fn limit_splats(&mut self, most: usize, planned: usize) {
         let beyond = planned.saturating_sub(self.init.max_points);
         self.init.max_points = self.init.max_points.min(most.saturating_sub(beyond));
@@ -117,23 +121,27 @@ impl RgbOptions {
         self
     }
 
-    /// The same options for a scene of `known` photos that goes on with `new` more: each may bring its share of the splats.
+    /// The same options for a scene of `known` photos that goes on with `new` more: each may bring
+    /// its share of the splats.
     pub fn going_on(self, known: usize, new: usize) -> Self {
-        // Steps at half size, 0.6 of a run, would undo what the scene shows already: they are left out, and of the others there are a
-        // few more, since new splats have seen none of them. Of many photos each is seen as often as in a run with sixteen.
+        // Steps at half size, 0.6 of a run, would undo what the scene shows already: they are left
+        // out, and of the others there are a few more, since new splats have seen none of them. Of
+        // many photos each is seen as often as in a run with sixteen.
         let steps = self.iterations.div_ceil(2).max(self.iterations * (known + new) / 16);
         let mut options = RgbOptions { coarse: 0.0, ..self.with_iterations(steps) };
         options.init.max_points = (options.init.max_points * new).div_ceil((known + new).max(1));
         options
     }
 
-    /// Most steps at half the photos' size. A thousand steps learn a few photos by heart: 0.9 dB more on them, 0.3 less on views
-    /// between them (docs/internals/experiments.md#how-long-to-train).
+    /// Most steps at half the photos' size. A thousand steps learn a few photos by heart: 0.9 dB
+    /// more on them, 0.3 less on views between them
+    /// (docs/internals/experiments.md#how-long-to-train).
     fn short() -> Self {
         RgbOptions { coarse: 0.6, ..Self::scaled(300, 2.0) }
     }
 
-    /// Fewer splats: on breakfast two fifths less time and 0.4 dB more on held-out views, 1.2 dB less on the photos themselves.
+    /// Fewer splats: on breakfast two fifths less time and 0.4 dB more on held-out views, 1.2 dB
+    /// less on the photos themselves.
     fn draft() -> Self {
         let mut options = Self::short();
         options.init.max_points = 130_000;
@@ -144,10 +152,11 @@ impl RgbOptions {
         let paper = Self::paper();
         RgbOptions {
             iterations,
-            // Stereo points are dense and already have the right colour, so splats start nearly opaque: from 0.1 the
-            // first hundred steps would only build up opacity.
+            // Stereo points are dense and already have the right colour, so splats start nearly
+            // opaque: from 0.1 the first hundred steps would only build up opacity.
             init: InitOptions { max_points: 200_000, opacity: 0.6, footprint: 0.7, neighbours: 1.0 },
-            // Held-out breakfast views show up to 14 % of pixels that no photo covers, all within this reach.
+            // Held-out breakfast views show up to 14 % of pixels that no photo covers, all within
+            // this reach.
             margin: 0.3,
             rates: Rates {
                 means: Exponential { start: 1.6e-4 * speed, end: 1.6e-5 * speed, steps: iterations },
@@ -210,9 +219,11 @@ impl RgbOptions {
 pub enum Start {
     /// Zero, as the paper.
     Zero,
-    /// The mean of the codes that a splat is seen with, weighted by how much it is blended into their pixels.
+    /// The mean of the codes that a splat is seen with, weighted by how much it is blended into
+    /// their pixels.
     Lifted,
-    /// The features whose blend is nearest to the codes of all labelled pixels, in the sense of least squares.
+    /// The features whose blend is nearest to the codes of all labelled pixels, in the sense of
+    /// least squares.
     LeastSquares,
 }
 
@@ -225,21 +236,23 @@ pub struct LanguageOptions {
     pub seed: u64,
     /// λ2 of `L = λ2·L_img + (1−λ2)·L_sem`.
     pub image_weight: f64,
-    /// Learning rates of everything but the features (reduced, docs/internals/method.md#language-rates).
+    /// Learning rates of everything but the features (reduced,
+    /// docs/internals/method.md#language-rates).
     pub rates: Rates,
     /// Learning rate of the features.
     pub feature_rate: f64,
-    /// ε of `f̂ = f/(‖f‖+ε)` per level (docs/internals/method.md#feature-gauge); only the ratio of ε and learning rate matters when
-    /// features start at zero.
+    /// ε of `f̂ = f/(‖f‖+ε)` per level (docs/internals/method.md#feature-gauge); only the ratio of
+    /// ε and learning rate matters when features start at zero.
     pub epsilon: f32,
     /// What the features start from.
     pub start: Start,
-    /// Train every level on its own copy of the splats, as the paper; otherwise all levels share one geometry.
+    /// Train every level on its own copy of the splats, as the paper; otherwise all levels share
+    /// one geometry.
     pub per_level: bool,
     /// Keep geometry, opacity and colour fixed: only the features move.
     pub detach_geometry: bool,
-    /// Measure the decode accuracy every so many steps and after the last one (0 = never), and stop when it gains less
-    /// than 0.1 % in two measurements.
+    /// Measure the decode accuracy every so many steps and after the last one (0 = never), and stop
+    /// when it gains less than 0.1 % in two measurements.
     pub check_every: usize,
 }
 
@@ -247,7 +260,8 @@ impl LanguageOptions {
     /// The options of a preset.
     pub fn preset(preset: Preset) -> Self {
         let iterations = match preset {
-            // Lifted features start near the end: three times as many steps decode as many pixels and find the same objects.
+            // Lifted features start near the end: three times as many steps decode as many pixels
+            // and find the same objects.
             Preset::Draft => 10,
             Preset::Default => 60,
             Preset::Paper => 1000,
@@ -265,7 +279,8 @@ impl LanguageOptions {
                 sh_dc: 1e-4,
                 sh_rest: 1e-4 / 20.0,
             },
-            // From zero: the paper's dynamics (7e-9 at ε = 1e-9) scaled to numbers f32 holds. After lifting: 2.5e-3.
+            // From zero: the paper's dynamics (7e-9 at ε = 1e-9) scaled to numbers f32 holds. After
+            // lifting: 2.5e-3.
             feature_rate: if paper { 7e-3 } else { 2.5e-3 },
             epsilon: 1e-3,
             start: if paper { Start::Zero } else { Start::Lifted },

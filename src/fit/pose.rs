@@ -1,11 +1,12 @@
-//! Camera pose refinement by Adam on left twists, `T ← exp(−lr·m̂/(√v̂+ε))·T` (docs/internals/method.md#pose-refinement).
+//! Camera pose refinement by Adam on left twists, `T ← exp(−lr·m̂/(√v̂+ε))·T`
+//! (docs/internals/method.md#pose-refinement).
 use super::schedule::Exponential;
 use crate::scene::Pose;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-/// Largest rotation (rad) and translation (in units of the scene scale) of one step: a single bad gradient must not
-/// throw a camera out of the scene.
+/// Largest rotation (rad) and translation (in units of the scene scale) of one step: a single bad
+/// gradient must not throw a camera out of the scene.
 const MAX_STEP: f64 = 1e-3;
 
 /// Adam state of one camera.
@@ -17,8 +18,8 @@ pub struct PoseAdam {
 }
 
 impl PoseAdam {
-    /// Applies one step for the gradient by the twist (ρ, θ). `rate` is the step size in radians; translations use
-    /// `rate · scale`, with the scene scale in world units.
+    /// Applies one step for the gradient by the twist (ρ, θ). `rate` is the step size in radians;
+    /// translations use `rate · scale`, with the scene scale in world units.
     pub fn update(&mut self, pose: &Pose, gradient: [f64; 6], rate: f64, scale: f64) -> Pose {
         if gradient.iter().any(|g| !g.is_finite()) {
             return *pose;
@@ -57,7 +58,8 @@ mod tests {
         let mut pose = Pose::IDENTITY;
         let mut adam = PoseAdam::default();
         for step in 0..400 {
-            // Gradient of ½|log(T·target⁻¹)|² to first order: the small-angle twist of the difference.
+            // Gradient of ½|log(T·target⁻¹)|² to first order: the small-angle twist of the
+            // difference.
             let difference = pose.compose(&target.inverse());
             let r = difference.rotation;
             let theta =

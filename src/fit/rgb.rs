@@ -1,4 +1,5 @@
-//! The RGB stage: splats from points, fitted to the photos, cameras refined on the way (docs/internals/method.md#splats).
+//! The RGB stage: splats from points, fitted to the photos, cameras refined on the way
+//! (docs/internals/method.md#splats).
 use super::bounds::Bounds;
 use super::coarse::{HalfSizePhotos, Photos};
 use super::init::splats_from_points;
@@ -23,8 +24,8 @@ use std::time::Instant;
 #[cfg(test)]
 mod tests;
 
-/// Photos of 8 bits cannot show more than their rounding noise, 10·log10(12·255²) = 58.9 dB: a render that happens to
-/// match exactly must not outweigh all other views.
+/// Photos of 8 bits cannot show more than their rounding noise, 10·log10(12·255²) = 58.9 dB: a
+/// render that happens to match exactly must not outweigh all other views.
 pub(crate) const MOST_PSNR: f64 = 60.0;
 /// Scale ratios above this are penalised (docs/internals/method.md#regularisers).
 const RATIO_LIMIT: f32 = 8.0;
@@ -38,8 +39,9 @@ pub struct CurvePoint {
     pub loss: f64,
     /// Mean SSIM over the same steps.
     pub ssim: f64,
-    /// Mean over the views of the PSNR when each was last looked at, dB. One view is looked at per point, which costs a
-    /// copy of its render; until every view had its turn the mean is over those that had.
+    /// Mean over the views of the PSNR when each was last looked at, dB. One view is looked at per
+    /// point, which costs a copy of its render; until every view had its turn the mean is over
+    /// those that had.
     pub psnr: f64,
     /// Number of splats.
     pub splats: usize,
@@ -83,8 +85,8 @@ pub struct Trained {
     pub stats: FitStats,
 }
 
-/// Fits splats to photos. `depths`, if given, regularises where a view's depth is confident. Deterministic for a seed
-/// up to the order of float atomics on the device.
+/// Fits splats to photos. `depths`, if given, regularises where a view's depth is confident.
+/// Deterministic for a seed up to the order of float atomics on the device.
 pub fn train_rgb(
     device: &Device,
     images: &[RgbImage],

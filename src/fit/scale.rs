@@ -6,8 +6,9 @@ use glam::DVec3;
 /// The lengths that schedules are relative to, world units.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SceneScale {
-    /// Multiplies position rates: the camera radius of Kerbl et al. 2023, but at least a quarter of the median depth,
-    /// since few photos taken close together say little about the size of the scene.
+    /// Multiplies position rates: the camera radius of Kerbl et al. 2023, but at least a quarter of
+    /// the median depth, since few photos taken close together say little about the size of the
+    /// scene.
     pub extent: f64,
     /// Median camera z of the points over all cameras.
     pub median_depth: f64,

@@ -2,7 +2,8 @@
 use crate::math::Random;
 use serde::{Deserialize, Serialize};
 
-/// Log-linear interpolation from `start` to `end` over `steps`, constant afterwards (docs/internals/method.md#schedules).
+/// Log-linear interpolation from `start` to `end` over `steps`, constant afterwards
+/// (docs/internals/method.md#schedules).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exponential {
     /// Rate at step 0.
@@ -60,7 +61,8 @@ mod tests {
         let rate = Exponential { start: 1.6e-4, end: 1.6e-6, steps: 30000 };
         assert!((rate.at(0) - 1.6e-4).abs() < 1e-12 && (rate.at(30000) - 1.6e-6).abs() < 1e-14);
         assert!((rate.at(15000) - 1.6e-5).abs() < 1e-12);
-        // docs/internals/method.md#schedules: the preset `paper` hardly lowers the rate within its 1000 steps.
+        // docs/internals/method.md#schedules: the preset `paper` hardly lowers the rate within its
+        // 1000 steps.
         assert!((rate.at(1000) / 1.6e-4 - 0.8577).abs() < 1e-4, "factor .86 within 1000");
         assert_eq!(Exponential::constant(0.0).at(3), 0.0);
     }

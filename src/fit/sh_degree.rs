@@ -1,8 +1,8 @@
 //! What photos say of the SH degree of a scene.
 use serde::{Deserialize, Serialize};
 
-/// What photos left out must gain for a degree to be worth its numbers, dB: a degree multiplies the colours of a file by 4 to 16,
-/// and less than this nobody sees.
+/// What photos left out must gain for a degree to be worth its numbers, dB: a degree multiplies the
+/// colours of a file by 4 to 16, and less than this nobody sees.
 const LEAST_GAIN: f64 = 0.1;
 
 /// What leaving photos out said of one degree.
@@ -37,8 +37,8 @@ impl DegreeTrial {
 pub struct ViewDependence {
     /// SH degree of the scene.
     pub degree: u32,
-    /// The degrees that were tried, the highest first; none where a degree was given, the photos are too few, or show the same points
-    /// equally bright.
+    /// The degrees that were tried, the highest first; none where a degree was given, the photos
+    /// are too few, or show the same points equally bright.
     pub trials: Vec<DegreeTrial>,
 }
 

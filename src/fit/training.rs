@@ -1,4 +1,5 @@
-//! What both training stages share: a step on the next view, repeated when its tile lists overflow; reports; checkpoints.
+//! What both training stages share: a step on the next view, repeated when its tile lists overflow;
+//! reports; checkpoints.
 use super::model::{self, Model};
 use super::schedule::ViewOrder;
 use super::views::Views;
@@ -25,7 +26,8 @@ pub(crate) struct Trainer {
     group: usize,
 }
 
-/// A training stage. What one of them adds to [`Trainer`] is its losses, its schedule and its measurements.
+/// A training stage. What one of them adds to [`Trainer`] is its losses, its schedule and its
+/// measurements.
 pub(crate) trait Training {
     /// What steps change beside splats, moments, cameras and the order of the views.
     type Figures: Serialize + DeserializeOwned;
@@ -90,8 +92,8 @@ pub(crate) struct Parts<'a> {
     pub options: &'a RasterOptions,
 }
 
-/// A training under way, for going on after a kill. Of models trained one after the other only the current one is kept;
-/// those before it are trained again.
+/// A training under way, for going on after a kill. Of models trained one after the other only the
+/// current one is kept; those before it are trained again.
 #[derive(Serialize, Deserialize)]
 struct State<F> {
     group: usize,
@@ -140,8 +142,8 @@ impl Trainer {
     }
 }
 
-/// Trains model number `group` for `iterations` steps, or until a review ends it; goes on from the checkpoint, if there is
-/// one. `progress` counts the steps of all groups.
+/// Trains model number `group` for `iterations` steps, or until a review ends it; goes on from the
+/// checkpoint, if there is one. `progress` counts the steps of all groups.
 pub(super) fn train<T: Training>(
     run: &mut T,
     group: usize,

@@ -1,5 +1,6 @@
-//! Colours that depend on the direction they are seen from (docs/internals/method.md#view-dependent-colour): spherical harmonics on a
-//! trained geometry, of the degree that photos left out support.
+//! Colours that depend on the direction they are seen from
+//! (docs/internals/method.md#view-dependent-colour): spherical harmonics on a trained geometry, of
+//! the degree that photos left out support.
 use super::coarse::Photos;
 use super::init::raise_sh_degree;
 use super::options::{Rates, RgbOptions};
@@ -15,9 +16,11 @@ use crate::scene::{Camera, Coverage, RgbImage, Splats, sh_coefficients};
 
 /// The highest degree that files, viewers and passes know.
 const HIGHEST: u32 = 3;
-/// Fewest photos that can say anything: with one left out of four, a splat is still seen from three directions.
+/// Fewest photos that can say anything: with one left out of four, a splat is still seen from three
+/// directions.
 const FEWEST_PHOTOS: usize = 4;
-/// Parts that the photos are dealt into, one of which is left out at a time. More parts take longer in proportion.
+/// Parts that the photos are dealt into, one of which is left out at a time. More parts take longer
+/// in proportion.
 const PARTS: usize = 4;
 
 /// Options of [`fit_view_dependent`].
@@ -41,10 +44,12 @@ impl ViewDependentOptions {
     }
 }
 
-/// Gives trained splats SH coefficients of the highest degree by which photos gain that the colours were not fitted to, if any,
-/// and fits the colours to the photos. Everything else of the splats, and the cameras, stay to the bit.
+/// Gives trained splats SH coefficients of the highest degree by which photos gain that the colours
+/// were not fitted to, if any, and fits the colours to the photos. Everything else of the splats,
+/// and the cameras, stay to the bit.
 ///
-/// The splats themselves have seen all photos, so what is compared is only what the coefficients add.
+/// The splats themselves have seen all photos, so what is compared is only what the coefficients
+/// add.
 pub fn fit_view_dependent(
     device: &Device,
     images: &[RgbImage],
@@ -81,7 +86,8 @@ pub fn fit_view_dependent(
     Ok(result)
 }
 
-/// The highest degree whose coefficients the device binds: their two moments are the largest buffer. `range` in bytes.
+/// The highest degree whose coefficients the device binds: their two moments are the largest
+/// buffer. `range` in bytes.
 fn highest(range: u64, splats: usize) -> u32 {
     let bytes = |degree: u32| (2 * 4 * 3 * sh_coefficients(degree) * splats) as u64;
     (0..=HIGHEST).rev().find(|d| bytes(*d) <= range).unwrap_or(0)
@@ -127,8 +133,8 @@ impl Fit<'_> {
         fit_photos(self.device, photos, start, scale, &options, &quiet)
     }
 
-    /// Degrees from the highest down until photos left out gain by one. A degree is compared with the colours of the splats fitted as
-    /// long, because they have not come to rest.
+    /// Degrees from the highest down until photos left out gain by one. A degree is compared with
+    /// the colours of the splats fitted as long, because they have not come to rest.
     fn trials(
         &self,
         images: &[RgbImage],

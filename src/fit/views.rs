@@ -1,4 +1,5 @@
-//! The training views in GPU memory, in the bands that the device binds, and one rasteriser per image size.
+//! The training views in GPU memory, in the bands that the device binds, and one rasteriser per
+//! image size.
 use crate::gpu::{self, Buffer, Device};
 use crate::pass::bands::Band;
 use crate::pass::metrics::planar;
@@ -14,13 +15,16 @@ use super::model::Model;
 pub(super) struct TrainView {
     /// Index into [`Views::stages`].
     pub(super) stage: usize,
-    /// Per band [3, rows, W] of the photo, [4, rows, W] with the weights of the pixels where some do not count.
+    /// Per band [3, rows, W] of the photo, [4, rows, W] with the weights of the pixels where some
+    /// do not count.
     pub(super) target: Vec<Buffer<f32>>,
     /// The sum of the weights, where some do not count.
     pub(super) covered: Option<f64>,
-    /// Per band [rows, W] the alpha that renders should have, −1 where another band answers; where emptiness is shown.
+    /// Per band [rows, W] the alpha that renders should have, −1 where another band answers; where
+    /// emptiness is shown.
     pub(super) alpha: Option<Vec<Buffer<f32>>>,
-    /// Per band [rows, W] depth where it is trusted and the band's own, else 0; and the number of trusted pixels.
+    /// Per band [rows, W] depth where it is trusted and the band's own, else 0; and the number of
+    /// trusted pixels.
     pub(super) depth: Option<(Vec<Buffer<f32>>, usize)>,
 }
 
@@ -63,7 +67,8 @@ pub(super) struct Views {
 }
 
 impl Views {
-    /// Uploads photos (and depth) and makes the rasterisers, for `capacity` splats with `feature_dim` features.
+    /// Uploads photos (and depth) and makes the rasterisers, for `capacity` splats with
+    /// `feature_dim` features.
     pub(super) fn new(
         device: &Device,
         images: &[RgbImage],
@@ -158,7 +163,8 @@ impl Views {
         Ok(image)
     }
 
-    /// What the view's rasteriser last rendered: colours clipped to [0, 1]. `None` where that was only a band of it.
+    /// What the view's rasteriser last rendered: colours clipped to [0, 1]. `None` where that was
+    /// only a band of it.
     pub(super) fn shown(&self, view: usize) -> Result<Option<RgbImage>> {
         let frame = self.stage(view).raster.frame();
         if frame.bands.count() > 1 {

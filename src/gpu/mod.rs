@@ -1,5 +1,5 @@
-//! The GPU as splatvk uses it: [`splatvk_gpu`], the generated bindings of `glsl/`, and the program's
-//! choices that the crate leaves open: environment variables and the folder of the cache.
+//! The GPU as splatvk uses it: [`splatvk_gpu`], the generated bindings of `glsl/`, and the
+//! program's choices that the crate leaves open: environment variables and the folder of the cache.
 mod folder;
 mod options;
 pub mod report;

@@ -105,7 +105,8 @@ fn describe(info: &DeviceInfo, lines: &mut Vec<Line>) {
         lines.push(line("switched off", Status::Note, names.join(", "), Some(advice)));
     }
     let mib = |bytes: u64| bytes >> 20;
-    // One feature plane set of 20 channels at 1 Mpixel in f32 takes 80 MB; Vulkan itself only promises 128 MiB.
+    // One feature plane set of 20 channels at 1 Mpixel in f32 takes 80 MB; Vulkan itself only
+    // promises 128 MiB.
     lines.push(line(
         "limits",
         Status::Ok,

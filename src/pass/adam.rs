@@ -1,4 +1,5 @@
-//! Adam on the GPU (Kingma & Ba 2015), with a learning rate per parameter class that the host sets before each step.
+//! Adam on the GPU (Kingma & Ba 2015), with a learning rate per parameter class that the host sets
+//! before each step.
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 
@@ -9,8 +10,8 @@ pub const EPSILON: f64 = shaders::adam::EPS;
 /// Threads per workgroup in `glsl/adam.comp` and `glsl/gather.comp`.
 const GROUP: usize = shaders::adam::WORKGROUP[0] as usize;
 
-/// Workgroup counts for `threads` in a shader that numbers its groups row by row: at most 32768 a row, since one
-/// dimension may end at 65535.
+/// Workgroup counts for `threads` in a shader that numbers its groups row by row: at most 32768 a
+/// row, since one dimension may end at 65535.
 pub(crate) fn rows_of_groups(threads: usize) -> [u32; 3] {
     let groups = threads.div_ceil(GROUP).max(1);
     let row = groups.min(32768);
@@ -74,7 +75,8 @@ impl Schedule {
         Ok(self.faults.read()?.first().copied().unwrap_or(0))
     }
 
-    /// Records one step of one class; `guard[1] ≠ 0` on the GPU makes it void (see the rasteriser's status).
+    /// Records one step of one class; `guard[1] ≠ 0` on the GPU makes it void (see the rasteriser's
+    /// status).
     pub fn record(
         &self,
         rec: &mut Recorder,
@@ -136,7 +138,8 @@ mod tests {
     fn gpu_equals_the_twin_over_many_steps_and_rates() {
         let device = crate::gpu::test_device();
         let mut random = Random::new(4);
-        // 9 values per row: 3 at the head rate, 6 at the tail rate; not a multiple of the workgroup.
+        // 9 values per row: 3 at the head rate, 6 at the tail rate; not a multiple of the
+        // workgroup.
         let (rows, stride, head, rates) = (101usize, 9usize, 3usize, [2e-3, 1e-4]);
         let count = rows * stride;
         let start: Vec<f32> = (0..count).map(|_| random.normal() as f32).collect();

@@ -1,15 +1,17 @@
 //! Images larger than a device binds at once are rendered in bands of rows.
 //!
-//! What exceeds a binding first are the planes of an image: 4 bytes per pixel and channel, 52 channels with three levels of
-//! 16 features. A band has its own planes, targets and labels; splats are projected and sorted once for all bands, and what
-//! flows back from every band adds up in the same gradients. Bands overlap by 16 rows on either side, which are
-//! rendered for the windows of SSIM and have no loss of their own. An image that fits is one band: the whole.
+//! What exceeds a binding first are the planes of an image: 4 bytes per pixel and channel, 52
+//! channels with three levels of 16 features. A band has its own planes, targets and labels; splats
+//! are projected and sorted once for all bands, and what flows back from every band adds up in the
+//! same gradients. Bands overlap by 16 rows on either side, which are rendered for the windows of
+//! SSIM and have no loss of their own. An image that fits is one band: the whole.
 use crate::gpu::DeviceInfo;
 use crate::{Error, Result};
 use std::ops::Range;
 
-/// Rows on either side of a band that its neighbours answer for: SSIM's gradient reaches twice five rows, and whole tiles
-/// and SSIM's strips of 16 rows keep every sum in the order that it has in a whole image.
+/// Rows on either side of a band that its neighbours answer for: SSIM's gradient reaches twice five
+/// rows, and whole tiles and SSIM's strips of 16 rows keep every sum in the order that it has in a
+/// whole image.
 const HALO: usize = 16;
 /// Bands that answer for fewer rows than these render mostly halo.
 const FEWEST_ROWS: usize = 16;
@@ -73,8 +75,8 @@ impl Bands {
         if height <= fit {
             return Ok(Bands::whole(width, height));
         }
-        // Every band is aligned to 16 rows and stores as many as the others, so that a plane begins at one place in all of
-        // them: the stored rows leave the same remainder as the height.
+        // Every band is aligned to 16 rows and stores as many as the others, so that a plane begins
+        // at one place in all of them: the stored rows leave the same remainder as the height.
         let rows = fit.saturating_sub(height % 16) / 16 * 16 + height % 16;
         if rows < 2 * HALO + FEWEST_ROWS || width > widest(device, planes) {
             return Err(Error::gpu(format!(

@@ -1,11 +1,12 @@
 //! Tile lists: for every 8×8 tile the splats that can change it, nearest first.
 //!
-//! Splats in depth order are asked how many tiles they touch, a scan of these counts gives every (splat, tile) entry its
-//! place, and lanes with equal shares of the entries write them. What remains is a stable grouping by tile: on a CPU
-//! device by counting, with a counter per tile and lane, on a GPU by a radix sort of the tile's few bits. No
-//! (tile, depth) pair is ever sorted.
+//! Splats in depth order are asked how many tiles they touch, a scan of these counts gives every
+//! (splat, tile) entry its place, and lanes with equal shares of the entries write them. What
+//! remains is a stable grouping by tile: on a CPU device by counting, with a counter per tile and
+//! lane, on a GPU by a radix sort of the tile's few bits. No (tile, depth) pair is ever sorted.
 //!
-//! A splat is listed where `max over the tile's pixel centres of o e^p ≥ 1/255`: `glsl/shared/tiles.glsl`.
+//! A splat is listed where `max over the tile's pixel centres of o e^p ≥ 1/255`:
+//! `glsl/shared/tiles.glsl`.
 use super::frame::FrameBuffers;
 use super::project::Projected;
 use super::sort::Sort;
@@ -13,9 +14,9 @@ use super::tile_lists::{Group, SORTING_LANES, TILE, TileLists};
 use crate::gpu::{Buffer, Recorder, shaders};
 use std::ops::Range;
 
-/// Records counting, writing and grouping of the entries of `count` depth-sorted splats (`splat_count` holds the same
-/// number on the device) on these rows of tiles; the lists land in `frame.lists`, the number of entries needed in
-/// `frame.status`.
+/// Records counting, writing and grouping of the entries of `count` depth-sorted splats
+/// (`splat_count` holds the same number on the device) on these rows of tiles; the lists land in
+/// `frame.lists`, the number of entries needed in `frame.status`.
 pub(super) fn record(
     rec: &mut Recorder,
     frame: &FrameBuffers,
@@ -149,7 +150,8 @@ pub fn twin(projected: &[Option<Projected>], order: &[u32], size: [u32; 2]) -> V
     lists
 }
 
-/// Largest o e^p over the rectangle spanned by the 8×8 pixel centres (not only at the centres, as the walk does).
+/// Largest o e^p over the rectangle spanned by the 8×8 pixel centres (not only at the centres, as
+/// the walk does).
 fn largest_alpha(p: &Projected, x0: u32, y0: u32) -> f64 {
     let [a, b, c] = p.conic;
     let power = |dx: f64, dy: f64| -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy;

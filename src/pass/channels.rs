@@ -4,8 +4,9 @@ use crate::gpu::shaders;
 /// RGB and depth come before the d features in every stack of planes.
 pub const BASE_CHANNELS: usize = shaders::shared::layout::BASE_CHANNELS as usize;
 
-/// A block of channels that one launch of the raster kernels handles: their cost per pixel and splat has a fixed part,
-/// but their registers grow with the channels, so 48 features go in three launches of at most 16.
+/// A block of channels that one launch of the raster kernels handles: their cost per pixel and
+/// splat has a fixed part, but their registers grow with the channels, so 48 features go in three
+/// launches of at most 16.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Block {
     /// The kernel variant: 4, 7, 12, 20 with RGB and depth, 16 without.

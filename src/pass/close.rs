@@ -1,5 +1,6 @@
-//! Comparison of computed numbers with reference numbers, for tests and [`crate::check`]: one bound on the whole, one on every element,
-//! and an explicit budget for the few that a threshold tips to the other side.
+//! Comparison of computed numbers with reference numbers, for tests and [`crate::check`]: one bound
+//! on the whole, one on every element, and an explicit budget for the few that a threshold tips to
+//! the other side.
 use std::fmt;
 
 /// What [`compare`] demands.
@@ -17,14 +18,16 @@ pub struct Tolerance {
     pub outlier_factor: f64,
 }
 
-/// Images (docs/internals/method.md#tolerances). A contribution at the α threshold of 1/255 may be counted by one side and not by the
-/// other, which is worth up to 1/255 of a channel value; at most 2 pixels in 10 000 may show that.
+/// Images (docs/internals/method.md#tolerances). A contribution at the α threshold of 1/255 may be
+/// counted by one side and not by the other, which is worth up to 1/255 of a channel value; at most
+/// 2 pixels in 10 000 may show that.
 pub const IMAGE: Tolerance =
     Tolerance { relative_l2: 1e-4, absolute: 1e-4, relative: 1e-5, outliers: 2e-4, outlier_factor: 200.0 };
 
-/// One class of gradients: relative 1e-3 in the L2 sense (docs/internals/method.md#tolerances; measured 4e-7 to 4e-6). Single elements
-/// are sums of many terms of both signs, so each is also allowed 2e-3 of the class's root mean square; a contribution at the
-/// α threshold that one side counts and the other does not may push 2 % of the elements of a small class beyond that.
+/// One class of gradients: relative 1e-3 in the L2 sense (docs/internals/method.md#tolerances;
+/// measured 4e-7 to 4e-6). Single elements are sums of many terms of both signs, so each is also
+/// allowed 2e-3 of the class's root mean square; a contribution at the α threshold that one side
+/// counts and the other does not may push 2 % of the elements of a small class beyond that.
 pub fn gradient_tolerance(reference: &[f64]) -> Tolerance {
     let rms = (reference.iter().map(|x| x * x).sum::<f64>() / reference.len().max(1) as f64).sqrt();
     Tolerance {

@@ -1,5 +1,6 @@
-//! The language loss: L1 between rendered features and the code of each labelled pixel (docs/internals/method.md#language-loss),
-//! and the upstream that lifts codes onto splats (docs/internals/method.md#lifting).
+//! The language loss: L1 between rendered features and the code of each labelled pixel
+//! (docs/internals/method.md#language-loss), and the upstream that lifts codes onto splats
+//! (docs/internals/method.md#lifting).
 use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 
@@ -22,15 +23,16 @@ pub struct Targets<'a> {
 pub enum Mode {
     /// The gradient of the loss.
     Loss,
-    /// The code itself: back-propagated, it gives `Σ w·c` per splat; and 1 for colour number `level` of labelled pixels, which gives
-    /// `Σ w` ([`FrameBuffers::colour_gradients`]). The colours' planes of the upstream stay so until something else writes them.
+    /// The code itself: back-propagated, it gives `Σ w·c` per splat; and 1 for colour number
+    /// `level` of labelled pixels, which gives `Σ w` ([`FrameBuffers::colour_gradients`]). The
+    /// colours' planes of the upstream stay so until something else writes them.
     Lift,
     /// `F − c`, the gradient of half the square: least squares.
     Residual,
 }
 
-/// Records the loss of a frame, or of the band in its planes: writes the feature planes of `frame.planes_grad` and, per
-/// pixel, `loss` [H·W].
+/// Records the loss of a frame, or of the band in its planes: writes the feature planes of
+/// `frame.planes_grad` and, per pixel, `loss` [H·W].
 pub fn record(rec: &mut Recorder, targets: &Targets, frame: &FrameBuffers, loss: &Buffer<f32>, mode: Mode) {
     rec.pass("feature loss");
     let pixels = frame.pixels();
@@ -60,7 +62,8 @@ fn record_planes(
     rec.dispatch_threads(call, [pixels, 1, 1]);
 }
 
-/// The CPU twin of the loss for one level: (loss per pixel, gradient [width, pixels]) of planar features.
+/// The CPU twin of the loss for one level: (loss per pixel, gradient [width, pixels]) of planar
+/// features.
 pub fn code_l1(
     labels: &[i32],
     codes: &[f64],

@@ -1,4 +1,5 @@
-//! Pruning and compaction: which splats stay, and moving their rows (parameters and optimiser state alike) together.
+//! Pruning and compaction: which splats stay, and moving their rows (parameters and optimiser state
+//! alike) together.
 use super::adam::rows_of_groups;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};

@@ -1,4 +1,5 @@
-//! Rendered features to code indices: `k*(p) = argmax_k F(p)·c_k`, brute force over the codes of a level.
+//! Rendered features to code indices: `k*(p) = argmax_k F(p)·c_k`, brute force over the codes of a
+//! level.
 use crate::gpu::shaders::decode::{MIN_FEATURE_SHARE, PIXELS, VOID_ALPHA, WORKGROUP};
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 use crate::{Error, Result};
@@ -32,9 +33,10 @@ impl Codes {
         Ok(Codes { buffer, count: (codes.len() / dim) as u32, dim: dim as u32, width: width as u32 })
     }
 
-    /// Decodes `pixels` pixels. `features` is planar `[planes, pixels]`, the level's channels are the planes
-    /// `first_plane..first_plane + dim`; `transmittance` is `[pixels]`, 1 − alpha. Writes `decoded`, `[pixels]` of `i32`
-    /// with −1 where alpha < 0.5, where ‖F‖ < alpha / 4 and without codes. Twin: [`decode_pixels`].
+    /// Decodes `pixels` pixels. `features` is planar `[planes, pixels]`, the level's channels are
+    /// the planes `first_plane..first_plane + dim`; `transmittance` is `[pixels]`, 1 − alpha.
+    /// Writes `decoded`, `[pixels]` of `i32` with −1 where alpha < 0.5, where ‖F‖ < alpha / 4 and
+    /// without codes. Twin: [`decode_pixels`].
     pub fn record(
         &self,
         rec: &mut Recorder,
@@ -59,8 +61,9 @@ impl Codes {
     }
 }
 
-/// Twin of [`Codes::record`], in f64: per pixel of planar `features` `[dim, P]` and `alpha` `[P]` the code, and by how much
-/// it won, `(F·c_1 − F·c_2) / ‖F‖`: within rounding of 0 the device may take the other.
+/// Twin of [`Codes::record`], in f64: per pixel of planar `features` `[dim, P]` and `alpha` `[P]`
+/// the code, and by how much it won, `(F·c_1 − F·c_2) / ‖F‖`: within rounding of 0 the device may
+/// take the other.
 pub fn decode_pixels(codes: &[f32], dim: usize, features: &[f32], alpha: &[f32]) -> (Vec<i32>, Vec<f64>) {
     let pixels = alpha.len();
     let decode = |p: usize| {
@@ -135,7 +138,8 @@ mod tests {
             let (twin_code, twin_margin) = decode_pixels(&codes, dim, &features, &alpha);
             let code = on_device(&codes, dim, &features, &alpha);
             for p in 0..pixels {
-                // Sums of at most 32 products of numbers below 1 in f32: 32 × 6e-8 × ‖F‖, over ‖F‖, twice.
+                // Sums of at most 32 products of numbers below 1 in f32: 32 × 6e-8 × ‖F‖, over ‖F‖,
+                // twice.
                 let tolerance = 8e-6;
                 assert!(code[p] == twin_code[p] || twin_margin[p] < tolerance, "{dim} {p}");
             }

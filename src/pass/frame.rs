@@ -1,4 +1,5 @@
-//! Buffers of one frame, and the gradients that its backward pass keeps per entry of the tile lists.
+//! Buffers of one frame, and the gradients that its backward pass keeps per entry of the tile
+//! lists.
 use super::bands::Bands;
 use super::channels::{Block, blocks};
 use super::tile_lists::{TILE, TileLists};
@@ -8,7 +9,8 @@ use crate::pass::KernelVariant;
 use crate::sync::lock;
 use std::ops::Range;
 
-/// Buffers of one frame; pixel planes are planar [C, H, W], f32, with H the rows of one band where there are several.
+/// Buffers of one frame; pixel planes are planar [C, H, W], f32, with H the rows of one band where
+/// there are several.
 pub struct FrameBuffers {
     /// Pixels.
     pub width: u32,
@@ -22,13 +24,14 @@ pub struct FrameBuffers {
     pub planes: Buffer<f32>,
     /// [H, W] final transmittance T_f; alpha = 1 − T_f.
     pub transmittance: Buffer<f32>,
-    /// [4 + d + 1, H, W]: the loss's gradient by `planes` and, last, by alpha. Zero at first; a loss overwrites the planes
-    /// it uses. Read by the backward pass.
+    /// [4 + d + 1, H, W]: the loss's gradient by `planes` and, last, by alpha. Zero at first; a
+    /// loss overwrites the planes it uses. Read by the backward pass.
     pub planes_grad: Buffer<f32>,
-    /// [10]: gradient by the left pose twist (ρ, θ) and by fx, fy, cx, cy. Written by the backward pass.
+    /// [10]: gradient by the left pose twist (ρ, θ) and by fx, fy, cx, cy. Written by the backward
+    /// pass.
     pub camera_grad: Buffer<f32>,
-    /// [3] u32: tile-list entries of this frame; the number needed if a frame did not fit since the last `grow`, else 0; the
-    /// longest list of a tile so far, where lists are made by counting.
+    /// [3] u32: tile-list entries of this frame; the number needed if a frame did not fit since the
+    /// last `grow`, else 0; the longest list of a tile so far, where lists are made by counting.
     pub status: Buffer<u32>,
     pub(super) projected: Buffer<f32>,
     pub(super) projected_grad: Buffer<f32>,
@@ -57,8 +60,8 @@ impl FrameBuffers {
         self.bands.pixels() as u32
     }
 
-    /// [N, 3] the last backward pass's gradient by the colour of every splat: `∂L/∂c_i = Σ_px w_i(px) ∂L/∂C(px)`, so that an
-    /// upstream of ones gives the blending weight of each.
+    /// [N, 3] the last backward pass's gradient by the colour of every splat: `∂L/∂c_i = Σ_px
+    /// w_i(px) ∂L/∂C(px)`, so that an upstream of ones gives the blending weight of each.
     pub fn colour_gradients(&self, splats: usize) -> Result<Vec<[f32; 3]>> {
         const FIRST: usize = shaders::shared::layout::MOMENTS as usize;
         let sums = self.projected_grad.read_range(0..GRADIENT_FLOATS * splats)?;
@@ -82,7 +85,8 @@ pub(super) const PROJECTED_FLOATS: usize = shaders::shared::layout::PROJECTED_FL
 /// Gradient by the camera: twist (ρ, θ), fx, fy, cx, cy.
 pub(super) const CAMERA_GRADIENTS: usize = shaders::shared::layout::CAMERA_GRADIENTS as usize;
 
-/// Bytes per entry of the widest buffer that [`Summation::Entries`] needs: the features of one launch.
+/// Bytes per entry of the widest buffer that [`Summation::Entries`] needs: the features of one
+/// launch.
 pub(super) fn entry_bytes(feature_dim: usize) -> usize {
     4 * GRADIENT_FLOATS.max(4 * widest_block(feature_dim) as usize)
 }
@@ -95,10 +99,11 @@ fn widest_block(feature_dim: usize) -> u32 {
 /// How the gradients that one splat gets from several tiles are added up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Summation {
-    /// Float atomics: no memory, but the order of the additions, and so the last digits, differ from run to run.
+    /// Float atomics: no memory, but the order of the additions, and so the last digits, differ
+    /// from run to run.
     Atomics,
-    /// Every tile stores what it adds, and a second pass sums per splat: the same bits on every run, for 48 bytes per
-    /// entry and about a tenth more time per step (lavapipe, 100,000 splats).
+    /// Every tile stores what it adds, and a second pass sums per splat: the same bits on every
+    /// run, for 48 bytes per entry and about a tenth more time per step (lavapipe, 100,000 splats).
     Entries,
 }
 
@@ -109,13 +114,15 @@ pub(super) struct GradientEntries(std::sync::Mutex<Option<EntryBuffers>>);
 #[derive(Clone)]
 pub(super) struct EntryBuffers {
     capacity: usize,
-    /// [capacity, 12] as `projected_grad`, and [capacity, vectors of a block] for one block after the other.
+    /// [capacity, 12] as `projected_grad`, and [capacity, vectors of a block] for one block after
+    /// the other.
     pub splats: Buffer<f32>,
     pub codes: Buffer<f32>,
 }
 
 impl Summation {
-    /// The faster way, unless the device was opened to be deterministic or gives wrong results by it.
+    /// The faster way, unless the device was opened to be deterministic or gives wrong results by
+    /// it.
     pub fn of(device: &Device) -> Summation {
         let info = device.info();
         match KernelVariant::AtomicGradients.or_replacement(info) {

@@ -2,7 +2,8 @@
 use super::ssim_l1::ssim_l1;
 use crate::scene::RgbImage;
 
-/// Peak signal-to-noise ratio in dB of two equally sized images; colours are clipped to [0, 1] as a viewer would.
+/// Peak signal-to-noise ratio in dB of two equally sized images; colours are clipped to [0, 1] as a
+/// viewer would.
 pub fn psnr(rendered: &RgbImage, target: &RgbImage) -> f64 {
     psnr_masked(rendered, target, |_| true)
 }

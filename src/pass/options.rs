@@ -3,7 +3,8 @@
 /// How stored features become rendered ones (docs/internals/method.md#feature-gauge).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FeatureMode {
-    /// f̂ = f / (‖f‖ + ε), the parameterisation of the paper, for each of several blocks of equal length (one per level).
+    /// f̂ = f / (‖f‖ + ε), the parameterisation of the paper, for each of several blocks of equal
+    /// length (one per level).
     Gauge {
         /// ε
         epsilon: f32,

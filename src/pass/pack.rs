@@ -8,7 +8,8 @@ use crate::{Error, Result};
 /// What to take from a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FrameChannel {
-    /// R, G, B on the background (not clamped where the encoding holds more than [0, 1]), and alpha.
+    /// R, G, B on the background (not clamped where the encoding holds more than [0, 1]), and
+    /// alpha.
     Colour,
     /// Accumulated opacity.
     Alpha,
@@ -23,7 +24,8 @@ pub enum FrameChannel {
 pub enum Encoding {
     /// 32-bit floats, all channels of a pixel side by side: `[H, W, C]`.
     F32,
-    /// 32-bit floats in groups of four, the last one filled up with zeros: `[⌈C/4⌉, H, W, 4]`, layers of an RGBA image.
+    /// 32-bit floats in groups of four, the last one filled up with zeros: `[⌈C/4⌉, H, W, 4]`,
+    /// layers of an RGBA image.
     F32x4,
     /// 16-bit floats in such groups.
     F16x4,
@@ -93,7 +95,8 @@ pub fn texels(
     Ok(device.buffer::<u32>("texels", encoding.bytes(source.channels(), pixels) / 4)?)
 }
 
-/// Packs what a band of a rendered frame answers for into the [`texels`] of the image. Twin: [`texels_of`].
+/// Packs what a band of a rendered frame answers for into the [`texels`] of the image. Twin:
+/// [`texels_of`].
 pub fn pack(
     device: &Device,
     frame: &FrameBuffers,
@@ -173,7 +176,8 @@ mod tests {
         let (width, height, dim) = (19u32, 7u32, 6usize);
         let pixels = (width * height) as usize;
         let raster = Rasterizer::new(&device, 1, dim, width, height).unwrap();
-        // Multiples of 1/64 are exact in half precision and keep the unorm values off the halves of rounding.
+        // Multiples of 1/64 are exact in half precision and keep the unorm values off the halves of
+        // rounding.
         let noise = |i: usize| ((i * 7919 + 13) % 97) as f32 / 64.0;
         let planes: Vec<f32> = (0..(BASE_CHANNELS + dim) * pixels).map(noise).collect();
         let transmittance: Vec<f32> = (0..pixels).map(|i| (i % 9) as f32 / 8.0).collect();
@@ -190,13 +194,15 @@ mod tests {
                 let expected = texels_of(&planes, &transmittance, source, encoding);
                 assert_eq!(got.len(), encoding.bytes(source.channels(), pixels), "{source:?} {encoding:?}");
                 if encoding == Encoding::F16x4 && source == FrameChannel::Depth {
-                    // z / alpha is not exact in half precision; rounding directions may differ by one step.
+                    // z / alpha is not exact in half precision; rounding directions may differ by
+                    // one step.
                     for (a, b) in got.chunks(2).zip(expected.chunks(2)) {
                         let step = |v: &[u8]| i32::from(u16::from_le_bytes([v[0], v[1]]));
                         assert!((step(a) - step(b)).abs() <= 1);
                     }
                 } else if source == FrameChannel::Depth && encoding != Encoding::Unorm8x4 {
-                    // Vulkan allows a quotient 2.5 units in the last place; an NVIDIA H200 makes use of it.
+                    // Vulkan allows a quotient 2.5 units in the last place; an NVIDIA H200 makes
+                    // use of it.
                     for (a, b) in got.chunks(4).zip(expected.chunks(4)) {
                         let unit = |v: &[u8]| i64::from(u32::from_le_bytes([v[0], v[1], v[2], v[3]]));
                         assert!((unit(a) - unit(b)).abs() <= 3, "{encoding:?}");

@@ -1,5 +1,5 @@
-//! Slanted-plane multi-view matching on the device. What the shaders compute is written down in the CPU twin,
-//! [`super::plane_sweep_cpu`].
+//! Slanted-plane multi-view matching on the device. What the shaders compute is written down in the
+//! CPU twin, [`super::plane_sweep_cpu`].
 use crate::Result;
 use crate::gpu::shaders::shared::plane_sweep::VIEW_SHARES;
 use crate::gpu::shaders::{plane_sweep, plane_sweep_refine, structs};
@@ -43,8 +43,8 @@ fn to_gpu(view: &SourceView) -> structs::SourceView {
     structs::SourceView { forward, back, centre, intrinsics, size }
 }
 
-/// Matching at one resolution on the device. Where it does not bind the planes of all views at once, those of a reference
-/// and its sources are brought together for every pass.
+/// Matching at one resolution on the device. Where it does not bind the planes of all views at
+/// once, those of a reference and its sources are brought together for every pass.
 pub struct GpuMatcher {
     device: Device,
     sources: Buffer<structs::SourceView>,
@@ -145,7 +145,8 @@ fn pixels_of(r: &ReferenceView) -> usize {
     r.width as usize * r.height as usize
 }
 
-/// Per pixel its own luma and that of the pixels to the right, below and diagonally below, 16 bits each.
+/// Per pixel its own luma and that of the pixels to the right, below and diagonally below, 16 bits
+/// each.
 fn quads(luma: &[f32], references: &[ReferenceView]) -> Vec<[u32; 2]> {
     let word = |a: f32, b: f32| ((b * 65535.0).round() as u32) << 16 | (a * 65535.0).round() as u32;
     let mut out = Vec::with_capacity(luma.len());
@@ -238,7 +239,8 @@ mod tests {
         [ReferenceView { sources: 1, ..view }, ReferenceView { first: width * height, ..view }]
     }
 
-    /// The second view, at `centre` in the camera frame of the first, turned half about y or not at all.
+    /// The second view, at `centre` in the camera frame of the first, turned half about y or not at
+    /// all.
     fn source(reference: &ReferenceView, centre: [f32; 3], turned: bool) -> SourceView {
         let [fx, fy, cx, cy] = reference.intrinsics;
         let sign = if turned { -1.0 } else { 1.0 };
@@ -256,7 +258,8 @@ mod tests {
         }
     }
 
-    /// All planes lie at depths below 1.7, none so oblique that it passes behind a camera at a depth of 8.
+    /// All planes lie at depths below 1.7, none so oblique that it passes behind a camera at a
+    /// depth of 8.
     #[test]
     fn a_photo_that_sees_a_plane_from_behind_does_not_speak_for_it() {
         let views = references(24, 16, 120.0, [0.6, 1.0]);

@@ -1,9 +1,11 @@
-//! CPU twin of the `plane_sweep` and `plane_sweep_refine` shaders: slanted-plane multi-view matching.
+//! CPU twin of the `plane_sweep` and `plane_sweep_refine` shaders: slanted-plane multi-view
+//! matching.
 //!
-//! A hypothesis is the plane `π·X = 1` in the reference camera's frame, so that the inverse depth along a pixel's ray is
-//! `1/z = π·ray` and the warp into a source view is the homography `K_s (R + t πᵀ)`. Matching cost: 1 − bilaterally
-//! weighted ZNCC (Schönberger et al. 2016, eq. 7–8), mixed over the best source views; propagation on a red-black
-//! checkerboard with adaptive candidate areas (Xu and Tao 2019, ACMM, section 3.1).
+//! A hypothesis is the plane `π·X = 1` in the reference camera's frame, so that the inverse depth
+//! along a pixel's ray is `1/z = π·ray` and the warp into a source view is the homography `K_s (R +
+//! t πᵀ)`. Matching cost: 1 − bilaterally weighted ZNCC (Schönberger et al. 2016, eq. 7–8), mixed
+//! over the best source views; propagation on a red-black checkerboard with adaptive candidate
+//! areas (Xu and Tao 2019, ACMM, section 3.1).
 use super::plane_sweep::{MAX_SOURCES, Matcher, ReferenceView, SourceView};
 use crate::Result;
 use crate::gpu::shaders::shared::plane_sweep as shared;
@@ -152,8 +154,8 @@ impl Inputs<'_> {
         (1.0 - covariance / scale).min(COST_LIMIT)
     }
 
-    /// Forward–backward reprojection error of the plane through a source view's present planes, pixels, at most
-    /// [`GEOMETRIC_LIMIT`].
+    /// Forward–backward reprojection error of the plane through a source view's present planes,
+    /// pixels, at most [`GEOMETRIC_LIMIT`].
     fn geometric_error(
         &self,
         planes: &[Vec4],
@@ -183,7 +185,8 @@ impl Inputs<'_> {
         error.length().min(GEOMETRIC_LIMIT)
     }
 
-    /// Aggregated cost of a plane at a pixel: the sorted source costs mixed by [`shared::VIEW_SHARES`].
+    /// Aggregated cost of a plane at a pixel: the sorted source costs mixed by
+    /// [`shared::VIEW_SHARES`].
     pub fn cost(&self, planes: &[Vec4], window: &Window, x: i32, y: i32, ray: Vec3, plane: Vec3) -> f32 {
         let r = &self.reference;
         let mut best = [COST_LIMIT + r.geometric * GEOMETRIC_LIMIT; MAX_SOURCES];
@@ -202,8 +205,8 @@ impl Inputs<'_> {
         (0..MAX_SOURCES).map(|k| shared::VIEW_SHARES[k] as f32 * best[k]).sum()
     }
 
-    /// A plane through `1/z = inverse_depth` at the pixel with a given normal, or None if it is seen too obliquely or
-    /// lies outside the searched range.
+    /// A plane through `1/z = inverse_depth` at the pixel with a given normal, or None if it is
+    /// seen too obliquely or lies outside the searched range.
     pub fn plane(&self, ray: Vec3, normal: Vec3, inverse_depth: f32) -> Option<Vec3> {
         let slope = normal.dot(ray);
         let [near, far] = [self.reference.range[1], self.reference.range[0]];
@@ -218,8 +221,9 @@ impl Inputs<'_> {
         Random(hash(r.seed ^ hash(r.first + y as u32 * r.width + x as u32)))
     }
 
-    /// The initial sweep at one pixel: `planes` inverse depths over the range, jittered, each with a random normal
-    /// (cosine-weighted about the viewing ray). Returns the best plane and its cost.
+    /// The initial sweep at one pixel: `planes` inverse depths over the range, jittered, each with
+    /// a random normal (cosine-weighted about the viewing ray). Returns the best plane and its
+    /// cost.
     pub fn sweep(&self, x: i32, y: i32) -> Vec4 {
         let r = &self.reference;
         let ray = self.ray(x, y);
@@ -279,7 +283,8 @@ impl Inputs<'_> {
             |plane: Vec3| self.cost(planes, &window, x, y, ray, plane) + self.roughness(&near, x, y, plane);
         let mut random = self.random(x, y);
         let current = own[(y as u32 * r.width + x as u32) as usize];
-        // Re-evaluated: after a change of resolution or of the other views its stored cost is stale.
+        // Re-evaluated: after a change of resolution or of the other views its stored cost is
+        // stale.
         let cost = total(current.truncate());
         let mut best = current.truncate().extend(cost);
         for area in 0..8 {
@@ -297,7 +302,8 @@ impl Inputs<'_> {
             let plane = best.truncate();
             let inverse_depth = plane.dot(ray);
             let normal = -plane.normalize();
-            // Log-uniform step lengths replace an annealing schedule: 10 % down to 0.02 % of the depth.
+            // Log-uniform step lengths replace an annealing schedule: 10 % down to 0.02 % of the
+            // depth.
             let depth_step = 0.1 * (-9.0 * random.uniform()).exp2();
             let normal_step = 0.7 * (-5.0 * random.uniform()).exp2();
             let moved = inverse_depth * (1.0 + depth_step * (2.0 * random.uniform() - 1.0));
@@ -321,8 +327,9 @@ impl Inputs<'_> {
         best
     }
 
-    /// The plane with the lowest cost in one of eight areas around a pixel (0–3: a near wedge per direction, 4–7: a
-    /// far strip per direction), all of the other checkerboard colour; None outside the image.
+    /// The plane with the lowest cost in one of eight areas around a pixel (0–3: a near wedge per
+    /// direction, 4–7: a far strip per direction), all of the other checkerboard colour; None
+    /// outside the image.
     pub fn area_best(&self, own: &[Vec4], x: i32, y: i32, area: usize) -> Option<Vec3> {
         let r = &self.reference;
         let (dx, dy) = [(1, 0), (-1, 0), (0, 1), (0, -1)][area % 4];

@@ -1,10 +1,12 @@
-//! Projection of splats to the screen (EWA, Zwicker et al. 2002; Kerbl et al. 2023, docs/internals/method.md#projection).
+//! Projection of splats to the screen (EWA, Zwicker et al. 2002; Kerbl et al. 2023,
+//! docs/internals/method.md#projection).
 //!
-//! Per splat, with R_q of the unit quaternion, s = exp(log scale):
-//! `t = R μ + τ`, `M = R_q diag(s)`, `B = J R M` (2×3), `Σ' = B Bᵀ + 0.3 I`, `(A, B, C) = Σ'⁻¹`,
-//! `u = fx t_x/t_z + cx − ½`, colour = max(0, Σ_k B_k(dir) sh_k + ½), opacity = σ(logit); that of antialiased splats is
-//! multiplied by √(det B Bᵀ / det Σ') (Yu et al. 2024, the 2-D Mip filter).
-//! J is evaluated at t_x/t_z clamped to the image border plus 30 % of the half width, so that splats far outside do not explode.
+//! Per splat, with R_q of the unit quaternion, s = exp(log scale): `t = R μ + τ`, `M = R_q
+//! diag(s)`, `B = J R M` (2×3), `Σ' = B Bᵀ + 0.3 I`, `(A, B, C) = Σ'⁻¹`, `u = fx t_x/t_z + cx − ½`,
+//! colour = max(0, Σ_k B_k(dir) sh_k + ½), opacity = σ(logit); that of antialiased splats is
+//! multiplied by √(det B Bᵀ / det Σ') (Yu et al. 2024, the 2-D Mip filter). J is evaluated at
+//! t_x/t_z clamped to the image border plus 30 % of the half width, so that splats far outside do
+//! not explode.
 use super::frame::FrameBuffers;
 use super::options::FeatureMode;
 use super::params::Params;
@@ -16,8 +18,8 @@ use crate::gpu::{Buffer, Recorder, shaders};
 use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 
-/// Records the projection of all splats, with the first (sh_degree + 1)² coefficients, to `frame.projected`
-/// and `frame.depth_pairs`.
+/// Records the projection of all splats, with the first (sh_degree + 1)² coefficients, to
+/// `frame.projected` and `frame.depth_pairs`.
 pub fn record(
     rec: &mut Recorder,
     splats: &SplatBuffers,
@@ -140,7 +142,8 @@ pub(super) fn geometry(params: &Params, i: usize, view: &View) -> Option<Geometr
     let to_screen = jacobian.map(|row| view.rotation.transpose() * row);
     let b = to_screen.map(|row| (rotation.transpose() * row) * scale);
     let (xx, xy, yy) = (b[0].dot(b[0]), b[0].dot(b[1]), b[1].dot(b[1]));
-    // det(BBᵀ + cI) by Lagrange's identity: no cancellation for needles, where xx·yy − xy² loses every digit.
+    // det(BBᵀ + cI) by Lagrange's identity: no cancellation for needles, where xx·yy − xy² loses
+    // every digit.
     let area = b[0].cross(b[1]).length_squared();
     let det = area + DILATION * (xx + yy) + DILATION * DILATION;
     let conic = [(yy + DILATION) / det, -xy / det, (xx + DILATION) / det];
@@ -163,8 +166,8 @@ pub(super) fn geometry(params: &Params, i: usize, view: &View) -> Option<Geometr
     })
 }
 
-/// Projects splat `i`; `None` when it is behind the near plane or its opacity is below `alpha_min`, where it can
-/// change no pixel.
+/// Projects splat `i`; `None` when it is behind the near plane or its opacity is below `alpha_min`,
+/// where it can change no pixel.
 pub fn twin(params: &Params, i: usize, view: &View, alpha_min: f64) -> Option<Projected> {
     let g = geometry(params, i, view)?;
     let own = 1.0 / (1.0 + (-params.opacity_logits[i]).exp());

@@ -1,10 +1,10 @@
 //! Gradients of the raw parameters and of the camera from those of the screen-space splats
 //! (docs/internals/method.md#backward-rasterisation).
 //!
-//! With Q the conic matrix and G_M = [[∂A, ½∂B], [½∂B, ∂C]]: `G' = −Q G_M Q`, `∂B = 2 G' B` (2×3), `∂M = Tᵀ ∂B`,
-//! `∂J = ∂B Mᵀ Rᵀ`, `∂R_cov Rᵀ = Jᵀ ∂J`. From there means, log scales, raw quaternion (through its
-//! normalisation), opacity logit, SH coefficients, and the left pose twist ξ = (ρ, θ), T_cw ← exp(ξ) T_cw:
-//! `∂ρ = Σ ∂t + R g_sh`, `∂θ = Σ t × ∂t + vee(Jᵀ∂J)`.
+//! With Q the conic matrix and G_M = [[∂A, ½∂B], [½∂B, ∂C]]: `G' = −Q G_M Q`, `∂B = 2 G' B` (2×3),
+//! `∂M = Tᵀ ∂B`, `∂J = ∂B Mᵀ Rᵀ`, `∂R_cov Rᵀ = Jᵀ ∂J`. From there means, log scales, raw quaternion
+//! (through its normalisation), opacity logit, SH coefficients, and the left pose twist ξ = (ρ, θ),
+//! T_cw ← exp(ξ) T_cw: `∂ρ = Σ ∂t + R g_sh`, `∂θ = Σ t × ∂t + vee(Jᵀ∂J)`.
 use super::frame::{CAMERA_GRADIENTS, FrameBuffers};
 use super::options::FeatureMode;
 use super::params::{Gradients, Params};
@@ -17,15 +17,15 @@ use crate::gpu::{Buffer, Device, Recorder, shaders};
 use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 
-/// Workgroups that share the splats, each of which leaves a part of the camera gradient: as many as fill a large GPU (a hundred
-/// thousand threads), or as a few cores begin quickly.
+/// Workgroups that share the splats, each of which leaves a part of the camera gradient: as many as
+/// fill a large GPU (a hundred thousand threads), or as a few cores begin quickly.
 pub(super) fn groups(device: &Device, splats: usize) -> u32 {
     let most = if device.info().is_cpu { 64 } else { 2048 };
     splats.div_ceil(shaders::project_backward::WORKGROUP[0] as usize).clamp(1, most) as u32
 }
 
-/// Records the gradients by all raw parameters (overwritten in `gradients`, zero where a splat was not seen) and by
-/// the camera (`camera_grad` [10]: ρ, θ, fx, fy, cx, cy).
+/// Records the gradients by all raw parameters (overwritten in `gradients`, zero where a splat was
+/// not seen) and by the camera (`camera_grad` [10]: ρ, θ, fx, fy, cx, cy).
 pub fn record(
     rec: &mut Recorder,
     splats: &SplatBuffers,
@@ -218,7 +218,8 @@ fn shape_backward(g: &Geometry, by_m: DMat3, i: usize, out: &mut Gradients) {
     out.params.quats[i] += (by_unit - g.quat * g.quat.dot(by_unit)) / g.quat_length;
 }
 
-/// ∂RGB → SH coefficients; returns what reaches the mean through the viewing direction (world axes).
+/// ∂RGB → SH coefficients; returns what reaches the mean through the viewing direction (world
+/// axes).
 fn colour_backward(
     params: &Params,
     i: usize,

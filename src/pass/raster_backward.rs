@@ -1,13 +1,15 @@
-//! Gradients of the blended image by every screen-space splat (docs/internals/method.md#backward-rasterisation).
+//! Gradients of the blended image by every screen-space splat
+//! (docs/internals/method.md#backward-rasterisation).
 //!
-//! Upstream planes [(4 + d) + 1, H, W]: ∂L/∂(RGB on background), ∂L/∂Σwz, ∂L/∂features, ∂L/∂alpha (alpha = 1 − T_f).
-//! For a contributor with w = αT, own = c·g: `∂c += w g`, `∂α = T own − (S − g_A T_f)/(1 − α)` with S the
-//! weighted upstream sum of everything behind it, background included. The pass walks front to back and gets S as
-//! (pixel total) − (what it has already passed), so that T needs no division and no list of contributors.
+//! Upstream planes [(4 + d) + 1, H, W]: ∂L/∂(RGB on background), ∂L/∂Σwz, ∂L/∂features, ∂L/∂alpha
+//! (alpha = 1 − T_f). For a contributor with w = αT, own = c·g: `∂c += w g`, `∂α = T own − (S − g_A
+//! T_f)/(1 − α)` with S the weighted upstream sum of everything behind it, background included. The
+//! pass walks front to back and gets S as (pixel total) − (what it has already passed), so that T
+//! needs no division and no list of contributors.
 //!
-//! With σ = ∂α · α (0 where α was clamped), the shader only sums six moments: Σσ, Σσdx, Σσdy, Σσdx², Σσdxdy, Σσdy².
-//! Every geometry gradient follows per splat: ∂o = m₀/o, ∂(u, v) = −(A m₁ + B m₂, C m₂ + B m₁),
-//! ∂(A, B, C) = (−½ m₃, −m₄, −½ m₅).
+//! With σ = ∂α · α (0 where α was clamped), the shader only sums six moments: Σσ, Σσdx, Σσdy,
+//! Σσdx², Σσdxdy, Σσdy². Every geometry gradient follows per splat: ∂o = m₀/o, ∂(u, v) = −(A m₁ + B
+//! m₂, C m₂ + B m₁), ∂(A, B, C) = (−½ m₃, −m₄, −½ m₅).
 use super::adam::rows_of_groups;
 use super::channels::{BASE_CHANNELS, Block, blocks};
 use super::frame::{EntryBuffers, FrameBuffers, GRADIENT_FLOATS, Summation, Tiles};
@@ -24,10 +26,11 @@ pub(super) fn record_clear(rec: &mut Recorder, frame: &FrameBuffers) {
     }
 }
 
-/// Records the way from `frame.planes_grad` to `frame.projected_grad` and `frame.codes_grad` of `count` splats, for some
-/// rows of tiles, whose lists are there. Adds to what [`record_clear`] cleared; where these are `all` tiles of the image,
-/// sums by entries need no clearing. `features_move_geometry` = false keeps the features' part of the loss away from
-/// everything but the features.
+/// Records the way from `frame.planes_grad` to `frame.projected_grad` and `frame.codes_grad` of
+/// `count` splats, for some rows of tiles, whose lists are there. Adds to what [`record_clear`]
+/// cleared; where these are `all` tiles of the image, sums by entries need no clearing.
+/// `features_move_geometry` = false keeps the features' part of the loss away from everything but
+/// the features.
 pub(super) fn record(
     rec: &mut Recorder,
     frame: &FrameBuffers,
@@ -52,7 +55,8 @@ pub(super) fn record(
                 for block in blocks {
                     record_entries(rec, frame, tiles, &entries, block, coupling);
                     if block.features > 0 {
-                        // No more vectors than there are: behind a splat's last one the next splat begins.
+                        // No more vectors than there are: behind a splat's last one the next splat
+                        // begins.
                         let columns = Columns {
                             width: block.vectors(),
                             vectors: block.features.div_ceil(4),
@@ -131,7 +135,8 @@ struct Columns {
     first_vector: u32,
 }
 
-/// The sums of `from` [entries, width] per splat, written or `add`ed to columns of `to` [N, stride].
+/// The sums of `from` [entries, width] per splat, written or `add`ed to columns of `to` [N,
+/// stride].
 fn record_sum(
     rec: &mut Recorder,
     frame: &FrameBuffers,

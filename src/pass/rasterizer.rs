@@ -1,4 +1,5 @@
-//! The training-facing render: parameters and gradients in GPU buffers, forward and backward as recorded commands.
+//! The training-facing render: parameters and gradients in GPU buffers, forward and backward as
+//! recorded commands.
 //!
 //! ```no_run
 //! # use splatvk::{gpu::{self, Recorder}, pass::rasterizer::*, pass::view::View, scene::{Camera, Splats}};
@@ -22,17 +23,19 @@
 //! ```
 //!
 //! A whole step may also be one [`crate::gpu::Program`]: [`Rasterizer::record_forward`], loss,
-//! [`Rasterizer::record_backward`], optimiser. It can be run again for other views after [`Rasterizer::set_view`].
-//! Then check [`Rasterizer::overflow`] after each run: if the lists did not fit, that step saw an image without any
-//! splats; call [`Rasterizer::grow`], record again and repeat the step (an optimiser pass can read
-//! `frame().status[1]` on the GPU and do nothing when it is not 0).
+//! [`Rasterizer::record_backward`], optimiser. It can be run again for other views after
+//! [`Rasterizer::set_view`]. Then check [`Rasterizer::overflow`] after each run: if the lists did
+//! not fit, that step saw an image without any splats; call [`Rasterizer::grow`], record again and
+//! repeat the step (an optimiser pass can read `frame().status[1]` on the GPU and do nothing when
+//! it is not 0).
 //!
-//! Recordings hold the buffers they were made with: record again after `grow`, after changing the number of splats,
-//! the SH degree or the options.
+//! Recordings hold the buffers they were made with: record again after `grow`, after changing the
+//! number of splats, the SH degree or the options.
 //!
-//! An image that is too large for the device is rendered in bands ([`super::bands`]), one after the other in the same
-//! planes: [`Rasterizer::record_projection`], then for every band [`Rasterizer::record_band`], loss,
-//! [`Rasterizer::record_band_backward`], and at the end [`Rasterizer::record_gradients`]. An image that fits is one band.
+//! An image that is too large for the device is rendered in bands ([`super::bands`]), one after the
+//! other in the same planes: [`Rasterizer::record_projection`], then for every band
+//! [`Rasterizer::record_band`], loss, [`Rasterizer::record_band_backward`], and at the end
+//! [`Rasterizer::record_gradients`]. An image that fits is one band.
 use super::bands::{Band, Bands};
 use super::channels::BASE_CHANNELS;
 use super::frame::{
@@ -67,7 +70,8 @@ impl DeviceChoices {
     }
 }
 
-/// Entries that the device takes at once, with the gradients that some ways of adding up keep for each.
+/// Entries that the device takes at once, with the gradients that some ways of adding up keep for
+/// each.
 fn most_entries(
     device: &Device,
     (grouping, tiles): (Grouping, usize),
@@ -96,7 +100,8 @@ pub struct Rasterizer {
 }
 
 impl Rasterizer {
-    /// Room for `capacity` splats with `feature_dim` features (0, or as the splats have), images of width × height.
+    /// Room for `capacity` splats with `feature_dim` features (0, or as the splats have), images of
+    /// width × height.
     pub fn new(
         device: &Device,
         capacity: usize,
@@ -125,7 +130,8 @@ impl Rasterizer {
         let tiles = width.div_ceil(TILE) as usize * strip as usize;
         let splats = capacity.max(1);
         let stride = feature_dim.next_multiple_of(4);
-        // About five entries per splat on the seeded scene; `forward` grows the list if that is too few.
+        // About five entries per splat on the seeded scene; `forward` grows the list if that is too
+        // few.
         let most = most_entries(device, (ways.grouping, tiles), ways.summation, feature_dim);
         let entries = (8 * splats + 4 * tiles).min(most);
         let frame = FrameBuffers {
@@ -194,8 +200,9 @@ impl Rasterizer {
         self.record_band(rec, params, &self.frame.bands.get(0));
     }
 
-    /// Records the way back from `frame().planes_grad` to `gradients` (overwritten; zero for unseen splats) and
-    /// `frame().camera_grad`. Needs the results of a forward pass with the same parameters, view and options.
+    /// Records the way back from `frame().planes_grad` to `gradients` (overwritten; zero for unseen
+    /// splats) and `frame().camera_grad`. Needs the results of a forward pass with the same
+    /// parameters, view and options.
     pub fn record_backward(
         &self,
         rec: &mut Recorder,
@@ -222,7 +229,8 @@ impl Rasterizer {
         project::record(rec, params, &self.camera, &self.frame, sh_degree);
         project::record_features(rec, params, &self.frame, options.feature_mode);
         rec.pass("depth sort");
-        // Keys are the bits of camera z. The sort is stable, so equal depths keep the order of the splats.
+        // Keys are the bits of camera z. The sort is stable, so equal depths keep the order of the
+        // splats.
         rec.fill(&self.count, params.count as u32);
         self.sort.record(rec, &self.frame.depth_pairs, &self.count, 32);
     }
@@ -236,8 +244,8 @@ impl Rasterizer {
         }
     }
 
-    /// Records the way back from `frame().planes_grad` of the band that was blended last to the splats on the screen: the
-    /// first band overwrites, the others add.
+    /// Records the way back from `frame().planes_grad` of the band that was blended last to the
+    /// splats on the screen: the first band overwrites, the others add.
     pub fn record_band_backward(
         &self,
         rec: &mut Recorder,
@@ -253,7 +261,8 @@ impl Rasterizer {
         }
         let inner = self.strips(band, band.inner.clone());
         let strips = match listed.as_slice() {
-            // The lists are still there. Sums by entries read every entry, so that the halo writes its zeros.
+            // The lists are still there. Sums by entries read every entry, so that the halo writes
+            // its zeros.
             [one] if self.frame.summation == Summation::Entries => vec![one.clone()],
             [one] => {
                 let rows = inner.first().map_or(0, |t| t.rows.start)..inner.last().map_or(0, |t| t.rows.end);
@@ -271,8 +280,8 @@ impl Rasterizer {
         }
     }
 
-    /// Records the rest of the way, from the splats on the screen to `gradients` (overwritten; zero for unseen splats) and
-    /// `frame().camera_grad`.
+    /// Records the rest of the way, from the splats on the screen to `gradients` (overwritten; zero
+    /// for unseen splats) and `frame().camera_grad`.
     pub fn record_gradients(
         &self,
         rec: &mut Recorder,
@@ -305,7 +314,8 @@ impl Rasterizer {
             .collect()
     }
 
-    /// Runs the forward pass of an image that is one band; grows the tile lists and repeats when they were too short.
+    /// Runs the forward pass of an image that is one band; grows the tile lists and repeats when
+    /// they were too short.
     pub fn forward(&mut self, params: &SplatBuffers, options: &RasterOptions) -> Result<()> {
         let bands = self.frame.bands.count();
         if bands > 1 {
@@ -315,7 +325,8 @@ impl Rasterizer {
         self.forward_bands(params, options, |_, _| Ok(()))
     }
 
-    /// Runs the forward pass band by band, and shows every band; grows the tile lists when they were too short.
+    /// Runs the forward pass band by band, and shows every band; grows the tile lists when they
+    /// were too short.
     pub fn forward_bands(
         &mut self,
         params: &SplatBuffers,
@@ -353,8 +364,9 @@ impl Rasterizer {
         }
     }
 
-    /// Entries that a frame needed since the last [`Rasterizer::grow`], if they did not fit; `None` when all was well.
-    /// An error where a tile has more splats than the device goes through: it would leave out the farthest of them.
+    /// Entries that a frame needed since the last [`Rasterizer::grow`], if they did not fit; `None`
+    /// when all was well. An error where a tile has more splats than the device goes through: it
+    /// would leave out the farthest of them.
     pub fn overflow(&self) -> Result<Option<usize>> {
         let status = self.frame.status.read()?;
         let (needed, longest) = (status[1] as usize, status[2]);
@@ -369,8 +381,9 @@ impl Rasterizer {
         Ok((needed > 0).then_some(needed))
     }
 
-    /// Makes room for tile lists of `needed` entries and a quarter more, or lists fewer rows of tiles at once where the
-    /// device binds no longer lists. Earlier recordings must not be run again.
+    /// Makes room for tile lists of `needed` entries and a quarter more, or lists fewer rows of
+    /// tiles at once where the device binds no longer lists. Earlier recordings must not be run
+    /// again.
     pub fn grow(&mut self, needed: usize) -> Result<()> {
         let tiles = self.frame.tiles()[0] as usize * (self.frame.bands.rows as u32).div_ceil(TILE) as usize;
         let lists = (self.grouping, tiles);
@@ -392,7 +405,8 @@ impl Rasterizer {
         Ok(self.frame.status.write(&[0; 3])?)
     }
 
-    /// The tile lists of the last forward pass, row by row of tiles, nearest splat first. For tests and statistics.
+    /// The tile lists of the last forward pass, row by row of tiles, nearest splat first. For tests
+    /// and statistics.
     pub fn tile_lists(&self) -> Result<Vec<Vec<u32>>> {
         let ranges = self.frame.lists.ranges.read()?;
         let splats = self.frame.lists.splats.read()?;

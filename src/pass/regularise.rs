@@ -1,9 +1,11 @@
-//! Regularisers of the RGB stage (docs/internals/method.md#regularisers): depth near the stereo depth, and no needles.
+//! Regularisers of the RGB stage (docs/internals/method.md#regularisers): depth near the stereo
+//! depth, and no needles.
 use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 
-/// Records `weight · Σ |D − A·d|/d` over pixels with reference depth d > 0, as gradients by D = Σwz and A; without a
-/// reference both gradients become zero. Weight: divide by the number of pixels for a mean.
+/// Records `weight · Σ |D − A·d|/d` over pixels with reference depth d > 0, as gradients by D = Σwz
+/// and A; without a reference both gradients become zero. Weight: divide by the number of pixels
+/// for a mean.
 pub fn record_depth(rec: &mut Recorder, frame: &FrameBuffers, reference: Option<&Buffer<f32>>, weight: f64) {
     rec.pass("regularisers");
     let pixels = frame.pixels();
@@ -42,7 +44,8 @@ pub fn depth_l1(depth: &[f64], alpha: &[f64], reference: &[f64], weight: f64) ->
     (loss, gradient)
 }
 
-/// Adds the gradient of `weight · Σ |A − a|` by A, over pixels with a wanted alpha a ≥ 0, to what [`record_depth`] left.
+/// Adds the gradient of `weight · Σ |A − a|` by A, over pixels with a wanted alpha a ≥ 0, to what
+/// [`record_depth`] left.
 pub fn record_alpha(rec: &mut Recorder, frame: &FrameBuffers, wanted: &Buffer<f32>, weight: f64) {
     rec.pass("regularisers");
     let pixels = frame.pixels();

@@ -42,8 +42,9 @@ pub struct Renderer {
 }
 
 impl Renderer {
-    /// Uploads splats and their raw features [N, d] (empty and 0 for none). All SH coefficients are used; the near
-    /// plane is a hundredth of the median depth that the first rendered camera sees, unless [`Renderer::with_near`].
+    /// Uploads splats and their raw features [N, d] (empty and 0 for none). All SH coefficients are
+    /// used; the near plane is a hundredth of the median depth that the first rendered camera sees,
+    /// unless [`Renderer::with_near`].
     pub fn new(device: &Device, splats: &Splats, features: &[f32], feature_dim: usize) -> Result<Renderer> {
         let buffers = SplatBuffers::upload(device, splats, features, feature_dim)?;
         Ok(Renderer::from_buffers(device, buffers))
@@ -117,7 +118,8 @@ impl Renderer {
         rasterizer.forward_bands(splats, &options, seen)
     }
 
-    /// [N] pixels of a view that each splat shows: its blending weight summed over them, 0 for what is hidden or outside.
+    /// [N] pixels of a view that each splat shows: its blending weight summed over them, 0 for what
+    /// is hidden or outside.
     ///
     /// `∂/∂c_i Σ_px C(px) = Σ_px w_i(px)`: the way back of a loss that adds up one colour.
     pub fn weights(&mut self, camera: &Camera) -> Result<Vec<f32>> {
@@ -200,16 +202,16 @@ impl RenderedFrame {
         let plane = |k: usize| k * stride + stored.start..k * stride + stored.end;
         for channel in 0..3 {
             let rgb = &mut self.rgb.data[inner.clone()];
-            frame.planes.show(plane(channel), &mut |at, values| {
+            frame.planes.read_with(plane(channel), &mut |at, values| {
                 rgb[at..].iter_mut().zip(values).for_each(|(out, v)| out[channel] = *v);
             })?;
         }
         let alpha = &mut self.alpha.data[inner.clone()];
-        frame.transmittance.show(stored.clone(), &mut |at, values| {
+        frame.transmittance.read_with(stored.clone(), &mut |at, values| {
             alpha[at..].iter_mut().zip(values).for_each(|(alpha, t)| *alpha = 1.0 - t);
         })?;
         let depth = &mut self.depth.data[inner];
-        frame.planes.show(plane(3), &mut |at, values| {
+        frame.planes.read_with(plane(3), &mut |at, values| {
             let outputs = depth[at..].iter_mut().zip(&alpha[at..]);
             for ((depth, alpha), z) in outputs.zip(values) {
                 *depth = if *alpha >= DEPTH_ALPHA_MIN { z / *alpha } else { 0.0 };
@@ -218,7 +220,8 @@ impl RenderedFrame {
         Ok(())
     }
 
-    /// Copies feature channels of a band, from number `first` on, to the channels `into` of this frame.
+    /// Copies feature channels of a band, from number `first` on, to the channels `into` of this
+    /// frame.
     pub fn read_features(
         &mut self,
         frame: &FrameBuffers,
@@ -230,7 +233,7 @@ impl RenderedFrame {
         for (k, to) in into.enumerate() {
             let at = (BASE_CHANNELS + first + k) * frame.bands.pixels();
             let (dim, features) = (self.feature_dim, &mut self.features[inner.start * self.feature_dim..]);
-            frame.planes.show(at + stored.start..at + stored.end, &mut |first, values| {
+            frame.planes.read_with(at + stored.start..at + stored.end, &mut |first, values| {
                 let pixels = features[first * dim..].chunks_exact_mut(dim);
                 pixels.zip(values).for_each(|(out, v)| out[to] = *v);
             })?;

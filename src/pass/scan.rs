@@ -11,14 +11,15 @@ pub struct Scan {
 impl Scan {
     /// Allocates one word per lane.
     pub fn new(device: &Device) -> Result<Scan> {
-        // Each lane walks a contiguous chunk twice. Step 2 is one workgroup of 256 threads, so 256 lanes keep it short on
-        // the CPU, while a GPU needs thousands of threads to be busy.
+        // Each lane walks a contiguous chunk twice. Step 2 is one workgroup of 256 threads, so 256
+        // lanes keep it short on the CPU, while a GPU needs thousands of threads to be busy.
         let lanes = if device.info().is_cpu { 256 } else { 16384 };
         Ok(Scan { sums: device.buffer::<u32>("scan sums", lanes as usize)?, lanes })
     }
 
-    /// `starts[i] = values[0] + .. + values[i - 1]` for the first `count[0]` elements, and `total[0]` the sum of them all.
-    /// `values` and `starts` are different buffers. Twin: [`exclusive_scan`].
+    /// `starts[i] = values[0] + .. + values[i - 1]` for the first `count[0]` elements, and
+    /// `total[0]` the sum of them all. `values` and `starts` are different buffers. Twin:
+    /// [`exclusive_scan`].
     pub fn record(
         &self,
         rec: &mut Recorder,

@@ -1,11 +1,13 @@
-//! Stable least-significant-digit radix sort of (key, value) pairs of `u32`, eight bits at a time, in two shapes.
+//! Stable least-significant-digit radix sort of (key, value) pairs of `u32`, eight bits at a time,
+//! in two shapes.
 //!
-//! [`Shape::Chunks`] gives every lane one contiguous chunk: count digits, turn the counts into places, move. Measured on
-//! lavapipe (Mesa 22.3.6, two cores): 100k pairs by 32 bits in about 3 ms, where a classic 256-thread 4-bit sort takes 180.
-//! [`Shape::Sweep`] is for GPUs, after Adinets & Merrill, "Onesweep" (2022): digits of all passes are counted at
-//! once, then each pass reads and writes every pair once, neighbours beside neighbours; tiles learn where their digits
-//! begin from the tiles before them while those run, or count for themselves where those do not go on. Both are correct on any
-//! device and any subgroup size.
+//! [`Shape::Chunks`] gives every lane one contiguous chunk: count digits, turn the counts into
+//! places, move. Measured on lavapipe (Mesa 22.3.6, two cores): 100k pairs by 32 bits in about 3
+//! ms, where a classic 256-thread 4-bit sort takes 180. [`Shape::Sweep`] is for GPUs, after Adinets
+//! & Merrill, "Onesweep" (2022): digits of all passes are counted at once, then each pass reads and
+//! writes every pair once, neighbours beside neighbours; tiles learn where their digits begin from
+//! the tiles before them while those run, or count for themselves where those do not go on. Both
+//! are correct on any device and any subgroup size.
 use super::adam::rows_of_groups;
 use crate::Result;
 use crate::gpu::{Buffer, Device, LOOP_ROUNDS, Recorder, shaders};
@@ -72,7 +74,8 @@ impl Sort {
     pub fn with(device: &Device, capacity: usize, shape: Shape) -> Result<Sort> {
         let work = match shape {
             Shape::Chunks => {
-                // 256 measured best on lavapipe for 100k to 1M pairs; the chunks of more would be too long for its loops.
+                // 256 measured best on lavapipe for 100k to 1M pairs; the chunks of more would be
+                // too long for its loops.
                 let lanes = capacity.div_ceil(LOOP_ROUNDS / 2).next_multiple_of(256).max(256);
                 Work::Chunks {
                     histogram: device.buffer::<u32>("sort histogram", 256 * lanes)?,
@@ -87,9 +90,9 @@ impl Sort {
         Ok(Sort { scratch: device.buffer::<u32>("sort scratch", 2 * capacity)?, work })
     }
 
-    /// Sorts the first `count[0]` elements of `pairs` (`[N]` of (key, value)) by the lowest `bits` bits of the key,
-    /// keeping the order of equal keys; what lies behind them is undefined afterwards. `count` is read on the device.
-    /// Twin: [`sort_pairs`].
+    /// Sorts the first `count[0]` elements of `pairs` (`[N]` of (key, value)) by the lowest `bits`
+    /// bits of the key, keeping the order of equal keys; what lies behind them is undefined
+    /// afterwards. `count` is read on the device. Twin: [`sort_pairs`].
     pub fn record(&self, rec: &mut Recorder, pairs: &Buffer<u32>, count: &Buffer<u32>, bits: u32) {
         if pairs.bytes() > self.scratch.bytes() {
             rec.fail(format!("sort: `{}` has more pairs than the capacity of the sort", pairs.name()));

@@ -1,11 +1,12 @@
-//! The image loss `w₁·mean|x−y| + w₂·(1 − mean SSIM(x,y))` and its gradient with respect to the rendered image x.
+//! The image loss `w₁·mean|x−y| + w₂·(1 − mean SSIM(x,y))` and its gradient with respect to the
+//! rendered image x.
 //!
-//! SSIM as 3D Gaussian splatting uses it (Wang et al. 2004; Kerbl et al. 2023): 11×11 Gaussian window, σ = 1.5,
-//! normalised, zero padding, per channel, C1 = 1e-4, C2 = 9e-4, mean over all pixels and channels.
-//! Where pixels have weights w, x is replaced by `y + w·(x − y)`: a pixel that does not count looks as it should in the windows of its
-//! neighbours, and the means are over the weights.
-//! With ∗ the (symmetric) window and S = A1·A2/(B1·B2), the derivative is three more blurs:
-//! `∂/∂x = ∗(∂S/∂μx) + 2x·∗(∂S/∂E[x²]) + y·∗(∂S/∂E[xy])`.
+//! SSIM as 3D Gaussian splatting uses it (Wang et al. 2004; Kerbl et al. 2023): 11×11 Gaussian
+//! window, σ = 1.5, normalised, zero padding, per channel, C1 = 1e-4, C2 = 9e-4, mean over all
+//! pixels and channels. Where pixels have weights w, x is replaced by `y + w·(x − y)`: a pixel that
+//! does not count looks as it should in the windows of its neighbours, and the means are over the
+//! weights. With ∗ the (symmetric) window and S = A1·A2/(B1·B2), the derivative is three more
+//! blurs: `∂/∂x = ∗(∂S/∂μx) + 2x·∗(∂S/∂E[x²]) + y·∗(∂S/∂E[xy])`.
 use super::bands::{Band, Bands};
 use super::sum;
 use crate::Result;
@@ -67,7 +68,8 @@ fn blur(plane: &[f64], width: usize, height: usize) -> Vec<f64> {
     out
 }
 
-/// The CPU twin, in f64: loss parts and gradient of [`ImageLoss::total`] for planar `[C, H, W]` images.
+/// The CPU twin, in f64: loss parts and gradient of [`ImageLoss::total`] for planar `[C, H, W]`
+/// images.
 pub fn ssim_l1(
     rendered: &[f64],
     target: &[f64],
@@ -161,7 +163,8 @@ impl Rows {
     }
 }
 
-/// The GPU pass for one image size: scratch memory, reused for every view of that size and all its bands.
+/// The GPU pass for one image size: scratch memory, reused for every view of that size and all its
+/// bands.
 pub struct SsimL1 {
     bands: Bands,
     rows: Rows,
@@ -198,10 +201,10 @@ impl SsimL1 {
         })
     }
 
-    /// Records the pass for a band. `rendered` and `gradient` are planar `[≥3, rows, W]` stacks whose first three planes
-    /// count, `target` `[3, rows, W]`; with `covered`, the sum of the weights of the whole image, `[4, rows, W]`, the last the weights
-    /// of the pixels. Afterwards `loss[slot]` is Σ|x−y| and `loss[slot+1]` ΣSSIM of the band: see
-    /// [`SsimL1::loss`].
+    /// Records the pass for a band. `rendered` and `gradient` are planar `[≥3, rows, W]` stacks
+    /// whose first three planes count, `target` `[3, rows, W]`; with `covered`, the sum of the
+    /// weights of the whole image, `[4, rows, W]`, the last the weights of the pixels. Afterwards
+    /// `loss[slot]` is Σ|x−y| and `loss[slot+1]` ΣSSIM of the band: see [`SsimL1::loss`].
     pub fn record(
         &self,
         rec: &mut Recorder,
@@ -365,7 +368,8 @@ mod tests {
     #[test]
     fn gpu_equals_the_twin_on_odd_sizes() {
         let device = crate::gpu::test_device();
-        // Neither side is a multiple of a strip or workgroup; the second is smaller than one strip and window.
+        // Neither side is a multiple of a strip or workgroup; the second is smaller than one strip
+        // and window.
         let sizes = [(75, 53), (13, 7), (130, 33)];
         let cases = sizes.into_iter().flat_map(|s| [(s, Rows::Strips), (s, Rows::Shared)]);
         for ((w, h), rows, weighted) in cases.flat_map(|(s, r)| [(s, r, false), (s, r, true)]) {

@@ -39,7 +39,8 @@ fn device_and_twin_choose_the_same_planes() {
         let gpu = GpuMatcher::new(&device, &level.luma, &level.references, &level.sources, start).unwrap();
         (gpu, CpuMatcher::new(level.luma.clone(), level.sources.clone(), start.to_vec()))
     };
-    // Rounding (exp, sqrt, order of sums) differs, so near ties may fall either way; anything else is a bug.
+    // Rounding (exp, sqrt, order of sums) differs, so near ties may fall either way; anything else
+    // is a bug.
     let compare = |a: &[Vec4], b: &[Vec4]| {
         let same: Vec<usize> = (0..a.len())
             .filter(|&k| (a[k].truncate() - b[k].truncate()).length() < 1e-4 * a[k].truncate().length())
@@ -104,7 +105,8 @@ fn two_slanted_planes_are_recovered_and_runs_repeat() {
     assert!(run() == (depths, points), "same input and seed, different output");
 }
 
-/// Little parallax and sensor noise: 1.5 px of mismatch are 3 % of the depth, and noise is a tenth of the contrast.
+/// Little parallax and sensor noise: 1.5 px of mismatch are 3 % of the depth, and noise is a tenth
+/// of the contrast.
 #[test]
 fn noisy_photos_with_little_parallax_give_a_surface() {
     let device = test_device();

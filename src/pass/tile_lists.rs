@@ -5,7 +5,8 @@ use crate::Result;
 use crate::gpu::{Buffer, Device, LOOP_ROUNDS, shaders};
 use crate::pass::KernelVariant;
 
-/// Tile edge, pixels. 8 evaluates 2.9 times the pairs it blends, 16 six times (measured on the seeded scene).
+/// Tile edge, pixels. 8 evaluates 2.9 times the pairs it blends, 16 six times (measured on the
+/// seeded scene).
 pub const TILE: u32 = shaders::shared::layout::TILE as u32;
 
 /// How entries in splat order become lists per tile.
@@ -56,11 +57,12 @@ pub(super) enum Group {
 /// Lanes that write entries before a sort, and that read them behind it: enough to fill any GPU.
 pub(super) const SORTING_LANES: u32 = 1 << 16;
 
-/// Most entries of a lane of [`Grouping::Counting`]: one that writes entries also passes rows and splats without any.
+/// Most entries of a lane of [`Grouping::Counting`]: one that writes entries also passes rows and
+/// splats without any.
 const SHARE: usize = LOOP_ROUNDS / 2;
 
-/// Longest list of a tile that goes into [`LOOP_ROUNDS`]: a round for each splat and, at subgroups of four, up to half as many for
-/// groups of them.
+/// Longest list of a tile that goes into [`LOOP_ROUNDS`]: a round for each splat and, at subgroups
+/// of four, up to half as many for groups of them.
 pub(super) const LONGEST_LIST: u32 = 40_000;
 
 impl TileLists {
@@ -97,12 +99,14 @@ impl TileLists {
     }
 }
 
-/// Few lanes keep a CPU device busy, and more only add counters to clear and scan, until each has its [`SHARE`].
+/// Few lanes keep a CPU device busy, and more only add counters to clear and scan, until each has
+/// its [`SHARE`].
 fn counting_lanes(tiles: usize, capacity: usize, binding: u64) -> u32 {
     capacity.div_ceil(SHARE).max(64).min(most_lanes(tiles, binding)) as u32 / 8 * 8
 }
 
-/// The number of lanes is bounded by memory: 16 M counters are 64 MiB, half of the smallest buffer limit that Vulkan allows.
+/// The number of lanes is bounded by memory: 16 M counters are 64 MiB, half of the smallest buffer
+/// limit that Vulkan allows.
 fn most_lanes(tiles: usize, binding: u64) -> usize {
     let counters = (binding / 4).min(1 << 24) as usize;
     (counters / tiles.max(1)).max(8) / 8 * 8

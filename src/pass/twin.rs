@@ -1,5 +1,5 @@
-//! f64 twins of the whole render: raw parameters in, images out, and back. What the GPU passes are tested
-//! against, composed of the twins that stand beside each pass.
+//! f64 twins of the whole render: raw parameters in, images out, and back. What the GPU passes are
+//! tested against, composed of the twins that stand beside each pass.
 use super::options::FeatureMode;
 use super::params::{Gradients, Params};
 use super::project::{self, Projected};
@@ -26,8 +26,8 @@ pub fn forward(params: &Params, view: &View, mode: FeatureMode, cutoffs: &Cutoff
     forward_in_order(params, view, mode, cutoffs, None)
 }
 
-/// Renders in f64, in a given depth order instead of the true one: finite differences must not see two splats
-/// change places, which is a jump of the image.
+/// Renders in f64, in a given depth order instead of the true one: finite differences must not see
+/// two splats change places, which is a jump of the image.
 pub fn forward_in_order(
     params: &Params,
     view: &View,

@@ -1,4 +1,5 @@
-//! Central differences of the twin itself: the analytic backward is right before any shader is compared with it.
+//! Central differences of the twin itself: the analytic backward is right before any shader is
+//! compared with it.
 use super::options::FeatureMode;
 use super::params::Params;
 use super::raster_forward::Cutoffs;
@@ -168,8 +169,8 @@ fn gauge_jacobian_at_zero_features_is_one_over_epsilon() {
     }
 }
 
-/// Moving the world and the camera together changes nothing, so the pose gradient equals minus what the same
-/// motion does to the splats: Σ_i ∂μ_i must be −Rᵀ∂ρ.
+/// Moving the world and the camera together changes nothing, so the pose gradient equals minus what
+/// the same motion does to the splats: Σ_i ∂μ_i must be −Rᵀ∂ρ.
 #[test]
 fn common_translation_is_a_gauge() {
     let s = scene(50, 3, 0, 11);

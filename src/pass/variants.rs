@@ -6,8 +6,9 @@ use crate::gpu::{DeviceInfo, NATIVE_FLOAT_ATOMICS};
 pub enum KernelVariant {
     /// Gradients added up by `atomicAdd` on float, where the device has it.
     FloatAtomics,
-    /// Gradients of several tiles added up by atomics ([`crate::pass::Summation::Atomics`]), of which floats are emulated by a
-    /// compare-and-swap loop where there are none or they are switched off.
+    /// Gradients of several tiles added up by atomics ([`crate::pass::Summation::Atomics`]), of
+    /// which floats are emulated by a compare-and-swap loop where there are none or they are
+    /// switched off.
     AtomicGradients,
     /// Gradients stored per tile and summed in order ([`crate::pass::Summation::Entries`]).
     StoredGradients,

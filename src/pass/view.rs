@@ -16,8 +16,9 @@ pub struct View {
     pub centre: [f64; 2],
     /// Width and height, pixels.
     pub size: [u32; 2],
-    /// Splats with camera z ≤ near are dropped. World units; 0.01 × the scene's median depth is a good value
-    /// (docs/internals/method.md#projection), because scenes are not metric and may have close points.
+    /// Splats with camera z ≤ near are dropped. World units; 0.01 × the scene's median depth is a
+    /// good value (docs/internals/method.md#projection), because scenes are not metric and may have
+    /// close points.
     pub near: f64,
     /// RGB behind everything.
     pub background: [f64; 3],
@@ -43,9 +44,10 @@ impl View {
         self
     }
 
-    /// Largest |t_x/t_z|, |t_y/t_z| that the Jacobian of the projection is evaluated at, towards negative and
-    /// positive coordinates: the image border plus 30 % of the half width. The general form of gsplat; for a
-    /// centred principal point it equals the 1.3·tan(fov/2) of Kerbl et al. 2023.
+    /// Largest |t_x/t_z|, |t_y/t_z| that the Jacobian of the projection is evaluated at, towards
+    /// negative and positive coordinates: the image border plus 30 % of the half width. The general
+    /// form of gsplat; for a centred principal point it equals the 1.3·tan(fov/2) of Kerbl et al.
+    /// 2023.
     pub fn jacobian_limits(&self) -> ([f64; 2], [f64; 2]) {
         let limit =
             |axis: usize, to_border: f64| (to_border + 0.15 * f64::from(self.size[axis])) / self.focal[axis];

@@ -28,8 +28,8 @@ struct Node<'g> {
     save: Save<'g>,
 }
 
-/// Stages and what they need of each other. Stages of one lane start in the order in which they were added, as far as their
-/// inputs allow.
+/// Stages and what they need of each other. Stages of one lane start in the order in which they
+/// were added, as far as their inputs allow.
 #[derive(Default)]
 pub struct Graph<'g> {
     nodes: Vec<Node<'g>>,
@@ -54,7 +54,8 @@ impl Outputs {
         self.seconds[output.node]
     }
 
-    /// Seconds that an output and all that it depends on took to make, one stage after the other, in this process.
+    /// Seconds that an output and all that it depends on took to make, one stage after the other,
+    /// in this process.
     pub fn seconds_in_all<T>(&self, output: Output<T>) -> f64 {
         let (mut total, mut asked) = (0.0, BTreeSet::from([output.node]));
         while let Some(node) = asked.pop_last() {
@@ -104,8 +105,8 @@ impl<'g> Graph<'g> {
         Output { node: self.nodes.len() - 1, made: PhantomData }
     }
 
-    /// Makes `targets` ([`Output::target`]), reading from `store` what it has and keeping there what was made. The first
-    /// error stops everything.
+    /// Makes `targets` ([`Output::target`]), reading from `store` what it has and keeping there
+    /// what was made. The first error stops everything.
     pub fn run(
         &self,
         targets: &[usize],
@@ -282,7 +283,8 @@ impl Shared<'_, '_> {
         Ok(())
     }
 
-    /// The first stage of the lane whose inputs are there, waiting for them; `None` when no more will come.
+    /// The first stage of the lane whose inputs are there, waiting for them; `None` when no more
+    /// will come.
     fn next(&self, lane: Lane) -> Option<(usize, Vec<Value>)> {
         let mut state = self.lock();
         loop {

@@ -1,5 +1,5 @@
-//! A device that is lost, or has no memory left, in the middle of training: what is said of it, and that the same work goes on with
-//! another.
+//! A device that is lost, or has no memory left, in the middle of training: what is said of it, and
+//! that the same work goes on with another.
 use super::{Graph, Store};
 use crate::Error;
 use crate::fit::{Preset, RgbOptions, Trained};

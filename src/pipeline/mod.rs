@@ -1,5 +1,6 @@
-//! Work as a graph of stages: each declares its inputs, its output and what that depends on; when a stage may run, beside
-//! which others, and whether its output is still there from an earlier run follows from that.
+//! Work as a graph of stages: each declares its inputs, its output and what that depends on; when a
+//! stage may run, beside which others, and whether its output is still there from an earlier run
+//! follows from that.
 mod graph;
 #[cfg(test)]
 mod lost_device_tests;

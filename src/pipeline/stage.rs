@@ -17,11 +17,13 @@ pub struct Context<'a> {
     pub progress: &'a dyn Progress,
 }
 
-/// What a stage keeps busy. One stage of each kind runs at a time: two on one device would only wait for each other.
+/// What a stage keeps busy. One stage of each kind runs at a time: two on one device would only
+/// wait for each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Lane {
-    /// The Vulkan device, and the processor where cameras are found: what everything else waits for.
+    /// The Vulkan device, and the processor where cameras are found: what everything else waits
+    /// for.
     Device,
     /// The processor: masks, features, words.
     Processor,
@@ -38,8 +40,9 @@ pub trait Stage: Send {
     /// What it makes.
     type Output: Send + Sync + 'static;
 
-    /// Everything that the output depends on besides the inputs, the program, what computes networks and, on the device's
-    /// lane, the device: options, seeds, checksums of models and files.
+    /// Everything that the output depends on besides the inputs, the program, what computes
+    /// networks and, on the device's lane, the device: options, seeds, checksums of models and
+    /// files.
     fn settings(&self) -> String;
 
     /// How the output is kept on disk; `None` for what is made again sooner than read.

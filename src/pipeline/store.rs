@@ -56,7 +56,8 @@ fn unwritable(e: postcard::Error) -> Error {
     Error::work(format!("stage store: {e}"))
 }
 
-/// Outputs by everything that they depend on. In a folder, any odd file is made again and written over.
+/// Outputs by everything that they depend on. In a folder, any odd file is made again and written
+/// over.
 #[derive(Default)]
 pub struct Store {
     folder: Option<PathBuf>,
@@ -84,7 +85,8 @@ impl Store {
         Store::default()
     }
 
-    /// Keeps every output of the graphs that run with it, as long as it lives or until [`Store::forget_unused`].
+    /// Keeps every output of the graphs that run with it, as long as it lives or until
+    /// [`Store::forget_unused`].
     pub fn in_memory() -> Store {
         Store { memory: Some(Mutex::default()), ..Store::default() }
     }
@@ -104,7 +106,8 @@ impl Store {
         }
     }
 
-    /// Keeps outputs in `folder`, and the state of training every so often; with `resume` what is there is used.
+    /// Keeps outputs in `folder`, and the state of training every so often; with `resume` what is
+    /// there is used.
     pub fn at(folder: impl Into<PathBuf>, resume: bool, every: Duration) -> Store {
         Store { folder: Some(folder.into()), resume, every, ..Store::default() }
     }
@@ -150,8 +153,8 @@ impl Store {
         Some((warnings, (codec.read)(body)?))
     }
 
-    /// Whether it is there now: a disk that is full costs the next run time, not this one its result. `warn` gets the first reason
-    /// why one is not.
+    /// Whether it is there now: a disk that is full costs the next run time, not this one its
+    /// result. `warn` gets the first reason why one is not.
     pub(super) fn save<T>(
         &self,
         name: &str,

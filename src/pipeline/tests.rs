@@ -104,7 +104,8 @@ fn finished_stages_are_not_run_again_and_their_warnings_stay() {
     assert_eq!(chain(&machine, &kept(true), 3).0, [1, 1, 1]);
     let list = Store::list(folder.path());
     assert!(list.len() == 3 && list.iter().all(|(_, bytes)| *bytes > 64), "{list:?}");
-    // Once the folder is full, what was not used for longest goes. 4 GiB of zeros take no space on a disk.
+    // Once the folder is full, what was not used for longest goes. 4 GiB of zeros take no space on
+    // a disk.
     let old = folder.path().join("old.stage");
     let file = std::fs::File::create(&old).unwrap();
     file.set_len(4 << 30).unwrap();

@@ -2,8 +2,8 @@
 use serde_json::Value;
 use std::path::{MAIN_SEPARATOR, Path};
 
-/// Takes the folders of the paths that a user typed out of all texts: `/home/me/photos/a.jpg` becomes `photos/a.jpg` where
-/// `/home/me/photos` was typed, and `a.jpg` where it was typed itself.
+/// Takes the folders of the paths that a user typed out of all texts: `/home/me/photos/a.jpg`
+/// becomes `photos/a.jpg` where `/home/me/photos` was typed, and `a.jpg` where it was typed itself.
 pub(super) fn bare<'a>(value: &mut Value, typed: impl IntoIterator<Item = &'a Path>) {
     let folder = |path: &Path| Some(path.parent()?.to_string_lossy().into_owned());
     let mut folders: Vec<String> = typed.into_iter().filter_map(folder).filter(|f| !f.is_empty()).collect();

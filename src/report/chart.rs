@@ -184,7 +184,8 @@ mod tests {
         assert!(
             (widths[1] / widths[0] - 2.0).abs() < 0.01 && svg.contains("a&lt;b") && svg.contains("stroke")
         );
-        // The whole width is that of a bar of 1; the line reaches as far beyond the end of its own as before it.
+        // The whole width is that of a bar of 1; the line reaches as far beyond the end of its own
+        // as before it.
         let line = svg.split("<path d=\"M").find(|p| p.contains("#222")).unwrap();
         let ends: Vec<f64> = line.split(['M', 'H', ' ', 'v']).filter_map(|v| v.parse().ok()).collect();
         assert!((ends[2] - ends[0] - 0.5 * widths[1]).abs() < 0.2, "{ends:?} {widths:?}");

@@ -12,12 +12,14 @@ pub fn turbo(v: f32) -> [f32; 3] {
     ]
 }
 
-/// A colour per label that differs from its neighbours': hues a golden angle apart; negative labels are dark grey.
+/// A colour per label that differs from its neighbours': hues a golden angle apart; negative labels
+/// are dark grey.
 pub fn label(index: i32) -> [f32; 3] {
     if index < 0 {
         return [0.13; 3];
     }
-    // 0.618… of a turn is the most even spacing for any count; saturation and value alternate to widen the gaps.
+    // 0.618… of a turn is the most even spacing for any count; saturation and value alternate to
+    // widen the gaps.
     let hue = (index as f64 * 0.618_033_988_749_895).fract() as f32 * 6.0;
     let (saturation, value) = ([0.62, 0.85, 0.45][index as usize % 3], [0.95, 0.8][index as usize / 3 % 2]);
     let channel = |offset: f32| {
@@ -27,8 +29,8 @@ pub fn label(index: i32) -> [f32; 3] {
     [channel(5.0), channel(3.0), channel(1.0)]
 }
 
-/// Depth, near = warm; unknown (≤ 0) = black. The range is that of the central 98 %, so that one stray pixel does not
-/// flatten the rest.
+/// Depth, near = warm; unknown (≤ 0) = black. The range is that of the central 98 %, so that one
+/// stray pixel does not flatten the rest.
 pub fn depth_image(depth: &Plane<f32>) -> RgbImage {
     let mut known: Vec<f32> = depth.data.iter().copied().filter(|z| *z > 0.0 && z.is_finite()).collect();
     known.sort_by(f32::total_cmp);
@@ -55,8 +57,8 @@ fn map<T: Copy>(plane: &Plane<T>, colour: impl Fn(T) -> [f32; 3]) -> RgbImage {
     }
 }
 
-/// Relevancy over a picture of the same size: grey where nothing answers, warm where it does; the mask gets a white
-/// outline.
+/// Relevancy over a picture of the same size: grey where nothing answers, warm where it does; the
+/// mask gets a white outline.
 pub fn heat_image(picture: &RgbImage, relevancy: &Plane<f32>, mask: Option<&Plane<bool>>) -> RgbImage {
     let luma = picture.luma();
     let edge = |x: usize, y: usize| {
@@ -71,7 +73,8 @@ pub fn heat_image(picture: &RgbImage, relevancy: &Plane<f32>, mask: Option<&Plan
     let mut data = Vec::with_capacity(relevancy.data.len());
     for y in 0..relevancy.height {
         for x in 0..relevancy.width {
-            // Relevancy 0.5 means "as close as a canonical phrase": below it the picture stays as it is.
+            // Relevancy 0.5 means "as close as a canonical phrase": below it the picture stays as
+            // it is.
             let heat = ((relevancy.at(x, y) - 0.5) * 2.0).clamp(0.0, 1.0);
             let (base, hot) = (0.25 + 0.5 * luma.at(x, y), turbo(0.45 + 0.5 * heat));
             let share = 0.85 * heat;
@@ -88,8 +91,8 @@ mod tests {
 
     #[test]
     fn turbo_passes_its_published_colours() {
-        // Entries 0, 128 and 255 of the published table; measured, the polynomial is within 0.02 of it in the middle and
-        // up to 0.13 off at the two dark ends.
+        // Entries 0, 128 and 255 of the published table; measured, the polynomial is within 0.02 of
+        // it in the middle and up to 0.13 off at the two dark ends.
         for (v, e) in
             [(0.0, [0.19, 0.07, 0.23]), (128.0 / 255.0, [0.645, 0.99, 0.233]), (1.0, [0.48, 0.016, 0.011])]
         {

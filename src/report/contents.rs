@@ -46,8 +46,8 @@ pub struct RunRecord {
 }
 
 impl RunRecord {
-    /// The same without the folders of the paths that the user typed: a scene and its report are passed on, and nobody there needs to
-    /// know where the photos lay.
+    /// The same without the folders of the paths that the user typed: a scene and its report are
+    /// passed on, and nobody there needs to know where the photos lay.
     pub fn without_folders<'a>(mut self, typed: impl IntoIterator<Item = &'a Path>) -> RunRecord {
         let mut warnings = Value::from(std::mem::take(&mut self.warnings));
         let typed: Vec<&Path> = typed.into_iter().collect();

@@ -40,7 +40,8 @@ fn page(report: &HtmlReport) -> Result<String> {
         let _ = write!(body, "<section class=\"note\"><h2>Warnings</h2><ul>{items}</ul></section>");
     }
     body.push_str("<section class=\"figures\">");
-    // The device stands with the times below and the answers have their own section: cards are for short figures.
+    // The device stands with the times below and the answers have their own section: cards are for
+    // short figures.
     for (label, value) in report.figures.iter().filter(|(l, _)| l != "device" && !l.starts_with('“')) {
         let _ = write!(body, "<div><b>{}</b><span>{}</span></div>", escape(value), escape(label));
     }

@@ -1,11 +1,13 @@
 //! Text of files and people as it may stand in a line of a message, a table or a page.
 
-/// Most characters of an error, warning or message. Longer ones keep their beginning and their end, where the advice is.
+/// Most characters of an error, warning or message. Longer ones keep their beginning and their end,
+/// where the advice is.
 const LONGEST: usize = 1000;
 /// Characters that a longer one keeps of its end.
 const END: usize = 300;
 
-/// One line of bounded length without control characters: messages quote names and texts of files, which may hold anything.
+/// One line of bounded length without control characters: messages quote names and texts of files,
+/// which may hold anything.
 pub fn one_line(message: &str) -> String {
     let mut line = String::with_capacity(message.len().min(4 * LONGEST));
     let mut count = 0;
@@ -22,7 +24,8 @@ pub fn one_line(message: &str) -> String {
     format!("{}…{}", &line[..at(LONGEST - END - 1)], &line[at(count - END)..])
 }
 
-/// The character, or a sign in its place: terminals obey control characters, and marks of direction turn text round.
+/// The character, or a sign in its place: terminals obey control characters, and marks of direction
+/// turn text round.
 pub fn visible(c: char) -> char {
     let turns = matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
     if c.is_control() || turns { '\u{fffd}' } else { c }

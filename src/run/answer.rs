@@ -1,4 +1,5 @@
-//! The answer of a scene to one text: whether it is there, how many of it and where, and what every view shows of it.
+//! The answer of a scene to one text: whether it is there, how many of it and where, and what every
+//! view shows of it.
 use super::view::DecodedFrame;
 use crate::Result;
 use crate::query::highlight::{Highlight, highlight};
@@ -28,14 +29,17 @@ pub struct Answers {
     pub text: String,
     /// What is understood of it.
     pub reading: Reading,
-    /// Per view. Where it is not found, the mask is empty; relevancy and location are those of what is nearest.
+    /// Per view. Where it is not found, the mask is empty; relevancy and location are those of what
+    /// is nearest.
     pub views: Vec<QueryResult>,
-    /// Whether the scene has what the text means; `None` where the text model knows too few texts to tell.
+    /// Whether the scene has what the text means; `None` where the text model knows too few texts
+    /// to tell.
     pub presence: Option<Presence>,
     /// Share of other things that fit the scene at least as well, in (0, 1]; `None` as before.
     pub p_value: Option<f32>,
-    /// How far the photos agree on what answers, 0 to 1 (docs/internals/method.md#reliability): of all of it, and per view of what it shows of
-    /// it. `None` where that is not known, or nothing answers.
+    /// How far the photos agree on what answers, 0 to 1 (docs/internals/method.md#reliability): of
+    /// all of it, and per view of what it shows of it. `None` where that is not known, or nothing
+    /// answers.
     pub reliability: Option<f64>,
     /// See `reliability`.
     pub view_reliability: Vec<Option<f64>>,
@@ -75,7 +79,8 @@ impl Answers {
         std::iter::once(self.verdict()).chain(self.reading.notes()).collect::<Vec<_>>().join("; ")
     }
 
-    /// What is known of the text and of its instances, as `query --json` and run.json have it; `views` are names of the views.
+    /// What is known of the text and of its instances, as `query --json` and run.json have it;
+    /// `views` are names of the views.
     pub fn record(&self, views: &[String], world: &World) -> Value {
         let metres = world.scale.as_ref().map(|s| s.metres_per_unit);
         let instances: Vec<Value> = self.instances.iter().map(|i| instance_json(i, views, metres)).collect();
@@ -130,7 +135,8 @@ impl Prepared {
         Prepared::new(splats, field, ShownPixels::of(field, &codes))
     }
 
-    /// What speaks for a text; `background` is the place of how well the other things of its form fit this scene.
+    /// What speaks for a text; `background` is the place of how well the other things of its form
+    /// fit this scene.
     fn evidence(
         &self,
         field: &LanguageField,
@@ -222,7 +228,8 @@ mod tests {
     /// Edge of the square pictures, pixels.
     const SIZE: usize = 100;
 
-    /// A wall of splats one unit before the camera, as wide as its picture, with two balls and a lemon in it: pixel → phrase.
+    /// A wall of splats one unit before the camera, as wide as its picture, with two balls and a
+    /// lemon in it: pixel → phrase.
     fn shown(x: usize, y: usize) -> usize {
         let within = |cx: i32, cy: i32| (x as i32 - cx).abs() <= 8 && (y as i32 - cy).abs() <= 8;
         match (within(20, 50) || within(80, 50), within(50, 80)) {
@@ -303,7 +310,8 @@ mod tests {
     #[test]
     fn an_absent_text_is_taken_back_everywhere() {
         let mut wall = wall();
-        // Whatever is asked, a hundred other things fit as well; the codes alone would say that it is found.
+        // Whatever is asked, a hundred other things fit as well; the codes alone would say that it
+        // is found.
         for text in ["red ball", "lemon"] {
             wall.things = Arc::new(regions::text_embedding(text).repeat(100));
             let a = wall.ask(text, Reading::default());

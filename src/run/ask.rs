@@ -1,4 +1,5 @@
-//! Questions to a scene that is kept on the device: what viewers, `splatvk query`, the C interface and benchmarks call.
+//! Questions to a scene that is kept on the device: what viewers, `splatvk query`, the C interface
+//! and benchmarks call.
 use super::answer::{Answers, Prepared};
 use super::recent::RecentOthers;
 use super::view::{DecodedFrame, Viewer};
@@ -35,7 +36,8 @@ pub fn embedded(texts: &[String], encoder: &mut dyn RegionEncoder) -> Result<Vec
     queries(texts, encoder, true)
 }
 
-/// Texts as queries: of phrasing that no embedding carries the rest is asked ([`phrasing`]), unless they are taken `verbatim`.
+/// Texts as queries: of phrasing that no embedding carries the rest is asked ([`phrasing`]), unless
+/// they are taken `verbatim`.
 pub fn queries(texts: &[String], encoder: &mut dyn RegionEncoder, verbatim: bool) -> Result<Vec<TextQuery>> {
     if texts.is_empty() {
         return Ok(Vec::new());
@@ -45,7 +47,8 @@ pub fn queries(texts: &[String], encoder: &mut dyn RegionEncoder, verbatim: bool
     texts.iter().map(|text| as_query(text, encoder, &canonicals, &mut others, verbatim)).collect()
 }
 
-/// What turns texts into answers about one scene: its text encoder, what that has embedded so far, and the scene prepared.
+/// What turns texts into answers about one scene: its text encoder, what that has embedded so far,
+/// and the scene prepared.
 pub(super) struct Questions {
     encoder: Box<dyn RegionEncoder>,
     /// [C, D] unit rows of the canonical phrases.
@@ -150,8 +153,8 @@ pub struct QueryScene {
 }
 
 impl QueryScene {
-    /// Uploads the scene and loads the text encoder, which must be of the field's space. Whether something is in the scene is told
-    /// by what its own `cameras` show.
+    /// Uploads the scene and loads the text encoder, which must be of the field's space. Whether
+    /// something is in the scene is told by what its own `cameras` show.
     pub fn open(
         device: &Device,
         (splats, cameras): (&Splats, &[Camera]),
@@ -202,8 +205,8 @@ impl QueryScene {
 /// Phrases of the text model that a viewer shows for a code.
 pub const NAMES: usize = 5;
 
-/// Per level and code the `best` phrases with their relevancy, best first; without phrases where the text model has no
-/// list of its own.
+/// Per level and code the `best` phrases with their relevancy, best first; without phrases where
+/// the text model has no list of its own.
 pub fn names(encoder: &mut dyn RegionEncoder, field: &LanguageField, best: usize) -> Result<CodeNames> {
     let canonicals = encoder.embed_texts(&CANONICAL_PHRASES)?;
     let mut levels = Vec::with_capacity(field.levels.len());

@@ -94,7 +94,8 @@ impl Settings {
         all
     }
 
-    /// How the camera of a photo was found; where that was not estimated, cameras were given and stand.
+    /// How the camera of a photo was found; where that was not estimated, cameras were given and
+    /// stand.
     fn fitted(&self, stem: &str) -> Fitted {
         let list = self.record["statistics"]["geometry"]["optics"].as_array();
         let own = list.into_iter().flatten().find(|o| o["photo"].as_str() == Some(stem));
@@ -197,7 +198,8 @@ impl BaseScene {
                 photo::MAX_VIEWS
             )));
         }
-        // Those of the scene have lost their lens and their light: what tells that a photo is the same is its name.
+        // Those of the scene have lost their lens and their light: what tells that a photo is the
+        // same is its name.
         let known = |p: &Photo| self.known.photos.iter().any(|k| k.stem == p.stem);
         if let Some(again) = new.iter().find(|p| known(p)) {
             return Err(Error::input(format!(
@@ -210,10 +212,12 @@ impl BaseScene {
     }
 }
 
-/// Side of the pictures that are compared: lens and light, which were taken out of one of them, change little at this size.
+/// Side of the pictures that are compared: lens and light, which were taken out of one of them,
+/// change little at this size.
 const COMPARED: usize = 24;
-/// Correlation of their brightness from which two photos of one name are one photo. On `breakfast` a photo and itself through a lens
-/// (k1 −0.12, k2 0.03) and gains of 0.6 to 0.75 reach 0.994, different photos at most 0.51.
+/// Correlation of their brightness from which two photos of one name are one photo. On `breakfast`
+/// a photo and itself through a lens (k1 −0.12, k2 0.03) and gains of 0.6 to 0.75 reach 0.994,
+/// different photos at most 0.51.
 const SAME: f64 = 0.95;
 
 fn likeness(a: &Photo, b: &Photo) -> f64 {

@@ -1,4 +1,5 @@
-//! Which codes a pixel may decode to, where codes are short (docs/internals/method.md#short-codes-at-borders).
+//! Which codes a pixel may decode to, where codes are short
+//! (docs/internals/method.md#short-codes-at-borders).
 use crate::gpu::Device;
 use crate::pass::renderer::Renderer;
 use crate::query::instances::splat_codes;
@@ -6,15 +7,17 @@ use crate::scene::{Camera, LevelField, Plane, Splats};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
-/// Codes of so many numbers need the rule: with 3 a mix of two codes is nearest to a third at almost every border, with 8
-/// hardly ever (docs/internals/method.md#code-length).
+/// Codes of so many numbers need the rule: with 3 a mix of two codes is nearest to a third at
+/// almost every border, with 8 hardly ever (docs/internals/method.md#code-length).
 const SHORT: usize = 4;
-/// Books with more codes are no things of a scene but a table of directions (an autoencoder's), whose neighbours mean the same.
+/// Books with more codes are no things of a scene but a table of directions (an autoencoder's),
+/// whose neighbours mean the same.
 const MOST_CODES: usize = 512;
-/// Least blending weight of the splats of a code: what is solid has a weight of 1, and of three things that share a pixel the least
-/// has less than this or is no ghost.
+/// Least blending weight of the splats of a code: what is solid has a weight of 1, and of three
+/// things that share a pixel the least has less than this or is no ghost.
 const LEAST_WEIGHT: f32 = 0.1;
-/// Codes whose weights are rendered at once: as many as features of the usual length, which every device binds.
+/// Codes whose weights are rendered at once: as many as features of the usual length, which every
+/// device binds.
 const AT_ONCE: usize = 16;
 
 /// What renders how much of every pixel the splats of each code are.
@@ -48,7 +51,8 @@ impl Border {
         Ok(Some(Border { renderer, codes, carried, book: book.codes.clone(), d }))
     }
 
-    /// Gives every pixel that has a code the nearest of those that are really there. `features` are the blended ones, [H, W, d].
+    /// Gives every pixel that has a code the nearest of those that are really there. `features` are
+    /// the blended ones, [H, W, d].
     pub fn settle(&mut self, camera: &Camera, features: &[f32], codes: &mut Plane<i32>) -> Result<()> {
         let d = self.d;
         if features.len() != codes.data.len() * d {

@@ -1,8 +1,9 @@
-//! What a run needs of memory, known before it begins: bytes per stage from the number and the sizes of the photos, against
-//! what the device binds and holds and what the host has left.
+//! What a run needs of memory, known before it begins: bytes per stage from the number and the
+//! sizes of the photos, against what the device binds and holds and what the host has left.
 //!
-//! The figures per pixel and splat are those of the buffers that the stages make (`fit::views`, `fit::model`,
-//! `pass::rasterizer`, `pass::ssim_l1`, `pose::stereo`); those of the host are measured (docs/internals/performance.md).
+//! The figures per pixel and splat are those of the buffers that the stages make (`fit::views`,
+//! `fit::model`, `pass::rasterizer`, `pass::ssim_l1`, `pose::stereo`); those of the host are
+//! measured (docs/internals/performance.md).
 use crate::fit::{Preset, RgbOptions};
 use crate::gpu::DeviceInfo;
 use crate::pass::bands::{Bands, widest};
@@ -12,11 +13,14 @@ use crate::photo::{SMALLEST_SIDE, working_size};
 use crate::scene::LEVEL_NAMES;
 use crate::{Error, Result};
 
-/// Bytes of the host per pixel of all photos: pictures, depth, points, masks, labels, and at the end every view with its codes.
+/// Bytes of the host per pixel of all photos: pictures, depth, points, masks, labels, and at the
+/// end every view with its codes.
 const HOST_PIXEL: u64 = 150;
-/// Bytes of the host per pixel of all photos at the size that they are matched at: planes, and the surfaces made of them.
+/// Bytes of the host per pixel of all photos at the size that they are matched at: planes, and the
+/// surfaces made of them.
 const STEREO_PIXEL: u64 = 150;
-/// Bytes of the host per pixel of one photo, as the edge network sees it: three maps of 64 channels.
+/// Bytes of the host per pixel of one photo, as the edge network sees it: three maps of 64
+/// channels.
 const NETWORK_PIXEL: u64 = 768;
 /// Longer side that this network sees at most (`infer::hed`).
 const NETWORK_SIDE: usize = 1600;
@@ -80,7 +84,8 @@ pub struct StageMemory {
     pub host: u64,
 }
 
-/// Bytes per stage for photos of these working sizes. An error where an image cannot even be rendered in bands.
+/// Bytes per stage for photos of these working sizes. An error where an image cannot even be
+/// rendered in bands.
 pub fn stages(
     device: &DeviceInfo,
     sizes: &[(usize, usize)],
@@ -88,7 +93,8 @@ pub fn stages(
 ) -> Result<Vec<StageMemory>> {
     let pixels = |s: &(usize, usize)| (s.0 * s.1) as u64;
     let all: u64 = sizes.iter().map(pixels).sum();
-    // `pose::stereo` halves the size until a reference and its sources fit; this is what they hold then at most.
+    // `pose::stereo` halves the size until a reference and its sources fit; this is what they hold
+    // then at most.
     let group = 16 * all.min(STEREO_VIEWS * sizes.iter().map(pixels).max().unwrap_or(0));
     let share = (device.max_storage_range as f64 / group.max(1) as f64).min(1.0);
     let matched = (all as f64 * share) as u64;
@@ -107,10 +113,11 @@ pub fn stages(
         let mut bytes = 0;
         for &(w, h) in &distinct {
             let stored = Bands::new(device, w, h, channels)?.pixels() as u64;
-            // Planes and their gradients; transmittance, loss; SSIM: three vec2 and one float per colour.
+            // Planes and their gradients; transmittance, loss; SSIM: three vec2 and one float per
+            // colour.
             bytes += stored * (4 * (2 * channels as u64 + 1) + 8 + 84);
-            // On the screen: 12 + 12 floats, the features and their gradients, depth keys and their sort; eight entries of
-            // 20 bytes in the lists.
+            // On the screen: 12 + 12 floats, the features and their gradients, depth keys and their
+            // sort; eight entries of 20 bytes in the lists.
             bytes += splats * (96 + 8 * features as u64 + 16 + 160);
         }
         // Photo, depth, and a label per level.
@@ -162,8 +169,8 @@ fn obstacle(limits: &Limits, sizes: &[(usize, usize)], work: &MemoryDemand) -> O
     None
 }
 
-/// Refuses a working size that cannot be done, and names the largest that can. `originals` are the (width, height) of the
-/// photos.
+/// Refuses a working size that cannot be done, and names the largest that can. `originals` are the
+/// (width, height) of the photos.
 pub fn check(
     limits: &Limits,
     originals: &[(usize, usize)],
@@ -189,7 +196,8 @@ pub fn check(
     )))
 }
 
-/// Splats that the device binds with this many features: a feature's two moments are the widest row.
+/// Splats that the device binds with this many features: a feature's two moments are the widest
+/// row.
 pub fn most_splats(device: &DeviceInfo, features: usize) -> usize {
     let row = (8 * features).max(96);
     (device.max_storage_range / row as u64) as usize

@@ -1,5 +1,6 @@
-//! `--compat`: what the paper, its authors' code and LangSplat do otherwise than this program by default
-//! (docs/internals/method.md#differences-from-the-paper). Each switch is a field here, and a row of the table there.
+//! `--compat`: what the paper, its authors' code and LangSplat do otherwise than this program by
+//! default (docs/internals/method.md#differences-from-the-paper). Each switch is a field here, and
+//! a row of the table there.
 use super::method::Method;
 use crate::language::Reducer;
 use crate::language::align::{AlignOptions, AreaScore};
@@ -56,7 +57,8 @@ pub const PAPER: Compat = Compat {
     mask: MaskRule::Lerf(0.6),
 };
 
-/// What the code of the authors does with its own defaults. Its step 2 asks for a score above 2 τ₁ = 1, which none has.
+/// What the code of the authors does with its own defaults. Its step 2 asks for a score above 2 τ₁
+/// = 1, which none has.
 pub const AUTHORS: Compat = Compat {
     name: "authors",
     about: "as the code that the paper's authors published does it",
@@ -65,7 +67,8 @@ pub const AUTHORS: Compat = Compat {
     ..PAPER
 };
 
-/// What LangSplat does with masks, codes and answers; it has no alignment, so that of this program stays.
+/// What LangSplat does with masks, codes and answers; it has no alignment, so that of this program
+/// stays.
 pub const LANGSPLAT: Compat = Compat {
     name: "langsplat",
     about: "masks, codes and answers as in LangSplat",
@@ -93,8 +96,8 @@ impl Compat {
         })
     }
 
-    /// What a scene was made with; `None` also for files that no run made. A record that cannot be read is an error: the scene
-    /// would answer in another way than it was made for.
+    /// What a scene was made with; `None` also for files that no run made. A record that cannot be
+    /// read is an error: the scene would answer in another way than it was made for.
     pub fn of_scene(scene: &Path) -> Result<Option<&'static Compat>> {
         let file = scene.join("run.json");
         let absent = |e: std::io::Error| matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory);

@@ -1,5 +1,6 @@
-//! The built-in language defaults end to end in 2D: graph masks, `words` features, XFeat matches, alignment, codebook
-//! and queries on the training targets (what a perfectly trained field would show).
+//! The built-in language defaults end to end in 2D: graph masks, `words` features, XFeat matches,
+//! alignment, codebook and queries on the training targets (what a perfectly trained field would
+//! show).
 use crate::infer::words::RegionWords;
 use crate::infer::{Registry, hed::Hed, xfeat::XFeat};
 use crate::language::align::{PairLinks, links_from_warps};
@@ -79,8 +80,9 @@ fn lemon_and_mug_are_found() {
     for (text, row) in &rows {
         println!("R {text}: {row:.2?}");
     }
-    // The plate is not asked for: with exact depth the built-in masks of one view join it to the table, which the smoother
-    // depth of stereo does not bring about (`splatvk eval` measures that).
+    // The plate is not asked for: with exact depth the built-in masks of one view join it to the
+    // table, which the smoother depth of stereo does not bring about (`splatvk eval` measures
+    // that).
     for name in ["lemon", "blue mug"] {
         let row = &rows.iter().find(|r| r.0 == name).unwrap().1;
         assert!(row.iter().filter(|r| r.1).count() >= 3, "{name}: {row:?}");

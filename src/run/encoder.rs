@@ -4,8 +4,8 @@ use crate::format::scene_dir::{Scene, TEXT_EMBEDDINGS};
 use crate::infer::{RegionEncoder, Registry};
 use crate::{Error, Result};
 
-/// For precomputed features the table of text embeddings that the scene carries, and a network; else the model that the scene was
-/// made with.
+/// For precomputed features the table of text embeddings that the scene carries, and a network;
+/// else the model that the scene was made with.
 pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncoder>> {
     let table = scene.path.join(TEXT_EMBEDDINGS);
     let levels = scene.language.iter().flat_map(|l| &l.levels);

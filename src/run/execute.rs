@@ -51,8 +51,8 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     Ok(outcome)
 }
 
-/// The run without its files, for programs that hold photos, device and models themselves. Of the plan, everything about
-/// inputs, output, device and models goes unread.
+/// The run without its files, for programs that hold photos, device and models themselves. Of the
+/// plan, everything about inputs, output, device and models goes unread.
 pub fn reconstruct(
     plan: &RunPlan,
     device: &Device,
@@ -68,7 +68,8 @@ pub fn reconstruct(
     work(plan, device, registry, None, photos, &Store::none(), progress)
 }
 
-/// Writes what [`reconstruct`] made as a scene directory, whole or not at all; `force` replaces a scene.
+/// Writes what [`reconstruct`] made as a scene directory, whole or not at all; `force` replaces a
+/// scene.
 pub fn save(outcome: &mut RunOutcome, out: &Path, force: bool, progress: &dyn Progress) -> Result<()> {
     let workspace = Workspace::create(out, force, &[])?;
     outcome.plan.out = out.to_path_buf();
@@ -100,7 +101,8 @@ fn joining(
     found.photos.iter().try_for_each(|p| photo::check_name(p))?;
     let mut files: Vec<Candidate> = found.photos.iter().map(|p| Candidate::file(p)).collect();
     photo::assign_masks(&mut files, &masks(plan)?, progress)?;
-    // As large as those of the scene, where nothing else is asked for: finer ones would be shown no better.
+    // As large as those of the scene, where nothing else is asked for: finer ones would be shown no
+    // better.
     let sides = base.known.photos.iter().map(|p| p.image.width.max(p.image.height));
     let max_size = plan.max_size.or(sides.max()).unwrap_or(max_size);
     let sizes = base.known.photos.iter().map(|p| (p.image.width, p.image.height));

@@ -62,7 +62,8 @@ pub(super) fn check(plan: &RunPlan, photos: &[Photo], registry: &Registry) -> Re
     sources::check::<MaskSources>(&plan.masks, &given, registry)
 }
 
-/// Adds the stages of the plan. Within a lane they start in this order, so what needs no geometry comes before what does.
+/// Adds the stages of the plan. Within a lane they start in this order, so what needs no geometry
+/// comes before what does.
 pub(super) fn scene(
     build: &mut GraphBuilder,
     plan: &RunPlan,

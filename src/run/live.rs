@@ -1,4 +1,5 @@
-//! A scene that a program holds in memory: rendered, queried and saved on demand. What the C interface is made of.
+//! A scene that a program holds in memory: rendered, queried and saved on demand. What the C
+//! interface is made of.
 use super::answer::Answers;
 use super::ask::Questions;
 use super::compat::{Compat, query_options};
@@ -58,8 +59,8 @@ enum SceneOrigin {
 }
 
 impl LiveScene {
-    /// Loads a scene directory, or a file of Gaussians that has no language. `models` is the folder of the models,
-    /// where the text encoder is taken from; `None` = the default one.
+    /// Loads a scene directory, or a file of Gaussians that has no language. `models` is the folder
+    /// of the models, where the text encoder is taken from; `None` = the default one.
     pub fn load(device: &Device, path: &Path, registry: &Registry) -> Result<LiveScene> {
         LiveScene::new(device, SceneOrigin::Loaded(Box::new(scene_dir::load(path)?)), registry)
     }
@@ -142,7 +143,8 @@ impl LiveScene {
         self.viewer.features(level)
     }
 
-    /// Renders one camera band by band and shows every band while it is on the device: [`Viewer::draw_bands`].
+    /// Renders one camera band by band and shows every band while it is on the device:
+    /// [`Viewer::draw_bands`].
     pub fn draw_bands(
         &mut self,
         model: usize,
@@ -153,7 +155,8 @@ impl LiveScene {
         self.viewer.draw_bands(model, camera, seen)
     }
 
-    /// Renders one camera that the device holds at once. The frame stays on the device, and valid until the next call.
+    /// Renders one camera that the device holds at once. The frame stays on the device, and valid
+    /// until the next call.
     pub fn draw(&mut self, camera: &Camera) -> Result<&FrameBuffers> {
         check(camera)?;
         self.viewer.draw(camera)
@@ -213,9 +216,9 @@ impl LiveScene {
         Questions::open(encoder, self.splats(), field, self.cameras())
     }
 
-    /// Writes a file of the kind that its name asks for ([`gaussians::write`]), or a scene directory where the name has no
-    /// ending, ends in a slash or is that of a folder, whole or not at
-    /// all; `replace` allows to replace a scene or file that is there.
+    /// Writes a file of the kind that its name asks for ([`gaussians::write`]), or a scene
+    /// directory where the name has no ending, ends in a slash or is that of a folder, whole or not
+    /// at all; `replace` allows to replace a scene or file that is there.
     pub fn save(&mut self, path: &Path, replace: bool) -> Result<()> {
         if gaussians::is_named(path) {
             self.check_spared(path)?;

@@ -1,5 +1,5 @@
-//! The compared methods as configurations of one engine: each shares photos, cameras, stereo points and every pass with the
-//! default, and changes only what its authors do differently to language.
+//! The compared methods as configurations of one engine: each shares photos, cameras, stereo points
+//! and every pass with the default, and changes only what its authors do differently to language.
 use super::view::Viewer;
 use crate::fit::scale::SceneScale;
 use crate::fit::{self, LanguageOptions, Photos, Preset, RgbOptions, Start, TrainedLanguage, index_head};
@@ -11,7 +11,8 @@ use crate::scene::{Camera, LanguageField, Splats};
 use crate::{Error, Result};
 use serde::Serialize;
 
-/// A method of the paper's comparison. All start from dense points of the photos, as the paper's "-s" rows.
+/// A method of the paper's comparison. All start from dense points of the photos, as the paper's
+/// "-s" rows.
 #[derive(Debug, PartialEq)]
 pub struct Method {
     /// As users write it.
@@ -49,7 +50,8 @@ pub static LEGAUSSIANS: Method = Method {
     recipe: Recipe { reducer: Reducer::Quantised, feature_dim: 8, index_head: true, ..UNALIGNED },
 };
 
-/// In the manner of LSM (Fan et al. 2024; its network is not part of this program): nothing is optimised for the scene.
+/// In the manner of LSM (Fan et al. 2024; its network is not part of this program): nothing is
+/// optimised for the scene.
 pub static LSM: Method = Method {
     name: "lsm",
     about: "No alignment, features lifted onto the stereo points in one pass, nothing optimised",
@@ -118,7 +120,8 @@ pub struct Recipe {
     pub language: LanguageFit,
     /// Smooth features in space and train a head that reads the codebook index from them.
     pub index_head: bool,
-    /// Thresholds and conditions of the alignment, of which `steps` leaves out what a method does not do.
+    /// Thresholds and conditions of the alignment, of which `steps` leaves out what a method does
+    /// not do.
     pub align: AlignOptions,
 }
 
@@ -132,8 +135,9 @@ impl Method {
     }
 
     /// What a run does that is asked for no method: training gains nothing over lifted features
-    /// (docs/internals/experiments.md#measured-lifting), so it trains them only where it is asked for something of the training: the
-    /// paper's preset, a number of steps, models of their own per level.
+    /// (docs/internals/experiments.md#measured-lifting), so it trains them only where it is asked
+    /// for something of the training: the paper's preset, a number of steps, models of their own
+    /// per level.
     pub fn by_default(
         preset: Option<Preset>,
         language_iterations: Option<usize>,
@@ -144,10 +148,12 @@ impl Method {
     }
 }
 
-/// Codes of up to 200 things stay apart at borders; with 3 numbers they do not (docs/internals/method.md#code-length).
+/// Codes of up to 200 things stay apart at borders; with 3 numbers they do not
+/// (docs/internals/method.md#code-length).
 pub const FEATURE_DIM: usize = 16;
 
-/// LangSplat trains on the masks of hundreds of photos; 100 epochs of those of a few photos would leave it half trained.
+/// LangSplat trains on the masks of hundreds of photos; 100 epochs of those of a few photos would
+/// leave it half trained.
 pub const AUTOENCODER: Reducer = Reducer::Autoencoder { least_steps: 2000 };
 
 /// λ2 of the paper.
@@ -199,7 +205,8 @@ impl Recipe {
         options.image_weight = self.image_weight;
         options.detach_geometry |= self.features_only;
         if matches!(self.reducer, Reducer::Autoencoder { .. }) {
-            // Decoding every training pixel against 2048 directions takes the processor longer than the training.
+            // Decoding every training pixel against 2048 directions takes the processor longer than
+            // the training.
             options.check_every = 0;
         }
         match self.language {
@@ -211,10 +218,12 @@ impl Recipe {
     }
 }
 
-/// Labelled pixels per view that an index head is trained on: some thousand in all pin its few hundred numbers.
+/// Labelled pixels per view that an index head is trained on: some thousand in all pin its few
+/// hundred numbers.
 const HEAD_SAMPLES: usize = 4000;
 
-/// Smooths the features in space and trains the index head of every level on what the photos' views then show.
+/// Smooths the features in space and trains the index head of every level on what the photos' views
+/// then show.
 fn train_index_heads(
     device: &Device,
     cameras: &[Camera],

@@ -54,7 +54,8 @@ impl FromStr for Length {
             Some((places, length)) => (places, Some(metres(length)?)),
             None => (text, None),
         };
-        // A minus may also be a sign, or part of a name: the first one that leaves two places counts.
+        // A minus may also be a sign, or part of a name: the first one that leaves two places
+        // counts.
         let split =
             |(at, _): (usize, &str)| Some([Place::parse(&places[..at])?, Place::parse(&places[at + 1..])?]);
         let ends = places.match_indices('-').find_map(split).ok_or_else(|| {
@@ -78,8 +79,8 @@ fn metres(text: &str) -> Result<f64, String> {
 
 /// What one photo can tell of a place: a click is right to a pixel …
 const CLICK_SIGMA: f64 = 1.0;
-/// … and depth to 1.5 %: then two thirds of 85 lengths between the middles of the things on `breakfast` err by no more than their
-/// stated deviation, half by no more than 0.7 of it.
+/// … and depth to 1.5 %: then two thirds of 85 lengths between the middles of the things on
+/// `breakfast` err by no more than their stated deviation, half by no more than 0.7 of it.
 const DEPTH_SIGMA: f64 = 0.015;
 
 /// A length as the scene has it.
@@ -149,7 +150,8 @@ fn camera<'a>(scene: &'a Scene, view: &str) -> Result<&'a Camera> {
     })
 }
 
-/// Standard deviation of a place along a direction, as the nearest camera in front of it sees it; 0 without cameras.
+/// Standard deviation of a place along a direction, as the nearest camera in front of it sees it; 0
+/// without cameras.
 fn sigma(scene: &Scene, place: DVec3, along: DVec3) -> f64 {
     let seen = scene.cameras.iter().map(|c| (c, c.project(place).1)).filter(|s| s.1 > 0.0);
     let Some((camera, depth)) = seen.min_by(|a, b| a.1.total_cmp(&b.1)) else { return 0.0 };
@@ -159,8 +161,8 @@ fn sigma(scene: &Scene, place: DVec3, along: DVec3) -> f64 {
     (DEPTH_SIGMA * depth * deep).hypot(CLICK_SIGMA * depth / camera.fx * across)
 }
 
-/// The scale at which lengths are as stated: the mean of what each of them says, weighted by how surely it says it. Its
-/// deviation is at least that by which they disagree.
+/// The scale at which lengths are as stated: the mean of what each of them says, weighted by how
+/// surely it says it. Its deviation is at least that by which they disagree.
 pub fn scale(lengths: &[Length], measured: &[Measured]) -> Option<Scale> {
     let stated = || lengths.iter().zip(measured).filter_map(|(l, m)| Some((l, m, l.metres?)));
     let logs: Vec<(f64, f64)> = stated()
@@ -169,7 +171,8 @@ pub fn scale(lengths: &[Length], measured: &[Measured]) -> Option<Scale> {
     let weight: f64 = logs.iter().map(|l| l.1).sum();
     let mean = logs.iter().map(|(log, w)| log * w).sum::<f64>() / weight;
     let misfit: f64 = logs.iter().map(|(log, w)| w * (log - mean).powi(2)).sum();
-    // Birge ratio: as much more than the stated deviations as the lengths differ by more than these.
+    // Birge ratio: as much more than the stated deviations as the lengths differ by more than
+    // these.
     let excess = (misfit / (logs.len().max(2) - 1) as f64).max(1.0);
     (!logs.is_empty()).then(|| Scale {
         metres_per_unit: mean.exp(),

@@ -12,7 +12,8 @@ use crate::report::ModelUsed;
 use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, LanguageField, Seen, Splats, World};
 
-/// Everything that a run made; [`crate::report`] turns it into run.json, report.html and the summary.
+/// Everything that a run made; [`crate::report`] turns it into run.json, report.html and the
+/// summary.
 #[non_exhaustive]
 pub struct RunOutcome {
     /// The plan that was run.
@@ -27,7 +28,8 @@ pub struct RunOutcome {
     pub photos: Vec<Photo>,
     /// Photos whose place could not be found surely.
     pub left_out: Vec<pose::choose::LeftOut>,
-    /// The first so many photos were in the scene already that the others were added to; 0 = no scene.
+    /// The first so many photos were in the scene already that the others were added to; 0 = no
+    /// scene.
     pub known: usize,
     /// Geometry before training.
     pub geometry: Geometry,

@@ -11,7 +11,8 @@ use crate::language::sam::SamOptions;
 use crate::scene::GivenCamera;
 use std::path::{Path, PathBuf};
 
-/// Training states are some ten megabytes for scenes of a few photos: written in a fraction of a second.
+/// Training states are some ten megabytes for scenes of a few photos: written in a fraction of a
+/// second.
 pub const CHECKPOINT_SECONDS: u64 = 30;
 
 /// What to do, with every default that does not depend on the machine resolved.
@@ -58,7 +59,8 @@ pub struct RunPlan {
     pub iterations: Option<usize>,
     /// Steps of the language stage instead of the preset's.
     pub language_iterations: Option<usize>,
-    /// SH degree of the colours, 0–3; `None` = what the photos support, and 0 in the paper's preset.
+    /// SH degree of the colours, 0–3; `None` = what the photos support, and 0 in the paper's
+    /// preset.
     pub sh_degree: Option<u32>,
     /// What gets language onto the splats; `None` = [`Method::by_default`].
     pub method: Option<&'static Method>,
@@ -68,7 +70,8 @@ pub struct RunPlan {
     pub per_level: bool,
     /// What is done as others do it; masks, code length and models of it stand in their own fields.
     pub compat: Option<&'static Compat>,
-    /// Greatest side of the working images, pixels; `None` = [`photo::default_max_size`] of the device.
+    /// Greatest side of the working images, pixels; `None` = [`photo::default_max_size`] of the
+    /// device.
     pub max_size: Option<usize>,
     /// Vulkan device.
     pub device: Option<String>,
@@ -76,7 +79,8 @@ pub struct RunPlan {
     pub deterministic: bool,
     /// Folder of the models.
     pub models: Option<PathBuf>,
-    /// What computes the networks, one of [`crate::infer::provider::NAMES`]; `None` = see [`Compute::by`].
+    /// What computes the networks, one of [`crate::infer::provider::NAMES`]; `None` = see
+    /// [`Compute::by`].
     pub provider: Option<String>,
 }
 
@@ -119,7 +123,8 @@ impl Default for RunPlan {
 }
 
 impl RunPlan {
-    /// The plan with what a `compat` decides beside the length of the codes ([`super::compat::feature_dim`]).
+    /// The plan with what a `compat` decides beside the length of the codes
+    /// ([`super::compat::feature_dim`]).
     pub fn compatible(self, compat: Option<&'static Compat>) -> RunPlan {
         RunPlan {
             per_level: self.per_level || compat.is_some_and(|c| c.per_level),

@@ -2,7 +2,8 @@
 use crate::query::presence::Background;
 use std::sync::Arc;
 
-/// Most bytes of embeddings that are kept: those of texts without a colour and of all with one, 20 MB from `words`, and a few more.
+/// Most bytes of embeddings that are kept: those of texts without a colour and of all with one, 20
+/// MB from `words`, and a few more.
 const MOST_BYTES: usize = 32 << 20;
 
 /// What texts of one form share.
@@ -73,7 +74,8 @@ mod tests {
             assert_eq!(things.unwrap().things.len(), quarter);
             assert!(recent.list.iter().map(|(_, s)| bytes(s)).sum::<usize>() <= MOST_BYTES);
         }
-        // The fifth form takes the place of "red", which was asked for least recently, and "red" that of "blue".
+        // The fifth form takes the place of "red", which was asked for least recently, and "red"
+        // that of "blue".
         assert_eq!(made, ["", "red", "blue", "green", "grey", "red"]);
         // More than all by itself: answered, and alone.
         recent.of("pink", |_| Ok::<_, ()>(vec![0.0; 5 * quarter])).unwrap();

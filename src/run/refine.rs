@@ -1,5 +1,6 @@
-//! Cameras of held-out photos refined against a finished scene, as evaluations of methods without known poses do: the
-//! scene is frozen, only the camera moves, until its render is closest to the photo.
+//! Cameras of held-out photos refined against a finished scene, as evaluations of methods without
+//! known poses do: the scene is frozen, only the camera moves, until its render is closest to the
+//! photo.
 use crate::Result;
 use crate::fit::pose::PoseAdam;
 use crate::fit::scale::SceneScale;
@@ -17,9 +18,10 @@ use crate::scene::{Camera, Pose, RgbImage, Splats};
 /// Weights of L1 and 1 − SSIM: those of training (Kerbl et al. 2023).
 const WEIGHTS: [f64; 2] = [0.8, 0.2];
 
-/// (divisor of the size, steps, first and last rate in radians). At half size a render costs a third and the photo's blur
-/// widens the reach to several pixels; the last steps at full size settle a tenth of a pixel. All steps together can turn
-/// a camera by 1.9 degrees about each axis: an error beyond that is no residue of an alignment.
+/// (divisor of the size, steps, first and last rate in radians). At half size a render costs a
+/// third and the photo's blur widens the reach to several pixels; the last steps at full size
+/// settle a tenth of a pixel. All steps together can turn a camera by 1.9 degrees about each axis:
+/// an error beyond that is no residue of an alignment.
 const LEVELS: [(u32, usize, f64, f64); 2] = [(2, 60, 1e-3, 2e-4), (1, 25, 3e-4, 3e-5)];
 
 /// Moves cameras before a frozen scene.
@@ -153,8 +155,9 @@ impl ViewRefiner {
     }
 }
 
-/// The photo in the light of the scene: per channel the mean and the spread of what the rasteriser shows, so that exposure
-/// and white balance do not pull at the camera. Where the scene shows nothing, there is nothing to compare either.
+/// The photo in the light of the scene: per channel the mean and the spread of what the rasteriser
+/// shows, so that exposure and white balance do not pull at the camera. Where the scene shows
+/// nothing, there is nothing to compare either.
 fn target(photo: &RgbImage, raster: &Rasterizer) -> Result<RgbImage> {
     let pixels = photo.data.len();
     let planes = raster.frame().planes.read_range(0..3 * pixels)?;

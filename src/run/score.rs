@@ -19,8 +19,8 @@ pub struct Questions<'a> {
     pub options: QueryOptions,
 }
 
-/// The figures of protocol `field`. With `refine`, held-out frames are scored a second time from refined cameras. `look` sees every decoded
-/// frame.
+/// The figures of protocol `field`. With `refine`, held-out frames are scored a second time from
+/// refined cameras. `look` sees every decoded frame.
 pub fn score_field(
     device: &Device,
     splats: &Splats,
@@ -78,8 +78,8 @@ fn rendered(view: &DecodedFrame) -> Rendered {
     Rendered { rgb: frame.rgb.clone(), alpha: frame.alpha.clone(), depth: frame.depth.clone() }
 }
 
-/// The frame from its refined camera, if that is closer to the photo, and how the camera moved. `camera` is the start,
-/// `given` what the true one shows.
+/// The frame from its refined camera, if that is closer to the photo, and how the camera moved.
+/// `camera` is the start, `given` what the true one shows.
 fn refined(
     refiner: &ViewRefiner,
     viewer: &mut Viewer,
@@ -123,7 +123,8 @@ mod tests {
             let (r, t) = (pose.rotation.transpose(), pose.translation);
             let row = |axis: DVec3, shift: f64| [axis.x, axis.y, axis.z, shift];
             let matrix = [row(r.x_axis, t.x), row(r.y_axis, t.y), row(r.z_axis, t.z), [0.0, 0.0, 0.0, 1.0]];
-            // What it states is an eighth more than the focal length that the photos were taken with.
+            // What it states is an eighth more than the focal length that the photos were taken
+            // with.
             frames.push(json!({
                 "file": own.name, "split": if k < 2 { "train" } else { "test" }, "fx": 1.125 * own.fx,
                 "fy": 1.125 * own.fy, "cx": own.cx, "cy": own.cy, "world_to_camera": matrix,

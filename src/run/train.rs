@@ -26,7 +26,8 @@ pub struct TrainPlan {
     pub cameras: PathBuf,
     /// How many photos with a camera are used; `None`: all, at most [`photo::MAX_VIEWS`].
     pub views: Option<usize>,
-    /// Points to start from (`.ply`, a COLMAP model folder or a data set that holds one) instead of stereo.
+    /// Points to start from (`.ply`, a COLMAP model folder or a data set that holds one) instead of
+    /// stereo.
     pub points: Option<PathBuf>,
     /// Scene directory.
     pub out: PathBuf,
@@ -42,11 +43,13 @@ pub struct TrainPlan {
     pub preset: Option<Preset>,
     /// Steps instead of the preset's.
     pub iterations: Option<usize>,
-    /// SH degree of the colours, 0–3; `None` = what the photos support, and 0 in the paper's preset.
+    /// SH degree of the colours, 0–3; `None` = what the photos support, and 0 in the paper's
+    /// preset.
     pub sh_degree: Option<u32>,
     /// Seed of everything random.
     pub seed: u64,
-    /// Greatest side of the working images, pixels; `None` = [`photo::default_max_size`] of the device.
+    /// Greatest side of the working images, pixels; `None` = [`photo::default_max_size`] of the
+    /// device.
     pub max_size: Option<usize>,
     /// Vulkan device.
     pub device: Option<String>,
@@ -54,7 +57,8 @@ pub struct TrainPlan {
     pub deterministic: bool,
     /// Folder of the models.
     pub models: Option<PathBuf>,
-    /// What computes the networks, one of [`crate::infer::provider::NAMES`]; `None` = see [`Compute::by`].
+    /// What computes the networks, one of [`crate::infer::provider::NAMES`]; `None` = see
+    /// [`Compute::by`].
     pub provider: Option<String>,
 }
 
@@ -75,7 +79,8 @@ impl TrainPlan {
     }
 }
 
-/// Photos that have a camera, in name order, at most as many as are wanted; what is left out is named in warnings.
+/// Photos that have a camera, in name order, at most as many as are wanted; what is left out is
+/// named in warnings.
 fn matched(
     plan: &TrainPlan,
     known: &[GivenCamera],
@@ -102,7 +107,8 @@ fn matched(
     photo::load_each(&files, max_size, progress)
 }
 
-/// The photos of the folder, and of the folders below it that names of cameras lie in, that have a camera.
+/// The photos of the folder, and of the folders below it that names of cameras lie in, that have a
+/// camera.
 fn with_cameras(plan: &TrainPlan, known: &[GivenCamera], progress: &dyn Progress) -> Result<Vec<Candidate>> {
     let names: Vec<&str> = known.iter().map(|c| c.camera.name.as_str()).collect();
     let found = photo::find_named(&plan.images, &names)?;
@@ -148,7 +154,8 @@ fn points(path: &Path, progress: &dyn Progress) -> Result<PointCloud> {
     Ok(points)
 }
 
-/// Gives points from a file the footprint that initialisation needs: `z / f` in the camera that sees them nearest.
+/// Gives points from a file the footprint that initialisation needs: `z / f` in the camera that
+/// sees them nearest.
 fn with_footprints(mut cloud: PointCloud, list: &[Camera], progress: &dyn Progress) -> Result<PointCloud> {
     let mut keep = PointCloud::default();
     // What is not finite would spread in training.

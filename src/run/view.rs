@@ -17,7 +17,8 @@ use std::ops::Range;
 pub struct DecodedFrame {
     /// Colour and depth; features only from [`Viewer::view_with_features`].
     pub rendered: RenderedFrame,
-    /// Per level, index as in [`crate::scene::LEVEL_NAMES`]; levels without codes are −1 everywhere.
+    /// Per level, index as in [`crate::scene::LEVEL_NAMES`]; levels without codes are −1
+    /// everywhere.
     pub codes: Vec<Plane<i32>>,
 }
 
@@ -63,7 +64,8 @@ pub struct FeatureChannels {
 pub const SCENE_MODEL: usize = 0;
 
 impl Model {
-    /// Uploads splats with the features of some levels side by side; `shown` has the channels of every level.
+    /// Uploads splats with the features of some levels side by side; `shown` has the channels of
+    /// every level.
     fn new(
         device: &Device,
         splats: &Splats,
@@ -92,7 +94,8 @@ impl Model {
 }
 
 impl Viewer {
-    /// Uploads the scene, each level's features on the splats that carry them ([`LevelField::carrier`]).
+    /// Uploads the scene, each level's features on the splats that carry them
+    /// ([`LevelField::carrier`]).
     pub fn new(device: &Device, splats: &Splats, field: &LanguageField) -> Result<Self> {
         let mut shown: Vec<Range<usize>> = Vec::with_capacity(field.levels.len());
         for level in &field.levels {
@@ -128,14 +131,14 @@ impl Viewer {
         })
     }
 
-    /// Renders one camera that the device holds at once, as the scene's own splats show it. The frame stays on the device,
-    /// and valid until the next call.
+    /// Renders one camera that the device holds at once, as the scene's own splats show it. The
+    /// frame stays on the device, and valid until the next call.
     pub fn draw(&mut self, camera: &Camera) -> Result<&FrameBuffers> {
         Ok(self.models[SCENE_MODEL].renderer.draw(camera)?.frame())
     }
 
-    /// Renders one camera band by band and shows every band while it is on the device. `model` is [`SCENE_MODEL`] or that of
-    /// [`Viewer::features`].
+    /// Renders one camera band by band and shows every band while it is on the device. `model` is
+    /// [`SCENE_MODEL`] or that of [`Viewer::features`].
     pub fn draw_bands(
         &mut self,
         model: usize,
@@ -195,7 +198,8 @@ impl Viewer {
     }
 }
 
-/// Decodes the levels of a band into `codes`; `output` keeps the buffers for the next one of the same size.
+/// Decodes the levels of a band into `codes`; `output` keeps the buffers for the next one of the
+/// same size.
 fn decode(
     device: &Device,
     levels: &[CarriedLevel],
@@ -236,7 +240,8 @@ pub fn seen(device: &Device, splats: &Splats, cameras: &[Camera], progress: &dyn
     Ok(Seen { pixels })
 }
 
-/// Share of every pixel that splats blend into it which no photo shows; alpha, without them, is what is known of it.
+/// Share of every pixel that splats blend into it which no photo shows; alpha, without them, is
+/// what is known of it.
 pub struct UnseenShare(Renderer);
 
 impl UnseenShare {

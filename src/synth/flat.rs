@@ -1,5 +1,6 @@
-//! Everything on one plane: sheets of colour on the ground seen straight down, as from a drone, or a poster seen from before it. The
-//! focal length of photos straight down is open: a longer one from higher up shows the same.
+//! Everything on one plane: sheets of colour on the ground seen straight down, as from a drone, or
+//! a poster seen from before it. The focal length of photos straight down is open: a longer one
+//! from higher up shows the same.
 use super::shapes::{SceneObject, Shape, paint};
 use crate::math::Random;
 use crate::scene::Pose;
@@ -32,7 +33,8 @@ const TILT: f64 = 1.0;
 const YAW: f64 = 5.0;
 /// Largest change of height, share.
 const HEIGHT: f64 = 0.03;
-/// Half the thickness of a sheet, metres: a tenth of a pixel from the usual distance would be 0.15 mm.
+/// Half the thickness of a sheet, metres: a tenth of a pixel from the usual distance would be 0.15
+/// mm.
 const THIN: f64 = 5e-5;
 
 /// The ground and some sheets on it, at any angles.

@@ -27,11 +27,12 @@ const TEXTS: &str = "text_embeddings.npz";
 /// JPEG quality of held-out views, and of photos unless asked otherwise: no visible artefacts.
 const QUALITY: u8 = 95;
 
-/// What is in a folder that [`generate`] or [`write_regions`] made and neither of them wrote, relative to it; `None` where the folder is
-/// no such one.
+/// What is in a folder that [`generate`] or [`write_regions`] made and neither of them wrote,
+/// relative to it; `None` where the folder is no such one.
 pub fn foreign(folder: &Path) -> Option<Vec<String>> {
     let truth: Option<serde_json::Value> = files::read_json(&folder.join(TRUTH), "").ok();
-    // Data sets of other makes may lie in the same layout; only ours state the knobs they were made with.
+    // Data sets of other makes may lie in the same layout; only ours state the knobs they were made
+    // with.
     let knobs = truth.as_ref().is_some_and(|truth| !truth["knobs"].is_null());
     let regions = |name: &str| folder.join(name).join(TEXTS).is_file();
     if !REGIONS.into_iter().all(regions) || truth.is_some() && !knobs {
@@ -42,8 +43,8 @@ pub fn foreign(folder: &Path) -> Option<Vec<String>> {
     Some(files::foreign(folder, &|name, is_folder| is_own(name, is_folder, views.as_deref())))
 }
 
-/// Whether a name is that of a file or folder of generated data with these views; `None` for regions alone, whose views are those of
-/// other data.
+/// Whether a name is that of a file or folder of generated data with these views; `None` for
+/// regions alone, whose views are those of other data.
 fn is_own(name: &str, is_folder: bool, views: Option<&[&str]>) -> bool {
     let Some((folder, file)) = name.rsplit_once('/') else {
         let folders: &[&str] = if views.is_some() { &["images", "held_out", "depth", "masks"] } else { &[] };
@@ -64,7 +65,8 @@ fn is_own(name: &str, is_folder: bool, views: Option<&[&str]>) -> bool {
         }
 }
 
-/// Makes a scene and writes it: photos, held-out views, depth, masks, cameras, and regions without and with flaws.
+/// Makes a scene and writes it: photos, held-out views, depth, masks, cameras, and regions without
+/// and with flaws.
 pub fn generate(
     folder: &Path,
     spec: &SceneSpec,
@@ -132,7 +134,8 @@ fn write_views(
     Ok(frames)
 }
 
-/// Writes `regions_exact/` and `regions_flawed/` for the photos of a ground-truth folder that has masks.
+/// Writes `regions_exact/` and `regions_flawed/` for the photos of a ground-truth folder that has
+/// masks.
 pub fn write_regions(data: &Path, out: &Path, flaws: &InjectedErrors) -> Result<()> {
     let truth = GroundTruth::read(data)?;
     let photos: Vec<&TruthFrame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();

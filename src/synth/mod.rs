@@ -1,4 +1,5 @@
-//! Data with a known answer: scenes with exact cameras, depth, masks and phrases, and regions with injected errors.
+//! Data with a known answer: scenes with exact cameras, depth, masks and phrases, and regions with
+//! injected errors.
 mod flat;
 mod folder;
 mod outdoor;

@@ -1,12 +1,14 @@
-//! Out of doors: houses behind the objects, paved ground from the feet of the photographer to the horizon, clouds and no
-//! end.
+//! Out of doors: houses behind the objects, paved ground from the feet of the photographer to the
+//! horizon, clouds and no end.
 use super::shapes::{Paint, SceneObject, Shape, paint};
 use crate::math::Random;
 use glam::DVec3;
 
-/// Lengths of a scene out of doors over those of a table: crates of one to two metres, seen from ten.
+/// Lengths of a scene out of doors over those of a table: crates of one to two metres, seen from
+/// ten.
 pub(super) const SCALE: f64 = 10.0;
-/// Height of the camera's elevation above the horizontal, degrees: eyes at two metres. The ground is at the feet.
+/// Height of the camera's elevation above the horizontal, degrees: eyes at two metres. The ground
+/// is at the feet.
 pub(super) const ELEVATION: f64 = 5.0;
 
 /// What stands behind everything, infinitely far away.

@@ -1,4 +1,5 @@
-//! Effects of a phone camera: lens, light, sensor noise. The distributions are stated in docs/internals/data.md.
+//! Effects of a phone camera: lens, light, sensor noise. The distributions are stated in
+//! docs/internals/data.md.
 use crate::math::Random;
 use crate::scene::{Camera, Lens, RgbImage};
 use crate::{Error, Result};
@@ -6,14 +7,16 @@ use glam::DVec2;
 use rayon::prelude::*;
 use serde::Serialize;
 
-/// Focal length over width: from an ultra-wide crop (71° across) to a 28 mm equivalent cropped to 4:3 (45°).
+/// Focal length over width: from an ultra-wide crop (71° across) to a 28 mm equivalent cropped to
+/// 4:3 (45°).
 const FOCAL: (f64, f64) = (0.7, 1.2);
-/// Largest |k1|: three times what the phone of the set `breakfast-phone` has, so that both signs are well covered.
+/// Largest |k1|: three times what the phone of the set `breakfast-phone` has, so that both signs
+/// are well covered.
 const K1: f64 = 0.15;
 /// Largest |k2 / k1|: as the lens of `breakfast-phone`, whose terms are 0.06 and −0.02.
 const K2_SHARE: f64 = 1.0 / 3.0;
-/// Least slope of the distorted by the undistorted radius anywhere in the picture: below it the corners are squeezed to a
-/// quarter and no lens of a phone looks like that.
+/// Least slope of the distorted by the undistorted radius anywhere in the picture: below it the
+/// corners are squeezed to a quarter and no lens of a phone looks like that.
 const MIN_SLOPE: f64 = 0.25;
 /// Largest offset of the principal point along x and along y, share of the width.
 const CENTRE: f64 = 0.01;
@@ -89,7 +92,8 @@ pub struct TrueLight {
     pub exposure_ev: f64,
     /// Gain of R, G and B beside the exposure.
     pub white_balance: [f64; 3],
-    /// v2, v4 of the fall-off `1 + v2 ρ² + v4 ρ⁴`; ρ is the distance from the principal point over half the diagonal.
+    /// v2, v4 of the fall-off `1 + v2 ρ² + v4 ρ⁴`; ρ is the distance from the principal point over
+    /// half the diagonal.
     pub vignetting: [f64; 2],
 }
 
@@ -142,7 +146,8 @@ fn optics(widest: &Camera, effects: &Effects, seed: u64) -> Result<Optics> {
         });
         lens = Some(drawn.ok_or_else(|| Error::work("generate: no lens covers the picture"))?);
     }
-    // The share that is lost in the corner, and how late the fall-off sets in: 0 = with ρ², 1 = with ρ⁴.
+    // The share that is lost in the corner, and how late the fall-off sets in: 0 = with ρ², 1 =
+    // with ρ⁴.
     let (lost, late) = (between(&mut light, 0.0, VIGNETTING), light.uniform());
     Ok(Optics { focal, offset, lens, vignetting: [-lost * (1.0 - late), -lost * late] })
 }
@@ -151,7 +156,8 @@ fn between(random: &mut Random, a: f64, b: f64) -> f64 {
     a + (b - a) * random.uniform()
 }
 
-/// Draws what the photos of one scene go through. Effects that are off change nothing that is drawn for the others.
+/// Draws what the photos of one scene go through. Effects that are off change nothing that is drawn
+/// for the others.
 pub fn photo_effects(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<PhotoEffects>> {
     let Some(first) = cameras.first() else { return Ok(Vec::new()) };
     let stream = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
@@ -238,8 +244,8 @@ mod tests {
         SceneSpec { seed, size: (320, 240), photo_noise: 0.0, effects, ..SceneSpec::default() }
     }
 
-    /// Small white discs before nothing, and for each its centre and its rim. They lie flat, so that each has one
-    /// brightness; rows above would see them from the side.
+    /// Small white discs before nothing, and for each its centre and its rim. They lie flat, so
+    /// that each has one brightness; rows above would see them from the side.
     fn markers(camera: &Camera, lens: &Lens) -> (SyntheticScene, Vec<(DVec3, Vec<DVec3>)>) {
         let to_world = camera.pose.inverse();
         let (mut objects, mut places) = (Vec::new(), Vec::new());

@@ -43,7 +43,8 @@ pub(super) fn build(spec: &SceneSpec) -> Result<SyntheticScene> {
     Ok(scene)
 }
 
-/// Puts all photos where the first one is, turned by `step` degrees from one to the next about the vertical there.
+/// Puts all photos where the first one is, turned by `step` degrees from one to the next about the
+/// vertical there.
 fn turn_in_place(scene: &mut SyntheticScene, step: f64) {
     let middle = (scene.train.len() - 1) as f64 / 2.0;
     let first = scene.train[0].pose;

@@ -5,7 +5,8 @@ use crate::query::presence::*;
 use crate::query::{TextQuery, field_relevancy};
 use crate::scene::{Codebook, LanguageField, LevelField, Plane};
 
-/// A scene that shows some phrases, each as one code with the feature of its text, and a speck of another one.
+/// A scene that shows some phrases, each as one code with the feature of its text, and a speck of
+/// another one.
 fn field(phrases: &[&str], speck: &str) -> (LanguageField, Vec<Plane<i32>>) {
     let dim = regions::DIM;
     let embeddings: Vec<f32> =

@@ -1,9 +1,11 @@
-//! Masks and features made from ground truth, with the errors of segmenters and encoders put in on purpose.
+//! Masks and features made from ground truth, with the errors of segmenters and encoders put in on
+//! purpose.
 //!
-//! The embedding space imitates what CLIP does to crops of one room: all image features share a large common part, so two
-//! different objects still have a cosine near 0.65 and the same object from another side near 0.9, while an image and its
-//! phrase reach only about 0.25. Words have fixed directions, so phrases that share a word are alike ("red can", "red
-//! book"), and any phrase has an embedding.
+//! The embedding space imitates what CLIP does to crops of one room: all image features share a
+//! large common part, so two different objects still have a cosine near 0.65 and the same object
+//! from another side near 0.9, while an image and its phrase reach only about 0.25. Words have
+//! fixed directions, so phrases that share a word are alike ("red can", "red book"), and any phrase
+//! has an embedding.
 use crate::eval::{BACKGROUND_LABELS, GroundTruth, TruthFrame};
 use crate::format::create_folder;
 use crate::format::npy::{self, NpyArray};
@@ -46,8 +48,8 @@ impl InjectedErrors {
     pub const NONE: InjectedErrors =
         InjectedErrors { seed: 0, split: 0.0, merge: 0.0, wrong: 0.0, noise: 0.0 };
 
-    /// The rates that `ablate` injects: every fifth mask is cut and every fifth feature mistaken, about what the paper's
-    /// figures show of SAM and CLIP between views far apart.
+    /// The rates that `ablate` injects: every fifth mask is cut and every fifth feature mistaken,
+    /// about what the paper's figures show of SAM and CLIP between views far apart.
     pub fn default_rates(seed: u64) -> InjectedErrors {
         InjectedErrors { seed, split: 0.2, merge: 0.05, wrong: 0.2, noise: 0.35 }
     }
@@ -128,7 +130,8 @@ fn region_feature(
     sum
 }
 
-/// Makes regions for frames of a ground truth that has masks; parts of objects need depth and are left out without it.
+/// Makes regions for frames of a ground truth that has masks; parts of objects need depth and are
+/// left out without it.
 pub fn regions(truth: &GroundTruth, frames: &[&TruthFrame], flaws: &InjectedErrors) -> Result<Regions> {
     let mut objects = Vec::new();
     for frame in frames {
@@ -158,8 +161,8 @@ pub fn regions(truth: &GroundTruth, frames: &[&TruthFrame], flaws: &InjectedErro
     Ok(Regions { masks, embeddings: embeddings.collect() })
 }
 
-/// Per frame and pixel the quarter of its object, 0 to 3: signs along the object's two longest axes in space, so that all
-/// views agree.
+/// Per frame and pixel the quarter of its object, 0 to 3: signs along the object's two longest axes
+/// in space, so that all views agree.
 fn parts(truth: &GroundTruth, frames: &[&TruthFrame], objects: &[Plane<u32>]) -> Result<Vec<Vec<u8>>> {
     let mut points: BTreeMap<u32, Vec<DVec3>> = BTreeMap::new();
     let mut places = Vec::new();
@@ -231,7 +234,8 @@ fn one_level(
     let swallowed = swallowed(labels, objects, level, flaws, random);
     for (&label, phrase) in labels {
         let pixels: Vec<usize> = (0..objects.data.len()).filter(|&p| objects.data[p] == label).collect();
-        // Drawn whether or not the object shows, so that one view's visibility does not change the others' flaws.
+        // Drawn whether or not the object shows, so that one view's visibility does not change the
+        // others' flaws.
         let (cut, mistaken) = (random.uniform() < flaws.split, random.uniform() < flaws.wrong);
         let other = names[random.below(names.len())];
         let background = BACKGROUND_LABELS.contains(&phrase.as_str());
@@ -336,10 +340,12 @@ fn compacted(masks: LevelMasks) -> LevelMasks {
     out
 }
 
-/// Of the other things that a query is weighed against every so many are in the table of texts: a megabyte of them.
+/// Of the other things that a query is weighed against every so many are in the table of texts: a
+/// megabyte of them.
 const OTHERS_EVERY: usize = 4;
 
-/// Writes regions as a `dir:` folder, with the embeddings of `phrases` and of other things to weigh them against.
+/// Writes regions as a `dir:` folder, with the embeddings of `phrases` and of other things to weigh
+/// them against.
 pub fn write(folder: &Path, frames: &[&TruthFrame], regions: &Regions, phrases: &[String]) -> Result<()> {
     create_folder(folder)?;
     for (frame, view) in frames.iter().zip(&regions.masks) {

@@ -11,9 +11,11 @@ use rayon::prelude::*;
 const LIGHT: DVec3 = DVec3::new(-0.4, -0.5, 0.77);
 /// Brightness of a surface that the light does not reach.
 const AMBIENT: f64 = 0.5;
-/// Direction to the window that shines on surfaces: behind the scene, so that a table shows it to the cameras.
+/// Direction to the window that shines on surfaces: behind the scene, so that a table shows it to
+/// the cameras.
 const WINDOW: DVec3 = DVec3::new(0.25, 0.8, 0.55);
-/// Exponent of highlights (Blinn 1977): half as bright 19 degrees off, as on satin paint or a book's cover.
+/// Exponent of highlights (Blinn 1977): half as bright 19 degrees off, as on satin paint or a
+/// book's cover.
 const HIGHLIGHT: i32 = 12;
 /// Rays per pixel side: edges of the photo are as soft as a lens makes them.
 const SAMPLES: usize = 2;
@@ -58,7 +60,8 @@ fn colour(scene: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, (x, y): 
     sum.map(|v| v / (SAMPLES * SAMPLES) as f64)
 }
 
-/// The picture alone, with a lens if there is one: each ray goes where the lens sends it, so nothing is resampled.
+/// The picture alone, with a lens if there is one: each ray goes where the lens sends it, so
+/// nothing is resampled.
 fn picture(scene: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, noise: f64, seed: u64) -> RgbImage {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let pixel = |p: usize| {
@@ -225,7 +228,8 @@ mod tests {
         };
         // acos near 1 keeps half of the digits
         assert!(error(&SceneSpec { pose_noise: 0.0, ..base.clone() }) < 1e-5);
-        // the mean length of three normal numbers is 1.6 σ; four cameras scatter by a quarter of that
+        // the mean length of three normal numbers is 1.6 σ; four cameras scatter by a quarter of
+        // that
         let two = error(&SceneSpec { pose_noise: 2.0, ..base.clone() });
         assert!((1.5..5.5).contains(&two), "{two}");
         for bad in [

@@ -1,5 +1,5 @@
-//! Small scenes with everything known: a table with objects before a wall, or a place out of doors, and the settings that make
-//! them hard.
+//! Small scenes with everything known: a table with objects before a wall, or a place out of doors,
+//! and the settings that make them hard.
 use super::flat::{self, Flat};
 use super::outdoor::{self, Sky};
 use super::phone::{self, Effects, PhotoEffects};
@@ -36,18 +36,22 @@ pub struct SceneSpec {
     pub occlusion: f64,
     /// Objects that have a look-alike in another place, by one word of their phrase.
     pub similar: usize,
-    /// Standard deviation of the error of the written starting cameras, degrees; positions err alike.
+    /// Standard deviation of the error of the written starting cameras, degrees; positions err
+    /// alike.
     pub pose_noise: f64,
     /// Standard deviation of the photos' noise, in units of full white.
     pub photo_noise: f64,
-    /// Whether cameras stand at even steps; otherwise each is up to 2 degrees off along the circle and 4 above or below it.
+    /// Whether cameras stand at even steps; otherwise each is up to 2 degrees off along the circle
+    /// and 4 above or below it.
     pub steady: bool,
-    /// Focal length of the last photo over that of the first; between them it grows from photo to photo.
+    /// Focal length of the last photo over that of the first; between them it grows from photo to
+    /// photo.
     pub zoom: f64,
     /// Everything on one plane instead.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub flat: Option<Flat>,
-    /// Out of doors, ten times as large: the ground begins at the feet, and behind a house stands the sky.
+    /// Out of doors, ten times as large: the ground begins at the feet, and behind a house stands
+    /// the sky.
     pub outdoor: bool,
     /// Effects of a phone camera on the photos; held-out views then are clean.
     pub effects: Effects,
@@ -223,7 +227,8 @@ fn place_objects(spec: &SceneSpec, random: &mut Random, objects: &mut Vec<SceneO
     random.shuffle(&mut names);
     let kinds = spec.objects - spec.similar;
     let unit = spec.unit();
-    // As close together as asked; where there is no room left, as near to that as they fit on the table.
+    // As close together as asked; where there is no room left, as near to that as they fit on the
+    // table.
     let asked = 0.42 - 0.16 * spec.occlusion;
     let reaches = || (0..).map(|i| asked + 0.04 * f64::from(i)).take_while(|r| *r <= TABLE).map(|r| r * unit);
     let mut taken: Vec<(DVec2, f64)> = Vec::new();
@@ -290,7 +295,8 @@ fn solid(noun: &str, unit: f64, random: &mut Random) -> (f64, Box<dyn Fn(DVec2) 
     }
 }
 
-/// A camera on a sphere around the middle of the scene, looking at it; `elevation` is that over a table.
+/// A camera on a sphere around the middle of the scene, looking at it; `elevation` is that over a
+/// table.
 fn camera(spec: &SceneSpec, name: &str, azimuth: f64, elevation: f64) -> Camera {
     let (target, elevation) = match spec.outdoor {
         true => (DVec3::new(0.0, 0.0, 0.12), outdoor::ELEVATION * elevation / 32.0),

@@ -152,7 +152,8 @@ fn between_cells(p: DVec3, seed: u64) -> f64 {
 }
 
 impl Paint {
-    /// Colour at a place: blocks of three sizes, so that there are corners to match at any distance.
+    /// Colour at a place: blocks of three sizes, so that there are corners to match at any
+    /// distance.
     pub fn at(&self, place: DVec3) -> [f64; 3] {
         // Off the faces of solids that lie on a cell border, where rounding would draw noise.
         let p = place + DVec3::new(0.000_31, 0.000_17, 0.000_23);

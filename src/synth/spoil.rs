@@ -1,5 +1,5 @@
-//! Photo sets of which no right scene, or only part of one, can be made: a run must refuse them, warn of the photo, or come out
-//! right all the same (docs/internals/trust.md#photo-sets).
+//! Photo sets of which no right scene, or only part of one, can be made: a run must refuse them,
+//! warn of the photo, or come out right all the same (docs/internals/trust.md#photo-sets).
 use super::{to_linear, to_srgb};
 use crate::math::Random;
 use crate::scene::{Camera, RgbImage};

@@ -1,4 +1,5 @@
-//! A headless Chromium, driven over the DevTools protocol through a pipe: nothing to install beside the browser itself.
+//! A headless Chromium, driven over the DevTools protocol through a pipe: nothing to install beside
+//! the browser itself.
 #![allow(dead_code, clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Write};
@@ -41,7 +42,8 @@ impl Page {
     /// Opens an empty page of a window of this size, CSS pixels; `phone` adds touch.
     pub fn open(program: &str, width: u32, height: u32, phone: bool) -> Page {
         let profile = tempfile::tempdir().unwrap();
-        // The browser reads commands from descriptor 3 and writes to 4: here its standard input and output.
+        // The browser reads commands from descriptor 3 and writes to 4: here its standard input and
+        // output.
         let mut child = Command::new("sh")
             .args(["-c", "exec \"$@\" 3<&0 4>&1 0</dev/null 1>&2 2>/dev/null", "sh", program])
             .args([

@@ -1,4 +1,5 @@
-//! The open pack at its real sizes: graphs with the interfaces of the public files, filled up with weights that nothing reads.
+//! The open pack at its real sizes: graphs with the interfaces of the public files, filled up with
+//! weights that nothing reads.
 use super::models::clip_graphs;
 use super::server::{File, Server, plain};
 use splatvk::fetch::{Client, Limits, fetch};
@@ -9,7 +10,8 @@ use splatvk::progress::Silent;
 use splatvk_test_support::onnx::{Attribute, FLOAT, Onnx};
 use std::collections::HashMap;
 
-/// Bytes of the two files without a size in the catalogue: 393.0 MiB of weights, the tokenizer of CLIP.
+/// Bytes of the two files without a size in the catalogue: 393.0 MiB of weights, the tokenizer of
+/// CLIP.
 const DA3_WEIGHTS: u64 = 412_090_368;
 
 /// No two bytes alike for long, as in weights.

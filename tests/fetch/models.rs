@@ -12,7 +12,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
-/// A network of depth that says how bright a pixel is. Not for commercial use, one file without a checksum in the catalogue.
+/// A network of depth that says how bright a pixel is. Not for commercial use, one file without a
+/// checksum in the catalogue.
 const DEPTH: &str = "depth_anything_v2_large";
 
 fn depth_network(padding: usize) -> Vec<u8> {
@@ -313,8 +314,8 @@ fn several_files_make_one_model_through_the_library() {
     assert_eq!(found.models.iter().map(|m| m.name.as_str()).collect::<Vec<_>>(), ["clip_toy"]);
 }
 
-/// Towers that know colours find what is red in a scene that they described. Whether it is there they cannot say: they know no word
-/// that could be meant instead.
+/// Towers that know colours find what is red in a scene that they described. Whether it is there
+/// they cannot say: they know no word that could be meant instead.
 #[test]
 fn what_was_fetched_describes_a_scene_and_answers_about_it() {
     let place = Place::new();

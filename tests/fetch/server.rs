@@ -28,7 +28,8 @@ pub struct Server {
 }
 
 impl Server {
-    /// `answer` gets every request, with how many came before it, and writes to the connection, which is closed afterwards.
+    /// `answer` gets every request, with how many came before it, and writes to the connection,
+    /// which is closed afterwards.
     pub fn start(answer: impl Fn(&Request, usize, &mut TcpStream) + Send + Sync + 'static) -> Server {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = format!("http://{}", listener.local_addr().unwrap());

@@ -7,8 +7,8 @@ use splatvk::photo::stem;
 use splatvk::scene::{Camera, Lens, PointCloud};
 use std::path::Path;
 
-/// Camera centres and rotations must survive text files (docs/internals/method.md#camera-files: 1e-9);
-/// centres relative to their size.
+/// Camera centres and rotations must survive text files (docs/internals/method.md#camera-files:
+/// 1e-9); centres relative to their size.
 fn assert_same_cameras(a: &[Camera], b: &[Camera]) {
     assert_eq!(a.len(), b.len());
     for (a, b) in a.iter().zip(b) {

@@ -1,4 +1,5 @@
-//! File formats: what is written reads back, foreign files are understood, damaged ones are refused in one line.
+//! File formats: what is written reads back, foreign files are understood, damaged ones are refused
+//! in one line.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod camera_files;
 
@@ -141,7 +142,8 @@ fn files_of_other_programs() {
     );
     let e = ply::read_splats(&data("formats/brush_init.ply")).unwrap_err().to_string();
     assert!(e.contains("not a Gaussian splat file"), "{e}");
-    // An ASCII cloud with columns in another order, of other types, and an element before the vertices.
+    // An ASCII cloud with columns in another order, of other types, and an element before the
+    // vertices.
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("points.ply");
     let text = "ply\nformat ascii 1.0\ncomment x\nelement camera 1\nproperty float f\nelement vertex 2\nproperty uchar red\n\
@@ -223,7 +225,8 @@ fn differences(a: &Splats, b: &Splats) -> [f32; 5] {
     ]
 }
 
-/// Half a step of each format (positions and scales of the packed PLY: of 10 bits over the range −1 to 1 of the noise).
+/// Half a step of each format (positions and scales of the packed PLY: of 10 bits over the range −1
+/// to 1 of the noise).
 #[test]
 fn packed_formats_round_trip_within_their_precision() {
     let folder = tempfile::tempdir().unwrap();
@@ -269,8 +272,9 @@ fn packed_formats_round_trip_within_their_precision() {
 
 #[test]
 fn splat_files_written_by_splat_transform() {
-    // Four Gaussians at the corners of a square in x and z. splat-transform (MIT, see the licence there) wrote .splat and
-    // versions 3 and 4 from one scene; the version 2 files hold the same bytes by hand, without the turn of the axes.
+    // Four Gaussians at the corners of a square in x and z. splat-transform (MIT, see the licence
+    // there) wrote .splat and versions 3 and 4 from one scene; the version 2 files hold the same
+    // bytes by hand, without the turn of the axes.
     let corners = [[-1.0, 0.0, -1.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]];
     let plain = gaussians::read(&data("formats/minimal.splat")).unwrap().0;
     assert_eq!(plain.means, corners);

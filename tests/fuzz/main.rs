@@ -1,8 +1,9 @@
-//! Every reader of outside bytes against damaged files: no panic, an answer within a second, memory in proportion to the file
-//! (docs/use/formats.md#limits), and errors that are the user's to mend.
+//! Every reader of outside bytes against damaged files: no panic, an answer within a second, memory
+//! in proportion to the file (docs/use/formats.md#limits), and errors that are the user's to mend.
 //!
-//! Coverage-guided fuzzers need a nightly compiler, and on stable Rust their front ends only make random bytes; so valid files
-//! are damaged here ([`mutate`]), those inside of containers with sums and lengths that are right again ([`readers`]).
+//! Coverage-guided fuzzers need a nightly compiler, and on stable Rust their front ends only make
+//! random bytes; so valid files are damaged here ([`mutate`]), those inside of containers with sums
+//! and lengths that are right again ([`readers`]).
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod heap;
 mod mutate;
@@ -30,7 +31,8 @@ const SECONDS: u64 = 60;
 /// Findings of one reader after which the others get their turn.
 const MOST_FINDINGS: usize = 5;
 
-/// `SPLATVK_FUZZ_SECONDS` sets the time, `SPLATVK_FUZZ_SEED` another sequence, `SPLATVK_FUZZ_ONLY` one reader.
+/// `SPLATVK_FUZZ_SECONDS` sets the time, `SPLATVK_FUZZ_SEED` another sequence, `SPLATVK_FUZZ_ONLY`
+/// one reader.
 #[test]
 fn readers_survive_damaged_files() {
     let _alone = ONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -73,7 +75,8 @@ fn readers_survive_damaged_files() {
     assert!(findings.is_empty(), "{} findings:\n{}", findings.len(), findings.join("\n"));
 }
 
-/// In memory where there is such a place: a file system on a disk waits at every file that is written again.
+/// In memory where there is such a place: a file system on a disk waits at every file that is
+/// written again.
 fn memory_folder() -> TempDir {
     let shared = Path::new("/dev/shm");
     if shared.is_dir() { TempDir::new_in(shared) } else { TempDir::new() }.unwrap()

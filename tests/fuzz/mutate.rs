@@ -72,7 +72,8 @@ const LENGTHS: [u64; 14] = [
 
 const FLOATS: [f32; 8] = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX, -0.0, 1e-45, 1e20, -200.0];
 
-/// A copy of a file, damaged in one place, or in up to five: a reader stops at the first that it notices.
+/// A copy of a file, damaged in one place, or in up to five: a reader stops at the first that it
+/// notices.
 pub fn damaged(whole: &[u8], others: &[&[u8]], random: &mut Random) -> Vec<u8> {
     let mut bytes = whole.to_vec();
     for _ in 0..1 + random.below(2) * random.below(5) {

@@ -26,8 +26,8 @@ impl Limits {
     pub const TIME: Duration = Duration::from_secs(1);
     /// Bytes beside four times the file and the file itself.
     pub const ROOM: usize = 64 << 20;
-    /// Of a decoded photo: those that state more than 20 megapixels are not decoded here, and 16 bytes a pixel and as much again
-    /// in the decoder are the most.
+    /// Of a decoded photo: those that state more than 20 megapixels are not decoded here, and 16
+    /// bytes a pixel and as much again in the decoder are the most.
     const PHOTO_ROOM: usize = 2 * 16 * 20_000_000 + Limits::ROOM;
     /// Decoding 20 megapixels takes a second of a busy machine.
     const PHOTO_TIME: Duration = Duration::from_secs(5);
@@ -109,7 +109,8 @@ pub fn within(size: usize, (room, most): (usize, Duration), read: impl FnOnce() 
     let (mark, began, worked) = (Heap::mark(&HEAP), Instant::now(), processor_time());
     let outcome = catch_unwind(AssertUnwindSafe(read));
     let peak = HEAP.peak_above(mark);
-    // Other programs make the clock run on, waiting does not make the processor work: neither is the reader's time by itself.
+    // Other programs make the clock run on, waiting does not make the processor work: neither is
+    // the reader's time by itself.
     let time = match processor_time().zip(worked) {
         Some((now, before)) => (now - before).min(began.elapsed()).max(began.elapsed() / 10),
         None => began.elapsed(),

@@ -14,7 +14,8 @@ pub struct Interpreted {
     pub float_atomics: bool,
     /// No buffer larger than this, bytes.
     pub max_binding: Option<u64>,
-    /// Buffers of these names hold nothing when a program begins: what it reads there it must have written.
+    /// Buffers of these names hold nothing when a program begins: what it reads there it must have
+    /// written.
     pub scratch: &'static [&'static str],
     pub change: Option<Change>,
     /// Modules that have run, and buffers that were scratch.
@@ -57,8 +58,8 @@ struct Buffers<'a> {
 }
 
 impl Buffers<'_> {
-    /// The memory of a buffer. Behind its own bytes a binding goes on to a whole vector of four words, which may be read
-    /// together with the others but must not matter.
+    /// The memory of a buffer. Behind its own bytes a binding goes on to a whole vector of four
+    /// words, which may be read together with the others but must not matter.
     fn memory(&mut self, buffer: &Buffer) -> &mut Memory {
         let entry = self.held.entry(buffer.id()).or_insert_with(|| {
             let bytes = buffer.cast::<u8>().read().expect("a mapped buffer");

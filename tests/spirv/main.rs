@@ -1,5 +1,6 @@
 //! The shipped SPIR-V in the interpreter: every pass against its CPU twin at subgroup sizes that no
-//! device at hand has, with faults that no driver reports. See docs/internals/trust.md#shaders-without-a-device.
+//! device at hand has, with faults that no driver reports. See
+//! docs/internals/trust.md#shaders-without-a-device.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod executor;
 mod mutations;
@@ -49,8 +50,8 @@ fn outcome(scene: passes::Scene, on: &Interpreted) -> Result<(), String> {
     })
 }
 
-/// All scenes at a subgroup size, where something is added atomically with native float atomics and without; the modules
-/// and scratch buffers that they used.
+/// All scenes at a subgroup size, where something is added atomically with native float atomics and
+/// without; the modules and scratch buffers that they used.
 fn run_all(schedule: Schedule) -> BTreeSet<&'static str> {
     let mut failed = Vec::new();
     let mut ran = BTreeSet::new();
@@ -119,7 +120,8 @@ fn subgroups_may_hold_any_invocations() {
     run_all(Schedule { scattered: true, seed: 6, ..interpreted(32, true).schedule });
 }
 
-/// A frame is all that the program writes: nothing of the last frame is left, whatever splats and lists it had.
+/// A frame is all that the program writes: nothing of the last frame is left, whatever splats and
+/// lists it had.
 #[test]
 fn a_frame_depends_on_nothing_that_was_there_before() {
     let scratch = &[
@@ -146,8 +148,8 @@ fn a_frame_depends_on_nothing_that_was_there_before() {
     assert!(unknown.is_empty(), "no pass has buffers named {unknown:?}");
 }
 
-/// Every module that is shipped, with and without native float atomics; workgroups one by one in either order and many at
-/// once; invocations dealt to subgroups in order and at random.
+/// Every module that is shipped, with and without native float atomics; workgroups one by one in
+/// either order and many at once; invocations dealt to subgroups in order and at random.
 #[test]
 #[ignore = "takes long: tools/test-long"]
 fn every_module_in_every_order() {

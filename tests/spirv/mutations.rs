@@ -72,8 +72,8 @@ fn first(list: &mut [Instruction], op: Op) -> &mut Instruction {
 
 #[test]
 fn a_dropped_barrier_is_a_race() {
-    // 2 each of scan_lanes, sort_bases, sort_digits, sort_offsets, ssim_rows_shared and sum, 6 of sort_sweep, 1 of
-    // camera_sum and of each degree of project_backward.
+    // 2 each of scan_lanes, sort_bases, sort_digits, sort_offsets, ssim_rows_shared and sum, 6 of
+    // sort_sweep, 1 of camera_sum and of each degree of project_backward.
     assert_eq!(without_barriers(&[32]), 12 + 6 + 5);
 }
 
@@ -166,9 +166,9 @@ fn a_variant_for_other_subgroups_is_reported() {
     assert!(said.contains("AbsentLane") || said.contains("Race"), "{said}");
 }
 
-/// A tile of the one-sweep sort looks for what those before it tell. It takes its number when it starts, so that they have started
-/// too; with the number of the workgroup they may come later, one at a time: it counts for itself then. With more patience it would
-/// wait for ever.
+/// A tile of the one-sweep sort looks for what those before it tell. It takes its number when it
+/// starts, so that they have started too; with the number of the workgroup they may come later, one
+/// at a time: it counts for itself then. With more patience it would wait for ever.
 #[test]
 fn reliance_on_the_order_of_workgroups_is_reported() {
     let scene = passes::named("sort in one sweep");

@@ -1,5 +1,5 @@
-//! Whether the comparisons with the CPU twins notice a wrong operation: modules that are shipped, with one operation in the place of
-//! another, as a slip of the hand would have it.
+//! Whether the comparisons with the CPU twins notice a wrong operation: modules that are shipped,
+//! with one operation in the place of another, as a slip of the hand would have it.
 use crate::executor::{Change, Interpreted};
 use crate::passes::{self, Scene};
 use crate::{interpreted, outcome};
@@ -26,10 +26,12 @@ const EXTREMES: [(u32, u32); 3] = [(37, 40), (38, 41), (39, 42)];
 
 /// Operations that are exchanged in every module.
 const EACH: usize = 8;
-/// Percent that must be noticed: 82 are (docs/internals/trust.md#shaders-without-a-device), and a changed shader draws other operations. What is
-/// not noticed has no effect in scenes so small, or none at all, such as a bound that the next line tests again.
+/// Percent that must be noticed: 82 are (docs/internals/trust.md#shaders-without-a-device), and a
+/// changed shader draws other operations. What is not noticed has no effect in scenes so small, or
+/// none at all, such as a bound that the next line tests again.
 const LEAST: usize = 77;
-/// Subgroups of the size that the device at hand has, so that the modules are those of the other tests.
+/// Subgroups of the size that the device at hand has, so that the modules are those of the other
+/// tests.
 const SUBGROUP: usize = 8;
 
 fn swapped(i: &Instruction) -> Option<Instruction> {

@@ -199,8 +199,8 @@ pub fn in_bands(
     (image, GpuGradients { splats, features, camera }, bands.count())
 }
 
-/// The lists of both groupings are equal and hold those of the twin, nearest first; how many entries the twin has, and how many
-/// more there are.
+/// The lists of both groupings are equal and hold those of the twin, nearest first; how many
+/// entries the twin has, and how many more there are.
 #[track_caller]
 pub fn assert_lists(device: &Device, scene: &Scene) -> (usize, usize) {
     let forward = scene.twin();

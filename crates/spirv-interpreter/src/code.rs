@@ -1,7 +1,8 @@
 //! What a module is lowered to: scalar operations on registers, in blocks.
 //!
-//! A register holds one 32-bit word for every invocation of a subgroup. A vector, a matrix or a structure is a list of
-//! registers, so taking it apart and putting it together costs nothing. Booleans are 0 or 1.
+//! A register holds one 32-bit word for every invocation of a subgroup. A vector, a matrix or a
+//! structure is a list of registers, so taking it apart and putting it together costs nothing.
+//! Booleans are 0 or 1.
 use spirv::BuiltIn;
 
 pub type Reg = u32;
@@ -150,7 +151,8 @@ pub struct Place {
 pub struct Step {
     pub index: Reg,
     pub stride: u32,
-    /// Number of elements; `Err` for an array up to the end of its buffer, with the word where it begins.
+    /// Number of elements; `Err` for an array up to the end of its buffer, with the word where it
+    /// begins.
     pub count: Result<u32, u32>,
 }
 

@@ -1,4 +1,5 @@
-//! Scheduling of a dispatch: some workgroups at a time, in any order, each for a slice of its blocks.
+//! Scheduling of a dispatch: some workgroups at a time, in any order, each for a slice of its
+//! blocks.
 use crate::code::Code;
 use crate::faults::Faults;
 use crate::memory::Memory;

@@ -1,12 +1,13 @@
 //! Interprets SPIR-V compute shaders, for tests.
 //!
-//! A device has one subgroup size and one scheduler. This interpreter takes any subgroup size and any
-//! order of workgroups, and reports faults that no driver reports:
+//! A device has one subgroup size and one scheduler. This interpreter takes any subgroup size and
+//! any order of workgroups, and reports faults that no driver reports:
 //!
 //! - **data races**, between invocations and between workgroups, by the memory model of Vulkan;
 //! - **reads of unwritten words**, in buffers that start empty, in workgroup and private memory;
 //! - **accesses out of bounds** of buffers, arrays and vectors;
-//! - **subgroup operations** in which not all invocations take part, and shuffles from absent lanes;
+//! - **subgroup operations** in which not all invocations take part, and shuffles from absent
+//!   lanes;
 //! - **barriers** that some invocations never reach, and waits that never end.
 //!
 //! ```no_run
@@ -34,9 +35,9 @@
 //! # Scope
 //! Compute shaders for Vulkan with logical addressing and 32-bit numbers: storage buffers of
 //! descriptor set 0, push constants, workgroup and private memory, atomics, subgroup vote, ballot,
-//! shuffle and arithmetic, most of GLSL.std.450. No images, no other number widths, no functions that
-//! the compiler has not inlined. A module that uses something else makes [`Shader::new`] panic with
-//! its name: this is a test tool, and a panic fails a test.
+//! shuffle and arithmetic, most of GLSL.std.450. No images, no other number widths, no functions
+//! that the compiler has not inlined. A module that uses something else makes [`Shader::new`] panic
+//! with its name: this is a test tool, and a panic fails a test.
 //!
 //! [`module`] takes modules apart and puts them together again, to break one instruction and see
 //! whether tests notice.

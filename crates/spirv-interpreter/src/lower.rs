@@ -1,4 +1,5 @@
-//! The body of a module to [`Code`]: blocks, memory, atomics, what subgroups do. Arithmetic is in `lower_alu.rs`.
+//! The body of a module to [`Code`]: blocks, memory, atomics, what subgroups do. Arithmetic is in
+//! `lower_alu.rs`.
 use crate::code::{
     Atomic, Block, Code, Edge, End, GARBAGE, Inst, Place, Reduction, Reg, Root, Step, Subgroup,
 };
@@ -65,8 +66,8 @@ pub fn lower(words: &[u32]) -> Code {
     }
 }
 
-/// Blocks such that all of a construct comes before its merge block: reverse post-order of a walk that goes to merge
-/// blocks first and to continue targets next.
+/// Blocks such that all of a construct comes before its merge block: reverse post-order of a walk
+/// that goes to merge blocks first and to continue targets next.
 fn structured_order(raw: &[Raw]) -> Vec<usize> {
     let index: HashMap<u32, usize> = raw.iter().enumerate().map(|(k, b)| (b.label, k)).collect();
     let next = |b: usize| -> Vec<usize> {
@@ -232,7 +233,8 @@ impl Lowering {
                 self.push(Inst::Load { to, place, words });
             }
             Op::Store => self.store(w[0], w[1]),
-            // Execution and memory scope are constants too; shaders have barriers of the whole workgroup only.
+            // Execution and memory scope are constants too; shaders have barriers of the whole
+            // workgroup only.
             Op::ControlBarrier => {
                 let scope = self.known(w[0]);
                 assert_eq!(scope, spirv::Scope::Workgroup as u32, "a barrier of a workgroup");
@@ -278,7 +280,8 @@ impl Lowering {
 
     fn atomic(&mut self, i: &Instruction) -> bool {
         let w = &i.words;
-        // Operands: result type and id, pointer, scope, semantics, then the value; a comparison has one semantics more.
+        // Operands: result type and id, pointer, scope, semantics, then the value; a comparison has
+        // one semantics more.
         let (op, value, expected) = match i.op {
             Op::AtomicLoad => (Atomic::Load, None, None),
             Op::AtomicStore => {

@@ -1,8 +1,8 @@
 //! Memory that records the accesses of each word, to find unwritten reads and data races.
 //!
-//! Two accesses race if at least one writes, not both are atomic, they are of different invocations,
-//! and no barrier lies between them. Barriers order the invocations of a workgroup only, and only the
-//! memory that they name. Nothing orders two workgroups of one dispatch.
+//! Two accesses race if at least one writes, not both are atomic, they are of different
+//! invocations, and no barrier lies between them. Barriers order the invocations of a workgroup
+//! only, and only the memory that they name. Nothing orders two workgroups of one dispatch.
 use crate::code::{Atomic, GARBAGE};
 
 /// An invocation: its number within the dispatch, from 1, and the barriers that it has passed.

@@ -1,5 +1,6 @@
-//! The invocations of a subgroup in lockstep. Those that went different ways meet again where the construct merges: the
-//! block that stands first in the structured order runs first, with all invocations that are there.
+//! The invocations of a subgroup in lockstep. Those that went different ways meet again where the
+//! construct merges: the block that stands first in the structured order runs first, with all
+//! invocations that are there.
 use crate::alu;
 use crate::code::{Code, Edge, End, GARBAGE, Inst, Place, Reg, Root, Step};
 use crate::faults::{Fault, Faults};
@@ -12,8 +13,8 @@ pub const OUTSIDE: u32 = 1 << 31;
 /// Block of an invocation that has returned.
 const DONE: u32 = u32::MAX;
 
-/// More blocks than any shader takes in a test, by a factor of ten: a subgroup that runs longer waits for something that
-/// does not come.
+/// More blocks than any shader takes in a test, by a factor of ten: a subgroup that runs longer
+/// waits for something that does not come.
 const MOST_BLOCKS: u64 = 1_000_000;
 
 /// What all workgroups of a dispatch see.

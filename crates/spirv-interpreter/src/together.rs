@@ -12,8 +12,8 @@ fn reduced(op: Reduction, a: u32, b: u32) -> u32 {
 }
 
 impl Subgroup {
-    /// Demands that all invocations take part: where some have gone another way, Vulkan does not say that the others
-    /// have met again.
+    /// Demands that all invocations take part: where some have gone another way, Vulkan does not
+    /// say that the others have met again.
     pub(crate) fn together(&mut self, op: Op, to: Reg, (a, b): (Reg, Reg), at: u32, faults: &mut Faults) {
         let lanes = self.locals.len();
         if self.active.len() != lanes {

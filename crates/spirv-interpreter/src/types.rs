@@ -25,7 +25,8 @@ pub struct Types {
     members: HashMap<(u32, u32), u32>,
 }
 
-/// Where an index leads: the type there, words from one element to the next, and how many there are if that is known.
+/// Where an index leads: the type there, words from one element to the next, and how many there are
+/// if that is known.
 pub struct Member {
     pub ty: u32,
     pub stride: u32,

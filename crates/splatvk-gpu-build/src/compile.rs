@@ -57,7 +57,8 @@ impl Compiler {
         Ok(Family { name: source.name.clone(), path: source.path.clone(), axes, constants, modules })
     }
 
-    /// Fills the cache on all cores. Errors are left to [`Compiler::family`], which meets them again in a fixed order.
+    /// Fills the cache on all cores. Errors are left to [`Compiler::family`], which meets them
+    /// again in a fixed order.
     pub fn warm(out_dir: &Path, sources: &[Source]) {
         let all: Vec<(&Source, Job)> =
             sources.iter().flat_map(|s| jobs(s).into_iter().map(move |j| (s, j))).collect();
@@ -122,7 +123,8 @@ impl Compiler {
                 [] => e.to_string(),
                 _ => format!("{e}\n{file}: error: ... in the variant {macros:?}"),
             })?;
-        // Written beside and renamed, so that an interrupted build leaves no half module in the cache.
+        // Written beside and renamed, so that an interrupted build leaves no half module in the
+        // cache.
         let part = target.with_extension("part");
         std::fs::write(&part, artifact.as_binary_u8())
             .and_then(|()| std::fs::rename(&part, target))

@@ -1,6 +1,7 @@
-//! Constants of the shader sources as Rust sees them, so that the host repeats none: `const` and `#define` at file scope
-//! whose value is a number, or an expression of numbers and earlier constants of the same file. What depends on a macro
-//! that the host or the device chooses is no constant and is left out.
+//! Constants of the shader sources as Rust sees them, so that the host repeats none: `const` and
+//! `#define` at file scope whose value is a number, or an expression of numbers and earlier
+//! constants of the same file. What depends on a macro that the host or the device chooses is no
+//! constant and is left out.
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
@@ -148,8 +149,8 @@ fn evaluate(text: &str, kind: Kind, known: &BTreeMap<String, f64>) -> Option<f64
     Some(sum + sign * product)
 }
 
-/// The Rust declarations. Floats come in f64 with the digits of the source, as the f64 twins need them; `as f32` gives
-/// what the shader has.
+/// The Rust declarations. Floats come in f64 with the digits of the source, as the f64 twins need
+/// them; `as f32` gives the value of the shader.
 pub fn declarations(w: &mut String, file: &str, constants: &[Constant], indent: &str) {
     for c in constants {
         let (scalar, written): (&str, Vec<String>) = match c.kind {

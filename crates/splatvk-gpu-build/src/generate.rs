@@ -114,7 +114,8 @@ fn one(family: &Family) -> Result<String, String> {
     Ok(out)
 }
 
-/// The bindings of all variants together: a variant may leave some out, but a number has one name and a name one number.
+/// The bindings of all variants together: a variant may leave some out, but a number has one name
+/// and a name one number.
 fn union(family: &Family) -> Result<Vec<Binding>, String> {
     let mut all: BTreeMap<u32, Binding> = BTreeMap::new();
     // Modules with native float atomics first: their blocks say what the others keep as bits.

@@ -10,7 +10,8 @@
 //! splatvk_gpu_build::compile("shaders");
 //! ```
 //!
-//! `src/lib.rs`, for `shaders/double.comp` with a buffer block `Values` and a push constant `count`:
+//! `src/lib.rs`, for `shaders/double.comp` with a buffer block `Values` and a push constant
+//! `count`:
 //!
 //! ```ignore
 //! pub mod shaders {

@@ -20,7 +20,7 @@ pub struct Binding {
     pub element: Element,
 }
 
-/// What a block holds, one or many.
+/// Element type of a block.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Element {
     /// The scalar of scalars, vectors and arrays of them.
@@ -37,7 +37,8 @@ pub enum Scalar {
     U32,
 }
 
-/// A member of the push constants or of a structure: array of columns of rows of scalars, each level optional.
+/// A member of the push constants or of a structure: array of columns of rows of scalars, each
+/// level optional.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Member {
     pub name: String,
@@ -60,7 +61,7 @@ pub struct Layout {
     pub bytes: u32,
 }
 
-/// What one module looks like from the host.
+/// The interface of a module.
 #[derive(Clone, Debug, Default)]
 pub struct Reflection {
     pub bindings: Vec<Binding>,
@@ -72,7 +73,8 @@ pub struct Reflection {
     pub capabilities: Vec<&'static str>,
 }
 
-/// SPIR-V capability number → variant of `splatvk_gpu::Capability`; `None` for those that every Vulkan 1.2 device has.
+/// SPIR-V capability number → variant of `splatvk_gpu::Capability`; `None` for those that every
+/// Vulkan 1.2 device has.
 const CAPABILITIES: &[(u32, Option<&str>)] = &[
     (1, None), // Shader
     (9, Some("Float16")),
@@ -182,7 +184,7 @@ impl Reader {
         Ok(())
     }
 
-    /// Follows pointers into variables and notes what is done through them.
+    /// Follows pointers to their variables and records the accesses.
     fn access(&mut self, opcode: u32, o: &[u32]) {
         const READ: Access = Access { read: true, write: false };
         const WRITE: Access = Access { read: false, write: true };
@@ -201,7 +203,8 @@ impl Reader {
             }
             68 => {} // OpArrayLength reads the descriptor, not the memory.
             229..=242 | 6035 | 5614 | 5615 => self.touch(o[2], BOTH),
-            // OpFunctionCall, OpCopyObject, OpSelect, OpPhi: a pointer handed on may be used for anything.
+            // OpFunctionCall, OpCopyObject, OpSelect, OpPhi: a pointer handed on may be used for
+            // anything.
             57 | 83 | 169 | 245 => o[2..].iter().for_each(|&id| self.touch(id, BOTH)),
             _ => {}
         }
@@ -274,7 +277,8 @@ impl Reader {
             self.decorations.contains_key(&(id, what))
                 || (0..members.len() as u32).all(|m| self.member_decorations.contains_key(&(block, m, what)))
         };
-        // `readonly` / `writeonly` are promises the GLSL compiler enforces; what the code does is the finer truth.
+        // `readonly` / `writeonly` are promises the GLSL compiler enforces; what the code does is
+        // the finer truth.
         let used = self.used.get(&id).copied().unwrap_or_default();
         let access = Access {
             read: used.read && !declared(NON_READABLE),

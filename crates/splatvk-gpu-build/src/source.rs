@@ -1,9 +1,10 @@
-//! Reading the shader sources: which files there are, what they include, which macro variants they ask for.
+//! Shader sources: the files, their includes, and the macro variants they
+//! ask for.
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// The header of this crate. A shader that includes it is compiled with native float atomics and with
-/// a compare-and-swap loop.
+/// The header of this crate. A shader that includes it is compiled with native float atomics and
+/// with a compare-and-swap loop.
 const ATOMIC_FLOAT: &str = "gpu/atomic_float.glsl";
 
 /// The text of an included file. `name` is relative to the folder of shaders, or a header of this
@@ -24,9 +25,11 @@ pub struct Source {
     pub closure: String,
     /// `// variants: CHANNELS=3,4,20`: one entry per line, combined as a cartesian product.
     pub axes: Vec<(String, Vec<u32>)>,
-    /// `// subgroups: 8,16,32`: compiled once per size (macro SUBGROUP_SIZE), chosen by the device at run time.
+    /// `// subgroups: 8,16,32`: compiled once per size (macro SUBGROUP_SIZE), chosen by the device
+    /// at run time.
     pub subgroups: Vec<u32>,
-    /// The file includes `gpu/atomic_float.glsl` (macro FLOAT_ATOMICS, chosen by the device at run time).
+    /// The file includes `gpu/atomic_float.glsl` (macro FLOAT_ATOMICS, chosen by the device at run
+    /// time).
     pub float_atomics: bool,
 }
 

@@ -8,7 +8,8 @@ use crate::{Error, Result};
 use ash::vk;
 use std::ffi::{CStr, CString};
 
-/// The host's Vulkan objects. They must outlive the [`Device`] made from them and everything made on it.
+/// The host's Vulkan objects. They must outlive the [`Device`] made from them and everything made
+/// on it.
 pub struct HostDevice {
     /// Where the host has its Vulkan functions from; `None` loads the system's loader.
     pub get_instance_proc_addr: Option<vk::PFN_vkGetInstanceProcAddr>,
@@ -31,12 +32,12 @@ pub struct HostDevice {
 }
 
 impl Device {
-    /// Works on the host's device; it is not destroyed with the [`Device`]. Of `options` only `staging`, `deterministic`
-    /// and `disabled` count.
+    /// Works on the host's device; it is not destroyed with the [`Device`]. Of `options` only
+    /// `staging`, `deterministic` and `disabled` count.
     ///
     /// # Safety
-    /// The handles are valid, belong together, were made as `host` says, and outlive everything made from the result.
-    /// The queue is used as [`HostDevice::queue_lock`] says.
+    /// The handles are valid, belong together, were made as `host` says, and outlive everything
+    /// made from the result. The queue is used as [`HostDevice::queue_lock`] says.
     pub unsafe fn adopt(host: HostDevice, options: &Options) -> Result<Device> {
         let refuse = |what: &str| Err(Error::Host(format!("the host's Vulkan device: {what}")));
         let null = host.instance == vk::Instance::null()
@@ -51,7 +52,8 @@ impl Device {
             Some(get) => unsafe { ash::Entry::from_static_fn(ash::StaticFn { get_instance_proc_addr: get }) },
             None => select::load()?,
         };
-        // A missing function becomes a stub that aborts when called, so ask for the newest ones that are used.
+        // A missing function becomes a stub that aborts when called, so ask for the newest ones
+        // that are used.
         // SAFETY: a live instance, per the contract, and a name that ends with zero.
         let instance_has =
             |name: &CStr| unsafe { entry.get_instance_proc_addr(host.instance, name.as_ptr()) };

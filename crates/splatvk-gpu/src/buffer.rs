@@ -10,15 +10,18 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
-/// A storage buffer of `T` in device memory. Clones share it; it lives as long as any clone, or any program that uses it.
+/// A storage buffer of `T` in device memory. Clones share it; it lives as long as any clone, or any
+/// program that uses it.
 ///
-/// The bindings of a shader ask for the element that its source declares: the scalar of scalars, vectors and arrays of
-/// them, so that a `vec4[]` and a `float[]` are both `Buffer<f32>` and their lengths count floats; the generated structure
-/// of structures. [`Buffer::cast`] is for memory that is declared in two ways. A plain `Buffer` is one of words, `u32`.
+/// The bindings of a shader ask for the element that its source declares: the scalar of scalars,
+/// vectors and arrays of them, so that a `vec4[]` and a `float[]` are both `Buffer<f32>` and their
+/// lengths count floats; the generated structure of structures. [`Buffer::cast`] is for memory that
+/// is declared in two ways. A plain `Buffer` is one of words, `u32`.
 ///
-/// On memory that is not mapped, what the host writes waits for the next submission and goes along with it, and what a
-/// recording has downloaded ([`crate::Recorder::download`]) is read without one; other reads submit and wait. Do not write
-/// from one thread what a program run by another uses.
+/// On memory that is not mapped, what the host writes waits for the next submission and goes along
+/// with it, and what a recording has downloaded ([`crate::Recorder::download`]) is read without
+/// one; other reads submit and wait. Do not write from one thread what a program run by another
+/// uses.
 pub struct Buffer<T = u32>(Arc<Inner>, PhantomData<fn() -> T>);
 
 struct Inner {
@@ -90,8 +93,8 @@ impl<T> Buffer<T> {
         Ok(Buffer(Arc::new(inner), PhantomData))
     }
 
-    /// The same memory with elements of another type; both handles share it. What does not fill a last element is not
-    /// counted by [`Buffer::len`].
+    /// The same memory with elements of another type; both handles share it. What does not fill a
+    /// last element is not counted by [`Buffer::len`].
     pub fn cast<U>(&self) -> Buffer<U> {
         Buffer(self.0.clone(), PhantomData)
     }
@@ -158,7 +161,7 @@ impl<T> Buffer<T> {
         self.0.host.get().is_some_and(|copy| copy.id() == other.id())
     }
 
-    /// Says whether the host's copy is what the buffer holds.
+    /// Marks the host's copy as equal to the buffer, or as outdated.
     pub(crate) fn set_fetched(&self, fetched: bool) {
         self.0.fetched.store(fetched, Ordering::Release);
     }
@@ -194,13 +197,13 @@ impl<T: Pod> Buffer<T> {
     /// Elements of a range.
     pub fn read_range(&self, range: Range<usize>) -> Result<Vec<T>> {
         let mut out = Vec::with_capacity(range.len());
-        self.show(range, &mut |_, piece| out.extend_from_slice(piece))?;
+        self.read_with(range, &mut |_, piece| out.extend_from_slice(piece))?;
         Ok(out)
     }
 
-    /// What [`Buffer::read_range`] copies, where the host reads it: piece by piece, each with its place in the range. `seen` must
-    /// not use the buffer.
-    pub fn show(&self, range: Range<usize>, seen: &mut dyn FnMut(usize, &[T])) -> Result<()> {
+    /// Passes the elements of a range to `visit` piece by piece, each with its place in the range,
+    /// without a copy. `visit` must not use the buffer.
+    pub fn read_with(&self, range: Range<usize>, visit: &mut dyn FnMut(usize, &[T])) -> Result<()> {
         let bytes = self.byte_range(range)?;
         let (start, end) = (bytes.start as usize, bytes.end as usize);
         if start == end {
@@ -209,14 +212,14 @@ impl<T: Pod> Buffer<T> {
         let fetched = self.0.host.get().filter(|_| self.0.fetched.load(Ordering::Acquire));
         for mapped in [Some(self.cast()), fetched.cloned()].into_iter().flatten() {
             if let Some(memory) = lock(&mapped.0.block).as_ref().and_then(Block::bytes) {
-                seen(0, bytemuck::cast_slice(&memory[start..end]));
+                visit(0, bytemuck::cast_slice(&memory[start..end]));
                 return Ok(());
             }
         }
         let mut at = 0;
         self.0.device.staged_read(self.raw(), bytes, &mut |piece| {
             let piece: &[T] = bytemuck::cast_slice(piece);
-            seen(at, piece);
+            visit(at, piece);
             at += piece.len();
         })
     }
@@ -251,7 +254,7 @@ impl<T> std::fmt::Debug for Buffer<T> {
 impl Drop for Inner {
     fn drop(&mut self) {
         if let Some(block) = lock(&self.block).take() {
-            lock(&self.device.0.staging).bury(&self.device.0.device, &self.device.0.heap, block);
+            lock(&self.device.0.staging).defer_free(&self.device.0.device, &self.device.0.heap, block);
         }
     }
 }

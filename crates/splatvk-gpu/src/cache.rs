@@ -7,8 +7,8 @@ use std::io;
 
 /// Keeps bytes by name. The host decides where, for instance in files of a folder.
 pub trait Cache: Debug + Send + Sync {
-    /// The bytes last written under a name. `None` if there are none or they may have changed since:
-    /// drivers trust their data, so an implementation verifies a checksum.
+    /// The bytes last written under a name. `None` if there are none or they may have changed
+    /// since: drivers trust their data, so an implementation verifies a checksum.
     fn read(&self, name: &str) -> Option<Vec<u8>>;
 
     /// Replaces the bytes of a name as a whole.
@@ -57,7 +57,8 @@ impl Driver {
         format!("{}-{}.disabled", self.name, env!("CARGO_PKG_VERSION"))
     }
 
-    /// Compiled pipelines of an earlier process. Empty if there are none or another driver made them.
+    /// Compiled pipelines of an earlier process. Empty if there are none or another driver made
+    /// them.
     pub fn pipelines(&self, cache: &dyn Cache) -> Vec<u8> {
         cache.read(&self.pipelines_name()).filter(|data| data.starts_with(&self.header)).unwrap_or_default()
     }

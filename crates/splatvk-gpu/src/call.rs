@@ -15,9 +15,10 @@ pub struct Call {
 }
 
 impl Call {
-    /// A call of a shader of one's own: one of the family's variants, a buffer per binding number, and the push constants as
-    /// the shader lays them out. Generated `shaders::NAME::call` functions check all of that at compile time; here a missing buffer is
-    /// an error when the recording is compiled.
+    /// A call of a shader of one's own: one of the family's variants, a buffer per binding number,
+    /// and the push constants as the shader lays them out. Generated `shaders::NAME::call`
+    /// functions check all of that at compile time; here a missing buffer is an error when the
+    /// recording is compiled.
     pub fn new(
         family: &'static Family,
         variant: Vec<u32>,

@@ -1,5 +1,6 @@
-//! Tells the host when a driver takes long to compile shaders, while it does: on a first run some take half a minute. Drivers that
-//! compile when a pipeline first runs, as lavapipe does, are not seen.
+//! Tells the host when a driver takes long to compile shaders, while it does: on a first run some
+//! take half a minute. Drivers that compile when a pipeline first runs, as lavapipe does, are not
+//! seen.
 use crate::sync::lock;
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::sync::{Mutex, OnceLock};
@@ -10,16 +11,18 @@ type Listener = fn(&str);
 
 static LISTENER: OnceLock<Listener> = OnceLock::new();
 
-/// A user who sees nothing for longer believes that the program hangs; lavapipe with its pipelines on disk needs less for all of them.
+/// A user who sees nothing for longer believes that the program hangs; lavapipe with its pipelines
+/// on disk needs less for all of them.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// Has `listener` called, at most once per device and from a thread of its own, when the driver of a device has compiled for two
-/// seconds and is not done. The first listener of a process stays.
+/// Has `listener` called, at most once per device and from a thread of its own, when the driver of
+/// a device has compiled for two seconds and is not done. The first listener of a process stays.
 pub fn on_long_compilation(listener: fn(&str)) {
     let _ = LISTENER.set(listener);
 }
 
-/// What is left of the patience with one device; none once the listener was called.
+/// The time that compilations on one device may still take before the listener is called; none
+/// afterwards.
 pub(crate) struct CompileTime(Mutex<Option<Duration>>);
 
 impl CompileTime {

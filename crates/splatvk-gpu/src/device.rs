@@ -74,8 +74,8 @@ pub(crate) struct Inner {
 }
 
 impl Device {
-    /// Adds this crate's part to a logical device. On failure the device is destroyed if it is ours; the instance
-    /// stays with the caller.
+    /// Adds this crate's part to a logical device. On failure the device is destroyed if it is
+    /// ours; the instance stays with the caller.
     pub(crate) fn assemble(
         entry: ash::Entry,
         physical: vk::PhysicalDevice,
@@ -92,7 +92,8 @@ impl Device {
             let kept = cache.as_ref().map(|c| driver.pipelines(c.as_ref())).unwrap_or_default();
             let create = |data: &[u8]| {
                 let info = vk::PipelineCacheCreateInfo::default().initial_data(data);
-                // SAFETY: the device is alive; the data is what its driver gave, by checksum and header, or empty.
+                // SAFETY: the device is alive; the data is what its driver gave, by checksum and
+                // header, or empty.
                 unsafe { device.create_pipeline_cache(&info, None) }
             };
             let pipelines = create(&kept).or_else(|_| create(&[])).map_err(vk_error("pipeline cache"))?;
@@ -159,7 +160,7 @@ impl Device {
         lock(&self.0.pipelines).keys().map(|key| key.0).collect()
     }
 
-    /// What the device is and can do.
+    /// The device's properties, limits and features.
     pub fn info(&self) -> &DeviceInfo {
         &self.0.info
     }
@@ -196,7 +197,7 @@ impl Device {
         self.0.driver.clone()
     }
 
-    /// What the validation layer has said so far; always empty without validation.
+    /// Messages of the validation layer so far; always empty without validation.
     pub fn validation_messages(&self) -> Vec<String> {
         self.0.sink.as_ref().map(Sink::messages).unwrap_or_default()
     }
@@ -225,7 +226,8 @@ impl Device {
 
     /// Records with synchronization2, wherever it comes from.
     pub(crate) fn cmd_barrier(&self, commands: vk::CommandBuffer, dependency: &vk::DependencyInfo<'_>) {
-        // SAFETY: the caller records `commands`, and synchronization2 is enabled on every device opened.
+        // SAFETY: the caller records `commands`, and synchronization2 is enabled on every device
+        // opened.
         unsafe {
             match &self.0.sync2 {
                 Some(extension) => extension.cmd_pipeline_barrier2(commands, dependency),
@@ -247,7 +249,8 @@ impl Device {
         }
         let queue = lock(&self.0.queue);
         let mut outcome = Ok(());
-        // SAFETY: our threads are kept apart by the lock, the host's by `queue_lock` or its promise (see HostDevice).
+        // SAFETY: our threads are kept apart by the lock, the host's by `queue_lock` or its promise
+        // (see HostDevice).
         let mut submit = || outcome = unsafe { self.0.device.queue_submit(*queue, infos, fence) };
         match &self.0.queue_lock {
             Some(host) => host(&mut submit),
@@ -265,11 +268,12 @@ impl std::fmt::Debug for Device {
 
 impl Drop for Inner {
     fn drop(&mut self) {
-        // SAFETY: buffers and programs hold the device, so only the parts below are left, and nothing runs: every submit waits.
+        // SAFETY: buffers and programs hold the device, so only the parts below are left, and
+        // nothing runs: every submit waits.
         unsafe {
             if self.owned {
-                // Every submit was waited for; this is for what a driver may do on its own. On the host's device it would
-                // take all of the host's queues.
+                // Every submit was waited for; this is for what a driver may do on its own. On the
+                // host's device it would take all of the host's queues.
                 let _ = self.device.device_wait_idle();
             }
             if let Some(cache) = &self.cache

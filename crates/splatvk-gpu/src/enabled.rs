@@ -1,8 +1,9 @@
 //! Features of a device that the host made.
 use ash::vk;
 
-/// Features that the host's device was made with. Only `synchronization2` is indispensable; each other one that is there
-/// allows faster shaders, and `timeline_semaphore` is needed for [`crate::external::Sync`].
+/// Features that the host's device was made with. Only `synchronization2` is indispensable; each
+/// other one that is there allows faster shaders, and `timeline_semaphore` is needed for
+/// [`crate::external::Sync`].
 #[derive(Clone, Copy, Debug, Default)]
 pub struct EnabledFeatures {
     /// Vulkan 1.0 features.
@@ -28,8 +29,8 @@ pub struct EnabledFeatures {
 }
 
 impl EnabledFeatures {
-    /// Reads a chain that starts with `VkPhysicalDeviceFeatures2`, as it was given to `vkCreateDevice`. Unknown
-    /// structures are skipped.
+    /// Reads a chain that starts with `VkPhysicalDeviceFeatures2`, as it was given to
+    /// `vkCreateDevice`. Unknown structures are skipped.
     ///
     /// # Safety
     /// `chain` is null or a valid chain of Vulkan structures.
@@ -38,7 +39,8 @@ impl EnabledFeatures {
         let mut f = EnabledFeatures::default();
         let mut next = chain.cast::<vk::BaseInStructure<'_>>();
         while !next.is_null() {
-            // SAFETY: a valid chain, per the contract; each structure has the type that its `s_type` says.
+            // SAFETY: a valid chain, per the contract; each structure has the type that its
+            // `s_type` says.
             unsafe {
                 match (*next).s_type {
                     vk::StructureType::PHYSICAL_DEVICE_FEATURES_2 => {

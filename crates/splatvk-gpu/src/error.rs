@@ -47,7 +47,7 @@ pub enum Error {
     /// The driver refused something else, or a recording is wrong.
     #[error("Vulkan: {message}")]
     Refused {
-        /// What was refused and why.
+        /// The refused operation and the reason.
         message: String,
         /// The driver's result, if it was asked.
         source: Option<VulkanError>,

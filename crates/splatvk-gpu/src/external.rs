@@ -1,4 +1,5 @@
-//! Handing results to buffers and images of the host program, on a device that it shares with splatvk.
+//! Handing results to buffers and images of the host program, on a device that it shares with
+//! splatvk.
 use crate::buffer::Buffer;
 use crate::device::Device;
 use crate::error::vk_error;
@@ -16,7 +17,8 @@ pub enum Target {
         /// First byte.
         offset: u64,
     },
-    /// An image of the host with `TRANSFER_DST` usage: 2D, mip level 0, layers from 0 on, colour aspect.
+    /// An image of the host with `TRANSFER_DST` usage: 2D, mip level 0, layers from 0 on, colour
+    /// aspect.
     Image {
         /// The host's image.
         raw: vk::Image,
@@ -40,7 +42,8 @@ pub struct Sync {
     pub signal: Option<(vk::Semaphore, u64)>,
 }
 
-/// A delivery under way. It keeps its sources; dropping it waits until the device is done with them.
+/// A delivery under way. It keeps its sources; dropping it waits until the device is done with
+/// them.
 pub struct Delivery {
     device: Device,
     pool: vk::CommandPool,
@@ -50,12 +53,13 @@ pub struct Delivery {
 }
 
 impl Device {
-    /// Copies whole buffers to targets of the host, ordered by timeline semaphores. The targets belong to the queue
-    /// family of the device when the copy begins, and still do when it ends.
+    /// Copies whole buffers to targets of the host, ordered by timeline semaphores. The targets
+    /// belong to the queue family of the device when the copy begins, and still do when it ends.
     ///
     /// # Safety
-    /// Every target is alive until the copy has ended, has the usage that [`Target`] names, is as large as its source
-    /// (images: `size` × `layers` texels of the source's texel size), and is on this device.
+    /// Every target is alive until the copy has ended, has the usage that [`Target`] names, is as
+    /// large as its source (images: `size` × `layers` texels of the source's texel size), and is on
+    /// this device.
     pub unsafe fn deliver(&self, copies: Vec<(Buffer, Target)>, sync: Sync) -> Result<Delivery> {
         if self.0.owned {
             return Err(Error::Host(
@@ -110,7 +114,8 @@ impl Device {
         self.cmd_edge_barrier(commands);
         self.cmd_layouts(commands, copies, false);
         for (from, target) in copies {
-            // SAFETY: recording; sources are kept by the delivery, targets are valid per the contract of `deliver`.
+            // SAFETY: recording; sources are kept by the delivery, targets are valid per the
+            // contract of `deliver`.
             unsafe {
                 match *target {
                     Target::Buffer { raw, offset } => {
@@ -187,7 +192,8 @@ impl Device {
             (sync.wait.into_iter().collect(), sync.signal.into_iter().collect());
         let (waits, wait_values): (Vec<_>, Vec<_>) = wait.into_iter().unzip();
         let (signals, signal_values): (Vec<_>, Vec<_>) = signal.into_iter().unzip();
-        // What precedes in the command buffer reads only our own memory, but keeping it behind the wait costs nothing.
+        // Earlier commands read only our own memory, but keeping it behind the
+        // wait costs nothing.
         let stages = vec![vk::PipelineStageFlags::ALL_COMMANDS; waits.len()];
         let mut timeline = vk::TimelineSemaphoreSubmitInfo::default()
             .wait_semaphore_values(&wait_values)

@@ -1,4 +1,4 @@
-//! Device features: which there are, which get enabled, what they mean for shaders.
+//! Device features: the offered ones, the enabled ones, and the shader capabilities that follow.
 use crate::enabled::EnabledFeatures;
 use crate::error::vk_error;
 use crate::info::{DeviceInfo, Options};
@@ -8,7 +8,7 @@ use crate::{Error, Result};
 use ash::vk;
 use std::collections::BTreeSet;
 
-/// What a physical device offers, before anything is enabled.
+/// The features that a physical device offers.
 #[derive(Clone, Copy, Default)]
 struct AvailableFeatures {
     base: vk::PhysicalDeviceFeatures,
@@ -123,7 +123,7 @@ pub(crate) fn create(
     Ok((device, described))
 }
 
-/// The description of a device that the host made: what it enabled is what there is.
+/// The description of a device that the host made: the enabled features are the offered ones.
 pub(crate) fn adopted(
     instance: &ash::Instance,
     candidate: &Candidate,

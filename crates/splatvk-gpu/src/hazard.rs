@@ -1,10 +1,12 @@
-//! Which barriers a list of commands needs, and an independent check that a list with barriers has them all.
+//! Which barriers a list of commands needs, and an independent check that a list with barriers has
+//! them all.
 //!
-//! Everything here is plain data (buffers are numbers), so both halves are tested without a device. They are written
-//! from opposite ends: [`derive`] keeps a summary per buffer and inserts what the next command lacks; [`check`] follows
-//! every single access through the barriers behind it, by the rules of the Vulkan memory model (execution dependency
-//! chains, availability, visibility). The validation layers are not enough: they miss read-modify-write chains between
-//! dispatches and float atomics.
+//! Everything here is plain data (buffers are numbers), so both halves are tested without a device.
+//! They are written from opposite ends: [`derive`] keeps a summary per buffer and inserts what the
+//! next command lacks; [`check`] follows every single access through the barriers behind it, by the
+//! rules of the Vulkan memory model (execution dependency chains, availability, visibility). The
+//! validation layers are not enough: they miss read-modify-write chains between dispatches and
+//! float atomics.
 use std::collections::BTreeMap;
 
 /// Where in the pipeline a command touches memory.
@@ -47,7 +49,7 @@ pub(crate) enum Step {
     Command(usize),
 }
 
-/// What [`derive`] remembers of a buffer.
+/// The state of a buffer in [`derive`].
 #[derive(Clone, Copy, Default)]
 struct BufferState {
     /// AccessStage of the last write.
@@ -102,7 +104,8 @@ struct PastAccess {
     write: bool,
     /// Stages that run after it.
     ordered: u8,
-    /// For a write: some barrier made it available, so that later barriers of the chain can make it visible.
+    /// For a write: some barrier made it available, so that later barriers of the chain can make it
+    /// visible.
     available: bool,
     /// For a write: stages whose reads / writes see it.
     visible: StageMasks,
@@ -129,7 +132,8 @@ pub(crate) fn check(commands: &[Vec<BufferAccess>], steps: &[Step]) -> Vec<Hazar
                 }
             }
             Step::Command(index) => {
-                // Against what came before the command first, so that its own touches do not meet each other.
+                // Against what came before the command first, so that its own touches do not meet
+                // each other.
                 for touch in &commands[*index] {
                     let earlier = past.entry(touch.buffer).or_default();
                     hazards.extend(earlier.iter().filter_map(|p| hazard(p, touch, *index)));
@@ -137,8 +141,8 @@ pub(crate) fn check(commands: &[Vec<BufferAccess>], steps: &[Step]) -> Vec<Hazar
                 for touch in &commands[*index] {
                     let earlier = past.entry(touch.buffer).or_default();
                     if touch.write {
-                        // What was ordered before this write is ordered before whatever follows it; what was not has
-                        // been reported.
+                        // What was ordered before this write is ordered before whatever follows it;
+                        // what was not has been reported.
                         earlier.clear();
                     }
                     earlier.push(PastAccess {
@@ -190,7 +194,8 @@ fn hazard(past: &PastAccess, touch: &BufferAccess, later: usize) -> Option<Hazar
     None
 }
 
-/// A buffer that one command touches twice, at least once writing: the order of the two is undefined.
+/// A buffer that one command touches twice, at least once writing: the order of the two is
+/// undefined.
 pub(crate) fn aliased(touches: &[BufferAccess]) -> Option<u64> {
     touches.iter().enumerate().find_map(|(i, a)| {
         touches[..i].iter().find(|b| b.buffer == a.buffer && (a.write || b.write)).map(|b| b.buffer)
@@ -247,7 +252,8 @@ mod tests {
                 removed += 1;
             }
         }
-        // By hand: buffer 1 before commands 1, 2, 3, 5, 7; buffer 2 before 4 and 6; buffer 3 before 5.
+        // By hand: buffer 1 before commands 1, 2, 3, 5, 7; buffer 2 before 4 and 6; buffer 3 before
+        // 5.
         assert_eq!(removed, 8);
     }
 

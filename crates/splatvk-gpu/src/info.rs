@@ -15,24 +15,29 @@ pub struct Options {
     pub choice: Option<String>,
     /// Khronos validation layer with synchronization validation.
     pub validation: bool,
-    /// With validation: shaders also check every access to a buffer. A test takes minutes instead of seconds.
+    /// With validation: shaders also check every access to a buffer. A test takes minutes instead
+    /// of seconds.
     pub gpu_assisted: bool,
-    /// Keep buffers out of host-visible memory, as on a GPU, even on a CPU device (to test the staging path).
+    /// Keep buffers out of host-visible memory, as on a GPU, even on a CPU device (to test the
+    /// staging path).
     pub staging: bool,
-    /// Only passes that give the same bits on every run of this device, even where others are faster.
+    /// Only passes that give the same bits on every run of this device, even where others are
+    /// faster.
     pub deterministic: bool,
-    /// No buffer larger than this, bytes, although the device would bind more: to test what is done in blocks.
+    /// No buffer larger than this, bytes, although the device would bind more: to test what is done
+    /// in blocks.
     pub max_binding: Option<u64>,
     /// Keeps compiled pipelines, and the kernel variants that are disabled on a device, from one
     /// process to the next. Not used on a host's device.
     pub cache: Option<Arc<dyn Cache>>,
-    /// Names of kernel variants not to be used. The crate itself knows [`NATIVE_FLOAT_ATOMICS`]; the
-    /// others are the program's, which finds them in [`DeviceInfo::disabled`].
+    /// Names of kernel variants not to be used. The crate itself knows [`NATIVE_FLOAT_ATOMICS`];
+    /// the others are the program's, which finds them in [`DeviceInfo::disabled`].
     pub disabled: BTreeSet<String>,
 }
 
 /// Rounds after which lavapipe leaves the loops of a shader, all of them together, and says nothing
-/// (`LP_MAX_TGSI_LOOP_ITERATIONS`, Mesa 22 to 25). Passes share work among lanes so that no lane comes near, on any device.
+/// (`LP_MAX_TGSI_LOOP_ITERATIONS`, Mesa 22 to 25). Passes share work among lanes so that no lane
+/// comes near, on any device.
 pub const LOOP_ROUNDS: usize = 65_535;
 
 /// A device's properties, limits and features.
@@ -51,7 +56,8 @@ pub struct DeviceInfo {
     pub mapped: bool,
     /// Default subgroup size.
     pub subgroup_size: u32,
-    /// Smallest and largest size that can be pinned; both `subgroup_size` without subgroup size control.
+    /// Smallest and largest size that can be pinned; both `subgroup_size` without subgroup size
+    /// control.
     pub subgroup_sizes: (u32, u32),
     /// Subgroup sizes can be pinned per pipeline.
     pub subgroup_control: bool,

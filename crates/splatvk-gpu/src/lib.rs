@@ -42,20 +42,21 @@
 //! ```
 //!
 //! # Parts
-//! - [`Device::open`] opens a device of its own, [`Device::adopt`] works on one of the host program.
+//! - [`Device::open`] opens a device of its own, [`Device::adopt`] works on one of the host
+//!   program.
 //! - [`Device::buffer`] and [`Device::buffer_from`] make storage buffers. [`Buffer`] is a handle;
 //!   clones share the memory.
-//! - [`Recorder`] records fills, copies and dispatches. Recording never fails; [`Recorder::run`] and
-//!   [`Recorder::compile`] return the first mistake.
+//! - [`Recorder`] records fills, copies and dispatches. Recording never fails; [`Recorder::run`]
+//!   and [`Recorder::compile`] return the first mistake.
 //! - [`Program`] is a compiled recording, to be run any number of times. Values that change between
 //!   runs go through a small buffer.
-//! - [`Family`] and [`Module`] are the tables that `splatvk-gpu-build` generates. They can be written
-//!   by hand for SPIR-V from elsewhere ([`Call::new`]).
+//! - [`Family`] and [`Module`] are the tables that `splatvk-gpu-build` generates. They can be
+//!   written by hand for SPIR-V from elsewhere ([`Call::new`]).
 //!
 //! # Barriers
-//! The tables state which buffers each module reads and writes, from its SPIR-V. A recording is split
-//! into commands with minimal barriers between them, and an independent check by the memory model of
-//! Vulkan accepts the result before it is encoded.
+//! The tables state which buffers each module reads and writes, from its SPIR-V. A recording is
+//! split into commands with minimal barriers between them, and an independent check by the memory
+//! model of Vulkan accepts the result before it is encoded.
 //!
 //! # Requirements
 //! A Vulkan loader and a driver for Vulkan 1.2 with `VK_KHR_synchronization2`. On Debian and Ubuntu

@@ -29,7 +29,8 @@ pub(crate) struct Heap {
     current: AtomicU64,
     peak: AtomicU64,
     allocations: AtomicU64,
-    /// The driver says of this allocation and all later ones that there is no memory: see [`Heap::exhaust_after`].
+    /// The driver says of this allocation and all later ones that there is no memory: see
+    /// [`Heap::exhaust_after`].
     #[cfg(feature = "testing")]
     exhausted_from: AtomicU64,
 }
@@ -42,19 +43,20 @@ pub(crate) struct Block {
 }
 
 impl Block {
-    /// What the host reads; `None` unless it was made mapped. Memory that merely happens to be visible to the host (all
-    /// of a CPU device's is) does not count, so that transfers are the same on every device.
+    /// The bytes for the host to read; `None` unless the block was made mapped. Memory that merely
+    /// happens to be visible to the host (all of a CPU device's is) does not count, so that
+    /// transfers are the same on every device.
     pub fn bytes(&self) -> Option<&[u8]> {
         self.memory.mapped_slice().filter(|_| self.mapped)
     }
 
-    /// What the host writes; as [`Block::bytes`].
+    /// The bytes for the host to write; as [`Block::bytes`].
     pub fn bytes_mut(&mut self) -> Option<&mut [u8]> {
         self.memory.mapped_slice_mut().filter(|_| self.mapped)
     }
 }
 
-/// What the allocator says, as the result that Vulkan gave it where it tells.
+/// An error of the allocator, as the Vulkan result where it has one.
 fn refused(what: &str, e: &AllocationError) -> Error {
     match e {
         AllocationError::OutOfMemory => vk_error(what)(vk::Result::ERROR_OUT_OF_DEVICE_MEMORY),
@@ -89,8 +91,8 @@ impl Heap {
         self.exhausted_from.store(self.figures().allocations + buffers, Ordering::Relaxed);
     }
 
-    /// A buffer for every use that passes and transfers have; `mapped` puts it where the host reads and writes it. `what`
-    /// names it in errors, with its size.
+    /// A buffer for every use that passes and transfers have; `mapped` puts it where the host reads
+    /// and writes it. `what` names it in errors, with its size.
     pub fn buffer(
         &self,
         device: &ash::Device,
@@ -137,7 +139,8 @@ impl Heap {
         let requirements = unsafe { device.get_buffer_memory_requirements(raw) };
         let mut guard = lock(&self.allocator);
         let allocator = guard.as_mut().ok_or_else(|| Error::refused("the device is closing"))?;
-        // GpuToCpu is cached host memory: read-backs and CPU devices need it, uploads do not suffer.
+        // GpuToCpu is cached host memory: read-backs and CPU devices need it, uploads do not
+        // suffer.
         let location = if mapped { MemoryLocation::GpuToCpu } else { MemoryLocation::GpuOnly };
         let allocation = allocator
             .allocate(&AllocationCreateDesc {

@@ -11,13 +11,15 @@ impl Device {
     /// [`Options::choice`] names.
     ///
     /// # Errors
-    /// [`Error::NoDevice`] without a usable loader, driver or device, [`Error::Choice`] if the choice
-    /// matches none, [`Error::NoValidationLayer`] if validation is asked for and not installed.
+    /// [`Error::NoDevice`] without a usable loader, driver or device, [`Error::Choice`] if the
+    /// choice matches none, [`Error::NoValidationLayer`] if validation is asked for and not
+    /// installed.
     pub fn open(options: &Options) -> Result<Device> {
         let entry = select::load()?;
         let sink = options.validation.then(|| Sink::new(options.gpu_assisted));
         let instance = select::instance(&entry, sink.as_ref())?;
-        // A clone keeps the loader in memory: `build` drops its entry on failure, and the instance must be destroyed after.
+        // A clone keeps the loader in memory: `build` drops its entry on failure, and the instance
+        // must be destroyed after.
         match Self::build(entry.clone(), &instance, sink, options) {
             Ok(device) => Ok(device),
             Err(e) => {

@@ -20,7 +20,7 @@ pub struct Program {
     label: String,
     commands: Vec<Command>,
     steps: Vec<Step>,
-    /// Buffers it writes, and whether the host has a copy of what they are in the end.
+    /// Buffers it writes, and whether it copies their final content to the host.
     results: Vec<(Buffer, bool)>,
     /// Runs of one program exclude each other: the command buffers are not for simultaneous use.
     raw: Mutex<Raw>,
@@ -82,7 +82,7 @@ impl Program {
         self.submit(raw.plain, raw.fence)
     }
 
-    /// What runs it in the place of the device, in tests.
+    /// The executor that replaces the device, in tests.
     fn executor(&self) -> Option<&dyn Executor> {
         self.device.0.stand_in.as_deref()
     }
@@ -290,7 +290,8 @@ impl Program {
         set: vk::DescriptorSet,
     ) -> Result<()> {
         let device = &self.device.0.device;
-        // SAFETY: recording; offsets and sizes were checked by the recorder, and all objects live as long as `self`.
+        // SAFETY: recording; offsets and sizes were checked by the recorder, and all objects live
+        // as long as `self`.
         unsafe {
             match &command.op {
                 Op::Fill { buffer, value } => {

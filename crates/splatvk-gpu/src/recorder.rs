@@ -7,8 +7,9 @@ use crate::module::Module;
 use crate::program::Program;
 use crate::{Error, Result};
 
-/// Collects commands; barriers are derived from what the shaders do with their buffers when it is compiled or run.
-/// Recording never fails: the first mistake is kept and returned by [`Recorder::compile`] and [`Recorder::run`].
+/// Collects commands; barriers are derived from the access of the shaders when it is
+/// compiled or run. Recording never fails: the first mistake is kept and returned by
+/// [`Recorder::compile`] and [`Recorder::run`].
 pub struct Recorder {
     device: Device,
     label: String,
@@ -67,9 +68,10 @@ impl Recorder {
         }
     }
 
-    /// Brings a buffer to the host with the same submission: until something writes it again, [`Buffer::read`] returns
-    /// what it holds here without another one. For small results that every run is asked for; the copy in mapped memory
-    /// stays as long as the buffer. Nothing where buffers are mapped.
+    /// Brings a buffer to the host with the same submission: until something writes it again,
+    /// [`Buffer::read`] returns what it holds here without another one. For small results that
+    /// every run is asked for; the copy in mapped memory stays as long as the buffer. Nothing where
+    /// buffers are mapped.
     pub fn download<T>(&mut self, buffer: &Buffer<T>) {
         if self.device.info().mapped {
             return;
@@ -128,8 +130,8 @@ impl Recorder {
         self.compile()?.run()
     }
 
-    /// Submits once and waits; milliseconds per command, in order. The first run of a shader includes the driver's own
-    /// compilation, so warm up before timing.
+    /// Submits once and waits; milliseconds per command, in order. The first run of a shader
+    /// includes the driver's own compilation, so warm up before timing.
     pub fn run_timed(self) -> Result<Vec<(String, f64)>> {
         self.compile()?.run_timed()
     }
@@ -142,7 +144,8 @@ impl Recorder {
         }
     }
 
-    /// One program per pass, to be run in order: slower than the whole, but the host can look at its clocks in between.
+    /// One program per pass, to be run in order: slower than the whole, but the host can look at
+    /// its clocks in between.
     pub fn compile_passes(self) -> Result<Vec<(&'static str, Program)>> {
         if let Some(e) = self.error {
             return Err(e);
@@ -204,7 +207,8 @@ impl Recorder {
         self.fail_with(Error::refused(message));
     }
 
-    /// [`Recorder::fail`] with an error that a program may react to, such as a device without memory.
+    /// [`Recorder::fail`] with an error that a program may react to, such as a device without
+    /// memory.
     pub fn fail_with(&mut self, error: Error) {
         self.error.get_or_insert(error);
     }

@@ -26,7 +26,8 @@ pub(crate) fn load() -> Result<ash::Entry> {
     unsafe { ash::Entry::load() }.map_err(|e| no_device(format!("no Vulkan loader ({e}); {INSTALL}"), e))
 }
 
-/// An instance, with validation layer, synchronization validation and debug messenger when asked for.
+/// An instance, with validation layer, synchronization validation and debug messenger when asked
+/// for.
 pub(crate) fn instance(entry: &ash::Entry, sink: Option<&validation::Sink>) -> Result<ash::Instance> {
     // SAFETY: a plain query.
     let version =
@@ -110,7 +111,8 @@ pub(crate) fn has_extension(list: &[vk::ExtensionProperties], name: &CStr) -> bo
     list.iter().any(|e| e.extension_name_as_c_str() == Ok(name))
 }
 
-/// A queue family with compute; one without graphics is preferred on GPUs that have it, since nothing else uses it.
+/// A queue family with compute; one without graphics is preferred on GPUs that have it, since
+/// nothing else uses it.
 pub(crate) fn queue_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<u32> {
     // SAFETY: `physical` belongs to `instance`.
     let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
@@ -124,7 +126,8 @@ pub(crate) fn queue_family(instance: &ash::Instance, physical: vk::PhysicalDevic
         .map(|i| i as u32)
 }
 
-/// The first usable device, or the one whose index in this order, or part of whose name, is `choice`.
+/// The first usable device, or the one whose index in this order, or part of whose name, is
+/// `choice`.
 pub(crate) fn choose(all: Vec<Candidate>, choice: Option<&str>) -> Result<Candidate> {
     let names: Vec<String> = all.iter().enumerate().map(|(i, c)| format!("{i} = {}", c.name)).collect();
     let listed = names.join(", ");

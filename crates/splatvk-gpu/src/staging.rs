@@ -1,16 +1,17 @@
-//! Mapped memory through which the host reaches buffers that are not, and what waits in it for the next submission.
+//! Mapped memory through which the host reaches buffers that are not, and what waits in it for the
+//! next submission.
 use crate::error::vk_error;
 use crate::memory::{Block, Heap};
 use crate::{Error, Result};
 use ash::vk;
 
-/// Most bytes that wait at once; larger transfers go in pieces. 16 MiB take over a millisecond on PCIe 4 ×16, against some
-/// 20 µs for a submission.
+/// Most bytes that wait at once; larger transfers go in pieces. 16 MiB take over a millisecond on
+/// PCIe 4 ×16, against some 20 µs for a submission.
 pub(crate) const MOST: u64 = 16 << 20;
 /// Bytes of a new batch; a training step sends a few hundred.
 const LEAST: u64 = 64 << 10;
 
-/// What the next submission does before its own commands.
+/// Transfers that the next submission performs before its own commands.
 pub(crate) enum Pending {
     /// Bytes of the batch go to a buffer.
     Write { target: vk::Buffer, at: u64, from: u64, bytes: u64 },
@@ -26,7 +27,8 @@ impl Pending {
     }
 }
 
-/// Mapped memory with the command buffer that copies from or to it. Used again once its submission is done.
+/// Mapped memory with the command buffer that copies from or to it. Used again once its submission
+/// is done.
 #[derive(Default)]
 pub(crate) struct Batch {
     block: Option<Block>,
@@ -81,7 +83,7 @@ impl Batch {
         self.block.as_ref().map(|b| b.raw).unwrap_or_default()
     }
 
-    /// What the device wrote.
+    /// The bytes that the device wrote.
     pub fn bytes(&self) -> Result<&[u8]> {
         self.block.as_ref().and_then(Block::bytes).ok_or_else(not_mapped)
     }
@@ -139,7 +141,7 @@ struct Flight {
 /// The frames of a device.
 #[derive(Default)]
 pub(crate) struct Staging {
-    /// Collects what the next submission takes along.
+    /// Collects the transfers of the next submission.
     pub current: Batch,
     spare: Vec<Batch>,
     flights: Vec<Flight>,
@@ -158,7 +160,8 @@ impl Staging {
         self.spare.push(batch);
     }
 
-    /// Takes the current batch, if anything waits in it, and remembers its targets under a number until [`Staging::land`].
+    /// Takes the current batch, if anything waits in it, and remembers its targets under a number
+    /// until [`Staging::land`].
     pub fn launch(&mut self) -> Option<(u64, Batch)> {
         if self.current.pending.is_empty() {
             return None;
@@ -182,8 +185,9 @@ impl Staging {
         }
     }
 
-    /// Destroys a buffer that nobody holds any more, or has it done when the last batch that writes to it lands.
-    pub fn bury(&mut self, device: &ash::Device, heap: &Heap, block: Block) {
+    /// Destroys a buffer that nobody holds any more, or has it done when the last batch that writes
+    /// to it lands.
+    pub fn defer_free(&mut self, device: &ash::Device, heap: &Heap, block: Block) {
         self.current.pending.retain(|p| p.target() != block.raw);
         let last =
             self.flights.iter_mut().filter(|f| f.targets.contains(&block.raw)).max_by_key(|f| f.number);

@@ -1,4 +1,4 @@
-//! What Vulkan offers on this machine, without opening a device.
+//! The Vulkan devices of this machine, described without opening one.
 use crate::{DeviceInfo, Error, Options, Result, features, select};
 use ash::vk;
 

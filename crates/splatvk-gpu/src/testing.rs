@@ -32,9 +32,10 @@ impl TestDevice {
         Device::open(&Options { validation: true, cache: None, ..options.clone() }).map(TestDevice)
     }
 
-    /// A device whose programs are run by an executor, with the shaders for one subgroup size, native float atomics unless
-    /// the options say no, and the choices for GPUs. Buffers must be mapped. No validation: nothing is recorded, and the layer
-    /// (1.3.239) crashes now and then where one thread opens or closes devices, as tests do by the thousand, while another works.
+    /// A device whose programs are run by an executor, with the shaders for one subgroup size,
+    /// native float atomics unless the options say no, and the choices for GPUs. Buffers must be
+    /// mapped. No validation: nothing is recorded, and the layer (1.3.239) crashes now and then
+    /// where one thread opens or closes devices, as tests do by the thousand, while another works.
     pub fn executed_by(
         executor: Box<dyn Executor>,
         subgroup_size: u32,

@@ -46,11 +46,12 @@ fn large_transfers_are_split() {
     let values: Vec<u32> = (0..count as u32).map(|i| i.wrapping_mul(2654435761)).collect();
     let buffer = device.buffer_from("large", &values).unwrap();
     assert!(buffer.read().unwrap() == values);
-    // Two full pieces on the way there; the rest of it goes with the first of three on the way back.
+    // Two full pieces on the way there; the rest of it goes with the first of three on the way
+    // back.
     assert_eq!(device.submissions(), 5);
     let (first, mut shown) = (1 << 20, 0);
     buffer
-        .show(first..count, &mut |at, piece| {
+        .read_with(first..count, &mut |at, piece| {
             assert!(at == shown && *piece == values[first + at..][..piece.len()]);
             shown += piece.len();
         })
@@ -118,7 +119,8 @@ fn copies_and_timestamps() {
 
 #[test]
 fn validation_messages_are_collected() {
-    // A device of its own, since the mistake below is deliberate. Dropped as a plain Device, it asserts nothing.
+    // A device of its own, since the mistake below is deliberate. Dropped as a plain Device, it
+    // asserts nothing.
     let device = Device::open(&Options { validation: true, ..Options::default() }).unwrap();
     assert!(device.validation_messages().is_empty());
     let info = ash::vk::BufferCreateInfo::default().size(0).usage(ash::vk::BufferUsageFlags::STORAGE_BUFFER);
@@ -177,7 +179,8 @@ fn submissions_hold_the_hosts_queue_lock() {
             submit();
         })),
     };
-    // SAFETY: the handles belong together, nothing else uses them, and they are destroyed after the device.
+    // SAFETY: the handles belong together, nothing else uses them, and they are destroyed after the
+    // device.
     let device = unsafe { Device::adopt(host, &options) }.unwrap();
     let numbers = device.buffer::<u32>("numbers", 4).unwrap();
     let mut rec = Recorder::new(&device, "fill");

@@ -10,7 +10,8 @@ use ash::vk::{self, Handle};
 use std::ops::Range;
 
 impl Device {
-    /// Submits what waits for a transfer and then these commands, all at once, and waits until the device is done.
+    /// Submits what waits for a transfer and then these commands, all at once, and waits until the
+    /// device is done.
     pub(crate) fn submit(&self, commands: vk::CommandBuffer, fence: vk::Fence, what: &str) -> Result<()> {
         let mut staging = lock(&self.0.staging);
         let flight = self.launch(&mut staging)?;
@@ -137,7 +138,8 @@ impl Device {
                         barriers.iter().map(|b| barrier::of(b, vk::Buffer::from_raw(b.buffer))).collect();
                     self.cmd_barrier(out, &vk::DependencyInfo::default().buffer_memory_barriers(&raw));
                 }
-                // SAFETY: recording; ranges were checked when the bytes were taken, and a dropped buffer leaves the list.
+                // SAFETY: recording; ranges were checked when the bytes were taken, and a dropped
+                // buffer leaves the list.
                 Step::Command(index) => unsafe {
                     match batch.pending[index] {
                         Pending::Write { target, at, from, bytes } => {
@@ -156,8 +158,9 @@ impl Device {
         unsafe { device.end_command_buffer(out) }.map_err(vk_error("transfers"))
     }
 
-    /// Orders a command buffer after everything before it and makes its results visible to the host and to what comes
-    /// next: put at both ends of every command buffer, so that derivation inside may start from a clean state.
+    /// Orders a command buffer after everything before it and makes its results visible to the host
+    /// and to what comes next: put at both ends of every command buffer, so that derivation inside
+    /// may start from a clean state.
     pub(crate) fn cmd_edge_barrier(&self, commands: vk::CommandBuffer) {
         let work = vk::PipelineStageFlags2::COMPUTE_SHADER
             | vk::PipelineStageFlags2::ALL_TRANSFER

@@ -1,4 +1,5 @@
-//! The Khronos validation layer with synchronization validation, its messages collected so that tests can fail on them.
+//! The Khronos validation layer with synchronization validation, its messages collected so that
+//! tests can fail on them.
 use crate::sync::lock;
 use crate::{Error, Result};
 use ash::vk;
@@ -17,7 +18,8 @@ impl Messages {
     }
 }
 
-/// The message store in a box, so that the address the driver keeps stays valid when the owner moves.
+/// The message store in a box, so that the address the driver keeps stays valid when the owner
+/// moves.
 pub(crate) struct Sink {
     messages: Box<Messages>,
     gpu_assisted: bool,
@@ -28,7 +30,7 @@ impl Sink {
         Sink { messages: Box::default(), gpu_assisted }
     }
 
-    /// What the layer checks beside the calls.
+    /// Checks beside those of the calls.
     pub fn features(&self) -> &'static [vk::ValidationFeatureEnableEXT] {
         use vk::ValidationFeatureEnableEXT as Enable;
         const ALL: &[Enable] = &[
@@ -40,7 +42,8 @@ impl Sink {
         if self.gpu_assisted { ALL } else { &ALL[..1] }
     }
 
-    /// What it leaves out: newer layers (1.4.309) warn where calls are checked beside every access, which other tests do without.
+    /// Checks that are left out: newer layers (1.4.309) warn where calls are checked beside every
+    /// access, which other tests do without.
     pub fn without(&self) -> &'static [vk::ValidationFeatureDisableEXT] {
         if self.gpu_assisted { &[vk::ValidationFeatureDisableEXT::CORE_CHECKS] } else { &[] }
     }
@@ -52,7 +55,8 @@ impl Sink {
             .message_severity(
                 vk::DebugUtilsMessageSeverityFlagsEXT::ERROR | vk::DebugUtilsMessageSeverityFlagsEXT::WARNING,
             )
-            // GENERAL is the loader talking about the machine's drivers and layers, not about our calls.
+            // GENERAL is the loader talking about the machine's drivers and layers, not about our
+            // calls.
             .message_type(
                 vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION
                     | vk::DebugUtilsMessageTypeFlagsEXT::PERFORMANCE,
@@ -73,7 +77,8 @@ unsafe extern "system" fn collect(
     user: *mut c_void,
 ) -> vk::Bool32 {
     if !data.is_null() && !user.is_null() {
-        // SAFETY: Vulkan passes valid callback data, and `user` is the boxed store, which outlives the instance.
+        // SAFETY: Vulkan passes valid callback data, and `user` is the boxed store, which outlives
+        // the instance.
         let (text, store) = unsafe { ((*data).message_as_c_str(), &*(user as *const Messages)) };
         store.lock().push(text.map(|t| t.to_string_lossy().into_owned()).unwrap_or_default());
     }

@@ -1,6 +1,7 @@
-//! Adapters: how one file's tensor names, layouts and value ranges map to the roles of a [`Contract`]. Adapters are data, TOML
-//! files: the built-in ones cover the public exports, a user's own lies beside the model (`adapter.toml` in its folder, or
-//! `NAME.toml` beside `NAME.onnx`) and needs to state only what differs from the built-in one of the same family.
+//! Adapters: how one file's tensor names, layouts and value ranges map to the roles of a
+//! [`Contract`]. Adapters are data, TOML files: the built-in ones cover the public exports, a
+//! user's own lies beside the model (`adapter.toml` in its folder, or `NAME.toml` beside
+//! `NAME.onnx`) and needs to state only what differs from the built-in one of the same family.
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -178,7 +179,8 @@ struct GraphSpec {
     pads: Option<bool>,
     /// Least confidence of a usable point, on the scale of the network after `apply`.
     confidence_floor: Option<f64>,
-    /// Where the first pixel's centre is in `intrinsics`: 0.5, or 0 where pixels are counted from their centres.
+    /// Where the first pixel's centre is in `intrinsics`: 0.5, or 0 where pixels are counted from
+    /// their centres.
     pixel_centre: Option<f64>,
     #[serde(skip)]
     family: String,
@@ -207,7 +209,8 @@ pub struct Adapter {
 }
 
 impl Adapter {
-    /// The adapter of a model file: `NAME.toml` beside it, else `adapter.toml` in its folder, else none of its own.
+    /// The adapter of a model file: `NAME.toml` beside it, else `adapter.toml` in its folder, else
+    /// none of its own.
     pub fn of_file(model: &Path) -> Result<Adapter> {
         for path in [model.with_extension("toml"), model.with_file_name("adapter.toml")] {
             if path.is_file() {
@@ -232,7 +235,8 @@ impl Adapter {
         Ok(adapter)
     }
 
-    /// Every description that may fit a graph of this adapter: its own, completed from the built-in ones, then those.
+    /// Every description that may fit a graph of this adapter: its own, completed from the built-in
+    /// ones, then those.
     fn specs(&self) -> Result<Vec<GraphSpec>> {
         let mut built_in = Vec::new();
         for (name, text) in BUILT_IN {

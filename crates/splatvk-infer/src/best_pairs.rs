@@ -1,5 +1,6 @@
-//! Which pairs of many photos are worth keeping: those that show most in common, a bounded number for every photo, so that time
-//! and memory of what follows grow with the number of photos and not with its square.
+//! Which pairs of many photos are worth keeping: those that show most in common, a bounded number
+//! for every photo, so that time and memory of what follows grow with the number of photos and not
+//! with its square.
 use crate::math::median;
 use crate::scene::{ModelView, PairPointmaps, Pointmap};
 
@@ -44,8 +45,9 @@ impl BestPairs {
     }
 }
 
-/// Which pairs are among the best three of one of their views, or in the maximum spanning forest, which keeps together what
-/// holds together. A pair that fails this among some pairs fails it among more, so pairs may come one after another.
+/// Which pairs are among the best three of one of their views, or in the maximum spanning forest,
+/// which keeps together what holds together. A pair that fails this among some pairs fails it among
+/// more, so pairs may come one after another.
 fn best(views: usize, pairs: &[([usize; 2], f64)]) -> Vec<bool> {
     let order = best_first(pairs);
     let mut keep = forest(views, pairs, &order);
@@ -59,8 +61,8 @@ fn best(views: usize, pairs: &[([usize; 2], f64)]) -> Vec<bool> {
     keep
 }
 
-/// Of the best pairs those without which a view would have fewer than three, or views would fall apart: a view that many others
-/// count among their best would have many more.
+/// Of the best pairs those without which a view would have fewer than three, or views would fall
+/// apart: a view that many others count among their best would have many more.
 fn enough(views: usize, pairs: &[([usize; 2], f64)]) -> Vec<bool> {
     let mut keep = vec![true; pairs.len()];
     let mut partners = vec![0; views];
@@ -96,8 +98,9 @@ fn forest(views: usize, pairs: &[([usize; 2], f64)], order: &[usize]) -> Vec<boo
     keep
 }
 
-/// How much of one view the other shows: the share of pixels of `seen` whose points, given in the other's camera, fall into its
-/// picture on the surface `base` that it sees, each counting by its confidence against the mean of that surface.
+/// How much of one view the other shows: the share of pixels of `seen` whose points, given in the
+/// other's camera, fall into its picture on the surface `base` that it sees, each counting by its
+/// confidence against the mean of that surface.
 fn shown(seen: &Pointmap, base: &Pointmap, seen_size: (usize, usize), size: (usize, usize)) -> f64 {
     let samples = |(w, h): (usize, usize)| {
         (STRIDE / 2..h)
@@ -171,7 +174,8 @@ mod tests {
             some.retain(|_| keep.next().unwrap());
         }
         assert_eq!(some, kept);
-        // In the end each view has three partners still, and no pair can go without that it would have fewer.
+        // In the end each view has three partners still, and no pair can go without that it would
+        // have fewer.
         let left = enough(10, &kept);
         let left: Vec<_> = kept.iter().zip(&left).filter(|p| *p.1).map(|p| p.0.0).collect();
         let partners = |v: usize| left.iter().filter(|p| p.contains(&v)).count();
@@ -184,7 +188,8 @@ mod tests {
 
     #[test]
     fn what_two_views_show_in_common_is_measured_by_their_points() {
-        // A plane 4 ahead of two cameras of 90°, the second moved to the right by a share of what they see.
+        // A plane 4 ahead of two cameras of 90°, the second moved to the right by a share of what
+        // they see.
         let (w, h) = (128usize, 96);
         let plane = |shift: f32| Pointmap {
             points: (0..w * h)

@@ -1,7 +1,8 @@
-//! Outputs of networks on disk, by the content of the photo and of the model: a second run computes none of them again.
+//! Outputs of networks on disk, by the content of the photo and of the model: a second run computes
+//! none of them again.
 //!
-//! The folder is a cache: anything odd about a file, and it is computed and written again. The least recently used files go
-//! when it grows beyond its capacity.
+//! The folder is a cache: anything odd about a file, and it is computed and written again. The
+//! least recently used files go when it grows beyond its capacity.
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -11,7 +12,8 @@ use crate::Result;
 use crate::files::home;
 use crate::files::{self, content_hash, sha256};
 
-/// Bytes that the folder may hold: the pointmaps and descriptors of a dozen scenes, or the masks of hundreds.
+/// Bytes that the folder may hold: the pointmaps and descriptors of a dozen scenes, or the masks of
+/// hundreds.
 const CAPACITY: u64 = 4 << 30;
 
 /// Extension of the files.
@@ -82,7 +84,8 @@ pub(super) fn remember(key: OutputKey, compute: impl FnOnce() -> Result<Vec<f32>
     Ok(values)
 }
 
-/// sha256 of a file, remembered across processes by its place, size and time of change: hashing gigabytes takes seconds.
+/// sha256 of a file, remembered across processes by its place, size and time of change: hashing
+/// gigabytes takes seconds.
 pub(super) fn fingerprint(path: &Path) -> std::io::Result<String> {
     let meta = std::fs::metadata(path)?;
     let age = meta.modified()?.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();

@@ -1,5 +1,5 @@
-//! The networks that splatvk knows and does not ship, and where their files come from: `catalogue.toml`, the one manifest of
-//! what `models list` names and `models fetch` gets.
+//! The networks that splatvk knows and does not ship, and where their files come from:
+//! `catalogue.toml`, the one manifest of what `models list` names and `models fetch` gets.
 use std::sync::OnceLock;
 
 use serde::{Deserialize, Serialize};
@@ -83,7 +83,8 @@ pub struct Source {
     pub name: String,
     /// Its size, where it is known.
     pub bytes: Option<u64>,
-    /// Its content, where it is known; otherwise the first download decides, which is kept in the model's adapter.
+    /// Its content, where it is known; otherwise the first download decides, which is kept in the
+    /// model's adapter.
     pub sha256: Option<String>,
 }
 
@@ -109,8 +110,8 @@ pub struct Recipe {
 }
 
 impl CatalogueEntry {
-    /// The most bytes that a file of it may have where its size is not known: sizes above are of all files, as an export writes them,
-    /// and a checkpoint may hold what training needed besides.
+    /// The most bytes that a file of it may have where its size is not known: sizes above are of
+    /// all files, as an export writes them, and a checkpoint may hold what training needed besides.
     pub fn ceiling(&self) -> u64 {
         u64::from(self.megabytes) * 2_000_000 + (64 << 20)
     }

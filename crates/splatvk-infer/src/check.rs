@@ -1,4 +1,5 @@
-//! Runs an installed network on a built-in input and holds it to its contract; measures time and memory on the way.
+//! Runs an installed network on a built-in input and holds it to its contract; measures time and
+//! memory on the way.
 use std::path::Path;
 use std::time::Instant;
 
@@ -14,7 +15,8 @@ use crate::progress::{Silent, peak_memory, reset_peak_memory};
 use crate::scene::{Affine, Plane, RgbImage};
 use crate::{Error, Result};
 
-/// Largest difference to the reference, relative to its largest value: what float32 sums in another order may cost.
+/// Largest difference to the reference, relative to its largest value: what float32 sums in another
+/// order may cost.
 const TOLERANCE: f32 = 1e-3;
 
 /// What one step took.
@@ -24,7 +26,8 @@ pub struct Measured {
     pub step: String,
     /// Wall seconds.
     pub seconds: f64,
-    /// Peak resident memory of the process during the step, bytes; 0 where the system does not tell.
+    /// Peak resident memory of the process during the step, bytes; 0 where the system does not
+    /// tell.
     pub peak_memory: u64,
     /// Largest difference to PyTorch's answer, relative to its largest value.
     pub error: Option<f32>,
@@ -39,8 +42,9 @@ fn measured<T>(step: String, steps: &mut Vec<Measured>, work: impl FnOnce() -> R
     Ok(done)
 }
 
-/// Repeats the reference of every graph that has one, then the model's task on two built-in pictures. An error names the
-/// file and what it did wrong. For a model of an uncached registry ([`super::Registry::uncached`]): the steps are measured.
+/// Repeats the reference of every graph that has one, then the model's task on two built-in
+/// pictures. An error names the file and what it did wrong. For a model of an uncached registry
+/// ([`super::Registry::uncached`]): the steps are measured.
 pub fn check(model: &Installed) -> Result<Vec<Measured>> {
     let mut steps = Vec::new();
     for graph in model.graphs.values() {
@@ -104,8 +108,8 @@ fn repeat(file: &GraphFile, reference: &Path) -> Result<f32> {
     let mut worst = 0f32;
     for (role, bound) in &file.binding.ports {
         let Some(wanted) = arrays.get(&format!("out.{}", bound.name)) else { continue };
-        // Layouts that differ from the contract's are for the toy graphs of the tests; exports use the contract's own, up to
-        // the channel axis of warps.
+        // Layouts that differ from the contract's are for the toy graphs of the tests; exports use
+        // the contract's own, up to the channel axis of warps.
         let given = outputs.take(role)?;
         let raw = super::graph::relayout(
             given,

@@ -1,4 +1,5 @@
-//! Class probabilities of an image region: EfficientNet-Lite0 (Tan 2020) on the region cut out of its surroundings.
+//! Class probabilities of an image region: EfficientNet-Lite0 (Tan 2020) on the region cut out of
+//! its surroundings.
 use rayon::prelude::*;
 
 use super::registry::{PackFileKind, Registry};
@@ -36,12 +37,14 @@ impl Classifier {
         Ok(Classifier { session: registry.session(PackFileKind::Classifier)? })
     }
 
-    /// [count, 1000] class probabilities of the regions `0..count` of `labels`; a zero row for a region without pixels.
+    /// [count, 1000] class probabilities of the regions `0..count` of `labels`; a zero row for a
+    /// region without pixels.
     ///
-    /// A region is judged from one crop: the square around its bounding box with everything else grey. On breakfast
-    /// (40 perfect masks, 840 Felzenszwalb segments, 416 masks of the graph segmentation) nothing else named more
-    /// regions right: wider crops, blurred, white, black or dimmed surroundings, the mirrored crop, filled holes or a
-    /// grown mask, averages of these, and the larger Lite1 and Lite2.
+    /// A region is judged from one crop: the square around its bounding box with everything else
+    /// grey. On breakfast (40 perfect masks, 840 Felzenszwalb segments, 416 masks of the graph
+    /// segmentation) nothing else named more regions right: wider crops, blurred, white, black or
+    /// dimmed surroundings, the mirrored crop, filled holes or a grown mask, averages of these, and
+    /// the larger Lite1 and Lite2.
     pub fn regions(
         &mut self,
         image: &RgbImage,
@@ -97,7 +100,8 @@ pub(super) fn extents(labels: &Plane<i32>, count: usize) -> Vec<Option<Extent>> 
     found
 }
 
-/// The region in the middle of a square of one value, resized to the network's input, [3, to, to] in [0, 1].
+/// The region in the middle of a square of one value, resized to the network's input, [3, to, to]
+/// in [0, 1].
 pub(super) fn crop(
     image: &RgbImage,
     labels: &Plane<i32>,
@@ -137,8 +141,9 @@ pub(super) fn crop(
     planes
 }
 
-/// For each output pixel of one axis: the first source pixel and the weights from there on. A triangle as wide as the
-/// reduction (at least one source pixel to each side), cut to the source range `from..to`.
+/// For each output pixel of one axis: the first source pixel and the weights from there on. A
+/// triangle as wide as the reduction (at least one source pixel to each side), cut to the source
+/// range `from..to`.
 fn taps(start: f32, side: usize, pixels: usize, from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let scale = side as f32 / pixels as f32;
     let reach = scale.max(1.0);
@@ -176,7 +181,8 @@ mod tests {
             assert!((at(c, 112, 112) - want).abs() < 1e-4, "{}", at(c, 112, 112));
             assert!((at(c, 112, 30) - GREY).abs() < 1e-6 && (at(c, 112, 200) - GREY).abs() < 1e-6);
         }
-        // The region fills a fifth of the square: its share of the green plane's departure from grey is that fifth.
+        // The region fills a fifth of the square: its share of the green plane's departure from
+        // grey is that fifth.
         let sum: f32 = (0..SIDE * SIDE).map(|i| planes[SIDE * SIDE + i] - GREY).sum();
         let want = (0.4 - GREY) * (SIDE * SIDE) as f32 / 5.0;
         assert!((sum / want - 1.0).abs() < 0.02, "{sum} {want}");

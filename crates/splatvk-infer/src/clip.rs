@@ -1,5 +1,6 @@
-//! CLIP (Radford et al. 2021; OpenCLIP): image regions and texts in one space, any embedding width. A model is an image tower
-//! or a network with a feature per pixel (LSeg), a text tower, and `tokenizer.json` beside it.
+//! CLIP (Radford et al. 2021; OpenCLIP): image regions and texts in one space, any embedding width.
+//! A model is an image tower or a network with a feature per pixel (LSeg), a text tower, and
+//! `tokenizer.json` beside it.
 use std::path::PathBuf;
 
 use rayon::prelude::*;
@@ -23,7 +24,8 @@ const BATCH: usize = 8;
 /// Tokens of a text where the graph leaves the number open: CLIP's context.
 const CONTEXT: usize = 77;
 
-/// CLIP's vocabulary, and what its own tokenizer makes of some texts (open_clip 3.3, less the start and end marks).
+/// CLIP's vocabulary, and what its own tokenizer makes of some texts (open_clip 3.3, less the start
+/// and end marks).
 const VOCABULARY: usize = 49408;
 const GOLDEN: [(&str, &[i64]); 12] = [
     ("lemon", &[7184]),
@@ -57,7 +59,8 @@ impl Clip {
         if let (Some(dense), Some(dim)) =
             (model.graphs.get_mut(&Part::DenseFeatures), text.fixed("embedding", "D"))
         {
-            // A picture of fixed size is as long as it is wide or high: only the texts tell which axis holds the features.
+            // A picture of fixed size is as long as it is wide or high: only the texts tell which
+            // axis holds the features.
             dense.fix_axis("features", "D", dim);
         }
         let (visual, axis) = match model.graph(Part::ImageTower) {
@@ -71,7 +74,8 @@ impl Clip {
             return Err(towers_differ(&visual, &text, &format!("embeddings of {a} and {b} values")));
         }
         let tokenizer = tokenizer(&model)?;
-        // The space is the weights: features may be compared with texts only when both came from them.
+        // The space is the weights: features may be compared with texts only when both came from
+        // them.
         let space =
             format!("{}:{}", model.family, OutputKey::new("space").model(&visual)?.model(&text)?.short());
         let mut clip = Clip { model, space, tokenizer, image: None, text: None, dim: 0 };
@@ -86,8 +90,8 @@ impl Clip {
         Ok(clip)
     }
 
-    /// Refuses towers of different checkpoints: plain red, green and blue squares must each be nearest to their own name.
-    /// Chance passes one pair of unrelated towers in 512.
+    /// Refuses towers of different checkpoints: plain red, green and blue squares must each be
+    /// nearest to their own name. Chance passes one pair of unrelated towers in 512.
     fn check_towers_match(&mut self, visual: &GraphFile, text: &GraphFile) -> Result<()> {
         const COLOURS: [(&str, [f32; 3]); 3] = [
             ("a red square", [0.9, 0.05, 0.05]),
@@ -116,7 +120,8 @@ impl Clip {
         Err(towers_differ(visual, text, "a red, a green and a blue square are not nearest to their names"))
     }
 
-    /// A tokenizer with CLIP's vocabulary must give CLIP's ids; another vocabulary is its model's own affair.
+    /// A tokenizer with CLIP's vocabulary must give CLIP's ids; another vocabulary is its model's
+    /// own affair.
     fn tokens_are_right(&self, tower: &GraphFile) -> Result<()> {
         if self.tokenizer.get_vocab_size(true) != VOCABULARY {
             return Ok(());
@@ -283,7 +288,8 @@ impl RegionEncoder for Clip {
         };
         let graph = self.text.insert(graph);
         let mut all = Vec::new();
-        // One at a time: a text's embedding must not depend on its neighbours, and some exports fix the batch at 1.
+        // One at a time: a text's embedding must not depend on its neighbours, and some exports fix
+        // the batch at 1.
         for ids in tokens {
             let mask = (0..context).map(|k| i64::from(k < ids.len())).collect();
             let mut ids = ids;
@@ -336,8 +342,8 @@ fn tokenizer(model: &Installed) -> Result<Tokenizer> {
     Ok(tokenizer)
 }
 
-/// What CLIP's own tokenizer does before it splits words: typographic quotes straightened (as ftfy does) and HTML entities
-/// resolved twice. Case and white space are the tokenizer file's affair.
+/// What CLIP's own tokenizer does before it splits words: typographic quotes straightened (as ftfy
+/// does) and HTML entities resolved twice. Case and white space are the tokenizer file's affair.
 fn cleaned(text: &str) -> String {
     let entities =
         [("&lt;", "<"), ("&gt;", ">"), ("&quot;", "\""), ("&#39;", "'"), ("&nbsp;", " "), ("&amp;", "&")];

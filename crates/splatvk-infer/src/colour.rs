@@ -1,10 +1,12 @@
-//! The eleven basic colour terms of English (Berlin & Kay 1969): which of them a patch shows, which of them a text names.
+//! The eleven basic colour terms of English (Berlin & Kay 1969): which of them a patch shows, which
+//! of them a text names.
 use std::sync::OnceLock;
 
 /// Terms that languages with eleven colour words share.
 pub const COUNT: usize = 11;
 
-/// Term, other spellings and words taken for it, and an sRGB colour near the middle of what people call by it.
+/// Term, other spellings and words taken for it, and an sRGB colour near the middle of what people
+/// call by it.
 const TERMS: [(&[&str], [u8; 3]); COUNT] = [
     (&["black"], [0, 0, 0]),
     (&["white"], [255, 255, 255]),
@@ -46,8 +48,8 @@ pub fn terms_of(rgb: [f32; 3]) -> [f32; COUNT] {
     weights.map(|w| w / total)
 }
 
-/// [`terms_of`] the middle of the colour's cell in a cube of 32³ cells: at most 4/255 off, and quick enough for every
-/// pixel.
+/// [`terms_of`] the middle of the colour's cell in a cube of 32³ cells: at most 4/255 off, and
+/// quick enough for every pixel.
 pub fn terms_near(rgb: [f32; 3]) -> &'static [f32; COUNT] {
     const CELLS: usize = 32;
     static TABLE: OnceLock<Vec<[f32; COUNT]>> = OnceLock::new();
@@ -101,8 +103,8 @@ pub fn nearest_term(towards: &[f32]) -> (&'static str, f32) {
     best.map_or(("", 0.0), |(i, cosine)| (TERMS[i].0[0], cosine))
 }
 
-/// Distribution over terms → direction: square roots (so that a dot product is a Bhattacharyya coefficient) less what
-/// all terms share, unit length. An even distribution gives zero.
+/// Distribution over terms → direction: square roots (so that a dot product is a Bhattacharyya
+/// coefficient) less what all terms share, unit length. An even distribution gives zero.
 pub fn direction(distribution: &[f32; COUNT]) -> [f32; COUNT] {
     let roots = distribution.map(f32::sqrt);
     let mean = roots.iter().sum::<f32>() / COUNT as f32;

@@ -7,8 +7,8 @@ use crate::{Error, Result};
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
-/// How networks are computed: by which provider, and whether their answers are kept. Clones share it; several in one process may
-/// differ, except that they share the one loaded library.
+/// How networks are computed: by which provider, and whether their answers are kept. Clones share
+/// it; several in one process may differ, except that they share the one loaded library.
 #[derive(Clone)]
 pub struct Compute(Arc<Shared>);
 
@@ -33,7 +33,8 @@ impl Default for Compute {
 }
 
 impl Compute {
-    /// By one of [`super::provider::NAMES`]; by default what `SPLATVK_PROVIDER` says, and without it `auto`.
+    /// By one of [`super::provider::NAMES`]; by default what `SPLATVK_PROVIDER` says, and without
+    /// it `auto`.
     pub fn by(asked: Option<&str>) -> Compute {
         let variable = || std::env::var("SPLATVK_PROVIDER").ok().filter(|v| !v.is_empty());
         let asked = asked.map(str::to_owned).or_else(variable).unwrap_or_else(|| "auto".to_owned());
@@ -55,14 +56,14 @@ impl Compute {
         if self.0.cached { cache::remember(key, compute) } else { compute() }
     }
 
-    /// Held while a large network is loaded: stages that run beside each other take turns, so that a run needs the memory of
-    /// one network and every network has all cores.
+    /// Held while a large network is loaded: stages that run beside each other take turns, so that
+    /// a run needs the memory of one network and every network has all cores.
     pub fn turn(&self) -> MutexGuard<'_, ()> {
         lock(&self.0.turn)
     }
 
-    /// The provider of new sessions, `None` for the CPU: found by computing a graph of one node on it. Asked for by name, one
-    /// that does not answer is an error.
+    /// The provider of new sessions, `None` for the CPU: found by computing a graph of one node on
+    /// it. Asked for by name, one that does not answer is an error.
     pub(super) fn selected(&self) -> Result<Option<&'static Provider>> {
         let found = || find(&self.0.asked, &mut |text| self.note(text));
         self.0.chosen.get_or_init(found).clone().map_err(Error::missing)
@@ -73,7 +74,8 @@ impl Compute {
         Ok(self.selected()?.map_or("cpu", |p| p.name))
     }
 
-    /// A network that the chosen provider refuses is computed by the CPU if nobody asked for the provider by name.
+    /// A network that the chosen provider refuses is computed by the CPU if nobody asked for the
+    /// provider by name.
     pub(super) fn replaceable(&self) -> bool {
         self.0.asked == "auto"
     }

@@ -1,8 +1,9 @@
-//! What splatvk requires of a graph: for every part of a model the roles of its inputs and outputs and the shapes in which the
-//! rest of the program sees them. Which name, layout and range a file uses for a role is data: see [`super::adapter`].
+//! What splatvk requires of a graph: for every part of a model the roles of its inputs and outputs
+//! and the shapes in which the rest of the program sees them. Which name, layout and range a file
+//! uses for a role is data: see [`super::adapter`].
 //!
-//! A shape is a row of axis names: "B H W 3" has a free batch, height and width, and three channels. An axis that occurs
-//! twice in one contract has one length.
+//! A shape is a row of axis names: "B H W 3" has a free batch, height and width, and three
+//! channels. An axis that occurs twice in one contract has one length.
 use serde::{Deserialize, Serialize};
 
 /// What a graph does.
@@ -205,7 +206,8 @@ static WARP: Contract = Contract {
     ],
 };
 
-// Which of the two it gives, the adapter says: names do not (Depth Anything calls both "predicted_depth").
+// Which of the two it gives, the adapter says: names do not (Depth Anything calls both
+// "predicted_depth").
 static DEPTH: Contract = Contract {
     name: "depth",
     inputs: &[slot("image", "B 3 H W", &["B H W 3"])],
@@ -235,7 +237,8 @@ pub fn axes(shape: &str) -> impl Iterator<Item = &str> {
     shape.split_whitespace()
 }
 
-/// Whether a tensor of `dims` (None = any) can have `shape`, given axis lengths found so far, which it adds to.
+/// Whether a tensor of `dims` (None = any) can have `shape`, given axis lengths found so far, which
+/// it adds to.
 pub fn unify<'s>(shape: &'s str, dims: &[Option<usize>], known: &mut Vec<(&'s str, usize)>) -> bool {
     let start = known.len();
     let fits = axes(shape).count() == dims.len()
@@ -258,8 +261,8 @@ pub fn unify<'s>(shape: &'s str, dims: &[Option<usize>], known: &mut Vec<(&'s st
     fits
 }
 
-/// Reorders axes: those that `to` lacks must have length 1 and go, those that `from` lacks come with length 1. `None`
-/// when the values do not have the shape `from`.
+/// Reorders axes: those that `to` lacks must have length 1 and go, those that `from` lacks come
+/// with length 1. `None` when the values do not have the shape `from`.
 pub fn reorder<T: Copy>(
     shape: Vec<usize>,
     data: Vec<T>,

@@ -1,5 +1,5 @@
-//! Depth priors: what a network says of the depth of each photo, or a folder of files holds. Scale and shift stay open;
-//! `pose::stereo` of splatvk finds them.
+//! Depth priors: what a network says of the depth of each photo, or a folder of files holds. Scale
+//! and shift stay open; `pose::stereo` of splatvk finds them.
 use std::path::Path;
 
 use glam::DVec2;
@@ -14,7 +14,8 @@ use crate::progress::Progress;
 use crate::scene::{DepthPrior, PairPointmaps, Plane, Pointmap, PriorKind};
 use crate::{Error, Result};
 
-/// One prior per photo, at its working size, from a network of one photo's depth or a geometry network.
+/// One prior per photo, at its working size, from a network of one photo's depth or a geometry
+/// network.
 pub fn of_network(
     model: &Installed,
     photos: &[Photo],
@@ -67,7 +68,8 @@ fn output(file: &GraphFile) -> (&'static str, PriorKind) {
     }
 }
 
-/// Smallest inverse depth, share of the largest, that counts as known: networks give 0 or a little less for the sky.
+/// Smallest inverse depth, share of the largest, that counts as known: networks give 0 or a little
+/// less for the sky.
 const HORIZON: f32 = 1e-4;
 
 fn with_horizon(mut map: Plane<f32>, kind: PriorKind) -> Plane<f32> {
@@ -108,11 +110,13 @@ fn of_pointmaps(
 /// Names of a photo's file in a folder of priors.
 const FILES: [(&str, PriorKind); 2] =
     [("depth.npy", PriorKind::Depth), ("inverse_depth.npy", PriorKind::InverseDepth)];
-/// Relative difference of the aspects of a map and its photo that rounding explains: a pixel of a map 64 pixels high.
+/// Relative difference of the aspects of a map and its photo that rounding explains: a pixel of a
+/// map 64 pixels high.
 const ASPECT: f64 = 0.016;
 
-/// The priors of a folder: per photo `<stem>_depth.npy` or `<stem>_inverse_depth.npy`, H × W floats of the whole upright photo at
-/// any size; 0 or less, or not finite, is unknown. Photos without a file have no prior.
+/// The priors of a folder: per photo `<stem>_depth.npy` or `<stem>_inverse_depth.npy`, H × W floats
+/// of the whole upright photo at any size; 0 or less, or not finite, is unknown. Photos without a
+/// file have no prior.
 pub fn of_folder(folder: &Path, photos: &[Photo]) -> Result<Vec<Option<DepthPrior>>> {
     let priors: Vec<Option<DepthPrior>> = photos.iter().map(|p| of_file(folder, p)).collect::<Result<_>>()?;
     if priors.iter().all(Option::is_none) {
@@ -167,8 +171,8 @@ fn of_file(folder: &Path, photo: &Photo) -> Result<Option<DepthPrior>> {
     Ok(Some(DepthPrior { values: sampled(&map, photo, place), kind: *kind }))
 }
 
-/// A map at the photo's working pixels, which lie at `place` in it: bilinear between known values, the nearest beside unknown
-/// ones; 0 outside and where unknown.
+/// A map at the photo's working pixels, which lie at `place` in it: bilinear between known values,
+/// the nearest beside unknown ones; 0 outside and where unknown.
 fn sampled(map: &Plane<f32>, photo: &Photo, place: impl Fn(DVec2) -> DVec2) -> Plane<f32> {
     let (width, height) = (photo.image.width, photo.image.height);
     let known = |v: f32| if v.is_finite() && v > 0.0 { v } else { 0.0 };
@@ -271,7 +275,8 @@ mod tests {
         assert!(read[1].is_none());
         let prior = read[0].as_ref().unwrap();
         assert_eq!((prior.kind, prior.values.at(0, 0)), (PriorKind::Depth, 0.0));
-        // The centre of column 20 of 56 lies at 10.25 of 28, a quarter from the centre of column 10 to that of 9.
+        // The centre of column 20 of 56 lies at 10.25 of 28, a quarter from the centre of column 10
+        // to that of 9.
         assert!((prior.values.at(20, 14) - 10.75).abs() < 1e-4, "{}", prior.values.at(20, 14));
         put("a_inverse_depth.npy", &[14, 28], map);
         refused("two priors of one photo");

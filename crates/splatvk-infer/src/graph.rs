@@ -1,4 +1,5 @@
-//! A loaded graph with inputs and outputs by role: layouts, element types and activations are handled here.
+//! A loaded graph with inputs and outputs by role: layouts, element types and activations are
+//! handled here.
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -89,7 +90,8 @@ impl GraphFile {
         bound.dims.as_ref()?.get(place)?.length()
     }
 
-    /// Of the layouts that an output's lengths allow, takes the first in which `axis` has `length`, if there is one.
+    /// Of the layouts that an output's lengths allow, takes the first in which `axis` has `length`,
+    /// if there is one.
     pub(super) fn fix_axis(&mut self, role: &str, axis: &str, length: usize) {
         let Some(slot) = self.binding.part.contract().slot(role) else { return };
         let Some(bound) = self.binding.ports.get_mut(role) else { return };
@@ -159,7 +161,8 @@ impl Outputs {
 }
 
 impl Graph {
-    /// Runs the graph on tensors in the layout of the contract; roles that the graph lacks are ignored.
+    /// Runs the graph on tensors in the layout of the contract; roles that the graph lacks are
+    /// ignored.
     pub fn run(&mut self, inputs: Vec<(&'static str, Input)>) -> Result<Outputs> {
         let contract = self.file.binding.part.contract();
         let name = self.file.path.display().to_string();

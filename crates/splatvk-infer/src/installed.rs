@@ -1,7 +1,9 @@
-//! The networks that users brought: every `.onnx` file in the model folders, recognised and put together into models.
+//! The networks that users brought: every `.onnx` file in the model folders, recognised and put
+//! together into models.
 //!
-//! A folder is a model (`sam_vit_b/encoder.onnx`, `sam_vit_b/decoder.onnx`); files that lie directly in a model folder
-//! belong together when their names do (`sam_vit_b_encoder.onnx`, `sam_vit_b_decoder.onnx`).
+//! A folder is a model (`sam_vit_b/encoder.onnx`, `sam_vit_b/decoder.onnx`); files that lie
+//! directly in a model folder belong together when their names do (`sam_vit_b_encoder.onnx`,
+//! `sam_vit_b_decoder.onnx`).
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -140,7 +142,8 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
     let mut failed: Vec<BrokenFile> = Vec::new();
     for file in files {
         match GraphFile::recognise(file) {
-            // The first of several variants (quantised, half precision): the plain name sorts first.
+            // The first of several variants (quantised, half precision): the plain name sorts
+            // first.
             Ok(graph) => {
                 let graph = GraphFile { compute: compute.clone(), ..graph };
                 graphs.entry(graph.binding.part).or_insert(graph);
@@ -198,8 +201,8 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
 }
 
 impl Registry {
-    /// The model that `--init`, `--masks` and so on call `name` (a family or a model's own name): of several the one that
-    /// the catalogue names first. The error says what to do.
+    /// The model that `--init`, `--masks` and so on call `name` (a family or a model's own name):
+    /// of several the one that the catalogue names first. The error says what to do.
     pub fn installed(&self, task: Task, name: &str) -> Result<Installed> {
         let inventory = inventory(self);
         let mut fitting: Vec<Installed> = inventory
@@ -225,7 +228,8 @@ impl Registry {
     }
 }
 
-/// What to do about a model that is not there: fetch it, or the one of its family that needs no export, or bring its files.
+/// What to do about a model that is not there: fetch it, or the one of its family that needs no
+/// export, or bring its files.
 fn how_to_get(name: &str, task: Task, place: &str) -> String {
     let own = catalogue().iter().find(|k| k.id == name);
     let family = || catalogue().iter().filter(|k| k.family == name && k.does(task));

@@ -1,7 +1,8 @@
 //! ONNX inference: sessions, model registry, one file per model family.
 //!
-//! Networks that users bring are recognised by what goes in and comes out: [`onnx`] reads a file's header, [`contract`] states
-//! what splatvk requires of each part of a model, [`adapter`] maps a file's names to it, [`graph`] runs it by role.
+//! Networks that users bring are recognised by what goes in and comes out: [`onnx`] reads a file's
+//! header, [`contract`] states what splatvk requires of each part of a model, [`adapter`] maps a
+//! file's names to it, [`graph`] runs it by role.
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]
 
@@ -61,16 +62,17 @@ pub fn nearest(regions: &[f32], rows: &[f32], dim: usize, best: usize) -> Vec<Ve
     regions.par_chunks_exact(dim).map(of).collect()
 }
 
-/// Puts image regions and texts into one space of unit vectors, so that a cosine measures how well a phrase names a
-/// region. Implemented by `words` (the built-in default) and by user-supplied CLIP-like pairs of towers.
+/// Puts image regions and texts into one space of unit vectors, so that a cosine measures how well
+/// a phrase names a region. Implemented by `words` (the built-in default) and by user-supplied
+/// CLIP-like pairs of towers.
 pub trait RegionEncoder: Send {
     /// Name of the space; features and texts may be compared only when this agrees.
     fn space(&self) -> &str;
     /// D, the length of every embedding.
     fn dim(&self) -> usize;
-    /// [count, D] row-major unit vectors, one per region `0..count` of `labels` (the same size as `image`; −1 and
-    /// values ≥ `count` belong to no region). A region without a pixel gets a zero row. Asks between what it gives the network
-    /// at once whether to stop.
+    /// [count, D] row-major unit vectors, one per region `0..count` of `labels` (the same size as
+    /// `image`; −1 and values ≥ `count` belong to no region). A region without a pixel gets a zero
+    /// row. Asks between what it gives the network at once whether to stop.
     fn embed_regions(
         &mut self,
         image: &RgbImage,
@@ -80,12 +82,14 @@ pub trait RegionEncoder: Send {
     ) -> Result<Vec<f32>>;
     /// [texts.len(), D] row-major unit vectors.
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>>;
-    /// [N, D] unit rows of [`things::of_form`]; fewer, or none, from an encoder that knows only some texts.
+    /// [N, D] unit rows of [`things::of_form`]; fewer, or none, from an encoder that knows only
+    /// some texts.
     fn others(&mut self, form: &str) -> Result<Vec<f32>> {
         let list = things::of_form(form);
         self.embed_texts(&list.iter().map(String::as_str).collect::<Vec<_>>())
     }
-    /// [M, D] unit rows of [`things::recoloured`]; fewer, or none, from an encoder that knows only some texts.
+    /// [M, D] unit rows of [`things::recoloured`]; fewer, or none, from an encoder that knows only
+    /// some texts.
     fn recoloured(&mut self, text: &str) -> Result<Vec<f32>> {
         let list = things::recoloured(text);
         self.embed_texts(&list.iter().map(String::as_str).collect::<Vec<_>>())
@@ -94,12 +98,13 @@ pub trait RegionEncoder: Send {
     fn holds(&self, _text: &str) -> bool {
         false
     }
-    /// Whether a text is among the words that the encoder knows, and which of them is nearest to it; `None` from an encoder that
-    /// is not bound to a list of words.
+    /// Whether a text is among the words that the encoder knows, and which of them is nearest to
+    /// it; `None` from an encoder that is not bound to a list of words.
     fn nearest_word(&mut self, _text: &str) -> Result<Option<(bool, String)>> {
         Ok(None)
     }
-    /// What gave a text its embedding, of an encoder that has several: a table or a network by name.
+    /// What gave a text its embedding, of an encoder that has several: a table or a network by
+    /// name.
     fn embedded_by(&self, _text: &str) -> Option<String> {
         None
     }
@@ -107,8 +112,8 @@ pub trait RegionEncoder: Send {
     fn doubt(&self) -> Option<String> {
         None
     }
-    /// Per region embedding ([count, D] rows) the `best` phrases of the encoder's own vocabulary, with their cosine, best
-    /// first. None from an encoder that has no list of phrases.
+    /// Per region embedding ([count, D] rows) the `best` phrases of the encoder's own vocabulary,
+    /// with their cosine, best first. None from an encoder that has no list of phrases.
     fn names(&mut self, regions: &[f32], _best: usize) -> Result<Vec<Vec<(String, f32)>>> {
         Ok(vec![Vec::new(); regions.len() / self.dim().max(1)])
     }

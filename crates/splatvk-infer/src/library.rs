@@ -1,4 +1,5 @@
-//! ONNX Runtime, loaded at run time from a shared library: once per process, since a second library cannot be loaded beside it.
+//! ONNX Runtime, loaded at run time from a shared library: once per process, since a second library
+//! cannot be loaded beside it.
 use crate::files::home;
 use crate::{Error, Result};
 use ort::environment::Environment;
@@ -16,7 +17,8 @@ const LIBRARY: &str = "libonnxruntime.so";
 /// The library's path and the environment made with it, or what went wrong.
 static LOADED: OnceLock<Result<(PathBuf, Environment), String>> = OnceLock::new();
 
-/// The library in use, loaded on the first call: `ORT_DYLIB_PATH`, else `lib` under [`home`], else the system's.
+/// The library in use, loaded on the first call: `ORT_DYLIB_PATH`, else `lib` under [`home`], else
+/// the system's.
 pub fn runtime() -> Result<PathBuf> {
     // ort panics when used without a library, so every session goes through this check first.
     Ok(loaded()?.0.clone())

@@ -1,5 +1,5 @@
-//! Geometry networks that see all photos in one call (VGGT, Depth Anything 3, MapAnything): depth and cameras, from which the
-//! pointmaps of every pair follow.
+//! Geometry networks that see all photos in one call (VGGT, Depth Anything 3, MapAnything): depth
+//! and cameras, from which the pointmaps of every pair follow.
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use super::best_pairs::BestPairs;

@@ -1,5 +1,6 @@
-//! The header of an ONNX file, read without its weights: inputs, outputs, operator set, and which files hold the
-//! rest. A file of several gigabytes is looked at in milliseconds, and a truncated one is found out before it is loaded.
+//! The header of an ONNX file, read without its weights: inputs, outputs, operator set, and which
+//! files hold the rest. A file of several gigabytes is looked at in milliseconds, and a truncated
+//! one is found out before it is loaded.
 //!
 //! Field numbers are those of the published onnx.proto3.
 use std::collections::HashSet;
@@ -80,9 +81,11 @@ pub struct Header {
     pub parameters: u64,
 }
 
-/// Most axes of a tensor and outputs of a graph: real ones have some tens. A few bytes in the file take fifty in memory.
+/// Most axes of a tensor and outputs of a graph: real ones have some tens. A few bytes in the file
+/// take fifty in memory.
 const MOST_PARTS: usize = 1 << 12;
-/// Most weights of a graph, which old files list among the inputs: the largest language models have some thousands.
+/// Most weights of a graph, which old files list among the inputs: the largest language models have
+/// some thousands.
 const MOST_WEIGHTS: usize = 1 << 17;
 
 /// A field of a protobuf message.
@@ -141,7 +144,8 @@ impl Reader {
         Some((key >> 3, field))
     }
 
-    /// Calls `each` for every field of the next `length` bytes; what `each` does not read is skipped.
+    /// Calls `each` for every field of the next `length` bytes; what `each` does not read is
+    /// skipped.
     fn message(
         &mut self,
         length: u64,

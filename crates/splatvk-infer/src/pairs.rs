@@ -1,5 +1,6 @@
-//! Geometry networks: DUSt3R and MASt3R see two photos at a time, VGGT and its like all of them. Both give pointmaps of pairs
-//! ([`PairPointmaps`]), which `pose::pointmap` of splatvk brings to one scene.
+//! Geometry networks: DUSt3R and MASt3R see two photos at a time, VGGT and its like all of them.
+//! Both give pointmaps of pairs ([`PairPointmaps`]), which `pose::pointmap` of splatvk brings to
+//! one scene.
 use super::best_pairs::BestPairs;
 use super::cache::OutputKey;
 use super::contract::Part;
@@ -13,8 +14,8 @@ use crate::progress::Progress;
 use crate::scene::{Descriptors, PairPointmaps, Pointmap, Pointmaps};
 use crate::{Error, Result};
 
-/// Pointmaps of pairs of photos, for `pose::pointmap::reconstruct` of splatvk: all pairs of up to four; of more, those that show most
-/// in common.
+/// Pointmaps of pairs of photos, for `pose::pointmap::reconstruct` of splatvk: all pairs of up to
+/// four; of more, those that show most in common.
 pub fn pointmaps(model: &Installed, photos: &[Photo], progress: &dyn Progress) -> Result<Pointmaps> {
     if let Ok(graph) = model.graph(Part::MultiView) {
         let _turn = graph.compute.turn();
@@ -172,7 +173,8 @@ fn positions(ready: &Prepared) -> Input {
     Input::I64(vec![1, rows * columns, 2], at)
 }
 
-/// Outputs → one row of values: length of a descriptor, then per view points, confidence, descriptors, their confidence.
+/// Outputs → one row of values: length of a descriptor, then per view points, confidence,
+/// descriptors, their confidence.
 fn pack(mut outputs: Outputs) -> Result<Vec<f32>> {
     let views = [("points1", "conf1", "desc1", "desc_conf1"), ("points2", "conf2", "desc2", "desc_conf2")];
     let mut all = vec![0.0];
@@ -215,7 +217,8 @@ fn unpack(values: &[f32], size: [&Prepared; 2]) -> Option<Decoded> {
     rest.is_empty().then_some(Decoded { maps: [a, b], descriptors: [da, db] })
 }
 
-/// Refuses output that a trained network cannot give: an activation that the export left out, or outputs in the wrong order.
+/// Refuses output that a trained network cannot give: an activation that the export left out, or
+/// outputs in the wrong order.
 struct Sense<'a> {
     model: &'a Installed,
     judged: usize,
@@ -243,7 +246,8 @@ impl Sense<'_> {
                 return Err(self.wrong("most points lie behind the camera that sees them", raw));
             }
             if own.points.len() == other.points.len() {
-                // Seen from the first camera, only the first view's points lie on the rays of its pixels.
+                // Seen from the first camera, only the first view's points lie on the rays of its
+                // pixels.
                 let [a, b] = [own, other].map(|m| off_the_rays(m, ready.width, ready.height));
                 self.judged += 1;
                 self.crossed += usize::from(b < 0.05 && a > 2.0 * b);
@@ -261,7 +265,8 @@ impl Sense<'_> {
     }
 }
 
-/// How far points project from their own pixels with the focal length that suits them best: median, in widths of the picture.
+/// How far points project from their own pixels with the focal length that suits them best: median,
+/// in widths of the picture.
 fn off_the_rays(map: &Pointmap, width: usize, height: usize) -> f64 {
     let centre = [0.5 * width as f64, 0.5 * height as f64];
     // (slopes of the point's ray, pixel from the centre)
@@ -296,8 +301,9 @@ mod tests {
     use splatvk_test_support::onnx::{Attribute, FLOAT, Onnx};
     use splatvk_test_support::toys::photo;
 
-    /// Pointmaps of 64 × 48 pixels from one graph, which knows the two views by the brightness of its first input: the points of
-    /// the dark and of the light view, in their own camera and in the other's, at `ports`, all as sure.
+    /// Pointmaps of 64 × 48 pixels from one graph, which knows the two views by the brightness of
+    /// its first input: the points of the dark and of the light view, in their own camera and in
+    /// the other's, at `ports`, all as sure.
     fn graph(own: &[Vec<f32>; 2], other: &[Vec<f32>; 2], ports: [&str; 2], sure: f32) -> Onnx {
         let dims = [1, 48, 64, 3];
         let mut graph = Onnx::new().input("img1", FLOAT, "1 3 48 64").input("img2", FLOAT, "1 3 48 64");
@@ -367,8 +373,9 @@ mod tests {
         assert!(error.contains("below 1") && error.contains("apply.conf = \"one-plus-exp\""), "{error}");
     }
 
-    /// A tilted wall in front of two cameras, every point on the ray through the centre of its pixel: where the photo shows that
-    /// point is known, and half a pixel of the network would be five of the photo.
+    /// A tilted wall in front of two cameras, every point on the ray through the centre of its
+    /// pixel: where the photo shows that point is known, and half a pixel of the network would be
+    /// five of the photo.
     #[test]
     fn points_of_a_pair_network_are_those_of_the_centres_of_its_pixels() {
         let (w, h) = (64usize, 48);

@@ -30,7 +30,8 @@ impl Prepared {
     }
 }
 
-/// Brings a photo to the size, aspect and range that a graph takes. `role` is the graph's image input.
+/// Brings a photo to the size, aspect and range that a graph takes. `role` is the graph's image
+/// input.
 pub fn prepare(image: &RgbImage, graph: &GraphFile, spec: &ImageSpec, role: &str) -> Prepared {
     let fixed = graph.fixed(role, "W").zip(graph.fixed(role, "H"));
     let (from_w, from_h) = (image.width as f64, image.height as f64);

@@ -1,5 +1,5 @@
-//! Execution providers of ONNX Runtime: which device computes the networks. The CPU always can; a GPU does when the installed
-//! library was built for it and answers.
+//! Execution providers of ONNX Runtime: which device computes the networks. The CPU always can; a
+//! GPU does when the installed library was built for it and answers.
 #[cfg(feature = "networks")]
 use ort::ep;
 use ort::ep::ExecutionProviderDispatch;
@@ -29,7 +29,8 @@ impl Provider {
         Provider { name, listed: P::is_available, registration, automatic }
     }
 
-    /// To be put before the CPU in a session; a session that cannot have it is refused, not made without it.
+    /// To be put before the CPU in a session; a session that cannot have it is refused, not made
+    /// without it.
     pub(super) fn registration(&self) -> ExecutionProviderDispatch {
         (self.registration)().error_on_failure()
     }
@@ -119,7 +120,8 @@ pub(super) fn settings(
     let builder = ort::session::Session::builder(environment)?
         .with_optimization_level(GraphOptimizationLevel::Level3)?
         .with_intra_threads(threads)?
-        // Else threads that wait for the next operator keep all cores busy, which passes on the CPU and other sessions need.
+        // Else threads that wait for the next operator keep all cores busy, which passes on the CPU
+        // and other sessions need.
         .with_intra_op_spinning(false)?;
     let mut providers: Vec<_> = provider.iter().map(|p| p.registration()).collect();
     if large {
@@ -137,7 +139,8 @@ const PROBE: &[u8] = b"\x08\x08\x3a\x33\
     \x62\x0f\x0a\x01y\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01\
     \x42\x04\x0a\x00\x10\x11";
 
-/// Computes a graph of one node: a library may list a provider, and even register it, on a machine without its device.
+/// Computes a graph of one node: a library may list a provider, and even register it, on a machine
+/// without its device.
 fn probe(environment: &Environment, provider: Option<&Provider>) -> ort::Result<()> {
     let mut session = settings(environment, provider, false)?.commit_from_memory(PROBE)?;
     let computed = session.run(ort::inputs!["x" => OrtTensor::from_array(([1usize], vec![2f32]))?])?;

@@ -1,6 +1,8 @@
-//! The default model pack: which files it holds, where they are, and whether they are what they should be.
+//! The default model pack: which files it holds, where they are, and whether they are what they
+//! should be.
 //!
-//! The table is `crates/splatvk-infer/src/pack.json`, the same one that the set-up script builds from, so the two cannot disagree.
+//! The table is `crates/splatvk-infer/src/pack.json`, the same one that the set-up script builds
+//! from, so the two cannot disagree.
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -94,8 +96,8 @@ pub struct Registry {
 }
 
 impl Registry {
-    /// The folders of `models_dir`, else of `SPLATVK_MODELS` (both may be lists, written like `PATH`), else `models` under
-    /// [`home`]. Opening does not read the files.
+    /// The folders of `models_dir`, else of `SPLATVK_MODELS` (both may be lists, written like
+    /// `PATH`), else `models` under [`home`]. Opening does not read the files.
     pub fn open(models_dir: Option<&Path>) -> Result<Self> {
         Registry::with(models_dir, Compute::default())
     }
@@ -173,8 +175,9 @@ impl Registry {
         wanted.map(|f| self.inspect(f)).collect()
     }
 
-    /// The file for `kind`, present and with the right content; otherwise an error that names the file, the sha256 it
-    /// should have and how to get it. Content is hashed once per process and file version.
+    /// The file for `kind`, present and with the right content; otherwise an error that names the
+    /// file, the sha256 it should have and how to get it. Content is hashed once per process and
+    /// file version.
     pub fn path(&self, kind: PackFileKind) -> Result<PathBuf> {
         let found = self.pack.files.iter().find(|f| f.kind == kind).map(|f| self.inspect(f));
         match found {

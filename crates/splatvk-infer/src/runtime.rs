@@ -1,4 +1,5 @@
-//! ONNX Runtime, loaded at run time from a shared library, and sessions with plain tensors in and out.
+//! ONNX Runtime, loaded at run time from a shared library, and sessions with plain tensors in and
+//! out.
 use std::path::{Path, PathBuf};
 
 use ort::session::SessionInputValue;
@@ -88,8 +89,8 @@ pub struct Session {
     _memory: Option<HandBack>,
 }
 
-/// Makes glibc return freed memory to the system when dropped. It keeps what it can: a loaded network would occupy twice its
-/// weights, a dropped one still once.
+/// Makes glibc return freed memory to the system when dropped. It keeps what it can: a loaded
+/// network would occupy twice its weights, a dropped one still once.
 struct HandBack;
 
 impl Drop for HandBack {
@@ -103,7 +104,8 @@ impl Drop for HandBack {
 }
 
 impl Session {
-    /// Loads a graph for the chosen provider; on the CPU it computes on as many threads as there are cores.
+    /// Loads a graph for the chosen provider; on the CPU it computes on as many threads as there
+    /// are cores.
     pub fn load(file: &Path, compute: &Compute) -> Result<Self> {
         let bytes = file.metadata().map_or(0, |m| m.len());
         Session::load_sized(file, bytes, compute)
@@ -185,5 +187,6 @@ fn floats(value: &ort::value::DynValue) -> ort::Result<Tensor> {
     })
 }
 
-/// Files from this size on, bytes, are networks whose memory counts for more than the time of allocating it.
+/// Files from this size on, bytes, are networks whose memory counts for more than the time of
+/// allocating it.
 const LARGE: u64 = 200 << 20;

@@ -1,4 +1,5 @@
-//! Networks that cut masks out of a photo at a point (SAM, SAM 2 and those that share their interfaces).
+//! Networks that cut masks out of a photo at a point (SAM, SAM 2 and those that share their
+//! interfaces).
 use super::contract::Part;
 use super::graph::{Graph, GraphFile};
 use super::installed::Installed;
@@ -40,7 +41,8 @@ pub struct Proposals {
 pub const MASKS: usize = 3;
 
 impl Sam {
-    /// Loads both graphs; refuses a decoder with a single mask per point, which cannot give three levels.
+    /// Loads both graphs; refuses a decoder with a single mask per point, which cannot give three
+    /// levels.
     pub fn load(model: &Installed) -> Result<Sam> {
         let decoder = model.graph(Part::MaskDecoder)?;
         if decoder.fixed("scores", "M").or(decoder.fixed("masks", "M")).is_some_and(|m| m < MASKS) {
@@ -65,7 +67,8 @@ impl Sam {
         Ok(Encoded { ready, tensors })
     }
 
-    /// Masks at some points of the encoded image (pixels, centre of the first at 0.5); at most [`BATCH`].
+    /// Masks at some points of the encoded image (pixels, centre of the first at 0.5); at most
+    /// [`BATCH`].
     pub fn decode(&mut self, image: &Encoded, points: &[[f64; 2]]) -> Result<Proposals> {
         let at_once = self.decoder.file.fixed("points", "P").unwrap_or(points.len()).max(1);
         let mut all = Proposals {

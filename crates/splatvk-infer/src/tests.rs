@@ -1,4 +1,5 @@
-//! Networks that users bring, as tiny graphs with the same interfaces: what fits is used, what does not is named.
+//! Networks that users bring, as tiny graphs with the same interfaces: what fits is used, what does
+//! not is named.
 use std::path::Path;
 
 use super::catalogue::{CatalogueEntry, catalogue, common_packages};
@@ -62,7 +63,8 @@ fn towers_are_recognised_by_their_tensors_and_proven_to_belong_together() {
     assert_eq!(mismatched.exit_code(), 2);
 }
 
-/// Folders from a hub hold both towers in one graph beside the two, and variants whose download stopped.
+/// Folders from a hub hold both towers in one graph beside the two, and variants whose download
+/// stopped.
 #[test]
 fn a_whole_model_does_without_what_cannot_be_used_beside_it() {
     let dir = tempfile::tempdir().unwrap();
@@ -265,7 +267,8 @@ fn sources_are_sound(model: &CatalogueEntry) {
         assert_eq!(name.file_name(), Some(name.as_os_str()), "{}", source.name);
         let hex = |s: &String| s.len() == 64 && s.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
         assert!(source.sha256.as_ref().is_none_or(hex), "{}", source.from);
-        // Whoever can change a file behind an address without a revision cannot change its checksum.
+        // Whoever can change a file behind an address without a revision cannot change its
+        // checksum.
         let fixed =
             source.from.split('/').any(|part| part.len() == 40) || !source.from.contains("huggingface");
         assert!(fixed || source.sha256.is_none(), "{}", source.from);
@@ -309,7 +312,8 @@ fn files_side_by_side_belong_together_by_name_and_the_catalogue_decides_which_is
 fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_the_adapter() {
     let (w, h) = (32u64, 16);
     let pixels = (w * h) as usize;
-    // ln 3 along z: e^d − 1 = 2. A mark of the first image's brightness in x tells the two orders apart.
+    // ln 3 along z: e^d − 1 = 2. A mark of the first image's brightness in x tells the two orders
+    // apart.
     let raw: Vec<f32> = (0..3 * pixels).map(|k| if k / pixels == 2 { 3f32.ln() } else { 0.0 }).collect();
     let mut graph = Onnx::new().input("img1", FLOAT, "1 3 16 32").input("img2", FLOAT, "1 3 16 32");
     for k in ["1", "2"] {
@@ -348,7 +352,8 @@ fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_t
     assert!(pair.x11.points[0][0].abs() < 1e-6 && pair.x22.points[0][0] > 1e-3, "{:?}", pair.x22.points[0]);
 }
 
-/// MASt3R as a matcher: pixels of one colour have one descriptor, and every colour occurs once in each photo.
+/// MASt3R as a matcher: pixels of one colour have one descriptor, and every colour occurs once in
+/// each photo.
 #[test]
 fn descriptors_of_a_pair_network_match_photos() {
     let (w, h) = (32u64, 16);
@@ -370,8 +375,8 @@ fn descriptors_of_a_pair_network_match_photos() {
     let registry = Registry::of(&[dir.path()]);
     let model = registry.installed(Task::Matcher, "mast3r").unwrap();
     assert_eq!(model.tasks, [Task::Geometry, Task::Depth, Task::Matcher]);
-    // A direction on a cone per pixel: no two pixels share one, neighbours are near each other. The second photo is the first
-    // moved by eight pixels.
+    // A direction on a cone per pixel: no two pixels share one, neighbours are near each other. The
+    // second photo is the first moved by eight pixels.
     let colours = |shift: usize| {
         let colour = |x: usize, y: usize| {
             let (sin, cos) = (0.1 * x as f32).sin_cos();

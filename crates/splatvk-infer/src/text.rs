@@ -42,8 +42,9 @@ impl TextEncoder {
         self.forward(&[&tokens])
     }
 
-    /// Unit embeddings [N, 384]. The int8 network scales its activations over a whole batch, so an embedding differs
-    /// in the third digit from what [`TextEncoder::embed`] gives: fine for a fixed list, wrong for a single query.
+    /// Unit embeddings [N, 384]. The int8 network scales its activations over a whole batch, so an
+    /// embedding differs in the third digit from what [`TextEncoder::embed`] gives: fine for a
+    /// fixed list, wrong for a single query.
     pub fn embed_list(&mut self, texts: &[&str], progress: &dyn Progress) -> Result<Vec<f32>> {
         let tokens = texts.iter().map(|t| self.tokens(t)).collect::<Result<Vec<_>>>()?;
         let mut order: Vec<usize> = (0..texts.len()).collect();

@@ -1,17 +1,20 @@
-//! Things of everyday life: what a text could have said instead. `query::presence` of splatvk weighs a text against them.
+//! Things of everyday life: what a text could have said instead. `query::presence` of splatvk
+//! weighs a text against them.
 use super::colour;
 
 /// One per line.
 const THINGS: &str = include_str!("things.txt");
 
-/// With words before them so many fewer are asked for: each form is a list of its own, which takes a text model seconds.
+/// With words before them so many fewer are asked for: each form is a list of its own, which takes
+/// a text model seconds.
 const FORMED_EVERY: usize = 4;
 
-/// Most colours of a form. A list is made for each form that is asked for, so that their number bounds the work and the memory.
+/// Most colours of a form. A list is made for each form that is asked for, so that their number
+/// bounds the work and the memory.
 const MOST_COLOURS: usize = 3;
 
-/// The words that a text must have in common with what else it could have said: its first colours, each once. Anything red is a
-/// little of a "red book".
+/// The words that a text must have in common with what else it could have said: its first colours,
+/// each once. Anything red is a little of a "red book".
 pub fn form(text: &str) -> String {
     let mut words: Vec<String> = Vec::new();
     for word in colour::words_in(text) {
@@ -22,7 +25,8 @@ pub fn form(text: &str) -> String {
     words.join(" ")
 }
 
-/// Whether many texts have a form, so that it is worth keeping what belongs to it: one colour at most.
+/// Whether many texts have a form, so that it is worth keeping what belongs to it: one colour at
+/// most.
 pub fn is_common(form: &str) -> bool {
     forms().any(|known| known == form)
 }

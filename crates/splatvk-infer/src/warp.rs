@@ -1,5 +1,6 @@
-//! Dense matches from networks: for every pixel of one photo its position in another, with a certainty. RoMa v1 and v2 say so
-//! themselves; MASt3R gives descriptors, whose nearest neighbours do.
+//! Dense matches from networks: for every pixel of one photo its position in another, with a
+//! certainty. RoMa v1 and v2 say so themselves; MASt3R gives descriptors, whose nearest neighbours
+//! do.
 use rayon::prelude::*;
 
 use super::cache::OutputKey;
@@ -102,7 +103,8 @@ fn by_descriptors(
     Ok(all)
 }
 
-/// Pitch of the pixels whose nearest neighbours are sought: a search for each would take minutes a pair on a CPU.
+/// Pitch of the pixels whose nearest neighbours are sought: a search for each would take minutes a
+/// pair on a CPU.
 const STEP: usize = 4;
 
 /// A warp at the network's resolution: (x, y) in [−1, 1] of the second input, certainty.
@@ -148,7 +150,8 @@ fn fields(mut values: &[f32]) -> Vec<Field> {
 }
 
 impl Field {
-    /// Where the nearest descriptors lie. What returns elsewhere is no match; that is for the caller to see.
+    /// Where the nearest descriptors lie. What returns elsewhere is no match; that is for the
+    /// caller to see.
     fn nearest(from: (&Descriptors, &Prepared), to: (&Descriptors, &Prepared)) -> Field {
         let (width, height) = (from.1.width / STEP, from.1.height / STEP);
         let seed =

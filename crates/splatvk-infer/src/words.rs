@@ -8,13 +8,14 @@
 //! | classes, 1000 | `√p` | `√w`, `w = softmax(cosine to each class name / 0.03)` |
 //! | colour, 11 | colour terms of its pixels | colour words in the text |
 //!
-//! The class block is what separates things: a dot product of square roots is a Bhattacharyya coefficient, and the
-//! steep softmax asks for the class that the phrase means instead of all that are vaguely alike. The meaning block ranks
-//! what no class names. Sentence embeddings have the class names' mean removed, which carries no information.
+//! The class block is what separates things: a dot product of square roots is a Bhattacharyya
+//! coefficient, and the steep softmax asks for the class that the phrase means instead of all that
+//! are vaguely alike. The meaning block ranks what no class names. Sentence embeddings have the
+//! class names' mean removed, which carries no information.
 //!
-//! A 1397th coordinate, zero for regions, takes up the length that a text leaves: a text that no class resembles
-//! ("object", "stuff": softmax against a constant 0.55) and that says no colour is nearly orthogonal to every region, as
-//! the canonical phrases of the relevancy score should be.
+//! A 1397th coordinate, zero for regions, takes up the length that a text leaves: a text that no
+//! class resembles ("object", "stuff": softmax against a constant 0.55) and that says no colour is
+//! nearly orthogonal to every region, as the canonical phrases of the relevancy score should be.
 //!
 //! It covers about a thousand everyday things and eleven colours. CLIP is the full model.
 use super::cache::OutputKey;
@@ -34,18 +35,21 @@ const REST_AT: usize = COLOUR_AT + colour::COUNT;
 /// Length of an embedding.
 pub const DIM: usize = REST_AT + 1;
 
-/// Shares of the squared length: meaning, classes, colour. Measured on breakfast (40 phrase–view pairs, perfect masks):
-/// 36 to 39 right for meaning 0.1–0.25, colour 0.3; 28 without colour; 24 without the class block.
+/// Shares of the squared length: meaning, classes, colour. Measured on breakfast (40 phrase–view
+/// pairs, perfect masks): 36 to 39 right for meaning 0.1–0.25, colour 0.3; 28 without colour; 24
+/// without the class block.
 const SHARES: [f32; 3] = [0.15, 0.55, 0.3];
 /// Softness of the step from text to classes; 0.03 to 0.05 measured equally good, 0.1 worse.
 const SOFTNESS: f32 = 0.03;
-/// Cosine to a class name from which a text counts as meaning that class: "object", "things", "stuff" and "texture"
-/// stay below 0.37, "blue mug" reaches 0.7 with "coffee mug". 0.5 to 0.6 measured equally good.
+/// Cosine to a class name from which a text counts as meaning that class: "object", "things",
+/// "stuff" and "texture" stay below 0.37, "blue mug" reaches 0.7 with "coffee mug". 0.5 to 0.6
+/// measured equally good.
 const THRESHOLD: f32 = 0.55;
 
-/// Cosine to the nearest class name, colours apart, from which a text is among the words that are known. Of a hundred texts that name
-/// no thing ("inflation", "Wednesday") five reach it: the level of a conformal test. So do 65 % of the 860 other names that the classes
-/// have, and of the 980 things of everyday life of [`things`].
+/// Cosine to the nearest class name, colours apart, from which a text is among the words that are
+/// known. Of a hundred texts that name no thing ("inflation", "Wednesday") five reach it: the level
+/// of a conformal test. So do 65 % of the 860 other names that the classes have, and of the 980
+/// things of everyday life of [`things`].
 const KNOWN: f32 = 0.46;
 
 /// The encoder. Networks are loaded when first needed.
@@ -273,7 +277,8 @@ impl Vocabulary {
         scores.iter().map(|s| power(*s) / total).collect()
     }
 
-    /// The class names as texts, without colour: [1000, DIM], all but the last coordinate, which no region has.
+    /// The class names as texts, without colour: [1000, DIM], all but the last coordinate, which no
+    /// region has.
     fn rows(&self) -> Vec<f32> {
         let mut rows = vec![0f32; CLASSES * DIM];
         rows.par_chunks_exact_mut(DIM).zip(self.names.par_chunks_exact(text::DIM)).for_each(|(row, name)| {
@@ -304,7 +309,8 @@ mod tests {
         query: &[f32],
         canonical: &[f32],
     ) -> Option<(usize, f32)> {
-        // Less than a thumbnail's worth of pixels is not worth ranking (a sliver of carpet in one view).
+        // Less than a thumbnail's worth of pixels is not worth ranking (a sliver of carpet in one
+        // view).
         let visible = |o: i32| view.masks.data.iter().filter(|m| **m == o).count() >= 50;
         let score = |o: i32| relevancy(&regions[o as usize * DIM..(o as usize + 1) * DIM], query, canonical);
         let right = visible(object).then(|| score(object))?;
@@ -312,7 +318,8 @@ mod tests {
         Some((better + 1, right))
     }
 
-    /// How many phrase–view pairs put the right region first, and of how many. Phrases in `sure` must.
+    /// How many phrase–view pairs put the right region first, and of how many. Phrases in `sure`
+    /// must.
     fn first_of(words: &mut RegionWords, split: &str, sure: &[&str]) -> (usize, usize) {
         let canonical = words.embed_texts(&["object", "things", "stuff", "texture"]).unwrap();
         let views = views(split);
@@ -338,7 +345,8 @@ mod tests {
     fn phrases_find_their_regions_on_breakfast() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
         let sure = ["lemon", "blue mug", "plate", "red soda can", "loaf of bread", "green book"];
-        // Measured 39 of 41 on the views that the shares were chosen on, 73 of 81 on views that they were not.
+        // Measured 39 of 41 on the views that the shares were chosen on, 73 of 81 on views that
+        // they were not.
         let (first, all) = first_of(&mut words, "train", &sure);
         assert!(first >= 37 && all == 41, "{first} of {all}");
         let (first, all) = first_of(&mut words, "test", &sure);
@@ -401,7 +409,8 @@ mod tests {
         let mut of = |v: &TestView| words.embed_regions(&v.image, &v.masks, 12, &Silent).unwrap();
         let (a, b) = (of(&views[1]), of(&views[2]));
         let row = |all: &[f32], i: usize| all[i * DIM..(i + 1) * DIM].to_vec();
-        // The eight objects. Measured: the same one 0.8 to 0.98, another 0.38 in the middle and 0.76 at most.
+        // The eight objects. Measured: the same one 0.8 to 0.98, another 0.38 in the middle and
+        // 0.76 at most.
         for i in 4..12 {
             let same = dot(&row(&a, i), &row(&b, i));
             let other =

@@ -18,7 +18,8 @@ const THRESHOLD: f32 = 0.05;
 /// Keypoints of one image, best first.
 #[derive(Clone, Debug, Default)]
 pub struct XFeatKeypoints {
-    /// [N] continuous (u, v) pixels of the input image; the centre of the first pixel is (0.5, 0.5).
+    /// [N] continuous (u, v) pixels of the input image; the centre of the first pixel is (0.5,
+    /// 0.5).
     pub keypoints: Vec<[f32; 2]>,
     /// [N] keypoint probability × reliability, in (0, 1].
     pub scores: Vec<f32>,
@@ -32,7 +33,8 @@ impl XFeatKeypoints {
         &self.descriptors[i * DIM..(i + 1) * DIM]
     }
 
-    /// Pairs (index here, index in `other`, cosine) that are each other's best match, with cosine ≥ `min_cosine`.
+    /// Pairs (index here, index in `other`, cosine) that are each other's best match, with cosine ≥
+    /// `min_cosine`.
     pub fn mutual_matches(&self, other: &XFeatKeypoints, min_cosine: f32) -> Vec<(usize, usize, f32)> {
         let forward = best_matches(&self.descriptors, &other.descriptors);
         let backward = best_matches(&other.descriptors, &self.descriptors);
@@ -71,7 +73,8 @@ pub struct DenseFeatures {
     pub descriptors: Vec<f32>,
     /// Reliability of each cell, in (0, 1).
     pub reliability: Plane<f32>,
-    /// Input pixels per cell, across and down: cell (c, r) is centred at `((c + 0.5)·x, (r + 0.5)·y)`.
+    /// Input pixels per cell, across and down: cell (c, r) is centred at `((c + 0.5)·x, (r +
+    /// 0.5)·y)`.
     pub pixels_per_cell: [f32; 2],
 }
 
@@ -101,7 +104,8 @@ impl DenseFeatures {
     }
 }
 
-/// Weights of the four neighbours of a point `t` past the second one (Keys 1981, a = −0.75 as torch's grid_sample).
+/// Weights of the four neighbours of a point `t` past the second one (Keys 1981, a = −0.75 as
+/// torch's grid_sample).
 fn cubic_weights(t: f32) -> [f32; 4] {
     let a = -0.75f32;
     let near = |d: f32| ((a + 2.0) * d - (a + 3.0)) * d * d + 1.0;
@@ -194,7 +198,8 @@ impl XFeat {
     }
 }
 
-/// Mean of the channels, resized bilinearly (half-pixel centres; the sizes differ by less than 32 pixels).
+/// Mean of the channels, resized bilinearly (half-pixel centres; the sizes differ by less than 32
+/// pixels).
 fn resized_grey(image: &RgbImage, w: usize, h: usize) -> Vec<f32> {
     let data = image.data.iter().map(|c| (c[0] + c[1] + c[2]) / 3.0).collect();
     let grey = Plane { width: image.width, height: image.height, data };
@@ -209,7 +214,8 @@ fn resized_grey(image: &RgbImage, w: usize, h: usize) -> Vec<f32> {
     rows.collect()
 }
 
-/// Keypoint probability per pixel from logits [65, ch, cw]: softmax over the 64 pixels of a cell and "none".
+/// Keypoint probability per pixel from logits [65, ch, cw]: softmax over the 64 pixels of a cell
+/// and "none".
 fn heatmap(logits: &[f32], cw: usize, ch: usize) -> Plane<f32> {
     let mut heat = Plane::filled(cw * CELL, ch * CELL, 0f32);
     for cy in 0..ch {
@@ -261,7 +267,8 @@ mod tests {
     use glam::DVec2;
     use splatvk_test_support::breakfast::{TestView, train_views};
 
-    /// Distance in pixels between each match and where the exact depth and cameras put it; hidden points are left out.
+    /// Distance in pixels between each match and where the exact depth and cameras put it; hidden
+    /// points are left out.
     fn errors(a: &TestView, b: &TestView, fa: &XFeatKeypoints, fb: &XFeatKeypoints) -> Vec<f64> {
         let one = |(i, j, _): (usize, usize, f32)| {
             let [u, v] = fa.keypoints[i];
@@ -269,7 +276,8 @@ mod tests {
             let world = a.camera.unproject(DVec2::new(u as f64, v as f64), depth);
             let (p, z) = b.camera.project(world);
             let inside = depth > 0.0 && z > 0.0 && p.x >= 0.0 && p.y >= 0.0 && p.x < 640.0 && p.y < 480.0;
-            // 2 % of depth is well above the 0.06 % to which the two maps agree and below any occluder's distance.
+            // 2 % of depth is well above the 0.06 % to which the two maps agree and below any
+            // occluder's distance.
             let seen = inside && (b.depth.at(p.x as usize, p.y as usize) as f64 - z).abs() < 0.02 * z;
             let [x, y] = fb.keypoints[j];
             seen.then(|| p.distance(DVec2::new(x as f64, y as f64)))
@@ -292,10 +300,11 @@ mod tests {
                     e.len(),
                     100.0 * share
                 );
-                // Measured: 319 to 1253 matches, 24 % (views 75° apart) to 38 % of them within 2 px; 53 % with a
-                // cosine of 0.9. Chance is 0.004 % (a disc of 2 px in 640 × 480).
+                // Measured: 319 to 1253 matches, 24 % (views 75° apart) to 38 % of them within 2
+                // px; 53 % with a cosine of 0.9. Chance is 0.004 % (a disc of 2 px in 640 × 480).
                 assert!(e.len() > 250 && share > 0.2, "views {i} and {j}: {} matches, {share}", e.len());
-                // Sub-pixel peaks: 1.2 to 1.6 px among matches within 5 px; whole pixels give 1.35 to 1.8.
+                // Sub-pixel peaks: 1.2 to 1.6 px among matches within 5 px; whole pixels give 1.35
+                // to 1.8.
                 let near = e.partition_point(|d| *d < 5.0);
                 assert!(e[near / 2] < 1.75, "views {i} and {j}: median error {}", e[near / 2]);
             }

@@ -1,7 +1,7 @@
 //! Files of Gaussian splatting, without a GPU and without networks.
 //!
-//! - [`format`]: splats in PLY, compressed PLY, SPZ, `.splat` and glTF; cameras of COLMAP, nerfstudio
-//!   and `transforms.json`; the scene folder of splatvk.
+//! - [`format`]: splats in PLY, compressed PLY, SPZ, `.splat` and glTF; cameras of COLMAP,
+//!   nerfstudio and `transforms.json`; the scene folder of splatvk.
 //! - [`photo`]: photos of any kind decoded to linear or sRGB colour, with EXIF, masks and colour
 //!   profiles.
 //!

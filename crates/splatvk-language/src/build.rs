@@ -16,7 +16,8 @@ pub enum Reducer {
     Bijection,
     /// A scene autoencoder to three dimensions and back, as LangSplat; `feature_dim` is then 3.
     Autoencoder {
-        /// Train for at least so many steps; the published 100 epochs are few of them for the features of a few photos.
+        /// Train for at least so many steps; the published 100 epochs are few of them for the
+        /// features of a few photos.
         least_steps: usize,
     },
     /// At most 128 mean features, as LEGaussians; codes are a start for an index head.
@@ -64,8 +65,8 @@ pub struct Language {
 
 /// Aligns the masks of all views and encodes the things they form.
 ///
-/// `masks`, `cameras` and `depths` have one entry per view, all at the view's working resolution; `matched` holds
-/// the dense matches of step 1 ([`super::matcher`]), once per unordered pair.
+/// `masks`, `cameras` and `depths` have one entry per view, all at the view's working resolution;
+/// `matched` holds the dense matches of step 1 ([`super::matcher`]), once per unordered pair.
 pub fn build(
     masks: &[ViewMasks],
     cameras: &[Camera],

@@ -1,7 +1,9 @@
-//! Precomputed masks and features, `dir:DIR` (the layout that LangSplat-style preprocessing writes).
+//! Precomputed masks and features, `dir:DIR` (the layout that LangSplat-style preprocessing
+//! writes).
 //!
-//! Per photo: `<stem>_s.npy`, int or float, 4×H×W (default, s, m, l) or 3×H×W (s, m, l), each value a row of
-//! `<stem>_f.npy` (N×D) or −1. `text_embeddings.npz` maps phrases to D-vectors of the same space.
+//! Per photo: `<stem>_s.npy`, int or float, 4×H×W (default, s, m, l) or 3×H×W (s, m, l), each value
+//! a row of `<stem>_f.npy` (N×D) or −1. `text_embeddings.npz` maps phrases to D-vectors of the same
+//! space.
 use super::{LevelMasks, ViewMasks};
 use crate::format::npy::{self, NpyData};
 use crate::photo::Photo;
@@ -11,14 +13,15 @@ use glam::DVec2;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Masks below this many pixels are dropped: LangSplat's own clean-up leaves none smaller, and fewer pixels carry no
-/// reliable feature (docs/internals/method.md#label-maps).
+/// Masks below this many pixels are dropped: LangSplat's own clean-up leaves none smaller, and
+/// fewer pixels carry no reliable feature (docs/internals/method.md#label-maps).
 pub const MIN_MASK_PIXELS: usize = 32;
 
 /// Vectors shorter than this have no direction (docs/internals/method.md#region-features).
 const MIN_NORM: f32 = 1e-6;
 
-/// Reads the masks of one photo, at its working resolution; with their features when `with_features`.
+/// Reads the masks of one photo, at its working resolution; with their features when
+/// `with_features`.
 ///
 /// The label map may have the photo's working size or its original (upright) size.
 pub fn read_view(dir: &Path, photo: &Photo, with_features: bool) -> Result<ViewMasks> {
@@ -140,8 +143,8 @@ pub fn normalise_rows(rows: &mut [f32], dim: usize) {
     }
 }
 
-/// Labels of the original or the working size as the photo's image shows them: nearest pixels, through the photo's affine
-/// map and the lens that was taken out.
+/// Labels of the original or the working size as the photo's image shows them: nearest pixels,
+/// through the photo's affine map and the lens that was taken out.
 fn to_working(labels: Plane<i32>, photo: &Photo) -> Plane<i32> {
     let (width, height) = (photo.image.width, photo.image.height);
     let same = (labels.width, labels.height) == (width, height);
@@ -162,7 +165,8 @@ fn to_working(labels: Plane<i32>, photo: &Photo) -> Plane<i32> {
     out
 }
 
-/// Global rows → compact per-level indices; regions that are too small or have no feature become holes.
+/// Global rows → compact per-level indices; regions that are too small or have no feature become
+/// holes.
 fn compact(labels: Plane<i32>, features: Option<&FeatureRows>, path: &Path) -> Result<LevelMasks> {
     let mut area: BTreeMap<i32, usize> = BTreeMap::new();
     for &l in labels.data.iter().filter(|&&l| l >= 0) {
@@ -300,8 +304,8 @@ mod tests {
         }
     }
 
-    /// Left half row 2, right half row 5 at every level of a 4-map file, plus one lone pixel of row 1;
-    /// nothing in its first map, which is no level.
+    /// Left half row 2, right half row 5 at every level of a 4-map file, plus one lone pixel of row
+    /// 1; nothing in its first map, which is no level.
     fn write_case(dir: &Path, width: usize, height: usize) {
         let mut labels = Vec::new();
         for map in 0..4 {
@@ -332,7 +336,8 @@ mod tests {
         });
         let columns = (0..200 * 100).map(|k| k % 200).collect();
         let labels = to_working(Plane { width: 200, height: 100, data: columns }, &seen);
-        // r = 0.6 is imaged at 0.6 (1 − 0.3 · 0.36) = 0.5352, 80.28 pixels from the middle instead of 90.
+        // r = 0.6 is imaged at 0.6 (1 − 0.3 · 0.36) = 0.5352, 80.28 pixels from the middle instead
+        // of 90.
         assert_eq!((labels.at(190, 50), labels.at(100, 50)), (180, 100));
     }
 

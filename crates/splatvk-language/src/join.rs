@@ -1,7 +1,9 @@
-//! Masks of photos that join a scene, under the codes that it has (docs/internals/method.md#photos-added-later).
+//! Masks of photos that join a scene, under the codes that it has
+//! (docs/internals/method.md#photos-added-later).
 //!
-//! A scene seen from the camera of a new photo shows its things where the photo shows them: the same alignment that joins masks of two
-//! photos joins the photo's masks with the codes that are rendered there.
+//! A scene seen from the camera of a new photo shows its things where the photo shows them: the
+//! same alignment that joins masks of two photos joins the photo's masks with the codes that are
+//! rendered there.
 use super::align::{self, Alignment, Component, PairLinks, links_from_depth, links_from_overlay};
 use super::build::{BuildOptions, Language};
 use super::codebook::{self, CodeEntry};
@@ -11,12 +13,13 @@ use crate::scene::{Camera, DepthMap, LanguageField, LevelField, MaskId, Plane};
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 
-/// Relative difference in depth that two views of one surface may have, as in the other alignment steps
-/// (docs/internals/method.md#reprojection).
+/// Relative difference in depth that two views of one surface may have, as in the other alignment
+/// steps (docs/internals/method.md#reprojection).
 const SAME_SURFACE: f32 = 0.05;
 
-/// Share of a mask that stands on surfaces the scene does not have, from which on a mask that is none of its things is a new one. Below,
-/// the scene has an answer for most of it already, which a second one would only contradict.
+/// Share of a mask that stands on surfaces the scene does not have, from which on a mask that is
+/// none of its things is a new one. Below, the scene has an answer for most of it already, which a
+/// second one would only contradict.
 const MOSTLY_NEW: f64 = 0.5;
 
 /// A scene from the camera of a new photo, and what was measured in that photo.
@@ -50,8 +53,9 @@ impl SceneView<'_> {
     }
 }
 
-/// The field of a scene that `masks` of new photos join, one entry per view of `new`. `known` are the codes of the scene's own photos:
-/// they stay, and so does every code. Splat features are empty until training fills them.
+/// The field of a scene that `masks` of new photos join, one entry per view of `new`. `known` are
+/// the codes of the scene's own photos: they stay, and so does every code. Splat features are empty
+/// until training fills them.
 pub fn join(
     field: &LanguageField,
     known: Vec<Vec<Plane<i32>>>,
@@ -91,7 +95,8 @@ pub fn join(
     Ok(Language { field: out, alignment })
 }
 
-/// One level of a joint alignment: views below `new.len()` are the scene's, the others those of the photos.
+/// One level of a joint alignment: views below `new.len()` are the scene's, the others those of the
+/// photos.
 struct Level<'a> {
     level: usize,
     field: &'a LevelField,
@@ -147,8 +152,9 @@ impl Level<'_> {
                 let own = of_mask.get(&MaskId::new(n + k, *label as usize));
                 let (code, twin) = own.copied().unwrap_or((-1, None));
                 let shown = if self.same[k][p] { codes.data[p] } else { -1 };
-                // Several things of the scene that the photo shows as one stay several where alignment has fused them, which it does
-                // not on the finest level; what matched nothing stays what it was.
+                // Several things of the scene that the photo shows as one stay several where
+                // alignment has fused them, which it does not on the finest level; what matched
+                // nothing stays what it was.
                 let stays = shown >= 0 && (code < 0 || twin.is_some_and(|t| t as i32 == scene.data[p]));
                 *label = if stays { shown } else { code };
             }
@@ -258,8 +264,8 @@ mod tests {
         let codes = vec![plane(|x, _| code(x)); 3];
         let measured = DepthMap { depth: plane(|_, _| 2.0), confidence: plane(|_, _| 0.9) };
         let depth = plane(|x, _| if x < 24 { 2.0 } else { 0.0 });
-        // The photo: mask 0 is the left thing, 1 the right one, 2 something new beyond; 3 is a spot within the left thing that
-        // resembles nothing there.
+        // The photo: mask 0 is the left thing, 1 the right one, 2 something new beyond; 3 is a spot
+        // within the left thing that resembles nothing there.
         let mask = |x: usize, y: usize| match x {
             0..4 if y < 8 => 3,
             0..12 => 0,

@@ -1,7 +1,8 @@
 //! Masks, region features, alignment, codebook.
 //!
-//! [`dir`] or [`graph`] give masks, a [`splatvk_infer::RegionEncoder`] or `dir` their features, [`matcher`] the dense
-//! matches between views; [`build()`] aligns everything and turns it into codebooks and training targets.
+//! [`dir`] or [`graph`] give masks, a [`splatvk_infer::RegionEncoder`] or `dir` their features,
+//! [`matcher`] the dense matches between views; [`build()`] aligns everything and turns it into
+//! codebooks and training targets.
 
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]

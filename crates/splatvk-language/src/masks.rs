@@ -12,8 +12,8 @@ pub struct LevelMasks {
     pub quality: Vec<f32>,
     /// [M, D] unit feature per mask, row-major; empty until region features ran.
     pub features: Vec<f32>,
-    /// Label maps with every mask as it was found, in one of them, so that masks which overlap are in different ones; empty
-    /// where `labels` has them whole, and once features are there.
+    /// Label maps with every mask as it was found, in one of them, so that masks which overlap are
+    /// in different ones; empty where `labels` has them whole, and once features are there.
     pub whole: Vec<Plane<i32>>,
 }
 
@@ -48,8 +48,8 @@ pub struct ViewMasks {
 }
 
 impl ViewMasks {
-    /// Per label of `truth`, the IoU of its best mask on each level. Labels of fewer than `least` pixels
-    /// are left out. The two may differ in size.
+    /// Per label of `truth`, the IoU of its best mask on each level. Labels of fewer than `least`
+    /// pixels are left out. The two may differ in size.
     pub fn best_ious(&self, truth: &Plane<u32>, least: usize) -> BTreeMap<u32, [f64; 3]> {
         let mut sizes: BTreeMap<u32, usize> = BTreeMap::new();
         truth.data.iter().for_each(|&t| *sizes.entry(t).or_default() += 1);
@@ -95,7 +95,8 @@ mod tests {
 
     #[test]
     fn iou_is_that_of_the_best_mask_at_any_size_and_specks_do_not_count() {
-        // 20 x 20 truth: label 7 on the left 8 columns, label 9 on 4 pixels; masks at half the size, left 5 columns and rest
+        // 20 x 20 truth: label 7 on the left 8 columns, label 9 on 4 pixels; masks at half the
+        // size, left 5 columns and rest
         let mut truth = Plane::filled(20, 20, 0u32);
         let mut labels = Plane::filled(10, 10, 1i32);
         for y in 0..20 {

@@ -1,9 +1,9 @@
-//! Dense matches between two views for step 1 of the alignment (`--matcher xfeat`), and the warp that depth and poses
-//! imply.
+//! Dense matches between two views for step 1 of the alignment (`--matcher xfeat`), and the warp
+//! that depth and poses imply.
 //!
-//! XFeat's descriptors on an 8×8 grid are matched mutually along epipolar lines (the poses are known by then), kept
-//! where neighbours agree, and spread over their cells by a local affine fit. Both directions come from one set of
-//! matches, so they are each other's inverse.
+//! XFeat's descriptors on an 8×8 grid are matched mutually along epipolar lines (the poses are
+//! known by then), kept where neighbours agree, and spread over their cells by a local affine fit.
+//! Both directions come from one set of matches, so they are each other's inverse.
 use crate::math::dot_f32 as dot;
 use crate::scene::{Camera, DenseWarp, DepthMap, Plane};
 use glam::{DMat2, DMat3, DVec2, DVec3};
@@ -13,8 +13,8 @@ use splatvk_infer::xfeat::DenseFeatures;
 /// Descriptor length.
 const DIM: usize = splatvk_infer::xfeat::DIM;
 
-/// Cells whose centre lies farther from the epipolar line than this many cells are no candidates: half a cell of
-/// quantisation on each side, and half a cell for pose errors.
+/// Cells whose centre lies farther from the epipolar line than this many cells are no candidates:
+/// half a cell of quantisation on each side, and half a cell for pose errors.
 const BAND_CELLS: f64 = 1.5;
 
 /// Which descriptor matches are accepted.
@@ -28,9 +28,10 @@ struct MatchLimits {
     neighbours: usize,
 }
 
-/// Chosen for what alignment counts, pixels that land on the right thing. Breakfast views 0 and 1 (25° apart): 42 % of the
-/// co-visible pixels are matched, 98.2 % of them on the same object and 62 % within 8 px; asking for 7 neighbours at
-/// cosine 0.85 gives 92 % within 8 px and 99.4 % on the same object, but 6 % of the pixels, too few for an area share.
+/// Chosen for what alignment counts, pixels that land on the right thing. Breakfast views 0 and 1
+/// (25° apart): 42 % of the co-visible pixels are matched, 98.2 % of them on the same object and 62
+/// % within 8 px; asking for 7 neighbours at cosine 0.85 gives 92 % within 8 px and 99.4 % on the
+/// same object, but 6 % of the pixels, too few for an area share.
 const MATCH_LIMITS: MatchLimits = MatchLimits { cosine: 0.6, agreement: 0.5, neighbours: 3 };
 
 /// One match between cell centres, refined below the cell in the second view.
@@ -42,8 +43,8 @@ struct Match {
     cosine: f32,
 }
 
-/// Dense warps i → j and j → i from XFeat descriptors; `cameras` have the working resolution the features were
-/// computed at.
+/// Dense warps i → j and j → i from XFeat descriptors; `cameras` have the working resolution the
+/// features were computed at.
 pub fn xfeat(a: &DenseFeatures, b: &DenseFeatures, cameras: (&Camera, &Camera)) -> (DenseWarp, DenseWarp) {
     accepted(a, b, cameras, MATCH_LIMITS)
 }
@@ -76,8 +77,8 @@ fn accepted(
     (there, back)
 }
 
-/// Match field that depth and poses imply: every pixel with known depth, projected; certainty 1 where the other view's
-/// depth agrees and the way back returns within `1.5·width/512` pixels.
+/// Match field that depth and poses imply: every pixel with known depth, projected; certainty 1
+/// where the other view's depth agrees and the way back returns within `1.5·width/512` pixels.
 pub fn geometry(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) -> DenseWarp {
     let links = super::align::links_from_depth(0, 1, (from, to), (depth, other)).forward;
     let (width, height) = (depth.depth.width, depth.depth.height);
@@ -274,7 +275,8 @@ mod tests {
         };
         let (kept, close, label) = score(MATCH_LIMITS);
         assert!(kept > total / 3 && 2 * close > kept, "{kept} {close}");
-        // 70 % of the image is table and wall: matches spread evenly would agree in about half of the cases
+        // 70 % of the image is table and wall: matches spread evenly would agree in about half of
+        // the cases
         assert!(label as f64 > 0.97 * kept as f64, "{label} of {kept}");
     }
 

@@ -7,7 +7,8 @@ use crate::progress::Progress;
 use crate::scene::Camera;
 use crate::{Error, Result};
 
-/// What a scene knows of its photos: one entry per photo in each list. The photos are without lens and in one light.
+/// What a scene knows of its photos: one entry per photo in each list. The photos are without lens
+/// and in one light.
 #[derive(Clone, Debug)]
 pub struct KnownPhotos {
     /// At working resolution.
@@ -18,8 +19,9 @@ pub struct KnownPhotos {
     pub fitted: Vec<Fitted>,
 }
 
-/// Cameras of `new` photos in the frame of the `known` ones, which stay as they are; all photos, the known ones first, with the
-/// new ones without lens and in the scene's light. A photo whose place cannot be found surely is an error that names it.
+/// Cameras of `new` photos in the frame of the `known` ones, which stay as they are; all photos,
+/// the known ones first, with the new ones without lens and in the scene's light. A photo whose
+/// place cannot be found surely is an error that names it.
 pub fn add(
     known: &KnownPhotos,
     new: Vec<Photo>,

@@ -1,20 +1,23 @@
-//! Keypoints that bridge wide angles: detected in photos as they would look from the side (ASIFT, Morel and Yu 2009). A flat
-//! patch seen under another angle is compressed along one direction; corners of the compressed photo match it.
+//! Keypoints that bridge wide angles: detected in photos as they would look from the side (ASIFT,
+//! Morel and Yu 2009). A flat patch seen under another angle is compressed along one direction;
+//! corners of the compressed photo match it.
 use super::matching::Keypoints;
 use super::sift;
 use crate::scene::Plane;
 use glam::{DMat2, DVec2};
 use rayon::prelude::*;
 
-/// Compressions: √2, 2 and 2√2 are 45°, 60° and 69° from the front; of two photos that see a patch from both sides each bears
-/// one.
+/// Compressions: √2, 2 and 2√2 are 45°, 60° and 69° from the front; of two photos that see a patch
+/// from both sides each bears one.
 const TILTS: [f64; 3] = [std::f64::consts::SQRT_2, 2.0, 2.0 * std::f64::consts::SQRT_2];
 /// Directions of a compression are this far apart over its factor, degrees (Morel and Yu).
 const TURN: f64 = 72.0;
-/// Blur along the compressed direction per √(t² − 1), pixels (Morel and Yu): what the pixels of a tilted camera would average.
+/// Blur along the compressed direction per √(t² − 1), pixels (Morel and Yu): what the pixels of a
+/// tilted camera would average.
 const BLUR: f64 = 0.8;
 
-/// Keypoints of a luma image and of its compressed versions, positions in the image itself; the strongest `limit` of each.
+/// Keypoints of a luma image and of its compressed versions, positions in the image itself; the
+/// strongest `limit` of each.
 pub(crate) fn detect(luma: &Plane<f32>, valid: &Plane<bool>, limit: usize) -> Keypoints {
     let mut all = sift::detect(luma, valid, limit);
     let turns = TILTS.iter().flat_map(|t| {

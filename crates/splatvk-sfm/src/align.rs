@@ -16,9 +16,9 @@ pub struct PoseErrors {
     pub focal: Vec<f64>,
 }
 
-/// Compares cameras in order. `mean_depth` is the mean camera-z of the true scene, true units. The global rotation is the
-/// chordal mean of the per-camera rotations, so that collinear centres do no harm; scale and shift are least squares
-/// over the centres. Empty input gives empty errors.
+/// Compares cameras in order. `mean_depth` is the mean camera-z of the true scene, true units. The
+/// global rotation is the chordal mean of the per-camera rotations, so that collinear centres do no
+/// harm; scale and shift are least squares over the centres. Empty input gives empty errors.
 pub fn pose_errors(estimated: &[Camera], truth: &[Camera], mean_depth: f64) -> PoseErrors {
     let pairs: Vec<_> = estimated.iter().zip(truth).collect();
     let n = pairs.len().max(1) as f64;

@@ -1,5 +1,5 @@
-//! Which photos a run uses when more are given: sharp ones that overlap, from different places, and that
-//! together show what all show.
+//! Which photos a run uses when more are given: sharp ones that overlap, from different places, and
+//! that together show what all show.
 use super::matching::{Keypoints, mutual_matches, valid_area};
 use super::overlap::{self, SimilarityInliers};
 use super::{sharpness, sift, still};
@@ -10,23 +10,25 @@ use crate::scene::{Coverage, Plane, RgbImage};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Long side at which corners are matched: enough to measure overlap, and cheap enough for a hundred photos.
+/// Long side at which corners are matched: enough to measure overlap, and cheap enough for a
+/// hundred photos.
 const FEATURE_SIDE: usize = 320;
 /// Corners per photo. Matching costs their square: 5 ms a pair.
 const FEATURES: usize = 300;
 /// Lowe's ratio. Wrong matches cost little, since the count is that of matches that agree.
 const RATIO: f32 = 0.85;
-/// Every pair is compared up to this many photos (780 pairs); beyond it every photo with [`NEIGHBOURS`] likely ones.
+/// Every pair is compared up to this many photos (780 pairs); beyond it every photo with
+/// [`NEIGHBOURS`] likely ones.
 const ALL_PAIRS: usize = 40;
 const NEIGHBOURS: usize = 12;
 
-/// Agreeing matches that make a usable link. Unrelated pairs reach 8 by chance (photos of a tower from all sides); twice
-/// that leaves room.
+/// Agreeing matches that make a usable link. Unrelated pairs reach 8 by chance (photos of a tower
+/// from all sides); twice that leaves room.
 const LINKED: usize = 16;
 /// Agreeing matches at which a photo shows half of what another shows.
 const HALF_SEEN: f64 = 40.0;
-/// Parallax over the image diagonal below which two photos are from nearly the same place: at 60° field of view and a
-/// scene as deep as it is far, a step of a fiftieth of the distance.
+/// Parallax over the image diagonal below which two photos are from nearly the same place: at 60°
+/// field of view and a scene as deep as it is far, a step of a fiftieth of the distance.
 const SAME_PLACE: f64 = 0.006;
 /// Of the fewer corners of two, the share that must match for them to show nearly the same.
 const SAME_SHARE: f64 = 0.35;
@@ -79,12 +81,14 @@ pub enum Reason {
     /// The photos used show most of what it shows.
     #[serde(rename = "adds_little")]
     LittleNewArea,
-    /// Its place among the others could not be found surely: so many percent of its matches agree with any cameras.
+    /// Its place among the others could not be found surely: so many percent of its matches agree
+    /// with any cameras.
     Doubtful(u8),
 }
 
 /// Finds the photos of files, folders and videos and chooses `views` of them (`None`: all, at most
-/// [`photo::DEFAULT_VIEWS`]), for [`photo::load_each`]. Says what it chose; without a choice, all are used.
+/// [`photo::DEFAULT_VIEWS`]), for [`photo::load_each`]. Says what it chose; without a choice, all
+/// are used.
 pub fn photos(
     inputs: &[std::path::PathBuf],
     views: Option<usize>,
@@ -249,7 +253,8 @@ fn links(seen: &[CandidateFeatures], progress: &dyn Progress) -> Result<Vec<Vec<
     Ok(links)
 }
 
-/// The pairs to compare: all, or for many photos each with those of the most similar colours and its neighbours in order.
+/// The pairs to compare: all, or for many photos each with those of the most similar colours and
+/// its neighbours in order.
 fn pairs(seen: &[CandidateFeatures]) -> Vec<(usize, usize)> {
     let n = seen.len();
     if n <= ALL_PAIRS {

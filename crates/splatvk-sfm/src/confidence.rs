@@ -2,8 +2,8 @@
 use super::Fitted;
 use serde::Serialize;
 
-/// Share of a photo's matches with the others that agree with the cameras, below which its place is in doubt: 0.93 and more
-/// where all are right on the tuning sets, 0.28 to 0.8 where one is wrong.
+/// Share of a photo's matches with the others that agree with the cameras, below which its place is
+/// in doubt: 0.93 and more where all are right on the tuning sets, 0.28 to 0.8 where one is wrong.
 pub(super) const DOUBTFUL: f64 = 0.85;
 /// Below this share it is not sure.
 const AGREED: f64 = 0.9;
@@ -14,7 +14,8 @@ pub(super) const DOUBTFUL_ROTATION: f64 = 2.0;
 /// σ of ln f above which depth is not sure.
 pub(super) const UNSURE_FOCAL: f64 = 0.05;
 
-/// Trust in the place of a camera. What each level was worth on generated photos is in docs/use/photos.md.
+/// Trust in the place of a camera. What each level was worth on generated photos is in
+/// docs/use/photos.md.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Confidence {

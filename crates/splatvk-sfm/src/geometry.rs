@@ -3,7 +3,8 @@ use crate::scene::{Camera, DepthMap, Lens, PointCloud};
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// What every geometry initialiser returns (docs/internals/method.md#geometry). World frame: camera 0 of the run, OpenCV axes.
+/// What every geometry initialiser returns (docs/internals/method.md#geometry). World frame: camera
+/// 0 of the run, OpenCV axes.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Geometry {
     /// One per photo, at the photo's working resolution.
@@ -36,23 +37,27 @@ pub struct SparsePoint {
 pub struct Fitted {
     /// Its lens.
     pub lens: Lens,
-    /// One standard deviation of ln f, k1, k2 and the principal point (x, y; original pixels); 0 = held where it is.
+    /// One standard deviation of ln f, k1, k2 and the principal point (x, y; original pixels); 0 =
+    /// held where it is.
     pub sigmas: [f64; 5],
     /// Median distance of its sightings from where the model projects their points, working pixels.
     pub residual: f64,
-    /// Share of its matches that agree with the cameras, of those on which its pairs with other photos agree by themselves.
+    /// Share of its matches that agree with the cameras, of those on which its pairs with other
+    /// photos agree by themselves.
     pub agreement: f64,
-    /// Whether one pair of photos, whose matches are few or mostly contradict each other, is all that its place rests on.
+    /// Whether one pair of photos, whose matches are few or mostly contradict each other, is all
+    /// that its place rests on.
     #[serde(default)]
     pub unconfirmed: bool,
-    /// One standard deviation of the direction in which its camera looks, against that of the first photo, radians.
+    /// One standard deviation of the direction in which its camera looks, against that of the first
+    /// photo, radians.
     pub rotation_sigma: f64,
     /// Photos of one number were explained with the same optics.
     pub camera: usize,
 }
 
-/// Cameras and the sparse points that fix them. World frame: camera 0; unit: the median depth of the points is
-/// 1 where it is free, that of the given cameras otherwise.
+/// Cameras and the sparse points that fix them. World frame: camera 0; unit: the median depth of
+/// the points is 1 where it is free, that of the given cameras otherwise.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct SparseModel {
     /// One per photo, at the photo's working resolution.
@@ -61,8 +66,8 @@ pub struct SparseModel {
     pub points: Vec<SparsePoint>,
     /// One standard deviation of ln f, if the focal length was estimated.
     pub focal_log_sigma: Option<f64>,
-    /// One per photo, if the optics were estimated. The cameras and the points' pixels are those of the pinhole that remains
-    /// when the lens is taken out of the photo.
+    /// One per photo, if the optics were estimated. The cameras and the points' pixels are those of
+    /// the pinhole that remains when the lens is taken out of the photo.
     pub fitted: Vec<Fitted>,
     /// Whether all that the photos agree on lies on one plane, as far as they tell.
     #[serde(default)]

@@ -1,4 +1,5 @@
-//! Given cameras brought to their photos: joined by name, turned as the photos were, at working size, their lens taken out.
+//! Given cameras brought to their photos: joined by name, turned as the photos were, at working
+//! size, their lens taken out.
 use super::matching::{Keypoints, Match, mutual_matches, valid_area};
 use super::minimal::{essential, triangulate_two};
 use super::sift;
@@ -13,14 +14,16 @@ use rayon::prelude::*;
 /// Which pixels of a photo whose EXIF states an orientation a camera belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Pixels {
-    /// Those of the file. COLMAP does not apply the orientation (colmap#1456), nor do most programs that build on it.
+    /// Those of the file. COLMAP does not apply the orientation (colmap#1456), nor do most programs
+    /// that build on it.
     Stored,
     /// Those that a viewer shows.
     Upright,
 }
 
-/// Cameras of photos (pinholes at working resolution). Where a camera is of the stored pixels it is turned as the photo was, and a
-/// photo that is mirrored by its orientation is mirrored back; then the lens is taken out of the photo.
+/// Cameras of photos (pinholes at working resolution). Where a camera is of the stored pixels it is
+/// turned as the photo was, and a photo that is mirrored by its orientation is mirrored back; then
+/// the lens is taken out of the photo.
 pub fn assign(photos: &mut [Photo], given: &[GivenCamera], progress: &dyn Progress) -> Result<Vec<Camera>> {
     let own = joined(photos, given)?;
     let pixels = pixels(photos, &own, progress)?;
@@ -54,7 +57,8 @@ pub fn assign(photos: &mut [Photo], given: &[GivenCamera], progress: &dyn Progre
     Ok(cameras)
 }
 
-/// How much farther from the principal point the lens images the first corner, share of the distance.
+/// How much farther from the principal point the lens images the first corner, share of the
+/// distance.
 fn bend(lens: &Lens, camera: &Camera) -> f64 {
     let corner = camera.ray(DVec2::ZERO).truncate();
     lens.distort(corner).length() / corner.length() - 1.0
@@ -77,17 +81,20 @@ fn joined<'a>(photos: &[Photo], given: &'a [GivenCamera]) -> Result<Vec<&'a Give
     photos.iter().zip(found).map(one).collect()
 }
 
-/// Sides that differ by rounding: working sizes are whole numbers, and so are those of reduced copies.
+/// Sides that differ by rounding: working sizes are whole numbers, and so are those of reduced
+/// copies.
 const SAME_ASPECT: f64 = 0.01;
 
-/// For every photo the pixels that its camera belongs to: by the size, then as that of the other photos says, then by matches.
+/// For every photo the pixels that its camera belongs to: by the size, then as that of the other
+/// photos says, then by matches.
 fn pixels(photos: &[Photo], own: &[&GivenCamera], progress: &dyn Progress) -> Result<Vec<Pixels>> {
     let told = photos.iter().zip(own).map(|(p, c)| by_size(p, &c.camera)).collect::<Result<Vec<_>>>()?;
     let open: Vec<usize> = (0..photos.len()).filter(|v| told[*v].is_none()).collect();
     if open.is_empty() {
         return Ok(told.into_iter().flatten().collect());
     }
-    // One program made the file: it did the same with all photos. Photos without orientation say nothing.
+    // One program made the file: it did the same with all photos. Photos without orientation say
+    // nothing.
     let says = |pixels| told.iter().zip(photos).any(|(t, p)| *t == Some(pixels) && !p.turn.is_none());
     let all = match (says(Pixels::Stored), says(Pixels::Upright)) {
         (true, false) => Pixels::Stored,
@@ -176,7 +183,8 @@ const ENOUGH: usize = 30;
 /// … and how many times as many as under the other assumption.
 const CLEARLY: f64 = 1.5;
 
-/// Under which assumption more matches obey the cameras: near their epipolar lines, and in front of both cameras.
+/// Under which assumption more matches obey the cameras: near their epipolar lines, and in front of
+/// both cameras.
 fn by_matches(photos: &[Photo], own: &[&GivenCamera], told: &[Option<Pixels>]) -> Option<Pixels> {
     let mut views: Vec<usize> = (0..photos.len()).collect();
     views.sort_by_key(|v| told[*v].is_some());
@@ -294,7 +302,8 @@ mod tests {
 
     #[test]
     fn cameras_of_stored_pixels_are_told_by_size() {
-        // Upright 64 × 80, stored 80 × 64: the camera of the stored pixels and a half-size copy of it are turned.
+        // Upright 64 × 80, stored 80 × 64: the camera of the stored pixels and a half-size copy of
+        // it are turned.
         for (w, h, fx) in [(80, 64, 110.0), (160, 128, 55.0)] {
             let turned = &assign(&mut [photo(64, 80, 1)], &[camera(w, h)], &Silent).unwrap()[0];
             assert_eq!((turned.width, turned.height, turned.fx), (64, 80, fx));
@@ -310,11 +319,13 @@ mod tests {
         let truth = testing::train(&testing::folder());
         let size = (truth.photos[0].image.width as f64, truth.photos[0].image.height as f64);
         for mirrored in [false, true] {
-            // The files hold the photos upside down or mirrored, with the EXIF tag that makes them right again.
+            // The files hold the photos upside down or mirrored, with the EXIF tag that makes them
+            // right again.
             let turn = if mirrored { Turn { quarters: 0, mirrored } } else { Turn { quarters: 2, mirrored } };
             let photos: Vec<Photo> = truth.photos.iter().map(|p| Photo { turn, ..p.clone() }).collect();
             let upright: Vec<GivenCamera> = truth.cameras.iter().cloned().map(GivenCamera::from).collect();
-            // A camera of the stored pixels: a half turn of the upright one, or the world in a mirror.
+            // A camera of the stored pixels: a half turn of the upright one, or the world in a
+            // mirror.
             let stored: Vec<GivenCamera> = match mirrored {
                 false => upright.iter().map(|c| c.turned(2)).collect(),
                 true => truth.cameras.iter().map(|c| in_a_mirror(c, size.0).into()).collect(),

@@ -1,12 +1,13 @@
-//! Homographies between two photos: a plane seen from two places, or anything seen by a camera that only turned or zoomed
-//! (Hartley and Zisserman 2004, sections 4.7, 8.4 and 13.1).
+//! Homographies between two photos: a plane seen from two places, or anything seen by a camera that
+//! only turned or zoomed (Hartley and Zisserman 2004, sections 4.7, 8.4 and 13.1).
 use super::numeric::{minimise_small, nearest_rotation};
 use crate::math::{Random, median};
 use crate::scene::Pose;
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{SMatrix, SVector};
 
-/// Samples of four matches: of matches of which half lie on one plane, 17 in a row miss it as rarely as once in three.
+/// Samples of four matches: of matches of which half lie on one plane, 17 in a row miss it as
+/// rarely as once in three.
 const SAMPLES: usize = 400;
 
 /// Where a homography shows a point.
@@ -42,8 +43,8 @@ fn robust(r: DVec2, scale: f64, out: &mut Vec<f64>) {
     out.extend([r.x * w, r.y * w]);
 }
 
-/// The homography on which most matches `x` → `y`, sorted best first, agree within `threshold`; `None` where it shows the scene
-/// mirrored or fewer than eight agree.
+/// The homography on which most matches `x` → `y`, sorted best first, agree within `threshold`;
+/// `None` where it shows the scene mirrored or fewer than eight agree.
 pub(crate) fn homography(x: &[DVec2], y: &[DVec2], threshold: f64, seed: u64) -> Option<DMat3> {
     let n = x.len();
     if n < 8 {
@@ -85,8 +86,9 @@ pub(crate) fn homography(x: &[DVec2], y: &[DVec2], threshold: f64, seed: u64) ->
     Some(at(&v))
 }
 
-/// Largest change of a homography's scale along the picture, as a share of that in the middle: 0 where it is affine, as between photos of
-/// a plane that both see straight on. `half`: half of the picture's sides, from whose middle points are counted.
+/// Largest change of a homography's scale along the picture, as a share of that in the middle: 0
+/// where it is affine, as between photos of a plane that both see straight on. `half`: half of the
+/// picture's sides, from whose middle points are counted.
 pub(crate) fn perspective(h: &DMat3, half: DVec2) -> f64 {
     let row = h.row(2);
     (row.truncate().abs().dot(half) / row.z).abs()
@@ -109,8 +111,8 @@ pub(crate) struct FocalRange {
     pub(crate) zoom: f64,
 }
 
-/// The turn in place that explains the matches best, starting from their homography. Pixels are centred and divided by the prior
-/// focal length of their photo.
+/// The turn in place that explains the matches best, starting from their homography. Pixels are
+/// centred and divided by the prior focal length of their photo.
 pub(crate) fn turn(h: &DMat3, x: &[DVec2], y: &[DVec2], threshold: f64, range: FocalRange) -> Turn {
     let k = |m: f64| DMat3::from_diagonal(DVec3::new(m, m, 1.0));
     let within = |mean: f64, ratio: f64| {
@@ -162,12 +164,12 @@ impl Turn {
     }
 }
 
-/// Pairs of matches off the plane that are tried for the epipole: of those of which a tenth is right, 300 hold two right ones almost
-/// surely.
+/// Pairs of matches off the plane that are tried for the epipole: of those of which a tenth is
+/// right, 300 hold two right ones almost surely.
 const EPIPOLES: usize = 300;
 
-/// How many matches agree with a homography and, off its plane, with the epipolar lines of one epipole (plane and parallax: Irani and
-/// Anandan 1996), less what chance brings near those.
+/// How many matches agree with a homography and, off its plane, with the epipolar lines of one
+/// epipole (plane and parallax: Irani and Anandan 1996), less what chance brings near those.
 pub(crate) fn on_and_off_plane(
     h: &DMat3,
     x: &[DVec2],
@@ -235,7 +237,8 @@ mod tests {
             let (t, x, y) = found(&pose, focal, deep);
             let left = t.residual(&x, &y) / PIXEL;
             println!("{left} {}", t.zoom);
-            // Noise of half a pixel in each photo has a median length of 0.83, and of 1.2 enlarged 1.8 times.
+            // Noise of half a pixel in each photo has a median length of 0.83, and of 1.2 enlarged
+            // 1.8 times.
             assert!(left < 1.4 && (t.zoom * focal[0] / focal[1] - 1.0).abs() < 0.02, "{left} {t:?}");
         }
     }

@@ -25,8 +25,8 @@ pub struct SolvedCameras {
 }
 
 /// Cameras of the photos, from the photos themselves (`cameras` = None; `seed` draws the samples of
-/// RANSAC) or as given. `detect` finds keypoints. From the photos themselves only those get one whose place can be found
-/// surely.
+/// RANSAC) or as given. `detect` finds keypoints. From the photos themselves only those get one
+/// whose place can be found surely.
 pub fn place(
     mut photos: Vec<Photo>,
     cameras: Option<&[GivenCamera]>,

@@ -1,5 +1,5 @@
-//! Cameras of as many photos as hold together (docs/internals/method.md#photos-left-out). A photo in a wrong place spoils the others: splats are
-//! trained to explain what it shows from there.
+//! Cameras of as many photos as hold together (docs/internals/method.md#photos-left-out). A photo
+//! in a wrong place spoils the others: splats are trained to explain what it shows from there.
 use super::SparseModel;
 use super::choose::{LeftOut, Reason};
 use super::confidence::DOUBTFUL;
@@ -20,8 +20,8 @@ pub struct Placed {
     pub left_out: Vec<LeftOut>,
 }
 
-/// Structure from motion with all photos that it can place surely, as long as those are more than half of them; what fewer
-/// agree on says nothing about the others. `features` are one per photo.
+/// Structure from motion with all photos that it can place surely, as long as those are more than
+/// half of them; what fewer agree on says nothing about the others. `features` are one per photo.
 pub fn place(
     mut photos: Vec<Photo>,
     mut features: Vec<Keypoints>,

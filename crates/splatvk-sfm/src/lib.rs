@@ -1,10 +1,10 @@
 //! Structure from motion and stereo for a few photos: photos to cameras, depth and points.
 //!
-//! - [`place`] finds the cameras of photos, with the uncertainty of each: matches, two-view geometry,
-//!   incremental reconstruction, bundle adjustment, lens and light. Keypoints come from a closure
-//!   ([`matching::Detect`]), so that no network is needed here.
-//! - [`stereo`] computes depth by slanted-plane multi-view stereo. The matching itself comes through
-//!   [`stereo::PlaneSweep`]: splatvk implements it on Vulkan.
+//! - [`place`] finds the cameras of photos, with the uncertainty of each: matches, two-view
+//!   geometry, incremental reconstruction, bundle adjustment, lens and light. Keypoints come from a
+//!   closure ([`matching::Detect`]), so that no network is needed here.
+//! - [`stereo`] computes depth by slanted-plane multi-view stereo. The matching itself comes
+//!   through [`stereo::PlaneSweep`]: splatvk implements it on Vulkan.
 //! - [`pointmap`] aligns pointmaps of networks such as MASt3R globally.
 //! - [`upright`] finds the direction against gravity.
 

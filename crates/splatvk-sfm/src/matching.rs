@@ -1,4 +1,5 @@
-//! Keypoint features, their matches between two photos, and the parts of photos that cannot hold features.
+//! Keypoint features, their matches between two photos, and the parts of photos that cannot hold
+//! features.
 use crate::photo::PlainBorder;
 use crate::scene::{Coverage, Plane, RgbImage};
 use glam::{DVec2, Vec4};
@@ -26,7 +27,8 @@ pub(crate) struct Match {
     pub(crate) quality: f64,
 }
 
-/// The keypoint of the other photo that is most similar to one, and the second-best similarity elsewhere.
+/// The keypoint of the other photo that is most similar to one, and the second-best similarity
+/// elsewhere.
 #[derive(Clone, Copy)]
 struct Nearest {
     index: usize,
@@ -55,7 +57,8 @@ impl Nearest {
 /// `a·b` of descriptors whose length is a multiple of 8, in eight sums.
 fn dot(a: &[f32], b: &[f32]) -> f32 {
     let (a, b) = (a.as_chunks::<8>().0, b.as_chunks::<8>().0);
-    // Vectors of glam and plain loops are fast in debug builds too, where iterators made this half of the time of placing cameras.
+    // Vectors of glam and plain loops are fast in debug builds too, where iterators made this half
+    // of the time of placing cameras.
     let mut sums = [Vec4::ZERO; 2];
     for i in 0..a.len() {
         let ([a0, a1, a2, a3, a4, a5, a6, a7], [b0, b1, b2, b3, b4, b5, b6, b7]) = (a[i], b[i]);
@@ -65,7 +68,8 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
     sums.map(|s| s.to_array()).as_flattened().iter().sum()
 }
 
-/// For each keypoint of `a` the nearest of `b`, and the other way round. Similarities are computed once, for some rows of `a` at a time.
+/// For each keypoint of `a` the nearest of `b`, and the other way round. Similarities are computed
+/// once, for some rows of `a` at a time.
 fn nearest(a: &Keypoints, b: &Keypoints) -> (Vec<Nearest>, Vec<Nearest>) {
     // With 8,000 keypoints in `b` the similarities of this many take 8 MB.
     const ROWS: usize = 256;
@@ -95,8 +99,9 @@ fn nearest(a: &Keypoints, b: &Keypoints) -> (Vec<Nearest>, Vec<Nearest>) {
     (forward, backward)
 }
 
-/// Mutual nearest neighbours whose distance is below `ratio` of the distance to the second-best elsewhere, best first.
-/// Descriptor lengths must be multiples of 8 and equal; otherwise there are no matches.
+/// Mutual nearest neighbours whose distance is below `ratio` of the distance to the second-best
+/// elsewhere, best first. Descriptor lengths must be multiples of 8 and equal; otherwise there are
+/// no matches.
 pub(crate) fn mutual_matches(a: &Keypoints, b: &Keypoints, ratio: f32) -> Vec<Match> {
     if a.dim != b.dim || !a.dim.is_multiple_of(8) || a.points.is_empty() || b.points.is_empty() {
         return Vec::new();
@@ -121,9 +126,10 @@ pub(crate) fn mutual_matches(a: &Keypoints, b: &Keypoints, ratio: f32) -> Vec<Ma
     out
 }
 
-/// True where features may lie: away from the image edge, from pixels that are not used, from a border that was found on loading and from uniform
-/// saturated margins (undistorted or scanned photos have white or black borders; their outline does not move with the
-/// scene and would pass for a match).
+/// True where features may lie: away from the image edge, from pixels that are not used, from a
+/// border that was found on loading and from uniform saturated margins (undistorted or scanned
+/// photos have white or black borders; their outline does not move with the scene and would pass
+/// for a match).
 pub(crate) fn valid_area(
     image: &RgbImage,
     border: PlainBorder,
@@ -166,7 +172,8 @@ pub(crate) fn valid_area(
                 stack.push(i + w);
             }
         }
-        // A border touches a good part of the outline; an overexposed window at the edge touches less.
+        // A border touches a good part of the outline; an overexposed window at the edge touches
+        // less.
         if touching * 5 > 2 * (w + h) {
             excluded.iter_mut().zip(&seen).for_each(|(b, s)| *b |= s);
         }

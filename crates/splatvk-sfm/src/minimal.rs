@@ -4,7 +4,8 @@ use crate::scene::Pose;
 use glam::{DMat3, DVec3};
 use nalgebra::{DMatrix, Matrix3, SMatrix, SVector};
 
-/// Monomials in (x, y, z) up to degree 3: the ten cubics that are eliminated, then the ten that remain.
+/// Monomials in (x, y, z) up to degree 3: the ten cubics that are eliminated, then the ten that
+/// remain.
 const MONOMIALS: [[u8; 3]; 20] = [
     [3, 0, 0],
     [2, 1, 0],
@@ -64,8 +65,8 @@ fn combine(a: &Poly, b: &Poly, factor: f64) -> Poly {
     std::array::from_fn(|k| a[k] + factor * b[k])
 }
 
-/// Essential matrices E (Frobenius norm 1) with `y_kᵀ E x_k = 0` for five pairs of rays (Nistér 2004 constraints, solved
-/// through the action matrix of Stewénius et al. 2006).
+/// Essential matrices E (Frobenius norm 1) with `y_kᵀ E x_k = 0` for five pairs of rays (Nistér
+/// 2004 constraints, solved through the action matrix of Stewénius et al. 2006).
 pub(crate) struct FivePoint {
     table: [[u8; 20]; 20],
 }
@@ -78,8 +79,8 @@ impl FivePoint {
     pub(crate) fn solve(&self, x: &[DVec3; 5], y: &[DVec3; 5]) -> Vec<DMat3> {
         let basis = null_space(x, y);
         let Some(reduced) = self.eliminate(&basis) else { return Vec::new() };
-        // Multiplication by x maps the remaining monomials x² xy xz y² yz z² x y z 1 to the first six cubics and four of
-        // themselves.
+        // Multiplication by x maps the remaining monomials x² xy xz y² yz z² x y z 1 to the first
+        // six cubics and four of themselves.
         let mut action = SMatrix::<f64, 10, 10>::zeros();
         for r in 0..6 {
             for c in 0..10 {
@@ -117,7 +118,8 @@ impl FivePoint {
         out
     }
 
-    /// The ten cubic constraints with the cubic monomials eliminated: the right half of the reduced matrix.
+    /// The ten cubic constraints with the cubic monomials eliminated: the right half of the reduced
+    /// matrix.
     fn eliminate(&self, basis: &[DMat3; 4]) -> Option<SMatrix<f64, 10, 10>> {
         let t = &self.table;
         let mut e = [[[0.0; 20]; 3]; 3];
@@ -198,7 +200,8 @@ pub(crate) fn decompose_essential(e: &DMat3) -> [Pose; 4] {
     ]
 }
 
-/// Camera poses that see three world points along three rays (Grunert 1841 in the form of Haralick et al. 1994).
+/// Camera poses that see three world points along three rays (Grunert 1841 in the form of Haralick
+/// et al. 1994).
 pub(crate) fn three_point(world: &[DVec3; 3], rays: &[DVec3; 3]) -> Vec<Pose> {
     let j = rays.map(|r| r.normalize());
     let (a2, b2, c2) = (
@@ -264,7 +267,8 @@ fn real_roots(c: &[f64; 5]) -> Vec<f64> {
     let Some(schur) = nalgebra::Schur::try_new(companion, 1e-14, 200) else { return Vec::new() };
     let mut roots = Vec::new();
     for value in schur.complex_eigenvalues().iter() {
-        // Double roots come out as a pair with imaginary parts of the order of the square root of rounding.
+        // Double roots come out as a pair with imaginary parts of the order of the square root of
+        // rounding.
         if value.im.abs() > 1e-5 * (1.0 + value.re.abs()) {
             continue;
         }
@@ -287,7 +291,8 @@ pub(crate) fn essential(pose: &Pose) -> DMat3 {
     super::numeric::skew(pose.translation) * pose.rotation
 }
 
-/// Point seen along two rays: linear least squares on the cross products, second camera = `pose`·first.
+/// Point seen along two rays: linear least squares on the cross products, second camera =
+/// `pose`·first.
 pub(crate) fn triangulate_two(pose: &Pose, x: DVec3, y: DVec3) -> Option<DVec3> {
     // λ·R x + t = μ·y in the second frame.
     let r = pose.rotation * x;

@@ -7,13 +7,15 @@ use glam::DVec2;
 pub(super) struct SimilarityInliers {
     /// Matches that agree.
     pub matches: usize,
-    /// Median distance of the agreeing matches from the similarity that explains them best, over the image diagonal: what
-    /// turning and zooming the camera does not explain, so about the parallax.
+    /// Median distance of the agreeing matches from the similarity that explains them best, over
+    /// the image diagonal: what turning and zooming the camera does not explain, so about the
+    /// parallax.
     pub parallax: f64,
 }
 
-/// How far a match may lie from the similarity, over the diagonal. Generous: depth moves corners by about as much between
-/// photos 30° apart, and wrong matches are spread over the whole photo, of which this circle covers 7 %.
+/// How far a match may lie from the similarity, over the diagonal. Generous: depth moves corners by
+/// about as much between photos 30° apart, and wrong matches are spread over the whole photo, of
+/// which this circle covers 7 %.
 const AGREES: f64 = 0.1;
 
 /// Zoom between two photos beyond which matches are wrong more often than right.
@@ -51,14 +53,16 @@ impl Similarity {
     }
 }
 
-/// The largest group of matches that one similarity explains roughly. Positions over the image diagonal; better matches
-/// first. Deterministic: pairs of neighbours in the list make the hypotheses.
+/// The largest group of matches that one similarity explains roughly. Positions over the image
+/// diagonal; better matches first. Deterministic: pairs of neighbours in the list make the
+/// hypotheses.
 pub(super) fn agreement(matches: &[(DVec2, DVec2)]) -> SimilarityInliers {
     let inliers = |s: &Similarity| -> Vec<(DVec2, DVec2)> {
         matches.iter().filter(|m| s.distance(m) < AGREES).copied().collect()
     };
     let mut best: Vec<(DVec2, DVec2)> = Vec::new();
-    // Six pairings of each match: at a third of right matches, 200 matches give over a hundred right hypotheses.
+    // Six pairings of each match: at a third of right matches, 200 matches give over a hundred
+    // right hypotheses.
     for stride in [1, 2, 3, 5, 8, 13] {
         for (m, n) in matches.iter().zip(matches.iter().skip(stride)) {
             // Closer points fix turn and zoom too badly.

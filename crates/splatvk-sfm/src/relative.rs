@@ -1,5 +1,5 @@
-//! Relative poses of camera pairs against known ones: errors that need no common frame, and the area under their recall
-//! curve.
+//! Relative poses of camera pairs against known ones: errors that need no common frame, and the
+//! area under their recall curve.
 use super::numeric::rotation_angle;
 use crate::scene::{Camera, Pose};
 use serde::Serialize;
@@ -11,8 +11,8 @@ pub struct PairError {
     pub pair: [usize; 2],
     /// Angle between the two relative rotations, degrees.
     pub rotation_degrees: f64,
-    /// Angle between the directions from the first camera to the second, seen by the first, degrees; none where the true
-    /// cameras stand on one spot.
+    /// Angle between the directions from the first camera to the second, seen by the first,
+    /// degrees; none where the true cameras stand on one spot.
     pub direction_degrees: Option<f64>,
 }
 
@@ -47,9 +47,9 @@ pub fn pair_errors(estimated: &[Camera], truth: &[Camera]) -> Vec<PairError> {
         .collect()
 }
 
-/// Area under the curve "share of the pairs whose larger angle is below x" for x from 0 to `degrees`, over `degrees`: 1 is
-/// perfect. Exact, without bins. Pairs that are `missing` (a camera was not found) count as failures. `None` without
-/// pairs.
+/// Area under the curve "share of the pairs whose larger angle is below x" for x from 0 to
+/// `degrees`, over `degrees`: 1 is perfect. Exact, without bins. Pairs that are `missing` (a camera
+/// was not found) count as failures. `None` without pairs.
 pub fn auc(errors: &[PairError], missing: usize, degrees: f64) -> Option<f64> {
     let count = errors.len() + missing;
     let sum: f64 = errors.iter().map(|e| (1.0 - e.worst() / degrees).max(0.0)).sum();
@@ -83,7 +83,8 @@ mod tests {
         assert_eq!(errors.iter().map(|e| e.pair).collect::<Vec<_>>(), [[0, 1], [0, 2], [1, 2]]);
         assert!(errors.iter().all(|e| e.worst() < 1e-5), "{errors:?}");
         assert!(auc(&errors, 0, 3.0).unwrap() > 0.999_99);
-        // Turn the last camera about its own centre: two rotations change, one direction seen from it does not exist.
+        // Turn the last camera about its own centre: two rotations change, one direction seen from
+        // it does not exist.
         let turn = Pose::exp(DVec3::ZERO, DVec3::X * 1.5f64.to_radians());
         moved[2].pose = turn.compose(&moved[2].pose);
         let errors = pair_errors(&moved, &truth);

@@ -12,7 +12,8 @@ pub(crate) struct Resection {
     pub(crate) inliers: Vec<usize>,
 }
 
-/// Squared reprojection error in pixels; infinite behind the camera. `pixel` is relative to the principal point.
+/// Squared reprojection error in pixels; infinite behind the camera. `pixel` is relative to the
+/// principal point.
 fn error2(pose: &Pose, focal: f64, world: DVec3, pixel: DVec2) -> f64 {
     let t = pose.transform(world);
     if t.z <= 1e-9 {
@@ -21,8 +22,9 @@ fn error2(pose: &Pose, focal: f64, world: DVec3, pixel: DVec2) -> f64 {
     (DVec2::new(t.x, t.y) * (focal / t.z) - pixel).length_squared()
 }
 
-/// World points and the pixels (relative to the principal point) that show them → world → camera pose. `threshold` in
-/// pixels; `seed` draws the samples. `None` with fewer than four points or without a consistent pose.
+/// World points and the pixels (relative to the principal point) that show them → world → camera
+/// pose. `threshold` in pixels; `seed` draws the samples. `None` with fewer than four points or
+/// without a consistent pose.
 pub(crate) fn resect(
     world: &[DVec3],
     pixels: &[DVec2],

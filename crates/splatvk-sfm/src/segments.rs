@@ -1,9 +1,10 @@
-//! Straight edges of a picture: neighbouring pixels whose gradients point the same way, as in LSD (Grompone von Gioi et al.
-//! 2010), with a bound on their width instead of its statistical test.
+//! Straight edges of a picture: neighbouring pixels whose gradients point the same way, as in LSD
+//! (Grompone von Gioi et al. 2010), with a bound on their width instead of its statistical test.
 use crate::scene::{Plane, RgbImage};
 use glam::{DVec2, IVec2};
 
-/// Longest side of the pictures in which edges are looked for, pixels: more would only show shorter ones.
+/// Longest side of the pictures in which edges are looked for, pixels: more would only show shorter
+/// ones.
 const SIZE: usize = 800;
 
 /// Standard deviation of the ends of an edge, pixels.
@@ -25,14 +26,16 @@ impl Segment {
 /// Gradients of one edge differ by at most this angle from their mean: 22.5°, as in LSD.
 const TOLERANCE: f64 = std::f64::consts::PI / 8.0;
 
-/// Smallest gradient, full white per pixel: at 2/255 noise of quantisation, LSD's `q / sin TOLERANCE`.
+/// Smallest gradient, full white per pixel: at 2/255 noise of quantisation, LSD's `q / sin
+/// TOLERANCE`.
 const MIN_GRADIENT: f32 = 0.0205;
 
-/// Shortest edge, share of the long side: 19 pixels at 640, whose direction noise of half a pixel turns by 1.5°.
+/// Shortest edge, share of the long side: 19 pixels at 640, whose direction noise of half a pixel
+/// turns by 1.5°.
 const MIN_LENGTH: f64 = 0.03;
 
-/// Largest spread of an edge's pixels across it, pixels: a sharp edge has 0.5, one blurred over four pixels 1.2; an arc that
-/// bends by three pixels is beyond it.
+/// Largest spread of an edge's pixels across it, pixels: a sharp edge has 0.5, one blurred over
+/// four pixels 1.2; an arc that bends by three pixels is beyond it.
 const MAX_SPREAD: f64 = 1.5;
 
 /// Least share of the length that pixels of the edge cover: scattered pixels are texture.
@@ -96,7 +99,8 @@ fn smoothed(luma: &Plane<f32>) -> Plane<f32> {
     out
 }
 
-/// Direction and size of the gradient per pixel, by central differences; none at the border of the picture.
+/// Direction and size of the gradient per pixel, by central differences; none at the border of the
+/// picture.
 fn gradients(luma: &Plane<f32>) -> Vec<(DVec2, f32)> {
     let (w, h) = (luma.width, luma.height);
     let at = |x: usize, y: usize| f64::from(luma.at(x, y));
@@ -110,7 +114,8 @@ fn gradients(luma: &Plane<f32>) -> Vec<(DVec2, f32)> {
     out
 }
 
-/// Pixels connected to the seed whose gradients point as the region's mean does; they are no longer free.
+/// Pixels connected to the seed whose gradients point as the region's mean does; they are no longer
+/// free.
 fn grow(seed: usize, (w, h): (usize, usize), gradients: &[(DVec2, f32)], free: &mut [bool]) -> Vec<usize> {
     let least = TOLERANCE.cos();
     let mut region = vec![seed];

@@ -4,13 +4,16 @@ use crate::photo::Photo;
 use crate::progress::Progress;
 use crate::scene::RgbImage;
 
-/// Long side at which sharpness is judged: near the working resolution, so that what is blurred there is blurred here.
+/// Long side at which sharpness is judged: near the working resolution, so that what is blurred
+/// there is blurred here.
 pub(super) const SIDE: usize = 1000;
-/// Sharpness below this share of the median is blur. A photo in focus keeps 0.68 under a Gaussian of 0.7 px at the scale
-/// judged, 0.53 under 1 px and 0.36 under 1.5 px; photos in focus of one place differ by up to 0.7 in what they show.
+/// Sharpness below this share of the median is blur. A photo in focus keeps 0.68 under a Gaussian
+/// of 0.7 px at the scale judged, 0.53 under 1 px and 0.36 under 1.5 px; photos in focus of one
+/// place differ by up to 0.7 in what they show.
 pub(super) const BLURRED: f64 = 0.6;
 
-/// Names photos far less sharp than the others: splats are trained to be as blurred as they are, and their matches are less exact.
+/// Names photos far less sharp than the others: splats are trained to be as blurred as they are,
+/// and their matches are less exact.
 pub(super) fn warn_of_blur(photos: &[Photo], progress: &dyn Progress) {
     let all: Vec<f64> = photos.iter().map(|p| of(&at_most(&p.image, SIDE))).collect();
     for (v, photo) in photos.iter().enumerate() {
@@ -37,8 +40,9 @@ fn at_most(image: &RgbImage, side: usize) -> std::borrow::Cow<'_, RgbImage> {
     std::borrow::Cow::Owned(image.resized_by_area(to(image.width), to(image.height)))
 }
 
-/// How much fine detail there is for the coarse detail there is: the energy of the gradient that a slight blur takes away,
-/// over the energy that it leaves. A ratio within one photo, so contrast and exposure cancel.
+/// How much fine detail there is for the coarse detail there is: the energy of the gradient that a
+/// slight blur takes away, over the energy that it leaves. A ratio within one photo, so contrast
+/// and exposure cancel.
 pub(super) fn of(image: &RgbImage) -> f64 {
     let fine = image.luma();
     // Two blurs three quarters of an octave apart; the first takes the noise of single pixels away.

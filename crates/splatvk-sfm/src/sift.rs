@@ -1,17 +1,19 @@
-//! Scale-invariant keypoints and descriptors (Lowe 2004; RootSIFT normalisation of Arandjelović & Zisserman 2012). They
-//! complement the learned features: fewer matches, but positions good to about 0.3 px without any model.
+//! Scale-invariant keypoints and descriptors (Lowe 2004; RootSIFT normalisation of Arandjelović &
+//! Zisserman 2012). They complement the learned features: fewer matches, but positions good to
+//! about 0.3 px without any model.
 use super::matching::Keypoints;
 use crate::scene::Plane;
 use glam::{DVec2, Vec4};
 use rayon::prelude::*;
 
-/// Blur levels per octave, blur of the first level and contrast threshold are Lowe's; the contrast threshold is halved,
-/// since weak corners cost nothing once matches are verified.
+/// Blur levels per octave, blur of the first level and contrast threshold are Lowe's; the contrast
+/// threshold is halved, since weak corners cost nothing once matches are verified.
 const LEVELS: usize = 3;
 const SIGMA: f32 = 1.6;
 const CONTRAST: f32 = 0.02 / LEVELS as f32;
 const EDGE_RATIO: f32 = 10.0;
-/// Photos up to this long side are doubled first: small photos hold most of their corners at the finest scale.
+/// Photos up to this long side are doubled first: small photos hold most of their corners at the
+/// finest scale.
 const DOUBLE_BELOW: usize = 1000;
 
 /// Keypoints of a luma image with 128-dimensional unit descriptors, strongest `limit` kept.
@@ -114,7 +116,8 @@ impl Octave {
         true
     }
 
-    /// Sub-sample position by the quadratic through the 27 neighbours; rejects weak and edge-like extrema.
+    /// Sub-sample position by the quadratic through the 27 neighbours; rejects weak and edge-like
+    /// extrema.
     fn localise(&self, level: usize, x: usize, y: usize) -> Option<(f64, f64, f64, f32)> {
         let (mut l, mut x, mut y) = (level, x, y);
         for _ in 0..4 {
@@ -165,8 +168,9 @@ impl Octave {
     fn describe(&self, level: usize, x: usize, y: usize, valid: &Plane<bool>) -> Vec<Keypoint> {
         let Some((x, y, l, strength)) = self.localise(level, x, y) else { return Vec::new() };
         let position = DVec2::new((x + 0.5) * self.step, (y + 0.5) * self.step);
-        // When doubled, sample i lies at (i + 0.5)/2 photo pixels; after decimation sample i lies at index i·step of the
-        // first octave, so the half-pixel shift is that of the first octave's grid.
+        // When doubled, sample i lies at (i + 0.5)/2 photo pixels; after decimation sample i lies
+        // at index i·step of the first octave, so the half-pixel shift is that of the first
+        // octave's grid.
         let first = if valid.width.max(valid.height) <= DOUBLE_BELOW { 0.5 } else { 1.0 };
         let position = position + DVec2::splat(0.5 * first - 0.5 * self.step);
         let (px, py) = (position.x as usize, position.y as usize);
@@ -193,7 +197,8 @@ fn gradient(image: &Plane<f32>, x: i64, y: i64) -> (f32, f32) {
     ((dx * dx + dy * dy).sqrt(), dy.atan2(dx))
 }
 
-/// Dominant gradient directions, radians (peaks of a smoothed 36-bin histogram above 80 % of the highest).
+/// Dominant gradient directions, radians (peaks of a smoothed 36-bin histogram above 80 % of the
+/// highest).
 fn orientations(image: &Plane<f32>, x: f64, y: f64, sigma: f64) -> Vec<f64> {
     const BINS: usize = 36;
     let mut histogram = [0f32; BINS];
@@ -227,7 +232,8 @@ fn orientations(image: &Plane<f32>, x: f64, y: f64, sigma: f64) -> Vec<f64> {
     out
 }
 
-/// 4×4 cells of 8 directions, trilinear votes, clipped at 0.2, square-rooted after L1 normalisation.
+/// 4×4 cells of 8 directions, trilinear votes, clipped at 0.2, square-rooted after L1
+/// normalisation.
 fn descriptor(image: &Plane<f32>, x: f64, y: f64, sigma: f64, angle: f64) -> [f32; 128] {
     let mut d = [0f32; 128];
     let cell = 3.0 * sigma;
@@ -267,7 +273,8 @@ fn descriptor(image: &Plane<f32>, x: f64, y: f64, sigma: f64, angle: f64) -> [f3
     d.map(|v| (v / sum).sqrt())
 }
 
-/// Twice the resolution, bilinear; sample i of the result lies at (i + 0.5)/2 in pixels of the input.
+/// Twice the resolution, bilinear; sample i of the result lies at (i + 0.5)/2 in pixels of the
+/// input.
 fn doubled(p: &Plane<f32>) -> Plane<f32> {
     let (w, h) = (p.width * 2, p.height * 2);
     let at = |i: usize, n: usize| {
@@ -357,7 +364,8 @@ mod tests {
         }
     }
 
-    /// A blob's keypoint must sit on the blob: this pins the half-pixel conventions of doubling and decimation.
+    /// A blob's keypoint must sit on the blob: this pins the half-pixel conventions of doubling and
+    /// decimation.
     #[test]
     fn blobs_are_found_where_they_are() {
         for sigma in [1.5f64, 3.0, 6.0, 12.0] {
@@ -390,7 +398,8 @@ mod tests {
         let matches = crate::matching::mutual_matches(&a, &b, 0.85);
         let to = |p: DVec2| DVec2::new(96.0 - p.y, p.x);
         let right = matches.iter().filter(|m| to(a.points[m.first]).distance(b.points[m.second]) < 1.0);
-        // A copy of this in double precision: 283 of 283, and none with descriptors that do not turn.
+        // A copy of this in double precision: 283 of 283, and none with descriptors that do not
+        // turn.
         let (right, all) = (right.count(), matches.len());
         assert!(right > 200 && 10 * right > 9 * all, "{right} of {all}");
     }

@@ -1,4 +1,5 @@
-//! Ground truth for tests: photos, cameras and depth of the breakfast set (and any set in its layout).
+//! Ground truth for tests: photos, cameras and depth of the breakfast set (and any set in its
+//! layout).
 use crate::math::Random;
 use crate::photo::{self, Photo};
 use crate::scene::{Camera, Lens, Pose, RgbImage};
@@ -12,7 +13,8 @@ pub(crate) struct Truth {
     pub(crate) folder: PathBuf,
 }
 
-/// The breakfast set in the repository, or another set of the same layout named by SPLATVK_TEST_SET.
+/// The breakfast set in the repository, or another set of the same layout named by
+/// SPLATVK_TEST_SET.
 pub(crate) fn folder() -> PathBuf {
     std::env::var_os("SPLATVK_TEST_SET").map_or_else(
         || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/breakfast"),
@@ -86,8 +88,8 @@ pub(crate) fn lensed(photo: &Photo, focal: f64, lens: Lens) -> Photo {
     out
 }
 
-/// Matches of points in two cameras, the first of which is the world: centred pixels over a prior focal length, with normal noise.
-/// `focal`, `noise` in the same unit.
+/// Matches of points in two cameras, the first of which is the world: centred pixels over a prior
+/// focal length, with normal noise. `focal`, `noise` in the same unit.
 pub(crate) fn matches_of(
     pose: &Pose,
     focal: [f64; 2],

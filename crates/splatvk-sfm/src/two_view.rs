@@ -1,13 +1,13 @@
-//! Two-view geometry with an uncertain focal length: RANSAC over five points, local optimisation of rotation,
-//! translation and focal length together, and detection of views that hold no parallax.
+//! Two-view geometry with an uncertain focal length: RANSAC over five points, local optimisation of
+//! rotation, translation and focal length together, and detection of views that hold no parallax.
 use super::minimal::{FivePoint, decompose_essential, essential, triangulate_two};
 use super::numeric::minimise_small;
 use crate::math::{Random, median};
 use crate::scene::Pose;
 use glam::{DMat3, DVec2, DVec3};
 
-/// Relation of two views. Pixels are centred and divided by the prior focal length of their photo; `stretch` is the
-/// estimated focal length as a multiple of the prior.
+/// Relation of two views. Pixels are centred and divided by the prior focal length of their photo;
+/// `stretch` is the estimated focal length as a multiple of the prior.
 #[derive(Clone, Debug)]
 pub(crate) struct TwoView {
     /// First camera → second camera, |translation| = 1.
@@ -34,7 +34,8 @@ fn signed_sampson(f: &DMat3, x: DVec2, y: DVec2) -> f64 {
     e / (fx.x * fx.x + fx.y * fx.y + ft.x * ft.x + ft.y * ft.y).max(1e-300).sqrt()
 }
 
-/// F between centred pixels of two cameras with known focal lengths; `pose` maps the first camera to the second.
+/// F between centred pixels of two cameras with known focal lengths; `pose` maps the first camera
+/// to the second.
 pub(crate) fn fundamental(pose: &Pose, f1: f64, f2: f64) -> DMat3 {
     let inverse = |f: f64| DMat3::from_diagonal(DVec3::new(1.0 / f, 1.0 / f, 1.0));
     inverse(f2) * essential(pose) * inverse(f1)
@@ -121,7 +122,8 @@ impl Data<'_> {
         best.1
     }
 
-    /// RANSAC at a fixed stretch. Matches are sorted best first; samples prefer the front of the list.
+    /// RANSAC at a fixed stretch. Matches are sorted best first; samples prefer the front of the
+    /// list.
     fn ransac(&self, m: f64, iterations: usize, prior_sigma: f64, seed: u64) -> Option<(f64, Pose, f64)> {
         let solver = FivePoint::new();
         let mut rng = Random::new(seed);
@@ -157,8 +159,9 @@ impl Data<'_> {
     }
 }
 
-/// Estimates the relation of two views from matches sorted best first. `x`, `y`: centred pixels over prior focal length;
-/// `threshold` in the same unit; `prior_sigma` is that of ln stretch. `seed` draws the samples.
+/// Estimates the relation of two views from matches sorted best first. `x`, `y`: centred pixels
+/// over prior focal length; `threshold` in the same unit; `prior_sigma` is that of ln stretch.
+/// `seed` draws the samples.
 pub(crate) fn estimate(
     x: &[DVec2],
     y: &[DVec2],
@@ -171,7 +174,8 @@ pub(crate) fn estimate(
         return None;
     }
     let data = Data { x, y, t2: threshold * threshold };
-    // ±1.5 σ covers 87 % of cameras when nothing is known; the local optimisation bridges the steps between.
+    // ±1.5 σ covers 87 % of cameras when nothing is known; the local optimisation bridges the steps
+    // between.
     let stretches: Vec<f64> = if prior_sigma > 0.1 {
         [0.0, -0.75, 0.75, -1.5, 1.5].iter().map(|k: &f64| (k * prior_sigma).exp()).collect()
     } else {
@@ -206,8 +210,8 @@ pub(crate) fn estimate(
     Some(TwoView { pose, stretch: m, inliers, parallax, rotation_residual })
 }
 
-/// Median residual after fitting a rotation and a focal stretch without translation: near the noise when the camera only
-/// turned.
+/// Median residual after fitting a rotation and a focal stretch without translation: near the noise
+/// when the camera only turned.
 fn pure_rotation_residual(x: &[DVec2], y: &[DVec2], used: &[usize], pose: &Pose, m: f64) -> f64 {
     let moved = |v: &[f64; 4], k: usize| {
         let r = Pose::exp(DVec3::ZERO, DVec3::new(v[0], v[1], v[2])).rotation * pose.rotation;
@@ -257,7 +261,8 @@ mod tests {
     #[test]
     fn noisy_matches_with_outliers_and_wrong_focal_give_the_rotation() {
         let turn = Pose::exp(DVec3::ZERO, DVec3::new(0.05, 0.45, -0.03));
-        // Not an orbit about one centre: equal distances with crossing axes leave the focal length free (Sturm 2001).
+        // Not an orbit about one centre: equal distances with crossing axes leave the focal length
+        // free (Sturm 2001).
         let c = DVec3::new(0.0, 0.0, 4.0);
         let pose =
             Pose { rotation: turn.rotation, translation: DVec3::new(0.3, 0.4, 2.5) - turn.rotation * c };

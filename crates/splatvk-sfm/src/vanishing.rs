@@ -1,5 +1,6 @@
-//! Focal length from vanishing points: edges of most things that people build run in three directions at right angles, and only
-//! the right focal length makes the directions that a photo shows so (docs/internals/method.md#vanishing-points).
+//! Focal length from vanishing points: edges of most things that people build run in three
+//! directions at right angles, and only the right focal length makes the directions that a photo
+//! shows so (docs/internals/method.md#vanishing-points).
 use super::segments::{self, END_SIGMA};
 use crate::math::Random;
 use crate::scene::RgbImage;
@@ -10,20 +11,23 @@ use rayon::prelude::*;
 const REACH: f64 = 0.96;
 /// … in steps of 8 %: half of what the sharpest photos of the tuning sets leave open.
 const STEP: f64 = 0.08;
-/// Triples of edges tried as three directions, per focal length: of edges of which a tenth runs in each of two directions,
-/// with a hundred the right two are drawn almost surely.
+/// Triples of edges tried as three directions, per focal length: of edges of which a tenth runs in
+/// each of two directions, with a hundred the right two are drawn almost surely.
 const DRAWS: usize = 600;
-/// Error of an edge's direction beside that of its ends, radians (0.6°): walls, boards and lenses are not quite straight.
+/// Error of an edge's direction beside that of its ends, radians (0.6°): walls, boards and lenses
+/// are not quite straight.
 const EDGE_FLOOR: f64 = 0.01;
 /// Share of the edges that may run in any direction.
 const CLUTTER: f64 = 0.5;
-/// Share of the edges that count as independent: an edge has two sides, and what stands in a row leans in a row.
+/// Share of the edges that count as independent: an edge has two sides, and what stands in a row
+/// leans in a row.
 const INDEPENDENT: f64 = 0.25;
-/// Largest σ of ln f that one photo may leave for it to count. Where things stand at any angle to each other
-/// (`breakfast`, `breakfast-phone`) or a photo shows two directions only, the tuning sets have 12 to 43 %; where walls or a
-/// table fix it, 5 to 9 %, with errors up to 8 %.
+/// Largest σ of ln f that one photo may leave for it to count. Where things stand at any angle to
+/// each other (`breakfast`, `breakfast-phone`) or a photo shows two directions only, the tuning
+/// sets have 12 to 43 %; where walls or a table fix it, 5 to 9 %, with errors up to 8 %.
 const SHARP: f64 = 0.1;
-/// σ of ln f that all photos of a set share: corners that are not quite square, an optical axis off the middle.
+/// σ of ln f that all photos of a set share: corners that are not quite square, an optical axis off
+/// the middle.
 const SHARED: f64 = 0.04;
 
 /// What a photo or several say of ln (f / long side).
@@ -33,8 +37,8 @@ pub(super) struct LogFocal {
     pub(super) sigma: f64,
 }
 
-/// ln (f / long side) of photos that one camera took, from those that show it sharply; `None` if none does. `prior` is on the
-/// same quantity and counted once.
+/// ln (f / long side) of photos that one camera took, from those that show it sharply; `None` if
+/// none does. `prior` is on the same quantity and counted once.
 pub(super) fn log_focal<'a>(images: impl Iterator<Item = &'a RgbImage>, prior: LogFocal) -> Option<LogFocal> {
     let sharp: Vec<LogFocal> =
         images.filter_map(|image| Edges::of(image).log_focal(prior)).filter(|f| f.sigma <= SHARP).collect();
@@ -80,7 +84,8 @@ impl Edges {
         Edges(found.segments.iter().map(edge).collect())
     }
 
-    /// Mean and deviation of the posterior over focal lengths, each with the three directions that suit it best.
+    /// Mean and deviation of the posterior over focal lengths, each with the three directions that
+    /// suit it best.
     fn log_focal(&self, prior: LogFocal) -> Option<LogFocal> {
         if self.0.len() < 3 {
             return None;
@@ -100,8 +105,8 @@ impl Edges {
         Some(LogFocal { mean: prior.mean + mean, sigma: square.sqrt().hypot(STEP / 12f64.sqrt()) })
     }
 
-    /// Log likelihood ratio against edges of any direction, with the best three directions at right angles. `focal` in long
-    /// sides.
+    /// Log likelihood ratio against edges of any direction, with the best three directions at right
+    /// angles. `focal` in long sides.
     fn best_likelihood(&self, focal: f64) -> f64 {
         let ray = |p: DVec2| p.extend(focal).normalize();
         let planes: Vec<EdgePlane> = self
@@ -138,7 +143,8 @@ impl Edges {
     }
 }
 
-/// Turns three directions about the coordinate axes by ever smaller angles as long as the likelihood rises.
+/// Turns three directions about the coordinate axes by ever smaller angles as long as the
+/// likelihood rises.
 fn climb(planes: &[EdgePlane], mut best: (f64, [DVec3; 3])) -> f64 {
     // From the error of a drawn direction to a twentieth of that of an edge.
     let mut angle = 0.03;
@@ -159,11 +165,13 @@ fn climb(planes: &[EdgePlane], mut best: (f64, [DVec3; 3])) -> f64 {
     best.0
 }
 
-/// Σ ln (ε + (1 − ε)/3 Σ π N(θ; σ)) with θ the angle in the picture between an edge and the way to a vanishing point.
+/// Σ ln (ε + (1 − ε)/3 Σ π N(θ; σ)) with θ the angle in the picture between an edge and the way to
+/// a vanishing point.
 fn likelihood(planes: &[EdgePlane], axes: &[DVec3; 3]) -> f64 {
     let one = |p: &EdgePlane| {
         let density = |axis: &DVec3| {
-            // The plane of the edge's middle and the direction; sin θ ≈ θ where the density is not 0.
+            // The plane of the edge's middle and the direction; sin θ ≈ θ where the density is not
+            // 0.
             let through = p.middle.cross(*axis).normalize_or_zero();
             let sine = p.normal.cross(through).length() / p.sigma;
             (-0.5 * sine * sine).exp() / p.sigma
@@ -181,7 +189,8 @@ mod tests {
 
     const PRIOR: LogFocal = LogFocal { mean: -0.105, sigma: 0.35 };
 
-    /// Edges of boxes that stand in `frames`, seen from above at an angle, and edges of any direction.
+    /// Edges of boxes that stand in `frames`, seen from above at an angle, and edges of any
+    /// direction.
     fn scene(focal: f64, frames: &[f64], boxes: usize, clutter: usize, seed: u64) -> Edges {
         let mut rng = Random::new(seed);
         let view = DQuat::from_rotation_x(0.5) * DQuat::from_rotation_y(0.6);

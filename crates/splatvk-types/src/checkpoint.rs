@@ -8,13 +8,15 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// A place for one state, which the next replaces; reached through [`crate::progress::Progress::checkpoint`].
+/// A place for one state, which the next replaces; reached through
+/// [`crate::progress::Progress::checkpoint`].
 pub struct Checkpoint {
     file: PathBuf,
     every: Duration,
     last: Mutex<Instant>,
     resume: bool,
-    /// The steps that the state on disk has behind it, as far as this process knows; [`UNKNOWN`] otherwise.
+    /// The steps that the state on disk has behind it, as far as this process knows; [`UNKNOWN`]
+    /// otherwise.
     done: AtomicU64,
 }
 
@@ -32,7 +34,8 @@ impl Checkpoint {
         postcard::from_bytes(&bytes).ok()
     }
 
-    /// What the state on disk, of this process or an earlier one, is a state of; `None` where there is none.
+    /// What the state on disk, of this process or an earlier one, is a state of; `None` where there
+    /// is none.
     pub fn named(&self, stage: &str) -> Option<String> {
         self.file.is_file().then(|| match self.done.load(Ordering::Relaxed) {
             UNKNOWN => format!("the state of stage {stage}"),
@@ -50,7 +53,8 @@ impl Checkpoint {
         lock(&self.last).elapsed() >= self.every
     }
 
-    /// Writes the state after `done` steps. A disk that is full costs the next process time, not this one its result.
+    /// Writes the state after `done` steps. A disk that is full costs the next process time, not
+    /// this one its result.
     pub fn save<T: Serialize>(&self, done: usize, state: &T) -> Result<()> {
         let bytes = postcard::to_stdvec(state).map_err(|e| Error::work(format!("checkpoint: {e}")))?;
         if files::write_with_checksum(&self.file, &bytes).is_ok() {

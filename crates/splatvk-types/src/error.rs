@@ -1,4 +1,5 @@
-//! The one error type. Every message is a single line that says what is wrong, where, and what to do next.
+//! The one error type. Every message is a single line that says what is wrong, where, and what to
+//! do next.
 mod system;
 
 pub use system::words;
@@ -9,11 +10,12 @@ use system::advice;
 /// The crate's result.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// What stands behind an error, where there is something.
+/// The cause of an error.
 pub type Cause = Box<dyn std::error::Error + Send + Sync + 'static>;
 
-/// Everything that can go wrong, by what a program may do about it. The message alone says everything; [`source`] is there
-/// for what the system or the driver said. [`Error::exit_code`] maps it to the process exit code.
+/// Everything that can go wrong, by what a program may do about it. The message alone says
+/// everything; [`source`] is there for what the system or the driver said. [`Error::exit_code`]
+/// maps it to the process exit code.
 ///
 /// [`source`]: std::error::Error::source
 #[derive(Debug, thiserror::Error)]
@@ -27,16 +29,18 @@ pub enum Error {
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// What the operating system said.
+        /// The error of the operating system.
         source: std::io::Error,
     },
-    /// A place cannot take a file: the disk is full, or the folder or file system does not allow it. Nothing half-written
-    /// stays there; the same work succeeds once there is space, or in another place.
+    /// A place cannot take a file: the disk is full, or the folder or file system does not allow
+    /// it. Nothing half-written stays there; the same work succeeds once there is space, or in
+    /// another place.
     #[error("{}: cannot be written: {}{}", path.display(), words(source), elsewhere(source))]
     Unwritable {
         /// The file or folder.
         path: PathBuf,
-        /// What the operating system said; its [`kind`](std::io::Error::kind) tells a full disk from a missing permission.
+        /// What the operating system said; its [`kind`](std::io::Error::kind) tells a full disk
+        /// from a missing permission.
         source: std::io::Error,
     },
     /// The inference library, a program or another installable part is missing or cannot be used.
@@ -47,26 +51,27 @@ pub enum Error {
     MissingModel {
         /// Its name in the model table, that of its folder, or the path of the file.
         model: String,
-        /// What is wrong with it and how to get it.
+        /// The fault and how to get the model.
         message: String,
     },
     /// No Vulkan loader, driver or device that can be used.
     #[error("{message}")]
     NoDevice {
-        /// What is missing and how to get it.
+        /// The missing part and how to get it.
         message: String,
-        /// What the loader or the driver said, if it was asked.
+        /// The error of the loader or the driver, if there is one.
         source: Option<Cause>,
     },
-    /// The Vulkan device was lost: reset by its driver, removed, or asleep. Everything on it is gone and nothing more can be
-    /// done with it; a new [`crate::gpu::Device`] may work.
+    /// The Vulkan device was lost: reset by its driver, removed, or asleep. Everything on it is
+    /// gone and nothing more can be done with it; a new [`crate::gpu::Device`] may work.
     #[error("Vulkan: {doing}: the device was lost ({source}); {}", after_loss(kept))]
     DeviceLost {
-        /// What was being done.
+        /// The operation that failed.
         doing: String,
-        /// The last thing that is on disk, from which the same run with `resume` goes on: "stage splats after step 120".
+        /// The last thing that is on disk, from which the same run with `resume` goes on: "stage
+        /// splats after step 120".
         kept: Option<String>,
-        /// What the driver said.
+        /// The driver's error.
         source: Cause,
     },
     /// The Vulkan device or its driver has no memory left.
@@ -75,19 +80,19 @@ pub enum Error {
         once_there_is_memory(kept)
     )]
     OutOfDeviceMemory {
-        /// What was being done, with its size where one is known.
+        /// The operation that failed, with its size where one is known.
         doing: String,
         /// As that of [`Error::DeviceLost`].
         kept: Option<String>,
-        /// What the driver said.
+        /// The driver's error.
         source: Cause,
     },
     /// The Vulkan driver refused something else, or the device cannot do it.
     #[error("Vulkan: {message}")]
     Gpu {
-        /// What was refused and why.
+        /// The refused operation and the reason.
         message: String,
-        /// What the driver said, if it was asked.
+        /// The driver's error, if it was asked.
         source: Option<Cause>,
     },
     /// Something failed while working on valid input.
@@ -123,8 +128,8 @@ impl Error {
     pub fn gpu(message: impl Into<String>) -> Self {
         Error::Gpu { message: message.into(), source: None }
     }
-    /// Attaches the path to an I/O error: `.map_err(Error::io(path))`. What only writing can meet becomes
-    /// [`Error::Unwritable`].
+    /// Attaches the path to an I/O error: `.map_err(Error::io(path))`. What only writing can meet
+    /// becomes [`Error::Unwritable`].
     pub fn io(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Error {
         use std::io::ErrorKind as K;
         let path = path.as_ref().to_path_buf();
@@ -140,7 +145,7 @@ impl Error {
         let path = path.as_ref().to_path_buf();
         move |source| Error::Unwritable { path, source }
     }
-    /// The same error, where `last` is on disk; what was named before is the later one.
+    /// Adds the last state on disk, unless a later one is named already.
     pub fn keeping(mut self, last: Option<String>) -> Self {
         if let Error::DeviceLost { kept, .. } | Error::OutOfDeviceMemory { kept, .. } = &mut self
             && kept.is_none()
@@ -149,8 +154,8 @@ impl Error {
         }
         self
     }
-    /// 2 for bad usage, bad input, a missing part or a place that cannot be written (also a full disk); 1 for a failure
-    /// while working; 130 when stopped by the user.
+    /// 2 for bad usage, bad input, a missing part or a place that cannot be written (also a full
+    /// disk); 1 for a failure while working; 130 when stopped by the user.
     pub fn exit_code(&self) -> u8 {
         match self {
             Error::Input(_) | Error::Missing(_) | Error::MissingModel { .. } => 2,
@@ -185,7 +190,7 @@ impl From<splatvk_gpu::Error> for Error {
     }
 }
 
-/// What the user can do about a place that cannot be written.
+/// Advice for a place that cannot be written.
 fn elsewhere(e: &std::io::Error) -> &'static str {
     use std::io::ErrorKind as K;
     match (e.kind(), advice(e)) {

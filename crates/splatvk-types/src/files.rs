@@ -1,5 +1,5 @@
-//! Files read within bounds; files that are whole or not there: written beside their place and renamed into it, some with a
-//! checksum in front; and the rule for what may be written over.
+//! Files read within bounds; files that are whole or not there: written beside their place and
+//! renamed into it, some with a checksum in front; and the rule for what may be written over.
 mod guard;
 mod hash;
 mod home;
@@ -34,17 +34,20 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, OnceLock};
 use std::time::SystemTime;
 
-/// Beyond the bytes of a file a reader takes at most four times its content, and this much (docs/use/formats.md#limits).
+/// Beyond the bytes of a file a reader takes at most four times its content, and this much
+/// (docs/use/formats.md#limits).
 pub const ROOM: u64 = 64 << 20;
 
 /// Most bytes of a text or JSON file: ten times the cameras of 10,000 photos.
 const LONGEST_TEXT: u64 = 64 << 20;
 
-/// Most values and keys of a JSON file. A value takes 32 bytes of memory and as few as two in the file, so the bound on the
-/// bytes would not hold the memory; the cameras of 10,000 photos have 450,000.
+/// Most values and keys of a JSON file. A value takes 32 bytes of memory and as few as two in the
+/// file, so the bound on the bytes would not hold the memory; the cameras of 10,000 photos have
+/// 450,000.
 const MOST_VALUES: usize = 1 << 20;
 
-/// How many times its bytes the content of a compressed file may have: Gaussians and features reach 5.
+/// How many times its bytes the content of a compressed file may have: Gaussians and features reach
+/// 5.
 const EXPANSION: u64 = 16;
 
 /// Most bytes that a compressed file of `size` bytes may hold.
@@ -52,8 +55,8 @@ pub fn most_content(size: usize) -> u64 {
     (size as u64).saturating_mul(EXPANSION).saturating_add(ROOM)
 }
 
-/// Opens a file that is to be read, and its size in bytes. Devices, pipes and folders are refused: they have no end, or none
-/// that can be known.
+/// Opens a file that is to be read, and its size in bytes. Devices, pipes and folders are refused:
+/// they have no end, or none that can be known.
 pub fn open(path: &Path) -> Result<(File, u64)> {
     let unreadable = |e: std::io::Error| match e.kind() {
         std::io::ErrorKind::NotFound => Error::io(path)(e),
@@ -77,7 +80,8 @@ pub fn open(path: &Path) -> Result<(File, u64)> {
     Ok((file, size))
 }
 
-/// Reads a whole file: as many bytes as it has when it is opened. Everything that is read whole is read here.
+/// Reads a whole file: as many bytes as it has when it is opened. Everything that is read whole is
+/// read here.
 pub fn read(path: &Path) -> Result<Vec<u8>> {
     read_within(path, u64::MAX)
 }
@@ -188,8 +192,9 @@ pub fn content_hash(path: &Path) -> std::io::Result<String> {
     Ok(hash)
 }
 
-/// Writes `parts` one after the other to a file of the program's own that appears whole or not at all, and that only its user can
-/// read; makes its folder, and removes what killed processes have left there.
+/// Writes `parts` one after the other to a file of the program's own that appears whole or not at
+/// all, and that only its user can read; makes its folder, and removes what killed processes have
+/// left there.
 pub fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
     // One at a time: of two threads that keep the same thing the second would be refused.
     static WRITING: Mutex<()> = Mutex::new(());
@@ -204,7 +209,8 @@ pub fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
     partial.keep(|from| std::fs::rename(from, path))
 }
 
-/// Makes a folder that only its user can look into, with the folders that it is in; one that is there stays as it is.
+/// Makes a folder that only its user can look into, with the folders that it is in; one that is
+/// there stays as it is.
 fn private_folder(folder: &Path) -> std::io::Result<()> {
     let mut builder = std::fs::DirBuilder::new();
     #[cfg(unix)]
@@ -220,8 +226,8 @@ fn private_file(path: &Path) -> std::io::Result<File> {
     options.write(true).create_new(true).open(path)
 }
 
-/// Whether nobody but the user can have written a file: it is the user's own or that of the system's owner, and no group or other
-/// users may write to it.
+/// Whether nobody but the user can have written a file: it is the user's own or that of the
+/// system's owner, and no group or other users may write to it.
 #[cfg(unix)]
 fn is_own(meta: &std::fs::Metadata) -> bool {
     use std::os::unix::fs::MetadataExt;
@@ -249,8 +255,8 @@ pub fn write_with_checksum(path: &Path, body: &[u8]) -> std::io::Result<()> {
     write(path, &[sha256(body).as_bytes(), body])
 }
 
-/// What [`write_with_checksum`] wrote; `None` if it is not there, not what was written, or another user may have written it. Counts as
-/// a use for [`prune`].
+/// What [`write_with_checksum`] wrote; `None` if it is not there, not what was written, or another
+/// user may have written it. Counts as a use for [`prune`].
 pub fn read_with_checksum(path: &Path) -> Option<Vec<u8>> {
     let (file, size) = open(path).ok()?;
     if !is_own(&file.metadata().ok()?) {
@@ -277,8 +283,8 @@ pub fn in_folder(folder: &Path, extension: &str) -> Vec<(PathBuf, u64)> {
     all
 }
 
-/// Removes the files of a folder with this extension that were not used for longest, until the rest fits into `capacity`
-/// bytes; never `newest`.
+/// Removes the files of a folder with this extension that were not used for longest, until the rest
+/// fits into `capacity` bytes; never `newest`.
 pub fn prune(newest: &Path, extension: &str, capacity: u64) {
     let Some(folder) = newest.parent() else { return };
     let entry = |e: std::fs::DirEntry| {

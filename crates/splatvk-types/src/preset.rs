@@ -7,6 +7,7 @@ pub enum Preset {
     Draft,
     /// The recommended length on a GPU.
     Default,
-    /// The constants of the reference implementation behind the paper (docs/internals/method.md#schedules).
+    /// The constants of the reference implementation behind the paper
+    /// (docs/internals/method.md#schedules).
     Paper,
 }

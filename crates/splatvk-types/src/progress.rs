@@ -55,7 +55,7 @@ impl Progress for Silent {
     fn warn(&self, _: &str) {}
 }
 
-/// What one stage took.
+/// Time and memory of one stage.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct StageRecord {
     /// Stage name.

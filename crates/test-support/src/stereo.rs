@@ -12,7 +12,8 @@ pub struct Set {
     pub sparse: Vec<DVec3>,
 }
 
-/// Smooth noise over the plane, three octaves down to about four pixels: something to match everywhere.
+/// Smooth noise over the plane, three octaves down to about four pixels: something to match
+/// everywhere.
 fn texture(u: f64, v: f64) -> f32 {
     let lattice = |x: i64, y: i64, octave: u32| {
         let h = hash(x as u32 ^ hash(y as u32 ^ hash(octave)));
@@ -108,7 +109,8 @@ pub fn within(errors: &[f32], limit: f32) -> f32 {
     errors.iter().filter(|&&e| e < limit).count() as f32 / errors.len() as f32
 }
 
-/// The training views of breakfast shrunk by `shrink`, with exact cameras and 60 exact points per view.
+/// The training views of breakfast shrunk by `shrink`, with exact cameras and 60 exact points per
+/// view.
 pub fn breakfast(shrink: u32) -> Set {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/breakfast");
     let truth = std::fs::read_to_string(root.join("ground_truth.json")).unwrap();

@@ -17,7 +17,8 @@ pub fn image_tower() -> Onnx {
 pub const WORDS: [&str; 12] =
     ["[UNK]", "red", "green", "blue", "dog", "city", "page", "text", "person", "bicycle", "plate", "food"];
 
-/// Sum of the words' rows: red, green and blue point along their channel, the rest (and padding) nowhere in particular.
+/// Sum of the words' rows: red, green and blue point along their channel, the rest (and padding)
+/// nowhere in particular.
 pub fn text_tower(order: [usize; 3]) -> Onnx {
     let mut table = vec![0.01f32; 3 * WORDS.len()];
     for (k, channel) in order.into_iter().enumerate() {

@@ -1,5 +1,5 @@
-//! A compute pass of one's own on a rendered frame, without a copy to the host: contour lines of the
-//! depth. `cargo run --release -p own_pass -- out/kitchen contours.png`.
+//! A compute pass of one's own on a rendered frame, without a copy to the host: contour lines of
+//! the depth. `cargo run --release -p own_pass -- out/kitchen contours.png`.
 use splatvk::format::{picture, scene_dir};
 use splatvk::gpu::{self, Recorder};
 use splatvk::pass::Renderer;

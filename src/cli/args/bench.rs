@@ -19,9 +19,11 @@ pub enum BenchPart {
     Models,
     /// The limits of the device
     Roofline,
-    /// Photos to cameras on every --data folder: errors, and whether the stated focal uncertainty is right
+    /// Photos to cameras on every --data folder: errors, and whether the stated focal uncertainty
+    /// is right
     Cameras,
-    /// Photos to masks on every --data folder with true masks, without cameras: IoU of the best mask with each object
+    /// Photos to masks on every --data folder with true masks, without cameras: IoU of the best
+    /// mask with each object
     Masks,
 }
 
@@ -34,7 +36,8 @@ pub struct BenchArgs {
     /// Gaussian .ply with its camera beside it, or a scene directory [default: a seeded scene]
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
-    /// Camera of the scene: pinhole .json as --write-scene writes it, transforms.json or cameras.json
+    /// Camera of the scene: pinhole .json as --write-scene writes it, transforms.json or
+    /// cameras.json
     #[arg(long, value_name = "FILE", requires = "scene")]
     pub camera: Option<PathBuf>,
     /// Splats of the seeded scene
@@ -94,7 +97,8 @@ pub struct BenchArgs {
     /// Measure nothing: print the ratios B / A of two files of --json
     #[arg(long, num_args = 2, value_names = ["A", "B"], conflicts_with_all = ["scene", "json", "write_scene"])]
     pub compare: Option<Vec<PathBuf>>,
-    /// Measure nothing: write scene.ply, scene.json and render.npy of the workload for other programs
+    /// Measure nothing: write scene.ply, scene.json and render.npy of the workload for other
+    /// programs
     #[arg(long, value_name = "DIR", conflicts_with = "json")]
     pub write_scene: Option<PathBuf>,
     /// Vulkan device: part of its name, or its number in `splatvk doctor`

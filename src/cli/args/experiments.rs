@@ -68,22 +68,22 @@ pub struct AblateArgs {
     /// Which tables
     #[arg(value_parser = tables(), required = true, value_name = "TABLE")]
     pub tables: Vec<String>,
-    /// Folders with ground_truth.json, photos and masks, or scenes of LERF-OVS, 3D-OVS or ScanNet: figures are means over
-    /// them, with their spread
+    /// Folders with ground_truth.json, photos and masks, or scenes of LERF-OVS, 3D-OVS or ScanNet:
+    /// figures are means over them, with their spread
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
     pub data: Vec<PathBuf>,
     /// How the data lies, and by which protocol it is scored
     #[arg(long, value_enum, default_value = "auto")]
     pub layout: LayoutArg,
-    /// Folder for ablate.json and one text and one chart per table, renewed after every row [default: out/ablate-NAME, after
-    /// the data]
+    /// Folder for ablate.json and one text and one chart per table, renewed after every row
+    /// [default: out/ablate-NAME, after the data]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Write over what is there: ordinary files of the names of tables
     #[arg(long)]
     pub force: bool,
-    /// Masks and features for every row: built-in, flawed (true masks, errors injected), exact, or dir:DIR [default: those
-    /// that each table is about]
+    /// Masks and features for every row: built-in, flawed (true masks, errors injected), exact, or
+    /// dir:DIR [default: those that each table is about]
     #[arg(long, value_name = "SOURCE")]
     pub regions: Option<String>,
     /// Photos of the default row [default: all train frames, at most 4]
@@ -98,7 +98,8 @@ pub struct AblateArgs {
     /// Seeds of cameras, stereo, training and injected errors: a run for each
     #[arg(long, visible_alias = "seed", value_delimiter = ',', default_value = "0", value_name = "N,...", value_parser = whole::<u64>(0..))]
     pub seeds: Vec<u64>,
-    /// Take the rows that an earlier run has left in --out, measured the same way, and go on from there
+    /// Take the rows that an earlier run has left in --out, measured the same way, and go on from
+    /// there
     #[arg(long)]
     pub resume: bool,
     /// Cameras and points of every row that does not vary them, as of run [default: sfm]
@@ -169,16 +170,19 @@ pub struct GenerateArgs {
     /// Objects that look like another one
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<usize>(0..))]
     pub similar: usize,
-    /// Out of doors, ten times as large: the ground begins at the feet, behind a house stands the sky
+    /// Out of doors, ten times as large: the ground begins at the feet, behind a house stands the
+    /// sky
     #[arg(long)]
     pub outdoor: bool,
     /// Everything on one plane instead of a table
     #[arg(long, value_name = "WAY", value_parser = flats())]
     pub flat: Option<Flat>,
-    /// Cameras at even steps of --baseline on one circle; otherwise each is up to 2 degrees off along it and 4 above or below it
+    /// Cameras at even steps of --baseline on one circle; otherwise each is up to 2 degrees off
+    /// along it and 4 above or below it
     #[arg(long)]
     pub steady: bool,
-    /// Focal length of the last photo over that of the first; between them it grows from photo to photo
+    /// Focal length of the last photo over that of the first; between them it grows from photo to
+    /// photo
     #[arg(long, default_value_t = 1.0, value_name = "RATIO")]
     pub zoom: f64,
     /// Error of the starting cameras in cameras_noisy.json, degrees
@@ -187,8 +191,8 @@ pub struct GenerateArgs {
     /// Noise of the photos, share of full white [default: 0.005; 0 with --sensor-noise]
     #[arg(long, value_name = "SHARE")]
     pub photo_noise: Option<f64>,
-    /// Photos as a phone takes them: --focal --lens --centre --light --sensor-noise --jpeg 82; held-out views stay clean, and depth
-    /// and masks are those of the undistorted photo
+    /// Photos as a phone takes them: --focal --lens --centre --light --sensor-noise --jpeg 82;
+    /// held-out views stay clean, and depth and masks are those of the undistorted photo
     #[arg(long)]
     pub phone: bool,
     /// Focal length drawn from 0.7 to 1.2 widths, one for all views [default: 1.025 widths]
@@ -200,17 +204,19 @@ pub struct GenerateArgs {
     /// Principal point of the photos off the middle, up to 1 % of the width along x and along y
     #[arg(long)]
     pub centre: bool,
-    /// Light of the photos: exposure within ±0.35 stops and white balance within ±6 % per photo, up to 35 % lost in the corners
+    /// Light of the photos: exposure within ±0.35 stops and white balance within ±6 % per photo, up
+    /// to 35 % lost in the corners
     #[arg(long)]
     pub light: bool,
-    /// Shot and read noise of a small sensor near ISO 200: 3000 electrons at full white, 4 electrons read noise
+    /// Shot and read noise of a small sensor near ISO 200: 3000 electrons at full white, 4
+    /// electrons read noise
     #[arg(long)]
     pub sensor_noise: bool,
     /// JPEG quality of the photos [default: 95; 82 with --phone]
     #[arg(long, value_name = "1-100", value_parser = whole::<u8>(1..=100))]
     pub jpeg: Option<u8>,
-    /// Every other photo by a second camera: focal length, lens, principal point and vignetting of its own, where the other options
-    /// ask for them
+    /// Every other photo by a second camera: focal length, lens, principal point and vignetting of
+    /// its own, where the other options ask for them
     #[arg(long)]
     pub two_cameras: bool,
     /// Photos of which no right scene, or only part of one, can be made

@@ -46,29 +46,33 @@ pub struct MakingArgs {
     /// Time against quality [default: draft on a CPU device, default on a GPU]
     #[arg(long, value_enum)]
     pub preset: Option<PresetArg>,
-    /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged [default: 800 on a CPU device, 1600 on a GPU]
+    /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged
+    /// [default: 800 on a CPU device, 1600 on a GPU]
     #[arg(long, value_name = "N", value_parser = whole::<usize>(SMALLEST_SIDE as u64..))]
     pub max_size: Option<usize>,
-    /// Go on where an earlier command ended, or change a late option: stages with the same photos and settings are not run again
+    /// Go on where an earlier command ended, or change a late option: stages with the same photos
+    /// and settings are not run again
     #[arg(long)]
     pub resume: bool,
     /// Replace a scene that is already there
     #[arg(long)]
     pub force: bool,
-    /// Folder of a mask per photo, x.png or x.jpg.png for x.jpg: black is not used [default: masks beside images]
+    /// Folder of a mask per photo, x.png or x.jpg.png for x.jpg: black is not used [default: masks
+    /// beside images]
     #[arg(long, value_name = "DIR")]
     pub photo_masks: Option<PathBuf>,
     /// Optimisation steps of the colour stage, instead of the preset's
     #[arg(long, value_name = "N", value_parser = whole::<usize>(1..), help_heading = EXPERTS)]
     pub iterations: Option<usize>,
-    /// Spherical-harmonics degree of the colours, which then depend on the direction [default: what photos support that are left out
-    /// for a test; 0 for fewer than four photos]
+    /// Spherical-harmonics degree of the colours, which then depend on the direction [default: what
+    /// photos support that are left out for a test; 0 for fewer than four photos]
     #[arg(long, value_name = "0-3", value_parser = whole::<u32>(0..=3), help_heading = EXPERTS)]
     pub sh_degree: Option<u32>,
     /// Seed of everything random
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u64>(0..), help_heading = EXPERTS)]
     pub seed: u64,
-    /// Same bits on every run on one machine: training adds up gradients in a fixed order, about a tenth slower
+    /// Same bits on every run on one machine: training adds up gradients in a fixed order, about a
+    /// tenth slower
     #[arg(long, help_heading = EXPERTS)]
     pub deterministic: bool,
     /// How often training keeps its state for --resume, seconds

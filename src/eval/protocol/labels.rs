@@ -1,4 +1,5 @@
-//! The labels of the published layouts as one object index per pixel, as ground truth for masks and features.
+//! The labels of the published layouts as one object index per pixel, as ground truth for masks and
+//! features.
 use crate::eval::ObjectMaps;
 use crate::scene::{Camera, Plane};
 use std::collections::BTreeMap;
@@ -22,7 +23,8 @@ pub(super) fn numbered(phrases: impl IntoIterator<Item = String>) -> BTreeMap<u3
     (1..).zip(phrases).collect()
 }
 
-/// Masks of one frame as one plane: where objects overlap, the smaller one is seen in front of the larger.
+/// Masks of one frame as one plane: where objects overlap, the smaller one is seen in front of the
+/// larger.
 pub(super) fn painted(mut masks: Vec<(u32, Plane<bool>)>) -> Option<Plane<u32>> {
     masks.sort_by_key(|(_, m)| std::cmp::Reverse(m.data.iter().filter(|&&in_it| in_it).count()));
     let (_, first) = masks.first()?;

@@ -1,4 +1,5 @@
-//! LERF-OVS as LangSplat evaluates it (docs/internals/method.md#lerf-ovs): polygons and boxes per labelled frame.
+//! LERF-OVS as LangSplat evaluates it (docs/internals/method.md#lerf-ovs): polygons and boxes per
+//! labelled frame.
 use super::labels::{Labels, numbered, painted};
 use super::polygon;
 use super::score::{

@@ -1,8 +1,10 @@
-//! The published evaluation protocols, from their public file layouts (docs/internals/method.md#protocols).
+//! The published evaluation protocols, from their public file layouts
+//! (docs/internals/method.md#protocols).
 //!
-//! [`open`] reads a data set's labels and lists the cameras to render and the texts to query; the caller renders and
-//! decodes each frame and hands it to [`Protocol::add`]; [`Protocol::finish`] gives the figures with the definitions they
-//! follow. The project's own protocol, `field`, is [`crate::eval`].
+//! [`open`] reads a data set's labels and lists the cameras to render and the texts to query; the
+//! caller renders and decodes each frame and hands it to [`Protocol::add`]; [`Protocol::finish`]
+//! gives the figures with the definitions they follow. The project's own protocol, `field`, is
+//! [`crate::eval`].
 mod labels;
 mod lerf;
 mod ovs;
@@ -32,8 +34,9 @@ pub fn labels(kind: ProtocolKind, folder: &Path) -> Result<Labels> {
     }
 }
 
-/// Reads the labels of `folder`. `scene` are the scene's cameras; `known` the data set's own cameras, which place the
-/// frames that the scene was not made from (without them only the scene's own photos are scored).
+/// Reads the labels of `folder`. `scene` are the scene's cameras; `known` the data set's own
+/// cameras, which place the frames that the scene was not made from (without them only the scene's
+/// own photos are scored).
 pub fn open(
     kind: ProtocolKind,
     folder: &Path,

@@ -1,4 +1,5 @@
-//! 3D-OVS (docs/internals/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and the data set's own argmax.
+//! 3D-OVS (docs/internals/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and
+//! the data set's own argmax.
 use super::labels::{Labels, numbered, painted};
 use super::score::{
     DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score, mask_iou,
@@ -17,7 +18,8 @@ const TAU: f32 = 0.8;
 const AREA: usize = 2000;
 /// Where no level passes: share of the best level's maximum that cuts the mask instead.
 const SUBSTITUTE: f32 = 0.95;
-/// Share of the maximal cosine that cuts the mask in the authors' script (its default; per scene .75 to .95).
+/// Share of the maximal cosine that cuts the mask in the authors' script (its default; per scene
+/// .75 to .95).
 const BAR: f32 = 0.85;
 /// Smallest mask there, pixels.
 const AUTHORS_AREA: usize = 3000;
@@ -162,7 +164,8 @@ fn top(map: &Plane<f32>) -> f32 {
     map.data.iter().copied().fold(f32::NEG_INFINITY, f32::max)
 }
 
-/// The paper: relevancy above τ per level; of the levels with more than 2000 such pixels, the one with the highest mean.
+/// The paper: relevancy above τ per level; of the levels with more than 2000 such pixels, the one
+/// with the highest mean.
 pub(super) fn paper_rule(levels: &[(usize, Plane<f32>)]) -> Option<Answer> {
     let mut best: Option<(f64, Answer)> = None;
     for (level, map) in levels {
@@ -185,7 +188,8 @@ pub(super) fn paper_rule(levels: &[(usize, Plane<f32>)]) -> Option<Answer> {
     Some((cut(map, SUBSTITUTE * peak), *level, true))
 }
 
-/// The authors' script: cosine above 0.85 of its maximum on the levels m and l; the level with the largest mask.
+/// The authors' script: cosine above 0.85 of its maximum on the levels m and l; the level with the
+/// largest mask.
 pub(super) fn authors_rule(levels: &[(usize, Plane<f32>)]) -> Option<Answer> {
     let coarse: Vec<&(usize, Plane<f32>)> = levels.iter().filter(|(l, _)| *l > 0).collect();
     let coarse = if coarse.is_empty() { levels.iter().collect() } else { coarse };
@@ -286,7 +290,8 @@ impl Protocol for Ovs {
     }
 }
 
-/// (labelled pixels, those whose class was found). A pixel of several classes is right with any of them.
+/// (labelled pixels, those whose class was found). A pixel of several classes is right with any of
+/// them.
 fn accuracy(best: &Plane<i32>, truth: &[Option<Plane<bool>>]) -> [u64; 2] {
     let Some(size) = truth.iter().flatten().next() else { return [0, 0] };
     let (mut all, mut right) = (0, 0);

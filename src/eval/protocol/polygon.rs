@@ -1,5 +1,5 @@
-//! Polygons to masks, as the label tools of LERF-OVS are read: vertices truncated to whole pixels, even-odd inside,
-//! outline included (what OpenCV's `fillPoly` draws).
+//! Polygons to masks, as the label tools of LERF-OVS are read: vertices truncated to whole pixels,
+//! even-odd inside, outline included (what OpenCV's `fillPoly` draws).
 use crate::scene::Plane;
 
 /// Farthest that a vertex may lie outside, pixels: beyond it products of coordinates leave 64 bits.
@@ -37,7 +37,8 @@ fn set(mask: &mut Plane<bool>, x: i64, y: i64) {
     }
 }
 
-/// Every pixel of an 8-connected line (Bresenham): one per step along the longer axis, rounded along the other.
+/// Every pixel of an 8-connected line (Bresenham): one per step along the longer axis, rounded
+/// along the other.
 fn outline(mask: &mut Plane<bool>, a: [i64; 2], b: [i64; 2]) {
     let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
     let steps = dx.abs().max(dy.abs());

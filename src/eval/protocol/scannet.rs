@@ -158,7 +158,8 @@ fn matrix(path: &Path) -> Result<Option<[f64; 16]>> {
     Ok(values.iter().all(|v| v.is_finite()).then_some(values))
 }
 
-/// The scan's own cameras: `pose/<frame>.txt` (camera to world) and `intrinsic/intrinsic_color.txt`.
+/// The scan's own cameras: `pose/<frame>.txt` (camera to world) and
+/// `intrinsic/intrinsic_color.txt`.
 fn cameras(folder: &Path, stems: &[String]) -> Result<Vec<Camera>> {
     let Some(k) = matrix(&folder.join("intrinsic/intrinsic_color.txt"))? else { return Ok(Vec::new()) };
     let mut out = Vec::new();

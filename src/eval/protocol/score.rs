@@ -155,7 +155,8 @@ impl DecodedView<'_> {
             .collect()
     }
 
-    /// Per pixel the prompt with the highest cosine at any level, −1 where nothing is; ties go to the earlier prompt.
+    /// Per pixel the prompt with the highest cosine at any level, −1 where nothing is; ties go to
+    /// the earlier prompt.
     pub(super) fn best_prompt(&self) -> Result<Plane<i32>> {
         let size =
             self.codes.first().ok_or_else(|| Error::work("the scene has no language level to query"))?;
@@ -181,7 +182,8 @@ pub(super) fn nearest<T: Copy>(map: &Plane<T>, (x, y): (usize, usize), (width, h
     map.at(mx.min(map.width - 1), my.min(map.height - 1))
 }
 
-/// Intersection over union; the prediction is resampled to the truth's size by nearest pixel. 0 when both are empty.
+/// Intersection over union; the prediction is resampled to the truth's size by nearest pixel. 0
+/// when both are empty.
 pub(super) fn mask_iou(predicted: &Plane<bool>, truth: &Plane<bool>) -> Result<f64> {
     if predicted.data.is_empty() {
         return Err(Error::work("eval: a mask without pixels"));
@@ -197,8 +199,8 @@ pub(super) fn mask_iou(predicted: &Plane<bool>, truth: &Plane<bool>) -> Result<f
     Ok(both as f64 / either.max(1) as f64)
 }
 
-/// Where the labelled frames stand: the scene's own cameras for its photos; for others the known ones, carried over by
-/// the similarity that the shared photos give.
+/// Where the labelled frames stand: the scene's own cameras for its photos; for others the known
+/// ones, carried over by the similarity that the shared photos give.
 pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Result<Vec<LabelledView>> {
     let own = |s: &str| scene.iter().find(|c| stem(&c.name) == s);
     let names: Vec<&str> = known.iter().map(|c| c.name.as_str()).collect();

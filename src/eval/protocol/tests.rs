@@ -182,7 +182,8 @@ fn lerf_equals_a_plain_computation() {
                     let (x, y) = ((p % W) as f64, (p / W) as f64);
                     let rectangle = (4.0..=20.0).contains(&x) && (3.0..=22.0).contains(&y);
                     let half = (49.0 - y) * 10.0 / 19.0;
-                    // the outline takes one pixel per row here (steps along y are longer): x rounded
+                    // the outline takes one pixel per row here (steps along y are longer): x
+                    // rounded
                     let triangle = (30.0..=49.0).contains(&y) && (x - 40.0).abs() <= half.round().max(half);
                     k == 0 && (rectangle || triangle)
                 })
@@ -513,7 +514,8 @@ fn own_ground_truth_serves_lerf_and_ovs() {
     let scene: Vec<Camera> =
         truth.frames.iter().filter(|f| f.split == Split::Train).map(|f| f.camera.clone()).collect();
     let objects = truth.objects(&truth.frames[0]).unwrap().unwrap();
-    // codes = object indices, embeddings = unit axes, prompts = the axes: everything is found exactly
+    // codes = object indices, embeddings = unit axes, prompts = the axes: everything is found
+    // exactly
     let mut embeddings = vec![0.0f32; 12 * 13];
     (0..12).for_each(|k| embeddings[k * 13 + k] = 1.0);
     let codebook = Codebook { embedding_dim: 13, code_dim: 1, embeddings, ..Codebook::default() };

@@ -3,20 +3,22 @@ use crate::math::Random;
 use crate::scene::{Camera, DepthMap, RgbImage};
 use glam::{DMat3, DVec2, DVec3};
 
-/// Grid of the splats in units of the longer image side: only the mean colour is known, so finer splats tell no more.
+/// Grid of the splats in units of the longer image side: only the mean colour is known, so finer
+/// splats tell no more.
 pub(super) const STEP: f64 = 0.01;
 /// Relative depth by which a splat must stand behind what a photo shows there: above stereo noise.
 pub(super) const BEHIND: f64 = 1.05;
 
-/// Half-width of the first window that a plane is fitted in, over the longer side; doubled up to twice where depth is
-/// missing.
+/// Half-width of the first window that a plane is fitted in, over the longer side; doubled up to
+/// twice where depth is missing.
 const WINDOW: f64 = 0.06;
-/// Relative inverse-depth difference that still counts as the same plane: above stereo noise, below object sizes.
+/// Relative inverse-depth difference that still counts as the same plane: above stereo noise, below
+/// object sizes.
 const INLIER: f64 = 0.01;
 /// Samples a plane needs: of a stride-3 grid, a tenth of the window at a straight border.
 const SAMPLES: usize = 30;
-/// Difference of colour, root of the summed squares, up to which a pixel looks like the border: a surface with its texture
-/// and shading, not another thing.
+/// Difference of colour, root of the summed squares, up to which a pixel looks like the border: a
+/// surface with its texture and shading, not another thing.
 const ALIKE: f32 = 0.25;
 
 /// A photo with what is known of it.
@@ -156,8 +158,8 @@ impl Shown<'_> {
         (y0..y1).step_by(stride).flat_map(move |y| (x0..x1).step_by(stride).map(move |x| (x, y)))
     }
 
-    /// Pixels of known depth in the first window around `at` that has [`SAMPLES`] of those that `belongs` accepts, weighted
-    /// towards `at`.
+    /// Pixels of known depth in the first window around `at` that has [`SAMPLES`] of those that
+    /// `belongs` accepts, weighted towards `at`.
     fn samples(&self, at: DVec2, belongs: impl Fn(&Sample) -> bool) -> Option<Vec<Sample>> {
         let within = |half: f64| -> Vec<Sample> {
             // At most about 400 samples however large the photo.
@@ -175,8 +177,8 @@ impl Shown<'_> {
     }
 }
 
-/// The plane with the most weight: the best of 60 triples (99 % sure to hit a plane with half of the
-/// samples, with a margin for noise), then least squares over its inliers.
+/// The plane with the most weight: the best of 60 triples (99 % sure to hit a plane with half of
+/// the samples, with a margin for noise), then least squares over its inliers.
 fn fit_plane(samples: &[Sample], random: &mut Random) -> Option<(f64, DVec2)> {
     let agrees =
         |s: &Sample, p: DVec3| ((p.x + p.y * s.offset.x + p.z * s.offset.y) / s.inverse - 1.0).abs() < INLIER;

@@ -1,9 +1,10 @@
 //! Surfaces continued where no photo shows them.
 //!
-//! Between a few views, a camera soon sees past what any photo shows, beyond its borders and behind its objects, and finds
-//! black there. Planes have an inverse depth that is affine in the pixel position, so floors, tables and walls continue
-//! exactly: coarse flat splats extend the plane that ends at a photo's border or at a depth edge, in its mean colour. No
-//! training view sees them, so they change no loss.
+//! Between a few views, a camera soon sees past what any photo shows, beyond its borders and behind
+//! its objects, and finds black there. Planes have an inverse depth that is affine in the pixel
+//! position, so floors, tables and walls continue exactly: coarse flat splats extend the plane that
+//! ends at a photo's border or at a depth edge, in its mean colour. No training view sees them, so
+//! they change no loss.
 mod anchor;
 
 use crate::math::Random;
@@ -13,8 +14,9 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
-/// How far behind a depth edge a plane goes on, in units of the longer image side: at a field of view of 55°, a camera turned
-/// by 20° about what stands in front sees 0.12 of what is half as far again.
+/// How far behind a depth edge a plane goes on, in units of the longer image side: at a field of
+/// view of 55°, a camera turned by 20° about what stands in front sees 0.12 of what is half as far
+/// again.
 const REVEALED: f64 = 0.12;
 /// Standard deviation in units of the grid: neighbours at 0.7 blend without gaps.
 const OVERLAP: f64 = 0.7;
@@ -31,8 +33,8 @@ struct UnseenSplat {
     colour: [f32; 3],
 }
 
-/// Flat splats around all photos and behind their depth edges, up to `reach` times the longer side away from where the
-/// surface ends; depth counts from `min_confidence` on.
+/// Flat splats around all photos and behind their depth edges, up to `reach` times the longer side
+/// away from where the surface ends; depth counts from `min_confidence` on.
 pub fn unseen_splats(
     images: &[RgbImage],
     cameras: &[Camera],
@@ -66,7 +68,8 @@ pub fn unseen_splats(
     splats
 }
 
-/// Splats around one photo and behind what it shows, up to `reach` pixels from where their surfaces end.
+/// Splats around one photo and behind what it shows, up to `reach` pixels from where their surfaces
+/// end.
 fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<UnseenSplat> {
     let size = shown.size();
     // What is hidden is seen through narrow cracks: twice as fine as beyond the borders.
@@ -89,8 +92,8 @@ fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<UnseenSplat
     }
     for pixel in shown.cells(fine, 0.0).filter(|p| p.x < size.x && p.y < size.y) {
         let depth = shown.depth_at(pixel.x as usize, pixel.y as usize);
-        // Nearer to the end of a surface that stands there itself, nothing is revealed: what lies behind would only shine
-        // through what training leaves transparent.
+        // Nearer to the end of a surface that stands there itself, nothing is revealed: what lies
+        // behind would only shine through what training leaves transparent.
         let next = Anchor::nearest(edges.iter(), pixel)
             .filter(|a| a.at.distance(pixel) < REVEALED * shown.long())
             .filter(|a| depth.is_some_and(|z| a.inverse(pixel) * z * BEHIND < 1.0));
@@ -110,7 +113,8 @@ fn in_the_way(c: &UnseenSplat, camera: &Camera, depth: &DepthMap) -> bool {
     known <= 0.0 || z < BEHIND * known
 }
 
-/// The splat that continues an anchor's plane at a pixel that does not show it; `None` near or past the horizon.
+/// The splat that continues an anchor's plane at a pixel that does not show it; `None` near or past
+/// the horizon.
 fn candidate(
     camera: &Camera,
     anchor: &Anchor,
@@ -118,7 +122,8 @@ fn candidate(
     distance: f64,
     step: f64,
 ) -> Option<UnseenSplat> {
-    // Beyond three times the distance of its end, or nearer than half of it, a plane is a guess too far.
+    // Beyond three times the distance of its end, or nearer than half of it, a plane is a guess too
+    // far.
     let value = anchor.inverse(pixel);
     if value < anchor.w / 3.0 || value > anchor.w * 2.0 {
         return None;
@@ -141,7 +146,8 @@ fn push(splats: &mut Splats, c: &UnseenSplat) {
     let y = normal.cross(x);
     let q = DQuat::from_mat3(&DMat3::from_cols(x, y, normal));
     let (sx, sy) = (OVERLAP * long.length(), OVERLAP * short.dot(y).abs());
-    // An eighth of the long side keeps the splat visible from a grazing camera and below the needle limit of 8 ... 10.
+    // An eighth of the long side keeps the splat visible from a grazing camera and below the needle
+    // limit of 8 ... 10.
     let sizes = [sx, sy.max(sx / 8.0), sx / 8.0];
     splats.means.push(c.position.as_vec3().into());
     splats.log_scales.push(sizes.map(|s| s.max(1e-12).ln() as f32));
@@ -168,7 +174,8 @@ mod tests {
         }
     }
 
-    /// Depth of the world plane n·p = offset, with a small nearer object in the middle of the lower border.
+    /// Depth of the world plane n·p = offset, with a small nearer object in the middle of the lower
+    /// border.
     fn scene(n: DVec3, offset: f64) -> (RgbImage, DepthMap) {
         let camera = camera();
         let centre = camera.pose.centre();
@@ -233,7 +240,8 @@ mod tests {
             assert!((n.dot(p) - 3.0).abs() < 0.01, "{p} at {z}");
             assert!((sh[0] * SH_C0 + 0.3).abs() < 0.02, "{}", sh[0]);
         }
-        // 40 × 30 px on a grid of 0.8 px, of which one in two to three survives where cells in space are shared.
+        // 40 × 30 px on a grid of 0.8 px, of which one in two to three survives where cells in
+        // space are shared.
         assert!(behind > 600, "{behind}");
     }
 
@@ -256,7 +264,8 @@ mod tests {
 
     #[test]
     fn beyond_a_border_the_next_surface_goes_on_behind_the_first() {
-        // A wall above and a nearer one below row 60: beyond the left border the lower one continues, and may end.
+        // A wall above and a nearer one below row 60: beyond the left border the lower one
+        // continues, and may end.
         let (image, depth) = walls(|_, y| if y < 60 { (3.0, [0.2; 3]) } else { (1.8, [0.8; 3]) });
         let splats = unseen_splats(&[image], &[camera()], &[depth], 0.2, 0.5, 0);
         let below: Vec<_> = places(&splats)
@@ -299,7 +308,8 @@ mod tests {
             let stands = |p: &&[f32; 3]| {
                 let (pixel, z) = camera.project(DVec3::from(p.map(f64::from)));
                 let inside = (0.0..160.0).contains(&pixel.x) && (0.0..120.0).contains(&pixel.y) && z > 0.0;
-                // Rounding may take a splat behind an edge to the pixel beside it, whose surface it continues.
+                // Rounding may take a splat behind an edge to the pixel beside it, whose surface it
+                // continues.
                 inside && z < 0.98 * f64::from(depth.depth.at(pixel.x as usize, pixel.y as usize))
             };
             splats.means.iter().filter(stands).count()

@@ -1,8 +1,9 @@
-//! The interactive 3D view: one page section that needs no build step and no request to anywhere else. `report.html`
-//! embeds it with the splats inside; `splatvk view` serves it and answers its questions.
+//! The interactive 3D view: one page section that needs no build step and no request to anywhere
+//! else. `report.html` embeds it with the splats inside; `splatvk view` serves it and answers its
+//! questions.
 //!
-//! The page is plain modules under an import map of `data:` addresses, so that the same text works from a file and from
-//! a server, with nothing beside it.
+//! The page is plain modules under an import map of `data:` addresses, so that the same text works
+//! from a file and from a server, with nothing beside it.
 mod pack;
 
 pub use pack::{Packed, pack};
@@ -114,7 +115,8 @@ impl Scene3d<'_> {
         Ok((section(&manifest, &splats), note))
     }
 
-    /// The whole page of a server that answers `POST query` and sends [`SCENE_PATH`]; `no_questions` says why it cannot answer.
+    /// The whole page of a server that answers `POST query` and sends [`SCENE_PATH`];
+    /// `no_questions` says why it cannot answer.
     pub fn served(&self, no_questions: Option<&str>) -> Result<String> {
         let mut manifest = self.manifest(no_questions.unwrap_or_default())?;
         manifest["live"] = no_questions.is_none().into();

@@ -1,6 +1,7 @@
 //! Splats in the few bytes that the page needs: quantised, in spatial order, deflated.
 //!
-//! Little endian, after gzip; N splats, B = ⌈N / 256⌉ blocks, L language levels, R = (degree + 1)² − 1:
+//! Little endian, after gzip; N splats, B = ⌈N / 256⌉ blocks, L language levels, R = (degree + 1)²
+//! − 1:
 //!
 //! | what | type | meaning |
 //! |---|---|---|
@@ -16,8 +17,8 @@
 //! | codes | u16 × N, L times | code + 1 per level, finest first; 0 = none |
 //! | unseen | u8 × N | 1 where no photo shows the splat |
 //!
-//! Planes of one quantity deflate better than records. A position is exact to 1/65535 of a block, which is a few
-//! neighbouring splats wide.
+//! Planes of one quantity deflate better than records. A position is exact to 1/65535 of a block,
+//! which is a few neighbouring splats wide.
 use crate::math::{quaternion_norm, sigmoid};
 use crate::query::instances;
 use crate::scene::{LanguageField, LevelField, SH_C0, Seen, Splats};
@@ -59,7 +60,8 @@ fn alpha(splats: &Splats, i: usize) -> f32 {
     sigmoid(splats.opacity_logits[i])
 }
 
-/// Splats that can be seen; when there are more than `most`, those with the largest opacity times area.
+/// Splats that can be seen; when there are more than `most`, those with the largest opacity times
+/// area.
 fn most_visible(splats: &Splats, most: usize) -> Vec<usize> {
     let finite = |i: &usize| splats.means[*i].iter().chain(&splats.log_scales[*i]).all(|v| v.is_finite());
     let seen = |i: &usize| alpha(splats, *i) >= MIN_ALPHA && finite(i);
@@ -184,8 +186,8 @@ fn sh_scales(splats: &Splats, order: &[usize], rest: usize) -> [f32; 3] {
     scales
 }
 
-/// Smallest three: the largest component follows from the unit length; its sign is made positive (q and −q are one
-/// rotation). The others lie within ±√½.
+/// Smallest three: the largest component follows from the unit length; its sign is made positive (q
+/// and −q are one rotation). The others lie within ±√½.
 fn rotation(q: [f32; 4]) -> u32 {
     let norm = quaternion_norm(&q);
     let largest = (0..4).max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs())).unwrap_or(0);

@@ -75,8 +75,8 @@ pub fn encoder(choice: &SourceChoice, registry: &Registry) -> Result<Box<dyn Reg
     make::<FeatureSources>(choice, registry, registry)?.into_inner()
 }
 
-/// Refuses texts that the scene could not be asked for, and a table without the canonical phrases that every answer is held
-/// against, while nothing is made of the photos yet.
+/// Refuses texts that the scene could not be asked for, and a table without the canonical phrases
+/// that every answer is held against, while nothing is made of the photos yet.
 pub fn check_texts(choice: &SourceChoice, queries: &[String], registry: &Registry) -> Result<()> {
     let has_table = text_table(choice).is_some();
     if choice.name != "dir" || (!has_table && queries.is_empty()) {

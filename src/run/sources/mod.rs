@@ -1,5 +1,6 @@
-//! Where cameras, matches, masks and features come from: a table per kind, an entry per source. The options of the command
-//! line with their help, the choices that errors name, `auto`, `splatvk doctor`, run.json and the C interface read them.
+//! Where cameras, matches, masks and features come from: a table per kind, an entry per source. The
+//! options of the command line with their help, the choices that errors name, `auto`, `splatvk
+//! doctor`, run.json and the C interface read them.
 mod depth;
 mod features;
 mod geometry;

@@ -58,7 +58,8 @@ pub trait SourceKind: 'static {
     const ABOUT: &'static str;
     /// What a network must do to be a source of it.
     const TASK: Task;
-    /// The sources that need no network of the user's; `auto` takes the first where none is installed.
+    /// The sources that need no network of the user's; `auto` takes the first where none is
+    /// installed.
     const SOURCES: &'static [Source<Self>];
     /// What a source is given.
     type Input<'i>;
@@ -160,8 +161,8 @@ pub fn default<K: SourceKind>() -> SourceChoice {
     K::SOURCES.first().map_or_else(|| SourceChoice::named(""), |s| SourceChoice::named(s.name))
 }
 
-/// What a text means: `auto`, an entry of the table, or the name of a network or of a family of them, whether installed or
-/// not. Files and folders must exist.
+/// What a text means: `auto`, an entry of the table, or the name of a network or of a family of
+/// them, whether installed or not. Files and folders must exist.
 pub fn choose<K: SourceKind>(text: &str, networks: &Inventory) -> Result<SourceChoice> {
     if text == "auto" {
         let best = networks.best(K::TASK).map(|model| SourceChoice::named(&model.name));
@@ -205,7 +206,8 @@ pub fn help<K: SourceKind>() -> String {
     )
 }
 
-/// One line about an option for `splatvk doctor`: (option, what `auto` takes and what else there is).
+/// One line about an option for `splatvk doctor`: (option, what `auto` takes and what else there
+/// is).
 pub(super) fn listed<K: SourceKind>(networks: &Inventory) -> (String, String) {
     let auto = networks.best(K::TASK).map_or(K::SOURCES.first().map_or("", |s| s.name), |m| &m.name);
     let own = K::SOURCES.iter().map(Source::syntax);

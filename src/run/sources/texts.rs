@@ -1,4 +1,5 @@
-//! Embeddings of texts for precomputed features: a table of phrases first, then a network whose texts are as long.
+//! Embeddings of texts for precomputed features: a table of phrases first, then a network whose
+//! texts are as long.
 use crate::infer::clip::Clip;
 use crate::infer::contract::Part;
 use crate::infer::installed::{Installed, Task, inventory};
@@ -16,16 +17,16 @@ pub const DIR_SPACE: &str = "dir";
 
 /// Phrases of the table that a network must embed alike.
 const PROBES: usize = 4;
-/// Least cosine between its embedding of a phrase and the table's. Tables may word a phrase as "a photo of …", which leaves
-/// it at 0.8 and more; directions of another space are at 0 ± 1/√D.
+/// Least cosine between its embedding of a phrase and the table's. Tables may word a phrase as "a
+/// photo of …", which leaves it at 0.8 and more; directions of another space are at 0 ± 1/√D.
 const SAME_SPACE: f64 = 0.5;
 
 fn cosine(a: &[f32], b: &[f32]) -> f64 {
     a.iter().zip(b).map(|(a, b)| f64::from(a * b)).sum()
 }
 
-/// What embeds texts for the features of a `dir:` folder whose table is `path`, if it has one; `dim` is the length of the
-/// features, where that is known.
+/// What embeds texts for the features of a `dir:` folder whose table is `path`, if it has one;
+/// `dim` is the length of the features, where that is known.
 pub fn dir_encoder(path: &Path, dim: Option<usize>, registry: &Registry) -> Result<Box<dyn RegionEncoder>> {
     let mut texts = TextEmbeddings::default();
     match dim {

@@ -1,4 +1,5 @@
-//! Photos that join a finished scene: their cameras, the surfaces that they add, and their masks under the scene's codes.
+//! Photos that join a finished scene: their cameras, the surfaces that they add, and their masks
+//! under the scene's codes.
 use super::cameras::{KnownGeometry, PlacedPhotos};
 use super::shared;
 use super::shared::keypoints;
@@ -17,7 +18,8 @@ use crate::{Error, Result};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Places new photos in a scene by matches with its photos; training moves their cameras on against its splats.
+/// Places new photos in a scene by matches with its photos; training moves their cameras on against
+/// its splats.
 pub struct AddedCameras {
     /// The scene.
     pub base: Arc<BaseScene>,
@@ -54,8 +56,8 @@ impl Stage for AddedCameras {
     }
 }
 
-/// Depth of all photos and the points that the new ones add: stereo for the new photos and their neighbours, what the scene renders
-/// for the others.
+/// Depth of all photos and the points that the new ones add: stereo for the new photos and their
+/// neighbours, what the scene renders for the others.
 pub struct AddedDepth {
     /// The scene.
     pub base: Arc<BaseScene>,
@@ -65,8 +67,8 @@ pub struct AddedDepth {
     pub seed: u64,
 }
 
-/// Photos of the scene that the depth of a new one is matched with: with itself four, the number that stereo was tuned on. Each
-/// takes as long as the new photo.
+/// Photos of the scene that the depth of a new one is matched with: with itself four, the number
+/// that stereo was tuned on. Each takes as long as the new photo.
 const NEIGHBOURS: usize = 3;
 
 impl Stage for AddedDepth {
@@ -127,8 +129,8 @@ impl Stage for AddedDepth {
     }
 }
 
-/// The splats of a scene that its photos show, no more than `most`: what it guessed where none looks is guessed anew with the new
-/// ones.
+/// The splats of a scene that its photos show, no more than `most`: what it guessed where none
+/// looks is guessed anew with the new ones.
 fn shown_splats(base: &BaseScene, most: usize, context: &Context) -> Result<Splats> {
     let rows = if base.seen.pixels.is_empty() {
         let seen = view::seen(context.device, &base.splats, &base.known.cameras, context.progress)?;
@@ -250,7 +252,8 @@ impl Stage for OnlyAddedGeometry {
     }
 }
 
-/// Brings the masks of new photos under the codes of the scene; what matches none of its things gets a code of its own.
+/// Brings the masks of new photos under the codes of the scene; what matches none of its things
+/// gets a code of its own.
 pub struct AlignAdded {
     /// The scene.
     pub base: Arc<BaseScene>,

@@ -22,13 +22,15 @@ pub enum CameraOrigin {
     Sfm,
     /// Known ones, joined to the photos by name.
     Known(CameraFile),
-    /// Pointmaps of a network, with depth; structure from motion where an untrained one gives no geometry.
+    /// Pointmaps of a network, with depth; structure from motion where an untrained one gives no
+    /// geometry.
     Network(Installed),
     /// Cameras and points that were given.
     GivenGeometry(Geometry),
 }
 
-/// Photos as all later stages take them, without lens distortion and in one light, and what is known of their cameras.
+/// Photos as all later stages take them, without lens distortion and in one light, and what is
+/// known of their cameras.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct PlacedPhotos {
     /// The photos that have a camera.

@@ -81,8 +81,8 @@ impl Stage for GraphMasks {
     }
 }
 
-/// A network's masks, or the built-in ones where it gave none: untrained weights rarely give a stable mask, and the stages
-/// after this one need some to work on.
+/// A network's masks, or the built-in ones where it gave none: untrained weights rarely give a
+/// stable mask, and the stages after this one need some to work on.
 pub struct MasksOrFallback;
 
 impl Stage for MasksOrFallback {

@@ -86,7 +86,8 @@ pub fn eight_features(device: &Device) {
     assert_images(&rendered(&raster), &scene.twin());
     let upstream = scene.upstream(7);
     let gradients = scene.gradients_by(device, ways, &upstream);
-    // The features' own gradients are those with coupling, and the geometry's those of the other planes.
+    // The features' own gradients are those with coupling, and the geometry's those of the other
+    // planes.
     scene.options.features_move_geometry = true;
     let reference = scene.twin_gradients(&scene.twin(), &upstream);
     assert_class("features", &gradients.features, &reference.params.features);
@@ -105,7 +106,8 @@ pub fn many_features(device: &Device) {
     there_and_back(device, &scene, by_atomics(device));
 }
 
-/// All widths of a launch that [`many_features`] leaves out, and all degrees, summed entry by entry.
+/// All widths of a launch that [`many_features`] leaves out, and all degrees, summed entry by
+/// entry.
 pub fn gradients_by_entry(device: &Device) {
     let ways = DeviceChoices { summation: Summation::Entries, ..DeviceChoices::of(device) };
     for (n, sh_degree, dim) in [(40, 2, 0), (20, 1, 3), (20, 3, 8), (15, 0, 16), (12, 0, 37)] {

@@ -1,4 +1,5 @@
-//! Small scenes for every pass, each compared with its twin. A scene panics where a pass fails or differs.
+//! Small scenes for every pass, each compared with its twin. A scene panics where a pass fails or
+//! differs.
 mod arrays;
 mod frames;
 mod losses;

@@ -17,8 +17,8 @@ impl From<Vec<GivenCamera>> for CameraFile {
 }
 
 impl CameraFile {
-    /// Cameras for views that are rendered: the pinholes that remain when the lenses are taken out, and a warning where there
-    /// are lenses.
+    /// Cameras for views that are rendered: the pinholes that remain when the lenses are taken out,
+    /// and a warning where there are lenses.
     pub fn pinholes(self) -> (Vec<Camera>, Vec<String>) {
         let mut warnings = self.warnings;
         let lensed = self.cameras.iter().filter(|c| !c.lens.is_none()).count();

@@ -22,8 +22,8 @@ pub fn read(path: &Path) -> Result<Vec<Camera>> {
     }
 }
 
-/// Reads cameras from nerfstudio `transforms.json`, `cameras.json`, a COLMAP model (text or binary), or the folder of a data set
-/// or scene that holds one of them.
+/// Reads cameras from nerfstudio `transforms.json`, `cameras.json`, a COLMAP model (text or
+/// binary), or the folder of a data set or scene that holds one of them.
 pub fn read_file(path: &Path) -> Result<CameraFile> {
     if path.is_dir() {
         return of_folder(path);
@@ -104,7 +104,8 @@ fn check_names(cameras: &[GivenCamera]) -> Result<(), String> {
     Ok(())
 }
 
-/// Where the masks of photos come from: a folder, and what a camera file names (`mask_path` of transforms.json).
+/// Where the masks of photos come from: a folder, and what a camera file names (`mask_path` of
+/// transforms.json).
 pub fn masks(folder: Option<&Path>, cameras: Option<&Path>) -> Result<MaskChoice> {
     let mut choice = MaskChoice { folder: folder.map(Path::to_path_buf), named: Vec::new() };
     let inside = cameras.map(|c| c.join("transforms.json")).filter(|file| file.is_file());

@@ -30,13 +30,14 @@ const BELOW: [&str; 12] = [
     "undistorted/sparse",
 ];
 
-/// The folder of the model of a data set: the folder itself or the first of those below it that [`is_model`].
+/// The folder of the model of a data set: the folder itself or the first of those below it that
+/// [`is_model`].
 pub fn find(folder: &Path) -> Option<PathBuf> {
     BELOW.iter().map(|below| folder.join(below)).find(|f| is_model(f))
 }
 
-/// Files of a model as text and of one in binary, in the order in which those of the other form go: a model is read as text as
-/// long as its images are there as text.
+/// Files of a model as text and of one in binary, in the order in which those of the other form go:
+/// a model is read as text as long as its images are there as text.
 pub const FILES: [[&str; 3]; 2] =
     [["images.txt", "cameras.txt", "points3D.txt"], ["images.bin", "cameras.bin", "points3D.bin"]];
 
@@ -162,7 +163,8 @@ fn text_cameras(bytes: &[u8], folder: &Path) -> Result<Intrinsic, String> {
     Ok(out)
 }
 
-/// Whether a line is the 2D points of the image before it, numbers in threes; an image has nine and a name.
+/// Whether a line is the 2D points of the image before it, numbers in threes; an image has nine and
+/// a name.
 fn is_points(line: &str) -> bool {
     let words = line.split_whitespace();
     words.clone().count().is_multiple_of(3) && words.into_iter().all(|w| w.parse::<f64>().is_ok())
@@ -267,7 +269,8 @@ fn binary_images(bytes: &[u8]) -> Result<Vec<Shot>, String> {
     Ok(out)
 }
 
-/// Reads `points3D.txt` or `points3D.bin` of a model folder or of a data set that holds one; confidence 1, radius 0.
+/// Reads `points3D.txt` or `points3D.bin` of a model folder or of a data set that holds one;
+/// confidence 1, radius 0.
 pub fn read_points(folder: &Path) -> Result<PointCloud> {
     let files = BELOW
         .iter()
@@ -319,15 +322,18 @@ fn binary_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
     Ok(out)
 }
 
-/// Most points that `points3D.txt` gets: other tools only start from them, and text takes 70 bytes a point.
+/// Most points that `points3D.txt` gets: other tools only start from them, and text takes 70 bytes
+/// a point.
 const MAX_POINTS: usize = 100_000;
 
-/// Writes a text model with PINHOLE cameras. Rust prints the shortest digits that read back exactly.
+/// Writes a text model with PINHOLE cameras. Rust prints the shortest digits that read back
+/// exactly.
 pub fn write(folder: &Path, cameras: &[Camera], points: Option<&PointCloud>) -> Result<()> {
     write_text(folder, cameras, None, points)
 }
 
-/// Writes a text model of photos as they were taken: one lens per camera, as OPENCV, FULL_OPENCV or OPENCV_FISHEYE.
+/// Writes a text model of photos as they were taken: one lens per camera, as OPENCV, FULL_OPENCV or
+/// OPENCV_FISHEYE.
 pub fn write_lensed(folder: &Path, cameras: &[Camera], lenses: &[Lens]) -> Result<()> {
     write_text(folder, cameras, Some(lenses), None)
 }

@@ -26,7 +26,8 @@ pub fn create_folder(path: &Path) -> Result<()> {
     std::fs::create_dir_all(path).map_err(Error::unwritable(path))
 }
 
-/// Writes a file beside its target and renames it: one that was there stays until the new one is whole. Makes its folder.
+/// Writes a file beside its target and renames it: one that was there stays until the new one is
+/// whole. Makes its folder.
 pub fn write_whole_file(out: &Path, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
     let partial = Partial::beside(out)?;
     write(partial.path())?;

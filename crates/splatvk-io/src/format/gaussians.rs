@@ -1,4 +1,5 @@
-//! Files of Gaussians: one reader and one writer for every format, chosen by the end of the file's name or by the format's.
+//! Files of Gaussians: one reader and one writer for every format, chosen by the end of the file's
+//! name or by the format's.
 mod degree;
 pub mod gltf;
 mod other;
@@ -147,8 +148,8 @@ pub fn endings() -> String {
     FORMATS.iter().map(|k| k.ending).collect::<Vec<_>>().join(", ")
 }
 
-/// Reads a file of Gaussians, and the language beside it, if any. Gaussians that cannot be computed with (numbers that are not
-/// finite or beyond 1e18, no rotation) are left out.
+/// Reads a file of Gaussians, and the language beside it, if any. Gaussians that cannot be computed
+/// with (numbers that are not finite or beyond 1e18, no rotation) are left out.
 pub fn read(path: &Path) -> Result<(Splats, Option<LanguageField>)> {
     read_noted(path).map(|(splats, language, _)| (splats, language))
 }
@@ -167,8 +168,8 @@ pub fn read_noted(path: &Path) -> Result<(Splats, Option<LanguageField>, Vec<Str
     Ok((splats, language, usable::finished(notes, path)))
 }
 
-/// Writes a file of Gaussians, and beside it ([`side_file`]) their language, if they have any; ordinary files that are there are
-/// replaced.
+/// Writes a file of Gaussians, and beside it ([`side_file`]) their language, if they have any;
+/// ordinary files that are there are replaced.
 pub fn write(path: &Path, splats: &Splats, language: Option<&LanguageField>) -> Result<()> {
     write_as(path, splats, language, format(path)?, WriteOptions::default())
 }
@@ -184,7 +185,8 @@ pub fn write_as(
     Reserved::open(path, true)?.write(splats, language, format, options)
 }
 
-/// The places of a file of Gaussians and of the language beside it, to which nobody else writes as long as this lives.
+/// The places of a file of Gaussians and of the language beside it, to which nobody else writes as
+/// long as this lives.
 #[derive(Debug)]
 pub struct Reserved {
     path: PathBuf,
@@ -213,7 +215,8 @@ impl Reserved {
         options: WriteOptions,
     ) -> Result<()> {
         let with_codes = language.filter(|l| l.levels.iter().any(|l| !l.codebook.is_empty()));
-        // What a format cannot hold is said of the place that was asked for, not of the file beside it.
+        // What a format cannot hold is said of the place that was asked for, not of the file beside
+        // it.
         let order = (format.write)(self.splat_file.path(), splats, options).map_err(|e| match e {
             Error::Input(what) => Error::input(format!("{}: {what}", self.path.display())),
             other => other,
@@ -224,7 +227,8 @@ impl Reserved {
         // Both are written. What came there meanwhile is not ours.
         check_place(&self.path, Kind::File, self.force)?;
         check_place(&self.side, Kind::File, self.force)?;
-        // Wherever a kill comes between these moves, no file has the language of another one beside it.
+        // Wherever a kill comes between these moves, no file has the language of another one beside
+        // it.
         if self.side.is_file() {
             std::fs::remove_file(&self.side).map_err(Error::unwritable(&self.side))?;
         }

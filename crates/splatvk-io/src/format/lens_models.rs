@@ -82,7 +82,8 @@ impl LensModel {
         self.reads == Some(Projection::Fisheye)
     }
 
-    /// The optics that a list of its parameters states; `None` where its lens is not read or the list has another length.
+    /// The optics that a list of its parameters states; `None` where its lens is not read or the
+    /// list has another length.
     pub fn optics(&self, values: &[f64]) -> Option<Optics> {
         if !self.is_read() || values.len() != self.parameters() {
             return None;
@@ -111,7 +112,8 @@ impl LensModel {
     }
 }
 
-/// The model that holds a lens with the fewest parameters of those that other programs know: its name and its distortion.
+/// The model that holds a lens with the fewest parameters of those that other programs know: its
+/// name and its distortion.
 pub(super) fn of_lens(lens: &Lens) -> (&'static str, Vec<f64>) {
     let Lens { k1, k2, k3, k4, k5, k6, p1, p2, fisheye } = *lens;
     if fisheye {

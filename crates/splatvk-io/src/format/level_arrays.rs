@@ -1,11 +1,12 @@
-//! What the splats carry on each level, as named arrays: the same in a scene directory and beside a file of Gaussians
-//! (docs/use/formats.md#features-of-splats).
+//! What the splats carry on each level, as named arrays: the same in a scene directory and beside a
+//! file of Gaussians (docs/use/formats.md#features-of-splats).
 use super::npy::{NpyArray, NpyData};
 use crate::scene::{CodeMix, Codebook, LevelField};
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 
-/// Adds the arrays of a level with codes. Row r is splat `order[r]`; an empty order is the scene's own.
+/// Adds the arrays of a level with codes. Row r is splat `order[r]`; an empty order is the scene's
+/// own.
 pub fn append(
     arrays: &mut Vec<(String, NpyArray)>,
     name: &str,
@@ -49,7 +50,8 @@ pub fn append(
     Ok(())
 }
 
-/// A codebook of the arrays clip [K, D], code [K, d], weight [K] and delta_min, without members; `Err` says what does not fit.
+/// A codebook of the arrays clip [K, D], code [K, d], weight [K] and delta_min, without members;
+/// `Err` says what does not fit.
 pub fn codebook([clip, code, weight, delta_min]: [&NpyArray; 4]) -> std::result::Result<Codebook, String> {
     let (&[k, embedding_dim], &[k2, code_dim]) = (&clip.shape[..], &code.shape[..]) else {
         return Err("its codes have no two dimensions".to_owned());
@@ -73,7 +75,8 @@ pub fn codebook([clip, code, weight, delta_min]: [&NpyArray; 4]) -> std::result:
     Ok(book)
 }
 
-/// Refuses a codebook with numbers that are not finite: what would be refused when it is read is not written either.
+/// Refuses a codebook with numbers that are not finite: what would be refused when it is read is
+/// not written either.
 pub fn check(book: &Codebook) -> std::result::Result<(), String> {
     finite("its embeddings", &book.embeddings, book.embedding_dim)?;
     finite("its codes", &book.codes, book.code_dim)?;

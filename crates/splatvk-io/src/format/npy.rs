@@ -8,7 +8,8 @@ use std::path::Path;
 
 const MAGIC: &[u8] = b"\x93NUMPY";
 
-/// Most bytes of the header of an array in an archive: NumPy's own have 128, and it refuses headers beyond 10,000.
+/// Most bytes of the header of an array in an archive: NumPy's own have 128, and it refuses headers
+/// beyond 10,000.
 const LONGEST_HEADER: u64 = 1 << 16;
 
 /// The values of an array in its stored type.
@@ -112,7 +113,8 @@ impl NpyArray {
             NpyData::Text(_) => Vec::new(),
         }
     }
-    /// All values as i32: floats are rounded, values outside i32 saturate, NaN becomes 0; empty for text.
+    /// All values as i32: floats are rounded, values outside i32 saturate, NaN becomes 0; empty for
+    /// text.
     pub fn to_i32(&self) -> Vec<i32> {
         match &self.data {
             NpyData::F16(v) => v.iter().map(|x| x.to_f32().round() as i32).collect(),
@@ -147,8 +149,8 @@ pub fn write(path: impl AsRef<Path>, array: &NpyArray) -> Result<()> {
     std::fs::write(path, bytes).map_err(Error::unwritable(path))
 }
 
-/// Reads every `.npy` member of an `.npz` file, by name without the extension. A file that holds more than 16 times its
-/// bytes and 64 MiB is refused.
+/// Reads every `.npy` member of an `.npz` file, by name without the extension. A file that holds
+/// more than 16 times its bytes and 64 MiB is refused.
 pub fn read_npz(path: impl AsRef<Path>) -> Result<BTreeMap<String, NpyArray>> {
     read_npz_of(path.as_ref(), 0)
 }
@@ -179,7 +181,8 @@ pub(super) fn read_npz_of(path: &Path, rows: usize) -> Result<BTreeMap<String, N
     files::guarded(unpacked).unwrap_or_else(|panic| Err(bad(format!("damaged ({panic})"))))
 }
 
-/// A whole member of at most `left` bytes: its header first, which tells how many bytes of values belong to it.
+/// A whole member of at most `left` bytes: its header first, which tells how many bytes of values
+/// belong to it.
 fn read_member(member: &mut impl Read, left: u64) -> Result<Vec<u8>, String> {
     let damaged = |e: std::io::Error| format!("damaged ({e})");
     let mut bytes = Vec::new();
@@ -215,8 +218,8 @@ pub fn write_packed_npz(path: impl AsRef<Path>, arrays: &[(&str, &NpyArray)]) ->
     write_zip(path.as_ref(), arrays, zip::CompressionMethod::Deflated)
 }
 
-/// In memory first: a `ZipWriter` whose disk is full goes on writing when it is dropped, prints of its own accord what comes of that,
-/// and panics where the place makes no sense.
+/// In memory first: a `ZipWriter` whose disk is full goes on writing when it is dropped, prints of
+/// its own accord what comes of that, and panics where the place makes no sense.
 fn write_zip(path: &Path, arrays: &[(&str, &NpyArray)], method: zip::CompressionMethod) -> Result<()> {
     let failed = |e: &dyn std::fmt::Display| {
         Error::work(format!("{}: cannot write the npz file: {e}", path.display()))
@@ -247,7 +250,8 @@ pub fn encode(array: &NpyArray) -> Result<Vec<u8>> {
     };
     let mut header =
         format!("{{'descr': '{}', 'fortran_order': False, 'shape': {shape}, }}", array.data.descr());
-    // magic + version + length field = 10 bytes; the whole preamble ends with '\n' on a multiple of 64
+    // magic + version + length field = 10 bytes; the whole preamble ends with '\n' on a multiple of
+    // 64
     while (10 + header.len() + 1) % 64 != 0 {
         header.push(' ');
     }
@@ -358,7 +362,8 @@ fn parse_shape(header: &str) -> Option<Vec<usize>> {
     inside.split(',').map(str::trim).filter(|s| !s.is_empty()).map(|s| s.parse().ok()).collect()
 }
 
-/// The values of a type that [`Header::value_bytes`] knows; `bytes` are theirs, no more and no fewer.
+/// The values of a type that [`Header::value_bytes`] knows; `bytes` are theirs, no more and no
+/// fewer.
 fn parse_values(descr: &str, bytes: &[u8]) -> NpyData {
     macro_rules! values {
         ($variant:ident, $t:ty) => {

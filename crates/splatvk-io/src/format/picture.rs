@@ -35,8 +35,8 @@ pub fn write_png(path: &Path, image: &RgbImage) -> Result<()> {
     write_bytes(path, (image.width, image.height), &bytes, image::ExtendedColorType::Rgb8)
 }
 
-/// The working image of a photo in `images` of a folder: with alpha where its background is empty, and with a grey mask in `masks`, as
-/// nerfstudio has them, where pixels are not used.
+/// The working image of a photo in `images` of a folder: with alpha where its background is empty,
+/// and with a grey mask in `masks`, as nerfstudio has them, where pixels are not used.
 pub(super) fn write_photo(folder: &Path, name: &str, photo: &Photo) -> Result<()> {
     let path = folder.join("images").join(name);
     match &photo.coverage {
@@ -155,7 +155,8 @@ pub fn write_exr(path: &Path, size: (usize, usize), planes: Planes) -> Result<()
     std::fs::write(path, bytes.into_inner()).map_err(Error::unwritable(path))
 }
 
-/// Reads every channel of the first layer of an OpenEXR file, by name; half floats and integers become floats.
+/// Reads every channel of the first layer of an OpenEXR file, by name; half floats and integers
+/// become floats.
 pub fn read_exr(path: &Path) -> Result<BTreeMap<String, Plane<f32>>> {
     use ex::ReadChannels;
     use ex::ReadLayers;

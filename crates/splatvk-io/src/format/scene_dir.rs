@@ -18,7 +18,8 @@ pub const VERSION: u32 = 2;
 /// Name in the manifest.
 const FORMAT: &str = "splatvk-scene";
 
-/// Text embeddings that came with precomputed features, kept so that the scene answers queries on its own.
+/// Text embeddings that came with precomputed features, kept so that the scene answers queries on
+/// its own.
 pub const TEXT_EMBEDDINGS: &str = "language/text_embeddings.npz";
 
 /// The manifest.
@@ -46,7 +47,8 @@ pub struct Scene {
     pub world: World,
     /// Codebooks and features; `None` without language.
     pub language: Option<LanguageField>,
-    /// What was left out of a file of Gaussians, for the user; a scene directory is taken whole or not at all.
+    /// What was left out of a file of Gaussians, for the user; a scene directory is taken whole or
+    /// not at all.
     pub warnings: Vec<String>,
 }
 
@@ -108,8 +110,8 @@ pub struct Contents<'a> {
     pub text_embeddings: Option<&'a Path>,
 }
 
-/// Writes splats, cameras and language into `folder`, which exists (see [`super::Workspace`]). The manifest comes last:
-/// a folder without it is not a scene.
+/// Writes splats, cameras and language into `folder`, which exists (see [`super::Workspace`]). The
+/// manifest comes last: a folder without it is not a scene.
 pub fn write(folder: &Path, c: &Contents) -> Result<()> {
     ply::write_splats(&folder.join(SPLATS), c.splats, ply::PlyOptions::default())?;
     if !c.seen.pixels.is_empty() {
@@ -276,7 +278,8 @@ fn read_seen(folder: &Path, splats: usize) -> Result<Seen> {
     }
 }
 
-/// Whether a folder is a scene directory: by the content of its manifest, as other programs use the name, too.
+/// Whether a folder is a scene directory: by the content of its manifest, as other programs use the
+/// name, too.
 pub fn is_scene(folder: &Path) -> bool {
     read_manifest(folder).is_ok()
 }
@@ -301,8 +304,8 @@ fn read_manifest(path: &Path) -> Result<Manifest> {
     Ok(manifest)
 }
 
-/// Drops the coefficients above a degree. The PLY is padded to degree 3 for other viewers; the scene's own degree renders
-/// the same in less time.
+/// Drops the coefficients above a degree. The PLY is padded to degree 3 for other viewers; the
+/// scene's own degree renders the same in less time.
 pub fn cut_degree(splats: Splats, degree: u32) -> Splats {
     let (have, keep) = (splats.sh_len(), crate::scene::sh_coefficients(degree.min(splats.sh_degree)));
     let sh = splats.sh.chunks_exact(have * 3).flat_map(|c| c[..keep * 3].iter().copied()).collect();

@@ -5,8 +5,8 @@ use crate::photo::stem;
 use crate::scene::LEVEL_NAMES;
 use std::path::Path;
 
-/// What is in a scene directory and splatvk did not write, relative to it; `None` where the folder is no scene directory of this
-/// program, by its manifest.
+/// What is in a scene directory and splatvk did not write, relative to it; `None` where the folder
+/// is no scene directory of this program, by its manifest.
 pub fn foreign(folder: &Path) -> Option<Vec<String>> {
     let names = Names::of(folder)?;
     Some(files::foreign(folder, &|name, is_folder| names.has(name, is_folder)))

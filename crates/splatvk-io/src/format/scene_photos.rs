@@ -1,4 +1,5 @@
-//! The photos that a scene directory keeps: their working images, and what was read of their files and taken out of them.
+//! The photos that a scene directory keeps: their working images, and what was read of their files
+//! and taken out of them.
 use crate::photo::{self, Photo};
 use crate::scene::{Camera, Coverage, Outside, Plane, RgbImage};
 use crate::{Error, Result, files};
@@ -26,7 +27,8 @@ pub fn picture(scene: &Path, camera: &Camera) -> Option<PathBuf> {
     files::within(&scene.join("cameras"), &camera.name)
 }
 
-/// The photos of a scene directory as they were trained on: without lens and in one light, in the order of its cameras.
+/// The photos of a scene directory as they were trained on: without lens and in one light, in the
+/// order of its cameras.
 pub fn load(scene: &Path) -> Result<Vec<Photo>> {
     let folder = scene.join("cameras");
     let file = folder.join(PHOTOS);

@@ -1,5 +1,5 @@
-//! Language beside a file of Gaussians: `NAME.language.npz`, for formats that have no place for it. Described in
-//! docs/use/formats.md.
+//! Language beside a file of Gaussians: `NAME.language.npz`, for formats that have no place for it.
+//! Described in docs/use/formats.md.
 use super::level_arrays;
 use super::npy::{self, NpyArray};
 use crate::scene::{LEVEL_NAMES, LanguageField, LevelField};
@@ -16,8 +16,8 @@ pub fn path(splats: &Path) -> PathBuf {
     name.into()
 }
 
-/// Writes the language of `count` Gaussians in the order of their file: its row r is number `order[r]` of the scene; an
-/// empty order is the scene's own.
+/// Writes the language of `count` Gaussians in the order of their file: its row r is number
+/// `order[r]` of the scene; an empty order is the scene's own.
 pub fn write(path: &Path, field: &LanguageField, count: usize, order: &[u32]) -> Result<()> {
     let mut arrays: Vec<(String, NpyArray)> = vec![
         ("space".into(), NpyArray::text(&field.space)),

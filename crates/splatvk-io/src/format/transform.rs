@@ -7,8 +7,8 @@ use nalgebra::DMatrix;
 /// Directions at which two expansions are compared: more than the 7 functions of degree 3 need.
 const DIRECTIONS: usize = 24;
 
-/// Moves, turns and scales the Gaussians; `by.rotation` is a proper rotation, `by.scale` > 0. Colours turn with them: what a
-/// splat showed in direction d, it shows in direction R·d.
+/// Moves, turns and scales the Gaussians; `by.rotation` is a proper rotation, `by.scale` > 0.
+/// Colours turn with them: what a splat showed in direction d, it shows in direction R·d.
 pub fn transform_splats(splats: &mut Splats, by: &Similarity) {
     let turn = DQuat::from_mat3(&by.rotation);
     let growth = by.scale.ln() as f32;
@@ -37,7 +37,8 @@ pub fn transform_splats(splats: &mut Splats, by: &Similarity) {
     }
 }
 
-/// Mirrors the Gaussians at the plane z = 0: what a splat showed in a direction, it shows in the mirrored one.
+/// Mirrors the Gaussians at the plane z = 0: what a splat showed in a direction, it shows in the
+/// mirrored one.
 pub fn mirror_z(splats: &mut Splats) {
     splats.means.iter_mut().for_each(|m| m[2] = -m[2]);
     // A rotation about an axis becomes the opposite one about the mirrored axis.
@@ -55,8 +56,9 @@ pub fn mirror_z(splats: &mut Splats) {
     }
 }
 
-/// How the 2l + 1 coefficients of degree l change when what they describe is turned: the functions of one degree span a
-/// space that rotations do not leave, so the least squares over some directions are exact.
+/// How the 2l + 1 coefficients of degree l change when what they describe is turned: the functions
+/// of one degree span a space that rotations do not leave, so the least squares over some
+/// directions are exact.
 fn turned_basis(rotation: &DMat3, degree: u32) -> DMatrix<f64> {
     let functions = 2 * degree as usize + 1;
     let first = (degree * degree) as usize;

@@ -1,4 +1,5 @@
-//! nerfstudio and instant-ngp `transforms.json`: camera → world in OpenGL axes (x right, y up, z backward).
+//! nerfstudio and instant-ngp `transforms.json`: camera → world in OpenGL axes (x right, y up, z
+//! backward).
 use super::camera_file::CameraFile;
 use super::lens_models::{self, LensModel};
 use crate::scene::{Camera, GivenCamera, Lens, Pose};
@@ -8,8 +9,9 @@ use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
 use std::path::Path;
 
-/// Intrinsics, at the top of the file or per frame; a frame's own win. The file itself and a frame are one type: flattened
-/// structures would hold all that a file has besides in memory first. `null` is as absent.
+/// Intrinsics, at the top of the file or per frame; a frame's own win. The file itself and a frame
+/// are one type: flattened structures would hold all that a file has besides in memory first.
+/// `null` is as absent.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct Block {
@@ -70,7 +72,8 @@ fn is_set(value: Option<&Value>) -> bool {
     }
 }
 
-/// Cameras of a file's text; `folder` is where its image paths start, for files that do not state the image size.
+/// Cameras of a file's text; `folder` is where its image paths start, for files that do not state
+/// the image size.
 pub(super) fn parse(text: &str, folder: &Path) -> Result<CameraFile, String> {
     let file: Block = files::parse_json(text.as_bytes())
         .map_err(|e| format!("not a JSON camera file (transforms.json): {e}; check it"))?;
@@ -254,8 +257,8 @@ impl OutLens {
     }
 }
 
-/// Writes `transforms.json`; every frame carries its own intrinsics. `ply_file_path`, relative to the file, names points
-/// or splats for tools that start from them.
+/// Writes `transforms.json`; every frame carries its own intrinsics. `ply_file_path`, relative to
+/// the file, names points or splats for tools that start from them.
 pub fn write(path: &Path, cameras: &[Camera], ply_file_path: Option<&str>) -> Result<()> {
     write_frames(path, cameras, None, ply_file_path)
 }

@@ -1,10 +1,12 @@
-//! A scene directory appears whole or not at all: work happens in a hidden folder beside it and is renamed in at the end.
+//! A scene directory appears whole or not at all: work happens in a hidden folder beside it and is
+//! renamed in at the end.
 use super::scene_files;
 use crate::files::{self, Kind, Partial, check_place, check_spared, restore, swap};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// A folder being written. Dropped without [`Workspace::commit`], it vanishes, and so do the folders that were made for it.
+/// A folder being written. Dropped without [`Workspace::commit`], it vanishes, and so do the
+/// folders that were made for it.
 #[derive(Debug)]
 pub struct Workspace {
     partial: Partial,
@@ -25,9 +27,10 @@ pub struct Replaced {
 const SCENE: Replaced = Replaced { name: "a scene", foreign: scene_files::foreign };
 
 impl Workspace {
-    /// Reserves `out`: it must not exist, be an empty folder, or, with `force`, hold a scene with nothing but what splatvk wrote, and
-    /// none of the `inputs`. No other process writes there meanwhile. Nothing at `out` changes before [`Workspace::commit`], except
-    /// that a scene which a killed process was about to replace comes back.
+    /// Reserves `out`: it must not exist, be an empty folder, or, with `force`, hold a scene with
+    /// nothing but what splatvk wrote, and none of the `inputs`. No other process writes there
+    /// meanwhile. Nothing at `out` changes before [`Workspace::commit`], except that a scene which
+    /// a killed process was about to replace comes back.
     pub fn create(out: &Path, force: bool, inputs: &[&Path]) -> Result<Workspace> {
         Workspace::replacing(out, force, inputs, SCENE)
     }
@@ -54,8 +57,9 @@ impl Workspace {
         self.partial.path()
     }
 
-    /// Moves the folder to its place; a scene that `force` allowed to replace is removed only after that. Where something came there
-    /// meanwhile that may not be replaced, the folder goes beside it, and the error says where.
+    /// Moves the folder to its place; a scene that `force` allowed to replace is removed only after
+    /// that. Where something came there meanwhile that may not be replaced, the folder goes beside
+    /// it, and the error says where.
     pub fn commit(self) -> Result<PathBuf> {
         let Workspace { partial, out, force, replaced } = self;
         let replaces = match check_place(&out, Kind::Folder, true).and_then(|()| replaced.check(&out, force))
@@ -83,7 +87,8 @@ impl Workspace {
 }
 
 impl Replaced {
-    /// Whether there is one at `out` that may be replaced; an error where anything is there that may not.
+    /// Whether there is one at `out` that may be replaced; an error where anything is there that
+    /// may not.
     fn check(&self, out: &Path, force: bool) -> Result<bool> {
         let (place, name) = (out.display(), self.name);
         match (self.foreign)(out) {

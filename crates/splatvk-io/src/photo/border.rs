@@ -1,5 +1,6 @@
-//! Plain borders around photos: scans, rectified and letterboxed pictures. They do not move with the scene, so they
-//! are neither matched nor trained on: their pixels continue the picture instead.
+//! Plain borders around photos: scans, rectified and letterboxed pictures. They do not move with
+//! the scene, so they are neither matched nor trained on: their pixels continue the picture
+//! instead.
 use crate::scene::RgbImage;
 use serde::{Deserialize, Serialize};
 
@@ -27,7 +28,8 @@ const PICTURE: f64 = 0.3;
 const MIXED: usize = 1;
 
 impl PlainBorder {
-    /// The white or black border of a picture. Opposite sides have one or neither: a bright sky has none below.
+    /// The white or black border of a picture. Opposite sides have one or neither: a bright sky has
+    /// none below.
     pub fn of(image: &RgbImage) -> PlainBorder {
         // Compression leaves a few grey levels of ringing on saturated pixels.
         let white = |c: [f32; 3]| c.iter().all(|v| *v > 0.95);

@@ -66,8 +66,8 @@ impl Candidate {
         matches!(self.source, CandidateOrigin::File)
     }
 
-    /// Upright pixels, at most `side` on the longer side; `None` past the end of a video that is shorter than it says.
-    /// Only one decoded file is held while it is made.
+    /// Upright pixels, at most `side` on the longer side; `None` past the end of a video that is
+    /// shorter than it says. Only one decoded file is held while it is made.
     pub fn thumbnail(&self, side: usize, progress: &dyn Progress) -> Result<Option<RgbImage>> {
         let (bytes, code) = match &self.source {
             CandidateOrigin::File => (read::read(&self.path)?, None),
@@ -81,15 +81,16 @@ impl Candidate {
         let (w, h) = decoded.size;
         let scale = (side as f64 / w.max(h) as f64).min(1.0);
         let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
-        // Two samples a side for every pixel of the thumbnail; all sixteen of a large photo would take as long as decoding.
+        // Two samples a side for every pixel of the thumbnail; all sixteen of a large photo would
+        // take as long as decoding.
         let step = ((0.5 / scale) as usize).max(1);
         let pixel = |x: usize, y: usize| decoded.at(x * step, y * step).0;
         Ok(Some(resize::area_average((w / step, h / step), (to(w), to(h)), pixel)))
     }
 }
 
-/// The candidates behind files, folders and videos, in the order of their names; frames in the order of time. Warns of what
-/// folders hold besides.
+/// The candidates behind files, folders and videos, in the order of their names; frames in the
+/// order of time. Warns of what folders hold besides.
 pub fn gather(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Candidate>> {
     let found = find(inputs)?;
     let warnings = found.warnings();

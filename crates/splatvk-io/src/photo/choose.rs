@@ -5,10 +5,12 @@ use crate::error::words;
 use crate::{Error, Result, files};
 use std::path::{Component, Path, PathBuf};
 
-/// Largest number of views: the pair count grows with its square, and the method is made for a few photos.
+/// Largest number of views: the pair count grows with its square, and the method is made for a few
+/// photos.
 pub const MAX_VIEWS: usize = 16;
 
-/// Views used when more photos are given and `--views` is not (docs/internals/method.md#choice-of-photos).
+/// Views used when more photos are given and `--views` is not
+/// (docs/internals/method.md#choice-of-photos).
 pub const DEFAULT_VIEWS: usize = 4;
 
 /// The photos behind the inputs and what was left out of the folders.
@@ -26,9 +28,9 @@ pub struct FoundFiles {
     pub inside: Vec<PathBuf>,
 }
 
-/// Lists the photos of files and folders (not their subfolders, but for `images` of a folder without photos of its own), sorted by
-/// file name, one of each where a camera wrote it in two formats. A file that is named must exist; its content is judged when it
-/// is read.
+/// Lists the photos of files and folders (not their subfolders, but for `images` of a folder
+/// without photos of its own), sorted by file name, one of each where a camera wrote it in two
+/// formats. A file that is named must exist; its content is judged when it is read.
 pub fn find(inputs: &[PathBuf]) -> Result<FoundFiles> {
     let mut found = FoundFiles::default();
     for input in inputs {
@@ -59,7 +61,8 @@ pub fn find(inputs: &[PathBuf]) -> Result<FoundFiles> {
     if found.photos.is_empty() && found.videos.is_empty() { Err(nothing(inputs, &found)) } else { Ok(found) }
 }
 
-/// The photos of a folder and of those folders below it (and below its `images`) in which names of cameras lie.
+/// The photos of a folder and of those folders below it (and below its `images`) in which names of
+/// cameras lie.
 pub fn find_named(root: &Path, names: &[&str]) -> Result<FoundFiles> {
     let mut folders: Vec<PathBuf> = names.iter().filter_map(|name| folder_of(name)).collect();
     folders.sort();

@@ -1,5 +1,6 @@
-//! Colours by the numbers of ITU-T H.273, as video, AVIF, HEIF and PNG state them, to sRGB. Pictures of high dynamic range (PQ and HLG,
-//! ITU-R BT.2100) become linear light in which diffuse white, 203 cd/m² (ITU-R BT.2408), is 1; what is brighter stays so.
+//! Colours by the numbers of ITU-T H.273, as video, AVIF, HEIF and PNG state them, to sRGB.
+//! Pictures of high dynamic range (PQ and HLG, ITU-R BT.2100) become linear light in which diffuse
+//! white, 203 cd/m² (ITU-R BT.2408), is 1; what is brighter stays so.
 use super::profile;
 use image::{DynamicImage, ImageBuffer, Rgb, Rgba};
 use moxcms::{CicpColorPrimaries, CicpProfile, ColorProfile, MatrixCoefficients, TransferCharacteristics};
@@ -45,8 +46,8 @@ impl Transfer {
         matches!(self, Transfer::Pq | Transfer::Hlg)
     }
 
-    /// Light of a signal in [0, 1], diffuse white 1. HLG is taken as the camera's light, without the rendering for a display: photos in
-    /// sRGB have none either.
+    /// Light of a signal in [0, 1], diffuse white 1. HLG is taken as the camera's light, without
+    /// the rendering for a display: photos in sRGB have none either.
     fn light(self, signal: f64) -> f64 {
         match self {
             Transfer::Pq => pq_luminance(signal) / WHITE,
@@ -76,7 +77,8 @@ fn hlg_light(signal: f64) -> f64 {
     if signal <= 0.5 { signal * signal / 3.0 } else { (((signal - C) / A).exp() + B) / 12.0 }
 }
 
-/// The image in sRGB, or in linear light with the primaries of sRGB; numbers that are not known are noted and left.
+/// The image in sRGB, or in linear light with the primaries of sRGB; numbers that are not known are
+/// noted and left.
 pub(super) fn to_srgb(image: DynamicImage, code: CodePoints, notes: &mut Vec<String>) -> DynamicImage {
     let [primaries, transfer, ..] = code;
     let transfer = Transfer::of(transfer).unwrap_or_else(|| {
@@ -107,7 +109,8 @@ pub(super) fn to_srgb(image: DynamicImage, code: CodePoints, notes: &mut Vec<Str
     profile::by_profile(image, &profile)
 }
 
-/// The numbers that an ICC profile states beside its curves, where they are those of a high dynamic range.
+/// The numbers that an ICC profile states beside its curves, where they are those of a high dynamic
+/// range.
 pub(super) fn of_hdr_profile(icc: &[u8]) -> Option<CodePoints> {
     let stated = ColorProfile::new_from_slice(icc).ok()?.cicp?;
     let code = [stated.color_primaries as u16, stated.transfer_characteristics as u16, 0, 1];
@@ -134,7 +137,8 @@ fn profile_of(primaries: u16) -> Option<ColorProfile> {
     Some(profile)
 }
 
-/// Linear light with the primaries of sRGB, floating point; light outside of them comes to lie on their border.
+/// Linear light with the primaries of sRGB, floating point; light outside of them comes to lie on
+/// their border.
 fn linear(image: DynamicImage, transfer: Transfer, profile: &ColorProfile) -> DynamicImage {
     let table: Vec<f32> = (0..=u16::MAX).map(|v| transfer.light(f64::from(v) / 65535.0) as f32).collect();
     let m = profile.transform_matrix(&ColorProfile::new_srgb()).v.map(|row| row.map(|v| v as f32));
@@ -236,7 +240,8 @@ mod tests {
 
     #[test]
     fn wide_primaries_become_those_of_srgb() {
-        // BT.709 to BT.2020 by ITU-R BT.2087, and P3 with D65 as the inverse of the matrix in profile.rs.
+        // BT.709 to BT.2020 by ITU-R BT.2087, and P3 with D65 as the inverse of the matrix in
+        // profile.rs.
         let colour = [0.5f64, 0.2, 0.1];
         let by = |m: [[f64; 3]; 3]| m.map(|r| (0..3).map(|k| r[k] * colour[k]).sum::<f64>());
         let in_2020 = by([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.088, 0.8956]]);

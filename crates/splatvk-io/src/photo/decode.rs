@@ -40,8 +40,8 @@ impl Decoded {
         Decoded { pixels, orientation, premultiplied, size, lens, notes: Vec::new() }
     }
 
-    /// The same with the colours that the file's metadata give the stored numbers. Code points go before a profile, a profile before
-    /// the gamma and chromaticities of PNG.
+    /// The same with the colours that the file's metadata give the stored numbers. Code points go
+    /// before a profile, a profile before the gamma and chromaticities of PNG.
     fn in_srgb(self, found: Metadata) -> Decoded {
         let Decoded { pixels, mut notes, .. } = self;
         notes.extend(found.notes);
@@ -79,8 +79,9 @@ impl Decoded {
         }
     }
 
-    /// Upright pixel as sRGB and its alpha; the colour is not multiplied by alpha, and black where alpha is 0. 1 is the white of an 8- or
-    /// 16-bit file; floating-point files (OpenEXR, Radiance, float TIFF) and those of high dynamic range go beyond it on the same curve.
+    /// Upright pixel as sRGB and its alpha; the colour is not multiplied by alpha, and black where
+    /// alpha is 0. 1 is the white of an 8- or 16-bit file; floating-point files (OpenEXR, Radiance,
+    /// float TIFF) and those of high dynamic range go beyond it on the same curve.
     pub fn at(&self, x: usize, y: usize) -> ([f32; 3], f32) {
         let (c, alpha) = self.stored(x, y);
         let c = match alpha {
@@ -92,7 +93,8 @@ impl Decoded {
         (if self.is_linear() { c.map(to_srgb) } else { c }, alpha)
     }
 
-    /// Whether the file holds linear light in floating point, as all formats with floats do by convention.
+    /// Whether the file holds linear light in floating point, as all formats with floats do by
+    /// convention.
     fn is_linear(&self) -> bool {
         matches!(self.pixels, DynamicImage::ImageRgb32F(_) | DynamicImage::ImageRgba32F(_))
     }
@@ -149,7 +151,8 @@ pub(super) fn is_sideways(orientation: Orientation) -> bool {
 
 /// Colour and alpha of a stored pixel.
 fn sample(image: &DynamicImage, x: u32, y: u32) -> ([f32; 3], f32) {
-    // f32 holds every 8- and 16-bit sample; dividing keeps 255 / 255 and 65535 / 65535 at exactly 1.
+    // f32 holds every 8- and 16-bit sample; dividing keeps 255 / 255 and 65535 / 65535 at exactly
+    // 1.
     let eight = |v: u8| v as f32 / 255.0;
     let sixteen = |v: u16| v as f32 / 65535.0;
     let grey = |[v, a]: [f32; 2]| ([v; 3], a);
@@ -170,13 +173,14 @@ fn sample(image: &DynamicImage, x: u32, y: u32) -> ([f32; 3], f32) {
     }
 }
 
-/// Light is not negative; renderers and sensors leave NaN, infinities and values just below zero behind.
+/// Light is not negative; renderers and sensors leave NaN, infinities and values just below zero
+/// behind.
 fn finite(v: f32) -> f32 {
     if v.is_finite() { v.max(0.0) } else { 0.0 }
 }
 
-/// Decodes the bytes of a file; `path` only names it in messages. `code` are the code points of a frame of a video, whose file says
-/// nothing of them.
+/// Decodes the bytes of a file; `path` only names it in messages. `code` are the code points of a
+/// frame of a video, whose file says nothing of them.
 pub(super) fn decode(bytes: Vec<u8>, path: &Path, code: Option<CodePoints>) -> Result<Decoded> {
     let named = |what: &str| format!("{}: {what}", path.display());
     if bytes.is_empty() {
@@ -218,7 +222,8 @@ fn damaged(what: &str) -> String {
     format!("the image is damaged ({what}); copy the photo again or save it anew")
 }
 
-/// Stored pixels of an image file that holds no photo but labels: as they are, in the file's own orientation.
+/// Stored pixels of an image file that holds no photo but labels: as they are, in the file's own
+/// orientation.
 pub fn stored_pixels(path: &Path) -> Result<DynamicImage> {
     let bytes = files::read(path)?;
     let named = |what: &str| Error::input(format!("{}: {what}", path.display()));
@@ -229,7 +234,8 @@ pub fn stored_pixels(path: &Path) -> Result<DynamicImage> {
     read.unwrap_or_else(|panic| Err(damaged(&panic))).map_err(|what| named(&what))
 }
 
-/// A file that the `image` crate reads and what it says beside its pixels; the error is one line without the file's name.
+/// A file that the `image` crate reads and what it says beside its pixels; the error is one line
+/// without the file's name.
 fn coded(mut bytes: Vec<u8>, format: ImageFormat) -> Result<(Decoded, Metadata), String> {
     let mut notes = Vec::new();
     match format {
@@ -281,7 +287,8 @@ fn coded(mut bytes: Vec<u8>, format: ImageFormat) -> Result<(Decoded, Metadata),
     Ok((Decoded::new(pixels, orientation, premultiplied, lens), found.bounded()))
 }
 
-/// The tags of the first image of a TIFF file, which is an EXIF block with pixels; none where they are damaged, and none of BigTIFF.
+/// The tags of the first image of a TIFF file, which is an EXIF block with pixels; none where they
+/// are damaged, and none of BigTIFF.
 fn tiff_metadata(bytes: &[u8], premultiplied: &mut bool) -> Metadata {
     let Some(tags) = Directories::of(bytes) else { return Metadata::default() };
     *premultiplied = tags.has_associated_alpha();
@@ -298,7 +305,8 @@ fn tiff_metadata(bytes: &[u8], premultiplied: &mut bool) -> Metadata {
     }
 }
 
-/// Longest header of a Radiance file, bytes: its lines hold the commands that made it. The decoder keeps each with 43 times its size.
+/// Longest header of a Radiance file, bytes: its lines hold the commands that made it. The decoder
+/// keeps each with 43 times its size.
 pub(super) const LONGEST_RADIANCE: usize = 64 << 10;
 
 fn check_radiance(bytes: &[u8]) -> Result<(), String> {

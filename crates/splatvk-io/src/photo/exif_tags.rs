@@ -3,11 +3,12 @@ use super::tiff::Directories;
 use exif::{Field, In, Reader, Tag, Value};
 use glam::DVec3;
 
-/// Diagonal of the 36 × 24 mm frame that "35 mm equivalent" refers to (CIPA DCG-001: equal diagonal angle of view).
+/// Diagonal of the 36 × 24 mm frame that "35 mm equivalent" refers to (CIPA DCG-001: equal diagonal
+/// angle of view).
 const FULL_FRAME_DIAGONAL_MM: f64 = 43.266615305567875;
 
-/// Shortest and longest plausible focal length over the long side of the image: a 140° fisheye and a 1,000 mm
-/// telephoto lens on full frame. Tags outside are typing errors or placeholders.
+/// Shortest and longest plausible focal length over the long side of the image: a 140° fisheye and
+/// a 1,000 mm telephoto lens on full frame. Tags outside are typing errors or placeholders.
 const PLAUSIBLE_FOCAL: std::ops::Range<f64> = 0.18..28.0;
 
 /// Lens facts of one file.
@@ -25,8 +26,8 @@ pub(super) struct Lens {
     pub panorama: Option<String>,
 }
 
-/// Reads the lens facts out of a raw EXIF block; a damaged block yields what could be read. `size` is the size of the
-/// image in pixels, in either orientation.
+/// Reads the lens facts out of a raw EXIF block; a damaged block yields what could be read. `size`
+/// is the size of the image in pixels, in either orientation.
 pub(super) fn lens(raw: &[u8], size: (u32, u32)) -> Lens {
     let Some(tags) = Directories::of(raw) else { return Lens::default() };
     let read = Reader::new().continue_on_error(true).read_raw(tags.digest());
@@ -58,8 +59,9 @@ fn number(fields: Fields, tag: Tag) -> Option<f64> {
     (value.is_finite() && value > 0.0).then_some(value)
 }
 
-/// The focal plane tags are exact where they are right, the 35 mm tag is a whole number of millimetres (2 % at 26 mm)
-/// but hard to get wrong: the former count only when the latter agrees or is absent.
+/// The focal plane tags are exact where they are right, the 35 mm tag is a whole number of
+/// millimetres (2 % at 26 mm) but hard to get wrong: the former count only when the latter agrees
+/// or is absent.
 fn focal(fields: Fields, (w, h): (u32, u32)) -> Option<f64> {
     let (w, h) = (w as f64, h as f64);
     if is_cut(fields, w.max(h) / w.min(h)) {
@@ -71,14 +73,16 @@ fn focal(fields: Fields, (w, h): (u32, u32)) -> Option<f64> {
         .filter(plausible);
     let plane = focal_plane(fields, w.max(h)).filter(plausible);
     match (plane, equivalent) {
-        // 12 %: rounding of a short 35 mm figure plus the width-based equivalents that some makers write.
+        // 12 %: rounding of a short 35 mm figure plus the width-based equivalents that some makers
+        // write.
         (Some(p), Some(e)) if (p / e).ln().abs() < 0.12 => Some(p),
         (_, Some(e)) => Some(e),
         (p, None) => p,
     }
 }
 
-/// Whether the file has another shape than the camera wrote: cut out since, and scaled by what no tag states.
+/// Whether the file has another shape than the camera wrote: cut out since, and scaled by what no
+/// tag states.
 fn is_cut(fields: Fields, aspect: f64) -> bool {
     let side = |tag| number(fields, tag);
     let written = side(Tag::PixelXDimension).zip(side(Tag::PixelYDimension));
@@ -97,7 +101,8 @@ fn focal_plane(fields: Fields, long_side: f64) -> Option<f64> {
         5 => 0.001,
         _ => return None,
     };
-    // The resolution counts pixels of the image as the camera wrote it; PixelXDimension tells when it was scaled since.
+    // The resolution counts pixels of the image as the camera wrote it; PixelXDimension tells when
+    // it was scaled since.
     let written = [Tag::PixelXDimension, Tag::PixelYDimension].map(|t| number(fields, t).unwrap_or(0.0));
     let written = written[0].max(written[1]);
     let scale = if written > 0.0 { long_side / written } else { 1.0 };
@@ -121,8 +126,9 @@ fn panorama(fields: Fields) -> Option<String> {
 /// A phone that is held still measures 1 g; what a moving one measures is not gravity alone.
 const STILL: std::ops::Range<f64> = 0.93..1.07;
 
-/// From the acceleration that iPhones note: in g, in axes of the phone (right, towards its top, out of its screen). The stored
-/// pictures of its back camera lie on their side: x towards the phone's bottom, y towards its left.
+/// From the acceleration that iPhones note: in g, in axes of the phone (right, towards its top, out
+/// of its screen). The stored pictures of its back camera lie on their side: x towards the phone's
+/// bottom, y towards its left.
 fn gravity(fields: Fields) -> Option<DVec3> {
     let Value::Undefined(note, _) = &fields(Tag::MakerNote)?.value else { return None };
     if ascii(fields, Tag::LensModel).is_some_and(|lens| lens.to_lowercase().contains("front")) {
@@ -140,9 +146,11 @@ fn gravity(fields: Fields) -> Option<DVec3> {
     }
 }
 
-/// Tag 8 of Apple's maker note, three signed fractions; `None` where the note is another maker's or damaged.
+/// Tag 8 of Apple's maker note, three signed fractions; `None` where the note is another maker's or
+/// damaged.
 fn apple_acceleration(note: &[u8]) -> Option<DVec3> {
-    // After the name, a version and "MM" follows a TIFF directory whose offsets count from the name.
+    // After the name, a version and "MM" follows a TIFF directory whose offsets count from the
+    // name.
     note.strip_prefix(b"Apple iOS\0").filter(|rest| rest.get(2..4) == Some(b"MM"))?;
     let bytes = |at: usize| note.get(at..at.checked_add(4)?)?.try_into().ok();
     let short = |at: usize| Some(u16::from_be_bytes(note.get(at..at.checked_add(2)?)?.try_into().ok()?));

@@ -1,5 +1,6 @@
-//! HEIC, HEIF and AVIF through libheif's C interface, loaded at run time: its HEVC decoders are under the LGPL and
-//! patents, so splatvk runs without it and never links it. The signatures are those of libheif 1.12 (2021), unchanged since.
+//! HEIC, HEIF and AVIF through libheif's C interface, loaded at run time: its HEVC decoders are
+//! under the LGPL and patents, so splatvk runs without it and never links it. The signatures are
+//! those of libheif 1.12 (2021), unchanged since.
 use super::kind::{LARGEST_DECODED, TOO_LARGE, check_pixels};
 use super::metadata::Metadata;
 use super::support::Support;
@@ -61,7 +62,8 @@ const CHANNEL_INTERLEAVED: c_int = 10;
 /// Opaque `heif_context`, `heif_image_handle` and `heif_image`.
 type Pointer = *mut c_void;
 
-/// The functions used, one line each: the struct, its fields and their look-up follow from this table.
+/// The functions used, one line each: the struct, its fields and their look-up follow from this
+/// table.
 macro_rules! functions {
     ($($name:ident: fn($($argument:ty),*) $(-> $result:ty)?;)*) => {
         #[allow(non_snake_case)] // the library's spelling
@@ -158,24 +160,26 @@ pub(super) fn status() -> Support {
     Support { found: format!("libheif {version} · {found}"), advice }
 }
 
-/// The primary image of a file, upright: libheif applies the rotation and mirroring that the container states, and those
-/// count, not the orientation in EXIF (ISO/IEC 23008-12).
+/// The primary image of a file, upright: libheif applies the rotation and mirroring that the
+/// container states, and those count, not the orientation in EXIF (ISO/IEC 23008-12).
 pub(super) struct Image {
     pub pixels: DynamicImage,
     pub metadata: Metadata,
 }
 
-/// Why there is no image: something to install, or something about the file. One line without the file's name.
+/// Why there is no image: something to install, or something about the file. One line without the
+/// file's name.
 pub(super) enum Failure {
     Missing(String),
     Input(String),
 }
 
-/// Decodes the primary image. 8-bit files give 8-bit, others 16-bit samples; premultiplied colours stay so and lose their
-/// alpha, which is the same as compositing on black.
+/// Decodes the primary image. 8-bit files give 8-bit, others 16-bit samples; premultiplied colours
+/// stay so and lose their alpha, which is the same as compositing on black.
 pub(super) fn decode(bytes: &[u8]) -> Result<Image, Failure> {
     let api = api().map_err(|what| Failure::Missing(format!("is a HEIC/AVIF photo and {what}")))?;
-    // SAFETY: `bytes` outlives the context, every pointer is freed once, and after what was made from it.
+    // SAFETY: `bytes` outlives the context, every pointer is freed once, and after what was made
+    // from it.
     unsafe {
         let (_context, handle) = primary(api, bytes)?;
         let shape = HeifLayout::of(api, handle.pointer)?;
@@ -207,7 +211,8 @@ pub(super) fn pixels(bytes: &[u8]) -> u64 {
     }
 }
 
-/// The context of a file and the handle of its primary image, which lives as long as the context; drop the handle first.
+/// The context of a file and the handle of its primary image, which lives as long as the context;
+/// drop the handle first.
 ///
 /// # Safety
 /// `bytes` must outlive the context.
@@ -319,7 +324,8 @@ impl HeifLayout {
         if plane.is_null() || stride < row_bytes || samples * rows == 0 || !(8..=16).contains(&bits) {
             return Err(Failure::Input("libheif gave no pixels for this file; save it as JPEG".to_owned()));
         }
-        // SAFETY: the library's rows of `stride` bytes, of which the first `row_bytes` hold samples.
+        // SAFETY: the library's rows of `stride` bytes, of which the first `row_bytes` hold
+        // samples.
         let row = |y| unsafe { std::slice::from_raw_parts(plane.add(y * stride), row_bytes) };
         let (w, h) = (w as u32, h as u32);
         let made = if self.deep {
@@ -381,7 +387,8 @@ unsafe fn code_points(api: &Api, handle: Pointer) -> Option<[u16; 4]> {
 /// The XMP packet: a block of the type that MIME has for RDF.
 unsafe fn xmp(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
     let mut ids = [0u32; 8];
-    // SAFETY: the caller's valid handle; at most as many ids as there is room for; the type is a string of the library or null.
+    // SAFETY: the caller's valid handle; at most as many ids as there is room for; the type is a
+    // string of the library or null.
     unsafe {
         let list = api.heif_image_handle_get_list_of_metadata_block_IDs;
         let count = list(handle, c"mime".as_ptr(), ids.as_mut_ptr(), ids.len() as c_int);
@@ -408,7 +415,8 @@ unsafe fn block(api: &Api, handle: Pointer, id: u32) -> Option<Vec<u8>> {
     }
 }
 
-/// The first EXIF block. It begins with the distance of the TIFF header from the end of these four bytes.
+/// The first EXIF block. It begins with the distance of the TIFF header from the end of these four
+/// bytes.
 unsafe fn exif(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
     let mut id = 0u32;
     // SAFETY: the caller's valid handle; one id is asked for.

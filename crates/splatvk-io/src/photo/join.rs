@@ -3,8 +3,8 @@ use super::kind::stem;
 use std::collections::HashMap;
 use unicode_normalization::UnicodeNormalization;
 
-/// A name as it is compared: its folders apart by "/", letters composed (macOS writes them with their accents apart), without
-/// blanks around it.
+/// A name as it is compared: its folders apart by "/", letters composed (macOS writes them with
+/// their accents apart), without blanks around it.
 pub fn plain_name(name: &str) -> String {
     let composed: String = name.trim().nfc().collect();
     let parts = composed.split(['/', '\\']).filter(|p| !p.is_empty() && *p != ".");
@@ -29,8 +29,8 @@ impl Name {
         self.folders.iter().rev().zip(folders.iter().rev()).take_while(|(a, b)| a == b).count()
     }
 
-    /// How well the file names agree: in every letter, but for the case of the extension, but for the extension, but for the
-    /// case; 0 = not.
+    /// How well the file names agree: in every letter, but for the case of the extension, but for
+    /// the extension, but for the case; 0 = not.
     fn agreement(&self, other: &Name) -> u8 {
         if self.file == other.file {
             4
@@ -48,9 +48,10 @@ impl Name {
     }
 }
 
-/// The index of the camera of every photo, by the path of the photo and the name that the file gives the camera; `None` where
-/// there is none. Of several the one whose folders agree with the photo's path furthest back from the file name, then the one
-/// whose file name agrees best. Where cameras name the photo's own folder, those of other folders are not meant.
+/// The index of the camera of every photo, by the path of the photo and the name that the file
+/// gives the camera; `None` where there is none. Of several the one whose folders agree with the
+/// photo's path furthest back from the file name, then the one whose file name agrees best. Where
+/// cameras name the photo's own folder, those of other folders are not meant.
 ///
 /// # Errors
 /// Two cameras that fit a photo alike, or two photos that fit a camera alike; the text names them.
@@ -116,14 +117,16 @@ pub fn join(photos: &[impl AsRef<str>], cameras: &[impl AsRef<str>]) -> Result<V
     Ok(found.into_iter().map(|fit| fit.map(|f| f.camera)).collect())
 }
 
-/// A camera that may be that of a photo, and how well it fits: shared folders, then the agreement of the file names.
+/// A camera that may be that of a photo, and how well it fits: shared folders, then the agreement
+/// of the file names.
 #[derive(Clone, Copy)]
 struct Fit {
     how: (usize, u8),
     camera: usize,
 }
 
-/// A name of its own for each file: its stem, with the folders in front that it takes to tell them apart.
+/// A name of its own for each file: its stem, with the folders in front that it takes to tell them
+/// apart.
 pub fn stems_apart(names: &[impl AsRef<str>]) -> Vec<String> {
     let all: Vec<Name> = names.iter().map(|n| Name::new(n.as_ref())).collect();
     let with = |name: &Name, folders: usize| {

@@ -1,5 +1,5 @@
-//! Whether a JPEG file is whole: its decoder fills a cut-off one with grey instead of reporting it, and grey areas would end up as
-//! geometry.
+//! Whether a JPEG file is whole: its decoder fills a cut-off one with grey instead of reporting it,
+//! and grey areas would end up as geometry.
 use super::kind::check_pixels;
 use image::codecs::jpeg::JpegDecoder;
 use image::{DynamicImage, ImageDecoder};
@@ -39,14 +39,15 @@ fn walk(bytes: &[u8], mut segment: impl FnMut(u8, &[u8])) -> bool {
     false
 }
 
-/// What may follow the last byte of a file without its end. Every Huffman code reads these bits in another way, so that pixels which
-/// are not in the file come out differently.
+/// What may follow the last byte of a file without its end. Every Huffman code reads these bits in
+/// another way, so that pixels which are not in the file come out differently.
 const FILLERS: [u8; 4] = [0x00, 0x55, 0xaa, 0x36];
 /// Bytes of it: the first missing block tells.
 const FILLED: usize = 4096;
 
-/// Whether all pixels are in a file without its end marker: whatever follows changes none of them. Only for sequential files, whose
-/// scans show all components; a progressive file may lack whole scans.
+/// Whether all pixels are in a file without its end marker: whatever follows changes none of them.
+/// Only for sequential files, whose scans show all components; a progressive file may lack whole
+/// scans.
 pub(super) fn has_all_pixels(bytes: &[u8]) -> bool {
     let (mut components, mut scanned, mut is_sequential) = (0, 0, false);
     walk(bytes, |marker, content| match marker {

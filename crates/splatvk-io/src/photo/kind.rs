@@ -1,4 +1,5 @@
-//! What kind of file it is, by its first bytes or its name, and what to do with the kinds that are not read.
+//! What kind of file it is, by its first bytes or its name, and what to do with the kinds that are
+//! not read.
 use super::tiff::Directories;
 use crate::scene::MAX_PIXELS;
 use crate::{Error, Result};
@@ -10,8 +11,8 @@ const PHOTO: [&str; 14] =
     ["jpg", "jpeg", "jpe", "jfif", "png", "webp", "tif", "tiff", "heic", "heif", "hif", "avif", "exr", "hdr"];
 const VIDEO: [&str; 14] =
     ["mp4", "m4v", "mov", "qt", "avi", "mkv", "webm", "mpg", "mpeg", "wmv", "3gp", "3g2", "mts", "m2ts"];
-/// Of Canon, Nikon, Sony, Olympus, Fujifilm, Panasonic, Leica, Pentax, Samsung, Hasselblad, Phase One, Mamiya, Minolta, Kodak, Epson,
-/// Sigma, GoPro and Apple's and Adobe's DNG.
+/// Of Canon, Nikon, Sony, Olympus, Fujifilm, Panasonic, Leica, Pentax, Samsung, Hasselblad, Phase
+/// One, Mamiya, Minolta, Kodak, Epson, Sigma, GoPro and Apple's and Adobe's DNG.
 const RAW: [&str; 28] = [
     "dng", "cr2", "cr3", "crw", "nef", "nrw", "arw", "srf", "sr2", "orf", "raf", "rw2", "raw", "rwl", "pef",
     "srw", "3fr", "fff", "iiq", "mef", "mos", "mrw", "dcr", "kdc", "k25", "erf", "x3f", "gpr",
@@ -22,7 +23,8 @@ const OTHER_IMAGE: [&str; 12] =
 /// The kinds that are read, for messages.
 pub(super) const READ: &str = "JPEG, PNG, HEIC, AVIF, WebP or TIFF";
 
-/// Most memory a decoded file may take: four times the largest photo that phones write (200 megapixels, 8 bit).
+/// Most memory a decoded file may take: four times the largest photo that phones write (200
+/// megapixels, 8 bit).
 pub(super) const LARGEST_DECODED: u64 = 2 << 30;
 pub(super) const TOO_LARGE: &str = "the image needs more than 2 GiB of memory; make it smaller";
 
@@ -48,8 +50,9 @@ fn has_extension(path: &Path, list: &[&str]) -> bool {
     path.extension().is_some_and(|e| list.iter().any(|l| e.eq_ignore_ascii_case(l)))
 }
 
-/// What joins a photo to its camera, masks and renders: its file name without folder and extension. Only the extensions of
-/// pictures are cut, so that the stem of a stem is itself, and "view.2" a name of its own.
+/// What joins a photo to its camera, masks and renders: its file name without folder and extension.
+/// Only the extensions of pictures are cut, so that the stem of a stem is itself, and "view.2" a
+/// name of its own.
 pub fn stem(file: &str) -> &str {
     let name = file.rsplit(['/', '\\']).next().unwrap_or(file);
     let picture =
@@ -78,8 +81,8 @@ pub(super) fn is_raw_name(path: &Path) -> bool {
     has_extension(path, &RAW)
 }
 
-/// Names of files in which one photo may lie beside others of the same stem: what phones and cameras write two of. PNG is not
-/// among them: it holds masks and cut-outs.
+/// Names of files in which one photo may lie beside others of the same stem: what phones and
+/// cameras write two of. PNG is not among them: it holds masks and cut-outs.
 pub(super) fn is_camera_format(path: &Path) -> bool {
     is_photo_name(path) && !has_extension(path, &["png", "exr", "hdr", "webp"])
 }
@@ -100,11 +103,12 @@ pub(super) fn begins_as_photo(path: &Path) -> bool {
             || brand(&start) == Some(FileKind::Heif))
 }
 
-/// Bytes of the longest stem: the scene's files are named after it, and cameras take names of 200 bytes.
+/// Bytes of the longest stem: the scene's files are named after it, and cameras take names of 200
+/// bytes.
 const LONGEST_STEM: usize = 196;
 
-/// Refuses names of photos that files of a scene cannot be named after: that are no Unicode, have control characters, or are too
-/// long.
+/// Refuses names of photos that files of a scene cannot be named after: that are no Unicode, have
+/// control characters, or are too long.
 pub fn check_name(path: &Path) -> Result<()> {
     let shown = path.to_string_lossy();
     let bad = |what: String| {
@@ -196,7 +200,8 @@ fn brand(bytes: &[u8]) -> Option<FileKind> {
     })
 }
 
-/// Raw files in the clothes of TIFF: their first image is a thumbnail or a mosaic, and would pass for the photo.
+/// Raw files in the clothes of TIFF: their first image is a thumbnail or a mosaic, and would pass
+/// for the photo.
 fn is_raw(bytes: &[u8]) -> bool {
     use exif::{Context, In, Tag};
     if bytes.get(8..10) == Some(b"CR") {
@@ -206,7 +211,8 @@ fn is_raw(bytes: &[u8]) -> bool {
     let Ok((fields, _)) = exif::parse_exif(&digest) else { return false };
     let first =
         |tag: u16| fields.iter().find(|f| f.ifd_num == In::PRIMARY && f.tag == Tag(Context::Tiff, tag));
-    // DNGVersion; a first image that is declared a reduced copy, with the real one in SubIFDs; a colour filter array.
+    // DNGVersion; a first image that is declared a reduced copy, with the real one in SubIFDs; a
+    // colour filter array.
     let reduced = first(0xfe).and_then(|f| f.value.get_uint(0)).is_some_and(|v| v & 1 == 1);
     let mosaic = first(0x106).and_then(|f| f.value.get_uint(0)) == Some(32803);
     first(0xc612).is_some() || (reduced && first(0x14a).is_some()) || mosaic
@@ -292,7 +298,8 @@ mod tests {
             kind(&block(&tags), Path::new("a.tif"))
         };
         assert_eq!(tiff(&[(0x100, long(10))]), FileKind::Image(ImageFormat::Tiff));
-        // A page of a multi-page file may be called reduced; only with the real image elsewhere is it a thumbnail.
+        // A page of a multi-page file may be called reduced; only with the real image elsewhere is
+        // it a thumbnail.
         assert_eq!(tiff(&[(0xfe, long(1))]), FileKind::Image(ImageFormat::Tiff));
         assert_eq!(tiff(&[(0xc612, Value::Byte(vec![1, 4, 0, 0]))]), FileKind::Refused(RAW_ADVICE));
         assert_eq!(tiff(&[(0xfe, long(1)), (0x14a, long(99))]), FileKind::Refused(RAW_ADVICE));

@@ -1,10 +1,11 @@
-//! Exposure, white balance and vignetting of one photo relative to the scene's light, and their removal.
+//! Exposure, white balance and vignetting of one photo relative to the scene's light, and their
+//! removal.
 use crate::scene::{RgbImage, to_linear, to_srgb};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// A photo shows `gain[c] · exp(falloff[0] r² + falloff[1] r⁴)` times the scene's light, in linear light; r is the
-/// distance from the image centre in half diagonals, 1 in the corners.
+/// A photo shows `gain[c] · exp(falloff[0] r² + falloff[1] r⁴)` times the scene's light, in linear
+/// light; r is the distance from the image centre in half diagonals, 1 in the corners.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Light {
     /// Per channel; 1 = the scene's light.
@@ -13,10 +14,11 @@ pub struct Light {
     pub falloff: [f64; 2],
     /// One standard deviation of the exposure, EV; 0 where nothing was estimated.
     pub sigma_ev: f64,
-    /// One standard deviation of the corner's brightness, as a share of it; 0 where nothing was estimated.
+    /// One standard deviation of the corner's brightness, as a share of it; 0 where nothing was
+    /// estimated.
     pub sigma_corner: f64,
-    /// Difference to the other photos' brightness, ln, that all this leaves in the tenth of the photo's parts that fits worst; 0 where
-    /// nothing was estimated.
+    /// Difference to the other photos' brightness, ln, that all this leaves in the tenth of the
+    /// photo's parts that fits worst; 0 where nothing was estimated.
     pub unexplained: f64,
 }
 
@@ -33,7 +35,8 @@ impl Light {
     /// What may be left unexplained before the user should know of it, ln: half an f-stop.
     const UNEXPLAINED: f64 = 0.35;
 
-    /// False where parts of the photo are lit differently than in the others: highlights, flash, a moving shadow.
+    /// False where parts of the photo are lit differently than in the others: highlights, flash, a
+    /// moving shadow.
     pub fn explains_the_photo(&self) -> bool {
         self.unexplained <= Light::UNEXPLAINED
     }
@@ -58,7 +61,8 @@ impl Light {
         (self.falloff[0] + self.falloff[1]).exp()
     }
 
-    /// "+0.31 EV, red +3 %, blue −2 %, corners −17 %": what is not zero at this precision; empty for [`Light::NONE`].
+    /// "+0.31 EV, red +3 %, blue −2 %, corners −17 %": what is not zero at this precision; empty
+    /// for [`Light::NONE`].
     pub fn summary(&self) -> String {
         let percent = |v: f64| (100.0 * (v - 1.0)).round();
         let signed = |v: f64| if v < 0.0 { format!("−{}", -v) } else { format!("+{v}") };
@@ -81,8 +85,8 @@ impl Light {
         (self.falloff[0] + self.falloff[1] * r2) * r2
     }
 
-    /// The image in the scene's light. Values may exceed 1: where the photo is brighter than the scene's light would
-    /// make it, nothing is lost by that.
+    /// The image in the scene's light. Values may exceed 1: where the photo is brighter than the
+    /// scene's light would make it, nothing is lost by that.
     pub fn removed(&self, image: &RgbImage) -> RgbImage {
         self.scaled(image, -1.0)
     }
@@ -135,7 +139,8 @@ mod tests {
             // A few f32 roundings of two powers.
             assert!((a - b).abs() < 1e-5, "{a} {b}");
         }
-        // In linear light, the centre changes by the gain and the outermost pixel nearly by gain and corner.
+        // In linear light, the centre changes by the gain and the outermost pixel nearly by gain
+        // and corner.
         let ratio = |x: usize, y: usize, c: usize| to_linear(lit.at(x, y)[c]) / to_linear(image.at(x, y)[c]);
         assert!((ratio(20, 15, 2) - 1.1).abs() < 2e-3 && (ratio(20, 15, 0) - 1.4).abs() < 2e-3);
         let r2 = radius2(39.5, 29.5, (40, 30));

@@ -50,8 +50,8 @@ impl Mask {
         Ok(Mask { path: path.to_path_buf(), size: (w, h), used, is_labels })
     }
 
-    /// Whether upright pixels of a photo are used. The mask may have another size of the same aspect, and lie as the photo does or as
-    /// its file does.
+    /// Whether upright pixels of a photo are used. The mask may have another size of the same
+    /// aspect, and lie as the photo does or as its file does.
     pub fn on(
         &self,
         photo: &Path,

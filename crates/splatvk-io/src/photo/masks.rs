@@ -74,7 +74,8 @@ fn report(
         }
         return Ok(());
     };
-    // Warnings are kept in scenes, which are passed on: a folder that nobody typed is named without those above it.
+    // Warnings are kept in scenes, which are passed on: a folder that nobody typed is named without
+    // those above it.
     let named = match &choice.folder {
         Some(typed) => typed.display().to_string(),
         None => file_name(&folder),
@@ -105,7 +106,8 @@ fn file_name(path: &Path) -> String {
     path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-/// The folder of images that a photo is in, itself or below it, and the folders from there to the photo.
+/// The folder of images that a photo is in, itself or below it, and the folders from there to the
+/// photo.
 fn image_folder(photo: &Path) -> Option<(&Path, &Path)> {
     let folder = photo.parent()?;
     let is_images = |f: &&Path| {
@@ -119,7 +121,8 @@ fn image_folder(photo: &Path) -> Option<(&Path, &Path)> {
 /// Folders between a photo and `images`: one per camera of a rig, and one of the camera itself.
 const DEEPEST: usize = 3;
 
-/// `masks` beside `images`, `masks_2` beside `images_2`. Beside the ground truth of `splatvk generate` it holds labels.
+/// `masks` beside `images`, `masks_2` beside `images_2`. Beside the ground truth of `splatvk
+/// generate` it holds labels.
 fn folder_beside(photo: &Path) -> Option<PathBuf> {
     let (images, _) = image_folder(photo)?;
     let name = images.file_name()?.to_str()?;
@@ -128,7 +131,8 @@ fn folder_beside(photo: &Path) -> Option<PathBuf> {
     there.into_iter().find(|m| m != images && m.is_dir() && !root.join("ground_truth.json").exists())
 }
 
-/// `x.jpg.png` (COLMAP), or `x` with an extension of its own (nerfstudio); of a photo in a folder of its camera in such a folder.
+/// `x.jpg.png` (COLMAP), or `x` with an extension of its own (nerfstudio); of a photo in a folder
+/// of its camera in such a folder.
 fn in_folder(folder: &Path, photo: &Path) -> Option<PathBuf> {
     let below = image_folder(photo).map(|(_, below)| folder.join(below)).filter(|f| f.is_dir());
     let folder = below.unwrap_or_else(|| folder.to_path_buf());

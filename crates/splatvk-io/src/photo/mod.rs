@@ -1,4 +1,5 @@
-//! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping (docs/internals/method.md#photos).
+//! Photos: choosing, decoding, EXIF, resizing, affine bookkeeping
+//! (docs/internals/method.md#photos).
 mod bars;
 mod border;
 mod candidate;

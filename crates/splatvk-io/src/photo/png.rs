@@ -1,5 +1,5 @@
-//! PNG files for the decoder: what is not pixels is taken out first, each within a bound, since its decoder inflates profiles and
-//! texts without one of their own.
+//! PNG files for the decoder: what is not pixels is taken out first, each within a bound, since its
+//! decoder inflates profiles and texts without one of their own.
 use super::metadata::{LARGEST_ICC, LARGEST_XMP, Metadata};
 use flate2::read::ZlibDecoder;
 use std::io::Read;
@@ -10,7 +10,8 @@ const SIGNATURE: usize = 8;
 const FRAME: usize = 12;
 const XMP: &[u8] = b"XML:com.adobe.xmp";
 
-/// Leaves the chunks that make pixels, and returns what the others say. Animations become their first picture.
+/// Leaves the chunks that make pixels, and returns what the others say. Animations become their
+/// first picture.
 pub(super) fn take_metadata(bytes: &mut Vec<u8>) -> Metadata {
     let mut found = Metadata::default();
     let (mut from, mut to) = (SIGNATURE, SIGNATURE);
@@ -73,7 +74,8 @@ fn icc(data: &[u8]) -> Option<Vec<u8>> {
     inflated(data.get(name + 2..)?, LARGEST_ICC)
 }
 
-/// An XMP packet in international text: keyword, whether it is compressed, method, language, translated keyword.
+/// An XMP packet in international text: keyword, whether it is compressed, method, language,
+/// translated keyword.
 fn xmp(data: &[u8]) -> Option<Vec<u8>> {
     let rest = data.strip_prefix(XMP)?.strip_prefix(&[0])?;
     let (flags, rest) = rest.split_at_checked(2)?;

@@ -1,5 +1,5 @@
-//! Colours as the ICC profile of a file means them, to sRGB: phones write Display P3, cameras Adobe RGB, and photos of both may make
-//! one scene. Colours outside sRGB come to lie on its border.
+//! Colours as the ICC profile of a file means them, to sRGB: phones write Display P3, cameras Adobe
+//! RGB, and photos of both may make one scene. Colours outside sRGB come to lie on its border.
 use crate::files::guarded;
 use image::{DynamicImage, ImageBuffer, Pixel};
 use moxcms::{
@@ -9,15 +9,17 @@ use moxcms::{
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// A profile that moves no colour by more than this is that of sRGB, in steps of 8 bits; tables of other makers differ by one.
+/// A profile that moves no colour by more than this is that of sRGB, in steps of 8 bits; tables of
+/// other makers differ by one.
 const SAME: u8 = 1;
 /// Levels per channel of the colours by which that is decided.
 const PROBES: [u8; 6] = [0, 51, 102, 153, 204, 255];
 /// Pixels that one thread converts at a time.
 const CHUNK: usize = 1 << 16;
 
-/// The same image in sRGB. A profile that is damaged, or is not one of the image's own channels (JPEGs with CMYK are RGB by now),
-/// leaves it as it is, with a note: metadata must not cost the photo.
+/// The same image in sRGB. A profile that is damaged, or is not one of the image's own channels
+/// (JPEGs with CMYK are RGB by now), leaves it as it is, with a note: metadata must not cost the
+/// photo.
 pub(super) fn to_srgb(image: DynamicImage, icc: &[u8], notes: &mut Vec<String>) -> DynamicImage {
     let Ok(profile) = ColorProfile::new_from_slice(icc) else {
         notes.push("its ICC profile is damaged and not used".to_owned());
@@ -45,7 +47,8 @@ fn is_grey(image: &DynamicImage) -> bool {
     !image.color().has_color()
 }
 
-/// The same image in sRGB by a profile of its channels. Grey of a profile for colours is left as it is.
+/// The same image in sRGB by a profile of its channels. Grey of a profile for colours is left as it
+/// is.
 pub(super) fn by_profile(image: DynamicImage, profile: &ColorProfile) -> DynamicImage {
     if !fits(&image, profile) || is_srgb(profile) {
         return image;
@@ -56,7 +59,8 @@ pub(super) fn by_profile(image: DynamicImage, profile: &ColorProfile) -> Dynamic
 /// Exponents of PNG that mean the curve of sRGB or of television, which FFmpeg writes as 1 / 1.961.
 const SRGB_GAMMA: std::ops::Range<f64> = 0.42..0.53;
 
-/// The image in sRGB by an exponent from light to stored numbers, and x and y of white, red, green and blue, as PNG states them.
+/// The image in sRGB by an exponent from light to stored numbers, and x and y of white, red, green
+/// and blue, as PNG states them.
 pub(super) fn by_numbers(
     image: DynamicImage,
     gamma: Option<f64>,

@@ -1,16 +1,18 @@
-//! Sizes of photos before they are decoded: what memory a run needs, and how many files may be decoded at once.
+//! Sizes of photos before they are decoded: what memory a run needs, and how many files may be
+//! decoded at once.
 use super::candidate::Candidate;
 use super::header;
 use std::ops::Range;
 
-/// Decoded bytes that may be held at once. A photo of 12 megapixels is 36 MB, one of 100 megapixels 300 MB, and two cores are
-/// busy with two of either.
+/// Decoded bytes that may be held at once. A photo of 12 megapixels is 36 MB, one of 100 megapixels
+/// 300 MB, and two cores are busy with two of either.
 const DECODED_AT_ONCE: u64 = 640 << 20;
 
 /// Bytes of a decoded pixel: 8-bit RGB, and as much again that some decoders hold while they work.
 const DECODED_PIXEL: u64 = 6;
 
-/// Taken for a photo whose size only its decoder finds (HEIC, frames of videos): the 48 megapixels of today's phones.
+/// Taken for a photo whose size only its decoder finds (HEIC, frames of videos): the 48 megapixels
+/// of today's phones.
 const ASSUMED: (usize, usize) = (8064, 6048);
 
 /// Upright (width, height) of photos that have not been read yet.

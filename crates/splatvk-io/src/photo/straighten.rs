@@ -4,7 +4,8 @@ use glam::DVec2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// A lens and the pinhole that remains when it is taken out of a picture: same size, focal length and principal point.
+/// A lens and the pinhole that remains when it is taken out of a picture: same size, focal length
+/// and principal point.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Straightening {
     /// What is taken out.
@@ -41,8 +42,8 @@ impl Straightening {
         Straightening { focal: self.focal * scale, centre: self.centre * scale, ..*self }
     }
 
-    /// The picture without the lens, by cubic interpolation (Catmull–Rom); what the lens did not see continues the nearest
-    /// pixels.
+    /// The picture without the lens, by cubic interpolation (Catmull–Rom); what the lens did not
+    /// see continues the nearest pixels.
     pub fn image(&self, image: &RgbImage) -> RgbImage {
         let size = (image.width, image.height);
         let data = resampled(size, |x, y| image.at(x, y), |p| self.source(p));
@@ -56,7 +57,8 @@ impl Straightening {
         Plane { width: size.0, height: size.1, data: data.into_iter().map(|[v]| v).collect() }
     }
 
-    /// [`Straightening::plane`] of a picture that is larger than the one that is meant, which is `width` pixels wide.
+    /// [`Straightening::plane`] of a picture that is larger than the one that is meant, which is
+    /// `width` pixels wide.
     pub(super) fn larger(&self, plane: &Plane<f32>, width: usize) -> Plane<f32> {
         self.resized(plane.width as f64 / width as f64).plane(plane)
     }
@@ -88,7 +90,8 @@ fn weights(t: f32) -> [f32; 4] {
     ]
 }
 
-/// Value at a continuous position; within the range of the four nearest pixels, so that edges do not ring.
+/// Value at a continuous position; within the range of the four nearest pixels, so that edges do
+/// not ring.
 fn cubic<const N: usize>(
     (w, h): (usize, usize),
     at: &impl Fn(usize, usize) -> [f32; N],
@@ -140,7 +143,8 @@ mod tests {
                 worst = (0..3).map(|k| (got[k] - want[k]).abs()).fold(worst, f32::max);
             }
         }
-        // The clamp to the neighbours' range costs up to a quarter of the curvature at crests: 0.15²/8 · 0.4.
+        // The clamp to the neighbours' range costs up to a quarter of the curvature at crests:
+        // 0.15²/8 · 0.4.
         assert!(worst < 2e-3, "{worst}");
     }
 }

@@ -24,8 +24,9 @@ impl Forest {
     }
 }
 
-/// Merges pixels along edges of rising weight while the edge is no heavier than both sides' internal difference plus
-/// `scale / size`; regions below `min_size` then join their most similar neighbour. Returns compact labels.
+/// Merges pixels along edges of rising weight while the edge is no heavier than both sides'
+/// internal difference plus `scale / size`; regions below `min_size` then join their most similar
+/// neighbour. Returns compact labels.
 ///
 /// `weight(p, q)` is the dissimilarity of two neighbouring pixels (8-neighbourhood).
 pub fn superpixels(

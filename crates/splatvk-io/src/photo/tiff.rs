@@ -1,12 +1,14 @@
-//! Tags of TIFF files and EXIF blocks, each value within a bound: counts and offsets come from the file, and a thousand tags may
-//! name the same bytes.
+//! Tags of TIFF files and EXIF blocks, each value within a bound: counts and offsets come from the
+//! file, and a thousand tags may name the same bytes.
 
 /// Largest value that is read, bytes: what a tag of a JPEG can have.
 const LARGEST_VALUE: usize = 64 << 10;
 
-/// Tags of the first directory that [`digest`] keeps: kind and channels of the image, make, model, orientation, signs of raw files.
+/// Tags of the first directory that [`digest`] keeps: kind and channels of the image, make, model,
+/// orientation, signs of raw files.
 const FIRST: [u16; 8] = [0xfe, 0x106, 0x10f, 0x110, 0x112, 0x14a, 0x152, 0xc612];
-/// Tags of the EXIF directory that it keeps: lens, sensor, size, colour space, processing, the maker's note.
+/// Tags of the EXIF directory that it keeps: lens, sensor, size, colour space, processing, the
+/// maker's note.
 const EXIF: [u16; 10] = [0x920a, 0x927c, 0xa001, 0xa002, 0xa003, 0xa20e, 0xa210, 0xa401, 0xa405, 0xa434];
 /// Where the first directory leads to the EXIF one, and that to the one of interoperability.
 const TO_EXIF: u16 = 0x8769;
@@ -58,7 +60,8 @@ impl Order {
         if self.0 { v.to_be_bytes() } else { v.to_le_bytes() }
     }
 
-    /// The entries of the directory at an offset; those that do not lie within the bytes are left out.
+    /// The entries of the directory at an offset; those that do not lie within the bytes are left
+    /// out.
     fn directory(self, bytes: &[u8], at: usize) -> Vec<Entry<'_>> {
         let count = self.short(bytes, at).unwrap_or(0);
         let entry = |k: usize| {

@@ -62,7 +62,8 @@ mod tests {
         for tag in 1..=8u8 {
             let turn = Turn::from(Orientation::from_exif(tag).unwrap());
             assert_eq!((turn.exif(), turn.stored((4, 3)) == (3, 4)), (tag, tag > 4));
-            // The picture of two by one pixels, turned and mirrored as the type says, is what the tag means.
+            // The picture of two by one pixels, turned and mirrored as the type says, is what the
+            // tag means.
             let stored = image::RgbImage::from_fn(3, 2, |x, y| image::Rgb([x as u8, y as u8, 0]));
             let mut upright = image::DynamicImage::from(stored.clone());
             upright.apply_orientation(Orientation::from_exif(tag).unwrap());

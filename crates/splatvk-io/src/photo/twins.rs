@@ -6,8 +6,8 @@ use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// Keeps one file of each photo: of those of one folder and one stem the one with most pixels, of equals the JPEG. Returns the
-/// others behind those that are kept.
+/// Keeps one file of each photo: of those of one folder and one stem the one with most pixels, of
+/// equals the JPEG. Returns the others behind those that are kept.
 pub(super) fn leave_out(photos: &mut Vec<PathBuf>) -> Vec<(PathBuf, PathBuf)> {
     let mut groups: BTreeMap<(Option<PathBuf>, String), Vec<PathBuf>> = BTreeMap::new();
     for photo in photos.iter().filter(|p| is_camera_format(p)) {

@@ -1,5 +1,5 @@
-//! Frames of a video through `ffprobe` and `ffmpeg`, as child processes: without a shell, reading local files only, within
-//! bounded time and memory.
+//! Frames of a video through `ffprobe` and `ffmpeg`, as child processes: without a shell, reading
+//! local files only, within bounded time and memory.
 use super::code_points::{self, CodePoints};
 use super::support::Support;
 use crate::error::words;
@@ -11,10 +11,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Frames looked at: one per second of a minute's walk around a thing, and 60 × 60 pairs are compared in seconds.
+/// Frames looked at: one per second of a minute's walk around a thing, and 60 × 60 pairs are
+/// compared in seconds.
 const CANDIDATES: u64 = 60;
 
-/// One frame of 8K HEVC between two key frames ten seconds apart decodes in half of this on two cores.
+/// One frame of 8K HEVC between two key frames ten seconds apart decodes in half of this on two
+/// cores.
 const LONGEST: Duration = Duration::from_secs(120);
 
 /// Largest frame, pixels: beyond 8K.
@@ -105,13 +107,15 @@ impl Video {
         (0..count).map(|i| self.duration * i as f64 / count as f64).collect()
     }
 
-    /// `clip.mp4/clip_0012400` for the frame at 12.4 s. Without dots: what follows one would pass for an extension.
+    /// `clip.mp4/clip_0012400` for the frame at 12.4 s. Without dots: what follows one would pass
+    /// for an extension.
     pub fn frame_name(&self, at: f64) -> PathBuf {
         let stem = self.path.file_stem().map(|s| s.to_string_lossy().replace('.', "_")).unwrap_or_default();
         self.path.join(format!("{stem}_{:07}", (at * 1000.0).round() as u64))
     }
 
-    /// The frame at a time, upright, as PNG bytes; at most `side` pixels long where that is given. Empty past the end.
+    /// The frame at a time, upright, as PNG bytes; at most `side` pixels long where that is given.
+    /// Empty past the end.
     pub fn frame(&self, at: f64, side: Option<usize>, progress: &dyn Progress) -> Result<Vec<u8>> {
         let mut command = reader("ffmpeg");
         // 1 GiB at once: four times what a frame of the largest size takes in 16 bit.
@@ -131,7 +135,8 @@ impl Video {
     }
 }
 
-/// The numbers of ITU-T H.273 for what ffprobe calls primaries and transfer; a name that is not known is said.
+/// The numbers of ITU-T H.273 for what ffprobe calls primaries and transfer; a name that is not
+/// known is said.
 fn code_points(stream: &serde_json::Value, path: &Path, progress: &dyn Progress) -> CodePoints {
     let number = |key: &str, of: fn(&str) -> Option<u16>, what: &str| {
         let name = stream[key].as_str().unwrap_or("");

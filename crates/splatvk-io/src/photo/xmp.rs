@@ -4,7 +4,8 @@ use std::path::Path;
 /// Namespace of panoramas (developers.google.com/streetview/spherical-metadata).
 const NAMESPACE: &str = "http://ns.google.com/photos/1.0/panorama/";
 
-/// What says that the photo is a panorama, as "GPano:ProjectionType=equirectangular"; `None` for photos of a pinhole.
+/// What says that the photo is a panorama, as "GPano:ProjectionType=equirectangular"; `None` for
+/// photos of a pinhole.
 pub(super) fn panorama(packet: &[u8]) -> Option<String> {
     let text = String::from_utf8_lossy(packet);
     let declared = text.find(NAMESPACE)?;

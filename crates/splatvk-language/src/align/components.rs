@@ -16,8 +16,9 @@ pub struct Component {
     pub weight: f64,
 }
 
-/// Constrained union-find over the edges, best edge first. A union is refused when it would put two masks of one view
-/// together (fused masks already share a label) or when the medoids' cosine is below `veto`.
+/// Constrained union-find over the edges, best edge first. A union is refused when it would put two
+/// masks of one view together (fused masks already share a label) or when the medoids' cosine is
+/// below `veto`.
 pub(super) fn build(state: &LevelState, edges: &[Edge], veto: f64) -> Vec<Component> {
     let mut groups: Vec<Component> = Vec::new();
     let mut owner: BTreeMap<MaskId, usize> = BTreeMap::new();

@@ -1,4 +1,5 @@
-//! Pixel correspondences between two views: from dense matches (docs/internals/method.md#pixel-matching) and from depth and poses
+//! Pixel correspondences between two views: from dense matches
+//! (docs/internals/method.md#pixel-matching) and from depth and poses
 //! (docs/internals/method.md#reprojection).
 use crate::scene::{Camera, DenseWarp, DepthMap, Plane};
 use glam::DVec2;
@@ -11,7 +12,8 @@ const NONE: u32 = u32::MAX;
 /// RoMa's probability above which a match counts (docs/internals/method.md#pixel-matching).
 const MIN_CERTAINTY: f32 = 0.35;
 
-/// Relative depth difference that occlusion tests and the round trip allow (docs/internals/method.md#reprojection).
+/// Relative depth difference that occlusion tests and the round trip allow
+/// (docs/internals/method.md#reprojection).
 const DEPTH_TOLERANCE: f64 = 0.05;
 
 /// Bilinear depth is used only where its four neighbours lie on one surface: max/min below this
@@ -88,7 +90,8 @@ fn one_way(warp: &DenseWarp, back: &DenseWarp) -> Links {
         }
         let Some(index) = pixel(q, other.width, other.height) else { return NONE };
         let home = [(p % width) as f32 + 0.5, (p / width) as f32 + 0.5];
-        // the exact return position is that of q, one pixel centre away at most: interpolate when possible
+        // the exact return position is that of q, one pixel centre away at most: interpolate when
+        // possible
         let r = sample(other, q);
         let error = ((r[0] - home[0]).powi(2) + (r[1] - home[1]).powi(2)).sqrt();
         if back.certainty.data[index] > 0.0 && error < tolerance { index as u32 } else { NONE }
@@ -103,16 +106,17 @@ fn pixel(q: [f32; 2], width: usize, height: usize) -> Option<usize> {
     inside.then(|| q[1] as usize * width + q[0] as usize)
 }
 
-/// Return position at q: the value of q's pixel shifted by q's offset from that pixel's centre, that is a first-order
-/// step with the identity Jacobian, which does not smear across discontinuities as interpolation would.
+/// Return position at q: the value of q's pixel shifted by q's offset from that pixel's centre,
+/// that is a first-order step with the identity Jacobian, which does not smear across
+/// discontinuities as interpolation would.
 fn sample(map: &Plane<[f32; 2]>, q: [f32; 2]) -> [f32; 2] {
     let (x, y) = (q[0] as usize, q[1] as usize);
     let v = map.at(x.min(map.width - 1), y.min(map.height - 1));
     [v[0] + (q[0] - x as f32 - 0.5), v[1] + (q[1] - y as f32 - 0.5)]
 }
 
-/// Step 3: projects every pixel with known depth into the other view and keeps it if that view sees the same surface
-/// there and projecting back returns to it within `1.5·width/512` pixels.
+/// Step 3: projects every pixel with known depth into the other view and keeps it if that view sees
+/// the same surface there and projecting back returns to it within `1.5·width/512` pixels.
 pub fn links_from_depth(
     i: usize,
     j: usize,
@@ -150,7 +154,8 @@ fn project(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) -> Li
             if d <= 0.0 {
                 return (NONE, true);
             }
-            // something nearer stands in front: this pixel cannot be seen from there and must not count against it
+            // something nearer stands in front: this pixel cannot be seen from there and must not
+            // count against it
             let hidden = d < zq * (1.0 - DEPTH_TOLERANCE);
             let returned = back.transform(to.ray(q) * d);
             let u = DVec2::new(
@@ -166,7 +171,8 @@ fn project(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) -> Li
     Links { target: rows.iter().map(|r| r.0).collect(), visible: rows.iter().map(|r| r.1).collect() }
 }
 
-/// Depth at a position: bilinear on one surface, else that of the pixel it falls into; ≤ 0 when unknown.
+/// Depth at a position: bilinear on one surface, else that of the pixel it falls into; ≤ 0 when
+/// unknown.
 fn surface_depth(depth: &Plane<f32>, q: [f32; 2], index: usize) -> f64 {
     let nearest = depth.data[index] as f64;
     let (fx, fy) = (q[0] - 0.5, q[1] - 0.5);

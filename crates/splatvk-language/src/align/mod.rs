@@ -1,9 +1,11 @@
-//! Three-step semantic alignment (docs/internals/method.md#alignment): which masks of different views are the same thing.
+//! Three-step semantic alignment (docs/internals/method.md#alignment): which masks of different
+//! views are the same thing.
 //!
-//! Step 1 scores mask pairs by dense matches, step 2 fuses masks that one view splits and another keeps whole,
-//! step 3 re-scores by reprojection through depth and poses. Accepted pairs are undirected edges; connected
-//! components, built under constraints, become the things of the scene. Everything is integer counting or f64 sums
-//! in a fixed order, so the result depends neither on the thread count nor on the order of the views.
+//! Step 1 scores mask pairs by dense matches, step 2 fuses masks that one view splits and another
+//! keeps whole, step 3 re-scores by reprojection through depth and poses. Accepted pairs are
+//! undirected edges; connected components, built under constraints, become the things of the scene.
+//! Everything is integer counting or f64 sums in a fixed order, so the result depends neither on
+//! the thread count nor on the order of the views.
 mod components;
 mod links;
 mod options;
@@ -39,7 +41,8 @@ pub struct LevelReport {
 /// The outcome: masks with fused labels, and per level the things they form.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Alignment {
-    /// The input masks; fused masks carry the smallest id of their set (absorbed ids have no pixel left).
+    /// The input masks; fused masks carry the smallest id of their set (absorbed ids have no pixel
+    /// left).
     pub views: Vec<ViewMasks>,
     /// Per level.
     pub components: Vec<Vec<Component>>,
@@ -47,8 +50,8 @@ pub struct Alignment {
     pub report: Vec<LevelReport>,
 }
 
-/// Aligns the masks of all views. `matched` holds the dense matches of step 1, `projected` the reprojections of step
-/// 3, each at most once per unordered pair of views; both may be empty.
+/// Aligns the masks of all views. `matched` holds the dense matches of step 1, `projected` the
+/// reprojections of step 3, each at most once per unordered pair of views; both may be empty.
 pub fn align(
     views: &[ViewMasks],
     matched: &[PairLinks],
@@ -64,7 +67,8 @@ pub fn align(
         let projected = if options.reprojection { projected } else { &[] };
         let mut table = score::match_proposals(&state, matched, options, 1);
         let mut fused = Vec::new();
-        // the finest level is never fused: its masks are subparts, and fusing them would make it another level
+        // the finest level is never fused: its masks are subparts, and fusing them would make it
+        // another level
         if options.fusion && level > 0 {
             fused = score::fuse(&mut state, matched, options);
             if !fused.is_empty() {

@@ -7,12 +7,14 @@ use serde::{Deserialize, Serialize};
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum AreaScore {
-    /// Share of the target's own pixels whose reverse match lands in the source: independent of image scale.
+    /// Share of the target's own pixels whose reverse match lands in the source: independent of
+    /// image scale.
     Coverage,
     /// Matched source pixels over target pixels, at most 1: the paper's ratio.
     Paper,
-    /// Share of the target's pixels at whose place the source view has a match of any mask: what the authors' code scores step 1
-    /// by, as if nothing moved between the views. Step 3 has the paper's ratio.
+    /// Share of the target's pixels at whose place the source view has a match of any mask: what
+    /// the authors' code scores step 1 by, as if nothing moved between the views. Step 3 has the
+    /// paper's ratio.
     SamePlace,
 }
 

@@ -45,7 +45,8 @@ impl LevelState {
     pub fn cosine(&self, a: MaskId, b: MaskId) -> f64 {
         dot(self.feature(a), self.feature(b))
     }
-    /// Weight of a mask in its component: pixels times quality (docs/internals/method.md#components).
+    /// Weight of a mask in its component: pixels times quality
+    /// (docs/internals/method.md#components).
     pub fn weight(&self, MaskId { view, mask }: MaskId) -> f64 {
         self.areas[view as usize][mask as usize] as f64 * self.quality[view as usize][mask as usize] as f64
     }
@@ -133,7 +134,8 @@ fn edge(state: &LevelState, step: u8, from: MaskId, to: MaskId, area: f64, optio
     Edge { step, from, to, area, lang, score: options.lambda * lang + (1.0 - options.lambda) * area }
 }
 
-/// Step 1 (docs/internals/method.md#pixel-matching): every mask proposes the mask that most of its matches fall into.
+/// Step 1 (docs/internals/method.md#pixel-matching): every mask proposes the mask that most of its
+/// matches fall into.
 pub(super) fn match_proposals(
     state: &LevelState,
     pairs: &[PairLinks],
@@ -187,7 +189,8 @@ struct FusionSet {
     coverage: f64,
 }
 
-/// Step 2 (docs/internals/method.md#mask-fusion): relabels every fusion set to its smallest id; returns what was fused.
+/// Step 2 (docs/internals/method.md#mask-fusion): relabels every fusion set to its smallest id;
+/// returns what was fused.
 pub(super) fn fuse(state: &mut LevelState, pairs: &[PairLinks], options: &AlignOptions) -> Vec<Fusion> {
     let mut sets = fusion_sets(state, pairs, options);
     sets.sort_by(|x, y| {
@@ -209,8 +212,8 @@ pub(super) fn fuse(state: &mut LevelState, pairs: &[PairLinks], options: &AlignO
         }
         named.push((set.view, members[0], state.feature(set.target).to_vec()));
     }
-    // The fused mask takes the feature of the mask that covers it whole (docs/internals/method.md#mask-fusion): the strongest set that
-    // it is in writes last.
+    // The fused mask takes the feature of the mask that covers it whole
+    // (docs/internals/method.md#mask-fusion): the strongest set that it is in writes last.
     for (view, member, feature) in named.into_iter().rev() {
         let at = find(&parent[view], member) * feature.len();
         state.features[view][at..at + feature.len()].copy_from_slice(&feature);
@@ -288,8 +291,8 @@ fn fusion_sets(state: &LevelState, pairs: &[PairLinks], options: &AlignOptions) 
     sets
 }
 
-/// Step 3 (docs/internals/method.md#reprojection): mutual best partners through depth and poses; they replace weaker matches from
-/// the same source and delete matches that geometry contradicts.
+/// Step 3 (docs/internals/method.md#reprojection): mutual best partners through depth and poses;
+/// they replace weaker matches from the same source and delete matches that geometry contradicts.
 pub(super) fn add_reprojections(
     table: &mut Table,
     state: &LevelState,
@@ -330,7 +333,8 @@ pub(super) fn add_reprojections(
     }
 }
 
-/// Removes matches i → j and j → i whose source projects into view j with enough pixels, none of them on the partner.
+/// Removes matches i → j and j → i whose source projects into view j with enough pixels, none of
+/// them on the partner.
 fn drop_contradicted(table: &mut Table, (i, j): (usize, usize), there: &Counts, n_min: u32) {
     table.retain(|_, e| {
         let (a, b) = if (e.from.view, e.to.view) == (i as u32, j as u32) {
@@ -345,7 +349,8 @@ fn drop_contradicted(table: &mut Table, (i, j): (usize, usize), there: &Counts, 
     });
 }
 
-/// One edge per unordered pair of masks, the larger score wins; best first, geometry first among equals.
+/// One edge per unordered pair of masks, the larger score wins; best first, geometry first among
+/// equals.
 pub(super) fn undirected(table: Table) -> Vec<Edge> {
     let mut best: BTreeMap<(MaskId, MaskId), Edge> = BTreeMap::new();
     for e in table.into_values() {

@@ -34,7 +34,8 @@ fn exact_depth(depth: &Plane<f32>) -> DepthMap {
     DepthMap { depth: depth.clone(), confidence: Plane { data: known, ..*depth } }
 }
 
-/// The breakfast views with their true masks; in level l every second view cuts every other object in two.
+/// The breakfast views with their true masks; in level l every second view cuts every other object
+/// in two.
 struct Scene {
     views: Vec<ViewMasks>,
     cameras: Vec<Camera>,
@@ -95,8 +96,8 @@ impl Scene {
         let warp = |i: usize, j: usize| matcher::geometry(&c[i], &d[i], &c[j], &d[j]);
         self.pairs().iter().map(|&(i, j)| links_from_warps(i, j, &warp(i, j), &warp(j, i))).collect()
     }
-    /// Share of same-component pairs that show one object, and share of same-object pairs that are together; large
-    /// masks only (100 pixels).
+    /// Share of same-component pairs that show one object, and share of same-object pairs that are
+    /// together; large masks only (100 pixels).
     fn purity_completeness(&self, a: &Alignment, level: usize) -> (f64, f64) {
         let mut owner = BTreeMap::new();
         for (k, c) in a.components[level].iter().enumerate() {
@@ -144,7 +145,8 @@ fn split_objects_are_fused_above_the_finest_level() {
     let a = align(&s.views, &s.matched(), &s.projected(), &AlignOptions::default()).unwrap();
     let (purity, completeness) = s.purity_completeness(&a, 2);
     println!("purity {purity:.3} completeness {completeness:.3} fused {:?}", a.report[2].fused);
-    // a part that covers less than 37 % of the whole cannot reach τ1 at a cosine of 0.8, so some halves stay alone
+    // a part that covers less than 37 % of the whole cannot reach τ1 at a cosine of 0.8, so some
+    // halves stay alone
     assert!(purity >= 0.98 && completeness >= 0.8, "{purity} {completeness}");
     let unfused = AlignOptions { fusion: false, ..AlignOptions::default() };
     let b = align(&s.views, &s.matched(), &s.projected(), &unfused).unwrap();
@@ -206,7 +208,8 @@ fn higher_thresholds_never_add_edges() {
     }
 }
 
-/// A view of a wall at z = 4 with a thin pole at z = 2, camera shifted by `x` and backed off by `back`.
+/// A view of a wall at z = 4 with a thin pole at z = 2, camera shifted by `x` and backed off by
+/// `back`.
 fn pole_view(x: f64, back: f64) -> (Camera, DepthMap, Plane<i32>) {
     let (width, height) = (160, 120);
     let pose = Pose { translation: DVec3::new(-x, 0.0, back), ..Pose::IDENTITY };
@@ -272,7 +275,8 @@ fn a_pole_does_not_link_to_the_wall_behind_it() {
 
 #[test]
 fn geometry_deletes_a_match_that_it_contradicts() {
-    // Matches join the mask of view 0 with the first of view 1; by depth and poses it is the second.
+    // Matches join the mask of view 0 with the first of view 1; by depth and poses it is the
+    // second.
     let (width, height) = (60, 10);
     let view = |features: &[f32], label: &dyn Fn(usize) -> i32| {
         let data = (0..width * height).map(|p| label(p % width)).collect();
@@ -300,7 +304,8 @@ fn geometry_deletes_a_match_that_it_contradicts() {
 
 #[test]
 fn coverage_does_not_depend_on_distance_but_the_papers_ratio_does() {
-    // view 1 stands at twice the distance from the picture: it shows it with a quarter of the pixels
+    // view 1 stands at twice the distance from the picture: it shows it with a quarter of the
+    // pixels
     let (near, far) = (pole_view(0.0, 0.0), pole_view(0.0, 4.0));
     let views = [alike(near.2), alike(far.2)];
     let warps = (
@@ -347,7 +352,8 @@ fn duplicates_empty_levels_and_single_views() {
 
 #[test]
 fn a_mask_of_two_fusion_sets_takes_the_feature_of_the_stronger() {
-    // View 0 has pieces 0, 1, 2 side by side; one mask of view 1 covers 0 and 1, one of view 2 covers 1 and 2.
+    // View 0 has pieces 0, 1, 2 side by side; one mask of view 1 covers 0 and 1, one of view 2
+    // covers 1 and 2.
     let (width, height) = (120, 10);
     let view = |rows: &[[f32; 3]], label: &dyn Fn(usize) -> i32| {
         let unit = |r: &[f32; 3]| r.map(|v| v / r.iter().map(|v| v * v).sum::<f32>().sqrt());

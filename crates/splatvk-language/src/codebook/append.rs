@@ -1,16 +1,19 @@
-//! Codes for things that come later: those there are stay as they are (docs/internals/method.md#photos-added-later).
+//! Codes for things that come later: those there are stay as they are
+//! (docs/internals/method.md#photos-added-later).
 use super::{CodeEntry, EncodedLevel, SAME_EMBEDDING, assert_bijection, build, min_chord, spread};
 use crate::Result;
 use crate::math::{Random, dot};
 use crate::scene::Codebook;
 
-/// Random directions tried for a code: of 16 numbers, with 200 codes, ten times as many find a place 2 % farther from the others.
+/// Random directions tried for a code: of 16 numbers, with 200 codes, ten times as many find a
+/// place 2 % farther from the others.
 const TRIED: usize = 4000;
 /// Steps that then move the best of them away from its nearest neighbours.
 const STEPS: usize = 400;
 
-/// The codebook with a code for every entry: that of an embedding which no text query can tell from its own, else a new one as far
-/// from all others as can be found. `dim` is the length of the codes where there are none yet.
+/// The codebook with a code for every entry: that of an embedding which no text query can tell from
+/// its own, else a new one as far from all others as can be found. `dim` is the length of the codes
+/// where there are none yet.
 pub fn append(book: &Codebook, entries: &[CodeEntry], dim: usize, seed: u64) -> Result<EncodedLevel> {
     if book.is_empty() {
         return build(entries, dim, seed);
@@ -60,7 +63,8 @@ fn farthest(codes: &[f32], dim: usize, random: &mut Random) -> Vec<f32> {
             (*best, *nearest) = (v, own);
         }
     };
-    // While there are fewer codes than numbers they are axes, and the next axis keeps mixtures of two from reading as a third.
+    // While there are fewer codes than numbers they are axes, and the next axis keeps mixtures of
+    // two from reading as a third.
     (1..dim).for_each(|k| consider(axis(k), &mut best, &mut nearest));
     if nearest <= 0.0 {
         return best.iter().map(|v| *v as f32).collect();

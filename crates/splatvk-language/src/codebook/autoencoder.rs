@@ -1,10 +1,11 @@
-//! The scene autoencoder of LangSplat (Qin et al. 2024, docs/internals/method.md#other-codebooks) as another way to make a
-//! codebook, so that a comparison with the bijection changes nothing else.
+//! The scene autoencoder of LangSplat (Qin et al. 2024, docs/internals/method.md#other-codebooks)
+//! as another way to make a codebook, so that a comparison with the bijection changes nothing else.
 //!
-//! An encoder D → 3 and a decoder 3 → D are trained on the scene's features. Splats carry points of the unit sphere, and a
-//! rendered point means whatever the decoder makes of it. The sphere is tabulated: the codebook is a lattice of
-//! [`LATTICE`] directions, at most 3.4° from any point, 1.7° on average, each with its decoded embedding. The decoder itself errs by
-//! far more, and the rest of the engine sees an ordinary codebook.
+//! An encoder D → 3 and a decoder 3 → D are trained on the scene's features. Splats carry points of
+//! the unit sphere, and a rendered point means whatever the decoder makes of it. The sphere is
+//! tabulated: the codebook is a lattice of [`LATTICE`] directions, at most 3.4° from any point,
+//! 1.7° on average, each with its decoded embedding. The decoder itself errs by far more, and the
+//! rest of the engine sees an ordinary codebook.
 use super::network::{Adam, Network, Step};
 use super::{CodeEntry, EncodedLevel, min_chord};
 use crate::math::Random;
@@ -54,7 +55,8 @@ fn unit_backward(y: &DMatrix<f32>, norms: &[f32], g: &DMatrix<f32>) -> DMatrix<f
 }
 
 impl Autoencoder {
-    /// Trains on unit rows `[N, dim]` for the published epochs, but at least `least_steps`: minutes on a CPU.
+    /// Trains on unit rows `[N, dim]` for the published epochs, but at least `least_steps`: minutes
+    /// on a CPU.
     pub fn train(
         features: &[f32],
         dim: usize,
@@ -147,7 +149,8 @@ fn lattice() -> Vec<f32> {
     (0..LATTICE).flat_map(point).collect()
 }
 
-/// One codebook per level, all over the same lattice; every entry gets the direction nearest to its encoding.
+/// One codebook per level, all over the same lattice; every entry gets the direction nearest to its
+/// encoding.
 pub(crate) fn build(
     levels: &[Vec<CodeEntry>],
     least_steps: usize,
@@ -215,7 +218,8 @@ mod tests {
             a[k] += 1e-2;
             b[k] -= 1e-2;
             let numeric = (value(&a) - value(&b)) / 2e-2;
-            // f32: values near 0.3 carry 3e-8, over a step of 2e-2; the third derivative adds a share of 1e-4
+            // f32: values near 0.3 carry 3e-8, over a step of 2e-2; the third derivative adds a
+            // share of 1e-4
             assert!((numeric - g[k]).abs() < 1e-5 + 1e-3 * g[k].abs(), "{k}: {numeric} {}", g[k]);
         }
     }

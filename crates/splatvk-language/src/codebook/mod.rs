@@ -1,4 +1,5 @@
-//! The bijection between embeddings and the short codes that splats carry (docs/internals/method.md#codebook).
+//! The bijection between embeddings and the short codes that splats carry
+//! (docs/internals/method.md#codebook).
 mod append;
 pub(super) mod autoencoder;
 mod network;
@@ -17,7 +18,8 @@ use rayon::prelude::*;
 /// (docs/internals/method.md#code-construction, step 1).
 const SAME_EMBEDDING: f64 = 0.9995;
 
-/// Smallest distance between two codes that the construction accepts (docs/internals/method.md#code-construction, step 5).
+/// Smallest distance between two codes that the construction accepts
+/// (docs/internals/method.md#code-construction, step 5).
 const MIN_CHORD: f32 = 0.02;
 
 /// One distinct embedding and the masks that have it.
@@ -40,8 +42,8 @@ pub struct EncodedLevel {
     pub code_of: Vec<u32>,
 }
 
-/// Builds the codebook of one level: merges indistinguishable embeddings, gives each of the K that remain a unit code
-/// of length `dim`, and proves that decoding inverts encoding, also under noise.
+/// Builds the codebook of one level: merges indistinguishable embeddings, gives each of the K that
+/// remain a unit code of length `dim`, and proves that decoding inverts encoding, also under noise.
 pub fn build(entries: &[CodeEntry], dim: usize, seed: u64) -> Result<EncodedLevel> {
     if dim == 0 {
         return Err(Error::input("the feature dimension must be at least 1"));
@@ -116,8 +118,8 @@ pub fn min_chord(codes: &[f32], dim: usize) -> f32 {
     (0..rows.len()).into_par_iter().map(nearest).reduce(|| 4.0, f32::min).sqrt()
 }
 
-/// The bijection guarantee: codes are distinct, decode(encode(k)) = k, also with uniform noise of amplitude 0.45 δ_min
-/// along a random direction.
+/// The bijection guarantee: codes are distinct, decode(encode(k)) = k, also with uniform noise of
+/// amplitude 0.45 δ_min along a random direction.
 fn assert_bijection(codebook: &Codebook, seed: u64) -> Result<()> {
     let chord = codebook.min_chord;
     if chord < MIN_CHORD {

@@ -1,4 +1,5 @@
-//! A small fully connected network with hand-written gradients, for the scene autoencoder. Batches are columns.
+//! A small fully connected network with hand-written gradients, for the scene autoencoder. Batches
+//! are columns.
 use crate::math::Random;
 use nalgebra::{DMatrix, DVector};
 
@@ -99,7 +100,8 @@ pub(super) struct Network {
 }
 
 impl Network {
-    /// Linear layers of the given widths with ReLU between, and batch normalisation before each ReLU if requested.
+    /// Linear layers of the given widths with ReLU between, and batch normalisation before each
+    /// ReLU if requested.
     pub fn new(input: usize, widths: &[usize], normalise: bool, random: &mut Random) -> Self {
         let mut layers = Vec::new();
         let mut from = input;
@@ -174,7 +176,8 @@ impl Layer {
     fn backward(&mut self, trace: &Trace, gradient: &DMatrix<f32>, adam: &Adam) -> DMatrix<f32> {
         let by_weight = gradient * trace.input.transpose();
         let by_bias = DMatrix::from_column_slice(gradient.nrows(), 1, gradient.column_sum().as_slice());
-        // `tr_mul` would take one product of columns after the other; this one is blocked for the caches.
+        // `tr_mul` would take one product of columns after the other; this one is blocked for the
+        // caches.
         let mut by_input = self.weight.value.transpose() * gradient;
         self.weight.update(&by_weight, adam);
         self.bias.update(&by_bias, adam);
@@ -254,8 +257,8 @@ mod tests {
         adam.tick();
         let gradient = network.backward(&pass, upstream.clone(), &adam);
         let scale = gradient.amax();
-        // f32 sums near 1 over a step of 2e-3: 1e-4 of rounding; a ReLU may switch within the step for
-        // one column of the batch, four inputs
+        // f32 sums near 1 over a step of 2e-3: 1e-4 of rounding; a ReLU may switch within the step
+        // for one column of the batch, four inputs
         let off = gradient.iter().zip(&numeric).filter(|(g, n)| (*g - *n).abs() > 5e-3 * scale).count();
         assert!(off <= 4, "{off} of {}: {gradient} {numeric:?}", x.len());
     }

@@ -1,9 +1,10 @@
-//! Weighted PCA with whitening, the start of the code layout (docs/internals/method.md#code-construction, step 3).
+//! Weighted PCA with whitening, the start of the code layout
+//! (docs/internals/method.md#code-construction, step 3).
 use crate::{Error, Result};
 use nalgebra::{DMatrix, SymmetricEigen};
 
-/// Projects K unit rows of length D onto the top `dim` weighted principal directions, whitens and normalises them.
-/// Directions beyond the rank of the data are left zero. [K, dim], f64.
+/// Projects K unit rows of length D onto the top `dim` weighted principal directions, whitens and
+/// normalises them. Directions beyond the rank of the data are left zero. [K, dim], f64.
 pub(super) fn project(rows: &[f32], weights: &[f64], d: usize, dim: usize) -> Result<Vec<f64>> {
     let count = weights.len();
     let total: f64 = weights.iter().sum();

@@ -1,5 +1,6 @@
-//! The quantised feature codebook of LEGaussians (Shi et al. 2024) as another way to make a codebook: at most 128 mean
-//! features stand for all, and what splats carry is free until an index head is trained on it.
+//! The quantised feature codebook of LEGaussians (Shi et al. 2024) as another way to make a
+//! codebook: at most 128 mean features stand for all, and what splats carry is free until an index
+//! head is trained on it.
 use super::{CodeEntry, EncodedLevel, min_chord};
 use crate::dir::normalise_rows;
 use crate::math::Random;
@@ -11,7 +12,8 @@ const ENTRIES: usize = 128;
 /// Rounds of k-means; assignments of a few hundred features settle within ten.
 const ROUNDS: usize = 20;
 
-/// Spherical k-means with weights: (unit centres, centre of each entry). Starts from entries far from each other.
+/// Spherical k-means with weights: (unit centres, centre of each entry). Starts from entries far
+/// from each other.
 fn cluster(entries: &[CodeEntry], count: usize) -> (Vec<Vec<f32>>, Vec<usize>) {
     let heaviest =
         (0..entries.len()).max_by(|&a, &b| entries[a].weight.total_cmp(&entries[b].weight).then(b.cmp(&a)));

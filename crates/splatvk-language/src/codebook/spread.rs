@@ -1,12 +1,13 @@
-//! Spreads codes over the sphere so that they stay apart (docs/internals/method.md#code-construction, step 4).
+//! Spreads codes over the sphere so that they stay apart
+//! (docs/internals/method.md#code-construction, step 4).
 use crate::math::{Random, dot};
 use rayon::prelude::*;
 
 /// Gradient steps; the minimum distance no longer grows after about 200 on 50 to 600 codes.
 const STEPS: usize = 300;
 
-/// How many nearest embeddings pull at each code, and how strongly against a mean repulsion of 1: enough to keep
-/// neighbours in meaning near each other, too little to bring codes together.
+/// How many nearest embeddings pull at each code, and how strongly against a mean repulsion of 1:
+/// enough to keep neighbours in meaning near each other, too little to bring codes together.
 const NEIGHBOURS: usize = 3;
 const ATTRACTION: f64 = 0.02;
 
@@ -26,8 +27,9 @@ fn normalise(v: &mut [f64]) {
     }
 }
 
-/// Minimises `Σ 1/‖y_k − y_l‖^p` plus a weak pull between neighbours in meaning, by projected gradient steps with a
-/// shrinking step length; returns the layout with the largest minimum distance seen, [K, dim] unit rows.
+/// Minimises `Σ 1/‖y_k − y_l‖^p` plus a weak pull between neighbours in meaning, by projected
+/// gradient steps with a shrinking step length; returns the layout with the largest minimum
+/// distance seen, [K, dim] unit rows.
 pub(super) fn spread(
     start: Vec<f64>,
     embeddings: &[f32],
@@ -39,7 +41,8 @@ pub(super) fn spread(
     let mut y = start;
     for row in y.chunks_exact_mut(dim) {
         normalise(row);
-        // equal projections (two embeddings alike in the kept directions) need a nudge to repel each other
+        // equal projections (two embeddings alike in the kept directions) need a nudge to repel
+        // each other
         row.iter_mut().for_each(|v| *v += 1e-3 * random.normal());
         normalise(row);
     }
@@ -96,7 +99,8 @@ fn repulsion(y: &[f64], k: usize, dim: usize, power: i32) -> Vec<f64> {
     force
 }
 
-/// Unit length: with p = 4 forces span many decades, and a fixed step length converges where a scaled one explodes.
+/// Unit length: with p = 4 forces span many decades, and a fixed step length converges where a
+/// scaled one explodes.
 fn normalise_force(force: &mut [f64]) {
     let norm = force.iter().map(|x| x * x).sum::<f64>().sqrt();
     if norm > 0.0 {

@@ -29,8 +29,8 @@ fn every_count_round_trips_under_noise() {
 
 #[test]
 fn spreading_comes_near_the_best_known_distances() {
-    // Best known: about 3.09/√K on the Fibonacci lattice for d = 3 (docs/internals/method.md#code-construction); measured .81 for
-    // 200 in d = 8.
+    // Best known: about 3.09/√K on the Fibonacci lattice for d = 3
+    // (docs/internals/method.md#code-construction); measured .81 for 200 in d = 8.
     let three = build(&entries(200, 64, 9), 3, 1).unwrap().codebook.min_chord;
     assert!(three > 0.6 * 3.09 / 200f32.sqrt(), "{three}");
     let eight = build(&entries(200, 64, 9), 8, 1).unwrap().codebook.min_chord;

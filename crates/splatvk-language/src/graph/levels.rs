@@ -1,9 +1,9 @@
 //! Three cuts of the merge tree.
 //!
-//! A fixed threshold cuts plain and printed things at different depths. What people call a thing is instead a node
-//! with a clear outline, so a level is the set of disjoint nodes with the largest total score (the rule by which HDBSCAN
-//! chooses clusters, Campello et al. 2013). Each level is cut by itself, so that what it
-//! holds does not hang on what a coarser one took.
+//! A fixed threshold cuts plain and printed things at different depths. What people call a thing is
+//! instead a node with a clear outline, so a level is the set of disjoint nodes with the largest
+//! total score (the rule by which HDBSCAN chooses clusters, Campello et al. 2013). Each level is
+//! cut by itself, so that what it holds does not hang on what a coarser one took.
 use super::options::{Cues, GraphOptions};
 use super::tree::Tree;
 use crate::scene::Plane;
@@ -34,8 +34,8 @@ fn inside(tree: &Tree, node: usize) -> Vec<usize> {
     tree.nodes[node].children.map_or(Vec::new(), |(a, b)| vec![a, b])
 }
 
-/// How clear the outline of a node is, weighed by its size. The share of costs over which it stays as it is, as in HDBSCAN,
-/// adds nothing to that: see `docs/internals/method.md#graph-masks`.
+/// How clear the outline of a node is, weighed by its size. The share of costs over which it stays
+/// as it is, as in HDBSCAN, adds nothing to that: see `docs/internals/method.md#graph-masks`.
 fn score(tree: &Tree, node: usize, area_power: f32, options: &GraphOptions) -> f32 {
     let r = &tree.nodes[node].region;
     let contour = r.contour / (r.perimeter - r.frame).max(1.0);
@@ -66,7 +66,8 @@ fn clearest(tree: &Tree, starts: &[usize], min_area: f32, score: impl Fn(usize) 
     chosen
 }
 
-/// The chosen nodes as a label map; what none of them covers joins the neighbour it shares the longest border with.
+/// The chosen nodes as a label map; what none of them covers joins the neighbour it shares the
+/// longest border with.
 fn paint(tree: &Tree, cues: &Cues, chosen: &[usize]) -> LevelMasks {
     let mut mask_of = vec![NONE; tree.leaves];
     for (mask, &node) in chosen.iter().enumerate() {

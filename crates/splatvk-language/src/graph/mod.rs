@@ -1,5 +1,6 @@
-//! Built-in masks without a large model: hierarchical merging of superpixels by colour and a learned boundary map; three
-//! cuts of the tree are the three levels. Method: `docs/internals/method.md#graph-masks`.
+//! Built-in masks without a large model: hierarchical merging of superpixels by colour and a
+//! learned boundary map; three cuts of the tree are the three levels. Method:
+//! `docs/internals/method.md#graph-masks`.
 mod levels;
 mod options;
 mod pixels;
@@ -15,7 +16,8 @@ use crate::scene::{Plane, RgbImage};
 use crate::{Error, Result};
 use options::Cues;
 
-/// Cuts one photo into masks of three levels. `edges` is a boundary probability per pixel, of the photo's size.
+/// Cuts one photo into masks of three levels. `edges` is a boundary probability per pixel, of the
+/// photo's size.
 pub fn segment(image: &RgbImage, edges: &Plane<f32>, options: &GraphOptions) -> Result<ViewMasks> {
     let (width, height) = (image.width, image.height);
     if (edges.width, edges.height) != (width, height) {

@@ -23,7 +23,8 @@ fn every_level_is_a_compact_partition() {
     assert!(again.levels.iter().zip(&masks.levels).all(|(a, b)| a.labels == b.labels));
 }
 
-/// A red square on grey, with a small blue dot inside the square; boundaries where the colour changes.
+/// A red square on grey, with a small blue dot inside the square; boundaries where the colour
+/// changes.
 fn square() -> (RgbImage, Plane<f32>, Plane<u32>) {
     let (width, height) = (320, 240);
     let mut image = RgbImage { width, height, data: vec![[0.5; 3]; width * height] };

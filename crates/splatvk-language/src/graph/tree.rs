@@ -183,8 +183,9 @@ fn union(a: &Region, b: &Region, shared: &Border) -> Region {
     out
 }
 
-/// Cost of merging two neighbours: how different their colours are and how strong the border between them is, less where it
-/// is much of the smaller one's outline, all weighed by size so that small regions go first.
+/// Cost of merging two neighbours: how different their colours are and how strong the border
+/// between them is, less where it is much of the smaller one's outline, all weighed by size so that
+/// small regions go first.
 fn merge_cost(a: &Region, b: &Region, border: &Border, total: f32, o: &GraphOptions) -> f32 {
     let small = if a.area <= b.area { a } else { b };
     let apart: f32 = (0..3).map(|c| (a.lab[c] / a.area - b.lab[c] / b.area).powi(2)).sum::<f32>().sqrt();

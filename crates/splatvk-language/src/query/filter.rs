@@ -1,4 +1,5 @@
-//! Smoothing and the LERF mask (docs/internals/method.md#smoothing, docs/internals/method.md#lerf-ovs).
+//! Smoothing and the LERF mask (docs/internals/method.md#smoothing,
+//! docs/internals/method.md#lerf-ovs).
 use crate::scene::Plane;
 use rayon::prelude::*;
 
@@ -8,8 +9,8 @@ const BOX: usize = 30;
 /// Side of the majority filter of the LERF protocol, pixels.
 const MAJORITY: usize = 7;
 
-/// 30×30 box mean with the window `x−15 … x+14`, border reflected without repeating the edge pixel (OpenCV
-/// `filter2D`, `REFLECT_101`).
+/// 30×30 box mean with the window `x−15 … x+14`, border reflected without repeating the edge pixel
+/// (OpenCV `filter2D`, `REFLECT_101`).
 pub fn box30(map: &Plane<f32>) -> Plane<f32> {
     box_filter(map, BOX, BOX / 2, reflect_101)
 }
@@ -20,7 +21,8 @@ pub fn blend(raw: &Plane<f32>, boxed: &Plane<f32>) -> Plane<f32> {
     Plane { width: raw.width, height: raw.height, data }
 }
 
-/// Protocol `lerf`: `clip(2·o − 1, 0, 1) > threshold` with o the min–max-normalised map, then a 7×7 majority.
+/// Protocol `lerf`: `clip(2·o − 1, 0, 1) > threshold` with o the min–max-normalised map, then a 7×7
+/// majority.
 pub fn lerf_mask(blended: &Plane<f32>, threshold: f32) -> Plane<bool> {
     let low = blended.data.iter().copied().fold(f32::INFINITY, f32::min);
     let high = blended.data.iter().map(|v| v - low).fold(0.0, f32::max) + 1e-9;
@@ -48,7 +50,8 @@ fn replicate(i: isize, n: usize) -> usize {
     i.clamp(0, n as isize - 1) as usize
 }
 
-/// Rows that one task of the vertical pass takes: enough that filling the first window is a small part of it.
+/// Rows that one task of the vertical pass takes: enough that filling the first window is a small
+/// part of it.
 const BAND: usize = 96;
 
 /// Separable mean over `size` pixels starting `anchor` before each pixel; running sums in f64.

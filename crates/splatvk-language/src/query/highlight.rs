@@ -3,8 +3,8 @@ use super::{QueryResult, TextQuery, field_relevancy};
 use crate::Result;
 use crate::scene::{LEVEL_NAMES, LanguageField, Plane};
 
-/// What viewers draw for a query. The level and the codes are those that answered in the views where the text was
-/// found, so that a viewer lights up what the views' masks show.
+/// What viewers draw for a query. The level and the codes are those that answered in the views
+/// where the text was found, so that a viewer lights up what the views' masks show.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Highlight {
     /// Chosen level, index as in [`LEVEL_NAMES`].
@@ -15,8 +15,8 @@ pub struct Highlight {
     pub relevancy: Vec<Vec<f32>>,
 }
 
-/// Sums up the answers to `query` in the frames whose decoded maps are `codes`. Views vote for a level with their score;
-/// where no view found anything, all of them vote.
+/// Sums up the answers to `query` in the frames whose decoded maps are `codes`. Views vote for a
+/// level with their score; where no view found anything, all of them vote.
 pub fn highlight(
     codes: &[&[Plane<i32>]],
     field: &LanguageField,

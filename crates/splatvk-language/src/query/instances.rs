@@ -5,18 +5,20 @@ use ahash::{HashMap, HashMapExt}; // quicker than the standard library's: a quer
 use glam::{DMat3, DQuat, DVec2, DVec3, IVec3};
 use rayon::prelude::*;
 
-/// Side of a cell, in median radii of the selected splats: cells that touch are one thing. On the data of [`LEAST_SHARE`] 3 to 8 tell the
-/// same things apart; with 2 more pieces are loose.
+/// Side of a cell, in median radii of the selected splats: cells that touch are one thing. On the
+/// data of [`LEAST_SHARE`] 3 to 8 tell the same things apart; with 2 more pieces are loose.
 const CELL: f64 = 4.0;
 
-/// A group of less than this share of the largest one is no thing of its own. In generated scenes of seeds 1 to 3 (tuning; opacities
-/// summed, cells of 4 radii) 56 things have 0.24 and more; of what is none, two pieces of wall have 0.24, the others 0.08 and less.
+/// A group of less than this share of the largest one is no thing of its own. In generated scenes
+/// of seeds 1 to 3 (tuning; opacities summed, cells of 4 radii) 56 things have 0.24 and more; of
+/// what is none, two pieces of wall have 0.24, the others 0.08 and less.
 const LEAST_SHARE: f64 = 0.15;
 
 /// Share of a group that lies outside its box on either side of an axis: a few splats always float.
 const OUTSIDE: f64 = 0.02;
 
-/// A splat is seen where the picture's depth is its own, up to this share: twice what depth is right to (`run::metric` of splatvk).
+/// A splat is seen where the picture's depth is its own, up to this share: twice what depth is
+/// right to (`run::metric` of splatvk).
 const DEPTH_SHARE: f64 = 0.03;
 
 /// Code of every splat, `argmax_k f·c_k`; none for splats without a feature.
@@ -36,7 +38,8 @@ pub struct Places {
     centres: Vec<DVec3>,
     /// [N] the two longest half axes (one standard deviation), world units.
     spans: Vec<[DVec3; 2]>,
-    /// [N] opacities. By area the few coarse splats of surfaces that no photo shows would outweigh a thing's many fine ones.
+    /// [N] opacities. By area the few coarse splats of surfaces that no photo shows would outweigh
+    /// a thing's many fine ones.
     weights: Vec<f64>,
     /// Per level [N], how far the photos agree on every splat; empty where that is not known.
     reliability: Vec<Vec<f32>>,
@@ -62,7 +65,8 @@ pub struct Instance {
     pub splats: Vec<usize>,
     /// Share of the weight of the selected splats that is its own.
     pub share: f64,
-    /// How far the photos agree on what it is, 0 to 1 (docs/internals/method.md#reliability); `None` where that is not known.
+    /// How far the photos agree on what it is, 0 to 1 (docs/internals/method.md#reliability);
+    /// `None` where that is not known.
     pub reliability: Option<f64>,
     /// Middle of the oriented box, world units.
     pub centre: DVec3,
@@ -70,7 +74,8 @@ pub struct Instance {
     pub bounds: [DVec3; 2],
     /// The box along its own axes.
     pub oriented: OrientedBox,
-    /// Per view the pixel that shows its middle, the first pixel's centre at (0.5, 0.5); `None` where it is not seen.
+    /// Per view the pixel that shows its middle, the first pixel's centre at (0.5, 0.5); `None`
+    /// where it is not seen.
     pub pixels: Vec<Option<[f64; 2]>>,
 }
 
@@ -215,7 +220,8 @@ impl Places {
         ((at - z).abs() <= DEPTH_SHARE * z).then_some(pixel)
     }
 
-    /// The pixel of a view that shows a thing's middle: of its splats that the view shows, the one nearest to their mean.
+    /// The pixel of a view that shows a thing's middle: of its splats that the view shows, the one
+    /// nearest to their mean.
     pub fn pixel(&self, instance: &Instance, camera: &Camera, depth: &Plane<f32>) -> Option<[f64; 2]> {
         let pixel = |&i: &usize| Some((self.seen(i, camera, depth)?, self.weights[i]));
         let seen: Vec<_> = instance.splats.iter().filter_map(pixel).collect();

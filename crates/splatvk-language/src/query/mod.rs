@@ -1,8 +1,9 @@
 //! Text queries and evaluation.
 //!
-//! A query is a unit vector and the canonical vectors of the same space. Its relevancy is computed once per code and
-//! gathered through the decoded code maps of a frame (docs/internals/method.md#queries). Level and location are chosen on the
-//! smoothed map; the mask of the `field` protocol is chosen on codes, so smoothing never moves its edges.
+//! A query is a unit vector and the canonical vectors of the same space. Its relevancy is computed
+//! once per code and gathered through the decoded code maps of a frame
+//! (docs/internals/method.md#queries). Level and location are chosen on the smoothed map; the mask
+//! of the `field` protocol is chosen on codes, so smoothing never moves its edges.
 pub mod filter;
 pub mod highlight;
 pub mod instances;
@@ -19,7 +20,8 @@ use rayon::prelude::*;
 /// The phrases that every query is compared against (LERF).
 pub const CANONICAL_PHRASES: [&str; 4] = ["object", "things", "stuff", "texture"];
 
-/// Cosines are multiplied by this before the softmax (LERF); without it no relevancy leaves 0.45 to 0.55.
+/// Cosines are multiplied by this before the softmax (LERF); without it no relevancy leaves 0.45 to
+/// 0.55.
 const LOGIT_SCALE: f64 = 10.0;
 
 /// A text query in the field's embedding space.
@@ -42,17 +44,19 @@ pub struct TextQuery {
 pub struct QueryOptions {
     /// Mask rule.
     pub mask: MaskRule,
-    /// A query whose best relevancy stays below this is "not found". 0.5 means: no closer than the nearest canonical
-    /// phrase (docs/internals/method.md#level-and-mask).
+    /// A query whose best relevancy stays below this is "not found". 0.5 means: no closer than the
+    /// nearest canonical phrase (docs/internals/method.md#level-and-mask).
     pub abs_threshold: f32,
-    /// For [`MaskRule::Codes`]: a part of a thing often matches a phrase a little better than the thing; the phrase still
-    /// means the thing. The coarsest level answers whose margin (see [`Slack`]) the best level's does not clearly exceed.
+    /// For [`MaskRule::Codes`]: a part of a thing often matches a phrase a little better than the
+    /// thing; the phrase still means the thing. The coarsest level answers whose margin (see
+    /// [`Slack`]) the best level's does not clearly exceed.
     pub slack: Slack,
 }
 
-/// By how much a coarser level may be worse and still answer. Levels are compared by their margin: how much nearer the
-/// best code is to the phrase than to every canonical phrase, in units of the cosine. Relevancy itself is the sigmoid of
-/// ten times that: it crowds good answers near 1 and would take their differences for nothing.
+/// By how much a coarser level may be worse and still answer. Levels are compared by their margin:
+/// how much nearer the best code is to the phrase than to every canonical phrase, in units of the
+/// cosine. Relevancy itself is the sigmoid of ten times that: it crowds good answers near 1 and
+/// would take their differences for nothing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Slack {
     /// Difference of margins that is noise of the features.
@@ -61,20 +65,22 @@ pub struct Slack {
     pub share: f32,
 }
 
-/// Measured on the breakfast photos: features of one thing seen from several sides differ by 0.01 where its margin is
-/// 0.02 ("box of cereal") and 0.03 to 0.09 where it is 0.2 to 0.5. On 80 perturbed segmentations the mean IoU is flat for
-/// margins of 0.02 to 0.03 with shares of 0.1 to 0.2, and 4 to 8 points lower without either.
+/// Measured on the breakfast photos: features of one thing seen from several sides differ by 0.01
+/// where its margin is 0.02 ("box of cereal") and 0.03 to 0.09 where it is 0.2 to 0.5. On 80
+/// perturbed segmentations the mean IoU is flat for margins of 0.02 to 0.03 with shares of 0.1 to
+/// 0.2, and 4 to 8 points lower without either.
 pub const SLACK: Slack = Slack { margin: 0.02, share: 0.1 };
 
 /// How the mask follows from relevancy.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub enum MaskRule {
-    /// Protocol `field`: the codes whose relevancy is at least this share of the way from 0.5 (as close as a canonical
-    /// phrase) to the best code of the level; their pixels are the mask, without smoothing.
+    /// Protocol `field`: the codes whose relevancy is at least this share of the way from 0.5 (as
+    /// close as a canonical phrase) to the best code of the level; their pixels are the mask,
+    /// without smoothing.
     Codes(f32),
-    /// Protocol `lerf` (docs/internals/method.md#lerf-ovs): threshold on the min–max-normalised smoothed map, then a 7×7 majority
-    /// filter.
+    /// Protocol `lerf` (docs/internals/method.md#lerf-ovs): threshold on the min–max-normalised
+    /// smoothed map, then a 7×7 majority filter.
     Lerf(f32),
 }
 
@@ -84,8 +90,9 @@ impl Default for QueryOptions {
     }
 }
 
-/// With 0.8, a code joins the best one when it is nearly as relevant: the pieces of an object that was cut into several
-/// masks with alike features do, a different object whose phrase shares some meaning does not.
+/// With 0.8, a code joins the best one when it is nearly as relevant: the pieces of an object that
+/// was cut into several masks with alike features do, a different object whose phrase shares some
+/// meaning does not.
 pub const CODE_SHARE: f32 = 0.8;
 
 /// The answer to one query in one frame.
@@ -93,7 +100,8 @@ pub const CODE_SHARE: f32 = 0.8;
 pub struct QueryResult {
     /// Chosen level, index as in [`crate::scene::LEVEL_NAMES`].
     pub level: usize,
-    /// [H, W] blended relevancy of the chosen level (docs/internals/method.md#smoothing), 0 where nothing is.
+    /// [H, W] blended relevancy of the chosen level (docs/internals/method.md#smoothing), 0 where
+    /// nothing is.
     pub relevancy: Plane<f32>,
     /// [H, W] the mask.
     pub mask: Plane<bool>,
@@ -106,7 +114,8 @@ pub struct QueryResult {
 }
 
 impl QueryResult {
-    /// Without a mask, which would look like an answer; what is nearest stays to see in the relevancy.
+    /// Without a mask, which would look like an answer; what is nearest stays to see in the
+    /// relevancy.
     pub fn take_back(&mut self) {
         self.found = false;
         self.mask.data.fill(false);
@@ -131,7 +140,8 @@ pub fn code_relevancy(codebook: &Codebook, query: &TextQuery) -> Result<Vec<f32>
     Ok(codebook.embeddings.chunks_exact(d).map(one).collect())
 }
 
-/// Relevancy of a text whose cosine to the region embedding `phi` is known, against canonical rows [C, D].
+/// Relevancy of a text whose cosine to the region embedding `phi` is known, against canonical rows
+/// [C, D].
 pub fn relevancy(phi: &[f32], cosine: f64, canonicals: &[f32]) -> f32 {
     let hardest =
         canonicals.chunks_exact(phi.len().max(1)).map(|n| dot(phi, n)).fold(f64::NEG_INFINITY, f64::max);
@@ -144,7 +154,8 @@ pub fn relevancy_map(codes: &Plane<i32>, relevancy: &[f32]) -> Plane<f32> {
     Plane { width: codes.width, height: codes.height, data: codes.data.par_iter().map(value).collect() }
 }
 
-/// Answers a query in one frame. `codes` holds the frame's decoded map per level; levels without codes are skipped.
+/// Answers a query in one frame. `codes` holds the frame's decoded map per level; levels without
+/// codes are skipped.
 pub fn answer(
     codes: &[Plane<i32>],
     field: &LanguageField,
@@ -175,8 +186,9 @@ pub fn field_relevancy(field: &LanguageField, query: &TextQuery) -> Result<Vec<V
     field.levels.iter().map(one).collect()
 }
 
-/// Where the best code is of the colour that the query names, codes that fit another colour better are no answers: "yellow brick"
-/// means no green one, however alike bricks are. Where it is not, features say too little of colours to go by them.
+/// Where the best code is of the colour that the query names, codes that fit another colour better
+/// are no answers: "yellow brick" means no green one, however alike bricks are. Where it is not,
+/// features say too little of colours to go by them.
 fn other_colours_out(book: &Codebook, query: &TextQuery, relevancy: &mut [f32]) {
     let rows = || book.embeddings.chunks_exact(book.embedding_dim.max(1));
     let of_colour = |row: &[f32]| {
@@ -214,8 +226,9 @@ pub fn answer_with(
         .collect();
     let chosen = choose_level(&candidates, options)
         .ok_or_else(|| Error::work("the scene has no language level to query"))?;
-    // With masks of codes the other levels count for the location: the whole "plate" may hold a lemon, which finer
-    // levels tell apart. The published protocols use the chosen level alone (docs/internals/method.md#lerf-ovs).
+    // With masks of codes the other levels count for the location: the whole "plate" may hold a
+    // lemon, which finer levels tell apart. The published protocols use the chosen level alone
+    // (docs/internals/method.md#lerf-ovs).
     let all = matches!(options.mask, MaskRule::Codes(_)).then(|| filter::box30(&sum(&candidates)));
     let best = candidates.swap_remove(chosen);
     let boxed = filter::box30(&best.raw);
@@ -239,9 +252,10 @@ fn highest(map: &Plane<f32>) -> f32 {
     map.data.iter().copied().fold(f32::NEG_INFINITY, f32::max)
 }
 
-/// The published protocols take the peak of the blended map (docs/internals/method.md#lerf-ovs). For masks of codes it is the
-/// margin whose relevancy is the peak of the blended *excess* over a canonical phrase, `max(0, 2·rel − 1)`: smoothing
-/// then counts against specks, which the usual 0.5 of their surroundings would hide.
+/// The published protocols take the peak of the blended map (docs/internals/method.md#lerf-ovs).
+/// For masks of codes it is the margin whose relevancy is the peak of the blended *excess* over a
+/// canonical phrase, `max(0, 2·rel − 1)`: smoothing then counts against specks, which the usual 0.5
+/// of their surroundings would hide.
 fn level_peak(raw: &Plane<f32>, rule: MaskRule) -> f32 {
     if !matches!(rule, MaskRule::Codes(_)) {
         return highest(&filter::blend(raw, &filter::box30(raw)));
@@ -274,7 +288,8 @@ fn first_best(peaks: &[f32]) -> Option<usize> {
     peaks.iter().position(|&p| p >= top)
 }
 
-/// The last level whose margin the best one's does not clearly exceed; the best one where no phrase is near.
+/// The last level whose margin the best one's does not clearly exceed; the best one where no phrase
+/// is near.
 fn coarsest_good(peaks: &[f32], slack: Slack) -> Option<usize> {
     let top = peaks.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     if top > 0.0 {
@@ -307,14 +322,14 @@ fn locate(evidence: &[f32], mask: &Plane<bool>) -> (usize, usize) {
     (p % mask.width.max(1), p / mask.width.max(1))
 }
 
-/// Relevancy from which a code joins the best one. Above 0.5 a code is closer to the phrase than to every canonical; the
-/// bar lies a share of the way from there.
+/// Relevancy from which a code joins the best one. Above 0.5 a code is closer to the phrase than to
+/// every canonical; the bar lies a share of the way from there.
 fn code_bar(top: f32, share: f32) -> f32 {
     if top > 0.5 { 0.5 + share * (top - 0.5) } else { top }
 }
 
-/// Pixels of the codes that answer the query ([`MaskRule::Codes`]). Only codes that this frame shows compete, so that a
-/// code seen elsewhere does not suppress the best one here.
+/// Pixels of the codes that answer the query ([`MaskRule::Codes`]). Only codes that this frame
+/// shows compete, so that a code seen elsewhere does not suppress the best one here.
 fn code_mask(map: &Plane<i32>, relevancy: &[f32], share: f32) -> Plane<bool> {
     let mut shown = vec![false; relevancy.len()];
     for &k in map.data.iter().filter(|&&k| k >= 0) {

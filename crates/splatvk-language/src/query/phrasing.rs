@@ -1,9 +1,11 @@
-//! Words of a text that no embedding of a few words carries: negations, places, and choices among several. A text that has them is
-//! answered for the rest of it, and says so (docs/internals/method.md#phrasing).
+//! Words of a text that no embedding of a few words carries: negations, places, and choices among
+//! several. A text that has them is answered for the rest of it, and says so
+//! (docs/internals/method.md#phrasing).
 use crate::{Error, Result};
 use serde::Serialize;
 
-/// Most characters of a question. A thing is named in a few words; text models read about 77 or 128 parts of words.
+/// Most characters of a question. A thing is named in a few words; text models read about 77 or 128
+/// parts of words.
 pub const MOST_CHARACTERS: usize = 300;
 /// Most words of a question.
 pub const MOST_WORDS: usize = 40;
@@ -32,8 +34,8 @@ const NEGATIONS: &str =
 const PLACES: &str = "on|in|inside|outside|at|under|underneath|beneath|below|above|over|behind|beside|besides|near|between|among|\
     around|against|opposite|across|by the|next to|close to|in front of|on top of|left of|right of|to the left|to the right";
 
-/// Of those, the ones that also begin names of things: "over ear headphones", "in line skates". They count at the start of a text
-/// only before an article.
+/// Of those, the ones that also begin names of things: "over ear headphones", "in line skates".
+/// They count at the start of a text only before an article.
 const PARTICLES: &str = "on|in|inside|outside|at|under|above|over|across|around";
 
 /// Words before a particle with which it makes one name: "carry on bag", "plug in", "pull over".
@@ -122,7 +124,8 @@ pub fn read(text: &str) -> Option<Phrasing> {
         let place =
             matches!(word.as_str(), "left" | "right") && words.get(start + 1).is_some_and(|w| w == "of");
         if !place && !in_name(&words, start) {
-            // What stands behind the choice may have more to leave out: "the second cup on the table".
+            // What stands behind the choice may have more to leave out: "the second cup on the
+            // table".
             let rest = said[start + 1..].join(" ");
             let inner = read(&rest);
             let answered = inner.as_ref().map_or(rest.as_str(), |p| p.answers_for.as_str());
@@ -137,7 +140,8 @@ pub fn read(text: &str) -> Option<Phrasing> {
     let end = words[..from].iter().rposition(|w| !is(LOOSE_ENDS, w)).map_or(0, |last| last + 1);
     match words[..end].iter().any(|w| !is(ARTICLES, w)) {
         true => split(&said[..end], &said[from..]),
-        // "left of the plate", "not the red one": what the words are about is all there is to look for.
+        // "left of the plate", "not the red one": what the words are about is all there is to look
+        // for.
         false => {
             let behind = words[at + length..].iter().take_while(|w| is(ARTICLES, w) || *w == "of").count();
             split(&said[at + length + behind..], &said[from..at + length])

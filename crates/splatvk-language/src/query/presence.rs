@@ -1,5 +1,6 @@
-//! Whether a scene shows what a text means (docs/internals/method.md#presence): a text is weighed against other things that it could have
-//! said. One that fits the scene no better than they do is no evidence of anything.
+//! Whether a scene shows what a text means (docs/internals/method.md#presence): a text is weighed
+//! against other things that it could have said. One that fits the scene no better than they do is
+//! no evidence of anything.
 use crate::math::dot_f32 as dot;
 use crate::scene::{LanguageField, Plane};
 use rayon::prelude::*;
@@ -9,12 +10,14 @@ use std::sync::Arc;
 /// Fewer other things tell nothing: the least share that they can state is above [`FOUND`].
 pub const MIN_OTHERS: usize = 20;
 
-/// Share of other things that fit at least as well, up to which a text is found. Of texts that are not in the scene no more than
-/// this share is called found, as far as they are like the other things: the level of a conformal test.
+/// Share of other things that fit at least as well, up to which a text is found. Of texts that are
+/// not in the scene no more than this share is called found, as far as they are like the other
+/// things: the level of a conformal test.
 pub const FOUND: f32 = 0.05;
 
-/// The same, from which on a text is not in the scene: three of four things that are hardly there fit better. Of what is in
-/// `breakfast` and five generated scenes (tuning; built-in words) one in sixteen is above, of what is not one in seven.
+/// The same, from which on a text is not in the scene: three of four things that are hardly there
+/// fit better. Of what is in `breakfast` and five generated scenes (tuning; built-in words) one in
+/// sixteen is above, of what is not one in seven.
 const ABSENT: f32 = 0.75;
 
 /// Codes that show less than this share of all pixels are specks, which answer anything by chance.
@@ -117,8 +120,8 @@ impl<'f> ShownCodes<'f> {
         ShownCodes { codes }
     }
 
-    /// The code that fits a text best, and by how much it is nearer to it than to every canonical phrase, as a difference of
-    /// cosines.
+    /// The code that fits a text best, and by how much it is nearer to it than to every canonical
+    /// phrase, as a difference of cosines.
     fn best(&self, text: &[f32]) -> Option<(&'f [f32], f32)> {
         let fits = self.codes.iter().map(|(row, common)| (*row, dot(row, text) - common));
         fits.max_by(|a, b| a.1.total_cmp(&b.1))
@@ -131,8 +134,9 @@ impl<'f> ShownCodes<'f> {
         Background { scores: scores.collect() }
     }
 
-    /// What speaks for a text against the scores of other things, and its embedding in other colours ([`Alternatives::colours`]);
-    /// `None` where there are too few other things to say, or no code is shown.
+    /// What speaks for a text against the scores of other things, and its embedding in other
+    /// colours ([`Alternatives::colours`]); `None` where there are too few other things to say, or
+    /// no code is shown.
     pub fn evidence(&self, text: &[f32], colours: &[f32], background: &Background) -> Option<Evidence> {
         if background.scores.len() < MIN_OTHERS {
             return None;

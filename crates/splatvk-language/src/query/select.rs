@@ -1,4 +1,5 @@
-//! Splats that a query selects in space, without any view (docs/internals/method.md#selection-in-space).
+//! Splats that a query selects in space, without any view
+//! (docs/internals/method.md#selection-in-space).
 use super::instances::Places;
 use super::{MaskRule, QueryOptions, TextQuery, field_relevancy, margin};
 use crate::Result;
@@ -21,8 +22,8 @@ pub struct Selection {
     pub found: bool,
 }
 
-/// Selects by the rule of the `field` masks: the coarsest level that is nearly as good as the best one answers, and of its
-/// codes those nearly as relevant as the best.
+/// Selects by the rule of the `field` masks: the coarsest level that is nearly as good as the best
+/// one answers, and of its codes those nearly as relevant as the best.
 pub fn select(
     field: &LanguageField,
     places: &Places,

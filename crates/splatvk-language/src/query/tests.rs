@@ -88,7 +88,8 @@ fn the_mask_follows_code_borders_exactly() {
 #[test]
 fn a_speck_does_not_outvote_the_whole() {
     let mut part = frame();
-    // level 1 shows the better code 0 on a few pixels only, level 2 its near-copy over the whole square
+    // level 1 shows the better code 0 on a few pixels only, level 2 its near-copy over the whole
+    // square
     part.data.iter_mut().filter(|k| **k == 0 || **k == 2).for_each(|k| *k = 1);
     for p in [12 * 60 + 25, 12 * 60 + 26, 13 * 60 + 25] {
         part.data[p] = 0;
@@ -152,7 +153,8 @@ fn an_all_void_frame_has_an_empty_mask() {
     assert!(!r.found && r.mask.data.iter().all(|m| !m));
 }
 
-/// Distinct unit vectors per object that share a strong common direction, as image features of one photo set do.
+/// Distinct unit vectors per object that share a strong common direction, as image features of one
+/// photo set do.
 fn oracle_vectors(count: usize, dim: usize) -> Vec<Vec<f32>> {
     let mut state = 11u64;
     let mut normal = || {
@@ -227,7 +229,8 @@ fn perfect_masks_and_distinct_features_answer_every_phrase() {
 
 #[test]
 fn the_location_avoids_what_a_finer_level_tells_apart() {
-    // The whole (level 2) spans a rectangle; on level 1 only its right part matches, as a plate around a lemon does.
+    // The whole (level 2) spans a rectangle; on level 1 only its right part matches, as a plate
+    // around a lemon does.
     let map = |from: usize| {
         let inside = |p: usize| (from..180).contains(&(p % 200)) && (20..100).contains(&(p / 200));
         let data = (0..200 * 120).map(|p| if inside(p) { 0 } else { 1 }).collect();

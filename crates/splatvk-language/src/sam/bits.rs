@@ -94,8 +94,8 @@ impl Bits {
         pairs.map(|(a, b)| (a & b).count_ones() as usize).sum()
     }
 
-    /// Fills holes and removes islands (8-connected) smaller than `least`; keeps the largest island if all are small. True
-    /// when something changed.
+    /// Fills holes and removes islands (8-connected) smaller than `least`; keeps the largest island
+    /// if all are small. True when something changed.
     pub fn clean(&mut self, least: usize) -> bool {
         let mut grid: Vec<bool> = (0..self.width * self.height).map(|p| self.has(p)).collect();
         let mut changed = false;
@@ -106,7 +106,8 @@ impl Bits {
                 continue;
             }
             let largest = (0..sizes.len()).max_by_key(|k| sizes[*k]);
-            // A mask of small islands only stays what its largest one is; an image of small holes only is filled.
+            // A mask of small islands only stays what its largest one is; an image of small holes
+            // only is filled.
             let all_small = island && !small.contains(&false);
             for (value, piece) in grid.iter_mut().zip(&pieces) {
                 let Some(k) = piece else { continue };

@@ -1,8 +1,10 @@
-//! Logits at points → proposals: enlarged to the photo, tested for stability, cut-off ones dropped, kept as runs.
+//! Logits at points → proposals: enlarged to the photo, tested for stability, cut-off ones dropped,
+//! kept as runs.
 use rayon::prelude::*;
 use splatvk_infer::sam::{MASKS, Proposals};
 
-/// Boxes nearer than this to a crop's border are cut off there, pixels (docs/internals/method.md#masks-from-points).
+/// Boxes nearer than this to a crop's border are cut off there, pixels
+/// (docs/internals/method.md#masks-from-points).
 pub(super) const BORDER: i32 = 20;
 
 /// A rectangle of the photo, pixels, ends excluded.
@@ -28,7 +30,8 @@ pub(super) struct MaskProposal {
 /// Logit offset of the stability test (docs/internals/method.md#masks-from-points).
 const OFFSET: f32 = 1.0;
 
-/// One axis of the enlargement: first source index and the weight of the next one, per target pixel.
+/// One axis of the enlargement: first source index and the weight of the next one, per target
+/// pixel.
 fn axis(pixels: usize, cells: usize, filled: f64) -> Vec<(usize, f32)> {
     let scale = cells as f64 * filled / pixels as f64;
     let one = |p: usize| {
@@ -41,8 +44,8 @@ fn axis(pixels: usize, cells: usize, filled: f64) -> Vec<(usize, f32)> {
 
 /// The proposals that pass `least` = (predicted IoU, stability), per point three, in order.
 ///
-/// The logits are enlarged bilinearly straight to the photo; SAM goes through 1024 pixels first, which differs by less than
-/// the grid of the logits resolves.
+/// The logits are enlarged bilinearly straight to the photo; SAM goes through 1024 pixels first,
+/// which differs by less than the grid of the logits resolves.
 pub(super) fn candidates(
     proposals: &Proposals,
     points: &[[f64; 2]],

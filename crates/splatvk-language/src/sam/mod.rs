@@ -1,6 +1,6 @@
-//! Masks from a network that is prompted with points (docs/internals/method.md#masks-from-points): a grid of points over the photo and
-//! over four overlapping crops, three masks each, one list per level; poor, unstable and doubled ones are dropped and
-//! the rest painted into label maps.
+//! Masks from a network that is prompted with points (docs/internals/method.md#masks-from-points):
+//! a grid of points over the photo and over four overlapping crops, three masks each, one list per
+//! level; poor, unstable and doubled ones are dropped and the rest painted into label maps.
 mod bits;
 mod filter;
 mod nms;
@@ -40,7 +40,8 @@ pub struct SamOptions {
     pub mask_overlap: f32,
     /// Least predicted IoU · stability.
     pub min_score: f32,
-    /// Paint masks in the order in which they came, those that needed a clean-up last, as LangSplat does; else larger ones first.
+    /// Paint masks in the order in which they came, those that needed a clean-up last, as LangSplat
+    /// does; else larger ones first.
     pub paint_in_order: bool,
 }
 
@@ -60,10 +61,12 @@ impl Default for SamOptions {
     }
 }
 
-/// Proposals below these are not kept, so that thresholds can be lowered to them without asking the network again.
+/// Proposals below these are not kept, so that thresholds can be lowered to them without asking the
+/// network again.
 const KEPT: (f32, f32) = (0.5, 0.5);
 
-/// The photo and, if asked for, the four overlapping quarters of layer 1 (docs/internals/method.md#masks-from-points).
+/// The photo and, if asked for, the four overlapping quarters of layer 1
+/// (docs/internals/method.md#masks-from-points).
 fn crops(width: usize, height: usize, quarters: bool) -> Vec<Crop> {
     let mut all = vec![Crop { x0: 0, y0: 0, x1: width, y1: height }];
     if quarters {
@@ -185,7 +188,8 @@ fn choose(candidates: Vec<MaskProposal>, width: usize, height: usize, options: &
                 changed: false,
             })
             .collect();
-        // Per crop the best guess wins, across crops the closest look, after the clean-up what needed none.
+        // Per crop the best guess wins, across crops the closest look, after the clean-up what
+        // needed none.
         let mut kept: Vec<Mask> = Vec::new();
         for crop in 0..areas.len() {
             let some = mine.iter().filter(|m| m.crop == crop).cloned().collect();

@@ -20,8 +20,8 @@ impl Mask {
     }
 }
 
-/// Largest share of the inner mask that may be seen as lying inside another, and the other's share below which it is the
-/// larger one (docs/internals/method.md#masks-from-points).
+/// Largest share of the inner mask that may be seen as lying inside another, and the other's share
+/// below which it is the larger one (docs/internals/method.md#masks-from-points).
 const INSIDE: (f32, f32) = (0.85, 0.5);
 
 /// Intersection over union of boxes.
@@ -36,8 +36,8 @@ fn box_overlap(a: &(Range<usize>, Range<usize>), b: &(Range<usize>, Range<usize>
     if either > 0.0 { both / either } else { 0.0 }
 }
 
-/// Keeps the masks whose boxes overlap no better one's by more than `most`, in the order in which they came. Ties go to the
-/// higher predicted IoU, then to the first.
+/// Keeps the masks whose boxes overlap no better one's by more than `most`, in the order in which
+/// they came. Ties go to the higher predicted IoU, then to the first.
 pub(super) fn boxes(masks: Vec<Mask>, most: f32, score: impl Fn(&Mask) -> f32) -> Vec<Mask> {
     let mut order: Vec<usize> = (0..masks.len()).collect();
     let rank = |i: usize| (score(&masks[i]), masks[i].iou);
@@ -53,8 +53,9 @@ pub(super) fn boxes(masks: Vec<Mask>, most: f32, score: impl Fn(&Mask) -> f32) -
     masks.into_iter().zip(stays).filter(|(_, s)| *s).map(|(m, _)| m).collect()
 }
 
-/// Drops masks that overlap a better one by more than `most`, that score no more than `least`, or of which at least 85 % lie
-/// inside a mask of the same level of which they cover less than half. If nothing is left, the three best stay.
+/// Drops masks that overlap a better one by more than `most`, that score no more than `least`, or
+/// of which at least 85 % lie inside a mask of the same level of which they cover less than half.
+/// If nothing is left, the three best stay.
 pub(super) fn masks(masks: Vec<Mask>, most: f32, least: f32) -> Vec<Mask> {
     let mut order: Vec<usize> = (0..masks.len()).collect();
     order.sort_by(|a, b| masks[*b].score().total_cmp(&masks[*a].score()));

@@ -4,9 +4,9 @@ use crate::LevelMasks;
 use crate::dir::MIN_MASK_PIXELS;
 use crate::scene::Plane;
 
-/// Larger masks first, so that small ones lie on top, and of equal ones the better on top; or `in_order`, those that were cleaned
-/// up on top. Masks of which fewer than
-/// [`MIN_MASK_PIXELS`] remain visible are dropped.
+/// Larger masks first, so that small ones lie on top, and of equal ones the better on top; or
+/// `in_order`, those that were cleaned up on top. Masks of which fewer than [`MIN_MASK_PIXELS`]
+/// remain visible are dropped.
 pub(super) fn labels(masks: &[Mask], in_order: bool, width: usize, height: usize) -> LevelMasks {
     let mut order: Vec<usize> = (0..masks.len()).collect();
     if in_order {

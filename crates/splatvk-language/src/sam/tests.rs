@@ -11,7 +11,8 @@ const LOW: usize = 64;
 /// Radii of the single guess and of the three levels, pixels of the 256-pixel input.
 const RADII: [f32; 4] = [1.0, 25.0, 30.0, 60.0];
 
-/// Logits (radius² − distance²) / 40 around the point: stability follows from the radius, the predicted IoU is given.
+/// Logits (radius² − distance²) / 40 around the point: stability follows from the radius, the
+/// predicted IoU is given.
 fn disc_network(folder: &Path, iou: [f32; 4]) {
     Onnx::new()
         .input("image", FLOAT, "1 3 256 256")
@@ -73,12 +74,13 @@ fn toy(iou: [f32; 4], options: &SamOptions, size: (usize, usize)) -> ViewMasks {
 fn every_level_holds_the_discs_of_its_radius() {
     let options = SamOptions { points: 3, crops: false, ..SamOptions::default() };
     let view = toy([0.99, 0.9, 0.9, 0.9], &options, (256, 192));
-    // A 3 × 3 grid on 256 × 192: 85 × 64 apart. Discs of radius 25 and 30 do not touch; those of 60 overlap, with a box IoU
-    // of 0.36 at most.
+    // A 3 × 3 grid on 256 × 192: 85 × 64 apart. Discs of radius 25 and 30 do not touch; those of 60
+    // overlap, with a box IoU of 0.36 at most.
     let level = |k: usize| &view.levels[k];
     assert_eq!([0, 1, 2].map(|k| level(k).quality.len()), [9, 9, 9]);
     for k in 0..9 {
-        // π r², to the coarse grid's error: interpolation lowers the logits by up to 0.2, that is r² by 8 of 625.
+        // π r², to the coarse grid's error: interpolation lowers the logits by up to 0.2, that is
+        // r² by 8 of 625.
         let area = level(0).labels.data.iter().filter(|l| **l == k).count() as f64;
         assert!((area / (std::f64::consts::PI * 625.0) - 1.0).abs() < 0.03, "{k}: {area}");
         // Point k of the grid lies in disc k.
@@ -136,7 +138,8 @@ const REFERENCE: [[usize; 4]; 5] =
 
 #[test]
 fn a_mask_seen_in_a_crop_lies_where_the_crop_does() {
-    // Logits of ten pixels each in a crop of 140 × 110; the mask is columns 5 to 8 and rows 4 to 7 of them.
+    // Logits of ten pixels each in a crop of 140 × 110; the mask is columns 5 to 8 and rows 4 to 7
+    // of them.
     let (width, height) = (14, 11);
     let inside = |k: usize| (5..9).contains(&(k % width)) && (4..8).contains(&(k / width));
     let logits = (0..MASKS * width * height).map(|k| if inside(k) { 10.0 } else { -10.0 }).collect();

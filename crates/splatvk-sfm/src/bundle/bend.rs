@@ -1,21 +1,24 @@
-//! What smooth displacements do to the result: of all that a projection leaves out (a lens that is not quite radial, a rolling
-//! shutter, a sensor or a paper that is not flat), and that more sightings do not average away.
+//! What smooth displacements do to the result: of all that a projection leaves out (a lens that is
+//! not quite radial, a rolling shutter, a sensor or a paper that is not flat), and that more
+//! sightings do not average away.
 use super::normal::Normal;
 use super::{OPTICS, Problem};
 use glam::{DVec2, DVec3};
 use nalgebra::DMatrix;
 
-/// Displacements of a photo by second-order polynomials of the place in it: those of first order are turns and zooms, which have
-/// parameters, and shears, which cameras do not have.
+/// Displacements of a photo by second-order polynomials of the place in it: those of first order
+/// are turns and zooms, which have parameters, and shears, which cameras do not have.
 pub(super) const PATTERNS: usize = 6;
 
-/// Displacements in units of their largest in the picture; `at`: the place from the middle in half long sides.
+/// Displacements in units of their largest in the picture; `at`: the place from the middle in half
+/// long sides.
 pub(super) fn patterns(at: DVec2) -> [DVec2; PATTERNS] {
     let squares = [at.x * at.x, at.x * at.y, at.y * at.y];
     std::array::from_fn(|k| if k < 3 { DVec2::X * squares[k] } else { DVec2::Y * squares[k - 3] })
 }
 
-/// Deviations of the parameters that independent displacements by every pattern in every photo bring.
+/// Deviations of the parameters that independent displacements by every pattern in every photo
+/// bring.
 pub(crate) struct Bent {
     /// Of ln f, k1, k2 and the shift per group; 0 where held.
     pub(crate) optics: Vec<[f64; OPTICS]>,
@@ -24,8 +27,8 @@ pub(crate) struct Bent {
 }
 
 impl Problem {
-    /// What displaced photos do; per camera, in pixels, half of the long side and by how much each pattern displaces its ends. `None`
-    /// where the photos leave a parameter open altogether.
+    /// What displaced photos do; per camera, in pixels, half of the long side and by how much each
+    /// pattern displaces its ends. `None` where the photos leave a parameter open altogether.
     pub(crate) fn bent(&self, c: f64, half_long: &[f64], by: &[f64]) -> Option<Bent> {
         let normal = self.linearise(c);
         let moved = self.covariance(&normal)? * self.gradients(&normal, c, half_long, by);
@@ -46,8 +49,8 @@ impl Problem {
         Some(bent)
     }
 
-    /// Gradients of the cost in the cameras' parameters, points eliminated, by the displacements: a column per camera and
-    /// pattern.
+    /// Gradients of the cost in the cameras' parameters, points eliminated, by the displacements: a
+    /// column per camera and pattern.
     fn gradients(&self, normal: &Normal, c: f64, half_long: &[f64], by: &[f64]) -> DMatrix<f64> {
         let mut out = DMatrix::zeros(self.sizes().1, PATTERNS * self.poses.len());
         let of_points = self.observations.chunk_by(|a, b| a.point == b.point);

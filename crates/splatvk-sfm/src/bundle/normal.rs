@@ -5,7 +5,8 @@ use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
-/// Normal equations: camera block (poses 1.., then optics; lower triangle), and per point its own block and coupling.
+/// Normal equations: camera block (poses 1.., then optics; lower triangle), and per point its own
+/// block and coupling.
 pub(super) struct Normal {
     pub(super) h: DMatrix<f64>,
     pub(super) g: DVector<f64>,
@@ -162,7 +163,8 @@ impl Problem {
         let (r2, bent) = (x.length_squared(), optics.lens.distort(x));
         let free = self.priors[group].deviations(optics).map(|d| d.1 > 0.0);
         let by_optics = [0, 1].map(|axis| {
-            // By ln f, which is the centred pixel itself, the lens and the shift; what is held has no derivative.
+            // By ln f, which is the centred pixel itself, the lens and the shift; what is held has
+            // no derivative.
             let mut by = [f * bent[axis], f * x[axis] * r2, f * x[axis] * r2 * r2, 0.0, 0.0, 0.0];
             by[3 + axis] = zoom / o.sigma;
             by.iter_mut().zip(free).filter(|(_, free)| !free).for_each(|(b, _)| *b = 0.0);
@@ -173,7 +175,8 @@ impl Problem {
         Some(Derivatives { r, w, by_point: rows.map(|row| to_world * row), by: [pose, Some(own)] })
     }
 
-    /// The camera system after eliminating the points, with damping λ on every diagonal; the lower triangle.
+    /// The camera system after eliminating the points, with damping λ on every diagonal; the lower
+    /// triangle.
     pub(super) fn reduce(normal: &Normal, lambda: f64) -> (DMatrix<f64>, DVector<f64>, Vec<DMat3>) {
         let (mut s, mut b) = (normal.h.clone(), normal.g.clone());
         for i in 0..b.len() {
@@ -190,7 +193,8 @@ impl Problem {
         (s, b, inverses)
     }
 
-    /// What eliminating some points takes away from a camera system of `n` parameters, and the inverses of their blocks.
+    /// What eliminating some points takes away from a camera system of `n` parameters, and the
+    /// inverses of their blocks.
     fn eliminate(points: &[PointBlock], n: usize, lambda: f64) -> (DMatrix<f64>, DVector<f64>, Vec<DMat3>) {
         let (mut h, mut g) = (DMatrix::zeros(n, n), DVector::zeros(n));
         let inverses: Vec<DMat3> = points.iter().map(|p| p.inverse(lambda)).collect();

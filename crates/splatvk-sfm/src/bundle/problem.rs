@@ -28,7 +28,8 @@ pub(crate) struct Optics {
 /// Number of parameters of [`Optics`]: ln f, k1, k2, shift.
 pub(crate) const OPTICS: usize = 5;
 
-/// What is known of optics before the images are seen, as normal deviates. σ = 0 holds a parameter where it is.
+/// What is known of optics before the images are seen, as normal deviates. σ = 0 holds a parameter
+/// where it is.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct OpticsPrior {
     /// ln f and its σ.
@@ -79,7 +80,8 @@ pub(crate) struct Problem {
     pub(crate) centres: Vec<DVec2>,
     /// Which optics each camera uses.
     pub(crate) group: Vec<usize>,
-    /// Pixels of each camera per original pixel of its optics: photos of one camera may be scaled differently.
+    /// Pixels of each camera per original pixel of its optics: photos of one camera may be scaled
+    /// differently.
     pub(crate) zoom: Vec<f64>,
     /// Per group.
     pub(crate) optics: Vec<Optics>,
@@ -95,7 +97,8 @@ pub(crate) struct Problem {
 pub(crate) struct Adjusted {
     /// Robust cost, in squared standard deviations.
     pub(crate) cost: f64,
-    /// σ of ln f, k1, k2 and the shift per group, from the observations and the priors; 0 where held.
+    /// σ of ln f, k1, k2 and the shift per group, from the observations and the priors; 0 where
+    /// held.
     pub(crate) sigmas: Vec<[f64; OPTICS]>,
     /// σ of the rotation of every pose against the first, about its least certain axis, radians.
     pub(crate) rotation_sigmas: Vec<f64>,

@@ -103,7 +103,8 @@ fn lens_and_principal_point_are_recovered_where_they_are_free() {
     assert_eq!(out.sigmas[0][1..], [0.0; 4], "what is held has no uncertainty");
 }
 
-/// The problem after a step in its parameters, numbered as in the normal equations and the points after them.
+/// The problem after a step in its parameters, numbered as in the normal equations and the points
+/// after them.
 fn moved(p: &Problem, at: usize, h: f64) -> Problem {
     let (poses, cameras) = p.sizes();
     let mut q = p.clone();

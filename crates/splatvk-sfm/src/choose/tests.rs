@@ -120,7 +120,8 @@ fn photos_of_two_places_are_not_mixed() {
     let links = (0..n).map(|i| (0..n).map(|j| link(i, j)).collect()).collect();
     let graph = Graph { links, quality: vec![1.0; n], same: vec![vec![false; n]; n] };
     let chosen = graph.choose(4);
-    // Two of each place would show more in all, but no camera of one could be placed among those of the other.
+    // Two of each place would show more in all, but no camera of one could be placed among those of
+    // the other.
     assert!(chosen.iter().all(|i| !place(*i)), "{chosen:?}");
     let names: Vec<String> = (0..n).map(|i| i.to_string()).collect();
     assert_eq!(graph.reason(4, &chosen, &names), Reason::NoOverlap);
@@ -130,7 +131,8 @@ fn photos_of_two_places_are_not_mixed() {
 
 #[test]
 fn of_many_photos_those_of_like_colours_are_compared() {
-    // Photos that follow each other look different: for up to four steps the colours are 9 apart and more.
+    // Photos that follow each other look different: for up to four steps the colours are 9 apart
+    // and more.
     let colour = |k: usize| (37 * k % 60) as f32;
     let seen = |k: usize| CandidateFeatures {
         features: Keypoints::default(),

@@ -1,11 +1,12 @@
 //! Exposure, white balance and vignetting of the photos, from how bright they show the same points.
 //!
-//! In linear light, a matt point p looks as bright from every side, and photo v shows it as
-//! `ln I = ln a_p + ln gain_v + falloff · (r², r⁴)`. Differences between two photos of a point leave out a_p; what is left
-//! is a small linear problem, solved robustly because highlights and wrong matches are no matt points: they may be most of
-//! the points, as long as they agree less on one difference than the matt ones do. The mean of the
-//! channels in log light gives exposure and vignetting, its differences to red and blue the white balance: these are
-//! separate problems, since texture that two views sample differently moves all channels together.
+//! In linear light, a matt point p looks as bright from every side, and photo v shows it as `ln I =
+//! ln a_p + ln gain_v + falloff · (r², r⁴)`. Differences between two photos of a point leave out
+//! a_p; what is left is a small linear problem, solved robustly because highlights and wrong
+//! matches are no matt points: they may be most of the points, as long as they agree less on one
+//! difference than the matt ones do. The mean of the channels in log light gives exposure and
+//! vignetting, its differences to red and blue the white balance: these are separate problems,
+//! since texture that two views sample differently moves all channels together.
 mod sample;
 mod solve;
 #[cfg(test)]
@@ -21,7 +22,8 @@ use solve::{Solution, System, exposure};
 /// Fewest points that separate light from content.
 const MIN_POINTS: usize = 50;
 
-/// The photos in one light, as far as exposure, white balance and vignetting explain the differences; warns of the rest.
+/// The photos in one light, as far as exposure, white balance and vignetting explain the
+/// differences; warns of the rest.
 pub fn equalised(mut photos: Vec<Photo>, model: &SparseModel, progress: &dyn Progress) -> Vec<Photo> {
     let found = estimate(&photos, model);
     photos.par_iter_mut().zip(&found).for_each(|(photo, light)| {
@@ -41,7 +43,8 @@ pub fn in_light_of(
     model: &SparseModel,
     progress: &dyn Progress,
 ) -> Vec<Photo> {
-    // The vignetting of the known photos is taken out already, whichever camera they share with the new ones.
+    // The vignetting of the known photos is taken out already, whichever camera they share with the
+    // new ones.
     let mut fitted = model.fitted.clone();
     let mut cameras: Vec<usize> = fitted.iter().skip(known).map(|f| f.camera).collect();
     cameras.sort_unstable();
@@ -80,7 +83,8 @@ fn warn_of_odd(photos: &[Photo], progress: &dyn Progress) {
     }
 }
 
-/// Exposure, white balance and vignetting of placed photos, one per photo; none are stated when none is significant.
+/// Exposure, white balance and vignetting of placed photos, one per photo; none are stated when
+/// none is significant.
 pub fn estimate(photos: &[Photo], model: &SparseModel) -> Vec<Light> {
     let pairs = pairs_of(photos, model);
     if photos.len() < 2 || pairs.iter().map(|p| p.share).sum::<f64>() < 0.5 * MIN_POINTS as f64 {

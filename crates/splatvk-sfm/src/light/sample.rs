@@ -6,7 +6,8 @@ use crate::scene::{RgbImage, to_linear};
 use glam::DVec2;
 use rayon::prelude::*;
 
-/// Half the side of the averaged patch as a fraction of the long side: 3 pixels at 640 outweigh noise and misplacement.
+/// Half the side of the averaged patch as a fraction of the long side: 3 pixels at 640 outweigh
+/// noise and misplacement.
 const PATCH: f64 = 3.0 / 640.0;
 /// A patch grows with the view's scale, at most to this many times its size.
 const MAX_GROWTH: f64 = 3.0;
@@ -14,14 +15,15 @@ const MAX_GROWTH: f64 = 3.0;
 const SATURATED: f32 = 0.98;
 /// Linear light below which quantisation and black level decide: 1 % is grey level 25 of 255.
 const DARK: f64 = 0.01;
-/// Standard deviation of the linear mean of a patch from quantisation and black level: half a grey level in the shadows.
+/// Standard deviation of the linear mean of a patch from quantisation and black level: half a grey
+/// level in the shadows.
 const FLOOR: f64 = 5e-4;
 /// ln error of a patch without texture: shading and noise.
 const PLAIN_SIGMA: f64 = 0.02;
 /// ln error per relative contrast of a patch: the views cut different pieces out of the texture.
 const TEXTURE_SIGMA: f64 = 0.3;
-/// Cells per side of a photo: residuals within a cell share highlight, shadow and texture, so they count as one when the
-/// standard deviation is estimated.
+/// Cells per side of a photo: residuals within a cell share highlight, shadow and texture, so they
+/// count as one when the standard deviation is estimated.
 const CELLS: f64 = 6.0;
 
 /// One photo's sight of a point.
@@ -52,7 +54,8 @@ pub(super) struct Pair {
 
 /// All pairs of usable sights of a point.
 pub(super) fn pairs_of(photos: &[Photo], model: &SparseModel) -> Vec<Pair> {
-    // Scale of every sight against the coarsest of its point: patches cover the same piece of surface.
+    // Scale of every sight against the coarsest of its point: patches cover the same piece of
+    // surface.
     let mut wanted: Vec<Vec<(usize, DVec2, f64)>> = vec![Vec::new(); photos.len()];
     for (k, point) in model.points.iter().enumerate() {
         let scale = |v: usize| {
@@ -117,7 +120,8 @@ impl Linear {
         Linear { image, clipped, patch }
     }
 
-    /// Mean light of the patch around a position; `None` where it leaves the photo, is clipped or too dark.
+    /// Mean light of the patch around a position; `None` where it leaves the photo, is clipped or
+    /// too dark.
     fn sample(&self, view: usize, pixel: DVec2, growth: f64) -> Option<Sample> {
         let (w, h) = (self.image.width, self.image.height);
         let half = (self.patch * growth).round().max(1.0);
@@ -151,7 +155,8 @@ impl Linear {
             view,
             pixel,
             ln: [grey, ln[0] - grey, ln[2] - grey],
-            // Texture that is cut differently changes brightness more than colour; how much, the robust scale tells.
+            // Texture that is cut differently changes brightness more than colour; how much, the
+            // robust scale tells.
             variance: [base + TEXTURE_SIGMA * TEXTURE_SIGMA * contrast2; 2],
             r2: radius2(pixel.x, pixel.y, (w, h)),
         })

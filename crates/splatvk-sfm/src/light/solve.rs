@@ -1,16 +1,18 @@
-//! Gains and vignetting from differences of brightness: robust linear least squares with standard deviations.
+//! Gains and vignetting from differences of brightness: robust linear least squares with standard
+//! deviations.
 use super::sample::Pair;
 use crate::math::{median, quantile};
 use nalgebra::{DMatrix, DVector};
 use std::collections::BTreeMap;
 
-/// Prior σ of ln gain: four photos in a thousand are farther apart than 3 EV; it only holds photos without points.
+/// Prior σ of ln gain: four photos in a thousand are farther apart than 3 EV; it only holds photos
+/// without points.
 const GAIN_PRIOR: f64 = 1.0;
 /// Prior σ of the vignetting terms: open lenses lose about a third in the corners.
 const FALLOFF_PRIOR: [f64; 2] = [0.3, 0.15];
-/// Standard deviations beyond which a difference does not count (Tukey's biweight, 95 % efficient on Gaussian noise; Holland &
-/// Welsch 1977). Highlights are no noise around the matt points but a heap of their own, often the larger one, so a weight
-/// that never reaches zero lets them win.
+/// Standard deviations beyond which a difference does not count (Tukey's biweight, 95 % efficient
+/// on Gaussian noise; Holland & Welsch 1977). Highlights are no noise around the matt points but a
+/// heap of their own, often the larger one, so a weight that never reaches zero lets them win.
 const TUKEY: f64 = 4.685;
 /// Rounds of re-weighting; the estimate moves by less than one standard deviation after five.
 const ROUNDS: usize = 12;
@@ -68,15 +70,17 @@ impl Solution {
     }
 }
 
-/// Exposure and vignetting, each only if it is significant. The photo of median exposure is the reference: its light is
-/// the scene's, so that the scene looks as one of the photos and few values leave the range of the files.
+/// Exposure and vignetting, each only if it is significant. The photo of median exposure is the
+/// reference: its light is the scene's, so that the scene looks as one of the photos and few values
+/// leave the range of the files.
 pub(super) fn exposure(system: &System) -> Solution {
     let lenses = system.lenses.iter().max().map_or(0, |l| l + 1);
     let mut free = Free { gains: true, falloff: vec![true; lenses] };
     let first = system.solve(&free, 0);
     let mut order: Vec<usize> = (0..system.views).collect();
     order.sort_by(|a, b| first.gain[*a].total_cmp(&first.gain[*b]));
-    // Of two middle ones the darker: the brighter photos then lose nothing when they are darkened to it.
+    // Of two middle ones the darker: the brighter photos then lose nothing when they are darkened
+    // to it.
     let reference = order[(system.views - 1) / 2];
     let mut found = system.solve(&free, reference);
     free.falloff = found.falloff_matters();
@@ -113,22 +117,24 @@ impl System<'_> {
         pair.variance[self.channel.min(1)]
     }
 
-    /// Re-weighted least squares; standard deviations from the spread of the cells' scores (the sandwich estimator for
-    /// clusters, Liang & Zeger 1986), since residuals within a cell have causes in common.
+    /// Re-weighted least squares; standard deviations from the spread of the cells' scores (the
+    /// sandwich estimator for clusters, Liang & Zeger 1986), since residuals within a cell have
+    /// causes in common.
     fn solve(&self, free: &Free, reference: usize) -> Solution {
         let columns = Columns::new(free, self.views, reference);
         let rows: Vec<_> = self.pairs.iter().map(|p| self.row(p, &columns)).collect();
         let mut x = self.start(&columns);
         let (mut h, mut residuals) = (DMatrix::from_diagonal(&columns.prior), Vec::new());
         let (mut weights, mut agreement) = (vec![0.0; rows.len()], vec![0.0; rows.len()]);
-        // Slope of the scores against their secant: what a redescending weight takes from the information.
+        // Slope of the scores against their secant: what a redescending weight takes from the
+        // information.
         let mut slope = 1.0;
         for _ in 0..ROUNDS {
             residuals = self.residuals(&rows, &x);
             let mut sizes: Vec<f64> =
                 self.pairs.iter().zip(&residuals).map(|(p, r)| r.abs() / self.variance(p).sqrt()).collect();
-            // 1.4826 median |u| is σ of Gaussian u; below a tenth of the expected noise the model is exact, and above that noise
-            // something else than noise is at work.
+            // 1.4826 median |u| is σ of Gaussian u; below a tenth of the expected noise the model
+            // is exact, and above that noise something else than noise is at work.
             let scale = (1.4826 * median(&mut sizes).unwrap_or(1.0)).clamp(0.1, 1.0);
             h = DMatrix::from_diagonal(&columns.prior);
             let mut g = DVector::zeros(x.len());
@@ -167,8 +173,9 @@ impl System<'_> {
         Solution { agreement, ..columns.solution(&x, covariance.as_ref(), reference) }
     }
 
-    /// Gains from the photos two by two: what the closer half of the common points agrees on (least median of squares,
-    /// Rousseeuw 1984), joined with least absolute deviations, so that a pair whose highlights agree better is outvoted.
+    /// Gains from the photos two by two: what the closer half of the common points agrees on (least
+    /// median of squares, Rousseeuw 1984), joined with least absolute deviations, so that a pair
+    /// whose highlights agree better is outvoted.
     fn start(&self, columns: &Columns) -> DVector<f64> {
         let mut common: BTreeMap<[usize; 2], Vec<f64>> = BTreeMap::new();
         for pair in self.pairs {
@@ -179,8 +186,8 @@ impl System<'_> {
         common.retain(|_, d| d.len() >= MIN_COMMON);
         let told: Vec<([usize; 2], f64)> = common.into_iter().map(|(v, mut d)| (v, shorth(&mut d))).collect();
         let mut x = DVector::zeros(columns.prior.len());
-        // Only for photos that share too few points with any other: absolute deviations would not outweigh the prior itself
-        // where photos are more than its σ apart.
+        // Only for photos that share too few points with any other: absolute deviations would not
+        // outweigh the prior itself where photos are more than its σ apart.
         let prior = 1e-6 * &columns.prior;
         for round in 0..ROUNDS {
             let mut h = DMatrix::from_diagonal(&prior);
@@ -209,8 +216,9 @@ impl System<'_> {
         self.pairs.iter().zip(rows).map(of).collect()
     }
 
-    /// Per view: the |ln| difference to the others that is left, in the tenth of its cells that fits worst. A cell takes
-    /// the median of its pairs, so that noise and single highlights do not count.
+    /// Per view: the |ln| difference to the others that is left, in the tenth of its cells that
+    /// fits worst. A cell takes the median of its pairs, so that noise and single highlights do not
+    /// count.
     pub(super) fn unexplained(&self, found: &Solution) -> Vec<f64> {
         let mut cells: BTreeMap<(usize, usize), Vec<f64>> = BTreeMap::new();
         for p in self.pairs {

@@ -7,7 +7,8 @@ use glam::DVec2;
 
 const SIZE: (usize, usize) = (320, 240);
 
-/// Photos of spots of plain colour at random places, lit as told, with noise in ln; every spot is seen by all photos.
+/// Photos of spots of plain colour at random places, lit as told, with noise in ln; every spot is
+/// seen by all photos.
 fn spots(lights: &[Light], noise: f64, seed: u64) -> (Vec<Photo>, SparseModel) {
     let mut rng = Random::new(seed);
     let mut images =
@@ -58,7 +59,8 @@ fn light(ev: f64, red: f64, blue: f64) -> Light {
     Light { gain: [e + red, e - red - blue, e + blue].map(f64::exp), falloff: [-0.15, -0.05], ..Light::NONE }
 }
 
-/// Largest errors against the truth: exposure (EV), exposure in standard deviations, colour (ln), corner.
+/// Largest errors against the truth: exposure (EV), exposure in standard deviations, colour (ln),
+/// corner.
 fn errors(found: &[Light], truth: &[Light]) -> [f64; 4] {
     let reference = found.iter().position(|l| l.sigma_ev == 0.0).unwrap();
     let mut out = [0.0f64; 4];
@@ -146,7 +148,8 @@ fn steady_light_is_left_alone() {
 fn wrong_matches_and_clipped_spots_do_not_count() {
     let truth = [light(-0.4, 0.0, 0.0), light(0.0, 0.05, 0.0), light(0.4, 0.0, 0.0), light(1.3, 0.0, 0.0)];
     let (photos, mut model) = spots(&truth, 0.05, 3);
-    // The last photo clips spots above 1 / 2.46 = 0.41; a fifth of the points are matched to another spot.
+    // The last photo clips spots above 1 / 2.46 = 0.41; a fifth of the points are matched to
+    // another spot.
     let clipped = photos[3].image.data.iter().filter(|c| c.iter().any(|v| *v > 1.0)).count();
     assert!(clipped > 1000);
     let mut photos = photos;
@@ -164,7 +167,8 @@ fn highlights_are_no_exposure() {
     let truth = [light(-0.3, 0.0, 0.0), light(0.0, 0.0, 0.0), light(0.2, 0.03, 0.0), light(0.4, 0.0, 0.0)];
     for seed in 0..3 {
         let (mut photos, model) = spots(&truth, 0.03, seed);
-        // White light of every strength over seven of ten spots of the last photo, over two of ten of the others.
+        // White light of every strength over seven of ten spots of the last photo, over two of ten
+        // of the others.
         let mut rng = Random::new(100 + seed);
         for point in &model.points {
             for (v, pixel) in &point.views {

@@ -1,5 +1,5 @@
-//! Step F: cameras, focal lengths, view scales and a smooth depth correction per view, adjusted together to the matches
-//! (Levenberg–Marquardt in f64).
+//! Step F: cameras, focal lengths, view scales and a smooth depth correction per view, adjusted
+//! together to the matches (Levenberg–Marquardt in f64).
 use super::canonical::Focals;
 use super::normal::{Normal, Pattern};
 use super::problem::{PairLinks, Problem, State, Step};
@@ -13,9 +13,10 @@ use nalgebra::DVector;
 
 /// Relative error of a step: the cameras must agree to 10⁻⁶ whatever the order of the views.
 const STEP_TOLERANCE: f64 = 1e-6;
-/// Cauchy scales, wide ones first so that a start far off is not held by its outliers: by how much they are stretched, steps at
-/// most, and the relative gain at which they are narrowed. Only the last end matters: the invariances of
-/// docs/internals/method.md#pointmap-adjustment (10⁻⁶) need a tighter one than a picture would.
+/// Cauchy scales, wide ones first so that a start far off is not held by its outliers: by how much
+/// they are stretched, steps at most, and the relative gain at which they are narrowed. Only the
+/// last end matters: the invariances of docs/internals/method.md#pointmap-adjustment (10⁻⁶) need a
+/// tighter one than a picture would.
 const SCALES: [(f64, usize, f64); 4] = [(8.0, 10, 1e-4), (4.0, 3, 1e-4), (2.0, 3, 1e-4), (1.0, 44, 1e-11)];
 
 /// The problem and its current solution.
@@ -55,7 +56,8 @@ impl Adjustment {
         Ok(())
     }
 
-    /// At most `steps` steps with the Cauchy scales times `stretch`, until one gains no more than a fraction `end` of the cost.
+    /// At most `steps` steps with the Cauchy scales times `stretch`, until one gains no more than a
+    /// fraction `end` of the cost.
     fn descend(
         &mut self,
         patterns: &[Pattern],
@@ -90,7 +92,8 @@ impl Adjustment {
         Ok(())
     }
 
-    /// Takes the matches from pairs whose median reprojection error exceeds `fraction` of the long side; true if there were any.
+    /// Takes the matches from pairs whose median reprojection error exceeds `fraction` of the long
+    /// side; true if there were any.
     pub(super) fn drop_wrong_pairs(&mut self, fraction: f64) -> bool {
         let (problem, state) = (&mut self.problem, &self.state);
         let most = fraction * problem.long;

@@ -30,7 +30,8 @@ fn mean_confidence(m: &Pointmap) -> f64 {
     m.confidence.iter().map(|c| *c as f64).sum::<f64>() / m.confidence.len().max(1) as f64
 }
 
-/// Factor that brings `map` to the scale of the canonical points: median z ratio over pixels where both are confident.
+/// Factor that brings `map` to the scale of the canonical points: median z ratio over pixels where
+/// both are confident.
 pub(super) fn scale_to(reference: &Pointmap, map: &Pointmap) -> Option<f64> {
     let middle = |m: &Pointmap| median(&mut m.confidence.iter().map(|c| *c as f64).collect::<Vec<_>>());
     let (a, b) = (middle(reference)?, middle(map)?);
@@ -150,7 +151,8 @@ pub(super) fn weiszfeld(view: &ModelView, c: &Canonical) -> Option<(f64, f64)> {
     (f.is_finite() && f > 0.0).then_some((f, total))
 }
 
-/// Views of different groups whose estimates agree this well share a focal length all the same when there is no EXIF.
+/// Views of different groups whose estimates agree this well share a focal length all the same when
+/// there is no EXIF.
 const AGREEMENT: f64 = 0.15;
 
 pub(super) fn focals(views: &[ModelView], canonical: &[Canonical]) -> Focals {

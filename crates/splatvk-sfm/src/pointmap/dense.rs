@@ -6,7 +6,8 @@ use crate::math::quantile;
 use crate::scene::{Camera, DepthMap, ModelView, Plane, PointCloud, Pointmaps};
 use glam::DVec2;
 
-/// A less confident point this much in front of another view's surface is wrong (depth noise is about this large).
+/// A less confident point this much in front of another view's surface is wrong (depth noise is
+/// about this large).
 const CLEAN_TOLERANCE: f64 = 0.005;
 /// A larger relative jump to a neighbour is an occlusion edge: the network interpolates across it.
 const EDGE_JUMP: f64 = 0.06;
@@ -175,7 +176,8 @@ fn to_working(view: &ModelView, l: &Layer) -> DepthMap {
     out
 }
 
-/// Confidence of a usable point: the floor, if there is one, or what the least confident share stays below, if that is more.
+/// Confidence of a usable point: the floor, if there is one, or what the least confident share
+/// stays below, if that is more.
 fn least_confidence(layers: &[Layer], floor: Option<f64>) -> f64 {
     let mut all: Vec<f64> =
         layers.iter().flat_map(|l| l.confidence.iter().copied()).filter(|c| *c > 0.0).collect();
@@ -183,7 +185,8 @@ fn least_confidence(layers: &[Layer], floor: Option<f64>) -> f64 {
     floor.map_or(least, |f| least.max(f))
 }
 
-/// Points of confidence 1 and more; a pixel that an already kept point of another view covers is left out.
+/// Points of confidence 1 and more; a pixel that an already kept point of another view covers is
+/// left out.
 fn fuse(views: &[ModelView], layers: &[Layer]) -> PointCloud {
     let mean = |l: &Layer| l.confidence.iter().sum::<f64>() / l.confidence.len().max(1) as f64;
     let mut order: Vec<usize> = (0..layers.len()).collect();

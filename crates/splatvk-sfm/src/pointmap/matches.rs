@@ -30,8 +30,9 @@ pub struct PairMatches {
     pub matches: Vec<PixelMatch>,
 }
 
-/// Follows seeds back and forth between two images until they return to themselves: every result is a pair of mutual
-/// nearest neighbours. `forward` maps pixels of A to their nearest in B, `backward` the reverse.
+/// Follows seeds back and forth between two images until they return to themselves: every result is
+/// a pair of mutual nearest neighbours. `forward` maps pixels of A to their nearest in B,
+/// `backward` the reverse.
 fn reciprocal(
     seeds: Vec<usize>,
     forward: impl Fn(&[usize]) -> Vec<usize>,
@@ -71,8 +72,8 @@ fn seeds(width: usize, height: usize) -> Vec<usize> {
         .collect()
 }
 
-/// Mutual nearest neighbours of dense descriptors (pixel of A, pixel of B), sorted; seeds from both images. `size` are
-/// (width, height) of A and B.
+/// Mutual nearest neighbours of dense descriptors (pixel of A, pixel of B), sorted; seeds from both
+/// images. `size` are (width, height) of A and B.
 pub fn descriptor_matches(
     a: &Descriptors,
     b: &Descriptors,
@@ -81,7 +82,8 @@ pub fn descriptor_matches(
     both_ways(size, |rows| a.nearest(rows, b), |rows| b.nearest(rows, a))
 }
 
-/// Mutual nearest neighbours of two pointmaps in one frame (pixel of A, pixel of B), sorted; seeds from both images.
+/// Mutual nearest neighbours of two pointmaps in one frame (pixel of A, pixel of B), sorted; seeds
+/// from both images.
 pub fn point_matches(a: &Pointmap, b: &Pointmap, size: [(usize, usize); 2]) -> Vec<(usize, usize)> {
     let (ta, tb) = (Tree::new(&a.points), Tree::new(&b.points));
     if ta.order.is_empty() || tb.order.is_empty() {
@@ -150,7 +152,8 @@ pub(super) fn of_pair(first: &ModelView, second: &ModelView, pair: &PairPointmap
     PairMatches { matches }
 }
 
-/// A balanced 3-d tree over finite points; `order` holds each subtree's median in the middle of its range.
+/// A balanced 3-d tree over finite points; `order` holds each subtree's median in the middle of its
+/// range.
 struct Tree<'a> {
     points: &'a [[f32; 3]],
     order: Vec<u32>,

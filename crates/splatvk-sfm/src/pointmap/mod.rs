@@ -1,7 +1,9 @@
-//! Pairwise pointmaps to cameras and dense points (docs/internals/method.md#pointmaps): what networks such as MASt3R, DUSt3R and
-//! VGGT predict for pairs of photos is brought to one scale, one set of cameras and one set of depth maps.
+//! Pairwise pointmaps to cameras and dense points (docs/internals/method.md#pointmaps): what
+//! networks such as MASt3R, DUSt3R and VGGT predict for pairs of photos is brought to one scale,
+//! one set of cameras and one set of depth maps.
 //!
-//! Positions are continuous pixels of the network's input ("model pixels"); the centre of the first pixel is 0.5.
+//! Positions are continuous pixels of the network's input ("model pixels"); the centre of the first
+//! pixel is 0.5.
 mod adjust;
 mod canonical;
 mod dense;
@@ -37,8 +39,8 @@ pub struct Reconstruction {
     pub left_out: Vec<usize>,
 }
 
-/// Steps A–G; `seed` draws the samples of RANSAC. Views that do not hold together with most of the others are left out, with a
-/// warning each.
+/// Steps A–G; `seed` draws the samples of RANSAC. Views that do not hold together with most of the
+/// others are left out, with a warning each.
 pub fn reconstruct(mut maps: Pointmaps, seed: u64, progress: &dyn Progress) -> Result<Reconstruction> {
     check(&maps)?;
     let mut matches = Vec::with_capacity(maps.pairs.len());
@@ -163,8 +165,8 @@ struct Start {
     focals: Focals,
 }
 
-/// The network's own cameras and those of the spanning tree, as far as there are any; where both are much the same, only the
-/// former.
+/// The network's own cameras and those of the spanning tree, as far as there are any; where both
+/// are much the same, only the former.
 fn starts(maps: &Pointmaps, canonical: &[Canonical], focals: Focals, edges: &[Edge]) -> Vec<Start> {
     let mut out = Vec::new();
     if let Some(first) = maps.cameras.first() {
@@ -183,10 +185,12 @@ fn starts(maps: &Pointmaps, canonical: &[Canonical], focals: Focals, edges: &[Ed
     out
 }
 
-/// Starts this near are one: 12 pixels at 512, which the widest Cauchy scale of the adjustment still takes for noise.
+/// Starts this near are one: 12 pixels at 512, which the widest Cauchy scale of the adjustment
+/// still takes for noise.
 const ALIKE: f64 = 12.0 / 512.0;
 
-/// Largest difference of two starts: angles, distances between centres in depths of the first view, ln f.
+/// Largest difference of two starts: angles, distances between centres in depths of the first view,
+/// ln f.
 fn apart(a: &Start, b: &Start, canonical: &[Canonical]) -> f64 {
     let mut depths: Vec<f64> = canonical[0].points.iter().map(|p| p.z).filter(|z| *z > 0.0).collect();
     let depth = median(&mut depths).unwrap_or(1.0);
@@ -264,7 +268,8 @@ fn not_connected(views: &[ModelView], joined: &[[usize; 2]], keep: &[usize]) -> 
     ))
 }
 
-/// Below 0.5 % of the depth the baseline is within the error of the pointmaps: the camera only turned.
+/// Below 0.5 % of the depth the baseline is within the error of the pointmaps: the camera only
+/// turned.
 const MIN_BASELINE: f64 = 0.005;
 
 fn parallax(views: &[ModelView], adjustment: &Adjustment) -> Result<()> {

@@ -1,15 +1,18 @@
-//! The normal equations in blocks: cameras dense, each view's depth corrections as a stencil of neighbours, and between two
-//! views only what their matches couple. Nothing grows with the square of the number of corrections.
+//! The normal equations in blocks: cameras dense, each view's depth corrections as a stencil of
+//! neighbours, and between two views only what their matches couple. Nothing grows with the square
+//! of the number of corrections.
 use super::problem::{GAUGE_WEIGHT, Link, PairLinks, Problem, STEP_WEIGHT, State};
 use super::residual::{Lattice, Row, SLOTS, slots};
 use crate::numeric::cauchy_weight;
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
-/// Pairs that are summed at a time: each has its own sums until they are added up, always in one order.
+/// Pairs that are summed at a time: each has its own sums until they are added up, always in one
+/// order.
 const AT_A_TIME: usize = 8;
 
-/// Which corrections of two views the matches of a pair couple: a sparse matrix with a row per corner of the first view.
+/// Which corrections of two views the matches of a pair couple: a sparse matrix with a row per
+/// corner of the first view.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Pattern {
     starts: Vec<u32>,
@@ -66,8 +69,8 @@ impl Coupling<'_> {
     }
 }
 
-/// Symmetric matrix over the corners of one grid, in which only neighbours meet: per corner its value with itself and with the
-/// corners before it by 1, columns − 1, columns and columns + 1.
+/// Symmetric matrix over the corners of one grid, in which only neighbours meet: per corner its
+/// value with itself and with the corners before it by 1, columns − 1, columns and columns + 1.
 #[derive(Clone, Debug)]
 pub(super) struct Stencil {
     pub(super) lattice: Lattice,
@@ -240,8 +243,8 @@ fn empty(problem: &Problem, view: usize) -> GridBlock {
     }
 }
 
-/// Indices of a pair's camera unknowns by slot; the first camera has no pose among them, and two views may share a focal
-/// length.
+/// Indices of a pair's camera unknowns by slot; the first camera has no pose among them, and two
+/// views may share a focal length.
 pub(super) fn camera_places(problem: &Problem, views: [usize; 2]) -> [Option<usize>; SLOTS] {
     let mut places = [None; SLOTS];
     for (side, view) in views.into_iter().enumerate() {

@@ -15,8 +15,8 @@ pub(super) struct Edge {
     pub(super) second: usize,
     /// First camera → second camera; translation in the canonical unit of the first view.
     pub(super) pose: Pose,
-    /// ln of (canonical unit of the second view / that of the first): global depth = canonical depth · e^κ,
-    /// κ_second − κ_first = this.
+    /// ln of (canonical unit of the second view / that of the first): global depth = canonical
+    /// depth · e^κ, κ_second − κ_first = this.
     pub(super) log_scale: f64,
     pub(super) score: f64,
 }
@@ -99,7 +99,8 @@ impl Direction<'_> {
         let rotation = self.procrustes(&chosen, &world)?;
         let inliers = found.inliers.len() as f64 / chosen.len() as f64;
         let apart = rotation_angle(&(rotation * found.pose.rotation.transpose())).to_degrees();
-        // Too few agree, or the two estimates contradict each other (docs/internals/method.md#pair-poses).
+        // Too few agree, or the two estimates contradict each other
+        // (docs/internals/method.md#pair-poses).
         if inliers < 0.15 || apart > 15.0 {
             return None;
         }

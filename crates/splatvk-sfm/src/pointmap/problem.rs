@@ -17,8 +17,9 @@ const SIZE_SIGMA: f64 = 0.05;
 const STEP_SIGMA: f64 = 0.02;
 /// The mean log scale is the gauge; any stiff value holds it.
 const GAUGE_SIGMA: f64 = 1e-3;
-/// Matches that a view takes part in at most, for each corner of its grid: what 8192 in each of three pairs are for the 825 of a
-/// 512 × 384 input. Four views keep all of theirs, and sixteen take four times as long.
+/// Matches that a view takes part in at most, for each corner of its grid: what 8192 in each of
+/// three pairs are for the 825 of a 512 × 384 input. Four views keep all of theirs, and sixteen
+/// take four times as long.
 const PER_CORNER: usize = 30;
 
 /// The unknowns.
@@ -89,7 +90,8 @@ pub(super) struct PairLinks {
     pub(super) links: Vec<Link>,
 }
 
-/// A pair with fewer matches holds no views together; structure from motion rests cameras on no fewer points.
+/// A pair with fewer matches holds no views together; structure from motion rests cameras on no
+/// fewer points.
 const LEAST_MATCHES: usize = 20;
 
 impl PairLinks {
@@ -210,8 +212,8 @@ impl Problem {
         [0, 1].map(|k| link.ends[k].depth(s.kappa[pair.views[k]], &s.grid[pair.views[k]]))
     }
 
-    /// Residuals and factors of the linear priors: Σκ, each ln f, then size and steps of the corrections; `f` takes (residual,
-    /// weight).
+    /// Residuals and factors of the linear priors: Σκ, each ln f, then size and steps of the
+    /// corrections; `f` takes (residual, weight).
     fn priors(&self, s: &State, mut f: impl FnMut(f64, f64)) {
         for (g, (mean, sigma)) in self.focal_priors.iter().enumerate() {
             f(s.log_focals[g] - mean, sigma.powi(-2));
@@ -280,8 +282,8 @@ impl Problem {
 pub(super) const STEP_WEIGHT: f64 = 1.0 / (STEP_SIGMA * STEP_SIGMA);
 pub(super) const GAUGE_WEIGHT: f64 = 1.0 / (GAUGE_SIGMA * GAUGE_SIGMA);
 
-/// How many matches of each pair ([views], matches) are used so that no view has more than its `most`: views with too many
-/// cut their largest pairs to one size.
+/// How many matches of each pair ([views], matches) are used so that no view has more than its
+/// `most`: views with too many cut their largest pairs to one size.
 fn shares(pairs: &[([usize; 2], usize)], most: &[usize]) -> Vec<usize> {
     let cap = |(view, most): (usize, &usize)| {
         let mut counts: Vec<usize> = pairs.iter().filter(|p| p.0.contains(&view)).map(|p| p.1).collect();
@@ -308,8 +310,8 @@ mod tests {
     fn no_view_has_more_than_its_share_of_matches_and_small_pairs_stay_whole() {
         let pairs = [([0, 1], 100), ([0, 2], 10), ([0, 3], 100), ([2, 3], 60)];
         assert_eq!(shares(&pairs, &[1000; 4]), [100, 10, 100, 60]);
-        // View 0: all of the small pair, half of the rest for each of the others; view 3: half and half, of which view 0
-        // takes less.
+        // View 0: all of the small pair, half of the rest for each of the others; view 3: half and
+        // half, of which view 0 takes less.
         assert_eq!(shares(&pairs, &[110; 4]), [50, 10, 50, 55]);
         assert_eq!(shares(&pairs, &[0; 4]), [0; 4]);
     }

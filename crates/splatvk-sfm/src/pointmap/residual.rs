@@ -95,7 +95,8 @@ pub(super) struct Row {
 }
 
 impl Direction {
-    /// Residuals of end `a`, `depths[0]` deep, against end `b`, `depths[1]` deep; `None` behind the camera.
+    /// Residuals of end `a`, `depths[0]` deep, against end `b`, `depths[1]` deep; `None` behind the
+    /// camera.
     pub(super) fn residual(&self, a: &End, b: &End, depths: [f64; 2]) -> Option<[f64; 3]> {
         self.seen(a, b, depths).map(|s| s.0)
     }
@@ -126,7 +127,8 @@ impl Direction {
         let ((pose_a, focal_a, kappa_a), (pose_b, focal_b, kappa_b)) =
             (slots(self.side), slots(1 - self.side));
         let relative: DMat3 = self.relative.rotation;
-        // T ← exp(ρ, θ) T: δt = ρ − [t]× θ; the inverse moves the other way, in the first camera's frame: δy = −ρ + [y]× θ.
+        // T ← exp(ρ, θ) T: δt = ρ − [t]× θ; the inverse moves the other way, in the first camera's
+        // frame: δy = −ρ + [y]× θ.
         let (turn_b, turn_a) = (skew(t), relative * skew(y));
         for c in 0..3 {
             set(pose_b + c, DVec3::AXES[c]);

@@ -1,11 +1,12 @@
-//! Solves the blocked normal equations: cameras are eliminated exactly, the depth corrections by conjugate gradients with each
-//! view's own block, factored as a band matrix, as preconditioner.
+//! Solves the blocked normal equations: cameras are eliminated exactly, the depth corrections by
+//! conjugate gradients with each view's own block, factored as a band matrix, as preconditioner.
 use super::normal::{Normal, Stencil};
 use super::problem::Step;
 use nalgebra::{Cholesky, DVector, Dyn};
 use rayon::prelude::*;
 
-/// Cholesky factor of a stencil's matrix: rows of the lower triangle, from `width` before the diagonal up to it.
+/// Cholesky factor of a stencil's matrix: rows of the lower triangle, from `width` before the
+/// diagonal up to it.
 struct Band {
     width: usize,
     rows: Vec<f64>,
@@ -24,7 +25,8 @@ impl Band {
             rows[i * stride + width] += damping * values[0];
             let (before, row) = rows.split_at_mut(i * stride);
             for j in i.saturating_sub(width)..i {
-                // Row i holds columns i − width to i; of row j the last j − (i − width) before its diagonal overlap.
+                // Row i holds columns i − width to i; of row j the last j − (i − width) before its
+                // diagonal overlap.
                 let overlap = j + width - i;
                 let above = &before[j * stride..(j + 1) * stride];
                 let sum: f64 = row[..overlap].iter().zip(&above[width - overlap..]).map(|(p, q)| p * q).sum();

@@ -38,7 +38,8 @@ fn case() -> (Case, Truth) {
         let (w, h) = (p.image.width / 2, p.image.height / 2);
         let full = testing::depth(&truth.folder, &p.stem);
         let width = p.image.width;
-        // The centre of a model pixel is the corner of four photo pixels; inverse depth is linear on planes.
+        // The centre of a model pixel is the corner of four photo pixels; inverse depth is linear
+        // on planes.
         let at = |k: usize| {
             let i = k / w * 2 * width + k % w * 2;
             4.0 / [i, i + 1, i + width, i + width + 1].iter().map(|i| 1.0 / full[*i] as f64).sum::<f64>()
@@ -171,7 +172,8 @@ fn noisy_pointmaps_place_cameras_and_depth() {
     assert!(g.points.len() > 30_000, "{}", g.points.len());
 }
 
-/// Largest difference between two reconstructions of the same views in the same order: angle, centre, ln f.
+/// Largest difference between two reconstructions of the same views in the same order: angle,
+/// centre, ln f.
 fn difference(a: &[Camera], b: &[Camera]) -> f64 {
     let relative = |c: &[Camera], v: usize| c[v].pose.compose(&c[0].pose.inverse());
     let unit = |c: &[Camera]| relative(c, 1).translation.length();

@@ -1,4 +1,5 @@
-//! Cameras of photos that join photos whose cameras are known (docs/internals/method.md#photos-added-later).
+//! Cameras of photos that join photos whose cameras are known
+//! (docs/internals/method.md#photos-added-later).
 use super::families::{corner_families, keypoints};
 use super::finish::{agreement, inlier_matches, sparse_points};
 use super::grow::{MIN_RESECTION, Resection, resection};
@@ -24,25 +25,30 @@ use nalgebra::{DMatrix, SMatrix};
 /// The photos of a scene. Their images are those of pinholes: without lens.
 #[derive(Clone, Copy)]
 pub struct Known<'a> {
-    /// At working resolution; fx and fy are taken for equal. They stay as they are, and so does the world frame.
+    /// At working resolution; fx and fy are taken for equal. They stay as they are, and so does the
+    /// world frame.
     pub cameras: &'a [Camera],
     /// What is known of how they were found.
     pub fitted: &'a [Fitted],
 }
 
-/// σ of ln f of a photo that comes from a camera of the scene at the same zoom: focusing nearer lengthens a lens by about a percent.
+/// σ of ln f of a photo that comes from a camera of the scene at the same zoom: focusing nearer
+/// lengthens a lens by about a percent.
 const SAME_CAMERA_SIGMA: f64 = 0.01;
-/// Fewest points seen by two photos besides the one that is refined: fewer leave its pose to chance, and points that only one
-/// other photo sees give way to wherever it is.
+/// Fewest points seen by two photos besides the one that is refined: fewer leave its pose to
+/// chance, and points that only one other photo sees give way to wherever it is.
 const MIN_FIXED: usize = 30;
-/// Rounds of refining the camera and triangulating the points anew: the second changes the pose by less than its σ.
+/// Rounds of refining the camera and triangulating the points anew: the second changes the pose by
+/// less than its σ.
 const ROUNDS: usize = 3;
 
-/// Standard deviations of a focal length from that of the same camera, up to which the two are taken for one.
+/// Standard deviations of a focal length from that of the same camera, up to which the two are
+/// taken for one.
 const AGREES: f64 = 3.0;
 
-/// Cameras and points for all `photos`, the first of which are `known`; the others need no cameras, `features` are one per photo.
-/// A photo that shares too little with the others is an error that names it.
+/// Cameras and points for all `photos`, the first of which are `known`; the others need no cameras,
+/// `features` are one per photo. A photo that shares too little with the others is an error that
+/// names it.
 pub fn with_added(
     photos: &[Photo],
     known: Known,
@@ -106,8 +112,8 @@ pub fn with_added(
     Ok(out)
 }
 
-/// A new photo that agrees with the focal length of its camera takes it over; others are told apart as cameras of their own. `focals`
-/// are what the files say, per view.
+/// A new photo that agrees with the focal length of its camera takes it over; others are told apart
+/// as cameras of their own. `focals` are what the files say, per view.
 fn share_optics(model: &mut Model, fitted: &mut [Fitted], focals: &[f64], known: usize) {
     for view in known..fitted.len() {
         let found = model.focal(view) / focals[view];
@@ -119,7 +125,8 @@ fn share_optics(model: &mut Model, fitted: &mut [Fitted], focals: &[f64], known:
     }
 }
 
-/// The known cameras, and for the other photos the optics of those; an error that names a photo of another camera.
+/// The known cameras, and for the other photos the optics of those; an error that names a photo of
+/// another camera.
 fn start_model(photos: &[Photo], cameras: &[Camera], seed: u64) -> Result<Model, Unplaced> {
     let known = |v: usize| cameras.get(v);
     let views = || 0..photos.len();
@@ -154,7 +161,8 @@ fn start_model(photos: &[Photo], cameras: &[Camera], seed: u64) -> Result<Model,
     })
 }
 
-/// The optics of a photo of the scene that was taken with the same camera as a new one by their files, and the σ of what may differ.
+/// The optics of a photo of the scene that was taken with the same camera as a new one by their
+/// files, and the σ of what may differ.
 fn shared_optics(photos: &[Photo], cameras: &[Camera], view: usize) -> Option<(Optics, OpticsPrior)> {
     let by_file = cameras_by_file(photos);
     let alike = (0..cameras.len()).find(|o| by_file[*o] == by_file[view])?;
@@ -170,7 +178,8 @@ fn shared_optics(photos: &[Photo], cameras: &[Camera], view: usize) -> Option<(O
     Some((Optics { focal, lens: photo.lens(), shift }, prior))
 }
 
-/// Places the photo that shows most of the points. An error that names all that are left when none shows enough.
+/// Places the photo that shows most of the points. An error that names all that are left when none
+/// shows enough.
 fn register(model: &mut Model, photos: &[Photo], pairs: &[Pair], threshold: f64) -> Result<usize, Unplaced> {
     let left: Vec<usize> = (0..photos.len()).filter(|v| model.poses[*v].is_none()).collect();
     let found = left.iter().filter_map(|v| Some((*v, resection(model, *v, threshold)?)));
@@ -221,7 +230,8 @@ struct Sigmas {
     rotation: f64,
 }
 
-/// Pose and focal length of a view that explain where it shows the points, which stay where they are.
+/// Pose and focal length of a view that explain where it shows the points, which stay where they
+/// are.
 fn refine(model: &mut Model, view: usize, threshold: f64) -> Sigmas {
     let prior = model.priors[view];
     let Some(pose) = model.poses[view] else { return Sigmas::default() };
@@ -244,9 +254,11 @@ fn refine(model: &mut Model, view: usize, threshold: f64) -> Sigmas {
     let mut squares: Vec<f64> =
         seen.iter().map(|s| (project(&[0.0; 7], s.0) - s.1).length_squared()).collect();
     let Some(middle) = median(&mut squares) else { return Sigmas::default() };
-    // The median of the squared length of a 2-D normal deviate is 2 ln 2 σ²; below 0.05 px the lens limits.
+    // The median of the squared length of a 2-D normal deviate is 2 ln 2 σ²; below 0.05 px the lens
+    // limits.
     let sigma = (middle / (2.0 * std::f64::consts::LN_2)).sqrt().max(0.05);
-    // Neighbours err alike: sightings count as fewer independent ones, against which the priors are weighed.
+    // Neighbours err alike: sightings count as fewer independent ones, against which the priors are
+    // weighed.
     let worth = (model.independent(2 * seen.len()) / (2 * seen.len()).max(1) as f64).sqrt();
     let log_focal = optics.focal.ln();
     let residuals = |x: &[f64; 7], out: &mut Vec<f64>| {

@@ -1,16 +1,18 @@
-//! Photos that are cut out of larger ones: their optical axis is not in the middle, and their focal length is another share of their
-//! side than that of whole photos.
+//! Photos that are cut out of larger ones: their optical axis is not in the middle, and their focal
+//! length is another share of their side than that of whole photos.
 use super::fit::{MAX_COST_SHARE, OpticsFit, STEPS, fit_optics};
 use super::model::{Freedom, Model};
 use crate::Result;
 use crate::bundle::{Adjusted, OpticsPrior};
 
-/// σ of the principal point of a photo that is cut out of a larger one, as a share of its long side: half of what is cut away.
+/// σ of the principal point of a photo that is cut out of a larger one, as a share of its long
+/// side: half of what is cut away.
 const CROP_SIGMA: f64 = 0.2;
 /// σ of its ln f: what the file states is of the whole photo, which may be twice as large.
 const FOCAL_SIGMA: f64 = 0.35;
 
-/// Least offset of the axis of such a photo, as a share of its long side: image stabilisation moves it by up to 0.02.
+/// Least offset of the axis of such a photo, as a share of its long side: image stabilisation moves
+/// it by up to 0.02.
 const OFF_CENTRE: f64 = 0.05;
 
 /// Which photos are taken for whole.
@@ -31,7 +33,8 @@ impl Guess {
         out.regrouped(&self.group)
     }
 
-    /// The view taken for whole, with the focal length of another whole photo of its kind or with its own.
+    /// The view taken for whole, with the focal length of another whole photo of its kind or with
+    /// its own.
     fn with_whole(&self, model: &Model, view: usize, prior: OpticsPrior) -> Vec<Guess> {
         let alike = |v: &usize| self.whole[*v] && model.alike[*v] == model.alike[view];
         let shared = (0..self.group.len()).find(alike).map(|v| self.group[v]);
@@ -44,8 +47,9 @@ impl Guess {
     }
 }
 
-/// The same fit, or one in which some photos are cut out of larger ones, if that explains the sightings better by as much as several
-/// cameras have to: each of them has optics of its own and a principal point anywhere.
+/// The same fit, or one in which some photos are cut out of larger ones, if that explains the
+/// sightings better by as much as several cameras have to: each of them has optics of its own and a
+/// principal point anywhere.
 pub(super) fn explained(best: OpticsFit) -> Result<OpticsFit> {
     let views = best.model.poses.len();
     // Two photos do not tell which of them is whole.

@@ -19,7 +19,8 @@ const MAX_AFFINE: usize = 700;
 
 /// What one detector found in all photos.
 pub(super) struct Family {
-    /// Matches are nearest neighbours whose distance is below this share of that to the second-best elsewhere.
+    /// Matches are nearest neighbours whose distance is below this share of that to the second-best
+    /// elsewhere.
     pub(super) ratio: f32,
     /// Per photo.
     pub(super) keypoints: Vec<Keypoints>,
@@ -35,7 +36,8 @@ pub(super) fn corner_families(
     let mut families = vec![Family { ratio: 0.85, keypoints: of_all(photos, MAX_CORNERS, sift::detect) }];
     progress.check()?;
     if features.len() == photos.len() {
-        // Learned descriptors are compared more leniently: their second-best is close by design of the training.
+        // Learned descriptors are compared more leniently: their second-best is close by design of
+        // the training.
         families.push(Family { ratio: 0.97, keypoints: masked(photos, features) });
     }
     Ok(families)

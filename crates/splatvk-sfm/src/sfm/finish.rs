@@ -1,4 +1,5 @@
-//! From a grown model to the final one: what the lens does, sightings refined to sub-pixel, further points.
+//! From a grown model to the final one: what the lens does, sightings refined to sub-pixel, further
+//! points.
 use super::families::MARGIN;
 use super::model::{Model, Sighting, Track};
 use super::optics::learn_optics;
@@ -18,8 +19,9 @@ use crate::{Fitted, SparseModel, SparsePoint};
 use glam::DVec2;
 use rayon::prelude::*;
 
-/// Share of a photo's matches that agree with the cameras, from which on they are taken for right while growing: where they
-/// are it is 0.97 and more on the tuning sets, below 0.8 where cameras or focal lengths are wrong.
+/// Share of a photo's matches that agree with the cameras, from which on they are taken for right
+/// while growing: where they are it is 0.97 and more on the tuning sets, below 0.8 where cameras or
+/// focal lengths are wrong.
 pub(super) const AGREED: f64 = 0.9;
 
 /// What the model was grown from.
@@ -30,8 +32,9 @@ pub(super) struct Evidence {
     pub(super) keypoints: Vec<Vec<Sighting>>,
 }
 
-/// Final adjustment: outliers out, weights from the residuals, the optics that the sightings determine, every sighting refined to
-/// sub-pixel and further points added where the geometry predicts them.
+/// Final adjustment: outliers out, weights from the residuals, the optics that the sightings
+/// determine, every sighting refined to sub-pixel and further points added where the geometry
+/// predicts them.
 pub(super) fn finish(
     photos: &[Photo],
     mut model: Model,
@@ -46,8 +49,8 @@ pub(super) fn finish(
     reweight_and_adjust(&mut model)?;
     learn_optics(&mut model)?;
     if bend(&model, photos) > REMATCH || model.has_crops() {
-        // The pinhole took what the lens displaces for outliers, above all near the corners: match again. So it did where the
-        // axis is not in the middle.
+        // The pinhole took what the lens displaces for outliers, above all near the corners: match
+        // again. So it did where the axis is not in the middle.
         rematch(&mut model, evidence, threshold);
         reweight_and_adjust(&mut model)?;
         learn_optics(&mut model)?;
@@ -73,7 +76,8 @@ pub(super) fn finish(
 /// Pixels of the working image within which the neighbours of a point lie on one plane with it.
 const REACH: f64 = 80.0;
 
-/// Refines all sightings to sub-pixel on the `straight` images, those of pinholes, and adds points that the geometry predicts.
+/// Refines all sightings to sub-pixel on the `straight` images, those of pinholes, and adds points
+/// that the geometry predicts.
 pub(super) fn sub_pixel(
     model: &mut Model,
     photos: &[Photo],
@@ -125,7 +129,8 @@ fn sharpen(model: &mut Model, photos: &[Photo]) -> bool {
     true
 }
 
-/// Adjusts with weights from the residuals. Weights and geometry depend on each other; they converge to a percent in two rounds.
+/// Adjusts with weights from the residuals. Weights and geometry depend on each other; they
+/// converge to a percent in two rounds.
 pub(super) fn reweight_and_adjust(model: &mut Model) -> Result<Adjusted> {
     model.weigh();
     model.adjust(f64::INFINITY, 2.0, 60)?;
@@ -133,7 +138,8 @@ pub(super) fn reweight_and_adjust(model: &mut Model) -> Result<Adjusted> {
     model.adjust(f64::INFINITY, 2.0, 60)
 }
 
-/// Displacement at a corner above which matching starts anew, pixels: three times the noise of keypoints.
+/// Displacement at a corner above which matching starts anew, pixels: three times the noise of
+/// keypoints.
 const REMATCH: f64 = 1.0;
 
 /// Largest displacement by the lens at a corner of a photo, pixels.
@@ -161,9 +167,9 @@ fn inliers_of(model: &Model, pair: &Matches, threshold: f64) -> Vec<KeypointMatc
     pair.list.iter().filter(close).map(|m| m.2).collect()
 }
 
-/// Per view the share of its matches that agree with the model's cameras, of those on which its pairs with other views agree
-/// by themselves. The view that agrees least is counted first and its pairs then left out: the others are not to suffer for
-/// it.
+/// Per view the share of its matches that agree with the model's cameras, of those on which its
+/// pairs with other views agree by themselves. The view that agrees least is counted first and its
+/// pairs then left out: the others are not to suffer for it.
 pub(super) fn agreement(model: &Model, pairs: &[Pair], threshold: f64) -> Vec<f64> {
     let counted = |p: &Pair| (inliers_of(model, &p.matches, threshold).len(), p.matches.list.len());
     let counts: Vec<(usize, usize)> = pairs.par_iter().map(counted).collect();
@@ -227,7 +233,8 @@ pub(super) fn straightened(model: &Model, view: usize, image: &RgbImage) -> RgbI
     }
 }
 
-/// Runs a step for pinholes on the model with its sightings moved to where a pinhole would show them.
+/// Runs a step for pinholes on the model with its sightings moved to where a pinhole would show
+/// them.
 fn on_straight(model: &mut Model, step: impl FnOnce(&mut Model)) {
     let optics = model.optics.clone();
     let lensed = model.clone_optics();
@@ -244,7 +251,8 @@ fn on_straight(model: &mut Model, step: impl FnOnce(&mut Model)) {
     }
 }
 
-/// The triangulated tracks, with the colour that the first of their photos has there, as pinholes show them.
+/// The triangulated tracks, with the colour that the first of their photos has there, as pinholes
+/// show them.
 pub(super) fn sparse_points(photos: &[Photo], model: &Model) -> Vec<SparsePoint> {
     let point = |t: &Track| {
         let views: Vec<(usize, DVec2)> = t

@@ -1,5 +1,5 @@
-//! From verified pairs to a reconstruction: the pair with most matches at good parallax first, the other views by
-//! resection, an adjustment after each.
+//! From verified pairs to a reconstruction: the pair with most matches at good parallax first, the
+//! other views by resection, an adjustment after each.
 use super::model::{Model, Track};
 use super::pair::Pair;
 use super::tracks::Sightings;
@@ -13,7 +13,8 @@ pub(super) struct Stuck {
     pub(super) left: Vec<usize>,
 }
 
-/// Fewest agreeing points for placing a view: six fix pose and focal length, twice that guards against chance.
+/// Fewest agreeing points for placing a view: six fix pose and focal length, twice that guards
+/// against chance.
 pub(super) const MIN_RESECTION: usize = 12;
 
 /// Usefulness of a pair as the seed: matches, discounted below 10° of parallax.
@@ -21,7 +22,8 @@ pub(super) fn seed_score(pair: &Pair) -> f64 {
     pair.geometry.inliers.len() as f64 * (pair.geometry.parallax / 10.0).min(1.0)
 }
 
-/// Grows a model over all views. `empty` holds centres, groups, optics and priors; `threshold` in pixels.
+/// Grows a model over all views. `empty` holds centres, groups, optics and priors; `threshold` in
+/// pixels.
 pub(super) fn grow(
     empty: &Model,
     tracks: &[Sightings],
@@ -65,7 +67,8 @@ pub(super) fn grow(
 /// Adjusts, triangulates again with the better cameras, adjusts.
 fn adjust_and_triangulate(model: &mut Model, threshold: f64) {
     for gate in [4.0, 2.0] {
-        // An adjustment that fails leaves the model as it is; too few points show up as a stuck view.
+        // An adjustment that fails leaves the model as it is; too few points show up as a stuck
+        // view.
         let _ = model.adjust(gate * threshold, 1.5, 25);
         model.triangulate_all(gate * threshold);
     }
@@ -80,7 +83,8 @@ pub(super) struct Resection {
     pub(super) count: usize,
 }
 
-/// Focal lengths tried for a view that shares its own with no placed view: resection bears half a step of 1.4.
+/// Focal lengths tried for a view that shares its own with no placed view: resection bears half a
+/// step of 1.4.
 const STRETCHES: [f64; 5] = [1.0, 0.7, 1.4, 0.5, 2.0];
 
 /// Pose of a view from its sightings of triangulated points.
@@ -105,8 +109,8 @@ pub(super) fn resection(model: &Model, view: usize, threshold: f64) -> Option<Re
     tried.filter_map(place).max_by_key(|p| p.count)
 }
 
-/// Fallback for a view with few tracks into the model: the relative pose of its best pair with a placed view, scaled by
-/// the depths of the points both see.
+/// Fallback for a view with few tracks into the model: the relative pose of its best pair with a
+/// placed view, scaled by the depths of the points both see.
 fn by_pair(model: &Model, pairs: &[Pair], left: &[usize], threshold: f64) -> Option<(usize, Pose)> {
     let mut best: Option<(usize, usize, Pose)> = None;
     for pair in pairs {
@@ -119,7 +123,8 @@ fn by_pair(model: &Model, pairs: &[Pair], left: &[usize], threshold: f64) -> Opt
             continue;
         };
         let base = model.poses[placed]?;
-        // Candidate scales: each common point proposes one, and the one most others agree with wins.
+        // Candidate scales: each common point proposes one, and the one most others agree with
+        // wins.
         let common: Vec<(DVec3, DVec2)> = model
             .tracks
             .iter()

@@ -15,12 +15,12 @@ use glam::DVec2;
 
 /// Fewest points that determine the depth range of a scene.
 const MIN_POINTS: usize = 20;
-/// Least share of the matches by appearance that must obey the given cameras: chance gives about 2 % (a band of 2 × 3 px
-/// in 480), true cameras 20 % and more.
+/// Least share of the matches by appearance that must obey the given cameras: chance gives about 2
+/// % (a band of 2 × 3 px in 480), true cameras 20 % and more.
 const MIN_AGREEMENT: f64 = 0.1;
 
-/// Points for given cameras (one per photo, at working resolution). The cameras keep their intrinsics, relative poses and
-/// unit of length; the world frame becomes that of camera 0.
+/// Points for given cameras (one per photo, at working resolution). The cameras keep their
+/// intrinsics, relative poses and unit of length; the world frame becomes that of camera 0.
 pub fn with_cameras(
     photos: &[Photo],
     cameras: &[Camera],

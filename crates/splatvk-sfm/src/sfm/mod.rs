@@ -37,16 +37,17 @@ use relate::{MIN_INLIERS, Related, THRESHOLD};
 use tracks::KeypointMatch;
 pub use unplaced::Unplaced;
 
-/// ln f of a photo without EXIF: 0.9 × the long side covers phones (0.8) to normal lenses (1.2) within one σ.
+/// ln f of a photo without EXIF: 0.9 × the long side covers phones (0.8) to normal lenses (1.2)
+/// within one σ.
 const FOCAL_GUESS: f64 = 0.9;
 const FOCAL_SIGMA: f64 = 0.35;
 /// EXIF focal lengths are rounded and sensors are cropped.
 const EXIF_SIGMA: f64 = 0.05;
-/// Radial distortion at the corner of a photo, as a share of the radius: below a hundredth where a phone has corrected it, a
-/// twentieth for plain wide lenses.
+/// Radial distortion at the corner of a photo, as a share of the radius: below a hundredth where a
+/// phone has corrected it, a twentieth for plain wide lenses.
 const LENS_SIGMA: f64 = 0.05;
-/// Cameras and sparse points from photos and their learned features (one per photo; may be empty, then only the
-/// built-in corner detector is used). `seed` draws the samples of RANSAC.
+/// Cameras and sparse points from photos and their learned features (one per photo; may be empty,
+/// then only the built-in corner detector is used). `seed` draws the samples of RANSAC.
 pub fn reconstruct(
     photos: &[Photo],
     features: &[Keypoints],
@@ -97,16 +98,18 @@ fn check_points(photos: &[Photo], model: &SparseModel) -> Result<(), Unplaced> {
 /// Steps of the progress bar: corners, matches, poses, refinement, extension.
 const STEPS: u64 = 5;
 
-/// Cameras, numbered in any way, if photos share one only where their files name it and its zoom. What such photos say against
-/// it is then image stabilisation, which moves the lens from photo to photo, and no other camera.
+/// Cameras, numbered in any way, if photos share one only where their files name it and its zoom.
+/// What such photos say against it is then image stabilisation, which moves the lens from photo to
+/// photo, and no other camera.
 fn separable(photos: &[Photo], group: &[usize]) -> Vec<usize> {
     let named = |p: &Photo| p.camera_model.is_some() && p.exif_focal.is_some();
     let first = |v: usize| group.iter().position(|g| *g == group[v]).unwrap_or(v);
     photos.iter().enumerate().map(|(v, p)| if named(p) { first(v) } else { v }).collect()
 }
 
-/// Groups and priors of the optics from the files, and from the edges in photos that are not `flat`: lines in one plane run in two
-/// directions at right angles at most, and what looks like a third has another reason.
+/// Groups and priors of the optics from the files, and from the edges in photos that are not
+/// `flat`: lines in one plane run in two directions at right angles at most, and what looks like a
+/// third has another reason.
 fn empty_model(photos: &[Photo], flat: &[bool], seed: u64) -> Model {
     let zoom: Vec<f64> = photos.iter().map(Photo::zoom).collect();
     let sides = |v: usize| photos[v].picture_size();
@@ -192,8 +195,8 @@ fn assemble(
     let mut seeds: Vec<&Pair> = pairs.iter().collect();
     seeds.sort_by(|a, b| grow::seed_score(b).total_cmp(&grow::seed_score(a)));
     seeds.truncate(SEEDS);
-    // Photos of one camera first; where that contradicts the pairs, every photo with its own focal length. That explains much
-    // that is wrong for other reasons, so it must settle the matter.
+    // Photos of one camera first; where that contradicts the pairs, every photo with its own focal
+    // length. That explains much that is wrong for other reasons, so it must settle the matter.
     let apart = empty.with_separate_optics();
     let attempts =
         std::iter::once(&empty).chain(&apart).flat_map(|start| seeds.iter().map(move |s| (start, *s)));

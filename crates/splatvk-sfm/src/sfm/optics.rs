@@ -5,7 +5,8 @@ use super::model::{Freedom, Model};
 use crate::Result;
 use crate::bundle::Adjusted;
 
-/// Steps from an optimum of the same sightings with one camera more: what is left of the cost after them decides nothing.
+/// Steps from an optimum of the same sightings with one camera more: what is left of the cost after
+/// them decides nothing.
 const STEPS_JOINED: usize = 12;
 
 /// Adjusts with `freedom`; standard deviations as [`learn_optics`] states them.
@@ -50,8 +51,9 @@ fn joined(mut best: OpticsFit) -> Result<OpticsFit> {
     Ok(best)
 }
 
-/// Decides which of the optics the photos determine and whether photos that look alike by their files share a camera, and adjusts
-/// with it. The standard deviations are those of all optics together: what the criterion leaves out may be there all the same.
+/// Decides which of the optics the photos determine and whether photos that look alike by their
+/// files share a camera, and adjusts with it. The standard deviations are those of all optics
+/// together: what the criterion leaves out may be there all the same.
 pub(super) fn learn_optics(model: &mut Model) -> Result<Adjusted> {
     let apart = model.with_separate_optics();
     // Which of the photos that look alike share a camera is decided once.
@@ -74,9 +76,10 @@ pub(super) fn learn_optics(model: &mut Model) -> Result<Adjusted> {
     Ok(found.outcome)
 }
 
-/// What the criterion must be below for several cameras: its value if one camera took the photos that look alike and only
-/// its principal point moved from photo to photo, as image stabilisation moves it, times [`MAX_COST_SHARE`] in cost. Optics
-/// of their own would turn such movement into wrong focal lengths.
+/// What the criterion must be below for several cameras: its value if one camera took the photos
+/// that look alike and only its principal point moved from photo to photo, as image stabilisation
+/// moves it, times [`MAX_COST_SHARE`] in cost. Optics of their own would turn such movement into
+/// wrong focal lengths.
 fn shared_camera_criterion(shared: &OpticsFit) -> Result<f64> {
     let mut model = shared.model.regrouped(&shared.model.separable);
     for (prior, optics) in model.priors.iter_mut().zip(&model.optics) {

@@ -1,4 +1,5 @@
-//! Pairs of photos whose matches agree on a geometry, and which photos only a doubtful one joins to the others.
+//! Pairs of photos whose matches agree on a geometry, and which photos only a doubtful one joins to
+//! the others.
 use super::tracks::KeypointMatch;
 use crate::two_view::TwoView;
 use glam::DVec2;
@@ -27,8 +28,8 @@ impl Pair {
     }
 }
 
-/// Agreeing matches, and their share of all, from which on a pair is taken for sure: on the tuning sets wrong geometries of
-/// two photos have up to 200 matches, but less than half of all.
+/// Agreeing matches, and their share of all, from which on a pair is taken for sure: on the tuning
+/// sets wrong geometries of two photos have up to 200 matches, but less than half of all.
 pub(super) const SURE: (usize, f64) = (100, 0.5);
 
 /// Whether `agree` matches of `all` leave no doubt.
@@ -46,9 +47,9 @@ pub(super) fn parts(n: usize, linked: impl Iterator<Item = (usize, usize)>) -> V
     part
 }
 
-/// Per photo whether a single unsure pair is all that joins its part of the photos to the rest: nothing confirms what that pair
-/// says. A part of more than half of the photos is where the others are missing. `agrees`: per pair, whether its matches
-/// agree with the cameras.
+/// Per photo whether a single unsure pair is all that joins its part of the photos to the rest:
+/// nothing confirms what that pair says. A part of more than half of the photos is where the others
+/// are missing. `agrees`: per pair, whether its matches agree with the cameras.
 pub(super) fn unconfirmed(n: usize, pairs: &[Pair], agrees: &[bool]) -> Vec<bool> {
     let part = parts(n, pairs.iter().filter(|p| p.sure).map(Pair::views));
     let leaves = |of: usize, p: &Pair| (part[p.views().0] == of) != (part[p.views().1] == of);

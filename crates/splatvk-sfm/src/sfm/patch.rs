@@ -11,10 +11,11 @@ pub(super) const RADIUS: i32 = 6;
 const WINDOW: f64 = 4.0;
 /// Blur before sampling: hides the pixel grid from the bilinear interpolation.
 const BLUR: f32 = 0.8;
-/// Standard deviation below which a patch has no texture (1 in 255, twice JPEG noise after the blur).
+/// Standard deviation below which a patch has no texture (1 in 255, twice JPEG noise after the
+/// blur).
 const MIN_CONTRAST: f64 = 0.008;
-/// Typical relative change of inverse depth per pixel of a surface seen at 45°, f = 650: 1/650. The slant prior is twice
-/// that.
+/// Typical relative change of inverse depth per pixel of a surface seen at 45°, f = 650: 1/650. The
+/// slant prior is twice that.
 const SLANT_SIGMA: f64 = 0.003;
 
 /// Blurred luma with its gradients.
@@ -112,7 +113,8 @@ fn standardised(values: &[f64], offsets: &[(DVec2, f64)]) -> Option<(Vec<f64>, f
     (sigma > MIN_CONTRAST).then(|| (values.iter().map(|v| (v - mean) / sigma).collect(), sigma))
 }
 
-/// Maps a patch of the reference view into another view through a plane of inverse depth `a (1 + b·d)`.
+/// Maps a patch of the reference view into another view through a plane of inverse depth `a (1 +
+/// b·d)`.
 struct Warp {
     m: DMat3,
     shift: DVec3,
@@ -230,8 +232,9 @@ impl<'a> Aligner<'a> {
         warp.apply(ray, f.inverse_depth, f.slant, DVec2::ZERO).map(|w| w.0)
     }
 
-    /// Gauss–Newton over the slant (shared by all views) and one shift per view, with gain and bias removed. `shifts`
-    /// start as given; views whose correlation stays below `least` are left out. Returns the improved facet.
+    /// Gauss–Newton over the slant (shared by all views) and one shift per view, with gain and bias
+    /// removed. `shifts` start as given; views whose correlation stays below `least` are left out.
+    /// Returns the improved facet.
     pub(super) fn align(
         &self,
         facet: &Facet,
@@ -259,7 +262,8 @@ impl<'a> Aligner<'a> {
                 };
                 scores.push(self.accumulate(&template, &seen, sigma, &gradients, &moves, k, &mut h, &mut g));
             }
-            // Slant prior against the starting plane, in units of the patch residual (about 0.3 at NCC 0.95).
+            // Slant prior against the starting plane, in units of the patch residual (about 0.3 at
+            // NCC 0.95).
             for k in 0..2 {
                 let w = (0.3 / SLANT_SIGMA).powi(2) * 0.05;
                 h[(k, k)] += w;
@@ -319,7 +323,8 @@ impl<'a> Aligner<'a> {
             .zip(moves)
             .map(|(q, m)| [q.dot(m[0]), q.dot(m[1]), q.x, q.y].map(|v| v / sigma))
             .collect();
-        // Standardising removes the mean and the component along the patch itself from every derivative.
+        // Standardising removes the mean and the component along the patch itself from every
+        // derivative.
         let (mut mean, mut along) = ([0.0; 4], [0.0; 4]);
         for ((row, s), o) in rows.iter().zip(seen).zip(&self.offsets) {
             for c in 0..4 {
@@ -342,8 +347,8 @@ impl<'a> Aligner<'a> {
         correlation
     }
 
-    /// Aligns back: the patch around `pixel` of `other`, seen through the same plane, must return to the facet's centre.
-    /// The distance it misses by, pixels.
+    /// Aligns back: the patch around `pixel` of `other`, seen through the same plane, must return
+    /// to the facet's centre. The distance it misses by, pixels.
     pub(super) fn round_trip(&self, f: &Facet, other: usize, pixel: DVec2) -> Option<f64> {
         let back = self.transferred(f, other, pixel)?;
         let start = f.pixel - self.expected(&back, f.view)?;

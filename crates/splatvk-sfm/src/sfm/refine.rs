@@ -11,7 +11,8 @@ pub(super) const REFINED: usize = 2;
 pub(super) const FINE: usize = 3;
 /// Least correlation of an aligned patch; views 75° apart reach 0.8 on a true match.
 const MIN_NCC: f64 = 0.8;
-/// Farthest a refined sighting may be from the keypoint it started at, pixels: about three times the detectors' noise.
+/// Farthest a refined sighting may be from the keypoint it started at, pixels: about three times
+/// the detectors' noise.
 const MAX_MOVE: f64 = 3.0;
 /// Largest forward–backward miss, pixels.
 const MAX_MISS: f64 = 0.3;
@@ -37,8 +38,9 @@ impl ViewPoints {
         ViewPoints { points }
     }
 
-    /// Local plane at a pixel from the nearest points, as inverse depth and relative slant; `None` with few neighbours
-    /// within `reach` pixels. Robust: two rounds of re-weighting at 2 % of the depth.
+    /// Local plane at a pixel from the nearest points, as inverse depth and relative slant; `None`
+    /// with few neighbours within `reach` pixels. Robust: two rounds of re-weighting at 2 % of the
+    /// depth.
     fn plane(&self, p: DVec2, reach: f64) -> Option<(f64, DVec2)> {
         let mut near: Vec<(f64, DVec2, f64)> =
             self.points.iter().map(|q| ((q.0 - p).length(), q.0 - p, q.1)).filter(|q| q.0 < reach).collect();
@@ -83,9 +85,10 @@ fn central(model: &Model, track: &Track, x: DVec3) -> usize {
     best.1
 }
 
-/// Moves every sighting onto the patch of its track's central view. Sightings that do not align keep their position and
-/// family; aligned ones change to `family`, so that their noise is estimated apart. `reach`: pixels within which the
-/// neighbours of a point lie on one plane with it.
+/// Moves every sighting onto the patch of its track's central view. Sightings that do not align
+/// keep their position and family; aligned ones change to `family`, so that their noise is
+/// estimated apart. `reach`: pixels within which the neighbours of a point lie on one plane with
+/// it.
 pub(super) fn refine(model: &mut Model, shades: &[Shades], family: usize, reach: f64) {
     let seen: Vec<ViewPoints> = (0..model.poses.len()).map(|v| ViewPoints::new(model, v)).collect();
     let fixed = &*model;
@@ -151,8 +154,8 @@ const SEARCH: f64 = 0.06;
 /// Least correlation of a predicted point: without a detector's vote it must look the same.
 const MIN_GUIDED_NCC: f64 = 0.88;
 
-/// Adds points at corners without one: depth predicted from the neighbours, searched along the epipolar lines, aligned
-/// photometrically in all views that show it. Returns how many.
+/// Adds points at corners without one: depth predicted from the neighbours, searched along the
+/// epipolar lines, aligned photometrically in all views that show it. Returns how many.
 pub(super) fn extend(model: &mut Model, shades: &[Shades], valid: &[Plane<bool>]) -> usize {
     let fixed = &*model;
     let aligner = Aligner::new(fixed, shades);

@@ -1,4 +1,5 @@
-//! The cameras of a scene and of photos that join it, adjusted together (docs/internals/method.md#photos-added-later).
+//! The cameras of a scene and of photos that join it, adjusted together
+//! (docs/internals/method.md#photos-added-later).
 use super::finish::{reweight_and_adjust, straightened, sub_pixel};
 use super::model::{Freedom, Model};
 use super::optics::adjust_optics;
@@ -9,13 +10,15 @@ use crate::progress::Progress;
 use crate::scene::{Lens, RgbImage};
 use glam::{DVec2, DVec3};
 
-/// σ of ln f about what the scene says of its cameras: wide, since the same sightings and more are weighed again.
+/// σ of ln f about what the scene says of its cameras: wide, since the same sightings and more are
+/// weighed again.
 const FOCAL_SIGMA: f64 = 0.05;
 
-/// Adjusts all cameras and points of a model whose first `known` views are those of a scene, sightings refined to sub-pixel and
-/// further points added as for a new scene. Views of one `camera`, numbered in any way, share their focal length in the ratios that
-/// they have. The world frame stays: the first camera where it is, the unit that of the first `known`. The model ends as one of
-/// pinholes.
+/// Adjusts all cameras and points of a model whose first `known` views are those of a scene,
+/// sightings refined to sub-pixel and further points added as for a new scene. Views of one
+/// `camera`, numbered in any way, share their focal length in the ratios that they have. The world
+/// frame stays: the first camera where it is, the unit that of the first `known`. The model ends as
+/// one of pinholes.
 pub(super) fn adjust(
     model: &mut Model,
     photos: &[Photo],
@@ -38,7 +41,8 @@ pub(super) fn adjust(
     Ok(outcome)
 }
 
-/// The same model of the photos as pinholes show them, with optics of its own for each view: focal length 1, all of it in the zoom.
+/// The same model of the photos as pinholes show them, with optics of its own for each view: focal
+/// length 1, all of it in the zoom.
 fn without_lens(model: &Model) -> Model {
     let mut out = model.clone();
     for s in out.tracks.iter_mut().flat_map(|t| &mut t.sightings) {
@@ -53,7 +57,8 @@ fn without_lens(model: &Model) -> Model {
     out
 }
 
-/// Scales the world about the first of the centres so that they are, in the mean, as far from it as `before`.
+/// Scales the world about the first of the centres so that they are, in the mean, as far from it as
+/// `before`.
 fn rescale(model: &mut Model, before: &[DVec3], after: &[DVec3]) {
     let Some((first, old)) = after.first().zip(before.first()) else { return };
     let pairs = || before.iter().zip(after).map(|(b, a)| (*b - *old, *a - *first));

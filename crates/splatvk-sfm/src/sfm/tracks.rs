@@ -12,8 +12,8 @@ pub(super) struct KeypointMatch {
 /// A scene point as the photos show it: at most once per view, at least twice.
 pub(super) type Sightings = Vec<Sighting>;
 
-/// Joins links into tracks, best links first; a link that would put two keypoints of one view into a track is left out.
-/// `points[view][keypoint]` are all keypoints.
+/// Joins links into tracks, best links first; a link that would put two keypoints of one view into
+/// a track is left out. `points[view][keypoint]` are all keypoints.
 pub(super) fn join(links: &mut [KeypointMatch], points: &[Vec<Sighting>]) -> Vec<Sightings> {
     links.sort_by(|a, b| {
         b.quality.total_cmp(&a.quality).then(a.first.cmp(&b.first)).then(a.second.cmp(&b.second))

@@ -5,8 +5,8 @@ use crate::choose::Reason;
 /// Why there are no cameras for all photos.
 #[derive(Debug)]
 pub struct Unplaced {
-    /// Photos without which the others may have cameras, ascending, each with what is wrong with it; empty if that is not
-    /// known.
+    /// Photos without which the others may have cameras, ascending, each with what is wrong with
+    /// it; empty if that is not known.
     pub views: Vec<(usize, Reason)>,
     /// The same in words.
     pub error: Error,

@@ -6,7 +6,8 @@ const BINS: usize = 12;
 /// Pixels added to every bin: a colour of no consistent pixel gives no evidence.
 const PRIOR: f32 = 2.0;
 
-/// Colour histogram of the consistent pixels on one surface, normalised against all consistent pixels.
+/// Colour histogram of the consistent pixels on one surface, normalised against all consistent
+/// pixels.
 pub struct ColourModel {
     share: Vec<f32>,
 }
@@ -29,7 +30,8 @@ impl ColourModel {
         ColourModel { share: on.iter().zip(&all).map(|(o, a)| (o + 0.5 * PRIOR) / (a + PRIOR)).collect() }
     }
 
-    /// Share of the consistent pixels of this colour that lie on the surface, 0 to 1; near 0.5 for unknown colours.
+    /// Share of the consistent pixels of this colour that lie on the surface, 0 to 1; near 0.5 for
+    /// unknown colours.
     pub fn share(&self, colour: [f32; 3]) -> f32 {
         self.share[bin(colour)]
     }

@@ -1,5 +1,6 @@
-//! Depth where matching fails (weak texture, in one view only, rims of objects): the planes of consistent pixels
-//! are carried on along paths of similar colour, never into space that another view sees through.
+//! Depth where matching fails (weak texture, in one view only, rims of objects): the planes of
+//! consistent pixels are carried on along paths of similar colour, never into space that another
+//! view sees through.
 use super::Level;
 use super::colours::ColourModel;
 use super::planes::WorldPlane;
@@ -9,18 +10,21 @@ use rayon::prelude::*;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-/// Cost of one pixel of path over constant colour; colour differences (RGB, Euclidean) are added, so that an edge of
-/// 5 grey levels weighs as much as 4 pixels.
+/// Cost of one pixel of path over constant colour; colour differences (RGB, Euclidean) are added,
+/// so that an edge of 5 grey levels weighs as much as 4 pixels.
 const STEP: f32 = 0.005;
-/// A locally fitted plane is carried on this much more reluctantly than one of the scene's large planes.
+/// A locally fitted plane is carried on this much more reluctantly than one of the scene's large
+/// planes.
 const LOCAL_RELUCTANCE: f32 = 2.0;
 /// Factor on the path cost over colours that never occur on the large plane, less [`OWN`].
 const FOREIGN: f32 = 3.0;
-/// Factor on the path cost over colours that occur only on the large plane: texture of the plane is no edge.
+/// Factor on the path cost over colours that occur only on the large plane: texture of the plane is
+/// no edge.
 const OWN: f32 = 0.1;
 /// Path cost of a pixel where the carried plane would block another view.
 const BLOCKING: f32 = 0.3;
-/// RGB distance (Euclidean) up to which two views show the same point: gloss and exposure change this much.
+/// RGB distance (Euclidean) up to which two views show the same point: gloss and exposure change
+/// this much.
 pub const COLOUR_TOLERANCE: f32 = 0.2;
 /// Factor on a pixel's path cost where another view confirms the carried plane.
 const CONFIRMED: f32 = 0.3;
@@ -29,8 +33,8 @@ const FILLED_CONFIDENCE: f32 = 0.3;
 /// Path cost at which a filled pixel's confidence has fallen to half.
 const HALF_CONFIDENCE_COST: f32 = 0.5;
 
-/// Rejects consistent pixels within `radius` of a depth step: there the matching window mixes two surfaces, and
-/// filling finds the colour edge more exactly.
+/// Rejects consistent pixels within `radius` of a depth step: there the matching window mixes two
+/// surfaces, and filling finds the colour edge more exactly.
 pub fn open_rims(level: &Level, surface: &Surface, radius: usize) -> Surface {
     let mut out = surface.clone();
     for (view, r) in level.references.iter().enumerate() {
@@ -56,7 +60,8 @@ pub fn open_rims(level: &Level, surface: &Surface, radius: usize) -> Surface {
     out
 }
 
-/// Gives every pixel that is not void a plane. `surface` holds the consistent pixels, its planes smoothed.
+/// Gives every pixel that is not void a plane. `surface` holds the consistent pixels, its planes
+/// smoothed.
 pub fn fill(
     level: &Level,
     links: &RelativePoses,
@@ -152,8 +157,9 @@ impl<'a> ViewFill<'a> {
         (plane.dot(ray) - here).abs() < 0.5 * self.level.tolerance[self.view] * here
     }
 
-    /// Dijkstra from the given pixels over the rejected pixels: per pixel where its plane comes from
-    /// (`u32::MAX` = unreached) and the path cost. With `plane`, that plane is carried; else each source's own.
+    /// Dijkstra from the given pixels over the rejected pixels: per pixel where its plane comes
+    /// from (`u32::MAX` = unreached) and the path cost. With `plane`, that plane is carried; else
+    /// each source's own.
     fn spread(
         &self,
         sources: &[u32],
@@ -194,7 +200,8 @@ impl<'a> ViewFill<'a> {
                     continue;
                 }
                 let evidence = self.evidence(n, candidate);
-                // Up to threefold the path cost for colours of other surfaces, next to nothing for the plane's own.
+                // Up to threefold the path cost for colours of other surfaces, next to nothing for
+                // the plane's own.
                 let foreign = colours.map_or(1.0, |c| FOREIGN * (1.0 - c.share(b)).powi(2) + OWN);
                 let total = here + (STEP + difference) * evidence.0 * foreign + evidence.1;
                 if total < cost[n] {

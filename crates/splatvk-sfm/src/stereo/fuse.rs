@@ -4,13 +4,15 @@ use super::surface::{RelativePoses, Surface, neighbours, ray};
 use crate::scene::PointCloud;
 use glam::Vec3;
 
-/// Relative depth step to a neighbour above which a pixel may float between two surfaces (docs/internals/method.md#fusion).
+/// Relative depth step to a neighbour above which a pixel may float between two surfaces
+/// (docs/internals/method.md#fusion).
 const FLYING: f32 = 0.06;
 /// Confidence from which a pixel counts as matched rather than filled.
 pub const MATCHED: f32 = 0.5;
 
-/// Matched pixels of all views first, filled ones after; within each, views by decreasing mean confidence. A pixel is
-/// skipped when a point already kept projects onto it at the same depth, within the view's tolerance.
+/// Matched pixels of all views first, filled ones after; within each, views by decreasing mean
+/// confidence. A pixel is skipped when a point already kept projects onto it at the same depth,
+/// within the view's tolerance.
 pub fn fuse(level: &Level, links: &RelativePoses, surface: &Surface) -> PointCloud {
     let mut order: Vec<usize> = (0..level.cameras.len()).collect();
     let mean = |view: usize| {
@@ -48,7 +50,8 @@ fn fuse_view(
         for &point in points {
             let Some((u, v, z)) = links.project(level, *other, view, point) else { continue };
             let (x, y) = (u as usize, v as usize);
-            // A kept point stands for the 3 × 3 pixels around it: its neighbours' gaps when seen closer by.
+            // A kept point stands for the 3 × 3 pixels around it: its neighbours' gaps when seen
+            // closer by.
             for py in y.saturating_sub(1)..(y + 2).min(height) {
                 for px in x.saturating_sub(1)..(x + 2).min(width) {
                     let here = depth.at(px, py);

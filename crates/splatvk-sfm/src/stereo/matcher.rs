@@ -2,7 +2,8 @@
 use crate::Result;
 use glam::Vec4;
 
-/// Most source views that one reference view is matched against: a fifth adds cost, hardly accuracy.
+/// Most source views that one reference view is matched against: a fifth adds cost, hardly
+/// accuracy.
 pub const MAX_SOURCES: usize = 4;
 
 /// A source view as a reference view sees it, laid out as in the shader.

@@ -1,5 +1,5 @@
-//! Dense depth for views with known cameras: multi-view slanted plane sweep, propagation, consistency checks,
-//! filling, and fusion into points.
+//! Dense depth for views with known cameras: multi-view slanted plane sweep, propagation,
+//! consistency checks, filling, and fusion into points.
 mod colours;
 mod fill;
 mod fuse;
@@ -24,12 +24,14 @@ use crate::progress::Progress;
 use crate::scene::{Camera, Coverage, DepthMap, DepthPrior, Plane, PointCloud, RgbImage};
 use glam::{DVec3, Vec4};
 
-/// Depth of every photo (complete but for white borders and what the photos do not use; confidence tells matched from filled) and fused points, from
-/// cameras at the photos' working resolutions. `sparse` are points of the scene in world coordinates: they set the
-/// searched depths and choose which views are matched. `sweep` computes the matching. Deterministic for a given device, seed
+/// Depth of every photo (complete but for white borders and what the photos do not use; confidence
+/// tells matched from filled) and fused points, from cameras at the photos' working resolutions.
+/// `sparse` are points of the scene in world coordinates: they set the searched depths and choose
+/// which views are matched. `sweep` computes the matching. Deterministic for a given device, seed
 /// and input.
 ///
-/// Confidence: 0.9 where two or more other views agree, 0.6 where one does, below 0.3 where depth was filled in.
+/// Confidence: 0.9 where two or more other views agree, 0.6 where one does, below 0.3 where depth
+/// was filled in.
 pub fn dense(
     sweep: &dyn PlaneSweep,
     images: &[RgbImage],
@@ -59,7 +61,8 @@ pub fn run_schedule<M: Matcher>(
 ) -> Result<Vec<Vec4>> {
     let rounds_of = |index: usize| {
         let photometric = if index == 0 { options.coarse_rounds } else { 0 };
-        // The last levels' rounds belong to the finest resolutions when small photos make fewer levels.
+        // The last levels' rounds belong to the finest resolutions when small photos make fewer
+        // levels.
         let skipped = options.rounds.len().saturating_sub(levels.len());
         (photometric, options.rounds.get(index + skipped).copied().unwrap_or(1))
     };
@@ -132,8 +135,9 @@ pub fn finish(
 
 /// Pixels: a plane fit over 11 × 11 pixels averages the matching noise of one window.
 const FIT_RADIUS: i32 = 5;
-/// Pixels on either side of a depth step that can be wrong: half the matching window at least; large photos inherit wider
-/// errors from coarser levels where texture is weak (breakfast at 640 × 480: 7 leaves 0.5 % fewer pixels wrong than 4).
+/// Pixels on either side of a depth step that can be wrong: half the matching window at least;
+/// large photos inherit wider errors from coarser levels where texture is weak (breakfast at 640 ×
+/// 480: 7 leaves 0.5 % fewer pixels wrong than 4).
 fn rim_radius(level: &Level) -> usize {
     (level.references.iter().map(|r| r.width.max(r.height)).max().unwrap_or(0) as usize / 90).max(4)
 }

@@ -11,7 +11,8 @@ pub struct StereoOptions {
     pub planes: u32,
     /// Photometric propagation rounds at the coarsest resolution.
     pub coarse_rounds: u32,
-    /// Rounds with the geometric term per resolution, coarsest first; the length is the number of resolutions.
+    /// Rounds with the geometric term per resolution, coarsest first; the length is the number of
+    /// resolutions.
     pub rounds: Vec<u32>,
     /// Weight of the geometric term per pixel of forward–backward reprojection error.
     pub geometric: f32,
@@ -32,8 +33,9 @@ impl Default for StereoOptions {
             rounds: vec![4, 4, 3],
             // 0.1 per pixel, saturating at 3 px: the same strength as ACMM's.
             geometric: 0.1,
-            // A fully different neighbourhood costs as much as 0.1 of correlation, less than real texture tells. On dark
-            // photos of a room (dining) 0.05 leaves 21 % and 0.4 20 % of the pixels wrong by a tenth, 0.1 leaves 18 %.
+            // A fully different neighbourhood costs as much as 0.1 of correlation, less than real
+            // texture tells. On dark photos of a room (dining) 0.05 leaves 21 % and 0.4 20 % of the
+            // pixels wrong by a tenth, 0.1 leaves 18 %.
             smoothness: 0.1,
             seed: 1,
             // What every Vulkan device binds.
@@ -45,13 +47,15 @@ impl Default for StereoOptions {
 impl StereoOptions {
     /// The same with another seed for a run's; run seed 0 leaves it.
     pub fn seeded(mut self, run: u64) -> StereoOptions {
-        // The seed counts up with every sweep, so those of runs must lie far apart: the upper half of a product with 2^64 / φ.
+        // The seed counts up with every sweep, so those of runs must lie far apart: the upper half
+        // of a product with 2^64 / φ.
         self.seed ^= (run.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32) as u32;
         self
     }
 
-    /// The options of a preset. A draft looks at the finest resolution once: three rounds there take three times as long
-    /// and gain 0.1 dB on breakfast, while depth at half the photos' size loses 1.4 dB.
+    /// The options of a preset. A draft looks at the finest resolution once: three rounds there
+    /// take three times as long and gain 0.1 dB on breakfast, while depth at half the photos' size
+    /// loses 1.4 dB.
     pub fn preset(preset: Preset) -> StereoOptions {
         let full = StereoOptions::default();
         match preset {

@@ -33,8 +33,8 @@ const SMALLEST_SHARE: f64 = 0.02;
 const MAX_PLANES: usize = 8;
 /// Points looked at: enough that the smallest plane has about 200.
 const SAMPLES: usize = 10_000;
-/// Hypotheses per plane, each from one point and its normal: a plane with 2 % of the points is missed with
-/// probability 0.98^300 < 0.3 %.
+/// Hypotheses per plane, each from one point and its normal: a plane with 2 % of the points is
+/// missed with probability 0.98^300 < 0.3 %.
 const TRIALS: u32 = 300;
 
 struct Sample {

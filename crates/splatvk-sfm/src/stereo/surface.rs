@@ -1,4 +1,5 @@
-//! Which matched pixels are kept: agreement with the other views, and smooth local planes for those.
+//! Which matched pixels are kept: agreement with the other views, and smooth local planes for
+//! those.
 use super::Level;
 use super::views::{DEPTH_TOLERANCE, REPROJECTION_TOLERANCE};
 use crate::scene::Plane;
@@ -14,8 +15,8 @@ pub struct Surface {
     pub confidence: Vec<f32>,
 }
 
-/// Where parallax is small, [`REPROJECTION_TOLERANCE`] corresponds to a larger depth difference; views that could not
-/// distinguish depths this far apart confirm nothing …
+/// Where parallax is small, [`REPROJECTION_TOLERANCE`] corresponds to a larger depth difference;
+/// views that could not distinguish depths this far apart confirm nothing …
 const UNINFORMATIVE: f32 = 0.06;
 /// … unless the view has nothing better: this many times its typical tolerance.
 const NOTHING_BETTER: f32 = 1.5;
@@ -27,14 +28,15 @@ pub fn free_space(level: &Level, view: usize) -> f32 {
     FREE_SPACE_TOLERANCE.max(2.0 * level.tolerance[view])
 }
 
-/// Aggregated cost above which even an agreeing pixel is rejected: half way between a perfect match in one view
-/// (0.4 + geometric limits) and none (1.0 and more).
+/// Aggregated cost above which even an agreeing pixel is rejected: half way between a perfect match
+/// in one view (0.4 + geometric limits) and none (1.0 and more).
 const COST_TOLERANCE: f32 = 0.75;
 /// Connected areas of consistent pixels smaller than this share of the image are chance.
 const SPECKLE_SHARE: f32 = 6e-4;
 /// Confidence by number of agreeing views.
 const CONFIDENCE: [f32; 3] = [0.0, 0.6, 0.9];
-/// Confidence of a pixel that only its surroundings confirm: it shapes the surface, it is no measurement.
+/// Confidence of a pixel that only its surroundings confirm: it shapes the surface, it is no
+/// measurement.
 const PLAUSIBLE: f32 = 0.45;
 /// Aggregated cost above which not even such a pixel is kept: next to no correlation in any view.
 const PLAUSIBLE_COST: f32 = 0.95;
@@ -93,14 +95,15 @@ impl RelativePoses {
         inside.then_some((u, v, p.z))
     }
 
-    /// A plane `π·X = 1` of frame `a` in frame `b`; without meaning where it passes through the camera of `b`.
+    /// A plane `π·X = 1` of frame `a` in frame `b`; without meaning where it passes through the
+    /// camera of `b`.
     pub fn plane(&self, a: usize, b: usize, plane: Vec3) -> Vec3 {
         let (r, t) = self.to[b * self.views + a];
         (r.transpose() * plane) / (1.0 - plane.dot(t))
     }
 
-    /// Relative depth difference that a point of frame `a` must show before view `b` contradicts it: what moves its
-    /// image by [`REPROJECTION_TOLERANCE`], at least [`DEPTH_TOLERANCE`].
+    /// Relative depth difference that a point of frame `a` must show before view `b` contradicts
+    /// it: what moves its image by [`REPROJECTION_TOLERANCE`], at least [`DEPTH_TOLERANCE`].
     fn tolerance(&self, level: &Level, a: usize, b: usize, point: Vec3) -> f32 {
         let (r, t) = self.to[a * self.views + b];
         let along = r * point;
@@ -155,7 +158,8 @@ pub fn ray(level: &Level, view: usize, x: usize, y: usize) -> Vec3 {
     Vec3::new((x as f32 + 0.5 - cx) / fx, (y as f32 + 0.5 - cy) / fy, 1.0)
 }
 
-/// Calls `f(view, x, y, index)` for all pixels of all views in parallel and collects the results in buffer order.
+/// Calls `f(view, x, y, index)` for all pixels of all views in parallel and collects the results in
+/// buffer order.
 pub fn map_pixels<T: Send>(level: &Level, f: impl Fn(usize, usize, usize, usize) -> T + Sync) -> Vec<T> {
     let mut out = Vec::with_capacity(level.pixels());
     for (view, r) in level.references.iter().enumerate() {
@@ -169,7 +173,8 @@ pub fn map_pixels<T: Send>(level: &Level, f: impl Fn(usize, usize, usize, usize)
     out
 }
 
-/// Keeps what at least one other view confirms and none that confirmed itself contradicts more often.
+/// Keeps what at least one other view confirms and none that confirmed itself contradicts more
+/// often.
 pub fn consistent_surface(
     level: &Level,
     links: &RelativePoses,
@@ -214,10 +219,11 @@ pub fn consistent_surface(
     surface
 }
 
-/// Adds what no view confirms in views with little parallax, where confirmation is hard to get: pixels that match
-/// somewhere, lie on one surface with their surroundings and block no confirmed pixel. Where parallax is ample, a missing
-/// confirmation means occlusion or error, and nothing is added; nor where texture is weak, since there the smoothness of the
-/// search makes surroundings agree on anything.
+/// Adds what no view confirms in views with little parallax, where confirmation is hard to get:
+/// pixels that match somewhere, lie on one surface with their surroundings and block no confirmed
+/// pixel. Where parallax is ample, a missing confirmation means occlusion or error, and nothing is
+/// added; nor where texture is weak, since there the smoothness of the search makes surroundings
+/// agree on anything.
 fn with_plausible(
     level: &Level,
     links: &RelativePoses,
@@ -331,8 +337,8 @@ pub fn neighbours(k: usize, width: usize, height: usize) -> impl Iterator<Item =
     .flatten()
 }
 
-/// Least-squares plane of the consistent pixels around each consistent pixel that lie on its plane, in inverse depth
-/// (affine over the image). `radius` in pixels.
+/// Least-squares plane of the consistent pixels around each consistent pixel that lie on its plane,
+/// in inverse depth (affine over the image). `radius` in pixels.
 pub fn smoothed(level: &Level, surface: &Surface, radius: i32) -> Surface {
     let planes = map_pixels(level, |view, x, y, k| {
         if surface.confidence[k] <= 0.0 {

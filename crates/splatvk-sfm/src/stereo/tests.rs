@@ -56,7 +56,8 @@ fn what_floats_between_two_surfaces_is_no_point() {
     let set = synthetic(32, 24);
     let levels = pyramid(&set.images, &set.cameras, &set.sparse, &StereoOptions::default()).unwrap();
     let level = &levels[0];
-    // In the first view a wall, something before it, and a column of pixels half way; the others have no depth.
+    // In the first view a wall, something before it, and a column of pixels half way; the others
+    // have no depth.
     let depth = |column: usize| [4.0f32, 3.0, 2.0][usize::from(column >= 16) + usize::from(column > 16)];
     let pixels = level.pixels();
     let mut surface =

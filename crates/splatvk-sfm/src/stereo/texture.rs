@@ -3,8 +3,9 @@ use super::Level;
 
 /// Half of the window, pixels: that of matching.
 const RADIUS: usize = 5;
-/// Standard deviation of luma (0 to 1) over the window below which noise, JPEG blocks and shading prevail. Of the cupboard doors of
-/// room_a three quarters lie below 0.017, of its matched pixels half above 0.03; the walls of generated scenes start at 0.03.
+/// Standard deviation of luma (0 to 1) over the window below which noise, JPEG blocks and shading
+/// prevail. Of the cupboard doors of room_a three quarters lie below 0.017, of its matched pixels
+/// half above 0.03; the walls of generated scenes start at 0.03.
 const WEAK: f64 = 0.02;
 
 /// Per pixel of all views whether it has too little texture to be told from its neighbours.

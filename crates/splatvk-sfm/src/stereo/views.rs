@@ -1,4 +1,5 @@
-//! What the matcher reads: the image pyramid, the source views of every view, the inverse depth range.
+//! What the matcher reads: the image pyramid, the source views of every view, the inverse depth
+//! range.
 use super::StereoOptions;
 use super::matcher::{MAX_SOURCES, ReferenceView, SourceView, binding};
 use crate::scene::{Camera, RgbImage};
@@ -22,14 +23,16 @@ pub struct Level {
     pub tolerance: Vec<f32>,
 }
 
-/// Depths that differ by less agree: several times the matching noise, far below the size of objects.
+/// Depths that differ by less agree: several times the matching noise, far below the size of
+/// objects.
 pub const DEPTH_TOLERANCE: f32 = 0.01;
 /// Where parallax is small, this many pixels of matching noise are a larger depth difference …
 pub const REPROJECTION_TOLERANCE: f32 = 1.5;
 /// … up to here: coarser depth no longer separates surfaces.
 const COARSEST_TOLERANCE: f32 = 0.1;
 
-/// Pixels by which the image in `other` moves per relative change of the depth that `camera` sees a point at.
+/// Pixels by which the image in `other` moves per relative change of the depth that `camera` sees a
+/// point at.
 fn parallax(camera: &Camera, other: &Camera, point: DVec3) -> f64 {
     let along = other.pose.rotation * (point - camera.pose.centre());
     let p = other.pose.transform(point);
@@ -38,7 +41,8 @@ fn parallax(camera: &Camera, other: &Camera, point: DVec3) -> f64 {
     du.hypot(dv)
 }
 
-/// [`Level::tolerance`] of a view: what half of the points can be told apart by in the source that tells best.
+/// [`Level::tolerance`] of a view: what half of the points can be told apart by in the source that
+/// tells best.
 fn tolerance(view: usize, cameras: &[Camera], chosen: &[usize], sparse: &[DVec3]) -> f32 {
     let best = |p: &DVec3| {
         let sources = chosen.iter().filter(|&&s| seen(&cameras[s], *p));
@@ -49,7 +53,8 @@ fn tolerance(view: usize, cameras: &[Camera], chosen: &[usize], sparse: &[DVec3]
     (REPROJECTION_TOLERANCE / typical as f32).clamp(DEPTH_TOLERANCE, COARSEST_TOLERANCE)
 }
 
-/// Smallest side of the coarsest resolution, pixels: below, the matching window covers whole objects.
+/// Smallest side of the coarsest resolution, pixels: below, the matching window covers whole
+/// objects.
 const SMALLEST_SIDE: usize = 100;
 
 /// The resolutions to match at, coarsest first: at most `options.rounds.len()`.
@@ -96,8 +101,9 @@ fn needed(guide: &[RgbImage], chosen: &[Vec<usize>]) -> usize {
     binding((0..guide.len()).map(pixels).sum(), groups)
 }
 
-/// Inverse depths between which a view is searched: the 1st and 99th percentile of the sparse points in front of it,
-/// widened to 0.6 of the nearest and twice the farthest depth, since sparse points miss the extremes.
+/// Inverse depths between which a view is searched: the 1st and 99th percentile of the sparse
+/// points in front of it, widened to 0.6 of the nearest and twice the farthest depth, since sparse
+/// points miss the extremes.
 fn inverse_depth_range(camera: &Camera, sparse: &[DVec3]) -> Result<[f64; 2]> {
     let mut depths: Vec<f64> = sparse
         .iter()
@@ -128,8 +134,8 @@ fn seen(camera: &Camera, p: DVec3) -> bool {
     z > 0.0 && pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < w && pixel.y < h
 }
 
-/// The best source views of a view: many shared points, seen under 5–60° (optimum 20°, as in COLMAP's and MVSNet's
-/// view selection; narrower has no parallax, wider no common appearance).
+/// The best source views of a view: many shared points, seen under 5–60° (optimum 20°, as in
+/// COLMAP's and MVSNet's view selection; narrower has no parallax, wider no common appearance).
 fn choose_sources(view: usize, cameras: &[Camera], sparse: &[DVec3], count: usize) -> Vec<usize> {
     let here = cameras[view].pose.centre();
     let mut scores: Vec<(f64, usize)> = (0..cameras.len())
@@ -169,7 +175,8 @@ fn level(
     ranges: &[[f64; 2]],
     tolerance: &[f32],
 ) -> Level {
-    // `halved` keeps the pixel grid's origin and drops odd borders: the scale is a power of two, not a size ratio.
+    // `halved` keeps the pixel grid's origin and drops odd borders: the scale is a power of two,
+    // not a size ratio.
     let cameras: Vec<Camera> = guide
         .iter()
         .zip(cameras)

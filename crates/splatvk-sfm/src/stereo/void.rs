@@ -1,4 +1,5 @@
-//! White borders around photos (rectified or cropped images) and pixels that are not used: nothing to match, nothing to fill.
+//! White borders around photos (rectified or cropped images) and pixels that are not used: nothing
+//! to match, nothing to fill.
 use super::Level;
 use super::surface::neighbours;
 use crate::scene::Coverage;
@@ -25,7 +26,8 @@ pub fn unused(level: &Level, coverage: &[Option<Coverage>]) -> Vec<bool> {
     out
 }
 
-/// Per pixel of all views: true for white that is connected to the image border within its outer 5 %.
+/// Per pixel of all views: true for white that is connected to the image border within its outer 5
+/// %.
 pub fn white_border(level: &Level) -> Vec<bool> {
     let mut out = Vec::with_capacity(level.pixels());
     for guide in &level.guide {
@@ -60,7 +62,8 @@ mod tests {
 
     #[test]
     fn unused_pixels_are_void() {
-        // Two views of 6 × 4 pixels, the second from a photo of twice the size whose left third is not used.
+        // Two views of 6 × 4 pixels, the second from a photo of twice the size whose left third is
+        // not used.
         let view = |first| ReferenceView { first, width: 6, height: 4, ..ReferenceView::default() };
         let grey = RgbImage { width: 6, height: 4, data: vec![[0.5; 3]; 24] };
         let level = Level {

@@ -2,9 +2,11 @@
 use super::planes::Surface;
 use glam::{DMat2, DVec2, DVec3};
 
-/// Standard deviation of an edge's direction beside that of its ends, radians: lens and camera are not quite right (0.3°).
+/// Standard deviation of an edge's direction beside that of its ends, radians: lens and camera are
+/// not quite right (0.3°).
 const EDGE_FLOOR: f64 = 0.005;
-/// Share of the edges' length that is as good as all of it: a table with a few boxes has a tenth of it upright.
+/// Share of the edges' length that is as good as all of it: a table with a few boxes has a tenth of
+/// it upright.
 const ENOUGH_EDGES: f64 = 0.08;
 /// Standard deviation of a surface's normal, radians (1.5°).
 const SURFACE_SIGMA: f64 = 0.026;
@@ -17,7 +19,8 @@ const PITCH_SIGMA: f64 = 0.7;
 /// Standard deviation of a phone's gravity, radians (1.5°).
 const GRAVITY_SIGMA: f64 = 0.026;
 
-/// An edge and the centre of its camera span a plane that an upright edge shares with the direction up.
+/// An edge and the centre of its camera span a plane that an upright edge shares with the direction
+/// up.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct EdgePlane {
     /// Unit.
@@ -49,8 +52,9 @@ pub(super) struct Agreement {
 }
 
 impl Agreement {
-    /// To compare directions by. A phone's own measurement outweighs all that is inferred; what is inferred must agree with how
-    /// cameras are held, since edges and surfaces have three directions in a room.
+    /// To compare directions by. A phone's own measurement outweighs all that is inferred; what is
+    /// inferred must agree with how cameras are held, since edges and surfaces have three
+    /// directions in a room.
     pub fn total(&self) -> f64 {
         3.0 * self.gravity + (0.5 + self.edges + self.surface) * self.roll
     }
@@ -94,13 +98,15 @@ impl Clues {
     }
 }
 
-/// Share of the edges that count as independent: an edge has two sides, and what stands in a row leans in a row.
+/// Share of the edges that count as independent: an edge has two sides, and what stands in a row
+/// leans in a row.
 const INDEPENDENT_EDGES: f64 = 0.25;
-/// What all evidence of one kind may be off by together, radians: edges (0.4°), surfaces (0.6°), cameras of one photographer
-/// (1.5°), phones (0.6°).
+/// What all evidence of one kind may be off by together, radians: edges (0.4°), surfaces (0.6°),
+/// cameras of one photographer (1.5°), phones (0.6°).
 const FLOORS: [f64; 4] = [0.007, 0.01, 0.026, 0.01];
 
-/// A quadratic in the plane tangent to the sphere at a direction: information, and information times the way to its optimum.
+/// A quadratic in the plane tangent to the sphere at a direction: information, and information
+/// times the way to its optimum.
 #[derive(Clone, Copy, Debug, Default)]
 struct Quadratic {
     information: DMat2,
@@ -120,7 +126,8 @@ impl Quadratic {
     }
 }
 
-/// A direction near another that agrees better, and its standard deviation about the least certain axis, radians.
+/// A direction near another that agrees better, and its standard deviation about the least certain
+/// axis, radians.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Refined {
     pub direction: DVec3,
@@ -128,7 +135,8 @@ pub(super) struct Refined {
 }
 
 impl Clues {
-    /// One step of iteratively re-weighted least squares from the unit vector `v`, with weights `blur` radians coarse.
+    /// One step of iteratively re-weighted least squares from the unit vector `v`, with weights
+    /// `blur` radians coarse.
     pub fn refined(&self, v: DVec3, blur: f64) -> Refined {
         let (x, y) = v.any_orthonormal_pair();
         let tangent = |n: DVec3| DVec2::new(n.dot(x), n.dot(y));

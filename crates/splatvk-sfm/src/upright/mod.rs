@@ -7,20 +7,23 @@ use crate::scene::{Camera, PointCloud, RgbImage, Up, UpEvidence};
 use clues::{Agreement, Clues, EdgePlane, Refined};
 use glam::DVec3;
 
-/// Least agreement of a direction that counts as known: two fifths of what edges, surface and roll make together (2.5). The
-/// tuning sets have 1.4 and more, but for `room_a` with 0.85, 3° off, and four photos of a tree trunk with 1.2, 7° off.
+/// Least agreement of a direction that counts as known: two fifths of what edges, surface and roll
+/// make together (2.5). The tuning sets have 1.4 and more, but for `room_a` with 0.85, 3° off, and
+/// four photos of a tree trunk with 1.2, 7° off.
 const LEAST_AGREEMENT: f64 = 1.0;
-/// So many times the agreement of every other direction: 1.15 in `room_a`, 1.05 for the trunk; nothing else comes near on the
-/// other tuning sets.
+/// So many times the agreement of every other direction: 1.15 in `room_a`, 1.05 for the trunk;
+/// nothing else comes near on the other tuning sets.
 const CLEAR: f64 = 1.3;
-/// Largest standard deviation of a direction that counts as known, degrees: a floor that leans by 5° is seen to lean.
+/// Largest standard deviation of a direction that counts as known, degrees: a floor that leans by
+/// 5° is seen to lean.
 const MOST_SIGMA: f64 = 5.0;
 /// Agreement from which a kind of evidence is named.
 const NAMED: f64 = 0.25;
 
-/// The direction up of a scene, from its photos (without lens), cameras and points: edges of the photos that are upright in the
-/// scene, level surfaces among the points, that cameras are held without much roll, and gravity in camera axes where a phone
-/// noted it. `None` where these are too few, or agree on several directions.
+/// The direction up of a scene, from its photos (without lens), cameras and points: edges of the
+/// photos that are upright in the scene, level surfaces among the points, that cameras are held
+/// without much roll, and gravity in camera axes where a phone noted it. `None` where these are too
+/// few, or agree on several directions.
 pub fn up(
     images: &[&RgbImage],
     cameras: &[Camera],
@@ -77,7 +80,8 @@ fn sphere() -> impl Iterator<Item = DVec3> {
     })
 }
 
-/// Coarseness of the search and of the steps that follow it, radians: 2.5°, beyond the distance of the directions tried.
+/// Coarseness of the search and of the steps that follow it, radians: 2.5°, beyond the distance of
+/// the directions tried.
 const BLURS: [f64; 3] = [0.044, 0.02, 0.0];
 /// Candidates are this far apart, radians (6°).
 const APART: f64 = 0.1;
@@ -85,7 +89,8 @@ const APART: f64 = 0.1;
 const CANDIDATES: usize = 12;
 /// Agreement of what is worth refining: a twentieth of what counts as known.
 const WORTH: f64 = 0.05;
-/// Steps per coarseness: on the tuning sets two reach the same to a twentieth of a degree, among a tree's branches to a quarter.
+/// Steps per coarseness: on the tuning sets two reach the same to a twentieth of a degree, among a
+/// tree's branches to a quarter.
 const STEPS: usize = 4;
 
 /// Directions that agree better than those around them, best first.

@@ -19,8 +19,8 @@ const SAMPLES: usize = 4000;
 const NEIGHBOURS: usize = 24;
 /// Planes tried per surface: one with a twentieth of the points is hit 15 times.
 const TRIALS: usize = 300;
-/// How far from a plane its points may be, share of their depth: twice what stereo errs by at the median on `breakfast`
-/// (docs/internals/results.md).
+/// How far from a plane its points may be, share of their depth: twice what stereo errs by at the
+/// median on `breakfast` (docs/internals/results.md).
 const THICKNESS: f64 = 0.006;
 /// Smallest share of the points that makes a surface.
 const MIN_SHARE: f64 = 0.05;

@@ -1,7 +1,8 @@
-//! What the operating system says, in words: its own text ends in a number, and names things as its programmers do.
+//! What the operating system says, in words: its own text ends in a number, and names things as its
+//! programmers do.
 use std::io;
 
-/// What is wrong, after the name of a file: "does not exist".
+/// The error in words that follow the name of a file: "does not exist".
 pub fn words(e: &io::Error) -> String {
     use io::ErrorKind as K;
     let known = match e.kind() {
@@ -27,7 +28,7 @@ pub fn words(e: &io::Error) -> String {
     known.to_owned()
 }
 
-/// What to do about it, behind a semicolon; empty where only its cause can tell.
+/// Advice behind a semicolon; empty where only the cause determines it.
 pub(super) fn advice(e: &io::Error) -> &'static str {
     use io::ErrorKind as K;
     match e.kind() {
@@ -72,8 +73,8 @@ mod tests {
     #[cfg(target_os = "linux")]
     #[test]
     fn system_errors_have_words_and_no_number() {
-        // EPERM, ENOENT, EIO, EACCES, ENOTDIR, EISDIR, ENFILE, EMFILE, EFBIG, ENOSPC, EROFS, EPIPE, ENAMETOOLONG, ELOOP,
-        // EADDRINUSE, EDQUOT.
+        // EPERM, ENOENT, EIO, EACCES, ENOTDIR, EISDIR, ENFILE, EMFILE, EFBIG, ENOSPC, EROFS, EPIPE,
+        // ENAMETOOLONG, ELOOP, EADDRINUSE, EDQUOT.
         for number in [1, 2, 5, 13, 20, 21, 23, 24, 27, 28, 30, 32, 36, 40, 98, 122] {
             let error = io::Error::from_raw_os_error(number);
             let text = words(&error);

@@ -1,5 +1,5 @@
-//! Decoders of other crates over bytes from outside. A file must not end the program, so that a panic of a decoder counts as damage
-//! of the file, and says nothing on stderr.
+//! Decoders of other crates over bytes from outside. A file must not end the program, so that a
+//! panic of a decoder counts as damage of the file, and says nothing on stderr.
 use std::any::Any;
 use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind, set_hook, take_hook};
@@ -28,7 +28,8 @@ impl Drop for Quiet {
 /// Longest text of a panic in a message, characters.
 const LONGEST: usize = 120;
 
-/// Runs a decoder on this thread; `Err` holds the text of its panic, one line. What it leaves half-done must not be used again.
+/// Runs a decoder on this thread; `Err` holds the text of its panic, one line. What it leaves
+/// half-done must not be used again.
 pub fn guarded<T>(decode: impl FnOnce() -> T) -> Result<T, String> {
     static HOOK: Once = Once::new();
     HOOK.call_once(|| {
@@ -45,7 +46,7 @@ pub fn guarded<T>(decode: impl FnOnce() -> T) -> Result<T, String> {
     outcome.map_err(|panic| one_line(panic_text(panic.as_ref())))
 }
 
-/// What a panic says.
+/// The message of a panic.
 pub fn panic_text(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<String>().map(String::as_str);
     text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")

@@ -2,9 +2,10 @@
 use crate::{Error, Result};
 use std::path::PathBuf;
 
-/// The folder that set-up fills: `SPLATVK_HOME`, else `splatvk` in the user's data folder (`XDG_DATA_HOME`, else `.local/share` in
-/// `HOME`, else in the home that the system knows). Code is loaded from there, so a relative `XDG_DATA_HOME` or `HOME`, which would
-/// mean the current folder, does not count; where nothing else is left, that is [`Error::Missing`].
+/// The folder that set-up fills: `SPLATVK_HOME`, else `splatvk` in the user's data folder
+/// (`XDG_DATA_HOME`, else `.local/share` in `HOME`, else in the home that the system knows). Code
+/// is loaded from there, so a relative `XDG_DATA_HOME` or `HOME`, which would mean the current
+/// folder, does not count; where nothing else is left, that is [`Error::Missing`].
 pub fn home() -> Result<PathBuf> {
     choose(|name| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from), std::env::home_dir())
 }

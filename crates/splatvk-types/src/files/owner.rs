@@ -1,5 +1,6 @@
-//! Whose unfinished work a folder holds: a mark in it names the owner, and the owner holds a lock on that mark as long as it
-//! lives. Only what bears such a mark, and whose owner is certainly gone, is ever removed.
+//! Whose unfinished work a folder holds: a mark in it names the owner, and the owner holds a lock
+//! on that mark as long as it lives. Only what bears such a mark, and whose owner is certainly
+//! gone, is ever removed.
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::fs::{File, TryLockError};
@@ -9,13 +10,15 @@ use std::time::Duration;
 
 /// The file in a folder of unfinished work that names its owner.
 const MARK: &str = "owner";
-/// What is written lies here, or in the folder itself.
+/// The output lies here, or in the folder itself.
 pub(super) const NEW: &str = "new";
-/// Where a result lies aside while another one takes its place, on file systems that cannot exchange two folders.
+/// Where a result lies aside while another one takes its place, on file systems that cannot
+/// exchange two folders.
 const OLD: &str = "old";
 /// Most bytes of a mark: ten times a long one.
 const LONGEST_MARK: u64 = 1 << 14;
-/// Another process holds the lock of a dead owner only while it looks at the mark or sweeps: it is waited for this often.
+/// Another process holds the lock of a dead owner only while it looks at the mark or sweeps: it is
+/// waited for this often.
 const PATIENCE: (u32, Duration) = (100, Duration::from_millis(20));
 
 /// The process that works in a folder, as its mark names it.
@@ -23,9 +26,10 @@ const PATIENCE: (u32, Duration) = (100, Duration::from_millis(20));
 pub struct Owner {
     /// What the folder is: a folder of another meaning has no such field.
     splatvk: String,
-    /// Name of the folder that the mark lies in: the mark of another folder says nothing of this one.
+    /// Name of the folder that the mark lies in: the mark of another folder says nothing of this
+    /// one.
     folder: String,
-    /// Name of what is written; empty for several files.
+    /// Name of the output; empty for several files.
     place: String,
     host: String,
     /// Identity of the kernel's run; empty where there is none to read.
@@ -33,7 +37,8 @@ pub struct Owner {
     /// Namespace in which the number of the process counts.
     processes: String,
     process: u32,
-    /// When the process started, in ticks after the kernel's start: numbers of processes are used again.
+    /// When the process started, in ticks after the kernel's start: numbers of processes are used
+    /// again.
     started: u64,
 }
 
@@ -70,8 +75,8 @@ impl Owner {
         self.is_near() && started(self.process) != Some(self.started)
     }
 
-    /// Whether nobody works in `folder` any more, where the mark is as `locked` says: free and held by this call, or on a file
-    /// system without locks.
+    /// Whether nobody works in `folder` any more, where the mark is as `locked` says: free and held
+    /// by this call, or on a file system without locks.
     fn is_gone(&self, locked: bool, folder: &Path) -> bool {
         match self.is_near() {
             // What this process works on, it holds.
@@ -94,19 +99,21 @@ fn name(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// When a living process started, in ticks after the kernel's start; `None` where there is none of that number, or no /proc.
+/// When a living process started, in ticks after the kernel's start; `None` where there is none of
+/// that number, or no /proc.
 fn started(process: u32) -> Option<u64> {
     let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
     // The second field, the name, may hold anything; the 22nd is the time (proc(5)).
     stat.rsplit_once(')')?.1.split_whitespace().nth(19)?.parse().ok()
 }
 
-/// Whether a lock that is free here is free for every machine that sees the folder: so it is on file systems of one machine, and
-/// not on every network.
+/// Whether a lock that is free here is free for every machine that sees the folder: so it is on
+/// file systems of one machine, and not on every network.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 fn locks_reach_everybody(folder: &Path) -> bool {
     use std::os::unix::ffi::OsStrExt;
-    // ext2 to 4, XFS, Btrfs, tmpfs, ramfs, F2FS, ZFS, bcachefs, overlay, FAT, exFAT and NTFS (linux/magic.h).
+    // ext2 to 4, XFS, Btrfs, tmpfs, ramfs, F2FS, ZFS, bcachefs, overlay, FAT, exFAT and NTFS
+    // (linux/magic.h).
     const LOCAL: [u64; 12] = [
         0xef53,
         0x5846_5342,
@@ -123,7 +130,8 @@ fn locks_reach_everybody(folder: &Path) -> bool {
     ];
     let Ok(path) = std::ffi::CString::new(folder.as_os_str().as_bytes()) else { return false };
     let mut found = std::mem::MaybeUninit::<libc::statfs>::uninit();
-    // SAFETY: a text that ends with a zero byte, and a structure of that type for the answer, both alive during the call.
+    // SAFETY: a text that ends with a zero byte, and a structure of that type for the answer, both
+    // alive during the call.
     if unsafe { libc::statfs(path.as_ptr(), found.as_mut_ptr()) } != 0 {
         return false;
     }
@@ -138,11 +146,12 @@ fn locks_reach_everybody(_: &Path) -> bool {
     !cfg!(target_os = "linux")
 }
 
-/// What a folder of unfinished work is found to be.
+/// State of a folder of unfinished work.
 pub enum Found {
     /// Nothing is there.
     Nothing,
-    /// An empty folder, or one with an empty mark: an owner was killed before it had written the mark, or is about to write it.
+    /// An empty folder, or one with an empty mark: an owner was killed before it had written the
+    /// mark, or is about to write it.
     Blank(Option<File>),
     /// Its owner is gone. As long as this is kept, nobody else sweeps it.
     Left(Held),
@@ -219,8 +228,9 @@ pub struct Held {
 }
 
 impl Held {
-    /// Takes `folder` to work on `place`: makes it, or, where its owner is gone, takes it over, with what is in it if `keep`. Where
-    /// somebody works in it, or anything else is there, that is bad input.
+    /// Takes `folder` to work on `place`: makes it, or, where its owner is gone, takes it over,
+    /// with what is in it if `keep`. Where somebody works in it, or anything else is there, that is
+    /// bad input.
     pub fn take(folder: &Path, place: &Path, keep: bool) -> Result<Held> {
         for _ in 0..PATIENCE.0 {
             match std::fs::create_dir(folder) {
@@ -249,7 +259,8 @@ impl Held {
         Err(busy(place, folder, None))
     }
 
-    /// Marks a folder that this process has just made; `None` where another one has taken it for a leftover in this moment.
+    /// Marks a folder that this process has just made; `None` where another one has taken it for a
+    /// leftover in this moment.
     fn mark(folder: &Path, place: &Path) -> std::io::Result<Option<Held>> {
         let mark = folder.join(MARK);
         let mut lock = match File::options().read(true).write(true).create_new(true).open(&mark) {
@@ -290,15 +301,16 @@ impl Held {
         self.folder.join(OLD)
     }
 
-    /// Brings back what a process that was killed between two moves had moved aside; whether nothing of it is left here.
+    /// Brings back what a process that was killed between two moves had moved aside; whether
+    /// nothing of it is left here.
     pub fn put_back(&self) -> bool {
         let old = self.aside();
         if old.symlink_metadata().is_err() {
             return true;
         }
         let Some(place) = self.folder.parent().map(|parent| parent.join(&self.place)) else { return false };
-        // What cannot be named again stays, and so does what another one came in the place of before the new one was there: it may be
-        // all that is left of a scene.
+        // What cannot be named again stays, and so does what another one came in the place of
+        // before the new one was there: it may be all that is left of a scene.
         let named = !self.place.is_empty() && !self.place.contains(char::REPLACEMENT_CHARACTER);
         let moved = || [NEW, ""].iter().all(|part| !self.folder.join(part).join(&self.place).exists());
         named && if place.symlink_metadata().is_ok() { moved() } else { std::fs::rename(&old, place).is_ok() }
@@ -310,14 +322,16 @@ impl Held {
     }
 }
 
-/// On the disk before anything else is in the folder: after a power cut, too, what is there has an owner.
+/// On the disk before anything else is in the folder: after a power cut, too, what is there has an
+/// owner.
 fn write(mark: &mut File, folder: &Path, place: &Path) -> std::io::Result<()> {
     let text = serde_json::to_string_pretty(&Owner::this(folder, place)).map_err(std::io::Error::other)?;
     mark.write_all((text + "\n").as_bytes())?;
     mark.sync_all()
 }
 
-/// Removes a leftover that was just looked at, while its lock is held; what was moved aside goes back first.
+/// Removes a leftover that was just looked at, while its lock is held; what was moved aside goes
+/// back first.
 pub fn remove(folder: &Path, found: Found) -> std::io::Result<()> {
     match found {
         Found::Left(held) if held.put_back() => held.clear(),
@@ -335,7 +349,8 @@ pub fn remove(folder: &Path, found: Found) -> std::io::Result<()> {
     }
 }
 
-/// Removes a folder of unfinished work, its mark last: killed in between, it leaves what still bears the mark.
+/// Removes a folder of unfinished work, its mark last: killed in between, it leaves what still
+/// bears the mark.
 pub(super) fn clear(folder: &Path) -> std::io::Result<()> {
     for entry in std::fs::read_dir(folder)? {
         let path = entry?.path();
@@ -483,7 +498,8 @@ mod tests {
             assert_eq!(at("a.ply/scene.json").exists(), !there, "nothing is written over");
             std::fs::remove_dir_all(at("a.ply")).unwrap();
         }
-        // Something came there while neither was at the place: what was moved aside is the only one.
+        // Something came there while neither was at the place: what was moved aside is the only
+        // one.
         leave(&at("x")).unwrap();
         std::fs::create_dir_all(at("x").join(NEW).join("a.ply")).unwrap();
         std::fs::create_dir(at("x").join(OLD)).unwrap();

@@ -1,5 +1,6 @@
-//! What is being written, in a hidden folder that its owner has marked and locked: it goes when the work fails, when the process is
-//! stopped, and, where the process was killed, with the next one that writes to the place.
+//! What is being written, in a hidden folder that its owner has marked and locked: it goes when the
+//! work fails, when the process is stopped, and, where the process was killed, with the next one
+//! that writes to the place.
 use super::owner::{self, Found, Held, NEW};
 use crate::sync::lock;
 use crate::{Error, Result};
@@ -8,12 +9,14 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard};
 
-/// What this process has begun: the hidden folder, and the folders that were made for it, deepest first.
+/// What this process has begun: the hidden folder, and the folders that were made for it, deepest
+/// first.
 static UNFINISHED: Mutex<Vec<(PathBuf, Vec<PathBuf>)>> = Mutex::new(Vec::new());
 /// Whether this process has finished anything that a user asked for.
 static FINISHED: AtomicBool = AtomicBool::new(false);
 
-/// How the names of hidden folders end. A place has one such name, so that one process at a time writes to it.
+/// How the names of hidden folders end. A place has one such name, so that one process at a time
+/// writes to it.
 pub const HIDDEN: &str = ".partial-splatvk";
 /// Longest name, in bytes, that is part of that of its hidden folder: file systems take 255.
 const LONGEST_NAME: usize = 200;
@@ -23,8 +26,9 @@ fn unfinished() -> MutexGuard<'static, Vec<(PathBuf, Vec<PathBuf>)>> {
     lock(&UNFINISHED)
 }
 
-/// A file or folder that is being written. Dropped without [`Partial::finish`], it vanishes, and with it the folders that were made
-/// for it. While it lives, no other process and no other thread writes to its place.
+/// A file or folder that is being written. Dropped without [`Partial::finish`], it vanishes, and
+/// with it the folders that were made for it. While it lives, no other process and no other thread
+/// writes to its place.
 #[derive(Debug)]
 pub struct Partial {
     path: PathBuf,
@@ -33,8 +37,8 @@ pub struct Partial {
 }
 
 impl Partial {
-    /// For one file or folder: beside `place`, whose folders are made where they are missing. A place that another process writes
-    /// to is bad input.
+    /// For one file or folder: beside `place`, whose folders are made where they are missing. A
+    /// place that another process writes to is bad input.
     pub fn beside(place: &Path) -> Result<Partial> {
         let mut partial = Partial::reserve(parent(place), &hidden_beside(place), place)?;
         // Under its own name, of which writers take the ending.
@@ -74,8 +78,8 @@ impl Partial {
         self.held.as_ref().map(Held::aside).unwrap_or_default()
     }
 
-    /// Moves what was written to its place, by `rename`; what is at [`Partial::path`] and [`Partial::aside`] after that, goes. An exit
-    /// waits for the move.
+    /// Moves what was written to its place, by `rename`; what is at [`Partial::path`] and
+    /// [`Partial::aside`] after that, goes. An exit waits for the move.
     pub fn finish<E>(self, rename: impl FnOnce(&Path) -> Result<(), E>) -> Result<(), E> {
         self.keep(|path| {
             rename(path)?;
@@ -101,7 +105,8 @@ impl Partial {
             // Removed on the way to an exit.
             return;
         }
-        // The error on the way out is the one to report, and a result that is at its place is whole; the next process sweeps the rest.
+        // The error on the way out is the one to report, and a result that is at its place is
+        // whole; the next process sweeps the rest.
         let _ = held.clear();
         let mut list = unfinished();
         if let Some(at) = at(&list) {
@@ -135,7 +140,8 @@ fn hidden_beside(place: &Path) -> PathBuf {
     parent(place).join(own)
 }
 
-/// Makes the folders of a path that are missing; those that were made, deepest first. A `..` behind a missing one leads nowhere.
+/// Makes the folders of a path that are missing; those that were made, deepest first. A `..` behind
+/// a missing one leads nowhere.
 fn make(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     let missing = folder.ancestors().take_while(|p| !p.as_os_str().is_empty() && !p.exists());
     let missing: Vec<PathBuf> = missing.map(Path::to_path_buf).collect();
@@ -177,8 +183,8 @@ pub fn restore(place: &Path) {
     }
 }
 
-/// Removes everything unfinished of this process, for exits that run no destructors; whether nothing that a user asked for had been
-/// finished before.
+/// Removes everything unfinished of this process, for exits that run no destructors; whether
+/// nothing that a user asked for had been finished before.
 pub fn remove_unfinished() -> bool {
     for (hidden, made) in unfinished().drain(..) {
         let _ = owner::clear(&hidden);
@@ -198,7 +204,7 @@ pub fn is_leftover(path: &Path) -> bool {
     named && matches!(owner::look(path), Found::Left(_) | Found::Blank(_))
 }
 
-/// What processes that are gone have left in a folder.
+/// Unfinished work in a folder whose processes are gone.
 pub fn leftovers(folder: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let mut found: Vec<PathBuf> = entries.map(|e| e.path()).filter(|p| is_leftover(p)).collect();
@@ -206,7 +212,8 @@ pub fn leftovers(folder: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Removes one of [`leftovers`], unless somebody has begun to work in it; what was moved aside goes back to its place.
+/// Removes one of [`leftovers`], unless somebody has begun to work in it; what was moved aside goes
+/// back to its place.
 pub fn remove_leftover(path: &Path) -> std::io::Result<()> {
     owner::remove(path, owner::look(path))
 }

@@ -2,7 +2,7 @@
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// What is to be written at a place.
+/// Kind of the output at a place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     /// One file.
@@ -11,9 +11,10 @@ pub enum Kind {
     Folder,
 }
 
-/// Refuses a place where writing would lose something. An ordinary file, and files in a folder that is not empty, are written
-/// over with `force` only; a symbolic link, a device, a pipe and what is of the other kind never are. A link further up the path is
-/// the user's way to name a folder and is followed.
+/// Refuses a place where writing would lose something. An ordinary file, and files in a folder that
+/// is not empty, are written over with `force` only; a symbolic link, a device, a pipe and what is
+/// of the other kind never are. A link further up the path is the user's way to name a folder and
+/// is followed.
 pub fn check_place(place: &Path, kind: Kind, force: bool) -> Result<()> {
     let bad = |what: &str| Err(Error::input(format!("{}: {what}", place.display())));
     // With a slash behind it, a link would be looked through.
@@ -51,8 +52,9 @@ fn is_empty(folder: &Path) -> Result<bool> {
 /// Most names that a message lists.
 const LISTED: usize = 8;
 
-/// What is in `folder` and nobody knows, relative to it and with `/`: `own` gets such a name, and whether it is a folder; what is in a
-/// folder that it does not know is not looked at. Leftovers of killed processes do not count, nor what file managers write.
+/// What is in `folder` and nobody knows, relative to it and with `/`: `own` gets such a name, and
+/// whether it is a folder; what is in a folder that it does not know is not looked at. Leftovers of
+/// killed processes do not count, nor what file managers write.
 pub fn foreign(folder: &Path, own: &dyn Fn(&str, bool) -> bool) -> Vec<String> {
     const OF_FILE_MANAGERS: [&str; 3] = [".DS_Store", "Thumbs.db", "desktop.ini"];
     let (mut found, mut open) = (Vec::new(), vec![String::new()]);
@@ -87,7 +89,7 @@ pub fn listed(names: &[impl AsRef<str>]) -> String {
     if more == 0 { first } else { format!("{first} and {more} more") }
 }
 
-/// Refuses what is read where it would be replaced.
+/// Refuses inputs that would be replaced.
 pub fn check_spared<'a>(place: &Path, inputs: impl IntoIterator<Item = &'a Path>) -> Result<()> {
     let Ok(whole) = place.canonicalize() else { return Ok(()) };
     let lies_there = |input: &&Path| input.canonicalize().is_ok_and(|input| input.starts_with(&whole));

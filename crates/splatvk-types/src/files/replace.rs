@@ -1,8 +1,10 @@
-//! One folder in the place of another, so that a process that is killed at any moment leaves one of them there.
+//! One folder in the place of another, so that a process that is killed at any moment leaves one of
+//! them there.
 use std::path::Path;
 
-/// Puts the folder `new` at `place`, where another one is; that one is at `new` or `aside` afterwards. In one step where the system
-/// can; a process that is killed within several leaves it at `aside`, and nothing at the place.
+/// Puts the folder `new` at `place`, where another one is; that one is at `new` or `aside`
+/// afterwards. In one step where the system can; a process that is killed within several leaves it
+/// at `aside`, and nothing at the place.
 pub fn swap(new: &Path, place: &Path, aside: &Path) -> std::io::Result<()> {
     match exchange(new, place) {
         Ok(()) => Ok(()),

@@ -2,7 +2,8 @@
 use super::Camera;
 use serde::{Deserialize, Serialize};
 
-/// Axis-aligned affine map of pixel positions, `u' = s·u + o` per axis (docs/internals/method.md#pixel-maps).
+/// Axis-aligned affine map of pixel positions, `u' = s·u + o` per axis
+/// (docs/internals/method.md#pixel-maps).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Affine {
     /// Scale along x and y.
@@ -15,8 +16,8 @@ impl Affine {
     /// Every pixel stays where it is.
     pub const IDENTITY: Affine = Affine { scale: [1.0; 2], offset: [0.0; 2] };
 
-    /// The map of a resize between two sizes `(width, height)`. The scales come from the rounded sizes, so they may
-    /// differ between the axes; the edges of the two images coincide.
+    /// The map of a resize between two sizes `(width, height)`. The scales come from the rounded
+    /// sizes, so they may differ between the axes; the edges of the two images coincide.
     pub fn resize(from: (u32, u32), to: (u32, u32)) -> Affine {
         Affine { scale: [to.0 as f64 / from.0 as f64, to.1 as f64 / from.1 as f64], offset: [0.0; 2] }
     }

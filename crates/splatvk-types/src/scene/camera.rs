@@ -70,7 +70,8 @@ fn skew(v: DVec3) -> DMat3 {
 pub const MAX_SIDE: u32 = 16_384;
 /// Most pixels of an image: the largest photos that phones take.
 pub const MAX_PIXELS: u64 = 200_000_000;
-/// Bytes of a camera's name after its folders: file systems take 255 with what is appended ("_relevancy.npy").
+/// Bytes of a camera's name after its folders: file systems take 255 with what is appended
+/// ("_relevancy.npy").
 const LONGEST_NAME: usize = 200;
 /// Bytes of a camera's name with its folders, as Linux takes them.
 const LONGEST_PATH: usize = 4096;
@@ -97,8 +98,8 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// Refuses what no pinhole camera can be, and what nothing can be written for: images beyond [`MAX_SIDE`] and
-    /// [`MAX_PIXELS`], names that are no names of files.
+    /// Refuses what no pinhole camera can be, and what nothing can be written for: images beyond
+    /// [`MAX_SIDE`] and [`MAX_PIXELS`], names that are no names of files.
     pub fn checked(self) -> Result<Camera, String> {
         let c = self;
         c.check_name()?;

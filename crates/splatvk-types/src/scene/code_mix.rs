@@ -1,16 +1,20 @@
-//! What a splat carries on a level, in five bytes: where it lies between two codes, and how sure that is.
+//! What a splat carries on a level, in five bytes: where it lies between two codes, and how sure
+//! that is.
 use crate::math::dot_f32 as dot;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Steps of [`CodeMix::share`] in a whole. Of two codes the nearer one comes first, so that half of it is enough: a byte.
+/// Steps of [`CodeMix::share`] in a whole. Of two codes the nearer one comes first, so that half of
+/// it is enough: a byte.
 const SHARE_STEPS: f32 = 510.0;
 
-/// Splats whose feature is shorter have none: lifting leaves exact zeros, training moves them by less than this.
+/// Splats whose feature is shorter have none: lifting leaves exact zeros, training moves them by
+/// less than this.
 pub const MIN_LENGTH: f32 = 0.1;
 
-/// A unit feature as the nearest mix of its nearest code with another. Blending and decoding read a feature only through its cosines
-/// to the codes, and a splat between two things mixes two of them; docs/internals/method.md#feature-storage has what that costs.
+/// A unit feature as the nearest mix of its nearest code with another. Blending and decoding read a
+/// feature only through its cosines to the codes, and a splat between two things mixes two of them;
+/// docs/internals/method.md#feature-storage has what that costs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CodeMix {
     /// The nearest code; the number of codes where the splat has no feature.
@@ -37,8 +41,8 @@ impl CodeMix {
         let Some((a, first)) = (0..count).map(|k| (cosine(k), k)).max_by(|x, y| x.0.total_cmp(&y.0)) else {
             return none;
         };
-        // Weights of the combination of the two that is nearest to the feature (least squares of unit vectors), and how much nearer
-        // it is than the first code alone.
+        // Weights of the combination of the two that is nearest to the feature (least squares of
+        // unit vectors), and how much nearer it is than the first code alone.
         let with = |k: usize| {
             let (b, ab) = (cosine(k), dot(row(codes, first, d), row(codes, k, d)));
             let weight = (b - ab * a).max(0.0);
@@ -72,7 +76,8 @@ impl CodeMix {
     }
 }
 
-/// The mixes of codes [K, d] nearest to features [N, d]; nothing where the codes are more than a mix can name.
+/// The mixes of codes [K, d] nearest to features [N, d]; nothing where the codes are more than a
+/// mix can name.
 pub fn mixes(features: &[f32], codes: &[f32], d: usize) -> Vec<CodeMix> {
     if d == 0 || codes.len() / d >= usize::from(u16::MAX) {
         return Vec::new();

@@ -2,22 +2,22 @@
 use super::image::{Plane, RgbImage};
 use serde::{Deserialize, Serialize};
 
-/// What the pixels of a photo stand for that are not used.
+/// Meaning of the pixels of a photo that are not used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outside {
-    /// Nobody says what is there: masks. No loss counts them.
+    /// Unknown content, as under a mask. No loss counts them.
     Unknown,
     /// Nothing is there: a transparent background. Renders become transparent there.
     Empty,
 }
 
-/// Which pixels of a photo are used, and what the others are.
+/// The used pixels of a photo, and the meaning of the others.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Coverage {
     /// [H, W] share of every working pixel that is used, in [0, 1].
     pub share: Plane<f32>,
-    /// What the rest is.
+    /// Meaning of the other pixels.
     pub outside: Outside,
 }
 

@@ -60,7 +60,8 @@ impl RgbImage {
     }
 }
 
-/// Depth (camera z, world units, 0 = unknown) and confidence of one view, at the photo's working resolution.
+/// Depth (camera z, world units, 0 = unknown) and confidence of one view, at the photo's working
+/// resolution.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct DepthMap {
     /// [H, W] camera z; 0 = unknown.

@@ -1,4 +1,5 @@
-//! Language of a scene: features of the splats per level, and the codebooks that map them to embeddings.
+//! Language of a scene: features of the splats per level, and the codebooks that map them to
+//! embeddings.
 use super::code_mix::{self, CodeMix};
 use super::{Plane, Splats};
 use serde::{Deserialize, Serialize};
@@ -64,7 +65,8 @@ impl Codebook {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// `argmax_k F·c_k` (docs/internals/method.md#decoding-codes); ties take the lowest k; `None` without codes.
+    /// `argmax_k F·c_k` (docs/internals/method.md#decoding-codes); ties take the lowest k; `None`
+    /// without codes.
     pub fn decode(&self, feature: &[f32]) -> Option<usize> {
         let mut best: Option<(f32, usize)> = None;
         for (k, code) in self.codes.chunks_exact(self.code_dim.max(1)).enumerate() {
@@ -82,16 +84,19 @@ impl Codebook {
 pub struct LevelField {
     /// The bijection.
     pub codebook: Codebook,
-    /// [N, d] splat features as rendered (the renderer's semantic channels), splat order of the scene.
+    /// [N, d] splat features as rendered (the renderer's semantic channels), splat order of the
+    /// scene.
     pub features: Vec<f32>,
-    /// [N] what the features are made of, and stored as; empty where they are no mixes of codes.
+    /// [N] the stored mixes of codes that give the features; empty where features are no mixes.
     pub mixes: Vec<CodeMix>,
-    /// [N] how far the photos agree on what a splat is, in 0..1 (docs/internals/method.md#reliability); empty where that is not known.
+    /// [N] agreement of the photos on the thing of a splat, in 0..1
+    /// (docs/internals/method.md#reliability); empty where that is not known.
     pub reliability: Vec<f32>,
-    /// Per training view: code index per pixel, −1 = none. Training targets; empty in a loaded scene.
+    /// Per training view: code index per pixel, −1 = none. Training targets; empty in a loaded
+    /// scene.
     pub targets: Vec<Plane<i32>>,
-    /// The splats that the features were trained on, where the level has a model of its own; `None` = those of the scene.
-    /// As many as the scene has, in its order.
+    /// The splats that the features were trained on, where the level has a model of its own; `None`
+    /// = those of the scene. As many as the scene has, in its order.
     pub splats: Option<Splats>,
 }
 
@@ -101,7 +106,8 @@ impl LevelField {
         self.splats.as_ref().unwrap_or(shared)
     }
 
-    /// Takes over features [N, d] of any length: as unit mixes of two codes, or as they are where a mix cannot name the codes.
+    /// Takes over features [N, d] of any length: as unit mixes of two codes, or as they are where a
+    /// mix cannot name the codes.
     pub fn carry(&mut self, features: Vec<f32>) {
         self.carry_mixes(code_mix::mixes(&features, &self.codebook.codes, self.codebook.code_dim));
         if self.mixes.is_empty() {
@@ -134,7 +140,8 @@ impl LevelField {
 pub struct LanguageField {
     /// Three levels.
     pub levels: Vec<LevelField>,
-    /// Identifies the embedding space, for example `words/efficientnet-lite+minilm` or `dir:oracle`.
+    /// Identifies the embedding space, for example `words/efficientnet-lite+minilm` or
+    /// `dir:oracle`.
     pub space: String,
 }
 

@@ -3,12 +3,14 @@ use super::Camera;
 use glam::{DMat2, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// Distortion in normalised camera coordinates: where a lens images the ideal position `x = (X/Z, Y/Z)`. The coefficients are
-/// those of OpenCV and COLMAP, with `r = |x|`:
+/// Distortion in normalised camera coordinates: where a lens images the ideal position `x = (X/Z,
+/// Y/Z)`. The coefficients are those of OpenCV and COLMAP, with `r = |x|`:
 ///
-/// - rectilinear: `x_d = x (1 + k1 r² + k2 r⁴ + k3 r⁶)/(1 + k4 r² + k5 r⁴ + k6 r⁶) + q r² + 2 x (q·x)` with `q = (p2, p1)` (Brown
-///   1966; `OPENCV`, `FULL_OPENCV`, and with fewer terms `SIMPLE_RADIAL` and `RADIAL`);
-/// - fisheye: `x_d = x θ/r (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)` with `θ = atan r` (Kannala and Brandt 2006; `OPENCV_FISHEYE`).
+/// - rectilinear: `x_d = x (1 + k1 r² + k2 r⁴ + k3 r⁶)/(1 + k4 r² + k5 r⁴ + k6 r⁶) + q r² + 2 x
+///   (q·x)` with `q = (p2, p1)` (Brown 1966; `OPENCV`, `FULL_OPENCV`, and with fewer terms
+///   `SIMPLE_RADIAL` and `RADIAL`);
+/// - fisheye: `x_d = x θ/r (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)` with `θ = atan r` (Kannala and
+///   Brandt 2006; `OPENCV_FISHEYE`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Lens {
@@ -28,7 +30,8 @@ pub struct Lens {
     pub p1: f64,
     /// Tangential, along x.
     pub p2: f64,
-    /// Whether the projection is equidistant, `r_d = θ` without coefficients, instead of rectilinear.
+    /// Whether the projection is equidistant, `r_d = θ` without coefficients, instead of
+    /// rectilinear.
     pub fisheye: bool,
 }
 
@@ -104,8 +107,9 @@ impl Lens {
         DMat2::from_cols(column(DVec2::X), column(DVec2::Y))
     }
 
-    /// The ideal position that the lens images at `y`, by Newton's method. Beyond the radius at which radial distortion folds
-    /// back there is none; the position at the fold is returned there.
+    /// The ideal position that the lens images at `y`, by Newton's method. Beyond the radius at
+    /// which radial distortion folds back there is none; the position at the fold is returned
+    /// there.
     pub fn undistort(&self, y: DVec2) -> DVec2 {
         let target = y.length();
         if self.is_none() || target < 1e-12 {
@@ -115,11 +119,13 @@ impl Lens {
             return self.undistort_in_the_plane(y);
         }
         let mut r = target;
-        // Newton converges quadratically from here; twenty steps are far more than any lens that can be inverted takes.
+        // Newton converges quadratically from here; twenty steps are far more than any lens that
+        // can be inverted takes.
         for _ in 0..20 {
             let r2 = r * r;
             let slope = 1.0 + r2 * (3.0 * self.k1 + 5.0 * r2 * self.k2);
-            // At a fold the derivative vanishes: half the radius leads back to the branch that starts at the centre.
+            // At a fold the derivative vanishes: half the radius leads back to the branch that
+            // starts at the centre.
             let next = if slope > 0.05 {
                 r - (r * (1.0 + r2 * (self.k1 + r2 * self.k2)) - target) / slope
             } else {
@@ -167,20 +173,23 @@ impl Lens {
         self.undistort(camera.ray(pixel).truncate()).extend(1.0)
     }
 
-    /// Whether radial distortion grows with the radius up to `radius` (normalised): beyond a fold it cannot be undone.
+    /// Whether radial distortion grows with the radius up to `radius` (normalised): beyond a fold
+    /// it cannot be undone.
     pub fn is_invertible_to(&self, radius: f64) -> bool {
-        // The derivative is a quadratic in r²; between 0 and the end its least value lies at an end or at the vertex.
+        // The derivative is a quadratic in r²; between 0 and the end its least value lies at an end
+        // or at the vertex.
         let at = |r2: f64| 1.0 + r2 * (3.0 * self.k1 + 5.0 * r2 * self.k2);
         let end = radius * radius;
         let vertex = if self.k2 == 0.0 { end } else { -0.3 * self.k1 / self.k2 };
         at(end) > 0.0 && (!(0.0..end).contains(&vertex) || at(vertex) > 0.0)
     }
 
-    /// Whether every position in the picture of a pinhole has one of its own in that of the lens: nowhere on the way from the
-    /// principal point to the edges does the distortion fold back or change its sign.
+    /// Whether every position in the picture of a pinhole has one of its own in that of the lens:
+    /// nowhere on the way from the principal point to the edges does the distortion fold back or
+    /// change its sign.
     pub fn is_invertible_in(&self, camera: &Camera) -> bool {
-        // Positions on each edge, and on the way to each of them. What folds between two of them spans less than a hundredth
-        // of the picture.
+        // Positions on each edge, and on the way to each of them. What folds between two of them
+        // spans less than a hundredth of the picture.
         const STEPS: u32 = 64;
         let (w, h) = (f64::from(camera.width), f64::from(camera.height));
         let share = |k: u32| f64::from(k) / f64::from(STEPS);

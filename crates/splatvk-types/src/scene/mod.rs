@@ -1,8 +1,8 @@
 //! Plain data: cameras, splats, images, depth maps, language fields. No GPU, no I/O.
 //!
-//! Conventions used everywhere: camera frame OpenCV (+x right, +y down, +z forward), pixel (column c, row r) covers
-//! `[c, c+1) × [r, r+1)` with its centre at `(c+0.5, r+0.5)`, quaternions `(w, x, y, z)`, depth = camera z, images
-//! row-major RGB in [0, 1] (sRGB values as they are).
+//! Conventions used everywhere: camera frame OpenCV (+x right, +y down, +z forward), pixel (column
+//! c, row r) covers `[c, c+1) × [r, r+1)` with its centre at `(c+0.5, r+0.5)`, quaternions `(w, x,
+//! y, z)`, depth = camera z, images row-major RGB in [0, 1] (sRGB values as they are).
 mod affine;
 mod camera;
 pub mod code_mix;

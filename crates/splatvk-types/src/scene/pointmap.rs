@@ -1,6 +1,7 @@
 //! Output of geometry networks: a 3-D point for every pixel, in the camera of one of a pair.
 //!
-//! Positions are continuous pixels of the network's input ("model pixels"); the centre of the first pixel is 0.5.
+//! Positions are continuous pixels of the network's input ("model pixels"); the centre of the first
+//! pixel is 0.5.
 use super::{Affine, Camera, Pose, RgbImage};
 use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
@@ -47,7 +48,8 @@ impl ModelView {
     }
 }
 
-/// A point and a confidence per pixel. 1 is none at all; how far above it a good one is depends on the network.
+/// A point and a confidence per pixel. 1 is none at all; how far above it a good one is depends on
+/// the network.
 #[derive(Clone, Debug, Default)]
 pub struct Pointmap {
     /// [H, W] points; OpenCV axes of the camera that the pair names.
@@ -75,10 +77,12 @@ pub struct Descriptors {
 }
 
 impl Descriptors {
-    /// For each of the pixels `rows` the pixel of `other` with the largest dot product; ties go to the lowest.
+    /// For each of the pixels `rows` the pixel of `other` with the largest dot product; ties go to
+    /// the lowest.
     pub fn nearest(&self, rows: &[usize], other: &Descriptors) -> Vec<usize> {
         let d = self.dim;
-        // Sixteen queries share each pass over the other image, which is far larger than the caches.
+        // Sixteen queries share each pass over the other image, which is far larger than the
+        // caches.
         rows.par_chunks(16)
             .flat_map_iter(|chunk| {
                 let mut best = vec![(f32::NEG_INFINITY, 0usize); chunk.len()];
@@ -97,8 +101,8 @@ impl Descriptors {
     }
 }
 
-/// Output of a network for a pair of views, decoded in both directions. The two directions, and different pairs, may
-/// have different scales.
+/// Output of a network for a pair of views, decoded in both directions. The two directions, and
+/// different pairs, may have different scales.
 #[derive(Clone, Debug, Default)]
 pub struct PairPointmaps {
     /// Index of the first view.
@@ -113,19 +117,20 @@ pub struct PairPointmaps {
     pub x22: Pointmap,
     /// First view's pixels in the second camera.
     pub x12: Pointmap,
-    /// Descriptors D11, D21 (first decoding) and D12, D22 (second decoding), if the network has them.
+    /// Descriptors D11, D21 (first decoding) and D12, D22 (second decoding), if the network has
+    /// them.
     pub descriptors: Option<[Descriptors; 4]>,
 }
 
-/// What a geometry network says of a set of photos.
+/// Output of a geometry network for a set of photos.
 #[derive(Clone, Debug, Default)]
 pub struct Pointmaps {
     /// The photos as it saw them.
     pub views: Vec<ModelView>,
     /// Pointmaps of pairs of them.
     pub pairs: Vec<PairPointmaps>,
-    /// Cameras that it gave for all of them at once, one per view at the size of its input, in the unit of the pointmaps; empty
-    /// when it gives none.
+    /// Cameras that it gave for all of them at once, one per view at the size of its input, in the
+    /// unit of the pointmaps; empty when it gives none.
     pub cameras: Vec<Camera>,
     /// Least confidence of a usable point on the network's own scale, if that is known.
     pub confidence_floor: Option<f64>,

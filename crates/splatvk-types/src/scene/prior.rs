@@ -2,7 +2,7 @@
 use super::Plane;
 use serde::{Deserialize, Serialize};
 
-/// What the values of a depth prior are; scale and shift may be unknown.
+/// Kind of the values of a depth prior; scale and shift may be unknown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum PriorKind {
     /// Camera z.
@@ -11,11 +11,12 @@ pub enum PriorKind {
     InverseDepth,
 }
 
-/// A depth map of unknown scale and shift, as a network sees one photo. It covers the whole photo, at any resolution.
+/// A depth map of unknown scale and shift, as a network sees one photo. It covers the whole photo,
+/// at any resolution.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DepthPrior {
     /// [H, W] values; 0 or less and what is not finite = unknown.
     pub values: Plane<f32>,
-    /// What they are.
+    /// Their kind.
     pub kind: PriorKind,
 }

@@ -1,8 +1,10 @@
-//! Area averaging: every output pixel is the mean of the input area that it covers, fractions included.
+//! Area averaging: every output pixel is the mean of the input area that it covers, fractions
+//! included.
 use crate::scene::{Plane, RgbImage};
 use rayon::prelude::*;
 
-/// Per output index: the first input index and the weights of it and its successors, which sum to 1.
+/// Per output index: the first input index and the weights of it and its successors, which sum to
+/// 1.
 fn footprints(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let step = from as f64 / to as f64;
     (0..to)
@@ -18,7 +20,8 @@ fn footprints(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
         .collect()
 }
 
-/// Resizes an image, given as a function of (column, row), by area averaging. Sizes are (width, height) ≥ 1.
+/// Resizes an image, given as a function of (column, row), by area averaging. Sizes are (width,
+/// height) ≥ 1.
 pub fn area_average(
     from: (usize, usize),
     to: (usize, usize),
@@ -41,8 +44,8 @@ pub fn area_average(
     RgbImage { width: to.0, height: to.1, data }
 }
 
-/// [`area_average`] of pixels with the share of each that is used; also [H, W] the share that is used of every output pixel. Where that
-/// is 0, the colour goes on smoothly from the others.
+/// [`area_average`] of pixels with the share of each that is used; also [H, W] the share that is
+/// used of every output pixel. Where that is 0, the colour goes on smoothly from the others.
 pub fn area_average_of_used(
     from: (usize, usize),
     to: (usize, usize),
@@ -71,13 +74,15 @@ impl Plane<f32> {
 }
 
 impl RgbImage {
-    /// The image at another size by area averaging: exact for down-scaling; enlarging repeats pixels.
+    /// The image at another size by area averaging: exact for down-scaling; enlarging repeats
+    /// pixels.
     pub fn resized_by_area(&self, width: usize, height: usize) -> RgbImage {
         area_average((self.width, self.height), (width, height), |x, y| self.at(x, y))
     }
 }
 
-/// The shape of a resampling filter; its width grows with the reduction (as Pillow's `resize` does).
+/// The shape of a resampling filter; its width grows with the reduction (as Pillow's `resize`
+/// does).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Kernel {
@@ -191,7 +196,8 @@ mod tests {
 
     #[test]
     fn kernels_agree_with_pillow() {
-        // Pillow 12, ((7 x + 13 y) % 17) / 16 in mode F, resized; rows of the top left 3 × 2 corner.
+        // Pillow 12, ((7 x + 13 y) % 17) / 16 in mode F, resized; rows of the top left 3 × 2
+        // corner.
         let data = (0..20 * 14).map(|i| [((7 * (i % 20) + 13 * (i / 20)) % 17) as f32 / 16.0; 3]).collect();
         let image = RgbImage { width: 20, height: 14, data };
         for (kernel, size, want) in PILLOW {

@@ -18,8 +18,9 @@ pub fn camera(width: u32, height: u32, pose: Pose) -> Camera {
     }
 }
 
-/// The benchmark scene: N splats spread evenly over the image at depths 2–6, about 34–43 blended per pixel at
-/// 50 000 splats and 480×360, whatever N and the size (the footprint shrinks with √N). Camera at the origin.
+/// The benchmark scene: N splats spread evenly over the image at depths 2–6, about 34–43 blended
+/// per pixel at 50 000 splats and 480×360, whatever N and the size (the footprint shrinks with √N).
+/// Camera at the origin.
 pub fn benchmark(n: usize, width: u32, height: u32, sh_degree: u32, seed: u64) -> (Splats, Camera) {
     let camera = camera(width, height, Pose::IDENTITY);
     let mut random = Random::new(seed);
@@ -32,8 +33,8 @@ pub fn benchmark(n: usize, width: u32, height: u32, sh_degree: u32, seed: u64) -
     (splats, camera)
 }
 
-/// A small test scene around the view axis of an off-axis camera with an off-centre principal point: every splat
-/// covers a few pixels, some lie beyond the image border.
+/// A small test scene around the view axis of an off-axis camera with an off-centre principal
+/// point: every splat covers a few pixels, some lie beyond the image border.
 pub fn small(n: usize, width: u32, height: u32, sh_degree: u32, seed: u64) -> (Splats, Camera) {
     let pose = Pose::exp(DVec3::new(0.1, -0.05, 0.2), DVec3::new(0.2, -0.3, 0.1));
     let mut camera = camera(width, height, pose);

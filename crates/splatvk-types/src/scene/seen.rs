@@ -1,12 +1,14 @@
-//! How much of the photos every splat shows. What no photo shows is a guess: a surface continued beyond the photos' borders and
-//! behind what stands in front, or the inside of a thing.
+//! How much of the photos every splat shows. What no photo shows is a guess: a surface continued
+//! beyond the photos' borders and behind what stands in front, or the inside of a thing.
 use super::Splats;
 
-/// Splats that show less of the photos than this, in pixels, are unseen: they leave no trace in any photo. The bound below which
-/// a splat starts without a feature, too (docs/internals/method.md#lifting).
+/// Splats that show less of the photos than this, in pixels, are unseen: they leave no trace in any
+/// photo. The bound below which a splat starts without a feature, too
+/// (docs/internals/method.md#lifting).
 const LEAST: f32 = 0.05;
 
-/// What the photos show of every splat; nothing where that is not known, as of a bare file of Gaussians.
+/// What the photos show of every splat; nothing where that is not known, as of a bare file of
+/// Gaussians.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Seen {
     /// [N] pixels: blending weights, summed over the pixels of all photos.
@@ -29,7 +31,8 @@ impl Seen {
         (0..splats.len()).filter(|i| !self.is_unseen(*i)).collect()
     }
 
-    /// The same, of more than `most` those of which photos show most; ascending.
+    /// Indices of the `most` splats with the largest summed blending weight over the photos;
+    /// ascending.
     pub fn most_shown(&self, splats: &Splats, most: usize) -> Vec<usize> {
         let mut rows = self.rows(splats);
         let pixels = |i: usize| self.pixels.get(i).copied().unwrap_or(0.0);

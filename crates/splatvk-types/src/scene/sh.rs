@@ -98,7 +98,8 @@ mod tests {
 
     #[test]
     fn basis_is_orthonormal_over_the_sphere() {
-        // Fibonacci points integrate polynomials of degree 6 on the sphere to about 1e-4 at 20 000 points.
+        // Fibonacci points integrate polynomials of degree 6 on the sphere to about 1e-4 at 20 000
+        // points.
         let n = 20_000;
         let mut gram = [[0.0; 16]; 16];
         for i in 0..n {

@@ -24,8 +24,9 @@ pub struct Splats {
     pub sh_degree: u32,
     /// [N, (degree+1)², 3] coefficients, DC first, RGB interleaved.
     pub sh: Vec<f32>,
-    /// Whether opacities are meant with the 2-D Mip filter (Yu et al. 2024, Mip-Splatting): where the projection dilates a splat,
-    /// its opacity falls by the square root of the ratio of the determinants, so that thin splats do not grow heavier.
+    /// Whether opacities are meant with the 2-D Mip filter (Yu et al. 2024, Mip-Splatting): where
+    /// the projection dilates a splat, its opacity falls by the square root of the ratio of the
+    /// determinants, so that thin splats do not grow heavier.
     pub antialiased: bool,
 }
 

@@ -1,5 +1,6 @@
-//! The sRGB transfer (IEC 61966-2-1), continued above 1 by the same formula: colours of high dynamic range keep their
-//! order and come back exactly, while everything up to 1 is as in an 8-bit photo.
+//! The sRGB transfer (IEC 61966-2-1), continued above 1 by the same formula: colours of high
+//! dynamic range keep their order and come back exactly, while everything up to 1 is as in an 8-bit
+//! photo.
 
 /// Encoded value to linear light; odd, so that values below 0 come back too.
 pub fn to_linear(v: f32) -> f32 {

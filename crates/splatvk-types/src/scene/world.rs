@@ -2,7 +2,7 @@
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// What told which way is up.
+/// Evidence for the direction up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
@@ -36,7 +36,7 @@ pub struct Up {
     pub direction: DVec3,
     /// One standard deviation about the least certain axis, degrees.
     pub sigma_degrees: f64,
-    /// What agrees on it.
+    /// The evidence that agrees.
     pub evidence: Vec<UpEvidence>,
 }
 
@@ -51,7 +51,8 @@ pub struct Scale {
     pub stated: Vec<String>,
 }
 
-/// What is known of how a scene lies in the world. The scene keeps its own coordinates.
+/// Direction up and scale of a scene, as far as they are known. The scene keeps its own
+/// coordinates.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct World {
     /// `None` where nothing tells it surely.
@@ -85,7 +86,8 @@ impl UpAxis {
 }
 
 impl Up {
-    /// Scene axes → axes with `axis` up; beyond that the smallest turn, so that forward stays forward.
+    /// Scene axes → axes with `axis` up; beyond that the smallest turn, so that forward stays
+    /// forward.
     pub fn levelled(&self, axis: UpAxis) -> DMat3 {
         axis.turn()
             * DMat3::from_quat(DQuat::from_rotation_arc(

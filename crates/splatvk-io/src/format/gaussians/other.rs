@@ -1,4 +1,5 @@
-//! Files that are of another format than their names say, or of one that is not read: what they are, and the way out.
+//! Files that are of another format than their names say, or of one that is not read: what they
+//! are, and the way out.
 use crate::{Error, files};
 use std::io::Read as _;
 use std::path::Path;

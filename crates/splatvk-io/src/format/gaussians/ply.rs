@@ -12,8 +12,9 @@ use crate::{Error, Result, files};
 use std::fmt::Write as _;
 use std::path::Path;
 
-/// Reads Gaussians in the INRIA layout, of any SH degree 0–3 (of degree 4 without band 4), and of other programs what is close to
-/// it; notes name what is not read, a line each. ASCII or binary. Compressed files as SuperSplat writes them are understood, too.
+/// Reads Gaussians in the INRIA layout, of any SH degree 0–3 (of degree 4 without band 4), and of
+/// other programs what is close to it; notes name what is not read, a line each. ASCII or binary.
+/// Compressed files as SuperSplat writes them are understood, too.
 pub fn read_noted(path: &Path, notes: &mut Vec<String>) -> Result<Splats> {
     let mut parse = |bytes: Vec<u8>| {
         if ply_packed::is_packed(&header(&bytes, "vertex")?.columns) {
@@ -104,7 +105,8 @@ fn scales(t: &Table, notes: &mut Vec<String>) -> Result<Vec<usize>, String> {
 /// Column of the 3-D smoothing filter of Mip-Splatting: a standard deviation per Gaussian.
 const FILTER: &str = "filter_3D";
 
-/// Works a 3-D filter of standard deviation f into a Gaussian (Yu et al. 2024, eq. 9): s' = √(s² + f²), o' = o ∏ s / s'.
+/// Works a 3-D filter of standard deviation f into a Gaussian (Yu et al. 2024, eq. 9): s' = √(s² +
+/// f²), o' = o ∏ s / s'.
 fn fold(log_scales: &mut [f32; 3], logit: &mut f32, filter: f32) {
     let (mut log_ratio, variance) = (0.0, f64::from(filter).powi(2));
     for log_scale in log_scales {
@@ -120,9 +122,11 @@ fn fold(log_scales: &mut [f32; 3], logit: &mut f32, filter: f32) {
 /// How [`write_splats`] writes.
 #[derive(Clone, Copy, Debug)]
 pub struct PlyOptions<'a> {
-    /// SH degree of the file: higher coefficients are zero, lower degrees cut them. INRIA's own loader asks for 3.
+    /// SH degree of the file: higher coefficients are zero, lower degrees cut them. INRIA's own
+    /// loader asks for 3.
     pub degree: u32,
-    /// Adds unit features and code indices per level after all standard columns; viewers skip what they do not know.
+    /// Adds unit features and code indices per level after all standard columns; viewers skip what
+    /// they do not know.
     pub language: Option<&'a LanguageField>,
 }
 

@@ -10,8 +10,9 @@ enum Mode {
     Flat,
 }
 
-/// What the comments state: `SplatRenderMode: mip` (Brush, SuperSplat), `antialiased 1` (Postshot) and the like. Returns whether
-/// the Gaussians are antialiased; notes name what is stated and not applied.
+/// What the comments state: `SplatRenderMode: mip` (Brush, SuperSplat), `antialiased 1` (Postshot)
+/// and the like. Returns whether the Gaussians are antialiased; notes name what is stated and not
+/// applied.
 pub(super) fn antialiased(comments: &[String], notes: &mut Vec<String>) -> Result<bool, String> {
     let mut stated: Vec<(Mode, &str)> = Vec::new();
     for text in comments {
@@ -44,7 +45,8 @@ pub(super) fn places(comments: &[String]) -> impl Iterator<Item = String> {
 /// The comment that [`antialiased`] reads, as Brush and SuperSplat write it.
 pub(super) const MIP: &str = "comment SplatRenderMode: mip\n";
 
-/// Lower-case letters and digits of what stands before the first colon, equals sign or value, and what stands after it.
+/// Lower-case letters and digits of what stands before the first colon, equals sign or value, and
+/// what stands after it.
 fn split(text: &str) -> (String, String) {
     let text = text.to_lowercase();
     let (key, value) = match text.split_once([':', '=']) {

@@ -60,7 +60,8 @@ impl PropertyType {
     }
 }
 
-/// Most columns of an element. Names of 4,096 take no time to look through; Gaussians with features have some hundreds.
+/// Most columns of an element. Names of 4,096 take no time to look through; Gaussians with features
+/// have some hundreds.
 const MOST_COLUMNS: usize = 4096;
 
 /// Most bytes before the values: those of 4,096 columns with long names.
@@ -83,8 +84,9 @@ pub(super) struct Header {
     pub elements: Vec<String>,
 }
 
-/// The lines of a header up to `end_header`, and the first byte after it. The first line decides whether a carriage return
-/// alone ends a line: elsewhere the byte after `end_header\r` could be a value that looks like a line feed.
+/// The lines of a header up to `end_header`, and the first byte after it. The first line decides
+/// whether a carriage return alone ends a line: elsewhere the byte after `end_header\r` could be a
+/// value that looks like a line feed.
 fn lines(bytes: &[u8]) -> Result<(Vec<String>, usize), String> {
     let mark = if bytes.starts_with(b"\xef\xbb\xbf") { 3 } else { 0 };
     let bytes = &bytes[mark..];

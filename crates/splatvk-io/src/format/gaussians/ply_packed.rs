@@ -1,5 +1,5 @@
-//! Compressed PLY as SuperSplat writes it: chunks of 256 Gaussians with their bounds, each Gaussian in four 32-bit words,
-//! SH in bytes. About a quarter of the size of a plain PLY without SH.
+//! Compressed PLY as SuperSplat writes it: chunks of 256 Gaussians with their bounds, each Gaussian
+//! in four 32-bit words, SH in bytes. About a quarter of the size of a plain PLY without SH.
 use super::ply_header::PropertyType;
 use super::ply_table as table;
 use super::{degree, ply_comments, usable};
@@ -32,7 +32,8 @@ const BOUNDS: [&str; 18] = [
     "max_b",
 ];
 const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
-/// Log scales beyond these carry no information (1e-9 to 5e8 units) and would cost the others of the chunk their precision.
+/// Log scales beyond these carry no information (1e-9 to 5e8 units) and would cost the others of
+/// the chunk their precision.
 const LOG_SCALE_MAX: f32 = 20.0;
 /// Bytes of SH hold −4 to 4.
 const SH_RANGE: f32 = 8.0;
@@ -137,8 +138,8 @@ fn pack_rotation(q: [f32; 4]) -> u32 {
     })
 }
 
-/// Writes a file. Neighbours share a chunk, so the Gaussians change their order: row r of the file is number `order[r]` of
-/// the scene.
+/// Writes a file. Neighbours share a chunk, so the Gaussians change their order: row r of the file
+/// is number `order[r]` of the scene.
 pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
     usable::check_written(s)?;
     let order = morton_order(&s.means);

@@ -17,8 +17,8 @@ pub(super) struct Colours {
 }
 
 impl Colours {
-    /// The colour columns of a table. Bytes end at 255, unsigned shorts at 65535; other types, and shorts that end at 255, are
-    /// told by the greatest value, which is noted.
+    /// The colour columns of a table. Bytes end at 255, unsigned shorts at 65535; other types, and
+    /// shorts that end at 255, are told by the greatest value, which is noted.
     pub fn of(t: &Table, notes: &mut Vec<String>) -> Result<Option<Colours>, String> {
         let found = |names: &[&str; 3]| t.all_of_any_case(*names);
         let Some((names, columns)) = COLOURS.iter().find_map(|n| Some((n, found(n)?))) else {
@@ -37,7 +37,8 @@ impl Colours {
         let white = match kinds[0] {
             PropertyType::U8 => return Ok(Some(Colours { columns, white: 255.0 })),
             PropertyType::U16 if greatest > 255.0 => return Ok(Some(Colours { columns, white: 65535.0 })),
-            // Photos of high dynamic range go a little beyond white; nothing of 0 to 255 is as dark as this.
+            // Photos of high dynamic range go a little beyond white; nothing of 0 to 255 is as dark
+            // as this.
             _ if !whole && greatest <= BRIGHTEST_SHARE => 1.0,
             _ if greatest <= 255.0 => 255.0,
             _ if greatest <= 65535.0 => 65535.0,
@@ -71,8 +72,8 @@ impl Colours {
 /// Greatest float colour that is read as a share of white.
 const BRIGHTEST_SHARE: f32 = 4.0;
 
-/// Reads positions and colours (`red green blue`, `r g b` or `diffuse_red …` of any type, or `f_dc`), and what is not read of the
-/// file, a line each; confidence 1, radius 0.
+/// Reads positions and colours (`red green blue`, `r g b` or `diffuse_red …` of any type, or
+/// `f_dc`), and what is not read of the file, a line each; confidence 1, radius 0.
 pub fn read_points(path: &Path) -> Result<(PointCloud, Vec<String>)> {
     let place = path.display();
     let t = table(files::read(path)?).map_err(|e| Error::input(format!("{place}: {e}")))?;
@@ -113,7 +114,8 @@ fn points(t: &Table, notes: &mut Vec<String>) -> Result<PointCloud, String> {
     Ok(p)
 }
 
-/// Writes a coloured point cloud as other tools expect it: `x y z nx ny nz` float, `red green blue` uchar.
+/// Writes a coloured point cloud as other tools expect it: `x y z nx ny nz` float, `red green blue`
+/// uchar.
 pub fn write_points(path: &Path, p: &PointCloud) -> Result<()> {
     let mut bytes = String::from("ply\nformat binary_little_endian 1.0\n").into_bytes();
     let mut header = format!("element vertex {}\n", p.len());

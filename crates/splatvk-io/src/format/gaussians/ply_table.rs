@@ -69,7 +69,8 @@ impl Table {
     }
 }
 
-/// A line on columns and elements that are not read; normals have no meaning here and are not named.
+/// A line on columns and elements that are not read; normals have no meaning here and are not
+/// named.
 fn unread(
     columns: &[(String, PropertyType)],
     read_columns: &[&str],
@@ -165,7 +166,8 @@ fn layout(columns: &[(String, PropertyType)]) -> (Vec<usize>, usize) {
     (offsets, width)
 }
 
-/// First byte of the rows and the first after them. Checked before anything is allocated: the counts come from the file.
+/// First byte of the rows and the first after them. Checked before anything is allocated: the
+/// counts come from the file.
 fn place(h: &Header, width: usize, size: usize) -> Result<(usize, usize), String> {
     let first = h.body.checked_add(h.skip);
     let end = first.and_then(|first| h.rows.checked_mul(width)?.checked_add(first));

@@ -35,9 +35,9 @@ pub fn read_noted(path: &Path, _notes: &mut Vec<String>) -> Result<Splats> {
     Ok(s)
 }
 
-/// Writes positions and standard deviations (f32 × 3 each), base colour and opacity (u8 × 4), rotation
-/// (w, x, y, z as `128 q + 128`), the most visible splats first, as progressive viewers expect: row r of the file is
-/// number `order[r]` of the scene.
+/// Writes positions and standard deviations (f32 × 3 each), base colour and opacity (u8 × 4),
+/// rotation (w, x, y, z as `128 q + 128`), the most visible splats first, as progressive viewers
+/// expect: row r of the file is number `order[r]` of the scene.
 pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
     usable::check_written(s)?;
     let alpha = |i: usize| crate::math::sigmoid(s.opacity_logits[i]);

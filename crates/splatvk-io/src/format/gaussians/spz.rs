@@ -1,9 +1,9 @@
-//! `.spz`, Niantic's compressed splats: versions 2 and 3 (one gzip stream, or bare) and 4 (one Zstandard stream per
-//! attribute) are read and written. About a tenth of the size of a PLY.
+//! `.spz`, Niantic's compressed splats: versions 2 and 3 (one gzip stream, or bare) and 4 (one
+//! Zstandard stream per attribute) are read and written. About a tenth of the size of a PLY.
 //!
-//! The format's axes are right, up, back unless a file states others; files are turned by 180° about x on the way in and out.
-//! Positions are 24-bit fixed point with as many fractional bits as their extent leaves room for (the format's own tools take
-//! 12).
+//! The format's axes are right, up, back unless a file states others; files are turned by 180°
+//! about x on the way in and out. Positions are 24-bit fixed point with as many fractional bits as
+//! their extent leaves room for (the format's own tools take 12).
 use super::{degree, spz_extensions, usable};
 use crate::math::quaternion_norm;
 use crate::scene::{Splats, sh_coefficients};
@@ -22,19 +22,22 @@ const FIXED_MAX: f32 = 8_388_607.0;
 const COLOUR_SCALE: f32 = 0.15;
 /// Largest base colour that a byte holds: f_dc ends at 0.5 / 0.15.
 pub const BRIGHTEST: f32 = 0.5 + crate::scene::SH_C0 * 0.5 / COLOUR_SCALE;
-/// Most Gaussians that are read, so that a damaged count does not take all memory: ten times the largest scenes shared.
+/// Most Gaussians that are read, so that a damaged count does not take all memory: ten times the
+/// largest scenes shared.
 const MAX_GAUSSIANS: usize = 100_000_000;
 
 /// Most bytes of extension records: those that are known have some dozens.
 const MOST_BEHIND: u64 = 1 << 20;
 
-/// Signs of the SH coefficients when y and z turn round: the parity of each basis function in (y, z) together.
+/// Signs of the SH coefficients when y and z turn round: the parity of each basis function in (y,
+/// z) together.
 const SH_SIGNS: [f32; 16] =
     [1.0, -1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
 
 /// Versions that are written.
 pub const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
-/// The newest version that most programs read: of the loaders of Niantic, SuperSplat and Spark (2.2) all know 3, Spark's not 4.
+/// The newest version that most programs read: of the loaders of Niantic, SuperSplat and Spark
+/// (2.2) all know 3, Spark's not 4.
 pub const DEFAULT_VERSION: u32 = 3;
 
 /// Bits of the header's flags.
@@ -108,7 +111,8 @@ impl Head {
 }
 
 impl Head {
-    /// [`Head::sections`] where a file of `size` bytes may hold as much: the count comes from the file.
+    /// [`Head::sections`] where a file of `size` bytes may hold as much: the count comes from the
+    /// file.
     fn checked_sections(&self, size: usize) -> Result<[usize; 6], String> {
         let sections = self.sections();
         match sections.iter().sum::<usize>() as u64 <= files::most_content(size) {
@@ -273,8 +277,8 @@ const SMALLER_MAX: f32 = std::f32::consts::FRAC_1_SQRT_2;
 /// Nine bits of magnitude.
 const MAGNITUDE: u32 = 511;
 
-/// Version 3: index of the largest of (x, y, z, w) in the top two bits, then the other three from the last to the first,
-/// each a sign and nine bits of magnitude.
+/// Version 3: index of the largest of (x, y, z, w) in the top two bits, then the other three from
+/// the last to the first, each a sign and nine bits of magnitude.
 fn smallest_three(b: &[u8]) -> [f32; 4] {
     let mut bits = u32::from_le_bytes([b[0], b[1], b[2], b[3]]);
     let largest = (bits >> 30) as usize;
@@ -401,7 +405,8 @@ mod tests {
     use super::*;
     use crate::scene::seeded;
 
-    /// A bare file of version 3 with a header that `change` changes, and what follows its Gaussians.
+    /// A bare file of version 3 with a header that `change` changes, and what follows its
+    /// Gaussians.
     fn read(change: impl FnOnce(&mut Vec<u8>), behind: &[u8]) -> Result<(Splats, Vec<String>), String> {
         let s = seeded::small(5, 32, 24, 3, 1002).0;
         let mut bytes = Vec::new();
@@ -475,7 +480,8 @@ mod tests {
             for (a, b) in s.quats.iter().zip(&back.quats) {
                 let norm = a.iter().map(|v| v * v).sum::<f32>().sqrt();
                 let dot = a.iter().zip(b).map(|(x, y)| x * y).sum::<f32>() / norm;
-                // In version 2 w is what the others leave, so half a step of theirs moves a w near 0 by a tenth.
+                // In version 2 w is what the others leave, so half a step of theirs moves a w near
+                // 0 by a tenth.
                 assert!(dot.abs() > if version == 2 { 0.99 } else { 0.99999 }, "{version}: {dot}");
             }
         }

@@ -11,15 +11,16 @@ const OTHERS: [(u32, &str); 2] =
 /// A draft that stored SH in another range.
 const SH_QUANTISATION: u32 = 0xadbe_0001;
 
-/// Directions of the first, second and third axis by number: right or left, up or down, front or back. 0 is "not specified".
-/// From 9 on as Niantic's present loader numbers them; its first one with these axes had 9 to 12 and 13 to 16 the other way
-/// round.
+/// Directions of the first, second and third axis by number: right or left, up or down, front or
+/// back. 0 is "not specified". From 9 on as Niantic's present loader numbers them; its first one
+/// with these axes had 9 to 12 and 13 to 16 the other way round.
 const SYSTEMS: [&str; 17] = [
     "RUB", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD",
     "LBU", "RBU",
 ];
 
-/// Applies the records to Gaussians that were read as right, up, back; notes name those that are not read.
+/// Applies the records to Gaussians that were read as right, up, back; notes name those that are
+/// not read.
 pub(super) fn apply(s: &mut Splats, mut records: &[u8], notes: &mut Vec<String>) -> Result<(), String> {
     let early = "its extension records end early; copy the file again";
     let mut axes = None;

@@ -27,8 +27,8 @@ fn the_eight_orientations_give_one_image() {
     use exif::{Tag, Value};
     let reference = decode(png(&picture(), None), Path::new("a.png"), None).unwrap();
     for tag in 1..=8u8 {
-        // The stored image is the upright one with the inverse of the tag applied: of the eight, only the two
-        // quarter turns are not their own inverse.
+        // The stored image is the upright one with the inverse of the tag applied: of the eight,
+        // only the two quarter turns are not their own inverse.
         let inverse = match tag {
             6 => 8,
             8 => 6,
@@ -121,7 +121,8 @@ fn floats_are_linear_light_and_may_exceed_one() {
     DynamicImage::ImageRgba32F(half).write_to(&mut exr, ImageFormat::OpenExr).unwrap();
     // OpenEXR stores colours multiplied by alpha.
     let d = decode(exr.into_inner(), Path::new("a.exr"), None).unwrap();
-    // By IEC 61966-2-1, 0.25 is 0.53710 and 4 is 1.055 · 4^(1/2.4) − 0.055; f32 powers are good to 1e-6.
+    // By IEC 61966-2-1, 0.25 is 0.53710 and 4 is 1.055 · 4^(1/2.4) − 0.055; f32 powers are good to
+    // 1e-6.
     let srgb = d.at(0, 1).0;
     let right = (srgb[0] - 0.537_099).abs() < 1e-5 && (srgb[1] - 1.824_796).abs() < 1e-5 && srgb[2] == 0.0;
     assert!(right, "{srgb:?}");
@@ -165,7 +166,8 @@ fn webp_with_exif_and_alpha() {
     assert!((c[0] - 200.0 / 255.0).abs() < 1e-6 && (alpha - 0.2).abs() < 1e-6, "{c:?} {alpha}");
 }
 
-/// An uncompressed little-endian TIFF: per page a size, the tags besides those of the layout, and the strip.
+/// An uncompressed little-endian TIFF: per page a size, the tags besides those of the layout, and
+/// the strip.
 fn tiff(pages: &[(u32, u32, &[(u16, u16, Vec<u32>)], Vec<u8>)]) -> Vec<u8> {
     let mut out = b"II*\0\0\0\0\0".to_vec();
     let mut link = 4;
@@ -263,7 +265,8 @@ fn cut_off_webp_tiff_and_exr_are_refused() {
         image.write_to(&mut out, format).unwrap();
         let bytes = out.into_inner();
         assert!(decode(bytes.clone(), Path::new(name), None).is_ok());
-        // The directory of a TIFF and the padding of a WebP may end the file: what is cut must reach into the pixels.
+        // The directory of a TIFF and the padding of a WebP may end the file: what is cut must
+        // reach into the pixels.
         for cut in (0..bytes.len() / 2).step_by(7) {
             let e = decode(bytes[..cut].to_vec(), Path::new(name), None).err();
             let e = e.unwrap_or_else(|| panic!("{name} cut at {cut} of {}", bytes.len()));

@@ -36,7 +36,8 @@ struct Line {
     side: usize,
     weight: f64,
     r: [f64; 3],
-    /// (unknown, derivatives); one index counts all unknowns, and one that both views share stands twice.
+    /// (unknown, derivatives); one index counts all unknowns, and one that both views share stands
+    /// twice.
     entries: Vec<(usize, [f64; 3])>,
 }
 

@@ -4,8 +4,9 @@ use crate::progress::{peak_memory, reset_peak_memory};
 use crate::scene::{Pose, RgbImage};
 use splatvk_infer::best_pairs::BestPairs;
 
-/// `count` cameras of a network of this size, and photos so many times as large, on a patch in front of the wall z = 4 + 0.35 sin(2.1 x) cos(1.7 y), all looking at its middle. It hides nothing
-/// of itself: it rises by less than one in one, and is seen by less than 45° from the side.
+/// `count` cameras of a network of this size, and photos so many times as large, on a patch in
+/// front of the wall z = 4 + 0.35 sin(2.1 x) cos(1.7 y), all looking at its middle. It hides
+/// nothing of itself: it rises by less than one in one, and is seen by less than 45° from the side.
 fn wall(count: usize, width: usize, height: usize, photo_scale: usize) -> Case {
     let (mut views, mut cameras, mut depths) = (Vec::new(), Vec::new(), Vec::new());
     let photo = (photo_scale * width, photo_scale * height);
@@ -77,7 +78,8 @@ impl Case {
     }
 }
 
-/// Seconds of processor time of this process so far: unlike the clock's they do not depend on what else the machine does.
+/// Seconds of processor time of this process so far: unlike the clock's they do not depend on what
+/// else the machine does.
 fn processor_seconds() -> f64 {
     let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
     let after_name = stat.rsplit(')').next().unwrap_or_default();
@@ -124,8 +126,8 @@ fn exif_tells_the_focal_length_where_there_is_any_and_the_points_where_not() {
     assert_eq!((exif.of(0), exif.of(1)), (80.0, 80.0));
 }
 
-/// Depth at working size belongs to the centres of the photo's pixels, four to one of the network's here: half a pixel of the
-/// network is seen.
+/// Depth at working size belongs to the centres of the photo's pixels, four to one of the network's
+/// here: half a pixel of the network is seen.
 #[test]
 fn depth_of_the_photo_is_that_of_the_centres_of_its_pixels() {
     let case = wall(3, 128, 96, 4);
@@ -149,7 +151,8 @@ fn depth_of_the_photo_is_that_of_the_centres_of_its_pixels() {
     }
 }
 
-/// Sixteen views of the size that a test can wait for; SPLATVK_TEST_SIZE=512x384 for that of the networks.
+/// Sixteen views of the size that a test can wait for; SPLATVK_TEST_SIZE=512x384 for that of the
+/// networks.
 #[test]
 #[ignore = "seconds and bytes: run it alone, in release, with MALLOC_MMAP_THRESHOLD_=65536 so that what is freed goes back"]
 fn sixteen_views_take_four_times_as_much_as_four() {

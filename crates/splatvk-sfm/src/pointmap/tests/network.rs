@@ -1,4 +1,5 @@
-//! What a network says besides the pointmaps: its own cameras, its own scale of confidence; and pairs that turn out wrong.
+//! What a network says besides the pointmaps: its own cameras, its own scale of confidence; and
+//! pairs that turn out wrong.
 use super::*;
 use crate::progress::Recorded;
 use crate::scene::Pose;

@@ -1,28 +1,33 @@
 //! Scale and shift of a depth prior, piece by piece.
 //!
-//! Both are fitted in inverse depth, because there planes are affine functions of the image: one scale and one shift turn a plane
-//! of the prior into a plane, what networks of relative depth leave open is just these two (Ranftl et al. 2020), and the noise of
-//! matching is even. In depth or its logarithm a shift would bend every wall.
+//! Both are fitted in inverse depth, because there planes are affine functions of the image: one
+//! scale and one shift turn a plane of the prior into a plane, what networks of relative depth
+//! leave open is just these two (Ranftl et al. 2020), and the noise of matching is even. In depth
+//! or its logarithm a shift would bend every wall.
 use super::pieces::{NO_PIECE, Pieces};
 use crate::math::hash;
 
-/// Pixels of stereo depth that err together, those of one matching window: they count as one measurement.
+/// Pixels of stereo depth that err together, those of one matching window: they count as one
+/// measurement.
 const CORRELATED: f64 = 81.0;
-/// Relative change of a prior's error from one piece to the next. Errors of a tenth that swing twice over the image change as much.
+/// Relative change of a prior's error from one piece to the next. Errors of a tenth that swing
+/// twice over the image change as much.
 const CHANGE: f64 = 0.02;
-/// Relative deviation of a piece from the whole image's scale and shift; keeps both apart where a piece is of one depth.
+/// Relative deviation of a piece from the whole image's scale and shift; keeps both apart where a
+/// piece is of one depth.
 const SPREAD: f64 = 0.3;
-/// Widths of the robust loss (Cauchy), multiples of stereo's own deviation, one per round: wide first, so that a piece that is
-/// far off is drawn in before it counts as an outlier.
+/// Widths of the robust loss (Cauchy), multiples of stereo's own deviation, one per round: wide
+/// first, so that a piece that is far off is drawn in before it counts as an outlier.
 const WIDTHS: [f64; 5] = [16.0, 8.0, 4.0, 2.0, 2.0];
-/// Two-pixel hypotheses for the scale and shift of the whole image: with half of the pixels right, all miss with 0.75^300.
+/// Two-pixel hypotheses for the scale and shift of the whole image: with half of the pixels right,
+/// all miss with 0.75^300.
 const TRIALS: u32 = 300;
 /// Pixels that score a hypothesis.
 const SCORED: usize = 500;
 /// A piece of which less than half agrees contradicts stereo.
 const LEAST_AGREEMENT: f64 = 0.5;
-/// A prior must explain what was matched by so much more than one constant depth does: one of another scene can be flattened
-/// until it is as good as that.
+/// A prior must explain what was matched by so much more than one constant depth does: one of
+/// another scene can be flattened until it is as good as that.
 const BETTER_THAN_FLAT: f64 = 1.05;
 /// Disagreement, multiples of the deviation, that no noise explains.
 const OUTLIER: f64 = 4.0;
@@ -47,9 +52,9 @@ struct Sample {
     weight: f64,
 }
 
-/// Brings `prior` (affine in inverse depth, [H, W], 0 = unknown) to `stereo` (inverse depth, 0 = unmatched) with
-/// `confidence`. `tolerance` is stereo's relative deviation. `None` if no scale and shift explain what stereo measured better than one
-/// depth for all of it.
+/// Brings `prior` (affine in inverse depth, [H, W], 0 = unknown) to `stereo` (inverse depth, 0 =
+/// unmatched) with `confidence`. `tolerance` is stereo's relative deviation. `None` if no scale and
+/// shift explain what stereo measured better than one depth for all of it.
 pub fn align(
     prior: &[f32],
     stereo: &[f32],
@@ -72,7 +77,8 @@ pub fn align(
     Some(solved.applied(&rough, &pieces, &samples, (width, height), f64::from(tolerance)))
 }
 
-/// Scale and shift of the whole image: the pair of pixels with which most others agree, then least squares over those.
+/// Scale and shift of the whole image: the pair of pixels with which most others agree, then least
+/// squares over those.
 fn whole(prior: &[f32], samples: &[Sample], tolerance: f64, seed: u32) -> Option<(f64, f64)> {
     if samples.len() < 2 * CORRELATED as usize {
         return None;
@@ -98,7 +104,8 @@ fn whole(prior: &[f32], samples: &[Sample], tolerance: f64, seed: u32) -> Option
         let (p, q) = (f64::from(prior[s.pixel]), f64::from(prior[t.pixel]));
         let a = (s.inverse - t.inverse) / (p - q);
         flat = flat.max(score((0.0, s.inverse)));
-        // A prior is nearer where the scene is nearer; the scale alone explains one of constant depth.
+        // A prior is nearer where the scene is nearer; the scale alone explains one of constant
+        // depth.
         for (a, b) in [(a, s.inverse - a * p), (s.inverse / p, 0.0)] {
             if a > 0.0 && a.is_finite() && score((a, b)) > best.0 {
                 best = (score((a, b)), (a, b));
@@ -134,7 +141,8 @@ struct Solved {
     unit: f64,
 }
 
-/// Symmetric 2 × 2 blocks on the diagonal and rank-one couplings of pairs: what conjugate gradients multiply with.
+/// Symmetric 2 × 2 blocks on the diagonal and rank-one couplings of pairs: what conjugate gradients
+/// multiply with.
 struct System {
     diagonal: Vec<[f64; 3]>,
     /// (a, b, h, weight): weight · (h · (x_a − x_b))².
@@ -334,7 +342,8 @@ fn hops(pieces: &Pieces, evidence: &[bool]) -> Vec<u32> {
     hops.into_iter().map(|h| h.min(farthest)).collect()
 }
 
-/// Mean over the known values within `radius`, so that no seams run between pieces; rows, then columns.
+/// Mean over the known values within `radius`, so that no seams run between pieces; rows, then
+/// columns.
 fn blurred(values: &[f32], width: usize, height: usize, radius: usize) -> Vec<f32> {
     let pass = |from: &[(f64, f64)], at: &dyn Fn(usize, usize) -> usize, lines: usize, length: usize| {
         let mut out = vec![(0.0, 0.0); from.len()];

@@ -1,11 +1,14 @@
 //! Where a depth prior cannot be right: around depth edges, over which networks blur.
 
-/// Half of the window that must be one plane, share of the view's width: what blurs of a hundredth of the width reach.
+/// Half of the window that must be one plane, share of the view's width: what blurs of a hundredth
+/// of the width reach.
 const RADIUS_SHARE: f32 = 1.0 / 90.0;
-/// Relative deviation from a plane beyond which the window holds two surfaces: a ball of a tenth of its distance bends by less.
+/// Relative deviation from a plane beyond which the window holds two surfaces: a ball of a tenth of
+/// its distance bends by less.
 const BENT: f64 = 0.012;
 
-/// Per pixel whether the inverse depths around it (0 = unknown) lie on one plane, by least squares over a square window.
+/// Per pixel whether the inverse depths around it (0 = unknown) lie on one plane, by least squares
+/// over a square window.
 pub fn flat(inverse: &[f32], width: usize, height: usize) -> Vec<bool> {
     let radius = ((RADIUS_SHARE * width as f32).round() as usize).max(2);
     let moments = Moments::new(inverse, width, height);
@@ -45,7 +48,8 @@ impl Moments {
         Moments { sums, width, height }
     }
 
-    /// Root mean square distance from the best plane over the window; `None` where next to nothing of it is known.
+    /// Root mean square distance from the best plane over the window; `None` where next to nothing
+    /// of it is known.
     fn deviation(&self, x: usize, y: usize, radius: usize) -> Option<f64> {
         let stride = self.width + 1;
         let (x0, x1) = (x.saturating_sub(radius), (x + radius + 1).min(self.width));
@@ -76,7 +80,8 @@ mod tests {
     #[test]
     fn planes_are_flat_and_blurred_steps_are_not() {
         let (width, height) = (360, 60);
-        // A slanted plane, then a step of 20 % in inverse depth that a network spreads over 5 pixels.
+        // A slanted plane, then a step of 20 % in inverse depth that a network spreads over 5
+        // pixels.
         let value = |x: f32, y: f32| 1.0 + 0.002 * x + 0.003 * y;
         let ramp = |x: f32| ((x - 86.0) / 5.0).clamp(0.0, 1.0);
         let inverse: Vec<f32> = (0..width * height)

@@ -1,8 +1,9 @@
 //! Depth that a network or a file suggests, joined with what stereo measured.
 //!
-//! A prior knows shapes, not sizes: it is brought to stereo's scale piece by piece ([`align`]), is left out where it contradicts
-//! what stereo is sure of, where it would stand before what another view sees, and at its own blurred edges ([`edges`]). What
-//! remains is averaged with matched depth by inverse variance, and stands in for it where nothing was matched.
+//! A prior knows shapes, not sizes: it is brought to stereo's scale piece by piece ([`align`]), is
+//! left out where it contradicts what stereo is sure of, where it would stand before what another
+//! view sees, and at its own blurred edges ([`edges`]). What remains is averaged with matched depth
+//! by inverse variance, and stands in for it where nothing was matched.
 mod align;
 mod edges;
 mod pieces;
@@ -15,21 +16,26 @@ use crate::progress::Progress;
 use crate::scene::{DepthPrior, PriorKind};
 use glam::Vec3;
 
-/// Confidence of a pixel that only the prior knows: it shapes the surface and is no measurement, as a plausible match is.
+/// Confidence of a pixel that only the prior knows: it shapes the surface and is no measurement, as
+/// a plausible match is.
 pub const SUGGESTED: f32 = 0.4;
-/// Deviation of depth, share of the view's tolerance, by confidence: what two views confirm, one view, none, and planes of areas.
+/// Deviation of depth, share of the view's tolerance, by confidence: what two views confirm, one
+/// view, none, and planes of areas.
 const DEVIATION: [(f32, f32); 4] = [(0.9, 0.5), (0.6, 1.0), (0.45, 2.0), (0.0, 3.0)];
-/// Matched depth and prior that differ by more deviations than this are not of one surface, and are not averaged.
+/// Matched depth and prior that differ by more deviations than this are not of one surface, and are
+/// not averaged.
 const SAME_SURFACE: f32 = 3.0;
-/// From this confidence on, depth stays where the prior contradicts it; below, what deviates less does.
+/// From this confidence on, depth stays where the prior contradicts it; below, what deviates less
+/// does.
 const SURE: f32 = 0.6;
-/// Pixels over which the slope of the prior is measured: one would read off the noise of half-precision files.
+/// Pixels over which the slope of the prior is measured: one would read off the noise of
+/// half-precision files.
 const SLOPE: usize = 2;
 /// Share of a prior in contradicted pieces from which on the user should know.
 const DOUBTFUL: f32 = 0.25;
 
-/// `surface` (matched, smoothed) with what the priors, one or none per view, add to it. Priors that do not fit are named in a
-/// warning and left out.
+/// `surface` (matched, smoothed) with what the priors, one or none per view, add to it. Priors that
+/// do not fit are named in a warning and left out.
 pub fn join(
     level: &Level,
     links: &RelativePoses,
@@ -171,7 +177,8 @@ impl Fused<'_> {
         Vec3::new(dx * fx, dy * fy, here - dx * u - dy * v)
     }
 
-    /// Whether a surface at this inverse depth would hide what another view has confirmed behind it.
+    /// Whether a surface at this inverse depth would hide what another view has confirmed behind
+    /// it.
     fn blocks(&self, x: usize, y: usize, inverse: f32) -> bool {
         let point = ray(self.level, self.view, x, y) / inverse;
         let pixel = [x as f32 + 0.5, y as f32 + 0.5];

@@ -1,13 +1,15 @@
-//! A view cut into small connected pieces, within which one scale and one shift of a depth prior are taken to hold.
+//! A view cut into small connected pieces, within which one scale and one shift of a depth prior
+//! are taken to hold.
 use crate::stereo::surface::neighbours;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-/// Side of a piece before its border follows the prior, share of the view's width: about 400 pieces. On room_a and breakfast
-/// (10 % prior) a half and twice as many give the same to 0.002 of AbsRel.
+/// Side of a piece before its border follows the prior, share of the view's width: about 400
+/// pieces. On room_a and breakfast (10 % prior) a half and twice as many give the same to 0.002 of
+/// AbsRel.
 pub const SIDE_SHARE: f32 = 1.0 / 24.0;
-/// Relative step of the prior between two neighbouring pixels that counts as far as the side of a piece: pieces end at the
-/// prior's own depth edges, where its errors change.
+/// Relative step of the prior between two neighbouring pixels that counts as far as the side of a
+/// piece: pieces end at the prior's own depth edges, where its errors change.
 const FULL_STEP: f32 = 0.05;
 
 /// Pieces of one view.
@@ -24,7 +26,8 @@ pub struct Pieces {
 pub const NO_PIECE: u32 = u32::MAX;
 
 impl Pieces {
-    /// Cuts by the shortest way from seeds on a grid; the way is longer over steps of `prior` (inverse depth, 0 = unknown).
+    /// Cuts by the shortest way from seeds on a grid; the way is longer over steps of `prior`
+    /// (inverse depth, 0 = unknown).
     pub fn cut(prior: &[f32], width: usize, height: usize) -> Pieces {
         let side = ((SIDE_SHARE * width as f32) as usize).max(4);
         let mut of = vec![NO_PIECE; prior.len()];
@@ -44,7 +47,8 @@ impl Pieces {
                 }
             }
         }
-        // A second pass gives seeds to areas that no seed of the grid reaches: islands between holes of the prior.
+        // A second pass gives seeds to areas that no seed of the grid reaches: islands between
+        // holes of the prior.
         for k in 0..=prior.len() {
             while let Some((Reverse(bits), p)) = heap.pop() {
                 let (p, here) = (p as usize, f32::from_bits(bits));

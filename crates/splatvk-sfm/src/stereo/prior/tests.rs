@@ -16,8 +16,9 @@ fn smooth(width: usize, height: usize, phase: f32) -> impl Fn(usize) -> f32 {
     }
 }
 
-/// True depth as a network might give it: inverse depth times a scale and plus a shift that both wander by `error` over the image,
-/// near surfaces spread over far ones and blurred by a tenth of `error` of the width, all in another unit.
+/// True depth as a network might give it: inverse depth times a scale and plus a shift that both
+/// wander by `error` over the image, near surfaces spread over far ones and blurred by a tenth of
+/// `error` of the width, all in another unit.
 fn simulated(depth: &Plane<f32>, error: f32, phase: f32) -> DepthPrior {
     let (width, height) = (depth.width, depth.height);
     let radius = (0.1 * error * width as f32).round().max(1.0) as usize;
@@ -71,7 +72,8 @@ fn level(set: &Set) -> Level {
     pyramid(&set.images, &set.cameras, &set.sparse, &options).unwrap().pop().unwrap()
 }
 
-/// Mean relative error of the pixels that only the prior knows, and their share of the unmatched ones.
+/// Mean relative error of the pixels that only the prior knows, and their share of the unmatched
+/// ones.
 fn suggested(set: &Set, level: &Level, before: &Surface, after: &Surface) -> (f32, f32) {
     let (mut sum, mut count, mut open) = (0.0, 0usize, 0usize);
     for (view, depth) in set.depth.iter().enumerate() {

@@ -1,8 +1,10 @@
-//! Planes for areas of one colour: what matching cannot see in the middle of a cupboard door, its rim and seams tell.
+//! Planes for areas of one colour: what matching cannot see in the middle of a cupboard door, its
+//! rim and seams tell.
 //!
-//! A photo is cut into areas of even colour. Of an area that is largely unmatched, the matched pixels in it and around it vote for
-//! planes; one that enough of its outline agrees with, and that no other view sees through, becomes the depth of its unmatched
-//! pixels. Two such planes meet where they intersect, if that is how their votes lie.
+//! A photo is cut into areas of even colour. Of an area that is largely unmatched, the matched
+//! pixels in it and around it vote for planes; one that enough of its outline agrees with, and that
+//! no other view sees through, becomes the depth of its unmatched pixels. Two such planes meet
+//! where they intersect, if that is how their votes lie.
 #[cfg(test)]
 mod tests;
 mod votes;
@@ -30,23 +32,28 @@ const SPECK: f32 = 5e-4;
 const WEAK_SHARE: f32 = 0.5;
 /// … and at most so much of it be matched: else what is matched tells enough.
 const MATCHED_SHARE: f32 = 0.6;
-/// Pixels around an area whose depth may be that of its rim, share of the width: the matching window's half and the opened rim.
+/// Pixels around an area whose depth may be that of its rim, share of the width: the matching
+/// window's half and the opened rim.
 const RING_SHARE: f32 = 1.0 / 60.0;
 /// Distance from a plane at which a cell still votes for it, multiples of the view's tolerance.
 const WIDTH: f32 = 1.5;
-/// A matched pixel is a mirror image if it lies behind its area's plane by so many widths of a vote …
+/// A matched pixel is a mirror image if it lies behind its area's plane by so many widths of a vote
+/// …
 const MIRRORED: f32 = 2.0;
-/// … and such pixels are fewer than this share of the voters' pixels: else the area is not what its outline says.
+/// … and such pixels are fewer than this share of the voters' pixels: else the area is not what its
+/// outline says.
 const MIRROR_SHARE: f32 = 0.3;
-/// Fills and refutations: what the other views have filled refutes a plane that nothing matched could.
+/// Fills and refutations: what the other views have filled refutes a plane that nothing matched
+/// could.
 const ROUNDS: usize = 3;
 /// Share of an area's unmatched pixels that a plane may put where another view sees through.
 const SEEN_THROUGH: f32 = 0.15;
 /// Pixels of an area that are tested for it, about.
 const TESTED: usize = 200;
 
-/// Gives unmatched pixels of weakly textured areas planes. `surface` holds the matched pixels, smoothed; of those, mirror images
-/// in shiny areas are dropped first, since they would contradict the planes of other views.
+/// Gives unmatched pixels of weakly textured areas planes. `surface` holds the matched pixels,
+/// smoothed; of those, mirror images in shiny areas are dropped first, since they would contradict
+/// the planes of other views.
 pub fn fill(
     level: &Level,
     links: &RelativePoses,
@@ -72,8 +79,8 @@ pub fn fill(
     transferred(level, links, &matched, &out, &views, void)
 }
 
-/// Gives weakly textured pixels that were not matched the plane that most views agree on, their own one included: what one view
-/// extends too far, the others show.
+/// Gives weakly textured pixels that were not matched the plane that most views agree on, their own
+/// one included: what one view extends too far, the others show.
 fn transferred(
     level: &Level,
     links: &RelativePoses,
@@ -207,7 +214,8 @@ impl<'a> View<'a> {
         })
     }
 
-    /// Matched pixels that show a mirror image: in an area, and behind the plane that its outline elects.
+    /// Matched pixels that show a mirror image: in an area, and behind the plane that its outline
+    /// elects.
     fn mirrored(&self, surface: &Surface, seed: u32) -> Vec<usize> {
         let depth = super::surface::depth(self.level, self.view, surface);
         let mut out = Vec::new();
@@ -231,7 +239,8 @@ impl<'a> View<'a> {
         out
     }
 
-    /// Pixels without depth in `surface`, with planes that `matched` elects and no view's `surface` refutes.
+    /// Pixels without depth in `surface`, with planes that `matched` elects and no view's `surface`
+    /// refutes.
     fn filled(
         &self,
         links: &RelativePoses,

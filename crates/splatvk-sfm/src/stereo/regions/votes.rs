@@ -2,28 +2,34 @@
 use crate::math::hash;
 use std::collections::BTreeMap;
 
-/// Side of the cells that vote, pixels: a textured corner shall not outvote the rest of the outline.
+/// Side of the cells that vote, pixels: a textured corner shall not outvote the rest of the
+/// outline.
 pub const CELL: usize = 4;
-/// Three-cell hypotheses per plane; one in eight cells on the plane makes 400 of them miss with 0.46.
+/// Three-cell hypotheses per plane; one in eight cells on the plane makes 400 of them miss with
+/// 0.46.
 const TRIALS: u32 = 400;
 /// Fewest voting cells of a plane.
 const FEWEST: usize = 12;
-/// Voting cells must spread over this share of the area's extent across their longer direction: else the plane may tilt.
+/// Voting cells must spread over this share of the area's extent across their longer direction:
+/// else the plane may tilt.
 const SPREAD: f32 = 0.2;
 /// Weight of a vote from around the area: it may be on something else.
 const OUTER: f32 = 0.3;
-/// Pixels around a cell without a plane in which it counts against one: a wrong match is no larger than some windows.
+/// Pixels around a cell without a plane in which it counts against one: a wrong match is no larger
+/// than some windows.
 const DISSENT: f32 = 24.0;
-/// How far from the middle of its voters a plane reaches, in their standard deviations: the corner of an evenly filled square lies
-/// at 2.4, so a seventh of its size beyond it.
+/// How far from the middle of its voters a plane reaches, in their standard deviations: the corner
+/// of an evenly filled square lies at 2.4, so a seventh of its size beyond it.
 pub const REACH: f32 = 2.8;
 /// Fewest of an area's cells that elect a plane, share.
 const QUORUM: f32 = 0.08;
 /// Most planes of an area: those of a room's corner and one more.
 const MOST_PLANES: usize = 4;
-/// Share of the voters of either plane that lie on the same side of the other where the two form a corner.
+/// Share of the voters of either plane that lie on the same side of the other where the two form a
+/// corner.
 const CORNER: f32 = 0.75;
-/// Share of the area's own votes within reach that must be for a plane: the table around a mug is not the mug.
+/// Share of the area's own votes within reach that must be for a plane: the table around a mug is
+/// not the mug.
 const OWN_SHARE: f32 = 0.3;
 
 /// A vote: the mean inverse depth of a cell's matched pixels that lie closest together.
@@ -46,7 +52,8 @@ pub fn at(plane: Affine, x: f32, y: f32) -> f32 {
     plane[0] + plane[1] * x + plane[2] * y
 }
 
-/// The votes of the matched pixels (depth above 0) of and around an area; `inner` tells which are its own.
+/// The votes of the matched pixels (depth above 0) of and around an area; `inner` tells which are
+/// its own.
 pub fn cells(around: &[usize], depth: &[f32], inner: &dyn Fn(usize) -> bool, width: usize) -> Vec<Cell> {
     let mut grid: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
     for &k in around.iter().filter(|&&k| depth[k] > 0.0) {
@@ -193,9 +200,10 @@ impl Votes {
     }
 }
 
-/// The plane of a pixel: of those that reach it the one with the nearest voters, unless cells of the area that voted for none are
-/// nearer. Where the voters of the two nearest lie so that either plane is in front on its own side, they meet in an inner corner
-/// and the nearer counts; where either is behind, in an outer one.
+/// The plane of a pixel: of those that reach it the one with the nearest voters, unless cells of
+/// the area that voted for none are nearer. Where the voters of the two nearest lie so that either
+/// plane is in front on its own side, they meet in an inner corner and the nearer counts; where
+/// either is behind, in an outer one.
 pub fn chosen(planes: &[Elected], against: &[Cell], x: f32, y: f32) -> Option<Affine> {
     let near = |cells: &[Cell], limit: f32| -> f32 {
         let squared = |c: &Cell| (c.x - x).powi(2) + (c.y - y).powi(2) + 1.0;
@@ -262,7 +270,8 @@ mod tests {
         Cell { x, y, inverse, inner: true }
     }
 
-    /// Two walls of even colour that meet at column 100, known along a line at the top and one at the bottom.
+    /// Two walls of even colour that meet at column 100, known along a line at the top and one at
+    /// the bottom.
     fn room() -> Votes {
         let left = |x: f32| 1.0 - 0.004 * x;
         let right = |x: f32| 0.2 + 0.004 * x;

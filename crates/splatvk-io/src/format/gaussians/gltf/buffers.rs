@@ -1,4 +1,5 @@
-//! What the addresses of buffers lead to: data inside of the file, or files in its own folder and below.
+//! What the addresses of buffers lead to: data inside of the file, or files in its own folder and
+//! below.
 use crate::files;
 use base64::Engine;
 use base64::alphabet::STANDARD;

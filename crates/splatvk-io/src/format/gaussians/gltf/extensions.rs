@@ -3,7 +3,8 @@ use super::layout::EXTENSION;
 use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value;
 
-/// Extensions that change neither points nor their attributes, or that the reader follows (quantised numbers).
+/// Extensions that change neither points nor their attributes, or that the reader follows
+/// (quantised numbers).
 const HARMLESS: [&str; 12] = [
     "KHR_mesh_quantization",
     "KHR_texture_transform",
@@ -85,7 +86,8 @@ pub(super) fn required(name: &str) -> Result<(), String> {
     }
 }
 
-/// A note on an extension that the file uses somewhere and does not need; where Gaussians have it, it is refused.
+/// A note on an extension that the file uses somewhere and does not need; where Gaussians have it,
+/// it is refused.
 pub(super) fn note(name: &str) -> Option<String> {
     (!is_harmless(name)).then(|| format!("its extension {name} is not read"))
 }

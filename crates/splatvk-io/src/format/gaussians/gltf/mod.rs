@@ -1,4 +1,5 @@
-//! glTF 2.0 with the ratified extension `KHR_gaussian_splatting`: points whose attributes are Gaussians.
+//! glTF 2.0 with the ratified extension `KHR_gaussian_splatting`: points whose attributes are
+//! Gaussians.
 //!
 //! | attribute | type | value |
 //! |---|---|---|

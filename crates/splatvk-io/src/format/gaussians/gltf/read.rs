@@ -1,4 +1,5 @@
-//! Reading: every primitive of the default scene that has the extension, moved by the nodes above it.
+//! Reading: every primitive of the default scene that has the extension, moved by the nodes above
+//! it.
 use super::buffers::{Buffer, contents};
 use super::extensions::{self, Refused};
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
@@ -97,8 +98,8 @@ struct BufferView {
 /// Most nodes: scenes of Gaussians have a handful, and a node takes 200 bytes while it is visited.
 const MOST_NODES: usize = 100_000;
 
-/// Reads a `.glb` or `.gltf`: scene axes, SH of the highest degree that any part has. Buffers outside of the file are read
-/// from its own folder only. Notes name what is not read, a line each.
+/// Reads a `.glb` or `.gltf`: scene axes, SH of the highest degree that any part has. Buffers
+/// outside of the file are read from its own folder only. Notes name what is not read, a line each.
 pub fn read_noted(path: &Path, notes: &mut Vec<String>) -> Result<Splats> {
     let bytes = files::read(path)?;
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -177,7 +178,8 @@ struct Document<'a> {
 }
 
 impl<'a> Document<'a> {
-    /// All primitives with the extension below the default scene, and where they are; one for every node that shows it.
+    /// All primitives with the extension below the default scene, and where they are; one for every
+    /// node that shows it.
     fn placed(&self) -> Result<Vec<(&'a Primitive, Similarity)>, String> {
         let root = self.root;
         let many = |n: usize| format!("{n} nodes, more than the {MOST_NODES} that are read; merge some");
@@ -233,8 +235,8 @@ impl<'a> Document<'a> {
         Ok(shown)
     }
 
-    /// Refuses what would take far more memory than the file has bytes: many nodes that show one mesh, attributes that share
-    /// their bytes. Counted before anything of that size is made.
+    /// Refuses what would take far more memory than the file has bytes: many nodes that show one
+    /// mesh, attributes that share their bytes. Counted before anything of that size is made.
     fn check_size(
         &self,
         placed: &[(&Primitive, Similarity)],
@@ -266,7 +268,8 @@ impl<'a> Document<'a> {
         (1..=3).rev().find(has).unwrap_or(0)
     }
 
-    /// The Gaussians of a primitive in the axes of its node; coefficients up to `sh_degree` that it lacks are zero.
+    /// The Gaussians of a primitive in the axes of its node; coefficients up to `sh_degree` that it
+    /// lacks are zero.
     fn primitive(&self, primitive: &Primitive, sh_degree: u32) -> Result<Splats, String> {
         if primitive.mode != Some(0) {
             return Err("Gaussians must be points (mode 0)".to_owned());
