@@ -1,8 +1,12 @@
-//! splatvk turns a few ordinary photos, without camera poses, into a Gaussian-splat scene that
-//! answers text queries, on any Vulkan device. The folders follow the data, left to right: photo →
-//! infer → pose → fit and language → query → report → run → cli and capi. They use what stands left
-//! of them, never what stands right; below all of them lie `scene` (plain data), `math`, `gpu`,
-//! `pass` and `format`. `tests/imports.rs` has the whole order and holds the code to it.
+//! splatvk turns a few ordinary photos, without camera poses, into a Gaussian-splat scene that answers
+//! text queries, on any Vulkan device.
+//!
+//! This crate holds the kernels ([`pass`], `glsl/`), training ([`fit`]), the pipeline of a run
+//! ([`run`]), the report, the command line and the C interface. The crates below it can be used alone
+//! and appear here under their own names: [`scene`], [`math`] and [`Error`] of `splatvk-types`,
+//! [`format`] and [`photo`] of `splatvk-io`, [`gpu`] on `splatvk-gpu`, [`pose`] (`splatvk-sfm`),
+//! [`infer`] (`splatvk-infer`), [`language`] and [`query`] (`splatvk-language`). Cargo enforces their
+//! order; `tests/imports.rs` enforces that of the folders here.
 //!
 //! # From a program
 //! Everything the command line does is here: [`run::run`] writes a scene directory,

@@ -1,5 +1,5 @@
-//! Who may use whom: the folders in one direction, the files without circles. Tests may use what
-//! they like.
+//! Dependencies between the folders of `src`: in one direction, and without circles between files.
+//! Tests are exempt.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 
 #[path = "support/sources.rs"]
@@ -9,7 +9,7 @@ use sources::Crate;
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// Each folder, or file beside them, and those that it uses; all of them stand above it.
+/// Each folder of `src`, and the folders that it uses. A folder comes after those that it uses.
 const FOLDERS: &[(&str, &str)] = &[
     ("gpu", ""),
     ("pass", "gpu"),
