@@ -1,12 +1,12 @@
-//! splatvk turns a few ordinary photos, without camera poses, into a Gaussian-splat scene that answers
-//! text queries, on any Vulkan device.
+//! splatvk turns a few ordinary photos, without camera poses, into a Gaussian-splat scene that
+//! answers text queries, on any Vulkan device.
 //!
 //! This crate holds the kernels ([`pass`], `glsl/`), training ([`fit`]), the pipeline of a run
-//! ([`run`]), the report, the command line and the C interface. The crates below it can be used alone
-//! and appear here under their own names: [`scene`], [`math`] and [`Error`] of `splatvk-types`,
-//! [`format`] and [`photo`] of `splatvk-io`, [`gpu`] on `splatvk-gpu`, [`pose`] (`splatvk-sfm`),
-//! [`infer`] (`splatvk-infer`), [`language`] and [`query`] (`splatvk-language`). Cargo enforces their
-//! order; `tests/imports.rs` enforces that of the folders here.
+//! ([`run`]), the report, the command line and the C interface. The crates below it can be used
+//! alone and appear here under their own names: [`scene`], [`math`] and [`Error`] of
+//! `splatvk-types`, [`format`] and [`photo`] of `splatvk-io`, [`gpu`] on `splatvk-gpu`, [`pose`]
+//! (`splatvk-sfm`), [`infer`] (`splatvk-infer`), [`language`] and [`query`] (`splatvk-language`).
+//! Cargo enforces their order; `tests/imports.rs` enforces that of the folders here.
 //!
 //! # From a program
 //! Everything the command line does is here: [`run::run`] writes a scene directory,

@@ -279,28 +279,13 @@ mod tests {
     use crate::scene::{Affine, RgbImage};
 
     fn photo(width: usize, height: usize, original: (u32, u32)) -> Photo {
+        let image = RgbImage { width, height, data: vec![[0.5; 3]; width * height] };
+        let scale = [width as f64 / original.0 as f64, height as f64 / original.1 as f64];
         Photo {
             path: "in/a.jpg".into(),
-            stem: "a".into(),
-            image: RgbImage { width, height, data: vec![[0.5; 3]; width * height] },
-            border: crate::photo::PlainBorder::default(),
             original_size: original,
-            to_working: Affine {
-                scale: [width as f64 / original.0 as f64, height as f64 / original.1 as f64],
-                offset: [0.0; 2],
-            },
-            exif_focal: None,
-            fine: None,
-            lost_pixels: 0,
-            coverage: None,
-            overlay: None,
-            masked: false,
-            notes: Vec::new(),
-            straightened: None,
-            turn: Default::default(),
-            camera_model: None,
-            gravity: None,
-            light: crate::photo::Light::NONE,
+            to_working: Affine { scale, offset: [0.0; 2] },
+            ..splatvk_test_support::toys::photo("a", image)
         }
     }
 
