@@ -1,5 +1,5 @@
 #version 450
-// Number of tiles of every splat, in depth order. Twin: pass::bin.
+// Number of tiles of every splat, in depth order. Reference: pass::bin.
 #extension GL_GOOGLE_include_directive : require
 layout(local_size_x = 64) in;
 

@@ -2,7 +2,7 @@
 // variants: GROUPING=0,1
 // Writes the entries: for every splat in depth order its tiles, row by row. A lane makes the same number of entries as
 // every other, so a splat that covers the screen is shared by many. If the entries do not fit, there are none, and the
-// status says how much room is needed: an image without splats, never one with a few of them missing. Twin: pass::bin.
+// status says how much room is needed: an image without splats, never one with a few of them missing. Reference: pass::bin.
 //
 // Rows of tiles from first_row up to end_row of the image are binned; tile 0 is the first of these.
 //

@@ -1,6 +1,6 @@
 #version 450
 // Grouping by sorting, last step: the sorted entries become the tile lists, and where the tile changes a list begins.
-// Twin: pass::bin.
+// Reference: pass::bin.
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer EntryCount { uint entry_count; };

@@ -1,6 +1,6 @@
 #version 450
 // Grouping by counting, last step: every lane of bin_emit.comp moves its entries, in order, to where its share of each
-// tile's list begins. Twin: pass::bin.
+// tile's list begins. Reference: pass::bin.
 layout(local_size_x = 8) in;
 
 layout(std430, binding = 0) readonly buffer EntryCount { uint entry_count; };

@@ -1,5 +1,5 @@
 #version 450
-// Number of splats per tile: the sum over the lanes of bin_emit.comp. Twin: pass::bin.
+// Number of splats per tile: the sum over the lanes of bin_emit.comp. Reference: pass::bin.
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer Counters { uint counters[]; };         // [tiles, lanes]

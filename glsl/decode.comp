@@ -1,7 +1,7 @@
 #version 450
 // Code per pixel: k* = argmax_k F.c_k, ties to the lowest k. -1 where alpha < VOID_ALPHA,
 // and where |F| < MIN_FEATURE_SHARE alpha: splats without features are what the pixel shows.
-// Twin: pass::decode::decode_pixels.
+// Reference: pass::decode::decode_pixels.
 // variants: DIM=4,8,16,32
 #extension GL_EXT_control_flow_attributes : require
 // Every thread takes four pixels, so that each code is loaded once for four: on lavapipe a load costs as much as seven FMAs.

@@ -1,7 +1,7 @@
 #version 450
 // Stored features to rendered ones, per block of `width` numbers: f / (|f| + epsilon), or f where epsilon < 0
 // (docs/internals/method.md#feature-gauge).
-// Twin: pass::project::features_twin.
+// Reference: pass::project::features_reference.
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer Features { float features[]; }; // [N, dim]

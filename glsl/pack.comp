@@ -1,5 +1,5 @@
 #version 450
-// Planes of a rendered frame to texels as hosts want them. Twin: pass::pack.
+// Planes of a rendered frame to texels as hosts want them. Reference: pass::pack.
 layout(local_size_x = 128) in;
 
 layout(std430, binding = 0) readonly buffer Planes { float planes[]; };              // [C, stride]

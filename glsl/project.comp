@@ -1,6 +1,6 @@
 #version 450
 // variants: SH_DEGREE=0,1,2,3
-// Projects splats to the screen and writes their depth sort keys. Equations and twin: pass::project.
+// Projects splats to the screen and writes their depth sort keys. Equations and reference: pass::project.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;

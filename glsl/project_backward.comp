@@ -1,6 +1,6 @@
 #version 450
 // variants: SH_DEGREE=0,1,2,3
-// Gradients of the raw splat parameters and of the camera. Equations and twin: pass::project_backward.
+// Gradients of the raw splat parameters and of the camera. Equations and reference: pass::project_backward.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_KHR_shader_subgroup_basic : require

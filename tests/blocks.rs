@@ -4,13 +4,13 @@ mod support;
 use glam::DVec3;
 use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions};
 use splatvk::gpu::{self, Device, Options, TestDevice, test_device};
-use splatvk::pass::Summation;
+use splatvk::pass::GradientReduction;
 use splatvk::pass::{RenderedFrame, Renderer};
 use splatvk::progress::Silent;
 use splatvk::query::{QueryOptions, TextQuery, answer};
 use splatvk::run::view::Viewer;
 use splatvk::scene::seeded;
-use splatvk::scene::{Camera, Codebook, LanguageField, LevelField, Plane, Pose, RgbImage, Splats};
+use splatvk::scene::{Camera, Codebook, Image, LanguageField, LevelField, Pose, RgbImage, Splats};
 use support::{GpuGradients, Scene, in_bands};
 
 const MIB: u64 = 1 << 20;
@@ -57,11 +57,11 @@ fn frames_and_gradients_are_those_of_the_whole() {
     let scene = Scene::new(splats, &camera, 48, 3);
     let upstream = scene.upstream(5);
     let whole = limited(128 * MIB, false);
-    let (image, atomics, one) = in_bands(&scene, &whole, Summation::Atomics, &upstream);
+    let (image, atomics, one) = in_bands(&scene, &whole, GradientReduction::Atomics, &upstream);
     assert!(one == 1 && image.iter().all(|v| v.is_finite()));
     for (mib, bands) in [(128, 1), (64, 2), (16, 12)] {
         let device = limited(mib * MIB, false);
-        for summation in [Summation::Atomics, Summation::Entries] {
+        for summation in [GradientReduction::Atomics, GradientReduction::Entries] {
             let (planes, gradients, count) = in_bands(&scene, &device, summation, &upstream);
             assert_eq!(count, bands, "{mib} MiB");
             assert!(planes == image, "{mib} MiB {summation:?}: other planes");
@@ -78,8 +78,8 @@ fn gradients_by_entry_fit_for_many_splats() {
     let scene = Scene::new(splats, &camera, 48, 4);
     let upstream = scene.upstream(6);
     let device = test_device();
-    let (_, atomics, _) = in_bands(&scene, &device, Summation::Atomics, &upstream);
-    let (_, entries, _) = in_bands(&scene, &device, Summation::Entries, &upstream);
+    let (_, atomics, _) = in_bands(&scene, &device, GradientReduction::Atomics, &upstream);
+    let (_, entries, _) = in_bands(&scene, &device, GradientReduction::Entries, &upstream);
     assert_alike(&atomics, &entries, "130,000 splats");
 }
 
@@ -149,7 +149,7 @@ fn field(images: &[RgbImage]) -> LanguageField {
             let square = |i: usize| i % image.width / 50 + 3 * (i / image.width / 50) + l as usize;
             let label = |i: usize| if square(i) % 5 == 0 { -1 } else { (square(i) % 8) as i32 };
             let data = (0..image.data.len()).map(label).collect();
-            Plane { width: image.width, height: image.height, data }
+            Image { width: image.width, height: image.height, data }
         };
         let embeddings = (0..64).map(|i| f32::from(u8::from(i % 9 == 0))).collect();
         LevelField {

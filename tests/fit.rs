@@ -7,14 +7,14 @@ use splatvk::gpu;
 use splatvk::pass::Renderer;
 use splatvk::pass::metrics::{psnr, psnr_masked, ssim};
 use splatvk::progress::Progress;
-use splatvk::scene::{Camera, DepthMap, Plane, PointCloud, Pose, RgbImage, to_linear, to_srgb};
+use splatvk::scene::{Camera, DepthMap, Image, PointCloud, Pose, RgbImage, to_linear, to_srgb};
 use std::path::{Path, PathBuf};
 
 /// A posed photo with exact depth.
 struct View {
     image: RgbImage,
     camera: Camera,
-    depth: Plane<f32>,
+    depth: Image<f32>,
 }
 
 /// One split of a test set, every side divided by `shrink`.
@@ -58,7 +58,7 @@ fn view(folder: &Path, frame: &serde_json::Value, shrink: usize) -> View {
     View {
         image: RgbImage { width: w, height: h, data: (0..w * h).map(mean).collect() },
         camera: camera.resized(w as u32, h as u32),
-        depth: Plane { width: w, height: h, data: (0..w * h).map(centre).collect() },
+        depth: Image { width: w, height: h, data: (0..w * h).map(centre).collect() },
     }
 }
 
@@ -128,7 +128,7 @@ fn breakfast_with_exact_geometry() {
         .iter()
         .map(|v| DepthMap {
             depth: v.depth.clone(),
-            confidence: Plane::filled(v.depth.width, v.depth.height, 1.0),
+            confidence: Image::filled(v.depth.width, v.depth.height, 1.0),
         })
         .collect();
     let cloud = points(&train);

@@ -11,7 +11,7 @@ use splatvk::pass::{FeatureMode, RasterOptions, Renderer};
 use splatvk::progress::Silent;
 use splatvk::run::view::Viewer;
 use splatvk::scene::{
-    Camera, Codebook, LanguageField, LevelField, Plane, Pose, RgbImage, Seen, Splats, World,
+    Camera, Codebook, Image, LanguageField, LevelField, Pose, RgbImage, Seen, Splats, World,
 };
 
 const WIDTH: u32 = 96;
@@ -209,7 +209,7 @@ fn two_objects(device: &Device, splats: &Splats, cameras: &[Camera]) -> Language
                 (true, left) => i32::from(!left),
             };
         let data = (0..frame.alpha.data.len()).map(label).collect();
-        Plane { width: WIDTH as usize, height: HEIGHT as usize, data }
+        Image { width: WIDTH as usize, height: HEIGHT as usize, data }
     });
     let level = LevelField {
         codebook: Codebook {

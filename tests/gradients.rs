@@ -1,17 +1,17 @@
-//! Gradients of the whole render on the GPU against the f64 twin, which is itself checked by
+//! Gradients of the whole render on the GPU against the f64 reference, which is itself checked by
 //! central differences.
 mod support;
 use splatvk::gpu::{self, NATIVE_FLOAT_ATOMICS, Options, Recorder, TestDevice, test_device};
-use splatvk::pass::{DeviceChoices, FeatureMode, Summation};
+use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction};
 use splatvk::scene::seeded;
 use support::{GpuGradients, Scene, assert_class, assert_gradients};
 
 /// Added up by atomics and entry by entry; the latter gives the same bits every time.
 #[test]
-fn random_scenes_match_the_twin() {
+fn random_scenes_match_reference() {
     let device = test_device();
     let by = |summation| DeviceChoices { summation, ..DeviceChoices::of(&device) };
-    let (atomics, entries) = (by(Summation::Atomics), by(Summation::Entries));
+    let (atomics, entries) = (by(GradientReduction::Atomics), by(GradientReduction::Entries));
     for (n, sh_degree, dim) in [(1, 3, 3), (10, 3, 0), (100, 2, 8), (500, 1, 16), (100, 0, 48)] {
         let scene = Scene::small(n, sh_degree, dim, 60 + n as u64);
         println!("{n} splats, degree {sh_degree}, {dim} features");
@@ -26,7 +26,7 @@ fn random_scenes_match_the_twin() {
 /// Opacities that fall where the projection dilates a splat, and those that no longer reach a
 /// pixel.
 #[test]
-fn antialiased_scenes_match_the_twin() {
+fn antialiased_scenes_match_reference() {
     let device = test_device();
     for (n, seed) in [(1, 81), (100, 82)] {
         let mut scene = Scene::small(n, 1, 3, seed);
@@ -56,7 +56,7 @@ fn every_one_of_thousands_of_splats_gets_its_gradient() {
 #[test]
 fn gradients_by_entry_have_room_for_lists_that_have_grown() {
     let device = test_device();
-    let ways = DeviceChoices { summation: Summation::Entries, ..DeviceChoices::of(&device) };
+    let ways = DeviceChoices { summation: GradientReduction::Entries, ..DeviceChoices::of(&device) };
     let mut scene = Scene::small(12, 0, 3, 67);
     scene.splats.log_scales.fill([-6.0; 3]);
     let upstream = scene.upstream(12);
@@ -90,7 +90,7 @@ fn colours_that_change_with_the_direction_move_the_means_as_in_the_twin() {
     let pixels = scene.pixels();
     let mut upstream = vec![0.0; 5 * pixels];
     upstream[..3 * pixels].fill(1.0);
-    let reference = scene.twin_gradients(&scene.twin(), &upstream).params.means;
+    let reference = scene.twin_gradients(&scene.reference(), &upstream).params.means;
     let reference: Vec<f64> = reference.iter().flat_map(|m| m.to_array()).collect();
     let gradients = scene.gradients(&device, &upstream);
     assert_class("means", gradients.splats.means.as_flattened(), &reference);
@@ -99,7 +99,7 @@ fn colours_that_change_with_the_direction_move_the_means_as_in_the_twin() {
 /// Edge cases of docs/internals/method.md#tolerances: clamped α, clamped Jacobian, needle, behind,
 /// hidden, outside, a clamped colour.
 #[test]
-fn edge_cases_match_the_twin() {
+fn edge_cases_match_reference() {
     let device = test_device();
     let mut scene = Scene::small(12, 3, 3, 31);
     let inverse = |v: glam::DVec3| {
@@ -129,7 +129,7 @@ fn edge_cases_match_the_twin() {
 /// Linear features, and features at exactly zero in the gauge, where the Jacobian is 1/ε; one
 /// gauge, and one per level.
 #[test]
-fn both_feature_modes_match_the_twin() {
+fn both_feature_modes_match_reference() {
     let device = test_device();
     let mut scene = Scene::small(40, 0, 6, 5);
     scene.features[6..12].fill(0.0);
@@ -178,7 +178,7 @@ fn without_float_atomics_the_gradients_are_the_same() {
     assert!(!device.info().float_atomics);
     let scene = Scene::small(100, 1, 3, 14);
     let upstream = scene.upstream(14);
-    let ways = DeviceChoices { summation: Summation::Atomics, ..DeviceChoices::of(&device) };
+    let ways = DeviceChoices { summation: GradientReduction::Atomics, ..DeviceChoices::of(&device) };
     assert_gradients(&scene, &scene.gradients_by(&device, ways, &upstream), 14);
 }
 
@@ -197,12 +197,12 @@ fn common_translation_is_a_gauge() {
 /// Widths that leave room in the last launch: in the sums by entry nothing may reach the next
 /// splat.
 #[test]
-fn feature_widths_that_fill_no_launch_match_the_twin() {
+fn feature_widths_that_fill_no_launch_match_reference() {
     let device = test_device();
     for dim in [4, 10, 24, 37] {
         let scene = Scene::small(30, 0, dim, 90 + dim as u64);
         let upstream = scene.upstream(9);
-        for summation in [Summation::Atomics, Summation::Entries] {
+        for summation in [GradientReduction::Atomics, GradientReduction::Entries] {
             let ways = DeviceChoices { summation, ..DeviceChoices::of(&device) };
             assert_gradients(&scene, &scene.gradients_by(&device, ways, &upstream), 9);
         }

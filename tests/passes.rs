@@ -1,13 +1,13 @@
-//! Every rasterisation pass on the GPU against its f64 twin, with validation on.
+//! Every rasterisation pass on the GPU against its f64 reference, with validation on.
 mod support;
 use glam::DVec3;
 use splatvk::gpu::{Recorder, test_device};
 use splatvk::math::Random;
 use splatvk::pass::channels::BASE_CHANNELS;
 use splatvk::pass::raster_backward;
-use splatvk::pass::raster_forward::{Cutoffs, TwinScene};
+use splatvk::pass::raster_forward::{Cutoffs, ReferenceScene};
 use splatvk::pass::{
-    DeviceChoices, FeatureMode, Grouping, RasterOptions, Rasterizer, Renderer, SplatBuffers, View,
+    DeviceChoices, FeatureMode, RasterOptions, Rasterizer, Renderer, SplatBuffers, TileBinning, View,
 };
 use splatvk::scene::seeded;
 use splatvk::scene::{Pose, Splats};
@@ -40,25 +40,25 @@ fn front_scene(splats: Splats, width: u32, height: u32) -> Scene {
 }
 
 #[test]
-fn random_scenes_match_the_twin() {
+fn random_scenes_match_reference() {
     let device = test_device();
     for (n, sh_degree, dim) in [(1, 0, 0), (10, 3, 3), (100, 2, 8), (500, 1, 16), (100, 0, 48), (10, 0, 21)] {
         let scene = Scene::small(n, sh_degree, dim, 40 + n as u64);
         println!("{n} splats, degree {sh_degree}, {dim} features");
-        assert_images(&scene.render(&device), &scene.twin());
+        assert_images(&scene.render(&device), &scene.reference());
     }
 }
 
 #[test]
-fn linear_features_and_lower_degrees_match_the_twin() {
+fn linear_features_and_lower_degrees_match_reference() {
     let device = test_device();
     let mut scene = Scene::small(60, 3, 5, 3);
     scene.options = RasterOptions { feature_mode: FeatureMode::Linear, sh_degree: 1, ..scene.options };
     let out = scene.render(&device);
-    // The twin has no separate active degree: cut the coefficients instead.
+    // The reference has no separate active degree: cut the coefficients instead.
     scene.splats.sh = scene.splats.sh.chunks_exact(48).flat_map(|c| c[..12].to_vec()).collect();
     scene.splats.sh_degree = 1;
-    assert_images(&out, &scene.twin());
+    assert_images(&out, &scene.reference());
 }
 
 /// One round splat on the axis: o e^(−½ r² / (f²s²/z² + 0.3)), in closed form.
@@ -133,11 +133,11 @@ fn identical_depths_are_drawn_in_index_order() {
     }
     splats.sh = (0..60).map(|i| ((i * 7) % 11) as f32 / 5.0 - 1.0).collect();
     let scene = front_scene(splats, 40, 40);
-    assert_images(&scene.render(&device), &scene.twin());
+    assert_images(&scene.render(&device), &scene.reference());
 }
 
 #[test]
-fn near_opaque_needle_huge_hidden_and_outside_splats_match_the_twin() {
+fn near_opaque_needle_huge_hidden_and_outside_splats_match_reference() {
     let device = test_device();
     let mut splats = splat([0.1, 0.0, 2.0], 0.2, 12.0); // opacity 0.999994: α is clamped at 0.99
     append(&mut splats, splat([0.0, 0.1, -2.0], 0.5, 3.0)); // behind
@@ -153,13 +153,13 @@ fn near_opaque_needle_huge_hidden_and_outside_splats_match_the_twin() {
     needle.quats[0] = [0.9, 0.1, -0.2, 0.35];
     append(&mut splats, needle);
     let scene = front_scene(splats, 61, 47);
-    let twin = scene.twin();
-    let visible: Vec<bool> = twin.projected.iter().map(Option::is_some).collect();
+    let reference = scene.reference();
+    let visible: Vec<bool> = reference.projected.iter().map(Option::is_some).collect();
     assert_eq!(visible, [true, false, false, true, true, true, true, false, false, true]);
-    assert_images(&scene.render(&device), &twin);
+    assert_images(&scene.render(&device), &reference);
 }
 
-/// The lists hold what the twin's exact test finds, nearest first, plus at most the few that its
+/// The lists hold what the reference's exact test finds, nearest first, plus at most the few that its
 /// margin lets in.
 #[test]
 fn tile_lists_contain_the_twins() {
@@ -174,7 +174,7 @@ fn the_lists_of_a_view_hold_nothing_of_the_view_before() {
     let whole = front_scene(splat([0.0, 0.0, 5.0], 50.0, -3.0), 40, 40);
     // Nothing in the first 24 of 25 tiles.
     let corner = front_scene(splat([0.889, 0.889, 2.0], 0.02, 2.0), 40, 40);
-    for grouping in [Grouping::Counting, Grouping::Sorting] {
+    for grouping in [TileBinning::Counting, TileBinning::Sorting] {
         let ways = DeviceChoices { grouping, ..DeviceChoices::of(&device) };
         let (params, mut raster) = whole.upload_for(&device, ways);
         raster.forward(&params, &whole.options).unwrap();
@@ -184,7 +184,7 @@ fn the_lists_of_a_view_hold_nothing_of_the_view_before() {
         let mut expected = vec![Vec::<u32>::new(); 25];
         expected[24].push(0);
         assert_eq!(raster.tile_lists().unwrap(), expected, "{grouping:?}");
-        assert_images(&rendered(&raster), &corner.twin());
+        assert_images(&rendered(&raster), &corner.reference());
     }
 }
 
@@ -198,7 +198,7 @@ fn long_lists_are_listed_whole() {
         append(&mut splats, splat([0.0, 0.0, 5.0 + 0.01 * k as f32], 50.0, 3.0));
     }
     let scene = front_scene(splats, 1000, 1000);
-    for grouping in [Grouping::Counting, Grouping::Sorting] {
+    for grouping in [TileBinning::Counting, TileBinning::Sorting] {
         let (params, mut raster) =
             scene.upload_for(&device, DeviceChoices { grouping, ..DeviceChoices::of(&device) });
         raster.forward(&params, &scene.options).unwrap();
@@ -235,10 +235,10 @@ fn no_splat_of_a_long_list_is_left_out_without_an_error() {
     }
 }
 
-/// 20 000 splats in one tile (10⁵ take the twin too long): nothing overflows, saturates or
+/// 20 000 splats in one tile (10⁵ take the reference too long): nothing overflows, saturates or
 /// loses its order.
 #[test]
-fn crowded_tile_matches_the_twin() {
+fn crowded_tile_matches_reference() {
     let device = test_device();
     let mut random = Random::new(4);
     let mut splats = Splats::default();
@@ -250,7 +250,7 @@ fn crowded_tile_matches_the_twin() {
         splats.sh[at] = random.scaled_normal(0.5) as f32;
     }
     let scene = front_scene(splats, 8, 8);
-    assert_images(&scene.render(&device), &scene.twin());
+    assert_images(&scene.render(&device), &scene.reference());
 }
 
 #[test]
@@ -319,13 +319,13 @@ fn splats_behind_the_camera_neither_show_nor_count_for_the_near_plane() {
 /// What a splat shows of a view, with colours and features that must not matter, in one band and in
 /// strips of the image.
 #[test]
-fn weights_of_a_view_match_the_twin() {
+fn weights_of_a_view_match_reference() {
     let device = test_device();
     for (n, dim) in [(300, 0), (120, 3)] {
         let scene = Scene::small(n, 2, dim, 33);
         let (_, camera) = seeded::small(n, 75, 53, 2, 33);
-        let forward = scene.twin();
-        let list = TwinScene {
+        let forward = scene.reference();
+        let list = ReferenceScene {
             projected: &forward.projected,
             features: &forward.rendered_features,
             feature_dim: dim,
@@ -334,8 +334,8 @@ fn weights_of_a_view_match_the_twin() {
         };
         let mut upstream = vec![0.0; (BASE_CHANNELS + dim + 1) * scene.pixels()];
         upstream[..scene.pixels()].fill(1.0);
-        let twin = raster_backward::twin(&list, &Cutoffs::STANDARD, &upstream);
-        let expected: Vec<f64> = twin.geometry.iter().map(|g| g.channels[0]).collect();
+        let reference = raster_backward::reference(&list, &Cutoffs::STANDARD, &upstream);
+        let expected: Vec<f64> = reference.geometry.iter().map(|g| g.channels[0]).collect();
         let mut renderer =
             Renderer::new(&device, &scene.splats, &scene.features, dim).unwrap().with_near(scene.view.near);
         let weights = renderer.weights(&camera).unwrap();
@@ -399,7 +399,7 @@ fn antialiased_opacity_falls_with_the_dilation() {
         scene.splats.log_scales = vec![[(sigma * 2.0 / scene.view.focal[0] as f32).ln(); 3]];
         scene.splats.antialiased = antialiased;
         let rendered = scene.render(&device);
-        assert_images(&rendered, &scene.twin());
+        assert_images(&rendered, &scene.reference());
         rendered.transmittance.iter().map(|t| 1.0 - t).fold(0.0, f32::max)
     };
     let ratio = alpha(true) / alpha(false);

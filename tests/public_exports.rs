@@ -9,7 +9,7 @@ use splatvk::infer::sam::Sam;
 use splatvk::infer::{RegionEncoder, Registry, pairs, warp};
 use splatvk::pose::pointmap;
 use splatvk::progress::Silent;
-use splatvk::scene::{Camera, Plane, Pose, RgbImage};
+use splatvk::scene::{Camera, Image, Pose, RgbImage};
 use splatvk_test_support::breakfast;
 use splatvk_test_support::onnx::{Attribute, FLOAT, INT64, Onnx};
 use splatvk_test_support::toys::{clip_in, photo};
@@ -205,7 +205,7 @@ fn dense_features_are_averaged_over_regions() {
         .write(&to.join("lseg.onnx"));
     let mut lseg =
         Clip::load(Registry::of(&[dir.path()]).installed(Task::Features, "lseg").unwrap()).unwrap();
-    let (mut image, mut labels) = (flat(32, 32, [0.5, 0.5, 1.0]), Plane::filled(32, 32, 1));
+    let (mut image, mut labels) = (flat(32, 32, [0.5, 0.5, 1.0]), Image::filled(32, 32, 1));
     for y in 0..32 {
         for x in 0..16 {
             // Half red, half green: their sum is the direction of the region.

@@ -18,7 +18,7 @@ use splatvk::run::ask::QueryScene;
 use splatvk::run::metric::{self, Length};
 use splatvk::run::sources;
 use splatvk::run::view::Viewer;
-use splatvk::scene::{LanguageField, Plane, RgbImage, Seen};
+use splatvk::scene::{Image, LanguageField, RgbImage, Seen};
 use std::path::{Path, PathBuf};
 
 fn to_float(picture: &image::RgbImage) -> RgbImage {
@@ -27,7 +27,7 @@ fn to_float(picture: &image::RgbImage) -> RgbImage {
 }
 
 /// A place inside the object's mask that is farthest from its edge, in pixels of the photo.
-fn inside(mask: &Plane<i32>, object: i32) -> (f64, f64) {
+fn inside(mask: &Image<i32>, object: i32) -> (f64, f64) {
     let clear = |x: usize, y: usize, r: usize| {
         x >= r
             && y >= r
@@ -57,7 +57,7 @@ fn iou(a: &[bool], b: &[bool]) -> f64 {
     both as f64 / a.iter().zip(b).filter(|(a, b)| **a || **b).count() as f64
 }
 
-fn is(mask: &Plane<i32>, object: i32) -> Vec<bool> {
+fn is(mask: &Image<i32>, object: i32) -> Vec<bool> {
     mask.data.iter().map(|l| *l == object).collect()
 }
 

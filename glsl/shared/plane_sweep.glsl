@@ -1,6 +1,6 @@
 // Slanted-plane matching, shared by plane_sweep.comp and plane_sweep_refine.comp. A hypothesis is the plane pi.X = 1 in
 // the reference camera's frame: 1/z = pi.ray, and the warp into a source view is the homography K_s (R + t pi^T).
-// Same order of operations as the CPU twin, src/pass/plane_sweep_cpu.rs.
+// Same order of operations as the CPU reference, src/pass/plane_sweep_cpu.rs.
 #extension GL_EXT_control_flow_attributes : require
 
 // Taps along one side of the matching window.

@@ -1,6 +1,6 @@
 // Gradients by the screen-space splats: T is recomputed front to back, six moments of σ and the channel sums are
 // reduced over the tile by butterflies so that lane i keeps splat i. Blocks of channels add up, since the gradient by
-// alpha is linear in the channels. Equations and twin: pass::raster_backward.
+// alpha is linear in the channels. Equations and reference: pass::raster_backward.
 //
 // BY_ENTRY 0: one atomic addition per value, tile and splat. 1: stored per entry for gradient_sum.comp, same bits every run.
 #include "shared/layout.glsl"

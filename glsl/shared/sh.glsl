@@ -1,4 +1,4 @@
-// Real spherical harmonics up to SH_DEGREE (order and signs of all 3DGS files). Twin: pass::sh.
+// Real spherical harmonics up to SH_DEGREE (order and signs of all 3DGS files). Reference: pass::sh.
 #define SH_COUNT ((SH_DEGREE + 1) * (SH_DEGREE + 1))
 
 void sh_basis(vec3 d, out float b[SH_COUNT]) {

@@ -9,7 +9,7 @@ use crate::eval::{EvalReport, Evaluation, GroundTruth, Rendered, Split};
 use crate::progress::Progress;
 use crate::query::{QueryOptions, TextQuery, answer_with, field_relevancy};
 use crate::run::stages::SharedEncoder;
-use crate::scene::{Camera, Codebook, LanguageField, LevelField, Plane, RgbImage};
+use crate::scene::{Camera, Codebook, Image, LanguageField, LevelField, RgbImage};
 
 /// Pixels along a cell. LSeg's features come at half the size of its input, which is about half
 /// that of a LERF photo.
@@ -20,10 +20,10 @@ fn described(
     image: &RgbImage,
     encoder: &SharedEncoder,
     progress: &dyn Progress,
-) -> Result<(LanguageField, Vec<Plane<i32>>)> {
+) -> Result<(LanguageField, Vec<Image<i32>>)> {
     let (columns, rows) = (image.width.div_ceil(CELL), image.height.div_ceil(CELL));
     let cell = |p: usize| (p / image.width / CELL * columns + p % image.width / CELL) as i32;
-    let labels = Plane {
+    let labels = Image {
         width: image.width,
         height: image.height,
         data: (0..image.width * image.height).map(cell).collect(),
@@ -56,8 +56,8 @@ pub(super) fn field(
             let relevancy = field_relevancy(&field, query)?;
             answers.push((*label, answer_with(&codes, &relevancy, &QueryOptions::default())?));
         }
-        let depth = Plane::filled(rgb.width, rgb.height, 0.0);
-        let alpha = Plane::filled(rgb.width, rgb.height, 1.0);
+        let depth = Image::filled(rgb.width, rgb.height, 0.0);
+        let alpha = Image::filled(rgb.width, rgb.height, 1.0);
         evaluation.add_frame(frame, &Rendered { rgb, alpha, depth }, &answers)?;
         progress.step(k as u64 + 1, "");
     }
@@ -115,7 +115,7 @@ mod tests {
         fn embed_regions(
             &mut self,
             image: &RgbImage,
-            labels: &Plane<i32>,
+            labels: &Image<i32>,
             count: usize,
             _: &dyn Progress,
         ) -> Result<Vec<f32>> {

@@ -12,7 +12,7 @@ use crate::query::{QueryOptions, TextQuery};
 use crate::run::score::{Questions, score_field};
 use crate::run::stages::{PlacedPhotos, SharedEncoder};
 use crate::run::view::Viewer;
-use crate::scene::{Codebook, Plane};
+use crate::scene::{Codebook, Image};
 use crate::synth::regions::{self, InjectedErrors};
 use crate::{Error, Result};
 use serde::Serialize;
@@ -120,7 +120,7 @@ impl Stage for EncoderEmbeddings {
             let Some(objects) = self.truth.objects(frame)? else { continue };
             let top = self.truth.labels.keys().max().map_or(0, |k| *k as usize);
             let data = objects.data.iter().map(|&o| o as i32).collect();
-            let labels = Plane { width: objects.width, height: objects.height, data };
+            let labels = Image { width: objects.width, height: objects.height, data };
             let (dim, rows) = self.encoder.with(|e| {
                 e.embed_regions(&photo.image, &labels, top + 1, context.progress).map(|rows| (e.dim(), rows))
             })?;
@@ -319,7 +319,7 @@ impl Stage for LabelledMasks {
             let background = labels.contains(&(shown.len() as i32)).then_some(&unlabelled);
             let features = shown.iter().map(|k| &words[k]).chain(background).flatten().copied();
             let level = LevelMasks {
-                labels: Plane { width: objects.width, height: objects.height, data: labels },
+                labels: Image { width: objects.width, height: objects.height, data: labels },
                 quality: vec![1.0; shown.len() + usize::from(background.is_some())],
                 features: features.collect(),
                 whole: Vec::new(),
@@ -400,9 +400,9 @@ impl Scale {
 /// code or truth are left out.
 fn agreement(
     frame: &TruthFrame,
-    codes: &Plane<i32>,
+    codes: &Image<i32>,
     book: &Codebook,
-    objects: &Plane<u32>,
+    objects: &Image<u32>,
     embeddings: &ObjectEmbeddings,
     scale: &Scale,
 ) -> Option<EmbeddingAgreement> {

@@ -11,7 +11,7 @@ use crate::gpu::{Device, Recorder};
 use crate::pass::pairs;
 use crate::pass::renderer::Renderer;
 use crate::scene::seeded;
-use crate::scene::{Codebook, LevelField, Plane, RgbImage};
+use crate::scene::{Codebook, Image, LevelField, RgbImage};
 
 /// Codes per level of the synthetic feature targets; a scene of four photos has about as many.
 const CODES: usize = 32;
@@ -89,7 +89,7 @@ fn level(image: &RgbImage, width: usize, seed: u64) -> LevelField {
             codes,
             ..Codebook::default()
         },
-        targets: vec![Plane { width: image.width, height: image.height, data }],
+        targets: vec![Image { width: image.width, height: image.height, data }],
         ..LevelField::default()
     }
 }

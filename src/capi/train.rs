@@ -13,7 +13,7 @@ use crate::run::compat::{self, Compat};
 use crate::run::live::LiveScene;
 use crate::run::sources::{self, SourceChoice, SourceKind, choose};
 use crate::run::{self, Method, RunPlan};
-use crate::scene::{Camera, GivenCamera, MAX_PIXELS, Plane, RgbImage};
+use crate::scene::{Camera, GivenCamera, Image, MAX_PIXELS, RgbImage};
 use std::path::{Path, PathBuf};
 
 /// Most bytes from one row of a photo in memory to the next: a part of an image as wide as any may be given.
@@ -149,7 +149,7 @@ unsafe fn single(
     // SAFETY: a byte for each of the pixels, whose number has been checked.
     let mask = unsafe { std::slice::from_raw_parts(given.mask, image.data.len()) };
     let used = mask.iter().map(|v| *v > 0).collect();
-    let used = Plane { width: image.width, height: image.height, data: used };
+    let used = Image { width: image.width, height: image.height, data: used };
     Ok(photo::from_used_pixels(&name, &image, &used, focal, max_size)?)
 }
 

@@ -6,8 +6,13 @@ use crate::pass::close::{Tolerance, compare};
 pub(super) type Found = crate::Result<Result<String, String>>;
 
 /// Compares arrays; says how close they are, or which element is not.
-pub(super) fn close(what: &str, actual: &[f32], twin: &[f64], tolerance: &Tolerance) -> Result<f64, String> {
-    compare(actual, twin, tolerance).map(|d| d.relative_l2).map_err(|e| format!("{what}: {e}"))
+pub(super) fn close(
+    what: &str,
+    actual: &[f32],
+    reference: &[f64],
+    tolerance: &Tolerance,
+) -> Result<f64, String> {
+    compare(actual, reference, tolerance).map(|d| d.relative_l2).map_err(|e| format!("{what}: {e}"))
 }
 
 /// Of several [`close`] the largest distance, as text.
@@ -23,13 +28,13 @@ pub(super) fn worst(all: impl IntoIterator<Item = Result<f64, String>>) -> Resul
 pub(super) fn equal<T: PartialEq + std::fmt::Debug>(
     what: &str,
     actual: &[T],
-    twin: &[T],
+    reference: &[T],
 ) -> Result<String, String> {
-    if actual.len() != twin.len() {
-        return Err(format!("{what}: {} elements against {}", actual.len(), twin.len()));
+    if actual.len() != reference.len() {
+        return Err(format!("{what}: {} elements against {}", actual.len(), reference.len()));
     }
-    match actual.iter().zip(twin).position(|(a, b)| a != b) {
+    match actual.iter().zip(reference).position(|(a, b)| a != b) {
         None => Ok(format!("{} equal", actual.len())),
-        Some(i) => Err(format!("{what}: element {i} is {:?}, should be {:?}", actual[i], twin[i])),
+        Some(i) => Err(format!("{what}: element {i} is {:?}, should be {:?}", actual[i], reference[i])),
     }
 }

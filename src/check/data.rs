@@ -6,7 +6,7 @@ use crate::pass::adam::{self, Class, Moments, Schedule};
 use crate::pass::close::Tolerance;
 use crate::pass::compact;
 use crate::pass::scan::{Scan, exclusive_scan};
-use crate::pass::sort::{Shape, Sort, sort_pairs};
+use crate::pass::sort::{Sort, SortAlgorithm, sort_pairs};
 
 /// A prime number of elements, more than a workgroup and no multiple of anything.
 const COUNT: usize = 20_011;
@@ -46,7 +46,7 @@ pub(super) fn scan(device: &Device) -> Found {
     Ok(equal("total", &total.read()?, &[sum]).and(equal("starts", &starts.read()?, &expected)))
 }
 
-pub(super) fn sort(device: &Device, shape: Shape) -> Found {
+pub(super) fn sort(device: &Device, shape: SortAlgorithm) -> Found {
     let mut expected: Vec<[u32; 2]> =
         words(COUNT, 3).into_iter().zip(0..).map(|(k, v)| [k >> 4, v]).collect();
     let pairs = device.buffer_from("pairs", expected.as_flattened())?;

@@ -11,7 +11,7 @@ use crate::pass::decode::{Codes, decode_pixels};
 use crate::pass::pack::{self, Encoding, FrameChannel};
 use crate::pass::plane_sweep::{GpuMatcher, Matcher, ReferenceView, SourceView};
 use crate::pass::plane_sweep_cpu::CpuMatcher;
-use crate::pass::ssim_l1::{self, Rows, SsimL1};
+use crate::pass::ssim_l1::{self, SsimL1, SsimRowKernel};
 use glam::Vec4;
 
 const SIZE: (usize, usize) = (75, 53);
@@ -26,7 +26,7 @@ fn wide(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&v| v.into()).collect()
 }
 
-pub(super) fn ssim_l1(device: &Device, rows: Rows) -> Found {
+pub(super) fn ssim_l1(device: &Device, rows: SsimRowKernel) -> Found {
     let x = noise(3 * PIXELS, 21);
     let y: Vec<f32> = noise(3 * PIXELS, 22).iter().zip(&x).map(|(n, x)| 0.7 * x + 0.3 * n).collect();
     let bands = Bands::whole(SIZE.0, SIZE.1);
@@ -39,7 +39,7 @@ pub(super) fn ssim_l1(device: &Device, rows: Rows) -> Found {
     rec.run()?;
     let sums = sums.read()?;
     let loss = pass.loss([sums[0], sums[1]].map(f64::from), None);
-    let (twin, by_pixel) = ssim_l1::ssim_l1(&wide(&x), &wide(&y), SIZE.0, SIZE.1, 0.8, 0.2);
+    let (reference, by_pixel) = ssim_l1::ssim_l1(&wide(&x), &wide(&y), SIZE.0, SIZE.1, 0.8, 0.2);
     let largest = by_pixel.iter().fold(0.0f64, |m, g| m.max(g.abs()));
     // E[x²] − E[x]² cancels about three digits in f32, and 1/C2 amplifies what is left in flat
     // regions.
@@ -52,7 +52,7 @@ pub(super) fn ssim_l1(device: &Device, rows: Rows) -> Found {
     };
     let sum = Tolerance { absolute: 1e-5, ..tolerance };
     Ok(worst([
-        close("loss", &[loss.l1 as f32, loss.ssim as f32], &[twin.l1, twin.ssim], &sum),
+        close("loss", &[loss.l1 as f32, loss.ssim as f32], &[reference.l1, reference.ssim], &sum),
         close("gradient", &gradient.read()?, &by_pixel, &tolerance),
     ]))
 }
@@ -106,15 +106,15 @@ pub(super) fn decode(device: &Device) -> Found {
         let mut rec = Recorder::new(device, "self-check of decoding");
         table.record(&mut rec, &features, 0, &transmittance, PIXELS as u32, &decoded);
         rec.run()?;
-        let (mut twin, margin) = decode_pixels(&codes, dim, &planes, &alpha);
+        let (mut reference, margin) = decode_pixels(&codes, dim, &planes, &alpha);
         let actual = decoded.read()?;
-        for ((t, &a), margin) in twin.iter_mut().zip(&actual).zip(margin) {
+        for ((t, &a), margin) in reference.iter_mut().zip(&actual).zip(margin) {
             // Sums of at most 32 products in f32: nearly equal codes may win either way.
             if margin < 8e-6 {
                 *t = a;
             }
         }
-        said = said.and(equal("codes", &actual, &twin));
+        said = said.and(equal("codes", &actual, &reference));
     }
     Ok(said)
 }
@@ -138,23 +138,23 @@ pub(super) fn pack(device: &Device) -> Found {
     ] {
         let texels = pack::texels(device, PIXELS, source, encoding)?;
         pack::pack(device, frame, &frame.bands.get(0), source, encoding, &texels)?;
-        let twin = pack::texels_of(&planes, &rest, source, encoding);
+        let reference = pack::texels_of(&planes, &rest, source, encoding);
         let actual = texels.cast::<u8>().read()?;
         said = said.and(match source {
-            FrameChannel::Depth => quotients(&actual, &twin),
-            _ => equal("bytes", &actual, &twin),
+            FrameChannel::Depth => quotients(&actual, &reference),
+            _ => equal("bytes", &actual, &reference),
         });
     }
     Ok(said)
 }
 
 /// Depth is a quotient, which Vulkan lets a device round in the last two bits and a half.
-fn quotients(actual: &[u8], twin: &[u8]) -> std::result::Result<String, String> {
+fn quotients(actual: &[u8], reference: &[u8]) -> std::result::Result<String, String> {
     let floats =
         |bytes: &[u8]| -> Vec<f32> { bytes.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect() };
     let tolerance =
         Tolerance { relative_l2: 1e-6, absolute: 1e-9, relative: 4e-7, outliers: 0.0, outlier_factor: 1.0 };
-    worst([close("depth", &floats(actual), &wide(&floats(twin)), &tolerance)])
+    worst([close("depth", &floats(actual), &wide(&floats(reference)), &tolerance)])
 }
 
 /// Two cameras side by side before a wall with noise on it.
@@ -208,14 +208,14 @@ pub(super) fn plane_sweep(device: &Device) -> Found {
 
 /// exp, sqrt and the order of sums round differently, so that nearly equal hypotheses may win
 /// either way; anything more is wrong (the bounds of the test of stereo).
-pub(super) fn planes(actual: &[Vec4], twin: &[Vec4]) -> std::result::Result<String, String> {
+pub(super) fn planes(actual: &[Vec4], reference: &[Vec4]) -> std::result::Result<String, String> {
     let same = |a: &Vec4, b: &Vec4| (a.truncate() - b.truncate()).length() < 1e-4 * a.truncate().length();
-    let agreeing: Vec<(&Vec4, &Vec4)> = actual.iter().zip(twin).filter(|(a, b)| same(a, b)).collect();
+    let agreeing: Vec<(&Vec4, &Vec4)> = actual.iter().zip(reference).filter(|(a, b)| same(a, b)).collect();
     let share = agreeing.len() as f64 / actual.len().max(1) as f64;
     let worst = agreeing.iter().map(|(a, b)| (a.w - b.w).abs()).fold(0.0, f32::max);
     if share < 0.985 || worst > 2e-3 {
         return Err(format!(
-            "planes: {:.1} % are the twin's, their costs differ by up to {worst:.1e}",
+            "planes: {:.1} % are the reference's, their costs differ by up to {worst:.1e}",
             100.0 * share
         ));
     }

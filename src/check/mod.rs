@@ -1,4 +1,4 @@
-//! Compares every pass on a device with its CPU twin, in seconds: `splatvk doctor --check`.
+//! Compares every pass on a device with its CPU reference, in seconds: `splatvk doctor --check`.
 //! Variants that gave wrong results are disabled for this device and driver ([`KernelVariant`]).
 mod compared;
 mod data;
@@ -7,9 +7,9 @@ mod render;
 
 use crate::Result;
 use crate::gpu::{Device, Options};
-use crate::pass::sort::Shape;
-use crate::pass::ssim_l1::Rows;
-use crate::pass::{Grouping, KernelVariant, Summation};
+use crate::pass::sort::SortAlgorithm;
+use crate::pass::ssim_l1::SsimRowKernel;
+use crate::pass::{GradientReduction, KernelVariant, TileBinning};
 use compared::Found;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -22,7 +22,7 @@ pub struct Row {
     pub pass: &'static str,
     /// Its variant, where there are several.
     pub variant: Option<KernelVariant>,
-    /// Wall-clock time of device and twin, with the driver's compilation.
+    /// Wall-clock time of device and reference, with the driver's compilation.
     pub time: Duration,
     /// The compared values and their distance, or the fault.
     pub outcome: std::result::Result<String, String>,
@@ -42,20 +42,22 @@ const fn case(pass: &'static str, variant: Option<KernelVariant>, check: fn(&Dev
 const CASES: &[Case] = &[
     case("buffers: upload, copy, fill, download", None, data::buffers),
     case("prefix sum", None, data::scan),
-    case("radix sort", Some(KernelVariant::ChunkSort), |d| data::sort(d, Shape::Chunks)),
-    case("radix sort", Some(KernelVariant::SweepSort), |d| data::sort(d, Shape::Sweep)),
+    case("radix sort", Some(KernelVariant::ChunkSort), |d| data::sort(d, SortAlgorithm::Chunks)),
+    case("radix sort", Some(KernelVariant::SweepSort), |d| data::sort(d, SortAlgorithm::Sweep)),
     case("gather", None, data::gather),
     case("Adam", None, data::adam),
     case("projection and rendering", Some(KernelVariant::CountedLists), |d| {
-        render::forward(d, Grouping::Counting)
+        render::forward(d, TileBinning::Counting)
     }),
     case("projection and rendering", Some(KernelVariant::SortedLists), |d| {
-        render::forward(d, Grouping::Sorting)
+        render::forward(d, TileBinning::Sorting)
     }),
-    case("gradients", Some(KernelVariant::StoredGradients), |d| render::backward(d, Summation::Entries)),
+    case("gradients", Some(KernelVariant::StoredGradients), |d| {
+        render::backward(d, GradientReduction::Entries)
+    }),
     case("depth and needle losses", None, render::regularisers),
-    case("SSIM and L1 loss", Some(KernelVariant::SsimStrips), |d| images::ssim_l1(d, Rows::Strips)),
-    case("SSIM and L1 loss", Some(KernelVariant::SsimShared), |d| images::ssim_l1(d, Rows::Shared)),
+    case("SSIM and L1 loss", Some(KernelVariant::SsimStrips), |d| images::ssim_l1(d, SsimRowKernel::Strips)),
+    case("SSIM and L1 loss", Some(KernelVariant::SsimShared), |d| images::ssim_l1(d, SsimRowKernel::Shared)),
     case("code loss", None, images::codes),
     case("decoding of codes", None, images::decode),
     case("packing of images", None, images::pack),
@@ -72,7 +74,8 @@ pub fn run(
 ) -> Result<Vec<Row>> {
     let mut device = device.clone();
     let mut rows: Vec<Row> = Vec::new();
-    let by_atomics = |variant| case("gradients", Some(variant), |d| render::backward(d, Summation::Atomics));
+    let by_atomics =
+        |variant| case("gradients", Some(variant), |d| render::backward(d, GradientReduction::Atomics));
     let last = match device.info().float_atomics {
         true => by_atomics(KernelVariant::FloatAtomics),
         false => by_atomics(KernelVariant::AtomicGradients),

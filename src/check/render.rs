@@ -5,10 +5,10 @@ use crate::math::Random;
 use crate::pass::close::{IMAGE, Tolerance, gradient_tolerance};
 use crate::pass::params::Params;
 use crate::pass::raster_forward::Cutoffs;
-use crate::pass::twin::{self, Forward};
+use crate::pass::reference::{self, Forward};
 use crate::pass::{
-    DeviceChoices, FeatureMode, Grouping, RasterOptions, Rasterizer, SplatBuffers, Summation, View,
-    regularise,
+    DeviceChoices, FeatureMode, GradientReduction, RasterOptions, Rasterizer, SplatBuffers, TileBinning,
+    View, regularise,
 };
 use crate::scene::Splats;
 use crate::scene::seeded;
@@ -39,8 +39,8 @@ impl Scene {
         Params::new(&self.splats, &self.features, FEATURES)
     }
 
-    fn twin(&self) -> Forward {
-        twin::forward(&self.params(), &self.view, MODE, &Cutoffs::STANDARD)
+    fn reference(&self) -> Forward {
+        reference::forward(&self.params(), &self.view, MODE, &Cutoffs::STANDARD)
     }
 
     fn rendered(&self, device: &Device, ways: DeviceChoices) -> crate::Result<(SplatBuffers, Rasterizer)> {
@@ -52,18 +52,18 @@ impl Scene {
     }
 }
 
-pub(super) fn forward(device: &Device, grouping: Grouping) -> Found {
+pub(super) fn forward(device: &Device, grouping: TileBinning) -> Found {
     let scene = Scene::new();
     let (_, raster) = scene.rendered(device, DeviceChoices { grouping, ..DeviceChoices::of(device) })?;
-    let twin = scene.twin();
+    let reference = scene.reference();
     let (planes, rest) = (raster.frame().planes.read()?, raster.frame().transmittance.read()?);
     Ok(worst([
-        close("planes", &planes, &twin.image.planes, &IMAGE),
-        close("transmittance", &rest, &twin.image.transmittance, &IMAGE),
+        close("planes", &planes, &reference.image.planes, &IMAGE),
+        close("transmittance", &rest, &reference.image.transmittance, &IMAGE),
     ]))
 }
 
-pub(super) fn backward(device: &Device, summation: Summation) -> Found {
+pub(super) fn backward(device: &Device, summation: GradientReduction) -> Found {
     let scene = Scene::new();
     let (params, raster) =
         scene.rendered(device, DeviceChoices { summation, ..DeviceChoices::of(device) })?;
@@ -79,21 +79,28 @@ pub(super) fn backward(device: &Device, summation: Summation) -> Found {
     let camera = raster.frame().camera_grad.read()?;
 
     let upstream: Vec<f64> = upstream.iter().map(|&g| g.into()).collect();
-    let twin =
-        twin::backward(&scene.params(), &scene.view, MODE, &Cutoffs::STANDARD, &scene.twin(), &upstream);
+    let reference = reference::backward(
+        &scene.params(),
+        &scene.view,
+        MODE,
+        &Cutoffs::STANDARD,
+        &scene.reference(),
+        &upstream,
+    );
     let flat = |v: &[DVec3]| v.iter().flat_map(|x| x.to_array()).collect::<Vec<f64>>();
-    let quats: Vec<f64> = twin.params.quats.iter().flat_map(|q| q.to_array()).collect();
-    let class =
-        |name: &str, actual: &[f32], twin: &[f64]| close(name, actual, twin, &gradient_tolerance(twin));
+    let quats: Vec<f64> = reference.params.quats.iter().flat_map(|q| q.to_array()).collect();
+    let class = |name: &str, actual: &[f32], reference: &[f64]| {
+        close(name, actual, reference, &gradient_tolerance(reference))
+    };
     Ok(worst([
-        class("means", splats.means.as_flattened(), &flat(&twin.params.means)),
-        class("log scales", splats.log_scales.as_flattened(), &flat(&twin.params.log_scales)),
+        class("means", splats.means.as_flattened(), &flat(&reference.params.means)),
+        class("log scales", splats.log_scales.as_flattened(), &flat(&reference.params.log_scales)),
         class("quaternions", splats.quats.as_flattened(), &quats),
-        class("opacity logits", &splats.opacity_logits, &twin.params.opacity_logits),
-        class("SH", &splats.sh, &flat(&twin.params.sh)),
-        class("features", &features, &twin.params.features),
-        class("pose", &camera[..6], &twin.twist),
-        class("intrinsics", &camera[6..], &twin.intrinsics),
+        class("opacity logits", &splats.opacity_logits, &reference.params.opacity_logits),
+        class("SH", &splats.sh, &flat(&reference.params.sh)),
+        class("features", &features, &reference.params.features),
+        class("pose", &camera[..6], &reference.twist),
+        class("intrinsics", &camera[6..], &reference.intrinsics),
     ]))
 }
 

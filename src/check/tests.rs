@@ -83,14 +83,14 @@ fn wrong_results_are_told_apart_from_right_ones() {
 
 #[test]
 fn planes_may_differ_where_two_are_nearly_as_good_and_nowhere_else() {
-    let twin = [Vec4::new(0.1, 0.0, 0.5, 0.2); 1000];
+    let reference = [Vec4::new(0.1, 0.0, 0.5, 0.2); 1000];
     let with = |count: usize, change: Vec4| {
-        let mut actual = twin;
+        let mut actual = reference;
         actual[..count].iter_mut().for_each(|plane| *plane += change);
-        planes(&actual, &twin)
+        planes(&actual, &reference)
     };
     assert!(with(10, Vec4::X).is_ok());
-    assert!(with(20, Vec4::X).unwrap_err().contains("98.0 % are the twin's"));
+    assert!(with(20, Vec4::X).unwrap_err().contains("98.0 % are the reference's"));
     assert!(with(1, 0.01 * Vec4::W).unwrap_err().contains("costs differ"));
 }
 

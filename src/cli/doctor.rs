@@ -78,7 +78,7 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
     }
 }
 
-/// Compares every pass with its CPU twin, and switches off what is wrong and can be replaced.
+/// Compares every pass with its CPU reference, and switches off what is wrong and can be replaced.
 fn check_passes(args: &DoctorArgs) -> Result<()> {
     // Without the cache nothing is disabled, and the driver compiles everything.
     let options = Options { cache: None, ..gpu::options(args.device.device.as_deref()) };

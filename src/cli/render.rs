@@ -10,7 +10,7 @@ use crate::format::picture::{self, Planes};
 use crate::gpu;
 use crate::report::colour;
 use crate::run::view::{DecodedFrame, UnseenShare, Viewer};
-use crate::scene::{LEVEL_NAMES, LanguageField, Plane, RgbImage, to_linear};
+use crate::scene::{Image, LEVEL_NAMES, LanguageField, RgbImage, to_linear};
 use crate::{Error, Result};
 
 pub fn render(args: &RenderArgs) -> Result<()> {
@@ -68,7 +68,7 @@ pub fn render(args: &RenderArgs) -> Result<()> {
 struct View<'a> {
     decoded: &'a DecodedFrame,
     /// [H, W] share that no photo shows, where it is asked for.
-    unseen: Option<&'a Plane<f32>>,
+    unseen: Option<&'a Image<f32>>,
 }
 
 /// Levels of the field that have codes: (name, first feature channel, number of channels, index).
@@ -133,7 +133,7 @@ fn png(
 }
 
 /// The first three components of the unit features as a colour.
-fn false_colour(features: &[f32], d: usize, like: &Plane<f32>) -> RgbImage {
+fn false_colour(features: &[f32], d: usize, like: &Image<f32>) -> RgbImage {
     let colour = |f: &[f32]| {
         let norm = f.iter().map(|v| v * v).sum::<f32>().sqrt();
         [0, 1, 2].map(|k| if norm > 0.0 && k < d { 0.5 + 0.5 * f[k] / norm } else { 0.0 })

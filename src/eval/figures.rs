@@ -1,6 +1,6 @@
 //! The figures of one frame: colour fit, depth, masks.
 use crate::math::median;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
 use serde::Serialize;
 
@@ -46,9 +46,9 @@ pub struct DepthScore {
 /// Depth of solid pixels; `scale` is that of the cameras, scene → truth. `None` without common
 /// pixels.
 pub fn depth_score(
-    depth: &Plane<f32>,
-    alpha: &Plane<f32>,
-    truth: &Plane<f32>,
+    depth: &Image<f32>,
+    alpha: &Image<f32>,
+    truth: &Image<f32>,
     scale: f64,
 ) -> Option<DepthScore> {
     let pairs = depth.data.iter().zip(&alpha.data).zip(&truth.data);
@@ -67,7 +67,7 @@ pub fn depth_score(
 
 /// Intersection over union of a mask (resampled to the truth's size by nearest pixel) and one
 /// object; 0 when both are empty.
-pub fn iou(mask: &Plane<bool>, objects: &Plane<u32>, label: u32) -> Result<f64> {
+pub fn iou(mask: &Image<bool>, objects: &Image<u32>, label: u32) -> Result<f64> {
     if mask.data.len() != mask.width * mask.height || mask.data.is_empty() {
         return Err(Error::work("eval: a mask without pixels"));
     }
@@ -95,8 +95,8 @@ mod tests {
     use super::*;
     use crate::pass::metrics::psnr;
 
-    fn plane(data: Vec<f32>) -> Plane<f32> {
-        Plane { width: data.len(), height: 1, data }
+    fn plane(data: Vec<f32>) -> Image<f32> {
+        Image { width: data.len(), height: 1, data }
     }
 
     #[test]

@@ -32,7 +32,7 @@ use crate::pose::align::{PoseErrors, pose_errors};
 use crate::pose::relative::{auc, pair_errors};
 use crate::query::QueryResult;
 use crate::query::instances::Instance;
-use crate::scene::{Camera, Plane, Pose, RgbImage, Similarity, Up, World};
+use crate::scene::{Camera, Image, Pose, RgbImage, Similarity, Up, World};
 use crate::{Error, Result};
 use figures::quantised;
 use glam::{DVec2, DVec3};
@@ -59,9 +59,9 @@ pub struct Rendered {
     /// Colours over the scene's background.
     pub rgb: RgbImage,
     /// Accumulated opacity.
-    pub alpha: Plane<f32>,
+    pub alpha: Image<f32>,
     /// Camera z in scene units, 0 where nothing is.
-    pub depth: Plane<f32>,
+    pub depth: Image<f32>,
 }
 
 /// Focal ratio and offset of the principal point of the scene's cameras against the truth: medians

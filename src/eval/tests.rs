@@ -35,7 +35,7 @@ fn a_perfect_scene_scores_perfectly_and_its_files_say_so() {
         let mut depth = truth.depth(&frame).unwrap().unwrap();
         depth.data.iter_mut().for_each(|z| *z /= similarity.scale as f32);
         let rgb = truth.image(&frame).unwrap();
-        let alpha = Plane::filled(640, 480, 1.0);
+        let alpha = Image::filled(640, 480, 1.0);
         let objects = truth.objects(&frame).unwrap().unwrap();
         let answers: Vec<(u32, QueryResult)> = eval
             .phrases()
@@ -43,7 +43,7 @@ fn a_perfect_scene_scores_perfectly_and_its_files_say_so() {
             .map(|(label, _)| {
                 let mask: Vec<bool> = objects.data.iter().map(|&o| o == label).collect();
                 let p = mask.iter().position(|&m| m).unwrap_or(0);
-                let mask = Plane { width: 640, height: 480, data: mask };
+                let mask = Image { width: 640, height: 480, data: mask };
                 (
                     label,
                     QueryResult { mask, location: (p % 640, p / 640), found: true, ..QueryResult::default() },
@@ -79,8 +79,8 @@ fn a_perfect_scene_scores_perfectly_and_its_files_say_so() {
 
 #[test]
 fn iou_counts_pixels_and_resamples_masks() {
-    let objects = Plane { width: 4, height: 2, data: vec![1, 1, 0, 0, 1, 1, 0, 2] };
-    let mask = |data: Vec<bool>, width| Plane { width, height: data.len() / width, data };
+    let objects = Image { width: 4, height: 2, data: vec![1, 1, 0, 0, 1, 1, 0, 2] };
+    let mask = |data: Vec<bool>, width| Image { width, height: data.len() / width, data };
     let m = mask(vec![true, false, false, false, true, true, true, false], 4);
     assert_eq!(iou(&m, &objects, 1).unwrap(), 3.0 / 5.0);
     assert_eq!(iou(&mask(vec![true, false], 2), &objects, 1).unwrap(), 1.0);

@@ -1,7 +1,7 @@
 //! Ground-truth folders: `ground_truth.json`, photos, `masks/<stem>.png`, `depth/<stem>.npz`.
 use crate::format::npy;
 use crate::photo::{self, stem};
-use crate::scene::{Camera, Lens, Plane, Pose, RgbImage};
+use crate::scene::{Camera, Image, Lens, Pose, RgbImage};
 use crate::{Error, Result, files};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
@@ -63,7 +63,7 @@ impl TruthFrame {
 pub trait ObjectMaps: std::fmt::Debug + Send + Sync {
     /// Object index per pixel of a frame, [H, W] of the label's own size; `None` where the frame
     /// has no labels.
-    fn objects(&self, stem: &str) -> Result<Option<Plane<u32>>>;
+    fn objects(&self, stem: &str) -> Result<Option<Image<u32>>>;
 }
 
 /// A ground-truth folder.
@@ -180,7 +180,7 @@ impl GroundTruth {
 
     /// Object index per pixel, if the set has masks: of the frame's size where another layout holds
     /// them.
-    pub fn objects(&self, frame: &TruthFrame) -> Result<Option<Plane<u32>>> {
+    pub fn objects(&self, frame: &TruthFrame) -> Result<Option<Image<u32>>> {
         if let Some(maps) = &self.maps {
             let (width, height) = (frame.camera.width as usize, frame.camera.height as usize);
             return Ok(maps.objects(&frame.stem)?.map(|plane| resampled(&plane, width, height)));
@@ -191,11 +191,11 @@ impl GroundTruth {
         }
         let image = open(&path)?.to_luma8();
         let data = image.pixels().map(|p| p.0[0] as u32).collect();
-        Ok(Some(Plane { width: image.width() as usize, height: image.height() as usize, data }))
+        Ok(Some(Image { width: image.width() as usize, height: image.height() as usize, data }))
     }
 
     /// Camera z per pixel, 0 = unknown, if the set has depth.
-    pub fn depth(&self, frame: &TruthFrame) -> Result<Option<Plane<f32>>> {
+    pub fn depth(&self, frame: &TruthFrame) -> Result<Option<Image<f32>>> {
         let path = self.depth_path(frame);
         if !path.exists() {
             return Ok(None);
@@ -203,7 +203,7 @@ impl GroundTruth {
         let arrays = npy::read_npz(&path)?;
         match arrays.get("depth") {
             Some(a) if a.shape.len() == 2 => {
-                Ok(Some(Plane { width: a.shape[1], height: a.shape[0], data: a.to_f32() }))
+                Ok(Some(Image { width: a.shape[1], height: a.shape[0], data: a.to_f32() }))
             }
             _ => Err(Error::input(format!("{}: no HxW array named depth", path.display()))),
         }
@@ -230,13 +230,13 @@ impl GroundTruth {
 }
 
 /// The nearest pixel's value at another size.
-fn resampled(plane: &Plane<u32>, width: usize, height: usize) -> Plane<u32> {
+fn resampled(plane: &Image<u32>, width: usize, height: usize) -> Image<u32> {
     if (plane.width, plane.height) == (width, height) || plane.data.is_empty() {
         return plane.clone();
     }
     let at = |k: usize, to: usize, from: usize| ((2 * k + 1) * from / (2 * to)).min(from - 1);
     let pixel = |p: usize| plane.at(at(p % width, width, plane.width), at(p / width, height, plane.height));
-    Plane { width, height, data: (0..width * height).map(pixel).collect() }
+    Image { width, height, data: (0..width * height).map(pixel).collect() }
 }
 
 fn open(path: &Path) -> Result<image::DynamicImage> {

@@ -107,14 +107,14 @@ pub fn present(entry: &CatalogueEntry, folder: &Path) -> Result<Present> {
 }
 
 /// Removes what interrupted fetches left of models that are installed by now, and puts back a model
-/// that one had taken out to replace it; not of those in `going_on`, which are fetched next.
-pub fn tidy(folder: &Path, going_on: &[&str]) -> Result<()> {
+/// that one had taken out to replace it; not of those in `for_continuation`, which are fetched next.
+pub fn tidy(folder: &Path, for_continuation: &[&str]) -> Result<()> {
     for (root, _) in leftovers(folder) {
         let name = staging::name(&root).unwrap_or_default();
         if let Found::Left(held) = look(&root) {
             held.put_back();
         }
-        if !going_on.contains(&name.as_str()) && folder.join(&name).exists() {
+        if !for_continuation.contains(&name.as_str()) && folder.join(&name).exists() {
             remove_leftover(&root).map_err(Error::io(&root))?;
         }
     }

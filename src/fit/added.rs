@@ -10,7 +10,7 @@ use super::unseen::unseen_splats;
 use crate::Result;
 use crate::gpu::Device;
 use crate::progress::Progress;
-use crate::scene::{Camera, DepthMap, Plane, PointCloud, Splats};
+use crate::scene::{Camera, DepthMap, Image, PointCloud, Splats};
 use glam::DVec3;
 
 /// Relative difference in depth from which on a point is on another surface than the one that is
@@ -23,7 +23,7 @@ const MIN_POINTS: usize = 4;
 /// The points on surfaces that a scene does not have: those that a new view measures where the
 /// scene renders nothing, or something clearly nearer or farther. `views` are new cameras, each
 /// with the depth that was measured in it and what the scene renders there.
-pub fn new_surface(points: &PointCloud, views: &[(&Camera, &DepthMap, &Plane<f32>)]) -> PointCloud {
+pub fn new_surface(points: &PointCloud, views: &[(&Camera, &DepthMap, &Image<f32>)]) -> PointCloud {
     let is_new = |i: usize| {
         let p = DVec3::from(points.positions[i].map(f64::from));
         views.iter().any(|(camera, measured, rendered)| {
@@ -92,10 +92,10 @@ mod tests {
         // Pixel 0 is rendered where it was measured, 1 behind, 2 not at all; 3 was measured
         // elsewhere.
         let measured = DepthMap {
-            depth: Plane { width: 4, height: 1, data: vec![2.0, 2.0, 2.0, 1.0] },
-            confidence: Plane { width: 4, height: 1, data: vec![0.9; 4] },
+            depth: Image { width: 4, height: 1, data: vec![2.0, 2.0, 2.0, 1.0] },
+            confidence: Image { width: 4, height: 1, data: vec![0.9; 4] },
         };
-        let rendered = Plane { width: 4, height: 1, data: vec![2.05, 3.0, 0.0, 0.0] };
+        let rendered = Image { width: 4, height: 1, data: vec![2.05, 3.0, 0.0, 0.0] };
         let mut points = PointCloud::default();
         for x in 0..4 {
             let p = camera.unproject(glam::DVec2::new(f64::from(x) + 0.5, 0.5), 2.0);

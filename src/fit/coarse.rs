@@ -1,6 +1,6 @@
 //! Training first at half the photos' size: there a step costs less than half, and what it fits is
 //! what matters early on.
-use crate::scene::{Camera, Coverage, DepthMap, Plane, RgbImage};
+use crate::scene::{Camera, Coverage, DepthMap, Image, RgbImage};
 
 /// What training compares with.
 #[derive(Clone, Copy)]
@@ -51,8 +51,8 @@ fn half(size: usize) -> usize {
 }
 
 /// Every second value: between a near and a far surface there is no depth to average.
-fn sampled(plane: &Plane<f32>) -> Plane<f32> {
+fn sampled(plane: &Image<f32>) -> Image<f32> {
     let (width, height) = (half(plane.width), half(plane.height));
     let at = |i: usize| plane.at(i % width * plane.width / width, i / width * plane.height / height);
-    Plane { width, height, data: (0..width * height).map(at).collect() }
+    Image { width, height, data: (0..width * height).map(at).collect() }
 }

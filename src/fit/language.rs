@@ -7,7 +7,7 @@ use super::lift::{CodeTargets, Lifting};
 use super::model::{Model, not_finite};
 use super::options::{LanguageOptions, Start};
 use super::scale::SceneScale;
-use super::training::{self, Review, Trainer, Training};
+use super::training::{self, StepReport, Trainer, Training};
 use super::views::Views;
 use crate::gpu::{self, Buffer, Device, Recorder};
 use crate::pass::channels::BASE_CHANNELS;
@@ -145,7 +145,7 @@ pub(crate) struct Run<'a> {
 
 /// What steps change beside the model.
 #[derive(Serialize, Deserialize)]
-pub(crate) struct Figures {
+pub(crate) struct StageState {
     recent: Vec<f64>,
     curve: Vec<LanguagePoint>,
 }
@@ -275,7 +275,7 @@ impl<'a> Run<'a> {
 }
 
 impl Training for Run<'_> {
-    type Figures = Figures;
+    type StageState = StageState;
 
     fn trainer(&self) -> &Trainer {
         &self.trainer
@@ -337,12 +337,12 @@ impl Training for Run<'_> {
         Ok(())
     }
 
-    fn review(&mut self, step: usize) -> Result<Review> {
+    fn review(&mut self, step: usize) -> Result<StepReport> {
         let LanguageOptions { check_every: every, iterations: last, .. } = *self.options;
         // A run that is measured once, at its end, needs no start to compare with.
         let due = step == last || (step.is_multiple_of(every) && every < last);
         if every == 0 || !due {
-            return Ok(Review::default());
+            return Ok(StepReport::default());
         }
         self.trainer.model.check(step)?;
         let point = self.measure(step)?;
@@ -351,14 +351,14 @@ impl Training for Run<'_> {
         let shares: Vec<String> = LEVEL_NAMES.into_iter().zip(&point.accuracy).filter_map(share).collect();
         let note = Some(format!("decoded: {}", shares.join(", ")));
         self.curve.push(point);
-        Ok(Review { figures, note, finished: self.settled() })
+        Ok(StepReport { figures, note, finished: self.settled() })
     }
 
-    fn figures(&self) -> Figures {
-        Figures { recent: self.recent.clone(), curve: self.curve.clone() }
+    fn stage_state(&self) -> StageState {
+        StageState { recent: self.recent.clone(), curve: self.curve.clone() }
     }
 
-    fn set_figures(&mut self, kept: Figures) {
+    fn set_stage_state(&mut self, kept: StageState) {
         (self.recent, self.curve) = (kept.recent, kept.curve);
     }
 }

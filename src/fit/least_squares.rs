@@ -82,7 +82,7 @@ mod tests {
     use crate::pass::{FeatureMode, RasterOptions, Renderer};
     use crate::progress::Silent;
     use crate::scene::seeded;
-    use crate::scene::{Codebook, LevelField, Plane, Pose, RgbImage, Splats};
+    use crate::scene::{Codebook, Image, LevelField, Pose, RgbImage, Splats};
     use glam::{DMat3, DVec3};
 
     #[test]
@@ -108,7 +108,7 @@ mod tests {
             ..Codebook::default()
         };
         let data = (0..SIZE.0 * SIZE.1).map(label).collect();
-        let targets = vec![Plane { width: SIZE.0, height: SIZE.1, data }];
+        let targets = vec![Image { width: SIZE.0, height: SIZE.1, data }];
         let level = LevelField { codebook, targets, ..LevelField::default() };
         let images = [RgbImage { width: SIZE.0, height: SIZE.1, data: vec![[0.5; 3]; SIZE.0 * SIZE.1] }];
         let cameras = [seeded::camera(SIZE.0 as u32, SIZE.1 as u32, Pose::IDENTITY)];

@@ -123,7 +123,7 @@ impl RgbOptions {
 
     /// The same options for a scene of `known` photos that goes on with `new` more: each may bring
     /// its share of the splats.
-    pub fn going_on(self, known: usize, new: usize) -> Self {
+    pub fn for_continuation(self, known: usize, new: usize) -> Self {
         // Steps at half size, 0.6 of a run, would undo what the scene shows already: they are left
         // out, and of the others there are a few more, since new splats have seen none of them. Of
         // many photos each is seen as often as in a run with sixteen.

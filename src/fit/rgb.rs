@@ -8,7 +8,7 @@ use super::options::RgbOptions;
 use super::pose::PoseAdam;
 use super::scale::SceneScale;
 use super::sh_degree::ViewDependence;
-use super::training::{self, Review, Trainer, Training};
+use super::training::{self, StepReport, Trainer, Training};
 use super::unseen::unseen_splats;
 use super::views::Views;
 use crate::gpu::{Device, Recorder};
@@ -202,7 +202,7 @@ pub(crate) struct Run<'a> {
 
 /// What steps change beside the model.
 #[derive(Serialize, Deserialize)]
-pub(crate) struct Figures {
+pub(crate) struct StageState {
     poses: Vec<PoseAdam>,
     recent: Vec<ImageLoss>,
     last: usize,
@@ -357,7 +357,7 @@ impl<'a> Run<'a> {
 }
 
 impl Training for Run<'_> {
-    type Figures = Figures;
+    type StageState = StageState;
 
     fn trainer(&self) -> &Trainer {
         &self.trainer
@@ -422,8 +422,8 @@ impl Training for Run<'_> {
         self.move_camera(view, iteration)
     }
 
-    fn review(&mut self, step: usize) -> Result<Review> {
-        let mut review = Review::default();
+    fn review(&mut self, step: usize) -> Result<StepReport> {
+        let mut review = StepReport::default();
         let every = self.options.report_every.max(1);
         if step > 0 && (step.is_multiple_of(every) || step == self.options.iterations) {
             let CurvePoint { loss, ssim, psnr, splats, .. } = self.measure(step)?;
@@ -434,9 +434,9 @@ impl Training for Run<'_> {
         Ok(review)
     }
 
-    fn figures(&self) -> Figures {
+    fn stage_state(&self) -> StageState {
         let Run { poses, recent, last, psnr, curve, .. } = self;
-        Figures {
+        StageState {
             poses: poses.clone(),
             recent: recent.clone(),
             last: *last,
@@ -445,7 +445,7 @@ impl Training for Run<'_> {
         }
     }
 
-    fn set_figures(&mut self, kept: Figures) {
+    fn set_stage_state(&mut self, kept: StageState) {
         (self.poses, self.recent, self.last) = (kept.poses, kept.recent, kept.last);
         (self.psnr, self.curve) = (kept.psnr, kept.curve);
     }

@@ -30,7 +30,7 @@ pub(crate) struct Trainer {
 /// measurements.
 pub(crate) trait Training {
     /// What steps change beside splats, moments, cameras and the order of the views.
-    type Figures: Serialize + DeserializeOwned;
+    type StageState: Serialize + DeserializeOwned;
 
     fn trainer(&self) -> &Trainer;
     fn trainer_mut(&mut self) -> &mut Trainer;
@@ -41,9 +41,9 @@ pub(crate) trait Training {
     /// Reads back what the host needs of a step on `view`.
     fn read_back(&mut self, view: usize, iteration: usize) -> Result<()>;
     /// Between steps, `step` of them done: measures when it is time to, and removes splats.
-    fn review(&mut self, step: usize) -> Result<Review>;
-    fn figures(&self) -> Self::Figures;
-    fn set_figures(&mut self, figures: Self::Figures);
+    fn review(&mut self, step: usize) -> Result<StepReport>;
+    fn stage_state(&self) -> Self::StageState;
+    fn set_stage_state(&mut self, figures: Self::StageState);
 
     /// One step on the next view.
     fn step(&mut self, iteration: usize) -> Result<()> {
@@ -75,7 +75,7 @@ pub(crate) trait Training {
 
 /// What [`Training::review`] found; empty between measurements.
 #[derive(Default)]
-pub(crate) struct Review {
+pub(crate) struct StepReport {
     /// Measurements by name, for [`Progress::figures`].
     pub(super) figures: Vec<(&'static str, f64)>,
     /// The same for people, if there is something new to say.
@@ -155,7 +155,7 @@ pub(super) fn train<T: Training>(
     let first = (group * iterations) as u64;
     let mut note = String::new();
     let mut review = |run: &mut T, step: usize| {
-        let Review { figures, note: news, finished } = run.review(step)?;
+        let StepReport { figures, note: news, finished } = run.review(step)?;
         if !figures.is_empty() {
             progress.figures(first + step as u64, &figures);
         }
@@ -189,19 +189,19 @@ pub(super) fn train<T: Training>(
 fn save<T: Training>(run: &T, done: usize, progress: &dyn Progress) -> Result<()> {
     let Some(checkpoint) = progress.checkpoint() else { return Ok(()) };
     let Trainer { group, model, cameras, order, .. } = run.trainer();
-    let (model, figures) = (model.state()?, run.figures());
+    let (model, figures) = (model.state()?, run.stage_state());
     let state = State { group: *group, done, model, cameras: cameras.clone(), order: order.clone(), figures };
     checkpoint.save(done, &state)
 }
 
 /// Takes over the state of an earlier process, and says how many steps it has done.
 fn restore<T: Training>(run: &mut T, progress: &dyn Progress) -> Result<usize> {
-    let kept = progress.checkpoint().and_then(|c| c.load::<State<T::Figures>>());
+    let kept = progress.checkpoint().and_then(|c| c.load::<State<T::StageState>>());
     let Some(kept) = kept.filter(|k| k.group == run.trainer().group) else { return Ok(0) };
     let trainer = run.trainer_mut();
     trainer.model = Model::restored(&trainer.device, &kept.model)?;
     (trainer.cameras, trainer.order) = (kept.cameras, kept.order);
-    run.set_figures(kept.figures);
+    run.set_stage_state(kept.figures);
     progress.checkpoint().iter().for_each(|c| c.went_on_from(kept.done));
     Ok(kept.done)
 }
@@ -215,7 +215,7 @@ mod tests {
     };
     use crate::gpu::{Device, Options, TestDevice};
     use crate::scene::seeded;
-    use crate::scene::{Camera, Codebook, LevelField, Plane, Pose, RgbImage, Splats};
+    use crate::scene::{Camera, Codebook, Image, LevelField, Pose, RgbImage, Splats};
     use glam::DVec3;
     use std::time::Duration;
 
@@ -290,7 +290,7 @@ mod tests {
                 codes: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
                 ..Codebook::default()
             },
-            targets: (0..2).map(|v| Plane { width: 75, height: 53, data: labels(v) }).collect(),
+            targets: (0..2).map(|v| Image { width: 75, height: 53, data: labels(v) }).collect(),
             ..LevelField::default()
         };
         let options = LanguageOptions::preset(Preset::Draft);

@@ -115,7 +115,7 @@ fn row_of(step: usize, rate: [f64; 2]) -> [f32; 4] {
     [(rate[0] * first) as f32, (rate[1] * first) as f32, second as f32, 0.0]
 }
 
-/// The CPU twin of one step for one class with one rate; `moments` are (m, v).
+/// The CPU reference of one step for one class with one rate; `moments` are (m, v).
 pub fn adam(parameters: &mut [f64], gradients: &[f64], moments: &mut [[f64; 2]], rate: f64, step: usize) {
     let t = step.max(1) as f64;
     for ((p, &g), mv) in parameters.iter_mut().zip(gradients).zip(moments) {
@@ -148,7 +148,7 @@ mod tests {
         let moments = Moments::new(&device, count).unwrap();
         let guard = device.buffer::<u32>("guard", 2).unwrap();
         let mut schedule = Schedule::new(&device, 2).unwrap();
-        let mut twin: Vec<f64> = start.iter().map(|&v| f64::from(v)).collect();
+        let mut reference: Vec<f64> = start.iter().map(|&v| f64::from(v)).collect();
         let mut state = vec![[0.0; 2]; count];
         for step in 1..=20 {
             let g: Vec<f32> =
@@ -162,10 +162,10 @@ mod tests {
             for i in 0..count {
                 let rate = rates[usize::from(i % stride >= head)];
                 let range = i..i + 1;
-                adam(&mut twin[range.clone()], &[f64::from(g[i])], &mut state[range], rate, step);
+                adam(&mut reference[range.clone()], &[f64::from(g[i])], &mut state[range], rate, step);
             }
         }
-        for (i, (p, t)) in parameters.read().unwrap().into_iter().zip(&twin).enumerate() {
+        for (i, (p, t)) in parameters.read().unwrap().into_iter().zip(&reference).enumerate() {
             // 20 steps of 2e-3, each rounded in f32.
             assert!((f64::from(p) - t).abs() < 2e-6, "{i}: {p} {t}");
         }

@@ -135,7 +135,7 @@ fn group_by_sorting(
 }
 
 /// The lists, by asking every pixel of every tile: `[tiles]`, each nearest first as `order` is.
-pub fn twin(projected: &[Option<Projected>], order: &[u32], size: [u32; 2]) -> Vec<Vec<u32>> {
+pub fn reference(projected: &[Option<Projected>], order: &[u32], size: [u32; 2]) -> Vec<Vec<u32>> {
     let tiles = size.map(|s| s.div_ceil(TILE));
     let mut lists = vec![Vec::new(); (tiles[0] * tiles[1]) as usize];
     for &i in order {

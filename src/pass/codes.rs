@@ -62,7 +62,7 @@ fn record_planes(
     rec.dispatch_threads(call, [pixels, 1, 1]);
 }
 
-/// The CPU twin of the loss for one level: (loss per pixel, gradient [width, pixels]) of planar
+/// The CPU reference of the loss for one level: (loss per pixel, gradient [width, pixels]) of planar
 /// features.
 pub fn code_l1(
     labels: &[i32],

@@ -37,7 +37,7 @@ pub fn gather<T: Pod>(
     Ok(to.cast())
 }
 
-/// The CPU twin of [`gather`].
+/// The CPU reference of [`gather`].
 pub fn gather_rows<T: Copy>(from: &[T], index: &[u32], stride: usize) -> Vec<T> {
     index.iter().flat_map(|&i| &from[i as usize * stride..][..stride]).copied().collect()
 }

@@ -152,8 +152,8 @@ mod tests {
         let codes = [0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0];
         assert_eq!(on_device(&codes, 2, &[2.0, 0.0, 0.0, 2.0], &[1.0, 1.0]), [1, 0]);
         assert_eq!(on_device(&[], 2, &[2.0, 0.0, 0.0, 2.0], &[1.0, 1.0]), [-1, -1]);
-        let (twin, _) = decode_pixels(&[], 2, &[2.0, 0.0, 0.0, 2.0], &[1.0, 1.0]);
-        assert_eq!(twin, [-1, -1]);
+        let (reference, _) = decode_pixels(&[], 2, &[2.0, 0.0, 0.0, 2.0], &[1.0, 1.0]);
+        assert_eq!(reference, [-1, -1]);
     }
 
     #[test]

@@ -36,7 +36,7 @@ pub struct FrameBuffers {
     pub(super) projected: Buffer<f32>,
     pub(super) projected_grad: Buffer<f32>,
     pub(super) camera_parts: Buffer<f32>,
-    pub(super) summation: Summation,
+    pub(super) summation: GradientReduction,
     pub(super) gradient_entries: GradientEntries,
     pub(super) codes: Buffer<f32>,
     pub(super) codes_grad: Buffer<f32>,
@@ -85,7 +85,7 @@ pub(super) const PROJECTED_FLOATS: usize = shaders::shared::layout::PROJECTED_FL
 /// Gradient by the camera: twist (ρ, θ), fx, fy, cx, cy.
 pub(super) const CAMERA_GRADIENTS: usize = shaders::shared::layout::CAMERA_GRADIENTS as usize;
 
-/// Bytes per entry of the widest buffer that [`Summation::Entries`] needs: the features of one
+/// Bytes per entry of the widest buffer that [`GradientReduction::Entries`] needs: the features of one
 /// launch.
 pub(super) fn entry_bytes(feature_dim: usize) -> usize {
     4 * GRADIENT_FLOATS.max(4 * widest_block(feature_dim) as usize)
@@ -98,7 +98,7 @@ fn widest_block(feature_dim: usize) -> u32 {
 
 /// How the gradients that one splat gets from several tiles are added up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Summation {
+pub enum GradientReduction {
     /// Float atomics: no memory, but the order of the additions, and so the last digits, differ
     /// from run to run.
     Atomics,
@@ -120,14 +120,14 @@ pub(super) struct EntryBuffers {
     pub codes: Buffer<f32>,
 }
 
-impl Summation {
+impl GradientReduction {
     /// The faster way, unless the device was opened to be deterministic or gives wrong results by
     /// it.
-    pub fn of(device: &Device) -> Summation {
+    pub fn of(device: &Device) -> GradientReduction {
         let info = device.info();
         match KernelVariant::AtomicGradients.or_replacement(info) {
-            KernelVariant::AtomicGradients if !info.deterministic => Summation::Atomics,
-            _ => Summation::Entries,
+            KernelVariant::AtomicGradients if !info.deterministic => GradientReduction::Atomics,
+            _ => GradientReduction::Entries,
         }
     }
 }

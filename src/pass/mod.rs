@@ -1,4 +1,4 @@
-//! One file per GPU pass, each with its CPU twin.
+//! One file per GPU pass, each with its CPU reference.
 pub mod adam;
 pub mod bands;
 pub mod bin;
@@ -20,6 +20,7 @@ pub mod project_backward;
 pub mod raster_backward;
 pub mod raster_forward;
 pub mod rasterizer;
+pub mod reference;
 pub mod regularise;
 pub mod renderer;
 pub mod scan;
@@ -28,20 +29,19 @@ pub mod splat_buffers;
 pub mod ssim_l1;
 pub mod sum;
 pub mod tile_lists;
-pub mod twin;
 pub mod variants;
 pub mod view;
 
-pub use frame::{FrameBuffers, Summation};
+pub use frame::{FrameBuffers, GradientReduction};
 pub use options::{FeatureMode, RasterOptions};
 pub use rasterizer::{DeviceChoices, Rasterizer};
 pub use renderer::{RenderedFrame, Renderer};
 pub use splat_buffers::SplatBuffers;
-pub use tile_lists::Grouping;
+pub use tile_lists::TileBinning;
 pub use variants::KernelVariant;
 pub use view::View;
 
 #[cfg(test)]
-mod stereo_tests;
+mod reference_tests;
 #[cfg(test)]
-mod twin_tests;
+mod stereo_tests;

@@ -30,8 +30,8 @@ mod tests {
     use super::*;
     use crate::pass::View;
     use crate::pass::params::Params;
-    use crate::pass::raster_forward::{Cutoffs, TwinScene, walk};
-    use crate::pass::twin;
+    use crate::pass::raster_forward::{Cutoffs, ReferenceScene, walk};
+    use crate::pass::reference;
     use crate::pass::{FeatureMode, RasterOptions, SplatBuffers};
     use crate::scene::seeded;
 
@@ -47,8 +47,8 @@ mod tests {
         let [evaluated, blended] = count(&device, &raster).unwrap();
 
         let forward =
-            twin::forward(&Params::new(&splats, &[], 0), &view, FeatureMode::Linear, &Cutoffs::STANDARD);
-        let scene = TwinScene {
+            reference::forward(&Params::new(&splats, &[], 0), &view, FeatureMode::Linear, &Cutoffs::STANDARD);
+        let scene = ReferenceScene {
             projected: &forward.projected,
             features: &[],
             feature_dim: 0,

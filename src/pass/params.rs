@@ -1,4 +1,4 @@
-//! Raw splat parameters and gradients as the f64 twins see them.
+//! Raw splat parameters and gradients as the f64 references see them.
 use crate::scene::{Splats, sh_coefficients};
 use glam::{DVec3, DVec4};
 

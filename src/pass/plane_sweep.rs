@@ -1,5 +1,5 @@
 //! Slanted-plane multi-view matching on the device. What the shaders compute is written down in the
-//! CPU twin, [`super::plane_sweep_cpu`].
+//! CPU reference, [`super::plane_sweep_cpu`].
 use crate::Result;
 use crate::gpu::shaders::shared::plane_sweep::VIEW_SHARES;
 use crate::gpu::shaders::{plane_sweep, plane_sweep_refine, structs};

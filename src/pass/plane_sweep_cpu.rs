@@ -1,4 +1,4 @@
-//! CPU twin of the `plane_sweep` and `plane_sweep_refine` shaders: slanted-plane multi-view
+//! CPU reference of the `plane_sweep` and `plane_sweep_refine` shaders: slanted-plane multi-view
 //! matching.
 //!
 //! A hypothesis is the plane `π·X = 1` in the reference camera's frame, so that the inverse depth
@@ -13,7 +13,7 @@ use crate::math::hash;
 use glam::{Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 
-// The shader's constants (glsl/shared/plane_sweep.glsl gives the reasons), in the twin's types.
+// The shader's constants (glsl/shared/plane_sweep.glsl gives the reasons), in the reference's types.
 const TAPS: usize = shared::TAPS as usize;
 const NEIGHBOURS: usize = shared::SMOOTH_NEIGHBOURS as usize;
 const COST_LIMIT: f32 = shared::COST_LIMIT as f32;
@@ -357,7 +357,7 @@ impl Inputs<'_> {
     }
 }
 
-/// The twin of the whole GPU matcher: same calls, plain loops.
+/// The reference of the whole GPU matcher: same calls, plain loops.
 pub struct CpuMatcher {
     luma: Vec<f32>,
     sources: Vec<SourceView>,

@@ -68,7 +68,7 @@ pub fn record_features(rec: &mut Recorder, splats: &SplatBuffers, frame: &FrameB
     rec.dispatch_threads(call, [count, 1, 1]);
 }
 
-/// A splat on the screen, f64 twin.
+/// A splat on the screen, f64 reference.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Projected {
     /// Centre in index coordinates (centre of the first pixel = 0), pixels.
@@ -168,7 +168,7 @@ pub(super) fn geometry(params: &Params, i: usize, view: &View) -> Option<Geometr
 
 /// Projects splat `i`; `None` when it is behind the near plane or its opacity is below `alpha_min`,
 /// where it can change no pixel.
-pub fn twin(params: &Params, i: usize, view: &View, alpha_min: f64) -> Option<Projected> {
+pub fn reference(params: &Params, i: usize, view: &View, alpha_min: f64) -> Option<Projected> {
     let g = geometry(params, i, view)?;
     let own = 1.0 / (1.0 + (-params.opacity_logits[i]).exp());
     let opacity = if params.antialiased { own * g.compensation } else { own };
@@ -194,7 +194,7 @@ pub(super) fn raw_colour(params: &Params, i: usize, view: &View) -> DVec3 {
 }
 
 /// Raw features [N, d] → rendered ones (docs/internals/method.md#feature-gauge).
-pub fn features_twin(features: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
+pub fn features_reference(features: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
     match mode {
         FeatureMode::Linear => features.to_vec(),
         FeatureMode::Gauge { epsilon, .. } => features

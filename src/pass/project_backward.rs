@@ -98,7 +98,7 @@ pub fn record_features(
 }
 
 /// Adds what flows back through splat `i` (which must be visible) to `out`.
-pub fn twin(params: &Params, i: usize, view: &View, upstream: &SplatGradient, out: &mut Gradients) {
+pub fn reference(params: &Params, i: usize, view: &View, upstream: &SplatGradient, out: &mut Gradients) {
     let Some(g) = geometry(params, i, view) else { return };
     let [m0, m1, m2, m3, m4, m5] = upstream.moments;
     let opacity = 1.0 / (1.0 + (-params.opacity_logits[i]).exp());
@@ -254,7 +254,7 @@ fn outer(a: DVec3, b: DVec3) -> DMat3 {
 
 /// ∂(rendered features) → ∂(raw features), both [N, d] (docs/internals/method.md#feature-gauge):
 /// `∂f = (∂f̂ − f̂'(f̂'·∂f̂)·‖f‖/(‖f‖+ε)) / (‖f‖+ε)` with f̂' = f/‖f‖.
-pub fn features_twin(features: &[f64], upstream: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
+pub fn features_reference(features: &[f64], upstream: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
     let FeatureMode::Gauge { epsilon, .. } = mode else { return upstream.to_vec() };
     let mut out = Vec::with_capacity(upstream.len());
     for (f, g) in features.chunks(mode.width(dim)).zip(upstream.chunks(mode.width(dim))) {

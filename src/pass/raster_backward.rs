@@ -12,8 +12,8 @@
 //! m₂, C m₂ + B m₁), ∂(A, B, C) = (−½ m₃, −m₄, −½ m₅).
 use super::adam::rows_of_groups;
 use super::channels::{BASE_CHANNELS, Block, blocks};
-use super::frame::{EntryBuffers, FrameBuffers, GRADIENT_FLOATS, Summation, Tiles};
-use super::raster_forward::{Cutoffs, TwinScene, channels_of, push, walk};
+use super::frame::{EntryBuffers, FrameBuffers, GRADIENT_FLOATS, GradientReduction, Tiles};
+use super::raster_forward::{Cutoffs, ReferenceScene, channels_of, push, walk};
 use crate::gpu::{Buffer, Recorder, shaders};
 
 /// Moments of one splat in the gradient buffer; RGB and z follow.
@@ -42,12 +42,12 @@ pub(super) fn record(
     let coupling = if features_move_geometry { 1.0 } else { 0.0 };
     let blocks = blocks(frame.feature_dim as u32);
     match frame.summation {
-        Summation::Atomics => {
+        GradientReduction::Atomics => {
             for block in blocks {
                 record_atomic(rec, frame, tiles, block, coupling);
             }
         }
-        Summation::Entries => match frame.gradient_entries.buffers(rec.device(), frame) {
+        GradientReduction::Entries => match frame.gradient_entries.buffers(rec.device(), frame) {
             Ok(entries) => {
                 let sum = |rec: &mut Recorder, from, to, columns| {
                     record_sum(rec, frame, count, from, to, columns, !all);
@@ -187,7 +187,7 @@ pub struct ScreenGradients {
 }
 
 /// Back-propagates `upstream` [(4 + d) + 1, H, W].
-pub fn twin(scene: &TwinScene, cutoffs: &Cutoffs, upstream: &[f64]) -> ScreenGradients {
+pub fn reference(scene: &ReferenceScene, cutoffs: &Cutoffs, upstream: &[f64]) -> ScreenGradients {
     let [width, height] = scene.view.size;
     let pixels = width as usize * height as usize;
     let dim = scene.feature_dim;

@@ -74,8 +74,8 @@ impl Cutoffs {
     pub const SMOOTH: Cutoffs = Cutoffs { alpha_min: 0.0, alpha_max: ALPHA_MAX, transmittance_min: 0.0 };
 }
 
-/// What the raster twins read.
-pub struct TwinScene<'a> {
+/// What the raster references read.
+pub struct ReferenceScene<'a> {
     /// [N].
     pub projected: &'a [Option<Projected>],
     /// [N, d] as rendered.
@@ -90,7 +90,7 @@ pub struct TwinScene<'a> {
 
 /// Output planes.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Image {
+pub struct RenderedImage {
     /// [4 + d, H, W]: RGB on the background, Σ w z, features.
     pub planes: Vec<f64>,
     /// [H, W] T_f; alpha is 1 − T_f.
@@ -112,7 +112,7 @@ pub struct Contribution {
 }
 
 /// Contributions to pixel (x, y), front to back, and the final T.
-pub fn walk(scene: &TwinScene, cutoffs: &Cutoffs, x: u32, y: u32) -> (Vec<Contribution>, f64) {
+pub fn walk(scene: &ReferenceScene, cutoffs: &Cutoffs, x: u32, y: u32) -> (Vec<Contribution>, f64) {
     let mut list = Vec::new();
     let mut transmittance = 1.0;
     for &i in scene.order {
@@ -142,7 +142,7 @@ pub fn walk(scene: &TwinScene, cutoffs: &Cutoffs, x: u32, y: u32) -> (Vec<Contri
 }
 
 /// Channel values (RGB, z, features) of one splat.
-pub(super) fn channels_of(scene: &TwinScene, splat: usize) -> Vec<f64> {
+pub(super) fn channels_of(scene: &ReferenceScene, splat: usize) -> Vec<f64> {
     let Some(p) = &scene.projected[splat] else { return Vec::new() };
     let mut values = vec![p.colour.x, p.colour.y, p.colour.z, p.depth];
     values.extend_from_slice(&scene.features[splat * scene.feature_dim..(splat + 1) * scene.feature_dim]);
@@ -150,12 +150,12 @@ pub(super) fn channels_of(scene: &TwinScene, splat: usize) -> Vec<f64> {
 }
 
 /// Renders by walking all splats at every pixel.
-pub fn twin(scene: &TwinScene, cutoffs: &Cutoffs) -> Image {
+pub fn reference(scene: &ReferenceScene, cutoffs: &Cutoffs) -> RenderedImage {
     let [width, height] = scene.view.size;
     let pixels = width as usize * height as usize;
     let channels = BASE_CHANNELS + scene.feature_dim;
     let values: Vec<_> = (0..scene.projected.len()).map(|i| channels_of(scene, i)).collect();
-    let mut image = Image { planes: vec![0.0; channels * pixels], transmittance: vec![1.0; pixels] };
+    let mut image = RenderedImage { planes: vec![0.0; channels * pixels], transmittance: vec![1.0; pixels] };
     for y in 0..height {
         for x in 0..width {
             let pixel = (y * width + x) as usize;

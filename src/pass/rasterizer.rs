@@ -39,10 +39,11 @@
 use super::bands::{Band, Bands};
 use super::channels::BASE_CHANNELS;
 use super::frame::{
-    CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, PROJECTED_FLOATS, Summation, Tiles, entry_bytes,
+    CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, GradientReduction, PROJECTED_FLOATS, Tiles,
+    entry_bytes,
 };
 use super::sort::Sort;
-use super::tile_lists::{self, Grouping, LONGEST_LIST, TILE, TileLists};
+use super::tile_lists::{self, LONGEST_LIST, TILE, TileBinning, TileLists};
 use super::view::View;
 use super::{bin, project, project_backward, raster_backward, raster_forward};
 use crate::gpu::shaders::structs::CameraView;
@@ -58,15 +59,15 @@ pub use super::splat_buffers::SplatBuffers;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DeviceChoices {
     /// How tile lists are made.
-    pub grouping: Grouping,
+    pub grouping: TileBinning,
     /// How gradients of several tiles are added up.
-    pub summation: Summation,
+    pub summation: GradientReduction,
 }
 
 impl DeviceChoices {
     /// What suits the device.
     pub fn of(device: &Device) -> DeviceChoices {
-        DeviceChoices { grouping: Grouping::of(device), summation: Summation::of(device) }
+        DeviceChoices { grouping: TileBinning::of(device), summation: GradientReduction::of(device) }
     }
 }
 
@@ -74,13 +75,13 @@ impl DeviceChoices {
 /// each.
 fn most_entries(
     device: &Device,
-    (grouping, tiles): (Grouping, usize),
-    summation: Summation,
+    (grouping, tiles): (TileBinning, usize),
+    summation: GradientReduction,
     feature_dim: usize,
 ) -> usize {
     let gradients = match summation {
-        Summation::Atomics => usize::MAX,
-        Summation::Entries => device.info().max_storage_range as usize / entry_bytes(feature_dim),
+        GradientReduction::Atomics => usize::MAX,
+        GradientReduction::Entries => device.info().max_storage_range as usize / entry_bytes(feature_dim),
     };
     tile_lists::most_entries(device, grouping, tiles).min(gradients)
 }
@@ -91,7 +92,7 @@ pub struct Rasterizer {
     capacity: usize,
     camera: Buffer<CameraView>,
     frame: FrameBuffers,
-    grouping: Grouping,
+    grouping: TileBinning,
     /// Rows of tiles whose lists are made at once.
     strip: u32,
     sort: Sort,
@@ -256,14 +257,14 @@ impl Rasterizer {
         rec.pass("raster backward");
         let listed = self.strips(band, band.top..band.top + band.rows);
         let all = self.frame.bands.count() == 1 && listed.len() == 1;
-        if band.index == 0 && !(all && self.frame.summation == Summation::Entries) {
+        if band.index == 0 && !(all && self.frame.summation == GradientReduction::Entries) {
             raster_backward::record_clear(rec, &self.frame);
         }
         let inner = self.strips(band, band.inner.clone());
         let strips = match listed.as_slice() {
             // The lists are still there. Sums by entries read every entry, so that the halo writes
             // its zeros.
-            [one] if self.frame.summation == Summation::Entries => vec![one.clone()],
+            [one] if self.frame.summation == GradientReduction::Entries => vec![one.clone()],
             [one] => {
                 let rows = inner.first().map_or(0, |t| t.rows.start)..inner.last().map_or(0, |t| t.rows.end);
                 vec![Tiles { rows, ..*one }]

@@ -28,7 +28,7 @@ pub fn record_depth(rec: &mut Recorder, frame: &FrameBuffers, reference: Option<
     rec.dispatch_threads(call, [pixels, 1, 1]);
 }
 
-/// The CPU twin: (loss, gradients by D and by A).
+/// The CPU reference: (loss, gradients by D and by A).
 pub fn depth_l1(depth: &[f64], alpha: &[f64], reference: &[f64], weight: f64) -> (f64, Vec<[f64; 2]>) {
     let mut loss = 0.0;
     let gradient = (0..depth.len()).map(|i| {
@@ -61,7 +61,7 @@ pub fn record_alpha(rec: &mut Recorder, frame: &FrameBuffers, wanted: &Buffer<f3
     rec.dispatch_threads(call, [pixels, 1, 1]);
 }
 
-/// The CPU twin: (loss, gradient by A).
+/// The CPU reference: (loss, gradient by A).
 pub fn alpha_l1(alpha: &[f64], wanted: &[f64], weight: f64) -> (f64, Vec<f64>) {
     let pairs = || alpha.iter().zip(wanted);
     let loss = pairs().filter(|(_, w)| **w >= 0.0).map(|(a, w)| weight * (a - w).abs()).sum();
@@ -86,7 +86,7 @@ pub fn record_ratio(
     rec.dispatch_threads(call, [count as u32, 1, 1]);
 }
 
-/// The CPU twin: (loss, gradient by the log-scales of one splat). Below e^10 it is exact.
+/// The CPU reference: (loss, gradient by the log-scales of one splat). Below e^10 it is exact.
 pub fn ratio_penalty(log_scales: [f64; 3], weight: f64, limit: f64) -> (f64, [f64; 3]) {
     let (mut high, mut low) = (0, 0);
     for k in 1..3 {

@@ -8,7 +8,7 @@ use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::{Device, Recorder, shaders};
 use crate::math::median;
-use crate::scene::{Camera, Plane, RgbImage, Splats};
+use crate::scene::{Camera, Image, RgbImage, Splats};
 use crate::{Error, Result};
 use std::ops::Range;
 
@@ -22,9 +22,9 @@ pub struct RenderedFrame {
     /// [H, W] RGB on the background. Not clamped: values may pass 1.
     pub rgb: RgbImage,
     /// [H, W] in [0, 1).
-    pub alpha: Plane<f32>,
+    pub alpha: Image<f32>,
     /// [H, W] expected camera z, Σ w z / alpha, world units; 0 where alpha < ½.
-    pub depth: Plane<f32>,
+    pub depth: Image<f32>,
     /// d.
     pub feature_dim: usize,
     /// [H, W, d] blended features, not divided by alpha.
@@ -182,8 +182,8 @@ impl RenderedFrame {
     pub fn empty(width: usize, height: usize, feature_dim: usize) -> RenderedFrame {
         RenderedFrame {
             rgb: RgbImage { width, height, data: vec![[0.0; 3]; width * height] },
-            alpha: Plane::filled(width, height, 0.0),
-            depth: Plane::filled(width, height, 0.0),
+            alpha: Image::filled(width, height, 0.0),
+            depth: Image::filled(width, height, 0.0),
             feature_dim,
             features: vec![0.0; width * height * feature_dim],
         }

@@ -1,9 +1,9 @@
 //! Stable least-significant-digit radix sort of (key, value) pairs of `u32`, eight bits at a time,
 //! in two shapes.
 //!
-//! [`Shape::Chunks`] gives every lane one contiguous chunk: count digits, turn the counts into
+//! [`SortAlgorithm::Chunks`] gives every lane one contiguous chunk: count digits, turn the counts into
 //! places, move. Measured on lavapipe (Mesa 22.3.6, two cores): 100k pairs by 32 bits in about 3
-//! ms, where a classic 256-thread 4-bit sort takes 180. [`Shape::Sweep`] is for GPUs, after Adinets
+//! ms, where a classic 256-thread 4-bit sort takes 180. [`SortAlgorithm::Sweep`] is for GPUs, after Adinets
 //! & Merrill, "Onesweep" (2022): digits of all passes are counted at once, then each pass reads and
 //! writes every pair once, neighbours beside neighbours; tiles learn where their digits begin from
 //! the tiles before them while those run, or count for themselves where those do not go on. Both
@@ -15,22 +15,22 @@ use crate::pass::KernelVariant;
 
 /// How the work is divided.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Shape {
+pub enum SortAlgorithm {
     /// A chunk of the pairs per lane: CPU devices.
     Chunks,
     /// Tiles in one sweep per digit: GPUs.
     Sweep,
 }
 
-impl Shape {
+impl SortAlgorithm {
     /// The faster one for a kind of device, unless it gives wrong results there.
-    pub fn of(device: &Device) -> Shape {
+    pub fn of(device: &Device) -> SortAlgorithm {
         let info = device.info();
         match (if info.is_cpu { KernelVariant::ChunkSort } else { KernelVariant::SweepSort })
             .or_replacement(info)
         {
-            KernelVariant::ChunkSort => Shape::Chunks,
-            _ => Shape::Sweep,
+            KernelVariant::ChunkSort => SortAlgorithm::Chunks,
+            _ => SortAlgorithm::Sweep,
         }
     }
 }
@@ -67,13 +67,13 @@ struct Key {
 impl Sort {
     /// Allocates 8 bytes per pair and the counters, in the shape that suits the device.
     pub fn new(device: &Device, capacity: usize) -> Result<Sort> {
-        Self::with(device, capacity, Shape::of(device))
+        Self::with(device, capacity, SortAlgorithm::of(device))
     }
 
     /// [`Sort::new`] in a given shape.
-    pub fn with(device: &Device, capacity: usize, shape: Shape) -> Result<Sort> {
+    pub fn with(device: &Device, capacity: usize, shape: SortAlgorithm) -> Result<Sort> {
         let work = match shape {
-            Shape::Chunks => {
+            SortAlgorithm::Chunks => {
                 // 256 measured best on lavapipe for 100k to 1M pairs; the chunks of more would be
                 // too long for its loops.
                 let lanes = capacity.div_ceil(LOOP_ROUNDS / 2).next_multiple_of(256).max(256);
@@ -82,7 +82,7 @@ impl Sort {
                     lanes: lanes as u32,
                 }
             }
-            Shape::Sweep => Work::Sweep {
+            SortAlgorithm::Sweep => Work::Sweep {
                 digits: device.buffer::<u32>("sort digits", PASSES * 256)?,
                 tiles: device.buffer::<u32>("sort tiles", PASSES * (1 + 256 * capacity.div_ceil(TILE)))?,
             },
@@ -216,12 +216,12 @@ mod tests {
             .collect()
     }
 
-    /// In both shapes, each against the twin.
+    /// In both shapes, each against the reference.
     fn sorted_on_device(pairs: &[[u32; 2]], n: usize, bits: u32) -> Vec<[u32; 2]> {
         let device = test_device();
         let mut expected = pairs[..n].to_vec();
         sort_pairs(&mut expected, bits);
-        for shape in [Shape::Chunks, Shape::Sweep] {
+        for shape in [SortAlgorithm::Chunks, SortAlgorithm::Sweep] {
             let sorted = sorted_in(&device, pairs, n, bits, shape);
             let wrong = sorted.iter().zip(&expected).filter(|(a, b)| a != b).count();
             assert_eq!(wrong, 0, "{n} pairs, {bits} bits, {shape:?}");
@@ -229,7 +229,13 @@ mod tests {
         expected
     }
 
-    fn sorted_in(device: &Device, pairs: &[[u32; 2]], n: usize, bits: u32, shape: Shape) -> Vec<[u32; 2]> {
+    fn sorted_in(
+        device: &Device,
+        pairs: &[[u32; 2]],
+        n: usize,
+        bits: u32,
+        shape: SortAlgorithm,
+    ) -> Vec<[u32; 2]> {
         let buffer = device.buffer_from("pairs", pairs.as_flattened()).unwrap();
         let count = device.buffer_from("count", &[n as u32]).unwrap();
         let sort = Sort::with(device, pairs.len(), shape).unwrap();

@@ -68,7 +68,7 @@ fn blur(plane: &[f64], width: usize, height: usize) -> Vec<f64> {
     out
 }
 
-/// The CPU twin, in f64: loss parts and gradient of [`ImageLoss::total`] for planar `[C, H, W]`
+/// The CPU reference, in f64: loss parts and gradient of [`ImageLoss::total`] for planar `[C, H, W]`
 /// images.
 pub fn ssim_l1(
     rendered: &[f64],
@@ -143,22 +143,22 @@ const CHANNELS: usize = 3;
 
 /// How rows are blurred.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Rows {
+pub enum SsimRowKernel {
     /// A strip of a row per thread, in registers: CPU devices.
     Strips,
     /// A span of a row per workgroup, in shared memory: GPUs.
     Shared,
 }
 
-impl Rows {
+impl SsimRowKernel {
     /// The faster one for a kind of device, unless it gives wrong results there.
-    pub fn of(device: &Device) -> Rows {
+    pub fn of(device: &Device) -> SsimRowKernel {
         let info = device.info();
         match (if info.is_cpu { KernelVariant::SsimStrips } else { KernelVariant::SsimShared })
             .or_replacement(info)
         {
-            KernelVariant::SsimStrips => Rows::Strips,
-            _ => Rows::Shared,
+            KernelVariant::SsimStrips => SsimRowKernel::Strips,
+            _ => SsimRowKernel::Shared,
         }
     }
 }
@@ -167,7 +167,7 @@ impl Rows {
 /// bands.
 pub struct SsimL1 {
     bands: Bands,
-    rows: Rows,
+    rows: SsimRowKernel,
     means: Buffer<f32>,
     moments: Buffer<f32>,
     slopes: Buffer<f32>,
@@ -180,11 +180,11 @@ pub struct SsimL1 {
 impl SsimL1 {
     /// Allocates for RGB images that are divided like this, with the rows that suit the device.
     pub fn new(device: &Device, bands: &Bands) -> Result<Self> {
-        Self::with(device, bands, Rows::of(device))
+        Self::with(device, bands, SsimRowKernel::of(device))
     }
 
     /// [`SsimL1::new`] with given rows.
-    pub fn with(device: &Device, bands: &Bands, rows: Rows) -> Result<Self> {
+    pub fn with(device: &Device, bands: &Bands, rows: SsimRowKernel) -> Result<Self> {
         let (width, height) = (bands.width, bands.rows);
         let values = CHANNELS * width * height;
         let pairs = |name| device.buffer::<f32>(name, 2 * values);
@@ -259,7 +259,7 @@ impl SsimL1 {
         let (cross, sums) = (&self.cross, &self.ssim_sums);
         let (w, h, n) = (width as i32, height as i32, strips as i32);
         match self.rows {
-            Rows::Strips => {
+            SsimRowKernel::Strips => {
                 use shaders::ssim_rows::{Bindings, Push, call};
                 let call = call(
                     &Bindings { means, moments, slopes, cross, sums },
@@ -267,7 +267,7 @@ impl SsimL1 {
                 );
                 rec.dispatch_threads(call, [strips, height, CHANNELS as u32]);
             }
-            Rows::Shared => {
+            SsimRowKernel::Shared => {
                 use shaders::ssim_rows_shared::{Bindings, Push, SPAN, call};
                 let call = call(
                     &Bindings { means, moments, slopes, cross, sums },
@@ -371,7 +371,7 @@ mod tests {
         // Neither side is a multiple of a strip or workgroup; the second is smaller than one strip
         // and window.
         let sizes = [(75, 53), (13, 7), (130, 33)];
-        let cases = sizes.into_iter().flat_map(|s| [(s, Rows::Strips), (s, Rows::Shared)]);
+        let cases = sizes.into_iter().flat_map(|s| [(s, SsimRowKernel::Strips), (s, SsimRowKernel::Shared)]);
         for ((w, h), rows, weighted) in cases.flat_map(|(s, r)| [(s, r, false), (s, r, true)]) {
             let x: Vec<f32> = (0..3 * w * h).map(|i| noise(i) as f32).collect();
             let y: Vec<f32> =

@@ -11,22 +11,22 @@ pub const TILE: u32 = shaders::shared::layout::TILE as u32;
 
 /// How entries in splat order become lists per tile.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Grouping {
+pub enum TileBinning {
     /// A counter per (tile, lane): little work, but for few lanes only.
     Counting,
     /// A radix sort by tile: any number of lanes.
     Sorting,
 }
 
-impl Grouping {
+impl TileBinning {
     /// What suits the device.
-    pub fn of(device: &Device) -> Grouping {
+    pub fn of(device: &Device) -> TileBinning {
         let info = device.info();
         match (if info.is_cpu { KernelVariant::CountedLists } else { KernelVariant::SortedLists })
             .or_replacement(info)
         {
-            KernelVariant::CountedLists => Grouping::Counting,
-            _ => Grouping::Sorting,
+            KernelVariant::CountedLists => TileBinning::Counting,
+            _ => TileBinning::Sorting,
         }
     }
 }
@@ -57,7 +57,7 @@ pub(super) enum Group {
 /// Lanes that write entries before a sort, and that read them behind it: enough to fill any GPU.
 pub(super) const SORTING_LANES: u32 = 1 << 16;
 
-/// Most entries of a lane of [`Grouping::Counting`]: one that writes entries also passes rows and
+/// Most entries of a lane of [`TileBinning::Counting`]: one that writes entries also passes rows and
 /// splats without any.
 const SHARE: usize = LOOP_ROUNDS / 2;
 
@@ -69,18 +69,18 @@ impl TileLists {
     /// Room for `capacity` entries of up to `splats` splats on `tiles` tiles.
     pub fn new(
         device: &Device,
-        grouping: Grouping,
+        grouping: TileBinning,
         splats: usize,
         tiles: usize,
         capacity: usize,
     ) -> Result<TileLists> {
         let group = match grouping {
-            Grouping::Counting => {
+            TileBinning::Counting => {
                 let lanes = counting_lanes(tiles, capacity, device.info().max_storage_range);
                 let counters = device.buffer::<u32>("tile counters", tiles * lanes as usize)?;
                 Group::Counting { counters, lanes }
             }
-            Grouping::Sorting => Group::Sorting {
+            TileBinning::Sorting => Group::Sorting {
                 entry_splats: device.buffer::<u32>("entry splats", capacity)?,
                 sort: Sort::new(device, capacity)?,
             },
@@ -115,12 +115,12 @@ fn most_lanes(tiles: usize, binding: u64) -> usize {
 /// Bytes per entry of the widest list.
 const ENTRY_BYTES: u64 = 8;
 
-/// Entries that the device binds, and that the lanes of [`Grouping::Counting`] go through.
-pub(super) fn most_entries(device: &Device, grouping: Grouping, tiles: usize) -> usize {
+/// Entries that the device binds, and that the lanes of [`TileBinning::Counting`] go through.
+pub(super) fn most_entries(device: &Device, grouping: TileBinning, tiles: usize) -> usize {
     let binding = device.info().max_storage_range;
     let bound = (binding / ENTRY_BYTES) as usize;
     match grouping {
-        Grouping::Counting => bound.min(most_lanes(tiles, binding) * SHARE),
-        Grouping::Sorting => bound,
+        TileBinning::Counting => bound.min(most_lanes(tiles, binding) * SHARE),
+        TileBinning::Sorting => bound,
     }
 }

@@ -6,23 +6,23 @@ use crate::gpu::{DeviceInfo, NATIVE_FLOAT_ATOMICS};
 pub enum KernelVariant {
     /// Gradients added up by `atomicAdd` on float, where the device has it.
     FloatAtomics,
-    /// Gradients of several tiles added up by atomics ([`crate::pass::Summation::Atomics`]), of
+    /// Gradients of several tiles added up by atomics ([`crate::pass::GradientReduction::Atomics`]), of
     /// which floats are emulated by a compare-and-swap loop where there are none or they are
     /// switched off.
     AtomicGradients,
-    /// Gradients stored per tile and summed in order ([`crate::pass::Summation::Entries`]).
+    /// Gradients stored per tile and summed in order ([`crate::pass::GradientReduction::Entries`]).
     StoredGradients,
-    /// Radix sort with a chunk per lane ([`crate::pass::sort::Shape::Chunks`]).
+    /// Radix sort with a chunk per lane ([`crate::pass::sort::SortAlgorithm::Chunks`]).
     ChunkSort,
-    /// Radix sort in one sweep per digit ([`crate::pass::sort::Shape::Sweep`]).
+    /// Radix sort in one sweep per digit ([`crate::pass::sort::SortAlgorithm::Sweep`]).
     SweepSort,
-    /// Tile lists by counters ([`crate::pass::Grouping::Counting`]).
+    /// Tile lists by counters ([`crate::pass::TileBinning::Counting`]).
     CountedLists,
-    /// Tile lists by a sort ([`crate::pass::Grouping::Sorting`]).
+    /// Tile lists by a sort ([`crate::pass::TileBinning::Sorting`]).
     SortedLists,
-    /// SSIM with a strip of a row per thread ([`crate::pass::ssim_l1::Rows::Strips`]).
+    /// SSIM with a strip of a row per thread ([`crate::pass::ssim_l1::SsimRowKernel::Strips`]).
     SsimStrips,
-    /// SSIM with a span of a row per workgroup ([`crate::pass::ssim_l1::Rows::Shared`]).
+    /// SSIM with a span of a row per workgroup ([`crate::pass::ssim_l1::SsimRowKernel::Shared`]).
     SsimShared,
 }
 
@@ -82,9 +82,9 @@ impl KernelVariant {
 mod tests {
     use super::*;
     use crate::gpu::{Options, TestDevice, options, test_device};
-    use crate::pass::sort::Shape;
-    use crate::pass::ssim_l1::Rows;
-    use crate::pass::{Grouping, Summation};
+    use crate::pass::sort::SortAlgorithm;
+    use crate::pass::ssim_l1::SsimRowKernel;
+    use crate::pass::{GradientReduction, TileBinning};
 
     #[test]
     fn disabled_variants_are_replaced() {
@@ -96,15 +96,15 @@ mod tests {
         let most: Vec<_> =
             KernelVariant::ALL.into_iter().filter(|v| *v != KernelVariant::SweepSort).collect();
         let device = without(&most);
-        assert_eq!(Shape::of(&device), Shape::Sweep);
-        assert_eq!(Rows::of(&device), Rows::of(&usual));
+        assert_eq!(SortAlgorithm::of(&device), SortAlgorithm::Sweep);
+        assert_eq!(SsimRowKernel::of(&device), SsimRowKernel::of(&usual));
         assert!(!device.info().float_atomics);
         // Both variants are wrong: nothing else is known, `doctor --check` says so.
-        assert_eq!(Summation::of(&device), Summation::of(&usual));
-        assert_eq!(Grouping::of(&device), Grouping::of(&usual));
+        assert_eq!(GradientReduction::of(&device), GradientReduction::of(&usual));
+        assert_eq!(TileBinning::of(&device), TileBinning::of(&usual));
         let device = without(&[KernelVariant::AtomicGradients, KernelVariant::CountedLists]);
-        assert_eq!(Summation::of(&device), Summation::Entries);
-        assert_eq!(Grouping::of(&device), Grouping::Sorting);
+        assert_eq!(GradientReduction::of(&device), GradientReduction::Entries);
+        assert_eq!(TileBinning::of(&device), TileBinning::Sorting);
         assert_eq!(device.info().float_atomics, usual.info().float_atomics);
     }
 }

@@ -1,4 +1,4 @@
-//! The camera as the passes see it: a twin form in f64 and the structure that the shaders read.
+//! The camera as the passes see it: a reference form in f64 and the structure that the shaders read.
 use crate::gpu::shaders::structs::CameraView;
 use crate::scene::Camera;
 use glam::{DMat3, DVec3};

@@ -1,5 +1,5 @@
 //! Values to colours: depth, heat, labels.
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 
 /// Turbo (Mikhailov 2019): the published polynomial fit of the colour map, [0, 1] → sRGB.
 pub fn turbo(v: f32) -> [f32; 3] {
@@ -31,7 +31,7 @@ pub fn label(index: i32) -> [f32; 3] {
 
 /// Depth, near = warm; unknown (≤ 0) = black. The range is that of the central 98 %, so that one
 /// stray pixel does not flatten the rest.
-pub fn depth_image(depth: &Plane<f32>) -> RgbImage {
+pub fn depth_image(depth: &Image<f32>) -> RgbImage {
     let mut known: Vec<f32> = depth.data.iter().copied().filter(|z| *z > 0.0 && z.is_finite()).collect();
     known.sort_by(f32::total_cmp);
     let quantile =
@@ -45,11 +45,11 @@ pub fn depth_image(depth: &Plane<f32>) -> RgbImage {
 }
 
 /// One colour per label.
-pub fn label_image(labels: &Plane<i32>) -> RgbImage {
+pub fn label_image(labels: &Image<i32>) -> RgbImage {
     map(labels, label)
 }
 
-fn map<T: Copy>(plane: &Plane<T>, colour: impl Fn(T) -> [f32; 3]) -> RgbImage {
+fn map<T: Copy>(plane: &Image<T>, colour: impl Fn(T) -> [f32; 3]) -> RgbImage {
     RgbImage {
         width: plane.width,
         height: plane.height,
@@ -59,7 +59,7 @@ fn map<T: Copy>(plane: &Plane<T>, colour: impl Fn(T) -> [f32; 3]) -> RgbImage {
 
 /// Relevancy over a picture of the same size: grey where nothing answers, warm where it does; the
 /// mask gets a white outline.
-pub fn heat_image(picture: &RgbImage, relevancy: &Plane<f32>, mask: Option<&Plane<bool>>) -> RgbImage {
+pub fn heat_image(picture: &RgbImage, relevancy: &Image<f32>, mask: Option<&Image<bool>>) -> RgbImage {
     let luma = picture.luma();
     let edge = |x: usize, y: usize| {
         mask.is_some_and(|m| {
@@ -115,7 +115,7 @@ mod tests {
 
     #[test]
     fn unknown_depth_is_black_and_near_is_warm() {
-        let d = Plane { width: 3, height: 1, data: vec![0.0, 1.0, 4.0] };
+        let d = Image { width: 3, height: 1, data: vec![0.0, 1.0, 4.0] };
         let c = depth_image(&d);
         assert_eq!(c.data[0], [0.0; 3]);
         assert!(c.data[1][0] > c.data[1][2] && c.data[2][2] > c.data[2][0]);
@@ -124,9 +124,9 @@ mod tests {
     #[test]
     fn heat_marks_the_mask_outline_and_keeps_the_rest_grey() {
         let picture = RgbImage { width: 5, height: 5, data: vec![[0.2, 0.4, 0.6]; 25] };
-        let mut relevancy = Plane::filled(5, 5, 0.3);
+        let mut relevancy = Image::filled(5, 5, 0.3);
         relevancy.data[12] = 0.95;
-        let mut mask = Plane::filled(5, 5, false);
+        let mut mask = Image::filled(5, 5, false);
         [6, 7, 8, 11, 12, 13, 16, 17, 18].iter().for_each(|&i| mask.data[i] = true);
         let out = heat_image(&picture, &relevancy, Some(&mask));
         assert_eq!(out.at(1, 1), [1.0; 3]);

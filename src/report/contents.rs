@@ -4,7 +4,7 @@ use super::viewer;
 use crate::Result;
 use crate::photo::Light;
 use crate::progress::StageRecord;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use serde::Serialize;
 use serde_json::Value;
 use std::path::Path;
@@ -75,9 +75,9 @@ pub struct ViewShown<'a> {
     /// Render from the final scene.
     pub render: Option<&'a RgbImage>,
     /// Expected depth of the render.
-    pub depth: Option<&'a Plane<f32>>,
+    pub depth: Option<&'a Image<f32>>,
     /// Decoded codes per level (name, map), −1 = none.
-    pub levels: &'a [(&'a str, Plane<i32>)],
+    pub levels: &'a [(&'a str, Image<i32>)],
     /// PSNR of the render, dB.
     pub psnr: Option<f64>,
     /// What was taken out of the photo.
@@ -90,9 +90,9 @@ pub struct AnswerShown<'a> {
     /// Index into the views.
     pub view: usize,
     /// [H, W] relevancy, size of the photo.
-    pub relevancy: &'a Plane<f32>,
+    pub relevancy: &'a Image<f32>,
     /// [H, W] mask.
-    pub mask: Option<&'a Plane<bool>>,
+    pub mask: Option<&'a Image<bool>>,
     /// Best relevancy.
     pub score: f32,
     /// Reached the threshold.

@@ -199,13 +199,13 @@ mod tests {
     use super::*;
     use crate::photo::Light;
     use crate::progress::StageRecord;
-    use crate::scene::Plane;
+    use crate::scene::Image;
 
     #[test]
     fn the_page_is_whole_and_needs_nothing_else() {
         let photo = RgbImage { width: 8, height: 6, data: vec![[0.5, 0.2, 0.1]; 48] };
-        let (depth, relevancy) = (Plane::filled(8, 6, 2.0f32), Plane::filled(8, 6, 0.9f32));
-        let levels = [("l", Plane::filled(8, 6, 1i32))];
+        let (depth, relevancy) = (Image::filled(8, 6, 2.0f32), Image::filled(8, 6, 0.9f32));
+        let levels = [("l", Image::filled(8, 6, 1i32))];
         let run = RunRecord {
             program: "splatvk".into(),
             config: serde_json::json!({"views": 4}),

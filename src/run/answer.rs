@@ -9,7 +9,7 @@ use crate::query::presence::{Background, Evidence, Presence, ShownCodes, ShownPi
 use crate::query::select::{Selection, select};
 use crate::query::{self, QueryOptions, QueryResult, TextQuery};
 use crate::report::viewer::ShownAnswer;
-use crate::scene::{Camera, LanguageField, Plane, Splats, World};
+use crate::scene::{Camera, Image, LanguageField, Splats, World};
 use glam::DVec3;
 use serde_json::{Value, json};
 
@@ -131,7 +131,7 @@ impl Prepared {
 
     /// Of a scene whose own views are these.
     pub fn of_frames(splats: &Splats, field: &LanguageField, frames: &[DecodedFrame]) -> Prepared {
-        let codes: Vec<&[Plane<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
+        let codes: Vec<&[Image<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
         Prepared::new(splats, field, ShownPixels::of(field, &codes))
     }
 
@@ -178,7 +178,7 @@ impl Prepared {
         // A model that cannot tell what is there cannot tell that an unclear text is, either.
         let doubt = query.reading.is_doubtful().then_some(Presence::Unsure);
         let presence = evidence.map(|e| e.presence).or(doubt);
-        let codes: Vec<&[Plane<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
+        let codes: Vec<&[Image<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
         let mut views = query::answer_all(&codes, field, query, options)?;
         for view in views.iter_mut().filter(|v| presence == Some(Presence::Absent) || !v.found) {
             view.take_back();
@@ -277,8 +277,8 @@ mod tests {
             space: "test".into(),
         };
         let codes =
-            Plane { width: SIZE, height: SIZE, data: pixels().map(|(x, y)| shown(x, y) as i32).collect() };
-        let none = Plane::filled(SIZE, SIZE, -1);
+            Image { width: SIZE, height: SIZE, data: pixels().map(|(x, y)| shown(x, y) as i32).collect() };
+        let none = Image::filled(SIZE, SIZE, -1);
         let mut rendered = RenderedFrame::empty(SIZE, SIZE, 0);
         rendered.depth.data.fill(1.0);
         let frames = vec![DecodedFrame { rendered, codes: vec![none.clone(), none, codes] }];

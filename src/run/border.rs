@@ -3,7 +3,7 @@
 use crate::gpu::Device;
 use crate::pass::renderer::Renderer;
 use crate::query::instances::splat_codes;
-use crate::scene::{Camera, LevelField, Plane, Splats};
+use crate::scene::{Camera, Image, LevelField, Splats};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -53,7 +53,7 @@ impl Border {
 
     /// Gives every pixel that has a code the nearest of those that are really there. `features` are
     /// the blended ones, [H, W, d].
-    pub fn settle(&mut self, camera: &Camera, features: &[f32], codes: &mut Plane<i32>) -> Result<()> {
+    pub fn settle(&mut self, camera: &Camera, features: &[f32], codes: &mut Image<i32>) -> Result<()> {
         let d = self.d;
         if features.len() != codes.data.len() * d {
             return Err(Error::work("features of another frame"));

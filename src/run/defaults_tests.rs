@@ -10,7 +10,7 @@ use crate::progress::Silent;
 use crate::query::*;
 use crate::run::stages::{SharedEncoder, masks::describe};
 use crate::scene::DepthMap;
-use crate::scene::Plane;
+use crate::scene::Image;
 use splatvk_test_support::breakfast::{TestView, phrases, train_views};
 
 struct Inputs {
@@ -29,7 +29,7 @@ fn inputs() -> Inputs {
     let (mut masks, mut depths, mut dense) = (Vec::new(), Vec::new(), Vec::new());
     for v in &views {
         let known = v.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect();
-        let depth = DepthMap { depth: v.depth.clone(), confidence: Plane { data: known, ..v.depth } };
+        let depth = DepthMap { depth: v.depth.clone(), confidence: Image { data: known, ..v.depth } };
         let edges = hed.edges(&v.image).unwrap();
         let m = segment(&v.image, &edges, &GraphOptions::default()).unwrap();
         dense.push(net.dense(&v.image).unwrap());
@@ -61,7 +61,7 @@ fn score(x: &Inputs) -> Vec<(String, Vec<(f32, bool)>)> {
     for (k, query) in &x.queries {
         let mut row = Vec::new();
         for (t, view) in x.views.iter().enumerate() {
-            let maps: Vec<Plane<i32>> = built.field.levels.iter().map(|l| l.targets[t].clone()).collect();
+            let maps: Vec<Image<i32>> = built.field.levels.iter().map(|l| l.targets[t].clone()).collect();
             let r = answer(&maps, &built.field, query, &QueryOptions::default()).unwrap();
             let pairs = view.masks.data.iter().map(|o| o == k).zip(&r.mask.data);
             let (both, either) =

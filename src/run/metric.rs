@@ -97,7 +97,7 @@ pub struct Measured {
 /// Measures lengths; a device is opened where one of them names pixels.
 pub fn measure(scene: &Scene, lengths: &[Length], device: Option<&str>) -> Result<Vec<Measured>> {
     let places = || lengths.iter().flat_map(|l| &l.ends);
-    let mut depths: Vec<(&str, crate::scene::Plane<f32>)> = Vec::new();
+    let mut depths: Vec<(&str, crate::scene::Image<f32>)> = Vec::new();
     if places().any(|p| matches!(p, Place::Pixel(..))) {
         let device = gpu::open(device)?;
         let mut viewer = Viewer::new(&device, &scene.splats, &LanguageField::default())?;

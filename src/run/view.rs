@@ -8,7 +8,7 @@ use crate::pass::raster_forward::BASE_CHANNELS;
 use crate::pass::rasterizer::FrameBuffers;
 use crate::pass::renderer::{RenderedFrame, Renderer};
 use crate::progress::Progress;
-use crate::scene::{Camera, LanguageField, Plane, SH_C0, Seen, Splats};
+use crate::scene::{Camera, Image, LanguageField, SH_C0, Seen, Splats};
 use std::ops::Range;
 
 /// A rendered frame and the code of every pixel per level (−1 = none).
@@ -19,7 +19,7 @@ pub struct DecodedFrame {
     pub rendered: RenderedFrame,
     /// Per level, index as in [`crate::scene::LEVEL_NAMES`]; levels without codes are −1
     /// everywhere.
-    pub codes: Vec<Plane<i32>>,
+    pub codes: Vec<Image<i32>>,
 }
 
 /// Renders and decodes one camera after the other, both on the device.
@@ -149,7 +149,7 @@ impl Viewer {
     }
 
     /// Only the codes of one camera, as [`DecodedFrame::codes`].
-    pub fn codes(&mut self, camera: &Camera) -> Result<Vec<Plane<i32>>> {
+    pub fn codes(&mut self, camera: &Camera) -> Result<Vec<Image<i32>>> {
         self.decoded(camera, None)
     }
 
@@ -162,9 +162,9 @@ impl Viewer {
     }
 
     /// Renders every model that `shown` or the codes need, and reads what `shown` has room for.
-    fn decoded(&mut self, camera: &Camera, mut shown: Option<&mut RenderedFrame>) -> Result<Vec<Plane<i32>>> {
+    fn decoded(&mut self, camera: &Camera, mut shown: Option<&mut RenderedFrame>) -> Result<Vec<Image<i32>>> {
         let (w, h) = (camera.width as usize, camera.height as usize);
-        let mut codes = vec![Plane::filled(w, h, -1); self.levels];
+        let mut codes = vec![Image::filled(w, h, -1); self.levels];
         let (device, output) = (&self.device, &mut self.output);
         for (m, Model { renderer, levels }) in self.models.iter_mut().enumerate() {
             if levels.is_empty() && !(m == SCENE_MODEL && shown.is_some()) {
@@ -206,7 +206,7 @@ fn decode(
     output: &mut Option<Buffer<i32>>,
     frame: &FrameBuffers,
     band: &Band,
-    codes: &mut [Plane<i32>],
+    codes: &mut [Image<i32>],
 ) -> Result<()> {
     let pixels = frame.pixels();
     let decoded = match output.take().filter(|o| o.bytes() == 4 * u64::from(pixels)) {
@@ -254,9 +254,9 @@ impl UnseenShare {
     }
 
     /// [H, W] in [0, 1).
-    pub fn view(&mut self, camera: &Camera) -> Result<Plane<f32>> {
+    pub fn view(&mut self, camera: &Camera) -> Result<Image<f32>> {
         let rgb = self.0.render(camera)?.rgb;
-        Ok(Plane { width: rgb.width, height: rgb.height, data: rgb.data.iter().map(|c| c[0]).collect() })
+        Ok(Image { width: rgb.width, height: rgb.height, data: rgb.data.iter().map(|c| c[0]).collect() })
     }
 }
 

@@ -3,11 +3,11 @@ use super::regions;
 use crate::infer::things;
 use crate::query::presence::*;
 use crate::query::{TextQuery, field_relevancy};
-use crate::scene::{Codebook, LanguageField, LevelField, Plane};
+use crate::scene::{Codebook, Image, LanguageField, LevelField};
 
 /// A scene that shows some phrases, each as one code with the feature of its text, and a speck of
 /// another one.
-fn field(phrases: &[&str], speck: &str) -> (LanguageField, Vec<Plane<i32>>) {
+fn field(phrases: &[&str], speck: &str) -> (LanguageField, Vec<Image<i32>>) {
     let dim = regions::DIM;
     let embeddings: Vec<f32> =
         phrases.iter().chain([&speck]).flat_map(|p| regions::text_embedding(p)).collect();
@@ -19,7 +19,7 @@ fn field(phrases: &[&str], speck: &str) -> (LanguageField, Vec<Plane<i32>>) {
         codes: vec![0.0; 3 * count],
         ..Codebook::default()
     };
-    let mut map = Plane::filled(100, 100, 0);
+    let mut map = Image::filled(100, 100, 0);
     map.data.iter_mut().enumerate().for_each(|(i, k)| *k = (i % phrases.len()) as i32);
     map.data[0] = phrases.len() as i32;
     let level = LevelField { codebook, ..LevelField::default() };

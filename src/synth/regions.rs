@@ -16,7 +16,7 @@ use crate::math::Random;
 use crate::photo::stem;
 use crate::query::presence::Alternatives;
 use crate::query::{CANONICAL_PHRASES, TextQuery};
-use crate::scene::Plane;
+use crate::scene::Image;
 use crate::{Error, Result};
 use glam::{DVec2, DVec3};
 use std::collections::{BTreeMap, BTreeSet};
@@ -163,7 +163,7 @@ pub fn regions(truth: &GroundTruth, frames: &[&TruthFrame], flaws: &InjectedErro
 
 /// Per frame and pixel the quarter of its object, 0 to 3: signs along the object's two longest axes
 /// in space, so that all views agree.
-fn parts(truth: &GroundTruth, frames: &[&TruthFrame], objects: &[Plane<u32>]) -> Result<Vec<Vec<u8>>> {
+fn parts(truth: &GroundTruth, frames: &[&TruthFrame], objects: &[Image<u32>]) -> Result<Vec<Vec<u8>>> {
     let mut points: BTreeMap<u32, Vec<DVec3>> = BTreeMap::new();
     let mut places = Vec::new();
     for (frame, objects) in frames.iter().zip(objects) {
@@ -188,7 +188,7 @@ fn parts(truth: &GroundTruth, frames: &[&TruthFrame], objects: &[Plane<u32>]) ->
         }
         _ => 0,
     };
-    let view = |(places, objects): (&Vec<Option<DVec3>>, &Plane<u32>)| {
+    let view = |(places, objects): (&Vec<Option<DVec3>>, &Image<u32>)| {
         places.iter().zip(&objects.data).map(|(x, label)| quarter(x, label)).collect()
     };
     Ok(places.iter().zip(objects).map(view).collect())
@@ -223,14 +223,14 @@ fn principal(points: &[DVec3]) -> Option<(DVec3, [DVec3; 2])> {
 fn one_level(
     labels: &BTreeMap<u32, String>,
     names: &[&str],
-    objects: &Plane<u32>,
+    objects: &Image<u32>,
     parts: &[u8],
     level: usize,
     flaws: &InjectedErrors,
     random: &mut Random,
 ) -> LevelMasks {
     let mut out =
-        LevelMasks { labels: Plane::filled(objects.width, objects.height, -1), ..LevelMasks::default() };
+        LevelMasks { labels: Image::filled(objects.width, objects.height, -1), ..LevelMasks::default() };
     let swallowed = swallowed(labels, objects, level, flaws, random);
     for (&label, phrase) in labels {
         let pixels: Vec<usize> = (0..objects.data.len()).filter(|&p| objects.data[p] == label).collect();
@@ -274,7 +274,7 @@ fn one_level(
 /// (object that disappears in a neighbour's mask, that neighbour) of level l.
 fn swallowed(
     labels: &BTreeMap<u32, String>,
-    objects: &Plane<u32>,
+    objects: &Image<u32>,
     level: usize,
     flaws: &InjectedErrors,
     random: &mut Random,
@@ -336,7 +336,7 @@ fn compacted(masks: LevelMasks) -> LevelMasks {
         out.features.extend_from_slice(&masks.features[k * DIM..(k + 1) * DIM]);
     }
     let data = masks.labels.data.iter().map(|&l| if l < 0 { -1 } else { index[l as usize] }).collect();
-    out.labels = Plane { data, ..masks.labels };
+    out.labels = Image { data, ..masks.labels };
     out
 }
 

@@ -3,7 +3,7 @@ use super::phone::PhotoEffects;
 use super::scene::SyntheticScene;
 use super::shapes::{Hit, SceneObject};
 use crate::math::Random;
-use crate::scene::{Camera, Lens, Plane, RgbImage};
+use crate::scene::{Camera, Image, Lens, RgbImage};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
@@ -26,9 +26,9 @@ pub struct RayCast {
     /// The photo.
     pub image: RgbImage,
     /// Camera z, metres; 0 where nothing is, or sky.
-    pub depth: Plane<f32>,
+    pub depth: Image<f32>,
     /// Label per pixel.
-    pub objects: Plane<u32>,
+    pub objects: Image<u32>,
 }
 
 fn first(scene: &SyntheticScene, from: DVec3, ray: DVec3) -> Option<(&SceneObject, Hit)> {
@@ -87,8 +87,8 @@ pub fn render(scene: &SyntheticScene, camera: &Camera, noise: f64, seed: u64) ->
     let pixels: Vec<(f32, u32)> = (0..width * height).into_par_iter().map(cast).collect();
     RayCast {
         image: picture(scene, camera, None, noise, seed),
-        depth: Plane { width, height, data: pixels.iter().map(|p| p.0).collect() },
-        objects: Plane { width, height, data: pixels.iter().map(|p| p.1).collect() },
+        depth: Image { width, height, data: pixels.iter().map(|p| p.0).collect() },
+        objects: Image { width, height, data: pixels.iter().map(|p| p.1).collect() },
     }
 }
 

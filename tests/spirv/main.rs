@@ -1,4 +1,4 @@
-//! The shipped SPIR-V in the interpreter: every pass against its CPU twin at subgroup sizes that no
+//! The shipped SPIR-V in the interpreter: every pass against its CPU reference at subgroup sizes that no
 //! device at hand has, with faults that no driver reports. See
 //! docs/internals/trust.md#shaders-without-a-device.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
@@ -69,7 +69,7 @@ fn run_all(schedule: Schedule) -> BTreeSet<&'static str> {
     ran
 }
 
-/// Every pass against its twin, and no shader file left out.
+/// Every pass against its reference, and no shader file left out.
 fn every_pass_at(subgroup_size: usize) {
     let ran = run_all(interpreted(subgroup_size, true).schedule);
     let forgotten: Vec<&str> = shaders::FAMILIES

@@ -1,4 +1,4 @@
-//! Whether the comparisons with the CPU twins notice a wrong operation: modules that are shipped,
+//! Whether the comparisons with the CPU references notice a wrong operation: modules that are shipped,
 //! with one operation in the place of another, as a slip of the hand would have it.
 use crate::executor::{Change, Interpreted};
 use crate::passes::{self, Scene};

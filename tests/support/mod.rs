@@ -6,9 +6,10 @@ use splatvk::pass::close::{Distance, Tolerance, compare};
 pub use splatvk::pass::close::{IMAGE, gradient_tolerance};
 use splatvk::pass::params::{Gradients, Params};
 use splatvk::pass::raster_forward::Cutoffs;
-use splatvk::pass::twin::{self, Forward};
+use splatvk::pass::reference::{self, Forward};
 use splatvk::pass::{
-    DeviceChoices, FrameBuffers, Grouping, RasterOptions, Rasterizer, SplatBuffers, Summation, View, bin,
+    DeviceChoices, FrameBuffers, GradientReduction, RasterOptions, Rasterizer, SplatBuffers, TileBinning,
+    View, bin,
 };
 use splatvk::scene::seeded;
 use splatvk::scene::{Camera, Splats};
@@ -58,8 +59,8 @@ impl Scene {
         Params::new(&self.splats, &self.features, self.dim)
     }
 
-    pub fn twin(&self) -> Forward {
-        twin::forward(&self.params(), &self.view, self.options.feature_mode, &Cutoffs::STANDARD)
+    pub fn reference(&self) -> Forward {
+        reference::forward(&self.params(), &self.view, self.options.feature_mode, &Cutoffs::STANDARD)
     }
 
     pub fn upload(&self, device: &Device) -> (SplatBuffers, Rasterizer) {
@@ -105,7 +106,7 @@ impl Scene {
     pub fn twin_gradients(&self, forward: &Forward, upstream: &[f32]) -> Gradients {
         let upstream: Vec<f64> = upstream.iter().map(|&g| g.into()).collect();
         let mode = self.options.feature_mode;
-        twin::backward(&self.params(), &self.view, mode, &Cutoffs::STANDARD, forward, &upstream)
+        reference::backward(&self.params(), &self.view, mode, &Cutoffs::STANDARD, forward, &upstream)
     }
 }
 
@@ -140,7 +141,7 @@ pub fn assert_class(name: &str, actual: &[f32], reference: &[f64]) {
 
 #[track_caller]
 pub fn assert_gradients(scene: &Scene, actual: &GpuGradients, seed: u64) {
-    let forward = scene.twin();
+    let forward = scene.reference();
     let reference = scene.twin_gradients(&forward, &scene.upstream(seed));
     let p = &reference.params;
     let flat = |v: &[[f32; 3]]| v.as_flattened().to_vec();
@@ -160,7 +161,7 @@ pub fn assert_gradients(scene: &Scene, actual: &GpuGradients, seed: u64) {
 pub fn in_bands(
     scene: &Scene,
     device: &Device,
-    summation: Summation,
+    summation: GradientReduction,
     upstream: &[f32],
 ) -> (Vec<f32>, GpuGradients, usize) {
     let params = SplatBuffers::upload(device, &scene.splats, &scene.features, scene.dim).unwrap();
@@ -199,20 +200,20 @@ pub fn in_bands(
     (image, GpuGradients { splats, features, camera }, bands.count())
 }
 
-/// The lists of both groupings are equal and hold those of the twin, nearest first; how many
-/// entries the twin has, and how many more there are.
+/// The lists of both groupings are equal and hold those of the reference, nearest first; how many
+/// entries the reference has, and how many more there are.
 #[track_caller]
 pub fn assert_lists(device: &Device, scene: &Scene) -> (usize, usize) {
-    let forward = scene.twin();
-    let expected = bin::twin(&forward.projected, &forward.order, scene.view.size);
+    let forward = scene.reference();
+    let expected = bin::reference(&forward.projected, &forward.order, scene.view.size);
     let lists = |grouping| {
         let (params, mut raster) =
             scene.upload_for(device, DeviceChoices { grouping, ..DeviceChoices::of(device) });
         raster.forward(&params, &scene.options).unwrap();
         raster.tile_lists().unwrap()
     };
-    let counted = lists(Grouping::Counting);
-    assert_eq!(counted, lists(Grouping::Sorting));
+    let counted = lists(TileBinning::Counting);
+    assert_eq!(counted, lists(TileBinning::Sorting));
     assert_eq!(counted.len(), expected.len());
     let mut extra = 0;
     for (list, expected) in counted.iter().zip(&expected) {

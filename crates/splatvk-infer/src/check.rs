@@ -12,7 +12,7 @@ use super::{RegionEncoder, depth_prior, pairs, warp};
 use crate::format::npy::{self, NpyData};
 use crate::photo::{Photo, PlainBorder};
 use crate::progress::{Silent, peak_memory, reset_peak_memory};
-use crate::scene::{Affine, Plane, RgbImage};
+use crate::scene::{Affine, Image, RgbImage};
 use crate::{Error, Result};
 
 /// Largest difference to the reference, relative to its largest value: what float32 sums in another
@@ -168,7 +168,7 @@ fn features(model: &Installed, image: &RgbImage, steps: &mut Vec<Measured>) -> R
     let mut net = measured(step, steps, || Clip::load(model.clone()))?;
     let half = |p: usize| i32::from(p % image.width >= image.width / 2);
     let data = (0..image.width * image.height).map(half).collect();
-    let labels = Plane { width: image.width, height: image.height, data };
+    let labels = Image { width: image.width, height: image.height, data };
     let rows = measured("2 regions".to_string(), steps, || net.embed_regions(image, &labels, 2, &Silent))?;
     let unit = |row: &[f32]| (row.iter().map(|v| v * v).sum::<f32>() - 1.0).abs() < 1e-3;
     if !rows.chunks_exact(net.dim()).all(unit) {

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use super::registry::{PackFileKind, Registry};
 use super::runtime::{Input, Session};
 use crate::progress::Progress;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
 
 /// ImageNet classes.
@@ -48,7 +48,7 @@ impl Classifier {
     pub fn regions(
         &mut self,
         image: &RgbImage,
-        labels: &Plane<i32>,
+        labels: &Image<i32>,
         count: usize,
         progress: &dyn Progress,
     ) -> Result<Vec<f32>> {
@@ -86,7 +86,7 @@ fn softmax(logits: &[f32]) -> Vec<f32> {
 }
 
 /// The boxes of the regions `0..count`; `None` for one without pixels.
-pub(super) fn extents(labels: &Plane<i32>, count: usize) -> Vec<Option<Extent>> {
+pub(super) fn extents(labels: &Image<i32>, count: usize) -> Vec<Option<Extent>> {
     let mut found: Vec<Option<Extent>> = vec![None; count];
     for y in 0..labels.height {
         for x in 0..labels.width {
@@ -104,7 +104,7 @@ pub(super) fn extents(labels: &Plane<i32>, count: usize) -> Vec<Option<Extent>> 
 /// in [0, 1].
 pub(super) fn crop(
     image: &RgbImage,
-    labels: &Plane<i32>,
+    labels: &Image<i32>,
     label: i32,
     e: Extent,
     to: usize,
@@ -165,7 +165,7 @@ mod tests {
     fn a_crop_centres_the_region_on_grey() {
         let (width, height) = (40, 30);
         let mut image = RgbImage { width, height, data: vec![[1.0, 0.0, 0.0]; width * height] };
-        let mut labels = Plane::filled(width, height, -1);
+        let mut labels = Image::filled(width, height, -1);
         for y in 10..14 {
             for x in 5..25 {
                 labels.data[y * width + x] = 2;

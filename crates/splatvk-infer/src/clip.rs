@@ -16,7 +16,7 @@ use super::runtime::Input;
 use super::text::normalise;
 use super::{RegionEncoder, things};
 use crate::progress::{Progress, Silent};
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
 
 /// Crops per forward pass: ViT-B/16 takes 0.2 GB for eight, and more are no faster on a CPU.
@@ -107,7 +107,7 @@ impl Clip {
             let mut cosines = Vec::new();
             for (_, rgb) in COLOURS {
                 let image = RgbImage { width: 224, height: 224, data: vec![rgb; 224 * 224] };
-                let shown = self.embed_regions(&image, &Plane::filled(224, 224, 0), 1, &Silent)?;
+                let shown = self.embed_regions(&image, &Image::filled(224, 224, 0), 1, &Silent)?;
                 let to = |name: &[f32]| name.iter().zip(&shown).map(|(a, b)| a * b).sum::<f32>();
                 cosines.extend(names.chunks_exact(self.dim.max(1)).map(to));
             }
@@ -178,7 +178,7 @@ impl Clip {
     fn crop_features(
         &mut self,
         image: &RgbImage,
-        labels: &Plane<i32>,
+        labels: &Image<i32>,
         count: usize,
         progress: &dyn Progress,
     ) -> Result<Vec<f32>> {
@@ -218,7 +218,7 @@ impl Clip {
     }
 
     /// Every region as the mean of its pixels' features.
-    fn pixel_features(&mut self, image: &RgbImage, labels: &Plane<i32>, count: usize) -> Result<Vec<f32>> {
+    fn pixel_features(&mut self, image: &RgbImage, labels: &Image<i32>, count: usize) -> Result<Vec<f32>> {
         let dim = self.dim;
         let graph = self.visual()?;
         let Some(spec) = graph.file.binding.image.clone() else {
@@ -258,7 +258,7 @@ impl RegionEncoder for Clip {
     fn embed_regions(
         &mut self,
         image: &RgbImage,
-        labels: &Plane<i32>,
+        labels: &Image<i32>,
         count: usize,
         progress: &dyn Progress,
     ) -> Result<Vec<f32>> {
@@ -374,7 +374,7 @@ mod tests {
         let image = RgbImage { width: 32, height: 20, data };
         let mut first_is_red = |labels: [i32; 2]| {
             let data = (0..640).map(|p| labels[p / 320]).collect();
-            let labels = Plane { width: 32, height: 20, data };
+            let labels = Image { width: 32, height: 20, data };
             let rows = clip.embed_regions(&image, &labels, 2, &Silent).unwrap();
             rows[0] > rows[2]
         };

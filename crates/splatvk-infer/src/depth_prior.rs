@@ -11,7 +11,7 @@ use super::installed::Installed;
 use crate::format::npy;
 use crate::photo::Photo;
 use crate::progress::Progress;
-use crate::scene::{DepthPrior, PairPointmaps, Plane, Pointmap, PriorKind};
+use crate::scene::{DepthPrior, Image, PairPointmaps, Pointmap, PriorKind};
 use crate::{Error, Result};
 
 /// One prior per photo, at its working size, from a network of one photo's depth or a geometry
@@ -42,7 +42,7 @@ pub fn of_network(
         })?;
         let map = match &values[..] {
             [w, h, data @ ..] if !data.is_empty() && data.len() == (*w as usize) * (*h as usize) => {
-                Plane { width: *w as usize, height: *h as usize, data: data.to_vec() }
+                Image { width: *w as usize, height: *h as usize, data: data.to_vec() }
             }
             _ => return Err(Error::work(format!("{}: gave no depth map", file.path.display()))),
         };
@@ -72,7 +72,7 @@ fn output(file: &GraphFile) -> (&'static str, PriorKind) {
 /// less for the sky.
 const HORIZON: f32 = 1e-4;
 
-fn with_horizon(mut map: Plane<f32>, kind: PriorKind) -> Plane<f32> {
+fn with_horizon(mut map: Image<f32>, kind: PriorKind) -> Image<f32> {
     if kind == PriorKind::InverseDepth {
         let least = HORIZON * map.data.iter().fold(0f32, |m, v| m.max(*v));
         map.data.iter_mut().for_each(|v| *v = v.max(least));
@@ -100,7 +100,7 @@ fn of_pointmaps(
     let prior = |(view, photo): (usize, &Photo)| {
         let (seen, map) = (&maps.views[view], of(view)?);
         let depth = map.points.iter().map(|p| p[2]).collect();
-        let depth = Plane { width: seen.width, height: seen.height, data: depth };
+        let depth = Image { width: seen.width, height: seen.height, data: depth };
         let place = |p: DVec2| DVec2::from_array(seen.from_working.apply(p.to_array()));
         Some(DepthPrior { values: sampled(&depth, photo, place), kind: PriorKind::Depth })
     };
@@ -162,7 +162,7 @@ fn of_file(folder: &Path, photo: &Photo) -> Result<Option<DepthPrior>> {
             path.display()
         )));
     }
-    let map = Plane { width, height, data };
+    let map = Image { width, height, data };
     let back = photo.to_working.inverse();
     let place = |p: DVec2| {
         let [u, v] = back.apply(photo.source(p).to_array());
@@ -173,7 +173,7 @@ fn of_file(folder: &Path, photo: &Photo) -> Result<Option<DepthPrior>> {
 
 /// A map at the photo's working pixels, which lie at `place` in it: bilinear between known values,
 /// the nearest beside unknown ones; 0 outside and where unknown.
-fn sampled(map: &Plane<f32>, photo: &Photo, place: impl Fn(DVec2) -> DVec2) -> Plane<f32> {
+fn sampled(map: &Image<f32>, photo: &Photo, place: impl Fn(DVec2) -> DVec2) -> Image<f32> {
     let (width, height) = (photo.image.width, photo.image.height);
     let known = |v: f32| if v.is_finite() && v > 0.0 { v } else { 0.0 };
     let value = |p: DVec2| {
@@ -193,7 +193,7 @@ fn sampled(map: &Plane<f32>, photo: &Photo, place: impl Fn(DVec2) -> DVec2) -> P
         mix(mix(four[0], four[1], fx), mix(four[2], four[3], fx), fy)
     };
     let pixel = |k: usize| DVec2::new((k % width) as f64 + 0.5, (k / width) as f64 + 0.5);
-    Plane { width, height, data: (0..width * height).map(|k| value(place(pixel(k)))).collect() }
+    Image { width, height, data: (0..width * height).map(|k| value(place(pixel(k)))).collect() }
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 use super::registry::{PackFileKind, Registry};
 use super::runtime::{Input, Session};
 use crate::scene::resize::Kernel;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
 
 /// Longer side of the largest image that the network sees, pixels. Each of its first maps takes 256
@@ -22,7 +22,7 @@ impl Hed {
     }
 
     /// Probability in [0, 1] that a person would draw a contour through each pixel.
-    pub fn edges(&mut self, image: &RgbImage) -> Result<Plane<f32>> {
+    pub fn edges(&mut self, image: &RgbImage) -> Result<Image<f32>> {
         let (width, height) = (image.width, image.height);
         if width == 0 || height == 0 {
             return Err(Error::input("the image has no pixels"));
@@ -37,12 +37,12 @@ impl Hed {
                 data: small.data.iter().map(|v| [*v; 3]).collect(),
             };
             let data = grey.resized(width, height, Kernel::Triangle).data.iter().map(|c| c[0]).collect();
-            return Ok(Plane { width, height, data });
+            return Ok(Image { width, height, data });
         }
         let input = Input::F32(vec![1, 3, height, width], planar(&image.data));
         let outputs = self.session.run(vec![("image", input)], &["edges"])?;
         let data = outputs.into_iter().next().map(|t| t.data).unwrap_or_default();
-        Ok(Plane { width, height, data })
+        Ok(Image { width, height, data })
     }
 }
 

@@ -46,7 +46,7 @@ pub(crate) use splatvk_io::{format, photo};
 pub(crate) use splatvk_types::{Error, Result, error, files, math, progress, scene, sync};
 
 use crate::progress::Progress;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 
 /// The `best` of the rows [P, D] for each of the regions [count, D], by cosine.
 pub fn nearest(regions: &[f32], rows: &[f32], dim: usize, best: usize) -> Vec<Vec<(usize, f32)>> {
@@ -76,7 +76,7 @@ pub trait RegionEncoder: Send {
     fn embed_regions(
         &mut self,
         image: &RgbImage,
-        labels: &Plane<i32>,
+        labels: &Image<i32>,
         count: usize,
         progress: &dyn Progress,
     ) -> Result<Vec<f32>>;

@@ -13,7 +13,7 @@ use splatvk_test_support::onnx::{Attribute, FLOAT, INT64, Onnx};
 use splatvk_test_support::toys::{clip_in, image_tower, photo, text_tower};
 
 use crate::progress::Silent;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 
 /// The error of recognising, or of loading and running, one graph.
 fn refused(graph: &Onnx, extra: &[(&str, &str)]) -> String {
@@ -45,7 +45,7 @@ fn towers_are_recognised_by_their_tensors_and_proven_to_belong_together() {
 
     // The left half is green, the right half blue; a label without pixels gets no direction.
     let (mut image, mut labels) =
-        (RgbImage { width: 32, height: 20, data: Vec::new() }, Plane::filled(32, 20, 0));
+        (RgbImage { width: 32, height: 20, data: Vec::new() }, Image::filled(32, 20, 0));
     for p in 0..32 * 20 {
         let right = p % 32 >= 16;
         image.data.push(if right { [0.0, 0.1, 1.0] } else { [0.0, 1.0, 0.1] });

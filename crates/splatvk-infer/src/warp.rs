@@ -11,7 +11,7 @@ use super::prepare::Prepared;
 use super::runtime::Tensor;
 use crate::photo::Photo;
 use crate::progress::Progress;
-use crate::scene::{DenseWarp, Descriptors, Plane};
+use crate::scene::{DenseWarp, Descriptors, Image};
 use crate::{Error, Result};
 
 /// Both directions for every unordered pair (i, j), i < j, in order.
@@ -180,8 +180,8 @@ impl Field {
     fn at_working_size(&self, from: (&Photo, &Prepared), to: (&Photo, &Prepared)) -> DenseWarp {
         let (width, height) = (from.0.image.width, from.0.image.height);
         let back = to.1.from_photo.inverse();
-        let mut target = Plane::filled(width, height, [-1.0f32; 2]);
-        let mut certainty = Plane::filled(width, height, 0.0f32);
+        let mut target = Image::filled(width, height, [-1.0f32; 2]);
+        let mut certainty = Image::filled(width, height, 0.0f32);
         let rows = target.data.par_chunks_mut(width).zip(certainty.data.par_chunks_mut(width)).enumerate();
         rows.for_each(|(y, (target, certainty))| {
             for x in 0..width {

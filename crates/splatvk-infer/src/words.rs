@@ -24,7 +24,7 @@ use super::registry::{PackFileKind, Registry};
 use super::text::{self, TextEncoder, normalise};
 use super::{RegionEncoder, colour, nearest, things};
 use crate::progress::{Progress, Silent};
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use crate::{Error, Result, files};
 use rayon::prelude::*;
 
@@ -102,7 +102,7 @@ impl RegionEncoder for RegionWords {
     fn embed_regions(
         &mut self,
         image: &RgbImage,
-        labels: &Plane<i32>,
+        labels: &Image<i32>,
         count: usize,
         progress: &dyn Progress,
     ) -> Result<Vec<f32>> {
@@ -208,7 +208,7 @@ fn text_key(what: &'static str, registry: &Registry) -> OutputKey {
 }
 
 /// Mean distribution over colour terms of each region's pixels; `None` for a region without pixels.
-fn region_colours(image: &RgbImage, labels: &Plane<i32>, count: usize) -> Vec<Option<[f32; colour::COUNT]>> {
+fn region_colours(image: &RgbImage, labels: &Image<i32>, count: usize) -> Vec<Option<[f32; colour::COUNT]>> {
     let mut sums = vec![([0f32; colour::COUNT], 0u32); count];
     for (label, rgb) in labels.data.iter().zip(&image.data) {
         if *label >= 0 && (*label as usize) < count {
@@ -433,6 +433,6 @@ mod tests {
         for row in texts.chunks_exact(DIM) {
             assert!((dot(row, row) - 1.0).abs() < 1e-4);
         }
-        assert!(words.embed_regions(&view.image, &Plane::filled(3, 3, 0), 1, &Silent).is_err());
+        assert!(words.embed_regions(&view.image, &Image::filled(3, 3, 0), 1, &Silent).is_err());
     }
 }

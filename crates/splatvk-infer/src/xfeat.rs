@@ -3,7 +3,7 @@ use rayon::prelude::*;
 
 use super::registry::{PackFileKind, Registry};
 use super::runtime::{Input, Session};
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
 
 /// Length of a descriptor.
@@ -72,7 +72,7 @@ pub struct DenseFeatures {
     /// [height, width, 64] unit vectors.
     pub descriptors: Vec<f32>,
     /// Reliability of each cell, in (0, 1).
-    pub reliability: Plane<f32>,
+    pub reliability: Image<f32>,
     /// Input pixels per cell, across and down: cell (c, r) is centred at `((c + 0.5)·x, (r +
     /// 0.5)·y)`.
     pub pixels_per_cell: [f32; 2],
@@ -119,7 +119,7 @@ fn normalise(v: &mut [f32]) {
 }
 
 /// Value at index coordinates (x, y), clamped to the border.
-fn bilinear(plane: &Plane<f32>, x: f32, y: f32) -> f32 {
+fn bilinear(plane: &Image<f32>, x: f32, y: f32) -> f32 {
     let (x, y) = (x.clamp(0.0, (plane.width - 1) as f32), y.clamp(0.0, (plane.height - 1) as f32));
     let (x0, y0) = (x as usize, y as usize);
     let (x1, y1) = ((x0 + 1).min(plane.width - 1), (y0 + 1).min(plane.height - 1));
@@ -166,7 +166,7 @@ impl XFeat {
     }
 
     /// Dense features and the keypoint probability of every pixel of the resized image.
-    fn forward(&mut self, image: &RgbImage) -> Result<(DenseFeatures, Plane<f32>)> {
+    fn forward(&mut self, image: &RgbImage) -> Result<(DenseFeatures, Image<f32>)> {
         if image.width == 0 || image.height == 0 {
             return Err(Error::input("the image has no pixels"));
         }
@@ -191,7 +191,7 @@ impl XFeat {
             width: cw,
             height: ch,
             descriptors: by_cell,
-            reliability: Plane { width: cw, height: ch, data: reliability.data.clone() },
+            reliability: Image { width: cw, height: ch, data: reliability.data.clone() },
             pixels_per_cell: [image.width as f32 / cw as f32, image.height as f32 / ch as f32],
         };
         Ok((dense, heatmap(&logits.data, cw, ch)))
@@ -202,7 +202,7 @@ impl XFeat {
 /// pixels).
 fn resized_grey(image: &RgbImage, w: usize, h: usize) -> Vec<f32> {
     let data = image.data.iter().map(|c| (c[0] + c[1] + c[2]) / 3.0).collect();
-    let grey = Plane { width: image.width, height: image.height, data };
+    let grey = Image { width: image.width, height: image.height, data };
     if (w, h) == (image.width, image.height) {
         return grey.data;
     }
@@ -216,8 +216,8 @@ fn resized_grey(image: &RgbImage, w: usize, h: usize) -> Vec<f32> {
 
 /// Keypoint probability per pixel from logits [65, ch, cw]: softmax over the 64 pixels of a cell
 /// and "none".
-fn heatmap(logits: &[f32], cw: usize, ch: usize) -> Plane<f32> {
-    let mut heat = Plane::filled(cw * CELL, ch * CELL, 0f32);
+fn heatmap(logits: &[f32], cw: usize, ch: usize) -> Image<f32> {
+    let mut heat = Image::filled(cw * CELL, ch * CELL, 0f32);
     for cy in 0..ch {
         for cx in 0..cw {
             let logit = |c: usize| logits[(c * ch + cy) * cw + cx];
@@ -233,7 +233,7 @@ fn heatmap(logits: &[f32], cw: usize, ch: usize) -> Plane<f32> {
 }
 
 /// Pixels above the threshold that no pixel of their 5×5 window exceeds.
-fn local_maxima(heat: &Plane<f32>) -> Vec<(usize, usize)> {
+fn local_maxima(heat: &Image<f32>) -> Vec<(usize, usize)> {
     let rows = (0..heat.height).into_par_iter().flat_map_iter(|y| {
         (0..heat.width).filter_map(move |x| {
             let value = heat.at(x, y);
@@ -248,7 +248,7 @@ fn local_maxima(heat: &Plane<f32>) -> Vec<(usize, usize)> {
 }
 
 /// Sub-pixel position of a peak relative to its pixel: a parabola per axis through the logarithms.
-fn peak_offset(heat: &Plane<f32>, x: usize, y: usize) -> [f32; 2] {
+fn peak_offset(heat: &Image<f32>, x: usize, y: usize) -> [f32; 2] {
     let log = |x: usize, y: usize| heat.at(x, y).max(1e-8).ln();
     let fit = |before: f32, at: f32, after: f32| {
         let curvature = before - 2.0 * at + after;

@@ -3,7 +3,7 @@ use super::ViewMasks;
 use super::align::{self, AlignOptions, Alignment, PairLinks, links_from_depth};
 use super::codebook::{self, CodeEntry, EncodedLevel, autoencoder, quantise};
 use crate::progress::Progress;
-use crate::scene::{Camera, DepthMap, LanguageField, LevelField, Plane};
+use crate::scene::{Camera, DepthMap, Image, LanguageField, LevelField};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -150,7 +150,7 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
         let targets = alignment.views.iter().zip(&code_of).map(|(view, codes)| {
             let labels = &view.levels[level].labels;
             let data = labels.data.iter().map(|&l| if l < 0 { -1 } else { codes[l as usize] }).collect();
-            Plane { width: labels.width, height: labels.height, data }
+            Image { width: labels.width, height: labels.height, data }
         });
         let targets = targets.collect();
         field.levels.push(LevelField { codebook: built.codebook, targets, ..LevelField::default() });

@@ -7,7 +7,7 @@
 use super::{LevelMasks, ViewMasks};
 use crate::format::npy::{self, NpyData};
 use crate::photo::Photo;
-use crate::scene::{Affine, Plane};
+use crate::scene::{Affine, Image};
 use crate::{Error, Result};
 use glam::DVec2;
 use std::collections::BTreeMap;
@@ -42,7 +42,7 @@ pub fn read_view(dir: &Path, photo: &Photo, with_features: bool) -> Result<ViewM
     let features = if with_features { Some(read_features(dir, photo)?) } else { None };
     let mut out = ViewMasks::default();
     for labels in levels {
-        let labels = Plane { width, height, data: labels };
+        let labels = Image { width, height, data: labels };
         let labels = to_working(labels, photo);
         out.levels.push(compact(labels, features.as_ref(), &path)?);
     }
@@ -145,13 +145,13 @@ pub fn normalise_rows(rows: &mut [f32], dim: usize) {
 
 /// Labels of the original or the working size as the photo's image shows them: nearest pixels,
 /// through the photo's affine map and the lens that was taken out.
-fn to_working(labels: Plane<i32>, photo: &Photo) -> Plane<i32> {
+fn to_working(labels: Image<i32>, photo: &Photo) -> Image<i32> {
     let (width, height) = (photo.image.width, photo.image.height);
     let same = (labels.width, labels.height) == (width, height);
     if same && photo.straightened.is_none() {
         return labels;
     }
-    let mut out = Plane::filled(width, height, -1);
+    let mut out = Image::filled(width, height, -1);
     let back = if same { Affine::IDENTITY } else { photo.to_working.inverse() };
     for y in 0..height {
         for x in 0..width {
@@ -167,7 +167,7 @@ fn to_working(labels: Plane<i32>, photo: &Photo) -> Plane<i32> {
 
 /// Global rows → compact per-level indices; regions that are too small or have no feature become
 /// holes.
-fn compact(labels: Plane<i32>, features: Option<&FeatureRows>, path: &Path) -> Result<LevelMasks> {
+fn compact(labels: Image<i32>, features: Option<&FeatureRows>, path: &Path) -> Result<LevelMasks> {
     let mut area: BTreeMap<i32, usize> = BTreeMap::new();
     for &l in labels.data.iter().filter(|&&l| l >= 0) {
         *area.entry(l).or_default() += 1;
@@ -197,7 +197,7 @@ fn compact(labels: Plane<i32>, features: Option<&FeatureRows>, path: &Path) -> R
         out.quality.push(1.0);
     }
     let data = labels.data.iter().map(|l| index.get(l).copied().unwrap_or(-1)).collect();
-    out.labels = Plane { width: labels.width, height: labels.height, data };
+    out.labels = Image { width: labels.width, height: labels.height, data };
     Ok(out)
 }
 
@@ -320,7 +320,7 @@ mod tests {
             centre: DVec2::new(100.0, 50.0),
         });
         let columns = (0..200 * 100).map(|k| k % 200).collect();
-        let labels = to_working(Plane { width: 200, height: 100, data: columns }, &seen);
+        let labels = to_working(Image { width: 200, height: 100, data: columns }, &seen);
         // r = 0.6 is imaged at 0.6 (1 − 0.3 · 0.36) = 0.5352, 80.28 pixels from the middle instead
         // of 90.
         assert_eq!((labels.at(190, 50), labels.at(100, 50)), (180, 100));

@@ -9,7 +9,7 @@ use super::build::{BuildOptions, Language};
 use super::codebook::{self, CodeEntry};
 use super::{LevelMasks, ViewMasks};
 use crate::progress::Progress;
-use crate::scene::{Camera, DepthMap, LanguageField, LevelField, MaskId, Plane};
+use crate::scene::{Camera, DepthMap, Image, LanguageField, LevelField, MaskId};
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 
@@ -27,9 +27,9 @@ pub struct SceneView<'a> {
     /// Its camera.
     pub camera: Camera,
     /// Per level the codes that the scene shows, −1 = none.
-    pub codes: Vec<Plane<i32>>,
+    pub codes: Vec<Image<i32>>,
     /// As the scene renders it, world units; 0 = nothing.
-    pub depth: Plane<f32>,
+    pub depth: Image<f32>,
     /// As it was measured in the photo.
     pub measured: &'a DepthMap,
 }
@@ -43,7 +43,7 @@ impl SceneView<'_> {
 
     /// The scene as if its codes were masks of a photo, each with the embedding of its code.
     fn masks(&self, field: &LanguageField) -> ViewMasks {
-        let level = |(labels, level): (&Plane<i32>, &LevelField)| LevelMasks {
+        let level = |(labels, level): (&Image<i32>, &LevelField)| LevelMasks {
             labels: labels.clone(),
             quality: vec![1.0; level.codebook.len()],
             features: level.codebook.embeddings.clone(),
@@ -58,7 +58,7 @@ impl SceneView<'_> {
 /// until training fills them.
 pub fn join(
     field: &LanguageField,
-    known: Vec<Vec<Plane<i32>>>,
+    known: Vec<Vec<Image<i32>>>,
     new: &[SceneView],
     masks: &[ViewMasks],
     options: &BuildOptions,
@@ -87,7 +87,7 @@ pub fn join(
     for (level, own) in field.levels.iter().enumerate() {
         let state = Level { level, field: own, new, same: &same, alignment: &alignment };
         let (codebook, mut targets) = state.join(known.len(), options)?;
-        let mut all: Vec<Plane<i32>> = known.iter().map(|codes| codes[level].clone()).collect();
+        let mut all: Vec<Image<i32>> = known.iter().map(|codes| codes[level].clone()).collect();
         all.append(&mut targets);
         out.levels.push(LevelField { codebook, targets: all, ..LevelField::default() });
     }
@@ -106,7 +106,7 @@ struct Level<'a> {
 }
 
 impl Level<'_> {
-    fn labels(&self, view: usize) -> &Plane<i32> {
+    fn labels(&self, view: usize) -> &Image<i32> {
         &self.alignment.views[view].levels[self.level].labels
     }
 
@@ -115,7 +115,7 @@ impl Level<'_> {
         &self,
         known: usize,
         options: &BuildOptions,
-    ) -> Result<(crate::scene::Codebook, Vec<Plane<i32>>)> {
+    ) -> Result<(crate::scene::Codebook, Vec<Image<i32>>)> {
         let n = self.new.len();
         let components = &self.alignment.components[self.level];
         let mut entries: Vec<CodeEntry> = Vec::new();
@@ -132,7 +132,7 @@ impl Level<'_> {
         }
         let joined = codebook::append(&self.field.codebook, &entries, options.feature_dim, options.seed)?;
         let mut codebook = joined.codebook;
-        let mut targets: Vec<Plane<i32>> = (0..n).map(|k| self.labels(n + k).clone()).collect();
+        let mut targets: Vec<Image<i32>> = (0..n).map(|k| self.labels(n + k).clone()).collect();
         // Per photo and mask: its code, and the mask of the scene that it is.
         let mut of_mask: BTreeMap<MaskId, (i32, Option<u32>)> = BTreeMap::new();
         for ((component, old), entry) in components.iter().zip(&old_of).zip(&entry_of) {
@@ -212,9 +212,9 @@ mod tests {
 
     const SIZE: (usize, usize) = (32, 16);
 
-    fn plane<T>(of: impl Fn(usize, usize) -> T) -> Plane<T> {
+    fn plane<T>(of: impl Fn(usize, usize) -> T) -> Image<T> {
         let data = (0..SIZE.0 * SIZE.1).map(|p| of(p % SIZE.0, p / SIZE.0)).collect();
-        Plane { width: SIZE.0, height: SIZE.1, data }
+        Image { width: SIZE.0, height: SIZE.1, data }
     }
 
     fn axis(k: usize) -> [f32; 4] {

@@ -1,5 +1,5 @@
 //! Masks of the photos.
-use crate::scene::Plane;
+use crate::scene::Image;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -7,14 +7,14 @@ use std::collections::BTreeMap;
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct LevelMasks {
     /// [H, W] mask index, −1 = hole.
-    pub labels: Plane<i32>,
+    pub labels: Image<i32>,
     /// [M] quality weight of each mask (predicted IoU · stability; 1 when unknown).
     pub quality: Vec<f32>,
     /// [M, D] unit feature per mask, row-major; empty until region features ran.
     pub features: Vec<f32>,
     /// Label maps with every mask as it was found, in one of them, so that masks which overlap are
     /// in different ones; empty where `labels` has them whole, and once features are there.
-    pub whole: Vec<Plane<i32>>,
+    pub whole: Vec<Image<i32>>,
 }
 
 impl LevelMasks {
@@ -50,7 +50,7 @@ pub struct ViewMasks {
 impl ViewMasks {
     /// Per label of `truth`, the IoU of its best mask on each level. Labels of fewer than `least`
     /// pixels are left out. The two may differ in size.
-    pub fn best_ious(&self, truth: &Plane<u32>, least: usize) -> BTreeMap<u32, [f64; 3]> {
+    pub fn best_ious(&self, truth: &Image<u32>, least: usize) -> BTreeMap<u32, [f64; 3]> {
         let mut sizes: BTreeMap<u32, usize> = BTreeMap::new();
         truth.data.iter().for_each(|&t| *sizes.entry(t).or_default() += 1);
         sizes.retain(|_, n| *n >= least);
@@ -83,7 +83,7 @@ mod tests {
     #[test]
     fn masks_without_used_pixels_go() {
         let mut masks = LevelMasks {
-            labels: Plane { width: 5, height: 1, data: vec![0, 0, 1, 2, -1] },
+            labels: Image { width: 5, height: 1, data: vec![0, 0, 1, 2, -1] },
             quality: vec![0.1, 0.2, 0.3],
             features: vec![1.0, 0.0, 0.0, 1.0, 0.6, 0.8],
             whole: Vec::new(),
@@ -97,8 +97,8 @@ mod tests {
     fn iou_is_that_of_the_best_mask_at_any_size_and_specks_do_not_count() {
         // 20 x 20 truth: label 7 on the left 8 columns, label 9 on 4 pixels; masks at half the
         // size, left 5 columns and rest
-        let mut truth = Plane::filled(20, 20, 0u32);
-        let mut labels = Plane::filled(10, 10, 1i32);
+        let mut truth = Image::filled(20, 20, 0u32);
+        let mut labels = Image::filled(10, 10, 1i32);
         for y in 0..20 {
             for x in 0..8 {
                 truth.data[y * 20 + x] = 7;
@@ -109,7 +109,7 @@ mod tests {
         }
         truth.data[10..14].fill(9);
         let level = LevelMasks { labels, quality: vec![1.0; 2], ..Default::default() };
-        let hole = LevelMasks { labels: Plane::filled(10, 10, -1), ..Default::default() };
+        let hole = LevelMasks { labels: Image::filled(10, 10, -1), ..Default::default() };
         let found = ViewMasks { levels: vec![level, hole] }.best_ious(&truth, 5);
         assert_eq!(found.keys().copied().collect::<Vec<_>>(), [0, 7]);
         assert_eq!(found[&7], [160.0 / 200.0, 0.0, 0.0]);

@@ -5,7 +5,7 @@
 //! known by then), kept where neighbours agree, and spread over their cells by a local affine fit.
 //! Both directions come from one set of matches, so they are each other's inverse.
 use crate::math::dot_f32 as dot;
-use crate::scene::{Camera, DenseWarp, DepthMap, Plane};
+use crate::scene::{Camera, DenseWarp, DepthMap, Image};
 use glam::{DMat2, DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 use splatvk_infer::xfeat::DenseFeatures;
@@ -83,8 +83,8 @@ pub fn geometry(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) 
     let links = super::align::links_from_depth(0, 1, (from, to), (depth, other)).forward;
     let (width, height) = (depth.depth.width, depth.depth.height);
     let mut warp = DenseWarp {
-        target: Plane::filled(width, height, [-1.0; 2]),
-        certainty: Plane::filled(width, height, 0.0),
+        target: Image::filled(width, height, [-1.0; 2]),
+        certainty: Image::filled(width, height, 0.0),
     };
     for p in 0..width * height {
         if links.target(p).is_some() {
@@ -211,10 +211,10 @@ fn spread(
     matches: impl Iterator<Item = (DVec2, DVec2, DMat2, f32)>,
 ) -> DenseWarp {
     let mut warp = DenseWarp {
-        target: Plane::filled(width, height, [-1.0; 2]),
-        certainty: Plane::filled(width, height, 0.0),
+        target: Image::filled(width, height, [-1.0; 2]),
+        certainty: Image::filled(width, height, 0.0),
     };
-    let mut distance = Plane::filled(width, height, f64::INFINITY);
+    let mut distance = Image::filled(width, height, f64::INFINITY);
     let reach = DVec2::new(grid.pixels_per_cell[0] as f64, grid.pixels_per_cell[1] as f64) * 0.75;
     for (from, to, jacobian, certainty) in matches {
         let (low, high) = (from - reach, from + reach);
@@ -245,7 +245,7 @@ mod tests {
 
     fn depth(view: &TestView) -> DepthMap {
         let known = view.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect();
-        DepthMap { depth: view.depth.clone(), confidence: Plane { data: known, ..view.depth } }
+        DepthMap { depth: view.depth.clone(), confidence: Image { data: known, ..view.depth } }
     }
 
     #[test]

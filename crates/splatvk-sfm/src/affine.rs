@@ -3,7 +3,7 @@
 //! corners of the compressed photo match it.
 use super::matching::Keypoints;
 use super::sift;
-use crate::scene::Plane;
+use crate::scene::Image;
 use glam::{DMat2, DVec2};
 use rayon::prelude::*;
 
@@ -18,7 +18,7 @@ const BLUR: f64 = 0.8;
 
 /// Keypoints of a luma image and of its compressed versions, positions in the image itself; the
 /// strongest `limit` of each.
-pub(crate) fn detect(luma: &Plane<f32>, valid: &Plane<bool>, limit: usize) -> Keypoints {
+pub(crate) fn detect(luma: &Image<f32>, valid: &Image<bool>, limit: usize) -> Keypoints {
     let mut all = sift::detect(luma, valid, limit);
     let turns = TILTS.iter().flat_map(|t| {
         let directions = (180.0 * t / TURN).round();
@@ -36,15 +36,15 @@ pub(crate) fn detect(luma: &Plane<f32>, valid: &Plane<bool>, limit: usize) -> Ke
 
 /// A turned and compressed image.
 struct Compressed {
-    luma: Plane<f32>,
-    valid: Plane<bool>,
+    luma: Image<f32>,
+    valid: Image<bool>,
     /// Position here → position in the image.
     back: DMat2,
     origin: DVec2,
 }
 
 impl Compressed {
-    fn new(image: &Plane<f32>, valid: &Plane<bool>, tilt: f64, turn: f64) -> Compressed {
+    fn new(image: &Image<f32>, valid: &Image<bool>, tilt: f64, turn: f64) -> Compressed {
         let size = DVec2::new(image.width as f64, image.height as f64);
         let (axis, across) = (DVec2::from_angle(turn), DVec2::from_angle(turn).perp());
         let extent = |d: DVec2| (size * d.abs()).element_sum();
@@ -53,15 +53,15 @@ impl Compressed {
         let width = (long as f64 / tilt).floor().max(1.0) as usize;
         let place =
             |u: f64, v: f64| 0.5 * size + axis * (u - 0.5 * long as f64) + across * (v - 0.5 * height as f64);
-        let mut turned = Plane::filled(long, height, 0.0f32);
+        let mut turned = Image::filled(long, height, 0.0f32);
         turned.data.par_chunks_mut(long).enumerate().for_each(|(y, row)| {
             row.iter_mut().enumerate().for_each(|(x, out)| {
                 *out = bilinear(image, place(x as f64 + 0.5, y as f64 + 0.5));
             });
         });
         let kernel = kernel(BLUR * (tilt * tilt - 1.0).sqrt());
-        let mut luma = Plane::filled(width, height, 0.0f32);
-        let mut inside = Plane::filled(width, height, false);
+        let mut luma = Image::filled(width, height, 0.0f32);
+        let mut inside = Image::filled(width, height, false);
         for y in 0..height {
             let row = &turned.data[y * long..(y + 1) * long];
             for x in 0..width {
@@ -103,7 +103,7 @@ fn weighted(row: &[f32], u: f64, kernel: &[f32]) -> f32 {
 }
 
 /// The image between its pixels; edges are repeated.
-fn bilinear(image: &Plane<f32>, p: DVec2) -> f32 {
+fn bilinear(image: &Image<f32>, p: DVec2) -> f32 {
     let most = DVec2::new(image.width as f64 - 1.0, image.height as f64 - 1.0);
     let q = (p - 0.5).clamp(DVec2::ZERO, most);
     let (x, y) = (q.x as usize, q.y as usize);
@@ -120,10 +120,10 @@ mod tests {
     use crate::math::Random;
 
     /// Smooth noise with structure of a few pixels.
-    fn texture(width: usize, height: usize) -> Plane<f32> {
+    fn texture(width: usize, height: usize) -> Image<f32> {
         let mut random = Random::new(1004);
         let noise =
-            Plane { width, height, data: (0..width * height).map(|_| random.uniform() as f32).collect() };
+            Image { width, height, data: (0..width * height).map(|_| random.uniform() as f32).collect() };
         let mut soft = sift::blurred(&noise, 2.0);
         soft.data.iter_mut().for_each(|v| *v = 0.5 + 4.0 * (*v - 0.5));
         soft
@@ -143,8 +143,8 @@ mod tests {
             let q = p - middle;
             axis * (3.0 * q.x) + across * q.y + middle
         };
-        let mut tilted = Plane::filled(360, 300, 0.5f32);
-        let mut valid = Plane::filled(360, 300, false);
+        let mut tilted = Image::filled(360, 300, 0.5f32);
+        let mut valid = Image::filled(360, 300, false);
         for i in 0..360 * 300 {
             let p = DVec2::new((i % 360) as f64 + 0.5, (i / 360) as f64 + 0.5);
             let inside = |q: DVec2| q.x > 4.0 && q.y > 4.0 && q.x < 356.0 && q.y < 296.0;
@@ -155,7 +155,7 @@ mod tests {
                 valid.data[i] = true;
             }
         }
-        let everywhere = Plane::filled(360, 300, true);
+        let everywhere = Image::filled(360, 300, true);
         let right = |a: &Keypoints, b: &Keypoints| {
             let matches = mutual_matches(a, b, 0.85);
             let good = matches.iter().filter(|m| to(a.points[m.first]).distance(b.points[m.second]) < 2.0);

@@ -6,7 +6,7 @@ use super::{sharpness, sift, still};
 use crate::Result;
 use crate::photo::{self, Candidate, PlainBorder};
 use crate::progress::Progress;
-use crate::scene::{Coverage, Plane, RgbImage};
+use crate::scene::{Coverage, Image, RgbImage};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -170,7 +170,7 @@ impl Look {
     }
 
     /// Features of the scene: `overlay` is what stands still in the frame.
-    fn features(&self, overlay: Option<&Plane<bool>>) -> CandidateFeatures {
+    fn features(&self, overlay: Option<&Image<bool>>) -> CandidateFeatures {
         let small = &self.small;
         // Margin 4: the descriptor's window at the finest scale.
         let coverage = overlay.map(|hidden| Coverage::without(None, hidden));

@@ -130,7 +130,7 @@ mod tests {
             // All but a strip of it.
             let (width, height) = (photo.image.width, photo.image.height);
             let data = (0..width * height).map(|i| i / width > 20).collect();
-            photo.set_overlay(Some(crate::scene::Plane { width, height, data }));
+            photo.set_overlay(Some(crate::scene::Image { width, height, data }));
         }
         let error = place(photos, Vec::new(), 0, &Silent).err().unwrap();
         assert!(error.exit_code() == 2, "{error}");

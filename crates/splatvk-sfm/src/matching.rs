@@ -1,7 +1,7 @@
 //! Keypoint features, their matches between two photos, and the parts of photos that cannot hold
 //! features.
 use crate::photo::PlainBorder;
-use crate::scene::{Coverage, Plane, RgbImage};
+use crate::scene::{Coverage, Image, RgbImage};
 use glam::{DVec2, Vec4};
 use rayon::prelude::*;
 
@@ -135,7 +135,7 @@ pub(crate) fn valid_area(
     border: PlainBorder,
     coverage: Option<&Coverage>,
     margin: usize,
-) -> Plane<bool> {
+) -> Image<bool> {
     let (w, h) = (image.width, image.height);
     let unused = |i: usize| coverage.is_some_and(|c| !c.uses(i));
     let mut excluded: Vec<bool> =
@@ -178,7 +178,7 @@ pub(crate) fn valid_area(
             excluded.iter_mut().zip(&seen).for_each(|(b, s)| *b |= s);
         }
     }
-    let blocked = Plane { width: w, height: h, data: excluded };
+    let blocked = Image { width: w, height: h, data: excluded };
     let near = dilated(&blocked, 2 * margin);
     let data = (0..w * h)
         .map(|i| {
@@ -186,11 +186,11 @@ pub(crate) fn valid_area(
             !near.data[i] && x >= margin && y >= margin && x + margin < w && y + margin < h
         })
         .collect();
-    Plane { width: w, height: h, data }
+    Image { width: w, height: h, data }
 }
 
 /// Pixels within `radius` (square) of a set pixel.
-fn dilated(p: &Plane<bool>, radius: usize) -> Plane<bool> {
+fn dilated(p: &Image<bool>, radius: usize) -> Image<bool> {
     let (w, h) = (p.width, p.height);
     let spread = |n: usize, stride: usize, start: usize, source: &[bool], out: &mut [bool]| {
         let mut last: Option<usize> = None;
@@ -216,7 +216,7 @@ fn dilated(p: &Plane<bool>, radius: usize) -> Plane<bool> {
     for x in 0..w {
         spread(h, w, x, &across, &mut out);
     }
-    Plane { width: w, height: h, data: out }
+    Image { width: w, height: h, data: out }
 }
 
 #[cfg(test)]
@@ -321,7 +321,7 @@ mod tests {
         let image = RgbImage { width: 60, height: 40, data };
         let share = (0..60 * 40).map(|i| if i % 60 < 30 { 1.0 } else { 0.0 }).collect();
         let coverage =
-            Coverage { share: Plane { width: 60, height: 40, data: share }, outside: Outside::Unknown };
+            Coverage { share: Image { width: 60, height: 40, data: share }, outside: Outside::Unknown };
         let open = valid_area(&image, PlainBorder::default(), Some(&coverage), 2);
         assert_eq!([25, 26, 29, 35].map(|x| open.at(x, 20)), [true, false, false, false]);
     }

@@ -1,6 +1,6 @@
 //! Straight edges of a picture: neighbouring pixels whose gradients point the same way, as in LSD
 //! (Grompone von Gioi et al. 2010), with a bound on their width instead of its statistical test.
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use glam::{DVec2, IVec2};
 
 /// Longest side of the pictures in which edges are looked for, pixels: more would only show shorter
@@ -57,7 +57,7 @@ pub(super) fn of(image: &RgbImage) -> Found {
 }
 
 /// The edges of a picture in the order of their strongest pixel.
-fn segments(luma: &Plane<f32>) -> Vec<Segment> {
+fn segments(luma: &Image<f32>) -> Vec<Segment> {
     let (w, h) = (luma.width, luma.height);
     if w < 8 || h < 8 {
         return Vec::new();
@@ -82,7 +82,7 @@ fn segments(luma: &Plane<f32>) -> Vec<Segment> {
 }
 
 /// Mean over 3 × 3 pixels with weights 1 2 1.
-fn smoothed(luma: &Plane<f32>) -> Plane<f32> {
+fn smoothed(luma: &Image<f32>) -> Image<f32> {
     let (w, h) = (luma.width, luma.height);
     let mut rows = luma.clone();
     for y in 0..h {
@@ -101,7 +101,7 @@ fn smoothed(luma: &Plane<f32>) -> Plane<f32> {
 
 /// Direction and size of the gradient per pixel, by central differences; none at the border of the
 /// picture.
-fn gradients(luma: &Plane<f32>) -> Vec<(DVec2, f32)> {
+fn gradients(luma: &Image<f32>) -> Vec<(DVec2, f32)> {
     let (w, h) = (luma.width, luma.height);
     let at = |x: usize, y: usize| f64::from(luma.at(x, y));
     let mut out = vec![(DVec2::ZERO, 0.0); w * h];
@@ -186,7 +186,7 @@ mod tests {
             let disc = step(p.distance(DVec2::new(115.0, 60.0)) - 25.0);
             0.2 + 0.6 * bar.max(disc)
         };
-        let luma = Plane { width: 160, height: 120, data: (0..160 * 120).map(value).collect() };
+        let luma = Image { width: 160, height: 120, data: (0..160 * 120).map(value).collect() };
         let found = segments(&luma);
         let long: Vec<_> = found.iter().filter(|s| s.length() > 60.0).collect();
         assert_eq!(long.len(), 2, "{found:?}");

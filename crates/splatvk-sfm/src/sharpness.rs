@@ -47,7 +47,7 @@ pub(super) fn of(image: &RgbImage) -> f64 {
     let fine = image.luma();
     // Two blurs three quarters of an octave apart; the first takes the noise of single pixels away.
     let (a, b) = (sift::blurred(&fine, 0.7), sift::blurred(&fine, 1.4));
-    let energy = |p: &crate::scene::Plane<f32>| -> f64 {
+    let energy = |p: &crate::scene::Image<f32>| -> f64 {
         (0..(p.height - 1) * p.width)
             .filter(|i| i % p.width + 1 < p.width)
             .map(|i| {
@@ -64,7 +64,7 @@ pub(super) fn of(image: &RgbImage) -> f64 {
 mod tests {
     use super::*;
     use crate::progress::{Recorded, Silent};
-    use crate::scene::Plane;
+    use crate::scene::Image;
     use crate::testing;
 
     #[test]
@@ -95,7 +95,7 @@ mod tests {
         assert!(warned(&photos).is_empty());
         let image = &mut photos[2].image;
         for c in 0..3 {
-            let channel = Plane {
+            let channel = Image {
                 width: image.width,
                 height: image.height,
                 data: image.data.iter().map(|p| p[c]).collect(),

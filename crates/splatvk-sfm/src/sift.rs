@@ -2,7 +2,7 @@
 //! Zisserman 2012). They complement the learned features: fewer matches, but positions good to
 //! about 0.3 px without any model.
 use super::matching::Keypoints;
-use crate::scene::Plane;
+use crate::scene::Image;
 use glam::{DVec2, Vec4};
 use rayon::prelude::*;
 
@@ -17,7 +17,7 @@ const EDGE_RATIO: f32 = 10.0;
 const DOUBLE_BELOW: usize = 1000;
 
 /// Keypoints of a luma image with 128-dimensional unit descriptors, strongest `limit` kept.
-pub(crate) fn detect(luma: &Plane<f32>, valid: &Plane<bool>, limit: usize) -> Keypoints {
+pub(crate) fn detect(luma: &Image<f32>, valid: &Image<bool>, limit: usize) -> Keypoints {
     let double = luma.width.max(luma.height) <= DOUBLE_BELOW;
     let (base, step) = if double { (doubled(luma), 0.5) } else { (luma.clone(), 1.0) };
     // A camera image is taken to be blurred by 0.5 px already.
@@ -54,14 +54,14 @@ impl Keypoint {
 }
 
 struct Octave {
-    gaussians: Vec<Plane<f32>>,
-    differences: Vec<Plane<f32>>,
+    gaussians: Vec<Image<f32>>,
+    differences: Vec<Image<f32>>,
     /// Photo pixels per sample.
     step: f64,
 }
 
 impl Octave {
-    fn new(first: Plane<f32>, step: f64) -> Octave {
+    fn new(first: Image<f32>, step: f64) -> Octave {
         let k = 2f32.powf(1.0 / LEVELS as f32);
         let mut gaussians = vec![first];
         for level in 1..LEVELS + 3 {
@@ -71,7 +71,7 @@ impl Octave {
         }
         let differences = gaussians
             .windows(2)
-            .map(|w| Plane {
+            .map(|w| Image {
                 width: w[0].width,
                 height: w[0].height,
                 data: w[1].data.iter().zip(&w[0].data).map(|(b, a)| b - a).collect(),
@@ -80,7 +80,7 @@ impl Octave {
         Octave { gaussians, differences, step }
     }
 
-    fn keypoints(&self, valid: &Plane<bool>) -> Vec<Keypoint> {
+    fn keypoints(&self, valid: &Image<bool>) -> Vec<Keypoint> {
         let (w, h) = (self.differences[0].width, self.differences[0].height);
         let mut out = Vec::new();
         for level in 1..=LEVELS {
@@ -165,7 +165,7 @@ impl Octave {
         None
     }
 
-    fn describe(&self, level: usize, x: usize, y: usize, valid: &Plane<bool>) -> Vec<Keypoint> {
+    fn describe(&self, level: usize, x: usize, y: usize, valid: &Image<bool>) -> Vec<Keypoint> {
         let Some((x, y, l, strength)) = self.localise(level, x, y) else { return Vec::new() };
         let position = DVec2::new((x + 0.5) * self.step, (y + 0.5) * self.step);
         // When doubled, sample i lies at (i + 0.5)/2 photo pixels; after decimation sample i lies
@@ -187,7 +187,7 @@ impl Octave {
 }
 
 /// Gradient (magnitude, angle) at a sample; zero at the border.
-fn gradient(image: &Plane<f32>, x: i64, y: i64) -> (f32, f32) {
+fn gradient(image: &Image<f32>, x: i64, y: i64) -> (f32, f32) {
     if x < 1 || y < 1 || x + 1 >= image.width as i64 || y + 1 >= image.height as i64 {
         return (0.0, 0.0);
     }
@@ -199,7 +199,7 @@ fn gradient(image: &Plane<f32>, x: i64, y: i64) -> (f32, f32) {
 
 /// Dominant gradient directions, radians (peaks of a smoothed 36-bin histogram above 80 % of the
 /// highest).
-fn orientations(image: &Plane<f32>, x: f64, y: f64, sigma: f64) -> Vec<f64> {
+fn orientations(image: &Image<f32>, x: f64, y: f64, sigma: f64) -> Vec<f64> {
     const BINS: usize = 36;
     let mut histogram = [0f32; BINS];
     let spread = 1.5 * sigma;
@@ -234,7 +234,7 @@ fn orientations(image: &Plane<f32>, x: f64, y: f64, sigma: f64) -> Vec<f64> {
 
 /// 4×4 cells of 8 directions, trilinear votes, clipped at 0.2, square-rooted after L1
 /// normalisation.
-fn descriptor(image: &Plane<f32>, x: f64, y: f64, sigma: f64, angle: f64) -> [f32; 128] {
+fn descriptor(image: &Image<f32>, x: f64, y: f64, sigma: f64, angle: f64) -> [f32; 128] {
     let mut d = [0f32; 128];
     let cell = 3.0 * sigma;
     let radius = (cell * 2.5 * std::f64::consts::SQRT_2).round() as i64;
@@ -275,7 +275,7 @@ fn descriptor(image: &Plane<f32>, x: f64, y: f64, sigma: f64, angle: f64) -> [f3
 
 /// Twice the resolution, bilinear; sample i of the result lies at (i + 0.5)/2 in pixels of the
 /// input.
-fn doubled(p: &Plane<f32>) -> Plane<f32> {
+fn doubled(p: &Image<f32>) -> Image<f32> {
     let (w, h) = (p.width * 2, p.height * 2);
     let at = |i: usize, n: usize| {
         let u = ((i as f32 + 0.5) * 0.5 - 0.5).clamp(0.0, (n - 1) as f32);
@@ -294,14 +294,14 @@ fn doubled(p: &Plane<f32>) -> Plane<f32> {
             data.push(top * (1.0 - fy) + low * fy);
         }
     }
-    Plane { width: w, height: h, data }
+    Image { width: w, height: h, data }
 }
 
 /// Every second sample of every second row.
-fn decimated(p: &Plane<f32>) -> Plane<f32> {
+fn decimated(p: &Image<f32>) -> Image<f32> {
     let (w, h) = (p.width / 2, p.height / 2);
     let data = (0..w * h).map(|i| p.at(i % w * 2, i / w * 2)).collect();
-    Plane { width: w, height: h, data }
+    Image { width: w, height: h, data }
 }
 
 /// `out += k·v`, both of one length. As in matching, vectors of glam are fast in debug builds too.
@@ -316,7 +316,7 @@ fn add_scaled(out: &mut [f32], k: f32, v: &[f32]) {
 }
 
 /// Gaussian blur, separable, edge samples repeated.
-pub(crate) fn blurred(p: &Plane<f32>, sigma: f32) -> Plane<f32> {
+pub(crate) fn blurred(p: &Image<f32>, sigma: f32) -> Image<f32> {
     let radius = (3.0 * sigma).ceil() as i64;
     let mut kernel: Vec<f32> =
         (-radius..=radius).map(|k| (-(k * k) as f32 / (2.0 * sigma * sigma)).exp()).collect();
@@ -338,7 +338,7 @@ pub(crate) fn blurred(p: &Plane<f32>, sigma: f32) -> Plane<f32> {
             add_scaled(row, *k, &across[r * w..(r + 1) * w]);
         }
     });
-    Plane { width: w, height: h, data }
+    Image { width: w, height: h, data }
 }
 
 #[cfg(test)]
@@ -350,7 +350,7 @@ mod tests {
         let (w, h, sigma) = (13, 7, 1.5);
         let mut random = crate::math::Random::new(3);
         let plane =
-            Plane { width: w, height: h, data: (0..w * h).map(|_| random.uniform() as f32).collect() };
+            Image { width: w, height: h, data: (0..w * h).map(|_| random.uniform() as f32).collect() };
         let blurred = blurred(&plane, sigma);
         for (x, y) in [(0, 0), (12, 3), (6, 6), (5, 2)] {
             let (mut sum, mut weights) = (0.0, 0.0);
@@ -376,8 +376,8 @@ mod tests {
                     (0.8 * (-(x * x + y * y) / (2.0 * sigma * sigma)).exp()) as f32
                 })
                 .collect();
-            let image = Plane { width: 160, height: 120, data };
-            let f = detect(&image, &Plane::filled(160, 120, true), 10);
+            let image = Image { width: 160, height: 120, data };
+            let f = detect(&image, &Image::filled(160, 120, true), 10);
             let best =
                 f.points.iter().map(|p| (*p - DVec2::new(cx, cy)).length()).fold(f64::INFINITY, f64::min);
             assert!(best < 0.06 * sigma.max(1.5), "σ {sigma}: {best}");
@@ -388,13 +388,13 @@ mod tests {
     fn corners_of_a_photo_that_was_held_on_its_side_match() {
         let mut random = crate::math::Random::new(1006);
         let data = (0..128 * 96).map(|_| random.uniform() as f32).collect();
-        let mut image = blurred(&Plane { width: 128, height: 96, data }, 2.0);
+        let mut image = blurred(&Image { width: 128, height: 96, data }, 2.0);
         image.data.iter_mut().for_each(|v| *v = 0.5 + 4.0 * (*v - 0.5));
         // A quarter turn takes (x, y) to (96 − y, x).
         let data = (0..96 * 128).map(|k| image.at(k / 96, 95 - k % 96)).collect();
-        let turned = Plane { width: 96, height: 128, data };
-        let a = detect(&image, &Plane::filled(128, 96, true), 300);
-        let b = detect(&turned, &Plane::filled(96, 128, true), 300);
+        let turned = Image { width: 96, height: 128, data };
+        let a = detect(&image, &Image::filled(128, 96, true), 300);
+        let b = detect(&turned, &Image::filled(96, 128, true), 300);
         let matches = crate::matching::mutual_matches(&a, &b, 0.85);
         let to = |p: DVec2| DVec2::new(96.0 - p.y, p.x);
         let right = matches.iter().filter(|m| to(a.points[m.first]).distance(b.points[m.second]) < 1.0);

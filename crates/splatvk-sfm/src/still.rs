@@ -7,7 +7,7 @@
 use super::sift::blurred;
 use super::two_view::{fundamental, sampson};
 use crate::photo::Photo;
-use crate::scene::{Camera, Outside, Plane, RgbImage};
+use crate::scene::{Camera, Image, Outside, RgbImage};
 use glam::DVec2;
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -54,10 +54,10 @@ pub fn mark(photos: &mut [Photo]) {
 }
 
 /// Per image the [`overlay`] of those of its size.
-pub(super) fn overlays<'a>(images: impl Iterator<Item = &'a RgbImage>) -> Vec<Option<Plane<bool>>> {
+pub(super) fn overlays<'a>(images: impl Iterator<Item = &'a RgbImage>) -> Vec<Option<Image<bool>>> {
     let images: Vec<&RgbImage> = images.collect();
     let size = |i: &RgbImage| (i.width, i.height);
-    let mut of_size: HashMap<(usize, usize), Option<Plane<bool>>> = HashMap::new();
+    let mut of_size: HashMap<(usize, usize), Option<Image<bool>>> = HashMap::new();
     let mut of = |image: &RgbImage| {
         let found = of_size.entry(size(image)).or_insert_with(|| {
             let alike: Vec<&RgbImage> = images.iter().copied().filter(|i| size(i) == size(image)).collect();
@@ -147,7 +147,7 @@ pub fn description(photos: &[Photo]) -> Option<String> {
 
 /// Which pixels belong to an overlay that all `images` have, which are of one size; `None` where
 /// there is none. At the size of the images.
-fn overlay(images: &[&RgbImage]) -> Option<Plane<bool>> {
+fn overlay(images: &[&RgbImage]) -> Option<Image<bool>> {
     let first = images.first().filter(|_| images.len() > 1)?;
     let (w, h) = (first.width, first.height);
     let scale = (SIDE as f64 / w.max(h) as f64).min(1.0);
@@ -174,30 +174,30 @@ fn overlay(images: &[&RgbImage]) -> Option<Plane<bool>> {
         let (x, y) = ((i % w) as f64 * scale, (i / w) as f64 * scale);
         mask[(y as usize).min(to(h) - 1) * to(w) + (x as usize).min(to(w) - 1)]
     };
-    Some(Plane { width: w, height: h, data: (0..w * h).map(at).collect() })
+    Some(Image { width: w, height: h, data: (0..w * h).map(at).collect() })
 }
 
 /// Gradients of a photo and their mean square in the window around each pixel.
 struct Gradients {
-    x: Plane<f32>,
-    y: Plane<f32>,
-    energy: Plane<f32>,
+    x: Image<f32>,
+    y: Image<f32>,
+    energy: Image<f32>,
 }
 
 impl Gradients {
-    fn of(luma: &Plane<f32>) -> Gradients {
+    fn of(luma: &Image<f32>) -> Gradients {
         let smooth = blurred(luma, SMOOTH);
         let (w, h) = (smooth.width, smooth.height);
         let along = |step: &dyn Fn(usize, usize) -> f32| {
             let data = (0..w * h).map(|i| step(i % w, i / w)).collect();
-            Plane { width: w, height: h, data }
+            Image { width: w, height: h, data }
         };
         let across =
             |x: usize, y: usize| 0.5 * (smooth.at((x + 1).min(w - 1), y) - smooth.at(x.max(1) - 1, y));
         let down = |x: usize, y: usize| 0.5 * (smooth.at(x, (y + 1).min(h - 1)) - smooth.at(x, y.max(1) - 1));
         let (x, y) = (along(&across), along(&down));
         let square = x.data.iter().zip(&y.data).map(|(a, b)| a * a + b * b).collect();
-        let energy = blurred(&Plane { width: w, height: h, data: square }, WINDOW);
+        let energy = blurred(&Image { width: w, height: h, data: square }, WINDOW);
         Gradients { x, y, energy }
     }
 
@@ -214,7 +214,7 @@ impl Gradients {
             self.x.data[i] * other.x.data[o] + self.y.data[i] * other.y.data[o]
         };
         let data = (0..self.x.data.len()).map(product).collect();
-        let product = blurred(&Plane { width: self.x.width, height: self.x.height, data }, WINDOW);
+        let product = blurred(&Image { width: self.x.width, height: self.x.height, data }, WINDOW);
         let relative = |(i, p): (usize, &f32)| {
             let (own, others) = (self.energy.data[i], other.energy.data[moved(i)]);
             (own.min(others) > TEXTURE * TEXTURE).then(|| p / (own * others).sqrt())
@@ -375,7 +375,7 @@ mod tests {
         photos.truncate(3);
         let square = |i: usize, x: usize, y: usize| (i % w).abs_diff(x) < 4 && (i / w).abs_diff(y) < 4;
         let mask = |i: usize| square(i, w / 2, h / 2) || square(i, 60, 60);
-        let mask = Plane { width: w, height: h, data: (0..w * h).map(mask).collect() };
+        let mask = Image { width: w, height: h, data: (0..w * h).map(mask).collect() };
         photos.iter_mut().for_each(|p| p.set_overlay(Some(mask.clone())));
         assert!(clear_scene(&mut photos, &cameras));
         for photo in &photos {

@@ -4,13 +4,13 @@ use std::path::PathBuf;
 use glam::{DMat3, DVec3};
 
 use splatvk_io::format::npy;
-use splatvk_types::scene::{Camera, Plane, Pose, RgbImage};
+use splatvk_types::scene::{Camera, Image, Pose, RgbImage};
 
 pub struct TestView {
     pub image: RgbImage,
     /// Object index per pixel.
-    pub masks: Plane<i32>,
-    pub depth: Plane<f32>,
+    pub masks: Image<i32>,
+    pub depth: Image<f32>,
     pub camera: Camera,
 }
 
@@ -59,8 +59,8 @@ fn view(frame: &serde_json::Value) -> TestView {
     let (fx, fy, cx, cy) = (number("fx"), number("fy"), number("cx"), number("cy"));
     TestView {
         image: RgbImage { width, height, data },
-        masks: Plane { width, height, data: masks.pixels().map(|p| p.0[0] as i32).collect() },
-        depth: Plane { width, height, data: depth },
+        masks: Image { width, height, data: masks.pixels().map(|p| p.0[0] as i32).collect() },
+        depth: Image { width, height, data: depth },
         camera: Camera { name: stem, width: width as u32, height: height as u32, fx, fy, cx, cy, pose },
     }
 }

@@ -1,14 +1,14 @@
 //! Photos with exact depth, for tests of stereo.
 use glam::{DMat3, DVec2, DVec3};
 use splatvk_types::math::hash;
-use splatvk_types::scene::{Camera, Plane, Pose, RgbImage};
+use splatvk_types::scene::{Camera, Image, Pose, RgbImage};
 use std::path::Path;
 
 /// Photos with exact depth.
 pub struct Set {
     pub images: Vec<RgbImage>,
     pub cameras: Vec<Camera>,
-    pub depth: Vec<Plane<f32>>,
+    pub depth: Vec<Image<f32>>,
     pub sparse: Vec<DVec3>,
 }
 
@@ -63,7 +63,7 @@ pub fn synthetic_from(width: u32, height: u32, reach: f64) -> Set {
     let mut set = Set { images: vec![], cameras: cameras.clone(), depth: vec![], sparse: vec![] };
     for camera in &cameras {
         let mut image = RgbImage { width: width as usize, height: height as usize, data: vec![] };
-        let mut depth = Plane::filled(width as usize, height as usize, 0.0f32);
+        let mut depth = Image::filled(width as usize, height as usize, 0.0f32);
         let (eye, to_world) = (camera.pose.centre(), camera.pose.inverse().rotation);
         for k in 0..(width * height) as usize {
             let pixel = DVec2::new((k as u32 % width) as f64 + 0.5, (k as u32 / width) as f64 + 0.5);
@@ -91,7 +91,7 @@ pub fn synthetic_from(width: u32, height: u32, reach: f64) -> Set {
 }
 
 /// Sorted relative depth errors, and the share of pixels with depth.
-pub fn errors(found: &Plane<f32>, exact: &Plane<f32>) -> (Vec<f32>, f32) {
+pub fn errors(found: &Image<f32>, exact: &Image<f32>) -> (Vec<f32>, f32) {
     let mut errors: Vec<f32> = found
         .data
         .iter()
@@ -152,7 +152,7 @@ pub fn breakfast(shrink: u32) -> Set {
             let (x, y) = (k as u32 % w * shrink + shrink / 2, k as u32 / w * shrink + shrink / 2);
             depth[(y * width + x) as usize]
         });
-        set.depth.push(Plane { width: w as usize, height: h as usize, data: sampled.collect() });
+        set.depth.push(Image { width: w as usize, height: h as usize, data: sampled.collect() });
         set.cameras.push(camera.resized(w, h));
     }
     set

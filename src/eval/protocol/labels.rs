@@ -1,7 +1,7 @@
 //! The labels of the published layouts as one object index per pixel, as ground truth for masks and
 //! features.
 use crate::eval::ObjectMaps;
-use crate::scene::{Camera, Plane};
+use crate::scene::{Camera, Image};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -25,10 +25,10 @@ pub(super) fn numbered(phrases: impl IntoIterator<Item = String>) -> BTreeMap<u3
 
 /// Masks of one frame as one plane: where objects overlap, the smaller one is seen in front of the
 /// larger.
-pub(super) fn painted(mut masks: Vec<(u32, Plane<bool>)>) -> Option<Plane<u32>> {
+pub(super) fn painted(mut masks: Vec<(u32, Image<bool>)>) -> Option<Image<u32>> {
     masks.sort_by_key(|(_, m)| std::cmp::Reverse(m.data.iter().filter(|&&in_it| in_it).count()));
     let (_, first) = masks.first()?;
-    let mut out = Plane::filled(first.width, first.height, 0u32);
+    let mut out = Image::filled(first.width, first.height, 0u32);
     let pixels = out.data.len();
     for (label, mask) in masks.iter().filter(|(_, m)| m.data.len() == pixels) {
         let inside = out.data.iter_mut().zip(&mask.data).filter(|(_, in_it)| **in_it);
@@ -43,7 +43,7 @@ mod tests {
 
     #[test]
     fn of_overlapping_masks_the_smaller_one_is_in_front() {
-        let mask = |from: usize, to: usize| Plane {
+        let mask = |from: usize, to: usize| Image {
             width: 6,
             height: 1,
             data: (0..6).map(|x| (from..to).contains(&x)).collect(),

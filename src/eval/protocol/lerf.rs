@@ -8,7 +8,7 @@ use super::score::{
 };
 use crate::eval::{MIN_OBJECT_PIXELS, ObjectMaps};
 use crate::query::filter;
-use crate::scene::{Camera, MAX_PIXELS, Plane};
+use crate::scene::{Camera, Image, MAX_PIXELS};
 use crate::{Error, Result, files};
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -22,7 +22,7 @@ const THRESHOLDS: [(f32, &str, &str); 2] = [(0.6, "thr0.6", "miou"), (0.4, "thr0
 #[derive(Clone, Debug, Default)]
 pub(super) struct Target {
     /// [H, W] of the label's size.
-    pub mask: Plane<bool>,
+    pub mask: Image<bool>,
     /// x1, y1, x2, y2 in label pixels, both ends inside.
     pub boxes: Vec<[f64; 4]>,
 }
@@ -79,7 +79,7 @@ pub(super) fn parse(text: &str, path: &Path) -> Result<BTreeMap<String, Target>>
     }
     let mut targets: BTreeMap<String, Target> = BTreeMap::new();
     for object in file.objects {
-        let empty = || Target { mask: Plane::filled(width, height, false), boxes: Vec::new() };
+        let empty = || Target { mask: Image::filled(width, height, false), boxes: Vec::new() };
         let target = targets.entry(object.category).or_insert_with(empty);
         polygon::fill(&mut target.mask, &object.segmentation);
         if let [x1, y1, x2, y2] = object.bbox[..] {
@@ -130,10 +130,10 @@ fn read_folder(folder: &Path) -> Result<BTreeMap<String, BTreeMap<String, Target
 
 /// Planes that are all in memory: a LERF scene has a handful of labelled frames.
 #[derive(Debug)]
-struct Painted(BTreeMap<String, Plane<u32>>);
+struct Painted(BTreeMap<String, Image<u32>>);
 
 impl ObjectMaps for Painted {
-    fn objects(&self, stem: &str) -> Result<Option<Plane<u32>>> {
+    fn objects(&self, stem: &str) -> Result<Option<Image<u32>>> {
         Ok(self.0.get(stem).cloned())
     }
 }
@@ -175,7 +175,7 @@ fn from_masks(own: OwnLabels) -> Result<(Vec<LabelledView>, Vec<BTreeMap<String,
     Ok((own.views, all))
 }
 
-fn target_of(objects: &Plane<u32>, label: u32) -> Target {
+fn target_of(objects: &Image<u32>, label: u32) -> Target {
     let data: Vec<bool> = objects.data.iter().map(|&o| o == label).collect();
     let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
     for (p, _) in data.iter().enumerate().filter(|(_, m)| **m) {
@@ -183,7 +183,7 @@ fn target_of(objects: &Plane<u32>, label: u32) -> Target {
         (0..2).for_each(|k| (low[k], high[k]) = (low[k].min(at[k]), high[k].max(at[k])));
     }
     let boxes = if low[0] <= high[0] { vec![[low[0], low[1], high[0], high[1]]] } else { Vec::new() };
-    Target { mask: Plane { width: objects.width, height: objects.height, data }, boxes }
+    Target { mask: Image { width: objects.width, height: objects.height, data }, boxes }
 }
 
 impl Protocol for Lerf {
@@ -201,9 +201,9 @@ impl Protocol for Lerf {
         for (phrase, target) in &self.targets[index] {
             let Some(prompt) = self.prompts.iter().position(|p| p == phrase) else { continue };
             let levels = seen.relevancy(prompt);
-            let boxed: Vec<Plane<f32>> = levels.iter().map(|(_, raw)| filter::box30(raw)).collect();
+            let boxed: Vec<Image<f32>> = levels.iter().map(|(_, raw)| filter::box30(raw)).collect();
             let localised = Some(localised(&boxed, target));
-            let blended: Vec<Plane<f32>> =
+            let blended: Vec<Image<f32>> =
                 levels.iter().zip(&boxed).map(|((_, raw), b)| filter::blend(raw, b)).collect();
             let Some(best) = highest_level(&blended) else { continue };
             for (threshold, rule, _) in THRESHOLDS {
@@ -260,19 +260,19 @@ impl Protocol for Lerf {
     }
 }
 
-fn peak(map: &Plane<f32>) -> f32 {
+fn peak(map: &Image<f32>) -> f32 {
     map.data.iter().copied().fold(f32::NEG_INFINITY, f32::max)
 }
 
 /// Index of the map with the highest peak, the first of equals.
-fn highest_level(maps: &[Plane<f32>]) -> Option<usize> {
+fn highest_level(maps: &[Image<f32>]) -> Option<usize> {
     let peaks: Vec<f32> = maps.iter().map(peak).collect();
     let top = peaks.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     peaks.iter().position(|&p| p >= top)
 }
 
 /// Whether any pixel with the highest value of the best level lies in any box.
-fn localised(boxed: &[Plane<f32>], target: &Target) -> bool {
+fn localised(boxed: &[Image<f32>], target: &Target) -> bool {
     let Some(map) = highest_level(boxed).map(|k| &boxed[k]) else { return false };
     let top = peak(map);
     let to_label = |p: usize, from: usize, to: usize| (p as f64 + 0.5) * to as f64 / from as f64 - 0.5;

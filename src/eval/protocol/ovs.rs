@@ -6,7 +6,7 @@ use super::score::{
     mean, nearest, place, summarise,
 };
 use crate::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, ObjectMaps, Split};
-use crate::scene::{Camera, Plane};
+use crate::scene::{Camera, Image};
 use crate::{Error, Result, files, photo};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -62,7 +62,7 @@ impl Ovs {
     }
 
     /// Mask per class of a frame; `None` where the frame does not label it.
-    fn truth(&self, view: &LabelledView) -> Result<Vec<Option<Plane<bool>>>> {
+    fn truth(&self, view: &LabelledView) -> Result<Vec<Option<Image<bool>>>> {
         match &self.source {
             LabelSource::Folder(root) => {
                 let one = |class: &String| {
@@ -76,7 +76,7 @@ impl Ovs {
                 let one = |label: &u32| {
                     let data: Vec<bool> = objects.data.iter().map(|o| o == label).collect();
                     let enough = data.iter().filter(|&&m| m).count() >= MIN_OBJECT_PIXELS;
-                    enough.then_some(Plane { width: objects.width, height: objects.height, data })
+                    enough.then_some(Image { width: objects.width, height: objects.height, data })
                 };
                 Ok(own.truth.labels.keys().map(one).collect())
             }
@@ -106,7 +106,7 @@ struct Maps {
 }
 
 impl ObjectMaps for Maps {
-    fn objects(&self, stem: &str) -> Result<Option<Plane<u32>>> {
+    fn objects(&self, stem: &str) -> Result<Option<Image<u32>>> {
         let mut masks = Vec::new();
         for (label, class) in &self.phrases {
             let path = self.root.join(stem).join(format!("{class}.png"));
@@ -143,30 +143,30 @@ fn frames(root: &Path) -> Result<Vec<String>> {
     Ok(names)
 }
 
-fn read_mask(path: &Path) -> Result<Plane<bool>> {
+fn read_mask(path: &Path) -> Result<Image<bool>> {
     let image = photo::stored_pixels(path)?.to_luma8();
     let data = image.pixels().map(|p| p.0[0] > 127).collect();
-    Ok(Plane { width: image.width() as usize, height: image.height() as usize, data })
+    Ok(Image { width: image.width() as usize, height: image.height() as usize, data })
 }
 
 /// An answer: mask, level, whether the substitute was needed.
-pub(super) type Answer = (Plane<bool>, usize, bool);
+pub(super) type Answer = (Image<bool>, usize, bool);
 
-fn cut(map: &Plane<f32>, above: f32) -> Plane<bool> {
-    Plane { width: map.width, height: map.height, data: map.data.iter().map(|&v| v > above).collect() }
+fn cut(map: &Image<f32>, above: f32) -> Image<bool> {
+    Image { width: map.width, height: map.height, data: map.data.iter().map(|&v| v > above).collect() }
 }
 
-fn area(mask: &Plane<bool>) -> usize {
+fn area(mask: &Image<bool>) -> usize {
     mask.data.iter().filter(|&&m| m).count()
 }
 
-fn top(map: &Plane<f32>) -> f32 {
+fn top(map: &Image<f32>) -> f32 {
     map.data.iter().copied().fold(f32::NEG_INFINITY, f32::max)
 }
 
 /// The paper: relevancy above τ per level; of the levels with more than 2000 such pixels, the one
 /// with the highest mean.
-pub(super) fn paper_rule(levels: &[(usize, Plane<f32>)]) -> Option<Answer> {
+pub(super) fn paper_rule(levels: &[(usize, Image<f32>)]) -> Option<Answer> {
     let mut best: Option<(f64, Answer)> = None;
     for (level, map) in levels {
         let mask = cut(map, TAU);
@@ -190,8 +190,8 @@ pub(super) fn paper_rule(levels: &[(usize, Plane<f32>)]) -> Option<Answer> {
 
 /// The authors' script: cosine above 0.85 of its maximum on the levels m and l; the level with the
 /// largest mask.
-pub(super) fn authors_rule(levels: &[(usize, Plane<f32>)]) -> Option<Answer> {
-    let coarse: Vec<&(usize, Plane<f32>)> = levels.iter().filter(|(l, _)| *l > 0).collect();
+pub(super) fn authors_rule(levels: &[(usize, Image<f32>)]) -> Option<Answer> {
+    let coarse: Vec<&(usize, Image<f32>)> = levels.iter().filter(|(l, _)| *l > 0).collect();
     let coarse = if coarse.is_empty() { levels.iter().collect() } else { coarse };
     let mut best: Option<(usize, Answer)> = None;
     for (level, map) in coarse {
@@ -233,7 +233,7 @@ impl Protocol for Ovs {
         for (class, target) in truth.iter().enumerate() {
             let Some(target) = target else { continue };
             let claimed = best.data.iter().map(|&k| k == class as i32).collect();
-            let claimed = Plane { width: best.width, height: best.height, data: claimed };
+            let claimed = Image { width: best.width, height: best.height, data: claimed };
             push(class, ARGMAX, mask_iou(&claimed, target)?, None, false);
             if BACKGROUND_LABELS.contains(&classes[class].as_str()) {
                 continue;
@@ -292,12 +292,12 @@ impl Protocol for Ovs {
 
 /// (labelled pixels, those whose class was found). A pixel of several classes is right with any of
 /// them.
-fn accuracy(best: &Plane<i32>, truth: &[Option<Plane<bool>>]) -> [u64; 2] {
+fn accuracy(best: &Image<i32>, truth: &[Option<Image<bool>>]) -> [u64; 2] {
     let Some(size) = truth.iter().flatten().next() else { return [0, 0] };
     let (mut all, mut right) = (0, 0);
     for y in 0..size.height {
         for x in 0..size.width {
-            let at = |m: &Plane<bool>| nearest(m, (x, y), (size.width, size.height));
+            let at = |m: &Image<bool>| nearest(m, (x, y), (size.width, size.height));
             if !truth.iter().flatten().any(at) {
                 continue;
             }

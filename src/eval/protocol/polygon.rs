@@ -1,12 +1,12 @@
 //! Polygons to masks, as the label tools of LERF-OVS are read: vertices truncated to whole pixels,
 //! even-odd inside, outline included (what OpenCV's `fillPoly` draws).
-use crate::scene::Plane;
+use crate::scene::Image;
 
 /// Farthest that a vertex may lie outside, pixels: beyond it products of coordinates leave 64 bits.
 pub const FARTHEST: f64 = 1e6;
 
 /// Sets the pixels of a closed polygon. Vertices may lie outside, up to [`FARTHEST`].
-pub fn fill(mask: &mut Plane<bool>, polygon: &[[f64; 2]]) {
+pub fn fill(mask: &mut Image<bool>, polygon: &[[f64; 2]]) {
     let points: Vec<[i64; 2]> = polygon.iter().map(|p| p.map(|v| v.trunc() as i64)).collect();
     let edges = || (0..points.len()).map(|i| (points[i], points[(i + 1) % points.len()]));
     for (a, b) in edges() {
@@ -31,7 +31,7 @@ pub fn fill(mask: &mut Plane<bool>, polygon: &[[f64; 2]]) {
     }
 }
 
-fn set(mask: &mut Plane<bool>, x: i64, y: i64) {
+fn set(mask: &mut Image<bool>, x: i64, y: i64) {
     if x >= 0 && y >= 0 && x < mask.width as i64 && y < mask.height as i64 {
         mask.data[y as usize * mask.width + x as usize] = true;
     }
@@ -39,7 +39,7 @@ fn set(mask: &mut Plane<bool>, x: i64, y: i64) {
 
 /// Every pixel of an 8-connected line (Bresenham): one per step along the longer axis, rounded
 /// along the other.
-fn outline(mask: &mut Plane<bool>, a: [i64; 2], b: [i64; 2]) {
+fn outline(mask: &mut Image<bool>, a: [i64; 2], b: [i64; 2]) {
     let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
     let steps = dx.abs().max(dy.abs());
     // Along the longer axis every step is a pixel: those before and after the image are left out.

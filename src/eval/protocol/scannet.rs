@@ -6,7 +6,7 @@ use super::score::{
 };
 use crate::eval::{ObjectMaps, Split};
 use crate::photo::{self, stem};
-use crate::scene::{Camera, Plane, Pose};
+use crate::scene::{Camera, Image, Pose};
 use crate::{Error, Result, files};
 use glam::{DMat3, DVec3};
 use std::collections::BTreeMap;
@@ -91,11 +91,11 @@ impl Scan {
 
 impl LabelFiles {
     /// Index in [`LABELS`] per pixel, −1 = unlabelled.
-    fn truth(&self, stem: &str) -> Result<Plane<i32>> {
+    fn truth(&self, stem: &str) -> Result<Image<i32>> {
         let path = self.folder.join(format!("{stem}.png"));
         let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
         let image = photo::stored_pixels(&path)?.to_luma16();
-        let mut out = Plane::filled(image.width() as usize, image.height() as usize, -1);
+        let mut out = Image::filled(image.width() as usize, image.height() as usize, -1);
         for (slot, pixel) in out.data.iter_mut().zip(image.pixels()) {
             let id = u32::from(pixel.0[0]);
             let nyu = match &self.table {
@@ -114,9 +114,9 @@ impl LabelFiles {
 }
 
 impl ObjectMaps for LabelFiles {
-    fn objects(&self, stem: &str) -> Result<Option<Plane<u32>>> {
-        let Plane { width, height, data } = self.truth(stem)?;
-        Ok(Some(Plane { width, height, data: data.into_iter().map(|k| (k + 1) as u32).collect() }))
+    fn objects(&self, stem: &str) -> Result<Option<Image<u32>>> {
+        let Image { width, height, data } = self.truth(stem)?;
+        Ok(Some(Image { width, height, data: data.into_iter().map(|k| (k + 1) as u32).collect() }))
     }
 }
 
@@ -219,7 +219,7 @@ impl Protocol for ScanNet {
         }
         let mask = |k: usize| {
             let data = best.data.iter().map(|&b| b == k as i32).collect();
-            (LABELS[k].to_string(), Plane { width: best.width, height: best.height, data })
+            (LABELS[k].to_string(), Image { width: best.width, height: best.height, data })
         };
         Ok((0..LABELS.len()).map(mask).collect())
     }

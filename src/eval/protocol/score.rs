@@ -3,7 +3,7 @@ use crate::eval::{Evaluation, GroundTruth, Split, to_scene};
 use crate::photo::{join, stem};
 use crate::pose::align::pose_errors;
 use crate::query::{TextQuery, field_relevancy, relevancy_map};
-use crate::scene::{Camera, LanguageField, Plane};
+use crate::scene::{Camera, Image, LanguageField};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -85,7 +85,7 @@ pub struct ProtocolReport {
 }
 
 /// A predicted mask, for whoever wants to keep it: (phrase, mask).
-pub type Masks = Vec<(String, Plane<bool>)>;
+pub type Masks = Vec<(String, Image<bool>)>;
 
 /// A data set under a protocol.
 pub trait Protocol {
@@ -127,21 +127,21 @@ impl CodeScores {
 /// One decoded frame.
 pub struct DecodedView<'a> {
     /// Per level, code per pixel, −1 = nothing there.
-    pub codes: &'a [Plane<i32>],
+    pub codes: &'a [Image<i32>],
     /// Scores of those codes.
     pub scores: &'a CodeScores,
 }
 
 impl DecodedView<'_> {
     /// (level, relevancy map) of the levels that have codes; 0 where nothing is.
-    pub(super) fn relevancy(&self, prompt: usize) -> Vec<(usize, Plane<f32>)> {
+    pub(super) fn relevancy(&self, prompt: usize) -> Vec<(usize, Image<f32>)> {
         let levels = self.codes.iter().zip(&self.scores.relevancy[prompt]).enumerate();
         let levels_with_codes = levels.filter(|(_, (_, values))| !values.is_empty());
         levels_with_codes.map(|(level, (codes, values))| (level, relevancy_map(codes, values))).collect()
     }
 
     /// (level, cosine map) of the levels that have codes; −∞ where nothing is.
-    pub(super) fn cosine(&self, prompt: usize) -> Vec<(usize, Plane<f32>)> {
+    pub(super) fn cosine(&self, prompt: usize) -> Vec<(usize, Image<f32>)> {
         let levels = self.codes.iter().zip(&self.scores.cosine[prompt]).enumerate();
         let levels_with_codes = levels.filter(|(_, (_, values))| !values.is_empty());
         let at = |values: &[f32], k: i32| {
@@ -150,17 +150,17 @@ impl DecodedView<'_> {
         levels_with_codes
             .map(|(level, (codes, values))| {
                 let data = codes.data.par_iter().map(|&k| at(values, k)).collect();
-                (level, Plane { width: codes.width, height: codes.height, data })
+                (level, Image { width: codes.width, height: codes.height, data })
             })
             .collect()
     }
 
     /// Per pixel the prompt with the highest cosine at any level, −1 where nothing is; ties go to
     /// the earlier prompt.
-    pub(super) fn best_prompt(&self) -> Result<Plane<i32>> {
+    pub(super) fn best_prompt(&self) -> Result<Image<i32>> {
         let size =
             self.codes.first().ok_or_else(|| Error::work("the scene has no language level to query"))?;
-        let mut best = Plane::filled(size.width, size.height, (f32::NEG_INFINITY, -1i32));
+        let mut best = Image::filled(size.width, size.height, (f32::NEG_INFINITY, -1i32));
         for prompt in 0..self.scores.cosine.len() {
             for (_, map) in self.cosine(prompt) {
                 for (slot, &v) in best.data.iter_mut().zip(&map.data) {
@@ -171,12 +171,12 @@ impl DecodedView<'_> {
             }
         }
         let data = best.data.iter().map(|b| b.1).collect();
-        Ok(Plane { width: best.width, height: best.height, data })
+        Ok(Image { width: best.width, height: best.height, data })
     }
 }
 
 /// Value of the pixel of `map` under the centre of pixel (x, y) of an image of another size.
-pub(super) fn nearest<T: Copy>(map: &Plane<T>, (x, y): (usize, usize), (width, height): (usize, usize)) -> T {
+pub(super) fn nearest<T: Copy>(map: &Image<T>, (x, y): (usize, usize), (width, height): (usize, usize)) -> T {
     let mx = ((x as f64 + 0.5) * map.width as f64 / width as f64) as usize;
     let my = ((y as f64 + 0.5) * map.height as f64 / height as f64) as usize;
     map.at(mx.min(map.width - 1), my.min(map.height - 1))
@@ -184,7 +184,7 @@ pub(super) fn nearest<T: Copy>(map: &Plane<T>, (x, y): (usize, usize), (width, h
 
 /// Intersection over union; the prediction is resampled to the truth's size by nearest pixel. 0
 /// when both are empty.
-pub(super) fn mask_iou(predicted: &Plane<bool>, truth: &Plane<bool>) -> Result<f64> {
+pub(super) fn mask_iou(predicted: &Image<bool>, truth: &Image<bool>) -> Result<f64> {
     if predicted.data.is_empty() {
         return Err(Error::work("eval: a mask without pixels"));
     }
@@ -261,7 +261,7 @@ impl OwnLabels {
     }
 
     /// Object index per pixel of a view.
-    pub(super) fn objects(&self, view: &LabelledView) -> Result<Option<Plane<u32>>> {
+    pub(super) fn objects(&self, view: &LabelledView) -> Result<Option<Image<u32>>> {
         match self.truth.frames.iter().find(|f| f.stem == view.stem) {
             Some(frame) => self.truth.objects(frame),
             None => Ok(None),

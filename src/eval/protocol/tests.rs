@@ -3,7 +3,7 @@ use super::*;
 use crate::eval::{GroundTruth, Split};
 use crate::math::Random;
 use crate::query::TextQuery;
-use crate::scene::{Codebook, LanguageField, LevelField, Plane, Pose};
+use crate::scene::{Codebook, Image, LanguageField, LevelField, Pose};
 use glam::DVec3;
 
 fn unit(random: &mut Random) -> Vec<f32> {
@@ -36,13 +36,13 @@ fn query(text: &str, random: &mut Random) -> TextQuery {
 }
 
 /// Blocks of random codes, some void.
-fn codes(width: usize, height: usize, random: &mut Random) -> Vec<Plane<i32>> {
+fn codes(width: usize, height: usize, random: &mut Random) -> Vec<Image<i32>> {
     let one = |random: &mut Random| {
         let blocks: Vec<i32> = (0..48).map(|_| (random.uniform() * 6.0) as i32 - 1).collect();
         let data = (0..width * height).map(|p| blocks[p / width * 6 / height * 8 + p % width * 8 / width]);
-        Plane { width, height, data: data.collect() }
+        Image { width, height, data: data.collect() }
     };
-    vec![one(random), Plane::filled(width, height, -1), one(random)]
+    vec![one(random), Image::filled(width, height, -1), one(random)]
 }
 
 /// Relevancy of a vector in f64.
@@ -55,7 +55,7 @@ fn oracle_relevancy(phi: &[f32], q: &TextQuery) -> f64 {
     q.canonicals.chunks(3).map(against).fold(1.0, f64::min)
 }
 
-fn oracle_map(field: &LanguageField, codes: &[Plane<i32>], level: usize, q: &TextQuery) -> Vec<f64> {
+fn oracle_map(field: &LanguageField, codes: &[Image<i32>], level: usize, q: &TextQuery) -> Vec<f64> {
     let rows: Vec<&[f32]> = field.levels[level].codebook.embeddings.chunks(3).collect();
     // one value per code, as f32, so that equal pixels are equal in both computations
     let value = |&k: &i32| if k < 0 { 0.0 } else { oracle_relevancy(rows[k as usize], q) as f32 as f64 };
@@ -234,8 +234,8 @@ fn lerf_ties_go_to_the_finer_level_and_larger_labels_resample() {
     let best = (0..5).max_by(|&a, &b| rows[a].total_cmp(&rows[b])).unwrap() as i32;
     // the left half is the best code, the right half void; both levels alike
     let data = (0..W * H).map(|p| if p % W < W / 2 { best } else { -1 }).collect();
-    let map = Plane { width: W, height: H, data };
-    let codes = vec![map.clone(), Plane::filled(W, H, -1), map];
+    let map = Image { width: W, height: H, data };
+    let codes = vec![map.clone(), Image::filled(W, H, -1), map];
     let mut protocol = open(ProtocolKind::Lerf, folder.path(), &scene, &[]).unwrap();
     let scores = CodeScores::new(&field, &[q]).unwrap();
     protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
@@ -252,7 +252,7 @@ fn polygons_equal_crossing_numbers_and_outlines() {
     for case in 0..200 {
         let n = 1 + case % 7;
         let polygon: Vec<[f64; 2]> = (0..n).map(|_| [0; 2].map(|_| random.uniform() * 50.0 - 10.0)).collect();
-        let mut mask = Plane::filled(30, 30, false);
+        let mut mask = Image::filled(30, 30, false);
         polygon::fill(&mut mask, &polygon);
         let p: Vec<[f64; 2]> = polygon.iter().map(|v| v.map(f64::trunc)).collect();
         for y in 0..30 {
@@ -282,7 +282,7 @@ fn polygons_equal_crossing_numbers_and_outlines() {
             }
         }
     }
-    let mut empty = Plane::filled(4, 4, false);
+    let mut empty = Image::filled(4, 4, false);
     polygon::fill(&mut empty, &[]);
     assert!(empty.data.iter().all(|m| !m));
 }
@@ -522,7 +522,7 @@ fn own_ground_truth_serves_lerf_and_ovs() {
     let field =
         LanguageField { levels: vec![LevelField { codebook, ..LevelField::default() }], space: "x".into() };
     let data = objects.data.iter().map(|&o| o as i32).collect();
-    let codes = [Plane { width: objects.width, height: objects.height, data }];
+    let codes = [Image { width: objects.width, height: objects.height, data }];
     let ask = |phrase: &String| {
         let label = truth.labels.iter().find(|(_, p)| *p == phrase).unwrap().0;
         let axis = |k: u32| (0..13).map(|i| f32::from(u8::from(i == k))).collect::<Vec<f32>>();

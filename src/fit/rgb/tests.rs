@@ -6,7 +6,7 @@ use crate::gpu::test_device;
 use crate::pass::Renderer;
 use crate::preset::Preset;
 use crate::scene::seeded;
-use crate::scene::{Plane, Pose};
+use crate::scene::{Image, Pose};
 use glam::DVec3;
 
 fn turned(camera: &Camera, by: DVec3) -> Camera {
@@ -59,7 +59,7 @@ fn refined_cameras_that_explain_the_photos_worse_are_not_kept() {
 /// The right half of a photo is not used.
 fn left_half(width: usize, height: usize, outside: Outside) -> Coverage {
     let share = (0..width * height).map(|i| if i % width < width / 2 { 1.0 } else { 0.0 }).collect();
-    Coverage { share: Plane { width, height, data: share }, outside }
+    Coverage { share: Image { width, height, data: share }, outside }
 }
 
 #[test]

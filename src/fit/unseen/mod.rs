@@ -159,7 +159,7 @@ fn push(splats: &mut Splats, c: &UnseenSplat) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Plane, Pose};
+    use crate::scene::{Image, Pose};
 
     fn camera() -> Camera {
         Camera {
@@ -180,7 +180,7 @@ mod tests {
         let camera = camera();
         let centre = camera.pose.centre();
         let mut image = RgbImage { width: 160, height: 120, data: Vec::new() };
-        let mut depth = Plane::filled(160, 120, 0.0f32);
+        let mut depth = Image::filled(160, 120, 0.0f32);
         for i in 0..160 * 120 {
             let pixel = DVec2::new((i % 160) as f64 + 0.5, (i / 160) as f64 + 0.5);
             let ray = camera.pose.inverse().rotation * camera.ray(pixel);
@@ -189,7 +189,7 @@ mod tests {
             depth.data[i] = (if object { 0.7 * z } else { z }) as f32;
             image.data.push(if object { [1.0, 0.0, 0.0] } else { [0.2, 0.5, 0.7] });
         }
-        let confidence = Plane::filled(160, 120, 1.0);
+        let confidence = Image::filled(160, 120, 1.0);
         (image, DepthMap { depth, confidence })
     }
 
@@ -257,9 +257,9 @@ mod tests {
     /// A photo of walls parallel to its image: depth and colour by pixel; depth 0 is unknown.
     fn walls(at: impl Fn(usize, usize) -> (f32, [f32; 3])) -> (RgbImage, DepthMap) {
         let pixels: Vec<_> = (0..160 * 120).map(|i| at(i % 160, i / 160)).collect();
-        let depth = Plane { width: 160, height: 120, data: pixels.iter().map(|p| p.0).collect() };
+        let depth = Image { width: 160, height: 120, data: pixels.iter().map(|p| p.0).collect() };
         let image = RgbImage { width: 160, height: 120, data: pixels.iter().map(|p| p.1).collect() };
-        (image, DepthMap { depth, confidence: Plane::filled(160, 120, 1.0) })
+        (image, DepthMap { depth, confidence: Image::filled(160, 120, 1.0) })
     }
 
     #[test]

@@ -8,7 +8,7 @@ use crate::language::dir::TextEmbeddings;
 use crate::progress::Progress;
 use crate::query::CANONICAL_PHRASES;
 use crate::query::presence::MIN_OTHERS;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -107,7 +107,7 @@ impl RegionEncoder for DirTexts {
     fn embed_regions(
         &mut self,
         _: &RgbImage,
-        _: &Plane<i32>,
+        _: &Image<i32>,
         _: usize,
         _: &dyn Progress,
     ) -> Result<Vec<f32>> {

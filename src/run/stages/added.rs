@@ -13,7 +13,7 @@ use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, SparseModel};
 use crate::run::base::BaseScene;
 use crate::run::view::{self, Viewer};
-use crate::scene::{Camera, DepthMap, Plane, Splats, Up};
+use crate::scene::{Camera, DepthMap, Image, Splats, Up};
 use crate::{Error, Result};
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -92,7 +92,7 @@ impl Stage for AddedDepth {
         let (count, all) = (self.base.known.photos.len(), placed.photos.len());
         let shown = shown_splats(&self.base, usize::MAX, context)?;
         let mut renderer = Renderer::new(context.device, &shown, &[], 0)?;
-        let rendered: Vec<Plane<f32>> =
+        let rendered: Vec<Image<f32>> =
             model.cameras.iter().map(|c| Ok(renderer.render(c)?.depth)).collect::<Result<_>>()?;
 
         let views = with_neighbours(model, count, all);
@@ -157,10 +157,10 @@ fn with_neighbours(model: &SparseModel, known: usize, all: usize) -> Vec<usize> 
 }
 
 /// Depth as the scene renders it, as sure as where several photos agreed on it: they trained it.
-fn trusted(depth: &Plane<f32>) -> DepthMap {
+fn trusted(depth: &Image<f32>) -> DepthMap {
     let confidence = depth.data.iter().map(|z| if *z > 0.0 { 0.9 } else { 0.0 }).collect();
     DepthMap {
-        confidence: Plane { width: depth.width, height: depth.height, data: confidence },
+        confidence: Image { width: depth.width, height: depth.height, data: confidence },
         depth: depth.clone(),
     }
 }
@@ -190,7 +190,7 @@ impl Stage for TrainOn {
     fn run(self, (placed, geometry): (&PlacedPhotos, &Geometry), context: &Context) -> Result<Trained> {
         let (count, all) = (self.base.known.photos.len(), placed.photos.len());
         let most = self.options.init.max_points;
-        let options = self.options.going_on(count, all - count);
+        let options = self.options.for_continuation(count, all - count);
         // As many splats on surfaces in the end as a run with all photos has.
         let fresh = geometry.points.len().min(options.init.max_points);
         let scene = shown_splats(&self.base, most - fresh, context)?;

@@ -10,7 +10,7 @@ use crate::language::{ViewMasks, dir, graph};
 use crate::photo::Photo;
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::progress::Progress;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use rayon::prelude::*;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -22,17 +22,17 @@ impl Stage for ContourMaps {
     const NAME: &'static str = "edges";
     const LANE: Lane = Lane::Processor;
     type Inputs = (Output<PlacedPhotos>,);
-    type Output = Vec<Plane<f32>>;
+    type Output = Vec<Image<f32>>;
 
     fn settings(&self) -> String {
         String::new()
     }
 
-    fn codec() -> Option<Codec<Vec<Plane<f32>>>> {
+    fn codec() -> Option<Codec<Vec<Image<f32>>>> {
         kept()
     }
 
-    fn run(self, (placed,): (&PlacedPhotos,), context: &Context) -> Result<Vec<Plane<f32>>> {
+    fn run(self, (placed,): (&PlacedPhotos,), context: &Context) -> Result<Vec<Image<f32>>> {
         let progress = context.progress;
         progress.begin("edges", placed.photos.len() as u64);
         let mut network = Hed::load(context.registry)?;
@@ -53,7 +53,7 @@ pub struct GraphMasks;
 impl Stage for GraphMasks {
     const NAME: &'static str = "graph-masks";
     const LANE: Lane = Lane::Processor;
-    type Inputs = (Output<PlacedPhotos>, Output<Vec<Plane<f32>>>);
+    type Inputs = (Output<PlacedPhotos>, Output<Vec<Image<f32>>>);
     type Output = Vec<ViewMasks>;
 
     fn settings(&self) -> String {
@@ -62,14 +62,14 @@ impl Stage for GraphMasks {
 
     fn run(
         self,
-        (placed, edges): (&PlacedPhotos, &Vec<Plane<f32>>),
+        (placed, edges): (&PlacedPhotos, &Vec<Image<f32>>),
         context: &Context,
     ) -> Result<Vec<ViewMasks>> {
         let progress = context.progress;
         progress.begin("masks", placed.photos.len() as u64);
         let done = AtomicU64::new(0);
         let options = graph::GraphOptions::default();
-        let one = |(photo, edges): (&Photo, &Plane<f32>)| {
+        let one = |(photo, edges): (&Photo, &Image<f32>)| {
             progress.check()?;
             let masks = graph::segment(&photo.image, edges, &options)?;
             progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
@@ -266,7 +266,7 @@ mod tests {
         fn embed_regions(
             &mut self,
             _: &RgbImage,
-            labels: &Plane<i32>,
+            labels: &Image<i32>,
             count: usize,
             progress: &dyn Progress,
         ) -> Result<Vec<f32>> {
@@ -282,7 +282,7 @@ mod tests {
     #[test]
     fn an_encoder_sees_masks_whole_whatever_lies_on_them() {
         let image = RgbImage { width: 4, height: 1, data: vec![[0.5; 3]; 4] };
-        let map = |data: [i32; 4]| Plane { width: 4, height: 1, data: data.to_vec() };
+        let map = |data: [i32; 4]| Image { width: 4, height: 1, data: data.to_vec() };
         // Mask 0 is three pixels long, mask 1 lies on two of them.
         let level = LevelMasks {
             labels: map([0, 1, 1, -1]),

@@ -1,7 +1,7 @@
 //! Passes over plain arrays: scan, gather, sum, sort.
 use splatvk::gpu::{Device, Recorder, shaders};
 use splatvk::math::Random;
-use splatvk::pass::sort::{Shape, Sort, sort_pairs};
+use splatvk::pass::sort::{Sort, SortAlgorithm, sort_pairs};
 use splatvk::pass::{compact, scan, sum};
 
 fn words(n: usize, below: u64, seed: u64) -> Vec<u32> {
@@ -55,7 +55,7 @@ pub fn sum(device: &Device) {
     }
 }
 
-fn sort(device: &Device, shape: Shape) {
+fn sort(device: &Device, shape: SortAlgorithm) {
     for (n, all, bits, range) in [
         (0, 5, 32, 9),
         (1, 1, 32, 9),
@@ -78,11 +78,11 @@ fn sort(device: &Device, shape: Shape) {
 }
 
 pub fn sort_chunks(device: &Device) {
-    sort(device, Shape::Chunks);
+    sort(device, SortAlgorithm::Chunks);
 }
 
 pub fn sort_sweep(device: &Device) {
-    sort(device, Shape::Sweep);
+    sort(device, SortAlgorithm::Sweep);
 }
 
 /// The shaders of `splatvk bench`.

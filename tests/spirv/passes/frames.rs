@@ -6,8 +6,8 @@ use crate::support::{
 use splatvk::gpu::{Device, Recorder};
 use splatvk::math::Random;
 use splatvk::pass::pack::{Encoding, FrameChannel, texels, texels_of};
-use splatvk::pass::raster_forward::{Cutoffs, TwinScene, walk};
-use splatvk::pass::{DeviceChoices, FeatureMode, Rasterizer, Summation};
+use splatvk::pass::raster_forward::{Cutoffs, ReferenceScene, walk};
+use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction, Rasterizer};
 use splatvk::pass::{decode as decoding, pack as packing, pairs as counting};
 use splatvk::scene::seeded;
 
@@ -20,7 +20,7 @@ fn scene(n: usize, sh_degree: u32, dim: usize, seed: u64) -> Scene {
 fn there_and_back(device: &Device, scene: &Scene, ways: DeviceChoices) {
     let (params, mut raster) = scene.upload_for(device, ways);
     raster.forward(&params, &scene.options).unwrap();
-    assert_images(&rendered(&raster), &scene.twin());
+    assert_images(&rendered(&raster), &scene.reference());
     let upstream = scene.upstream(7);
     assert_gradients(scene, &scene.gradients_by(device, ways, &upstream), 7);
 }
@@ -28,7 +28,7 @@ fn there_and_back(device: &Device, scene: &Scene, ways: DeviceChoices) {
 /// One program.
 pub fn image(device: &Device) {
     let scene = scene(40, 1, 3, 1048);
-    assert_images(&scene.render(device), &scene.twin());
+    assert_images(&scene.render(device), &scene.reference());
 }
 
 /// No splat, one, none in view, fewer pixels than a tile, and lists that have to grow.
@@ -51,21 +51,21 @@ pub fn edge_cases(device: &Device) {
     there_and_back(device, &beyond, DeviceChoices::of(device));
 }
 
-/// Band by band, against the twin of the whole: 8 planes of 6000 pixels do not fit in 128 KiB.
+/// Band by band, against the reference of the whole: 8 planes of 6000 pixels do not fit in 128 KiB.
 pub fn bands(device: &Device) {
     let (splats, camera) = seeded::small(12, 40, 150, 0, 1052);
     let scene = Scene::new(splats, &camera, 3, 1052);
     let upstream = scene.upstream(7);
-    for summation in [Summation::Atomics, Summation::Entries] {
+    for summation in [GradientReduction::Atomics, GradientReduction::Entries] {
         let (planes, gradients, count) = in_bands(&scene, device, summation, &upstream);
         assert!(count > 1, "one band");
-        assert_close("planes", &planes, &scene.twin().image.planes, &IMAGE);
+        assert_close("planes", &planes, &scene.reference().image.planes, &IMAGE);
         assert_gradients(&scene, &gradients, 7);
     }
 }
 
 fn by_atomics(device: &Device) -> DeviceChoices {
-    DeviceChoices { summation: Summation::Atomics, ..DeviceChoices::of(device) }
+    DeviceChoices { summation: GradientReduction::Atomics, ..DeviceChoices::of(device) }
 }
 
 pub fn colours(device: &Device) {
@@ -83,18 +83,18 @@ pub fn eight_features(device: &Device) {
     let ways = by_atomics(device);
     let (params, mut raster) = scene.upload_for(device, ways);
     raster.forward(&params, &scene.options).unwrap();
-    assert_images(&rendered(&raster), &scene.twin());
+    assert_images(&rendered(&raster), &scene.reference());
     let upstream = scene.upstream(7);
     let gradients = scene.gradients_by(device, ways, &upstream);
     // The features' own gradients are those with coupling, and the geometry's those of the other
     // planes.
     scene.options.features_move_geometry = true;
-    let reference = scene.twin_gradients(&scene.twin(), &upstream);
+    let reference = scene.twin_gradients(&scene.reference(), &upstream);
     assert_class("features", &gradients.features, &reference.params.features);
     let mut without = upstream;
     let pixels = scene.pixels();
     without[4 * pixels..12 * pixels].fill(0.0);
-    let reference = scene.twin_gradients(&scene.twin(), &without);
+    let reference = scene.twin_gradients(&scene.reference(), &without);
     let means: Vec<f64> = reference.params.means.iter().flat_map(|m| m.to_array()).collect();
     assert_class("means", gradients.splats.means.as_flattened(), &means);
 }
@@ -109,14 +109,14 @@ pub fn many_features(device: &Device) {
 /// All widths of a launch that [`many_features`] leaves out, and all degrees, summed entry by
 /// entry.
 pub fn gradients_by_entry(device: &Device) {
-    let ways = DeviceChoices { summation: Summation::Entries, ..DeviceChoices::of(device) };
+    let ways = DeviceChoices { summation: GradientReduction::Entries, ..DeviceChoices::of(device) };
     for (n, sh_degree, dim) in [(40, 2, 0), (20, 1, 3), (20, 3, 8), (15, 0, 16), (12, 0, 37)] {
         let scene = scene(n, sh_degree, dim, 1043 + dim as u64);
         there_and_back(device, &scene, ways);
     }
 }
 
-/// Tile lists in both ways, against the twin's.
+/// Tile lists in both ways, against the reference's.
 pub fn lists_by_counting(device: &Device) {
     let (total, extra) = assert_lists(device, &scene(60, 0, 0, 1044));
     assert!(total > 50 && extra * 20 < total, "{extra} of {total}");
@@ -127,8 +127,8 @@ pub fn pairs(device: &Device) {
     let (params, mut raster) = scene.upload(device);
     raster.forward(&params, &scene.options).unwrap();
     let [evaluated, blended] = counting::count(device, &raster).unwrap();
-    let forward = scene.twin();
-    let twin = TwinScene {
+    let forward = scene.reference();
+    let reference = ReferenceScene {
         projected: &forward.projected,
         features: &[],
         feature_dim: 0,
@@ -136,7 +136,7 @@ pub fn pairs(device: &Device) {
         view: &scene.view,
     };
     let pixels = (0..19).flat_map(|y| (0..27).map(move |x| (x, y)));
-    let expected: usize = pixels.map(|(x, y)| walk(&twin, &Cutoffs::STANDARD, x, y).0.len()).sum();
+    let expected: usize = pixels.map(|(x, y)| walk(&reference, &Cutoffs::STANDARD, x, y).0.len()).sum();
     // f32 and f64 may disagree at the two thresholds for one pair.
     assert!((blended - expected as f64).abs() <= 1.0, "{blended} of {expected}");
     let listed: usize = raster.tile_lists().unwrap().iter().map(Vec::len).sum();

@@ -8,7 +8,7 @@ use splatvk::pass::codes::{self as language, Mode, Targets};
 use splatvk::pass::regularise::{
     alpha_l1, depth_l1, ratio_penalty, record_alpha, record_depth, record_ratio,
 };
-use splatvk::pass::ssim_l1::{self as image_loss, Rows};
+use splatvk::pass::ssim_l1::{self as image_loss, SsimRowKernel};
 
 fn normal(n: usize, seed: u64) -> Vec<f32> {
     let mut random = Random::new(seed);
@@ -86,7 +86,7 @@ pub fn adam(device: &Device) {
     let moments = Moments::new(device, count).unwrap();
     let guard = device.buffer::<u32>("guard", 2).unwrap();
     let mut schedule = Schedule::new(device, 2).unwrap();
-    let (mut twin, mut state) = (wide(&start), vec![[0.0; 2]; count]);
+    let (mut reference, mut state) = (wide(&start), vec![[0.0; 2]; count]);
     for step in 1..=4 {
         let mut g = normal(count, 1065 + step as u64);
         g[5] = f32::NAN;
@@ -99,10 +99,10 @@ pub fn adam(device: &Device) {
         for i in 0..count {
             let rate = rates[usize::from(i % stride >= head)];
             let range = i..i + 1;
-            optimiser::adam(&mut twin[range.clone()], &[f64::from(g[i])], &mut state[range], rate, step);
+            optimiser::adam(&mut reference[range.clone()], &[f64::from(g[i])], &mut state[range], rate, step);
         }
     }
-    for (i, (p, t)) in parameters.read().unwrap().into_iter().zip(&twin).enumerate() {
+    for (i, (p, t)) in parameters.read().unwrap().into_iter().zip(&reference).enumerate() {
         // As in src/pass/adam.rs.
         assert!((f64::from(p) - t).abs() < 2e-6, "{i}: {p} {t}");
     }
@@ -176,7 +176,7 @@ pub fn codes(device: &Device) {
 
 pub fn ssim_l1(device: &Device) {
     let sizes = [(13, 7), (70, 18)];
-    let cases = sizes.into_iter().flat_map(|s| [(s, Rows::Strips), (s, Rows::Shared)]);
+    let cases = sizes.into_iter().flat_map(|s| [(s, SsimRowKernel::Strips), (s, SsimRowKernel::Shared)]);
     for ((w, h), rows, weighted) in cases.flat_map(|(s, r)| [(s, r, false), (s, r, true)]) {
         let weight = |i: usize| if weighted { [0.0f32, 1.0, 0.25][(i % w / 4 + i / w / 3) % 3] } else { 1.0 };
         let weights: Vec<f32> = (0..w * h).map(weight).collect();

@@ -1,4 +1,4 @@
-//! Small scenes for every pass, each compared with its twin. A scene panics where a pass fails or
+//! Small scenes for every pass, each compared with its reference. A scene panics where a pass fails or
 //! differs.
 mod arrays;
 mod frames;

@@ -2,7 +2,7 @@
 use super::npy::{self, NpyArray};
 use super::to_byte;
 use crate::photo::Photo;
-use crate::scene::{Coverage, LEVEL_NAMES, Outside, Plane, RgbImage};
+use crate::scene::{Coverage, Image, LEVEL_NAMES, Outside, RgbImage};
 use crate::{Error, Result};
 use exr::prelude as ex;
 use std::collections::BTreeMap;
@@ -56,7 +56,7 @@ pub(super) fn write_photo(folder: &Path, name: &str, photo: &Photo) -> Result<()
 }
 
 /// 8-bit grey PNG of values in [0, 1].
-pub fn write_grey_png(path: &Path, plane: &Plane<f32>) -> Result<()> {
+pub fn write_grey_png(path: &Path, plane: &Image<f32>) -> Result<()> {
     let bytes: Vec<u8> = plane.data.iter().map(|v| to_byte(*v)).collect();
     write_bytes(path, (plane.width, plane.height), &bytes, image::ExtendedColorType::L8)
 }
@@ -67,7 +67,7 @@ pub fn write_grey_bytes(path: &Path, size: (usize, usize), bytes: &[u8]) -> Resu
 }
 
 /// 8-bit grey PNG, 0 or 255.
-pub fn write_mask_png(path: &Path, plane: &Plane<bool>) -> Result<()> {
+pub fn write_mask_png(path: &Path, plane: &Image<bool>) -> Result<()> {
     let bytes: Vec<u8> = plane.data.iter().map(|v| if *v { 255 } else { 0 }).collect();
     write_bytes(path, (plane.width, plane.height), &bytes, image::ExtendedColorType::L8)
 }
@@ -110,15 +110,15 @@ pub struct Planes<'a> {
     /// R, G, B.
     pub rgb: Option<&'a RgbImage>,
     /// A.
-    pub alpha: Option<&'a Plane<f32>>,
+    pub alpha: Option<&'a Image<f32>>,
     /// Z, scene units.
-    pub depth: Option<&'a Plane<f32>>,
+    pub depth: Option<&'a Image<f32>>,
     /// unseen: share of every pixel that no photo shows.
-    pub unseen: Option<&'a Plane<f32>>,
+    pub unseen: Option<&'a Image<f32>>,
     /// feat.00 …: (d, [H, W, d] values).
     pub features: Option<(usize, &'a [f32])>,
     /// code.s, code.m, code.l: one map per level, −1 = none.
-    pub codes: &'a [Plane<i32>],
+    pub codes: &'a [Image<i32>],
 }
 
 /// Writes a scan-line, ZIP-compressed, 32-bit float OpenEXR file.
@@ -157,7 +157,7 @@ pub fn write_exr(path: &Path, size: (usize, usize), planes: Planes) -> Result<()
 
 /// Reads every channel of the first layer of an OpenEXR file, by name; half floats and integers
 /// become floats.
-pub fn read_exr(path: &Path) -> Result<BTreeMap<String, Plane<f32>>> {
+pub fn read_exr(path: &Path) -> Result<BTreeMap<String, Image<f32>>> {
     use ex::ReadChannels;
     use ex::ReadLayers;
     let reader = ex::read().no_deep_data().largest_resolution_level().all_channels().first_valid_layer();
@@ -167,7 +167,7 @@ pub fn read_exr(path: &Path) -> Result<BTreeMap<String, Plane<f32>>> {
         .map_err(|e| Error::input(format!("{}: not a readable EXR file: {e}", path.display())))?;
     let (width, height) = (image.layer_data.size.x(), image.layer_data.size.y());
     let plane = |c: ex::AnyChannel<ex::FlatSamples>| {
-        (c.name.to_string(), Plane { width, height, data: c.sample_data.values_as_f32().collect() })
+        (c.name.to_string(), Image { width, height, data: c.sample_data.values_as_f32().collect() })
     };
     Ok(image.layer_data.channel_data.list.into_iter().map(plane).collect())
 }
@@ -190,9 +190,9 @@ mod tests {
         let (w, h, d) = (5, 3, 2);
         let rgb =
             RgbImage { width: w, height: h, data: (0..15).map(|i| [i as f32 * 0.1, -1.5, 2.0e5]).collect() };
-        let depth = Plane { width: w, height: h, data: (0..15).map(|i| i as f32 * 1e-3).collect() };
+        let depth = Image { width: w, height: h, data: (0..15).map(|i| i as f32 * 1e-3).collect() };
         let features: Vec<f32> = (0..30).map(|i| i as f32).collect();
-        let codes = Plane { width: w, height: h, data: (-1..14).collect::<Vec<i32>>() };
+        let codes = Image { width: w, height: h, data: (-1..14).collect::<Vec<i32>>() };
         let planes = Planes {
             rgb: Some(&rgb),
             depth: Some(&depth),

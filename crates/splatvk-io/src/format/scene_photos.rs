@@ -1,7 +1,7 @@
 //! The photos that a scene directory keeps: their working images, and what was read of their files
 //! and taken out of them.
 use crate::photo::{self, Photo};
-use crate::scene::{Camera, Coverage, Outside, Plane, RgbImage};
+use crate::scene::{Camera, Coverage, Image, Outside, RgbImage};
 use crate::{Error, Result, files};
 use std::path::{Path, PathBuf};
 
@@ -14,7 +14,7 @@ pub(super) fn write(cameras: &Path, photos: &[Photo]) -> Result<()> {
         let image = RgbImage { width: p.image.width, height: p.image.height, data: Vec::new() };
         // Its folder is nobody's business who gets the scene.
         let path = p.path.file_name().map_or_else(|| p.path.clone(), PathBuf::from);
-        let none = Plane { width: p.image.width, height: p.image.height, data: Vec::new() };
+        let none = Image { width: p.image.width, height: p.image.height, data: Vec::new() };
         let coverage = p.coverage.as_ref().map(|c| Coverage { share: none, ..c.clone() });
         Photo { image, path, coverage, fine: None, ..p.clone() }
     };
@@ -80,10 +80,10 @@ fn check_size(path: &Path, photo: &Photo) -> Result<()> {
 }
 
 /// The share of every pixel that is used.
-fn mask(cameras: &Path, photo: &Photo) -> Result<Plane<f32>> {
+fn mask(cameras: &Path, photo: &Photo) -> Result<Image<f32>> {
     let path = own_file(cameras, "masks", photo)?;
     check_size(&path, photo)?;
     let data =
         photo::stored_pixels(&path)?.to_luma8().as_raw().iter().map(|v| f32::from(*v) / 255.0).collect();
-    Ok(Plane { width: photo.image.width, height: photo.image.height, data })
+    Ok(Image { width: photo.image.width, height: photo.image.height, data })
 }

@@ -195,7 +195,7 @@ pub(super) fn message(photos: &[Photo], bars: &[Bars]) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Camera, Coverage, Plane, Pose};
+    use crate::scene::{Camera, Coverage, Image, Pose};
 
     const SIZE: (usize, usize) = (160, 120);
 
@@ -254,7 +254,7 @@ mod tests {
         assert_eq!(find(&photos).len(), 2);
         let (width, height) = SIZE;
         let bars = (0..width * height).map(|i| !(26..94).contains(&(i / width))).collect();
-        let hidden = Plane { width, height, data: bars };
+        let hidden = Image { width, height, data: bars };
         photos.iter_mut().for_each(|p| p.coverage = Some(Coverage::without(None, &hidden)));
         assert!(find(&photos).is_empty());
     }
@@ -277,7 +277,7 @@ mod tests {
         let mut cut = photo(1, |_, _| None);
         let bars = PlainBorder { left: 20, top: 10, right: 0, bottom: 30 };
         let hidden =
-            Plane { width: 160, height: 120, data: (0..160 * 120).map(|i| i == 160 * 12 + 25).collect() };
+            Image { width: 160, height: 120, data: (0..160 * 120).map(|i| i == 160 * 12 + 25).collect() };
         cut.coverage = Some(Coverage::without(None, &hidden));
         cut.cut(bars);
         assert!(

@@ -8,7 +8,7 @@ use super::overlay::Overlay;
 use super::straighten::Straightening;
 use super::turn::Turn;
 use crate::scene::resize;
-use crate::scene::{Affine, Camera, Coverage, Lens, Outside, Plane, RgbImage};
+use crate::scene::{Affine, Camera, Coverage, Image, Lens, Outside, RgbImage};
 use crate::{Error, Result, files};
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -56,7 +56,7 @@ pub struct Photo {
     /// Luma of the photo at more pixels than the working image has, for measuring positions; where
     /// there are more.
     #[serde(skip)]
-    pub fine: Option<Arc<Plane<f32>>>,
+    pub fine: Option<Arc<Image<f32>>>,
     /// Pixels of the file whose values are not finite numbers, which are read as black.
     pub lost_pixels: usize,
     /// Which pixels are used; `None` = all. Those that are not continue the others smoothly in
@@ -138,7 +138,7 @@ impl Photo {
     }
 
     /// Leaves `hidden` out of [`Photo::coverage`], instead of the overlay that was left out so far.
-    pub fn set_overlay(&mut self, hidden: Option<Plane<bool>>) {
+    pub fn set_overlay(&mut self, hidden: Option<Image<bool>>) {
         let before = match self.overlay.take() {
             Some(overlay) => overlay.before,
             None => self.coverage.take(),
@@ -303,7 +303,7 @@ pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>, max_size: 
 pub fn from_used_pixels(
     name: &Path,
     image: &RgbImage,
-    used: &Plane<bool>,
+    used: &Image<bool>,
     focal: Option<f64>,
     max_size: usize,
 ) -> Result<Photo> {
@@ -430,7 +430,7 @@ mod tests {
         let (width, height) = (64, 64);
         let image = RgbImage { width, height, data: vec![[0.5; 3]; width * height] };
         let mut photo = from_pixels("a.png".as_ref(), &image, None, 64).unwrap();
-        let plane = |of: &dyn Fn(usize) -> bool| Plane {
+        let plane = |of: &dyn Fn(usize) -> bool| Image {
             width,
             height,
             data: (0..width * height).map(|i| of(i % width)).collect::<Vec<bool>>(),

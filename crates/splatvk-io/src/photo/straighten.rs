@@ -1,5 +1,5 @@
 //! Photos resampled to a pinhole without distortion.
-use crate::scene::{Camera, Lens, Plane, RgbImage};
+use crate::scene::{Camera, Image, Lens, RgbImage};
 use glam::DVec2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -51,15 +51,15 @@ impl Straightening {
     }
 
     /// [`Straightening::image`] of one channel.
-    pub fn plane(&self, plane: &Plane<f32>) -> Plane<f32> {
+    pub fn plane(&self, plane: &Image<f32>) -> Image<f32> {
         let size = (plane.width, plane.height);
         let data = resampled(size, |x, y| [plane.at(x, y)], |p| self.source(p));
-        Plane { width: size.0, height: size.1, data: data.into_iter().map(|[v]| v).collect() }
+        Image { width: size.0, height: size.1, data: data.into_iter().map(|[v]| v).collect() }
     }
 
     /// [`Straightening::plane`] of a picture that is larger than the one that is meant, which is
     /// `width` pixels wide.
-    pub(super) fn larger(&self, plane: &Plane<f32>, width: usize) -> Plane<f32> {
+    pub(super) fn larger(&self, plane: &Image<f32>, width: usize) -> Image<f32> {
         self.resized(plane.width as f64 / width as f64).plane(plane)
     }
 }

@@ -1,5 +1,5 @@
 //! Fine over-segmentation: graph merging after Felzenszwalb and Huttenlocher (IJCV 2004).
-use crate::scene::Plane;
+use crate::scene::Image;
 
 /// Disjoint sets of pixels with size and internal difference.
 struct Forest {
@@ -35,7 +35,7 @@ pub fn superpixels(
     scale: f32,
     min_size: u32,
     weight: impl Fn(usize, usize) -> f32,
-) -> (Plane<i32>, usize) {
+) -> (Image<i32>, usize) {
     let count = width * height;
     let mut edges: Vec<(f32, u32, u32)> = Vec::with_capacity(4 * count);
     for y in 0..height {
@@ -74,7 +74,7 @@ pub fn superpixels(
     }
     let mut index = vec![-1i32; count];
     let mut next = 0;
-    let mut labels = Plane::filled(width, height, 0i32);
+    let mut labels = Image::filled(width, height, 0i32);
     for p in 0..count {
         let root = forest.find(p);
         if index[root] < 0 {

@@ -1,7 +1,7 @@
 //! Pixel correspondences between two views: from dense matches
 //! (docs/internals/method.md#pixel-matching) and from depth and poses
 //! (docs/internals/method.md#reprojection).
-use crate::scene::{Camera, DenseWarp, DepthMap, Plane};
+use crate::scene::{Camera, DenseWarp, DepthMap, Image};
 use glam::DVec2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -109,7 +109,7 @@ fn pixel(q: [f32; 2], width: usize, height: usize) -> Option<usize> {
 /// Return position at q: the value of q's pixel shifted by q's offset from that pixel's centre,
 /// that is a first-order step with the identity Jacobian, which does not smear across
 /// discontinuities as interpolation would.
-fn sample(map: &Plane<[f32; 2]>, q: [f32; 2]) -> [f32; 2] {
+fn sample(map: &Image<[f32; 2]>, q: [f32; 2]) -> [f32; 2] {
     let (x, y) = (q[0] as usize, q[1] as usize);
     let v = map.at(x.min(map.width - 1), y.min(map.height - 1));
     [v[0] + (q[0] - x as f32 - 0.5), v[1] + (q[1] - y as f32 - 0.5)]
@@ -173,7 +173,7 @@ fn project(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) -> Li
 
 /// Depth at a position: bilinear on one surface, else that of the pixel it falls into; ≤ 0 when
 /// unknown.
-fn surface_depth(depth: &Plane<f32>, q: [f32; 2], index: usize) -> f64 {
+fn surface_depth(depth: &Image<f32>, q: [f32; 2], index: usize) -> f64 {
     let nearest = depth.data[index] as f64;
     let (fx, fy) = (q[0] - 0.5, q[1] - 0.5);
     if fx < 0.0 || fy < 0.0 || fx as usize + 1 >= depth.width || fy as usize + 1 >= depth.height {

@@ -3,12 +3,12 @@ use super::super::ViewMasks;
 use super::links::{Links, PairLinks};
 use super::{AlignOptions, AreaScore, Edge, Fusion};
 use crate::math::dot;
-use crate::scene::{MaskId, Plane};
+use crate::scene::{Image, MaskId};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// The masks of one level over all views, with the labels that fusion may change.
 pub(super) struct LevelState {
-    pub labels: Vec<Plane<i32>>,
+    pub labels: Vec<Image<i32>>,
     /// [view][mask · D] unit rows.
     pub features: Vec<Vec<f32>>,
     pub quality: Vec<Vec<f32>>,

@@ -1,6 +1,6 @@
 use super::score::{LevelState, fuse, match_proposals};
 use super::*;
-use crate::scene::{Camera, DenseWarp, DepthMap, MaskId, Plane, Pose};
+use crate::scene::{Camera, DenseWarp, DepthMap, Image, MaskId, Pose};
 use crate::{LevelMasks, matcher};
 use glam::DVec3;
 use splatvk_test_support::breakfast::{TestView, train_views};
@@ -29,9 +29,9 @@ impl Noise {
     }
 }
 
-fn exact_depth(depth: &Plane<f32>) -> DepthMap {
+fn exact_depth(depth: &Image<f32>) -> DepthMap {
     let known = depth.data.iter().map(|&z| f32::from(z > 0.0)).collect();
-    DepthMap { depth: depth.clone(), confidence: Plane { data: known, ..*depth } }
+    DepthMap { depth: depth.clone(), confidence: Image { data: known, ..*depth } }
 }
 
 /// The breakfast views with their true masks; in level l every second view cuts every other object
@@ -210,7 +210,7 @@ fn higher_thresholds_never_add_edges() {
 
 /// A view of a wall at z = 4 with a thin pole at z = 2, camera shifted by `x` and backed off by
 /// `back`.
-fn pole_view(x: f64, back: f64) -> (Camera, DepthMap, Plane<i32>) {
+fn pole_view(x: f64, back: f64) -> (Camera, DepthMap, Image<i32>) {
     let (width, height) = (160, 120);
     let pose = Pose { translation: DVec3::new(-x, 0.0, back), ..Pose::IDENTITY };
     let camera = Camera {
@@ -223,8 +223,8 @@ fn pole_view(x: f64, back: f64) -> (Camera, DepthMap, Plane<i32>) {
         cy: 60.0,
         pose,
     };
-    let mut depth = Plane::filled(width, height, 0.0f32);
-    let mut labels = Plane::filled(width, height, 0);
+    let mut depth = Image::filled(width, height, 0.0f32);
+    let mut labels = Image::filled(width, height, 0);
     for row in 0..height {
         for col in 0..width {
             let ray = camera.ray(glam::DVec2::new(col as f64 + 0.5, row as f64 + 0.5));
@@ -245,7 +245,7 @@ fn pole_view(x: f64, back: f64) -> (Camera, DepthMap, Plane<i32>) {
 }
 
 /// All three masks look alike, so that only geometry can tell them apart.
-fn alike(labels: Plane<i32>) -> ViewMasks {
+fn alike(labels: Image<i32>) -> ViewMasks {
     let mut row = [0.0; DIM];
     row[0] = 1.0;
     let level =
@@ -281,7 +281,7 @@ fn geometry_deletes_a_match_that_it_contradicts() {
     let view = |features: &[f32], label: &dyn Fn(usize) -> i32| {
         let data = (0..width * height).map(|p| label(p % width)).collect();
         let level = LevelMasks {
-            labels: Plane { width, height, data },
+            labels: Image { width, height, data },
             quality: vec![1.0; features.len() / 2],
             features: features.to_vec(),
             ..LevelMasks::default()
@@ -332,8 +332,8 @@ fn duplicates_empty_levels_and_single_views() {
     let twice = [s.views[0].clone(), s.views[0].clone()];
     let (w, h) = (640, 480);
     let home = |p: usize| [(p % w) as f32 + 0.5, (p / w) as f32 + 0.5];
-    let target = Plane { width: w, height: h, data: (0..w * h).map(home).collect() };
-    let same = DenseWarp { target, certainty: Plane::filled(w, h, 1.0) };
+    let target = Image { width: w, height: h, data: (0..w * h).map(home).collect() };
+    let same = DenseWarp { target, certainty: Image::filled(w, h, 1.0) };
     let matched = [links_from_warps(0, 1, &same, &same)];
     let a = align(&twice, &matched, &[], &AlignOptions::default()).unwrap();
     assert!(!a.report[1].edges.is_empty());
@@ -344,7 +344,7 @@ fn duplicates_empty_levels_and_single_views() {
     let alone = align(&s.views[..1], &[], &[], &AlignOptions::default()).unwrap();
     assert_eq!(alone.components[0].len(), s.object[0].len());
     let mut holed = s.views.clone();
-    holed[1].levels[0] = LevelMasks { labels: Plane::filled(w, h, -1), ..LevelMasks::default() };
+    holed[1].levels[0] = LevelMasks { labels: Image::filled(w, h, -1), ..LevelMasks::default() };
     let a = align(&holed, &s.matched(), &s.projected(), &AlignOptions::default()).unwrap();
     assert!(a.components[0].iter().flat_map(|c| &c.members).all(|m| m.view != 1));
     assert!(align(&[], &[], &[], &AlignOptions::default()).unwrap().components.is_empty());
@@ -359,7 +359,7 @@ fn a_mask_of_two_fusion_sets_takes_the_feature_of_the_stronger() {
         let unit = |r: &[f32; 3]| r.map(|v| v / r.iter().map(|v| v * v).sum::<f32>().sqrt());
         let data = (0..width * height).map(|p| label(p % width)).collect();
         let level = LevelMasks {
-            labels: Plane { width, height, data },
+            labels: Image { width, height, data },
             quality: vec![1.0; rows.len()],
             features: rows.iter().flat_map(unit).collect(),
             ..LevelMasks::default()
@@ -390,20 +390,20 @@ fn the_authors_ratio_knows_only_things_that_stay_in_place() {
     let view = |first: usize| {
         let data =
             (0..width * height).map(|p| if (first..first + 10).contains(&(p % width)) { 0 } else { -1 });
-        let labels = Plane { width, height, data: data.collect() };
+        let labels = Image { width, height, data: data.collect() };
         let level =
             LevelMasks { labels, quality: vec![1.0], features: vec![1.0, 0.0], ..LevelMasks::default() };
         ViewMasks { levels: vec![level] }
     };
     let warp = |shift: f32, from: usize| DenseWarp {
-        target: Plane {
+        target: Image {
             width,
             height,
             data: (0..width * height)
                 .map(|p| [(p % width) as f32 + 0.5 + shift, (p / width) as f32 + 0.5])
                 .collect(),
         },
-        certainty: Plane {
+        certainty: Image {
             width,
             height,
             data: (0..width * height)

@@ -6,7 +6,7 @@
 //! cut by itself, so that what it holds does not hang on what a coarser one took.
 use super::options::{Cues, GraphOptions};
 use super::tree::Tree;
-use crate::scene::Plane;
+use crate::scene::Image;
 use crate::{LevelMasks, ViewMasks};
 use std::collections::BTreeMap;
 
@@ -104,7 +104,7 @@ fn paint(tree: &Tree, cues: &Cues, chosen: &[usize]) -> LevelMasks {
     }
     let value = |&l: &i32| if mask_of[l as usize] == NONE { -1 } else { mask_of[l as usize] as i32 };
     let (width, height) = (cues.labels.width, cues.labels.height);
-    let labels = Plane { width, height, data: cues.labels.data.iter().map(value).collect() };
+    let labels = Image { width, height, data: cues.labels.data.iter().map(value).collect() };
     LevelMasks { labels, quality: vec![1.0; chosen.len()], ..LevelMasks::default() }
 }
 

@@ -12,13 +12,13 @@ mod tests;
 pub use options::GraphOptions;
 
 use super::ViewMasks;
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
 use options::Cues;
 
 /// Cuts one photo into masks of three levels. `edges` is a boundary probability per pixel, of the
 /// photo's size.
-pub fn segment(image: &RgbImage, edges: &Plane<f32>, options: &GraphOptions) -> Result<ViewMasks> {
+pub fn segment(image: &RgbImage, edges: &Image<f32>, options: &GraphOptions) -> Result<ViewMasks> {
     let (width, height) = (image.width, image.height);
     if (edges.width, edges.height) != (width, height) {
         let (w, h) = (edges.width, edges.height);
@@ -29,7 +29,7 @@ pub fn segment(image: &RgbImage, edges: &Plane<f32>, options: &GraphOptions) -> 
     Ok(levels::cut(&tree, &cues, options))
 }
 
-fn cues<'a>(image: &RgbImage, edges: &'a Plane<f32>, options: &GraphOptions) -> Cues<'a> {
+fn cues<'a>(image: &RgbImage, edges: &'a Image<f32>, options: &GraphOptions) -> Cues<'a> {
     let (width, height) = (image.width, image.height);
     let lab = pixels::smooth_lab(image, options::SMOOTHING);
     let linear = ((width * height) as f32 / (640.0 * 480.0)).sqrt();

@@ -2,7 +2,7 @@
 //! changed, from 0.948: the best-of-three IoU and that with one level per object (`splatvk bench
 //! masks`), each on breakfast and on generated scenes (tuning sets,
 //! `docs/internals/method.md#graph-masks`). Differences below 0.005 are noise.
-use crate::scene::Plane;
+use crate::scene::Image;
 
 /// Blur before anything is compared, pixels. 0.940 with 0.8, Felzenszwalb and Huttenlocher's own.
 pub(super) const SMOOTHING: f32 = 0.5;
@@ -65,8 +65,8 @@ impl Default for GraphOptions {
 
 /// Everything the tree is built from.
 pub(super) struct Cues<'a> {
-    pub(super) labels: Plane<i32>,
+    pub(super) labels: Image<i32>,
     pub(super) count: usize,
     pub(super) lab: Vec<[f32; 3]>,
-    pub(super) edges: &'a Plane<f32>,
+    pub(super) edges: &'a Image<f32>,
 }

@@ -25,10 +25,10 @@ fn every_level_is_a_compact_partition() {
 
 /// A red square on grey, with a small blue dot inside the square; boundaries where the colour
 /// changes.
-fn square() -> (RgbImage, Plane<f32>, Plane<u32>) {
+fn square() -> (RgbImage, Image<f32>, Image<u32>) {
     let (width, height) = (320, 240);
     let mut image = RgbImage { width, height, data: vec![[0.5; 3]; width * height] };
-    let mut truth = Plane::filled(width, height, 0);
+    let mut truth = Image::filled(width, height, 0);
     for y in 60..160 {
         for x in 100..220 {
             let dot = (x as i32 - 160).pow(2) + (y as i32 - 110).pow(2) < 64;
@@ -36,7 +36,7 @@ fn square() -> (RgbImage, Plane<f32>, Plane<u32>) {
             truth.data[y * width + x] = 1;
         }
     }
-    let mut edges = Plane::filled(width, height, 0.0);
+    let mut edges = Image::filled(width, height, 0.0);
     for p in 0..width * (height - 1) {
         if p % width + 1 < width && [p + 1, p + width].iter().any(|&q| image.data[p] != image.data[q]) {
             edges.data[p] = 0.9;
@@ -59,9 +59,9 @@ fn what_no_contour_divides_merges_first_even_where_colours_differ_more() {
     // A dark stripe, a bright one, and behind the only contour one that is a little brighter still.
     let (width, height) = (30, 10);
     let stripe = |p: usize| p % width / 10;
-    let mut edges = Plane::filled(width, height, 0.0);
+    let mut edges = Image::filled(width, height, 0.0);
     edges.data.iter_mut().skip(19).step_by(width).for_each(|e| *e = 1.0);
-    let labels = Plane { width, height, data: (0..width * height).map(|p| stripe(p) as i32).collect() };
+    let labels = Image { width, height, data: (0..width * height).map(|p| stripe(p) as i32).collect() };
     let lab = (0..width * height).map(|p| [[30.0, 60.0, 65.0][stripe(p)], 0.0, 0.0]).collect();
     let tree = tree::build(&Cues { labels, count: 3, lab, edges: &edges }, &GraphOptions::default());
     assert_eq!(tree.nodes[3].children, Some((0, 1)));
@@ -70,10 +70,10 @@ fn what_no_contour_divides_merges_first_even_where_colours_differ_more() {
 #[test]
 fn a_flat_image_and_wrong_sizes() {
     let flat = RgbImage { width: 64, height: 64, data: vec![[0.3; 3]; 4096] };
-    let masks = segment(&flat, &Plane::filled(64, 64, 0.0), &GraphOptions::default()).unwrap();
+    let masks = segment(&flat, &Image::filled(64, 64, 0.0), &GraphOptions::default()).unwrap();
     for level in &masks.levels {
         assert!(level.quality.len() == 1 && level.labels.data.iter().all(|&l| l == 0));
     }
-    let edges = Plane::filled(32, 64, 0.0);
+    let edges = Image::filled(32, 64, 0.0);
     assert!(segment(&flat, &edges, &GraphOptions::default()).is_err());
 }

@@ -1,6 +1,6 @@
 //! Smoothing and the LERF mask (docs/internals/method.md#smoothing,
 //! docs/internals/method.md#lerf-ovs).
-use crate::scene::Plane;
+use crate::scene::Image;
 use rayon::prelude::*;
 
 /// Side of the smoothing box, pixels (LERF, LangSplat).
@@ -11,29 +11,29 @@ const MAJORITY: usize = 7;
 
 /// 30×30 box mean with the window `x−15 … x+14`, border reflected without repeating the edge pixel
 /// (OpenCV `filter2D`, `REFLECT_101`).
-pub fn box30(map: &Plane<f32>) -> Plane<f32> {
+pub fn box30(map: &Image<f32>) -> Image<f32> {
     box_filter(map, BOX, BOX / 2, reflect_101)
 }
 
 /// `½ (box + raw)`.
-pub fn blend(raw: &Plane<f32>, boxed: &Plane<f32>) -> Plane<f32> {
+pub fn blend(raw: &Image<f32>, boxed: &Image<f32>) -> Image<f32> {
     let data = raw.data.iter().zip(&boxed.data).map(|(a, b)| 0.5 * (a + b)).collect();
-    Plane { width: raw.width, height: raw.height, data }
+    Image { width: raw.width, height: raw.height, data }
 }
 
 /// Protocol `lerf`: `clip(2·o − 1, 0, 1) > threshold` with o the min–max-normalised map, then a 7×7
 /// majority.
-pub fn lerf_mask(blended: &Plane<f32>, threshold: f32) -> Plane<bool> {
+pub fn lerf_mask(blended: &Image<f32>, threshold: f32) -> Image<bool> {
     let low = blended.data.iter().copied().fold(f32::INFINITY, f32::min);
     let high = blended.data.iter().map(|v| v - low).fold(0.0, f32::max) + 1e-9;
     let mask = blended.data.iter().map(|v| {
         let o = ((v - low) / high * 2.0 - 1.0).clamp(0.0, 1.0);
         if o > threshold { 1.0 } else { 0.0 }
     });
-    let mask = Plane { width: blended.width, height: blended.height, data: mask.collect() };
+    let mask = Image { width: blended.width, height: blended.height, data: mask.collect() };
     let votes = box_filter(&mask, MAJORITY, MAJORITY / 2, replicate);
     let data = votes.data.iter().map(|&v| v >= 0.5).collect();
-    Plane { width: mask.width, height: mask.height, data }
+    Image { width: mask.width, height: mask.height, data }
 }
 
 /// Index inside 0..n for an index that may lie outside; reflection without the edge.
@@ -55,9 +55,9 @@ fn replicate(i: isize, n: usize) -> usize {
 const BAND: usize = 96;
 
 /// Separable mean over `size` pixels starting `anchor` before each pixel; running sums in f64.
-fn box_filter(map: &Plane<f32>, size: usize, anchor: usize, border: fn(isize, usize) -> usize) -> Plane<f32> {
+fn box_filter(map: &Image<f32>, size: usize, anchor: usize, border: fn(isize, usize) -> usize) -> Image<f32> {
     let (w, h) = (map.width, map.height);
-    let mut out = Plane::filled(w, h, 0.0f32);
+    let mut out = Image::filled(w, h, 0.0f32);
     if w == 0 || h == 0 {
         return out;
     }
@@ -96,9 +96,9 @@ fn box_filter(map: &Plane<f32>, size: usize, anchor: usize, border: fn(isize, us
 mod tests {
     use super::*;
 
-    fn noise(w: usize, h: usize) -> Plane<f32> {
+    fn noise(w: usize, h: usize) -> Image<f32> {
         let data = (0..w * h).map(|i| ((i * 7919 + 13) % 1009) as f32 / 1009.0).collect();
-        Plane { width: w, height: h, data }
+        Image { width: w, height: h, data }
     }
 
     #[test]
@@ -142,6 +142,6 @@ mod tests {
         let count = |t: f32| lerf_mask(&map, t).data.iter().filter(|&&m| m).count();
         assert!(count(0.4) >= count(0.6) && count(0.6) >= count(0.9) && count(0.6) > 300);
         assert!(!lerf_mask(&map, 0.6).at(60, 40), "a single pixel has no majority");
-        assert!(!lerf_mask(&Plane::filled(5, 5, 0.3), 0.6).data.iter().any(|&m| m));
+        assert!(!lerf_mask(&Image::filled(5, 5, 0.3), 0.6).data.iter().any(|&m| m));
     }
 }

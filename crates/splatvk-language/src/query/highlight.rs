@@ -1,7 +1,7 @@
 //! The answer to a query for the scene as a whole: which codes are highlighted, in any view.
 use super::{QueryResult, TextQuery, field_relevancy};
 use crate::Result;
-use crate::scene::{LEVEL_NAMES, LanguageField, Plane};
+use crate::scene::{Image, LEVEL_NAMES, LanguageField};
 
 /// What viewers draw for a query. The level and the codes are those that answered in the views
 /// where the text was found, so that a viewer lights up what the views' masks show.
@@ -18,7 +18,7 @@ pub struct Highlight {
 /// Sums up the answers to `query` in the frames whose decoded maps are `codes`. Views vote for a
 /// level with their score; where no view found anything, all of them vote.
 pub fn highlight(
-    codes: &[&[Plane<i32>]],
+    codes: &[&[Image<i32>]],
     field: &LanguageField,
     query: &TextQuery,
     answers: &[QueryResult],
@@ -71,17 +71,17 @@ mod tests {
             canonicals: vec![0.0, 0.0, 1.0],
             ..Default::default()
         };
-        let map = |data: &[i32]| Plane { width: data.len(), height: 1, data: data.to_vec() };
+        let map = |data: &[i32]| Image { width: data.len(), height: 1, data: data.to_vec() };
         let (first, second) = (
             vec![map(&[0, 1]), map(&[-1, -1]), map(&[0, 2])],
             vec![map(&[1, 1]), map(&[-1, -1]), map(&[1, 1])],
         );
-        let frames: Vec<&[Plane<i32>]> = vec![&first, &second];
+        let frames: Vec<&[Image<i32>]> = vec![&first, &second];
         let answer = |level, found, score, mask: [bool; 2]| QueryResult {
             level,
             found,
             score,
-            mask: Plane { width: 2, height: 1, data: mask.to_vec() },
+            mask: Image { width: 2, height: 1, data: mask.to_vec() },
             ..QueryResult::default()
         };
         let seen = [answer(2, true, 0.9, [true, false]), answer(0, false, 0.95, [true, true])];

@@ -1,6 +1,6 @@
 //! Things in space: the selected splats as connected groups (docs/internals/method.md#instances).
 use crate::scene::code_mix::MIN_LENGTH;
-use crate::scene::{Camera, LanguageField, LevelField, Plane, Splats};
+use crate::scene::{Camera, Image, LanguageField, LevelField, Splats};
 use ahash::{HashMap, HashMapExt}; // quicker than the standard library's: a query looks up cells some million times
 use glam::{DMat3, DQuat, DVec2, DVec3, IVec3};
 use rayon::prelude::*;
@@ -207,12 +207,12 @@ impl Places {
     }
 
     /// Those of some splats that a view shows.
-    pub fn seen_of(&self, splats: &[usize], camera: &Camera, depth: &Plane<f32>) -> Vec<usize> {
+    pub fn seen_of(&self, splats: &[usize], camera: &Camera, depth: &Image<f32>) -> Vec<usize> {
         splats.iter().copied().filter(|i| self.seen(*i, camera, depth).is_some()).collect()
     }
 
     /// Where a view shows a splat's middle.
-    fn seen(&self, splat: usize, camera: &Camera, depth: &Plane<f32>) -> Option<DVec2> {
+    fn seen(&self, splat: usize, camera: &Camera, depth: &Image<f32>) -> Option<DVec2> {
         let inside = |v: f64, size: u32| (0.0..f64::from(size)).contains(&v);
         let (pixel, z) = camera.project(self.centres[splat]);
         let shown = z > 0.0 && inside(pixel.x, camera.width) && inside(pixel.y, camera.height);
@@ -222,7 +222,7 @@ impl Places {
 
     /// The pixel of a view that shows a thing's middle: of its splats that the view shows, the one
     /// nearest to their mean.
-    pub fn pixel(&self, instance: &Instance, camera: &Camera, depth: &Plane<f32>) -> Option<[f64; 2]> {
+    pub fn pixel(&self, instance: &Instance, camera: &Camera, depth: &Image<f32>) -> Option<[f64; 2]> {
         let pixel = |&i: &usize| Some((self.seen(i, camera, depth)?, self.weights[i]));
         let seen: Vec<_> = instance.splats.iter().filter_map(pixel).collect();
         let total: f64 = seen.iter().map(|s| s.1).sum();

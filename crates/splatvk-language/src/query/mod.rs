@@ -14,7 +14,7 @@ pub mod select;
 use self::phrasing::Reading;
 use self::presence::Alternatives;
 use crate::math::dot;
-use crate::scene::{Codebook, LanguageField, LevelField, Plane};
+use crate::scene::{Codebook, Image, LanguageField, LevelField};
 use crate::{Error, Result};
 use rayon::prelude::*;
 /// The phrases that every query is compared against (LERF).
@@ -102,9 +102,9 @@ pub struct QueryResult {
     pub level: usize,
     /// [H, W] blended relevancy of the chosen level (docs/internals/method.md#smoothing), 0 where
     /// nothing is.
-    pub relevancy: Plane<f32>,
+    pub relevancy: Image<f32>,
     /// [H, W] the mask.
-    pub mask: Plane<bool>,
+    pub mask: Image<bool>,
     /// Column and row of the most relevant pixel.
     pub location: (usize, usize),
     /// Best unsmoothed relevancy of the frame at the chosen level.
@@ -149,15 +149,15 @@ pub fn relevancy(phi: &[f32], cosine: f64, canonicals: &[f32]) -> f32 {
 }
 
 /// Relevancy per pixel of a decoded map; void pixels (−1) get 0.
-pub fn relevancy_map(codes: &Plane<i32>, relevancy: &[f32]) -> Plane<f32> {
+pub fn relevancy_map(codes: &Image<i32>, relevancy: &[f32]) -> Image<f32> {
     let value = |&k: &i32| usize::try_from(k).ok().and_then(|k| relevancy.get(k)).copied().unwrap_or(0.0);
-    Plane { width: codes.width, height: codes.height, data: codes.data.par_iter().map(value).collect() }
+    Image { width: codes.width, height: codes.height, data: codes.data.par_iter().map(value).collect() }
 }
 
 /// Answers a query in one frame. `codes` holds the frame's decoded map per level; levels without
 /// codes are skipped.
 pub fn answer(
-    codes: &[Plane<i32>],
+    codes: &[Image<i32>],
     field: &LanguageField,
     query: &TextQuery,
     options: &QueryOptions,
@@ -167,7 +167,7 @@ pub fn answer(
 
 /// [`answer`] in several frames.
 pub fn answer_all(
-    frames: &[&[Plane<i32>]],
+    frames: &[&[Image<i32>]],
     field: &LanguageField,
     query: &TextQuery,
     options: &QueryOptions,
@@ -205,14 +205,14 @@ fn other_colours_out(book: &Codebook, query: &TextQuery, relevancy: &mut [f32]) 
 /// One level of a frame.
 struct LevelCandidate {
     level: usize,
-    raw: Plane<f32>,
+    raw: Image<f32>,
     /// By what levels compete.
     peak: f32,
 }
 
 /// [`answer`] with the relevancy of every code per level ([`field_relevancy`]).
 pub fn answer_with(
-    codes: &[Plane<i32>],
+    codes: &[Image<i32>],
     relevancy: &[Vec<f32>],
     options: &QueryOptions,
 ) -> Result<QueryResult> {
@@ -248,7 +248,7 @@ pub fn answer_with(
     })
 }
 
-fn highest(map: &Plane<f32>) -> f32 {
+fn highest(map: &Image<f32>) -> f32 {
     map.data.iter().copied().fold(f32::NEG_INFINITY, f32::max)
 }
 
@@ -256,12 +256,12 @@ fn highest(map: &Plane<f32>) -> f32 {
 /// For masks of codes it is the margin whose relevancy is the peak of the blended *excess* over a
 /// canonical phrase, `max(0, 2·rel − 1)`: smoothing then counts against specks, which the usual 0.5
 /// of their surroundings would hide.
-fn level_peak(raw: &Plane<f32>, rule: MaskRule) -> f32 {
+fn level_peak(raw: &Image<f32>, rule: MaskRule) -> f32 {
     if !matches!(rule, MaskRule::Codes(_)) {
         return highest(&filter::blend(raw, &filter::box30(raw)));
     }
     let data = raw.data.iter().map(|v| (2.0 * v - 1.0).max(0.0)).collect();
-    let excess = Plane { data, ..*raw };
+    let excess = Image { data, ..*raw };
     let peak = highest(&filter::blend(&excess, &filter::box30(&excess)));
     // below every canonical phrase: negative, by the best code
     margin(if peak > 0.0 { 0.5 + 0.5 * peak } else { highest(raw).min(0.5) })
@@ -300,8 +300,8 @@ fn coarsest_good(peaks: &[f32], slack: Slack) -> Option<usize> {
 }
 
 /// Relevancy summed over the levels.
-fn sum(candidates: &[LevelCandidate]) -> Plane<f32> {
-    let Some((first, others)) = candidates.split_first() else { return Plane::default() };
+fn sum(candidates: &[LevelCandidate]) -> Image<f32> {
+    let Some((first, others)) = candidates.split_first() else { return Image::default() };
     let mut sum = first.raw.clone();
     for other in others {
         sum.data.iter_mut().zip(&other.raw.data).for_each(|(s, v)| *s += v);
@@ -310,7 +310,7 @@ fn sum(candidates: &[LevelCandidate]) -> Plane<f32> {
 }
 
 /// The pixel with the highest evidence, inside the mask where it has any pixel.
-fn locate(evidence: &[f32], mask: &Plane<bool>) -> (usize, usize) {
+fn locate(evidence: &[f32], mask: &Image<bool>) -> (usize, usize) {
     let any = mask.data.iter().any(|&m| m);
     let mut top: Option<(f32, usize)> = None;
     for (p, &v) in evidence.iter().enumerate() {
@@ -330,7 +330,7 @@ fn code_bar(top: f32, share: f32) -> f32 {
 
 /// Pixels of the codes that answer the query ([`MaskRule::Codes`]). Only codes that this frame
 /// shows compete, so that a code seen elsewhere does not suppress the best one here.
-fn code_mask(map: &Plane<i32>, relevancy: &[f32], share: f32) -> Plane<bool> {
+fn code_mask(map: &Image<i32>, relevancy: &[f32], share: f32) -> Image<bool> {
     let mut shown = vec![false; relevancy.len()];
     for &k in map.data.iter().filter(|&&k| k >= 0) {
         if let Some(s) = shown.get_mut(k as usize) {
@@ -342,7 +342,7 @@ fn code_mask(map: &Plane<i32>, relevancy: &[f32], share: f32) -> Plane<bool> {
     let bar = code_bar(top, share);
     let chosen: Vec<bool> = relevancy.iter().map(|&r| r > 0.0 && r >= bar).collect();
     let data = map.data.iter().map(|&k| k >= 0 && chosen.get(k as usize).copied().unwrap_or(false)).collect();
-    Plane { width: map.width, height: map.height, data }
+    Image { width: map.width, height: map.height, data }
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 //! against other things that it could have said. One that fits the scene no better than they do is
 //! no evidence of anything.
 use crate::math::dot_f32 as dot;
-use crate::scene::{LanguageField, Plane};
+use crate::scene::{Image, LanguageField};
 use rayon::prelude::*;
 use serde::Serialize;
 use std::sync::Arc;
@@ -74,7 +74,7 @@ pub struct ShownPixels {
 
 impl ShownPixels {
     /// Counts a view; `maps` holds its decoded map per level.
-    pub fn add(&mut self, field: &LanguageField, maps: &[Plane<i32>]) {
+    pub fn add(&mut self, field: &LanguageField, maps: &[Image<i32>]) {
         self.codes.resize(field.levels.len(), Vec::new());
         self.all.resize(field.levels.len(), 0);
         for (((counts, all), level), map) in
@@ -91,7 +91,7 @@ impl ShownPixels {
     }
 
     /// Of several views.
-    pub fn of(field: &LanguageField, views: &[&[Plane<i32>]]) -> ShownPixels {
+    pub fn of(field: &LanguageField, views: &[&[Image<i32>]]) -> ShownPixels {
         let mut shown = ShownPixels::default();
         views.iter().for_each(|maps| shown.add(field, maps));
         shown

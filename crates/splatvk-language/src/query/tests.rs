@@ -31,8 +31,8 @@ fn query(v: &[f32]) -> TextQuery {
 }
 
 /// 60×40: code 1 everywhere, code 0 in a square, code 2 right of it, void in the first column.
-fn frame() -> Plane<i32> {
-    let mut map = Plane::filled(60, 40, 1);
+fn frame() -> Image<i32> {
+    let mut map = Image::filled(60, 40, 1);
     for y in 0..40 {
         for x in 0..60 {
             if x == 0 {
@@ -63,7 +63,7 @@ fn relevancy_is_the_worst_pairwise_softmax() {
 
 #[test]
 fn the_mask_follows_code_borders_exactly() {
-    let maps = vec![Plane::filled(60, 40, -1), frame(), frame()];
+    let maps = vec![Image::filled(60, 40, -1), frame(), frame()];
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap();
     assert_eq!(r.level, 2, "the whole answers when it is as good as its part");
     let lerf = QueryOptions { mask: MaskRule::Lerf(0.6), ..QueryOptions::default() };
@@ -96,7 +96,7 @@ fn a_speck_does_not_outvote_the_whole() {
     }
     let mut whole = frame();
     whole.data.iter_mut().filter(|k| **k == 0).for_each(|k| *k = 2);
-    let maps = vec![Plane::filled(60, 40, -1), part, whole];
+    let maps = vec![Image::filled(60, 40, -1), part, whole];
     let ask = |slack: Slack| {
         let options = QueryOptions { slack, ..QueryOptions::default() };
         answer(&maps, &field(), &query(&[1.0, 0.0, -0.02, 0.1]), &options).unwrap().level
@@ -118,7 +118,7 @@ fn a_clearly_better_part_answers_and_a_marginally_better_one_does_not() {
         };
         let levels = vec![LevelField::default(), level(entry(1.0 + tilt)), level(entry(1.0))];
         let field = LanguageField { levels, ..LanguageField::default() };
-        let maps = vec![Plane::filled(60, 40, -1), Plane::filled(60, 40, 0), Plane::filled(60, 40, 0)];
+        let maps = vec![Image::filled(60, 40, -1), Image::filled(60, 40, 0), Image::filled(60, 40, 0)];
         answer(&maps, &field, &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap().level
     };
     // Margins: cosine 0.707 of the whole; 0.74 (within 0.02 and a tenth) and 0.89 of the part.
@@ -127,7 +127,7 @@ fn a_clearly_better_part_answers_and_a_marginally_better_one_does_not() {
 
 #[test]
 fn frames_are_answered_alike_one_by_one_and_together() {
-    let (one, two) = (vec![frame(), frame(), frame()], vec![Plane::filled(60, 40, -1), frame(), frame()]);
+    let (one, two) = (vec![frame(), frame(), frame()], vec![Image::filled(60, 40, -1), frame(), frame()]);
     let q = query(&[1.0, 0.0, 0.0, 0.0]);
     let together = answer_all(&[&one, &two], &field(), &q, &QueryOptions::default()).unwrap();
     for (codes, all) in [&one, &two].into_iter().zip(&together) {
@@ -139,7 +139,7 @@ fn frames_are_answered_alike_one_by_one_and_together() {
 
 #[test]
 fn what_no_code_means_is_not_found() {
-    let maps = vec![Plane::filled(60, 40, -1), frame(), frame()];
+    let maps = vec![Image::filled(60, 40, -1), frame(), frame()];
     let r = answer(&maps, &field(), &query(&[0.0, 0.0, -1.0, 0.0]), &QueryOptions::default()).unwrap();
     assert!(!r.found && r.score < 0.5);
     let empty = LanguageField::default();
@@ -148,7 +148,7 @@ fn what_no_code_means_is_not_found() {
 
 #[test]
 fn an_all_void_frame_has_an_empty_mask() {
-    let maps = vec![Plane::filled(60, 40, -1); 3];
+    let maps = vec![Image::filled(60, 40, -1); 3];
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap();
     assert!(!r.found && r.mask.data.iter().all(|m| !m));
 }
@@ -182,7 +182,7 @@ fn perfect_masks_and_distinct_features_answer_every_phrase() {
     let masks: Vec<ViewMasks> = views
         .iter()
         .map(|v| {
-            let labels = Plane { data: v.masks.data.iter().map(|&k| k.max(0)).collect(), ..v.masks };
+            let labels = Image { data: v.masks.data.iter().map(|&k| k.max(0)).collect(), ..v.masks };
             let features = vectors[..12].concat();
             let level = LevelMasks { labels, quality: vec![1.0; 12], features, ..LevelMasks::default() };
             ViewMasks { levels: vec![level.clone(), level.clone(), level] }
@@ -192,7 +192,7 @@ fn perfect_masks_and_distinct_features_answer_every_phrase() {
         .iter()
         .map(|v| DepthMap {
             depth: v.depth.clone(),
-            confidence: Plane { data: v.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect(), ..v.depth },
+            confidence: Image { data: v.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect(), ..v.depth },
         })
         .collect();
     let cameras: Vec<_> = views.iter().map(|v| v.camera.clone()).collect();
@@ -213,7 +213,7 @@ fn perfect_masks_and_distinct_features_answer_every_phrase() {
             ..Default::default()
         };
         for (t, view) in views.iter().enumerate() {
-            let maps: Vec<Plane<i32>> = built.field.levels.iter().map(|l| l.targets[t].clone()).collect();
+            let maps: Vec<Image<i32>> = built.field.levels.iter().map(|l| l.targets[t].clone()).collect();
             let r = answer(&maps, &built.field, &query, &QueryOptions::default()).unwrap();
             if view.masks.data.contains(object) {
                 assert!(
@@ -234,9 +234,9 @@ fn the_location_avoids_what_a_finer_level_tells_apart() {
     let map = |from: usize| {
         let inside = |p: usize| (from..180).contains(&(p % 200)) && (20..100).contains(&(p / 200));
         let data = (0..200 * 120).map(|p| if inside(p) { 0 } else { 1 }).collect();
-        Plane { width: 200, height: 120, data }
+        Image { width: 200, height: 120, data }
     };
-    let maps = [Plane::filled(200, 120, -1), map(120), map(20)];
+    let maps = [Image::filled(200, 120, -1), map(120), map(20)];
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap();
     assert_eq!(r.level, 2);
     assert!((120..180).contains(&r.location.0) && (20..100).contains(&r.location.1), "{:?}", r.location);

@@ -2,7 +2,7 @@
 use super::nms::Mask;
 use crate::LevelMasks;
 use crate::dir::MIN_MASK_PIXELS;
-use crate::scene::Plane;
+use crate::scene::Image;
 
 /// Larger masks first, so that small ones lie on top, and of equal ones the better on top; or
 /// `in_order`, those that were cleaned up on top. Masks of which fewer than [`MIN_MASK_PIXELS`]
@@ -17,7 +17,7 @@ pub(super) fn labels(masks: &[Mask], in_order: bool, width: usize, height: usize
             b.bits.count().cmp(&a.bits.count()).then(a.score().total_cmp(&b.score()))
         });
     }
-    let mut labels = Plane::filled(width, height, -1i32);
+    let mut labels = Image::filled(width, height, -1i32);
     for index in order {
         masks[index].bits.ones().for_each(|p| labels.data[p] = index as i32);
     }
@@ -39,12 +39,12 @@ pub(super) fn labels(masks: &[Mask], in_order: bool, width: usize, height: usize
 }
 
 /// Every mask that has a place, with all its pixels, on the first map where nothing is in its way.
-fn whole(masks: &[Mask], place: &[i32], width: usize, height: usize) -> Vec<Plane<i32>> {
-    let mut maps: Vec<Plane<i32>> = Vec::new();
+fn whole(masks: &[Mask], place: &[i32], width: usize, height: usize) -> Vec<Image<i32>> {
+    let mut maps: Vec<Image<i32>> = Vec::new();
     for (mask, label) in masks.iter().zip(place).filter(|(_, label)| **label >= 0) {
-        let free = |map: &Plane<i32>| mask.bits.ones().all(|p| map.data[p] < 0);
+        let free = |map: &Image<i32>| mask.bits.ones().all(|p| map.data[p] < 0);
         let at = maps.iter().position(free).unwrap_or_else(|| {
-            maps.push(Plane::filled(width, height, -1));
+            maps.push(Image::filled(width, height, -1));
             maps.len() - 1
         });
         mask.bits.ones().for_each(|p| maps[at].data[p] = *label);

@@ -17,7 +17,7 @@ fn picture(image: &RgbImage) -> image::RgbImage {
 fn blurred(image: &RgbImage, sigma: f32) -> RgbImage {
     let channel = |k: usize| {
         let data = image.data.iter().map(|c| c[k]).collect();
-        sift::blurred(&crate::scene::Plane { width: image.width, height: image.height, data }, sigma)
+        sift::blurred(&crate::scene::Image { width: image.width, height: image.height, data }, sigma)
     };
     let planes = [0, 1, 2].map(channel);
     let data = (0..image.data.len()).map(|i| [0, 1, 2].map(|k: usize| planes[k].data[i])).collect();

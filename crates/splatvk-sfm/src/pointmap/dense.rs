@@ -3,7 +3,7 @@ use super::adjust::Adjustment;
 use super::canonical::Canonical;
 use crate::Geometry;
 use crate::math::quantile;
-use crate::scene::{Camera, DepthMap, ModelView, Plane, PointCloud, Pointmaps};
+use crate::scene::{Camera, DepthMap, Image, ModelView, PointCloud, Pointmaps};
 use glam::DVec2;
 
 /// A less confident point this much in front of another view's surface is wrong (depth noise is
@@ -147,7 +147,7 @@ fn mask_edges(l: &mut Layer) {
 /// Bilinear within a surface, nearest across its edges; unknown outside the network's crop.
 fn to_working(view: &ModelView, l: &Layer) -> DepthMap {
     let (w, h) = (view.image.width, view.image.height);
-    let mut out = DepthMap { depth: Plane::filled(w, h, 0f32), confidence: Plane::filled(w, h, 0f32) };
+    let mut out = DepthMap { depth: Image::filled(w, h, 0f32), confidence: Image::filled(w, h, 0f32) };
     for y in 0..h {
         for x in 0..w {
             let [u, v] = view.from_working.apply([x as f64 + 0.5, y as f64 + 0.5]);

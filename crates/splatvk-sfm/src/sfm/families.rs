@@ -4,7 +4,7 @@ use crate::Result;
 use crate::matching::{self, Keypoints};
 use crate::photo::Photo;
 use crate::progress::Progress;
-use crate::scene::Plane;
+use crate::scene::Image;
 use crate::{affine, sift};
 use rayon::prelude::*;
 
@@ -51,19 +51,19 @@ pub(super) fn affine_family(photos: &[Photo]) -> Family {
 fn of_all(
     photos: &[Photo],
     limit: usize,
-    detect: impl Fn(&Plane<f32>, &Plane<bool>, usize) -> Keypoints + Sync,
+    detect: impl Fn(&Image<f32>, &Image<bool>, usize) -> Keypoints + Sync,
 ) -> Vec<Keypoints> {
     let one = |p: &Photo| detect(&p.image.luma(), &valid(p), limit);
     photos.par_iter().map(one).collect()
 }
 
 /// Where features of a photo may lie.
-fn valid(photo: &Photo) -> Plane<bool> {
+fn valid(photo: &Photo) -> Image<bool> {
     matching::valid_area(&photo.image, photo.border, photo.coverage.as_ref(), MARGIN)
 }
 
 /// Keypoints on valid pixels.
-fn within(f: &Keypoints, valid: &Plane<bool>) -> Keypoints {
+fn within(f: &Keypoints, valid: &Image<bool>) -> Keypoints {
     let mut out = Keypoints { dim: f.dim, ..Default::default() };
     for (k, p) in f.points.iter().enumerate() {
         let (x, y) = (p.x.max(0.0) as usize, p.y.max(0.0) as usize);

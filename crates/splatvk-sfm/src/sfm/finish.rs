@@ -12,7 +12,7 @@ use crate::bundle::Adjusted;
 use crate::matching;
 use crate::photo::{Photo, Straightening};
 use crate::progress::Progress;
-use crate::scene::{Camera, Lens, Plane, RgbImage};
+use crate::scene::{Camera, Image, Lens, RgbImage};
 use crate::two_view::{fundamental, sampson};
 use crate::{Error, Result};
 use crate::{Fitted, SparseModel, SparsePoint};
@@ -87,7 +87,7 @@ pub(super) fn sub_pixel(
 ) -> Result<()> {
     let shades: Vec<Shades> = straight.par_iter().map(|image| Shades::new(&image.luma())).collect();
     let valid = |p: &Photo, image| matching::valid_area(image, p.border, p.coverage.as_ref(), MARGIN);
-    let valid: Vec<Plane<bool>> = photos.iter().zip(straight).map(|(p, image)| valid(p, image)).collect();
+    let valid: Vec<Image<bool>> = photos.iter().zip(straight).map(|(p, image)| valid(p, image)).collect();
     on_straight(model, |m| refine::refine(m, &shades, refine::REFINED, REACH));
     reweight_and_adjust(model)?;
     progress.check()?;

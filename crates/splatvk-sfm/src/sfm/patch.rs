@@ -1,6 +1,6 @@
 //! Photometric alignment of small planar patches between views with known cameras.
 use super::model::Model;
-use crate::scene::Plane;
+use crate::scene::Image;
 use crate::sift::blurred;
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
@@ -20,13 +20,13 @@ const SLANT_SIGMA: f64 = 0.003;
 
 /// Blurred luma with its gradients.
 pub(super) struct Shades {
-    value: Plane<f32>,
+    value: Image<f32>,
     dx: Vec<f32>,
     dy: Vec<f32>,
 }
 
 impl Shades {
-    pub(super) fn new(luma: &Plane<f32>) -> Shades {
+    pub(super) fn new(luma: &Image<f32>) -> Shades {
         let value = blurred(luma, BLUR);
         let (w, h) = (value.width, value.height);
         let at = |x: usize, y: usize| value.data[y * w + x];

@@ -1,7 +1,7 @@
 //! Sub-pixel refinement of all sightings, and further points predicted from the geometry.
 use super::model::{Model, Sighting, Track};
 use super::patch::{Aligner, Facet, RADIUS, Shades};
-use crate::scene::Plane;
+use crate::scene::Image;
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
@@ -156,7 +156,7 @@ const MIN_GUIDED_NCC: f64 = 0.88;
 
 /// Adds points at corners without one: depth predicted from the neighbours, searched along the
 /// epipolar lines, aligned photometrically in all views that show it. Returns how many.
-pub(super) fn extend(model: &mut Model, shades: &[Shades], valid: &[Plane<bool>]) -> usize {
+pub(super) fn extend(model: &mut Model, shades: &[Shades], valid: &[Image<bool>]) -> usize {
     let fixed = &*model;
     let aligner = Aligner::new(fixed, shades);
     let mut all: Vec<Track> = Vec::new();
@@ -173,7 +173,7 @@ pub(super) fn extend(model: &mut Model, shades: &[Shades], valid: &[Plane<bool>]
 }
 
 /// The strongest corner of each grid cell that is not near a known point.
-fn free_corners(shades: &Shades, valid: &Plane<bool>, seen: &ViewPoints) -> Vec<DVec2> {
+fn free_corners(shades: &Shades, valid: &Image<bool>, seen: &ViewPoints) -> Vec<DVec2> {
     let (w, h) = shades.size();
     let margin = RADIUS as usize + 4;
     let (columns, rows) = (w / CELL + 1, h / CELL + 1);
@@ -205,7 +205,7 @@ fn free_corners(shades: &Shades, valid: &Plane<bool>, seen: &ViewPoints) -> Vec<
 fn predicted(
     aligner: &Aligner,
     seen: &ViewPoints,
-    valid: &[Plane<bool>],
+    valid: &[Image<bool>],
     view: usize,
     pixel: DVec2,
 ) -> Option<Track> {

@@ -21,7 +21,7 @@ pub use views::{Level, pyramid};
 
 use crate::Result;
 use crate::progress::Progress;
-use crate::scene::{Camera, Coverage, DepthMap, DepthPrior, Plane, PointCloud, RgbImage};
+use crate::scene::{Camera, Coverage, DepthMap, DepthPrior, Image, PointCloud, RgbImage};
 use glam::{DVec3, Vec4};
 
 /// Depth of every photo (complete but for white borders and what the photos do not use; confidence
@@ -147,8 +147,8 @@ fn depth_map(level: &Level, surface: &surface::Surface, view: usize, image: &Rgb
     let r = &level.references[view];
     let scale = (image.width / r.width as usize).max(1);
     let mut out = DepthMap {
-        depth: Plane::filled(image.width, image.height, 0.0),
-        confidence: Plane::filled(image.width, image.height, 0.0),
+        depth: Image::filled(image.width, image.height, 0.0),
+        confidence: Image::filled(image.width, image.height, 0.0),
     };
     let [fx, fy, cx, cy] = r.intrinsics;
     for y in 0..image.height {

@@ -2,7 +2,7 @@
 //! those.
 use super::Level;
 use super::views::{DEPTH_TOLERANCE, REPROJECTION_TOLERANCE};
-use crate::scene::Plane;
+use crate::scene::Image;
 use glam::{DMat3, DVec2, DVec3, Vec3, Vec4};
 use rayon::prelude::*;
 
@@ -273,10 +273,10 @@ fn support(level: &Level, matched: &[Vec4], view: usize, x: usize, y: usize, pla
 }
 
 /// Depth map of a view from its planes; 0 where rejected.
-pub fn depth(level: &Level, view: usize, surface: &Surface) -> Plane<f32> {
+pub fn depth(level: &Level, view: usize, surface: &Surface) -> Image<f32> {
     let r = &level.references[view];
     let (width, height) = (r.width as usize, r.height as usize);
-    let mut out = Plane::filled(width, height, 0.0);
+    let mut out = Image::filled(width, height, 0.0);
     for y in 0..height {
         for x in 0..width {
             let k = r.first as usize + y * width + x;

@@ -212,7 +212,7 @@ fn level(
         });
         sources.extend(chosen[view].iter().map(|&other| source(camera, &cameras[other], first[other])));
     }
-    // The shaders read 16 bits per value; rounding here keeps the CPU twin equal.
+    // The shaders read 16 bits per value; rounding here keeps the CPU reference equal.
     let rounded = |l: f32| (l.clamp(0.0, 1.0) * 65535.0).round() / 65535.0;
     let luma = guide.iter().flat_map(|g| g.luma().data).map(rounded).collect();
     Level { cameras, guide: guide.to_vec(), luma, sources, references, tolerance: tolerance.to_vec() }

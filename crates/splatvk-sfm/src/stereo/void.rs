@@ -57,7 +57,7 @@ pub fn white_border(level: &Level) -> Vec<bool> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Outside, Plane, RgbImage};
+    use crate::scene::{Image, Outside, RgbImage};
     use crate::stereo::ReferenceView;
 
     #[test]
@@ -76,7 +76,7 @@ mod tests {
         };
         let share = (0..12 * 8).map(|i| if i % 12 < 4 { 0.0 } else { 1.0 }).collect();
         let coverage =
-            Coverage { share: Plane { width: 12, height: 8, data: share }, outside: Outside::Empty };
+            Coverage { share: Image { width: 12, height: 8, data: share }, outside: Outside::Empty };
         let void = unused(&level, &[None, Some(coverage)]);
         let expected: Vec<bool> = (0..48).map(|k| k >= 24 && k % 6 < 2).collect();
         assert_eq!(void, expected);

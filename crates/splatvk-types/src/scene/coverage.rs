@@ -1,5 +1,5 @@
 //! Which pixels of a photo are used.
-use super::image::{Plane, RgbImage};
+use super::image::{Image, RgbImage};
 use serde::{Deserialize, Serialize};
 
 /// Meaning of the pixels of a photo that are not used.
@@ -16,7 +16,7 @@ pub enum Outside {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Coverage {
     /// [H, W] share of every working pixel that is used, in [0, 1].
-    pub share: Plane<f32>,
+    pub share: Image<f32>,
     /// Meaning of the other pixels.
     pub outside: Outside,
 }
@@ -29,25 +29,25 @@ impl Coverage {
 
     /// [H, W] weight of every pixel in losses: 0 or 1. Emptiness is shown as well as things are; of
     /// what is not known even a part would count.
-    pub fn weights(&self) -> Plane<f32> {
+    pub fn weights(&self) -> Image<f32> {
         let weight = |share: &f32| match self.outside {
             Outside::Empty => 1.0,
             // Averaging leaves a little less than 1 where everything is used.
             Outside::Unknown => f32::from(u8::from(*share > 0.999)),
         };
-        Plane { data: self.share.data.iter().map(weight).collect(), ..self.share.clone() }
+        Image { data: self.share.data.iter().map(weight).collect(), ..self.share.clone() }
     }
 
     /// A coverage, or all pixels, without those where something hides the scene; the scene behind
     /// them is unknown.
-    pub fn without(before: Option<&Coverage>, hidden: &Plane<bool>) -> Coverage {
+    pub fn without(before: Option<&Coverage>, hidden: &Image<bool>) -> Coverage {
         let left = |(i, hidden): (usize, &bool)| match before {
             _ if *hidden => 0.0,
             Some(before) => before.share.data[i],
             None => 1.0,
         };
         let data = hidden.data.iter().enumerate().map(left).collect();
-        let share = Plane { width: hidden.width, height: hidden.height, data };
+        let share = Image { width: hidden.width, height: hidden.height, data };
         Coverage { share, outside: Outside::Unknown }
     }
 
@@ -115,7 +115,7 @@ mod tests {
     use super::*;
 
     fn coverage(outside: Outside) -> Coverage {
-        Coverage { share: Plane { width: 3, height: 1, data: vec![0.0, 0.5, 1.0] }, outside }
+        Coverage { share: Image { width: 3, height: 1, data: vec![0.0, 0.5, 1.0] }, outside }
     }
 
     #[test]

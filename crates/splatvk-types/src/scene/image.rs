@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// A row-major map of one value per pixel, `data[y * width + x]`.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
-pub struct Plane<T> {
+pub struct Image<T> {
     /// Pixels.
     pub width: usize,
     /// Pixels.
@@ -13,23 +13,23 @@ pub struct Plane<T> {
     pub data: Vec<T>,
 }
 
-impl<T: Clone> Plane<T> {
+impl<T: Clone> Image<T> {
     /// A map filled with one value.
     pub fn filled(width: usize, height: usize, value: T) -> Self {
-        Plane { width, height, data: vec![value; width * height] }
+        Image { width, height, data: vec![value; width * height] }
     }
 }
 
-impl<T: Copy> Plane<T> {
+impl<T: Copy> Image<T> {
     /// Value at column x, row y.
     pub fn at(&self, x: usize, y: usize) -> T {
         self.data[y * self.width + x]
     }
 
     /// The part of a size (width, height) whose first pixel is at column x, row y.
-    pub fn cropped(&self, (x, y): (usize, usize), (width, height): (usize, usize)) -> Plane<T> {
+    pub fn cropped(&self, (x, y): (usize, usize), (width, height): (usize, usize)) -> Image<T> {
         let row = |r: usize| self.data[(y + r) * self.width + x..][..width].iter().copied();
-        Plane { width, height, data: (0..height).flat_map(row).collect() }
+        Image { width, height, data: (0..height).flat_map(row).collect() }
     }
 }
 
@@ -54,9 +54,9 @@ impl RgbImage {
         self.at((p.x.max(0.0) as usize).min(self.width - 1), (p.y.max(0.0) as usize).min(self.height - 1))
     }
     /// Rec. 601 luma per pixel.
-    pub fn luma(&self) -> Plane<f32> {
+    pub fn luma(&self) -> Image<f32> {
         let data = self.data.iter().map(|c| 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2]).collect();
-        Plane { width: self.width, height: self.height, data }
+        Image { width: self.width, height: self.height, data }
     }
 }
 
@@ -65,9 +65,9 @@ impl RgbImage {
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct DepthMap {
     /// [H, W] camera z; 0 = unknown.
-    pub depth: Plane<f32>,
+    pub depth: Image<f32>,
     /// [H, W] confidence ≥ 0; 0 where depth is unknown.
-    pub confidence: Plane<f32>,
+    pub confidence: Image<f32>,
 }
 
 impl DepthMap {

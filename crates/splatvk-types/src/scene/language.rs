@@ -1,7 +1,7 @@
 //! Language of a scene: features of the splats per level, and the codebooks that map them to
 //! embeddings.
 use super::code_mix::{self, CodeMix};
-use super::{Plane, Splats};
+use super::{Image, Splats};
 use serde::{Deserialize, Serialize};
 
 /// A mask of a view. Stored as the pair `[view, mask]`.
@@ -94,7 +94,7 @@ pub struct LevelField {
     pub reliability: Vec<f32>,
     /// Per training view: code index per pixel, −1 = none. Training targets; empty in a loaded
     /// scene.
-    pub targets: Vec<Plane<i32>>,
+    pub targets: Vec<Image<i32>>,
     /// The splats that the features were trained on, where the level has a model of its own; `None`
     /// = those of the scene. As many as the scene has, in its order.
     pub splats: Option<Splats>,

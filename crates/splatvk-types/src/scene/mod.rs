@@ -29,7 +29,7 @@ pub use camera::{Camera, MAX_PIXELS, MAX_SIDE, Pose};
 pub use code_mix::CodeMix;
 pub use coverage::{Coverage, Outside};
 pub use given::GivenCamera;
-pub use image::{DepthMap, Plane, RgbImage};
+pub use image::{DepthMap, Image, RgbImage};
 pub use language::{Codebook, LEVEL_NAMES, LanguageField, LevelField, MaskId};
 pub use lens::Lens;
 pub use pointmap::{Descriptors, ModelView, PairPointmaps, Pointmap, Pointmaps};

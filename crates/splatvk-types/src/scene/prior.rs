@@ -1,5 +1,5 @@
 //! Depth that is suggested, not measured.
-use super::Plane;
+use super::Image;
 use serde::{Deserialize, Serialize};
 
 /// Kind of the values of a depth prior; scale and shift may be unknown.
@@ -16,7 +16,7 @@ pub enum PriorKind {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DepthPrior {
     /// [H, W] values; 0 or less and what is not finite = unknown.
-    pub values: Plane<f32>,
+    pub values: Image<f32>,
     /// Their kind.
     pub kind: PriorKind,
 }

@@ -1,6 +1,6 @@
 //! Area averaging: every output pixel is the mean of the input area that it covers, fractions
 //! included.
-use crate::scene::{Plane, RgbImage};
+use crate::scene::{Image, RgbImage};
 use rayon::prelude::*;
 
 /// Per output index: the first input index and the weights of it and its successors, which sum to
@@ -50,14 +50,14 @@ pub fn area_average_of_used(
     from: (usize, usize),
     to: (usize, usize),
     pixel: impl Fn(usize, usize) -> ([f32; 3], f32) + Sync,
-) -> (RgbImage, Plane<f32>) {
+) -> (RgbImage, Image<f32>) {
     let mut image = area_average(from, to, |x, y| {
         let (colour, share) = pixel(x, y);
         colour.map(|v| v * share)
     });
     let share = area_average(from, to, |x, y| [pixel(x, y).1; 3]);
     // A little more than 1 by rounding.
-    let share = Plane { width: to.0, height: to.1, data: share.data.iter().map(|s| s[0].min(1.0)).collect() };
+    let share = Image { width: to.0, height: to.1, data: share.data.iter().map(|s| s[0].min(1.0)).collect() };
     for (colour, share) in image.data.iter_mut().zip(&share.data).filter(|(_, share)| **share > 0.0) {
         *colour = colour.map(|v| v / share);
     }
@@ -65,11 +65,11 @@ pub fn area_average_of_used(
     (image, share)
 }
 
-impl Plane<f32> {
+impl Image<f32> {
     /// The map at another size by area averaging.
-    pub fn resized_by_area(&self, width: usize, height: usize) -> Plane<f32> {
+    pub fn resized_by_area(&self, width: usize, height: usize) -> Image<f32> {
         let out = area_average((self.width, self.height), (width, height), |x, y| [self.at(x, y); 3]);
-        Plane { width, height, data: out.data.iter().map(|v| v[0]).collect() }
+        Image { width, height, data: out.data.iter().map(|v| v[0]).collect() }
     }
 }
 

@@ -1,7 +1,7 @@
 //! Fusion with priors made from true depth, with errors of known size.
 use super::*;
 use crate::progress::{Recorded, Silent};
-use crate::scene::Plane;
+use crate::scene::Image;
 use crate::stereo::surface::RelativePoses;
 use crate::stereo::{StereoOptions, pyramid};
 use splatvk_test_support::stereo::{Set, breakfast};
@@ -19,7 +19,7 @@ fn smooth(width: usize, height: usize, phase: f32) -> impl Fn(usize) -> f32 {
 /// True depth as a network might give it: inverse depth times a scale and plus a shift that both
 /// wander by `error` over the image, near surfaces spread over far ones and blurred by a tenth of
 /// `error` of the width, all in another unit.
-fn simulated(depth: &Plane<f32>, error: f32, phase: f32) -> DepthPrior {
+fn simulated(depth: &Image<f32>, error: f32, phase: f32) -> DepthPrior {
     let (width, height) = (depth.width, depth.height);
     let radius = (0.1 * error * width as f32).round().max(1.0) as usize;
     let known: Vec<f32> = depth.data.iter().map(|z| if *z > 0.0 { 1.0 / z } else { 0.0 }).collect();
@@ -47,7 +47,7 @@ fn simulated(depth: &Plane<f32>, error: f32, phase: f32) -> DepthPrior {
         let inverse = blurred[k] * (1.0 + error * scale(k)) + 0.5 * error * unit * shift(k);
         3.0 * inverse + 0.7 * unit
     };
-    let values = Plane { width, height, data: (0..width * height).map(of).collect() };
+    let values = Image { width, height, data: (0..width * height).map(of).collect() };
     DepthPrior { values, kind: PriorKind::InverseDepth }
 }
 
@@ -117,7 +117,7 @@ fn a_prior_of_another_scene_is_refused_and_named() {
     let links = RelativePoses::new(&level);
     let before = matched(&set, &level);
     // Near where the scene is far.
-    let inverted = |d: &Plane<f32>| Some(DepthPrior { values: d.clone(), kind: PriorKind::InverseDepth });
+    let inverted = |d: &Image<f32>| Some(DepthPrior { values: d.clone(), kind: PriorKind::InverseDepth });
     let priors: Vec<_> = set.depth.iter().map(inverted).collect();
     let recorded = Recorded::new(&Silent);
     let after = join(&level, &links, &before, &priors, 1, &recorded);

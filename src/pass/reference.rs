@@ -1,11 +1,11 @@
-//! f64 twins of the whole render: raw parameters in, images out, and back. What the GPU passes are
-//! tested against, composed of the twins that stand beside each pass.
+//! f64 references of the whole render: raw parameters in, images out, and back. What the GPU passes are
+//! tested against, composed of the references that stand beside each pass.
 use super::options::FeatureMode;
 use super::params::{Gradients, Params};
 use super::project::{self, Projected};
 use super::project_backward;
 use super::raster_backward;
-use super::raster_forward::{self, Cutoffs, Image};
+use super::raster_forward::{self, Cutoffs, RenderedImage};
 use super::view::View;
 
 /// Everything the forward pass produced.
@@ -18,7 +18,7 @@ pub struct Forward {
     /// Visible splats, nearest first, ties by index.
     pub order: Vec<u32>,
     /// Planes.
-    pub image: Image,
+    pub image: RenderedImage,
 }
 
 /// Renders in f64.
@@ -36,21 +36,21 @@ pub fn forward_in_order(
     given: Option<&[u32]>,
 ) -> Forward {
     let projected: Vec<_> =
-        (0..params.len()).map(|i| project::twin(params, i, view, cutoffs.alpha_min)).collect();
-    let rendered_features = project::features_twin(&params.features, params.feature_dim, mode);
+        (0..params.len()).map(|i| project::reference(params, i, view, cutoffs.alpha_min)).collect();
+    let rendered_features = project::features_reference(&params.features, params.feature_dim, mode);
     let mut order: Vec<u32> = (0..params.len() as u32).filter(|&i| projected[i as usize].is_some()).collect();
     // f32 depth, as the sort keys on the GPU are: equal keys keep index order (the sort is stable).
     let depth = |i: u32| projected[i as usize].as_ref().map_or(0.0, |p| p.depth) as f32;
     order.sort_by(|&a, &b| depth(a).total_cmp(&depth(b)));
     let order = given.map_or(order, <[u32]>::to_vec);
-    let scene = raster_forward::TwinScene {
+    let scene = raster_forward::ReferenceScene {
         projected: &projected,
         features: &rendered_features,
         feature_dim: params.feature_dim,
         order: &order,
         view,
     };
-    let image = raster_forward::twin(&scene, cutoffs);
+    let image = raster_forward::reference(&scene, cutoffs);
     Forward { projected, rendered_features, order, image }
 }
 
@@ -64,21 +64,21 @@ pub fn backward(
     forward: &Forward,
     upstream: &[f64],
 ) -> Gradients {
-    let scene = raster_forward::TwinScene {
+    let scene = raster_forward::ReferenceScene {
         projected: &forward.projected,
         features: &forward.rendered_features,
         feature_dim: params.feature_dim,
         order: &forward.order,
         view,
     };
-    let splat = raster_backward::twin(&scene, cutoffs, upstream);
+    let splat = raster_backward::reference(&scene, cutoffs, upstream);
     let mut out = Gradients { params: params.zeros_like(), twist: [0.0; 6], intrinsics: [0.0; 4] };
     for i in 0..params.len() {
         if forward.projected[i].is_some() {
-            project_backward::twin(params, i, view, &splat.geometry[i], &mut out);
+            project_backward::reference(params, i, view, &splat.geometry[i], &mut out);
         }
     }
     out.params.features =
-        project_backward::features_twin(&params.features, &splat.features, params.feature_dim, mode);
+        project_backward::features_reference(&params.features, &splat.features, params.feature_dim, mode);
     out
 }

@@ -1,9 +1,9 @@
-//! Central differences of the twin itself: the analytic backward is right before any shader is
+//! Central differences of the reference itself: the analytic backward is right before any shader is
 //! compared with it.
 use super::options::FeatureMode;
 use super::params::Params;
 use super::raster_forward::Cutoffs;
-use super::twin::{backward, forward, forward_in_order};
+use super::reference::{backward, forward, forward_in_order};
 use super::view::View;
 use crate::math::Random;
 use crate::scene::Pose;
@@ -163,7 +163,7 @@ fn clamped_jacobian_and_clamped_alpha() {
 #[test]
 fn gauge_jacobian_at_zero_features_is_one_over_epsilon() {
     let mode = FeatureMode::Gauge { epsilon: 1e-3, blocks: 1 };
-    let raw = super::project_backward::features_twin(&[0.0; 3], &[1.0, -2.0, 0.5], 3, mode);
+    let raw = super::project_backward::features_reference(&[0.0; 3], &[1.0, -2.0, 0.5], 3, mode);
     for (a, b) in raw.iter().zip([1.0, -2.0, 0.5]) {
         assert!((a - b / f64::from(1e-3f32)).abs() < 1e-9);
     }
