@@ -6,7 +6,6 @@
 //! alone and appear here under their own names: [`scene`], [`math`] and [`Error`] of
 //! `splatvk-types`, [`format`] and [`photo`] of `splatvk-io`, [`gpu`] on `splatvk-gpu`, [`pose`]
 //! (`splatvk-sfm`), [`infer`] (`splatvk-infer`), [`language`] and [`query`] (`splatvk-language`).
-//! Cargo enforces their order; `tests/imports.rs` enforces that of the folders here.
 //!
 //! # From a program
 //! Everything the command line does is here: [`run::run`] writes a scene directory,
@@ -60,7 +59,6 @@
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]
 
-pub mod ablate;
 pub mod bench;
 #[cfg(feature = "capi")]
 pub mod capi;
@@ -74,7 +72,6 @@ pub mod pass;
 pub mod pipeline;
 pub mod report;
 pub mod run;
-pub mod synth;
 
 #[cfg(feature = "cli")]
 #[doc(hidden)]

@@ -5,7 +5,10 @@ mod fixture;
 
 use fixture::command::{limited, memory_was_limited, refuses, splatvk, text};
 use fixture::{data, scene, small_views, train_log};
+use splatlab::generate::regions::InjectedErrors;
+use splatlab::generate::{SceneSpec, generate};
 use splatvk::format::npy::{self, NpyArray};
+use splatvk::progress::Silent;
 use splatvk::scene::Seen;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -125,8 +128,8 @@ fn a_size_that_cannot_be_done_is_refused_with_one_that_can() {
 fn train_chooses_views_and_names_them() {
     let folder = tempfile::tempdir().unwrap();
     let (set, out) = (folder.path().join("set"), folder.path().join("scene"));
-    let size = ["--views", "5", "--held-out", "1", "--size", "160x120", "--objects", "2"];
-    assert!(splatvk().arg("generate").arg("--out").arg(&set).args(size).output().unwrap().status.success());
+    let spec = SceneSpec { views: 5, held_out: 1, size: (160, 120), objects: 2, ..SceneSpec::default() };
+    generate(&set, &spec, &InjectedErrors::NONE, &Silent).unwrap();
     let mut train = splatvk();
     train
         .arg("train")

@@ -64,12 +64,11 @@ const FILES: [&str; 4] = [
     "export SCENE --format transforms --out",
     "bench sort --keys 1000 --repeats 1 --json",
 ];
-const FOLDERS: [&str; 7] = [
+const FOLDERS: [&str; 6] = [
     "export SCENE --format colmap --out",
     "render SCENE --cameras CAMERAS --out",
     "query SCENE lemon --out",
     "eval SCENE --ground-truth TRUTH --out",
-    "ablate alignment --data TRUTH --out",
     "bench --write-scene",
     "manuals",
 ];
@@ -392,8 +391,7 @@ fn copy(from: &Path, to: &Path) {
 #[test]
 fn second_command_for_one_place_is_refused() {
     for words in [
-        "generate --size 1600x1200 --views 40 --out",
-        "ablate alignment --data TRUTH --seeds 1,2,3,4,5,6,7,8 --out",
+        "train --images IMAGES --cameras KNOWN --iterations 1000000 --out",
         "bench training --splats 2000 --seconds 600 --json",
     ] {
         let folder = tempfile::tempdir().unwrap();
@@ -430,9 +428,8 @@ fn second_command_for_one_place_is_refused() {
 #[test]
 fn told_to_stop_a_command_leaves_nothing() {
     let lines = [
-        "generate --size 1600x1200 --views 40 --out",
+        "train --images IMAGES --cameras KNOWN --iterations 1000000 --out",
         "bench training --splats 2000 --seconds 600 --json",
-        "ablate alignment --data TRUTH --seeds 1,2,3,4,5,6,7,8 --out",
     ];
     for words in lines {
         let folder = tempfile::tempdir().unwrap();

@@ -5,7 +5,6 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
 mod bench;
-mod experiments;
 mod number;
 mod shared;
 
@@ -13,7 +12,6 @@ pub use super::export::ExportArgs;
 pub use super::measure::MeasureArgs;
 pub use super::run::RunArgs;
 pub use bench::{BenchArgs, BenchPart};
-pub use experiments::{AblateArgs, GenerateArgs, LayoutArg};
 pub use number::whole;
 pub use shared::{DeviceArgs, EXPERTS, LogFormat, MACHINE, MakingArgs, PresetArg, compats};
 
@@ -50,10 +48,6 @@ pub enum Command {
     Measure(MeasureArgs),
     /// Scene against ground truth → figures
     Eval(EvalArgs),
-    /// Data with ground truth → the tables of the paper's experiments
-    Ablate(AblateArgs),
-    /// Synthetic scene with ground truth, as hard as asked
-    Generate(GenerateArgs),
     /// Scene → another program's format
     Export(ExportArgs),
     /// The installed models
@@ -68,6 +62,20 @@ pub enum Command {
     Completions(CompletionsArgs),
     /// Man pages into a folder
     Manuals(ManualsArgs),
+    /// A command of splatlab
+    #[command(hide = true, disable_help_flag = true)]
+    Ablate(MovedArgs),
+    /// A command of splatlab
+    #[command(hide = true, disable_help_flag = true)]
+    Generate(MovedArgs),
+}
+
+/// Arguments of a command that is elsewhere.
+#[derive(Debug, Args)]
+pub struct MovedArgs {
+    /// Anything
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true, hide = true)]
+    pub rest: Vec<std::ffi::OsString>,
 }
 
 impl Command {
@@ -79,7 +87,6 @@ impl Command {
             Command::Query(args) => &mut args.device,
             Command::View(args) => &mut args.device,
             Command::Eval(args) => &mut args.device,
-            Command::Ablate(args) => &mut args.device,
             Command::Models(args) => match &mut args.action {
                 ModelsAction::List(device) | ModelsAction::Check(device) | ModelsAction::Path(device) => {
                     device
@@ -89,6 +96,7 @@ impl Command {
             Command::Doctor(args) => &mut args.device,
             Command::Bench(args) => return Some(&mut args.provider),
             Command::Render(_)
+            | Command::Ablate(_)
             | Command::Generate(_)
             | Command::Export(_)
             | Command::Measure(_)

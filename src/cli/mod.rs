@@ -1,5 +1,4 @@
 //! Command line: [`args`] = arguments, `plan` = the plan that they describe, one file per command.
-mod ablate;
 pub mod args;
 mod bench;
 mod clean;
@@ -7,15 +6,14 @@ mod doctor;
 mod eval;
 mod export;
 mod fetch;
-mod generate;
 mod kept;
 mod line;
 mod measure;
 mod models;
-mod outputs;
+pub mod outputs;
 mod plan;
-mod print;
-mod progress;
+pub mod print;
+pub mod progress;
 mod query;
 mod render;
 mod run;
@@ -27,25 +25,44 @@ mod usage;
 mod view;
 mod views;
 
-use crate::{Result, gpu};
-use args::Command;
+use crate::{Error, Result, gpu};
+use args::{Cli, Command, LogFormat};
+use clap::{CommandFactory, FromArgMatches};
 use std::process::ExitCode;
 
-/// Runs the command line of this process: one error line at most, and an exit code that says what
-/// kind it was ([`Error::exit_code`]).
+/// A program of commands with one way of parsing, reporting and ending. The laboratory has a
+/// second one.
+pub trait Program: CommandFactory + FromArgMatches {
+    /// Name of the program.
+    const NAME: &'static str;
+
+    /// Options that a command takes because its neighbours do, and does not use: (command,
+    /// options). Its help hides them.
+    const UNUSED: &'static [(&'static str, &'static [&'static str])];
+
+    /// Format of standard error.
+    fn log(&self) -> LogFormat;
+
+    /// Runs the command.
+    fn execute(self) -> Result<()>;
+}
+
+/// The command line of `splatvk`.
 pub fn main() -> ExitCode {
-    let cli = match usage::parse() {
-        Ok(cli) => cli,
+    start::<Cli>()
+}
+
+/// Runs the command line of this process: one error line at most, and an exit code by the kind of
+/// the error ([`Error::exit_code`]).
+pub fn start<P: Program>() -> ExitCode {
+    let program = match usage::parse::<P>() {
+        Ok(program) => program,
         Err(code) => return code,
     };
-    progress::set_format(cli.log);
+    progress::set_format(P::NAME, program.log());
     progress::stop_on_signal();
     gpu::on_long_compilation(progress::tell_of_compilation);
-    let mut command = cli.command;
-    if let Some(provider) = command.provider() {
-        *provider = cli.provider;
-    }
-    match execute(command) {
+    match program.execute() {
         Ok(()) => {
             progress::release();
             ExitCode::SUCCESS
@@ -57,23 +74,53 @@ pub fn main() -> ExitCode {
     }
 }
 
-fn execute(command: Command) -> Result<()> {
-    match command {
-        Command::Run(args) => run::run(&args),
-        Command::Train(args) => train::train(&args),
-        Command::Render(args) => render::render(&args),
-        Command::Query(args) => query::query(&args),
-        Command::View(args) => view::view(&args),
-        Command::Eval(args) => eval::eval(&args),
-        Command::Ablate(args) => ablate::ablate(&args),
-        Command::Generate(args) => generate::generate(&args),
-        Command::Measure(args) => measure::measure(&args),
-        Command::Export(args) => export::export(&args),
-        Command::Models(args) => models::models(&args),
-        Command::Bench(args) => bench::bench(&args),
-        Command::Clean(args) => clean::clean(&args),
-        Command::Doctor(args) => doctor::doctor(&args),
-        Command::Completions(args) => shell::completions(&args),
-        Command::Manuals(args) => shell::manuals(&args),
+impl Program for Cli {
+    const NAME: &'static str = "splatvk";
+
+    const UNUSED: &'static [(&'static str, &'static [&'static str])] = &[
+        ("render", &["provider"]),
+        ("measure", &["provider", "log"]),
+        ("export", &["provider", "log"]),
+        ("clean", &["provider", "log"]),
+        ("completions", &["provider", "log"]),
+        ("manuals", &["provider", "log"]),
+        ("models list", &["provider", "log", "device"]),
+        ("models path", &["provider", "log", "device"]),
+    ];
+
+    fn log(&self) -> LogFormat {
+        self.log
     }
+
+    fn execute(mut self) -> Result<()> {
+        if let Some(provider) = self.command.provider() {
+            *provider = self.provider;
+        }
+        match self.command {
+            Command::Run(args) => run::run(&args),
+            Command::Train(args) => train::train(&args),
+            Command::Render(args) => render::render(&args),
+            Command::Query(args) => query::query(&args),
+            Command::View(args) => view::view(&args),
+            Command::Eval(args) => eval::eval(&args),
+            Command::Measure(args) => measure::measure(&args),
+            Command::Export(args) => export::export(&args),
+            Command::Models(args) => models::models(&args),
+            Command::Bench(args) => bench::bench(&args),
+            Command::Clean(args) => clean::clean(&args),
+            Command::Doctor(args) => doctor::doctor(&args),
+            Command::Completions(args) => shell::completions(&args),
+            Command::Manuals(args) => shell::manuals(&args),
+            Command::Ablate(_) => Err(moved("ablate")),
+            Command::Generate(_) => Err(moved("generate")),
+        }
+    }
+}
+
+/// Where a command went that is not for users.
+fn moved(command: &str) -> Error {
+    Error::input(format!(
+        "{command} is a command of splatlab, which nothing installs: in a clone of {}, run `cargo run --release -p splatlab -- {command}`",
+        env!("CARGO_PKG_REPOSITORY")
+    ))
 }

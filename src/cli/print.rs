@@ -5,7 +5,7 @@ use std::io::Write;
 use std::path::Path;
 
 /// Prints text for people to standard output, without control characters.
-pub(super) fn print(text: &str) -> Result<()> {
+pub fn print(text: &str) -> Result<()> {
     put(&lines(text))
 }
 
@@ -19,14 +19,14 @@ fn put(text: &str) -> Result<()> {
 }
 
 /// Prints one JSON object on a line of its own.
-pub(super) fn print_json(value: &serde_json::Value) -> Result<()> {
+pub fn print_json(value: &serde_json::Value) -> Result<()> {
     // As it is: JSON escapes control characters itself, and names must stay what they are.
     put(&format!("{value}\n"))
 }
 
 /// The lines that one copies after a scene was made: where its report is, and the command that
 /// shows it.
-pub(super) fn ending(scene: &Path) -> String {
+pub fn ending(scene: &Path) -> String {
     let report = scene.join("report.html");
     format!("report: {}\nlook at it: splatvk view {}\n", report.display(), quoted(scene))
 }
@@ -39,7 +39,7 @@ fn quoted(path: &Path) -> String {
 }
 
 /// Names the files that a command wrote.
-pub(super) fn listing(files: &[std::path::PathBuf], as_json: bool) -> Result<()> {
+pub fn listing(files: &[std::path::PathBuf], as_json: bool) -> Result<()> {
     if as_json {
         return print_json(&serde_json::json!({ "files": files }));
     }

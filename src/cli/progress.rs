@@ -9,7 +9,7 @@ use indicatif::{HumanDuration, MultiProgress, ProgressBar, ProgressState, Progre
 use serde_json::{Value, json};
 use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{LazyLock, Mutex};
+use std::sync::{LazyLock, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 /// Set by the first Ctrl-C of the process; work notices it between steps.
@@ -19,9 +19,14 @@ static STOPPED: AtomicBool = AtomicBool::new(false);
 static JSON: AtomicBool = AtomicBool::new(false);
 static BEGAN: LazyLock<Instant> = LazyLock::new(Instant::now);
 
-/// Chooses the format of everything that goes to standard error from now on.
-pub fn set_format(format: LogFormat) {
+/// Name of the program, before its errors.
+static NAME: OnceLock<&'static str> = OnceLock::new();
+
+/// Chooses the format of everything that goes to standard error from now on, and the name before
+/// errors.
+pub fn set_format(name: &'static str, format: LogFormat) {
     LazyLock::force(&BEGAN);
+    NAME.get_or_init(|| name);
     JSON.store(format == LogFormat::Json, Ordering::SeqCst);
 }
 
@@ -54,7 +59,7 @@ pub fn print_error(message: &str, exit_code: u8) {
     let message = one_line(message);
     match as_json() {
         true => write_event("error", json!({ "message": message, "exit_code": exit_code })),
-        false => write_line(&format!("splatvk: {message}")),
+        false => write_line(&format!("{}: {message}", NAME.get().unwrap_or(&"splatvk"))),
     }
 }
 

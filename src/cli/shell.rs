@@ -1,5 +1,5 @@
 //! `splatvk completions`, `splatvk manuals`: what tools/install puts beside the program.
-use super::args::{CompletionsArgs, ManualsArgs};
+use super::args::{Cli, CompletionsArgs, ManualsArgs};
 use super::outputs::WrittenFiles;
 use super::print::print;
 use super::usage;
@@ -7,7 +7,7 @@ use crate::{Error, Result};
 
 pub fn completions(args: &CompletionsArgs) -> Result<()> {
     let mut script = Vec::new();
-    clap_complete::generate(args.shell, &mut usage::command(), "splatvk", &mut script);
+    clap_complete::generate(args.shell, &mut usage::command::<Cli>(), "splatvk", &mut script);
     print(&String::from_utf8_lossy(&script))
 }
 

@@ -1,42 +1,29 @@
 //! What was typed: the definition of the command line, and its mistakes in one line each, with what
 //! may have been meant.
+use super::Program;
 use super::args::Cli;
 use super::line::one_line;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
-use clap::{Command, CommandFactory, FromArgMatches};
+use clap::{Command, CommandFactory};
 use std::error::Error as _;
 use std::num::{ParseFloatError, ParseIntError};
 use std::process::ExitCode;
 
-/// Options that a command takes, because all or its neighbours do, and has no use for: its help
-/// does not show them.
-const UNUSED: [(&str, &[&str]); 9] = [
-    ("render", &["provider"]),
-    ("measure", &["provider", "log"]),
-    ("generate", &["provider", "log"]),
-    ("export", &["provider", "log"]),
-    ("clean", &["provider", "log"]),
-    ("completions", &["provider", "log"]),
-    ("manuals", &["provider", "log"]),
-    ("models list", &["provider", "log", "device"]),
-    ("models path", &["provider", "log", "device"]),
-];
-
-/// The command line: what is parsed, and what completions are made of.
-pub fn command() -> Command {
-    built(Cli::command())
+/// The command line of a program: the parser, and the source of shell completions.
+pub fn command<P: Program>() -> Command {
+    built::<P>(P::command())
 }
 
-/// The same for man pages: `splatvk help` has none.
+/// The command line for man pages: `splatvk help` has none.
 pub fn manual() -> Command {
-    built(Cli::command().disable_help_subcommand(true))
+    built::<Cli>(Cli::command().disable_help_subcommand(true))
 }
 
-fn built(all: Command) -> Command {
+fn built<P: Program>(all: Command) -> Command {
     let mut all = all.mut_subcommands(numbers_may_be_negative);
     // Options of all commands get into each of them here.
     all.build();
-    UNUSED.iter().fold(all, |all, (path, options)| hide(all, path, options))
+    P::UNUSED.iter().fold(all, |all, (path, options)| hide(all, path, options))
 }
 
 /// "--views -3" is a number that is refused, not an option "-3".
@@ -55,15 +42,15 @@ fn hide(command: Command, path: &str, options: &[&str]) -> Command {
     }
 }
 
-/// What this process was asked for, or how it ends.
-pub fn parse() -> Result<Cli, ExitCode> {
-    let parsed = command().try_get_matches().and_then(|found| Cli::from_arg_matches(&found));
-    parsed.map_err(|error| print_usage_error(&error))
+/// The arguments of this process, or the exit code of a mistake in them, which is printed.
+pub fn parse<P: Program>() -> Result<P, ExitCode> {
+    let parsed = command::<P>().try_get_matches().and_then(|found| P::from_arg_matches(&found));
+    parsed.map_err(|error| print_usage_error(&error, &command::<P>()))
 }
 
 /// Help and version go to standard output; what cannot be parsed is one line like every other
 /// error, exit code 2.
-fn print_usage_error(error: &clap::Error) -> ExitCode {
+fn print_usage_error(error: &clap::Error, all: &Command) -> ExitCode {
     let help = matches!(
         error.kind(),
         ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand | ErrorKind::MissingSubcommand
@@ -74,12 +61,12 @@ fn print_usage_error(error: &clap::Error) -> ExitCode {
         let _ = error.print();
         return if asked { ExitCode::SUCCESS } else { ExitCode::from(2) };
     }
-    eprintln!("splatvk: {}", one_line(&message(error)));
+    eprintln!("{}: {}", all.get_name(), one_line(&message(error, all)));
     ExitCode::from(2)
 }
 
 /// What is wrong, what may have been meant, and which help shows the rest.
-fn message(error: &clap::Error) -> String {
+fn message(error: &clap::Error, all: &Command) -> String {
     let text = |kind| texts(error, kind).into_iter().next().unwrap_or_default();
     // "--views <N>": its name is enough.
     let option = || text(ContextKind::InvalidArg).split(' ').next().unwrap_or_default().to_owned();
@@ -92,7 +79,7 @@ fn message(error: &clap::Error) -> String {
         ErrorKind::InvalidSubcommand => {
             let name = text(ContextKind::InvalidSubcommand);
             let near = match meant(ContextKind::SuggestedSubcommand) {
-                none if none.is_empty() => swapped(error, &name),
+                none if none.is_empty() => swapped(error, all, &name),
                 near => near,
             };
             format!("there is no command {name}{near}")
@@ -119,24 +106,23 @@ fn message(error: &clap::Error) -> String {
         }
         // The message may go on over several lines before the usage.
         _ => {
-            let all = error.to_string();
-            all.split("\n\n").next().unwrap_or(&all).trim_start_matches("error: ").to_owned()
+            let text = error.to_string();
+            text.split("\n\n").next().unwrap_or(&text).trim_start_matches("error: ").to_owned()
         }
     };
-    format!("{wrong}; {} --help shows what there is", asked_command(error))
+    format!("{wrong}; {} --help shows what there is", asked_command(error, all))
 }
 
 /// Clap compares places and finds nothing near to "rnu": a command with the same letters in another
 /// order may be meant.
-fn swapped(error: &clap::Error, name: &str) -> String {
+fn swapped(error: &clap::Error, all: &Command, name: &str) -> String {
     let sorted = |word: &str| {
         let mut letters: Vec<char> = word.chars().collect();
         letters.sort_unstable();
         letters
     };
-    let asked = asked_command(error);
-    let all = command();
-    let of = asked.split(' ').skip(1).try_fold(&all, |c, word| c.find_subcommand(word));
+    let asked = asked_command(error, all);
+    let of = asked.split(' ').skip(1).try_fold(all, |c, word| c.find_subcommand(word));
     let same = of.and_then(|c| c.get_subcommands().find(|c| sorted(c.get_name()) == sorted(name)));
     same.map_or(String::new(), |c| format!("; did you mean {}?", c.get_name()))
 }
@@ -170,14 +156,14 @@ fn choices(all: &[String]) -> String {
 }
 
 /// The command up to its first argument: "splatvk models list".
-fn asked_command(error: &clap::Error) -> String {
+fn asked_command(error: &clap::Error, all: &Command) -> String {
     let usage = match error.get(ContextKind::Usage) {
         Some(ContextValue::StyledStr(usage)) => usage.to_string(),
         _ => String::new(),
     };
     let words = usage.trim_start_matches("Usage:").split_whitespace();
     let words: Vec<&str> = words.take_while(|w| w.starts_with(char::is_alphanumeric)).collect();
-    if words.is_empty() { "splatvk".to_owned() } else { words.join(" ") }
+    if words.is_empty() { all.get_name().to_owned() } else { words.join(" ") }
 }
 
 #[cfg(test)]
@@ -185,13 +171,14 @@ mod tests {
     use super::*;
 
     fn said(line: &[&str]) -> String {
-        let error = command().try_get_matches_from(["splatvk"].iter().chain(line)).unwrap_err();
-        one_line(&message(&error))
+        let all = command::<Cli>();
+        let error = all.clone().try_get_matches_from(["splatvk"].iter().chain(line)).unwrap_err();
+        one_line(&message(&error, &all))
     }
 
     #[test]
     fn the_definitions_are_consistent() {
-        command().debug_assert();
+        command::<Cli>().debug_assert();
     }
 
     #[test]
@@ -233,7 +220,6 @@ mod tests {
             ),
             (&["run", "x", "--max-size", "1e3"], "--max-size 1e3: not a whole number; give 64 or more"),
             (&["view", "x", "--port", "70000"], "--port 70000: give 0 to 65535"),
-            (&["generate", "--out", "x", "--texture", "much"], "--texture much: not a number; give one"),
             (&["bench", "--sweep", "1,x"], "--sweep x: not a whole number; give 1 or more"),
         ] {
             let text = said(line);
@@ -244,7 +230,8 @@ mod tests {
     #[test]
     fn a_help_shows_what_its_command_uses() {
         let help = |path: &str| {
-            let found = path.split(' ').fold(command(), |c, name| c.find_subcommand(name).unwrap().clone());
+            let found =
+                path.split(' ').fold(command::<Cli>(), |c, name| c.find_subcommand(name).unwrap().clone());
             { found }.render_help().to_string()
         };
         for path in ["clean", "models list", "export"] {

@@ -67,7 +67,6 @@ pub struct ImageScore {
 
 /// How one phrase did in one frame.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-#[non_exhaustive]
 pub struct MaskScore {
     /// Frame file stem.
     pub frame: String,

@@ -2,8 +2,6 @@
 //! stage may run, beside which others, and whether its output is still there from an earlier run
 //! follows from that.
 mod graph;
-#[cfg(test)]
-mod lost_device_tests;
 mod output;
 mod stage;
 mod store;

@@ -219,10 +219,11 @@ mod tests {
     use super::*;
     use crate::infer::things;
     use crate::pass::RenderedFrame;
+    use crate::query::CANONICAL_PHRASES;
     use crate::query::phrasing::{Phrasing, Vocabulary};
     use crate::query::presence::Alternatives;
     use crate::scene::{Codebook, LevelField, Pose, Scale};
-    use crate::synth::regions;
+    use splatvk_test_support::embedding::{self, text_embedding};
     use std::sync::Arc;
 
     /// Edge of the square pictures, pixels.
@@ -263,9 +264,9 @@ mod tests {
         };
         let unit = |k: usize| (0..3).map(move |c| f32::from(u8::from(c == k)));
         let codebook = Codebook {
-            embedding_dim: regions::DIM,
+            embedding_dim: embedding::DIM,
             code_dim: 3,
-            embeddings: phrases.iter().flat_map(|p| regions::text_embedding(p)).collect(),
+            embeddings: phrases.iter().flat_map(|p| text_embedding(p)).collect(),
             codes: (0..3).flat_map(unit).collect(),
             ..Codebook::default()
         };
@@ -294,14 +295,24 @@ mod tests {
             pose: Pose { rotation: glam::DMat3::IDENTITY, translation: DVec3::ZERO },
         }];
         let prepared = Prepared::of_frames(&splats, &field, &frames);
-        let things = things::of_form("").iter().flat_map(|t| regions::text_embedding(t)).collect();
+        let things = things::of_form("").iter().flat_map(|t| text_embedding(t)).collect();
         Wall { field, prepared, cameras, frames, things: Arc::new(things) }
+    }
+
+    /// A query in the embedding space made by rule.
+    fn made_query(text: &str) -> TextQuery {
+        TextQuery {
+            text: text.to_owned(),
+            embedding: text_embedding(text),
+            canonicals: CANONICAL_PHRASES.iter().flat_map(|c| text_embedding(c)).collect(),
+            ..TextQuery::default()
+        }
     }
 
     impl Wall {
         fn ask(&self, text: &str, reading: Reading) -> Answers {
             let alternatives = Alternatives { things: self.things.clone(), colours: Vec::new() };
-            let query = TextQuery { alternatives, reading, ..regions::query(text) };
+            let query = TextQuery { alternatives, reading, ..made_query(text) };
             let views = (&self.cameras[..], &self.frames[..]);
             self.prepared.answer(&self.field, views, &query, &QueryOptions::default(), &mut None).unwrap()
         }
@@ -313,7 +324,7 @@ mod tests {
         // Whatever is asked, a hundred other things fit as well; the codes alone would say that it
         // is found.
         for text in ["red ball", "lemon"] {
-            wall.things = Arc::new(regions::text_embedding(text).repeat(100));
+            wall.things = Arc::new(text_embedding(text).repeat(100));
             let a = wall.ask(text, Reading::default());
             assert_eq!(a.presence, Some(Presence::Absent));
             assert!(a.views[0].score > 0.5, "{}", a.views[0].score);

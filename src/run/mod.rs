@@ -21,7 +21,7 @@ mod record;
 pub mod refine;
 pub mod score;
 pub mod sources;
-pub(crate) mod stages;
+pub mod stages;
 pub mod train;
 pub mod view;
 

@@ -1,6 +1,8 @@
 //! Whole models: asked for, downloaded or exported, checked, installed, replaced, killed.
 use super::server::{File, Server, plain};
 use super::sha256;
+use splatlab::generate::regions::InjectedErrors;
+use splatlab::generate::{SceneSpec, generate};
 use splatvk::fetch::{self, Client, Limits};
 use splatvk::infer::Registry;
 use splatvk::infer::catalogue::{CatalogueEntry, catalogue};
@@ -328,14 +330,18 @@ fn what_was_fetched_describes_a_scene_and_answers_about_it() {
     let splatvk = |arguments: &[&str]| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));
         command.args(arguments).current_dir(place.folder.path());
-        if arguments[0] != "generate" {
-            command.arg("--models").arg(place.models());
-        }
-        succeeds(&mut command)
+        succeeds(command.arg("--models").arg(place.models()))
     };
     let json = |text: &str| serde_json::from_str::<serde_json::Value>(text).unwrap();
-    let size = ["--seed", "2", "--size", "160x120", "--views", "3", "--held-out", "1", "--pose-noise", "0"];
-    splatvk(&[&["generate", "--out", "data"], &size[..]].concat());
+    let spec = SceneSpec {
+        seed: 2,
+        size: (160, 120),
+        views: 3,
+        held_out: 1,
+        pose_noise: 0.0,
+        ..SceneSpec::default()
+    };
+    generate(&place.folder.path().join("data"), &spec, &InjectedErrors::NONE, &Silent).unwrap();
     let given = ["--init", "cameras:data/cameras_noisy.json", "--masks", "dir:data/regions_exact"];
     let short = ["--preset", "draft", "--iterations", "30", "--out", "scene", "--json"];
     let run = json(&splatvk(&[&["run", "data/images"], &given[..], &short[..]].concat()));

@@ -1,0 +1,176 @@
+//! Features in 2D: what an encoder says of a photo's own pixels, without a scene (the row "LSeg" of
+//! the paper's comparison with LSM). Every cell of a few pixels is a code of its own, so that the
+//! rules of the protocols apply unchanged.
+use super::data::DataSet;
+use super::stages::{Scored, asked};
+use crate::Result;
+use splatvk::eval::protocol::{self, CodeScores, DecodedView, ProtocolKind};
+use splatvk::eval::{Evaluation, GroundTruth, Rendered, Split};
+use splatvk::progress::Progress;
+use splatvk::query::{QueryOptions, TextQuery, answer_with, field_relevancy};
+use splatvk::run::stages::SharedEncoder;
+use splatvk::scene::{Camera, Codebook, Image, LanguageField, LevelField, RgbImage};
+
+/// Pixels along a cell. LSeg's features come at half the size of its input, which is about half
+/// that of a LERF photo.
+const CELL: usize = 4;
+
+/// One photo as a field of one level, and the code of each pixel.
+fn described(
+    image: &RgbImage,
+    encoder: &SharedEncoder,
+    progress: &dyn Progress,
+) -> Result<(LanguageField, Vec<Image<i32>>)> {
+    let (columns, rows) = (image.width.div_ceil(CELL), image.height.div_ceil(CELL));
+    let cell = |p: usize| (p / image.width / CELL * columns + p % image.width / CELL) as i32;
+    let labels = Image {
+        width: image.width,
+        height: image.height,
+        data: (0..image.width * image.height).map(cell).collect(),
+    };
+    let (embedding_dim, embeddings) =
+        encoder.with(|e| e.embed_regions(image, &labels, columns * rows, progress).map(|f| (e.dim(), f)))?;
+    let codebook = Codebook { embedding_dim, embeddings, ..Codebook::default() };
+    let level = LevelField { codebook, ..LevelField::default() };
+    Ok((LanguageField { levels: vec![level], space: encoder.space().to_owned() }, vec![labels]))
+}
+
+/// By protocol `field`, every frame.
+pub(super) fn field(
+    truth: &GroundTruth,
+    encoder: &SharedEncoder,
+    queries: &[TextQuery],
+    progress: &dyn Progress,
+) -> Result<Scored> {
+    let train = truth.frames.iter().filter(|f| f.split == Split::Train);
+    let cameras: Vec<Camera> = train.map(|f| f.camera.clone()).collect();
+    let mut evaluation = Evaluation::new(truth.clone(), &cameras, None)?;
+    let labels: Vec<u32> = evaluation.phrases().into_iter().map(|p| p.0).collect();
+    progress.begin("eval", truth.frames.len() as u64);
+    for (k, frame) in truth.frames.iter().enumerate() {
+        progress.check()?;
+        let rgb = truth.image(frame)?;
+        let (field, codes) = described(&rgb, encoder, progress)?;
+        let mut answers = Vec::new();
+        for (label, query) in labels.iter().zip(queries) {
+            let relevancy = field_relevancy(&field, query)?;
+            answers.push((*label, answer_with(&codes, &relevancy, &QueryOptions::default())?));
+        }
+        let depth = Image::filled(rgb.width, rgb.height, 0.0);
+        let alpha = Image::filled(rgb.width, rgb.height, 1.0);
+        evaluation.add_frame(frame, &Rendered { rgb, alpha, depth }, &answers)?;
+        progress.step(k as u64 + 1, "");
+    }
+    progress.end();
+    // Nothing was rendered: the photo is compared with itself there.
+    let mut report = evaluation.finish();
+    report.images.clear();
+    Ok(Scored { report, ..Scored::default() })
+}
+
+/// By a published protocol, every labelled photo.
+pub(super) fn published(
+    data: &DataSet,
+    kind: ProtocolKind,
+    encoder: &SharedEncoder,
+    queries: &[TextQuery],
+    progress: &dyn Progress,
+) -> Result<Scored> {
+    // Each photo is its own view; where it stands does not matter.
+    let cameras: Vec<Camera> =
+        data.truth.frames.iter().map(|f| Camera { name: f.stem.clone(), ..f.camera.clone() }).collect();
+    let mut protocol = protocol::open(kind, &data.labels, &cameras, &[])?;
+    let asked = asked(&protocol.prompts(), queries);
+    let views = protocol.views().to_vec();
+    progress.begin("eval", views.len() as u64);
+    for (k, view) in views.iter().enumerate() {
+        progress.check()?;
+        let Some(frame) = data.truth.frames.iter().find(|f| f.stem == view.stem) else { continue };
+        let (field, codes) = described(&data.truth.image(frame)?, encoder, progress)?;
+        let scores = CodeScores::new(&field, &asked)?;
+        protocol.add(k, &DecodedView { codes: &codes, scores: &scores })?;
+        progress.step(k as u64 + 1, "");
+    }
+    progress.end();
+    Ok(Scored { published: Some(protocol.finish()), ..Scored::default() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::data::{DataSet, Layout};
+    use super::*;
+    use splatvk::infer::RegionEncoder;
+    use splatvk::language::dir::normalise_rows;
+    use splatvk::progress::Silent;
+
+    /// Regions are their mean colour, texts the colour that they name.
+    struct Colours;
+
+    impl RegionEncoder for Colours {
+        fn space(&self) -> &str {
+            "colours"
+        }
+        fn dim(&self) -> usize {
+            3
+        }
+        fn embed_regions(
+            &mut self,
+            image: &RgbImage,
+            labels: &Image<i32>,
+            count: usize,
+            _: &dyn Progress,
+        ) -> Result<Vec<f32>> {
+            let mut rows = vec![0.0; 3 * count];
+            for (pixel, label) in image.data.iter().zip(&labels.data) {
+                (0..3).for_each(|c| rows[3 * *label as usize + c] += pixel[c]);
+            }
+            normalise_rows(&mut rows, 3);
+            Ok(rows)
+        }
+        fn embed_texts(&mut self, _: &[&str]) -> Result<Vec<f32>> {
+            Ok(Vec::new())
+        }
+    }
+
+    #[test]
+    fn the_pixels_of_labelled_photos_answer_for_themselves() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::create_dir_all(at("images")).unwrap();
+        let side = 120;
+        for stem in ["0", "1"] {
+            // Red left of the middle, blue right of it: 7200 pixels each, and no cell across the
+            // border.
+            let red = |x: u32| x < side / 2;
+            let photo = image::RgbImage::from_fn(side, side, |x, _| {
+                image::Rgb(if red(x) { [250, 0, 0] } else { [0, 0, 250] })
+            });
+            photo.save(at(&format!("images/{stem}.png"))).unwrap();
+            std::fs::create_dir_all(at(&format!("segmentations/{stem}"))).unwrap();
+            for (class, of) in [("red half", true), ("blue half", false)] {
+                let mask = image::GrayImage::from_fn(side, side, |x, _| {
+                    image::Luma([if red(x) == of { 255 } else { 0 }])
+                });
+                mask.save(at(&format!("segmentations/{stem}/{class}.png"))).unwrap();
+            }
+        }
+        std::fs::write(at("segmentations/classes.txt"), "red half\nblue half\n").unwrap();
+        let data = DataSet::open("halves".into(), folder.path(), None).unwrap();
+        assert_eq!(data.layout, Layout::Published(ProtocolKind::Ovs));
+        let query = |text: &str, embedding: [f32; 3]| TextQuery {
+            text: text.into(),
+            embedding: embedding.into(),
+            canonicals: vec![0.0, 1.0, 0.0],
+            alternatives: Default::default(),
+            reading: Default::default(),
+        };
+        let encoder = SharedEncoder::new(Box::new(Colours), String::new());
+        let miou = |red: [f32; 3]| {
+            let queries = [query("blue half", [0.0, 0.0, 1.0]), query("red half", red)];
+            let scored = published(&data, ProtocolKind::Ovs, &encoder, &queries, &Silent).unwrap();
+            scored.published.unwrap().summary["train"].figures["miou"]
+        };
+        assert_eq!(miou([1.0, 0.0, 0.0]), 1.0);
+        assert_eq!(miou([0.0, 0.0, 1.0]), 0.5, "a text that means the other half finds the other half");
+    }
+}

@@ -1,0 +1,436 @@
+//! Runs setups as graphs of stages that share one store: setups that agree up to a stage share what
+//! that stage made.
+use super::data::{DataSet, Layout, Scope};
+use super::flat;
+use super::setup::{Available, Network, Regions, RowWork, Setup, TableRow};
+use super::stages::{
+    EncoderEmbeddings, LabelEmbeddings, LabelledMasks, MaskEmbeddings, ObjectEmbeddings, Score,
+    ScorePublished, Scored, SyntheticEmbeddings, SyntheticMasks,
+};
+use crate::generate::regions::{self, InjectedErrors};
+use crate::{Error, Result};
+use splatvk::eval::{BACKGROUND_LABELS, GroundTruth, Split, TruthFrame};
+use splatvk::fit::{LanguageOptions, Preset, RgbOptions, Trained, TrainedLanguage};
+use splatvk::gpu::Device;
+use splatvk::infer::Registry;
+use splatvk::infer::installed::{Installed, Task, catalogue, inventory};
+use splatvk::language::sam::SamOptions;
+use splatvk::language::{Language, ViewMasks};
+use splatvk::photo;
+use splatvk::pipeline::{Graph, Output, Store};
+use splatvk::progress::{Progress, Recorded};
+use splatvk::query::TextQuery;
+use splatvk::run::ask;
+use splatvk::run::sources::{
+    self, DepthSources, FeatureSources, GeometrySources, GraphBuilder, MaskSources, MatchSources,
+    PosedPhotos, SourceChoice,
+};
+use splatvk::run::stages::{self, CameraOrigin, PlacedPhotos, SharedEncoder};
+use splatvk::scene::Camera;
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+/// What came out of a setup.
+#[derive(Clone)]
+#[non_exhaustive]
+pub struct RowFigures {
+    /// Figures of protocol `field`, and agreement of decoded embeddings with the true ones.
+    pub scored: Arc<Scored>,
+    /// Splats of the finished scene.
+    pub splats: usize,
+    /// Codes per level.
+    pub codes: Vec<usize>,
+    /// Parameters, gradients, optimiser state and pixel planes of the features in training, bytes.
+    pub feature_bytes: u64,
+    /// Seconds of alignment, language stage and scoring.
+    pub seconds: f64,
+    /// Seconds of both training stages.
+    pub training_seconds: f64,
+    /// Seconds of all stages from photos to the finished scene, one after the other, shared ones
+    /// included.
+    pub total_seconds: f64,
+}
+
+/// The machine, one data set, and what was made of it.
+pub struct Runner<'a> {
+    device: &'a Device,
+    registry: &'a Registry,
+    data: Arc<DataSet>,
+    truth: Arc<GroundTruth>,
+    seed: u64,
+    progress: &'a dyn Progress,
+    store: Store,
+    encoders: Vec<Encoder>,
+    /// Setups that ran with this seed.
+    done: Vec<(Setup, RowFigures)>,
+}
+
+/// An encoder with its answers to the evaluation's phrases.
+struct Encoder {
+    choice: SourceChoice,
+    encoder: SharedEncoder,
+    queries: Vec<TextQuery>,
+}
+
+/// Trained features are large, and rows of one setup share their figures.
+const PASSING: &[&str] = &["language"];
+
+/// The stages of a setup.
+struct Stages {
+    build: GraphBuilder,
+    placed: Output<PlacedPhotos>,
+    trained: Output<Trained>,
+    aligned: Output<Language>,
+    language: Output<TrainedLanguage>,
+    scored: Output<Scored>,
+    queries: Vec<TextQuery>,
+}
+
+/// Bytes that `channels` features of `splats` splats take while they are trained in views of
+/// `pixels` pixels: value, raw value, gradient and two moments each, and a plane with its gradient
+/// per channel.
+pub fn feature_bytes(splats: usize, channels: usize, pixels: usize) -> u64 {
+    4 * channels as u64 * (5 * splats as u64 + 2 * pixels as u64)
+}
+
+fn pixels(placed: &PlacedPhotos) -> usize {
+    placed.photos.iter().map(|p| p.image.data.len()).max().unwrap_or(0)
+}
+
+impl<'a> Runner<'a> {
+    /// Opens the data on a machine.
+    pub fn open(
+        device: &'a Device,
+        registry: &'a Registry,
+        data: DataSet,
+        progress: &'a dyn Progress,
+    ) -> Self {
+        let store = Store::in_memory_without(PASSING);
+        let (data, truth) = (Arc::new(data.clone()), Arc::new(data.truth));
+        let (encoders, done) = (Vec::new(), Vec::new());
+        Runner { device, registry, data, truth, seed: 0, progress, store, encoders, done }
+    }
+
+    /// Photos of the default row, where the user does not say.
+    pub fn default_views(&self) -> usize {
+        let train = self.truth.frames.iter().filter(|f| f.split == Split::Train).count();
+        train.min(self.data.layout.views())
+    }
+
+    /// The seed of what runs from now on. What the seed before the last one alone has made is
+    /// dropped.
+    pub fn start_seed(&mut self, seed: u64) {
+        self.store.forget_unused();
+        self.done.clear();
+        self.seed = seed;
+    }
+
+    /// Frames whose photos a scene of so many views is made from: train frames spread over their
+    /// order, and held-out ones when they do not suffice.
+    pub fn frames(&self, views: usize) -> Result<Vec<TruthFrame>> {
+        let of =
+            |split| -> Vec<&TruthFrame> { self.truth.frames.iter().filter(|f| f.split == split).collect() };
+        let (train, test) = (of(Split::Train), of(Split::Test));
+        let pick = |from: &[&TruthFrame], n: usize| -> Vec<TruthFrame> {
+            photo::spread(from.len(), n).into_iter().map(|i| from[i].clone()).collect()
+        };
+        if views < 2 || views > train.len() + test.len() {
+            return Err(Error::input(format!(
+                "{}: {views} views of {} frames",
+                self.truth.folder.display(),
+                train.len() + test.len()
+            )));
+        }
+        let mut frames = pick(&train, views.min(train.len()));
+        if views > train.len() {
+            frames.extend(pick(&test, views - train.len()));
+        }
+        Ok(frames)
+    }
+
+    /// What rows can be scored on: held-out frames that none of them has as a photo, or the photos
+    /// that all of them have.
+    pub(super) fn scope<'r>(&self, rows: impl Iterator<Item = &'r TableRow>) -> Scope {
+        let headline = self.data.layout.headline();
+        let (mut seen, mut shared) = (BTreeSet::new(), None::<BTreeSet<String>>);
+        for row in rows {
+            let RowWork::Score(setup) = &row.runs else { continue };
+            // A row with too few frames says so when it runs.
+            let Ok(frames) = self.frames(setup.views) else { continue };
+            let stems: BTreeSet<String> = frames.into_iter().map(|f| f.stem).collect();
+            shared =
+                Some(shared.map_or_else(|| stems.clone(), |s| s.intersection(&stems).cloned().collect()));
+            seen.extend(stems);
+        }
+        let own = self.data.layout == Layout::Own;
+        let counts = |f: &&TruthFrame| match headline {
+            Split::Train => shared.as_ref().is_some_and(|s| s.contains(&f.stem)),
+            split => !seen.contains(&f.stem) && (!own || f.split == split),
+        };
+        let frames = self.truth.frames.iter().filter(counts).map(|f| f.stem.clone()).collect();
+        Scope { headline, frames }
+    }
+
+    /// What there is to compare.
+    pub fn available(&self) -> Available {
+        let of = |split| self.truth.frames.iter().filter(|f| f.split == split).count();
+        let there = inventory(self.registry);
+        let network = |name: &str, family: &str, fetch: Option<&String>| Network {
+            name: name.to_owned(),
+            family: family.to_owned(),
+            fetch: fetch.cloned(),
+        };
+        let networks = |task| {
+            let trained = there.models.iter().filter(|m| m.tasks.contains(&task) && !m.untrained());
+            let installed: Vec<&Installed> = trained.collect();
+            let mut all: Vec<Network> = installed.iter().map(|m| network(&m.name, &m.family, None)).collect();
+            for known in catalogue().iter().filter(|k| k.does(task)) {
+                if all.iter().all(|n| n.family != known.family) {
+                    all.push(network(&known.family, &known.family, Some(&known.id)));
+                }
+            }
+            all
+        };
+        Available {
+            // Half of the held-out frames must stay held out.
+            views: of(Split::Train) + of(Split::Test) / 2,
+            cameras: self.data.layout == Layout::Own || !self.data.known.is_empty(),
+            geometry: networks(Task::Geometry),
+            matchers: networks(Task::Matcher),
+            masks: networks(Task::Masks),
+            features: networks(Task::Features),
+        }
+    }
+
+    /// The stages of a setup, up to its figures.
+    fn stages(&mut self, setup: &Setup) -> Result<Stages> {
+        let frames = self.frames(setup.views)?;
+        let paths: Vec<PathBuf> = frames.iter().map(|f| self.truth.folder.join(&f.file)).collect();
+        let photos = photo::load_all(&paths, self.progress)?;
+        let registry = self.registry;
+        let given = |r: &Regions| matches!(r, Regions::Found { features, .. } if features.argument.is_some());
+        let mut build = GraphBuilder {
+            graph: Graph::default(),
+            registry: registry.clone(),
+            sam: SamOptions::default(),
+            given_features: given(&setup.regions),
+            depth_prior: sources::default::<DepthSources>(),
+            preset: Preset::Draft,
+            seed: self.seed,
+        };
+        let posed = if setup.true_cameras {
+            let named = |f: &TruthFrame| Camera { name: f.stem.clone(), ..f.camera.clone() }.into();
+            build.posed(photos, CameraOrigin::Known(frames.iter().map(named).collect::<Vec<_>>().into()))?
+        } else {
+            sources::make::<GeometrySources>(&setup.init, registry, (&mut build, photos))?
+        };
+        let PosedPhotos { placed, geometry } = posed;
+        let matches = sources::make::<MatchSources>(&setup.matcher, registry, (&mut build, posed))?;
+        let options = self.rgb_options(setup);
+        let trained = build.graph.add(stages::TrainColour { options }, (placed, geometry));
+        let RegionData { masks, embeddings, queries, space } = self.described(setup, &mut build, posed)?;
+        let (recipe, seed) = (setup.recipe, self.seed);
+        let aligned = build.graph.add(stages::Align { recipe, space, seed }, (masks, matches, geometry));
+        let options = LanguageOptions {
+            iterations: setup.language_iterations,
+            seed,
+            // Every row trains equally long.
+            check_every: 0,
+            ..LanguageOptions::preset(Preset::Draft)
+        };
+        let language = build.graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
+        let scene = (trained, language, embeddings);
+        let scored = match self.data.layout {
+            Layout::Own => {
+                build.graph.add(Score { truth: self.truth.clone(), queries: queries.clone() }, scene)
+            }
+            Layout::Published(kind) => {
+                let score = ScorePublished { data: self.data.clone(), kind, queries: queries.clone() };
+                build.graph.add(score, scene)
+            }
+        };
+        Ok(Stages { build, placed, trained, aligned, language, scored, queries })
+    }
+
+    fn rgb_options(&self, setup: &Setup) -> RgbOptions {
+        let mut options = RgbOptions::preset(Preset::Draft).with_iterations(setup.iterations);
+        options.seed = self.seed;
+        options.init.max_points = setup.max_points.unwrap_or(options.init.max_points);
+        setup.recipe.rgb(options)
+    }
+
+    /// Masks with features, the true embedding of every object in the space of these features, and
+    /// the questions.
+    fn described(
+        &mut self,
+        setup: &Setup,
+        build: &mut GraphBuilder,
+        posed: PosedPhotos,
+    ) -> Result<RegionData> {
+        let (truth, placed) = (self.truth.clone(), posed.placed);
+        let (masks, features) = match &setup.regions {
+            Regions::Found { masks, features } => (masks, features),
+            Regions::Exact => return Ok(self.synthetic(InjectedErrors::NONE, build, posed)),
+            Regions::Flawed => {
+                return Ok(self.synthetic(InjectedErrors::default_rates(self.seed), build, posed));
+            }
+            Regions::TrueSegmentation { features } => {
+                let Encoder { encoder, queries, .. } = self.encoder(features)?;
+                let (encoder, queries) = (encoder.clone(), queries.clone());
+                let masks = LabelledMasks { truth: truth.clone(), encoder: encoder.clone() };
+                let space = encoder.space().to_owned();
+                return Ok(RegionData {
+                    masks: build.graph.add(masks, (placed,)),
+                    embeddings: build.graph.add(LabelEmbeddings { truth, encoder }, ()),
+                    queries,
+                    space,
+                });
+            }
+        };
+        let registry = self.registry;
+        let Encoder { encoder, queries, .. } = self.encoder(features)?;
+        let (encoder, queries, space) = (encoder.clone(), queries.clone(), encoder.space().to_owned());
+        let found = sources::make::<MaskSources>(masks, registry, (build, posed))?;
+        let masks = build.graph.add(stages::RegionFeatures { encoder: encoder.clone() }, (placed, found));
+        let embeddings = if features.argument.is_some() {
+            build.graph.add(MaskEmbeddings { truth }, (placed, masks))
+        } else {
+            build.graph.add(EncoderEmbeddings { truth, encoder }, (placed,))
+        };
+        Ok(RegionData { masks, embeddings, queries, space })
+    }
+
+    /// True masks with synthetic features.
+    fn synthetic(
+        &self,
+        flaws: InjectedErrors,
+        build: &mut GraphBuilder,
+        PosedPhotos { placed, .. }: PosedPhotos,
+    ) -> RegionData {
+        let truth = self.truth.clone();
+        RegionData {
+            masks: build.graph.add(SyntheticMasks { truth: truth.clone(), flaws }, (placed,)),
+            embeddings: build.graph.add(SyntheticEmbeddings { truth, flaws }, (placed,)),
+            queries: self.phrases().iter().map(|p| regions::query(p)).collect(),
+            space: "synthetic".into(),
+        }
+    }
+
+    /// An encoder, loaded once and asked once: the built-in one compares each phrase with a
+    /// thousand others.
+    fn encoder(&mut self, choice: &SourceChoice) -> Result<&Encoder> {
+        let known = self.encoders.iter().position(|e| e.choice == *choice);
+        let at = match known {
+            Some(at) => at,
+            None => {
+                let encoder = sources::make::<FeatureSources>(choice, self.registry, self.registry)?;
+                let queries = encoder.with(|e| ask::embedded(&self.phrases(), e))?;
+                self.encoders.push(Encoder { choice: choice.clone(), encoder, queries });
+                self.encoders.len() - 1
+            }
+        };
+        Ok(&self.encoders[at])
+    }
+
+    /// Phrases that the evaluation may ask for, in its order.
+    fn phrases(&self) -> Vec<String> {
+        let own = self.data.layout == Layout::Own;
+        let asked = |p: &&String| !own || !BACKGROUND_LABELS.contains(&p.as_str());
+        self.truth.labels.values().filter(asked).cloned().collect()
+    }
+
+    /// The labelled photos themselves, without a scene: features of every few pixels, asked
+    /// directly.
+    pub fn flat(&mut self, choice: &SourceChoice) -> Result<Scored> {
+        let (data, truth, progress) = (self.data.clone(), self.truth.clone(), self.progress);
+        let Encoder { encoder, queries, .. } = self.encoder(choice)?;
+        match data.layout {
+            Layout::Own => flat::field(&truth, encoder, queries, progress),
+            Layout::Published(kind) => flat::published(&data, kind, encoder, queries, progress),
+        }
+    }
+
+    /// Runs a setup, as far as it was not run before.
+    pub fn outcome(&mut self, setup: &Setup) -> Result<RowFigures> {
+        if let Some((_, known)) = self.done.iter().find(|(s, _)| s == setup) {
+            return Ok(known.clone());
+        }
+        let s = self.stages(setup)?;
+        let targets = [s.placed.target(), s.aligned.target(), s.language.target(), s.scored.target()];
+        let progress = Recorded::new(self.progress);
+        let made = s.build.graph.run(&targets, self.device, self.registry, &self.store, &progress)?;
+        let (placed, language, scored) = (made.get(s.placed)?, made.get(s.language)?, made.get(s.scored)?);
+        let levels = &language.field.levels;
+        let codes = levels.iter().map(|l| l.codebook.members.iter().filter(|m| !m.is_empty()).count());
+        let channels: usize = levels.iter().map(|l| l.codebook.code_dim).sum();
+        let figures = RowFigures {
+            splats: language.splats.len(),
+            codes: codes.collect(),
+            feature_bytes: feature_bytes(language.splats.len(), channels, pixels(&placed)),
+            seconds: made.seconds(s.aligned) + made.seconds(s.language) + made.seconds(s.scored),
+            training_seconds: made.seconds(s.trained) + made.seconds(s.language),
+            total_seconds: made.seconds_in_all(s.language),
+            scored,
+        };
+        self.done.push((setup.clone(), figures.clone()));
+        Ok(figures)
+    }
+
+    /// Bytes of a setup's features in training if they were as long as the embeddings, on three
+    /// levels.
+    pub fn unreduced_bytes(&mut self, setup: &Setup) -> Result<u64> {
+        let s = self.stages(setup)?;
+        let targets = [s.placed.target(), s.trained.target()];
+        let progress = Recorded::new(self.progress);
+        let made = s.build.graph.run(&targets, self.device, self.registry, &self.store, &progress)?;
+        let (placed, trained) = (made.get(s.placed)?, made.get(s.trained)?);
+        let length = s.queries.first().map_or(0, |q| q.embedding.len());
+        Ok(feature_bytes(trained.splats.len(), 3 * length, pixels(&placed)))
+    }
+}
+
+/// What [`Runner::described`] adds.
+struct RegionData {
+    masks: Output<Vec<ViewMasks>>,
+    embeddings: Output<ObjectEmbeddings>,
+    queries: Vec<TextQuery>,
+    space: String,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::setup::Sources;
+    use super::*;
+    use splatvk::progress::Silent;
+    use splatvk::run::method::SPARSELGS;
+
+    #[test]
+    fn held_out_views_that_one_row_has_as_photos_are_scored_in_none() {
+        let (device, registry) = (splatvk::gpu::open(None).unwrap(), Registry::open(None).unwrap());
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast");
+        let data = DataSet::open("breakfast".into(), folder.as_ref(), None).unwrap();
+        let runner = Runner::open(&device, &registry, data, &Silent);
+        let row = |views: usize| {
+            let Sources { init, matcher, .. } = Sources::default();
+            let setup = Setup {
+                views,
+                init,
+                true_cameras: true,
+                matcher,
+                max_points: None,
+                regions: Regions::Exact,
+                recipe: SPARSELGS.recipe,
+                iterations: 1,
+                language_iterations: 1,
+            };
+            let (label, group, note) = (views.to_string(), String::new(), String::new());
+            TableRow { label, group, runs: RowWork::Score(setup), note }
+        };
+        // Four photos and eight held-out views, of which the second row takes two.
+        let scope = runner.scope([row(4), row(6)].iter());
+        let photos = runner.frames(6).unwrap();
+        assert_eq!((photos.len(), scope.frames.len()), (6, 6));
+        assert!(photos.iter().all(|f| !scope.frames.contains(&f.stem)), "{scope:?}");
+    }
+}

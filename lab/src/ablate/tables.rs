@@ -1,0 +1,298 @@
+//! The tables of the paper's experiments, as data: each is a list of setups that differ in one
+//! thing. The paper's own figures are in [`super::paper`].
+use super::setup::{Available, Group, Regions, RowWork, Setup, Sources, TableRow};
+use serde::Serialize;
+use splatvk::language::Reducer;
+use splatvk::run::method::{AUTOENCODER, LSM, METHODS, Recipe, SPARSELGS};
+use splatvk::run::sources::{FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice};
+
+/// Column name, decimals.
+pub(super) type Column = (&'static str, usize);
+
+/// A table: what it varies, under which regions, and what it shows.
+pub struct Table {
+    /// As the command line spells it.
+    pub name: &'static str,
+    /// What it compares.
+    pub about: &'static str,
+    /// Figures beside mIoU and mAcc.
+    pub(super) columns: &'static [Column],
+    /// The regions under which it is run when the user does not say; one group of rows each.
+    pub(super) regions: fn(&Sources, &Available) -> Vec<Regions>,
+    /// The rows of a group.
+    pub(super) rows: fn(&Group) -> Vec<TableRow>,
+}
+
+impl Serialize for Table {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name)
+    }
+}
+
+/// Regions of a table that is about errors of masks and features; the built-in models make few on
+/// an easy scene.
+const WITH_ERRORS: fn(&Sources, &Available) -> Vec<Regions> = |own, _| vec![own.regions(), Regions::Flawed];
+/// Regions of a table that is about something else: perfect ones leave that as the only cause of a
+/// difference.
+const PERFECT: fn(&Sources, &Available) -> Vec<Regions> = |_, _| vec![Regions::Exact];
+/// Regions of a table about what finds them.
+const OWN: fn(&Sources, &Available) -> Vec<Regions> = |own, _| vec![own.regions()];
+
+/// Every table, in the order of `ablate all`.
+pub static TABLES: [Table; 13] = [
+    Table {
+        name: "alignment",
+        about: "None, step 1, steps 1 and 2, step 3, all three",
+        columns: &[("SIM", 3), ("MSE", 4), ("codes", 0)],
+        regions: WITH_ERRORS,
+        rows: |group| {
+            let row = |(label, steps): (&str, [bool; 3])| {
+                group.recipe(label, Recipe { steps, ..group.base.recipe })
+            };
+            [
+                ("none", [false, false, false]),
+                ("step 1", [true, false, false]),
+                ("steps 1, 2", [true, true, false]),
+                ("step 3", [false, false, true]),
+                ("steps 1, 2, 3", [true, true, true]),
+            ]
+            .map(row)
+            .into()
+        },
+    },
+    Table {
+        name: "bijection",
+        about: "Bijection, autoencoder, no reduction",
+        columns: &[("SIM", 3), ("MB", 0)],
+        regions: WITH_ERRORS,
+        rows: |group| {
+            let short = Recipe { feature_dim: 3, ..group.base.recipe };
+            let published = Recipe { reducer: Reducer::Autoencoder { least_steps: 0 }, ..short };
+            let longer = Recipe { reducer: AUTOENCODER, ..short };
+            vec![
+                group.row("bijection", group.base.clone()),
+                group.recipe("bijection, 3 dimensions", short),
+                group.recipe("autoencoder, 100 epochs", published),
+                group.recipe("autoencoder, 2000 steps", longer),
+                TableRow {
+                    runs: RowWork::MemoryOnly(group.base.clone()),
+                    note: "not trained: memory only".into(),
+                    ..group.row("no reduction", group.base.clone())
+                },
+            ]
+        },
+    },
+    Table {
+        name: "methods",
+        about: "This program's way and the baselines",
+        columns: &[("SIM", 3), ("MB", 0)],
+        regions: WITH_ERRORS,
+        rows: |group| METHODS.iter().map(|m| group.recipe(m.name, m.recipe)).collect(),
+    },
+    Table {
+        name: "dimension",
+        about: "Codes of 3, 8 and 16 numbers",
+        columns: &[("SIM", 3), ("MB", 0)],
+        regions: OWN,
+        rows: |group| {
+            let row = |d: usize| group.recipe(&d.to_string(), Recipe { feature_dim: d, ..group.base.recipe });
+            [3, 8, 16].map(row).into()
+        },
+    },
+    Table {
+        name: "image-loss",
+        about: "Language training with and without the image loss",
+        columns: &[("PSNR", 2), ("SIM", 3)],
+        regions: PERFECT,
+        rows: |group| {
+            // Longer than the other tables: geometry moves slowly at the rates of this stage, and
+            // it is geometry that the image loss protects.
+            let long =
+                Setup { language_iterations: 3 * group.base.language_iterations, ..group.base.clone() };
+            let without = Recipe { image_weight: 0.0, ..long.recipe };
+            vec![
+                group.row("with image loss", long.clone()),
+                group.row("without", Setup { recipe: without, ..long }),
+            ]
+        },
+    },
+    Table {
+        name: "regions",
+        about: "Masks and features as found, with injected errors, exact",
+        columns: &[("SIM", 3), ("codes", 0)],
+        regions: |own, _| vec![own.regions(), Regions::Flawed, Regions::Exact],
+        rows: |group| vec![group.row(&group.base.regions.name(), group.base.clone())],
+    },
+    Table {
+        name: "masks",
+        about: "Masks of the built-in graph, or of installed networks",
+        columns: &[("SIM", 3), ("codes", 0)],
+        regions: OWN,
+        rows: |group| {
+            let features = &group.sources.features;
+            group.each::<MaskSources>(&group.available.masks, |masks| Setup {
+                regions: Regions::Found { masks, features: features.clone() },
+                ..group.base.clone()
+            })
+        },
+    },
+    Table {
+        name: "features",
+        about: "Features of the built-in words, or of installed networks",
+        columns: &[("SIM", 3), ("codes", 0)],
+        regions: OWN,
+        rows: |group| {
+            let masks = &group.sources.masks;
+            group.each::<FeatureSources>(&group.available.features, |features| Setup {
+                regions: Regions::Found { masks: masks.clone(), features },
+                ..group.base.clone()
+            })
+        },
+    },
+    Table {
+        name: "matcher",
+        about: "Dense matches of the built-in descriptors, or of installed networks",
+        columns: &[("SIM", 3), ("codes", 0)],
+        regions: WITH_ERRORS,
+        rows: |group| {
+            // Step 3 finds again what matches have missed: without it they are all there is.
+            let recipe = Recipe { steps: [true, true, false], ..group.base.recipe };
+            group.each::<MatchSources>(&group.available.matchers, |matcher| Setup {
+                matcher,
+                recipe,
+                ..group.base.clone()
+            })
+        },
+    },
+    Table {
+        name: "points",
+        about: "At most 50k, 500k, or all splats at the start",
+        columns: &[("PSNR", 2), ("splats", 0)],
+        regions: PERFECT,
+        rows: |group| {
+            // Short codes: those of 16 numbers for a million splats are more than lavapipe binds to
+            // a shader.
+            let recipe = Recipe { feature_dim: 3, ..group.base.recipe };
+            let row = |(label, most): (&str, usize)| {
+                group.row(label, Setup { max_points: Some(most), recipe, ..group.base.clone() })
+            };
+            [("cap 50k", 50_000), ("cap 500k", 500_000), ("cap none", usize::MAX)].map(row).into()
+        },
+    },
+    Table {
+        name: "views",
+        about: "2, 4 and 6 photos",
+        columns: &[("PSNR", 2), ("splats", 0)],
+        regions: |_, _| vec![Regions::Flawed],
+        rows: |group| {
+            let row = |views: usize| {
+                let row = group.row(&format!("{views} views"), Setup { views, ..group.base.clone() });
+                if views <= group.available.views {
+                    return row;
+                }
+                Group::impossible(row, format!("the data set has {} photos to spare", group.available.views))
+            };
+            [2, 4, 6].map(row).into()
+        },
+    },
+    Table {
+        name: "initializer",
+        about: "Cameras and points from photos alone, from the true cameras, or from installed networks",
+        columns: &[("PSNR", 2), ("splats", 0)],
+        regions: PERFECT,
+        rows: |group| {
+            let from = |init: SourceChoice| Setup { init, true_cameras: false, ..group.base.clone() };
+            let mut rows = group.each::<GeometrySources>(&group.available.geometry, from);
+            let known = group.row("true cameras", Setup { true_cameras: true, ..group.base.clone() });
+            let known = match group.available.cameras {
+                true => known,
+                false => Group::impossible(known, "the data set states no cameras".to_owned()),
+            };
+            rows.insert(1, known);
+            rows
+        },
+    },
+    Table {
+        name: "feed-forward",
+        about: "In the manner of LSM, beside features of LSeg in space and in 2D, and true masks",
+        columns: &[("SIM", 3)],
+        regions: OWN,
+        rows: |group| {
+            let Sources { masks, features, .. } = group.sources;
+            let base = &group.base;
+            let mut rows = vec![group.recipe(LSM.name, LSM.recipe), group.row(SPARSELGS.name, base.clone())];
+            if let Some(network) = group.available.features.iter().find(|n| n.family == "lseg") {
+                let features = SourceChoice::named(&network.name);
+                let regions = Regions::Found { masks: masks.clone(), features: features.clone() };
+                let lifted = group.row("features of lseg", Setup { regions, ..base.clone() });
+                let flat = RowWork::Flat(features);
+                let flat = TableRow { runs: flat, ..group.row("lseg in 2D", base.clone()) };
+                rows.extend([lifted, flat].map(|row| group.if_installed(row, network)));
+            }
+            let regions = Regions::TrueSegmentation { features: features.clone() };
+            rows.push(group.row("true segmentation", Setup { regions, ..base.clone() }));
+            rows
+        },
+    },
+];
+
+/// The table of a name.
+pub fn table(name: &str) -> Option<&'static Table> {
+    TABLES.iter().find(|t| t.name == name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::setup::Network;
+    use super::*;
+
+    fn network(name: &str, fetch: Option<&str>) -> Network {
+        Network { name: name.into(), family: name.into(), fetch: fetch.map(str::to_owned) }
+    }
+
+    #[test]
+    fn rows_differ_in_what_their_table_is_about() {
+        let sources = Sources::default();
+        let base = Setup {
+            views: 4,
+            init: sources.init.clone(),
+            true_cameras: false,
+            matcher: sources.matcher.clone(),
+            max_points: None,
+            regions: Regions::Exact,
+            recipe: SPARSELGS.recipe,
+            iterations: 10,
+            language_iterations: 2,
+        };
+        let networks = || vec![network("there", None), network("not", Some("not_b"))];
+        let available = Available {
+            views: 4,
+            cameras: true,
+            geometry: networks(),
+            matchers: networks(),
+            masks: networks(),
+            features: networks(),
+        };
+        for table in &TABLES {
+            let mut setups: Vec<Setup> = Vec::new();
+            let mut rows = Vec::new();
+            for regions in (table.regions)(&sources, &available) {
+                let base = Setup { regions, ..base.clone() };
+                rows.extend((table.rows)(&Group { base, sources: &sources, available: &available }));
+            }
+            for row in &rows {
+                if let RowWork::Score(setup) = &row.runs {
+                    assert!(!setups.contains(setup), "{}: two rows of one setup", table.name);
+                    setups.push(setup.clone());
+                } else {
+                    assert!(!row.note.is_empty(), "{}: {} says not why", table.name, row.label);
+                }
+            }
+            if ["masks", "features", "matcher", "initializer"].contains(&table.name) {
+                let note = |name: &str| rows.iter().find(|r| r.label == name).map(|r| r.note.as_str());
+                assert_eq!(note("there"), Some(""), "{}", table.name);
+                assert_eq!(note("not"), Some("not installed: splatvk models fetch not_b"), "{}", table.name);
+            }
+        }
+    }
+}

@@ -1,0 +1,265 @@
+//! Command-line arguments.
+use crate::ablate::{Layout, TABLES};
+use crate::generate::{Flat, Spoil};
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use splatvk::cli::args::{DeviceArgs, LogFormat, MACHINE, whole};
+use splatvk::eval::protocol::ProtocolKind;
+use splatvk::infer::provider;
+use std::path::PathBuf;
+
+/// Tables of the paper's experiments, and data with ground truth
+#[derive(Debug, Parser)]
+#[command(name = "splatlab", version, about, max_term_width = 100, arg_required_else_help = true)]
+pub struct Lab {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+    /// Progress and messages on standard error: for people, or one JSON object per line
+    #[arg(long, global = true, value_enum, default_value = "text", value_name = "FORMAT")]
+    pub log: LogFormat,
+    /// What computes the networks, as far as the ONNX Runtime library can; auto: a GPU that
+    /// answers, or else the CPU
+    #[arg(long, global = true, value_parser = PossibleValuesParser::new(provider::NAMES), value_name = "NAME", help_heading = MACHINE)]
+    pub provider: Option<String>,
+}
+
+/// One variant per command; each has its own file beside this one.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Data with ground truth → the tables of the paper's experiments
+    Ablate(AblateArgs),
+    /// Synthetic scene with ground truth, as hard as asked
+    Generate(GenerateArgs),
+}
+
+fn tables() -> PossibleValuesParser {
+    let all = PossibleValue::new("all").help("Every table, shared stages once");
+    let each = TABLES.iter().map(|t| PossibleValue::new(t.name).help(t.about));
+    PossibleValuesParser::new(std::iter::once(all).chain(each))
+}
+
+fn spoils() -> impl TypedValueParser<Value = Spoil> {
+    ways(&Spoil::ALL)
+}
+
+fn flats() -> impl TypedValueParser<Value = Flat> {
+    ways(&Flat::ALL)
+}
+
+/// One of a list of values, each with its name and what it does.
+fn ways<T: Copy + Send + Sync + 'static>(
+    all: &'static [(T, &'static str, &'static str)],
+) -> impl TypedValueParser<Value = T> {
+    let each = all.iter().map(|(_, name, about)| PossibleValue::new(*name).help(*about));
+    PossibleValuesParser::new(each).try_map(|given| {
+        let known = all.iter().find(|(_, name, _)| *name == given);
+        known.map(|(way, ..)| *way).ok_or("no such way")
+    })
+}
+
+/// Layouts of data sets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum LayoutArg {
+    /// As what lies in the folder
+    Auto,
+    /// ground_truth.json: protocol field on held-out views
+    Own,
+    /// LERF-OVS: images/ in the folder, labels in ../label/NAME
+    Lerf,
+    /// 3D-OVS: images/ and segmentations/classes.txt
+    #[value(name = "3dovs")]
+    Ovs,
+    /// ScanNet: color/, label-filt/, pose/, intrinsic/
+    Scannet,
+}
+
+impl LayoutArg {
+    /// What was asked for; none = look.
+    pub fn given(self) -> Option<Layout> {
+        match self {
+            LayoutArg::Auto => None,
+            LayoutArg::Own => Some(Layout::Own),
+            LayoutArg::Lerf => Some(Layout::Published(ProtocolKind::Lerf)),
+            LayoutArg::Ovs => Some(Layout::Published(ProtocolKind::Ovs)),
+            LayoutArg::Scannet => Some(Layout::Published(ProtocolKind::ScanNet)),
+        }
+    }
+}
+
+/// `splatlab ablate`
+#[derive(Debug, Args)]
+pub struct AblateArgs {
+    /// Which tables
+    #[arg(value_parser = tables(), required = true, value_name = "TABLE")]
+    pub tables: Vec<String>,
+    /// Folders with ground_truth.json, photos and masks, or scenes of LERF-OVS, 3D-OVS or ScanNet:
+    /// figures are means over them, with their spread
+    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
+    pub data: Vec<PathBuf>,
+    /// How the data lies, and by which protocol it is scored
+    #[arg(long, value_enum, default_value = "auto")]
+    pub layout: LayoutArg,
+    /// Folder for ablate.json and one text and one chart per table, renewed after every row
+    /// [default: out/ablate-NAME, after the data]
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Write over what is there: ordinary files of the names of tables
+    #[arg(long)]
+    pub force: bool,
+    /// Masks and features for every row: built-in, flawed (true masks, errors injected), exact, or
+    /// dir:DIR [default: those that each table is about]
+    #[arg(long, value_name = "SOURCE")]
+    pub regions: Option<String>,
+    /// Photos of the default row [default: all train frames, at most 4]
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
+    pub views: Option<usize>,
+    /// Take the true cameras in every row, for photos that alone would give none
+    #[arg(long)]
+    pub true_cameras: bool,
+    /// Most stereo points that splats start from, in rows that do not vary it [default: draft's]
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
+    pub max_points: Option<usize>,
+    /// Seeds of cameras, stereo, training and injected errors: a run for each
+    #[arg(long, visible_alias = "seed", value_delimiter = ',', default_value = "0", value_name = "N,...", value_parser = whole::<u64>(0..))]
+    pub seeds: Vec<u64>,
+    /// Take the rows that an earlier run has left in --out, measured the same way, and go on from
+    /// there
+    #[arg(long)]
+    pub resume: bool,
+    /// Cameras and points of every row that does not vary them, as of run [default: sfm]
+    #[arg(long, value_name = "SOURCE")]
+    pub init: Option<String>,
+    /// The same for dense matches [default: xfeat]
+    #[arg(long, value_name = "SOURCE")]
+    pub matcher: Option<String>,
+    /// The same for masks [default: graph]
+    #[arg(long, value_name = "SOURCE")]
+    pub masks: Option<String>,
+    /// The same for features [default: words]
+    #[arg(long, value_name = "SOURCE")]
+    pub features: Option<String>,
+    /// Optimisation steps of the colour stage, instead of draft's
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
+    pub iterations: Option<usize>,
+    /// Optimisation steps of the language stage [default: 30]
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
+    pub language_iterations: Option<usize>,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// `splatlab generate`
+#[derive(Debug, Args)]
+pub struct GenerateArgs {
+    /// Folder to write: photos, held-out views, depth, masks, cameras, regions
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Replace data that an earlier call made; a folder of anything else is never replaced
+    #[arg(long)]
+    pub force: bool,
+    /// Make no scene: only regions_exact/ and regions_flawed/ for this data set with masks
+    #[arg(long, value_name = "DIR")]
+    pub from: Option<PathBuf>,
+    /// Everything random
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u64>(0..))]
+    pub seed: u64,
+    /// Photos
+    #[arg(long, default_value_t = 4, value_name = "N", value_parser = whole::<usize>(0..))]
+    pub views: usize,
+    /// Held-out views
+    #[arg(long, default_value_t = 6, value_name = "N", value_parser = whole::<usize>(0..))]
+    pub held_out: usize,
+    /// Picture size, pixels
+    #[arg(long, default_value = "640x480", value_name = "WxH")]
+    pub size: String,
+    /// Objects on the table, 1 to 12
+    #[arg(long, default_value_t = 8, value_name = "N", value_parser = whole::<usize>(0..=12))]
+    pub objects: usize,
+    /// Angle between neighbouring photos, degrees
+    #[arg(long, default_value_t = 20.0, value_name = "DEG")]
+    pub baseline: f64,
+    /// Contrast of surfaces: 1 = plenty to match, 0 = bare
+    #[arg(long, default_value_t = 1.0, value_name = "0-1")]
+    pub texture: f64,
+    /// Highlights that move with the camera: 1 = up to full white, 0 = none
+    #[arg(long, default_value_t = 0.0, value_name = "0-1")]
+    pub gloss: f64,
+    /// Thin poles
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<usize>(0..))]
+    pub thin: usize,
+    /// Objects close together and behind each other
+    #[arg(long, default_value_t = 0.3, value_name = "0-1")]
+    pub occlusion: f64,
+    /// Objects that look like another one
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<usize>(0..))]
+    pub similar: usize,
+    /// Out of doors, ten times as large: the ground begins at the feet, behind a house stands the
+    /// sky
+    #[arg(long)]
+    pub outdoor: bool,
+    /// Everything on one plane instead of a table
+    #[arg(long, value_name = "WAY", value_parser = flats())]
+    pub flat: Option<Flat>,
+    /// Cameras at even steps of --baseline on one circle; otherwise each is up to 2 degrees off
+    /// along it and 4 above or below it
+    #[arg(long)]
+    pub steady: bool,
+    /// Focal length of the last photo over that of the first; between them it grows from photo to
+    /// photo
+    #[arg(long, default_value_t = 1.0, value_name = "RATIO")]
+    pub zoom: f64,
+    /// Error of the starting cameras in cameras_noisy.json, degrees
+    #[arg(long, default_value_t = 0.1, value_name = "DEG")]
+    pub pose_noise: f64,
+    /// Noise of the photos, share of full white [default: 0.005; 0 with --sensor-noise]
+    #[arg(long, value_name = "SHARE")]
+    pub photo_noise: Option<f64>,
+    /// Photos as a phone takes them: --focal --lens --centre --light --sensor-noise --jpeg 82;
+    /// held-out views stay clean, and depth and masks are those of the undistorted photo
+    #[arg(long)]
+    pub phone: bool,
+    /// Focal length drawn from 0.7 to 1.2 widths, one for all views [default: 1.025 widths]
+    #[arg(long)]
+    pub focal: bool,
+    /// Radial distortion of the photos, one lens for all: k1 within ±0.15, k2 within a third of k1
+    #[arg(long)]
+    pub lens: bool,
+    /// Principal point of the photos off the middle, up to 1 % of the width along x and along y
+    #[arg(long)]
+    pub centre: bool,
+    /// Light of the photos: exposure within ±0.35 stops and white balance within ±6 % per photo, up
+    /// to 35 % lost in the corners
+    #[arg(long)]
+    pub light: bool,
+    /// Shot and read noise of a small sensor near ISO 200: 3000 electrons at full white, 4
+    /// electrons read noise
+    #[arg(long)]
+    pub sensor_noise: bool,
+    /// JPEG quality of the photos [default: 95; 82 with --phone]
+    #[arg(long, value_name = "1-100", value_parser = whole::<u8>(1..=100))]
+    pub jpeg: Option<u8>,
+    /// Every other photo by a second camera: focal length, lens, principal point and vignetting of
+    /// its own, where the other options ask for them
+    #[arg(long)]
+    pub two_cameras: bool,
+    /// Photos of which no right scene, or only part of one, can be made
+    #[arg(long, value_name = "WAY", value_parser = spoils())]
+    pub spoil: Option<Spoil>,
+    /// regions_flawed/: rate of masks cut in two
+    #[arg(long, default_value_t = 0.2, value_name = "RATE")]
+    pub split: f64,
+    /// regions_flawed/: rate of objects swallowed by a neighbour's mask
+    #[arg(long, default_value_t = 0.05, value_name = "RATE")]
+    pub merge: f64,
+    /// regions_flawed/: rate of features of another object
+    #[arg(long, default_value_t = 0.2, value_name = "RATE")]
+    pub wrong: f64,
+    /// regions_flawed/: random part of every feature
+    #[arg(long, default_value_t = 0.35, value_name = "LENGTH")]
+    pub noise: f64,
+    /// Print one JSON object on standard output
+    #[arg(long)]
+    pub json: bool,
+}

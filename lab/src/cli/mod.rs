@@ -1,0 +1,36 @@
+//! Command line of the laboratory: one file per command; parsing, reports and exit codes are those
+//! of `splatvk`.
+mod ablate;
+pub mod args;
+mod generate;
+
+use crate::Result;
+use args::{Command, Lab};
+use splatvk::cli::args::LogFormat;
+use splatvk::cli::{Program, start};
+use std::process::ExitCode;
+
+/// The command line of `splatlab`.
+pub fn main() -> ExitCode {
+    start::<Lab>()
+}
+
+impl Program for Lab {
+    const NAME: &'static str = "splatlab";
+
+    const UNUSED: &'static [(&'static str, &'static [&'static str])] = &[("generate", &["provider", "log"])];
+
+    fn log(&self) -> LogFormat {
+        self.log
+    }
+
+    fn execute(self) -> Result<()> {
+        match self.command {
+            Command::Ablate(mut args) => {
+                args.device.provider = self.provider;
+                ablate::ablate(&args)
+            }
+            Command::Generate(args) => generate::generate(&args),
+        }
+    }
+}

@@ -1,0 +1,305 @@
+//! The tables on data sets in the published layouts, and the driver of all of them, on small fakes
+//! made from generated scenes.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
+use image::GenericImageView;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+fn splatlab(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_splatlab")).args(args).output().unwrap()
+}
+
+/// The program that lists the installed networks; `cargo test --workspace` builds it beside this
+/// one.
+fn splatvk() -> PathBuf {
+    let program = Path::new(env!("CARGO_BIN_EXE_splatlab")).with_file_name("splatvk");
+    assert!(program.is_file(), "{}: build it with cargo build", program.display());
+    program
+}
+
+fn read(path: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+}
+
+fn path(p: &Path) -> &str {
+    p.to_str().unwrap()
+}
+
+/// A generated scene, and what of it the fakes need.
+struct Scene {
+    folder: tempfile::TempDir,
+    truth: Value,
+}
+
+/// One frame: (stem, photo, object index per pixel, world to camera, intrinsics fx fy cx cy).
+struct Frame {
+    stem: String,
+    photo: image::DynamicImage,
+    objects: image::GrayImage,
+    pose: [[f64; 4]; 4],
+    optics: [f64; 4],
+}
+
+impl Scene {
+    fn generate(seed: &str) -> Scene {
+        let folder = tempfile::tempdir().unwrap();
+        let small =
+            ["--size", "160x120", "--views", "4", "--held-out", "2", "--objects", "4", "--pose-noise", "0"];
+        let out = folder.path().join("data");
+        let made = splatlab(&[&["generate", "--out", path(&out), "--seed", seed][..], &small].concat());
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        let truth = read(&out.join("ground_truth.json"));
+        Scene { folder, truth }
+    }
+
+    fn frames(&self) -> Vec<Frame> {
+        let data = self.folder.path().join("data");
+        let one = |f: &Value| {
+            let file = f["file"].as_str().unwrap();
+            let stem = Path::new(file).file_stem().unwrap().to_str().unwrap().to_owned();
+            let masks = image::open(data.join("masks").join(format!("{stem}.png"))).unwrap();
+            Frame {
+                photo: image::open(data.join(file)).unwrap(),
+                objects: masks.to_luma8(),
+                pose: serde_json::from_value(f["world_to_camera"].clone()).unwrap(),
+                optics: ["fx", "fy", "cx", "cy"].map(|k| f[k].as_f64().unwrap()),
+                stem,
+            }
+        };
+        self.truth["frames"].as_array().unwrap().iter().map(one).collect()
+    }
+
+    /// Objects without the surfaces behind them.
+    fn labels(&self) -> BTreeMap<u8, String> {
+        let all: BTreeMap<u8, String> = serde_json::from_value(self.truth["labels"].clone()).unwrap();
+        let behind = ["table", "wall", "carpet", "floor"];
+        all.into_iter().filter(|(_, p)| !behind.iter().any(|b| p.ends_with(b))).collect()
+    }
+}
+
+/// Camera to world of a rigid world to camera.
+fn to_world(m: &[[f64; 4]; 4]) -> [[f64; 4]; 4] {
+    let mut out = [[0.0, 0.0, 0.0, 0.0], [0.0; 4], [0.0; 4], [0.0, 0.0, 0.0, 1.0]];
+    for r in 0..3 {
+        (0..3).for_each(|c| out[r][c] = m[c][r]);
+        out[r][3] = -(0..3).map(|k| m[k][r] * m[k][3]).sum::<f64>();
+    }
+    out
+}
+
+/// Outline of an object, row by row: exact for what is convex along rows.
+fn polygon(objects: &image::GrayImage, label: u8) -> (Vec<[f64; 2]>, [f64; 4]) {
+    let (mut left, mut right) = (Vec::new(), Vec::new());
+    for y in 0..objects.height() {
+        let inside = (0..objects.width()).filter(|&x| objects.get_pixel(x, y).0[0] == label);
+        if let (Some(a), Some(b)) = (inside.clone().min(), inside.max()) {
+            left.push([f64::from(a), f64::from(y)]);
+            right.push([f64::from(b), f64::from(y)]);
+        }
+    }
+    let edge =
+        |v: &[[f64; 2]], k: usize, of: fn(f64, f64) -> f64| v.iter().map(|p| p[k]).reduce(of).unwrap_or(0.0);
+    let bbox = [
+        edge(&left, 0, f64::min),
+        edge(&left, 1, f64::min),
+        edge(&right, 0, f64::max),
+        edge(&left, 1, f64::max),
+    ];
+    right.reverse();
+    left.extend(right);
+    (left, bbox)
+}
+
+/// `transforms.json` as nerfstudio writes it: camera to world in OpenGL axes.
+fn transforms(frames: &[Frame]) -> Value {
+    let one = |f: &Frame| {
+        let mut m = to_world(&f.pose);
+        m.iter_mut().take(3).for_each(|row| (1..3).for_each(|c| row[c] = -row[c]));
+        let [fx, fy, cx, cy] = f.optics;
+        let (w, h) = f.photo.dimensions();
+        json!({ "file_path": format!("images/{}.jpg", f.stem), "transform_matrix": m, "fl_x": fx, "fl_y": fy, "cx": cx,
+                "cy": cy, "w": w, "h": h })
+    };
+    json!({ "frames": frames.iter().map(one).collect::<Vec<_>>() })
+}
+
+/// `lerf_ovs/SCENE` and `lerf_ovs/label/SCENE`, every other photo labelled.
+fn as_lerf(scene: &Scene, root: &Path, name: &str) {
+    let (images, labels) = (root.join(name).join("images"), root.join("label").join(name));
+    std::fs::create_dir_all(&images).unwrap();
+    std::fs::create_dir_all(&labels).unwrap();
+    let frames = scene.frames();
+    for f in &frames {
+        f.photo.save(images.join(format!("{}.jpg", f.stem))).unwrap();
+        let (width, height) = f.photo.dimensions();
+        let shown = scene.labels().into_iter().map(|(label, phrase)| (phrase, polygon(&f.objects, label)));
+        let objects: Vec<Value> = shown
+            .filter(|(_, (outline, _))| outline.len() > 8)
+            .map(|(phrase, (outline, bbox))| {
+                json!({ "category": phrase, "group": 1, "segmentation": outline, "bbox": bbox, "layer": 1.0, "iscrowd": 0 })
+            })
+            .collect();
+        let info = json!({ "name": format!("{}.jpg", f.stem), "width": width, "height": height, "depth": 3, "note": "" });
+        let text = json!({ "info": info, "objects": objects }).to_string();
+        std::fs::write(labels.join(format!("{}.json", f.stem)), text).unwrap();
+    }
+    std::fs::write(root.join(name).join("transforms.json"), transforms(&frames).to_string()).unwrap();
+}
+
+fn as_ovs(scene: &Scene, root: &Path, name: &str) {
+    let folder = root.join(name);
+    std::fs::create_dir_all(folder.join("images")).unwrap();
+    let frames = scene.frames();
+    for f in &frames {
+        f.photo.save(folder.join("images").join(format!("{}.jpg", f.stem))).unwrap();
+        let masks = folder.join("segmentations").join(&f.stem);
+        std::fs::create_dir_all(&masks).unwrap();
+        for (label, phrase) in scene.labels() {
+            let mut mask = f.objects.clone();
+            mask.pixels_mut().for_each(|p| p.0[0] = if p.0[0] == label { 255 } else { 0 });
+            mask.save(masks.join(format!("{phrase}.png"))).unwrap();
+        }
+    }
+    let classes: Vec<String> = scene.labels().into_values().collect();
+    std::fs::write(folder.join("segmentations/classes.txt"), classes.join("\n")).unwrap();
+    std::fs::write(folder.join("transforms.json"), transforms(&frames).to_string()).unwrap();
+}
+
+/// A scan whose objects are chairs and whose wall is a wall.
+fn as_scannet(scene: &Scene, root: &Path, name: &str) {
+    let folder = root.join(name);
+    for inner in ["color", "label-filt", "pose", "intrinsic"] {
+        std::fs::create_dir_all(folder.join(inner)).unwrap();
+    }
+    let matrix = |m: &[[f64; 4]; 4]| {
+        m.iter().map(|r| r.map(|v| v.to_string()).join(" ")).collect::<Vec<_>>().join("\n")
+    };
+    let solid = scene.labels();
+    for (k, f) in scene.frames().iter().enumerate() {
+        let stem = (10 * k).to_string();
+        f.photo.save(folder.join(format!("color/{stem}.jpg"))).unwrap();
+        let (w, h) = f.objects.dimensions();
+        let raw = image::ImageBuffer::<image::Luma<u16>, Vec<u16>>::from_fn(w, h, |x, y| {
+            image::Luma([if solid.contains_key(&f.objects.get_pixel(x, y).0[0]) { 2 } else { 1 }])
+        });
+        raw.save(folder.join(format!("label-filt/{stem}.png"))).unwrap();
+        std::fs::write(folder.join(format!("pose/{stem}.txt")), matrix(&to_world(&f.pose))).unwrap();
+        let [fx, fy, cx, cy] = f.optics;
+        let k = [[fx, 0.0, cx, 0.0], [0.0, fy, cy, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
+        std::fs::write(folder.join("intrinsic/intrinsic_color.txt"), matrix(&k)).unwrap();
+    }
+    let table = "id\traw_category\tcategory\tnyu40id\n1\twall\twall\t1\n2\tchair\tchair\t5\n";
+    std::fs::write(root.join("scannetv2-labels.combined.tsv"), table).unwrap();
+}
+
+/// Seconds instead of minutes.
+const SHORT: [&str; 7] =
+    ["--iterations", "10", "--language-iterations", "2", "--true-cameras", "--max-points", "5000"];
+
+fn ablate(args: &[&str], data: &Path, out: &Path) -> Value {
+    let all = [args, &["--data", path(data), "--out", path(out), "--json"], &SHORT].concat();
+    let output = splatlab(&[&["ablate"][..], &all].concat());
+    assert!(output.status.success(), "{all:?}\n{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+fn row<'r>(report: &'r Value, label: &str) -> &'r Value {
+    let rows = report["tables"][0]["rows"].as_array().unwrap();
+    rows.iter().find(|r| r["label"] == label).expect(label)
+}
+
+/// True masks with the embeddings of their labels: whatever layout they lie in, they are found
+/// again.
+#[test]
+#[ignore = "takes long: tools/test-long"]
+fn true_segmentation_is_found_again_in_every_layout() {
+    let scene = Scene::generate("1003");
+    let root = tempfile::tempdir().unwrap();
+    as_lerf(&scene, &root.path().join("lerf_ovs"), "teatime");
+    as_ovs(&scene, &root.path().join("3d_ovs"), "bed");
+    as_scannet(&scene, &root.path().join("scannet"), "scene0000_00");
+    for (layout, data, paper, least) in [
+        // LERF's masks are cut from smoothed maps: at this size edges move by a good part of an
+        // object.
+        ("lerf", "lerf_ovs/teatime", 0.7125, 0.6),
+        // Nothing has the 2000 pixels that a mask of the paper's rule needs: every answer is the
+        // substitute's.
+        ("3dovs", "3d_ovs/bed", f64::NAN, 0.55),
+        ("scannet", "scannet/scene0000_00", 0.4709, 0.8),
+    ] {
+        let out = root.path().join(format!("out-{layout}"));
+        let report = ablate(&["feed-forward"], &root.path().join(data), &out);
+        assert_eq!(
+            report["layout"],
+            if layout == "scannet" { json!({"published": "scannet"}) } else { json!({"published": layout}) }
+        );
+        let figures = &row(&report, "true segmentation")["figures"];
+        let figure = |name: &str| figures[name].as_f64().unwrap_or(f64::NAN);
+        assert!(figure("mIoU") > least && figure("SIM") > 0.9, "{layout}: {figures}");
+        assert!(figure("Tr.T") > 0.0 && figure("T.T") > figure("Tr.T"), "{layout}: {figures}");
+        // Without the true masks less is found.
+        let own = row(&report, "sparselgs")["figures"]["mIoU"].as_f64().unwrap();
+        assert!(own < figure("mIoU"), "{layout}: {own} {figures}");
+        for label in ["features of lseg", "lseg in 2D"] {
+            let note = row(&report, label)["note"].as_str().unwrap();
+            assert_eq!(note, "not installed: splatvk models fetch lseg");
+        }
+        let stated =
+            row(&report, if layout == "lerf" { "sparselgs" } else { "lsm" })["paper"]["mIoU"].as_f64();
+        assert_eq!(stated.is_none(), paper.is_nan());
+        assert!(stated.is_none_or(|v| v == paper), "{layout}: {stated:?}");
+    }
+}
+
+#[test]
+#[ignore = "takes long: tools/test-long"]
+fn the_driver_runs_what_is_there_and_says_what_is_missing() {
+    let root = tempfile::tempdir().unwrap();
+    let (data, out) = (root.path().join("data"), root.path().join("out"));
+    for (seed, name) in [("1003", "teatime"), ("1004", "ramen")] {
+        as_lerf(&Scene::generate(seed), &data.join("lerf_ovs"), name);
+    }
+    std::fs::create_dir_all(data.join("3d_ovs/sofa/images")).unwrap();
+    let driver = concat!(env!("CARGO_MANIFEST_DIR"), "/tools/paper-tables");
+    let run = |data: &Path| {
+        let options = ["--", "--seeds", "0", "--regions", "exact"];
+        let mut command = Command::new(driver);
+        command.arg(data).arg(&out).args(options).args(SHORT);
+        command
+            .env("SPLATVK", splatvk())
+            .env("SPLATLAB", env!("CARGO_BIN_EXE_splatlab"))
+            .env("ONLY", "alignment")
+            .output()
+            .unwrap()
+    };
+    let output = run(&data);
+    let (said, errors) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{said}\n{errors}");
+    for line in [
+        "lerf: figurines lacks the folder itself",
+        "3dovs: sofa lacks images/, segmentations/classes.txt",
+        "3dovs: bed lacks the folder itself",
+        "scannet: not in ",
+        "network sam: splatvk models fetch sam_vit_h",
+    ] {
+        assert!(said.contains(line), "no \"{line}\" in {said}");
+    }
+    let page = std::fs::read_to_string(out.join("paper-tables.md")).unwrap();
+    assert!(page.contains("## lerf: ramen, teatime") && page.contains("### alignment"), "{page}");
+    let steps = page.lines().find(|l| l.starts_with("| steps 1, 2, 3 |")).unwrap();
+    assert!(steps.contains(" ± ") && steps.contains("(0.538)") && steps.contains("| 2 |"), "{steps}");
+    assert!(page.contains("mIoU by scene") && page.contains("lerf: figurines lacks"), "{page}");
+    // The second call takes every row from the first.
+    let seconds = || {
+        let report = read(&out.join("lerf-1/ablate.json"));
+        let all = report["measurements"].as_array().unwrap().clone();
+        all.iter().map(|m| format!("{:.9}", m["figures"]["T.T"].as_f64().unwrap())).collect::<Vec<_>>()
+    };
+    let before = seconds();
+    assert!(run(&data).status.success());
+    assert_eq!((before.len(), &before), (10, &seconds()));
+    let nothing = run(&root.path().join("nowhere"));
+    assert_eq!(nothing.status.code(), Some(2));
+}

@@ -1,0 +1,184 @@
+//! Generated data and the tables on it, as a user runs them.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+fn splatlab(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_splatlab")).args(args).output().unwrap()
+}
+
+fn run(args: &[&str]) -> serde_json::Value {
+    let output = splatlab(args);
+    assert!(output.status.success(), "{args:?}\n{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+fn path(p: &Path) -> &str {
+    p.to_str().unwrap()
+}
+
+/// One small scene through generate and ablate.
+#[test]
+fn a_generated_scene_is_ablated() {
+    let folder = tempfile::tempdir().unwrap();
+    let (data, out) = (folder.path().join("data"), folder.path().join("tables"));
+    let small = [
+        "--size",
+        "160x120",
+        "--views",
+        "3",
+        "--held-out",
+        "2",
+        "--objects",
+        "4",
+        "--seed",
+        "1000",
+        "--json",
+    ];
+    run(&[&["generate", "--out", path(&data)], &small[..]].concat());
+    let short = ["--iterations", "10", "--language-iterations", "2", "--true-cameras", "--json"];
+    let report = run(&[
+        &["ablate", "bijection", "--data", path(&data), "--out", path(&out), "--regions", "exact"],
+        &short[..],
+    ]
+    .concat());
+    let rows = report["tables"][0]["rows"].as_array().unwrap();
+    assert_eq!(rows.len(), 5);
+    let figure = |row: usize, name: &str| rows[row]["figures"][name].as_f64();
+    // the bijection keeps every meaning, whatever the dimension; one photo in four objects' size is
+    // coarse, though
+    assert!(
+        figure(0, "SIM").unwrap() > figure(2, "SIM").unwrap() && figure(0, "mIoU").unwrap() > 0.3,
+        "{rows:?}"
+    );
+    assert!(figure(4, "mIoU").is_none() && figure(4, "MB").unwrap() > 10.0 * figure(0, "MB").unwrap());
+    for file in ["bijection.txt", "bijection.svg", "ablate.json"] {
+        assert!(out.join(file).metadata().unwrap().len() > 100, "{file}");
+    }
+}
+
+/// Two scenes and one that cannot be read, with two seeds; what they share runs once, and the
+/// second call takes it all from the first.
+#[test]
+#[ignore = "takes long: tools/test-long"]
+fn scenes_and_seeds_have_a_spread_and_a_failed_scene_is_a_note() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let small = ["--size", "160x120", "--views", "3", "--held-out", "2", "--objects", "4"];
+    for (name, seed) in [("a", "1000"), ("b", "1001"), ("broken", "1000")] {
+        let made = splatlab(&[&["generate", "--out", path(&at(name)), "--seed", seed], &small[..]].concat());
+        assert!(made.status.success());
+    }
+    std::fs::remove_dir_all(at("broken/images")).unwrap();
+    let (a, b, broken, out) = (at("a"), at("b"), at("broken"), at("out"));
+    let ablate = || {
+        let mut args =
+            vec!["--log", "json", "ablate", "alignment", "--data", path(&broken), path(&a), path(&b)];
+        args.extend([
+            "--seeds",
+            "0,1",
+            "--regions",
+            "exact",
+            "--true-cameras",
+            "--out",
+            path(&out),
+            "--resume",
+            "--json",
+        ]);
+        args.extend(["--iterations", "5", "--language-iterations", "1", "--max-points", "5000"]);
+        let output = splatlab(&args);
+        let log = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success(), "{log}");
+        let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let begun = move |stage: &str| {
+            let events = log.lines().filter_map(|l| serde_json::from_str::<serde_json::Value>(l).ok());
+            events.filter(|e| e["event"] == "begin" && e["stage"] == stage).count()
+        };
+        (report, begun)
+    };
+    let (report, begun) = ablate();
+    let row = &report["tables"][0]["rows"][0];
+    assert_eq!(
+        (row["spread"]["mIoU"]["n"].as_u64(), row["difference"]["scenes"].as_u64()),
+        (Some(4), Some(2))
+    );
+    assert!(
+        row["spread"]["mIoU"]["sd"].as_f64().unwrap() > 0.0 && row["difference"]["half"].is_f64(),
+        "{row}"
+    );
+    let note = row["note"].as_str().unwrap();
+    assert!(note.starts_with("2 of 6 failed, first broken with seed 0: "), "{note}");
+    // Cameras are given, so that no random number enters before stereo: once per scene, training
+    // once per scene and seed.
+    assert_eq!((begun("features"), begun("splats")), (2, 4));
+    let text = std::fs::read_to_string(out.join("alignment.txt")).unwrap();
+    assert!(text.contains(" ± ") && text.contains("Δ mIoU"), "{text}");
+    let (again, begun) = ablate();
+    assert_eq!((begun("features"), begun("splats")), (0, 0));
+    // Numbers may change in their last digit on the way through the file.
+    let row = &again["tables"][0]["rows"][0];
+    let miou = |row: &serde_json::Value| row["figures"]["mIoU"].as_f64().unwrap();
+    assert!((miou(row) - miou(&report["tables"][0]["rows"][0])).abs() < 1e-12, "{row}");
+    assert_eq!((row["spread"]["mIoU"]["n"].as_u64(), row["note"].as_str()), (Some(4), Some(note)));
+}
+
+#[test]
+fn what_cannot_be_done_is_one_line_and_exit_code_two() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let o = path(&out);
+    let breakfast = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/breakfast");
+    for (args, says) in [
+        (vec!["generate", "--out", o, "--size", "wide"], "640x480"),
+        (vec!["generate", "--out", o, "--objects", "40"], "--objects"),
+        (vec!["generate", "--out", o, "--wrong", "2"], "--wrong"),
+        (vec!["generate", "--out", o, "--from", o], "ground_truth.json"),
+        (vec!["generate", "--out", o, "--phone", "--jpeg", "0"], "--jpeg"),
+        (vec!["ablate", "all", "--data", o, "--out", o], "ground_truth.json"),
+        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--regions", "clip"], "--regions clip"),
+        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--iterations", "0"], "--iterations 0"),
+        (vec!["ablate", "all", "--data", breakfast, breakfast, "--out", o], "the same folder twice"),
+        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--seeds", "1,1"], "the same seed twice"),
+        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--matcher", "sift"], "--matcher sift"),
+        (vec!["ablate", "all", "--data", breakfast, "--out", o, "--layout", "lerf"], "LERF-OVS"),
+    ] {
+        let output = splatlab(&args);
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{args:?}\n{text}");
+        assert!(text.lines().count() == 1 && text.contains(says), "{args:?}\n{text}");
+        assert!(!out.exists(), "{args:?} left something behind");
+    }
+}
+
+/// A second command for one output folder is refused by the process that works there; a command
+/// that is told to stop leaves nothing behind.
+#[cfg(unix)]
+#[test]
+fn output_folder_has_one_writer() {
+    let breakfast = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/breakfast");
+    for words in [
+        &["generate", "--size", "1600x1200", "--views", "40"][..],
+        &["ablate", "alignment", "--data", breakfast, "--seeds", "1,2,3,4,5,6,7,8"],
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let place = folder.path().join("out");
+        let mut first = Command::new(env!("CARGO_BIN_EXE_splatlab"));
+        first.args(words).arg("--out").arg(&place).stdout(Stdio::null()).stderr(Stdio::null());
+        let mut first = first.spawn().unwrap();
+        let marks =
+            [".out.partial-splatvk/owner", "out/.partial-splatvk/owner"].map(|m| folder.path().join(m));
+        let begun = Instant::now();
+        while !marks.iter().any(|m| m.metadata().is_ok_and(|m| m.len() > 0)) {
+            assert!(begun.elapsed() < Duration::from_secs(60), "{words:?}: nothing is reserved");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        let second = splatlab(&[words, &["--out", path(&place), "--force"]].concat());
+        let text = String::from_utf8_lossy(&second.stderr).into_owned();
+        assert_eq!(second.status.code(), Some(2), "{text}");
+        assert!(text.contains(&format!("process {}", first.id())), "{text}");
+        Command::new("kill").args(["-TERM", &first.id().to_string()]).status().unwrap();
+        assert_eq!(first.wait().unwrap().code(), Some(130));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "{words:?}");
+    }
+}
