@@ -67,22 +67,22 @@ pub struct Rendered {
 /// Focal ratio and offset of the principal point of the scene's cameras against the truth: medians
 /// over the train frames.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct OpticsOffset {
+struct IntrinsicsOffset {
     /// Focal length over the true one.
     focal: f64,
     /// Principal point minus the true one, share of the width and of the height.
     centre: [f64; 2],
 }
 
-impl OpticsOffset {
-    fn of(estimated: &[Camera], known: &[Camera]) -> OpticsOffset {
+impl IntrinsicsOffset {
+    fn of(estimated: &[Camera], known: &[Camera]) -> IntrinsicsOffset {
         let median = |value: &dyn Fn(&Camera, &Camera) -> f64| {
             let mut all: Vec<f64> = estimated.iter().zip(known).map(|(e, k)| value(e, k)).collect();
             crate::math::median(&mut all).unwrap_or(0.0)
         };
         let of_width = |c: &Camera, x: f64| x / f64::from(c.width);
         let of_height = |c: &Camera, y: f64| y / f64::from(c.height);
-        OpticsOffset {
+        IntrinsicsOffset {
             focal: median(&|e, k| of_width(e, e.fx) / of_width(k, k.fx)),
             centre: [
                 median(&|e, k| of_width(e, e.cx) - of_width(k, k.cx)),
@@ -96,7 +96,7 @@ impl OpticsOffset {
 pub struct Evaluation {
     truth: GroundTruth,
     similarity: Similarity,
-    optics_offset: OpticsOffset,
+    intrinsics_offset: IntrinsicsOffset,
     out: Option<PathBuf>,
     /// Places on surfaces that train frames show: in the scene, and true.
     surface: Vec<(DVec3, DVec3)>,
@@ -137,9 +137,9 @@ impl Evaluation {
             camera_lengths: length_score(&centres, 0.0),
             ..EvalReport::default()
         };
-        let (similarity, optics_offset) = (errors.similarity, OpticsOffset::of(&estimated, &known));
+        let (similarity, intrinsics_offset) = (errors.similarity, IntrinsicsOffset::of(&estimated, &known));
         let out = out.map(Path::to_path_buf);
-        Ok(Evaluation { similarity, optics_offset, out, surface: Vec::new(), mean_depth, report, truth })
+        Ok(Evaluation { similarity, intrinsics_offset, out, surface: Vec::new(), mean_depth, report, truth })
     }
 
     /// Scores the scene's direction up, as far as it is known.
@@ -158,7 +158,7 @@ impl Evaluation {
     /// A camera of the truth with the optics that the scene found for its own photos: what a photo
     /// taken with the same camera shows of the scene if the scene is right about itself.
     pub fn with_scene_optics(&self, camera: &Camera) -> Camera {
-        let OpticsOffset { focal, centre: [x, y] } = self.optics_offset;
+        let IntrinsicsOffset { focal, centre: [x, y] } = self.intrinsics_offset;
         Camera {
             fx: camera.fx * focal,
             fy: camera.fy * focal,

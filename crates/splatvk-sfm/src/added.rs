@@ -1,4 +1,4 @@
-//! Photos that join those of a scene (docs/internals/method.md#photos-added-later).
+//! Registration of new photos to a scene (docs/internals/method.md#photos-added-later).
 use super::matching::Detect;
 use super::sfm::{self, Known};
 use super::{Confidence, Fitted, SolvedCameras, learned_features, light};
@@ -7,21 +7,21 @@ use crate::progress::Progress;
 use crate::scene::Camera;
 use crate::{Error, Result};
 
-/// What a scene knows of its photos: one entry per photo in each list. The photos are without lens
-/// and in one light.
+/// Photos of a scene with their cameras; one entry per photo in each list. The photos are
+/// undistorted and photometrically equalised.
 #[derive(Clone, Debug)]
 pub struct KnownPhotos {
-    /// At working resolution.
+    /// Photos at working resolution.
     pub photos: Vec<Photo>,
-    /// Of the working images.
+    /// Cameras of the working images.
     pub cameras: Vec<Camera>,
-    /// How the cameras were found.
+    /// Estimated intrinsics and fit quality.
     pub fitted: Vec<Fitted>,
 }
 
-/// Cameras of `new` photos in the frame of the `known` ones, which stay as they are; all photos,
-/// the known ones first, with the new ones without lens and in the scene's light. A photo whose
-/// place cannot be found surely is an error that names it.
+/// Registers `new` photos in the world frame of the `known` ones. Returns all photos, the known
+/// ones first; the new ones are undistorted and in the light of the scene. The error names a photo
+/// that cannot be registered with confidence.
 pub fn add(
     known: &KnownPhotos,
     new: Vec<Photo>,
@@ -35,10 +35,10 @@ pub fn add(
     let cameras = Known { cameras: &known.cameras, fitted: &known.fitted };
     let model = sfm::with_added(&photos, cameras, &features, seed, progress)?;
     for (photo, fitted) in photos.iter().zip(&model.fitted).skip(count) {
-        check(&photo.stem, fitted)?;
+        check_confidence(&photo.stem, fitted)?;
     }
     for ((photo, fitted), camera) in photos.iter_mut().zip(&model.fitted).zip(&model.cameras).skip(count) {
-        // Only the cameras were measured on it.
+        // The fine image only serves the registration.
         photo.fine = None;
         photo.straighten(fitted.lens, camera);
     }
@@ -51,8 +51,8 @@ pub fn add(
     })
 }
 
-/// Refuses a place that is in doubt.
-fn check(stem: &str, fitted: &Fitted) -> Result<()> {
+/// Returns an error if the confidence is low.
+fn check_confidence(stem: &str, fitted: &Fitted) -> Result<()> {
     if fitted.confidence() > Confidence::Low {
         return Ok(());
     }
@@ -69,10 +69,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_place_in_doubt_is_refused_by_name() {
+    fn check_confidence_refuses_low_by_name() {
         let sure = Fitted { agreement: 0.97, rotation_sigma: 0.002, ..Fitted::default() };
-        assert!(check("late", &sure).is_ok());
-        let refusal = |fitted: Fitted| check("late", &fitted).unwrap_err().to_string();
+        assert!(check_confidence("late", &sure).is_ok());
+        let refusal = |fitted: Fitted| check_confidence("late", &fitted).unwrap_err().to_string();
         let contradicted = refusal(Fitted { agreement: 0.6, ..sure });
         assert!(contradicted.starts_with("late: only 60 % of its matches"), "{contradicted}");
         let open = refusal(Fitted { rotation_sigma: 0.06, ..sure });

@@ -1,44 +1,44 @@
-//! Keypoints that bridge wide angles: detected in photos as they would look from the side (ASIFT,
-//! Morel and Yu 2009). A flat patch seen under another angle is compressed along one direction;
-//! corners of the compressed photo match it.
+//! Affine-invariant keypoints (ASIFT, Morel and Yu 2009), for matches between views far apart in
+//! angle. Corners are also detected in copies of the photo that are compressed along one direction,
+//! as an oblique view compresses a planar patch.
 use super::matching::Keypoints;
 use super::sift;
 use crate::scene::Image;
 use glam::{DMat2, DVec2};
 use rayon::prelude::*;
 
-/// Compressions: √2, 2 and 2√2 are 45°, 60° and 69° from the front; of two photos that see a patch
-/// from both sides each bears one.
+/// Tilts of the simulated views: √2, 2 and 2√2 are 45°, 60° and 69° from the normal; of two photos
+/// that see a patch from both sides each bears one.
 const TILTS: [f64; 3] = [std::f64::consts::SQRT_2, 2.0, 2.0 * std::f64::consts::SQRT_2];
-/// Directions of a compression are this far apart over its factor, degrees (Morel and Yu).
+/// Angle between the directions of a compression, degrees, times its tilt (Morel and Yu).
 const TURN: f64 = 72.0;
-/// Blur along the compressed direction per √(t² − 1), pixels (Morel and Yu): what the pixels of a
-/// tilted camera would average.
+/// Blur along the compressed direction per √(t² − 1), pixels (Morel and Yu): the average over the
+/// pixels of a tilted camera.
 const BLUR: f64 = 0.8;
 
-/// Keypoints of a luma image and of its compressed versions, positions in the image itself; the
-/// strongest `limit` of each.
+/// Keypoints of a luma image and of its compressed copies, the strongest `limit` of each; positions
+/// in pixels of the image itself.
 pub(crate) fn detect(luma: &Image<f32>, valid: &Image<bool>, limit: usize) -> Keypoints {
     let mut all = sift::detect(luma, valid, limit);
-    let turns = TILTS.iter().flat_map(|t| {
+    let views = TILTS.iter().flat_map(|t| {
         let directions = (180.0 * t / TURN).round();
         (0..directions as usize).map(move |k| (*t, (k as f64 * 180.0 / directions).to_radians()))
     });
-    let turns: Vec<(f64, f64)> = turns.collect();
-    let seen =
-        turns.par_iter().map(|&(tilt, turn)| Compressed::new(luma, valid, tilt, turn).keypoints(limit));
-    for found in seen.collect::<Vec<_>>() {
+    let views: Vec<(f64, f64)> = views.collect();
+    let compressed =
+        views.par_iter().map(|&(tilt, turn)| Compressed::new(luma, valid, tilt, turn).keypoints(limit));
+    for found in compressed.collect::<Vec<_>>() {
         all.points.extend(found.points);
         all.descriptors.extend(found.descriptors);
     }
     all
 }
 
-/// A turned and compressed image.
+/// A rotated and compressed copy of an image.
 struct Compressed {
     luma: Image<f32>,
     valid: Image<bool>,
-    /// Position here → position in the image.
+    /// Linear map from positions in the copy to positions in the image.
     back: DMat2,
     origin: DVec2,
 }
@@ -48,15 +48,16 @@ impl Compressed {
         let size = DVec2::new(image.width as f64, image.height as f64);
         let (axis, across) = (DVec2::from_angle(turn), DVec2::from_angle(turn).perp());
         let extent = |d: DVec2| (size * d.abs()).element_sum();
-        // Every pixel of the turned image along its first axis, of which each `tilt`-th stays.
+        // The rotated image has full resolution along its first axis, of which every `tilt`-th
+        // sample stays.
         let (long, height) = (extent(axis).ceil() as usize, extent(across).ceil() as usize);
         let width = (long as f64 / tilt).floor().max(1.0) as usize;
-        let place =
+        let to_image =
             |u: f64, v: f64| 0.5 * size + axis * (u - 0.5 * long as f64) + across * (v - 0.5 * height as f64);
         let mut turned = Image::filled(long, height, 0.0f32);
         turned.data.par_chunks_mut(long).enumerate().for_each(|(y, row)| {
             row.iter_mut().enumerate().for_each(|(x, out)| {
-                *out = bilinear(image, place(x as f64 + 0.5, y as f64 + 0.5));
+                *out = bilinear(image, to_image(x as f64 + 0.5, y as f64 + 0.5));
             });
         });
         let kernel = kernel(BLUR * (tilt * tilt - 1.0).sqrt());
@@ -66,14 +67,14 @@ impl Compressed {
             let row = &turned.data[y * long..(y + 1) * long];
             for x in 0..width {
                 let u = (x as f64 + 0.5) * tilt;
-                luma.data[y * width + x] = weighted(row, u, &kernel);
-                let p = place(u, y as f64 + 0.5);
+                luma.data[y * width + x] = blurred_at(row, u, &kernel);
+                let p = to_image(u, y as f64 + 0.5);
                 let within = p.x >= 0.0 && p.y >= 0.0 && p.x < size.x && p.y < size.y;
                 inside.data[y * width + x] = within && valid.at(p.x as usize, p.y as usize);
             }
         }
         let back = DMat2::from_cols(axis * tilt, across);
-        Compressed { luma, valid: inside, back, origin: place(0.0, 0.0) }
+        Compressed { luma, valid: inside, back, origin: to_image(0.0, 0.0) }
     }
 
     fn keypoints(&self, limit: usize) -> Keypoints {
@@ -83,7 +84,7 @@ impl Compressed {
     }
 }
 
-/// Normalised Gaussian.
+/// Normalised Gaussian kernel of radius 3 σ.
 fn kernel(sigma: f64) -> Vec<f32> {
     let radius = (3.0 * sigma).ceil() as i64;
     let values: Vec<f64> =
@@ -92,8 +93,8 @@ fn kernel(sigma: f64) -> Vec<f32> {
     values.iter().map(|v| (v / sum) as f32).collect()
 }
 
-/// The blurred row around a position, between its pixels; ends are repeated.
-fn weighted(row: &[f32], u: f64, kernel: &[f32]) -> f32 {
+/// Blurred value of a row at position `u`, linear between samples; ends are repeated.
+fn blurred_at(row: &[f32], u: f64, kernel: &[f32]) -> f32 {
     let at = u - 0.5;
     let (low, share) = (at.floor() as i64, at.fract() as f32);
     let radius = kernel.len() as i64 / 2;
@@ -102,10 +103,10 @@ fn weighted(row: &[f32], u: f64, kernel: &[f32]) -> f32 {
     blurred(low) * (1.0 - share) + blurred(low + 1) * share
 }
 
-/// The image between its pixels; edges are repeated.
+/// Bilinear value of the image; edges are repeated.
 fn bilinear(image: &Image<f32>, p: DVec2) -> f32 {
-    let most = DVec2::new(image.width as f64 - 1.0, image.height as f64 - 1.0);
-    let q = (p - 0.5).clamp(DVec2::ZERO, most);
+    let last = DVec2::new(image.width as f64 - 1.0, image.height as f64 - 1.0);
+    let q = (p - 0.5).clamp(DVec2::ZERO, last);
     let (x, y) = (q.x as usize, q.y as usize);
     let (x1, y1) = ((x + 1).min(image.width - 1), (y + 1).min(image.height - 1));
     let (fx, fy) = (q.x.fract() as f32, q.y.fract() as f32);
@@ -130,10 +131,10 @@ mod tests {
     }
 
     #[test]
-    fn a_patch_compressed_three_times_is_matched_where_plain_corners_fail() {
+    fn detect_matches_patch_at_70_degrees() {
         let image = texture(360, 300);
         let middle = DVec2::new(180.0, 150.0);
-        // As seen after turning by 25° and tilting by 70°.
+        // A view rotated by 25° and tilted by 70°.
         let (axis, across) = (DVec2::from_angle(0.44), DVec2::from_angle(0.44).perp());
         let to = |p: DVec2| {
             let q = p - middle;

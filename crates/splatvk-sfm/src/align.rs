@@ -1,4 +1,4 @@
-//! Comparing estimated cameras with known ones: the error measures of `eval` and of the tests.
+//! Errors of estimated cameras against known ones, for `eval` and the tests.
 use super::numeric::{nearest_rotation, rotation_angle};
 use crate::scene::{Camera, Similarity};
 use glam::{DMat3, DVec3};
@@ -17,8 +17,9 @@ pub struct PoseErrors {
 }
 
 /// Compares cameras in order. `mean_depth` is the mean camera-z of the true scene, true units. The
-/// global rotation is the chordal mean of the per-camera rotations, so that collinear centres do no
-/// harm; scale and shift are least squares over the centres. Empty input gives empty errors.
+/// global rotation is the chordal mean of the per-camera rotations, so that collinear centres are
+/// no problem; scale and translation are least squares over the centres. Empty input gives empty
+/// errors.
 pub fn pose_errors(estimated: &[Camera], truth: &[Camera], mean_depth: f64) -> PoseErrors {
     let pairs: Vec<_> = estimated.iter().zip(truth).collect();
     let n = pairs.len().max(1) as f64;
@@ -73,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn a_similarity_is_no_error_and_a_turned_camera_is() {
+    fn pose_errors_are_invariant_to_similarity() {
         let truth: Vec<_> = (0..4)
             .map(|k| {
                 let k = k as f64;

@@ -1,5 +1,5 @@
-//! Which photos a run uses when more are given: sharp ones that overlap, from different places, and
-//! that together show what all show.
+//! Selection of photos where more are given than wanted: sharp, overlapping, from different
+//! positions, and together covering the scene.
 use super::matching::{Keypoints, mutual_matches, valid_area};
 use super::overlap::{self, SimilarityInliers};
 use super::{sharpness, sift, still};
@@ -17,23 +17,24 @@ const FEATURE_SIDE: usize = 320;
 const FEATURES: usize = 300;
 /// Lowe's ratio. Wrong matches cost little, since the count is that of matches that agree.
 const RATIO: f32 = 0.85;
-/// Every pair is compared up to this many photos (780 pairs); beyond it every photo with
+/// Most photos of which every pair is compared (780 pairs); beyond it every photo is compared with
 /// [`NEIGHBOURS`] likely ones.
 const ALL_PAIRS: usize = 40;
 const NEIGHBOURS: usize = 12;
 
-/// Agreeing matches that make a usable link. Unrelated pairs reach 8 by chance (photos of a tower
-/// from all sides); twice that leaves room.
+/// Fewest inliers of a usable link. Unrelated pairs reach 8 by chance (photos of a tower from all
+/// sides); twice that leaves a margin.
 const LINKED: usize = 16;
-/// Agreeing matches at which a photo shows half of what another shows.
+/// Inliers at which a photo shows half of another.
 const HALF_SEEN: f64 = 40.0;
 /// Parallax over the image diagonal below which two photos are from nearly the same place: at 60°
 /// field of view and a scene as deep as it is far, a step of a fiftieth of the distance.
 const SAME_PLACE: f64 = 0.006;
-/// Of the fewer corners of two, the share that must match for them to show nearly the same.
+/// Least share of matches, of the smaller number of corners, at which two photos show nearly the
+/// same.
 const SAME_SHARE: f64 = 0.35;
 
-/// What was chosen and why, for messages and run.json.
+/// The photos chosen and those left out, with reasons, for messages and run.json.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
 #[non_exhaustive]
 pub struct Choice {
@@ -47,9 +48,9 @@ pub struct Choice {
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(into = "(String, Reason)", from = "(String, Reason)")]
 pub struct LeftOut {
-    /// Its name.
+    /// Name of the photo.
     pub photo: String,
-    /// Why it is not used.
+    /// Reason for leaving it out.
     pub reason: Reason,
 }
 
@@ -65,7 +66,7 @@ impl From<(String, Reason)> for LeftOut {
     }
 }
 
-/// Why a photo is not used.
+/// Reason for leaving out a photo.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
@@ -78,17 +79,16 @@ pub enum Reason {
     /// The same picture, or taken from the same place, as this one.
     #[serde(rename = "nearly_the_same_as")]
     Duplicate(String),
-    /// The photos used show most of what it shows.
+    /// The photos used cover most of its content.
     #[serde(rename = "adds_little")]
     LittleNewArea,
-    /// Its place among the others could not be found surely: so many percent of its matches agree
-    /// with any cameras.
+    /// Its pose is uncertain: only this percentage of its matches agrees with any cameras.
     Doubtful(u8),
 }
 
-/// Finds the photos of files, folders and videos and chooses `views` of them (`None`: all, at most
-/// [`photo::DEFAULT_VIEWS`]), for [`photo::load_each`]. Says what it chose; without a choice, all
-/// are used.
+/// Gathers the photos of files, folders and videos and chooses `views` of them (`None`: all, at
+/// most [`photo::DEFAULT_VIEWS`]), for [`photo::load_each`]. Reports the choice to `progress`;
+/// without a choice, all are used.
 pub fn photos(
     inputs: &[std::path::PathBuf],
     views: Option<usize>,
@@ -107,14 +107,7 @@ pub fn photos(
 impl Choice {
     /// "using 2 of 4 photos: a.jpg, b.jpg (sharp, …); left out: …".
     pub fn message(&self) -> String {
-        // A list longer than this is not read; run.json has it all.
-        const NAMED: usize = 6;
-        let list = |names: &[&str]| {
-            let more = names.len().saturating_sub(NAMED);
-            let shown = names[..names.len() - more].join(", ");
-            if more > 0 { format!("{shown} and {more} more") } else { shown }
-        };
-        let of = |wanted: &dyn Fn(&Reason) -> bool| -> Vec<&str> {
+        let names_with = |wanted: &dyn Fn(&Reason) -> bool| -> Vec<&str> {
             self.left_out.iter().filter(|l| wanted(&l.reason)).map(|l| l.photo.as_str()).collect()
         };
         let mut parts = Vec::new();
@@ -123,15 +116,15 @@ impl Choice {
             (Reason::NoOverlap, "too little in common with the others"),
             (Reason::LittleNewArea, "the others show it"),
         ] {
-            let names = of(&|r| *r == reason);
+            let names = names_with(&|r| *r == reason);
             if !names.is_empty() {
-                parts.push(format!("{} ({words})", list(&names)));
+                parts.push(format!("{} ({words})", shortened_list(&names)));
             }
         }
         for same in &self.used {
-            let names = of(&|r| matches!(r, Reason::Duplicate(n) if n == same));
+            let names = names_with(&|r| matches!(r, Reason::Duplicate(n) if n == same));
             if !names.is_empty() {
-                parts.push(format!("{} (nearly the same as {same})", list(&names)));
+                parts.push(format!("{} (nearly the same as {same})", shortened_list(&names)));
             }
         }
         let used: Vec<&str> = self.used.iter().map(String::as_str).collect();
@@ -145,31 +138,39 @@ impl Choice {
     }
 }
 
+/// At most six names, separated by commas; run.json has all of them.
+fn shortened_list(names: &[&str]) -> String {
+    const NAMED: usize = 6;
+    let more = names.len().saturating_sub(NAMED);
+    let shown = names[..names.len() - more].join(", ");
+    if more > 0 { format!("{shown} and {more} more") } else { shown }
+}
+
 /// Features and sharpness of a candidate.
 struct CandidateFeatures {
     features: Keypoints,
     /// Image diagonal in the features' pixels.
     diagonal: f64,
     sharpness: f64,
-    /// Colours on a grid, for photos that are too many to compare all.
+    /// Colours on a grid, for sets too large to compare all pairs.
     signature: Vec<f32>,
 }
 
-/// A candidate at the size at which it is compared.
-struct Look {
+/// Reduced image and sharpness of a candidate.
+struct Thumbnail {
     small: RgbImage,
     sharpness: f64,
 }
 
-impl Look {
-    fn of(image: &RgbImage) -> Look {
+impl Thumbnail {
+    fn of(image: &RgbImage) -> Thumbnail {
         let scale = (FEATURE_SIDE as f64 / image.width.max(image.height) as f64).min(1.0);
         let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
         let small = image.resized_by_area(to(image.width), to(image.height));
-        Look { small, sharpness: sharpness::of(image) }
+        Thumbnail { small, sharpness: sharpness::measure(image) }
     }
 
-    /// Features of the scene: `overlay` is what stands still in the frame.
+    /// Features outside of `overlay`.
     fn features(&self, overlay: Option<&Image<bool>>) -> CandidateFeatures {
         let small = &self.small;
         // Margin 4: the descriptor's window at the finest scale.
@@ -184,13 +185,17 @@ impl Look {
     }
 }
 
-/// Features of all candidates, without what stands still in all photos of one size.
-fn features(looks: &[Look]) -> Vec<CandidateFeatures> {
-    let overlays = still::overlays(looks.iter().map(|l| &l.small));
-    looks.par_iter().zip(&overlays).map(|(look, overlay)| look.features(overlay.as_ref())).collect()
+/// Features of all candidates, outside of the overlays that stand still in all photos of one size.
+fn features(thumbnails: &[Thumbnail]) -> Vec<CandidateFeatures> {
+    let overlays = still::overlays(thumbnails.iter().map(|l| &l.small));
+    thumbnails
+        .par_iter()
+        .zip(&overlays)
+        .map(|(thumbnail, overlay)| thumbnail.features(overlay.as_ref()))
+        .collect()
 }
 
-/// Indices of the chosen candidates in order, and the reasons. Deterministic.
+/// Chooses `wanted` candidates. Returns their indices, ascending, and the reasons. Deterministic.
 pub fn choose(
     candidates: &[Candidate],
     wanted: usize,
@@ -198,17 +203,17 @@ pub fn choose(
 ) -> Result<(Vec<usize>, Choice)> {
     progress.begin("choose", candidates.len() as u64);
     let done = AtomicU64::new(0);
-    let look = |c: &Candidate| {
+    let load = |c: &Candidate| {
         progress.check()?;
-        let seen = c.thumbnail(sharpness::SIDE, progress)?.map(|image| Look::of(&image));
+        let seen = c.thumbnail(sharpness::SIDE, progress)?.map(|image| Thumbnail::of(&image));
         progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
         Ok(seen)
     };
-    let looks: Vec<Result<Option<Look>>> = candidates.par_iter().map(look).collect();
-    let looks = looks.into_iter().collect::<Result<Vec<_>>>()?;
-    let there: Vec<usize> = (0..looks.len()).filter(|i| looks[*i].is_some()).collect();
-    let looks: Vec<Look> = looks.into_iter().flatten().collect();
-    let seen = features(&looks);
+    let thumbnails: Vec<Result<Option<Thumbnail>>> = candidates.par_iter().map(load).collect();
+    let thumbnails = thumbnails.into_iter().collect::<Result<Vec<_>>>()?;
+    let there: Vec<usize> = (0..thumbnails.len()).filter(|i| thumbnails[*i].is_some()).collect();
+    let thumbnails: Vec<Thumbnail> = thumbnails.into_iter().flatten().collect();
+    let seen = features(&thumbnails);
     progress.end();
     photo::photo_count(seen.len(), Some(wanted))?;
     let links = links(&seen, progress)?;
@@ -233,15 +238,9 @@ fn links(seen: &[CandidateFeatures], progress: &dyn Progress) -> Result<Vec<Vec<
     let done = AtomicU64::new(0);
     let compare = |&(i, j): &(usize, usize)| {
         progress.check()?;
-        let (a, b) = (&seen[i], &seen[j]);
-        let matches = mutual_matches(&a.features, &b.features, RATIO);
-        let points = |f: &Keypoints, d: f64, k: usize| f.points[k] / d;
-        let ends: Vec<_> = matches
-            .iter()
-            .map(|m| (points(&a.features, a.diagonal, m.first), points(&b.features, b.diagonal, m.second)))
-            .collect();
+        let link = link(&seen[i], &seen[j]);
         progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
-        Ok((i, j, overlap::agreement(&ends)))
+        Ok((i, j, link))
     };
     let found = pairs.par_iter().map(compare).collect::<Result<Vec<_>>>()?;
     let mut links = vec![vec![SimilarityInliers::default(); n]; n];
@@ -253,8 +252,15 @@ fn links(seen: &[CandidateFeatures], progress: &dyn Progress) -> Result<Vec<Vec<
     Ok(links)
 }
 
-/// The pairs to compare: all, or for many photos each with those of the most similar colours and
-/// its neighbours in order.
+fn link(a: &CandidateFeatures, b: &CandidateFeatures) -> SimilarityInliers {
+    let matches = mutual_matches(&a.features, &b.features, RATIO);
+    let position = |c: &CandidateFeatures, k: usize| c.features.points[k] / c.diagonal;
+    let ends: Vec<_> = matches.iter().map(|m| (position(a, m.first), position(b, m.second))).collect();
+    overlap::similarity_inliers(&ends)
+}
+
+/// Pairs to compare: all, or for many photos each with those of the most similar colours and its
+/// neighbours in order.
 fn pairs(seen: &[CandidateFeatures]) -> Vec<(usize, usize)> {
     let n = seen.len();
     if n <= ALL_PAIRS {
@@ -279,7 +285,7 @@ fn pairs(seen: &[CandidateFeatures]) -> Vec<(usize, usize)> {
     pairs
 }
 
-/// Everything that the choice depends on.
+/// Links and quality of the candidates, from which the choice is made.
 struct Graph {
     links: Vec<Vec<SimilarityInliers>>,
     /// Sharpness over the median, at most 1.
@@ -287,13 +293,25 @@ struct Graph {
     same: Vec<Vec<bool>>,
 }
 
-/// What a set of photos is worth; smaller is better, compared from the left.
+/// Cost of a set of photos; fields are compared in order, smaller is better.
 #[derive(Clone, Copy, PartialEq, PartialOrd)]
 struct Cost {
-    /// Groups of the set that no link joins.
+    /// Connected components of the set.
     parts: usize,
-    /// Minus what is seen of all.
+    /// Blur of the set, minus the share of all photos that it shows.
     unseen: f64,
+}
+
+impl Cost {
+    fn is_below(&self, other: &Cost) -> bool {
+        self.partial_cmp(other) == Some(std::cmp::Ordering::Less)
+    }
+}
+
+/// The cheaper of two choices; the first on ties, so that the result does not depend on the
+/// machine.
+fn cheaper<T>(a: (Cost, T), b: (Cost, T)) -> (Cost, T) {
+    if b.0.is_below(&a.0) { b } else { a }
 }
 
 impl Graph {
@@ -342,33 +360,21 @@ impl Graph {
         let parts = (0..set.len()).filter(|k| group.contains(k)).count();
         let best =
             |i: usize| set.iter().map(|&j| self.quality[j] * self.overlap_share(i, j)).fold(0.0, f64::max);
-        // A photo that is linked to none shows another place, which is not to be covered.
+        // A photo without links shows another scene, which need not be covered.
         let counts = |i: &usize| self.links[*i].iter().any(|l| l.matches >= LINKED);
         let seen: f64 = (0..self.links.len()).filter(counts).map(best).sum();
-        // Blur is paid for by itself, too: a blurred photo may be the only one of its place.
+        // Blur has a cost by itself, too: a blurred photo may be the only one of its place.
         let blur: f64 = set.iter().map(|&j| 1.0 - self.quality[j]).sum();
         Cost { parts, unseen: blur - seen }
     }
 
-    /// Best set found by growing from every photo and then swapping single photos while that helps.
+    /// Best set by greedy growth from every photo, followed by swaps of single photos as long as
+    /// they help.
     fn choose(&self, wanted: usize) -> Vec<usize> {
         let n = self.links.len();
-        let better = |a: &Cost, b: &Cost| a.partial_cmp(b) == Some(std::cmp::Ordering::Less);
-        let grow = |start: usize| {
-            let mut set = vec![start];
-            while set.len() < wanted {
-                let with = |j: usize| [&set[..], &[j]].concat();
-                let free = (0..n).filter(|j| !set.contains(j)).map(|j| (self.cost(&with(j)), j));
-                // On ties the first, so that the result does not depend on the machine.
-                let best = free.reduce(|a, b| if better(&b.0, &a.0) { b } else { a });
-                set.extend(best.map(|b| b.1));
-            }
-            (self.cost(&set), set)
-        };
-        let grown: Vec<(Cost, Vec<usize>)> = (0..n).into_par_iter().map(grow).collect();
-        let Some((mut cost, mut set)) =
-            grown.into_iter().reduce(|a, b| if better(&b.0, &a.0) { b } else { a })
-        else {
+        let grown: Vec<(Cost, Vec<usize>)> =
+            (0..n).into_par_iter().map(|start| self.grow(start, wanted)).collect();
+        let Some((mut cost, mut set)) = grown.into_iter().reduce(cheaper) else {
             return Vec::new();
         };
         loop {
@@ -378,13 +384,25 @@ impl Graph {
                 other[k] = j;
                 (self.cost(&other), other)
             });
-            match swapped.reduce(|a, b| if better(&b.0, &a.0) { b } else { a }) {
-                Some(next) if better(&next.0, &cost) => (cost, set) = next,
+            match swapped.reduce(cheaper) {
+                Some(next) if next.0.is_below(&cost) => (cost, set) = next,
                 _ => break,
             }
         }
         set.sort_unstable();
         set
+    }
+
+    /// Grows a set of `wanted` photos from one by the cheapest addition each.
+    fn grow(&self, start: usize, wanted: usize) -> (Cost, Vec<usize>) {
+        let mut set = vec![start];
+        while set.len() < wanted {
+            let with = |j: usize| [&set[..], &[j]].concat();
+            let free = (0..self.links.len()).filter(|j| !set.contains(j));
+            let best = free.map(|j| (self.cost(&with(j)), j)).reduce(cheaper);
+            set.extend(best.map(|b| b.1));
+        }
+        (self.cost(&set), set)
     }
 
     fn reason(&self, i: usize, chosen: &[usize], names: &[String]) -> Reason {

@@ -1,34 +1,35 @@
-//! How far the place of a photo's camera is to be trusted (docs/internals/method.md#confidence).
+//! Confidence in an estimated camera (docs/internals/method.md#confidence).
 use super::Fitted;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
-/// Share of a photo's matches with the others that agree with the cameras, below which its place is
-/// in doubt: 0.93 and more where all are right on the tuning sets, 0.28 to 0.8 where one is wrong.
+/// Share of inlier matches below which confidence is low: 0.93 and more where all cameras are right
+/// on the tuning sets, 0.28 to 0.8 where one is wrong.
 pub(super) const DOUBTFUL: f64 = 0.85;
-/// Below this share it is not sure.
+/// Share of inlier matches below which confidence is at most medium.
 const AGREED: f64 = 0.9;
-/// σ of a rotation above which the place of a camera is not sure, degrees: a few pixels of a photo.
+/// σ of a rotation above which confidence is at most medium, degrees: a few pixels of a photo.
 const UNSURE_ROTATION: f64 = 0.5;
-/// σ above which it is in doubt, degrees: what is hidden behind near things comes out elsewhere.
+/// σ of a rotation above which confidence is low, degrees: surfaces behind near objects then appear
+/// in other places.
 pub(super) const DOUBTFUL_ROTATION: f64 = 2.0;
-/// σ of ln f above which depth is not sure.
+/// σ of ln f above which confidence is at most medium: depth is uncertain.
 pub(super) const UNSURE_FOCAL: f64 = 0.05;
 
-/// Trust in the place of a camera. What each level was worth on generated photos is in
+/// Confidence in pose and focal length of a camera. Its accuracy on generated photos is in
 /// docs/use/photos.md.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Confidence {
     /// May be wrong by degrees.
     Low,
-    /// Right, but not to a fraction of a degree, or the focal length is open.
+    /// Correct, but not to a fraction of a degree, or with an uncertain focal length.
     Medium,
-    /// Right.
+    /// Correct.
     High,
 }
 
 impl Confidence {
-    /// Its word.
+    /// Lower-case name.
     pub fn name(self) -> &'static str {
         match self {
             Confidence::Low => "low",
@@ -39,7 +40,7 @@ impl Confidence {
 }
 
 impl Fitted {
-    /// What the stated deviations and the agreement of the matches come to.
+    /// Confidence from the standard deviations and the share of inlier matches.
     pub fn confidence(&self) -> Confidence {
         let rotation = self.rotation_sigma.to_degrees();
         if self.agreement < DOUBTFUL || self.unconfirmed || rotation > DOUBTFUL_ROTATION {
@@ -57,7 +58,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_worst_of_what_is_known_decides() {
+    fn confidence_follows_the_worst_measure() {
         let good = Fitted { agreement: 0.97, rotation_sigma: 0.002, ..Fitted::default() };
         let level = |f: Fitted| f.confidence();
         assert_eq!(level(good), Confidence::High);

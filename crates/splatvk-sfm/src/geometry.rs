@@ -3,8 +3,8 @@ use crate::scene::{Camera, DepthMap, Lens, PointCloud};
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// What every geometry initialiser returns (docs/internals/method.md#geometry). World frame: camera
-/// 0 of the run, OpenCV axes.
+/// Result of a geometry initialiser (docs/internals/method.md#geometry). World frame: camera 0 of
+/// the run, OpenCV axes.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Geometry {
     /// One per photo, at the photo's working resolution.
@@ -15,13 +15,13 @@ pub struct Geometry {
     pub points: PointCloud,
     /// One standard deviation of ln f, if the focal length was estimated.
     pub focal_log_sigma: Option<f64>,
-    /// What was found of the optics, one per photo, if it was estimated.
+    /// Estimated intrinsics and fit quality, one per photo, if they were estimated.
     pub fitted: Vec<Fitted>,
-    /// Name of the initialiser and of what it used, for run.json.
+    /// Name of the initialiser and of its inputs, for run.json.
     pub method: String,
 }
 
-/// A triangulated point and where the photos show it.
+/// A triangulated point with its observations.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SparsePoint {
     /// World units.
@@ -32,32 +32,29 @@ pub struct SparsePoint {
     pub views: Vec<(usize, DVec2)>,
 }
 
-/// What the photos told of the optics of one of them.
+/// Estimated intrinsics and fit quality of one photo.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Fitted {
-    /// Its lens.
+    /// Lens distortion.
     pub lens: Lens,
     /// One standard deviation of ln f, k1, k2 and the principal point (x, y; original pixels); 0 =
-    /// held where it is.
+    /// held fixed.
     pub sigmas: [f64; 5],
-    /// Median distance of its sightings from where the model projects their points, working pixels.
+    /// Median reprojection error of its observations, working pixels.
     pub residual: f64,
-    /// Share of its matches that agree with the cameras, of those on which its pairs with other
-    /// photos agree by themselves.
+    /// Share of the inliers of its two-view geometries that agree with the final cameras, too.
     pub agreement: f64,
-    /// Whether one pair of photos, whose matches are few or mostly contradict each other, is all
-    /// that its place rests on.
+    /// Whether its pose rests on a single pair of photos whose inliers are few or a minority.
     #[serde(default)]
     pub unconfirmed: bool,
-    /// One standard deviation of the direction in which its camera looks, against that of the first
-    /// photo, radians.
+    /// One standard deviation of the rotation of its camera against the first photo, radians.
     pub rotation_sigma: f64,
-    /// Photos of one number were explained with the same optics.
+    /// Camera id; photos of one id share intrinsics.
     pub camera: usize,
 }
 
-/// Cameras and the sparse points that fix them. World frame: camera 0; unit: the median depth of
-/// the points is 1 where it is free, that of the given cameras otherwise.
+/// Cameras and triangulated points. World frame: camera 0; unit: the median depth of the points
+/// where scale is free, that of the given cameras otherwise.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct SparseModel {
     /// One per photo, at the photo's working resolution.
@@ -66,10 +63,10 @@ pub struct SparseModel {
     pub points: Vec<SparsePoint>,
     /// One standard deviation of ln f, if the focal length was estimated.
     pub focal_log_sigma: Option<f64>,
-    /// One per photo, if the optics were estimated. The cameras and the points' pixels are those of
-    /// the pinhole that remains when the lens is taken out of the photo.
+    /// Estimated intrinsics and fit quality, one per photo, if they were estimated. Cameras and
+    /// pixel positions are those of the undistorted photos.
     pub fitted: Vec<Fitted>,
-    /// Whether all that the photos agree on lies on one plane, as far as they tell.
+    /// Whether the matches of all photos lie on one plane.
     #[serde(default)]
     pub flat: bool,
 }

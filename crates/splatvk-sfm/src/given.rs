@@ -1,5 +1,5 @@
-//! Given cameras brought to their photos: joined by name, turned as the photos were, at working
-//! size, their lens taken out.
+//! Given cameras assigned to their photos: joined by name, rotated by the EXIF orientation, scaled
+//! to working size, with the distortion taken out of the photos.
 use super::matching::{Keypoints, Match, mutual_matches, valid_area};
 use super::minimal::{essential, triangulate_two};
 use super::sift;
@@ -11,19 +11,20 @@ use crate::{Error, Result, files};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-/// Which pixels of a photo whose EXIF states an orientation a camera belongs to.
+/// Pixel frame of a given camera, for photos with an EXIF orientation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Pixels {
-    /// Those of the file. COLMAP does not apply the orientation (colmap#1456), nor do most programs
-    /// that build on it.
+    /// Pixels as stored in the file. COLMAP does not apply the orientation (colmap#1456), nor do
+    /// most programs that build on it.
     Stored,
-    /// Those that a viewer shows.
+    /// Pixels after the orientation, as viewers show them.
     Upright,
 }
 
-/// Cameras of photos (pinholes at working resolution). Where a camera is of the stored pixels it is
-/// turned as the photo was, and a photo that is mirrored by its orientation is mirrored back; then
-/// the lens is taken out of the photo.
+/// Assigns `given` cameras to photos and undistorts these. Returns pinhole cameras at working
+/// resolution. A camera of the stored pixels is rotated by the EXIF orientation, and a photo
+/// mirrored by its orientation is mirrored back. The error names a photo without a camera, or with
+/// one of another aspect ratio.
 pub fn assign(photos: &mut [Photo], given: &[GivenCamera], progress: &dyn Progress) -> Result<Vec<Camera>> {
     let own = joined(photos, given)?;
     let pixels = pixels(photos, &own, progress)?;
@@ -44,7 +45,7 @@ pub fn assign(photos: &mut [Photo], given: &[GivenCamera], progress: &dyn Progre
             photo.unmirror();
         }
         photo.straighten(lens, &camera);
-        let share = bend(&lens, &camera);
+        let share = corner_distortion(&lens, &camera);
         strongest = if share.abs() > strongest.abs() { share } else { strongest };
         cameras.push(camera);
     }
@@ -57,49 +58,48 @@ pub fn assign(photos: &mut [Photo], given: &[GivenCamera], progress: &dyn Progre
     Ok(cameras)
 }
 
-/// How much farther from the principal point the lens images the first corner, share of the
-/// distance.
-fn bend(lens: &Lens, camera: &Camera) -> f64 {
+/// Radial displacement of the first image corner by the lens, as a share of its distance from the
+/// principal point.
+fn corner_distortion(lens: &Lens, camera: &Camera) -> f64 {
     let corner = camera.ray(DVec2::ZERO).truncate();
     lens.distort(corner).length() / corner.length() - 1.0
 }
 
-/// The camera of each photo.
+/// Camera of each photo, joined by file name.
 fn joined<'a>(photos: &[Photo], given: &'a [GivenCamera]) -> Result<Vec<&'a GivenCamera>> {
     let names: Vec<&str> = given.iter().map(|c| c.camera.name.as_str()).collect();
     let paths: Vec<String> = photos.iter().map(|p| p.path.to_string_lossy().into_owned()).collect();
     let found = join(&paths, &names).map_err(Error::input)?;
-    let one = |(photo, found): (&Photo, Option<usize>)| {
-        found.map(|k| &given[k]).ok_or_else(|| {
-            Error::input(format!(
-                "{}: the camera file has no camera of this name; it names {}",
-                photo.path.display(),
-                files::listed(&names)
-            ))
-        })
+    let missing = |photo: &Photo| {
+        Error::input(format!(
+            "{}: the camera file has no camera of this name; it names {}",
+            photo.path.display(),
+            files::listed(&names)
+        ))
     };
-    photos.iter().zip(found).map(one).collect()
+    let cameras = photos.iter().zip(found);
+    cameras.map(|(photo, found)| found.map(|k| &given[k]).ok_or_else(|| missing(photo))).collect()
 }
 
-/// Sides that differ by rounding: working sizes are whole numbers, and so are those of reduced
-/// copies.
+/// Largest relative difference of equal aspect ratios: sides of working images and of reduced
+/// copies are rounded to whole pixels.
 const SAME_ASPECT: f64 = 0.01;
 
-/// For every photo the pixels that its camera belongs to: by the size, then as that of the other
-/// photos says, then by matches.
+/// Pixel frame of each camera: from its image size, else from that of the other photos, else from
+/// matches.
 fn pixels(photos: &[Photo], own: &[&GivenCamera], progress: &dyn Progress) -> Result<Vec<Pixels>> {
-    let told = photos.iter().zip(own).map(|(p, c)| by_size(p, &c.camera)).collect::<Result<Vec<_>>>()?;
-    let open: Vec<usize> = (0..photos.len()).filter(|v| told[*v].is_none()).collect();
+    let known = photos.iter().zip(own).map(|(p, c)| by_size(p, &c.camera)).collect::<Result<Vec<_>>>()?;
+    let open: Vec<usize> = (0..photos.len()).filter(|v| known[*v].is_none()).collect();
     if open.is_empty() {
-        return Ok(told.into_iter().flatten().collect());
+        return Ok(known.into_iter().flatten().collect());
     }
-    // One program made the file: it did the same with all photos. Photos without orientation say
-    // nothing.
-    let says = |pixels| told.iter().zip(photos).any(|(t, p)| *t == Some(pixels) && !p.turn.is_none());
-    let all = match (says(Pixels::Stored), says(Pixels::Upright)) {
+    // One program wrote the file and treated all photos alike. Photos without an orientation are no
+    // evidence.
+    let is_used = |pixels| known.iter().zip(photos).any(|(t, p)| *t == Some(pixels) && !p.turn.is_none());
+    let all = match (is_used(Pixels::Stored), is_used(Pixels::Upright)) {
         (true, false) => Pixels::Stored,
         (false, true) => Pixels::Upright,
-        _ => by_matches(photos, own, &told).unwrap_or_else(|| {
+        _ => by_matches(photos, own, &known).unwrap_or_else(|| {
             let names: Vec<&str> = open.iter().map(|v| photos[*v].stem.as_str()).collect();
             progress.warn(&format!(
                 "neither sizes nor matches show whether the cameras of {} belong to the stored pixels or to the upright ones (EXIF \
@@ -109,10 +109,11 @@ fn pixels(photos: &[Photo], own: &[&GivenCamera], progress: &dyn Progress) -> Re
             Pixels::Stored
         }),
     };
-    Ok(told.into_iter().map(|t| t.unwrap_or(all)).collect())
+    Ok(known.into_iter().map(|t| t.unwrap_or(all)).collect())
 }
 
-/// By the size of a camera's picture; `None` where both may be meant.
+/// Pixel frame from the image size of a camera; `None` where both are possible. The error names a
+/// photo of another aspect ratio.
 fn by_size(photo: &Photo, camera: &Camera) -> Result<Option<Pixels>> {
     if photo.turn.is_none() && fits(camera, photo.original_size) {
         return Ok(Some(Pixels::Upright));
@@ -152,7 +153,7 @@ fn fits(camera: &Camera, (w, h): (u32, u32)) -> bool {
     (a / b - 1.0).abs() <= SAME_ASPECT
 }
 
-/// The camera of a photo in the frame of its upright picture, at working resolution.
+/// Rotates a given camera into the frame of the upright photo and scales it to working resolution.
 fn at_working_size(photo: &Photo, own: &GivenCamera, pixels: Pixels) -> GivenCamera {
     let quarters = if pixels == Pixels::Stored { photo.turn.quarters } else { 0 };
     let GivenCamera { camera, lens } = own.turned(quarters);
@@ -169,42 +170,44 @@ fn at_working_size(photo: &Photo, own: &GivenCamera, pixels: Pixels) -> GivenCam
     GivenCamera { camera, lens }
 }
 
-/// Photos that are matched to tell the pixels; every two of them.
+/// Most photos matched, in all pairs, to decide between the pixel frames.
 const MATCHED: usize = 6;
-/// Long side at which they are matched, and corners of each.
+/// Long side of the images matched, pixels.
 const SIDE: usize = 480;
+/// Most corners per image.
 const CORNERS: usize = 500;
-/// Lowe's ratio.
+/// Lowe's ratio test.
 const RATIO: f32 = 0.85;
-/// Distance from the epipolar line, share of the long side (2 pixels of 480).
+/// Largest distance from the epipolar line, share of the long side (2 pixels of 480).
 const NEAR: f64 = 2.0 / 480.0;
-/// Fewest agreeing matches that decide …
+/// Fewest inliers for a decision.
 const ENOUGH: usize = 30;
-/// … and how many times as many as under the other assumption.
+/// Least ratio of the inliers of the two pixel frames for a decision.
 const CLEARLY: f64 = 1.5;
 
-/// Under which assumption more matches obey the cameras: near their epipolar lines, and in front of
-/// both cameras.
-fn by_matches(photos: &[Photo], own: &[&GivenCamera], told: &[Option<Pixels>]) -> Option<Pixels> {
+/// Pixel frame in which clearly more matches are inliers; `None` without a clear one. Inliers are
+/// near their epipolar lines and in front of both cameras.
+fn by_matches(photos: &[Photo], own: &[&GivenCamera], known: &[Option<Pixels>]) -> Option<Pixels> {
     let mut views: Vec<usize> = (0..photos.len()).collect();
-    views.sort_by_key(|v| told[*v].is_some());
+    views.sort_by_key(|v| known[*v].is_some());
     views.truncate(MATCHED);
     let corners: Vec<Keypoints> = views.par_iter().map(|v| detect(&photos[*v])).collect();
     let pairs: Vec<(usize, usize)> =
         (0..views.len()).flat_map(|i| (i + 1..views.len()).map(move |j| (i, j))).collect();
-    let agreeing = |(i, j): &(usize, usize)| -> [usize; 2] {
+    let inliers = |(i, j): &(usize, usize)| -> [usize; 2] {
         let (a, b) = (views[*i], views[*j]);
-        if told[a].is_some() && told[b].is_some() {
+        if known[a].is_some() && known[b].is_some() {
             return [0, 0];
         }
         let matches = mutual_matches(&corners[*i], &corners[*j], RATIO);
         [Pixels::Stored, Pixels::Upright].map(|pixels| {
-            let of = |v: usize| told[v].unwrap_or(pixels);
-            let (one, other) = (seen_by(&photos[a], own[a], of(a)), seen_by(&photos[b], own[b], of(b)));
-            obeying(&matches, (&corners[*i], &one), (&corners[*j], &other))
+            let frame = |v: usize| known[v].unwrap_or(pixels);
+            let first = framed_camera(&photos[a], own[a], frame(a));
+            let second = framed_camera(&photos[b], own[b], frame(b));
+            count_inliers(&matches, (&corners[*i], &first), (&corners[*j], &second))
         })
     };
-    let counts: Vec<[usize; 2]> = pairs.par_iter().map(agreeing).collect();
+    let counts: Vec<[usize; 2]> = pairs.par_iter().map(inliers).collect();
     let [stored, upright] = [0, 1].map(|k| counts.iter().map(|c| c[k]).sum::<usize>());
     let wins = |a: usize, b: usize| a >= ENOUGH && a as f64 > CLEARLY * b as f64;
     match (wins(stored, upright), wins(upright, stored)) {
@@ -214,6 +217,7 @@ fn by_matches(photos: &[Photo], own: &[&GivenCamera], told: &[Option<Pixels>]) -
     }
 }
 
+/// Corners of a photo in working pixels, detected on an image of long side [`SIDE`].
 fn detect(photo: &Photo) -> Keypoints {
     let image = &photo.image;
     let share = (SIDE as f64 / image.width.max(image.height) as f64).min(1.0);
@@ -225,20 +229,20 @@ fn detect(photo: &Photo) -> Keypoints {
     found
 }
 
-/// A camera and whether the picture that it sees is the mirrored one of the photo.
-struct Seen {
+/// A camera; `mirrored` where its pixels are those of the mirrored photo.
+struct FramedCamera {
     given: GivenCamera,
     mirrored: bool,
 }
 
-fn seen_by(photo: &Photo, own: &GivenCamera, pixels: Pixels) -> Seen {
-    Seen {
+fn framed_camera(photo: &Photo, own: &GivenCamera, pixels: Pixels) -> FramedCamera {
+    FramedCamera {
         given: at_working_size(photo, own, pixels),
         mirrored: pixels == Pixels::Stored && photo.turn.mirrored,
     }
 }
 
-impl Seen {
+impl FramedCamera {
     fn ray(&self, p: DVec2) -> DVec3 {
         let GivenCamera { camera, lens } = &self.given;
         let x = if self.mirrored { f64::from(camera.width) - p.x } else { p.x };
@@ -246,17 +250,22 @@ impl Seen {
     }
 }
 
-fn obeying(matches: &[Match], (a, one): (&Keypoints, &Seen), (b, other): (&Keypoints, &Seen)) -> usize {
-    let (first, second) = (&one.given.camera, &other.given.camera);
+/// Number of matches near their epipolar lines and in front of both cameras.
+fn count_inliers(
+    matches: &[Match],
+    (a, from): (&Keypoints, &FramedCamera),
+    (b, to): (&Keypoints, &FramedCamera),
+) -> usize {
+    let (first, second) = (&from.given.camera, &to.given.camera);
     let pose = second.pose.compose(&first.pose.inverse());
     let between = essential(&pose);
     let near = NEAR * f64::from(first.width.max(first.height)) / first.fx;
-    let obeys = |m: &&Match| {
-        let (x, y) = (one.ray(a.points[m.first]), other.ray(b.points[m.second]));
-        let seen = triangulate_two(&pose, x, y).is_some_and(|p| p.z > 0.0 && pose.transform(p).z > 0.0);
-        seen && sampson(&between, x.truncate(), y.truncate()) < near * near
+    let is_inlier = |m: &&Match| {
+        let (x, y) = (from.ray(a.points[m.first]), to.ray(b.points[m.second]));
+        let in_front = triangulate_two(&pose, x, y).is_some_and(|p| p.z > 0.0 && pose.transform(p).z > 0.0);
+        in_front && sampson(&between, x.truncate(), y.truncate()) < near * near
     };
-    matches.iter().filter(obeys).count()
+    matches.iter().filter(is_inlier).count()
 }
 
 #[cfg(test)]
@@ -279,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn given_cameras_are_scaled_to_their_photos_and_never_stretched() {
+    fn assign_scales_cameras_without_stretching() {
         let of = |w, h| assign(&mut [photo(80, 64, 0)], &[camera(w, h)], &Silent);
         let half = &of(160, 128).unwrap()[0];
         assert_eq!((half.width, half.height, half.fx, half.cx, half.cy), (80, 64, 50.0, 30.0, 25.0));
@@ -288,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_of_cut_photos_are_of_whole_files() {
+    fn assign_cut_photo_uses_file_size() {
         let cut = |mirrored| {
             let mut photo = Photo { turn: Turn { quarters: 0, mirrored }, ..photo(160, 128, 0) };
             photo.cut(PlainBorder { left: 20, top: 8, right: 0, bottom: 0 });
@@ -296,14 +305,14 @@ mod tests {
             (camera.width, camera.height, camera.fx, camera.cx, camera.cy)
         };
         assert_eq!(cut(false), (140, 120, 200.0, 100.0, 92.0));
-        // The bar on the left is on the right of the stored pixels, which the camera is of.
+        // The left bar is on the right in the stored pixels of the camera.
         assert_eq!(cut(true), (140, 120, 200.0, 120.0, 92.0));
     }
 
     #[test]
-    fn cameras_of_stored_pixels_are_told_by_size() {
-        // Upright 64 × 80, stored 80 × 64: the camera of the stored pixels and a half-size copy of
-        // it are turned.
+    fn assign_rotates_cameras_of_stored_size() {
+        // Upright 64 × 80, stored 80 × 64: cameras of the stored aspect ratio are rotated, at both
+        // sizes.
         for (w, h, fx) in [(80, 64, 110.0), (160, 128, 55.0)] {
             let turned = &assign(&mut [photo(64, 80, 1)], &[camera(w, h)], &Silent).unwrap()[0];
             assert_eq!((turned.width, turned.height, turned.fx), (64, 80, fx));
@@ -315,17 +324,15 @@ mod tests {
     }
 
     #[test]
-    fn what_size_cannot_tell_matches_do() {
+    fn pixels_equal_aspect_decided_by_matches() {
         let truth = testing::train(&testing::folder());
         let size = (truth.photos[0].image.width as f64, truth.photos[0].image.height as f64);
         for mirrored in [false, true] {
-            // The files hold the photos upside down or mirrored, with the EXIF tag that makes them
-            // right again.
+            // The files store the photos upside down or mirrored, with the EXIF tag that undoes it.
             let turn = if mirrored { Turn { quarters: 0, mirrored } } else { Turn { quarters: 2, mirrored } };
             let photos: Vec<Photo> = truth.photos.iter().map(|p| Photo { turn, ..p.clone() }).collect();
             let upright: Vec<GivenCamera> = truth.cameras.iter().cloned().map(GivenCamera::from).collect();
-            // A camera of the stored pixels: a half turn of the upright one, or the world in a
-            // mirror.
+            // Cameras of the stored pixels: rotated by 180°, or of the mirrored world.
             let stored: Vec<GivenCamera> = match mirrored {
                 false => upright.iter().map(|c| c.turned(2)).collect(),
                 true => truth.cameras.iter().map(|c| in_a_mirror(c, size.0).into()).collect(),
@@ -349,7 +356,7 @@ mod tests {
         }
     }
 
-    /// The camera that sees the mirrored picture of what `camera` sees, in the mirrored world.
+    /// Camera of the mirrored photo in the mirrored world.
     fn in_a_mirror(camera: &Camera, width: f64) -> Camera {
         let mirror = glam::DMat3::from_diagonal(DVec3::new(-1.0, 1.0, 1.0));
         let pose = Pose {
@@ -360,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn blank_photos_leave_the_orientation_open() {
+    fn assign_blank_photos_warns_of_orientation() {
         let photos = [photo(80, 64, 2), Photo { path: "b.png".into(), stem: "b".into(), ..photo(80, 64, 2) }];
         let mut other = camera(80, 64);
         other.camera.name = "b.jpg".into();
@@ -371,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn a_given_lens_is_taken_out_of_the_photo() {
+    fn assign_removes_given_lens_distortion() {
         let truth = testing::train(&testing::folder());
         let camera = &truth.cameras[0];
         for lens in [

@@ -1,4 +1,4 @@
-//! Photos to cameras, and from cameras to depth (docs/internals/method.md#geometry).
+//! Camera estimation and dense stereo as single calls (docs/internals/method.md#geometry).
 use super::choose::LeftOut;
 use super::confidence::{DOUBTFUL, DOUBTFUL_ROTATION, UNSURE_FOCAL};
 use super::leave_out::{self, Placed};
@@ -12,21 +12,21 @@ use crate::progress::Progress;
 use crate::scene::{DepthPrior, GivenCamera};
 use glam::DVec2;
 
-/// Photos whose cameras are known, as every later stage sees them.
+/// Registered photos and their cameras, the input of all later stages.
 pub struct SolvedCameras {
-    /// The photos, ready for dense stages.
+    /// Undistorted and photometrically equalised photos.
     pub photos: Vec<Photo>,
     /// Their cameras and sparse points.
     pub model: SparseModel,
-    /// Photos whose place could not be found surely.
+    /// Photos that could not be registered with confidence.
     pub left_out: Vec<LeftOut>,
-    /// Where the cameras come from, for run.json.
+    /// Source of the cameras, for run.json.
     pub method: String,
 }
 
-/// Cameras of the photos, from the photos themselves (`cameras` = None; `seed` draws the samples of
-/// RANSAC) or as given. `detect` finds keypoints. From the photos themselves only those get one
-/// whose place can be found surely.
+/// Estimates the cameras of photos (`cameras` = `None`; `seed` draws the samples of RANSAC) or
+/// assigns given ones; then undistorts and equalises the photos. `detect` finds keypoints. Without
+/// given cameras, photos that cannot be registered with confidence are left out.
 pub fn place(
     mut photos: Vec<Photo>,
     cameras: Option<&[GivenCamera]>,
@@ -56,8 +56,7 @@ pub fn place(
     warn_of_misfits(&photos, &model, progress);
     progress.check()?;
     let mut photos = photos;
-    // Only the cameras were measured on the fine images, and only they decide what of the overlays
-    // is scene.
+    // Fine images and overlays only serve camera estimation.
     photos.iter_mut().for_each(|p| (p.fine, p.overlay) = (None, None));
     for ((photo, fitted), camera) in photos.iter_mut().zip(&model.fitted).zip(&model.cameras) {
         photo.straighten(fitted.lens, camera);
@@ -67,7 +66,7 @@ pub fn place(
     Ok(SolvedCameras { photos, model, left_out, method: method.into() })
 }
 
-/// Says what the photos leave open of the focal length and of the angles between the cameras.
+/// Warns of unconfirmed cameras, an uncertain focal length and uncertain rotations.
 fn warn_of_doubt(photos: &[Photo], model: &SparseModel, progress: &dyn Progress) {
     let named = |test: &dyn Fn(&super::Fitted) -> bool| {
         let all = photos.iter().zip(&model.fitted).filter(|(_, f)| test(f));
@@ -105,8 +104,8 @@ fn warn_of_doubt(photos: &[Photo], model: &SparseModel, progress: &dyn Progress)
     }
 }
 
-/// Depth maps and points of placed photos by stereo; `priors`, one or none per photo, or none at
-/// all, suggest depth where photos cannot be matched.
+/// Depth maps and points of registered photos by multi-view stereo. `priors` (one optional entry
+/// per photo, or empty) guide depth where matching fails.
 pub fn dense(
     sweep: &dyn PlaneSweep,
     photos: &[Photo],
@@ -125,18 +124,19 @@ pub fn dense(
     Ok(Geometry { cameras, depths, points, focal_log_sigma, fitted, method })
 }
 
-/// A photo whose matches miss by so many times what those of the other photos miss …
+/// Least residual of a photo that does not fit the model, as a multiple of the median of the
+/// others.
 const STRANGE: f64 = 4.0;
-/// … and by at least this share of the long side (half a pixel at 640) does not fit the model.
+/// Least residual of such a photo, share of the long side (half a pixel at 640).
 const STRANGE_SHARE: f64 = 0.5 / 640.0;
 
-/// Distance of the principal point from the middle, share of the long side, that no lens has:
-/// stabilised sensors move by a hundredth.
+/// Least offset of the principal point that is reported, share of the long side: stabilised sensors
+/// move by a hundredth.
 const OFF_CENTRE: f64 = 0.03;
 
-/// Distance of a principal point from the middle of the photo, working pixels. Bars that were cut
-/// off may lie over a photo or frame a whole one: the middle is anywhere between that of the
-/// picture and that of the file.
+/// Distance of the principal point from the image centre, working pixels. Bars that were cut off
+/// may lie over a photo or frame a whole one, so the centre is the nearest point between that of
+/// the picture and that of the file.
 fn off_middle(photo: &Photo, principal_point: DVec2) -> f64 {
     let picture = DVec2::new(photo.image.width as f64, photo.image.height as f64) * 0.5;
     let (w, h) = photo.original_size;
@@ -145,7 +145,7 @@ fn off_middle(photo: &Photo, principal_point: DVec2) -> f64 {
     (principal_point - picture - way.clamp(0.0, 1.0) * to_file).length()
 }
 
-/// Names photos whose content, lens or file does not fit the cameras that explain the others.
+/// Warns of photos with few inliers, an off-centre principal point or large residuals.
 fn warn_of_misfits(photos: &[Photo], model: &SparseModel, progress: &dyn Progress) {
     for (v, ((photo, own), camera)) in photos.iter().zip(&model.fitted).zip(&model.cameras).enumerate() {
         let (stem, long) = (&photo.stem, photo.image.width.max(photo.image.height) as f64);
@@ -179,10 +179,10 @@ fn warn_of_misfits(photos: &[Photo], model: &SparseModel, progress: &dyn Progres
     }
 }
 
-/// Keypoints of a photo that the detector returns at most.
+/// Most keypoints per photo.
 pub const MAX_KEYPOINTS: usize = 4096;
 
-/// Learned features of all photos.
+/// Keypoints of all photos by `detect`.
 pub fn learned_features(
     photos: &[Photo],
     detect: &mut Detect,
@@ -208,19 +208,19 @@ mod tests {
     use crate::{Fitted, testing};
 
     #[test]
-    fn middle_of_cut_photo_lies_between_picture_and_file() {
+    fn off_middle_accepts_file_centre() {
         let image = RgbImage { width: 640, height: 480, data: vec![[0.5; 3]; 640 * 480] };
         let mut photo = crate::photo::from_pixels("a.png".as_ref(), &image, None, 640).unwrap();
         assert!((off_middle(&photo, DVec2::new(330.0, 240.0)) - 10.0).abs() < 1e-9);
         photo.cut(PlainBorder { bottom: 80, ..PlainBorder::default() });
-        // The picture has its middle at 200, the file at 240.
+        // The centre of the picture is at 200, that of the file at 240.
         for (y, off) in [(190.0, 10.0), (200.0, 0.0), (225.0, 0.0), (240.0, 0.0), (252.0, 12.0)] {
             assert!((off_middle(&photo, DVec2::new(320.0, y)) - off).abs() < 1e-9, "{y}");
         }
     }
 
     #[test]
-    fn photos_that_do_not_fit_are_named_with_what_does_not() {
+    fn warn_of_misfits_names_each_cause() {
         let truth = testing::train(&testing::folder());
         let good = Fitted { agreement: 0.98, residual: 0.1, ..Fitted::default() };
         let mut model =
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_that_rest_on_one_doubtful_pair_are_named() {
+    fn warn_of_doubt_names_unconfirmed_cameras() {
         let truth = testing::train(&testing::folder());
         let mut model = SparseModel { fitted: vec![Fitted::default(); 4], ..Default::default() };
         let warned = |model: &SparseModel| {
@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn an_open_focal_length_is_said_with_the_angles_that_it_opens() {
+    fn warn_of_doubt_states_focal_sigma() {
         let photos = [grey_photo(), grey_photo()];
         let warned_of = |focal_log_sigma, rotation_sigma, flat| {
             let fitted = vec![Fitted { rotation_sigma, ..Fitted::default() }; 2];
@@ -295,7 +295,7 @@ mod tests {
 
     #[test]
     #[ignore = "takes long: tools/test-long"]
-    fn placed_photos_are_straight_and_in_one_light() {
+    fn place_undistorts_and_equalises_photos() {
         let truth = testing::train(&testing::folder());
         let registry = splatvk_infer::Registry::open(None).unwrap();
         let mut xfeat = splatvk_infer::xfeat::XFeat::load(&registry).unwrap();
@@ -306,8 +306,7 @@ mod tests {
         photos[1].image = dim.applied(&photos[1].image);
         let before = psnr(&photos[1].image, &truth.photos[1].image);
         let placed = place(photos, None, &mut |i| Ok(testing::keypoints(&mut xfeat, i)), 0, &Silent).unwrap();
-        // Against the photo without lens, in the light of the others: only a lens and a gain that
-        // are both taken out agree.
+        // Against the undistorted photo with the gain of the others.
         for (photo, original) in placed.photos.iter().zip(&truth.photos) {
             let agreed = psnr(&photo.image, &original.image);
             println!("{}: {agreed:.1} dB, before {before:.1}", photo.stem);
@@ -315,7 +314,7 @@ mod tests {
             assert!(agreed > 38.0, "{}: {agreed}, before {before}", photo.stem);
             assert!(photo.lens().k1 < -0.1 && photo.fine.is_none());
         }
-        // The camera of the file keeps the lens, at the file's size.
+        // The original camera has the size of the file.
         let original = placed.photos[0].original_camera(&placed.model.cameras[0]);
         assert_eq!((original.width, original.height), (640, 480));
         assert!((original.fx / truth.cameras[0].fx - 1.0).abs() < 0.005);

@@ -1,18 +1,18 @@
-//! Cameras of as many photos as hold together (docs/internals/method.md#photos-left-out). A photo
-//! in a wrong place spoils the others: splats are trained to explain what it shows from there.
+//! Registration that leaves out photos that do not fit (docs/internals/method.md#photos-left-out).
+//! A photo with a wrong pose spoils the scene: splats are trained to explain it from there.
 use super::SparseModel;
 use super::choose::{LeftOut, Reason};
 use super::confidence::DOUBTFUL;
 use super::matching::Keypoints;
-use super::sfm::{self, Unplaced};
+use super::sfm::{self, Unregistered};
 use super::still;
 use crate::photo::Photo;
 use crate::progress::Progress;
 use crate::{Error, Result};
 
-/// Photos that have cameras.
+/// Registered photos and those left out.
 pub struct Placed {
-    /// The photos that have a camera.
+    /// The registered photos.
     pub photos: Vec<Photo>,
     /// Their cameras and points.
     pub model: SparseModel,
@@ -20,8 +20,9 @@ pub struct Placed {
     pub left_out: Vec<LeftOut>,
 }
 
-/// Structure from motion with all photos that it can place surely, as long as those are more than
-/// half of them; what fewer agree on says nothing about the others. `features` are one per photo.
+/// Structure from motion that leaves out photos that it cannot register with confidence, as long as
+/// more than half remain: agreement of fewer is no evidence against the others. `features` are one
+/// per photo, or empty.
 pub fn place(
     mut photos: Vec<Photo>,
     mut features: Vec<Keypoints>,
@@ -38,23 +39,23 @@ pub fn place(
             continue;
         }
         let views: Vec<(usize, Reason)> = match &found {
-            Ok(model) => least_sure(model).into_iter().collect(),
-            Err(Unplaced { views, .. }) => views.clone(),
+            Ok(model) => least_confident(model).into_iter().collect(),
+            Err(Unregistered { views, .. }) => views.clone(),
         };
         let rest = photos.len() - views.len();
         if views.is_empty() || rest < 2 || 2 * rest <= given {
-            let model = found.map_err(|unplaced| with_overlay(unplaced.error, &photos))?;
+            let model = found.map_err(|unregistered| with_overlay(unregistered.error, &photos))?;
             return Ok(Placed { photos, model, left_out });
         }
         for (view, reason) in views.into_iter().rev() {
-            let photo = taken_out(&mut photos, &mut features, view);
+            let photo = remove_photo(&mut photos, &mut features, view);
             progress.warn(&message(&photo.stem, &reason));
             left_out.push(LeftOut { photo: photo.stem, reason });
         }
     }
 }
 
-/// Names what stands still in the frame where it may be why the rest was not enough.
+/// Adds the description of an overlay to an error about the input, as its possible cause.
 fn with_overlay(error: Error, photos: &[Photo]) -> Error {
     match (still::description(photos), error) {
         (Some(overlay), Error::Input(text)) => Error::input(format!(
@@ -64,22 +65,22 @@ fn with_overlay(error: Error, photos: &[Photo]) -> Error {
     }
 }
 
-/// Takes a photo out of the list, with its features where there are any.
-fn taken_out(photos: &mut Vec<Photo>, features: &mut Vec<Keypoints>, view: usize) -> Photo {
+/// Removes a photo and its features, if there are any.
+fn remove_photo(photos: &mut Vec<Photo>, features: &mut Vec<Keypoints>, view: usize) -> Photo {
     if view < features.len() {
         features.remove(view);
     }
     photos.remove(view)
 }
 
-/// The photo whose place is most in doubt, if that of any is.
-fn least_sure(model: &SparseModel) -> Option<(usize, Reason)> {
+/// The photo with the lowest agreement, if that is below [`DOUBTFUL`].
+fn least_confident(model: &SparseModel) -> Option<(usize, Reason)> {
     let shares = model.fitted.iter().map(|f| f.agreement).enumerate();
     let (view, share) = shares.filter(|s| s.1 < DOUBTFUL).min_by(|a, b| a.1.total_cmp(&b.1))?;
     Some((view, Reason::Doubtful((100.0 * share).round() as u8)))
 }
 
-/// What is said of a photo without a camera.
+/// Warning for a photo that is left out.
 pub(super) fn message(stem: &str, reason: &Reason) -> String {
     const JOIN: &str = "a photo from between it and the others would join it to them";
     match reason {
@@ -107,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn a_photo_of_something_else_is_left_out_by_name_and_the_others_stay_right() {
+    fn place_leaves_out_unrelated_photo() {
         let truth = testing::train(&testing::folder());
         let mut photos = truth.photos.clone();
         photos.insert(1, grey(&photos[0]));
@@ -122,12 +123,12 @@ mod tests {
     }
 
     #[test]
-    fn an_overlay_that_leaves_too_little_is_named() {
+    fn place_error_names_large_overlay() {
         let truth = testing::train(&testing::folder());
         let small = |p: &Photo| Photo { fine: None, ..crate::photo::load_at(&p.path, 320).unwrap() };
         let mut photos: Vec<Photo> = truth.photos[..2].iter().map(small).collect();
         for photo in &mut photos {
-            // All but a strip of it.
+            // The overlay covers all but a strip.
             let (width, height) = (photo.image.width, photo.image.height);
             let data = (0..width * height).map(|i| i / width > 20).collect();
             photo.set_overlay(Some(crate::scene::Image { width, height, data }));
@@ -141,10 +142,10 @@ mod tests {
     }
 
     #[test]
-    fn half_of_the_photos_are_not_left_out() {
+    fn place_keeps_more_than_half() {
         let truth = testing::train(&testing::folder());
         let small = |p: &Photo| Photo { fine: None, ..crate::photo::load_at(&p.path, 320).unwrap() };
-        // Two that go together, and two that show nothing of it.
+        // Two photos that overlap, and two unrelated ones.
         let mut photos: Vec<Photo> = truth.photos[..2].iter().map(small).collect();
         let sky = grey(&photos[0]);
         let mut dusk = Photo { stem: "dusk".into(), ..sky.clone() };
@@ -155,26 +156,26 @@ mod tests {
     }
 
     #[test]
-    fn the_photos_that_stay_keep_their_own_features() {
+    fn remove_photo_removes_its_features() {
         let photo = |stem: &str| {
             let image = RgbImage { width: 64, height: 64, data: vec![[0.5; 3]; 64 * 64] };
             crate::photo::from_pixels(stem.as_ref(), &image, None, 64).unwrap()
         };
         let mut photos = ["a", "b", "c"].map(photo).to_vec();
         let mut features = [8, 16, 24].map(|dim| Keypoints { dim, ..Keypoints::default() }).to_vec();
-        assert_eq!(taken_out(&mut photos, &mut features, 1).stem, "b");
+        assert_eq!(remove_photo(&mut photos, &mut features, 1).stem, "b");
         let left: Vec<_> = photos.iter().zip(&features).map(|(p, f)| (p.stem.as_str(), f.dim)).collect();
         assert_eq!(left, [("a", 8), ("c", 24)]);
     }
 
     #[test]
-    fn the_photo_that_agrees_least_is_the_one_in_doubt() {
+    fn least_confident_has_lowest_agreement() {
         let fitted = |agreement| crate::Fitted { agreement, ..Default::default() };
         let model = |shares: &[f64]| SparseModel {
             fitted: shares.iter().map(|s| fitted(*s)).collect(),
             ..SparseModel::default()
         };
-        assert_eq!(least_sure(&model(&[0.93, 0.98, 0.86])), None);
-        assert_eq!(least_sure(&model(&[0.8, 0.98, 0.3])), Some((2, Reason::Doubtful(30))));
+        assert_eq!(least_confident(&model(&[0.93, 0.98, 0.86])), None);
+        assert_eq!(least_confident(&model(&[0.8, 0.98, 0.3])), Some((2, Reason::Doubtful(30))));
     }
 }

@@ -1,5 +1,4 @@
-//! Keypoint features, their matches between two photos, and the parts of photos that cannot hold
-//! features.
+//! Keypoints, descriptor matching, and the image area where keypoints may lie.
 use crate::photo::PlainBorder;
 use crate::scene::{Coverage, Image, RgbImage};
 use glam::{DVec2, Vec4};
@@ -16,10 +15,10 @@ pub struct Keypoints {
     pub descriptors: Vec<f32>,
 }
 
-/// Finds the keypoints of an image; a network does. Images are at working size.
+/// Keypoint detector for images at working size, such as a network.
 pub type Detect<'a> = dyn FnMut(&RgbImage) -> crate::Result<Keypoints> + 'a;
 
-/// A putative match, better ones have a higher quality.
+/// A putative match; a better one has a higher quality.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Match {
     pub(crate) first: usize,
@@ -27,8 +26,8 @@ pub(crate) struct Match {
     pub(crate) quality: f64,
 }
 
-/// The keypoint of the other photo that is most similar to one, and the second-best similarity
-/// elsewhere.
+/// Nearest neighbour of a descriptor in the other photo, and the best similarity elsewhere in that
+/// photo.
 #[derive(Clone, Copy)]
 struct Nearest {
     index: usize,
@@ -39,9 +38,9 @@ struct Nearest {
 impl Nearest {
     const NONE: Nearest = Nearest { index: 0, best: f32::NEG_INFINITY, second: f32::NEG_INFINITY };
 
-    /// Candidate `k` of `points`, after all before it.
+    /// Updates the neighbour with candidate `k` of `points`; candidates come in order.
     fn consider(&mut self, k: usize, similarity: f32, points: &[DVec2]) {
-        // The same corner may be listed twice (two orientations): it must not spoil its own ratio.
+        // A corner that is listed twice (two orientations) must not spoil its own ratio.
         let elsewhere = |index: usize| (points[k] - points[index]).length() > 2.0;
         if similarity > self.best {
             if self.best > f32::NEG_INFINITY && elsewhere(self.index) {
@@ -57,8 +56,8 @@ impl Nearest {
 /// `a·b` of descriptors whose length is a multiple of 8, in eight sums.
 fn dot(a: &[f32], b: &[f32]) -> f32 {
     let (a, b) = (a.as_chunks::<8>().0, b.as_chunks::<8>().0);
-    // Vectors of glam and plain loops are fast in debug builds too, where iterators made this half
-    // of the time of placing cameras.
+    // glam vectors and plain loops are fast in debug builds, too, where iterators took half of the
+    // time of camera estimation.
     let mut sums = [Vec4::ZERO; 2];
     for i in 0..a.len() {
         let ([a0, a1, a2, a3, a4, a5, a6, a7], [b0, b1, b2, b3, b4, b5, b6, b7]) = (a[i], b[i]);
@@ -68,12 +67,12 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
     sums.map(|s| s.to_array()).as_flattened().iter().sum()
 }
 
-/// For each keypoint of `a` the nearest of `b`, and the other way round. Similarities are computed
-/// once, for some rows of `a` at a time.
+/// Nearest neighbours of `a` in `b`, and of `b` in `a`. Similarities are computed once, for some
+/// rows of `a` at a time.
 fn nearest(a: &Keypoints, b: &Keypoints) -> (Vec<Nearest>, Vec<Nearest>) {
     // With 8,000 keypoints in `b` the similarities of this many take 8 MB.
     const ROWS: usize = 256;
-    // Enough for every core, and few enough of them stay in its first cache.
+    // Enough parts for every core, and each fits its L1 cache.
     const COLUMNS: usize = 512;
     let (dim, columns) = (a.dim, b.points.len());
     let (mut forward, mut backward) = (vec![Nearest::NONE; a.points.len()], vec![Nearest::NONE; columns]);
@@ -112,9 +111,8 @@ pub(crate) fn mutual_matches(a: &Keypoints, b: &Keypoints, ratio: f32) -> Vec<Ma
         .enumerate()
         .filter(|(i, m)| backward[m.index].index == *i)
         .filter_map(|(i, m)| {
-            // |a − b|² = 2 − 2 a·b for unit vectors.
-            let distance = |s: f32| (2.0 - 2.0 * s.min(1.0)).max(0.0).sqrt();
-            let (d1, d2) = (distance(m.best), distance(m.second.max(backward[m.index].second).max(-1.0)));
+            let second = m.second.max(backward[m.index].second).max(-1.0);
+            let (d1, d2) = (descriptor_distance(m.best), descriptor_distance(second));
             (d1 < ratio * d2).then(|| Match {
                 first: i,
                 second: m.index,
@@ -126,10 +124,14 @@ pub(crate) fn mutual_matches(a: &Keypoints, b: &Keypoints, ratio: f32) -> Vec<Ma
     out
 }
 
-/// True where features may lie: away from the image edge, from pixels that are not used, from a
-/// border that was found on loading and from uniform saturated margins (undistorted or scanned
-/// photos have white or black borders; their outline does not move with the scene and would pass
-/// for a match).
+/// Distance of unit vectors from their dot product: |a − b|² = 2 − 2 a·b.
+fn descriptor_distance(similarity: f32) -> f32 {
+    (2.0 - 2.0 * similarity.min(1.0)).max(0.0).sqrt()
+}
+
+/// Mask of the pixels where keypoints may lie: `margin` pixels from the image edge, and away from
+/// unused pixels, from `border` and from uniform saturated margins (undistorted or scanned photos
+/// have white or black ones; their outline does not move with the scene and would match).
 pub(crate) fn valid_area(
     image: &RgbImage,
     border: PlainBorder,
@@ -192,31 +194,33 @@ pub(crate) fn valid_area(
 /// Pixels within `radius` (square) of a set pixel.
 fn dilated(p: &Image<bool>, radius: usize) -> Image<bool> {
     let (w, h) = (p.width, p.height);
-    let spread = |n: usize, stride: usize, start: usize, source: &[bool], out: &mut [bool]| {
-        let mut last: Option<usize> = None;
-        for k in 0..n {
-            if source[start + k * stride] {
-                last = Some(k);
-            }
-            out[start + k * stride] |= last.is_some_and(|l| k - l <= radius);
-        }
-        let mut last: Option<usize> = None;
-        for k in (0..n).rev() {
-            if source[start + k * stride] {
-                last = Some(k);
-            }
-            out[start + k * stride] |= last.is_some_and(|l| l - k <= radius);
-        }
-    };
     let mut across = vec![false; w * h];
     for y in 0..h {
-        spread(w, 1, y * w, &p.data, &mut across);
+        dilate_line(radius, y * w, 1, w, &p.data, &mut across);
     }
     let mut out = vec![false; w * h];
     for x in 0..w {
-        spread(h, w, x, &across, &mut out);
+        dilate_line(radius, x, w, h, &across, &mut out);
     }
     Image { width: w, height: h, data: out }
+}
+
+/// Dilates one row or column of `n` pixels into `out`.
+fn dilate_line(radius: usize, start: usize, stride: usize, n: usize, source: &[bool], out: &mut [bool]) {
+    let mut last: Option<usize> = None;
+    for k in 0..n {
+        if source[start + k * stride] {
+            last = Some(k);
+        }
+        out[start + k * stride] |= last.is_some_and(|l| k - l <= radius);
+    }
+    let mut last: Option<usize> = None;
+    for k in (0..n).rev() {
+        if source[start + k * stride] {
+            last = Some(k);
+        }
+        out[start + k * stride] |= last.is_some_and(|l| l - k <= radius);
+    }
 }
 
 #[cfg(test)]
@@ -224,7 +228,8 @@ mod tests {
     use super::*;
     use crate::math::Random;
 
-    /// `n` unit descriptors at random places, each third at the place of the one before.
+    /// `n` keypoints with unit descriptors at random positions, each third at that of the one
+    /// before.
     fn random_keypoints(n: usize, seed: u64) -> Keypoints {
         let (mut random, dim) = (Random::new(seed), 16);
         let mut made = Keypoints { dim, ..Keypoints::default() };
@@ -239,8 +244,8 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_are_those_of_a_plain_search_both_ways() {
-        // More rows than are compared at a time, more columns than one part of them has.
+    fn nearest_equals_plain_search() {
+        // More rows than a block, more columns than a part.
         let (a, b) = (random_keypoints(600, 1), random_keypoints(1100, 2));
         let plain = |from: &Keypoints, to: &Keypoints| -> Vec<(usize, f32)> {
             let rows = from.descriptors.chunks_exact(16);
@@ -268,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn a_corner_that_is_listed_twice_does_not_spoil_its_own_ratio() {
+    fn nearest_ignores_repeated_corner() {
         let mut found = Nearest::NONE;
         let points = [DVec2::ZERO, DVec2::new(50.0, 0.0), DVec2::new(50.5, 0.0)];
         for (k, similarity) in [0.2, 0.9, 0.8].into_iter().enumerate() {
@@ -278,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn a_white_frame_is_masked_and_a_bright_window_is_not() {
+    fn valid_area_masks_only_white_frames() {
         let mut image = RgbImage { width: 100, height: 80, data: vec![[0.4, 0.5, 0.6]; 8000] };
         for y in 30..40 {
             for x in 0..6 {
@@ -299,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn ambiguous_descriptors_are_dropped_and_clear_ones_matched() {
+    fn mutual_matches_drop_ambiguous_descriptors() {
         let unit = |k: usize| {
             let mut v = vec![0f32; 8];
             v[k] = 1.0;
@@ -315,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn features_keep_away_from_unused_pixels() {
+    fn valid_area_excludes_unused_pixels() {
         use crate::scene::Outside;
         let data = (0..60 * 40).map(|i| [0.3 + 0.4 * (i % 7) as f32 / 7.0; 3]).collect();
         let image = RgbImage { width: 60, height: 40, data };

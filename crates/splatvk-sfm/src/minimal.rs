@@ -286,13 +286,13 @@ fn real_roots(c: &[f64; 5]) -> Vec<f64> {
     roots
 }
 
-/// `E = [t]× R`.
+/// Essential matrix `[t]× R`.
 pub(crate) fn essential(pose: &Pose) -> DMat3 {
     super::numeric::skew(pose.translation) * pose.rotation
 }
 
-/// Point seen along two rays: linear least squares on the cross products, second camera =
-/// `pose`·first.
+/// Midpoint of the shortest segment between two rays, in the frame of the first camera; `pose` maps
+/// the first camera to the second. `None` behind either camera.
 pub(crate) fn triangulate_two(pose: &Pose, x: DVec3, y: DVec3) -> Option<DVec3> {
     // λ·R x + t = μ·y in the second frame.
     let r = pose.rotation * x;
@@ -318,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn five_points_recover_the_essential_matrix() {
+    fn five_point_recovers_essential_matrix() {
         let solver = FivePoint::new();
         let mut rng = Random::new(7);
         let mut worst: Vec<f64> = Vec::new();
@@ -347,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn three_points_recover_the_pose() {
+    fn three_point_recovers_pose() {
         let mut rng = Random::new(3);
         let mut good = 0;
         for _ in 0..200 {
@@ -364,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn the_four_decompositions_contain_the_motion() {
+    fn decompose_essential_contains_true_motion() {
         let pose = Pose::exp(DVec3::new(0.6, -0.3, 0.2), DVec3::new(0.2, 0.5, -0.1));
         let t = pose.translation.normalize();
         assert!(decompose_essential(&essential(&pose)).iter().any(|p| {

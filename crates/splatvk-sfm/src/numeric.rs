@@ -7,7 +7,7 @@ pub(crate) fn cauchy_weight(r2: f64, c: f64) -> f64 {
     1.0 / (1.0 + r2 / (c * c))
 }
 
-/// The Cauchy loss itself.
+/// Cauchy loss, from r².
 pub(crate) fn cauchy(r2: f64, c: f64) -> f64 {
     c * c * (r2 / (c * c)).ln_1p()
 }
@@ -53,7 +53,8 @@ pub(crate) fn rotation_log(r: &DMat3) -> DVec3 {
 }
 
 /// Least squares by Levenberg–Marquardt over few parameters with a forward-difference Jacobian.
-/// `residuals(x)` returns weighted residuals of fixed length; the loss is their squared sum.
+/// `residuals(x, out)` fills `out` with weighted residuals of fixed length; the loss is their
+/// squared sum. Returns parameters and loss.
 pub(crate) fn minimise_small<const N: usize>(
     x0: [f64; N],
     step: [f64; N],

@@ -1,5 +1,4 @@
-//! Relative poses of camera pairs against known ones: errors that need no common frame, and the
-//! area under their recall curve.
+//! Errors of relative poses, which need no common frame, and the area under their recall curve.
 use super::numeric::rotation_angle;
 use crate::scene::{Camera, Pose};
 use serde::Serialize;
@@ -12,7 +11,7 @@ pub struct PairError {
     /// Angle between the two relative rotations, degrees.
     pub rotation_degrees: f64,
     /// Angle between the directions from the first camera to the second, seen by the first,
-    /// degrees; none where the true cameras stand on one spot.
+    /// degrees; `None` where the true centres coincide.
     pub direction_degrees: Option<f64>,
 }
 
@@ -23,7 +22,7 @@ impl PairError {
     }
 }
 
-/// Every pair of cameras, in order.
+/// Errors of all pairs of cameras, in order.
 pub fn pair_errors(estimated: &[Camera], truth: &[Camera]) -> Vec<PairError> {
     let n = estimated.len().min(truth.len());
     let centres: Vec<_> = truth.iter().map(|c| c.pose.centre()).collect();
@@ -33,9 +32,9 @@ pub fn pair_errors(estimated: &[Camera], truth: &[Camera]) -> Vec<PairError> {
     pairs
         .map(|(i, j)| {
             let (e, t) = (relative(estimated, i, j), relative(truth, i, j));
-            // Seen by the first camera: the centre of the second.
+            // Centre of the second camera in the frame of the first.
             let (to_e, to_t) = (e.centre(), t.centre());
-            // A millionth of the rig is rounding, not a direction.
+            // A millionth of the rig's size is rounding, not a direction.
             let apart = to_t.length() > 1e-6 * reach;
             let angle = if to_e.length() > 0.0 { to_e.angle_between(to_t).to_degrees() } else { 180.0 };
             PairError {
@@ -66,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn a_similarity_is_no_error_and_angles_are_those_that_were_put_in() {
+    fn pair_errors_equal_applied_angles() {
         let truth: Vec<Camera> = (0..3)
             .map(|k| {
                 let k = f64::from(k);
@@ -100,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_on_one_spot_have_no_direction_and_opposite_ones_are_wrong() {
+    fn coincident_centres_have_no_direction() {
         let at = |x: f64| camera(Pose { translation: DVec3::X * x, ..Pose::IDENTITY });
         let errors = pair_errors(&[at(0.0), at(1.0), at(1.0)], &[at(0.0), at(-1.0), at(-1.0)]);
         assert_eq!(errors[2].direction_degrees, None);

@@ -5,7 +5,7 @@ use crate::math::Random;
 use crate::scene::Pose;
 use glam::{DVec2, DVec3};
 
-/// A pose and which correspondences agree with it.
+/// A camera pose and the indices of its inliers.
 #[derive(Clone, Debug)]
 pub(crate) struct Resection {
     pub(crate) pose: Pose,
@@ -22,9 +22,9 @@ fn error2(pose: &Pose, focal: f64, world: DVec3, pixel: DVec2) -> f64 {
     (DVec2::new(t.x, t.y) * (focal / t.z) - pixel).length_squared()
 }
 
-/// World points and the pixels (relative to the principal point) that show them → world → camera
-/// pose. `threshold` in pixels; `seed` draws the samples. `None` with fewer than four points or
-/// without a consistent pose.
+/// World → camera pose from world points and their pixels relative to the principal point (RANSAC
+/// over three points, then a Cauchy fit). `threshold` in pixels; `seed` draws the samples. `None`
+/// with fewer than four points or inliers.
 pub(crate) fn resect(
     world: &[DVec3],
     pixels: &[DVec2],
@@ -60,7 +60,7 @@ pub(crate) fn resect(
 
 /// Robust least squares on the reprojection error (Cauchy at half the threshold).
 fn polish(pose: &Pose, world: &[DVec3], pixels: &[DVec2], focal: f64, threshold: f64, steps: usize) -> Pose {
-    // Points far outside do not pull; leaving them out keeps the residual vector short.
+    // Far outliers have no influence; leaving them out keeps the residual vector short.
     let near: Vec<usize> = (0..world.len())
         .filter(|&k| error2(pose, focal, world[k], pixels[k]) < 16.0 * threshold * threshold)
         .collect();
@@ -69,11 +69,11 @@ fn polish(pose: &Pose, world: &[DVec3], pixels: &[DVec2], focal: f64, threshold:
     }
     let c = 0.5 * threshold;
     let size = pose.translation.length().max(1e-3);
-    let at = |x: &[f64; 6]| {
+    let updated = |x: &[f64; 6]| {
         Pose::exp(DVec3::new(x[0], x[1], x[2]) * size, DVec3::new(x[3], x[4], x[5])).compose(pose)
     };
     let (x, _) = minimise_small([0.0; 6], [1e-7; 6], steps, |x, out| {
-        let p = at(x);
+        let p = updated(x);
         out.clear();
         for &k in &near {
             let t = p.transform(world[k]);
@@ -87,7 +87,7 @@ fn polish(pose: &Pose, world: &[DVec3], pixels: &[DVec2], focal: f64, threshold:
             out.push(r.y * w);
         }
     });
-    at(&x).orthonormalised()
+    updated(&x).orthonormalised()
 }
 
 #[cfg(test)]
@@ -96,7 +96,7 @@ mod tests {
     use crate::numeric::rotation_angle;
 
     #[test]
-    fn half_outliers_are_survived() {
+    fn resect_half_outliers_recovers_pose() {
         let mut rng = Random::new(11);
         let truth = Pose::exp(DVec3::new(0.4, -0.2, 0.5), DVec3::new(0.2, -0.5, 0.1));
         let (mut world, mut pixels) = (Vec::new(), Vec::new());

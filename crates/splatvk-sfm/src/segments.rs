@@ -1,10 +1,10 @@
-//! Straight edges of a picture: neighbouring pixels whose gradients point the same way, as in LSD
-//! (Grompone von Gioi et al. 2010), with a bound on their width instead of its statistical test.
+//! Straight edges of an image: connected pixels of similar gradient direction, as in LSD (Grompone
+//! von Gioi et al. 2010), with a bound on their width instead of its statistical test.
 use crate::scene::{Image, RgbImage};
 use glam::{DVec2, IVec2};
 
-/// Longest side of the pictures in which edges are looked for, pixels: more would only show shorter
-/// ones.
+/// Long side of the image in which edges are detected, pixels: a larger one only adds shorter
+/// edges.
 const SIZE: usize = 800;
 
 /// Standard deviation of the ends of an edge, pixels.
@@ -23,40 +23,39 @@ impl Segment {
     }
 }
 
-/// Gradients of one edge differ by at most this angle from their mean: 22.5°, as in LSD.
+/// Largest angle between a gradient and the mean of its edge: 22.5°, as in LSD.
 const TOLERANCE: f64 = std::f64::consts::PI / 8.0;
 
 /// Smallest gradient, full white per pixel: at 2/255 noise of quantisation, LSD's `q / sin
 /// TOLERANCE`.
 const MIN_GRADIENT: f32 = 0.0205;
 
-/// Shortest edge, share of the long side: 19 pixels at 640, whose direction noise of half a pixel
-/// turns by 1.5°.
+/// Shortest edge, share of the long side: 19 pixels at 640, where noise of half a pixel turns the
+/// direction by 1.5°.
 const MIN_LENGTH: f64 = 0.03;
 
-/// Largest spread of an edge's pixels across it, pixels: a sharp edge has 0.5, one blurred over
-/// four pixels 1.2; an arc that bends by three pixels is beyond it.
+/// Largest standard deviation of an edge's pixels across it, pixels: a sharp edge has 0.5, one
+/// blurred over four pixels 1.2; an arc that bends by three pixels is beyond it.
 const MAX_SPREAD: f64 = 1.5;
 
 /// Least share of the length that pixels of the edge cover: scattered pixels are texture.
 const MIN_COVER: f64 = 0.8;
 
-/// Edges of a photo, in pixels of the reduced picture in which they were found.
+/// Edges of a photo, in pixels of the reduced image in which they were detected.
 pub(super) struct Found {
     pub segments: Vec<Segment>,
     pub width: usize,
     pub height: usize,
 }
 
-/// The edges of a photo.
-pub(super) fn of(image: &RgbImage) -> Found {
+pub(super) fn detect(image: &RgbImage) -> Found {
     let scale = (SIZE as f64 / image.width.max(image.height) as f64).min(1.0);
     let size = |s: usize| ((s as f64 * scale).round() as usize).max(1);
     let small = image.resized_by_area(size(image.width), size(image.height));
     Found { segments: segments(&small.luma()), width: small.width, height: small.height }
 }
 
-/// The edges of a picture in the order of their strongest pixel.
+/// Edges of an image, in the order of their strongest pixel.
 fn segments(luma: &Image<f32>) -> Vec<Segment> {
     let (w, h) = (luma.width, luma.height);
     if w < 8 || h < 8 {
@@ -99,8 +98,7 @@ fn smoothed(luma: &Image<f32>) -> Image<f32> {
     out
 }
 
-/// Direction and size of the gradient per pixel, by central differences; none at the border of the
-/// picture.
+/// Direction and magnitude of the gradient per pixel, by central differences; zero at the border.
 fn gradients(luma: &Image<f32>) -> Vec<(DVec2, f32)> {
     let (w, h) = (luma.width, luma.height);
     let at = |x: usize, y: usize| f64::from(luma.at(x, y));
@@ -114,8 +112,8 @@ fn gradients(luma: &Image<f32>) -> Vec<(DVec2, f32)> {
     out
 }
 
-/// Pixels connected to the seed whose gradients point as the region's mean does; they are no longer
-/// free.
+/// Region of pixels connected to the seed whose gradients agree with its mean direction; they are
+/// removed from `free`.
 fn grow(seed: usize, (w, h): (usize, usize), gradients: &[(DVec2, f32)], free: &mut [bool]) -> Vec<usize> {
     let least = TOLERANCE.cos();
     let mut region = vec![seed];
@@ -141,10 +139,10 @@ fn grow(seed: usize, (w, h): (usize, usize), gradients: &[(DVec2, f32)], free: &
     region
 }
 
-/// The line through a region, weighted by gradients; `None` for what is bent, broad or scattered.
+/// Gradient-weighted line through a region; `None` if the region is bent, broad or scattered.
 fn fit(region: &[usize], width: usize, gradients: &[(DVec2, f32)]) -> Option<Segment> {
-    let at = |k: usize| DVec2::new((k % width) as f64 + 0.5, (k / width) as f64 + 0.5);
-    let weighted = || region.iter().map(|k| (at(*k), f64::from(gradients[*k].1)));
+    let centre = |k: usize| DVec2::new((k % width) as f64 + 0.5, (k / width) as f64 + 0.5);
+    let weighted = || region.iter().map(|k| (centre(*k), f64::from(gradients[*k].1)));
     let total: f64 = weighted().map(|p| p.1).sum();
     let middle = weighted().fold(DVec2::ZERO, |sum, (p, g)| sum + p * g) / total;
     let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
@@ -161,10 +159,11 @@ fn fit(region: &[usize], width: usize, gradients: &[(DVec2, f32)]) -> Option<Seg
     if (across.max(0.0) / total).sqrt() > MAX_SPREAD {
         return None;
     }
-    let reach = |k: &usize| (at(*k) - middle).dot(along);
-    let (low, high) = region.iter().map(reach).fold((0.0, 0.0), |(a, b): (f64, f64), t| (a.min(t), b.max(t)));
+    let offset_along = |k: &usize| (centre(*k) - middle).dot(along);
+    let (low, high) =
+        region.iter().map(offset_along).fold((0.0, 0.0), |(a, b): (f64, f64), t| (a.min(t), b.max(t)));
     let mut covered = vec![false; (high - low) as usize + 1];
-    region.iter().for_each(|k| covered[(reach(k) - low) as usize] = true);
+    region.iter().for_each(|k| covered[(offset_along(k) - low) as usize] = true);
     let share = covered.iter().filter(|c| **c).count() as f64 / covered.len() as f64;
     (share >= MIN_COVER).then(|| Segment { from: middle + low * along, to: middle + high * along })
 }
@@ -174,7 +173,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_tilted_bar_has_two_long_edges_and_a_disc_has_none() {
+    fn segments_of_bar_but_not_disc() {
         let turn = DVec2::from_angle(0.3);
         // Soft edges, as a lens makes them.
         let step = |d: f64| (0.5 - d).clamp(0.0, 1.0) as f32;

@@ -1,21 +1,21 @@
-//! Which photos are blurred: out of focus, or moved while they were taken.
+//! Detection of blurred photos: out of focus, or moved during the exposure.
 use super::sift;
 use crate::photo::Photo;
 use crate::progress::Progress;
-use crate::scene::RgbImage;
+use crate::scene::{Image, RgbImage};
 
-/// Long side at which sharpness is judged: near the working resolution, so that what is blurred
-/// there is blurred here.
+/// Long side at which sharpness is measured, pixels: near the working resolution, so that blur
+/// there shows here.
 pub(super) const SIDE: usize = 1000;
 /// Sharpness below this share of the median is blur. A photo in focus keeps 0.68 under a Gaussian
-/// of 0.7 px at the scale judged, 0.53 under 1 px and 0.36 under 1.5 px; photos in focus of one
-/// place differ by up to 0.7 in what they show.
+/// of 0.7 px at that scale, 0.53 under 1 px and 0.36 under 1.5 px; among photos in focus of one
+/// place, content alone gives shares down to 0.7.
 pub(super) const BLURRED: f64 = 0.6;
 
-/// Names photos far less sharp than the others: splats are trained to be as blurred as they are,
-/// and their matches are less exact.
+/// Warns of photos that are far less sharp than the others: splats trained on them become as
+/// blurred, and their matches are less exact.
 pub(super) fn warn_of_blur(photos: &[Photo], progress: &dyn Progress) {
-    let all: Vec<f64> = photos.iter().map(|p| of(&at_most(&p.image, SIDE))).collect();
+    let all: Vec<f64> = photos.iter().map(|p| measure(&reduced_to(&p.image, SIDE))).collect();
     for (v, photo) in photos.iter().enumerate() {
         let mut others: Vec<f64> = all.iter().enumerate().filter(|(o, _)| *o != v).map(|(_, s)| *s).collect();
         let Some(usual) = crate::math::median(&mut others) else { continue };
@@ -30,8 +30,8 @@ pub(super) fn warn_of_blur(photos: &[Photo], progress: &dyn Progress) {
     }
 }
 
-/// The image, or a smaller one whose long side is `side`.
-fn at_most(image: &RgbImage, side: usize) -> std::borrow::Cow<'_, RgbImage> {
+/// The image, reduced to a long side of `side` if it is larger.
+fn reduced_to(image: &RgbImage, side: usize) -> std::borrow::Cow<'_, RgbImage> {
     let long = image.width.max(image.height);
     if long <= side {
         return std::borrow::Cow::Borrowed(image);
@@ -40,38 +40,39 @@ fn at_most(image: &RgbImage, side: usize) -> std::borrow::Cow<'_, RgbImage> {
     std::borrow::Cow::Owned(image.resized_by_area(to(image.width), to(image.height)))
 }
 
-/// How much fine detail there is for the coarse detail there is: the energy of the gradient that a
-/// slight blur takes away, over the energy that it leaves. A ratio within one photo, so contrast
-/// and exposure cancel.
-pub(super) fn of(image: &RgbImage) -> f64 {
+/// Sharpness: the gradient energy that a slight blur removes, over the energy that it leaves. As a
+/// ratio within one photo it is independent of contrast and exposure.
+pub(super) fn measure(image: &RgbImage) -> f64 {
     let fine = image.luma();
-    // Two blurs three quarters of an octave apart; the first takes the noise of single pixels away.
+    // The two blurs are three quarters of an octave apart; the first suppresses noise of single
+    // pixels.
     let (a, b) = (sift::blurred(&fine, 0.7), sift::blurred(&fine, 1.4));
-    let energy = |p: &crate::scene::Image<f32>| -> f64 {
-        (0..(p.height - 1) * p.width)
-            .filter(|i| i % p.width + 1 < p.width)
-            .map(|i| {
-                let (dx, dy) = (p.data[i + 1] - p.data[i], p.data[i + p.width] - p.data[i]);
-                (dx * dx + dy * dy) as f64
-            })
-            .sum()
-    };
-    let (before, after) = (energy(&a), energy(&b));
+    let (before, after) = (gradient_energy(&a), gradient_energy(&b));
     (before - after).max(0.0) / after.max(1e-12)
+}
+
+/// Sum of the squared forward differences.
+fn gradient_energy(p: &Image<f32>) -> f64 {
+    (0..(p.height - 1) * p.width)
+        .filter(|i| i % p.width + 1 < p.width)
+        .map(|i| {
+            let (dx, dy) = (p.data[i + 1] - p.data[i], p.data[i + p.width] - p.data[i]);
+            (dx * dx + dy * dy) as f64
+        })
+        .sum()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::progress::{Recorded, Silent};
-    use crate::scene::Image;
     use crate::testing;
 
     #[test]
-    fn a_photo_with_more_pixels_is_judged_at_the_size_of_the_others() {
+    fn warn_of_blur_ignores_photo_size() {
         let mut random = crate::math::Random::new(1005);
         let noise: Vec<[f32; 3]> = (0..1000 * 64).map(|_| [random.uniform() as f32; 3]).collect();
-        // Every pixel shown `times` × `times` times: pixel by pixel that has less fine detail.
+        // Every pixel repeated `times` × `times` times: pixel by pixel that has less fine detail.
         let photo = |times: usize| {
             let (width, height) = (1000 * times, 64 * times);
             let from = |k: usize| k / width / times * 1000 + k % width / times;
@@ -85,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn a_photo_out_of_focus_is_named_and_sharp_ones_are_not() {
+    fn warn_of_blur_names_defocused_photo() {
         let mut photos = testing::train(&testing::folder()).photos;
         let warned = |photos: &[Photo]| {
             let recorded = Recorded::new(&Silent);

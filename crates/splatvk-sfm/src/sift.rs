@@ -20,7 +20,7 @@ const DOUBLE_BELOW: usize = 1000;
 pub(crate) fn detect(luma: &Image<f32>, valid: &Image<bool>, limit: usize) -> Keypoints {
     let double = luma.width.max(luma.height) <= DOUBLE_BELOW;
     let (base, step) = if double { (doubled(luma), 0.5) } else { (luma.clone(), 1.0) };
-    // A camera image is taken to be blurred by 0.5 px already.
+    // Camera images are assumed to have a blur of 0.5 px.
     let existing = 0.5 / step as f32;
     let mut current = blurred(&base, (SIGMA * SIGMA - existing * existing).max(0.01).sqrt());
     let mut found: Vec<Keypoint> = Vec::new();
@@ -277,17 +277,12 @@ fn descriptor(image: &Image<f32>, x: f64, y: f64, sigma: f64, angle: f64) -> [f3
 /// input.
 fn doubled(p: &Image<f32>) -> Image<f32> {
     let (w, h) = (p.width * 2, p.height * 2);
-    let at = |i: usize, n: usize| {
-        let u = ((i as f32 + 0.5) * 0.5 - 0.5).clamp(0.0, (n - 1) as f32);
-        let k = (u as usize).min(n.saturating_sub(2));
-        (k, u - k as f32)
-    };
     let mut data = Vec::with_capacity(w * h);
     for y in 0..h {
-        let (r, fy) = at(y, p.height);
+        let (r, fy) = half_position(y, p.height);
         let r1 = (r + 1).min(p.height - 1);
         for x in 0..w {
-            let (c, fx) = at(x, p.width);
+            let (c, fx) = half_position(x, p.width);
             let c1 = (c + 1).min(p.width - 1);
             let top = p.at(c, r) * (1.0 - fx) + p.at(c1, r) * fx;
             let low = p.at(c, r1) * (1.0 - fx) + p.at(c1, r1) * fx;
@@ -297,6 +292,13 @@ fn doubled(p: &Image<f32>) -> Image<f32> {
     Image { width: w, height: h, data }
 }
 
+/// Input sample and fraction at sample `i` of a doubled line, whose input has `n` samples.
+fn half_position(i: usize, n: usize) -> (usize, f32) {
+    let u = ((i as f32 + 0.5) * 0.5 - 0.5).clamp(0.0, (n - 1) as f32);
+    let k = (u as usize).min(n.saturating_sub(2));
+    (k, u - k as f32)
+}
+
 /// Every second sample of every second row.
 fn decimated(p: &Image<f32>) -> Image<f32> {
     let (w, h) = (p.width / 2, p.height / 2);
@@ -304,7 +306,7 @@ fn decimated(p: &Image<f32>) -> Image<f32> {
     Image { width: w, height: h, data }
 }
 
-/// `out += k·v`, both of one length. As in matching, vectors of glam are fast in debug builds too.
+/// `out += k·v`, both of one length. As in matching, glam vectors are fast in debug builds, too.
 fn add_scaled(out: &mut [f32], k: f32, v: &[f32]) {
     let ((out, out_rest), (v, v_rest)) = (out.as_chunks_mut::<4>(), v.as_chunks::<4>());
     for i in 0..out.len() {
@@ -346,7 +348,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_blur_is_the_weighted_mean_of_what_is_around() {
+    fn blurred_equals_gaussian_weighted_mean() {
         let (w, h, sigma) = (13, 7, 1.5);
         let mut random = crate::math::Random::new(3);
         let plane =
@@ -367,7 +369,7 @@ mod tests {
     /// A blob's keypoint must sit on the blob: this pins the half-pixel conventions of doubling and
     /// decimation.
     #[test]
-    fn blobs_are_found_where_they_are() {
+    fn detect_locates_blobs_exactly() {
         for sigma in [1.5f64, 3.0, 6.0, 12.0] {
             let (cx, cy) = (70.3, 61.8);
             let data = (0..160 * 120)
@@ -385,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn corners_of_a_photo_that_was_held_on_its_side_match() {
+    fn detect_matches_rotated_photo() {
         let mut random = crate::math::Random::new(1006);
         let data = (0..128 * 96).map(|_| random.uniform() as f32).collect();
         let mut image = blurred(&Image { width: 128, height: 96, data }, 2.0);
@@ -398,8 +400,8 @@ mod tests {
         let matches = crate::matching::mutual_matches(&a, &b, 0.85);
         let to = |p: DVec2| DVec2::new(96.0 - p.y, p.x);
         let right = matches.iter().filter(|m| to(a.points[m.first]).distance(b.points[m.second]) < 1.0);
-        // A copy of this in double precision: 283 of 283, and none with descriptors that do not
-        // turn.
+        // A double-precision reference finds 283 of 283, and none with descriptors that are not
+        // rotated.
         let (right, all) = (right.count(), matches.len());
         assert!(right > 200 && 10 * right > 9 * all, "{right} of {all}");
     }

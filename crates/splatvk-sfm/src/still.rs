@@ -1,9 +1,9 @@
-//! Overlays stand still in the frame while the scene moves through it: watermarks, captions, logos,
-//! a bonnet. It is no part of the scene, and its corners match perfectly in every photo, as if no
-//! camera had moved (colmap#2539).
+//! Detection of overlays: watermarks, captions, logos or a bonnet, which stand still in the frame
+//! while the scene moves. They are no part of the scene, and their corners match perfectly in all
+//! photos, as if no camera had moved (colmap#2539).
 //!
-//! Gradients of an overlay are the same in all photos, also of a half-transparent one (Dekel et al.
-//! 2017, "On the effectiveness of visible watermarks"); those of the scene are elsewhere in each.
+//! Gradients of an overlay, even of a half-transparent one, are equal in all photos (Dekel et al.
+//! 2017, "On the effectiveness of visible watermarks"); those of the scene move.
 use super::sift::blurred;
 use super::two_view::{fundamental, sampson};
 use crate::photo::Photo;
@@ -12,38 +12,37 @@ use glam::DVec2;
 use rayon::prelude::*;
 use std::collections::HashMap;
 
-/// Long side at which photos are compared, pixels. The lengths below are pixels of it.
+/// Long side at which photos are compared, pixels. The lengths below are in these pixels.
 const SIDE: usize = 640;
-/// Blur before the gradient, standard deviation: noise and compression are finer.
+/// Standard deviation of the blur before the gradient: noise and compression are finer.
 const SMOOTH: f32 = 1.0;
 /// Standard deviation of the window in which gradients are compared: about a letter of a caption.
 const WINDOW: f32 = 4.0;
-/// Root mean square gradient, full white per pixel, below which a window is plain in a photo: noise
-/// has half of it.
+/// Root mean square gradient, full white per pixel, below which a window has no texture: noise has
+/// half of it.
 const TEXTURE: f32 = 0.004;
-/// Correlation of the gradients in every two photos compared that makes an overlay. On unspoilt
-/// tuning sets no region of [`LEAST_AREA`] reaches it together with [`PEAK`], photos 3° apart
+/// Least correlation of the gradients of an overlay in each pair of photos compared. On tuning sets
+/// without overlays no region of [`LEAST_AREA`] reaches it together with [`PEAK`], photos 3° apart
 /// included.
 const ALIKE: f32 = 0.7;
-/// Correlation that joins what is around it: strokes before a busy scene.
+/// Least correlation of pixels that extend an overlay: strokes before a busy scene.
 const JOINED: f32 = 0.5;
-/// How much more the gradients correlate than when one photo is moved by [`ASIDE`] in any
-/// direction: a straight edge that lies along the motion of the camera stays where it is, too, but
-/// looks the same all along.
+/// Least excess of the correlation over that with one photo shifted by [`ASIDE`] in any direction.
+/// A straight edge along the motion of the camera also stands still, but correlates as well when
+/// shifted along itself.
 const PEAK: f32 = 0.2;
-/// Pixels.
+/// Shift for [`PEAK`], pixels.
 const ASIDE: f64 = 4.0;
 /// Smallest area of an overlay, share of the picture: a date of ten small digits has five times
 /// that.
 const LEAST_AREA: f64 = 0.0005;
-/// Of all windows with texture, the share above which it is the photos that are alike, as from a
-/// tripod.
+/// Share of the textured windows above which the photos themselves are equal, as from a tripod.
 const SAME_PHOTOS: f64 = 0.85;
-/// Largest difference of colours that are the same in all photos: of compression.
+/// Largest difference between equal colours of different photos, due to compression.
 const SAME_COLOUR: f32 = 0.05;
 
-/// Leaves out of every photo what stands still in all photos of its size. Photos without background
-/// show nothing but the scene.
+/// Marks the overlay that all photos of one size share. Photos with a transparent background have
+/// none.
 pub fn mark(photos: &mut [Photo]) {
     let empty = |p: &Photo| p.coverage.as_ref().is_some_and(|c| c.outside == Outside::Empty);
     if photos.iter().any(empty) {
@@ -53,30 +52,29 @@ pub fn mark(photos: &mut [Photo]) {
     photos.iter_mut().zip(found).for_each(|(photo, hidden)| photo.set_overlay(hidden));
 }
 
-/// Per image the [`overlay`] of those of its size.
+/// Overlay per image, from all images of its size.
 pub(super) fn overlays<'a>(images: impl Iterator<Item = &'a RgbImage>) -> Vec<Option<Image<bool>>> {
     let images: Vec<&RgbImage> = images.collect();
     let size = |i: &RgbImage| (i.width, i.height);
     let mut of_size: HashMap<(usize, usize), Option<Image<bool>>> = HashMap::new();
-    let mut of = |image: &RgbImage| {
-        let found = of_size.entry(size(image)).or_insert_with(|| {
-            let alike: Vec<&RgbImage> = images.iter().copied().filter(|i| size(i) == size(image)).collect();
-            overlay(&alike)
+    for image in &images {
+        of_size.entry(size(image)).or_insert_with(|| {
+            let group: Vec<&RgbImage> = images.iter().copied().filter(|i| size(i) == size(image)).collect();
+            overlay(&group)
         });
-        found.clone()
-    };
-    images.iter().map(|image| of(image)).collect()
+    }
+    images.iter().map(|image| of_size[&size(image)].clone()).collect()
 }
 
-/// Distance from an epipolar line, share of the long side, within which a place that stands still
-/// agrees with the cameras.
+/// Largest distance of a static pixel from its epipolar line, share of the long side, at which the
+/// cameras explain it.
 const EXPLAINED: f64 = 3.0 / 640.0;
-/// Pixels of a region that are tried.
+/// Most pixels tested per region.
 const TRIED: usize = 200;
 
-/// Takes out of the overlays what the cameras explain: the point that all cameras look at, and what
-/// is far away while the camera does not turn, stand still as well and are scene. Whether there was
-/// any.
+/// Removes regions that the cameras explain from the overlays: a point that all cameras look at,
+/// and distant surfaces while the camera does not rotate, also stand still. Returns whether any was
+/// removed.
 pub(super) fn clear_scene(photos: &mut [Photo], cameras: &[Camera]) -> bool {
     let mut cleared = false;
     for first in 0..photos.len() {
@@ -90,7 +88,7 @@ pub(super) fn clear_scene(photos: &mut [Photo], cameras: &[Camera]) -> bool {
             let tried = pixels.iter().step_by(pixels.len().div_ceil(TRIED));
             let all = tried.clone().count();
             let at = |i: usize| DVec2::new((i % mask.width) as f64 + 0.5, (i / mask.width) as f64 + 0.5);
-            if 2 * tried.filter(|i| explained(cameras, &group, at(**i))).count() > all {
+            if 2 * tried.filter(|i| is_explained(cameras, &group, at(**i))).count() > all {
                 pixels.iter().for_each(|i| kept.data[*i] = false);
                 cleared = true;
             }
@@ -103,8 +101,8 @@ pub(super) fn clear_scene(photos: &mut [Photo], cameras: &[Camera]) -> bool {
     cleared
 }
 
-/// Whether cameras can show one point of the scene at the same pixel.
-fn explained(cameras: &[Camera], group: &[usize], pixel: DVec2) -> bool {
+/// Whether one scene point can project to the same `pixel` of all cameras in `group`.
+fn is_explained(cameras: &[Camera], group: &[usize], pixel: DVec2) -> bool {
     let focal = |c: &Camera| 0.5 * (c.fx + c.fy);
     group.len() > 1
         && neighbours(group.len()).all(|(i, j)| {
@@ -115,25 +113,20 @@ fn explained(cameras: &[Camera], group: &[usize], pixel: DVec2) -> bool {
         })
 }
 
-/// The overlay in words: its share of the frame and its place; `None` without one.
+/// Overlay in words: its share of the frame and its position; `None` without one.
 pub fn description(photos: &[Photo]) -> Option<String> {
     let mask = &photos.iter().find_map(|p| p.overlay.as_ref())?.hidden;
     let (w, h) = (mask.width, mask.height);
     let set: Vec<usize> = (0..w * h).filter(|i| mask.data[*i]).collect();
     let share = set.len() as f64 / (w * h) as f64;
-    // Where nine tenths of it are: single specks elsewhere do not matter.
+    // The central nine tenths of its pixels, without specks elsewhere.
     let spread = |along: &dyn Fn(usize) -> f64| {
         let mut all: Vec<f64> = set.iter().map(|i| along(*i)).collect();
         all.sort_by(f64::total_cmp);
         (all[all.len() / 20], all[(all.len() - 1) * 19 / 20])
     };
-    let side = |(from, to): (f64, f64), low: &'static str, high: &'static str| match () {
-        () if to < 0.5 => Some(low),
-        () if from > 0.5 => Some(high),
-        () => None,
-    };
-    let across = side(spread(&|i| (i % w) as f64 / w as f64), "left", "right");
-    let down = side(spread(&|i| (i / w) as f64 / h as f64), "top", "bottom");
+    let across = half_of_range(spread(&|i| (i % w) as f64 / w as f64), "left", "right");
+    let down = half_of_range(spread(&|i| (i / w) as f64 / h as f64), "top", "bottom");
     let place = match (down, across) {
         (Some(down), Some(across)) => format!("at the {down} {across}"),
         (Some(one), None) | (None, Some(one)) => format!("at the {one}"),
@@ -145,8 +138,16 @@ pub fn description(photos: &[Photo]) -> Option<String> {
     ))
 }
 
-/// Which pixels belong to an overlay that all `images` have, which are of one size; `None` where
-/// there is none. At the size of the images.
+/// Name of the half of [0, 1] that contains a range; `None` across the middle.
+fn half_of_range((from, to): (f64, f64), low: &'static str, high: &'static str) -> Option<&'static str> {
+    match () {
+        () if to < 0.5 => Some(low),
+        () if from > 0.5 => Some(high),
+        () => None,
+    }
+}
+
+/// Mask of the overlay that all `images`, of one size, share; at that size. `None` without one.
 fn overlay(images: &[&RgbImage]) -> Option<Image<bool>> {
     let first = images.first().filter(|_| images.len() > 1)?;
     let (w, h) = (first.width, first.height);
@@ -154,11 +155,11 @@ fn overlay(images: &[&RgbImage]) -> Option<Image<bool>> {
     let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
     let small: Vec<RgbImage> = images.par_iter().map(|i| i.resized_by_area(to(w), to(h))).collect();
     let gradients: Vec<Gradients> = small.iter().map(|i| Gradients::of(&i.luma())).collect();
-    let alike = agreement(&gradients)?;
-    let textured = alike.iter().filter(|c| c.is_some()).count();
-    let least = (LEAST_AREA * alike.len() as f64) as usize;
-    let wide: Vec<bool> = alike.iter().map(|c| c.is_some_and(|c| c > JOINED)).collect();
-    let sure = peaks(&gradients, &alike);
+    let least_correlation = least_correlation(&gradients)?;
+    let textured = least_correlation.iter().filter(|c| c.is_some()).count();
+    let least = (LEAST_AREA * least_correlation.len() as f64) as usize;
+    let wide: Vec<bool> = least_correlation.iter().map(|c| c.is_some_and(|c| c > JOINED)).collect();
+    let sure = peaks(&gradients, &least_correlation);
     let (labels, count) = components(&wide, to(w));
     let mut seeds = vec![0usize; count];
     let marked = labels.iter().zip(&sure).filter(|(_, s)| **s);
@@ -169,7 +170,7 @@ fn overlay(images: &[&RgbImage]) -> Option<Image<bool>> {
     if !mask.contains(&true) || share > SAME_PHOTOS {
         return None;
     }
-    fill(&mut mask, &small, to(w));
+    fill_enclosed(&mut mask, &small, to(w));
     let at = |i: usize| {
         let (x, y) = ((i % w) as f64 * scale, (i / w) as f64 * scale);
         mask[(y as usize).min(to(h) - 1) * to(w) + (x as usize).min(to(w) - 1)]
@@ -177,7 +178,7 @@ fn overlay(images: &[&RgbImage]) -> Option<Image<bool>> {
     Some(Image { width: w, height: h, data: (0..w * h).map(at).collect() })
 }
 
-/// Gradients of a photo and their mean square in the window around each pixel.
+/// Gradients of a photo, and their mean square in the window around each pixel.
 struct Gradients {
     x: Image<f32>,
     y: Image<f32>,
@@ -201,8 +202,8 @@ impl Gradients {
         Gradients { x, y, energy }
     }
 
-    /// Correlation with the gradients of another photo that is moved by whole pixels; `None` where
-    /// one of the two is plain.
+    /// Windowed correlation with the gradients of another photo that is shifted by whole pixels;
+    /// `None` where either has no texture.
     fn correlation(&self, other: &Gradients, (dx, dy): (i64, i64)) -> Vec<Option<f32>> {
         let (w, h) = (self.x.width as i64, self.x.height as i64);
         let moved = |i: usize| {
@@ -223,15 +224,15 @@ impl Gradients {
     }
 }
 
-/// Photos that are compared: each with the next, the last with the first.
+/// Pairs of photos that are compared: each with the next, the last with the first.
 fn neighbours(count: usize) -> impl Iterator<Item = (usize, usize)> {
     let last = (count > 2).then_some((count - 1, 0));
     (1..count).map(|i| (i - 1, i)).chain(last)
 }
 
-/// Least correlation of the gradients at one place, over the photos that are compared; `None` where
-/// one is plain, or nothing is alike anywhere.
-fn agreement(photos: &[Gradients]) -> Option<Vec<Option<f32>>> {
+/// Least correlation per pixel over the pairs compared, `None` where a photo has no texture. `None`
+/// altogether if too few pixels exceed [`ALIKE`].
+fn least_correlation(photos: &[Gradients]) -> Option<Vec<Option<f32>>> {
     let mut least: Option<Vec<Option<f32>>> = None;
     for (i, j) in neighbours(photos.len()) {
         let both = photos[i].correlation(&photos[j], (0, 0));
@@ -251,10 +252,9 @@ fn agreement(photos: &[Gradients]) -> Option<Vec<Option<f32>>> {
     least
 }
 
-/// Where gradients are alike at the same place and nowhere around it, in all photos that are
-/// compared.
-fn peaks(photos: &[Gradients], alike: &[Option<f32>]) -> Vec<bool> {
-    let mut sure: Vec<bool> = alike.iter().map(|c| c.is_some_and(|c| c > ALIKE)).collect();
+/// Pixels whose correlation exceeds [`ALIKE`] and peaks at zero shift in all pairs compared.
+fn peaks(photos: &[Gradients], correlation: &[Option<f32>]) -> Vec<bool> {
+    let mut sure: Vec<bool> = correlation.iter().map(|c| c.is_some_and(|c| c > ALIKE)).collect();
     for (i, j) in neighbours(photos.len()) {
         let here = photos[i].correlation(&photos[j], (0, 0));
         let shifts: Vec<(i64, i64)> = (0..8)
@@ -273,8 +273,7 @@ fn peaks(photos: &[Gradients], alike: &[Option<f32>]) -> Vec<bool> {
     sure
 }
 
-/// Number per pixel of the connected set pixels that it belongs to (0 where none is set), and how
-/// many numbers there are.
+/// Connected component of each set pixel, from 1 (0 where unset), and the number of labels with 0.
 fn components(set: &[bool], width: usize) -> (Vec<usize>, usize) {
     let (mut labels, mut count, mut stack) = (vec![0; set.len()], 1, Vec::new());
     for start in 0..set.len() {
@@ -296,7 +295,7 @@ fn components(set: &[bool], width: usize) -> (Vec<usize>, usize) {
     (labels, count)
 }
 
-/// The pixels left, right, above and below.
+/// Indices of the pixels left, right, above and below.
 fn around(i: usize, width: usize, pixels: usize) -> impl Iterator<Item = usize> {
     let x = i % width;
     let sides = [
@@ -308,20 +307,13 @@ fn around(i: usize, width: usize, pixels: usize) -> impl Iterator<Item = usize> 
     sides.into_iter().flatten()
 }
 
-/// Adds what has one colour in all photos and is enclosed by the overlay: the ground of a sign
-/// between its letters.
-fn fill(mask: &mut [bool], images: &[RgbImage], width: usize) {
-    let same = |i: usize| {
-        (0..3).all(|c| {
-            let values = images.iter().map(|image| image.data[i][c]);
-            let (low, high) =
-                values.fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
-            high - low < SAME_COLOUR
-        })
-    };
-    let plain: Vec<bool> = (0..mask.len()).into_par_iter().map(|i| !mask[i] && same(i)).collect();
+/// Adds regions that have one colour in all photos and are enclosed by the overlay: the ground of a
+/// sign between its letters.
+fn fill_enclosed(mask: &mut [bool], images: &[RgbImage], width: usize) {
+    let plain: Vec<bool> =
+        (0..mask.len()).into_par_iter().map(|i| !mask[i] && has_one_colour(images, i)).collect();
     let (labels, count) = components(&plain, width);
-    // Sides of the region towards the overlay, and towards what is neither.
+    // Pixel sides of each region next to the overlay, and next to other pixels.
     let mut sides = vec![(0usize, 0usize); count];
     for (i, label) in labels.iter().enumerate().filter(|l| *l.1 > 0) {
         for n in around(i, width, mask.len()).filter(|n| labels[*n] != *label) {
@@ -334,8 +326,15 @@ fn fill(mask: &mut [bool], images: &[RgbImage], width: usize) {
     }
 }
 
-/// So many times more of the outline of a plain region touches the overlay than anything else where
-/// it is a part of it.
+fn has_one_colour(images: &[RgbImage], i: usize) -> bool {
+    (0..3).all(|c| {
+        let values = images.iter().map(|image| image.data[i][c]);
+        let (low, high) = values.fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
+        high - low < SAME_COLOUR
+    })
+}
+
+/// Least ratio of an enclosed region's outline next to the overlay to the rest of its outline.
 const ENCLOSED: usize = 9;
 
 #[cfg(test)]
@@ -350,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn unspoilt_photos_have_no_overlay() {
+    fn mark_finds_no_overlay_in_breakfast() {
         let mut photos = breakfast();
         mark(&mut photos);
         assert!(photos.iter().all(|p| p.overlay.is_none()) && description(&photos).is_none());
@@ -361,7 +360,7 @@ mod tests {
     }
 
     #[test]
-    fn what_all_cameras_look_at_is_scene() {
+    fn clear_scene_removes_explained_regions() {
         let mut photos = breakfast();
         let (w, h) = (photos[0].image.width, photos[0].image.height);
         // Three cameras around one point, the middle of each photo; a second region is in a corner.

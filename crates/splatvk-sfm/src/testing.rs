@@ -73,7 +73,7 @@ pub(crate) fn bilinear(image: &RgbImage, x: f64, y: f64) -> [f32; 3] {
     })
 }
 
-/// A photo of the same view through a lens about the middle of the image.
+/// The photo of the same view with distortion about the image centre.
 pub(crate) fn lensed(photo: &Photo, focal: f64, lens: Lens) -> Photo {
     let mut out = photo.clone();
     let (w, h) = (photo.image.width, photo.image.height);
@@ -88,8 +88,8 @@ pub(crate) fn lensed(photo: &Photo, focal: f64, lens: Lens) -> Photo {
     out
 }
 
-/// Matches of points in two cameras, the first of which is the world: centred pixels over a prior
-/// focal length, with normal noise. `focal`, `noise` in the same unit.
+/// Random points projected into two cameras, the first of which is the world frame: centred pixels
+/// with normal noise; `focal` and `noise` in the same unit.
 pub(crate) fn matches_of(
     pose: &Pose,
     focal: [f64; 2],
@@ -98,13 +98,13 @@ pub(crate) fn matches_of(
     point: impl Fn(&mut Random) -> DVec3,
 ) -> (Vec<DVec2>, Vec<DVec2>) {
     let mut rng = Random::new(1000);
-    let one = |rng: &mut Random| {
+    let project = |rng: &mut Random| {
         let p = point(rng);
         let q = pose.transform(p);
         [(p, focal[0]), (q, focal[1])]
             .map(|(p, f)| DVec2::new(p.x, p.y) * (f / p.z) + DVec2::new(rng.normal(), rng.normal()) * noise)
     };
-    (0..n).map(|_| one(&mut rng)).map(|[a, b]| (a, b)).unzip()
+    (0..n).map(|_| project(&mut rng)).map(|[a, b]| (a, b)).unzip()
 }
 
 /// Keypoints of the built-in network.

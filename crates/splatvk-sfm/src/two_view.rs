@@ -1,13 +1,14 @@
 //! Two-view geometry with an uncertain focal length: RANSAC over five points, local optimisation of
-//! rotation, translation and focal length together, and detection of views that hold no parallax.
+//! rotation, translation and focal length together, and detection of views without parallax.
 use super::minimal::{FivePoint, decompose_essential, essential, triangulate_two};
 use super::numeric::minimise_small;
 use crate::math::{Random, median};
 use crate::scene::Pose;
 use glam::{DMat3, DVec2, DVec3};
 
-/// Relation of two views. Pixels are centred and divided by the prior focal length of their photo;
-/// `stretch` is the estimated focal length as a multiple of the prior.
+/// Relative pose of two views with an estimated focal length. Pixels are centred and divided by the
+/// prior focal length of their photo; `stretch` is the estimated focal length as a multiple of the
+/// prior.
 #[derive(Clone, Debug)]
 pub(crate) struct TwoView {
     /// First camera → second camera, |translation| = 1.
@@ -51,13 +52,14 @@ fn ray(p: DVec2, m: f64) -> DVec3 {
     (p / m).extend(1.0)
 }
 
-struct Data<'a> {
+/// Matches in prior-focal units, and the squared inlier threshold.
+struct CentredMatches<'a> {
     x: &'a [DVec2],
     y: &'a [DVec2],
     t2: f64,
 }
 
-impl Data<'_> {
+impl CentredMatches<'_> {
     /// Truncated squared error relative to the threshold, summed; stops early above `limit`.
     fn score(&self, f: &DMat3, limit: f64) -> f64 {
         let mut sum = 0.0;
@@ -80,13 +82,13 @@ impl Data<'_> {
         }
         // Noise is about a third of the threshold; Cauchy at that scale.
         let c2 = self.t2 / 9.0;
-        let at = |v: &[f64; 7]| {
+        let updated = |v: &[f64; 7]| {
             let turn = Pose::exp(DVec3::ZERO, DVec3::new(v[0], v[1], v[2]));
             let t = pose.translation + DVec3::new(v[3], v[4], v[5]);
             Pose { rotation: turn.rotation * pose.rotation, translation: t.normalize() }
         };
         let (v, _) = minimise_small([0.0; 7], [1e-7; 7], steps, |v, out| {
-            let f = stretched(&essential(&at(v)), m * v[6].clamp(-1.0, 1.0).exp());
+            let f = stretched(&essential(&updated(v)), m * v[6].clamp(-1.0, 1.0).exp());
             out.clear();
             out.extend(near.iter().map(|&k| {
                 let r = signed_sampson(&f, self.x[k], self.y[k]);
@@ -97,16 +99,16 @@ impl Data<'_> {
             out.push((length.length() - 1.0) * 10.0);
             out.push(((m.ln() + v[6]) / prior_sigma).clamp(-1e6, 1e6));
         });
-        let p = at(&v);
+        let p = updated(&v);
         (p.orthonormalised(), m * v[6].clamp(-1.0, 1.0).exp())
     }
 
-    /// Of the four decompositions, the one with most points in front of both cameras.
-    fn choose(&self, e: &DMat3, m: f64) -> Pose {
+    /// Decomposition of `e` with most points in front of both cameras.
+    fn choose_pose(&self, e: &DMat3, m: f64) -> Pose {
         let f = stretched(e, m);
         let used: Vec<usize> =
             (0..self.x.len()).filter(|&k| sampson(&f, self.x[k], self.y[k]) < self.t2).collect();
-        let front = |p: &Pose| {
+        let count_in_front = |p: &Pose| {
             used.iter()
                 .filter(|&&k| triangulate_two(p, ray(self.x[k], m), ray(self.y[k], m)).is_some())
                 .count()
@@ -114,7 +116,7 @@ impl Data<'_> {
         let candidates = decompose_essential(e);
         let mut best = (0, candidates[0]);
         for p in candidates {
-            let count = front(&p);
+            let count = count_in_front(&p);
             if count > best.0 {
                 best = (count, p);
             }
@@ -144,7 +146,7 @@ impl Data<'_> {
                 if value >= limit * 1.1 {
                     continue;
                 }
-                let (pose, m2) = self.polish(&self.choose(&e, m), m, prior_sigma, 6);
+                let (pose, m2) = self.polish(&self.choose_pose(&e, m), m, prior_sigma, 6);
                 let refined = self.score(&stretched(&essential(&pose), m2), f64::INFINITY);
                 if refined < limit {
                     best = Some((refined, pose, m2));
@@ -159,9 +161,9 @@ impl Data<'_> {
     }
 }
 
-/// Estimates the relation of two views from matches sorted best first. `x`, `y`: centred pixels
-/// over prior focal length; `threshold` in the same unit; `prior_sigma` is that of ln stretch.
-/// `seed` draws the samples.
+/// Estimates the relative pose of two views from matches sorted best first. `x`, `y`: centred
+/// pixels over prior focal length; `threshold` in the same unit; `prior_sigma` is that of ln
+/// stretch. `seed` draws the samples.
 pub(crate) fn estimate(
     x: &[DVec2],
     y: &[DVec2],
@@ -173,9 +175,8 @@ pub(crate) fn estimate(
     if n < 8 {
         return None;
     }
-    let data = Data { x, y, t2: threshold * threshold };
-    // ±1.5 σ covers 87 % of cameras when nothing is known; the local optimisation bridges the steps
-    // between.
+    let data = CentredMatches { x, y, t2: threshold * threshold };
+    // ±1.5 σ of the prior covers 87 % of cameras; the local optimisation bridges the steps between.
     let stretches: Vec<f64> = if prior_sigma > 0.1 {
         [0.0, -0.75, 0.75, -1.5, 1.5].iter().map(|k: &f64| (k * prior_sigma).exp()).collect()
     } else {
@@ -219,7 +220,7 @@ fn pure_rotation_residual(x: &[DVec2], y: &[DVec2], used: &[usize], pose: &Pose,
         let q = r * ray(x[k], s);
         DVec2::new(q.x, q.y) * (s / q.z.max(1e-6)) - y[k]
     };
-    // Start from the rotation that best turns the rays.
+    // Starts from the rotation of `pose`.
     let (v, _) = minimise_small([0.0; 4], [1e-7; 4], 30, |v, out| {
         out.clear();
         for &k in used {
@@ -259,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn noisy_matches_with_outliers_and_wrong_focal_give_the_rotation() {
+    fn estimate_wrong_focal_recovers_rotation() {
         let turn = Pose::exp(DVec3::ZERO, DVec3::new(0.05, 0.45, -0.03));
         // Not an orbit about one centre: equal distances with crossing axes leave the focal length
         // free (Sturm 2001).
@@ -276,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turning_camera_is_recognised() {
+    fn estimate_pure_rotation_has_no_parallax() {
         let pose = Pose::exp(DVec3::ZERO, DVec3::new(0.02, 0.2, 0.01));
         let (x, y) = views(&pose, 660.0, 300, false);
         let found = estimate(&x, &y, 3.0 / 576.0, 0.35, 0).unwrap();

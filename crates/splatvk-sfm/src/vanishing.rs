@@ -1,52 +1,52 @@
-//! Focal length from vanishing points: edges of most things that people build run in three
-//! directions at right angles, and only the right focal length makes the directions that a photo
-//! shows so (docs/internals/method.md#vanishing-points).
+//! Focal length from vanishing points (docs/internals/method.md#vanishing-points). Man-made edges
+//! mostly run in three orthogonal directions, which are orthogonal in a photo only under the right
+//! focal length.
 use super::segments::{self, END_SIGMA};
 use crate::math::Random;
 use crate::scene::RgbImage;
 use glam::{DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
-/// Focal lengths tried, natural logarithms about the middle of the prior: 0.38 to 2.6 times it …
+/// Largest |ln| of a focal length tried over the prior mean: 0.38 to 2.6 times it.
 const REACH: f64 = 0.96;
-/// … in steps of 8 %: half of what the sharpest photos of the tuning sets leave open.
+/// Step of ln f: 8 %, half of the uncertainty that the sharpest photos of the tuning sets leave.
 const STEP: f64 = 0.08;
-/// Triples of edges tried as three directions, per focal length: of edges of which a tenth runs in
-/// each of two directions, with a hundred the right two are drawn almost surely.
+/// Samples of three edges per focal length: with a tenth of the edges in each of two directions, a
+/// hundred samples almost surely contain the right two.
 const DRAWS: usize = 600;
-/// Error of an edge's direction beside that of its ends, radians (0.6°): walls, boards and lenses
-/// are not quite straight.
+/// σ of an edge's direction beside that of its ends, radians (0.6°): walls, boards and lenses are
+/// not quite straight.
 const EDGE_FLOOR: f64 = 0.01;
 /// Share of the edges that may run in any direction.
 const CLUTTER: f64 = 0.5;
-/// Share of the edges that count as independent: an edge has two sides, and what stands in a row
-/// leans in a row.
+/// Share of the edges that count as independent: an edge has two sides, and objects in a row share
+/// their tilt.
 const INDEPENDENT: f64 = 0.25;
-/// Largest σ of ln f that one photo may leave for it to count. Where things stand at any angle to
-/// each other (`breakfast`, `breakfast-phone`) or a photo shows two directions only, the tuning
-/// sets have 12 to 43 %; where walls or a table fix it, 5 to 9 %, with errors up to 8 %.
+/// Largest σ of ln f of a photo that is used. Where objects stand at any angle to each other
+/// (`breakfast`, `breakfast-phone`) or a photo shows two directions only, the tuning sets have 12
+/// to 43 %; where walls or a table determine it, 5 to 9 %, with errors up to 8 %.
 const SHARP: f64 = 0.1;
-/// σ of ln f that all photos of a set share: corners that are not quite square, an optical axis off
-/// the middle.
+/// σ of ln f common to all photos of a set: corners that are not quite square, an off-centre
+/// principal point.
 const SHARED: f64 = 0.04;
 
-/// What a photo or several say of ln (f / long side).
+/// Estimate of ln (f / long side).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct LogFocal {
     pub(super) mean: f64,
     pub(super) sigma: f64,
 }
 
-/// ln (f / long side) of photos that one camera took, from those that show it sharply; `None` if
-/// none does. `prior` is on the same quantity and counted once.
+/// Estimates ln (f / long side) of photos of one camera, from those with a σ up to [`SHARP`];
+/// `None` without any. `prior` is on the same quantity; the result includes it.
 pub(super) fn log_focal<'a>(images: impl Iterator<Item = &'a RgbImage>, prior: LogFocal) -> Option<LogFocal> {
     let sharp: Vec<LogFocal> =
         images.filter_map(|image| Edges::of(image).log_focal(prior)).filter(|f| f.sigma <= SHARP).collect();
-    joined(&sharp)
+    combined(&sharp)
 }
 
-/// Weighted mean; where the photos differ by more than they state, they all know less.
-fn joined(found: &[LogFocal]) -> Option<LogFocal> {
+/// Weighted mean; σ grows where the photos differ by more than their own σ.
+fn combined(found: &[LogFocal]) -> Option<LogFocal> {
     let weight = |f: &LogFocal| f.sigma.powi(-2);
     let sum: f64 = found.iter().map(weight).sum();
     let mean = found.iter().map(|f| weight(f) * f.mean).sum::<f64>() / sum;
@@ -55,7 +55,7 @@ fn joined(found: &[LogFocal]) -> Option<LogFocal> {
     (!found.is_empty()).then(|| LogFocal { mean, sigma: (scatter / sum).sqrt().hypot(SHARED) })
 }
 
-/// A straight edge, its ends from the middle of the photo in units of the long side.
+/// A straight edge; ends relative to the image centre, in units of the long side.
 struct Edge {
     ends: [DVec2; 2],
     /// One standard deviation of its direction, radians.
@@ -64,17 +64,17 @@ struct Edge {
 
 struct Edges(Vec<Edge>);
 
-/// The plane of an edge and the centre of the camera.
+/// Plane through an edge and the camera centre.
 struct EdgePlane {
     normal: DVec3,
-    /// Ray of the middle of the edge.
+    /// Ray of the midpoint of the edge.
     middle: DVec3,
     sigma: f64,
 }
 
 impl Edges {
     fn of(image: &RgbImage) -> Edges {
-        let found = segments::of(image);
+        let found = segments::detect(image);
         let half = 0.5 * DVec2::new(found.width as f64, found.height as f64);
         let long = 2.0 * half.max_element();
         let edge = |s: &segments::Segment| Edge {
@@ -84,8 +84,7 @@ impl Edges {
         Edges(found.segments.iter().map(edge).collect())
     }
 
-    /// Mean and deviation of the posterior over focal lengths, each with the three directions that
-    /// suit it best.
+    /// Posterior mean and σ over focal lengths, each with its best three orthogonal directions.
     fn log_focal(&self, prior: LogFocal) -> Option<LogFocal> {
         if self.0.len() < 3 {
             return None;
@@ -101,12 +100,12 @@ impl Edges {
         let sum: f64 = weights.iter().sum();
         let mean = weights.iter().zip(&offsets).map(|(w, x)| w * x).sum::<f64>() / sum;
         let square = weights.iter().zip(&offsets).map(|(w, x)| w * (x - mean).powi(2)).sum::<f64>() / sum;
-        // A peak between two steps is no sharper than they are.
+        // σ includes the quantisation by steps.
         Some(LogFocal { mean: prior.mean + mean, sigma: square.sqrt().hypot(STEP / 12f64.sqrt()) })
     }
 
-    /// Log likelihood ratio against edges of any direction, with the best three directions at right
-    /// angles. `focal` in long sides.
+    /// Log likelihood ratio of the best three orthogonal directions, against edges of any
+    /// direction. `focal` in long sides.
     fn best_likelihood(&self, focal: f64) -> f64 {
         let ray = |p: DVec2| p.extend(focal).normalize();
         let planes: Vec<EdgePlane> = self
@@ -118,9 +117,9 @@ impl Edges {
                 sigma: *sigma,
             })
             .collect();
-        // The same draws for every focal length: their luck is not to tell them apart.
+        // Equal draws for every focal length, so that their luck does not distinguish them.
         let mut rng = Random::new(0);
-        // Long edges have small σ and say most.
+        // The longer of two edges, which has the smaller σ.
         let mut draw = || {
             let (a, b) = (rng.below(planes.len()), rng.below(planes.len()));
             if planes[a].sigma < planes[b].sigma { a } else { b }
@@ -139,13 +138,13 @@ impl Edges {
                 best = (value, axes);
             }
         }
-        climb(&planes, best)
+        climb_likelihood(&planes, best)
     }
 }
 
-/// Turns three directions about the coordinate axes by ever smaller angles as long as the
-/// likelihood rises.
-fn climb(planes: &[EdgePlane], mut best: (f64, [DVec3; 3])) -> f64 {
+/// Rotates three directions about the coordinate axes by ever smaller angles as long as the
+/// likelihood rises; returns the likelihood.
+fn climb_likelihood(planes: &[EdgePlane], mut best: (f64, [DVec3; 3])) -> f64 {
     // From the error of a drawn direction to a twentieth of that of an edge.
     let mut angle = 0.03;
     while angle > 0.0005 {
@@ -165,22 +164,22 @@ fn climb(planes: &[EdgePlane], mut best: (f64, [DVec3; 3])) -> f64 {
     best.0
 }
 
-/// Σ ln (ε + (1 − ε)/3 Σ π N(θ; σ)) with θ the angle in the picture between an edge and the way to
-/// a vanishing point.
+/// Σ ln (ε + (1 − ε)/3 Σ π N(θ; σ)) with θ the angle in the image between an edge and the direction
+/// to a vanishing point.
 fn likelihood(planes: &[EdgePlane], axes: &[DVec3; 3]) -> f64 {
-    let one = |p: &EdgePlane| {
-        let density = |axis: &DVec3| {
-            // The plane of the edge's middle and the direction; sin θ ≈ θ where the density is not
-            // 0.
-            let through = p.middle.cross(*axis).normalize_or_zero();
-            let sine = p.normal.cross(through).length() / p.sigma;
-            (-0.5 * sine * sine).exp() / p.sigma
-        };
-        let near: f64 = axes.iter().map(density).sum();
-        let aligned = (1.0 - CLUTTER) / 3.0 * near * (0.5 * std::f64::consts::PI).sqrt();
-        (CLUTTER + aligned).ln()
+    planes.iter().map(|p| log_likelihood(p, axes)).sum()
+}
+
+fn log_likelihood(p: &EdgePlane, axes: &[DVec3; 3]) -> f64 {
+    let density = |axis: &DVec3| {
+        // Plane through the midpoint and the direction; sin θ ≈ θ where the density is not 0.
+        let through = p.middle.cross(*axis).normalize_or_zero();
+        let sine = p.normal.cross(through).length() / p.sigma;
+        (-0.5 * sine * sine).exp() / p.sigma
     };
-    planes.iter().map(one).sum()
+    let near: f64 = axes.iter().map(density).sum();
+    let aligned = (1.0 - CLUTTER) / 3.0 * near * (0.5 * std::f64::consts::PI).sqrt();
+    (CLUTTER + aligned).ln()
 }
 
 #[cfg(test)]
@@ -189,8 +188,8 @@ mod tests {
 
     const PRIOR: LogFocal = LogFocal { mean: -0.105, sigma: 0.35 };
 
-    /// Edges of boxes that stand in `frames`, seen from above at an angle, and edges of any
-    /// direction.
+    /// Edges of boxes rotated by `frames` about the vertical, seen obliquely from above, and edges
+    /// of any direction.
     fn scene(focal: f64, frames: &[f64], boxes: usize, clutter: usize, seed: u64) -> Edges {
         let mut rng = Random::new(seed);
         let view = DQuat::from_rotation_x(0.5) * DQuat::from_rotation_y(0.6);
@@ -220,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn boxes_at_right_angles_tell_the_focal_length() {
+    fn log_focal_of_boxes_is_sharp() {
         for (k, focal) in [0.7, 0.9, 1.2].into_iter().enumerate() {
             let found = scene(focal, &[0.0], 40, 40, k as u64).log_focal(PRIOR).unwrap();
             let error = found.mean - focal.ln();
@@ -233,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_at_any_angle_tells_nothing() {
+    fn log_focal_of_clutter_is_uncertain() {
         let all = [0.0, 0.3, 0.55, 0.9, 1.2];
         for seed in 0..2 {
             let loose = scene(0.9, &all, 40, 40, seed).log_focal(PRIOR).unwrap();
@@ -249,17 +248,17 @@ mod tests {
     }
 
     #[test]
-    fn photos_that_contradict_each_other_know_less() {
+    fn combined_contradicting_photos_widen_sigma() {
         let one = |mean| LogFocal { mean, sigma: 0.05 };
-        assert_eq!(joined(&[]), None);
-        let agree = joined(&[one(0.0), one(0.02)]).unwrap();
+        assert_eq!(combined(&[]), None);
+        let agree = combined(&[one(0.0), one(0.02)]).unwrap();
         assert!((agree.mean - 0.01).abs() < 1e-12 && agree.sigma < 0.06, "{agree:?}");
-        let differ = joined(&[one(-0.2), one(0.2)]).unwrap();
+        let differ = combined(&[one(-0.2), one(0.2)]).unwrap();
         assert!(differ.sigma > 0.15, "{differ:?}");
     }
 
     #[test]
-    fn breakfast_leaves_it_open() {
+    fn log_focal_of_breakfast_is_none() {
         let truth = super::super::testing::train(&super::super::testing::folder());
         assert_eq!(log_focal(truth.photos.iter().map(|p| &p.image), PRIOR), None);
     }

@@ -1,19 +1,20 @@
-//! Bundle adjustment: cameras, their optics and points that minimise the robust reprojection error
+//! Bundle adjustment: poses, intrinsics and points that minimise the robust reprojection error
 //! (Levenberg–Marquardt in f64, points eliminated by the Schur complement).
-mod bend;
+mod displacement;
 mod normal;
 mod problem;
 
 use super::numeric::cauchy_weight;
 use crate::scene::Pose;
 use crate::{Error, Result};
-pub(crate) use bend::Bent;
+pub(crate) use displacement::DisplacementSigmas;
 use glam::{DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
 use normal::Normal;
-pub(crate) use problem::{Adjusted, OPTICS, Observation, Optics, OpticsPrior, Problem};
+pub(crate) use problem::{Adjusted, INTRINSICS, Intrinsics, IntrinsicsPrior, Observation, Problem};
 
 impl Problem {
+    /// The problem after a damped Gauss–Newton step; `None` if the system is not positive definite.
     fn stepped(&self, normal: &Normal, lambda: f64) -> Option<Problem> {
         let (s, b, inverses) = Self::reduce(normal, lambda);
         let d = s.cholesky()?.solve(&b);
@@ -27,15 +28,15 @@ impl Problem {
             next.poses[k] = step.compose(&self.poses[k]).orthonormalised();
         }
         let pose_size = 6 * (self.poses.len() - 1);
-        for (k, optics) in next.optics.iter_mut().enumerate() {
-            let step = |j: usize| -d[pose_size + OPTICS * k + j];
-            // Steps beyond half the focal length or 0.1 in the lens are outside the linear range.
-            // Where focal length and distance grow by one factor, photos of a flat scene hardly
-            // change: such a step is exact in f, not in ln f.
-            optics.focal *= 1.0 + step(0).clamp(-0.4, 0.6);
-            optics.lens.k1 += step(1).clamp(-0.1, 0.1);
-            optics.lens.k2 += step(2).clamp(-0.1, 0.1);
-            optics.shift += DVec2::new(step(3), step(4));
+        for (k, intrinsics) in next.intrinsics.iter_mut().enumerate() {
+            let step = |j: usize| -d[pose_size + INTRINSICS * k + j];
+            // Steps beyond half the focal length or 0.1 in the distortion are outside the linear
+            // range. Where focal length and distance grow by one factor, photos of a flat scene
+            // hardly change: such a step is exact in f, not in ln f.
+            intrinsics.focal *= 1.0 + step(0).clamp(-0.4, 0.6);
+            intrinsics.lens.k1 += step(1).clamp(-0.1, 0.1);
+            intrinsics.lens.k2 += step(2).clamp(-0.1, 0.1);
+            intrinsics.principal_point_offset += DVec2::new(step(3), step(4));
         }
         for (p, inverse) in normal.points.iter().zip(&inverses) {
             let mut g = p.g;
@@ -78,7 +79,7 @@ impl Problem {
         Ok(Adjusted { cost, sigmas, rotation_sigmas })
     }
 
-    /// Covariance of the cameras' parameters, for residuals of the stated σ; `None` where it is not
+    /// Covariance of poses and intrinsics, for residuals of the stated σ; `None` where it is not
     /// finite.
     fn covariance(&self, normal: &Normal) -> Option<DMatrix<f64>> {
         // Marginalise the points without damping; λ = 1e-9 only keeps numerical zeros positive.
@@ -93,8 +94,8 @@ impl Problem {
         s.cholesky().map(|f| f.inverse())
     }
 
-    /// Sum of the squared residuals, in units of their σ, and degrees of freedom; outlying ones
-    /// count little in both.
+    /// Weighted sum of the squared residuals, in units of their σ, and the degrees of freedom;
+    /// outliers count little in both.
     pub(crate) fn squares(&self, c: f64) -> (f64, f64) {
         let (mut sum, mut freedom) = (0.0, -(self.sizes().1 as f64) - 3.0 * self.points.len() as f64);
         for o in &self.observations {
@@ -114,29 +115,30 @@ impl Problem {
         sum / freedom.max(1.0)
     }
 
-    /// σ of the optics per group and of the rotation per pose, from the inverse of the reduced
+    /// σ of the intrinsics per camera and of the rotation per pose, from the inverse of the reduced
     /// system, scaled by the observed residual variance.
-    fn sigmas(&self, c: f64) -> (Vec<[f64; OPTICS]>, Vec<f64>) {
+    fn sigmas(&self, c: f64) -> (Vec<[f64; INTRINSICS]>, Vec<f64>) {
         let inverse = self.covariance(&self.linearise(c));
         let (pose_size, _) = self.sizes();
         let variance = self.variance(c);
-        let sigma = |group: usize, k: usize, prior: f64| {
-            let i = pose_size + OPTICS * group + k;
-            let seen = inverse.as_ref().map_or(f64::INFINITY, |m| (m[(i, i)] * variance).sqrt());
-            seen.min(prior)
+        let sigma = |camera: usize, k: usize, prior: f64| {
+            let i = pose_size + INTRINSICS * camera + k;
+            let estimated = inverse.as_ref().map_or(f64::INFINITY, |m| (m[(i, i)] * variance).sqrt());
+            estimated.min(prior)
         };
-        let of = |(group, (o, p)): (usize, (&Optics, &OpticsPrior))| {
+        let camera_sigmas = |(camera, (o, p)): (usize, (&Intrinsics, &IntrinsicsPrior))| {
             let priors = p.deviations(o).map(|d| d.1);
-            std::array::from_fn(|k| sigma(group, k, priors[k]))
+            std::array::from_fn(|k| sigma(camera, k, priors[k]))
         };
-        let optics = self.optics.iter().zip(&self.priors).enumerate().map(of).collect();
+        let intrinsics = self.intrinsics.iter().zip(&self.priors).enumerate().map(camera_sigmas).collect();
         let rotation = |pose: usize| {
             let Some(at) = pose.checked_sub(1).map(|k| 6 * k + 3) else { return 0.0 };
-            let seen = inverse.as_ref().map(|m| m.fixed_view::<3, 3>(at, at).symmetric_eigenvalues().max());
-            // Beyond half a turn nothing is known.
-            (seen.unwrap_or(f64::INFINITY) * variance).sqrt().min(std::f64::consts::PI)
+            let largest =
+                inverse.as_ref().map(|m| m.fixed_view::<3, 3>(at, at).symmetric_eigenvalues().max());
+            // π is no information at all.
+            (largest.unwrap_or(f64::INFINITY) * variance).sqrt().min(std::f64::consts::PI)
         };
-        (optics, (0..self.poses.len()).map(rotation).collect())
+        (intrinsics, (0..self.poses.len()).map(rotation).collect())
     }
 }
 

@@ -1,18 +1,19 @@
-//! The normal equations of the adjustment, and the points eliminated from them.
-use super::{OPTICS, Observation, Problem};
+//! Normal equations of bundle adjustment, and the elimination of the points.
+use super::{INTRINSICS, Observation, Problem};
 use crate::numeric::{cauchy_weight, skew};
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
-/// Normal equations: camera block (poses 1.., then optics; lower triangle), and per point its own
-/// block and coupling.
+/// Normal equations: camera block (poses 1.., then intrinsics; lower triangle), and per point its
+/// own block and coupling.
 pub(super) struct Normal {
     pub(super) h: DMatrix<f64>,
     pub(super) g: DVector<f64>,
     pub(super) points: Vec<PointBlock>,
 }
 
+/// Block of one point: Hessian `v`, gradient `g` and coupling with the cameras.
 pub(super) struct PointBlock {
     pub(super) point: usize,
     v: DMat3,
@@ -20,7 +21,7 @@ pub(super) struct PointBlock {
     pub(super) coupling: Vec<Coupling>,
 }
 
-/// How a point hangs together with the parameters `at .. at + size`.
+/// Hessian block of a point and the parameters `at .. at + size`.
 pub(super) struct Coupling {
     pub(super) at: usize,
     pub(super) size: usize,
@@ -28,7 +29,7 @@ pub(super) struct Coupling {
 }
 
 impl PointBlock {
-    /// The inverse of its own block, with damping λ on the diagonal.
+    /// Inverse of the Hessian, with damping λ on the diagonal.
     pub(super) fn inverse(&self, lambda: f64) -> DMat3 {
         let mut v = self.v;
         // The tiny absolute term keeps unobserved points from making the block singular.
@@ -38,8 +39,8 @@ impl PointBlock {
         v.inverse()
     }
 
-    /// Its coupling with the parameters `at .. at + size`.
-    fn with(&mut self, at: usize, size: usize) -> &mut Coupling {
+    /// Coupling with the parameters `at .. at + size`, added where it is missing.
+    fn coupling_with(&mut self, at: usize, size: usize) -> &mut Coupling {
         let known = self.coupling.iter().position(|k| k.at == at).unwrap_or_else(|| {
             self.coupling.push(Coupling { at, size, by: [DVec3::ZERO; 6] });
             self.coupling.len() - 1
@@ -48,32 +49,34 @@ impl PointBlock {
     }
 }
 
-/// An observation's residual, in standard deviations, its weight, and the derivatives of (u, v).
+/// Residual of an observation in standard deviations, its weight, and its derivatives.
 pub(super) struct Derivatives {
     r: DVec2,
     pub(super) w: f64,
     pub(super) by_point: [DVec3; 2],
-    /// By the pose, unless it is held, and the optics.
-    pub(super) by: [Option<By>; 2],
+    /// By the pose, unless it is fixed, and by the intrinsics.
+    pub(super) by: [Option<JacobianBlock>; 2],
 }
 
 /// Derivatives of (u, v) by the parameters `at .. at + size`.
-pub(super) struct By {
+pub(super) struct JacobianBlock {
     pub(super) at: usize,
     pub(super) size: usize,
     pub(super) rows: [[f64; 6]; 2],
 }
 
-/// Points that one thread takes at a time. Sums are over the same parts on any number of threads.
+/// Points per parallel part. The parts, and with them the order of sums, do not depend on the
+/// number of threads.
 const PART: usize = 512;
 
 impl Problem {
-    /// Number of parameters of the poses, and of poses and optics.
+    /// Number of parameters of the poses, and of poses and intrinsics.
     pub(super) fn sizes(&self) -> (usize, usize) {
         let poses = 6 * (self.poses.len() - 1);
-        (poses, poses + OPTICS * self.optics.len())
+        (poses, poses + INTRINSICS * self.intrinsics.len())
     }
 
+    /// Normal equations at the current estimate, with the priors.
     pub(super) fn linearise(&self, c: f64) -> Normal {
         let (pose_size, n) = self.sizes();
         let of_points: Vec<&[Observation]> = self.observations.chunk_by(|a, b| a.point == b.point).collect();
@@ -85,7 +88,7 @@ impl Problem {
             normal.g += part.g;
             normal.points.extend(part.points);
         }
-        let all = self.optics.iter().zip(&self.priors).flat_map(|(o, p)| p.deviations(o));
+        let all = self.intrinsics.iter().zip(&self.priors).flat_map(|(o, p)| p.deviations(o));
         for (k, (distance, sigma)) in all.enumerate() {
             let i = pose_size + k;
             if sigma > 0.0 {
@@ -98,7 +101,7 @@ impl Problem {
         normal
     }
 
-    /// The observations of some points, without the priors.
+    /// Normal equations of the observations of some points, without the priors.
     fn linearise_part(&self, of_points: &[&[Observation]], c: f64) -> Normal {
         let (_, n) = self.sizes();
         let mut normal = Normal { h: DMatrix::zeros(n, n), g: DVector::zeros(n), points: Vec::new() };
@@ -111,13 +114,13 @@ impl Problem {
                     block.v += DMat3::from_cols(*j * j.x, *j * j.y, *j * j.z) * w;
                 }
                 for (column, own) in by.iter().flatten().enumerate() {
-                    let coupling = block.with(own.at, own.size);
+                    let coupling = block.coupling_with(own.at, own.size);
                     let [u, v] = own.rows;
                     for k in 0..own.size {
                         coupling.by[k] += w * (by_point[0] * u[k] + by_point[1] * v[k]);
                         normal.g[own.at + k] += w * (u[k] * r.x + v[k] * r.y);
                     }
-                    // The poses come before the optics, so what is filled is the lower triangle.
+                    // Poses come before intrinsics, so this fills the lower triangle.
                     for (row, other) in by.iter().flatten().enumerate().skip(column) {
                         let [a, b] = other.rows;
                         for k in 0..own.size {
@@ -134,49 +137,50 @@ impl Problem {
         normal
     }
 
-    /// `None` behind the camera.
+    /// Residual and derivatives of an observation; `None` behind the camera.
     pub(super) fn derivatives(&self, o: &Observation, c: f64) -> Option<Derivatives> {
         let (t, p) = self.project(o);
         if t.z <= 1e-9 {
             return None;
         }
-        let group = self.group[o.camera];
-        let (optics, zoom) = (&self.optics[group], self.zoom[o.camera]);
+        let camera = self.camera_ids[o.view];
+        let (intrinsics, zoom) = (&self.intrinsics[camera], self.zoom[o.view]);
         let r = (p - o.pixel) / o.sigma;
-        let f = optics.focal * zoom / o.sigma;
+        let f = intrinsics.focal * zoom / o.sigma;
         let x = DVec2::new(t.x, t.y) / t.z;
-        let bend = optics.lens.jacobian(x);
-        // Rows of ∂(u, v)/∂t, each a 3-vector: through x = (X, Y)/Z and the lens.
+        let jacobian = intrinsics.lens.jacobian(x);
+        // Rows of ∂(u, v)/∂t, each a 3-vector: through x = (X, Y)/Z and the distortion.
         let rows = [0, 1].map(|axis| {
-            let by = bend.row(axis) * (f / t.z);
+            let by = jacobian.row(axis) * (f / t.z);
             DVec3::new(by.x, by.y, -by.dot(x))
         });
-        let to_world = self.poses[o.camera].rotation.transpose();
+        let to_world = self.poses[o.view].rotation.transpose();
         // δt = ρ − [t]× θ, so ∂/∂θ = −rowᵀ[t]× = ([t]× row)ᵀ.
-        let pose = self.camera_offset(o.camera).map(|at| {
+        let pose = self.pose_offset(o.view).map(|at| {
             let by = |row: DVec3| {
                 let turn = skew(t) * row;
                 [row.x, row.y, row.z, turn.x, turn.y, turn.z]
             };
-            By { at, size: 6, rows: rows.map(by) }
+            JacobianBlock { at, size: 6, rows: rows.map(by) }
         });
-        let (r2, bent) = (x.length_squared(), optics.lens.distort(x));
-        let free = self.priors[group].deviations(optics).map(|d| d.1 > 0.0);
-        let by_optics = [0, 1].map(|axis| {
-            // By ln f, which is the centred pixel itself, the lens and the shift; what is held has
-            // no derivative.
-            let mut by = [f * bent[axis], f * x[axis] * r2, f * x[axis] * r2 * r2, 0.0, 0.0, 0.0];
+        let (r2, distorted) = (x.length_squared(), intrinsics.lens.distort(x));
+        let free = self.priors[camera].deviations(intrinsics).map(|d| d.1 > 0.0);
+        let by_intrinsics = [0, 1].map(|axis| {
+            // By ln f (the centred pixel itself), distortion and principal point; parameters that
+            // are held have no derivative.
+            let mut by = [f * distorted[axis], f * x[axis] * r2, f * x[axis] * r2 * r2, 0.0, 0.0, 0.0];
             by[3 + axis] = zoom / o.sigma;
             by.iter_mut().zip(free).filter(|(_, free)| !free).for_each(|(b, _)| *b = 0.0);
             by
         });
-        let own = By { at: self.sizes().0 + OPTICS * group, size: OPTICS, rows: by_optics };
+        let own =
+            JacobianBlock { at: self.sizes().0 + INTRINSICS * camera, size: INTRINSICS, rows: by_intrinsics };
         let w = cauchy_weight(r.length_squared(), c);
         Some(Derivatives { r, w, by_point: rows.map(|row| to_world * row), by: [pose, Some(own)] })
     }
 
-    /// The camera system after eliminating the points, with damping λ on every diagonal; the lower
-    /// triangle.
+    /// Camera system after eliminating the points, with damping λ on every diagonal (lower
+    /// triangle), and the inverses of the point blocks.
     pub(super) fn reduce(normal: &Normal, lambda: f64) -> (DMatrix<f64>, DVector<f64>, Vec<DMat3>) {
         let (mut s, mut b) = (normal.h.clone(), normal.g.clone());
         for i in 0..b.len() {
@@ -193,7 +197,7 @@ impl Problem {
         (s, b, inverses)
     }
 
-    /// What eliminating some points takes away from a camera system of `n` parameters, and the
+    /// Contribution of some points to the Schur complement of `n` camera parameters, and the
     /// inverses of their blocks.
     fn eliminate(points: &[PointBlock], n: usize, lambda: f64) -> (DMatrix<f64>, DVector<f64>, Vec<DMat3>) {
         let (mut h, mut g) = (DMatrix::zeros(n, n), DVector::zeros(n));

@@ -1,12 +1,12 @@
-//! What an adjustment changes, and what it costs.
+//! Parameters, observations and cost of bundle adjustment.
 use crate::numeric::cauchy;
 use crate::scene::{Lens, Pose};
 use glam::{DVec2, DVec3};
 
-/// One sighting of a point.
+/// Observation of a point in one view.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Observation {
-    pub(crate) camera: usize,
+    pub(crate) view: usize,
     pub(crate) point: usize,
     /// Measured position, pixels.
     pub(crate) pixel: DVec2,
@@ -14,103 +14,109 @@ pub(crate) struct Observation {
     pub(crate) sigma: f64,
 }
 
-/// What the photos of one camera share.
+/// Intrinsics that the photos of one camera share.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Optics {
+pub(crate) struct Intrinsics {
     /// Focal length, original pixels.
     pub(crate) focal: f64,
     /// Radial distortion.
     pub(crate) lens: Lens,
-    /// Principal point from the middle of the photo, original pixels.
-    pub(crate) shift: DVec2,
+    /// Principal point relative to the image centre, original pixels.
+    pub(crate) principal_point_offset: DVec2,
 }
 
-/// Number of parameters of [`Optics`]: ln f, k1, k2, shift.
-pub(crate) const OPTICS: usize = 5;
+/// Number of parameters of [`Intrinsics`]: ln f, k1, k2, principal point offset.
+pub(crate) const INTRINSICS: usize = 5;
 
-/// What is known of optics before the images are seen, as normal deviates. σ = 0 holds a parameter
-/// where it is.
+/// Normal priors of intrinsics. σ = 0 holds a parameter where it is.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct OpticsPrior {
+pub(crate) struct IntrinsicsPrior {
     /// ln f and its σ.
     pub(crate) log_focal: (f64, f64),
     /// σ of k1 and k2 around 0.
     pub(crate) lens: [f64; 2],
-    /// σ of the shift around 0, original pixels.
-    pub(crate) shift: f64,
+    /// σ of the principal point offset around 0, original pixels.
+    pub(crate) principal_point_offset: f64,
 }
 
-impl OpticsPrior {
+impl IntrinsicsPrior {
     /// Number of parameters that it leaves free.
     pub(crate) fn count(&self) -> usize {
         let radial = self.lens.iter().filter(|s| **s > 0.0).count();
-        usize::from(self.log_focal.1 > 0.0) + radial + 2 * usize::from(self.shift > 0.0)
+        usize::from(self.log_focal.1 > 0.0) + radial + 2 * usize::from(self.principal_point_offset > 0.0)
     }
 
     /// σ of every parameter, in the order of [`Adjusted::sigmas`].
-    pub(crate) fn sigmas(&self) -> [f64; OPTICS] {
-        [self.log_focal.1, self.lens[0], self.lens[1], self.shift, self.shift]
+    pub(crate) fn sigmas(&self) -> [f64; INTRINSICS] {
+        [
+            self.log_focal.1,
+            self.lens[0],
+            self.lens[1],
+            self.principal_point_offset,
+            self.principal_point_offset,
+        ]
     }
 
-    /// Multiplies every σ.
-    pub(crate) fn narrow(&mut self, scale: f64) {
+    /// Multiplies every σ by `scale`.
+    pub(crate) fn scale_sigmas(&mut self, scale: f64) {
         self.log_focal.1 *= scale;
         self.lens.iter_mut().for_each(|s| *s *= scale);
-        self.shift *= scale;
+        self.principal_point_offset *= scale;
     }
 
     /// (distance from the prior's mean, σ) of every parameter.
-    pub(super) fn deviations(&self, o: &Optics) -> [(f64, f64); OPTICS] {
+    pub(super) fn deviations(&self, o: &Intrinsics) -> [(f64, f64); INTRINSICS] {
         [
             (o.focal.ln() - self.log_focal.0, self.log_focal.1),
             (o.lens.k1, self.lens[0]),
             (o.lens.k2, self.lens[1]),
-            (o.shift.x, self.shift),
-            (o.shift.y, self.shift),
+            (o.principal_point_offset.x, self.principal_point_offset),
+            (o.principal_point_offset.y, self.principal_point_offset),
         ]
     }
 }
 
-/// Everything the adjustment changes, and what it may not.
+/// Variables, constants and observations of a bundle adjustment.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Problem {
-    /// World → camera; camera 0 stays fixed.
+    /// World → camera, one per view; view 0 stays fixed.
     pub(crate) poses: Vec<Pose>,
-    /// Middle of each photo, pixels.
+    /// Image centre of each view, pixels.
     pub(crate) centres: Vec<DVec2>,
-    /// Which optics each camera uses.
-    pub(crate) group: Vec<usize>,
-    /// Pixels of each camera per original pixel of its optics: photos of one camera may be scaled
+    /// Camera id of each view: index into `intrinsics` and `priors`.
+    pub(crate) camera_ids: Vec<usize>,
+    /// Pixels of each view per original pixel of its camera: photos of one camera may be scaled
     /// differently.
     pub(crate) zoom: Vec<f64>,
-    /// Per group.
-    pub(crate) optics: Vec<Optics>,
-    /// Per group.
-    pub(crate) priors: Vec<OpticsPrior>,
+    /// Per camera id.
+    pub(crate) intrinsics: Vec<Intrinsics>,
+    /// Per camera id.
+    pub(crate) priors: Vec<IntrinsicsPrior>,
     pub(crate) points: Vec<DVec3>,
-    /// Those of one point in a row.
+    /// Grouped by point.
     pub(crate) observations: Vec<Observation>,
 }
 
-/// What an adjustment found.
+/// Result of an adjustment.
 #[derive(Clone, Debug)]
 pub(crate) struct Adjusted {
     /// Robust cost, in squared standard deviations.
     pub(crate) cost: f64,
-    /// σ of ln f, k1, k2 and the shift per group, from the observations and the priors; 0 where
-    /// held.
-    pub(crate) sigmas: Vec<[f64; OPTICS]>,
+    /// σ of ln f, k1, k2 and the principal point offset per camera id, from the observations and
+    /// the priors; 0 where held.
+    pub(crate) sigmas: Vec<[f64; INTRINSICS]>,
     /// σ of the rotation of every pose against the first, about its least certain axis, radians.
     pub(crate) rotation_sigmas: Vec<f64>,
 }
 
 impl Problem {
-    /// Projection in camera frame and its pixel.
+    /// Point in the camera frame and its pixel.
     pub(super) fn project(&self, o: &Observation) -> (DVec3, DVec2) {
-        let t = self.poses[o.camera].transform(self.points[o.point]);
-        let (optics, zoom) = (&self.optics[self.group[o.camera]], self.zoom[o.camera]);
-        let seen = optics.lens.distort(DVec2::new(t.x, t.y) / t.z);
-        (t, seen * (optics.focal * zoom) + optics.shift * zoom + self.centres[o.camera])
+        let t = self.poses[o.view].transform(self.points[o.point]);
+        let (intrinsics, zoom) = (&self.intrinsics[self.camera_ids[o.view]], self.zoom[o.view]);
+        let distorted = intrinsics.lens.distort(DVec2::new(t.x, t.y) / t.z);
+        let (offset, centre) = (intrinsics.principal_point_offset, self.centres[o.view]);
+        (t, distorted * (intrinsics.focal * zoom) + offset * zoom + centre)
     }
 
     /// Reprojection residual of an observation, pixels; infinite behind the camera.
@@ -126,7 +132,7 @@ impl Problem {
             .iter()
             .map(|o| {
                 let (t, p) = self.project(o);
-                // A point that a step pushes behind a camera must look expensive, but finite.
+                // A point that a step moves behind a camera has a large, but finite cost.
                 if t.z > 1e-9 {
                     cauchy((p - o.pixel).length_squared() / (o.sigma * o.sigma), c)
                 } else {
@@ -138,11 +144,12 @@ impl Problem {
     }
 
     fn prior_cost(&self) -> f64 {
-        let all = self.optics.iter().zip(&self.priors).flat_map(|(o, p)| p.deviations(o));
+        let all = self.intrinsics.iter().zip(&self.priors).flat_map(|(o, p)| p.deviations(o));
         all.filter(|(_, sigma)| *sigma > 0.0).map(|(d, sigma)| (d / sigma).powi(2)).sum()
     }
 
-    pub(super) fn camera_offset(&self, camera: usize) -> Option<usize> {
-        camera.checked_sub(1).map(|c| 6 * c)
+    /// Index of the first parameter of a pose; `None` for the fixed one.
+    pub(super) fn pose_offset(&self, view: usize) -> Option<usize> {
+        view.checked_sub(1).map(|v| 6 * v)
     }
 }

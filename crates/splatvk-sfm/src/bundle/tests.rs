@@ -9,10 +9,10 @@ fn scene(noise: f64) -> (Problem, Problem) {
     let mut rng = Random::new(5);
     let mut p = Problem {
         centres: vec![DVec2::new(320.0, 240.0); 4],
-        group: vec![0; 4],
+        camera_ids: vec![0; 4],
         zoom: vec![1.0; 4],
-        optics: vec![Optics { focal: 600.0, lens: Lens::NONE, shift: DVec2::ZERO }],
-        priors: vec![OpticsPrior { log_focal: (576f64.ln(), 0.35), ..Default::default() }],
+        intrinsics: vec![Intrinsics { focal: 600.0, lens: Lens::NONE, principal_point_offset: DVec2::ZERO }],
+        priors: vec![IntrinsicsPrior { log_focal: (576f64.ln(), 0.35), ..Default::default() }],
         ..Default::default()
     };
     for k in 0..4 {
@@ -24,14 +24,18 @@ fn scene(noise: f64) -> (Problem, Problem) {
     p.poses[0] = Pose::IDENTITY;
     for k in 0..200 {
         p.points.push(DVec3::new(rng.normal() * 0.5, rng.normal() * 0.4, 3.0 + rng.normal() * 0.4));
-        for camera in 0..4 {
-            let mut o = Observation { camera, point: k, pixel: DVec2::ZERO, sigma: 1.0 };
+        for view in 0..4 {
+            let mut o = Observation { view, point: k, pixel: DVec2::ZERO, sigma: 1.0 };
             o.pixel = p.project(&o).1 + DVec2::new(rng.normal(), rng.normal()) * noise;
             p.observations.push(o);
         }
     }
     let truth = p.clone();
-    p.optics[0] = Optics { focal: p.optics[0].focal * 1.15, lens: Lens::NONE, shift: DVec2::ZERO };
+    p.intrinsics[0] = Intrinsics {
+        focal: p.intrinsics[0].focal * 1.15,
+        lens: Lens::NONE,
+        principal_point_offset: DVec2::ZERO,
+    };
     for k in 1..4 {
         let v = |rng: &mut Random| DVec3::new(rng.normal(), rng.normal(), rng.normal()) * 0.02;
         p.poses[k] = Pose::exp(v(&mut rng), v(&mut rng)).compose(&p.poses[k]);
@@ -43,7 +47,7 @@ fn scene(noise: f64) -> (Problem, Problem) {
 }
 
 #[test]
-fn exact_data_with_outliers_is_recovered() {
+fn solve_recovers_truth_despite_outliers() {
     let (mut p, truth) = scene(0.0);
     let mut rng = Random::new(8);
     for o in p.observations.iter_mut().step_by(7) {
@@ -52,59 +56,66 @@ fn exact_data_with_outliers_is_recovered() {
     p.priors[0].log_focal.1 = 100.0;
     p.solve(4.0, 60).unwrap();
     p.solve(0.02, 60).unwrap();
-    assert!((p.optics[0].focal / 600.0 - 1.0).abs() < 1e-4, "{}", p.optics[0].focal);
+    assert!((p.intrinsics[0].focal / 600.0 - 1.0).abs() < 1e-4, "{}", p.intrinsics[0].focal);
     for (a, b) in p.poses.iter().zip(&truth.poses) {
         assert!(rotation_angle(&(a.rotation * b.rotation.transpose())) < 1e-4);
     }
 }
 
 #[test]
-fn focal_sigma_predicts_the_scatter_of_the_estimate() {
+fn focal_sigma_matches_error() {
     // σ of one run is compared with the actual error of that run: within a factor that a normal
     // deviate exceeds once in 10,000.
     let (mut p, _) = scene(1.0);
     let out = p.solve(1e3, 60).unwrap();
     let sigma = out.sigmas[0][0];
     assert!(sigma > 1e-4 && sigma < 0.02, "{sigma}");
-    assert!((p.optics[0].focal / 600.0).ln().abs() < 3.9 * sigma, "{} {sigma}", p.optics[0].focal);
+    assert!((p.intrinsics[0].focal / 600.0).ln().abs() < 3.9 * sigma, "{} {sigma}", p.intrinsics[0].focal);
 }
 
 #[test]
-fn variance_is_that_of_the_noise() {
+fn variance_equals_noise() {
     let (mut p, _) = scene(0.2);
     p.solve(1e3, 60).unwrap();
     assert!((p.variance(1e3) / 0.04 - 1.0).abs() < 0.1, "{}", p.variance(1e3));
 }
 
 #[test]
-fn lens_and_principal_point_are_recovered_where_they_are_free() {
+fn solve_recovers_free_intrinsics() {
     let (mut p, _) = scene(0.0);
-    let truth = Optics { focal: 600.0, lens: Lens::radial(-0.12, 0.03), shift: DVec2::new(4.0, -3.0) };
+    let truth = Intrinsics {
+        focal: 600.0,
+        lens: Lens::radial(-0.12, 0.03),
+        principal_point_offset: DVec2::new(4.0, -3.0),
+    };
     let (mut wide, _) = scene(0.0);
-    wide.optics[0] = truth;
-    // The rig of `scene` before it was disturbed, seen through that lens.
+    wide.intrinsics[0] = truth;
+    // The rig of `scene` before it was disturbed, with that distortion.
     let (_, rig) = scene(0.0);
     wide.poses.clone_from(&rig.poses);
     wide.points.clone_from(&rig.points);
     for (k, o) in wide.observations.iter().enumerate() {
-        // Exact: the priors must not be felt.
+        // Exact, so that the priors have no influence.
         p.observations[k] = Observation { pixel: wide.project(o).1, sigma: 1e-3, ..*o };
     }
-    let free = OpticsPrior { log_focal: (576f64.ln(), 0.35), lens: [0.5; 2], shift: 20.0 };
+    let free =
+        IntrinsicsPrior { log_focal: (576f64.ln(), 0.35), lens: [0.5; 2], principal_point_offset: 20.0 };
     let mut held = p.clone();
     p.priors[0] = free;
     p.solve(1e9, 200).unwrap();
-    let found = p.optics[0];
+    let found = p.intrinsics[0];
     assert!((found.focal / 600.0 - 1.0).abs() < 1e-3, "{found:?}");
     assert!((found.lens.k1 + 0.12).abs() < 2e-3 && (found.lens.k2 - 0.03).abs() < 1e-2, "{found:?}");
-    assert!((found.shift - truth.shift).length() < 0.5, "{found:?}");
+    assert!((found.principal_point_offset - truth.principal_point_offset).length() < 0.5, "{found:?}");
     let out = held.solve(1e9, 100).unwrap();
-    assert_eq!((held.optics[0].lens, held.optics[0].shift), (Lens::NONE, DVec2::ZERO));
+    assert_eq!(
+        (held.intrinsics[0].lens, held.intrinsics[0].principal_point_offset),
+        (Lens::NONE, DVec2::ZERO)
+    );
     assert_eq!(out.sigmas[0][1..], [0.0; 4], "what is held has no uncertainty");
 }
 
-/// The problem after a step in its parameters, numbered as in the normal equations and the points
-/// after them.
+/// The problem after a step in one parameter, numbered as in the normal equations, points last.
 fn moved(p: &Problem, at: usize, h: f64) -> Problem {
     let (poses, cameras) = p.sizes();
     let mut q = p.clone();
@@ -114,13 +125,13 @@ fn moved(p: &Problem, at: usize, h: f64) -> Problem {
         let pose = &mut q.poses[1 + at / 6];
         *pose = Pose::exp(step[0], step[1]).compose(pose);
     } else if at < cameras {
-        let o = &mut q.optics[(at - poses) / OPTICS];
-        match (at - poses) % OPTICS {
+        let o = &mut q.intrinsics[(at - poses) / INTRINSICS];
+        match (at - poses) % INTRINSICS {
             0 => o.focal *= h.exp(),
             1 => o.lens.k1 += h,
             2 => o.lens.k2 += h,
-            3 => o.shift.x += h,
-            _ => o.shift.y += h,
+            3 => o.principal_point_offset.x += h,
+            _ => o.principal_point_offset.y += h,
         }
     } else {
         q.points[(at - cameras) / 3][(at - cameras) % 3] += h;
@@ -128,19 +139,24 @@ fn moved(p: &Problem, at: usize, h: f64) -> Problem {
     q
 }
 
-/// Two cameras of different optics, all parameters free, away from the optimum.
+/// Two cameras with different intrinsics, all parameters free, away from the optimum.
 fn two_cameras() -> Problem {
     let (mut p, _) = scene(1.0);
-    let free = OpticsPrior { log_focal: (576f64.ln(), 0.35), lens: [0.1; 2], shift: 5.0 };
-    p.priors = vec![free, OpticsPrior { lens: [0.2; 2], ..free }];
-    let optics = |focal, k1| Optics { focal, lens: Lens::radial(k1, -0.04), shift: DVec2::new(2.0, 1.0) };
-    p.optics = vec![optics(620.0, 0.05), optics(590.0, -0.1)];
-    p.group = vec![0, 1, 0, 1];
+    let free =
+        IntrinsicsPrior { log_focal: (576f64.ln(), 0.35), lens: [0.1; 2], principal_point_offset: 5.0 };
+    p.priors = vec![free, IntrinsicsPrior { lens: [0.2; 2], ..free }];
+    let intrinsics = |focal, k1| Intrinsics {
+        focal,
+        lens: Lens::radial(k1, -0.04),
+        principal_point_offset: DVec2::new(2.0, 1.0),
+    };
+    p.intrinsics = vec![intrinsics(620.0, 0.05), intrinsics(590.0, -0.1)];
+    p.camera_ids = vec![0, 1, 0, 1];
     p
 }
 
 #[test]
-fn the_gradient_is_the_derivative_of_the_cost() {
+fn gradient_equals_derivative_of_cost() {
     let (p, c, h) = (two_cameras(), 1e3, 1e-6);
     let normal = p.linearise(c);
     let cameras = p.sizes().1;
@@ -154,7 +170,7 @@ fn the_gradient_is_the_derivative_of_the_cost() {
 }
 
 #[test]
-fn a_step_without_the_points_is_that_of_the_whole_system() {
+fn reduced_step_equals_full_step() {
     let mut p = two_cameras();
     p.points.truncate(30);
     p.observations.retain(|o| o.point < 30);
@@ -174,7 +190,7 @@ fn a_step_without_the_points_is_that_of_the_whole_system() {
     let jacobian = DMatrix::from_columns(&columns);
     let (mut whole, mut g) =
         (jacobian.transpose() * &jacobian, jacobian.transpose() * DVector::from_vec(residuals(&p)));
-    let priors = p.optics.iter().zip(&p.priors).flat_map(|(o, prior)| prior.deviations(o));
+    let priors = p.intrinsics.iter().zip(&p.priors).flat_map(|(o, prior)| prior.deviations(o));
     for (k, (distance, sigma)) in priors.enumerate() {
         let i = p.sizes().0 + k;
         whole[(i, i)] += 1.0 / (sigma * sigma);
@@ -190,33 +206,33 @@ fn a_step_without_the_points_is_that_of_the_whole_system() {
         // Differences of second order and rounding; a missing block shows in the first digit.
         assert!((*a - *b - want).length() < 1e-5 * (1.0 + want.length()), "{k}: {} {want}", *a - *b);
     }
-    let focal = |q: &Problem, k: usize| q.optics[k].focal / p.optics[k].focal - 1.0;
+    let focal = |q: &Problem, k: usize| q.intrinsics[k].focal / p.intrinsics[k].focal - 1.0;
     for k in 0..2 {
-        let want = -step[p.sizes().0 + OPTICS * k];
+        let want = -step[p.sizes().0 + INTRINSICS * k];
         assert!((focal(&next, k) - want).abs() < 1e-6, "{} {want}", focal(&next, k));
     }
 }
 
 #[test]
-fn displaced_photos_move_parameters_as_stated() {
+fn displacement_sigmas_match_displaced_photos() {
     let (_, mut truth) = scene(0.0);
     truth.priors[0].log_focal = (600f64.ln(), 0.35);
     let (by, half) = (vec![0.5; 4], vec![320.0; 4]);
-    let stated = truth.bent(1e9, &half, &by).unwrap();
+    let stated = truth.displacement_sigmas(1e9, &half, &by).unwrap();
     let (mut focal, mut rotation) = (0.0, 0.0);
-    for column in 0..4 * bend::PATTERNS {
-        let (camera, pattern) = (column / bend::PATTERNS, column % bend::PATTERNS);
+    for column in 0..4 * displacement::PATTERNS {
+        let (view, pattern) = (column / displacement::PATTERNS, column % displacement::PATTERNS);
         let mut p = truth.clone();
-        for o in p.observations.iter_mut().filter(|o| o.camera == camera) {
+        for o in p.observations.iter_mut().filter(|o| o.view == view) {
             let at = (o.pixel - DVec2::new(320.0, 240.0)) / 320.0;
-            o.pixel += bend::patterns(at)[pattern] * by[camera];
+            o.pixel += displacement::patterns(at)[pattern] * by[view];
         }
         p.solve(1e9, 30).unwrap();
-        focal += (p.optics[0].focal / 600.0).ln().powi(2);
+        focal += (p.intrinsics[0].focal / 600.0).ln().powi(2);
         rotation += rotation_angle(&(p.poses[3].rotation * truth.poses[3].rotation.transpose())).powi(2);
     }
-    println!("{} {focal} {} {rotation}", stated.optics[0][0], stated.rotations[3]);
-    assert!((stated.optics[0][0] / focal.sqrt() - 1.0).abs() < 0.05);
+    println!("{} {focal} {} {rotation}", stated.intrinsics[0][0], stated.rotations[3]);
+    assert!((stated.intrinsics[0][0] / focal.sqrt() - 1.0).abs() < 0.05);
     assert!((stated.rotations[3] / rotation.sqrt() - 1.0).abs() < 0.05);
-    assert_eq!((stated.optics[0][1], stated.rotations[0]), (0.0, 0.0), "held");
+    assert_eq!((stated.intrinsics[0][1], stated.rotations[0]), (0.0, 0.0), "held");
 }

@@ -1,4 +1,4 @@
-//! Which photos are taken of sets with known faults.
+//! Choice from sets of photos with known faults.
 use super::*;
 use crate::progress::Silent;
 use std::path::{Path, PathBuf};
@@ -24,23 +24,23 @@ fn blurred(image: &RgbImage, sigma: f32) -> RgbImage {
     RgbImage { width: image.width, height: image.height, data }
 }
 
-/// The four photos, named so that the order of names would take the bad ones.
+/// The four photos and faulty ones; the order of names would choose the faulty ones.
 fn folder_with_faults() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    let to = |name: &str| folder.path().join(name);
+    let path = |name: &str| folder.path().join(name);
     for (i, name) in ["b", "d", "f", "h"].iter().enumerate() {
-        std::fs::copy(breakfast(&format!("images/train_{i:02}.jpg")), to(&format!("{name}.jpg"))).unwrap();
+        std::fs::copy(breakfast(&format!("images/train_{i:02}.jpg")), path(&format!("{name}.jpg"))).unwrap();
     }
     let photo = |i: usize| photo::load(&breakfast(&format!("images/train_{i:02}.jpg"))).unwrap().image;
-    picture(&blurred(&photo(0), 2.5)).save(to("a_blurred.png")).unwrap();
-    // A second shot from the same place: two pixels aside and a third of a stop darker.
+    picture(&blurred(&photo(0), 2.5)).save(path("a_blurred.png")).unwrap();
+    // A second photo from the same place: two pixels aside and a third of a stop darker.
     let (shot, mut again) = (photo(1), photo(1));
     for y in 0..again.height {
         for x in 0..again.width {
             again.data[y * again.width + x] = shot.at((x + 2).min(shot.width - 1), y).map(|v| v * 0.9);
         }
     }
-    picture(&again).save(to("e_again.png")).unwrap();
+    picture(&again).save(path("e_again.png")).unwrap();
     // Another place: boxes of all sizes and colours.
     let mut elsewhere = image::RgbImage::new(640, 480);
     let mut state = 7u32;
@@ -55,22 +55,22 @@ fn folder_with_faults() -> tempfile::TempDir {
             elsewhere.put_pixel(u, v, colour);
         }
     }
-    elsewhere.save(to("z_elsewhere.png")).unwrap();
+    elsewhere.save(path("z_elsewhere.png")).unwrap();
     folder
 }
 
 #[test]
-fn blurred_repeated_and_foreign_photos_are_left_out() {
+fn choose_leaves_out_faulty_photos() {
     let folder = folder_with_faults();
     let candidates = photo::gather(&[folder.path().to_path_buf()], &Silent).unwrap();
     assert_eq!(candidates.len(), 7);
     let (chosen, choice) = choose(&candidates, 4, &Silent).unwrap();
     let used = choice.used.clone();
     assert_eq!(chosen.len(), 4);
-    // Of the pair taken from one place either may stand for both.
-    let one_of_both =
+    // Either photo of one place may be chosen.
+    let repeated_count =
         |list: &[String]| list.iter().filter(|n| ["d.jpg", "e_again.png"].contains(&n.as_str())).count();
-    assert_eq!(one_of_both(&used), 1, "{choice:?}");
+    assert_eq!(repeated_count(&used), 1, "{choice:?}");
     assert!(["b.jpg", "f.jpg", "h.jpg"].iter().all(|n| used.iter().any(|u| u == n)), "{choice:?}");
     let reason = |name: &str| choice.left_out.iter().find(|l| l.photo == name).map(|l| l.reason.clone());
     assert_eq!(reason("a_blurred.png"), Some(Reason::Blurred));
@@ -90,14 +90,14 @@ fn blurred_repeated_and_foreign_photos_are_left_out() {
 }
 
 #[test]
-fn as_many_photos_as_views_are_all_used() {
+fn photos_uses_all_when_few() {
     assert_eq!(photos(&[breakfast("images")], Some(4), &Silent).unwrap().0.len(), 4);
     let e = photos(&[breakfast("images")], Some(5), &Silent).unwrap_err();
     assert!(e.to_string().starts_with("--views 5: only 4"), "{e}");
 }
 
 #[test]
-fn long_lists_are_cut_short() {
+fn choice_message_shortens_long_lists() {
     let left_out =
         (0..30).map(|i| LeftOut { photo: format!("{i:02}.jpg"), reason: Reason::LittleNewArea }).collect();
     let choice = Choice { used: vec!["a.jpg".into(), "b.jpg".into()], left_out };
@@ -109,20 +109,19 @@ fn long_lists_are_cut_short() {
 }
 
 #[test]
-fn photos_of_two_places_are_not_mixed() {
+fn graph_choose_keeps_to_one_place() {
     // Photos 0-2 and 6-8 show one place, 3-5 and 9-10 another.
-    let place = |i: usize| i % 6 >= 3;
+    let is_second_place = |i: usize| i % 6 >= 3;
     let n = 11;
     let link = |i: usize, j: usize| {
-        let matches = if i != j && place(i) == place(j) { 60 } else { 3 };
+        let matches = if i != j && is_second_place(i) == is_second_place(j) { 60 } else { 3 };
         SimilarityInliers { matches, parallax: 0.05 }
     };
     let links = (0..n).map(|i| (0..n).map(|j| link(i, j)).collect()).collect();
     let graph = Graph { links, quality: vec![1.0; n], same: vec![vec![false; n]; n] };
     let chosen = graph.choose(4);
-    // Two of each place would show more in all, but no camera of one could be placed among those of
-    // the other.
-    assert!(chosen.iter().all(|i| !place(*i)), "{chosen:?}");
+    // Two of each place would cover more, but cannot be registered with each other.
+    assert!(chosen.iter().all(|i| !is_second_place(*i)), "{chosen:?}");
     let names: Vec<String> = (0..n).map(|i| i.to_string()).collect();
     assert_eq!(graph.reason(4, &chosen, &names), Reason::NoOverlap);
     let left = [0, 1, 2, 6, 7, 8].into_iter().find(|i| !chosen.contains(i)).unwrap();
@@ -130,17 +129,16 @@ fn photos_of_two_places_are_not_mixed() {
 }
 
 #[test]
-fn of_many_photos_those_of_like_colours_are_compared() {
-    // Photos that follow each other look different: for up to four steps the colours are 9 apart
-    // and more.
+fn pairs_compares_photos_of_similar_colour() {
+    // Consecutive photos differ: for up to four steps the colours are 9 apart and more.
     let colour = |k: usize| (37 * k % 60) as f32;
-    let seen = |k: usize| CandidateFeatures {
+    let features = |k: usize| CandidateFeatures {
         features: Keypoints::default(),
         diagonal: 1.0,
         sharpness: 1.0,
         signature: vec![colour(k)],
     };
-    let found = pairs(&(0..60).map(seen).collect::<Vec<_>>());
+    let found = pairs(&(0..60).map(features).collect::<Vec<_>>());
     for (i, j) in (0..60).flat_map(|i| (i + 1..60).map(move |j| (i, j))) {
         let alike = (colour(i) - colour(j)).abs() <= 6.0;
         assert!(!alike || found.contains(&(i, j)), "{i} and {j}");

@@ -1,28 +1,27 @@
-//! Gains and vignetting from differences of brightness: robust linear least squares with standard
-//! deviations.
+//! Gains and vignetting by robust linear least squares, with standard deviations.
 use super::sample::Pair;
 use crate::math::{median, quantile};
 use nalgebra::{DMatrix, DVector};
 use std::collections::BTreeMap;
 
-/// Prior σ of ln gain: four photos in a thousand are farther apart than 3 EV; it only holds photos
+/// Prior σ of ln gain: four photos in a thousand differ by more than 3 EV. It only fixes photos
 /// without points.
 const GAIN_PRIOR: f64 = 1.0;
-/// Prior σ of the vignetting terms: open lenses lose about a third in the corners.
+/// Prior σ of the vignetting terms: wide apertures lose about a third in the corners.
 const FALLOFF_PRIOR: [f64; 2] = [0.3, 0.15];
-/// Standard deviations beyond which a difference does not count (Tukey's biweight, 95 % efficient
-/// on Gaussian noise; Holland & Welsch 1977). Highlights are no noise around the matt points but a
-/// heap of their own, often the larger one, so a weight that never reaches zero lets them win.
+/// Cutoff of Tukey's biweight, standard deviations (95 % efficient on Gaussian noise; Holland &
+/// Welsch 1977). Highlights are not noise around the matt points but a cluster of their own, often
+/// the larger one, which would win with a weight that never reaches zero.
 const TUKEY: f64 = 4.685;
-/// Rounds of re-weighting; the estimate moves by less than one standard deviation after five.
+/// Rounds of re-weighting; after five the estimate moves by less than one standard deviation.
 const ROUNDS: usize = 12;
-/// Fewest common points that tell the difference of two photos by themselves.
+/// Fewest common points for the difference of two photos.
 const MIN_COMMON: usize = 20;
-/// Standard deviations that an effect must exceed before it is taken out.
+/// Standard deviations that a correction must exceed.
 const SIGNIFICANT: f64 = 4.0;
-/// Smallest exposure or colour difference worth touching photos for, ln.
+/// Smallest correction of exposure or colour, ln.
 const MIN_GAIN: f64 = 0.01;
-/// Smallest loss in the corners worth touching photos for, ln.
+/// Smallest correction of the corners, ln.
 const MIN_FALLOFF: f64 = 0.03;
 
 /// One of the three linear problems.
@@ -32,19 +31,19 @@ pub(super) struct System<'a> {
     pub(super) views: usize,
     /// Lens of every view.
     pub(super) lenses: &'a [usize],
-    /// Which difference is explained: 0 = brightness, 1 = red, 2 = blue.
+    /// Difference to fit: 0 = brightness, 1 = red, 2 = blue.
     pub(super) channel: usize,
 }
 
-/// Which unknowns are estimated; the others are 0.
+/// Estimated unknowns; the others are 0.
 #[derive(Clone, Debug, PartialEq)]
-struct Free {
+struct Unknowns {
     gains: bool,
     /// Per lens.
     falloff: Vec<bool>,
 }
 
-/// Unknowns of a [`System`] with one standard deviation each.
+/// Solution of a [`System`] with standard deviations.
 #[derive(Clone, Debug)]
 pub(super) struct Solution {
     /// ln, per view.
@@ -54,7 +53,7 @@ pub(super) struct Solution {
     pub(super) falloff: Vec<[f64; 2]>,
     pub(super) corner_sigma: Vec<f64>,
     pub(super) reference: usize,
-    /// Per pair: 1 = it agrees, 0 = something else than light of the whole photo is at work.
+    /// Biweight per pair: 1 = inlier, 0 = a cause other than the light of the whole photo.
     pub(super) agreement: Vec<f64>,
 }
 
@@ -63,24 +62,23 @@ impl Solution {
         self.gain.iter().zip(&self.sigma).any(|(g, d)| g.abs() > MIN_GAIN.max(SIGNIFICANT * d))
     }
 
-    /// Per lens: darker corners than chance explains. Brighter ones are no vignetting.
+    /// True per lens with significantly darker corners. Brighter ones are no vignetting.
     fn falloff_matters(&self) -> Vec<bool> {
         let corner = self.falloff.iter().map(|f| f[0] + f[1]);
         corner.zip(&self.corner_sigma).map(|(v, d)| -v > MIN_FALLOFF.max(SIGNIFICANT * d)).collect()
     }
 }
 
-/// Exposure and vignetting, each only if it is significant. The photo of median exposure is the
-/// reference: its light is the scene's, so that the scene looks as one of the photos and few values
-/// leave the range of the files.
+/// Exposure and vignetting, each only if significant. The photo of median exposure is the
+/// reference: its light is the scene's, so that the scene looks like one of the photos and few
+/// values leave the range of the files.
 pub(super) fn exposure(system: &System) -> Solution {
     let lenses = system.lenses.iter().max().map_or(0, |l| l + 1);
-    let mut free = Free { gains: true, falloff: vec![true; lenses] };
+    let mut free = Unknowns { gains: true, falloff: vec![true; lenses] };
     let first = system.solve(&free, 0);
     let mut order: Vec<usize> = (0..system.views).collect();
     order.sort_by(|a, b| first.gain[*a].total_cmp(&first.gain[*b]));
-    // Of two middle ones the darker: the brighter photos then lose nothing when they are darkened
-    // to it.
+    // Of two middle ones the darker: darkening the others to it loses nothing.
     let reference = order[(system.views - 1) / 2];
     let mut found = system.solve(&free, reference);
     free.falloff = found.falloff_matters();
@@ -97,10 +95,10 @@ pub(super) fn exposure(system: &System) -> Solution {
 impl System<'_> {
     pub(super) fn gains(&self, reference: usize) -> Solution {
         let lenses = self.lenses.iter().max().map_or(0, |l| l + 1);
-        self.solve(&Free { gains: true, falloff: vec![false; lenses] }, reference)
+        self.solve(&Unknowns { gains: true, falloff: vec![false; lenses] }, reference)
     }
 
-    /// Columns that a pair touches, with their coefficients.
+    /// Row of a pair: columns with their coefficients.
     fn row(&self, pair: &Pair, column: &Columns) -> Vec<(usize, f64)> {
         let mut row = Vec::with_capacity(6);
         for (k, sign) in [(0, 1.0), (1, -1.0)] {
@@ -117,24 +115,22 @@ impl System<'_> {
         pair.variance[self.channel.min(1)]
     }
 
-    /// Re-weighted least squares; standard deviations from the spread of the cells' scores (the
-    /// sandwich estimator for clusters, Liang & Zeger 1986), since residuals within a cell have
-    /// causes in common.
-    fn solve(&self, free: &Free, reference: usize) -> Solution {
+    /// Iteratively re-weighted least squares. Standard deviations: cluster-robust sandwich
+    /// estimator (Liang & Zeger 1986) over cells, since residuals within a cell have common causes.
+    fn solve(&self, free: &Unknowns, reference: usize) -> Solution {
         let columns = Columns::new(free, self.views, reference);
         let rows: Vec<_> = self.pairs.iter().map(|p| self.row(p, &columns)).collect();
-        let mut x = self.start(&columns);
+        let mut x = self.initial(&columns);
         let (mut h, mut residuals) = (DMatrix::from_diagonal(&columns.prior), Vec::new());
         let (mut weights, mut agreement) = (vec![0.0; rows.len()], vec![0.0; rows.len()]);
-        // Slope of the scores against their secant: what a redescending weight takes from the
-        // information.
+        // Slope of the scores over their secant: information left by a redescending weight.
         let mut slope = 1.0;
         for _ in 0..ROUNDS {
             residuals = self.residuals(&rows, &x);
             let mut sizes: Vec<f64> =
                 self.pairs.iter().zip(&residuals).map(|(p, r)| r.abs() / self.variance(p).sqrt()).collect();
-            // 1.4826 median |u| is σ of Gaussian u; below a tenth of the expected noise the model
-            // is exact, and above that noise something else than noise is at work.
+            // 1.4826 median |u| is σ of Gaussian u. Below a tenth of the expected noise the model
+            // is exact; above it the cause is not noise.
             let scale = (1.4826 * median(&mut sizes).unwrap_or(1.0)).clamp(0.1, 1.0);
             h = DMatrix::from_diagonal(&columns.prior);
             let mut g = DVector::zeros(x.len());
@@ -173,10 +169,9 @@ impl System<'_> {
         Solution { agreement, ..columns.solution(&x, covariance.as_ref(), reference) }
     }
 
-    /// Gains from the photos two by two: what the closer half of the common points agrees on (least
-    /// median of squares, Rousseeuw 1984), joined with least absolute deviations, so that a pair
-    /// whose highlights agree better is outvoted.
-    fn start(&self, columns: &Columns) -> DVector<f64> {
+    /// Initial gains: pairwise differences by the shorth (least median of squares, Rousseeuw 1984),
+    /// combined by least absolute deviations against pairs whose highlights agree better.
+    fn initial(&self, columns: &Columns) -> DVector<f64> {
         let mut common: BTreeMap<[usize; 2], Vec<f64>> = BTreeMap::new();
         for pair in self.pairs {
             let [a, b] = pair.views;
@@ -184,19 +179,20 @@ impl System<'_> {
             common.entry([a.min(b), a.max(b)]).or_default().push(if a < b { d } else { -d });
         }
         common.retain(|_, d| d.len() >= MIN_COMMON);
-        let told: Vec<([usize; 2], f64)> = common.into_iter().map(|(v, mut d)| (v, shorth(&mut d))).collect();
+        let offsets: Vec<([usize; 2], f64)> =
+            common.into_iter().map(|(v, mut d)| (v, shorth(&mut d))).collect();
         let mut x = DVector::zeros(columns.prior.len());
-        // Only for photos that share too few points with any other: absolute deviations would not
-        // outweigh the prior itself where photos are more than its σ apart.
+        // Only for photos with too few points in common with any other: absolute deviations would
+        // not outweigh the full prior where photos differ by more than its σ.
         let prior = 1e-6 * &columns.prior;
         for round in 0..ROUNDS {
             let mut h = DMatrix::from_diagonal(&prior);
             let mut g = DVector::zeros(x.len());
-            for (views, difference) in &told {
+            for (views, difference) in &offsets {
                 let row = [(columns.gain[views[0]], 1.0), (columns.gain[views[1]], -1.0)];
                 let row = row.into_iter().filter_map(|(c, sign)| Some((c?, sign)));
                 let r = difference - row.clone().map(|(c, sign)| sign * x[c]).sum::<f64>();
-                // A thousandth is less than a grey level.
+                // A thousandth is below a grey level.
                 let weight = if round == 0 { 1.0 } else { 1.0 / r.abs().max(1e-3) };
                 for (a, ca) in row.clone() {
                     g[a] += weight * ca * difference;
@@ -210,31 +206,30 @@ impl System<'_> {
     }
 
     fn residuals(&self, rows: &[Vec<(usize, f64)>], x: &DVector<f64>) -> Vec<f64> {
-        let of = |(p, row): (&Pair, &Vec<(usize, f64)>)| {
+        let residual = |(p, row): (&Pair, &Vec<(usize, f64)>)| {
             p.difference[self.channel] - row.iter().map(|(a, c)| c * x[*a]).sum::<f64>()
         };
-        self.pairs.iter().zip(rows).map(of).collect()
+        self.pairs.iter().zip(rows).map(residual).collect()
     }
 
-    /// Per view: the |ln| difference to the others that is left, in the tenth of its cells that
-    /// fits worst. A cell takes the median of its pairs, so that noise and single highlights do not
-    /// count.
+    /// Per view: 0.9 quantile over its cells of the remaining |ln| difference to the others. A cell
+    /// takes the median of its pairs, so that noise and single highlights do not count.
     pub(super) fn unexplained(&self, found: &Solution) -> Vec<f64> {
         let mut cells: BTreeMap<(usize, usize), Vec<f64>> = BTreeMap::new();
         for p in self.pairs {
-            let shown = |k: usize| {
+            let predicted = |k: usize| {
                 let f = found.falloff[self.lenses[p.views[k]]];
                 found.gain[p.views[k]] + f[0] * p.r[k][0] + f[1] * p.r[k][1]
             };
-            let left = p.difference[self.channel] - shown(0) + shown(1);
-            cells.entry((p.views[0], p.cells[0])).or_default().push(left);
-            cells.entry((p.views[1], p.cells[1])).or_default().push(-left);
+            let residual = p.difference[self.channel] - predicted(0) + predicted(1);
+            cells.entry((p.views[0], p.cells[0])).or_default().push(residual);
+            cells.entry((p.views[1], p.cells[1])).or_default().push(-residual);
         }
         let mut per_view = vec![Vec::new(); self.views];
-        for ((view, _), mut left) in cells {
-            // Fewer pairs have no usable median.
-            if left.len() >= 5 {
-                per_view[view].extend(median(&mut left).map(f64::abs));
+        for ((view, _), mut residuals) in cells {
+            // Fewer pairs have no reliable median.
+            if residuals.len() >= 5 {
+                per_view[view].extend(median(&mut residuals).map(f64::abs));
             }
         }
         per_view.iter_mut().map(|v| quantile(v, 0.9).unwrap_or(0.0)).collect()
@@ -249,7 +244,7 @@ fn shorth(values: &mut [f64]) -> f64 {
     shortest.map_or(0.0, |w| w[half / 2])
 }
 
-/// Where the unknowns stand.
+/// Column of each unknown.
 struct Columns {
     gain: Vec<Option<usize>>,
     falloff: Vec<Option<usize>>,
@@ -258,7 +253,7 @@ struct Columns {
 }
 
 impl Columns {
-    fn new(free: &Free, views: usize, reference: usize) -> Columns {
+    fn new(free: &Unknowns, views: usize, reference: usize) -> Columns {
         let mut prior: Vec<f64> = Vec::new();
         let mut take = |wanted: bool, sigmas: &[f64]| {
             wanted.then(|| {
@@ -275,7 +270,7 @@ impl Columns {
         let variance = |a: usize, b: usize| covariance.map_or(f64::INFINITY, |c| c[(a, b)]);
         let gain = |c: &Option<usize>| c.map_or(0.0, |c| x[c]);
         let falloff = |c: &Option<usize>| c.map_or([0.0; 2], |c| [x[c], x[c + 1]]);
-        let corner = |c: &Option<usize>| {
+        let corner_sigma = |c: &Option<usize>| {
             c.map_or(0.0, |c| {
                 (variance(c, c) + 2.0 * variance(c, c + 1) + variance(c + 1, c + 1)).max(0.0).sqrt()
             })
@@ -284,7 +279,7 @@ impl Columns {
             gain: self.gain.iter().map(gain).collect(),
             sigma: self.gain.iter().map(|c| c.map_or(0.0, |c| variance(c, c).max(0.0).sqrt())).collect(),
             falloff: self.falloff.iter().map(falloff).collect(),
-            corner_sigma: self.falloff.iter().map(corner).collect(),
+            corner_sigma: self.falloff.iter().map(corner_sigma).collect(),
             reference,
             agreement: Vec::new(),
         }

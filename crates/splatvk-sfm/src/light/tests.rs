@@ -7,8 +7,8 @@ use glam::DVec2;
 
 const SIZE: (usize, usize) = (320, 240);
 
-/// Photos of spots of plain colour at random places, lit as told, with noise in ln; every spot is
-/// seen by all photos.
+/// Photos of spots of plain colour at random places under `lights`, with noise in ln; all photos
+/// show every spot.
 fn spots(lights: &[Light], noise: f64, seed: u64) -> (Vec<Photo>, SparseModel) {
     let mut rng = Random::new(seed);
     let mut images =
@@ -59,8 +59,7 @@ fn light(ev: f64, red: f64, blue: f64) -> Light {
     Light { gain: [e + red, e - red - blue, e + blue].map(f64::exp), falloff: [-0.15, -0.05], ..Light::NONE }
 }
 
-/// Largest errors against the truth: exposure (EV), exposure in standard deviations, colour (ln),
-/// corner.
+/// Largest errors: exposure (EV), exposure in standard deviations, colour (ln), corner.
 fn errors(found: &[Light], truth: &[Light]) -> [f64; 4] {
     let reference = found.iter().position(|l| l.sigma_ev == 0.0).unwrap();
     let mut out = [0.0f64; 4];
@@ -78,7 +77,7 @@ fn errors(found: &[Light], truth: &[Light]) -> [f64; 4] {
 }
 
 #[test]
-fn photos_of_cameras_told_apart_have_corners_of_their_own() {
+fn estimate_separates_vignetting_by_camera() {
     let truth: Vec<Light> = [[-0.3, -0.05], [0.0, 0.0], [-0.3, -0.05], [0.0, 0.0]]
         .map(|falloff| Light { falloff, ..Light::NONE })
         .to_vec();
@@ -87,28 +86,28 @@ fn photos_of_cameras_told_apart_have_corners_of_their_own() {
     model.fitted = [0, 1, 0, 1].map(fitted).to_vec();
     let found = estimate(&photos, &model);
     for (f, t) in found.iter().zip(&truth) {
-        // As one camera they would all lose half of it.
+        // As one camera, all would get half of the vignetting.
         assert!((f.corner() - t.corner()).abs() < 0.05, "{} {}", f.corner(), t.corner());
     }
 }
 
 #[test]
-fn known_light_is_recovered_within_its_sigma() {
+fn estimate_within_stated_sigma() {
     let truth =
         [light(-0.35, 0.04, -0.03), light(0.0, 0.0, 0.0), light(0.3, -0.05, 0.02), light(0.5, 0.0, 0.06)];
     let (photos, model) = spots(&truth, 0.05, 1);
     let found = estimate(&photos, &model);
     let [ev, sigmas, colour, corner] = errors(&found, &truth);
-    // 600 spots with σ 0.05: 0.003 in ln, 0.004 EV; the corner is extrapolated a little.
+    // 600 spots with σ 0.05: 0.003 in ln, 0.004 EV; the corner is slightly extrapolated.
     assert!(ev < 0.02 && sigmas < 4.0 && colour < 0.01 && corner < 0.03, "{ev} {sigmas} {colour} {corner}");
     assert!(found.iter().all(|l| l.unexplained < 0.1), "{found:?}");
-    // The photo of median exposure, of two the darker, keeps its light but for the vignetting.
+    // The photo of median exposure (the darker of two) keeps its gain.
     let kept: Vec<bool> = found.iter().map(|l| l.gain == [1.0; 3]).collect();
     assert_eq!(kept, [false, true, false, false]);
 }
 
 #[test]
-fn a_photo_added_later_comes_into_the_light_of_the_others() {
+fn in_light_of_keeps_known_photos() {
     let lit = [Light::NONE, Light::NONE, Light::NONE, light(0.5, 0.05, -0.04)];
     let (photos, mut model) = spots(&lit, 0.01, 7);
     let (plain, _) = spots(&[Light::NONE; 4], 0.01, 7);
@@ -120,12 +119,12 @@ fn a_photo_added_later_comes_into_the_light_of_the_others() {
     let colours = |p: &Photo| p.image.data.as_flattened().to_vec();
     let off =
         colours(&after[3]).iter().zip(colours(&plain[3])).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-    // Half a stop is 0.14 at the brightest spots; 0.03 is what the corners may be off by.
+    // Half a stop is 0.14 at the brightest spots; the corners may be wrong by 0.03.
     assert!(off < 0.03, "{off}");
 }
 
 #[test]
-fn photos_many_stops_apart_are_brought_together() {
+fn estimate_spans_many_stops() {
     let truth = [light(-1.8, 0.0, 0.0), light(0.0, 0.02, 0.0), light(1.8, 0.0, -0.02)];
     let (photos, model) = spots(&truth, 0.03, 6);
     let [ev, sigmas, colour, corner] = errors(&estimate(&photos, &model), &truth);
@@ -133,7 +132,7 @@ fn photos_many_stops_apart_are_brought_together() {
 }
 
 #[test]
-fn steady_light_is_left_alone() {
+fn equalised_keeps_steady_light() {
     for seed in 0..5 {
         let (photos, model) = spots(&[Light::NONE; 4], 0.1, seed);
         let found = estimate(&photos, &model);
@@ -145,11 +144,10 @@ fn steady_light_is_left_alone() {
 }
 
 #[test]
-fn wrong_matches_and_clipped_spots_do_not_count() {
+fn estimate_ignores_mismatches_and_clipping() {
     let truth = [light(-0.4, 0.0, 0.0), light(0.0, 0.05, 0.0), light(0.4, 0.0, 0.0), light(1.3, 0.0, 0.0)];
     let (photos, mut model) = spots(&truth, 0.05, 3);
-    // The last photo clips spots above 1 / 2.46 = 0.41; a fifth of the points are matched to
-    // another spot.
+    // The last photo clips spots above 1 / 2.46 = 0.41; a fifth of the points are mismatched.
     let clipped = photos[3].image.data.iter().filter(|c| c.iter().any(|v| *v > 1.0)).count();
     assert!(clipped > 1000);
     let mut photos = photos;
@@ -163,12 +161,12 @@ fn wrong_matches_and_clipped_spots_do_not_count() {
 }
 
 #[test]
-fn highlights_are_no_exposure() {
+fn estimate_ignores_highlights() {
     let truth = [light(-0.3, 0.0, 0.0), light(0.0, 0.0, 0.0), light(0.2, 0.03, 0.0), light(0.4, 0.0, 0.0)];
     for seed in 0..3 {
         let (mut photos, model) = spots(&truth, 0.03, seed);
-        // White light of every strength over seven of ten spots of the last photo, over two of ten
-        // of the others.
+        // White highlights of random strength on seven of ten spots of the last photo, and two of
+        // ten of the others.
         let mut rng = Random::new(100 + seed);
         for point in &model.points {
             for (v, pixel) in &point.views {
@@ -191,7 +189,7 @@ fn highlights_are_no_exposure() {
 }
 
 #[test]
-fn a_photo_in_another_light_is_named() {
+fn estimate_flags_shadowed_photo() {
     let (mut photos, model) = spots(&[Light::NONE; 4], 0.05, 4);
     // A shadow over the left half of one photo: 40 % of the light.
     for k in (0..SIZE.0 * SIZE.1).filter(|k| k % SIZE.0 < SIZE.0 / 2) {
@@ -203,7 +201,7 @@ fn a_photo_in_another_light_is_named() {
 }
 
 #[test]
-fn real_points_tell_the_light_of_real_photos() {
+fn estimate_recovers_light_of_real_photos() {
     let truth = testing::train(&testing::folder());
     let cameras: Vec<Camera> = truth.cameras;
     let model = sfm::with_cameras(&truth.photos, &cameras, &[], &Silent).unwrap();
@@ -217,6 +215,6 @@ fn real_points_tell_the_light_of_real_photos() {
     let found = estimate(&photos, &model);
     eprintln!("lit: {found:?}");
     let [ev, _, colour, corner] = errors(&found, &lights);
-    // 0.05 EV is 3.5 %, below what a viewer sees side by side.
+    // 0.05 EV is 3.5 %, invisible side by side.
     assert!(ev < 0.05 && colour < 0.02 && corner < 0.05, "{ev} {colour} {corner}");
 }

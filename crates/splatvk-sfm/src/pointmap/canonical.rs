@@ -1,16 +1,16 @@
-//! Steps B and C: one depth map per view from all pairs that contain it, and the focal lengths.
+//! Steps B and C: a canonical depth map per view from all its pairs, and the focal lengths.
 use crate::math::median;
 use crate::scene::{Camera, ModelView, PairPointmaps, Pointmap};
 use glam::{DVec2, DVec3};
 
-/// Depth of one view from all its pairs, in the scale of its reference pair.
+/// Canonical pointmap of one view: mean over all its pairs in the scale of the reference pair.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Canonical {
     /// [H, W] points in the view's own camera frame.
     pub(super) points: Vec<DVec3>,
     /// [H, W] `Σw²/Σw` of w = confidence − 1.
     pub(super) confidence: Vec<f64>,
-    /// [H, W] weighted standard deviation of ln z between the pairs: the depth's uncertainty.
+    /// [H, W] weighted standard deviation of ln z between the pairs: uncertainty of the depth.
     pub(super) spread: Vec<f64>,
 }
 
@@ -30,11 +30,13 @@ fn mean_confidence(m: &Pointmap) -> f64 {
     m.confidence.iter().map(|c| *c as f64).sum::<f64>() / m.confidence.len().max(1) as f64
 }
 
-/// Factor that brings `map` to the scale of the canonical points: median z ratio over pixels where
-/// both are confident.
+pub(super) fn median_confidence(m: &Pointmap) -> Option<f64> {
+    median(&mut m.confidence.iter().map(|c| *c as f64).collect::<Vec<_>>())
+}
+
+/// Scale from `map` to `reference`: median ratio of z over pixels above median confidence in both.
 pub(super) fn scale_to(reference: &Pointmap, map: &Pointmap) -> Option<f64> {
-    let middle = |m: &Pointmap| median(&mut m.confidence.iter().map(|c| *c as f64).collect::<Vec<_>>());
-    let (a, b) = (middle(reference)?, middle(map)?);
+    let (a, b) = (median_confidence(reference)?, median_confidence(map)?);
     let mut ratios: Vec<f64> = (0..map.points.len())
         .filter(|&k| reference.confidence[k] as f64 >= a && map.confidence[k] as f64 >= b)
         .filter(|&k| reference.points[k][2] > 0.0 && map.points[k][2] > 0.0)
@@ -43,11 +45,12 @@ pub(super) fn scale_to(reference: &Pointmap, map: &Pointmap) -> Option<f64> {
     median(&mut ratios)
 }
 
-pub(super) fn all(views: &[ModelView], pairs: &[PairPointmaps]) -> Vec<Canonical> {
-    (0..views.len()).map(|v| of_view(views[v].width * views[v].height, &own_maps(pairs, v))).collect()
+/// Canonical map of every view.
+pub(super) fn canonical_maps(views: &[ModelView], pairs: &[PairPointmaps]) -> Vec<Canonical> {
+    (0..views.len()).map(|v| canonical_map(views[v].width * views[v].height, &own_maps(pairs, v))).collect()
 }
 
-fn of_view(size: usize, maps: &[&Pointmap]) -> Canonical {
+fn canonical_map(size: usize, maps: &[&Pointmap]) -> Canonical {
     let mut best: Option<(f64, &Pointmap)> = None;
     for m in maps {
         let mean = mean_confidence(m);
@@ -66,7 +69,7 @@ fn of_view(size: usize, maps: &[&Pointmap]) -> Canonical {
             if !(p.is_finite() && p.z > 0.0) {
                 continue;
             }
-            // A hair above zero, so that a pixel of least confidence everywhere still has a depth.
+            // Above zero, so that a pixel of lowest confidence in all pairs still has a depth.
             let w = (m.confidence[k] as f64 - 1.0).max(0.0) + 1e-3;
             let l = (p.z * s).ln();
             sum += p * (s * w);
@@ -88,7 +91,7 @@ fn of_view(size: usize, maps: &[&Pointmap]) -> Canonical {
     out
 }
 
-/// Focal lengths and which of them each view uses.
+/// Focal lengths, shared by groups of views.
 #[derive(Clone, Debug)]
 pub(super) struct Focals {
     pub(super) group: Vec<usize>,
@@ -99,13 +102,13 @@ pub(super) struct Focals {
 }
 
 impl Focals {
-    /// With the focal lengths of a network's cameras to start from; the priors stay.
-    pub(super) fn started(&self, cameras: &[Camera]) -> Focals {
-        let of_group = |g: usize| {
+    /// Starts from the median focal lengths of a network's cameras; the priors stay.
+    pub(super) fn starting_from(&self, cameras: &[Camera]) -> Focals {
+        let group_median = |g: usize| {
             let members = cameras.iter().zip(&self.group).filter(|(_, own)| **own == g);
             median(&mut members.map(|(c, _)| (c.fx * c.fy).sqrt()).collect::<Vec<f64>>())
         };
-        let values = self.values.iter().enumerate().map(|(g, f)| of_group(g).unwrap_or(*f)).collect();
+        let values = self.values.iter().enumerate().map(|(g, f)| group_median(g).unwrap_or(*f)).collect();
         Focals { values, ..self.clone() }
     }
 
@@ -114,70 +117,74 @@ impl Focals {
     }
 }
 
-/// Weighted Weiszfeld estimate: minimises `Σ w |p − f·(x/z, y/z)|` over f.
+/// Weiszfeld estimate of f, which minimises `Σ w |p − f·(x/z, y/z)|`, with the total weight.
 pub(super) fn weiszfeld(view: &ModelView, c: &Canonical) -> Option<(f64, f64)> {
-    let middle = view.centre();
-    // Every third pixel in both axes: the estimate averages over tens of thousands all the same.
-    struct Sample {
-        /// Pixel from the principal point.
-        pixel: DVec2,
-        /// (x, y) / z of its point.
-        direction: DVec2,
-        weight: f64,
-    }
-    let samples: Vec<Sample> = (0..c.points.len())
+    let principal_point = view.centre();
+    // Every third pixel in both axes still leaves tens of thousands of samples.
+    let samples: Vec<FocalSample> = (0..c.points.len())
         .filter(|k| (k % view.width).is_multiple_of(3) && (k / view.width).is_multiple_of(3))
         .filter(|&k| c.points[k].z > 0.0)
         .map(|k| {
-            let p = DVec2::new((k % view.width) as f64 + 0.5, (k / view.width) as f64 + 0.5) - middle;
+            let p =
+                DVec2::new((k % view.width) as f64 + 0.5, (k / view.width) as f64 + 0.5) - principal_point;
             let x = c.points[k];
-            Sample { pixel: p, direction: DVec2::new(x.x, x.y) / x.z, weight: c.confidence[k] }
+            FocalSample { pixel: p, direction: DVec2::new(x.x, x.y) / x.z, weight: c.confidence[k] }
         })
         .collect();
-    let solve = |weight: &dyn Fn(&Sample) -> f64| {
-        let (mut a, mut b) = (0.0, 0.0);
-        for s in &samples {
-            let w = weight(s);
-            a += w * s.pixel.dot(s.direction);
-            b += w * s.direction.length_squared();
-        }
-        a / b
-    };
-    let mut f = solve(&|s| s.weight);
+    let mut f = weighted_focal(&samples, |s| s.weight);
     for _ in 0..20 {
-        f = solve(&|s| s.weight / (s.pixel - s.direction * f).length().max(1e-8));
+        f = weighted_focal(&samples, |s| s.weight / (s.pixel - s.direction * f).length().max(1e-8));
     }
     let total: f64 = samples.iter().map(|s| s.weight).sum();
     (f.is_finite() && f > 0.0).then_some((f, total))
 }
 
-/// Views of different groups whose estimates agree this well share a focal length all the same when
-/// there is no EXIF.
+/// Sample of [`weiszfeld`].
+struct FocalSample {
+    /// Pixel from the principal point.
+    pixel: DVec2,
+    /// (x, y) / z of its point.
+    direction: DVec2,
+    weight: f64,
+}
+
+/// Weighted least-squares focal length.
+fn weighted_focal(samples: &[FocalSample], weight: impl Fn(&FocalSample) -> f64) -> f64 {
+    let (mut a, mut b) = (0.0, 0.0);
+    for s in samples {
+        let w = weight(s);
+        a += w * s.pixel.dot(s.direction);
+        b += w * s.direction.length_squared();
+    }
+    a / b
+}
+
+/// Without EXIF, all views share a focal length if their estimates differ by less than this share.
 const AGREEMENT: f64 = 0.15;
 
 pub(super) fn focals(views: &[ModelView], canonical: &[Canonical]) -> Focals {
     let estimates: Vec<(f64, f64)> = views
         .iter()
         .zip(canonical)
-        // 1.2 × the width (45°) where a view has no points at all; the prior then decides.
+        // 1.2 × the width (45°) for a view without points; the prior then decides.
         .map(|(v, c)| weiszfeld(v, c).unwrap_or((1.2 * v.width as f64, 1e-9)))
         .collect();
     let no_exif = views.iter().all(|v| v.exif_focal.is_none());
     let same_size = views.iter().all(|v| (v.width, v.height) == (views[0].width, views[0].height));
     let (low, high) = estimates.iter().fold((f64::MAX, 0f64), |m, e| (m.0.min(e.0), m.1.max(e.0)));
     let share_all = no_exif && same_size && high / low < 1.0 + AGREEMENT;
-    let mut names: Vec<usize> = Vec::new();
+    let mut keys: Vec<usize> = Vec::new();
     let mut group = Vec::new();
     for v in views {
         let key = if share_all { 0 } else { v.camera_group };
-        let g = names.iter().position(|n| *n == key).unwrap_or_else(|| {
-            names.push(key);
-            names.len() - 1
+        let g = keys.iter().position(|k| *k == key).unwrap_or_else(|| {
+            keys.push(key);
+            keys.len() - 1
         });
         group.push(g);
     }
     let (mut values, mut priors) = (Vec::new(), Vec::new());
-    for g in 0..names.len() {
+    for g in 0..keys.len() {
         let members: Vec<usize> = (0..views.len()).filter(|v| group[*v] == g).collect();
         let mut exif: Vec<f64> = members.iter().filter_map(|v| views[*v].exif_focal).collect();
         match median(&mut exif) {

@@ -1,4 +1,4 @@
-//! Step G: depth maps at working resolution, cleaned and masked, and de-duplicated points.
+//! Step G: filtered depth maps at working resolution, and points without duplicates.
 use super::adjust::Adjustment;
 use super::canonical::Canonical;
 use crate::Geometry;
@@ -6,15 +6,15 @@ use crate::math::quantile;
 use crate::scene::{Camera, DepthMap, Image, ModelView, PointCloud, Pointmaps};
 use glam::DVec2;
 
-/// A less confident point this much in front of another view's surface is wrong (depth noise is
-/// about this large).
+/// A less confident point this much before another surface is a floater; depth noise is about as
+/// large.
 const CLEAN_TOLERANCE: f64 = 0.005;
 /// A larger relative jump to a neighbour is an occlusion edge: the network interpolates across it.
 const EDGE_JUMP: f64 = 0.06;
 /// Points of two views closer than this in depth are the same point.
 const SAME_DEPTH: f64 = 0.01;
-/// Share of the pixels that are no points whatever the scale of their confidence.
-const LEAST_CONFIDENT: f64 = 0.2;
+/// Share of least confident pixels that give no points, at any scale of the confidence.
+const UNUSED_SHARE: f64 = 0.2;
 
 /// Depth and confidence of one view at model resolution.
 struct Layer {
@@ -26,15 +26,15 @@ struct Layer {
 pub(super) fn output(maps: &Pointmaps, canonical: &[Canonical], a: &Adjustment) -> Geometry {
     let views = &maps.views;
     let mut layers: Vec<Layer> = (0..views.len()).map(|v| layer(&views[v], &canonical[v], a, v)).collect();
-    clean(&mut layers, &partners(maps));
+    remove_floaters(&mut layers, &paired_views(maps));
     for l in &mut layers {
         mask_edges(l);
     }
-    // The canonical confidence counts from 0.
+    // The canonical confidence starts at 0.
     let least = least_confidence(&layers, maps.confidence_floor.map(|c| c - 1.0));
-    // From here on 1 is that of the least confident point, whatever the network's scale.
+    // From here on the least confident point has confidence 1, at any scale of the network.
     layers.iter_mut().flat_map(|l| &mut l.confidence).for_each(|c| *c /= least);
-    let depths = views.iter().zip(&layers).map(|(v, l)| to_working(v, l)).collect();
+    let depths = views.iter().zip(&layers).map(|(v, l)| to_working_size(v, l)).collect();
     let cameras = (0..views.len()).map(|v| views[v].working_camera(a.focal(v), &a.state.poses[v])).collect();
     Geometry {
         cameras,
@@ -47,7 +47,7 @@ pub(super) fn output(maps: &Pointmaps, canonical: &[Canonical], a: &Adjustment) 
 }
 
 fn layer(view: &ModelView, c: &Canonical, a: &Adjustment, index: usize) -> Layer {
-    let middle = view.centre();
+    let principal_point = view.centre();
     let f = a.focal(index);
     let depth = (0..view.width * view.height)
         .map(|k| {
@@ -62,8 +62,8 @@ fn layer(view: &ModelView, c: &Canonical, a: &Adjustment, index: usize) -> Layer
             height: view.height as u32,
             fx: f,
             fy: f,
-            cx: middle.x,
-            cy: middle.y,
+            cx: principal_point.x,
+            cy: principal_point.y,
             pose: a.state.poses[index],
         },
         depth,
@@ -75,12 +75,12 @@ impl Layer {
     fn width(&self) -> usize {
         self.camera.width as usize
     }
-    fn world(&self, k: usize) -> glam::DVec3 {
+    fn unproject(&self, k: usize) -> glam::DVec3 {
         let p = DVec2::new((k % self.width()) as f64 + 0.5, (k / self.width()) as f64 + 0.5);
         self.camera.unproject(p, self.depth[k])
     }
-    /// Pixel index under a world point and the point's depth.
-    fn hit(&self, world: glam::DVec3) -> Option<(usize, f64)> {
+    /// Pixel index and depth of a world point, if it projects into the view.
+    fn project(&self, world: glam::DVec3) -> Option<(usize, f64)> {
         let (p, z) = self.camera.project(world);
         let inside = z > 0.0
             && p.x >= 0.0
@@ -91,8 +91,8 @@ impl Layer {
     }
 }
 
-/// The views with which each shares a pair: those that show much of the same.
-fn partners(maps: &Pointmaps) -> Vec<Vec<usize>> {
+/// Views that share a pair with each view: those of large overlap.
+fn paired_views(maps: &Pointmaps) -> Vec<Vec<usize>> {
     let mut all = vec![Vec::new(); maps.views.len()];
     for pair in &maps.pairs {
         all[pair.first].push(pair.second);
@@ -101,17 +101,17 @@ fn partners(maps: &Pointmaps) -> Vec<Vec<usize>> {
     all
 }
 
-/// Removes points that float in front of a more confident surface of a partner.
-fn clean(layers: &mut [Layer], partners: &[Vec<usize>]) {
+/// Removes points in front of a more confident surface of a view of their pairs.
+fn remove_floaters(layers: &mut [Layer], partners: &[Vec<usize>]) {
     let removed: Vec<Vec<usize>> = (0..layers.len())
         .map(|i| {
             let l = &layers[i];
             (0..l.depth.len())
                 .filter(|&k| l.depth[k] > 0.0)
                 .filter(|&k| {
-                    let x = l.world(k);
+                    let x = l.unproject(k);
                     partners[i].iter().map(|j| &layers[*j]).any(|other| {
-                        other.hit(x).is_some_and(|(m, z)| {
+                        other.project(x).is_some_and(|(m, z)| {
                             z < (1.0 - CLEAN_TOLERANCE) * other.depth[m]
                                 && l.confidence[k] < other.confidence[m]
                         })
@@ -129,14 +129,13 @@ fn clean(layers: &mut [Layer], partners: &[Vec<usize>]) {
 
 fn mask_edges(l: &mut Layer) {
     let (w, h) = (l.width(), l.camera.height as usize);
-    let jump = |a: f64, b: f64| a > 0.0 && b > 0.0 && (a - b).abs() > EDGE_JUMP * a.min(b);
     let edges: Vec<usize> = (0..w * h)
         .filter(|&k| {
             let (x, y, z) = (k % w, k / w, l.depth[k]);
-            (x > 0 && jump(z, l.depth[k - 1]))
-                || (x + 1 < w && jump(z, l.depth[k + 1]))
-                || (y > 0 && jump(z, l.depth[k - w]))
-                || (y + 1 < h && jump(z, l.depth[k + w]))
+            (x > 0 && is_jump(z, l.depth[k - 1]))
+                || (x + 1 < w && is_jump(z, l.depth[k + 1]))
+                || (y > 0 && is_jump(z, l.depth[k - w]))
+                || (y + 1 < h && is_jump(z, l.depth[k + w]))
         })
         .collect();
     for k in edges {
@@ -144,8 +143,12 @@ fn mask_edges(l: &mut Layer) {
     }
 }
 
-/// Bilinear within a surface, nearest across its edges; unknown outside the network's crop.
-fn to_working(view: &ModelView, l: &Layer) -> DepthMap {
+fn is_jump(a: f64, b: f64) -> bool {
+    a > 0.0 && b > 0.0 && (a - b).abs() > EDGE_JUMP * a.min(b)
+}
+
+/// Depth at working size: bilinear within a surface, nearest across edges, 0 outside the crop.
+fn to_working_size(view: &ModelView, l: &Layer) -> DepthMap {
     let (w, h) = (view.image.width, view.image.height);
     let mut out = DepthMap { depth: Image::filled(w, h, 0f32), confidence: Image::filled(w, h, 0f32) };
     for y in 0..h {
@@ -155,11 +158,11 @@ fn to_working(view: &ModelView, l: &Layer) -> DepthMap {
             if u < 0.0 || v < 0.0 || u >= mw as f64 || v >= mh as f64 {
                 continue;
             }
-            let near = v as usize * mw + u as usize;
+            let nearest = v as usize * mw + u as usize;
             let (a, b) = ((u - 0.5).max(0.0), (v - 0.5).max(0.0));
             let (i, j) = ((a as usize).min(mw.saturating_sub(2)), (b as usize).min(mh.saturating_sub(2)));
             let (fx, fy) = ((a - i as f64).min(1.0), (b - j as f64).min(1.0));
-            let mut z = l.depth[near];
+            let mut z = l.depth[nearest];
             if mw > 1 && mh > 1 {
                 let k = [j * mw + i, j * mw + i + 1, (j + 1) * mw + i, (j + 1) * mw + i + 1];
                 let wt = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
@@ -167,30 +170,28 @@ fn to_working(view: &ModelView, l: &Layer) -> DepthMap {
                     z = k.iter().zip(wt).map(|(&k, w)| w * l.depth[k]).sum();
                 }
             }
-            if l.confidence[near] > 0.0 && z > 0.0 {
+            if l.confidence[nearest] > 0.0 && z > 0.0 {
                 out.depth.data[y * w + x] = z as f32;
-                out.confidence.data[y * w + x] = l.confidence[near] as f32;
+                out.confidence.data[y * w + x] = l.confidence[nearest] as f32;
             }
         }
     }
     out
 }
 
-/// Confidence of a usable point: the floor, if there is one, or what the least confident share
-/// stays below, if that is more.
+/// Least confidence of a point: the quantile [`UNUSED_SHARE`] or the floor, whichever is larger.
 fn least_confidence(layers: &[Layer], floor: Option<f64>) -> f64 {
     let mut all: Vec<f64> =
         layers.iter().flat_map(|l| l.confidence.iter().copied()).filter(|c| *c > 0.0).collect();
-    let least = quantile(&mut all, LEAST_CONFIDENT).unwrap_or(1.0);
+    let least = quantile(&mut all, UNUSED_SHARE).unwrap_or(1.0);
     floor.map_or(least, |f| least.max(f))
 }
 
-/// Points of confidence 1 and more; a pixel that an already kept point of another view covers is
-/// left out.
+/// Points of confidence 1 and above; pixels that a kept point of another view covers are skipped.
 fn fuse(views: &[ModelView], layers: &[Layer]) -> PointCloud {
-    let mean = |l: &Layer| l.confidence.iter().sum::<f64>() / l.confidence.len().max(1) as f64;
     let mut order: Vec<usize> = (0..layers.len()).collect();
-    order.sort_by(|a, b| mean(&layers[*b]).total_cmp(&mean(&layers[*a])).then(a.cmp(b)));
+    order
+        .sort_by(|a, b| mean_confidence(&layers[*b]).total_cmp(&mean_confidence(&layers[*a])).then(a.cmp(b)));
     let mut covered: Vec<Vec<bool>> = layers.iter().map(|l| vec![false; l.depth.len()]).collect();
     let mut cloud = PointCloud::default();
     for v in order {
@@ -200,9 +201,9 @@ fn fuse(views: &[ModelView], layers: &[Layer]) -> PointCloud {
             if l.confidence[k] < 1.0 || l.depth[k] <= 0.0 || covered[v][k] {
                 continue;
             }
-            let world = l.world(k);
+            let world = l.unproject(k);
             for (j, other) in layers.iter().enumerate().filter(|(j, _)| *j != v) {
-                if let Some((m, z)) = other.hit(world) {
+                if let Some((m, z)) = other.project(world) {
                     covered[j][m] |= (z - other.depth[m]).abs() < SAME_DEPTH * z;
                 }
             }
@@ -219,13 +220,17 @@ fn fuse(views: &[ModelView], layers: &[Layer]) -> PointCloud {
     cloud
 }
 
+fn mean_confidence(l: &Layer) -> f64 {
+    l.confidence.iter().sum::<f64>() / l.confidence.len().max(1) as f64
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::scene::Pose;
 
     #[test]
-    fn depth_that_floats_before_a_surer_surface_is_removed() {
+    fn remove_floaters_before_confident_surface() {
         let (name, pose) = (String::new(), Pose::IDENTITY);
         let camera = Camera { name, width: 4, height: 3, fx: 4.0, fy: 4.0, cx: 2.0, cy: 1.5, pose };
         let layer = |confidence: f64| Layer {
@@ -234,9 +239,9 @@ mod tests {
             confidence: vec![confidence; 12],
         };
         let mut layers = [layer(1.0), layer(5.0)];
-        // Before the other view's surface, within its noise, and behind it.
+        // Before the other view's surface, within the noise of that, and behind it.
         layers[0].depth[5..8].copy_from_slice(&[2.0, 3.99, 5.0]);
-        clean(&mut layers, &[vec![1], vec![0]]);
+        remove_floaters(&mut layers, &[vec![1], vec![0]]);
         let removed: Vec<usize> = (0..12).filter(|k| layers[0].confidence[*k] == 0.0).collect();
         assert_eq!(removed, [5]);
         assert_eq!(layers[1].confidence, [5.0; 12], "it is before another surface itself, but surer");

@@ -1,38 +1,38 @@
-//! Step A: matched pixels by reciprocal nearest neighbours, of descriptors or of 3-D points.
+//! Step A: matches by reciprocal nearest neighbours of descriptors or of 3-D points.
 use crate::scene::{Descriptors, ModelView, PairPointmaps, Pointmap};
 use glam::DVec2;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Seeds start on a grid of this pitch (MASt3R's `subsample`).
+/// Pitch of the grid of seeds (MASt3R's `subsample`).
 const PITCH: usize = 8;
-/// Rounds before a wandering seed is given up (MASt3R).
+/// Rounds after which a seed that has not converged is dropped (MASt3R).
 const ROUNDS: usize = 10;
-/// Most matches per pair, and the grid over which they are spread.
-const CAP: usize = 8192;
+/// Most matches per pair, and cells per side of the grid over which they are spread.
+const MAX_MATCHES: usize = 8192;
 const CELLS: usize = 16;
 
-/// Two pixel positions that show one point.
+/// Positions of one scene point in two views, model pixels.
 #[derive(Clone, Copy, Debug)]
 pub struct PixelMatch {
-    /// In the first view.
+    /// Position in the first view.
     pub a: DVec2,
-    /// In the second view.
+    /// Position in the second view.
     pub b: DVec2,
-    /// > 0.
+    /// Weight, above 0.
     pub weight: f64,
 }
 
 /// Matched pixels of a pair.
 #[derive(Clone, Debug, Default)]
 pub struct PairMatches {
-    /// Model pixels.
+    /// Matches in model pixels.
     pub matches: Vec<PixelMatch>,
 }
 
-/// Follows seeds back and forth between two images until they return to themselves: every result is
-/// a pair of mutual nearest neighbours. `forward` maps pixels of A to their nearest in B,
-/// `backward` the reverse.
+/// Fast reciprocal matching (Leroy et al. 2024): follows seeds between two images until they return
+/// to themselves, as pairs of mutual nearest neighbours. `forward` maps pixels of A to their
+/// nearest in B, `backward` the reverse.
 fn reciprocal(
     seeds: Vec<usize>,
     forward: impl Fn(&[usize]) -> Vec<usize>,
@@ -44,10 +44,10 @@ fn reciprocal(
         if active.is_empty() {
             break;
         }
-        let there = forward(&active);
-        // Seeds that arrive at the same pixel would go on alike: the first stays.
+        let nearest = forward(&active);
+        // Seeds that meet at a pixel take the same path from there: only the first continues.
         let mut arrivals: BTreeMap<usize, usize> = BTreeMap::new();
-        for (a, b) in active.iter().zip(&there) {
+        for (a, b) in active.iter().zip(&nearest) {
             arrivals.entry(*b).or_insert(*a);
         }
         let (b, a): (Vec<usize>, Vec<usize>) = arrivals.into_iter().unzip();
@@ -72,30 +72,28 @@ fn seeds(width: usize, height: usize) -> Vec<usize> {
         .collect()
 }
 
-/// Mutual nearest neighbours of dense descriptors (pixel of A, pixel of B), sorted; seeds from both
-/// images. `size` are (width, height) of A and B.
+/// Mutual nearest neighbours of dense descriptors as (pixel of A, pixel of B), sorted; seeds from
+/// both images. `size` is (width, height) of A and B.
 pub fn descriptor_matches(
     a: &Descriptors,
     b: &Descriptors,
     size: [(usize, usize); 2],
 ) -> Vec<(usize, usize)> {
-    both_ways(size, |rows| a.nearest(rows, b), |rows| b.nearest(rows, a))
+    reciprocal_from_both(size, |rows| a.nearest(rows, b), |rows| b.nearest(rows, a))
 }
 
-/// Mutual nearest neighbours of two pointmaps in one frame (pixel of A, pixel of B), sorted; seeds
-/// from both images.
+/// Mutual nearest neighbours of two pointmaps in one frame as (pixel of A, pixel of B), sorted;
+/// seeds from both images.
 pub fn point_matches(a: &Pointmap, b: &Pointmap, size: [(usize, usize); 2]) -> Vec<(usize, usize)> {
     let (ta, tb) = (Tree::new(&a.points), Tree::new(&b.points));
     if ta.order.is_empty() || tb.order.is_empty() {
         return Vec::new();
     }
-    let query = |rows: &[usize], from: &Pointmap, tree: &Tree| -> Vec<usize> {
-        rows.par_iter().map(|r| tree.nearest(from.points[*r])).collect()
-    };
-    both_ways(size, |rows| query(rows, a, &tb), |rows| query(rows, b, &ta))
+    reciprocal_from_both(size, |rows| tb.nearest_to(rows, a), |rows| ta.nearest_to(rows, b))
 }
 
-fn both_ways(
+/// Reciprocal matches (pixel of A, pixel of B) from the seeds of both images, sorted.
+fn reciprocal_from_both(
     size: [(usize, usize); 2],
     forward: impl Fn(&[usize]) -> Vec<usize>,
     backward: impl Fn(&[usize]) -> Vec<usize>,
@@ -108,30 +106,22 @@ fn both_ways(
     all
 }
 
-/// All matches of a pair with weights, capped and spread over the first image.
+/// Weighted matches of a pair, at most [`MAX_MATCHES`], spread over the first image.
 pub(super) fn of_pair(first: &ModelView, second: &ModelView, pair: &PairPointmaps) -> PairMatches {
     let size = [(first.width, first.height), (second.width, second.height)];
     let mut weights: BTreeMap<(usize, usize), f64> = BTreeMap::new();
-    let mut add = |found: Vec<(usize, usize)>, qa: &[f32], qb: &[f32]| {
-        for (a, b) in found {
-            let w = (qa[a] as f64 * qb[b] as f64).max(0.0).sqrt();
-            let slot = weights.entry((a, b)).or_insert(w);
-            *slot = slot.max(w);
-        }
-    };
     match &pair.descriptors {
         Some([d11, d21, d12, d22]) => {
             for (a, b) in [(d11, d21), (d12, d22)] {
-                add(descriptor_matches(a, b, size), &a.confidence, &b.confidence);
+                add_matches(&mut weights, descriptor_matches(a, b, size), &a.confidence, &b.confidence);
             }
         }
         None => {
             for (a, b) in [(&pair.x11, &pair.x21), (&pair.x12, &pair.x22)] {
-                add(point_matches(a, b, size), &a.confidence, &b.confidence);
+                add_matches(&mut weights, point_matches(a, b, size), &a.confidence, &b.confidence);
             }
         }
     }
-    let centre = |k: usize, w: usize| DVec2::new((k % w) as f64 + 0.5, (k / w) as f64 + 0.5);
     // Round-robin over cells, best first within each.
     let mut cells: Vec<Vec<(f64, usize, usize)>> = vec![Vec::new(); CELLS * CELLS];
     for ((a, b), w) in weights {
@@ -146,13 +136,35 @@ pub(super) fn of_pair(first: &ModelView, second: &ModelView, pair: &PairPointmap
     let deepest = cells.iter().map(Vec::len).max().unwrap_or(0);
     let matches = (0..deepest)
         .flat_map(|k| cells.iter().filter_map(move |c| c.get(k)))
-        .take(CAP)
-        .map(|&(weight, a, b)| PixelMatch { a: centre(a, first.width), b: centre(b, second.width), weight })
+        .take(MAX_MATCHES)
+        .map(|&(weight, a, b)| PixelMatch {
+            a: pixel_centre(a, first.width),
+            b: pixel_centre(b, second.width),
+            weight,
+        })
         .collect();
     PairMatches { matches }
 }
 
-/// A balanced 3-d tree over finite points; `order` holds each subtree's median in the middle of its
+/// Adds matches weighted by √(qa qb); a repeated match keeps its larger weight.
+fn add_matches(
+    weights: &mut BTreeMap<(usize, usize), f64>,
+    found: Vec<(usize, usize)>,
+    qa: &[f32],
+    qb: &[f32],
+) {
+    for (a, b) in found {
+        let w = (qa[a] as f64 * qb[b] as f64).max(0.0).sqrt();
+        let slot = weights.entry((a, b)).or_insert(w);
+        *slot = slot.max(w);
+    }
+}
+
+fn pixel_centre(k: usize, width: usize) -> DVec2 {
+    DVec2::new((k % width) as f64 + 0.5, (k / width) as f64 + 0.5)
+}
+
+/// Balanced k-d tree over finite points: `order` holds each subtree's median in the middle of its
 /// range.
 struct Tree<'a> {
     points: &'a [[f32; 3]],
@@ -163,8 +175,13 @@ impl<'a> Tree<'a> {
     fn new(points: &'a [[f32; 3]]) -> Tree<'a> {
         let mut order: Vec<u32> =
             (0..points.len() as u32).filter(|k| points[*k as usize].iter().all(|v| v.is_finite())).collect();
-        split(points, &mut order, 0);
+        sort_into_tree(points, &mut order, 0);
         Tree { points, order }
+    }
+
+    /// Nearest point of the tree to each of the pixels `rows` of `from`.
+    fn nearest_to(&self, rows: &[usize], from: &Pointmap) -> Vec<usize> {
+        rows.par_iter().map(|r| self.nearest(from.points[*r])).collect()
     }
 
     fn nearest(&self, query: [f32; 3]) -> usize {
@@ -198,7 +215,7 @@ impl<'a> Tree<'a> {
     }
 }
 
-fn split(points: &[[f32; 3]], order: &mut [u32], axis: usize) {
+fn sort_into_tree(points: &[[f32; 3]], order: &mut [u32], axis: usize) {
     if order.len() < 2 {
         return;
     }
@@ -207,8 +224,8 @@ fn split(points: &[[f32; 3]], order: &mut [u32], axis: usize) {
         points[*a as usize][axis].total_cmp(&points[*b as usize][axis]).then(a.cmp(b))
     });
     let (low, high) = order.split_at_mut(middle);
-    split(points, low, (axis + 1) % 3);
-    split(points, &mut high[1..], (axis + 1) % 3);
+    sort_into_tree(points, low, (axis + 1) % 3);
+    sort_into_tree(points, &mut high[1..], (axis + 1) % 3);
 }
 
 #[cfg(test)]
@@ -217,10 +234,10 @@ mod tests {
     use crate::math::Random;
 
     #[test]
-    fn every_match_is_mutual_by_brute_force() {
+    fn descriptor_matches_are_mutual_nearest() {
         let mut rng = Random::new(9);
         let (w, h, d) = (32, 24, 8);
-        let mut random = |n: usize| Descriptors {
+        let mut random_descriptors = |n: usize| Descriptors {
             dim: d,
             data: (0..n)
                 .flat_map(|_| {
@@ -231,8 +248,8 @@ mod tests {
                 .collect(),
             confidence: vec![1.0; n],
         };
-        let a = random(w * h);
-        let mut b = random(w * h);
+        let a = random_descriptors(w * h);
+        let mut b = random_descriptors(w * h);
         // A shift by three columns makes true matches.
         for k in 0..w * h {
             if k % w >= 3 {
@@ -252,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn tree_search_equals_brute_force() {
+    fn nearest_equals_brute_force() {
         let mut rng = Random::new(1);
         let points: Vec<[f32; 3]> = (0..500).map(|_| std::array::from_fn(|_| rng.normal() as f32)).collect();
         let tree = Tree::new(&points);

@@ -1,6 +1,6 @@
-//! Pairwise pointmaps to cameras and dense points (docs/internals/method.md#pointmaps): what
-//! networks such as MASt3R, DUSt3R and VGGT predict for pairs of photos is brought to one scale,
-//! one set of cameras and one set of depth maps.
+//! Global alignment of pairwise pointmaps (docs/internals/method.md#pointmaps). The predictions of
+//! networks such as MASt3R, DUSt3R and VGGT for pairs of photos become one set of cameras and depth
+//! maps of one scale.
 //!
 //! Positions are continuous pixels of the network's input ("model pixels"); the centre of the first
 //! pixel is 0.5.
@@ -28,73 +28,73 @@ use canonical::{Canonical, Focals};
 pub use matches::{PairMatches, PixelMatch, descriptor_matches, point_matches};
 use pairs::Edge;
 use problem::Problem;
-use tree::{Placement, largest_component};
+use tree::{Registration, largest_component};
 
-/// Cameras, depth and points, and for which photos.
+/// Aligned geometry, and the views without any.
 #[derive(Clone, Debug)]
 pub struct Reconstruction {
-    /// Of the placed views, in order. Its method says where the adjustment started.
+    /// Geometry of the registered views, in order; its `method` names the start.
     pub geometry: Geometry,
-    /// Views that no pair joins to the others, ascending.
+    /// Views that no usable pair connects with the others, ascending.
     pub left_out: Vec<usize>,
 }
 
-/// Steps A–G; `seed` draws the samples of RANSAC. Views that do not hold together with most of the
-/// others are left out, with a warning each.
+/// Matches the pointmaps and aligns them (steps A–G); `seed` draws the samples of RANSAC. Views
+/// that are not connected with most of the others are left out, with a warning each.
 pub fn reconstruct(mut maps: Pointmaps, seed: u64, progress: &dyn Progress) -> Result<Reconstruction> {
-    check(&maps)?;
+    check_input(&maps)?;
     let mut matches = Vec::with_capacity(maps.pairs.len());
     for pair in &mut maps.pairs {
         progress.check()?;
         matches.push(matches::of_pair(&maps.views[pair.first], &maps.views[pair.second], pair));
-        // They take most of the memory, and have served.
+        // Descriptors take most of the memory and are used only for the matches.
         pair.descriptors = None;
     }
     align(maps, matches, seed, progress)
 }
 
-/// Steps B–G for given matches, one list per pair.
+/// Aligns pointmaps (steps B–G) for given matches, one list per pair.
 pub fn align(
     mut maps: Pointmaps,
     mut matches: Vec<PairMatches>,
     seed: u64,
     progress: &dyn Progress,
 ) -> Result<Reconstruction> {
-    check(&maps)?;
+    check_input(&maps)?;
     let given = maps.views.len();
-    let mut placed: Vec<usize> = (0..given).collect();
+    let mut registered: Vec<usize> = (0..given).collect();
     loop {
         let used = match attempt(&maps, &matches, seed, progress)? {
-            Attempt::Placed(geometry) => {
-                let left_out = (0..given).filter(|v| !placed.contains(v)).collect();
+            Attempt::Registered(geometry) => {
+                let left_out = (0..given).filter(|v| !registered.contains(v)).collect();
                 return Ok(Reconstruction { geometry: *geometry, left_out });
             }
-            Attempt::Apart(used) => used,
+            Attempt::Disconnected(used) => used,
         };
         let joined: Vec<[usize; 2]> =
             maps.pairs.iter().zip(&used).filter(|p| *p.1).map(|(p, _)| [p.first, p.second]).collect();
         let keep = largest_component(maps.views.len(), &joined);
-        // As structure from motion does: what fewer agree on says nothing about the others.
+        // As in structure from motion, at most half of the views do not stand for the scene.
         if 2 * keep.len() <= given {
             return Err(not_connected(&maps.views, &joined, &keep));
         }
         for v in (0..maps.views.len()).filter(|v| !keep.contains(v)) {
             progress.warn(&leave_out::message(&maps.views[v].name, &Reason::NoOverlap));
         }
-        placed = keep.iter().map(|v| placed[*v]).collect();
-        restrict(&mut maps, &mut matches, &keep, &used);
+        registered = keep.iter().map(|v| registered[*v]).collect();
+        keep_views(&mut maps, &mut matches, &keep, &used);
     }
 }
 
-/// Cameras for all views, or which pairs are usable while these do not join all views.
+/// Geometry of all views, or true per usable pair where these do not connect all views.
 enum Attempt {
-    Placed(Box<Geometry>),
-    Apart(Vec<bool>),
+    Registered(Box<Geometry>),
+    Disconnected(Vec<bool>),
 }
 
 fn attempt(maps: &Pointmaps, matches: &[PairMatches], seed: u64, progress: &dyn Progress) -> Result<Attempt> {
     let (views, pairs) = (&maps.views, &maps.pairs);
-    let canonical = canonical::all(views, pairs);
+    let canonical = canonical::canonical_maps(views, pairs);
     let focals = canonical::focals(views, &canonical);
     let edges: Vec<Option<Edge>> = pairs
         .iter()
@@ -104,40 +104,32 @@ fn attempt(maps: &Pointmaps, matches: &[PairMatches], seed: u64, progress: &dyn 
     let usable: Vec<bool> = edges.iter().map(Option::is_some).collect();
     let starts = starts(maps, &canonical, focals, &edges.into_iter().flatten().collect::<Vec<_>>());
     if starts.is_empty() {
-        return Ok(Attempt::Apart(usable));
+        return Ok(Attempt::Disconnected(usable));
     }
     let problem = Problem::new(views, &canonical, &starts[0].focals, pairs, matches);
     let (mut adjustment, method) = best_adjustment(problem, &starts, progress)?;
     if !adjustment.problem.joins_all_views() {
-        return Ok(Attempt::Apart(adjustment.problem.pairs.iter().map(|p| p.joins()).collect()));
+        return Ok(Attempt::Disconnected(adjustment.problem.pairs.iter().map(|p| p.joins()).collect()));
     }
     adjustment.normalise();
-    parallax(views, &adjustment)?;
+    check_parallax(views, &adjustment)?;
     progress.check()?;
     let geometry = Geometry { method: method.into(), ..dense::output(maps, &canonical, &adjustment) };
-    Ok(Attempt::Placed(Box::new(geometry)))
+    Ok(Attempt::Registered(Box::new(geometry)))
 }
 
-/// Of the adjustments from all starts the one that explains the matches best, and where it started.
+/// Adjusts from every start and returns the result of the lowest match cost, with its method.
 fn best_adjustment(
     problem: Problem,
     starts: &[Start],
     progress: &dyn Progress,
 ) -> Result<(Adjustment, &'static str)> {
-    let solved = |problem: Problem, start: &Start| -> Result<Adjustment> {
-        let mut a = Adjustment::new(problem, &start.placement, &start.focals);
-        a.solve(progress)?;
-        // A pair that disagrees with all others by more than 5 px at 512 is wrong as a whole.
-        if a.drop_wrong_pairs(5.0 / 512.0) && a.problem.joins_all_views() {
-            a.solve(progress)?;
-        }
-        Ok(a)
-    };
     const FROM_NETWORK: &str = "pointmaps, started from the network's own cameras";
     Ok(match starts {
         [network, pairs] => {
-            let (a, b) = (solved(problem.clone(), network)?, solved(problem, pairs)?);
-            if a.disagreement() <= b.disagreement() {
+            let a = adjusted(problem.clone(), network, progress)?;
+            let b = adjusted(problem, pairs, progress)?;
+            if a.total_match_cost() <= b.total_match_cost() {
                 (a, FROM_NETWORK)
             } else {
                 (b, "pointmaps, started from pairs: the network's own cameras explain fewer matches")
@@ -145,81 +137,93 @@ fn best_adjustment(
         }
         [start, ..] => {
             let method = if start.origin == Origin::Network { FROM_NETWORK } else { "pointmaps" };
-            (solved(problem, start)?, method)
+            (adjusted(problem, start, progress)?, method)
         }
         [] => return Err(Error::work("pointmaps without a start")),
     })
 }
 
-/// Where a start comes from.
+/// Solves from one start, and again after the removal of wrong pairs.
+fn adjusted(problem: Problem, start: &Start, progress: &dyn Progress) -> Result<Adjustment> {
+    let mut a = Adjustment::new(problem, &start.registration, &start.focals);
+    a.solve(progress)?;
+    // A pair that disagrees with all others by more than 5 px at 512 is wrong as a whole.
+    if a.drop_wrong_pairs(5.0 / 512.0) && a.problem.joins_all_views() {
+        a.solve(progress)?;
+    }
+    Ok(a)
+}
+
+/// Origin of a start.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Origin {
     Network,
     Pairs,
 }
 
-/// Where the adjustment may start.
+/// Initial values of the adjustment.
 struct Start {
     origin: Origin,
-    placement: Placement,
+    registration: Registration,
     focals: Focals,
 }
 
-/// The network's own cameras and those of the spanning tree, as far as there are any; where both
-/// are much the same, only the former.
+/// Starts from the network's own cameras and from the spanning tree, where they exist; only the
+/// former if both are within [`SAME_START`].
 fn starts(maps: &Pointmaps, canonical: &[Canonical], focals: Focals, edges: &[Edge]) -> Vec<Start> {
     let mut out = Vec::new();
     if let Some(first) = maps.cameras.first() {
         let back = first.pose.inverse();
         let poses = maps.cameras.iter().map(|c| c.pose.compose(&back)).collect();
-        // Cameras and depth have one unit.
-        let placement = Placement { poses, kappa: vec![0.0; maps.views.len()] };
-        out.push(Start { origin: Origin::Network, placement, focals: focals.started(&maps.cameras) });
+        // The network's cameras and its depth have the same unit.
+        let registration = Registration { poses, kappa: vec![0.0; maps.views.len()] };
+        let focals = focals.starting_from(&maps.cameras);
+        out.push(Start { origin: Origin::Network, registration, focals });
     }
-    if let Ok(placement) = tree::place(maps.views.len(), edges) {
-        let pairs = Start { origin: Origin::Pairs, placement, focals };
-        if out.first().is_none_or(|network| apart(network, &pairs, canonical) > ALIKE) {
+    if let Ok(registration) = tree::register(maps.views.len(), edges) {
+        let pairs = Start { origin: Origin::Pairs, registration, focals };
+        if out.first().is_none_or(|network| largest_difference(network, &pairs, canonical) > SAME_START) {
             out.push(pairs);
         }
     }
     out
 }
 
-/// Starts this near are one: 12 pixels at 512, which the widest Cauchy scale of the adjustment
-/// still takes for noise.
-const ALIKE: f64 = 12.0 / 512.0;
+/// Starts with a smaller difference count as one: 12 pixels at 512, still noise at the widest
+/// Cauchy scale of the adjustment.
+const SAME_START: f64 = 12.0 / 512.0;
 
-/// Largest difference of two starts: angles, distances between centres in depths of the first view,
-/// ln f.
-fn apart(a: &Start, b: &Start, canonical: &[Canonical]) -> f64 {
+/// Largest difference between two starts: rotation angles, distances between centres in median
+/// depths of the first view, ln f.
+fn largest_difference(a: &Start, b: &Start, canonical: &[Canonical]) -> f64 {
     let mut depths: Vec<f64> = canonical[0].points.iter().map(|p| p.z).filter(|z| *z > 0.0).collect();
     let depth = median(&mut depths).unwrap_or(1.0);
     let focals = a.focals.values.iter().zip(&b.focals.values).map(|(f, g)| (f / g).ln().abs());
-    let poses = a.placement.poses.iter().zip(&b.placement.poses).map(|(p, q)| {
-        let turn = rotation_angle(&(p.rotation * q.rotation.transpose()));
-        turn.max((p.centre() - q.centre()).length() / depth)
+    let poses = a.registration.poses.iter().zip(&b.registration.poses).map(|(p, q)| {
+        let angle = rotation_angle(&(p.rotation * q.rotation.transpose()));
+        angle.max((p.centre() - q.centre()).length() / depth)
     });
     focals.chain(poses).fold(0.0, f64::max)
 }
 
-/// Keeps the views `keep` and of the pairs between them those that are `used`.
-fn restrict(maps: &mut Pointmaps, matches: &mut Vec<PairMatches>, keep: &[usize], used: &[bool]) {
-    let place = |v: usize| keep.iter().position(|k| *k == v);
+/// Keeps the views `keep` and those `used` pairs that lie between them.
+fn keep_views(maps: &mut Pointmaps, matches: &mut Vec<PairMatches>, keep: &[usize], used: &[bool]) {
+    let new_index = |v: usize| keep.iter().position(|k| *k == v);
     let pairs = std::mem::take(&mut maps.pairs);
     for ((pair, m), used) in pairs.into_iter().zip(std::mem::take(matches)).zip(used) {
-        if let (true, Some(first), Some(second)) = (*used, place(pair.first), place(pair.second)) {
+        if let (true, Some(first), Some(second)) = (*used, new_index(pair.first), new_index(pair.second)) {
             maps.pairs.push(PairPointmaps { first, second, ..pair });
             matches.push(m);
         }
     }
     let kept = |k: usize| keep.contains(&k);
-    let mut at = 0..;
-    maps.views.retain(|_| at.next().is_some_and(kept));
-    let mut at = 0..;
-    maps.cameras.retain(|_| at.next().is_some_and(kept));
+    let mut indices = 0..;
+    maps.views.retain(|_| indices.next().is_some_and(kept));
+    let mut indices = 0..;
+    maps.cameras.retain(|_| indices.next().is_some_and(kept));
 }
 
-fn check(maps: &Pointmaps) -> Result<()> {
+fn check_input(maps: &Pointmaps) -> Result<()> {
     let views = &maps.views;
     if views.len() < 2 {
         return Err(Error::input("pointmaps need at least two photos"));
@@ -254,25 +258,25 @@ fn check(maps: &Pointmaps) -> Result<()> {
     Ok(())
 }
 
-/// Names the pairs that are missing between the views that hold together and the others.
+/// Error that names the pairs missing between the kept views and the others.
 fn not_connected(views: &[ModelView], joined: &[[usize; 2]], keep: &[usize]) -> Error {
-    let left = (0..views.len()).filter(|v| !keep.contains(v));
-    let bad: Vec<String> = left
+    let left_out = (0..views.len()).filter(|v| !keep.contains(v));
+    let missing: Vec<String> = left_out
         .flat_map(|l| keep.iter().map(move |v| (l, *v)))
         .filter(|(a, b)| !joined.contains(&[*a, *b]) && !joined.contains(&[*b, *a]))
         .map(|(a, b)| format!("{}–{}", views[b].name, views[a].name))
         .collect();
     Error::input(format!(
         "photos do not overlap enough: no consistent geometry for {}; take photos that share at least half of what they show",
-        bad.join(", ")
+        missing.join(", ")
     ))
 }
 
 /// Below 0.5 % of the depth the baseline is within the error of the pointmaps: the camera only
-/// turned.
+/// rotated.
 const MIN_BASELINE: f64 = 0.005;
 
-fn parallax(views: &[ModelView], adjustment: &Adjustment) -> Result<()> {
+fn check_parallax(views: &[ModelView], adjustment: &Adjustment) -> Result<()> {
     let poses = &adjustment.state.poses;
     let mut widest = 0.0f64;
     for i in 0..poses.len() {

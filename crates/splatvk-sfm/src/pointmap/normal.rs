@@ -1,31 +1,29 @@
-//! The normal equations in blocks: cameras dense, each view's depth corrections as a stencil of
-//! neighbours, and between two views only what their matches couple. Nothing grows with the square
-//! of the number of corrections.
+//! Normal equations in blocks: a dense one for the cameras, a stencil per view for its depth
+//! corrections, and between two views only the entries that their matches couple. Nothing grows
+//! with the square of the number of corrections.
 use super::problem::{GAUGE_WEIGHT, Link, PairLinks, Problem, STEP_WEIGHT, State};
 use super::residual::{Lattice, Row, SLOTS, slots};
 use crate::numeric::cauchy_weight;
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
-/// Pairs that are summed at a time: each has its own sums until they are added up, always in one
-/// order.
-const AT_A_TIME: usize = 8;
+/// Pairs accumulated in parallel: each has its own sums, which are then added in a fixed order.
+const PAIRS_PER_BATCH: usize = 8;
 
-/// Which corrections of two views the matches of a pair couple: a sparse matrix with a row per
-/// corner of the first view.
+/// Sparsity of the block that couples the corrections of two views: a compressed matrix with a row
+/// per corner of the first view.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Pattern {
+pub(super) struct SparsityPattern {
     starts: Vec<u32>,
     columns: Vec<u32>,
-    /// Per match the places of its 4 × 4 values.
-    places: Vec<[u32; 16]>,
+    /// Per match the indices of its 4 × 4 values.
+    indices: Vec<[u32; 16]>,
 }
 
-impl Pattern {
-    fn new(links: &[Link], rows: usize) -> Pattern {
-        let entry = |l: &Link, k: usize| (l.ends[0].corners[k / 4] as u32, l.ends[1].corners[k % 4] as u32);
+impl SparsityPattern {
+    fn new(links: &[Link], rows: usize) -> SparsityPattern {
         let mut entries: Vec<(u32, u32)> =
-            links.iter().flat_map(|l| (0..16).map(move |k| entry(l, k))).collect();
+            links.iter().flat_map(|l| (0..16).map(move |k| corner_pair(l, k))).collect();
         entries.sort_unstable();
         entries.dedup();
         let mut starts = vec![0u32; rows + 1];
@@ -35,27 +33,32 @@ impl Pattern {
         for row in 0..rows {
             starts[row + 1] += starts[row];
         }
-        let place = |l: &Link, k: usize| entries.partition_point(|e| *e < entry(l, k)) as u32;
-        let places = links.iter().map(|l| std::array::from_fn(|k| place(l, k))).collect();
-        Pattern { starts, columns: entries.iter().map(|e| e.1).collect(), places }
+        let index = |l: &Link, k: usize| entries.partition_point(|e| *e < corner_pair(l, k)) as u32;
+        let indices = links.iter().map(|l| std::array::from_fn(|k| index(l, k))).collect();
+        SparsityPattern { starts, columns: entries.iter().map(|e| e.1).collect(), indices }
     }
 
-    /// The patterns of all pairs.
-    pub(super) fn all(problem: &Problem) -> Vec<Pattern> {
-        let of = |p: &PairLinks| Pattern::new(&p.links, problem.lattices[p.views[0]].len());
-        problem.pairs.par_iter().map(of).collect()
+    /// Patterns of all pairs.
+    pub(super) fn all(problem: &Problem) -> Vec<SparsityPattern> {
+        let rows = |p: &PairLinks| problem.lattices[p.views[0]].len();
+        problem.pairs.par_iter().map(|p| SparsityPattern::new(&p.links, rows(p))).collect()
     }
 }
 
-/// Values of a [`Pattern`].
+/// Corners of the first and the second view that value `k` of a match couples.
+fn corner_pair(l: &Link, k: usize) -> (u32, u32) {
+    (l.ends[0].corners[k / 4] as u32, l.ends[1].corners[k % 4] as u32)
+}
+
+/// Values of a [`SparsityPattern`].
 pub(super) struct Coupling<'a> {
     pub(super) views: [usize; 2],
-    pattern: &'a Pattern,
+    pattern: &'a SparsityPattern,
     values: Vec<f64>,
 }
 
 impl Coupling<'_> {
-    /// Adds to the corrections `y` of one side what those of the other, `x`, are coupled with.
+    /// Adds the product with the other side's corrections `x` to those of `side`, `y`.
     pub(super) fn add_product(&self, side: usize, x: &[f64], y: &mut [f64]) {
         for (row, range) in self.pattern.starts.windows(2).enumerate() {
             let range = range[0] as usize..range[1] as usize;
@@ -69,8 +72,8 @@ impl Coupling<'_> {
     }
 }
 
-/// Symmetric matrix over the corners of one grid, in which only neighbours meet: per corner its
-/// value with itself and with the corners before it by 1, columns − 1, columns and columns + 1.
+/// Symmetric matrix over the corners of one grid that couples neighbours only: per corner the
+/// values with itself and with the corners before it by 1, columns − 1, columns and columns + 1.
 #[derive(Clone, Debug)]
 pub(super) struct Stencil {
     pub(super) lattice: Lattice,
@@ -87,7 +90,7 @@ impl Stencil {
         [0, 1, c - 1, c, c + 1]
     }
 
-    /// Adds the outer product of a position's bilinear weights with themselves.
+    /// Adds `factor` times the outer product of a position's bilinear weights.
     fn add(&mut self, corners: [usize; 4], w: [f64; 4], factor: f64) {
         let [a, b, c, d] = corners;
         for k in 0..4 {
@@ -117,35 +120,40 @@ impl Stencil {
     }
 }
 
-/// One view's depth corrections.
+/// Block of one view's depth corrections.
 pub(super) struct GridBlock {
     pub(super) stencil: Stencil,
     pub(super) gradient: Vec<f64>,
-    /// Camera unknowns that meet them.
+    /// Camera unknowns coupled with the corrections.
     pub(super) unknowns: Vec<usize>,
-    /// One row for each of those, one column per corner.
+    /// Coupling with the cameras: one row per entry of `unknowns`, one column per corner.
     pub(super) cameras: DMatrix<f64>,
 }
 
-/// Hessian of Gauss–Newton and gradient.
-pub(super) struct Normal<'a> {
+/// Gauss–Newton Hessian and gradient.
+pub(super) struct NormalEquations<'a> {
     pub(super) camera: DMatrix<f64>,
     pub(super) camera_gradient: DVector<f64>,
     pub(super) grids: Vec<GridBlock>,
     pub(super) couplings: Vec<Coupling<'a>>,
 }
 
-impl<'a> Normal<'a> {
-    /// Of the robust cost with scales stretched by `c`.
-    pub(super) fn new(problem: &Problem, patterns: &'a [Pattern], s: &State, c: f64) -> Normal<'a> {
+impl<'a> NormalEquations<'a> {
+    /// Normal equations of the robust cost, with Cauchy scales stretched by `c`.
+    pub(super) fn new(
+        problem: &Problem,
+        patterns: &'a [SparsityPattern],
+        s: &State,
+        c: f64,
+    ) -> NormalEquations<'a> {
         let n = problem.camera_unknowns();
-        let mut normal = Normal {
+        let mut normal = NormalEquations {
             camera: DMatrix::zeros(n, n),
             camera_gradient: DVector::zeros(n),
-            grids: (0..problem.lattices.len()).map(|v| empty(problem, v)).collect(),
+            grids: (0..problem.lattices.len()).map(|v| zero_block(problem, v)).collect(),
             couplings: Vec::with_capacity(patterns.len()),
         };
-        for (pairs, patterns) in problem.pairs.chunks(AT_A_TIME).zip(patterns.chunks(AT_A_TIME)) {
+        for (pairs, patterns) in problem.pairs.chunks(PAIRS_PER_BATCH).zip(patterns.chunks(PAIRS_PER_BATCH)) {
             let sums: Vec<PairSums> = pairs
                 .par_iter()
                 .zip(patterns)
@@ -161,18 +169,18 @@ impl<'a> Normal<'a> {
     }
 
     fn add(&mut self, problem: &Problem, pair: &PairLinks, sums: &PairSums) {
-        let places = camera_places(problem, pair.views);
-        for (i, p) in places.iter().enumerate() {
+        let indices = camera_indices(problem, pair.views);
+        for (i, p) in indices.iter().enumerate() {
             let Some(p) = *p else { continue };
             self.camera_gradient[p] += sums.gradient[i];
-            for (j, q) in places.iter().enumerate() {
+            for (j, q) in indices.iter().enumerate() {
                 let Some(q) = *q else { continue };
                 self.camera[(p, q)] += sums.camera[i.max(j)][i.min(j)];
             }
         }
         for (v, side) in pair.views.iter().zip(&sums.sides) {
             let block = &mut self.grids[*v];
-            let rows = places.map(|p| block.unknowns.iter().position(|u| Some(*u) == p));
+            let rows = indices.map(|p| block.unknowns.iter().position(|u| Some(*u) == p));
             for (k, values) in side.cameras.iter().enumerate() {
                 for (row, value) in rows.iter().zip(values) {
                     if let Some(row) = row {
@@ -215,7 +223,7 @@ impl<'a> Normal<'a> {
                     block.gradient[j] -= step;
                     block.stencil.values[i][0] += STEP_WEIGHT;
                     block.stencil.values[j][0] += STEP_WEIGHT;
-                    // The left neighbour is one corner before, the upper one a row.
+                    // The left neighbour is one corner before, the upper one a row of corners.
                     block.stencil.values[j][if j == i + 1 { 1 } else { 3 }] -= STEP_WEIGHT;
                 }
             }
@@ -223,13 +231,13 @@ impl<'a> Normal<'a> {
     }
 }
 
-/// Zeros for one view, with the camera unknowns of its pairs.
-fn empty(problem: &Problem, view: usize) -> GridBlock {
+/// Zero block of one view, with the camera unknowns of its pairs.
+fn zero_block(problem: &Problem, view: usize) -> GridBlock {
     let mut unknowns: Vec<usize> = problem
         .pairs
         .iter()
         .filter(|p| p.views.contains(&view) && !p.links.is_empty())
-        .flat_map(|p| camera_places(problem, p.views))
+        .flat_map(|p| camera_indices(problem, p.views))
         .flatten()
         .collect();
     unknowns.sort_unstable();
@@ -243,22 +251,22 @@ fn empty(problem: &Problem, view: usize) -> GridBlock {
     }
 }
 
-/// Indices of a pair's camera unknowns by slot; the first camera has no pose among them, and two
+/// Indices of a pair's camera unknowns by slot; the first camera has no pose unknowns, and two
 /// views may share a focal length.
-pub(super) fn camera_places(problem: &Problem, views: [usize; 2]) -> [Option<usize>; SLOTS] {
-    let mut places = [None; SLOTS];
+pub(super) fn camera_indices(problem: &Problem, views: [usize; 2]) -> [Option<usize>; SLOTS] {
+    let mut indices = [None; SLOTS];
     for (side, view) in views.into_iter().enumerate() {
         let (pose, focal, kappa) = slots(side);
         for k in 0..6 {
-            places[pose + k] = problem.pose(view).map(|p| p + k);
+            indices[pose + k] = problem.pose(view).map(|p| p + k);
         }
-        places[focal] = Some(problem.focal(problem.group[view]));
-        places[kappa] = Some(problem.kappa(view));
+        indices[focal] = Some(problem.focal(problem.group[view]));
+        indices[kappa] = Some(problem.kappa(view));
     }
-    places
+    indices
 }
 
-/// What the matches of one pair add.
+/// Contribution of one pair to the normal equations.
 struct PairSums {
     /// Lower triangle.
     camera: [[f64; SLOTS]; SLOTS],
@@ -273,68 +281,66 @@ struct SideSums {
     stencil: Stencil,
 }
 
+impl SideSums {
+    fn zeros(lattice: Lattice) -> SideSums {
+        let n = lattice.len();
+        SideSums { cameras: vec![[0.0; SLOTS]; n], gradient: vec![0.0; n], stencil: Stencil::new(lattice) }
+    }
+}
+
 impl PairSums {
-    fn new(problem: &Problem, s: &State, pair: &PairLinks, pattern: &Pattern, c: f64) -> PairSums {
-        let side = |k: usize| {
-            let lattice = problem.lattices[pair.views[k]];
-            let n = lattice.len();
-            SideSums {
-                cameras: vec![[0.0; SLOTS]; n],
-                gradient: vec![0.0; n],
-                stencil: Stencil::new(lattice),
-            }
-        };
+    fn new(problem: &Problem, s: &State, pair: &PairLinks, pattern: &SparsityPattern, c: f64) -> PairSums {
         let mut sums = PairSums {
             camera: [[0.0; SLOTS]; SLOTS],
             gradient: [0.0; SLOTS],
-            sides: [side(0), side(1)],
+            sides: pair.views.map(|v| SideSums::zeros(problem.lattices[v])),
             coupling: vec![0.0; pattern.columns.len()],
         };
         let directions = [0, 1].map(|side| problem.direction(s, pair, side));
-        for (link, places) in pair.links.iter().zip(&pattern.places) {
+        for (link, coupled) in pair.links.iter().zip(&pattern.indices) {
             let d = problem.depths(s, pair, link);
             for (k, direction) in directions.iter().enumerate() {
                 let row = direction.row(&link.ends[k], &link.ends[1 - k], [d[k], d[1 - k]]);
                 if let Some(row) = row {
-                    sums.add(&row, link, k, places, c);
+                    sums.add(&row, link, k, coupled, c);
                 }
             }
         }
         sums
     }
 
-    fn add(&mut self, row: &Row, link: &Link, side: usize, places: &[u32; 16], c: f64) {
-        let Row { r, camera, along, away } = row;
+    fn add(&mut self, row: &Row, link: &Link, side: usize, coupled: &[u32; 16], c: f64) {
+        let Row { r, camera, by_point_depth: point, by_pixel_depth: pixel } = row;
         let wp = link.weight * cauchy_weight(r[0] * r[0] + r[1] * r[1], c);
         let w = [wp, wp, link.weight * cauchy_weight(r[2] * r[2], c)];
-        let (mut by_along, mut by_away) = ([0.0; SLOTS], [0.0; SLOTS]);
+        let (mut cross_point, mut cross_pixel) = ([0.0; SLOTS], [0.0; SLOTS]);
         for i in 0..SLOTS {
             let d: [f64; 3] = std::array::from_fn(|k| w[k] * camera[k][i]);
             self.gradient[i] += d[0] * r[0] + d[1] * r[1] + d[2] * r[2];
             for j in 0..=i {
                 self.camera[i][j] += d[0] * camera[0][j] + d[1] * camera[1][j] + d[2] * camera[2][j];
             }
-            by_along[i] = d[0] * along[0] + d[1] * along[1] + d[2] * along[2];
-            by_away[i] = d[2] * away;
+            cross_point[i] = d[0] * point[0] + d[1] * point[1] + d[2] * point[2];
+            cross_pixel[i] = d[2] * pixel;
         }
-        let sum = |f: [f64; 3]| (0..3).map(|k| w[k] * f[k] * along[k]).sum::<f64>();
+        let point_product = |f: [f64; 3]| (0..3).map(|k| w[k] * f[k] * point[k]).sum::<f64>();
         let ends = [
-            (side, by_along, sum(*r), sum(*along)),
-            (1 - side, by_away, w[2] * away * r[2], w[2] * away * away),
+            (side, cross_point, point_product(*r), point_product(*point)),
+            (1 - side, cross_pixel, w[2] * pixel * r[2], w[2] * pixel * pixel),
         ];
-        for (side, by, gradient, square) in ends {
+        for (side, cross, gradient, square) in ends {
             let (end, sums) = (&link.ends[side], &mut self.sides[side]);
             for (corner, weight) in end.corners.iter().zip(end.weights) {
                 sums.gradient[*corner] += weight * gradient;
-                for (sum, value) in sums.cameras[*corner].iter_mut().zip(&by) {
+                for (sum, value) in sums.cameras[*corner].iter_mut().zip(&cross) {
                     *sum += weight * value;
                 }
             }
             sums.stencil.add(end.corners, end.weights, square);
         }
-        let both = w[2] * along[2] * away;
-        for (k, place) in places.iter().enumerate() {
-            self.coupling[*place as usize] +=
+        let both = w[2] * point[2] * pixel;
+        for (k, index) in coupled.iter().enumerate() {
+            self.coupling[*index as usize] +=
                 both * link.ends[0].weights[k / 4] * link.ends[1].weights[k % 4];
         }
     }

@@ -1,5 +1,5 @@
-//! Step D: the relative pose and scale of each pair, estimated twice and compared.
-use super::canonical::{Canonical, Focals};
+//! Step D: relative pose and scale of each pair, estimated in both directions.
+use super::canonical::{Canonical, Focals, median_confidence};
 use super::matches::PixelMatch;
 use crate::math::median;
 use crate::numeric::{cauchy_weight, from_na, rotation_angle, to_na};
@@ -8,34 +8,34 @@ use crate::scene::{ModelView, PairPointmaps, Pointmap, Pose};
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{Matrix3, Vector3};
 
-/// A pair that passed the checks.
+/// Relative pose of a pair that passed the checks: an edge of the view graph.
 #[derive(Clone, Debug)]
 pub(super) struct Edge {
     pub(super) first: usize,
     pub(super) second: usize,
     /// First camera → second camera; translation in the canonical unit of the first view.
     pub(super) pose: Pose,
-    /// ln of (canonical unit of the second view / that of the first): global depth = canonical
-    /// depth · e^κ, κ_second − κ_first = this.
+    /// κ_second − κ_first = ln(canonical unit of the second view / that of the first); global depth
+    /// = canonical depth · e^κ.
     pub(super) log_scale: f64,
     pub(super) score: f64,
 }
 
-/// A similarity `y = scale · rotation · x + translation`.
+/// Similarity transform `y = scale · rotation · x + translation`.
 pub(super) struct Umeyama {
     pub(super) rotation: DMat3,
     pub(super) scale: f64,
     pub(super) translation: DVec3,
 }
 
-/// Weighted similarity between point sets (Umeyama 1991), `weights` ≥ 0.
+/// Weighted least-squares similarity between point sets (Umeyama 1991); `weights` ≥ 0.
 pub(super) fn umeyama(x: &[DVec3], y: &[DVec3], weights: &[f64]) -> Option<Umeyama> {
     let total: f64 = weights.iter().sum();
     if total <= 0.0 || x.len() < 3 {
         return None;
     }
-    let mean = |v: &[DVec3]| v.iter().zip(weights).map(|(p, w)| *p * *w).sum::<DVec3>() / total;
-    let (mx, my) = (mean(x), mean(y));
+    let weighted_mean = |v: &[DVec3]| v.iter().zip(weights).map(|(p, w)| *p * *w).sum::<DVec3>() / total;
+    let (mx, my) = (weighted_mean(x), weighted_mean(y));
     let (mut h, mut size) = (DMat3::ZERO, 0.0);
     for ((p, q), w) in x.iter().zip(y).zip(weights) {
         let (a, b) = (*p - mx, *q - my);
@@ -55,19 +55,19 @@ pub(super) fn umeyama(x: &[DVec3], y: &[DVec3], weights: &[f64]) -> Option<Umeya
     })
 }
 
-/// One direction: the pixels of `seen` as points in `frame`'s camera.
+/// One direction of a pair: pixels of view `seen` as points in the camera of view `frame`.
 struct Direction<'a> {
-    /// Points of the seen view in the frame's camera.
+    /// Points of view `seen` in the camera of `frame`.
     cross: &'a Pointmap,
-    /// Points of the seen view in its own camera.
+    /// Points of view `seen` in its own camera.
     own: &'a Pointmap,
-    /// Points of the frame's view in its own camera, same scale as `cross`.
+    /// Points of view `frame` in its own camera, at the scale of `cross`.
     base: &'a Pointmap,
     frame: usize,
     seen: usize,
 }
 
-/// Result of one direction: frame → seen.
+/// Relative pose frame → seen, with the share of inliers.
 struct Relative {
     pose: Pose,
     log_scale: f64,
@@ -86,7 +86,7 @@ impl Direction<'_> {
         seed: u64,
     ) -> Option<Relative> {
         let view = &views[self.seen];
-        let chosen = confident(self.cross, self.own);
+        let chosen = confident_pixels(self.cross, self.own);
         let world: Vec<DVec3> = chosen.iter().map(|&k| self.cross.point(k)).collect();
         let pixels: Vec<DVec2> = chosen
             .iter()
@@ -98,25 +98,24 @@ impl Direction<'_> {
         let found = resect(&world, &pixels, focals.of(self.seen), threshold, 512, seed)?;
         let rotation = self.procrustes(&chosen, &world)?;
         let inliers = found.inliers.len() as f64 / chosen.len() as f64;
-        let apart = rotation_angle(&(rotation * found.pose.rotation.transpose())).to_degrees();
-        // Too few agree, or the two estimates contradict each other
-        // (docs/internals/method.md#pair-poses).
-        if inliers < 0.15 || apart > 15.0 {
+        let difference = rotation_angle(&(rotation * found.pose.rotation.transpose())).to_degrees();
+        // Few inliers, or PnP contradicts Procrustes (docs/internals/method.md#pair-poses).
+        if inliers < 0.15 || difference > 15.0 {
             return None;
         }
-        let to_base = median_ratio(&canonical[self.frame], self.base)?;
+        let to_canonical = median_ratio(&canonical[self.frame], self.base)?;
         let mut ratios: Vec<f64> = chosen
             .iter()
             .zip(&world)
-            .map(|(&k, x)| found.pose.transform(*x).z * to_base / canonical[self.seen].points[k].z)
+            .map(|(&k, x)| found.pose.transform(*x).z * to_canonical / canonical[self.seen].points[k].z)
             .filter(|r| r.is_finite() && *r > 0.0)
             .collect();
         let mut pose = found.pose;
-        pose.translation *= to_base;
+        pose.translation *= to_canonical;
         Some(Relative { pose, log_scale: median(&mut ratios)?.ln(), inliers })
     }
 
-    /// Rotation frame → seen by aligning both predictions of the seen view, three robust rounds.
+    /// Rotation frame → seen by Procrustes alignment, three rounds with Cauchy weights.
     fn procrustes(&self, chosen: &[usize], world: &[DVec3]) -> Option<DMat3> {
         let own: Vec<DVec3> = chosen.iter().map(|&k| self.own.point(k)).collect();
         let base: Vec<f64> = chosen
@@ -139,30 +138,30 @@ impl Direction<'_> {
     }
 }
 
-/// Up to SAMPLES pixels, most confident half first thinned evenly.
-fn confident(cross: &Pointmap, own: &Pointmap) -> Vec<usize> {
-    let value = |k: usize| (cross.confidence[k] * own.confidence[k]) as f64;
+/// Up to [`SAMPLES`] pixels, evenly thinned from the more confident half.
+fn confident_pixels(cross: &Pointmap, own: &Pointmap) -> Vec<usize> {
+    let joint_confidence = |k: usize| (cross.confidence[k] * own.confidence[k]) as f64;
     let usable: Vec<usize> =
         (0..cross.points.len()).filter(|&k| cross.point(k).is_finite() && own.point(k).is_finite()).collect();
-    let Some(middle) = median(&mut usable.iter().map(|&k| value(k)).collect::<Vec<_>>()) else {
+    let Some(least) = median(&mut usable.iter().map(|&k| joint_confidence(k)).collect::<Vec<_>>()) else {
         return Vec::new();
     };
-    let good: Vec<usize> = usable.into_iter().filter(|&k| value(k) >= middle).collect();
+    let good: Vec<usize> = usable.into_iter().filter(|&k| joint_confidence(k) >= least).collect();
     let step = (good.len() / SAMPLES).max(1);
     good.into_iter().step_by(step).take(SAMPLES).collect()
 }
 
-/// Median of canonical z over the map's z, over the confident half.
+/// Median ratio of canonical z to the z of `map`, over the more confident half.
 fn median_ratio(c: &Canonical, map: &Pointmap) -> Option<f64> {
-    let middle = median(&mut map.confidence.iter().map(|c| *c as f64).collect::<Vec<_>>())?;
+    let least = median_confidence(map)?;
     let mut ratios: Vec<f64> = (0..map.points.len())
-        .filter(|&k| map.confidence[k] as f64 >= middle && map.points[k][2] > 0.0 && c.points[k].z > 0.0)
+        .filter(|&k| map.confidence[k] as f64 >= least && map.points[k][2] > 0.0 && c.points[k].z > 0.0)
         .map(|k| c.points[k].z / map.points[k][2] as f64)
         .collect();
     median(&mut ratios)
 }
 
-/// Relative pose of a pair from both directions; `None` when neither is trustworthy.
+/// Relative pose of a pair from the direction with more inliers; `None` if both are rejected.
 pub(super) fn edge(
     views: &[ModelView],
     pair: &PairPointmaps,

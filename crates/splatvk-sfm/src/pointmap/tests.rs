@@ -11,7 +11,7 @@ use crate::scene::{Affine, Camera, Pointmap};
 use crate::testing::{self, Truth};
 use glam::{DVec2, DVec3};
 
-/// What is wrong with the pointmaps and matches.
+/// Errors of the simulated pointmaps and matches.
 #[derive(Clone, Copy)]
 struct Faults {
     depth: f64,
@@ -30,7 +30,7 @@ struct Case {
     depths: Vec<Vec<f64>>,
 }
 
-/// The breakfast views as a network with half their resolution would see them.
+/// The breakfast views as input of a network of half their resolution.
 fn case() -> (Case, Truth) {
     let truth = testing::train(&testing::folder());
     let (mut views, mut cameras, mut depths) = (Vec::new(), Vec::new(), Vec::new());
@@ -40,11 +40,11 @@ fn case() -> (Case, Truth) {
         let width = p.image.width;
         // The centre of a model pixel is the corner of four photo pixels; inverse depth is linear
         // on planes.
-        let at = |k: usize| {
+        let mean_depth = |k: usize| {
             let i = k / w * 2 * width + k % w * 2;
             4.0 / [i, i + 1, i + width, i + width + 1].iter().map(|i| 1.0 / full[*i] as f64).sum::<f64>()
         };
-        depths.push((0..w * h).map(at).collect());
+        depths.push((0..w * h).map(mean_depth).collect());
         cameras.push(c.resized(w as u32, h as u32));
         views.push(ModelView {
             name: p.stem.clone(),
@@ -120,14 +120,14 @@ impl Case {
     }
 }
 
-/// What a pair network would say.
-fn said(views: &[ModelView], pairs: &[PairPointmaps]) -> Pointmaps {
+/// Pointmaps as a network returns them.
+fn network_output(views: &[ModelView], pairs: &[PairPointmaps]) -> Pointmaps {
     Pointmaps { views: views.to_vec(), pairs: pairs.to_vec(), ..Pointmaps::default() }
 }
 
 /// Cameras for all views.
 fn aligned(views: &[ModelView], pairs: &[PairPointmaps], matches: &[PairMatches]) -> Geometry {
-    let found = align(said(views, pairs), matches.to_vec(), 0, &Silent).unwrap();
+    let found = align(network_output(views, pairs), matches.to_vec(), 0, &Silent).unwrap();
     assert!(found.left_out.is_empty());
     found.geometry
 }
@@ -137,7 +137,7 @@ fn errors(g: &Geometry, truth: &Truth) -> PoseErrors {
 }
 
 #[test]
-fn noisy_pointmaps_place_cameras_and_depth() {
+fn align_recovers_cameras_from_noisy_pointmaps() {
     let (case, truth) = case();
     let (pairs, matches) = case.input(FAULTS);
     let start = std::time::Instant::now();
@@ -189,7 +189,7 @@ fn difference(a: &[Camera], b: &[Camera]) -> f64 {
 
 #[test]
 #[ignore = "takes long: tools/test-long"]
-fn order_of_views_and_scale_of_a_pair_do_not_matter() {
+fn align_invariant_to_order_and_scale() {
     let (mut case, _) = case();
     // Three views keep the three solutions short.
     case.views.truncate(3);
@@ -221,7 +221,7 @@ fn order_of_views_and_scale_of_a_pair_do_not_matter() {
 }
 
 #[test]
-fn matches_are_found_from_the_points_themselves() {
+fn of_pair_without_descriptors_matches_points() {
     let (case, _) = case();
     let mut rng = Random::new(3);
     let exact = Faults { depth: 0.0, pixels: 0.0, outliers: 0.0, scale: 0.7 };
@@ -237,32 +237,32 @@ fn matches_are_found_from_the_points_themselves() {
             (case.cameras[1].project(x).0 - m.b).length()
         })
         .collect();
-    // Nearest pixels: up to 0.71 px off by rounding.
+    // Nearest pixels are up to 0.71 px off by rounding.
     assert!(crate::math::median(&mut errors).unwrap() < 0.75);
 }
 
 #[test]
-fn views_without_geometry_are_refused_by_name() {
+fn align_rejects_views_without_geometry() {
     let (case, _) = case();
     let (pairs, matches) = case.input(FAULTS);
     // Two disjoint pairs: 0–1 and 2–3.
     let keep = [0usize, 5];
     let (p, m) =
         keep.iter().map(|k| (pairs[*k].clone(), matches[*k].clone())).unzip::<_, _, Vec<_>, Vec<_>>();
-    let error = align(said(&case.views, &p), m, 0, &Silent).unwrap_err();
+    let error = align(network_output(&case.views, &p), m, 0, &Silent).unwrap_err();
     assert!(error.exit_code() == 2 && error.to_string().contains("train_00–train_02"), "{error}");
     // Identical photos: every map in the same frame.
     let mut rng = Random::new(5);
     let twin =
         Case { cameras: vec![case.cameras[0].clone(); 2], depths: vec![case.depths[0].clone(); 2], ..case };
     let (p, m) = twin.pair(0, 1, FAULTS, &mut rng);
-    let error = align(said(&twin.views[..2], &[p]), vec![m], 0, &Silent).unwrap_err();
+    let error = align(network_output(&twin.views[..2], &[p]), vec![m], 0, &Silent).unwrap_err();
     assert!(error.exit_code() == 2 && error.to_string().contains("no parallax"), "{error}");
     // A map of the wrong size.
     let (mut p, m) = twin.pair(0, 1, FAULTS, &mut rng);
     p.x21.points.pop();
     assert!(
-        align(said(&twin.views[..2], &[p]), vec![m], 0, &Silent)
+        align(network_output(&twin.views[..2], &[p]), vec![m], 0, &Silent)
             .unwrap_err()
             .to_string()
             .contains("wrong model output")

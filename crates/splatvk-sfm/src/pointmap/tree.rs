@@ -1,24 +1,24 @@
-//! Step E: a maximum spanning tree over the pairs, then averaging over all pairs.
+//! Step E: poses along the maximum spanning tree of the pairs, averaged over all pairs.
 use super::pairs::Edge;
 use crate::numeric::rotation_log;
 use crate::scene::Pose;
 use glam::{DMat3, DVec3};
 use nalgebra::{DMatrix, DVector};
 
-/// Poses (camera 0 = identity) and log scales (view 0 = 0): global depth = canonical depth · e^κ.
+/// Poses (camera 0 = identity) and log scales κ (view 0 = 0): global depth = canonical depth · e^κ.
 #[derive(Clone, Debug)]
-pub(super) struct Placement {
+pub(super) struct Registration {
     pub(super) poses: Vec<Pose>,
     pub(super) kappa: Vec<f64>,
 }
 
-/// Places all views; `Err` lists the views that no chain of pairs connects with view 0.
-pub(super) fn place(n: usize, edges: &[Edge]) -> Result<Placement, Vec<usize>> {
+/// Registers all views; `Err` lists the views that no chain of pairs connects with view 0.
+pub(super) fn register(n: usize, edges: &[Edge]) -> Result<Registration, Vec<usize>> {
     let mut poses: Vec<Option<Pose>> = vec![None; n];
     let mut kappa: Vec<f64> = vec![0.0; n];
     poses[0] = Some(Pose::IDENTITY);
     loop {
-        // Prim: the best edge between a placed and a free view.
+        // Prim's algorithm: the best edge between a registered and an unregistered view.
         let mut best: Option<&Edge> = None;
         for e in edges {
             let crossing = poses[e.first].is_some() != poses[e.second].is_some();
@@ -43,37 +43,37 @@ pub(super) fn place(n: usize, edges: &[Edge]) -> Result<Placement, Vec<usize>> {
             (None, None) => break,
         }
     }
-    let left: Vec<usize> = (0..n).filter(|v| poses[*v].is_none()).collect();
-    if !left.is_empty() {
-        return Err(left);
+    let unregistered: Vec<usize> = (0..n).filter(|v| poses[*v].is_none()).collect();
+    if !unregistered.is_empty() {
+        return Err(unregistered);
     }
-    let mut out = Placement { poses: poses.into_iter().flatten().collect(), kappa };
+    let mut out = Registration { poses: poses.into_iter().flatten().collect(), kappa };
     average_rotations(&mut out, edges);
     average_scales(&mut out, edges);
     average_translations(&mut out, edges);
     Ok(out)
 }
 
-/// The views that the most pairs hold together, ascending; of equals the one with the first view.
+/// Largest component of the view graph, ascending; of equal ones the one with the lowest view.
 pub(super) fn largest_component(views: usize, pairs: &[[usize; 2]]) -> Vec<usize> {
     let mut label: Vec<usize> = (0..views).collect();
     for [a, b] in pairs {
-        let (keep, gone) = (label[*a].min(label[*b]), label[*a].max(label[*b]));
-        label.iter_mut().filter(|l| **l == gone).for_each(|l| *l = keep);
+        let (kept, replaced) = (label[*a].min(label[*b]), label[*a].max(label[*b]));
+        label.iter_mut().filter(|l| **l == replaced).for_each(|l| *l = kept);
     }
-    let of = |l: usize| (0..views).filter(|v| label[*v] == l).collect::<Vec<_>>();
-    (0..views).map(of).rev().max_by_key(Vec::len).unwrap_or_default()
+    let members = |l: usize| (0..views).filter(|v| label[*v] == l).collect::<Vec<_>>();
+    (0..views).map(members).rev().max_by_key(Vec::len).unwrap_or_default()
 }
 
-/// Weight of an edge with residual length r in an L1 sense; the floor keeps exact edges finite.
-fn l1(weight: f64, r: f64) -> f64 {
+/// L1 weight of an edge with residual length `r`; the floor keeps the weight of exact edges finite.
+fn l1_weight(weight: f64, r: f64) -> f64 {
     weight / r.max(1e-4)
 }
 
-/// One weighted linear equation: (unknowns with factors, right-hand side, weight).
+/// Weighted linear equation: (unknowns with coefficients, right-hand side, weight).
 type Equation = (Vec<(usize, f64)>, f64, f64);
 
-/// Solves weighted linear equations in the least-squares sense.
+/// Weighted least-squares solution of linear equations in `n` unknowns.
 fn least_squares(n: usize, rows: &[Equation]) -> Option<DVector<f64>> {
     let (mut h, mut g) = (DMatrix::<f64>::zeros(n, n), DVector::<f64>::zeros(n));
     for (row, b, w) in rows {
@@ -91,15 +91,15 @@ fn least_squares(n: usize, rows: &[Equation]) -> Option<DVector<f64>> {
     Some(h.cholesky()?.solve(&g))
 }
 
-/// Iteratively re-weighted least squares on so(3).
-fn average_rotations(p: &mut Placement, edges: &[Edge]) {
+/// Rotation averaging by iteratively re-weighted least squares on so(3).
+fn average_rotations(p: &mut Registration, edges: &[Edge]) {
     for _ in 0..20 {
         let mut rows = Vec::new();
         for e in edges {
             let (a, b) = (&p.poses[e.first].rotation, &p.poses[e.second].rotation);
             // exp(ω_b) R_b ≈ R_ba exp(ω_a) R_a, so R_ba ω_a − ω_b = log(R_b R_aᵀ R_baᵀ).
             let residual = rotation_log(&(*b * a.transpose() * e.pose.rotation.transpose()));
-            let w = l1(e.score, residual.length());
+            let w = l1_weight(e.score, residual.length());
             for k in 0..3 {
                 let mut row = Vec::new();
                 if e.first > 0 {
@@ -122,7 +122,7 @@ fn average_rotations(p: &mut Placement, edges: &[Edge]) {
     }
 }
 
-fn average_scales(p: &mut Placement, edges: &[Edge]) {
+fn average_scales(p: &mut Registration, edges: &[Edge]) {
     for _ in 0..20 {
         let rows: Vec<_> = edges
             .iter()
@@ -135,7 +135,7 @@ fn average_scales(p: &mut Placement, edges: &[Edge]) {
                 if e.second > 0 {
                     row.push((e.second - 1, 1.0));
                 }
-                (row, -r, l1(e.score, r.abs()))
+                (row, -r, l1_weight(e.score, r.abs()))
             })
             .collect();
         let Some(x) = least_squares(p.kappa.len() - 1, &rows) else { return };
@@ -145,15 +145,15 @@ fn average_scales(p: &mut Placement, edges: &[Edge]) {
     }
 }
 
-/// With rotations and scales known, τ_b = R_ba τ_a + e^{κ_a} t_ba is linear.
-fn average_translations(p: &mut Placement, edges: &[Edge]) {
+/// With known rotations and scales, τ_b = R_ba τ_a + e^{κ_a} t_ba is linear.
+fn average_translations(p: &mut Registration, edges: &[Edge]) {
     for _ in 0..20 {
         let mut rows = Vec::new();
         for e in edges {
             let relative: DMat3 = p.poses[e.second].rotation * p.poses[e.first].rotation.transpose();
-            let shift = e.pose.translation * p.kappa[e.first].exp();
-            let residual = p.poses[e.second].translation - relative * p.poses[e.first].translation - shift;
-            let w = l1(e.score, residual.length() / shift.length().max(1e-9));
+            let offset = e.pose.translation * p.kappa[e.first].exp();
+            let residual = p.poses[e.second].translation - relative * p.poses[e.first].translation - offset;
+            let w = l1_weight(e.score, residual.length() / offset.length().max(1e-9));
             for k in 0..3 {
                 let mut row = Vec::new();
                 if e.first > 0 {
@@ -179,7 +179,7 @@ mod tests {
     use crate::numeric::rotation_angle;
 
     #[test]
-    fn averaging_outvotes_a_wrong_edge() {
+    fn register_corrects_a_wrong_edge() {
         let mut rng = Random::new(4);
         let truth: Vec<Pose> = (0..5)
             .map(|k| {
@@ -196,10 +196,10 @@ mod tests {
                 edges.push(Edge { first: i, second: j, pose, log_scale: kappa[j] - kappa[i], score: 1.0 });
             }
         }
-        // Not in the tree, but in the average.
+        // This edge is not in the tree, only in the average.
         edges[6].pose.rotation = Pose::exp(DVec3::ZERO, DVec3::Y * 0.2).rotation * edges[6].pose.rotation;
         edges[6].score = 0.3;
-        let p = place(5, &edges).unwrap();
+        let p = register(5, &edges).unwrap();
         let back = truth[0].inverse();
         for v in 0..5 {
             let want = truth[v].compose(&back);
@@ -207,11 +207,11 @@ mod tests {
             assert!((p.poses[v].translation - want.translation).length() < 1e-2, "{v}");
             assert!((p.kappa[v] - (kappa[v] - kappa[0])).abs() < 1e-9);
         }
-        assert_eq!(place(5, &edges[..1]).unwrap_err(), [2, 3, 4]);
+        assert_eq!(register(5, &edges[..1]).unwrap_err(), [2, 3, 4]);
     }
 
     #[test]
-    fn the_largest_component_is_found_whatever_the_order_of_the_pairs() {
+    fn largest_component_ignores_pair_order() {
         assert_eq!(largest_component(6, &[[5, 2], [0, 1], [4, 5], [4, 2]]), [2, 4, 5]);
         assert_eq!(largest_component(4, &[[3, 2], [1, 0]]), [0, 1]);
         assert_eq!(largest_component(3, &[]), [0]);

@@ -1,61 +1,60 @@
-//! From verified pairs to a reconstruction: the pair with most matches at good parallax first, the
-//! other views by resection, an adjustment after each.
+//! Incremental reconstruction from verified pairs: the pair with most inliers at good parallax
+//! first, the other views by resection, an adjustment after each.
 use super::model::{Model, Track};
 use super::pair::Pair;
-use super::tracks::Sightings;
+use super::tracks::TrackElements;
 use crate::resect::resect;
 use crate::scene::Pose;
 use glam::{DVec2, DVec3};
 
-/// Why a reconstruction could not grow to all views.
+/// A reconstruction that could not register all views.
 pub(super) struct Stuck {
-    /// Views without a camera.
-    pub(super) left: Vec<usize>,
+    pub(super) unregistered: Vec<usize>,
 }
 
-/// Fewest agreeing points for placing a view: six fix pose and focal length, twice that guards
-/// against chance.
+/// Fewest inliers for registering a view: six points determine pose and focal length, twice that
+/// guards against chance.
 pub(super) const MIN_RESECTION: usize = 12;
 
-/// Usefulness of a pair as the seed: matches, discounted below 10° of parallax.
+/// Score of a pair as the seed: inliers, discounted below 10° of parallax.
 pub(super) fn seed_score(pair: &Pair) -> f64 {
     pair.geometry.inliers.len() as f64 * (pair.geometry.parallax / 10.0).min(1.0)
 }
 
-/// Grows a model over all views. `empty` holds centres, groups, optics and priors; `threshold` in
-/// pixels.
+/// Registers all views, starting from the pair `seed`. `empty` holds centres, camera ids,
+/// intrinsics and priors; `threshold` in pixels.
 pub(super) fn grow(
     empty: &Model,
-    tracks: &[Sightings],
+    tracks: &[TrackElements],
     pairs: &[Pair],
     seed: &Pair,
     threshold: f64,
 ) -> Result<Model, Stuck> {
     let mut model = empty.clone();
-    model.tracks = tracks.iter().map(|t| Track { position: None, sightings: t.clone() }).collect();
+    model.tracks = tracks.iter().map(|t| Track { position: None, elements: t.clone() }).collect();
     model.poses[seed.matches.first] = Some(Pose::IDENTITY);
     model.poses[seed.matches.second] = Some(seed.geometry.pose);
     model.triangulate_all(2.0 * threshold);
     adjust_and_triangulate(&mut model, threshold);
     let views = model.poses.len();
     loop {
-        let left: Vec<usize> = (0..views).filter(|v| model.poses[*v].is_none()).collect();
-        if left.is_empty() {
+        let unregistered: Vec<usize> = (0..views).filter(|v| model.poses[*v].is_none()).collect();
+        if unregistered.is_empty() {
             break;
         }
-        let best = left
+        let best = unregistered
             .iter()
             .map(|&v| (resection(&model, v, threshold), v))
             .max_by_key(|(r, v)| (r.as_ref().map_or(0, |r| r.count), std::cmp::Reverse(*v)));
         match best {
             Some((Some(r), v)) if r.count >= MIN_RESECTION => {
                 model.poses[v] = Some(r.pose);
-                let group = model.group[v];
-                model.optics[group].focal *= r.stretch;
+                let camera = model.camera_ids[v];
+                model.intrinsics[camera].focal *= r.stretch;
             }
-            _ => match by_pair(&model, pairs, &left, threshold) {
+            _ => match pose_from_pair(&model, pairs, &unregistered, threshold) {
                 Some((v, pose)) => model.poses[v] = Some(pose),
-                None => return Err(Stuck { left }),
+                None => return Err(Stuck { unregistered }),
             },
         }
         model.triangulate_all(2.0 * threshold);
@@ -64,71 +63,76 @@ pub(super) fn grow(
     Ok(model)
 }
 
-/// Adjusts, triangulates again with the better cameras, adjusts.
+/// Adjusts and triangulates twice, the second time with a tighter gate.
 fn adjust_and_triangulate(model: &mut Model, threshold: f64) {
     for gate in [4.0, 2.0] {
-        // An adjustment that fails leaves the model as it is; too few points show up as a stuck
-        // view.
+        // A failed adjustment leaves the model unchanged; too few points then show as an
+        // unregistered view.
         let _ = model.adjust(gate * threshold, 1.5, 25);
         model.triangulate_all(gate * threshold);
     }
 }
 
-/// Pose of a view from triangulated points that it shows.
+/// Pose of a view from triangulated points.
 pub(super) struct Resection {
     pub(super) pose: Pose,
-    /// Focal length as a multiple of the one that the view came with.
+    /// Focal length as a multiple of that in the model.
     pub(super) stretch: f64,
-    /// Points that agree.
+    /// Number of inliers.
     pub(super) count: usize,
 }
 
-/// Focal lengths tried for a view that shares its own with no placed view: resection bears half a
-/// step of 1.4.
+/// Focal lengths tried for a view whose camera no registered view shares, as multiples of that in
+/// the model: resection tolerates half a step of 1.4.
 const STRETCHES: [f64; 5] = [1.0, 0.7, 1.4, 0.5, 2.0];
 
-/// Pose of a view from its sightings of triangulated points.
+/// Registers a view from its observations of triangulated points.
 pub(super) fn resection(model: &Model, view: usize, threshold: f64) -> Option<Resection> {
     let (mut world, mut pixels) = (Vec::<DVec3>::new(), Vec::<DVec2>::new());
     for t in &model.tracks {
         let Some(x) = t.position else { continue };
-        if let Some(s) = t.sightings.iter().find(|s| s.view == view) {
+        if let Some(s) = t.elements.iter().find(|s| s.view == view) {
             world.push(x);
-            pixels.push(model.straight(view, s.pixel));
+            pixels.push(model.undistorted(view, s.pixel));
         }
     }
-    let group = model.group[view];
-    let known = (0..model.poses.len()).any(|v| model.group[v] == group && model.poses[v].is_some());
-    let sigma = if known { 0.0 } else { model.priors[group].log_focal.1 };
-    // A ratio of two focal lengths has √2 of the σ of one; two of it.
+    let camera = model.camera_ids[view];
+    let known = (0..model.poses.len()).any(|v| model.camera_ids[v] == camera && model.poses[v].is_some());
+    let sigma = if known { 0.0 } else { model.priors[camera].log_focal.1 };
+    // A ratio of two focal lengths has √2 of the σ of one; ratios up to two σ are tried.
     let tried = STRETCHES.into_iter().filter(|s| s.ln().abs() <= 2.0 * 2f64.sqrt() * sigma);
-    let place = |stretch: f64| {
+    let resect_with = |stretch: f64| {
         let r = resect(&world, &pixels, model.focal(view) * stretch, 2.0 * threshold, 500, model.seed)?;
         Some(Resection { pose: r.pose, stretch, count: r.inliers.len() })
     };
-    tried.filter_map(place).max_by_key(|p| p.count)
+    tried.filter_map(resect_with).max_by_key(|p| p.count)
 }
 
-/// Fallback for a view with few tracks into the model: the relative pose of its best pair with a
-/// placed view, scaled by the depths of the points both see.
-fn by_pair(model: &Model, pairs: &[Pair], left: &[usize], threshold: f64) -> Option<(usize, Pose)> {
+/// Fallback for a view with few observations of triangulated points: the relative pose of its best
+/// pair with a registered view, scaled by the depths of common points.
+fn pose_from_pair(
+    model: &Model,
+    pairs: &[Pair],
+    unregistered: &[usize],
+    threshold: f64,
+) -> Option<(usize, Pose)> {
     let mut best: Option<(usize, usize, Pose)> = None;
     for pair in pairs {
         let (first, second) = (pair.matches.first, pair.matches.second);
-        let (placed, new, relative) = if left.contains(&second) && !left.contains(&first) {
+        let (registered, new, relative) = if unregistered.contains(&second) && !unregistered.contains(&first)
+        {
             (first, second, pair.geometry.pose)
-        } else if left.contains(&first) && !left.contains(&second) {
+        } else if unregistered.contains(&first) && !unregistered.contains(&second) {
             (second, first, pair.geometry.pose.inverse())
         } else {
             continue;
         };
-        let base = model.poses[placed]?;
-        // Candidate scales: each common point proposes one, and the one most others agree with
-        // wins.
+        let base = model.poses[registered]?;
+        // Each common point yields a candidate scale; the one that most others agree with wins.
         let common: Vec<(DVec3, DVec2)> = model
             .tracks
             .iter()
-            .filter_map(|t| Some((t.position?, t.sightings.iter().find(|s| s.view == new)?.pixel)))
+            .filter_map(|t| Some((t.position?, t.elements.iter().find(|s| s.view == new)?.pixel)))
             .collect();
         let unit = relative.translation.normalize();
         for (x, pixel) in &common {

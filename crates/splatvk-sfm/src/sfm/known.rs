@@ -1,10 +1,10 @@
-//! Sparse points for cameras that are known already.
-use super::families::{corner_families, keypoints};
+//! Triangulation of sparse points for known cameras.
+use super::detectors::{detect_features, keypoints};
 use super::finish::inlier_matches;
-use super::model::{Freedom, MIN_ANGLE_DEGREES, Model, Sighting, Track};
-use super::relate::{THRESHOLD, putative_matches};
+use super::model::{MIN_ANGLE_DEGREES, Model, RefinedIntrinsics, Track, TrackElement};
 use super::tracks;
-use crate::bundle::{Optics, OpticsPrior};
+use super::verify::{THRESHOLD, putative_matches};
+use crate::bundle::{Intrinsics, IntrinsicsPrior};
 use crate::matching::Keypoints;
 use crate::photo::Photo;
 use crate::progress::Progress;
@@ -15,12 +15,12 @@ use glam::DVec2;
 
 /// Fewest points that determine the depth range of a scene.
 const MIN_POINTS: usize = 20;
-/// Least share of the matches by appearance that must obey the given cameras: chance gives about 2
-/// % (a band of 2 × 3 px in 480), true cameras 20 % and more.
+/// Least share of the putative matches that obey the given cameras: chance gives about 2 % (a band
+/// of 2 × 3 px in 480), true cameras 20 % and more.
 const MIN_AGREEMENT: f64 = 0.1;
 
-/// Points for given cameras (one per photo, at working resolution). The cameras keep their
-/// intrinsics, relative poses and unit of length; the world frame becomes that of camera 0.
+/// Triangulates points for given cameras (one per photo, at working resolution). The cameras keep
+/// their intrinsics, relative poses and unit of length; the world frame becomes that of camera 0.
 pub fn with_cameras(
     photos: &[Photo],
     cameras: &[Camera],
@@ -30,48 +30,50 @@ pub fn with_cameras(
     if photos.len() < 2 || photos.len() != cameras.len() {
         return Err(Error::input("known cameras need one camera per photo and at least two photos"));
     }
-    let families = corner_families(photos, features, progress)?;
-    // Every view becomes a camera with one focal length and its principal point at the origin.
-    let focal = |c: &Camera| 0.5 * (c.fx + c.fy);
-    let flat = |c: &Camera, p: DVec2| DVec2::new((p.x - c.cx) / c.fx, (p.y - c.cy) / c.fy) * focal(c);
+    let detectors = detect_features(photos, features, progress)?;
     let long = photos[0].image.width.max(photos[0].image.height) as f64;
     let threshold = THRESHOLD * long;
     let back = cameras[0].pose.inverse();
+    // The model has one focal length per camera and principal points at the origin.
     let mut model = Model {
         poses: cameras.iter().map(|c| Some(c.pose.compose(&back))).collect(),
         centres: vec![DVec2::ZERO; cameras.len()],
-        group: (0..cameras.len()).collect(),
-        alike: (0..cameras.len()).collect(),
-        separable: (0..cameras.len()).collect(),
+        camera_ids: (0..cameras.len()).collect(),
+        camera_ids_by_file: (0..cameras.len()).collect(),
+        camera_ids_by_exif: (0..cameras.len()).collect(),
         zoom: vec![1.0; cameras.len()],
-        optics: cameras
+        intrinsics: cameras
             .iter()
-            .map(|c| Optics { focal: focal(c), lens: Lens::NONE, shift: DVec2::ZERO })
+            .map(|c| Intrinsics {
+                focal: mean_focal(c),
+                lens: Lens::NONE,
+                principal_point_offset: DVec2::ZERO,
+            })
             .collect(),
-        priors: vec![OpticsPrior::default(); cameras.len()],
-        freedom: Freedom::Focal,
+        priors: vec![IntrinsicsPrior::default(); cameras.len()],
+        refined: RefinedIntrinsics::Focal,
         tracks: Vec::new(),
-        // Nothing is drawn where cameras are known.
+        // No samples are drawn with known cameras.
         seed: 0,
     };
-    let mut putative = putative_matches(photos, &families, progress)?;
+    let mut putative = putative_matches(photos, &detectors, progress)?;
     for pair in &mut putative {
         let (a, b) = (&cameras[pair.first], &cameras[pair.second]);
-        pair.list.iter_mut().for_each(|m| (m.0, m.1) = (flat(a, m.0), flat(b, m.1)));
+        pair.list.iter_mut().for_each(|m| (m.0, m.1) = (to_isotropic(a, m.0), to_isotropic(b, m.1)));
     }
     let tried: usize = putative.iter().map(|p| p.list.len()).sum();
     let mut links = inlier_matches(&model, &putative, threshold);
     let agreement = links.len() as f64 / tried.max(1) as f64;
-    let keypoints: Vec<Vec<Sighting>> = (0..photos.len())
+    let keypoints: Vec<Vec<TrackElement>> = (0..photos.len())
         .map(|v| {
-            let mut all = keypoints(&families, v);
-            all.iter_mut().for_each(|s| s.pixel = flat(&cameras[v], s.pixel));
+            let mut all = keypoints(&detectors, v);
+            all.iter_mut().for_each(|s| s.pixel = to_isotropic(&cameras[v], s.pixel));
             all
         })
         .collect();
     model.tracks = tracks::join(&mut links, &keypoints)
         .into_iter()
-        .map(|sightings| Track { position: None, sightings })
+        .map(|elements| Track { position: None, elements })
         .collect();
     model.triangulate_all(threshold);
     model.prune(threshold);
@@ -83,7 +85,7 @@ pub fn with_cameras(
             model.tracks.len()
         )));
     }
-    let placed: Vec<Camera> = cameras
+    let registered: Vec<Camera> = cameras
         .iter()
         .zip(&model.poses)
         .map(|(c, p)| Camera { pose: p.unwrap_or(c.pose), ..c.clone() })
@@ -93,10 +95,10 @@ pub fn with_cameras(
         .iter()
         .filter_map(|t| {
             let views: Vec<(usize, DVec2)> = t
-                .sightings
+                .elements
                 .iter()
                 .map(|s| {
-                    let (c, p) = (&cameras[s.view], s.pixel / focal(&cameras[s.view]));
+                    let (c, p) = (&cameras[s.view], s.pixel / mean_focal(&cameras[s.view]));
                     (s.view, DVec2::new(p.x * c.fx + c.cx, p.y * c.fy + c.cy))
                 })
                 .collect();
@@ -104,5 +106,15 @@ pub fn with_cameras(
             Some(SparsePoint { position: t.position?, colour: photos[v].image.nearest(p), views })
         })
         .collect();
-    Ok(SparseModel { cameras: placed, points, focal_log_sigma: None, fitted: Vec::new(), flat: false })
+    Ok(SparseModel { cameras: registered, points, focal_log_sigma: None, fitted: Vec::new(), flat: false })
+}
+
+fn mean_focal(c: &Camera) -> f64 {
+    0.5 * (c.fx + c.fy)
+}
+
+/// Maps a pixel to the camera of focal length [`mean_focal`] with the principal point at the
+/// origin.
+fn to_isotropic(c: &Camera, p: DVec2) -> DVec2 {
+    DVec2::new((p.x - c.cx) / c.fx, (p.y - c.cy) / c.fy) * mean_focal(c)
 }

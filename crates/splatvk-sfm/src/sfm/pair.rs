@@ -1,5 +1,4 @@
-//! Pairs of photos whose matches agree on a geometry, and which photos only a doubtful one joins to
-//! the others.
+//! Pairs of photos with a verified two-view geometry, and photos that only a doubtful one connects.
 use super::tracks::KeypointMatch;
 use crate::two_view::TwoView;
 use glam::DVec2;
@@ -12,50 +11,49 @@ pub(super) struct Matches {
     pub(super) list: Vec<(DVec2, DVec2, KeypointMatch)>,
 }
 
-/// Two views whose matches agree on a geometry.
 pub(super) struct Pair {
-    /// Those that agree.
+    /// The inliers.
     pub(super) matches: Matches,
     pub(super) geometry: TwoView,
-    /// Whether so many of all matches agree that the geometry is right beyond doubt.
+    /// Whether the inliers pass [`SURE`].
     pub(super) sure: bool,
 }
 
 impl Pair {
-    /// Its photos, ascending.
+    /// Indices of its views, ascending.
     pub(super) fn views(&self) -> (usize, usize) {
         (self.matches.first, self.matches.second)
     }
 }
 
-/// Agreeing matches, and their share of all, from which on a pair is taken for sure: on the tuning
-/// sets wrong geometries of two photos have up to 200 matches, but less than half of all.
+/// Fewest inliers, and their least share of all matches, of a sure pair: on the tuning sets wrong
+/// geometries of two photos have up to 200 inliers, but less than half of all matches.
 pub(super) const SURE: (usize, f64) = (100, 0.5);
 
-/// Whether `agree` matches of `all` leave no doubt.
-pub(super) fn is_sure(agree: usize, all: usize) -> bool {
-    agree >= SURE.0 && agree as f64 >= SURE.1 * all as f64
+/// Whether `inliers` of `all` matches make a sure pair.
+pub(super) fn is_sure(inliers: usize, all: usize) -> bool {
+    inliers >= SURE.0 && inliers as f64 >= SURE.1 * all as f64
 }
 
-/// Per photo the part that links connect it to, by the first photo of that part.
-pub(super) fn parts(n: usize, linked: impl Iterator<Item = (usize, usize)>) -> Vec<usize> {
-    let mut part: Vec<usize> = (0..n).collect();
+/// Connected component of each photo, by its first photo.
+pub(super) fn components(n: usize, linked: impl Iterator<Item = (usize, usize)>) -> Vec<usize> {
+    let mut component: Vec<usize> = (0..n).collect();
     for (i, j) in linked {
-        let (a, b) = (part[i].min(part[j]), part[i].max(part[j]));
-        part.iter_mut().filter(|p| **p == b).for_each(|p| *p = a);
+        let (a, b) = (component[i].min(component[j]), component[i].max(component[j]));
+        component.iter_mut().filter(|p| **p == b).for_each(|p| *p = a);
     }
-    part
+    component
 }
 
-/// Per photo whether a single unsure pair is all that joins its part of the photos to the rest:
-/// nothing confirms what that pair says. A part of more than half of the photos is where the others
-/// are missing. `agrees`: per pair, whether its matches agree with the cameras.
+/// Whether each photo's pose rests on a single unsure pair: sure pairs connect it to at most half
+/// of the photos, and fewer than two agreeing pairs connect these to the rest. `agrees`: per pair,
+/// whether its matches agree with the cameras.
 pub(super) fn unconfirmed(n: usize, pairs: &[Pair], agrees: &[bool]) -> Vec<bool> {
-    let part = parts(n, pairs.iter().filter(|p| p.sure).map(Pair::views));
-    let leaves = |of: usize, p: &Pair| (part[p.views().0] == of) != (part[p.views().1] == of);
+    let component = components(n, pairs.iter().filter(|p| p.sure).map(Pair::views));
+    let leaves = |of: usize, p: &Pair| (component[p.views().0] == of) != (component[p.views().1] == of);
     let joined = |of: usize| pairs.iter().zip(agrees).filter(|(p, agrees)| **agrees && leaves(of, p)).count();
-    let size = |of: usize| part.iter().filter(|p| **p == of).count();
-    (0..n).map(|v| 2 * size(part[v]) <= n && joined(part[v]) < 2).collect()
+    let size = |of: usize| component.iter().filter(|p| **p == of).count();
+    (0..n).map(|v| 2 * size(component[v]) <= n && joined(component[v]) < 2).collect()
 }
 
 #[cfg(test)]
@@ -75,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn two_pairs_that_agree_confirm_a_photo_and_one_does_not() {
+    fn unconfirmed_unless_two_pairs_agree() {
         let mut pairs = vec![pair(0, 1, true), pair(1, 2, true), pair(2, 3, false)];
         assert_eq!(unconfirmed(4, &pairs, &[true; 3]), [false, false, false, true]);
         pairs.push(pair(1, 3, false));

@@ -7,9 +7,9 @@ use nalgebra::{DMatrix, DVector};
 
 /// Half the side of a patch: 13 × 13 pixels hold enough texture at corners and stay planar.
 pub(super) const RADIUS: i32 = 6;
-/// Gaussian window, pixels: the point itself matters most.
+/// σ of the Gaussian window, pixels: the point itself matters most.
 const WINDOW: f64 = 4.0;
-/// Blur before sampling: hides the pixel grid from the bilinear interpolation.
+/// σ of the blur before sampling, pixels: hides the pixel grid from the bilinear interpolation.
 const BLUR: f32 = 0.8;
 /// Standard deviation below which a patch has no texture (1 in 255, twice JPEG noise after the
 /// blur).
@@ -19,14 +19,14 @@ const MIN_CONTRAST: f64 = 0.008;
 const SLANT_SIGMA: f64 = 0.003;
 
 /// Blurred luma with its gradients.
-pub(super) struct Shades {
+pub(super) struct LumaGradients {
     value: Image<f32>,
     dx: Vec<f32>,
     dy: Vec<f32>,
 }
 
-impl Shades {
-    pub(super) fn new(luma: &Image<f32>) -> Shades {
+impl LumaGradients {
+    pub(super) fn new(luma: &Image<f32>) -> LumaGradients {
         let value = blurred(luma, BLUR);
         let (w, h) = (value.width, value.height);
         let at = |x: usize, y: usize| value.data[y * w + x];
@@ -37,7 +37,7 @@ impl Shades {
                 dy[y * w + x] = 0.5 * (at(x, y + 1) - at(x, y - 1));
             }
         }
-        Shades { value, dx, dy }
+        LumaGradients { value, dx, dy }
     }
 
     pub(super) fn size(&self) -> (usize, usize) {
@@ -91,7 +91,7 @@ impl Shades {
     }
 }
 
-/// Window weights and offsets, row-major.
+/// Offsets and weights of the window, row-major.
 fn window() -> Vec<(DVec2, f64)> {
     let mut out = Vec::new();
     for y in -RADIUS..=RADIUS {
@@ -105,7 +105,7 @@ fn window() -> Vec<(DVec2, f64)> {
     out
 }
 
-/// Zero-mean, unit-variance values under the window; `None` without texture.
+/// Zero-mean, unit-variance values under the window, and their σ; `None` without texture.
 fn standardised(values: &[f64], offsets: &[(DVec2, f64)]) -> Option<(Vec<f64>, f64)> {
     let mean: f64 = values.iter().zip(offsets).map(|(v, o)| v * o.1).sum();
     let variance: f64 = values.iter().zip(offsets).map(|(v, o)| (v - mean).powi(2) * o.1).sum();
@@ -156,16 +156,16 @@ impl Warp {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Aligned {
     pub(super) view: usize,
-    /// Where the view shows the centre of the reference patch.
+    /// Position of the centre of the reference patch.
     pub(super) pixel: DVec2,
     /// Normalised cross-correlation.
     pub(super) ncc: f64,
 }
 
-/// What alignment needs, prepared once.
+/// Model, images and window of the alignment.
 pub(super) struct Aligner<'a> {
     pub(super) model: &'a Model,
-    pub(super) shades: &'a [Shades],
+    pub(super) images: &'a [LumaGradients],
     offsets: Vec<(DVec2, f64)>,
 }
 
@@ -181,18 +181,19 @@ pub(super) struct Facet {
 }
 
 impl<'a> Aligner<'a> {
-    pub(super) fn new(model: &'a Model, shades: &'a [Shades]) -> Aligner<'a> {
-        Aligner { model, shades, offsets: window() }
+    pub(super) fn new(model: &'a Model, images: &'a [LumaGradients]) -> Aligner<'a> {
+        Aligner { model, images, offsets: window() }
     }
 
-    /// The facet's own patch, standardised; `None` at the image edge or without texture.
+    /// Standardised patch of the facet in its own view; `None` at the image edge or without
+    /// texture.
     pub(super) fn template(&self, f: &Facet) -> Option<Vec<f64>> {
         let values: Option<Vec<f64>> =
-            self.offsets.iter().map(|o| self.shades[f.view].value_at(f.pixel + o.0)).collect();
+            self.offsets.iter().map(|o| self.images[f.view].value_at(f.pixel + o.0)).collect();
         Some(standardised(&values?, &self.offsets)?.0)
     }
 
-    /// Normalised cross-correlation of a facet's template with another view at a shift.
+    /// Normalised cross-correlation of a facet's template with another view, shifted by `shift`.
     pub(super) fn ncc(&self, template: &[f64], f: &Facet, other: usize, shift: DVec2) -> Option<f64> {
         let warp = Warp::new(self.model, f.view, other)?;
         let values: Option<Vec<f64>> = self
@@ -200,16 +201,21 @@ impl<'a> Aligner<'a> {
             .iter()
             .map(|(d, _)| {
                 let p = warp.position(self.model.ray(f.view, f.pixel + *d), f.inverse_depth, f.slant, *d)?;
-                self.shades[other].value_at(p + shift)
+                self.images[other].value_at(p + shift)
             })
             .collect();
-        let (seen, _) = standardised(&values?, &self.offsets)?;
-        Some(seen.iter().zip(template).zip(&self.offsets).map(|((a, b), o)| a * b * o.1).sum())
+        let (sampled, _) = standardised(&values?, &self.offsets)?;
+        Some(sampled.iter().zip(template).zip(&self.offsets).map(|((a, b), o)| a * b * o.1).sum())
     }
 
     /// Values, gradients and slant derivatives of the warped patch.
     #[expect(clippy::type_complexity, reason = "three parallel arrays used once")]
-    fn look(&self, f: &Facet, other: usize, shift: DVec2) -> Option<(Vec<f64>, Vec<DVec2>, Vec<[DVec2; 2]>)> {
+    fn sample_warped(
+        &self,
+        f: &Facet,
+        other: usize,
+        shift: DVec2,
+    ) -> Option<(Vec<f64>, Vec<DVec2>, Vec<[DVec2; 2]>)> {
         let warp = Warp::new(self.model, f.view, other)?;
         let n = self.offsets.len();
         let (mut values, mut gradients, mut moves) =
@@ -217,7 +223,7 @@ impl<'a> Aligner<'a> {
         for (d, _) in &self.offsets {
             let ray = self.model.ray(f.view, f.pixel + *d);
             let (p, by) = warp.apply(ray, f.inverse_depth, f.slant, *d)?;
-            let (value, gradient) = self.shades[other].sample(p + shift)?;
+            let (value, gradient) = self.images[other].sample(p + shift)?;
             values.push(value);
             gradients.push(gradient);
             moves.push(by);
@@ -225,16 +231,16 @@ impl<'a> Aligner<'a> {
         Some((values, gradients, moves))
     }
 
-    /// Where the facet's centre projects without shift.
-    pub(super) fn expected(&self, f: &Facet, other: usize) -> Option<DVec2> {
+    /// Projection of the facet's centre without shift.
+    pub(super) fn project_centre(&self, f: &Facet, other: usize) -> Option<DVec2> {
         let warp = Warp::new(self.model, f.view, other)?;
         let ray = self.model.ray(f.view, f.pixel);
         warp.apply(ray, f.inverse_depth, f.slant, DVec2::ZERO).map(|w| w.0)
     }
 
     /// Gauss–Newton over the slant (shared by all views) and one shift per view, with gain and bias
-    /// removed. `shifts` start as given; views whose correlation stays below `least` are left out.
-    /// Returns the improved facet.
+    /// removed. `starts`: views with initial shifts; views whose correlation stays below `least`
+    /// are left out. Returns the improved facet and the aligned views.
     pub(super) fn align(
         &self,
         facet: &Facet,
@@ -250,17 +256,18 @@ impl<'a> Aligner<'a> {
             let (mut h, mut g) = (DMatrix::<f64>::zeros(n, n), DVector::<f64>::zeros(n));
             scores.clear();
             for (k, (view, shift)) in active.iter().enumerate() {
-                let step = self.look(&f, *view, *shift).and_then(|l| {
-                    let (seen, sigma) = standardised(&l.0, &self.offsets)?;
-                    Some((seen, sigma, l.1, l.2))
+                let step = self.sample_warped(&f, *view, *shift).and_then(|(values, gradients, moves)| {
+                    let (sampled, sigma) = standardised(&values, &self.offsets)?;
+                    Some((sampled, sigma, gradients, moves))
                 });
-                let Some((seen, sigma, gradients, moves)) = step else {
+                let Some((sampled, sigma, gradients, moves)) = step else {
                     scores.push(-1.0);
                     h[(2 + 2 * k, 2 + 2 * k)] += 1.0;
                     h[(3 + 2 * k, 3 + 2 * k)] += 1.0;
                     continue;
                 };
-                scores.push(self.accumulate(&template, &seen, sigma, &gradients, &moves, k, &mut h, &mut g));
+                scores
+                    .push(self.accumulate(&template, &sampled, sigma, &gradients, &moves, k, &mut h, &mut g));
             }
             // Slant prior against the starting plane, in units of the patch residual (about 0.3 at
             // NCC 0.95).
@@ -273,7 +280,7 @@ impl<'a> Aligner<'a> {
                 h[(i, i)] = h[(i, i)] * 1.001 + 1e-9;
             }
             let d = h.cholesky()?.solve(&g);
-            // Beyond a pixel per step the linearisation is void.
+            // Beyond a pixel per step the linearisation is invalid.
             f.slant -= DVec2::new(d[0], d[1]).clamp_length_max(SLANT_SIGMA);
             let mut largest: f64 = 0.0;
             for (k, a) in active.iter_mut().enumerate() {
@@ -282,7 +289,7 @@ impl<'a> Aligner<'a> {
                 largest = largest.max(step.length());
             }
             if round >= 3 {
-                // Occluded or wrong views would bend the plane of the others.
+                // Occluded or wrong views would distort the plane of the others.
                 let keep: Vec<bool> = scores.iter().map(|s| *s > 0.5).collect();
                 let mut k = keep.iter();
                 active.retain(|_| *k.next().unwrap_or(&false));
@@ -290,7 +297,7 @@ impl<'a> Aligner<'a> {
             if active.is_empty() {
                 return None;
             }
-            // A hundredth of a pixel is below what JPEG leaves.
+            // A hundredth of a pixel is below the noise of JPEG.
             if round >= 3 && largest < 0.01 {
                 break;
             }
@@ -299,7 +306,7 @@ impl<'a> Aligner<'a> {
             .iter()
             .filter_map(|(view, shift)| {
                 let ncc = self.ncc(&template, &f, *view, *shift)?;
-                let pixel = self.expected(&f, *view)? + *shift;
+                let pixel = self.project_centre(&f, *view)? + *shift;
                 (ncc >= least).then_some(Aligned { view: *view, pixel, ncc })
             })
             .collect();
@@ -310,7 +317,7 @@ impl<'a> Aligner<'a> {
     fn accumulate(
         &self,
         template: &[f64],
-        seen: &[f64],
+        sampled: &[f64],
         sigma: f64,
         gradients: &[DVec2],
         moves: &[[DVec2; 2]],
@@ -326,48 +333,48 @@ impl<'a> Aligner<'a> {
         // Standardising removes the mean and the component along the patch itself from every
         // derivative.
         let (mut mean, mut along) = ([0.0; 4], [0.0; 4]);
-        for ((row, s), o) in rows.iter().zip(seen).zip(&self.offsets) {
+        for ((row, s), o) in rows.iter().zip(sampled).zip(&self.offsets) {
             for c in 0..4 {
                 mean[c] += o.1 * row[c];
                 along[c] += o.1 * row[c] * s;
             }
         }
-        let at = [0, 1, 2 + 2 * k, 3 + 2 * k];
+        let index = [0, 1, 2 + 2 * k, 3 + 2 * k];
         let mut correlation = 0.0;
-        for (((row, s), t), o) in rows.iter().zip(seen).zip(template).zip(&self.offsets) {
+        for (((row, s), t), o) in rows.iter().zip(sampled).zip(template).zip(&self.offsets) {
             let j: [f64; 4] = std::array::from_fn(|c| row[c] - mean[c] - along[c] * s);
             correlation += o.1 * s * t;
             for a in 0..4 {
-                g[at[a]] += o.1 * j[a] * (s - t);
+                g[index[a]] += o.1 * j[a] * (s - t);
                 for b in 0..4 {
-                    h[(at[a], at[b])] += o.1 * j[a] * j[b];
+                    h[(index[a], index[b])] += o.1 * j[a] * j[b];
                 }
             }
         }
         correlation
     }
 
-    /// Aligns back: the patch around `pixel` of `other`, seen through the same plane, must return
-    /// to the facet's centre. The distance it misses by, pixels.
+    /// Forward–backward error, pixels: distance from the facet's centre after the patch around
+    /// `pixel` of `other` is aligned back through the same plane.
     pub(super) fn round_trip(&self, f: &Facet, other: usize, pixel: DVec2) -> Option<f64> {
-        let back = self.transferred(f, other, pixel)?;
-        let start = f.pixel - self.expected(&back, f.view)?;
+        let back = self.transfer(f, other, pixel)?;
+        let start = f.pixel - self.project_centre(&back, f.view)?;
         let (_, found) = self.align(&back, &[(f.view, start)], 0.5)?;
         Some((found[0].pixel - f.pixel).length())
     }
 
-    /// The facet's plane as seen from another view, centred at `pixel`.
-    fn transferred(&self, f: &Facet, other: usize, pixel: DVec2) -> Option<Facet> {
+    /// The facet's plane in another view, centred at `pixel`.
+    fn transfer(&self, f: &Facet, other: usize, pixel: DVec2) -> Option<Facet> {
         let warp = Warp::new(self.model, f.view, other)?;
         // Inverse depth in the other view at three points of the patch.
-        let at = |d: DVec2| -> Option<(DVec2, f64)> {
+        let project = |d: DVec2| -> Option<(DVec2, f64)> {
             let ray = self.model.ray(f.view, f.pixel + d);
             let rho = f.inverse_depth * (1.0 + f.slant.dot(d));
             let h = warp.m * ray + warp.shift * rho;
             (h.z > 1e-6 && rho > 0.0)
                 .then(|| (DVec2::new(h.x, h.y) * (warp.f / h.z) + warp.centre, rho / h.z))
         };
-        let (c, x, y) = (at(DVec2::ZERO)?, at(DVec2::X * 4.0)?, at(DVec2::Y * 4.0)?);
+        let (c, x, y) = (project(DVec2::ZERO)?, project(DVec2::X * 4.0)?, project(DVec2::Y * 4.0)?);
         let m = glam::DMat2::from_cols(x.0 - c.0, y.0 - c.0);
         if m.determinant().abs() < 1e-3 {
             return None;

@@ -1,25 +1,25 @@
-//! Sub-pixel refinement of all sightings, and further points predicted from the geometry.
-use super::model::{Model, Sighting, Track};
-use super::patch::{Aligner, Facet, RADIUS, Shades};
+//! Sub-pixel refinement of all observations, and further points predicted from the geometry.
+use super::model::{Model, Track, TrackElement};
+use super::patch::{Aligner, Facet, LumaGradients, RADIUS};
 use crate::scene::Image;
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
-/// Family of photometrically aligned sightings, after those of the detectors …
+/// Detector index of photometrically aligned observations, after those of the detectors.
 pub(super) const REFINED: usize = 2;
-/// … and of those aligned on images with more pixels.
+/// Detector index of observations aligned on images with more pixels.
 pub(super) const FINE: usize = 3;
 /// Least correlation of an aligned patch; views 75° apart reach 0.8 on a true match.
 const MIN_NCC: f64 = 0.8;
-/// Farthest a refined sighting may be from the keypoint it started at, pixels: about three times
-/// the detectors' noise.
+/// Largest distance of a refined observation from its keypoint, pixels: about three times the
+/// detectors' noise.
 const MAX_MOVE: f64 = 3.0;
-/// Largest forward–backward miss, pixels.
+/// Largest forward–backward error, pixels.
 const MAX_MISS: f64 = 0.3;
 /// Neighbours that predict the local plane.
 const NEIGHBOURS: usize = 8;
 
-/// Points of the model as one view sees them: (pixel, inverse depth).
+/// Points that a view observes: (pixel, inverse depth).
 struct ViewPoints {
     points: Vec<(DVec2, f64)>,
 }
@@ -30,7 +30,7 @@ impl ViewPoints {
             .tracks
             .iter()
             .filter_map(|t| {
-                let s = t.sightings.iter().find(|s| s.view == view)?;
+                let s = t.elements.iter().find(|s| s.view == view)?;
                 let (_, z) = model.project(view, t.position?)?;
                 Some((s.pixel, 1.0 / z))
             })
@@ -71,13 +71,13 @@ impl ViewPoints {
     }
 }
 
-/// The view from which a point is seen most centrally: least total angle to the other views.
-fn central(model: &Model, track: &Track, x: DVec3) -> usize {
+/// Index of the observation of the most central view: least total angle to the other views.
+fn most_central(model: &Model, track: &Track, x: DVec3) -> usize {
     let ray = |v: usize| model.poses[v].map(|p| (x - p.centre()).normalize());
     let mut best = (f64::INFINITY, 0);
-    for (k, s) in track.sightings.iter().enumerate() {
+    for (k, s) in track.elements.iter().enumerate() {
         let Some(r) = ray(s.view) else { continue };
-        let sum: f64 = track.sightings.iter().filter_map(|o| ray(o.view)).map(|o| o.angle_between(r)).sum();
+        let sum: f64 = track.elements.iter().filter_map(|o| ray(o.view)).map(|o| o.angle_between(r)).sum();
         if sum < best.0 {
             best = (sum, k);
         }
@@ -85,40 +85,40 @@ fn central(model: &Model, track: &Track, x: DVec3) -> usize {
     best.1
 }
 
-/// Moves every sighting onto the patch of its track's central view. Sightings that do not align
-/// keep their position and family; aligned ones change to `family`, so that their noise is
-/// estimated apart. `reach`: pixels within which the neighbours of a point lie on one plane with
-/// it.
-pub(super) fn refine(model: &mut Model, shades: &[Shades], family: usize, reach: f64) {
-    let seen: Vec<ViewPoints> = (0..model.poses.len()).map(|v| ViewPoints::new(model, v)).collect();
+/// Aligns every observation with the patch of its track's most central view. Observations that do
+/// not align keep position and detector; aligned ones get `detector`, so that their noise is
+/// estimated separately. `reach`: distance up to which neighbours predict the local plane of a
+/// point, pixels.
+pub(super) fn refine(model: &mut Model, images: &[LumaGradients], detector: usize, reach: f64) {
+    let points: Vec<ViewPoints> = (0..model.poses.len()).map(|v| ViewPoints::new(model, v)).collect();
     let fixed = &*model;
-    let aligner = Aligner::new(fixed, shades);
-    let moved: Vec<Option<Vec<Sighting>>> =
-        fixed.tracks.par_iter().map(|t| refined(&aligner, &seen, t, family, reach)).collect();
+    let aligner = Aligner::new(fixed, images);
+    let moved: Vec<Option<Vec<TrackElement>>> =
+        fixed.tracks.par_iter().map(|t| refine_track(&aligner, &points, t, detector, reach)).collect();
     for (t, m) in model.tracks.iter_mut().zip(moved) {
         if let Some(m) = m {
-            t.sightings = m;
+            t.elements = m;
         }
     }
 }
 
-fn refined(
+fn refine_track(
     aligner: &Aligner,
-    seen: &[ViewPoints],
+    points: &[ViewPoints],
     track: &Track,
-    family: usize,
+    detector: usize,
     reach: f64,
-) -> Option<Vec<Sighting>> {
+) -> Option<Vec<TrackElement>> {
     let (model, x) = (aligner.model, track.position?);
-    let reference = central(model, track, x);
-    let base = track.sightings[reference];
+    let reference = most_central(model, track, x);
+    let base = track.elements[reference];
     let z = model.project(base.view, x)?.1;
-    let others: Vec<&Sighting> = track.sightings.iter().filter(|s| s.view != base.view).collect();
+    let others: Vec<&TrackElement> = track.elements.iter().filter(|s| s.view != base.view).collect();
     let start = |f: &Facet| -> Vec<(usize, DVec2)> {
-        others.iter().filter_map(|s| Some((s.view, s.pixel - aligner.expected(f, s.view)?))).collect()
+        others.iter().filter_map(|s| Some((s.view, s.pixel - aligner.project_centre(f, s.view)?))).collect()
     };
     let flat = Facet { view: base.view, pixel: base.pixel, inverse_depth: 1.0 / z, slant: DVec2::ZERO };
-    let leaning = seen[base.view].plane(base.pixel, reach).map(|p| Facet { slant: p.1, ..flat });
+    let leaning = points[base.view].plane(base.pixel, reach).map(|p| Facet { slant: p.1, ..flat });
     let template = aligner.template(&flat)?;
     let score = |f: &Facet| -> f64 {
         start(f).iter().filter_map(|(v, s)| aligner.ncc(&template, f, *v, *s)).map(|n| n.max(0.0)).sum()
@@ -128,14 +128,14 @@ fn refined(
         _ => flat,
     };
     let (facet, aligned) = aligner.align(&facet, &start(&facet), MIN_NCC)?;
-    let mut out = track.sightings.clone();
+    let mut out = track.elements.clone();
     let mut count = 0;
     for a in aligned {
         let Some(s) = out.iter_mut().find(|s| s.view == a.view) else { continue };
         let good = (s.pixel - a.pixel).length() < MAX_MOVE
             && aligner.round_trip(&facet, a.view, a.pixel).is_some_and(|m| m < MAX_MISS);
         if good {
-            *s = Sighting { pixel: a.pixel, family, ..*s };
+            *s = TrackElement { pixel: a.pixel, detector, ..*s };
             count += 1;
         }
     }
@@ -143,28 +143,28 @@ fn refined(
         return None;
     }
     // The reference patch defines the point, so its own position is exact.
-    out[reference].family = family;
+    out[reference].detector = detector;
     Some(out)
 }
 
 /// Pitch of the grid on which further corners are picked, pixels.
 const CELL: usize = 10;
-/// Inverse depths tried around the prediction, relative.
+/// Largest relative change of the predicted inverse depth that is tried.
 const SEARCH: f64 = 0.06;
-/// Least correlation of a predicted point: without a detector's vote it must look the same.
+/// Least correlation of a predicted point, which no detector confirms.
 const MIN_GUIDED_NCC: f64 = 0.88;
 
 /// Adds points at corners without one: depth predicted from the neighbours, searched along the
-/// epipolar lines, aligned photometrically in all views that show it. Returns how many.
-pub(super) fn extend(model: &mut Model, shades: &[Shades], valid: &[Image<bool>]) -> usize {
+/// epipolar lines, aligned photometrically in all views that show it. Returns their number.
+pub(super) fn extend(model: &mut Model, images: &[LumaGradients], valid: &[Image<bool>]) -> usize {
     let fixed = &*model;
-    let aligner = Aligner::new(fixed, shades);
+    let aligner = Aligner::new(fixed, images);
     let mut all: Vec<Track> = Vec::new();
     for view in 0..fixed.poses.len() {
-        let seen = ViewPoints::new(fixed, view);
-        let corners = free_corners(&shades[view], &valid[view], &seen);
+        let points = ViewPoints::new(fixed, view);
+        let corners = free_corners(&images[view], &valid[view], &points);
         let found: Vec<Option<Track>> =
-            corners.par_iter().map(|p| predicted(&aligner, &seen, valid, view, *p)).collect();
+            corners.par_iter().map(|p| predict_track(&aligner, &points, valid, view, *p)).collect();
         all.extend(found.into_iter().flatten());
     }
     let count = all.len();
@@ -173,12 +173,12 @@ pub(super) fn extend(model: &mut Model, shades: &[Shades], valid: &[Image<bool>]
 }
 
 /// The strongest corner of each grid cell that is not near a known point.
-fn free_corners(shades: &Shades, valid: &Image<bool>, seen: &ViewPoints) -> Vec<DVec2> {
-    let (w, h) = shades.size();
+fn free_corners(image: &LumaGradients, valid: &Image<bool>, points: &ViewPoints) -> Vec<DVec2> {
+    let (w, h) = image.size();
     let margin = RADIUS as usize + 4;
     let (columns, rows) = (w / CELL + 1, h / CELL + 1);
     let mut taken = vec![false; columns * rows];
-    for (p, _) in &seen.points {
+    for (p, _) in &points.points {
         let (x, y) = (p.x.max(0.0) as usize / CELL, p.y.max(0.0) as usize / CELL);
         if x < columns && y < rows {
             taken[y * columns + x] = true;
@@ -191,7 +191,7 @@ fn free_corners(shades: &Shades, valid: &Image<bool>, seen: &ViewPoints) -> Vec<
             if taken[cell] || !valid.at(x, y) {
                 continue;
             }
-            let c = shades.cornerness(x, y);
+            let c = image.cornerness(x, y);
             if c > best[cell].0 {
                 best[cell] = (c, x, y);
             }
@@ -202,15 +202,15 @@ fn free_corners(shades: &Shades, valid: &Image<bool>, seen: &ViewPoints) -> Vec<
     best.iter().filter(|b| b.0 > least).map(|b| DVec2::new(b.1 as f64 + 0.5, b.2 as f64 + 0.5)).collect()
 }
 
-fn predicted(
+fn predict_track(
     aligner: &Aligner,
-    seen: &ViewPoints,
+    points: &ViewPoints,
     valid: &[Image<bool>],
     view: usize,
     pixel: DVec2,
 ) -> Option<Track> {
     let model = aligner.model;
-    let (rho, slant) = seen.plane(pixel, 60.0)?;
+    let (rho, slant) = points.plane(pixel, 60.0)?;
     let flat = Facet { view, pixel, inverse_depth: rho, slant };
     let template = aligner.template(&flat)?;
     let inside = |v: usize, p: DVec2| {
@@ -218,14 +218,14 @@ fn predicted(
         x < valid[v].width && y < valid[v].height && valid[v].at(x, y)
     };
     let others: Vec<usize> = (0..model.poses.len())
-        .filter(|v| *v != view && aligner.expected(&flat, *v).is_some_and(|p| inside(*v, p)))
+        .filter(|v| *v != view && aligner.project_centre(&flat, *v).is_some_and(|p| inside(*v, p)))
         .collect();
     // Steps of about a pixel in the view where depth moves the point most.
     let swing = others
         .iter()
         .filter_map(|v| {
             let far = Facet { inverse_depth: rho * (1.0 + SEARCH), ..flat };
-            Some((aligner.expected(&far, *v)? - aligner.expected(&flat, *v)?).length())
+            Some((aligner.project_centre(&far, *v)? - aligner.project_centre(&flat, *v)?).length())
         })
         .fold(0.0, f64::max);
     let steps = (swing.ceil() as i32).clamp(1, 40);
@@ -248,15 +248,15 @@ fn predicted(
     }
     let starts: Vec<(usize, DVec2)> = others.iter().map(|v| (*v, DVec2::ZERO)).collect();
     let (facet, aligned) = aligner.align(&facet, &starts, MIN_GUIDED_NCC)?;
-    let keep = |v: usize, p: DVec2| Sighting { view: v, pixel: p, sigma: 0.3, family: REFINED };
-    let mut sightings = vec![keep(view, pixel)];
+    let observation = |v: usize, p: DVec2| TrackElement { view: v, pixel: p, sigma: 0.3, detector: REFINED };
+    let mut elements = vec![observation(view, pixel)];
     for a in aligned {
-        let missed = aligner.expected(&facet, a.view)?.distance(a.pixel);
+        let missed = aligner.project_centre(&facet, a.view)?.distance(a.pixel);
         let back = aligner.round_trip(&facet, a.view, a.pixel);
         if missed < MAX_MOVE && back.is_some_and(|m| m < MAX_MISS) && a.ncc >= MIN_GUIDED_NCC {
-            sightings.push(keep(a.view, a.pixel));
+            elements.push(observation(a.view, a.pixel));
         }
     }
-    let position = model.triangulate(&sightings, 1.5)?;
-    (sightings.len() >= 2).then_some(Track { position: Some(position), sightings })
+    let position = model.triangulate(&elements, 1.5)?;
+    (elements.len() >= 2).then_some(Track { position: Some(position), elements })
 }

@@ -36,19 +36,19 @@ fn check(name: &str, features: impl Fn(&[Photo]) -> Vec<Keypoints>, rotation: f6
 }
 
 #[test]
-fn corners_alone_place_the_breakfast_cameras() {
-    // A tenth of what is asked of the whole (0.2°, 0.3 %, 1 %): ten times what it measures, so a
+fn reconstruct_breakfast_from_corners() {
+    // A tenth of the limits of the whole (0.2°, 0.3 %, 1 %): ten times the measured errors, so a
     // slip shows.
     check("corners", |_| Vec::new(), 0.03, 0.0005, 0.002);
 }
 
 #[test]
-fn learned_features_place_the_breakfast_cameras() {
+fn reconstruct_breakfast_from_learned_features() {
     check("corners + XFeat", learned, 0.03, 0.0005, 0.002);
 }
 
 #[test]
-fn known_cameras_give_points_on_the_true_surface() {
+fn with_cameras_triangulates_true_surface() {
     let truth = testing::train(&testing::folder());
     let model = with_cameras(&truth.photos, &truth.cameras, &[], &Silent).unwrap();
     let mut errors = Vec::new();
@@ -64,7 +64,7 @@ fn known_cameras_give_points_on_the_true_surface() {
         }
     }
     assert!(crate::math::median(&mut errors).unwrap() < 0.005);
-    // Cameras of other photos must be refused: mirror the rig.
+    // Cameras of other photos must be refused: the rig is reversed.
     let mut wrong = truth.cameras.clone();
     wrong.reverse();
     let error = with_cameras(&truth.photos, &wrong, &[], &Silent).unwrap_err().to_string();
@@ -90,7 +90,7 @@ fn turned(photo: &Photo, focal: f64, angle: f64) -> Photo {
     out
 }
 
-/// The error for photos that cannot be reconstructed: one line, exit code 2, naming the photos.
+/// Error for photos that cannot be reconstructed: one line, exit code 2, naming the photos.
 fn refusal(photos: &[Photo]) -> String {
     let error = reconstruct(photos, &[], 0, &Silent).unwrap_err().error;
     let text = error.to_string();
@@ -99,7 +99,7 @@ fn refusal(photos: &[Photo]) -> String {
 }
 
 #[test]
-fn photos_without_geometry_are_refused_by_name() {
+fn reconstruct_refuses_photos_without_geometry() {
     let truth = testing::train(&testing::folder());
     let a = &truth.photos[0];
     let twice = [a.clone(), Photo { stem: "copy".into(), ..a.clone() }];
@@ -122,12 +122,12 @@ fn photos_without_geometry_are_refused_by_name() {
 }
 
 #[test]
-fn two_photos_of_different_size_and_known_focal_are_enough() {
+fn reconstruct_two_photos_with_exif() {
     let mut truth = testing::train(&testing::folder());
     truth.photos.truncate(2);
     truth.cameras.truncate(2);
-    // The second photo comes from a file of 1.6 times its size, as another working resolution of
-    // the same camera.
+    // The second photo has a file of 1.6 times its size, as another working resolution of the same
+    // camera.
     let half = &mut truth.photos[1];
     half.original_size = (1024, 768);
     half.to_working = crate::scene::Affine::resize(half.original_size, (640, 480));
@@ -141,14 +141,14 @@ fn two_photos_of_different_size_and_known_focal_are_enough() {
     let turn = crate::numeric::rotation_angle(&(found.rotation * want.rotation.transpose())).to_degrees();
     let aim = found.translation.angle_between(want.translation).to_degrees();
     println!("two views: {turn:.3}° {aim:.3}°, σ ln f {:?}", model.focal_log_sigma);
-    // An orbit of two views hardly sees the focal length: 2 % of it turn the views by up to half a
-    // degree.
+    // Two views of an orbit hardly determine the focal length: 2 % of it turn the views by up to
+    // half a degree.
     assert!(turn < 0.8 && aim < 0.8, "{turn} {aim}");
     assert!(model.focal_log_sigma.unwrap() > 0.002);
 }
 
 #[test]
-fn a_lens_is_found_and_a_pinhole_stays_one() {
+fn reconstruct_finds_only_real_distortion() {
     let truth = testing::train(&testing::folder());
     let focal = truth.cameras[0].fx;
     let model = reconstruct(&truth.photos, &[], 0, &Silent).unwrap();
@@ -159,7 +159,7 @@ fn a_lens_is_found_and_a_pinhole_stays_one() {
     let model = reconstruct(&photos, &[], 0, &Silent).unwrap();
     let e = pose_errors(&model.cameras, &truth.cameras, truth.mean_depth);
     let found = model.fitted[0];
-    // Where both lenses image the corner of the undistorted picture.
+    // Position of the undistorted corner under both lenses.
     let corner = DVec2::new(320.0, 240.0) / focal;
     let miss = (found.lens.distort(corner) - lens.distort(corner)).length() * focal;
     println!("{found:?}: corner {miss:.2} px, {e:?}");
@@ -171,33 +171,34 @@ fn a_lens_is_found_and_a_pinhole_stays_one() {
 }
 
 #[test]
-fn a_view_in_the_wrong_place_is_the_only_one_that_disagrees() {
+fn agreement_low_only_for_wrong_view() {
     let truth = testing::train(&testing::folder());
-    let mut families = corner_families(&truth.photos, &[], &Silent).unwrap();
+    let mut detectors = detect_features(&truth.photos, &[], &Silent).unwrap();
     let mut model = empty_model(&truth.photos, &[false; 4], 0);
-    model.optics[0].focal = truth.cameras[0].fx;
+    model.intrinsics[0].focal = truth.cameras[0].fx;
     model.poses = truth.cameras.iter().map(|c| Some(c.pose)).collect();
-    let putative = relate::putative_matches(&truth.photos, &families, &Silent).unwrap();
-    let pairs = relate::related(&truth.photos, &mut families, putative, &model, &Silent).unwrap().pairs;
+    let putative = verify::putative_matches(&truth.photos, &detectors, &Silent).unwrap();
+    let pairs = verify::verify_all(&truth.photos, &mut detectors, putative, &model, &Silent).unwrap().pairs;
     let right = agreement(&model, &pairs, 3.0);
     assert!(right.iter().all(|a| *a > AGREED), "{right:?}");
     let turn = crate::scene::Pose::exp(glam::DVec3::new(0.1, 0.0, 0.0), glam::DVec3::new(0.0, 0.05, 0.0));
     model.poses[2] = Some(turn.compose(&truth.cameras[2].pose));
     let wrong = agreement(&model, &pairs, 3.0);
     println!("{right:?} {wrong:?}");
-    // Its neighbours share half of their matches with it and are not blamed.
+    // Its neighbours share half of their matches with it, which do not count for them.
     assert!(wrong[2] < 0.5 && [0, 1, 3].iter().all(|v| wrong[*v] > AGREED), "{wrong:?}");
 }
 
 #[test]
-fn two_photos_75_degrees_apart_say_how_little_they_know() {
+fn reconstruct_75_degrees_has_low_confidence() {
     let truth = testing::train(&testing::folder());
     let outer = [truth.photos[0].clone(), truth.photos[3].clone()];
     let cameras = [truth.cameras[0].clone(), truth.cameras[3].clone()];
     let model = reconstruct(&outer, &[], 0, &Silent).unwrap();
     let error = crate::relative::pair_errors(&model.cameras, &cameras)[0].rotation_degrees;
     let sigma = model.fitted[1].rotation_sigma.to_degrees();
-    // Equal distances to what both axes meet leave the focal length open, and with it the angle.
+    // Equal distances to the intersection of both axes leave the focal length undetermined, and
+    // with it the angle.
     println!("{error}° ± {sigma}°, {} points", model.points.len());
     assert!(sigma > 2.0 && error < 4.0 * sigma, "{error} {sigma}");
     assert!(model.fitted.iter().all(|f| f.confidence() == crate::Confidence::Low));
@@ -206,25 +207,25 @@ fn two_photos_75_degrees_apart_say_how_little_they_know() {
 }
 
 #[test]
-fn corners_seen_from_the_side_join_photos_75_degrees_apart() {
+fn affine_features_match_75_degrees() {
     let truth = testing::train(&testing::folder());
     let outer = [truth.photos[0].clone(), truth.photos[3].clone()];
     let mut model = empty_model(&outer, &[false; 2], 0);
-    model.optics[0].focal = truth.cameras[0].fx;
+    model.intrinsics[0].focal = truth.cameras[0].fx;
     model.poses = [0, 3].map(|v| Some(truth.cameras[v].pose)).to_vec();
-    let mut families = corner_families(&outer, &[], &Silent).unwrap();
-    let right = |families: &[families::Family]| {
-        let putative = relate::putative_matches(&outer, families, &Silent).unwrap();
+    let mut detectors = detect_features(&outer, &[], &Silent).unwrap();
+    let right = |detectors: &[detectors::DetectorFeatures]| {
+        let putative = verify::putative_matches(&outer, detectors, &Silent).unwrap();
         (finish::inlier_matches(&model, &putative, 1.5).len(), putative[0].list.len())
     };
-    let plain = right(&families);
-    families.push(families::affine_family(&outer));
-    let wide = right(&families);
+    let plain = right(&detectors);
+    detectors.push(detectors::affine_features(&outer));
+    let wide = right(&detectors);
     println!("{plain:?} {wide:?}");
     assert!(wide.0 > 3 * plain.0 && 2 * wide.0 > wide.1, "{plain:?} {wide:?}");
 }
 
-/// The middle of a photo at the size of the whole: the inner 1 / `zoom` of its width.
+/// The centre of a photo, enlarged to the size of the whole: the inner 1 / `zoom` of its width.
 fn cropped(photo: &Photo, zoom: f64) -> Photo {
     let mut out = photo.clone();
     let (w, h) = (photo.image.width, photo.image.height);
@@ -238,16 +239,15 @@ fn cropped(photo: &Photo, zoom: f64) -> Photo {
 
 #[test]
 #[ignore = "takes long: tools/test-long"]
-fn photos_that_only_look_like_one_camera_are_told_apart() {
+fn reconstruct_separates_different_cameras() {
     let truth = testing::train(&testing::folder());
     let focal = truth.cameras[0].fx;
     let one = reconstruct(&truth.photos, &[], 0, &Silent).unwrap();
     assert!(one.fitted.iter().all(|f| f.camera == 0 && f.agreement > 0.9), "{:?}", one.fitted);
     let lens = Lens::radial(-0.12, 0.03);
     type Change<'a> = &'a dyn Fn(&Photo) -> Photo;
-    // No file says that two of the photos came through a lens, or were cut out of larger ones.
-    // Change, zoom, limits of rotation in degrees and of the centre: a cut enlarged twice shows
-    // half the detail.
+    // No file states that two of the photos have distortion, or are cropped. Change, zoom, limits
+    // of rotation in degrees and of the centre: a crop enlarged twice shows half the detail.
     let sets: [(Change, f64, [f64; 2]); 2] =
         [(&|p| lensed(p, focal, lens), 1.0, [0.05, 0.001]), (&|p| cropped(p, 2.0), 2.0, [0.1, 0.002])];
     for (change, zoom, [rotation, centre]) in sets {
@@ -263,7 +263,7 @@ fn photos_that_only_look_like_one_camera_are_told_apart() {
         let of: Vec<usize> = model.fitted.iter().map(|f| f.camera).collect();
         assert!(of[1] == of[3] && of[0] != of[1] && of[2] != of[1], "{of:?}");
         assert!(model.fitted.iter().all(|f| f.agreement > 0.9));
-        // With one camera for all: 0.9° and 3 % with the lens, tens of degrees with the cut.
+        // With one camera for all: 0.9° and 3 % with the distortion, tens of degrees with the crop.
         assert!(e.rotation_degrees.iter().all(|v| *v < rotation), "{:?}", e.rotation_degrees);
         assert!(e.centre.iter().all(|v| *v < centre), "{e:?}");
         assert!(e.focal.iter().zip(&model.fitted).all(|(v, f)| *v < 2.0 * f.sigmas[0]), "{e:?}");
@@ -271,7 +271,7 @@ fn photos_that_only_look_like_one_camera_are_told_apart() {
 }
 
 #[test]
-fn planes_seen_straight_on_are_flat() {
+fn flat_photos_detects_frontal_planes() {
     let image = RgbImage { width: 640, height: 480, data: vec![[0.5; 3]; 640 * 480] };
     let photos = ["a", "b"].map(|name| crate::photo::from_pixels(name.as_ref(), &image, None, 640).unwrap());
     let flat = |pose: Pose, depth: f64| {
@@ -280,12 +280,12 @@ fn planes_seen_straight_on_are_flat() {
             DVec3::new(rng.uniform() - 0.5, 0.75 * (rng.uniform() - 0.5), 1.0) * z
         };
         let (x, y) = testing::matches_of(&pose, [600.0; 2], 300, 0.5, point);
-        let one = |(k, (x, y)): (usize, (&DVec2, &DVec2))| {
+        let keypoint_match = |(k, (x, y)): (usize, (&DVec2, &DVec2))| {
             let middle = DVec2::new(320.0, 240.0);
             (*x + middle, *y + middle, KeypointMatch { first: (0, k), second: (1, k), quality: 1.0 })
         };
-        let list = x.iter().zip(&y).enumerate().map(one).collect();
-        relate::flat_photos(&photos, &[pair::Matches { first: 0, second: 1, list }], 0)
+        let list = x.iter().zip(&y).enumerate().map(keypoint_match).collect();
+        verify::flat_photos(&photos, &[pair::Matches { first: 0, second: 1, list }], 0)
     };
     let aside = Pose::exp(DVec3::new(-0.8, 0.2, 0.1), DVec3::ZERO);
     let leaning = Pose::exp(DVec3::new(-0.8, 0.2, 0.1), DVec3::X * 0.4);
@@ -298,14 +298,14 @@ fn planes_seen_straight_on_are_flat() {
     assert_eq!(flat(aside, 2.0), [false; 2]);
 }
 
-/// Focal length, relative to the true one, of a plane seen nearly straight on by positions of that
-/// noise, pixels of σ 0.05 at least.
+/// Estimated focal length over the true one, of a plane seen nearly straight on with positions of
+/// that noise; σ is 0.05 pixels at least.
 fn focal_of_plane(noise: f64, tilt: f64) -> f64 {
     let truth = testing::train(&testing::folder());
     let mut rng = Random::new(4);
     let focal = 800.0;
     let mut model = empty_model(&truth.photos, &[true; 4], 0);
-    model.optics[0].focal = focal;
+    model.intrinsics[0].focal = focal;
     let places = [[0.0, 0.0], [0.6, 0.0], [0.0, 0.5], [0.5, 0.6]];
     let lean = |[x, y]: [f64; 2]| Pose::exp(DVec3::new(-x, -y, 0.0), tilt * DVec3::new(y, -x, 0.3));
     model.poses = places.map(|place| Some(lean(place))).to_vec();
@@ -313,35 +313,35 @@ fn focal_of_plane(noise: f64, tilt: f64) -> f64 {
         let x = DVec3::new(2.0 * rng.uniform() - 0.7, 1.6 * rng.uniform() - 0.5, 4.0);
         let seen = (0..4).map(|view| {
             let pixel = model.project(view, x).unwrap().0 + DVec2::new(rng.normal(), rng.normal()) * noise;
-            Sighting { view, pixel, sigma: noise.max(0.05), family: 0 }
+            TrackElement { view, pixel, sigma: noise.max(0.05), detector: 0 }
         });
-        let sightings = seen.collect();
-        model.tracks.push(model::Track { position: Some(x), sightings });
+        let elements = seen.collect();
+        model.tracks.push(model::Track { position: Some(x), elements });
     }
     model.adjust(f64::INFINITY, 2.0, 60).unwrap();
-    model.optics[0].focal / focal
+    model.intrinsics[0].focal / focal
 }
 
 #[test]
-fn priors_count_against_residuals_not_against_the_least_sigma() {
+fn adjust_weighs_priors_against_residuals() {
     let off = [0.002, 0.3].map(|noise| (focal_of_plane(noise, 0.03) - 1.0).abs());
     println!("{off:?}");
-    // The prior is 22 % below: exact positions leave it no say, those of phones do.
+    // The prior is 22 % below: it has no influence on exact positions, but on those of phones.
     assert!(off[0] < 0.005 && off[1] > 0.05, "{off:?}");
 }
 
 #[test]
-fn parts_of_photos_are_told_by_their_axes() {
+fn with_crops_finds_cropped_photos() {
     let truth = testing::train(&testing::folder());
     let (mut rng, cuts) =
         (Random::new(6), [DVec2::ZERO, DVec2::new(90.0, -50.0), DVec2::ZERO, DVec2::new(-60.0, 70.0)]);
     let whole = empty_model(&truth.photos, &[true; 4], 0);
-    let mut seen = whole.regrouped(&[0, 1, 2, 3]);
+    let mut seen = whole.with_camera_ids(&[0, 1, 2, 3]);
     seen.poses = truth.cameras.iter().map(|c| Some(c.pose)).collect();
-    for (v, optics) in seen.optics.iter_mut().enumerate() {
-        optics.focal = truth.cameras[v].fx;
+    for (v, intrinsics) in seen.intrinsics.iter_mut().enumerate() {
+        intrinsics.focal = truth.cameras[v].fx;
         if v % 2 == 1 {
-            (optics.focal, optics.shift) = (1.4 * optics.focal, cuts[v]);
+            (intrinsics.focal, intrinsics.principal_point_offset) = (1.4 * intrinsics.focal, cuts[v]);
         }
     }
     let mut model = model::Model { poses: seen.poses.clone(), ..whole };
@@ -350,25 +350,25 @@ fn parts_of_photos_are_told_by_their_axes() {
         let x = truth.cameras[0].unproject(pixel, truth.mean_depth * (0.7 + 0.6 * rng.uniform()));
         let seen = (0..4).filter_map(|view| {
             let pixel = seen.project(view, x)?.0 + DVec2::new(rng.normal(), rng.normal()) * 0.1;
-            Some(Sighting { view, pixel, sigma: 0.1, family: 0 })
+            Some(TrackElement { view, pixel, sigma: 0.1, detector: 0 })
         });
-        let sightings = seen.collect();
-        model.tracks.push(model::Track { position: Some(x), sightings });
+        let elements = seen.collect();
+        model.tracks.push(model::Track { position: Some(x), elements });
     }
-    let one_camera = fit::fit_optics(&model, Freedom::Focal, 60).unwrap();
-    let model = crops::explained(one_camera).unwrap().model;
-    let of = |v: usize| model.optics[model.group[v]];
+    let one_camera = fit::fit_intrinsics(&model, RefinedIntrinsics::Focal, 60).unwrap();
+    let model = crops::with_crops(one_camera).unwrap().model;
+    let of = |v: usize| model.intrinsics[model.camera_ids[v]];
     for v in 0..4 {
         let focal = if v % 2 == 1 { 1.4 } else { 1.0 };
         let found = of(v);
-        assert!((found.shift - cuts[v]).length() < 8.0, "{v}: {found:?}");
+        assert!((found.principal_point_offset - cuts[v]).length() < 8.0, "{v}: {found:?}");
         assert!((found.focal / (focal * truth.cameras[0].fx) - 1.0).abs() < 0.03, "{v}: {found:?}");
     }
-    assert!(model.group[0] == model.group[2] && model.has_crops());
+    assert!(model.camera_ids[0] == model.camera_ids[2] && model.has_crops());
 }
 
-/// The part of a photo that a lens moved by image stabilisation would show: 600 × 440 pixels, off
-/// the middle by `shift`.
+/// The part of a photo that a lens moved by image stabilisation shows: 600 × 440 pixels, off the
+/// centre by `shift`.
 fn moved(photo: &Photo, shift: [i32; 2]) -> Photo {
     let (width, height) = (600, 440);
     let at = |x: i32, y: i32| photo.image.at((x + 20 + shift[0]) as usize, (y + 20 + shift[1]) as usize);
@@ -378,7 +378,7 @@ fn moved(photo: &Photo, shift: [i32; 2]) -> Photo {
 }
 
 #[test]
-fn a_moving_lens_does_not_make_another_camera() {
+fn reconstruct_stabilised_lens_keeps_one_camera() {
     let truth = testing::train(&testing::folder());
     let shifts = [[0, 0], [12, -6], [-10, 8], [6, 10]];
     let moved = |(p, s): (&Photo, [i32; 2])| moved(p, s);
@@ -388,16 +388,16 @@ fn a_moving_lens_does_not_make_another_camera() {
     let focal: Vec<f64> = model.cameras.iter().map(|c| c.fx / truth.cameras[0].fx - 1.0).collect();
     println!("{of:?} {focal:?} {:?}", model.fitted[0].sigmas);
     assert_eq!(of, [0; 4]);
-    // A principal point for all is an approximation where it moves by 2 % of the width: measured
-    // 0.038.
+    // One principal point is an approximation where it moves by 2 % of the width: measured 0.038.
     assert!(focal.iter().all(|f| f.abs() < 0.05), "{focal:?}");
 }
 
 #[test]
-fn photos_whose_files_name_camera_and_zoom_share_it() {
+fn equal_exif_shares_intrinsics() {
     let mut photos = testing::train(&testing::folder()).photos;
-    let separate =
-        |photos: &[Photo]| empty_model(photos, &[false; 4], 0).with_separate_optics().map(|m| m.group);
+    let separate = |photos: &[Photo]| {
+        empty_model(photos, &[false; 4], 0).with_separate_intrinsics().map(|m| m.camera_ids)
+    };
     assert_eq!(separate(&photos), Some(vec![0, 1, 2, 3]));
     for p in &mut photos[..3] {
         (p.camera_model, p.exif_focal) = (Some("phone".into()), Some(600.0));
@@ -409,7 +409,7 @@ fn photos_whose_files_name_camera_and_zoom_share_it() {
 }
 
 #[test]
-fn larger_images_make_cameras_better() {
+fn fine_images_improve_cameras() {
     let mut truth = testing::train(&testing::folder());
     let photos = std::mem::take(&mut truth.photos);
     truth.photos = photos.iter().map(|p| crate::photo::load_at(&p.path, 320).unwrap()).collect();
@@ -457,7 +457,7 @@ fn corner_of_a_room(focal: f64) -> RgbImage {
 }
 
 #[test]
-fn walls_tell_the_focal_length_where_the_file_does_not() {
+fn empty_model_focal_from_walls() {
     let focal: f64 = 224.0;
     let room = corner_of_a_room(focal);
     let prior = |exif: Option<f64>, flat: bool| {
@@ -466,7 +466,7 @@ fn walls_tell_the_focal_length_where_the_file_does_not() {
     };
     let (mean, sigma) = prior(None, false);
     println!("{:.3} ± {sigma:.3}", mean - focal.ln());
-    // The long side alone says 0.25 ± 0.35; the walls 0.007 ± 0.060.
+    // The prior from the long side has 0.25 ± 0.35; the walls 0.007 ± 0.060.
     assert!((mean - focal.ln()).abs() < 0.05 && sigma < 0.1, "{mean} {sigma}");
     assert_eq!(prior(Some(300.0), false), (300f64.ln(), EXIF_SIGMA), "EXIF goes before");
     assert_eq!(prior(None, true).1, FOCAL_SIGMA, "a picture of a room on a wall tells nothing");

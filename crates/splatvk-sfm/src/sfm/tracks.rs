@@ -1,7 +1,7 @@
-//! Matches of all pairs, joined into tracks.
-use super::model::Sighting;
+//! Tracks from the matches of all pairs.
+use super::model::TrackElement;
 
-/// A verified match between two keypoints; keypoints are numbered per view.
+/// A match between two keypoints, each by view and index.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct KeypointMatch {
     pub(super) first: (usize, usize),
@@ -9,12 +9,12 @@ pub(super) struct KeypointMatch {
     pub(super) quality: f64,
 }
 
-/// A scene point as the photos show it: at most once per view, at least twice.
-pub(super) type Sightings = Vec<Sighting>;
+/// Observations of one point: at most one per view, at least two.
+pub(super) type TrackElements = Vec<TrackElement>;
 
 /// Joins links into tracks, best links first; a link that would put two keypoints of one view into
-/// a track is left out. `points[view][keypoint]` are all keypoints.
-pub(super) fn join(links: &mut [KeypointMatch], points: &[Vec<Sighting>]) -> Vec<Sightings> {
+/// a track is skipped. `points[view][keypoint]` are all keypoints.
+pub(super) fn join(links: &mut [KeypointMatch], points: &[Vec<TrackElement>]) -> Vec<TrackElements> {
     links.sort_by(|a, b| {
         b.quality.total_cmp(&a.quality).then(a.first.cmp(&b.first)).then(a.second.cmp(&b.second))
     });
@@ -31,8 +31,8 @@ pub(super) fn join(links: &mut [KeypointMatch], points: &[Vec<Sighting>]) -> Vec
     let mut members: Vec<Vec<(usize, usize)>> =
         points.iter().enumerate().flat_map(|(v, p)| (0..p.len()).map(move |k| vec![(v, k)])).collect();
     for link in links.iter() {
-        let a = root(&mut parent, starts[link.first.0] + link.first.1);
-        let b = root(&mut parent, starts[link.second.0] + link.second.1);
+        let a = find_root(&mut parent, starts[link.first.0] + link.first.1);
+        let b = find_root(&mut parent, starts[link.second.0] + link.second.1);
         if a == b || members[a].iter().any(|m| members[b].iter().any(|n| n.0 == m.0)) {
             continue;
         }
@@ -50,7 +50,8 @@ pub(super) fn join(links: &mut [KeypointMatch], points: &[Vec<Sighting>]) -> Vec
         .collect()
 }
 
-fn root(parent: &mut [usize], mut i: usize) -> usize {
+/// Root of the union–find tree of `i`, with path halving.
+fn find_root(parent: &mut [usize], mut i: usize) -> usize {
     while parent[i] != i {
         parent[i] = parent[parent[i]];
         i = parent[i];
@@ -63,14 +64,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn chains_join_and_conflicts_lose_to_better_links() {
-        let keypoint = |view: usize, k: usize| Sighting {
+    fn join_skips_conflicting_links() {
+        let keypoint = |view: usize, k: usize| TrackElement {
             view,
             pixel: glam::DVec2::new(view as f64, k as f64),
             sigma: 1.0,
-            family: 0,
+            detector: 0,
         };
-        let points: Vec<Vec<Sighting>> = (0..3).map(|v| (0..2).map(|k| keypoint(v, k)).collect()).collect();
+        let points: Vec<Vec<TrackElement>> =
+            (0..3).map(|v| (0..2).map(|k| keypoint(v, k)).collect()).collect();
         let link = |a, b, quality| KeypointMatch { first: a, second: b, quality };
         let mut links = [
             link((1, 0), (2, 0), 0.5),

@@ -1,13 +1,12 @@
-//! Which of the scene's large planes a colour belongs to.
+//! Colour model of a large plane.
 use crate::scene::RgbImage;
 
-/// Bins per channel; finer ones stay empty for small planes.
+/// Bins per channel; smaller bins stay empty for small planes.
 const BINS: usize = 12;
-/// Pixels added to every bin: a colour of no consistent pixel gives no evidence.
+/// Pixels added to every bin, so that an unobserved colour gives no evidence.
 const PRIOR: f32 = 2.0;
 
-/// Colour histogram of the consistent pixels on one surface, normalised against all consistent
-/// pixels.
+/// Colours of the consistent pixels on one surface as a share of those of all consistent pixels.
 pub struct ColourModel {
     share: Vec<f32>,
 }
@@ -17,24 +16,25 @@ fn bin(colour: [f32; 3]) -> usize {
 }
 
 impl ColourModel {
-    /// From the pixels on the surface and all consistent pixels (which include them).
+    /// Model from the pixels `on` the surface and all `consistent` pixels (which include them).
     pub fn new(guide: &RgbImage, on: &[u32], consistent: &[u32]) -> ColourModel {
-        let count = |pixels: &[u32]| {
-            let mut bins = vec![0.0f32; BINS * BINS * BINS];
-            for &k in pixels {
-                bins[bin(guide.data[k as usize])] += 1.0;
-            }
-            blurred(&bins)
-        };
-        let (on, all) = (count(on), count(consistent));
+        let (on, all) = (histogram(guide, on), histogram(guide, consistent));
         ColourModel { share: on.iter().zip(&all).map(|(o, a)| (o + 0.5 * PRIOR) / (a + PRIOR)).collect() }
     }
 
-    /// Share of the consistent pixels of this colour that lie on the surface, 0 to 1; near 0.5 for
-    /// unknown colours.
+    /// Share of the consistent pixels of this colour on the surface; near 0.5 for unknown colours.
     pub fn share(&self, colour: [f32; 3]) -> f32 {
         self.share[bin(colour)]
     }
+}
+
+/// Blurred colour histogram of some pixels.
+fn histogram(guide: &RgbImage, pixels: &[u32]) -> Vec<f32> {
+    let mut bins = vec![0.0f32; BINS * BINS * BINS];
+    for &k in pixels {
+        bins[bin(guide.data[k as usize])] += 1.0;
+    }
+    blurred(&bins)
 }
 
 /// Mean over the 3 × 3 × 3 bins around each: soft bin edges.

@@ -1,32 +1,31 @@
-//! Depth maps of all views to one set of points (docs/internals/method.md#fusion).
+//! Fusion of the depth maps of all views into points (docs/internals/method.md#fusion).
 use super::Level;
 use super::surface::{RelativePoses, Surface, neighbours, ray};
 use crate::scene::PointCloud;
 use glam::Vec3;
 
-/// Relative depth step to a neighbour above which a pixel may float between two surfaces
-/// (docs/internals/method.md#fusion).
+/// Relative depth step to a neighbour above which a pixel may float between two surfaces.
 const FLYING: f32 = 0.06;
-/// Confidence from which a pixel counts as matched rather than filled.
+/// Least confidence of a matched pixel; filled ones have less.
 pub const MATCHED: f32 = 0.5;
 
-/// Matched pixels of all views first, filled ones after; within each, views by decreasing mean
-/// confidence. A pixel is skipped when a point already kept projects onto it at the same depth,
-/// within the view's tolerance.
-pub fn fuse(level: &Level, links: &RelativePoses, surface: &Surface) -> PointCloud {
+/// Fuses matched pixels of all views first, then filled ones; within each, views by decreasing mean
+/// confidence. A pixel is skipped if a kept point projects onto it at the same depth within the
+/// view's tolerance.
+pub fn fuse(level: &Level, poses: &RelativePoses, surface: &Surface) -> PointCloud {
     let mut order: Vec<usize> = (0..level.cameras.len()).collect();
-    let mean = |view: usize| {
+    let mean_confidence = |view: usize| {
         let r = &level.references[view];
         let own = &surface.confidence[r.first as usize..(r.first + r.width * r.height) as usize];
         own.iter().sum::<f32>() / own.len().max(1) as f32
     };
-    order.sort_by(|&a, &b| mean(b).total_cmp(&mean(a)).then(a.cmp(&b)));
+    order.sort_by(|&a, &b| mean_confidence(b).total_cmp(&mean_confidence(a)).then(a.cmp(&b)));
     let mut cloud = PointCloud::default();
     // Kept points per view, in that view's frame.
     let mut kept: Vec<(usize, Vec<Vec3>)> = Vec::new();
     for matched in [true, false] {
         for &view in &order {
-            let points = fuse_view(level, links, surface, view, matched, &kept, &mut cloud);
+            let points = fuse_view(level, poses, surface, view, matched, &kept, &mut cloud);
             kept.push((view, points));
         }
     }
@@ -35,7 +34,7 @@ pub fn fuse(level: &Level, links: &RelativePoses, surface: &Surface) -> PointClo
 
 fn fuse_view(
     level: &Level,
-    links: &RelativePoses,
+    poses: &RelativePoses,
     surface: &Surface,
     view: usize,
     matched: bool,
@@ -48,10 +47,9 @@ fn fuse_view(
     let mut covered = vec![false; width * height];
     for (other, points) in kept {
         for &point in points {
-            let Some((u, v, z)) = links.project(level, *other, view, point) else { continue };
+            let Some((u, v, z)) = poses.project(level, *other, view, point) else { continue };
             let (x, y) = (u as usize, v as usize);
-            // A kept point stands for the 3 × 3 pixels around it: its neighbours' gaps when seen
-            // closer by.
+            // A kept point covers 3 × 3 pixels, so that no gaps arise in a closer view.
             for py in y.saturating_sub(1)..(y + 2).min(height) {
                 for px in x.saturating_sub(1)..(x + 2).min(width) {
                     let here = depth.at(px, py);

@@ -1,19 +1,18 @@
-//! The interface to the plane sweep: a GPU, or its reference implementation, computes the matching.
+//! Interface to the plane sweep, which a GPU or its CPU reference computes.
 use crate::Result;
 use glam::Vec4;
 
-/// Most source views that one reference view is matched against: a fifth adds cost, hardly
-/// accuracy.
+/// Most source views of one reference view: a fifth adds cost but hardly accuracy.
 pub const MAX_SOURCES: usize = 4;
 
-/// A source view as a reference view sees it, laid out as in the shader.
+/// Source view relative to a reference view, in the layout of the shader.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct SourceView {
-    /// Rows of K_s [R | t]: (ray, 1/z) of the reference to the homogeneous source pixel, scaled by
-    /// the inverse depth.
+    /// Rows of K_s [R | t]: (ray, 1/z) of the reference to the homogeneous pixel of the source,
+    /// scaled by the inverse depth.
     pub forward: [[f32; 4]; 3],
-    /// Rows of the inverse mapping: (ray, 1/z) of the source to the homogeneous reference pixel.
+    /// Rows of the inverse map: (ray, 1/z) of the source to the homogeneous pixel of the reference.
     pub back: [[f32; 4]; 3],
     /// Source camera centre in the reference frame; w unused.
     pub centre: [f32; 4],
@@ -23,7 +22,7 @@ pub struct SourceView {
     pub size: [u32; 4],
 }
 
-/// The reference view and the search of one pass.
+/// Reference view and search parameters of one pass.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ReferenceView {
     /// fx, fy, cx, cy, pixels.
@@ -48,7 +47,7 @@ pub struct ReferenceView {
     pub parity: u32,
     /// Hypotheses of the initial sweep.
     pub planes: u32,
-    /// Weight of the disagreement with the neighbours' surfaces.
+    /// Weight of the difference to the neighbours' surfaces.
     pub smoothness: f32,
 }
 
@@ -75,12 +74,12 @@ impl Matcher for Box<dyn Matcher> {
     }
 }
 
-/// Makes matchers: the device that computes the plane sweep.
+/// Factory of matchers: a device that computes the plane sweep.
 pub trait PlaneSweep {
-    /// Bytes that a pass binds at once: larger photos are matched at half their size, or less.
+    /// Most bytes of one binding: larger photos are matched at half their size, or less.
     fn binding(&self) -> u64;
-    /// A matcher. `luma` and `planes` (π, cost) hold all views one after the other, as the
-    /// references say.
+    /// Matcher of all views. `luma` and `planes` (π, cost) hold the views one after the other, at
+    /// the offsets of the references.
     fn matcher(
         &self,
         luma: &[f32],
@@ -90,11 +89,11 @@ pub trait PlaneSweep {
     ) -> Result<Box<dyn Matcher>>;
 }
 
-/// Bytes of a plane.
+/// Bytes of one plane with its cost.
 pub const PLANE_BYTES: usize = size_of::<[f32; 4]>();
 
-/// Bytes of the largest buffer that matching needs for these views: `groups` are the pixels of each
-/// reference and its sources together, `all` those of all views.
+/// Bytes of the largest buffer for matching: `groups` are the pixels of each reference with its
+/// sources, `all` those of all views.
 pub fn binding(all: usize, groups: impl Iterator<Item = usize>) -> usize {
     PLANE_BYTES * groups.max().unwrap_or(0).min(all)
 }

@@ -1,5 +1,5 @@
-//! Dense depth for views with known cameras: multi-view slanted plane sweep, propagation,
-//! consistency checks, filling, and fusion into points.
+//! Dense multi-view stereo with known cameras: slanted plane sweep, propagation, consistency
+//! checks, filling, and fusion into points.
 mod colours;
 mod fill;
 mod fuse;
@@ -24,14 +24,12 @@ use crate::progress::Progress;
 use crate::scene::{Camera, Coverage, DepthMap, DepthPrior, Image, PointCloud, RgbImage};
 use glam::{DVec3, Vec4};
 
-/// Depth of every photo (complete but for white borders and what the photos do not use; confidence
-/// tells matched from filled) and fused points, from cameras at the photos' working resolutions.
-/// `sparse` are points of the scene in world coordinates: they set the searched depths and choose
-/// which views are matched. `sweep` computes the matching. Deterministic for a given device, seed
-/// and input.
+/// Depth maps and fused points of photos with `cameras` at their working resolutions. Depth is
+/// complete except at white borders and unused pixels. `sparse` are points of the scene in world
+/// coordinates: they set the range of depth and choose the source views. `sweep` computes the
+/// matching. Deterministic for a given device, seed and input.
 ///
-/// Confidence: 0.9 where two or more other views agree, 0.6 where one does, below 0.3 where depth
-/// was filled in.
+/// Confidence: 0.9 with two or more agreeing views, 0.6 with one, below 0.3 for filled depth.
 pub fn dense(
     sweep: &dyn PlaneSweep,
     images: &[RgbImage],
@@ -52,22 +50,15 @@ pub fn dense(
     Ok(finish(images, coverage, finest, &planes, priors, options, progress))
 }
 
-/// Planes (π, cost) of all views at the finest resolution; `matcher` makes the matcher of a level.
+/// Planes (π, cost) of all views at the finest resolution; `matcher` makes a level's matcher.
 pub fn run_schedule<M: Matcher>(
     levels: &[Level],
     options: &StereoOptions,
     progress: &dyn Progress,
     matcher: impl Fn(&Level, Vec<Vec4>) -> Result<M>,
 ) -> Result<Vec<Vec4>> {
-    let rounds_of = |index: usize| {
-        let photometric = if index == 0 { options.coarse_rounds } else { 0 };
-        // The last levels' rounds belong to the finest resolutions when small photos make fewer
-        // levels.
-        let skipped = options.rounds.len().saturating_sub(levels.len());
-        (photometric, options.rounds.get(index + skipped).copied().unwrap_or(1))
-    };
     let work = |index: usize| {
-        let (photometric, geometric) = rounds_of(index);
+        let (photometric, geometric) = rounds(options, levels.len(), index);
         ((photometric + geometric) as u64) * levels[index].pixels() as u64 / 1000
     };
     progress.begin("dense stereo", (0..levels.len()).map(work).sum());
@@ -84,7 +75,7 @@ pub fn run_schedule<M: Matcher>(
                 matcher.sweep(&ReferenceView { seed, planes: options.planes, ..*reference })?;
             }
         }
-        let (photometric, geometric) = rounds_of(index);
+        let (photometric, geometric) = rounds(options, levels.len(), index);
         for round in 0..photometric + geometric {
             let geometric = if round < photometric { 0.0 } else { options.geometric };
             for reference in &level.references {
@@ -104,6 +95,14 @@ pub fn run_schedule<M: Matcher>(
     Ok(planes)
 }
 
+/// Photometric and geometric rounds of level `index` of `levels`.
+fn rounds(options: &StereoOptions, levels: usize, index: usize) -> (u32, u32) {
+    let photometric = if index == 0 { options.coarse_rounds } else { 0 };
+    // Small photos have fewer levels: they skip the first entries, those of the coarsest.
+    let skipped = options.rounds.len().saturating_sub(levels);
+    (photometric, options.rounds.get(index + skipped).copied().unwrap_or(1))
+}
+
 /// Depth maps and points from matched planes.
 pub fn finish(
     images: &[RgbImage],
@@ -116,15 +115,15 @@ pub fn finish(
 ) -> (Vec<DepthMap>, PointCloud) {
     let void = void::unused(level, coverage);
     let weak = texture::weak(level);
-    let links = surface::RelativePoses::new(level);
-    let consistent = surface::consistent_surface(level, &links, matched, &void, &weak);
+    let poses = surface::RelativePoses::new(level);
+    let consistent = surface::consistent_surface(level, &poses, matched, &void, &weak);
     let fitted = surface::smoothed(level, &consistent, FIT_RADIUS);
     let large = planes::large_planes(level, &fitted, options.seed);
-    let opened = fill::open_rims(level, &fitted, rim_radius(level));
-    let inferred = regions::fill(level, &links, &opened, &void, &weak, options.seed);
-    let joined = prior::join(level, &links, &inferred, priors, options.seed, progress);
-    let complete = fill::fill(level, &links, &joined, &large, &void);
-    let points = fuse::fuse(level, &links, &complete);
+    let trimmed = fill::without_depth_edges(level, &fitted, depth_edge_radius(level));
+    let inferred = regions::fill(level, &poses, &trimmed, &void, &weak, options.seed);
+    let fused = prior::fuse_priors(level, &poses, &inferred, priors, options.seed, progress);
+    let complete = fill::fill(level, &poses, &fused, &large, &void);
+    let points = fuse::fuse(level, &poses, &complete);
     let mut depths: Vec<DepthMap> =
         images.iter().enumerate().map(|(view, image)| depth_map(level, &complete, view, image)).collect();
     for (depth, coverage) in depths.iter_mut().zip(coverage) {
@@ -133,16 +132,17 @@ pub fn finish(
     (depths, points)
 }
 
-/// Pixels: a plane fit over 11 × 11 pixels averages the matching noise of one window.
+/// Radius of the plane fit, pixels: averages the matching noise of one window over 11 × 11.
 const FIT_RADIUS: i32 = 5;
-/// Pixels on either side of a depth step that can be wrong: half the matching window at least;
-/// large photos inherit wider errors from coarser levels where texture is weak (breakfast at 640 ×
-/// 480: 7 leaves 0.5 % fewer pixels wrong than 4).
-fn rim_radius(level: &Level) -> usize {
+/// Pixels on either side of a depth step that can be wrong: at least half the matching window.
+/// Large photos inherit wider errors from coarser levels where texture is weak (breakfast at
+/// 640 × 480: 7 leaves 0.5 % fewer pixels wrong than 4).
+fn depth_edge_radius(level: &Level) -> usize {
     (level.references.iter().map(|r| r.width.max(r.height)).max().unwrap_or(0) as usize / 90).max(4)
 }
 
-/// Depth and confidence of one view at its photo's resolution; π holds between the pixels, too.
+/// Depth and confidence of one view at its photo's resolution; π is evaluated at each of its
+/// pixels.
 fn depth_map(level: &Level, surface: &surface::Surface, view: usize, image: &RgbImage) -> DepthMap {
     let r = &level.references[view];
     let scale = (image.width / r.width as usize).max(1);

@@ -2,7 +2,7 @@
 use super::matcher::MAX_SOURCES;
 use crate::preset::Preset;
 
-/// How dense stereo works; the defaults are meant for 3–4 photos of about 640 × 480.
+/// Options of dense stereo; the defaults are for 3–4 photos of about 640 × 480.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StereoOptions {
     /// Source views per reference view, at most 4.
@@ -11,16 +11,15 @@ pub struct StereoOptions {
     pub planes: u32,
     /// Photometric propagation rounds at the coarsest resolution.
     pub coarse_rounds: u32,
-    /// Rounds with the geometric term per resolution, coarsest first; the length is the number of
-    /// resolutions.
+    /// Rounds with the geometric term, one entry per resolution, coarsest first.
     pub rounds: Vec<u32>,
     /// Weight of the geometric term per pixel of forward–backward reprojection error.
     pub geometric: f32,
-    /// Weight of the disagreement with the neighbours' depth: carries planes over weak texture.
+    /// Weight of the difference to the neighbours' depth, which extends planes over weak texture.
     pub smoothness: f32,
     /// Seed of the hashed random numbers.
     pub seed: u32,
-    /// Bytes that the device binds at once: larger photos are matched at half their size, or less.
+    /// Most bytes of one binding: larger photos are matched at half their size, or less.
     pub binding: u64,
 }
 
@@ -31,31 +30,30 @@ impl Default for StereoOptions {
             planes: 48,
             coarse_rounds: 6,
             rounds: vec![4, 4, 3],
-            // 0.1 per pixel, saturating at 3 px: the same strength as ACMM's.
+            // 0.1 per pixel, saturating at 3 px, is the strength of ACMM.
             geometric: 0.1,
             // A fully different neighbourhood costs as much as 0.1 of correlation, less than real
-            // texture tells. On dark photos of a room (dining) 0.05 leaves 21 % and 0.4 20 % of the
+            // texture. On dark photos of a room (dining) 0.05 leaves 21 % and 0.4 20 % of the
             // pixels wrong by a tenth, 0.1 leaves 18 %.
             smoothness: 0.1,
             seed: 1,
-            // What every Vulkan device binds.
+            // Vulkan's required minimum of `maxStorageBufferRange`.
             binding: 1 << 27,
         }
     }
 }
 
 impl StereoOptions {
-    /// The same with another seed for a run's; run seed 0 leaves it.
+    /// The options with the seed of a run mixed in; run seed 0 changes nothing.
     pub fn seeded(mut self, run: u64) -> StereoOptions {
-        // The seed counts up with every sweep, so those of runs must lie far apart: the upper half
-        // of a product with 2^64 / φ.
+        // The seed increases with every sweep, so the seeds of runs must lie far apart: the upper
+        // half of a product with 2^64 / φ.
         self.seed ^= (run.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32) as u32;
         self
     }
 
-    /// The options of a preset. A draft looks at the finest resolution once: three rounds there
-    /// take three times as long and gain 0.1 dB on breakfast, while depth at half the photos' size
-    /// loses 1.4 dB.
+    /// Options of a preset. A draft has one round at the finest resolution: three take three times
+    /// as long and gain 0.1 dB on breakfast, while depth at half the photos' size loses 1.4 dB.
     pub fn preset(preset: Preset) -> StereoOptions {
         let full = StereoOptions::default();
         match preset {
@@ -70,12 +68,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn run_seed_0_is_the_default_and_other_runs_draw_other_planes() {
-        let of = |run| StereoOptions::default().seeded(run).seed;
-        assert_eq!(of(0), StereoOptions::default().seed);
-        let mut all: Vec<u32> = (0..100).map(of).collect();
+    fn seeded_keeps_default_for_seed_0() {
+        let seed_of = |run| StereoOptions::default().seeded(run).seed;
+        assert_eq!(seed_of(0), StereoOptions::default().seed);
+        let mut all: Vec<u32> = (0..100).map(seed_of).collect();
         all.sort_unstable();
-        // A run counts up by some hundred.
+        // A run increases its seed by some hundred.
         assert!(all.windows(2).all(|w| w[1] - w[0] > 10_000), "{all:?}");
     }
 }

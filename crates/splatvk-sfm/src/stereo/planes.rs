@@ -1,4 +1,5 @@
-//! The scene's large planes (tables, walls, floors), found in the consistent points of all views.
+//! Large planes of the scene (tables, walls, floors) from the consistent points of all views, by
+//! sequential RANSAC.
 use super::Level;
 use super::surface::{Surface, ray};
 use crate::math::hash;
@@ -11,27 +12,27 @@ use nalgebra::{Matrix3, SymmetricEigen};
 pub struct WorldPlane {
     /// Unit normal.
     pub normal: DVec3,
-    /// World units.
+    /// Distance from the origin, world units.
     pub offset: f64,
 }
 
 impl WorldPlane {
-    /// The plane as `π·X = 1` in a camera's frame; None if it passes through the camera.
+    /// The plane as `π·X = 1` in a camera's frame; `None` if it contains the camera centre.
     pub fn in_camera(&self, camera: &Camera) -> Option<Vec3> {
         let distance = self.offset - self.normal.dot(camera.pose.centre());
         (distance.abs() > 1e-9).then(|| (camera.pose.rotation * self.normal / distance).as_vec3())
     }
 }
 
-/// Distance from the plane of a point that lies on it, relative to the depth tolerance of its view.
+/// Largest distance of an inlier, relative to the depth tolerance of its view.
 const TOLERANCE: f64 = 0.4;
-/// Largest angle between the local and the plane's normal, as a cosine (25°).
+/// Largest angle between the local normal of an inlier and the plane's, as a cosine (25°).
 const NORMAL_TOLERANCE: f64 = 0.906;
-/// Planes with a smaller share of all points are not large.
+/// Least share of all points on a large plane.
 const SMALLEST_SHARE: f64 = 0.02;
 /// Most planes looked for.
 const MAX_PLANES: usize = 8;
-/// Points looked at: enough that the smallest plane has about 200.
+/// Sampled points: the smallest plane has about 200 of them.
 const SAMPLES: usize = 10_000;
 /// Hypotheses per plane, each from one point and its normal: a plane with 2 % of the points is
 /// missed with probability 0.98^300 < 0.3 %.
@@ -41,11 +42,11 @@ struct Sample {
     position: DVec3,
     normal: DVec3,
     depth: f64,
-    /// Of its depth, world units.
+    /// Depth tolerance, world units.
     tolerance: f64,
 }
 
-/// Planes by decreasing number of points. `surface` must be smoothed, so that its normals are good.
+/// Planes by decreasing number of points. `surface` must be smoothed for accurate normals.
 pub fn large_planes(level: &Level, surface: &Surface, seed: u32) -> Vec<WorldPlane> {
     let mut samples = gather(level, surface);
     let total = samples.len();
@@ -111,7 +112,7 @@ fn gather(level: &Level, surface: &Surface) -> Vec<Sample> {
     samples
 }
 
-/// Total least squares over the points on the plane, weighted by 1/depth².
+/// Total least squares over the inliers, weighted by 1/depth².
 fn refit(plane: &WorldPlane, samples: &[Sample]) -> WorldPlane {
     let on: Vec<&Sample> = samples.iter().filter(|s| lies_on(plane, s)).collect();
     if on.len() < 10 {

@@ -1,5 +1,4 @@
-//! Which matched pixels are kept: agreement with the other views, and smooth local planes for
-//! those.
+//! Consistency of the matched pixels between views, and local plane fits to the consistent ones.
 use super::Level;
 use super::views::{DEPTH_TOLERANCE, REPROJECTION_TOLERANCE};
 use crate::scene::Image;
@@ -15,51 +14,51 @@ pub struct Surface {
     pub confidence: Vec<f32>,
 }
 
-/// Where parallax is small, [`REPROJECTION_TOLERANCE`] corresponds to a larger depth difference;
-/// views that could not distinguish depths this far apart confirm nothing …
-const UNINFORMATIVE: f32 = 0.06;
-/// … unless the view has nothing better: this many times its typical tolerance.
-const NOTHING_BETTER: f32 = 1.5;
-/// A point this much nearer than what another view sees there would hide it: it cannot exist.
+/// Views with a larger relative depth tolerance confirm nothing: [`REPROJECTION_TOLERANCE`] is a
+/// large depth difference at small parallax …
+const MAX_CONFIRMING_TOLERANCE: f32 = 0.06;
+/// … unless it is below this multiple of the view's typical tolerance.
+const TYPICAL_TOLERANCE_FACTOR: f32 = 1.5;
+/// A point nearer than another view's surface by this share would occlude it: it cannot exist.
 pub const FREE_SPACE_TOLERANCE: f32 = 0.03;
 
-/// [`FREE_SPACE_TOLERANCE`], wider where depth is known less well.
-pub fn free_space(level: &Level, view: usize) -> f32 {
+/// [`FREE_SPACE_TOLERANCE`], larger for views of less accurate depth.
+pub fn free_space_tolerance(level: &Level, view: usize) -> f32 {
     FREE_SPACE_TOLERANCE.max(2.0 * level.tolerance[view])
 }
 
-/// Aggregated cost above which even an agreeing pixel is rejected: half way between a perfect match
-/// in one view (0.4 + geometric limits) and none (1.0 and more).
+/// Aggregated cost above which a pixel is rejected: half way between a perfect match in one view
+/// (0.4 + geometric limits) and none (1.0 and more).
 const COST_TOLERANCE: f32 = 0.75;
-/// Connected areas of consistent pixels smaller than this share of the image are chance.
+/// Connected areas of consistent pixels below this share of the image are matched by chance.
 const SPECKLE_SHARE: f32 = 6e-4;
 /// Confidence by number of agreeing views.
 const CONFIDENCE: [f32; 3] = [0.0, 0.6, 0.9];
-/// Confidence of a pixel that only its surroundings confirm: it shapes the surface, it is no
+/// Confidence of a pixel that only its surroundings confirm: it shapes the surface but is no
 /// measurement.
 const PLAUSIBLE: f32 = 0.45;
-/// Aggregated cost above which not even such a pixel is kept: next to no correlation in any view.
+/// Aggregated cost above which such a pixel is rejected: hardly any correlation in any view.
 const PLAUSIBLE_COST: f32 = 0.95;
 /// Share of the surroundings that must lie on a plausible pixel's plane; chance matches scatter.
 const SUPPORT: f32 = 0.6;
-/// The surroundings: 9 × 9 pixels, every second.
+/// Radius of the surroundings in taps: 9 × 9 of every second pixel.
 const SUPPORT_TAPS: i32 = 4;
 
 /// Visibility of a point in another view.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub enum Visibility {
-    /// Outside its image, or the other view has no depth there.
+    /// Outside the image, or without depth there.
     Outside,
-    /// The other view has a surface at the same place.
+    /// The other view has the same surface.
     Agrees,
     /// The other view has a nearer surface.
     Occluded,
-    /// The other view has a farther surface: the point lies in space that it shows to be free.
+    /// The other view has a farther surface: the point lies in its free space.
     FreeSpace,
 }
 
-/// Maps between the cameras of a level, in f32.
+/// Relative poses between the cameras of a level, in f32.
 pub struct RelativePoses {
     /// `to[a * views + b]`: rotation and translation of frame a → frame b.
     to: Vec<(glam::Mat3, Vec3)>,
@@ -67,7 +66,7 @@ pub struct RelativePoses {
 }
 
 impl RelativePoses {
-    /// Precomputes all pairs.
+    /// Computes the poses of all pairs.
     pub fn new(level: &Level) -> RelativePoses {
         let views = level.cameras.len();
         let mut to = Vec::with_capacity(views * views);
@@ -81,7 +80,7 @@ impl RelativePoses {
         RelativePoses { to, views }
     }
 
-    /// Depth and pixel of a point of frame `a` in view `b`, if it falls into the image.
+    /// Pixel and depth in view `b` of a point of frame `a`, if it projects into the image.
     pub fn project(&self, level: &Level, a: usize, b: usize, point: Vec3) -> Option<(f32, f32, f32)> {
         let (r, t) = self.to[a * self.views + b];
         let p = r * point + t;
@@ -95,15 +94,14 @@ impl RelativePoses {
         inside.then_some((u, v, p.z))
     }
 
-    /// A plane `π·X = 1` of frame `a` in frame `b`; without meaning where it passes through the
-    /// camera of `b`.
+    /// Plane `π·X = 1` of frame `a` in frame `b`; undefined if it contains the centre of `b`.
     pub fn plane(&self, a: usize, b: usize, plane: Vec3) -> Vec3 {
         let (r, t) = self.to[b * self.views + a];
         (r.transpose() * plane) / (1.0 - plane.dot(t))
     }
 
-    /// Relative depth difference that a point of frame `a` must show before view `b` contradicts
-    /// it: what moves its image by [`REPROJECTION_TOLERANCE`], at least [`DEPTH_TOLERANCE`].
+    /// Relative depth difference from which view `b` contradicts a point of frame `a`: a shift of
+    /// its image by [`REPROJECTION_TOLERANCE`], at least [`DEPTH_TOLERANCE`].
     fn tolerance(&self, level: &Level, a: usize, b: usize, point: Vec3) -> f32 {
         let (r, t) = self.to[a * self.views + b];
         let along = r * point;
@@ -115,7 +113,7 @@ impl RelativePoses {
         (REPROJECTION_TOLERANCE / du.hypot(dv).max(1e-6)).max(DEPTH_TOLERANCE)
     }
 
-    /// Visibility in view `b` of a point of frame `a` seen at pixel position (x, y).
+    /// Visibility in view `b` of a point of frame `a`, whose image in `a` is `pixel`.
     pub fn visibility(
         &self,
         level: &Level,
@@ -133,18 +131,18 @@ impl RelativePoses {
         }
         let [fx, fy, cx, cy] = r.intrinsics;
         let ray = Vec3::new((u - cx) / fx, (v - cy) / fy, 1.0);
-        let seen = 1.0 / surface.planes[index].dot(ray).max(1e-9);
+        let surface_depth = 1.0 / surface.planes[index].dot(ray).max(1e-9);
         let tolerance = self.tolerance(level, a, b, point);
         let free = FREE_SPACE_TOLERANCE.max(2.0 * tolerance);
-        if z < seen * (1.0 - free) {
+        if z < surface_depth * (1.0 - free) {
             return Visibility::FreeSpace;
         }
-        if z > seen * (1.0 + free) {
+        if z > surface_depth * (1.0 + free) {
             return Visibility::Occluded;
         }
-        let agrees = tolerance < UNINFORMATIVE.max(NOTHING_BETTER * level.tolerance[a])
-            && (z - seen).abs() < tolerance * seen
-            && self.project(level, b, a, ray * seen).is_some_and(|(x, y, _)| {
+        let agrees = tolerance < MAX_CONFIRMING_TOLERANCE.max(TYPICAL_TOLERANCE_FACTOR * level.tolerance[a])
+            && (z - surface_depth).abs() < tolerance * surface_depth
+            && self.project(level, b, a, ray * surface_depth).is_some_and(|(x, y, _)| {
                 let (dx, dy) = (x - pixel[0], y - pixel[1]);
                 dx * dx + dy * dy < REPROJECTION_TOLERANCE * REPROJECTION_TOLERANCE
             });
@@ -152,14 +150,13 @@ impl RelativePoses {
     }
 }
 
-/// Camera-frame ray through a pixel's centre.
+/// Ray through a pixel's centre in the camera's frame, z = 1.
 pub fn ray(level: &Level, view: usize, x: usize, y: usize) -> Vec3 {
     let [fx, fy, cx, cy] = level.references[view].intrinsics;
     Vec3::new((x as f32 + 0.5 - cx) / fx, (y as f32 + 0.5 - cy) / fy, 1.0)
 }
 
-/// Calls `f(view, x, y, index)` for all pixels of all views in parallel and collects the results in
-/// buffer order.
+/// Results of `f(view, x, y, index)` in parallel for all pixels of all views, in buffer order.
 pub fn map_pixels<T: Send>(level: &Level, f: impl Fn(usize, usize, usize, usize) -> T + Sync) -> Vec<T> {
     let mut out = Vec::with_capacity(level.pixels());
     for (view, r) in level.references.iter().enumerate() {
@@ -173,11 +170,10 @@ pub fn map_pixels<T: Send>(level: &Level, f: impl Fn(usize, usize, usize, usize)
     out
 }
 
-/// Keeps what at least one other view confirms and none that confirmed itself contradicts more
-/// often.
+/// Keeps pixels with at least one agreeing view and more agreeing than contradicting ones.
 pub fn consistent_surface(
     level: &Level,
-    links: &RelativePoses,
+    poses: &RelativePoses,
     matched: &[Vec4],
     void: &[bool],
     weak: &[bool],
@@ -191,7 +187,7 @@ pub fn consistent_surface(
             .collect(),
     };
     let views = level.cameras.len();
-    // The second time only confirmed pixels confirm, and they contradict.
+    // In the second round only confirmed pixels confirm or contradict.
     for round in 0..2 {
         surface.confidence = map_pixels(level, |view, x, y, k| {
             if surface.confidence[k] <= 0.0 {
@@ -205,7 +201,7 @@ pub fn consistent_surface(
             let (mut agree, mut against) = (0usize, 0usize);
             for other in (0..views).filter(|&o| o != view) {
                 let pixel = [x as f32 + 0.5, y as f32 + 0.5];
-                match links.visibility(level, &surface, view, other, pixel, ray / inverse) {
+                match poses.visibility(level, &surface, view, other, pixel, ray / inverse) {
                     Visibility::Agrees => agree += 1,
                     Visibility::FreeSpace => against += 1,
                     _ => {}
@@ -214,19 +210,18 @@ pub fn consistent_surface(
             if agree == 0 || (round > 0 && against >= agree) { 0.0 } else { CONFIDENCE[agree.min(2)] }
         });
     }
-    let mut surface = with_plausible(level, links, &surface, matched, void, weak);
+    let mut surface = with_plausible(level, poses, &surface, matched, void, weak);
     remove_speckles(level, &mut surface);
     surface
 }
 
-/// Adds what no view confirms in views with little parallax, where confirmation is hard to get:
-/// pixels that match somewhere, lie on one surface with their surroundings and block no confirmed
-/// pixel. Where parallax is ample, a missing confirmation means occlusion or error, and nothing is
-/// added; nor where texture is weak, since there the smoothness of the search makes surroundings
-/// agree on anything.
+/// Adds unconfirmed pixels in views of little parallax, where few are confirmed: pixels that match
+/// in some view, lie on one plane with their surroundings and in no other view's free space. With
+/// ample parallax a missing confirmation means occlusion or error. On weak texture the smoothness
+/// of the search makes surroundings agree on any plane.
 fn with_plausible(
     level: &Level,
-    links: &RelativePoses,
+    poses: &RelativePoses,
     confirmed: &Surface,
     matched: &[Vec4],
     void: &[bool],
@@ -245,7 +240,7 @@ fn with_plausible(
         }
         let pixel = [x as f32 + 0.5, y as f32 + 0.5];
         let against = (0..level.cameras.len()).filter(|&o| o != view).any(|o| {
-            links.visibility(level, confirmed, view, o, pixel, ray / inverse) == Visibility::FreeSpace
+            poses.visibility(level, confirmed, view, o, pixel, ray / inverse) == Visibility::FreeSpace
         });
         if against { 0.0 } else { PLAUSIBLE }
     });
@@ -289,7 +284,7 @@ pub fn depth(level: &Level, view: usize, surface: &Surface) -> Image<f32> {
     out
 }
 
-/// Rejects small areas that are connected by depth.
+/// Rejects small areas of connected depth.
 fn remove_speckles(level: &Level, surface: &mut Surface) {
     for view in 0..level.cameras.len() {
         let depth = depth(level, view, surface);
@@ -309,7 +304,7 @@ fn remove_speckles(level: &Level, surface: &mut Surface) {
                 next += 1;
                 for n in neighbours(k, depth.width, depth.height) {
                     let (a, b) = (depth.data[k], depth.data[n]);
-                    if !done[n] && b > 0.0 && (a - b).abs() < free_space(level, view) * a {
+                    if !done[n] && b > 0.0 && (a - b).abs() < free_space_tolerance(level, view) * a {
                         done[n] = true;
                         area.push(n);
                     }
@@ -324,7 +319,7 @@ fn remove_speckles(level: &Level, surface: &mut Surface) {
     }
 }
 
-/// The up to four direct neighbours of a pixel index.
+/// Up to four direct neighbours of a pixel index.
 pub fn neighbours(k: usize, width: usize, height: usize) -> impl Iterator<Item = usize> {
     let (x, y) = (k % width, k / width);
     [
@@ -337,8 +332,8 @@ pub fn neighbours(k: usize, width: usize, height: usize) -> impl Iterator<Item =
     .flatten()
 }
 
-/// Least-squares plane of the consistent pixels around each consistent pixel that lie on its plane,
-/// in inverse depth (affine over the image). `radius` in pixels.
+/// Smooths each consistent pixel: a least-squares plane, in inverse depth (affine over the image),
+/// of the consistent pixels within `radius` that lie on its plane.
 pub fn smoothed(level: &Level, surface: &Surface, radius: i32) -> Surface {
     let planes = map_pixels(level, |view, x, y, k| {
         if surface.confidence[k] <= 0.0 {
@@ -347,7 +342,7 @@ pub fn smoothed(level: &Level, surface: &Surface, radius: i32) -> Surface {
         let r = &level.references[view];
         let plane = surface.planes[k];
         let inverse = plane.dot(ray(level, view, x, y));
-        // Normal equations of 1/z = a + b dx + c dy, relative to the centre's own value.
+        // Normal equations of 1/z = a + b dx + c dy, relative to the value at the centre.
         let (mut m, mut rhs) = ([0.0f64; 6], [0.0f64; 3]);
         for dy in -radius..=radius {
             for dx in -radius..=radius {
@@ -378,7 +373,7 @@ pub fn smoothed(level: &Level, surface: &Surface, radius: i32) -> Surface {
             DVec3::new(m[1], m[3], m[4]),
             DVec3::new(m[2], m[4], m[5]),
         );
-        // Fewer than a dozen pixels, or all in a row: the matched plane is better than the fit.
+        // Fewer than a dozen pixels, or collinear ones: the matched plane is better than the fit.
         if m[0] < 12.0 || matrix.determinant() < 1e-3 * m[0] * m[3] * m[5] {
             return plane;
         }

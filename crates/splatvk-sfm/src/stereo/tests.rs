@@ -4,8 +4,8 @@ use glam::{DMat3, DVec2};
 use splatvk_test_support::stereo::synthetic;
 
 #[test]
-fn of_many_photos_each_is_matched_with_those_at_the_best_angles() {
-    // Seven cameras around the points, 10° from one to the next.
+fn pyramid_chooses_sources_at_best_angles() {
+    // Seven cameras around the points at steps of 10°.
     let camera = |k: u32| Camera {
         name: k.to_string(),
         width: 64,
@@ -27,14 +27,14 @@ fn of_many_photos_each_is_matched_with_those_at_the_best_angles() {
     let first = &levels[0].references[0];
     let sources = &levels[0].sources[first.first_source as usize..][..first.sources as usize];
     let chosen: Vec<u32> = sources.iter().map(|s| s.size[2] / (64 * 64)).collect();
-    // 20°, 30° and 40°; the next has too little parallax, the last ones show other sides.
+    // 20°, 30° and 40°; 10° has too little parallax, the others show other sides.
     assert_eq!(chosen, [2, 3, 4]);
 }
 
 #[test]
-fn depth_matched_at_half_the_size_is_that_of_the_photos_own_pixels() {
+fn depth_map_from_half_size_exact() {
     let set = synthetic(160, 120);
-    // Three photos take 0.9 MB, at half their size a quarter of it.
+    // Three photos take 0.9 MB, and a quarter of it at half their size.
     let options = StereoOptions { binding: 500_000, ..StereoOptions::default() };
     let levels = pyramid(&set.images, &set.cameras, &set.sparse, &options).unwrap();
     let level = &levels[levels.len() - 1];
@@ -52,12 +52,11 @@ fn depth_matched_at_half_the_size_is_that_of_the_photos_own_pixels() {
 }
 
 #[test]
-fn what_floats_between_two_surfaces_is_no_point() {
+fn fuse_skips_flying_pixels() {
     let set = synthetic(32, 24);
     let levels = pyramid(&set.images, &set.cameras, &set.sparse, &StereoOptions::default()).unwrap();
     let level = &levels[0];
-    // In the first view a wall, something before it, and a column of pixels half way; the others
-    // have no depth.
+    // First view: a wall, an object before it, a column of pixels half way. Others: no depth.
     let depth = |column: usize| [4.0f32, 3.0, 2.0][usize::from(column >= 16) + usize::from(column > 16)];
     let pixels = level.pixels();
     let mut surface =
@@ -68,14 +67,14 @@ fn what_floats_between_two_surfaces_is_no_point() {
     }
     let points = fuse::fuse(level, &surface::RelativePoses::new(level), &surface);
     let depths = points.positions.iter().map(|p| level.cameras[0].project(DVec3::from(p.map(f64::from))).1);
-    let near = |z: f64| depths.clone().filter(|d| (d / z - 1.0).abs() < 1e-4).count();
-    // The columns on both sides of a step may be wrong, too.
-    assert_eq!((near(4.0), near(3.0), near(2.0)), (15 * 24, 0, 14 * 24));
+    let count_at = |z: f64| depths.clone().filter(|d| (d / z - 1.0).abs() < 1e-4).count();
+    // The columns on both sides of a step are skipped, too.
+    assert_eq!((count_at(4.0), count_at(3.0), count_at(2.0)), (15 * 24, 0, 14 * 24));
     assert_eq!(points.len(), 29 * 24);
 }
 
 #[test]
-fn unusable_input_is_refused() {
+fn pyramid_rejects_unusable_input() {
     let set = synthetic(32, 32);
     let options = StereoOptions::default();
     assert!(pyramid(&set.images[..1], &set.cameras[..1], &set.sparse, &options).is_err());

@@ -1,21 +1,21 @@
-//! How much there is to match around a pixel.
+//! Pixels of weak texture.
 use super::Level;
 
-/// Half of the window, pixels: that of matching.
+/// Half of the window, pixels, as for matching.
 const RADIUS: usize = 5;
 /// Standard deviation of luma (0 to 1) over the window below which noise, JPEG blocks and shading
-/// prevail. Of the cupboard doors of room_a three quarters lie below 0.017, of its matched pixels
-/// half above 0.03; the walls of generated scenes start at 0.03.
+/// prevail. In room_a three quarters of the cupboard doors lie below 0.017 and half of the matched
+/// pixels above 0.03; the walls of generated scenes start at 0.03.
 const WEAK: f64 = 0.02;
 
-/// Per pixel of all views whether it has too little texture to be told from its neighbours.
+/// Per pixel of all views: true if its texture is too weak for matching.
 pub fn weak(level: &Level) -> Vec<bool> {
     let mut out = Vec::with_capacity(level.pixels());
     for r in &level.references {
         let (width, height, first) = (r.width as usize, r.height as usize, r.first as usize);
         let luma = &level.luma[first..first + width * height];
         let stride = width + 1;
-        // Sums of luma and its square over all rectangles that begin in the corner.
+        // Integral images of luma and its square.
         let mut sums = vec![[0.0f64; 2]; stride * (height + 1)];
         for y in 0..height {
             let mut row = [0.0; 2];

@@ -1,5 +1,4 @@
-//! What the matcher reads: the image pyramid, the source views of every view, the inverse depth
-//! range.
+//! Input of the matcher: image pyramid, source views and inverse depth range of every view.
 use super::StereoOptions;
 use super::matcher::{MAX_SOURCES, ReferenceView, SourceView, binding};
 use crate::scene::{Camera, RgbImage};
@@ -15,7 +14,7 @@ pub struct Level {
     pub guide: Vec<RgbImage>,
     /// Luma of all views, one after the other.
     pub luma: Vec<f32>,
-    /// SourceView views of all references.
+    /// Source views of all references.
     pub sources: Vec<SourceView>,
     /// One per view; parity, seed and search parameters are set per pass.
     pub references: Vec<ReferenceView>,
@@ -23,16 +22,15 @@ pub struct Level {
     pub tolerance: Vec<f32>,
 }
 
-/// Depths that differ by less agree: several times the matching noise, far below the size of
-/// objects.
+/// Relative difference below which depths agree: several times the matching noise, far below the
+/// size of objects.
 pub const DEPTH_TOLERANCE: f32 = 0.01;
-/// Where parallax is small, this many pixels of matching noise are a larger depth difference …
+/// Matching noise, pixels; at small parallax it is a larger depth difference …
 pub const REPROJECTION_TOLERANCE: f32 = 1.5;
-/// … up to here: coarser depth no longer separates surfaces.
+/// … up to this limit: coarser depth no longer separates surfaces.
 const COARSEST_TOLERANCE: f32 = 0.1;
 
-/// Pixels by which the image in `other` moves per relative change of the depth that `camera` sees a
-/// point at.
+/// Shift of a point's image in `other`, pixels per relative change of its depth in `camera`.
 fn parallax(camera: &Camera, other: &Camera, point: DVec3) -> f64 {
     let along = other.pose.rotation * (point - camera.pose.centre());
     let p = other.pose.transform(point);
@@ -41,23 +39,22 @@ fn parallax(camera: &Camera, other: &Camera, point: DVec3) -> f64 {
     du.hypot(dv)
 }
 
-/// [`Level::tolerance`] of a view: what half of the points can be told apart by in the source that
-/// tells best.
+/// [`Level::tolerance`] of a view: for the median point, in its source with the largest parallax.
 fn tolerance(view: usize, cameras: &[Camera], chosen: &[usize], sparse: &[DVec3]) -> f32 {
-    let best = |p: &DVec3| {
-        let sources = chosen.iter().filter(|&&s| seen(&cameras[s], *p));
+    let best_parallax = |p: &DVec3| {
+        let sources = chosen.iter().filter(|&&s| in_image(&cameras[s], *p));
         sources.map(|&s| parallax(&cameras[view], &cameras[s], *p)).reduce(f64::max)
     };
-    let mut all: Vec<f64> = sparse.iter().filter(|p| seen(&cameras[view], **p)).filter_map(best).collect();
+    let mut all: Vec<f64> =
+        sparse.iter().filter(|p| in_image(&cameras[view], **p)).filter_map(best_parallax).collect();
     let typical = crate::math::median(&mut all).unwrap_or(f64::INFINITY);
     (REPROJECTION_TOLERANCE / typical as f32).clamp(DEPTH_TOLERANCE, COARSEST_TOLERANCE)
 }
 
-/// Smallest side of the coarsest resolution, pixels: below, the matching window covers whole
-/// objects.
+/// Least shorter side of a level, pixels: below, the matching window covers whole objects.
 const SMALLEST_SIDE: usize = 100;
 
-/// The resolutions to match at, coarsest first: at most `options.rounds.len()`.
+/// Levels of the image pyramid, coarsest first: at most `options.rounds.len()`.
 pub fn pyramid(
     images: &[RgbImage],
     cameras: &[Camera],
@@ -78,7 +75,7 @@ pub fn pyramid(
         .collect();
     let tolerance: Vec<f32> = (0..cameras.len()).map(|v| tolerance(v, cameras, &chosen[v], sparse)).collect();
     let mut guide = images.to_vec();
-    while needed(&guide, &chosen) as u64 > options.binding {
+    while bound_bytes(&guide, &chosen) as u64 > options.binding {
         guide = guide.iter().map(halved).collect();
     }
     let mut levels = vec![level(&guide, cameras, &chosen, &ranges, &tolerance)];
@@ -93,17 +90,16 @@ pub fn pyramid(
     Ok(levels)
 }
 
-/// Bytes that matching binds at once.
-fn needed(guide: &[RgbImage], chosen: &[Vec<usize>]) -> usize {
+/// Bytes of the largest binding for matching.
+fn bound_bytes(guide: &[RgbImage], chosen: &[Vec<usize>]) -> usize {
     let pixels = |view: usize| guide[view].data.len();
     let groups =
         (0..guide.len()).map(|view| pixels(view) + chosen[view].iter().map(|&s| pixels(s)).sum::<usize>());
     binding((0..guide.len()).map(pixels).sum(), groups)
 }
 
-/// Inverse depths between which a view is searched: the 1st and 99th percentile of the sparse
-/// points in front of it, widened to 0.6 of the nearest and twice the farthest depth, since sparse
-/// points miss the extremes.
+/// Range of inverse depth of a view: 1st and 99th percentile of depth of the sparse points in its
+/// image, widened to 0.6 of the nearest and twice the farthest because sparse points miss extremes.
 fn inverse_depth_range(camera: &Camera, sparse: &[DVec3]) -> Result<[f64; 2]> {
     let mut depths: Vec<f64> = sparse
         .iter()
@@ -123,27 +119,29 @@ fn inverse_depth_range(camera: &Camera, sparse: &[DVec3]) -> Result<[f64; 2]> {
         )));
     }
     depths.sort_by(f64::total_cmp);
-    let at = |share: f64| depths[((depths.len() - 1) as f64 * share) as usize];
-    Ok([1.0 / (2.0 * at(0.99)), 1.0 / (0.6 * at(0.01))])
+    let quantile = |share: f64| depths[((depths.len() - 1) as f64 * share) as usize];
+    Ok([1.0 / (2.0 * quantile(0.99)), 1.0 / (0.6 * quantile(0.01))])
 }
 
-/// Whether a point falls into a camera's image.
-fn seen(camera: &Camera, p: DVec3) -> bool {
+/// True if a point projects into a camera's image.
+fn in_image(camera: &Camera, p: DVec3) -> bool {
     let (pixel, z) = camera.project(p);
     let (w, h) = (camera.width as f64, camera.height as f64);
     z > 0.0 && pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < w && pixel.y < h
 }
 
-/// The best source views of a view: many shared points, seen under 5–60° (optimum 20°, as in
-/// COLMAP's and MVSNet's view selection; narrower has no parallax, wider no common appearance).
+/// Best source views of a view: many shared points at angles of 5–60° (optimum 20°, as in COLMAP's
+/// and MVSNet's view selection; smaller angles have no parallax, larger ones no common appearance).
 fn choose_sources(view: usize, cameras: &[Camera], sparse: &[DVec3], count: usize) -> Vec<usize> {
     let here = cameras[view].pose.centre();
     let mut scores: Vec<(f64, usize)> = (0..cameras.len())
         .filter(|&other| other != view)
         .map(|other| {
             let there = cameras[other].pose.centre();
-            let score =
-                sparse.iter().filter(|&&p| seen(&cameras[view], p) && seen(&cameras[other], p)).map(|&p| {
+            let score = sparse
+                .iter()
+                .filter(|&&p| in_image(&cameras[view], p) && in_image(&cameras[other], p))
+                .map(|&p| {
                     let angle = (here - p).angle_between(there - p).to_degrees();
                     let width = if angle < 20.0 { 8.0 } else { 25.0 };
                     (-0.5 * ((angle - 20.0) / width).powi(2)).exp()
@@ -175,8 +173,8 @@ fn level(
     ranges: &[[f64; 2]],
     tolerance: &[f32],
 ) -> Level {
-    // `halved` keeps the pixel grid's origin and drops odd borders: the scale is a power of two,
-    // not a size ratio.
+    // `halved` keeps the origin of the pixel grid and drops odd borders: the scale is a power of
+    // two, not a size ratio.
     let cameras: Vec<Camera> = guide
         .iter()
         .zip(cameras)
@@ -210,30 +208,35 @@ fn level(
             sources: chosen[view].len() as u32,
             ..ReferenceView::default()
         });
-        sources.extend(chosen[view].iter().map(|&other| source(camera, &cameras[other], first[other])));
+        sources.extend(chosen[view].iter().map(|&other| source_view(camera, &cameras[other], first[other])));
     }
-    // The shaders read 16 bits per value; rounding here keeps the CPU reference equal.
-    let rounded = |l: f32| (l.clamp(0.0, 1.0) * 65535.0).round() / 65535.0;
-    let luma = guide.iter().flat_map(|g| g.luma().data).map(rounded).collect();
+    let luma = guide.iter().flat_map(|g| g.luma().data).map(rounded_to_16_bits).collect();
     Level { cameras, guide: guide.to_vec(), luma, sources, references, tolerance: tolerance.to_vec() }
 }
 
-fn source(reference: &Camera, other: &Camera, first: u32) -> SourceView {
-    // ReferenceView frame → source frame.
+/// Rounds as the shaders' 16-bit input, so that the CPU reference computes the same.
+fn rounded_to_16_bits(luma: f32) -> f32 {
+    (luma.clamp(0.0, 1.0) * 65535.0).round() / 65535.0
+}
+
+/// Rows of K [R | t].
+fn projection_rows(camera: &Camera, rotation: DMat3, translation: DVec3) -> [[f32; 4]; 3] {
+    let k = DMat3::from_cols(
+        DVec3::new(camera.fx, 0.0, 0.0),
+        DVec3::new(0.0, camera.fy, 0.0),
+        DVec3::new(camera.cx, camera.cy, 1.0),
+    );
+    let (m, t) = (k * rotation, k * translation);
+    [0, 1, 2].map(|i| m.row(i).extend(t[i]).as_vec4().to_array())
+}
+
+fn source_view(reference: &Camera, other: &Camera, first: u32) -> SourceView {
+    // Reference frame → source frame.
     let relative = other.pose.compose(&reference.pose.inverse());
-    let rows = |camera: &Camera, rotation: DMat3, translation: DVec3| {
-        let k = DMat3::from_cols(
-            DVec3::new(camera.fx, 0.0, 0.0),
-            DVec3::new(0.0, camera.fy, 0.0),
-            DVec3::new(camera.cx, camera.cy, 1.0),
-        );
-        let (m, t) = (k * rotation, k * translation);
-        [0, 1, 2].map(|i| m.row(i).extend(t[i]).as_vec4().to_array())
-    };
     let inverse = relative.inverse();
     SourceView {
-        forward: rows(other, relative.rotation, relative.translation),
-        back: rows(reference, inverse.rotation, inverse.translation),
+        forward: projection_rows(other, relative.rotation, relative.translation),
+        back: projection_rows(reference, inverse.rotation, inverse.translation),
         centre: inverse.translation.extend(0.0).as_vec4().to_array(),
         intrinsics: [other.fx, other.fy, other.cx, other.cy].map(|v| v as f32),
         size: [other.width, other.height, first, 0],
@@ -246,7 +249,7 @@ impl Level {
         self.luma.len()
     }
 
-    /// Planes of the next coarser level copied to this one: π does not depend on the resolution.
+    /// Planes of the next coarser level copied to this one: π is independent of resolution.
     pub fn enlarged(&self, coarse: &Level, planes: &[Vec4]) -> Vec<Vec4> {
         let mut out = Vec::with_capacity(self.pixels());
         for (fine, coarse) in self.references.iter().zip(&coarse.references) {

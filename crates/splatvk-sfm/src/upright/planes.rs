@@ -1,36 +1,36 @@
-//! Flat surfaces among the points of a scene.
+//! Planar surfaces among the points of a scene, by sequential RANSAC.
 use crate::math::Random;
 use crate::scene::{Camera, PointCloud};
 use glam::DVec3;
 use nalgebra::{Matrix3, SymmetricEigen};
 
-/// A flat surface.
+/// Planar surface.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Surface {
-    /// Unit, of either sign.
+    /// Unit normal of either sign.
     pub normal: DVec3,
-    /// Share of the scene's points that lie on it.
+    /// Share of the scene's points on the surface.
     pub share: f64,
 }
 
-/// Points that are looked at: a surface with a twentieth of the scene still has 200 of them.
+/// Sampled points: a surface with a twentieth of the scene still has 200 of them.
 const SAMPLES: usize = 4000;
-/// Neighbours whose plane is tried.
+/// Neighbours that a hypothesis is fitted to.
 const NEIGHBOURS: usize = 24;
-/// Planes tried per surface: one with a twentieth of the points is hit 15 times.
+/// Hypotheses per surface: one with a twentieth of the points is hit 15 times.
 const TRIALS: usize = 300;
-/// How far from a plane its points may be, share of their depth: twice what stereo errs by at the
-/// median on `breakfast` (docs/internals/results.md).
+/// Largest distance of an inlier, share of its depth: twice the median error of stereo on
+/// `breakfast` (docs/internals/results.md).
 const THICKNESS: f64 = 0.006;
-/// Smallest share of the points that makes a surface.
+/// Least share of the points on a surface.
 const MIN_SHARE: f64 = 0.05;
-/// Surfaces looked for.
-const MOST: usize = 5;
+/// Most surfaces.
+const MAX_SURFACES: usize = 5;
 
-/// A point and how far from a plane it may be to belong to it.
+/// A point and its inlier distance.
 type Sample = (DVec3, f64);
 
-/// The surfaces that hold the most points, one after the other.
+/// Surfaces by falling number of points.
 pub(super) fn surfaces(points: &PointCloud, cameras: &[Camera]) -> Vec<Surface> {
     let step = points.len().div_ceil(SAMPLES).max(1);
     let sample = |k: usize| {
@@ -43,15 +43,15 @@ pub(super) fn surfaces(points: &PointCloud, cameras: &[Camera]) -> Vec<Surface> 
     let all = left.len();
     let mut random = Random::new(0);
     let mut found = Vec::new();
-    while found.len() < MOST && left.len() > NEIGHBOURS {
-        let tried = (0..TRIALS).map(|_| plane(&left, &near(&left, random.below(left.len()))));
-        let count = |plane: &(DVec3, DVec3)| left.iter().filter(|s| lies_on(s, plane)).count();
-        let Some(best) = tried.max_by_key(count) else { break };
-        // Twice over its own points: the first plane was that of a small patch.
+    while found.len() < MAX_SURFACES && left.len() > NEIGHBOURS {
+        let tried = (0..TRIALS).map(|_| fit_plane(&left, &nearest(&left, random.below(left.len()))));
+        let inlier_count = |plane: &(DVec3, DVec3)| left.iter().filter(|s| lies_on(s, plane)).count();
+        let Some(best) = tried.max_by_key(inlier_count) else { break };
+        // Two fits to its own inliers: the hypothesis is that of a small patch.
         let best = (0..2).fold(best, |best, _| {
-            plane(&left, &(0..left.len()).filter(|k| lies_on(&left[*k], &best)).collect::<Vec<_>>())
+            fit_plane(&left, &(0..left.len()).filter(|k| lies_on(&left[*k], &best)).collect::<Vec<_>>())
         });
-        let share = count(&best) as f64 / all as f64;
+        let share = inlier_count(&best) as f64 / all as f64;
         if share < MIN_SHARE {
             break;
         }
@@ -65,17 +65,17 @@ fn lies_on((p, thickness): &Sample, (middle, normal): &(DVec3, DVec3)) -> bool {
     (*p - *middle).dot(*normal).abs() < *thickness
 }
 
-/// The nearest neighbours of a point.
-fn near(points: &[Sample], of: usize) -> Vec<usize> {
-    let far = |k: &usize| points[*k].0.distance_squared(points[of].0);
+/// Nearest neighbours of a point.
+fn nearest(points: &[Sample], of: usize) -> Vec<usize> {
+    let squared_distance = |k: &usize| points[*k].0.distance_squared(points[of].0);
     let mut order: Vec<usize> = (0..points.len()).collect();
-    order.select_nth_unstable_by(NEIGHBOURS, |a, b| far(a).total_cmp(&far(b)));
+    order.select_nth_unstable_by(NEIGHBOURS, |a, b| squared_distance(a).total_cmp(&squared_distance(b)));
     order.truncate(NEIGHBOURS);
     order
 }
 
-/// A point of the plane through some points, least squares, and its normal.
-fn plane(points: &[Sample], of: &[usize]) -> (DVec3, DVec3) {
+/// Least-squares plane: a point on it and its normal.
+fn fit_plane(points: &[Sample], of: &[usize]) -> (DVec3, DVec3) {
     let n = of.len().max(1) as f64;
     let middle = of.iter().map(|k| points[*k].0).sum::<DVec3>() / n;
     let mut moments = Matrix3::zeros();
@@ -94,7 +94,7 @@ mod tests {
     use crate::scene::Pose;
 
     #[test]
-    fn a_table_and_a_wall_are_found_among_clutter() {
+    fn surfaces_finds_planes_among_clutter() {
         let mut random = Random::new(3);
         let mut cloud = PointCloud::default();
         for _ in 0..9000 {

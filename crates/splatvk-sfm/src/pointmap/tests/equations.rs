@@ -1,18 +1,18 @@
-//! The blocked equations against derivatives by differences and against a dense matrix.
+//! Derivatives against finite differences, and the blocked equations against a dense matrix.
 use super::super::adjust::Adjustment;
-use super::super::normal::{Normal, Pattern, camera_places};
+use super::super::normal::{NormalEquations, SparsityPattern, camera_indices};
 use super::super::problem::{GAUGE_WEIGHT, Problem, STEP_WEIGHT, State, Step};
 use super::super::solver::Factored;
 use super::*;
 use crate::numeric::cauchy_weight;
 use nalgebra::{DMatrix, DVector};
 
-/// Everything at its start, with corrections that are not zero.
-fn started(views: usize) -> Adjustment {
+/// Adjustment at its start, with non-zero corrections.
+fn unsolved(views: usize) -> Adjustment {
     let (mut case, _) = case();
     case.views.truncate(views);
     let (pairs, matches) = case.input(FAULTS);
-    let canonical = canonical::all(&case.views, &pairs);
+    let canonical = canonical::canonical_maps(&case.views, &pairs);
     let focals = canonical::focals(&case.views, &canonical);
     let edges: Vec<Edge> = pairs
         .iter()
@@ -20,7 +20,7 @@ fn started(views: usize) -> Adjustment {
         .filter_map(|(p, m)| pairs::edge(&case.views, p, &m.matches, &canonical, &focals, 0))
         .collect();
     assert_eq!(edges.len(), pairs.len());
-    let start = tree::place(views, &edges).unwrap();
+    let start = tree::register(views, &edges).unwrap();
     let mut a =
         Adjustment::new(Problem::new(&case.views, &canonical, &focals, &pairs, &matches), &start, &focals);
     let mut rng = Random::new(31);
@@ -29,60 +29,60 @@ fn started(views: usize) -> Adjustment {
     a
 }
 
-/// A match seen from one side, with what it says.
-struct Line {
+/// Residuals of a match in one direction, with their derivatives.
+struct JacobianRow {
     pair: usize,
     link: usize,
     side: usize,
     weight: f64,
     r: [f64; 3],
-    /// (unknown, derivatives); one index counts all unknowns, and one that both views share stands
-    /// twice.
+    /// (index among all unknowns, derivatives); an unknown that both views share stands twice.
     entries: Vec<(usize, [f64; 3])>,
 }
 
-/// Every match from both sides.
-fn lines(p: &Problem, s: &State) -> Vec<Line> {
+/// Rows of every match in both directions.
+fn jacobian_rows(p: &Problem, s: &State) -> Vec<JacobianRow> {
     let mut out = Vec::new();
     for (k, pair) in p.pairs.iter().enumerate() {
-        let places = camera_places(p, pair.views);
+        let indices = camera_indices(p, pair.views);
         for (l, link) in pair.links.iter().enumerate() {
             let d = p.depths(s, pair, link);
             for side in 0..2 {
                 let ends = [&link.ends[side], &link.ends[1 - side]];
                 let row = p.direction(s, pair, side).row(ends[0], ends[1], [d[side], d[1 - side]]).unwrap();
                 let mut entries = Vec::new();
-                for (slot, place) in places.iter().enumerate() {
-                    entries.extend(place.map(|i| (i, row.camera.map(|r| r[slot]))));
+                for (slot, index) in indices.iter().enumerate() {
+                    entries.extend(index.map(|i| (i, row.camera.map(|r| r[slot]))));
                 }
-                for (end, by) in [row.along, [0.0, 0.0, row.away]].into_iter().enumerate() {
+                for (end, by) in [row.by_point_depth, [0.0, 0.0, row.by_pixel_depth]].into_iter().enumerate()
+                {
                     let view = pair.views[if end == 0 { side } else { 1 - side }];
                     for (corner, weight) in ends[end].corners.iter().zip(ends[end].weights) {
                         entries.push((p.camera_unknowns() + p.grid(view) + corner, by.map(|v| v * weight)));
                     }
                 }
-                out.push(Line { pair: k, link: l, side, weight: link.weight, r: row.r, entries });
+                out.push(JacobianRow { pair: k, link: l, side, weight: link.weight, r: row.r, entries });
             }
         }
     }
     out
 }
 
-fn flat(step: &Step) -> DVector<f64> {
+fn flattened(step: &Step) -> DVector<f64> {
     DVector::from_iterator(step.camera.len() + step.grid.len(), step.camera.iter().chain(&step.grid).copied())
 }
 
-fn step_of(p: &Problem, all: &DVector<f64>) -> Step {
+fn unflattened(p: &Problem, all: &DVector<f64>) -> Step {
     let n = p.camera_unknowns();
     Step { camera: all.rows(0, n).into_owned(), grid: all.iter().skip(n).copied().collect() }
 }
 
 #[test]
-fn residual_gradients_agree_with_differences() {
-    let a = started(4);
+fn row_derivatives_equal_finite_differences() {
+    let a = unsolved(4);
     let (p, s) = (&a.problem, &a.state);
     let n = p.camera_unknowns() + p.grid(4);
-    let all = lines(p, s);
+    let all = jacobian_rows(p, s);
     for line in all.iter().step_by(all.len() / 40) {
         let residual = |s: &State| {
             let (pair, side) = (&p.pairs[line.pair], line.side);
@@ -100,7 +100,7 @@ fn residual_gradients_agree_with_differences() {
             let moved = |h: f64| {
                 let mut step = DVector::zeros(n);
                 step[i] = -h;
-                residual(&s.stepped(p, &step_of(p, &step)))
+                residual(&s.updated(p, &unflattened(p, &step)))
             };
             let (up, down) = (moved(1e-6), moved(-1e-6));
             for c in 0..3 {
@@ -111,7 +111,7 @@ fn residual_gradients_agree_with_differences() {
     }
 }
 
-/// The whole normal matrix and gradient, entry by entry from the rows and priors.
+/// Dense normal matrix and gradient, entry by entry from the rows and priors.
 fn dense(p: &Problem, s: &State, c: f64) -> (DMatrix<f64>, DVector<f64>) {
     let grids = p.camera_unknowns();
     let n = grids + p.grid(p.lattices.len());
@@ -122,7 +122,7 @@ fn dense(p: &Problem, s: &State, c: f64) -> (DMatrix<f64>, DVector<f64>) {
             entries.iter().for_each(|(j, e)| h[(*i, *j)] += w * d * e);
         }
     };
-    for Line { weight, r, entries, .. } in lines(p, s) {
+    for JacobianRow { weight, r, entries, .. } in jacobian_rows(p, s) {
         let wp = weight * cauchy_weight(r[0] * r[0] + r[1] * r[1], c);
         let w = [wp, wp, weight * cauchy_weight(r[2] * r[2], c)];
         for k in 0..3 {
@@ -136,14 +136,14 @@ fn dense(p: &Problem, s: &State, c: f64) -> (DMatrix<f64>, DVector<f64>) {
     let all: Vec<(usize, f64)> = (0..p.lattices.len()).map(|v| (p.kappa(v), 1.0)).collect();
     add(&all, p.gauge(s), GAUGE_WEIGHT);
     for (v, l) in p.lattices.iter().enumerate() {
-        let at = |i: usize| grids + p.grid(v) + i;
+        let unknown = |i: usize| grids + p.grid(v) + i;
         for y in 0..l.rows {
             for x in 0..l.columns {
                 let i = y * l.columns + x;
-                add(&[(at(i), 1.0)], s.grid[v][i], p.size_weights[v][i]);
+                add(&[(unknown(i), 1.0)], s.grid[v][i], p.size_weights[v][i]);
                 for j in [(x + 1 < l.columns).then_some(i + 1), (y + 1 < l.rows).then_some(i + l.columns)] {
                     let Some(j) = j else { continue };
-                    add(&[(at(i), 1.0), (at(j), -1.0)], s.grid[v][i] - s.grid[v][j], STEP_WEIGHT);
+                    add(&[(unknown(i), 1.0), (unknown(j), -1.0)], s.grid[v][i] - s.grid[v][j], STEP_WEIGHT);
                 }
             }
         }
@@ -152,24 +152,24 @@ fn dense(p: &Problem, s: &State, c: f64) -> (DMatrix<f64>, DVector<f64>) {
 }
 
 #[test]
-fn blocked_equations_have_the_dense_solution() {
-    let a = started(3);
+fn blocked_solution_equals_dense_solution() {
+    let a = unsolved(3);
     let (p, s) = (&a.problem, &a.state);
-    let patterns = Pattern::all(p);
-    let normal = Normal::new(p, &patterns, s, 2.0);
+    let patterns = SparsityPattern::all(p);
+    let normal = NormalEquations::new(p, &patterns, s, 2.0);
     let (h, g) = dense(p, s, 2.0);
     for damping in [0.0, 1e-2] {
         let mut damped = h.clone();
         (0..g.len()).for_each(|i| damped[(i, i)] *= 1.0 + damping);
         let want = damped.cholesky().unwrap().solve(&g);
-        let found = flat(&Factored::new(&normal, damping).unwrap().step(1e-12).unwrap());
-        // Conditioned like 10⁸: 10⁻¹⁶ of f64 leaves 10⁻⁸.
+        let found = flattened(&Factored::new(&normal, damping).unwrap().step(1e-12).unwrap());
+        // A condition number of 10⁸: 10⁻¹⁶ of f64 leaves 10⁻⁸.
         assert!((&found - &want).norm() < 1e-7 * want.norm(), "{}", (&found - &want).norm() / want.norm());
     }
 }
 
 #[test]
-fn deviation_of_the_focal_length_is_that_of_the_dense_inverse() {
+fn focal_sigma_equals_dense_inverse() {
     let (mut case, _) = case();
     case.views.truncate(2);
     let (pairs, matches) = case.input(FAULTS);
@@ -181,14 +181,14 @@ fn deviation_of_the_focal_length_is_that_of_the_dense_inverse() {
 }
 
 fn solved(views: &[ModelView], pairs: &[PairPointmaps], matches: &[PairMatches]) -> Adjustment {
-    let canonical = canonical::all(views, pairs);
+    let canonical = canonical::canonical_maps(views, pairs);
     let focals = canonical::focals(views, &canonical);
     let edges: Vec<Edge> = pairs
         .iter()
         .zip(matches)
         .filter_map(|(p, m)| pairs::edge(views, p, &m.matches, &canonical, &focals, 0))
         .collect();
-    let start = tree::place(views.len(), &edges).unwrap();
+    let start = tree::register(views.len(), &edges).unwrap();
     let mut a = Adjustment::new(Problem::new(views, &canonical, &focals, pairs, matches), &start, &focals);
     a.solve(&Silent).unwrap();
     a

@@ -1,18 +1,17 @@
-//! What a network says besides the pointmaps: its own cameras, its own scale of confidence; and
-//! pairs that turn out wrong.
+//! Other outputs of a network: its own cameras and its own scale of confidence; and wrong pairs.
 use super::*;
 use crate::progress::Recorded;
 use crate::scene::Pose;
 
-/// One unit for all maps, as a network gives that sees all photos at once.
+/// One unit for all maps, as from a network that sees all photos at once.
 const AT_ONCE: Faults = Faults { scale: 0.0, ..FAULTS };
 
 fn solved(case: &Case, pairs: &[PairPointmaps], matches: &[PairMatches], cameras: &[Camera]) -> Geometry {
-    let maps = Pointmaps { cameras: cameras.to_vec(), ..said(&case.views, pairs) };
+    let maps = Pointmaps { cameras: cameras.to_vec(), ..network_output(&case.views, pairs) };
     align(maps, matches.to_vec(), 0, &Silent).unwrap().geometry
 }
 
-/// Turned about the vertical axis and moved.
+/// Cameras rotated about the vertical axis and translated.
 fn moved(cameras: &[Camera], degrees: f64, shift: f64) -> Vec<Camera> {
     let mut out = cameras.to_vec();
     for (k, c) in out.iter_mut().enumerate().skip(1) {
@@ -30,13 +29,13 @@ fn assert_right(g: &Geometry, truth: &Truth) {
 }
 
 #[test]
-fn good_cameras_of_a_network_start_the_adjustment() {
+fn align_starts_from_network_cameras() {
     let (case, truth) = case();
     let (pairs, matches) = case.input(AT_ONCE);
     let g = solved(&case, &pairs, &matches, &moved(&case.cameras, 0.2, 0.01 * truth.mean_depth));
     assert_eq!(g.method, "pointmaps, started from the network's own cameras");
     assert_right(&g, &truth);
-    // The end does not depend on the start.
+    // The solution does not depend on the start.
     let from_pairs = solved(&case, &pairs, &matches, &[]);
     assert_eq!(from_pairs.method, "pointmaps");
     let d = difference(&g.cameras, &from_pairs.cameras);
@@ -44,7 +43,7 @@ fn good_cameras_of_a_network_start_the_adjustment() {
 }
 
 #[test]
-fn wrong_cameras_of_a_network_lose_against_those_from_pairs() {
+fn align_rejects_wrong_network_cameras() {
     let (case, truth) = case();
     let (pairs, matches) = case.input(AT_ONCE);
     let g = solved(&case, &pairs, &matches, &moved(&case.cameras, 60.0, truth.mean_depth));
@@ -53,11 +52,11 @@ fn wrong_cameras_of_a_network_lose_against_those_from_pairs() {
 }
 
 #[test]
-fn cameras_of_a_network_win_where_its_pairs_agree_on_wrong_ones() {
+fn align_prefers_network_to_wrong_pairs() {
     let (case, truth) = case();
     let (mut pairs, matches) = case.input(AT_ONCE);
     let right = case.cameras.clone();
-    // Points as cameras elsewhere would see them: rigid, and wrong.
+    // Points in the frames of other cameras: rigid, and wrong.
     let elsewhere = moved(&right, 60.0, truth.mean_depth);
     let mut rng = Random::new(9);
     for p in &mut pairs {
@@ -71,20 +70,20 @@ fn cameras_of_a_network_win_where_its_pairs_agree_on_wrong_ones() {
                 .collect();
         }
     }
-    let canonical = canonical::all(&case.views, &pairs);
+    let canonical = canonical::canonical_maps(&case.views, &pairs);
     let focals = canonical::focals(&case.views, &canonical);
     let edges = pairs
         .iter()
         .zip(&matches)
         .filter_map(|(p, m)| pairs::edge(&case.views, p, &m.matches, &canonical, &focals, 0));
-    assert!(tree::place(4, &edges.collect::<Vec<_>>()).is_ok(), "the pairs do give a start");
+    assert!(tree::register(4, &edges.collect::<Vec<_>>()).is_ok(), "the pairs do give a start");
     let g = solved(&case, &pairs, &matches, &right);
     assert_eq!(g.method, "pointmaps, started from the network's own cameras");
     assert_right(&g, &truth);
 }
 
 #[test]
-fn cameras_of_a_network_serve_where_its_pairs_give_none() {
+fn align_without_edges_uses_network_cameras() {
     let (case, truth) = case();
     let (mut pairs, matches) = case.input(AT_ONCE);
     // Each view's points are right in its own camera, and nonsense in any other.
@@ -95,12 +94,12 @@ fn cameras_of_a_network_serve_where_its_pairs_give_none() {
     let g = solved(&case, &pairs, &matches, &case.cameras);
     assert_eq!(g.method, "pointmaps, started from the network's own cameras");
     assert_right(&g, &truth);
-    let error = align(said(&case.views, &pairs), matches, 0, &Silent).unwrap_err();
+    let error = align(network_output(&case.views, &pairs), matches, 0, &Silent).unwrap_err();
     assert!(error.to_string().contains("do not overlap enough"), "{error}");
 }
 
 #[test]
-fn a_view_whose_pairs_all_turn_out_wrong_is_left_out_by_name() {
+fn view_with_wrong_pairs_left_out() {
     let (case, truth) = case();
     let (pairs, mut matches) = case.input(FAULTS);
     let mut rng = Random::new(21);
@@ -110,7 +109,7 @@ fn a_view_whose_pairs_all_turn_out_wrong_is_left_out_by_name() {
         m.matches.iter_mut().for_each(|m| m.b = DVec2::new(rng.uniform() * size.0, rng.uniform() * size.1));
     }
     let recorded = Recorded::new(&Silent);
-    let found = align(said(&case.views, &pairs), matches, 0, &recorded).unwrap();
+    let found = align(network_output(&case.views, &pairs), matches, 0, &recorded).unwrap();
     assert_eq!(found.left_out, [3]);
     assert!(recorded.warnings()[0].starts_with("train_03 is left out"), "{:?}", recorded.warnings());
     assert_eq!(found.geometry.cameras.len(), 3);
@@ -119,19 +118,19 @@ fn a_view_whose_pairs_all_turn_out_wrong_is_left_out_by_name() {
 }
 
 #[test]
-fn points_are_chosen_on_the_networks_own_scale_of_confidence() {
+fn confidence_floor_selects_points() {
     let (case, _) = case();
     let (mut pairs, matches) = case.input(AT_ONCE);
     let mut rng = Random::new(3);
-    // Depth Anything 3's: hardly above 1.
+    // Confidence as of Depth Anything 3: hardly above 1.
     for map in pairs.iter_mut().flat_map(|p| [&mut p.x11, &mut p.x21, &mut p.x22, &mut p.x12]) {
         map.confidence.iter_mut().for_each(|c| *c = 1.02 + 0.2 * rng.uniform() as f32);
     }
-    let with = |floor: Option<f64>| {
-        let maps = Pointmaps { confidence_floor: floor, ..said(&case.views, &pairs) };
+    let align_with = |floor: Option<f64>| {
+        let maps = Pointmaps { confidence_floor: floor, ..network_output(&case.views, &pairs) };
         align(maps, matches.clone(), 0, &Silent).unwrap().geometry
     };
-    let (free, own, other) = (with(None), with(Some(1.15)), with(Some(3.0)));
+    let (free, own, other) = (align_with(None), align_with(Some(1.15)), align_with(Some(3.0)));
     let counts = [&free, &own, &other].map(|g| g.points.len());
     println!(
         "points without a floor {}, with its own {}, with that of another network {}",
@@ -140,10 +139,15 @@ fn points_are_chosen_on_the_networks_own_scale_of_confidence() {
     assert!(counts[0] > 100_000 && counts[2] == 0, "{counts:?}");
     assert!(counts[1] > 30_000 && counts[1] < counts[0] * 4 / 5, "{counts:?}");
     // Training takes depth from half the confidence of a point.
-    let usable = |g: &Geometry| {
+    let usable_share = |g: &Geometry| {
         let all = g.depths.iter().flat_map(|d| d.confidence.data.iter().zip(&d.depth.data));
         let known: Vec<bool> = all.filter(|(_, z)| **z > 0.0).map(|(c, _)| *c >= 0.5).collect();
         known.iter().filter(|k| **k).count() as f64 / known.len() as f64
     };
-    assert!(usable(&free) > 0.9 && usable(&other) == 0.0, "{} {}", usable(&free), usable(&other));
+    assert!(
+        usable_share(&free) > 0.9 && usable_share(&other) == 0.0,
+        "{} {}",
+        usable_share(&free),
+        usable_share(&other)
+    );
 }

@@ -1,50 +1,47 @@
-//! Scale and shift of a depth prior, piece by piece.
+//! Piecewise alignment of a depth prior by scale and shift.
 //!
-//! Both are fitted in inverse depth, because there planes are affine functions of the image: one
-//! scale and one shift turn a plane of the prior into a plane, what networks of relative depth
-//! leave open is just these two (Ranftl et al. 2020), and the noise of matching is even. In depth
-//! or its logarithm a shift would bend every wall.
+//! Both are fitted in inverse depth, where planes are affine in the image: one scale and one shift
+//! map planes to planes, networks of relative depth leave open just these two (Ranftl et al. 2020),
+//! and matching noise is uniform. In depth or its logarithm a shift would bend walls.
 use super::pieces::{NO_PIECE, Pieces};
 use crate::math::hash;
 
-/// Pixels of stereo depth that err together, those of one matching window: they count as one
-/// measurement.
+/// Pixels with correlated errors, those of one matching window: one independent measurement.
 const CORRELATED: f64 = 81.0;
-/// Relative change of a prior's error from one piece to the next. Errors of a tenth that swing
-/// twice over the image change as much.
+/// σ of the relative change of a prior's error between neighbouring pieces. Errors of a tenth that
+/// swing twice over the image change as much.
 const CHANGE: f64 = 0.02;
-/// Relative deviation of a piece from the whole image's scale and shift; keeps both apart where a
-/// piece is of one depth.
+/// σ of a piece's correction; separates scale and shift where a piece has one depth.
 const SPREAD: f64 = 0.3;
-/// Widths of the robust loss (Cauchy), multiples of stereo's own deviation, one per round: wide
-/// first, so that a piece that is far off is drawn in before it counts as an outlier.
+/// Scales of the Cauchy loss, multiples of stereo's own σ, one per round: wide first, so that a
+/// piece that is far off is fitted before it counts as an outlier.
 const WIDTHS: [f64; 5] = [16.0, 8.0, 4.0, 2.0, 2.0];
-/// Two-pixel hypotheses for the scale and shift of the whole image: with half of the pixels right,
-/// all miss with 0.75^300.
+/// Two-pixel hypotheses for the global scale and shift: with half of the pixels right, all miss
+/// with probability 0.75^300.
 const TRIALS: u32 = 300;
 /// Pixels that score a hypothesis.
 const SCORED: usize = 500;
-/// A piece of which less than half agrees contradicts stereo.
+/// Least share of inliers in a piece that is kept.
 const LEAST_AGREEMENT: f64 = 0.5;
-/// A prior must explain what was matched by so much more than one constant depth does: one of
-/// another scene can be flattened until it is as good as that.
+/// Least ratio of a prior's score to that of a constant depth: the prior of another scene can be
+/// flattened to a ratio of one.
 const BETTER_THAN_FLAT: f64 = 1.05;
-/// Disagreement, multiples of the deviation, that no noise explains.
+/// Residual of an outlier, multiples of σ: no noise is as large.
 const OUTLIER: f64 = 4.0;
-/// Fewest independent measurements that judge a piece.
-const JUDGES: f64 = 2.0;
+/// Fewest independent measurements for the decision on a piece.
+const MIN_EVIDENCE: f64 = 2.0;
 
-/// A prior at the scale of stereo.
+/// Prior at the scale of stereo.
 pub struct Aligned {
-    /// Inverse depth per pixel; 0 where the prior is unknown, or contradicts stereo.
+    /// Inverse depth per pixel; 0 where the prior is unknown or contradicts stereo.
     pub inverse: Vec<f32>,
-    /// Its relative standard deviation per pixel.
+    /// Relative standard deviation per pixel.
     pub deviation: Vec<f32>,
-    /// Share of the prior's pixels that lie in pieces which contradict stereo.
+    /// Share of the prior's pixels in pieces that contradict stereo.
     pub contradicted: f32,
 }
 
-/// What stereo measured at a pixel.
+/// Stereo measurement at a pixel.
 #[derive(Clone, Copy)]
 struct Sample {
     pixel: usize,
@@ -52,9 +49,9 @@ struct Sample {
     weight: f64,
 }
 
-/// Brings `prior` (affine in inverse depth, [H, W], 0 = unknown) to `stereo` (inverse depth, 0 =
-/// unmatched) with `confidence`. `tolerance` is stereo's relative deviation. `None` if no scale and
-/// shift explain what stereo measured better than one depth for all of it.
+/// Aligns `prior` (affine in inverse depth, [H, W], 0 = unknown) with `stereo` (inverse depth, 0 =
+/// unmatched), weighted by `confidence`. `tolerance` is the relative σ of stereo. `None` if no
+/// scale and shift fit better than one constant depth.
 pub fn align(
     prior: &[f32],
     stereo: &[f32],
@@ -67,23 +64,24 @@ pub fn align(
         .filter(|&k| prior[k] > 0.0 && stereo[k] > 0.0)
         .map(|k| Sample { pixel: k, inverse: f64::from(stereo[k]), weight: f64::from(confidence[k]) })
         .collect();
-    let (scale, shift) = whole(prior, &samples, f64::from(tolerance), seed)?;
-    // Values that the shift brings to infinity or beyond are as far as anything can be said to be.
+    let (scale, shift) = global_fit(prior, &samples, f64::from(tolerance), seed)?;
+    // Limit for values that the shift maps to infinity or beyond.
     let farthest = 0.25 * stereo.iter().copied().filter(|s| *s > 0.0).fold(f32::INFINITY, f32::min);
-    let of = |q: f32| if q > 0.0 { ((scale * f64::from(q) + shift) as f32).max(farthest) } else { 0.0 };
-    let rough: Vec<f32> = prior.iter().map(|&q| of(q)).collect();
+    let rough_inverse =
+        |q: f32| if q > 0.0 { ((scale * f64::from(q) + shift) as f32).max(farthest) } else { 0.0 };
+    let rough: Vec<f32> = prior.iter().map(|&q| rough_inverse(q)).collect();
     let pieces = Pieces::cut(&rough, width, height);
-    let solved = Solved::new(&rough, &pieces, &samples, f64::from(tolerance));
-    Some(solved.applied(&rough, &pieces, &samples, (width, height), f64::from(tolerance)))
+    let corrections = Corrections::solve(&rough, &pieces, &samples, f64::from(tolerance));
+    Some(corrections.applied(&rough, &pieces, &samples, (width, height), f64::from(tolerance)))
 }
 
-/// Scale and shift of the whole image: the pair of pixels with which most others agree, then least
-/// squares over those.
-fn whole(prior: &[f32], samples: &[Sample], tolerance: f64, seed: u32) -> Option<(f64, f64)> {
+/// Global scale and shift: the hypothesis of two pixels with the best robust score, then
+/// re-weighted least squares.
+fn global_fit(prior: &[f32], samples: &[Sample], tolerance: f64, seed: u32) -> Option<(f64, f64)> {
     if samples.len() < 2 * CORRELATED as usize {
         return None;
     }
-    // Wide: the prior's own errors of some ten percent are still in.
+    // Wide, so that the prior's own errors of some ten percent are inliers.
     let width = WIDTHS[0] * tolerance;
     let residual =
         |(a, b): (f64, f64), s: &Sample| (a * f64::from(prior[s.pixel]) + b - s.inverse) / s.inverse;
@@ -104,8 +102,7 @@ fn whole(prior: &[f32], samples: &[Sample], tolerance: f64, seed: u32) -> Option
         let (p, q) = (f64::from(prior[s.pixel]), f64::from(prior[t.pixel]));
         let a = (s.inverse - t.inverse) / (p - q);
         flat = flat.max(score((0.0, s.inverse)));
-        // A prior is nearer where the scene is nearer; the scale alone explains one of constant
-        // depth.
+        // Scales must be positive; one without shift fits a prior of constant depth.
         for (a, b) in [(a, s.inverse - a * p), (s.inverse / p, 0.0)] {
             if a > 0.0 && a.is_finite() && score((a, b)) > best.0 {
                 best = (score((a, b)), (a, b));
@@ -135,14 +132,13 @@ fn whole(prior: &[f32], samples: &[Sample], tolerance: f64, seed: u32) -> Option
     (found.0 > 0.0 && score(found) > BETTER_THAN_FLAT * flat).then_some(found)
 }
 
-/// Correction of every piece: inverse depth = (1 + u) · rough + v · unit.
-struct Solved {
-    correction: Vec<[f64; 2]>,
+/// Correction (u, v) of every piece: inverse depth = (1 + u) · rough + v · unit.
+struct Corrections {
+    per_piece: Vec<[f64; 2]>,
     unit: f64,
 }
 
-/// Symmetric 2 × 2 blocks on the diagonal and rank-one couplings of pairs: what conjugate gradients
-/// multiply with.
+/// Sparse system of 2 × 2 blocks on the diagonal and rank-one couplings of pairs of pieces.
 struct System {
     diagonal: Vec<[f64; 3]>,
     /// (a, b, h, weight): weight · (h · (x_a − x_b))².
@@ -150,7 +146,7 @@ struct System {
 }
 
 impl System {
-    fn times(&self, x: &[[f64; 2]]) -> Vec<[f64; 2]> {
+    fn product(&self, x: &[[f64; 2]]) -> Vec<[f64; 2]> {
         let mut out: Vec<[f64; 2]> = self
             .diagonal
             .iter()
@@ -167,7 +163,7 @@ impl System {
         out
     }
 
-    /// Conjugate gradients with the blocks as preconditioner.
+    /// Conjugate gradients with the diagonal blocks as preconditioner.
     fn solve(&self, rhs: &[[f64; 2]]) -> Vec<[f64; 2]> {
         let mut blocks = self.diagonal.clone();
         for &(a, b, h, weight) in &self.couplings {
@@ -177,35 +173,22 @@ impl System {
                 }
             }
         }
-        let conditioned = |r: &[[f64; 2]]| -> Vec<[f64; 2]> {
-            let one = |(m, r): (&[f64; 3], &[f64; 2])| {
-                let det = m[0] * m[2] - m[1] * m[1];
-                [(m[2] * r[0] - m[1] * r[1]) / det, (m[0] * r[1] - m[1] * r[0]) / det]
-            };
-            blocks.iter().zip(r).map(one).collect()
-        };
-        let dot = |a: &[[f64; 2]], b: &[[f64; 2]]| -> f64 {
-            a.iter().zip(b).map(|(a, b)| a[0] * b[0] + a[1] * b[1]).sum()
-        };
-        let add = |a: &mut [[f64; 2]], b: &[[f64; 2]], s: f64| {
-            a.iter_mut().zip(b).for_each(|(a, b)| (0..2).for_each(|c| a[c] += s * b[c]));
-        };
         let mut x = vec![[0.0; 2]; rhs.len()];
         let mut r = rhs.to_vec();
-        let mut z = conditioned(&r);
+        let mut z = preconditioned(&blocks, &r);
         let mut p = z.clone();
         let mut rz = dot(&r, &z);
         let end = 1e-12 * rz;
-        // As many steps as unknowns would be exact; it takes about fifty.
+        // Exact after as many steps as unknowns; about fifty are enough.
         for _ in 0..2 * rhs.len() {
             if rz <= end {
                 break;
             }
-            let q = self.times(&p);
+            let q = self.product(&p);
             let step = rz / dot(&p, &q);
-            add(&mut x, &p, step);
-            add(&mut r, &q, -step);
-            z = conditioned(&r);
+            add_scaled(&mut x, &p, step);
+            add_scaled(&mut r, &q, -step);
+            z = preconditioned(&blocks, &r);
             let next = dot(&r, &z);
             p.iter_mut().zip(&z).for_each(|(p, z)| (0..2).for_each(|c| p[c] = z[c] + next / rz * p[c]));
             rz = next;
@@ -214,8 +197,25 @@ impl System {
     }
 }
 
-impl Solved {
-    fn new(rough: &[f32], pieces: &Pieces, samples: &[Sample], tolerance: f64) -> Solved {
+/// Solution of each 2 × 2 block for its part of `r`.
+fn preconditioned(blocks: &[[f64; 3]], r: &[[f64; 2]]) -> Vec<[f64; 2]> {
+    let solve_block = |(m, r): (&[f64; 3], &[f64; 2])| {
+        let det = m[0] * m[2] - m[1] * m[1];
+        [(m[2] * r[0] - m[1] * r[1]) / det, (m[0] * r[1] - m[1] * r[0]) / det]
+    };
+    blocks.iter().zip(r).map(solve_block).collect()
+}
+
+fn dot(a: &[[f64; 2]], b: &[[f64; 2]]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a[0] * b[0] + a[1] * b[1]).sum()
+}
+
+fn add_scaled(a: &mut [[f64; 2]], b: &[[f64; 2]], s: f64) {
+    a.iter_mut().zip(b).for_each(|(a, b)| (0..2).for_each(|c| a[c] += s * b[c]));
+}
+
+impl Corrections {
+    fn solve(rough: &[f32], pieces: &Pieces, samples: &[Sample], tolerance: f64) -> Corrections {
         let mut all: Vec<f64> = samples.iter().map(|s| s.inverse).collect();
         let unit = crate::math::median(&mut all).unwrap_or(1.0);
         let (mut mean, mut size) = (vec![0.0; pieces.count], vec![0.0f64; pieces.count]);
@@ -227,13 +227,13 @@ impl Solved {
         let mut couplings = Vec::new();
         for &(a, b, length) in &pieces.borders {
             let (a, b) = (a as usize, b as usize);
-            // Whole where the border is as long as the smaller piece is wide.
+            // Full weight where the border is as long as the smaller piece is wide.
             let share = (f64::from(length) / size[a].min(size[b]).sqrt()).min(1.0);
             for at in [mean[a], mean[b]] {
                 couplings.push((a, b, [1.0, unit / at], 0.5 * share / (CHANGE * CHANGE)));
             }
         }
-        let mut solved = Solved { correction: vec![[0.0; 2]; pieces.count], unit };
+        let mut corrections = Corrections { per_piece: vec![[0.0; 2]; pieces.count], unit };
         for width in WIDTHS {
             let start = [1.0 / (SPREAD * SPREAD), 0.0, 1.0 / (SPREAD * SPREAD)];
             let mut system = System { diagonal: vec![start; pieces.count], couplings };
@@ -241,7 +241,7 @@ impl Solved {
             for s in samples {
                 let piece = pieces.of[s.pixel] as usize;
                 let at = f64::from(rough[s.pixel]);
-                let off = solved.residual(piece, at, s.inverse) / (width * tolerance);
+                let off = corrections.residual(piece, at, s.inverse) / (width * tolerance);
                 let weight = s.weight / CORRELATED / (1.0 + off * off) / (tolerance * tolerance);
                 let g = [at / s.inverse, unit / s.inverse];
                 let wanted = 1.0 - at / s.inverse;
@@ -252,15 +252,15 @@ impl Solved {
                 }
                 (0..2).for_each(|c| rhs[piece][c] += weight * wanted * g[c]);
             }
-            solved.correction = system.solve(&rhs);
+            corrections.per_piece = system.solve(&rhs);
             couplings = system.couplings;
         }
-        solved
+        corrections
     }
 
-    /// Relative error of the corrected prior.
+    /// Relative residual of the corrected prior.
     fn residual(&self, piece: usize, rough: f64, inverse: f64) -> f64 {
-        let [u, v] = self.correction[piece];
+        let [u, v] = self.per_piece[piece];
         ((1.0 + u) * rough + v * self.unit - inverse) / inverse
     }
 
@@ -278,21 +278,20 @@ impl Solved {
             errors[piece].push(self.residual(piece, f64::from(rough[s.pixel]), s.inverse).abs());
         }
         let mut all: Vec<f64> = errors.iter().flatten().copied().collect();
-        // From the median absolute error to a standard deviation (normal distribution).
+        // 1.4826 × the median absolute error is σ of a normal distribution.
         let overall = (1.4826 * crate::math::median(&mut all).unwrap_or(0.0)).max(0.5 * tolerance);
-        let judged = |piece: &Vec<f64>| piece.len() as f64 >= JUDGES * CORRELATED;
         let limit = OUTLIER * overall.max(tolerance);
         let wrong: Vec<bool> = errors
             .iter()
             .map(|e| {
                 let agree = e.iter().filter(|e| **e < limit).count() as f64;
-                judged(e) && agree < LEAST_AGREEMENT * e.len() as f64
+                has_evidence(e) && agree < LEAST_AGREEMENT * e.len() as f64
             })
             .collect();
-        let hops = hops(pieces, &errors.iter().map(judged).collect::<Vec<_>>());
+        let hops = hops(pieces, &errors.iter().map(|e| has_evidence(e)).collect::<Vec<_>>());
         let deviation: Vec<f32> = (0..pieces.count)
             .map(|piece| {
-                let own = match judged(&errors[piece]) {
+                let own = match has_evidence(&errors[piece]) {
                     true => 1.4826 * crate::math::median(&mut errors[piece]).unwrap_or(overall),
                     false => overall,
                 };
@@ -301,17 +300,18 @@ impl Solved {
             .collect();
         let radius = (width as f32 * 0.5 * super::pieces::SIDE_SHARE) as usize;
         let field = |c: usize| {
-            let of = |&p: &u32| if p == NO_PIECE { f32::NAN } else { self.correction[p as usize][c] as f32 };
-            blurred(&pieces.of.iter().map(of).collect::<Vec<_>>(), width, height, radius)
+            let value =
+                |&p: &u32| if p == NO_PIECE { f32::NAN } else { self.per_piece[p as usize][c] as f32 };
+            box_filtered(&pieces.of.iter().map(value).collect::<Vec<_>>(), width, height, radius)
         };
         let (u, v) = (field(0), field(1));
         let mut out =
             Aligned { inverse: vec![0.0; rough.len()], deviation: vec![0.0; rough.len()], contradicted: 0.0 };
-        let (mut known, mut refused) = (0.0f32, 0.0f32);
+        let (mut known, mut rejected) = (0.0f32, 0.0f32);
         for (k, &piece) in pieces.of.iter().enumerate().filter(|(_, p)| **p != NO_PIECE) {
             known += 1.0;
             if wrong[piece as usize] {
-                refused += 1.0;
+                rejected += 1.0;
                 continue;
             }
             let value = (1.0 + u[k]) * rough[k] + v[k] * self.unit as f32;
@@ -320,15 +320,20 @@ impl Solved {
                 out.deviation[k] = deviation[piece as usize];
             }
         }
-        out.contradicted = refused / known.max(1.0);
+        out.contradicted = rejected / known.max(1.0);
         out
     }
 }
 
-/// How many pieces away the nearest piece with evidence is.
+/// True if a piece with these errors has enough independent measurements.
+fn has_evidence(errors: &[f64]) -> bool {
+    errors.len() as f64 >= MIN_EVIDENCE * CORRELATED
+}
+
+/// Distance to the nearest piece with evidence, in pieces.
 fn hops(pieces: &Pieces, evidence: &[bool]) -> Vec<u32> {
     let mut hops: Vec<u32> = evidence.iter().map(|&e| if e { 0 } else { u32::MAX }).collect();
-    // Farther than the image is wide in pieces, the whole image's scale and shift serve.
+    // At the width of the image and beyond, the global fit is as good.
     let farthest = (1.0 / super::pieces::SIDE_SHARE) as u32;
     for far in 0..farthest {
         for &(a, b, _) in &pieces.borders {
@@ -342,27 +347,34 @@ fn hops(pieces: &Pieces, evidence: &[bool]) -> Vec<u32> {
     hops.into_iter().map(|h| h.min(farthest)).collect()
 }
 
-/// Mean over the known values within `radius`, so that no seams run between pieces; rows, then
-/// columns.
-fn blurred(values: &[f32], width: usize, height: usize, radius: usize) -> Vec<f32> {
-    let pass = |from: &[(f64, f64)], at: &dyn Fn(usize, usize) -> usize, lines: usize, length: usize| {
-        let mut out = vec![(0.0, 0.0); from.len()];
-        for line in 0..lines {
-            let mut sums = vec![(0.0, 0.0)];
-            for k in 0..length {
-                let (last, next) = (sums[k], from[at(line, k)]);
-                sums.push((last.0 + next.0, last.1 + next.1));
-            }
-            for k in 0..length {
-                let (a, b) = (sums[k.saturating_sub(radius)], sums[(k + radius + 1).min(length)]);
-                out[at(line, k)] = (b.0 - a.0, b.1 - a.1);
-            }
-        }
-        out
-    };
+/// Box filter over known values within `radius`, by rows and columns, against visible seams.
+fn box_filtered(values: &[f32], width: usize, height: usize, radius: usize) -> Vec<f32> {
     let start: Vec<(f64, f64)> =
         values.iter().map(|v| if v.is_nan() { (0.0, 0.0) } else { (f64::from(*v), 1.0) }).collect();
-    let rows = pass(&start, &|y, x| y * width + x, height, width);
-    let both = pass(&rows, &|x, y| y * width + x, width, height);
+    let rows = line_sums(&start, |y, x| y * width + x, height, width, radius);
+    let both = line_sums(&rows, |x, y| y * width + x, width, height, radius);
     both.into_iter().map(|(sum, n)| if n > 0.0 { (sum / n) as f32 } else { 0.0 }).collect()
+}
+
+/// Sums of values and counts over `radius` on either side; `index` takes line and pixel.
+fn line_sums(
+    from: &[(f64, f64)],
+    index: impl Fn(usize, usize) -> usize,
+    lines: usize,
+    length: usize,
+    radius: usize,
+) -> Vec<(f64, f64)> {
+    let mut out = vec![(0.0, 0.0); from.len()];
+    for line in 0..lines {
+        let mut sums = vec![(0.0, 0.0)];
+        for k in 0..length {
+            let (last, next) = (sums[k], from[index(line, k)]);
+            sums.push((last.0 + next.0, last.1 + next.1));
+        }
+        for k in 0..length {
+            let (a, b) = (sums[k.saturating_sub(radius)], sums[(k + radius + 1).min(length)]);
+            out[index(line, k)] = (b.0 - a.0, b.1 - a.1);
+        }
+    }
+    out
 }

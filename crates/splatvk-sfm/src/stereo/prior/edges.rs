@@ -1,13 +1,13 @@
-//! Where a depth prior cannot be right: around depth edges, over which networks blur.
+//! Depth edges of a prior, over which networks blur.
 
-/// Half of the window that must be one plane, share of the view's width: what blurs of a hundredth
-/// of the width reach.
+/// Half of the window of the plane fit, share of the view's width: the reach of a blur by a
+/// hundredth of the width.
 const RADIUS_SHARE: f32 = 1.0 / 90.0;
-/// Relative deviation from a plane beyond which the window holds two surfaces: a ball of a tenth of
-/// its distance bends by less.
+/// Relative deviation from a plane above which the window holds two surfaces; a ball of a tenth of
+/// its distance deviates less.
 const BENT: f64 = 0.012;
 
-/// Per pixel whether the inverse depths around it (0 = unknown) lie on one plane, by least squares
+/// Per pixel: true if the inverse depths around it (0 = unknown) lie on one plane, by least squares
 /// over a square window.
 pub fn flat(inverse: &[f32], width: usize, height: usize) -> Vec<bool> {
     let radius = ((RADIUS_SHARE * width as f32).round() as usize).max(2);
@@ -20,7 +20,7 @@ pub fn flat(inverse: &[f32], width: usize, height: usize) -> Vec<bool> {
         .collect()
 }
 
-/// Sums of 1, x, y, x², xy, y², v, xv, yv, v² over all rectangles that begin in the corner.
+/// Integral images of 1, x, y, x², xy, y², v, xv, yv, v².
 struct Moments {
     sums: Vec<[f64; 10]>,
     width: usize,
@@ -48,8 +48,7 @@ impl Moments {
         Moments { sums, width, height }
     }
 
-    /// Root mean square distance from the best plane over the window; `None` where next to nothing
-    /// of it is known.
+    /// Root mean square residual of a plane fit over the window; `None` where hardly any is known.
     fn deviation(&self, x: usize, y: usize, radius: usize) -> Option<f64> {
         let stride = self.width + 1;
         let (x0, x1) = (x.saturating_sub(radius), (x + radius + 1).min(self.width));
@@ -78,15 +77,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn planes_are_flat_and_blurred_steps_are_not() {
+    fn flat_rejects_blurred_steps() {
         let (width, height) = (360, 60);
-        // A slanted plane, then a step of 20 % in inverse depth that a network spreads over 5
-        // pixels.
-        let value = |x: f32, y: f32| 1.0 + 0.002 * x + 0.003 * y;
+        // A slanted plane, then a step of 20 % in inverse depth that is blurred over 5 pixels.
+        let plane = |x: f32, y: f32| 1.0 + 0.002 * x + 0.003 * y;
         let ramp = |x: f32| ((x - 86.0) / 5.0).clamp(0.0, 1.0);
         let inverse: Vec<f32> = (0..width * height)
             .map(|k| ((k % width) as f32, (k / width) as f32))
-            .map(|(x, y)| value(x, y) * (1.0 - 0.2 * ramp(x)))
+            .map(|(x, y)| plane(x, y) * (1.0 - 0.2 * ramp(x)))
             .collect();
         let flat = flat(&inverse, width, height);
         for y in 0..height {

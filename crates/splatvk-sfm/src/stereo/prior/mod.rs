@@ -1,9 +1,9 @@
-//! Depth that a network or a file suggests, joined with what stereo measured.
+//! Fusion of depth priors (from a network or files) with matched depth.
 //!
-//! A prior knows shapes, not sizes: it is brought to stereo's scale piece by piece ([`align`]), is
-//! left out where it contradicts what stereo is sure of, where it would stand before what another
-//! view sees, and at its own blurred edges ([`edges`]). What remains is averaged with matched depth
-//! by inverse variance, and stands in for it where nothing was matched.
+//! A prior has shape without scale: it is aligned with stereo piece by piece ([`align`]). It is
+//! dropped where it contradicts confident stereo, lies in another view's free space, or is blurred
+//! over a depth edge ([`edges`]). The rest is averaged with matched depth by inverse variance, and
+//! replaces it where nothing was matched.
 mod align;
 mod edges;
 mod pieces;
@@ -16,29 +16,27 @@ use crate::progress::Progress;
 use crate::scene::{DepthPrior, PriorKind};
 use glam::Vec3;
 
-/// Confidence of a pixel that only the prior knows: it shapes the surface and is no measurement, as
-/// a plausible match is.
+/// Confidence of a pixel with depth from the prior alone: it shapes the surface but is no
+/// measurement, like a plausible match.
 pub const SUGGESTED: f32 = 0.4;
-/// Deviation of depth, share of the view's tolerance, by confidence: what two views confirm, one
-/// view, none, and planes of areas.
+/// (least confidence, σ of depth as a share of the view's tolerance): confirmed by two views, by
+/// one, by none, and inferred.
 const DEVIATION: [(f32, f32); 4] = [(0.9, 0.5), (0.6, 1.0), (0.45, 2.0), (0.0, 3.0)];
-/// Matched depth and prior that differ by more deviations than this are not of one surface, and are
-/// not averaged.
+/// Matched depth and prior that differ by more σ are of different surfaces and are not averaged.
 const SAME_SURFACE: f32 = 3.0;
-/// From this confidence on, depth stays where the prior contradicts it; below, what deviates less
-/// does.
+/// From this confidence on matched depth beats a contradicting prior; below, the smaller σ does.
 const SURE: f32 = 0.6;
-/// Pixels over which the slope of the prior is measured: one would read off the noise of
+/// Half of the distance for slopes of the prior, pixels: one would measure the noise of
 /// half-precision files.
 const SLOPE: usize = 2;
-/// Share of a prior in contradicted pieces from which on the user should know.
+/// Share of a prior in rejected pieces from which on the user is warned.
 const DOUBTFUL: f32 = 0.25;
 
-/// `surface` (matched, smoothed) with what the priors, one or none per view, add to it. Priors that
-/// do not fit are named in a warning and left out.
-pub fn join(
+/// `surface` (matched, smoothed) fused with the priors, one or none per view. Priors that do not
+/// fit are named in a warning and skipped.
+pub fn fuse_priors(
     level: &Level,
-    links: &RelativePoses,
+    poses: &RelativePoses,
     surface: &Surface,
     priors: &[Option<DepthPrior>],
     seed: u32,
@@ -76,15 +74,15 @@ pub fn join(
                 100.0 * aligned.contradicted
             ));
         }
-        let fused = Fused { level, links, surface, view, matched: &matched, aligned: &aligned };
-        let (planes, confidence) = fused.run(width, height);
+        let fusion = PriorFusion { level, poses, surface, view, matched: &matched, aligned: &aligned };
+        let (planes, confidence) = fusion.run(width, height);
         out.planes[own.clone()].copy_from_slice(&planes);
         out.confidence[own].copy_from_slice(&confidence);
     }
     out
 }
 
-/// The prior as inverse depth at the level's size, bilinear; 0 where it is unknown.
+/// Prior as inverse depth at the level's size, bilinear; 0 where unknown.
 fn resampled(prior: &DepthPrior, width: usize, height: usize) -> Vec<f32> {
     let values = &prior.values;
     let inverse = |v: f32| match prior.kind {
@@ -92,29 +90,34 @@ fn resampled(prior: &DepthPrior, width: usize, height: usize) -> Vec<f32> {
         PriorKind::Depth => 1.0 / v,
         PriorKind::InverseDepth => v,
     };
-    let axis = |k: usize, from: usize, to: usize| {
-        let at = ((k as f32 + 0.5) * from as f32 / to as f32 - 0.5).clamp(0.0, (from - 1) as f32);
-        (at as usize, (at as usize + 1).min(from - 1), at.fract())
-    };
     let mut out = Vec::with_capacity(width * height);
     for y in 0..height {
-        let (y0, y1, fy) = axis(y, values.height, height);
+        let (y0, y1, fy) = bilinear_taps(y, values.height, height);
         for x in 0..width {
-            let (x0, x1, fx) = axis(x, values.width, width);
+            let (x0, x1, fx) = bilinear_taps(x, values.width, width);
             let four = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|(x, y)| inverse(values.at(x, y)));
-            // Unknown beside known stays unknown: a mean with 0 would be a wall far away.
-            let mix = |a: f32, b: f32, t: f32| a + t * (b - a);
-            let value = mix(mix(four[0], four[1], fx), mix(four[2], four[3], fx), fy);
+            // Unknown if any tap is: a mean with 0 would be a wall far away.
+            let value = lerp(lerp(four[0], four[1], fx), lerp(four[2], four[3], fx), fy);
             out.push(if four.iter().all(|v| *v > 0.0) { value } else { 0.0 });
         }
     }
     out
 }
 
-/// One view's matched depth and its aligned prior.
-struct Fused<'a> {
+/// Both taps of sample `k` of `to` among `from` values, and the weight of the second.
+fn bilinear_taps(k: usize, from: usize, to: usize) -> (usize, usize, f32) {
+    let position = ((k as f32 + 0.5) * from as f32 / to as f32 - 0.5).clamp(0.0, (from - 1) as f32);
+    (position as usize, (position as usize + 1).min(from - 1), position.fract())
+}
+
+fn lerp(a: f32, b: f32, t: f32) -> f32 {
+    a + t * (b - a)
+}
+
+/// Matched depth and aligned prior of one view.
+struct PriorFusion<'a> {
     level: &'a Level,
-    links: &'a RelativePoses,
+    poses: &'a RelativePoses,
     surface: &'a Surface,
     view: usize,
     /// Inverse depth, 0 = unmatched.
@@ -122,7 +125,7 @@ struct Fused<'a> {
     aligned: &'a align::Aligned,
 }
 
-impl Fused<'_> {
+impl PriorFusion<'_> {
     fn run(&self, width: usize, height: usize) -> (Vec<Vec3>, Vec<f32>) {
         let first = self.level.references[self.view].first as usize;
         let flat = edges::flat(&self.aligned.inverse, width, height);
@@ -138,8 +141,8 @@ impl Fused<'_> {
             if confidence[k] > 0.0 {
                 let (matched, deviation) = (self.matched[k], self.deviation(confidence[k]) * self.matched[k]);
                 let other = self.aligned.deviation[k] * prior;
-                let apart = (matched - prior).abs() > SAME_SURFACE * deviation.hypot(other);
-                if !apart {
+                let differ = (matched - prior).abs() > SAME_SURFACE * deviation.hypot(other);
+                if !differ {
                     let (a, b) = (deviation.powi(-2), other.powi(-2));
                     planes[k] = (planes[k] * a + plane * b) / (a + b);
                     continue;
@@ -148,7 +151,7 @@ impl Fused<'_> {
                     continue;
                 }
             }
-            if !self.blocks(x, y, prior) {
+            if !self.in_free_space(x, y, prior) {
                 planes[k] = plane;
                 confidence[k] = SUGGESTED;
             }
@@ -157,11 +160,11 @@ impl Fused<'_> {
     }
 
     fn deviation(&self, confidence: f32) -> f32 {
-        let of = DEVIATION.iter().find(|(least, _)| confidence >= *least);
-        of.map_or(1.0, |(_, share)| *share) * self.level.tolerance[self.view]
+        let entry = DEVIATION.iter().find(|(least, _)| confidence >= *least);
+        entry.map_or(1.0, |(_, share)| *share) * self.level.tolerance[self.view]
     }
 
-    /// The tangent plane `π` of the aligned prior.
+    /// Tangent plane `π` of the aligned prior.
     fn plane(&self, x: usize, y: usize, width: usize, height: usize) -> Vec3 {
         let inverse = &self.aligned.inverse;
         let here = inverse[y * width + x];
@@ -177,13 +180,12 @@ impl Fused<'_> {
         Vec3::new(dx * fx, dy * fy, here - dx * u - dy * v)
     }
 
-    /// Whether a surface at this inverse depth would hide what another view has confirmed behind
-    /// it.
-    fn blocks(&self, x: usize, y: usize, inverse: f32) -> bool {
+    /// True if a surface at this inverse depth would lie in the free space of another view.
+    fn in_free_space(&self, x: usize, y: usize, inverse: f32) -> bool {
         let point = ray(self.level, self.view, x, y) / inverse;
         let pixel = [x as f32 + 0.5, y as f32 + 0.5];
         (0..self.level.cameras.len()).filter(|&o| o != self.view).any(|other| {
-            let seen = self.links.visibility(self.level, self.surface, self.view, other, pixel, point);
+            let seen = self.poses.visibility(self.level, self.surface, self.view, other, pixel, point);
             seen == Visibility::FreeSpace
         })
     }

@@ -1,54 +1,50 @@
-//! A view cut into small connected pieces, within which one scale and one shift of a depth prior
-//! are taken to hold.
+//! Connected pieces of a view, each with one scale and one shift of a depth prior.
 use crate::stereo::surface::neighbours;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-/// Side of a piece before its border follows the prior, share of the view's width: about 400
-/// pieces. On room_a and breakfast (10 % prior) a half and twice as many give the same to 0.002 of
-/// AbsRel.
+/// Pitch of the seeds of pieces, share of the view's width: about 400 pieces. On room_a and
+/// breakfast (10 % prior) half and twice as many give the same AbsRel to 0.002.
 pub const SIDE_SHARE: f32 = 1.0 / 24.0;
-/// Relative step of the prior between two neighbouring pixels that counts as far as the side of a
+/// Relative step of the prior between neighbouring pixels that costs as much as the side of a
 /// piece: pieces end at the prior's own depth edges, where its errors change.
 const FULL_STEP: f32 = 0.05;
 
 /// Pieces of one view.
 pub struct Pieces {
-    /// Piece of every pixel; `NO_PIECE` where the prior knows nothing.
+    /// Piece of every pixel, or [`NO_PIECE`].
     pub of: Vec<u32>,
-    /// How many there are.
+    /// Number of pieces.
     pub count: usize,
-    /// Pairs of neighbouring pieces (a < b) with the pixels that their border is long.
+    /// Pairs of neighbouring pieces (a < b) with the length of their border, pixels.
     pub borders: Vec<(u32, u32, f32)>,
 }
 
-/// Where the prior knows nothing.
+/// Piece of a pixel without prior.
 pub const NO_PIECE: u32 = u32::MAX;
 
 impl Pieces {
-    /// Cuts by the shortest way from seeds on a grid; the way is longer over steps of `prior`
-    /// (inverse depth, 0 = unknown).
+    /// Assigns pixels to the seed of the shortest path from a grid; steps of `prior` (inverse
+    /// depth, 0 = unknown) lengthen a path.
     pub fn cut(prior: &[f32], width: usize, height: usize) -> Pieces {
         let side = ((SIDE_SHARE * width as f32) as usize).max(4);
         let mut of = vec![NO_PIECE; prior.len()];
         let mut cost = vec![f32::INFINITY; prior.len()];
         let mut heap = BinaryHeap::new();
         let mut count = 0;
-        let mut start = |k: usize, cost: &mut [f32], of: &mut [u32], heap: &mut BinaryHeap<_>| {
-            cost[k] = 0.0;
-            of[k] = count;
+        let mut seed = |k: usize, cost: &mut [f32], of: &mut [u32], heap: &mut BinaryHeap<_>| {
+            (cost[k], of[k]) = (0.0, count);
             heap.push((Reverse(0u32), k as u32));
             count += 1;
         };
         for y in (side / 2..height).step_by(side) {
             for x in (side / 2..width).step_by(side) {
                 if prior[y * width + x] > 0.0 {
-                    start(y * width + x, &mut cost, &mut of, &mut heap);
+                    seed(y * width + x, &mut cost, &mut of, &mut heap);
                 }
             }
         }
-        // A second pass gives seeds to areas that no seed of the grid reaches: islands between
-        // holes of the prior.
+        // Areas that no seed of the grid reaches, islands between holes, get a seed afterwards.
         for k in 0..=prior.len() {
             while let Some((Reverse(bits), p)) = heap.pop() {
                 let (p, here) = (p as usize, f32::from_bits(bits));
@@ -67,7 +63,7 @@ impl Pieces {
                 }
             }
             if k < prior.len() && prior[k] > 0.0 && of[k] == NO_PIECE {
-                start(k, &mut cost, &mut of, &mut heap);
+                seed(k, &mut cost, &mut of, &mut heap);
             }
         }
         let borders = borders(&of, width);
@@ -101,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pieces_end_at_steps_and_cover_all_that_is_known() {
+    fn cut_ends_pieces_at_depth_steps() {
         let (width, height) = (96, 48);
         // Two planes that meet at column 41, and a hole with an island in it.
         let mut prior: Vec<f32> =

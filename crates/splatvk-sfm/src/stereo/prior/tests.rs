@@ -6,7 +6,7 @@ use crate::stereo::surface::RelativePoses;
 use crate::stereo::{StereoOptions, pyramid};
 use splatvk_test_support::stereo::{Set, breakfast};
 
-/// A smooth field of mean 0 and standard deviation 1 that swings about twice over the image.
+/// Smooth field of mean 0 and standard deviation 1 that swings about twice over the image.
 fn smooth(width: usize, height: usize, phase: f32) -> impl Fn(usize) -> f32 {
     move |k| {
         let (x, y) = ((k % width) as f32 / width as f32, (k / width) as f32 / height as f32);
@@ -16,16 +16,16 @@ fn smooth(width: usize, height: usize, phase: f32) -> impl Fn(usize) -> f32 {
     }
 }
 
-/// True depth as a network might give it: inverse depth times a scale and plus a shift that both
-/// wander by `error` over the image, near surfaces spread over far ones and blurred by a tenth of
-/// `error` of the width, all in another unit.
+/// Network-like prior from true depth: inverse depth with a scale and a shift that both vary by
+/// `error` over the image, near surfaces spread over far ones and blurred by a tenth of `error` of
+/// the width.
 fn simulated(depth: &Image<f32>, error: f32, phase: f32) -> DepthPrior {
     let (width, height) = (depth.width, depth.height);
     let radius = (0.1 * error * width as f32).round().max(1.0) as usize;
     let known: Vec<f32> = depth.data.iter().map(|z| if *z > 0.0 { 1.0 / z } else { 0.0 }).collect();
     let mut sorted: Vec<f64> = known.iter().filter(|v| **v > 0.0).map(|v| f64::from(*v)).collect();
     let unit = crate::math::median(&mut sorted).unwrap() as f32;
-    let windows = |from: &[f32], of: &dyn Fn(&[f32]) -> f32| -> Vec<f32> {
+    let filtered = |from: &[f32], reduce: &dyn Fn(&[f32]) -> f32| -> Vec<f32> {
         let mut out = Vec::with_capacity(from.len());
         for k in 0..from.len() {
             let (x, y) = (k % width, k / width);
@@ -35,23 +35,24 @@ fn simulated(depth: &Image<f32>, error: f32, phase: f32) -> DepthPrior {
                     inside.push(from[py * width + px]);
                 }
             }
-            out.push(of(&inside));
+            out.push(reduce(&inside));
         }
         out
     };
-    let bled = windows(&known, &|w| w.iter().copied().fold(0.0, f32::max));
-    let mixed: Vec<f32> = known.iter().zip(&bled).map(|(k, b)| 0.5 * (k + b)).collect();
-    let blurred = windows(&mixed, &|w| w.iter().sum::<f32>() / w.len() as f32);
+    let dilated = filtered(&known, &|w| w.iter().copied().fold(0.0, f32::max));
+    let mixed: Vec<f32> = known.iter().zip(&dilated).map(|(k, b)| 0.5 * (k + b)).collect();
+    let blurred = filtered(&mixed, &|w| w.iter().sum::<f32>() / w.len() as f32);
     let (scale, shift) = (smooth(width, height, phase), smooth(width, height, phase + 0.37));
-    let of = |k: usize| {
+    let value = |k: usize| {
         let inverse = blurred[k] * (1.0 + error * scale(k)) + 0.5 * error * unit * shift(k);
         3.0 * inverse + 0.7 * unit
     };
-    let values = Image { width, height, data: (0..width * height).map(of).collect() };
+    let values = Image { width, height, data: (0..width * height).map(value).collect() };
     DepthPrior { values, kind: PriorKind::InverseDepth }
 }
 
-/// True depth as matched, but for blocks of a sixth of the width that cover half of the image.
+/// Matched surface from true depth, without blocks of a sixth of the width that cover half of the
+/// image.
 fn matched(set: &Set, level: &Level) -> Surface {
     let mut surface = Surface { planes: Vec::new(), confidence: Vec::new() };
     for (view, depth) in set.depth.iter().enumerate() {
@@ -72,8 +73,7 @@ fn level(set: &Set) -> Level {
     pyramid(&set.images, &set.cameras, &set.sparse, &options).unwrap().pop().unwrap()
 }
 
-/// Mean relative error of the pixels that only the prior knows, and their share of the unmatched
-/// ones.
+/// Mean relative error of pixels from the prior alone, and their share of the unmatched ones.
 fn suggested(set: &Set, level: &Level, before: &Surface, after: &Surface) -> (f32, f32) {
     let (mut sum, mut count, mut open) = (0.0, 0usize, 0usize);
     for (view, depth) in set.depth.iter().enumerate() {
@@ -91,19 +91,19 @@ fn suggested(set: &Set, level: &Level, before: &Surface, after: &Surface) -> (f3
 }
 
 #[test]
-fn a_prior_with_wandering_scale_and_shift_fills_what_was_not_matched() {
+fn fuse_priors_follows_varying_scale() {
     let set = breakfast(4);
     let level = level(&set);
-    let links = RelativePoses::new(&level);
+    let poses = RelativePoses::new(&level);
     let before = matched(&set, &level);
     for (error, at_most) in [(0.05, 0.03), (0.1, 0.07), (0.2, 0.15)] {
         let priors: Vec<_> =
             set.depth.iter().enumerate().map(|(v, d)| Some(simulated(d, error, 0.2 * v as f32))).collect();
-        let after = join(&level, &links, &before, &priors, 1, &Silent);
+        let after = fuse_priors(&level, &poses, &before, &priors, 1, &Silent);
         let (mean, share) = suggested(&set, &level, &before, &after);
         println!("prior off by {error}: filled {share:.2} with a mean error of {mean:.4}");
         assert!(mean < at_most && share > 0.5, "prior off by {error}: {mean} over {share}");
-        // What two views confirm moves by no more than it deviates.
+        // Matched pixels keep their confidence.
         for (k, c) in before.confidence.iter().enumerate().filter(|(_, c)| **c > 0.0) {
             assert_eq!(after.confidence[k], *c);
         }
@@ -111,16 +111,16 @@ fn a_prior_with_wandering_scale_and_shift_fills_what_was_not_matched() {
 }
 
 #[test]
-fn a_prior_of_another_scene_is_refused_and_named() {
+fn fuse_priors_rejects_another_scene() {
     let set = breakfast(8);
     let level = level(&set);
-    let links = RelativePoses::new(&level);
+    let poses = RelativePoses::new(&level);
     let before = matched(&set, &level);
     // Near where the scene is far.
     let inverted = |d: &Image<f32>| Some(DepthPrior { values: d.clone(), kind: PriorKind::InverseDepth });
     let priors: Vec<_> = set.depth.iter().map(inverted).collect();
     let recorded = Recorded::new(&Silent);
-    let after = join(&level, &links, &before, &priors, 1, &recorded);
+    let after = fuse_priors(&level, &poses, &before, &priors, 1, &recorded);
     let warned = recorded.warnings();
     let used = after.confidence.iter().filter(|c| **c == SUGGESTED).count();
     println!("{used} of {} pixels suggested; {warned:?}", after.confidence.len());
@@ -129,10 +129,10 @@ fn a_prior_of_another_scene_is_refused_and_named() {
 }
 
 #[test]
-fn a_piece_that_contradicts_stereo_is_left_out_and_one_that_hides_a_view_too() {
+fn fuse_priors_rejects_contradicting_block() {
     let set = breakfast(4);
     let level = level(&set);
-    let links = RelativePoses::new(&level);
+    let poses = RelativePoses::new(&level);
     let before = matched(&set, &level);
     // Exact, but for a block of view 0 that stands at half its depth.
     let mut priors: Vec<Option<DepthPrior>> =
@@ -144,7 +144,7 @@ fn a_piece_that_contradicts_stereo_is_left_out_and_one_that_hides_a_view_too() {
     for k in (0..depth.data.len()).filter(|k| wrong(*k)) {
         depth.data[k] *= 0.5;
     }
-    let after = join(&level, &links, &before, &priors, 1, &Silent);
+    let after = fuse_priors(&level, &poses, &before, &priors, 1, &Silent);
     let (mut bad, mut good) = (0usize, 0usize);
     for k in (0..set.depth[0].data.len()).filter(|k| before.confidence[*k] <= 0.0) {
         let truth = set.depth[0].data[k];

@@ -3,13 +3,13 @@ use super::*;
 use crate::stereo::{StereoOptions, pyramid, texture};
 use splatvk_test_support::stereo::{Set, synthetic};
 
-/// Pixels at the rim of the square that are matched.
+/// Width of the matched rim of the square, pixels.
 const RIM: usize = 4;
-/// Columns and rows of the mirror image in view 1.
+/// Columns of the mirror image in view 1.
 const MIRROR: std::ops::Range<usize> = 64..74;
 
-/// The square of one colour, and which pixels of a view show it.
-fn plain(mut set: Set) -> (Set, Vec<Vec<bool>>) {
+/// The set with a square of one colour, and the square's pixels in each view.
+fn with_plain_square(mut set: Set) -> (Set, Vec<Vec<bool>>) {
     let mut squares = Vec::new();
     for image in &mut set.images {
         let square: Vec<bool> = image.data.iter().map(|c| c[0] > c[2]).collect();
@@ -20,11 +20,11 @@ fn plain(mut set: Set) -> (Set, Vec<Vec<bool>>) {
 }
 
 #[test]
-fn the_rim_of_a_plain_square_tells_its_plane_and_mirror_images_go() {
-    let (set, squares) = plain(synthetic(160, 120));
+fn fill_extends_rim_without_mirror_image() {
+    let (set, squares) = with_plain_square(synthetic(160, 120));
     let options = StereoOptions { rounds: vec![1], ..StereoOptions::default() };
     let level = pyramid(&set.images, &set.cameras, &set.sparse, &options).unwrap().pop().unwrap();
-    let links = RelativePoses::new(&level);
+    let poses = RelativePoses::new(&level);
     let mut surface = Surface { planes: Vec::new(), confidence: Vec::new() };
     let mut open = Vec::new();
     for (view, (depth, square)) in set.depth.iter().zip(&squares).enumerate() {
@@ -33,7 +33,7 @@ fn the_rim_of_a_plain_square_tells_its_plane_and_mirror_images_go() {
             let (x, y) = (k % width, k / width);
             let inside = (y.saturating_sub(RIM)..(y + RIM + 1).min(height))
                 .all(|y| (x.saturating_sub(RIM)..(x + RIM + 1).min(width)).all(|x| square[y * width + x]));
-            // What a mirror shows lies behind it, and looks as well matched.
+            // A mirror image lies behind the mirror and looks well matched.
             let mirrored = view == 1 && inside && MIRROR.contains(&x) && (50..60).contains(&y);
             let depth = if mirrored { 1.6 * depth.data[k] } else { depth.data[k] };
             surface.planes.push(Vec3::new(0.0, 0.0, 1.0 / depth));
@@ -42,7 +42,7 @@ fn the_rim_of_a_plain_square_tells_its_plane_and_mirror_images_go() {
         }
     }
     let void = vec![false; level.pixels()];
-    let filled = fill(&level, &links, &surface, &void, &texture::weak(&level), 1);
+    let filled = fill(&level, &poses, &surface, &void, &texture::weak(&level), 1);
     let errors = map_pixels(&level, |view, x, y, k| {
         let truth = set.depth[view].at(x, y);
         let found = 1.0 / filled.planes[k].dot(ray(&level, view, x, y));
@@ -55,8 +55,8 @@ fn the_rim_of_a_plain_square_tells_its_plane_and_mirror_images_go() {
     assert!(all > 5000 && known.len() * 10 > all * 9, "{} of {all}", known.len());
     assert!(worst < 0.01, "worst error {worst}");
 
-    // Nothing is inferred where there is texture, and nothing matched is lost but the mirror image.
+    // Textured pixels are not inferred; only the mirror image loses its depth.
     let textured = vec![false; level.pixels()];
-    let untouched = fill(&level, &links, &surface, &void, &textured, 1);
+    let untouched = fill(&level, &poses, &surface, &void, &textured, 1);
     assert_eq!(untouched.confidence, surface.confidence);
 }

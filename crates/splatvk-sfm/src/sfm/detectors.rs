@@ -1,5 +1,5 @@
 //! Keypoints per detector and photo.
-use super::model::Sighting;
+use super::model::TrackElement;
 use crate::Result;
 use crate::matching::{self, Keypoints};
 use crate::photo::Photo;
@@ -8,56 +8,55 @@ use crate::scene::Image;
 use crate::{affine, sift};
 use rayon::prelude::*;
 
-/// Strongest corners kept per photo: matching stays below a second for four photos.
+/// Most corners per photo, the strongest: matching stays below a second for four photos.
 const MAX_CORNERS: usize = 4000;
 
-/// Pixels next to the image edge that hold no features: their neighbourhood is cut off.
+/// Pixels next to the image edge without keypoints: their neighbourhood is cut off.
 pub(super) const MARGIN: usize = 4;
 
-/// Strongest corners kept per compressed version of a photo: matching then takes seconds per pair.
+/// Most corners per compressed copy of a photo: matching then takes seconds per pair.
 const MAX_AFFINE: usize = 700;
 
-/// What one detector found in all photos.
-pub(super) struct Family {
+/// Keypoints of one detector in all photos.
+pub(super) struct DetectorFeatures {
     /// Matches are nearest neighbours whose distance is below this share of that to the second-best
     /// elsewhere.
     pub(super) ratio: f32,
-    /// Per photo.
     pub(super) keypoints: Vec<Keypoints>,
 }
 
-/// Built-in corners, then the learned ones if given.
-pub(super) fn corner_families(
+/// Features of the built-in corner detector, then the learned ones if given.
+pub(super) fn detect_features(
     photos: &[Photo],
     features: &[Keypoints],
     progress: &dyn Progress,
-) -> Result<Vec<Family>> {
+) -> Result<Vec<DetectorFeatures>> {
     progress.check()?;
-    let mut families = vec![Family { ratio: 0.85, keypoints: of_all(photos, MAX_CORNERS, sift::detect) }];
+    let mut detectors =
+        vec![DetectorFeatures { ratio: 0.85, keypoints: detect_all(photos, MAX_CORNERS, sift::detect) }];
     progress.check()?;
     if features.len() == photos.len() {
         // Learned descriptors are compared more leniently: their second-best is close by design of
         // the training.
-        families.push(Family { ratio: 0.97, keypoints: masked(photos, features) });
+        detectors.push(DetectorFeatures { ratio: 0.97, keypoints: masked(photos, features) });
     }
-    Ok(families)
+    Ok(detectors)
 }
 
-/// Corners of all photos as they look from the side.
-pub(super) fn affine_family(photos: &[Photo]) -> Family {
-    Family { ratio: 0.85, keypoints: of_all(photos, MAX_AFFINE, affine::detect) }
+/// Affine-invariant corners of all photos.
+pub(super) fn affine_features(photos: &[Photo]) -> DetectorFeatures {
+    DetectorFeatures { ratio: 0.85, keypoints: detect_all(photos, MAX_AFFINE, affine::detect) }
 }
 
-fn of_all(
+fn detect_all(
     photos: &[Photo],
     limit: usize,
     detect: impl Fn(&Image<f32>, &Image<bool>, usize) -> Keypoints + Sync,
 ) -> Vec<Keypoints> {
-    let one = |p: &Photo| detect(&p.image.luma(), &valid(p), limit);
-    photos.par_iter().map(one).collect()
+    photos.par_iter().map(|p| detect(&p.image.luma(), &valid(p), limit)).collect()
 }
 
-/// Where features of a photo may lie.
+/// Mask of the pixels of a photo where keypoints may lie.
 fn valid(photo: &Photo) -> Image<bool> {
     matching::valid_area(&photo.image, photo.border, photo.coverage.as_ref(), MARGIN)
 }
@@ -75,14 +74,14 @@ fn within(f: &Keypoints, valid: &Image<bool>) -> Keypoints {
     out
 }
 
-/// Masked features of all detectors, per family and photo.
+/// Keypoints of all photos on valid pixels.
 pub(super) fn masked(photos: &[Photo], features: &[Keypoints]) -> Vec<Keypoints> {
     photos.iter().zip(features).map(|(p, f)| within(f, &valid(p))).collect()
 }
 
-/// All keypoints of a view, numbered as the links number them.
-pub(super) fn keypoints(families: &[Family], view: usize) -> Vec<Sighting> {
+/// Keypoints of a view over all detectors, numbered as in [`super::tracks::KeypointMatch`].
+pub(super) fn keypoints(detectors: &[DetectorFeatures], view: usize) -> Vec<TrackElement> {
     let all =
-        families.iter().enumerate().flat_map(|(k, f)| f.keypoints[view].points.iter().map(move |p| (k, *p)));
-    all.map(|(family, pixel)| Sighting { view, pixel, sigma: 1.0, family }).collect()
+        detectors.iter().enumerate().flat_map(|(k, f)| f.keypoints[view].points.iter().map(move |p| (k, *p)));
+    all.map(|(detector, pixel)| TrackElement { view, pixel, sigma: 1.0, detector }).collect()
 }

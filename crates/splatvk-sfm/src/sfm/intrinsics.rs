@@ -1,0 +1,97 @@
+//! Selection of the intrinsics that the observations determine, and of the photos that share a
+//! camera.
+use super::crops;
+use super::fit::{IntrinsicsFit, MAX_COST_SHARE, STEPS, fit_intrinsics};
+use super::model::{Model, RefinedIntrinsics};
+use crate::Result;
+use crate::bundle::Adjusted;
+
+/// Most steps from an optimum of the same observations with one camera more: the cost that remains
+/// after them does not decide.
+const STEPS_JOINED: usize = 12;
+
+/// Adjusts with `refined` intrinsics; standard deviations as from [`estimate_intrinsics`].
+pub(super) fn adjust_intrinsics(model: &mut Model, refined: RefinedIntrinsics) -> Result<Adjusted> {
+    let mut found = fit_intrinsics(model, refined, STEPS)?;
+    found.widen_sigmas();
+    *model = found.model;
+    Ok(found.outcome)
+}
+
+/// Best fit over `choices`, with the standard deviations of the last of them.
+fn best_fit(model: &Model, choices: &[RefinedIntrinsics]) -> Result<IntrinsicsFit> {
+    let mut all = choices.iter().map(|f| fit_intrinsics(model, *f, STEPS)).collect::<Result<Vec<_>>>()?;
+    let of_all = all.last().map(|e| e.outcome.clone());
+    all.sort_by(|a, b| a.bic.total_cmp(&b.bic));
+    let mut best = all.swap_remove(0);
+    if let Some(Adjusted { sigmas, rotation_sigmas, .. }) = of_all {
+        best.outcome = Adjusted { sigmas, rotation_sigmas, ..best.outcome };
+    }
+    Ok(best)
+}
+
+/// Merges cameras of photos that may share one, as long as the criterion falls.
+fn merge_cameras(mut best: IntrinsicsFit) -> Result<IntrinsicsFit> {
+    for view in 1..best.model.camera_ids.len() {
+        let mut tried = Vec::new();
+        for other in 0..view {
+            let target = best.model.camera_ids[other];
+            if best.model.camera_ids_by_file[other] != best.model.camera_ids_by_file[view]
+                || tried.contains(&target)
+            {
+                continue;
+            }
+            tried.push(target);
+            let mut camera_ids = best.model.camera_ids.clone();
+            camera_ids[view] = target;
+            let trial =
+                fit_intrinsics(&best.model.with_camera_ids(&camera_ids), best.model.refined, STEPS_JOINED)?;
+            if trial.bic < best.bic {
+                best = trial;
+                break;
+            }
+        }
+    }
+    Ok(best)
+}
+
+/// Selects the intrinsics to refine and the photos that share a camera, and adjusts. The standard
+/// deviations are those of a fit of all intrinsics, since parameters that the criterion drops may
+/// still be present.
+pub(super) fn estimate_intrinsics(model: &mut Model) -> Result<Adjusted> {
+    let apart = model.with_separate_intrinsics();
+    // Shared cameras are decided only once.
+    let merged = model.camera_ids != model.camera_ids_by_file
+        && apart.as_ref().is_some_and(|a| a.camera_ids != model.camera_ids);
+    let decided = model.has_crops() || merged;
+    let start = if decided { model.clone() } else { model.with_camera_ids(&model.camera_ids_by_file) };
+    let mut found = best_fit(&start, &RefinedIntrinsics::ALL)?;
+    if let Some(apart) = apart.filter(|_| !decided) {
+        let apart = best_fit(&apart, &[RefinedIntrinsics::Focal, RefinedIntrinsics::Radial])?;
+        if apart.bic < found.bic {
+            let several = best_fit(&merge_cameras(apart)?.model, &RefinedIntrinsics::ALL)?;
+            if several.bic < shared_camera_criterion(&found)? {
+                found = several;
+            }
+        }
+    }
+    found = crops::with_crops(found)?;
+    found.widen_sigmas();
+    *model = found.model;
+    Ok(found.outcome)
+}
+
+/// Bound of the criterion for several cameras: its value if photos that may share a camera do so
+/// and only its principal point moves from photo to photo, as by image stabilisation, with
+/// [`MAX_COST_SHARE`] of the cost. Separate intrinsics would turn such movement into wrong focal
+/// lengths.
+fn shared_camera_criterion(shared: &IntrinsicsFit) -> Result<f64> {
+    let mut model = shared.model.with_camera_ids(&shared.model.camera_ids_by_exif);
+    for (prior, intrinsics) in model.priors.iter_mut().zip(&model.intrinsics) {
+        prior.log_focal = (intrinsics.focal.ln(), 0.0);
+        prior.lens = [0.0; 2];
+    }
+    let moved = fit_intrinsics(&model, RefinedIntrinsics::Full, STEPS)?;
+    let n = model.effective_observations(model.residual_components());
+    Ok(moved.bic + shared.model.intrinsics_parameters() as f64 * n.ln() + n * MAX_COST_SHARE.ln())
+}
